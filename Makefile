@@ -1,0 +1,49 @@
+# Each target works alone on a machine with Python >= 3.11, make and git: it makes the environment it needs.
+PYTHON ?= python3
+VENV ?= .venv
+BIN = $(VENV)/bin
+STAMP = $(VENV)/.installed
+DEMO_OUT ?= udccal-demo
+ACCURACY_OUT ?= accuracy
+
+.PHONY: install demo test test-slow lint types contracts check accuracy tables clean
+
+install: $(STAMP)
+
+$(STAMP): pyproject.toml constraints.txt
+	$(PYTHON) -c "import sys; sys.exit(None if sys.version_info >= (3, 11) else 'udccal needs Python 3.11 or newer: make PYTHON=python3.12')"
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[dev]"
+	touch $(STAMP)
+
+demo: $(STAMP)
+	$(BIN)/udccal demo --out $(DEMO_OUT)
+
+test: $(STAMP)
+	$(BIN)/python -m pytest -m "not slow" -n 2
+
+test-slow: $(STAMP)
+	$(BIN)/python -m pytest -m slow
+
+lint: $(STAMP)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+types: $(STAMP)
+	$(BIN)/mypy
+
+contracts: $(STAMP)
+	$(BIN)/lint-imports
+
+check: lint types contracts test
+
+# The accuracy table of README.md, on two full-size rigs. Writes accuracy.json; non-zero exit where a number is missed.
+accuracy: $(STAMP)
+	$(BIN)/python -m tests.benchmarks.accuracy --out $(ACCURACY_OUT)
+
+# Puts the measured tables into README.md.
+tables: $(STAMP)
+	$(BIN)/python -m tests.benchmarks.readme_tables --accuracy $(ACCURACY_OUT)
+
+clean:
+	rm -rf $(VENV) $(DEMO_OUT) $(ACCURACY_OUT) build dist *.egg-info

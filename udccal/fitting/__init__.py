@@ -1,0 +1,1 @@
+"""Estimators: a session in, a term with covariance and diagnostics out."""

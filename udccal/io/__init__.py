@@ -1,0 +1,1 @@
+"""Files on disk: EXR, PNG, checksums, and writes that are whole or absent."""

@@ -1,0 +1,1 @@
+"""The five terms as pure JAX functions of small immutable parameter objects, and their composition."""

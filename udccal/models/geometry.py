@@ -1,0 +1,143 @@
+"""Geometry: pinhole with Brown-Conrady distortion, the pose of the camera behind the panel, and the virtual rotation.
+
+Pixel coordinates, frames and signs are those of docs/conventions.md. All functions are pure and differentiable.
+"""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+from jaxtyping import ArrayLike as Arrayish
+
+
+class Geometry(eqx.Module):
+    """Where rays go.
+
+    Attributes:
+        focal: (fx, fy) in px. centre: (cx, cy) in px.
+        distortion: (k1, k2, p1, p2, k3), OpenCV's order and signs.
+        rotation: rotation vector in rad of ``R_panel_camera`` (camera coordinates to panel coordinates).
+        pupil: entrance pupil in panel coordinates in mm; z is minus the stand-off.
+    """
+
+    focal: Float[Arrayish, "2"]
+    centre: Float[Arrayish, "2"]
+    distortion: Float[Arrayish, "5"]
+    rotation: Float[Arrayish, "3"]
+    pupil: Float[Arrayish, "3"]
+
+
+class VirtualView(eqx.Module):
+    """A distortion-free pinhole picture whose image plane is parallel to the panel, seen from the same pupil."""
+
+    columns: int = eqx.field(static=True)
+    rows: int = eqx.field(static=True)
+    focal_px: float
+    centre: Float[Arrayish, "2"]
+
+
+def rotation_matrix(vector: Float[Arrayish, "3"]) -> Float[Array, "3 3"]:
+    """Rodrigues' formula, differentiable at zero."""
+    x, y, z = jnp.asarray(vector)
+    angle2 = x * x + y * y + z * z
+    small = angle2 < 1e-12
+    safe = jnp.where(small, 1.0, angle2)
+    angle = jnp.sqrt(safe)
+    s = jnp.where(small, 1.0 - angle2 / 6.0, jnp.sin(angle) / angle)
+    c = jnp.where(small, 0.5 - angle2 / 24.0, (1.0 - jnp.cos(angle)) / safe)
+    zero = jnp.zeros_like(x)
+    k = jnp.array([[zero, -z, y], [z, zero, -x], [-y, x, zero]])
+    return jnp.eye(3, dtype=k.dtype) + s * k + c * (k @ k)
+
+
+def mounting_rotation(
+    tilt_rad: Float[Arrayish, ""], roll_rad: Float[Arrayish, ""], yaw_rad: Float[Arrayish, ""]
+) -> Float[Array, "3 3"]:
+    """``R_panel_camera`` = Ry(yaw) Rx(-tilt) Rz(roll)."""
+    zero = jnp.zeros_like(jnp.asarray(tilt_rad, dtype=float))
+    ry = rotation_matrix(jnp.stack([zero, jnp.asarray(yaw_rad), zero]))
+    rx = rotation_matrix(jnp.stack([-jnp.asarray(tilt_rad), zero, zero]))
+    rz = rotation_matrix(jnp.stack([zero, zero, jnp.asarray(roll_rad)]))
+    return ry @ rx @ rz
+
+
+def tilt_rad(geometry: Geometry) -> Float[Array, ""]:
+    """Angle by which the camera's axis points below the panel's normal, in rad."""
+    axis = rotation_matrix(geometry.rotation)[:, 2]
+    return jnp.arcsin(jnp.clip(axis[1], -1.0, 1.0))
+
+
+def distort(geometry: Geometry, points: Float[Arrayish, "*n 2"]) -> Float[Array, "*n 2"]:
+    """Ideal normalised image points to distorted ones (OpenCV's five-coefficient model)."""
+    points = jnp.asarray(points)
+    k1, k2, p1, p2, k3 = jnp.asarray(geometry.distortion)
+    x, y = points[..., 0], points[..., 1]
+    r2 = x * x + y * y
+    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    return jnp.stack(
+        [
+            x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+            y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
+        ],
+        axis=-1,
+    )
+
+
+def project(geometry: Geometry, points: Float[Arrayish, "*n 3"]) -> Float[Array, "*n 2"]:
+    """Points in camera coordinates (any unit, z > 0) to sensor pixels."""
+    points = jnp.asarray(points)
+    ideal = points[..., :2] / points[..., 2:]
+    return distort(geometry, ideal) * jnp.asarray(geometry.focal) + jnp.asarray(geometry.centre)
+
+
+def unproject(geometry: Geometry, pixels: Float[Arrayish, "*n 2"], iterations: int = 12) -> Float[Array, "*n 2"]:
+    """Sensor pixels to ideal normalised image points (x/z, y/z).
+
+    Fixed-point inversion of the distortion; 12 rounds leave less than 1e-9 px for distortions up to 10 %.
+    """
+    measured = (jnp.asarray(pixels) - jnp.asarray(geometry.centre)) / jnp.asarray(geometry.focal)
+    ideal = measured
+    for _ in range(iterations):
+        ideal = ideal + measured - distort(geometry, ideal)
+    return ideal
+
+
+def panel_directions(geometry: Geometry, pixels: Float[Arrayish, "*n 2"]) -> Float[Array, "*n 3"]:
+    """Unit vectors in panel coordinates of the rays through sensor pixels, pointing to the viewer's side."""
+    ideal = unproject(geometry, pixels)
+    rays = jnp.concatenate([ideal, jnp.ones_like(ideal[..., :1])], axis=-1)
+    rays = rays @ rotation_matrix(geometry.rotation).T
+    return rays / jnp.linalg.norm(rays, axis=-1, keepdims=True)
+
+
+def panel_points_mm(geometry: Geometry, pixels: Float[Arrayish, "*n 2"]) -> Float[Array, "*n 2"]:
+    """Where the rays through sensor pixels cross the panel plane, in panel coordinates in mm."""
+    rays = panel_directions(geometry, pixels)
+    pupil = jnp.asarray(geometry.pupil)
+    return pupil[:2] - pupil[2] * rays[..., :2] / rays[..., 2:]
+
+
+def project_directions(geometry: Geometry, directions: Float[Arrayish, "*n 3"]) -> Float[Array, "*n 2"]:
+    """Directions in panel coordinates to sensor pixels; the inverse of ``panel_directions``."""
+    return project(geometry, jnp.asarray(directions) @ rotation_matrix(geometry.rotation))
+
+
+def view_to_sensor(
+    geometry: Geometry, view: VirtualView, view_pixels: Float[Arrayish, "*n 2"]
+) -> Float[Array, "*n 2"]:
+    """Sensor pixel that each pixel of the virtual view looks at: virtual rotation and distortion in one map."""
+    plane = (jnp.asarray(view_pixels) - jnp.asarray(view.centre)) / view.focal_px
+    directions = jnp.concatenate([plane, jnp.ones_like(plane[..., :1])], axis=-1)
+    return project_directions(geometry, directions)
+
+
+def virtual_rotation_homography(geometry: Geometry, view: VirtualView) -> Float[Array, "3 3"]:
+    """Homography from undistorted sensor pixels to pixels of the virtual view: K_view R_panel_camera K^-1."""
+    fx, fy = jnp.asarray(geometry.focal)
+    cx, cy = jnp.asarray(geometry.centre)
+    vx, vy = jnp.asarray(view.centre)
+    one, zero = jnp.ones_like(fx), jnp.zeros_like(fx)
+    inverse = jnp.array([[one / fx, zero, -cx / fx], [zero, one / fy, -cy / fy], [zero, zero, one]])
+    outer = jnp.array([[view.focal_px, 0.0, vx], [0.0, view.focal_px, vy], [0.0, 0.0, 1.0]])
+    return outer @ rotation_matrix(geometry.rotation) @ inverse

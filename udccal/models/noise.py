@@ -1,0 +1,42 @@
+"""Noise: EMVA 1288's linear camera model with the extra terms of the ELD model (Tukey-lambda read noise, row noise)."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+from jaxtyping import ArrayLike as Arrayish
+
+
+class Noise(eqx.Module):
+    """The sensor's numbers, under their EMVA 1288 and ELD names.
+
+    ``sigma_d_e`` is the temporal dark noise of one frame at zero exposure without quantisation, row noise included.
+    """
+
+    K_DN_per_e: Float[Arrayish, ""]
+    black_DN: Float[Arrayish, ""]
+    saturation_DN: Float[Arrayish, ""]
+    sigma_d_e: Float[Arrayish, ""]
+    lambda_read: Float[Arrayish, ""]
+    sigma_row_DN: Float[Arrayish, ""]
+    q_DN: Float[Arrayish, ""]
+    dark_current_e_per_s: Float[Arrayish, ""]
+    DSNU1288_e: Float[Arrayish, ""]
+    PRNU1288: Float[Arrayish, ""]
+
+
+def electrons(noise: Noise, signal_DN: Float[Arrayish, "*n"]) -> Float[Array, "*n"]:
+    """Linear signal in e-: (DN - black) / K."""
+    return (jnp.asarray(signal_DN) - noise.black_DN) / noise.K_DN_per_e
+
+
+def variance_e(noise: Noise, signal_e: Float[Arrayish, "*n"], exposure_s: Float[Arrayish, ""]) -> Float[Array, "*n"]:
+    """Temporal variance in e-^2 of one sample whose mean signal (dark signal excluded) is ``signal_e``.
+
+    EMVA 1288, equation of the photon transfer curve: shot + dark current + sigma_d^2 + quantisation.
+    """
+    quantisation = (noise.q_DN / noise.K_DN_per_e) ** 2 / 12.0
+    shot = jnp.maximum(jnp.asarray(signal_e), 0.0)
+    dark = noise.dark_current_e_per_s * exposure_s
+    return shot + dark + jnp.asarray(noise.sigma_d_e) ** 2 + quantisation

@@ -1,0 +1,1 @@
+"""The versioned rig profile: schema, reading and writing."""

@@ -1,0 +1,1 @@
+"""The runtime that undoes the panel: raw mosaics in, clean pictures out."""

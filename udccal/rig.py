@@ -1,0 +1,187 @@
+"""The rig as built: nominal values with tolerances, all that a fit needs to start. Read from ``rig.toml``."""
+
+from __future__ import annotations
+
+import os
+import tomllib
+from importlib import resources
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from udccal.errors import RigError
+
+CfaPattern = Literal["RGGB", "BGGR", "GRBG", "GBRG"]
+_MAX_TOML_BYTES = 64 * 1024
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class Nominal(_Strict):
+    """A value the rig was built to have, and how far off it may be (same unit)."""
+
+    value: float
+    tolerance: Annotated[float, Field(ge=0)]
+
+
+class Panel(_Strict):
+    """The transparent display."""
+
+    model: str
+    columns: Annotated[int, Field(ge=8, le=16384)]
+    rows: Annotated[int, Field(ge=8, le=16384)]
+    pitch_mm: Nominal
+    row_open_fraction: Nominal
+    column_open_fraction: Nominal
+    structure_thickness_mm: Nominal
+    glass_thickness_mm: Annotated[float, Field(gt=0, le=20)]
+    glass_index: Annotated[float, Field(ge=1, le=2.5)]
+    gamma: Nominal
+
+
+class Camera(_Strict):
+    """The sensor."""
+
+    model: str
+    columns: Annotated[int, Field(ge=64, le=16384)]
+    rows: Annotated[int, Field(ge=64, le=16384)]
+    pitch_um: Annotated[float, Field(gt=0, le=100)]
+    cfa: CfaPattern
+    bits: Annotated[int, Field(ge=8, le=16)]
+    full_well_e: Nominal
+    black_DN: Nominal
+    K_DN_per_e: Nominal
+    frame_rate_hz: Annotated[float, Field(gt=0)]
+    min_exposure_s: Annotated[float, Field(gt=0)]
+    max_exposure_s: Annotated[float, Field(gt=0)]
+
+
+class Lens(_Strict):
+    """The lens; its entrance pupil has the diameter ``focal_mm / f_number``."""
+
+    model: str
+    focal_mm: Nominal
+    f_number: Nominal
+    focus_mm: Annotated[float, Field(gt=0)]
+
+
+class Mounting(_Strict):
+    """Where the entrance pupil sits behind the panel, and where the camera points.
+
+    ``T_panel_camera`` has the rotation Ry(yaw) Rx(-tilt) Rz(roll); tilt is positive when the camera looks down.
+    ``panel_x_px``, ``panel_y_px`` is the panel pixel straight in front of the pupil.
+    """
+
+    standoff_mm: Nominal
+    tilt_deg: Nominal
+    roll_deg: Nominal
+    yaw_deg: Nominal
+    panel_x_px: Nominal
+    panel_y_px: Nominal
+
+
+class Captures(_Strict):
+    """How much a full calibration captures; each number trades time for accuracy."""
+
+    flats: Annotated[int, Field(ge=2)] = 300
+    noise_levels: Annotated[int, Field(ge=4)] = 20
+    noise_stack: Annotated[int, Field(ge=2)] = 16
+    psf_columns: Annotated[int, Field(ge=1)] = 7
+    psf_rows: Annotated[int, Field(ge=1)] = 5
+    psf_shifts: Annotated[int, Field(ge=1)] = 8
+    psf_exposures: Annotated[int, Field(ge=1)] = 7
+    psf_region_columns: Annotated[int, Field(ge=16)] = 256
+    psf_region_rows: Annotated[int, Field(ge=16)] = 512
+    psf_led_mm: Annotated[float, Field(gt=0)] = 1.15
+    psf_distance_mm: Annotated[float, Field(gt=0)] = 2000.0
+    backscatter_pictures: Annotated[int, Field(ge=2)] = 24
+    backscatter_frames: Annotated[int, Field(ge=2)] = 8
+    board_views: Annotated[int, Field(ge=3)] = 20
+
+
+class View(_Strict):
+    """The picture that restoration delivers."""
+
+    columns: Annotated[int, Field(ge=16, le=16384)] = 1920
+    rows: Annotated[int, Field(ge=16, le=16384)] = 1080
+
+
+class RigDescription(_Strict):
+    """One rig as it was built to be."""
+
+    format: Literal["udccal-rig"]
+    version: Literal[1]
+    name: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9._-]{0,63}$")]
+    panel: Panel
+    camera: Camera
+    lens: Lens
+    mounting: Mounting
+    captures: Captures
+    view: View
+
+    @property
+    def focal_px(self) -> float:
+        """Nominal focal length in sensor pixels."""
+        return self.lens.focal_mm.value * 1000.0 / self.camera.pitch_um
+
+    @property
+    def pupil_mm(self) -> float:
+        """Nominal entrance-pupil diameter."""
+        return self.lens.focal_mm.value / self.lens.f_number.value
+
+    @property
+    def saturation_DN(self) -> int:
+        """Largest number the converter can deliver."""
+        return int(2**self.camera.bits - 1)
+
+
+def user_rig_folder() -> Path:
+    """The folder in which a user's own rigs are looked up by name."""
+    default = Path.home() / ".local" / "share" / "udccal" / "rigs"
+    return Path(os.environ.get("UDCCAL_RIGS", str(default)))
+
+
+def shipped_rig_folder() -> Path:
+    """The folder of the rigs that ship with udccal."""
+    return Path(str(resources.files("rig_profiles")))
+
+
+def find_rig(name_or_path: str | Path) -> Path:
+    """Folder of a rig given by path, or by name in the user's folder or among those shipped.
+
+    Raises:
+        RigError: when no folder with a ``rig.toml`` is found.
+    """
+    path = Path(name_or_path)
+    places = [path] if path.parts[1:] or path.is_absolute() else [user_rig_folder() / path, shipped_rig_folder() / path, path]
+    for place in places:
+        if (place / "rig.toml").is_file():
+            return place
+    shipped = sorted(p.parent.name for p in shipped_rig_folder().glob("*/rig.toml"))
+    raise RigError(
+        f"Expected a rig folder with a rig.toml, found none for '{name_or_path}'. "
+        f"Give a path, or one of the shipped rigs: {', '.join(shipped)}."
+    )
+
+
+def load_rig(name_or_path: str | Path) -> RigDescription:
+    """Read and check a rig description.
+
+    Raises:
+        RigError: when it is missing, not TOML, or a value is missing, unknown or out of range.
+    """
+    file = find_rig(name_or_path) / "rig.toml"
+    raw = file.read_bytes()
+    if len(raw) > _MAX_TOML_BYTES:
+        raise RigError(f"Expected {file} to hold at most {_MAX_TOML_BYTES} bytes, found {len(raw)}. Shorten it.")
+    try:
+        return RigDescription.model_validate(tomllib.loads(raw.decode("utf-8")))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise RigError(f"Expected {file} to be TOML, found: {error}. Correct that line.") from error
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"])
+        raise RigError(f"Expected a valid '{where}' in {file}, found: {first['msg']}. Correct that value.") from error

@@ -1,0 +1,1 @@
+"""Captured data on disk: manifest, frames, running averages, checksums, resume."""

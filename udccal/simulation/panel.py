@@ -1,0 +1,61 @@
+"""The panel as a mask: which part of each row and column is open for a ray, and where the pupil's footprint lies.
+
+Panel pixel (row i, column j) is centred on Y = i * pitch, X = j * pitch and reaches half a pitch to either side, so
+that panel pixel coordinates follow the rule of docs/conventions.md. For a ray along the panel's normal its open part is
+centred on the same point; the opaque structure (traces, emitters) straddles the borders between neighbours.
+
+The opaque structure reaches from the panel plane (z = 0) to z = thickness on the viewer's side. A ray that crosses the
+panel plane at Y crosses z = thickness at Y + thickness * tan_y, and it must find both points in the same opening: the
+open interval of Y is the overlap of the opening with itself moved by -thickness * tan_y. Glass is thin compared with
+the distances involved; its refraction is left out.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+
+from udccal.simulation.truth import RigTruth
+
+
+def row_open_interval(
+    truth: RigTruth, tan_y: Float[np.ndarray, "*n"]
+) -> tuple[Float[np.ndarray, "*n"], Float[np.ndarray, "*n"]]:
+    """Where rays of slope ``tan_y`` = s_y / s_z pass the rows.
+
+    Returns:
+        (start, width) in fractions of a pitch: open for Y / pitch in [i + start, i + start + width], i an integer.
+        ``start`` lies near -row_open / 2; ``width`` is never negative.
+    """
+    return _open_interval(truth.panel.row_open, truth.panel.structure_thickness_mm / truth.panel.pitch_mm, tan_y)
+
+
+def column_open_interval(
+    truth: RigTruth, tan_x: Float[np.ndarray, "*n"]
+) -> tuple[Float[np.ndarray, "*n"], Float[np.ndarray, "*n"]]:
+    """Where rays of slope ``tan_x`` = s_x / s_z pass the columns; see ``row_open_interval``."""
+    return _open_interval(truth.panel.column_open, truth.panel.structure_thickness_mm / truth.panel.pitch_mm, tan_x)
+
+
+def pupil_footprint(
+    truth: RigTruth, directions: Float[np.ndarray, "*n 3"]
+) -> tuple[Float[np.ndarray, "*n 2"], Float[np.ndarray, "*n 2 2"]]:
+    """The entrance pupil projected onto the panel plane along ``directions`` (panel coordinates, s_z > 0).
+
+    Returns:
+        (centre, shape) in mm: the footprint is the ellipse ``centre + shape @ u`` over the unit disc of ``u``.
+    """
+    optics = truth.optics
+    slopes = directions[..., :2] / directions[..., 2:]
+    centre = optics.pupil_mm[:2] - optics.pupil_mm[2] * slopes
+    across = optics.R_panel_camera[:, :2] * (optics.pupil_diameter_mm / 2)
+    shape = across[:2] - slopes[..., :, None] * across[2]
+    return centre, shape
+
+
+def _open_interval(
+    fraction: float, thickness: float, slope: Float[np.ndarray, "*n"]
+) -> tuple[Float[np.ndarray, "*n"], Float[np.ndarray, "*n"]]:
+    shift = thickness * slope
+    start = -fraction / 2 - np.minimum(shift, 0.0)
+    return start, np.maximum(fraction - np.abs(shift), 0.0)
