@@ -70,7 +70,7 @@ class PanelPicture:
 class Photograph:
     """A scene in linear radiance on a plane parallel to the panel at ``distance_mm``, with the display lit or dark.
 
-    The picture's centre lies on the optical axis of the virtual view and ``width_mm`` wide; outside it is mirrored.
+    The picture is ``width_mm`` wide, its centre on the ray of the middle of the sensor; outside it is mirrored.
     """
 
     radiance: Float[np.ndarray, "rows columns 3"]

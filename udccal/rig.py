@@ -156,7 +156,8 @@ def find_rig(name_or_path: str | Path) -> Path:
         RigError: when no folder with a ``rig.toml`` is found.
     """
     path = Path(name_or_path)
-    places = [path] if path.parts[1:] or path.is_absolute() else [user_rig_folder() / path, shipped_rig_folder() / path, path]
+    by_name = [] if path.parts[1:] or path.is_absolute() else [user_rig_folder() / path, shipped_rig_folder() / path]
+    places = [*by_name, path]
     for place in places:
         if (place / "rig.toml").is_file():
             return place

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from types import TracebackType
-from typing import Protocol, Self, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import UInt16
@@ -73,7 +73,7 @@ class Camera(Protocol):
         """Bits per sample."""
         ...
 
-    def __enter__(self) -> Self: ...
+    def __enter__(self) -> Camera: ...
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None

@@ -27,6 +27,8 @@ def read_exr(path: Path) -> dict[str, Float32[np.ndarray, "rows columns"]]:
     try:
         names = _checked_channel_names(path)
         with OpenEXR.File(str(path), separate_channels=True) as file:
+            if not file.parts:  # the library warns and goes on when pixel data cannot be decoded
+                raise FileFormatError(_unreadable(path, "pixel data cut short or damaged"))
             channels = {name: _plane(file.channels(0)[name].pixels) for name in names}
     except (RuntimeError, ValueError, KeyError, TypeError, OSError) as error:
         raise FileFormatError(_unreadable(path, str(error))) from error

@@ -8,7 +8,8 @@ from __future__ import annotations
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
-from jaxtyping import ArrayLike as Arrayish
+
+from udccal.models.arrays import Arrayish
 
 
 class Geometry(eqx.Module):
@@ -123,9 +124,7 @@ def project_directions(geometry: Geometry, directions: Float[Arrayish, "*n 3"]) 
     return project(geometry, jnp.asarray(directions) @ rotation_matrix(geometry.rotation))
 
 
-def view_to_sensor(
-    geometry: Geometry, view: VirtualView, view_pixels: Float[Arrayish, "*n 2"]
-) -> Float[Array, "*n 2"]:
+def view_to_sensor(geometry: Geometry, view: VirtualView, view_pixels: Float[Arrayish, "*n 2"]) -> Float[Array, "*n 2"]:
     """Sensor pixel that each pixel of the virtual view looks at: virtual rotation and distortion in one map."""
     plane = (jnp.asarray(view_pixels) - jnp.asarray(view.centre)) / view.focal_px
     directions = jnp.concatenate([plane, jnp.ones_like(plane[..., :1])], axis=-1)

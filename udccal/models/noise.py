@@ -5,7 +5,8 @@ from __future__ import annotations
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
-from jaxtyping import ArrayLike as Arrayish
+
+from udccal.models.arrays import Arrayish
 
 
 class Noise(eqx.Module):

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from udccal.rig import RigDescription
 
 TermName = Literal["noise", "geometry", "wire", "psf", "backscatter"]
 Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
-RelativePath = Annotated[str, Field(pattern=r"^[A-Za-z0-9_\-]+(/[A-Za-z0-9_\-]+)*\.(png|exr)$", max_length=200)]
+RELATIVE_PATH = r"^[A-Za-z0-9_\-]+(/[A-Za-z0-9_\-]+)*\.(png|exr)$"
+RelativePath = Annotated[str, Field(pattern=RELATIVE_PATH, max_length=200)]
 
 
 class _Strict(BaseModel):
@@ -49,6 +51,17 @@ class StoredCapture(_Strict):
     first_timestamp_s: float
     last_timestamp_s: float
     rejected: tuple[Rejection, ...] = ()
+
+    @model_validator(mode="after")
+    def _kind_fits_file(self) -> StoredCapture:
+        suffix = ".png" if self.kind == "frame" else ".exr"
+        if not self.file.endswith(suffix):
+            raise ValueError(f"a capture of kind '{self.kind}' in a file ending in {suffix}")
+        if (self.kind == "frame") != (self.frames == 1):
+            raise ValueError("frames = 1 for a single frame, and at least 2 for an average")
+        if self.last_timestamp_s < self.first_timestamp_s:
+            raise ValueError("last_timestamp_s not before first_timestamp_s")
+        return self
 
 
 class DarkSubject(_Strict):
@@ -94,9 +107,7 @@ class PanelSubject(_Strict):
     role: Literal["white", "picture", "brightened"]
 
 
-Subject = Annotated[
-    DarkSubject | FlatSubject | LedSubject | BoardSubject | PanelSubject, Field(discriminator="kind")
-]
+Subject = Annotated[DarkSubject | FlatSubject | LedSubject | BoardSubject | PanelSubject, Field(discriminator="kind")]
 
 
 class StoredStep(_Strict):
@@ -107,6 +118,12 @@ class StoredStep(_Strict):
     subject: Subject
     completed_at: Annotated[str, Field(max_length=40)]
     captures: Annotated[tuple[StoredCapture, ...], Field(min_length=1, max_length=256)]
+
+    @model_validator(mode="after")
+    def _id_names_term(self) -> StoredStep:
+        if not self.id.startswith(f"{self.term}/"):
+            raise ValueError(f"an id that begins with '{self.term}/'")
+        return self
 
 
 class StoredCamera(_Strict):
@@ -127,3 +144,14 @@ class Manifest(_Strict):
     rig: RigDescription
     camera: StoredCamera
     steps: Annotated[tuple[StoredStep, ...], Field(max_length=20000)] = ()
+
+    @model_validator(mode="after")
+    def _steps_fit_together(self) -> Manifest:
+        repeated = [step for step, times in Counter(step.id for step in self.steps).items() if times > 1]
+        if repeated:
+            raise ValueError(f"each step once, not '{repeated[0]}' twice")
+        for step in self.steps:
+            for region in (capture.region for capture in step.captures):
+                if region.x + region.columns > self.rig.camera.columns or region.y + region.rows > self.rig.camera.rows:
+                    raise ValueError(f"regions inside the sensor, not as in step '{step.id}'")
+        return self

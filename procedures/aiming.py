@@ -1,0 +1,109 @@
+"""Where to hold things, from the nominal mounting alone: the numbers a person is told, which no fit ever reads."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+
+from udccal.arrangements import Board, BoardSpec
+from udccal.rig import RigDescription
+
+_PLASTIC = 1.32471795724474602596  # root of x^3 = x + 1
+
+
+def low_discrepancy(count: int, dimensions: int = 2) -> Float[np.ndarray, "count dimensions"]:
+    """Points that fill the unit cube evenly at any count: the R-sequence.
+
+    Source: M. Roberts, The unreasonable effectiveness of quasirandom sequences (2018).
+    """
+    growth = _PLASTIC if dimensions == 2 else _generalised_golden_ratio(dimensions)
+    steps = growth ** -np.arange(1.0, dimensions + 1)
+    return (0.5 + np.arange(1, count + 1)[:, None] * steps) % 1.0
+
+
+def nominal_rotation(rig: RigDescription) -> Float[np.ndarray, "3 3"]:
+    """Nominal R_panel_camera = Ry(yaw) Rx(-tilt) Rz(roll)."""
+    mounting = rig.mounting
+    yaw, tilt, roll = (np.deg2rad(item.value) for item in (mounting.yaw_deg, mounting.tilt_deg, mounting.roll_deg))
+    return _turn(1, yaw) @ _turn(0, -tilt) @ _turn(2, roll)
+
+
+def nominal_pupil_mm(rig: RigDescription) -> Float[np.ndarray, "3"]:
+    """Nominal place of the entrance pupil in panel coordinates."""
+    mounting, pitch = rig.mounting, rig.panel.pitch_mm.value
+    return np.array([mounting.panel_x_px.value * pitch, mounting.panel_y_px.value * pitch, -mounting.standoff_mm.value])
+
+
+def nominal_ray(rig: RigDescription, x_px: float, y_px: float) -> Float[np.ndarray, "3"]:
+    """Direction in panel coordinates in which a sensor pixel looks, of length 1 along the camera's axis."""
+    camera = rig.camera
+    across = (x_px - (camera.columns - 1) / 2) / rig.focal_px
+    down = (y_px - (camera.rows - 1) / 2) / rig.focal_px
+    return nominal_rotation(rig) @ np.array([across, down, 1.0])
+
+
+def nominal_pixels(rig: RigDescription, points_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
+    """Sensor pixels at which a perfect nominal camera sees points given in panel coordinates."""
+    rays = (points_mm - nominal_pupil_mm(rig)) @ nominal_rotation(rig)
+    centre = np.array([(rig.camera.columns - 1) / 2, (rig.camera.rows - 1) / 2])
+    return rays[:, :2] / rays[:, 2:] * rig.focal_px + centre
+
+
+def board_facing(
+    rig: RigDescription,
+    spec: BoardSpec,
+    pixel: tuple[float, float],
+    distance_mm: float,
+    lean_rad: tuple[float, float, float],
+) -> Board:
+    """A board whose centre is seen at ``pixel``, leaning by rotations about x, y, then z from facing the camera."""
+    lean = _turn(2, lean_rad[2]) @ _turn(1, lean_rad[1]) @ _turn(0, lean_rad[0])
+    return _placed(rig, spec, pixel, distance_mm, nominal_rotation(rig) @ lean, parallel=False)
+
+
+def board_parallel(rig: RigDescription, spec: BoardSpec, distance_mm: float) -> Board:
+    """A board parallel to the panel whose centre is seen in the middle of the sensor."""
+    middle = ((rig.camera.columns - 1) / 2, (rig.camera.rows - 1) / 2)
+    return _placed(rig, spec, middle, distance_mm, np.eye(3), parallel=True)
+
+
+def _placed(
+    rig: RigDescription,
+    spec: BoardSpec,
+    pixel: tuple[float, float],
+    distance_mm: float,
+    rotation: Float[np.ndarray, "3 3"],
+    parallel: bool,
+) -> Board:
+    centre = nominal_pupil_mm(rig) + distance_mm * nominal_ray(rig, *pixel)
+    half = np.array([spec.columns, spec.rows, 0.0]) * spec.square_mm / 2
+    x, y, z = (float(value) for value in centre - rotation @ half)
+    return Board(spec, _rotation_vector(rotation), (x, y, z), parallel_to_panel=parallel)
+
+
+def _generalised_golden_ratio(dimensions: int) -> float:
+    ratio = 2.0
+    for _ in range(60):
+        ratio = (1 + ratio) ** (1 / (dimensions + 1))
+    return ratio
+
+
+def _turn(axis: int, angle_rad: float) -> Float[np.ndarray, "3 3"]:
+    """Right-handed rotation about a coordinate axis."""
+    cosine, sine = np.cos(angle_rad), np.sin(angle_rad)
+    i, j = (axis + 1) % 3, (axis + 2) % 3
+    matrix = np.eye(3)
+    matrix[i, i] = matrix[j, j] = cosine
+    matrix[i, j], matrix[j, i] = -sine, sine
+    return matrix
+
+
+def _rotation_vector(rotation: Float[np.ndarray, "3 3"]) -> tuple[float, float, float]:
+    """Axis times angle in rad, for angles below 180 degrees."""
+    twice = np.array(
+        [rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]]
+    )
+    sine, cosine = np.linalg.norm(twice) / 2, (np.trace(rotation) - 1) / 2
+    angle = np.arctan2(sine, cosine)
+    x, y, z = (float(value) for value in (twice / 2 if sine < 1e-12 else twice / (2 * sine) * angle))
+    return x, y, z

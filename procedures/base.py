@@ -1,0 +1,185 @@
+"""Procedures, their steps, and the runner that carries them out on a bench, real or simulated."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import ClassVar, Literal, Protocol, final, runtime_checkable
+
+from procedures.capture import take
+from procedures.checks import Check
+from procedures.metering import Exposed, meter, trial_frame
+from procedures.plans import Exposure, Fixed, Metered, Plan, TimesThatOf
+from udccal.arrangements import Arrangement, Board, Dark, FlatLight, Led, PanelPicture
+from udccal.cameras.protocol import Camera, Region
+from udccal.displays.protocol import Display
+from udccal.errors import CaptureError
+from udccal.rig import RigDescription
+from udccal.sessions.schema import BoardSubject, DarkSubject, FlatSubject, LedSubject, Subject, TermName
+from udccal.sessions.writer import SessionWriter
+
+PictureRole = Literal["white", "picture", "brightened"]
+
+
+@dataclass(frozen=True)
+class Step:
+    """One thing to set up, look at, and capture.
+
+    Attributes:
+        id: ``term/name``, unique in a session.
+        instruction: what a person is to do, as a sentence.
+        role: of the picture on the panel, for steps that show one.
+    """
+
+    id: str
+    term: TermName
+    arrangement: Arrangement
+    instruction: str
+    check: Check
+    region: Region
+    exposure: Exposure
+    plan: Plan
+    role: PictureRole = "picture"
+
+
+@runtime_checkable
+class Stage(Protocol):
+    """Puts things in front of the camera: a simulated world, or a person who follows an instruction."""
+
+    def arrange(self, arrangement: Arrangement) -> None:
+        """Return once the arrangement stands."""
+        ...
+
+
+@dataclass(frozen=True)
+class Bench:
+    """What a procedure works with."""
+
+    camera: Camera
+    display: Display
+    stage: Stage
+
+
+@dataclass(frozen=True)
+class StepProgress:
+    """Said before a step begins, and once more (``step`` absent) when all are done."""
+
+    term: TermName
+    done: int
+    total: int
+    step: Step | None
+
+
+Progress = Callable[[StepProgress], None]
+
+
+class Procedure(ABC):
+    """What a technician captures for one term."""
+
+    term: ClassVar[TermName]
+
+    @abstractmethod
+    def steps(self, rig: RigDescription) -> Iterator[Step]:
+        """The steps in the order they are to be done; built one at a time."""
+
+    @final
+    def run(
+        self, camera: Camera, display: Display, stage: Stage, writer: SessionWriter, progress: Progress | None = None
+    ) -> None:
+        """Carry out the steps; what ``run_procedure`` does, for callers that know a procedure by entry point only."""
+        run_procedure(self, Bench(camera, display, stage), writer, progress)
+
+
+def run_procedure(procedure: Procedure, bench: Bench, writer: SessionWriter, progress: Progress | None = None) -> None:
+    """Carry out every step that the session does not hold yet, on a bench whose camera is open.
+
+    Raises:
+        CaptureError: when the camera does not fit the rig, or does not see what a step needs.
+        CameraError, SessionError: from the camera and the writer. Steps completed before stay in the session.
+    """
+    rig = writer.manifest.rig
+    _check_camera(bench.camera, rig)
+    total = sum(1 for _ in procedure.steps(rig))
+    last_exposure_s: float | None = None
+    for done, step in enumerate(procedure.steps(rig)):
+        if progress is not None:
+            progress(StepProgress(procedure.term, done, total, step))
+        if step.id not in writer.completed_ids:
+            last_exposure_s = _run_step(step, bench, writer, last_exposure_s)
+    if progress is not None:
+        progress(StepProgress(procedure.term, total, total, None))
+
+
+def _run_step(step: Step, bench: Bench, writer: SessionWriter, start_s: float | None) -> float:
+    """Carry out one step; returns its exposure, a good guess for the next."""
+    rig = writer.manifest.rig
+    arrangement = step.arrangement
+    if isinstance(arrangement, PanelPicture):
+        bench.display.show(arrangement.picture)
+    else:
+        bench.display.off()
+    bench.stage.arrange(arrangement)
+    try:
+        exposed = _expose(step, bench.camera, writer, start_s)
+        step.check(exposed.frame, rig)
+        captures = take(bench.camera, step.region, exposed.exposure_s, step.plan, rig)
+    except CaptureError as error:
+        raise CaptureError(f"Step {step.id}: {error}") from error
+    writer.add_step(step.id, step.term, _subject(step, writer), captures)
+    return exposed.exposure_s
+
+
+def _expose(step: Step, camera: Camera, writer: SessionWriter, start_s: float | None) -> Exposed:
+    rig = writer.manifest.rig
+    match step.exposure:
+        case Metered():
+            return meter(camera, step.region, step.exposure, rig, start_s)
+        case Fixed(exposure_s):
+            wanted = exposure_s
+        case TimesThatOf(step_id, factor):
+            earlier = writer.step(step_id)
+            if earlier is None:
+                raise CaptureError(f"Expected the step '{step_id}' before this one, found it not captured. Capture it.")
+            wanted = factor * earlier.captures[0].exposure_s
+    bounded = min(max(wanted, rig.camera.min_exposure_s), rig.camera.max_exposure_s)
+    frame = trial_frame(camera, step.region, bounded)
+    return Exposed(frame.settings.exposure_s, frame)
+
+
+def _subject(step: Step, writer: SessionWriter) -> Subject:
+    match step.arrangement:
+        case Dark():
+            return DarkSubject()
+        case FlatLight():
+            return FlatSubject()
+        case Led(x_px, y_px, distance_mm, diameter_mm):
+            return LedSubject(x_px=x_px, y_px=y_px, distance_mm=distance_mm, diameter_mm=diameter_mm)
+        case Board(spec, parallel_to_panel=parallel):
+            return BoardSubject(
+                columns=spec.columns,
+                rows=spec.rows,
+                square_mm=spec.square_mm,
+                marker_mm=spec.marker_mm,
+                dictionary=spec.dictionary,
+                parallel_to_panel=parallel,
+            )
+        case PanelPicture(picture):
+            return writer.store_picture(step.id, picture, step.role)
+    raise CaptureError(f"Expected an arrangement that calibrates a term, found another for the step '{step.id}'.")
+
+
+def _check_camera(camera: Camera, rig: RigDescription) -> None:
+    expected = (rig.camera.columns, rig.camera.rows, rig.camera.cfa, rig.camera.bits)
+    found = (camera.sensor.columns, camera.sensor.rows, camera.cfa, camera.bits)
+    if found != expected:
+        raise CaptureError(
+            f"Expected a camera of {expected[0]} x {expected[1]}, {expected[2]}, {expected[3]} bits as the rig "
+            f"'{rig.name}' says, found {found[0]} x {found[1]}, {found[2]}, {found[3]} bits. "
+            "Connect the right camera, or correct rig.toml."
+        )
+
+
+def whole_sensor(rig: RigDescription) -> Region:
+    """The whole sensor as a region."""
+    return Region(0, 0, rig.camera.columns, rig.camera.rows)

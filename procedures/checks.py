@@ -1,0 +1,137 @@
+"""What the camera must see before a step is captured; each check speaks to the person at the rig."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import cv2
+import numpy as np
+
+from procedures.metering import spot_light
+from udccal.arrangements import BoardSpec
+from udccal.cameras.protocol import Frame
+from udccal.errors import CaptureError
+from udccal.rig import RigDescription
+
+Check = Callable[[Frame, RigDescription], None]
+
+_STRAY_E = 60.0  # electrons above the nominal black level that a dark frame may show, beside the tolerances
+_UNEVEN = 0.15  # of the brightest: the darkest patch an even light may leave, vignetting included
+_FEWEST_CORNERS, _ENOUGH_CORNERS = 6, 12  # a quarter of the board, within these bounds
+_EDGE = 8
+
+
+def is_dark(frame: Frame, rig: RigDescription) -> None:
+    """No light reaches the sensor.
+
+    Raises:
+        CaptureError: when the frame is brighter than black level and dark current can make it.
+    """
+    camera = rig.camera
+    above_DN = float(np.median(frame.data)) - camera.black_DN.value - camera.black_DN.tolerance
+    # Half the sensor at 100 e-/s is more dark current than any camera within its specification shows.
+    allowed_e = _STRAY_E + 100.0 * frame.settings.exposure_s
+    if above_DN > allowed_e * camera.K_DN_per_e.value:
+        raise CaptureError(
+            f"Expected a dark frame, found it {above_DN:.0f} DN above the black level. "
+            "Cap the lens, switch the panel off and close the blackout, then repeat the step."
+        )
+
+
+def is_even(frame: Frame, rig: RigDescription) -> None:
+    """An even light fills the view.
+
+    Raises:
+        CaptureError: when a part of the view is much darker than the brightest.
+    """
+    light = _patches(frame) - rig.camera.black_DN.value
+    darkest, brightest = float(light.min()), float(light.max())
+    if darkest < _UNEVEN * brightest:
+        raise CaptureError(
+            f"Expected an even light over the whole view, found patches at {max(darkest, 0.0) / brightest:.0%} of the "
+            "brightest. Bring the LED panel closer and centre it, and take away what stands in front of it."
+        )
+
+
+def shows_led(frame: Frame, rig: RigDescription) -> None:
+    """One small light stands out of a dark region, not at its edge unless the region ends with the sensor.
+
+    Raises:
+        CaptureError: when the room is not dark, or the light lies outside the region.
+    """
+    region, light = frame.settings.region, spot_light(frame.data)
+    brightest = float(light.max())
+    if float(np.median(frame.data)) - rig.camera.black_DN.value > 0.5 * brightest:
+        raise CaptureError(
+            "Expected an LED in a dark room, found the surroundings nearly as bright. Darken the room, then repeat."
+        )
+    row, column = (int(index) for index in np.unravel_index(int(light.argmax()), light.shape))
+    inside = (
+        (region.x == 0 or column >= _EDGE)
+        and (region.y == 0 or row >= _EDGE)
+        and (region.x + region.columns == rig.camera.columns or column < region.columns - _EDGE)
+        and (region.y + region.rows == rig.camera.rows or row < region.rows - _EDGE)
+    )
+    if not inside:
+        raise CaptureError(
+            f"Expected the LED near the middle of the marked region, found it at its edge ({column}, {row}). "
+            "Move the LED to the mark, then repeat the step."
+        )
+
+
+def shows_board(spec: BoardSpec) -> Check:
+    """A check that a ChArUco board of this kind is found."""
+
+    def check(frame: Frame, rig: RigDescription) -> None:
+        """Find the board.
+
+        Raises:
+            CaptureError: when fewer than a quarter of its inner corners (6 to 12) are seen.
+        """
+        quarter = (spec.columns - 1) * (spec.rows - 1) // 4
+        needed = min(max(quarter, _FEWEST_CORNERS), _ENOUGH_CORNERS)
+        found = _corners_seen(frame, spec)
+        if found < needed:
+            raise CaptureError(
+                f"Expected to find at least {needed} corners of the {spec.columns} x {spec.rows} ChArUco board, "
+                f"found {found}. Hold the board as described, evenly lit and flat, then repeat the step."
+            )
+
+    return check
+
+
+def shows_panel_light(frame: Frame, rig: RigDescription) -> None:
+    """The white panel scatters light into the lens, and nothing else does.
+
+    Raises:
+        CaptureError: when nothing is seen; what else shines is for the dark frame to say.
+    """
+    light_DN = float(np.percentile(frame.data, 99.9)) - rig.camera.black_DN.value - rig.camera.black_DN.tolerance
+    if light_DN <= 0:
+        raise CaptureError(
+            "Expected to see light of the white panel, found none. Check that the panel shows the picture."
+        )
+
+
+def sees_anything(frame: Frame, rig: RigDescription) -> None:
+    """No condition: dark pictures on the panel may leave nothing to see."""
+
+
+def _patches(frame: Frame) -> np.ndarray:
+    """Means over about 16 x 16 patches of whole 2 x 2 cells: colour and noise average out."""
+    height, width = (2 * max(1, side // 32) for side in frame.data.shape)
+    down, across = frame.data.shape[0] // height, frame.data.shape[1] // width
+    whole = frame.data[: down * height, : across * width]
+    return whole.reshape(down, height, across, width).mean(axis=(1, 3))
+
+
+def _corners_seen(frame: Frame, spec: BoardSpec) -> int:
+    grey = cv2.blur(frame.data.astype(np.float32), (2, 2))  # every 2 x 2 holds each site of the pattern once
+    low, high = np.percentile(grey, (0.5, 99.5))
+    picture = np.clip((grey - low) / max(float(high - low), 1.0) * 255, 0, 255).astype(np.uint8)
+    if min(picture.shape) < 600:  # markers of few pixels are found more surely in a magnified picture
+        picture = cv2.resize(picture, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC)
+    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, spec.dictionary))
+    board = cv2.aruco.CharucoBoard((spec.columns, spec.rows), spec.square_mm, spec.marker_mm, dictionary)
+    corners = cv2.aruco.CharucoDetector(board).detectBoard(picture)[0]
+    return 0 if corners is None else len(corners)

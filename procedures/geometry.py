@@ -1,0 +1,87 @@
+"""Geometry: views of a ChArUco board in varied poses, and one of it on a jig parallel to the panel for the tilt."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import ClassVar, final
+
+import numpy as np
+
+from procedures.aiming import board_facing, board_parallel, low_discrepancy
+from procedures.base import Procedure, Step, whole_sensor
+from procedures.checks import shows_board
+from procedures.plans import Metered, Stack
+from udccal.arrangements import Board, BoardSpec
+from udccal.rig import RigDescription
+from udccal.sessions.schema import TermName
+
+_MOST_SQUARES, _FEWEST_SQUARES, _SQUARE_PX = 12, 5, 40.0
+_MARKER = 0.75  # of the square
+_SPAN_AT_MM, _SPAN = 850.0, 0.6  # at this distance the board spans this part of the view's width
+_NEAREST_MM, _FARTHEST_MM = 570.0, 1250.0
+_JIG_MM = 700.0
+_LEVEL = 0.75
+_FRAMES = 8
+_MOST_LEAN_RAD, _MOST_TURN_RAD = np.deg2rad(40.0), np.deg2rad(20.0)
+# Middle of the board as a fraction of the sensor: centre, corners, edges, over and over.
+_SPOTS = ((0.5, 0.5), (0.2, 0.2), (0.8, 0.8), (0.8, 0.2), (0.2, 0.8), (0.5, 0.2), (0.5, 0.8), (0.2, 0.5), (0.8, 0.5))
+
+
+@final
+class GeometryProcedure(Procedure):
+    """Poses are spread so that corners reach the edges of the field and the board leans every way."""
+
+    term: ClassVar[TermName] = "geometry"
+
+    def steps(self, rig: RigDescription) -> Iterator[Step]:
+        """The view on the jig, then the views held by hand."""
+        spec = board_spec(rig)
+        jig = board_parallel(rig, spec, _JIG_MM)
+        yield _view(rig, "geometry/panel", jig, "Put the board on the jig that holds it parallel to the display.")
+        for index, board in enumerate(board_poses(rig, spec)):
+            yield _view(rig, f"geometry/view_{index}", board, _describe(rig, board))
+
+
+def board_spec(rig: RigDescription) -> BoardSpec:
+    """A board of 12 x 9 squares (fewer where the camera has few pixels), in millimetres that suit its field of view."""
+    columns = int(np.clip(_SPAN * rig.camera.columns / _SQUARE_PX, _FEWEST_SQUARES, _MOST_SQUARES))
+    view_mm = _SPAN_AT_MM * rig.camera.columns / rig.focal_px
+    square = float(round(_SPAN * view_mm / columns))
+    return BoardSpec(columns, round(0.75 * columns), square, _MARKER * square)
+
+
+def board_poses(rig: RigDescription, spec: BoardSpec) -> Iterator[Board]:
+    """``captures.board_views`` poses."""
+    camera, count = rig.camera, rig.captures.board_views
+    for index, (near, lean_x, lean_y, turn) in enumerate(low_discrepancy(count, 4)):
+        across, down = _SPOTS[index % len(_SPOTS)]
+        reach = 1.0 - abs(across - 0.5) - abs(down - 0.5)  # boards at the corners are held nearer
+        distance = _NEAREST_MM + (_FARTHEST_MM - _NEAREST_MM) * float(near) * reach
+        lean = (
+            float((2 * lean_x - 1) * _MOST_LEAN_RAD),
+            float((2 * lean_y - 1) * _MOST_LEAN_RAD),
+            float((2 * turn - 1) * _MOST_TURN_RAD),
+        )
+        yield board_facing(rig, spec, (across * camera.columns, down * camera.rows), distance, lean)
+
+
+def _view(rig: RigDescription, step_id: str, board: Board, instruction: str) -> Step:
+    return Step(
+        id=step_id,
+        term="geometry",
+        arrangement=board,
+        instruction=instruction,
+        check=shows_board(board.spec),
+        region=whole_sensor(rig),
+        exposure=Metered(_LEVEL),
+        plan=Stack(_FRAMES),
+    )
+
+
+def _describe(rig: RigDescription, board: Board) -> str:
+    x, y, z = board.translation_mm
+    angles = ", ".join(f"{np.rad2deg(angle):.0f}" for angle in board.rotation_vector)
+    return (
+        f"Hold the board still, its top left corner {x:.0f} mm right of, {y:.0f} mm below and {z:.0f} mm in front of "
+        f"the display's top left corner, turned about ({angles}) degrees."
+    )

@@ -1,0 +1,131 @@
+"""Finding an exposure by a few test frames."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, UInt16
+
+from procedures.plans import Metered
+from udccal.cameras.protocol import Camera, Frame, Region, Settings
+from udccal.errors import CaptureError
+from udccal.rig import RigDescription
+
+_MOST_TEST_FRAMES = 16
+_CLIPPED = 0.88  # of the range: within the tolerances of full well and gain the true level may be unknown
+_BURIED = 0.02  # of the range: the true level is too uncertain to scale by
+_CLOSE = 0.05  # relative distance from the target that is good enough
+_ENOUGH = 0.25  # of the target, at the longest exposure
+
+Level = Callable[[UInt16[np.ndarray, "rows columns"], RigDescription], float]
+
+
+@dataclass(frozen=True)
+class Exposed:
+    """An exposure and the test frame that shows what it gives."""
+
+    exposure_s: float
+    frame: Frame
+
+
+def trial_frame(camera: Camera, region: Region, exposure_s: float) -> Frame:
+    """One complete frame at an exposure.
+
+    Raises:
+        CaptureError: when three in a row are incomplete.
+    """
+    camera.configure(Settings(exposure_s, 0.0, region))
+    for _ in range(3):
+        for frame in camera.frames(1):
+            if frame.complete:
+                return frame
+    raise CaptureError("Expected a complete test frame, found three incomplete ones. Check the camera's cable.")
+
+
+def meter(camera: Camera, region: Region, plan: Metered, rig: RigDescription, start_s: float | None = None) -> Exposed:
+    """Find the exposure at which the signal of what stands before the camera reaches the plan's target.
+
+    Args:
+        camera: gives the test frames.
+        region: part of the sensor to look at.
+        plan: which signal, and how far up the range from black to saturation.
+        rig: black level, bits and the limits of the exposure.
+        start_s: a guess, e.g. what a step before this one used.
+
+    Raises:
+        CaptureError: when the signal is clipped at the shortest exposure or buried at the longest.
+    """
+    shortest, longest = rig.camera.min_exposure_s, rig.camera.max_exposure_s
+    level_of = even_level if plan.signal == "even" else spot_level
+    exposure = min(max(start_s or 30 * shortest, shortest), longest)
+    for _ in range(_MOST_TEST_FRAMES):
+        frame = trial_frame(camera, region, float(exposure))
+        exposure = frame.settings.exposure_s
+        level = level_of(frame.data, rig)
+        if level > _CLIPPED:
+            wanted = exposure / 8
+        elif level < _BURIED:
+            wanted = exposure * 8
+        else:
+            wanted = exposure * plan.target / level
+        bounded = min(max(wanted, shortest), longest)
+        if abs(bounded / exposure - 1) < _CLOSE and level <= _CLIPPED:
+            _refuse_dark(level, plan, exposure)
+            return Exposed(exposure, frame)
+        if bounded == exposure:
+            raise CaptureError(
+                f"Expected a signal below saturation, found it clipped at the shortest exposure of {exposure:.3g} s. "
+                "Dim the light or stop the lens down, then repeat the step."
+            )
+        exposure = bounded
+    raise CaptureError(
+        f"Expected a steady light, found that {_MOST_TEST_FRAMES} test frames did not settle on an exposure. "
+        "Check that the light does not flicker or move, then repeat the step."
+    )
+
+
+def even_level(data: UInt16[np.ndarray, "rows columns"], rig: RigDescription) -> float:
+    """Level of the brightest channel of an even field, 0 at black and 1 at saturation: the 99.9th percentile."""
+    return _fraction(float(np.percentile(data, 99.9)), rig)
+
+
+def spot_level(data: UInt16[np.ndarray, "rows columns"], rig: RigDescription) -> float:
+    """Level of the brightest sample of a small light in a dark region, 0 at black and 1 at saturation."""
+    return _fraction(float(np.median(data)) + float(spot_light(data).max()), rig)
+
+
+def spot_light(data: UInt16[np.ndarray, "rows columns"]) -> Float[np.ndarray, "rows columns"]:
+    """Samples above their surroundings in DN, hot pixels held down.
+
+    A hot pixel stands alone while a light spreads: a sample counts at most ten times as much as its brightest
+    neighbour.
+    """
+    above = np.maximum(data - float(np.median(data)), 0.0)
+    brightest_near = np.zeros_like(above)
+    for dy in (-1, 0, 1):
+        for dx in (-1, 0, 1):
+            if dx or dy:
+                np.maximum(brightest_near, np.roll(above, (dy, dx), axis=(0, 1)), out=brightest_near)
+    return np.minimum(above, 10.0 * brightest_near)
+
+
+def _refuse_dark(level: float, plan: Metered, exposure_s: float) -> None:
+    if level < _ENOUGH * plan.target:
+        what = "light" if plan.signal == "even" else "LED"
+        raise CaptureError(
+            f"Expected to see the {what}, found only {max(level, 0.0):.1%} of the range at the longest exposure of "
+            f"{exposure_s:.3g} s. Check that it is switched on and inside the camera's view, then repeat the step."
+        )
+
+
+def saturation_DN(rig: RigDescription) -> float:
+    """Nominal level at which a sample clips: the converter's end or the full well, whichever comes first."""
+    camera = rig.camera
+    return min(float(rig.saturation_DN), camera.black_DN.value + camera.K_DN_per_e.value * camera.full_well_e.value)
+
+
+def _fraction(level_DN: float, rig: RigDescription) -> float:
+    black = rig.camera.black_DN.value
+    return (level_DN - black) / (saturation_DN(rig) - black)

@@ -1,0 +1,97 @@
+"""Verbs one after the other on a toy rig of which only the noise is captured: the other terms are absent."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.toy_rigs import write_toy_rig
+from udccal.io.exr import read_rgb_exr
+from udccal.io.png import read_png16, read_rgb8, write_png16
+
+PORTRAIT = Path(__file__).resolve().parents[2] / "udccal" / "data" / "portrait.jpg"
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
+
+
+def udccal(*words: str | Path) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "udccal.cli.main", *map(str, words), "--json"]
+    return subprocess.run(command, capture_output=True, text=True, timeout=800)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a toy rig, its session and its profile."""
+    folder = tmp_path_factory.mktemp("verbs")
+    rig = write_toy_rig(folder)
+    done = udccal(
+        "calibrate", "--rig", rig, "--session", folder / "session", "--profile", folder / "profile", "--term", "noise"
+    )
+    assert done.returncode == 0, done.stderr
+    status = {term["term"]: term["status"] for term in json.loads(done.stdout)["terms"]}
+    assert status.pop("noise") == "CONVERGED"
+    assert set(status.values()) == {"ABSENT"}
+    assert (folder / "profile-report.html").is_file()
+    return folder
+
+
+@pytest.fixture(scope="module")
+def mosaic(folder: Path) -> tuple[Path, float]:
+    """A simulated frame of the toy rig, and its exposure."""
+    done = udccal("simulate", PORTRAIT, "--rig", folder / "toy", "--out", folder / "simulated")
+    assert done.returncode == 0, done.stderr
+    (made,) = json.loads(done.stdout)["files"]
+    assert read_rgb8(Path(made["ideal"])).shape == (68, 120, 3)
+    assert read_rgb8(Path(made["preview"])).shape == (48, 64, 3)
+    return Path(made["mosaic"]), made["exposure_s"]
+
+
+def test_restore_writes_display_and_linear_pictures(folder: Path, mosaic: tuple[Path, float]) -> None:
+    path, exposure_s = mosaic
+    words = ["restore", path, "--profile", folder / "profile", "--out", folder / "out", "--exposure-s", str(exposure_s)]
+    for kind in ("png", "exr"):
+        done = udccal(*words, "--format", kind)
+        assert done.returncode == 0, done.stderr
+    shown = read_rgb8(folder / "out" / f"{path.stem}.png")
+    linear = read_rgb_exr(folder / "out" / f"{path.stem}.exr")
+    assert shown.shape == linear.shape == (68, 120, 3)
+    assert shown.std() > 20
+    assert linear.mean() > 1e4  # e-/s
+
+
+def test_frames_that_do_not_fit_are_refused(folder: Path, mosaic: tuple[Path, float]) -> None:
+    path, exposure_s = mosaic
+    small, bright = folder / "small.png", folder / "bright.png"
+    write_png16(small, read_png16(path)[::2, ::2].copy())
+    write_png16(bright, np.full((96, 128), 5000, np.uint16))
+    common = ["--profile", folder / "profile", "--out", folder / "refused"]
+    for words, said in (
+        ([small, "--exposure-s", str(exposure_s)], "128 x 96"),
+        ([bright, "--exposure-s", str(exposure_s)], "4095"),
+        ([path], "--exposure-s"),
+        ([path, small, "--exposure-s", str(exposure_s)], "128 x 96"),
+    ):
+        done = udccal("restore", *words, *common)
+        assert done.returncode == 1
+        assert said in json.loads(done.stdout)["error"]
+        assert not (folder / "refused").exists()
+
+
+def test_profile_show_lists_what_was_measured(folder: Path) -> None:
+    done = udccal("profile", "show", folder / "profile")
+    shown = json.loads(done.stdout)
+    assert shown["rig"] == "toy"
+    assert "K_DN_per_e" in {estimate["name"] for estimate in shown["estimates"]}
+
+
+def test_a_damaged_session_leaves_the_profile_as_it_was(folder: Path) -> None:
+    before = (folder / "profile" / "profile.json").read_bytes()
+    (folder / "session" / "noise" / "flat_0_0.png").write_bytes(b"broken")
+    done = udccal("fit", folder / "session", "--profile", folder / "profile")
+    assert done.returncode == 1
+    assert "SHA-256" in json.loads(done.stdout)["error"]
+    assert (folder / "profile" / "profile.json").read_bytes() == before

@@ -1,0 +1,75 @@
+"""Every example runs, at toy size."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from tests.toy_rigs import write_toy_rig
+from udccal.io.exr import write_rgb_exr
+from udccal.io.png import read_rgb8, write_rgb8
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def run(*words: str | Path) -> str:
+    done = subprocess.run([sys.executable, *map(str, words)], capture_output=True, text=True, timeout=280, cwd=ROOT)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def toy_rig(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_toy_rig(tmp_path_factory.mktemp("rig"))
+
+
+@pytest.fixture(scope="module")
+def toy_data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder laid out as the shared pictures are, with one small picture of each kind."""
+    folder = tmp_path_factory.mktemp("data")
+    for kind in ("hdr", "photos", "environments"):
+        (folder / kind).mkdir()
+    portrait = read_portrait()
+    write_rgb_exr(folder / "hdr" / "scene.exr", portrait.astype("float32"))
+    write_rgb8(folder / "photos" / "scene.png", portrait)
+    for name in ("lobby", "park"):
+        assert cv2.imwrite(str(folder / "environments" / f"{name}.hdr"), portrait[::2, ::2].astype("float32"))
+    return folder
+
+
+def read_portrait() -> np.ndarray:
+    picture = cv2.imread(str(ROOT / "udccal" / "data" / "portrait.jpg"))
+    return cv2.resize(picture, (96, 64))[..., ::-1].copy()
+
+
+def test_fit_api_prints_the_noise_term() -> None:
+    said = run("examples/fit_api.py")
+    assert "CONVERGED" in said
+    assert "K_DN_per_e" in said
+
+
+def test_read_dng(shared_data: Path, tmp_path: Path) -> None:
+    preview = tmp_path / "preview.png"
+    said = run("examples/read_dng.py", shared_data / "raw" / "colorchart.dng", "--out", preview)
+    assert "black 2056 DN" in said
+    assert read_rgb8(preview).shape == (578, 867, 3)
+
+
+def test_boards_intrinsics(shared_data: Path) -> None:
+    assert "rms" in run("examples/boards_intrinsics.py", "--data", shared_data)
+
+
+@pytest.mark.slow
+def test_restore_shared_scenes(toy_rig: Path, toy_data: Path, tmp_path: Path) -> None:
+    profile = tmp_path / "profile"
+    calibrate = ["-m", "udccal.cli.main", "calibrate", "--rig", toy_rig, "--term", "noise"]
+    run(*calibrate, "--session", tmp_path / "session", "--profile", profile)
+    scenes = ["--data", toy_data, "--rig", toy_rig, "--size", "64", "--out", tmp_path / "out"]
+    said = run("examples/restore_shared_scenes.py", "--profile", profile, *scenes)
+    assert "mean gain" in said
+    assert len(list((tmp_path / "out").glob("*.png"))) == 4

@@ -1,0 +1,220 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from tests.simulation.toy import toy_rig, toy_truth
+from udccal.cameras.protocol import CameraIdentity, Region, Settings
+from udccal.cfa import channel_map
+from udccal.displays.pictures import face_picture
+from udccal.fitting.absent import absent_wire
+from udccal.fitting.backscatter import fit_backscatter, fit_shots
+from udccal.fitting.backscatter_data import Binned, PanelShots, bin_rate, grid_step, visible_crop
+from udccal.fitting.noise import nominal_noise
+from udccal.fitting.nominal import nominal_geometry, rotation_vector
+from udccal.fitting.result import FitResult, FitStatus
+from udccal.models.backscatter import Backscatter, backscatter_rate
+from udccal.models.geometry import Geometry
+from udccal.rig import RigDescription, load_rig
+from udccal.sessions.averaging import AveragedFrames
+from udccal.sessions.schema import DarkSubject
+from udccal.sessions.store import Session
+from udccal.sessions.writer import SessionWriter
+from udccal.simulation.backscatter import backscatterer
+
+EXPOSURE_S = 0.05
+FRAMES = 8
+
+
+def wide_rig() -> RigDescription:
+    """The toy with big pixels: as much of the panel is seen as at full size."""
+    rig = toy_rig()
+    return rig.model_copy(update={"camera": rig.camera.model_copy(update={"pitch_um": 55.2})})
+
+
+def wide_truth():  # type: ignore[no-untyped-def]
+    truth = toy_truth()
+    fx_px, fy_px = truth.optics.fx_px / 8, truth.optics.fy_px / 8
+    optics = replace(truth.optics, fx_px=fx_px, fy_px=fy_px, distortion=(-0.07, 0.03, 0.0, 0.0, 0.0))
+    return replace(truth, description=wide_rig(), optics=optics)
+
+
+TRUTH = wide_truth()
+RIG = wide_rig()
+
+
+def known_geometry() -> Geometry:
+    """What a geometry fit would know: all but the pupil's place, which is nominal."""
+    optics = TRUTH.optics
+    return Geometry(
+        focal=np.array([optics.fx_px, optics.fy_px]),
+        centre=np.array([optics.cx_px, optics.cy_px]),
+        distortion=np.array(optics.distortion),
+        rotation=rotation_vector(optics.R_panel_camera),
+        pupil=nominal_geometry(RIG).pupil,
+    )
+
+
+def picture(seed: int) -> np.ndarray:
+    return face_picture(seed, RIG.panel.columns, RIG.panel.rows)
+
+
+WHITE = np.full((RIG.panel.rows, RIG.panel.columns, 3), 255, np.uint8)
+SHOWN = [picture(seed) for seed in range(10)]
+
+
+def noisy(rate: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    variance = (rate * EXPOSURE_S + 25.0) / FRAMES / EXPOSURE_S**2
+    return rate + rng.normal(size=rate.shape) * np.sqrt(variance), variance
+
+
+@pytest.fixture(scope="module")
+def simulator():  # type: ignore[no-untyped-def]
+    return backscatterer(TRUTH)
+
+
+@pytest.fixture(scope="module")
+def shots(simulator) -> PanelShots:  # type: ignore[no-untyped-def]
+    rng = np.random.default_rng(1)
+    crop = visible_crop(known_geometry(), RIG)
+
+    def binned(shown: np.ndarray) -> Binned:
+        rate, variance = noisy(simulator.rate(shown), rng)
+        return bin_rate(rate, variance, 0.0, RIG.camera.cfa, grid_step(RIG))
+
+    return PanelShots(
+        binned(WHITE), tuple(binned(one) for one in SHOWN), np.stack([crop.of(one) for one in SHOWN]), crop
+    )
+
+
+@pytest.fixture(scope="module")
+def fitted(shots: PanelShots) -> FitResult[Backscatter]:
+    return fit_shots(shots, known_geometry(), RIG, positions=60)
+
+
+def rate(term: Backscatter, shown: np.ndarray) -> np.ndarray:
+    with jax.enable_x64(True):
+        return np.asarray(backscatter_rate(term, shown))
+
+
+def error_of_peak(term: Backscatter, shown: np.ndarray, simulator) -> float:  # type: ignore[no-untyped-def]
+    truth = simulator.rate(shown)
+    return float(np.sqrt(np.mean((rate(term, shown) - truth) ** 2)) / truth.max())
+
+
+def test_pictures_not_in_the_fit_are_predicted(fitted: FitResult[Backscatter], simulator) -> None:  # type: ignore[no-untyped-def]
+    assert fitted.status is FitStatus.CONVERGED
+    for seed in (100, 101):
+        assert error_of_peak(fitted.term, picture(seed), simulator) < 0.02
+    assert error_of_peak(fitted.term, WHITE, simulator) < 0.02
+
+
+def test_a_shifted_picture_does_not_pass(fitted: FitResult[Backscatter], simulator) -> None:  # type: ignore[no-untyped-def]
+    shifted = np.roll(picture(100), 2, axis=1)
+    truth = simulator.rate(picture(100))
+    error = np.sqrt(np.mean((rate(fitted.term, shifted) - truth) ** 2)) / truth.max()
+    assert error > 0.02
+
+
+def test_what_the_simulator_was_built_with_is_found(fitted: FitResult[Backscatter]) -> None:
+    assert fitted.estimate("gamma").value == pytest.approx(TRUTH.panel.gamma, abs=0.01)
+    assert fitted.estimate("distance_mm").value == pytest.approx(-TRUTH.optics.pupil_mm[2], abs=0.3)
+    nominal_px = known_geometry().pupil[0] / RIG.panel.pitch_mm.value
+    offset = nominal_px - TRUTH.optics.pupil_mm[0] / TRUTH.panel.pitch_mm
+    assert fitted.term.emitters_px[1, 0] == pytest.approx(offset, abs=0.2)
+    np.testing.assert_allclose(np.asarray(fitted.term.mix).sum(axis=1), 1.0, atol=1e-12)
+    assert all(e.sigma >= 0 for e in fitted.estimates)
+
+
+def test_candidates_compete_on_held_out_pictures(fitted: FitResult[Backscatter]) -> None:
+    assert sum(c.chosen for c in fitted.candidates) == 1
+    chosen = next(c for c in fitted.candidates if c.chosen)
+    assert chosen.criterion <= 1.05 * min(c.criterion for c in fitted.candidates)
+    held_out = next(d for d in fitted.diagnostics if d.name == "held_out_rms_of_peak")
+    assert held_out.value == chosen.criterion < 0.02
+
+
+def test_a_clipped_white_is_saturated(shots: PanelShots) -> None:
+    result = fit_shots(replace(shots, white=replace(shots.white, clipped=0.3)), known_geometry(), RIG)
+    assert result.status is FitStatus.SATURATED
+    assert rate(result.term, WHITE).max() == 0.0
+
+
+def test_a_black_panel_is_absent(shots: PanelShots) -> None:
+    dark = replace(shots.white, rate=np.random.default_rng(0).normal(size=shots.white.rate.shape))
+    dark = replace(dark, variance=np.ones_like(dark.rate))
+    result = fit_shots(replace(shots, white=dark), known_geometry(), RIG)
+    assert result.status is FitStatus.ABSENT
+    assert result.ok
+    assert rate(result.term, WHITE).max() == 0.0
+
+
+def test_few_pictures_are_too_few(shots: PanelShots) -> None:
+    few = replace(shots, seen=shots.seen[:3], shown=shots.shown[:3])
+    assert fit_shots(few, known_geometry(), RIG).status is FitStatus.TOO_FEW_DATA
+    clipped = tuple(replace(one, clipped=0.5) for one in shots.seen)
+    assert "clipped" in fit_shots(replace(shots, seen=clipped), known_geometry(), RIG).notes[0]
+
+
+@pytest.mark.slow
+def test_pictures_in_the_wrong_order_are_a_poor_fit(shots: PanelShots) -> None:
+    result = fit_shots(replace(shots, shown=shots.shown[::-1].copy()), known_geometry(), RIG, positions=60)
+    assert not result.ok
+
+
+def test_bins_are_means_of_one_colour() -> None:
+    rows, columns, step = 24, 32, 4
+    channels = channel_map("GBRG", rows, columns)
+    mosaic = np.array([10.0, 20.0, 30.0])[channels]
+    binned = bin_rate(mosaic, np.ones_like(mosaic), 0.0, "GBRG", step)
+    np.testing.assert_allclose(binned.rate, np.broadcast_to([[[10.0]], [[20.0]], [[30.0]]], (3, 6, 8)))
+    np.testing.assert_allclose(binned.variance[:, 0, 0], [1 / 4, 1 / 8, 1 / 4])
+
+
+@pytest.mark.parametrize("name", ["lg55-aca2040", "lg55-reduced", "mk31-imx1600"])
+def test_the_grid_covers_the_sensor_and_resolves_the_ripple(name: str) -> None:
+    rig = load_rig(name)
+    step = grid_step(rig)
+    period = rig.panel.pitch_mm.value / rig.mounting.standoff_mm.value * rig.focal_px
+    assert step % 2 == 0
+    assert step <= max(4, period / 6)
+    assert rig.camera.columns % step < 4
+    assert rig.camera.rows % step < 4
+
+
+@pytest.mark.slow
+def test_a_session(simulator, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+    noise = nominal_noise(RIG)
+    writer = SessionWriter.create(tmp_path / "s", RIG, CameraIdentity("a", "b", "c", "test"))
+    rng = np.random.default_rng(4)
+
+    def average(rate_e: np.ndarray) -> AveragedFrames:
+        value, variance = noisy(rate_e, rng)
+        gain = float(noise.K_DN_per_e)
+        mean = float(noise.black_DN) + gain * EXPOSURE_S * value
+        settings = Settings(EXPOSURE_S, 0.0, Region(0, 0, RIG.camera.columns, RIG.camera.rows))
+        single = variance * FRAMES * (gain * EXPOSURE_S) ** 2
+        return AveragedFrames(mean.astype(np.float32), single.astype(np.float32), FRAMES, settings, 0.0, 1.0)
+
+    dark = np.zeros((RIG.camera.rows, RIG.camera.columns))
+    writer.add_step("backscatter/dark", "backscatter", DarkSubject(), [average(dark)])
+    for index, shown in enumerate([WHITE, *SHOWN]):
+        name = "backscatter/white" if index == 0 else f"backscatter/picture_{index - 1}"
+        subject = writer.store_picture(name, shown, "white" if index == 0 else "picture")
+        writer.add_step(name, "backscatter", subject, [average(simulator.rate(shown))])
+    session = Session.open(tmp_path / "s")
+    result = fit_backscatter(session, noise, known_geometry(), absent_wire(RIG, known_geometry()), positions=60)
+    assert result.status is FitStatus.CONVERGED
+    assert error_of_peak(result.term, picture(100), simulator) < 0.02
+
+
+def test_a_session_without_white_is_too_few_data(tmp_path: Path) -> None:
+    SessionWriter.create(tmp_path / "s", RIG, CameraIdentity("a", "b", "c", "test"))
+    geometry = known_geometry()
+    result = fit_backscatter(Session.open(tmp_path / "s"), nominal_noise(RIG), geometry, absent_wire(RIG, geometry))
+    assert result.status is FitStatus.TOO_FEW_DATA
+    assert "backscatter/white" in result.notes[0]

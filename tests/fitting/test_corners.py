@@ -1,0 +1,96 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.ndimage import convolve1d
+
+from tests.fitting.boards import SIZE, SPEC, draw, pose, true_corners
+from udccal.arrangements import BoardSpec
+from udccal.errors import FitError
+from udccal.fitting.corners import board_points_mm, charuco_board, detect_corners, luminance
+
+GAINS = np.array([[0.6, 1.0], [1.0, 0.7]])
+
+
+@pytest.fixture(scope="module")
+def view() -> tuple[np.ndarray, np.ndarray]:
+    matrix, translation = pose((0.2, -0.25, 0.1), (5.0, -3.0, 330.0))
+    return draw(matrix, translation), true_corners(matrix, translation)
+
+
+def mosaic(picture: np.ndarray, noise: float = 0.0) -> np.ndarray:
+    gains = np.tile(GAINS, (SIZE[1] // 2, SIZE[0] // 2))
+    return 3000 * picture * gains + noise * np.random.default_rng(0).normal(size=picture.shape)
+
+
+def streaked(picture: np.ndarray) -> np.ndarray:
+    """A core and side orders up and down, as slits give."""
+    kernel = np.zeros(31)
+    kernel[15], kernel[[5, 10, 20, 25]] = 0.7, [0.05, 0.1, 0.1, 0.05]
+    return convolve1d(picture, kernel, axis=0, mode="nearest")
+
+
+def test_a_moved_picture_moves_the_luminance_by_as_much() -> None:
+    """Also by an odd number of pixels, which exchanges the sites of the pattern."""
+    y, x = np.mgrid[0:40, 0:40]
+    for shift in (0, 1):
+        blob = np.exp(-((x - 20 - shift) ** 2 + (y - 17) ** 2) / 18.0)
+        grey = luminance(1000 * blob * np.tile(GAINS, (20, 20)))
+        assert (grey * x).sum() / grey.sum() == pytest.approx(20 + shift, abs=0.02)
+        assert (grey * y).sum() / grey.sum() == pytest.approx(17, abs=0.02)
+
+
+def test_an_even_picture_has_no_pattern_left() -> None:
+    grey = luminance(np.tile(GAINS, (20, 20)))
+    assert np.ptp(grey) < 1e-12
+
+
+def test_corners_are_found_where_they_are(view: tuple[np.ndarray, np.ndarray]) -> None:
+    picture, truth = view
+    found = detect_corners(luminance(mosaic(picture, noise=12.0)), SPEC)
+    assert len(found.ids) >= 20
+    error = found.xy - truth[found.ids]
+    assert np.abs(error.mean(axis=0)).max() < 0.01
+    assert np.sqrt((error**2).mean()) < 0.03
+    assert found.sigma.max() < 0.3
+
+
+def test_streaks_along_the_rows_normal_do_not_move_corners(view: tuple[np.ndarray, np.ndarray]) -> None:
+    picture, truth = view
+    found = detect_corners(luminance(mosaic(streaked(picture), noise=12.0)), SPEC)
+    assert len(found.ids) >= 15
+    error = found.xy - truth[found.ids]
+    assert np.abs(np.median(error, axis=0)).max() < 0.03
+    assert np.sqrt((error**2).mean()) < 0.12
+
+
+def test_a_picture_shifted_by_half_a_pixel_does_not_pass(view: tuple[np.ndarray, np.ndarray]) -> None:
+    picture, truth = view
+    half = (picture + np.roll(picture, 1, axis=1)) / 2
+    found = detect_corners(luminance(mosaic(half)), SPEC)
+    assert (found.xy - truth[found.ids]).mean(axis=0)[0] == pytest.approx(0.5, abs=0.02)
+
+
+def test_no_board_gives_no_corners() -> None:
+    noise = np.random.default_rng(0).uniform(0, 100, SIZE[::-1])
+    found = detect_corners(noise, SPEC)
+    assert len(found.ids) == 0
+    assert found.xy.shape == (0, 2)
+    assert len(detect_corners(np.zeros(SIZE[::-1]), SPEC).ids) == 0
+
+
+def test_another_dictionary_is_not_this_board(view: tuple[np.ndarray, np.ndarray]) -> None:
+    other = BoardSpec(SPEC.columns, SPEC.rows, SPEC.square_mm, SPEC.marker_mm, "DICT_4X4_50")
+    assert len(detect_corners(luminance(mosaic(view[0])), other).ids) == 0
+
+
+def test_an_unknown_dictionary_is_refused() -> None:
+    with pytest.raises(FitError, match="dictionary"):
+        charuco_board(BoardSpec(7, 5, 40.0, 30.0, "imread"))
+
+
+def test_corner_numbers_run_along_rows() -> None:
+    points = board_points_mm(SPEC)
+    np.testing.assert_allclose(points[0], [40.0, 40.0, 0.0])
+    np.testing.assert_allclose(points[1], [80.0, 40.0, 0.0])
+    assert len(points) == (SPEC.columns - 1) * (SPEC.rows - 1)

@@ -1,0 +1,183 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from tests.fitting.boards import CAMERA, SIZE, SPEC, draw, pose, true_corners
+from udccal.cameras.protocol import CameraIdentity, Region, Settings
+from udccal.errors import FitError
+from udccal.fitting.bundle import CalibratedViews, calibrate_views
+from udccal.fitting.corners import BoardCorners, board_points_mm
+from udccal.fitting.geometry import BoardView, fit_geometry, fit_views, projection_sigma_px
+from udccal.fitting.noise import nominal_noise
+from udccal.fitting.nominal import nominal_geometry
+from udccal.fitting.result import FitResult, FitStatus
+from udccal.models.geometry import Geometry, mounting_rotation, project_directions, rotation_matrix
+from udccal.rig import load_rig
+from udccal.sessions.averaging import AveragedFrames
+from udccal.sessions.schema import BoardSubject
+from udccal.sessions.store import Session
+from udccal.sessions.writer import SessionWriter
+
+TILT_DEG, ROLL_DEG, YAW_DEG = 17.0, 0.6, -0.4
+NOISE_PX = 0.02
+START = Geometry(
+    focal=np.array([295.0, 295.0]),
+    centre=np.array([159.5, 119.5]),
+    distortion=np.zeros(5),
+    rotation=np.zeros(3),
+    pupil=np.array([500.0, 100.0, -14.0]),
+)
+
+
+def mounting() -> np.ndarray:
+    with jax.enable_x64(True):
+        return np.asarray(mounting_rotation(*np.deg2rad(np.array([TILT_DEG, ROLL_DEG, YAW_DEG]))))
+
+
+def poses() -> list[tuple[np.ndarray, np.ndarray]]:
+    """The first is parallel to the panel: board axes are panel axes."""
+    middle = np.array([SPEC.columns, SPEC.rows, 0]) * SPEC.square_mm / 2
+    parallel = mounting().T
+    views = [(parallel, np.array([0.0, 0.0, 420.0]) - parallel @ middle)]
+    rng = np.random.default_rng(3)
+    for place in ((0, 0), (-70, -50), (70, 50), (70, -50), (-70, 50), (0, -50), (-70, 0), (60, 0)):
+        lean = tuple(rng.uniform(-0.5, 0.5, 3))
+        views.append(pose(lean, (place[0], place[1], float(rng.uniform(330, 420)))))
+    return views
+
+
+def views(noise_px: float = NOISE_PX) -> list[BoardView]:
+    rng = np.random.default_rng(5)
+    found = []
+    for index, (matrix, translation) in enumerate(poses()):
+        xy = true_corners(matrix, translation)
+        xy = xy + noise_px * rng.normal(size=xy.shape)
+        corners = BoardCorners(np.arange(len(xy)), xy, np.full(len(xy), noise_px))
+        found.append(BoardView(f"geometry/view_{index}", SPEC, index == 0, corners, 0.0))
+    return found
+
+
+def without_corners(view: BoardView) -> BoardView:
+    return replace(view, corners=BoardCorners(np.zeros(0, dtype=np.int64), np.zeros((0, 2)), np.zeros(0)))
+
+
+@pytest.fixture(scope="module")
+def fitted() -> FitResult[Geometry]:
+    """With one corner read as its neighbour's."""
+    found = views()
+    found[2].corners.xy[7] += 3.0
+    return fit_views(found, START, SIZE)
+
+
+def test_intrinsics_and_tilt_are_found(fitted: FitResult[Geometry]) -> None:
+    assert fitted.status is FitStatus.CONVERGED
+    truth = {"fx": 300.0, "fy": 300.4, "cx": 161.0, "cy": 118.0, "k1": -0.08, "p1": 4e-4, "p2": -3e-4}
+    for name, value in (truth | {"tilt_deg": TILT_DEG, "roll_deg": ROLL_DEG, "yaw_deg": YAW_DEG}).items():
+        estimate = fitted.estimate(name)
+        assert estimate.sigma > 0
+        assert abs(estimate.value - value) < 5 * estimate.sigma, name
+    assert abs(fitted.estimate("tilt_deg").value - TILT_DEG) < 0.05
+
+
+def test_rays_land_where_they_should(fitted: FitResult[Geometry]) -> None:
+    truth = Geometry(CAMERA.focal, CAMERA.centre, CAMERA.distortion, fitted.term.rotation, CAMERA.pupil)
+    x, y = np.meshgrid(np.linspace(0, SIZE[0] - 1, 9), np.linspace(0, SIZE[1] - 1, 7))
+    pixels = np.stack([x.ravel(), y.ravel()], axis=1)
+    with jax.enable_x64(True):
+        ideal = np.asarray(rotation_matrix(fitted.term.rotation)).T @ mounting()
+        assert np.rad2deg(np.abs(ideal - np.eye(3)).max()) < 0.05
+        directions = np.random.default_rng(0).uniform([-0.4, 0.0, 1.0], [0.4, 0.6, 1.0], (60, 3))
+        error = np.asarray(project_directions(fitted.term, directions)) - np.asarray(
+            project_directions(truth, directions)
+        )
+    assert np.percentile(np.linalg.norm(error, axis=1), 95) < 0.15
+    sigma = projection_sigma_px(fitted, pixels)
+    assert sigma.shape == pixels.shape
+    assert 0 < np.median(sigma) < 0.15
+
+
+def test_the_outlier_is_left_out_and_named(fitted: FitResult[Geometry]) -> None:
+    assert any("geometry/view_2" in note and " 7 " in f" {note} ".replace(",", " ") for note in fitted.notes)
+    rejected = next(d.value for d in fitted.diagnostics if d.name == "corners_rejected")
+    assert 1 <= rejected <= 3
+
+
+def test_the_order_of_the_distortion_is_chosen_by_bic(fitted: FitResult[Geometry]) -> None:
+    chosen = [c for c in fitted.candidates if c.chosen]
+    assert len(fitted.candidates) == 5
+    assert chosen == [min(fitted.candidates, key=lambda c: c.criterion)]
+    assert "p1" in chosen[0].name
+
+
+def test_boards_never_found_are_too_few_data() -> None:
+    result = fit_views([without_corners(view) for view in views()], START, SIZE)
+    assert result.status is FitStatus.TOO_FEW_DATA
+    assert "geometry/view_0" in result.notes[0]
+    assert result.term is START
+    np.testing.assert_array_equal(projection_sigma_px(result, np.zeros((3, 2))), 0.0)
+    with pytest.raises(FitError, match="TOO_FEW_DATA"):
+        result.or_raise("geometry")
+
+
+def test_without_the_parallel_view_there_is_no_tilt() -> None:
+    result = fit_views(views()[1:], START, SIZE)
+    assert result.status is FitStatus.TOO_FEW_DATA
+    assert "parallel" in result.notes[-1]
+
+
+def test_clipped_boards_are_saturated() -> None:
+    assert fit_views([replace(v, clipped=0.5) for v in views()], START, SIZE).status is FitStatus.SATURATED
+
+
+def test_too_few_views_are_refused() -> None:
+    with pytest.raises(FitError, match="3 views"):
+        calibrate_views([board_points_mm(SPEC)] * 2, [v.corners.xy for v in views()[:2]], SIZE)
+
+
+@pytest.mark.slow
+def test_a_bent_board_is_a_poor_fit() -> None:
+    """A board that is not as described: no camera sees it so."""
+    bent = np.outer(np.arange(24) % 5, [0.0, 0.0, 8.0])
+    points = board_points_mm(SPEC) * np.array([1.0, 1.1, 1.0]) + bent
+    bundle = calibrate_views([points] * 9, [v.corners.xy for v in views()], SIZE, START)
+    assert bundle.rms_px > 1.0
+
+
+@pytest.mark.slow
+def test_a_plain_camera_needs_no_start() -> None:
+    found = views()
+    bundle: CalibratedViews = calibrate_views([board_points_mm(SPEC)] * 9, [v.corners.xy for v in found], SIZE)
+    assert bundle.converged
+    np.testing.assert_allclose(bundle.focal, CAMERA.focal, atol=0.5)
+    assert bundle.rms_px < 2 * NOISE_PX * np.sqrt(2)
+
+
+@pytest.mark.slow
+def test_a_session_of_drawn_boards(tmp_path: Path) -> None:
+    rig = load_rig("lg55-reduced")
+    camera = rig.camera.model_copy(update={"columns": SIZE[0], "rows": SIZE[1], "pitch_um": 20.2})
+    rig = rig.model_copy(update={"camera": camera})
+    writer = SessionWriter.create(tmp_path / "s", rig, CameraIdentity("a", "b", "c", "test"))
+    for index, (matrix, translation) in enumerate(poses()):
+        mean = (64 + 2500 * draw(matrix, translation)).astype(np.float32)
+        settings = Settings(0.01, 0.0, Region(0, 0, *SIZE))
+        average = AveragedFrames(mean, np.full_like(mean, 4.0), 8, settings, 0.0, 1.0)
+        subject = BoardSubject(
+            columns=SPEC.columns,
+            rows=SPEC.rows,
+            square_mm=SPEC.square_mm,
+            marker_mm=SPEC.marker_mm,
+            dictionary=SPEC.dictionary,
+            parallel_to_panel=index == 0,
+        )
+        writer.add_step(f"geometry/view_{index}", "geometry", subject, [average])
+    result = fit_geometry(Session.open(tmp_path / "s"), nominal_noise(rig))
+    assert result.status is FitStatus.CONVERGED
+    assert abs(result.estimate("tilt_deg").value - TILT_DEG) < 0.2  # a sixth of the pixels across
+    assert result.estimate("fx").value == pytest.approx(300.0, abs=1.0)
+    np.testing.assert_allclose(result.term.pupil, nominal_geometry(rig).pupil)

@@ -1,0 +1,222 @@
+"""The psf fit on a grating, on blur that has nothing to do with one, and on sessions that cannot be fitted."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.special import ndtr
+
+from udccal.cameras.protocol import CameraIdentity, Frame, Region, Settings
+from udccal.cfa import channel_map
+from udccal.fitting.absent import absent_wire
+from udccal.fitting.hdr import HdrMerge
+from udccal.fitting.noise import nominal_noise
+from udccal.fitting.nominal import nominal_geometry
+from udccal.fitting.psf import Effort, fit_psf, fit_shots, window_half
+from udccal.fitting.psf_residual import stencils
+from udccal.fitting.psf_shots import Shots, cut_crop, group, stack
+from udccal.fitting.psf_start import start_model, wire_shows
+from udccal.fitting.result import FitResult, FitStatus
+from udccal.fitting.wire_harmonics import wire_start
+from udccal.fitting.wire_phase import ideal_wire
+from udccal.models.geometry import Geometry
+from udccal.models.psf import PsfField, psf_kernels
+from udccal.models.wire import Wire
+from udccal.numerics import in_float64
+from udccal.rig import RigDescription, load_rig
+from udccal.sessions.schema import LedSubject
+from udccal.sessions.store import Session
+from udccal.sessions.writer import SessionWriter
+from udccal.simulation.psf import captured_light
+from udccal.simulation.psf import kernels as simulated_kernels
+from udccal.simulation.truth import RigTruth, draw_truth
+
+HALF = (20, 10)
+MIDDLE = np.array([16, 26])
+TOY = Effort(positions=5, shifts=2, half_px=HALF, close_px=(16, 8), iterations=6)
+FLUX = 1e8 * np.array([0.7, 1.0, 0.6])
+
+
+@dataclass(frozen=True)
+class Fitted:
+    result: FitResult[PsfField]
+    worst_l2: float
+
+
+def kernels(field: PsfField, positions: np.ndarray, rows: int, columns: int) -> np.ndarray:
+    return in_float64(lambda: np.asarray(psf_kernels(field, positions, rows, columns)))()
+
+
+def relative_l2(found: np.ndarray, expected: np.ndarray) -> np.ndarray:
+    return np.sqrt(((found - expected) ** 2).sum(axis=(2, 3)) / (expected**2).sum(axis=(2, 3)))
+
+
+def shots_of(light, rig: RigDescription, places: np.ndarray, shifts: int, disc_px: float, seed: int = 0) -> Shots:
+    """Crops of LEDs about ``places``; ``light(x, y, middle)`` is the image (3, 53, 33) about an integer middle."""
+    rng = np.random.default_rng(seed)
+    crops, aims = [], []
+    for place in places:
+        for _ in range(shifts):
+            aim = place + rng.uniform(0, 2, 2)
+            source = aim + rng.uniform(-1, 1, 2)
+            middle = np.round(aim)
+            corner = (middle - MIDDLE) // 2 * 2
+            image = light(source, corner + MIDDLE)
+            channel = channel_map(rig.camera.cfa, 53, 33)
+            rate = np.take_along_axis(image * FLUX[:, None, None], channel[None], axis=0)[0]
+            sigma = np.hypot(0.003 * rate, 20.0)
+            merged = HdrMerge(
+                rate + sigma * rng.standard_normal(rate.shape), sigma, np.ones(rate.shape, dtype=np.int64)
+            )
+            crop = cut_crop(merged, tuple(int(v) for v in corner), tuple(float(v) for v in aim), rig.camera.cfa, HALF)
+            assert crop is not None
+            crops.append(crop)
+            aims.append(aim)
+    return stack(crops, np.array(aims), np.full(len(aims), disc_px))
+
+
+def places_on(rig: RigDescription, columns: int, rows: int) -> np.ndarray:
+    x, y = (np.linspace(40, size - 40, n) for size, n in ((rig.camera.columns, columns), (rig.camera.rows, rows)))
+    return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2).round()
+
+
+def seen_by_the_wire(truth: RigTruth, geometry: Geometry) -> Wire:
+    """A wire as its own fit would find it, a little off."""
+    panel, pitch = truth.panel, truth.panel.pitch_mm
+    ideal = in_float64(lambda: ideal_wire(geometry, wire_start(truth.description), np.array([[0.0, 1.0]])))()
+    return replace(
+        ideal,
+        offset=truth.optics.pupil_mm[:2] / pitch + 0.01,
+        standoff_per_pitch=np.float64((panel.structure_thickness_mm / 2 - truth.optics.pupil_mm[2]) / pitch),
+        pupil_per_pitch=np.float64(truth.optics.pupil_diameter_mm / pitch * 1.005),
+        row_open=np.float64(panel.row_open + 0.003),
+        column_open=np.float64(panel.column_open - 0.002),
+        depth_per_pitch=np.float64(panel.structure_thickness_mm / pitch),
+    )
+
+
+def true_geometry(truth: RigTruth) -> Geometry:
+    optics = truth.optics
+    matrix = optics.R_panel_camera
+    angle = np.arccos((np.trace(matrix) - 1) / 2)
+    axis = np.array([matrix[2, 1] - matrix[1, 2], matrix[0, 2] - matrix[2, 0], matrix[1, 0] - matrix[0, 1]])
+    return Geometry(
+        focal=np.array([optics.fx_px, optics.fy_px]),
+        centre=np.array([optics.cx_px, optics.cy_px]),
+        distortion=np.array(optics.distortion),
+        rotation=axis * angle / (2 * np.sin(angle)),
+        pupil=optics.pupil_mm,
+    )
+
+
+@pytest.fixture(scope="module")
+def grating() -> Fitted:
+    truth = draw_truth(load_rig("lg55-reduced"), seed=1)
+    rig, geometry = truth.description, true_geometry(truth)
+    disc = 1.0
+
+    def light(source: np.ndarray, middle: np.ndarray) -> np.ndarray:
+        return captured_light(truth, middle.astype(float), 53, 33, tuple(source - middle), disc)
+
+    shots = shots_of(light, rig, places_on(rig, 3, 3), 3, disc)
+    result = fit_shots(shots, rig, geometry, seen_by_the_wire(truth, geometry), TOY)
+    places = np.array([[300.0, 240.0], [720.0, 610.0]])
+    error = relative_l2(kernels(result.term, places, 65, 33), simulated_kernels(truth, places, 65, 33))
+    return Fitted(result, float(error.max()))
+
+
+def test_a_grating_is_predicted_where_it_was_not_captured(grating: Fitted) -> None:
+    assert grating.result.status is FitStatus.CONVERGED
+    assert grating.worst_l2 < 0.03
+    assert grating.result.estimate("row_open_fraction").value == pytest.approx(0.3917, abs=0.004)
+    assert all(estimate.sigma > 0 for estimate in grating.result.estimates)
+    assert grating.result.cov.shape == (6, 6)
+    assert sum(candidate.chosen for candidate in grating.result.candidates) == 1
+
+
+def streak(source: np.ndarray, middle: np.ndarray, disc_px: float, rig: RigDescription) -> np.ndarray:
+    """Two Gaussians that grow over the field; not a grating's."""
+    down, across = source[1] / rig.camera.rows - 0.5, source[0] / rig.camera.columns - 0.5
+    image = np.zeros((3, 53, 33))
+    for channel, size in enumerate((1.1, 1.0, 0.9)):
+        for weight, sigma_x, sigma_y in ((0.85, 0.8 + 0.1 * across, 0.9 + 0.2 * down), (0.15, 1.4, 5.0 + 1.5 * down)):
+            sx, sy = (np.hypot(sigma * size, disc_px / 4) for sigma in (sigma_x, sigma_y))
+            x, y = (
+                np.diff(ndtr((np.arange(n + 1) - n // 2 - 0.5 - o) / s))
+                for n, o, s in ((33, source[0] - middle[0], sx), (53, source[1] - middle[1], sy))
+            )
+            image[channel] += weight * np.outer(y, x)
+    return image
+
+
+@pytest.mark.xfail(strict=True, reason="The free image misses blur that is no grating by some 20 %, not 3 %.")
+def test_blur_without_a_grating_is_carried_by_the_image() -> None:
+    rig = load_rig("lg55-reduced")
+    geometry = nominal_geometry(rig)
+    shots = shots_of(lambda s, m: streak(s, m, 1.0, rig), rig, places_on(rig, 4, 3), 4, 1.0)
+    result = fit_shots(shots, rig, geometry, absent_wire(rig, geometry), TOY)
+    assert result.status is FitStatus.CONVERGED
+    assert float(result.term.diffraction_share) == 0.0
+    place = np.array([[430.0, 300.0]])
+    truth = streak(place[0], place[0], 0.0, rig)[None, :, 6:-6, 6:-6]
+    error = relative_l2(kernels(result.term, place, 41, 21), truth)
+    assert error.max() < 0.03
+    other = streak(place[0] + [0.0, 0.4], place[0], 0.0, rig)[None, :, 6:-6, 6:-6]
+    assert relative_l2(kernels(result.term, place, 41, 21), other).min() > 0.1
+
+
+def test_a_stencil_moves_towards_its_offset() -> None:
+    moved = stencils(np.array([[0.4, -0.3]]), np.array([0.0]))[0]
+    y, x = np.mgrid[-3:4, -3:4]
+    assert moved.sum() == pytest.approx(1.0)
+    assert (moved * x).sum() == pytest.approx(0.4)
+    assert (moved * y).sum() == pytest.approx(-0.3)
+
+
+def test_aims_fall_into_groups() -> None:
+    aims = np.array([[10.0, 10.0], [11.5, 10.5], [50.0, 10.0], [10.4, 11.9]])
+    np.testing.assert_array_equal(group(aims), [0, 0, 1, 0])
+
+
+def session_of(folder: Path, level_DN: int, places: int = 6) -> Session:
+    """Brackets whose LED is a square of ``level_DN`` at the shortest exposure, clipped beyond 12 bit."""
+    rig = load_rig("lg55-reduced")
+    writer = SessionWriter.create(folder, rig, CameraIdentity("maker", "model", "1", "test"))
+    rng = np.random.default_rng(0)
+    for place in range(places):
+        region = Region(100 * place + 20, 40, 48, 64)
+        frames = []
+        for exposure in (1e-4, 4e-4):
+            data = 64.0 + rng.normal(0, 2, (64, 48))
+            data[30:34, 22:26] += level_DN * exposure / 1e-4
+            settings = Settings(exposure, 0.0, region)
+            frames.append(Frame(np.clip(data.round(), 0, 4095).astype(np.uint16), settings, 0.0, 0, True))
+        subject = LedSubject(x_px=region.x + 23.5, y_px=region.y + 31.5, distance_mm=2000.0, diameter_mm=2.3)
+        writer.add_step(f"psf/p{place:02d}_s0", "psf", subject, frames)
+    return Session.open(folder)
+
+
+@pytest.mark.parametrize(
+    ("level_DN", "places", "status"),
+    [(0, 6, FitStatus.TOO_DARK), (60000, 6, FitStatus.SATURATED), (2000, 2, FitStatus.TOO_FEW_DATA)],
+)
+def test_bad_captures_are_said_to_be_bad(tmp_path: Path, level_DN: int, places: int, status: FitStatus) -> None:
+    session = session_of(tmp_path / "session", level_DN, places)
+    geometry = nominal_geometry(session.rig)
+    result = fit_psf(session, nominal_noise(session.rig), geometry, absent_wire(session.rig, geometry))
+    assert result.status is status
+    assert result.notes
+    assert not result.ok
+    assert window_half(session, (48, 16)) == (28, 16)
+
+
+def test_where_no_wire_shows_the_rig_says_where_to_start() -> None:
+    rig = load_rig("lg55-reduced")
+    geometry = nominal_geometry(rig)
+    model = start_model(rig, geometry, absent_wire(rig, geometry))
+    assert not wire_shows(absent_wire(rig, geometry))
+    assert float(model.visibility) == 0.0
+    np.testing.assert_allclose(model.open_fraction, [0.94, 0.40])

@@ -1,0 +1,172 @@
+"""The psf model against brute force, against the simulator's wave optics, and against itself."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from udccal.models.diffraction import Diffraction, disc_autocorrelation, local_frame, slit_coefficient
+from udccal.models.fields import polynomial_basis, polynomial_terms
+from udccal.models.geometry import Geometry
+from udccal.models.interference import disc_overlap_coefficient
+from udccal.models.lattice import lattice_for, sample, spline_coefficients
+from udccal.models.psf import PsfField, psf_kernels
+from udccal.numerics import in_float64
+from udccal.rig import load_rig
+from udccal.simulation.psf import kernels as simulated_kernels
+from udccal.simulation.spectrum import camera_spectrum
+from udccal.simulation.truth import RigTruth, draw_truth
+
+ROWS, COLUMNS = 49, 25
+
+
+def as_numpy(function: Callable[..., object]) -> Callable[..., np.ndarray]:
+    return in_float64(lambda *args: np.asarray(function(*args)))
+
+
+def rotation_vector(matrix: np.ndarray) -> np.ndarray:
+    angle = np.arccos((np.trace(matrix) - 1) / 2)
+    axis = np.array([matrix[2, 1] - matrix[1, 2], matrix[0, 2] - matrix[2, 0], matrix[1, 0] - matrix[0, 1]])
+    return axis * angle / (2 * np.sin(angle))
+
+
+def true_field(truth: RigTruth) -> PsfField:
+    """The model with the simulator's own numbers."""
+    optics, panel, spectrum = truth.optics, truth.panel, camera_spectrum(truth)
+    geometry = Geometry(
+        focal=np.array([optics.fx_px, optics.fy_px]),
+        centre=np.array([optics.cx_px, optics.cy_px]),
+        distortion=np.array(optics.distortion),
+        rotation=rotation_vector(optics.R_panel_camera),
+        pupil=optics.pupil_mm,
+    )
+    diffraction = Diffraction(
+        pitch_mm=np.float64(panel.pitch_mm),
+        open_fraction=np.array([panel.column_open, panel.row_open]),
+        thickness_mm=np.float64(panel.structure_thickness_mm),
+        pupil_mm=np.float64(optics.pupil_diameter_mm),
+        blur_px=np.float64(0.0),
+        offset=optics.pupil_mm[:2] / panel.pitch_mm,
+        standoff_per_pitch=np.float64((panel.structure_thickness_mm / 2 - optics.pupil_mm[2]) / panel.pitch_mm),
+        visibility=np.float64(1.0),
+        wavelengths_nm=spectrum.wavelengths_nm,
+        spectrum=spectrum.weights,
+    )
+    return PsfField(
+        geometry=geometry,
+        diffraction=diffraction,
+        diffraction_share=np.float64(1.0),
+        residual=np.zeros((1, 3, 1, 1)),
+        centre_px=np.array([511.5, 383.5]),
+        half_px=np.array([511.5, 383.5]),
+        degree=0,
+        fine=14,
+    )
+
+
+@pytest.fixture(scope="module")
+def truth() -> RigTruth:
+    return draw_truth(load_rig("lg55-reduced"), seed=1)
+
+
+@pytest.mark.parametrize("lag", [0.1, 0.8, 1.05, 2.3, -1.2])
+@pytest.mark.parametrize("order", [0, 1, 2])
+def test_slits_against_a_sum(lag: float, order: int) -> None:
+    y = (np.arange(20000) + 0.5) / 20000
+    opened = 0.7
+
+    def open_at(place: np.ndarray) -> np.ndarray:
+        return np.abs((place + 0.5) % 1 - 0.5) < opened / 2
+
+    both = open_at(y + lag / 2) & open_at(y - lag / 2)
+    expected = (both * np.cos(2 * np.pi * order * y)).mean() / opened
+    assert as_numpy(slit_coefficient)(np.array([lag]), opened, order)[0] == pytest.approx(expected, abs=3e-4)
+
+
+@pytest.mark.parametrize(
+    ("lag", "wave"), [((0.0, 0.0), (0.3, 5.1)), ((0.2, 0.35), (0.4, 3.0)), ((-0.5, 0.1), (5.0, 5.0))]
+)
+def test_overlap_of_discs_against_a_sum(lag: tuple[float, float], wave: tuple[float, float]) -> None:
+    axis = (np.arange(1500) + 0.5) / 1500 - 0.5
+    x, y = np.meshgrid(axis, axis)
+    inside = [(x + s * lag[0] / 2) ** 2 + (y + s * lag[1] / 2) ** 2 < 0.25 for s in (1, -1)]
+    both = inside[0] & inside[1]
+    scale = 4 / np.pi / 1500**2
+    expected = (both * np.cos(2 * np.pi * (wave[0] * x + wave[1] * y))).sum() * scale
+    found = as_numpy(disc_overlap_coefficient)(np.array([lag]), np.array(wave))[0]
+    assert found == pytest.approx(expected, abs=2e-4)
+    area = as_numpy(disc_autocorrelation)(np.array([np.hypot(*lag)]))[0]
+    assert area == pytest.approx(both.sum() * scale, abs=1e-3)
+
+
+def test_a_lattice_gives_back_what_its_transfer_says() -> None:
+    def value(points: np.ndarray) -> jnp.ndarray:
+        lattice = lattice_for(48.0, 40.0, 3, 4)
+        fy, fx = lattice.frequency_y[:, None], lattice.frequency_x[None, :]
+        transfer = jnp.exp(-2 * np.pi**2 * (0.9**2 * fx**2 + 1.3**2 * fy**2))[None]
+        return sample(lattice, spline_coefficients(lattice, transfer), jnp.asarray(points))[:, 0]
+
+    points = np.random.default_rng(0).uniform(-4, 4, (200, 2))
+    expected = np.exp(-0.5 * ((points[:, 0] / 0.9) ** 2 + (points[:, 1] / 1.3) ** 2)) / (2 * np.pi * 0.9 * 1.3)
+    np.testing.assert_allclose(as_numpy(value)(points), expected, atol=0.04 * expected.max())
+    np.testing.assert_array_equal(as_numpy(value)(np.array([[30.0, 0.0]])), 0.0)
+
+
+def test_polynomials_are_counted_and_start_with_one() -> None:
+    unit = np.array([[0.2, -0.4], [1.0, 1.0]])
+    basis = as_numpy(lambda u: polynomial_basis(u, 2))(unit)
+    assert basis.shape == (2, polynomial_terms(2)) == (2, 6)
+    np.testing.assert_allclose(basis[:, 0], 1.0)
+    np.testing.assert_allclose(basis[1], 1.0)
+    assert polynomial_terms(-1) == 0
+
+
+def test_kernels_agree_with_wave_optics(truth: RigTruth) -> None:
+    positions = np.array([[512.0, 384.0], [940.0, 715.0]])
+    field = true_field(truth)
+    expected = simulated_kernels(truth, positions, ROWS, COLUMNS)
+    found = as_numpy(lambda p: psf_kernels(field, p, ROWS, COLUMNS))(positions)
+    np.testing.assert_allclose(found.sum(axis=(2, 3)), 1.0, atol=1e-9)
+    assert relative_l2(found, expected).max() < 0.02
+    bright = expected > 1e-3 * expected.max(axis=(2, 3), keepdims=True)
+    assert np.sqrt((((found - expected) / expected)[bright] ** 2).mean()) < 0.08
+    wrong = replace(field, diffraction=replace(field.diffraction, open_fraction=np.array([0.94, 0.5])))
+    assert relative_l2(as_numpy(lambda p: psf_kernels(wrong, p, ROWS, COLUMNS))(positions), expected).min() > 0.05
+
+
+def relative_l2(found: np.ndarray, expected: np.ndarray) -> np.ndarray:
+    return np.sqrt(((found - expected) ** 2).sum(axis=(2, 3)) / (expected**2).sum(axis=(2, 3)))
+
+
+def test_the_residual_follows_its_polynomial_and_is_cut_or_padded(truth: RigTruth) -> None:
+    residual = np.zeros((3, 3, 5, 5))
+    residual[0, :, 2, 2] = 1.0
+    residual[1, :, 2, 4] = 0.5
+    field = replace(true_field(truth), diffraction_share=np.float64(0.0), residual=residual, degree=1)
+    places = np.array([[511.5, 383.5], [511.5, 767.0], [1023.0, 383.5]])
+    wide = as_numpy(lambda p: psf_kernels(field, p, 7, 7))(places)
+    first_order = as_numpy(lambda p: polynomial_basis((p - field.centre_px) / field.half_px, 1))(places)[:, 1]
+    share = 0.5 * first_order
+    np.testing.assert_allclose(wide[:, 0, 3, 5], share / (1 + share), atol=1e-12)
+    narrow = as_numpy(lambda p: psf_kernels(field, p, 3, 3))(places)
+    np.testing.assert_allclose(narrow[:, :, 1, 1], 1.0, atol=1e-12)
+
+
+def test_the_footprint_grows_with_obliquity(truth: RigTruth) -> None:
+    geometry = true_field(truth).geometry
+
+    def area(place: np.ndarray) -> jnp.ndarray:
+        frame = local_frame(geometry, place)
+        axis = jnp.linalg.inv(frame.footprint)
+        return jnp.abs(1.0 / jnp.linalg.det(axis)) * frame.direction[2]
+
+    # Light through the panel's openings is the same tube that enters the pupil: area times cosine is the pupil's own.
+    centre, corner = np.array([511.5, 383.5]), np.array([1000.0, 740.0])
+    towards = as_numpy(lambda p: local_frame(geometry, p).direction)
+    axis = truth.optics.R_panel_camera[:, 2]
+    for place in (centre, corner):
+        assert as_numpy(area)(place) == pytest.approx(abs(float(towards(place) @ axis)), rel=1e-6)

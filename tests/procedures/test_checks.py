@@ -1,0 +1,77 @@
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from procedures.checks import is_dark, is_even, shows_board, shows_led, shows_panel_light
+from udccal.arrangements import BoardSpec
+from udccal.cameras.protocol import Frame, Region, Settings
+from udccal.errors import CaptureError
+from udccal.rig import load_rig
+
+RIG = load_rig("lg55-reduced")
+SPEC = BoardSpec(7, 5, 60.0, 45.0)
+
+
+def frame(data: np.ndarray, x: int = 100, y: int = 100, exposure_s: float = 0.01) -> Frame:
+    region = Region(x, y, data.shape[1], data.shape[0])
+    return Frame(np.rint(data).clip(0, 4095).astype(np.uint16), Settings(exposure_s, 0.0, region), 0.0, 0, True)
+
+
+def board_picture(columns: int = 640, rows: int = 480) -> np.ndarray:
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_1000)
+    board = cv2.aruco.CharucoBoard((SPEC.columns, SPEC.rows), SPEC.square_mm, SPEC.marker_mm, dictionary)
+    picture = board.generateImage((columns, rows), marginSize=40).astype(float)
+    picture[::2, ::2] *= 0.5  # as a Bayer mosaic has it
+    return 64 + picture * 10
+
+
+def test_dark_is_told_from_light() -> None:
+    rng = np.random.default_rng(0)
+    is_dark(frame(rng.normal(66, 3, (64, 64))), RIG)
+    is_dark(frame(rng.normal(64 + 0.355 * 200, 8, (64, 64)), exposure_s=10.0), RIG)  # dark current
+    with pytest.raises(CaptureError, match=r"Expected a dark frame, found it .* Cap the lens"):
+        is_dark(frame(rng.normal(150, 8, (64, 64))), RIG)
+
+
+def test_a_shadow_in_a_flat_is_found() -> None:
+    flat = np.full((96, 128), 2500.0)
+    flat[::2, ::2] *= 0.5
+    is_even(frame(flat), RIG)
+    flat[20:60, 30:70] = 80
+    with pytest.raises(CaptureError, match=r"Expected an even light .* patches at 1%"):
+        is_even(frame(flat), RIG)
+
+
+@pytest.mark.parametrize(("row", "column", "fine"), [(24, 16, True), (2, 16, False), (24, 30, False)])
+def test_an_led_must_lie_inside_its_region(row: int, column: int, fine: bool) -> None:
+    data = np.full((48, 32), 66.0)
+    data[row - 1 : row + 2, column - 1 : column + 2] = 900
+    data[row, column] = 3000
+    if fine:
+        shows_led(frame(data), RIG)
+    else:
+        with pytest.raises(CaptureError, match="found it at its edge"):
+            shows_led(frame(data), RIG)
+        shows_led(frame(data, x=RIG.camera.columns - 32, y=0), RIG)  # there the region ends with the sensor
+
+
+def test_a_lit_room_is_not_dark_enough_for_an_led() -> None:
+    data = np.full((48, 32), 2000.0)
+    data[20:23, 12:15] = 3000
+    with pytest.raises(CaptureError, match="Darken the room"):
+        shows_led(frame(data), RIG)
+
+
+def test_a_board_is_found_and_its_absence_told() -> None:
+    check = shows_board(SPEC)
+    check(frame(board_picture()), RIG)
+    with pytest.raises(CaptureError, match=r"at least 6 corners of the 7 x 5 ChArUco board, found 0"):
+        check(frame(np.full((480, 640), 500.0)), RIG)
+
+
+def test_a_dark_panel_is_told() -> None:
+    shows_panel_light(frame(np.full((48, 64), 400.0)), RIG)
+    with pytest.raises(CaptureError, match="light of the white panel, found none"):
+        shows_panel_light(frame(np.full((48, 64), 64.0)), RIG)

@@ -1,0 +1,17 @@
+from __future__ import annotations
+
+from udccal.profiles.provenance import portable_command
+from udccal.profiles.units import unit_of
+
+
+def test_a_command_says_nothing_about_the_machine() -> None:
+    command = portable_command(["/home/me/bin/udccal", "fit", "/data/mine/session", "--profile=/home/me/p", "--json"])
+    assert command == "udccal fit session --profile=p --json"
+
+
+def test_units_follow_names() -> None:
+    assert unit_of("diffraction.pitch_mm") == "mm"
+    assert unit_of("fields_px.0") == "px"
+    assert unit_of("geometry.focal") == "px"
+    assert unit_of("dark_current_e_per_s") == "e-/s"
+    assert unit_of("degree") == "1"

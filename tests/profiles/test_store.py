@@ -1,0 +1,174 @@
+from __future__ import annotations
+
+import dataclasses
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+
+from udccal.errors import FitError, ProfileError
+from udccal.fitting.result import FitStatus
+from udccal.profiles.profile import Profile, build_profile
+from udccal.profiles.provenance import PROFILE_NAME, profile_sha256
+from udccal.profiles.store import read_profile, read_stored, write_profile
+
+TERMS = ("noise", "geometry", "wire", "psf", "backscatter")
+NO_COV = np.zeros((0, 0))
+
+
+def assert_same(a: Profile, b: Profile) -> None:
+    for name in TERMS:
+        one, other = a.result(name), b.result(name)
+        assert jax.tree.structure(one.term) == jax.tree.structure(other.term)
+        for x, y in zip(jax.tree.leaves(one.term), jax.tree.leaves(other.term), strict=True):
+            np.testing.assert_array_equal(x, y)
+            assert np.asarray(x).dtype == np.asarray(y).dtype
+        assert dataclasses.replace(one, term=0, cov=NO_COV) == dataclasses.replace(other, term=0, cov=NO_COV)
+        np.testing.assert_array_equal(one.cov, other.cov)
+    np.testing.assert_array_equal(a.wire_map, b.wire_map)
+    np.testing.assert_array_equal(a.backscatter_mask, b.backscatter_mask)
+    assert (a.rig, a.provenance, a.parent, a.invalidated_by) == (b.rig, b.provenance, b.parent, b.invalidated_by)
+
+
+@pytest.fixture(scope="module")
+def original(tmp_path_factory: pytest.TempPathFactory, toy_profile: Profile) -> Path:
+    folder = tmp_path_factory.mktemp("original") / "p"
+    write_profile(folder, toy_profile)
+    return folder
+
+
+@pytest.fixture
+def stored(tmp_path: Path, original: Path) -> Path:
+    return Path(shutil.copytree(original, tmp_path / "p"))
+
+
+@pytest.mark.parametrize("name", ["p", "p.zip"])
+def test_everything_comes_back_bit_for_bit(tmp_path: Path, toy_profile: Profile, name: str) -> None:
+    write_profile(tmp_path / name, toy_profile)
+    assert_same(read_profile(tmp_path / name), toy_profile)
+    assert [item.name for item in tmp_path.iterdir()] == [name]
+
+
+def test_geometry_is_stored_once(stored: Path) -> None:
+    sections = json.loads((stored / PROFILE_NAME).read_text())["terms"]
+    kinds = {name: [p["kind"] for p in sections[name]["parameters"]] for name in TERMS}
+    assert all("reference" in kinds[name] for name in ("wire", "psf", "backscatter"))
+    assert "reference" not in kinds["geometry"]
+
+
+def test_a_term_with_another_geometry_keeps_it(tmp_path: Path, toy_profile: Profile) -> None:
+    wire = toy_profile.wire.term
+    geometry = type(wire.geometry)(**{**vars(wire.geometry), "pupil": np.array([1.0, 2.0, -3.0])})
+    other = type(wire)(**{**vars(wire), "geometry": geometry})
+    changed = dataclasses.replace(toy_profile, wire=dataclasses.replace(toy_profile.wire, term=other))
+    write_profile(tmp_path / "p", changed)
+    assert_same(read_profile(tmp_path / "p"), changed)
+
+
+def test_a_fitted_parameter_carries_unit_and_sigma(stored: Path) -> None:
+    parameters = {p["name"]: p for p in json.loads((stored / PROFILE_NAME).read_text())["terms"]["noise"]["parameters"]}
+    assert (parameters["K_DN_per_e"]["unit"], parameters["K_DN_per_e"]["sigma"]) == ("DN/e-", 1e-3)
+    assert (parameters["sigma_d_e"]["unit"], parameters["sigma_d_e"]["sigma"]) == ("e-", None)
+
+
+def test_a_profile_is_replaced_whole(stored: Path, toy_profile: Profile) -> None:
+    child = dataclasses.replace(toy_profile, parent=profile_sha256(stored))
+    write_profile(stored, child)
+    assert read_profile(stored).parent == child.parent
+    assert [item.name for item in stored.parent.iterdir()] == ["p"]
+
+
+def test_a_folder_with_anything_else_is_left_alone(stored: Path, toy_profile: Profile) -> None:
+    (stored / "rig.toml").write_text("mine")
+    with pytest.raises(ProfileError, match=r"found also 'rig.toml'"):
+        write_profile(stored, toy_profile)
+    other = stored.parent / "holiday"
+    other.mkdir()
+    (other / "photo.png").write_text("mine")
+    with pytest.raises(ProfileError, match="Choose another path"):
+        write_profile(other, toy_profile)
+    assert (other / "photo.png").read_text() == "mine"
+
+
+def test_a_failed_write_leaves_nothing(tmp_path: Path, toy_profile: Profile) -> None:
+    broken = dataclasses.replace(toy_profile.noise, chi2_dof=float("nan"))
+    with pytest.raises(ProfileError, match="chi2_dof"):
+        write_profile(tmp_path / "p", dataclasses.replace(toy_profile, noise=broken))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_bad_fit_makes_no_profile(toy_profile: Profile) -> None:
+    results = {name: toy_profile.result(name) for name in TERMS}
+    results["wire"] = dataclasses.replace(results["wire"], status=FitStatus.SATURATED)
+    with pytest.raises(FitError, match="SATURATED"):
+        build_profile(toy_profile.rig, toy_profile.provenance, **results)
+
+
+def damaged(change: Callable[[dict[str, Any]], object]) -> Callable[[Path], None]:
+    def apply(folder: Path) -> None:
+        document = json.loads((folder / PROFILE_NAME).read_text())
+        change(document)
+        (folder / PROFILE_NAME).write_text(json.dumps(document))
+
+    return apply
+
+
+def parameter(document: dict[str, Any], term: str, name: str) -> dict[str, Any]:
+    return next(p for p in document["terms"][term]["parameters"] if p["name"] == name)
+
+
+def array_of(document: dict[str, Any]) -> dict[str, Any]:
+    return document["terms"]["psf"]["arrays"][0]
+
+
+DAMAGES: dict[str, tuple[Callable[[Path], object], str]] = {
+    "no profile.json": (lambda f: (f / PROFILE_NAME).unlink(), "found none"),
+    "cut short": (lambda f: (f / PROFILE_NAME).write_bytes((f / PROFILE_NAME).read_bytes()[:500]), "to be JSON"),
+    "not an object": (lambda f: (f / PROFILE_NAME).write_text("[1]"), "JSON object"),
+    "newer": (damaged(lambda d: d.update(version=2)), "newer version 2"),
+    "another format": (damaged(lambda d: d.update(format="udccal-session")), "format 'udccal-profile'"),
+    "unknown entry": (damaged(lambda d: d.update(extra=1)), "'extra'"),
+    "missing entry": (damaged(lambda d: d.pop("rig")), "'rig'"),
+    "not a number": (damaged(lambda d: parameter(d, "noise", "black_DN").update(value=float("nan"))), "value"),
+    "wrong type": (damaged(lambda d: parameter(d, "noise", "black_DN").update(value="64")), "value"),
+    "missing parameter": (damaged(lambda d: d["terms"]["noise"]["parameters"].pop()), "found none"),
+    "unknown parameter": (damaged(lambda d: parameter(d, "noise", "q_DN").update(name="os")), "found none|found also"),
+    "wrong shape": (damaged(lambda d: parameter(d, "geometry", "focal").update(shape=[3])), "3 values"),
+    "another model": (damaged(lambda d: d["terms"]["wire"].update(model="Path")), "found 'Path'"),
+    "another nested model": (
+        damaged(lambda d: parameter(d, "psf", "diffraction").update(model="Popen")), "found 'Popen'"
+    ),
+    "unknown status": (damaged(lambda d: d["terms"]["wire"]["fit"].update(status="FINE")), "found 'FINE'"),
+    "path escape": (damaged(lambda d: array_of(d).update(file="../psf_residual.exr")), "file"),
+    "absolute path": (damaged(lambda d: array_of(d).update(file="/etc/passwd")), "file"),
+    "wrong size of an array": (damaged(lambda d: array_of(d).update(shape=[1, 3, 15, 14])), "samples"),
+    "array missing": (lambda f: (f / "psf_residual.exr").unlink(), "found none"),
+    "array changed": (lambda f: (f / "psf_residual.exr").write_bytes(b"x"), "SHA-256"),
+    "wire map missing": (lambda f: (f / "wire_map.exr").unlink(), "found none"),
+    "picture not listed": (damaged(lambda d: d["pictures"].pop(0)), "found none"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_a_damaged_profile_is_refused_with_a_sentence(stored: Path, damage: str) -> None:
+    apply, message = DAMAGES[damage]
+    apply(stored)
+    with pytest.raises(ProfileError, match=message):
+        read_profile(stored)
+
+
+def test_a_link_out_of_the_folder_is_refused(stored: Path) -> None:
+    (stored / "wire_map.exr").rename(stored.parent / "elsewhere.exr")
+    (stored / "wire_map.exr").symlink_to(stored.parent / "elsewhere.exr")
+    with pytest.raises(ProfileError, match="found none"):
+        read_profile(stored)
+
+
+def test_the_stored_form_can_be_read_without_its_arrays(stored: Path, toy_profile: Profile) -> None:
+    (stored / "psf_residual.exr").unlink()
+    assert read_stored(stored).rig == toy_profile.rig

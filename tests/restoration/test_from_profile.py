@@ -1,0 +1,67 @@
+"""A profile with every term present, through the whole runtime."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from udccal.fitting.absent import absent_backscatter, absent_psf, absent_wire
+from udccal.fitting.nominal import nominal_geometry
+from udccal.fitting.result import FitResult, FitStatus
+from udccal.models.noise import Noise
+from udccal.profiles.profile import Profile, build_profile
+from udccal.profiles.provenance import provenance_now
+from udccal.profiles.store import read_profile, write_profile
+from udccal.restoration.plan import PlanOptions
+from udccal.restoration.runtime import Restorer
+from udccal.rig import RigDescription
+
+
+@pytest.fixture(scope="module")
+def small_rig(toy_rig: RigDescription) -> RigDescription:
+    """As small as the rig of the profiles' tests, so that the terms are compiled once for both."""
+    camera = toy_rig.camera.model_copy(update={"columns": 96, "rows": 64, "pitch_um": 69.0})
+    panel = toy_rig.panel.model_copy(update={"columns": 32, "rows": 24})
+    return toy_rig.model_copy(update={"camera": camera, "panel": panel})
+
+
+@pytest.fixture(scope="module")
+def profile(small_rig: RigDescription, toy_noise: Noise) -> Profile:
+    geometry = nominal_geometry(small_rig)
+    point = absent_psf(small_rig, geometry)
+    residual = np.pad(np.asarray(point.residual), ((0, 0), (0, 0), (7, 7), (7, 7)))
+    dark = absent_backscatter(small_rig, geometry)
+    lit = type(dark)(**{**vars(dark), "mask": np.full(np.shape(dark.mask), 2.0e4), "window": 24})
+
+    def fitted(term: object) -> FitResult:
+        return FitResult(term, FitStatus.CONVERGED, (), np.zeros((0, 0)), 1.0, 100)
+
+    return build_profile(
+        small_rig,
+        provenance_now(None, None),
+        noise=fitted(toy_noise),
+        geometry=fitted(geometry),
+        wire=fitted(absent_wire(small_rig, geometry)),
+        psf=fitted(type(point)(**{**vars(point), "residual": residual})),
+        backscatter=fitted(lit),
+    )
+
+
+def test_a_stored_profile_restores_a_frame(profile: Profile, tmp_path: Path) -> None:
+    write_profile(tmp_path / "p", profile)
+    options = PlanOptions(grid_rows=2, grid_columns=2, pad_rows=8, pad_columns=8)
+    restorer = Restorer.from_profile(read_profile(tmp_path / "p"), options)
+    rig, exposure_s = profile.rig, 0.02
+    picture = np.full((rig.panel.rows, rig.panel.columns, 3), 255, np.uint8)
+    scene_e = 2000.0
+    backscatter_e = exposure_s * restorer.mask
+    frame = np.rint(64 + 0.355 * (scene_e + backscatter_e + 20 * exposure_s)).astype(np.uint16)
+    for shown in (picture, np.zeros_like(picture)):
+        expected = scene_e + (0.0 if shown.any() else backscatter_e.mean())
+        restored = restorer.restore(frame, exposure_s, shown)
+        np.testing.assert_allclose(restored * exposure_s, expected, rtol=0.02)
+    # Without the picture, an even frame might be all backscatter: no more than the mask is taken away.
+    unknown = restorer.restore(frame, exposure_s)
+    np.testing.assert_allclose(unknown * exposure_s, scene_e, rtol=0.02)

@@ -1,0 +1,66 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from udccal.errors import RestorationError
+from udccal.io.exr import read_rgb_exr
+from udccal.io.png import read_rgb8
+from udccal.restoration.metrics import least_squares_gain, psnr, ssim
+from udccal.restoration.sinks import write_picture
+from udccal.restoration.tone import Tone, display_exposure, encode_srgb, to_rgb8
+
+RNG = np.random.default_rng(0)
+PICTURE = (RNG.random((40, 50, 3)) * 5000).astype(np.float32)
+
+
+def test_srgb_at_its_known_points() -> None:
+    np.testing.assert_allclose(
+        encode_srgb(np.array([-1.0, 0.0, 0.0031308, 0.2140, 1.0, 9.0])), [0, 0, 0.04045, 0.5, 1, 1], atol=2e-4
+    )
+
+
+def test_the_97th_percentile_is_shown_at_0_9() -> None:
+    shown = encode_srgb(PICTURE * display_exposure(PICTURE))
+    assert np.percentile(shown, 97) == pytest.approx(0.9, abs=1e-3)
+
+
+def test_gains_work_on_linear_light() -> None:
+    even = np.full((2, 2, 3), 0.1, np.float32)
+    shown = Tone(1.0, (1.0, 2.0, 0.5)).apply(even)
+    np.testing.assert_allclose(shown[0, 0], encode_srgb(np.array([0.1, 0.2, 0.05])), atol=1e-6)
+
+
+def test_psnr_and_ssim_know_good_from_bad() -> None:
+    truth = cv2.GaussianBlur(RNG.random((60, 60, 3)), (0, 0), 2.0)
+    assert psnr(truth + 0.1, truth) == pytest.approx(20.0, abs=0.01)
+    assert ssim(truth, truth) == pytest.approx(1.0)
+    assert psnr(truth, truth) == 120.0
+    noisy = truth + RNG.normal(0, 0.05, truth.shape)
+    assert ssim(noisy, truth) < 0.7 < ssim(truth + 0.01, truth)
+
+
+def test_gains_are_found_back() -> None:
+    np.testing.assert_allclose(least_squares_gain(PICTURE / np.array([2.0, 4.0, 0.5]), PICTURE), [2.0, 4.0, 0.5])
+
+
+def test_pictures_are_written_as_their_name_says(tmp_path: Path) -> None:
+    tone = Tone(display_exposure(PICTURE))
+    write_picture(tmp_path / "a.exr", PICTURE, tone)
+    write_picture(tmp_path / "a.png", PICTURE, tone)
+    write_picture(tmp_path / "b.png", PICTURE, tone, bits=16)
+    np.testing.assert_array_equal(read_rgb_exr(tmp_path / "a.exr"), PICTURE)
+    np.testing.assert_array_equal(read_rgb8(tmp_path / "a.png"), to_rgb8(tone.apply(PICTURE)))
+    fine = cv2.imread(str(tmp_path / "b.png"), cv2.IMREAD_UNCHANGED)
+    assert fine.dtype == np.uint16
+    np.testing.assert_allclose(fine[..., ::-1] / 65535, tone.apply(PICTURE), atol=1e-5)
+
+
+@pytest.mark.parametrize(("name", "bits"), [("a.jpg", 8), ("a.png", 12)])
+def test_other_forms_are_refused(tmp_path: Path, name: str, bits: int) -> None:
+    with pytest.raises(RestorationError, match=r"Expected a picture name ending in"):
+        write_picture(tmp_path / name, PICTURE, Tone(1.0), bits)
+    assert list(tmp_path.iterdir()) == []

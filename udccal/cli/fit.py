@@ -1,0 +1,21 @@
+"""``udccal fit``: a captured session to a profile with its report."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from udccal.cli.options import ProfilePath
+
+
+def fit(
+    context: typer.Context,
+    session: Annotated[Path, typer.Argument(help="Folder of a captured session.")],
+    profile: ProfilePath,
+) -> None:
+    """Fit all five terms of a captured session and write a profile with its report."""
+    from udccal.cli.jobs.fit import fit_to_profile
+
+    fit_to_profile(context.obj, session, profile)

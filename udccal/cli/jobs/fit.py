@@ -1,0 +1,116 @@
+"""From a captured session to a profile and its report."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from udccal.cli.output import Output, StageTime
+from udccal.displays.pictures import face_picture
+from udccal.errors import FitError
+from udccal.fitting.calibrate import ORDER, Calibration, FitEffort, fit_session
+from udccal.profiles.profile import build_profile
+from udccal.profiles.provenance import provenance_now
+from udccal.profiles.store import check_replaceable, write_profile
+from udccal.reports.page import write_page
+from udccal.reports.report import calibration_page, gather
+from udccal.reports.tables import Table
+from udccal.sessions.manifest import MANIFEST_NAME
+from udccal.sessions.schema import TermName
+from udccal.sessions.store import Session
+
+# Seed of a picture that no calibration shows.
+UNSEEN_PICTURE = 9001
+
+
+@dataclass(frozen=True)
+class TermSummary:
+    """How one term's fit ended."""
+
+    term: str
+    status: str
+    advice: str
+    chi2_dof: float
+    notes: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class FitSummary:
+    """What ``fit`` and ``calibrate`` deliver."""
+
+    session: Path
+    profile: Path
+    report: Path
+    terms: tuple[TermSummary, ...]
+    times: tuple[StageTime, ...]
+
+
+def fit_to_profile(output: Output, session_path: Path, profile_path: Path) -> None:
+    """Fit a session, write the report and the profile, print the summary.
+
+    Raises:
+        SessionError: when the session is missing or damaged.
+        FitError: when a term ended in a bad status; the report is written then, the profile is not.
+        ProfileError: when something else stands where the profile is to go.
+    """
+    check_replaceable(profile_path)
+    session = Session.open(session_path)
+    calibration = run_fits(output, session)
+    report = profile_path.with_name(f"{profile_path.name.removesuffix('.zip')}-report.html")
+    with output.stage("report"):
+        panel = session.rig.panel
+        unseen = face_picture(UNSEEN_PICTURE, panel.columns, panel.rows)
+        evidence = gather(session, calibration, unseen, None)
+        write_page(report, calibration_page(session, evidence, None))
+    show_status(output, calibration)
+    try:
+        store_profile(output, session, calibration, profile_path)
+    except FitError as error:
+        raise FitError(f"{error} No profile was written; the report {report} shows every term.") from error
+    output.say(f"Profile: {profile_path}\nReport: {report}")
+    output.result(FitSummary(session_path, profile_path, report, summaries(calibration), tuple(output.times)))
+
+
+def run_fits(output: Output, session: Session, effort: FitEffort | None = None) -> Calibration:
+    """All five fits, with a bar."""
+    with output.stage("fits") as stage:
+
+        def progress(term: TermName) -> None:
+            stage.update(ORDER.index(term), len(ORDER), f"fitting {term}")
+
+        calibration = fit_session(session, progress, effort)
+    for time in calibration.times:
+        output.say(f"  {time.term}: {time.seconds:.1f} s")
+    return calibration
+
+
+def store_profile(output: Output, session: Session, calibration: Calibration, path: Path) -> None:
+    """Write the profile of a calibration.
+
+    Raises:
+        FitError: when a term cannot be used.
+        ProfileError: when something else stands at ``path``.
+    """
+    with output.stage("profile"):
+        profile = build_profile(
+            calibration.rig,
+            provenance_now(session.path / MANIFEST_NAME, session.camera),
+            calibration.noise,
+            calibration.geometry,
+            calibration.wire,
+            calibration.psf,
+            calibration.backscatter,
+        )
+        write_profile(path, profile)
+
+
+def summaries(calibration: Calibration) -> tuple[TermSummary, ...]:
+    """The end of each term's fit."""
+    results = ((term, calibration.result(term)) for term in ORDER)
+    return tuple(TermSummary(t, r.status.name, r.status.value, r.chi2_dof, r.notes) for t, r in results)
+
+
+def show_status(output: Output, calibration: Calibration) -> None:
+    """One line per term."""
+    rows = tuple((s.term, s.status, f"{s.chi2_dof:.3f}", s.advice) for s in summaries(calibration))
+    output.table(Table("Fits", ("term", "status", "reduced χ²", "what it means"), rows, frozenset({2})))

@@ -1,0 +1,27 @@
+"""The picture that the panel showed, as a file given by a person."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import UInt8
+
+from udccal.errors import FileFormatError
+from udccal.io.png import read_rgb8
+from udccal.rig import RigDescription
+
+
+def read_panel_picture(path: Path, rig: RigDescription) -> UInt8[np.ndarray, "panel_rows panel_columns 3"]:
+    """Read an 8-bit RGB picture of the panel's own size.
+
+    Raises:
+        FileFormatError: when it cannot be read or has another size.
+    """
+    picture = read_rgb8(path)
+    if picture.shape[:2] != (rig.panel.rows, rig.panel.columns):
+        raise FileFormatError(
+            f"Expected {path} to have {rig.panel.columns} x {rig.panel.rows} pixels as the panel has, found "
+            f"{picture.shape[1]} x {picture.shape[0]}. Give the picture as the panel showed it."
+        )
+    return picture

@@ -1,0 +1,111 @@
+"""Restoring raw files one at a time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from jaxtyping import UInt16
+
+from udccal.cameras.files import read_raw
+from udccal.cli.jobs.panel_picture import read_panel_picture
+from udccal.cli.output import Output
+from udccal.errors import RestorationError
+from udccal.io.png import read_png16
+from udccal.profiles.store import read_profile
+from udccal.restoration.runtime import Restorer, check_frame
+from udccal.restoration.sinks import write_picture
+from udccal.restoration.tone import Tone, display_exposure
+from udccal.rig import RigDescription
+
+
+@dataclass(frozen=True)
+class RestoredFile:
+    """One restored frame."""
+
+    source: Path
+    picture: Path
+    exposure_s: float
+
+
+@dataclass(frozen=True)
+class RestoreSummary:
+    """What ``restore`` delivers."""
+
+    profile: Path
+    pictures: tuple[RestoredFile, ...]
+
+
+def restore_files(
+    output: Output,
+    images: list[Path],
+    profile_path: Path,
+    out: Path,
+    panel_picture: Path | None,
+    exposure_s: float | None,
+    picture_format: Literal["png", "exr"],
+) -> None:
+    """Restore every image with a profile and write it under ``out``, one by one.
+
+    Raises:
+        ProfileError: when the profile cannot be read.
+        FileFormatError: when an image or the panel's picture cannot be read.
+        RestorationError: when an image does not fit the profile's rig, or its exposure is not known.
+    """
+    profile = read_profile(profile_path)
+    shown = None if panel_picture is None else read_panel_picture(panel_picture, profile.rig)
+    targets = _targets(images, out, picture_format)
+    for image in images:  # so that a bad file is told before the long work begins
+        _checked_frame(image, exposure_s, profile.rig)
+    restored: list[RestoredFile] = []
+    with output.stage("restoring") as stage:
+        restorer = Restorer.from_profile(profile)
+        for index, (image, target) in enumerate(zip(images, targets, strict=True)):
+            stage.update(index, len(images), f"restoring {image.name}")
+            mosaic, exposure = _checked_frame(image, exposure_s, profile.rig)
+            picture = restorer.restore(mosaic, exposure, shown)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            write_picture(target, picture, Tone(display_exposure(picture)))
+            restored.append(RestoredFile(image, target, exposure))
+    for item in restored:
+        output.say(f"{item.source} -> {item.picture}")
+    output.result(RestoreSummary(profile_path, tuple(restored)))
+
+
+def _targets(images: list[Path], out: Path, picture_format: str) -> list[Path]:
+    """One file per image; refuses to let one overwrite another, or its own source."""
+    targets = [out / f"{image.stem}.{picture_format}" for image in images]
+    for index, (image, target) in enumerate(zip(images, targets, strict=True)):
+        if target in targets[:index] or target.resolve() == image.resolve():
+            raise RestorationError(
+                f"Expected names that differ in {out}, found {target.name} to be taken when restoring {image}. "
+                "Rename the image, or choose another folder."
+            )
+    return targets
+
+
+def _checked_frame(
+    image: Path, given_s: float | None, rig: RigDescription
+) -> tuple[UInt16[np.ndarray, "rows columns"], float]:
+    """A frame that belongs to the rig, and its exposure: the one given goes before the file's own."""
+    mosaic, in_file = _read_mosaic(image)
+    exposure = in_file if given_s is None else given_s
+    if exposure is None:
+        raise RestorationError(
+            f"Expected the exposure of {image} in the file or from --exposure-s, found neither. Add --exposure-s."
+        )
+    try:
+        check_frame(mosaic, exposure, rig)
+    except RestorationError as error:
+        raise RestorationError(f"{image}: {error}") from error
+    return mosaic, exposure
+
+
+def _read_mosaic(image: Path) -> tuple[UInt16[np.ndarray, "rows columns"], float | None]:
+    """A mosaic and the exposure its file states, if any."""
+    if image.suffix.lower() == ".png":
+        return read_png16(image), None
+    raw = read_raw(image)
+    return raw.data, raw.exposure_s

@@ -1,0 +1,69 @@
+"""What a profile holds, for people and for machines."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import get_args
+
+from udccal.cli.output import Output
+from udccal.profiles.store import read_profile
+from udccal.reports.fit_tables import estimates_table
+from udccal.sessions.schema import TermName
+
+
+@dataclass(frozen=True)
+class ShownEstimate:
+    """One quantity of a profile."""
+
+    term: str
+    name: str
+    value: float
+    sigma: float
+    unit: str
+
+
+@dataclass(frozen=True)
+class ShownTerm:
+    """How a term's fit ended."""
+
+    term: str
+    status: str
+    chi2_dof: float
+
+
+@dataclass(frozen=True)
+class ProfileSummary:
+    """What ``profile show`` delivers."""
+
+    profile: Path
+    rig: str
+    created_at: str
+    terms: tuple[ShownTerm, ...]
+    estimates: tuple[ShownEstimate, ...]
+    invalidated_by: tuple[str, ...]
+
+
+def show_profile(output: Output, path: Path) -> None:
+    """Print every term's status and every quantity with its unit and sigma.
+
+    Raises:
+        ProfileError: when the profile cannot be read.
+    """
+    profile = read_profile(path)
+    results = [(term, profile.result(term)) for term in get_args(TermName)]
+    output.say(f"Profile of {profile.rig.name}, made {profile.provenance.created_at}")
+    for term, result in results:
+        output.table(estimates_table(f"{term}: {result.status.name.lower().replace('_', ' ')}", result))
+    output.result(
+        ProfileSummary(
+            profile=path,
+            rig=profile.rig.name,
+            created_at=profile.provenance.created_at,
+            terms=tuple(ShownTerm(term, r.status.name, r.chi2_dof) for term, r in results),
+            estimates=tuple(
+                ShownEstimate(term, e.name, e.value, e.sigma, e.unit) for term, r in results for e in r.estimates
+            ),
+            invalidated_by=profile.invalidated_by,
+        )
+    )

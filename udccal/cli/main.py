@@ -1,0 +1,89 @@
+"""The command ``udccal``: its verbs, its global options, and what a person sees when something goes wrong."""
+
+from __future__ import annotations
+
+import json
+import sys
+import traceback
+from typing import Annotated
+
+import typer
+
+from udccal import __version__
+from udccal.cli.calibrate import calibrate
+from udccal.cli.demo import demo
+from udccal.cli.fit import fit
+from udccal.cli.output import Output
+from udccal.cli.profile import profile_app
+from udccal.cli.restore import restore
+from udccal.cli.simulate import simulate
+from udccal.errors import UdccalError
+
+_GLOBAL_FLAGS = ("--json", "--debug")
+
+app = typer.Typer(
+    name="udccal",
+    help="Calibrate a camera that looks through a transparent display, and restore what it sees.",
+    epilog="--json and --debug may also stand after the verb.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    add_completion=False,
+)
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        print(f"udccal {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def globals_(
+    context: typer.Context,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON on standard output.")] = False,
+    debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")] = False,
+    version: Annotated[
+        bool, typer.Option("--version", help="Print the version.", callback=_version, is_eager=True)
+    ] = False,
+) -> None:
+    """Calibrate a camera that looks through a transparent display, and restore what it sees."""
+    context.obj = Output(as_json=as_json, debug=debug)
+
+
+for _verb in (demo, calibrate, fit, restore, simulate):
+    app.command(no_args_is_help=_verb is not demo)(_verb)
+app.add_typer(profile_app, name="profile")
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Run the command and leave with its exit status: 0, 1 for a known failure, 2 for wrong usage, 70 for a bug."""
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    flags = [flag for flag in _GLOBAL_FLAGS if flag in given]
+    rest = [word for word in given if word not in _GLOBAL_FLAGS]
+    try:
+        app(args=[*flags, *rest], prog_name="udccal")
+    except UdccalError as error:
+        _fail(str(error), 1, flags)
+    except KeyboardInterrupt:
+        _fail("Stopped. Run the same command again to go on; completed steps of a session are kept.", 130, flags)
+    except Exception as error:
+        _fail(
+            f"Something unexpected went wrong ({type(error).__name__}). "
+            "Run the same command with --debug and report what it prints.",
+            70,
+            flags,
+        )
+
+
+def _fail(sentence: str, status: int, flags: list[str]) -> None:
+    """One sentence on standard error (the traceback before it with ``--debug``), and a non-zero exit status."""
+    if "--debug" in flags:
+        traceback.print_exc()
+    if "--json" in flags:
+        print(json.dumps({"error": sentence}), flush=True)
+    print(f"udccal: {' '.join(sentence.split())}", file=sys.stderr, flush=True)
+    sys.exit(status)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,117 @@
+"""What every verb prints: tables or JSON on standard output, progress and errors on standard error."""
+
+from __future__ import annotations
+
+import dataclasses
+import enum
+import json
+import math
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import PurePath
+from typing import Any
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+from rich.table import Table as RichTable
+
+from udccal.reports.tables import Table
+
+# Of tables that go to a file or a pipe.
+_FILE_WIDTH = 120
+
+
+@dataclass(frozen=True)
+class StageTime:
+    """How long one stage took."""
+
+    stage: str
+    seconds: float
+
+
+class Stage:
+    """A running stage with a progress bar; the total may become known on the way."""
+
+    def __init__(self, bar: Progress, name: str) -> None:
+        self._bar = bar
+        self._task = bar.add_task(name, total=None)
+
+    def update(self, done: int, total: int | None = None, text: str | None = None) -> None:
+        """Move the bar to ``done`` of ``total`` and say what is being done."""
+        self._bar.update(self._task, completed=done, total=total)
+        if text is not None:
+            self._bar.update(self._task, description=text)
+
+
+@dataclass
+class Output:
+    """Where a verb prints to, and how."""
+
+    as_json: bool = False
+    debug: bool = False
+    times: list[StageTime] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self._people = Console(stderr=True)
+        self._standard = Console(width=None if sys.stdout.isatty() else _FILE_WIDTH)
+
+    def say(self, sentence: str) -> None:
+        """A sentence for the person watching, on standard error."""
+        self._people.print(sentence, highlight=False, markup=False, soft_wrap=True)
+
+    def table(self, table: Table) -> None:
+        """A table for people on standard output; nothing with ``--json``."""
+        if self.as_json:
+            return
+        shown = RichTable(title=table.title, title_justify="left", title_style="bold")
+        for index, column in enumerate(table.columns):
+            shown.add_column(column, justify="right" if index in table.right else "left")
+        for row in table.rows:
+            shown.add_row(*row)
+        self._standard.print(shown, markup=False)
+
+    def result(self, result: object) -> None:
+        """The machine-readable result (a dataclass), on standard output with ``--json`` only."""
+        if self.as_json:
+            print(json.dumps(plain(result), indent=2, allow_nan=False), flush=True)
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[Stage]:
+        """A stage that may take more than a second: shows a bar while it runs and notes how long it took."""
+        start = time.perf_counter()
+        columns = (
+            SpinnerColumn(),
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TimeElapsedColumn(),
+        )
+        off = not self._people.is_terminal  # a file or pipe gets the times only
+        with Progress(*columns, console=self._people, transient=True, disable=off) as bar:
+            yield Stage(bar, name)
+        self.times.append(StageTime(name, time.perf_counter() - start))
+        self.say(f"{name}: {self.times[-1].seconds:.1f} s")
+
+
+def plain(value: object) -> Any:
+    """A dataclass, path, enumeration, number or sequence as JSON's own types; numbers that are not finite become null.
+
+    Raises:
+        TypeError: for anything else.
+    """
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {item.name: plain(getattr(value, item.name)) for item in dataclasses.fields(value)}
+    if isinstance(value, enum.Enum):
+        return value.name
+    if isinstance(value, PurePath):
+        return str(value)
+    if isinstance(value, (list, tuple)):
+        return [plain(item) for item in value]
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if value is None or isinstance(value, (str, int)):
+        return value
+    raise TypeError(f"expected a value that JSON can hold, found {type(value).__name__}")

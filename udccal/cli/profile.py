@@ -1,0 +1,26 @@
+"""``udccal profile``: looks into profiles."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+profile_app = typer.Typer(help="Look into a profile.", no_args_is_help=True, pretty_exceptions_enable=False)
+
+
+@profile_app.callback()
+def profile() -> None:
+    """Look into a profile."""
+
+
+@profile_app.command(no_args_is_help=True)
+def show(
+    context: typer.Context,
+    path: Annotated[Path, typer.Argument(metavar="PROFILE", help="Folder or zip file of the profile.")],
+) -> None:
+    """Show what a profile holds: every term's status, and every quantity with its unit and sigma."""
+    from udccal.cli.jobs.show import show_profile
+
+    show_profile(context.obj, path)

@@ -1,0 +1,37 @@
+"""``udccal restore``: raw frames to clean pictures."""
+
+from __future__ import annotations
+
+import enum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from udccal.cli.options import OutFolder, PanelPicturePath, ProfilePath
+
+
+class PictureFormat(enum.StrEnum):
+    """How restored pictures are written: display-encoded 8-bit PNG, or linear OpenEXR in e-/s."""
+
+    png = "png"
+    exr = "exr"
+
+
+def restore(
+    context: typer.Context,
+    images: Annotated[list[Path], typer.Argument(metavar="IMAGE...", help="Raw mosaics: 16-bit PNG, or DNG.")],
+    profile: ProfilePath,
+    out: OutFolder,
+    panel_picture: PanelPicturePath = None,
+    exposure_s: Annotated[
+        float | None, typer.Option("--exposure-s", min=1e-7, help="Exposure of the frames, where the file has none.")
+    ] = None,
+    picture_format: Annotated[
+        PictureFormat, typer.Option("--format", help="png: for looking at. exr: linear light in e-/s.")
+    ] = PictureFormat.png,
+) -> None:
+    """Restore raw frames with a rig's profile."""
+    from udccal.cli.jobs.restore import restore_files
+
+    restore_files(context.obj, images, profile, out, panel_picture, exposure_s, picture_format.value)

@@ -1,0 +1,24 @@
+"""``udccal simulate``: a photograph as a simulated rig would see it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from udccal.cli.options import OutFolder, PanelPicturePath, RigName, Seed
+
+
+def simulate(
+    context: typer.Context,
+    images: Annotated[list[Path], typer.Argument(metavar="IMAGE...", help="Photographs: PNG, JPEG, HDR or EXR.")],
+    rig: RigName,
+    out: OutFolder,
+    panel_picture: PanelPicturePath = None,
+    seed: Seed = 0,
+) -> None:
+    """Degrade photographs as a simulated rig would see them: a raw mosaic, a preview, and the ideal view."""
+    from udccal.cli.jobs.simulate import simulate_files
+
+    simulate_files(context.obj, images, rig, out, panel_picture, seed)

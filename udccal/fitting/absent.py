@@ -1,0 +1,73 @@
+"""Terms that do nothing: what stands where a session has no steps for a term."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from udccal.fitting.wire_harmonics import wire_start
+from udccal.fitting.wire_phase import ideal_wire
+from udccal.models.backscatter import Backscatter
+from udccal.models.diffraction import Diffraction
+from udccal.models.geometry import Geometry
+from udccal.models.psf import PsfField
+from udccal.models.wire import Wire
+from udccal.rig import RigDescription
+
+
+def absent_wire(rig: RigDescription, geometry: Geometry) -> Wire:
+    """A wire map that is 1 everywhere: a panel that is open all over."""
+    ideal = ideal_wire(geometry, wire_start(rig), np.zeros((0, 2)))
+    return replace(ideal, row_open=np.float64(1.0), column_open=np.float64(1.0), depth_per_pitch=np.float64(0.0))
+
+
+def absent_psf(rig: RigDescription, geometry: Geometry) -> PsfField:
+    """A kernel that is a single pixel everywhere; its diffraction is the rig's nominal one and has no share in it."""
+    panel, camera = rig.panel, rig.camera
+    half = np.array([camera.columns - 1, camera.rows - 1]) / 2.0
+    wavelengths_nm = np.linspace(400.0, 700.0, 4)
+    return PsfField(
+        geometry=geometry,
+        diffraction=Diffraction(
+            pitch_mm=np.float64(panel.pitch_mm.value),
+            open_fraction=np.array([panel.column_open_fraction.value, panel.row_open_fraction.value]),
+            thickness_mm=np.float64(panel.structure_thickness_mm.value),
+            pupil_mm=np.float64(rig.pupil_mm),
+            offset=np.zeros(2),
+            standoff_per_pitch=np.float64(rig.mounting.standoff_mm.value / panel.pitch_mm.value),
+            visibility=np.float64(0.0),
+            blur_px=np.float64(0.0),
+            wavelengths_nm=wavelengths_nm,
+            spectrum=np.full((3, len(wavelengths_nm)), 1.0 / len(wavelengths_nm)),
+        ),
+        diffraction_share=np.float64(0.0),
+        residual=np.ones((1, 3, 1, 1)),
+        centre_px=half,
+        half_px=half,
+        degree=0,
+    )
+
+
+def absent_backscatter(rig: RigDescription, geometry: Geometry) -> Backscatter:
+    """A panel that sends no light back, with the rig's nominal measures."""
+    panel, camera = rig.panel, rig.camera
+    step = min(camera.columns, camera.rows) // 2
+    return Backscatter(
+        geometry=geometry,
+        mask=np.zeros((3, camera.rows // step, camera.columns // step)),
+        mix=np.eye(3),
+        gamma=np.float64(panel.gamma.value),
+        pitch_mm=np.float64(panel.pitch_mm.value),
+        pupil_mm=np.float64(rig.pupil_mm),
+        distance_mm=np.float64(rig.mounting.standoff_mm.value),
+        emitters_px=np.zeros((3, 2)),
+        softness_px=np.float64(0.2),
+        reflection=np.float64(0.0),
+        reflection_mm=np.float64(0.0),
+        columns=camera.columns,
+        rows=camera.rows,
+        cfa=camera.cfa,
+        step=step,
+        window=1,
+    )

@@ -1,0 +1,183 @@
+"""What the backscatter fit looks at: binned rates of the panel's light, colour by colour, and what the panel showed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+
+from udccal.cfa import cell_channels
+from udccal.models.backscatter import Backscatter, footprints, grid_positions
+from udccal.models.geometry import Geometry, panel_directions
+from udccal.models.noise import Noise
+from udccal.models.wire import Wire, wire_map
+from udccal.numerics import in_float64
+from udccal.rig import RigDescription
+from udccal.sessions.schema import DarkSubject, PanelSubject, StoredStep
+from udccal.sessions.store import Session
+
+# Panel pixels around the nominally visible part that are kept: the footprint's own size and the nominal's tolerances.
+_MARGIN_PX = 12
+# Part of saturation from which a mean counts as clipped.
+_CLIPPED = 0.98
+
+
+@dataclass(frozen=True)
+class Binned:
+    """Rates in e-/s on the term's grid by camera colour, their variance, and how much of the frame was clipped."""
+
+    rate: Float[np.ndarray, "3 grid_rows grid_columns"]
+    variance: Float[np.ndarray, "3 grid_rows grid_columns"]
+    clipped: float
+
+
+@dataclass(frozen=True)
+class PanelCrop:
+    """The part of the panel that the camera can see: its first pixel and its size."""
+
+    column: int
+    row: int
+    columns: int
+    rows: int
+
+    def of(self, picture: UInt8[np.ndarray, "panel_rows panel_columns 3"]) -> UInt8[np.ndarray, "rows columns 3"]:
+        """That part of a picture."""
+        return picture[self.row : self.row + self.rows, self.column : self.column + self.columns].copy()
+
+
+@dataclass(frozen=True)
+class PanelShots:
+    """White, and the pictures with what the camera saw of them."""
+
+    white: Binned
+    seen: tuple[Binned, ...]
+    shown: UInt8[np.ndarray, "pictures crop_rows crop_columns 3"]
+    crop: PanelCrop
+
+
+def read_shots(session: Session, noise: Noise, crop: PanelCrop, wire: Wire) -> PanelShots | None:
+    """Bin every picture of a session, one at a time; None when white or dark was not captured.
+
+    Raises:
+        SessionError: when a file is missing or damaged.
+    """
+    panels = [(step, step.subject) for step in session.steps("backscatter") if isinstance(step.subject, PanelSubject)]
+    white = [step for step, subject in panels if subject.role == "white"]
+    dark = [step for step in session.steps("backscatter") if isinstance(step.subject, DarkSubject)]
+    if not white or not dark:
+        return None
+    camera = session.rig.camera
+    gain, saturation = float(np.asarray(noise.K_DN_per_e)), float(np.asarray(noise.saturation_DN))
+    shading = sensor_map(wire, camera.rows, camera.columns)
+    dark_mean = session.average(dark[0].captures[0]).mean.astype(np.float64)
+
+    def binned(step: StoredStep) -> Binned:
+        capture = step.captures[0]
+        average = session.average(capture)
+        to_rate = 1.0 / (gain * capture.exposure_s * shading)
+        variance = average.variance / average.frames * to_rate**2
+        clipped = float(np.mean(average.mean >= _CLIPPED * saturation))
+        rate = (average.mean - dark_mean) * to_rate
+        return bin_rate(rate, variance, clipped, camera.cfa, grid_step(session.rig))
+
+    others = [(step, subject) for step, subject in panels if subject.role != "white"]
+    shown = [crop.of(session.picture(subject)) for _, subject in others]
+    empty = np.zeros((0, crop.rows, crop.columns, 3), np.uint8)
+    return PanelShots(
+        white=binned(white[0]),
+        seen=tuple(binned(step) for step, _ in others),
+        shown=np.stack(shown) if shown else empty,
+        crop=crop,
+    )
+
+
+@in_float64
+def sensor_map(wire: Wire, rows: int, columns: int) -> Float[np.ndarray, "rows columns"]:
+    """The wire over the whole sensor."""
+    return np.asarray(wire_map(wire, rows, columns), dtype=np.float64)
+
+
+def grid_step(rig: RigDescription) -> int:
+    """Spacing of the grid in sensor px: even, near an eighth of the panel rows' period, and leaving little over."""
+    camera = rig.camera
+    period = rig.panel.pitch_mm.value / rig.mounting.standoff_mm.value * rig.focal_px
+    largest = max(4, int(period / 8))
+    choices = range(2 * (largest // 2), max(2, int(0.6 * largest)), -2)
+    return min(choices, key=lambda step: camera.columns % step + camera.rows % step)
+
+
+def bin_rate(
+    rate: Float[np.ndarray, "rows columns"],
+    variance: Float[np.ndarray, "rows columns"],
+    clipped: float,
+    cfa: str,
+    step: int,
+) -> Binned:
+    """Average a mosaic over blocks of ``step`` x ``step`` (even) pixels per colour."""
+    rows, columns = (size // step for size in rate.shape)
+    sums = np.zeros((2, 3, rows, columns))
+    sites = np.zeros(3)
+    for (j, i), channel in np.ndenumerate(cell_channels(cfa)):
+        sites[channel] += 1
+        for k, plane in enumerate((rate, variance)):
+            part = plane[j : rows * step : 2, i : columns * step : 2].astype(np.float64)
+            blocks = part.reshape(rows, step // 2, columns, step // 2)
+            sums[k, channel] += blocks.mean(axis=(1, 3))
+    samples = (sites * (step // 2) ** 2)[:, None, None]
+    return Binned(sums[0] / sites[:, None, None], sums[1] / sites[:, None, None] / samples, clipped)
+
+
+@in_float64
+def visible_crop(geometry: Geometry, rig: RigDescription) -> PanelCrop:
+    """The part of the panel that any sensor pixel may see, with room for the tolerances of the mounting."""
+    camera, panel = rig.camera, rig.panel
+    edge_x, edge_y = np.linspace(0, camera.columns - 1, 9), np.linspace(0, camera.rows - 1, 9)
+    pixels = np.stack(np.meshgrid(edge_x, edge_y), axis=-1).reshape(-1, 2)
+    template = nominal_term(geometry, rig, np.zeros((3, 2, 2)), grid_step(rig), window=1)
+    centre = np.asarray(footprints(template, panel_directions(geometry, pixels), rig.mounting.standoff_mm.value)[0])
+    first = np.floor(centre.min(axis=0)).astype(int) - _MARGIN_PX
+    last = np.ceil(centre.max(axis=0)).astype(int) + _MARGIN_PX
+    first = np.clip(first, 0, [panel.columns - 8, panel.rows - 8])
+    last = np.clip(last, first + 8, [panel.columns, panel.rows])
+    return PanelCrop(int(first[0]), int(first[1]), int(last[0] - first[0]), int(last[1] - first[1]))
+
+
+def nominal_term(
+    geometry: Geometry, rig: RigDescription, mask: Float[np.ndarray, "3 a b"], step: int, window: int
+) -> Backscatter:
+    """A term with the rig's nominal measures and the mask given: where the fit starts."""
+    panel = rig.panel
+    return Backscatter(
+        geometry=geometry,
+        mask=mask,
+        mix=np.eye(3),
+        gamma=np.float64(panel.gamma.value),
+        pitch_mm=np.float64(panel.pitch_mm.value),
+        pupil_mm=np.float64(rig.pupil_mm),
+        distance_mm=np.float64(rig.mounting.standoff_mm.value),
+        emitters_px=np.zeros((3, 2)),
+        softness_px=np.float64(0.15),
+        reflection=np.float64(0.5),
+        reflection_mm=np.float64(2 * panel.glass_thickness_mm / panel.glass_index),
+        columns=rig.camera.columns,
+        rows=rig.camera.rows,
+        cfa=rig.camera.cfa,
+        step=step,
+        window=window,
+    )
+
+
+@in_float64
+def sampled_rays(
+    geometry: Geometry, rig: RigDescription, step: int, count: int
+) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, " n"]]:
+    """About ``count`` grid positions spread evenly (the R2 sequence): their rays and flat grid indices."""
+    x, y = (np.asarray(axis) for axis in grid_positions(rig.camera.columns, rig.camera.rows, step))
+    plastic = 1.32471795724474602596
+    sequence = (0.5 + np.arange(count)[:, None] / np.array([plastic, plastic**2])) % 1.0
+    columns, rows = (sequence * [len(x), len(y)]).astype(int).T
+    flat = np.unique(rows * len(x) + columns)
+    rows, columns = np.divmod(flat, len(x))
+    rays = panel_directions(geometry, np.stack([x[columns], y[rows]], axis=1))
+    return np.asarray(rays, dtype=np.float64), flat

@@ -1,0 +1,146 @@
+"""All five fits of a session, each with what the ones before it found: noise, geometry, wire, psf, backscatter."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import TypeVar, get_args
+
+import numpy as np
+
+from udccal.fitting.absent import absent_backscatter, absent_psf, absent_wire
+from udccal.fitting.backscatter import fit_backscatter
+from udccal.fitting.geometry import fit_geometry
+from udccal.fitting.noise import fit_noise, nominal_noise
+from udccal.fitting.nominal import nominal_geometry
+from udccal.fitting.psf import Effort, fit_psf
+from udccal.fitting.result import FitResult, FitStatus
+from udccal.fitting.wire import FIELD_SAMPLES, fit_wire
+from udccal.models.backscatter import Backscatter
+from udccal.models.geometry import Geometry
+from udccal.models.noise import Noise
+from udccal.models.psf import PsfField
+from udccal.models.wire import Wire
+from udccal.rig import RigDescription
+from udccal.sessions.schema import TermName
+from udccal.sessions.store import Session
+
+Term = TypeVar("Term")
+ORDER: tuple[TermName, ...] = get_args(TermName)
+
+
+@dataclass(frozen=True)
+class FitEffort:
+    """What the fits may spend; less is quicker and less accurate.
+
+    Attributes:
+        wire_samples: pixels that the wire's fields are fitted to.
+        psf: see ``udccal.fitting.psf.Effort``.
+        backscatter_positions: sensor positions that the footprint is fitted at.
+    """
+
+    wire_samples: int = FIELD_SAMPLES
+    psf: Effort = field(default_factory=Effort)
+    backscatter_positions: int = 96
+
+
+# For a demonstration.
+QUICK = FitEffort(wire_samples=100_000, psf=Effort(positions=8, shifts=2, iterations=8), backscatter_positions=32)
+
+
+@dataclass(frozen=True)
+class FitTime:
+    """How long one term's fit took."""
+
+    term: TermName
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """The five results of one session, and how long each took."""
+
+    rig: RigDescription
+    noise: FitResult[Noise]
+    geometry: FitResult[Geometry]
+    wire: FitResult[Wire]
+    psf: FitResult[PsfField]
+    backscatter: FitResult[Backscatter]
+    times: tuple[FitTime, ...]
+
+    def result(self, term: TermName) -> FitResult:
+        """The result of a term by its name."""
+        results: dict[TermName, FitResult] = {
+            "noise": self.noise,
+            "geometry": self.geometry,
+            "wire": self.wire,
+            "psf": self.psf,
+            "backscatter": self.backscatter,
+        }
+        return results[term]
+
+    def or_raise(self) -> Calibration:
+        """Itself when every term can be used.
+
+        Raises:
+            FitError: with the advice of the first bad status otherwise.
+        """
+        for term in ORDER:
+            self.result(term).or_raise(term)
+        return self
+
+
+def fit_session(
+    session: Session, progress: Callable[[TermName], None] = lambda term: None, effort: FitEffort | None = None
+) -> Calibration:
+    """Fit every term of a session; a term without steps gets its nominal or absent form, a note and status ABSENT.
+
+    Args:
+        session: what was captured.
+        progress: called with a term's name when its fit begins.
+        effort: what the fits may spend.
+
+    Raises:
+        SessionError: when a file of the session is missing or damaged.
+    """
+    rig, effort = session.rig, effort or FitEffort()
+    times: list[FitTime] = []
+
+    def run(term: TermName, fit: Callable[[], FitResult[Term]], otherwise: Callable[[], Term]) -> FitResult[Term]:
+        progress(term)
+        start = time.perf_counter()
+        result = fit() if session.steps(term) else _left_out(term, otherwise())
+        times.append(FitTime(term, time.perf_counter() - start))
+        return result
+
+    noise = run("noise", lambda: fit_noise(session), lambda: nominal_noise(rig))
+    geometry = run("geometry", lambda: fit_geometry(session, noise.term), lambda: nominal_geometry(rig))
+    wire = run(
+        "wire",
+        lambda: fit_wire(session, noise.term, geometry.term, effort.wire_samples),
+        lambda: absent_wire(rig, geometry.term),
+    )
+    psf = run(
+        "psf",
+        lambda: fit_psf(session, noise.term, geometry.term, wire.term, effort.psf),
+        lambda: absent_psf(rig, geometry.term),
+    )
+    backscatter = run(
+        "backscatter",
+        lambda: fit_backscatter(session, noise.term, geometry.term, wire.term, effort.backscatter_positions),
+        lambda: absent_backscatter(rig, geometry.term),
+    )
+    return Calibration(rig, noise, geometry, wire, psf, backscatter, tuple(times))
+
+
+def _left_out(name: TermName, term: Term) -> FitResult[Term]:
+    return FitResult(
+        term=term,
+        status=FitStatus.ABSENT,
+        estimates=(),
+        cov=np.zeros((0, 0)),
+        chi2_dof=0.0,
+        samples=0,
+        notes=(f"The session has no {name} steps; the term stands at what the rig description says, or is absent.",),
+    )

@@ -1,0 +1,202 @@
+"""Normal equations of the diffraction fit, one field position at a time.
+
+The kernel is linear in the spectra, so one evaluation for every wavelength node serves all colours and all their
+derivatives. The few other parameters are differentiated by forward differences, one after the other: a compiled loop
+that is far smaller than the derivative of the whole computation would be.
+"""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from jaxtyping import ArrayLike as Arrayish
+
+from udccal.fitting.psf_blocks import HEAD, Block, Local, unpack
+from udccal.models.diffraction import Diffraction, LocalFrame, average_transfer
+from udccal.models.interference import interference_transfer, node_overlaps, overlap_tables
+from udccal.models.lattice import Lattice, sample, spline_coefficients
+
+_HUBER = 3.0
+# Forward differences: pitch, open fractions, thickness, pupil, blur, footprint (x, y, stand-off), place (x, y).
+_STEPS = np.array([1e-5, 1e-5, 1e-5, 1e-5, 1e-4, 1e-3, 1e-4, 1e-4, 1e-4, 1e-4, 1e-4])
+
+
+class Evaluator(eqx.Module):
+    """What stays the same from call to call.
+
+    Attributes:
+        wavelengths_nm: nodes of the spectra.
+        model_error: see ``weighted``.
+        lattice: for the transfer functions.
+        interference: whether the footprint's place on the rows is known.
+    """
+
+    wavelengths_nm: Float[Arrayish, " nodes"]
+    model_error: Float[Arrayish, ""]
+    lattice: Lattice = eqx.field(static=True)
+    interference: bool = eqx.field(static=True)
+
+    def model(self, theta: Float[Arrayish, " p"]) -> Diffraction:
+        """The model that a vector of global parameters stands for."""
+        return unpack(theta, self.wavelengths_nm, self.interference)
+
+
+class Normal(eqx.Module):
+    """Sums over samples of products of derivatives: global x global, global x local, local x local."""
+
+    gg: Float[Array, "p p"]
+    gl: Float[Array, "shots p l"]
+    ll: Float[Array, "shots l l"]
+    g: Float[Array, " p"]
+    l: Float[Array, "shots l"]  # noqa: E741
+    cost: Float[Array, ""]
+
+
+@eqx.filter_jit
+def overlaps_of(
+    evaluator: Evaluator, theta: Float[Arrayish, " p"], frame: LocalFrame
+) -> Float[Array, "nodes terms rows half"]:
+    """The slow part of interference, in single precision: it hardly changes in the course of a fit."""
+    model = evaluator.model(theta)
+    if not evaluator.interference:
+        return jnp.zeros((0, 0, 0, 0), jnp.float32)
+    tables = overlap_tables(model, frame)
+    return node_overlaps(model, frame, evaluator.lattice, tables).astype(jnp.float32)
+
+
+@eqx.filter_jit
+def kernel_coefficients(
+    evaluator: Evaluator,
+    theta: Float[Arrayish, " p"],
+    block: Block,
+    overlaps: Float[Arrayish, "n_nodes n_terms n_rows n_half"],
+) -> Float[Array, "rows columns 3"]:
+    """The three colours' kernel on the lattice."""
+    model = evaluator.model(theta)
+    return _coefficients(evaluator, model, block, jnp.asarray(model.spectrum), overlaps)
+
+
+def _coefficients(
+    evaluator: Evaluator,
+    model: Diffraction,
+    block: Block,
+    spectra: Float[Array, "c nodes"],
+    overlaps: Float[Arrayish, "n_nodes n_terms n_rows n_half"],
+) -> Float[Array, "rows columns c"]:
+    transfer = average_transfer(model, block.frame, evaluator.lattice, spectra, block.disc_px)
+    if evaluator.interference:
+        transfer = transfer + interference_transfer(
+            model, block.frame, evaluator.lattice, spectra, overlaps, block.disc_px
+        )
+    return spline_coefficients(evaluator.lattice, transfer)
+
+
+def _sampled(
+    evaluator: Evaluator,
+    block: Block,
+    coefficients: Float[Array, "rows columns c"],
+    offset_px: Float[Array, "shots 2"],
+) -> Float[Array, "shots n c"]:
+    """What one unit of light brings to every sample."""
+    points = jnp.asarray(block.points) - (offset_px @ jnp.asarray(block.slope).T)[:, None]
+    values = sample(evaluator.lattice, coefficients, points.reshape(-1, 2)).reshape(*points.shape[:2], -1)
+    return values * jnp.asarray(block.density)[..., None]
+
+
+@eqx.filter_jit
+def normal_equations(
+    evaluator: Evaluator,
+    theta: Float[Arrayish, " p"],
+    block: Block,
+    local: Local,
+    overlaps: Float[Arrayish, "n_nodes n_terms n_rows n_half"],
+) -> Normal:
+    """One field position's share of the Gauss-Newton equations, with Huber's weights; see ``weighted``."""
+    theta, offset, colour = jnp.asarray(theta), jnp.asarray(local.offset_px), jnp.asarray(block.colour)
+    spectra = jnp.asarray(evaluator.model(theta).spectrum)
+    every = jnp.eye(spectra.shape[1], dtype=theta.dtype)
+    nodes = _sampled(evaluator, block, _coefficients(evaluator, evaluator.model(theta), block, every, overlaps), offset)
+    unit = jnp.einsum("snj,cj,snc->sn", nodes, spectra, colour)
+
+    def difference(step: Float[Array, " head_and_move"]) -> Float[Array, "shots n"]:
+        model = evaluator.model(theta + jnp.concatenate([step[:HEAD], jnp.zeros(theta.size - HEAD)]))
+        moved = _sampled(
+            evaluator, block, _coefficients(evaluator, model, block, spectra, overlaps), offset + step[HEAD:]
+        )
+        return (jnp.sum(moved * colour, axis=-1) - unit) / jnp.sum(step)
+
+    slopes = jnp.moveaxis(jax.lax.map(difference, jnp.diag(jnp.asarray(_STEPS))), 0, -1)
+    by_logs = jnp.einsum("snc,cj,snj->sncj", colour, spectra, nodes - unit[..., None])
+    flux = jnp.einsum("snc,sc->sn", colour, jnp.asarray(local.flux))
+    by_global = flux[..., None] * jnp.concatenate([slopes[..., :HEAD], by_logs.reshape(*unit.shape, -1)], axis=-1)
+    by_local = _by_local(block, local, unit, slopes[..., HEAD:])
+    weight, residual = weighted(evaluator, block, local, unit)
+    size = jnp.abs(residual) * jnp.sqrt(weight)
+    huber = weight * jnp.minimum(1.0, _HUBER / jnp.maximum(size, 1e-12))
+    return Normal(
+        gg=jnp.einsum("snp,sn,snq->pq", by_global, huber, by_global),
+        gl=jnp.einsum("snp,sn,snl->spl", by_global, huber, by_local),
+        ll=jnp.einsum("snk,sn,snl->skl", by_local, huber, by_local),
+        g=jnp.einsum("snp,sn->p", by_global, huber * residual),
+        l=jnp.einsum("snl,sn->sl", by_local, huber * residual),
+        cost=jnp.sum(jnp.where(size < _HUBER, size**2, 2.0 * _HUBER * size - _HUBER**2)),
+    )
+
+
+@eqx.filter_jit
+def local_equations(
+    evaluator: Evaluator, block: Block, local: Local, coefficients: Float[Arrayish, "rows columns 3"]
+) -> tuple[Float[Array, "shots l l"], Float[Array, "shots l"]]:
+    """Normal matrix and right side of every shot's own unknowns for a given kernel."""
+    coefficients = jnp.asarray(coefficients)
+
+    def light(move: Float[Array, "2"]) -> Float[Array, "shots n"]:
+        values = _sampled(evaluator, block, coefficients, jnp.asarray(local.offset_px) + move)
+        return jnp.sum(values * block.colour, axis=-1)
+
+    unit, by_move = light(jnp.zeros(2)), jax.jacfwd(light)(jnp.zeros(2))
+    by_local = _by_local(block, local, unit, by_move)
+    weight, residual = weighted(evaluator, block, local, unit)
+    huber = weight * jnp.minimum(1.0, _HUBER / jnp.maximum(jnp.abs(residual) * jnp.sqrt(weight), 1e-12))
+    matrix = jnp.einsum("snk,sn,snl->skl", by_local, huber, by_local)
+    return matrix, jnp.einsum("snl,sn->sl", by_local, huber * residual)
+
+
+@eqx.filter_jit
+def unit_light(
+    evaluator: Evaluator,
+    block: Block,
+    offset_px: Float[Arrayish, "shots 2"],
+    coefficients: Float[Arrayish, "rows columns 3"],
+) -> Float[Array, "shots n"]:
+    """What one unit of light of its own colour brings to every sample."""
+    values = _sampled(evaluator, block, jnp.asarray(coefficients), jnp.asarray(offset_px))
+    return jnp.sum(values * block.colour, axis=-1)
+
+
+def _by_local(
+    block: Block, local: Local, unit: Float[Array, "shots n"], by_move: Float[Array, "shots n 2"]
+) -> Float[Array, "shots n l"]:
+    flux = jnp.einsum("snc,sc->sn", block.colour, jnp.asarray(local.flux))
+    own = [flux[..., None] * by_move, unit[..., None] * block.colour, jnp.ones_like(unit)[..., None]]
+    return jnp.concatenate(own, axis=-1)
+
+
+def weighted(
+    evaluator: Evaluator, block: Block, local: Local, unit: Float[Array, "shots n"]
+) -> tuple[Float[Array, "shots n"], Float[Array, "shots n"]]:
+    """Inverse variances, and data less expectation.
+
+    What the model leaves out matters the more, relatively, the fainter a sample is: its standard deviation is taken as
+    ``model_error`` times expectation^(3/4) peak^(1/4), e.g. at 10^-4 of the peak ten times ``model_error``.
+    """
+    light = unit * jnp.einsum("snc,sc->sn", block.colour, jnp.asarray(local.flux))
+    known = jnp.asarray(block.weight) > 0
+    size = jnp.where(known, jnp.maximum(light, 0.0), 0.0)
+    left_out = evaluator.model_error * (size + 1e-30) ** 0.75 * jnp.max(size, axis=1, keepdims=True) ** 0.25
+    variance = 1.0 / jnp.where(known, block.weight, 1.0) + left_out**2
+    residual = block.rate - light - jnp.asarray(local.background)[:, None]
+    return jnp.where(known, 1.0 / variance, 0.0), residual

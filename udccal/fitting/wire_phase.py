@@ -1,0 +1,229 @@
+"""The wire's shape: where the rays meet the panel, and how large pupil and openings are.
+
+A scan by demodulation finds stand-off and origin; Gauss-Newton refines them with everything else, on a sample.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from udccal.fitting.wire_basis import (
+    SHAPE_PARAMETERS,
+    Basis,
+    Normal,
+    Pixels,
+    accumulate,
+    merit,
+    move,
+    residuals,
+)
+from udccal.fitting.wire_harmonics import FIELD_DEGREES, SMOOTH_DEGREE, WireStart, plain_basis
+from udccal.models.geometry import Geometry
+from udccal.models.wire import Wire, carriers, kappa, slopes, waves
+
+# How far the geometry's own rotation may be off (rad); origin in periods: unknown.
+_ROTATION_PRIOR, _ORIGIN_PRIOR = 0.02, 0.5
+# The rig's tolerances are bounds on a careful build; the fit may go somewhat beyond.
+_PRIOR_WIDENING = 2.0
+_SCAN_STEP = 0.003
+_PUPILS = 7
+_OUTLIER = 6.0
+_ROUNDS = 15
+# Chi-squared that the first harmonic must explain in the scan; chance does not reach a third of it in 300 trials.
+LEAST_GAIN = 100.0
+
+
+@dataclass(frozen=True)
+class PhaseFit:
+    """A wire whose shape is final, the site gains, the covariance of the shape parameters, and the evidence."""
+
+    wire: Wire
+    gains: Float[np.ndarray, "4"]
+    cov: Float[np.ndarray, "10 10"]
+    gain_in_chi2: float
+    variance: float
+    converged: bool
+    iterations: int
+
+
+_kappa = jax.jit(lambda wire, ideal: kappa(wire, slopes(wire, ideal)))
+
+
+def ideal_wire(geometry: Geometry, start: WireStart, harmonics: Float[np.ndarray, "harmonics 2"]) -> Wire:
+    """The rig as built, with a round pupil."""
+    fields = np.zeros((len(harmonics), 2, 2, FIELD_DEGREES))
+    fields[:, 0, 0, 0] = 1.0
+    return Wire(
+        geometry=geometry,
+        rotation=np.zeros(3),
+        standoff_per_pitch=np.float64(start.standoff_per_pitch),
+        offset=np.zeros(2),
+        pupil_per_pitch=np.float64(start.pupil_per_pitch),
+        row_open=np.float64(start.row_open),
+        column_open=np.float64(start.column_open),
+        depth_per_pitch=np.float64(start.depth_per_pitch),
+        harmonics=harmonics,
+        frequency=np.tile([0.0, 1.0], (len(harmonics), 1)),
+        fields=fields,
+        baseline=np.zeros((SMOOTH_DEGREE + 1, SMOOTH_DEGREE + 1)),
+    )
+
+
+def with_harmonics(wire: Wire, harmonics: Float[np.ndarray, "harmonics 2"], pixels: Pixels) -> Wire:
+    """The same shape with other harmonics of a round pupil, and their ranges of kappa over the sample."""
+    fields = np.zeros((len(harmonics), 2, 2, FIELD_DEGREES))
+    fields[:, 0, 0, 0] = 1.0
+    unknown = np.tile([0.0, 1.0], (len(harmonics), 1))
+    wire = eqx.tree_at(lambda w: (w.harmonics, w.frequency, w.fields), wire, (harmonics, unknown, fields))
+    seen = np.asarray(_kappa(wire, pixels.ideal[:: max(1, len(pixels.ideal) // 2048)][:2048]))
+    low, high = seen.min(axis=1), seen.max(axis=1)
+    frequency = np.stack([(low + high) / 2, np.maximum(0.51 * (high - low), 0.01)], axis=1)
+    return eqx.tree_at(lambda w: w.frequency, wire, frequency)
+
+
+def add_increment(
+    wire: Wire, gains: Float[np.ndarray, "4"], basis: Basis, values: Float[np.ndarray, " n"]
+) -> tuple[Wire, Float[np.ndarray, "4"]]:
+    """Apply a solution of the linear problem (columns of ``basis`` only)."""
+    smooth = len(basis.baseline)
+    baseline, fields = np.array(wire.baseline), np.array(wire.fields)
+    baseline[basis.baseline[:, 0], basis.baseline[:, 1]] += values[:smooth]
+    fields[tuple(basis.fields.T)] += values[basis.fixed : basis.size]
+    site = values[smooth : basis.fixed]
+    wire = eqx.tree_at(lambda w: (w.baseline, w.fields), wire, (baseline, fields))
+    return wire, gains * np.exp(np.append(site, -site.sum()))
+
+
+def reject_outliers(wire: Wire, gains: Float[np.ndarray, "4"], pixels: Pixels) -> Pixels:
+    """Leave out pixels further than 6 robust sigma from the present model (hot, dead, dusty)."""
+    residual = np.abs(residuals(wire, gains, pixels))
+    spread = 1.4826 * float(np.median(residual[pixels.weight > 0]))
+    return eqx.tree_at(lambda p: p.weight, pixels, np.where(residual <= _OUTLIER * spread, pixels.weight, 0.0))
+
+
+def solve(normal: Normal, prior: Float[np.ndarray, " n"]) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n n"]]:
+    """Solution and inverse of normal equations; ``prior`` is a sigma about zero per parameter (0: none)."""
+    matrix = normal.matrix + np.diag(np.where(prior > 0, 1.0 / np.where(prior > 0, prior, 1.0) ** 2, 0.0))
+    scale = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+    # The tiny ridge only decides between columns that the data cannot tell apart.
+    inverse = np.linalg.inv(matrix / np.outer(scale, scale) + 1e-12 * np.eye(len(scale))) / np.outer(scale, scale)
+    return inverse @ normal.right, inverse
+
+
+def fit_phase(
+    geometry: Geometry, start: WireStart, few: Pixels, many: Pixels, harmonics: Float[np.ndarray, "harmonics 2"]
+) -> PhaseFit:
+    """Baseline alone; stand-off and origin by demodulation of the first harmonics; then all of it together.
+
+    Searches on ``few`` pixels, and finishes on ``many``.
+    """
+    bare = with_harmonics(ideal_wire(geometry, start, harmonics[:1]), harmonics[:1], few)
+    # Without any panel: no waves, and nothing that narrows with obliquity.
+    bare = eqx.tree_at(lambda w: (w.fields, w.depth_per_pitch), bare, (np.zeros_like(bare.fields), np.float64(0.0)))
+    gains, plain = np.ones(4), plain_basis()
+    for _ in range(4):
+        values, _inverse = solve(accumulate(bare, gains, few, plain), np.zeros(plain.size))
+        bare, gains = add_increment(bare, gains, plain, values)
+    few = reject_outliers(bare, gains, few)
+    shape, gain = _scan(bare, gains, start, few, (0.0, 1.0))
+    if gain < LEAST_GAIN:
+        variance = merit(bare, gains, few) / max(int(np.count_nonzero(few.weight)) - plain.size, 1)
+        return PhaseFit(bare, gains, np.zeros((10, 10)), gain, variance, True, 0)
+    shape, _gain = _scan(shape, gains, start, few, (1.0, 0.0))
+    shape = eqx.tree_at(lambda w: w.depth_per_pitch, shape, np.float64(start.depth_per_pitch))
+    wire = with_harmonics(shape, harmonics, few)
+    wire, gains, _inverse, _converged, first = _gauss_newton(wire, gains, few, start)
+    many = reject_outliers(wire, gains, many)
+    wire, gains, inverse, converged, second = _gauss_newton(wire, gains, many, start)
+    variance = merit(wire, gains, many) / max(int(np.count_nonzero(many.weight)) - len(inverse), 1)
+    cov = inverse[-SHAPE_PARAMETERS:, -SHAPE_PARAMETERS:] * variance
+    return PhaseFit(wire, gains, cov, gain, variance, converged, first + second)
+
+
+_carrier = jax.jit(lambda wire, ideal: carriers(wire, slopes(wire, ideal), kappa(wire, slopes(wire, ideal)))[0, 0])
+_wave = jax.jit(lambda wire, ideal: waves(wire, slopes(wire, ideal))[:, 0])
+
+
+def _scan(
+    wire: Wire, gains: Float[np.ndarray, "4"], start: WireStart, pixels: Pixels, harmonic: tuple[float, float]
+) -> tuple[Wire, float]:
+    """Stand-off, pupil and origin that put most of the signal into one harmonic; along X only the origin is open.
+
+    Also how much chi-squared that harmonic would explain, in units of the residual variance.
+    """
+    residual = residuals(wire, gains, pixels) * (pixels.weight > 0)
+    wire = with_harmonics(wire, np.array([harmonic]), pixels)
+    along_y = harmonic[1] > 0
+    standoffs, pupils = np.array([wire.standoff_per_pitch]), np.array([wire.pupil_per_pitch])
+    if along_y:
+        reach = 1.2 * start.standoff_tolerance + 0.01
+        standoffs = start.standoff_per_pitch * np.arange(1 - reach, 1 + reach, _SCAN_STEP)
+        pupils = start.pupil_per_pitch * (1 + 1.2 * start.pupil_tolerance * np.linspace(-1, 1, _PUPILS))
+    trials = [eqx.tree_at(lambda w: w.pupil_per_pitch, wire, np.float64(pupil)) for pupil in pupils]
+    sizes = np.stack([np.asarray(_carrier(trial, pixels.ideal)) for trial in trials])
+    trials = [eqx.tree_at(lambda w: w.standoff_per_pitch, wire, np.float64(standoff)) for standoff in standoffs]
+    waves_seen = [np.asarray(_wave(trial, pixels.ideal)) for trial in trials]
+    # residual = a cos(phase + t) = a (cos t cos(phase) - sin t sin(phase)): the angle found is t.
+    found = np.stack([(sizes * residual) @ (wave[0] - 1j * wave[1]) for wave in waves_seen])
+    gain = np.abs(found) / np.sqrt(np.sum(sizes**2, axis=1))
+    i, j = np.unravel_index(int(np.argmax(gain)), gain.shape)
+    offset = np.array(wire.offset)
+    offset[1 if along_y else 0] = float(np.angle(found[i, j])) / (2 * np.pi)
+    found_wire = eqx.tree_at(
+        lambda w: (w.standoff_per_pitch, w.pupil_per_pitch, w.offset),
+        wire,
+        (np.float64(standoffs[i]), np.float64(pupils[j]), offset),
+    )
+    variance = float(np.sum(residual**2)) / max(int(np.count_nonzero(pixels.weight)), 1)
+    return found_wire, 2 * float(gain[i, j]) ** 2 / variance
+
+
+def _gauss_newton(
+    wire: Wire, gains: Float[np.ndarray, "4"], pixels: Pixels, start: WireStart
+) -> tuple[Wire, Float[np.ndarray, "4"], Float[np.ndarray, "n n"], bool, int]:
+    basis = plain_basis()
+    prior = np.concatenate([np.zeros(basis.size), _prior(start)])
+    now = merit(wire, gains, pixels)
+    converged, inverse, iterations = False, np.eye(len(prior)), 0
+    while not converged and iterations < _ROUNDS:
+        iterations += 1
+        values, inverse = solve(accumulate(wire, gains, pixels, basis, shape=True), prior)
+        for halving in range(6):
+            step = values * 0.5**halving
+            trial, trial_gains = add_increment(wire, gains, basis, step)
+            trial = _numpy(move(trial, step[-SHAPE_PARAMETERS:]))
+            then = merit(trial, trial_gains, pixels)
+            if then < now:
+                wire, gains, now = trial, trial_gains, then
+                break
+        else:
+            # At the minimum up to rounding, or stuck.
+            return wire, gains, inverse, bool(np.all(_steps_in_sigma(values, inverse) < 1.0)), iterations
+        converged = bool(np.all(_steps_in_sigma(values, inverse) < 0.05))
+    return wire, gains, inverse, converged, iterations
+
+
+def _steps_in_sigma(values: Float[np.ndarray, " n"], inverse: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "10"]:
+    return np.abs(values[-SHAPE_PARAMETERS:]) / np.sqrt(np.diag(inverse)[-SHAPE_PARAMETERS:])
+
+
+def _prior(start: WireStart) -> Float[np.ndarray, "10"]:
+    sizes = [
+        start.standoff_tolerance,
+        _ORIGIN_PRIOR,
+        _ORIGIN_PRIOR,
+        start.pupil_tolerance,
+        start.row_tolerance,
+        start.column_tolerance,
+        start.depth_tolerance,
+    ]
+    return np.array([_ROTATION_PRIOR] * 3 + sizes) * _PRIOR_WIDENING
+
+
+def _numpy(wire: Wire) -> Wire:
+    return jax.tree.map(lambda leaf: np.asarray(leaf, dtype=np.float64), wire)

@@ -1,0 +1,42 @@
+"""Photographs in any common format as linear RGB light."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Float
+
+from udccal.errors import FileFormatError
+from udccal.io.exr import read_rgb_exr
+from udccal.io.limits import check_size
+
+_MAX_BYTES = 256 * 1024 * 1024
+
+
+def read_photograph(path: Path, gamma: float = 2.2) -> Float[np.ndarray, "rows columns 3"]:
+    """Linear RGB of a photograph: OpenEXR and Radiance as they are, 8- and 16-bit pictures raised to ``gamma``.
+
+    Values of integer formats lie between 0 and 1; negative values of float formats become 0.
+
+    Raises:
+        FileFormatError: when the file is missing, too large, or not a colour picture.
+    """
+    if not path.is_file():
+        raise FileFormatError(f"Expected a photograph at {path}, found no file. Check the path.")
+    if path.suffix.lower() == ".exr":
+        return np.maximum(read_rgb_exr(path), 0.0)
+    if path.stat().st_size > _MAX_BYTES:
+        raise FileFormatError(f"Expected {path} to hold at most {_MAX_BYTES} bytes, found more. Use a smaller picture.")
+    encoded = np.frombuffer(path.read_bytes(), np.uint8)
+    picture = cv2.imdecode(encoded, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH) if encoded.size else None
+    if picture is None:
+        raise FileFormatError(f"Expected {path} to be a PNG, JPEG, Radiance or OpenEXR picture, found another kind.")
+    check_size(path, picture.shape[0], picture.shape[1], 3)
+    rgb = np.ascontiguousarray(picture[..., ::-1])
+    if rgb.dtype == np.uint8:
+        return (rgb.astype(np.float32) / 255.0) ** gamma
+    if rgb.dtype == np.uint16:
+        return (rgb.astype(np.float32) / 65535.0) ** gamma
+    return np.maximum(rgb.astype(np.float32), 0.0)

@@ -1,0 +1,225 @@
+"""Diffraction by a panel of periodic slits in front of a round pupil, as a field over the sensor.
+
+The light sent from direction cosines l0 to l has the transfer function, f in cycles per unit direction cosine,
+
+    O(f) = sum over wavelengths of w(lambda) R(lambda f),  R(s) = sum_gh cos(2 pi (g X + h Y)) A_g(s_x) A_h(s_y) H_gh(s)
+
+with R the autocorrelation of the open part of the pupil's footprint at a lag s on the panel. A_h are the Fourier
+coefficients of a row of slits times itself moved by the lag; H_gh that of the footprint times itself moved by the lag;
+(X, Y) is where the footprint's centre lies, in pitches (Goodman, Introduction to Fourier Optics, sections 3.10, 6.3).
+The term g = h = 0 is the average over X and Y, an incoherent sum of diffraction orders; the others are the
+interference between neighbouring orders, which changes as the footprint slides over the rows (see ``interference``).
+Direction cosines along the panel make this exact at any angle: stretch and conical bending come with the geometry.
+"""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from udccal.models.arrays import Arrayish
+from udccal.models.geometry import Geometry, panel_directions, rotation_matrix
+from udccal.models.lattice import Lattice
+
+_FINE_NM = 1.0
+PUPIL_NODES = 4
+
+
+class Diffraction(eqx.Module):
+    """The few numbers behind the whole field.
+
+    Attributes:
+        pitch_mm: pitch of rows and columns.
+        open_fraction: open part of the (columns, rows) for a ray along the panel's normal.
+        thickness_mm: depth of the opaque structure; it narrows slits by thickness * |tangent of the obliquity|.
+        pupil_mm: diameter of the entrance pupil.
+        offset: footprint centre (X, Y) of a ray along the normal, in pitches from the middle of an opening, modulo 1.
+        standoff_per_pitch: distance from the pupil to the openings, in pitches: the centre moves by this times slope.
+        visibility: 1, or 0 to leave interference between orders out (the footprint's place is then not known).
+        blur_px: standard deviation of a Gaussian that stands for what else blurs a little.
+        wavelengths_nm: nodes of the spectra, evenly spaced.
+        spectrum: light per colour channel at the nodes, linear between them; each channel sums to 1.
+    """
+
+    pitch_mm: Float[Arrayish, ""]
+    open_fraction: Float[Arrayish, "2"]
+    thickness_mm: Float[Arrayish, ""]
+    pupil_mm: Float[Arrayish, ""]
+    offset: Float[Arrayish, "2"]
+    standoff_per_pitch: Float[Arrayish, ""]
+    visibility: Float[Arrayish, ""]
+    blur_px: Float[Arrayish, ""]
+    wavelengths_nm: Float[Arrayish, " nodes"]
+    spectrum: Float[Arrayish, "3 nodes"]
+
+
+class LocalFrame(eqx.Module):
+    """Geometry about one source.
+
+    Attributes:
+        direction: (l_x, l_y, l_z) of the source in panel coordinates.
+        jacobian: d(l_x, l_y) / d(pixel x, y).
+        footprint: takes the unit disc of the pupil (camera x, y) to the panel plane along the source's ray.
+    """
+
+    direction: Float[Array, "3"]
+    jacobian: Float[Array, "2 2"]
+    footprint: Float[Array, "2 2"]
+
+
+def local_frame(geometry: Geometry, position_px: Float[Arrayish, "2"]) -> LocalFrame:
+    """Direction, scale and footprint of the pupil at a sensor position."""
+
+    def cosines(position: Float[Array, "2"]) -> Float[Array, "3"]:
+        return panel_directions(geometry, position[None])[0]
+
+    position = jnp.asarray(position_px)
+    direction = cosines(position)
+    jacobian = jax.jacfwd(cosines)(position)[:2]
+    across = rotation_matrix(geometry.rotation)[:, :2]
+    footprint = across[:2] - jnp.outer(direction[:2] / direction[2], across[2])
+    return LocalFrame(direction, jacobian, footprint)
+
+
+def node_scale(frame: LocalFrame) -> Float[Array, "2"]:
+    """Direction cosines (along x, along y) per pixel at the source: the unit of the lattice about it."""
+    return jnp.abs(jnp.diagonal(frame.jacobian))
+
+
+def average_transfer(
+    model: Diffraction,
+    frame: LocalFrame,
+    lattice: Lattice,
+    spectra: Float[Array, "c nodes"],
+    disc_px: Float[Arrayish, ""] = 0.0,
+) -> Float[Array, "c rows half"]:
+    """Transfer functions averaged over the footprint's place, for light of the given spectra, pixel included.
+
+    The lattice is in panel directions about the source; ``disc_px`` is the diameter of a round source on the sensor.
+    """
+    fx, fy = lattice_frequencies(frame, lattice)
+    opened = open_fractions(model, frame)
+    columns, rows = slit_table(model, opened[0], fx, 0), slit_table(model, opened[1], fy, 0)
+    anchors, share = pupil_anchors(model)
+    lag_x, lag_y = relative_lag(model, frame, fx, fy)
+    distance = jnp.sqrt(lag_x**2 + lag_y**2 + 1e-30)
+    total = jnp.zeros((spectra.shape[0], lattice.rows, fx.shape[0]))
+    for a in range(PUPIL_NODES):
+        slits = jnp.einsum("cj,yj,xj->cyx", spectra * share[a], rows, columns)
+        total = total + slits * disc_autocorrelation(distance * (anchors[a] * 1e-6))
+    return total * sensor_transfer(frame, fx, fy, model.blur_px, disc_px)
+
+
+def lattice_frequencies(frame: LocalFrame, lattice: Lattice) -> tuple[Float[Array, " half"], Float[Array, " rows"]]:
+    """(f_x, f_y) of a lattice's spectrum, in cycles per unit direction cosine."""
+    scale = node_scale(frame)
+    return jnp.asarray(lattice.frequency_x) / scale[0], jnp.asarray(lattice.frequency_y) / scale[1]
+
+
+def open_fractions(model: Diffraction, frame: LocalFrame) -> Float[Array, "2"]:
+    """Open part of (columns, rows) along the source's ray."""
+    shadow = model.thickness_mm / model.pitch_mm * jnp.abs(frame.direction[:2] / frame.direction[2])
+    return jnp.clip(jnp.asarray(model.open_fraction) - shadow, 0.02, 1.0)
+
+
+def relative_lag(
+    model: Diffraction, frame: LocalFrame, fx: Float[Array, " half"], fy: Float[Array, " rows"]
+) -> tuple[Float[Array, "rows half"], Float[Array, "rows half"]]:
+    """Lag of a frequency per mm of wavelength, in diameters of the pupil and in its own axes."""
+    inverse = jnp.linalg.inv(frame.footprint * model.pupil_mm)
+    column = fy[:, None]
+    return inverse[0, 0] * fx + inverse[0, 1] * column, inverse[1, 0] * fx + inverse[1, 1] * column
+
+
+def disc_autocorrelation(relative_lag: Float[Arrayish, "*n"]) -> Float[Array, "*n"]:
+    """Overlap of a disc with itself moved by ``relative_lag`` diameters, as a fraction of its area."""
+    inside = relative_lag < 1.0
+    x = jnp.where(inside, relative_lag, 0.5)
+    return jnp.where(inside, (jnp.arccos(x) - x * jnp.sqrt(1.0 - x * x)) * (2.0 / jnp.pi), 0.0)
+
+
+def slit_coefficient(
+    relative_lag: Float[Arrayish, "*n"], opened: Float[Arrayish, ""], order: int
+) -> Float[Array, "*n"]:
+    """Fourier coefficient of a row of slits times itself moved by ``relative_lag`` pitches; 1 for order 0 at lag 0.
+
+    Where slits meet slits N pitches away, the common openings are ``opened`` - |lag - N| wide and lie half a pitch
+    further per N. The origin is the middle of an opening.
+    """
+    lag = jnp.asarray(relative_lag)
+    whole = jnp.floor(lag)
+    here, next_one = jnp.maximum(opened - lag + whole, 0.0), jnp.maximum(opened - 1.0 + lag - whole, 0.0)
+    if order == 0:
+        return (here + next_one) / opened
+    parity = 1.0 - 2.0 * jnp.mod(order * whole, 2.0)
+    both = jnp.sin(jnp.pi * order * here) + (-1) ** order * jnp.sin(jnp.pi * order * next_one)
+    return parity * both / (jnp.pi * order * opened)
+
+
+def slit_table(
+    model: Diffraction, opened: Float[Array, ""], frequency: Float[Array, " n"], order: int
+) -> Float[Array, "n nodes"]:
+    """Slit coefficients averaged over the light of each wavelength node, for lags lambda * frequency.
+
+    A node's light is a triangle as wide as its distance to its neighbours, summed in steps of about a nanometre: so
+    orders far out smear into a continuum as they do in daylight, without a node for every nanometre.
+    """
+    nodes = jnp.asarray(model.wavelengths_nm)
+    step = nodes[1] - nodes[0]
+    count = _fine_count(model)
+    offset = jnp.arange(-count + 1, count) / count
+    triangle = (1.0 - jnp.abs(offset)) / count
+    fine = nodes[:, None] + offset * step
+
+    def averaged(wavelengths_nm: Float[Array, " k"]) -> Float[Array, " n"]:
+        lag = frequency[:, None] * (wavelengths_nm * 1e-6 / model.pitch_mm)
+        return slit_coefficient(lag, opened, order) @ triangle
+
+    return jax.lax.map(averaged, fine).T
+
+
+def _fine_count(model: Diffraction) -> int:
+    """Steps from one wavelength node to the next; nodes are taken as spread over about 300 nm."""
+    return max(2, int(np.ceil(300.0 / (np.shape(model.wavelengths_nm)[0] - 1) / _FINE_NM)))
+
+
+def pupil_anchors(model: Diffraction) -> tuple[Float[Array, " a"], Float[Array, "a nodes"]]:
+    """A few wavelengths, and the weights that interpolate a smooth function from them to the nodes.
+
+    The footprint's autocorrelation varies so smoothly with wavelength that it is computed for the few only.
+    """
+    nodes = jnp.asarray(model.wavelengths_nm)
+    angle = np.pi * (np.arange(PUPIL_NODES) + 0.5) / PUPIL_NODES
+    anchors = (nodes[0] + nodes[-1]) / 2.0 + (nodes[-1] - nodes[0]) / 2.0 * jnp.asarray(np.cos(angle))
+    others = [jnp.delete(anchors, a) for a in range(PUPIL_NODES)]
+    share = [jnp.prod((nodes - rest[:, None]) / (anchors[a] - rest[:, None]), axis=0) for a, rest in enumerate(others)]
+    return anchors, jnp.stack(share)
+
+
+def sensor_transfer(
+    frame: LocalFrame,
+    fx: Float[Array, " half"],
+    fy: Float[Array, " rows"],
+    blur_px: Float[Arrayish, ""],
+    disc_px: Float[Arrayish, ""],
+) -> Float[Array, "rows half"]:
+    """Square pixel, small Gaussian and round source, all of them round or square on the sensor."""
+    jacobian = frame.jacobian
+    nu_x = jacobian[0, 0] * fx + jacobian[1, 0] * fy[:, None]
+    nu_y = jacobian[0, 1] * fx + jacobian[1, 1] * fy[:, None]
+    nu2 = nu_x**2 + nu_y**2
+    gaussian = jnp.exp(-2.0 * (jnp.pi * blur_px) ** 2 * nu2)
+    return jnp.sinc(nu_x) * jnp.sinc(nu_y) * gaussian * _disc_transfer(jnp.pi * disc_px * jnp.sqrt(nu2 + 1e-30))
+
+
+def _disc_transfer(z: Float[Array, "*n"]) -> Float[Array, "*n"]:
+    """2 J1(z) / z by Gauss-Chebyshev quadrature; exact to 1e-6 for z up to 8."""
+    count = 8
+    angle = np.pi * np.arange(1, count + 1) / (count + 1)
+    total = jnp.zeros_like(z)
+    for t, w in zip(np.cos(angle), 2.0 / (count + 1) * np.sin(angle) ** 2, strict=True):
+        total = total + w * jnp.cos(z * t)
+    return total

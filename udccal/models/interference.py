@@ -1,0 +1,115 @@
+"""Interference between neighbouring diffraction orders: what of the kernel depends on where the pupil's footprint lies.
+
+These are the terms of ``models.diffraction`` with (g, h) other than (0, 0). They move about one percent of the light,
+but between the orders, where little light falls, they decide how much. Only the lowest matter.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from udccal.models.arrays import Arrayish
+from udccal.models.diffraction import (
+    Diffraction,
+    LocalFrame,
+    lattice_frequencies,
+    open_fractions,
+    relative_lag,
+    sensor_transfer,
+    slit_table,
+)
+from udccal.models.lattice import Lattice
+
+# (g, h): periods along columns and rows. The opposite of each is contained in it.
+TERMS = ((0.0, 1.0), (0.0, 2.0), (1.0, 0.0), (2.0, 0.0), (1.0, 1.0), (1.0, -1.0))
+_COLUMN_OF, _ROW_OF = np.abs(np.array(TERMS, dtype=int)).T
+_QUADRATURE = 32
+_TABLE = 128
+
+
+def interference_transfer(
+    model: Diffraction,
+    frame: LocalFrame,
+    lattice: Lattice,
+    spectra: Float[Array, "c nodes"],
+    overlaps: Float[Arrayish, "nodes terms rows half"],
+    disc_px: Float[Arrayish, ""] = 0.0,
+) -> Float[Array, "c rows half"]:
+    """What to add to ``average_transfer``; ``overlaps`` come from ``node_overlaps``, and hardly change in a fit."""
+    fx, fy = lattice_frequencies(frame, lattice)
+    opened = open_fractions(model, frame)
+    columns = jnp.stack([slit_table(model, opened[0], fx, g) for g in range(_COLUMN_OF.max() + 1)])
+    rows = jnp.stack([slit_table(model, opened[1], fy, h) for h in range(_ROW_OF.max() + 1)])
+    place = jnp.asarray(model.offset) + model.standoff_per_pitch * frame.direction[:2] / frame.direction[2]
+    strength = model.visibility * 2.0 * jnp.cos(2.0 * jnp.pi * (jnp.array(TERMS) @ place))
+
+    def add(
+        total: Float[Array, "c rows half"], node: tuple[Array, Array, Array, Array]
+    ) -> tuple[Float[Array, "c rows half"], None]:
+        column, row, overlap, share = node
+        here = jnp.einsum("t,ty,tx,tyx->yx", strength, row[_ROW_OF], column[_COLUMN_OF], overlap)
+        return total + share[:, None, None] * here, None
+
+    nodes = (jnp.moveaxis(columns, -1, 0), jnp.moveaxis(rows, -1, 0), jnp.asarray(overlaps), spectra.T)
+    total, _ = jax.lax.scan(add, jnp.zeros((spectra.shape[0], lattice.rows, fx.shape[0])), nodes)
+    return total * sensor_transfer(frame, fx, fy, model.blur_px, disc_px)
+
+
+def node_overlaps(
+    model: Diffraction, frame: LocalFrame, lattice: Lattice, tables: Float[Array, "terms y x"]
+) -> Float[Array, "nodes terms rows half"]:
+    """H_gh for the wavelength of every node at every frequency of a lattice; ``tables`` from ``overlap_tables``."""
+    lag_x, lag_y = relative_lag(model, frame, *lattice_frequencies(frame, lattice))
+    scales = jnp.asarray(model.wavelengths_nm) * 1e-6
+    return jax.lax.map(lambda scale: _look_up(tables, lag_x * scale, lag_y * scale), scales)
+
+
+def disc_overlap_coefficient(lag: Float[Arrayish, "*n 2"], wave: Float[Arrayish, "2"]) -> Float[Array, "*n"]:
+    """Fourier coefficient of a disc of diameter 1 times itself moved by ``lag``, at ``wave`` cycles, per disc area.
+
+    The common part is a lens of half-thickness w(t) = sqrt(1/4 - t^2) - |lag| / 2 about its long axis t; the integral
+    across it is elementary, that along it is done by Gauss-Legendre quadrature in t = t_max sin(angle).
+    """
+    lag = jnp.asarray(lag) + jnp.array([1e-6, 0.0])
+    distance = jnp.sqrt(jnp.sum(lag**2, axis=-1))
+    axis = lag / distance[..., None]
+    across = axis @ jnp.asarray(wave)
+    along = axis[..., 0] * jnp.asarray(wave)[1] - axis[..., 1] * jnp.asarray(wave)[0]
+    half = jnp.sqrt(jnp.maximum(0.25 - distance**2 / 4.0, 0.0))
+    nodes, weights = np.polynomial.legendre.leggauss(_QUADRATURE)
+    # The integrand is even: half of it, twice.
+    angle, weight = jnp.asarray((nodes + 1.0) * np.pi / 4), jnp.asarray(weights * np.pi / 2)
+    t = half[..., None] * jnp.sin(angle)
+    width = jnp.maximum(jnp.sqrt(0.25 - t * t) - distance[..., None] / 2.0, 0.0)
+    slab = 2.0 * width * jnp.sinc(2.0 * across[..., None] * width)
+    integrand = slab * jnp.cos(2.0 * jnp.pi * along[..., None] * t) * half[..., None] * jnp.cos(angle)
+    return integrand @ weight * (4.0 / jnp.pi)
+
+
+def overlap_tables(model: Diffraction, frame: LocalFrame) -> Float[Array, "terms y x"]:
+    """H_gh of every term on a grid of lags: x from 0 to 1, y from -1 to 1 diameters of the pupil."""
+    waves = jnp.array(TERMS) @ frame.footprint * (model.pupil_mm / model.pitch_mm)
+    x, y = jnp.linspace(0.0, 1.0, _TABLE + 1), jnp.linspace(-1.0, 1.0, 2 * _TABLE + 1)
+    grid = jnp.stack(jnp.meshgrid(x, y), axis=-1)
+    return jax.lax.map(lambda wave: disc_overlap_coefficient(grid, wave), waves)
+
+
+def _look_up(
+    tables: Float[Array, "t y x"], lag_x: Float[Array, "rows half"], lag_y: Float[Array, "rows half"]
+) -> Float[Array, "t rows half"]:
+    """Bilinear interpolation; a lag and its opposite give the same; none overlap from one diameter on."""
+    flip = jnp.where(lag_x < 0, -1.0, 1.0)
+    x, y = lag_x * flip * _TABLE, (lag_y * flip + 1.0) * _TABLE
+    inside = lag_x**2 + lag_y**2 < 1.0
+    column = jnp.clip(jnp.floor(x), 0, _TABLE - 1).astype(jnp.int32)
+    row = jnp.clip(jnp.floor(y), 0, 2 * _TABLE - 1).astype(jnp.int32)
+    right, down = jnp.clip(x - column, 0.0, 1.0), jnp.clip(y - row, 0.0, 1.0)
+    flat = tables.reshape(tables.shape[0], -1)
+    corner = row * (_TABLE + 1) + column
+    below = corner + _TABLE + 1
+    top = flat[:, corner] * (1.0 - right) + flat[:, corner + 1] * right
+    bottom = flat[:, below] * (1.0 - right) + flat[:, below + 1] * right
+    return jnp.where(inside, top * (1.0 - down) + bottom * down, 0.0)

@@ -1,0 +1,158 @@
+"""psf: the kernel of a point source, as a field over the sensor.
+
+Two parts add up: diffraction by the panel (few parameters, exact far from the source) and a residual, an image whose
+pixels are polynomials of the field position (for whatever else blurs). The kernel belongs to the source point.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from udccal.models.arrays import Arrayish
+from udccal.models.diffraction import Diffraction, LocalFrame, average_transfer, local_frame, node_scale
+from udccal.models.fields import polynomial_basis
+from udccal.models.geometry import Geometry, panel_directions
+from udccal.models.interference import interference_transfer, node_overlaps, overlap_tables
+from udccal.models.lattice import Lattice, lattice_for, low_pass, sample, spline_coefficients
+
+# A kernel is a cross: along each axis, detail finer than this band (cycles per pixel) matters near the axis only.
+_BAND = (0.8, 1.3)
+_COARSE, _MARGIN = 3, 1.25
+_FINE_PX, _FINE_BLEND_PX = 28, (10.0, 14.0)
+# Interference between orders is followed over so many (rows, columns), and left out farther away, on one lattice.
+_INTERFERENCE_PX, _INTERFERENCE_PER_PX = (144, 72), 4
+# Smaller kernels are cut from one of this size: little is saved below it, and compilers are slow with tiny transforms.
+_LEAST_PX = 32
+
+
+class PsfField(eqx.Module):
+    """The psf term.
+
+    Attributes:
+        geometry: where pixels look.
+        diffraction: the panel's diffraction.
+        diffraction_share: 1, or 0 when the residual carries the whole kernel.
+        residual: coefficients of the residual image; its terms are ``fields.polynomial_basis`` of ``degree``.
+        centre_px, half_px: positions scale as (p - centre) / half for the polynomials.
+        degree: of the residual's polynomials; -1 for no residual.
+        fine: lattice nodes to a pixel where detail matters; see ``fine_oversample``.
+    """
+
+    geometry: Geometry
+    diffraction: Diffraction
+    diffraction_share: Float[Arrayish, ""]
+    residual: Float[Arrayish, "terms 3 window_rows window_columns"]
+    centre_px: Float[Arrayish, "2"]
+    half_px: Float[Arrayish, "2"]
+    degree: int = eqx.field(static=True)
+    fine: int = eqx.field(static=True, default=8)
+
+
+@eqx.filter_jit
+def psf_kernels(
+    field: PsfField, positions_px: Float[Arrayish, "n 2"], rows: int, columns: int
+) -> Float[Array, "n 3 rows columns"]:
+    """Kernels of point sources centred on a pixel at each position, integrated over pixels; each colour sums to 1.
+
+    ``rows`` and ``columns`` are odd; the origin is the middle sample.
+    """
+
+    def one(position: Float[Array, "2"]) -> Float[Array, "3 rows columns"]:
+        kernel = field.diffraction_share * diffraction_kernel(
+            field.diffraction, field.geometry, position, rows, columns, field.fine
+        ) + residual_kernel(field, position, rows, columns)
+        return kernel / jnp.sum(kernel, axis=(1, 2), keepdims=True)
+
+    return jax.lax.map(one, jnp.asarray(positions_px))
+
+
+def fine_oversample(pupil_mm: float, focal_px: float) -> int:
+    """Nodes to a pixel that hold nearly all detail a diffraction-limited lens delivers in blue, within reason."""
+    cycles_per_px = pupil_mm / 480e-6 / focal_px
+    return min(max(2 * round(0.95 * cycles_per_px), 6), 14)
+
+
+def diffraction_kernel(
+    model: Diffraction, geometry: Geometry, position_px: Float[Arrayish, "2"], rows: int, columns: int, fine: int = 8
+) -> Float[Array, "3 rows columns"]:
+    """Diffraction alone, per unit of light that falls anywhere."""
+    frame = local_frame(geometry, position_px)
+    spectra = jnp.asarray(model.spectrum)
+    y, x = jnp.meshgrid(jnp.arange(rows) - rows // 2, jnp.arange(columns) - columns // 2, indexing="ij")
+    offsets = jnp.stack([x.ravel(), y.ravel()], axis=-1) * 1.0
+    points, density = lattice_points(geometry, frame, position_px, offsets)
+    size_px = (max(rows, _LEAST_PX), max(columns, _LEAST_PX))
+    values = _cross(lambda grid: average_transfer(model, frame, grid, spectra), points, size_px, fine)
+    close_y, close_x = (min(size, most) * _MARGIN for size, most in zip(size_px, _INTERFERENCE_PX, strict=True))
+    grid = lattice_for(close_y, close_x, _INTERFERENCE_PER_PX, _INTERFERENCE_PER_PX)
+    overlaps = node_overlaps(model, frame, grid, overlap_tables(model, frame))
+    interference = interference_transfer(model, frame, grid, spectra, overlaps)
+    values = values + sample(grid, spline_coefficients(grid, interference), points)
+    return (values * density[:, None]).T.reshape(-1, rows, columns)
+
+
+def _cross(
+    transfer: Callable[[Lattice], Float[Array, "c rows half"]],
+    points: Float[Array, "n 2"],
+    size_px: tuple[int, int],
+    fine: int,
+) -> Float[Array, "n c"]:
+    """Values at points of what has a transfer function, in four bands: coarse or fine along each axis."""
+    rows, columns = size_px
+    values: Array | float = 0.0
+    for fine_y, fine_x in itertools.product((False, True), repeat=2):
+        grid = lattice_for(
+            (_FINE_PX if fine_y else rows) * _MARGIN,
+            (_FINE_PX if fine_x else columns) * _MARGIN,
+            fine if fine_y else _COARSE,
+            fine if fine_x else _COARSE,
+        )
+        band = _band(grid.frequency_y, fine_y)[:, None] * _band(grid.frequency_x, fine_x)
+        coefficients = spline_coefficients(grid, transfer(grid) * band)
+        near = jnp.ones(points.shape[0])
+        near = near * low_pass(points[:, 0], *_FINE_BLEND_PX) if fine_x else near
+        near = near * low_pass(points[:, 1], *_FINE_BLEND_PX) if fine_y else near
+        values = values + near[:, None] * sample(grid, coefficients, points)
+    return jnp.asarray(values)
+
+
+def lattice_points(
+    geometry: Geometry, frame: LocalFrame, position_px: Float[Arrayish, "2"], offsets_px: Float[Array, "n 2"]
+) -> tuple[Float[Array, "n 2"], Float[Array, " n"]]:
+    """Pixels in units of the lattice about a source, and the lattice area that each covers."""
+
+    def cosines(pixel: Float[Array, "2"]) -> Float[Array, "2"]:
+        return panel_directions(geometry, pixel[None])[0, :2]
+
+    pixels = jnp.asarray(position_px) + offsets_px
+    scale = node_scale(frame)
+    points = (panel_directions(geometry, pixels)[:, :2] - frame.direction[:2]) / scale
+    jacobian = jax.vmap(jax.jacfwd(cosines))(pixels)
+    return points, jnp.abs(jnp.linalg.det(jacobian)) / (scale[0] * scale[1])
+
+
+def residual_kernel(
+    field: PsfField, position_px: Float[Array, "2"], rows: int, columns: int
+) -> Float[Array, "3 rows columns"]:
+    """The residual image at a position, cut or padded with zeros to the size asked for."""
+    residual = jnp.asarray(field.residual)
+    unit = (position_px - jnp.asarray(field.centre_px)) / jnp.asarray(field.half_px)
+    image = jnp.einsum("t,tcyx->cyx", polynomial_basis(unit[None], field.degree)[0], residual)
+    for axis, size in ((1, rows), (2, columns)):
+        spare = (size - image.shape[axis]) // 2
+        if spare < 0:
+            image = jax.lax.slice_in_dim(image, -spare, image.shape[axis] + spare, axis=axis)
+        else:
+            image = jnp.pad(image, [(spare, spare) if a == axis else (0, 0) for a in range(3)])
+    return image
+
+
+def _band(frequency: Float[Arrayish, " n"], fine: bool) -> Float[Array, " n"]:
+    low = low_pass(frequency, *_BAND)
+    return 1.0 - low if fine else low

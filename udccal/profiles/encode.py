@@ -1,0 +1,150 @@
+"""Between a profile in memory and its stored form in a folder."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from udccal.errors import ProfileError
+from udccal.fitting.result import FitResult
+from udccal.io.exr import write_exr
+from udccal.io.hashing import sha256_file
+from udccal.models.backscatter import Backscatter
+from udccal.models.geometry import Geometry
+from udccal.models.noise import Noise
+from udccal.models.psf import PsfField
+from udccal.models.wire import Wire
+from udccal.profiles.arrays import read_checked
+from udccal.profiles.evidence import load_fit, store_fit
+from udccal.profiles.packing import Packed, pack, unpack
+from udccal.profiles.pictures import ATLAS_COLUMNS, ATLAS_ROWS, psf_atlas
+from udccal.profiles.profile import Profile
+from udccal.profiles.schema import FORMAT, VERSION, Lineage, Section, StoredPicture, StoredProfile, Terms
+
+Channels = Mapping[str, Float[np.ndarray, "rows columns"]]
+
+
+def encode(profile: Profile, folder: Path) -> StoredProfile:
+    """Write a profile's arrays to ``folder`` and return what belongs into ``profile.json``."""
+    shared = profile.geometry.term
+    return StoredProfile(
+        format=FORMAT,
+        version=VERSION,
+        rig=profile.rig,
+        lineage=Lineage(parent=profile.parent),
+        provenance=profile.provenance,
+        invalidated_by=profile.invalidated_by,
+        terms=Terms(
+            noise=_store_section(profile.noise, "noise", folder, shared),
+            geometry=_store_section(profile.geometry, "geometry", folder, None),
+            wire=_store_section(profile.wire, "wire", folder, shared),
+            psf=_store_section(profile.psf, "psf", folder, shared),
+            backscatter=_store_section(profile.backscatter, "backscatter", folder, shared),
+        ),
+        pictures=_store_pictures(profile, folder),
+    )
+
+
+def decode(stored: StoredProfile, folder: Path) -> Profile:
+    """The profile of a stored form and the arrays beside it.
+
+    Raises:
+        ProfileError: when a file or a value is not in order.
+    """
+    terms, camera = stored.terms, stored.rig.camera
+    geometry = _load_section(terms.geometry, Geometry, folder, None)
+    shared = geometry.term
+    pictures = {picture.name: picture for picture in stored.pictures}
+    for name in ("wire_map", "psf_atlas", "backscatter_white"):
+        if name not in pictures:
+            raise ProfileError(f"Expected the picture '{name}' in {folder}, found none. Make the profile again.")
+    wire = _load_picture(pictures["wire_map"], folder, ("wire",), camera.rows, camera.columns)
+    mask = _load_picture(pictures["backscatter_white"], folder, tuple("RGB"), camera.rows // 2, camera.columns // 2)
+    atlas = pictures["psf_atlas"]
+    _load_picture(atlas, folder, tuple("RGB"), atlas.rows, atlas.columns)
+    return Profile(
+        rig=stored.rig,
+        provenance=stored.provenance,
+        parent=stored.lineage.parent,
+        noise=_load_section(terms.noise, Noise, folder, shared),
+        geometry=geometry,
+        wire=_load_section(terms.wire, Wire, folder, shared),
+        psf=_load_section(terms.psf, PsfField, folder, shared),
+        backscatter=_load_section(terms.backscatter, Backscatter, folder, shared),
+        wire_map=np.array(wire["wire"], dtype=np.float32),
+        backscatter_mask=np.stack([mask[name] for name in "RGB"], axis=-1).astype(np.float32),
+        invalidated_by=stored.invalidated_by,
+    )
+
+
+def _store_section(result: FitResult, name: str, folder: Path, geometry: Geometry | None) -> Section:
+    packed = pack(result.term, name, result.estimates, folder, geometry)
+    return Section(
+        model=type(result.term).__name__,
+        version=1,
+        parameters=packed.parameters,
+        arrays=packed.arrays,
+        fit=store_fit(result, name, folder),
+    )
+
+
+def _load_section(section: Section, kind: type, folder: Path, geometry: Geometry | None) -> FitResult[Any]:
+    if section.model != kind.__name__:
+        raise ProfileError(f"Expected the model {kind.__name__}, found '{section.model}'. Update udccal to read it.")
+    term = unpack(Packed(section.parameters, section.arrays), kind, folder, geometry)
+    return load_fit(section.fit, term, folder)
+
+
+def _store_pictures(profile: Profile, folder: Path) -> tuple[StoredPicture, ...]:
+    mask = {name: profile.backscatter_mask[..., index] for index, name in enumerate("RGB")}
+    atlas = psf_atlas(profile.psf.term, profile.rig)
+    return (
+        _store_picture(folder, "wire_map", {"wire": profile.wire_map}, "1", "The wire at every pixel, mean 1."),
+        _store_picture(
+            folder,
+            "psf_atlas",
+            atlas,
+            "1",
+            f"Kernels at {ATLAS_COLUMNS} x {ATLAS_ROWS} field positions, from 5 % to 95 % of the sensor's width and "
+            "height, tiled as they lie on the sensor. Look at it with the exposure raised.",
+        ),
+        _store_picture(
+            folder,
+            "backscatter_white",
+            mask,
+            "e-/s",
+            "Backscatter of an all-white panel, one sample per 2 x 2 cell of the sensor, before the wire.",
+        ),
+    )
+
+
+def _store_picture(folder: Path, name: str, channels: Channels, unit: str, what: str) -> StoredPicture:
+    file = f"{name}.exr"
+    write_exr(folder / file, channels)
+    rows, columns = next(iter(channels.values())).shape
+    return StoredPicture.model_validate(
+        {
+            "name": name,
+            "file": file,
+            "sha256": sha256_file(folder / file),
+            "columns": columns,
+            "rows": rows,
+            "unit": unit,
+            "what": what,
+        }
+    )
+
+
+def _load_picture(picture: StoredPicture, folder: Path, names: tuple[str, ...], rows: int, columns: int) -> Channels:
+    channels = read_checked(folder, picture.file, picture.sha256)
+    found = next(iter(channels.values())).shape
+    if set(channels) != set(names) or found != (rows, columns) or (picture.rows, picture.columns) != found:
+        raise ProfileError(
+            f"Expected {picture.file} to have the channels {', '.join(names)} of {columns} x {rows} samples, found "
+            f"{', '.join(channels)} of {found[1]} x {found[0]}. Restore the profile from a copy."
+        )
+    return channels

@@ -1,0 +1,37 @@
+"""The psf evaluated at field positions, in a way that compiles once for every use of the same kernel size."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+from jaxtyping import Float, Float32
+
+from udccal.models.psf import PsfField, psf_kernels
+from udccal.numerics import in_float64
+from udccal.rig import RigDescription
+
+# Far enough that what lies beyond is weaker than the noise of a well-exposed frame.
+KERNEL_ROWS, KERNEL_COLUMNS = 257, 65
+
+
+def kernel_size(
+    rig: RigDescription, most_rows: int = KERNEL_ROWS, most_columns: int = KERNEL_COLUMNS
+) -> tuple[int, int]:
+    """(rows, columns) of kernels for a rig, odd; a small sensor gets smaller ones."""
+    rows, columns = min(most_rows, rig.camera.rows // 2), min(most_columns, rig.camera.columns // 2)
+    return rows - 1 + rows % 2, columns - 1 + columns % 2
+
+
+def kernels_at(
+    psf: PsfField, positions_px: Float[np.ndarray, "n 2"], rows: int, columns: int, workers: int = 2
+) -> Float32[np.ndarray, "n 3 rows columns"]:
+    """Kernels at positions, one call each: the same compiled function serves any number of them, on several threads."""
+
+    @in_float64
+    def one(position: Float[np.ndarray, "2"]) -> Float32[np.ndarray, "3 rows columns"]:
+        return np.asarray(psf_kernels(psf, position[None], rows, columns), dtype=np.float32)[0]
+
+    first = one(positions_px[0])
+    with ThreadPoolExecutor(workers) as pool:
+        return np.stack([first, *pool.map(one, positions_px[1:])])

@@ -1,0 +1,48 @@
+"""Maps evaluated from the terms: stored to be looked at, and so that restoration need not evaluate them again."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from jaxtyping import Float32
+
+from udccal.cfa import channel_map
+from udccal.models.backscatter import Backscatter, backscatter_rate
+from udccal.models.psf import PsfField
+from udccal.models.wire import Wire, wire_map
+from udccal.numerics import in_float64
+from udccal.profiles.kernels import kernel_size, kernels_at
+from udccal.rig import RigDescription
+
+ATLAS_COLUMNS, ATLAS_ROWS = 5, 3
+_INSET = 0.05
+
+
+@in_float64
+def sensor_wire_map(wire: Wire, rig: RigDescription) -> Float32[np.ndarray, "rows columns"]:
+    """The wire at every pixel of the sensor."""
+    return np.asarray(wire_map(wire, rig.camera.rows, rig.camera.columns), dtype=np.float32)
+
+
+@in_float64
+def backscatter_mask(term: Backscatter, rig: RigDescription) -> Float32[np.ndarray, "half_rows half_columns 3"]:
+    """Backscatter of an all-white panel in e-/s before the wire, one sample per 2 x 2 cell and channel."""
+    white = np.full((rig.panel.rows, rig.panel.columns, 3), 255, dtype=np.uint8)
+    mosaic = np.asarray(backscatter_rate(term, white), dtype=np.float64)
+    rows, columns = mosaic.shape[0] // 2 * 2, mosaic.shape[1] // 2 * 2
+    cells = mosaic[:rows, :columns].reshape(rows // 2, 2, columns // 2, 2)
+    channels = channel_map(rig.camera.cfa, 2, 2)
+    planes = [cells.transpose(0, 2, 1, 3)[:, :, channels == channel].mean(axis=-1) for channel in range(3)]
+    return np.stack(planes, axis=-1).astype(np.float32)
+
+
+def psf_atlas(term: PsfField, rig: RigDescription) -> Mapping[str, Float32[np.ndarray, "rows columns"]]:
+    """Kernels on a grid of field positions, tiled as the positions lie on the sensor; channels R, G, B."""
+    x = np.linspace(_INSET, 1 - _INSET, ATLAS_COLUMNS) * (rig.camera.columns - 1)
+    y = np.linspace(_INSET, 1 - _INSET, ATLAS_ROWS) * (rig.camera.rows - 1)
+    rows, columns = kernel_size(rig)
+    kernels = kernels_at(term, np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2), rows, columns)
+    tiles = kernels.reshape(ATLAS_ROWS, ATLAS_COLUMNS, 3, rows, columns)
+    atlas = tiles.transpose(2, 0, 3, 1, 4).reshape(3, ATLAS_ROWS * rows, -1)
+    return dict(zip("RGB", atlas, strict=True))

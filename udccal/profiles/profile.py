@@ -1,0 +1,99 @@
+"""A profile in memory: what a rig was measured to be, with the evidence."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float32
+
+from udccal.fitting.result import FitResult
+from udccal.models.backscatter import Backscatter
+from udccal.models.geometry import Geometry
+from udccal.models.noise import Noise
+from udccal.models.psf import PsfField
+from udccal.models.wire import Wire
+from udccal.profiles.pictures import backscatter_mask, sensor_wire_map
+from udccal.profiles.schema import Provenance
+from udccal.rig import RigDescription
+from udccal.sessions.schema import TermName
+
+# A person reads these in profile.json and in the report; each names something that happens to a rig.
+INVALIDATED_BY = (
+    "The lens was refocused, its aperture changed, or it was exchanged: geometry, wire and psf are stale.",
+    "The camera moved against the panel, be it by a fraction of a millimetre: wire and backscatter are stale.",
+    "The camera was turned against the panel: geometry, wire, psf and backscatter are stale.",
+    "The panel was exchanged: wire, psf and backscatter are stale.",
+    "The panel's brightness, gamma or colour settings changed: backscatter is stale.",
+    "The camera's gain, black level or binning changed: noise is stale, and every term with it.",
+)
+
+
+@dataclass(frozen=True)
+class Profile:
+    """One rig as measured.
+
+    Attributes:
+        rig: what it was built to be.
+        provenance: where the numbers come from. parent: SHA-256 of the profile it was derived from, or None.
+        noise, geometry, wire, psf, backscatter: the terms with their evidence.
+        wire_map: the wire at every pixel of the sensor, mean 1. Restoration divides by it.
+        backscatter_mask: backscatter of an all-white panel in e-/s, one sample per 2 x 2 cell and channel.
+        invalidated_by: what makes the profile stale, in sentences.
+    """
+
+    rig: RigDescription
+    provenance: Provenance
+    parent: str | None
+    noise: FitResult[Noise]
+    geometry: FitResult[Geometry]
+    wire: FitResult[Wire]
+    psf: FitResult[PsfField]
+    backscatter: FitResult[Backscatter]
+    wire_map: Float32[np.ndarray, "rows columns"]
+    backscatter_mask: Float32[np.ndarray, "half_rows half_columns 3"]
+    invalidated_by: tuple[str, ...] = INVALIDATED_BY
+
+    def result(self, term: TermName) -> FitResult:
+        """The fit of a term by its name."""
+        results: dict[TermName, FitResult] = {
+            "noise": self.noise,
+            "geometry": self.geometry,
+            "wire": self.wire,
+            "psf": self.psf,
+            "backscatter": self.backscatter,
+        }
+        return results[term]
+
+
+def build_profile(
+    rig: RigDescription,
+    provenance: Provenance,
+    noise: FitResult[Noise],
+    geometry: FitResult[Geometry],
+    wire: FitResult[Wire],
+    psf: FitResult[PsfField],
+    backscatter: FitResult[Backscatter],
+    parent: str | None = None,
+) -> Profile:
+    """A profile from five fits: evaluates the maps that restoration reads.
+
+    Raises:
+        FitError: with the advice of the first fit that ended in a bad status.
+    """
+    for name, result in (
+        ("noise", noise), ("geometry", geometry), ("wire", wire), ("psf", psf), ("backscatter", backscatter)
+    ):  # fmt: skip
+        result.or_raise(name)
+    return Profile(
+        rig=rig,
+        provenance=provenance,
+        parent=parent,
+        noise=noise,
+        geometry=geometry,
+        wire=wire,
+        psf=psf,
+        backscatter=backscatter,
+        wire_map=sensor_wire_map(wire.term, rig),
+        backscatter_mask=backscatter_mask(backscatter.term, rig),
+    )

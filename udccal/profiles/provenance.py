@@ -1,0 +1,48 @@
+"""Where a profile's numbers come from."""
+
+from __future__ import annotations
+
+import hashlib
+import platform
+import sys
+from datetime import UTC, datetime
+from importlib import metadata
+from pathlib import Path, PurePath
+
+from udccal import __version__
+from udccal.io.hashing import sha256_file
+from udccal.profiles.schema import Provenance
+from udccal.sessions.schema import StoredCamera
+
+PROFILE_NAME = "profile.json"
+
+
+def provenance_now(session_manifest: Path | None, camera: StoredCamera | None) -> Provenance:
+    """The provenance of a profile made by this process, now, from a session (or from none)."""
+    return Provenance(
+        created_at=datetime.now(UTC).isoformat(timespec="seconds"),
+        udccal=__version__,
+        python=platform.python_version(),
+        numpy=metadata.version("numpy"),
+        jax=metadata.version("jax"),
+        command=portable_command(sys.argv)[:1000],
+        session_sha256=None if session_manifest is None else sha256_file(session_manifest),
+        camera=camera,
+    )
+
+
+def portable_command(arguments: list[str]) -> str:
+    """A command line in which absolute paths are cut down to their last name: it says nothing about the machine."""
+
+    def portable(argument: str) -> str:
+        option, equals, value = argument.partition("=")
+        if equals and option.startswith("-"):
+            return f"{option}={portable(value)}"
+        return PurePath(argument).name if Path(argument).is_absolute() else argument
+
+    return " ".join(portable(argument) for argument in arguments)
+
+
+def profile_sha256(folder: Path) -> str:
+    """The hash by which a derived profile names this one: of ``profile.json``, which holds all other checksums."""
+    return hashlib.sha256((folder / PROFILE_NAME).read_bytes()).hexdigest()

@@ -1,0 +1,202 @@
+"""``profile.json``, format version 1. docs/profile.md says the same to people and to other programs."""
+
+from __future__ import annotations
+
+from typing import Annotated, Final, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from udccal.rig import RigDescription
+from udccal.sessions.schema import Sha256, StoredCamera
+
+FORMAT: Final = "udccal-profile"
+VERSION: Final = 1
+# Arrays of at most so many values stand in profile.json, where a person can read and compare them.
+INLINE_VALUES = 512
+
+Name = Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]*(\.[A-Za-z0-9_]+)*$", max_length=120)]
+Identifier = Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$", max_length=60)]
+FileName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*\.exr$", max_length=100)]
+Sentence = Annotated[str, Field(max_length=2000)]
+Unit = Annotated[str, Field(max_length=40)]
+Sigma = Annotated[float, Field(ge=0)]
+Shape = Annotated[tuple[Annotated[int, Field(ge=0, le=2**24)], ...], Field(max_length=6)]
+DType = Literal["float64", "float32", "int64", "int32", "uint8", "bool"]
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class Number(_Strict):
+    """One real parameter."""
+
+    kind: Literal["number"] = "number"
+    name: Name
+    value: float
+    unit: Unit
+    sigma: Sigma | None
+
+
+class Numbers(_Strict):
+    """A small array in row-major order; ``sigma`` has one value per element, or is null."""
+
+    kind: Literal["numbers"] = "numbers"
+    name: Name
+    dtype: DType
+    shape: Shape
+    value: Annotated[tuple[float, ...], Field(max_length=INLINE_VALUES)]
+    unit: Unit
+    sigma: Annotated[tuple[Sigma, ...], Field(max_length=INLINE_VALUES)] | None
+
+
+class Choice(_Strict):
+    """An order, a size, a name or a switch that belongs to the model's form and is not fitted; null is none."""
+
+    kind: Literal["choice"] = "choice"
+    name: Name
+    value: bool | int | Annotated[str, Field(max_length=200)] | None
+
+
+class Group(_Strict):
+    """A parameter made of parameters: a nested ``model`` whose fields follow as ``name.field``."""
+
+    kind: Literal["group"] = "group"
+    name: Name
+    model: Identifier
+
+
+class Sequence(_Strict):
+    """A parameter that is a sequence; its items follow as ``name.0``, ``name.1``, ..."""
+
+    kind: Literal["sequence"] = "sequence"
+    name: Name
+    length: Annotated[int, Field(ge=0, le=256)]
+
+
+class Reference(_Strict):
+    """A parameter that is another section's term, stored once there."""
+
+    kind: Literal["reference"] = "reference"
+    name: Name
+    section: Literal["geometry"]
+
+
+Parameter = Annotated[Number | Numbers | Choice | Group | Sequence | Reference, Field(discriminator="kind")]
+
+
+class StoredArray(_Strict):
+    """An array in an EXR file of the same folder, folded to two dimensions (all but the last; the last).
+
+    Its value is the sum of the channels ``value``, ``remainder`` and ``remainder2`` (those there are) in float64.
+    """
+
+    name: Name
+    file: FileName
+    sha256: Sha256
+    dtype: DType
+    shape: Shape
+    unit: Unit
+
+
+class StoredPicture(_Strict):
+    """A map evaluated from the terms, to look at and to restore with."""
+
+    name: Literal["wire_map", "psf_atlas", "backscatter_white"]
+    file: FileName
+    sha256: Sha256
+    columns: Annotated[int, Field(ge=1, le=16384)]
+    rows: Annotated[int, Field(ge=1, le=16384)]
+    unit: Unit
+    what: Sentence
+
+
+class StoredEstimate(_Strict):
+    """One named quantity of a fit with its unit and one standard deviation."""
+
+    name: Annotated[str, Field(max_length=120)]
+    value: float
+    sigma: Sigma
+    unit: Unit
+
+
+class StoredCandidate(_Strict):
+    """One order that was tried."""
+
+    name: Annotated[str, Field(max_length=200)]
+    parameters: Annotated[int, Field(ge=0)]
+    criterion: float
+    chosen: bool
+
+
+class StoredDiagnostic(_Strict):
+    """A number about the fit itself."""
+
+    name: Annotated[str, Field(max_length=120)]
+    value: float
+    unit: Unit
+
+
+class StoredFit(_Strict):
+    """How a term's fit went. ``covariance`` names the array, or is null when no covariance was given."""
+
+    status: Annotated[str, Field(pattern=r"^[A-Z_]{1,40}$")]
+    chi2_dof: Annotated[float, Field(ge=0)]
+    samples: Annotated[int, Field(ge=0)]
+    estimates: Annotated[tuple[StoredEstimate, ...], Field(max_length=20000)]
+    candidates: Annotated[tuple[StoredCandidate, ...], Field(max_length=1000)]
+    diagnostics: Annotated[tuple[StoredDiagnostic, ...], Field(max_length=20000)]
+    notes: Annotated[tuple[Sentence, ...], Field(max_length=1000)]
+    covariance: Numbers | StoredArray | None
+
+
+class Section(_Strict):
+    """One term: what it is, its values, and the evidence for them."""
+
+    model: Identifier
+    version: Literal[1]
+    parameters: Annotated[tuple[Parameter, ...], Field(max_length=2000)]
+    arrays: Annotated[tuple[StoredArray, ...], Field(max_length=200)]
+    fit: StoredFit
+
+
+class Terms(_Strict):
+    """The five terms."""
+
+    noise: Section
+    geometry: Section
+    wire: Section
+    psf: Section
+    backscatter: Section
+
+
+class Provenance(_Strict):
+    """Where the numbers come from. ``command`` carries file names without the folders they lay in."""
+
+    created_at: Annotated[str, Field(max_length=40)]
+    udccal: Annotated[str, Field(max_length=40)]
+    python: Annotated[str, Field(max_length=40)]
+    numpy: Annotated[str, Field(max_length=40)]
+    jax: Annotated[str, Field(max_length=40)]
+    command: Annotated[str, Field(max_length=1000)]
+    session_sha256: Sha256 | None
+    camera: StoredCamera | None
+
+
+class Lineage(_Strict):
+    """``parent`` is the SHA-256 of the ``profile.json`` that this profile was derived from, or null."""
+
+    parent: Sha256 | None
+
+
+class StoredProfile(_Strict):
+    """The whole of ``profile.json``."""
+
+    format: Literal["udccal-profile"]
+    version: Literal[1]
+    rig: RigDescription
+    lineage: Lineage
+    provenance: Provenance
+    invalidated_by: Annotated[tuple[Sentence, ...], Field(max_length=100)]
+    terms: Terms
+    pictures: Annotated[tuple[StoredPicture, ...], Field(max_length=3)]

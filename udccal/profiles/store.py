@@ -1,0 +1,159 @@
+"""Reading and writing profiles: whole or not at all, checked before anything is believed."""
+
+from __future__ import annotations
+
+import json
+import os
+import secrets
+import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from pydantic import ValidationError
+
+from udccal.errors import ProfileError
+from udccal.profiles.archive import pack_archive, unpack_archive
+from udccal.profiles.encode import decode, encode
+from udccal.profiles.profile import Profile
+from udccal.profiles.provenance import PROFILE_NAME
+from udccal.profiles.schema import StoredArray, StoredProfile
+from udccal.profiles.versions import migrated
+
+_MAX_JSON_BYTES = 32 * 1024 * 1024
+
+
+def write_profile(path: Path, profile: Profile) -> None:
+    """Write a profile as a folder, or as one file where ``path`` ends in ``.zip``; replaces a profile that is there.
+
+    Raises:
+        ProfileError: when ``path`` is taken by something that is not a profile; nothing is changed then.
+    """
+    check_replaceable(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with _temporary_beside(path) as folder:
+        stored = encode(profile, folder)
+        (folder / PROFILE_NAME).write_text(stored.model_dump_json(indent=1) + "\n", encoding="utf-8")
+        if path.suffix == ".zip":
+            pack_archive(folder, path)
+        else:
+            _flush(folder)
+            _replace(folder, path)
+
+
+def read_profile(path: Path) -> Profile:
+    """Read a profile from a folder or a zip file.
+
+    Raises:
+        ProfileError: when it is missing, damaged, altered, too large, newer, or does not follow docs/profile.md.
+    """
+    if path.is_file():
+        with tempfile.TemporaryDirectory(prefix="udccal-") as folder:
+            unpack_archive(path, Path(folder))
+            return decode(read_stored(Path(folder)), Path(folder))
+    return decode(read_stored(path), path)
+
+
+def read_stored(folder: Path) -> StoredProfile:
+    """``profile.json`` of a folder, migrated to the present version and checked; the arrays are not read.
+
+    Raises:
+        ProfileError: as ``read_profile``.
+    """
+    file = folder / PROFILE_NAME
+    if not file.is_file():
+        raise ProfileError(
+            f"Expected a profile with a {PROFILE_NAME} at {folder}, found none. Check the path, or calibrate the rig."
+        )
+    size = file.stat().st_size
+    if size > _MAX_JSON_BYTES:
+        raise ProfileError(f"Expected {file} to hold at most {_MAX_JSON_BYTES} bytes, found {size}. It is not ours.")
+    try:
+        found = json.loads(file.read_bytes())
+    except (ValueError, RecursionError) as error:
+        raise ProfileError(f"Expected {file} to be JSON, found: {error}. Restore it from a copy.") from error
+    if not isinstance(found, dict):
+        raise ProfileError(f"Expected {file} to hold a JSON object, found another value. Restore it from a copy.")
+    current = migrated(found, str(file))
+    try:
+        return StoredProfile.model_validate_json(json.dumps(current), strict=True)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"])
+        raise ProfileError(
+            f"Expected a valid '{where}' in {file}, found: {first['msg']}. Restore it from a copy."
+        ) from error
+
+
+@contextmanager
+def _temporary_beside(path: Path) -> Iterator[Path]:
+    folder = path.with_name(f".{path.name}-{secrets.token_hex(6)}.partial")
+    folder.mkdir()
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _replace(folder: Path, path: Path) -> None:
+    """Move a finished folder into place; an older profile is moved aside first and removed last."""
+    if not path.exists():
+        os.replace(folder, path)
+        return
+    aside = path.with_name(f".{path.name}-{secrets.token_hex(6)}.old")
+    os.replace(path, aside)
+    try:
+        os.replace(folder, path)
+    except OSError:
+        os.replace(aside, path)
+        raise
+    shutil.rmtree(aside, ignore_errors=True)
+
+
+def check_replaceable(path: Path) -> None:
+    """Refuse a path at which a profile cannot be written; worth asking before the work that leads to one.
+
+    Raises:
+        ProfileError: when something other than a profile stands there.
+    """
+    if not path.exists() or (path.is_dir() and not any(path.iterdir())):
+        return
+    try:
+        if path.is_file():
+            with tempfile.TemporaryDirectory(prefix="udccal-") as folder:
+                unpack_archive(path, Path(folder))
+                read_stored(Path(folder))
+            return
+        stored = read_stored(path)
+    except ProfileError as error:
+        raise ProfileError(
+            f"Expected {path} to be free or to hold a profile that may be replaced, found something else ({error}) "
+            "Choose another path."
+        ) from error
+    ours = {PROFILE_NAME, *stored_files(stored)}
+    others = sorted(item.name for item in path.iterdir() if item.name not in ours)
+    if others:
+        raise ProfileError(
+            f"Expected {path} to hold only a profile's files, found also '{others[0]}'. Move it, or choose"
+            " another path."
+        )
+
+
+def stored_files(stored: StoredProfile) -> set[str]:
+    """Names of the EXR files that a profile lists."""
+    sections = (getattr(stored.terms, name) for name in type(stored.terms).model_fields)
+    files = {picture.file for picture in stored.pictures}
+    for section in sections:
+        files |= {array.file for array in section.arrays}
+        covariance = section.fit.covariance
+        if isinstance(covariance, StoredArray):
+            files.add(covariance.file)
+    return files
+
+
+def _flush(folder: Path) -> None:
+    """Have every byte on disk before the name appears."""
+    for file in folder.iterdir():
+        with file.open("rb+") as stream:
+            os.fsync(stream.fileno())

@@ -1,0 +1,50 @@
+"""Corners of the boards in a session against the fitted geometry: numbers for the report's coverage picture."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Float
+
+from udccal.fitting.corners import board_points_mm
+from udccal.fitting.geometry import BoardView, read_view
+from udccal.models.geometry import Geometry
+from udccal.models.noise import Noise
+from udccal.sessions.schema import BoardSubject
+from udccal.sessions.store import Session
+
+
+@dataclass(frozen=True)
+class BoardEvidence:
+    """Every corner found, and how far it lies from where the fitted lens and the best pose of its board put it."""
+
+    corners_px: Float[np.ndarray, "n 2"]
+    residuals_px: Float[np.ndarray, "n 2"]
+    views: int
+
+
+def board_evidence(session: Session, noise: Noise, geometry: Geometry) -> BoardEvidence | None:
+    """Corners and residuals of all board views of a session; None when there are none.
+
+    Raises:
+        SessionError: when a file of the session is damaged.
+    """
+    steps = [step for step in session.steps("geometry") if isinstance(step.subject, BoardSubject)]
+    views = [view for view in (read_view(session, step, noise) for step in steps) if view.usable]
+    if not views:
+        return None
+    residuals = [_residuals(view, geometry) for view in views]
+    return BoardEvidence(np.concatenate([v.corners.xy for v in views]), np.concatenate(residuals), len(views))
+
+
+def _residuals(view: BoardView, geometry: Geometry) -> Float[np.ndarray, "n 2"]:
+    """Found minus projected, after the pose that fits this view best."""
+    (fx, fy), (cx, cy) = np.asarray(geometry.focal), np.asarray(geometry.centre)
+    matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    distortion = np.asarray(geometry.distortion, dtype=np.float64)
+    points_mm = board_points_mm(view.spec)[view.corners.ids]
+    _, rotation, translation = cv2.solvePnP(points_mm, view.corners.xy, matrix, distortion)
+    projected, _ = cv2.projectPoints(points_mm, rotation, translation, matrix, distortion)
+    return view.corners.xy - projected.reshape(-1, 2)

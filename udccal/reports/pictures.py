@@ -1,0 +1,68 @@
+"""How good a picture is: display-encoded values against the truth, as PSNR and SSIM. Numbers only."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, UInt16
+
+from udccal.cfa import cell_channels
+from udccal.restoration.metrics import least_squares_gain, psnr, ssim
+from udccal.restoration.tone import display_exposure, encode_srgb
+
+
+@dataclass(frozen=True)
+class Score:
+    """One picture against the truth."""
+
+    psnr_dB: float
+    ssim: float
+
+
+@dataclass(frozen=True)
+class PictureComparison:
+    """A scene before and after restoration and as it is, all display-encoded (0 to 1), with both scores."""
+
+    name: str
+    before: Float[np.ndarray, "rows columns 3"]
+    after: Float[np.ndarray, "rows columns 3"]
+    truth: Float[np.ndarray, "rows columns 3"]
+    score_before: Score
+    score_after: Score
+
+    @property
+    def gain_dB(self) -> float:
+        """PSNR after minus PSNR before."""
+        return self.score_after.psnr_dB - self.score_before.psnr_dB
+
+
+def compare_pictures(
+    name: str,
+    before: Float[np.ndarray, "rows columns 3"],
+    after: Float[np.ndarray, "rows columns 3"],
+    truth: Float[np.ndarray, "rows columns 3"],
+) -> PictureComparison:
+    """Score linear pictures of one scene on the virtual view.
+
+    All three share the exposure that shows the truth well. ``before`` gets the least-squares gain per channel,
+    ``after`` none: restoration has to get the level right.
+    """
+    exposure = display_exposure(truth)
+    blurred = encode_srgb(before * least_squares_gain(before, truth) * exposure)
+    restored, ideal = encode_srgb(after * exposure), encode_srgb(truth * exposure)
+    return PictureComparison(name, blurred, restored, ideal, _score(blurred, ideal), _score(restored, ideal))
+
+
+def _score(picture: Float[np.ndarray, "rows columns 3"], truth: Float[np.ndarray, "rows columns 3"]) -> Score:
+    return Score(psnr(picture, truth), ssim(picture, truth))
+
+
+def mosaic_preview(
+    mosaic: UInt16[np.ndarray, "rows columns"], cfa: str, black_DN: float
+) -> Float[np.ndarray, "half_rows half_columns 3"]:
+    """A linear picture of half the size, each 2 x 2 cell one pixel: quick, and free of interpolation."""
+    rows, columns = mosaic.shape[0] // 2 * 2, mosaic.shape[1] // 2 * 2
+    signal = np.maximum(mosaic[:rows, :columns].astype(np.float32) - np.float32(black_DN), 0.0)
+    sites = [(channel, signal[j::2, i::2]) for (j, i), channel in np.ndenumerate(cell_channels(cfa))]
+    return np.stack([np.mean([s for c, s in sites if c == channel], axis=0) for channel in range(3)], axis=-1)

@@ -1,0 +1,105 @@
+"""The report of a calibration: collects the numbers, draws the figures, writes the page."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import UInt8
+
+from udccal.fitting.calibrate import ORDER, Calibration
+from udccal.reports import figures
+from udccal.reports.board_views import board_evidence
+from udccal.reports.evidence import photon_transfer
+from udccal.reports.maps import fitted_maps
+from udccal.reports.page import Fact, Illustration, Page
+from udccal.reports.pictures import PictureComparison
+from udccal.reports.sections import Evidence, sections
+from udccal.reports.tables import Table
+from udccal.reports.truth import compare_with_truth, true_maps, truth_table
+from udccal.restoration.tone import to_rgb8
+from udccal.sessions.store import Session
+from udccal.simulation.light import RigLight
+
+
+def gather(
+    session: Session,
+    calibration: Calibration,
+    picture: UInt8[np.ndarray, "panel_rows panel_columns 3"],
+    light: RigLight | None,
+) -> Evidence:
+    """Every number the report shows; ``light`` is the simulated rig's, None for a rig that is really there.
+
+    Raises:
+        SessionError: when a file of the session is damaged.
+    """
+    fitted = fitted_maps(calibration, picture)
+    true = None if light is None else true_maps(light, fitted)
+    rows = () if light is None or true is None else compare_with_truth(calibration, light.truth, fitted, true)
+    noise, geometry = calibration.noise.term, calibration.geometry.term
+    return Evidence(
+        calibration, fitted, true, rows, photon_transfer(session, noise), board_evidence(session, noise, geometry)
+    )
+
+
+def calibration_page(session: Session, evidence: Evidence, scene: PictureComparison | None) -> Page:
+    """The page of one calibration, with a restored scene when there is one."""
+    calibration = evidence.calibration
+    bad = [term for term in ORDER if not calibration.result(term).ok]
+    good = "All five terms can be used."
+    verdict = f"Not usable: {', '.join(bad)}. Each section says what to do." if bad else good
+    camera, sensor = session.camera, calibration.rig.camera
+    facts = (
+        Fact("rig", calibration.rig.name),
+        Fact("panel", calibration.rig.panel.model),
+        Fact("camera", f"{camera.vendor} {camera.model}, serial {camera.serial}"),
+        Fact("sensor", f"{sensor.columns} × {sensor.rows}, {sensor.cfa}, {sensor.bits} bits"),
+        Fact("captured", session.manifest.created_at),
+        Fact("steps", str(len(session.manifest.steps))),
+        Fact("fits", f"{sum(t.seconds for t in calibration.times):.1f} s"),
+    )
+    tables = (truth_table(evidence.rows),) if evidence.rows else ()
+    return Page(
+        title=f"Calibration of {calibration.rig.name}",
+        verdict=verdict,
+        facts=facts,
+        pictures=() if scene is None else scene_illustrations(scene),
+        picture_sentence="" if scene is None else scene_sentence(scene),
+        tables=tables,
+        sections=sections(evidence),
+    )
+
+
+def scene_sentence(scene: PictureComparison) -> str:
+    """What restoration did to a scene, in numbers."""
+    before, after = scene.score_before, scene.score_after
+    return (
+        f"Restoration takes “{scene.name}” from {before.psnr_dB:.2f} dB to {after.psnr_dB:.2f} dB PSNR "
+        f"(gain {scene.gain_dB:.2f} dB) and from {before.ssim:.3f} to {after.ssim:.3f} SSIM."
+    )
+
+
+def scene_table(scene: PictureComparison) -> Table:
+    """Scores before and after as text."""
+    rows = tuple(
+        (name, f"{score.psnr_dB:.2f}", f"{score.ssim:.4f}")
+        for name, score in (("before", scene.score_before), ("after", scene.score_after))
+    )
+    return Table(f"The picture “{scene.name}”", ("", "PSNR [dB]", "SSIM"), rows, frozenset({1, 2}))
+
+
+def scene_illustrations(scene: PictureComparison) -> tuple[Illustration, ...]:
+    """Before, after, truth and what is left."""
+    difference = np.abs(scene.after - scene.truth).mean(axis=-1)
+    return (
+        Illustration(
+            figures.embedded_picture(to_rgb8(scene.before)),
+            "Before: black level, colour and geometry only.",
+            "before",
+        ),
+        Illustration(figures.embedded_picture(to_rgb8(scene.after)), "After: restored with this profile.", "after"),
+        Illustration(figures.embedded_picture(to_rgb8(scene.truth)), "Truth: the same view without a panel.", "truth"),
+        Illustration(
+            figures.embedded_png(figures.difference_figure(difference, "|after − truth|")),
+            "What is left, on a scale to a tenth of full.",
+            "difference",
+        ),
+    )

@@ -1,0 +1,131 @@
+"""The five chapters of a report: which figures and tables each term gets, and the sentences around them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from matplotlib.figure import Figure
+
+from udccal.fitting.calibrate import ORDER, Calibration
+from udccal.fitting.result import FitResult, FitStatus
+from udccal.reports import figures
+from udccal.reports.board_views import BoardEvidence
+from udccal.reports.evidence import PhotonTransfer
+from udccal.reports.fit_tables import candidates_table, diagnostics_table, estimates_table
+from udccal.reports.maps import TermMaps
+from udccal.reports.page import Illustration, TermSection
+from udccal.reports.tables import number, spread
+from udccal.reports.truth import TruthRow
+from udccal.sessions.schema import TermName
+
+_LONGEST_LIST = 14
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """All numbers a report draws from; what is None is left out of the page."""
+
+    calibration: Calibration
+    fitted: TermMaps
+    true: TermMaps | None
+    rows: tuple[TruthRow, ...]
+    transfer: PhotonTransfer | None
+    boards: BoardEvidence | None
+
+
+_EXPLANATIONS: dict[TermName, str] = {
+    "noise": "How the sensor counts: gain, dark noise and the unevenness of its pixels, in the terms of EMVA 1288.",
+    "geometry": "Where each pixel looks: the lens with its distortion, and how the camera is tilted against the panel.",
+    "wire": "The shadow of the panel's pixel rows, far out of focus: a ripple that multiplies the picture.",
+    "psf": "How the panel's rows spread a point of light by diffraction; it changes over the field and with colour.",
+    "backscatter": "Light of the panel itself that scatters back into the lens; it depends on what the panel shows.",
+}
+
+
+def sections(evidence: Evidence) -> tuple[TermSection, ...]:
+    """One section per term in the order of the fits."""
+    return tuple(_section(term, evidence) for term in ORDER)
+
+
+def _section(term: TermName, evidence: Evidence) -> TermSection:
+    result = evidence.calibration.result(term)
+    shown = () if result.status is FitStatus.ABSENT else _illustrations(term, evidence)
+    estimates = estimates_table("Fitted", result)
+    long = len(estimates.rows) > _LONGEST_LIST
+    details = [diagnostics_table("The fit itself", result)]
+    if result.candidates:
+        details.append(candidates_table("Orders tried (lower is better)", result))
+    if long:
+        details.append(estimates)
+    return TermSection(
+        term=term,
+        heading=term.capitalize(),
+        explanation=_EXPLANATIONS[term],
+        status=result.status,
+        finding=_finding(term, result, evidence.rows),
+        illustrations=shown,
+        tables=() if long or not estimates.rows else (estimates,),
+        details=tuple(details) if result.samples else (),
+        notes=result.notes,
+    )
+
+
+def _finding(term: TermName, result: FitResult, rows: tuple[TruthRow, ...]) -> str:
+    """The one number that says most: the distance from the truth when it is known, else the first estimate."""
+    distances = [row for row in rows if row.term == term and row.fitted is None]
+    if distances:
+        worst = distances[0]
+        return f"{worst.quantity[0].upper()}{worst.quantity[1:]}: {worst.error:.2g} {worst.unit}."
+    if not result.estimates:
+        return "Nothing was fitted."
+    first = result.estimates[0]
+    return f"{first.name} = {number(first.value, first.sigma)} ± {spread(first.sigma)} {first.unit}."
+
+
+def _illustrations(term: TermName, evidence: Evidence) -> tuple[Illustration, ...]:
+    draw = {"noise": _noise, "geometry": _geometry, "wire": _wire, "psf": _psf, "backscatter": _backscatter}
+    return draw[term](evidence)
+
+
+def _illustration(figure: Figure, caption: str, alt: str) -> tuple[Illustration, ...]:
+    return (Illustration(figures.embedded_png(figure), caption, alt),)
+
+
+def _noise(evidence: Evidence) -> tuple[Illustration, ...]:
+    if evidence.transfer is None:
+        return ()
+    caption = "Pairs of flats at rising exposure. The points should follow the line until they clip (dotted)."
+    return _illustration(figures.photon_transfer_figure(evidence.transfer), caption, "photon transfer")
+
+
+def _geometry(evidence: Evidence) -> tuple[Illustration, ...]:
+    if evidence.boards is None:
+        return ()
+    camera = evidence.calibration.rig.camera
+    caption = (
+        f"Left: corners of {evidence.boards.views} views; they should reach into every corner of the sensor. "
+        "Right: what is left after the fit; it should be round and centred."
+    )
+    figure = figures.board_figure(evidence.boards, camera.columns, camera.rows)
+    return _illustration(figure, caption, "board coverage and residuals")
+
+
+def _wire(evidence: Evidence) -> tuple[Illustration, ...]:
+    caption = (
+        "The ripple in the map by which the picture is divided (the lens's shading is taken out here, to show it). "
+        "A difference from the truth should show no stripes and no trend."
+    )
+    return _illustration(figures.wire_figure(evidence.fitted, evidence.true), caption, "wire map")
+
+
+def _psf(evidence: Evidence) -> tuple[Illustration, ...]:
+    caption = "A point of light at places between the captured ones; brightness is logarithmic over five decades."
+    return _illustration(figures.psf_figure(evidence.fitted, evidence.true), caption, "point-spread functions")
+
+
+def _backscatter(evidence: Evidence) -> tuple[Illustration, ...]:
+    caption = (
+        "The part of the panel in front of the lens, showing a picture that was not captured, and the light it sends "
+        "back into the camera (one site of the pattern)."
+    )
+    return _illustration(figures.backscatter_figure(evidence.fitted, evidence.true), caption, "backscatter")

@@ -1,0 +1,67 @@
+"""The simulated rig's own values of the quantities that the fits estimate, under the names of the estimates."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from udccal.fitting.nominal import rotation_vector
+from udccal.models.geometry import Geometry
+from udccal.sessions.schema import TermName
+from udccal.simulation.truth import RigTruth
+
+
+@dataclass(frozen=True)
+class TrueValue:
+    """A quantity as it really is; ``name`` and unit are those of the term's estimate."""
+
+    term: TermName
+    name: str
+    value: float
+
+
+def true_values(truth: RigTruth) -> tuple[TrueValue, ...]:
+    """Every quantity that both a fit and the simulated rig can name."""
+    sensor, optics, panel = truth.sensor, truth.optics, truth.panel
+    standoff_mm = -float(optics.pupil_mm[2])
+    sigma_d = float(np.hypot(sensor.sigma_read_e, sensor.sigma_row_DN / sensor.K_DN_per_e))
+    return (
+        TrueValue("noise", "K_DN_per_e", sensor.K_DN_per_e),
+        TrueValue("noise", "sigma_d_e", sigma_d),
+        TrueValue("noise", "black_DN", sensor.black_DN),
+        TrueValue("noise", "dark_current_e_per_s", sensor.dark_current_e_per_s),
+        TrueValue("noise", "PRNU1288", sensor.PRNU1288),
+        TrueValue("noise", "DSNU1288_e", sensor.DSNU1288_e),
+        TrueValue("noise", "sigma_row_DN", sensor.sigma_row_DN),
+        TrueValue("noise", "lambda_read", sensor.lambda_read),
+        TrueValue("geometry", "fx", optics.fx_px),
+        TrueValue("geometry", "fy", optics.fy_px),
+        TrueValue("geometry", "cx", optics.cx_px),
+        TrueValue("geometry", "cy", optics.cy_px),
+        TrueValue("geometry", "tilt_deg", optics.tilt_deg),
+        # An opening of some depth lets light through as a thin one half-way through it would.
+        TrueValue("wire", "standoff_per_pitch", (standoff_mm + panel.structure_thickness_mm / 2) / panel.pitch_mm),
+        TrueValue("wire", "row_open", panel.row_open),
+        TrueValue("wire", "column_open", panel.column_open),
+        TrueValue("psf", "pitch", panel.pitch_mm),
+        TrueValue("psf", "row_open_fraction", panel.row_open),
+        TrueValue("psf", "column_open_fraction", panel.column_open),
+        TrueValue("psf", "structure_thickness", panel.structure_thickness_mm),
+        TrueValue("psf", "pupil_diameter", optics.pupil_diameter_mm),
+        TrueValue("backscatter", "gamma", panel.gamma),
+        TrueValue("backscatter", "pupil_mm", optics.pupil_diameter_mm),
+        TrueValue("backscatter", "distance_mm", standoff_mm),
+    )
+
+
+def true_geometry(truth: RigTruth) -> Geometry:
+    """The simulated rig's geometry as the term that a perfect fit would find."""
+    optics = truth.optics
+    return Geometry(
+        focal=np.array([optics.fx_px, optics.fy_px]),
+        centre=np.array([optics.cx_px, optics.cy_px]),
+        distortion=np.array(optics.distortion),
+        rotation=rotation_vector(optics.R_panel_camera),
+        pupil=np.array(optics.pupil_mm),
+    )

@@ -1,0 +1,78 @@
+"""Subtracting the panel's own light: from the panel picture when it is known, from the mask alone when it is not."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import Float, Float32, UInt8
+
+from udccal.cfa import channel_map
+from udccal.models.backscatter import Backscatter, PanelResponse, panel_response, response_rate
+from udccal.numerics import in_float64
+from udccal.rig import RigDescription
+
+# The level is read from blocks of so many samples: large enough to average noise, small enough to find dark places.
+_BLOCK = 16
+_PERCENTILE = 1.0
+
+
+@in_float64
+def prepared_response(term: Backscatter, rig: RigDescription) -> PanelResponse:
+    """The term worked out for the rig's panel, in float32 numpy arrays."""
+    response = panel_response(term, rig.panel.rows, rig.panel.columns)
+    return jax.tree.map(_single, response)
+
+
+def _single(leaf: Any) -> np.ndarray:
+    """A leaf as numpy, in single precision if it is real; jitted functions take it outside the float64 context."""
+    array = np.asarray(leaf)
+    return array.astype(np.float32) if np.issubdtype(array.dtype, np.floating) else array
+
+
+def known_rate(
+    response: PanelResponse, picture: UInt8[np.ndarray, "panel_rows panel_columns 3"]
+) -> Float32[np.ndarray, "rows columns"]:
+    """Backscatter in e-/s at every sample of the mosaic while the panel shows ``picture``."""
+    return np.asarray(response_rate(response, picture), dtype=np.float32)
+
+
+def mask_mosaic(
+    mask: Float32[np.ndarray, "half_rows half_columns 3"], cfa: str, rows: int, columns: int
+) -> Float32[np.ndarray, "rows columns"]:
+    """The profile's mask (one value per 2 x 2 cell and channel) at every sample, each of its own colour."""
+    last_row, last_column = mask.shape[0] - 1, mask.shape[1] - 1
+    cell_rows = np.minimum(np.arange(rows) // 2, last_row)[:, None]
+    cell_columns = np.minimum(np.arange(columns) // 2, last_column)[None, :]
+    return mask[cell_rows, cell_columns, channel_map(cfa, rows, columns)]
+
+
+def estimated_rate(
+    signal_rate: Float32[np.ndarray, "rows columns"], mask: Float32[np.ndarray, "rows columns"], cfa: str
+) -> Float32[np.ndarray, "rows columns"]:
+    """Backscatter in e-/s when the panel picture is not known: the mask times one level per colour.
+
+    Light only adds, so the frame is nowhere darker than its backscatter: the level is what the darkest places (the 1st
+    percentile of 16 x 16 blocks) allow, between 0 and 1. A scene without dark places gets too much taken away, by at
+    most its own darkest percent.
+    """
+    channels = channel_map(cfa, *signal_rate.shape)
+    levels = np.array([_level(signal_rate, mask, channels == channel) for channel in range(3)], dtype=np.float32)
+    return mask * levels[channels]
+
+
+def _level(
+    signal_rate: Float[np.ndarray, "rows columns"], mask: Float[np.ndarray, "rows columns"], own: np.ndarray
+) -> float:
+    light, possible = _block_sums(np.where(own, signal_rate, 0.0)), _block_sums(np.where(own, mask, 0.0))
+    usable = possible > 0
+    if not usable.any():
+        return 0.0
+    return float(np.clip(np.percentile(light[usable] / possible[usable], _PERCENTILE), 0.0, 1.0))
+
+
+def _block_sums(samples: np.ndarray) -> Float[np.ndarray, "block_rows block_columns"]:
+    rows, columns = (max(size // _BLOCK, 1) for size in samples.shape)
+    cut = samples[: rows * _BLOCK, : columns * _BLOCK]
+    return cut.reshape(rows, cut.shape[0] // rows, columns, cut.shape[1] // columns).sum(axis=(1, 3))

@@ -1,0 +1,78 @@
+"""Demosaicing by linear filters: Malvar, He and Cutler, "High-quality linear interpolation for demosaicing of
+Bayer-patterned color images", ICASSP 2004.
+
+Linear on purpose: noise stays what it was, negative values stay, and the deblurring that follows sees a linear camera.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float32
+
+from udccal.cfa import BLUE, GREEN, RED, cell_channels, channel_map
+
+# Figure 2 of the paper, in eighths. The picture's own sample is in the middle.
+_GREEN_AT_COLOUR = np.array(
+    [[0, 0, -1, 0, 0], [0, 0, 2, 0, 0], [-1, 2, 4, 2, -1], [0, 0, 2, 0, 0], [0, 0, -1, 0, 0]], dtype=np.float32
+) / np.float32(8)
+_COLOUR_ALONG_ROW = np.array(
+    [[0, 0, 0.5, 0, 0], [0, -1, 0, -1, 0], [-1, 4, 5, 4, -1], [0, -1, 0, -1, 0], [0, 0, 0.5, 0, 0]], dtype=np.float32
+) / np.float32(8)
+_COLOUR_ALONG_COLUMN = np.ascontiguousarray(_COLOUR_ALONG_ROW.T)
+_COLOUR_ACROSS = np.array(
+    [[0, 0, -1.5, 0, 0], [0, 2, 0, 2, 0], [-1.5, 0, 6, 0, -1.5], [0, 2, 0, 2, 0], [0, 0, -1.5, 0, 0]],
+    dtype=np.float32,
+) / np.float32(8)
+_BILINEAR = np.array([[1, 2, 1], [2, 4, 2], [1, 2, 1]], dtype=np.float32)
+_FOOTPRINT = np.ones((5, 5), dtype=np.uint8)
+
+
+def demosaic(mosaic: Float32[np.ndarray, "rows columns"], cfa: str) -> Float32[np.ndarray, "rows columns 3"]:
+    """A colour at every sample. Borders continue by mirroring, which keeps the pattern."""
+    cell = cell_channels(cfa)
+    picture = np.empty((*mosaic.shape, 3), dtype=np.float32)
+    green = _filtered(mosaic, _GREEN_AT_COLOUR)
+    along_row, along_column, across = (
+        _filtered(mosaic, kernel) for kernel in (_COLOUR_ALONG_ROW, _COLOUR_ALONG_COLUMN, _COLOUR_ACROSS)
+    )
+    for j in (0, 1):
+        for i in (0, 1):
+            site = (slice(j, None, 2), slice(i, None, 2))
+            own = int(cell[j, i])
+            picture[(*site, own)] = mosaic[site]
+            if own == GREEN:
+                picture[(*site, int(cell[j, 1 - i]))] = along_row[site]
+                picture[(*site, int(cell[1 - j, i]))] = along_column[site]
+            else:
+                picture[(*site, GREEN)] = green[site]
+                picture[(*site, RED + BLUE - own)] = across[site]
+    return picture
+
+
+def demosaic_clipped(
+    mosaic: Float32[np.ndarray, "rows columns"], cfa: str, saturated: Bool[np.ndarray, "rows columns"]
+) -> tuple[Float32[np.ndarray, "rows columns 3"], Bool[np.ndarray, "rows columns 3"]]:
+    """``demosaic``, and which of its values carry data although some samples are saturated.
+
+    A saturated sample would spoil all three colours of the 5 x 5 pixels around it. There, each colour is interpolated
+    from its own samples alone, and carries data unless one of these is itself saturated.
+    """
+    picture = demosaic(mosaic, cfa)
+    valid = np.ones(picture.shape, dtype=bool)
+    if not saturated.any():
+        return picture, valid
+    spoilt = cv2.dilate(saturated.astype(np.uint8), _FOOTPRINT).astype(bool)
+    channels = channel_map(cfa, *mosaic.shape)
+    for channel in range(3):
+        own = (channels == channel).astype(np.float32)
+        alone = _filtered(mosaic * own, _BILINEAR) / _filtered(own, _BILINEAR)
+        picture[..., channel] = np.where(spoilt, alone, picture[..., channel])
+        valid[..., channel] = _filtered(own * saturated, _BILINEAR) == 0
+    return picture, valid
+
+
+def _filtered(
+    mosaic: Float32[np.ndarray, "rows columns"], kernel: Float32[np.ndarray, "k k"]
+) -> Float32[np.ndarray, "rows columns"]:
+    return cv2.filter2D(mosaic, cv2.CV_32F, kernel, borderType=cv2.BORDER_REFLECT_101)

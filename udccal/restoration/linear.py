@@ -1,0 +1,63 @@
+"""From raw numbers to electrons, and which samples are not to be believed."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from jaxtyping import ArrayLike, Bool, Float32, UInt16
+
+from udccal.models.noise import Noise, variance_e
+
+# A sample stands out when it differs from all its neighbours by so many sigma of temporal noise ...
+_OUTLIER_SIGMA = 8.0
+# ... and by so many times their own spread. A point of light seen through the panel stays below 4: its kernel is wide.
+_OUTLIER_RATIO = 5.0
+_NEIGHBOURS = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], dtype=np.uint8)
+
+
+def scalar(value: ArrayLike) -> float:
+    """A term's parameter, be it a number or an array of no dimensions, as a float."""
+    return float(np.asarray(value))
+
+
+def to_electrons(
+    mosaic: UInt16[np.ndarray, "rows columns"], noise: Noise, exposure_s: float
+) -> Float32[np.ndarray, "rows columns"]:
+    """Signal in e-: (DN - black) / K minus the mean dark current. Negative values stay."""
+    scale = 1.0 / scalar(noise.K_DN_per_e)
+    offset = scalar(noise.black_DN) * scale + scalar(noise.dark_current_e_per_s) * exposure_s
+    return mosaic.astype(np.float32) * np.float32(scale) - np.float32(offset)
+
+
+def saturated(
+    mosaic: UInt16[np.ndarray, "rows columns"], noise: Noise, margin: float
+) -> Bool[np.ndarray, "rows columns"]:
+    """Samples within ``margin`` (a fraction of the range above black) of saturation: their value is only a bound."""
+    top, black = scalar(noise.saturation_DN), scalar(noise.black_DN)
+    return mosaic >= top - margin * (top - black)
+
+
+def mean_variance_e2(mosaic: UInt16[np.ndarray, "rows columns"], noise: Noise, exposure_s: float) -> float:
+    """Temporal variance of a frame's samples in e-^2, averaged over the frame (EMVA 1288's linear model)."""
+    mean_e = (float(mosaic.mean()) - scalar(noise.black_DN)) / scalar(noise.K_DN_per_e)
+    dark_e = scalar(noise.dark_current_e_per_s) * exposure_s
+    return float(variance_e(noise, max(mean_e - dark_e, 0.0), exposure_s))
+
+
+def without_defects(signal_e: Float32[np.ndarray, "rows columns"], noise: Noise) -> Float32[np.ndarray, "rows columns"]:
+    """Hot and dead samples replaced by the median of their 3 x 3 neighbourhood of the same colour.
+
+    A sample counts as defective when it lies outside the range of its eight neighbours of the same colour by more than
+    8 sigma of its temporal noise and by more than 5 times that range.
+    """
+    cleaned = signal_e.copy()
+    floor = scalar(noise.sigma_d_e) ** 2
+    for j in (0, 1):
+        for i in (0, 1):
+            plane = np.ascontiguousarray(signal_e[j::2, i::2])
+            high, low = cv2.dilate(plane, _NEIGHBOURS), cv2.erode(plane, _NEIGHBOURS)
+            sigma = np.sqrt(np.maximum(high, 0.0) + floor)
+            allowed = np.maximum(_OUTLIER_SIGMA * sigma, _OUTLIER_RATIO * (high - low))
+            defective = (plane > high + allowed) | (plane < low - allowed)
+            cleaned[j::2, i::2] = np.where(defective, cv2.medianBlur(plane, 3), plane)
+    return cleaned

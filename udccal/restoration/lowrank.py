@@ -1,0 +1,83 @@
+"""A space-varying psf in low rank: k(.; p) = sum_r c_r(p) h_r, by an SVD over field positions.
+
+The kernel belongs to the source point (docs/conventions.md), so blurring is y = sum_r h_r * (c_r x).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from scipy.interpolate import make_interp_spline
+
+
+@dataclass(frozen=True)
+class KernelGrid:
+    """Kernels of one picture on a regular grid of source positions; each channel of each kernel sums to 1."""
+
+    x_px: Float[np.ndarray, " nx"]
+    y_px: Float[np.ndarray, " ny"]
+    kernels: Float[np.ndarray, "ny nx channels rows columns"]
+
+
+@dataclass(frozen=True)
+class LowRank:
+    """Eigen-kernels of one channel and their coefficients at the grid's positions.
+
+    ``residual`` is the RMS over the positions of the kernels' relative L2 error.
+    """
+
+    x_px: Float[np.ndarray, " nx"]
+    y_px: Float[np.ndarray, " ny"]
+    kernels: Float[np.ndarray, "rank rows columns"]
+    coefficients: Float[np.ndarray, "rank ny nx"]
+    residual: float
+
+
+def decompose(grid: KernelGrid, channel: int, tolerance: float, max_rank: int) -> LowRank:
+    """The smallest rank whose relative L2 error, RMS over the positions, is at most ``tolerance``.
+
+    The kernels' sums join the SVD as one more, heavily weighted sample, so that truncation does not print a slow
+    brightness pattern onto the picture: sum_r c_r sum(h_r) stays 1.
+    """
+    ny, nx, _, rows, columns = grid.kernels.shape
+    samples = grid.kernels[:, :, channel].reshape(ny * nx, rows * columns).astype(np.float64)
+    sums = samples.sum(axis=1, keepdims=True)
+    augmented = np.concatenate([samples, sums * np.linalg.norm(samples, axis=1).max() * 10.0], axis=1)
+    # The Gram matrix over positions is small; its eigenvectors are the left singular vectors.
+    values, vectors = np.linalg.eigh(augmented @ augmented.T)
+    order = np.argsort(values)[::-1]
+    norms = np.linalg.norm(samples, axis=1)
+    rank, left, right, residual = 0, vectors, samples, 1.0
+    for rank in range(1, min(max_rank, len(order)) + 1):
+        left = vectors[:, order[:rank]]
+        right = left.T @ samples
+        residual = float(np.sqrt(np.mean((np.linalg.norm(samples - left @ right, axis=1) / norms) ** 2)))
+        if residual <= tolerance:
+            break
+    return LowRank(
+        x_px=grid.x_px,
+        y_px=grid.y_px,
+        kernels=right.reshape(rank, rows, columns).astype(np.float32),
+        coefficients=left.T.reshape(rank, ny, nx).astype(np.float32),
+        residual=residual,
+    )
+
+
+def coefficient_map(
+    low_rank: LowRank, index: int, x_px: Float[np.ndarray, " columns"], y_px: Float[np.ndarray, " rows"]
+) -> Float[np.ndarray, "rows columns"]:
+    """One coefficient at every pixel by bicubic interpolation of the grid; held constant outside the grid."""
+    values = low_rank.coefficients[index].astype(np.float64)
+    along_y = _interpolation(low_rank.y_px, y_px)
+    along_x = _interpolation(low_rank.x_px, x_px)
+    return (along_y @ values @ along_x.T).astype(np.float32)
+
+
+def _interpolation(nodes: Float[np.ndarray, " n"], at: Float[np.ndarray, " m"]) -> Float[np.ndarray, "m n"]:
+    """Matrix that takes values at the nodes to a spline's values (cubic where there are four nodes) at ``at``."""
+    if len(nodes) == 1:
+        return np.ones((len(at), 1))
+    spline = make_interp_spline(nodes, np.eye(len(nodes)), k=min(3, len(nodes) - 1))
+    return spline(np.clip(at, nodes[0], nodes[-1]))

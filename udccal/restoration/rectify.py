@@ -1,0 +1,36 @@
+"""Undistortion and virtual rotation in one resampling."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Float32
+
+from udccal.models.geometry import Geometry, VirtualView, view_to_sensor
+from udccal.numerics import in_float64
+
+
+@dataclass(frozen=True)
+class Rectification:
+    """For every pixel of the view, the sensor pixel it looks at."""
+
+    map_x: Float32[np.ndarray, "rows columns"]
+    map_y: Float32[np.ndarray, "rows columns"]
+
+    @classmethod
+    def of(cls, geometry: Geometry, view: VirtualView) -> Rectification:
+        """Evaluate the map once."""
+        pixels = _sensor_pixels(geometry, view)
+        return cls(*(np.ascontiguousarray(pixels[..., axis], dtype=np.float32) for axis in range(2)))
+
+    def apply(self, picture: Float32[np.ndarray, "rows columns 3"]) -> Float32[np.ndarray, "view_rows view_columns 3"]:
+        """Resample a sensor picture onto the view (Lanczos over 8 x 8 pixels)."""
+        return cv2.remap(picture, self.map_x, self.map_y, cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REFLECT_101)
+
+
+@in_float64
+def _sensor_pixels(geometry: Geometry, view: VirtualView) -> Float[np.ndarray, "rows columns 2"]:
+    x, y = np.arange(view.columns, dtype=np.float64), np.arange(view.rows, dtype=np.float64)
+    return np.asarray(view_to_sensor(geometry, view, np.stack(np.meshgrid(x, y), axis=-1)))

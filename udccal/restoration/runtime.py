@@ -1,0 +1,175 @@
+"""Restoration of frames with a profile: everything is worked out once, then reused for every frame.
+
+Units: a restored picture is linear light in e-/s of each camera colour, on the scale of a pixel whose wire value is 1
+(the wire's mean over the sensor). It may be slightly negative where noise says so; encoding for a display clips that.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float32, UInt8, UInt16
+
+from udccal.errors import RestorationError
+from udccal.fitting.result import FitStatus
+from udccal.models.backscatter import PanelResponse
+from udccal.models.geometry import VirtualView
+from udccal.models.noise import Noise
+from udccal.profiles.profile import Profile
+from udccal.restoration.adapt import adapted
+from udccal.restoration.backscatter import estimated_rate, known_rate, mask_mosaic, prepared_response
+from udccal.restoration.deblur import Deblurrer, expected_smoothness
+from udccal.restoration.demosaic import demosaic, demosaic_clipped
+from udccal.restoration.linear import mean_variance_e2, saturated, scalar, to_electrons, without_defects
+from udccal.restoration.plan import PlanOptions, build_deblurrers, kernel_grid
+from udccal.restoration.rectify import Rectification
+from udccal.restoration.view import inscribed_view
+from udccal.rig import RigDescription
+
+Mosaic = Float32[np.ndarray, "rows columns"]
+Picture = Float32[np.ndarray, "rows columns 3"]
+
+
+@dataclass(frozen=True)
+class Restorer:
+    """A profile made ready to restore frames.
+
+    Attributes:
+        rig: the rig. noise: its noise term. view: what is delivered.
+        wire: map to divide by. mask: backscatter of a white panel in e-/s.
+        response: the backscatter term for known panel pictures; None when the rig shows no backscatter.
+        deblurrers: one per channel. rectification: sensor to view. options: the choices made.
+    """
+
+    rig: RigDescription
+    noise: Noise
+    view: VirtualView
+    wire: Mosaic
+    mask: Mosaic
+    response: PanelResponse | None
+    deblurrers: tuple[Deblurrer, ...]
+    rectification: Rectification
+    options: PlanOptions
+
+    @classmethod
+    def from_profile(cls, profile: Profile, options: PlanOptions | None = None) -> Restorer:
+        """Work everything out for a profile.
+
+        Raises:
+            RestorationError: when the profile's geometry leaves no view through the panel.
+        """
+        options = options or PlanOptions()
+        rig, geometry = profile.rig, profile.geometry.term
+        camera = rig.camera
+        view = inscribed_view(geometry, camera.columns, camera.rows, rig.view.columns, rig.view.rows)
+        absent = profile.backscatter.status is FitStatus.ABSENT
+        return cls(
+            rig=rig,
+            noise=profile.noise.term,
+            view=view,
+            wire=profile.wire_map,
+            mask=mask_mosaic(profile.backscatter_mask, camera.cfa, camera.rows, camera.columns),
+            response=None if absent else prepared_response(profile.backscatter.term, rig),
+            deblurrers=build_deblurrers(kernel_grid(profile.psf.term, rig, options), rig, options),
+            rectification=Rectification.of(geometry, view),
+            options=options,
+        )
+
+    def restore(
+        self,
+        mosaic: UInt16[np.ndarray, "frame_rows frame_columns"],
+        exposure_s: float,
+        panel_picture: UInt8[np.ndarray, "panel_rows panel_columns 3"] | None = None,
+    ) -> Picture:
+        """A clean picture on the virtual view, linear, in e-/s.
+
+        Args:
+            mosaic: raw frame in DN. exposure_s: its exposure.
+            panel_picture: what the panel showed (a black picture when it was off); None when that is not known.
+
+        Raises:
+            RestorationError: when the frame, its exposure or the panel picture does not belong to this rig.
+        """
+        check_frame(mosaic, exposure_s, self.rig)
+        check_panel_picture(panel_picture, self.rig)
+        signal = without_defects(to_electrons(mosaic, self.noise, exposure_s), self.noise) / self.wire
+        if self.response is not None:
+            signal -= np.float32(exposure_s) * self._backscatter_rate(signal, exposure_s, panel_picture)
+        clipped = saturated(mosaic, self.noise, self.options.saturation_margin)
+        blurred, valid = demosaic_clipped(signal, self.rig.camera.cfa, clipped)
+        sharp = self.deblur(blurred, valid, mean_variance_e2(mosaic, self.noise, exposure_s))
+        return self.rectification.apply(sharp) / np.float32(exposure_s)
+
+    def before(self, mosaic: UInt16[np.ndarray, "frame_rows frame_columns"], exposure_s: float) -> Picture:
+        """The same frame without the cure: black level, demosaicing and geometry only."""
+        check_frame(mosaic, exposure_s, self.rig)
+        signal = to_electrons(mosaic, self.noise, exposure_s)
+        return self.rectification.apply(demosaic(signal, self.rig.camera.cfa)) / np.float32(exposure_s)
+
+    def deblur(self, blurred: Picture, valid: Bool[np.ndarray, "rows columns 3"], variance_e2: float) -> Picture:
+        """Deblur a demosaiced picture on the sensor.
+
+        Args:
+            blurred: in e-. valid: which of its values carry data. variance_e2: of its noise, on average.
+        """
+        channels = []
+        for channel, deblurrer in enumerate(self.deblurrers):
+            plane, known = np.ascontiguousarray(blurred[..., channel]), np.ascontiguousarray(valid[..., channel])
+            smoothness = expected_smoothness(plane, variance_e2, self.options.contrast)
+            sharp = deblurrer.solve(plane, known, smoothness).picture
+            floor_e2 = scalar(self.noise.sigma_d_e) ** 2
+            channels.append(adapted(deblurrer, sharp, smoothness, floor_e2, self.options.local_contrast))
+        return np.stack(channels, axis=-1)
+
+    def _backscatter_rate(
+        self,
+        signal: Mosaic,
+        exposure_s: float,
+        panel_picture: UInt8[np.ndarray, "panel_rows panel_columns 3"] | None,
+    ) -> Mosaic:
+        if panel_picture is None or self.response is None:
+            return estimated_rate(signal / np.float32(exposure_s), self.mask, self.rig.camera.cfa)
+        return known_rate(self.response, panel_picture)
+
+
+def check_frame(mosaic: np.ndarray, exposure_s: float, rig: RigDescription) -> None:
+    """Refuse a frame that the rig cannot have taken.
+
+    Raises:
+        RestorationError: for another type, size or range of samples, or an exposure that is not positive.
+    """
+    camera = rig.camera
+    if mosaic.dtype != np.uint16 or mosaic.ndim != 2:
+        raise RestorationError(
+            f"Expected a mosaic of 16-bit samples, found {mosaic.dtype} of {mosaic.ndim} dimensions. "
+            "Give the raw frame."
+        )
+    if mosaic.shape != (camera.rows, camera.columns):
+        raise RestorationError(
+            f"Expected a frame of {camera.columns} x {camera.rows} samples as rig '{rig.name}' takes, found "
+            f"{mosaic.shape[1]} x {mosaic.shape[0]}. Use the profile of the rig that took it, and whole frames."
+        )
+    if int(mosaic.max()) > rig.saturation_DN:
+        raise RestorationError(
+            f"Expected samples of {camera.bits} bits, at most {rig.saturation_DN}, found {int(mosaic.max())}. "
+            "Give the frame as the camera delivered it, not scaled up."
+        )
+    if not (np.isfinite(exposure_s) and exposure_s > 0):
+        raise RestorationError(f"Expected a positive exposure in seconds, found {exposure_s}. Give the frame's own.")
+
+
+def check_panel_picture(picture: np.ndarray | None, rig: RigDescription) -> None:
+    """Refuse a panel picture that the rig's panel cannot have shown pixel for pixel.
+
+    Raises:
+        RestorationError: for another size or type.
+    """
+    if picture is None:
+        return
+    expected = (rig.panel.rows, rig.panel.columns, 3)
+    if picture.shape != expected or picture.dtype != np.uint8:
+        raise RestorationError(
+            f"Expected a panel picture of {expected[1]} x {expected[0]} 8-bit RGB pixels as the panel has, found shape "
+            f"{picture.shape} of {picture.dtype}. Give what the panel showed, or leave it out."
+        )

@@ -1,0 +1,98 @@
+"""Averages of many frames in memory that does not grow with their number, with unusable frames replaced."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import final
+
+import numpy as np
+from jaxtyping import Float32, UInt16
+
+from udccal.cameras.protocol import Frame, Settings
+from udccal.errors import CaptureError
+from udccal.sessions.frame_checks import FrameChecks
+from udccal.sessions.schema import Rejection
+
+MAX_FRAMES = 40_000  # (sum of 16-bit samples)^2 still fits 64 bits
+_DELIVERIES = 8  # each asks only for what is still missing
+
+
+@dataclass(frozen=True)
+class AveragedFrames:
+    """Mean and unbiased variance of single frames in DN and DN^2, with what is needed to store them."""
+
+    mean: Float32[np.ndarray, "rows columns"]
+    variance: Float32[np.ndarray, "rows columns"]
+    frames: int
+    settings: Settings
+    first_timestamp_s: float
+    last_timestamp_s: float
+    rejected: tuple[Rejection, ...] = ()
+
+
+@final
+class RunningMoments:
+    """Exact sums of integers: mean and variance carry no rounding until they are asked for."""
+
+    def __init__(self, rows: int, columns: int) -> None:
+        """Start empty for frames of this size."""
+        self._sum = np.zeros((rows, columns), np.int64)
+        self._squares = np.zeros((rows, columns), np.int64)
+        self.frames = 0
+
+    def add(self, data: UInt16[np.ndarray, "rows columns"]) -> None:
+        """Take one frame in."""
+        self._sum += data
+        self._squares += np.multiply(data, data, dtype=np.uint32)
+        self.frames += 1
+
+    def mean(self) -> Float32[np.ndarray, "rows columns"]:
+        """Mean in DN."""
+        return (self._sum / self.frames).astype(np.float32)
+
+    def variance(self) -> Float32[np.ndarray, "rows columns"]:
+        """Unbiased sample variance in DN^2; needs two frames."""
+        count = self.frames
+        exact = count * self._squares - self._sum**2
+        return (exact / (count * (count - 1))).astype(np.float32)
+
+
+def average_frames(deliver: Callable[[int], Iterator[Frame]], count: int, checks: FrameChecks) -> AveragedFrames:
+    """Average ``count`` good frames; bad ones are counted with their reason and replaced.
+
+    Args:
+        deliver: a configured camera's ``frames``.
+        count: how many frames to average.
+        checks: which frames are good.
+
+    Raises:
+        CaptureError: when too many frames had to be left out.
+        CameraError: from the camera.
+    """
+    if not 2 <= count <= MAX_FRAMES:
+        raise CaptureError(f"Expected between 2 and {MAX_FRAMES} frames to average, found {count}. Change the plan.")
+    moments: RunningMoments | None = None
+    ends: list[Frame] = []
+    for _ in range(_DELIVERIES):
+        wanted = count - (moments.frames if moments is not None else 0)
+        for frame in checks.accepted(deliver(wanted), wanted):
+            moments = moments or RunningMoments(*frame.data.shape)
+            moments.add(frame.data)
+            ends = [*ends[:1], frame]
+        if moments is not None and moments.frames == count:
+            return AveragedFrames(
+                mean=moments.mean(),
+                variance=moments.variance(),
+                frames=count,
+                settings=ends[0].settings,
+                first_timestamp_s=ends[0].timestamp_s,
+                last_timestamp_s=ends[-1].timestamp_s,
+                rejected=checks.rejections(),
+            )
+    reasons = ", ".join(f"{item.frames} {item.reason}" for item in checks.rejections())
+    raise CaptureError(
+        f"Expected {count} usable frames, found that too many had to be left out "
+        f"({reasons or 'the camera delivered too few'}). "
+        "Check the light, the exposure and the camera's cable, then repeat the step."
+    )

@@ -1,0 +1,159 @@
+"""Reading a session: every file is checked for existence, checksum, shape and range before its numbers are used."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import final
+
+import numpy as np
+from jaxtyping import Float32, UInt8, UInt16
+
+from udccal.errors import FileFormatError, SessionError
+from udccal.io.exr import read_exr
+from udccal.io.hashing import sha256_file
+from udccal.io.png import read_png16, read_rgb8
+from udccal.rig import RigDescription
+from udccal.sessions.manifest import read_manifest
+from udccal.sessions.schema import Manifest, PanelSubject, StoredCamera, StoredCapture, StoredStep, TermName
+
+
+@dataclass(frozen=True)
+class Average:
+    """Mean and unbiased variance of single frames in DN and DN^2, sample by sample of the mosaic."""
+
+    mean: Float32[np.ndarray, "rows columns"]
+    variance: Float32[np.ndarray, "rows columns"]
+    frames: int
+
+
+@final
+class Session:
+    """A captured session on disk, open for reading. Nothing is kept in memory but the manifest."""
+
+    def __init__(self, path: Path, manifest: Manifest) -> None:
+        """Use ``Session.open``."""
+        self.path = path
+        self.manifest = manifest
+        self._verified: set[str] = set()
+
+    @classmethod
+    def open(cls, path: str | Path) -> Session:
+        """Open the session in a folder.
+
+        Raises:
+            SessionError: when there is none, or its manifest does not follow docs/session.md.
+        """
+        folder = Path(path)
+        return cls(folder, read_manifest(folder))
+
+    @property
+    def rig(self) -> RigDescription:
+        """The rig as it was built to be."""
+        return self.manifest.rig
+
+    @property
+    def camera(self) -> StoredCamera:
+        """The camera that took the session."""
+        return self.manifest.camera
+
+    def steps(self, term: TermName) -> tuple[StoredStep, ...]:
+        """The completed steps of a term, in the order they were captured."""
+        return tuple(step for step in self.manifest.steps if step.term == term)
+
+    def step(self, step_id: str) -> StoredStep:
+        """The completed step of that id.
+
+        Raises:
+            SessionError: when it was not captured.
+        """
+        for step in self.manifest.steps:
+            if step.id == step_id:
+                return step
+        raise SessionError(
+            f"Expected the step '{step_id}' in the session {self.path}, found that it was not captured. Capture it."
+        )
+
+    def frame(self, capture: StoredCapture) -> UInt16[np.ndarray, "rows columns"]:
+        """The single frame of a capture in DN.
+
+        Raises:
+            SessionError: when it is an average, or the file is missing, changed, mis-shaped or out of range.
+        """
+        if capture.kind != "frame":
+            raise SessionError(f"Expected '{capture.file}' of {self.path} to be a single frame, found an average.")
+        data = self._read(capture.file, capture.sha256, read_png16)
+        self._check_shape(capture, data.shape)
+        self._check_range(capture, float(data.max()))
+        return data
+
+    def average(self, capture: StoredCapture) -> Average:
+        """The average of a capture.
+
+        Raises:
+            SessionError: when it is a single frame, or the file is missing, changed, mis-shaped or out of range.
+        """
+        if capture.kind != "average":
+            raise SessionError(f"Expected '{capture.file}' of {self.path} to be an average, found a single frame.")
+        channels = self._read(capture.file, capture.sha256, read_exr)
+        if set(channels) != {"mean", "variance"}:
+            raise SessionError(
+                f"Expected the channels mean and variance in '{capture.file}' of {self.path}, "
+                f"found {', '.join(sorted(channels))}. Write it as docs/session.md says."
+            )
+        mean, variance = channels["mean"], channels["variance"]
+        self._check_shape(capture, mean.shape)
+        self._check_range(capture, float(mean.max()))
+        if float(min(mean.min(), variance.min())) < 0:
+            raise SessionError(f"Expected no negative values in '{capture.file}' of {self.path}, found some.")
+        return Average(mean, variance, capture.frames)
+
+    def picture(self, subject: PanelSubject) -> UInt8[np.ndarray, "panel_rows panel_columns 3"]:
+        """The picture that the panel showed, 8-bit RGB at the panel's resolution.
+
+        Raises:
+            SessionError: when the file is missing, changed or of another size.
+        """
+        picture = self._read(subject.picture, subject.picture_sha256, read_rgb8)
+        expected = (self.rig.panel.rows, self.rig.panel.columns)
+        if picture.shape[:2] != expected:
+            raise SessionError(
+                f"Expected '{subject.picture}' of {self.path} to have {expected[1]} x {expected[0]} pixels as the "
+                f"panel, found {picture.shape[1]} x {picture.shape[0]}. Store what the panel showed, pixel for pixel."
+            )
+        return picture
+
+    def _read(self, name: str, sha256: str, reader):  # type: ignore[no-untyped-def]
+        file = self.path / name
+        if not file.is_file() or not file.resolve().is_relative_to(self.path.resolve()):
+            raise SessionError(
+                f"Expected the file '{name}' inside the session {self.path}, found none. Restore it, or capture again."
+            )
+        if name not in self._verified:
+            found = sha256_file(file)
+            if found != sha256:
+                raise SessionError(
+                    f"Expected '{name}' of {self.path} to have the SHA-256 {sha256[:12]}..., found {found[:12]}...: "
+                    "the file was changed or damaged. Restore it, or capture that step again."
+                )
+            self._verified.add(name)
+        try:
+            return reader(file)
+        except FileFormatError as error:
+            raise SessionError(str(error)) from error
+
+    def _check_shape(self, capture: StoredCapture, shape: tuple[int, ...]) -> None:
+        region = capture.region
+        if shape != (region.rows, region.columns):
+            raise SessionError(
+                f"Expected '{capture.file}' of {self.path} to have {region.columns} x {region.rows} samples as its "
+                f"region says, found {shape[1]} x {shape[0]}. Correct the region, or capture again."
+            )
+
+    def _check_range(self, capture: StoredCapture, largest: float) -> None:
+        limit = self.rig.saturation_DN
+        if largest > limit:
+            raise SessionError(
+                f"Expected samples of at most {limit} DN in '{capture.file}' of {self.path} ({self.rig.camera.bits} "
+                f"bits), found {largest:g}. Store them right-aligned, as the converter delivers them."
+            )

@@ -1,0 +1,144 @@
+"""Space-variant blur of the simulated rig in low rank: y = sum_r h_r * (c_r x), the kernel belonging to the source.
+
+Kernels on a grid of source positions are decomposed per colour by a singular value decomposition (Lauer, "Deconvolution
+with a spatially-variant PSF", 2002); between the grid's nodes the coefficients c_r follow a cubic spline.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.fft
+from jaxtyping import Float
+from scipy.interpolate import make_interp_spline
+
+from udccal.simulation.psf import phase_averaged_kernels
+from udccal.simulation.truth import RigTruth
+
+_WORKERS = 2
+
+
+@dataclass(frozen=True)
+class SpaceVariantBlur:
+    """The operator for one sensor size.
+
+    Attributes:
+        components: kernels h_r by colour; odd sizes, origin in the middle.
+        coefficients: c_r by colour at the grid's nodes.
+        grid_x_px: x of the grid's columns on the sensor. grid_y_px: y of its rows.
+        relative_error: what the cut at this rank left out of the kernels, relative L2, worst colour.
+    """
+
+    components: Float[np.ndarray, "3 rank rows columns"]
+    coefficients: Float[np.ndarray, "3 rank grid_rows grid_columns"]
+    grid_x_px: Float[np.ndarray, "grid_columns"]
+    grid_y_px: Float[np.ndarray, "grid_rows"]
+    relative_error: float
+
+    @property
+    def margin(self) -> tuple[int, int]:
+        """(rows, columns) of scene that must surround the sensor on every side."""
+        return self.components.shape[2] // 2, self.components.shape[3] // 2
+
+    def apply(self, canvas: Float[np.ndarray, "canvas_rows canvas_columns 3"]) -> Float[np.ndarray, "rows columns 3"]:
+        """Blur a scene drawn on the sensor's pixels and ``margin`` around them; what the sensor holds is returned.
+
+        Pixel (margin columns, margin rows) of ``canvas`` is sensor pixel (0, 0). Light that leaves the canvas comes in
+        again at its other side, but reaches no further than the margin, which is cut off.
+        """
+        margin_rows, margin_columns = self.margin
+        rows, columns = canvas.shape[0], canvas.shape[1]
+        basis_y = _spline_basis(self.grid_y_px, np.arange(rows) - margin_rows)
+        basis_x = _spline_basis(self.grid_x_px, np.arange(columns) - margin_columns)
+        shape = (scipy.fft.next_fast_len(rows, real=True), scipy.fft.next_fast_len(columns, real=True))
+        blurred = np.empty((rows - 2 * margin_rows, columns - 2 * margin_columns, 3))
+        for colour in range(3):
+            total = np.zeros((shape[0], shape[1] // 2 + 1), np.complex64)
+            for component, coefficients in zip(self.components[colour], self.coefficients[colour], strict=True):
+                weighted = canvas[..., colour] * (basis_y @ coefficients @ basis_x.T)
+                total += _transform(weighted, shape) * _transform(_origin_first(component, shape), shape)
+            plane = scipy.fft.irfft2(total, s=shape, workers=_WORKERS)
+            blurred[..., colour] = plane[margin_rows : rows - margin_rows, margin_columns : columns - margin_columns]
+        return blurred
+
+
+def build_blur(
+    truth: RigTruth,
+    grid_columns: int,
+    grid_rows: int,
+    rows: int,
+    columns: int,
+    max_rank: int = 16,
+    tolerance: float = 1e-3,
+) -> SpaceVariantBlur:
+    """Blur from kernels of ``rows`` x ``columns`` pixels on a grid that spans the sensor.
+
+    Args:
+        truth: the simulated rig.
+        grid_columns: source positions across. grid_rows: source positions down.
+        rows: odd number of rows of a kernel. columns: odd number of columns.
+        max_rank: components kept at most.
+        tolerance: components are kept until the kernels on the grid are met with this relative error.
+    """
+    camera = truth.description.camera
+    grid_x = np.linspace(0.0, camera.columns - 1.0, grid_columns)
+    grid_y = np.linspace(0.0, camera.rows - 1.0, grid_rows)
+    nodes = np.stack(np.meshgrid(grid_x, grid_y), axis=-1).reshape(-1, 2)
+    stack = np.empty((3, len(nodes), rows * columns), np.float32)
+    for index, kernel in enumerate(_each_kernel(truth, nodes, rows, columns)):
+        stack[:, index] = kernel.reshape(3, -1)
+    components, coefficients, error = low_rank(stack, max_rank, tolerance)
+    return SpaceVariantBlur(
+        components=components.reshape(3, -1, rows, columns),
+        coefficients=coefficients.reshape(3, -1, grid_rows, grid_columns),
+        grid_x_px=grid_x,
+        grid_y_px=grid_y,
+        relative_error=error,
+    )
+
+
+def low_rank(
+    stack: Float[np.ndarray, "3 nodes samples"], max_rank: int, tolerance: float
+) -> tuple[Float[np.ndarray, "3 rank samples"], Float[np.ndarray, "3 rank nodes"], float]:
+    """Components and coefficients such that ``stack[c, n]`` = sum over r of ``coefficients[c, r, n] components[c, r]``.
+
+    Returns:
+        components, coefficients, and the relative error (L2, worst colour) of the common rank chosen.
+    """
+    gram = np.einsum("cns,cms->cnm", stack, stack, optimize=True).astype(np.float64)
+    power, vectors = np.linalg.eigh(gram)
+    power, vectors = np.maximum(power[:, ::-1], 0.0), vectors[:, :, ::-1]
+    left_out = np.sqrt(np.maximum(1.0 - np.cumsum(power, axis=1) / power.sum(axis=1, keepdims=True), 0.0)).max(axis=0)
+    rank = int(min(np.argmax(left_out <= tolerance) + 1 if left_out[-1] <= tolerance else power.shape[1], max_rank))
+    coefficients = np.moveaxis(vectors[:, :, :rank], 2, 1)
+    components = (coefficients.astype(np.float32) @ stack).astype(np.float32)
+    return components, np.ascontiguousarray(coefficients), float(left_out[rank - 1])
+
+
+def _each_kernel(
+    truth: RigTruth, nodes: Float[np.ndarray, "n 2"], rows: int, columns: int
+) -> Iterator[Float[np.ndarray, "3 rows columns"]]:
+    for node in nodes:
+        yield phase_averaged_kernels(truth, node[None], rows, columns)[0]
+
+
+def _spline_basis(nodes: Float[np.ndarray, "nodes"], positions: np.ndarray) -> Float[np.ndarray, "n nodes"]:
+    """Matrix from values at ``nodes`` to a cubic spline's values at ``positions``, constant outside the nodes."""
+    if nodes.size == 1:
+        return np.ones((positions.size, 1))
+    cardinal = make_interp_spline(nodes, np.eye(nodes.size), k=min(3, nodes.size - 1))
+    return cardinal(np.clip(positions, nodes[0], nodes[-1]))
+
+
+def _origin_first(
+    kernel: Float[np.ndarray, "rows columns"], shape: tuple[int, int]
+) -> Float[np.ndarray, "padded_rows padded_columns"]:
+    padded = np.zeros(shape, np.float32)
+    padded[: kernel.shape[0], : kernel.shape[1]] = kernel
+    return np.roll(padded, (-(kernel.shape[0] // 2), -(kernel.shape[1] // 2)), axis=(0, 1))
+
+
+def _transform(plane: Float[np.ndarray, "rows columns"], shape: tuple[int, int]) -> np.ndarray:
+    return scipy.fft.rfft2(plane.astype(np.float32), s=shape, workers=_WORKERS)

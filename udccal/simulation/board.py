@@ -1,0 +1,70 @@
+"""A ChArUco board held in front of the panel, ray by ray."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Float32
+
+from udccal.arrangements import Board, BoardSpec
+from udccal.simulation.picture import SUPERSAMPLING, supersample
+from udccal.simulation.rays import slope_grid
+from udccal.simulation.truth import RigTruth
+
+_BLACK, _SURROUND = 0.04, 0.35
+_TEXELS_PER_SQUARE = (24, 400)
+
+
+def render_board_radiance(
+    truth: RigTruth, board: Board, margin: tuple[int, int] = (0, 0)
+) -> Float[np.ndarray, "rows columns 3"]:
+    """Radiance of a board in grey surroundings on the sensor's pixels and ``margin`` = (rows, columns) around them.
+
+    White paper has the radiance 1.
+    """
+    camera = truth.description.camera
+    texture, texels_per_mm = _texture(truth, board)
+    rotation, _ = cv2.Rodrigues(np.asarray(board.rotation_vector))
+    x, y = (np.arange(-m, n + m, dtype=float) for m, n in ((margin[1], camera.columns), (margin[0], camera.rows)))
+    origin = rotation.T @ (truth.optics.pupil_mm - np.asarray(board.translation_mm))
+
+    def one_sample(dx: float, dy: float) -> Float[np.ndarray, "rows columns 3"]:
+        slopes = slope_grid(truth, x + dx, y + dy)
+        rays = np.concatenate([slopes, np.ones_like(slopes[..., :1])], axis=-1) @ rotation
+        # The face is seen by rays that run into the board; all others meet the surroundings.
+        ahead = np.maximum(rays[..., 2:], 1e-9)
+        points = origin[:2] - origin[2] * rays[..., :2] / ahead
+        texel = np.clip(points * texels_per_mm - 0.5, -10.0, max(texture.shape) + 10.0).astype(np.float32)
+        grey = cv2.remap(
+            texture,
+            texel[..., 0],
+            texel[..., 1],
+            cv2.INTER_LINEAR,
+            borderMode=cv2.BORDER_CONSTANT,
+            borderValue=(_SURROUND,),
+        )
+        return np.repeat(grey[..., None].astype(np.float64), 3, axis=-1)
+
+    return supersample(one_sample)
+
+
+def board_corners_mm(spec: BoardSpec) -> Float[np.ndarray, "corners 3"]:
+    """Inner chessboard corners in board coordinates, in the order of their ChArUco numbers."""
+    x, y = np.meshgrid(np.arange(1, spec.columns), np.arange(1, spec.rows))
+    return np.stack([x, y, np.zeros_like(x)], axis=-1).reshape(-1, 3) * spec.square_mm
+
+
+def opencv_board(spec: BoardSpec) -> cv2.aruco.CharucoBoard:
+    """The board as OpenCV knows it."""
+    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, spec.dictionary))
+    return cv2.aruco.CharucoBoard((spec.columns, spec.rows), spec.square_mm, spec.marker_mm, dictionary)
+
+
+def _texture(truth: RigTruth, board: Board) -> tuple[Float32[np.ndarray, "texel_rows texel_columns"], float]:
+    """The printed board with texels a little coarser than samples on the sensor, and its texels per millimetre."""
+    spec = board.spec
+    distance = max(board.translation_mm[2] - truth.optics.pupil_mm[2], spec.square_mm)
+    samples = 0.7 * truth.optics.fx_px * spec.square_mm / distance * SUPERSAMPLING
+    per_square = int(np.clip(samples, *_TEXELS_PER_SQUARE))
+    image = opencv_board(spec).generateImage((spec.columns * per_square, spec.rows * per_square), marginSize=0)
+    return (_BLACK + (1 - _BLACK) * (image / 255.0)).astype(np.float32), per_square / spec.square_mm

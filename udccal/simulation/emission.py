@@ -1,0 +1,100 @@
+"""Which panel pixels the pupil collects light from, when it looks along given rays at the plane of the emitters.
+
+A panel pixel has one emitter per primary, side by side in the opaque strip below its opening. The share of an emitter's
+light that reaches a sensor pixel is the part of the emitter inside the pupil's (defocused) footprint. Shares depend on
+the rig alone, so that they are worked out once and applied to any number of pictures.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+from scipy import sparse
+
+from udccal.simulation.footprint import converging_footprint
+from udccal.simulation.truth import RigTruth
+
+EMITTER_COLUMN_OFFSETS = (-0.3, 0.0, 0.3)
+EMITTER_ROW_OFFSET = 0.5
+_EMITTER_WIDTH = 0.22
+_HEIGHT_IN_STRIP = 0.5
+_CHORDS_PER_ROW = 6
+
+
+def emitter_shares(
+    truth: RigTruth,
+    directions: Float[np.ndarray, "n 3"],
+    depth_mm: float,
+    weight: Float[np.ndarray, "n"],
+    primary: int,
+) -> sparse.csr_array:
+    """Matrix that takes the light of one primary (panel pixels, row-major) to what the rays receive.
+
+    Args:
+        truth: the rig.
+        directions: rays in panel coordinates.
+        depth_mm: z of the plane in which the emitters (or their mirror image) appear.
+        weight: factor per ray; an evenly lit panel gives ``weight`` to within the ripple of the rows.
+        primary: index of the emitter.
+    """
+    pitch = truth.panel.pitch_mm
+    centre, shape = (array / pitch for array in converging_footprint(truth, directions, depth_mm))
+    height = _HEIGHT_IN_STRIP * (1 - truth.panel.row_open)
+    half_y = np.linalg.norm(shape[:, 1], axis=-1)
+    half_x = np.linalg.norm(shape[:, 0], axis=-1)
+    first_row = np.floor(centre[:, 1] - half_y - EMITTER_ROW_OFFSET).astype(np.int64)
+    first_column = np.floor(centre[:, 0] - half_x).astype(np.int64)
+    rows_touched = int(np.ceil(2 * half_y.max())) + 2
+    columns = first_column[:, None] + np.arange(int(np.ceil(2 * half_x.max())) + 2)
+    left = columns + EMITTER_COLUMN_OFFSETS[primary] - _EMITTER_WIDTH / 2
+    scale = (weight / (np.pi * height * _EMITTER_WIDTH))[:, None]
+    shares, pixels = [], []
+    for i in range(rows_touched):
+        row = first_row + i
+        top = row + EMITTER_ROW_OFFSET - height / 2
+        shares.append(scale * _disc_in_boxes(centre, shape, top, height, left))
+        pixels.append(_flat_indices(truth, row[:, None], columns))
+    return _matrix(truth, np.concatenate(shares, axis=1), np.concatenate(pixels, axis=1))
+
+
+def _disc_in_boxes(
+    centre: Float[np.ndarray, "n 2"],
+    shape: Float[np.ndarray, "n 2 2"],
+    top: Float[np.ndarray, "n"],
+    height: float,
+    left: Float[np.ndarray, "n boxes"],
+) -> Float[np.ndarray, "n boxes"]:
+    """Area of the unit disc over one row of boxes: chords along X, summed by Gauss's rule over the row's height."""
+    half = np.linalg.norm(shape[:, 1], axis=-1)
+    along = shape[:, 1] / half[:, None]
+    slant = shape[:, 0, 0] * along[:, 0] + shape[:, 0, 1] * along[:, 1]
+    reach = np.abs(shape[:, 0, 1] * along[:, 0] - shape[:, 0, 0] * along[:, 1])
+    low = (top - centre[:, 1]) / half
+    begin, end = (np.arcsin(np.clip(edge, -1.0, 1.0)) for edge in (low, low + height / half))
+    middle, span = (begin + end) / 2, (end - begin) / 2
+    area = np.zeros_like(left)
+    for node, weight in zip(*np.polynomial.legendre.leggauss(_CHORDS_PER_ROW), strict=True):
+        angle = middle + node * span
+        cosine = np.cos(angle)
+        x = centre[:, 0] + slant * np.sin(angle)
+        begin_x, end_x = (x - reach * cosine)[:, None], (x + reach * cosine)[:, None]
+        length = np.minimum(end_x, left + _EMITTER_WIDTH) - np.maximum(begin_x, left)
+        area += (weight * span * cosine / reach)[:, None] * np.maximum(length, 0.0)
+    return area
+
+
+def _flat_indices(truth: RigTruth, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    """Index of each panel pixel in a row-major picture, -1 outside the panel."""
+    panel = truth.description.panel
+    inside = (rows >= 0) & (rows < panel.rows) & (columns >= 0) & (columns < panel.columns)
+    return np.where(inside, rows * panel.columns + columns, -1)
+
+
+def _matrix(truth: RigTruth, shares: np.ndarray, pixels: np.ndarray) -> sparse.csr_array:
+    panel = truth.description.panel
+    used = (shares > 0) & (pixels >= 0)
+    ends = np.concatenate([[0], np.cumsum(used.sum(axis=1))])
+    return sparse.csr_array(
+        (shares[used].astype(np.float32), pixels[used].astype(np.int32), ends.astype(np.int32)),
+        shape=(len(shares), panel.rows * panel.columns),
+    )

@@ -1,0 +1,136 @@
+"""Light on one rig's sensor for each arrangement: y = [(x * k) + b] w, in e-/s behind the colour filters, no noise.
+
+What depends on the rig alone (wire map, blur, shares of the panel's light) is worked out when first needed, and kept.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property, lru_cache
+from typing import final
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from udccal.arrangements import Board, Led, Photograph
+from udccal.cameras.protocol import Region
+from udccal.cfa import cell_channels, channel_map
+from udccal.simulation.backscatter import Backscatterer, backscatterer
+from udccal.simulation.blur import SpaceVariantBlur, build_blur
+from udccal.simulation.psf import SHARED_PX, captured_light, spread_at
+from udccal.simulation.scene import render_board, render_photograph
+from udccal.simulation.spread import AngularSpread
+from udccal.simulation.truth import RigTruth
+from udccal.simulation.wire import wire_map
+
+# What the camera's red, green and blue make of the white LED light of the flat field and of the small LED.
+LED_WHITE = np.array([0.6, 1.0, 0.7])
+_FLAT_FILL, _FLAT_EXPOSURE_S = 0.65, 8e-3
+_LED_FILL, _LED_EXPOSURE_S = 0.8, 100e-6
+# A board is located by its corners: light scattered far from them does not matter.
+_BOARD_KERNEL = (129, 65)
+# Shifts of an LED about one place fall into no more than four cells; each pattern takes some 50 MB at full size.
+_KEPT_SPREADS = 4
+
+
+@final
+class RigLight:
+    """The deterministic part of a simulated rig: everything in front of the photodiodes."""
+
+    def __init__(self, truth: RigTruth) -> None:
+        self.truth = truth
+        self._peaks: dict[float, float] = {}
+        self._spread_at = lru_cache(maxsize=_KEPT_SPREADS)(
+            lambda x, y, reach_x, reach_y: spread_at(truth, np.array([x, y]), (reach_x, reach_y))
+        )
+
+    @cached_property
+    def wire(self) -> Float[np.ndarray, "rows columns"]:
+        """The true wire map, mean 1."""
+        return wire_map(self.truth)
+
+    @cached_property
+    def backscatterer(self) -> Backscatterer:
+        """The true answer to panel light."""
+        return backscatterer(self.truth)
+
+    @cached_property
+    def blur(self) -> SpaceVariantBlur:
+        """The true blur of photographs."""
+        captures = self.truth.description.captures
+        rows, columns = captures.psf_region_rows | 1, captures.psf_region_columns | 1
+        return build_blur(self.truth, max(captures.psf_columns, 5), max(captures.psf_rows, 4), rows, columns)
+
+    @cached_property
+    def board_blur(self) -> SpaceVariantBlur:
+        """A lighter blur for boards."""
+        captures = self.truth.description.captures
+        rows, columns = (
+            min(captures.psf_region_rows | 1, _BOARD_KERNEL[0]),
+            min(captures.psf_region_columns | 1, _BOARD_KERNEL[1]),
+        )
+        return build_blur(self.truth, 4, 3, rows, columns, max_rank=7, tolerance=1e-2)
+
+    def flat(self) -> Float[np.ndarray, "rows columns"]:
+        """An even white field that fills the wells to about 65 % (green, mean) in 8 ms."""
+        camera = self.truth.description.camera
+        rate = _FLAT_FILL * self.truth.sensor.full_well_e / _FLAT_EXPOSURE_S
+        return rate * LED_WHITE[channel_map(camera.cfa, camera.rows, camera.columns)] * self.wire
+
+    def board(self, board: Board) -> Float[np.ndarray, "rows columns"]:
+        """A board in even surroundings."""
+        return self._mosaic(render_board(self.truth, board, self.board_blur)) * self.wire
+
+    def panel(self, picture: UInt8[np.ndarray, "panel_rows panel_columns 3"]) -> Float[np.ndarray, "rows columns"]:
+        """The panel's own light in a dark room."""
+        return self.backscatterer.rate(picture) * self.wire
+
+    def photograph(self, photograph: Photograph) -> Float[np.ndarray, "rows columns"]:
+        """A scene through the panel, which may be lit."""
+        scene = self._mosaic(render_photograph(self.truth, photograph, self.blur))
+        if photograph.panel_picture is not None:
+            scene = scene + self.backscatterer.rate(photograph.panel_picture)
+        return scene * self.wire
+
+    def led(self, led: Led, image_px: tuple[float, float], region: Region) -> Float[np.ndarray, "rows columns"]:
+        """A small LED whose image is centred at ``image_px``, as far as its light falls into ``region``."""
+        disc_px = self.led_disc_px(led)
+        rows, columns = region.rows | 1, region.columns | 1
+        middle = np.array([region.x + columns // 2, region.y + rows // 2], dtype=float)
+        offset = (float(image_px[0] - middle[0]), float(image_px[1] - middle[1]))
+        spread = self._spread_near(image_px, region)
+        light = captured_light(self.truth, middle, rows, columns, offset, disc_px, spread=spread)
+        light = light[:, : region.rows, : region.columns]
+        down, across = slice(region.y, region.y + region.rows), slice(region.x, region.x + region.columns)
+        channels = channel_map(self.truth.description.camera.cfa, region.rows, region.columns)
+        coloured = LED_WHITE[channels] * np.take_along_axis(light, channels[None], axis=0)[0]
+        return self._led_flux(disc_px) * coloured * self.wire[down, across]
+
+    def _spread_near(self, image_px: tuple[float, float], region: Region) -> AngularSpread:
+        """The diffraction pattern at the middle of the cell that the LED is in, for all pixels of the region.
+
+        The cell, not the LED before, decides: a resumed session then sees the same light as an uninterrupted one.
+        """
+        x, y = ((np.floor(v / SHARED_PX) + 0.5) * SHARED_PX for v in image_px)
+        reach_x = max(x - region.x, region.x + region.columns - x) + SHARED_PX
+        reach_y = max(y - region.y, region.y + region.rows - y) + SHARED_PX
+        return self._spread_at(float(x), float(y), float(reach_x), float(reach_y))
+
+    def led_disc_px(self, led: Led) -> float:
+        """Diameter of the LED's image."""
+        distance = led.distance_mm - float(self.truth.optics.pupil_mm[2])
+        return led.diameter_mm / distance * self.truth.optics.fx_px
+
+    def _led_flux(self, disc_px: float) -> float:
+        """Electrons per second in all: the brightest pixel anywhere reaches 80 % of the full well in 100 us."""
+        if disc_px not in self._peaks:
+            camera = self.truth.description.camera
+            middle = np.array([camera.columns // 2, camera.rows // 2], dtype=float)
+            light = captured_light(self.truth, middle, 9, 9, source_disc_px=disc_px)
+            self._peaks[disc_px] = float((light.max(axis=(1, 2)) * LED_WHITE).max() * self.wire.max())
+        return _LED_FILL * self.truth.sensor.full_well_e / _LED_EXPOSURE_S / self._peaks[disc_px]
+
+    def _mosaic(self, colours: Float[np.ndarray, "rows columns 3"]) -> Float[np.ndarray, "rows columns"]:
+        mosaic = np.empty(colours.shape[:2])
+        for (j, i), channel in np.ndenumerate(cell_channels(self.truth.description.camera.cfa)):
+            mosaic[j::2, i::2] = colours[j::2, i::2, channel]
+        return mosaic

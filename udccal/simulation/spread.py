@@ -1,0 +1,131 @@
+"""Where the light of one distant source goes after the panel, by colour, in direction cosines."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse
+from jaxtyping import Float, Int
+
+from udccal.simulation.diffraction import power_spectrum
+from udccal.simulation.spectrum import camera_spectrum
+from udccal.simulation.truth import RigTruth
+
+# In sensor pixels: cells are this fine up to the reach from the source, and grow by a factor to the coarsest beyond.
+_FINEST, _COARSEST, _FINE_REACH, _GROWTH = 1 / 32, 0.25, 3.0, 1.06
+
+
+@dataclass(frozen=True)
+class AngularSpread:
+    """Cumulative light by colour over direction cosines relative to the source (panel axes X, Y).
+
+    ``cumulative[k, m, c]`` is the fraction of colour c's light with l_y < edges_y[k] and l_x < edges_x[m], counted from
+    the first edges.
+    """
+
+    edges_x: Float[np.ndarray, "nodes_x"]
+    edges_y: Float[np.ndarray, "nodes_y"]
+    cumulative: Float[np.ndarray, "nodes_y nodes_x 3"]
+
+    def below(self, x: Float[np.ndarray, "*n"], y: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n 3"]:
+        """Light at direction cosines less than both ``x`` and ``y``, relative to the source."""
+        column, right = _bracket(self.edges_x, x)
+        row, down = _bracket(self.edges_y, y)
+        flat = self.cumulative.reshape(-1, 3)
+        corner = row * self.edges_x.size + column
+        top = _mix(flat[corner], flat[corner + 1], right)
+        corner += self.edges_x.size
+        return _mix(top, _mix(flat[corner], flat[corner + 1], right), down)
+
+
+def angular_spread(
+    truth: RigTruth,
+    direction: Float[np.ndarray, "3"],
+    reach: tuple[float, float],
+    shifts: tuple[tuple[float, float], ...] = ((0.0, 0.0),),
+) -> AngularSpread:
+    """Spread of a source at ``direction``, out to direction cosines ``reach`` = (x, y) from it."""
+    spectrum = camera_spectrum(truth)
+    shortest_mm = float(spectrum.wavelengths_nm[0]) * 1e-6
+    power = power_spectrum(truth, direction, (reach[0] / shortest_mm, reach[1] / shortest_mm), shifts)
+    unit = 1.0 / truth.optics.fx_px
+    edges_x, edges_y = _edges(reach[0], unit), _edges(reach[1], unit)
+    relative_step = spectrum.step_nm / spectrum.wavelengths_nm
+    # Power is even: cells with l_y >= 0 are computed, the others are their mirror image.
+    half_y = edges_y[edges_y.size // 2 :]
+    cells = np.zeros((3, half_y.size - 1, edges_x.size - 1))
+    for wavelength_nm, weights, relative in zip(
+        spectrum.wavelengths_nm, spectrum.weights.T, relative_step, strict=True
+    ):
+        per_y = power.step_y * wavelength_nm * 1e-6
+        per_x = power.step_x * wavelength_nm * 1e-6
+        pick_y = _cell_operator(half_y, float(relative), per_y, power.zero_y, power.cumulative.shape[0])
+        pick_x = _cell_operator(edges_x, float(relative), per_x, power.zero_x, power.cumulative.shape[1])
+        light = (pick_x @ np.ascontiguousarray((pick_y @ power.cumulative).T)).T
+        cells += weights[:, None, None] * light
+    return AngularSpread(edges_x, edges_y, _cumulative(np.concatenate([cells[:, ::-1, ::-1], cells], axis=1)))
+
+
+def _edges(reach: float, unit: float) -> Float[np.ndarray, "nodes"]:
+    """Cell edges, symmetric about zero, finest at zero."""
+    fine = np.arange(0.0, _FINE_REACH, _FINEST)
+    edges = list(fine * unit)
+    step = _FINEST
+    while edges[-1] < reach:
+        step = min(step * _GROWTH, _COARSEST)
+        edges.append(edges[-1] + step * unit)
+    positive = np.array(edges)
+    return np.concatenate([-positive[:0:-1], positive])
+
+
+def _cell_operator(
+    edges: Float[np.ndarray, "nodes"], relative_step: float, cosine_per_row: float, origin: float, nodes: int
+) -> scipy.sparse.csr_array:
+    """Sparse matrix from cumulative power to the light in each cell, for one wavelength.
+
+    The wavelength stands for a band, over which light at distance l moves by l * step / wavelength: each cell collects
+    from a window widened by that much (variances add), scaled back to the cell's width.
+    """
+    middle, width = (edges[1:] + edges[:-1]) / 2, np.diff(edges)
+    window = np.hypot(width, middle * relative_step)
+    rows, columns, values = [], [], []
+    for edge, sign in ((middle + window / 2, 1.0), (middle - window / 2, -1.0)):
+        position = np.clip(edge / cosine_per_row + origin, 0.0, nodes - 1.0)
+        first = np.clip(position.astype(np.int64) - 1, 0, nodes - 4)
+        for tap, weight in enumerate(_cubic_weights(position - first)):
+            rows.append(np.arange(middle.size))
+            columns.append(first + tap)
+            values.append(sign * weight * width / window)
+    entries = (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns)))
+    return scipy.sparse.csr_array(entries, shape=(middle.size, nodes))
+
+
+def _cubic_weights(position: Float[np.ndarray, "n"]) -> tuple[Float[np.ndarray, "n"], ...]:
+    """Lagrange's weights of the values at 0, 1, 2, 3 for the cubic through them."""
+    a, b, c, d = position, position - 1, position - 2, position - 3
+    return -b * c * d / 6, a * c * d / 2, -a * b * d / 2, a * b * c / 6
+
+
+def _cumulative(cells: Float[np.ndarray, "3 cells_y cells_x"]) -> Float[np.ndarray, "nodes_y nodes_x 3"]:
+    total = np.zeros((cells.shape[1] + 1, cells.shape[2] + 1, 3))
+    total[1:, 1:] = np.moveaxis(cells.cumsum(axis=1).cumsum(axis=2), 0, -1)
+    return total
+
+
+def _bracket(
+    edges: Float[np.ndarray, "nodes"], value: Float[np.ndarray, "*n"]
+) -> tuple[Int[np.ndarray, "*n"], Float[np.ndarray, "*n 1"]]:
+    """Node before each value, and how far the value is on the way to the next node."""
+    position = np.interp(value, edges, np.arange(edges.size))
+    index = np.minimum(position.astype(np.int64), edges.size - 2)
+    return index, (position - index)[..., None]
+
+
+def _mix(
+    first: Float[np.ndarray, "*n 3"], second: Float[np.ndarray, "*n 3"], part: Float[np.ndarray, "*n 1"]
+) -> Float[np.ndarray, "*n 3"]:
+    second -= first
+    second *= part
+    second += first
+    return second

@@ -1,0 +1,176 @@
+"""A simulated rig with something in front of it: what a simulated camera and display share."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import final
+
+import numpy as np
+from jaxtyping import Float, Float64, UInt16
+
+from udccal.arrangements import Arrangement, Board, Dark, FlatLight, Led, PanelPicture, Photograph
+from udccal.cameras.protocol import Region, Settings
+from udccal.simulation.disturbances import Disturbances, knock
+from udccal.simulation.light import RigLight
+from udccal.simulation.sensor import Sensor
+from udccal.simulation.truth import RigTruth
+
+_AIMING_ERROR_PX = 0.5
+
+
+@dataclass(frozen=True)
+class LedTruth:
+    """Where an LED was asked for, and where its image really was (x, y in px)."""
+
+    asked_px: tuple[float, float]
+    image_px: tuple[float, float]
+    disc_px: float
+
+
+@dataclass(frozen=True)
+class _Rendered:
+    """Expected rates of the present arrangement in a rectangle of the sensor."""
+
+    region: Region
+    rate: Float64[np.ndarray, "rows columns"]
+
+
+@final
+class SimulatedWorld:
+    """The rig, what is arranged in front of it, and the clock.
+
+    Args:
+        truth: the rig.
+        disturbances: what goes wrong.
+        seed: of noise and of aiming errors.
+        led_support: (rows, columns) on either side of an LED's image within which its light is followed; by default
+            the region that the psf procedure captures, which then is covered wherever in it the image lies.
+
+    Attributes:
+        sensor: the rig's sensor.
+        truth_log: what tests may know and fits may not.
+    """
+
+    def __init__(
+        self,
+        truth: RigTruth,
+        disturbances: Disturbances | None = None,
+        seed: int = 0,
+        led_support: tuple[int, int] | None = None,
+    ) -> None:
+        captures, camera = truth.description.captures, truth.description.camera
+        self.disturbances = disturbances or Disturbances()
+        self.seed = seed
+        self.sensor = Sensor(truth)
+        self.truth_log: list[LedTruth] = []
+        self.light = RigLight(truth)
+        self._knocked = False
+        self._whole = Region(0, 0, camera.columns, camera.rows)
+        self._led_support = led_support or (captures.psf_region_rows, captures.psf_region_columns)
+        self._led: LedTruth | None = None
+        self._arrangement: Arrangement = Dark()
+        self._rendered: _Rendered | None = None
+        self._frames_begun = 0
+        self._clock_s = 0.0
+
+    @property
+    def truth(self) -> RigTruth:
+        """The rig as it stands now (after a knock: as the knock left it)."""
+        return self.light.truth
+
+    def arrange(self, arrangement: Arrangement) -> None:
+        """Put something in front of the camera, in place of what was there."""
+        self._arrangement, self._rendered, self._led = arrangement, None, None
+        if isinstance(arrangement, Led):
+            self._led = self._aim(arrangement)
+            self.truth_log.append(self._led)
+
+    def expected_rate(self, region: Region) -> Float64[np.ndarray, "rows columns"]:
+        """Expected photo-electrons per second in ``region``, before noise and flicker; not to be written to."""
+        if self._rendered is None or not _covers(self._rendered.region, region):
+            self._rendered = self._render(region)
+        x, y = region.x - self._rendered.region.x, region.y - self._rendered.region.y
+        rate = self._rendered.rate[y : y + region.rows, x : x + region.columns]
+        return rate + self.disturbances.leak_e_per_s if self.disturbances.leak_e_per_s else rate
+
+    def next_frame(self, period_s: float) -> tuple[int, float]:
+        """Start a frame: (frame number, time at which its exposure begins); frames that get lost are passed over."""
+        while self.disturbances.drops(self._frames_begun):
+            self._tick(period_s)
+        frame_id, timestamp_s = self._frames_begun, self._clock_s
+        if self.disturbances.knocked(frame_id) and not self._knocked:
+            self._knock()
+        self._tick(period_s)
+        return frame_id, timestamp_s
+
+    def rate_during(self, settings: Settings, timestamp_s: float) -> Float64[np.ndarray, "rows columns"]:
+        """Expected rate of one frame, flicker included."""
+        rate = self.expected_rate(settings.region)
+        if isinstance(self._arrangement, FlatLight) and self.disturbances.flicker_fraction:
+            return rate * self.disturbances.flicker(timestamp_s, settings.exposure_s)
+        return rate
+
+    def develop(
+        self, rate: Float[np.ndarray, "rows columns"], settings: Settings, frame_id: int
+    ) -> UInt16[np.ndarray, "rows columns"]:
+        """What the sensor makes of the light; the frame's number seeds its noise, so that order does not matter."""
+        rng = np.random.Generator(np.random.SFC64(np.random.SeedSequence([self.seed, 0xF2A3E, frame_id])))
+        return self.sensor.expose(rate, settings.exposure_s, settings.region, rng, settings.gain_dB)
+
+    def _tick(self, period_s: float) -> None:
+        self._frames_begun += 1
+        self._clock_s += period_s
+
+    def _knock(self) -> None:
+        self._knocked = True
+        self.light = RigLight(knock(self.truth, self.disturbances.knock_mm))
+        self._rendered = None
+
+    def _aim(self, led: Led) -> LedTruth:
+        """A person aims the LED; the error depends on the place alone, so that a resumed session finds it again."""
+        place = [round(1e3 * v) & 0xFFFFFFFF for v in (led.x_px, led.y_px)]
+        error = np.random.default_rng([self.seed, 0xA13, *place]).uniform(-_AIMING_ERROR_PX, _AIMING_ERROR_PX, 2)
+        image = (led.x_px + float(error[0]), led.y_px + float(error[1]))
+        return LedTruth((led.x_px, led.y_px), image, self.light.led_disc_px(led))
+
+    def _render(self, region: Region) -> _Rendered:
+        arrangement = self._arrangement
+        match arrangement:
+            case Led():
+                return _Rendered(region, self._led_rate(arrangement, region))
+            case Dark():
+                rate = np.zeros((self._whole.rows, self._whole.columns))
+            case FlatLight():
+                rate = self.light.flat()
+            case Board():
+                rate = self.light.board(arrangement)
+            case PanelPicture():
+                rate = self.light.panel(arrangement.picture)
+            case Photograph():
+                rate = self.light.photograph(arrangement)
+        rate.flags.writeable = False
+        return _Rendered(self._whole, rate)
+
+    def _led_rate(self, led: Led, region: Region) -> Float64[np.ndarray, "rows columns"]:
+        assert self._led is not None
+        rate = np.zeros((region.rows, region.columns))
+        lit = _lit_part(region, self._led.image_px, self._led_support)
+        if lit is not None:
+            x, y = lit.x - region.x, lit.y - region.y
+            rate[y : y + lit.rows, x : x + lit.columns] = self.light.led(led, self._led.image_px, lit)
+        rate.flags.writeable = False
+        return rate
+
+
+def _covers(outer: Region, inner: Region) -> bool:
+    across = outer.x <= inner.x and inner.x + inner.columns <= outer.x + outer.columns
+    return across and outer.y <= inner.y and inner.y + inner.rows <= outer.y + outer.rows
+
+
+def _lit_part(region: Region, image_px: tuple[float, float], support: tuple[int, int]) -> Region | None:
+    """The part of ``region`` within ``support`` (rows, columns) of an image, on even coordinates; None when empty."""
+    left, right = (max(region.x, 2 * int((image_px[0] - support[1]) // 2)), region.x + region.columns)
+    top, bottom = (max(region.y, 2 * int((image_px[1] - support[0]) // 2)), region.y + region.rows)
+    right = min(right, 2 * int((image_px[0] + support[1]) // 2 + 1))
+    bottom = min(bottom, 2 * int((image_px[1] + support[0]) // 2 + 1))
+    return Region(left, top, right - left, bottom - top) if right > left and bottom > top else None
