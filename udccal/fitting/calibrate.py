@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import TypeVar, get_args
 
@@ -38,15 +39,19 @@ class FitEffort:
         wire_samples: pixels that the wire's fields are fitted to.
         psf: see ``udccal.fitting.psf.Effort``.
         backscatter_positions: sensor positions that the footprint is fitted at.
+        workers: with 2, psf and backscatter, which do not need each other, are fitted at once, in more memory.
     """
 
     wire_samples: int = FIELD_SAMPLES
     psf: Effort = field(default_factory=Effort)
     backscatter_positions: int = 96
+    workers: int = 1
 
 
 # For a demonstration.
-QUICK = FitEffort(wire_samples=100_000, psf=Effort(positions=8, shifts=2, iterations=8), backscatter_positions=32)
+QUICK = FitEffort(
+    wire_samples=75_000, psf=Effort(positions=8, shifts=2, iterations=8), backscatter_positions=32, workers=2
+)
 
 
 @dataclass(frozen=True)
@@ -121,17 +126,21 @@ def fit_session(
         lambda: fit_wire(session, noise.term, geometry.term, effort.wire_samples),
         lambda: absent_wire(rig, geometry.term),
     )
-    psf = run(
-        "psf",
-        lambda: fit_psf(session, noise.term, geometry.term, wire.term, effort.psf),
-        lambda: absent_psf(rig, geometry.term),
-    )
-    backscatter = run(
-        "backscatter",
-        lambda: fit_backscatter(session, noise.term, geometry.term, wire.term, effort.backscatter_positions),
-        lambda: absent_backscatter(rig, geometry.term),
-    )
-    return Calibration(rig, noise, geometry, wire, psf, backscatter, tuple(times))
+    with ThreadPoolExecutor(effort.workers) as pool:
+        psf = pool.submit(
+            run,
+            "psf",
+            lambda: fit_psf(session, noise.term, geometry.term, wire.term, effort.psf),
+            lambda: absent_psf(rig, geometry.term),
+        )
+        backscatter = pool.submit(
+            run,
+            "backscatter",
+            lambda: fit_backscatter(session, noise.term, geometry.term, wire.term, effort.backscatter_positions),
+            lambda: absent_backscatter(rig, geometry.term),
+        )
+    times.sort(key=lambda taken: ORDER.index(taken.term))
+    return Calibration(rig, noise, geometry, wire, psf.result(), backscatter.result(), tuple(times))
 
 
 def _left_out(name: TermName, term: Term) -> FitResult[Term]:

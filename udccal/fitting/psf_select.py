@@ -151,7 +151,7 @@ def _mean_kernel(data: _Data, sources: Sources) -> Float[np.ndarray, "3 rows col
     return kernel / np.maximum(kernel.sum(axis=(1, 2), keepdims=True), 1e-30)
 
 
-def _free_sources(data: _Data, sources: Sources, magnitude: np.ndarray, rounds: int = 2) -> Sources:
+def _free_sources(data: _Data, sources: Sources, magnitude: np.ndarray) -> Sources:
     """Places and light when diffraction explains nothing: from the crops themselves, then from the image they give."""
     shots = data.shots
     colour = np.eye(3)[shots.channel] * (shots.weight > 0)[..., None]
@@ -159,9 +159,9 @@ def _free_sources(data: _Data, sources: Sources, magnitude: np.ndarray, rounds: 
     covered = np.einsum("cyx,syxc->sc", magnitude, colour)
     free = Sources(shots.centre_px, light / np.maximum(covered, 1e-6), np.zeros(shots.count))
     every = np.ones(shots.count, dtype=bool)
-    for _ in range(rounds):
-        image = _solve(data, free, every, 0, 0.0, magnitude)
-        free = refine_sources(shots, free, data.windows(free, 0, every), image)
-        total = replace(free, flux=free.flux * image[0].sum(axis=(1, 2)))
-        free = total
+    enough = polynomial_terms(1) <= len(np.unique(shots.position))
+    for degree in (0, 1) if enough else (0,):
+        image = _solve(data, free, every, degree, 0.0, magnitude)
+        free = refine_sources(shots, free, data.windows(free, degree, every), image)
+        free = replace(free, flux=free.flux * image[0].sum(axis=(1, 2)))
     return free

@@ -26,8 +26,8 @@ from udccal.models.wire import Wire, modulation, panel_rotation, slopes, wire_va
 from udccal.numerics import in_float64
 from udccal.sessions.store import Session
 
-SEARCH_SAMPLES = 20_000
-PHASE_SAMPLES = 50_000
+# Of the pixels that the fields are fitted to: so many for the search of the phase, and for its fit.
+SEARCH_SHARE, PHASE_SHARE = 1 / 15, 1 / 6
 PHASE_HARMONICS = 24
 SHAPE_NAMES = (
     "rotation_x_deg",
@@ -92,7 +92,7 @@ def fit_wire_map(
         geometry: where the rays go.
         start: from the rig description.
         prnu: relative pixel-to-pixel response, added to the variance.
-        field_samples: pixels used for the amplitude fields.
+        field_samples: pixels used for the amplitude fields; the phase is fitted to a sixth of them.
     """
     values, relative_variance = _balanced(signal, variance, prnu)
     if values is None or float(np.median(values / np.sqrt(relative_variance))) < _LEAST_SIGNAL_TO_NOISE:
@@ -101,7 +101,7 @@ def fit_wire_map(
         return _failed(geometry, start, FitStatus.TOO_FEW_DATA, f"There are {values.size} pixels.")
     few, coarse, pixels = (
         sample_pixels(values, relative_variance, geometry, _odd_step(values.size, samples))
-        for samples in (SEARCH_SAMPLES, PHASE_SAMPLES, field_samples)
+        for samples in (int(SEARCH_SHARE * field_samples), int(PHASE_SHARE * field_samples), field_samples)
     )
     harmonics, sizes = possible_harmonics(start)
     phase = fit_phase(geometry, start, few, coarse, harmonics[:PHASE_HARMONICS])

@@ -6,6 +6,7 @@ j - rows // 2) pixels from ``position``; the source's image is at ``position`` +
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -35,6 +36,7 @@ class _Care:
 _CORE, _STREAKS, _ELSEWHERE = _Care(192, 4, 0.03), _Care(16, 2, 0.06), _Care(1, 1, 0.2)
 _STREAK_HALF_WIDTH_PX = 6.0
 _BLOCK = 20_000
+_WORKERS = 2
 # Sources no farther apart than this share one diffraction pattern.
 SHARED_PX = 4.0
 
@@ -106,9 +108,13 @@ def captured_light(
     pixels = np.stack([offsets[:-1, :-1], offsets[:-1, 1:], offsets[1:, 1:], offsets[1:, :-1]], axis=2)
     # All points of the disc share one diffraction pattern: it moves, but does not change, over a pixel or two.
     light = np.empty((rows, columns, 3))
-    for care, chosen in _by_care(truth, pixels):
+
+    def gather(care: _Care, chosen: Bool[np.ndarray, "rows columns"]) -> None:
         disc = _disc(truth, source, source_disc_px, care.disc_points) - direction[:2]
         light[chosen] = _mean_over_disc(spread, pixels[chosen], disc, care)
+
+    with ThreadPoolExecutor(_WORKERS) as pool:
+        list(pool.map(gather, *zip(*_by_care(truth, pixels), strict=True)))
     return np.maximum(np.moveaxis(light, -1, 0), 0.0)
 
 
