@@ -68,16 +68,17 @@ def demonstrate(output: Output, rig_name: str, out: Path, seed: int) -> None:
         world = simulated_rig(rig, seed)
     capture(output, rig, world, out / "session", ORDER)
     session = Session.open(out / "session")
+    panel_picture = face_picture(UNSEEN_PICTURE, rig.panel.columns, rig.panel.rows)
     with ThreadPoolExecutor(1) as pool:
-        # The true blur of the photograph to come needs nothing of the fits.
+        # Neither the true blur of the photograph nor the report's evidence has to wait for what runs beside it.
         pool.submit(lambda: world.light.blur)
         calibration = run_fits(output, session, QUICK)
-    show_status(output, calibration)
-    store_profile(output, session, calibration, out / "profile")
-    panel_picture = face_picture(UNSEEN_PICTURE, rig.panel.columns, rig.panel.rows)
-    scene = _restore_portrait(output, world, panel_picture, out)
+        show_status(output, calibration)
+        gathered = pool.submit(gather, session, calibration, panel_picture, world.light)
+        store_profile(output, session, calibration, out / "profile")
+        scene = _restore_portrait(output, world, panel_picture, out)
     with output.stage("report"):
-        evidence = gather(session, calibration, panel_picture, world.light)
+        evidence = gathered.result()
         report = out / "report.html"
         write_page(report, calibration_page(session, evidence, scene))
     output.table(truth_table(evidence.rows))
