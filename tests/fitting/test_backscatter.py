@@ -11,7 +11,6 @@ from tests.simulation.toy import toy_rig, toy_truth
 from udccal.cameras.protocol import CameraIdentity, Region, Settings
 from udccal.cfa import channel_map
 from udccal.displays.pictures import face_picture
-from udccal.fitting.absent import absent_wire
 from udccal.fitting.backscatter import fit_backscatter, fit_shots
 from udccal.fitting.backscatter_data import Binned, PanelShots, bin_rate, grid_step, visible_crop
 from udccal.fitting.noise import nominal_noise
@@ -207,14 +206,14 @@ def test_a_session(simulator, tmp_path: Path) -> None:  # type: ignore[no-untype
         subject = writer.store_picture(name, shown, "white" if index == 0 else "picture")
         writer.add_step(name, "backscatter", subject, [average(simulator.rate(shown))])
     session = Session.open(tmp_path / "s")
-    result = fit_backscatter(session, noise, known_geometry(), absent_wire(RIG, known_geometry()), positions=60)
+    result = fit_backscatter(session, noise, known_geometry(), np.ones(dark.shape), positions=60)
     assert result.status is FitStatus.CONVERGED
     assert error_of_peak(result.term, picture(100), simulator) < 0.02
 
 
 def test_a_session_without_white_is_too_few_data(tmp_path: Path) -> None:
     SessionWriter.create(tmp_path / "s", RIG, CameraIdentity("a", "b", "c", "test"))
-    geometry = known_geometry()
-    result = fit_backscatter(Session.open(tmp_path / "s"), nominal_noise(RIG), geometry, absent_wire(RIG, geometry))
+    flat = np.ones((RIG.camera.rows, RIG.camera.columns))
+    result = fit_backscatter(Session.open(tmp_path / "s"), nominal_noise(RIG), known_geometry(), flat)
     assert result.status is FitStatus.TOO_FEW_DATA
     assert "backscatter/white" in result.notes[0]

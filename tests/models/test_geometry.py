@@ -57,6 +57,20 @@ def test_directions_come_back_to_their_pixels() -> None:
     np.testing.assert_allclose(back, pixels(), atol=1e-6)
 
 
+def test_area_of_pixels_is_the_determinant_of_the_directions_slopes() -> None:
+    def cosines(pixel: jax.Array) -> jax.Array:
+        return g.panel_directions(GEOMETRY, pixel[None])[0, :2]
+
+    @in_float64
+    def both() -> tuple[np.ndarray, np.ndarray]:
+        slopes = jax.vmap(jax.jacfwd(cosines))(jnp.asarray(pixels()))
+        return np.asarray(g.area_of_pixels(GEOMETRY, pixels())), np.abs(np.linalg.det(np.asarray(slopes)))
+
+    area, determinant = both()
+    np.testing.assert_allclose(area, determinant, rtol=1e-9)
+    assert np.ptp(area) > 0.2 * area.mean()
+
+
 def test_rotation_is_that_of_opencv_and_has_a_derivative_at_zero() -> None:
     vector = np.array([0.3, -0.2, 0.5])
     with jax.enable_x64(True):

@@ -8,6 +8,7 @@ import pytest
 from udccal.fitting.absent import absent_backscatter, absent_psf, absent_wire
 from udccal.fitting.nominal import nominal_geometry
 from udccal.fitting.result import Candidate, Diagnostic, Estimate, FitResult, FitStatus
+from udccal.fitting.wire import sensor_map
 from udccal.models.noise import Noise
 from udccal.profiles.profile import Profile, build_profile
 from udccal.profiles.provenance import provenance_now
@@ -51,13 +52,15 @@ def toy_profile(toy_rig: RigDescription) -> Profile:
     residual = np.pad(rng.normal(0, 1e-6, (1, 3, 15, 15)), 0)
     residual[0, :, 7, 7] = 1.0
     estimates = (Estimate("K_DN_per_e", 0.355, 1e-3, "DN/e-"), Estimate("black_DN", 64.1, 0.1, "DN"))
+    wire = absent_wire(toy_rig, geometry)
     return build_profile(
         toy_rig,
         provenance_now(None, StoredCamera(vendor="Basler", model="acA2040", serial="1", backend="simulated")),
         noise=fitted(noise, estimates),
         geometry=fitted(geometry),
-        wire=fitted(absent_wire(toy_rig, geometry)),
+        wire=fitted(wire),
         psf=fitted(type(psf)(**{**vars(psf), "residual": residual})),
         backscatter=fitted(absent_backscatter(toy_rig, geometry), status=FitStatus.ABSENT),
+        wire_map=sensor_map(wire, toy_rig.camera.rows, toy_rig.camera.columns),
         parent="ab" * 32,
     )

@@ -106,7 +106,7 @@ def test_a_bad_fit_makes_no_profile(toy_profile: Profile) -> None:
     results = {name: toy_profile.result(name) for name in TERMS}
     results["wire"] = dataclasses.replace(results["wire"], status=FitStatus.SATURATED)
     with pytest.raises(FitError, match="SATURATED"):
-        build_profile(toy_profile.rig, toy_profile.provenance, **results)
+        build_profile(toy_profile.rig, toy_profile.provenance, **results, wire_map=toy_profile.wire_map)
 
 
 def damaged(change: Callable[[dict[str, Any]], object]) -> Callable[[Path], None]:

@@ -10,6 +10,7 @@ import pytest
 from udccal.fitting.absent import absent_backscatter, absent_psf, absent_wire
 from udccal.fitting.nominal import nominal_geometry
 from udccal.fitting.result import FitResult, FitStatus
+from udccal.fitting.wire import sensor_map
 from udccal.models.noise import Noise
 from udccal.profiles.profile import Profile, build_profile
 from udccal.profiles.provenance import provenance_now
@@ -38,14 +39,16 @@ def profile(small_rig: RigDescription, toy_noise: Noise) -> Profile:
     def fitted(term: object) -> FitResult:
         return FitResult(term, FitStatus.CONVERGED, (), np.zeros((0, 0)), 1.0, 100)
 
+    wire = absent_wire(small_rig, geometry)
     return build_profile(
         small_rig,
         provenance_now(None, None),
         noise=fitted(toy_noise),
         geometry=fitted(geometry),
-        wire=fitted(absent_wire(small_rig, geometry)),
+        wire=fitted(wire),
         psf=fitted(type(point)(**{**vars(point), "residual": residual})),
         backscatter=fitted(lit),
+        wire_map=sensor_map(wire, small_rig.camera.rows, small_rig.camera.columns),
     )
 
 

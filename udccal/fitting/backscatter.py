@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float
 from udccal.fitting.absent import absent_backscatter
 from udccal.fitting.backscatter_data import (
     PanelShots,
+    directions,
     grid_step,
     nominal_term,
     read_shots,
@@ -40,9 +41,8 @@ from udccal.fitting.backscatter_solve import (
 from udccal.fitting.result import Candidate, Diagnostic, Estimate, FitResult, FitStatus
 from udccal.fitting.solvers import Solution
 from udccal.models.backscatter import Backscatter, grid_positions
-from udccal.models.geometry import Geometry, panel_directions
+from udccal.models.geometry import Geometry
 from udccal.models.noise import Noise
-from udccal.models.wire import Wire
 from udccal.numerics import in_float64
 from udccal.rig import RigDescription
 from udccal.sessions.store import Session
@@ -80,7 +80,11 @@ class _Problem:
 
 
 def fit_backscatter(
-    session: Session, noise: Noise, geometry: Geometry, wire: Wire, positions: int = 96
+    session: Session,
+    noise: Noise,
+    geometry: Geometry,
+    shading: Float[np.ndarray, "rows columns"],
+    positions: int = 96,
 ) -> FitResult[Backscatter]:
     """Fit the backscatter term to the steps ``backscatter/*`` of a session.
 
@@ -88,13 +92,13 @@ def fit_backscatter(
         session: holds ``backscatter/white``, ``backscatter/dark`` and at least 6 other pictures, as averages.
         noise: gives K, black level and saturation.
         geometry: where rays go.
-        wire: divided out of what was measured.
+        shading: the wire's map of the sensor (``fitting.wire.sensor_map``), divided out of what was measured.
         positions: number of sensor positions that the footprint is fitted at.
 
     Raises:
         SessionError: when a file is missing or damaged.
     """
-    shots = read_shots(session, noise, visible_crop(geometry, session.rig), wire)
+    shots = read_shots(session, noise, visible_crop(geometry, session.rig), shading)
     if shots is None:
         note = "Expected the steps backscatter/white and backscatter/dark, found that they were not captured."
         return _without(session.rig, geometry, FitStatus.TOO_FEW_DATA, note)
@@ -218,7 +222,7 @@ def _term(template: Backscatter, x: Float[np.ndarray, "18"]) -> Backscatter:
     """The fitted term in numpy, its window no larger than the footprints on the whole grid need."""
     columns, rows = (np.asarray(a) for a in grid_positions(template.columns, template.rows, template.step))
     pixels = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
-    rays = np.asarray(panel_directions(template.geometry, pixels), dtype=np.float64)
+    rays = np.asarray(directions(template.geometry, pixels), dtype=np.float64)
     fitted = with_vector(template, jnp.asarray(x))
     return Backscatter(
         geometry=template.geometry,

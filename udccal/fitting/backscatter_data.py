@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import equinox as eqx
+import jax
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Array, Float, Int, UInt8
 
 from udccal.cfa import cell_channels
+from udccal.models.arrays import Arrayish
 from udccal.models.backscatter import Backscatter, footprints, grid_positions
 from udccal.models.geometry import Geometry, panel_directions
 from udccal.models.noise import Noise
-from udccal.models.wire import Wire, wire_map
 from udccal.numerics import in_float64
 from udccal.rig import RigDescription
 from udccal.sessions.schema import DarkSubject, PanelSubject, StoredStep
@@ -56,8 +58,13 @@ class PanelShots:
     crop: PanelCrop
 
 
-def read_shots(session: Session, noise: Noise, crop: PanelCrop, wire: Wire) -> PanelShots | None:
+def read_shots(
+    session: Session, noise: Noise, crop: PanelCrop, shading: Float[np.ndarray, "rows columns"]
+) -> PanelShots | None:
     """Bin every picture of a session, one at a time; None when white or dark was not captured.
+
+    Args:
+        shading: the wire's map of the sensor, divided out.
 
     Raises:
         SessionError: when a file is missing or damaged.
@@ -69,7 +76,6 @@ def read_shots(session: Session, noise: Noise, crop: PanelCrop, wire: Wire) -> P
         return None
     camera = session.rig.camera
     gain, saturation = float(np.asarray(noise.K_DN_per_e)), float(np.asarray(noise.saturation_DN))
-    shading = sensor_map(wire, camera.rows, camera.columns)
     dark_mean = session.average(dark[0].captures[0]).mean.astype(np.float64)
 
     def binned(step: StoredStep) -> Binned:
@@ -90,12 +96,6 @@ def read_shots(session: Session, noise: Noise, crop: PanelCrop, wire: Wire) -> P
         shown=np.stack(shown) if shown else empty,
         crop=crop,
     )
-
-
-@in_float64
-def sensor_map(wire: Wire, rows: int, columns: int) -> Float[np.ndarray, "rows columns"]:
-    """The wire over the whole sensor."""
-    return np.asarray(wire_map(wire, rows, columns), dtype=np.float64)
 
 
 def grid_step(rig: RigDescription) -> int:
@@ -135,12 +135,19 @@ def visible_crop(geometry: Geometry, rig: RigDescription) -> PanelCrop:
     edge_x, edge_y = np.linspace(0, camera.columns - 1, 9), np.linspace(0, camera.rows - 1, 9)
     pixels = np.stack(np.meshgrid(edge_x, edge_y), axis=-1).reshape(-1, 2)
     template = nominal_term(geometry, rig, np.zeros((3, 2, 2)), grid_step(rig), window=1)
-    centre = np.asarray(footprints(template, panel_directions(geometry, pixels), rig.mounting.standoff_mm.value)[0])
+    centre = np.asarray(_centres(template, pixels, rig.mounting.standoff_mm.value))
     first = np.floor(centre.min(axis=0)).astype(int) - _MARGIN_PX
     last = np.ceil(centre.max(axis=0)).astype(int) + _MARGIN_PX
     first = np.clip(first, 0, [panel.columns - 8, panel.rows - 8])
     last = np.clip(last, first + 8, [panel.columns, panel.rows])
     return PanelCrop(int(first[0]), int(first[1]), int(last[0] - first[0]), int(last[1] - first[1]))
+
+
+@eqx.filter_jit
+def _centres(
+    term: Backscatter, pixels: Float[Arrayish, "n 2"], distance_mm: Float[Arrayish, ""]
+) -> Float[Array, "n 2"]:
+    return footprints(term, panel_directions(term.geometry, pixels), distance_mm)[0]
 
 
 def nominal_term(
@@ -168,6 +175,9 @@ def nominal_term(
     )
 
 
+directions = jax.jit(panel_directions)
+
+
 @in_float64
 def sampled_rays(
     geometry: Geometry, rig: RigDescription, step: int, count: int
@@ -179,5 +189,5 @@ def sampled_rays(
     columns, rows = (sequence * [len(x), len(y)]).astype(int).T
     flat = np.unique(rows * len(x) + columns)
     rows, columns = np.divmod(flat, len(x))
-    rays = panel_directions(geometry, np.stack([x[columns], y[rows]], axis=1))
+    rays = directions(geometry, np.stack([x[columns], y[rows]], axis=1))
     return np.asarray(rays, dtype=np.float64), flat

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -160,7 +161,7 @@ def corners_of(
     template: Backscatter, x: Float[np.ndarray, "18"], rays: Float[np.ndarray, "n 3"]
 ) -> Int[np.ndarray, "n 2"]:
     """First panel pixel of the window of each position."""
-    return np.asarray(window_corners(with_vector(template, jnp.asarray(x)), rays)).astype(np.int64)
+    return np.asarray(_corners(template, x, rays)).astype(np.int64)
 
 
 @in_float64
@@ -168,24 +169,45 @@ def errors(
     template: Backscatter, data: Ratios, x: Float[np.ndarray, "18"], corner: Int[np.ndarray, "n 2"]
 ) -> Float[np.ndarray, "pictures 3 n"]:
     """Predicted less measured ratio, 0 where a position has no weight."""
-    model = _predict(with_vector(template, jnp.asarray(x)), data.rays, corner, data.shown, data.first)
+    model = _predict(template, x, data.rays, corner, data.shown, data.first)
     return np.where(data.weight > 0, np.asarray(model, dtype=np.float64) - data.ratio, 0.0)
 
 
 @in_float64
 def window_for(template: Backscatter, x: Float[np.ndarray, "18"], rays: Float[np.ndarray, "n 3"], slack: float) -> int:
     """Odd number of panel pixels across a window that holds both footprints at every position."""
-    term = with_vector(template, jnp.asarray(x))
-    near, shape = (np.asarray(a) for a in footprints(term, rays, term.distance_mm))
-    far, far_shape = (np.asarray(a) for a in footprints(term, rays, term.distance_mm + term.reflection_mm))
+    (near, shape), (far, far_shape), emitters = jax.tree.map(np.asarray, _extents(template, x, rays))
     extent = np.maximum(np.linalg.norm(shape, axis=2), np.linalg.norm(far_shape, axis=2)).max()
     apart = np.abs(far - near).max() / 2
-    emitters = np.asarray(term.emitters_px)
     spread = np.abs(emitters - emitters.mean(axis=0)).max()
     return 2 * int(np.ceil(extent + apart + spread + 4 * abs(float(x[3])) + slack)) + 1
 
 
-_predict = eqx.filter_jit(predict)
+@eqx.filter_jit
+def _predict(
+    template: Backscatter,
+    x: Float[Arrayish, "18"],
+    rays: Float[Arrayish, "n 3"],
+    corner: Int[Arrayish, "n 2"],
+    shown: Float[Arrayish, "pictures crop_rows crop_columns 3"],
+    first: Int[Arrayish, "2"],
+) -> Float[Array, "pictures 3 n"]:
+    return predict(with_vector(template, jnp.asarray(x)), rays, corner, shown, first)
+
+
+@eqx.filter_jit
+def _corners(template: Backscatter, x: Float[Arrayish, "18"], rays: Float[Arrayish, "n 3"]) -> Int[Array, "n 2"]:
+    return window_corners(with_vector(template, jnp.asarray(x)), rays)
+
+
+@eqx.filter_jit
+def _extents(
+    template: Backscatter, x: Float[Arrayish, "18"], rays: Float[Arrayish, "n 3"]
+) -> tuple[tuple[Array, Array], tuple[Array, Array], Array]:
+    """The direct and the reflected footprints, and the emitters' places."""
+    term = with_vector(template, jnp.asarray(x))
+    far = term.distance_mm + term.reflection_mm
+    return footprints(term, rays, term.distance_mm), footprints(term, rays, far), jnp.asarray(term.emitters_px)
 
 
 @in_float64
@@ -198,8 +220,7 @@ def scan_offset(template: Backscatter, data: Ratios, rig: RigDescription) -> Flo
             vector = start_vector(rig, np.array([x, y]))
             vector[12:] = 0.0
             corner = corners_of(template, vector, data.rays)
-            term = with_vector(template, jnp.asarray(vector))
-            primaries = np.asarray(_predict(term, data.rays, corner, data.shown, data.first))
+            primaries = np.asarray(_predict(template, vector, data.rays, corner, data.shown, data.first))
             cost = sum(_free_mix_cost(primaries, data, channel) for channel in range(3))
             if cost < best:
                 best, offset = cost, np.array([x, y])

@@ -214,9 +214,12 @@ def _scatter(offset: Float[np.ndarray, " points"], points: _Points) -> Float[np.
     return np.maximum(np.array(medians) / 1.1774, 1e-6)
 
 
+_compiled_residuals = jax.jit(_residuals)
+
+
 @in_float64
 def _residuals_px(x: Float[np.ndarray, " n"], points: _Points) -> Float[np.ndarray, "points 2"]:
-    flat = _residuals(jnp.asarray(x), points.board, points.image, np.ones(len(points.board)), points.view)
+    flat = _compiled_residuals(x, points.board, points.image, np.ones(len(points.board)), points.view)
     return np.asarray(flat, dtype=np.float64).reshape(-1, 2)
 
 

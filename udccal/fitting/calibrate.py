@@ -9,15 +9,16 @@ from dataclasses import dataclass, field
 from typing import TypeVar, get_args
 
 import numpy as np
+from jaxtyping import Float
 
 from udccal.fitting.absent import absent_backscatter, absent_psf, absent_wire
 from udccal.fitting.backscatter import fit_backscatter
-from udccal.fitting.geometry import fit_geometry
+from udccal.fitting.geometry import BoardView, fit_views, read_views
 from udccal.fitting.noise import fit_noise, nominal_noise
 from udccal.fitting.nominal import nominal_geometry
 from udccal.fitting.psf import Effort, fit_psf
 from udccal.fitting.result import FitResult, FitStatus
-from udccal.fitting.wire import FIELD_SAMPLES, fit_wire
+from udccal.fitting.wire import FIELD_SAMPLES, fit_wire, sensor_map
 from udccal.models.backscatter import Backscatter
 from udccal.models.geometry import Geometry
 from udccal.models.noise import Noise
@@ -64,7 +65,12 @@ class FitTime:
 
 @dataclass(frozen=True)
 class Calibration:
-    """The five results of one session, and how long each took."""
+    """The five results of one session, and how long each took.
+
+    Attributes:
+        wire_map: the fitted wire over the sensor, which takes long enough to be kept.
+        boards: what the geometry was fitted to.
+    """
 
     rig: RigDescription
     noise: FitResult[Noise]
@@ -73,6 +79,8 @@ class Calibration:
     psf: FitResult[PsfField]
     backscatter: FitResult[Backscatter]
     times: tuple[FitTime, ...]
+    wire_map: Float[np.ndarray, "rows columns"]
+    boards: tuple[BoardView, ...]
 
     def result(self, term: TermName) -> FitResult:
         """The result of a term by its name."""
@@ -120,7 +128,13 @@ def fit_session(
         return result
 
     noise = run("noise", lambda: fit_noise(session), lambda: nominal_noise(rig))
-    geometry = run("geometry", lambda: fit_geometry(session, noise.term), lambda: nominal_geometry(rig))
+    boards: list[BoardView] = []
+
+    def geometry_of_boards() -> FitResult[Geometry]:
+        boards.extend(read_views(session, noise.term))
+        return fit_views(boards, nominal_geometry(rig), (rig.camera.columns, rig.camera.rows))
+
+    geometry = run("geometry", geometry_of_boards, lambda: nominal_geometry(rig))
     wire = run(
         "wire",
         lambda: fit_wire(session, noise.term, geometry.term, effort.wire_samples),
@@ -133,14 +147,17 @@ def fit_session(
             lambda: fit_psf(session, noise.term, geometry.term, wire.term, effort.psf),
             lambda: absent_psf(rig, geometry.term),
         )
+        wire_map = pool.submit(sensor_map, wire.term, rig.camera.rows, rig.camera.columns)
+        positions = effort.backscatter_positions
         backscatter = pool.submit(
             run,
             "backscatter",
-            lambda: fit_backscatter(session, noise.term, geometry.term, wire.term, effort.backscatter_positions),
+            lambda: fit_backscatter(session, noise.term, geometry.term, wire_map.result(), positions),
             lambda: absent_backscatter(rig, geometry.term),
         )
     times.sort(key=lambda taken: ORDER.index(taken.term))
-    return Calibration(rig, noise, geometry, wire, psf.result(), backscatter.result(), tuple(times))
+    terms = (noise, geometry, wire, psf.result(), backscatter.result())
+    return Calibration(rig, *terms, tuple(times), wire_map.result(), tuple(boards))
 
 
 def _left_out(name: TermName, term: Term) -> FitResult[Term]:

@@ -6,6 +6,7 @@ One view shows the board parallel to the panel. Its axes are then the panel's, s
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import jax
@@ -19,6 +20,7 @@ from udccal.fitting.bundle import INTRINSIC_NAMES, OUTLIER_SIGMA, CalibratedView
 from udccal.fitting.corners import MIN_CORNERS, BoardCorners, board_points_mm, detect_corners, luminance
 from udccal.fitting.nominal import nominal_geometry
 from udccal.fitting.result import Diagnostic, Estimate, FitResult, FitStatus
+from udccal.models.arrays import Arrayish
 from udccal.models.geometry import (
     Geometry,
     mounting_rotation,
@@ -65,13 +67,17 @@ def fit_geometry(session: Session, noise: Noise) -> FitResult[Geometry]:
     Raises:
         SessionError: when a file is missing or damaged.
     """
-    steps = [step for step in session.steps("geometry") if isinstance(step.subject, BoardSubject)]
-    views = [read_view(session, step, noise) for step in steps]
     camera = session.rig.camera
-    return fit_views(views, nominal_geometry(session.rig), (camera.columns, camera.rows))
+    return fit_views(read_views(session, noise), nominal_geometry(session.rig), (camera.columns, camera.rows))
 
 
-def read_view(session: Session, step: StoredStep, noise: Noise) -> BoardView:
+def read_views(session: Session, noise: Noise) -> tuple[BoardView, ...]:
+    """The boards of all steps ``geometry/*``; arguments and errors as for ``fit_geometry``."""
+    steps = [step for step in session.steps("geometry") if isinstance(step.subject, BoardSubject)]
+    return tuple(_read_view(session, step, noise) for step in steps)
+
+
+def _read_view(session: Session, step: StoredStep, noise: Noise) -> BoardView:
     """Find the board in the first capture of a step (its average, or a single frame)."""
     subject, capture = step.subject, step.captures[0]
     if not isinstance(subject, BoardSubject):
@@ -85,7 +91,7 @@ def read_view(session: Session, step: StoredStep, noise: Noise) -> BoardView:
     return BoardView(step.id, spec, subject.parallel_to_panel, moved, clipped)
 
 
-def fit_views(views: list[BoardView], nominal: Geometry, image_size: tuple[int, int]) -> FitResult[Geometry]:
+def fit_views(views: Sequence[BoardView], nominal: Geometry, image_size: tuple[int, int]) -> FitResult[Geometry]:
     """Fit the geometry term to boards already found; ``image_size`` is (columns, rows)."""
     usable = [view for view in views if view.usable]
     notes = _notes(views)
@@ -105,7 +111,7 @@ def fit_views(views: list[BoardView], nominal: Geometry, image_size: tuple[int, 
     return _result(bundle, usable, parallel, nominal, notes)
 
 
-def _notes(views: list[BoardView]) -> tuple[str, ...]:
+def _notes(views: Sequence[BoardView]) -> tuple[str, ...]:
     lost = [view.step_id for view in views if len(view.corners.ids) < MIN_CORNERS]
     clipped = [view.step_id for view in views if view.clipped > _MAX_CLIPPED]
     notes = []
@@ -185,11 +191,14 @@ def _held(bundle: CalibratedViews) -> tuple[str, ...]:
     return (*fixed, "Stand-off and panel position are the rig's nominal ones; the wire fit refines them.")
 
 
-def _angles_deg(rotation: Float[Array, "3"]) -> Float[Array, "3"]:
+def _angles_deg(rotation: Float[Arrayish, "3"]) -> Float[Array, "3"]:
     """(tilt, roll, yaw) of R_panel_camera = Ry(yaw) Rx(-tilt) Rz(roll)."""
     r = rotation_matrix(rotation)
     tilt, roll, yaw = jnp.arcsin(r[1, 2]), jnp.arctan2(r[1, 0], r[1, 1]), jnp.arctan2(r[0, 2], r[2, 2])
     return jnp.rad2deg(jnp.stack([tilt, roll, yaw]))
+
+
+_angles, _angle_slopes = jax.jit(_angles_deg), jax.jit(jax.jacfwd(_angles_deg))
 
 
 @in_float64
@@ -197,12 +206,12 @@ def _with_angles(
     bundle: CalibratedViews, parallel: list[int], rotation: Float[np.ndarray, "3"]
 ) -> tuple[Float[np.ndarray, "12"], Float[np.ndarray, "12 12"]]:
     """Values and covariance of intrinsics and angles; several parallel views count as their mean."""
-    slope = np.asarray(jax.jacfwd(_angles_deg)(jnp.asarray(rotation)))
+    slope = np.asarray(_angle_slopes(rotation))
     picks = np.zeros((12, len(bundle.cov)))
     picks[:9, :9] = np.eye(9)
     for view in parallel:
         picks[9:, 9 + 6 * view : 12 + 6 * view] = -slope / len(parallel)
-    angles = np.asarray(_angles_deg(jnp.asarray(rotation)), dtype=np.float64)
+    angles = np.asarray(_angles(rotation), dtype=np.float64)
     values = np.concatenate([bundle.focal, bundle.centre, bundle.distortion, angles])
     return values, picks @ bundle.cov @ picks.T
 

@@ -22,7 +22,7 @@ from udccal.fitting.wire_phase import (
 from udccal.fitting.wire_select import Selection, select
 from udccal.models.geometry import Geometry, tilt_rad
 from udccal.models.noise import Noise
-from udccal.models.wire import Wire, modulation, panel_rotation, slopes, wire_values
+from udccal.models.wire import Wire, modulation, panel_rotation, slopes, wire_map, wire_values
 from udccal.numerics import in_float64
 from udccal.sessions.store import Session
 
@@ -104,7 +104,7 @@ def fit_wire_map(
         for samples in (int(SEARCH_SHARE * field_samples), int(PHASE_SHARE * field_samples), field_samples)
     )
     harmonics, sizes = possible_harmonics(start)
-    phase = fit_phase(geometry, start, few, coarse, harmonics[:PHASE_HARMONICS])
+    phase = fit_phase(geometry, start, few, coarse, harmonics, PHASE_HARMONICS)
     present = phase.gain_in_chi2 >= LEAST_GAIN
     drawn = int(np.count_nonzero(pixels.weight))
     pixels = reject_outliers(phase.wire, phase.gains, pixels)
@@ -117,6 +117,12 @@ def fit_wire_map(
     residual = residuals(wire, gains, coarse)[coarse.weight > 0]
     wire = _mean_one(_trimmed(wire), values.shape)
     return _result(wire, residual, phase, chosen, pixels, drawn, present)
+
+
+@in_float64
+def sensor_map(wire: Wire, rows: int, columns: int) -> Float[np.ndarray, "rows columns"]:
+    """The wire at every pixel of the sensor. It takes seconds: keep it."""
+    return np.asarray(wire_map(wire, rows, columns), dtype=np.float64)
 
 
 def _odd_step(pixels: int, samples: int) -> int:

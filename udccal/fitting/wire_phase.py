@@ -116,14 +116,20 @@ def solve(normal: Normal, prior: Float[np.ndarray, " n"]) -> tuple[Float[np.ndar
 
 
 def fit_phase(
-    geometry: Geometry, start: WireStart, few: Pixels, many: Pixels, harmonics: Float[np.ndarray, "harmonics 2"]
+    geometry: Geometry,
+    start: WireStart,
+    few: Pixels,
+    many: Pixels,
+    harmonics: Float[np.ndarray, "harmonics 2"],
+    strongest: int,
 ) -> PhaseFit:
     """Baseline alone; stand-off and origin by demodulation of the first harmonics; then all of it together.
 
-    Searches on ``few`` pixels, and finishes on ``many``.
+    Searches on ``few`` pixels, and finishes on ``many``, with the ``strongest`` of ``harmonics``.
     """
-    bare = with_harmonics(ideal_wire(geometry, start, harmonics[:1]), harmonics[:1], few)
-    # Without any panel: no waves, and nothing that narrows with obliquity.
+    # Without any panel: no waves, and nothing that narrows with obliquity. All harmonics are there, at nothing, so that
+    # what is compiled here serves the final fit, too.
+    bare = with_harmonics(ideal_wire(geometry, start, harmonics), harmonics, few)
     bare = eqx.tree_at(lambda w: (w.fields, w.depth_per_pitch), bare, (np.zeros_like(bare.fields), np.float64(0.0)))
     gains, plain = np.ones(4), plain_basis()
     for _ in range(4):
@@ -136,7 +142,7 @@ def fit_phase(
         return PhaseFit(bare, gains, np.zeros((10, 10)), gain, variance, True, 0)
     shape, _gain = _scan(shape, gains, start, few, (1.0, 0.0))
     shape = eqx.tree_at(lambda w: w.depth_per_pitch, shape, np.float64(start.depth_per_pitch))
-    wire = with_harmonics(shape, harmonics, few)
+    wire = with_harmonics(shape, harmonics[:strongest], few)
     wire, gains, _inverse, _converged, first = _gauss_newton(wire, gains, few, start)
     many = reject_outliers(wire, gains, many)
     wire, gains, inverse, converged, second = _gauss_newton(wire, gains, many, start)

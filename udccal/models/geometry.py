@@ -6,8 +6,9 @@ Pixel coordinates, frames and signs are those of docs/conventions.md. All functi
 from __future__ import annotations
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from udccal.models.arrays import Arrayish
 
@@ -85,6 +86,21 @@ def distort(geometry: Geometry, points: Float[Arrayish, "*n 2"]) -> Float[Array,
     )
 
 
+def stretch(geometry: Geometry, points: Float[Arrayish, "*n 2"]) -> Float[Array, "*n"]:
+    """Area after ``distort`` over area before it, at ideal normalised image points: the determinant of its slopes."""
+    points = jnp.asarray(points)
+    k1, k2, p1, p2, k3 = jnp.asarray(geometry.distortion)
+    x, y = points[..., 0], points[..., 1]
+    r2 = x * x + y * y
+    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    # d(radial)/dx is 2 x slope, d(radial)/dy is 2 y slope.
+    slope = k1 + r2 * (2 * k2 + r2 * 3 * k3)
+    x_by_x = radial + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x
+    y_by_y = radial + 2 * y * y * slope + 6 * p1 * y + 2 * p2 * x
+    crossed = 2 * x * y * slope + 2 * p1 * x + 2 * p2 * y
+    return x_by_x * y_by_y - crossed * crossed
+
+
 def project(geometry: Geometry, points: Float[Arrayish, "*n 3"]) -> Float[Array, "*n 2"]:
     """Points in camera coordinates (any unit, z > 0) to sensor pixels."""
     points = jnp.asarray(points)
@@ -98,10 +114,12 @@ def unproject(geometry: Geometry, pixels: Float[Arrayish, "*n 2"], iterations: i
     Fixed-point inversion of the distortion; 12 rounds leave less than 1e-9 px for distortions up to 10 %.
     """
     measured = (jnp.asarray(pixels) - jnp.asarray(geometry.centre)) / jnp.asarray(geometry.focal)
-    ideal = measured
-    for _ in range(iterations):
-        ideal = ideal + measured - distort(geometry, ideal)
-    return ideal
+
+    # A loop of the compiler's: written out, it would take most of the time that compiling a fit takes.
+    def closer(_: Int[Array, ""], ideal: Float[Array, "*n 2"]) -> Float[Array, "*n 2"]:
+        return ideal + measured - distort(geometry, ideal)
+
+    return jax.lax.fori_loop(0, iterations, closer, measured)
 
 
 def panel_directions(geometry: Geometry, pixels: Float[Arrayish, "*n 2"]) -> Float[Array, "*n 3"]:
@@ -110,6 +128,19 @@ def panel_directions(geometry: Geometry, pixels: Float[Arrayish, "*n 2"]) -> Flo
     rays = jnp.concatenate([ideal, jnp.ones_like(ideal[..., :1])], axis=-1)
     rays = rays @ rotation_matrix(geometry.rotation).T
     return rays / jnp.linalg.norm(rays, axis=-1, keepdims=True)
+
+
+def area_of_pixels(geometry: Geometry, pixels: Float[Arrayish, "*n 2"]) -> Float[Array, "*n"]:
+    """Area in panel direction cosines (l_x, l_y) that a square pixel at each place covers.
+
+    An ideal image point at radius r sees the solid angle (1 + r^2)^(-3/2) per unit area; l_z of it falls on the plane
+    of the cosines.
+    """
+    ideal = unproject(geometry, pixels)
+    rays = jnp.concatenate([ideal, jnp.ones_like(ideal[..., :1])], axis=-1)
+    length = jnp.linalg.norm(rays, axis=-1)
+    along = jnp.abs(rays @ rotation_matrix(geometry.rotation)[2]) / length
+    return along / (length**3 * jnp.abs(stretch(geometry, ideal)) * jnp.prod(jnp.asarray(geometry.focal)))
 
 
 def panel_points_mm(geometry: Geometry, pixels: Float[Arrayish, "*n 2"]) -> Float[Array, "*n 2"]:

@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 from udccal.models.arrays import Arrayish
 from udccal.models.diffraction import Diffraction, LocalFrame, average_transfer, local_frame, node_scale
 from udccal.models.fields import polynomial_basis
-from udccal.models.geometry import Geometry, panel_directions
+from udccal.models.geometry import Geometry, area_of_pixels, panel_directions
 from udccal.models.interference import interference_transfer, node_overlaps, overlap_tables
 from udccal.models.lattice import Lattice, lattice_for, low_pass, sample, spline_coefficients
 
@@ -127,14 +127,10 @@ def lattice_points(
 ) -> tuple[Float[Array, "n 2"], Float[Array, " n"]]:
     """Pixels in units of the lattice about a source, and the lattice area that each covers."""
 
-    def cosines(pixel: Float[Array, "2"]) -> Float[Array, "2"]:
-        return panel_directions(geometry, pixel[None])[0, :2]
-
     pixels = jnp.asarray(position_px) + offsets_px
     scale = node_scale(frame)
     points = (panel_directions(geometry, pixels)[:, :2] - frame.direction[:2]) / scale
-    jacobian = jax.vmap(jax.jacfwd(cosines))(pixels)
-    return points, jnp.abs(jnp.linalg.det(jacobian)) / (scale[0] * scale[1])
+    return points, area_of_pixels(geometry, pixels) / (scale[0] * scale[1])
 
 
 def residual_kernel(

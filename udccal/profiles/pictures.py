@@ -10,19 +10,12 @@ from jaxtyping import Float32
 from udccal.cfa import channel_map
 from udccal.models.backscatter import Backscatter, backscatter_rate
 from udccal.models.psf import PsfField
-from udccal.models.wire import Wire, wire_map
 from udccal.numerics import in_float64
 from udccal.profiles.kernels import kernel_size, kernels_at
 from udccal.rig import RigDescription
 
 ATLAS_COLUMNS, ATLAS_ROWS = 5, 3
 _INSET = 0.05
-
-
-@in_float64
-def sensor_wire_map(wire: Wire, rig: RigDescription) -> Float32[np.ndarray, "rows columns"]:
-    """The wire at every pixel of the sensor."""
-    return np.asarray(wire_map(wire, rig.camera.rows, rig.camera.columns), dtype=np.float32)
 
 
 @in_float64

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float, Float32
 
 from udccal.fitting.result import FitResult
 from udccal.models.backscatter import Backscatter
@@ -13,7 +13,7 @@ from udccal.models.geometry import Geometry
 from udccal.models.noise import Noise
 from udccal.models.psf import PsfField
 from udccal.models.wire import Wire
-from udccal.profiles.pictures import backscatter_mask, sensor_wire_map
+from udccal.profiles.pictures import backscatter_mask
 from udccal.profiles.schema import Provenance
 from udccal.rig import RigDescription
 from udccal.sessions.schema import TermName
@@ -74,9 +74,10 @@ def build_profile(
     wire: FitResult[Wire],
     psf: FitResult[PsfField],
     backscatter: FitResult[Backscatter],
+    wire_map: Float[np.ndarray, "rows columns"],
     parent: str | None = None,
 ) -> Profile:
-    """A profile from five fits: evaluates the maps that restoration reads.
+    """A profile from five fits and the fitted wire's map; evaluates the other maps that are stored with it.
 
     Raises:
         FitError: with the advice of the first fit that ended in a bad status.
@@ -94,6 +95,6 @@ def build_profile(
         wire=wire,
         psf=psf,
         backscatter=backscatter,
-        wire_map=sensor_wire_map(wire.term, rig),
+        wire_map=wire_map.astype(np.float32),
         backscatter_mask=backscatter_mask(backscatter.term, rig),
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -9,11 +10,8 @@ import numpy as np
 from jaxtyping import Float
 
 from udccal.fitting.corners import board_points_mm
-from udccal.fitting.geometry import BoardView, read_view
+from udccal.fitting.geometry import BoardView
 from udccal.models.geometry import Geometry
-from udccal.models.noise import Noise
-from udccal.sessions.schema import BoardSubject
-from udccal.sessions.store import Session
 
 
 @dataclass(frozen=True)
@@ -25,14 +23,9 @@ class BoardEvidence:
     views: int
 
 
-def board_evidence(session: Session, noise: Noise, geometry: Geometry) -> BoardEvidence | None:
-    """Corners and residuals of all board views of a session; None when there are none.
-
-    Raises:
-        SessionError: when a file of the session is damaged.
-    """
-    steps = [step for step in session.steps("geometry") if isinstance(step.subject, BoardSubject)]
-    views = [view for view in (read_view(session, step, noise) for step in steps) if view.usable]
+def board_evidence(boards: Sequence[BoardView], geometry: Geometry) -> BoardEvidence | None:
+    """Corners and residuals of all usable board views; None when there are none."""
+    views = [view for view in boards if view.usable]
     if not views:
         return None
     residuals = [_residuals(view, geometry) for view in views]

@@ -11,7 +11,6 @@ from scipy.ndimage import gaussian_filter
 from udccal.fitting.calibrate import Calibration
 from udccal.models.backscatter import backscatter_rate
 from udccal.models.geometry import Geometry, panel_points_mm
-from udccal.models.wire import wire_map
 from udccal.numerics import in_float64
 from udccal.profiles.kernels import kernel_size, kernels_at
 from udccal.rig import RigDescription
@@ -52,10 +51,9 @@ def report_positions(rig: RigDescription) -> Float[np.ndarray, "places 2"]:
 def fitted_maps(calibration: Calibration, picture: UInt8[np.ndarray, "panel_rows panel_columns 3"]) -> TermMaps:
     """Maps of the fitted terms."""
     rig = calibration.rig
-    rows, columns = rig.camera.rows, rig.camera.columns
     positions = report_positions(rig)
     return TermMaps(
-        wire=np.asarray(wire_map(calibration.wire.term, rows, columns)),
+        wire=calibration.wire_map,
         positions_px=positions,
         kernels=kernels_at(calibration.psf.term, positions, *kernel_size(rig)),
         picture=picture,

@@ -36,7 +36,12 @@ def gather(
     rows = () if light is None or true is None else compare_with_truth(calibration, light.truth, fitted, true)
     noise, geometry = calibration.noise.term, calibration.geometry.term
     return Evidence(
-        calibration, fitted, true, rows, photon_transfer(session, noise), board_evidence(session, noise, geometry)
+        calibration,
+        fitted,
+        true,
+        rows,
+        photon_transfer(session, noise),
+        board_evidence(calibration.boards, geometry),
     )
 
 

@@ -100,6 +100,7 @@ def store_profile(output: Output, session: Session, calibration: Calibration, pa
             calibration.wire,
             calibration.psf,
             calibration.backscatter,
+            calibration.wire_map,
         )
         write_profile(path, profile)
 
