@@ -10,7 +10,7 @@ from scipy.special import j0, j1
 
 from udccal.models.bessel import bessel_j0_j1
 from udccal.models.geometry import Geometry, panel_points_mm, unproject
-from udccal.models.wire import Wire, kappa, modulation, panel_rotation, slopes, wire_map, wire_values
+from udccal.models.wire import Wire, kappa, modulation, panel_rotation, slopes, waves, wire_map, wire_values
 
 ROWS, COLUMNS = 48, 64
 _values = jax.jit(wire_values, static_argnums=(2, 3))
@@ -38,6 +38,7 @@ def make_wire(pupil: float = 5.0) -> Wire:
         harmonics=np.array(orders, dtype=float),
         frequency=np.tile([1.0, 1.0], (len(orders), 1)),
         fields=fields,
+        amplitudes=np.zeros((0, 2, 1, 1)),
         baseline=np.zeros((3, 3)),
     )
 
@@ -56,7 +57,7 @@ def test_series_is_the_open_area_of_the_footprint(ideal: tuple[float, float]) ->
     with jax.enable_x64(True):
         point = np.array([ideal])
         slope = np.asarray(jax.jit(slopes)(wire, point))
-        series = 1 + float(jax.jit(modulation)(wire, slope)[0])
+        series = 1 + float(jax.jit(modulation)(wire, slope, np.zeros((1, 2)))[0])
         rotation = np.asarray(panel_rotation(wire))
     # Count points of the tilted pupil that fall into openings.
     rng = np.random.default_rng(0)
@@ -110,6 +111,22 @@ def test_no_harmonics_leave_the_shading() -> None:
     flat = np.asarray(wire_map(bare, ROWS, COLUMNS))
     assert np.allclose(flat, 0.36, rtol=1e-5)
     assert not np.allclose(np.asarray(wire_map(wire, ROWS, COLUMNS)), 0.36, rtol=1e-3)
+
+
+def test_an_amplitude_beside_the_pupils_is_a_polynomial_over_the_sensor() -> None:
+    wire = make_wire()
+    beside = np.zeros((1, 2, 2, 2))
+    beside[0, 0, 1, 0], beside[0, 1, 0, 1] = 0.02, 0.03
+    free = Wire(**{**wire.__dict__, "amplitudes": beside})
+    pixels = np.array([[5.0, 40.0], [31.5, 23.5], [60.0, 2.0]])
+    with jax.enable_x64(True):
+        without, with_it = (np.asarray(_values(w, pixels, ROWS, COLUMNS)) for w in (wire, free))
+        slope = slopes(wire, unproject(wire.geometry, pixels))
+        cosine, sine = np.asarray(waves(wire, slope))[:, 0]
+        base = without / (1 + np.asarray(modulation(wire, slope, np.zeros((3, 2)))))
+    x, y = 2 * pixels[:, 0] / (COLUMNS - 1) - 1, 2 * pixels[:, 1] / (ROWS - 1) - 1
+    np.testing.assert_allclose(with_it - without, base * (0.02 * y * cosine + 0.03 * x * sine), atol=1e-12)
+    assert np.abs(with_it - without).max() > 1e-3
 
 
 def test_differentiable_in_its_shape() -> None:

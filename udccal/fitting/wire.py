@@ -109,7 +109,7 @@ def fit_wire_map(
     drawn = int(np.count_nonzero(pixels.weight))
     pixels = reject_outliers(phase.wire, phase.gains, pixels)
     wire = with_harmonics(phase.wire, harmonics if present else harmonics[:0], pixels)
-    basis = full_basis(sizes) if present else plain_basis()
+    basis = full_basis(sizes, phase.basis) if present else plain_basis()
     normal = accumulate(wire, phase.gains, pixels, basis)
     chosen = select(normal.matrix, normal.right, normal.power, normal.samples, basis.groups)
     wire, gains = add_increment(wire, phase.gains, basis, chosen.values)
@@ -163,7 +163,7 @@ def _mean_one(wire: Wire, shape: tuple[int, ...]) -> Wire:
 
 
 _values = jax.jit(wire_values, static_argnums=(2, 3))
-_modulation = jax.jit(lambda wire, ideal: modulation(wire, slopes(wire, ideal)))
+_modulation = jax.jit(lambda wire, ideal, scaled: modulation(wire, slopes(wire, ideal), scaled))
 
 
 def _result(
@@ -178,8 +178,8 @@ def _result(
     used = int(np.count_nonzero(pixels.weight))
     spread = float(np.sqrt(np.mean(residual**2)))
     tilt = float(np.rad2deg(np.arcsin(np.asarray(panel_rotation(wire))[1, 2])))
-    few = pixels.ideal[:: max(1, len(pixels.ideal) // 16_384)][:16_384]
-    waves = np.asarray(_modulation(wire, few))
+    few = np.s_[:: max(1, len(pixels.ideal) // 16_384)]
+    waves = np.asarray(_modulation(wire, pixels.ideal[few][:16_384], pixels.scaled[few][:16_384]))
     sigma = spread * float(np.sqrt(chosen.keep.sum() / max(used, 1) + len(phase.cov) / max(residual.size, 1)))
     status = FitStatus.CONVERGED if phase.converged else FitStatus.NOT_CONVERGED
     notes: tuple[str, ...] = ("cov covers the shape parameters; all coefficients show in wire_map_rms_sigma.",)

@@ -29,6 +29,8 @@ from udccal.numerics import in_float64
 SITES = 4
 SHAPE_PARAMETERS = 10
 _BLOCK = 4096
+# Of differences: the shortest period in any parameter is some 3e-4 / 2 pi, the rounding of a value 1e-16.
+_STEP = 1e-7
 
 
 class Pixels(eqx.Module):
@@ -56,18 +58,20 @@ class Basis:
     """The linear coefficients in the order of the columns.
 
     First the baseline's Legendre pairs (degree in y, in x), then three CFA-site gains (the fourth follows from a mean
-    of one), then the fields' coefficients: a row of ``fields`` per column (harmonic, phase, carrier, degree).
-    ``groups`` numbers the columns that selection keeps or drops together; -1 is always kept.
+    of one), then the amplitudes' coefficients: a row of ``amplitudes`` per column (harmonic, phase, degree in y, in x),
+    then the fields' coefficients: a row of ``fields`` per column (harmonic, phase, carrier, degree). ``groups`` numbers
+    the columns that selection keeps or drops together; -1 is always kept.
     """
 
     baseline: Int[np.ndarray, "smooth 2"]
+    amplitudes: Int[np.ndarray, "beside 4"]
     fields: Int[np.ndarray, "columns 4"]
     groups: Int[np.ndarray, " all"]
 
     @property
     def fixed(self) -> int:
         """Columns before the fields."""
-        return len(self.baseline) + SITES - 1
+        return len(self.baseline) + SITES - 1 + len(self.amplitudes)
 
     @property
     def size(self) -> int:
@@ -151,12 +155,12 @@ def block_residual(wire: Wire, gains: Array, pixels: Pixels) -> tuple[Float[Arra
     """(value / (gain exp(B)) - (1 + modulation), gain exp(B)) for one block."""
     slope = slopes(wire, pixels.ideal)
     base = jnp.exp(log_baseline(wire, pixels.scaled, slope)) * gains[pixels.site]
-    return jnp.asarray(pixels.value) / base - 1 - modulation(wire, slope), base
+    return jnp.asarray(pixels.value) / base - 1 - modulation(wire, slope, pixels.scaled), base
 
 
 @functools.partial(jax.jit, static_argnames=("shape",))
 def _smooth_columns(
-    wire: Wire, gains: Array, pixels: Pixels, baseline: Array, shape: bool
+    wire: Wire, gains: Array, pixels: Pixels, baseline: Array, amplitudes: Array, shape: bool
 ) -> tuple[Float[Array, " n"], Float[Array, " n"], Float[Array, "fixed n"]]:
     slope = slopes(wire, pixels.ideal)
     residual, base = block_residual(wire, gains, pixels)
@@ -165,15 +169,18 @@ def _smooth_columns(
     last = pixels.site == SITES - 1
     sites = jnp.stack([jnp.where(pixels.site == k, 1.0, jnp.where(last, -1.0, 0.0)) for k in range(SITES - 1)])
     # The baseline acts on everything: the change of exp(B) (1 + M), relative to exp(B), is (1 + M) dB.
-    whole = 1 + modulation(wire, slope)
+    whole = 1 + modulation(wire, slope, pixels.scaled)
     parts = [in_y[baseline[:, 0]] * in_x[baseline[:, 1]] * whole, sites * whole]
+    if len(amplitudes):
+        harmonic, phase, degree_y, degree_x = amplitudes.T
+        parts.append(waves(wire, slope)[phase, harmonic] * in_y[degree_y] * in_x[degree_x])
     if shape:
-
-        def moved(steps: Array) -> Array:
+        # One difference after the other: derivatives of all ten at once take five times as long, and longer to compile.
+        def slope_of(steps: Float[Array, "10"]) -> Float[Array, " n"]:
             there, base_there = block_residual(move(wire, steps), gains, pixels)
-            return -there * base_there
+            return (residual * base - there * base_there) / jnp.sum(steps)
 
-        parts.append(jax.jacfwd(moved)(jnp.zeros(SHAPE_PARAMETERS)).T / base)
+        parts.append(jax.lax.map(slope_of, _STEP * jnp.eye(SHAPE_PARAMETERS)) / base)
     return residual, base, jnp.concatenate(parts)
 
 
@@ -217,7 +224,7 @@ def accumulate(wire: Wire, gains: Float[np.ndarray, "4"], pixels: Pixels, basis:
     matrix, right, power, samples = np.zeros((size, size)), np.zeros(size), 0.0, 0
     for part in pixels.blocks():
         residual, base, design = (
-            np.asarray(a) for a in _smooth_columns(wire, gains, part, basis.baseline, shape=shape)
+            np.asarray(a) for a in _smooth_columns(wire, gains, part, basis.baseline, basis.amplitudes, shape=shape)
         )
         if len(basis.fields):
             design = np.concatenate([design, _field_columns(wire, part, basis.fields)])

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from udccal.fitting.wire_basis import SITES, Basis
 from udccal.models.wire import HIGHEST_ORDER
@@ -85,17 +85,32 @@ def possible_harmonics(start: WireStart) -> tuple[Float[np.ndarray, "harmonics 2
 
 def plain_basis(degree: int = SMOOTH_DEGREE) -> Basis:
     """Baseline up to a total degree, and site gains."""
-    pairs = np.array([(i, j) for i in range(degree + 1) for j in range(degree + 1 - i)])
-    return Basis(pairs, np.zeros((0, 4), dtype=np.int64), np.full(len(pairs) + SITES - 1, -1))
+    pairs = _pairs(degree)
+    none = np.zeros((0, 4), dtype=np.int64)
+    return Basis(pairs, none, none, np.full(len(pairs) + SITES - 1, -1))
 
 
-def full_basis(sizes: Float[np.ndarray, " harmonics"]) -> Basis:
-    """Baseline, gains, and every correction to the round pupil that may be needed: more for stronger harmonics."""
+def free_basis(strongest: int, degree: int) -> Basis:
+    """The plain basis, and amplitudes of the strongest harmonics up to a total degree over the sensor."""
     plain = plain_basis()
+    amplitudes = [(h, phase, *pair) for h in range(strongest) for phase in (0, 1) for pair in _pairs(degree)]
+    groups = np.full(len(plain.groups) + len(amplitudes), -1)
+    return Basis(plain.baseline, np.array(amplitudes, dtype=np.int64).reshape(-1, 4), plain.fields, groups)
+
+
+def _pairs(degree: int) -> Int[np.ndarray, "pairs 2"]:
+    return np.array([(i, j) for i in range(degree + 1) for j in range(degree + 1 - i)])
+
+
+def full_basis(sizes: Float[np.ndarray, " harmonics"], free: Basis) -> Basis:
+    """What ``free`` has, and every correction to the round pupil that may be needed: more for stronger harmonics."""
     fields: list[tuple[int, int, int, int]] = []
-    degrees = plain.baseline.sum(axis=1)
+    degrees = free.baseline.sum(axis=1)
     groups = [-1 if d <= _ALWAYS_SMOOTH else int(d) for d in degrees] + [-1] * (SITES - 1)
     group = SMOOTH_DEGREE
+    for harmonic, phase, *pair in free.amplitudes:
+        groups.append(group + 1 + int((2 * harmonic + phase) * (SMOOTH_DEGREE + 1) + sum(pair)))
+    group = max(groups[-1], group)
     for h, size in enumerate(sizes):
         # What a real pupil changes of the weakest harmonics is too small to be seen.
         cosines, sines = (4, 3) if size > _STRONG else (2, 1) if size > _MIDDLE else (0, 0)
@@ -105,4 +120,4 @@ def full_basis(sizes: Float[np.ndarray, " harmonics"]) -> Basis:
                 fields += [(h, phase, carrier, degree) for carrier in (0, 1)]
                 group += 1
                 groups += [group] * 2
-    return Basis(plain.baseline, np.array(fields, dtype=np.int64).reshape(-1, 4), np.array(groups))
+    return Basis(free.baseline, free.amplitudes, np.array(fields, dtype=np.int64).reshape(-1, 4), np.array(groups))

@@ -14,6 +14,7 @@ from jaxtyping import Float
 
 from udccal.fitting.wire_basis import (
     SHAPE_PARAMETERS,
+    SITES,
     Basis,
     Normal,
     Pixels,
@@ -22,7 +23,7 @@ from udccal.fitting.wire_basis import (
     move,
     residuals,
 )
-from udccal.fitting.wire_harmonics import FIELD_DEGREES, SMOOTH_DEGREE, WireStart, plain_basis
+from udccal.fitting.wire_harmonics import FIELD_DEGREES, SMOOTH_DEGREE, WireStart, free_basis, plain_basis
 from udccal.models.geometry import Geometry
 from udccal.models.wire import Wire, carriers, kappa, slopes, waves
 
@@ -34,13 +35,22 @@ _SCAN_STEP = 0.003
 _PUPILS = 7
 _OUTLIER = 6.0
 _ROUNDS = 15
+# Gauss-Newton ends when no shape parameter moves by more than this part of its sigma.
+_SETTLED = 0.05
+# Beyond this residual variance amplitudes that no pupil explains are tried; they must lower it by the second factor.
+_DOUBTFUL, _WORTH = 1.15, 0.95
+_FREE_HARMONICS, _FREE_DEGREE = 3, 3
+_AMPLITUDE_PRIOR = 0.05
 # Chi-squared that the first harmonic must explain in the scan; chance does not reach a third of it in 300 trials.
 LEAST_GAIN = 100.0
 
 
 @dataclass(frozen=True)
 class PhaseFit:
-    """A wire whose shape is final, the site gains, the covariance of the shape parameters, and the evidence."""
+    """A wire whose shape is final, the site gains, the covariance of the shape parameters, and the evidence.
+
+    ``basis`` are the linear columns that went with the shape.
+    """
 
     wire: Wire
     gains: Float[np.ndarray, "4"]
@@ -49,6 +59,7 @@ class PhaseFit:
     variance: float
     converged: bool
     iterations: int
+    basis: Basis
 
 
 _kappa = jax.jit(lambda wire, ideal: kappa(wire, slopes(wire, ideal)))
@@ -70,6 +81,7 @@ def ideal_wire(geometry: Geometry, start: WireStart, harmonics: Float[np.ndarray
         harmonics=harmonics,
         frequency=np.tile([0.0, 1.0], (len(harmonics), 1)),
         fields=fields,
+        amplitudes=np.zeros((0, 2, 1, 1)),
         baseline=np.zeros((SMOOTH_DEGREE + 1, SMOOTH_DEGREE + 1)),
     )
 
@@ -91,11 +103,13 @@ def add_increment(
 ) -> tuple[Wire, Float[np.ndarray, "4"]]:
     """Apply a solution of the linear problem (columns of ``basis`` only)."""
     smooth = len(basis.baseline)
-    baseline, fields = np.array(wire.baseline), np.array(wire.fields)
+    baseline, amplitudes, fields = np.array(wire.baseline), np.array(wire.amplitudes), np.array(wire.fields)
     baseline[basis.baseline[:, 0], basis.baseline[:, 1]] += values[:smooth]
+    site = values[smooth : smooth + SITES - 1]
+    amplitudes[tuple(basis.amplitudes.T)] += values[smooth + SITES - 1 : basis.fixed]
     fields[tuple(basis.fields.T)] += values[basis.fixed : basis.size]
-    site = values[smooth : basis.fixed]
-    wire = eqx.tree_at(lambda w: (w.baseline, w.fields), wire, (baseline, fields))
+    leaves = (baseline, amplitudes, fields)
+    wire = eqx.tree_at(lambda w: (w.baseline, w.amplitudes, w.fields), wire, leaves)
     return wire, gains * np.exp(np.append(site, -site.sum()))
 
 
@@ -139,16 +153,21 @@ def fit_phase(
     shape, gain = _scan(bare, gains, start, few, (0.0, 1.0))
     if gain < LEAST_GAIN:
         variance = merit(bare, gains, few) / max(int(np.count_nonzero(few.weight)) - plain.size, 1)
-        return PhaseFit(bare, gains, np.zeros((10, 10)), gain, variance, True, 0)
+        return PhaseFit(bare, gains, np.zeros((10, 10)), gain, variance, True, 0, plain)
     shape, _gain = _scan(shape, gains, start, few, (1.0, 0.0))
     shape = eqx.tree_at(lambda w: w.depth_per_pitch, shape, np.float64(start.depth_per_pitch))
     wire = with_harmonics(shape, harmonics[:strongest], few)
-    wire, gains, _inverse, _converged, first = _gauss_newton(wire, gains, few, start)
-    many = reject_outliers(wire, gains, many)
-    wire, gains, inverse, converged, second = _gauss_newton(wire, gains, many, start)
-    variance = merit(wire, gains, many) / max(int(np.count_nonzero(many.weight)) - len(inverse), 1)
-    cov = inverse[-SHAPE_PARAMETERS:, -SHAPE_PARAMETERS:] * variance
-    return PhaseFit(wire, gains, cov, gain, variance, converged, first + second)
+    tried = _gauss_newton(wire, gains, few, start, plain)
+    if tried.variance > _DOUBTFUL:
+        free = free_basis(_FREE_HARMONICS, _FREE_DEGREE)
+        room = np.zeros((_FREE_HARMONICS, 2, _FREE_DEGREE + 1, _FREE_DEGREE + 1))
+        other = _gauss_newton(eqx.tree_at(lambda w: w.amplitudes, wire, room), gains, few, start, free)
+        tried = other if other.variance < _WORTH * tried.variance else tried
+    many = reject_outliers(tried.wire, tried.gains, many)
+    last = _gauss_newton(tried.wire, tried.gains, many, start, tried.basis)
+    cov = last.inverse[-SHAPE_PARAMETERS:, -SHAPE_PARAMETERS:] * last.variance
+    rounds = tried.rounds + last.rounds
+    return PhaseFit(last.wire, last.gains, cov, gain, last.variance, last.converged, rounds, tried.basis)
 
 
 _carrier = jax.jit(lambda wire, ideal: carriers(wire, slopes(wire, ideal), kappa(wire, slopes(wire, ideal)))[0, 0])
@@ -189,29 +208,50 @@ def _scan(
     return found_wire, 2 * float(gain[i, j]) ** 2 / variance
 
 
+@dataclass(frozen=True)
+class _Descent:
+    """Where Gauss-Newton ended, with the inverse of its last normal matrix and the residual variance."""
+
+    wire: Wire
+    gains: Float[np.ndarray, "4"]
+    basis: Basis
+    inverse: Float[np.ndarray, "n n"]
+    variance: float
+    converged: bool
+    rounds: int
+
+
 def _gauss_newton(
-    wire: Wire, gains: Float[np.ndarray, "4"], pixels: Pixels, start: WireStart
-) -> tuple[Wire, Float[np.ndarray, "4"], Float[np.ndarray, "n n"], bool, int]:
-    basis = plain_basis()
-    prior = np.concatenate([np.zeros(basis.size), _prior(start)])
+    wire: Wire, gains: Float[np.ndarray, "4"], pixels: Pixels, start: WireStart, basis: Basis
+) -> _Descent:
+    beside = np.full(basis.fixed, 0.0)
+    beside[len(basis.baseline) + SITES - 1 :] = _AMPLITUDE_PRIOR
+    prior = np.concatenate([beside, _prior(start)])
+    samples = max(int(np.count_nonzero(pixels.weight)) - len(prior), 1)
     now = merit(wire, gains, pixels)
-    converged, inverse, iterations = False, np.eye(len(prior)), 0
-    while not converged and iterations < _ROUNDS:
-        iterations += 1
+    values, inverse, rounds = np.zeros(len(prior)), np.eye(len(prior)), 0
+    largest, gained = np.inf, np.inf
+    while largest > _SETTLED and rounds < _ROUNDS:
+        rounds += 1
         values, inverse = solve(accumulate(wire, gains, pixels, basis, shape=True), prior)
+        largest = float(np.max(_steps_in_sigma(values, inverse)))
         for halving in range(6):
             step = values * 0.5**halving
             trial, trial_gains = add_increment(wire, gains, basis, step)
             trial = _numpy(move(trial, step[-SHAPE_PARAMETERS:]))
             then = merit(trial, trial_gains, pixels)
             if then < now:
-                wire, gains, now = trial, trial_gains, then
+                wire, gains, now, gained = trial, trial_gains, then, now - then
                 break
         else:
             # At the minimum up to rounding, or stuck.
-            return wire, gains, inverse, bool(np.all(_steps_in_sigma(values, inverse) < 1.0)), iterations
-        converged = bool(np.all(_steps_in_sigma(values, inverse) < 0.05))
-    return wire, gains, inverse, converged, iterations
+            break
+    # What the data hardly show, such as columns that leave no trace, may creep on for ever. A step of one sigma in each
+    # shape parameter, or what that gains in chi-squared, is no matter.
+    variance = now / samples
+    return _Descent(
+        wire, gains, basis, inverse, variance, min(largest, gained / (SHAPE_PARAMETERS * variance)) < 1.0, rounds
+    )
 
 
 def _steps_in_sigma(values: Float[np.ndarray, " n"], inverse: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "10"]:

@@ -12,7 +12,8 @@ amplitude is the slits' Fourier coefficient times that of the footprint: for a r
 
 where kappa is the length of (n, m) seen through the footprint's shape and the openings narrow with the obliquity of the
 ray because the structure has some depth. What a real pupil does differently are short Legendre series in kappa: they
-scale G, and shift its argument (z G'), for cosine and sine.
+scale G, and shift its argument (z G'), for cosine and sine. Where no pupil explains the amplitudes of the strongest
+harmonics, polynomials over the sensor are added to them.
 """
 
 from __future__ import annotations
@@ -48,6 +49,8 @@ class Wire(eqx.Module):
         frequency: (middle, half range) of kappa over the sensor, per harmonic.
         fields: coefficients by harmonic; phase (cos, sin); carrier (G, z G'); Legendre degree in kappa. The ideal
             round pupil has 1 at (cos, G, degree 0) and 0 elsewhere.
+        amplitudes: of the first harmonics, Legendre coefficients over the sensor of what is added to their amplitude;
+            by harmonic, phase (cos, sin), degree in y and in x. Mostly of no harmonic: what the pupil does is enough.
         baseline: Legendre coefficients by degree in y and in x, over the sensor scaled to [-1, 1], of the logarithm
             of everything in B but the mean openings.
     """
@@ -63,6 +66,7 @@ class Wire(eqx.Module):
     harmonics: Float[Arrayish, "harmonics 2"]
     frequency: Float[Arrayish, "harmonics 2"]
     fields: Float[Arrayish, "harmonics 2 2 degrees"]
+    amplitudes: Float[Arrayish, "strongest 2 amplitude_degrees_y amplitude_degrees_x"]
     baseline: Float[Arrayish, "degrees_y degrees_x"]
 
 
@@ -141,8 +145,8 @@ def field_powers(wire: Wire, seen: Float[Arrayish, "harmonics n"], degrees: int)
     return legendre((jnp.asarray(seen) - frequency[:, :1]) / frequency[:, 1:], degrees)
 
 
-def modulation(wire: Wire, slope: Float[Arrayish, "2 n"]) -> Float[Array, " n"]:
-    """Sum of all harmonics."""
+def modulation(wire: Wire, slope: Float[Arrayish, "2 n"], scaled: Float[Arrayish, "n 2"]) -> Float[Array, " n"]:
+    """Sum of all harmonics, for rays of these slopes at sensor positions ``scaled`` to [-1, 1]."""
     seen = kappa(wire, slope)
     fields = jnp.asarray(wire.fields)
     powers = field_powers(wire, seen, fields.shape[-1])
@@ -152,7 +156,18 @@ def modulation(wire: Wire, slope: Float[Arrayish, "2 n"]) -> Float[Array, " n"]:
     for p, c in ((0, 0), (0, 1), (1, 0), (1, 1)):
         series = sum(fields[:, p, c, d, None] * powers[d] for d in range(fields.shape[-1]))
         total = total + series * carrier[c] * wave[p]
-    return jnp.sum(total, axis=0)
+    return jnp.sum(total, axis=0) + _beside_the_pupil(wire, wave, jnp.asarray(scaled))
+
+
+def _beside_the_pupil(
+    wire: Wire, wave: Float[Array, "2 harmonics n"], scaled: Float[Array, "n 2"]
+) -> Float[Array, " n"] | float:
+    """The harmonics whose amplitudes have a part that is a polynomial over the sensor: that part."""
+    strongest, _, count_y, count_x = jnp.shape(wire.amplitudes)
+    if strongest == 0:
+        return 0.0
+    in_x, in_y = legendre(scaled[:, 0], count_x), legendre(scaled[:, 1], count_y)
+    return jnp.einsum("hpyx,yn,xn,phn->n", jnp.asarray(wire.amplitudes), in_y, in_x, wave[:, :strongest])
 
 
 def log_baseline(wire: Wire, scaled: Float[Arrayish, "n 2"], slope: Float[Arrayish, "2 n"]) -> Float[Array, " n"]:
@@ -172,8 +187,8 @@ def scaled_positions(pixels: Float[Arrayish, "n 2"], rows: int, columns: int) ->
 def wire_values(wire: Wire, pixels: Float[Arrayish, "n 2"], rows: int, columns: int) -> Float[Array, " n"]:
     """The map at given pixels of a sensor of ``rows`` x ``columns``."""
     slope = slopes(wire, unproject(wire.geometry, pixels))
-    base = log_baseline(wire, scaled_positions(pixels, rows, columns), slope)
-    return jnp.exp(base) * (1 + modulation(wire, slope))
+    scaled = scaled_positions(pixels, rows, columns)
+    return jnp.exp(log_baseline(wire, scaled, slope)) * (1 + modulation(wire, slope, scaled))
 
 
 @functools.partial(jax.jit, static_argnames=("rows", "columns"))
