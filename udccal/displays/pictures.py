@@ -81,5 +81,5 @@ def _ellipse(
     fine = 2**_SUBPIXEL_BITS
     centre = (round((head.x + middle[0] * head.size) * fine), round((head.y + middle[1] * head.size) * fine))
     axes = (max(1, round(half_axes[0] * head.size * fine)), max(1, round(half_axes[1] * head.size * fine)))
-    rgb = tuple(float(v) for v in np.rint(np.clip(colour, 0, 255)))
+    rgb = tuple(float(round(min(max(value, 0.0), 255.0))) for value in colour.tolist())
     cv2.ellipse(picture, centre, axes, head.lean_deg, 0, 360, rgb, cv2.FILLED, cv2.LINE_AA, _SUBPIXEL_BITS)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import jax
 import numpy as np
 from jaxtyping import Float, UInt8
 from scipy.ndimage import gaussian_filter
@@ -62,11 +63,14 @@ def fitted_maps(calibration: Calibration, picture: UInt8[np.ndarray, "panel_rows
     )
 
 
+_panel_points_mm = jax.jit(panel_points_mm)
+
+
 def _seen_px(geometry: Geometry, rig: RigDescription) -> tuple[int, int, int, int]:
     """Panel pixels that the rays through the sensor's border cross, and the pupil's width around them."""
     x, y = rig.camera.columns - 1.0, rig.camera.rows - 1.0
     corners = np.array([[0, 0], [x / 2, 0], [x, 0], [x, y / 2], [x, y], [x / 2, y], [0, y], [0, y / 2]])
-    points = np.asarray(panel_points_mm(geometry, corners)) / rig.panel.pitch_mm.value
+    points = np.asarray(_panel_points_mm(geometry, corners)) / rig.panel.pitch_mm.value
     reach = rig.pupil_mm / rig.panel.pitch_mm.value
     low = np.clip(np.floor(points.min(axis=0) - reach), 0, [rig.panel.columns - 2, rig.panel.rows - 2])
     high = np.clip(np.ceil(points.max(axis=0) + reach), low + 1, [rig.panel.columns - 1, rig.panel.rows - 1])

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from udccal.fitting.nominal import rotation_vector
 from udccal.models.geometry import Geometry
 from udccal.sessions.schema import TermName
 from udccal.simulation.truth import RigTruth
@@ -62,6 +62,6 @@ def true_geometry(truth: RigTruth) -> Geometry:
         focal=np.array([optics.fx_px, optics.fy_px]),
         centre=np.array([optics.cx_px, optics.cy_px]),
         distortion=np.array(optics.distortion),
-        rotation=rotation_vector(optics.R_panel_camera),
+        rotation=np.asarray(Rotation.from_matrix(optics.R_panel_camera).as_rotvec(), dtype=np.float64),
         pupil=np.array(optics.pupil_mm),
     )

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import cv2
+import jax
 import numpy as np
 from jaxtyping import Float, Float32
 
@@ -30,7 +31,10 @@ class Rectification:
         return cv2.remap(picture, self.map_x, self.map_y, cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REFLECT_101)
 
 
+_sensor_places = jax.jit(view_to_sensor)
+
+
 @in_float64
 def _sensor_pixels(geometry: Geometry, view: VirtualView) -> Float[np.ndarray, "rows columns 2"]:
     x, y = np.arange(view.columns, dtype=np.float64), np.arange(view.rows, dtype=np.float64)
-    return np.asarray(view_to_sensor(geometry, view, np.stack(np.meshgrid(x, y), axis=-1)))
+    return np.asarray(_sensor_places(geometry, view, np.stack(np.meshgrid(x, y), axis=-1)))

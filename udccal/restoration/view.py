@@ -15,7 +15,7 @@ _CENTRES = 15
 _REFINEMENTS = 4
 _BISECTIONS = 24
 
-_project = jax.jit(project_directions)
+_project, _directions = jax.jit(project_directions), jax.jit(panel_directions)
 
 
 @in_float64
@@ -84,7 +84,7 @@ def _slope_range(
 ) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
     """Smallest and largest slope (x/z, y/z) against the panel's normal among the sensor's border pixels."""
     pixels = (_unit_border() + 1) / 2 * last
-    rays = np.asarray(panel_directions(geometry, pixels))
+    rays = np.asarray(_directions(geometry, pixels))
     if np.any(rays[:, 2] <= 0):
         raise RestorationError(
             "Expected every pixel to look to the front of the panel, found some that look back. "
