@@ -6,8 +6,10 @@ j - rows // 2) pixels from ``position``; the source's image is at ``position`` +
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -108,13 +110,26 @@ def captured_light(
     pixels = np.stack([offsets[:-1, :-1], offsets[:-1, 1:], offsets[1:, 1:], offsets[1:, :-1]], axis=2)
     # All points of the disc share one diffraction pattern: it moves, but does not change, over a pixel or two.
     light = np.empty((rows, columns, 3))
+    core, streaks = _close(truth, offsets)
+    pixels = np.stack([offsets[:-1, :-1], offsets[:-1, 1:], offsets[1:, 1:], offsets[1:, :-1]], axis=2)
+
+    def disc(care: _Care) -> Float[np.ndarray, "points 2"]:
+        return _disc(truth, source, source_disc_px, care.disc_points) - direction[:2]
+
+    def gather_core() -> None:
+        corners = offsets[core[0].start : core[0].stop + 1, core[1].start : core[1].stop + 1]
+        light[core] = _mean_over_disc(partial(_light_in_window, spread), corners, disc(_CORE), _CORE)
 
     def gather(care: _Care, chosen: Bool[np.ndarray, "rows columns"]) -> None:
-        disc = _disc(truth, source, source_disc_px, care.disc_points) - direction[:2]
-        light[chosen] = _mean_over_disc(spread, pixels[chosen], disc, care)
+        light[chosen] = _mean_over_disc(partial(_light_inside, spread), pixels[chosen], disc(care), care)
 
+    elsewhere = ~streaks
+    streaks[core] = elsewhere[core] = False
     with ThreadPoolExecutor(_WORKERS) as pool:
-        list(pool.map(gather, *zip(*_by_care(truth, pixels), strict=True)))
+        parts = [pool.submit(gather_core), pool.submit(gather, _STREAKS, streaks)]
+        parts.append(pool.submit(gather, _ELSEWHERE, elsewhere))
+    for part in parts:
+        part.result()
     return np.maximum(np.moveaxis(light, -1, 0), 0.0)
 
 
@@ -139,44 +154,78 @@ def _spread_over(
     return angular_spread(truth, direction, (float(reach[0]), float(reach[1])), shifts)
 
 
-def _by_care(
-    truth: RigTruth, pixels: Float[np.ndarray, "rows columns 4 2"]
-) -> tuple[tuple[_Care, Bool[np.ndarray, "rows columns"]], ...]:
-    """The pixels that need each degree of care; every pixel is in exactly one group."""
-    close = np.abs(pixels.mean(axis=2)) < _STREAK_HALF_WIDTH_PX / truth.optics.fx_px
-    core, streaks = close.all(axis=-1), close.any(axis=-1)
-    return (_CORE, core), (_STREAKS, streaks & ~core), (_ELSEWHERE, ~streaks)
+def _close(
+    truth: RigTruth, offsets: Float[np.ndarray, "corner_rows corner_columns 2"]
+) -> tuple[tuple[slice, slice], Bool[np.ndarray, "rows columns"]]:
+    """The window of pixels about the source, and the pixels on either streak through it, those in the window included.
+
+    The window is empty when the source lies outside the array.
+    """
+    middle = (offsets[:-1, :-1] + offsets[1:, 1:]) / 2
+    close = np.abs(middle) < _STREAK_HALF_WIDTH_PX / truth.optics.fx_px
+    core = close.all(axis=-1)
+    places = (np.flatnonzero(core.any(axis=axis)) for axis in (1, 0))
+    down, across = (slice(p[0], p[-1] + 1) if p.size else slice(0, 0) for p in places)
+    return (down, across), close.any(axis=-1)
 
 
 def _mean_over_disc(
-    spread: AngularSpread, pixels: Float[np.ndarray, "n 4 2"], disc: Float[np.ndarray, "points 2"], care: _Care
-) -> Float[np.ndarray, "n 3"]:
+    light_of: Callable[[np.ndarray, _Care], Float[np.ndarray, "points *pixels 3"]],
+    corners: Float[np.ndarray, "*corners 2"],
+    disc: Float[np.ndarray, "points 2"],
+    care: _Care,
+) -> Float[np.ndarray, "*pixels 3"]:
     """Light inside each pixel, averaged over the points of the source; a bounded number of both at once."""
-    total = np.zeros((len(pixels), 3))
-    block = max(1, _BLOCK // max(1, len(pixels)))
+    block = max(1, _BLOCK * 4 // max(4, corners.size // 2))
     # The points of a disc meet the steps of a staircase at different places, so that its errors average out.
     care = replace(care, step_px=care.step_px * len(disc) ** 0.5)
-    for first in range(0, len(disc), block):
-        total += _light_inside(spread, pixels - disc[first : first + block, None, None], care).sum(axis=0)
-    return total / len(disc)
+    moves = disc.reshape(-1, *np.ones(corners.ndim - 1, dtype=int), 2)
+    return np.sum(
+        [light_of(corners - moves[k : k + block], care).sum(axis=0) for k in range(0, len(disc), block)], axis=0
+    ) / len(disc)
+
+
+def _light_in_window(
+    spread: AngularSpread, corners: Float[np.ndarray, "points corner_rows corner_columns 2"], care: _Care
+) -> Float[np.ndarray, "points rows columns 3"]:
+    """Light inside every pixel of a window; an edge between two pixels is worked out once."""
+    if min(corners.shape[1:3]) < 2:
+        return np.zeros((len(corners), max(corners.shape[1] - 1, 0), max(corners.shape[2] - 1, 0), 3))
+    steps = _steps(corners[:, :-1, 1:] - corners[:, :-1, :-1], corners[:, 1:, 1:] - corners[:, :-1, 1:], care)
+    along = _light_along(spread, corners[:, :, :-1], corners[:, :, 1:], steps)
+    down = _light_along(spread, corners[:, :-1], corners[:, 1:], steps)
+    return along[:, :-1] + down[:, :, 1:] - along[:, 1:] - down[:, :, :-1]
 
 
 def _light_inside(
     spread: AngularSpread, pixels: Float[np.ndarray, "points n 4 2"], care: _Care
 ) -> Float[np.ndarray, "points n 3"]:
-    """Light inside each pixel, a quadrilateral in direction cosines, by Green's theorem along its edges.
+    """Light inside each pixel, a quadrilateral in direction cosines, by Green's theorem along its edges."""
+    if pixels.shape[1] == 0:
+        return np.zeros((*pixels.shape[:2], 3))
+    steps = _steps(pixels[:, :, 1] - pixels[:, :, 0], pixels[:, :, 2] - pixels[:, :, 1], care)
+    return _light_along(spread, pixels, np.roll(pixels, -1, axis=-2), steps).sum(axis=-2)
+
+
+def _steps(along: Float[np.ndarray, "*n 2"], down: Float[np.ndarray, "*n 2"], care: _Care) -> int:
+    """Steps of the staircases that stand for the pixels' edges along a row and down a column."""
+    along, down = (np.abs(edge).reshape(-1, 2).max(axis=0) for edge in (along, down))
+    slant = max(float(along[1] / along[0]), float(down[0] / down[1]))
+    return max(care.steps, int(np.ceil(slant / care.step_px)))
+
+
+def _light_along(
+    spread: AngularSpread, start: Float[np.ndarray, "*n 2"], end: Float[np.ndarray, "*n 2"], steps: int
+) -> Float[np.ndarray, "*n 3"]:
+    """What an edge adds to the light of the pixel that lies on its right; the pixel beyond it gets the opposite.
 
     Each edge is replaced by a staircase. Neighbours share their edges: no light is lost or counted twice.
     """
-    start, end = pixels, np.roll(pixels, -1, axis=-2)
-    light = np.zeros((*pixels.shape[:2], 3))
-    move = np.abs(end - start).max(axis=(0, 1), initial=1e-12)
-    slant = max(float(move[0, 1] / move[0, 0]), float(move[1, 0] / move[1, 1]))
-    count = max(care.steps, int(np.ceil(slant / care.step_px)))
-    for index in range(count):
-        low, high = (start + (end - start) * ((index + part) / count) for part in (0, 1))
+    light = np.zeros((*start.shape[:-1], 3))
+    for index in range(steps):
+        low, high = (start + (end - start) * ((index + part) / steps) for part in (0, 1))
         x = (low[..., 0] + high[..., 0]) / 2
-        light += (spread.below(x, high[..., 1]) - spread.below(x, low[..., 1])).sum(axis=-2)
+        light += spread.below(x, high[..., 1]) - spread.below(x, low[..., 1])
     return light
 
 
