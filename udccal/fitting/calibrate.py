@@ -104,8 +104,64 @@ class Calibration:
         return self
 
 
-def fit_session(
+@dataclass(frozen=True)
+class Foundation:
+    """The fits that psf and backscatter stand on; see ``Calibration`` for what comes with them."""
+
+    noise: FitResult[Noise]
+    geometry: FitResult[Geometry]
+    wire: FitResult[Wire]
+    times: tuple[FitTime, ...]
+    wire_map: Float[np.ndarray, "rows columns"]
+    boards: tuple[BoardView, ...]
+
+
+class _Clock:
+    """Runs fits one by one and notes how long each took."""
+
+    def __init__(self, session: Session, progress: Callable[[TermName], None]) -> None:
+        self._session, self._progress = session, progress
+        self.times: list[FitTime] = []
+
+    def run(self, term: TermName, fit: Callable[[], FitResult[Term]], otherwise: Callable[[], Term]) -> FitResult[Term]:
+        """The fit of a term, or what stands for it when the session has no steps of it."""
+        self._progress(term)
+        start = time.perf_counter()
+        result = fit() if self._session.steps(term) else _left_out(term, otherwise())
+        self.times.append(FitTime(term, time.perf_counter() - start))
+        return result
+
+
+def fit_foundation(
     session: Session, progress: Callable[[TermName], None] = lambda term: None, effort: FitEffort | None = None
+) -> Foundation:
+    """Fit noise, geometry and wire; arguments and errors as for ``fit_session``.
+
+    This needs the steps of these terms only: it can go on while the others are captured.
+    """
+    rig, effort, clock = session.rig, effort or FitEffort(), _Clock(session, progress)
+    noise = clock.run("noise", lambda: fit_noise(session), lambda: nominal_noise(rig))
+    boards: list[BoardView] = []
+
+    def geometry_of_boards() -> FitResult[Geometry]:
+        boards.extend(read_views(session, noise.term))
+        return fit_views(boards, nominal_geometry(rig), (rig.camera.columns, rig.camera.rows))
+
+    geometry = clock.run("geometry", geometry_of_boards, lambda: nominal_geometry(rig))
+    wire = clock.run(
+        "wire",
+        lambda: fit_wire(session, noise.term, geometry.term, effort.wire_samples),
+        lambda: absent_wire(rig, geometry.term),
+    )
+    wire_map = sensor_map(wire.term, rig.camera.rows, rig.camera.columns)
+    return Foundation(noise, geometry, wire, tuple(clock.times), wire_map, tuple(boards))
+
+
+def fit_session(
+    session: Session,
+    progress: Callable[[TermName], None] = lambda term: None,
+    effort: FitEffort | None = None,
+    foundation: Foundation | None = None,
 ) -> Calibration:
     """Fit every term of a session; a term without steps gets its nominal or absent form, a note and status ABSENT.
 
@@ -113,51 +169,30 @@ def fit_session(
         session: what was captured.
         progress: called with a term's name when its fit begins.
         effort: what the fits may spend.
+        foundation: what ``fit_foundation`` found in the same session, when it has been run already.
 
     Raises:
         SessionError: when a file of the session is missing or damaged.
     """
-    rig, effort = session.rig, effort or FitEffort()
-    times: list[FitTime] = []
-
-    def run(term: TermName, fit: Callable[[], FitResult[Term]], otherwise: Callable[[], Term]) -> FitResult[Term]:
-        progress(term)
-        start = time.perf_counter()
-        result = fit() if session.steps(term) else _left_out(term, otherwise())
-        times.append(FitTime(term, time.perf_counter() - start))
-        return result
-
-    noise = run("noise", lambda: fit_noise(session), lambda: nominal_noise(rig))
-    boards: list[BoardView] = []
-
-    def geometry_of_boards() -> FitResult[Geometry]:
-        boards.extend(read_views(session, noise.term))
-        return fit_views(boards, nominal_geometry(rig), (rig.camera.columns, rig.camera.rows))
-
-    geometry = run("geometry", geometry_of_boards, lambda: nominal_geometry(rig))
-    wire = run(
-        "wire",
-        lambda: fit_wire(session, noise.term, geometry.term, effort.wire_samples),
-        lambda: absent_wire(rig, geometry.term),
-    )
+    rig, effort, clock = session.rig, effort or FitEffort(), _Clock(session, progress)
+    base = foundation or fit_foundation(session, progress, effort)
+    noise, geometry = base.noise.term, base.geometry.term
     with ThreadPoolExecutor(effort.workers) as pool:
         psf = pool.submit(
-            run,
+            clock.run,
             "psf",
-            lambda: fit_psf(session, noise.term, geometry.term, wire.term, effort.psf),
-            lambda: absent_psf(rig, geometry.term),
+            lambda: fit_psf(session, noise, geometry, base.wire.term, effort.psf),
+            lambda: absent_psf(rig, geometry),
         )
-        wire_map = pool.submit(sensor_map, wire.term, rig.camera.rows, rig.camera.columns)
-        positions = effort.backscatter_positions
         backscatter = pool.submit(
-            run,
+            clock.run,
             "backscatter",
-            lambda: fit_backscatter(session, noise.term, geometry.term, wire_map.result(), positions),
-            lambda: absent_backscatter(rig, geometry.term),
+            lambda: fit_backscatter(session, noise, geometry, base.wire_map, effort.backscatter_positions),
+            lambda: absent_backscatter(rig, geometry),
         )
-    times.sort(key=lambda taken: ORDER.index(taken.term))
-    terms = (noise, geometry, wire, psf.result(), backscatter.result())
-    return Calibration(rig, *terms, tuple(times), wire_map.result(), tuple(boards))
+    terms = (base.noise, base.geometry, base.wire, psf.result(), backscatter.result())
+    late = sorted(clock.times, key=lambda taken: ORDER.index(taken.term))
+    return Calibration(rig, *terms, (*base.times, *late), base.wire_map, base.boards)
 
 
 def _left_out(name: TermName, term: Term) -> FitResult[Term]:

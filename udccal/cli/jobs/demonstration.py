@@ -16,7 +16,7 @@ from udccal.cli.jobs.fit import UNSEEN_PICTURE, run_fits, show_status, store_pro
 from udccal.cli.jobs.scene import capture_photograph
 from udccal.cli.output import Output, StageTime
 from udccal.displays.pictures import face_picture
-from udccal.fitting.calibrate import ORDER, QUICK
+from udccal.fitting.calibrate import ORDER, QUICK, fit_foundation
 from udccal.io.photograph import read_photograph
 from udccal.io.png import write_png16, write_rgb8
 from udccal.profiles.store import check_replaceable, read_profile
@@ -30,9 +30,12 @@ from udccal.restoration.runtime import Restorer
 from udccal.restoration.sinks import write_picture
 from udccal.restoration.tone import Tone, display_exposure
 from udccal.rig import load_rig
+from udccal.sessions.schema import TermName
 from udccal.sessions.store import Session
 from udccal.simulation.world import SimulatedWorld
 
+# The terms that the fits of the others stand on.
+_EARLY: tuple[TermName, ...] = ("noise", "geometry", "wire")
 # Evening light in the room, where the panel's own light counts: as bad a start as the panel gives in practice.
 _ROOM_LIGHT = 0.25
 # A coarser grid of kernels than by default: quicker to work out.
@@ -66,13 +69,15 @@ def demonstrate(output: Output, rig_name: str, out: Path, seed: int) -> None:
     check_replaceable(out / "profile")
     with output.stage("simulated rig"):
         world = simulated_rig(rig, seed)
-    capture(output, rig, world, out / "session", ORDER)
-    session = Session.open(out / "session")
     panel_picture = face_picture(UNSEEN_PICTURE, rig.panel.columns, rig.panel.rows)
+    capture(output, rig, world, out / "session", _EARLY)
     with ThreadPoolExecutor(1) as pool:
-        # Neither the true blur of the photograph nor the report's evidence has to wait for what runs beside it.
+        # The first fits, the true blur of the photograph and the report's evidence go on beside what they do not need.
+        foundation = pool.submit(fit_foundation, Session.open(out / "session"), effort=QUICK)
         pool.submit(lambda: world.light.blur)
-        calibration = run_fits(output, session, QUICK)
+        capture(output, rig, world, out / "session", [term for term in ORDER if term not in _EARLY])
+        session = Session.open(out / "session")
+        calibration = run_fits(output, session, QUICK, foundation.result())
         show_status(output, calibration)
         gathered = pool.submit(gather, session, calibration, panel_picture, world.light)
         store_profile(output, session, calibration, out / "profile")

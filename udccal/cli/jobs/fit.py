@@ -8,7 +8,7 @@ from pathlib import Path
 from udccal.cli.output import Output, StageTime
 from udccal.displays.pictures import face_picture
 from udccal.errors import FitError
-from udccal.fitting.calibrate import ORDER, Calibration, FitEffort, fit_session
+from udccal.fitting.calibrate import ORDER, Calibration, FitEffort, Foundation, fit_session
 from udccal.profiles.profile import build_profile
 from udccal.profiles.provenance import provenance_now
 from udccal.profiles.store import check_replaceable, write_profile
@@ -71,14 +71,16 @@ def fit_to_profile(output: Output, session_path: Path, profile_path: Path) -> No
     output.result(FitSummary(session_path, profile_path, report, summaries(calibration), tuple(output.times)))
 
 
-def run_fits(output: Output, session: Session, effort: FitEffort | None = None) -> Calibration:
-    """All five fits, with a bar."""
+def run_fits(
+    output: Output, session: Session, effort: FitEffort | None = None, foundation: Foundation | None = None
+) -> Calibration:
+    """All five fits, with a bar; those of ``foundation`` are done."""
     with output.stage("fits") as stage:
 
         def progress(term: TermName) -> None:
             stage.update(ORDER.index(term), len(ORDER), f"fitting {term}")
 
-        calibration = fit_session(session, progress, effort)
+        calibration = fit_session(session, progress, effort, foundation)
     for time in calibration.times:
         output.say(f"  {time.term}: {time.seconds:.1f} s")
     return calibration
