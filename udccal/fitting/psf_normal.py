@@ -185,6 +185,22 @@ def _by_local(
     return jnp.concatenate(own, axis=-1)
 
 
+@eqx.filter_jit
+def unit_light_at(
+    evaluator: Evaluator,
+    block: Block,
+    moves_px: Float[Arrayish, "moves 2"],
+    coefficients: Float[Arrayish, "rows columns 3"],
+) -> Float[Array, "moves shots n"]:
+    """``unit_light`` with all shots moved alike, for each of several moves."""
+    shots = jnp.shape(block.rate)[0]
+
+    def one(move: Float[Array, "2"]) -> Float[Array, "shots n"]:
+        return unit_light(evaluator, block, jnp.broadcast_to(move, (shots, 2)), coefficients)
+
+    return jax.lax.map(one, jnp.asarray(moves_px))
+
+
 def weighted(
     evaluator: Evaluator, block: Block, local: Local, unit: Float[Array, "shots n"]
 ) -> tuple[Float[Array, "shots n"], Float[Array, "shots n"]]:

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from udccal.fitting.psf_blocks import Block, Local
-from udccal.fitting.psf_normal import Evaluator, unit_light
+from udccal.fitting.psf_normal import Evaluator, unit_light, unit_light_at
 
 _GRID_PX = np.linspace(-1.25, 1.25, 11)
 _CORE_SAMPLES = 117
@@ -23,15 +23,12 @@ _TRUST = 0.1
 def start_local(evaluator: Evaluator, block: Block, coefficients: Float[np.ndarray, "rows columns 3"]) -> Local:
     """Start of every shot's own unknowns: place by search, light and background by least squares."""
     core = _core(block)
-    shots = np.shape(block.rate)[0]
-    best, offset = np.full(shots, np.inf), np.zeros((shots, 2))
-    for move in np.stack(np.meshgrid(_GRID_PX, _GRID_PX), axis=-1).reshape(-1, 2):
-        unit = np.asarray(unit_light(evaluator, core, np.tile(move, (shots, 1)), coefficients))
-        cost = np.array([_linear(core, unit[s], s)[1] for s in range(shots)])
-        offset[cost < best] = move
-        best = np.minimum(best, cost)
+    moves = np.stack(np.meshgrid(_GRID_PX, _GRID_PX), axis=-1).reshape(-1, 2)
+    tried = np.asarray(unit_light_at(evaluator, core, moves, coefficients))
+    shots = range(np.shape(block.rate)[0])
+    offset = np.stack([moves[np.argmin(_linear(core, tried[:, s], s)[1])] for s in shots])
     unit = np.asarray(unit_light(evaluator, block, offset, coefficients))
-    linear = np.stack([_linear(block, unit[s], s)[0] for s in range(shots)])
+    linear = np.stack([_linear(block, unit[None, s], s)[0][0] for s in shots])
     return Local(offset, linear[:, :3], linear[:, 3])
 
 
@@ -50,14 +47,19 @@ def _core(block: Block) -> Block:
     return replace(block, **fields, **pairs)
 
 
-def _linear(block: Block, unit: Float[np.ndarray, " n"], shot: int) -> tuple[Float[np.ndarray, "4"], float]:
-    """Light per colour and background of one shot, and the cost that remains."""
+def _linear(
+    block: Block, units: Float[np.ndarray, "moves n"], shot: int
+) -> tuple[Float[np.ndarray, "moves 4"], Float[np.ndarray, " moves"]]:
+    """Light per colour and background of one shot for each of several expectations, and the cost that remains."""
     rate, weight = np.asarray(block.rate)[shot], np.asarray(block.weight)[shot]
     known = weight > 0
     variance = 1.0 / np.where(known, weight, 1.0) + (_TRUST * np.maximum(rate, 0.0)) ** 2
     root = np.where(known, 1.0 / np.sqrt(variance), 0.0)
-    design = np.concatenate([unit[:, None] * np.asarray(block.colour)[shot], np.ones((unit.size, 1))], axis=1)
-    solution = np.linalg.lstsq(design * root[:, None], rate * root, rcond=1e-10)[0]
+    coloured = units[..., None] * np.asarray(block.colour)[shot]
+    design = np.concatenate([coloured, np.ones((*units.shape, 1))], axis=-1) * root[:, None]
+    size = np.maximum(np.linalg.norm(design, axis=1, keepdims=True), 1e-30)
+    inverse = np.linalg.pinv(np.einsum("mnk,mnl->mkl", design / size, design / size), rcond=1e-12, hermitian=True)
+    solution = np.einsum("mkl,mnl,n->mk", inverse, design / size, rate * root, optimize=True)
     # Without the bound a place where nothing is expected would fit a dark neighbourhood best.
-    left = np.minimum(np.abs((rate - design @ solution) * root), 10.0)
-    return solution, float((left**2).sum())
+    left = np.minimum(np.abs(rate * root - np.einsum("mnk,mk->mn", design / size, solution)), 10.0)
+    return solution / size[:, 0], (left**2).sum(axis=-1)
