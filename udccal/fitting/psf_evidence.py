@@ -9,6 +9,7 @@ from udccal.fitting.psf_diffraction import DiffractionFit, Problem, fitted_model
 from udccal.fitting.psf_normal import kernel_coefficients
 from udccal.fitting.psf_select import Selection
 from udccal.fitting.psf_shots import Shots
+from udccal.fitting.psf_start import HELD
 from udccal.fitting.result import Diagnostic, Estimate, FitResult, FitStatus
 from udccal.models.diffraction import Diffraction
 from udccal.models.geometry import Geometry
@@ -85,6 +86,8 @@ def _estimates(
     if not selection.share:
         return (kernel,), np.array([[kernel.sigma**2]])
     cov = fit.cov[: len(_NAMES), : len(_NAMES)] * scale
+    # The pitch was held, so that the spectra could move; it may be off by what the rig's description allows.
+    cov[0, 0] += 1.0 / (HELD * problem.prior.root[0, 0]) ** 2
     sigma = np.sqrt(np.diag(cov))
     numbers = tuple(
         Estimate(name, float(value), float(s), unit)

@@ -17,7 +17,7 @@ _PEAKS_NM, _WIDTH_NM = (600.0, 535.0, 460.0), 45.0
 _BEND, _FREEDOM = 1.0, 5.0
 _BLUR_PX = 0.1
 # Of the rig's tolerances: what is left of them after the wire's fit, and for what is held.
-_MEASURED, _HELD = 0.3, 0.05
+_MEASURED, HELD = 0.3, 0.05
 _PLACE_PERIODS = 0.05
 
 
@@ -57,7 +57,7 @@ def start_prior(rig: RigDescription, model: Diffraction, measured: bool) -> Prio
     panel, theta = rig.panel, pack(model)
     tighter = _MEASURED if measured else 1.0
     sigma = [
-        _HELD * panel.pitch_mm.tolerance,
+        HELD * panel.pitch_mm.tolerance,
         tighter * panel.column_open_fraction.tolerance,
         tighter * panel.row_open_fraction.tolerance,
         tighter * panel.structure_thickness_mm.tolerance,
