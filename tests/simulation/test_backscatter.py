@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from tests.simulation.toy import toy_truth
+from udccal.errors import UdccalError
 from udccal.simulation import backscatter
 from udccal.simulation.backscatter import Backscatterer, backscatter_rate, backscatterer, fresnel_reflectance
 from udccal.simulation.emission import EMITTER_COLUMN_OFFSETS, EMITTER_ROW_OFFSET, emitter_shares
@@ -30,6 +31,11 @@ def turned_grid(samples: int) -> np.ndarray:
 
 def test_dark_panel_sends_nothing(scatter: Backscatterer) -> None:
     assert not scatter.rate(picture(0)).any()
+
+
+def test_a_picture_of_another_size_is_refused(scatter: Backscatterer) -> None:
+    with pytest.raises(UdccalError, match=r"Expected a picture of the panel's .* found 20 x 10"):
+        scatter.rate(np.zeros((10, 20, 3), np.uint8))
 
 
 def test_follows_the_transfer_curve(scatter: Backscatterer) -> None:

@@ -15,6 +15,7 @@ from scipy import sparse
 from scipy.interpolate import RectBivariateSpline
 
 from udccal.cfa import cell_channels
+from udccal.errors import UdccalError
 from udccal.simulation.emission import emitter_shares
 from udccal.simulation.truth import RigTruth, pixels_to_directions
 
@@ -33,7 +34,17 @@ class Backscatterer:
     shares: tuple[sparse.csr_array, ...]
 
     def rate(self, picture: UInt8[np.ndarray, "panel_rows panel_columns 3"]) -> Float[np.ndarray, "rows columns"]:
-        """Mosaic of backscatter in e-/s while the panel shows ``picture``, before multiplication by the wire."""
+        """Mosaic of backscatter in e-/s while the panel shows ``picture``, before multiplication by the wire.
+
+        Raises:
+            UdccalError: when the picture is not of the panel's size.
+        """
+        panel = self.truth.description.panel
+        if picture.shape[:2] != (panel.rows, panel.columns):
+            raise UdccalError(
+                f"Expected a picture of the panel's {panel.columns} x {panel.rows} pixels, found "
+                f"{picture.shape[1]} x {picture.shape[0]}. Resize it to the panel."
+            )
         light = panel_light(self.truth, picture)
         primaries = [share @ light[:, i] for i, share in enumerate(self.shares)]
         mixed = self.truth.panel.primaries @ np.stack(primaries)
