@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 
 from udccal.arrangements import Board, BoardSpec
 from udccal.rig import RigDescription
@@ -24,8 +25,8 @@ def low_discrepancy(count: int, dimensions: int = 2) -> Float[np.ndarray, "count
 def nominal_rotation(rig: RigDescription) -> Float[np.ndarray, "3 3"]:
     """Nominal R_panel_camera = Ry(yaw) Rx(-tilt) Rz(roll)."""
     mounting = rig.mounting
-    yaw, tilt, roll = (np.deg2rad(item.value) for item in (mounting.yaw_deg, mounting.tilt_deg, mounting.roll_deg))
-    return _turn(1, yaw) @ _turn(0, -tilt) @ _turn(2, roll)
+    angles_deg = [mounting.yaw_deg.value, -mounting.tilt_deg.value, mounting.roll_deg.value]
+    return np.asarray(Rotation.from_euler("YXZ", angles_deg, degrees=True).as_matrix(), dtype=np.float64)
 
 
 def nominal_pupil_mm(rig: RigDescription) -> Float[np.ndarray, "3"]:
@@ -57,7 +58,7 @@ def board_facing(
     lean_rad: tuple[float, float, float],
 ) -> Board:
     """A board whose centre is seen at ``pixel``, leaning by rotations about x, y, then z from facing the camera."""
-    lean = _turn(2, lean_rad[2]) @ _turn(1, lean_rad[1]) @ _turn(0, lean_rad[0])
+    lean = Rotation.from_euler("xyz", lean_rad).as_matrix()
     return _placed(rig, spec, pixel, distance_mm, nominal_rotation(rig) @ lean, parallel=False)
 
 
@@ -78,7 +79,8 @@ def _placed(
     centre = nominal_pupil_mm(rig) + distance_mm * nominal_ray(rig, *pixel)
     half = np.array([spec.columns, spec.rows, 0.0]) * spec.square_mm / 2
     x, y, z = (float(value) for value in centre - rotation @ half)
-    return Board(spec, _rotation_vector(rotation), (x, y, z), parallel_to_panel=parallel)
+    along_x, along_y, along_z = (float(value) for value in Rotation.from_matrix(rotation).as_rotvec())
+    return Board(spec, (along_x, along_y, along_z), (x, y, z), parallel_to_panel=parallel)
 
 
 def _generalised_golden_ratio(dimensions: int) -> float:
@@ -86,24 +88,3 @@ def _generalised_golden_ratio(dimensions: int) -> float:
     for _ in range(60):
         ratio = (1 + ratio) ** (1 / (dimensions + 1))
     return ratio
-
-
-def _turn(axis: int, angle_rad: float) -> Float[np.ndarray, "3 3"]:
-    """Right-handed rotation about a coordinate axis."""
-    cosine, sine = np.cos(angle_rad), np.sin(angle_rad)
-    i, j = (axis + 1) % 3, (axis + 2) % 3
-    matrix = np.eye(3)
-    matrix[i, i] = matrix[j, j] = cosine
-    matrix[i, j], matrix[j, i] = -sine, sine
-    return matrix
-
-
-def _rotation_vector(rotation: Float[np.ndarray, "3 3"]) -> tuple[float, float, float]:
-    """Axis times angle in rad, for angles below 180 degrees."""
-    twice = np.array(
-        [rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]]
-    )
-    sine, cosine = np.linalg.norm(twice) / 2, (np.trace(rotation) - 1) / 2
-    angle = np.arctan2(sine, cosine)
-    x, y, z = (float(value) for value in (twice / 2 if sine < 1e-12 else twice / (2 * sine) * angle))
-    return x, y, z

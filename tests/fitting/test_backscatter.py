@@ -6,6 +6,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from tests.simulation.toy import toy_rig, toy_truth
 from udccal.cameras.protocol import CameraIdentity, Region, Settings
@@ -14,7 +15,7 @@ from udccal.displays.pictures import face_picture
 from udccal.fitting.backscatter import fit_backscatter, fit_shots
 from udccal.fitting.backscatter_data import Binned, PanelShots, bin_rate, grid_step, visible_crop
 from udccal.fitting.noise import nominal_noise
-from udccal.fitting.nominal import nominal_geometry, rotation_vector
+from udccal.fitting.nominal import nominal_geometry
 from udccal.fitting.result import FitResult, FitStatus
 from udccal.models.backscatter import Backscatter, backscatter_rate
 from udccal.models.geometry import Geometry
@@ -53,7 +54,7 @@ def known_geometry() -> Geometry:
         focal=np.array([optics.fx_px, optics.fy_px]),
         centre=np.array([optics.cx_px, optics.cy_px]),
         distortion=np.array(optics.distortion),
-        rotation=rotation_vector(optics.R_panel_camera),
+        rotation=Rotation.from_matrix(optics.R_panel_camera).as_rotvec(),
         pupil=nominal_geometry(RIG).pupil,
     )
 

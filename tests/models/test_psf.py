@@ -8,6 +8,7 @@ from dataclasses import replace
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from udccal.models.diffraction import Diffraction, disc_autocorrelation, local_frame, slit_coefficient
 from udccal.models.fields import polynomial_basis, polynomial_terms
@@ -28,12 +29,6 @@ def as_numpy(function: Callable[..., object]) -> Callable[..., np.ndarray]:
     return in_float64(lambda *args: np.asarray(function(*args)))
 
 
-def rotation_vector(matrix: np.ndarray) -> np.ndarray:
-    angle = np.arccos((np.trace(matrix) - 1) / 2)
-    axis = np.array([matrix[2, 1] - matrix[1, 2], matrix[0, 2] - matrix[2, 0], matrix[1, 0] - matrix[0, 1]])
-    return axis * angle / (2 * np.sin(angle))
-
-
 def true_field(truth: RigTruth) -> PsfField:
     """The model with the simulator's own numbers."""
     optics, panel, spectrum = truth.optics, truth.panel, camera_spectrum(truth)
@@ -41,7 +36,7 @@ def true_field(truth: RigTruth) -> PsfField:
         focal=np.array([optics.fx_px, optics.fy_px]),
         centre=np.array([optics.cx_px, optics.cy_px]),
         distortion=np.array(optics.distortion),
-        rotation=rotation_vector(optics.R_panel_camera),
+        rotation=Rotation.from_matrix(optics.R_panel_camera).as_rotvec(),
         pupil=optics.pupil_mm,
     )
     diffraction = Diffraction(
