@@ -6,13 +6,11 @@ j - rows // 2) pixels from ``position``; the source's image is at ``position`` +
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from udccal.errors import UdccalError
 from udccal.simulation.rays import cosine_grid
@@ -37,7 +35,8 @@ class _Care:
 # Nearly all light falls close to the source, most of the rest on two thin streaks across it.
 _CORE, _STREAKS, _ELSEWHERE = _Care(192, 4, 0.03), _Care(16, 2, 0.06), _Care(1, 1, 0.2)
 _STREAK_HALF_WIDTH_PX = 6.0
-_BLOCK = 20_000
+# Corners times points of the source at once: their numbers stay in a processor's cache.
+_BLOCK = 8_000
 _WORKERS = 2
 # Sources no farther apart than this share one diffraction pattern.
 SHARED_PX = 4.0
@@ -107,29 +106,18 @@ def captured_light(
     )
     offsets = corners - direction[:2]
     spread = spread or _spread_over(truth, direction, offsets, shifts)
-    pixels = np.stack([offsets[:-1, :-1], offsets[:-1, 1:], offsets[1:, 1:], offsets[1:, :-1]], axis=2)
-    # All points of the disc share one diffraction pattern: it moves, but does not change, over a pixel or two.
     light = np.empty((rows, columns, 3))
-    core, streaks = _close(truth, offsets)
-    pixels = np.stack([offsets[:-1, :-1], offsets[:-1, 1:], offsets[1:, 1:], offsets[1:, :-1]], axis=2)
-
-    def disc(care: _Care) -> Float[np.ndarray, "points 2"]:
-        return _disc(truth, source, source_disc_px, care.disc_points) - direction[:2]
-
-    def gather_core() -> None:
-        corners = offsets[core[0].start : core[0].stop + 1, core[1].start : core[1].stop + 1]
-        light[core] = _mean_over_disc(partial(_light_in_window, spread), corners, disc(_CORE), _CORE)
-
-    def gather(care: _Care, chosen: Bool[np.ndarray, "rows columns"]) -> None:
-        light[chosen] = _mean_over_disc(partial(_light_inside, spread), pixels[chosen], disc(care), care)
-
-    elsewhere = ~streaks
-    streaks[core] = elsewhere[core] = False
-    with ThreadPoolExecutor(_WORKERS) as pool:
-        parts = [pool.submit(gather_core), pool.submit(gather, _STREAKS, streaks)]
-        parts.append(pool.submit(gather, _ELSEWHERE, elsewhere))
-    for part in parts:
-        part.result()
+    down, across = _near(truth, offsets)
+    everything = slice(None)
+    for window, care in (
+        ((everything, everything), _ELSEWHERE),
+        ((down, everything), _STREAKS),
+        ((everything, across), _STREAKS),
+        ((down, across), _CORE),
+    ):
+        # All points of the disc share one diffraction pattern: it moves, but does not change, over a pixel or two.
+        disc = _disc(truth, source, source_disc_px, care.disc_points) - direction[:2]
+        light[window] = _mean_over_disc(spread, offsets[_corners(window)], disc, care)
     return np.maximum(np.moveaxis(light, -1, 0), 0.0)
 
 
@@ -154,57 +142,50 @@ def _spread_over(
     return angular_spread(truth, direction, (float(reach[0]), float(reach[1])), shifts)
 
 
-def _close(
-    truth: RigTruth, offsets: Float[np.ndarray, "corner_rows corner_columns 2"]
-) -> tuple[tuple[slice, slice], Bool[np.ndarray, "rows columns"]]:
-    """The window of pixels about the source, and the pixels on either streak through it, those in the window included.
+def _near(truth: RigTruth, offsets: Float[np.ndarray, "corner_rows corner_columns 2"]) -> tuple[slice, slice]:
+    """The rows and the columns that hold the two streaks through the source, bent as they are; none far from it."""
+    close = np.abs((offsets[:-1, :-1] + offsets[1:, 1:]) / 2) < _STREAK_HALF_WIDTH_PX / truth.optics.fx_px
+    down, across = (np.flatnonzero(close[..., axis].any(axis=axis)) for axis in (1, 0))
+    return (
+        slice(down[0], down[-1] + 1) if down.size else slice(0, 0),
+        slice(across[0], across[-1] + 1) if across.size else slice(0, 0),
+    )
 
-    The window is empty when the source lies outside the array.
-    """
-    middle = (offsets[:-1, :-1] + offsets[1:, 1:]) / 2
-    close = np.abs(middle) < _STREAK_HALF_WIDTH_PX / truth.optics.fx_px
-    core = close.all(axis=-1)
-    places = (np.flatnonzero(core.any(axis=axis)) for axis in (1, 0))
-    down, across = (slice(p[0], p[-1] + 1) if p.size else slice(0, 0) for p in places)
-    return (down, across), close.any(axis=-1)
+
+def _corners(window: tuple[slice, slice]) -> tuple[slice, slice]:
+    """The corners of a window's pixels."""
+    down, across = (part if part.stop is None else slice(part.start, part.stop + 1) for part in window)
+    return down, across
 
 
 def _mean_over_disc(
-    light_of: Callable[[np.ndarray, _Care], Float[np.ndarray, "points *pixels 3"]],
-    corners: Float[np.ndarray, "*corners 2"],
+    spread: AngularSpread,
+    corners: Float[np.ndarray, "corner_rows corner_columns 2"],
     disc: Float[np.ndarray, "points 2"],
     care: _Care,
-) -> Float[np.ndarray, "*pixels 3"]:
-    """Light inside each pixel, averaged over the points of the source; a bounded number of both at once."""
-    block = max(1, _BLOCK * 4 // max(4, corners.size // 2))
+) -> Float[np.ndarray, "rows columns 3"]:
+    """Light inside each pixel of a window, averaged over the points of the source, a bounded number at once."""
+    block = max(1, _BLOCK // corners[..., 0].size)
     # The points of a disc meet the steps of a staircase at different places, so that its errors average out.
     care = replace(care, step_px=care.step_px * len(disc) ** 0.5)
-    moves = disc.reshape(-1, *np.ones(corners.ndim - 1, dtype=int), 2)
-    return np.sum(
-        [light_of(corners - moves[k : k + block], care).sum(axis=0) for k in range(0, len(disc), block)], axis=0
-    ) / len(disc)
+    blocks = [corners - disc[k : k + block, None, None] for k in range(0, len(disc), block)]
+    with ThreadPoolExecutor(_WORKERS) as pool:
+        return sum(pool.map(lambda moved: _light_in_window(spread, moved, care).sum(axis=0), blocks)) / len(disc)
 
 
 def _light_in_window(
     spread: AngularSpread, corners: Float[np.ndarray, "points corner_rows corner_columns 2"], care: _Care
 ) -> Float[np.ndarray, "points rows columns 3"]:
-    """Light inside every pixel of a window; an edge between two pixels is worked out once."""
+    """Light inside every pixel of a window, a quadrilateral in direction cosines, by Green's theorem along its edges.
+
+    An edge between two pixels is worked out once.
+    """
     if min(corners.shape[1:3]) < 2:
         return np.zeros((len(corners), max(corners.shape[1] - 1, 0), max(corners.shape[2] - 1, 0), 3))
     steps = _steps(corners[:, :-1, 1:] - corners[:, :-1, :-1], corners[:, 1:, 1:] - corners[:, :-1, 1:], care)
     along = _light_along(spread, corners[:, :, :-1], corners[:, :, 1:], steps)
     down = _light_along(spread, corners[:, :-1], corners[:, 1:], steps)
     return along[:, :-1] + down[:, :, 1:] - along[:, 1:] - down[:, :, :-1]
-
-
-def _light_inside(
-    spread: AngularSpread, pixels: Float[np.ndarray, "points n 4 2"], care: _Care
-) -> Float[np.ndarray, "points n 3"]:
-    """Light inside each pixel, a quadrilateral in direction cosines, by Green's theorem along its edges."""
-    if pixels.shape[1] == 0:
-        return np.zeros((*pixels.shape[:2], 3))
-    steps = _steps(pixels[:, :, 1] - pixels[:, :, 0], pixels[:, :, 2] - pixels[:, :, 1], care)
-    return _light_along(spread, pixels, np.roll(pixels, -1, axis=-2), steps).sum(axis=-2)
 
 
 def _steps(along: Float[np.ndarray, "*n 2"], down: Float[np.ndarray, "*n 2"], care: _Care) -> int:
