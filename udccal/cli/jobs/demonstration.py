@@ -70,11 +70,12 @@ def demonstrate(output: Output, rig_name: str, out: Path, seed: int) -> None:
     with output.stage("simulated rig"):
         world = simulated_rig(rig, seed)
     panel_picture = face_picture(UNSEEN_PICTURE, rig.panel.columns, rig.panel.rows)
-    capture(output, rig, world, out / "session", _EARLY)
     with ThreadPoolExecutor(1) as pool:
-        # The first fits, the true blur of the photograph and the report's evidence go on beside what they do not need.
+        # Beside the captures: first what only the simulated world needs, then the fits of what has been captured, at
+        # last the evidence of the report.
+        pool.submit(lambda: (world.light.blur, world.light.backscatterer))
+        capture(output, rig, world, out / "session", _EARLY)
         foundation = pool.submit(fit_foundation, Session.open(out / "session"), effort=QUICK)
-        pool.submit(lambda: world.light.blur)
         capture(output, rig, world, out / "session", [term for term in ORDER if term not in _EARLY])
         session = Session.open(out / "session")
         calibration = run_fits(output, session, QUICK, foundation.result())
