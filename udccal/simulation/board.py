@@ -27,14 +27,16 @@ def render_board_radiance(
     rotation, _ = cv2.Rodrigues(np.asarray(board.rotation_vector))
     x, y = (np.arange(-m, n + m, dtype=float) for m, n in ((margin[1], camera.columns), (margin[0], camera.rows)))
     origin = rotation.T @ (truth.optics.pupil_mm - np.asarray(board.translation_mm))
+    # Takes slopes (s_x, s_y, 1) to a ray's depth along the board's normal, and to its texel times that depth.
+    depth = rotation[:, 2]
+    texels = texels_per_mm * (np.outer(origin[:2], depth) - origin[2] * rotation[:, :2].T) - 0.5 * depth
+    projection = np.vstack([texels, depth])
 
-    def one_sample(dx: float, dy: float) -> Float[np.ndarray, "rows columns 3"]:
-        slopes = slope_grid(truth, x + dx, y + dy)
-        rays = np.concatenate([slopes, np.ones_like(slopes[..., :1])], axis=-1) @ rotation
+    def one_sample(dx: float, dy: float) -> Float[np.ndarray, "rows columns"]:
+        rays = cv2.transform(slope_grid(truth, x + dx, y + dy), projection)
         # The face is seen by rays that run into the board; all others meet the surroundings.
-        ahead = np.maximum(rays[..., 2:], 1e-9)
-        points = origin[:2] - origin[2] * rays[..., :2] / ahead
-        texel = np.clip(points * texels_per_mm - 0.5, -10.0, max(texture.shape) + 10.0).astype(np.float32)
+        texel = (rays[..., :2] / np.maximum(rays[..., 2:], 1e-9)).astype(np.float32)
+        np.clip(texel, -10.0, max(texture.shape) + 10.0, out=texel)
         grey = cv2.remap(
             texture,
             texel[..., 0],
@@ -43,9 +45,9 @@ def render_board_radiance(
             borderMode=cv2.BORDER_CONSTANT,
             borderValue=(_SURROUND,),
         )
-        return np.repeat(grey[..., None].astype(np.float64), 3, axis=-1)
+        return grey.astype(np.float64)
 
-    return supersample(one_sample)
+    return np.repeat(supersample(one_sample)[..., None], 3, axis=-1)
 
 
 def board_corners_mm(spec: BoardSpec) -> Float[np.ndarray, "corners 3"]:

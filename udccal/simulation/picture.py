@@ -48,8 +48,8 @@ def place_picture(
 
 
 def supersample(
-    render: Callable[[float, float], Float[np.ndarray, "rows columns 3"]],
-) -> Float[np.ndarray, "rows columns 3"]:
+    render: Callable[[float, float], Float[np.ndarray, "rows columns *colours"]],
+) -> Float[np.ndarray, "rows columns *colours"]:
     """Mean of ``render(dx, dy)`` over sample points (dx, dy) spread evenly over a pixel."""
     offsets = (np.arange(SUPERSAMPLING) + 0.5) / SUPERSAMPLING - 0.5
     total = render(float(offsets[0]), float(offsets[0]))
