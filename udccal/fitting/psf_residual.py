@@ -1,12 +1,15 @@
-"""The part of the kernel that diffraction does not explain: an image whose pixels are polynomials of the position.
+"""The part of the kernel that diffraction does not explain: an image whose nodes are polynomials of the position.
 
 All shots of all positions are solved together on Bayer sites: ridge regression by conjugate gradients, never forming
 the matrix. A shot's expectation is the image at its position, moved by a fraction of a pixel and smeared by the LED's
 disc; both are one small stencil per shot.
+
+Beside diffraction one node to a pixel is enough; see ``psf_free`` for an image that carries the whole kernel.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import equinox as eqx
@@ -20,11 +23,10 @@ from udccal.fitting.psf_shots import Shots
 from udccal.models.arrays import Arrayish
 from udccal.models.fields import polynomial_basis
 
-_STENCIL = 9
-_REACH = _STENCIL // 2
-_ITERATIONS = 60
-_TOLERANCE = 1e-4
-_PEAK_ERROR = 0.03
+# Nodes to a pixel of an image that carries the whole kernel, and how far it is smooth, in nodes.
+FREE_PER_PX, _FREE_SMOOTH = 2, 1.0
+_LANCZOS, _FARTHEST_PX = 3, 2
+_ITERATIONS = 150
 
 
 class Windows(eqx.Module):
@@ -32,12 +34,13 @@ class Windows(eqx.Module):
 
     Attributes:
         basis: polynomials at each shot's position.
-        stencil: shift and disc.
+        stencil: shift and disc, in nodes.
         flux: light of each sample's own colour, 0 where nothing is known.
         colour: one-hot.
         explained: per unit of light, what diffraction brings to each sample.
         rate: e-/s without background.
         weight: inverse variance of the rate.
+        per_px: nodes of the image to a pixel; its first and last nodes lie on the first and last pixels.
     """
 
     basis: Float[Arrayish, "shots terms"]
@@ -47,6 +50,7 @@ class Windows(eqx.Module):
     explained: Float[Arrayish, "shots rows columns"]
     rate: Float[Arrayish, "shots rows columns"]
     weight: Float[Arrayish, "shots rows columns"]
+    per_px: int = eqx.field(static=True)
 
 
 @dataclass(frozen=True)
@@ -79,12 +83,14 @@ def make_windows(
     unit: Float[np.ndarray, "shots 2"],
     degree: int,
     model_error: float,
+    per_px: int = 1,
 ) -> Windows:
     """Cut windows of ``half`` (rows, columns) to either side; ``explained`` covers these already.
 
     Args:
         unit: positions scaled to about [-1, 1].
         model_error: relative error of the peak that is allowed for, beside the noise of the data.
+        per_px: nodes of the image to a pixel.
     """
     rows, columns = shots.rate.shape[1:]
     cut = np.s_[:, rows // 2 - half[0] : rows // 2 + half[0] + 1, columns // 2 - half[1] : columns // 2 + half[1] + 1]
@@ -98,43 +104,49 @@ def make_windows(
     variance = 1.0 / np.where(known, shots.weight[cut], 1.0) + (model_error * smooth**0.75 * peak**0.25) ** 2
     return Windows(
         basis=np.asarray(polynomial_basis(unit, degree)),
-        stencil=stencils(sources.place_px - shots.origin_px, shots.disc_px),
+        stencil=stencils(sources.place_px - shots.origin_px, shots.disc_px, per_px),
         flux=flux * known,
         colour=colour,
         explained=explained,
         rate=rate * known,
         weight=np.where(known, 1.0 / variance, 0.0),
+        per_px=per_px,
     )
 
 
 def stencils(
-    offset_px: Float[np.ndarray, "shots 2"], disc_px: Float[np.ndarray, " shots"]
+    offset_px: Float[np.ndarray, "shots 2"], disc_px: Float[np.ndarray, " shots"], per_px: int = 1
 ) -> Float[np.ndarray, "shots size size"]:
-    """Weights that move an image by (x, y) and average it over a disc, by Lanczos's interpolation over six samples."""
+    """Weights that move an image by (x, y) and average it over a disc, by Lanczos's interpolation over six nodes."""
     index = np.arange(64)
     radius, angle = np.sqrt((index + 0.5) / 64) / 2, index * np.pi * (3 - np.sqrt(5))
     disc = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=-1)
-    points = offset_px[:, None] + disc * disc_px[:, None, None]
-    node = np.arange(-_REACH, _REACH + 1)
+    points = per_px * (offset_px[:, None] + disc * disc_px[:, None, None])
+    reach = per_px * _FARTHEST_PX + _LANCZOS - 1
+    node = np.arange(-reach, reach + 1)
     along_x, along_y = (_lanczos(points[..., i, None] - node) for i in (0, 1))
     return np.einsum("spy,spx->syx", along_y, along_x) / len(index)
 
 
 def _lanczos(distance: Float[np.ndarray, "*n taps"]) -> Float[np.ndarray, "*n taps"]:
-    weight = np.where(np.abs(distance) < 3, np.sinc(distance) * np.sinc(distance / 3), 0.0)
+    inside = np.abs(distance) < _LANCZOS
+    weight = np.where(inside, np.sinc(distance) * np.sinc(distance / _LANCZOS), 0.0)
     return weight / weight.sum(axis=-1, keepdims=True)
 
 
 @eqx.filter_jit
-def predict(windows: Windows, image: Float[Array, "terms 3 rows columns"]) -> Float[Array, "shots rows columns"]:
+def predict(
+    windows: Windows, image: Float[Array, "terms 3 node_rows node_columns"]
+) -> Float[Array, "shots rows columns"]:
     """What the residual image brings to each sample per unit of light."""
+    reach, stride = jnp.shape(windows.stencil)[-1] // 2, (windows.per_px, windows.per_px)
 
     def one(shot: tuple[Array, Array, Array]) -> Float[Array, "rows columns"]:
         basis, stencil, colour = shot
         here = jnp.einsum("t,tcyx->cyx", basis, image)
         # A stencil moves towards +x where its weight lies at +x: this is convolution, so it is turned round.
         moved = jax.lax.conv_general_dilated(
-            here[:, None], stencil[None, None, ::-1, ::-1], (1, 1), [(_REACH, _REACH)] * 2
+            here[:, None], stencil[None, None, ::-1, ::-1], stride, [(reach, reach)] * 2
         )[:, 0]
         return jnp.einsum("cyx,yxc->yx", moved, colour)
 
@@ -143,72 +155,54 @@ def predict(windows: Windows, image: Float[Array, "terms 3 rows columns"]) -> Fl
 
 @eqx.filter_jit
 def solve_residual(
-    windows: Windows, share: Float[Arrayish, ""], spread: Float[Arrayish, "terms 3 rows columns"]
-) -> Float[Array, "terms 3 rows columns"]:
+    windows: Windows, share: Float[Arrayish, ""], spread: Float[Arrayish, "terms 3 node_rows node_columns"]
+) -> Float[Array, "terms 3 node_rows node_columns"]:
     """Ridge estimate of the image with prior standard deviations ``spread``, ``share`` of diffraction being kept."""
     spread, flux, weight = jnp.asarray(spread), jnp.asarray(windows.flux), jnp.asarray(windows.weight)
     missing = jnp.asarray(windows.rate) - flux * share * jnp.asarray(windows.explained)
 
-    def forward(scaled: Float[Array, "terms 3 rows columns"]) -> Float[Array, "shots rows columns"]:
+    def forward(scaled: Float[Array, "terms 3 node_rows node_columns"]) -> Float[Array, "shots rows columns"]:
         return flux * predict(windows, scaled * spread)
 
-    backward = jax.linear_transpose(forward, jax.ShapeDtypeStruct(spread.shape, spread.dtype))
-
-    def normal(scaled: Float[Array, "terms 3 rows columns"]) -> Float[Array, "terms 3 rows columns"]:
-        return scaled + backward(weight * forward(scaled))[0]
-
-    right = backward(weight * missing)[0]
-    solution, _ = jax.scipy.sparse.linalg.cg(normal, right, tol=_TOLERANCE, maxiter=_ITERATIONS)
-    return solution * spread
+    return ridge(forward, lambda light: weight * light, missing, spread) * spread
 
 
-def refine_sources(
-    shots: Shots, sources: Sources, windows: Windows, image: Float[np.ndarray, "terms 3 rows columns"]
-) -> Sources:
-    """One Gauss-Newton step of places and light of every shot for a given image (diffraction left out).
+def ridge(
+    forward: Callable[[Array], Array],
+    weigh: Callable[[Array], Array],
+    data: Float[Array, "shots rows columns"],
+    like: Float[Array, "terms 3 node_rows node_columns"],
+    iterations: int = 60,
+    tolerance: float = 1e-4,
+) -> Float[Array, "terms 3 node_rows node_columns"]:
+    """The image of unit prior that explains ``data`` best, by conjugate gradients on the normal equations.
 
-    Samples weigh nearly alike: an image that does not yet follow the field is right about the peak, not the wings.
+    Args:
+        forward: linear, from an image to light. weigh: the data's inverse covariance.
+        data: light. like: an array of the image's shape.
+        iterations: at most. tolerance: relative residual at which they end.
     """
-    step = 0.05
-    offset = sources.place_px - shots.origin_px
+    backward = jax.linear_transpose(forward, jax.ShapeDtypeStruct(like.shape, like.dtype))
 
-    def at(move: tuple[float, float]) -> Float[np.ndarray, "shots rows columns"]:
-        moved = stencils(offset + np.asarray(move), shots.disc_px)
-        return np.asarray(predict(replace_stencil(windows, moved), jnp.asarray(image)))
+    def normal(image: Array) -> Array:
+        return image + backward(weigh(forward(image)))[0]
 
-    here = at((0.0, 0.0))
-    slopes = [(at((step, 0.0)) - at((-step, 0.0))) / (2 * step), (at((0.0, step)) - at((0.0, -step))) / (2 * step)]
-    place, flux = sources.place_px.copy(), sources.flux.copy()
-    for s in range(shots.count):
-        weight = np.asarray(windows.weight)[s]
-        even = (_PEAK_ERROR * np.asarray(windows.rate)[s].max()) ** 2
-        root = np.sqrt(np.where(weight > 0, 1.0 / (1.0 / np.where(weight > 0, weight, 1.0) + even), 0.0))
-        own, colour = np.asarray(windows.flux)[s], np.asarray(windows.colour)[s]
-        columns = [own * slope[s] for slope in slopes] + [own * here[s] * colour[..., c] for c in range(3)]
-        design = np.stack([(column * root).ravel() for column in columns], axis=1)
-        target = ((np.asarray(windows.rate)[s] - own * here[s]) * root).ravel()
-        move = np.linalg.lstsq(design, target, rcond=1e-8)[0]
-        place[s] += np.clip(move[:2], -0.5, 0.5)
-        flux[s] *= 1.0 + np.clip(move[2:], -0.5, 0.5)
-    return Sources(place, flux, sources.background)
-
-
-def replace_stencil(windows: Windows, stencil: Float[np.ndarray, "shots size size"]) -> Windows:
-    """The same windows with LEDs elsewhere."""
-    return replace(windows, stencil=stencil)
+    right = backward(weigh(data))[0]
+    return jax.scipy.sparse.linalg.cg(normal, right, tol=tolerance, maxiter=iterations)[0]
 
 
 def prior_spread(
-    magnitude: Float[np.ndarray, "3 rows columns"], degree_terms: int, relative: float
-) -> Float[np.ndarray, "terms 3 rows columns"]:
-    """Prior standard deviation of every coefficient: a fraction of the kernel's own size near that pixel."""
+    magnitude: Float[np.ndarray, "3 rows columns"], degree_terms: int, relative: float, per_px: int = 1
+) -> Float[np.ndarray, "terms 3 node_rows node_columns"]:
+    """Prior standard deviation of every coefficient: a fraction of the kernel's own size near that node."""
     near = scipy.ndimage.maximum_filter(scipy.ndimage.gaussian_filter(np.abs(magnitude), (0, 0.7, 0.7)), (1, 3, 3))
-    floor = 1e-5 * near.max(axis=(1, 2), keepdims=True)
-    return np.tile((relative * (near + floor))[None], (degree_terms, 1, 1, 1))
+    near = near + 1e-5 * near.max(axis=(1, 2), keepdims=True)
+    nodes = [1.0, *((per_px * (size - 1) + 1) / size for size in near.shape[1:])]
+    return np.tile(relative * scipy.ndimage.zoom(near, nodes, order=1)[None], (degree_terms, 1, 1, 1))
 
 
 def mismatch(
-    windows: Windows, share: float, image: Float[np.ndarray, "terms 3 rows columns"]
+    windows: Windows, share: float, image: Float[np.ndarray, "terms 3 node_rows node_columns"]
 ) -> Float[np.ndarray, "3"]:
     """Relative L2 error per colour of the expectation, with what the data's own noise adds taken out."""
     unit = share * np.asarray(windows.explained) + np.asarray(predict(windows, jnp.asarray(image)))

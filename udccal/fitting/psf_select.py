@@ -6,15 +6,15 @@ from dataclasses import dataclass, replace
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
+from udccal.fitting.psf_free import PER_PX, fixed, image_of, movable, on_pixels, solve_free
 from udccal.fitting.psf_residual import (
     Sources,
     Windows,
     make_windows,
     mismatch,
     prior_spread,
-    refine_sources,
     solve_residual,
 )
 from udccal.fitting.psf_shots import Shots
@@ -29,6 +29,8 @@ _WORTH = 0.9
 # Beyond this mismatch of diffraction alone, an image without diffraction is tried too.
 _DOUBTFUL = 0.05
 _HIGHEST = 3
+# Of places and light together with a free image, which change by less than this (px; relatively).
+_ROUNDS, _FARTHEST = 2, 0.7
 
 
 @dataclass(frozen=True)
@@ -64,11 +66,11 @@ class _Data:
     explained: Float[np.ndarray, "shots rows columns"]
     unit: Float[np.ndarray, "shots 2"]
 
-    def windows(self, sources: Sources, degree: int, keep: Bool[np.ndarray, " shots"]) -> Windows:
+    def windows(self, sources: Sources, degree: int, share: float, keep: Bool[np.ndarray, " shots"]) -> Windows:
         half = (self.shots.rate.shape[1] // 2, self.shots.rate.shape[2] // 2)
-        return make_windows(
-            self.shots.pick(keep), sources.pick(keep), self.explained[keep], half, self.unit[keep], degree, _MODEL_ERROR
-        )
+        shots, own = self.shots.pick(keep), sources.pick(keep)
+        parts = (self.explained[keep], half, self.unit[keep], degree, _MODEL_ERROR, _per_px(share))
+        return make_windows(shots, own, *parts)
 
 
 def select_field(
@@ -98,9 +100,20 @@ def select_field(
     for trial in trials[1:]:
         best = trial if trial.criterion < _WORTH * best.criterion else best
     image = _solve(data, best.sources, np.ones(shots.count, dtype=bool), best.degree, best.share, magnitude)
-    size = int(np.prod(shots.rate.shape[1:])) * 3
-    candidates = tuple(Candidate(t.name, size * polynomial_terms(t.degree), t.criterion, t is best) for t in trials)
+    image = image if best.share else on_pixels(image)
+    candidates = tuple(Candidate(t.name, _size(t, shots), t.criterion, t is best) for t in trials)
     return Selection(best.degree, best.share, image, best.sources, best.mismatch, candidates)
+
+
+def _per_px(share: float) -> int:
+    return 1 if share else PER_PX
+
+
+def _size(trial: _Trial, shots: Shots) -> int:
+    """Coefficients of a trial's image."""
+    per_px = _per_px(trial.share)
+    rows, columns = (per_px * (size - 1) + 1 for size in shots.rate.shape[1:])
+    return 3 * rows * columns * polynomial_terms(trial.degree)
 
 
 def _rising(
@@ -123,7 +136,7 @@ def _trial(
     data: _Data, sources: Sources, test: Bool[np.ndarray, " shots"], degree: int, share: float, magnitude: np.ndarray
 ) -> _Trial:
     image = _solve(data, sources, ~test, degree, share, magnitude)
-    error = mismatch(data.windows(sources, max(degree, 0), test), share, image)
+    error = mismatch(data.windows(sources, max(degree, 0), share, test), share, image)
     kind = "diffraction" if share else "free image"
     name = kind if degree < 0 else f"{kind}, residual degree {degree}" if share else f"{kind}, degree {degree}"
     return _Trial(name, degree, share, sources, error)
@@ -131,13 +144,15 @@ def _trial(
 
 def _solve(
     data: _Data, sources: Sources, keep: Bool[np.ndarray, " shots"], degree: int, share: float, magnitude: np.ndarray
-) -> Float[np.ndarray, "terms 3 rows columns"]:
-    shape = (polynomial_terms(max(degree, 0)), *magnitude.shape)
+) -> Float[np.ndarray, "terms 3 node_rows node_columns"]:
+    spread = prior_spread(magnitude, polynomial_terms(max(degree, 0)), _BESIDE if share else _FREE, _per_px(share))
     if degree < 0:
-        return np.zeros(shape)
-    spread = prior_spread(magnitude, shape[0], _BESIDE if share else _FREE)
-    windows = data.windows(sources, degree, keep)
-    return np.asarray(solve_residual(windows, jnp.asarray(share), jnp.asarray(spread)))
+        return np.zeros_like(spread)
+    windows = data.windows(sources, degree, share, keep)
+    if share:
+        return np.asarray(solve_residual(windows, jnp.asarray(share), jnp.asarray(spread)))
+    scaled, _ = solve_free(windows, spread, fixed(windows), np.zeros_like(spread))
+    return np.asarray(image_of(scaled, spread))
 
 
 def _mean_kernel(data: _Data, sources: Sources) -> Float[np.ndarray, "3 rows columns"]:
@@ -152,16 +167,31 @@ def _mean_kernel(data: _Data, sources: Sources) -> Float[np.ndarray, "3 rows col
 
 
 def _free_sources(data: _Data, sources: Sources, magnitude: np.ndarray) -> Sources:
-    """Places and light when diffraction explains nothing: from the crops themselves, then from the image they give."""
+    """Places and light when diffraction explains nothing: from the crops themselves, then along with the image."""
     shots = data.shots
     colour = np.eye(3)[shots.channel] * (shots.weight > 0)[..., None]
     light = np.einsum("syx,syxc->sc", shots.rate, colour)
     covered = np.einsum("cyx,syxc->sc", magnitude, colour)
-    free = Sources(shots.centre_px, light / np.maximum(covered, 1e-6), np.zeros(shots.count))
+    start = Sources(shots.centre_px, light / np.maximum(covered, 1e-6), np.zeros(shots.count))
+    degree = 1 if polynomial_terms(1) <= len(np.unique(shots.position)) else 0
+    spread = prior_spread(magnitude, polynomial_terms(degree), _FREE, PER_PX)
     every = np.ones(shots.count, dtype=bool)
-    enough = polynomial_terms(1) <= len(np.unique(shots.position))
-    for degree in (0, 1) if enough else (0,):
-        image = _solve(data, free, every, degree, 0.0, magnitude)
-        free = refine_sources(shots, free, data.windows(free, degree, every), image)
-        free = replace(free, flux=free.flux * image[0].sum(axis=(1, 2)))
+    free, changed = start, np.zeros((shots.count, 5))
+    windows = data.windows(free, degree, 0.0, every)
+    scaled, _ = solve_free(windows, spread, fixed(windows), np.zeros_like(spread))
+    for _ in range(_ROUNDS):
+        own = movable(shots, free, windows, np.asarray(image_of(scaled, spread)), changed)
+        scaled, found = solve_free(windows, spread, own, scaled)
+        changed = np.clip(_within_positions(np.asarray(found), shots.position), -_FARTHEST, _FARTHEST)
+        free = replace(start, place_px=start.place_px + changed[:, :2], flux=start.flux * (1.0 + changed[:, 2:]))
+        windows = data.windows(free, degree, 0.0, every)
     return free
+
+
+def _within_positions(
+    values: Float[np.ndarray, "shots 5"], position: Int[np.ndarray, " shots"]
+) -> Float[np.ndarray, "shots 5"]:
+    """What differs among the shots of a position: what is common to them, a change of the image there does as well."""
+    total = np.zeros((int(position.max()) + 1, values.shape[1]))
+    np.add.at(total, position, values)
+    return values - (total / np.maximum(np.bincount(position), 1)[:, None])[position]
