@@ -15,7 +15,8 @@ from udccal.errors import FitError, ProfileError
 from udccal.fitting.result import FitStatus
 from udccal.profiles.profile import Profile, build_profile
 from udccal.profiles.provenance import PROFILE_NAME, profile_sha256
-from udccal.profiles.store import read_profile, read_stored, write_profile
+from udccal.profiles.store import RIG_PROFILE, find_profile, read_profile, read_stored, write_profile
+from udccal.rig import load_rig, shipped_rig_folder
 
 TERMS = ("noise", "geometry", "wire", "psf", "backscatter")
 NO_COV = np.zeros((0, 0))
@@ -172,3 +173,25 @@ def test_a_link_out_of_the_folder_is_refused(stored: Path) -> None:
 def test_the_stored_form_can_be_read_without_its_arrays(stored: Path, toy_profile: Profile) -> None:
     (stored / "psf_residual.exr").unlink()
     assert read_stored(stored).rig == toy_profile.rig
+
+
+def test_profiles_are_found_by_path_and_by_name(
+    tmp_path: Path, original: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    mine = tmp_path / "rigs" / "mine"
+    shutil.copytree(shipped_rig_folder() / "lg55-reduced", mine, ignore=shutil.ignore_patterns(RIG_PROFILE))
+    monkeypatch.setenv("UDCCAL_RIGS", str(mine.parent))
+    assert find_profile(original) == original
+    with pytest.raises(ProfileError, match=r"Expected a profile .* found none"):
+        read_profile(find_profile("mine"))
+    with pytest.raises(ProfileError, match=r"Expected a profile .* found none"):
+        read_profile(find_profile("no-such-rig"))
+    shutil.copytree(original, mine / RIG_PROFILE)
+    assert find_profile("mine") == mine / RIG_PROFILE
+
+
+def test_the_shipped_profile_is_of_the_shipped_rig() -> None:
+    profile = read_profile(find_profile("lg55-reduced"))
+    assert profile.rig == load_rig("lg55-reduced")
+    assert {profile.result(term).status for term in TERMS} == {FitStatus.CONVERGED}
+    assert profile.provenance.command.startswith("udccal calibrate")

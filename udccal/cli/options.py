@@ -9,7 +9,8 @@ import typer
 
 RigName = Annotated[str, typer.Option("--rig", help="Name of a shipped rig, of one of your own, or a folder.")]
 SessionFolder = Annotated[Path, typer.Option("--session", help="Folder of the session; an unfinished one goes on.")]
-ProfilePath = Annotated[Path, typer.Option("--profile", help="Folder of the profile.")]
+ProfilePath = Annotated[Path, typer.Option("--profile", help="Folder of the profile, or its zip file.")]
+FoundProfile = Annotated[Path, typer.Option("--profile", help="A profile's folder or zip file, or a rig's name.")]
 OutFolder = Annotated[Path, typer.Option("--out", help="Folder for what is written.")]
 Seed = Annotated[int, typer.Option("--seed", help="Which rig, of all that fit the description, is simulated.")]
 PanelPicturePath = Annotated[

@@ -18,7 +18,7 @@ def profile() -> None:
 @profile_app.command(no_args_is_help=True)
 def show(
     context: typer.Context,
-    path: Annotated[Path, typer.Argument(metavar="PROFILE", help="Folder or zip file of the profile.")],
+    path: Annotated[Path, typer.Argument(metavar="PROFILE", help="The profile's folder or zip file, or a rig's name.")],
 ) -> None:
     """Show what a profile holds: every term's status, and every quantity with its unit and sigma."""
     from udccal.cli.jobs.show import show_profile

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from udccal.cli.options import OutFolder, PanelPicturePath, ProfilePath
+from udccal.cli.options import FoundProfile, OutFolder, PanelPicturePath
 
 
 class PictureFormat(enum.StrEnum):
@@ -21,7 +21,7 @@ class PictureFormat(enum.StrEnum):
 def restore(
     context: typer.Context,
     images: Annotated[list[Path], typer.Argument(metavar="IMAGE...", help="Raw mosaics: 16-bit PNG, or DNG.")],
-    profile: ProfilePath,
+    profile: FoundProfile,
     out: OutFolder,
     panel_picture: PanelPicturePath = None,
     exposure_s: Annotated[

@@ -13,14 +13,17 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
-from udccal.errors import ProfileError
+from udccal.errors import ProfileError, RigError
 from udccal.profiles.archive import pack_archive, unpack_archive
 from udccal.profiles.encode import decode, encode
 from udccal.profiles.profile import Profile
 from udccal.profiles.provenance import PROFILE_NAME
 from udccal.profiles.schema import StoredArray, StoredProfile
 from udccal.profiles.versions import migrated
+from udccal.rig import find_rig
 
+# In a rig's folder, beside its rig.toml.
+RIG_PROFILE = "profile"
 _MAX_JSON_BYTES = 32 * 1024 * 1024
 
 
@@ -53,6 +56,21 @@ def read_profile(path: Path) -> Profile:
             unpack_archive(path, Path(folder))
             return decode(read_stored(Path(folder)), Path(folder))
     return decode(read_stored(path), path)
+
+
+def find_profile(name_or_path: str | Path) -> Path:
+    """A profile given by path, or by the name of a rig whose folder holds one as ``profile``.
+
+    What is there at the path goes first; a path at which nothing is comes back as it is, for a reader to complain of.
+    """
+    path = Path(name_or_path)
+    if path.exists():
+        return path
+    try:
+        of_rig = find_rig(name_or_path) / RIG_PROFILE
+    except RigError:
+        return path
+    return of_rig if of_rig.is_dir() else path
 
 
 def read_stored(folder: Path) -> StoredProfile:

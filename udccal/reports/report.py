@@ -59,7 +59,7 @@ def calibration_page(session: Session, evidence: Evidence, scene: PictureCompari
         Fact("sensor", f"{sensor.columns} × {sensor.rows}, {sensor.cfa}, {sensor.bits} bits"),
         Fact("captured", session.manifest.created_at),
         Fact("steps", str(len(session.manifest.steps))),
-        Fact("fits", f"{sum(t.seconds for t in calibration.times):.1f} s"),
+        Fact("fits", ", ".join(f"{t.term} {t.seconds:.1f} s" for t in calibration.times)),
     )
     tables = (truth_table(evidence.rows),) if evidence.rows else ()
     return Page(
