@@ -16,7 +16,7 @@ from udccal.fitting.hdr import HdrMerge
 from udccal.fitting.noise import nominal_noise
 from udccal.fitting.nominal import nominal_geometry
 from udccal.fitting.psf import Effort, fit_psf, fit_shots, window_half
-from udccal.fitting.psf_residual import stencils
+from udccal.fitting.psf_residual import shifts
 from udccal.fitting.psf_shots import Shots, cut_crop, group, stack
 from udccal.fitting.psf_start import start_model, wire_shows
 from udccal.fitting.result import FitResult, FitStatus
@@ -167,12 +167,16 @@ def test_blur_without_a_grating_is_carried_by_the_image() -> None:
     assert relative_l2(kernels(result.term, place, 41, 21), other).min() > 0.1
 
 
-def test_a_stencil_moves_towards_its_offset() -> None:
-    moved = stencils(np.array([[0.4, -0.3]]), np.array([0.0]))[0]
-    y, x = np.mgrid[-4:5, -4:5]
-    assert moved.sum() == pytest.approx(1.0)
-    assert (moved * x).sum() == pytest.approx(0.4, abs=0.02)
-    assert (moved * y).sum() == pytest.approx(-0.3, abs=0.02)
+@pytest.mark.parametrize("per_px", [1, 2])
+def test_matrices_move_towards_the_offset_and_smear_by_the_disc(per_px: int) -> None:
+    nodes = np.arange(per_px * 40 + 1) / per_px
+    image = np.exp(-0.5 * ((nodes - 20.0) / 1.5) ** 2)
+    moved, smeared = shifts(np.array([0.4, 0.0]), np.array([0.0, 1.6]), 41, per_px) @ image
+    samples = np.arange(41)
+    for seen, mean, variance in ((moved, 20.4, 1.5**2), (smeared, 20.0, 1.5**2 + 1.6**2 / 16)):
+        assert np.average(samples, weights=seen) == pytest.approx(mean, abs=0.012)
+        assert np.average((samples - mean) ** 2, weights=seen) == pytest.approx(variance, rel=5e-3)
+    assert moved.sum() == pytest.approx(np.sqrt(2 * np.pi) * 1.5, rel=1e-3)
 
 
 def test_aims_fall_into_groups() -> None:

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from udccal.fitting.psf_residual import Sources, Windows, predict, ridge, stencils
+from udccal.fitting.psf_residual import Sources, Windows, predict, ridge, shifts
 from udccal.fitting.psf_shots import Shots
 from udccal.models.arrays import Arrayish
 
@@ -57,11 +57,13 @@ def movable(
     changed: Float[np.ndarray, "shots 5"],
 ) -> Own:
     """Places and light about ``sources``, at which they have been ``changed`` by so much, under an image."""
-    offset = sources.place_px - shots.origin_px
+    rows, columns = np.shape(windows.rate)[1:]
+    x, y = (sources.place_px - shots.origin_px).T
 
     def at(move: tuple[float, float]) -> Float[np.ndarray, "shots rows columns"]:
-        stencil = stencils(offset + np.asarray(move), shots.disc_px, windows.per_px)
-        return np.asarray(predict(replace(windows, stencil=stencil), jnp.asarray(image)))
+        down = shifts(y + move[1], shots.disc_px, rows, PER_PX)
+        across = shifts(x + move[0], shots.disc_px, columns, PER_PX)
+        return np.asarray(predict(replace(windows, down=down, across=across), jnp.asarray(image)))
 
     h = _STEP_PX
     slopes = [(at((h, 0.0)) - at((-h, 0.0))) / (2 * h), (at((0.0, h)) - at((0.0, -h))) / (2 * h)]

@@ -2,7 +2,8 @@
 
 All shots of all positions are solved together on Bayer sites: ridge regression by conjugate gradients, never forming
 the matrix. A shot's expectation is the image at its position, moved by a fraction of a pixel and smeared by the LED's
-disc; both are one small stencil per shot.
+disc. Along rows and along columns that is one small matrix each (for a disc of a pixel or two, which pixels cannot tell
+from the product of its shadows).
 
 Beside diffraction one node to a pixel is enough; see ``psf_free`` for an image that carries the whole kernel.
 """
@@ -23,10 +24,8 @@ from udccal.fitting.psf_shots import Shots
 from udccal.models.arrays import Arrayish
 from udccal.models.fields import polynomial_basis
 
-# Nodes to a pixel of an image that carries the whole kernel, and how far it is smooth, in nodes.
-FREE_PER_PX, _FREE_SMOOTH = 2, 1.0
-_LANCZOS, _FARTHEST_PX = 3, 2
-_ITERATIONS = 150
+_LANCZOS = 3
+_DISC_POINTS = 8
 
 
 class Windows(eqx.Module):
@@ -34,23 +33,22 @@ class Windows(eqx.Module):
 
     Attributes:
         basis: polynomials at each shot's position.
-        stencil: shift and disc, in nodes.
+        down, across: from nodes to samples, along columns and along rows: shift and disc.
         flux: light of each sample's own colour, 0 where nothing is known.
         colour: one-hot.
         explained: per unit of light, what diffraction brings to each sample.
         rate: e-/s without background.
         weight: inverse variance of the rate.
-        per_px: nodes of the image to a pixel; its first and last nodes lie on the first and last pixels.
     """
 
     basis: Float[Arrayish, "shots terms"]
-    stencil: Float[Arrayish, "shots size size"]
+    down: Float[Arrayish, "shots rows node_rows"]
+    across: Float[Arrayish, "shots columns node_columns"]
     flux: Float[Arrayish, "shots rows columns"]
     colour: Float[Arrayish, "shots rows columns 3"]
     explained: Float[Arrayish, "shots rows columns"]
     rate: Float[Arrayish, "shots rows columns"]
     weight: Float[Arrayish, "shots rows columns"]
-    per_px: int = eqx.field(static=True)
 
 
 @dataclass(frozen=True)
@@ -90,7 +88,7 @@ def make_windows(
     Args:
         unit: positions scaled to about [-1, 1].
         model_error: relative error of the peak that is allowed for, beside the noise of the data.
-        per_px: nodes of the image to a pixel.
+        per_px: nodes of the image to a pixel; its first and last lie on the first and last pixels.
     """
     rows, columns = shots.rate.shape[1:]
     cut = np.s_[:, rows // 2 - half[0] : rows // 2 + half[0] + 1, columns // 2 - half[1] : columns // 2 + half[1] + 1]
@@ -102,36 +100,41 @@ def make_windows(
     peak = smooth.max(axis=(1, 2), keepdims=True)
     # As in ``psf_normal.weighted``: what a smooth field leaves out matters the more, relatively, the fainter a sample.
     variance = 1.0 / np.where(known, shots.weight[cut], 1.0) + (model_error * smooth**0.75 * peak**0.25) ** 2
+    offset = sources.place_px - shots.origin_px
     return Windows(
         basis=np.asarray(polynomial_basis(unit, degree)),
-        stencil=stencils(sources.place_px - shots.origin_px, shots.disc_px, per_px),
+        down=shifts(offset[:, 1], shots.disc_px, 2 * half[0] + 1, per_px),
+        across=shifts(offset[:, 0], shots.disc_px, 2 * half[1] + 1, per_px),
         flux=flux * known,
         colour=colour,
         explained=explained,
         rate=rate * known,
         weight=np.where(known, 1.0 / variance, 0.0),
-        per_px=per_px,
     )
 
 
-def stencils(
-    offset_px: Float[np.ndarray, "shots 2"], disc_px: Float[np.ndarray, " shots"], per_px: int = 1
-) -> Float[np.ndarray, "shots size size"]:
-    """Weights that move an image by (x, y) and average it over a disc, by Lanczos's interpolation over six nodes."""
-    index = np.arange(64)
-    radius, angle = np.sqrt((index + 0.5) / 64) / 2, index * np.pi * (3 - np.sqrt(5))
-    disc = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=-1)
-    points = per_px * (offset_px[:, None] + disc * disc_px[:, None, None])
-    reach = per_px * _FARTHEST_PX + _LANCZOS - 1
-    node = np.arange(-reach, reach + 1)
-    along_x, along_y = (_lanczos(points[..., i, None] - node) for i in (0, 1))
-    return np.einsum("spy,spx->syx", along_y, along_x) / len(index)
+def shifts(
+    offset_px: Float[np.ndarray, " shots"], disc_px: Float[np.ndarray, " shots"], samples: int, per_px: int = 1
+) -> Float[np.ndarray, "shots samples nodes"]:
+    """Matrices along one axis that move an image by an offset and average it over a disc's shadow.
+
+    Lanczos's interpolation over six nodes; the shadow of a disc is summed by Gauss and Chebyshev's rule.
+    """
+    angle = np.pi * np.arange(1, _DISC_POINTS + 1) / (_DISC_POINTS + 1)
+    shots, nodes = len(offset_px), per_px * (samples - 1) + 1
+    matrix = np.zeros((shots, samples, nodes + 2 * _LANCZOS))  # what falls beside the nodes is cut off at the end
+    index = np.ogrid[:shots, :samples]
+    for part, weight in zip(np.cos(angle) / 2, 2 / (_DISC_POINTS + 1) * np.sin(angle) ** 2, strict=True):
+        place = per_px * (np.arange(samples) - (offset_px + part * disc_px)[:, None])
+        first = np.floor(place).astype(np.int64) - _LANCZOS + 1
+        taps = np.stack([_lanczos(place - first - tap) for tap in range(2 * _LANCZOS)])
+        for tap, value in enumerate(weight * taps / taps.sum(axis=0)):
+            matrix[(*index, np.clip(first + tap + _LANCZOS, 0, matrix.shape[2] - 1))] += value
+    return matrix[:, :, _LANCZOS:-_LANCZOS]
 
 
-def _lanczos(distance: Float[np.ndarray, "*n taps"]) -> Float[np.ndarray, "*n taps"]:
-    inside = np.abs(distance) < _LANCZOS
-    weight = np.where(inside, np.sinc(distance) * np.sinc(distance / _LANCZOS), 0.0)
-    return weight / weight.sum(axis=-1, keepdims=True)
+def _lanczos(distance: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
+    return np.where(np.abs(distance) < _LANCZOS, np.sinc(distance) * np.sinc(distance / _LANCZOS), 0.0)
 
 
 @eqx.filter_jit
@@ -139,18 +142,14 @@ def predict(
     windows: Windows, image: Float[Array, "terms 3 node_rows node_columns"]
 ) -> Float[Array, "shots rows columns"]:
     """What the residual image brings to each sample per unit of light."""
-    reach, stride = jnp.shape(windows.stencil)[-1] // 2, (windows.per_px, windows.per_px)
 
-    def one(shot: tuple[Array, Array, Array]) -> Float[Array, "rows columns"]:
-        basis, stencil, colour = shot
-        here = jnp.einsum("t,tcyx->cyx", basis, image)
-        # A stencil moves towards +x where its weight lies at +x: this is convolution, so it is turned round.
-        moved = jax.lax.conv_general_dilated(
-            here[:, None], stencil[None, None, ::-1, ::-1], stride, [(reach, reach)] * 2
-        )[:, 0]
+    def one(shot: tuple[Array, Array, Array, Array]) -> Float[Array, "rows columns"]:
+        basis, down, across, colour = shot
+        moved = down @ jnp.einsum("t,tcyx->cyx", basis, image) @ across.T
         return jnp.einsum("cyx,yxc->yx", moved, colour)
 
-    return jax.lax.map(one, (jnp.asarray(windows.basis), jnp.asarray(windows.stencil), jnp.asarray(windows.colour)))
+    parts = (windows.basis, windows.down, windows.across, windows.colour)
+    return jax.lax.map(one, tuple(jnp.asarray(part) for part in parts))
 
 
 @eqx.filter_jit

@@ -25,7 +25,7 @@ from udccal.models.lattice import Lattice
 
 # (g, h): periods along columns and rows. The opposite of each is contained in it.
 TERMS = ((0.0, 1.0), (0.0, 2.0), (1.0, 0.0), (2.0, 0.0), (1.0, 1.0), (1.0, -1.0))
-_COLUMN_OF, _ROW_OF = np.abs(np.array(TERMS, dtype=int)).T
+_COLUMN_OF, _ROW_OF = np.abs(np.array(TERMS, dtype=np.int32)).T
 _QUADRATURE = 32
 _TABLE = 128
 
