@@ -159,6 +159,8 @@ def test_blur_without_a_grating_is_carried_by_the_image() -> None:
     result = fit_shots(shots, rig, geometry, absent_wire(rig, geometry), TOY)
     assert result.status is FitStatus.CONVERGED
     assert float(result.term.diffraction_share) == 0.0
+    assert result.chi2_dof < 10.0
+    assert "not that of a panel's grating" in result.notes[0]
     place = np.array([[430.0, 300.0]])
     truth = streak(place[0], place[0], 0.0, rig)[None, :, 6:-6, 6:-6]
     error = relative_l2(kernels(result.term, place, 41, 21), truth)

@@ -20,6 +20,15 @@ _DRAWS = 6
 _NAMES = ("pitch", "column_open_fraction", "row_open_fraction", "structure_thickness", "pupil_diameter", "blur")
 _UNITS = ("mm", "1", "1", "mm", "mm", "px")
 
+_DIFFRACTION_NOTES = (
+    "cov covers the numbers of diffraction; field coefficients of the residual and spectra are left out of it.",
+    "chi2_dof is of the fit of diffraction, which allows for a model error of 1.5 % of the peak.",
+)
+_FREE_NOTES = (
+    "The blur is not that of a panel's grating: an image carries the kernel, no number of diffraction is known.",
+    "chi2_dof is of that image, and allows for a model error of 1 % of the peak.",
+)
+
 
 def fit_result(
     shots: Shots,
@@ -52,14 +61,11 @@ def fit_result(
         status=status,
         estimates=estimates,
         cov=cov,
-        chi2_dof=fit.chi2_dof,
-        samples=fit.samples,
+        chi2_dof=fit.chi2_dof if selection.share else selection.chi2_dof,
+        samples=fit.samples if selection.share else selection.samples,
         candidates=selection.candidates,
         diagnostics=_diagnostics(shots, fit, selection),
-        notes=(
-            "cov covers the numbers of diffraction; field coefficients of the residual and spectra are left out of it.",
-            "chi2_dof is of the fit of diffraction, which allows for a model error of 1.5 % of the peak.",
-        ),
+        notes=_DIFFRACTION_NOTES if selection.share else _FREE_NOTES,
     )
 
 
@@ -82,9 +88,11 @@ def _estimates(
     problem: Problem, fit: DiffractionFit, selection: Selection
 ) -> tuple[tuple[Estimate, ...], Float[np.ndarray, "n n"]]:
     scale = max(fit.chi2_dof, 1.0)
-    kernel = Estimate("kernel_relative_l2", float(selection.held_out.mean()), _kernel_sigma(problem, fit, scale), "1")
+    error = float(selection.held_out.mean())
     if not selection.share:
-        return (kernel,), np.array([[kernel.sigma**2]])
+        sigma_of_mean = float(selection.held_out.std(ddof=1) / np.sqrt(selection.held_out.size))
+        return (Estimate("kernel_relative_l2", error, sigma_of_mean, "1"),), np.array([[sigma_of_mean**2]])
+    kernel = Estimate("kernel_relative_l2", error, _kernel_sigma(problem, fit, scale), "1")
     cov = fit.cov[: len(_NAMES), : len(_NAMES)] * scale
     # The pitch was held, so that the spectra could move; it may be off by what the rig's description allows.
     cov[0, 0] += 1.0 / (HELD * problem.prior.root[0, 0]) ** 2

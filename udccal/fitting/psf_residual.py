@@ -203,10 +203,26 @@ def prior_spread(
 def mismatch(
     windows: Windows, share: float, image: Float[np.ndarray, "terms 3 node_rows node_columns"]
 ) -> Float[np.ndarray, "3"]:
-    """Relative L2 error per colour of the expectation, with what the data's own noise adds taken out."""
-    unit = share * np.asarray(windows.explained) + np.asarray(predict(windows, jnp.asarray(image)))
-    light = unit * np.asarray(windows.flux)
+    """Relative L2 error per colour of the expectation, the data's own noise included."""
+    light = expected(windows, share, image)
     error = (np.asarray(windows.rate) - light) ** 2
     colour, known = np.asarray(windows.colour), np.asarray(windows.weight) > 0
     size = np.einsum("syx,syxc->c", light**2 * known, colour)
     return np.sqrt(np.einsum("syx,syxc->c", error * known, colour) / np.maximum(size, 1e-30))
+
+
+def normalised_errors(
+    windows: Windows, share: float, image: Float[np.ndarray, "terms 3 node_rows node_columns"]
+) -> Float[np.ndarray, " samples"]:
+    """Errors of all samples in units of their sigma."""
+    weight = np.asarray(windows.weight)
+    errors = (np.asarray(windows.rate) - expected(windows, share, image)) * np.sqrt(weight)
+    return errors[weight > 0]
+
+
+def expected(
+    windows: Windows, share: float, image: Float[np.ndarray, "terms 3 node_rows node_columns"]
+) -> Float[np.ndarray, "shots rows columns"]:
+    """What diffraction and image together bring to each sample, in e-/s."""
+    unit = share * np.asarray(windows.explained) + np.asarray(predict(windows, jnp.asarray(image)))
+    return unit * np.asarray(windows.flux)

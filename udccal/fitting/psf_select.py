@@ -14,6 +14,7 @@ from udccal.fitting.psf_residual import (
     Windows,
     make_windows,
     mismatch,
+    normalised_errors,
     prior_spread,
     solve_residual,
 )
@@ -35,13 +36,26 @@ _ROUNDS, _FARTHEST = 2, 0.7
 
 @dataclass(frozen=True)
 class Selection:
-    """The residual chosen, and how well it predicts."""
+    """The residual chosen, and how well it predicts.
+
+    Attributes:
+        degree: of the residual's polynomials, -1 for none.
+        share: of diffraction, 1 or 0.
+        image: the residual on pixels.
+        sources: every shot's place and light.
+        held_out: relative L2 by colour at positions that were left out.
+        chi2_dof: mean square of all samples' errors in units of their sigma, a model error of 1 % allowed for.
+        samples: how many they are.
+        candidates: what was tried.
+    """
 
     degree: int
     share: float
     image: Float[np.ndarray, "terms 3 rows columns"]
     sources: Sources
     held_out: Float[np.ndarray, "3"]
+    chi2_dof: float
+    samples: int
     candidates: tuple[Candidate, ...]
 
 
@@ -99,10 +113,19 @@ def select_field(
     best = trials[0]
     for trial in trials[1:]:
         best = trial if trial.criterion < _WORTH * best.criterion else best
-    image = _solve(data, best.sources, np.ones(shots.count, dtype=bool), best.degree, best.share, magnitude)
-    image = image if best.share else on_pixels(image)
-    candidates = tuple(Candidate(t.name, _size(t, shots), t.criterion, t is best) for t in trials)
-    return Selection(best.degree, best.share, image, best.sources, best.mismatch, candidates)
+    every = np.ones(shots.count, dtype=bool)
+    image = _solve(data, best.sources, every, best.degree, best.share, magnitude)
+    errors = normalised_errors(data.windows(best.sources, max(best.degree, 0), best.share, every), best.share, image)
+    return Selection(
+        degree=best.degree,
+        share=best.share,
+        image=image if best.share else on_pixels(image),
+        sources=best.sources,
+        held_out=best.mismatch,
+        chi2_dof=float(np.mean(errors**2)),
+        samples=len(errors),
+        candidates=tuple(Candidate(t.name, _size(t, shots), t.criterion, t is best) for t in trials),
+    )
 
 
 def _per_px(share: float) -> int:
