@@ -12,7 +12,7 @@ _CHANGES = {
     "pitch_um = 6.9": "pitch_um = 55.2",
     "noise_levels = 10": "noise_levels = 5",
     "noise_stack = 8": "noise_stack = 2",
-    "psf_region_columns = 64": "psf_region_columns = 16",
+    "psf_region_columns = 48": "psf_region_columns = 16",
     "psf_region_rows = 144": "psf_region_rows = 32",
     "[view]\ncolumns = 960\nrows = 540": "[view]\ncolumns = 120\nrows = 68",
 }

@@ -99,3 +99,12 @@ def test_even_light_stays_even():
     blur = build_blur(toy_truth(), 2, 2, 33, 17)
     even = blur.apply(np.ones((96 + 32, 128 + 16, 3)))
     assert np.allclose(even, 1.0, atol=5e-3)
+
+
+def test_light_is_never_less_than_none_beside_a_flame() -> None:
+    down, across = np.arange(ROWS) - ROWS // 2, np.arange(COLUMNS) - COLUMNS // 2
+    sharp = np.exp(-0.5 * (down[:, None] ** 2 + across**2) / 0.4**2)
+    blur = SpaceVariantBlur(np.tile(sharp, (3, 1, 1, 1)), np.ones((3, 1, 1, 1)), np.zeros(1), np.zeros(1), 0.0)
+    canvas = np.zeros((16 + ROWS - 1, 12 + COLUMNS - 1, 3))
+    canvas[9, 7] = 1e9
+    assert blur.apply(canvas).min() >= 0.0
