@@ -50,7 +50,7 @@ def scenes(folder: Path, size: int, every: int) -> Iterator[Scene]:
     for file in files[::every]:
         # Which curve made an 8-bit photograph is not known: gamma differs from file to file.
         gamma = np.random.default_rng(zlib.crc32(file.name.encode())).uniform(1.8, 2.2)
-        yield _scene(file.stem, read_photograph(file, float(gamma)), size)
+        yield _scene(f"{file.parent.name}-{file.stem}", read_photograph(file, float(gamma)), size)
     for name, yaw, pitch in PANORAMAS[::every]:
         equirect = read_photograph(folder / "environments" / name).astype(np.float64)
         view = panorama_view(equirect, yaw, pitch, FIELD_OF_VIEW_DEG, 1024, 768)
@@ -92,7 +92,7 @@ def main() -> None:
         write_rgb8(arguments.out / f"{scene.name}.png", _side_by_side(comparison))
         gains.append(comparison.gain_dB)
         print(
-            f"{scene.name:20} {comparison.score_before.psnr_dB:8.2f} {comparison.score_after.psnr_dB:8.2f} "
+            f"{scene.name:22} {comparison.score_before.psnr_dB:8.2f} {comparison.score_after.psnr_dB:8.2f} "
             f"{comparison.gain_dB:+7.2f}   {comparison.score_before.ssim:.3f} -> {comparison.score_after.ssim:.3f}"
         )
     print(f"mean gain {np.mean(gains):+.2f} dB over {len(gains)} scenes; before | after | truth in {arguments.out}")
