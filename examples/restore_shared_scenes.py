@@ -82,7 +82,7 @@ def main() -> None:
     panel = profile.rig.panel
     arguments.out.mkdir(parents=True, exist_ok=True)
     gains = []
-    print(f"{'scene':20} {'before':>8} {'after':>8} {'gain':>7}   SSIM")
+    print(f"{'scene':22} {'before':>8} {'after':>8} {'gain':>7}   SSIM")
     for number, scene in enumerate(scenes(arguments.data, arguments.size, arguments.every)):
         shown = face_picture(9001 + number % 4, panel.columns, panel.rows)
         shot = capture_photograph(world, arguments.light * scene.radiance, restorer.view, shown)
