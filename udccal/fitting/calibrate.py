@@ -51,7 +51,7 @@ class FitEffort:
 
 # For a demonstration.
 QUICK = FitEffort(
-    wire_samples=75_000, psf=Effort(positions=8, shifts=2, iterations=8), backscatter_positions=32, workers=2
+    wire_samples=60_000, psf=Effort(positions=6, shifts=2, iterations=6), backscatter_positions=32, workers=2
 )
 
 

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 
 from udccal.fitting.psf_blocks import blocks, fit_lattice
 from udccal.fitting.psf_diffraction import DiffractionFit, fit_diffraction, fit_locals, pose
-from udccal.fitting.psf_evidence import failed, fit_result
+from udccal.fitting.psf_evidence import diffraction_alone, failed, fit_result
 from udccal.fitting.psf_normal import Evaluator
 from udccal.fitting.psf_read import read_shots
 from udccal.fitting.psf_residual import Sources, with_light_of_peak
@@ -88,6 +88,11 @@ def fit_psf(
     left_out = reading.clipped + reading.dark
     note = f"{left_out} pictures were left out: {reading.dark} without an LED, {reading.clipped} clipped."
     return replace(result, notes=(*result.notes, note)) if left_out else result
+
+
+def nominal_psf(rig: RigDescription, geometry: Geometry, wire: Wire) -> PsfField:
+    """What the fit starts from: diffraction by the panel as the rig's description and the wire have it."""
+    return diffraction_alone(start_model(rig, geometry, wire), geometry)
 
 
 def window_half(session: Session, largest: tuple[int, int]) -> tuple[int, int]:

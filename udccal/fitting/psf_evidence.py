@@ -69,19 +69,24 @@ def fit_result(
     )
 
 
-def failed(start: Diffraction, geometry: Geometry, status: FitStatus, note: str) -> FitResult[PsfField]:
-    """No fit: the term is the nominal diffraction."""
+def diffraction_alone(model: Diffraction, geometry: Geometry) -> PsfField:
+    """A field without a residual."""
     half = np.maximum(np.asarray(geometry.centre, dtype=np.float64), 1.0)
-    term = PsfField(
+    return PsfField(
         geometry=geometry,
-        diffraction=start,
+        diffraction=model,
         diffraction_share=np.float64(1.0),
         residual=np.zeros((1, 3, 1, 1)),
         centre_px=half,
         half_px=half,
         degree=0,
+        fine=fine_oversample(float(model.pupil_mm), float(np.mean(np.asarray(geometry.focal)))),
     )
-    return FitResult(term, status, (), np.zeros((0, 0)), 0.0, 0, notes=(note,))
+
+
+def failed(start: Diffraction, geometry: Geometry, status: FitStatus, note: str) -> FitResult[PsfField]:
+    """No fit: the term is the nominal diffraction."""
+    return FitResult(diffraction_alone(start, geometry), status, (), np.zeros((0, 0)), 0.0, 0, notes=(note,))
 
 
 def _estimates(

@@ -41,7 +41,7 @@ class Selection:
     Attributes:
         degree: of the residual's polynomials, -1 for none.
         share: of diffraction, 1 or 0.
-        image: the residual on pixels.
+        image: the residual on pixels; a single zero for none.
         sources: every shot's place and light.
         held_out: relative L2 by colour at positions that were left out.
         chi2_dof: mean square of all samples' errors in units of their sigma, a model error of 1 % allowed for.
@@ -119,7 +119,7 @@ def select_field(
     return Selection(
         degree=best.degree,
         share=best.share,
-        image=image if best.share else on_pixels(image),
+        image=np.zeros((1, 3, 1, 1)) if best.degree < 0 else image if best.share else on_pixels(image),
         sources=best.sources,
         held_out=best.mismatch,
         chi2_dof=float(np.mean(errors**2)),

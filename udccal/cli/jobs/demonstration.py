@@ -16,9 +16,11 @@ from udccal.cli.jobs.fit import UNSEEN_PICTURE, run_fits, show_status, store_pro
 from udccal.cli.jobs.scene import capture_photograph
 from udccal.cli.output import Output, StageTime
 from udccal.displays.pictures import face_picture
-from udccal.fitting.calibrate import ORDER, QUICK, fit_foundation
+from udccal.fitting.calibrate import ORDER, QUICK, Foundation, fit_foundation
+from udccal.fitting.psf import nominal_psf
 from udccal.io.photograph import read_photograph
 from udccal.io.png import write_png16, write_rgb8
+from udccal.profiles.kernels import kernel_size, kernels_at
 from udccal.profiles.store import check_replaceable, read_profile
 from udccal.reports.page import write_page
 from udccal.reports.pictures import PictureComparison, Score, compare_pictures
@@ -29,7 +31,7 @@ from udccal.restoration.plan import PlanOptions
 from udccal.restoration.runtime import Restorer
 from udccal.restoration.sinks import write_picture
 from udccal.restoration.tone import Tone, display_exposure
-from udccal.rig import load_rig
+from udccal.rig import RigDescription, load_rig
 from udccal.sessions.schema import TermName
 from udccal.sessions.store import Session
 from udccal.simulation.world import SimulatedWorld
@@ -76,6 +78,7 @@ def demonstrate(output: Output, rig_name: str, out: Path, seed: int) -> None:
         pool.submit(lambda: (world.light.blur, world.light.backscatterer))
         capture(output, rig, world, out / "session", _EARLY)
         foundation = pool.submit(fit_foundation, Session.open(out / "session"), effort=QUICK)
+        pool.submit(lambda: _prepare_kernels(rig, foundation.result()))
         capture(output, rig, world, out / "session", [term for term in ORDER if term not in _EARLY])
         session = Session.open(out / "session")
         calibration = run_fits(output, session, QUICK, foundation.result())
@@ -97,6 +100,12 @@ def demonstrate(output: Output, rig_name: str, out: Path, seed: int) -> None:
             rig.name, seed, report, evidence.rows, scene.score_before, scene.score_after, tuple(output.times), seconds
         )
     )
+
+
+def _prepare_kernels(rig: RigDescription, foundation: Foundation) -> None:
+    """Compile the psf's kernel while the fits leave a core to spare; profile, report and restorer wait for it."""
+    start = nominal_psf(rig, foundation.geometry.term, foundation.wire.term)
+    kernels_at(start, np.asarray(start.centre_px)[None], *kernel_size(rig))
 
 
 def portrait() -> Float[np.ndarray, "rows columns 3"]:
