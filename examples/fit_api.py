@@ -10,7 +10,8 @@ import argparse
 import tempfile
 from pathlib import Path
 
-from udccal.cli.jobs.capture import capture, simulated_rig
+from udccal.cli.jobs.benches import simulated_bench, simulated_rig
+from udccal.cli.jobs.capture import capture
 from udccal.cli.output import Output
 from udccal.fitting.noise import fit_noise
 from udccal.models.noise import electrons, variance_e
@@ -35,7 +36,8 @@ def main() -> None:
         if path is None:
             path = Path(folder) / "session"
             rig = toy_rig()
-            capture(Output(), rig, simulated_rig(rig, seed=0), path, ("noise",))
+            with simulated_bench(simulated_rig(rig, seed=0)) as bench:
+                capture(Output(), rig, bench, path, ("noise",))
         report(Session.open(path))
 
 

@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from udccal.cli.jobs.capture import simulated_rig
+from udccal.cli.jobs.benches import simulated_rig
 from udccal.cli.jobs.scene import capture_photograph
 from udccal.displays.pictures import face_picture
 from udccal.io.photograph import read_photograph

@@ -5,13 +5,13 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import ClassVar, Literal, Protocol, final, runtime_checkable
+from typing import ClassVar, Literal, final
 
 from procedures.capture import take
-from procedures.checks import Check
+from procedures.checks import Check, frame_limits
 from procedures.metering import Exposed, meter, trial_frame
 from procedures.plans import Exposure, Fixed, Metered, Plan, TimesThatOf
-from udccal.arrangements import Arrangement, Board, Dark, FlatLight, Led, PanelPicture
+from udccal.arrangements import Arrangement, Board, Dark, FlatLight, Led, Occasion, PanelPicture, Stage
 from udccal.cameras.protocol import Camera, Region
 from udccal.displays.protocol import Display
 from udccal.errors import CaptureError
@@ -41,15 +41,6 @@ class Step:
     exposure: Exposure
     plan: Plan
     role: PictureRole = "picture"
-
-
-@runtime_checkable
-class Stage(Protocol):
-    """Puts things in front of the camera: a simulated world, or a person who follows an instruction."""
-
-    def arrange(self, arrangement: Arrangement) -> None:
-        """Return once the arrangement stands."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -101,33 +92,40 @@ def run_procedure(procedure: Procedure, bench: Bench, writer: SessionWriter, pro
     rig = writer.manifest.rig
     _check_camera(bench.camera, rig)
     total = sum(1 for _ in procedure.steps(rig))
-    last_exposure_s: float | None = None
+    before: str | None = None
     for done, step in enumerate(procedure.steps(rig)):
         if progress is not None:
             progress(StepProgress(procedure.term, done, total, step))
         if step.id not in writer.completed_ids:
-            last_exposure_s = _run_step(step, bench, writer, last_exposure_s)
+            _run_step(step, bench, writer, _exposure_of(before, writer))
+        before = step.id
     if progress is not None:
         progress(StepProgress(procedure.term, total, total, None))
 
 
-def _run_step(step: Step, bench: Bench, writer: SessionWriter, start_s: float | None) -> float:
-    """Carry out one step; returns its exposure, a good guess for the next."""
+def _exposure_of(step_id: str | None, writer: SessionWriter) -> float | None:
+    """A step's exposure, a good guess for the next one; from the session, so that resuming changes nothing."""
+    step = writer.step(step_id) if step_id is not None else None
+    return None if step is None else step.captures[0].exposure_s
+
+
+def _run_step(step: Step, bench: Bench, writer: SessionWriter, start_s: float | None) -> None:
     rig = writer.manifest.rig
     arrangement = step.arrangement
     if isinstance(arrangement, PanelPicture):
         bench.display.show(arrangement.picture)
     else:
         bench.display.off()
-    bench.stage.arrange(arrangement)
+    bench.stage.arrange(arrangement, Occasion(step.id, writer.number(step.id), step.instruction))
     try:
         exposed = _expose(step, bench.camera, writer, start_s)
         step.check(exposed.frame, rig)
-        captures = take(bench.camera, step.region, exposed.exposure_s, step.plan, rig)
+        limits = frame_limits(rig, exposed.exposure_s, dark=isinstance(arrangement, Dark))
+        captures = take(bench.camera, step.region, exposed.exposure_s, step.plan, limits, rig.camera.max_exposure_s)
+        bench.display.check()
     except CaptureError as error:
         raise CaptureError(f"Step {step.id}: {error}") from error
     writer.add_step(step.id, step.term, _subject(step, writer), captures)
-    return exposed.exposure_s
 
 
 def _expose(step: Step, camera: Camera, writer: SessionWriter, start_s: float | None) -> Exposed:

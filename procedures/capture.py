@@ -1,39 +1,101 @@
-"""Carrying out a capture plan at a known exposure."""
+"""Carrying out a capture plan at a known exposure; frames that are not fit are left out, counted and replaced."""
 
 from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
 
 from procedures.plans import Bracket, Plan, Singles, Stack
 from udccal.cameras.protocol import Camera, Frame, Region, Settings
 from udccal.errors import CaptureError
-from udccal.rig import RigDescription
-from udccal.sessions.averaging import AveragedFrames, average_frames
-from udccal.sessions.frame_checks import FrameChecks
+from udccal.sessions.averaging import average_frames
+from udccal.sessions.bracket_checks import bracket_fault
+from udccal.sessions.captured import Capture, SingleFrame
+from udccal.sessions.frame_checks import FrameChecks, FrameLimits, frames_agree
 
 _TRIES = 4
+_AGREEMENT = 0.01  # relative, of the mean light of single frames of one scene
 
 
 def take(
-    camera: Camera, region: Region, exposure_s: float, plan: Plan, rig: RigDescription
-) -> tuple[Frame | AveragedFrames, ...]:
+    camera: Camera, region: Region, exposure_s: float, plan: Plan, limits: FrameLimits, longest_s: float
+) -> tuple[Capture, ...]:
     """What the plan asks for: single frames, or one average.
+
+    Args:
+        camera: open.
+        region: of the sensor.
+        exposure_s: of the first frame.
+        plan: what to take.
+        limits: what each frame must stay within; single frames may clip, since that is what some are taken for.
+        longest_s: the longest exposure of a bracket.
 
     Raises:
         CaptureError: when the camera does not deliver enough usable frames.
     """
+    settings = Settings(exposure_s, 0.0, region)
+    clipping = replace(limits, max_saturated_fraction=1.0)
     match plan:
         case Stack(frames):
-            camera.configure(Settings(exposure_s, 0.0, region))
-            checks = FrameChecks(rig.camera.black_DN.value, float(rig.saturation_DN))
-            return (average_frames(camera.frames, frames, checks),)
+            camera.configure(settings)
+            return (average_frames(camera.frames, frames, FrameChecks(limits)),)
         case Singles(frames):
-            camera.configure(Settings(exposure_s, 0.0, region))
-            return tuple(_single(camera) for _ in range(frames))
+            camera.configure(settings)
+            return _singles(camera, frames, clipping)
         case Bracket(frames, factor):
-            taken = []
-            for seconds in _bracket(exposure_s, frames, factor, rig.camera.max_exposure_s):
-                camera.configure(Settings(seconds, 0.0, region))
-                taken.append(_single(camera))
-            return tuple(taken)
+            exposures = _bracket(exposure_s, frames, factor, longest_s)
+            return _exposures(camera, settings, exposures, clipping)
+
+
+def _singles(camera: Camera, count: int, limits: FrameLimits) -> tuple[SingleFrame, ...]:
+    """Frames of one scene and setting, whose light agrees; those left out are told with the first."""
+    checks = FrameChecks(limits)
+    for _ in range(_TRIES):
+        frames = [_good_frame(camera, checks) for _ in range(count)]
+        if frames_agree(frames, limits.black_DN, _AGREEMENT):
+            return (SingleFrame(frames[0], checks.rejections()), *(SingleFrame(frame) for frame in frames[1:]))
+        for _ in frames:  # which of them is right cannot be told
+            checks.reject("flicker")
+    raise CaptureError(_sentence("a steady light", checks))
+
+
+def _exposures(
+    camera: Camera, settings: Settings, exposures: list[float], limits: FrameLimits
+) -> tuple[SingleFrame, ...]:
+    """One frame at each exposure, all of the same light."""
+    taken: list[SingleFrame] = []
+    for exposure_s in exposures:
+        camera.configure(replace(settings, exposure_s=exposure_s))
+        checks = FrameChecks(limits)
+        frame = _good_frame(camera, checks, lambda frame: _change(taken, frame, limits))
+        taken.append(SingleFrame(frame, checks.rejections()))
+    return tuple(taken)
+
+
+def _change(taken: list[SingleFrame], frame: Frame, limits: FrameLimits) -> str | None:
+    return bracket_fault(taken[-1].frame, frame, limits) if taken else None
+
+
+def _good_frame(
+    camera: Camera, checks: FrameChecks, fault: Callable[[Frame], str | None] = lambda frame: None
+) -> Frame:
+    for _ in range(_TRIES):
+        for frame in camera.frames(1):
+            if checks.fault(frame) is not None:
+                continue
+            reason = fault(frame)
+            if reason is None:
+                return frame
+            checks.reject(reason)
+    raise CaptureError(_sentence("a usable frame", checks))
+
+
+def _sentence(expected: str, checks: FrameChecks) -> str:
+    found = ", ".join(f"{item.frames} {item.reason}" for item in checks.rejections()) or "no frame at all"
+    return (
+        f"Expected {expected}, found frames that had to be left out one after the other ({found}). "
+        "Check the light, that nothing moves, and the camera's cable, then repeat the step."
+    )
 
 
 def _bracket(first_s: float, frames: int, factor: float, longest_s: float) -> list[float]:
@@ -42,13 +104,3 @@ def _bracket(first_s: float, frames: int, factor: float, longest_s: float) -> li
     while len(exposures) < frames and exposures[-1] < longest_s:
         exposures.append(min(exposures[-1] * factor, longest_s))
     return exposures
-
-
-def _single(camera: Camera) -> Frame:
-    for _ in range(_TRIES):
-        for frame in camera.frames(1):
-            if frame.complete:
-                return frame
-    raise CaptureError(
-        f"Expected a complete frame, found {_TRIES} incomplete ones in a row. Check the camera's cable, then repeat."
-    )

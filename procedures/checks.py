@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -12,6 +13,7 @@ from udccal.arrangements import BoardSpec
 from udccal.cameras.protocol import Frame
 from udccal.errors import CaptureError
 from udccal.rig import RigDescription
+from udccal.sessions.frame_checks import FrameLimits
 
 Check = Callable[[Frame, RigDescription], None]
 
@@ -21,17 +23,29 @@ _FEWEST_CORNERS, _ENOUGH_CORNERS = 6, 12  # a quarter of the board, within these
 _EDGE = 8
 
 
+def dark_limit_DN(rig: RigDescription, exposure_s: float) -> float:
+    """The highest median a dark frame may have: black level and dark current cannot make it brighter."""
+    camera = rig.camera
+    # Half the sensor at 100 e-/s is more dark current than any camera within its specification shows.
+    allowed_e = _STRAY_E + 100.0 * exposure_s
+    return camera.black_DN.value + camera.black_DN.tolerance + allowed_e * camera.K_DN_per_e.value
+
+
+def frame_limits(rig: RigDescription, exposure_s: float, dark: bool) -> FrameLimits:
+    """What each frame of a step's captures must stay within."""
+    limits = FrameLimits(rig.camera.black_DN.value, float(rig.saturation_DN))
+    return replace(limits, dark_DN=dark_limit_DN(rig, exposure_s)) if dark else limits
+
+
 def is_dark(frame: Frame, rig: RigDescription) -> None:
     """No light reaches the sensor.
 
     Raises:
         CaptureError: when the frame is brighter than black level and dark current can make it.
     """
-    camera = rig.camera
-    above_DN = float(np.median(frame.data)) - camera.black_DN.value - camera.black_DN.tolerance
-    # Half the sensor at 100 e-/s is more dark current than any camera within its specification shows.
-    allowed_e = _STRAY_E + 100.0 * frame.settings.exposure_s
-    if above_DN > allowed_e * camera.K_DN_per_e.value:
+    median = float(np.median(frame.data))
+    if median > dark_limit_DN(rig, frame.settings.exposure_s):
+        above_DN = median - rig.camera.black_DN.value - rig.camera.black_DN.tolerance
         raise CaptureError(
             f"Expected a dark frame, found it {above_DN:.0f} DN above the black level. "
             "Cap the lens, switch the panel off and close the blackout, then repeat the step."

@@ -60,6 +60,7 @@ def meter(camera: Camera, region: Region, plan: Metered, rig: RigDescription, st
     shortest, longest = rig.camera.min_exposure_s, rig.camera.max_exposure_s
     level_of = even_level if plan.signal == "even" else spot_level
     exposure = min(max(start_s or 30 * shortest, shortest), longest)
+    tried: set[float] = set()
     for _ in range(_MOST_TEST_FRAMES):
         frame = trial_frame(camera, region, float(exposure))
         exposure = frame.settings.exposure_s
@@ -74,11 +75,17 @@ def meter(camera: Camera, region: Region, plan: Metered, rig: RigDescription, st
         if abs(bounded / exposure - 1) < _CLOSE and level <= _CLIPPED:
             _refuse_dark(level, plan, exposure)
             return Exposed(exposure, frame)
-        if bounded == exposure:
+        if (
+            exposure in tried and level <= _CLIPPED
+        ):  # asked for another, the camera has none nearer: files, coarse steps
+            _refuse_dark(level, plan, exposure)
+            return Exposed(exposure, frame)
+        if bounded == exposure or exposure in tried:
             raise CaptureError(
                 f"Expected a signal below saturation, found it clipped at the shortest exposure of {exposure:.3g} s. "
                 "Dim the light or stop the lens down, then repeat the step."
             )
+        tried.add(exposure)
         exposure = bounded
     raise CaptureError(
         f"Expected a steady light, found that {_MOST_TEST_FRAMES} test frames did not settle on an exposure. "

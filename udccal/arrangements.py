@@ -6,6 +6,7 @@ Pixel positions follow docs/conventions.md: (0, 0) is the centre of the top-left
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -80,3 +81,24 @@ class Photograph:
 
 
 Arrangement = Dark | FlatLight | Led | Board | PanelPicture | Photograph
+
+
+@dataclass(frozen=True)
+class Occasion:
+    """What an arrangement is for: told to a person with it; a simulated world takes its clock and its chance from it.
+
+    ``number`` is the place of the step in the session, counted from 0.
+    """
+
+    step_id: str
+    number: int
+    instruction: str
+
+
+@runtime_checkable
+class Stage(Protocol):
+    """Puts things in front of the camera: a simulated world, or a person who follows an instruction."""
+
+    def arrange(self, arrangement: Arrangement, occasion: Occasion) -> None:
+        """Return once the arrangement stands."""
+        ...

@@ -25,6 +25,26 @@ class CameraError(UdccalError):
     """A camera refused a setting, timed out, or delivered something unusable."""
 
 
+class CameraTimeout(CameraError):
+    """A camera did not answer, or sent no frame, within the time allowed."""
+
+
+class CameraLost(CameraError):
+    """A camera was unplugged, lost power, or reset itself; open it again."""
+
+
+class CameraBusy(CameraError):
+    """A camera is held by another program, or its device node may not be opened by this user."""
+
+
+class CameraProtocolError(CameraError):
+    """A camera answered something that its standard does not allow."""
+
+
+class DisplayError(UdccalError):
+    """A picture could not be shown on the panel, pixel for pixel."""
+
+
 class CaptureError(UdccalError):
     """What the camera saw is not what a procedure's step needs."""
 

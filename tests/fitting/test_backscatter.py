@@ -20,7 +20,7 @@ from udccal.fitting.result import FitResult, FitStatus
 from udccal.models.backscatter import Backscatter, backscatter_rate
 from udccal.models.geometry import Geometry
 from udccal.rig import RigDescription, load_rig
-from udccal.sessions.averaging import AveragedFrames
+from udccal.sessions.captured import AveragedFrames
 from udccal.sessions.schema import DarkSubject
 from udccal.sessions.store import Session
 from udccal.sessions.writer import SessionWriter

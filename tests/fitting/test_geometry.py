@@ -18,7 +18,7 @@ from udccal.fitting.nominal import nominal_geometry
 from udccal.fitting.result import FitResult, FitStatus
 from udccal.models.geometry import Geometry, mounting_rotation, project_directions, rotation_matrix
 from udccal.rig import load_rig
-from udccal.sessions.averaging import AveragedFrames
+from udccal.sessions.captured import AveragedFrames
 from udccal.sessions.schema import BoardSubject
 from udccal.sessions.store import Session
 from udccal.sessions.writer import SessionWriter

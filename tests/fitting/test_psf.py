@@ -27,6 +27,7 @@ from udccal.models.psf import PsfField, psf_kernels
 from udccal.models.wire import Wire
 from udccal.numerics import in_float64
 from udccal.rig import RigDescription, load_rig
+from udccal.sessions.captured import SingleFrame
 from udccal.sessions.schema import LedSubject
 from udccal.sessions.store import Session
 from udccal.sessions.writer import SessionWriter
@@ -198,7 +199,8 @@ def session_of(folder: Path, level_DN: int, places: int = 6) -> Session:
             data = 64.0 + rng.normal(0, 2, (64, 48))
             data[30:34, 22:26] += level_DN * exposure / 1e-4
             settings = Settings(exposure, 0.0, region)
-            frames.append(Frame(np.clip(data.round(), 0, 4095).astype(np.uint16), settings, 0.0, 0, True))
+            frame = Frame(np.clip(data.round(), 0, 4095).astype(np.uint16), settings, 0.0, 0, True)
+            frames.append(SingleFrame(frame))
         subject = LedSubject(x_px=region.x + 23.5, y_px=region.y + 31.5, distance_mm=2000.0, diameter_mm=2.3)
         writer.add_step(f"psf/p{place:02d}_s0", "psf", subject, frames)
     return Session.open(folder)

@@ -18,7 +18,7 @@ from udccal.fitting.wire_select import select
 from udccal.models.geometry import Geometry
 from udccal.models.wire import Wire, wire_map
 from udccal.rig import load_rig
-from udccal.sessions.averaging import AveragedFrames
+from udccal.sessions.captured import AveragedFrames
 from udccal.sessions.schema import DarkSubject, FlatSubject
 from udccal.sessions.store import Session
 from udccal.sessions.writer import SessionWriter

@@ -14,9 +14,10 @@ from procedures.plans import TimesThatOf
 from procedures.psf import PsfProcedure
 from procedures.wire import WireProcedure
 from tests.procedures.benches import new_writer, simulated_bench, small_rig
-from udccal.arrangements import Arrangement, Dark
+from udccal.arrangements import Arrangement, Dark, Occasion
 from udccal.errors import CaptureError
 from udccal.sessions.store import Session
+from udccal.sessions.writer import SessionWriter
 from udccal.simulation.disturbances import Disturbances
 
 
@@ -26,8 +27,8 @@ class DarkStage:
     def __init__(self, bench: Bench) -> None:
         self.bench = bench
 
-    def arrange(self, arrangement: Arrangement) -> None:
-        self.bench.stage.arrange(Dark())
+    def arrange(self, arrangement: Arrangement, occasion: Occasion) -> None:
+        self.bench.stage.arrange(Dark(), occasion)
 
 
 def test_noise_and_wire_run_unattended(tmp_path: Path) -> None:
@@ -80,7 +81,9 @@ def test_resuming_captures_only_what_is_missing(tmp_path: Path) -> None:
             run_procedure(WireProcedure(), bench, writer, stop_at_dark)
         before = Session.open(tmp_path).manifest.steps
         assert [step.id for step in before] == ["wire/flat"]
-        run_procedure(WireProcedure(), bench, writer.resume(tmp_path))
+        writer.close()
+        with SessionWriter.resume(tmp_path) as again:
+            run_procedure(WireProcedure(), bench, again)
     after = Session.open(tmp_path).manifest.steps
     assert after[0] == before[0]
     assert after[1].captures[0].exposure_s == before[0].captures[0].exposure_s
@@ -111,7 +114,7 @@ def test_no_light_where_a_flat_should_be_is_refused_and_nothing_is_stored(tmp_pa
         writer = new_writer(tmp_path, rig, bench)
         with pytest.raises(CaptureError, match=r"Step wire/flat: Expected to see the light, found only"):
             run_procedure(WireProcedure(), replace(bench, stage=DarkStage(bench)), writer)
-    assert [item.name for item in tmp_path.iterdir()] == ["session.json"]
+    assert {item.name for item in tmp_path.iterdir()} == {"session.json", ".session.lock"}
 
 
 def test_another_camera_than_the_rigs_is_refused(tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ import pytest
 
 from procedures.metering import meter, spot_level, trial_frame
 from procedures.plans import Metered
-from udccal.cameras.protocol import CameraIdentity, Frame, Region, Settings
+from udccal.cameras.protocol import CameraIdentity, Counts, Features, Frame, Mode, Range, Region, Settings, Trigger
 from udccal.errors import CaptureError
 from udccal.rig import load_rig
 
@@ -25,12 +25,19 @@ class Scripted:
         self.taken: list[float] = []
         self.identity = CameraIdentity("a", "b", "c", "d")
         self.sensor, self.cfa, self.bits = REGION, "RGGB", 12
+        self.mode, self.counts = Mode("BayerRG12"), Counts()
+        limits = Range(RIG.camera.min_exposure_s, RIG.camera.max_exposure_s)
+        free = (Trigger.FREE_RUN,)
+        self.features = Features(limits, Range(0.0, 0.0), Range(1.0, 120.0), ("BayerRG12",), free, (2, 2, 2, 2))
 
     def __enter__(self) -> Scripted:
         return self
 
     def __exit__(self, kind, error, trace) -> None:
         pass
+
+    def set_mode(self, mode: Mode) -> Mode:
+        return self.mode
 
     def configure(self, settings: Settings) -> Settings:
         self.settings = settings
@@ -103,3 +110,21 @@ def test_a_dim_light_is_taken_at_the_longest_exposure() -> None:
 def test_torn_frames_are_refused() -> None:
     with pytest.raises(CaptureError, match="complete test frame"):
         trial_frame(Scripted(np.zeros((24, 32)), complete=False), REGION, 0.1)
+
+
+class OneExposure(Scripted):
+    """As files are: whatever is asked for, there is one exposure."""
+
+    def configure(self, settings: Settings) -> Settings:
+        self.settings = Settings(0.02, 0.0, settings.region)
+        return self.settings
+
+
+def test_a_camera_with_one_exposure_is_taken_as_it_is_unless_it_clips_or_shows_nothing() -> None:
+    rate = 0.4 * 11000 / 0.02
+    exposed = meter(OneExposure(np.full((24, 32), rate)), REGION, Metered(0.65), RIG)
+    assert exposed.exposure_s == 0.02
+    with pytest.raises(CaptureError, match="clipped"):
+        meter(OneExposure(np.full((24, 32), 1e9)), REGION, Metered(0.65), RIG)
+    with pytest.raises(CaptureError, match="Expected to see the light"):
+        meter(OneExposure(np.full((24, 32), 1e4)), REGION, Metered(0.65), RIG)

@@ -12,7 +12,7 @@ from udccal.errors import SessionError
 from udccal.io.exr import write_exr
 from udccal.io.hashing import sha256_file
 from udccal.rig import load_rig
-from udccal.sessions.averaging import AveragedFrames
+from udccal.sessions.captured import AveragedFrames, SingleFrame
 from udccal.sessions.schema import DarkSubject, FlatSubject
 from udccal.sessions.store import Session
 from udccal.sessions.writer import SessionWriter
@@ -23,9 +23,9 @@ RIG = load_rig("lg55-reduced")
 NESTED = "[" * 100_000
 
 
-def frame(seed: int = 0) -> Frame:
+def frame(seed: int = 0) -> SingleFrame:
     data = np.random.default_rng(seed).integers(0, 4096, (24, 32)).astype(np.uint16)
-    return Frame(data, SETTINGS, 1.5, 7, True)
+    return SingleFrame(Frame(data, SETTINGS, 1.5, 7, True))
 
 
 def average() -> AveragedFrames:
@@ -44,12 +44,14 @@ def folder(tmp_path: Path) -> Path:
     picture[..., 1] = 9
     shown = writer.store_picture("backscatter/picture_0", picture, "picture")
     writer.add_step("backscatter/picture_0", "backscatter", shown, [average()])
+    writer.close()
     return path
 
 
 def edit(folder: Path, change: Callable[[dict], None]) -> None:
     file = folder / "session.json"
     content = json.loads(file.read_text())
+    del content["manifest_sha256"]  # as a person would who edits it
     change(content)
     file.write_text(json.dumps(content))
 
@@ -57,7 +59,7 @@ def edit(folder: Path, change: Callable[[dict], None]) -> None:
 def test_what_was_written_is_read(folder: Path) -> None:
     session = Session.open(folder)
     (dark,) = session.steps("noise")
-    np.testing.assert_array_equal(session.frame(dark.captures[1]), frame(1).data)
+    np.testing.assert_array_equal(session.frame(dark.captures[1]), frame(1).frame.data)
     found = session.average(session.step("wire/flat").captures[0])
     np.testing.assert_array_equal(found.mean, average().mean)
     np.testing.assert_array_equal(found.variance, average().variance)

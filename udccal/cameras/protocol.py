@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import enum
 from collections.abc import Iterator
 from dataclasses import dataclass
 from types import TracebackType
@@ -31,9 +32,31 @@ class Region:
     rows: int
 
 
+class Trigger(enum.StrEnum):
+    """What starts an exposure."""
+
+    FREE_RUN = "free-run"  # the camera's own clock
+    SOFTWARE = "software"  # the driver, each time a frame is asked for: nothing is exposed before
+    EXTERNAL = "external"  # a signal at the camera's trigger input
+
+
+@dataclass(frozen=True)
+class Mode:
+    """How a camera works, chosen once for a session.
+
+    Attributes:
+        pixel_format: name after the GenICam Pixel Format Naming Convention, e.g. ``BayerRG12p``.
+        frame_rate_hz: of a free-running camera; None for the fastest that exposure and link allow.
+    """
+
+    pixel_format: str
+    frame_rate_hz: float | None = None
+    trigger: Trigger = Trigger.FREE_RUN
+
+
 @dataclass(frozen=True)
 class Settings:
-    """What the camera is asked to do, or what it accepted."""
+    """What a camera is asked to do for the next frames, or what it accepted."""
 
     exposure_s: float
     gain_dB: float
@@ -41,8 +64,48 @@ class Settings:
 
 
 @dataclass(frozen=True)
+class Range:
+    """Bounds, both included."""
+
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class Features:
+    """What a camera can do.
+
+    Attributes:
+        region_steps: (x, y, columns, rows) of a region are multiples of these; all even, so that the CFA pattern of
+            a region is the sensor's own.
+    """
+
+    exposure_s: Range
+    gain_dB: Range
+    frame_rate_hz: Range
+    pixel_formats: tuple[str, ...]
+    triggers: tuple[Trigger, ...]
+    region_steps: tuple[int, int, int, int]
+
+
+@dataclass(frozen=True)
+class Counts:
+    """Frames since the camera was opened: handed out (incomplete ones among them), incomplete, and never arrived."""
+
+    delivered: int = 0
+    incomplete: int = 0
+    dropped: int = 0
+
+
+@dataclass(frozen=True)
 class Frame:
-    """One frame with the settings it was really taken with; ``data`` is the caller's own copy, in DN."""
+    """One frame with the settings it was really taken with; ``data`` is the caller's own copy, in DN.
+
+    Attributes:
+        timestamp_s: start of the exposure on the camera's clock.
+        frame_id: the camera's own count; a gap is a frame that never arrived.
+        complete: False when samples are missing; those are 0.
+    """
 
     data: UInt16[np.ndarray, "rows columns"]
     settings: Settings
@@ -53,7 +116,7 @@ class Frame:
 
 @runtime_checkable
 class Camera(Protocol):
-    """A source of raw mosaics, used as a context manager."""
+    """A source of raw mosaics, used as a context manager; everything but ``identity`` needs it open."""
 
     @property
     def identity(self) -> CameraIdentity: ...
@@ -65,12 +128,27 @@ class Camera(Protocol):
 
     @property
     def cfa(self) -> str:
-        """CFA pattern of the whole sensor's top-left 2 x 2, e.g. ``RGGB``."""
+        """CFA pattern of the whole sensor's top-left 2 x 2, e.g. ``RGGB``; ``mono`` without one."""
         ...
 
     @property
     def bits(self) -> int:
-        """Bits per sample."""
+        """Bits per sample in the present mode."""
+        ...
+
+    @property
+    def features(self) -> Features:
+        """What the camera can do in the present mode."""
+        ...
+
+    @property
+    def mode(self) -> Mode:
+        """How it works now."""
+        ...
+
+    @property
+    def counts(self) -> Counts:
+        """Frames since it was opened."""
         ...
 
     def __enter__(self) -> Camera: ...
@@ -79,10 +157,20 @@ class Camera(Protocol):
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None: ...
 
+    def set_mode(self, mode: Mode) -> Mode:
+        """Ask for a mode; returns what the device accepted, read back. Raises CameraError when it refuses."""
+        ...
+
     def configure(self, settings: Settings) -> Settings:
-        """Ask for settings; returns what the device accepted. Raises CameraError when it refuses."""
+        """Ask for settings; returns what the device accepted, read back. Raises CameraError when it refuses."""
         ...
 
     def frames(self, count: int) -> Iterator[Frame]:
-        """Deliver ``count`` frames one at a time. Raises CameraError on a time-out."""
+        """Deliver ``count`` frames one at a time, incomplete ones among them and marked.
+
+        Raises:
+            CameraTimeout: when none comes within the exposure and the camera's time-out.
+            CameraLost: when the camera is no longer there.
+            CameraError: when it is not open, or stops in another way.
+        """
         ...

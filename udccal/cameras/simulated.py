@@ -5,18 +5,23 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
 from types import TracebackType
 from typing import final
 
 import numpy as np
 from jaxtyping import Float
 
-from udccal.cameras.protocol import CameraIdentity, Frame, Region, Settings
-from udccal.errors import CameraError
+from udccal.cameras.checks import check_mode, check_settings, not_open, superseded
+from udccal.cameras.faults import CameraFaults
+from udccal.cameras.format_names import unpacked_format_name
+from udccal.cameras.protocol import CameraIdentity, Counts, Features, Frame, Mode, Range, Region, Settings, Trigger
+from udccal.errors import CameraLost, CameraTimeout
 from udccal.simulation.world import SimulatedWorld
 
-_GAIN_DB = (0.0, 24.0)
-_MIN_REGION = 2
+_GAIN_DB = Range(0.0, 24.0)
+_SLOWEST_HZ = 0.01
+_STEPS = (2, 2, 2, 2)
 _DEFAULT_EXPOSURE_S = 8e-3
 # Frames are developed ahead on as many threads; their noise is seeded per frame, so that this changes nothing.
 _THREADS = 2
@@ -24,15 +29,23 @@ _THREADS = 2
 
 @final
 class SimulatedCamera:
-    """Implements ``udccal.cameras.protocol.Camera`` on a simulated world."""
+    """Implements ``udccal.cameras.protocol.Camera`` on a simulated world, whose clock its frames move on."""
 
-    def __init__(self, world: SimulatedWorld) -> None:
+    def __init__(self, world: SimulatedWorld, faults: CameraFaults | None = None) -> None:
         camera = world.truth.description.camera
         self._world = world
         self._camera = camera
+        self._faults = faults or CameraFaults()
         self._open = False
+        self._lost = False
+        self._stream = 0
+        self._counts = Counts()
+        self._next_id: int | None = None
+        self._handed_out = 0
+        self._last: Frame | None = None
         exposure = min(max(_DEFAULT_EXPOSURE_S, camera.min_exposure_s), camera.max_exposure_s)
         self._settings = Settings(exposure, 0.0, self.sensor)
+        self._mode = Mode(unpacked_format_name(camera.cfa, camera.bits))
 
     @property
     def identity(self) -> CameraIdentity:
@@ -54,51 +67,99 @@ class SimulatedCamera:
         """Bits per sample."""
         return self._camera.bits
 
+    @property
+    def features(self) -> Features:
+        """What the rig's camera can do; its one pixel format is that of the rig description."""
+        camera = self._camera
+        return Features(
+            exposure_s=Range(camera.min_exposure_s, camera.max_exposure_s),
+            gain_dB=_GAIN_DB,
+            frame_rate_hz=Range(min(_SLOWEST_HZ, camera.frame_rate_hz), camera.frame_rate_hz),
+            pixel_formats=(unpacked_format_name(camera.cfa, camera.bits),),
+            triggers=(Trigger.FREE_RUN, Trigger.SOFTWARE),
+            region_steps=_STEPS,
+        )
+
+    @property
+    def mode(self) -> Mode:
+        """How it works now."""
+        return self._mode
+
+    @property
+    def counts(self) -> Counts:
+        """Frames since it was opened; dropped are those that the world's disturbances or a fault took."""
+        return self._counts
+
     def __enter__(self) -> SimulatedCamera:
-        self._open = True
+        self._open, self._lost = True, False
+        self._counts, self._next_id, self._last = Counts(), None, None
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._open = False
+        self._stream += 1
+
+    def set_mode(self, mode: Mode) -> Mode:
+        """Accept a mode as it is; the frame rate paces the simulated clock, not the wall's.
+
+        Raises:
+            CameraError: when the camera does not have it, or is closed or gone.
+        """
+        self._check_open()
+        check_mode(mode, self.features)
+        self._mode = mode
+        return mode
 
     def configure(self, settings: Settings) -> Settings:
         """Accept settings as they are.
 
         Raises:
-            CameraError: when one is outside what the camera can do.
+            CameraError: when one is outside what the camera can do, or the camera is closed or gone.
         """
-        self._check_range("an exposure", settings.exposure_s, self._camera.min_exposure_s, self._camera.max_exposure_s)
-        self._check_range("a gain", settings.gain_dB, *_GAIN_DB)
-        self._check_region(settings.region)
+        self._check_open()
+        check_settings(settings, self.features, self.sensor)
         self._settings = settings
         return settings
 
     def frames(self, count: int) -> Iterator[Frame]:
         """Deliver ``count`` frames with the present settings and whatever is arranged when each is exposed.
 
-        Raises:
-            CameraError: when the camera is not open.
-        """
-        if not self._open:
-            raise CameraError("Expected an open camera, found it closed. Use it in a 'with' statement.")
-        return self._deliver(count)
+        Free-running, frames are exposed ahead of the one handed out; with the software trigger none is.
 
-    def _deliver(self, count: int) -> Iterator[Frame]:
+        Raises:
+            CameraError: when the camera is not open, or the stream is read on after it was closed.
+            CameraTimeout, CameraLost: as the faults say.
+        """
+        self._check_open()
+        self._stream += 1
+        return self._deliver(count, self._stream)
+
+    def _check_open(self) -> None:
+        if self._lost:
+            raise CameraLost("Expected the simulated camera, found it unplugged. Plug it in and open it again.")
+        if not self._open:
+            raise not_open()
+
+    def _deliver(self, count: int, stream: int) -> Iterator[Frame]:
         waiting: deque[Future[Frame]] = deque()
+        ahead = 0 if self._mode.trigger is Trigger.SOFTWARE else _THREADS
         with ThreadPoolExecutor(_THREADS) as pool:
-            for _ in range(count):
-                waiting.append(self._expose(pool))
-                if len(waiting) > _THREADS:
-                    yield waiting.popleft().result()
-            while waiting:
-                yield waiting.popleft().result()
+            for left in range(count, 0, -1):
+                if self._stream != stream:
+                    raise superseded()
+                while len(waiting) < min(ahead + 1, left):
+                    waiting.append(self._expose(pool))
+                yield self._hand_out(waiting.popleft())
 
     def _expose(self, pool: ThreadPoolExecutor) -> Future[Frame]:
         settings = self._settings
-        period_s = max(1.0 / self._camera.frame_rate_hz, settings.exposure_s)
-        frame_id, timestamp_s = self._world.next_frame(period_s)
+        rate_hz = self._mode.frame_rate_hz or self._camera.frame_rate_hz
+        frame_id, timestamp_s = self._world.next_frame(max(1.0 / rate_hz, settings.exposure_s))
+        if self._next_id is not None:
+            self._count(dropped=frame_id - self._next_id)
+        self._next_id = frame_id + 1
         rate = self._world.rate_during(settings, timestamp_s)
         return pool.submit(self._develop, rate, settings, timestamp_s, frame_id)
 
@@ -108,16 +169,34 @@ class SimulatedCamera:
         data = self._world.develop(rate, settings, frame_id)
         return Frame(data, settings, timestamp_s, frame_id, complete=True)
 
-    def _check_range(self, what: str, value: float, low: float, high: float) -> None:
-        if not low <= value <= high:
-            raise CameraError(f"Expected {what} from {low:g} to {high:g}, found {value:g}. Ask for one in that range.")
+    def _hand_out(self, developed: Future[Frame]) -> Frame:
+        """The frame as it comes over a link with faults."""
+        number, self._handed_out = self._handed_out, self._handed_out + 1
+        faults = self._faults
+        if number == faults.unplug_at_frame:
+            self._lost = True
+            self._check_open()
+        if number == faults.time_out_at_frame:
+            self._count(dropped=1)
+            raise CameraTimeout(f"Expected frame {number} of the simulated camera, found none in time. Ask again.")
+        frame = developed.result()
+        if faults.repeats(number) and self._last is not None:
+            self._count(dropped=1)
+            frame = replace(self._last, data=self._last.data.copy())
+        elif faults.cuts(number):
+            frame = _cut(frame)
+        self._count(delivered=1, incomplete=0 if frame.complete else 1)
+        if faults.repeat_every:
+            self._last = replace(frame, data=frame.data.copy())
+        return frame
 
-    def _check_region(self, region: Region) -> None:
-        even = all(v % 2 == 0 for v in (region.x, region.y, region.columns, region.rows))
-        starts = region.x >= 0 and region.y >= 0 and min(region.columns, region.rows) >= _MIN_REGION
-        ends = region.x + region.columns <= self._camera.columns and region.y + region.rows <= self._camera.rows
-        if not (even and starts and ends):
-            raise CameraError(
-                f"Expected a region on even coordinates inside {self._camera.columns} x {self._camera.rows} pixels, "
-                f"found {region.columns} x {region.rows} at ({region.x}, {region.y}). Move or shrink it."
-            )
+    def _count(self, delivered: int = 0, incomplete: int = 0, dropped: int = 0) -> None:
+        counts = self._counts
+        self._counts = Counts(counts.delivered + delivered, counts.incomplete + incomplete, counts.dropped + dropped)
+
+
+def _cut(frame: Frame) -> Frame:
+    """The frame without its lower half."""
+    data = frame.data.copy()
+    data[len(data) // 2 :] = 0
+    return replace(frame, data=data, complete=False)

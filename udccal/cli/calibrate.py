@@ -3,17 +3,40 @@
 from __future__ import annotations
 
 import enum
-from typing import Annotated
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from udccal.cli.options import ProfilePath, RigName, Seed, SessionFolder
+from udccal.cli.output import Output
+
+if TYPE_CHECKING:
+    from udccal.cli.jobs.benches import CaptureBench
+    from udccal.rig import RigDescription
 
 
 class CameraKind(enum.StrEnum):
     """Which camera captures."""
 
     sim = "sim"
+    u3v = "u3v"
+    pylon = "pylon"
+
+
+class DisplayKind(enum.StrEnum):
+    """What shows pictures on the panel of a real rig."""
+
+    window = "window"
+    manual = "manual"
+
+
+class ExchangedPart(enum.StrEnum):
+    """What a person exchanged in the middle of a session."""
+
+    camera = "camera"
+    lens = "lens"
 
 
 class TermChoice(enum.StrEnum):
@@ -26,24 +49,69 @@ class TermChoice(enum.StrEnum):
     backscatter = "backscatter"
 
 
+_CAMERA_HELP = "sim: a simulated rig; u3v: any USB3 Vision camera; pylon: through Basler's SDK."
+_DISPLAY_HELP = "Of a real rig. window: full screen on --monitor; manual: you show the files you are told."
+
+
 def calibrate(
     context: typer.Context,
     rig: RigName,
     session: SessionFolder,
     profile: ProfilePath,
-    camera: Annotated[CameraKind, typer.Option("--camera", help="sim: a simulated rig.")] = CameraKind.sim,
+    camera: Annotated[CameraKind, typer.Option("--camera", help=_CAMERA_HELP)] = CameraKind.sim,
+    serial: Annotated[
+        str | None, typer.Option("--serial", help="Of the camera; needed if there are several.")
+    ] = None,
+    display: Annotated[DisplayKind, typer.Option("--display", help=_DISPLAY_HELP)] = DisplayKind.manual,
+    monitor: Annotated[int, typer.Option("--monitor", help="Number of the panel among the monitors; see doctor.")] = 0,
     seed: Seed = 0,
     term: Annotated[
         list[TermChoice] | None, typer.Option("--term", help="Capture this term only; may be given again.")
     ] = None,
+    exchanged: Annotated[
+        list[ExchangedPart] | None, typer.Option("--exchanged", help="What was exchanged since the session began.")
+    ] = None,
 ) -> None:
     """Capture every calibration step of a rig, then fit them. An interrupted session goes on where it stopped."""
-    from udccal.cli.jobs.capture import capture, simulated_rig
+    from udccal.cli.jobs.capture import capture
     from udccal.cli.jobs.fit import fit_to_profile
     from udccal.profiles.store import check_replaceable
     from udccal.rig import load_rig
+    from udccal.sessions.changes import Exchanged
 
+    output: Output = context.obj
     description = load_rig(rig)
     check_replaceable(profile)
-    capture(context.obj, description, simulated_rig(description, seed), session, [t.value for t in term or TermChoice])
-    fit_to_profile(context.obj, session, profile)
+    if camera is CameraKind.sim:
+        opened = _simulated(description, seed)
+    else:
+        opened = _real(output, description, camera, serial, display, monitor, session)
+    with opened as bench:
+        parts = {Exchanged(part.value) for part in exchanged or ()}
+        capture(output, description, bench, session, [t.value for t in term or TermChoice], parts)
+    fit_to_profile(output, session, profile)
+
+
+def _simulated(rig: RigDescription, seed: int) -> AbstractContextManager[CaptureBench]:
+    from udccal.cli.jobs.benches import simulated_bench, simulated_rig
+
+    return simulated_bench(simulated_rig(rig, seed))
+
+
+def _real(
+    output: Output,
+    rig: RigDescription,
+    camera: CameraKind,
+    serial: str | None,
+    display: DisplayKind,
+    monitor: int,
+    session: Path,
+) -> AbstractContextManager[CaptureBench]:
+    from udccal.cli.jobs import benches
+
+    seen = benches.u3v_camera(serial) if camera is CameraKind.u3v else benches.pylon_camera(serial)
+    if display is DisplayKind.window:
+        shown = benches.window_display(rig, monitor)
+    else:
+        shown = benches.manual_display(output, rig, session.with_name(f"{session.name}-pictures"))
+    return benches.real_bench(output, rig, seen, shown)

@@ -18,6 +18,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table as RichTable
 
+from udccal.errors import UdccalError
 from udccal.reports.tables import Table
 
 # Of tables that go to a file or a pipe.
@@ -56,11 +57,32 @@ class Output:
 
     def __post_init__(self) -> None:
         self._people = Console(stderr=True)
+        self._bar: Progress | None = None
         self._standard = Console(width=None if sys.stdout.isatty() else _FILE_WIDTH)
 
     def say(self, sentence: str) -> None:
         """A sentence for the person watching, on standard error."""
         self._people.print(sentence, highlight=False, markup=False, soft_wrap=True)
+
+    def ask(self, question: str) -> str:
+        """Ask the person watching and wait for a line, however long it takes; the progress bar rests meanwhile.
+
+        Raises:
+            UdccalError: when nobody can answer, since standard input is closed.
+        """
+        if self._bar is not None:
+            self._bar.stop()
+        try:
+            self._people.print(question, end=" ", highlight=False, markup=False, soft_wrap=True)
+            return input()
+        except EOFError as error:
+            raise UdccalError(
+                f"Expected a person to answer '{question}', found that standard input is closed. Run the command in "
+                "a terminal; it goes on where it stopped."
+            ) from error
+        finally:
+            if self._bar is not None:
+                self._bar.start()
 
     def table(self, table: Table) -> None:
         """A table for people on standard output; nothing with ``--json``."""
@@ -91,7 +113,11 @@ class Output:
         )
         off = not self._people.is_terminal  # a file or pipe gets the times only
         with Progress(*columns, console=self._people, transient=True, disable=off) as bar:
-            yield Stage(bar, name)
+            self._bar = bar
+            try:
+                yield Stage(bar, name)
+            finally:
+                self._bar = None
         self.times.append(StageTime(name, time.perf_counter() - start))
         self.say(f"{name}: {self.times[-1].seconds:.1f} s")
 

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from types import TracebackType
 from typing import final
 
 import numpy as np
 from jaxtyping import UInt8
 
 from udccal.arrangements import Dark, PanelPicture
-from udccal.errors import CaptureError
+from udccal.displays.checked import check_picture
+from udccal.displays.protocol import PanelSize
 from udccal.simulation.world import SimulatedWorld
 
 
@@ -24,18 +26,27 @@ class SimulatedDisplay:
         self._world = world
         self.picture: UInt8[np.ndarray, "rows columns 3"] | None = None
 
+    @property
+    def size(self) -> PanelSize:
+        """Pixels of the simulated panel."""
+        panel = self._world.truth.description.panel
+        return PanelSize(panel.columns, panel.rows)
+
+    def __enter__(self) -> SimulatedDisplay:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Nothing to let go of: the world keeps what is arranged in it."""
+
     def show(self, picture: UInt8[np.ndarray, "rows columns 3"]) -> None:
         """Show an 8-bit RGB picture at the panel's own resolution.
 
         Raises:
-            CaptureError: when the picture is not of the panel's size.
+            DisplayError: when the picture is not 8-bit RGB of the panel's size.
         """
-        panel = self._world.truth.description.panel
-        if picture.shape[:2] != (panel.rows, panel.columns):
-            raise CaptureError(
-                f"Expected a picture of {panel.columns} x {panel.rows} pixels, found {picture.shape[1]} x "
-                f"{picture.shape[0]}. Resize it to the panel's resolution."
-            )
+        check_picture(picture, self.size)
         self.picture = picture.copy()
         self._world.arrange(PanelPicture(self.picture))
 
@@ -43,3 +54,6 @@ class SimulatedDisplay:
         """Show nothing."""
         self.picture = None
         self._world.arrange(Dark())
+
+    def check(self) -> None:
+        """Always true: nothing covers a simulated panel."""

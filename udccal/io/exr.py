@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -44,6 +46,7 @@ def write_exr(path: Path, channels: Mapping[str, Float[np.ndarray, "rows columns
     """Write named channels of one size as 32-bit floats, atomically and without loss.
 
     Raises:
+        OSError: when the disk is full or cannot be written to.
         FileFormatError: when there is nothing to write, sizes differ or are out of bounds, or a value is not finite.
     """
     planes = {name: np.ascontiguousarray(plane, dtype=np.float32) for name, plane in channels.items()}
@@ -57,7 +60,11 @@ def write_exr(path: Path, channels: Mapping[str, Float[np.ndarray, "rows columns
             raise FileFormatError(f"Expected finite numbers in channel '{name}' of {path}, found NaN or infinity.")
     header = {"compression": _COMPRESSION, "type": OpenEXR.scanlineimage}
     with atomic_path(path) as temporary, OpenEXR.File(header, planes) as file:
-        file.write(str(temporary))
+        try:
+            file.write(str(temporary))
+        except RuntimeError as error:
+            reason = _reason(error)
+            raise OSError(reason, os.strerror(reason)) from error
 
 
 def read_rgb_exr(path: Path) -> Float32[np.ndarray, "rows columns 3"]:
@@ -94,6 +101,12 @@ def _checked_channel_names(path: Path) -> list[str]:
     if any(channel.xSampling != 1 or channel.ySampling != 1 for channel in described):
         raise FileFormatError(_unreadable(path, "subsampled channels"))
     return [channel.name for channel in described]
+
+
+def _reason(error: RuntimeError) -> int:
+    """The library says in words only why a write failed."""
+    reasons = (errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EROFS)
+    return next((reason for reason in reasons if os.strerror(reason) in str(error)), errno.EIO)
 
 
 def _plane(pixels: np.ndarray) -> Float32[np.ndarray, "rows columns"]:

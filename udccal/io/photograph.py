@@ -11,6 +11,8 @@ from jaxtyping import Float
 from udccal.errors import FileFormatError
 from udccal.io.exr import read_rgb_exr
 from udccal.io.limits import check_size
+from udccal.io.picture_header import picture_size
+from udccal.io.png_chunks import SIGNATURE, png_fault
 
 _MAX_BYTES = 256 * 1024 * 1024
 
@@ -29,14 +31,24 @@ def read_photograph(path: Path, gamma: float = 2.2) -> Float[np.ndarray, "rows c
         return np.maximum(read_rgb_exr(path), 0.0)
     if path.stat().st_size > _MAX_BYTES:
         raise FileFormatError(f"Expected {path} to hold at most {_MAX_BYTES} bytes, found more. Use a smaller picture.")
-    encoded = np.frombuffer(path.read_bytes(), np.uint8)
-    picture = cv2.imdecode(encoded, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH) if encoded.size else None
-    if picture is None:
-        raise FileFormatError(f"Expected {path} to be a PNG, JPEG, Radiance or OpenEXR picture, found another kind.")
-    check_size(path, picture.shape[0], picture.shape[1], 3)
+    picture = _decoded(path, path.read_bytes())
     rgb = np.ascontiguousarray(picture[..., ::-1])
     if rgb.dtype == np.uint8:
         return (rgb.astype(np.float32) / 255.0) ** gamma
     if rgb.dtype == np.uint16:
         return (rgb.astype(np.float32) / 65535.0) ** gamma
     return np.maximum(rgb.astype(np.float32), 0.0)
+
+
+def _decoded(path: Path, content: bytes) -> np.ndarray:
+    """Blue, green and red, of a file whose header and frame were looked at first."""
+    size = picture_size(content)
+    if size is None:
+        raise FileFormatError(f"Expected {path} to be a PNG, JPEG, Radiance or OpenEXR picture, found another kind.")
+    check_size(path, *size, 3)
+    fault = png_fault(content) if content.startswith(SIGNATURE) else None
+    encoded = np.frombuffer(content, np.uint8)
+    picture = None if fault else cv2.imdecode(encoded, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
+    if picture is None:
+        raise FileFormatError(f"Expected {path} to be a whole picture, found {fault or 'damaged data'}. Copy it again.")
+    return picture

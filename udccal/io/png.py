@@ -13,9 +13,8 @@ from jaxtyping import UInt8, UInt16
 from udccal.errors import FileFormatError
 from udccal.io.atomic import write_atomically
 from udccal.io.limits import check_size
+from udccal.io.png_chunks import SIGNATURE, png_fault
 
-_SIGNATURE = b"\x89PNG\r\n\x1a\n"
-_END = b"IEND\xaeB`\x82"
 _GREY, _RGB = 0, 2
 # Neighbours in a mosaic differ by colour and noise: neither filters nor a search for repeats shrink it, they only cost
 # two thirds of the time. Level 1 shrinks pictures nearly as far as higher levels do.
@@ -77,24 +76,24 @@ def _read(path: Path, bits: int, colour: int, expected: str) -> np.ndarray:
             f"Expected {path} to be {expected}, found {header.bits} bits of colour type {header.colour}. "
             "Save it in that form."
         )
-    picture = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_UNCHANGED)
+    content = path.read_bytes()
+    fault = png_fault(content)
+    if fault is not None:
+        raise FileFormatError(f"Expected {path} to be a whole PNG file, found {fault}. Copy or capture it again.")
+    picture = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
     if picture is None:
         raise FileFormatError(f"Expected {path} to be {expected}, found damaged data. Copy or capture it again.")
     return picture
 
 
 def _checked_header(path: Path) -> _Header:
-    """The IHDR chunk, read and bounded before anything is decompressed, of a file that ends as a PNG must."""
+    """The IHDR chunk, read and bounded before the rest of the file is."""
     if not path.is_file():
         raise FileFormatError(f"Expected a PNG file at {path}, found none. Check the path.")
     with path.open("rb") as stream:
         start = stream.read(33)
-        stream.seek(max(0, path.stat().st_size - len(_END)))
-        end = stream.read()
-    if len(start) < 33 or not start.startswith(_SIGNATURE) or start[12:16] != b"IHDR":
+    if len(start) < 33 or not start.startswith(SIGNATURE) or start[12:16] != b"IHDR":
         raise FileFormatError(f"Expected {path} to be a PNG file, found other content. Check the file.")
-    if end != _END:  # decoders fill the missing part with zeros instead of refusing
-        raise FileFormatError(f"Expected {path} to be a whole PNG file, found it cut short. Copy or capture it again.")
     header = _Header(*struct.unpack(">IIBB", start[16:26]))
     check_size(path, header.rows, header.columns, 3 if header.colour == _RGB else 1)
     return header

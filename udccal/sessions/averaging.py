@@ -3,32 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from typing import final
 
+import cv2
 import numpy as np
 from jaxtyping import Float32, UInt16
 
-from udccal.cameras.protocol import Frame, Settings
+from udccal.cameras.protocol import Frame
 from udccal.errors import CaptureError
+from udccal.sessions.captured import AveragedFrames
 from udccal.sessions.frame_checks import FrameChecks
-from udccal.sessions.schema import Rejection
 
-MAX_FRAMES = 40_000  # (sum of 16-bit samples)^2 still fits 64 bits
+MAX_FRAMES = 40_000  # sums of 16-bit samples fit 32 bits, and (sum of samples)^2 fits 64
 _DELIVERIES = 8  # each asks only for what is still missing
-
-
-@dataclass(frozen=True)
-class AveragedFrames:
-    """Mean and unbiased variance of single frames in DN and DN^2, with what is needed to store them."""
-
-    mean: Float32[np.ndarray, "rows columns"]
-    variance: Float32[np.ndarray, "rows columns"]
-    frames: int
-    settings: Settings
-    first_timestamp_s: float
-    last_timestamp_s: float
-    rejected: tuple[Rejection, ...] = ()
 
 
 @final
@@ -37,14 +24,15 @@ class RunningMoments:
 
     def __init__(self, rows: int, columns: int) -> None:
         """Start empty for frames of this size."""
-        self._sum = np.zeros((rows, columns), np.int64)
-        self._squares = np.zeros((rows, columns), np.int64)
+        self._sum = np.zeros((rows, columns), np.uint32)
+        # Whole numbers below 2^53: floating point, for which OpenCV has a fast accumulator, holds them exactly.
+        self._squares = np.zeros((rows, columns), np.float64)
         self.frames = 0
 
     def add(self, data: UInt16[np.ndarray, "rows columns"]) -> None:
         """Take one frame in."""
-        self._sum += data
-        self._squares += np.multiply(data, data, dtype=np.uint32)
+        np.add(self._sum, data, out=self._sum)
+        cv2.accumulateSquare(data, self._squares)
         self.frames += 1
 
     def mean(self) -> Float32[np.ndarray, "rows columns"]:
@@ -54,7 +42,7 @@ class RunningMoments:
     def variance(self) -> Float32[np.ndarray, "rows columns"]:
         """Unbiased sample variance in DN^2; needs two frames."""
         count = self.frames
-        exact = count * self._squares - self._sum**2
+        exact = count * self._squares.astype(np.int64) - self._sum.astype(np.int64) ** 2
         return (exact / (count * (count - 1))).astype(np.float32)
 
 

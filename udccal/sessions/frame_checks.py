@@ -1,12 +1,16 @@
-"""Which frames of a steady scene are fit to be averaged: complete, of one setting, unclipped, and not flickering."""
+"""Which frames of a steady scene are fit to be averaged: complete, of one setting, unclipped, dark where they must be
+dark, as bright as the others, and showing the same thing."""
 
 from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from typing import final
 
+import cv2
 import numpy as np
+from jaxtyping import Float32, UInt16
 
 from udccal.cameras.protocol import Frame, Settings
 from udccal.sessions.schema import Rejection
@@ -17,6 +21,34 @@ _FEWEST = 4  # below this a median says nothing
 _SIGMAS = 8.0
 _FLOOR_RELATIVE = 2e-3
 _FLOOR_DN = 0.3
+# Motion, in patches of the frame: 3072 of them at full size, of which the largest of pure noise lies at 4 sigmas.
+_PATCH_PX = 32
+_FEWEST_PATCHES = 12
+_PATCH_SIGMAS = 10.0
+_PATCH_FLOOR_RELATIVE = 3e-3
+_PATCH_FLOOR_DN = 1.0
+
+
+@dataclass(frozen=True)
+class FrameLimits:
+    """What a good frame stays within, in DN.
+
+    Attributes:
+        max_saturated_fraction: of samples at ``saturation_DN`` or above; 1 where clipping is meant.
+        dark_DN: the median a dark frame may have; None where light is meant.
+    """
+
+    black_DN: float
+    saturation_DN: float
+    max_saturated_fraction: float = 1e-3
+    dark_DN: float | None = None
+
+
+@dataclass(frozen=True)
+class _Seen:
+    frame: Frame
+    mean: float
+    patches: Float32[np.ndarray, "down across"]
 
 
 @final
@@ -25,14 +57,18 @@ class FrameChecks:
 
     Flicker: a frame whose mean differs from the median of recent means by more than 8 robust sigmas (1.4826 MAD, not
     taken below 0.2 % of the signal or 0.3 DN) is left out. Fast flicker that all frames share stays in the variance.
+
+    Motion: a frame some patch of which (32 x 32 px), brightness divided out, differs from the mean of the frames before
+    by more than 10 times the usual spread of patches, 0.3 % of the signal and 1 DN is left out: something moved, passed
+    by, or changed in one place. Fewer than 12 patches are not judged.
     """
 
-    def __init__(self, black_DN: float, saturation_DN: float, max_saturated_fraction: float = 1e-3) -> None:
-        """Start a capture; more than ``max_saturated_fraction`` of samples at ``saturation_DN`` rejects a frame."""
-        self._black = black_DN
-        self._saturation = saturation_DN
-        self._max_saturated = max_saturated_fraction
-        self._means: deque[float] = deque(maxlen=_MEMORY)
+    def __init__(self, limits: FrameLimits) -> None:
+        """Start a capture."""
+        self._limits = limits
+        self._recent: deque[float] = deque(maxlen=_MEMORY)
+        self._patches: deque[Float32[np.ndarray, "down across"]] = deque(maxlen=_WARM_UP)
+        self._spreads: deque[float] = deque(maxlen=_MEMORY)
         self._settings: Settings | None = None
         self._reasons: Counter[str] = Counter()
         self._dropped = 0
@@ -51,26 +87,39 @@ class FrameChecks:
 
     def accepted(self, frames: Iterable[Frame], expected: int) -> Iterator[Frame]:
         """The usable ones among frames of one delivery of ``expected``; at most eight are held at a time."""
-        held: list[tuple[float, Frame]] = []
+        held: list[_Seen] = []
         warm_up = min(_WARM_UP, expected)
         last_id: int | None = None
         for frame in frames:
-            if last_id is not None and frame.frame_id > last_id + 1:
-                self._dropped += frame.frame_id - last_id - 1
+            reason = self._fault(frame, last_id)
             last_id = frame.frame_id
-            reason = self._fault(frame)
             if reason is not None:
                 self._reasons[reason] += 1
                 continue
-            mean = float(frame.data.mean())
-            if len(self._means) + len(held) + 1 < warm_up:
-                held.append((mean, frame))
+            seen = _Seen(frame, cv2.mean(frame.data)[0], _patch_means(frame.data))
+            if len(self._recent) + len(held) + 1 < warm_up:
+                held.append(seen)
                 continue
-            yield from self._steady([*held, (mean, frame)])
+            yield from self._steady([*held, seen])
             held = []
         yield from self._steady(held)
 
-    def _fault(self, frame: Frame) -> str | None:
+    def reject(self, reason: str) -> None:
+        """Count a frame that the caller leaves out for a reason of its own."""
+        self._reasons[reason] += 1
+
+    def fault(self, frame: Frame) -> str | None:
+        """Why a frame by itself is not fit to be stored, or None; counted."""
+        reason = self._fault(frame, None)
+        if reason is not None:
+            self._reasons[reason] += 1
+        return reason
+
+    def _fault(self, frame: Frame, last_id: int | None) -> str | None:
+        if last_id is not None:
+            if frame.frame_id <= last_id:
+                return "delivered twice"
+            self._dropped += frame.frame_id - last_id - 1
         if not frame.complete:
             return "incomplete"
         if self._settings is None:
@@ -78,21 +127,69 @@ class FrameChecks:
         region = frame.settings.region
         if frame.settings != self._settings or frame.data.shape != (region.rows, region.columns):
             return "settings changed"
-        if float(np.mean(frame.data >= self._saturation)) > self._max_saturated:
+        clipped = np.count_nonzero(frame.data >= self._limits.saturation_DN)
+        if clipped > self._limits.max_saturated_fraction * frame.data.size:
             return "saturated"
+        if self._limits.dark_DN is not None and _quick_median(frame.data) > self._limits.dark_DN:
+            return "light leak"
         return None
 
-    def _steady(self, candidates: list[tuple[float, Frame]]) -> Iterator[Frame]:
-        """Frames in line with the recent means; the candidates themselves count towards the yardstick."""
-        means = np.array([*self._means, *(mean for mean, _ in candidates)])
+    def _steady(self, candidates: list[_Seen]) -> Iterator[Frame]:
+        """Frames in line with those before; the candidates themselves count towards the yardstick."""
+        means = np.array([*self._recent, *(seen.mean for seen in candidates)])
         if means.size == 0:
             return
         middle = float(np.median(means))
         spread = 1.4826 * float(np.median(np.abs(means - middle)))
-        limit = max(_SIGMAS * spread, _FLOOR_RELATIVE * (middle - self._black), _FLOOR_DN)
-        for mean, frame in candidates:
-            if means.size >= _FEWEST and abs(mean - middle) > limit:
+        limit = max(_SIGMAS * spread, _FLOOR_RELATIVE * (middle - self._limits.black_DN), _FLOOR_DN)
+        judged = means.size >= _FEWEST
+        moved = self._moved(candidates, middle) if judged else [False] * len(candidates)
+        for seen, has_moved in zip(candidates, moved, strict=True):
+            if judged and abs(seen.mean - middle) > limit:
                 self._reasons["flicker"] += 1
-                continue
-            self._means.append(mean)
-            yield frame
+            elif has_moved:
+                self._reasons["motion"] += 1
+            else:
+                self._recent.append(seen.mean)
+                self._patches.append(seen.patches)
+                yield seen.frame
+
+    def _moved(self, candidates: list[_Seen], mean_DN: float) -> list[bool]:
+        """Whether some patch of each candidate changed against the frames before by more than patches usually do."""
+        reference = np.median([*self._patches, *(seen.patches for seen in candidates)], axis=0)
+        if reference.size < _FEWEST_PATCHES:
+            return [False] * len(candidates)
+        black = self._limits.black_DN
+        light = np.maximum(reference - black, 1.0)
+        brightness = [max(seen.mean - black, 1.0) / max(mean_DN - black, 1.0) for seen in candidates]
+        # Shot noise grows with the root of the light; its scale is what most frames show.
+        changes = [
+            (seen.patches - black - ratio * (reference - black)) / np.sqrt(light)
+            for seen, ratio in zip(candidates, brightness, strict=True)
+        ]
+        self._spreads.extend(1.4826 * float(np.median(np.abs(change))) for change in changes)
+        usual = float(np.median(self._spreads))
+        floor = (_PATCH_FLOOR_RELATIVE * light + _PATCH_FLOOR_DN) / np.sqrt(light)
+        limit = np.maximum(_PATCH_SIGMAS * usual, floor)
+        return [bool((np.abs(change) > limit).any()) for change in changes]
+
+
+def frames_agree(frames: Iterable[Frame], black_DN: float, tolerance: float) -> bool:
+    """Whether the mean light of frames of one scene and setting agrees within ``tolerance`` (relative), or 0.5 DN."""
+    means = [cv2.mean(frame.data)[0] - black_DN for frame in frames]
+    return max(means) - min(means) <= max(tolerance * max(means), 0.5)
+
+
+def _quick_median(data: UInt16[np.ndarray, "rows columns"]) -> float:
+    """Of every third row and column, which meets all sites of the pattern: a ninth of the time, and as good."""
+    return float(np.median(data[::3, ::3]))
+
+
+def _patch_means(data: UInt16[np.ndarray, "rows columns"]) -> Float32[np.ndarray, "down across"]:
+    """Means over patches of whole 2 x 2 cells; what is left over at the right and below is not looked at."""
+    side = max(2, min(_PATCH_PX, min(data.shape) // 8 * 2))
+    down, across = data.shape[0] // side, data.shape[1] // side
+    if min(down, across) < 1:
+        return np.zeros((0, 0), np.float32)
+    whole = data[: down * side, : across * side]
+    return cv2.resize(whole.astype(np.float32), (across, down), interpolation=cv2.INTER_AREA)

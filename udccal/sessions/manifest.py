@@ -2,36 +2,46 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
+import re
+import shutil
 from pathlib import Path
 
 from pydantic import ValidationError
 
 from udccal.errors import SessionError
-from udccal.io.atomic import write_atomically
+from udccal.io.atomic import atomic_path, write_atomically
 from udccal.sessions.schema import Manifest
 
 MANIFEST_NAME = "session.json"
+PREVIOUS_NAME = "session.previous.json"
 FORMAT = "udccal-session"
 VERSION = 1
 _MAX_BYTES = 64 * 1024 * 1024
+_BLANK = b"0" * 64  # stands for the manifest's own checksum while that is taken
+_SEAL = re.compile(rb'"manifest_sha256":\s*"([0-9a-f]{64})"')
 
 
-def read_manifest(folder: Path) -> Manifest:
+class NewerManifestError(SessionError):
+    """A manifest of a later version of udccal: whole, but not for this one."""
+
+
+def read_manifest(folder: Path, name: str = MANIFEST_NAME) -> Manifest:
     """Read and check the manifest of a session.
 
     Raises:
-        SessionError: when it is missing, too large, not JSON, of a newer version, or does not follow docs/session.md.
+        SessionError: when it is missing, too large, not JSON, of a newer version, changed after it was written, or
+            does not follow docs/session.md.
     """
-    file = folder / MANIFEST_NAME
+    file = folder / name
     if not file.is_file():
-        raise SessionError(
-            f"Expected a session with a {MANIFEST_NAME} at {folder}, found none. Check the path, or capture a session."
-        )
+        raise SessionError(f"Expected a session with a {name} at {folder}, found none. Check the path, or capture one.")
     size = file.stat().st_size
     if size > _MAX_BYTES:
         raise SessionError(f"Expected {file} to hold at most {_MAX_BYTES} bytes, found {size}. It is not a manifest.")
     content = file.read_bytes()
+    _check_seal(file, content)
     _check_version(file, content)
     try:
         return Manifest.model_validate_json(content, strict=True)
@@ -41,7 +51,30 @@ def read_manifest(folder: Path) -> Manifest:
 
 def write_manifest(folder: Path, manifest: Manifest) -> None:
     """Replace the manifest whole: a reader meets the old one or the new one, never half of either."""
-    write_atomically(folder / MANIFEST_NAME, manifest.model_dump_json(indent=1).encode() + b"\n")
+    blank = manifest.model_copy(update={"manifest_sha256": _BLANK.decode()})
+    content = blank.model_dump_json(indent=1).encode() + b"\n"
+    seal = hashlib.sha256(content).hexdigest().encode()
+    write_atomically(folder / MANIFEST_NAME, content.replace(_BLANK, seal, 1))
+
+
+def keep_previous(folder: Path) -> None:
+    """Copy the manifest as it stands, so that damage to the next one costs one step only."""
+    with atomic_path(folder / PREVIOUS_NAME) as temporary:
+        shutil.copyfile(folder / MANIFEST_NAME, temporary)
+
+
+def _check_seal(file: Path, content: bytes) -> None:
+    """A manifest with a checksum of its own has the bytes that were written; another program may write none."""
+    seal = _SEAL.search(content)
+    if seal is None:
+        return
+    start, end = seal.span(1)
+    if hashlib.sha256(content[:start] + _BLANK + content[end:]).hexdigest() != seal[1].decode():
+        raise SessionError(
+            f"Expected {file} to have the bytes that were written, found that its own checksum does not match: it was "
+            "changed or damaged. Capture again, which goes on from the copy kept before the last step; or, if you "
+            "edited it, remove the entry 'manifest_sha256'."
+        )
 
 
 def _check_version(file: Path, content: bytes) -> None:
@@ -54,7 +87,7 @@ def _check_version(file: Path, content: bytes) -> None:
         raise SessionError(f"Expected {file} to have the format '{FORMAT}', found another. Check the path.")
     version = found.get("version")
     if isinstance(version, int) and version > VERSION:
-        raise SessionError(
+        raise NewerManifestError(
             f"Expected {file} to have version {VERSION}, found the newer version {version}. Update udccal to read it."
         )
 

@@ -135,14 +135,25 @@ class StoredCamera(_Strict):
     backend: Annotated[str, Field(max_length=100)]
 
 
+class StoredChange(_Strict):
+    """The camera or the lens was exchanged, and a person said that the session shall go on all the same."""
+
+    what: Literal["camera", "lens"]
+    before: Annotated[str, Field(max_length=300)]
+    after: Annotated[str, Field(max_length=300)]
+    after_steps: Annotated[int, Field(ge=0)]
+
+
 class Manifest(_Strict):
     """The whole of ``session.json``."""
 
     format: Literal["udccal-session"]
     version: Literal[1]
+    manifest_sha256: Sha256 | None = None
     created_at: Annotated[str, Field(max_length=40)]
     rig: RigDescription
     camera: StoredCamera
+    changes: Annotated[tuple[StoredChange, ...], Field(max_length=100)] = ()
     steps: Annotated[tuple[StoredStep, ...], Field(max_length=20000)] = ()
 
     @model_validator(mode="after")

@@ -2,110 +2,175 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Sequence
+import errno
+from collections.abc import Callable, Iterator, Sequence, Set
+from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
+from types import TracebackType
 from typing import Literal, final
 
 import numpy as np
+from filelock import FileLock
 from jaxtyping import UInt8
 from pydantic import ValidationError
 
-from udccal.cameras.protocol import CameraIdentity, Frame, Region
+from udccal.cameras.protocol import CameraIdentity
 from udccal.errors import SessionError
-from udccal.io.exr import write_exr
-from udccal.io.hashing import sha256_file
-from udccal.io.png import write_png16, write_rgb8
 from udccal.rig import RigDescription
-from udccal.sessions.averaging import AveragedFrames
-from udccal.sessions.manifest import MANIFEST_NAME, read_manifest, write_manifest
-from udccal.sessions.schema import (
-    RELATIVE_PATH,
-    Manifest,
-    PanelSubject,
-    StoredCamera,
-    StoredCapture,
-    StoredRegion,
-    StoredStep,
-    Subject,
-    TermName,
+from udccal.sessions.captured import Capture
+from udccal.sessions.changes import Exchanged, admit, stored_camera
+from udccal.sessions.damage import Damage, find_damage, remove_leftovers
+from udccal.sessions.lock import LOCK_NAME, lock_session
+from udccal.sessions.manifest import (
+    MANIFEST_NAME,
+    PREVIOUS_NAME,
+    NewerManifestError,
+    keep_previous,
+    read_manifest,
+    write_manifest,
 )
+from udccal.sessions.placing import place_capture, place_picture
+from udccal.sessions.schema import Manifest, PanelSubject, StoredStep, Subject, TermName
+
+Now = Callable[[], datetime]
+
+
+def utc_now() -> datetime:
+    """The time of day; a simulated rig has its own."""
+    return datetime.now(UTC)
 
 
 @final
 class SessionWriter:
-    """Adds completed steps to a session on disk; the manifest on disk is true after every call.
+    """Adds completed steps to a session on disk, alone; the manifest on disk is true after every call.
 
-    Surviving a crash in the middle of a step, and telling its leftovers apart, has its place in ``resume``.
+    Whatever ends the process, and whenever, the session holds every step that ``add_step`` returned from, each once.
+    Use it as a context manager, or ``close`` it, to let others write to the session.
+
+    Attributes:
+        damage: files found missing or changed when the session was opened; their steps count as not captured.
+        recovered: the manifest itself was damaged, and the one before the last step was taken in its place.
     """
 
-    def __init__(self, path: Path, manifest: Manifest) -> None:
+    def __init__(
+        self, path: Path, manifest: Manifest, lock: FileLock, now: Now, damage: tuple[Damage, ...], recovered: bool
+    ) -> None:
         """Use ``create``, ``resume`` or ``create_or_resume``."""
         self.path = path
         self.manifest = manifest
+        self.damage = damage
+        self.recovered = recovered
+        self._lock = lock
+        self._now = now
+        self._invalid = {item.step_id for item in damage}
 
     @classmethod
-    def create(cls, path: str | Path, rig: RigDescription, camera: CameraIdentity) -> SessionWriter:
+    def create(cls, path: str | Path, rig: RigDescription, camera: CameraIdentity, now: Now = utc_now) -> SessionWriter:
         """Begin a session in a new or empty folder.
 
         Raises:
-            SessionError: when the folder holds anything.
+            SessionError: when the folder holds anything, cannot be written to, or another process begins one there.
         """
         folder = Path(path)
-        if (folder / MANIFEST_NAME).exists():
-            raise SessionError(f"Expected no session at {folder}, found one. Resume it, or choose another folder.")
-        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-            raise SessionError(
-                f"Expected {folder} to be a new or empty folder, found other content. Choose another folder."
+        _check_new(folder)
+        with _sentences("a session", folder):
+            folder.mkdir(parents=True, exist_ok=True)
+            lock = lock_session(folder)
+        try:
+            _check_new(folder)
+            manifest = Manifest(
+                format="udccal-session", version=1, created_at=_time(now), rig=rig, camera=stored_camera(camera)
             )
-        folder.mkdir(parents=True, exist_ok=True)
-        manifest = Manifest(
-            format="udccal-session", version=1, created_at=_now(), rig=rig, camera=_stored_camera(camera)
-        )
-        write_manifest(folder, manifest)
-        return cls(folder, manifest)
+            with _sentences("a session", folder):
+                write_manifest(folder, manifest)
+        except BaseException:
+            lock.release()
+            raise
+        return cls(folder, manifest, lock, now, (), recovered=False)
 
     @classmethod
-    def resume(cls, path: str | Path) -> SessionWriter:
-        """Go on with a session; steps that its manifest names count as completed.
+    def resume(cls, path: str | Path, now: Now = utc_now) -> SessionWriter:
+        """Go on with a session; steps that its manifest names and whose files are whole count as completed.
+
+        Every file is read and compared with its checksum. What a killed process left half-written is removed.
 
         Raises:
-            SessionError: when there is none, or its manifest does not follow docs/session.md.
+            SessionError: when there is none, another process writes to it, or its manifest does not follow
+                docs/session.md and no earlier one is left.
         """
         folder = Path(path)
-        return cls(folder, read_manifest(folder))
+        if not any((folder / name).is_file() for name in (MANIFEST_NAME, PREVIOUS_NAME)):
+            raise SessionError(f"Expected a session at {folder}, found none. Check the path, or begin one.")
+        lock = lock_session(folder)
+        try:
+            manifest, recovered = _read_or_recover(folder)
+            with _sentences("a session", folder):
+                remove_leftovers(folder)
+                damage = find_damage(folder, manifest)
+        except BaseException:
+            lock.release()
+            raise
+        return cls(folder, manifest, lock, now, damage, recovered)
 
     @classmethod
-    def create_or_resume(cls, path: str | Path, rig: RigDescription, camera: CameraIdentity) -> SessionWriter:
+    def create_or_resume(
+        cls,
+        path: str | Path,
+        rig: RigDescription,
+        camera: CameraIdentity,
+        accepted: Set[Exchanged] = frozenset(),
+        now: Now = utc_now,
+    ) -> SessionWriter:
         """Go on with the session in a folder if there is one of this rig and camera, else begin one.
 
+        Args:
+            path: the session's folder.
+            rig: as described now.
+            camera: the one at hand.
+            accepted: what a person exchanged on purpose since the session was begun.
+            now: the time of day.
+
         Raises:
-            SessionError: when the folder holds something else, or a session of another rig or camera.
+            SessionError: when the folder holds something else, or a session of another rig, camera or lens.
         """
-        if not (Path(path) / MANIFEST_NAME).exists():
-            return cls.create(path, rig, camera)
-        writer = cls.resume(path)
-        if writer.manifest.rig != rig:
-            raise SessionError(
-                f"Expected the session {path} to be of the rig '{rig.name}' as described now, found another one "
-                f"('{writer.manifest.rig.name}'). Begin a new session."
-            )
-        if writer.manifest.camera != _stored_camera(camera):
-            raise SessionError(
-                f"Expected the session {path} to be of camera {camera.model} {camera.serial}, found "
-                f"{writer.manifest.camera.model} {writer.manifest.camera.serial}. Begin a new session."
-            )
+        if not any((Path(path) / name).exists() for name in (MANIFEST_NAME, PREVIOUS_NAME)):
+            return cls.create(path, rig, camera, now)
+        writer = cls.resume(path, now)
+        try:
+            manifest = admit(writer.path, writer.manifest, rig, camera, accepted)
+            if manifest is not writer.manifest:
+                writer._write(manifest)
+        except BaseException:
+            writer.close()
+            raise
         return writer
+
+    def __enter__(self) -> SessionWriter:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Let others write to the session."""
+        self._lock.release()
 
     @property
     def completed_ids(self) -> frozenset[str]:
         """Ids of the steps that need not be captured again."""
-        return frozenset(step.id for step in self.manifest.steps)
+        return frozenset(step.id for step in self.manifest.steps) - self._invalid
 
     def step(self, step_id: str) -> StoredStep | None:
-        """A completed step, or None."""
+        """A step that was captured (its files may be damaged), or None."""
         return next((step for step in self.manifest.steps if step.id == step_id), None)
+
+    def number(self, step_id: str) -> int:
+        """The place of a step in the session, counted from 0: the one it has, or the next that is free."""
+        ids = [step.id for step in self.manifest.steps]
+        return ids.index(step_id) if step_id in ids else len(ids)
 
     def store_picture(
         self,
@@ -113,74 +178,93 @@ class SessionWriter:
         picture: UInt8[np.ndarray, "panel_rows panel_columns 3"],
         role: Literal["white", "picture", "brightened"],
     ) -> PanelSubject:
-        """Store what the panel shows during a step, before the step is added with the subject returned."""
-        name = f"{step_id}_shown.png"
-        write_rgb8(self._place(name), picture)
-        return PanelSubject(picture=name, picture_sha256=sha256_file(self.path / name), role=role)
-
-    def add_step(
-        self, step_id: str, term: TermName, subject: Subject, captures: Sequence[Frame | AveragedFrames]
-    ) -> StoredStep:
-        """Store a completed step's captures and name them in the manifest.
+        """Store what the panel shows during a step, before the step is added with the subject returned.
 
         Raises:
-            SessionError: when the step is there already, or does not fit docs/session.md.
+            SessionError: when the id does not fit docs/session.md, or the disk is full or cannot be written to.
+        """
+        with _sentences(f"the picture of the step '{step_id}'", self.path):
+            return place_picture(self.path, step_id, picture, role)
+
+    def add_step(self, step_id: str, term: TermName, subject: Subject, captures: Sequence[Capture]) -> StoredStep:
+        """Store a completed step's captures and name them in the manifest, in place of the step if it was damaged.
+
+        Raises:
+            SessionError: when the step is there already, does not fit docs/session.md, or the disk is full or cannot
+                be written to. The session stays as it was.
         """
         if step_id in self.completed_ids:
             raise SessionError(f"Expected a new step in {self.path}, found '{step_id}' captured already. Skip it.")
         try:
-            step = StoredStep(
-                id=step_id,
-                term=term,
-                subject=subject,
-                completed_at=_now(),
-                captures=tuple(self._store(f"{step_id}_{index}", capture) for index, capture in enumerate(captures)),
-            )
-            manifest = Manifest.model_validate(dict(self.manifest) | {"steps": (*self.manifest.steps, step)})
+            with _sentences(f"the step '{step_id}'", self.path):
+                step = StoredStep(
+                    id=step_id,
+                    term=term,
+                    subject=subject,
+                    completed_at=_time(self._now),
+                    captures=tuple(
+                        place_capture(self.path, f"{step_id}_{index}", capture)
+                        for index, capture in enumerate(captures)
+                    ),
+                )
+            manifest = Manifest.model_validate(dict(self.manifest) | {"steps": self._steps_with(step)})
         except ValidationError as error:
             raise SessionError(f"Expected the step '{step_id}' to fit docs/session.md, found: {error}") from error
-        write_manifest(self.path, manifest)
-        self.manifest = manifest
+        self._write(manifest)
+        self._invalid.discard(step_id)
         return step
 
-    def _store(self, stem: str, capture: Frame | AveragedFrames) -> StoredCapture:
-        settings = capture.settings
-        if isinstance(capture, AveragedFrames):
-            name, frames = f"{stem}.exr", capture.frames
-            first, last, rejected = capture.first_timestamp_s, capture.last_timestamp_s, capture.rejected
-            write_exr(self._place(name), {"mean": capture.mean, "variance": capture.variance})
-        else:
-            name, frames = f"{stem}.png", 1
-            first, last, rejected = capture.timestamp_s, capture.timestamp_s, ()
-            write_png16(self._place(name), capture.data)
-        return StoredCapture(
-            kind="average" if isinstance(capture, AveragedFrames) else "frame",
-            file=name,
-            sha256=sha256_file(self.path / name),
-            frames=frames,
-            exposure_s=settings.exposure_s,
-            gain_dB=settings.gain_dB,
-            region=_stored_region(settings.region),
-            first_timestamp_s=first,
-            last_timestamp_s=last,
-            rejected=rejected,
+    def _steps_with(self, step: StoredStep) -> tuple[StoredStep, ...]:
+        steps, number = self.manifest.steps, self.number(step.id)
+        return (*steps[:number], step, *steps[number + 1 :])
+
+    def _write(self, manifest: Manifest) -> None:
+        with _sentences("the manifest", self.path):
+            keep_previous(self.path)
+            write_manifest(self.path, manifest)
+        self.manifest = manifest
+
+
+def _check_new(folder: Path) -> None:
+    if (folder / MANIFEST_NAME).exists():
+        raise SessionError(f"Expected no session at {folder}, found one. Resume it, or choose another folder.")
+    if folder.exists() and (not folder.is_dir() or any(item.name != LOCK_NAME for item in folder.iterdir())):
+        raise SessionError(
+            f"Expected {folder} to be a new or empty folder, found other content. Choose another folder."
         )
 
-    def _place(self, name: str) -> Path:
-        if not re.fullmatch(RELATIVE_PATH, name):
-            raise SessionError(f"Expected a step id of letters, digits, '_', '-' and '/', found a file name '{name}'.")
-        file = self.path / name
-        file.parent.mkdir(parents=True, exist_ok=True)
-        return file
+
+def _read_or_recover(folder: Path) -> tuple[Manifest, bool]:
+    """The manifest, or if that is damaged the one before it, which then takes its place."""
+    try:
+        return read_manifest(folder), False
+    except NewerManifestError:
+        raise
+    except SessionError:
+        try:
+            manifest = read_manifest(folder, PREVIOUS_NAME)
+        except SessionError:
+            manifest = None
+        if manifest is None:
+            raise
+    with _sentences("the manifest", folder):
+        write_manifest(folder, manifest)
+    return manifest, True
 
 
-def _now() -> str:
-    return datetime.now(UTC).isoformat(timespec="seconds")
+@contextmanager
+def _sentences(what: str, folder: Path) -> Iterator[None]:
+    """Say what the operating system refused, and what to do."""
+    try:
+        yield
+    except OSError as error:
+        full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+        advice = "Free some space there" if full else "Check the disk, the folder and its permissions"
+        raise SessionError(
+            f"Expected to store {what} in {folder}, found: {error.strerror or error}. {advice}, then run the same "
+            "command again: completed steps are kept."
+        ) from error
 
 
-def _stored_camera(camera: CameraIdentity) -> StoredCamera:
-    return StoredCamera(vendor=camera.vendor, model=camera.model, serial=camera.serial, backend=camera.backend)
-
-
-def _stored_region(region: Region) -> StoredRegion:
-    return StoredRegion(x=region.x, y=region.y, columns=region.columns, rows=region.rows)
+def _time(now: Now) -> str:
+    return now().isoformat(timespec="seconds")

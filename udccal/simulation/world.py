@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
 from typing import final
 
 import numpy as np
 from jaxtyping import Float, Float64, UInt16
 
-from udccal.arrangements import Arrangement, Board, Dark, FlatLight, Led, PanelPicture, Photograph
+from udccal.arrangements import Arrangement, Board, Dark, FlatLight, Led, Occasion, PanelPicture, Photograph
 from udccal.cameras.protocol import Region, Settings
 from udccal.simulation.disturbances import Disturbances, knock
 from udccal.simulation.light import RigLight
@@ -16,6 +17,11 @@ from udccal.simulation.sensor import Sensor
 from udccal.simulation.truth import RigTruth
 
 _AIMING_ERROR_PX = 0.5
+# Each step of a session has a time and a stretch of noise of its own, so that the same steps give the same session
+# however often it was interrupted: no step takes an hour, nor a million frames.
+_STEP_S = 3600.0
+_STEP_FRAMES = 1_000_000
+_EPOCH = datetime(2000, 1, 1, tzinfo=UTC)
 
 
 @dataclass(frozen=True)
@@ -71,6 +77,7 @@ class SimulatedWorld:
         self._arrangement: Arrangement = Dark()
         self._rendered: _Rendered | None = None
         self._frames_begun = 0
+        self._noise_from = 0
         self._clock_s = 0.0
 
     @property
@@ -78,12 +85,19 @@ class SimulatedWorld:
         """The rig as it stands now (after a knock: as the knock left it)."""
         return self.light.truth
 
-    def arrange(self, arrangement: Arrangement) -> None:
-        """Put something in front of the camera, in place of what was there."""
+    def arrange(self, arrangement: Arrangement, occasion: Occasion | None = None) -> None:
+        """Put something in front of the camera, in place of what was there; an occasion sets clock and noise."""
+        if occasion is not None:
+            self._clock_s = (1 + occasion.number) * _STEP_S
+            self._noise_from = (1 + occasion.number) * _STEP_FRAMES - self._frames_begun
         self._arrangement, self._rendered, self._led = arrangement, None, None
         if isinstance(arrangement, Led):
             self._led = self._aim(arrangement)
             self.truth_log.append(self._led)
+
+    def now(self) -> datetime:
+        """The simulated time of day."""
+        return _EPOCH + timedelta(seconds=self._clock_s)
 
     def expected_rate(self, region: Region) -> Float64[np.ndarray, "rows columns"]:
         """Expected photo-electrons per second in ``region``, before noise and flicker; not to be written to."""
@@ -114,7 +128,8 @@ class SimulatedWorld:
         self, rate: Float[np.ndarray, "rows columns"], settings: Settings, frame_id: int
     ) -> UInt16[np.ndarray, "rows columns"]:
         """What the sensor makes of the light; the frame's number seeds its noise, so that order does not matter."""
-        rng = np.random.Generator(np.random.SFC64(np.random.SeedSequence([self.seed, 0xF2A3E, frame_id])))
+        index = self._noise_from + frame_id
+        rng = np.random.Generator(np.random.SFC64(np.random.SeedSequence([self.seed, 0xF2A3E, index])))
         return self.sensor.expose(rate, settings.exposure_s, settings.region, rng, settings.gain_dB)
 
     def _tick(self, period_s: float) -> None:

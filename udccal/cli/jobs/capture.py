@@ -2,37 +2,37 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 from pathlib import Path
 from typing import Any, get_args
 
-from udccal.cameras.simulated import SimulatedCamera
+from udccal.cli.jobs.benches import CaptureBench
 from udccal.cli.output import Output
-from udccal.displays.simulated import SimulatedDisplay
+from udccal.errors import CameraTimeout, CaptureError
 from udccal.plugins import find_procedure
 from udccal.rig import RigDescription
+from udccal.sessions.changes import Exchanged
 from udccal.sessions.schema import TermName
 from udccal.sessions.writer import SessionWriter
-from udccal.simulation.truth import draw_truth
-from udccal.simulation.world import SimulatedWorld
 
 
-def simulated_rig(rig: RigDescription, seed: int) -> SimulatedWorld:
-    """A simulated rig of that description; another seed is another specimen."""
-    return SimulatedWorld(draw_truth(rig, seed))
-
-
-def capture(output: Output, rig: RigDescription, world: SimulatedWorld, path: Path, terms: Sequence[TermName]) -> None:
-    """Capture the steps of the terms that the session does not hold yet, on a simulated rig.
+def capture(
+    output: Output,
+    rig: RigDescription,
+    bench: CaptureBench,
+    path: Path,
+    terms: Sequence[TermName],
+    exchanged: Set[Exchanged] = frozenset(),
+) -> None:
+    """Capture the steps of the terms that the session does not hold yet, or no longer whole.
 
     Raises:
         UdccalError: when a procedure is not installed.
         CaptureError: when the camera does not see what a step needs.
-        SessionError: when the folder holds another rig's session.
+        SessionError: when the folder holds another rig's or camera's session, or another process writes to it.
     """
-    with SimulatedCamera(world) as camera:
-        display = SimulatedDisplay(world)
-        writer = SessionWriter.create_or_resume(path, rig, camera.identity)
+    with SessionWriter.create_or_resume(path, rig, bench.camera.identity, exchanged, bench.now) as writer:
+        _say_damage(output, writer)
         for term in (name for name in get_args(TermName) if name in terms):
             with output.stage(f"capturing {term}") as stage:
                 procedure = find_procedure(term)()
@@ -40,4 +40,17 @@ def capture(output: Output, rig: RigDescription, world: SimulatedWorld, path: Pa
                 def progress(at: Any) -> None:
                     stage.update(at.done, at.total)
 
-                procedure.run(camera, display, world, writer, progress)
+                while True:
+                    try:
+                        procedure.run(bench.camera, bench.display, bench.stage, writer, progress)
+                        break
+                    except (CaptureError, CameraTimeout) as error:
+                        if not bench.try_again(str(error)):
+                            raise
+
+
+def _say_damage(output: Output, writer: SessionWriter) -> None:
+    if writer.recovered:
+        output.say("The session's manifest was damaged; going on from the copy kept before the last step.")
+    for damage in writer.damage:
+        output.say(f"Damaged: {damage}; that step is captured again.")

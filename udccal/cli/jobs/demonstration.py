@@ -11,7 +11,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from udccal.cli.jobs.capture import capture, simulated_rig
+from udccal.cli.jobs.benches import simulated_bench, simulated_rig
+from udccal.cli.jobs.capture import capture
 from udccal.cli.jobs.fit import UNSEEN_PICTURE, run_fits, show_status, store_profile
 from udccal.cli.jobs.scene import capture_photograph
 from udccal.cli.output import Output, StageTime
@@ -72,14 +73,14 @@ def demonstrate(output: Output, rig_name: str, out: Path, seed: int) -> None:
     with output.stage("simulated rig"):
         world = simulated_rig(rig, seed)
     panel_picture = face_picture(UNSEEN_PICTURE, rig.panel.columns, rig.panel.rows)
-    with ThreadPoolExecutor(1) as pool:
+    with ThreadPoolExecutor(1) as pool, simulated_bench(world) as bench:
         # Beside the captures: first what only the simulated world needs, then the fits of what has been captured, at
         # last the evidence of the report.
         pool.submit(lambda: (world.light.blur, world.light.backscatterer))
-        capture(output, rig, world, out / "session", _EARLY)
+        capture(output, rig, bench, out / "session", _EARLY)
         foundation = pool.submit(fit_foundation, Session.open(out / "session"), effort=QUICK)
         pool.submit(lambda: _prepare_kernels(rig, foundation.result()))
-        capture(output, rig, world, out / "session", [term for term in ORDER if term not in _EARLY])
+        capture(output, rig, bench, out / "session", [term for term in ORDER if term not in _EARLY])
         session = Session.open(out / "session")
         calibration = run_fits(output, session, QUICK, foundation.result())
         show_status(output, calibration)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from udccal.cli.jobs.capture import simulated_rig
+from udccal.cli.jobs.benches import simulated_rig
 from udccal.cli.jobs.panel_picture import read_panel_picture
 from udccal.cli.jobs.scene import CapturedScene, capture_photograph
 from udccal.cli.output import Output

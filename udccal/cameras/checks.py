@@ -1,0 +1,74 @@
+"""What every backend refuses, in the same words: settings and modes that a camera cannot do, and use while closed."""
+
+from __future__ import annotations
+
+from udccal.cameras.protocol import Features, Mode, Range, Region, Settings
+from udccal.errors import CameraError
+
+
+def check_settings(settings: Settings, features: Features, sensor: Region) -> None:
+    """Refuse an exposure, gain or region that a camera does not have; NaN is outside every range.
+
+    Raises:
+        CameraError: which says the bounds.
+    """
+    _check_range("an exposure in s", settings.exposure_s, features.exposure_s)
+    _check_range("a gain in dB", settings.gain_dB, features.gain_dB)
+    check_region(settings.region, sensor, features.region_steps)
+
+
+def check_region(region: Region, sensor: Region, steps: tuple[int, int, int, int]) -> None:
+    """Refuse a region that is empty, reaches beyond the sensor, or is not on its steps (x, y, columns, rows).
+
+    Raises:
+        CameraError: which says the sensor's size and the steps.
+    """
+    numbers = (region.x, region.y, region.columns, region.rows)
+    across = region.x >= 0 and region.columns > 0 and region.x + region.columns <= sensor.columns
+    down = region.y >= 0 and region.rows > 0 and region.y + region.rows <= sensor.rows
+    if not (across and down) or any(number % step for number, step in zip(numbers, steps, strict=True)):
+        raise CameraError(
+            f"Expected a region on even coordinates inside {sensor.columns} x {sensor.rows} pixels (x, y, columns and "
+            f"rows multiples of {', '.join(map(str, steps))}), found {region.columns} x {region.rows} at "
+            f"({region.x}, {region.y}). Move or shrink it."
+        )
+
+
+def check_mode(mode: Mode, features: Features) -> None:
+    """Refuse a pixel format, frame rate or trigger that a camera does not have.
+
+    Raises:
+        CameraError: which says what it has.
+    """
+    if mode.pixel_format not in features.pixel_formats:
+        raise CameraError(
+            f"Expected one of the camera's pixel formats {', '.join(features.pixel_formats)}, found "
+            f"{mode.pixel_format[:40]!r}. Choose one of these."
+        )
+    if mode.frame_rate_hz is not None:
+        _check_range("a frame rate in Hz", mode.frame_rate_hz, features.frame_rate_hz)
+    if mode.trigger not in features.triggers:
+        raise CameraError(
+            f"Expected a trigger that the camera has ({', '.join(features.triggers)}), found {mode.trigger}. "
+            "Choose one of these."
+        )
+
+
+def not_open() -> CameraError:
+    """The error of a camera that is used while closed."""
+    return CameraError("Expected an open camera, found it closed. Use it in a 'with' statement.")
+
+
+def superseded() -> CameraError:
+    """The error of a stream that is read on after its camera was closed, or after another stream was begun."""
+    return CameraError(
+        "Expected frames of the camera's present stream, found that it was closed or began another one. "
+        "Read one stream at a time, inside the 'with' statement."
+    )
+
+
+def _check_range(what: str, value: float, bounds: Range) -> None:
+    if not bounds.low <= value <= bounds.high:
+        raise CameraError(
+            f"Expected {what} from {bounds.low:g} to {bounds.high:g}, found {value:g}. Ask for one in that range."
+        )

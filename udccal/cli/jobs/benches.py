@@ -1,0 +1,95 @@
+"""What a capture works with: a camera, a display, and whoever puts things in front of the camera."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from udccal.arrangements import Stage
+from udccal.cameras.choice import mode_for
+from udccal.cameras.protocol import Camera
+from udccal.cameras.simulated import SimulatedCamera
+from udccal.cli.jobs.person import PersonStage
+from udccal.cli.output import Output
+from udccal.displays.mirrored import MirroredDisplay
+from udccal.displays.protocol import Display, PanelSize
+from udccal.displays.simulated import SimulatedDisplay
+from udccal.rig import RigDescription
+from udccal.sessions.writer import Now, utc_now
+from udccal.simulation.truth import draw_truth
+from udccal.simulation.world import SimulatedWorld
+
+
+@dataclass(frozen=True)
+class CaptureBench:
+    """An open camera, a display, a stage, the time of day there, and whether to repeat a step that was refused."""
+
+    camera: Camera
+    display: Display
+    stage: Stage
+    now: Now
+    try_again: Callable[[str], bool]
+
+
+def simulated_rig(rig: RigDescription, seed: int) -> SimulatedWorld:
+    """A simulated rig of that description; another seed is another specimen."""
+    return SimulatedWorld(draw_truth(rig, seed))
+
+
+@contextmanager
+def simulated_bench(world: SimulatedWorld) -> Iterator[CaptureBench]:
+    """Camera, display, stage and clock of a simulated world, where nothing gets better by trying again."""
+    with SimulatedCamera(world) as camera, SimulatedDisplay(world) as display:
+        yield CaptureBench(camera, display, world, world.now, lambda sentence: False)
+
+
+@contextmanager
+def real_bench(output: Output, rig: RigDescription, camera: Camera, display: Display) -> Iterator[CaptureBench]:
+    """A camera and a display of this world, and the person at the rig.
+
+    Raises:
+        CameraError: when the camera cannot be opened, or has no pixel format as the rig asks for.
+        DisplayError: when the display cannot be opened.
+    """
+    person = PersonStage(output)
+    with camera, display:
+        camera.set_mode(mode_for(camera.features, rig.camera.cfa, rig.camera.bits))
+        yield CaptureBench(camera, MirroredDisplay(display), person, utc_now, person.try_again)
+
+
+def u3v_camera(serial: str | None) -> Camera:
+    """The USB3 Vision camera of that serial number, or the only one."""
+    from udccal.cameras.u3v.camera import U3vCamera
+
+    return U3vCamera(serial)
+
+
+def pylon_camera(serial: str | None) -> Camera:
+    """The camera of that serial number that Basler's SDK sees, or the only one."""
+    from udccal.cameras.pylon import PylonCamera
+
+    return PylonCamera(serial)
+
+
+def panel_size(rig: RigDescription) -> PanelSize:
+    """Pixels of a rig's panel."""
+    return PanelSize(rig.panel.columns, rig.panel.rows)
+
+
+def window_display(rig: RigDescription, monitor: int) -> Display:
+    """A full-screen window on the monitor of that number."""
+    from udccal.displays.window import WindowDisplay
+
+    return WindowDisplay(monitor, panel_size(rig))
+
+
+def manual_display(output: Output, rig: RigDescription, folder: Path) -> Display:
+    """A panel that the person at the rig works, with the pictures in a folder."""
+    from udccal.displays.manual import ManualDisplay
+
+    def confirm(question: str) -> bool:
+        return output.ask(f"{question} (Enter for yes, n for no)").strip().lower() not in ("n", "no")
+
+    return ManualDisplay(folder, panel_size(rig), output.say, confirm)

@@ -1,0 +1,51 @@
+"""Whether the exposures of a bracket show one and the same light."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float64, UInt16
+
+from udccal.cameras.protocol import Frame
+from udccal.sessions.frame_checks import FrameLimits
+
+_SIGNAL_DN = 40.0  # above black: below, an uncertain black level and noise say more than the light
+_BELOW_SATURATION = 0.85
+_FEWEST_SAMPLES = 8
+_BRIGHTNESS = 0.1  # relative
+_PATTERN = 0.15  # relative, in the root of the mean square
+_PATTERN_CHI2 = 6.0
+_DN_PER_e = 1.0  # a gain that no camera at 0 dB exceeds: the noise is not taken too low
+_READ_DN = 3.0
+
+
+def bracket_fault(shorter: Frame, longer: Frame, limits: FrameLimits) -> str | None:
+    """Compare two exposures of a small light, where the longer one does not clip and the shorter one shows something.
+
+    Args:
+        shorter: a frame that was found good.
+        longer: the next one, of the same region.
+        limits: black and saturation level.
+
+    Returns:
+        ``"motion"`` where the light's pattern changed by more than 15 % and 6 times the variance of noise;
+        ``"flicker"`` where its brightness, exposure divided out, did by more than 10 %; None where it is the same or
+        nothing can be said.
+    """
+    ratio = longer.settings.exposure_s / shorter.settings.exposure_s
+    before, after = _light(shorter.data), _light(longer.data)
+    useful = (longer.data < _BELOW_SATURATION * limits.saturation_DN) & (before > _SIGNAL_DN)
+    if np.count_nonzero(useful) < _FEWEST_SAMPLES:
+        return None
+    expected, found = ratio * before[useful], after[useful]
+    brightness = float(found.sum() / expected.sum())
+    change = found / brightness - expected
+    variance = _DN_PER_e * expected * (1 + ratio) + (1 + ratio**2) * _READ_DN**2
+    relative = float(np.sqrt(np.mean(change**2) / np.mean(expected**2)))
+    if relative > _PATTERN and float(np.mean(change**2 / variance)) > _PATTERN_CHI2:
+        return "motion"
+    return "flicker" if abs(brightness - 1) > _BRIGHTNESS else None
+
+
+def _light(data: UInt16[np.ndarray, "rows columns"]) -> Float64[np.ndarray, "rows columns"]:
+    """Samples above the dark surroundings, which hold black level and dark current of this very frame."""
+    return data - float(np.median(data))

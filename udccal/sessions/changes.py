@@ -1,0 +1,70 @@
+"""Whether a session may go on with the camera and the rig at hand."""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Iterator, Set
+from pathlib import Path
+
+from udccal.cameras.protocol import CameraIdentity
+from udccal.errors import SessionError
+from udccal.rig import RigDescription
+from udccal.sessions.schema import Manifest, StoredCamera, StoredChange
+
+
+class Exchanged(enum.StrEnum):
+    """What may be exchanged in the middle of a session when a person says so."""
+
+    CAMERA = "camera"
+    LENS = "lens"
+
+
+def stored_camera(camera: CameraIdentity) -> StoredCamera:
+    """A camera's identity as a manifest holds it."""
+    return StoredCamera(vendor=camera.vendor, model=camera.model, serial=camera.serial, backend=camera.backend)
+
+
+def admit(
+    path: Path, manifest: Manifest, rig: RigDescription, camera: CameraIdentity, accepted: Set[Exchanged]
+) -> Manifest:
+    """The manifest with which the session goes on: as it was, or with the exchange that was accepted written into it.
+
+    Raises:
+        SessionError: when the rig is another one, or camera or lens differ and that was not accepted.
+    """
+    if rig.model_copy(update={"lens": manifest.rig.lens}) != manifest.rig:
+        raise SessionError(
+            f"Expected the session {path} to be of the rig '{rig.name}' as described now, found another one "
+            f"('{manifest.rig.name}'). Begin a new session."
+        )
+    changes = tuple(_changes(manifest, rig, camera))
+    for change in changes:
+        if Exchanged(change.what) not in accepted:
+            raise SessionError(
+                f"Expected the session {path} to be of the {change.what} {change.after}, found {change.before}. Put "
+                f"that {change.what} back, begin a new session, or say that the {change.what} was exchanged "
+                f"(--exchanged {change.what}): what was captured before then belongs to another {change.what}."
+            )
+    if not changes:
+        return manifest
+    update = {"rig": rig, "camera": stored_camera(camera), "changes": (*manifest.changes, *changes)}
+    return manifest.model_copy(update=update)
+
+
+def _changes(manifest: Manifest, rig: RigDescription, camera: CameraIdentity) -> Iterator[StoredChange]:
+    steps = len(manifest.steps)
+    before, after = manifest.camera, stored_camera(camera)
+    if before != after:
+        yield StoredChange(what="camera", before=_camera_name(before), after=_camera_name(after), after_steps=steps)
+    if manifest.rig.lens != rig.lens:
+        yield StoredChange(what="lens", before=_lens_name(manifest.rig), after=_lens_name(rig), after_steps=steps)
+
+
+def _camera_name(camera: StoredCamera) -> str:
+    return f"{camera.vendor} {camera.model} {camera.serial}"[:300]
+
+
+def _lens_name(rig: RigDescription) -> str:
+    lens = rig.lens
+    values = f"{lens.focal_mm.value:g} mm f/{lens.f_number.value:g} focused at {lens.focus_mm:g} mm"
+    return f"{lens.model} ({values})"[:300]

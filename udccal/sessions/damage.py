@@ -1,0 +1,55 @@
+"""Which files of a session are no longer what was captured."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from udccal.io.hashing import sha256_file
+from udccal.sessions.schema import Manifest, PanelSubject, StoredStep
+
+_LEFTOVER = re.compile(r"\..+-[0-9a-f]{12}\.partial\.(png|exr|json)")
+
+
+@dataclass(frozen=True)
+class Damage:
+    """A file that has to be captured again with its step."""
+
+    step_id: str
+    file: str
+    what: Literal["missing", "changed"]
+
+    def __str__(self) -> str:
+        """As said to a person."""
+        return f"{self.file} of the step {self.step_id} is {self.what}"
+
+
+def find_damage(folder: Path, manifest: Manifest) -> tuple[Damage, ...]:
+    """Compare every file that the manifest names with its checksum; reads the whole session."""
+    return tuple(damage for step in manifest.steps for damage in _damage(folder, step))
+
+
+def remove_leftovers(folder: Path) -> None:
+    """Remove the half-written files that a killed process left under temporary names; no other file is touched."""
+    for path in folder.rglob(".*.partial.*"):
+        if _LEFTOVER.fullmatch(path.name) and path.is_file() and not path.is_symlink():
+            path.unlink()
+
+
+def _damage(folder: Path, step: StoredStep) -> Iterator[Damage]:
+    for name, expected in _named_files(step):
+        file = folder / name
+        if not file.is_file() or not file.resolve().is_relative_to(folder.resolve()):
+            yield Damage(step.id, name, "missing")
+        elif sha256_file(file) != expected:
+            yield Damage(step.id, name, "changed")
+
+
+def _named_files(step: StoredStep) -> Iterator[tuple[str, str]]:
+    for capture in step.captures:
+        yield capture.file, capture.sha256
+    if isinstance(step.subject, PanelSubject):
+        yield step.subject.picture, step.subject.picture_sha256

@@ -1,0 +1,32 @@
+"""One process at a time writes to a session."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from filelock import FileLock, Timeout
+
+from udccal.errors import SessionError
+
+LOCK_NAME = ".session.lock"
+
+
+def lock_session(folder: Path) -> FileLock:
+    """Hold a session until the lock is released; the operating system releases it when the process ends in any way.
+
+    Raises:
+        SessionError: when another process, or another writer in this one, holds it, or the disk knows no locks.
+    """
+    lock = FileLock(folder / LOCK_NAME, timeout=0, thread_local=False)
+    try:
+        lock.acquire()
+    except Timeout as error:
+        raise SessionError(
+            f"Expected the session {folder} to be free, found that another process is writing to it. "
+            "Wait until it ends, or stop it."
+        ) from error
+    except (OSError, NotImplementedError) as error:
+        raise SessionError(
+            f"Expected to lock the session {folder}, found: {error}. Use a folder on a local disk of your own."
+        ) from error
+    return lock
