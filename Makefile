@@ -6,7 +6,7 @@ STAMP = $(VENV)/.installed
 DEMO_OUT ?= udccal-demo
 ACCURACY_OUT ?= accuracy
 
-.PHONY: install demo test test-slow lint types contracts check accuracy tables clean
+.PHONY: install demo test test-slow test-usb fuzz load lint types contracts check accuracy tables clean
 
 install: $(STAMP)
 
@@ -24,6 +24,19 @@ test: $(STAMP)
 
 test-slow: $(STAMP)
 	$(BIN)/python -m pytest -m slow
+
+# The USB3 Vision driver through libusb and a real kernel's USB: boots one in qemu, with a virtual camera plugged in.
+test-usb: $(STAMP)
+	$(BIN)/python -m tests.usb_stack
+
+# A hundred thousand broken inputs for every reader of bytes from outside.
+fuzz: $(STAMP)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[fuzz]"
+	$(BIN)/python -m tests.fuzz.run --inputs 100000
+
+# Ten thousand full-size frames through capture and averaging.
+load: $(STAMP)
+	$(BIN)/python -m tests.benchmarks.load --frames 10000
 
 lint: $(STAMP)
 	$(BIN)/ruff check .

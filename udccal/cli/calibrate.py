@@ -11,6 +11,7 @@ import typer
 
 from udccal.cli.options import ProfilePath, RigName, Seed, SessionFolder
 from udccal.cli.output import Output
+from udccal.errors import CameraError
 
 if TYPE_CHECKING:
     from udccal.cli.jobs.benches import CaptureBench
@@ -23,6 +24,7 @@ class CameraKind(enum.StrEnum):
     sim = "sim"
     u3v = "u3v"
     pylon = "pylon"
+    files = "files"
 
 
 class DisplayKind(enum.StrEnum):
@@ -49,7 +51,7 @@ class TermChoice(enum.StrEnum):
     backscatter = "backscatter"
 
 
-_CAMERA_HELP = "sim: a simulated rig; u3v: any USB3 Vision camera; pylon: through Basler's SDK."
+_CAMERA_HELP = "sim: a simulated rig; u3v: any USB3 Vision camera; pylon: through Basler's SDK; files: see --files."
 _DISPLAY_HELP = "Of a real rig. window: full screen on --monitor; manual: you show the files you are told."
 
 
@@ -59,9 +61,8 @@ def calibrate(
     session: SessionFolder,
     profile: ProfilePath,
     camera: Annotated[CameraKind, typer.Option("--camera", help=_CAMERA_HELP)] = CameraKind.sim,
-    serial: Annotated[
-        str | None, typer.Option("--serial", help="Of the camera; needed if there are several.")
-    ] = None,
+    serial: Annotated[str | None, typer.Option("--serial", help="Of the camera; needed if there are several.")] = None,
+    files: Annotated[Path | None, typer.Option("--files", help="Folder of one folder of pictures per step.")] = None,
     display: Annotated[DisplayKind, typer.Option("--display", help=_DISPLAY_HELP)] = DisplayKind.manual,
     monitor: Annotated[int, typer.Option("--monitor", help="Number of the panel among the monitors; see doctor.")] = 0,
     seed: Seed = 0,
@@ -82,10 +83,14 @@ def calibrate(
     output: Output = context.obj
     description = load_rig(rig)
     check_replaceable(profile)
-    if camera is CameraKind.sim:
-        opened = _simulated(description, seed)
-    else:
-        opened = _real(output, description, camera, serial, display, monitor, session)
+    pictures = session.with_name(f"{session.name}-pictures")
+    match camera:
+        case CameraKind.sim:
+            opened = _simulated(description, seed)
+        case CameraKind.files:
+            opened = _files(output, description, files, pictures)
+        case _:
+            opened = _real(output, description, camera, serial, display, monitor, pictures)
     with opened as bench:
         parts = {Exchanged(part.value) for part in exchanged or ()}
         capture(output, description, bench, session, [t.value for t in term or TermChoice], parts)
@@ -98,6 +103,16 @@ def _simulated(rig: RigDescription, seed: int) -> AbstractContextManager[Capture
     return simulated_bench(simulated_rig(rig, seed))
 
 
+def _files(
+    output: Output, rig: RigDescription, files: Path | None, pictures: Path
+) -> AbstractContextManager[CaptureBench]:
+    from udccal.cli.jobs.benches import files_bench
+
+    if files is None:
+        raise CameraError("Expected the folder with the pictures of each step, found none. Give it with --files.")
+    return files_bench(output, rig, files, pictures)
+
+
 def _real(
     output: Output,
     rig: RigDescription,
@@ -105,7 +120,7 @@ def _real(
     serial: str | None,
     display: DisplayKind,
     monitor: int,
-    session: Path,
+    pictures: Path,
 ) -> AbstractContextManager[CaptureBench]:
     from udccal.cli.jobs import benches
 
@@ -113,5 +128,5 @@ def _real(
     if display is DisplayKind.window:
         shown = benches.window_display(rig, monitor)
     else:
-        shown = benches.manual_display(output, rig, session.with_name(f"{session.name}-pictures"))
+        shown = benches.manual_display(output, rig, pictures)
     return benches.real_bench(output, rig, seen, shown)

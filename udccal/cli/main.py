@@ -12,6 +12,7 @@ import typer
 from udccal import __version__
 from udccal.cli.calibrate import calibrate
 from udccal.cli.demo import demo
+from udccal.cli.doctor import doctor
 from udccal.cli.fit import fit
 from udccal.cli.output import Output
 from udccal.cli.profile import profile_app
@@ -50,8 +51,8 @@ def globals_(
     context.obj = Output(as_json=as_json, debug=debug)
 
 
-for _verb in (demo, calibrate, fit, restore, simulate):
-    app.command(no_args_is_help=_verb is not demo)(_verb)
+for _verb in (demo, doctor, calibrate, fit, restore, simulate):
+    app.command(no_args_is_help=_verb not in (demo, doctor))(_verb)
 app.add_typer(profile_app, name="profile")
 
 

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from types import TracebackType
-from typing import Protocol, runtime_checkable
+from typing import Protocol, final, runtime_checkable
 
 import numpy as np
 from jaxtyping import UInt8
 
 
+@final
 @dataclass(frozen=True)
 class PanelSize:
     """Pixels of a panel, across and down."""

@@ -100,7 +100,7 @@ def _sentence(file: Path, error: ValidationError) -> str:
     if first["type"] == "extra_forbidden":
         return f"Expected only the entries of docs/session.md in {file}, found '{where}'. Remove it."
     if first["type"] == "value_error":
-        return f"Expected in {where} of {file} {first['ctx']['error']}. Correct it as docs/session.md says."
+        return f"Expected in {where} of {file} {first['ctx']['error']}, found otherwise. Correct it."
     found = repr(first["input"])
     shown = found if len(found) <= 60 else found[:57] + "..."
     return f"Expected a valid '{where}' in {file} ({first['msg']}), found {shown}. Correct it as docs/session.md says."

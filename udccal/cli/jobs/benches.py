@@ -11,8 +11,10 @@ from udccal.arrangements import Stage
 from udccal.cameras.choice import mode_for
 from udccal.cameras.protocol import Camera
 from udccal.cameras.simulated import SimulatedCamera
+from udccal.cameras.step_folders import StepFolders
 from udccal.cli.jobs.person import PersonStage
 from udccal.cli.output import Output
+from udccal.displays.manual import ManualDisplay
 from udccal.displays.mirrored import MirroredDisplay
 from udccal.displays.protocol import Display, PanelSize
 from udccal.displays.simulated import SimulatedDisplay
@@ -59,6 +61,20 @@ def real_bench(output: Output, rig: RigDescription, camera: Camera, display: Dis
         yield CaptureBench(camera, MirroredDisplay(display), person, utc_now, person.try_again)
 
 
+@contextmanager
+def files_bench(output: Output, rig: RigDescription, root: Path, pictures: Path) -> Iterator[CaptureBench]:
+    """Pictures taken with any camera, in one folder per step; what the panel is to show is written to ``pictures``.
+
+    Raises:
+        CameraError: when there are no pictures, or they do not state an exposure.
+        FileFormatError: when the first cannot be read.
+    """
+    folders = StepFolders(root, rig.camera.cfa, rig.camera.bits)
+    display = MirroredDisplay(ManualDisplay(pictures, panel_size(rig), output.say, lambda question: True))
+    with folders.camera as camera, display:
+        yield CaptureBench(camera, display, folders, utc_now, lambda sentence: False)
+
+
 def u3v_camera(serial: str | None) -> Camera:
     """The USB3 Vision camera of that serial number, or the only one."""
     from udccal.cameras.u3v.camera import U3vCamera
@@ -87,7 +103,6 @@ def window_display(rig: RigDescription, monitor: int) -> Display:
 
 def manual_display(output: Output, rig: RigDescription, folder: Path) -> Display:
     """A panel that the person at the rig works, with the pictures in a folder."""
-    from udccal.displays.manual import ManualDisplay
 
     def confirm(question: str) -> bool:
         return output.ask(f"{question} (Enter for yes, n for no)").strip().lower() not in ("n", "no")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import final
 
 from udccal.cli.output import Output
 from udccal.doctor.examine import Wanted, examine
@@ -12,6 +13,7 @@ from udccal.reports.tables import Table
 _EXAMPLE = "udccal doctor --rig NAME --session FOLDER --camera u3v --display window"
 
 
+@final
 @dataclass(frozen=True)
 class DoctorSummary:
     """What ``doctor`` delivers; ``ready`` is false when something that was asked for cannot work."""

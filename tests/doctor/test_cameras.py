@@ -1,0 +1,61 @@
+from __future__ import annotations
+
+from importlib.metadata import PackageNotFoundError
+
+import pytest
+
+from udccal.doctor import cameras
+from udccal.doctor.answers import Failure, SeenCamera
+from udccal.doctor.cameras import camera_finding, pylon_sdk_finding
+from udccal.doctor.finding import Finding, Status
+
+GOOD = SeenCamera("Basler ace 1")
+SLOW = SeenCamera("Basler ace 2", too_slow=True)
+HELD = SeenCamera("Basler ace 3", trouble="Expected it free, found it held. Close that program.")
+
+
+@pytest.mark.parametrize("asked", [False, True])
+def test_a_camera_that_can_be_opened_is_fine(asked: bool) -> None:
+    finding = camera_finding("u3v", (GOOD, SLOW, HELD), asked)
+    assert finding.topic == "cameras by u3v"
+    assert finding.status is Status.OK
+    assert "Basler ace 1; Basler ace 2 (at a port or cable slower than it is made for)" in finding.found
+    assert "Close that program" in finding.advice
+
+
+@pytest.mark.parametrize(
+    ("answer", "found", "advice"),
+    [
+        ((), "none seen", "Plug the camera in"),
+        ((HELD,), "cannot be opened", "Close that program"),
+        (Failure("no answer within 30 s"), "no answer within 30 s", "Unplug the camera"),
+        (Failure("Expected libusb, found none. Install it.", True), "cannot look", "Install it."),
+    ],
+    ids=["none", "held", "hung", "missing"],
+)
+def test_none_to_open_is_a_note_and_a_problem_only_when_asked_for(
+    answer: tuple[SeenCamera, ...] | Failure, found: str, advice: str
+) -> None:
+    for asked, status in ((False, Status.NOTE), (True, Status.PROBLEM)):
+        finding = camera_finding("u3v", answer, asked)
+        assert finding.status is status
+        assert found in finding.found
+        assert advice in finding.advice or not (asked or answer)
+
+
+def test_the_sdk_is_a_note_when_missing_and_a_problem_when_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    def absent(name: str) -> str:
+        raise PackageNotFoundError(name)
+
+    monkeypatch.setattr(cameras, "version", absent)
+    assert pylon_sdk_finding(False).status is Status.NOTE
+    assert pylon_sdk_finding(True).status is Status.PROBLEM
+    assert "pip install 'udccal[pylon]'" in pylon_sdk_finding(False).advice
+    monkeypatch.setattr(cameras, "version", lambda name: "1.2")
+    assert pylon_sdk_finding(True) == Finding("pylon SDK", Status.OK, "pypylon 1.2")
+
+
+def test_only_notes_become_problems() -> None:
+    for status in (Status.OK, Status.PROBLEM):
+        assert Finding("t", status, "f").needed(True).status is status
+    assert Finding("t", Status.NOTE, "f").needed(False).status is Status.NOTE

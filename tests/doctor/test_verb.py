@@ -1,0 +1,147 @@
+"""The whole verb: the table for people, JSON and exit status for scripts."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from tests.doctor.trees import BASLER, CONTROL, add_device, set_usb_memory
+from udccal.cli.jobs import doctor as job
+from udccal.cli.output import Output
+from udccal.displays.window_messages import Monitor
+from udccal.doctor import cameras
+from udccal.doctor import examine as examining
+from udccal.doctor.answers import Failure, JaxDevice, SeenCamera
+from udccal.doctor.displays import monitor_finding
+from udccal.doctor.examine import Wanted, examine
+from udccal.doctor.finding import Finding, Status
+from udccal.doctor.machine import Machine
+from udccal.doctor.questions import Question
+
+TOPICS = [
+    "Python",
+    "packages",
+    "cameras by u3v",
+    "pylon SDK",
+    "cameras by pylon",
+    "USB speed",
+    "USB permission",
+    "USB memory",
+    "monitors",
+    "GPU",
+    "JAX devices",
+    "disk",
+]
+FINDINGS = (
+    Finding("cameras by u3v", Status.OK, "Basler ace 1"),
+    Finding("USB memory", Status.NOTE, "16 MB", "More:\necho 1000 | sudo tee " + "/a/long/path" * 20),
+    Finding("disk", Status.PROBLEM, "1.0 GB free", "Free 2.0 GB more."),
+)
+
+
+def udccal(*words: str | Path) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "udccal.cli.main", "doctor", *map(str, words)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=200)
+
+
+def fake_ask(u3v: tuple[SeenCamera, ...] | Failure) -> Callable:
+    answers = {Question.U3V: u3v, Question.PYLON: (), Question.JAX: (JaxDevice("cpu", "cpu"),)}
+    return lambda question, read, seconds: answers[question]
+
+
+@pytest.fixture
+def wired(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Machine:
+    """A computer with a camera on a USB 2 port, one monitor, and Basler's SDK."""
+    add_device(tmp_path, "1-1", BASLER | {"speed": "480"}, CONTROL)
+    set_usb_memory(tmp_path, "16")
+    monkeypatch.setattr(cameras, "version", lambda name: "26.9")
+    monkeypatch.setattr(examining, "ask", fake_ask((SeenCamera("Basler ace 1"),)))
+    monkeypatch.setattr(
+        examining,
+        "monitor_finding",
+        lambda size, m: monitor_finding(size, m, lambda: (Monitor(0, 0, 0, 640, 480, 60),)),
+    )
+    return Machine(tmp_path, "linux", lambda path: True)
+
+
+def test_all_topics_in_order_and_notes_alone_are_no_problem(wired: Machine) -> None:
+    found = examine(Wanted(machine=wired))
+    assert [finding.topic for finding in found] == TOPICS
+    assert {f.topic for f in found if f.status is Status.NOTE} >= {"cameras by pylon", "USB speed", "USB memory"}
+    assert Status.PROBLEM not in {finding.status for finding in found}
+
+
+@pytest.mark.parametrize(
+    ("camera", "monitor", "topics"),
+    [
+        ("sim", None, set()),
+        ("u3v", 0, set()),
+        ("pylon", None, {"cameras by pylon"}),
+        (None, 3, {"monitors"}),
+    ],
+    ids=["sim", "all there", "pylon", "no such monitor"],
+)
+def test_what_was_asked_for_and_cannot_work_is_a_problem(
+    wired: Machine, camera: str | None, monitor: int | None, topics: set[str]
+) -> None:
+    found = examine(Wanted(camera=camera, monitor=monitor, machine=wired))
+    assert {finding.topic for finding in found if finding.status is Status.PROBLEM} == topics
+
+
+def test_a_hanging_backend_is_one_row_and_the_others_are_there(wired: Machine, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(examining, "ask", fake_ask(Failure("no answer within 30 s")))
+    found = {finding.topic: finding for finding in examine(Wanted(camera="u3v", machine=wired))}
+    assert found["cameras by u3v"].status is Status.PROBLEM
+    assert found["JAX devices"].status is Status.OK
+
+
+def test_people_get_a_table_and_advice_that_can_be_pasted(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(job, "examine", lambda wanted: FINDINGS)
+    assert not job.report(Output(), Wanted())
+    out, err = capsys.readouterr()
+    for finding in FINDINGS:
+        assert finding.topic in out
+        assert finding.found in out
+    assert FINDINGS[1].advice in err  # commands are never broken across lines
+    assert err.strip().endswith("Not ready: disk. Follow the advice above, then run this again.")
+
+
+def test_scripts_get_json(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(job, "examine", lambda wanted: FINDINGS[:2])
+    assert job.report(Output(as_json=True), Wanted())
+    out, err = capsys.readouterr()
+    summary = json.loads(out)
+    assert summary["ready"] is True
+    assert [finding["status"] for finding in summary["findings"]] == ["OK", "NOTE"]
+    assert "No problem found" in err
+    assert job.report(Output(as_json=True), Wanted(camera="sim"))
+    assert capsys.readouterr().err.strip().endswith("Ready for what was asked for.")
+
+
+def test_the_exit_status_says_whether_what_was_asked_for_can_work(tmp_path: Path) -> None:
+    done = udccal("--json", "--rig", "lg55-reduced", "--session", tmp_path / "session")
+    summary = json.loads(done.stdout)
+    assert done.returncode == (0 if summary["ready"] else 1)
+    assert {"Python", "cameras by u3v", "monitors", "GPU", "JAX devices", "disk"} <= {
+        finding["topic"] for finding in summary["findings"]
+    }
+    assert "Traceback" not in done.stderr
+    file = tmp_path / "file"
+    file.write_bytes(b"")
+    refused = udccal("--json", "--rig", "lg55-reduced", "--session", file / "session")
+    assert refused.returncode == 1
+    assert json.loads(refused.stdout)["ready"] is False  # one object, and the only one
+    assert "Not ready: " in refused.stderr
+
+
+def test_an_unknown_rig_is_one_sentence() -> None:
+    done = udccal("--rig", "no-such-rig")
+    assert done.returncode == 1
+    assert done.stderr.startswith("udccal: Expected a rig folder")

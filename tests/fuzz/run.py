@@ -1,0 +1,77 @@
+"""Feeds a target with broken inputs, guided by which lines of udccal they reach.
+
+python -m tests.fuzz.run gencp --inputs 100000          # one target
+python -m tests.fuzz.run --inputs 100000                # all, each in a process of its own
+
+An input that makes a reader crash, hang for ten seconds, take 2 GiB, or raise anything but an udccal error ends its
+target's run with a non-zero status and is written to the current folder; keep it in tests/fuzz/kept/<target>/.
+"""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import atheris
+
+with atheris.instrument_imports(include=["udccal"]):
+    from tests.fuzz.targets import TARGETS
+
+_HANG_S = 10
+_MEMORY_MIB = 2048
+KEPT = Path(__file__).with_name("kept")
+
+
+def _run_all(inputs: int, names: list[str]) -> int:
+    failed = []
+    for name in names:
+        start = time.monotonic()
+        command = [sys.executable, "-m", "tests.fuzz.run", name, "--inputs", str(inputs), "--here"]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        verdict = "ok" if done.returncode == 0 else "FAILED"
+        print(f"{name:12} {inputs} inputs {time.monotonic() - start:7.0f} s  {verdict}", flush=True)
+        if done.returncode != 0:
+            failed.append(name)
+            print(done.stdout[-1000:] + done.stderr[-4000:], flush=True)
+    return 1 if failed else 0
+
+
+def _run_here(name: str, inputs: int) -> None:
+    target = TARGETS[name]
+    with tempfile.TemporaryDirectory(prefix="udccal-corpus-") as folder:
+        kept = sorted((KEPT / name).glob("*")) if (KEPT / name).is_dir() else []
+        for index, seed in enumerate((*target.seeds(), *(path.read_bytes() for path in kept))):
+            (Path(folder) / str(index)).write_bytes(seed)
+        options = [
+            f"-runs={inputs}",
+            f"-timeout={_HANG_S}",
+            f"-rss_limit_mb={_MEMORY_MIB}",
+            f"-max_len={target.max_bytes}",
+            "-seed=1",
+            "-print_final_stats=1",
+        ]
+        atheris.Setup([sys.argv[0], *options, folder], target.try_out)
+        atheris.Fuzz()
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("targets", nargs="*")
+    parser.add_argument("--inputs", type=int, default=100_000)
+    parser.add_argument("--here", action="store_true", help="one target in this process")
+    arguments = parser.parse_args()
+    unknown = [name for name in arguments.targets if name not in TARGETS]
+    if unknown:
+        parser.error(f"expected targets among {', '.join(TARGETS)}, found {', '.join(unknown)}")
+    if arguments.here:
+        _run_here(arguments.targets[0], arguments.inputs)
+    else:
+        sys.exit(_run_all(arguments.inputs, arguments.targets or list(TARGETS)))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,8 @@
+"""All targets by name."""
+
+from __future__ import annotations
+
+from tests.fuzz.device_targets import DEVICE_TARGETS
+from tests.fuzz.file_targets import FILE_TARGETS
+
+TARGETS = {target.name: target for target in (*DEVICE_TARGETS, *FILE_TARGETS)}

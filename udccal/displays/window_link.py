@@ -1,0 +1,131 @@
+"""The asking end of the panel's window: starts its process, and waits for every answer a bounded time."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import json
+import os
+import queue
+import subprocess
+import sys
+import threading
+from importlib.metadata import PackageNotFoundError, version
+from typing import final
+
+from pydantic import TypeAdapter, ValidationError
+
+from udccal.displays.window_messages import Job, Reply, Request
+from udccal.errors import DisplayError
+
+START_S = 30.0
+_END_S = 3.0
+_LONGEST_LINE = 1 << 16
+# One surface pixel is one panel pixel, tearing-free, and the window stays when a person works on another monitor.
+_SDL = {
+    "PYGAME_HIDE_SUPPORT_PROMPT": "1",
+    "SDL_RENDER_VSYNC": "1",
+    "SDL_RENDER_SCALE_QUALITY": "nearest",
+    "SDL_VIDEO_MINIMIZE_ON_FOCUS_LOSS": "0",
+    "SDL_VIDEO_ALLOW_SCREENSAVER": "0",
+    "SDL_WINDOWS_DPI_AWARENESS": "permonitorv2",
+    "SDL_NO_SIGNAL_HANDLERS": "1",
+}
+_REPLY = TypeAdapter(Reply)
+
+
+@final
+class WindowLink:
+    """One process of ``udccal.displays.window_process``; close it when done."""
+
+    def __init__(self, job: Job) -> None:
+        """Start the process; its first reply is to be fetched with ``reply``.
+
+        Raises:
+            DisplayError: when the optional package is not installed.
+        """
+        _need_pygame()
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "udccal.displays.window_process", json.dumps(dataclasses.asdict(job))],
+            env=os.environ | _SDL,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+        )
+        self._lines: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+
+    def ask(self, request: Request, seconds: float) -> Reply:
+        """Send a request and wait for its reply; see ``reply``."""
+        assert self._process.stdin is not None
+        try:
+            self._process.stdin.write(f"{request}\n".encode())
+            self._process.stdin.flush()
+        except OSError as error:
+            raise self._ended() from error
+        return self.reply(seconds)
+
+    def reply(self, seconds: float) -> Reply:
+        """The next reply.
+
+        Raises:
+            DisplayError: when the reply tells of a problem, or none comes in time, or the process is gone.
+        """
+        try:
+            line = self._lines.get(timeout=seconds)
+        except queue.Empty:
+            raise DisplayError(
+                f"Expected the panel's window to answer within {seconds:g} s, found it silent. Check that the desktop "
+                "responds, then run the same command again."
+            ) from None
+        if not line:
+            self._lines.put(line)
+            raise self._ended()
+        try:
+            reply = _REPLY.validate_json(line)
+        except ValidationError as error:
+            raise self._ended() from error
+        if reply.problem:
+            raise DisplayError(reply.problem)
+        return reply
+
+    def close(self) -> None:
+        """End the process, in order if it listens, else by force."""
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        with contextlib.suppress(OSError):  # the process is gone, and with it what was still to be written
+            self._process.stdin.close()
+        try:
+            self._process.wait(_END_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        self._reader.join(_END_S)
+        self._process.stdout.close()
+
+    def _read(self) -> None:
+        assert self._process.stdout is not None
+        while line := self._process.stdout.readline(_LONGEST_LINE):
+            self._lines.put(line)
+        self._lines.put(b"")
+
+    def _ended(self) -> DisplayError:
+        try:
+            status = str(self._process.wait(_END_S))
+        except subprocess.TimeoutExpired:
+            status = "unknown"
+        return DisplayError(
+            f"Expected the panel's window to stay open, found that its process ended (status {status}). Run the same "
+            "command again; if it happens again, update the graphics driver."
+        )
+
+
+def _need_pygame() -> None:
+    try:
+        version("pygame-ce")
+    except PackageNotFoundError:
+        raise DisplayError(
+            "Expected the package pygame-ce for a window on the panel, found none. "
+            "Install it: pip install 'udccal[window]'"
+        ) from None

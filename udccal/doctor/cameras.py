@@ -1,0 +1,38 @@
+"""Which cameras are seen, and by which backend."""
+
+from __future__ import annotations
+
+from importlib.metadata import PackageNotFoundError, version
+
+from udccal.doctor.answers import Failure, SeenCamera
+from udccal.doctor.finding import Finding, Status
+
+ASK_S = 30.0
+_PLUG_IN = "Plug the camera in, power it, and run this again."
+_BROKEN = "Unplug the camera and run this again. If that changes nothing, install the backend's software again."
+_SLOW = " (at a port or cable slower than it is made for)"
+
+
+def camera_finding(backend: str, answer: tuple[SeenCamera, ...] | Failure, asked: bool) -> Finding:
+    """What a backend answered, in a row; a problem when the backend was asked for and has no camera to open."""
+    topic = f"cameras by {backend}"
+    if isinstance(answer, Failure):
+        found = "it cannot look for any" if answer.refused else answer.reason
+        return Finding(topic, Status.NOTE, found, answer.reason if answer.refused else _BROKEN).needed(asked)
+    if not answer:
+        return Finding(topic, Status.NOTE, "none seen", _PLUG_IN if asked else "").needed(asked)
+    found = "; ".join(f"{camera.name}{_SLOW if camera.too_slow else ''}" for camera in answer)
+    troubles = "\n".join(f"{camera.name}: {camera.trouble}" for camera in answer if camera.trouble)
+    if all(camera.trouble for camera in answer):
+        return Finding(topic, Status.NOTE, f"{found}; cannot be opened", troubles).needed(asked)
+    return Finding(topic, Status.OK, found, troubles)
+
+
+def pylon_sdk_finding(asked: bool) -> Finding:
+    """Whether Basler's SDK is there, without loading it."""
+    topic = "pylon SDK"
+    try:
+        return Finding(topic, Status.OK, f"pypylon {version('pypylon')}")
+    except PackageNotFoundError:
+        advice = "Only for Basler cameras through Basler's own SDK; u3v does without:\npip install 'udccal[pylon]'"
+        return Finding(topic, Status.NOTE, "not installed", advice).needed(asked)

@@ -1,0 +1,45 @@
+"""The child process that answers one question: ``python -m udccal.doctor.child QUESTION FILE``.
+
+The answer goes to the file, as JSON, since what vendors' software prints is nobody's business; exit status 0 for an
+answer, ``FAILED`` for the reason why there is none, anything else when the process broke down.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import sys
+from pathlib import Path
+
+from udccal.doctor.answers import Failure
+from udccal.doctor.questions import Question, answer
+from udccal.errors import UdccalError
+
+FAILED = 3
+
+
+def main() -> None:
+    """Answer the question in the first argument into the file in the second."""
+    status = _write(Question(sys.argv[1]), Path(sys.argv[2]))
+    os._exit(status)  # at once: libraries that look for hardware are known to hang or crash while they are unloaded
+
+
+def _write(question: Question, file: Path) -> int:
+    try:
+        answers = answer(question)
+    except UdccalError as error:
+        return _failed(file, Failure(str(error), refused=True))
+    except Exception as error:  # whatever foreign software raises is the answer to whether it works
+        return _failed(file, Failure(f"{type(error).__name__}: {error}"))
+    file.write_text(json.dumps([dataclasses.asdict(each) for each in answers]), encoding="utf-8")
+    return 0
+
+
+def _failed(file: Path, failure: Failure) -> int:
+    file.write_text(json.dumps(dataclasses.asdict(failure)), encoding="utf-8")
+    return FAILED
+
+
+if __name__ == "__main__":
+    main()

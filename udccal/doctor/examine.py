@@ -1,0 +1,73 @@
+"""All checks, those that wait for others side by side."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import final
+
+from udccal.displays.protocol import PanelSize
+from udccal.doctor import accelerators, cameras
+from udccal.doctor.answers import read_cameras, read_devices
+from udccal.doctor.ask import ask
+from udccal.doctor.disk import disk_finding
+from udccal.doctor.displays import monitor_finding
+from udccal.doctor.finding import Finding, Status
+from udccal.doctor.machine import Machine
+from udccal.doctor.packages import packages_finding, python_finding
+from udccal.doctor.questions import Question
+from udccal.doctor.usb import usb_findings
+from udccal.rig import RigDescription
+
+
+@final
+@dataclass(frozen=True)
+class Wanted:
+    """What the person is about to do.
+
+    Attributes:
+        camera: the backend they mean to use, ``u3v`` or ``pylon``; None when they did not say.
+        monitor: number of the monitor that a window shall fill; None for no window.
+        rig: the rig they mean to calibrate.
+        session: folder that the session shall go to.
+    """
+
+    camera: str | None = None
+    monitor: int | None = None
+    rig: RigDescription | None = None
+    session: Path | None = None
+    machine: Machine = field(default_factory=Machine)
+
+
+def examine(wanted: Wanted) -> tuple[Finding, ...]:
+    """Every finding, in the order that a person should read them."""
+    with ThreadPoolExecutor() as pool:
+        u3v = pool.submit(ask, Question.U3V, read_cameras, cameras.ASK_S)
+        jax = pool.submit(ask, Question.JAX, read_devices, accelerators.ASK_JAX_S)
+        pylon = pool.submit(_pylon, wanted.camera == Question.PYLON)
+        monitors = pool.submit(monitor_finding, _panel_size(wanted.rig), wanted.monitor)
+        gpu = accelerators.gpu_finding()
+        return (
+            python_finding(),
+            packages_finding(),
+            cameras.camera_finding(Question.U3V, u3v.result(), wanted.camera == Question.U3V),
+            *pylon.result(),
+            *usb_findings(wanted.machine),
+            monitors.result(),
+            gpu,
+            accelerators.jax_finding(jax.result(), gpu),
+            disk_finding(wanted.session, wanted.rig),
+        )
+
+
+def _pylon(asked: bool) -> tuple[Finding, ...]:
+    sdk = cameras.pylon_sdk_finding(asked)
+    if sdk.status is not Status.OK:
+        return (sdk,)
+    answer = ask(Question.PYLON, read_cameras, cameras.ASK_S)
+    return sdk, cameras.camera_finding(Question.PYLON, answer, asked)
+
+
+def _panel_size(rig: RigDescription | None) -> PanelSize | None:
+    return None if rig is None else PanelSize(rig.panel.columns, rig.panel.rows)
