@@ -8,7 +8,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from udccal.cameras.files import FileCamera, read_raw
+from udccal.cameras.files import FileCamera
+from udccal.cameras.picture_files.mosaics import read_raw
 from udccal.reports.pictures import mosaic_preview
 from udccal.restoration.sinks import write_picture
 from udccal.restoration.tone import Tone, display_exposure

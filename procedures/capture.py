@@ -62,10 +62,12 @@ def _singles(camera: Camera, count: int, limits: FrameLimits) -> tuple[SingleFra
 def _exposures(
     camera: Camera, settings: Settings, exposures: list[float], limits: FrameLimits
 ) -> tuple[SingleFrame, ...]:
-    """One frame at each exposure, all of the same light."""
+    """One frame at each exposure, all of the same light; fewer where the camera has no longer ones, as with files."""
     taken: list[SingleFrame] = []
     for exposure_s in exposures:
-        camera.configure(replace(settings, exposure_s=exposure_s))
+        accepted = camera.configure(replace(settings, exposure_s=exposure_s))
+        if taken and accepted.exposure_s <= taken[-1].frame.settings.exposure_s:
+            break
         checks = FrameChecks(limits)
         frame = _good_frame(camera, checks, lambda frame: _change(taken, frame, limits))
         taken.append(SingleFrame(frame, checks.rejections()))

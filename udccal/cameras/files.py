@@ -1,113 +1,84 @@
-"""Files as a camera: the frames of camera raw files (DNG and others), 16-bit PNG, or EXR, in the order given."""
+"""Files as a camera: camera raw files (DNG and others), 16-bit PNG or TIFF, or EXR, one frame after the other."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
-from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import final
+from typing import Final, final
 
-import numpy as np
-import rawpy
-from jaxtyping import UInt16
+from udccal.cameras.checks import check_mode, check_region, not_open, superseded
+from udccal.cameras.format_names import PATTERNS, unpacked_format_name
+from udccal.cameras.picture_files.facts import Facts, read_facts
+from udccal.cameras.picture_files.listing import ListedPicture, list_files
+from udccal.cameras.picture_files.mosaics import Layout, read_mosaic
+from udccal.cameras.picture_files.sidecar import list_folder
+from udccal.cameras.protocol import CameraIdentity, Counts, Features, Frame, Mode, Range, Region, Settings, Trigger
+from udccal.errors import CameraError
 
-from udccal.cameras.protocol import CameraIdentity, Frame, Region, Settings
-from udccal.errors import CameraError, FileFormatError
-from udccal.io.exr import read_exr
-from udccal.io.limits import check_size
-from udccal.io.png import read_png16
+Source = str | Path | Sequence[str | Path]
+
+_STEPS: Final = (2, 2, 2, 2)
 
 
+@final
 @dataclass(frozen=True)
-class Mosaic:
-    """One raw picture with what its file says about it; ``exposure_s`` is absent where the file does not say."""
+class _Shot:
+    """A file and how it was taken."""
 
-    data: UInt16[np.ndarray, "rows columns"]
-    cfa: str
-    black_DN: float
-    saturation_DN: int
-    exposure_s: float | None
-
-
-def read_raw(path: Path) -> Mosaic:
-    """Read the visible part of a Bayer mosaic from a camera raw file.
-
-    Raises:
-        FileFormatError: when it is missing, not a raw file, damaged, too large, or not a 2 x 2 Bayer mosaic.
-    """
-    if not path.is_file():
-        raise FileFormatError(f"Expected a camera raw file at {path}, found none. Check the path.")
-    try:
-        with closing(rawpy.RawPy()) as raw:
-            raw.open_file(str(path))
-            check_size(path, raw.sizes.raw_height, raw.sizes.raw_width)
-            raw.unpack()
-            return _mosaic(path, raw)
-    except rawpy.LibRawError as error:
-        reason = error.args[0] if error.args else type(error).__name__
-        shown = reason.decode("ascii", "replace") if isinstance(reason, bytes) else str(reason)
-        message = f"Expected {path} to be a whole camera raw file, found: {shown}. Copy it again."
-        raise FileFormatError(message) from error
-
-
-def _mosaic(path: Path, raw: rawpy.RawPy) -> Mosaic:
-    bayer = raw.raw_type == rawpy.RawType.Flat and raw.raw_pattern is not None and raw.raw_pattern.shape == (2, 2)
-    names = raw.color_desc.decode("ascii", "replace")
-    cfa = "".join(names[int(index)] for index in raw.raw_colors_visible[:2, :2].ravel()) if bayer else ""
-    if sorted(cfa) != ["B", "G", "G", "R"]:
-        raise FileFormatError(f"Expected a 2 x 2 Bayer mosaic in {path}, found another layout. Use a raw Bayer file.")
-    other = getattr(raw, "other", None)  # older rawpy does not tell
-    exposure_s = float(other.shutter_speed) if other is not None else 0.0
-    return Mosaic(
-        data=raw.raw_image_visible.copy(),
-        cfa=cfa,
-        black_DN=float(np.mean(raw.black_level_per_channel)),
-        saturation_DN=int(raw.white_level),
-        exposure_s=exposure_s if exposure_s > 0 else None,
-    )
+    path: Path
+    exposure_s: float
+    gain_dB: float
+    taken_s: float
 
 
 @final
 class FileCamera:
-    """A camera whose frames are files. It starts at the first again only when entered again.
+    """Implements ``udccal.cameras.protocol.Camera`` on files of one size, taken by one camera.
 
-    Raw files say their own pattern and level; for PNG and EXR, which do not, give ``cfa`` and ``bits``.
+    A file's exposure is what ``frames.csv`` beside it says, or what the file itself states. Its gain is relative to the
+    first file's: 20 log10 of the ratio of their ISO values, since no file says which ISO is the sensor's own.
+    ``configure`` chooses the files whose gain, then exposure, comes nearest, and begins with the first of these.
     """
 
-    def __init__(self, paths: Sequence[str | Path], cfa: str = "RGGB", bits: int = 16, exposure_s: float = 1.0) -> None:
-        """Open a list of files of one size.
+    def __init__(self, source: Source, cfa: str = "RGGB", bits: int = 16, exposure_s: float | None = 1.0) -> None:
+        """Take a folder, or files in the order of the frames, and read the first one.
 
         Args:
-            paths: in the order of the frames.
-            cfa: pattern of PNG and EXR files.
-            bits: of PNG and EXR files.
-            exposure_s: of files that do not say theirs.
+            source: a folder, with or without a ``frames.csv``, or a list of files.
+            cfa: pattern of PNG, TIFF and EXR files, ``mono`` for none; raw files say their own.
+            bits: of PNG, TIFF and EXR files.
+            exposure_s: of files that do not say theirs; None to refuse these.
 
         Raises:
-            CameraError: when the list is empty.
-            FileFormatError: when the first file cannot be read.
+            CameraError: when there are no files, or one does not say its exposure and none is given.
+            FileFormatError: when a file cannot be read.
         """
-        if not paths:
-            raise CameraError("Expected at least one file to take frames from, found none. List the files.")
-        self._paths = tuple(Path(path) for path in paths)
-        self._default = (cfa, bits, exposure_s)
-        first = self._read(self._paths[0])
-        self._cfa, self._bits = first.cfa, max(int(first.saturation_DN).bit_length(), 1)
-        self._sensor = Region(0, 0, first.data.shape[1], first.data.shape[0])
-        self._identity = CameraIdentity("files", self._paths[0].suffix.lstrip("."), self._paths[0].name[:100], "files")
-        self._region = self._sensor
+        self._layout, self._exposure_s = _layout(cfa, bits), exposure_s
+        listed = _listed(source)
+        self._maker = facts = read_facts(listed[0].path)
+        self._identity = _identity(facts, listed[0].path)
+        first = read_mosaic(listed[0].path, self._layout)
+        rows, columns = (2 * (side // 2) for side in first.data.shape)  # regions of whole 2 x 2 cells
+        self._shape, self._cfa = first.data.shape, first.cfa
+        self._bits = min(max(first.saturation_DN.bit_length(), 1), 16)
+        self._sensor = Region(0, 0, columns, rows)
+        self._mode = Mode(unpacked_format_name(self._cfa, self._bits))
+        self._region, self._counts, self._taken_s = self._sensor, Counts(), -math.inf
+        self._open, self._stream = False, 0
+        self._shots = self._queue = tuple(self._shot(item) for item in listed)
         self._next = 0
 
     @property
     def identity(self) -> CameraIdentity:
-        """The kind and the name of the first file: files do not say reliably which camera made them."""
+        """What the first file says of the camera that took it."""
         return self._identity
 
     @property
     def sensor(self) -> Region:
-        """The size of the first file."""
+        """The first file's whole cells."""
         return self._sensor
 
     @property
@@ -120,78 +91,169 @@ class FileCamera:
         """Bits that hold the saturation level."""
         return self._bits
 
+    @property
+    def features(self) -> Features:
+        """Exposures and gains are those of the files; files have no rate, and nothing triggers them."""
+        exposures = [shot.exposure_s for shot in self._shots]
+        gains = [shot.gain_dB for shot in self._shots]
+        return Features(
+            exposure_s=Range(min(exposures), max(exposures)),
+            gain_dB=Range(min(gains), max(gains)),
+            frame_rate_hz=Range(0.0, 0.0),
+            pixel_formats=(unpacked_format_name(self._cfa, self._bits),),
+            triggers=(Trigger.FREE_RUN,),
+            region_steps=_STEPS,
+        )
+
+    @property
+    def mode(self) -> Mode:
+        """The one there is."""
+        return self._mode
+
+    @property
+    def counts(self) -> Counts:
+        """Frames since it was opened."""
+        return self._counts
+
     def __enter__(self) -> FileCamera:
         """Begin with the first file."""
-        self._next = 0
+        self._open, self._next, self._queue = True, 0, self._shots
+        self._counts, self._taken_s = Counts(), -math.inf
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Nothing is held open."""
+        """No file is held open between frames."""
+        self._open = False
+        self._stream += 1
 
-    def configure(self, settings: Settings) -> Settings:
-        """Choose a region; exposure and gain were decided when the files were made and are told with each frame.
+    def load(self, source: Source) -> None:
+        """Take other files of the same camera in place of those before, such as those of a session's next step.
 
         Raises:
-            CameraError: when the region is not inside the picture or not aligned to the pattern.
+            CameraError: when there are none, or they are another camera's.
+            FileFormatError: when what one states cannot be read.
         """
-        region = settings.region
-        spare_x, spare_y = self._sensor.columns - region.columns, self._sensor.rows - region.rows
-        inside = 0 <= region.x <= spare_x and 0 <= region.y <= spare_y
-        if not inside or region.x % 2 or region.y % 2 or min(region.columns, region.rows) < 1:
+        shots = tuple(self._shot(item) for item in _listed(source))
+        self._shots = self._queue = shots
+        self._next, self._taken_s = 0, -math.inf
+        self._stream += 1
+
+    def set_mode(self, mode: Mode) -> Mode:
+        """Accept the one mode there is.
+
+        Raises:
+            CameraError: when it is another, or the camera is closed.
+        """
+        self._check_open()
+        check_mode(mode, self.features)
+        return self._mode
+
+    def configure(self, settings: Settings) -> Settings:
+        """Choose a region and the files nearest in gain and exposure, and begin with the first of these.
+
+        Raises:
+            CameraError: when the region is not inside the picture or not aligned to the pattern, the exposure or gain
+                is not a number, or the camera is closed.
+        """
+        self._check_open()
+        check_region(settings.region, self._sensor, _STEPS)
+        if not (0 < settings.exposure_s < math.inf and math.isfinite(settings.gain_dB)):
             raise CameraError(
-                f"Expected an even-aligned region inside {self._sensor.columns} x {self._sensor.rows}, found "
-                f"{region.columns} x {region.rows} at ({region.x}, {region.y}). Choose one inside."
+                f"Expected an exposure above 0 s and a gain in dB, found {settings.exposure_s:g} s and "
+                f"{settings.gain_dB:g} dB. Ask for the nearest that the files have."
             )
-        self._region = region
-        return Settings(self._default[2], 0.0, region)
+        self._region = settings.region
+        best = min(self._shots, key=lambda shot: _distance(shot, settings))
+        chosen = (best.gain_dB, best.exposure_s)
+        self._queue = tuple(shot for shot in self._shots if (shot.gain_dB, shot.exposure_s) == chosen)
+        self._next, self._taken_s = 0, -math.inf
+        return Settings(best.exposure_s, best.gain_dB, settings.region)
 
     def frames(self, count: int) -> Iterator[Frame]:
         """The next files, one at a time.
 
         Raises:
-            CameraError: when the files are used up, or one has another size or pattern than the first.
+            CameraError: when the files are used up, one has another size or pattern than the first, or the camera is
+                closed.
             FileFormatError: when one cannot be read.
         """
-        for _ in range(count):
-            if self._next >= len(self._paths):
-                raise CameraError(
-                    f"Expected {count} more frames, found that all {len(self._paths)} files are used. List more files."
-                )
-            index, self._next = self._next, self._next + 1
-            yield self._frame(index)
+        self._check_open()
+        self._stream += 1
+        return self._deliver(count, self._stream)
 
-    def _frame(self, index: int) -> Frame:
-        mosaic = self._read(self._paths[index])
-        if mosaic.data.shape != (self._sensor.rows, self._sensor.columns) or mosaic.cfa != self._cfa:
+    def _check_open(self) -> None:
+        if not self._open:
+            raise not_open()
+
+    def _deliver(self, count: int, stream: int) -> Iterator[Frame]:
+        for _ in range(count):
+            if self._stream != stream:
+                raise superseded()
+            if self._next >= len(self._queue):
+                raise CameraError(
+                    f"Expected {count} more frames at this setting, found that all {len(self._queue)} files are used. "
+                    "Take more, or ask for fewer."
+                )
+            shot, self._next = self._queue[self._next], self._next + 1
+            yield self._frame(shot)
+
+    def _frame(self, shot: _Shot) -> Frame:
+        mosaic = read_mosaic(shot.path, self._layout)
+        if mosaic.data.shape != self._shape or mosaic.cfa != self._cfa or int(mosaic.data.max()) >> self._bits:
             raise CameraError(
-                f"Expected {self._paths[index]} to have the size and pattern of {self._paths[0]}, found another. "
+                f"Expected {shot.path} to have the size, pattern and bits of the first file, found another. "
                 "Take the files of one camera."
             )
         region = self._region
         data = mosaic.data[region.y : region.y + region.rows, region.x : region.x + region.columns].copy()
-        exposure = mosaic.exposure_s if mosaic.exposure_s is not None else self._default[2]
-        return Frame(data, Settings(exposure, 0.0, region), self._paths[index].stat().st_mtime, index, True)
+        self._taken_s = max(self._taken_s, shot.taken_s)  # copied files may carry times out of order
+        number, self._counts = self._counts.delivered, Counts(self._counts.delivered + 1)
+        return Frame(data, Settings(shot.exposure_s, shot.gain_dB, region), self._taken_s, number, True)
 
-    def _read(self, path: Path) -> Mosaic:
-        cfa, bits, _ = self._default
-        match path.suffix.lower():
-            case ".png":
-                data = read_png16(path)
-            case ".exr":
-                data = _single_plane(path)
-            case _:
-                return read_raw(path)
-        limit = 2**bits - 1
-        if int(data.max()) > limit:
-            raise CameraError(f"Expected samples of {bits} bits in {path}, found {int(data.max())} DN. Give its bits.")
-        return Mosaic(data, cfa, 0.0, limit, None)
+    def _shot(self, listed: ListedPicture) -> _Shot:
+        facts = read_facts(listed.path)
+        first = self._maker
+        if (facts.vendor, facts.model, facts.serial) != (first.vendor, first.model, first.serial):
+            raise CameraError(
+                f"Expected files of one camera ({_name(first)}), found {listed.path} by another ({_name(facts)}). "
+                "Take the files of one camera."
+            )
+        exposure_s = next((s for s in (listed.exposure_s, facts.exposure_s, self._exposure_s) if s is not None), None)
+        if exposure_s is None:
+            raise CameraError(
+                f"Expected the exposure of {listed.path} in the file or in a frames.csv beside it, found neither. "
+                "Write a frames.csv."
+            )
+        ratio = facts.iso / first.iso if facts.iso and first.iso else 1.0
+        gain_dB = listed.gain_dB if listed.gain_dB is not None else 20.0 * math.log10(ratio)
+        taken_s = next((s for s in (listed.timestamp_s, facts.taken_s) if s is not None), None)
+        return _Shot(listed.path, exposure_s, gain_dB, listed.path.stat().st_mtime if taken_s is None else taken_s)
 
 
-def _single_plane(path: Path) -> UInt16[np.ndarray, "rows columns"]:
-    """An EXR of one channel that holds whole numbers of DN."""
-    channels = list(read_exr(path).values())
-    if len(channels) != 1 or channels[0].min() < 0 or channels[0].max() > 65535:
-        raise FileFormatError(f"Expected one channel of 0 to 65535 DN in {path}, found something else. Use a mosaic.")
-    return np.rint(channels[0]).astype(np.uint16)
+def _layout(cfa: str, bits: int) -> Layout:
+    if cfa not in PATTERNS or not 1 <= bits <= 16:
+        raise CameraError(
+            f"Expected a pattern of {', '.join(PATTERNS)} and 1 to 16 bits, found {cfa[:20]!r} and {bits}. "
+            "Take them from the camera's data sheet."
+        )
+    return Layout(cfa, bits)
+
+
+def _listed(source: Source) -> tuple[ListedPicture, ...]:
+    return list_folder(Path(source)) if isinstance(source, str | Path) else list_files(source)
+
+
+def _name(facts: Facts) -> str:
+    return " ".join(text for text in (facts.vendor, facts.model, facts.serial) if text) or "none stated"
+
+
+def _identity(facts: Facts, path: Path) -> CameraIdentity:
+    """Files that say nothing all belong to one nameless camera, so that a session can go on with other files."""
+    model = facts.model or path.suffix.lower().lstrip(".") or "unnamed"
+    return CameraIdentity(facts.vendor or "files", model, facts.serial or "not stated", "files")
+
+
+def _distance(shot: _Shot, settings: Settings) -> tuple[float, float]:
+    return abs(shot.gain_dB - settings.gain_dB), abs(math.log(shot.exposure_s / settings.exposure_s))

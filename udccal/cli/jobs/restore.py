@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import UInt16
 
-from udccal.cameras.files import read_raw
+from udccal.cameras.picture_files.mosaics import read_raw
 from udccal.cli.jobs.panel_picture import read_panel_picture
 from udccal.cli.output import Output
 from udccal.errors import RestorationError

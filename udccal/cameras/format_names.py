@@ -1,0 +1,14 @@
+"""Names after the GenICam Pixel Format Naming Convention (PFNC) for mosaics that come without one."""
+
+from __future__ import annotations
+
+from typing import Final
+
+_FAMILIES: Final = {"mono": "Mono", "RGGB": "BayerRG", "GRBG": "BayerGR", "GBRG": "BayerGB", "BGGR": "BayerBG"}
+PATTERNS: Final = tuple(_FAMILIES)
+_BITS: Final = (8, 10, 12, 14, 16)
+
+
+def unpacked_format_name(cfa: str, bits: int) -> str:
+    """The name of unpacked samples of that pattern, at the next of the convention's sizes that holds the bits."""
+    return f"{_FAMILIES[cfa]}{next(size for size in _BITS if size >= bits)}"

@@ -1,0 +1,131 @@
+"""Modes and settings as GenICam features: SFNC's names, and where a device lacks these, the older ones that end in
+``Abs``."""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+from udccal.cameras.pixel_formats import PIXEL_FORMATS
+from udccal.cameras.protocol import Features, Mode, Range, Region, Settings, Trigger
+from udccal.cameras.pylon_sdk.nodes import Nodes
+
+_EXPOSURE: Final = ("ExposureTime", "ExposureTimeAbs")  # in us
+_GAIN: Final = ("Gain", "GainAbs")  # in dB
+_RATE: Final = ("AcquisitionFrameRate", "AcquisitionFrameRateAbs")
+_RATE_ENABLE: Final = ("AcquisitionFrameRateEnable", "AcquisitionFrameRateEnabled")
+_US_PER_S: Final = 1e6
+_NOTHING: Final = Range(0.0, 0.0)
+_FRAME_START: Final = "FrameStart"
+_SOFTWARE: Final = "Software"
+
+
+def read_sensor(nodes: Nodes) -> Region:
+    """The largest region without binning, cut to whole 2 x 2 cells."""
+    sides = (nodes.number("WidthMax", "SensorWidth", "Width"), nodes.number("HeightMax", "SensorHeight", "Height"))
+    columns, rows = (2 * (int(side or 0) // 2) for side in sides)
+    return Region(0, 0, columns, rows)
+
+
+def read_features(nodes: Nodes) -> Features:
+    """What the device can do now."""
+    exposure = nodes.bounds(*_EXPOSURE) or _NOTHING
+    steps = tuple(math.lcm(2, nodes.step(name)) for name in ("OffsetX", "OffsetY", "Width", "Height"))
+    return Features(
+        exposure_s=Range(exposure.low / _US_PER_S, exposure.high / _US_PER_S),
+        gain_dB=nodes.bounds(*_GAIN) or _NOTHING,
+        frame_rate_hz=nodes.bounds(*_RATE) or _NOTHING,
+        pixel_formats=_formats(nodes),
+        triggers=_triggers(nodes),
+        region_steps=(steps[0], steps[1], steps[2], steps[3]),
+    )
+
+
+def read_mode(nodes: Nodes) -> Mode:
+    """How the device works now."""
+    return Mode(nodes.text("PixelFormat"), _paced_rate_hz(nodes), _trigger(nodes))
+
+
+def write_mode(nodes: Nodes, mode: Mode) -> None:
+    """Set a mode that was found among the features."""
+    nodes.choose("PixelFormat", mode.pixel_format)
+    can_be_free = nodes.set_flag(mode.frame_rate_hz is not None, *_RATE_ENABLE)
+    fastest = nodes.bounds(*_RATE)
+    if mode.frame_rate_hz is not None:
+        nodes.set_number(mode.frame_rate_hz, *_RATE)
+    elif fastest is not None and not can_be_free:
+        nodes.set_number(fastest.high, *_RATE)
+    for selector in nodes.choices("TriggerSelector"):
+        if nodes.choose("TriggerSelector", selector):
+            nodes.choose("TriggerMode", "Off")
+    if mode.trigger is not Trigger.FREE_RUN:
+        nodes.choose("TriggerSelector", _FRAME_START)
+        nodes.choose("TriggerSource", _SOFTWARE if mode.trigger is Trigger.SOFTWARE else _line(nodes))
+        nodes.choose("TriggerMode", "On")
+
+
+def read_settings(nodes: Nodes) -> Settings:
+    """What the device exposes with now; a device without a gain in dB is at 0 dB."""
+    numbers = [int(nodes.number(name) or 0) for name in ("OffsetX", "OffsetY", "Width", "Height")]
+    exposure_s = (nodes.number(*_EXPOSURE) or 0.0) / _US_PER_S
+    return Settings(exposure_s, nodes.number(*_GAIN) or 0.0, Region(*numbers))
+
+
+def write_settings(nodes: Nodes, settings: Settings) -> None:
+    """Set what was found within the features; a device without a gain in dB is set to the least it has."""
+    nodes.set_number(settings.exposure_s * _US_PER_S, *_EXPOSURE)
+    least = nodes.bounds("GainRaw")
+    if not nodes.set_number(settings.gain_dB, *_GAIN) and least is not None:
+        nodes.set_whole(int(least.low), "GainRaw")
+    region = settings.region
+    for offset, size, start, length in (
+        ("OffsetX", "Width", region.x, region.columns),
+        ("OffsetY", "Height", region.y, region.rows),
+    ):
+        nodes.set_whole(0, offset)  # makes room for any size
+        nodes.set_whole(length, size)
+        nodes.set_whole(start, offset)
+
+
+def frame_period_s(nodes: Nodes) -> float:
+    """Time from one frame to the next of a paced camera; 0 when it runs as fast as it can."""
+    rate_hz = _paced_rate_hz(nodes)
+    return 1.0 / rate_hz if rate_hz else 0.0
+
+
+def _paced_rate_hz(nodes: Nodes) -> float | None:
+    """The rate that the camera is held to; a device without a switch for that always is."""
+    return nodes.number(*_RATE) if nodes.flag(*_RATE_ENABLE) in (True, None) else None
+
+
+def ticks_per_s(nodes: Nodes) -> float:
+    """Of the camera's clock: USB3 Vision counts in ns, GigE Vision says in what."""
+    return nodes.number("GevTimestampTickFrequency") or 1e9
+
+
+def _formats(nodes: Nodes) -> tuple[str, ...]:
+    """Formats that hold raw samples; a colour sensor's Mono formats are mixed from its colours."""
+    coloured = nodes.text("PixelColorFilter").startswith("Bayer")
+    known = (name for name in nodes.choices("PixelFormat") if name in PIXEL_FORMATS)
+    return tuple(name for name in known if not (coloured and PIXEL_FORMATS[name].cfa == "mono"))
+
+
+def _triggers(nodes: Nodes) -> tuple[Trigger, ...]:
+    if _FRAME_START not in nodes.choices("TriggerSelector"):
+        return (Trigger.FREE_RUN,)
+    sources = nodes.choices("TriggerSource")
+    software = (Trigger.SOFTWARE,) if _SOFTWARE in sources else ()
+    external = (Trigger.EXTERNAL,) if any(source.startswith("Line") for source in sources) else ()
+    return (Trigger.FREE_RUN, *software, *external)
+
+
+def _trigger(nodes: Nodes) -> Trigger:
+    if not nodes.choose("TriggerSelector", _FRAME_START) or nodes.text("TriggerMode") != "On":
+        return Trigger.FREE_RUN
+    return Trigger.SOFTWARE if nodes.text("TriggerSource") == _SOFTWARE else Trigger.EXTERNAL
+
+
+def _line(nodes: Nodes) -> str:
+    """The trigger line chosen already, or the first."""
+    chosen = nodes.text("TriggerSource")
+    return chosen if chosen.startswith("Line") else next(s for s in nodes.choices("TriggerSource") if "Line" in s)

@@ -1,0 +1,126 @@
+"""Which cameras the SDK sees, and opening one."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final, final
+
+from udccal.cameras.protocol import CameraIdentity
+from udccal.cameras.pylon_sdk.failures import reason_of, translated
+from udccal.cameras.pylon_sdk.loading import Sdk
+from udccal.cameras.pylon_sdk.nodes import Nodes
+from udccal.errors import CameraBusy, CameraError, CameraLost
+
+# First line of the files that pylon Viewer writes.
+_FEATURE_FILE: Final = "# {05D8C294-F295-4dfb-9D01-096BD04049F4}"
+_MAX_FEATURE_BYTES: Final = 1 << 20
+_MAX_NAME: Final = 100
+
+
+@final
+@dataclass(frozen=True)
+class OpenDevice:
+    """An open camera: the SDK's object for it, and its features."""
+
+    sdk: Sdk
+    camera: Any
+    nodes: Nodes
+
+
+def device_infos(sdk: Sdk) -> Sequence[Any]:
+    """What the SDK's transport layers find now.
+
+    Raises:
+        CameraError: when they cannot look.
+    """
+    try:
+        return tuple(sdk.pylon.TlFactory.GetInstance().EnumerateDevices())
+    except sdk.genicam.GenericException as error:
+        raise CameraError(
+            f"Expected Basler's SDK to list its cameras, found: {reason_of(error)}. Check its installation."
+        ) from error
+
+
+def identity_of(info: Any) -> CameraIdentity:
+    """Who a camera that was found is."""
+    texts = (info.GetVendorName(), info.GetModelName(), info.GetSerialNumber())
+    vendor, model, serial = (str(text)[:_MAX_NAME] or "not stated" for text in texts)
+    return CameraIdentity(vendor, model, serial, "pylon")
+
+
+def choose_info(infos: Sequence[Any], serial: str | None) -> Any:
+    """The camera of that serial number, or the only one.
+
+    Raises:
+        CameraError: when it is not there, or there are several to choose from.
+    """
+    if serial is not None:
+        infos = [info for info in infos if info.GetSerialNumber() == serial]
+    if len(infos) == 1:
+        return infos[0]
+    wanted = "a camera" if serial is None else f"the camera with serial number {serial[:_MAX_NAME]}"
+    if not infos:
+        raise CameraError(
+            f"Expected {wanted} for Basler's SDK, found none. Check cable and power; 'udccal doctor' says more."
+        )
+    serials = ", ".join(str(info.GetSerialNumber()) for info in infos)
+    raise CameraError(f"Expected one camera to choose, found {len(infos)} ({serials}). Give a serial number.")
+
+
+def open_device(sdk: Sdk, info: Any) -> OpenDevice:
+    """Open a camera for control and streaming.
+
+    Raises:
+        CameraBusy: when another program holds it, or this user may not open it.
+    """
+    factory = sdk.pylon.TlFactory.GetInstance()
+    name = identity_of(info).serial
+    held = (sdk.pylon.Accessibility_Opened, sdk.pylon.Accessibility_OpenedExclusively)
+    try:
+        accessible, why = factory.IsDeviceAccessibleInfo(info)
+        if not accessible:
+            found = "another program to hold it" if why in held else "that it cannot be reached"
+            raise CameraBusy(
+                f"Expected to open the camera {name}, found {found}. Close other programs that use it, such as pylon "
+                "Viewer; 'udccal doctor' says which permissions it needs."
+            )
+        camera = sdk.pylon.InstantCamera(factory.CreateDevice(info))
+        camera.Open()
+    except sdk.genicam.GenericException as error:
+        raise CameraBusy(
+            f"Expected to open the camera {name}, found: {reason_of(error)}. Close other programs that use it, such as "
+            "pylon Viewer; 'udccal doctor' says which permissions it needs."
+        ) from error
+    return OpenDevice(sdk, camera, Nodes(camera.GetNodeMap()))
+
+
+def load_features(device: OpenDevice, path: Path) -> None:
+    """Set what a feature file of pylon Viewer says.
+
+    Raises:
+        CameraError: when it is not one, or the camera refuses a line of it.
+    """
+    if not path.is_file() or os.path.getsize(path) > _MAX_FEATURE_BYTES:
+        raise CameraError(f"Expected a feature file of pylon Viewer at {path}, found none. Check the path.")
+    text = path.read_text("utf-8", "replace")
+    if not text.startswith(_FEATURE_FILE):
+        raise CameraError(
+            f"Expected {path} to be a feature file (.pfs) of pylon Viewer, found other content. Save it there again."
+        )
+    with translated(device.sdk, device.camera, f"to set the features in {path}"):
+        device.sdk.pylon.FeaturePersistence.LoadFromString(text, device.camera.GetNodeMap(), True)
+
+
+def close_device(device: OpenDevice) -> None:
+    """Close a camera; one that is gone already is let go of without an error.
+
+    Raises:
+        CameraError: when it does not close.
+    """
+    with suppress(CameraLost), translated(device.sdk, device.camera, "the camera to close"):
+        device.camera.Close()
+        device.camera.DestroyDevice()
