@@ -116,6 +116,19 @@ def test_a_lamp_of_changing_pattern_is_a_poor_fit() -> None:
     assert fit_noise_data(replace(data, flats=bent), nominal_noise(rig)).status is FitStatus.POOR_FIT
 
 
+def test_pairs_of_one_frame_twice_are_a_poor_fit() -> None:
+    rig, sensor = toy("lg55-aca2040", 3)
+    data = reduced(sensor, np.linspace(0.05, 0.6, 8), 3)
+    light = np.full((ROWS, COLUMNS), sensor.truth.full_well_e / 0.02)
+    twice = []
+    for t in 0.02 * np.linspace(0.05, 0.6, 8):
+        frame = sensor.expose(light, float(t), Region(0, 0, COLUMNS, ROWS), np.random.default_rng(0))
+        twice.append(photon_transfer.bin_pair(frame, frame, float(t)))
+    result = fit_noise_data(replace(data, flats=tuple(twice)), nominal_noise(rig))
+    assert result.status is FitStatus.POOR_FIT
+    assert "copies of each other" in result.notes[0]
+
+
 @pytest.mark.parametrize("fraction", [0.0, 0.25, 0.5])
 def test_rounding_coarser_than_the_noise(fraction: float) -> None:
     rng = np.random.default_rng(7)

@@ -139,6 +139,13 @@ def fit_noise_data(data: NoiseData, nominal: Noise) -> FitResult[Noise]:
             FitStatus.SATURATED,
             f"Expected at least {_FEWEST_LEVELS} flat exposures below 70 % of saturation, found {found}.",
         )
+    if line.K_DN_per_e <= 0:
+        return _failed(
+            nominal,
+            FitStatus.POOR_FIT,
+            f"Expected the variance of flats to grow with their mean, found a slope of {line.K_DN_per_e:.3g} DN per "
+            "electron: the two frames of a pair may be copies of each other.",
+        )
     row_DN, _row_sigma = nonuniformity.combine_rows(data.rows)
     dark = read_noise.fit_dark(data.darks, read_noise.Surroundings(line.K_DN_per_e, row_DN))
     total = float(dark.values[2]) ** 2 + data.q_DN**2 / 12.0

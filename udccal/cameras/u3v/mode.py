@@ -1,0 +1,161 @@
+"""Pixel format, frame rate and trigger by their SFNC names, and what a camera can do in all."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from udccal.cameras.pixel_formats import PIXEL_FORMATS, PixelFormat, pixel_format
+from udccal.cameras.protocol import Features, Mode, Range, Trigger
+from udccal.cameras.u3v.nodes import NodeMap
+from udccal.cameras.u3v.settings import check_range, exposure_range, gain_range, region_steps
+from udccal.errors import CameraError
+
+# Names before SFNC 2.0 come second.
+_RATE: Final = ("AcquisitionFrameRate", "AcquisitionFrameRateAbs")
+_RATE_ENABLE: Final = ("AcquisitionFrameRateEnable", "AcquisitionFrameRateEnabled")
+_RESULTING_RATE: Final = ("ResultingFrameRate", "AcquisitionResultingFrameRate", "ResultingFrameRateAbs")
+_FRAME_START: Final = "FrameStart"
+_SOFTWARE: Final = "Software"
+_LINE: Final = "Line"
+
+
+def read_features(nodes: NodeMap) -> Features:
+    """What the camera can do in its present mode."""
+    return Features(
+        exposure_s=exposure_range(nodes),
+        gain_dB=gain_range(nodes),
+        frame_rate_hz=_rate_range(nodes),
+        pixel_formats=tuple(s for s in nodes.choices("PixelFormat") if s in PIXEL_FORMATS),
+        triggers=_triggers(nodes),
+        region_steps=region_steps(nodes),
+    )
+
+
+def read_format(nodes: NodeMap) -> PixelFormat:
+    """The pixel format that the camera has now.
+
+    Raises:
+        CameraError: when it is not one that can be unpacked.
+    """
+    return pixel_format(nodes.choice("PixelFormat"))
+
+
+def choose_known_format(nodes: NodeMap) -> None:
+    """Leave the pixel format if it can be unpacked; else take the one with most bits.
+
+    Raises:
+        CameraError: when the camera has none that can be unpacked.
+    """
+    if nodes.choice("PixelFormat") in PIXEL_FORMATS:
+        return
+    known = [PIXEL_FORMATS[s] for s in nodes.choices("PixelFormat") if s in PIXEL_FORMATS]
+    if not known:
+        raise CameraError(
+            f"Expected a camera with a Mono or Bayer pixel format, found {', '.join(nodes.choices('PixelFormat'))}. "
+            "Use another camera."
+        )
+    nodes.choose("PixelFormat", max(known, key=lambda f: (f.bits, f.packed)).name)
+    nodes.refresh()
+
+
+def read_mode(nodes: NodeMap) -> Mode:
+    """How the camera works now."""
+    enable, rate = nodes.first(*_RATE_ENABLE), nodes.first(*_RATE)
+    limited = rate is not None and (enable is None or nodes.flag(enable))
+    rate_hz = nodes.number(rate) if limited and rate is not None else None
+    return Mode(nodes.choice("PixelFormat"), rate_hz, _read_trigger(nodes))
+
+
+def apply_mode(nodes: NodeMap, mode: Mode) -> Mode:
+    """Ask for a mode; returns what the camera has afterwards, read back from it.
+
+    Raises:
+        CameraError: when the camera or this program does not know a part of it.
+    """
+    formats = tuple(s for s in nodes.choices("PixelFormat") if s in PIXEL_FORMATS)
+    _check_choice("a pixel format", mode.pixel_format, formats)
+    _check_choice("a trigger", mode.trigger, _triggers(nodes))
+    nodes.choose("PixelFormat", mode.pixel_format)
+    _set_trigger(nodes, mode.trigger)
+    nodes.refresh()
+    _set_rate(nodes, mode.frame_rate_hz)
+    nodes.refresh()
+    return read_mode(nodes)
+
+
+def _check_choice(what: str, asked: str, allowed: tuple[str, ...]) -> None:
+    if asked not in allowed:
+        raise CameraError(f"Expected {what} out of {', '.join(allowed)}, found {asked[:40]!r}. Choose one of them.")
+
+
+def _rate_range(nodes: NodeMap) -> Range:
+    name = nodes.first(*_RATE)
+    if name is not None:
+        return nodes.bounds(name)
+    resulting = nodes.first(*_RESULTING_RATE)
+    rate_hz = nodes.number(resulting) if resulting is not None else 0.0
+    return Range(rate_hz, rate_hz)
+
+
+def _set_rate(nodes: NodeMap, rate_hz: float | None) -> None:
+    enable = nodes.first(*_RATE_ENABLE)
+    if enable is not None:
+        nodes.set_flag(enable, rate_hz is not None)
+        nodes.refresh()
+    name = nodes.first(*_RATE)
+    if rate_hz is not None:
+        check_range("a frame rate", "Hz", rate_hz, _rate_range(nodes))
+    if name is not None and (rate_hz is not None or enable is None) and nodes.writable(name):
+        nodes.set_number(name, nodes.bounds(name).high if rate_hz is None else rate_hz)
+
+
+def _triggers(nodes: NodeMap) -> tuple[Trigger, ...]:
+    if not nodes.has("TriggerMode") or not nodes.has("TriggerSource"):
+        return (Trigger.FREE_RUN,)
+    sources = nodes.choices("TriggerSource")
+    triggers = [Trigger.FREE_RUN]
+    if _SOFTWARE in sources:
+        triggers.append(Trigger.SOFTWARE)
+    if any(source.startswith(_LINE) for source in sources):
+        triggers.append(Trigger.EXTERNAL)
+    return tuple(triggers)
+
+
+def _select_frame_start(nodes: NodeMap) -> None:
+    if nodes.writable("TriggerSelector") and nodes.choice("TriggerSelector") != _FRAME_START:
+        nodes.choose("TriggerSelector", _FRAME_START)
+        nodes.refresh()
+
+
+def _read_trigger(nodes: NodeMap) -> Trigger:
+    if not nodes.has("TriggerMode"):
+        return Trigger.FREE_RUN
+    _select_frame_start(nodes)
+    if nodes.choice("TriggerMode") == "Off":
+        return Trigger.FREE_RUN
+    return Trigger.SOFTWARE if nodes.choice("TriggerSource") == _SOFTWARE else Trigger.EXTERNAL
+
+
+def _set_trigger(nodes: NodeMap, trigger: Trigger) -> None:
+    """Every kind of trigger is switched off, and the one that starts a frame on again where it is wanted."""
+    if not nodes.has("TriggerMode"):
+        return
+    for selector in nodes.choices("TriggerSelector") if nodes.writable("TriggerSelector") else ():
+        nodes.choose("TriggerSelector", selector)
+        nodes.refresh()
+        if nodes.writable("TriggerMode"):
+            nodes.choose("TriggerMode", "Off")
+    _select_frame_start(nodes)
+    nodes.choose("TriggerMode", "Off")
+    if trigger is not Trigger.FREE_RUN:
+        nodes.choose("TriggerSource", _source(nodes, trigger))
+        nodes.choose("TriggerMode", "On")
+
+
+def _source(nodes: NodeMap, trigger: Trigger) -> str:
+    """A camera's own choice of an input stays, so that it can be set beforehand with its maker's program."""
+    if trigger is Trigger.SOFTWARE:
+        return _SOFTWARE
+    present = nodes.choice("TriggerSource")
+    lines = [s for s in nodes.choices("TriggerSource") if s.startswith(_LINE)]
+    return present if present in lines else lines[0]

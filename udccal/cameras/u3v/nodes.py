@@ -1,0 +1,222 @@
+"""A camera's features by name, through EMVA's GenApi: its description says which registers a feature stands in."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any, Final, Protocol, final, runtime_checkable
+
+from udccal.cameras.protocol import Range
+from udccal.errors import CameraError, CameraProtocolError, CameraTimeout
+
+_PORT: Final = "Device"
+_MOST_INTEGER: Final = 1 << 63
+_COMMAND_S: Final = 1.0
+_COMMAND_POLL_S: Final = 5e-3
+
+
+@runtime_checkable
+class Registers(Protocol):
+    """A device's memory."""
+
+    def read(self, address: int, length: int) -> bytes:
+        """``length`` bytes from an address."""
+        ...
+
+    def write(self, address: int, data: bytes) -> None:
+        """Put ``data`` to an address."""
+        ...
+
+
+@final
+class NodeMap:
+    """The features that a description names, on a device's memory.
+
+    Every method that asks for a feature raises CameraError when the camera has none of that name or refuses, and
+    whatever the memory raises.
+
+    Args:
+        xml: a description that was checked; GenApi itself would follow its entities.
+
+    Raises:
+        CameraError: when GenApi is not installed, or cannot make sense of the description.
+    """
+
+    def __init__(self, xml: str, memory: Registers) -> None:
+        self._genapi = _import_genapi()
+        self._map = self._genapi.NodeMap()
+        with self._told("load its description"):
+            self._map.load_xml_from_string(xml)
+            self._port = _port(self._genapi, memory)
+            self._map.connect(self._port, _PORT)
+            self._chunks = self._genapi.ChunkAdapterU3V(self._map)
+
+    def refresh(self) -> None:
+        """Forget every value that was read: GenApi keeps them, and cameras change some behind its back."""
+        # Invalidating one node would leave the registers below it as they were.
+        self._map._invalidate_nodes()
+
+    def has(self, name: str) -> bool:
+        """Whether the camera has the feature, in its present state."""
+        return self._access(name) >= self._genapi.EAccessMode.WO
+
+    def writable(self, name: str) -> bool:
+        """Whether the feature may be set now."""
+        return self._access(name) in (self._genapi.EAccessMode.WO, self._genapi.EAccessMode.RW)
+
+    def first(self, *names: str) -> str | None:
+        """The first of several names for one thing that the camera has."""
+        return next((name for name in names if self.has(name)), None)
+
+    def number(self, name: str) -> float:
+        """A number, whether GenApi holds it as integer or as float."""
+        with self._told(f"read {name}"):
+            value = float(self._number(name).value)
+        if not math.isfinite(value):
+            raise CameraProtocolError(f"Expected a number in {name}, found {value}. Update the camera's firmware.")
+        return value
+
+    def bounds(self, name: str) -> Range:
+        """Between which a number may be set now."""
+        with self._told(f"read the limits of {name}"):
+            node = self._number(name)
+            bounds = Range(float(node.min), float(node.max))
+        if not bounds.low <= bounds.high < math.inf:
+            raise CameraProtocolError(
+                f"Expected limits of {name}, found {bounds.low} to {bounds.high}. Update the camera's firmware."
+            )
+        return bounds
+
+    def step(self, name: str) -> int:
+        """By which an integer may be changed; 1 when the camera does not say."""
+        with self._told(f"read the step of {name}"):
+            return max(1, int(self._number(name).inc))
+
+    def set_number(self, name: str, value: float | int) -> None:
+        """Set a number."""
+        with self._told(f"set {name} to {value:g}"):
+            if not abs(value) < _MOST_INTEGER:
+                raise ValueError("no number that a register holds")
+            node = self._number(name)
+            node.value = round(value) if isinstance(node, self._genapi.IInteger) else float(value)
+
+    def choice(self, name: str) -> str:
+        """Which of its choices an enumeration has."""
+        with self._told(f"read {name}"):
+            return str(self._node(name, "IEnumeration").value)
+
+    def choices(self, name: str) -> tuple[str, ...]:
+        """What an enumeration may be set to now."""
+        with self._told(f"read the choices of {name}"):
+            return tuple(str(symbol) for symbol in self._node(name, "IEnumeration").symbolics)
+
+    def choose(self, name: str, symbol: str) -> None:
+        """Set an enumeration."""
+        with self._told(f"set {name} to {symbol}"):
+            self._node(name, "IEnumeration").value = symbol
+
+    def flag(self, name: str) -> bool:
+        """A boolean."""
+        with self._told(f"read {name}"):
+            return bool(self._node(name, "IBoolean").value)
+
+    def set_flag(self, name: str, value: bool) -> None:
+        """Set a boolean."""
+        with self._told(f"set {name} to {value}"):
+            self._node(name, "IBoolean").value = value
+
+    def execute(self, name: str, wait_s: float = _COMMAND_S) -> None:
+        """Carry out a command, and wait until the camera has.
+
+        Raises:
+            CameraTimeout: when it is not done in that time.
+        """
+        with self._told(f"execute {name}"):
+            node = self._node(name, "ICommand")
+            node.execute()
+            for _ in range(round(wait_s / _COMMAND_POLL_S)):
+                if node.is_done():
+                    return
+                time.sleep(_COMMAND_POLL_S)
+        raise CameraTimeout(f"Expected {name} to be carried out, found it still going on. Open the camera again.")
+
+    @contextmanager
+    def chunks(self, data: bytes) -> Iterator[None]:
+        """Features that stand in chunk data can be read inside; ``data`` must be a sound sequence of chunks."""
+        with self._told("lay out its chunk data"):
+            self._chunks.attach_buffer(data, len(data))
+        try:
+            yield
+        finally:
+            self._chunks.detach_buffer()
+
+    def close(self) -> None:
+        """Let go of the memory, and of what was made of the description."""
+        # The adapter lives until the program ends, through a finalizer that holds it, and the node map with it.
+        self._chunks.detach_node_map()
+        self._map.disconnect()
+
+    def _access(self, name: str) -> int:
+        with self._told(f"say whether it has {name}"):
+            try:
+                node = self._map.get_node(name)
+            except self._genapi.LogicalErrorException:
+                return int(self._genapi.EAccessMode.NI)
+            return int(self._genapi.EAccessMode.NI) if node is None else int(node.get_access_mode())
+
+    def _number(self, name: str) -> Any:
+        return self._node(name, "IFloat", "IInteger")
+
+    def _node(self, name: str, *kinds: str) -> Any:
+        """A feature, if GenApi holds it as one of these kinds; a description may say anything."""
+        node = self._map.get_node(name)
+        found = "nothing of that name" if node is None else f"an {type(node).__name__}"
+        if not any(isinstance(node, getattr(self._genapi, kind)) for kind in kinds):
+            raise CameraError(
+                f"Expected the camera's {name} to be an {' or '.join(kinds)}, found {found}. Use another camera."
+            )
+        return node
+
+    @contextmanager
+    def _told(self, what: str) -> Iterator[None]:
+        """Turns GenApi's exceptions into sentences; those of the memory come through as they are."""
+        try:
+            yield
+        except (self._genapi.GenericException, RuntimeError, TypeError, ValueError, ArithmeticError) as error:
+            # Behind the first colon GenApi tells of its own source files.
+            reason = " ".join(str(error).split(" : ")[0].split())[:200] or type(error).__name__
+            raise CameraError(
+                f"Expected the camera to {what}, found: {reason}. Ask for something that it can do."
+            ) from error
+
+
+def _import_genapi() -> Any:
+    try:
+        from genicam import genapi
+    except ImportError as error:
+        raise CameraError(
+            'Expected EMVA\'s GenApi, found none. Install it with: pip install "udccal[u3v]" (the package genicam).'
+        ) from error
+    return genapi
+
+
+def _port(genapi: Any, memory: Registers) -> Any:
+    """GenApi's way to a device's memory; its base class is only there once GenApi is imported."""
+
+    @final
+    class DevicePort(genapi.AbstractPort):
+        def __init__(self) -> None:
+            super().__init__()
+
+        def get_access_mode(self) -> int:
+            return int(genapi.EAccessMode.RW)
+
+        def read(self, address: int, length: int) -> bytes:
+            return memory.read(address, length)
+
+        def write(self, address: int, data: bytes) -> None:
+            memory.write(address, bytes(data))
+
+    return DevicePort()

@@ -1,0 +1,91 @@
+"""A block of the stream as a frame: samples unpacked, settings and time from its chunks, what is missing made 0."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Final, final
+
+from udccal.cameras.pixel_formats import PixelFormat, payload_bytes, pixel_format_of, unpack
+from udccal.cameras.protocol import Frame, Settings
+from udccal.cameras.u3v.chunk_values import ChunkValues, read_chunks
+from udccal.cameras.u3v.chunks import behind_picture
+from udccal.cameras.u3v.nodes import NodeMap
+from udccal.cameras.u3v.receiver import Block
+from udccal.cameras.u3v.stream import ImageInfo, PayloadType
+from udccal.errors import CameraProtocolError
+
+_NS_PER_S: Final = 1e9
+# Whole samples of every packing fill this many bytes: least common multiple of 1, 2, 3 and 5.
+_WHOLE_SAMPLES_BYTES: Final = 30
+_NO_CHUNKS: Final = ChunkValues(None, None, None)
+
+
+@final
+@dataclass(frozen=True)
+class PictureReader:
+    """Makes frames of blocks taken with settings that the camera accepted.
+
+    Attributes:
+        tick_s: of the time in chunks.
+    """
+
+    nodes: NodeMap
+    settings: Settings
+    format: PixelFormat
+    tick_s: float
+
+    def frame(self, payload: memoryview, block: Block, frame_id: int) -> Frame:
+        """The frame that a block holds; its payload is free for others afterwards.
+
+        Raises:
+            CameraProtocolError: when it is no picture of the settings.
+        """
+        image = self._image(block)
+        rows, columns = self.settings.region.rows, self.settings.region.columns
+        needed = payload_bytes(self.format, rows, columns, image.padding_x)
+        if needed > len(payload):
+            raise CameraProtocolError(
+                f"Expected a picture of up to {len(payload)} bytes, found {needed} with {image.padding_x} bytes after "
+                "each line. Update the camera's firmware."
+            )
+        trailer = block.trailer
+        complete = (
+            block.whole and block.valid >= needed and (trailer is None or trailer.rows is None or trailer.rows == rows)
+        )
+        values = _NO_CHUNKS
+        if complete and block.leader.payload_type is PayloadType.IMAGE_EXTENDED_CHUNK:
+            try:
+                values = read_chunks(self.nodes, behind_picture(payload[: block.valid], needed), self.tick_s)
+            except CameraProtocolError:
+                complete = False
+        if block.valid < needed:
+            # Samples fall on multiples of these bytes, counted from the start of a line or of the picture.
+            unit = needed // rows if image.padding_x else _WHOLE_SAMPLES_BYTES
+            start = block.valid // unit * unit
+            payload[start:needed] = bytes(needed - start)
+        data = unpack(payload[:needed], self.format, rows, columns, image.padding_x)
+        timestamp_s = block.leader.timestamp_ns / _NS_PER_S
+        if not block.leader.timestamp_ns and values.timestamp_s is not None:
+            timestamp_s = values.timestamp_s
+        return Frame(data, self._taken_with(values), timestamp_s, frame_id, complete)
+
+    def _image(self, block: Block) -> ImageInfo:
+        """The picture that the leader announces, if it is the one that was asked for."""
+        image = block.leader.image
+        if image is None:
+            raise CameraProtocolError("Expected a picture, found chunks alone. Switch ChunkEnable of Image on.")
+        region, format = self.settings.region, pixel_format_of(image.pixel_format)
+        if (image.columns, image.rows, format) != (region.columns, region.rows, self.format):
+            raise CameraProtocolError(
+                f"Expected {region.columns} x {region.rows} pixels in {self.format.name}, found {image.columns} x "
+                f"{image.rows} in {format.name}. Configure the camera again."
+            )
+        return image
+
+    def _taken_with(self, values: ChunkValues) -> Settings:
+        settings = self.settings
+        if values.exposure_s is not None:
+            settings = replace(settings, exposure_s=values.exposure_s)
+        if values.gain_dB is not None:
+            settings = replace(settings, gain_dB=values.gain_dB)
+        return settings

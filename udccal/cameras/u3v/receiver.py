@@ -1,0 +1,208 @@
+"""Frames out of the stream endpoint: leader, payload and trailer, and back into step after anything else."""
+
+from __future__ import annotations
+
+import time
+from array import array
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final, Protocol, final, runtime_checkable
+
+from udccal.cameras.u3v.layout import StreamLayout
+from udccal.cameras.u3v.stream import Leader, Trailer, is_leader, is_trailer, parse_leader, parse_trailer
+from udccal.cameras.u3v.usb_errors import RECOVERABLE
+from udccal.errors import CameraProtocolError, CameraTimeout
+
+# Waiting for a leader is cut into pieces, so that it can be given up between them.
+_SLICE_S: Final = 0.1
+# Times that one frame may be looked for anew after a halt, an overflow, a failed transfer or repeated ids.
+_MOST_TROUBLES: Final = 32
+
+
+@runtime_checkable
+class StreamLink(Protocol):
+    """What is needed of USB: one endpoint, with errors as ``transport`` raises them."""
+
+    def read_stream(self, buffer: array[int], timeout_s: float) -> int:
+        """Fill a buffer, or as much of it as comes."""
+        ...
+
+    def clear_stream_halt(self) -> None:
+        """Make the endpoint usable again."""
+        ...
+
+
+@final
+@dataclass(frozen=True)
+class Block:
+    """What came of one frame.
+
+    Attributes:
+        trailer: None when none came.
+        received: bytes of payload, from its beginning without a gap.
+    """
+
+    leader: Leader
+    trailer: Trailer | None
+    received: int
+
+    @property
+    def valid(self) -> int:
+        """Bytes of payload that came and mean something."""
+        return self.received if self.trailer is None else min(self.received, self.trailer.valid_bytes)
+
+    @property
+    def whole(self) -> bool:
+        """Whether the device says that it sent everything, and all of it came."""
+        trailer = self.trailer
+        return (
+            trailer is not None
+            and trailer.block_id == self.leader.block_id
+            and trailer.status == 0
+            and trailer.valid_bytes <= self.received
+        )
+
+
+@final
+class Receiver:
+    """Reads one block after the other, each id once; what belongs to none is thrown away.
+
+    Args:
+        timeout_s: for each transfer within a frame.
+    """
+
+    def __init__(self, link: StreamLink, layout: StreamLayout, timeout_s: float) -> None:
+        self._link = link
+        self._layout = layout
+        self._timeout_s = timeout_s
+        sizes = {layout.leader, layout.trailer, layout.transfer, *layout.transfers}
+        self._buffers = {size: array("B", bytes(size)) for size in sizes}
+        self._in_step = True
+        self._next_leader: Leader | None = None
+        self._last_id = -1
+
+    @property
+    def room(self) -> int:
+        """Bytes that a buffer for a payload must have."""
+        return sum(self._layout.transfers)
+
+    def receive(self, payload: memoryview, wait_s: float, stopped: Callable[[], bool]) -> Block | None:
+        """The next block, whole or not; ``payload`` is filled from its beginning.
+
+        Args:
+            payload: of ``room`` bytes.
+            wait_s: longest wait for its leader.
+            stopped: asked now and then; None is returned once it says so.
+
+        Raises:
+            CameraTimeout: when no leader comes.
+            CameraLost: when the camera is gone.
+            CameraProtocolError: when only data without leaders comes, or blocks with ids that were there before.
+        """
+        for _ in range(_MOST_TROUBLES):
+            leader = self._leader(wait_s, stopped)
+            if leader is None:
+                return None
+            block = self._block(leader, payload)
+            # A leader that another one follows at once was left over from an earlier run.
+            left_over = not block.received and self._next_leader is not None
+            if leader.block_id > self._last_id and not left_over:
+                self._last_id = leader.block_id
+                return block
+        raise CameraProtocolError(
+            f"Expected a frame after frame {self._last_id}, found {_MOST_TROUBLES} that were there before. "
+            "Open the camera again."
+        )
+
+    def _leader(self, wait_s: float, stopped: Callable[[], bool]) -> Leader | None:
+        """The next leader; None when stopped."""
+        leader, self._next_leader = self._next_leader, None
+        waited_s, foreign, troubles = 0.0, 0, 0
+        latest = time.monotonic() + wait_s + self._timeout_s
+        while leader is None and not stopped():
+            try:
+                # Out of step, long reads take what is left of a broken frame; a leader ends one by its short packet.
+                packet = self._read(self._layout.leader if self._in_step else self._layout.transfer, _SLICE_S)
+                leader = _leader_in(packet)
+            except CameraTimeout as error:
+                waited_s += _SLICE_S
+                if waited_s >= wait_s:
+                    raise CameraTimeout(
+                        f"Expected a frame within {wait_s:g} s, found none. Check the trigger, the cable and the port."
+                    ) from error
+                continue
+            except RECOVERABLE:
+                self._recover()
+                packet, troubles = memoryview(b""), troubles + 1
+            if leader is None:
+                self._in_step, foreign = False, foreign + len(packet)
+                if troubles > _MOST_TROUBLES or foreign > 4 * self.room or time.monotonic() > latest:
+                    raise _no_leader(foreign, troubles, packet)
+        self._in_step = True
+        return leader
+
+    def _block(self, leader: Leader, payload: memoryview) -> Block:
+        """What follows a leader, as far as it is in order; out of order, the rest is left to be thrown away."""
+        received = 0
+        try:
+            for size in self._layout.transfers:
+                data = self._read(size, self._timeout_s)
+                if len(data) <= max(self._layout.leader, self._layout.trailer) and _is_head(data):
+                    return self._ended(leader, received, data)
+                payload[received : received + len(data)] = data
+                received += len(data)
+                if len(data) < size:  # the device has no more to send, or the time was up in the middle
+                    break
+            data = self._read(self._layout.trailer, self._timeout_s)
+            # Some devices end a payload that fills its transfers with an empty packet all the same.
+            return self._ended(leader, received, data or self._read(self._layout.trailer, self._timeout_s))
+        except CameraTimeout:
+            self._in_step = False
+        except RECOVERABLE:
+            self._recover()
+        return Block(leader, None, received)
+
+    def _ended(self, leader: Leader, received: int, packet: memoryview) -> Block:
+        """The block, with what came behind its payload."""
+        try:
+            if is_trailer(bytes(packet[:4])):
+                return Block(leader, parse_trailer(bytes(packet)), received)
+        except CameraProtocolError:
+            pass  # a trailer cut short says nothing of the payload
+        self._next_leader = _leader_in(packet)
+        self._in_step = self._next_leader is not None
+        return Block(leader, None, received)
+
+    def _recover(self) -> None:
+        """After a halt, an overflow or a failed transfer: make the endpoint usable, and look for the next leader."""
+        self._link.clear_stream_halt()
+        self._in_step = False
+
+    def _read(self, size: int, timeout_s: float) -> memoryview:
+        buffer = self._buffers[size]
+        return memoryview(buffer)[: self._link.read_stream(buffer, timeout_s)]
+
+
+def _is_head(packet: memoryview) -> bool:
+    start = bytes(packet[:4])
+    return is_leader(start) or is_trailer(start)
+
+
+def _leader_in(packet: memoryview) -> Leader | None:
+    """The leader that a packet is; None when it is another thing, or a leader that makes no sense."""
+    try:
+        return parse_leader(bytes(packet)) if is_leader(bytes(packet[:4])) else None
+    except CameraProtocolError:
+        return None
+
+
+def _no_leader(foreign: int, troubles: int, packet: memoryview) -> CameraProtocolError:
+    if is_leader(bytes(packet[:4])):
+        try:
+            parse_leader(bytes(packet))
+        except CameraProtocolError as error:
+            return error
+    return CameraProtocolError(
+        f"Expected the leader of a frame, found {foreign} bytes of other data and {troubles} failed transfers. "
+        "Unplug the camera and plug it in again."
+    )
