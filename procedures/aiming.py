@@ -7,6 +7,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from udccal.arrangements import Board, BoardSpec
+from udccal.mounting import nominal_pupil_mm, nominal_rotation
 from udccal.rig import RigDescription
 
 _PLASTIC = 1.32471795724474602596  # root of x^3 = x + 1
@@ -20,19 +21,6 @@ def low_discrepancy(count: int, dimensions: int = 2) -> Float[np.ndarray, "count
     growth = _PLASTIC if dimensions == 2 else _generalised_golden_ratio(dimensions)
     steps = growth ** -np.arange(1.0, dimensions + 1)
     return (0.5 + np.arange(1, count + 1)[:, None] * steps) % 1.0
-
-
-def nominal_rotation(rig: RigDescription) -> Float[np.ndarray, "3 3"]:
-    """Nominal R_panel_camera = Ry(yaw) Rx(-tilt) Rz(roll)."""
-    mounting = rig.mounting
-    angles_deg = [mounting.yaw_deg.value, -mounting.tilt_deg.value, mounting.roll_deg.value]
-    return np.asarray(Rotation.from_euler("YXZ", angles_deg, degrees=True).as_matrix(), dtype=np.float64)
-
-
-def nominal_pupil_mm(rig: RigDescription) -> Float[np.ndarray, "3"]:
-    """Nominal place of the entrance pupil in panel coordinates."""
-    mounting, pitch = rig.mounting, rig.panel.pitch_mm.value
-    return np.array([mounting.panel_x_px.value * pitch, mounting.panel_y_px.value * pitch, -mounting.standoff_mm.value])
 
 
 def nominal_ray(rig: RigDescription, x_px: float, y_px: float) -> Float[np.ndarray, "3"]:

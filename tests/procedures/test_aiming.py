@@ -9,11 +9,10 @@ from procedures.aiming import (
     board_parallel,
     low_discrepancy,
     nominal_pixels,
-    nominal_pupil_mm,
     nominal_ray,
-    nominal_rotation,
 )
 from udccal.arrangements import Board, BoardSpec
+from udccal.mounting import nominal_pupil_mm, nominal_rotation
 from udccal.rig import load_rig
 
 RIG = load_rig("lg55-aca2040")

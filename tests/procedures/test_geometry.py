@@ -6,11 +6,12 @@ import cv2
 import numpy as np
 import pytest
 
-from procedures.aiming import nominal_pixels, nominal_rotation
+from procedures.aiming import nominal_pixels
 from procedures.base import run_procedure
 from procedures.geometry import GeometryProcedure, board_poses, board_spec
 from tests.procedures.benches import new_writer, simulated_bench
 from udccal.arrangements import Board
+from udccal.mounting import nominal_rotation
 from udccal.rig import RigDescription, load_rig
 from udccal.sessions.store import Session
 

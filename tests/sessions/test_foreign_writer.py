@@ -55,13 +55,13 @@ def test_it_fits(session: Session, world: dict) -> None:
     results = fit_session(session, lambda *_: None)
     for term in ("noise", "geometry", "wire", "psf", "backscatter"):
         assert getattr(results, term).ok, (term, getattr(results, term).status, getattr(results, term).notes)
-    noise = results.noise
+    noise = results.foundation.noise
     assert noise.estimate("K_DN_per_e").value == pytest.approx(world["K_DN_PER_E"], rel=0.02)
     assert noise.estimate("PRNU1288").value == pytest.approx(world["PRNU"], rel=0.1)
-    focal = np.asarray(results.geometry.term.focal)
+    focal = np.asarray(results.foundation.geometry.term.focal)
     np.testing.assert_allclose(focal, world["FOCAL_PX"], rtol=2e-3)
     rows, columns = world["ROWS"], world["COLUMNS"]
-    wire = np.asarray(wire_map(results.wire.term, rows, columns))
+    wire = np.asarray(wire_map(results.foundation.wire.term, rows, columns))
     assert np.sqrt(np.mean((wire / world["wire"]() - 1) ** 2)) < 2e-3
     position = np.array([[250.0, 120.0]])
     kernel = np.asarray(psf_kernels(results.psf.term, position, 61, 41))[0]

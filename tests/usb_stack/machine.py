@@ -61,6 +61,7 @@ def run_guest(image: Path, archive: Path, limit_s: float) -> int:
         if outcome.booted:
             text = f"Expected the guest to end in {limit_s:.0f} s, found it did not. See its last lines above."
             raise CannotRun(text)
+        print(f"the guest does not boot with {accelerator.name} here", flush=True)
     raise CannotRun("Expected the guest to boot, found it did not. See its last lines above.")
 
 

@@ -67,30 +67,39 @@ class FitTime:
 
 
 @dataclass(frozen=True)
-class Calibration:
-    """The five results of one session, and how long each took.
+class Foundation:
+    """The fits that psf and backscatter stand on.
 
     Attributes:
+        times: how long these took.
         wire_map: the fitted wire over the sensor, which takes long enough to be kept.
         boards: what the geometry was fitted to.
     """
 
-    rig: RigDescription
     noise: FitResult[Noise]
     geometry: FitResult[Geometry]
     wire: FitResult[Wire]
-    psf: FitResult[PsfField]
-    backscatter: FitResult[Backscatter]
     times: tuple[FitTime, ...]
     wire_map: Float[np.ndarray, "rows columns"]
     boards: tuple[BoardView, ...]
 
+
+@dataclass(frozen=True)
+class Calibration:
+    """The five results of one session, and how long each took."""
+
+    rig: RigDescription
+    foundation: Foundation
+    psf: FitResult[PsfField]
+    backscatter: FitResult[Backscatter]
+    times: tuple[FitTime, ...]
+
     def result(self, term: TermName) -> FitResult:
         """The result of a term by its name."""
         results: dict[TermName, FitResult] = {
-            "noise": self.noise,
-            "geometry": self.geometry,
-            "wire": self.wire,
+            "noise": self.foundation.noise,
+            "geometry": self.foundation.geometry,
+            "wire": self.foundation.wire,
             "psf": self.psf,
             "backscatter": self.backscatter,
         }
@@ -105,18 +114,6 @@ class Calibration:
         for term in ORDER:
             self.result(term).or_raise(term)
         return self
-
-
-@dataclass(frozen=True)
-class Foundation:
-    """The fits that psf and backscatter stand on; see ``Calibration`` for what comes with them."""
-
-    noise: FitResult[Noise]
-    geometry: FitResult[Geometry]
-    wire: FitResult[Wire]
-    times: tuple[FitTime, ...]
-    wire_map: Float[np.ndarray, "rows columns"]
-    boards: tuple[BoardView, ...]
 
 
 class _Clock:
@@ -193,9 +190,8 @@ def fit_session(
             lambda: fit_backscatter(session, noise, geometry, base.wire_map, effort.backscatter_positions),
             lambda: absent_backscatter(rig, geometry),
         )
-    terms = (base.noise, base.geometry, base.wire, psf.result(), backscatter.result())
     late = sorted(clock.times, key=lambda taken: ORDER.index(taken.term))
-    return Calibration(rig, *terms, (*base.times, *late), base.wire_map, base.boards)
+    return Calibration(rig, base, psf.result(), backscatter.result(), (*base.times, *late))
 
 
 def _left_out(name: TermName, term: Term) -> FitResult[Term]:

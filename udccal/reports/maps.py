@@ -54,11 +54,11 @@ def fitted_maps(calibration: Calibration, picture: UInt8[np.ndarray, "panel_rows
     rig = calibration.rig
     positions = report_positions(rig)
     return TermMaps(
-        wire=calibration.wire_map,
+        wire=calibration.foundation.wire_map,
         positions_px=positions,
         kernels=kernels_at(calibration.psf.term, positions, *kernel_size(rig)),
         picture=picture,
-        seen_px=_seen_px(calibration.geometry.term, rig),
+        seen_px=_seen_px(calibration.foundation.geometry.term, rig),
         backscatter=np.asarray(backscatter_rate(calibration.backscatter.term, picture)),
     )
 

@@ -34,14 +34,14 @@ def gather(
     fitted = fitted_maps(calibration, picture)
     true = None if light is None else true_maps(light, fitted)
     rows = () if light is None or true is None else compare_with_truth(calibration, light.truth, fitted, true)
-    noise, geometry = calibration.noise.term, calibration.geometry.term
+    noise, geometry = calibration.foundation.noise.term, calibration.foundation.geometry.term
     return Evidence(
         calibration,
         fitted,
         true,
         rows,
         photon_transfer(session, noise),
-        board_evidence(calibration.boards, geometry),
+        board_evidence(calibration.foundation.boards, geometry),
     )
 
 

@@ -65,10 +65,10 @@ def compare_with_truth(
         if estimate.name == value.name
         for error in (estimate.value - value.value,)
     ]
-    ray = ray_error_px(calibration.geometry.term, truth)
+    ray = ray_error_px(calibration.foundation.geometry.term, truth)
     distances = (
         TruthRow("geometry", "rays, 95th percentile", "px", None, None, ray, None),
-        _wire_distance(calibration.wire, fitted, true),
+        _wire_distance(calibration.foundation.wire, fitted, true),
         *_psf_distances(fitted, true),
         _backscatter_distance(fitted, true),
     )

@@ -174,7 +174,7 @@ def test_refuses_unsound_xml(text: str) -> None:
 
 
 def test_refuses_more_elements_than_any_camera_has(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("udccal.cameras.u3v.description._MOST_ELEMENTS", 1000)
+    monkeypatch.setattr("udccal.cameras.u3v.outline._MOST_ELEMENTS", 1000)
     checked_xml(b"<RegisterDescription>" + b"<a/>" * 999 + b"</RegisterDescription>")
     with pytest.raises(CameraProtocolError, match="1000 elements"):
         checked_xml(b"<RegisterDescription>" + b"<a/>" * 1000 + b"</RegisterDescription>")

@@ -9,7 +9,7 @@ from typing import Final, final
 from udccal.cameras.u3v.control import ControlChannel
 from udccal.errors import CameraProtocolError
 
-# ABRM (GenICam GenCP 1.3, 5.1): addresses.
+# Technology Agnostic Bootstrap Register Map, ABRM (GenICam GenCP): addresses.
 _MANUFACTURER_NAME: Final = 0x0004
 _MODEL_NAME: Final = 0x0044
 _SERIAL_NUMBER: Final = 0x0144
@@ -18,7 +18,7 @@ _MANIFEST_TABLE_ADDRESS: Final = 0x01D0
 _SBRM_ADDRESS: Final = 0x01D8
 _STRING_BYTES: Final = 64
 
-# SBRM (USB3 Vision 1.1, 4.4): offsets.
+# Technology Specific Bootstrap Register Map, SBRM (USB3 Vision): offsets.
 _U3VCP_CAPABILITY: Final = 0x04
 _MAXIMUM_TRANSFER_LENGTHS: Final = 0x14  # of a command, then of an acknowledge
 _SIRM_ADDRESS: Final = 0x20

@@ -1,4 +1,4 @@
-"""What a camera says of each frame in its chunk data: exposure, gain and time, by their SFNC names (2.7, 18)."""
+"""What a camera says of each frame in its chunk data: exposure, gain and time, by SFNC's Chunk Data Control."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Chunk data: what a payload holds besides the picture (USB3 Vision 1.1, 5.4).
+"""Chunk data: what a payload holds besides the picture (USB3 Vision, chunk data).
 
 Each chunk is its data, then its id and the length of its data, both 32 bits and little-endian: chunks are found from
 the payload's end. The picture is the first of them.

@@ -11,17 +11,14 @@ from dataclasses import dataclass
 from typing import Final, Protocol, final, runtime_checkable
 from xml.parsers import expat
 
-from udccal.errors import CameraProtocolError
+from udccal.cameras.u3v.outline import check_outline, unsound
 
 # Files of real cameras have 0.1 to 4 MiB, unzipped.
 _MOST_FILE_BYTES: Final = 8 << 20
 _MOST_XML_BYTES: Final = 32 << 20
 _MOST_ENTRIES: Final = 32
-_MOST_DEPTH: Final = 32
-_MOST_ELEMENTS: Final = 300_000
-_ROOT: Final = "RegisterDescription"
 
-# A manifest entry (GenCP 1.3, 5.4): file version, schema word, address, size, SHA-1, reserved.
+# An entry of the manifest table (GenICam GenCP): file version, schema word, address, size, SHA-1, reserved.
 _ENTRY: Final = struct.Struct("<IIQQ20s20x")
 _DEVICE_XML: Final = 0
 _UNCOMPRESSED: Final = 0
@@ -77,20 +74,20 @@ def read_description(memory: Memory, manifest_address: int) -> str:
     """
     entries = [e for e in _read_manifest(memory, manifest_address) if e.file_type == _DEVICE_XML]
     if not entries:
-        raise _unsound("a manifest that names a description", "none in it")
+        raise unsound("a manifest that names a description", "none in it")
     entry = max(entries, key=lambda e: e.version)
     if not 0 < entry.size <= _MOST_FILE_BYTES:
-        raise _unsound(f"a description of up to {_MOST_FILE_BYTES} bytes", f"{entry.size}")
+        raise unsound(f"a description of up to {_MOST_FILE_BYTES} bytes", f"{entry.size}")
     stored = memory.read(entry.address, entry.size)
     if entry.sha1 is not None and hashlib.sha1(stored, usedforsecurity=False).digest() != entry.sha1:
-        raise _unsound("a description with the SHA-1 that the manifest says", "another")
+        raise unsound("a description with the SHA-1 that the manifest says", "another")
     return checked_xml(unpacked(stored, entry.file_format))
 
 
 def _read_manifest(memory: Memory, address: int) -> tuple[ManifestEntry, ...]:
     count = struct.unpack("<Q", memory.read(address, 8))[0]
     if count > _MOST_ENTRIES:
-        raise _unsound(f"a manifest of up to {_MOST_ENTRIES} entries", f"{count}")
+        raise unsound(f"a manifest of up to {_MOST_ENTRIES} entries", f"{count}")
     return tuple(parse_entry(memory.read(address + 8 + i * _ENTRY.size, _ENTRY.size)) for i in range(count))
 
 
@@ -101,7 +98,7 @@ def parse_entry(data: bytes) -> ManifestEntry:
         CameraProtocolError: when there are fewer or more.
     """
     if len(data) != _ENTRY.size:
-        raise _unsound(f"a manifest entry of {_ENTRY.size} bytes", f"{len(data)}")
+        raise unsound(f"a manifest entry of {_ENTRY.size} bytes", f"{len(data)}")
     version, schema, address, size, sha1 = _ENTRY.unpack(data)
     return ManifestEntry(
         version=(version >> 24, version >> 16 & 0xFF, version & 0xFFFF),
@@ -122,24 +119,24 @@ def unpacked(stored: bytes, file_format: int) -> bytes:
     if file_format == _UNCOMPRESSED:
         return stored
     if file_format != _ZIPPED:
-        raise _unsound("a description that is plain or zipped", f"format {file_format}")
+        raise unsound("a description that is plain or zipped", f"format {file_format}")
     try:
         with zipfile.ZipFile(io.BytesIO(stored)) as archive:
             names = [m for m in archive.infolist() if m.filename.lower().endswith(".xml")]
             if not names:
-                raise _unsound("a zip with an XML file", f"{len(archive.infolist())} other files")
+                raise unsound("a zip with an XML file", f"{len(archive.infolist())} other files")
             with archive.open(names[0]) as member:
                 # Read no further than allowed, whatever size the zip claims.
                 xml = member.read(_MOST_XML_BYTES + 1)
     except _ZIP_ERRORS as error:
-        raise _unsound("a zip that can be read", f"{type(error).__name__}: {str(error)[:80]}") from error
+        raise unsound("a zip that can be read", f"{type(error).__name__}: {str(error)[:80]}") from error
     if len(xml) > _MOST_XML_BYTES:
-        raise _unsound(f"a description of up to {_MOST_XML_BYTES} bytes", "a longer one")
+        raise unsound(f"a description of up to {_MOST_XML_BYTES} bytes", "a longer one")
     return xml
 
 
 def checked_xml(raw: bytes) -> str:
-    """XML text that is well-formed, not deep, and has no document type and so no entities.
+    """XML text that is well-formed, and whose outline is one that GenApi can be given.
 
     Raises:
         CameraProtocolError: otherwise.
@@ -147,48 +144,9 @@ def checked_xml(raw: bytes) -> str:
     try:
         # Some devices fill their file up with zeros.
         text = raw.rstrip(b"\0").decode("utf-8-sig")
-        _Outline().check(text)
+        check_outline(text)
     except UnicodeDecodeError as error:
-        raise _unsound("a description in UTF-8", "bytes that are not") from error
+        raise unsound("a description in UTF-8", "bytes that are not") from error
     except expat.ExpatError as error:
-        raise _unsound("well-formed XML", f"{expat.ErrorString(error.code)} in line {error.lineno}") from error
+        raise unsound("well-formed XML", f"{expat.ErrorString(error.code)} in line {error.lineno}") from error
     return text
-
-
-@final
-class _Outline:
-    """Counts a text's elements while expat goes through it."""
-
-    def __init__(self) -> None:
-        self._depth = self._elements = 0
-
-    def check(self, text: str) -> None:
-        parser = expat.ParserCreate("utf-8")
-        parser.StartElementHandler = self._start
-        parser.EndElementHandler = self._end
-        parser.StartDoctypeDeclHandler = self._doctype
-        parser.Parse(text.encode(), True)
-
-    def _start(self, name: str, attributes: dict[str, str]) -> None:
-        if self._elements == 0 and name.rpartition(":")[2] != _ROOT:
-            raise _unsound(f"a description whose root is {_ROOT}", f"{name[:40]!r}")
-        self._depth += 1
-        self._elements += 1
-        if self._depth > _MOST_DEPTH or self._elements > _MOST_ELEMENTS:
-            raise _unsound(
-                f"a description of up to {_MOST_ELEMENTS} elements, {_MOST_DEPTH} deep",
-                f"{self._elements} elements, {self._depth} deep",
-            )
-
-    def _end(self, name: str) -> None:
-        self._depth -= 1
-
-    def _doctype(self, name: str, system: str | None, public: str | None, internal: int) -> None:
-        raise _unsound("a description without a document type", f"{name[:40]!r}")
-
-
-def _unsound(expected: str, found: str) -> CameraProtocolError:
-    return CameraProtocolError(
-        f"Expected {expected} in the camera, found {found}. Unplug it and plug it in again; "
-        "if it stays, update its firmware."
-    )

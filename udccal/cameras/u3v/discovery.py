@@ -19,12 +19,12 @@ from udccal.errors import CameraBusy, CameraError, CameraLost
 
 BACKEND: Final = "u3v"
 
-# Interface class, subclass and protocols (USB3 Vision 1.1, 3.2).
+# Interface class, subclass and protocols (USB3 Vision, interface descriptors).
 _CLASS, _SUBCLASS = 0xEF, 0x05
 _CONTROL, _STREAM = 0, 2
 _ENDPOINT_IN: Final = 0x80
 _BULK: Final = 2
-# The device info descriptor behind the control interface's (USB3 Vision 1.1, 3.2.2.2): class-specific interface
+# The device info descriptor behind the control interface's (USB3 Vision): class-specific interface
 # descriptor, subtype device info, versions of GenCP and of USB3 Vision, then indices of strings and a mask of speeds.
 _DEVICE_INFO: Final = struct.Struct("<BBBII9B")
 _DEVICE_INFO_HEAD: Final = (0x24, 0x01)

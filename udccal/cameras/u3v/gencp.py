@@ -1,7 +1,7 @@
 """GenCP over USB3 Vision: commands into bytes, acknowledges out of bytes. Nothing here touches a device.
 
 A message is a prefix ``U3VC``, a header of flags or status, command, length of what follows and request id, and the
-command's own data; everything is little-endian (GenICam GenCP 1.3, 4; USB3 Vision 1.1, 4.2).
+command's own data; everything is little-endian (GenICam GenCP; prefix after USB3 Vision).
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ SHORT_ACKNOWLEDGE_BYTES: Final = _HEADER.size + _TWO_WORDS.size
 
 @final
 class Command(enum.IntEnum):
-    """Commands and acknowledges (GenCP, 4.3)."""
+    """Commands and acknowledges (GenCP, command ids)."""
 
     READMEM = 0x0800
     READMEM_ACK = 0x0801
@@ -40,7 +40,7 @@ class Command(enum.IntEnum):
 
 @final
 class Status(enum.IntEnum):
-    """What a device answers (GenCP, 4.3.2; the 0xA000s are USB3 Vision's own)."""
+    """What a device answers (GenCP, status codes; the 0xA000s are USB3 Vision's own)."""
 
     SUCCESS = 0x0000
     NOT_IMPLEMENTED = 0x8001

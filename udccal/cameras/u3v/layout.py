@@ -16,7 +16,7 @@ _MOST_PAYLOAD_BYTES: Final = 1 << 28
 _MOST_HEAD_BYTES: Final = 1 << 16
 _MOST_ALIGNMENT_BITS: Final = 20
 
-# SIRM (USB3 Vision 1.1, 4.5): offsets.
+# Streaming Interface Register Map, SIRM (USB3 Vision): offsets.
 _INFO: Final = 0x00
 _CONTROL: Final = 0x04
 _REQUIRED: Final = 0x08  # sizes of payload (8 bytes), leader and trailer

@@ -41,6 +41,7 @@ class NodeMap:
         xml: a description that was checked; GenApi itself would follow its entities.
 
     Raises:
+        CameraProtocolError: when the description has no port to the device.
         CameraError: when GenApi is not installed, or cannot make sense of the description.
     """
 
@@ -49,6 +50,11 @@ class NodeMap:
         self._map = self._genapi.NodeMap()
         with self._told("load its description"):
             self._map.load_xml_from_string(xml)
+            # GenApi takes any node of this name for a port, and would bring the process down with it.
+            if not isinstance(self._map.get_node(_PORT), self._genapi.IPort):
+                raise CameraProtocolError(
+                    f"Expected a description with a port {_PORT}, found none. Update the camera's firmware."
+                )
             self._port = _port(self._genapi, memory)
             self._map.connect(self._port, _PORT)
             self._chunks = self._genapi.ChunkAdapterU3V(self._map)

@@ -1,4 +1,4 @@
-"""Exposure, gain and region by their SFNC names (GenICam Standard Features Naming Convention 2.7, 4 to 7)."""
+"""Exposure, gain and region by their SFNC names (GenICam Standard Features Naming Convention)."""
 
 from __future__ import annotations
 

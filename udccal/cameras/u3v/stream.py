@@ -1,4 +1,4 @@
-"""What stands before and after the payload of a frame: leader and trailer, out of bytes (USB3 Vision 1.1, 5.3)."""
+"""What stands before and after a payload: leader and trailer, out of bytes (USB3 Vision, stream protocol)."""
 
 from __future__ import annotations
 

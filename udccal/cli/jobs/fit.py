@@ -97,12 +97,12 @@ def store_profile(output: Output, session: Session, calibration: Calibration, pa
         profile = build_profile(
             calibration.rig,
             provenance_now(session.path / MANIFEST_NAME, session.camera),
-            calibration.noise,
-            calibration.geometry,
-            calibration.wire,
+            calibration.foundation.noise,
+            calibration.foundation.geometry,
+            calibration.foundation.wire,
             calibration.psf,
             calibration.backscatter,
-            calibration.wire_map,
+            calibration.foundation.wire_map,
         )
         write_profile(path, profile)
 

@@ -1,0 +1,91 @@
+"""What a description must look like before GenApi is given it, which trusts it more than a camera deserves."""
+
+from __future__ import annotations
+
+from typing import Final, final
+from xml.parsers import expat
+
+from udccal.errors import CameraProtocolError
+
+_ROOT: Final = "RegisterDescription"
+_MOST_DEPTH: Final = 32
+_MOST_ELEMENTS: Final = 300_000
+# References that GenApi follows without asking what kind of node is at their end.
+_KIND_REFERRED_TO: Final = {"pPort": "Port"}
+
+
+def check_outline(text: str) -> None:
+    """Refuse a description of another root, with a document type (and so entities), too deep, or too long.
+
+    Refused are also references to a kind of node that cannot stand there, where GenApi would not notice.
+
+    Raises:
+        CameraProtocolError: as a sentence.
+        expat.ExpatError: when the text is not well-formed.
+    """
+    outline = _Outline()
+    parser = expat.ParserCreate("utf-8")
+    parser.buffer_text = True
+    parser.StartElementHandler = outline.start
+    parser.EndElementHandler = outline.end
+    parser.CharacterDataHandler = outline.characters
+    parser.StartDoctypeDeclHandler = outline.doctype
+    parser.Parse(text.encode(), True)
+    outline.check_references()
+
+
+def unsound(expected: str, found: str) -> CameraProtocolError:
+    """The error that says what is wrong with a description."""
+    return CameraProtocolError(
+        f"Expected {expected} in the camera, found {found}. Unplug it and plug it in again; "
+        "if it stays, update its firmware."
+    )
+
+
+@final
+class _Outline:
+    """Elements, kinds of nodes and references between them, noted down while expat goes through a text."""
+
+    def __init__(self) -> None:
+        self._path: list[str] = []
+        self._text = ""
+        self._elements = 0
+        self._kinds: dict[str, str] = {}
+        self._references: list[tuple[str, str]] = []
+
+    def start(self, name: str, attributes: dict[str, str]) -> None:
+        tag = _local(name)
+        if not self._elements and tag != _ROOT:
+            raise unsound(f"a description whose root is {_ROOT}", f"{tag[:40]!r}")
+        self._path.append(tag)
+        self._text = ""
+        self._elements += 1
+        if len(self._path) > _MOST_DEPTH or self._elements > _MOST_ELEMENTS:
+            raise unsound(
+                f"a description of up to {_MOST_ELEMENTS} elements, {_MOST_DEPTH} deep",
+                f"{self._elements} elements, {len(self._path)} deep",
+            )
+        if "Name" in attributes:
+            self._kinds[attributes["Name"]] = tag
+
+    def characters(self, text: str) -> None:
+        self._text += text
+
+    def end(self, name: str) -> None:
+        tag = self._path.pop()
+        if tag in _KIND_REFERRED_TO:
+            self._references.append((tag, self._text.strip()))
+        self._text = ""
+
+    def doctype(self, name: str, system: str | None, public: str | None, internal: int) -> None:
+        raise unsound("a description without a document type", f"{name[:40]!r}")
+
+    def check_references(self) -> None:
+        for reference, target in self._references:
+            kind = self._kinds.get(target, "nothing")
+            if kind != _KIND_REFERRED_TO[reference]:
+                raise unsound(f"a {_KIND_REFERRED_TO[reference]} behind each {reference}", f"{kind} {target[:40]!r}")
+
+
+def _local(name: str) -> str:
+    return name.rpartition(":")[2]
