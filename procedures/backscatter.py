@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from procedures.base import PictureRole, Procedure, Step, whole_sensor
-from procedures.checks import is_dark, sees_anything, shows_panel_light
+from procedures.checks import is_dark, sees_anything
 from procedures.plans import Exposure, Metered, Stack, TimesThatOf
 from udccal.arrangements import Dark, PanelPicture
 from udccal.displays.pictures import face_picture
@@ -67,7 +67,7 @@ def _shown(rig: RigDescription, step_id: str, picture: Picture, role: PictureRol
         term="backscatter",
         arrangement=PanelPicture(picture),
         instruction=_BLACKOUT,
-        check=shows_panel_light if role == "white" else sees_anything,
+        check=sees_anything,
         region=whole_sensor(rig),
         exposure=exposure,
         plan=Stack(rig.captures.backscatter_frames),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 from procedures.plans import Bracket, Plan, Singles, Stack
@@ -37,25 +36,26 @@ def take(
     clipping = replace(limits, max_saturated_fraction=1.0)
     match plan:
         case Stack(frames):
-            camera.configure(settings)
-            return (average_frames(camera.frames, frames, FrameChecks(limits)),)
+            return (average_frames(camera.frames, frames, FrameChecks(limits, camera.configure(settings))),)
         case Singles(frames):
-            camera.configure(settings)
-            return _singles(camera, frames, clipping)
+            return _singles(camera, frames, FrameChecks(clipping, camera.configure(settings)), limits.black_DN)
         case Bracket(frames, factor):
             exposures = _bracket(exposure_s, frames, factor, longest_s)
             return _exposures(camera, settings, exposures, clipping)
 
 
-def _singles(camera: Camera, count: int, limits: FrameLimits) -> tuple[SingleFrame, ...]:
+def _singles(camera: Camera, count: int, checks: FrameChecks, black_DN: float) -> tuple[SingleFrame, ...]:
     """Frames of one scene and setting, whose light agrees; those left out are told with the first."""
-    checks = FrameChecks(limits)
+    frames: list[Frame] = []
     for _ in range(_TRIES):
-        frames = [_good_frame(camera, checks) for _ in range(count)]
-        if frames_agree(frames, limits.black_DN, _AGREEMENT):
+        frames += checks.sound(camera.frames(count - len(frames)))
+        if len(frames) < count:
+            continue
+        if frames_agree(frames, black_DN, _AGREEMENT):
             return (SingleFrame(frames[0], checks.rejections()), *(SingleFrame(frame) for frame in frames[1:]))
         for _ in frames:  # which of them is right cannot be told
             checks.reject("flicker")
+        frames = []
     raise CaptureError(_sentence("a steady light", checks))
 
 
@@ -68,26 +68,17 @@ def _exposures(
         accepted = camera.configure(replace(settings, exposure_s=exposure_s))
         if taken and accepted.exposure_s <= taken[-1].frame.settings.exposure_s:
             break
-        checks = FrameChecks(limits)
-        frame = _good_frame(camera, checks, lambda frame: _change(taken, frame, limits))
-        taken.append(SingleFrame(frame, checks.rejections()))
+        taken.append(_next_exposure(camera, FrameChecks(limits, accepted), taken, limits))
     return tuple(taken)
 
 
-def _change(taken: list[SingleFrame], frame: Frame, limits: FrameLimits) -> str | None:
-    return bracket_fault(taken[-1].frame, frame, limits) if taken else None
-
-
-def _good_frame(
-    camera: Camera, checks: FrameChecks, fault: Callable[[Frame], str | None] = lambda frame: None
-) -> Frame:
+def _next_exposure(camera: Camera, checks: FrameChecks, taken: list[SingleFrame], limits: FrameLimits) -> SingleFrame:
+    """A frame that shows the light of the one taken before."""
     for _ in range(_TRIES):
-        for frame in camera.frames(1):
-            if checks.fault(frame) is not None:
-                continue
-            reason = fault(frame)
+        for frame in checks.sound(camera.frames(1)):
+            reason = bracket_fault(taken[-1].frame, frame, limits) if taken else None
             if reason is None:
-                return frame
+                return SingleFrame(frame, checks.rejections())
             checks.reject(reason)
     raise CaptureError(_sentence("a usable frame", checks))
 

@@ -8,23 +8,24 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from procedures.metering import spot_light
+from procedures.metering import lowest_saturation_DN, spot_light
 from udccal.arrangements import BoardSpec
 from udccal.cameras.protocol import Frame
 from udccal.errors import CaptureError
 from udccal.rig import RigDescription
 from udccal.sessions.frame_checks import FrameLimits
+from udccal.sessions.patches import brightest_patch_DN
 
 Check = Callable[[Frame, RigDescription], None]
 
 _STRAY_E = 60.0  # electrons above the nominal black level that a dark frame may show, beside the tolerances
 _UNEVEN = 0.15  # of the brightest: the darkest patch an even light may leave, vignetting included
 _FEWEST_CORNERS, _ENOUGH_CORNERS = 6, 12  # a quarter of the board, within these bounds
-_EDGE = 8
+_AIM_PX = 10  # the fit looks a little further
 
 
 def dark_limit_DN(rig: RigDescription, exposure_s: float) -> float:
-    """The highest median a dark frame may have: black level and dark current cannot make it brighter."""
+    """What no patch of a dark frame exceeds: black level and dark current cannot make it brighter."""
     camera = rig.camera
     # Half the sensor at 100 e-/s is more dark current than any camera within its specification shows.
     allowed_e = _STRAY_E + 100.0 * exposure_s
@@ -33,7 +34,7 @@ def dark_limit_DN(rig: RigDescription, exposure_s: float) -> float:
 
 def frame_limits(rig: RigDescription, exposure_s: float, dark: bool) -> FrameLimits:
     """What each frame of a step's captures must stay within."""
-    limits = FrameLimits(rig.camera.black_DN.value, float(rig.saturation_DN))
+    limits = FrameLimits(rig.camera.black_DN.value, lowest_saturation_DN(rig))
     return replace(limits, dark_DN=dark_limit_DN(rig, exposure_s)) if dark else limits
 
 
@@ -43,11 +44,11 @@ def is_dark(frame: Frame, rig: RigDescription) -> None:
     Raises:
         CaptureError: when the frame is brighter than black level and dark current can make it.
     """
-    median = float(np.median(frame.data))
-    if median > dark_limit_DN(rig, frame.settings.exposure_s):
-        above_DN = median - rig.camera.black_DN.value - rig.camera.black_DN.tolerance
+    brightest = brightest_patch_DN(frame.data)
+    if brightest > dark_limit_DN(rig, frame.settings.exposure_s):
+        above_DN = brightest - rig.camera.black_DN.value - rig.camera.black_DN.tolerance
         raise CaptureError(
-            f"Expected a dark frame, found it {above_DN:.0f} DN above the black level. "
+            f"Expected a dark frame, found it {above_DN:.0f} DN above the black level, in a part at least. "
             "Cap the lens, switch the panel off and close the blackout, then repeat the step."
         )
 
@@ -67,30 +68,31 @@ def is_even(frame: Frame, rig: RigDescription) -> None:
         )
 
 
-def shows_led(frame: Frame, rig: RigDescription) -> None:
-    """One small light stands out of a dark region, not at its edge unless the region ends with the sensor.
+def shows_led(x_px: float, y_px: float) -> Check:
+    """A check that one small light stands out of a dark room, its image where it was aimed at on the sensor."""
 
-    Raises:
-        CaptureError: when the room is not dark, or the light lies outside the region.
-    """
-    region, light = frame.settings.region, spot_light(frame.data)
-    brightest = float(light.max())
-    if float(np.median(frame.data)) - rig.camera.black_DN.value > 0.5 * brightest:
-        raise CaptureError(
-            "Expected an LED in a dark room, found the surroundings nearly as bright. Darken the room, then repeat."
-        )
-    row, column = (int(index) for index in np.unravel_index(int(light.argmax()), light.shape))
-    inside = (
-        (region.x == 0 or column >= _EDGE)
-        and (region.y == 0 or row >= _EDGE)
-        and (region.x + region.columns == rig.camera.columns or column < region.columns - _EDGE)
-        and (region.y + region.rows == rig.camera.rows or row < region.rows - _EDGE)
-    )
-    if not inside:
-        raise CaptureError(
-            f"Expected the LED near the middle of the marked region, found it at its edge ({column}, {row}). "
-            "Move the LED to the mark, then repeat the step."
-        )
+    def check(frame: Frame, rig: RigDescription) -> None:
+        """Find the LED.
+
+        Raises:
+            CaptureError: when the room is not dark, or the light lies more than 10 px away.
+        """
+        region, light = frame.settings.region, spot_light(frame.data)
+        if float(np.median(frame.data)) - rig.camera.black_DN.value > 0.5 * float(light.max()):
+            raise CaptureError(
+                "Expected an LED in a dark room, found the surroundings nearly as bright. Darken the room, then repeat."
+            )
+        row, column = (int(index) for index in np.unravel_index(int(light.argmax()), light.shape))
+        right, down = x_px - region.x - column, y_px - region.y - row
+        if max(abs(right), abs(down)) > _AIM_PX:
+            raise CaptureError(
+                f"Expected the LED's image within {_AIM_PX} px of column {x_px:.0f}, row {y_px:.0f}, found it at "
+                f"column {region.x + column}, row {region.y + row}. Move the LED so that its image goes "
+                f"{abs(right):.0f} px {'right' if right > 0 else 'left'} and {abs(down):.0f} px "
+                f"{'down' if down > 0 else 'up'} (as the camera sees it), then repeat the step."
+            )
+
+    return check
 
 
 def shows_board(spec: BoardSpec) -> Check:
@@ -112,19 +114,6 @@ def shows_board(spec: BoardSpec) -> Check:
             )
 
     return check
-
-
-def shows_panel_light(frame: Frame, rig: RigDescription) -> None:
-    """The white panel scatters light into the lens, and nothing else does.
-
-    Raises:
-        CaptureError: when nothing is seen; what else shines is for the dark frame to say.
-    """
-    light_DN = float(np.percentile(frame.data, 99.9)) - rig.camera.black_DN.value - rig.camera.black_DN.tolerance
-    if light_DN <= 0:
-        raise CaptureError(
-            "Expected to see light of the white panel, found none. Check that the panel shows the picture."
-        )
 
 
 def sees_anything(frame: Frame, rig: RigDescription) -> None:

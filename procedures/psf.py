@@ -44,7 +44,7 @@ class PsfProcedure(Procedure):
                     instruction=f"Darken the room. Put the LED {captures.psf_distance_mm / 1000:g} m in front of the "
                     f"display so that its image falls on column {led.x_px:.0f}, row {led.y_px:.0f} of the sensor"
                     + (", then move it by less than its image's width." if shift else "."),
-                    check=shows_led,
+                    check=shows_led(led.x_px, led.y_px),
                     region=region,
                     exposure=Metered(_LEVEL, "spot"),
                     plan=Bracket(captures.psf_exposures),

@@ -55,8 +55,7 @@ def measure(rig: RigDescription, count: int) -> Load:
     world.arrange(FlatLight())
     memory: list[float] = []
     with SimulatedCamera(world) as camera:
-        camera.configure(Settings(_EXPOSURE_S, 0.0, camera.sensor))
-        checks = FrameChecks(frame_limits(rig, _EXPOSURE_S, dark=False))
+        checks = _checks(rig, camera.configure(Settings(_EXPOSURE_S, 0.0, camera.sensor)))
         start = time.perf_counter()
         average = average_frames(_Watched(camera, memory, count).frames, count, checks)
         seconds = time.perf_counter() - start
@@ -87,7 +86,7 @@ def _alone(rig: RigDescription, kept: list[Frame], repeats: int = 5) -> tuple[fl
     taken: list[list[float]] = []
     for _ in range(repeats):
         times = [time.perf_counter()]
-        average_frames(lambda count: _replayed(kept, count), 4 * len(kept), _checks(rig))
+        average_frames(lambda count: _replayed(kept, count), 4 * len(kept), _checks(rig, kept[0].settings))
         times.append(time.perf_counter())
         stack.mean(axis=0)
         times.append(time.perf_counter())
@@ -99,8 +98,8 @@ def _alone(rig: RigDescription, kept: list[Frame], repeats: int = 5) -> tuple[fl
     return 1e3 * mine / (4 * len(kept)), 1e3 * mean / len(kept), 1e3 * both / len(kept)
 
 
-def _checks(rig: RigDescription) -> FrameChecks:
-    return FrameChecks(frame_limits(rig, _EXPOSURE_S, dark=False))
+def _checks(rig: RigDescription, settings: Settings) -> FrameChecks:
+    return FrameChecks(frame_limits(rig, settings.exposure_s, dark=False), settings)
 
 
 def _replayed(kept: list[Frame], count: int) -> Iterator[Frame]:

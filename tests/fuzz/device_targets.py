@@ -124,7 +124,8 @@ DEVICE_TARGETS = (
         "zip",
         lambda data: unpacked(data, 1),
         lambda: (zipped("<RegisterDescription/>"), zipped(_description().decode())),
+        32768,
     ),
     Target("xml", _describe, lambda: (_description(),), 65536),
-    Target("features", _change_and_describe, lambda: (b"", bytes(range(16))), 64),
+    Target("features", _change_and_describe, lambda: (b"", bytes([0, 5, 0, 5, 0, 70, 0, 70, 0, 90, 0, 90])), 64),
 )

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import tempfile
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from tests.cameras.small_tiff import grey_entries, write_dng, write_tiff
@@ -15,6 +17,7 @@ from udccal.cameras.picture_files.mosaics import read_raw
 from udccal.cameras.picture_files.sidecar import list_folder
 from udccal.cameras.picture_files.tiff import read_tiff16
 from udccal.cameras.protocol import CameraIdentity, Frame, Region, Settings
+from udccal.errors import SessionError
 from udccal.io.exr import read_exr, write_exr
 from udccal.io.photograph import read_photograph
 from udccal.io.png import read_png16, read_rgb8, write_png16, write_rgb8
@@ -27,6 +30,7 @@ from udccal.sessions.writer import SessionWriter
 _MOSAIC = np.arange(12 * 8, dtype=np.uint16).reshape(8, 12)
 _LARGER = np.arange(64 * 48, dtype=np.uint16).reshape(48, 64)  # LibRaw wants no smaller ones
 _RGB = np.arange(6 * 5 * 3, dtype=np.uint8).reshape(6, 5, 3)
+_SMOOTH = np.linspace(0, 255, 16 * 20 * 3).reshape(16, 20, 3).astype(np.uint8)
 _PLANES = {"mean": np.linspace(60, 70, 24).reshape(4, 6), "variance": np.full((4, 6), 3.0)}
 
 
@@ -74,10 +78,11 @@ def _manifests() -> tuple[bytes, ...]:
 
 
 def _open_session(path: Path) -> None:
-    """Everything that is read of a session before its pictures, and an attempt at each of those."""
+    """Everything that is read of a session, its pictures and averages too, which are never there."""
     session = Session.open(path.parent)
-    for step in session.manifest.steps:
-        session.step(step.id)
+    for capture in (capture for step in session.manifest.steps for capture in step.captures):
+        with contextlib.suppress(SessionError):
+            session.frame(capture) if capture.kind == "frame" else session.average(capture)
 
 
 FILE_TARGETS = (
@@ -91,6 +96,10 @@ FILE_TARGETS = (
     Target(
         "photograph",
         of_file("a.jpg", read_photograph),
-        lambda: (written("a.png", lambda path: write_rgb8(path, _RGB)),),
+        lambda: (
+            written("a.png", lambda path: write_rgb8(path, _RGB)),
+            written("a.jpg", lambda path: cv2.imwrite(str(path), _SMOOTH)),
+            written("a.hdr", lambda path: cv2.imwrite(str(path), _SMOOTH.astype(np.float32))),
+        ),
     ),
 )

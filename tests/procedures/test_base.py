@@ -89,6 +89,23 @@ def test_resuming_captures_only_what_is_missing(tmp_path: Path) -> None:
     assert after[1].captures[0].exposure_s == before[0].captures[0].exposure_s
 
 
+def test_a_damaged_step_is_captured_again_at_the_exposure_that_others_were_captured_at(tmp_path: Path) -> None:
+    rig = small_rig()
+    with simulated_bench(rig) as bench:
+        with new_writer(tmp_path, rig, bench) as writer:
+            run_procedure(WireProcedure(), bench, writer)
+        before = Session.open(tmp_path)
+        file = tmp_path / before.step("wire/flat").captures[0].file
+        file.write_bytes(file.read_bytes()[:-1])
+        dimmed = Disturbances(flicker_fraction=0.3, flicker_hz=1e-9)  # a lamp 30 % brighter than it was
+        with simulated_bench(rig, dimmed) as later, SessionWriter.resume(tmp_path) as writer:
+            assert [item.step_id for item in writer.damage] == ["wire/flat"]
+            run_procedure(WireProcedure(), later, writer)
+    flat, dark = Session.open(tmp_path).manifest.steps
+    assert flat.captures[0].sha256 != before.step("wire/flat").captures[0].sha256
+    assert flat.captures[0].exposure_s == dark.captures[0].exposure_s == before.step("wire/dark").captures[0].exposure_s
+
+
 def test_dropped_frames_are_counted(tmp_path: Path) -> None:
     rig = small_rig()
     with simulated_bench(rig, Disturbances(dropped_frame_every=5)) as bench:

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from procedures.checks import is_dark, is_even, shows_board, shows_led, shows_panel_light
+from procedures.checks import is_dark, is_even, shows_board, shows_led
 from udccal.arrangements import BoardSpec
 from udccal.cameras.protocol import Frame, Region, Settings
 from udccal.errors import CaptureError
@@ -44,24 +44,35 @@ def test_a_shadow_in_a_flat_is_found() -> None:
         is_even(frame(flat), RIG)
 
 
-@pytest.mark.parametrize(("row", "column", "fine"), [(24, 16, True), (2, 16, False), (24, 30, False)])
-def test_an_led_must_lie_inside_its_region(row: int, column: int, fine: bool) -> None:
+@pytest.mark.parametrize(("row", "column", "fine"), [(24, 16, True), (31, 10, True), (2, 16, False), (24, 29, False)])
+def test_an_led_must_be_where_it_was_aimed_at(row: int, column: int, fine: bool) -> None:
     data = np.full((48, 32), 66.0)
     data[row - 1 : row + 2, column - 1 : column + 2] = 900
     data[row, column] = 3000
+    check = shows_led(100 + 16.4, 100 + 24.3)
     if fine:
-        shows_led(frame(data), RIG)
+        check(frame(data), RIG)
     else:
-        with pytest.raises(CaptureError, match="found it at its edge"):
-            shows_led(frame(data), RIG)
-        shows_led(frame(data, x=RIG.camera.columns - 32, y=0), RIG)  # there the region ends with the sensor
+        found = f"found it at column {100 + column}, row {100 + row}. Move the LED .* (22 px down|13 px left)"
+        with pytest.raises(CaptureError, match=found):
+            check(frame(data), RIG)
+
+
+def test_a_leak_in_a_part_of_a_dark_frame_is_told_and_hot_pixels_are_not() -> None:
+    rng = np.random.default_rng(0)
+    dark = rng.normal(64, 3, (192, 256))
+    dark[rng.integers(0, 192, 300), rng.integers(0, 256, 300)] = 4000
+    is_dark(frame(dark), RIG)
+    dark[:70, :90] += 60
+    with pytest.raises(CaptureError, match="in a part at least"):
+        is_dark(frame(dark), RIG)
 
 
 def test_a_lit_room_is_not_dark_enough_for_an_led() -> None:
     data = np.full((48, 32), 2000.0)
     data[20:23, 12:15] = 3000
     with pytest.raises(CaptureError, match="Darken the room"):
-        shows_led(frame(data), RIG)
+        shows_led(113.0, 121.0)(frame(data), RIG)
 
 
 def test_a_board_is_found_and_its_absence_told() -> None:
@@ -69,9 +80,3 @@ def test_a_board_is_found_and_its_absence_told() -> None:
     check(frame(board_picture()), RIG)
     with pytest.raises(CaptureError, match=r"at least 6 corners of the 7 x 5 ChArUco board, found 0"):
         check(frame(np.full((480, 640), 500.0)), RIG)
-
-
-def test_a_dark_panel_is_told() -> None:
-    shows_panel_light(frame(np.full((48, 64), 400.0)), RIG)
-    with pytest.raises(CaptureError, match="light of the white panel, found none"):
-        shows_panel_light(frame(np.full((48, 64), 64.0)), RIG)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import hashlib
 import multiprocessing
+import signal
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -79,9 +80,10 @@ def capture_with_kills(work: Work, folder: Path, rng: np.random.Generator, withi
         How often it was killed.
 
     Raises:
-        AssertionError: when a completed step was lost, a process failed by itself, or the end is never reached.
+        AssertionError: when a completed step was lost or captured again, a process failed by itself, or the end is
+            never reached.
     """
-    kills, completed = 0, frozenset[str]()
+    kills, completed = 0, dict[str, tuple[int, ...]]()
     context = multiprocessing.get_context("fork")
     end = time.monotonic() + _LIMIT_S
     while time.monotonic() < end:
@@ -92,13 +94,14 @@ def capture_with_kills(work: Work, folder: Path, rng: np.random.Generator, withi
             process.kill()
             process.join(10)
             kills += 1
-        elif process.exitcode != 0:
-            raise AssertionError(f"expected the capture to end by itself or by a signal, found {process.exitcode}")
-        else:
-            return kills
         now = _completed(folder)
-        if completed - now:
-            raise AssertionError(f"expected completed steps to stay, found that {sorted(completed - now)} are gone")
+        repeated = [step for step, written in completed.items() if now.get(step) != written]
+        if repeated:
+            raise AssertionError(f"expected completed steps to stay as they were, found others for {repeated}")
+        if process.exitcode == 0:
+            return kills
+        if process.exitcode != -signal.SIGKILL:
+            raise AssertionError(f"expected the capture to end by itself or by a signal, found {process.exitcode}")
         # On a busy machine a step may take longer than it was given.
         within_s = within_s if len(now) > len(completed) else 1.2 * within_s
         completed = now
@@ -141,10 +144,12 @@ def _world(rig: RigDescription, terms: tuple[TermName, ...]) -> SimulatedWorld:
     return world
 
 
-def _completed(folder: Path) -> frozenset[str]:
+def _completed(folder: Path) -> dict[str, tuple[int, ...]]:
+    """Every completed step, and when its files were written."""
     if not (folder / "session.json").exists():
-        return frozenset()
-    return frozenset(step.id for step in read_manifest(folder).steps)
+        return {}
+    steps = read_manifest(folder).steps
+    return {step.id: tuple((folder / capture.file).stat().st_mtime_ns for capture in step.captures) for step in steps}
 
 
 def main() -> None:

@@ -54,7 +54,7 @@ def test_a_large_offset_costs_no_digit_of_the_variance() -> None:
 
 
 def test_a_steady_scene_loses_no_frame() -> None:
-    average = average_frames(Script([1000.0] * 40).frames, 40, FrameChecks(LIMITS))
+    average = average_frames(Script([1000.0] * 40).frames, 40, FrameChecks(LIMITS, SETTINGS))
     assert (average.frames, average.rejected) == (40, ())
     assert average.first_timestamp_s == 0.0
     assert average.last_timestamp_s == pytest.approx(3.9)
@@ -66,7 +66,7 @@ def test_a_steady_scene_loses_no_frame() -> None:
 def test_a_flicker_is_replaced_wherever_it_comes(place: int) -> None:
     means = [1000.0] * 31
     means[place] = 1040.0
-    average = average_frames(Script(means).frames, 30, FrameChecks(LIMITS))
+    average = average_frames(Script(means).frames, 30, FrameChecks(LIMITS, SETTINGS))
     assert average.frames == 30
     assert reasons(average) == {"flicker": 1}
     assert float(average.mean.mean()) == pytest.approx(1000, abs=0.2)
@@ -74,34 +74,34 @@ def test_a_flicker_is_replaced_wherever_it_comes(place: int) -> None:
 
 def test_a_slow_drift_is_not_a_flicker() -> None:
     means = list(np.linspace(1000, 1010, 60))
-    assert average_frames(Script(means).frames, 60, FrameChecks(LIMITS)).rejected == ()
+    assert average_frames(Script(means).frames, 60, FrameChecks(LIMITS, SETTINGS)).rejected == ()
 
 
 def test_torn_dropped_and_clipped_frames_are_counted_and_replaced() -> None:
     means = [1000.0] * 24
     means[9] = 4095.0
     ids = [*range(12), *range(14, 26)]
-    average = average_frames(Script(means, ids, torn=(4, 5)).frames, 20, FrameChecks(LIMITS))
+    average = average_frames(Script(means, ids, torn=(4, 5)).frames, 20, FrameChecks(LIMITS, SETTINGS))
     assert average.frames == 20
     assert reasons(average) == {"incomplete": 2, "saturated": 1, "dropped on the way from the camera": 2}
 
 
 def test_a_saturated_scene_is_refused_with_its_reason() -> None:
     with pytest.raises(CaptureError, match=r"Expected 10 usable frames, found .* saturated"):
-        average_frames(Script([4095.0] * 200).frames, 10, FrameChecks(LIMITS))
+        average_frames(Script([4095.0] * 200).frames, 10, FrameChecks(LIMITS, SETTINGS))
 
 
 def test_a_camera_that_stops_is_refused() -> None:
     with pytest.raises(CaptureError, match="delivered too few"):
-        average_frames(Script([1000.0] * 5).frames, 10, FrameChecks(LIMITS))
+        average_frames(Script([1000.0] * 5).frames, 10, FrameChecks(LIMITS, SETTINGS))
     with pytest.raises(CaptureError, match="between 2 and"):
-        average_frames(Script([]).frames, 1, FrameChecks(LIMITS))
+        average_frames(Script([]).frames, 1, FrameChecks(LIMITS, SETTINGS))
 
 
 def test_memory_does_not_grow_with_the_number_of_frames() -> None:
     def peak(count: int) -> int:
         tracemalloc.start()
-        average_frames(Script([1000.0] * count).frames, count, FrameChecks(LIMITS))
+        average_frames(Script([1000.0] * count).frames, count, FrameChecks(LIMITS, SETTINGS))
         size = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()
         return size

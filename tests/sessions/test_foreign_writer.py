@@ -54,7 +54,8 @@ def test_it_fits(session: Session, world: dict) -> None:
 
     results = fit_session(session, lambda *_: None)
     for term in ("noise", "geometry", "wire", "psf", "backscatter"):
-        assert getattr(results, term).ok, (term, getattr(results, term).status, getattr(results, term).notes)
+        found = results.result(term)
+        assert found.ok, (term, found.status, found.notes)
     noise = results.foundation.noise
     assert noise.estimate("K_DN_per_e").value == pytest.approx(world["K_DN_PER_E"], rel=0.02)
     assert noise.estimate("PRNU1288").value == pytest.approx(world["PRNU"], rel=0.1)

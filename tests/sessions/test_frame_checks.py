@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from udccal.cameras.protocol import Frame, Region, Settings
+from udccal.errors import CaptureError
 from udccal.sessions.averaging import average_frames
 from udccal.sessions.bracket_checks import bracket_fault
 from udccal.sessions.frame_checks import FrameChecks, FrameLimits, frames_agree
@@ -37,7 +38,7 @@ def average_of(scenes: list[np.ndarray], count: int, limits: FrameLimits = LIMIT
         for _ in range(wanted):
             yield next(frames)
 
-    average = average_frames(deliver, count, FrameChecks(limits))
+    average = average_frames(deliver, count, FrameChecks(limits, SETTINGS))
     assert average.frames == count
     return {item.reason: item.frames for item in average.rejected}
 
@@ -83,9 +84,40 @@ def test_light_in_a_dark_frame_is_a_leak() -> None:
 def test_a_frame_delivered_twice_counts_once() -> None:
     frames = [frame(light(), index) for index in range(12)]
     order = [*frames[:6], frames[5], *frames[6:]]
-    checks = FrameChecks(LIMITS)
+    checks = FrameChecks(LIMITS, SETTINGS)
     assert [item.frame_id for item in checks.accepted(order, 13)] == list(range(12))
     assert [(item.reason, item.frames) for item in checks.rejections()] == [("delivered twice", 1)]
+
+
+def test_a_replay_of_several_frames_counts_none_of_them_twice() -> None:
+    frames = [frame(light(), index) for index in range(12)]
+    checks = FrameChecks(LIMITS, SETTINGS)
+    order = [*frames[:6], *frames[3:6], *frames[6:]]
+    assert [item.frame_id for item in checks.accepted(order, 15)] == list(range(12))
+    assert list(checks.sound([frames[11]])) == []  # once more, in the next delivery
+    assert [(item.reason, item.frames) for item in checks.rejections()] == [("delivered twice", 4)]
+
+
+def test_frames_of_other_settings_than_were_asked_for_are_left_out() -> None:
+    stale = frame(light(), 0, exposure_s=0.02)
+    rounded = frame(light(), 1, exposure_s=0.01002)  # what the camera made of the 0.01
+    checks = FrameChecks(LIMITS, SETTINGS)
+    assert [item.frame_id for item in checks.sound([stale, rounded])] == [1]
+    assert [item.reason for item in checks.rejections()] == ["settings changed"]
+
+
+def test_a_light_that_changed_for_good_ends_the_capture_soon() -> None:
+    asked = 0
+
+    def deliver(count: int) -> Iterator[Frame]:
+        nonlocal asked
+        for _ in range(count):
+            asked += 1
+            yield frame(light() * (1.0 if asked <= 40 else 1.02), asked)
+
+    with pytest.raises(CaptureError, match="flicker"):
+        average_frames(deliver, 60, FrameChecks(LIMITS, SETTINGS))
+    assert asked <= 60 + 20
 
 
 def test_two_frames_agree_or_do_not() -> None:

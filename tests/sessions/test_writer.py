@@ -14,6 +14,7 @@ import pytest
 
 from udccal.cameras.protocol import CameraIdentity, Frame, Region, Settings
 from udccal.errors import SessionError
+from udccal.io.hashing import sha256_file
 from udccal.rig import RigDescription, load_rig
 from udccal.sessions.captured import AveragedFrames, SingleFrame
 from udccal.sessions.changes import Exchanged
@@ -120,18 +121,21 @@ def test_another_rig_camera_or_lens_does_not_go_on_unless_told(tmp_path: Path) -
         SessionWriter.create_or_resume(tmp_path, load_rig("mk31-imx1600"), CAMERA)
     with pytest.raises(SessionError, match=r"of the camera maker model 0002, found maker model 0001\. Put"):
         SessionWriter.create_or_resume(tmp_path, RIG, OTHER_CAMERA, {Exchanged.LENS})
-    with pytest.raises(SessionError, match=r"of the lens 8 mm f/2 .*\(--exchanged lens\)"):
+    with pytest.raises(SessionError, match=r"of the lens 8 mm f/2 .*6 ± 0.1 mm.*\(--exchanged lens\)"):
         SessionWriter.create_or_resume(tmp_path, with_other_lens(), CAMERA, {Exchanged.CAMERA})
     with pytest.raises(SessionError, match="found none"):
         SessionWriter.resume(tmp_path / "nowhere")
     before = (tmp_path / "session.json").read_bytes()
     SessionWriter.create_or_resume(tmp_path, RIG, CAMERA, {Exchanged.CAMERA}).close()
     assert (tmp_path / "session.json").read_bytes() == before  # nothing was exchanged, nothing is noted
-    with SessionWriter.create_or_resume(tmp_path, with_other_lens(), OTHER_CAMERA, set(Exchanged)):
-        pass
+    with SessionWriter.create_or_resume(tmp_path, with_other_lens(), OTHER_CAMERA, set(Exchanged)) as writer:
+        writer.add_step("noise/dark_3", "noise", DarkSubject(), [frame()])
     manifest = Session.open(tmp_path).manifest
-    assert [(change.what, change.after_steps) for change in manifest.changes] == [("camera", 3), ("lens", 3)]
+    assert [change.what for change in manifest.changes] == ["camera", "lens"]
+    assert [step.after_changes for step in manifest.steps] == [0, 0, 0, 2]
     assert (manifest.camera.serial, manifest.rig.lens.model) == ("0002", "8 mm f/2")
+    by_another_backend = replace(OTHER_CAMERA, backend="other", vendor="MAKER")
+    SessionWriter.create_or_resume(tmp_path, with_other_lens(), by_another_backend).close()
     SessionWriter.create_or_resume(tmp_path, with_other_lens(), OTHER_CAMERA).close()
 
 
@@ -221,6 +225,56 @@ def test_leftovers_of_a_killed_process_are_removed_and_nothing_else(tmp_path: Pa
     SessionWriter.resume(tmp_path).close()
     assert not any(path.exists() for path in leftovers)
     assert all(path.exists() for path in kept)
+
+
+def test_a_process_killed_while_it_begins_a_session_leaves_a_folder_to_begin_in(tmp_path: Path) -> None:
+    (tmp_path / ".session-0123456789ab.partial.json").write_text("{")
+    (tmp_path / ".session.lock").touch()
+    SessionWriter.create_or_resume(tmp_path, RIG, CAMERA).close()
+    assert not list(tmp_path.glob("*.partial*"))
+    assert Session.open(tmp_path).manifest.steps == ()
+
+
+def test_an_edited_manifest_that_is_wrong_is_kept_aside(tmp_path: Path) -> None:
+    three_steps(tmp_path)
+    content = json.loads((tmp_path / "session.json").read_text())
+    del content["manifest_sha256"]
+    edited = json.dumps(content | {"crated_at": "today"})
+    (tmp_path / "session.json").write_text(edited)
+    with SessionWriter.resume(tmp_path) as writer:
+        assert writer.recovered
+    assert (tmp_path / "session.damaged.json").read_text() == edited
+
+
+def test_an_unreadable_file_is_damage_to_the_writer_and_a_sentence_to_the_reader(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    three_steps(tmp_path)
+
+    def bad_sector(path: Path) -> str:
+        if path.name == "dark_1_0.png":
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+        return sha256_file(path)
+
+    monkeypatch.setattr("udccal.sessions.damage.sha256_file", bad_sector)
+    monkeypatch.setattr("udccal.sessions.store.sha256_file", bad_sector)
+    with SessionWriter.resume(tmp_path) as writer:
+        assert [(item.file, item.what) for item in writer.damage] == [("noise/dark_1_0.png", "unreadable")]
+    session = Session.open(tmp_path)
+    with pytest.raises(SessionError, match="Input/output error"):
+        session.frame(session.step("noise/dark_1").captures[0])
+
+
+def test_nothing_is_written_through_a_link_out_of_the_session(tmp_path: Path) -> None:
+    three_steps(tmp_path / "session")
+    (tmp_path / "session" / "noise").rename(tmp_path / "elsewhere")
+    (tmp_path / "session" / "noise").symlink_to(tmp_path / "elsewhere")
+    before = {path.name: path.read_bytes() for path in (tmp_path / "elsewhere").iterdir()}
+    with SessionWriter.resume(tmp_path / "session") as writer:
+        assert {item.what for item in writer.damage} == {"missing"}
+        with pytest.raises(SessionError, match="a link out of the session"):
+            writer.add_step("noise/dark_0", "noise", DarkSubject(), [frame(level=7)])
+    assert {path.name: path.read_bytes() for path in (tmp_path / "elsewhere").iterdir()} == before
 
 
 @pytest.mark.parametrize("failing", range(12))

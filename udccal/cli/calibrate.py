@@ -83,7 +83,7 @@ def calibrate(
     output: Output = context.obj
     description = load_rig(rig)
     check_replaceable(profile)
-    pictures = session.with_name(f"{session.name}-pictures")
+    pictures = session.resolve().with_name(f"{session.resolve().name}-pictures")
     match camera:
         case CameraKind.sim:
             opened = _simulated(description, seed)

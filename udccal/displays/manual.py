@@ -65,8 +65,13 @@ class ManualDisplay:
         file = self._folder / f"panel-{hashlib.sha256(picture.tobytes()).hexdigest()[:12]}.png"
         if self._shown == file.name:
             return
-        self._folder.mkdir(parents=True, exist_ok=True)
-        write_rgb8(file, picture)
+        try:
+            self._folder.mkdir(parents=True, exist_ok=True)
+            write_rgb8(file, picture)
+        except OSError as error:
+            raise DisplayError(
+                f"Expected to write the picture {file}, found: {error.strerror}. Check the disk and permissions."
+            ) from error
         self._ask(
             file.name,
             f"Show {file.resolve()} on the panel: full screen, pixel for pixel, not resized, no menu or pointer on it.",

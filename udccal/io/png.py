@@ -23,6 +23,8 @@ _MOSAIC = [
     *(cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_HUFFMAN_ONLY),
     *(cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_NONE),
 ]
+# No PNG is much larger than its samples; texts and profiles beside them fit into a megabyte.
+_MOST_OVERHEAD, _MOST_EXTRA = 2, 1 << 20
 _PICTURE = [cv2.IMWRITE_PNG_COMPRESSION, 1]
 
 
@@ -76,6 +78,10 @@ def _read(path: Path, bits: int, colour: int, expected: str) -> np.ndarray:
             f"Expected {path} to be {expected}, found {header.bits} bits of colour type {header.colour}. "
             "Save it in that form."
         )
+    pixel_bytes = bits // 8 * (3 if colour == _RGB else 1)
+    most_bytes = _MOST_OVERHEAD * header.columns * header.rows * pixel_bytes + _MOST_EXTRA
+    if path.stat().st_size > most_bytes:
+        raise FileFormatError(f"Expected {path} to hold at most {most_bytes} bytes, found more. Copy it again.")
     content = path.read_bytes()
     fault = png_fault(content)
     if fault is not None:

@@ -59,6 +59,10 @@ def calibration_page(session: Session, evidence: Evidence, scene: PictureCompari
         Fact("sensor", f"{sensor.columns} × {sensor.rows}, {sensor.cfa}, {sensor.bits} bits"),
         Fact("captured", session.manifest.created_at),
         Fact("steps", str(len(session.manifest.steps))),
+        *(
+            Fact("exchanged", f"{change.what}: {change.before}, then {change.after}")
+            for change in session.manifest.changes
+        ),
         Fact("fits", ", ".join(f"{t.term} {t.seconds:.1f} s" for t in calibration.times)),
     )
     tables = (truth_table(evidence.rows),) if evidence.rows else ()

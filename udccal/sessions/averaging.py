@@ -16,6 +16,7 @@ from udccal.sessions.frame_checks import FrameChecks
 
 MAX_FRAMES = 40_000  # sums of 16-bit samples fit 32 bits, and (sum of samples)^2 fits 64
 _DELIVERIES = 8  # each asks only for what is still missing
+_ENOUGH_TO_TELL = 8  # frames of one delivery, all of them unusable
 
 
 @final
@@ -63,7 +64,8 @@ def average_frames(deliver: Callable[[int], Iterator[Frame]], count: int, checks
     moments: RunningMoments | None = None
     ends: list[Frame] = []
     for _ in range(_DELIVERIES):
-        wanted = count - (moments.frames if moments is not None else 0)
+        before = moments.frames if moments is not None else 0
+        wanted = count - before
         for frame in checks.accepted(deliver(wanted), wanted):
             moments = moments or RunningMoments(*frame.data.shape)
             moments.add(frame.data)
@@ -78,6 +80,8 @@ def average_frames(deliver: Callable[[int], Iterator[Frame]], count: int, checks
                 last_timestamp_s=ends[-1].timestamp_s,
                 rejected=checks.rejections(),
             )
+        if wanted >= _ENOUGH_TO_TELL and (moments.frames if moments is not None else 0) == before:
+            break  # what is wrong stays wrong: a lamp that changed for good, a scene that clips
     reasons = ", ".join(f"{item.frames} {item.reason}" for item in checks.rejections())
     raise CaptureError(
         f"Expected {count} usable frames, found that too many had to be left out "

@@ -9,7 +9,7 @@ from udccal.cameras.protocol import Frame
 from udccal.sessions.frame_checks import FrameLimits
 
 _SIGNAL_DN = 40.0  # above black: below, an uncertain black level and noise say more than the light
-_BELOW_SATURATION = 0.85
+_BELOW_SATURATION = 0.95
 _FEWEST_SAMPLES = 8
 _BRIGHTNESS = 0.1  # relative
 _PATTERN = 0.15  # relative, in the root of the mean square

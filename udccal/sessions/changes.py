@@ -52,12 +52,12 @@ def admit(
 
 
 def _changes(manifest: Manifest, rig: RigDescription, camera: CameraIdentity) -> Iterator[StoredChange]:
-    steps = len(manifest.steps)
     before, after = manifest.camera, stored_camera(camera)
-    if before != after:
-        yield StoredChange(what="camera", before=_camera_name(before), after=_camera_name(after), after_steps=steps)
+    # The same camera may be opened by another backend, which may spell its maker differently.
+    if (before.model, before.serial) != (after.model, after.serial):
+        yield StoredChange(what="camera", before=_camera_name(before), after=_camera_name(after))
     if manifest.rig.lens != rig.lens:
-        yield StoredChange(what="lens", before=_lens_name(manifest.rig), after=_lens_name(rig), after_steps=steps)
+        yield StoredChange(what="lens", before=_lens_name(manifest.rig), after=_lens_name(rig))
 
 
 def _camera_name(camera: StoredCamera) -> str:
@@ -66,5 +66,6 @@ def _camera_name(camera: StoredCamera) -> str:
 
 def _lens_name(rig: RigDescription) -> str:
     lens = rig.lens
-    values = f"{lens.focal_mm.value:g} mm f/{lens.f_number.value:g} focused at {lens.focus_mm:g} mm"
+    focal, stop = (f"{item.value:g} ± {item.tolerance:g}" for item in (lens.focal_mm, lens.f_number))
+    values = f"{focal} mm, f/{stop}, focused at {lens.focus_mm:g} mm"
     return f"{lens.model} ({values})"[:300]

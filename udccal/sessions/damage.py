@@ -20,7 +20,7 @@ class Damage:
 
     step_id: str
     file: str
-    what: Literal["missing", "changed"]
+    what: Literal["missing", "changed", "unreadable"]
 
     def __str__(self) -> str:
         """As said to a person."""
@@ -35,8 +35,13 @@ def find_damage(folder: Path, manifest: Manifest) -> tuple[Damage, ...]:
 def remove_leftovers(folder: Path) -> None:
     """Remove the half-written files that a killed process left under temporary names; no other file is touched."""
     for path in folder.rglob(".*.partial.*"):
-        if _LEFTOVER.fullmatch(path.name) and path.is_file() and not path.is_symlink():
+        if is_leftover(path):
             path.unlink()
+
+
+def is_leftover(path: Path) -> bool:
+    """Whether a killed process left this behind half-written."""
+    return _LEFTOVER.fullmatch(path.name) is not None and path.is_file() and not path.is_symlink()
 
 
 def _damage(folder: Path, step: StoredStep) -> Iterator[Damage]:
@@ -44,7 +49,13 @@ def _damage(folder: Path, step: StoredStep) -> Iterator[Damage]:
         file = folder / name
         if not file.is_file() or not file.resolve().is_relative_to(folder.resolve()):
             yield Damage(step.id, name, "missing")
-        elif sha256_file(file) != expected:
+            continue
+        try:
+            found = sha256_file(file)
+        except OSError:  # a bad sector, or permissions
+            yield Damage(step.id, name, "unreadable")
+            continue
+        if found != expected:
             yield Damage(step.id, name, "changed")
 
 

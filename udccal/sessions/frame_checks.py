@@ -10,9 +10,10 @@ from typing import final
 
 import cv2
 import numpy as np
-from jaxtyping import Float32, UInt16
+from jaxtyping import Float32
 
 from udccal.cameras.protocol import Frame, Settings
+from udccal.sessions.patches import brightest_patch_DN, patch_means
 from udccal.sessions.schema import Rejection
 
 _MEMORY = 31  # means remembered as the yardstick
@@ -22,11 +23,12 @@ _SIGMAS = 8.0
 _FLOOR_RELATIVE = 2e-3
 _FLOOR_DN = 0.3
 # Motion, in patches of the frame: 3072 of them at full size, of which the largest of pure noise lies at 4 sigmas.
-_PATCH_PX = 32
 _FEWEST_PATCHES = 12
 _PATCH_SIGMAS = 10.0
 _PATCH_FLOOR_RELATIVE = 3e-3
 _PATCH_FLOOR_DN = 1.0
+# A camera may state for a frame what it rounded the settings to.
+_EXPOSURE_RELATIVE, _GAIN_DB = 0.01, 0.05
 
 
 @dataclass(frozen=True)
@@ -35,7 +37,7 @@ class FrameLimits:
 
     Attributes:
         max_saturated_fraction: of samples at ``saturation_DN`` or above; 1 where clipping is meant.
-        dark_DN: the median a dark frame may have; None where light is meant.
+        dark_DN: what no patch of a dark frame may exceed; None where light is meant.
     """
 
     black_DN: float
@@ -63,13 +65,14 @@ class FrameChecks:
     by, or changed in one place. Fewer than 12 patches are not judged.
     """
 
-    def __init__(self, limits: FrameLimits) -> None:
-        """Start a capture."""
+    def __init__(self, limits: FrameLimits, settings: Settings) -> None:
+        """Start a capture with the settings that the camera accepted."""
         self._limits = limits
+        self._settings = settings
+        self._latest: tuple[int, float] | None = None
         self._recent: deque[float] = deque(maxlen=_MEMORY)
         self._patches: deque[Float32[np.ndarray, "down across"]] = deque(maxlen=_WARM_UP)
         self._spreads: deque[float] = deque(maxlen=_MEMORY)
-        self._settings: Settings | None = None
         self._reasons: Counter[str] = Counter()
         self._dropped = 0
 
@@ -89,14 +92,8 @@ class FrameChecks:
         """The usable ones among frames of one delivery of ``expected``; at most eight are held at a time."""
         held: list[_Seen] = []
         warm_up = min(_WARM_UP, expected)
-        last_id: int | None = None
-        for frame in frames:
-            reason = self._fault(frame, last_id)
-            last_id = frame.frame_id
-            if reason is not None:
-                self._reasons[reason] += 1
-                continue
-            seen = _Seen(frame, cv2.mean(frame.data)[0], _patch_means(frame.data))
+        for frame in self.sound(frames):
+            seen = _Seen(frame, cv2.mean(frame.data)[0], patch_means(frame.data))
             if len(self._recent) + len(held) + 1 < warm_up:
                 held.append(seen)
                 continue
@@ -104,33 +101,38 @@ class FrameChecks:
             held = []
         yield from self._steady(held)
 
+    def sound(self, frames: Iterable[Frame]) -> Iterator[Frame]:
+        """The frames of one delivery in which nothing is wrong by itself, whatever the others show."""
+        last_id: int | None = None
+        for frame in frames:
+            reason = self._fault(frame, last_id)
+            last_id = frame.frame_id if last_id is None else max(last_id, frame.frame_id)
+            if reason is None:
+                yield frame
+            else:
+                self._reasons[reason] += 1
+
     def reject(self, reason: str) -> None:
         """Count a frame that the caller leaves out for a reason of its own."""
         self._reasons[reason] += 1
 
-    def fault(self, frame: Frame) -> str | None:
-        """Why a frame by itself is not fit to be stored, or None; counted."""
-        reason = self._fault(frame, None)
-        if reason is not None:
-            self._reasons[reason] += 1
-        return reason
-
     def _fault(self, frame: Frame, last_id: int | None) -> str | None:
+        # Ids may begin anew with each delivery; the same id at the same time is the same frame even so.
+        repeated = (frame.frame_id, frame.timestamp_s) == self._latest
+        self._latest = (frame.frame_id, frame.timestamp_s)
+        if repeated or (last_id is not None and frame.frame_id <= last_id):
+            return "delivered twice"
         if last_id is not None:
-            if frame.frame_id <= last_id:
-                return "delivered twice"
             self._dropped += frame.frame_id - last_id - 1
         if not frame.complete:
             return "incomplete"
-        if self._settings is None:
-            self._settings = frame.settings
-        region = frame.settings.region
-        if frame.settings != self._settings or frame.data.shape != (region.rows, region.columns):
+        region = self._settings.region
+        if not _same(frame.settings, self._settings) or frame.data.shape != (region.rows, region.columns):
             return "settings changed"
         clipped = np.count_nonzero(frame.data >= self._limits.saturation_DN)
         if clipped > self._limits.max_saturated_fraction * frame.data.size:
             return "saturated"
-        if self._limits.dark_DN is not None and _quick_median(frame.data) > self._limits.dark_DN:
+        if self._limits.dark_DN is not None and brightest_patch_DN(frame.data) > self._limits.dark_DN:
             return "light leak"
         return None
 
@@ -180,16 +182,6 @@ def frames_agree(frames: Iterable[Frame], black_DN: float, tolerance: float) -> 
     return max(means) - min(means) <= max(tolerance * max(means), 0.5)
 
 
-def _quick_median(data: UInt16[np.ndarray, "rows columns"]) -> float:
-    """Of every third row and column, which meets all sites of the pattern: a ninth of the time, and as good."""
-    return float(np.median(data[::3, ::3]))
-
-
-def _patch_means(data: UInt16[np.ndarray, "rows columns"]) -> Float32[np.ndarray, "down across"]:
-    """Means over patches of whole 2 x 2 cells; what is left over at the right and below is not looked at."""
-    side = max(2, min(_PATCH_PX, min(data.shape) // 8 * 2))
-    down, across = data.shape[0] // side, data.shape[1] // side
-    if min(down, across) < 1:
-        return np.zeros((0, 0), np.float32)
-    whole = data[: down * side, : across * side]
-    return cv2.resize(whole.astype(np.float32), (across, down), interpolation=cv2.INTER_AREA)
+def _same(found: Settings, expected: Settings) -> bool:
+    exposure = abs(found.exposure_s - expected.exposure_s) <= _EXPOSURE_RELATIVE * expected.exposure_s
+    return exposure and abs(found.gain_dB - expected.gain_dB) <= _GAIN_DB and found.region == expected.region

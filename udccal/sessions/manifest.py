@@ -16,6 +16,7 @@ from udccal.sessions.schema import Manifest
 
 MANIFEST_NAME = "session.json"
 PREVIOUS_NAME = "session.previous.json"
+DAMAGED_NAME = "session.damaged.json"
 FORMAT = "udccal-session"
 VERSION = 1
 _MAX_BYTES = 64 * 1024 * 1024

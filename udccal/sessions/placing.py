@@ -64,6 +64,8 @@ def _place(folder: Path, name: str) -> Path:
         raise SessionError(f"Expected a step id of letters, digits, '_', '-' and '/', found a file name '{name}'.")
     file = folder / name
     file.parent.mkdir(parents=True, exist_ok=True)
+    if not file.parent.resolve().is_relative_to(folder.resolve()):
+        raise SessionError(f"Expected {file.parent} to be a folder, found a link out of the session. Remove it.")
     return file
 
 

@@ -117,6 +117,7 @@ class StoredStep(_Strict):
     term: TermName
     subject: Subject
     completed_at: Annotated[str, Field(max_length=40)]
+    after_changes: Annotated[int, Field(ge=0, le=100)] = 0
     captures: Annotated[tuple[StoredCapture, ...], Field(min_length=1, max_length=256)]
 
     @model_validator(mode="after")
@@ -141,7 +142,6 @@ class StoredChange(_Strict):
     what: Literal["camera", "lens"]
     before: Annotated[str, Field(max_length=300)]
     after: Annotated[str, Field(max_length=300)]
-    after_steps: Annotated[int, Field(ge=0)]
 
 
 class Manifest(_Strict):

@@ -35,7 +35,7 @@ class Session:
         """Use ``Session.open``."""
         self.path = path
         self.manifest = manifest
-        self._verified: set[str] = set()
+        self._verified: set[tuple[str, str]] = set()
 
     @classmethod
     def open(cls, path: str | Path) -> Session:
@@ -129,14 +129,14 @@ class Session:
             raise SessionError(
                 f"Expected the file '{name}' inside the session {self.path}, found none. Restore it, or capture again."
             )
-        if name not in self._verified:
-            found = sha256_file(file)
+        if (name, sha256) not in self._verified:
+            found = _checksum(file)
             if found != sha256:
                 raise SessionError(
                     f"Expected '{name}' of {self.path} to have the SHA-256 {sha256[:12]}..., found {found[:12]}...: "
-                    "the file was changed or damaged. Restore it, or capture that step again."
+                    "the file was changed or damaged. Restore it, or capture again, which captures that step alone."
                 )
-            self._verified.add(name)
+            self._verified.add((name, sha256))
         try:
             return reader(file)
         except FileFormatError as error:
@@ -157,3 +157,12 @@ class Session:
                 f"Expected samples of at most {limit} DN in '{capture.file}' of {self.path} ({self.rig.camera.bits} "
                 f"bits), found {largest:g}. Store them right-aligned, as the converter delivers them."
             )
+
+
+def _checksum(file: Path) -> str:
+    try:
+        return sha256_file(file)
+    except OSError as error:
+        raise SessionError(
+            f"Expected to read {file}, found: {error.strerror}. Check the disk and permissions."
+        ) from error

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import shutil
 from collections.abc import Callable, Iterator, Sequence, Set
 from contextlib import contextmanager
 from datetime import UTC, datetime
@@ -20,9 +21,10 @@ from udccal.errors import SessionError
 from udccal.rig import RigDescription
 from udccal.sessions.captured import Capture
 from udccal.sessions.changes import Exchanged, admit, stored_camera
-from udccal.sessions.damage import Damage, find_damage, remove_leftovers
+from udccal.sessions.damage import Damage, find_damage, is_leftover, remove_leftovers
 from udccal.sessions.lock import LOCK_NAME, lock_session
 from udccal.sessions.manifest import (
+    DAMAGED_NAME,
     MANIFEST_NAME,
     PREVIOUS_NAME,
     NewerManifestError,
@@ -79,6 +81,7 @@ class SessionWriter:
             lock = lock_session(folder)
         try:
             _check_new(folder)
+            remove_leftovers(folder)
             manifest = Manifest(
                 format="udccal-session", version=1, created_at=_time(now), rig=rig, camera=stored_camera(camera)
             )
@@ -202,6 +205,7 @@ class SessionWriter:
                     term=term,
                     subject=subject,
                     completed_at=_time(self._now),
+                    after_changes=len(self.manifest.changes),
                     captures=tuple(
                         place_capture(self.path, f"{step_id}_{index}", capture)
                         for index, capture in enumerate(captures)
@@ -228,10 +232,15 @@ class SessionWriter:
 def _check_new(folder: Path) -> None:
     if (folder / MANIFEST_NAME).exists():
         raise SessionError(f"Expected no session at {folder}, found one. Resume it, or choose another folder.")
-    if folder.exists() and (not folder.is_dir() or any(item.name != LOCK_NAME for item in folder.iterdir())):
+    if folder.exists() and (not folder.is_dir() or not all(_may_be_there(item) for item in folder.iterdir())):
         raise SessionError(
             f"Expected {folder} to be a new or empty folder, found other content. Choose another folder."
         )
+
+
+def _may_be_there(item: Path) -> bool:
+    """What a process that was killed while it began a session leaves behind."""
+    return item.name == LOCK_NAME or is_leftover(item)
 
 
 def _read_or_recover(folder: Path) -> tuple[Manifest, bool]:
@@ -248,6 +257,8 @@ def _read_or_recover(folder: Path) -> tuple[Manifest, bool]:
         if manifest is None:
             raise
     with _sentences("the manifest", folder):
+        if (folder / MANIFEST_NAME).exists():  # a person may have edited it, and want that back
+            shutil.copyfile(folder / MANIFEST_NAME, folder / DAMAGED_NAME)
         write_manifest(folder, manifest)
     return manifest, True
 

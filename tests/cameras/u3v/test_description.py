@@ -173,6 +173,28 @@ def test_refuses_unsound_xml(text: str) -> None:
     assert len(str(caught.value)) < 400
 
 
+@pytest.mark.parametrize(
+    "nodes",
+    [
+        '<IntReg Name="R"><pPort>Device</pPort></IntReg><Integer Name="Device"/>',
+        '<IntReg Name="R"><pPort>Nowhere</pPort></IntReg>',
+        '<IntReg Name="R"><pPort>R</pPort></IntReg>',
+        '<Category Name="Root"><pFeature>Device</pFeature></Category><Port Name="Device"/>',
+        '<Integer Name="I"><pValue> Device\n</pValue></Integer><Port Name="Device"/>',
+        '<Group><Integer Name="I"><pMin>Device</pMin></Integer></Group><g:Port Name="Device"/>',
+    ],
+)
+def test_refuses_references_that_genapi_would_follow_into_the_void(nodes: str) -> None:
+    with pytest.raises(CameraProtocolError, match=SENTENCE):
+        checked_xml(f"<RegisterDescription>{nodes}</RegisterDescription>".encode())
+
+
+def test_accepts_references_of_the_right_kind() -> None:
+    nodes = '<IntReg Name="R"><pPort>\n Device</pPort><pMin>R</pMin></IntReg><Group><Port Name="Device"/></Group>'
+    text = f"<RegisterDescription>{nodes}</RegisterDescription>"
+    assert checked_xml(text.encode()) == text
+
+
 def test_refuses_more_elements_than_any_camera_has(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("udccal.cameras.u3v.outline._MOST_ELEMENTS", 1000)
     checked_xml(b"<RegisterDescription>" + b"<a/>" * 999 + b"</RegisterDescription>")

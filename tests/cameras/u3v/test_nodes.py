@@ -223,6 +223,13 @@ def test_refuses_descriptions_that_make_no_sense(xml: str, memory: Memory) -> No
         NodeMap(xml, memory)
 
 
+@pytest.mark.parametrize("port", ['<Integer Name="Device"><Value>1</Value></Integer>', ""])
+def test_refuses_descriptions_without_a_port_to_the_device(port: str, memory: Memory) -> None:
+    nodes = '<Integer Name="One"><Value>1</Value></Integer>' + port
+    with pytest.raises(CameraError, match=SENTENCE):
+        NodeMap(HEAD + nodes + "</RegisterDescription>", memory)
+
+
 def test_nothing_of_it_stays_in_memory(memory: Memory) -> None:
     made = NodeMap(XML, memory)
     inner = weakref.ref(made._map)

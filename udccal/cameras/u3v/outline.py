@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Final, final
 from xml.parsers import expat
 
@@ -10,8 +11,10 @@ from udccal.errors import CameraProtocolError
 _ROOT: Final = "RegisterDescription"
 _MOST_DEPTH: Final = 32
 _MOST_ELEMENTS: Final = 300_000
-# References that GenApi follows without asking what kind of node is at their end.
-_KIND_REFERRED_TO: Final = {"pPort": "Port"}
+# Elements that refer to a node are named so; GenApi follows them without asking what kind of node is at their end.
+_REFERENCE: Final = re.compile("p[A-Z]")
+_PORT_REFERENCE: Final = "pPort"
+_PORT: Final = "Port"
 
 
 def check_outline(text: str) -> None:
@@ -73,7 +76,7 @@ class _Outline:
 
     def end(self, name: str) -> None:
         tag = self._path.pop()
-        if tag in _KIND_REFERRED_TO:
+        if _REFERENCE.match(tag):
             self._references.append((tag, self._text.strip()))
         self._text = ""
 
@@ -83,8 +86,8 @@ class _Outline:
     def check_references(self) -> None:
         for reference, target in self._references:
             kind = self._kinds.get(target, "nothing")
-            if kind != _KIND_REFERRED_TO[reference]:
-                raise unsound(f"a {_KIND_REFERRED_TO[reference]} behind each {reference}", f"{kind} {target[:40]!r}")
+            if (kind == _PORT) != (reference == _PORT_REFERENCE):
+                raise unsound(f"another kind of node behind {reference}", f"{kind} {target[:40]!r}")
 
 
 def _local(name: str) -> str:

@@ -51,6 +51,9 @@ def capture(
 
 def _say_damage(output: Output, writer: SessionWriter) -> None:
     if writer.recovered:
-        output.say("The session's manifest was damaged; going on from the copy kept before the last step.")
+        output.say(
+            "The session's manifest was damaged; going on from the copy kept before the last step. The damaged one is "
+            "kept as session.damaged.json."
+        )
     for damage in writer.damage:
-        output.say(f"Damaged: {damage}; that step is captured again.")
+        output.say(f"Damaged: {damage}; that step has to be captured again.")

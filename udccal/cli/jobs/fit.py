@@ -55,7 +55,13 @@ def fit_to_profile(output: Output, session_path: Path, profile_path: Path) -> No
     """
     check_replaceable(profile_path)
     session = Session.open(session_path)
+    for change in session.manifest.changes:
+        output.say(
+            f"Careful: the {change.what} was exchanged during this session, from {change.before} to {change.after}. "
+            "The fits take all steps for those of one."
+        )
     calibration = run_fits(output, session)
+    profile_path = profile_path.resolve()
     report = profile_path.with_name(f"{profile_path.name.removesuffix('.zip')}-report.html")
     with output.stage("report"):
         panel = session.rig.panel
