@@ -127,5 +127,5 @@ DEVICE_TARGETS = (
         32768,
     ),
     Target("xml", _describe, lambda: (_description(),), 65536),
-    Target("features", _change_and_describe, lambda: (b"", bytes([0, 5, 0, 5, 0, 70, 0, 70, 0, 90, 0, 90])), 64),
+    Target("features", _change_and_describe, lambda: (bytes((0, 5, 0, 5)) * 4,), 64),
 )
