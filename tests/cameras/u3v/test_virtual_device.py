@@ -256,7 +256,7 @@ def test_spoilt_descriptions_are_spoilt() -> None:
 
 
 def test_emvas_genapi_loads_the_description_and_converts() -> None:
-    genapi = pytest.importorskip("genicam.genapi", reason="needs genicam: pip install 'udccal[u3v]'")
+    genapi = pytest.importorskip("genicam.genapi", reason="needs genicam: pip install genicam")
     host = host_of(VirtualCamera())
 
     class Port(genapi.AbstractPort):

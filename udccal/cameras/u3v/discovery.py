@@ -140,7 +140,7 @@ def _libusb() -> Any:
     backend = backend or usb.backend.libusb1.get_backend()
     if backend is None:
         raise CameraError(
-            'Expected libusb, found none. Install it with: pip install "udccal[u3v]" (or from the system, e.g. '
+            "Expected libusb, found none. Install it with: pip install libusb-package (or from the system, e.g. "
             "apt install libusb-1.0-0)."
         )
     return backend

@@ -202,9 +202,7 @@ def _import_genapi() -> Any:
     try:
         from genicam import genapi
     except ImportError as error:
-        raise CameraError(
-            'Expected EMVA\'s GenApi, found none. Install it with: pip install "udccal[u3v]" (the package genicam).'
-        ) from error
+        raise CameraError("Expected EMVA's GenApi, found none. Install it with: pip install genicam") from error
     return genapi
 
 
