@@ -8,7 +8,7 @@ from typing import Any, get_args
 
 from udccal.cli.jobs.benches import CaptureBench
 from udccal.cli.output import Output
-from udccal.errors import CameraTimeout, CaptureError
+from udccal.errors import CameraTimeout, CaptureError, DisplayError
 from udccal.plugins import find_procedure
 from udccal.rig import RigDescription
 from udccal.sessions.changes import Exchanged
@@ -44,7 +44,7 @@ def capture(
                     try:
                         procedure.run(bench.camera, bench.display, bench.stage, writer, progress)
                         break
-                    except (CaptureError, CameraTimeout) as error:
+                    except (CaptureError, CameraTimeout, DisplayError) as error:
                         if not bench.try_again(str(error)):
                             raise
 
