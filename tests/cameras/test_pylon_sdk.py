@@ -183,10 +183,13 @@ def test_reasons_are_short() -> None:
 # --- opening
 
 
-@pytest.mark.parametrize(("why", "found"), [(2, "another program"), (3, "another program"), (4, "cannot be reached")])
-def test_a_camera_that_may_not_be_opened_is_busy(why: int, found: str) -> None:
+@pytest.mark.parametrize(
+    ("why", "error", "found"),
+    [(2, CameraBusy, "another program"), (3, CameraBusy, "another program"), (4, CameraLost, "cannot be reached")],
+)
+def test_a_camera_that_may_not_be_opened_is_busy_or_lost(why: int, error: type[CameraError], found: str) -> None:
     sdk = Sdk(Factory(InstantCamera(), accessible=(False, why)), Genicam())
-    with pytest.raises(CameraBusy, match=rf"Expected to open the camera 0042, found .*{found}.*\. Close"):
+    with pytest.raises(error, match=rf"Expected to open the camera 0042, found .*{found}.*\. (Close|Plug)"):
         open_device(sdk, DeviceInfo())
 
 

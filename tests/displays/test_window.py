@@ -197,22 +197,27 @@ def test_a_dead_screen_is_an_error(screen: VirtualScreen) -> None:
         display.off()
         screen.process.kill()
         screen.process.wait()
-        with pytest.raises(DisplayError, match="its process ended"):
+        with pytest.raises(DisplayError, match=r"its process ended|Expected a desktop"):
             display.show(noise(SMALL))
-        with pytest.raises(DisplayError, match="its process ended"):
+        with pytest.raises(DisplayError, match=r"its process ended|found it closed"):
             display.check()
 
 
 def test_a_silent_window_is_an_error_in_bounded_time(screen: VirtualScreen, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(window, "_ANSWER_S", 0.2)
     monkeypatch.setattr(window_link, "_END_S", 0.2)
-    start = time.monotonic()
+    start, picture = time.monotonic(), noise(SMALL)
     with WindowDisplay(0, SMALL, SETTLE_S) as display:
         assert display._link is not None
         os.kill(display._link._process.pid, signal.SIGSTOP)
         with pytest.raises(DisplayError, match=r"answer within 0\.25 s, found it silent"):
             display.off()
-    assert time.monotonic() - start < 20
+        with pytest.raises(DisplayError, match="its process ended"):
+            display.check()
+        monkeypatch.setattr(window, "_ANSWER_S", 20.0)
+        display.show(picture)  # in a new window, with no late answer of the old one between
+        np.testing.assert_array_equal(screen.pixels(), picture)
+    assert time.monotonic() - start < 30
 
 
 @pytest.mark.parametrize("driver", ["x11", "dummy", "offscreen"])

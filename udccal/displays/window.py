@@ -95,14 +95,14 @@ class WindowDisplay:
                 was asked last, or it cannot be shown now.
         """
         check_picture(picture, self._size)
-        link = self._opened()
+        link = self._opened_anew()
         assert self._shared is not None
         self._shared[:] = picture
         link.ask("show", self._settle_s + _ANSWER_S)
 
     def off(self) -> None:
         """Show black; errors as ``show``."""
-        self._opened().ask("black", self._settle_s + _ANSWER_S)
+        self._opened_anew().ask("black", self._settle_s + _ANSWER_S)
 
     def check(self) -> None:
         """Return when the window has been on screen since it was asked last.
@@ -116,6 +116,13 @@ class WindowDisplay:
         if self._link is None:
             raise DisplayError("Expected an open window, found it closed. Use it in a 'with' statement.")
         return self._link
+
+    def _opened_anew(self) -> WindowLink:
+        """The window; a new one where its process ended, which was said when it did."""
+        if not self._opened().alive:
+            self._close()
+            self.__enter__()
+        return self._opened()
 
     def _close(self) -> None:
         if self._link is not None:

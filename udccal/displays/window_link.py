@@ -56,6 +56,11 @@ class WindowLink:
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
 
+    @property
+    def alive(self) -> bool:
+        """Whether the process still runs."""
+        return self._process.poll() is None
+
     def ask(self, request: Request, seconds: float) -> Reply:
         """Send a request and wait for its reply; see ``reply``."""
         assert self._process.stdin is not None
@@ -75,9 +80,10 @@ class WindowLink:
         try:
             line = self._lines.get(timeout=seconds)
         except queue.Empty:
+            self._process.kill()  # its late answer must not be taken for that of the next request
             raise DisplayError(
                 f"Expected the panel's window to answer within {seconds:g} s, found it silent. Check that the desktop "
-                "responds, then run the same command again."
+                "responds, then try again: it is opened anew."
             ) from None
         if not line:
             self._lines.put(line)

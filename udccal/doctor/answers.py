@@ -15,7 +15,7 @@ class SeenCamera:
 
     Attributes:
         name: maker, model and serial.
-        too_slow: it hangs on a slower port than it was made for, as far as the backend knows.
+        too_slow: it is plugged into a slower port than it was made for, as far as the backend knows.
         trouble: why it cannot be opened, as a sentence; empty when nothing is known against it.
     """
 

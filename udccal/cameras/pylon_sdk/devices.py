@@ -64,7 +64,7 @@ def choose_info(infos: Sequence[Any], serial: str | None) -> Any:
         return infos[0]
     wanted = "a camera" if serial is None else f"the camera with serial number {serial[:_MAX_NAME]}"
     if not infos:
-        raise CameraError(
+        raise CameraLost(
             f"Expected {wanted} for Basler's SDK, found none. Check cable and power; 'udccal doctor' says more."
         )
     serials = ", ".join(str(info.GetSerialNumber()) for info in infos)
@@ -76,17 +76,22 @@ def open_device(sdk: Sdk, info: Any) -> OpenDevice:
 
     Raises:
         CameraBusy: when another program holds it, or this user may not open it.
+        CameraLost: when it cannot be reached.
     """
     factory = sdk.pylon.TlFactory.GetInstance()
     name = identity_of(info).serial
     held = (sdk.pylon.Accessibility_Opened, sdk.pylon.Accessibility_OpenedExclusively)
     try:
         accessible, why = factory.IsDeviceAccessibleInfo(info)
-        if not accessible:
-            found = "another program to hold it" if why in held else "that it cannot be reached"
+        if not accessible and why in held:
             raise CameraBusy(
-                f"Expected to open the camera {name}, found {found}. Close other programs that use it, such as pylon "
-                "Viewer; 'udccal doctor' says which permissions it needs."
+                f"Expected to open the camera {name}, found another program to hold it. Close other programs that use "
+                "it, such as pylon Viewer."
+            )
+        if not accessible:
+            raise CameraLost(
+                f"Expected to open the camera {name}, found that it cannot be reached. Plug it in again; 'udccal doctor' "
+                "says which permissions it needs."
             )
         camera = sdk.pylon.InstantCamera(factory.CreateDevice(info))
         camera.Open()
