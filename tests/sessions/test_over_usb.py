@@ -36,7 +36,7 @@ def rig(tmp_path: Path) -> RigDescription:
 @contextmanager
 def bench_over_usb(rig: RigDescription, world: SimulatedWorld, device: VirtualCamera) -> Iterator[CaptureBench]:
     with U3vCamera(backend=VirtualBackend([device])) as camera:
-        camera.set_mode(mode_for(camera.features, rig.camera.cfa, rig.camera.bits))
+        camera.set_mode(mode_for(camera.features, camera.sensor, rig.camera.cfa, rig.camera.bits))
         yield CaptureBench(camera, SimulatedDisplay(world), world, world.now, lambda sentence: False)
 
 

@@ -2,13 +2,26 @@
 
 from __future__ import annotations
 
-from udccal.cameras.pixel_formats import PIXEL_FORMATS
-from udccal.cameras.protocol import Features, Mode
+from udccal.cameras.pixel_formats import PIXEL_FORMATS, payload_bytes
+from udccal.cameras.protocol import Features, Mode, Region
 from udccal.errors import CameraError
 
+# Half of what USB 3 carries: a driver that reads one transfer after the other, on a computer that does other things too,
+# keeps up with it. Faster cameras are held back to that; a calibration waits for light and hands, not for frames.
+MOST_BYTES_PER_S = 200e6
 
-def mode_for(features: Features, cfa: str, bits: int) -> Mode:
-    """A free-running mode with the pattern and the bits that a rig's description asks for; packed ones need less USB.
+
+def mode_for(
+    features: Features, sensor: Region, cfa: str, bits: int, most_bytes_per_s: float = MOST_BYTES_PER_S
+) -> Mode:
+    """A free-running mode with the pattern and the bits that a rig's description asks for, packed if the camera can.
+
+    Args:
+        features: of the camera.
+        sensor: of the camera, whole.
+        cfa: pattern that the rig says.
+        bits: per sample that the rig says.
+        most_bytes_per_s: of whole frames, that the way from the camera carries without loss.
 
     Raises:
         CameraError: when the camera has no such format.
@@ -20,4 +33,7 @@ def mode_for(features: Features, cfa: str, bits: int) -> Mode:
             f"Expected a camera with a pixel format of {bits} bits and the pattern {cfa}, as the rig says, found "
             f"{', '.join(features.pixel_formats) or 'none'}. Connect the right camera, or correct rig.toml."
         )
-    return Mode(min(fitting, key=lambda each: each.bits_per_pixel).name)
+    chosen = min(fitting, key=lambda each: each.bits_per_pixel)
+    rate_hz = most_bytes_per_s / payload_bytes(chosen, sensor.rows, sensor.columns)
+    rates = features.frame_rate_hz
+    return Mode(chosen.name, None if rate_hz >= rates.high else max(rate_hz, rates.low))

@@ -38,8 +38,8 @@ def speed_finding(cameras: Sequence[BusCamera]) -> Finding:
     if any(0 < camera.mbit_per_s < _SUPER_SPEED_MBIT for camera in cameras):
         advice = (
             "The camera runs, but at a tenth of its frame rate or less: it is plugged into a USB 2 port or cable. Plug "
-            "it straight into a USB 3 port of the computer (blue, or marked SS), without a hub, with a USB 3 cable of at "
-            "most 3 m."
+            "it straight into a USB 3 port of the computer (blue, or marked SS), without a hub, with a USB 3 cable of "
+            "at most 3 m."
         )
         return Finding(topic, Status.NOTE, found, advice)
     return Finding(topic, Status.OK, found)

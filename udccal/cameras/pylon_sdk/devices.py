@@ -90,8 +90,8 @@ def open_device(sdk: Sdk, info: Any) -> OpenDevice:
             )
         if not accessible:
             raise CameraLost(
-                f"Expected to open the camera {name}, found that it cannot be reached. Plug it in again; 'udccal doctor' "
-                "says which permissions it needs."
+                f"Expected to open the camera {name}, found that it cannot be reached. Plug it in again; "
+                "'udccal doctor' says which permissions it needs."
             )
         camera = sdk.pylon.InstantCamera(factory.CreateDevice(info))
         camera.Open()

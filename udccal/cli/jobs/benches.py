@@ -57,7 +57,7 @@ def real_bench(output: Output, rig: RigDescription, camera: Camera, display: Dis
     """
     person = PersonStage(output)
     with camera, display:
-        camera.set_mode(mode_for(camera.features, rig.camera.cfa, rig.camera.bits))
+        camera.set_mode(mode_for(camera.features, camera.sensor, rig.camera.cfa, rig.camera.bits))
         yield CaptureBench(camera, MirroredDisplay(display), person, utc_now, person.try_again)
 
 
