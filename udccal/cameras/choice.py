@@ -6,7 +6,7 @@ from udccal.cameras.pixel_formats import PIXEL_FORMATS, payload_bytes
 from udccal.cameras.protocol import Features, Mode, Region
 from udccal.errors import CameraError
 
-# Half of what USB 3 carries: a driver that reads one transfer after the other, on a computer that does other things too,
+# Half of what USB 3 carries: a driver that reads one transfer after the other, on a computer that does other things,
 # keeps up with it. Faster cameras are held back to that; a calibration waits for light and hands, not for frames.
 MOST_BYTES_PER_S = 200e6
 

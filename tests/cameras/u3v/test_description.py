@@ -207,3 +207,47 @@ def test_refuses_other_encodings() -> None:
         checked_xml(XML.replace("Root", "Ä").encode("latin-1"))
     with pytest.raises(CameraProtocolError, match=SENTENCE):
         checked_xml(XML.encode("utf-16"))
+
+
+@pytest.mark.parametrize("declared", ["ISO-8859-1", "iso-8859-1", "windows-1252"])
+def test_accepts_the_encoding_that_a_description_declares(declared: str) -> None:
+    text = f'<?xml version="1.0" encoding="{declared}"?><RegisterDescription ToolTip="°C µs"/>'
+    # What is handed on declares what it then is.
+    assert checked_xml(text.encode("latin-1")) == text.replace(declared, "utf-8")
+
+
+@pytest.mark.parametrize("mark", [b"", b"\xef\xbb\xbf"])
+@pytest.mark.parametrize("declared", ["UTF-8", "utf-16", "zip", "rot13", "no-such-thing"])
+def test_everything_else_is_utf_8_whatever_it_declares(mark: bytes, declared: str) -> None:
+    text = f'<?xml version="1.0" encoding="{declared}"?><RegisterDescription ToolTip="°C µs"/>'
+    assert checked_xml(mark + text.encode()) == text.replace(declared, "utf-8")
+    with pytest.raises(CameraProtocolError, match="UTF-8"):
+        checked_xml(mark + text.encode("latin-1"))
+
+
+def test_a_byte_order_mark_counts_more_than_the_declaration() -> None:
+    text = '<?xml version="1.0" encoding="ISO-8859-1"?><RegisterDescription ToolTip="°C"/>'
+    assert checked_xml(b"\xef\xbb\xbf" + text.encode()) == text.replace("ISO-8859-1", "utf-8")
+
+
+def test_names_within_a_node_are_no_names_of_nodes() -> None:
+    nodes = (
+        '<Port Name="Device"/><IntReg Name="R"><pPort>Device</pPort></IntReg>'
+        '<Enumeration Name="E"><EnumEntry Name="Device"><Value>0</Value></EnumEntry></Enumeration>'
+        '<IntSwissKnife Name="K"><pVariable Name="Device">R</pVariable><Formula>Device</Formula></IntSwissKnife>'
+    )
+    text = f"<RegisterDescription>{nodes}</RegisterDescription>"
+    assert checked_xml(text.encode()) == text
+
+
+@pytest.mark.parametrize(
+    "nodes",
+    [
+        '<Integer Name="I"><Port Name="P"/></Integer>',
+        '<Integer Name="Device"/><Integer Name="I"><Port Name="Device"/></Integer><A><pPort>Device</pPort></A>',
+        '<StructReg><pPort>S</pPort><StructEntry Name="S"/></StructReg><Port Name="Device"/>',
+    ],
+)
+def test_nothing_within_a_node_passes_for_a_port(nodes: str) -> None:
+    with pytest.raises(CameraProtocolError, match=SENTENCE):
+        checked_xml(f"<RegisterDescription>{nodes}</RegisterDescription>".encode())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import struct
 from collections.abc import Iterator
 
 import numpy as np
@@ -18,7 +19,9 @@ from tests.virtual_u3v.memory import Status
 from tests.virtual_u3v.model import CameraModel
 from tests.virtual_u3v.sources import Exposure, PatternSource
 from udccal.cameras.protocol import Counts, Frame, Mode, Region, Settings, Trigger
+from udccal.cameras.u3v.acquisition import frame_wait_s
 from udccal.cameras.u3v.camera import U3vCamera
+from udccal.cameras.u3v.nodes import NodeMap
 from udccal.errors import CameraBusy, CameraError, CameraLost, CameraProtocolError, CameraTimeout
 
 SENTENCE = r"Expected .* found.*\. \w+"
@@ -399,3 +402,57 @@ def test_frames_of_another_size_than_agreed_are_refused(camera: U3vCamera, devic
     device._memory.put_uint(at.HEIGHT, 46)
     with pytest.raises(CameraProtocolError, match=SENTENCE):
         list(frames)
+
+
+@pytest.mark.parametrize("faults", [Faults(dropped_frames=(0, 1)), Faults(missing_leaders=(0, 1))])
+def test_frames_lost_before_the_first_are_counted(camera: U3vCamera, device: VirtualCamera, faults: Faults) -> None:
+    device.inject(faults)
+    frames = list(camera.frames(2))
+    assert [f.frame_id for f in frames] == [2, 3]
+    assert camera.counts == Counts(delivered=2, dropped=2)
+    device.inject(faults)
+    assert [f.frame_id for f in camera.frames(1)] == [6]
+    assert camera.counts == Counts(delivered=3, dropped=4)
+
+
+@pytest.mark.parametrize("rate_hz", [0.0, -1.0])
+def test_a_camera_that_says_it_makes_no_frames_is_refused(
+    camera: U3vCamera, device: VirtualCamera, rate_hz: float
+) -> None:
+    device._memory.put_uint(at.ACQUISITION_FRAME_RATE_ENABLE, 1)
+    device._memory.put(at.ACQUISITION_FRAME_RATE, struct.pack("<d", rate_hz))
+    with pytest.raises(CameraProtocolError, match=SENTENCE):
+        next(camera.frames(1))
+
+
+@pytest.mark.parametrize(
+    ("exposure_s", "rate_hz", "trigger", "wait_s"),
+    [
+        (4e-3, None, Trigger.FREE_RUN, 2.004),
+        (4e-3, 0.1, Trigger.FREE_RUN, 12.0),
+        (4e-3, 0.1, Trigger.SOFTWARE, 2.004),
+        (30.0, 0.1, Trigger.FREE_RUN, 32.0),
+        (4e-3, 1e-12, Trigger.FREE_RUN, 122.004),
+        (1e12, None, Trigger.FREE_RUN, 3602.0),
+        (1e12, 1e-12, Trigger.FREE_RUN, 3722.0),
+    ],
+)
+def test_waits_are_bounded_whatever_the_camera_says(
+    exposure_s: float, rate_hz: float | None, trigger: Trigger, wait_s: float
+) -> None:
+    settings, mode = Settings(exposure_s, 0.0, REGION), Mode("BayerRG8", rate_hz, trigger)
+    assert frame_wait_s(settings, mode, 2.0) == pytest.approx(wait_s)
+
+
+def test_the_usb_device_is_left_free_when_genapi_fails(device: VirtualCamera, monkeypatch: pytest.MonkeyPatch) -> None:
+    def failing(self: NodeMap) -> None:
+        raise CameraError("Expected an end, found none. Stop.")
+
+    backend = VirtualBackend([device])
+    camera = U3vCamera(backend=backend)
+    camera.__enter__()
+    assert backend._handles
+    monkeypatch.setattr(NodeMap, "close", failing)
+    with pytest.raises(CameraError, match="an end"):
+        camera.__exit__(None, None, None)
+    assert not backend._handles

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import gc
 import struct
+import time
 import weakref
 from collections.abc import Iterator
 
@@ -9,6 +10,7 @@ import pytest
 
 from tests.cameras.u3v.toy_nodes import HEAD, float_register, integer_register
 from udccal.cameras.protocol import Range
+from udccal.cameras.u3v.description import checked_xml
 from udccal.cameras.u3v.nodes import NodeMap
 from udccal.errors import CameraError, CameraLost, CameraProtocolError, CameraTimeout
 
@@ -243,3 +245,50 @@ def test_absent_genapi_is_a_sentence(monkeypatch: pytest.MonkeyPatch, memory: Me
     monkeypatch.setitem(__import__("sys").modules, "genicam", None)
     with pytest.raises(CameraError, match="pip install"):
         NodeMap(XML, memory)
+
+
+def test_slow_answers_do_not_draw_out_a_command(
+    nodes: NodeMap, memory: Memory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    memory.clears_commands = False
+    reads: list[int] = []
+
+    def slow(address: int, length: int) -> bytes:
+        reads.append(address)
+        time.sleep(0.2)
+        return bytes(memory.content[address : address + length])
+
+    monkeypatch.setattr(memory, "read", slow)
+    with pytest.raises(CameraTimeout, match=SENTENCE):
+        nodes.execute("Start", 0.5)
+    assert len(reads) <= 5
+
+
+def test_says_what_there_is_of_a_kind(nodes: NodeMap) -> None:
+    assert [nodes.writable("Width", kind) for kind in ("IInteger", "IFloat", "IEnumeration")] == [True, False, False]
+    assert [nodes.writable(name, "IFloat") for name in ("ExposureTime", "Hidden", "Fixed", "Nothing")] == [
+        *(True, False, False, False)
+    ]
+
+
+def test_an_entry_and_a_variable_may_have_the_name_of_the_port(memory: Memory) -> None:
+    more = (
+        '<IntSwissKnife Name="Twice"><pVariable Name="Device">W</pVariable><Formula>2*Device</Formula></IntSwissKnife>'
+        '<Enumeration Name="Source"><EnumEntry Name="Device"><Value>0</Value></EnumEntry>'
+        "<pValue>T</pValue></Enumeration>"
+    )
+    nodes = NodeMap(checked_xml(XML.replace("</Reg", more + "</Reg").encode()), memory)
+    try:
+        assert (nodes.choice("Source"), nodes.number("Twice")) == ("Device", 128)
+    finally:
+        nodes.close()
+
+
+def test_a_description_in_latin_1_can_be_loaded(memory: Memory) -> None:
+    head = '<?xml version="1.0" encoding="ISO-8859-1"?>'
+    raw = (head + XML.replace('ToolTip=""', 'ToolTip="°C µs"')).encode("latin-1")
+    nodes = NodeMap(checked_xml(raw), memory)
+    try:
+        assert nodes.number("Width") == 64
+    finally:
+        nodes.close()

@@ -11,7 +11,8 @@ from udccal.cameras.protocol import Mode, Range, Region, Settings, Trigger
 from udccal.cameras.u3v.chunk_values import enable_chunks, tick_s
 from udccal.cameras.u3v.mode import apply_mode, choose_known_format, read_features, read_mode
 from udccal.cameras.u3v.nodes import NodeMap
-from udccal.cameras.u3v.settings import apply_settings, read_settings, sensor_region, take_control
+from udccal.cameras.u3v.raw_samples import send_raw_samples
+from udccal.cameras.u3v.settings import apply_settings, read_settings, sensor_region
 from udccal.errors import CameraError
 
 SENTENCE = r"Expected .* found .*\. \w+"
@@ -75,7 +76,7 @@ def test_a_camera_without_exposure_is_refused() -> None:
 def test_takes_control_of_exposure_and_gain() -> None:
     nodes, registers = nodes_of(GAIN)
     registers.set_uint(88, 1)
-    take_control(nodes)
+    send_raw_samples(nodes)
     assert [registers.uint(address) for address in (72, 88, 92)] == [1, 0, 1]
     assert read_features(nodes).gain_dB == Range(0.0, 12.0)
 
@@ -179,3 +180,15 @@ def test_ticks_are_ns_unless_the_camera_says_otherwise() -> None:
     registers.set_uint(120, 125_000_000)
     nodes.refresh()
     assert tick_s(nodes) == 8e-9
+
+
+def test_a_colour_sensor_offers_its_mosaic_alone() -> None:
+    formats = enumeration("PixelFormat", 16, Mono8=0x01080001, BayerRG8=0x01080009, BayerRG12=0x01100011)
+    registers = Registers()
+    registers.set_uint(16, 0x01080001)
+    nodes = NodeMap(HEAD + SIZES + EXPOSURE + formats + TAIL, registers)
+    assert read_features(nodes).pixel_formats == ("BayerRG8", "BayerRG12")
+    with pytest.raises(CameraError, match="BayerRG8, BayerRG12"):
+        apply_mode(nodes, Mode("Mono8"))
+    choose_known_format(nodes)
+    assert registers.uint(16) == 0x01100011

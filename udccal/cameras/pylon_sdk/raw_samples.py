@@ -5,46 +5,34 @@ Features that a camera does not have, or has fixed, are passed over.
 
 from __future__ import annotations
 
-from typing import Final
-
+from udccal.cameras import raw_state
 from udccal.cameras.pylon_sdk.nodes import Nodes
-
-_OFF: Final = (
-    *("ExposureAuto", "GainAuto", "BalanceWhiteAuto", "TestImageSelector", "TestPattern", "ImageCompressionMode"),
-    *("BslColorSpace", "BslLightSourcePreset", "LightSourcePreset", "LightSourceSelector", "PgiMode", "SequencerMode"),
-    *("BslDefectPixelCorrectionMode", "BslStaticDefectPixelCorrectionMode", "DefectPixelCorrectionMode"),
-)
-_CHOSEN: Final = (
-    ("ExposureMode", "Timed"),
-    ("AcquisitionMode", "Continuous"),
-    ("GainSelector", "All"),
-    ("BinningHorizontalMode", "Sum"),
-    ("BinningVerticalMode", "Sum"),
-)
-_FALSE: Final = ("GammaEnable", "LUTEnable", "ColorTransformationEnable", "ReverseX", "ReverseY", "CenterX", "CenterY")
-_WHOLE: Final = (
-    ("DigitalShift", 0),
-    ("BinningHorizontal", 1),
-    ("BinningVertical", 1),
-    ("DecimationHorizontal", 1),
-    ("DecimationVertical", 1),
-)
 
 
 def send_raw_samples(nodes: Nodes) -> None:
-    """Switch it all off."""
-    for name in _OFF:
-        nodes.choose(name, "Off")
-    for name, value in _CHOSEN:
-        nodes.choose(name, value)
-    for name in _FALSE:
+    """Bring a camera into the state of ``raw_state``."""
+    for choice in raw_state.CHOICES:
+        nodes.choose(choice.name, choice.symbol)
+    for name in raw_state.SWITCHED_OFF:
         nodes.set_flag(False, name)
-    for name, number in _WHOLE:
-        nodes.set_whole(number, name)
-    nodes.set_number(1.0, "Gamma")
-    for colour in ("Red", "Green", "Blue"):
-        if nodes.choose("BalanceRatioSelector", colour):
-            nodes.set_number(1.0, "BalanceRatio", "BalanceRatioAbs")
+    for number in raw_state.WHOLE_NUMBERS:
+        nodes.set_whole(number.value, number.name)
+    nodes.set_number(1.0, raw_state.GAMMA)
+    for colour in raw_state.BALANCE_COLOURS:
+        if nodes.choose(raw_state.BALANCE_SELECTOR, colour):
+            nodes.set_number(1.0, *raw_state.BALANCE_RATIO)
+    _select_gain(nodes)
+
+
+def _select_gain(nodes: Nodes) -> None:
+    """Select the gain that is set from now on; a digital one beside it would multiply what it sends."""
+    choices = nodes.choices(raw_state.GAIN_SELECTOR)
+    selected = next((gain for gain in raw_state.GAINS if gain in choices), None)
+    if selected is None:
+        return
+    if nodes.choose(raw_state.GAIN_SELECTOR, raw_state.DIGITAL_GAIN) and (bounds := nodes.bounds("Gain")) is not None:
+        nodes.set_number(min(max(0.0, bounds.low), bounds.high), "Gain")
+    nodes.choose(raw_state.GAIN_SELECTOR, selected)
 
 
 def send_chunks(nodes: Nodes) -> None:

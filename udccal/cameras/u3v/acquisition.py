@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import contextlib
-import time
 from collections.abc import Generator, Iterator
 from dataclasses import dataclass
 from typing import Final, final
 
-from udccal.cameras.protocol import Frame, Trigger
+from udccal.cameras.protocol import Frame, Mode, Settings, Trigger
 from udccal.cameras.u3v.device import Device
 from udccal.cameras.u3v.pictures import PictureReader
+from udccal.cameras.u3v.polling import comes_true
 from udccal.cameras.u3v.readahead import ReadAhead
 from udccal.cameras.u3v.receiver import Block, Receiver
 from udccal.errors import CameraError, CameraTimeout
@@ -18,6 +18,9 @@ from udccal.errors import CameraError, CameraTimeout
 _READY_POLL_S: Final = 2e-3
 # After a trigger that may have arrived twice, a second frame would begin within this time.
 _TWICE_S: Final = 0.5
+# Whatever the camera says, frames are not waited for longer than an exposure of this length, and this much beyond it.
+_MOST_EXPOSURE_S: Final = 3600.0
+_MOST_PERIOD_S: Final = 120.0
 
 Blocks = Generator[tuple[memoryview, Block], None, None]
 
@@ -39,10 +42,10 @@ class Acquisition:
     timeout_s: float
 
     def frames(self, count: int, first_id: int) -> Iterator[tuple[Frame, int]]:
-        """Frames, each with how many were lost between the one before and it.
+        """Frames, each with how many were lost between the one before, or the start, and it.
 
         Args:
-            first_id: of the first frame; block ids begin anew with each run.
+            first_id: of the first frame that the camera takes; block ids begin anew with each run.
 
         Raises:
             CameraTimeout, CameraLost, CameraProtocolError, CameraError: as for ``Camera.frames``.
@@ -51,12 +54,12 @@ class Acquisition:
         layout = self.device.registers.configure(self.device.link.stream_packet)
         receiver = Receiver(self.device.link, layout, self.timeout_s)
         blocks = self._blocks(receiver, count)
-        previous: int | None = None
+        previous = -1  # ids count from 0 (USB3 Vision 1.0): what is missing before the first is lost as well
         try:
             self.device.start()
             for payload, block in blocks:
                 block_id = block.leader.block_id
-                lost = 0 if previous is None else block_id - previous - 1
+                lost = block_id - previous - 1
                 first_id += lost
                 previous = block_id
                 yield self.reader.frame(payload, block, first_id), lost
@@ -99,12 +102,27 @@ class Acquisition:
         if "FrameTriggerWait" not in nodes.choices("AcquisitionStatusSelector"):
             return
         nodes.choose("AcquisitionStatusSelector", "FrameTriggerWait")
-        for _ in range(max(1, round(self.wait_s / _READY_POLL_S))):
+
+        def ready() -> bool:
             nodes.refresh()
-            if nodes.flag("AcquisitionStatus"):
-                return
-            time.sleep(_READY_POLL_S)
-        raise CameraTimeout("Expected the camera to take a trigger, found it busy. Shorten the exposure or try again.")
+            return nodes.flag("AcquisitionStatus")
+
+        if not comes_true(ready, self.wait_s, _READY_POLL_S):
+            raise CameraTimeout(
+                "Expected the camera to take a trigger, found it busy. Shorten the exposure or try again."
+            )
+
+
+def frame_wait_s(settings: Settings, mode: Mode, timeout_s: float) -> float:
+    """Longest wait for a frame: its exposure, or the frame rate's period, and a time-out on top; s.
+
+    Args:
+        mode: with a frame rate above 0 Hz, or none.
+    """
+    exposure_s = min(settings.exposure_s, _MOST_EXPOSURE_S)
+    if mode.frame_rate_hz is None or mode.trigger is not Trigger.FREE_RUN:
+        return exposure_s + timeout_s
+    return min(max(exposure_s, 1.0 / mode.frame_rate_hz), exposure_s + _MOST_PERIOD_S) + timeout_s
 
 
 def _never() -> bool:

@@ -8,8 +8,8 @@ from dataclasses import replace
 from types import TracebackType
 from typing import Any, final
 
-from udccal.cameras.protocol import CameraIdentity, Counts, Features, Frame, Mode, Region, Settings, Trigger
-from udccal.cameras.u3v.acquisition import Acquisition
+from udccal.cameras.protocol import CameraIdentity, Counts, Features, Frame, Mode, Region, Settings
+from udccal.cameras.u3v.acquisition import Acquisition, frame_wait_s
 from udccal.cameras.u3v.bootstrap import read_bootstrap
 from udccal.cameras.u3v.chunk_values import enable_chunks, tick_s
 from udccal.cameras.u3v.control import ControlChannel
@@ -21,7 +21,8 @@ from udccal.cameras.u3v.layout import StreamRegisters
 from udccal.cameras.u3v.mode import apply_mode, choose_known_format, read_features, read_format, read_mode
 from udccal.cameras.u3v.nodes import NodeMap
 from udccal.cameras.u3v.pictures import PictureReader
-from udccal.cameras.u3v.settings import apply_settings, read_settings, sensor_region, take_control
+from udccal.cameras.u3v.raw_samples import send_raw_samples
+from udccal.cameras.u3v.settings import apply_settings, read_settings, sensor_region
 from udccal.cameras.u3v.transport import UsbLink
 from udccal.errors import CameraError
 
@@ -126,8 +127,10 @@ class U3vCamera:
                 if self._delivery is not None:
                     self._delivery.end()
         finally:
-            device.nodes.close()
-            device.link.close()
+            try:
+                device.nodes.close()
+            finally:
+                device.link.close()
 
     def set_mode(self, mode: Mode) -> Mode:
         """Ask for a mode; returns what the camera accepted, read back from it.
@@ -171,12 +174,11 @@ class U3vCamera:
         device = self._opened()
         device.nodes.refresh()
         settings, mode = read_settings(device.nodes), read_mode(device.nodes)
-        period_s = 0.0 if mode.frame_rate_hz is None else 1.0 / mode.frame_rate_hz
         yield from Acquisition(
             device=device,
             reader=PictureReader(device.nodes, settings, read_format(device.nodes), self._chunk_tick_s),
             trigger=mode.trigger,
-            wait_s=max(settings.exposure_s, period_s if mode.trigger is Trigger.FREE_RUN else 0.0) + self._timeout_s,
+            wait_s=frame_wait_s(settings, mode, self._timeout_s),
             timeout_s=self._timeout_s,
         ).frames(count, self._next_id)
 
@@ -212,8 +214,7 @@ class U3vCamera:
             on_failure.callback(nodes.close)
             device = Device(link, control, StreamRegisters(control, bootstrap.sirm_address), nodes)
             device.leave_any_run()
-            take_control(nodes)
-            nodes.refresh()
+            send_raw_samples(nodes)
             choose_known_format(nodes)
             enable_chunks(nodes)
             self._chunk_tick_s = tick_s(nodes)

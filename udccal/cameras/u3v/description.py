@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import codecs
 import hashlib
 import io
+import re
 import struct
 import zipfile
 import zlib
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Final, Protocol, final, runtime_checkable
 from xml.parsers import expat
 
@@ -23,6 +26,11 @@ _ENTRY: Final = struct.Struct("<IIQQ20s20x")
 _DEVICE_XML: Final = 0
 _UNCOMPRESSED: Final = 0
 _ZIPPED: Final = 1
+# The beginning of a file that declares an encoding.
+_DECLARATION: Final = re.compile(
+    rb"""(<\?xml\s[\x20-\x3d\x3f-\x7e\s]{0,200}?\sencoding\s*=\s*["'])([\w.-]{1,40})(["'])""", re.ASCII
+)
+_ENCODINGS: Final = MappingProxyType({"iso-8859-1": "iso-8859-1", "latin1": "iso-8859-1", "windows-1252": "cp1252"})
 _ZIP_ERRORS: Final = (
     zipfile.BadZipFile,
     zlib.error,
@@ -136,17 +144,29 @@ def unpacked(stored: bytes, file_format: int) -> bytes:
 
 
 def checked_xml(raw: bytes) -> str:
-    """XML text that is well-formed, and whose outline is one that GenApi can be given.
+    """XML text that is well-formed, and whose outline is one that GenApi can be given; it declares UTF-8, or nothing.
 
     Raises:
         CameraProtocolError: otherwise.
     """
     try:
         # Some devices fill their file up with zeros.
-        text = raw.rstrip(b"\0").decode("utf-8-sig")
+        text = _text(raw.rstrip(b"\0"))
+        # What is checked is the very text that GenApi is given.
         check_outline(text)
     except UnicodeDecodeError as error:
-        raise unsound("a description in UTF-8", "bytes that are not") from error
+        raise unsound(f"a description in {error.encoding.upper()}", "bytes that are not") from error
     except expat.ExpatError as error:
         raise unsound("well-formed XML", f"{expat.ErrorString(error.code)} in line {error.lineno}") from error
     return text
+
+
+def _text(raw: bytes) -> str:
+    """Text out of the encoding that it declares, one of a few; else UTF-8, as behind that one's mark."""
+    unmarked = raw.removeprefix(codecs.BOM_UTF8)
+    declared = _DECLARATION.match(unmarked)
+    if declared is None:
+        return unmarked.decode("utf-8")
+    head, name, tail = (part.decode("ascii") for part in declared.groups())
+    encoding = _ENCODINGS.get(name.lower(), "utf-8") if len(unmarked) == len(raw) else "utf-8"
+    return f"{head}utf-8{tail}{unmarked[declared.end() :].decode(encoding)}"

@@ -8,7 +8,7 @@ from udccal.cameras.pixel_formats import PIXEL_FORMATS, PixelFormat, pixel_forma
 from udccal.cameras.protocol import Features, Mode, Range, Trigger
 from udccal.cameras.u3v.nodes import NodeMap
 from udccal.cameras.u3v.settings import check_range, exposure_range, gain_range, region_steps
-from udccal.errors import CameraError
+from udccal.errors import CameraError, CameraProtocolError
 
 # Names before SFNC 2.0 come second.
 _RATE: Final = ("AcquisitionFrameRate", "AcquisitionFrameRateAbs")
@@ -25,7 +25,7 @@ def read_features(nodes: NodeMap) -> Features:
         exposure_s=exposure_range(nodes),
         gain_dB=gain_range(nodes),
         frame_rate_hz=_rate_range(nodes),
-        pixel_formats=tuple(s for s in nodes.choices("PixelFormat") if s in PIXEL_FORMATS),
+        pixel_formats=_raw_formats(nodes),
         triggers=_triggers(nodes),
         region_steps=region_steps(nodes),
     )
@@ -41,14 +41,15 @@ def read_format(nodes: NodeMap) -> PixelFormat:
 
 
 def choose_known_format(nodes: NodeMap) -> None:
-    """Leave the pixel format if it can be unpacked; else take the one with most bits.
+    """Leave the pixel format if it holds raw samples; else take the one with most bits.
 
     Raises:
         CameraError: when the camera has none that can be unpacked.
     """
-    if nodes.choice("PixelFormat") in PIXEL_FORMATS:
+    names = _raw_formats(nodes)
+    if nodes.choice("PixelFormat") in names:
         return
-    known = [PIXEL_FORMATS[s] for s in nodes.choices("PixelFormat") if s in PIXEL_FORMATS]
+    known = [PIXEL_FORMATS[name] for name in names]
     if not known:
         raise CameraError(
             f"Expected a camera with a Mono or Bayer pixel format, found {', '.join(nodes.choices('PixelFormat'))}. "
@@ -59,10 +60,18 @@ def choose_known_format(nodes: NodeMap) -> None:
 
 
 def read_mode(nodes: NodeMap) -> Mode:
-    """How the camera works now."""
+    """How the camera works now.
+
+    Raises:
+        CameraProtocolError: when it says that it makes no frames in a second, or fewer.
+    """
     enable, rate = nodes.first(*_RATE_ENABLE), nodes.first(*_RATE)
     limited = rate is not None and (enable is None or nodes.flag(enable))
     rate_hz = nodes.number(rate) if limited and rate is not None else None
+    if rate_hz is not None and rate_hz <= 0:
+        raise CameraProtocolError(
+            f"Expected a frame rate above 0 Hz, found {rate_hz:g} in {rate}. Set another one with its maker's program."
+        )
     return Mode(nodes.choice("PixelFormat"), rate_hz, _read_trigger(nodes))
 
 
@@ -72,8 +81,7 @@ def apply_mode(nodes: NodeMap, mode: Mode) -> Mode:
     Raises:
         CameraError: when the camera or this program does not know a part of it.
     """
-    formats = tuple(s for s in nodes.choices("PixelFormat") if s in PIXEL_FORMATS)
-    _check_choice("a pixel format", mode.pixel_format, formats)
+    _check_choice("a pixel format", mode.pixel_format, _raw_formats(nodes))
     _check_choice("a trigger", mode.trigger, _triggers(nodes))
     nodes.choose("PixelFormat", mode.pixel_format)
     _set_trigger(nodes, mode.trigger)
@@ -86,6 +94,12 @@ def apply_mode(nodes: NodeMap, mode: Mode) -> Mode:
 def _check_choice(what: str, asked: str, allowed: tuple[str, ...]) -> None:
     if asked not in allowed:
         raise CameraError(f"Expected {what} out of {', '.join(allowed)}, found {asked[:40]!r}. Choose one of them.")
+
+
+def _raw_formats(nodes: NodeMap) -> tuple[str, ...]:
+    """Formats that can be unpacked; a colour sensor's Mono formats are mixed from its colours."""
+    known = tuple(name for name in nodes.choices("PixelFormat") if name in PIXEL_FORMATS)
+    return tuple(name for name in known if PIXEL_FORMATS[name].cfa != "mono") or known
 
 
 def _rate_range(nodes: NodeMap) -> Range:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, Final, Protocol, final, runtime_checkable
 
 from udccal.cameras.protocol import Range
+from udccal.cameras.u3v.polling import comes_true
 from udccal.errors import CameraError, CameraProtocolError, CameraTimeout
 
 _PORT: Final = "Device"
@@ -68,9 +68,15 @@ class NodeMap:
         """Whether the camera has the feature, in its present state."""
         return self._access(name) >= self._genapi.EAccessMode.WO
 
-    def writable(self, name: str) -> bool:
-        """Whether the feature may be set now."""
-        return self._access(name) in (self._genapi.EAccessMode.WO, self._genapi.EAccessMode.RW)
+    def writable(self, name: str, kind: str | None = None) -> bool:
+        """Whether the feature may be set now.
+
+        Args:
+            kind: GenApi's interface that it must have too, e.g. ``IFloat``.
+        """
+        if self._access(name) not in (self._genapi.EAccessMode.WO, self._genapi.EAccessMode.RW):
+            return False
+        return kind is None or isinstance(self._map.get_node(name), getattr(self._genapi, kind))
 
     def first(self, *names: str) -> str | None:
         """The first of several names for one thing that the camera has."""
@@ -142,10 +148,8 @@ class NodeMap:
         with self._told(f"execute {name}"):
             node = self._node(name, "ICommand")
             node.execute()
-            for _ in range(round(wait_s / _COMMAND_POLL_S)):
-                if node.is_done():
-                    return
-                time.sleep(_COMMAND_POLL_S)
+            if comes_true(node.is_done, wait_s, _COMMAND_POLL_S):
+                return
         raise CameraTimeout(f"Expected {name} to be carried out, found it still going on. Open the camera again.")
 
     @contextmanager

@@ -15,6 +15,8 @@ _MOST_ELEMENTS: Final = 300_000
 _REFERENCE: Final = re.compile("p[A-Z]")
 _PORT_REFERENCE: Final = "pPort"
 _PORT: Final = "Port"
+_PLACES_OF_NODES: Final = ([_ROOT], ["Group"])
+_PART_OF_REGISTER: Final = "StructEntry"  # becomes a node by itself
 
 
 def check_outline(text: str) -> None:
@@ -68,7 +70,11 @@ class _Outline:
                 f"a description of up to {_MOST_ELEMENTS} elements, {_MOST_DEPTH} deep",
                 f"{self._elements} elements, {len(self._path)} deep",
             )
-        if "Name" in attributes:
+        # Names of entries, of variables and of constants are known within their node alone.
+        is_node = self._path[-2:-1] in _PLACES_OF_NODES or tag == _PART_OF_REGISTER
+        if tag == _PORT and not is_node:
+            raise unsound("a description with ports among its nodes", f"one inside {self._path[-2]}")
+        if is_node and "Name" in attributes:
             self._kinds[attributes["Name"]] = tag
 
     def characters(self, text: str) -> None:

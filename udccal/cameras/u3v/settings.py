@@ -11,30 +11,9 @@ from udccal.errors import CameraError
 
 _EXPOSURE: Final = ("ExposureTime", "ExposureTimeAbs")  # us; the second before SFNC 1.5
 _GAIN: Final = "Gain"  # dB
-_AUTOMATICS: Final = ("ExposureAuto", "GainAuto", "BalanceWhiteAuto")
-_ANALOG: Final = ("AnalogAll", "All")
 # Lowest and highest gain of a camera without one.
 _NO_GAIN: Final = Range(0.0, 0.0)
 _US_PER_S: Final = 1e6
-
-
-def take_control(nodes: NodeMap) -> None:
-    """Stop the camera from choosing exposure, gain or white balance itself, and let it run until it is stopped.
-
-    Raises:
-        CameraError: when it refuses.
-    """
-    for name in _AUTOMATICS:
-        if nodes.writable(name):
-            nodes.choose(name, "Off")
-    if nodes.writable("ExposureMode"):
-        nodes.choose("ExposureMode", "Timed")
-    if nodes.writable("GainSelector"):
-        selector = next((s for s in _ANALOG if s in nodes.choices("GainSelector")), None)
-        if selector is not None:
-            nodes.choose("GainSelector", selector)
-    if nodes.writable("AcquisitionMode"):
-        nodes.choose("AcquisitionMode", "Continuous")
 
 
 def sensor_region(nodes: NodeMap) -> Region:
