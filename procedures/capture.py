@@ -84,7 +84,7 @@ def _next_exposure(camera: Camera, checks: FrameChecks, taken: list[SingleFrame]
 
 
 def _sentence(expected: str, checks: FrameChecks) -> str:
-    found = ", ".join(f"{item.frames} {item.reason}" for item in checks.rejections()) or "no frame at all"
+    found = checks.summary() or "no frame at all"
     return (
         f"Expected {expected}, found frames that had to be left out one after the other ({found}). "
         "Check the light, that nothing moves, and the camera's cable, then repeat the step."

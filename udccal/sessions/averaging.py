@@ -82,9 +82,8 @@ def average_frames(deliver: Callable[[int], Iterator[Frame]], count: int, checks
             )
         if wanted >= _ENOUGH_TO_TELL and (moments.frames if moments is not None else 0) == before:
             break  # what is wrong stays wrong: a lamp that changed for good, a scene that clips
-    reasons = ", ".join(f"{item.frames} {item.reason}" for item in checks.rejections())
     raise CaptureError(
         f"Expected {count} usable frames, found that too many had to be left out "
-        f"({reasons or 'the camera delivered too few'}). "
+        f"({checks.summary() or 'the camera delivered too few'}). "
         "Check the light, the exposure and the camera's cable, then repeat the step."
     )

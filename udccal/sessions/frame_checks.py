@@ -76,17 +76,16 @@ class FrameChecks:
         self._reasons: Counter[str] = Counter()
         self._dropped = 0
 
-    @property
-    def rejected_frames(self) -> int:
-        """How many frames were delivered and left out; frames the camera never delivered are not among them."""
-        return sum(self._reasons.values())
-
     def rejections(self) -> tuple[Rejection, ...]:
         """Reasons with their counts, the commonest first."""
         found = [Rejection(reason=reason, frames=frames) for reason, frames in self._reasons.most_common()]
         if self._dropped:
             found.append(Rejection(reason="dropped on the way from the camera", frames=self._dropped))
         return tuple(found)
+
+    def summary(self) -> str:
+        """The same in words, for a sentence; empty when nothing was left out."""
+        return ", ".join(f"{item.frames} {item.reason}" for item in self.rejections())
 
     def accepted(self, frames: Iterable[Frame], expected: int) -> Iterator[Frame]:
         """The usable ones among frames of one delivery of ``expected``; at most eight are held at a time."""
