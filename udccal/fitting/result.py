@@ -56,6 +56,21 @@ class Diagnostic:
 
 
 @dataclass(frozen=True)
+class Outliers:
+    """Samples left out of a fit by a stated rule.
+
+    Attributes:
+        rule: what made them outliers, such as "off by more than 5 robust sigma of their view".
+        count: how many.
+        places: the first of them by name or position, for a person to look at.
+    """
+
+    rule: str
+    count: int
+    places: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
 class FitResult(Generic[Term]):
     """A fitted term and the evidence for it.
 
@@ -72,6 +87,7 @@ class FitResult(Generic[Term]):
     candidates: tuple[Candidate, ...] = ()
     diagnostics: tuple[Diagnostic, ...] = ()
     notes: tuple[str, ...] = field(default=())
+    outliers: tuple[Outliers, ...] = ()
 
     @property
     def ok(self) -> bool:

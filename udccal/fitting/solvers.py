@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import logging
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -20,13 +21,20 @@ with warnings.catch_warnings():
     warnings.simplefilter("ignore", DeprecationWarning)
     import jaxopt
 
+# Every iteration of every solve, at level DEBUG: `udccal fit --log`, or logging's own settings.
+LOG = logging.getLogger("udccal.fitting")
+
 # A fit has converged when another step would lower chi2 by less than this, in units of the residual variance.
 _LEFT_TO_GAIN = 1e-3
 
 
 @dataclass(frozen=True)
 class Solution:
-    """Minimiser of 0.5 |r(x)|^2 with the covariance (J^T J)^-1, valid when residuals are in units of their sigma."""
+    """Minimiser of 0.5 |r(x)|^2 with the covariance (J^T J)^-1, valid when residuals are in units of their sigma.
+
+    ``history`` is chi2 at the start and after each iteration. Where the residuals stopped being finite on the way,
+    ``x`` is the start and ``converged`` is False.
+    """
 
     x: Float[np.ndarray, " n"]
     cov: Float[np.ndarray, "n n"]
@@ -34,6 +42,7 @@ class Solution:
     residuals: Float[np.ndarray, " m"]
     iterations: int
     converged: bool
+    history: Float[np.ndarray, " iterations_plus_1"]
 
 
 @in_float64
@@ -58,7 +67,14 @@ def least_squares(
     origin = np.asarray(start, dtype=np.float64)
     unit = np.asarray(scale, dtype=np.float64)
     solve = _compiled(residuals, max_iterations, tolerance)
-    z, steps, r, jacobian = (np.asarray(part) for part in solve(origin, unit, args))
+    z, steps, r, jacobian, trace = (np.asarray(part) for part in solve(origin, unit, args))
+    history = trace[: int(steps) + 1]
+    _log(residuals, history)
+    if not (np.isfinite(z).all() and np.isfinite(r).all() and np.isfinite(jacobian).all()):
+        r = np.asarray(residuals(jnp.asarray(origin), *args))
+        r = np.where(np.isfinite(r), r, 0.0)
+        nothing = np.zeros((len(origin), len(origin)))
+        return Solution(origin, nothing, float(r @ r), r, int(steps), False, history)
     cov = np.linalg.pinv(jacobian.T @ jacobian, hermitian=True)
     return Solution(
         x=origin + unit * z,
@@ -67,7 +83,14 @@ def least_squares(
         residuals=r,
         iterations=int(steps),
         converged=_at_minimum(jacobian.T @ r, cov, r),
+        history=history,
     )
+
+
+def _log(residuals: Callable[..., Array], history: Float[np.ndarray, " iterations_plus_1"]) -> None:
+    name = f"{residuals.__module__}.{residuals.__qualname__}"
+    for iteration, chi2 in enumerate(history):
+        LOG.debug("%s: iteration %d, chi2 %.9g", name, iteration, chi2)
 
 
 def _at_minimum(
@@ -84,7 +107,7 @@ def _at_minimum(
 @functools.lru_cache(maxsize=32)
 def _compiled(
     residuals: Callable[..., Array], max_iterations: int, tolerance: float
-) -> Callable[[np.ndarray, np.ndarray, tuple[Any, ...]], tuple[Array, Array, Array, Array]]:
+) -> Callable[[np.ndarray, np.ndarray, tuple[Any, ...]], tuple[Array, Array, Array, Array, Array]]:
     """One solver per residual function: candidates and restarts of the same shapes then share its compilation."""
 
     def scaled(z: Array, origin: Array, unit: Array, args: tuple[Any, ...]) -> Array:
@@ -95,10 +118,22 @@ def _compiled(
     )
 
     @jax.jit
-    def solve(origin: Array, unit: Array, args: tuple[Any, ...]) -> tuple[Array, Array, Array, Array]:
-        outcome = solver.run(jnp.zeros_like(origin), origin, unit, args)
+    def solve(origin: Array, unit: Array, args: tuple[Any, ...]) -> tuple[Array, Array, Array, Array, Array]:
+        def unfinished(carry: tuple[Any, ...]) -> Array:
+            _, state, _ = carry
+            return (state.error > tolerance) & (state.iter_num < max_iterations)
+
+        def step(carry: tuple[Any, ...]) -> tuple[Any, ...]:
+            z, state, trace = carry
+            z, state = solver.update(z, state, origin, unit, args)
+            return z, state, trace.at[state.iter_num].set(2 * state.value)
+
+        z = jnp.zeros_like(origin)
+        first = solver.init_state(z, origin, unit, args)
+        trace = jnp.zeros(max_iterations + 1, first.value.dtype).at[0].set(2 * first.value)
+        z, state, trace = jax.lax.while_loop(unfinished, step, (z, first, trace))
         # The state's residuals and slopes are those at the solution: to ask again would be to compile them again.
-        return outcome.params, outcome.state.iter_num, outcome.state.residual, outcome.state.jac
+        return z, state.iter_num, state.residual, state.jac, trace
 
     return solve
 

@@ -1,0 +1,56 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.benchmarks.efficiency.trials import Trials, column, figure, table, write_json
+
+_COUNT = 2000
+
+
+def _draw(
+    spread: float = 1.0, offset: float = 0.0, claimed: float = 1.0, places: int = 1, shared: float = 0.0
+) -> Trials:
+    rng = np.random.default_rng(7)
+    common, own = rng.standard_normal((_COUNT, 1)), rng.standard_normal((_COUNT, places))
+    error = offset + spread * (np.sqrt(shared) * common + np.sqrt(1 - shared) * own)
+    return Trials("a", error, np.full(error.shape, claimed), np.ones(error.shape))
+
+
+def test_an_efficient_and_honest_fit_passes() -> None:
+    found = figure(_draw())
+    assert found.ok
+    assert found.efficiency == pytest.approx(1.0, abs=0.1)
+    assert found.efficiency_error == pytest.approx(np.sqrt(2 / _COUNT), rel=0.2)
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        _draw(spread=1.15, claimed=1.15),  # honest, but 30 % above the bound
+        _draw(offset=0.3),  # biased
+        _draw(claimed=0.8),  # sigma too small
+        _draw(claimed=1.3),  # sigma too large
+        Trials("nan", np.full((9, 1), np.nan), np.ones((9, 1)), np.ones((9, 1))),
+    ],
+)
+def test_a_wasteful_biased_or_dishonest_fit_does_not(bad: Trials) -> None:
+    assert not figure(bad).ok
+
+
+def test_places_that_share_their_noise_do_not_count_as_many() -> None:
+    alone, apart = figure(_draw(places=50, shared=0.99)), figure(_draw(places=50))
+    assert alone.efficiency_error > 5 * apart.efficiency_error
+
+
+def test_table_and_file_show_what_was_missed(tmp_path: Path) -> None:
+    figures = [figure(_draw()), figure(column("b", [5.0, 6.0, 5.0], [1.0, 1.0, 1.0], 1.0))]
+    assert table(figures).count("**missed**") == 1
+    write_json(figures, tmp_path / "efficiency.json")
+    kept = json.loads((tmp_path / "efficiency.json").read_text())
+    names = ["efficiency", "efficiency_error", "name", "ok", "realisations", "z_mean", "z_std"]
+    assert [sorted(one) for one in kept] == [names] * 2
+    assert [one["ok"] for one in kept] == [True, False]

@@ -1,0 +1,39 @@
+"""`make extremes`: every fit at the ends of its range. Puts the table into docs/numerics.md."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import sys
+import time
+from pathlib import Path
+
+from tests.benchmarks.extremes.case import Case, Outcome, table
+from tests.benchmarks.readme_tables import between
+
+# Each module has ``CASES``.
+MODULES = ("noise", "hdr", "geometry", "wire", "psf", "backscatter")
+_PAGE = Path(__file__).resolve().parents[3] / "docs" / "numerics.md"
+
+
+def main() -> None:
+    """Run the chosen terms; non-zero exit where one fails."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("terms", nargs="*", default=list(MODULES), choices=[[], *MODULES], metavar="term")
+    terms = parser.parse_args().terms or list(MODULES)
+    rows: list[tuple[Case, Outcome, float]] = []
+    for term in terms:
+        for case in importlib.import_module(f"tests.benchmarks.extremes.{term}").CASES:
+            start = time.perf_counter()
+            found = case.run()
+            rows.append((case, found, time.perf_counter() - start))
+            print(f"{term}: {case.name}: {found.status.name} {'ok' if found.ok else 'MISSED'}", flush=True)
+    if set(terms) == set(MODULES):
+        _PAGE.write_text(between(_PAGE.read_text(encoding="utf-8"), "extremes", table(rows)), encoding="utf-8")
+    else:
+        print(table(rows))
+    sys.exit(0 if all(found.ok for _, found, _ in rows) else 1)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,99 @@
+"""What data can tell at best: Fisher information of Gaussian, possibly clipped samples, and the Cramér–Rao bound.
+
+The model is given as one pure JAX function from parameters to the mean and variance of every sample; its slopes come
+from automatic differentiation, so that a bound and a fit share one likelihood. With mean m, variance v and samples
+clipped at c, one sample brings
+
+    I = m' m'^T / v  w_m(z) + v' v'^T / (2 v^2) w_v(z) + cross terms,   z = (c - m) / sqrt(v),
+
+where the weights are 1 far below the clipping (Kay, Fundamentals of Statistical Signal Processing I, eq. 3.31; for
+the clipped normal: Amemiya, Econometrica 41, 1973).
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from scipy.special import log_ndtr, ndtr
+
+from udccal.numerics import in_float64
+
+# Parameters to (mean, variance) of every sample.
+Predict = Callable[..., tuple[Float[Array, " samples"], Float[Array, " samples"]]]
+
+
+@in_float64
+def fisher_information(
+    predict: Predict, x: Float[np.ndarray, " n"], *args: Any, clip: float = np.inf
+) -> Float[np.ndarray, "n n"]:
+    """Information on ``x`` in independent samples, expected over the noise.
+
+    Args:
+        predict: pure JAX function at module scope; ``predict(x, *args)`` gives mean and variance of each sample.
+        x: parameters.
+        clip: samples at or above this value tell only that they are so.
+    """
+    (mean, variance), (mean_slope, variance_slope) = (
+        tuple(np.asarray(part, dtype=np.float64) for part in pair) for pair in _linearised(predict)(x, args)
+    )
+    sigma = np.sqrt(variance)
+    # Scores are linear in (u, u^2) below the clipping, u = (y - mean) / sigma.
+    by_mean, by_sigma = mean_slope / sigma[:, None], 0.5 * variance_slope / variance[:, None]
+    own, cross, square = _clipped_moments((clip - mean) / sigma)
+    mixed = by_mean.T @ (by_sigma * cross[:, None])
+    return by_mean.T @ (by_mean * own[:, None]) + mixed + mixed.T + by_sigma.T @ (by_sigma * square[:, None])
+
+
+def cramer_rao(
+    information: Float[np.ndarray, "n n"], slopes: Float[np.ndarray, "quantities n"] | None = None
+) -> Float[np.ndarray, " quantities"]:
+    """Smallest standard deviation of unbiased estimates: of the parameters, or of quantities with these slopes.
+
+    Parameters of very different size are scaled before the inversion. What the data cannot tell at all is infinite.
+    """
+    root = np.sqrt(np.diag(information))
+    seen = root > 0
+    scale = np.where(seen, root, 1.0)
+    scaled = information[np.ix_(seen, seen)] / np.outer(root[seen], root[seen])
+    inverse = np.linalg.pinv(scaled, rcond=1e-13, hermitian=True)
+    directions = (np.eye(len(root)) if slopes is None else np.asarray(slopes, dtype=np.float64)) / scale
+    variance = np.einsum("qi,ij,qj->q", directions[:, seen], inverse, directions[:, seen])
+    lost = np.abs(directions[:, ~seen]).sum(axis=1) > 0
+    # A direction in the null space of the information comes back shortened from its projection.
+    kept = directions[:, seen] @ (inverse @ scaled)
+    lost |= np.linalg.norm(kept - directions[:, seen], axis=1) > 1e-6 * np.linalg.norm(directions, axis=1)
+    return np.where(lost, np.inf, np.sqrt(np.maximum(variance, 0.0)))
+
+
+@functools.lru_cache(maxsize=32)
+def _linearised(predict: Predict) -> Callable[..., tuple[tuple[Array, Array], tuple[Array, Array]]]:
+    @jax.jit
+    def both(x: Array, args: tuple[Any, ...]) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+        def at(values: Array) -> tuple[Array, Array]:
+            return predict(values, *args)
+
+        return at(jnp.asarray(x)), jax.jacfwd(at)(jnp.asarray(x))
+
+    return both
+
+
+def _clipped_moments(
+    z: Float[np.ndarray, " samples"],
+) -> tuple[Float[np.ndarray, " samples"], Float[np.ndarray, " samples"], Float[np.ndarray, " samples"]]:
+    """Of a unit normal clipped at ``z``: information (mean, mean), (mean, sigma) and (sigma, sigma)."""
+    z = np.clip(z, -30.0, 40.0)
+    density = np.exp(-0.5 * z**2) / np.sqrt(2 * np.pi)
+    below = ndtr(z)
+    # density / (1 - below), without 0 / 0 far above.
+    hazard = np.exp(-0.5 * z**2 - 0.5 * np.log(2 * np.pi) - log_ndtr(-z))
+    first = below - z * density + density * hazard
+    # Below: E[u (u^2 - 1)] = -density (z^2 + 1) over u < z; clipped: (z h) h (1 - below) = z density hazard.
+    cross = -density * (z**2 + 1) + z * density * hazard
+    square = 2 * below - density * (z**3 + z) + z**2 * density * hazard
+    return np.maximum(first, 0.0), cross, np.maximum(square, 0.0)
