@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import jax
 import numpy as np
 import pytest
 
+from udccal.errors import FitError
+from udccal.fitting import hdr
 from udccal.fitting.hdr import UNKNOWN_SIGMA, merge_bracket
+from udccal.fitting.hdr_likelihood import merge_block
 from udccal.models.noise import Noise
 
 NOISE = Noise(
@@ -72,3 +76,55 @@ def test_level_near_saturation_is_not_pulled_down() -> None:
     merge = merge_bracket(bracket(rate, EXPOSURES[:4], 5), EXPOSURES[:4], NOISE)
     z = (merge.rate_e_per_s - rate) / merge.sigma_e_per_s
     assert abs(z.mean()) < 0.1
+
+
+def test_colour_planes_and_one_row_are_pictures_too() -> None:
+    frames = bracket(1e4, EXPOSURES, 6, (8, 9))
+    whole = merge_bracket(np.stack([frames] * 3, axis=-1), EXPOSURES, NOISE)
+    row = merge_bracket(frames.reshape(7, 72), EXPOSURES, NOISE)
+    np.testing.assert_array_equal(whole.rate_e_per_s[..., 1].ravel(), row.rate_e_per_s)
+
+
+@pytest.mark.parametrize("times", [EXPOSURES[:3], -EXPOSURES, EXPOSURES * np.nan])
+def test_exposures_that_cannot_be_are_refused(times: np.ndarray) -> None:
+    with pytest.raises(FitError, match="positive exposure"):
+        merge_bracket(bracket(10.0, EXPOSURES, 7, (4, 4)), times, NOISE)
+
+
+def test_a_hit_is_left_out_and_listed() -> None:
+    rate = 2e3
+    frames = bracket(rate, EXPOSURES, 8, (30, 40))
+    frames[6, 3, 5] = 3000
+    frames[5, 10, 20] = 4095
+    merge = merge_bracket(frames, EXPOSURES, NOISE)
+    (found,) = merge.outliers
+    assert found.count == 2
+    assert set(found.places) == {"(3, 5)", "(10, 20)"}
+    for place in ((3, 5), (10, 20)):
+        assert abs(merge.rate_e_per_s[place] - rate) < 5 * merge.sigma_e_per_s[place]
+    assert merge.sigma_e_per_s[3, 5] > 1.5 * np.median(merge.sigma_e_per_s)
+
+
+def test_a_frame_of_other_light_is_left_out_and_listed() -> None:
+    rates = np.geomspace(1e2, 1e5, 4000).reshape(40, 100)
+    rng = np.random.default_rng(9)
+    light = np.where(np.arange(7)[:, None, None] == 3, 0.9, 1.0) * rates * EXPOSURES[:, None, None]
+    electrons = np.minimum(rng.poisson(light + 20.0 * EXPOSURES[:, None, None]), 10973)
+    frames = np.clip(np.rint(64.3 + 0.355 * (electrons + 4.5 * rng.standard_normal(light.shape))), 0, 4095)
+    merge = merge_bracket(frames.astype(np.uint16), EXPOSURES, NOISE)
+    assert [o.places for o in merge.outliers] == [("frame 3",)]
+    z = (merge.rate_e_per_s - rates) / merge.sigma_e_per_s
+    assert abs(z.mean()) < 0.06
+    assert z.std() == pytest.approx(1.0, abs=0.05)
+
+
+def test_single_precision_moves_no_rate_by_a_hundredth_of_its_sigma() -> None:
+    frames = np.concatenate([bracket(rate, EXPOSURES, 11, (20, 20)) for rate in (0.0, 30.0, 1e3, 1e5, 1e7)], axis=1)
+    merge = merge_bracket(frames, EXPOSURES, NOISE)
+    numbers = jax.tree.map(lambda n: np.float64(n), hdr._sensor_numbers(NOISE, float(EXPOSURES.max())))
+    with jax.enable_x64(True):
+        double = jax.tree.map(
+            np.asarray, merge_block(frames.reshape(7, -1), EXPOSURES / EXPOSURES.max(), numbers, None)
+        )
+    off = merge.rate_e_per_s.ravel() - double.rate / EXPOSURES.max()
+    assert np.abs(off / merge.sigma_e_per_s.ravel()).max() < 0.01
