@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from udccal.cli.options import ProfilePath, RigName, Seed, SessionFolder
+from udccal.cli.options import IterationLog, ProfilePath, RigName, Seed, SessionFolder
 from udccal.cli.output import Output
 from udccal.errors import CameraError
 
@@ -72,6 +72,7 @@ def calibrate(
     exchanged: Annotated[
         list[ExchangedPart] | None, typer.Option("--exchanged", help="What was exchanged since the session began.")
     ] = None,
+    log: IterationLog = None,
 ) -> None:
     """Capture every calibration step of a rig, then fit them. An interrupted session goes on where it stopped."""
     from udccal.cli.jobs.capture import capture
@@ -94,7 +95,7 @@ def calibrate(
     with opened as bench:
         parts = {Exchanged(part.value) for part in exchanged or ()}
         capture(output, description, bench, session, [t.value for t in term or TermChoice], parts)
-    fit_to_profile(output, session, profile)
+    fit_to_profile(output, session, profile, log)
 
 
 def _simulated(rig: RigDescription, seed: int) -> AbstractContextManager[CaptureBench]:

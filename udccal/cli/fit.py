@@ -7,15 +7,16 @@ from typing import Annotated
 
 import typer
 
-from udccal.cli.options import ProfilePath
+from udccal.cli.options import IterationLog, ProfilePath
 
 
 def fit(
     context: typer.Context,
     session: Annotated[Path, typer.Argument(help="Folder of a captured session.")],
     profile: ProfilePath,
+    log: IterationLog = None,
 ) -> None:
     """Fit all five terms of a captured session and write a profile with its report."""
     from udccal.cli.jobs.fit import fit_to_profile
 
-    fit_to_profile(context.obj, session, profile)
+    fit_to_profile(context.obj, session, profile, log)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
 import traceback
 from typing import Annotated
@@ -58,6 +59,8 @@ app.add_typer(profile_app, name="profile")
 
 def main(arguments: list[str] | None = None) -> None:
     """Run the command and leave with its exit status: 0, 1 for a known failure, 2 for wrong usage, 70 for a bug."""
+    # XLA's own log, before JAX is imported: what matters in it comes as an exception, too.
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     given = list(sys.argv[1:] if arguments is None else arguments)
     flags = [flag for flag in _GLOBAL_FLAGS if flag in given]
     rest = [word for word in given if word not in _GLOBAL_FLAGS]

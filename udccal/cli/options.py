@@ -13,6 +13,7 @@ ProfilePath = Annotated[Path, typer.Option("--profile", help="Folder of the prof
 FoundProfile = Annotated[Path, typer.Option("--profile", help="A profile's folder or zip file, or a rig's name.")]
 OutFolder = Annotated[Path, typer.Option("--out", help="Folder for what is written.")]
 Seed = Annotated[int, typer.Option("--seed", help="Which rig, of all that fit the description, is simulated.")]
+IterationLog = Annotated[Path | None, typer.Option("--log", help="Write every iteration of every solver to this file.")]
 PanelPicturePath = Annotated[
     Path | None, typer.Option("--panel-picture", help="8-bit RGB PNG that the panel showed; omit if not known.")
 ]

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
 from udccal.cli.output import Output, StageTime
+from udccal.compilation import compilation_clock, keep_compilations
 from udccal.displays.pictures import face_picture
-from udccal.errors import FitError
+from udccal.errors import FitError, UdccalError
 from udccal.fitting.calibrate import ORDER, Calibration, FitEffort, Foundation, fit_session
+from udccal.fitting.solvers import LOG
 from udccal.profiles.profile import build_profile
 from udccal.profiles.provenance import provenance_now
 from udccal.profiles.store import check_replaceable, write_profile
@@ -43,10 +48,11 @@ class FitSummary:
     report: Path
     terms: tuple[TermSummary, ...]
     times: tuple[StageTime, ...]
+    compilation_s: float
 
 
-def fit_to_profile(output: Output, session_path: Path, profile_path: Path) -> None:
-    """Fit a session, write the report and the profile, print the summary.
+def fit_to_profile(output: Output, session_path: Path, profile_path: Path, log: Path | None = None) -> None:
+    """Fit a session, write the report and the profile, print the summary; the solvers' iterations go to ``log``.
 
     Raises:
         SessionError: when the session is missing or damaged.
@@ -54,13 +60,16 @@ def fit_to_profile(output: Output, session_path: Path, profile_path: Path) -> No
         ProfileError: when something else stands where the profile is to go.
     """
     check_replaceable(profile_path)
+    keep_compilations()
+    clock = compilation_clock()
     session = Session.open(session_path)
     for change in session.manifest.changes:
         output.say(
             f"Careful: the {change.what} was exchanged during this session, from {change.before} to {change.after}. "
             "The fits take all steps for those of one."
         )
-    calibration = run_fits(output, session)
+    with _iterations_to(log):
+        calibration = run_fits(output, session)
     profile_path = profile_path.resolve()
     report = profile_path.with_name(f"{profile_path.name.removesuffix('.zip')}-report.html")
     with output.stage("report"):
@@ -73,8 +82,34 @@ def fit_to_profile(output: Output, session_path: Path, profile_path: Path) -> No
         store_profile(output, session, calibration, profile_path)
     except FitError as error:
         raise FitError(f"{error} No profile was written; the report {report} shows every term.") from error
+    output.say(f"Of all this, compilation (less in the next run): {clock.seconds:.1f} s")
     output.say(f"Profile: {profile_path}\nReport: {report}")
-    output.result(FitSummary(session_path, profile_path, report, summaries(calibration), tuple(output.times)))
+    terms, times = summaries(calibration), tuple(output.times)
+    output.result(FitSummary(session_path, profile_path, report, terms, times, clock.seconds))
+
+
+@contextmanager
+def _iterations_to(path: Path | None) -> Iterator[None]:
+    if path is None:
+        yield
+        return
+    try:
+        handler = logging.FileHandler(path, mode="w", encoding="utf-8")
+    except OSError as error:
+        raise UdccalError(
+            f"Expected to write the iterations to {path}, found that it cannot be written ({error.strerror}). "
+            "Give --log a file in a folder that can be written to."
+        ) from error
+    handler.setFormatter(logging.Formatter("%(relativeCreated)9.0f ms  %(message)s"))
+    level = LOG.level
+    LOG.addHandler(handler)
+    LOG.setLevel(logging.DEBUG)
+    try:
+        yield
+    finally:
+        LOG.setLevel(level)
+        LOG.removeHandler(handler)
+        handler.close()
 
 
 def run_fits(

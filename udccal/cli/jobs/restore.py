@@ -12,6 +12,7 @@ from jaxtyping import UInt16
 from udccal.cameras.picture_files.mosaics import read_raw
 from udccal.cli.jobs.panel_picture import read_panel_picture
 from udccal.cli.output import Output
+from udccal.compilation import keep_compilations
 from udccal.errors import RestorationError
 from udccal.io.png import read_png16
 from udccal.profiles.store import find_profile, read_profile
@@ -54,6 +55,7 @@ def restore_files(
         FileFormatError: when an image or the panel's picture cannot be read.
         RestorationError: when an image does not fit the profile's rig, or its exposure is not known.
     """
+    keep_compilations()
     profile = read_profile(find_profile(profile_path))
     shown = None if panel_picture is None else read_panel_picture(panel_picture, profile.rig)
     targets = _targets(images, out, picture_format)

@@ -1,0 +1,66 @@
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from udccal.compilation import FOLDER_VARIABLE, compilation_clock, compilation_folder
+
+# Compiles for longer than what is not worth keeping.
+_PROGRAM = """
+import jax, jax.numpy as jnp
+from udccal.compilation import compilation_clock, keep_compilations
+keep_compilations()
+clock = compilation_clock()
+def work(x):
+    for k in range(150):
+        x = jnp.sin(x @ x + k)
+    return x
+jax.jit(work)(jnp.ones((8, 8))).block_until_ready()
+print(clock.seconds)
+"""
+
+
+def _run(folder: Path) -> float:
+    environment = {**os.environ, FOLDER_VARIABLE: str(folder), "TF_CPP_MIN_LOG_LEVEL": "3"}
+    done = subprocess.run(
+        [sys.executable, "-c", _PROGRAM], env=environment, capture_output=True, text=True, check=True, timeout=120
+    )
+    return float(done.stdout)
+
+
+def _kept(folder: Path) -> list[Path]:
+    return [path for path in folder.rglob("*-cache") if path.is_file()]
+
+
+def test_the_second_run_reads_what_the_first_compiled(tmp_path: Path) -> None:
+    first = _run(tmp_path)
+    kept = {path: path.stat().st_size for path in _kept(tmp_path)}
+    assert first > 0.1
+    assert kept
+    _run(tmp_path)
+    assert {path: path.stat().st_size for path in _kept(tmp_path)} == kept
+
+
+def test_a_folder_that_others_may_write_is_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(FOLDER_VARIABLE, str(tmp_path))
+    folder = compilation_folder()
+    folder.mkdir(parents=True)
+    folder.chmod(0o777)
+    _run(tmp_path)
+    assert not _kept(tmp_path)
+
+
+def test_processors_have_folders_of_their_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(FOLDER_VARIABLE, str(tmp_path))
+    here = compilation_folder()
+    monkeypatch.setattr("udccal.compilation._processor", lambda: b"another one")
+    assert compilation_folder() != here
+    assert compilation_folder().parent == here.parent == tmp_path
+
+
+def test_there_is_one_clock() -> None:
+    assert compilation_clock() is compilation_clock()
