@@ -71,6 +71,14 @@ class Outliers:
 
 
 @dataclass(frozen=True)
+class ResidualSample:
+    """Some of a fit's residuals, evenly drawn: where on the sensor they lie, and their size in units of their sigma."""
+
+    positions_px: Float[np.ndarray, "n 2"]
+    z: Float[np.ndarray, " n"]
+
+
+@dataclass(frozen=True)
 class FitResult(Generic[Term]):
     """A fitted term and the evidence for it.
 
@@ -88,6 +96,7 @@ class FitResult(Generic[Term]):
     diagnostics: tuple[Diagnostic, ...] = ()
     notes: tuple[str, ...] = field(default=())
     outliers: tuple[Outliers, ...] = ()
+    residuals: ResidualSample | None = None
 
     @property
     def ok(self) -> bool:

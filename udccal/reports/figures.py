@@ -42,14 +42,15 @@ def _uri(png: bytes) -> str:
     return "data:image/png;base64," + base64.b64encode(png).decode("ascii")
 
 
-def _figure(columns: int, width: float, height: float) -> tuple[Figure, list[Axes]]:
+def row_of_axes(columns: int, width: float, height: float) -> tuple[Figure, list[Axes]]:
+    """A figure of ``columns`` panels side by side, in inches."""
     figure = Figure(figsize=(width, height), dpi=_DPI, layout="constrained")
     return figure, [figure.add_subplot(1, columns, i + 1) for i in range(columns)]
 
 
 def photon_transfer_figure(points: PhotonTransfer) -> Figure:
     """Photon transfer: the slope is the gain K."""
-    figure, (axes,) = _figure(1, 6.0, 3.6)
+    figure, (axes,) = row_of_axes(1, 6.0, 3.6)
     for channel, (name, colour) in enumerate(zip(_NAMES, _COLOURS, strict=True)):
         mean, variance = points.mean_DN[:, channel], points.variance_DN2[:, channel]
         axes.loglog(mean, variance, "o", ms=4.5, color=colour, label=name, alpha=0.8)
@@ -66,7 +67,7 @@ def photon_transfer_figure(points: PhotonTransfer) -> Figure:
 
 def board_figure(evidence: BoardEvidence, columns: int, rows: int) -> Figure:
     """Where the boards' corners lay on the sensor, and what the fit leaves of them."""
-    figure, (coverage, residuals) = _figure(2, 6.8, 3.1)
+    figure, (coverage, residuals) = row_of_axes(2, 6.8, 3.1)
     coverage.plot(evidence.corners_px[:, 0], evidence.corners_px[:, 1], ".", ms=3, color=_COLOURS[2])
     coverage.set(xlim=(0, columns), ylim=(rows, 0), xlabel="x [px]", ylabel="y [px]", aspect="equal")
     coverage.set_title("corners found on the sensor", fontsize=9)
@@ -84,12 +85,12 @@ def wire_figure(fitted: TermMaps, true: TermMaps | None) -> Figure:
     shown = [("fitted", 100.0 * ripple(fitted.wire))]
     if true is not None:
         shown += [("truth", 100.0 * ripple(true.wire)), ("fitted − truth", 100.0 * (fitted.wire / true.wire - 1.0))]
-    figure, axes = _figure(len(shown), 4.1 * len(shown), 3.1)
+    figure, axes = row_of_axes(len(shown), 4.1 * len(shown), 3.1)
     reach = float(np.percentile(np.abs(shown[0][1]), 99.5)) or 1.0
     for index, (axis, (title, values)) in enumerate(zip(axes, shown, strict=True)):
         limit = reach if index < 2 else float(np.percentile(np.abs(values), 99.5)) or 1.0
         image = axis.imshow(values, cmap="gray" if index < 2 else "RdBu_r", vmin=-limit, vmax=limit, aspect="equal")
-        _bare(axis, title)
+        bare(axis, title)
         figure.colorbar(image, ax=axis, shrink=0.75, label="%")
     return figure
 
@@ -105,7 +106,7 @@ def psf_figure(fitted: TermMaps, true: TermMaps | None) -> Figure:
             axis = figure.add_subplot(len(rows), places, r * places + p + 1)
             axis.imshow(_log_colour(_middle_rows(kernels[p], ky)), interpolation="nearest")
             x, y = fitted.positions_px[p]
-            _bare(axis, f"{name}, at ({x:.0f}, {y:.0f})")
+            bare(axis, f"{name}, at ({x:.0f}, {y:.0f})")
     return figure
 
 
@@ -126,31 +127,32 @@ def backscatter_figure(fitted: TermMaps, true: TermMaps | None, cfa_step: int = 
     shown = [("fitted", fitted.backscatter[site])]
     if true is not None:
         shown += [("truth", true.backscatter[site]), ("fitted − truth", (fitted.backscatter - true.backscatter)[site])]
-    figure, axes = _figure(1 + len(shown), 3.6 * (1 + len(shown)), 2.7)
+    figure, axes = row_of_axes(1 + len(shown), 3.6 * (1 + len(shown)), 2.7)
     left, top, right, bottom = fitted.seen_px
     axes[0].imshow(fitted.picture[top : bottom + 1, left : right + 1])
-    _bare(axes[0], "part of the panel in view")
+    bare(axes[0], "part of the panel in view")
     reach = max(float(np.max(shown[0][1])), 1e-9)
     for index, (axis, (title, values)) in enumerate(zip(axes[1:], shown, strict=True)):
         limit = reach if index < 2 else float(np.percentile(np.abs(values), 99.5)) or 1.0
         image = axis.imshow(
             values, cmap="magma" if index < 2 else "RdBu_r", vmin=0.0 if index < 2 else -limit, vmax=limit
         )
-        _bare(axis, title)
+        bare(axis, title)
         figure.colorbar(image, ax=axis, shrink=0.75, label="e⁻/s")
     return figure
 
 
 def difference_figure(difference: Float[np.ndarray, "rows columns"], title: str) -> Figure:
     """Absolute difference of display-encoded values, on a scale to 0.1."""
-    figure, (axis,) = _figure(1, 6.0, 3.5)
+    figure, (axis,) = row_of_axes(1, 6.0, 3.5)
     image = axis.imshow(difference, cmap="inferno", vmin=0.0, vmax=0.1)
-    _bare(axis, title)
+    bare(axis, title)
     figure.colorbar(image, ax=axis, shrink=0.8, label="display value")
     return figure
 
 
-def _bare(axis: Axes, title: str) -> None:
+def bare(axis: Axes, title: str) -> None:
+    """A picture's panel: a title, no ticks."""
     axis.set_title(title, fontsize=9)
     axis.set_xticks([])
     axis.set_yticks([])

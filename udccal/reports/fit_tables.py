@@ -25,3 +25,9 @@ def candidates_table(title: str, result: FitResult) -> Table:
         (c.name, str(c.parameters), f"{c.criterion:.1f}", "chosen" if c.chosen else "") for c in result.candidates
     )
     return Table(title, ("tried", "parameters", "criterion", ""), rows, frozenset({1, 2}))
+
+
+def outliers_table(title: str, result: FitResult) -> Table:
+    """What was left out, by which rule, and where the first of it lies."""
+    rows = tuple((o.rule, str(o.count), ", ".join(o.places)) for o in result.outliers)
+    return Table(title, ("rule", "count", "first places"), rows, frozenset({1}))

@@ -8,17 +8,27 @@ from matplotlib.figure import Figure
 
 from udccal.fitting.calibrate import ORDER, Calibration
 from udccal.fitting.result import FitResult, FitStatus
-from udccal.reports import figures
+from udccal.reports import figures, fit_figures
 from udccal.reports.board_views import BoardEvidence
 from udccal.reports.evidence import PhotonTransfer
-from udccal.reports.fit_tables import candidates_table, diagnostics_table, estimates_table
+from udccal.reports.fit_figures import TradeCurve
+from udccal.reports.fit_tables import candidates_table, diagnostics_table, estimates_table, outliers_table
 from udccal.reports.maps import TermMaps
 from udccal.reports.page import Illustration, TermSection
+from udccal.reports.residuals import residual_histogram, residual_map
 from udccal.reports.tables import number, spread
 from udccal.reports.truth import TruthRow
 from udccal.sessions.schema import TermName
 
 _LONGEST_LIST = 14
+
+
+@dataclass(frozen=True)
+class TermTrade:
+    """How sure one term would be with more or fewer captures."""
+
+    term: TermName
+    curves: tuple[TradeCurve, ...]
 
 
 @dataclass(frozen=True)
@@ -31,6 +41,7 @@ class Evidence:
     rows: tuple[TruthRow, ...]
     transfer: PhotonTransfer | None
     boards: BoardEvidence | None
+    trades: tuple[TermTrade, ...] = ()
 
 
 _EXPLANATIONS: dict[TermName, str] = {
@@ -49,12 +60,14 @@ def sections(evidence: Evidence) -> tuple[TermSection, ...]:
 
 def _section(term: TermName, evidence: Evidence) -> TermSection:
     result = evidence.calibration.result(term)
-    shown = () if result.status is FitStatus.ABSENT else _illustrations(term, evidence)
+    shown = () if result.status is FitStatus.ABSENT else (*_illustrations(term, evidence), *_quality(term, evidence))
     estimates = estimates_table("Fitted", result)
     long = len(estimates.rows) > _LONGEST_LIST
     details = [diagnostics_table("The fit itself", result)]
     if result.candidates:
         details.append(candidates_table("Orders tried (lower is better)", result))
+    if result.outliers:
+        details.append(outliers_table("Left out", result))
     if long:
         details.append(estimates)
     return TermSection(
@@ -85,6 +98,25 @@ def _finding(term: TermName, result: FitResult, rows: tuple[TruthRow, ...]) -> s
 def _illustrations(term: TermName, evidence: Evidence) -> tuple[Illustration, ...]:
     draw = {"noise": _noise, "geometry": _geometry, "wire": _wire, "psf": _psf, "backscatter": _backscatter}
     return draw[term](evidence)
+
+
+def _quality(term: TermName, evidence: Evidence) -> tuple[Illustration, ...]:
+    """What the fit left over, and what more captures would bring."""
+    drawn: list[Illustration] = []
+    camera, sample = evidence.calibration.rig.camera, evidence.calibration.result(term).residuals
+    if sample is not None and len(sample.z):
+        cells, histogram = residual_map(sample, camera.columns, camera.rows), residual_histogram(sample)
+        caption = (
+            "What the fit left over. Left: a model that fits leaves no large patches of one colour (grey: no data). "
+            "Right: bars that follow the line are noise alone; wider ones are structure that the model lacks."
+        )
+        drawn += _illustration(fit_figures.residual_figure(cells, histogram), caption, f"residuals of {term}")
+    for trade in evidence.trades:
+        if trade.term == term:
+            caption = "How sure the result is against how much is captured. Where a curve is flat, more brings nothing."
+            figure = fit_figures.trade_figure(trade.curves)
+            drawn += _illustration(figure, caption, f"accuracy of {term} against captures")
+    return tuple(drawn)
 
 
 def _illustration(figure: Figure, caption: str, alt: str) -> tuple[Illustration, ...]:
