@@ -1,0 +1,138 @@
+"""`make peers`: udccal and its peers on the same works with known truth, in one run. Puts the table into docs/peers.md.
+
+The peers run in environments of their own, made by the works' setup.sh; one after another, since timings side by side
+are worthless. A peer that cannot run here is a line that says why.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import subprocess
+import sys
+import tempfile
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+from tests.benchmarks.peers.lines import Line, tables
+from tests.benchmarks.readme_tables import between
+
+_ROOT = Path(__file__).resolve().parents[3]
+_PAGE = _ROOT / "docs" / "peers.md"
+_LIMIT_S = 1800
+_SYSTEM_PYTHON = "/usr/bin/python3"
+
+
+@dataclass(frozen=True)
+class Peer:
+    """One script of a peer; ``environment`` of setup.sh, None for the system's Python (Debian packages)."""
+
+    work: str
+    environment: str | None
+    script: str
+
+
+PEERS = (
+    Peer("noise", "classic", "noise_floor.py --eff"),
+    Peer("noise", "classic", "noise_floor.py --nonlin"),
+    Peer("noise", "emva", "noise_emva1288.py"),
+    Peer("noise", "emva", "noise_emva1288.py --nonlin"),
+    Peer("hdr", "classic", "hdr_floor.py"),
+    Peer("hdr", "hdr", "hdr_hdrutils.py"),
+    Peer("hdr", "classic", "hdr_opencv.py"),
+    Peer("hdr", "chdri", "hdr_colourhdri.py"),
+    Peer("psf_field", "classic", "psf_field_baselines.py"),
+    Peer("psf_field", "piff", "psf_field_piff.py 4"),
+    Peer("psf_field", "regpsf", "psf_field_regularizepsf.py 128"),
+    Peer("psf_field", "jaxstar", "psf_field_starred.py"),
+    Peer("intrinsics", "classic", "intrinsics_opencv.py"),
+    Peer("intrinsics", None, "intrinsics_mrcal.py"),
+)
+OURS = {
+    "noise": ("ours_noise", "ours_noise --variant nonlin"),
+    "hdr": ("ours_hdr",),
+    "psf_field": ("ours_psf_field",),
+    "intrinsics": ("ours_intrinsics",),
+}
+
+
+def main() -> None:
+    """Run ours and theirs; the results stay in a JSON-lines file, from which the table is made."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("works", nargs="*", default=list(OURS), choices=[[], *OURS], metavar="work")
+    parser.add_argument("--peers", type=Path, default=_ROOT.parent / "shared" / "peers", help="folder of works.py")
+    parser.add_argument("--environments", type=Path, default=Path(tempfile.gettempdir()) / "peers")
+    parser.add_argument("--ours-only", action="store_true", help="leave the peers' earlier results as they are")
+    parser.add_argument("--out", type=Path, default=Path("peers"), help="folder for results.jsonl")
+    options = parser.parse_args()
+    works = tuple(options.works) or tuple(OURS)
+    options.out.mkdir(parents=True, exist_ok=True)
+    environment = {
+        **os.environ,
+        "PEERS_VENVS": str(options.environments),
+        "PEERS_OUT": os.environ.get("PEERS_OUT", str(options.environments / "data")),
+    }
+    if not options.ours_only:
+        _set_up(options.peers, environment)
+    results = options.out / "results.jsonl"
+    kept = [line for line in _read(results) if not _measured_again(line, works, options.ours_only)]
+    for work in works:
+        for script in OURS[work]:
+            command = [sys.executable, "-m", *f"tests.benchmarks.peers.{script}".split(), "--peers", str(options.peers)]
+            kept += _run(work, f"udccal ({script})", command, _ROOT, environment)
+        for peer in PEERS if not options.ours_only else ():
+            if peer.work == work:
+                python = _python(peer, options.environments)
+                kept += _run(work, peer.script, [python, *peer.script.split()], options.peers, environment)
+        results.write_text("".join(line.text() + "\n" for line in kept), encoding="utf-8")
+    stamp = f"Measured {datetime.now(UTC):%Y-%m-%d}, all in one run." if not options.ours_only else ""
+    page = between(_PAGE.read_text(encoding="utf-8"), "peers", f"{stamp}\n\n{tables(kept)}")
+    _PAGE.write_text(page, encoding="utf-8")
+
+
+def _set_up(peers: Path, environment: dict[str, str]) -> None:
+    """Those of setup.sh's environments that the peers here need; each of its lines ``mk NAME ...`` makes one."""
+    needed = {peer.environment for peer in PEERS}
+    script = "\n".join(
+        line
+        for line in (peers / "setup.sh").read_text(encoding="utf-8").splitlines()
+        if not line.startswith("mk ") or line.split()[1] in needed
+    )
+    subprocess.run(["sh", "-c", script], cwd=peers, env=environment, check=False, timeout=_LIMIT_S)
+
+
+def _python(peer: Peer, environments: Path) -> str:
+    if peer.environment is None:
+        return _SYSTEM_PYTHON
+    return str(environments / f"venv_{peer.environment}" / "bin" / "python")
+
+
+def _read(path: Path) -> list[Line]:
+    if not path.is_file():
+        return []
+    return [Line.read(text) for text in path.read_text(encoding="utf-8").splitlines()]
+
+
+def _measured_again(line: Line, works: tuple[str, ...], ours_only: bool) -> bool:
+    return line.work in works and (not ours_only or line.peer.startswith("udccal"))
+
+
+def _run(work: str, name: str, command: list[str], folder: Path, environment: dict[str, str]) -> list[Line]:
+    try:
+        done = subprocess.run(
+            command, cwd=folder, env=environment, capture_output=True, text=True, timeout=_LIMIT_S, check=False
+        )
+    except (OSError, subprocess.TimeoutExpired) as error:
+        return [Line.failure(work, name, str(error))]
+    lines = [Line.read(text) for text in done.stdout.splitlines() if text.startswith("{")]
+    if lines:
+        print("\n".join(line.text() for line in lines), flush=True)
+        return lines
+    reason = (done.stderr.strip().splitlines() or ["no output"])[-1]
+    print(f"{name}: {reason}", flush=True)
+    return [Line.failure(work, name, reason[:160])]
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,38 @@
+from __future__ import annotations
+
+import pytest
+
+from tests.benchmarks.peers.lines import Line, tables
+
+_LINES = [
+    Line.read('{"work": "hdr", "peer": "udccal", "version": "1", "seconds": 0.2, "full": {"ratio": [1.01, 1.0]}}'),
+    Line.read('{"work": "noise", "peer": "a", "version": "2", "seconds": 3, "rel_err_rms": {"K": 0.0003}}'),
+    Line.failure("noise", "b", "no such file"),
+]
+
+
+def test_each_work_has_a_table_with_what_was_measured() -> None:
+    text = tables(_LINES)
+    assert text.index("### noise") < text.index("### hdr")
+    assert "| a 2 | 0.03 |" in text
+    assert "1.01, 1" in text
+
+
+def test_what_did_not_run_says_why() -> None:
+    assert "| b | did not run here: no such file |" in tables(_LINES)
+
+
+def test_missing_and_wrong_numbers_are_dashes() -> None:
+    line = Line.read('{"work": "noise", "peer": "a", "seconds": "fast", "ok": true}')
+    assert line.number("seconds") is None
+    assert line.number("ok") is None
+    assert line.number("rel_err_rms", "K") is None
+
+
+def test_lines_survive_being_written() -> None:
+    assert [Line.read(line.text()) for line in _LINES] == _LINES
+
+
+def test_a_line_without_a_work_is_refused() -> None:
+    with pytest.raises(KeyError):
+        Line.read('{"peer": "a"}')
