@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -68,3 +69,27 @@ def test_a_stored_profile_restores_a_frame(profile: Profile, tmp_path: Path) -> 
     # Without the picture, an even frame might be all backscatter: no more than the mask is taken away.
     unknown = restorer.restore(frame, exposure_s)
     np.testing.assert_allclose(unknown * exposure_s, scene_e, rtol=0.02)
+
+
+def test_absent_terms_cost_nothing(profile: Profile) -> None:
+    def absent(term: FitResult) -> FitResult:
+        return replace(term, status=FitStatus.ABSENT)
+
+    without = replace(
+        profile, wire=absent(profile.wire), psf=absent(profile.psf), backscatter=absent(profile.backscatter)
+    )
+    restorer = Restorer.from_profile(without, PlanOptions(grid_rows=2, grid_columns=2))
+    assert restorer.wire is None
+    assert restorer.deblurrers == ()
+    assert restorer.response is None
+    frame = np.full((profile.rig.camera.rows, profile.rig.camera.columns), 64 + round(0.355 * 2000), np.uint16)
+    np.testing.assert_allclose(restorer.restore(frame, 0.02) * 0.02, 2000.0, rtol=0.01)
+
+
+def test_the_shading_of_a_wire_that_is_not_there_stays(profile: Profile) -> None:
+    shaded = replace(
+        profile,
+        wire=replace(profile.wire, status=FitStatus.ABSENT),
+        wire_map=profile.wire_map * np.linspace(0.8, 1.2, profile.rig.camera.columns, dtype=np.float32),
+    )
+    assert Restorer.from_profile(shaded, PlanOptions(grid_rows=2, grid_columns=2)).wire is not None

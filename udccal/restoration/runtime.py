@@ -37,15 +37,16 @@ class Restorer:
 
     Attributes:
         rig: the rig. noise: its noise term. view: what is delivered.
-        wire: map to divide by. mask: backscatter of a white panel in e-/s.
+        wire: map to divide by; None when it is 1 everywhere. mask: backscatter of a white panel in e-/s.
         response: the backscatter term for known panel pictures; None when the rig shows no backscatter.
-        deblurrers: one per channel. rectification: sensor to view. options: the choices made.
+        deblurrers: one per channel; none when the rig shows no blur. rectification: sensor to view.
+        options: the choices made.
     """
 
     rig: RigDescription
     noise: Noise
     view: VirtualView
-    wire: Mosaic
+    wire: Mosaic | None
     mask: Mosaic
     response: PanelResponse | None
     deblurrers: tuple[Deblurrer, ...]
@@ -63,15 +64,17 @@ class Restorer:
         rig, geometry = profile.rig, profile.geometry.term
         camera = rig.camera
         view = inscribed_view(geometry, camera.columns, camera.rows, rig.view.columns, rig.view.rows)
-        absent = profile.backscatter.status is FitStatus.ABSENT
+        unscattered = profile.backscatter.status is FitStatus.ABSENT
+        unblurred = profile.psf.status is FitStatus.ABSENT
+        even = profile.wire.status is FitStatus.ABSENT and bool(np.all(profile.wire_map == 1.0))
         return cls(
             rig=rig,
             noise=profile.noise.term,
             view=view,
-            wire=profile.wire_map,
+            wire=None if even else profile.wire_map,
             mask=mask_mosaic(profile.backscatter_mask, camera.cfa, camera.rows, camera.columns),
-            response=None if absent else prepared_response(profile.backscatter.term, rig),
-            deblurrers=build_deblurrers(kernel_grid(profile.psf.term, rig, options), rig, options),
+            response=None if unscattered else prepared_response(profile.backscatter.term, rig),
+            deblurrers=() if unblurred else build_deblurrers(kernel_grid(profile.psf.term, rig, options), rig, options),
             rectification=Rectification.of(geometry, view),
             options=options,
         )
@@ -93,12 +96,15 @@ class Restorer:
         """
         check_frame(mosaic, exposure_s, self.rig)
         check_panel_picture(panel_picture, self.rig)
-        signal = without_defects(to_electrons(mosaic, self.noise, exposure_s), self.noise) / self.wire
+        signal = without_defects(to_electrons(mosaic, self.noise, exposure_s), self.noise)
+        if self.wire is not None:
+            signal /= self.wire
         if self.response is not None:
             signal -= np.float32(exposure_s) * self._backscatter_rate(signal, exposure_s, panel_picture)
         clipped = saturated(mosaic, self.noise, self.options.saturation_margin)
-        blurred, valid = demosaic_clipped(signal, self.rig.camera.cfa, clipped)
-        sharp = self.deblur(blurred, valid, mean_variance_e2(mosaic, self.noise, exposure_s))
+        sharp, valid = demosaic_clipped(signal, self.rig.camera.cfa, clipped)
+        if self.deblurrers:
+            sharp = self.deblur(sharp, valid, mean_variance_e2(mosaic, self.noise, exposure_s))
         return self.rectification.apply(sharp) / np.float32(exposure_s)
 
     def before(self, mosaic: UInt16[np.ndarray, "frame_rows frame_columns"], exposure_s: float) -> Picture:
