@@ -5,8 +5,10 @@ BIN = $(VENV)/bin
 STAMP = $(VENV)/.installed
 DEMO_OUT ?= udccal-demo
 ACCURACY_OUT ?= accuracy
+EFFICIENCY_OUT ?= efficiency
+PEERS ?=
 
-.PHONY: install demo test test-slow test-usb fuzz load lint types contracts check accuracy tables clean
+.PHONY: install demo test test-slow test-usb fuzz load lint types contracts check accuracy tables efficiency extremes peers growth clean
 
 install: $(STAMP)
 
@@ -54,9 +56,26 @@ check: lint types contracts test
 accuracy: $(STAMP)
 	$(BIN)/python -m tests.benchmarks.accuracy --out $(ACCURACY_OUT)
 
+# Every fit against its Cramér–Rao bound, and its error bars against the truth. Writes efficiency.json and the table of
+# docs/numerics.md; non-zero exit where a figure is missed.
+efficiency: $(STAMP)
+	$(BIN)/python -m tests.benchmarks.efficiency.run --out $(EFFICIENCY_OUT)
+
+# Every fit at the ends of its range. Writes the table of docs/numerics.md; non-zero exit where one fails.
+extremes: $(STAMP)
+	$(BIN)/python -m tests.benchmarks.extremes.run
+
+# udccal and its peers on the same works. Writes the table of docs/peers.md. PEERS: folder of works.py.
+peers: $(STAMP)
+	$(BIN)/python -m tests.benchmarks.peers.run $(if $(PEERS),--peers $(PEERS))
+
+# Seconds and memory of every fit as its data double. Writes the table of docs/numerics.md.
+growth: $(STAMP)
+	$(BIN)/python -m tests.benchmarks.growth.run
+
 # Puts the measured tables into README.md.
 tables: $(STAMP)
 	$(BIN)/python -m tests.benchmarks.readme_tables --accuracy $(ACCURACY_OUT)
 
 clean:
-	rm -rf $(VENV) $(DEMO_OUT) $(ACCURACY_OUT) build dist *.egg-info
+	rm -rf $(VENV) $(DEMO_OUT) $(ACCURACY_OUT) $(EFFICIENCY_OUT) peers build dist *.egg-info

@@ -20,7 +20,7 @@ def between(text: str, marker: str, content: str) -> str:
     first, last = f"<!-- {marker} -->", f"<!-- /{marker} -->"
     start, end = text.find(first), text.find(last)
     if start < 0 or end < start:
-        raise ValueError(f"Expected the markers {first} and {last} in README.md, found them missing. Put them back.")
+        raise ValueError(f"Expected the markers {first} and {last} in the page, found them missing. Put them back.")
     return f"{text[: start + len(first)]}\n{content.strip()}\n{text[end:]}"
 
 

@@ -73,3 +73,9 @@ def test_restore_shared_scenes(toy_rig: Path, toy_data: Path, tmp_path: Path) ->
     said = run("examples/restore_shared_scenes.py", "--profile", profile, *scenes)
     assert "mean gain" in said
     assert len(list((tmp_path / "out").glob("*.png"))) == 4
+
+
+def test_merge_bracket_lists_the_flicker_and_the_hit() -> None:
+    said = run("examples/merge_bracket.py")
+    assert "frame 4" in said
+    assert "(20, 30)" in said

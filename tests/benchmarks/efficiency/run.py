@@ -9,8 +9,10 @@ import time
 from pathlib import Path
 
 from tests.benchmarks.efficiency.trials import Figure, figure, table, write_json
+from tests.benchmarks.readme_tables import between
 
 # Each module has ``trials(share) -> list[Trials]``; with share 1 it makes as many realisations as its figures need.
+_PAGE = Path(__file__).resolve().parents[3] / "docs" / "numerics.md"
 MODULES = ("noise", "hdr", "geometry", "wire", "psf", "psf_stamps", "backscatter")
 
 
@@ -32,6 +34,8 @@ def main() -> None:
         # Term by term: nothing is lost where a later one is stopped.
         write_json(figures, options.out / "efficiency.json")
         (options.out / "efficiency.md").write_text(table(figures) + "\n", encoding="utf-8")
+    if set(options.terms or MODULES) == set(MODULES) and options.share == 1.0:
+        _PAGE.write_text(between(_PAGE.read_text(encoding="utf-8"), "efficiency", table(figures)), encoding="utf-8")
     sys.exit(0 if all(f.ok for f in figures) else 1)
 
 
