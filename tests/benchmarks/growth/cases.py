@@ -1,0 +1,16 @@
+"""What is measured as data double: per term and knob, its sizes and the work."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Case:
+    """One knob of one term; ``prepare(size)`` makes the data and returns the work on them."""
+
+    term: str
+    knob: str
+    sizes: tuple[int, ...]
+    prepare: Callable[[int], Callable[[], object]]
