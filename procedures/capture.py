@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 from procedures.plans import Bracket, Plan, Singles, Stack
@@ -39,9 +40,8 @@ def take(
             return (average_frames(camera.frames, frames, FrameChecks(limits, camera.configure(settings))),)
         case Singles(frames):
             return _singles(camera, frames, FrameChecks(clipping, camera.configure(settings)), limits.black_DN)
-        case Bracket(frames, factor):
-            exposures = _bracket(exposure_s, frames, factor, longest_s)
-            return _exposures(camera, settings, exposures, clipping)
+        case Bracket():
+            return _exposures(camera, settings, plan.exposures_s(exposure_s, longest_s), clipping)
 
 
 def _singles(camera: Camera, count: int, checks: FrameChecks, black_DN: float) -> tuple[SingleFrame, ...]:
@@ -60,7 +60,7 @@ def _singles(camera: Camera, count: int, checks: FrameChecks, black_DN: float) -
 
 
 def _exposures(
-    camera: Camera, settings: Settings, exposures: list[float], limits: FrameLimits
+    camera: Camera, settings: Settings, exposures: Sequence[float], limits: FrameLimits
 ) -> tuple[SingleFrame, ...]:
     """One frame at each exposure, all of the same light; fewer where the camera has no longer ones, as with files."""
     taken: list[SingleFrame] = []
@@ -89,11 +89,3 @@ def _sentence(expected: str, checks: FrameChecks) -> str:
         f"Expected {expected}, found frames that had to be left out one after the other ({found}). "
         "Check the light, that nothing moves, and the camera's cable, then repeat the step."
     )
-
-
-def _bracket(first_s: float, frames: int, factor: float, longest_s: float) -> list[float]:
-    """Exposures that rise by ``factor``; the last is the camera's longest if the next step would pass it."""
-    exposures = [first_s]
-    while len(exposures) < frames and exposures[-1] < longest_s:
-        exposures.append(min(exposures[-1] * factor, longest_s))
-    return exposures

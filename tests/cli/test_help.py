@@ -8,7 +8,18 @@ import sys
 
 import pytest
 
-VERBS = ([], ["demo"], ["doctor"], ["calibrate"], ["fit"], ["restore"], ["simulate"], ["profile"], ["profile", "show"])
+VERBS = (
+    [],
+    ["demo"],
+    ["doctor"],
+    ["calibrate"],
+    ["fit"],
+    ["plan"],
+    ["restore"],
+    ["simulate"],
+    ["profile"],
+    ["profile", "show"],
+)
 # typer itself loads pydantic, which is quick
 HEAVY = ("jax", "numpy", "cv2", "matplotlib", "scipy", "equinox", "rawpy", "OpenEXR")
 LIMIT_S = 0.5

@@ -79,3 +79,16 @@ def test_merge_bracket_lists_the_flicker_and_the_hit() -> None:
     said = run("examples/merge_bracket.py")
     assert "frame 4" in said
     assert "(20, 30)" in said
+
+
+def test_noise_from_arrays() -> None:
+    assert "CONVERGED" in run("examples/noise_from_arrays.py")
+
+
+def test_array_calibration_says_how_sure_it_is() -> None:
+    assert "px" in run("examples/array_calibration.py")
+
+
+@pytest.mark.slow
+def test_psf_from_stamps() -> None:
+    assert "CONVERGED" in run("examples/psf_from_stamps.py")

@@ -13,7 +13,7 @@ from udccal.cameras.protocol import CameraIdentity, Region, Settings
 from udccal.cfa import channel_map
 from udccal.displays.pictures import face_picture
 from udccal.fitting.backscatter import fit_backscatter, fit_shots
-from udccal.fitting.backscatter_data import Binned, PanelShots, bin_rate, grid_step, visible_crop
+from udccal.fitting.backscatter_data import Binned, Bins, PanelShots, block_weights, grid_step, visible_crop
 from udccal.fitting.noise import nominal_noise
 from udccal.fitting.nominal import nominal_geometry
 from udccal.fitting.result import FitResult, FitStatus
@@ -82,12 +82,20 @@ def shots(simulator) -> PanelShots:  # type: ignore[no-untyped-def]
     rng = np.random.default_rng(1)
     crop = visible_crop(known_geometry(), RIG)
 
-    def binned(shown: np.ndarray) -> Binned:
-        rate, variance = noisy(simulator.rate(shown), rng)
-        return bin_rate(rate, variance, 0.0, RIG.camera.cfa, grid_step(RIG))
+    def binned(light: np.ndarray) -> Binned:
+        rate, _ = noisy(light, rng)
+        bins, one = Bins(RIG.camera.cfa, grid_step(RIG)), np.ones_like(rate)
+        mean = bins.mean(rate)
+        shot, rest = bins.variance(one / EXPOSURE_S / FRAMES), bins.variance(one * 25.0 / FRAMES / EXPOSURE_S**2)
+        return Binned(mean, shot, rest, np.zeros(mean.shape, dtype=bool), EXPOSURE_S)
 
     return PanelShots(
-        binned(WHITE), tuple(binned(one) for one in SHOWN), np.stack([crop.of(one) for one in SHOWN]), crop
+        white=binned(simulator.rate(WHITE)),
+        dark=binned(np.zeros((RIG.camera.rows, RIG.camera.columns))),
+        seen=tuple(binned(simulator.rate(one)) for one in SHOWN),
+        shown=np.stack([crop.of(one) for one in SHOWN]),
+        crop=crop,
+        names=tuple(f"picture_{seed}" for seed in range(len(SHOWN))),
     )
 
 
@@ -130,33 +138,45 @@ def test_what_the_simulator_was_built_with_is_found(fitted: FitResult[Backscatte
     assert all(e.sigma >= 0 for e in fitted.estimates)
 
 
-def test_candidates_compete_on_held_out_pictures(fitted: FitResult[Backscatter]) -> None:
+def test_the_candidate_of_the_largest_evidence_is_chosen(fitted: FitResult[Backscatter]) -> None:
     assert sum(c.chosen for c in fitted.candidates) == 1
     chosen = next(c for c in fitted.candidates if c.chosen)
-    assert chosen.criterion <= 1.05 * min(c.criterion for c in fitted.candidates)
+    assert chosen.criterion == min(c.criterion for c in fitted.candidates)
     held_out = next(d for d in fitted.diagnostics if d.name == "held_out_rms_of_peak")
-    assert held_out.value == chosen.criterion < 0.02
+    assert 0 < held_out.value < 0.02
+
+
+def test_what_the_model_leaves_out_counts_as_noise(fitted: FitResult[Backscatter]) -> None:
+    """The simulator is not of the model's class: its chi2 is explained by an error that is stated."""
+    share = next(d.value for d in fitted.diagnostics if d.name == "model_error_of_white")
+    assert 1e-4 < share < 0.01
+    assert fitted.chi2_dof == pytest.approx(1.0, abs=0.15)
+    assert any("counts as noise" in note for note in fitted.notes)
 
 
 def test_a_clipped_white_is_saturated(shots: PanelShots) -> None:
-    result = fit_shots(replace(shots, white=replace(shots.white, clipped=0.3)), known_geometry(), RIG)
+    clipped = np.random.default_rng(0).random(shots.white.clipped.shape) < 0.3
+    result = fit_shots(replace(shots, white=replace(shots.white, clipped=clipped)), known_geometry(), RIG)
     assert result.status is FitStatus.SATURATED
     assert rate(result.term, WHITE).max() == 0.0
 
 
 def test_a_black_panel_is_absent(shots: PanelShots) -> None:
-    dark = replace(shots.white, rate=np.random.default_rng(0).normal(size=shots.white.rate.shape))
-    dark = replace(dark, variance=np.ones_like(dark.rate))
-    result = fit_shots(replace(shots, white=dark), known_geometry(), RIG)
-    assert result.status is FitStatus.ABSENT
+    """In each of 100 captures, and it costs nothing later."""
+    rng = np.random.default_rng(0)
+    for _ in range(100):
+        sigma = np.sqrt(shots.white.rest)
+        dark = [replace(shots.white, rate=sigma * rng.normal(size=sigma.shape)) for _ in range(2)]
+        result = fit_shots(replace(shots, white=dark[0], dark=dark[1]), known_geometry(), RIG)
+        assert result.status is FitStatus.ABSENT
     assert result.ok
     assert rate(result.term, WHITE).max() == 0.0
 
 
 def test_few_pictures_are_too_few(shots: PanelShots) -> None:
-    few = replace(shots, seen=shots.seen[:3], shown=shots.shown[:3])
+    few = replace(shots, seen=shots.seen[:3], shown=shots.shown[:3], names=shots.names[:3])
     assert fit_shots(few, known_geometry(), RIG).status is FitStatus.TOO_FEW_DATA
-    clipped = tuple(replace(one, clipped=0.5) for one in shots.seen)
+    clipped = tuple(replace(one, clipped=np.ones_like(one.clipped)) for one in shots.seen)
     assert "clipped" in fit_shots(replace(shots, seen=clipped), known_geometry(), RIG).notes[0]
 
 
@@ -169,10 +189,25 @@ def test_pictures_in_the_wrong_order_are_a_poor_fit(shots: PanelShots) -> None:
 def test_bins_are_means_of_one_colour() -> None:
     rows, columns, step = 24, 32, 4
     channels = channel_map("GBRG", rows, columns)
-    mosaic = np.array([10.0, 20.0, 30.0])[channels]
-    binned = bin_rate(mosaic, np.ones_like(mosaic), 0.0, "GBRG", step)
-    np.testing.assert_allclose(binned.rate, np.broadcast_to([[[10.0]], [[20.0]], [[30.0]]], (3, 6, 8)))
-    np.testing.assert_allclose(binned.variance[:, 0, 0], [1 / 4, 1 / 8, 1 / 4])
+    bins = Bins("GBRG", step)
+    mean = bins.mean(np.array([10.0, 20.0, 30.0])[channels])
+    np.testing.assert_allclose(mean, np.broadcast_to([[[10.0]], [[20.0]], [[30.0]]], (3, 6, 8)))
+    rng = np.random.default_rng(0)
+    many = np.stack([bins.mean(rng.normal(size=(rows, columns))) for _ in range(3000)])
+    np.testing.assert_allclose(bins.variance(np.ones((rows, columns))), many.var(axis=0), rtol=0.2)
+    rowwise = np.stack([bins.mean(np.repeat(rng.normal(size=(rows, 1)), columns, axis=1)) for _ in range(3000)])
+    np.testing.assert_allclose(bins.row_variance(np.ones((rows, columns))), rowwise.var(axis=0), rtol=0.2)
+
+
+@pytest.mark.parametrize("cfa", ["RGGB", "BGGR", "GRBG", "GBRG"])
+def test_every_colour_of_a_bin_is_of_its_centre(cfa: str) -> None:
+    """A slanted plane: the mean of a block's own samples alone would be half a pixel off in red and blue."""
+    y, x = np.mgrid[0:24, 0:32].astype(float)
+    mean = Bins(cfa, 4).mean(2 * x + 3 * y)
+    centres_x, centres_y = 4 * np.arange(8) + 1.5, 4 * np.arange(6) + 1.5
+    wanted = 2 * centres_x + 3 * centres_y[:, None]
+    np.testing.assert_allclose(mean[:, 1:-1, 1:-1], np.broadcast_to(wanted, (3, 6, 8))[:, 1:-1, 1:-1], atol=1e-9)
+    np.testing.assert_allclose(block_weights(12, 6, 4, 0).sum(axis=1), 1.0)
 
 
 @pytest.mark.parametrize("name", ["lg55-aca2040", "lg55-reduced", "mk31-imx1600"])

@@ -10,9 +10,9 @@ import pytest
 from tests.fitting.boards import CAMERA, SIZE, SPEC, draw, pose, true_corners
 from udccal.cameras.protocol import CameraIdentity, Region, Settings
 from udccal.errors import FitError
-from udccal.fitting.bundle import CalibratedViews, calibrate_views
+from udccal.fitting.bundle import CalibratedViews, Prior, calibrate_views
 from udccal.fitting.corners import BoardCorners, board_points_mm
-from udccal.fitting.geometry import BoardView, fit_geometry, fit_views, projection_sigma_px
+from udccal.fitting.geometry import BoardView, fit_geometry, fit_views, projection_sigma_px, rig_prior
 from udccal.fitting.noise import nominal_noise
 from udccal.fitting.nominal import nominal_geometry
 from udccal.fitting.result import FitResult, FitStatus
@@ -112,6 +112,32 @@ def test_the_order_of_the_distortion_is_chosen_by_bic(fitted: FitResult[Geometry
     assert len(fitted.candidates) == 5
     assert chosen == [min(fitted.candidates, key=lambda c: c.criterion)]
     assert "p1" in chosen[0].name
+
+
+def test_the_outlier_is_in_the_list_and_residuals_are_in_sigma(fitted: FitResult[Geometry]) -> None:
+    assert "geometry/view_2 corner 7" in fitted.outliers[-1].places
+    assert fitted.residuals is not None
+    assert fitted.residuals.positions_px.shape == (len(fitted.residuals.z), 2)
+    assert 0.7 < fitted.residuals.z.std() < 1.1  # the fit itself takes up a part
+
+
+def test_one_board_on_the_jig_tells_the_tilt_when_the_lens_is_known_beforehand() -> None:
+    sigma = np.array([5.0, 5.0, 3.0, 3.0, 0.03, 0.02, 1e-3, 1e-3, 0.01])
+    prior = Prior(np.array([300.0, 300.0, 160.0, 119.0, -0.08, 0.03, 0, 0, 0]), 1 / sigma**2)
+    assert fit_views(views()[:1], START, SIZE).status is FitStatus.TOO_FEW_DATA
+    result = fit_views(views()[:1], START, SIZE, prior)
+    assert result.status is FitStatus.CONVERGED
+    tilt = result.estimate("tilt_deg")
+    assert abs(tilt.value - TILT_DEG) < 4 * tilt.sigma
+    assert 0.1 < tilt.sigma < 1.5  # 3 px of the centre are 0.6 degrees
+
+
+def test_the_rig_says_what_its_lens_may_be() -> None:
+    rig = load_rig("lg55-reduced")
+    prior = rig_prior(rig)
+    assert prior.mean[0] == pytest.approx(rig.focal_px)
+    assert prior.precision[0] ** -0.5 == pytest.approx(rig.focal_px * 0.1 / 6.0)
+    assert (prior.precision > 0).all()
 
 
 def test_boards_never_found_are_too_few_data() -> None:

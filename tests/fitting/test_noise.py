@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from udccal.cameras.protocol import Region
-from udccal.fitting import nonuniformity, photon_transfer, read_noise
-from udccal.fitting.noise import NoiseData, converter_step, fit_noise_data, nominal_noise
+from udccal.fitting import noise_moments, nonuniformity, read_noise
+from udccal.fitting.noise import converter_step, fit_noise_data, nominal_noise
+from udccal.fitting.noise_data import NoiseData
 from udccal.fitting.result import FitResult, FitStatus
 from udccal.models.noise import Noise
 from udccal.rig import RigDescription, load_rig
@@ -26,7 +27,7 @@ def toy(name: str, seed: int) -> tuple[RigDescription, Sensor]:
     return rig, Sensor(draw_truth(rig, seed))
 
 
-def reduced(sensor: Sensor, levels: np.ndarray, seed: int) -> NoiseData:
+def reduced(sensor: Sensor, levels: np.ndarray, seed: int, stack_level: float | None = None) -> NoiseData:
     """Frames as the noise procedure takes them; ``levels`` are fractions of the full well."""
     rng = np.random.default_rng(seed)
     region = Region(0, 0, COLUMNS, ROWS)
@@ -39,22 +40,29 @@ def reduced(sensor: Sensor, levels: np.ndarray, seed: int) -> NoiseData:
     for t in 0.02 * levels:
         # The lamp flickers by half a per cent.
         pair = [sensor.expose(light * (1 + 0.005 * rng.standard_normal()), t, region, rng) for _ in range(2)]
-        flats.append(photon_transfer.bin_pair(pair[0], pair[1], float(t)))
+        flats.append(noise_moments.reduce_pair(pair[0], pair[1], float(t)))
+    top = 2**sensor.truth.bits - 1
     for t in (0.0005, 0.002, 0.01, 0.02, 0.25, 1.0):
         pair = [sensor.expose(none, t, region, rng) for _ in range(2)]
-        darks.append(read_noise.dark_pair(pair[0], pair[1], t))
-        rows.append(nonuniformity.row_moments(pair[0], pair[1]))
-    middle = 0.02 * float(levels[len(levels) // 2])
+        darks.append(read_noise.dark_pair(pair[0], pair[1], t, 1, top))
+        rows.append(noise_moments.reduce_pair(pair[0], pair[1], t).rows)
+    middle = 0.02 * float(levels[len(levels) // 2] if stack_level is None else stack_level)
     return NoiseData(
         darks=tuple(darks),
-        rows=tuple(rows),
+        dark_rows=tuple(rows),
         flats=tuple(flats),
-        flat_stack=np.mean([sensor.expose(light, middle, region, rng) for _ in range(STACK)], axis=0),
-        dark_stack=np.mean([sensor.expose(none, middle, region, rng) for _ in range(STACK)], axis=0),
-        flat_frames=STACK,
-        dark_frames=STACK,
+        flat_stack=average(sensor, light, middle, region, rng),
+        dark_stack=average(sensor, none, middle, region, rng),
         q_DN=1,
+        top_DN=float(top),
     )
+
+
+def average(
+    sensor: Sensor, light: np.ndarray, exposure_s: float, region: Region, rng: np.random.Generator
+) -> noise_moments.StackMoments:
+    frames = [sensor.expose(light, exposure_s, region, rng) for _ in range(STACK)]
+    return noise_moments.StackMoments(exposure_s, np.mean(frames, axis=0).astype(np.float32), STACK)
 
 
 @pytest.fixture(scope="module", params=["lg55-aca2040", "mk31-imx1600"])
@@ -69,7 +77,7 @@ def test_recovers_what_the_rig_needs(fitted: tuple[Sensor, FitResult[Noise]]) ->
     assert term.K_DN_per_e == pytest.approx(truth.K_DN_per_e, rel=0.01)
     assert term.sigma_d_e == pytest.approx(sensor.sigma_d_e, rel=0.03)
     assert pytest.approx(truth.PRNU1288, rel=0.05) == term.PRNU1288
-    assert term.saturation_DN == pytest.approx(sensor.saturation_DN, abs=1.5)
+    assert term.saturation_DN == pytest.approx(sensor.saturation_DN, abs=0.5)
     assert term.sigma_row_DN == pytest.approx(truth.sigma_row_DN, rel=0.15)
 
 
@@ -79,8 +87,10 @@ def test_errors_are_as_large_as_claimed(fitted: tuple[Sensor, FitResult[Noise]])
     expected = {
         "K_DN_per_e": truth.K_DN_per_e,
         "black_DN": truth.black_DN,
+        "saturation_DN": sensor.saturation_DN,
         "sigma_d_e": sensor.sigma_d_e,
         "lambda_read": truth.lambda_read,
+        "sigma_row_DN": truth.sigma_row_DN,
         "dark_current_e_per_s": truth.dark_current_e_per_s,
         "DSNU1288_e": truth.DSNU1288_e,
         "PRNU1288": truth.PRNU1288,
@@ -88,6 +98,17 @@ def test_errors_are_as_large_as_claimed(fitted: tuple[Sensor, FitResult[Noise]])
     z = {name: (result.estimate(name).value - value) / result.estimate(name).sigma for name, value in expected.items()}
     assert max(abs(v) for v in z.values()) < 4.5, z
     assert 0.5 < result.chi2_dof < 2.0
+
+
+def test_every_term_of_the_sensor_is_found_and_no_other(fitted: tuple[Sensor, FitResult[Noise]]) -> None:
+    chosen = {candidate.name for candidate in fitted[1].candidates if candidate.chosen}
+    assert {"with row noise", "with dark current", "with DSNU", "with PRNU"} <= chosen
+    # The lamp flickers, the sensor is straight.
+    assert "response: linear, unsteady light" in chosen
+
+
+def test_hot_pixels_are_listed(fitted: tuple[Sensor, FitResult[Noise]]) -> None:
+    assert any("hot" in outliers.rule for outliers in fitted[1].outliers)
 
 
 def test_no_light_is_too_dark() -> None:
@@ -101,6 +122,13 @@ def test_clipped_flats_are_saturated() -> None:
     rig, sensor = toy("lg55-aca2040", 1)
     result = fit_noise_data(reduced(sensor, np.linspace(3.0, 4.0, 6), 1), nominal_noise(rig))
     assert result.status is FitStatus.SATURATED
+
+
+def test_a_clipped_stack_is_saturated() -> None:
+    rig, sensor = toy("lg55-aca2040", 1)
+    result = fit_noise_data(reduced(sensor, np.linspace(0.05, 1.6, 10), 1, stack_level=3.0), nominal_noise(rig))
+    assert result.status is FitStatus.SATURATED
+    assert "flat stack" in result.notes[0]
 
 
 def test_two_levels_are_too_few() -> None:
@@ -123,7 +151,7 @@ def test_pairs_of_one_frame_twice_are_a_poor_fit() -> None:
     twice = []
     for t in 0.02 * np.linspace(0.05, 0.6, 8):
         frame = sensor.expose(light, float(t), Region(0, 0, COLUMNS, ROWS), np.random.default_rng(0))
-        twice.append(photon_transfer.bin_pair(frame, frame, float(t)))
+        twice.append(noise_moments.reduce_pair(frame, frame, float(t)))
     result = fit_noise_data(replace(data, flats=tuple(twice)), nominal_noise(rig))
     assert result.status is FitStatus.POOR_FIT
     assert "copies of each other" in result.notes[0]
@@ -136,25 +164,61 @@ def test_rounding_coarser_than_the_noise(fraction: float) -> None:
     offset = 24 + fraction + spread * rng.standard_normal((400, 400))
     frames = [np.rint(offset + sigma * rng.standard_normal((400, 400))).astype(np.uint16) for _ in range(2)]
     pair = read_noise.dark_pair(frames[0], frames[1], 0.01)
-    fit = read_noise.fit_dark(
-        (pair, read_noise.DarkPair(0.02, pair.edges_DN, pair.counts, 0, 400)), read_noise.Surroundings(0.06, 0.0)
-    )
-    assert fit.values[2] == pytest.approx(sigma, rel=0.03)
+    fit = read_noise.fit_dark((pair, replace(pair, exposure_s=0.02)), read_noise.Surroundings(0.06, 0.0))
+    assert np.sqrt(fit.values[2]) == pytest.approx(sigma, rel=0.03)
     # What the textbook's white quantisation makes of the same frames is worse than what is asked for.
     naive = 0.5 * np.var(frames[0].astype(float) - frames[1]) - 1 / 12
     if fraction == 0.0:
         assert abs(np.sqrt(max(naive, 0.0)) / sigma - 1) > 0.1
 
 
+def test_codes_cut_off_at_zero_are_censored() -> None:
+    rng = np.random.default_rng(8)
+    black, sigma = 0.3, 2.0
+    frames = [np.clip(np.rint(black + sigma * rng.standard_normal((300, 400))), 0, None) for _ in range(4)]
+    pairs = tuple(
+        read_noise.dark_pair(frames[i].astype(np.uint16), frames[i + 1].astype(np.uint16), 0.01 * (i + 1))
+        for i in (0, 2)
+    )
+    assert pairs[0].edges_DN[0] == -np.inf
+    fit = read_noise.fit_dark(pairs, read_noise.Surroundings(0.3, 0.0), normal=True)
+    assert fit.values[0] == pytest.approx(black, abs=0.05)
+    assert np.sqrt(fit.values[2]) == pytest.approx(sigma, rel=0.02)
+    # Moments of the cut-off codes are far away.
+    assert frames[0].std() < 0.75 * sigma
+
+
+def test_a_wide_window_of_codes_is_grouped_and_loses_nothing() -> None:
+    rng = np.random.default_rng(9)
+    frames = [np.rint(2000 + 200 * rng.standard_normal((200, 300))).astype(np.uint16) for _ in range(2)]
+    frames[0][0, 0] = 3  # far below the window
+    pair = read_noise.dark_pair(frames[0], frames[1], 0.01)
+    assert pair.counts.shape[0] <= 161
+    assert pair.outside >= 1
+    assert pair.counts.sum() + pair.outside == frames[0].size
+    assert np.sqrt(read_noise.start_values((pair,))[2]) == pytest.approx(200, rel=0.02)
+
+
 def test_hot_pixels_do_not_carry_the_prnu() -> None:
     rng = np.random.default_rng(2)
     signal = 1000 * (1 + 0.005 * rng.standard_normal((200, 300)))
-    clean = nonuniformity.prnu(signal, np.zeros_like(signal))
+    clean = nonuniformity.prnu(signal, 0.0, 0.0)
     signal[rng.random(signal.shape) < 1e-3] *= 3
-    hot = nonuniformity.prnu(signal, np.zeros_like(signal))
-    assert clean.value == pytest.approx(0.005, rel=0.03)
-    assert hot.value == pytest.approx(0.005, rel=0.03)
+    hot = nonuniformity.prnu(signal, 0.0, 0.0)
+    assert np.sqrt(clean.variance) == pytest.approx(0.005, rel=0.03)
+    assert np.sqrt(hot.variance) == pytest.approx(0.005, rel=0.03)
     assert hot.outliers > clean.outliers
+    assert hot.places
+
+
+def test_shading_and_waves_do_not_carry_the_prnu() -> None:
+    rng = np.random.default_rng(3)
+    y, x = np.mgrid[:240, :320]
+    light = (1 - 0.3 * ((x / 320 - 0.5) ** 2 + (y / 240 - 0.5) ** 2)) * (1 + 0.02 * np.cos(2 * np.pi * y / 40))
+    signal = 1000 * light * (1 + 0.005 * rng.standard_normal(light.shape))
+    found = nonuniformity.prnu(signal, 0.0, 0.0)
+    assert np.sqrt(found.variance) == pytest.approx(0.005, rel=0.02)
+    assert np.std(signal) / 1000 > 0.02
 
 
 def test_counts_hot_pixels_and_converter_steps() -> None:

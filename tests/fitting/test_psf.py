@@ -21,7 +21,7 @@ from udccal.fitting.psf_shots import Shots, cut_crop, group, stack
 from udccal.fitting.psf_start import start_model, wire_shows
 from udccal.fitting.result import FitResult, FitStatus
 from udccal.fitting.wire_harmonics import wire_start
-from udccal.fitting.wire_phase import ideal_wire
+from udccal.fitting.wire_scan import ideal_wire
 from udccal.models.geometry import Geometry
 from udccal.models.psf import PsfField, psf_kernels
 from udccal.models.wire import Wire
@@ -37,7 +37,7 @@ from udccal.simulation.truth import RigTruth, draw_truth
 
 HALF = (20, 10)
 MIDDLE = np.array([16, 26])
-TOY = Effort(positions=5, shifts=2, half_px=HALF, close_px=(16, 8), iterations=6)
+TOY = Effort(positions=5, shifts=2, half_px=HALF, close_px=(16, 8), iterations=25)
 FLUX = 1e8 * np.array([0.7, 1.0, 0.6])
 
 
@@ -135,7 +135,15 @@ def test_a_grating_is_predicted_where_it_was_not_captured(grating: Fitted) -> No
     assert grating.result.estimate("row_open_fraction").value == pytest.approx(0.3917, abs=0.004)
     assert all(estimate.sigma > 0 for estimate in grating.result.estimates)
     assert grating.result.cov.shape == (6, 6)
-    assert sum(candidate.chosen for candidate in grating.result.candidates) == 1
+    # One of the wire's phase, one of the residual's orders.
+    assert [c.chosen for c in grating.result.candidates][:2] == [True, False]
+    assert sum(candidate.chosen for candidate in grating.result.candidates) == 2
+    numbers = {d.name: d.value for d in grating.result.diagnostics}
+    # The model has the lowest terms of the interference only: its strength is about 1, and far from 0.
+    assert numbers["wire_phase_strength"] == pytest.approx(1.0, abs=0.4)
+    assert 0.0 < numbers["efficiency"] <= 1.05
+    assert 0.0 <= numbers["residual_pattern_p"] <= 1.0
+    assert grating.result.chi2_dof == pytest.approx(1.0, abs=0.15)
 
 
 def streak(source: np.ndarray, middle: np.ndarray, disc_px: float, rig: RigDescription) -> np.ndarray:

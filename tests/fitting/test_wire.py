@@ -12,7 +12,7 @@ import pytest
 from udccal.cameras.protocol import CameraIdentity, Region, Settings
 from udccal.fitting.noise import nominal_noise
 from udccal.fitting.result import FitResult, FitStatus
-from udccal.fitting.wire import fit_wire, fit_wire_map
+from udccal.fitting.wire import WireFit, fit_wire, fit_wire_and_sigma, fit_wire_map, sensor_map
 from udccal.fitting.wire_harmonics import WireStart, wire_start
 from udccal.fitting.wire_select import select
 from udccal.models.geometry import Geometry
@@ -76,9 +76,14 @@ def flat_of(truth: np.ndarray, seed: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.fixture(scope="module")
-def fitted(bench: Bench) -> FitResult[Wire]:
+def both(bench: Bench) -> WireFit:
     signal, variance = flat_of(bench.truth, 1)
-    return fit_wire_map(signal, variance, bench.geometry, bench.start, PRNU)
+    return fit_wire_and_sigma(signal, variance, bench.geometry, bench.start, PRNU)
+
+
+@pytest.fixture(scope="module")
+def fitted(both: WireFit) -> FitResult[Wire]:
+    return both.result
 
 
 def test_map_is_better_than_the_average_it_came_from(bench: Bench, fitted: FitResult[Wire]) -> None:
@@ -98,9 +103,28 @@ def test_shape_errors_are_as_large_as_claimed(bench: Bench, fitted: FitResult[Wi
     assert any(c.chosen for c in fitted.candidates)
 
 
-def test_hot_pixels_are_left_out_and_counted(fitted: FitResult[Wire]) -> None:
+def test_hot_pixels_are_left_out_and_listed(bench: Bench, fitted: FitResult[Wire]) -> None:
     left_out = next(d.value for d in fitted.diagnostics if d.name == "pixels_left_out")
-    assert 1 <= left_out <= 30
+    signal, _ = flat_of(bench.truth, 1)
+    local = signal / (2000.0 * bench.truth * np.tile([[0.7, 1.0], [1.0, 0.6]], (ROWS // 2, COLUMNS // 2)))
+    hot = {f"({y}, {x})" for y, x in np.argwhere(local > 1.2)}
+    (outliers,) = fitted.outliers
+    assert outliers.count == left_out
+    assert hot
+    assert hot <= set(outliers.places)
+    assert "robust sigma" in outliers.rule
+
+
+def test_the_maps_sigma_covers_the_truth(bench: Bench, both: WireFit) -> None:
+    assert both.sigma is not None
+    found = sensor_map(both.result.term, ROWS, COLUMNS)
+    y, x = np.divmod(np.random.default_rng(3).choice(found.size, 1000, replace=False), COLUMNS)
+    sigma = both.sigma.at(np.stack([x, y], axis=-1).astype(np.float64))
+    error = (found - bench.truth)[y, x]
+    assert np.mean(np.abs(error) < 1.96 * sigma) >= 0.85
+    # And it is no idle bound.
+    assert np.sqrt(np.mean(error**2)) > 0.4 * np.sqrt(np.mean(sigma**2))
+    assert sigma.max() < 2e-3
 
 
 def test_no_panel_is_absent(bench: Bench) -> None:

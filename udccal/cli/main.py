@@ -16,6 +16,7 @@ from udccal.cli.demo import demo
 from udccal.cli.doctor import doctor
 from udccal.cli.fit import fit
 from udccal.cli.output import Output
+from udccal.cli.plan import plan
 from udccal.cli.profile import profile_app
 from udccal.cli.restore import restore
 from udccal.cli.simulate import simulate
@@ -52,7 +53,7 @@ def globals_(
     context.obj = Output(as_json=as_json, debug=debug)
 
 
-for _verb in (demo, doctor, calibrate, fit, restore, simulate):
+for _verb in (demo, doctor, plan, calibrate, fit, restore, simulate):
     app.command(no_args_is_help=_verb not in (demo, doctor))(_verb)
 app.add_typer(profile_app, name="profile")
 

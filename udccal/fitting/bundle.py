@@ -6,45 +6,68 @@ Array functions only: corners from a ChArUco board through a panel and from a ch
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
-import cv2
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
 
 from udccal.errors import FitError
-from udccal.fitting.result import Candidate
-from udccal.fitting.solvers import Solution, least_squares
-from udccal.models.arrays import Arrayish
-from udccal.models.geometry import Geometry, project, rotation_matrix
-from udccal.numerics import in_float64
-
-# Distortion orders, simplest first: which of (k1, k2, p1, p2, k3) are free.
-ORDERS = (
-    ("no distortion", (0, 0, 0, 0, 0)),
-    ("k1", (1, 0, 0, 0, 0)),
-    ("k1 k2", (1, 1, 0, 0, 0)),
-    ("k1 k2 p1 p2", (1, 1, 1, 1, 0)),
-    ("k1 k2 p1 p2 k3", (1, 1, 1, 1, 1)),
+from udccal.fitting.bundle_evidence import Evidence, weigh
+from udccal.fitting.bundle_noise import (
+    OUTLIER_RULE,
+    STRANGE_RULE,
+    Scatter,
+    covariance,
+    leverages,
+    maximum_likelihood,
+    strange_views,
 )
-INTRINSIC_NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
-# Corners further from the model than this many robust sigma of their view are left out, then all is refit.
-OUTLIER_SIGMA = 5.0
-_MAX_OUTLIER_ROUNDS = 4
-_MIN_VIEWS = 3
-_MIN_POINTS = 6
-# A corner's own sigma says little about what the saddle leaves out; this is added to it in quadrature.
-_SIGMA_FLOOR_PX = 0.04
+from udccal.fitting.bundle_orders import INTRINSIC_NAMES, ORDERS, Ordered, choose_order, free_intrinsics, settle
+from udccal.fitting.bundle_points import MIN_POINTS, Gathered, Points, gather
+from udccal.fitting.bundle_projection import Gauge, projection_covariance
+from udccal.fitting.bundle_solve import NO_PRIOR, Bundle, Prior, Solved, residuals_px, solve
+from udccal.fitting.bundle_start import facing, starts
+from udccal.fitting.result import Candidate, FitStatus, Outliers
+from udccal.models.geometry import Geometry
+
+__all__ = ["INTRINSIC_NAMES", "ORDERS", "CalibratedViews", "Gauge", "Prior", "calibrate_views"]
+
+# Without a prior, fewer views do not tell a lens; with one, a single view tells at least its pose.
+MIN_VIEWS = 3
+# A focal length or centre less certain than this (of the focal length, of the picture's width) counts as not told:
+# beyond it the model is not linear over a sigma, and an error bar would not be true.
+MOST_UNCERTAIN = 0.05
+_MOST_PLACES = 20
+# A view that scatters this many times as much as the median view is worth a sentence.
+_SCATTERS_MORE = 3.0
 
 
 @dataclass(frozen=True)
 class CalibratedViews:
-    """Intrinsics and poses; ``cov`` is of (fx, fy, cx, cy, k1, k2, p1, p2, k3, then 6 per view), scaled by residuals.
+    """Intrinsics and poses with their uncertainty, and the evidence for them.
 
     A pose takes board coordinates to camera coordinates: rotation vector (rad), then translation (board's unit).
-    ``used`` and ``residuals_px`` follow the points of all views one after another; ``view`` says whose they are.
+
+    Attributes:
+        focal, centre: (fx, fy) and (cx, cy) in px.
+        distortion: (k1, k2, p1, p2, k3); 0 where the data do not ask for it.
+        poses: of the views in use.
+        cov: of (fx, fy, cx, cy, k1, k2, p1, p2, k3, then 6 per view in use). The scale of the noise is estimated,
+            and where the views disagree beyond it, what they disagree by is added.
+        points_px: the finite points of all views in use one after another. residuals_px: projected minus these.
+        view: whose points they are, counted over the views in use. index: their place in their view as given.
+        used: which are not outliers.
+        names: the views in use, by their place in what was given.
+        sigma_px: of each point, as estimated: the sigma given times the scale of its scatter.
+        free: which intrinsics were fitted.
+        chi2_dof: scatter over the sigma given, squared; 1 where none was given.
+        candidates: the orders of the distortion, by BIC.
+        evidence: tests of the model.
+        status: ``CONVERGED``, or why not to use this; ``notes`` say what to do.
+        outliers: points left out.
+        iterations: of the last solve with all distortions free.
+        starts_agreeing: how many of the starts led to this minimum.
+        image_size: (columns, rows).
     """
 
     focal: Float[np.ndarray, "2"]
@@ -52,42 +75,49 @@ class CalibratedViews:
     distortion: Float[np.ndarray, "5"]
     poses: Float[np.ndarray, "views 6"]
     cov: Float[np.ndarray, "n n"]
+    points_px: Float[np.ndarray, "points 2"]
     residuals_px: Float[np.ndarray, "points 2"]
     view: Int[np.ndarray, " points"]
+    index: Int[np.ndarray, " points"]
     used: Bool[np.ndarray, " points"]
+    names: tuple[int, ...]
+    sigma_px: Float[np.ndarray, " points"]
     free: tuple[bool, ...]
     chi2_dof: float
     candidates: tuple[Candidate, ...]
+    evidence: Evidence
+    status: FitStatus
+    notes: tuple[str, ...]
+    outliers: tuple[Outliers, ...]
     iterations: int
-    converged: bool
+    starts_agreeing: int
+    image_size: tuple[int, int]
+
+    @property
+    def converged(self) -> bool:
+        """Whether this can be used."""
+        return self.status is FitStatus.CONVERGED
+
+    @property
+    def intrinsics(self) -> Float[np.ndarray, "9"]:
+        """In the order of ``INTRINSIC_NAMES``."""
+        return np.concatenate([self.focal, self.centre, self.distortion])
 
     @property
     def rms_px(self) -> float:
         """Root of the mean squared distance between seen and projected points, as OpenCV's calibrateCamera counts."""
         return float(np.sqrt((self.residuals_px[self.used] ** 2).sum(axis=1).mean()))
 
+    def projection_covariance(
+        self, pixels: Float[np.ndarray, "rays 2"], gauge: Gauge = Gauge.BOARDS
+    ) -> Float[np.ndarray, "rays 2 2"]:
+        """Covariance in px^2 of where the rays that the fit puts at these pixels land.
 
-@dataclass(frozen=True)
-class _Points:
-    board: Float[np.ndarray, "points 3"]
-    image: Float[np.ndarray, "points 2"]
-    sigma: Float[np.ndarray, " points"]
-    view: Int[np.ndarray, " points"]
-    used: Bool[np.ndarray, " points"]
-
-
-def _residuals(
-    x: Float[Array, " n"],
-    board: Float[Arrayish, "points 3"],
-    image: Float[Arrayish, "points 2"],
-    weight: Float[Arrayish, " points"],
-    view: Int[Arrayish, " points"],
-) -> Float[Array, " m"]:
-    camera = Geometry(x[:2], x[2:4], x[4:9], jnp.zeros(3), jnp.zeros(3))
-    poses = x[9:].reshape(-1, 6)
-    rotations = jax.vmap(rotation_matrix)(poses[:, :3])
-    points = jnp.einsum("nij,nj->ni", rotations[view], board) + poses[view, 3:]
-    return ((project(camera, points) - image) * jnp.asarray(weight)[:, None]).ravel()
+        A pattern that the residuals show beyond chance is an error of the model; its size is added.
+        """
+        bundle = Bundle(self.intrinsics, self.poses)
+        cov = projection_covariance(bundle, self.cov, self.image_size, np.asarray(pixels, dtype=np.float64), gauge)
+        return cov + self.evidence.pattern_px**2 * np.eye(2)
 
 
 def calibrate_views(
@@ -96,157 +126,162 @@ def calibrate_views(
     image_size: tuple[int, int],
     start: Geometry | None = None,
     sigmas: Sequence[Float[np.ndarray, " _"]] | None = None,
+    *,
+    prior: Prior | None = None,
+    start_poses: Float[np.ndarray, "views 6"] | None = None,
 ) -> CalibratedViews:
     """Calibrate a camera from views of flat boards.
 
     Args:
         object_points: per view, points on the board (z = 0) in any unit of length.
-        image_points: per view, the same points in px, (0, 0) the centre of the top-left pixel.
+        image_points: per view, the same points in px, (0, 0) the centre of the top-left pixel; NaN where not seen.
         image_size: (columns, rows).
-        start: intrinsics to start from; without it they come from the views' vanishing points (Zhang, 2000).
-        sigmas: per view, one sigma in px of each point; without it all points count alike.
+        start: intrinsics to start from. The views' vanishing points (Zhang, 2000) give another start in any case; the
+            lower minimum wins.
+        sigmas: per view, one sigma in px of each point, up to a common factor; without it all points count alike.
+        prior: what is known of the intrinsics beforehand; with it a single view may do.
+        start_poses: per view, a pose to start from, with ``start``.
 
     The order of the distortion is the one with the lowest BIC (Schwarz, 1978) on the points that remain after
-    outliers are left out. The covariance is scaled so that chi2 per degree of freedom is one.
+    outliers are left out.
 
     Raises:
-        FitError: with fewer than 3 views, or a view of fewer than 6 points.
+        FitError: with fewer than 3 usable views (1 with a prior), each of 6 finite points that are not on one line.
     """
-    _check(object_points, image_points)
-    points = _gather(object_points, image_points, sigmas)
-    origin = _start(object_points, image_points, image_size, start)
-    full, points = _solve_without_outliers(origin, points, ORDERS[-1][1])
-    solutions, scores = [], []
-    for name, free in ORDERS:
-        last = name == ORDERS[-1][0]
-        solution = full if last else _solve(_frozen(full.x, free), points, free)
-        parameters = 4 + sum(free) + 6 * len(object_points)
-        solutions.append(solution)
-        scores.append(Candidate(name, parameters, _bic(solution, points, parameters), chosen=False))
-    best = min(range(len(scores)), key=lambda k: scores[k].criterion)
-    scores[best] = replace(scores[best], chosen=True)
-    return _result(solutions[best], points, ORDERS[best][1], tuple(scores))
+    gathered = gather(object_points, image_points, sigmas)
+    wanted, known = (MIN_VIEWS, NO_PRIOR) if prior is None else (1, prior)
+    _check(gathered, len(object_points), wanted)
+    points, outliers = gathered.points, gathered.outliers
+    full, scattered, agree = _settled(points, image_size, start, start_poses, known)
+    strange = strange_views(scattered, points)
+    if strange.any() and (~strange).sum() >= wanted:
+        outliers = (*outliers, _whole_views(points, strange))
+        points = points.without(strange)
+        full, scattered, agree = _settled(points, image_size, start, start_poses, known)
+    every = free_intrinsics(ORDERS[-1][1])
+    full, scatter = maximum_likelihood(full, scattered, points, every, known)
+    ordered = choose_order(full, scatter.points, known)
+    finished, final, dof = _rescaled(ordered, scatter.points, known)
+    evidence = weigh(finished, final, ordered.free, image_size, dof)
+    cov = covariance(finished, ordered.free) * evidence.variance_factor
+    status, advice = _judge(finished, cov, image_size)
+    bundle = Bundle(finished.bundle.intrinsics, facing(finished.bundle.poses))
+    return CalibratedViews(
+        focal=bundle.intrinsics[:2],
+        centre=bundle.intrinsics[2:4],
+        distortion=bundle.intrinsics[4:],
+        poses=bundle.poses,
+        cov=cov,
+        points_px=final.image,
+        residuals_px=residuals_px(bundle, final),
+        view=final.view,
+        index=final.index,
+        used=final.used,
+        names=final.names,
+        sigma_px=final.sigma,
+        free=tuple(bool(one) for one in ordered.free),
+        chi2_dof=1.0 if sigmas is None else _scale2(final, points),
+        candidates=ordered.candidates,
+        evidence=evidence,
+        status=status,
+        notes=(*gathered.notes, *advice, *_remarks(scatter, evidence, ordered)),
+        outliers=(*outliers, *_listed(final)),
+        iterations=full.iterations,
+        starts_agreeing=agree,
+        image_size=image_size,
+    )
 
 
-def _check(object_points: Sequence[np.ndarray], image_points: Sequence[np.ndarray]) -> None:
-    counts = [min(len(a), len(b)) for a, b in zip(object_points, image_points, strict=True)]
-    if len(counts) < _MIN_VIEWS or min(counts) < _MIN_POINTS:
+def _settled(
+    points: Points,
+    image_size: tuple[int, int],
+    start: Geometry | None,
+    start_poses: Float[np.ndarray, "views 6"] | None,
+    prior: Prior,
+) -> tuple[Solved, Points, int]:
+    poses = None if start_poses is None else np.asarray(start_poses, dtype=np.float64)[list(points.names)]
+    return settle(starts(points, image_size, _vector(start), poses), points, prior)
+
+
+def _whole_views(points: Points, views: Bool[np.ndarray, " views"]) -> Outliers:
+    names = tuple(f"view {points.names[k]}" for k in np.flatnonzero(views))
+    return Outliers(STRANGE_RULE, int(views[points.view].sum()), names[:_MOST_PLACES])
+
+
+def _check(gathered: Gathered, given: int, wanted: int) -> None:
+    if len(gathered.points.names) < wanted:
         raise FitError(
-            f"Expected at least {_MIN_VIEWS} views of at least {_MIN_POINTS} points each, found {len(counts)} views "
-            f"with {', '.join(map(str, counts)) or 'no'} points. Capture more views of the board."
+            f"Expected at least {wanted} views of at least {MIN_POINTS} points each, found {given} views, "
+            f"{len(gathered.points.names)} of them usable. {' '.join(gathered.notes)} Capture more views of the board."
         )
 
 
-def _gather(board: Sequence[np.ndarray], image: Sequence[np.ndarray], sigmas: Sequence[np.ndarray] | None) -> _Points:
-    count = [len(p) for p in board]
-    own = np.concatenate(sigmas) if sigmas is not None else np.full(sum(count), 0.1)
-    return _Points(
-        board=np.concatenate(board).astype(np.float64),
-        image=np.concatenate(image).astype(np.float64),
-        sigma=np.hypot(own, _SIGMA_FLOOR_PX),
-        view=np.repeat(np.arange(len(board)), count),
-        used=np.ones(sum(count), dtype=bool),
-    )
-
-
-def _start(
-    board: Sequence[np.ndarray], image: Sequence[np.ndarray], size: tuple[int, int], start: Geometry | None
-) -> Float[np.ndarray, " n"]:
-    single = [np.ascontiguousarray(p, dtype=np.float32) for p in image]
-    flat = [np.ascontiguousarray(p, dtype=np.float32) for p in board]
+def _vector(start: Geometry | None) -> Float[np.ndarray, "9"] | None:
     if start is None:
-        matrix = cv2.initCameraMatrix2D(flat, single, size)
-        focal, centre = np.diag(matrix)[:2], matrix[:2, 2]
-        distortion = np.zeros(5)
-    else:
-        focal, centre = np.asarray(start.focal, dtype=np.float64), np.asarray(start.centre, dtype=np.float64)
-        distortion = np.asarray(start.distortion, dtype=np.float64)
-    matrix = np.array([[focal[0], 0, centre[0]], [0, focal[1], centre[1]], [0, 0, 1.0]])
-    poses = []
-    for points, pixels in zip(flat, single, strict=True):
-        _, rotation, translation = cv2.solvePnP(points, pixels, matrix, distortion)
-        poses.append(np.concatenate([rotation.ravel(), translation.ravel()]))
-    return np.concatenate([focal, centre, distortion, *poses]).astype(np.float64)
+        return None
+    parts = (start.focal, start.centre, start.distortion)
+    return np.concatenate([np.asarray(part, dtype=np.float64) for part in parts])
 
 
-def _frozen(x: Float[np.ndarray, " n"], free: tuple[int, ...]) -> Float[np.ndarray, " n"]:
-    held = x.copy()
-    held[4:9] *= np.array(free, dtype=np.float64)
-    return held
+def _rescaled(ordered: Ordered, points: Points, prior: Prior) -> tuple[Solved, Points, float]:
+    """The chosen order with the scale of its own residuals, and the degrees of freedom behind that."""
+    solved = ordered.solved
+    use = points.used
+    dof = float((2 - leverages(solved, points, ordered.free))[use].sum())
+    square = ((residuals_px(solved.bundle, points) / points.sigma[:, None])[use] ** 2).sum()
+    factor = max(np.sqrt(square / max(dof, 1.0)), 1e-6)
+    points = points.scaled(np.full(len(points.names), factor))
+    return solve(solved.bundle, points, ordered.free, prior), points, max(dof, 1.0)
 
 
-def _solve(start: Float[np.ndarray, " n"], points: _Points, free: tuple[int, ...]) -> Solution:
-    """A parameter that is held has no scale, so the solver cannot move it."""
-    views = (len(start) - 9) // 6
-    distance = np.abs(start[9:].reshape(-1, 6)[:, 5]).mean()
-    lens = np.array([1.0, 1.0, 1.0, 1.0]) * 1e-3 * start[0]
-    bend = np.array([1e-2, 1e-2, 1e-3, 1e-3, 1e-2]) * np.array(free)
-    pose = np.array([1e-3, 1e-3, 1e-3, 1e-3 * distance, 1e-3 * distance, 1e-3 * distance])
-    scale = np.concatenate([lens, bend, np.tile(pose, views)])
-    weight = points.used / points.sigma
-    return least_squares(
-        _residuals, start, scale, points.board, points.image, weight, points.view, max_iterations=30, tolerance=1e-8
-    )
+def _scale2(points: Points, given: Points) -> float:
+    return float(((points.sigma / given.sigma)[points.used] ** 2).mean())
 
 
-def _solve_without_outliers(
-    start: Float[np.ndarray, " n"], points: _Points, free: tuple[int, ...]
-) -> tuple[Solution, _Points]:
-    """Each view has its own scatter (blur, light, distance): sigma is scaled, and outliers are judged, view by view."""
-    solution = _solve(start, points, free)
-    own = points.sigma
-    for _ in range(_MAX_OUTLIER_ROUNDS):
-        offset = np.linalg.norm(_residuals_px(solution.x, points), axis=1)
-        sigma = own * _scatter(offset / own, points)[points.view]
-        used = offset <= OUTLIER_SIGMA * sigma
-        settled = (used == points.used).all() and np.allclose(sigma, points.sigma, rtol=0.1)
-        if settled:
-            break
-        points = replace(points, used=used, sigma=sigma)
-        solution = _solve(solution.x, points, free)
-    return solution, points
+def _judge(
+    solved: Solved, cov: Float[np.ndarray, "n n"], image_size: tuple[int, int]
+) -> tuple[FitStatus, tuple[str, ...]]:
+    """Whether the views tell the lens; else what to capture."""
+    sigma = np.sqrt(np.diag(cov))
+    by_focal = float((sigma[:2] / np.abs(solved.bundle.intrinsics[:2])).max())
+    by_centre = float(sigma[2:4].max() / image_size[0])
+    if by_focal > MOST_UNCERTAIN or by_centre > MOST_UNCERTAIN:
+        what = "focal length" if by_focal > by_centre else "centre of the picture"
+        return FitStatus.TOO_FEW_DATA, (
+            f"The views do not tell the {what} (one sigma is {min(max(by_focal, by_centre), 99.0):.0%}). "
+            "Lean the board by 20 to 40 degrees, another way in each view, and let it fill the picture.",
+        )
+    if not solved.converged:
+        return FitStatus.NOT_CONVERGED, ("Check that the points of each view are in the order of the board's.",)
+    return FitStatus.CONVERGED, ()
 
 
-def _scatter(offset: Float[np.ndarray, " points"], points: _Points) -> Float[np.ndarray, " views"]:
-    """Robust sigma per view: the length of a two-dimensional normal deviate has the median 1.1774 sigma."""
-    views = range(int(points.view.max()) + 1)
-    medians = [np.median(offset[(points.view == view) & points.used]) for view in views]
-    return np.maximum(np.array(medians) / 1.1774, 1e-6)
+def _remarks(scatter: Scatter, evidence: Evidence, ordered: Ordered) -> tuple[str, ...]:
+    notes = []
+    if ordered.by_prior:
+        notes.append(
+            "The views alone do not tell the whole lens: what is known beforehand stands for part of it, and every "
+            "distortion coefficient stays free within that. Lean the board another way in each view to know more."
+        )
+    relative = scatter.scales / np.median(scatter.scales)
+    loud = [f"{scatter.points.names[k]} ({relative[k]:.1f} x)" for k in np.flatnonzero(relative > _SCATTERS_MORE)]
+    if loud:
+        notes.append(f"Views that scatter more than the median view, and count for less: {', '.join(loud)}.")
+    if evidence.views.flagged:
+        notes.append(
+            f"The views disagree on the lens beyond their noise (ratio {evidence.views.ratio:.1f}, "
+            f"p = {evidence.views.p_value:.1g}): every variance is multiplied by that ratio. Is the board flat?"
+        )
+    if evidence.pattern.flagged:
+        notes.append(
+            f"The residuals follow a pattern over the picture (p = {evidence.pattern.p_value:.1g}, about "
+            f"{evidence.pattern_px:.3f} px): the lens bends rays in a way that no order has."
+        )
+    return tuple(notes)
 
 
-_compiled_residuals = jax.jit(_residuals)
-
-
-@in_float64
-def _residuals_px(x: Float[np.ndarray, " n"], points: _Points) -> Float[np.ndarray, "points 2"]:
-    flat = _compiled_residuals(x, points.board, points.image, np.ones(len(points.board)), points.view)
-    return np.asarray(flat, dtype=np.float64).reshape(-1, 2)
-
-
-def _bic(solution: Solution, points: _Points, parameters: int) -> float:
-    """n log(chi2 / n) + k log n: the noise is estimated, too."""
-    n = 2 * int(points.used.sum())
-    return float(n * np.log(max(solution.chi2, 1e-300) / n) + parameters * np.log(n))
-
-
-def _result(
-    solution: Solution, points: _Points, free: tuple[int, ...], candidates: tuple[Candidate, ...]
-) -> CalibratedViews:
-    parameters = next(c.parameters for c in candidates if c.chosen)
-    chi2_dof = solution.chi2 / max(2 * int(points.used.sum()) - parameters, 1)
-    x = solution.x
-    return CalibratedViews(
-        focal=x[:2],
-        centre=x[2:4],
-        distortion=x[4:9],
-        poses=x[9:].reshape(-1, 6),
-        cov=solution.cov * chi2_dof,
-        residuals_px=_residuals_px(x, points),
-        view=points.view,
-        used=points.used,
-        free=(True,) * 4 + tuple(bool(f) for f in free),
-        chi2_dof=float(chi2_dof),
-        candidates=candidates,
-        iterations=solution.iterations,
-        converged=solution.converged,
-    )
+def _listed(points: Points) -> tuple[Outliers, ...]:
+    out = np.flatnonzero(~points.used)
+    if not len(out):
+        return ()
+    return (Outliers(OUTLIER_RULE, len(out), tuple(points.place(int(k)) for k in out[:_MOST_PLACES])),)

@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from udccal.fitting.absent import absent_backscatter, absent_psf, absent_wire
 from udccal.fitting.backscatter import fit_backscatter
-from udccal.fitting.geometry import BoardView, fit_views, read_views
+from udccal.fitting.geometry import BoardView, fit_views, read_views, rig_prior
 from udccal.fitting.noise import fit_noise, nominal_noise
 from udccal.fitting.nominal import nominal_geometry
 from udccal.fitting.psf import Effort, fit_psf
@@ -52,7 +52,7 @@ class FitEffort:
 # For a demonstration.
 QUICK = FitEffort(
     wire_samples=60_000,
-    psf=Effort(positions=6, shifts=2, half_px=(36, 12), close_px=(32, 12), iterations=6),
+    psf=Effort(positions=6, shifts=2, half_px=(36, 12), close_px=(32, 12), iterations=12),
     backscatter_positions=32,
     workers=2,
 )
@@ -145,7 +145,8 @@ def fit_foundation(
 
     def geometry_of_boards() -> FitResult[Geometry]:
         boards.extend(read_views(session, noise.term))
-        return fit_views(boards, nominal_geometry(rig), (rig.camera.columns, rig.camera.rows))
+        size = (rig.camera.columns, rig.camera.rows)
+        return fit_views(boards, nominal_geometry(rig), size, rig_prior(rig))
 
     geometry = clock.run("geometry", geometry_of_boards, lambda: nominal_geometry(rig))
     wire = clock.run(

@@ -7,118 +7,110 @@ One view shows the board parallel to the panel. Its axes are then the panel's, s
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from scipy.spatial.transform import Rotation
 
-from udccal.arrangements import BoardSpec
-from udccal.fitting.bundle import INTRINSIC_NAMES, OUTLIER_SIGMA, CalibratedViews, calibrate_views
-from udccal.fitting.corners import MIN_CORNERS, BoardCorners, board_points_mm, detect_corners, luminance
+from udccal.errors import FitError
+from udccal.fitting.bundle import INTRINSIC_NAMES, MIN_VIEWS, CalibratedViews, Prior, calibrate_views
+from udccal.fitting.bundle_noise import OUTLIER_RULE
+from udccal.fitting.bundle_points import bucket
+from udccal.fitting.corners import MIN_CORNERS, board_points_mm
+from udccal.fitting.geometry_angles import ANGLE_NAMES, panel_rotation, with_angles
+from udccal.fitting.geometry_views import MAX_CLIPPED, BoardView, read_views
 from udccal.fitting.nominal import nominal_geometry
-from udccal.fitting.result import Diagnostic, Estimate, FitResult, FitStatus
-from udccal.models.arrays import Arrayish
-from udccal.models.geometry import (
-    Geometry,
-    mounting_rotation,
-    panel_directions,
-    project,
-    rotation_matrix,
-)
+from udccal.fitting.result import Diagnostic, Estimate, FitResult, FitStatus, Outliers, ResidualSample
+from udccal.models.geometry import Geometry, mounting_rotation, panel_directions, project
 from udccal.models.noise import Noise
 from udccal.numerics import in_float64
-from udccal.sessions.schema import BoardSubject, StoredStep
+from udccal.rig import RigDescription
 from udccal.sessions.store import Session
 
-_MIN_VIEWS = 3
-# A view with more of its samples than this at saturation has bloomed edges.
-_MAX_CLIPPED = 0.02
-_WORST_RMS_PX = 1.0
-ANGLE_NAMES = ("tilt_deg", "roll_deg", "yaw_deg")
+__all__ = ["BoardView", "fit_geometry", "fit_views", "projection_sigma_px", "read_views", "rig_prior"]
+
+_WORST_RMS_PX, _WORST_CHI2_DOF = 1.0, 9.0
+# A corner's own sigma says little about what the saddle leaves out; this is added to it in quadrature.
+_SIGMA_FLOOR_PX = 0.04
+# Lenses sit on their sensors' middles to about this part of the width (one sigma).
+_CENTRE_SIGMA = 0.01
+# (k1, k2, p1, p2, k3) of lenses that this model describes.
+_BEND_SIGMA = (0.2, 0.2, 1e-3, 1e-3, 0.1)
+_MOST_RESIDUALS = 2000
+_PATTERN = "residual_pattern"
 UNITS = ("px", "px", "px", "px", "1", "1", "1", "1", "1", "deg", "deg", "deg")
-
-
-@dataclass(frozen=True)
-class BoardView:
-    """The corners of one step's board."""
-
-    step_id: str
-    spec: BoardSpec
-    parallel: bool
-    corners: BoardCorners
-    clipped: float
-
-    @property
-    def usable(self) -> bool:
-        """Whether enough corners were found in an unclipped picture."""
-        return len(self.corners.ids) >= MIN_CORNERS and self.clipped <= _MAX_CLIPPED
 
 
 def fit_geometry(session: Session, noise: Noise) -> FitResult[Geometry]:
     """Fit the geometry term to the steps ``geometry/*`` of a session.
 
+    What the rig's description says of the lens is the prior: where the views do not tell the focal length, it stays
+    nominal with the sigma of its tolerance.
+
     Args:
-        session: holds views of a board, at least 3, and one of them ``parallel_to_panel``.
+        session: holds views of a board, one of them ``parallel_to_panel``.
         noise: gives the black level and saturation.
 
     Raises:
         SessionError: when a file is missing or damaged.
     """
-    camera = session.rig.camera
-    return fit_views(read_views(session, noise), nominal_geometry(session.rig), (camera.columns, camera.rows))
+    rig = session.rig
+    size = (rig.camera.columns, rig.camera.rows)
+    return fit_views(read_views(session, noise), nominal_geometry(rig), size, rig_prior(rig))
 
 
-def read_views(session: Session, noise: Noise) -> tuple[BoardView, ...]:
-    """The boards of all steps ``geometry/*``; arguments and errors as for ``fit_geometry``."""
-    steps = [step for step in session.steps("geometry") if isinstance(step.subject, BoardSubject)]
-    return tuple(_read_view(session, step, noise) for step in steps)
+def rig_prior(rig: RigDescription) -> Prior:
+    """What a rig's description says of its lens: the focal length by its tolerance, the rest as lenses commonly are."""
+    nominal = nominal_geometry(rig)
+    sigma = np.array([0.0, 0.0, 0.0, 0.0, *_BEND_SIGMA])
+    sigma[:2] = rig.focal_px * max(rig.lens.focal_mm.tolerance / rig.lens.focal_mm.value, 1e-4)
+    sigma[2:4] = _CENTRE_SIGMA * rig.camera.columns
+    return Prior(np.concatenate([nominal.focal, nominal.centre, nominal.distortion]), 1 / sigma**2)
 
 
-def _read_view(session: Session, step: StoredStep, noise: Noise) -> BoardView:
-    """Find the board in the first capture of a step (its average, or a single frame)."""
-    subject, capture = step.subject, step.captures[0]
-    if not isinstance(subject, BoardSubject):
-        raise TypeError(f"step {step.id} shows no board")
-    mean = session.frame(capture) if capture.kind == "frame" else session.average(capture).mean
-    spec = BoardSpec(subject.columns, subject.rows, subject.square_mm, subject.marker_mm, subject.dictionary)
-    corners = detect_corners(luminance(mean.astype(np.float64) - float(np.asarray(noise.black_DN))), spec)
-    shift = np.array([capture.region.x, capture.region.y], dtype=np.float64)
-    moved = BoardCorners(corners.ids, corners.xy + shift, corners.sigma)
-    clipped = float(np.mean(mean >= 0.995 * float(np.asarray(noise.saturation_DN))))
-    return BoardView(step.id, spec, subject.parallel_to_panel, moved, clipped)
+def fit_views(
+    views: Sequence[BoardView], nominal: Geometry, image_size: tuple[int, int], prior: Prior | None = None
+) -> FitResult[Geometry]:
+    """Fit the geometry term to boards already found.
 
-
-def fit_views(views: Sequence[BoardView], nominal: Geometry, image_size: tuple[int, int]) -> FitResult[Geometry]:
-    """Fit the geometry term to boards already found; ``image_size`` is (columns, rows)."""
+    Args:
+        views: boards, one of them parallel to the panel; at least 3 usable ones, or any number with a prior.
+        nominal: where to start; its pupil is kept.
+        image_size: (columns, rows).
+        prior: on the intrinsics, such as ``rig_prior`` gives.
+    """
     usable = [view for view in views if view.usable]
     notes = _notes(views)
-    parallel = [k for k, view in enumerate(usable) if view.parallel]
-    if len(usable) < _MIN_VIEWS or not parallel:
-        clipped = sum(view.clipped > _MAX_CLIPPED for view in views)
+    wanted = MIN_VIEWS if prior is None else 1
+    parallel = sum(view.parallel for view in usable)
+    if len(usable) < wanted or not parallel:
+        clipped = sum(view.clipped > MAX_CLIPPED for view in views)
         status = FitStatus.SATURATED if clipped > len(views) / 2 else FitStatus.TOO_FEW_DATA
-        found = f"Expected {_MIN_VIEWS} views with a board and one of them parallel to the panel, found {len(usable)} "
-        return _failed(nominal, status, (*notes, f"{found}and {len(parallel)}."))
-    bundle = calibrate_views(
-        [board_points_mm(view.spec)[view.corners.ids] for view in usable],
-        [view.corners.xy for view in usable],
-        image_size,
-        nominal,
-        [view.corners.sigma for view in usable],
-    )
-    return _result(bundle, usable, parallel, nominal, notes)
+        found = f"Expected {wanted} views with a board and one of them parallel to the panel, found {len(usable)} "
+        return _failed(nominal, status, (*notes, f"{found}and {parallel}."))
+    try:
+        bundle = calibrate_views(
+            [board_points_mm(view.spec)[view.corners.ids] for view in usable],
+            [view.corners.xy for view in usable],
+            image_size,
+            nominal,
+            [np.hypot(view.corners.sigma, _SIGMA_FLOOR_PX) for view in usable],
+            prior=prior,
+        )
+    except FitError as error:
+        return _failed(nominal, FitStatus.TOO_FEW_DATA, (*notes, str(error)))
+    return _result(bundle, [usable[k] for k in bundle.names], nominal, (*notes, *bundle.notes))
 
 
 def _notes(views: Sequence[BoardView]) -> tuple[str, ...]:
     lost = [view.step_id for view in views if len(view.corners.ids) < MIN_CORNERS]
-    clipped = [view.step_id for view in views if view.clipped > _MAX_CLIPPED]
+    clipped = [view.step_id for view in views if view.clipped > MAX_CLIPPED]
     notes = []
     if lost:
         notes.append(f"No board (fewer than {MIN_CORNERS} corners) in {', '.join(lost)}.")
     if clipped:
-        notes.append(f"More than {_MAX_CLIPPED:.0%} of the samples clipped in {', '.join(clipped)}.")
+        notes.append(f"More than {MAX_CLIPPED:.0%} of the samples clipped in {', '.join(clipped)}.")
     return tuple(notes)
 
 
@@ -129,60 +121,89 @@ def _failed(nominal: Geometry, status: FitStatus, notes: tuple[str, ...]) -> Fit
 
 
 def _result(
-    bundle: CalibratedViews, views: list[BoardView], parallel: list[int], nominal: Geometry, notes: tuple[str, ...]
+    bundle: CalibratedViews, views: list[BoardView], nominal: Geometry, notes: tuple[str, ...]
 ) -> FitResult[Geometry]:
-    mean = Rotation.from_rotvec(-bundle.poses[parallel, :3]).mean()
-    rotation = np.asarray(mean.as_rotvec(), dtype=np.float64)
-    term = Geometry(
-        focal=bundle.focal,
-        centre=bundle.centre,
-        distortion=bundle.distortion,
-        rotation=rotation,
-        pupil=np.asarray(nominal.pupil, dtype=np.float64),
-    )
-    values, cov = _with_angles(bundle, parallel, rotation)
+    """``views`` are those that the bundle uses."""
+    parallel = [k for k, view in enumerate(views) if view.parallel]
+    if bundle.status is FitStatus.TOO_FEW_DATA or not parallel:
+        lost = () if parallel else ("No usable view shows the board parallel to the panel; capture that view again.",)
+        return _failed(nominal, FitStatus.TOO_FEW_DATA, (*notes, *lost))
+    rotation = panel_rotation(bundle, parallel)
+    pupil = np.asarray(nominal.pupil, dtype=np.float64)
+    values, cov = with_angles(bundle, parallel, rotation)
     sigma = np.sqrt(np.maximum(np.diag(cov), 0.0))
     names = INTRINSIC_NAMES + ANGLE_NAMES
-    estimates = tuple(
-        Estimate(name, float(value), float(one), unit)
-        for name, value, one, unit in zip(names, values, sigma, UNITS, strict=True)
-    )
-    status = FitStatus.CONVERGED if bundle.converged else FitStatus.NOT_CONVERGED
-    if bundle.rms_px > _WORST_RMS_PX:
-        status = FitStatus.POOR_FIT
     return FitResult(
-        term=term,
-        status=status,
-        estimates=estimates,
+        term=Geometry(bundle.focal, bundle.centre, bundle.distortion, rotation, pupil),
+        status=FitStatus.POOR_FIT if _poor(bundle) else bundle.status,
+        estimates=tuple(
+            Estimate(name, float(value), float(one), unit)
+            for name, value, one, unit in zip(names, values, sigma, UNITS, strict=True)
+        ),
         cov=cov,
         chi2_dof=bundle.chi2_dof,
         samples=2 * int(bundle.used.sum()),
         candidates=bundle.candidates,
-        diagnostics=_diagnostics(bundle, views),
+        diagnostics=_diagnostics(bundle),
         notes=(*notes, *_rejections(bundle, views), *_held(bundle)),
+        outliers=_outliers(bundle, views),
+        residuals=_residuals(bundle),
     )
 
 
-def _diagnostics(bundle: CalibratedViews, views: list[BoardView]) -> tuple[Diagnostic, ...]:
+def _poor(bundle: CalibratedViews) -> bool:
+    """Far off in pixels, and far more so than the corners' own sigma allows."""
+    return bundle.rms_px > _WORST_RMS_PX and bundle.chi2_dof > _WORST_CHI2_DOF
+
+
+def _residuals(bundle: CalibratedViews) -> ResidualSample:
+    """Both coordinates of evenly drawn corners in use, in sigma."""
+    use = np.flatnonzero(bundle.used)
+    drawn = use[:: max(1, -(-len(use) // _MOST_RESIDUALS))]
+    z = bundle.residuals_px[drawn] / bundle.sigma_px[drawn, None]
+    return ResidualSample(np.repeat(bundle.points_px[drawn], 2, axis=0), z.ravel())
+
+
+def _diagnostics(bundle: CalibratedViews) -> tuple[Diagnostic, ...]:
+    evidence = bundle.evidence
     return (
         Diagnostic("rms_reprojection", bundle.rms_px, "px"),
-        Diagnostic("views", float(len(views)), "1"),
+        Diagnostic("views", float(len(bundle.names)), "1"),
         Diagnostic("corners_used", float(bundle.used.sum()), "1"),
         Diagnostic("corners_rejected", float((~bundle.used).sum()), "1"),
         Diagnostic("iterations", float(bundle.iterations), "1"),
+        Diagnostic("starts_agreeing", float(bundle.starts_agreeing), "1"),
+        Diagnostic("rms_held_out", evidence.held_out_rms_px, "px"),
+        Diagnostic("rms_held_out_expected", evidence.expected_rms_px, "px"),
+        Diagnostic("views_disagree_p", evidence.views.p_value, "1"),
+        Diagnostic("variance_factor", evidence.variance_factor, "1"),
+        Diagnostic("residual_pattern_p", evidence.pattern.p_value, "1"),
+        Diagnostic(_PATTERN, evidence.pattern_px, "px"),
     )
+
+
+def _corners_out(bundle: CalibratedViews, views: list[BoardView]) -> list[tuple[str, list[int]]]:
+    """Steps that lost corners, and the numbers of those."""
+    lost = []
+    for k, view in enumerate(views):
+        out = bundle.index[(bundle.view == k) & ~bundle.used]
+        if len(out):
+            lost.append((view.step_id, [int(corner) for corner in view.corners.ids[out]]))
+    return lost
 
 
 def _rejections(bundle: CalibratedViews, views: list[BoardView]) -> tuple[str, ...]:
     """One sentence per view that lost corners."""
-    ids = np.concatenate([view.corners.ids for view in views])
-    notes = []
-    for index, view in enumerate(views):
-        out = ids[(bundle.view == index) & ~bundle.used]
-        if len(out):
-            listed = ", ".join(map(str, out))
-            notes.append(f"{view.step_id}: corners {listed} left out, off by more than {OUTLIER_SIGMA:g} robust sigma.")
-    return tuple(notes)
+    return tuple(
+        f"{step}: corners {', '.join(map(str, corners))} left out, {OUTLIER_RULE}."
+        for step, corners in _corners_out(bundle, views)
+    )
+
+
+def _outliers(bundle: CalibratedViews, views: list[BoardView]) -> tuple[Outliers, ...]:
+    places = [f"{step} corner {corner}" for step, corners in _corners_out(bundle, views) for corner in corners]
+    found = (Outliers(OUTLIER_RULE, len(places), tuple(places[:20])),) if places else ()
+    return (*(other for other in bundle.outliers if other.rule != OUTLIER_RULE), *found)
 
 
 def _held(bundle: CalibratedViews) -> tuple[str, ...]:
@@ -191,47 +212,32 @@ def _held(bundle: CalibratedViews) -> tuple[str, ...]:
     return (*fixed, "Stand-off and panel position are the rig's nominal ones; the wire fit refines them.")
 
 
-def _angles_deg(rotation: Float[Arrayish, "3"]) -> Float[Array, "3"]:
-    """(tilt, roll, yaw) of R_panel_camera = Ry(yaw) Rx(-tilt) Rz(roll)."""
-    r = rotation_matrix(rotation)
-    tilt, roll, yaw = jnp.arcsin(r[1, 2]), jnp.arctan2(r[1, 0], r[1, 1]), jnp.arctan2(r[0, 2], r[2, 2])
-    return jnp.rad2deg(jnp.stack([tilt, roll, yaw]))
-
-
-_angles, _angle_slopes = jax.jit(_angles_deg), jax.jit(jax.jacfwd(_angles_deg))
-
-
-@in_float64
-def _with_angles(
-    bundle: CalibratedViews, parallel: list[int], rotation: Float[np.ndarray, "3"]
-) -> tuple[Float[np.ndarray, "12"], Float[np.ndarray, "12 12"]]:
-    """Values and covariance of intrinsics and angles; several parallel views count as their mean."""
-    slope = np.asarray(_angle_slopes(rotation))
-    picks = np.zeros((12, len(bundle.cov)))
-    picks[:9, :9] = np.eye(9)
-    for view in parallel:
-        picks[9:, 9 + 6 * view : 12 + 6 * view] = -slope / len(parallel)
-    angles = np.asarray(_angles(rotation), dtype=np.float64)
-    values = np.concatenate([bundle.focal, bundle.centre, bundle.distortion, angles])
-    return values, picks @ bundle.cov @ picks.T
-
-
 @in_float64
 def projection_sigma_px(result: FitResult[Geometry], pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
     """One sigma in px (x, y) of where directions fixed in panel coordinates appear, at the sensor pixels given.
 
-    Zero everywhere when the fit failed and has no covariance.
+    What the residuals show of the model's own error is part of it. Zero everywhere when the fit failed and has no
+    covariance.
     """
     if not len(result.cov):
         return np.zeros((len(pixels), 2))
-    term = result.term
-    parameters = np.array([e.value for e in result.estimates])
-    directions = panel_directions(term, pixels)
+    padded = np.tile(np.asarray(result.term.centre, dtype=np.float64), (bucket(len(pixels)), 1))
+    padded[: len(pixels)] = pixels
+    directions = np.asarray(_directions(result.term, padded))
+    slopes = np.asarray(_slopes(np.array([e.value for e in result.estimates]), directions))[: len(pixels)]
+    variance = np.maximum(np.einsum("nip,pq,niq->ni", slopes, result.cov, slopes), 0.0)
+    pattern = next((d.value for d in result.diagnostics if d.name == _PATTERN), 0.0)
+    return np.sqrt(variance + pattern**2)
 
+
+_directions = jax.jit(panel_directions)
+
+
+@jax.jit
+def _slopes(parameters: Float[Array, "12"], directions: Float[Array, "n 3"]) -> Float[Array, "n 2 12"]:
     def seen(x: Float[Array, "12"]) -> Float[Array, "n 2"]:
         camera = Geometry(x[:2], x[2:4], x[4:9], jnp.zeros(3), jnp.zeros(3))
         tilt, roll, yaw = jnp.deg2rad(x[9:])
         return project(camera, directions @ mounting_rotation(tilt, roll, yaw))
 
-    jacobian = np.asarray(jax.jacfwd(seen)(jnp.asarray(parameters)), dtype=np.float64)
-    return np.sqrt(np.maximum(np.einsum("nip,pq,niq->ni", jacobian, result.cov, jacobian), 0.0))
+    return jax.jacfwd(seen)(parameters)

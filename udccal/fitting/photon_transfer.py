@@ -1,136 +1,327 @@
-"""Photon transfer: temporal variance against mean, per CFA site and tile, from pairs of flats (EMVA 1288, clause 6)."""
+"""Photon transfer and response at once: gain K, read noise V0, curvature by maximum likelihood (EMVA 1288, clause 6).
+
+The sensor turns a linear signal z (DN above black) into y = z - c (z^2 + K z): c is 0 for a linear one. Then
+
+    temporal variance = K z (1 - 2 c z)^2 + V0 + q^2/12,     light part of z = A (u + u0),
+
+with u the relative exposure to light. Sample variances are chi-squared: their weights come from the model, not from the
+data. Both relations bear on c; the first alone where the light is unsteady, which is one of the candidates.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float, UInt16
+from jaxtyping import Bool, Float
 
-# Tiles keep shading and the slow flicker of a lamp out of the variance; each must still hold many samples.
-_MOST_TILES = 8
-_FEWEST_SAMPLES = 400
-# EMVA 1288 fits the photon transfer curve up to 70 % of saturation.
-FIT_UP_TO = 0.7
-# A bin whose variance has fallen below this fraction of the straight line is saturated.
-_COLLAPSED = 0.3
+from udccal.fitting.read_noise import inverse
+
+PARAMETERS = ("K_DN_per_e", "V0_DN2", "curvature_per_DN", "response_DN_per_light", "light_offset")
+# Bent by more than this share at full scale, the quadratic is no description (and soon has no inverse).
+MOST_BENT = 0.24
+_ROUNDS = 40
 
 
 @dataclass(frozen=True)
-class PairBins:
-    """One pair of frames reduced to bins (CFA site x tile): mean, temporal variance in DN^2, top code, samples."""
+class Levels:
+    """Bright exposures, already reduced: one row per level, one column per bin (CFA site x tile).
 
-    exposure_s: float
-    mean_DN: Float[np.ndarray, " bins"]
-    variance_DN2: Float[np.ndarray, " bins"]
-    median_DN: Float[np.ndarray, " bins"]
-    samples: int
+    Attributes:
+        mean_DN: above black.
+        variance_DN2: temporal.
+        dof: of the variances.
+        samples: per bin and level, frames times pixels: the mean's weight.
+        usable: bins safely inside the range of the sensor.
+        light: relative exposure; nan where unknown.
+        steady: levels whose frames agree in brightness; the others tell nothing about the response.
+        dark_DN: dark signal in each level.
+        row_variance_DN2: variance of each level's mean from row noise.
+    """
+
+    mean_DN: Float[np.ndarray, "levels bins"]
+    variance_DN2: Float[np.ndarray, "levels bins"]
+    dof: Float[np.ndarray, "levels bins"]
+    samples: Float[np.ndarray, "levels bins"]
+    usable: Bool[np.ndarray, "levels bins"]
+    light: Float[np.ndarray, " levels"]
+    steady: Bool[np.ndarray, " levels"]
+    dark_DN: Float[np.ndarray, " levels"]
+    row_variance_DN2: Float[np.ndarray, " levels"]
+
+
+@dataclass(frozen=True)
+class DarkVariance:
+    """What dark frames tell about V0: each estimate (DN^2) with its standard deviation; and the rounding to add.
+
+    The estimates hold for the gain ``K_DN_per_e``; with another one the shot noise of their dark signal ``drift_DN``
+    changes, and they by as much.
+    """
+
+    V0_DN2: Float[np.ndarray, " points"]
+    sigma_DN2: Float[np.ndarray, " points"]
+    rounding_DN2: float
+    K_DN_per_e: float
+    drift_DN: Float[np.ndarray, " points"]
+
+    def expected(self, K_DN_per_e: float, V0_DN2: float) -> Float[np.ndarray, " points"]:
+        """What the estimates should come out as."""
+        return V0_DN2 + (K_DN_per_e - self.K_DN_per_e) * self.drift_DN
+
+
+@dataclass(frozen=True)
+class Order:
+    """Which parts of the model are free: curvature, offset of the exposures, light that differs by level."""
+
+    curved: bool = False
+    offset: bool = False
+    unsteady: bool = False
+
+    @property
+    def name(self) -> str:
+        """For the table of candidates."""
+        parts = ["curved" if self.curved else "linear"]
+        parts += ["exposure offset"] * self.offset + ["unsteady light"] * self.unsteady
+        return "response: " + ", ".join(parts)
+
+    @property
+    def parameters(self) -> int:
+        """Beyond those that every candidate has."""
+        return int(self.curved) + int(self.offset) + int(self.unsteady)
 
 
 @dataclass(frozen=True)
 class TransferFit:
-    """The straight line variance = K (mean - black) + V0 with the covariance of (K, V0)."""
+    """Values in the order of ``PARAMETERS`` with their covariance, and how well they describe the data.
 
-    K_DN_per_e: float
-    V0_DN2: float
-    cov: Float[np.ndarray, "2 2"]
+    ``scatter`` is the relative standard deviation of the light from level to level; ``variance_z`` and ``level_z`` are
+    residuals in units of sigma, nan where unused.
+    """
+
+    values: Float[np.ndarray, "5"]
+    cov: Float[np.ndarray, "5 5"]
+    scatter: float
+    deviance: float
     chi2_dof: float
-    bins: int
-    levels: int
+    converged: bool
+    variance_z: Float[np.ndarray, "levels bins"]
+    level_z: Float[np.ndarray, " levels"]
 
 
-def bin_pair(
-    first: UInt16[np.ndarray, "rows columns"], second: UInt16[np.ndarray, "rows columns"], exposure_s: float
-) -> PairBins:
-    """Reduce a pair of frames of the same scene; a common change of brightness within a tile drops out."""
-    total, half_difference, values = [], [], []
-    for row in (0, 1):
-        for column in (0, 1):
-            a = _tiles(first[row::2, column::2])
-            b = _tiles(second[row::2, column::2])
-            total.append(0.5 * (a.mean(axis=1) + b.mean(axis=1)))
-            half_difference.append(0.5 * np.var(a - b, axis=1, ddof=1))
-            values.append(np.median(a, axis=1))
-            samples = a.shape[1]
-    return PairBins(
-        exposure_s=exposure_s,
-        mean_DN=np.concatenate(total),
-        variance_DN2=np.concatenate(half_difference),
-        median_DN=np.concatenate(values),
-        samples=samples,
-    )
+def linear_signal(mean_DN, curvature_per_DN, K_DN_per_e):  # type: ignore[no-untyped-def]
+    """z from y = z - c (z^2 + K z); works on numpy and JAX arrays alike."""
+    slope = 1 - curvature_per_DN * K_DN_per_e
+    # The root that goes to y / slope for c -> 0, in the form without cancellation.
+    return 2 * mean_DN / (slope + (slope**2 - 4 * curvature_per_DN * mean_DN) ** 0.5)
 
 
-def _tiles(site: UInt16[np.ndarray, "rows columns"]) -> Float[np.ndarray, "tiles samples"]:
-    across = int(np.clip(np.sqrt(site.size / _FEWEST_SAMPLES), 1, _MOST_TILES))
-    height, width = site.shape[0] // across, site.shape[1] // across
-    cut = site[: height * across, : width * across].astype(np.float64)
-    return cut.reshape(across, height, across, width).transpose(0, 2, 1, 3).reshape(across * across, height * width)
+def temporal_variance(signal_DN, K_DN_per_e, V0_DN2, curvature_per_DN, rounding_DN2):  # type: ignore[no-untyped-def]
+    """Temporal variance in DN^2 at the linear signal z; works on numpy and JAX arrays alike."""
+    return K_DN_per_e * signal_DN * (1 - 2 * curvature_per_DN * signal_DN) ** 2 + V0_DN2 + rounding_DN2
 
 
 def fit_transfer(
-    flats: tuple[PairBins, ...], black_DN: float, saturation_DN: float, dark_variance: tuple[float, float]
-) -> TransferFit | None:
-    """Fit the line to bins darker than 70 % of saturation; weights come from the fitted line, iterated.
+    levels: Levels, dark: DarkVariance, full_DN: float, order: Order, start: Float[np.ndarray, "5"]
+) -> TransferFit:
+    """Fisher scoring on the likelihood of all variances and level means.
 
     Args:
-        flats: the binned pairs.
-        black_DN: mean dark level without dark current (dark current only moves a bin along the line).
-        saturation_DN: where the signal stops.
-        dark_variance: (temporal dark variance in DN^2 with quantisation, its sigma): one more point, at black.
-
-    Returns:
-        The line, or None when fewer than three bins lie inside the range.
+        levels: bright exposures; at least one usable bin.
+        dark: what dark frames tell about V0.
+        full_DN: saturation above black; sets the scale of the curvature.
+        order: what is free.
+        start: values of ``PARAMETERS`` to begin with.
     """
-    limit = black_DN + FIT_UP_TO * (saturation_DN - black_DN)
-    inside = [flat.mean_DN <= limit for flat in flats]
-    x = np.concatenate([flat.mean_DN[keep] for flat, keep in zip(flats, inside, strict=True)]) - black_DN
-    y = np.concatenate([flat.variance_DN2[keep] for flat, keep in zip(flats, inside, strict=True)])
-    n = np.concatenate([np.full(keep.sum(), flat.samples) for flat, keep in zip(flats, inside, strict=True)])
-    if x.size < 3:
-        return None
-    design = np.column_stack([np.append(x, 0.0), np.ones(x.size + 1)])
-    data = np.append(y, dark_variance[0])
-    model = np.maximum(data, dark_variance[0])
-    for _ in range(4):
-        # Var(s^2) = 2 sigma^4 / (n - 1) for near-normal samples.
-        sigma = np.append(model[:-1] * np.sqrt(2.0 / (n - 1)), dark_variance[1])
-        weighted = design / sigma[:, None]
-        cov = np.linalg.pinv(weighted.T @ weighted, hermitian=True)
-        line = cov @ (weighted.T @ (data / sigma))
-        model = np.maximum(design @ line, 0.25 * dark_variance[0])
-    chi2 = float(np.sum(((data - design @ line) / sigma) ** 2))
-    return TransferFit(
-        K_DN_per_e=float(line[0]),
-        V0_DN2=float(line[1]),
-        cov=cov,
-        chi2_dof=chi2 / max(x.size - 1, 1),
-        bins=int(x.size),
-        levels=sum(bool(keep.any()) for keep in inside),
+    x, scatter2 = np.array(start, dtype=np.float64), 0.0
+    x[2] = x[2] if order.curved else 0.0
+    x[4] = x[4] if order.offset else 0.0
+    responds = _responds(levels)
+    free = np.array([True, True, order.curved, responds.any(), order.offset and bool(responds.any())])
+    converged = False
+    for _ in range(_ROUNDS):
+        residual, weight, slope = _linearised(x, levels, dark, full_DN, scatter2)
+        information = slope.T @ (slope * weight[:, None])
+        information = np.where(np.outer(free, free), information, 0.0)
+        step = inverse(information) @ np.where(free, slope.T @ (weight * residual), 0.0)
+        x = _inside(x + step, full_DN)
+        if order.unsteady:
+            scatter2 = _scatter2(x, levels, responds)
+        gain = float(step @ information @ step)
+        if gain < 1e-8:
+            converged = True
+            break
+    _, _, slope = _linearised(x, levels, dark, full_DN, scatter2)
+    return _judged(x, levels, dark, scatter2, inverse(information), converged)
+
+
+def _responds(levels: Levels) -> Bool[np.ndarray, " levels"]:
+    seen = levels.usable.any(axis=1) & levels.steady & np.isfinite(levels.light)
+    known = levels.light[seen]
+    # Levels of one and the same exposure differ by the lamp's power, which nobody measured.
+    return seen if known.size > 2 and float(np.ptp(known)) > 0 else np.zeros_like(seen)
+
+
+def _inside(x: Float[np.ndarray, "5"], full_DN: float) -> Float[np.ndarray, "5"]:
+    x = x.copy()
+    x[2] = np.clip(x[2], -MOST_BENT / full_DN, MOST_BENT / full_DN)
+    return x
+
+
+def _parts(
+    x: Float[np.ndarray, "5"], levels: Levels, dark: DarkVariance
+) -> tuple[Float[np.ndarray, "levels bins"], Float[np.ndarray, "levels bins"], Float[np.ndarray, " levels"]]:
+    """Modelled variances, and the levels' brightness over that modelled, less one."""
+    K, V0, c, gain, offset = x
+    mean = np.where(levels.usable, levels.mean_DN, 0.0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        signal = np.nan_to_num(linear_signal(mean, c, K), posinf=0.0)
+    variance = np.maximum(temporal_variance(signal, K, V0, c, dark.rounding_DN2), 1e-9)
+    brightness = _brightness(signal - levels.dark_DN[:, None], levels.usable)
+    expected = gain * (levels.light + offset)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        relative = brightness / expected - 1
+    return signal, variance, relative
+
+
+def _brightness(light_DN: Float[np.ndarray, "levels bins"], usable: np.ndarray) -> Float[np.ndarray, " levels"]:
+    """Mean light of each level as if every bin were usable in it: bins share one pattern through all levels."""
+    if usable[usable.any(axis=1)].all():
+        return light_DN.mean(axis=1)
+    pattern = np.ones(usable.shape[1])
+    count = np.maximum(usable.sum(axis=1), 1)
+    for _ in range(6):
+        level = np.where(usable, light_DN, 0.0).sum(axis=1) / np.maximum((usable * pattern).sum(axis=1), 1e-9)
+        weight = (usable * (level**2)[:, None]).sum(axis=0)
+        moved = np.where(usable, light_DN * level[:, None], 0.0).sum(axis=0) / np.maximum(weight, 1e-12)
+        pattern = np.where(weight > 0, moved, 1.0)
+        pattern /= max(float(pattern.mean()), 1e-9)
+    return np.where(count > 0, level, 0.0)
+
+
+def _level_variance(levels: Levels, variance: Float[np.ndarray, "levels bins"]) -> Float[np.ndarray, " levels"]:
+    """Relative variance of each level's brightness by shot, read and row noise."""
+    count = np.maximum(levels.usable.sum(axis=1), 1)
+    mean = np.where(levels.usable, levels.mean_DN, 0.0).sum(axis=1) / count
+    noise = np.where(levels.usable, variance / levels.samples, 0.0).sum(axis=1) / count**2
+    return (noise + levels.row_variance_DN2) / np.maximum(mean, 1e-9) ** 2
+
+
+def _linearised(
+    x: Float[np.ndarray, "5"], levels: Levels, dark: DarkVariance, full_DN: float, scatter2: float
+) -> tuple[Float[np.ndarray, " data"], Float[np.ndarray, " data"], Float[np.ndarray, "data 5"]]:
+    responds = _responds(levels)
+
+    def predicted(at: Float[np.ndarray, "5"]) -> Float[np.ndarray, " data"]:
+        _, variance, relative = _parts(at, levels, dark)
+        return np.concatenate([variance[levels.usable], dark.expected(at[0], at[1]), -relative[responds]])
+
+    _, variance, relative = _parts(x, levels, dark)
+    off = dark.V0_DN2 - dark.expected(x[0], x[1])
+    residual = np.concatenate([(levels.variance_DN2 - variance)[levels.usable], off, relative[responds]])
+    weight = np.concatenate(
+        [
+            1 / _sampling(x, levels, variance)[levels.usable],
+            1 / dark.sigma_DN2**2,
+            1 / (_level_variance(levels, variance)[responds] + scatter2),
+        ]
     )
+    # Slopes by central differences, in steps small beside each parameter's own size.
+    size = np.array([abs(x[0]), abs(x[1]) + dark.rounding_DN2 + 1e-3, 0.1 / full_DN, abs(x[3]), _light_size(levels)])
+    columns = []
+    for step in np.diag(1e-4 * size):
+        columns.append((predicted(x + step) - predicted(x - step)) / (2 * step.sum()))
+    return residual, weight, np.stack(columns, axis=1)
 
 
-def find_saturation(flats: tuple[PairBins, ...], black_DN: float, top_code_DN: float) -> tuple[float, float, int]:
-    """Level at which the temporal variance collapses: (saturation, its sigma, number of saturated bins).
+def _light_size(levels: Levels) -> float:
+    known = levels.light[np.isfinite(levels.light)]
+    return max(float(np.max(known, initial=0.0)), 1e-30)
 
-    A bin is saturated when its variance is under 30 % of what the least saturated half of the data predicts for its
-    mean. Where no bin is saturated the converter's largest code is returned, with zero bins.
-    """
-    mean = np.concatenate([flat.mean_DN for flat in flats]) - black_DN
-    variance = np.concatenate([flat.variance_DN2 for flat in flats])
-    median = np.concatenate([flat.median_DN for flat in flats])
-    bright = mean > 0.05 * (top_code_DN - black_DN)
-    if not bright.any():
-        return top_code_DN, 0.0, 0
-    slope = variance[bright] / mean[bright]
-    # Below saturation variance/mean is K plus a small positive part; clipping only lowers it.
-    usual = float(np.quantile(slope, 0.75))
-    collapsed = slope < _COLLAPSED * usual
-    # Saturation is a ceiling: a quiet bin well below the brightest one is something else.
-    collapsed &= mean[bright] >= 0.9 * mean[bright].max()
-    count = int(collapsed.sum())
-    if count == 0:
-        return top_code_DN, 0.0, 0
-    levels = median[bright][collapsed]
-    spread = float(np.std(levels)) if count > 1 else 0.5
-    return float(np.median(levels)), max(spread, 0.5) / np.sqrt(count), count
+
+def _sampling(
+    x: Float[np.ndarray, "5"], levels: Levels, variance: Float[np.ndarray, "levels bins"]
+) -> Float[np.ndarray, "levels bins"]:
+    """Variance of (sample variance - K mean): of Poisson counts the two err together, of read noise apart."""
+    return 2 * variance**2 / levels.dof + x[0] ** 2 * (max(x[1], 0.0) + 1e-12) / levels.samples
+
+
+def _scatter2(x: Float[np.ndarray, "5"], levels: Levels, responds: np.ndarray) -> float:
+    """Maximum-likelihood variance of the light from level to level, beyond what noise explains."""
+    dark = DarkVariance(np.zeros(0), np.zeros(0), 0.0, 0.0, np.zeros(0))
+    _, variance, relative = _parts(x, levels, dark)
+    known = _level_variance(levels, variance)[responds]
+    square = relative[responds] ** 2
+    found = float(np.mean(square))
+    for _ in range(50):
+        weight = 1 / (found + known) ** 2
+        found = max(float(np.sum(weight * (square - known)) / np.sum(weight)), 0.0)
+    return found
+
+
+def _judged(
+    x: Float[np.ndarray, "5"],
+    levels: Levels,
+    dark: DarkVariance,
+    scatter2: float,
+    cov: Float[np.ndarray, "5 5"],
+    converged: bool,
+) -> TransferFit:
+    _, variance, relative = _parts(x, levels, dark)
+    responds, use = _responds(levels), levels.usable
+    spread = np.sqrt(_sampling(x, levels, variance))
+    variance_z = np.where(use, (levels.variance_DN2 - variance) / spread, np.nan)
+    level_variance = _level_variance(levels, variance) + scatter2
+    level_z = np.where(responds, relative / np.sqrt(np.where(responds, level_variance, 1.0)), np.nan)
+    dark_z = (dark.V0_DN2 - dark.expected(x[0], x[1])) / dark.sigma_DN2
+    ratio = np.maximum(levels.variance_DN2[use] / variance[use], 1e-12)
+    deviance = float(np.sum(levels.dof[use] * (ratio - 1 - np.log(ratio)))) + float(np.sum(dark_z**2))
+    deviance += float(np.nansum(level_z**2) + np.sum(np.log(level_variance[responds])))
+    chi2 = float(np.nansum(variance_z**2))
+    finite = bool(np.isfinite(x).all() and np.isfinite(cov).all())
+    chi2_dof = chi2 / max(int(use.sum()) - 1, 1)
+    return TransferFit(x, cov, float(np.sqrt(scatter2)), deviance, chi2_dof, converged and finite, variance_z, level_z)
+
+
+def start_transfer(levels: Levels, dark: DarkVariance) -> Float[np.ndarray, "5"]:
+    """A straight line with rough weights, and the response through the origin."""
+    use = levels.usable
+    signal, variance = levels.mean_DN[use], levels.variance_DN2[use]
+    floor = float(np.average(dark.V0_DN2, weights=1 / dark.sigma_DN2**2)) + dark.rounding_DN2
+    K = float(np.median((variance - floor) / np.maximum(signal, 1e-9)))
+    light = np.where(np.isfinite(levels.light), levels.light, 0.0)
+    brightness = _brightness(levels.mean_DN - levels.dark_DN[:, None], use)
+    gain = float(light @ brightness) / max(float(light @ light), 1e-30)
+    return np.array([K, floor - dark.rounding_DN2, 0.0, gain if gain > 0 else 1.0, 0.0])
+
+
+def choose_transfer(
+    levels: Levels, dark: DarkVariance, full_DN: float
+) -> tuple[TransferFit, Order, tuple[tuple[Order, float], ...]]:
+    """The order with the least BIC, its fit, and the criterion of every order tried (0: the best)."""
+    orders = [Order(*(bool(n >> k & 1) for k in range(3))) for n in range(8)]
+    if not _responds(levels).any():
+        orders = [Order(), Order(curved=True)]
+    simplest = fit_transfer(levels, dark, full_DN, orders[0], start_transfer(levels, dark))
+    start = simplest.values if simplest.converged else start_transfer(levels, dark)
+    fits = [simplest, *(fit_transfer(levels, dark, full_DN, order, start) for order in orders[1:])]
+    penalty = float(np.log(max(float(levels.dof[levels.usable].sum()), 2.0)))
+    criteria = [
+        fit.deviance + penalty * order.parameters if np.isfinite(fit.deviance) and fit.converged else np.inf
+        for fit, order in zip(fits, orders, strict=True)
+    ]
+    best = int(np.argmin(criteria))
+    least = criteria[best] if np.isfinite(criteria[best]) else 0.0
+    tried = tuple((order, value - least) for order, value in zip(orders, criteria, strict=True) if np.isfinite(value))
+    return fits[best], orders[best], tried
+
+
+def without_outliers(levels: Levels, fit: TransferFit, limit: float) -> tuple[Levels, int, tuple[int, ...]]:
+    """Levels less what lies beyond ``limit`` robust sigma of the fit; how many bins, and which levels' brightness."""
+    z = fit.variance_z[levels.usable]
+    scale = max(1.0, 1.4826 * float(np.median(np.abs(z - np.median(z)))))
+    wrong = levels.usable & (np.abs(np.nan_to_num(fit.variance_z)) > limit * scale)
+    seen = fit.level_z[np.isfinite(fit.level_z)]
+    level_scale = max(1.0, 1.4826 * float(np.median(np.abs(seen)))) if seen.size else 1.0
+    off = np.abs(np.nan_to_num(fit.level_z)) > limit * level_scale
+    cleaned = replace(levels, usable=levels.usable & ~wrong, steady=levels.steady & ~off)
+    return cleaned, int(wrong.sum()), tuple(int(i) for i in np.flatnonzero(off))

@@ -13,14 +13,17 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from udccal.fitting.psf_blocks import blocks, fit_lattice
-from udccal.fitting.psf_diffraction import DiffractionFit, fit_diffraction, fit_locals, pose
-from udccal.fitting.psf_evidence import diffraction_alone, failed, fit_result
+from udccal.fitting.psf_diffraction import DiffractionFit, fit_locals
+from udccal.fitting.psf_evidence import NAMES, diffraction_alone, failed, fit_result
+from udccal.fitting.psf_field import fit_field
 from udccal.fitting.psf_normal import Evaluator
+from udccal.fitting.psf_posterior import PsfPosterior, posterior
 from udccal.fitting.psf_read import read_shots
 from udccal.fitting.psf_residual import Sources, with_light_of_peak
+from udccal.fitting.psf_samples import share_of_information
 from udccal.fitting.psf_select import select_field
 from udccal.fitting.psf_shots import Shots
-from udccal.fitting.psf_start import WAVELENGTHS_NM, start_model, start_prior, wire_shows
+from udccal.fitting.psf_start import start_model, start_prior, wire_shows
 from udccal.fitting.result import FitResult, FitStatus
 from udccal.models.geometry import Geometry
 from udccal.models.noise import Noise
@@ -32,9 +35,6 @@ from udccal.sessions.store import Session
 
 _LEAST_POSITIONS = 3
 _LEAST_SHARE = 0.5
-# All samples about the peak, and this share of the others, go into the fit of diffraction.
-_PEAK_HALF_PX, _ELSEWHERE_SHARE = (12, 6), 1 / 6
-MODEL_ERROR = 0.015
 
 
 @dataclass(frozen=True)
@@ -45,6 +45,7 @@ class Effort:
         positions, shifts: so many field positions, and pictures of each, go into the fit of diffraction.
         half_px: largest window (rows, columns) to either side of the LED; the regions captured may bound it further.
         close_px: the same for the fit of diffraction, whose time grows with it.
+        far_share: of the samples away from the peak, so many go into it; all of those about the peak do.
         iterations: at most, of the fit of diffraction.
     """
 
@@ -52,6 +53,7 @@ class Effort:
     shifts: int = 3
     half_px: tuple[int, int] = (48, 16)
     close_px: tuple[int, int] = (40, 14)
+    far_share: float = 1 / 6
     iterations: int = 30
 
 
@@ -80,10 +82,8 @@ def fit_psf(
     if reading.dark > (1 - _LEAST_SHARE) * max(reading.taken, 1):
         note = f"{reading.dark} of {reading.taken} pictures show no LED."
         return failed(start, geometry, FitStatus.TOO_DARK, note)
-    if reading.shots is None or int(reading.shots.position.max()) + 1 < _LEAST_POSITIONS:
-        found = 0 if reading.shots is None else int(reading.shots.position.max()) + 1
-        note = f"{found} field positions were captured; {_LEAST_POSITIONS} are needed at least."
-        return failed(start, geometry, FitStatus.TOO_FEW_DATA, note)
+    if reading.shots is None:
+        return failed(start, geometry, FitStatus.TOO_FEW_DATA, "No field position was captured.")
     result = fit_shots(reading.shots, session.rig, geometry, wire, effort)
     left_out = reading.clipped + reading.dark
     note = f"{left_out} pictures were left out: {reading.dark} without an LED, {reading.clipped} clipped."
@@ -102,26 +102,45 @@ def window_half(session: Session, largest: tuple[int, int]) -> tuple[int, int]:
     return max(4, min(largest[0], rows // 2 - 4)), max(4, min(largest[1], columns // 2 - 4))
 
 
-@in_float64
+@dataclass(frozen=True)
+class FittedPsf:
+    """The result, and what ``psf_sigma`` needs to say how sure the kernel is at a field point (None: nothing known)."""
+
+    result: FitResult[PsfField]
+    posterior: PsfPosterior | None
+
+
 def fit_shots(
     shots: Shots, rig: RigDescription, geometry: Geometry, wire: Wire, effort: Effort | None = None
 ) -> FitResult[PsfField]:
     """Fit the psf term to crops about the LED; see ``fit_psf``."""
+    return fit_shots_fully(shots, rig, geometry, wire, effort).result
+
+
+@in_float64
+def fit_shots_fully(
+    shots: Shots, rig: RigDescription, geometry: Geometry, wire: Wire, effort: Effort | None = None
+) -> FittedPsf:
+    """As ``fit_shots``, with the posterior of the numbers of diffraction."""
     effort = effort or Effort()
     start = start_model(rig, geometry, wire)
-    held_out = held_out_positions(int(shots.position.max()) + 1)
+    count = int(shots.position.max()) + 1
+    if count < _LEAST_POSITIONS:
+        note = f"{count} field positions were captured; {_LEAST_POSITIONS} are needed at least."
+        return FittedPsf(failed(start, geometry, FitStatus.TOO_FEW_DATA, note), None)
+    held_out = held_out_positions(count)
     chosen = shots.pick(some_shots(shots, held_out, effort))
     chosen = replace(chosen, position=np.unique(chosen.position, return_inverse=True)[1].reshape(-1))
     half = (shots.rate.shape[1] // 2, shots.rate.shape[2] // 2)
     close = (min(half[0], effort.close_px[0]), min(half[1], effort.close_px[1]))
-    evaluator = Evaluator(WAVELENGTHS_NM, MODEL_ERROR, fit_lattice(close), wire_shows(wire))
-    fit_blocks = blocks(chosen, geometry, _some_samples(chosen, close))
-    problem = pose(fit_blocks, evaluator, start_prior(rig, start, wire_shows(wire)))
-    fit = fit_diffraction(problem, effort.iterations)
-    sources, explained = _all_sources(shots, geometry, replace(evaluator, lattice=fit_lattice(half)), fit)
+    seen = wire_shows(wire)
+    field = fit_field(chosen, geometry, start_prior(rig, start, seen), close, effort.far_share, effort.iterations, seen)
+    evaluator = replace(field.diffraction.problem.evaluator, lattice=fit_lattice(half))
+    sources, explained = _all_sources(shots, geometry, evaluator, field.diffraction)
     size = np.array([rig.camera.columns - 1, rig.camera.rows - 1]) / 2.0
     selection = select_field(shots, sources, explained, held_out, (shots.positions_px() - size) / size)
-    return fit_result(shots, geometry, problem, fit, selection, size)
+    used = share_of_information(field.diffraction, field.shots, geometry, close, shots.count, len(NAMES))
+    return FittedPsf(fit_result(shots, geometry, field, selection, size, used), posterior(field.diffraction, geometry))
 
 
 def held_out_positions(count: int) -> Bool[np.ndarray, " positions"]:
@@ -140,20 +159,6 @@ def some_shots(shots: Shots, held_out: Bool[np.ndarray, " positions"], effort: E
     return keep
 
 
-def _some_samples(shots: Shots, close: tuple[int, int]) -> Bool[np.ndarray, "shots rows columns"]:
-    """All samples about the peak and a seeded draw of the others up to ``close``, as many in every shot."""
-    rng = np.random.default_rng(2)
-    offsets = np.abs(shots.offsets())
-    near = (offsets[..., 0] <= _PEAK_HALF_PX[1]) & (offsets[..., 1] <= _PEAK_HALF_PX[0])
-    inside = (offsets[..., 0] <= close[1]) & (offsets[..., 1] <= close[0])
-    near &= inside
-    far = np.flatnonzero((inside & ~near).ravel())
-    chosen = np.tile(near.ravel(), (shots.count, 1))
-    for row in chosen:
-        row[rng.choice(far, int(len(far) * _ELSEWHERE_SHARE), replace=False)] = True
-    return chosen.reshape(shots.rate.shape)
-
-
 def _all_sources(
     shots: Shots, geometry: Geometry, evaluator: Evaluator, fit: DiffractionFit
 ) -> tuple[Sources, Float[np.ndarray, "shots rows columns"]]:
@@ -161,7 +166,7 @@ def _all_sources(
     place, flux, background = shots.centre_px.copy(), np.zeros((shots.count, 3)), np.zeros(shots.count)
     explained = np.zeros(shots.rate.shape)
     for block in blocks(shots, geometry, np.ones(shots.rate.shape, dtype=bool)):
-        local, unit = fit_locals(evaluator, fit.theta, block)
+        local, unit = fit_locals(evaluator, fit.theta, block, fit.model_error)
         index = np.asarray(block.index)
         real = index >= 0
         place[index[real]] += np.asarray(local.offset_px)[real]

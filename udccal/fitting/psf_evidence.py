@@ -5,8 +5,11 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-from udccal.fitting.psf_diffraction import DiffractionFit, Problem, fitted_model
+from udccal.fitting.psf_blocks import BLUR
+from udccal.fitting.psf_diffraction import DiffractionFit, fitted_model
+from udccal.fitting.psf_field import FieldFit
 from udccal.fitting.psf_normal import kernel_coefficients
+from udccal.fitting.psf_posterior import full_cov
 from udccal.fitting.psf_select import Selection
 from udccal.fitting.psf_shots import Shots
 from udccal.fitting.psf_start import HELD
@@ -17,12 +20,12 @@ from udccal.models.psf import PsfField, fine_oversample
 
 _POOR = 0.2
 _DRAWS = 6
-_NAMES = ("pitch", "column_open_fraction", "row_open_fraction", "structure_thickness", "pupil_diameter", "blur")
+NAMES = ("pitch", "column_open_fraction", "row_open_fraction", "structure_thickness", "pupil_diameter", "blur")
 _UNITS = ("mm", "1", "1", "mm", "mm", "px")
 
 _DIFFRACTION_NOTES = (
     "cov covers the numbers of diffraction; field coefficients of the residual and spectra are left out of it.",
-    "chi2_dof is of the fit of diffraction, which allows for a model error of 1.5 % of the peak.",
+    "chi2_dof is of the fit of diffraction and allows for the model error that its residuals tell.",
 )
 _FREE_NOTES = (
     "The blur is not that of a panel's grating: an image carries the kernel, no number of diffraction is known.",
@@ -33,15 +36,16 @@ _FREE_NOTES = (
 def fit_result(
     shots: Shots,
     geometry: Geometry,
-    problem: Problem,
-    fit: DiffractionFit,
+    field: FieldFit,
     selection: Selection,
     size: Float[np.ndarray, "2"],
+    efficiency: float,
 ) -> FitResult[PsfField]:
     """Everything together; ``size`` is the sensor's (half width, half height) in px, also its centre."""
+    fit = field.diffraction
     term = PsfField(
         geometry=geometry,
-        diffraction=fitted_model(problem.evaluator, fit.theta),
+        diffraction=fitted_model(fit.problem.evaluator, fit.theta),
         diffraction_share=np.float64(selection.share),
         residual=selection.image,
         centre_px=size,
@@ -55,17 +59,18 @@ def fit_result(
         status = FitStatus.POOR_FIT
     elif selection.share and not fit.converged:
         status = FitStatus.NOT_CONVERGED
-    estimates, cov = _estimates(problem, fit, selection)
+    estimates, cov = _estimates(fit, selection)
     return FitResult(
         term=term,
         status=status,
         estimates=estimates,
         cov=cov,
         chi2_dof=fit.chi2_dof if selection.share else selection.chi2_dof,
-        samples=fit.samples if selection.share else selection.samples,
-        candidates=selection.candidates,
-        diagnostics=_diagnostics(shots, fit, selection),
+        samples=fit.problem.samples if selection.share else selection.samples,
+        candidates=(*(field.phase.candidates if field.phase else ()), *selection.candidates),
+        diagnostics=(*_diagnostics(shots, fit, selection), *_of_diffraction(field, efficiency)),
         notes=_DIFFRACTION_NOTES if selection.share else _FREE_NOTES,
+        outliers=fit.outliers,
     )
 
 
@@ -89,39 +94,50 @@ def failed(start: Diffraction, geometry: Geometry, status: FitStatus, note: str)
     return FitResult(diffraction_alone(start, geometry), status, (), np.zeros((0, 0)), 0.0, 0, notes=(note,))
 
 
-def _estimates(
-    problem: Problem, fit: DiffractionFit, selection: Selection
-) -> tuple[tuple[Estimate, ...], Float[np.ndarray, "n n"]]:
-    scale = max(fit.chi2_dof, 1.0)
+def _estimates(fit: DiffractionFit, selection: Selection) -> tuple[tuple[Estimate, ...], Float[np.ndarray, "n n"]]:
     error = float(selection.held_out.mean())
+    spread = float(selection.held_out.std(ddof=1) / np.sqrt(selection.held_out.size))
     if not selection.share:
-        sigma_of_mean = float(selection.held_out.std(ddof=1) / np.sqrt(selection.held_out.size))
-        return (Estimate("kernel_relative_l2", error, sigma_of_mean, "1"),), np.array([[sigma_of_mean**2]])
-    kernel = Estimate("kernel_relative_l2", error, _kernel_sigma(problem, fit, scale), "1")
-    cov = fit.cov[: len(_NAMES), : len(_NAMES)] * scale
+        return (Estimate("kernel_relative_l2", error, spread, "1"),), np.array([[spread**2]])
+    whole = full_cov(fit)
+    kernel = Estimate("kernel_relative_l2", error, float(np.hypot(_kernel_sigma(fit, whole), spread)), "1")
+    # The fit's own parameter is the logarithm of the blur.
+    values, unit = fit.theta[: len(NAMES)].copy(), np.ones(len(NAMES))
+    values[BLUR] = unit[BLUR] = np.exp(fit.theta[BLUR])
+    cov = whole[: len(NAMES), : len(NAMES)] * np.outer(unit, unit)
     # The pitch was held, so that the spectra could move; it may be off by what the rig's description allows.
-    cov[0, 0] += 1.0 / (HELD * problem.prior.root[0, 0]) ** 2
+    cov[0, 0] += 1.0 / (HELD * fit.problem.prior.root[0, 0]) ** 2
     sigma = np.sqrt(np.diag(cov))
-    numbers = tuple(
-        Estimate(name, float(value), float(s), unit)
-        for name, value, s, unit in zip(_NAMES, fit.theta, sigma, _UNITS, strict=False)
-    )
+    numbers = tuple(Estimate(n, float(v), float(s), u) for n, v, s, u in zip(NAMES, values, sigma, _UNITS, strict=True))
     return (*numbers, kernel), cov
 
 
-def _kernel_sigma(problem: Problem, fit: DiffractionFit, scale: float) -> float:
+def _kernel_sigma(fit: DiffractionFit, cov: Float[np.ndarray, "p p"]) -> float:
     """Relative L2 spread of what the first position expects, for parameters drawn from their covariance."""
     rng = np.random.default_rng(3)
-    values, vectors = np.linalg.eigh(fit.cov * scale)
+    values, vectors = np.linalg.eigh(cov)
     root = vectors * np.sqrt(np.maximum(values, 0.0))
-    block, overlaps = problem.blocks[0], problem.overlaps[0]
+    block, overlaps = fit.problem.blocks[0], fit.problem.overlaps[0]
 
     def light(theta: Float[np.ndarray, " p"]) -> Float[np.ndarray, "rows columns 3"]:
-        return np.asarray(kernel_coefficients(problem.evaluator, theta, block, overlaps))
+        return np.asarray(kernel_coefficients(fit.problem.evaluator, theta, block, overlaps))
 
     middle = light(fit.theta)
     drawn = [light(fit.theta + root @ rng.standard_normal(fit.theta.size)) - middle for _ in range(_DRAWS)]
     return float(np.sqrt(np.mean([(d**2).sum() for d in drawn]) / (middle**2).sum()))
+
+
+def _of_diffraction(field: FieldFit, efficiency: float) -> tuple[Diagnostic, ...]:
+    fit = field.diffraction
+    made = [
+        Diagnostic("model_error", fit.model_error, "1"),
+        Diagnostic("efficiency", efficiency, "1"),
+        Diagnostic("residual_pattern_p", fit.pattern_p, "1"),
+    ]
+    if field.phase:
+        made.append(Diagnostic("wire_phase_strength", field.phase.strength, "1"))
+        made.append(Diagnostic("wire_phase_strength_sigma", field.phase.sigma, "1"))
+    return tuple(made)
 
 
 def _diagnostics(shots: Shots, fit: DiffractionFit, selection: Selection) -> tuple[Diagnostic, ...]:
@@ -134,7 +150,7 @@ def _diagnostics(shots: Shots, fit: DiffractionFit, selection: Selection) -> tup
         Diagnostic("field_positions", float(shots.position.max() + 1), "1"),
         Diagnostic("pictures", float(shots.count), "1"),
         Diagnostic("samples_left_out", left_out, "1"),
-        Diagnostic("iterations", float(fit.iterations), "1"),
+        Diagnostic("iterations", float(fit.point.iterations), "1"),
         Diagnostic("residual_degree", float(selection.degree), "1"),
         Diagnostic("diffraction_share", selection.share, "1"),
     )

@@ -14,12 +14,12 @@ import numpy as np
 from jaxtyping import Array, Float
 from jaxtyping import ArrayLike as Arrayish
 
-from udccal.fitting.psf_blocks import HEAD, Block, Local, unpack
+from udccal.fitting.psf_blocks import HEAD, PUPIL, Block, Local, corrected, unpack
 from udccal.models.diffraction import Diffraction, LocalFrame, average_transfer
 from udccal.models.interference import interference_transfer, node_overlaps, overlap_tables
 from udccal.models.lattice import Lattice, sample, spline_coefficients
 
-_HUBER = 3.0
+HUBER = 3.0
 # Forward differences: pitch, open fractions, thickness, pupil, blur, footprint (x, y, stand-off), place (x, y).
 _STEPS = np.array([1e-5, 1e-5, 1e-5, 1e-5, 1e-4, 1e-3, 1e-4, 1e-4, 1e-4, 1e-4, 1e-4])
 
@@ -29,13 +29,11 @@ class Evaluator(eqx.Module):
 
     Attributes:
         wavelengths_nm: nodes of the spectra.
-        model_error: see ``weighted``.
         lattice: for the transfer functions.
         interference: whether the footprint's place on the rows is known.
     """
 
     wavelengths_nm: Float[Arrayish, " nodes"]
-    model_error: Float[Arrayish, ""]
     lattice: Lattice = eqx.field(static=True)
     interference: bool = eqx.field(static=True)
 
@@ -47,12 +45,12 @@ class Evaluator(eqx.Module):
 class Normal(eqx.Module):
     """Sums over samples of products of derivatives: global x global, global x local, local x local."""
 
-    gg: Float[Array, "p p"]
-    gl: Float[Array, "shots p l"]
-    ll: Float[Array, "shots l l"]
-    g: Float[Array, " p"]
-    l: Float[Array, "shots l"]  # noqa: E741
-    cost: Float[Array, ""]
+    gg: Float[Arrayish, "p p"]
+    gl: Float[Arrayish, "shots p l"]
+    ll: Float[Arrayish, "shots l l"]
+    g: Float[Arrayish, " p"]
+    l: Float[Arrayish, "shots l"]  # noqa: E741
+    cost: Float[Arrayish, ""]
 
 
 @eqx.filter_jit
@@ -114,7 +112,7 @@ def normal_equations(
     local: Local,
     overlaps: Float[Arrayish, "n_nodes n_terms n_rows n_half"],
 ) -> Normal:
-    """One field position's share of the Gauss-Newton equations, with Huber's weights; see ``weighted``."""
+    """One field position's share of the Gauss-Newton equations, with Huber's weights."""
     theta, offset, colour = jnp.asarray(theta), jnp.asarray(local.offset_px), jnp.asarray(block.colour)
     spectra = jnp.asarray(evaluator.model(theta).spectrum)
     every = jnp.eye(spectra.shape[1], dtype=theta.dtype)
@@ -129,20 +127,21 @@ def normal_equations(
         return (jnp.sum(moved * colour, axis=-1) - unit) / jnp.sum(step)
 
     slopes = jnp.moveaxis(jax.lax.map(difference, jnp.diag(jnp.asarray(_STEPS))), 0, -1)
+    slopes = slopes.at[..., PUPIL].add(jnp.asarray(block.overlap_slope))
     by_logs = jnp.einsum("snc,cj,snj->sncj", colour, spectra, nodes - unit[..., None])
     flux = jnp.einsum("snc,sc->sn", colour, jnp.asarray(local.flux))
     by_global = flux[..., None] * jnp.concatenate([slopes[..., :HEAD], by_logs.reshape(*unit.shape, -1)], axis=-1)
+    unit = corrected(block, theta, unit)
     by_local = _by_local(block, local, unit, slopes[..., HEAD:])
-    weight, residual = weighted(evaluator, block, local, unit)
-    size = jnp.abs(residual) * jnp.sqrt(weight)
-    huber = weight * jnp.minimum(1.0, _HUBER / jnp.maximum(size, 1e-12))
+    residual = _residual(block, local, unit)
+    huber, size = _huber(block, residual)
     return Normal(
         gg=jnp.einsum("snp,sn,snq->pq", by_global, huber, by_global),
         gl=jnp.einsum("snp,sn,snl->spl", by_global, huber, by_local),
         ll=jnp.einsum("snk,sn,snl->skl", by_local, huber, by_local),
         g=jnp.einsum("snp,sn->p", by_global, huber * residual),
         l=jnp.einsum("snl,sn->sl", by_local, huber * residual),
-        cost=jnp.sum(jnp.where(size < _HUBER, size**2, 2.0 * _HUBER * size - _HUBER**2)),
+        cost=jnp.sum(jnp.where(size < HUBER, size**2, 2.0 * HUBER * size - HUBER**2)),
     )
 
 
@@ -157,10 +156,10 @@ def local_equations(
         values = _sampled(evaluator, block, coefficients, jnp.asarray(local.offset_px) + move)
         return jnp.sum(values * block.colour, axis=-1)
 
-    unit, by_move = light(jnp.zeros(2)), jax.jacfwd(light)(jnp.zeros(2))
+    unit, by_move = light(jnp.zeros(2)) + jnp.asarray(block.correction), jax.jacfwd(light)(jnp.zeros(2))
     by_local = _by_local(block, local, unit, by_move)
-    weight, residual = weighted(evaluator, block, local, unit)
-    huber = weight * jnp.minimum(1.0, _HUBER / jnp.maximum(jnp.abs(residual) * jnp.sqrt(weight), 1e-12))
+    residual = _residual(block, local, unit)
+    huber, _ = _huber(block, residual)
     matrix = jnp.einsum("snk,sn,snl->skl", by_local, huber, by_local)
     return matrix, jnp.einsum("snl,sn->sl", by_local, huber * residual)
 
@@ -201,18 +200,12 @@ def unit_light_at(
     return jax.lax.map(one, jnp.asarray(moves_px))
 
 
-def weighted(
-    evaluator: Evaluator, block: Block, local: Local, unit: Float[Array, "shots n"]
-) -> tuple[Float[Array, "shots n"], Float[Array, "shots n"]]:
-    """Inverse variances, and data less expectation.
-
-    What the model leaves out matters the more, relatively, the fainter a sample is: its standard deviation is taken as
-    ``model_error`` times expectation^(3/4) peak^(1/4), e.g. at 10^-4 of the peak ten times ``model_error``.
-    """
+def _residual(block: Block, local: Local, unit: Float[Array, "shots n"]) -> Float[Array, "shots n"]:
     light = unit * jnp.einsum("snc,sc->sn", block.colour, jnp.asarray(local.flux))
-    known = jnp.asarray(block.weight) > 0
-    size = jnp.where(known, jnp.maximum(light, 0.0), 0.0)
-    left_out = evaluator.model_error * (size + 1e-30) ** 0.75 * jnp.max(size, axis=1, keepdims=True) ** 0.25
-    variance = 1.0 / jnp.where(known, block.weight, 1.0) + left_out**2
-    residual = block.rate - light - jnp.asarray(local.background)[:, None]
-    return jnp.where(known, 1.0 / variance, 0.0), residual
+    return jnp.asarray(block.rate) - light - jnp.asarray(local.background)[:, None]
+
+
+def _huber(block: Block, residual: Float[Array, "shots n"]) -> tuple[Float[Array, "shots n"], Float[Array, "shots n"]]:
+    """Weights that let no sample pull harder than one ``HUBER`` sigma off, and residuals in units of sigma."""
+    size = jnp.abs(residual) * jnp.sqrt(jnp.asarray(block.weight))
+    return jnp.asarray(block.weight) * jnp.minimum(1.0, HUBER / jnp.maximum(size, 1e-12)), size

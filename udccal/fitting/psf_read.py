@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from udccal.fitting.hdr import merge_bracket
-from udccal.fitting.psf_shots import SEARCH_PX, Crop, Shots, cut_crop, stack
+from udccal.fitting.psf_shots import SEARCH_PX, Crop, Shots, cut_crop, shot_noise, stack
 from udccal.models.noise import Noise
 from udccal.models.wire import Wire, wire_values
 from udccal.sessions.schema import LedSubject, StoredStep
@@ -66,7 +66,9 @@ def without_wire(shots: Shots, wire: Wire, rows: int, columns: int) -> Shots:
     pixels = shots.offsets()[None] + shots.origin_px[:, None, None]
     gains = np.stack([np.asarray(_values(wire, p.reshape(-1, 2) * 1.0, rows, columns)) for p in pixels])
     gain = gains.reshape(shots.rate.shape)
-    return replace(shots, rate=shots.rate / gain, weight=shots.weight * gain**2)
+    return replace(
+        shots, rate=shots.rate / gain, weight=shots.weight * gain**2, noise_per_rate=shots.noise_per_rate / gain
+    )
 
 
 def _read_shot(
@@ -83,8 +85,10 @@ def _read_shot(
     merged = merge_bracket(frames, exposures, noise)
     corner = (region.x + across.start, region.y + first.start)
     full = int((merged.used == 0).sum()) >= _CLIPPED_SAMPLES and _is_clipped(frames, exposures, noise)
-    crop = None if full else cut_crop(merged, corner, (subject.x_px, subject.y_px), session.rig.camera.cfa, half)
-    return crop, full
+    if full:
+        return None, True
+    aim, slope = (subject.x_px, subject.y_px), shot_noise(merged, noise)
+    return cut_crop(merged, corner, aim, session.rig.camera.cfa, half, slope), False
 
 
 def _part(aim: float, reach: int, size: int) -> slice:

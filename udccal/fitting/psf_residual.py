@@ -220,6 +220,15 @@ def normalised_errors(
     return errors[weight > 0]
 
 
+def loss_by_shot(
+    windows: Windows, share: float, image: Float[np.ndarray, "terms 3 node_rows node_columns"]
+) -> Float[np.ndarray, " shots"]:
+    """Mean squared error of each shot's samples in units of their sigma."""
+    weight = np.asarray(windows.weight)
+    square = (np.asarray(windows.rate) - expected(windows, share, image)) ** 2 * weight
+    return square.sum(axis=(1, 2)) / np.maximum((weight > 0).sum(axis=(1, 2)), 1)
+
+
 def expected(
     windows: Windows, share: float, image: Float[np.ndarray, "terms 3 node_rows node_columns"]
 ) -> Float[np.ndarray, "shots rows columns"]:

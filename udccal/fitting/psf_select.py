@@ -12,6 +12,7 @@ from udccal.fitting.psf_free import PER_PX, fixed, image_of, movable, on_pixels,
 from udccal.fitting.psf_residual import (
     Sources,
     Windows,
+    loss_by_shot,
     make_windows,
     mismatch,
     normalised_errors,
@@ -25,8 +26,8 @@ from udccal.models.fields import polynomial_terms
 _MODEL_ERROR = 0.01
 # On top of diffraction the residual may be this fraction of the kernel nearby; free, it may be all of it.
 _BESIDE, _FREE = 0.1, 1.0
-# A higher order must lower the mismatch by this factor to be worth its coefficients.
-_WORTH = 0.9
+# A higher order must lower the held-out loss by this share, and by a standard error, to be worth its coefficients.
+_WORTH = 0.02
 # Beyond this mismatch of diffraction alone, an image without diffraction is tried too.
 _DOUBTFUL = 0.05
 _HIGHEST = 3
@@ -66,10 +67,22 @@ class _Trial:
     share: float
     sources: Sources
     mismatch: Float[np.ndarray, "3"]
+    loss: Float[np.ndarray, " shots"]
 
     @property
     def criterion(self) -> float:
+        """Minus twice the logarithm of the held-out likelihood per sample, but for a constant."""
+        return float(self.loss.mean())
+
+    @property
+    def relative_l2(self) -> float:
         return float(np.sqrt((self.mismatch**2).mean()))
+
+    def beats(self, other: _Trial) -> bool:
+        """Whether it predicts what was held out better, beyond what its pictures leave in doubt."""
+        gain = other.loss - self.loss
+        doubt = float(gain.std(ddof=1) / np.sqrt(gain.size)) if gain.size > 1 else np.inf
+        return float(gain.mean()) > max(doubt, _WORTH * other.criterion)
 
 
 @dataclass(frozen=True)
@@ -106,13 +119,13 @@ def select_field(
     test = held_out[shots.position]
     magnitude = _mean_kernel(data, sources)
     plain = _trial(data, sources, test, -1, 1.0, magnitude)
-    trials = [plain, *_rising(data, sources, test, 1.0, magnitude, plain.criterion)]
-    if plain.criterion > _DOUBTFUL:
+    trials = [plain, *_rising(data, sources, test, 1.0, magnitude, plain)]
+    if plain.relative_l2 > _DOUBTFUL:
         free = _free_sources(data, sources, magnitude)
-        trials += _rising(data, free, test, 0.0, magnitude, np.inf)
+        trials += _rising(data, free, test, 0.0, magnitude, None)
     best = trials[0]
     for trial in trials[1:]:
-        best = trial if trial.criterion < _WORTH * best.criterion else best
+        best = trial if trial.beats(best) else best
     every = np.ones(shots.count, dtype=bool)
     image = _solve(data, best.sources, every, best.degree, best.share, magnitude)
     errors = normalised_errors(data.windows(best.sources, max(best.degree, 0), best.share, every), best.share, image)
@@ -140,7 +153,12 @@ def _size(trial: _Trial, shots: Shots) -> int:
 
 
 def _rising(
-    data: _Data, sources: Sources, test: Bool[np.ndarray, " shots"], share: float, magnitude: np.ndarray, before: float
+    data: _Data,
+    sources: Sources,
+    test: Bool[np.ndarray, " shots"],
+    share: float,
+    magnitude: np.ndarray,
+    before: _Trial | None,
 ) -> list[_Trial]:
     """Degrees 0, 1, ... until one does not help; never more terms than positions to fit them to."""
     positions = len(np.unique(data.shots.position[~test]))
@@ -149,9 +167,9 @@ def _rising(
         if polynomial_terms(degree) > positions:
             break
         trials.append(_trial(data, sources, test, degree, share, magnitude))
-        if trials[-1].criterion > _WORTH * before:
+        if before is not None and not trials[-1].beats(before):
             break
-        before = trials[-1].criterion
+        before = trials[-1]
     return trials
 
 
@@ -159,10 +177,11 @@ def _trial(
     data: _Data, sources: Sources, test: Bool[np.ndarray, " shots"], degree: int, share: float, magnitude: np.ndarray
 ) -> _Trial:
     image = _solve(data, sources, ~test, degree, share, magnitude)
-    error = mismatch(data.windows(sources, max(degree, 0), share, test), share, image)
+    windows = data.windows(sources, max(degree, 0), share, test)
+    error, loss = mismatch(windows, share, image), loss_by_shot(windows, share, image)
     kind = "diffraction" if share else "free image"
     name = kind if degree < 0 else f"{kind}, residual degree {degree}" if share else f"{kind}, degree {degree}"
-    return _Trial(name, degree, share, sources, error)
+    return _Trial(name, degree, share, sources, error, loss)
 
 
 def _solve(

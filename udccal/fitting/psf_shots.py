@@ -10,6 +10,7 @@ from jaxtyping import Float, Int
 
 from udccal.cfa import channel_map
 from udccal.fitting.hdr import HdrMerge
+from udccal.models.noise import Noise
 
 # Aims that lie this close together are shifts of one field position.
 _GROUP_PX = 4.0
@@ -26,6 +27,8 @@ class Shots:
         position: index of the field position that the shot belongs to.
         disc_px: diameter of the LED's image.
         rate: e-/s; weight: 1 / sigma^2 in (e-/s)^-2, 0 where nothing is known; channel: 0, 1, 2 for R, G, B.
+        noise_per_rate: how fast sigma^2 grows with the rate, in e-/s: the sigma of a sample that noise has made
+            darker is too small, and a fit that went by it would come out too dark.
     """
 
     centre_px: Float[np.ndarray, "shots 2"]
@@ -35,6 +38,7 @@ class Shots:
     rate: Float[np.ndarray, "shots rows columns"]
     weight: Float[np.ndarray, "shots rows columns"]
     channel: Int[np.ndarray, "shots rows columns"]
+    noise_per_rate: Float[np.ndarray, "shots rows columns"]
 
     @property
     def count(self) -> int:
@@ -66,10 +70,16 @@ class Crop:
     rate: Float[np.ndarray, "rows columns"]
     weight: Float[np.ndarray, "rows columns"]
     channel: Int[np.ndarray, "rows columns"]
+    noise_per_rate: Float[np.ndarray, "rows columns"]
 
 
 def cut_crop(
-    merged: HdrMerge, corner_px: tuple[int, int], aim_px: tuple[float, float], cfa: str, half: tuple[int, int]
+    merged: HdrMerge,
+    corner_px: tuple[int, int],
+    aim_px: tuple[float, float],
+    cfa: str,
+    half: tuple[int, int],
+    noise_per_rate: Float[np.ndarray, "rows columns"] | None = None,
 ) -> Crop | None:
     """Crop of 2 * half + 1 samples (rows, columns) about the LED; what lies outside the region gets no weight.
 
@@ -79,6 +89,7 @@ def cut_crop(
         aim_px: where the LED was aimed at, on the sensor.
         cfa: pattern of the sensor.
         half: (rows, columns) to either side of the LED.
+        noise_per_rate: see ``shot_noise``; without it the merged sigma is taken as it is.
 
     Returns:
         None when no light stands out from the noise near the aim.
@@ -95,7 +106,21 @@ def cut_crop(
         rate=_window(rate, middle, half),
         weight=_window(weight, middle, half),
         channel=_window(channel_map(cfa, *rate.shape), middle, half),
+        noise_per_rate=_window(np.zeros_like(rate) if noise_per_rate is None else noise_per_rate, middle, half),
     )
+
+
+def shot_noise(merged: HdrMerge, noise: Noise) -> Float[np.ndarray, "rows columns"]:
+    """How fast a merged sample's variance grows with its rate, in (e-/s)^2 per e-/s.
+
+    Variance (r + d) u + f u^2 is that of one exposure of 1/u seconds, f being what a dark sample has; a bracket is
+    taken for the single exposure that has its variance.
+    """
+    K, dark = float(np.asarray(noise.K_DN_per_e)), float(np.asarray(noise.dark_current_e_per_s))
+    floor = float(np.asarray(noise.sigma_d_e)) ** 2 + (float(np.asarray(noise.q_DN)) / K) ** 2 / 12.0
+    light, variance = np.maximum(merged.rate_e_per_s + dark, 0.0), merged.sigma_e_per_s**2
+    slope = 2.0 * variance / (light + np.sqrt(light**2 + 4.0 * floor * variance))
+    return np.where(merged.used > 0, slope, 0.0)
 
 
 def stack(crops: list[Crop], aims_px: Float[np.ndarray, "shots 2"], disc_px: Float[np.ndarray, " shots"]) -> Shots:
@@ -108,6 +133,7 @@ def stack(crops: list[Crop], aims_px: Float[np.ndarray, "shots 2"], disc_px: Flo
         rate=np.stack([c.rate for c in crops]),
         weight=np.stack([c.weight for c in crops]),
         channel=np.stack([c.channel for c in crops]),
+        noise_per_rate=np.stack([c.noise_per_rate for c in crops]),
     )
 
 

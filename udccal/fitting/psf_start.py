@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from udccal.fitting.psf_blocks import HEAD, pack
-from udccal.fitting.psf_diffraction import Prior
+from udccal.fitting.psf_descent import Prior
 from udccal.models.diffraction import Diffraction
 from udccal.models.geometry import Geometry
 from udccal.models.wire import Wire
@@ -15,7 +15,8 @@ WAVELENGTHS_NM = np.linspace(400.0, 700.0, 13)
 _PEAKS_NM, _WIDTH_NM = (600.0, 535.0, 460.0), 45.0
 # Standard deviations of the logarithm of a spectrum: of its bend from node to node, and about its start.
 _BEND, _FREEDOM = 1.0, 5.0
-_BLUR_PX = 0.1
+# Most of what blurs is known; the rest is taken for this, give or take a factor e.
+_BLUR_PX, _BLUR_LOG = 0.1, 1.0
 # Of the rig's tolerances: what is left of them after the wire's fit, and for what is held.
 _MEASURED, HELD = 0.3, 0.05
 _PLACE_PERIODS = 0.05
@@ -62,7 +63,7 @@ def start_prior(rig: RigDescription, model: Diffraction, measured: bool) -> Prio
         tighter * panel.row_open_fraction.tolerance,
         tighter * panel.structure_thickness_mm.tolerance,
         tighter * 2.0 * rig.pupil_mm * rig.lens.f_number.tolerance / rig.lens.f_number.value,
-        _BLUR_PX,
+        _BLUR_LOG,
         *(3 * (_PLACE_PERIODS,)),
     ]
     roots = [np.eye(HEAD, theta.size) / np.maximum(np.array(sigma), 1e-6)[:, None]]

@@ -1,30 +1,35 @@
 """Dark noise by maximum likelihood of integer codes: black, dark current, sigma, Tukey-lambda shape and DSNU at once.
 
 The likelihood is that of the pair of codes one pixel gave in two frames, with the rounding inside it. Rounding is
-therefore exact where the noise is a fraction of a code, and not the usual 1/12.
+therefore exact where the noise is a fraction of a code, and not the usual 1/12; and codes that stop at 0 or at the
+converter's end are censored samples: they tell that the signal lies beyond, and no more.
 """
 
 from __future__ import annotations
 
-import functools
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int, UInt16
-from scipy.special import gammaln
 
-_MOST_CODES = 48
+from udccal.fitting.noise_density import LEAST_SHAPE, MOST_SHAPE, NORMAL_SHAPE, dark_cdf
+
+_MOST_CODES = 160
 # Share of samples from anywhere in the window (hot and blinking pixels); keeps one outlier from deciding.
 _BACKGROUND = 1e-5
-_NODES, _NODE_WEIGHTS = np.polynomial.hermite_e.hermegauss(24)
-_NODE_WEIGHTS = _NODE_WEIGHTS / _NODE_WEIGHTS.sum()
-_LEAST_SHAPE, _MOST_SHAPE = -0.1, 0.45
-PARAMETERS = ("black_DN", "dark_DN_per_s", "sigma_DN", "DSNU_DN", "lambda_read")
+# Prior on the shape, wide beside any real sensor's; it decides only where rounding hides the shape.
+_SHAPE_SIGMA = 0.3
+# Nodes of the offset's normal distribution: this far out, this many per width of the temporal noise.
+_REACH, _NODES_PER_WIDTH, _FEWEST_NODES, _MOST_NODES = 5.5, 1.6, 13, 1201
+PARAMETERS = ("black_DN", "dark_DN_per_s", "variance_DN2", "DSNU_DN2", "lambda_read")
 
 
 @dataclass(frozen=True)
 class DarkPair:
-    """A pair of dark frames reduced to the joint histogram of the two codes of each pixel."""
+    """A pair of dark frames reduced to the joint histogram of the two codes of each pixel.
+
+    The outermost edges are infinite where the codes stop there (at 0, or at the converter's end).
+    """
 
     exposure_s: float
     edges_DN: Float[np.ndarray, " codes_plus_1"]
@@ -35,13 +40,26 @@ class DarkPair:
 
 @dataclass(frozen=True)
 class DarkFit:
-    """Values in the order of ``PARAMETERS``; ``edge_gain`` is d(mean code)/d(black), 1 when rounding is white."""
+    """Values in the order of ``PARAMETERS``: variances of single samples without row noise.
+
+    ``edge_gains`` is d(mean code)/d(black) per pair: 1 when rounding is white and no code is cut off. ``deviance`` is
+    minus twice the log-likelihood of the histograms.
+    """
 
     values: Float[np.ndarray, "5"]
     cov: Float[np.ndarray, "5 5"]
-    edge_gain: float
+    edge_gains: Float[np.ndarray, " pairs"]
+    deviance: float
     converged: bool
     iterations: int
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """What is known apart from the histograms: conversion gain, and the row noise beside the read noise."""
+
+    K_DN_per_e: float
+    sigma_row_DN: float
 
 
 def dark_pair(
@@ -49,112 +67,142 @@ def dark_pair(
     second: UInt16[np.ndarray, "rows columns"],
     exposure_s: float,
     q_DN: int = 1,
+    top_code: int = 65535,
 ) -> DarkPair:
     """Joint histogram over a window of codes around the median; codes beyond it are counted as outside."""
-    low, middle, high = np.percentile(first, [2.0, 50.0, 98.0])
+    sample = first[:: max(1, first.size // 65536)]
+    low, middle, high = np.percentile(sample, [2.0, 50.0, 98.0])
     # 98th minus 2nd percentile is 4.1 sigma; 1.9 times that each side is about 7.8 sigma.
     half = int(np.ceil(1.9 * (high - low) / q_DN)) + 4
     group = max(1, int(np.ceil((2 * half + 1) / _MOST_CODES)))
-    codes = (2 * half + 1 + group - 1) // group
-    start = round(middle / q_DN) - half
-    a = (first.astype(np.int64) // q_DN - start) // group
-    b = (second.astype(np.int64) // q_DN - start) // group
-    inside = (a >= 0) & (a < codes) & (b >= 0) & (b < codes)
-    counts = np.bincount((a[inside] * codes + b[inside]).ravel(), minlength=codes * codes).reshape(codes, codes)
+    start = max(round(middle / q_DN) - half, 0)
+    codes = min((round(middle / q_DN) + half - start) // group, (top_code // q_DN - start) // group) + 1
+    # One more group takes all that lies outside the window, codes below it included: they wrap around.
+    side = codes + 1
+    index = _code_groups(first, start, group, q_DN, codes) * np.uint16(side)
+    index += _code_groups(second, start, group, q_DN, codes)
+    counts = np.bincount(index.ravel(), minlength=side * side).reshape(side, side)[:codes, :codes]
     edges = (start + group * np.arange(codes + 1) - 0.5) * q_DN
-    return DarkPair(exposure_s, edges.astype(np.float64), counts, int(inside.size - inside.sum()), first.shape[0])
+    edges[0] = -np.inf if start == 0 else edges[0]
+    edges[-1] = np.inf if edges[-1] >= top_code else edges[-1]
+    return DarkPair(exposure_s, edges.astype(np.float64), counts, int(first.size - counts.sum()), first.shape[0])
 
 
-def tukey_lambda_std(shape: float) -> float:
-    """Standard deviation of the Tukey-lambda distribution with quantile (p^l - (1-p)^l) / l."""
-    if abs(shape) < 1e-4:
-        return float(np.pi / np.sqrt(3.0))
-    ratio = np.exp(2 * gammaln(shape + 1) - gammaln(2 * shape + 2))
-    return float(np.sqrt(2.0 / shape**2 * (1.0 / (1 + 2 * shape) - ratio)))
+def _code_groups(
+    frame: UInt16[np.ndarray, "rows columns"], start: int, group: int, q_DN: int, codes: int
+) -> UInt16[np.ndarray, "rows columns"]:
+    shifted = frame // np.uint16(q_DN) if q_DN > 1 else frame
+    below = shifted < np.uint16(start) if group > 1 else None
+    shifted = shifted - np.uint16(start)
+    if group > 1:
+        shifted //= np.uint16(group)
+        # A wrapped code may come to lie inside once it is divided.
+        shifted[below] = codes
+    return np.minimum(shifted, np.uint16(codes), out=shifted)
 
 
-@functools.lru_cache(maxsize=64)
-def _standard_cdf(shape: float) -> tuple[Float[np.ndarray, " grid"], Float[np.ndarray, " grid"]]:
-    p = 1.0 / (1.0 + np.exp(-np.linspace(-24.0, 24.0, 6001)))
-    tail = 1.0 / (1.0 + np.exp(np.linspace(-24.0, 24.0, 6001)))
-    safe = shape if abs(shape) >= 1e-4 else 1e-4
-    return (p**safe - tail**safe) / safe / tukey_lambda_std(safe), p
+def centres_DN(pair: DarkPair) -> Float[np.ndarray, " codes"]:
+    """Middle of each group of codes; of a cut-off end, where its neighbours would put it."""
+    edges = pair.edges_DN
+    step = float(np.median(np.diff(edges[np.isfinite(edges)]))) if np.isfinite(edges).sum() > 1 else 1.0
+    middle = 0.5 * (edges[1:] + edges[:-1])
+    if np.isinf(edges[0]):
+        middle[0] = edges[1] - 0.5 * step
+    if np.isinf(edges[-1]):
+        middle[-1] = edges[-2] + 0.5 * step
+    return middle
 
 
-@functools.lru_cache(maxsize=1)
-def _kurtosis_table() -> tuple[Float[np.ndarray, " shapes"], Float[np.ndarray, " shapes"]]:
-    shapes = np.linspace(_LEAST_SHAPE, _MOST_SHAPE, 48)
-    p = (np.arange(100_000) + 0.5) / 100_000
-    excess = [float(np.mean(((p**s - (1 - p) ** s) / s / tukey_lambda_std(s)) ** 4)) - 3.0 for s in shapes]
-    return shapes, np.array(excess)
-
-
-def diluted_shape(shape: float, share: float) -> float:
-    """Shape with the kurtosis that remains when only ``share`` of the variance is Tukey-lambda, the rest Gaussian."""
-    shapes, excess = _kurtosis_table()
-    kurtosis = float(np.interp(shape, shapes, excess)) * share**2
-    return float(np.interp(-kurtosis, -excess, shapes))
-
-
-@dataclass(frozen=True)
-class Surroundings:
-    """What is known apart from the histograms: conversion gain, and the row noise inside the dark noise."""
-
-    K_DN_per_e: float
-    sigma_row_DN: float
+def _nodes(spread: float, width: float) -> tuple[Float[np.ndarray, " nodes"], Float[np.ndarray, " nodes"]]:
+    """Offsets in DN and their weights: evenly spaced, which for a smooth integrand is as good as any quadrature."""
+    wanted = 2 * _REACH * spread * _NODES_PER_WIDTH / max(width, 1e-9)
+    number = int(np.clip(np.ceil(wanted), _FEWEST_NODES, _MOST_NODES)) | 1
+    z = np.linspace(-_REACH, _REACH, number)
+    weights = np.exp(-0.5 * z**2)
+    return spread * z, weights / weights.sum()
 
 
 def _pair_probability(
     pair: DarkPair, values: Float[np.ndarray, "5"], known: Surroundings
 ) -> Float[np.ndarray, "codes codes"]:
-    black, per_s, sigma, spread, shape = (float(v) for v in values)
+    black, per_s, variance, spread2, shape = (float(v) for v in values)
     drift = per_s * pair.exposure_s
-    # Shot noise of the dark current: K times its DN, added to the read noise's variance.
-    width = np.sqrt(sigma**2 + known.K_DN_per_e * max(drift, 0.0))
-    share = max(sigma**2 - known.sigma_row_DN**2, 0.25 * sigma**2) / width**2
-    grid, cdf = _standard_cdf(diluted_shape(shape, share))
-    centres = black + drift + spread * _NODES
-    below = np.interp((pair.edges_DN[None, :] - centres[:, None]) / width, grid, cdf, left=0.0, right=1.0)
+    grid, cdf = dark_cdf(np.sqrt(variance), shape, known.sigma_row_DN, drift, known.K_DN_per_e)
+    # Counts of dark current widen the distribution but leave its peaks as narrow as the read noise.
+    offsets, weights = _nodes(np.sqrt(spread2), np.sqrt(variance + known.sigma_row_DN**2))
+    centres = black + drift + offsets
+    below = np.interp(pair.edges_DN[None, :] - centres[:, None], grid, cdf, left=0.0, right=1.0)
     single = np.diff(below, axis=1)
-    joint = np.einsum("n,na,nb->ab", _NODE_WEIGHTS, single, single)
+    joint = (single * weights[:, None]).T @ single
     return (1 - _BACKGROUND) * joint + _BACKGROUND / joint.size
 
 
-def _log_likelihood(pairs: tuple[DarkPair, ...], values: Float[np.ndarray, "5"], known: Surroundings) -> float:
-    return float(sum(np.sum(pair.counts * np.log(_pair_probability(pair, values, known))) for pair in pairs))
+def _deviance(pairs: tuple[DarkPair, ...], values: Float[np.ndarray, "5"], known: Surroundings) -> float:
+    likelihood = sum(float(np.sum(pair.counts * np.log(_pair_probability(pair, values, known)))) for pair in pairs)
+    return -2.0 * likelihood - 2.0 * _log_prior(values)
 
 
-def _bounded(values: Float[np.ndarray, "5"]) -> Float[np.ndarray, "5"]:
-    low = np.array([-np.inf, -np.inf, 0.02, 1e-3, _LEAST_SHAPE])
-    high = np.array([np.inf, np.inf, np.inf, np.inf, _MOST_SHAPE])
-    return np.clip(values, low, high)
+def _log_prior(values: Float[np.ndarray, "5"]) -> float:
+    return -0.5 * ((float(values[4]) - NORMAL_SHAPE) / _SHAPE_SIGMA) ** 2
+
+
+# Variances at these are those of none: three hundredths of a code, a thousandth for the offsets.
+LEAST_VARIANCE = 1e-3
+_LOW = np.array([-np.inf, -np.inf, LEAST_VARIANCE, 1e-6, LEAST_SHAPE])
+_HIGH = np.array([np.inf, np.inf, np.inf, np.inf, MOST_SHAPE])
+
+
+def _steps(pairs: tuple[DarkPair, ...], values: Float[np.ndarray, "5"]) -> Float[np.ndarray, "5"]:
+    """For slopes by differences: small beside the noise, large beside the arithmetic."""
+    width = float(np.sqrt(values[2] + 0.01))
+    longest = max(max(pair.exposure_s for pair in pairs), 1e-9)
+    variance = 2e-3 * width**2
+    return np.array([2e-3 * width, 2e-3 * width / longest, variance, max(1e-3 * values[3], 1e-4 * variance), 2e-3])
+
+
+def _slopes(
+    pair: DarkPair,
+    at: Float[np.ndarray, "codes codes"],
+    values: Float[np.ndarray, "5"],
+    steps: Float[np.ndarray, "5"],
+    known: Surroundings,
+) -> Float[np.ndarray, "5 cells"]:
+    """One-sided: the second order, which that leaves, sums to nothing in the score at the truth."""
+    slopes = []
+    for index, step in enumerate(np.diag(steps)):
+        moved = values + step if values[index] + steps[index] <= _HIGH[index] else values - step
+        rise = _pair_probability(pair, moved, known) - at
+        slopes.append(rise.ravel() / (moved[index] - values[index]))
+    return np.stack(slopes)
 
 
 def _score_and_information(
-    pairs: tuple[DarkPair, ...], values: Float[np.ndarray, "5"], known: Surroundings
+    pairs: tuple[DarkPair, ...], values: Float[np.ndarray, "5"], known: Surroundings, free: np.ndarray
 ) -> tuple[Float[np.ndarray, "5"], Float[np.ndarray, "5 5"]]:
-    step = np.array([1e-3, 1e-3, 1e-3, 1e-3, 2e-3]) * np.array([values[2], values[2], values[2], values[2], 1.0])
-    step[1] /= max(max(pair.exposure_s for pair in pairs), 1e-9)
+    steps = _steps(pairs, values)
     score, information = np.zeros(5), np.zeros((5, 5))
     for pair in pairs:
-        p = _pair_probability(pair, values, known).ravel()
-        slopes = np.stack(
-            [
-                (_pair_probability(pair, values + d, known) - _pair_probability(pair, values - d, known)).ravel()
-                for d in np.diag(step)
-            ]
-        ) / (2 * step[:, None])
-        total = pair.counts.sum()
+        joint = _pair_probability(pair, values, known)
+        slopes, p = _slopes(pair, joint, values, steps, known), joint.ravel()
         score += slopes @ (pair.counts.ravel() / p)
-        information += total * (slopes / p) @ slopes.T
-    return score, information
+        information += float(pair.counts.sum()) * (slopes / p) @ slopes.T
+    score[4] -= (values[4] - NORMAL_SHAPE) / _SHAPE_SIGMA**2
+    information[4, 4] += 1 / _SHAPE_SIGMA**2
+    return np.where(free, score, 0.0), np.where(np.outer(free, free), information, 0.0)
+
+
+def information(
+    pairs: tuple[DarkPair, ...], values: Float[np.ndarray, "5"], known: Surroundings
+) -> Float[np.ndarray, "5 5"]:
+    """Expected information on ``values`` in histograms of that many samples, for bounds; the prior's is in it."""
+    return _score_and_information(pairs, values, known, np.ones(5, bool))[1]
 
 
 def start_values(pairs: tuple[DarkPair, ...]) -> Float[np.ndarray, "5"]:
-    """Moments of the histograms: the covariance of the two codes is the spread of the offsets."""
+    """Moments of the histograms: the covariance of the two codes is the variance of the offsets."""
     times, means, variances, spreads = [], [], [], []
     for pair in pairs:
-        centres = 0.5 * (pair.edges_DN[1:] + pair.edges_DN[:-1])
+        centres = centres_DN(pair)
         share = pair.counts / max(pair.counts.sum(), 1)
         mean_a, mean_b = share.sum(axis=1) @ centres, share.sum(axis=0) @ centres
         spread = float((centres - mean_a) @ share @ (centres - mean_b))
@@ -167,57 +215,121 @@ def start_values(pairs: tuple[DarkPair, ...]) -> Float[np.ndarray, "5"]:
     norm = float(centred @ centred)
     slope = float(centred @ np.array(means)) / norm if norm > 0 else 0.0
     black = float(np.mean(means) - slope * np.mean(times))
-    sigma = np.sqrt(max(min(variances) - 1.0 / 12.0, 0.05))
-    return np.array([black, slope, sigma, np.sqrt(max(min(spreads), 0.003)), 0.12])
+    variance = max(min(variances) - 1.0 / 12.0, 0.05)
+    return np.array([black, slope, variance, max(min(spreads), 0.003), NORMAL_SHAPE])
 
 
-def fit_dark(pairs: tuple[DarkPair, ...], known: Surroundings, max_iterations: int = 40) -> DarkFit:
+def fit_dark(
+    pairs: tuple[DarkPair, ...],
+    known: Surroundings,
+    start: Float[np.ndarray, "5"] | None = None,
+    normal: bool = False,
+    max_iterations: int = 40,
+) -> DarkFit:
     """Fisher scoring with step halving on the likelihood of all pairs.
 
-    The pairs share their pixels' offsets, so the information on black and DSNU does not add up over pairs: their
-    sigmas are widened by the square root of the number of pairs. Row noise moves the mean of a whole frame; that is
-    added to the sigmas of black and dark current.
+    The pairs share their pixels' offsets, so the information on DSNU does not add up over pairs: its sigma is widened
+    by the square root of their number. Row noise in ``known`` is that of the population; the mean levels that decide
+    black and dark current carry their own weights (see ``dark_levels``).
+
+    Args:
+        pairs: the histograms.
+        known: what is known besides.
+        start: values to begin with; moments otherwise.
+        normal: hold the shape at that of normal noise.
+        max_iterations: upper bound.
     """
-    values = _bounded(start_values(pairs))
-    best = _log_likelihood(pairs, values, known)
+    values = np.clip(start_values(pairs) if start is None else start, _LOW, _HIGH)
+    one_exposure = len({pair.exposure_s for pair in pairs}) < 2
+    free = np.array([True, not one_exposure, True, True, not normal])
+    values[1] = 0.0 if one_exposure else values[1]
+    values[4] = NORMAL_SHAPE if normal else values[4]
+    best = _deviance(pairs, values, known)
     converged, iterations = False, 0
     while not converged and iterations < max_iterations:
         iterations += 1
-        score, information = _score_and_information(pairs, values, known)
-        step = _inverse(information) @ score
+        score, information = _score_and_information(pairs, values, known, free)
+        # At a bound with the score pointing outwards the bound is the answer.
+        inside = free & ~((values <= _LOW) & (score < 0)) & ~((values >= _HIGH) & (score > 0))
+        step = inverse(np.where(np.outer(inside, inside), information, 0.0)) @ np.where(inside, score, 0.0)
+        gained = 0.0
         for halving in range(12):
-            trial = _bounded(values + step * 0.5**halving)
-            value = _log_likelihood(pairs, trial, known)
-            if value >= best:
-                values, best = trial, value
+            trial = np.clip(values + step * 0.5**halving, _LOW, _HIGH)
+            deviance = _deviance(pairs, trial, known)
+            if deviance <= best:
+                gained, values, best = best - deviance, trial, deviance
                 break
-        # Half the squared step in units of sigma is what the likelihood can still gain.
-        converged = bool(score @ step < 1e-3)
-    _, information = _score_and_information(pairs, values, known)
-    widen = np.sqrt(np.array([len(pairs), 1.0, 1.0, len(pairs), 1.0]))
-    cov = _inverse(information) * np.outer(widen, widen)
-    cov[:2, :2] += _frame_shift_cov(pairs, known.sigma_row_DN)
-    return DarkFit(values, cov, _edge_gain(pairs, values, known), converged, iterations)
+        # The squared step in units of sigma is twice what the likelihood can still gain.
+        converged = bool(score[inside] @ step[inside] < 1e-3) or gained < 1e-4
+    _, information = _score_and_information(pairs, values, known, free)
+    information = _least(information, pairs, free)
+    widen = np.sqrt(np.array([1.0, 1.0, 1.0, len(pairs), 1.0]))
+    cov = inverse(information) * np.outer(widen, widen)
+    return DarkFit(values, cov, _edge_gains(pairs, values, known), best, converged, iterations)
 
 
-def _frame_shift_cov(pairs: tuple[DarkPair, ...], sigma_row: float) -> Float[np.ndarray, "2 2"]:
-    design = np.array([[1.0, pair.exposure_s] for pair in pairs])
-    weight = np.array([2.0 * pair.rows for pair in pairs]) / max(sigma_row, 1e-6) ** 2
-    return np.linalg.pinv(design.T @ (design * weight[:, None]), hermitian=True)
+def _code_step(pair: DarkPair) -> float:
+    return float(np.min(np.diff(pair.edges_DN)))
 
 
-def _inverse(information: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
-    root = np.sqrt(np.maximum(np.diag(information), 1e-300))
+def _least(
+    information: Float[np.ndarray, "5 5"], pairs: tuple[DarkPair, ...], free: np.ndarray
+) -> Float[np.ndarray, "5 5"]:
+    """What rounding hides is no larger than rounding: that much is known of codes that are all the same."""
+    hidden = _code_step(pairs[0]) ** 2 / 12.0
+    longest = max(max(pair.exposure_s for pair in pairs), 1e-9)
+    least = np.array([1 / hidden, longest**2 / hidden, 1 / hidden**2, 1 / hidden**2, 1 / _SHAPE_SIGMA**2])
+    found = information.copy()
+    for i in np.flatnonzero(free & (np.diag(information) < least)):
+        found[i, :] = found[:, i] = 0.0
+        found[i, i] = least[i]
+    return found
+
+
+def inverse(information: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
+    """Of a symmetric matrix of very unlike scales; rows and columns without information come back as zero."""
+    root = np.sqrt(np.maximum(np.diag(information), 0.0))
+    root = np.where(root > 1e-150, root, np.inf)
     outer = np.outer(root, root)
-    return np.linalg.pinv(information / outer, rcond=1e-10) / outer
+    return np.linalg.pinv(information / outer, rcond=1e-12, hermitian=True) / outer
 
 
-def _edge_gain(pairs: tuple[DarkPair, ...], values: Float[np.ndarray, "5"], known: Surroundings) -> float:
-    """Root mean square over the pairs, as row noise is measured over all of them."""
-    step = np.array([0.01 * values[2], 0.0, 0.0, 0.0, 0.0])
+def dark_levels(
+    pairs: tuple[DarkPair, ...], fit: DarkFit, known: Surroundings
+) -> tuple[Float[np.ndarray, " pairs"], Float[np.ndarray, " pairs"]]:
+    """Mean of each pair (censoring and rounding undone) and the variance of its temporal noise, row noise included.
+
+    One scoring step per pair from the common fit; the offsets' share of the variance is the same in every pair and
+    does not count here.
+    """
+    means, variances = [], []
+    steps = _steps(pairs, fit.values)
+    for pair in pairs:
+        joint = _pair_probability(pair, fit.values, known)
+        p = joint.ravel()
+        moved = fit.values + np.array([steps[0], 0.0, 0.0, 0.0, 0.0])
+        slope = (_pair_probability(pair, moved, known) - joint).ravel() / steps[0]
+        total = float(pair.counts.sum())
+        information = total * float((slope / p) @ slope)
+        score = float(slope @ (pair.counts.ravel() / p))
+        # Where all codes are one code, the level is known to rounding alone.
+        blind = _code_step(pair) ** 2 / 12.0
+        if information * blind < 1:
+            means.append(fit.values[0] + fit.values[1] * pair.exposure_s)
+            variances.append(blind)
+            continue
+        means.append(fit.values[0] + fit.values[1] * pair.exposure_s + score / information)
+        temporal = max(1 / information - fit.values[3] / total, 0.05 / information)
+        variances.append(temporal + known.sigma_row_DN**2 / (2 * pair.rows))
+    return np.array(means), np.array(variances)
+
+
+def _edge_gains(
+    pairs: tuple[DarkPair, ...], values: Float[np.ndarray, "5"], known: Surroundings
+) -> Float[np.ndarray, " pairs"]:
+    step = np.array([0.01 * np.sqrt(values[2]), 0.0, 0.0, 0.0, 0.0])
     gains = []
     for pair in pairs:
-        centres = 0.5 * (pair.edges_DN[1:] + pair.edges_DN[:-1])
         rise = _pair_probability(pair, values + step, known) - _pair_probability(pair, values - step, known)
-        gains.append(float(rise.sum(axis=1) @ centres / (2 * step[0])))
-    return float(np.sqrt(np.mean(np.square(gains))))
+        gains.append(float(rise.sum(axis=1) @ centres_DN(pair) / (2 * step[0])))
+    return np.array(gains)

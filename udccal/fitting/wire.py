@@ -1,55 +1,57 @@
-"""Wire fit: from the average of flats to a smooth, noise-free map of the panel's modulation and the shading."""
+"""Wire fit: from the average of flats to a smooth, noise-free map of the panel's modulation and the shading.
+
+Maximum a posteriori with the rig description as prior: every pixel weighs by the variance that its expected signal
+brings (shot, read and quantisation noise over the frames, PRNU), pixels that clip by the model are left out, outliers
+are listed. A search on few pixels is followed by one joint fit of shape and fields on many.
+"""
 
 from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import final
 
 import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Float
 
-from udccal.fitting.result import Diagnostic, Estimate, FitResult, FitStatus
-from udccal.fitting.wire_basis import Pixels, accumulate, residuals, sample_pixels
-from udccal.fitting.wire_harmonics import WireStart, full_basis, plain_basis, possible_harmonics, wire_start
-from udccal.fitting.wire_phase import (
-    LEAST_GAIN,
-    PhaseFit,
-    add_increment,
-    fit_phase,
-    ideal_wire,
-    reject_outliers,
-    with_harmonics,
-)
-from udccal.fitting.wire_select import Selection, select
-from udccal.models.geometry import Geometry, tilt_rad
+from udccal.fitting.result import FitResult, FitStatus
+from udccal.fitting.wire_basis import sample_pixels
+from udccal.fitting.wire_harmonics import WireStart, full_basis, possible_harmonics, wire_start
+from udccal.fitting.wire_joint import fit_joint, settle
+from udccal.fitting.wire_misfit import misfit
+from udccal.fitting.wire_noise import FlatNoise, flat_noise, judge, site_numbers
+from udccal.fitting.wire_phase import fit_phase
+from udccal.fitting.wire_result import wire_result
+from udccal.fitting.wire_scan import ideal_wire
+from udccal.fitting.wire_sigma import MapSigma, map_sigma
+from udccal.models.geometry import Geometry
 from udccal.models.noise import Noise
-from udccal.models.wire import Wire, modulation, panel_rotation, slopes, wire_map, wire_values
+from udccal.models.wire import Wire, wire_map, wire_values
 from udccal.numerics import in_float64
 from udccal.sessions.store import Session
 
-# Of the pixels that the fields are fitted to: so many for the search of the phase, and for its fit.
+# Of the pixels that the joint fit has: so many for the search of the phase, and for its fit.
 SEARCH_SHARE, PHASE_SHARE = 1 / 15, 1 / 6
 PHASE_HARMONICS = 24
-SHAPE_NAMES = (
-    "rotation_x_deg",
-    "rotation_y_deg",
-    "rotation_z_deg",
-    "standoff_per_pitch",
-    "offset_x",
-    "offset_y",
-    "pupil_per_pitch",
-    "row_open",
-    "column_open",
-    "depth_per_pitch",
-)
-SHAPE_UNITS = ("deg", "deg", "deg", "1", "period", "period", "1", "1", "1", "1")
 # More samples than this gain little: the map's sigma is PRNU sqrt(parameters / samples).
 FIELD_SAMPLES = 300_000
 _LEAST_SAMPLES = 4000
-_LEAST_SIGNAL_TO_NOISE = 3.0
-_MOST_SATURATED = 0.01
-# Structure that the model lacks, as strong as shot noise and PRNU together.
-_WORST_CHI2 = 2.0
+# Of one pixel of the average; there are thousands.
+_LEAST_SIGNAL_TO_NOISE = 1.0
+_MOST_SATURATED = 0.05
+# Single frames must stay so many sigma below saturation, or their average is bent.
+_HEADROOM = 5.0
 _MEAN_GRID = (192, 256)
+
+
+@final
+@dataclass(frozen=True)
+class WireFit:
+    """The fitted term, and how sure its map is at any pixel; none where the fit failed."""
+
+    result: FitResult[Wire]
+    sigma: MapSigma | None
 
 
 def fit_wire(session: Session, noise: Noise, geometry: Geometry, field_samples: int = FIELD_SAMPLES) -> FitResult[Wire]:
@@ -59,23 +61,25 @@ def fit_wire(session: Session, noise: Noise, geometry: Geometry, field_samples: 
         session: holds both averages at one exposure.
         noise: for saturation and PRNU.
         geometry: where the rays go.
-        field_samples: pixels used for the fields; time grows with it, the map's sigma falls with its square root.
+        field_samples: pixels of the joint fit; time grows with it, the map's sigma falls with its square root.
 
     Raises:
         SessionError: when a file of the session is missing or damaged.
     """
     flat = session.average(session.step("wire/flat").captures[0])
     dark = session.average(session.step("wire/dark").captures[0])
-    clipped = float(np.mean(flat.mean >= 0.98 * float(np.asarray(noise.saturation_DN))))
+    saturation = float(np.asarray(noise.saturation_DN))
+    clipped = float(np.mean(flat.mean >= 0.98 * saturation))
     start = wire_start(session.rig)
     if clipped > _MOST_SATURATED:
         return _failed(geometry, start, FitStatus.SATURATED, f"{100 * clipped:.1f} % of the flat is clipped.")
     variance = flat.variance / flat.frames + dark.variance / dark.frames
+    headroom = saturation - float(np.mean(dark.mean))
+    clip = headroom - _HEADROOM * np.sqrt(max(headroom * float(np.asarray(noise.K_DN_per_e)), 0.0))
     prnu = float(np.asarray(noise.PRNU1288))
-    return fit_wire_map(flat.mean - dark.mean, variance, geometry, start, prnu, field_samples)
+    return fit_wire_map(flat.mean - dark.mean, variance, geometry, start, prnu, field_samples, clip)
 
 
-@in_float64
 def fit_wire_map(
     signal: Float[np.ndarray, "rows columns"],
     variance: Float[np.ndarray, "rows columns"],
@@ -83,40 +87,89 @@ def fit_wire_map(
     start: WireStart,
     prnu: float,
     field_samples: int = FIELD_SAMPLES,
+    clip: float = np.inf,
+    all_pixels: bool = False,
 ) -> FitResult[Wire]:
+    """The result of ``fit_wire_and_sigma``, whose arguments these are."""
+    return fit_wire_and_sigma(signal, variance, geometry, start, prnu, field_samples, clip, all_pixels).result
+
+
+@in_float64
+def fit_wire_and_sigma(
+    signal: Float[np.ndarray, "rows columns"],
+    variance: Float[np.ndarray, "rows columns"],
+    geometry: Geometry,
+    start: WireStart,
+    prnu: float,
+    field_samples: int = FIELD_SAMPLES,
+    clip: float = np.inf,
+    all_pixels: bool = False,
+) -> WireFit:
     """Fit the wire to an averaged flat.
 
     Args:
         signal: flat minus dark, in any linear unit; colours need not be balanced.
-        variance: of ``signal`` itself (after averaging), in its unit squared; PRNU not included.
+        variance: of ``signal`` itself (after averaging), in its unit squared; PRNU not included. It is smoothed to a
+            straight line against the signal before it weighs anything.
         geometry: where the rays go.
-        start: from the rig description.
+        start: from the rig description; its tolerances are the prior.
         prnu: relative pixel-to-pixel response, added to the variance.
-        field_samples: pixels used for the amplitude fields; the phase is fitted to a sixth of them.
+        field_samples: pixels of the joint fit; the search makes do with a part of them.
+        clip: signal from which on single frames clip; pixels that the model puts there are left out.
+        all_pixels: take a last step with every pixel of the sensor, in some ten times the time.
     """
-    values, relative_variance = _balanced(signal, variance, prnu)
-    if values is None or float(np.median(values / np.sqrt(relative_variance))) < _LEAST_SIGNAL_TO_NOISE:
-        return _failed(geometry, start, FitStatus.TOO_DARK, f"The flat's median is {float(np.median(signal)):.3g}.")
-    if values.size < _LEAST_SAMPLES:
-        return _failed(geometry, start, FitStatus.TOO_FEW_DATA, f"There are {values.size} pixels.")
-    few, coarse, pixels = (
-        sample_pixels(values, relative_variance, geometry, _odd_step(values.size, samples))
-        for samples in (int(SEARCH_SHARE * field_samples), int(PHASE_SHARE * field_samples), field_samples)
+    means = _site_means(signal, clip)
+    if not (np.isfinite(means).all() and (means > 0).all()):
+        if not np.isfinite(means).all():
+            note = "All of a CFA site is clipped, or no number; expose shorter."
+            return WireFit(_failed(geometry, start, FitStatus.SATURATED, note), None)
+        return WireFit(_failed(geometry, start, FitStatus.TOO_DARK, "A CFA site has no light; check the lamp."), None)
+    rows, columns = signal.shape
+    sites = site_numbers(rows, columns)
+    values = signal / means[sites]
+    noise = flat_noise(values, variance, means, prnu, clip)
+    if signal.size < _LEAST_SAMPLES:
+        note = f"There are {signal.size} pixels; use a larger region of the sensor."
+        return WireFit(_failed(geometry, start, FitStatus.TOO_FEW_DATA, note), None)
+    expected = np.sqrt(noise.variance(np.arange(4), np.ones(4)))
+    if float(np.min(1 / expected)) < _LEAST_SIGNAL_TO_NOISE:
+        note = f"A pixel's noise is {float(expected.max()):.2g} of its signal. Average more frames, or expose longer."
+        return WireFit(_failed(geometry, start, FitStatus.TOO_DARK, note), None)
+    return _fitted(values, noise, geometry, start, field_samples, all_pixels)
+
+
+def _fitted(
+    values: Float[np.ndarray, "rows columns"],
+    noise: FlatNoise,
+    geometry: Geometry,
+    start: WireStart,
+    field_samples: int,
+    all_pixels: bool,
+) -> WireFit:
+    sites = site_numbers(*values.shape)
+    variance = noise.variance(sites, np.ones(values.shape))
+    # To begin with, pixels that clip are left out by their own values; later, by the model's.
+    variance = np.where(values < noise.clip[sites], variance, 0.0)
+    step = _odd_step(values.size, field_samples)
+    few, coarse = (
+        sample_pixels(values, variance, geometry, _odd_step(values.size, max(int(share * field_samples), 1)))
+        for share in (SEARCH_SHARE, PHASE_SHARE)
     )
     harmonics, sizes = possible_harmonics(start)
-    phase = fit_phase(geometry, start, few, coarse, harmonics, PHASE_HARMONICS)
-    present = phase.gain_in_chi2 >= LEAST_GAIN
-    drawn = int(np.count_nonzero(pixels.weight))
-    pixels = reject_outliers(phase.wire, phase.gains, pixels)
-    wire = with_harmonics(phase.wire, harmonics if present else harmonics[:0], pixels)
-    basis = full_basis(sizes, phase.basis) if present else plain_basis()
-    normal = accumulate(wire, phase.gains, pixels, basis)
-    chosen = select(normal.matrix, normal.right, normal.power, normal.samples, basis.groups)
-    wire, gains = add_increment(wire, phase.gains, basis, chosen.values)
-    coarse = reject_outliers(wire, gains, coarse)
-    residual = residuals(wire, gains, coarse)[coarse.weight > 0]
-    wire = _mean_one(_trimmed(wire), values.shape)
-    return _result(wire, residual, phase, chosen, pixels, drawn, present)
+    phase = fit_phase(geometry, start, noise, few, coarse, harmonics, PHASE_HARMONICS)
+    basis = full_basis(sizes if phase.present else sizes[:0], phase.basis)
+    joint = fit_joint(phase, sample_pixels(values, variance, geometry, step), noise, basis, phase.wire)
+    if all_pixels and step > 1:
+        every = sample_pixels(values, variance, geometry, 1)
+        joint, step = settle(phase, joint.wire, joint.gains, every, noise, joint.basis, joint.candidates), 1
+    wire = _mean_one(joint.wire, values.shape)
+    sigma = map_sigma(joint, wire, *values.shape)
+    # In steps of three, for a sample of all CFA sites that the fit has not seen.
+    unseen = sample_pixels(values, variance, geometry, 3 * step, step // 2) if step > 1 else joint.judged.pixels
+    found = misfit(joint, judge(joint.wire, joint.gains, unseen, noise), sigma.rms(), held_out=step > 1)
+    sigma = replace(sigma, model=found.by_tile)
+    term = _trimmed(wire) if phase.present else _bare(wire)
+    return WireFit(wire_result(phase, joint, found, sigma, term, values.size), sigma)
 
 
 @in_float64
@@ -130,19 +183,14 @@ def _odd_step(pixels: int, samples: int) -> int:
     return step + 1 - step % 2
 
 
-def _balanced(
-    signal: Float[np.ndarray, "rows columns"], variance: Float[np.ndarray, "rows columns"], prnu: float
-) -> tuple[Float[np.ndarray, "rows columns"] | None, Float[np.ndarray, "rows columns"]]:
-    """Each CFA site divided by its mean; the variance relative to that, PRNU added."""
-    values, relative = signal.astype(np.float64), variance.astype(np.float64)
-    for row in (0, 1):
-        for column in (0, 1):
-            mean = float(values[row::2, column::2].mean())
-            if mean <= 0:
-                return None, relative
-            values[row::2, column::2] /= mean
-            relative[row::2, column::2] /= mean**2
-    return values, relative + (max(prnu, 1e-5) * np.maximum(values, 0.05)) ** 2
+def _site_means(signal: Float[np.ndarray, "rows columns"], clip: float) -> Float[np.ndarray, "4"]:
+    """Of what is neither clipped nor not a number; not a number where nothing is left."""
+    means = []
+    for k in range(4):
+        site = signal[k // 2 :: 2, k % 2 :: 2]
+        good = site[np.isfinite(site) & (site < clip)]
+        means.append(float(good.mean(dtype=np.float64)) if good.size else np.nan)
+    return np.array(means)
 
 
 def _trimmed(wire: Wire) -> Wire:
@@ -150,6 +198,12 @@ def _trimmed(wire: Wire) -> Wire:
     used = np.flatnonzero(np.any(np.asarray(wire.fields) != 0, axis=(0, 1, 2)))
     count = int(used.max()) + 1 if used.size else 1
     return eqx.tree_at(lambda w: w.fields, wire, np.asarray(wire.fields)[..., :count])
+
+
+def _bare(wire: Wire) -> Wire:
+    """Without harmonics: an absent panel costs nothing later."""
+    leaves = (np.zeros((0, 2)), np.zeros((0, 2)), np.zeros((0, 2, 2, 1)), np.zeros((0, 2, 1, 1)))
+    return eqx.tree_at(lambda w: (w.harmonics, w.frequency, w.fields, w.amplitudes), wire, leaves)
 
 
 def _mean_one(wire: Wire, shape: tuple[int, ...]) -> Wire:
@@ -163,68 +217,6 @@ def _mean_one(wire: Wire, shape: tuple[int, ...]) -> Wire:
 
 
 _values = jax.jit(wire_values, static_argnums=(2, 3))
-_modulation = jax.jit(lambda wire, ideal, scaled: modulation(wire, slopes(wire, ideal), scaled))
-
-
-def _result(
-    wire: Wire,
-    residual: Float[np.ndarray, " n"],
-    phase: PhaseFit,
-    chosen: Selection,
-    pixels: Pixels,
-    drawn: int,
-    present: bool,
-) -> FitResult[Wire]:
-    used = int(np.count_nonzero(pixels.weight))
-    spread = float(np.sqrt(np.mean(residual**2)))
-    tilt = float(np.rad2deg(np.arcsin(np.asarray(panel_rotation(wire))[1, 2])))
-    few = np.s_[:: max(1, len(pixels.ideal) // 16_384)]
-    waves = np.asarray(_modulation(wire, pixels.ideal[few][:16_384], pixels.scaled[few][:16_384]))
-    sigma = spread * float(np.sqrt(chosen.keep.sum() / max(used, 1) + len(phase.cov) / max(residual.size, 1)))
-    status = FitStatus.CONVERGED if phase.converged else FitStatus.NOT_CONVERGED
-    notes: tuple[str, ...] = ("cov covers the shape parameters; all coefficients show in wire_map_rms_sigma.",)
-    if not present:
-        status, notes = FitStatus.ABSENT, ("No modulation by rows is visible; the map is the shading alone.",)
-    if chosen.variance > _WORST_CHI2:
-        status = FitStatus.POOR_FIT
-    estimates, cov = _estimates(wire, phase) if present else ((), np.zeros((0, 0)))
-    return FitResult(
-        term=wire,
-        status=status,
-        estimates=estimates,
-        cov=cov,
-        chi2_dof=chosen.variance,
-        samples=used,
-        candidates=chosen.candidates,
-        diagnostics=(
-            Diagnostic("wire_map_rms_sigma", 100 * sigma, "%"),
-            Diagnostic("residual_rms", 100 * spread, "%"),
-            Diagnostic("modulation_peak_to_peak", 100 * float(np.ptp(waves)), "%"),
-            Diagnostic("harmonics", float(np.shape(wire.harmonics)[0]), "1"),
-            Diagnostic("parameters", float(chosen.keep.sum()), "1"),
-            Diagnostic("pixels_left_out", float(drawn - used), "1"),
-            Diagnostic("gain_in_chi2", phase.gain_in_chi2, "1"),
-            Diagnostic("tilt_by_wire", tilt, "deg"),
-            Diagnostic("tilt_by_wire_minus_geometry", tilt - float(np.rad2deg(tilt_rad(wire.geometry))), "deg"),
-            Diagnostic("iterations", float(phase.iterations), "1"),
-        ),
-        notes=notes,
-    )
-
-
-def _estimates(wire: Wire, phase: PhaseFit) -> tuple[tuple[Estimate, ...], Float[np.ndarray, "10 10"]]:
-    # The fit's own parameters are radians and, for stand-off and pupil, logarithms.
-    unit = np.ones(10)
-    unit[:3] = 180 / np.pi
-    unit[3], unit[6] = float(np.asarray(wire.standoff_per_pitch)), float(np.asarray(wire.pupil_per_pitch))
-    cov = phase.cov * np.outer(unit, unit)
-    shape = (wire.standoff_per_pitch, *np.mod(wire.offset, 1.0), wire.pupil_per_pitch)
-    found = np.array([*np.rad2deg(wire.rotation), *shape, wire.row_open, wire.column_open, wire.depth_per_pitch])
-    estimates = tuple(
-        Estimate(name, float(value), float(np.sqrt(variance)), unit_name)
-        for name, value, variance, unit_name in zip(SHAPE_NAMES, found, np.diag(cov), SHAPE_UNITS, strict=True)
-    )
-    return estimates, cov
 
 
 def _failed(geometry: Geometry, start: WireStart, status: FitStatus, note: str) -> FitResult[Wire]:

@@ -1,4 +1,4 @@
-"""Which harmonics and degrees the data support: backward elimination by the Bayesian information criterion."""
+"""Which harmonics and degrees the data support, by the Bayesian information criterion: backward, then forward."""
 
 from __future__ import annotations
 
@@ -12,6 +12,8 @@ from udccal.fitting.result import Candidate
 _ROUNDS = 24
 # In each round the weaker half of the groups that do not pay for themselves goes; the rest is judged again.
 _SHARE = 0.5
+# Of a dropped column, the share that the kept ones cannot say; less is rounding.
+_LEAST_NEW = 1e-8
 
 
 @dataclass(frozen=True)
@@ -31,7 +33,7 @@ def select(
     samples: int,
     groups: Int[np.ndarray, " all"],
 ) -> Selection:
-    """Drop groups of columns while that lowers the criterion; group -1 stays.
+    """Drop groups of columns while that lowers the criterion, and take back what was dropped in error; -1 stays.
 
     A group of k columns pays for itself when leaving it out raises chi-squared, in units of the residual variance of
     the full model (so that PRNU counts as noise), by more than k ln(samples).
@@ -48,9 +50,23 @@ def select(
             keep &= groups != group
         values, inverse = _solve(matrix, right, keep)
         tried.append((keep.copy(), values, _criterion(power, right, values, keep, variance, samples)))
+    eliminated = len(tried)
+    keep = tried[int(np.argmin([criterion for _, _, criterion in tried]))][0].copy()
+    for _ in range(_ROUNDS):
+        missed = _missed_group(matrix, right, groups, keep, variance, samples)
+        if missed is None:
+            break
+        keep |= groups == missed
+        values, inverse = _solve(matrix, right, keep)
+        tried.append((keep.copy(), values, _criterion(power, right, values, keep, variance, samples)))
     best = int(np.argmin([criterion for _, _, criterion in tried]))
     candidates = tuple(
-        Candidate(f"elimination round {i}", int(kept.sum()), float(criterion), i == best)
+        Candidate(
+            f"elimination round {i}" if i < eliminated else f"addition {i - eliminated + 1}",
+            int(kept.sum()),
+            float(criterion),
+            i == best,
+        )
         for i, (kept, _, criterion) in enumerate(tried)
     )
     keep, values, _ = tried[best]
@@ -103,3 +119,29 @@ def _weak_groups(
         if margin < 0:
             weak.append((margin / len(inside), int(group)))
     return [group for _, group in sorted(weak)]
+
+
+def _missed_group(
+    matrix: Float[np.ndarray, "all all"],
+    right: Float[np.ndarray, " all"],
+    groups: Int[np.ndarray, " all"],
+    keep: Bool[np.ndarray, " all"],
+    variance: float,
+    samples: int,
+) -> int | None:
+    """The dropped group whose return would lower the criterion most; rounds of many groups may drop too much."""
+    values, inverse = _solve(matrix, right, keep)
+    left = right - matrix @ values
+    found, best = None, 0.0
+    for group in np.unique(groups[~keep]):
+        inside = groups == group
+        shared = matrix[np.ix_(inside, keep)]
+        own = matrix[np.ix_(inside, inside)] - shared @ inverse @ shared.T
+        scale = np.sqrt(np.maximum(np.diag(matrix)[inside], 1e-300))
+        eigen, vectors = np.linalg.eigh(own / np.outer(scale, scale))
+        seen = eigen > _LEAST_NEW
+        gain = float(np.sum((vectors.T @ (left[inside] / scale))[seen] ** 2 / eigen[seen])) / variance
+        margin = gain - inside.sum() * np.log(samples)
+        if margin > best:
+            found, best = int(group), margin
+    return found

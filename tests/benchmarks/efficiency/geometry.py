@@ -1,0 +1,151 @@
+"""Geometry from a session-like set of boards, over realisations of the corners' noise.
+
+Eleven views of 48 corners, one of them parallel to the panel, a lens with four distortion coefficients of visible size
+and corners whose sigma differ by a factor of three. Two kinds of rays are followed: fixed to the panel, as restoration
+needs them, and fixed to nothing, that is after the best common rotation, as lenses are compared.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from tests.benchmarks.efficiency.trials import Trials
+from tests.fitting.boards import Sight, sight
+from udccal.fitting.bundle import CalibratedViews, Gauge, calibrate_views
+from udccal.fitting.bundle_projection import field_grid
+from udccal.fitting.corners import board_points_mm
+from udccal.fitting.geometry import fit_views, projection_sigma_px
+from udccal.fitting.information import cramer_rao, fisher_information
+from udccal.fitting.result import FitResult
+from udccal.models.geometry import Geometry, project, rotation_matrix
+from udccal.numerics import in_float64
+
+_REALISATIONS = 400
+_NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "tilt_deg", "roll_deg", "yaw_deg")
+# Fractions of the picture's width and height.
+_FIELD = np.array([[0.5, 0.5], [0.05, 0.05], [0.95, 0.1], [0.1, 0.9], [0.75, 0.7]])
+# A corner outside the picture tells nothing.
+_UNSEEN_PX2 = 1e12
+_START = Geometry(np.full(2, 850.0), np.array([511.5, 383.5]), np.zeros(5), np.zeros(3), np.zeros(3))
+
+
+def corners_seen(
+    x: Float[Array, " n"], board: Float[Array, "corners 3"], variance: Float[Array, " samples"]
+) -> tuple[Float[Array, " samples"], Float[Array, " samples"]]:
+    """Mean and variance of all coordinates; ``x`` is (fx, fy, cx, cy, k1, k2, p1, p2) and the poses."""
+    camera = _camera(x)
+
+    def one(pose: Float[Array, "6"]) -> Float[Array, "corners 2"]:
+        return project(camera, board @ rotation_matrix(pose[:3]).T + pose[3:])
+
+    return jax.vmap(one)(x[8:].reshape(-1, 6)).ravel(), variance
+
+
+def _camera(x: Float[Array, " n"]) -> Geometry:
+    bend = jnp.concatenate([x[4:8], jnp.zeros(1)])
+    return Geometry(x[:2], x[2:4], bend, jnp.zeros(3), jnp.zeros(3))
+
+
+def _angles_deg(x: Float[Array, " n"]) -> Float[Array, "3"]:
+    """(tilt, roll, yaw) of the camera against the parallel board, the first."""
+    panel_camera = rotation_matrix(x[8:11]).T
+    tilt, roll = jnp.arcsin(panel_camera[1, 2]), jnp.arctan2(panel_camera[1, 0], panel_camera[1, 1])
+    return jnp.rad2deg(jnp.stack([tilt, roll, jnp.arctan2(panel_camera[0, 2], panel_camera[2, 2])]))
+
+
+def _landed(x: Float[Array, " n"], directions: Float[Array, "rays 3"]) -> Float[Array, " coordinates"]:
+    """Where directions fixed to the parallel board land."""
+    return project(_camera(x), directions @ rotation_matrix(x[8:11]).T).ravel()
+
+
+def _lens_alone(x: Float[Array, " n"], rays: Float[Array, "rays 3"]) -> Float[Array, " coordinates"]:
+    """Where rays fixed to the camera land."""
+    return project(_camera(x), rays).ravel()
+
+
+@in_float64
+def trials(share: float = 1.0) -> list[Trials]:
+    """Realisations of the intrinsics, the mounting and where rays land."""
+    scene, count = sight(views=11), max(int(_REALISATIONS * share), 20)
+    truth = np.concatenate([scene.camera.focal, scene.camera.centre, scene.camera.distortion[:4], scene.poses.ravel()])
+    board = board_points_mm(scene.spec)
+    variance = np.repeat(np.where(scene.seen(), scene.sigma_px**2, _UNSEEN_PX2).ravel(), 2)
+    information = fisher_information(corners_seen, truth, board, variance)
+    pixels = _FIELD * np.array(scene.size)
+    rays = _rays(scene, pixels)
+    turned = rays @ np.asarray(rotation_matrix(scene.poses[0, :3]))
+    slopes = np.vstack([np.eye(len(truth))[:8], jax.jacfwd(_angles_deg)(truth)])
+    bound = cramer_rao(information, slopes)
+    by_panel = cramer_rao(information, np.asarray(jax.jacfwd(_landed)(truth, turned)))
+    grid = field_grid(scene.size)
+    grid_rays = _rays(scene, grid)
+    aligned = cramer_rao(information, _without_turn(np.asarray(jax.jacfwd(_lens_alone)(truth, grid_rays)), scene, grid))
+    values = np.concatenate([truth[:8], np.asarray(_angles_deg(truth))])
+    found: list[list[np.ndarray]] = [[], [], [], [], [], []]
+    rng = np.random.default_rng(4)
+    for _ in range(count):
+        views = scene.views(rng)
+        result = fit_views(views, _START, scene.size).or_raise("geometry")
+        ids = [view.corners.ids for view in views]
+        sigmas = [scene.sigma_px[k, seen] for k, seen in enumerate(ids)]
+        bundle = calibrate_views([board[i] for i in ids], [v.corners.xy for v in views], scene.size, None, sigmas)
+        parts = (
+            *_parameters(result, values),
+            *_panel_rays(result, turned, pixels),
+            *_lens_rays(bundle, grid_rays, grid),
+        )
+        for kept, part in zip(found, parts, strict=True):
+            kept.append(part)
+    error, sigma, ray_error, ray_sigma, lens_error, lens_sigma = (np.array(part) for part in found)
+    wide = np.broadcast_to(bound, error.shape)
+    named = [Trials(f"geometry/{name}", error[:, [k]], sigma[:, [k]], wide[:, [k]]) for k, name in enumerate(_NAMES)]
+    return [
+        *named,
+        Trials("geometry/ray of the panel", ray_error, ray_sigma, np.broadcast_to(by_panel, ray_error.shape)),
+        Trials("geometry/ray of the lens", lens_error, lens_sigma, np.broadcast_to(aligned, lens_error.shape)),
+    ]
+
+
+def _rays(scene: Sight, pixels: Float[np.ndarray, "rays 2"]) -> Float[np.ndarray, "rays 3"]:
+    """Through pixels, in camera coordinates, by Newton's method on the truth."""
+    ideal = (pixels - scene.camera.centre) / scene.camera.focal
+    for _ in range(40):
+        rays = np.concatenate([ideal, np.ones((len(ideal), 1))], axis=1)
+        ideal = ideal - (np.asarray(project(scene.camera, rays)) - pixels) / scene.camera.focal
+    return np.concatenate([ideal, np.ones((len(ideal), 1))], axis=1)
+
+
+def _turns(camera: Geometry, rays: Float[np.ndarray, "rays 3"]) -> Float[np.ndarray, "coordinates 3"]:
+    """How the rays' places move with a small rotation."""
+    return np.asarray(jax.jacfwd(lambda w: project(camera, rays @ rotation_matrix(w).T).ravel())(np.zeros(3)))
+
+
+def _without_turn(slopes: np.ndarray, scene: Sight, grid: np.ndarray) -> np.ndarray:
+    """Less what a rotation over the grid can undo."""
+    turns = _turns(scene.camera, _rays(scene, grid))
+    return slopes - turns @ np.linalg.lstsq(turns, slopes, rcond=None)[0]
+
+
+def _parameters(result: FitResult[Geometry], truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    estimates = [result.estimate(name) for name in _NAMES]
+    return np.array([e.value for e in estimates]) - truth, np.array([e.sigma for e in estimates])
+
+
+def _panel_rays(result: FitResult[Geometry], turned: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    seen = np.asarray(project(result.term, turned @ np.asarray(rotation_matrix(result.term.rotation))))
+    return (seen - pixels).ravel(), projection_sigma_px(result, seen).ravel()
+
+
+def _lens_rays(bundle: CalibratedViews, rays: np.ndarray, grid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    camera = Geometry(bundle.focal, bundle.centre, bundle.distortion, np.zeros(3), np.zeros(3))
+    turn = np.zeros(3)
+    for _ in range(4):
+        now = rays @ np.asarray(rotation_matrix(turn)).T
+        error = (np.asarray(project(camera, now)) - grid).ravel()
+        # Turns are small: one after another they add.
+        turn = turn - np.linalg.lstsq(_turns(camera, now), error, rcond=None)[0]
+    cov = bundle.projection_covariance(grid, Gauge.ALIGNED)
+    return error, np.sqrt(np.einsum("nii->ni", cov)).ravel()

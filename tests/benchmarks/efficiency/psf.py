@@ -1,0 +1,148 @@
+"""psf: the numbers of diffraction, and the kernel at field points, against the Cramér–Rao bound.
+
+Truths are drawn from the fit's prior, pictures have shot and read noise, and all samples go into the fit. The pitch is
+held by the fit and stated with the rig's tolerance: there is nothing to be efficient about, and it is left out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from tests.benchmarks.efficiency.trials import Trials
+from tests.benchmarks.psf_scene import Picture, Scene, pictures, shots_of, small_scene
+from udccal.fitting.information import cramer_rao, fisher_information
+from udccal.fitting.psf_blocks import LOCAL, Block, Local, blocks, fit_lattice
+from udccal.fitting.psf_descent import Prior, damped
+from udccal.fitting.psf_field import fit_field
+from udccal.fitting.psf_normal import Evaluator, kernel_coefficients, overlaps_of, unit_light
+from udccal.fitting.psf_posterior import kernel_and_slopes
+from udccal.fitting.psf_start import WAVELENGTHS_NM, start_model, start_prior
+from udccal.fitting.psf_weights import sensor_variance
+from udccal.numerics import in_float64
+
+_REALISATIONS = 100
+_ITERATIONS = 60
+# By name: index among the fit's global parameters.
+_NUMBERS = {
+    "column_open_fraction": 1,
+    "row_open_fraction": 2,
+    "structure_thickness": 3,
+    "pupil_diameter": 4,
+    "log_blur": 5,
+}
+_POINTS_PX = np.array([[350.0, 260.0], [700.0, 480.0]])
+_WINDOW = (17, 9)
+# (row, column) of the green kernel: peak, beside it, and on the series of orders.
+_SAMPLES = ((8, 4), (8, 5), (7, 4), (5, 4), (2, 4))
+
+
+@dataclass(frozen=True)
+class _Outcome:
+    """Errors, stated sigmas and bounds of all numbers, then of all kernel samples relative to the peak."""
+
+    error: Float[np.ndarray, " quantities"]
+    sigma: Float[np.ndarray, " quantities"]
+    bound: Float[np.ndarray, " quantities"]
+
+
+def trials(share: float) -> list[Trials]:
+    """All realisations, by quantity."""
+    scene = small_scene(positions=(3, 1), shifts=2, half=(14, 7))
+    prior = start_prior(scene.rig, start_model(scene.rig, scene.geometry, scene.wire), True)
+    outcomes = [_realisation(scene, prior, seed) for seed in range(max(round(_REALISATIONS * share), 3))]
+    error, sigma, bound = (np.stack([getattr(o, name) for o in outcomes]) for name in ("error", "sigma", "bound"))
+    numbers = [
+        Trials(f"psf/{name}", *(part[:, i : i + 1] for part in (error, sigma, bound)))
+        for i, name in enumerate(_NUMBERS)
+    ]
+    count = len(_NUMBERS)
+    return [*numbers, Trials("psf/kernel at field points", error[:, count:], sigma[:, count:], bound[:, count:])]
+
+
+@in_float64
+def _realisation(scene: Scene, prior: Prior, seed: int) -> _Outcome:
+    rng = np.random.default_rng(seed)
+    cov = np.linalg.inv(prior.root.T @ prior.root)
+    theta = prior.mean + np.linalg.cholesky(cov) @ rng.standard_normal(len(cov))
+    made = pictures(scene, theta, rng)
+    fit = fit_field(shots_of(scene, made, rng), scene.geometry, prior, scene.half, 1.0, _ITERATIONS, True).diffraction
+    evaluator = fit.problem.evaluator
+    information = _information(scene, prior, theta, made)
+    true, slopes = _at_points(scene, evaluator, theta)
+    found, fitted_slopes = _at_points(scene, evaluator, fit.theta)
+    pick = np.array(list(_NUMBERS.values()))
+    every = np.concatenate([np.eye(theta.size)[pick], slopes])
+    stated = np.concatenate([np.eye(theta.size)[pick], fitted_slopes])
+    return _Outcome(
+        error=np.concatenate([(fit.theta - theta)[pick], found - true]),
+        sigma=np.sqrt(np.einsum("qi,ij,qj->q", stated, fit.cov, stated)),
+        bound=cramer_rao(information, every),
+    )
+
+
+def _at_points(
+    scene: Scene, evaluator: Evaluator, theta: Float[np.ndarray, " p"]
+) -> tuple[Float[np.ndarray, " samples"], Float[np.ndarray, "samples p"]]:
+    """Samples of the green kernel relative to its peak, at all field points, and their slopes."""
+    values, slopes = [], []
+    for point in _POINTS_PX:
+        kernel, by = (
+            np.asarray(part)
+            for part in kernel_and_slopes(evaluator, theta, scene.geometry, point, fit_lattice(scene.half), *_WINDOW)
+        )
+        peak, peak_slope = kernel[1, 8, 4], by[:, 1, 8, 4]
+        for row, column in _SAMPLES[1:]:
+            ratio = kernel[1, row, column] / peak
+            values.append(ratio)
+            slopes.append((by[:, 1, row, column] - ratio * peak_slope) / peak)
+    return np.array(values), np.stack(slopes)
+
+
+def _information(
+    scene: Scene, prior: Prior, theta: Float[np.ndarray, " p"], made: list[Picture]
+) -> Float[np.ndarray, "p p"]:
+    """Information on the global parameters, the prior's included, with every shot's own unknowns taken out.
+
+    The light is Poisson's: its variance tells no more of the mean than the mean itself does.
+    """
+    shots = shots_of(scene, made, np.random.default_rng(0))
+    true = np.stack([picture.source_px for picture in made])
+    shots = replace(shots, centre_px=true)
+    evaluator = Evaluator(WAVELENGTHS_NM, fit_lattice(scene.half), True)
+    total = prior.root.T @ prior.root
+    for block in blocks(shots, scene.geometry, np.ones(shots.rate.shape, dtype=bool)):
+        index = np.asarray(block.index)
+        flux = np.stack([made[i].flux for i in index])
+        shots_own = np.concatenate([np.zeros((len(index), 2)), flux, np.zeros((len(index), 1))], axis=1)
+        x = np.concatenate([theta, shots_own.ravel()])
+        light, _ = _predict(x, evaluator, block, np.ones(np.shape(block.rate)))
+        variance = sensor_variance(block, np.asarray(light).reshape(np.shape(block.rate)))
+        both = fisher_information(_predict, x, evaluator, block, variance)
+        p = theta.size
+        parts = [np.s_[p + LOCAL * s : p + LOCAL * (s + 1)] for s in range(len(index))]
+        own = np.stack([both[part, part] for part in parts])
+        cross = both[:p, p:].reshape(p, len(index), LOCAL)
+        total = total + both[:p, :p] - np.einsum("psl,slm,qsm->pq", cross, np.linalg.inv(damped(own, 0.0)), cross)
+    return total
+
+
+def _predict(
+    x: Float[Array, " n"],
+    evaluator: Evaluator,
+    block: Block,
+    variance: Float[Array, "shots n"],
+) -> tuple[Float[Array, " samples"], Float[Array, " samples"]]:
+    """Mean and variance of all samples of a position; globals, then each shot's place, light and background."""
+    shots = np.shape(variance)[0]
+    theta, own = x[: -LOCAL * shots], x[-LOCAL * shots :].reshape(shots, LOCAL)
+    local = Local(own[:, :2], own[:, 2:5], own[:, 5])
+    # Interference tells of the pupil by its overlaps: they are part of the model.
+    overlaps = overlaps_of(evaluator, theta, block.frame)
+    unit = unit_light(evaluator, block, local.offset_px, kernel_coefficients(evaluator, theta, block, overlaps))
+    light = unit * jnp.einsum("snc,sc->sn", jnp.asarray(block.colour), jnp.asarray(local.flux))
+    mean = light + jnp.asarray(local.background)[:, None]
+    return mean.ravel(), jnp.asarray(variance).ravel()

@@ -1,0 +1,213 @@
+"""Psf fields from stamps whose truth is known in closed form, and not of the model's own making."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from udccal.errors import FitError
+from udccal.fitting.psf_stamps import fit_psf_stamps
+from udccal.fitting.psf_stamps_data import Stamps, mosaic_channels
+from udccal.fitting.psf_stamps_orders import Orders
+from udccal.fitting.psf_stamps_term import StampsPsf
+from udccal.fitting.result import FitResult, FitStatus
+
+SENSOR = np.array([1000, 800])
+READ_E = 4.0
+ORDERS = Orders(warp=2, image=1, spacing_px=1.0)
+
+
+def kernel(position: np.ndarray, shift: np.ndarray, size: int, wider: float = 1.0) -> np.ndarray:
+    """Two Gaussians; wider towards the corners, one of them brighter towards the right."""
+    x, y = 2 * position / SENSOR - 1
+    stretch = wider * (1 + 0.15 * (x * x + y * y))
+    v, u = np.mgrid[:size, :size] - size // 2
+    u, v = (u - shift[0]) / stretch, (v - shift[1]) / stretch
+    core = np.exp(-0.5 * (u**2 + v**2) / 1.3**2) / (2 * np.pi * 1.3**2)
+    lobe = np.exp(-0.5 * ((u - 3) ** 2 + v**2) / 1.5**2) / (2 * np.pi * 1.5**2)
+    return (core + 0.1 * (1 + 0.4 * x) * lobe) / 1.1 / stretch**2
+
+
+def places(rng: np.random.Generator, count: int) -> np.ndarray:
+    """A jittered grid over the sensor."""
+    across = int(np.ceil(np.sqrt(1.25 * count)))
+    grid = np.stack(np.meshgrid(np.arange(across), np.arange(-(-count // across))), axis=-1).reshape(-1, 2)[:count]
+    cells = np.array([across, -(-count // across)])
+    return (grid + 0.5 + rng.uniform(-0.3, 0.3, grid.shape)) / cells * SENSOR
+
+
+def make(seed: int, count: int = 30, size: int = 15, light_e: float = 1e5) -> tuple[Stamps, np.ndarray]:
+    """Stamps and the shifts of their light."""
+    rng = np.random.default_rng(seed)
+    position = places(rng, count)
+    middle = np.rint(position).astype(np.int64)
+    light = light_e * rng.uniform(0.5, 1.5, count)
+    values = [f * kernel(p, p - m, size) for f, p, m in zip(light, position, middle, strict=True)]
+    noisy = rng.poisson(values) + READ_E * rng.standard_normal(np.shape(values))
+    return Stamps(noisy, middle, READ_E), position - middle
+
+
+def test_positions() -> np.ndarray:
+    return np.random.default_rng(99).uniform(0.1, 0.9, (12, 2)) * SENSOR
+
+
+def centred(term: StampsPsf, position: np.ndarray, wider: float = 1.0) -> np.ndarray:
+    """The truth in the term's convention: it sums to 1, its centroid under the term's Gaussian is zero."""
+    v, u = np.mgrid[: term.rows, : term.columns] - term.rows // 2
+    weight, shift = np.exp(-0.5 * (u**2 + v**2) / term.window_px**2), np.zeros(2)
+    for _ in range(60):
+        light = weight * kernel(position, shift, term.rows, wider)
+        shift = shift - 1.5 * np.array([(u * light).sum(), (v * light).sum()]) / light.sum()
+    found = kernel(position, shift, term.rows, wider)
+    return found / found.sum()
+
+
+def errors(term: StampsPsf) -> tuple[np.ndarray, np.ndarray]:
+    """Of held-out kernels: relative L2, and every pixel in units of its sigma."""
+    held_out = test_positions()
+    truth = np.array([centred(term, p) for p in held_out])
+    off = term.predict(held_out) - truth
+    return np.linalg.norm(off, axis=(1, 2)) / np.linalg.norm(truth, axis=(1, 2)), off / term.sigma(held_out)
+
+
+@pytest.fixture(scope="module")
+def fitted() -> FitResult[StampsPsf]:
+    return fit_psf_stamps(make(1)[0])
+
+
+test_positions.__test__ = False  # type: ignore[attr-defined]
+
+
+def test_held_out_kernels_within_their_error_bars(fitted: FitResult[StampsPsf]) -> None:
+    relative, z = errors(fitted.term)
+    assert fitted.status is FitStatus.CONVERGED
+    assert np.median(relative) < 0.008
+    assert 0.8 < z.std() < 1.2
+    assert abs(fitted.chi2_dof - 1) < 0.06
+
+
+def test_the_predicted_error_is_that_found(fitted: FitResult[StampsPsf]) -> None:
+    relative, _ = errors(fitted.term)
+    predicted = fitted.term.relative_l2(test_positions())[:, 0]
+    assert np.sqrt((relative**2).mean()) == pytest.approx(np.sqrt((predicted**2).mean()), rel=0.35)
+
+
+def test_the_table_has_one_choice_and_it_needs_the_map(fitted: FitResult[StampsPsf]) -> None:
+    chosen = [c for c in fitted.candidates if c.chosen]
+    assert len(chosen) == 1
+    assert chosen[0].criterion == min(c.criterion for c in fitted.candidates)
+    assert chosen[0].name.startswith("map degree 2, image degree 1")
+
+
+def test_kernels_sum_to_one_and_are_centred(fitted: FitResult[StampsPsf]) -> None:
+    predicted = fitted.term.predict(test_positions())
+    v, u = np.mgrid[:15, :15] - 7
+    weight = np.exp(-0.5 * (u**2 + v**2) / fitted.term.window_px**2)
+    np.testing.assert_allclose(predicted.sum(axis=(1, 2)), 1.0, atol=1e-12)
+    np.testing.assert_allclose(
+        [(weight * u * predicted).sum(axis=(1, 2)), (weight * v * predicted).sum(axis=(1, 2))], 0, atol=1e-8
+    )
+
+
+def test_cosmic_hits_are_listed_and_left_out() -> None:
+    stamps, _ = make(2)
+    values = stamps.values_e.copy()
+    values[3, 2, 11] += 3000.0
+    values[8, 7, 9] += 8000.0
+    result = fit_psf_stamps(replace(stamps, values_e=values), ORDERS)
+    assert sum(o.count for o in result.outliers) == 2
+    assert result.outliers[0].places == (
+        "stamp 3, +4 px, -5 px from its middle",
+        "stamp 8, +2 px, +0 px from its middle",
+    )
+    assert np.median(errors(result.term)[0]) < 0.008
+
+
+def test_a_double_star_is_left_out() -> None:
+    stamps, _ = make(3)
+    values = stamps.values_e.copy()
+    values[5] += 0.5 * np.roll(values[5], (3, 3), axis=(0, 1))
+    result = fit_psf_stamps(replace(stamps, values_e=values), ORDERS)
+    assert any("stamp 5" in o.places for o in result.outliers)
+    assert np.median(errors(result.term)[0]) < 0.008
+
+
+def test_missing_samples_and_clipped_cores() -> None:
+    stamps, _ = make(4)
+    values = stamps.values_e.copy()
+    values[np.random.default_rng(0).random(values.shape) < 0.05] = np.nan
+    clip = float(np.nanquantile(np.nanmax(values, axis=(1, 2)), 0.6))
+    values = np.where(values >= clip, clip, values)
+    result = fit_psf_stamps(replace(stamps, values_e=values, clip_e=clip), ORDERS)
+    relative, z = errors(result.term)
+    assert np.median(relative) < 0.01
+    assert 0.75 < z.std() < 1.25
+    assert next(d.value for d in result.diagnostics if d.name == "clipped_samples") > 10
+
+
+def test_clipping_that_is_not_told_is_seen() -> None:
+    stamps, _ = make(4)
+    clip = float(np.quantile(stamps.values_e.max(axis=(1, 2)), 0.3))
+    told_nothing = replace(stamps, values_e=np.minimum(stamps.values_e, clip))
+    assert np.median(errors(fit_psf_stamps(told_nothing, ORDERS).term)[0]) > 0.01
+
+
+def test_mosaic_gives_a_field_per_colour() -> None:
+    rng = np.random.default_rng(5)
+    stamps, _ = make(5, count=40)
+    channel = mosaic_channels("RGGB", stamps.position_px, 15, 15)
+    position = places(np.random.default_rng(5), 40)
+    values = np.empty(channel.shape)
+    for k, (p, m) in enumerate(zip(position, stamps.position_px, strict=True)):
+        for plane, (light, wider) in enumerate(((1e5, 1.1), (2e5, 1.0), (1e5, 0.9))):
+            own = channel[k] == plane
+            values[k][own] = rng.poisson(light * kernel(p, p - m, 15, wider))[own]
+    values += READ_E * rng.standard_normal(values.shape)
+    result = fit_psf_stamps(Stamps(values, stamps.position_px, READ_E, channel=channel), ORDERS)
+    assert result.status is FitStatus.CONVERGED
+    for plane, wider in enumerate((1.1, 1.0, 0.9)):
+        truth = np.array([centred(result.term, p, wider) for p in test_positions()])
+        off = result.term.predict(test_positions(), plane) - truth
+        assert np.median(np.linalg.norm(off, axis=(1, 2)) / np.linalg.norm(truth, axis=(1, 2))) < 0.03
+
+
+def test_too_dark_stamps_say_so() -> None:
+    result = fit_psf_stamps(make(6, light_e=150.0)[0])
+    assert result.status is FitStatus.TOO_DARK
+    assert "Light over noise" in result.notes[0]
+
+
+def test_clipped_cores_everywhere_say_so() -> None:
+    stamps, _ = make(7)
+    result = fit_psf_stamps(replace(stamps, clip_e=500.0))
+    assert result.status is FitStatus.SATURATED
+
+
+def test_wrong_noise_is_a_poor_fit() -> None:
+    stamps, _ = make(8)
+    rough = stamps.values_e + np.random.default_rng(1).normal(0, 40.0, stamps.values_e.shape)
+    assert fit_psf_stamps(replace(stamps, values_e=rough), ORDERS).status is FitStatus.POOR_FIT
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"read_e": 0.0}, "read noise above 0"),
+        ({"clip_e": float("nan")}, "clipping level above 0"),
+        ({"position_px": np.zeros((2, 2), dtype=np.int64)}, "a position for each"),
+        ({"channel": np.full((30, 15, 15), 2)}, "channels 0, 1 and 2"),
+        ({"channel": np.zeros((30, 15, 14), dtype=np.int64)}, "a channel for every sample"),
+        ({"values_e": np.zeros((30, 3, 15))}, "7 to 255 samples"),
+    ],
+)
+def test_bad_stamps_are_refused(change: dict, words: str) -> None:
+    with pytest.raises(FitError, match=words):
+        replace(make(1)[0], **change)
+
+
+def test_three_stamps_are_too_few() -> None:
+    stamps, _ = make(1)
+    with pytest.raises(FitError, match="at least 4 stamps"):
+        fit_psf_stamps(replace(stamps, values_e=stamps.values_e[:3], position_px=stamps.position_px[:3]))

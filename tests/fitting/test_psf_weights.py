@@ -1,0 +1,168 @@
+"""What the psf fit goes by: noise at the expected light, a model error that the residuals tell, outliers, patterns."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.benchmarks.psf_scene import frames_of, small_scene
+from udccal.fitting.hdr import HdrMerge
+from udccal.fitting.psf_blocks import Block, Local
+from udccal.fitting.psf_outliers import without_outliers
+from udccal.fitting.psf_pattern import pattern_p_value
+from udccal.fitting.psf_samples import choose_samples
+from udccal.fitting.psf_shots import Shots, shot_noise
+from udccal.fitting.psf_weights import estimate_model_error, left_out, model_weights, sensor_variance
+from udccal.models.diffraction import LocalFrame
+
+SHOTS, SAMPLES = 6, 400
+
+
+def block_of(rate: np.ndarray, variance: np.ndarray, noise_per_rate: float = 0.0) -> Block:
+    """Samples on whole pixels, three colours in turn."""
+    shots, samples = rate.shape
+    x = np.arange(samples)
+    points = np.broadcast_to(np.stack([x % 20, x // 20], axis=-1) * 1.0, (shots, samples, 2))
+    frame = LocalFrame(jnp.array([0.0, 0.0, 1.0]), jnp.eye(2), jnp.eye(2))
+    return Block(
+        frame=frame,
+        points=points,
+        density=np.ones_like(rate),
+        slope=np.eye(2),
+        begun_px=np.zeros((shots, 2)),
+        colour=np.broadcast_to(np.eye(3)[x % 3], (shots, samples, 3)),
+        rate=rate,
+        known=1.0 / variance,
+        noise_per_rate=np.full_like(rate, noise_per_rate),
+        weight=1.0 / variance,
+        correction=np.zeros_like(rate),
+        overlap_slope=np.zeros_like(rate),
+        overlaps_pupil_mm=1.0,
+        disc_px=1.0,
+        index=np.arange(shots),
+    )
+
+
+def light_of() -> np.ndarray:
+    return np.tile(1e6 * np.exp(-np.arange(SAMPLES) / 60.0), (SHOTS, 1))
+
+
+def noisy(rng: np.random.Generator, model_error: float = 0.0) -> tuple[np.ndarray, Block]:
+    light = light_of()
+    sigma = np.hypot(np.hypot(0.005 * light, 30.0), left_out(light, model_error))
+    noise = np.hypot(0.005 * light, 30.0) ** 2
+    return light, block_of(light + sigma * rng.standard_normal(light.shape), noise)
+
+
+@pytest.mark.parametrize("true", [0.003, 0.015, 0.08])
+def test_a_model_error_is_found_as_large_as_it_is(true: float) -> None:
+    light, block = noisy(np.random.default_rng(1), true)
+    residual = (np.asarray(block.rate) - light).ravel()
+    found = estimate_model_error(residual, 1 / np.asarray(block.known).ravel(), left_out(light, 1.0).ravel(), 0)
+    assert found == pytest.approx(true, rel=0.1)
+
+
+def test_noise_is_not_taken_for_a_model_error() -> None:
+    found = []
+    for seed in range(40):
+        light, block = noisy(np.random.default_rng(seed))
+        residual = (np.asarray(block.rate) - light).ravel()
+        variance = 1 / np.asarray(block.known).ravel()
+        found.append(estimate_model_error(residual, variance, left_out(light, 1.0).ravel(), 0))
+    assert np.count_nonzero(found) <= 2
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    scale=st.floats(1e-6, 1e6), spread=st.floats(0.0, 1e3), outlier=st.floats(-1e9, 1e9), parameters=st.integers(0, 50)
+)
+def test_the_model_error_is_always_a_number_within_bounds(
+    scale: float, spread: float, outlier: float, parameters: int
+) -> None:
+    rng = np.random.default_rng(0)
+    residual = scale * spread * rng.standard_normal(50)
+    residual[0] += outlier
+    share = scale * np.linspace(0.0, 1.0, 50)
+    found = estimate_model_error(residual, np.full(50, scale**2), share, parameters)
+    assert np.isfinite(found)
+    assert 0.0 <= found <= 0.5
+
+
+def test_variance_follows_the_expected_light_not_the_noisy_one() -> None:
+    rate = np.array([[90.0, 110.0]])
+    block = block_of(rate, (rate + 4.0) / 2.0, noise_per_rate=0.5)
+    np.testing.assert_allclose(sensor_variance(block, np.full((1, 2), 100.0)), 52.0)
+    weighed = model_weights(block, np.full((1, 2), 100.0), Local(np.zeros((1, 2)), np.ones((1, 3)), np.zeros(1)), 0.0)
+    np.testing.assert_allclose(weighed.weight, 1 / 52.0)
+
+
+def test_the_slope_of_the_variance_is_that_of_the_exposure() -> None:
+    scene = small_scene()
+    exposure, floor = 0.02, 25.0 + (1.0 / float(scene.noise.K_DN_per_e)) ** 2 / 12.0
+    rate = np.array([[0.0, 1e3, 1e6]])
+    sigma = np.sqrt(rate / exposure + floor / exposure**2)
+    used = np.array([[1, 1, 0]])
+    slope = shot_noise(HdrMerge(rate, sigma, used), scene.noise)
+    np.testing.assert_allclose(slope, [[1 / exposure, 1 / exposure, 0.0]], rtol=1e-9)
+
+
+def own(light: np.ndarray) -> tuple[list[np.ndarray], tuple[Local, ...]]:
+    return [light], (Local(np.zeros((SHOTS, 2)), np.ones((SHOTS, 3)), np.zeros(SHOTS)),)
+
+
+def test_a_cosmic_hit_and_a_picture_that_moved_are_left_out_and_listed() -> None:
+    light, block = noisy(np.random.default_rng(3))
+    rate = np.array(block.rate)
+    rate[1, 200] += 40 * np.sqrt(1 / np.asarray(block.known)[1, 200])
+    rate[4] = np.roll(rate[4], 3)
+    (kept,), found = without_outliers([replace(block, rate=rate)], *own(light))
+    pictures_out, samples_out = found
+    assert pictures_out.places == ("picture 4 at position 0",)
+    assert samples_out.count == 1
+    assert samples_out.places == ("picture 1 at position 0, +40 sigma",)
+    assert np.count_nonzero(np.asarray(kept.weight) == 0) == SAMPLES + 1
+
+
+def test_good_pictures_all_stay() -> None:
+    light, block = noisy(np.random.default_rng(4))
+    (kept,), found = without_outliers([block], *own(light))
+    assert found == ()
+    np.testing.assert_array_equal(kept.weight, block.weight)
+
+
+def test_noise_has_no_pattern_and_a_common_misfit_has_one() -> None:
+    values = []
+    for seed in range(60):
+        light, block = noisy(np.random.default_rng(seed))
+        values.append(pattern_p_value((block,), [np.asarray(block.rate) - light]))
+    assert 0.3 < np.mean(values) < 0.7
+    assert np.mean(np.array(values) < 0.05) < 0.2
+    light, block = noisy(np.random.default_rng(5))
+    wave = 0.005 * light * np.sin(np.arange(SAMPLES) / 7.0)
+    assert pattern_p_value((block,), [np.asarray(block.rate) + wave - light]) < 1e-6
+
+
+def test_samples_are_drawn_as_many_in_every_picture() -> None:
+    rng = np.random.default_rng(0)
+    rate = rng.uniform(1e3, 1e6, (3, 41, 21))
+    zeros = np.zeros_like(rate)
+    channel = np.zeros(rate.shape, dtype=np.int64)
+    origin = np.zeros((3, 2), dtype=np.int64)
+    shots = Shots(np.zeros((3, 2)), origin, np.arange(3), np.ones(3), rate, zeros + 1.0, channel, zeros)
+    every, some = (choose_samples(shots, (18, 9), share).sum(axis=(1, 2)) for share in (1.0, 0.2))
+    assert (every == 37 * 19).all()
+    assert len(set(some.tolist())) == 1
+    assert some[0] < every[0]
+
+
+def test_brackets_are_clipped_and_quantised() -> None:
+    scene = small_scene()
+    frames = frames_of(scene, np.array([[0.0, 9e6]]), np.random.default_rng(0))
+    assert frames.shape == (6, 1, 2)
+    assert (frames[1:, 0, 1] == scene.rig.saturation_DN).all()
+    assert abs(float(frames[0, 0, 0]) - float(scene.noise.black_DN)) < 12

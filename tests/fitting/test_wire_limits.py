@@ -1,0 +1,143 @@
+"""The wire fit on flats of its own model: at the bound, of the right order, and never without a finite answer."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import equinox as eqx
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.benchmarks.efficiency.wire import (
+    COLUMNS,
+    PRNU,
+    ROWS,
+    drawn_truth,
+    fitted,
+    geometry,
+    map_at,
+    noisy,
+    places,
+    shape_values,
+    start,
+)
+from udccal.fitting.result import FitResult, FitStatus
+from udccal.fitting.wire import fit_wire_and_sigma, fit_wire_map
+from udccal.models.wire import Wire
+
+# Baseline up to degree 4, three site gains.
+_PLAIN = 18
+
+
+def columns_kept(result: FitResult[Wire]) -> int:
+    return int(next(d.value for d in result.diagnostics if d.name == "parameters"))
+
+
+def test_map_and_shape_are_within_their_errors_from_a_start_that_is_a_fifth_off() -> None:
+    built = start()
+    flat = noisy(drawn_truth(1, built, geometry()), 1)
+    wrong = replace(
+        built, standoff_per_pitch=0.8 * built.standoff_per_pitch, pupil_per_pitch=1.2 * built.pupil_per_pitch
+    )
+    fit = fitted(flat, wrong, geometry())
+    result = fit.result.or_raise("wire")
+    assert fit.sigma is not None
+    off = np.array([e.value for e in result.estimates]) - shape_values(flat.truth)
+    off[4:6] -= np.round(off[4:6])
+    assert np.all(np.abs(off) < 4 * np.array([e.sigma for e in result.estimates]))
+    error = map_at(result.term, places()) - map_at(flat.truth, places())
+    assert np.all(np.abs(error) < 4.5 * fit.sigma.at(places()))
+    assert columns_kept(result) == _PLAIN
+    # A start so far beyond its tolerance is doubted in words.
+    assert any("standoff_per_pitch" in note for note in result.notes)
+
+
+def test_no_modulation_is_absent_and_costs_nothing() -> None:
+    flat = noisy(drawn_truth(2, start(), geometry(), modulated=False), 2)
+    fit = fitted(flat, start(), geometry())
+    assert fit.result.status is FitStatus.ABSENT
+    assert np.shape(fit.result.term.harmonics) == (0, 2)
+    assert fit.sigma is not None
+    error = map_at(fit.result.term, places()) - map_at(flat.truth, places())
+    assert np.all(np.abs(error) < 4.5 * fit.sigma.at(places()))
+
+
+def test_saturated_flat_says_what_to_do() -> None:
+    signal = np.full((ROWS, COLUMNS), 4095.0)
+    result = fit_wire_map(signal, signal, geometry(), start(), PRNU, clip=4000.0)
+    assert result.status is FitStatus.SATURATED
+    assert "shorter" in " ".join(result.notes)
+
+
+def finite_or_told(seed: int, electrons: float, prnu: float, broken: float, level: float) -> None:
+    flat = noisy(drawn_truth(seed, start(), geometry()), seed, electrons, prnu)
+    signal = flat.signal + level
+    rng = np.random.default_rng(seed)
+    signal[rng.random(signal.shape) < broken] = rng.choice([np.nan, np.inf, -1e9, 0.0, 1e9])
+    fit = fit_wire_and_sigma(signal, flat.variance, geometry(), start(), prnu, signal.size)
+    numbers = [np.asarray(e) for e in (fit.result.cov, [e.value for e in fit.result.estimates])]
+    assert all(np.isfinite(part).all() for part in numbers)
+    assert np.isfinite(map_at(fit.result.term, places())).all()
+    if fit.result.ok and not level:
+        assert fit.sigma is not None
+        error = map_at(fit.result.term, places()) - map_at(flat.truth, places())
+        assert np.all(np.abs(error) < 5 * fit.sigma.at(places()))
+    if not fit.result.ok:
+        assert fit.result.notes
+
+
+_INPUTS = {
+    "seed": st.integers(0, 1000),
+    "electrons": st.floats(0.3, 1e6),
+    "prnu": st.floats(0.0, 0.03),
+    "broken": st.sampled_from([0.0, 1e-4, 1e-2]),
+    "level": st.sampled_from([0.0, 0.0, -1e3]),
+}
+
+
+@settings(max_examples=3, deadline=None, derandomize=True)
+@given(**_INPUTS)
+def test_any_flat_is_finite_and_within_its_errors_or_told(
+    seed: int, electrons: float, prnu: float, broken: float, level: float
+) -> None:
+    finite_or_told(seed, electrons, prnu, broken, level)
+
+
+@pytest.mark.slow
+@settings(max_examples=60, deadline=None, derandomize=True)
+@given(**_INPUTS)
+def test_many_flats_are_finite_and_within_their_errors_or_told(
+    seed: int, electrons: float, prnu: float, broken: float, level: float
+) -> None:
+    finite_or_told(seed, electrons, prnu, broken, level)
+
+
+@pytest.mark.slow
+def test_the_right_order_is_chosen() -> None:
+    """A shading of degree 6 and a first harmonic that leans over the field, both at ten times what BIC asks for."""
+    right = 0
+    for seed in range(100):
+        truth = drawn_truth(seed, start(), geometry())
+        baseline = np.array(truth.baseline)
+        leaning = seed % 2 == 0
+        if leaning:
+            baseline[[0, 3, 6], [6, 3, 0]] += 1.5e-3
+        truth = eqx.tree_at(lambda w, b=baseline: w.baseline, truth, baseline)
+        result = fitted(noisy(truth, seed), start(), geometry()).result
+        right += columns_kept(result) == _PLAIN + (7 if leaning else 0)
+    assert right >= 95
+
+
+@pytest.mark.slow
+def test_absent_and_present_are_told_apart() -> None:
+    """Present: the first harmonic explains 200 of chi-squared, twice what is asked for."""
+    told = 0
+    for seed in range(200):
+        present = seed % 2 == 0
+        # Fewer electrons: the harmonic explains less.
+        flat = noisy(drawn_truth(seed, start(), geometry(), modulated=present), seed, 3e3)
+        status = fitted(flat, start(), geometry()).result.status
+        told += status is (FitStatus.CONVERGED if present else FitStatus.ABSENT)
+    assert told >= 190

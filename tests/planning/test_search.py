@@ -1,0 +1,97 @@
+"""The search on costs and sigmas that are known in closed form."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from udccal.planning.knobs import KNOBS, additions, least_captures
+from udccal.planning.search import Oracle, cheapest, worthwhile
+from udccal.planning.steps import Cost
+from udccal.rig import Captures
+from udccal.sessions.schema import TermName
+
+
+def wire(floor: float = 0.0) -> Oracle:
+    return Oracle(
+        "wire",
+        lambda captures: math.sqrt(floor**2 + 1 / captures.flats),
+        lambda captures: Cost(captures.flats, 0.01 * captures.flats, 2),
+    )
+
+
+def psf(dear: str) -> Oracle:
+    """Positions and shifts tell alike; one of them takes ten times as long."""
+
+    def cost(captures: Captures) -> Cost:
+        positions, shifts = captures.psf_columns * captures.psf_rows, captures.psf_shifts
+        seconds = 10.0 * positions + shifts if dear == "positions" else positions + 10.0 * shifts
+        return Cost(positions * shifts, seconds, positions * shifts)
+
+    def sigma(captures: Captures) -> float:
+        return 1 / math.sqrt(captures.psf_columns * captures.psf_rows * captures.psf_shifts)
+
+    return Oracle("psf", sigma, cost)
+
+
+@pytest.mark.parametrize("target", [0.5, 0.123, 0.0421, 0.01])
+def test_as_few_flats_as_reach_the_target(target: float) -> None:
+    found = cheapest(wire(), Captures(), target)
+    assert found is not None
+    assert found.flats == max(2, math.ceil(1 / target**2 - 1e-9))
+    assert found == Captures(flats=found.flats)
+
+
+def test_what_is_cheap_is_added() -> None:
+    dear_positions, dear_shifts = (cheapest(psf(dear), Captures(), 0.1) for dear in ("positions", "shifts"))
+    assert dear_positions is not None
+    assert dear_shifts is not None
+    for captures in (dear_positions, dear_shifts):
+        assert captures.psf_columns * captures.psf_rows * captures.psf_shifts >= 100
+    assert dear_positions.psf_shifts > 3 * dear_shifts.psf_shifts
+    assert dear_positions.psf_columns * dear_positions.psf_rows < dear_shifts.psf_columns * dear_shifts.psf_rows
+
+
+def test_nothing_can_be_taken_away_from_a_plan() -> None:
+    oracle = psf("positions")
+    found = cheapest(oracle, Captures(), 0.087)
+    assert found is not None
+    for knob in KNOBS["psf"]:
+        if knob.of(found) > knob.least:
+            assert oracle.sigma(knob.set(found, knob.of(found) - 1)) > 0.087
+
+
+def test_the_same_question_has_the_same_answer_whatever_the_rig_had_before() -> None:
+    first, second = (cheapest(psf("shifts"), Captures(psf_shifts=shifts), 0.03) for shifts in (2, 60))
+    assert first == second is not None
+
+
+@pytest.mark.parametrize("target", [0.3, 0.29])
+def test_a_target_at_or_below_the_floor_is_not_reached(target: float) -> None:
+    assert cheapest(wire(floor=0.3), Captures(), target) is None
+
+
+def test_a_sigma_that_nothing_lowers_ends_the_search() -> None:
+    stuck = Oracle("psf", lambda captures: 1.0, lambda captures: Cost(1, 1.0, 1))
+    assert cheapest(stuck, Captures(), 0.5) is None
+    assert worthwhile(stuck, Captures()) == []
+
+
+def test_captures_too_few_for_a_fit_are_added_to() -> None:
+    def sigma(captures: Captures) -> float:
+        return math.inf if captures.board_views < 7 else 1 / captures.board_views
+
+    oracle = Oracle("geometry", sigma, lambda captures: Cost(1, float(captures.board_views), captures.board_views))
+    assert cheapest(oracle, Captures(), 0.15) == Captures(board_views=7)
+
+
+@pytest.mark.parametrize("term", list(KNOBS))
+def test_every_least_design_is_a_valid_one_and_can_grow(term: TermName) -> None:
+    least = least_captures(term, Captures())
+    assert Captures.model_validate(least.model_dump()) == least
+    grown = list(additions(term, least))
+    assert len(grown) == len(KNOBS[term])
+    for knob, more in grown:
+        assert knob.of(more) > knob.of(least)
+        assert Captures.model_validate(more.model_dump()) == more

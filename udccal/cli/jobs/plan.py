@@ -1,0 +1,206 @@
+"""Planning a capture, for people and for machines."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import final, get_args
+
+from udccal.cli.output import Output
+from udccal.compilation import keep_compilations
+from udccal.errors import RigError
+from udccal.planning.measured import Measured, measured_state
+from udccal.planning.plan import CapturePlan, Setting, Suggestion, TermPlan, make_plan
+from udccal.planning.rig_file import check_absent, write_planned_rig
+from udccal.planning.state import RigState, nominal_state
+from udccal.planning.steps import Cost
+from udccal.planning.targets import parse_targets
+from udccal.profiles.store import RIG_PROFILE, find_profile, read_profile
+from udccal.reports.tables import Table
+from udccal.rig import RigDescription, find_rig, load_rig
+from udccal.sessions.schema import TermName
+
+
+@final
+@dataclass(frozen=True)
+class Number:
+    """One number of the planned captures block."""
+
+    name: str
+    value: float
+
+
+@final
+@dataclass(frozen=True)
+class PlanSummary:
+    """What ``plan`` delivers."""
+
+    rig: str
+    profile: Path | None
+    reached: bool
+    cost: Cost
+    cost_before: Cost
+    terms: tuple[TermPlan, ...]
+    untouched: tuple[TermName, ...]
+    per_second: Suggestion | None
+    per_set_up: Suggestion | None
+    captures: tuple[Number, ...]
+    out: Path | None
+
+
+def plan_captures(output: Output, rig_name: str, words: Sequence[str], profile: Path | None, out: Path | None) -> bool:
+    """Plan, print, and write the rig with the planned captures; returns whether every target is reached.
+
+    Raises:
+        UdccalError: when a target cannot be read, or a procedure is missing.
+        RigError: when the rig is not known, or something is at ``out`` already.
+        ProfileError: when the profile cannot be read.
+    """
+    targets = parse_targets(words)
+    rig = load_rig(rig_name)
+    if out is not None:
+        check_absent(out)
+    keep_compilations()
+    path = _profile_path(rig_name, profile)
+    state = nominal_state(rig) if path is None else _measured(rig, path)
+    with output.stage("planning") as stage:
+
+        def progress(term: TermName) -> None:
+            stage.update([t.term for t in targets].index(term), len(targets), f"planning {term}")
+
+        made = make_plan(state, targets, progress)
+    _show(output, made)
+    if out is not None:
+        write_planned_rig(rig_name, made.captures, out)
+        output.say(f"Rig with these captures: {out}")
+    numbers = tuple(Number(name, value) for name, value in made.captures.model_dump().items())
+    output.result(
+        PlanSummary(
+            rig=rig.name,
+            profile=path,
+            reached=made.reached,
+            cost=made.cost,
+            cost_before=made.cost_before,
+            terms=made.terms,
+            untouched=made.untouched,
+            per_second=made.per_second,
+            per_set_up=made.per_set_up,
+            captures=numbers,
+            out=out,
+        )
+    )
+    return made.reached
+
+
+def _profile_path(rig_name: str, profile: Path | None) -> Path | None:
+    """The profile asked for, or the one in the rig's folder."""
+    if profile is not None:
+        return find_profile(profile)
+    beside = find_rig(rig_name) / RIG_PROFILE
+    return beside if beside.exists() else None
+
+
+def _measured(rig: RigDescription, path: Path) -> RigState:
+    profile = read_profile(path)
+    if profile.rig.name != rig.name or profile.rig.camera != rig.camera or profile.rig.panel != rig.panel:
+        raise RigError(
+            f"Expected a profile of the rig '{rig.name}' at {path}, found one of '{profile.rig.name}'"
+            f"{' with another camera or panel' if profile.rig.name == rig.name else ''}. Give that rig's profile."
+        )
+    fits = Measured(profile.noise, profile.geometry, profile.wire, profile.psf, profile.backscatter)
+    return measured_state(rig, fits)
+
+
+def _show(output: Output, made: CapturePlan) -> None:
+    rows = tuple(
+        (
+            term.term,
+            _amount(term.target, term.unit),
+            _amount(term.sigma, term.unit),
+            _amount(term.floor, term.unit) if term.floor > 0 else "–",
+            "; ".join(
+                f"{s.name} {s.planned}" + (f" (now {s.before})" if s.planned != s.before else "") for s in term.settings
+            ),
+            str(term.cost.frames),
+            _duration(term.cost.seconds),
+            str(term.cost.set_ups),
+        )
+        for term in made.terms
+    )
+    head = ("term", "target", "sigma", "floor", "captures", "frames", "camera", "set-ups")
+    output.table(Table("Planned captures", head, rows, frozenset({1, 2, 3, 5, 6, 7})))
+    additions = tuple(
+        (
+            term.term,
+            what,
+            _addition(one),
+            f"{one.gain_percent:.2g} %",
+            _duration(one.cost.seconds),
+            str(one.cost.set_ups),
+        )
+        for term in made.terms
+        for what, one in (("second", term.per_second), ("set-up", term.per_set_up))
+        if one is not None
+    )
+    if additions:
+        columns = ("term", "most per", "addition", "sigma falls by", "camera", "set-ups")
+        output.table(Table("What one addition more would bring", columns, additions, frozenset({3, 4, 5})))
+    for sentence in _sentences(made):
+        output.say(sentence)
+
+
+def _sentences(made: CapturePlan) -> list[str]:
+    said = [_out_of_reach(term) for term in made.terms if not term.reached]
+    if made.untouched:
+        said.append(f"Without a target, as the rig has them: {', '.join(made.untouched)}.")
+    before, after = made.cost_before, made.cost
+    said.append(
+        f"All {len(get_args(TermName))} terms: {after.frames} frames in {_duration(after.seconds)} of the camera's "
+        f"time, {after.set_ups} things to set up (now {before.frames} frames, {_duration(before.seconds)}, "
+        f"{before.set_ups})."
+    )
+    for what, one in (("second of capture", made.per_second), ("set-up", made.per_set_up)):
+        if one is not None:
+            said.append(
+                f"Most per {what}: {_addition(one)} lowers the sigma of {one.term} by {one.gain_percent:.2g} %."
+            )
+    return said
+
+
+def _out_of_reach(term: TermPlan) -> str:
+    target = _amount(term.target, term.unit)
+    if term.floor >= term.target:
+        return (
+            f"{term.term}: no amount of capture reaches {target}; {_amount(term.floor, term.unit)} is left. "
+            f"{term.lowered_by}"
+        )
+    left = "" if not term.lowered_by else f" {term.lowered_by}"
+    return (
+        f"{term.term}: {target} lies so near what endless captures leave ({_amount(term.floor, term.unit)}) that no "
+        f"capture of a reasonable length reaches it.{left}"
+    )
+
+
+def _addition(one: Suggestion) -> str:
+    return f"{one.setting.name} {one.setting.before} to {one.setting.planned}"
+
+
+def _fall(one: Suggestion) -> str:
+    return f"{one.gain_percent:.2g} %"
+
+
+def _setting(one: Setting) -> str:
+    return f"{one.name} {one.planned}" + (f" (now {one.before})" if one.planned != one.before else "")
+
+
+def _amount(value: float, unit: str) -> str:
+    return f"{value:.3g} {unit}" if math.isfinite(value) else "not told"
+
+
+def _duration(seconds: float) -> str:
+    if seconds < 60:
+        return f"{seconds:.1f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes} min {rest:02d} s"

@@ -1,0 +1,70 @@
+"""The state that fits have measured: at its values, and with the errors beside noise that they have found."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, final
+
+import numpy as np
+
+from udccal.fitting.result import FitResult, FitStatus
+from udccal.models.backscatter import Backscatter
+from udccal.models.geometry import Geometry
+from udccal.models.noise import Noise
+from udccal.models.psf import PsfField
+from udccal.models.wire import Wire
+from udccal.planning.state import RigState, Unexplained, nominal_state
+from udccal.rig import RigDescription
+
+
+@final
+@dataclass(frozen=True)
+class Measured:
+    """The fits of one rig, as a profile holds them."""
+
+    noise: FitResult[Noise]
+    geometry: FitResult[Geometry]
+    wire: FitResult[Wire]
+    psf: FitResult[PsfField]
+    backscatter: FitResult[Backscatter]
+
+
+def measured_state(rig: RigDescription, fits: Measured) -> RigState:
+    """A rig at the values of its fits; terms that these hold as absent, or could not tell, stand as built."""
+    nominal = nominal_state(rig)
+    geometry_seen = _seen(fits.geometry)
+    return RigState(
+        rig=rig,
+        noise=fits.noise.term if _seen(fits.noise) else nominal.noise,
+        geometry=fits.geometry.term if geometry_seen else nominal.geometry,
+        wire=fits.wire.term if _seen(fits.wire) else None,
+        psf=fits.psf.term if _seen(fits.psf) else None,
+        backscatter=fits.backscatter.term if _seen(fits.backscatter) else None,
+        unexplained=Unexplained(
+            corner_px=corner_scatter_px(fits.geometry) if geometry_seen else None,
+            wire=_diagnostic(fits.wire, "wire_map_model_sigma") / 100,
+            psf=_diagnostic(fits.psf, "model_error"),
+            backscatter=_diagnostic(fits.backscatter, "model_error_of_white"),
+            inflation=max(_diagnostic(fits.backscatter, "pattern_inflation"), 1.0),
+        ),
+    )
+
+
+def corner_scatter_px(geometry: FitResult[Geometry]) -> float | None:
+    """Scatter of corners by axis as a geometry fit found it, disagreement of views included; None where not known."""
+    views, rms_px = _diagnostic(geometry, "views"), _diagnostic(geometry, "rms_reprojection")
+    if views == 0 or rms_px == 0:
+        return None
+    free = sum(estimate.sigma > 0 for estimate in geometry.estimates)
+    spent = (free + 6 * views) / max(geometry.samples, 1)
+    by_axis = rms_px / np.sqrt(2 * max(1 - spent, 0.05))
+    return float(by_axis * np.sqrt(max(_diagnostic(geometry, "variance_factor"), 1.0)))
+
+
+def _seen(result: FitResult[Any]) -> bool:
+    return result.status is FitStatus.CONVERGED
+
+
+def _diagnostic(result: FitResult[Any], name: str) -> float:
+    """0 where the fit does not tell."""
+    return next((item.value for item in result.diagnostics if item.name == name), 0.0)
