@@ -23,6 +23,7 @@ from tests.benchmarks.efficiency.wire import (
     shape_values,
     start,
 )
+from tests.benchmarks.extremes.wire import constant
 from udccal.fitting.result import FitResult, FitStatus
 from udccal.fitting.wire import fit_wire_and_sigma, fit_wire_map
 from udccal.models.wire import Wire
@@ -141,3 +142,9 @@ def test_absent_and_present_are_told_apart() -> None:
         status = fitted(flat, start(), geometry()).result.status
         told += status is (FitStatus.CONVERGED if present else FitStatus.ABSENT)
     assert told >= 190
+
+
+def test_a_flat_without_any_noise_or_ripple_is_absent() -> None:
+    found = constant(1000.0)
+    assert found.status is FitStatus.ABSENT
+    assert found.finite

@@ -17,6 +17,8 @@ from udccal.models.wire import Wire, log_baseline, modulation, scaled_positions,
 from udccal.numerics import in_float64
 
 SITES = 4
+# Residual variance in units of what noise makes: less is none at all, and what is divided by it stays finite.
+LEAST_VARIANCE = 1e-12
 BLOCK = 2048
 # Tiles of the sensor, down and across, whose residuals are looked at as a whole.
 TILES = (6, 8)

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from udccal.fitting.result import Candidate
-from udccal.fitting.wire_basis import Basis, Normal, Pixels, accumulate
+from udccal.fitting.wire_basis import LEAST_VARIANCE, Basis, Normal, Pixels, accumulate
 from udccal.fitting.wire_noise import FlatNoise, Judged, judge
 from udccal.fitting.wire_phase import PhaseFit, add_increment, moved, solve
 from udccal.fitting.wire_prior import Prior
@@ -107,7 +107,7 @@ def settle(
 
 
 def _variance(normal: Normal) -> float:
-    return max(normal.power / max(normal.samples - len(normal.right), 1), 1e-300)
+    return max(normal.power / max(normal.samples - len(normal.right), 1), LEAST_VARIANCE)
 
 
 def _at(

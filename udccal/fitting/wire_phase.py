@@ -13,7 +13,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from udccal.fitting.wire_basis import SITES, Basis, Normal, Pixels, accumulate, merit
+from udccal.fitting.wire_basis import LEAST_VARIANCE, SITES, Basis, Normal, Pixels, accumulate, merit
 from udccal.fitting.wire_harmonics import WireStart, free_basis, plain_basis
 from udccal.fitting.wire_noise import FlatNoise, judge
 from udccal.fitting.wire_prior import Prior, rig_prior
@@ -98,7 +98,7 @@ def fit_phase(
             break
     best = places[0].gain if places else 0.0
     if best < LEAST_GAIN:
-        variance = merit(bare, gains, sample) / max(sample.used - plain_basis().size, 1)
+        variance = max(merit(bare, gains, sample) / max(sample.used - plain_basis().size, 1), LEAST_VARIANCE)
         return PhaseFit(bare, gains, prior, best, variance, True, 0, plain_basis())
     rivals = _search(places, gains, start, prior, sample, harmonics[:strongest])
     wire = with_harmonics(rivals[0].wire, harmonics, few)
@@ -198,7 +198,7 @@ def _gauss_newton(
     samples = max(pixels.used - basis.size - SHAPE_PARAMETERS, 1)
     precision = prior.precision(basis, shape=True)
     chi2 = merit(wire, gains, pixels)
-    variance = max(chi2 / samples, 1e-300)
+    variance = max(chi2 / samples, LEAST_VARIANCE)
     now = chi2 / variance + prior.cost(wire, basis, shape=True)
     largest, gained, done = np.inf, np.inf, 0
     while largest > _SETTLED and done < rounds:
@@ -214,7 +214,7 @@ def _gauss_newton(
             then = chi2 / variance + prior.cost(trial, basis, shape=True)
             if then < now:
                 wire, gains, gained = trial, trial_gains, now - then
-                variance = max(chi2 / samples, 1e-300)
+                variance = max(chi2 / samples, LEAST_VARIANCE)
                 now = chi2 / variance + prior.cost(wire, basis, shape=True)
                 break
         else:
