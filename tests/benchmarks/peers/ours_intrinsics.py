@@ -4,7 +4,7 @@
 
 ``rot_rms`` is the pixel error over the field after the best common rotation, root mean square over the seeds, and
 ``predicted_rms`` what the covariances say of it; ``projection_z_std`` compares the two place by place.
-``seconds`` is the median of one calibration once compiled, ``first_seconds`` the very first with compilation.
+``seconds`` is the median of one calibration once compiled, ``first_run_s`` the very first with compilation.
 """
 
 from __future__ import annotations
@@ -110,7 +110,7 @@ def main() -> None:
         "udccal",
         __version__,
         float(np.median(seconds)),
-        first_seconds=first,
+        first_run_s=first,
         seeds=options.seeds,
         converged=sum(result.converged for result in results),
         orders=[next(c.name for c in result.candidates if c.chosen) for result in results],

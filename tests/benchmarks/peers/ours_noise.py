@@ -85,7 +85,7 @@ def main() -> None:
         "udccal",
         version("udccal"),
         float(np.median(seconds)),
-        seconds_first=seconds[0],
+        first_run_s=seconds[0],
         variant=options.variant,
         shape=[rows, columns],
         rel_err_rms=rms,

@@ -81,7 +81,7 @@ def report(
 ) -> None:
     chosen = next(candidate.name for candidate in result.candidates if candidate.chosen)
     works.emit(
-        "psf_field", name, udccal.__version__, seconds, seconds_first=first, status=result.status.name, order=chosen,
+        "psf_field", name, udccal.__version__, seconds, first_run_s=first, status=result.status.name, order=chosen,
         predicted=result.estimate("kernel_relative_l2").value, chi2_dof=result.chi2_dof, z_mean=z.mean(), z_std=z.std(),
         **found,
     )  # fmt: skip
