@@ -53,7 +53,7 @@ OURS = {
     "noise": ("ours_noise", "ours_noise --variant nonlin"),
     "hdr": ("ours_hdr",),
     "psf_field": ("ours_psf_field",),
-    "intrinsics": ("ours_intrinsics",),
+    "intrinsics": ("ours_intrinsics --starts 1000",),
 }
 
 
