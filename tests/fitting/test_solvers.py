@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from jaxtyping import Array, Float
 
-from udccal.fitting.solvers import LOG, least_squares
+from udccal.fitting.iteration_log import LOG
+from udccal.fitting.solvers import least_squares
 
 _TIMES = np.linspace(0.0, 3.0, 50)
 

@@ -7,7 +7,8 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Bool, Float
 
-from udccal.fitting.solvers import LOG, Solution
+from udccal.fitting.iteration_log import LOG
+from udccal.fitting.solvers import Solution
 from udccal.numerics import in_float64
 
 _STEPS = 30

@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from udccal.fitting.bundle_points import Blocks, Points, blocks
-from udccal.fitting.solvers import LOG
+from udccal.fitting.iteration_log import LOG
 from udccal.models.arrays import Arrayish
 from udccal.models.geometry import Geometry, project, rotation_matrix
 from udccal.numerics import in_float64

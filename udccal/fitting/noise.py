@@ -9,7 +9,7 @@ from udccal.fitting.noise_dark import DarkFrames, DarkTerms, fit_dark_terms
 from udccal.fitting.noise_data import NoiseData
 from udccal.fitting.noise_light import LightTerms, fit_light_terms, rough_gain
 from udccal.fitting.noise_moments import PairMoments, RowMoments, StackMoments, reduce_pair
-from udccal.fitting.noise_report import NAMES, UNITS, assemble, failed
+from udccal.fitting.noise_report import NAMES, UNITS, assemble, assumed_noise, failed
 from udccal.fitting.read_noise import DarkPair, dark_pair, start_values
 from udccal.fitting.result import FitResult, FitStatus
 from udccal.models.noise import Noise
@@ -39,18 +39,7 @@ def converter_step(frame: UInt16[np.ndarray, "rows columns"]) -> int:
 def nominal_noise(rig: RigDescription) -> Noise:
     """Noise from the rig description alone: what a failed fit returns."""
     camera = rig.camera
-    return Noise(
-        K_DN_per_e=camera.K_DN_per_e.value,
-        black_DN=camera.black_DN.value,
-        saturation_DN=float(rig.saturation_DN),
-        sigma_d_e=5.0,
-        lambda_read=0.14,
-        sigma_row_DN=0.0,
-        q_DN=1.0,
-        dark_current_e_per_s=0.0,
-        DSNU1288_e=0.0,
-        PRNU1288=0.0,
-    )
+    return assumed_noise(camera.K_DN_per_e.value, camera.black_DN.value, float(rig.saturation_DN))
 
 
 def fit_noise(session: Session) -> FitResult[Noise]:

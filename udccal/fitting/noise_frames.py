@@ -18,7 +18,7 @@ from udccal.errors import FitError
 from udccal.fitting.noise import converter_step, fit_noise_data
 from udccal.fitting.noise_data import NoiseData
 from udccal.fitting.noise_moments import PairMoments, StackMoments, reduce_pair, reduce_stack
-from udccal.fitting.noise_report import failed
+from udccal.fitting.noise_report import assumed_noise, failed
 from udccal.fitting.read_noise import DarkPair, dark_pair
 from udccal.fitting.result import FitResult, FitStatus
 from udccal.models.noise import Noise
@@ -91,18 +91,7 @@ def fit_noise_measured(data: NoiseData | None) -> FitResult[Noise]:
 
 def _unknown(top_DN: float) -> Noise:
     """What is assumed of a sensor of which nothing is known."""
-    return Noise(
-        K_DN_per_e=1.0,
-        black_DN=0.0,
-        saturation_DN=top_DN,
-        sigma_d_e=5.0,
-        lambda_read=0.14,
-        sigma_row_DN=0.0,
-        q_DN=1.0,
-        dark_current_e_per_s=0.0,
-        DSNU1288_e=0.0,
-        PRNU1288=0.0,
-    )
+    return assumed_noise(1.0, 0.0, top_DN)
 
 
 def measure_frames(

@@ -29,6 +29,22 @@ NAMES = (
 NONLINEARITY = "nonlinearity"
 
 
+def assumed_noise(K_DN_per_e: float, black_DN: float, saturation_DN: float) -> Noise:
+    """What is taken for granted of a sensor of which only these are known."""
+    return Noise(
+        K_DN_per_e=K_DN_per_e,
+        black_DN=black_DN,
+        saturation_DN=saturation_DN,
+        sigma_d_e=5.0,
+        lambda_read=0.14,
+        sigma_row_DN=0.0,
+        q_DN=1.0,
+        dark_current_e_per_s=0.0,
+        DSNU1288_e=0.0,
+        PRNU1288=0.0,
+    )
+
+
 def failed(nominal: Noise, status: FitStatus, note: str) -> FitResult[Noise]:
     """The nominal term, with the reason and the advice."""
     return FitResult(

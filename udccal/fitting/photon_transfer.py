@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float
 
+from udccal.fitting.iteration_log import LOG
 from udccal.fitting.read_noise import inverse
 
 PARAMETERS = ("K_DN_per_e", "V0_DN2", "curvature_per_DN", "response_DN_per_light", "light_offset")
@@ -138,7 +139,7 @@ def fit_transfer(
     responds = _responds(levels)
     free = np.array([True, True, order.curved, responds.any(), order.offset and bool(responds.any())])
     converged = False
-    for _ in range(_ROUNDS):
+    for iteration in range(1, _ROUNDS + 1):
         residual, weight, slope = _linearised(x, levels, dark, full_DN, scatter2)
         information = slope.T @ (slope * weight[:, None])
         information = np.where(np.outer(free, free), information, 0.0)
@@ -147,6 +148,7 @@ def fit_transfer(
         if order.unsteady:
             scatter2 = _scatter2(x, levels, responds)
         gain = float(step @ information @ step)
+        LOG.debug("noise, photon transfer: iteration %d, moved by %.3g sigma", iteration, max(gain, 0.0) ** 0.5)
         if gain < 1e-8:
             converged = True
             break

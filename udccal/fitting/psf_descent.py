@@ -9,9 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from udccal.fitting.iteration_log import LOG
 from udccal.fitting.psf_blocks import LOCAL, Block, Local
 from udccal.fitting.psf_normal import Evaluator, Normal, normal_equations, overlaps_of
-from udccal.fitting.solvers import LOG
 
 _MAX_STEP_PX = 0.5
 _FIRST_DAMPING, _LAST_DAMPING = 1e-2, 1e6

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
+from udccal.fitting.iteration_log import LOG
 from udccal.fitting.psf_blocks import FOOTPRINT, PUPIL, Block, Local, corrected
 from udccal.fitting.psf_descent import Point, Problem, damped, descend, moved, pose, reduced, stand
 from udccal.fitting.psf_normal import (
@@ -25,7 +26,6 @@ from udccal.fitting.psf_pattern import pattern_p_value
 from udccal.fitting.psf_places import start_local
 from udccal.fitting.psf_weights import estimate_model_error, first_weights, left_out, model_weights, sensor_variance
 from udccal.fitting.result import Outliers
-from udccal.fitting.solvers import LOG
 from udccal.models.diffraction import Diffraction
 
 # Until the residuals tell; it also keeps a fit that is still far off from trusting the brightest samples alone.

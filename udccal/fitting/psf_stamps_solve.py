@@ -6,13 +6,13 @@ bring what a clipped normal tells, and every round the priors' precisions are se
 
 from __future__ import annotations
 
-import logging
 from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.special import log_ndtr
 
+from udccal.fitting.iteration_log import LOG
 from udccal.fitting.psf_stamps_blocks import Blocks
 from udccal.fitting.psf_stamps_data import Plane
 from udccal.fitting.psf_stamps_field import PlaneField, see
@@ -20,7 +20,6 @@ from udccal.fitting.psf_stamps_normal import Normal, Posterior, Weighted, border
 from udccal.fitting.psf_stamps_prior import Envelope, Precisions, image_prior, log_det, update, updated_image
 from udccal.models.fields import polynomial_terms
 
-LOG = logging.getLogger("udccal.fitting")
 _DRAWS = 16
 _HALVINGS = 6
 # Converged when the next step would gain less than this in log likelihood, and the evidence changes less than that.

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int, UInt16
 
+from udccal.fitting.iteration_log import LOG
 from udccal.fitting.noise_density import LEAST_SHAPE, MOST_SHAPE, NORMAL_SHAPE, dark_cdf
 
 _MOST_CODES = 160
@@ -259,6 +260,7 @@ def fit_dark(
             if deviance <= best:
                 gained, values, best = best - deviance, trial, deviance
                 break
+        LOG.debug("noise, dark codes: iteration %d, deviance %.9g", iterations, best)
         # The squared step in units of sigma is twice what the likelihood can still gain.
         converged = bool(score[inside] @ step[inside] < 1e-3) or gained < 1e-4
     _, information = _score_and_information(pairs, values, known, free)

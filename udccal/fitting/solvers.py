@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import logging
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -14,15 +13,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from udccal.fitting.iteration_log import LOG
 from udccal.numerics import in_float64
 
 with warnings.catch_warnings():
     # jaxopt says on import that it is no longer developed; it is complete for what is used here.
     warnings.simplefilter("ignore", DeprecationWarning)
     import jaxopt
-
-# Every iteration of every solve, at level DEBUG: `udccal fit --log`, or logging's own settings.
-LOG = logging.getLogger("udccal.fitting")
 
 # A fit has converged when another step would lower chi2 by less than this, in units of the residual variance.
 _LEFT_TO_GAIN = 1e-3
@@ -136,20 +133,3 @@ def _compiled(
         return z, state.iter_num, state.residual, state.jac, trace
 
     return solve
-
-
-@in_float64
-def ridge(
-    design: Float[np.ndarray, "m n"],
-    data: Float[np.ndarray, " m"],
-    weights: Float[np.ndarray, " m"],
-    penalty: Float[np.ndarray, " n"],
-) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n n"]]:
-    """Weighted linear least squares with a diagonal quadratic penalty; returns the solution and its covariance.
-
-    ``weights`` are inverse variances; ``penalty`` is an inverse prior variance per parameter (0: none).
-    """
-    weighted = design * weights[:, None]
-    normal = design.T @ weighted + np.diag(penalty)
-    cov = np.linalg.pinv(normal, hermitian=True)
-    return cov @ (weighted.T @ data), cov

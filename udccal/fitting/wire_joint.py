@@ -8,6 +8,7 @@ from typing import final
 import numpy as np
 from jaxtyping import Float
 
+from udccal.fitting.iteration_log import LOG
 from udccal.fitting.result import Candidate
 from udccal.fitting.wire_basis import LEAST_VARIANCE, Basis, Normal, Pixels, accumulate
 from udccal.fitting.wire_noise import FlatNoise, Judged, judge
@@ -94,6 +95,7 @@ def settle(
         precision, offsets = prior.precision(basis, shape), prior.offsets(state.wire, basis, shape)
         values, inverse = solve(state.normal, precision, offsets, variance)
         largest = float(np.max(np.abs(values) / np.sqrt(np.diag(inverse))))
+        LOG.debug("wire, joint: iteration %d, residual variance %.9g, to move by %.3g sigma", rounds, variance, largest)
         following = None
         if largest > _SETTLED and rounds < _ROUNDS:
             following = _downhill(state, values, judged.pixels, basis, shape, prior, variance)

@@ -13,6 +13,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
+from udccal.fitting.iteration_log import LOG
 from udccal.fitting.wire_basis import LEAST_VARIANCE, SITES, Basis, Normal, Pixels, accumulate, merit
 from udccal.fitting.wire_harmonics import WireStart, free_basis, plain_basis
 from udccal.fitting.wire_noise import FlatNoise, judge
@@ -206,6 +207,7 @@ def _gauss_newton(
         normal = accumulate(wire, gains, pixels, basis, shape=True)
         values, inverse = solve(normal, precision, prior.offsets(wire, basis, shape=True), variance)
         largest = float(np.max(steps_in_sigma(values, inverse)))
+        LOG.debug("wire, phase: iteration %d, chi2 %.9g, to move by %.3g sigma", done, now, largest)
         for halving in range(6):
             step = values * 0.5**halving
             trial, trial_gains = add_increment(wire, gains, basis, step)
