@@ -1,11 +1,13 @@
 """Planned against obtained: what ``udccal plan`` foretells at two designs of a reduced rig, and what fits then state.
 
-    python -m tests.benchmarks.planning [--out DIR] [--term NAME ...]
+    python -m tests.benchmarks.planning [--out DIR] [--term NAME ...] [--realisations N]
 
 Both designs are captured on the simulated rig and fitted. The fits of the first design are the profile at whose values
 both are predicted: at the first the prediction is of what was just measured, at the second it has to scale. Sigmas by
-noise are compared: how far a model is off is estimated anew by every fit, and a plan takes it from the profile.
-Writes DIR/planning.json and DIR/planning.md; exits with 1 where a prediction is off by more than 15 %.
+noise are compared: how far a model is off is estimated anew by every fit, and a plan takes it from the profile. The psf
+is compared in small windows of a rig whose light is in the class of its fit, and with the errors found, too.
+Writes DIR/planning.json and DIR/planning.md, and the table in docs/planning.md when all terms were asked for; exits
+with 1 where a prediction is off by more than 15 %.
 """
 
 from __future__ import annotations
@@ -18,10 +20,13 @@ from typing import final, get_args
 
 import numpy as np
 
+from tests.benchmarks.planning_psf import Compared, compared_psf
+from tests.benchmarks.readme_tables import between
 from tests.benchmarks.rows import Row, table, write_json
 from udccal.cli.jobs.benches import simulated_bench, simulated_rig
 from udccal.cli.jobs.capture import capture
 from udccal.cli.output import Output
+from udccal.compilation import keep_compilations
 from udccal.displays.pictures import face_picture
 from udccal.fitting.backscatter import problem_of
 from udccal.fitting.backscatter_data import read_shots as read_pictures
@@ -31,11 +36,6 @@ from udccal.fitting.backscatter_report import known_from
 from udccal.fitting.backscatter_select import choose
 from udccal.fitting.calibrate import Calibration, FitEffort, fit_session
 from udccal.fitting.geometry import projection_sigma_px
-from udccal.fitting.psf import fit_shots_fully, window_half
-from udccal.fitting.psf_posterior import psf_sigma
-from udccal.fitting.psf_read import read_shots as read_leds
-from udccal.models.psf import psf_kernels
-from udccal.numerics import in_float64
 from udccal.planning.measured import Measured, measured_state
 from udccal.planning.predictors import predictor_for
 from udccal.planning.state import Unexplained, sensor_samples
@@ -44,15 +44,15 @@ from udccal.sessions.schema import TermName
 from udccal.sessions.store import Session
 
 MOST_OFF = 0.15
+# Errors found in fewer fits than these tell too little.
+_ENOUGH = 12
+_PAGE = Path(__file__).resolve().parents[2] / "docs" / "planning.md"
+_OF_SESSIONS: tuple[TermName, ...] = ("noise", "geometry", "wire", "backscatter")
 _RIG = "lg55-reduced"
 _NEW_PICTURES = (9001, 9002, 9003)
-_KERNEL = (89, 33)
 OTHER = {
     "flats": 8,
     "noise_levels": 5,
-    "psf_rows": 2,
-    "psf_shifts": 2,
-    "psf_exposures": 4,
     "backscatter_pictures": 12,
     "backscatter_frames": 2,
     "board_views": 12,
@@ -80,34 +80,18 @@ class Obtained:
             case "wire":
                 found = {item.name: item.value for item in self.calibration.foundation.wire.diagnostics}
                 return float(np.sqrt(found["wire_map_rms_sigma"] ** 2 - found["wire_map_model_sigma"] ** 2))
-            case "psf":
-                return _psf_percent(self)
             case "backscatter":
                 return _backscatter_percent(self)
+            case "psf":
+                raise ValueError("expected a term of a session, found the psf, which has scenes of its own")
 
 
 def obtained(rig: RigDescription, folder: Path, seed: int = 0) -> Obtained:
     """Capture a rig in simulation (what the folder holds already is kept), and fit it."""
     with simulated_bench(simulated_rig(rig, seed)) as bench:
-        capture(Output(), rig, bench, folder, get_args(TermName))
+        capture(Output(), rig, bench, folder, _OF_SESSIONS)
     session = Session.open(folder)
     return Obtained(session, fit_session(session))
-
-
-@in_float64
-def _psf_percent(made: Obtained) -> float:
-    """Relative L2 of the stated sigmas at the places that the prediction looks at, root mean square."""
-    base, session = made.calibration.foundation, made.session
-    reading = read_leds(session, base.noise.term, base.wire.term, window_half(session, FitEffort().psf.half_px))
-    if reading.shots is None:
-        return float("inf")
-    fit = fit_shots_fully(reading.shots, session.rig, base.geometry.term, base.wire.term)
-    camera = session.rig.camera
-    places = np.array([[0.45, 0.55], [0.15, 0.2], [0.85, 0.7]]) * [camera.columns, camera.rows]
-    sigma = psf_sigma(replace(fit.posterior, model_error=0.0), places, *_KERNEL)
-    kernel = np.asarray(psf_kernels(fit.result.term, places, *_KERNEL))
-    relative = (sigma**2).sum(axis=(2, 3)) / (kernel**2).sum(axis=(2, 3))
-    return 100 * float(np.sqrt(relative.mean()))
 
 
 def _backscatter_percent(made: Obtained) -> float:
@@ -138,11 +122,41 @@ def compared(term: TermName, designs: list[tuple[str, Captures, Obtained]]) -> l
     predictor = predictor_for(term, by_noise)
     rows = []
     for name, captures, made in designs:
-        predicted, found = predictor.sigma(captures), made.sigma(term)
-        off = predicted / found - 1
-        said = f"{term}, {name}: predicted {predicted:.3g}, obtained {found:.3g}"
-        rows.append(Row(said, 100 * off, 100 * MOST_OFF, "%", abs(off) <= MOST_OFF))
+        rows.append(_row(f"{term}, {name}", predictor.sigma(captures), "stated", made.sigma(term)))
     return rows
+
+
+def psf_rows(made: Compared) -> list[Row]:
+    """One design's; errors found are compared where there are enough of them, within what these tell."""
+    rows = [_row(f"psf, {made.name}", made.predicted, "stated", made.stated)]
+    if made.realisations >= _ENOUGH:
+        found = _row(f"psf, {made.name}", made.predicted, "found", made.obtained)
+        rows.append(replace(found, limit=100 * (MOST_OFF + 2 * made.spread)))
+        rows[-1] = replace(rows[-1], ok=abs(found.value) <= rows[-1].limit)
+    return rows
+
+
+def _row(name: str, predicted: float, how: str, obtained: float) -> Row:
+    off = predicted / obtained - 1
+    said = f"{name}: predicted {predicted:.3g}, {how} {obtained:.3g}"
+    return Row(said, 100 * off, 100 * MOST_OFF, "%", abs(off) <= MOST_OFF)
+
+
+def session_rows(terms: list[TermName], out: Path) -> list[Row]:
+    """Capture and fit both designs, and compare."""
+    if not terms:
+        return []
+    rig = load_rig(_RIG)
+    other = rig.captures.model_copy(update=OTHER)
+    designs = [
+        (
+            name,
+            captures,
+            obtained(rig.model_copy(update={"captures": captures}), out / f"session-{name.split()[-1]}"),
+        )
+        for name, captures in (("rig's own", rig.captures), ("other", other))
+    ]
+    return [row for term in terms for row in compared(term, designs)]
 
 
 def main() -> int:
@@ -150,22 +164,19 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("planning"), help="folder for sessions and results")
     parser.add_argument("--term", action="append", choices=get_args(TermName), help="this term only; may be repeated")
+    parser.add_argument("--realisations", type=int, default=16, help="fits of each of the psf's designs")
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
-    rig = load_rig(_RIG)
-    other = rig.captures.model_copy(update=OTHER)
-    designs = [
-        (
-            name,
-            captures,
-            obtained(rig.model_copy(update={"captures": captures}), options.out / f"session-{name.split()[-1]}"),
-        )
-        for name, captures in (("rig's own", rig.captures), ("other", other))
-    ]
-    rows = [row for term in options.term or get_args(TermName) for row in compared(term, designs)]
+    keep_compilations()
+    terms: list[TermName] = options.term or list(get_args(TermName))
+    rows = session_rows([term for term in terms if term != "psf"], options.out)
+    if "psf" in terms:
+        rows += [row for made in compared_psf(options.realisations) for row in psf_rows(made)]
     print(table(rows))
     write_json(rows, options.out / "planning.json")
     (options.out / "planning.md").write_text(table(rows) + "\n", encoding="utf-8")
+    if set(terms) == set(get_args(TermName)):
+        _PAGE.write_text(between(_PAGE.read_text(encoding="utf-8"), "planning", table(rows)), encoding="utf-8")
     return 0 if all(row.ok for row in rows) else 1
 
 

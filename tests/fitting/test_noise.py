@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 
 from udccal.cameras.protocol import Region
-from udccal.fitting import noise_moments, nonuniformity, read_noise
+from udccal.fitting import noise_codes, noise_moments, nonuniformity, read_noise
 from udccal.fitting.noise import converter_step, fit_noise_data, nominal_noise
 from udccal.fitting.noise_data import NoiseData
+from udccal.fitting.noise_pairs import reduce_pair
+from udccal.fitting.noise_prnu import prnu
 from udccal.fitting.result import FitResult, FitStatus
 from udccal.models.noise import Noise
 from udccal.rig import RigDescription, load_rig
@@ -40,12 +42,12 @@ def reduced(sensor: Sensor, levels: np.ndarray, seed: int, stack_level: float | 
     for t in 0.02 * levels:
         # The lamp flickers by half a per cent.
         pair = [sensor.expose(light * (1 + 0.005 * rng.standard_normal()), t, region, rng) for _ in range(2)]
-        flats.append(noise_moments.reduce_pair(pair[0], pair[1], float(t)))
+        flats.append(reduce_pair(pair[0], pair[1], float(t)))
     top = 2**sensor.truth.bits - 1
     for t in (0.0005, 0.002, 0.01, 0.02, 0.25, 1.0):
         pair = [sensor.expose(none, t, region, rng) for _ in range(2)]
-        darks.append(read_noise.dark_pair(pair[0], pair[1], t, 1, top))
-        rows.append(noise_moments.reduce_pair(pair[0], pair[1], t).rows)
+        darks.append(noise_codes.dark_pair(pair[0], pair[1], t, 1, top))
+        rows.append(reduce_pair(pair[0], pair[1], t).rows)
     middle = 0.02 * float(levels[len(levels) // 2] if stack_level is None else stack_level)
     return NoiseData(
         darks=tuple(darks),
@@ -151,7 +153,7 @@ def test_pairs_of_one_frame_twice_are_a_poor_fit() -> None:
     twice = []
     for t in 0.02 * np.linspace(0.05, 0.6, 8):
         frame = sensor.expose(light, float(t), Region(0, 0, COLUMNS, ROWS), np.random.default_rng(0))
-        twice.append(noise_moments.reduce_pair(frame, frame, float(t)))
+        twice.append(reduce_pair(frame, frame, float(t)))
     result = fit_noise_data(replace(data, flats=tuple(twice)), nominal_noise(rig))
     assert result.status is FitStatus.POOR_FIT
     assert "copies of each other" in result.notes[0]
@@ -163,7 +165,7 @@ def test_rounding_coarser_than_the_noise(fraction: float) -> None:
     sigma, spread = 0.28, 0.08
     offset = 24 + fraction + spread * rng.standard_normal((400, 400))
     frames = [np.rint(offset + sigma * rng.standard_normal((400, 400))).astype(np.uint16) for _ in range(2)]
-    pair = read_noise.dark_pair(frames[0], frames[1], 0.01)
+    pair = noise_codes.dark_pair(frames[0], frames[1], 0.01)
     fit = read_noise.fit_dark((pair, replace(pair, exposure_s=0.02)), read_noise.Surroundings(0.06, 0.0))
     assert np.sqrt(fit.values[2]) == pytest.approx(sigma, rel=0.03)
     # What the textbook's white quantisation makes of the same frames is worse than what is asked for.
@@ -177,7 +179,7 @@ def test_codes_cut_off_at_zero_are_censored() -> None:
     black, sigma = 0.3, 2.0
     frames = [np.clip(np.rint(black + sigma * rng.standard_normal((300, 400))), 0, None) for _ in range(4)]
     pairs = tuple(
-        read_noise.dark_pair(frames[i].astype(np.uint16), frames[i + 1].astype(np.uint16), 0.01 * (i + 1))
+        noise_codes.dark_pair(frames[i].astype(np.uint16), frames[i + 1].astype(np.uint16), 0.01 * (i + 1))
         for i in (0, 2)
     )
     assert pairs[0].edges_DN[0] == -np.inf
@@ -192,7 +194,7 @@ def test_a_wide_window_of_codes_is_grouped_and_loses_nothing() -> None:
     rng = np.random.default_rng(9)
     frames = [np.rint(2000 + 200 * rng.standard_normal((200, 300))).astype(np.uint16) for _ in range(2)]
     frames[0][0, 0] = 3  # far below the window
-    pair = read_noise.dark_pair(frames[0], frames[1], 0.01)
+    pair = noise_codes.dark_pair(frames[0], frames[1], 0.01)
     assert pair.counts.shape[0] <= 161
     assert pair.outside >= 1
     assert pair.counts.sum() + pair.outside == frames[0].size
@@ -202,9 +204,9 @@ def test_a_wide_window_of_codes_is_grouped_and_loses_nothing() -> None:
 def test_hot_pixels_do_not_carry_the_prnu() -> None:
     rng = np.random.default_rng(2)
     signal = 1000 * (1 + 0.005 * rng.standard_normal((200, 300)))
-    clean = nonuniformity.prnu(signal, 0.0, 0.0)
+    clean = prnu(signal, 0.0, 0.0)
     signal[rng.random(signal.shape) < 1e-3] *= 3
-    hot = nonuniformity.prnu(signal, 0.0, 0.0)
+    hot = prnu(signal, 0.0, 0.0)
     assert np.sqrt(clean.variance) == pytest.approx(0.005, rel=0.03)
     assert np.sqrt(hot.variance) == pytest.approx(0.005, rel=0.03)
     assert hot.outliers > clean.outliers
@@ -216,7 +218,7 @@ def test_shading_and_waves_do_not_carry_the_prnu() -> None:
     y, x = np.mgrid[:240, :320]
     light = (1 - 0.3 * ((x / 320 - 0.5) ** 2 + (y / 240 - 0.5) ** 2)) * (1 + 0.02 * np.cos(2 * np.pi * y / 40))
     signal = 1000 * light * (1 + 0.005 * rng.standard_normal(light.shape))
-    found = nonuniformity.prnu(signal, 0.0, 0.0)
+    found = prnu(signal, 0.0, 0.0)
     assert np.sqrt(found.variance) == pytest.approx(0.005, rel=0.02)
     assert np.std(signal) / 1000 > 0.02
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 import pytest
@@ -123,6 +124,19 @@ def test_hot_pixels_are_named() -> None:
     assert "row 7, column 9" in hot.places
 
 
+def test_residuals_are_those_of_normal_noise_and_lie_on_the_sensor() -> None:
+    sensor = replace(PLAIN, rows=256, columns=384)
+    levels, stack = capture(sensor, 8)
+    sample = fit_noise_frames(levels, stack, bayer=True, top_code=4095).residuals
+    assert sample is not None
+    assert len(sample.z) > 100
+    assert sample.z.std() == pytest.approx(1.0, abs=4 / np.sqrt(2 * len(sample.z)))
+    middle = sample.positions_px.mean(axis=0)
+    assert middle == pytest.approx([0.5 * (sensor.columns - 1), 0.5 * (sensor.rows - 1)], abs=3.0)
+    assert sample.positions_px.min() >= 0
+    assert (sample.positions_px < [sensor.columns, sensor.rows]).all()
+
+
 FRAME = np.full((32, 32), 100, np.uint16)
 
 
@@ -151,14 +165,17 @@ def test_nothing_at_all_is_too_few() -> None:
 
 
 # A failing example is shown as drawn: to shrink it would take hundreds of fits.
-@settings(
-    max_examples=14,
-    deadline=None,
-    derandomize=True,
-    phases=(Phase.explicit, Phase.generate),
-    suppress_health_check=list(HealthCheck),
-)
-@given(
+def _examples(count: int) -> settings:
+    return settings(
+        max_examples=count,
+        deadline=None,
+        derandomize=True,
+        phases=(Phase.explicit, Phase.generate),
+        suppress_health_check=list(HealthCheck),
+    )
+
+
+_ANY_SENSOR = given(
     K=st.floats(-1.3, 1.3),
     bits=st.sampled_from([8, 10, 12, 14, 16]),
     read_e=st.one_of(st.just(0.0), st.floats(0.3, 30.0)),
@@ -170,7 +187,22 @@ def test_nothing_at_all_is_too_few() -> None:
     flicker=st.sampled_from([0.0, 0.0, 0.003, 0.03]),
     seed=st.integers(0, 10_000),
 )
-def test_any_sensor_gives_a_result_within_its_error_or_a_status(
+
+
+@_examples(3)
+@_ANY_SENSOR
+def test_any_sensor_gives_a_result_within_its_error_or_a_status(**numbers: Any) -> None:
+    _within_its_error_or_a_status(**numbers)
+
+
+@pytest.mark.slow
+@_examples(40)
+@_ANY_SENSOR
+def test_any_of_many_sensors_gives_a_result_within_its_error_or_a_status(**numbers: Any) -> None:
+    _within_its_error_or_a_status(**numbers)
+
+
+def _within_its_error_or_a_status(
     K: float, bits: int, read_e: float, black: float, top: float, row: float, dark: float, bend: float,
     flicker: float, seed: int,
 ) -> None:  # fmt: skip

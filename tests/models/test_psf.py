@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from udccal.models.diffraction import Diffraction, disc_autocorrelation, local_frame, slit_coefficient
+from udccal.models.diffraction import Diffraction, disc_autocorrelation, local_frame, slit_coefficients
 from udccal.models.fields import polynomial_basis, polynomial_terms
 from udccal.models.geometry import Geometry
 from udccal.models.interference import disc_overlap_coefficient
@@ -79,7 +79,7 @@ def test_slits_against_a_sum(lag: float, order: int) -> None:
 
     both = open_at(y + lag / 2) & open_at(y - lag / 2)
     expected = (both * np.cos(2 * np.pi * order * y)).mean() / opened
-    assert as_numpy(slit_coefficient)(np.array([lag]), opened, order)[0] == pytest.approx(expected, abs=3e-4)
+    assert as_numpy(slit_coefficients)(np.array([lag]), opened, 3)[order, 0] == pytest.approx(expected, abs=3e-4)
 
 
 @pytest.mark.parametrize(

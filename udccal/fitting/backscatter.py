@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from udccal.fitting.absent import absent_backscatter
+from udccal.fitting.backscatter_begin import Problem
 from udccal.fitting.backscatter_data import (
     PanelShots,
     grid_step,
@@ -21,9 +22,9 @@ from udccal.fitting.backscatter_data import (
     sampled_rays,
     visible_crop,
 )
-from udccal.fitting.backscatter_likelihood import LEAST_VARIANCE, evidence
+from udccal.fitting.backscatter_evidence import LEAST_VARIANCE, evidence, pictures_of
 from udccal.fitting.backscatter_report import told
-from udccal.fitting.backscatter_select import Problem, choose
+from udccal.fitting.backscatter_select import choose
 from udccal.fitting.backscatter_solve import SLACK_PX, scan_offset, window_for
 from udccal.fitting.backscatter_vector import prior_of
 from udccal.fitting.result import FitResult, FitStatus
@@ -90,10 +91,11 @@ def problem_of(shots: PanelShots, geometry: Geometry, rig: RigDescription, posit
     step = grid_step(rig)
     rays, flat = sampled_rays(geometry, rig, step, positions)
     prior = prior_of(rig)
-    template = nominal_term(geometry, rig, np.zeros_like(shots.white.rate), step, window=1)
+    # The mask comes out of the likelihood; the template's is of no size.
+    template = nominal_term(geometry, rig, np.zeros((3, 1, 1)), step, window=1)
     wide = replace(template, window=window_for(template, prior.mean, rays, SLACK_PX))
-    start = scan_offset(wide, evidence(shots, rays[::4], flat[::4]), rig, prior)
-    return Problem(wide, evidence(shots, rays, flat), flat, prior, start.x)
+    seen = evidence(shots, rays, flat, pictures_of(shots.shown, shots.crop))
+    return Problem(wide, seen, flat, prior, scan_offset(wide, seen, rig, prior).x)
 
 
 def _shows_light(shots: PanelShots) -> bool:

@@ -8,7 +8,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.stats import chi2, norm
 
-from udccal.fitting.backscatter_likelihood import LEAST_VARIANCE, Evidence, Fitted
+from udccal.fitting.backscatter_evidence import LEAST_VARIANCE, Evidence
+from udccal.fitting.backscatter_likelihood import Fitted
 from udccal.fitting.result import Outliers
 
 # Samples further off than this many robust sigma of all samples are left out.
@@ -20,6 +21,8 @@ _BRIGHTNESS_SIGMA = 6.0
 # ... or when it is described this much worse than the others.
 _SHAPE_TIMES = 4.0
 _MAD = 1.4826
+# Half of a normal's draws lie within this many sigma.
+_PROBABLE = 1 / _MAD
 # Significance from which chi2 above its degrees of freedom, or a pattern, counts as the model's error.
 SIGNIFICANT = 1e-3
 _CELLS = 3
@@ -71,7 +74,7 @@ def undescribed_share(fitted: Fitted, seen: Evidence, freedom: float) -> float:
     unit[0] = 0.0
     unit = unit[used]
     # White and dark have no part in the model's error.
-    dark = float((fitted.dark_errors**2 / np.asarray(seen.dark_variance)).sum())
+    dark = float((fitted.dark_errors**2 / seen.dark_variance).sum())
     if not unit.any() or chi2.sf(float((square / noise).sum()) + dark, freedom) > SIGNIFICANT:
         return 0.0
     low, high = 0.0, float(np.sqrt(square.max() / unit[unit > 0].min()))
@@ -82,12 +85,29 @@ def undescribed_share(fitted: Fitted, seen: Evidence, freedom: float) -> float:
     return float(0.5 * (low + high))
 
 
+def typical_share(fitted: Fitted, seen: Evidence) -> float:
+    """Error of the modelled ratios, as one sigma, that makes half of all errors smaller than their probable error.
+
+    Odd pictures have no say in it, nor has the size of their errors.
+    """
+    used = fitted.weight[1:] > 0
+    noise = noise_variance(fitted, seen)[1:][used]
+    square = (fitted.errors[1:] ** 2)[used]
+    unit = np.broadcast_to(fitted.mask**2, used.shape)[used]
+    if not unit.any():
+        return 0.0
+    low, high = 0.0, float(np.sqrt(square.max() / unit[unit > 0].min()))
+    for _ in range(40):
+        middle = 0.5 * (low + high)
+        above = float(np.median(square / (noise + middle**2 * unit))) > _PROBABLE**2
+        low, high = (middle, high) if above else (low, middle)
+    return high
+
+
 def noise_variance(fitted: Fitted, seen: Evidence) -> Float[np.ndarray, "shots 3 n"]:
     """Of every sample at its modelled rate, without the model's own error."""
-    shot = np.asarray(seen.shot)
-    return np.maximum(
-        shot * np.maximum(fitted.mask * fitted.ratio, 0.0) + np.asarray(seen.rest), LEAST_VARIANCE * shot**2
-    )
+    light = np.maximum(fitted.mask * fitted.ratio, 0.0)
+    return np.maximum(seen.shot * light + seen.rest, LEAST_VARIANCE * seen.shot**2)
 
 
 @dataclass(frozen=True)

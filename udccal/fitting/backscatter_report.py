@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 
 from udccal.fitting.backscatter_checks import Pattern, listed, pattern
 from udccal.fitting.backscatter_data import PanelShots, directions
-from udccal.fitting.backscatter_light import Knowledge, mask_of
+from udccal.fitting.backscatter_light import Knowledge, Other, mask_of
 from udccal.fitting.backscatter_likelihood import chi2_of
 from udccal.fitting.backscatter_select import Choice
 from udccal.fitting.backscatter_solve import window_for
@@ -33,6 +33,8 @@ _PLACE = [1, 2, 6, 7]
 # Rates between frames of one shot vary this much more than noise when the panel flickers.
 _STEADY = 1.3
 _MOST_ODD = 0.25
+# Candidates less probable than this do not widen the error bars of predicted light.
+_POSSIBLE = 1e-3
 _MOST_RESIDUALS = 6000
 
 
@@ -82,11 +84,9 @@ def _cov_over_orders(choice: Choice, known: Knowledge) -> Float[np.ndarray, "18 
 
     Hoeting et al., Statistical Science 14, 1999, around the chosen candidate's values.
     """
-    criteria = np.array([one.criterion for one in choice.rivals])
-    odds = np.exp(-0.5 * (criteria - criteria.min()))
     values, slopes = values_of(known.x), value_slopes(known.x)
     cov = np.zeros_like(known.cov)
-    for one, probability in zip(choice.rivals, odds / odds.sum(), strict=True):
+    for one, probability in zip(choice.rivals, choice.odds, strict=True):
         chosen = one.order is choice.order
         off = np.zeros(len(values)) if chosen else values_of(one.solution.x) - values
         own = slopes if chosen else value_slopes(one.solution.x)
@@ -104,6 +104,11 @@ def known_from(choice: Choice) -> Knowledge:
         cov=solution.cov * residual_pattern(choice).inflation,
         share=choice.state.share,
         kept=tuple(bool(one) for one in ~choice.odd_shots),
+        others=tuple(
+            Other(one.solution.x, one.solution.cov, float(probability))
+            for one, probability in zip(choice.rivals, choice.odds, strict=True)
+            if one.order is not choice.order and probability > _POSSIBLE
+        ),
     )
 
 
@@ -123,6 +128,12 @@ def _status(choice: Choice) -> tuple[FitStatus, tuple[str, ...]]:
     solution, prior = choice.state.fitted.solution, choice.problem.prior
     if not solution.converged:
         return FitStatus.NOT_CONVERGED, ("Check panel and mounting in the rig's description.",)
+    template = choice.problem.template
+    if window_for(template, solution.x, choice.problem.seen.rays, slack=0.0) > template.window:
+        return FitStatus.POOR_FIT, (
+            "The pictures ask for footprints on the panel of more than twice their nominal width. Check lens, "
+            "stand-off and pitch in the description, and that every frame was stored with the picture that was shown.",
+        )
     unsure = np.sqrt(np.maximum(np.diag(solution.cov), 0.0)) > _UNDETERMINED * prior.sigma
     if unsure[_PLACE].any():
         names = ", ".join(NAMES[k] for k in _PLACE if unsure[k])
@@ -188,8 +199,8 @@ def _outliers(choice: Choice, shots: PanelShots, clipped: list[str]) -> tuple[Ou
     """What was left out, by rule."""
     names = ("white", *shots.names)
     odd = [name for name, one in zip(names, choice.odd_shots, strict=True) if one]
-    gone = np.asarray(choice.problem.seen.usable) & ~choice.state.usable & ~choice.odd_shots[:, None, None]
-    clips = ~np.asarray(choice.problem.seen.usable)
+    gone = choice.problem.seen.usable & ~choice.state.usable & ~choice.odd_shots[:, None, None]
+    clips = ~choice.problem.seen.usable
     return (
         *listed("pictures with more than 2 % of their bins clipped", clipped),
         *listed("pictures whose brightness or pattern is unlike the others by more than 6 robust sigma", odd),
@@ -212,7 +223,7 @@ def _term(known: Knowledge, mask: Float[np.ndarray, "3 grid_rows grid_columns"])
     template, x = known.template, known.x
     columns, rows = (np.asarray(a) for a in grid_positions(template.columns, template.rows, template.step))
     pixels = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
-    rays = np.asarray(directions(template.geometry, pixels), dtype=np.float64)
+    rays = directions(template.geometry, pixels)
     fitted, values = with_vector(template, jnp.asarray(x)), values_of(x)
     return Backscatter(
         geometry=template.geometry,

@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from scipy.stats import chi2
 
+from udccal.fitting.backscatter_begin import Problem, calmed, solved, two_planes
 from udccal.fitting.backscatter_checks import (
     SIGNIFICANT,
     lost_bins,
@@ -16,16 +17,9 @@ from udccal.fitting.backscatter_checks import (
     odd_samples,
     undescribed_share,
 )
-from udccal.fitting.backscatter_likelihood import (
-    Evidence,
-    Fitted,
-    degrees_of_freedom,
-    fitted_at,
-    solve,
-    weights,
-    weights_to_start,
-)
-from udccal.fitting.backscatter_solve import corners_of, with_room
+from udccal.fitting.backscatter_evidence import weights, weights_to_start
+from udccal.fitting.backscatter_likelihood import Fitted, degrees_of_freedom, reweighed
+from udccal.fitting.backscatter_solve import with_room
 from udccal.fitting.backscatter_vector import (
     CROSSTALK,
     KERNELS,
@@ -33,32 +27,17 @@ from udccal.fitting.backscatter_vector import (
     TWO_PLANES,
     Order,
     Prior,
-    split_plane,
     values_of,
     without_crosstalk,
 )
 from udccal.fitting.solvers import Solution
-from udccal.models.backscatter import Backscatter
 
 _ROUNDS = 4
 HELD_OUT_EVERY = 4
-# Where a second plane may start: light of it over that of the first.
-_REFLECTIONS = (1.0, 0.2)
 # Model's error, as a share of white, from which no order describes anything and none is compared.
-_NOTHING_FITS = 0.15
+_NOTHING_FITS = 0.05
 # Rise of chi2 from which a candidate is not fitted any more.
 _HOPELESS = 1000.0
-
-
-@dataclass(frozen=True)
-class Problem:
-    """What all candidates share; ``flat`` are the grid indices of the positions."""
-
-    template: Backscatter
-    seen: Evidence
-    flat: Int[np.ndarray, " n"]
-    prior: Prior
-    start: Float[np.ndarray, "18"]
 
 
 @dataclass(frozen=True)
@@ -113,35 +92,37 @@ class Choice:
         """Degrees of freedom; a parameter that its prior holds takes less than one."""
         return freedom_of(self.state.fitted, self.order, self.problem.prior)
 
+    @property
+    def odds(self) -> Float[np.ndarray, " rivals"]:
+        """How probable each candidate is."""
+        criteria = np.array([one.criterion for one in self.rivals])
+        odds = np.exp(-0.5 * (criteria - criteria.min()))
+        return np.asarray(odds / odds.sum())
+
 
 def choose(problem: Problem, kernels: tuple[Order, ...] = KERNELS) -> Choice:
     """Fit the candidates and take the one of the largest evidence; ``kernels`` holds one where the order is known."""
     seen = problem.seen
-    usable = np.asarray(seen.usable)
-    first = _solved(problem, ONE_PLANE, problem.start, weights_to_start(seen))
+    usable = seen.usable
+    noise = weights_to_start(seen)
+    first = replace(calmed(problem, ONE_PLANE, problem.start, noise), weight=noise)
     odd = odd_pictures(first)
-    problem = replace(problem, template=with_room(problem.template, first.solution.x, np.asarray(seen.rays)))
-    rich = _two_planes(problem, first.solution.x, np.where(odd[:, None, None], 0.0, first.weight))
+    problem = replace(problem, template=with_room(problem.template, first.solution.x, seen.rays))
+    rich = two_planes(problem, first, np.where(odd[:, None, None], 0.0, noise))
     # Judged anew: one plane describes some good pictures badly.
-    odd = odd_pictures(replace(rich, weight=first.weight))
-    rich = replace(rich, weight=np.where(odd[:, None, None], 0.0, first.weight))
+    odd = odd_pictures(replace(rich, weight=noise))
+    rich = replace(rich, weight=np.where(odd[:, None, None], 0.0, noise))
     state = State(rich, _without_odd(problem, rich, usable & ~odd[:, None, None], usable), 0.0)
     state = refit(problem, TWO_PLANES, state)
-    problem = replace(problem, template=with_room(problem.template, state.fitted.solution.x, np.asarray(seen.rays)))
+    problem = replace(problem, template=with_room(problem.template, state.fitted.solution.x, seen.rays))
     if state.share > _NOTHING_FITS:
         kernels = (TWO_PLANES,)
     order, start, rivals = _compared(problem, state, first.solution.x, kernels)
-    chosen = _solved(problem, order, start, state.fitted.weight)
+    chosen = solved(problem, order, start, state.fitted.weight)
     state = refit(problem, order, replace(state, fitted=chosen))
     held = _held_out(problem, order, state)
     # Pictures that took no part tell what new ones will meet.
     return Choice(problem, order, replace(state, share=max(state.share, held.share)), rivals, odd, held)
-
-
-def _two_planes(problem: Problem, simple: Float[np.ndarray, "18"], weight: np.ndarray) -> Fitted:
-    """The better of two fits: a reflection as strong as the emitters themselves to begin with, and a fainter one."""
-    starts = [split_plane(simple, problem.prior, reflection) for reflection in _REFLECTIONS]
-    return min((_solved(problem, TWO_PLANES, x, weight) for x in starts), key=lambda one: one.solution.chi2)
 
 
 def refit(problem: Problem, order: Order, state: State) -> State:
@@ -151,7 +132,7 @@ def refit(problem: Problem, order: Order, state: State) -> State:
         freedom = freedom_of(fitted, order, problem.prior)
         share = undescribed_share(fitted, problem.seen, freedom)
         weight = weights(problem.seen, fitted.mask * fitted.ratio, fitted.mask, share, state.usable)
-        state = State(_solved(problem, order, fitted.solution.x, weight), state.usable, share)
+        state = State(solved(problem, order, fitted.solution.x, weight), state.usable, share)
     return state
 
 
@@ -161,12 +142,6 @@ def freedom_of(fitted: Fitted, order: Order, prior: Prior) -> float:
     return degrees_of_freedom(fitted.weight, float(np.maximum(1.0 - known, 0.0).sum()))
 
 
-def _solved(problem: Problem, order: Order, x: Float[np.ndarray, "18"], weight: np.ndarray) -> Fitted:
-    start = order.start(x, problem.prior)
-    corner = corners_of(problem.template, start, np.asarray(problem.seen.rays))
-    return solve(problem.template, problem.seen, weight, order, problem.prior, start, corner)
-
-
 def _without_odd(
     problem: Problem, fitted: Fitted, usable: Bool[np.ndarray, "shots 3 n"], before: Bool[np.ndarray, "shots 3 n"]
 ) -> Bool[np.ndarray, "shots 3 n"]:
@@ -174,7 +149,7 @@ def _without_odd(
     begun = usable
     for _ in range(_ROUNDS):
         weight = np.where(usable, fitted.weight, 0.0)
-        fitted = fitted_at(problem.template, problem.seen, weight, fitted.solution, fitted.corner)
+        fitted = reweighed(fitted.solution, fitted.corner, fitted.ratio, problem.seen, weight)
         odd = odd_samples(fitted)
         if not odd.any():
             break
@@ -190,7 +165,7 @@ def _compared(
     tried: list[Rival] = []
     for order in kernels:
         start = simple if order.free[4] == 0 else rich.solution.x
-        fitted = rich if order is TWO_PLANES else _solved(problem, order, start, weight)
+        fitted = rich if order is TWO_PLANES else solved(problem, order, start, weight)
         tried.append(Rival(order, fitted.solution, _criterion(fitted.solution, order, prior)))
     best = min(tried, key=lambda one: one.criterion)
     plain, off = without_crosstalk(best.order), _crosstalk_chi2(best.solution)
@@ -198,7 +173,7 @@ def _compared(
         # A fit without it would wander far for nothing: the loss is told from the parabola at the minimum.
         tried.append(Rival(plain, best.solution, _criterion(best.solution, plain, prior) + off))
     else:
-        bare = _solved(problem, plain, best.solution.x, weight).solution
+        bare = solved(problem, plain, best.solution.x, weight).solution
         tried.append(Rival(plain, bare, _criterion(bare, plain, prior)))
     best = min(tried, key=lambda one: one.criterion)
     return best.order, best.solution.x, tuple(tried)
@@ -215,18 +190,19 @@ def _criterion(solution: Solution, order: Order, prior: Prior) -> float:
     """-2 ln of the evidence by Laplace's method: chi2, and per parameter how far the data narrow its prior.
 
     It is what the BIC approximates for priors as wide as one sample's information. The priors here say more than that:
-    a parameter that the data cannot tell costs nothing and stays, with its true error bar.
+    a parameter that the data cannot tell costs nothing and stays, with its true error bar. What is known about panels
+    beforehand counts as well.
     """
     free = order.free > 0
     narrowed = solution.cov[np.ix_(free, free)] / np.outer(prior.sigma[free], prior.sigma[free])
-    return solution.chi2 - float(np.linalg.slogdet(narrowed)[1])
+    return solution.chi2 - float(np.linalg.slogdet(narrowed)[1]) + order.against
 
 
 def _held_out(problem: Problem, order: Order, state: State) -> HeldOut:
     """A fit without every fourth picture, and its errors there."""
     weight = state.fitted.weight.copy()
     weight[HELD_OUT_EVERY::HELD_OUT_EVERY] = 0.0
-    fitted = _solved(problem, order, state.fitted.solution.x, weight)
+    fitted = solved(problem, order, state.fitted.solution.x, weight)
     used = (state.fitted.weight > 0) & (weight == 0)
     if not used.any():
         return HeldOut(0.0, 0.0, 0.0)

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from udccal.fitting.backscatter_likelihood import Evidence, light_ratios, weights_to_start
+from udccal.fitting.backscatter_blocks import in_blocks
+from udccal.fitting.backscatter_evidence import Evidence, weights_to_start
+from udccal.fitting.backscatter_ratios import mixed_ratios, primary_light, shares_at, windows_at
 from udccal.fitting.backscatter_vector import (
+    EMITTERS,
+    OFFSET,
     TWO_PLANES,
     Prior,
     offset_reach_px,
@@ -24,9 +27,9 @@ from udccal.models.backscatter import Backscatter, footprints, window_corners
 from udccal.numerics import in_float64
 from udccal.rig import RigDescription
 
-_SCAN_STEP_PX = 1.25
 # Room that a window leaves for the footprint to move during a fit.
 SLACK_PX = 0.7
+_MOST_WIDER = 2
 
 
 @dataclass(frozen=True)
@@ -37,70 +40,81 @@ class Start:
     cost: float
 
 
-@in_float64
 def corners_of(
     template: Backscatter, x: Float[np.ndarray, "18"], rays: Float[np.ndarray, "n 3"]
 ) -> Int[np.ndarray, "n 2"]:
     """First panel pixel of the window of each position."""
-    return np.asarray(_corners(template, x, rays)).astype(np.int64)
+    return _extents(template, x, rays).corner
 
 
-@in_float64
 def window_for(template: Backscatter, x: Float[np.ndarray, "18"], rays: Float[np.ndarray, "n 3"], slack: float) -> int:
     """Odd number of panel pixels across a window that holds both footprints at every position."""
-    (near, shape), (far, far_shape), emitters = jax.tree.map(np.asarray, _extents(template, x, rays))
-    extent = np.maximum(np.linalg.norm(shape, axis=2), np.linalg.norm(far_shape, axis=2)).max()
-    apart = np.abs(far - near).max() / 2
+    found = _extents(template, x, rays)
+    emitters = np.insert(x[EMITTERS].reshape(2, 2), 1, 0.0, axis=0)
     spread = np.abs(emitters - emitters.mean(axis=0)).max()
-    return 2 * int(np.ceil(extent + apart + spread + 4 * float(values_of(x)[3]) + slack)) + 1
+    return 2 * int(np.ceil(found.reach_px.max() + spread + 4 * float(values_of(x)[3]) + slack)) + 1
 
 
 def with_room(template: Backscatter, x: Float[np.ndarray, "18"], rays: Float[np.ndarray, "n 3"]) -> Backscatter:
-    """The template with a window that holds the footprints and lets them move, never smaller than it was."""
-    if window_for(template, x, rays, 0.0) <= template.window:
+    """The template with a window that holds the footprints and lets them move, never smaller than it was.
+
+    It stays where it would have to be more than twice as wide: such a fit has gone astray.
+    """
+    if not template.window < window_for(template, x, rays, 0.0) <= _MOST_WIDER * template.window:
         return template
     return replace(template, window=window_for(template, x, rays, SLACK_PX))
 
 
-@eqx.filter_jit
-def _corners(template: Backscatter, x: Float[Arrayish, "18"], rays: Float[Arrayish, "n 3"]) -> Int[Array, "n 2"]:
-    return window_corners(with_vector(template, jnp.asarray(x)), rays)
+@dataclass(frozen=True)
+class _Extents:
+    """Per position: the window's first panel pixel, and how far the footprints reach from its middle."""
+
+    corner: Int[np.ndarray, "n 2"]
+    reach_px: Float[np.ndarray, " n"]
 
 
-@eqx.filter_jit
-def _extents(
-    template: Backscatter, x: Float[Arrayish, "18"], rays: Float[Arrayish, "n 3"]
-) -> tuple[tuple[Array, Array], tuple[Array, Array], Array]:
-    """The direct and the reflected footprints, and the emitters' places."""
+@in_float64
+def _extents(template: Backscatter, x: Float[np.ndarray, "18"], rays: Float[np.ndarray, "n 3"]) -> _Extents:
+    # The corner is worked out for a window of one pixel: windows of any size then share one compilation.
+    single = replace(template, window=1)
+    middle, reach = in_blocks(lambda part: _middle_and_reach(single, x, part), rays)
+    return _Extents((middle - (template.window - 1) // 2).astype(np.int64), reach)
+
+
+@jax.jit
+def _middle_and_reach(
+    template: Backscatter, x: Float[Arrayish, "18"], rays: Float[Arrayish, "b 3"]
+) -> tuple[Int[Array, "b 2"], Float[Array, " b"]]:
     term = with_vector(template, jnp.asarray(x))
-    far = term.distance_mm + term.reflection_mm
-    return footprints(term, rays, term.distance_mm), footprints(term, rays, far), jnp.asarray(term.emitters_px)
+    near, shape = footprints(term, rays, term.distance_mm)
+    far, far_shape = footprints(term, rays, term.distance_mm + term.reflection_mm)
+    extent = jnp.maximum(jnp.linalg.norm(shape, axis=2), jnp.linalg.norm(far_shape, axis=2)).max(axis=1)
+    return window_corners(term, rays), extent + jnp.abs(far - near).max(axis=1) / 2
 
 
 @in_float64
 def scan_offset(template: Backscatter, seen: Evidence, rig: RigDescription, prior: Prior) -> Start:
-    """Panel offset at which a free mix of primaries explains the ratios best: where least squares may start."""
-    best = Start(prior.mean, np.inf)
-    across, down = (_SCAN_STEP_PX * np.ceil(reach / _SCAN_STEP_PX) for reach in offset_reach_px(rig))
+    """Panel offset at which a free mix of primaries explains the ratios best: where least squares may start.
+
+    Offsets are whole panel pixels: a window that moves with them sees the same shares of its emitters.
+    """
+    across, down = (int(np.ceil(reach)) for reach in offset_reach_px(rig))
     target = _ratios_seen(seen)
-    for y in np.arange(-down, down + 1e-9, _SCAN_STEP_PX):
-        for x in np.arange(-across, across + 1e-9, _SCAN_STEP_PX):
-            vector = prior.mean.copy()
-            vector[6:8] = x, y
-            plain = without_crosstalk(TWO_PLANES).start(vector, prior)
-            corner = corners_of(template, plain, np.asarray(seen.rays))
-            primaries = np.asarray(_primaries(template, plain, seen, corner))
+    plain = without_crosstalk(TWO_PLANES).start(prior.mean, prior)
+    corner = corners_of(template, plain, seen.rays)
+    shares = shares_at(template, plain, seen.rays, corner)
+    best = Start(prior.mean, np.inf)
+    for y in range(-down, down + 1):
+        for x in range(-across, across + 1):
+            moved = windows_at(template.window, seen.rays, corner - np.array([x, y]), seen.shown)
+            light, white = primary_light(shares, float(plain[0]), moved, seen.shown)
+            primaries = mixed_ratios(light, white, np.eye(3))
             cost = sum(_free_mix_cost(primaries, target, channel) for channel in range(3))
             if cost < best.cost:
+                vector = prior.mean.copy()
+                vector[OFFSET] = x, y
                 best = Start(vector, cost)
     return best
-
-
-@eqx.filter_jit
-def _primaries(
-    template: Backscatter, x: Float[Arrayish, "18"], seen: Evidence, corner: Int[Arrayish, "n 2"]
-) -> Float[Array, "pictures 3 n"]:
-    return light_ratios(with_vector(template, jnp.asarray(x)), seen, corner, seen.shown)
 
 
 @dataclass(frozen=True)
@@ -112,7 +126,7 @@ class _Target:
 
 
 def _ratios_seen(seen: Evidence) -> _Target:
-    light = np.asarray(seen.light) - np.asarray(seen.exposure)[:, None, None] * np.asarray(seen.dark)
+    light = seen.light - seen.exposure[:, None, None] * seen.dark
     weight = weights_to_start(seen)
     lit = light[0] * weight[0] > 1.0
     white = np.where(lit, light[0], 1.0)

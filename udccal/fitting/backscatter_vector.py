@@ -26,11 +26,15 @@ _LOGARITHMIC = np.array([1, 2, 3, 4, 5, 12, 13, 14, 15, 16, 17])
 _LENGTHS_BY_PITCH = [1, 2, 5]
 # Stands for the logarithm of nothing.
 _ABSENT = -40.0
-_DISTANCE, _REFLECTION, _DEPTH, _EMITTERS, CROSSTALK = 1, 4, 5, slice(8, 12), slice(12, 18)
+_DISTANCE, _REFLECTION, _DEPTH, CROSSTALK = 1, 4, 5, slice(12, 18)
+# Of the green emitters from the centres of their pixels, and of red and blue from green.
+OFFSET, EMITTERS = slice(6, 8), slice(8, 12)
 # Those that tell where footprints lie and how they look.
 PLACES = slice(1, 12)
 _OFF_DIAGONAL = (np.array([0, 0, 1, 1, 2, 2]), np.array([1, 2, 0, 2, 0, 1]))
 _SOFTNESS_PX, _CROSSTALK = 0.15, 0.1
+# -2 ln(1 / 2)
+_ODDS_AGAINST = 1.4
 
 
 @dataclass(frozen=True)
@@ -53,6 +57,16 @@ class Order:
         """How many are fitted."""
         return int(self.free.sum())
 
+    @property
+    def against(self) -> float:
+        """-2 ln of how likely this order is beforehand, against one that leaves everything free.
+
+        Panels have a cover glass, their primaries lie side by side and cameras' colours overlap: an order that does
+        without one of these has to be twice as good.
+        """
+        without = (~self.free[[_REFLECTION, EMITTERS.start, CROSSTALK.start]].astype(bool)).sum()
+        return float(without) * _ODDS_AGAINST
+
     def held(self) -> tuple[str, ...]:
         """Names of the parameters that are not fitted."""
         return tuple(name for name, one in zip(NAMES, self.free, strict=True) if not one)
@@ -60,7 +74,7 @@ class Order:
     def start(self, x: Float[np.ndarray, "18"], prior: Prior) -> Float[np.ndarray, "18"]:
         """``x`` with the held parameters at where this order has them."""
         neutral = prior.mean.copy()
-        neutral[_EMITTERS] = 0.0
+        neutral[EMITTERS] = 0.0
         if not self.free[CROSSTALK].any():
             neutral[CROSSTALK] = _ABSENT
         if not self.free[_REFLECTION]:
@@ -169,3 +183,17 @@ def mix_of(x: Float[Array, "18"]) -> Float[Array, "3 3"]:
     """Camera colour from primary; rows sum to 1."""
     mix = jnp.eye(3, dtype=x.dtype).at[_OFF_DIAGONAL].set(jnp.exp(x[CROSSTALK]))
     return mix / mix.sum(axis=1, keepdims=True)
+
+
+def mix_and_slopes(x: Float[np.ndarray, "18"]) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "6 3 3"]]:
+    """``mix_of`` and its slopes by the crosstalk parameters."""
+    crosstalk, each = np.exp(x[CROSSTALK]), np.arange(6)
+    mix = np.eye(3)
+    mix[_OFF_DIAGONAL] = crosstalk
+    row, column = _OFF_DIAGONAL
+    scale = crosstalk / mix.sum(axis=1)[row]
+    mix = mix / mix.sum(axis=1, keepdims=True)
+    slopes = np.zeros((6, 3, 3))
+    slopes[each, row] = -mix[row] * scale[:, None]
+    slopes[each, row, column] += scale
+    return mix, slopes

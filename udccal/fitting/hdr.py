@@ -74,12 +74,17 @@ def merge_bracket(
         keep = np.delete(keep, bad)
         merged = _merge(flat[keep], scaled[keep], sensor)
     hits = _mend_hits(flat[keep], scaled[keep], sensor, merged)
-    known = merged.used > 0
+    # In place: copies of a full frame would cost as much as a third of the merging.
+    for values in (merged.rate, merged.sigma):
+        values /= np.float32(unit)
+    unknown = merged.used <= 0
+    if unknown.any():
+        merged.rate[unknown], merged.sigma[unknown] = 0.0, UNKNOWN_SIGMA
     shape = frames.shape[1:]
     return HdrMerge(
-        np.where(known, merged.rate, 0.0).reshape(shape) / unit,
-        np.where(known, merged.sigma.astype(np.float64) / unit, UNKNOWN_SIGMA).reshape(shape),
-        merged.used.reshape(shape).astype(np.int64),
+        merged.rate.reshape(shape),
+        merged.sigma.reshape(shape),
+        merged.used.reshape(shape),
         _listed(dropped, hits, shape),
     )
 

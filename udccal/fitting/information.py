@@ -60,15 +60,26 @@ def cramer_rao(
     root = np.sqrt(np.diag(information))
     seen = root > 0
     scale = np.where(seen, root, 1.0)
-    scaled = information[np.ix_(seen, seen)] / np.outer(root[seen], root[seen])
-    inverse = np.linalg.pinv(scaled, rcond=1e-13, hermitian=True)
-    directions = (np.eye(len(root)) if slopes is None else np.asarray(slopes, dtype=np.float64)) / scale
-    variance = np.einsum("qi,ij,qj->q", directions[:, seen], inverse, directions[:, seen])
-    lost = np.abs(directions[:, ~seen]).sum(axis=1) > 0
+    inverse = scaled_inverse(information, 1e-13)
+    directions = np.eye(len(root)) if slopes is None else np.asarray(slopes, dtype=np.float64)
+    variance = np.einsum("qi,ij,qj->q", directions, inverse, directions)
     # A direction in the null space of the information comes back shortened from its projection.
-    kept = directions[:, seen] @ (inverse @ scaled)
-    lost |= np.linalg.norm(kept - directions[:, seen], axis=1) > 1e-6 * np.linalg.norm(directions, axis=1)
+    short = (directions @ (inverse @ information) - directions) / scale
+    lost = np.linalg.norm(short, axis=1) > 1e-6 * np.linalg.norm(directions / scale, axis=1)
     return np.where(lost, np.inf, np.sqrt(np.maximum(variance, 0.0)))
+
+
+def scaled_inverse(information: Float[np.ndarray, "n n"], rcond: float = 1e-12) -> Float[np.ndarray, "n n"]:
+    """Inverse of a symmetric matrix of very unlike scales; what it does not tell at all comes back as zero.
+
+    Args:
+        information: positive semi-definite.
+        rcond: eigenvalues of the matrix with a unit diagonal below this share of the largest count as none.
+    """
+    root = np.sqrt(np.maximum(np.diag(information), 0.0))
+    root = np.where(root > 1e-150, root, np.inf)
+    outer = np.outer(root, root)
+    return np.linalg.pinv(information / outer, rcond=rcond, hermitian=True) / outer
 
 
 @functools.lru_cache(maxsize=32)

@@ -5,12 +5,15 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import UInt16
 
+from udccal.fitting.noise_codes import DarkPair, dark_pair
+from udccal.fitting.noise_curve import Curve, fit_curve, rough_gain
 from udccal.fitting.noise_dark import DarkFrames, DarkTerms, fit_dark_terms
 from udccal.fitting.noise_data import NoiseData
-from udccal.fitting.noise_light import LightTerms, fit_light_terms, rough_gain
-from udccal.fitting.noise_moments import PairMoments, RowMoments, StackMoments, reduce_pair
+from udccal.fitting.noise_light import LightTerms, fit_light_terms
+from udccal.fitting.noise_moments import PairMoments, RowMoments, StackMoments
+from udccal.fitting.noise_pairs import reduce_pair
 from udccal.fitting.noise_report import NAMES, UNITS, assemble, assumed_noise, failed
-from udccal.fitting.read_noise import DarkPair, dark_pair, start_values
+from udccal.fitting.read_noise import start_values
 from udccal.fitting.result import FitResult, FitStatus
 from udccal.models.noise import Noise
 from udccal.rig import RigDescription
@@ -111,13 +114,13 @@ def fit_noise_data(data: NoiseData, nominal: Noise) -> FitResult[Noise]:
         return refused
     frames = DarkFrames(data.darks, data.dark_rows, data.dark_stack, data.q_DN)
     dark = fit_dark_terms(frames, rough_gain(data))
-    light = fit_light_terms(data, dark)
+    curve = fit_curve(data, dark)
     for _ in range(_MOST_ROUNDS):
-        if light.usable_levels < _FEWEST_LEVELS or light.K_DN_per_e <= 0 or not _gain_matters(dark, light, frames):
+        if curve.usable_levels < _FEWEST_LEVELS or curve.K_DN_per_e <= 0 or not _gain_matters(dark, curve, frames):
             break
-        dark = fit_dark_terms(frames, light.K_DN_per_e, dark)
-        light = fit_light_terms(data, dark)
-    return _judged(data, dark, light, nominal)
+        dark = fit_dark_terms(frames, curve.K_DN_per_e, dark)
+        curve = fit_curve(data, dark)
+    return _judged(data, dark, fit_light_terms(data, dark, curve), nominal)
 
 
 def _look(data: NoiseData, nominal: Noise) -> FitResult[Noise] | None:
@@ -132,11 +135,14 @@ def _look(data: NoiseData, nominal: Noise) -> FitResult[Noise] | None:
     return None
 
 
-def _gain_matters(dark: DarkTerms, light: LightTerms, frames: DarkFrames) -> bool:
-    """Whether another gain moves the dark current's shot noise by a tenth of what the read noise is known to."""
+def _gain_matters(dark: DarkTerms, curve: Curve, frames: DarkFrames) -> bool:
+    """Whether another gain moves the dark current's shot noise by half of what the read noise is known to.
+
+    To first order the photon transfer fit moves the read noise with the gain by itself.
+    """
     longest = max(pair.exposure_s for pair in frames.pairs)
-    moved = abs(light.K_DN_per_e - dark.K_DN_per_e) * dark.dark_DN_per_s.value * longest
-    return moved > 0.1 * float(np.sqrt(dark.read_DN2.variance))
+    moved = abs(curve.K_DN_per_e - dark.K_DN_per_e) * dark.dark_DN_per_s.value * longest
+    return moved > 0.5 * float(np.sqrt(dark.read_DN2.variance))
 
 
 def _hides_black(data: NoiseData, dark: DarkTerms) -> bool:
@@ -147,6 +153,7 @@ def _hides_black(data: NoiseData, dark: DarkTerms) -> bool:
 
 
 def _judged(data: NoiseData, dark: DarkTerms, light: LightTerms, nominal: Noise) -> FitResult[Noise]:
+    curve = light.curve
     if _hides_black(data, dark):
         note = "Dark codes are cut off at 0 and show too little noise to tell black. Raise the black level."
         return failed(nominal, FitStatus.POOR_FIT, note)
@@ -154,33 +161,35 @@ def _judged(data: NoiseData, dark: DarkTerms, light: LightTerms, nominal: Noise)
         return failed(
             nominal,
             FitStatus.POOR_FIT,
-            f"Expected the variance of flats to grow with their mean, found a slope of {light.K_DN_per_e:.3g} DN per "
+            f"Expected the variance of flats to grow with their mean, found a slope of {curve.K_DN_per_e:.3g} DN per "
             "electron: the two frames of a pair may be copies of each other.",
         )
-    if light.usable_levels < _FEWEST_LEVELS:
+    if curve.usable_levels < _FEWEST_LEVELS:
         status = FitStatus.SATURATED if light.saturation.bins else FitStatus.TOO_DARK
         return failed(
             nominal,
             status,
             f"Expected at least {_FEWEST_LEVELS} flat exposures between the dark noise and 90 % of saturation, "
-            f"found {light.usable_levels}.",
+            f"found {curve.usable_levels}.",
         )
     sigma_K = float(np.sqrt(light.transfer.cov[0, 0]))
     if (
         not np.isfinite(sigma_K)
         or sigma_K <= 0
-        or abs(light.K_DN_per_e) < _LEAST_GAIN_SIGMA * sigma_K
-        or (light.shot_significance < _LEAST_GAIN_SIGMA)
+        or abs(curve.K_DN_per_e) < _LEAST_GAIN_SIGMA * sigma_K
+        or (curve.shot_significance < _LEAST_GAIN_SIGMA)
     ):
         return failed(
             nominal,
             FitStatus.TOO_DARK,
-            f"The gain comes out as {light.K_DN_per_e:.3g} ± {sigma_K:.2g} DN per electron: "
+            f"The gain comes out as {curve.K_DN_per_e:.3g} ± {sigma_K:.2g} DN per electron: "
             "the flats hold too little shot noise.",
         )
-    if light.K_DN_per_e < 0:
+    if curve.K_DN_per_e < 0:
         return failed(
-            nominal, FitStatus.POOR_FIT, f"The variance of flats falls with their mean ({light.K_DN_per_e:.3g} DN/e)."
+            nominal,
+            FitStatus.POOR_FIT,
+            f"The variance of flats falls with their mean ({curve.K_DN_per_e:.3g} DN/e).",
         )
     if light.stack_clipped:
         median = float(np.median(data.flat_stack.mean_DN))

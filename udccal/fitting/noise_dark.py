@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from udccal.fitting import nonuniformity, read_noise
+from udccal.fitting import noise_codes, nonuniformity, read_noise
+from udccal.fitting.information import scaled_inverse
 from udccal.fitting.noise_density import NORMAL_SHAPE, excess_kurtosis
 from udccal.fitting.noise_moments import RowMoments, StackMoments
 from udccal.fitting.result import Candidate
@@ -26,7 +27,7 @@ _VISIBLE = 0.2
 class DarkFrames:
     """Dark pairs as histograms, their row noise, and the averaged dark stack."""
 
-    pairs: tuple[read_noise.DarkPair, ...]
+    pairs: tuple[noise_codes.DarkPair, ...]
     rows: tuple[RowMoments, ...]
     stack: StackMoments
     q_DN: int
@@ -247,5 +248,5 @@ def _line(
     times: Float[np.ndarray, " n"], means: Float[np.ndarray, " n"], variances: Float[np.ndarray, " n"]
 ) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2 2"]]:
     design = np.column_stack([np.ones_like(times), times])
-    cov = read_noise.inverse(design.T @ (design / variances[:, None]))
+    cov = scaled_inverse(design.T @ (design / variances[:, None]))
     return cov @ (design.T @ (means / variances)), cov

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from udccal.fitting.noise_codes import DarkPair
 from udccal.fitting.noise_moments import PairMoments, RowMoments, StackMoments
-from udccal.fitting.read_noise import DarkPair
 
 
 @dataclass(frozen=True)

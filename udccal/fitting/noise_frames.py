@@ -16,10 +16,12 @@ from jaxtyping import UInt8, UInt16
 
 from udccal.errors import FitError
 from udccal.fitting.noise import converter_step, fit_noise_data
+from udccal.fitting.noise_codes import DarkPair, dark_pair
 from udccal.fitting.noise_data import NoiseData
-from udccal.fitting.noise_moments import PairMoments, StackMoments, reduce_pair, reduce_stack
+from udccal.fitting.noise_moments import PairMoments, StackMoments
+from udccal.fitting.noise_pairs import reduce_pair
 from udccal.fitting.noise_report import assumed_noise, failed
-from udccal.fitting.read_noise import DarkPair, dark_pair
+from udccal.fitting.noise_stacks import reduce_stack
 from udccal.fitting.result import FitResult, FitStatus
 from udccal.models.noise import Noise
 

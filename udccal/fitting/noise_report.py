@@ -8,8 +8,10 @@ from jaxtyping import Float
 from udccal.fitting import nonuniformity
 from udccal.fitting.noise_dark import DarkTerms
 from udccal.fitting.noise_data import NoiseData
-from udccal.fitting.noise_light import OUTLIER_SIGMA, LightTerms
-from udccal.fitting.result import Candidate, Diagnostic, Estimate, FitResult, FitStatus, Outliers
+from udccal.fitting.noise_levels import OUTLIER_SIGMA
+from udccal.fitting.noise_light import LightTerms
+from udccal.fitting.noise_tiling import tiling
+from udccal.fitting.result import Candidate, Diagnostic, Estimate, FitResult, FitStatus, Outliers, ResidualSample
 from udccal.models.noise import Noise
 
 UNITS = ("DN/e", "DN", "DN", "e", "1", "DN", "DN", "e/s", "e", "1")
@@ -27,6 +29,7 @@ NAMES = (
 )
 # The eleventh estimate, where the data ask for it: the share of the signal that is missing at full scale.
 NONLINEARITY = "nonlinearity"
+_MOST_RESIDUALS = 6000
 
 
 def assumed_noise(K_DN_per_e: float, black_DN: float, saturation_DN: float) -> Noise:
@@ -57,7 +60,7 @@ def assemble(data: NoiseData, dark: DarkTerms, light: LightTerms, status: FitSta
     values, cov = _values(data, dark, light)
     names: tuple[str, ...] = (*NAMES, NONLINEARITY)
     units: tuple[str, ...] = (*UNITS, "1")
-    if not light.order.curved:
+    if not light.curve.order.curved:
         names, units, values, cov = NAMES, UNITS, values[:-1], cov[:-1, :-1]
     sigma = np.sqrt(np.maximum(np.diag(cov), 0.0))
     return FitResult(
@@ -69,11 +72,12 @@ def assemble(data: NoiseData, dark: DarkTerms, light: LightTerms, status: FitSta
         ),
         cov=cov,
         chi2_dof=light.transfer.chi2_dof,
-        samples=light.bins + dark.samples,
+        samples=light.curve.bins + dark.samples,
         candidates=(*dark.candidates, *_prnu_candidates(light), *_response_candidates(light)),
         diagnostics=_diagnostics(data, dark, light),
         notes=_notes(data, dark, light),
         outliers=_outliers(data, dark, light),
+        residuals=_residuals(data, light),
     )
 
 
@@ -156,16 +160,16 @@ def _prnu_candidates(light: LightTerms) -> tuple[Candidate, ...]:
 
 def _response_candidates(light: LightTerms) -> tuple[Candidate, ...]:
     return tuple(
-        Candidate(order.name, order.parameters, float(criterion), order == light.order)
-        for order, criterion in light.tried
+        Candidate(order.name, order.parameters, float(criterion), order == light.curve.order)
+        for order, criterion in light.curve.tried
     )
 
 
 def _diagnostics(data: NoiseData, dark: DarkTerms, light: LightTerms) -> tuple[Diagnostic, ...]:
     return (
-        Diagnostic("photon_transfer_bins", float(light.bins), "1"),
-        Diagnostic("photon_transfer_levels", float(light.usable_levels), "1"),
-        Diagnostic("photon_transfer_up_to", light.fit_up_to, "1"),
+        Diagnostic("photon_transfer_bins", float(light.curve.bins), "1"),
+        Diagnostic("photon_transfer_levels", float(light.curve.usable_levels), "1"),
+        Diagnostic("photon_transfer_up_to", light.curve.fit_up_to, "1"),
         Diagnostic("V0_DN2", float(light.transfer.values[1]), "DN^2"),
         Diagnostic("saturated_bins", float(light.saturation.bins), "1"),
         Diagnostic("curvature", float(light.transfer.values[2]), "1/DN"),
@@ -185,17 +189,23 @@ def _outliers(data: NoiseData, dark: DarkTerms, light: LightTerms) -> tuple[Outl
         stack = len(data.flats)
         return tuple("flat stack" if i >= stack else f"flat {i} ({data.flats[i].exposure_s:.4g} s)" for i in levels)[:8]
 
-    sigma = f"{OUTLIER_SIGMA:.0f} robust sigma"
+    sigma, curve = f"{OUTLIER_SIGMA:.0f} robust sigma", light.curve
     # Among clipped samples those that are not stand out; that is no defect.
     ceiling = light.saturation.level_DN - 0.1 * light.full_DN
     hits = sum(flat.outliers for flat in data.flats if float(flat.mean_DN.max()) < ceiling) + data.dark_outliers
     found = (
         Outliers("two codes of a pixel 8 sigma apart in a pair (hits, blinking pixels)", hits),
         Outliers(
-            f"flats of a pair that differ in brightness by {sigma}", len(light.flickering), named(light.flickering)
+            f"flats of a pair that differ in brightness by {sigma}",
+            len(curve.flickering),
+            named(curve.flickering),
         ),
-        Outliers(f"brightness off the response by {sigma}", len(light.levels_left_out), named(light.levels_left_out)),
-        Outliers(f"bins of flats off the photon transfer curve by {sigma}", light.bins_left_out),
+        Outliers(
+            f"brightness off the response by {sigma}",
+            len(curve.levels_left_out),
+            named(curve.levels_left_out),
+        ),
+        Outliers(f"bins of flats off the photon transfer curve by {sigma}", curve.bins_left_out),
         _pixels("averaged dark pixels 6 robust sigma off (hot)", dark.defects),
         _pixels("averaged flat pixels 6 robust sigma off their surroundings", light.prnu),
     )
@@ -206,6 +216,16 @@ def _pixels(rule: str, found: nonuniformity.Unevenness) -> Outliers:
     return Outliers(rule, found.outliers, tuple(f"row {row}, column {column}" for row, column in found.places))
 
 
+def _residuals(data: NoiseData, light: LightTerms) -> ResidualSample:
+    """Variances of bins off the photon transfer curve, evenly drawn from all levels."""
+    z = light.transfer.variance_z
+    rows, columns = data.flat_stack.mean_DN.shape
+    places = np.tile(tiling(rows, columns, data.period).centres_px, (len(z), 1))
+    used = np.flatnonzero(np.isfinite(z.ravel()))
+    drawn = used[:: max(1, -(-len(used) // _MOST_RESIDUALS))]
+    return ResidualSample(places[drawn], z.ravel()[drawn])
+
+
 def _notes(data: NoiseData, dark: DarkTerms, light: LightTerms) -> tuple[str, ...]:
     notes = list(data.notes)
     if not light.saturation.bins:
@@ -213,13 +233,13 @@ def _notes(data: NoiseData, dark: DarkTerms, light: LightTerms) -> tuple[str, ..
         notes.append(f"No flat reached saturation; the converter's largest code, {level:.0f} DN, is taken for it.")
     if not dark.white:
         notes.append("Rounding or cut-off codes bend the dark codes; black and DSNU come from the histograms.")
-    if light.order.curved:
+    if light.curve.order.curved:
         notes.append(f"The response bends: {100 * light.nonlinearity:.2g} % of the signal is missing at full scale.")
     if light.bent_too_far:
         notes.append("The response bends more than the model can say. Check the exposures and the lamp.")
-    if light.fit_up_to < 0.9:
-        part = f"{100 * light.fit_up_to:.0f} %"
+    if light.curve.fit_up_to < 0.9:
+        part = f"{100 * light.curve.fit_up_to:.0f} %"
         notes.append(f"Flats above {part} of saturation do not follow the curve and are left out.")
-    if light.order.unsteady:
+    if light.curve.order.unsteady:
         notes.append(f"The light differs by {100 * light.transfer.scatter:.2g} % from level to level.")
     return tuple(notes)

@@ -10,13 +10,13 @@ data. Both relations bear on c; the first alone where the light is unsteady, whi
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float
 
+from udccal.fitting.information import scaled_inverse
 from udccal.fitting.iteration_log import LOG
-from udccal.fitting.read_noise import inverse
 
 PARAMETERS = ("K_DN_per_e", "V0_DN2", "curvature_per_DN", "response_DN_per_light", "light_offset")
 # Bent by more than this share at full scale, the quadratic is no description (and soon has no inverse).
@@ -136,14 +136,14 @@ def fit_transfer(
     x, scatter2 = np.array(start, dtype=np.float64), 0.0
     x[2] = x[2] if order.curved else 0.0
     x[4] = x[4] if order.offset else 0.0
-    responds = _responds(levels)
+    responds = responding(levels)
     free = np.array([True, True, order.curved, responds.any(), order.offset and bool(responds.any())])
     converged = False
     for iteration in range(1, _ROUNDS + 1):
         residual, weight, slope = _linearised(x, levels, dark, full_DN, scatter2)
         information = slope.T @ (slope * weight[:, None])
         information = np.where(np.outer(free, free), information, 0.0)
-        step = inverse(information) @ np.where(free, slope.T @ (weight * residual), 0.0)
+        step = scaled_inverse(information) @ np.where(free, slope.T @ (weight * residual), 0.0)
         x = _inside(x + step, full_DN)
         if order.unsteady:
             scatter2 = _scatter2(x, levels, responds)
@@ -153,10 +153,11 @@ def fit_transfer(
             converged = True
             break
     _, _, slope = _linearised(x, levels, dark, full_DN, scatter2)
-    return _judged(x, levels, dark, scatter2, inverse(information), converged)
+    return _judged(x, levels, dark, scatter2, scaled_inverse(information), converged)
 
 
-def _responds(levels: Levels) -> Bool[np.ndarray, " levels"]:
+def responding(levels: Levels) -> Bool[np.ndarray, " levels"]:
+    """Levels whose brightness tells about the response."""
     seen = levels.usable.any(axis=1) & levels.steady & np.isfinite(levels.light)
     known = levels.light[seen]
     # Levels of one and the same exposure differ by the lamp's power, which nobody measured.
@@ -187,9 +188,12 @@ def _parts(
 
 def _brightness(light_DN: Float[np.ndarray, "levels bins"], usable: np.ndarray) -> Float[np.ndarray, " levels"]:
     """Mean light of each level as if every bin were usable in it: bins share one pattern through all levels."""
-    if usable[usable.any(axis=1)].all():
+    complete = np.flatnonzero(usable.all(axis=1))
+    if complete.size == np.count_nonzero(usable.any(axis=1)):
         return light_DN.mean(axis=1)
-    pattern = np.ones(usable.shape[1])
+    # Alternating from the complete levels' pattern, the others add little; from none the first rounds would be rough.
+    pattern = light_DN[complete].sum(axis=0) if complete.size else np.ones(usable.shape[1])
+    pattern = pattern / max(float(pattern.mean()), 1e-9)
     count = np.maximum(usable.sum(axis=1), 1)
     for _ in range(6):
         level = np.where(usable, light_DN, 0.0).sum(axis=1) / np.maximum((usable * pattern).sum(axis=1), 1e-9)
@@ -211,7 +215,7 @@ def _level_variance(levels: Levels, variance: Float[np.ndarray, "levels bins"]) 
 def _linearised(
     x: Float[np.ndarray, "5"], levels: Levels, dark: DarkVariance, full_DN: float, scatter2: float
 ) -> tuple[Float[np.ndarray, " data"], Float[np.ndarray, " data"], Float[np.ndarray, "data 5"]]:
-    responds = _responds(levels)
+    responds = responding(levels)
 
     def predicted(at: Float[np.ndarray, "5"]) -> Float[np.ndarray, " data"]:
         _, variance, relative = _parts(at, levels, dark)
@@ -269,7 +273,7 @@ def _judged(
     converged: bool,
 ) -> TransferFit:
     _, variance, relative = _parts(x, levels, dark)
-    responds, use = _responds(levels), levels.usable
+    responds, use = responding(levels), levels.usable
     spread = np.sqrt(_sampling(x, levels, variance))
     variance_z = np.where(use, (levels.variance_DN2 - variance) / spread, np.nan)
     level_variance = _level_variance(levels, variance) + scatter2
@@ -294,36 +298,3 @@ def start_transfer(levels: Levels, dark: DarkVariance) -> Float[np.ndarray, "5"]
     brightness = _brightness(levels.mean_DN - levels.dark_DN[:, None], use)
     gain = float(light @ brightness) / max(float(light @ light), 1e-30)
     return np.array([K, floor - dark.rounding_DN2, 0.0, gain if gain > 0 else 1.0, 0.0])
-
-
-def choose_transfer(
-    levels: Levels, dark: DarkVariance, full_DN: float
-) -> tuple[TransferFit, Order, tuple[tuple[Order, float], ...]]:
-    """The order with the least BIC, its fit, and the criterion of every order tried (0: the best)."""
-    orders = [Order(*(bool(n >> k & 1) for k in range(3))) for n in range(8)]
-    if not _responds(levels).any():
-        orders = [Order(), Order(curved=True)]
-    simplest = fit_transfer(levels, dark, full_DN, orders[0], start_transfer(levels, dark))
-    start = simplest.values if simplest.converged else start_transfer(levels, dark)
-    fits = [simplest, *(fit_transfer(levels, dark, full_DN, order, start) for order in orders[1:])]
-    penalty = float(np.log(max(float(levels.dof[levels.usable].sum()), 2.0)))
-    criteria = [
-        fit.deviance + penalty * order.parameters if np.isfinite(fit.deviance) and fit.converged else np.inf
-        for fit, order in zip(fits, orders, strict=True)
-    ]
-    best = int(np.argmin(criteria))
-    least = criteria[best] if np.isfinite(criteria[best]) else 0.0
-    tried = tuple((order, value - least) for order, value in zip(orders, criteria, strict=True) if np.isfinite(value))
-    return fits[best], orders[best], tried
-
-
-def without_outliers(levels: Levels, fit: TransferFit, limit: float) -> tuple[Levels, int, tuple[int, ...]]:
-    """Levels less what lies beyond ``limit`` robust sigma of the fit; how many bins, and which levels' brightness."""
-    z = fit.variance_z[levels.usable]
-    scale = max(1.0, 1.4826 * float(np.median(np.abs(z - np.median(z)))))
-    wrong = levels.usable & (np.abs(np.nan_to_num(fit.variance_z)) > limit * scale)
-    seen = fit.level_z[np.isfinite(fit.level_z)]
-    level_scale = max(1.0, 1.4826 * float(np.median(np.abs(seen)))) if seen.size else 1.0
-    off = np.abs(np.nan_to_num(fit.level_z)) > limit * level_scale
-    cleaned = replace(levels, usable=levels.usable & ~wrong, steady=levels.steady & ~off)
-    return cleaned, int(wrong.sum()), tuple(int(i) for i in np.flatnonzero(off))

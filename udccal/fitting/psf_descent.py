@@ -8,9 +8,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
+from scipy.special import softmax
 
 from udccal.fitting.iteration_log import LOG
-from udccal.fitting.psf_blocks import LOCAL, Block, Local
+from udccal.fitting.psf_blocks import HEAD, LOCAL, Block, Local
 from udccal.fitting.psf_normal import Evaluator, Normal, normal_equations, overlaps_of
 
 _MAX_STEP_PX = 0.5
@@ -81,7 +82,7 @@ def descend(problem: Problem, point: Point, most: int, enough: float) -> Point:
     Slopes that are themselves sums over a lattice promise a little for ever: where little is promised and the last step
     brought next to nothing, that is the end, too.
     """
-    damping, iterations, lowered = _FIRST_DAMPING, point.iterations, np.inf
+    damping, raise_by, iterations, lowered = _FIRST_DAMPING, 2.0, point.iterations, np.inf
     while True:
         step, moves, gain = _step(problem, point, damping)
         converged = bool(np.isfinite(gain)) and (gain < enough or (gain < _SMALL and lowered < _STALLED))
@@ -89,12 +90,28 @@ def descend(problem: Problem, point: Point, most: int, enough: float) -> Point:
             return Point(point.theta, point.local, point.cost, point.normals, iterations, converged)
         iterations += 1
         tried = tuple(moved(one, move) for one, move in zip(point.local, moves, strict=True))
-        new = stand(problem, point.theta + step, tried, iterations)
+        new = stand(problem, stepped(point.theta, step), tried, iterations)
         LOG.debug("psf: iteration %d, chi2 %.9g, damping %.1g", iterations, new.cost, damping)
         if np.isfinite(new.cost) and new.cost < point.cost:
-            lowered, point, damping = point.cost - new.cost, new, damping / 10.0
+            lowered, point = point.cost - new.cost, new
+            damping, raise_by = damping * _lower_by(lowered / gain), 2.0
         else:
-            damping *= 8.0
+            damping, raise_by = damping * raise_by, 2.0 * raise_by
+
+
+def stepped(theta: Float[np.ndarray, " p"], step: Float[np.ndarray, " p"]) -> Float[np.ndarray, " p"]:
+    """Global parameters after a step; light grows by what the step says, not by that number's exponential."""
+    spectra = softmax(theta[HEAD:].reshape(3, -1), axis=1)
+    logs = step[HEAD:].reshape(3, -1)
+    mean = np.sum(spectra * logs, axis=1, keepdims=True)
+    grown = logs - mean
+    grown = np.where(grown > 0, np.log1p(np.maximum(grown, 0.0)), grown)
+    return theta + np.concatenate([step[:HEAD], (mean + grown).ravel()])
+
+
+def _lower_by(kept: float) -> float:
+    """Factor on the damping after a step that kept this share of its promise (Nielsen, IMM-REP-1999-05, eq. 2.5)."""
+    return float(np.clip(1.0 - (2.0 * kept - 1.0) ** 3, 0.1, 2.0))
 
 
 def reduced(

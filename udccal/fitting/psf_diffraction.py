@@ -31,10 +31,11 @@ from udccal.models.diffraction import Diffraction
 # Until the residuals tell; it also keeps a fit that is still far off from trusting the brightest samples alone.
 FIRST_MODEL_ERROR = 0.015
 _ROUNDS = 5
-# The first descent ends where it would gain this share of the cost, the others where it would gain so much.
-_ROUGHLY, _FULLY = 1e-3, 1e-2
-# In sigma: a round that moves every parameter by less is the last.
-_STILL = 0.1
+# The first descent ends where it would gain this share of the cost; rounds where they would gain so much, those after
+# which the weights hardly change anything and the others.
+_ROUGHLY, _FULLY, _NEARLY = 1e-3, 1e-2, 1.0
+# In sigma: a round that moves every parameter by less is the last; the weights are about those of the end.
+_STILL, _SETTLED = 0.1, 1.0
 # Overlaps are in single precision: by such a step of the pupil, their difference is not.
 _PUPIL_STEP_MM = 0.01
 
@@ -90,13 +91,14 @@ def refine(problem: Problem, point: Point, max_iterations: int) -> DiffractionFi
         max_iterations: of all descents together.
     """
     whole: DiffractionFit | None = None
+    enough = _NEARLY
     for _ in range(_ROUNDS):
         # What interference depends on hardly changes in a descent, but it does.
         there = pose(problem.blocks, problem.evaluator, problem.prior, point.theta)
         corrected = replace(there, blocks=with_interference(there, point))
         problem, model_error, found = _reweighed(corrected, point)
         before = point.theta
-        point = descend(problem, stand(problem, before, point.local, point.iterations), max_iterations, _FULLY)
+        point = descend(problem, stand(problem, before, point.local, point.iterations), max_iterations, enough)
         matrix, _, _ = reduced(problem, point)
         change = point.theta - before
         LOG.debug("psf: model error %.3g, moved by %.3g sigma", model_error, float(np.sqrt(change @ matrix @ change)))
@@ -104,8 +106,10 @@ def refine(problem: Problem, point: Point, max_iterations: int) -> DiffractionFi
             # Out of iterations: the round before, whose weights are those of a model not quite this one, has an end.
             return whole or _result(problem, point, model_error, found)
         whole = _result(problem, point, model_error, found)
-        if change @ matrix @ change < _STILL**2:
+        moved_by = change @ matrix @ change
+        if enough == _FULLY and moved_by < _STILL**2:
             break
+        enough = _FULLY if moved_by < _SETTLED**2 else _NEARLY
     assert whole is not None  # there is a first round
     return whole
 

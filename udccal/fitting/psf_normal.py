@@ -1,8 +1,7 @@
 """Normal equations of the diffraction fit, one field position at a time.
 
 The kernel is linear in the spectra, so one evaluation for every wavelength node serves all colours and all their
-derivatives. The few other parameters are differentiated by forward differences, one after the other: a compiled loop
-that is far smaller than the derivative of the whole computation would be.
+derivatives; for those by the few other parameters see ``psf_slopes``.
 """
 
 from __future__ import annotations
@@ -10,18 +9,16 @@ from __future__ import annotations
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 from jaxtyping import ArrayLike as Arrayish
 
-from udccal.fitting.psf_blocks import HEAD, PUPIL, Block, Local, corrected, unpack
+from udccal.fitting.psf_blocks import PUPIL, Block, Local, corrected, unpack
+from udccal.fitting.psf_slopes import factors_by_parameter, kernel_slopes
 from udccal.models.diffraction import Diffraction, LocalFrame, average_transfer
 from udccal.models.interference import interference_transfer, node_overlaps, overlap_tables
 from udccal.models.lattice import Lattice, sample, spline_coefficients
 
 HUBER = 3.0
-# Forward differences: pitch, open fractions, thickness, pupil, blur, footprint (x, y, stand-off), place (x, y).
-_STEPS = np.array([1e-5, 1e-5, 1e-5, 1e-5, 1e-4, 1e-3, 1e-4, 1e-4, 1e-4, 1e-4, 1e-4])
 
 
 class Evaluator(eqx.Module):
@@ -114,25 +111,23 @@ def normal_equations(
 ) -> Normal:
     """One field position's share of the Gauss-Newton equations, with Huber's weights."""
     theta, offset, colour = jnp.asarray(theta), jnp.asarray(local.offset_px), jnp.asarray(block.colour)
-    spectra = jnp.asarray(evaluator.model(theta).spectrum)
-    every = jnp.eye(spectra.shape[1], dtype=theta.dtype)
-    nodes = _sampled(evaluator, block, _coefficients(evaluator, evaluator.model(theta), block, every, overlaps), offset)
+    model = evaluator.model(theta)
+    spectra = jnp.asarray(model.spectrum)
+    used = overlaps if evaluator.interference else None
+    coefficients, by_factor = kernel_slopes(model, block, evaluator.lattice, spectra, used)
+    count = spectra.shape[1]
+    parts = jnp.concatenate([coefficients, by_factor.reshape(*coefficients.shape[:2], -1)], axis=-1)
+    sampled = _sampled(evaluator, block, parts, offset)
+    nodes, by_colour = sampled[..., :count], sampled[..., count:].reshape(*sampled.shape[:2], -1, 3)
     unit = jnp.einsum("snj,cj,snc->sn", nodes, spectra, colour)
-
-    def difference(step: Float[Array, " head_and_move"]) -> Float[Array, "shots n"]:
-        model = evaluator.model(theta + jnp.concatenate([step[:HEAD], jnp.zeros(theta.size - HEAD)]))
-        moved = _sampled(
-            evaluator, block, _coefficients(evaluator, model, block, spectra, overlaps), offset + step[HEAD:]
-        )
-        return (jnp.sum(moved * colour, axis=-1) - unit) / jnp.sum(step)
-
-    slopes = jnp.moveaxis(jax.lax.map(difference, jnp.diag(jnp.asarray(_STEPS))), 0, -1)
+    slopes = jnp.einsum("snfc,snc->snf", by_colour, colour) @ factors_by_parameter(model, block.frame)
     slopes = slopes.at[..., PUPIL].add(jnp.asarray(block.overlap_slope))
+    by_move = _by_move(evaluator, block, coefficients @ spectra.T, offset)
     by_logs = jnp.einsum("snc,cj,snj->sncj", colour, spectra, nodes - unit[..., None])
     flux = jnp.einsum("snc,sc->sn", colour, jnp.asarray(local.flux))
-    by_global = flux[..., None] * jnp.concatenate([slopes[..., :HEAD], by_logs.reshape(*unit.shape, -1)], axis=-1)
+    by_global = flux[..., None] * jnp.concatenate([slopes, by_logs.reshape(*unit.shape, -1)], axis=-1)
     unit = corrected(block, theta, unit)
-    by_local = _by_local(block, local, unit, slopes[..., HEAD:])
+    by_local = _by_local(block, local, unit, by_move)
     residual = _residual(block, local, unit)
     huber, size = _huber(block, residual)
     return Normal(
@@ -150,13 +145,10 @@ def local_equations(
     evaluator: Evaluator, block: Block, local: Local, coefficients: Float[Arrayish, "rows columns 3"]
 ) -> tuple[Float[Array, "shots l l"], Float[Array, "shots l"]]:
     """Normal matrix and right side of every shot's own unknowns for a given kernel."""
-    coefficients = jnp.asarray(coefficients)
-
-    def light(move: Float[Array, "2"]) -> Float[Array, "shots n"]:
-        values = _sampled(evaluator, block, coefficients, jnp.asarray(local.offset_px) + move)
-        return jnp.sum(values * block.colour, axis=-1)
-
-    unit, by_move = light(jnp.zeros(2)) + jnp.asarray(block.correction), jax.jacfwd(light)(jnp.zeros(2))
+    coefficients, offset = jnp.asarray(coefficients), jnp.asarray(local.offset_px)
+    unit = jnp.sum(_sampled(evaluator, block, coefficients, offset) * block.colour, axis=-1)
+    unit = unit + jnp.asarray(block.correction)
+    by_move = _by_move(evaluator, block, coefficients, offset)
     by_local = _by_local(block, local, unit, by_move)
     residual = _residual(block, local, unit)
     huber, _ = _huber(block, residual)
@@ -174,6 +166,20 @@ def unit_light(
     """What one unit of light of its own colour brings to every sample."""
     values = _sampled(evaluator, block, jnp.asarray(coefficients), jnp.asarray(offset_px))
     return jnp.sum(values * block.colour, axis=-1)
+
+
+def _by_move(
+    evaluator: Evaluator,
+    block: Block,
+    coefficients: Float[Array, "rows columns 3"],
+    offset_px: Float[Array, "shots 2"],
+) -> Float[Array, "shots n 2"]:
+    """Of one unit of light, when its source moves by a pixel."""
+
+    def light(move: Float[Array, "2"]) -> Float[Array, "shots n"]:
+        return jnp.sum(_sampled(evaluator, block, coefficients, offset_px + move) * block.colour, axis=-1)
+
+    return jax.jacfwd(light)(jnp.zeros(2))
 
 
 def _by_local(

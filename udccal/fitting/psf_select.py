@@ -67,7 +67,7 @@ class _Trial:
     share: float
     sources: Sources
     mismatch: Float[np.ndarray, "3"]
-    loss: Float[np.ndarray, " shots"]
+    loss: Float[np.ndarray, " places"]
 
     @property
     def criterion(self) -> float:
@@ -79,7 +79,7 @@ class _Trial:
         return float(np.sqrt((self.mismatch**2).mean()))
 
     def beats(self, other: _Trial) -> bool:
-        """Whether it predicts what was held out better, beyond what its pictures leave in doubt."""
+        """Whether it predicts what was held out better, beyond what the places held out leave in doubt."""
         gain = other.loss - self.loss
         doubt = float(gain.std(ddof=1) / np.sqrt(gain.size)) if gain.size > 1 else np.inf
         return float(gain.mean()) > max(doubt, _WORTH * other.criterion)
@@ -178,10 +178,17 @@ def _trial(
 ) -> _Trial:
     image = _solve(data, sources, ~test, degree, share, magnitude)
     windows = data.windows(sources, max(degree, 0), share, test)
-    error, loss = mismatch(windows, share, image), loss_by_shot(windows, share, image)
+    error = mismatch(windows, share, image)
+    loss = _by_place(loss_by_shot(windows, share, image), data.shots.position[test])
     kind = "diffraction" if share else "free image"
     name = kind if degree < 0 else f"{kind}, residual degree {degree}" if share else f"{kind}, degree {degree}"
     return _Trial(name, degree, share, sources, error, loss)
+
+
+def _by_place(loss: Float[np.ndarray, " shots"], position: Int[np.ndarray, " shots"]) -> Float[np.ndarray, " places"]:
+    """Means by position: pictures of one share what the model leaves out there. Of a single position, its pictures'."""
+    places = np.unique(position)
+    return np.array([loss[position == place].mean() for place in places]) if len(places) > 1 else loss
 
 
 def _solve(

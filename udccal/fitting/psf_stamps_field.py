@@ -16,14 +16,18 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
+from numpy.polynomial.legendre import legvander
 
 from udccal.models.arrays import Arrayish
-from udccal.models.fields import polynomial_basis
+from udccal.models.fields import polynomial_basis, polynomial_terms
 
 TAPS = 4  # nodes along an axis that a cubic B-spline listens to
 # What a star may change by itself: relative light, centre (x, y), and the four numbers of its map, row by row.
 OWN = 7
+# Arrays are filled up to a multiple of so many nodes and stars, and to polynomials of at least this degree.
+_NODES, _STARS, _HIGHEST = 4096, 8, 4
 
 
 class PlaneField(eqx.Module):
@@ -56,38 +60,33 @@ class Seen(NamedTuple):
         inside: whether the sample lies on the grid.
     """
 
-    value: Float[Array, "stars samples"]
-    slopes: Float[Array, "stars samples 6"]
-    first: Int[Array, "stars samples"]
-    down: Float[Array, "stars samples 4"]
-    across: Float[Array, "stars samples 4"]
-    inside: Bool[Array, "stars samples"]
+    value: Float[Arrayish, "stars samples"]
+    slopes: Float[Arrayish, "stars samples 6"]
+    first: Int[Arrayish, "stars samples"]
+    down: Float[Arrayish, "stars samples 4"]
+    across: Float[Arrayish, "stars samples 4"]
+    inside: Bool[Arrayish, "stars samples"]
 
 
-def image_basis(field: PlaneField, unit: Float[Arrayish, "stars 2"]) -> Float[Array, "stars terms"]:
-    """B_t of the images at positions scaled to about [-1, 1]."""
-    return polynomial_basis(unit, field.image_degree)
+def polynomials(unit: Float[Arrayish, "stars 2"], degree: int) -> Float[np.ndarray, "stars terms"]:
+    """All B_t up to a degree at positions scaled to about [-1, 1]; lower degrees are the first columns of higher."""
+    x, y = (legvander(np.asarray(part, dtype=np.float64), degree) for part in np.asarray(unit).T)
+    columns = [x[:, i] * y[:, total - i] for total in range(degree + 1) for i in range(total + 1)]
+    return np.stack(columns, axis=1)
 
 
-def warps(field: PlaneField, unit: Float[Arrayish, "stars 2"]) -> Float[Array, "stars 2 2"]:
+def warps(field: PlaneField, unit: Float[Arrayish, "stars 2"]) -> Float[np.ndarray, "stars 2 2"]:
     """M at positions scaled to about [-1, 1]."""
-    basis = polynomial_basis(unit, field.warp_degree)[:, 1:]
-    return jnp.eye(2) + jnp.einsum("sm,mij->sij", basis, jnp.asarray(field.warp))
+    return np.eye(2) + np.einsum("sm,mij->sij", polynomials(unit, field.warp_degree)[:, 1:], np.asarray(field.warp))
 
 
-def laterals(field: PlaneField, unit: Float[Arrayish, "stars 2"]) -> Float[Array, "stars 2"]:
-    """L in px (x, y)."""
-    return polynomial_basis(unit, field.lateral_degree)[:, 1:] @ jnp.asarray(field.lateral)
-
-
-@eqx.filter_jit
 def see(
     field: PlaneField,
     unit: Float[Arrayish, "stars 2"],
     centre_px: Float[Arrayish, "stars 2"],
     offset_px: Float[Arrayish, "stars samples 2"],
 ) -> Seen:
-    """Values and slopes at samples.
+    """Values and slopes at samples; numpy's where all that is given is.
 
     Args:
         field: of one colour.
@@ -95,37 +94,88 @@ def see(
         centre_px: of the light that all colours share, (x, y) from each stamp's middle sample.
         offset_px: of samples, (x, y) from each stamp's middle sample.
     """
-    images = jnp.einsum("st,tyx->syx", image_basis(field, unit), jnp.asarray(field.nodes))
-    maps, own = warps(field, unit), jnp.asarray(centre_px) + laterals(field, unit)
-    return jax.vmap(_see_star, in_axes=(0, 0, 0, 0, None))(images, maps, own, jnp.asarray(offset_px), field.spacing_px)
+    # What is compiled knows neither orders nor how many nodes and stars there are: a fit that tries many compiles once.
+    degree = max(field.image_degree, field.warp_degree, field.lateral_degree, _HIGHEST)
+    terms, (rows, columns) = polynomial_terms(degree), np.shape(field.nodes)[1:]
+    most = rows * columns + -rows * columns % _NODES
+    stars = np.shape(unit)[0]
+    many = stars + -stars % _STARS
+    padded = Padded(
+        images=_filled(field.nodes.reshape(-1, rows * columns), (terms, most)),
+        warp=_filled(field.warp, (terms - 1, 2, 2)),
+        lateral=_filled(field.lateral, (terms - 1, 2)),
+        rows=np.int32(rows),
+        columns=np.int32(columns),
+        spacing_px=np.float64(field.spacing_px),
+    )
+    basis = polynomial_basis(unit, degree) if isinstance(unit, jax.Array) else polynomials(unit, degree)
+    own = _filled(centre_px, (many, 2)), _filled(offset_px, (many, *np.shape(offset_px)[1:]))
+    seen = _see(padded, _filled(basis, (many, terms)), *own)
+    if any(isinstance(part, jax.Array) for part in (field.nodes, field.warp, field.lateral, unit, centre_px)):
+        return Seen(*(part[:stars] for part in seen))
+    return Seen(*(np.asarray(part)[:stars] for part in seen))
+
+
+class Padded(NamedTuple):
+    """A field whose images and polynomials are filled up with zeros; how many nodes there are, and how far apart."""
+
+    images: Float[Arrayish, "terms nodes"]
+    warp: Float[Arrayish, "terms_less_1 2 2"]
+    lateral: Float[Arrayish, "terms_less_1 2"]
+    rows: Int[Arrayish, ""]
+    columns: Int[Arrayish, ""]
+    spacing_px: Float[Arrayish, ""]
+
+
+def _filled(values: Arrayish, shape: tuple[int, ...]) -> Arrayish:
+    """``values`` with zeros behind them, along every axis."""
+    place = tuple(slice(0, size) for size in np.shape(values))
+    if isinstance(values, jax.Array):
+        return jnp.zeros(shape, values.dtype).at[place].set(values)
+    out = np.zeros(shape)
+    out[place] = values
+    return out
+
+
+@jax.jit
+def _see(
+    field: Padded,
+    basis: Float[Array, "stars terms"],
+    centre_px: Float[Array, "stars 2"],
+    offset_px: Float[Array, "stars samples 2"],
+) -> Seen:
+    maps = jnp.eye(2) + jnp.einsum("sm,mij->sij", basis[:, 1:], field.warp)
+    own = centre_px + basis[:, 1:] @ field.lateral
+    return jax.vmap(_see_star, in_axes=(0, None, 0, 0, 0))(basis @ field.images, field, maps, own, offset_px)
 
 
 def _see_star(
-    image: Float[Array, "grid_rows grid_columns"],
+    image: Float[Array, " nodes"],
+    grid: Padded,
     warp: Float[Array, "2 2"],
     centre: Float[Array, "2"],
     offset: Float[Array, "samples 2"],
-    spacing: float,
 ) -> Seen:
-    inverse = jnp.linalg.inv(warp)
-    thinner = 1.0 / jnp.linalg.det(warp)
+    # By hand: a decomposition, even of 2 x 2, takes long to compile.
+    thinner = 1.0 / (warp[0, 0] * warp[1, 1] - warp[0, 1] * warp[1, 0])
+    inverse = thinner * jnp.array([[warp[1, 1], -warp[0, 1]], [-warp[1, 0], warp[0, 0]]])
     at = (offset - centre) @ inverse.T
-    rows, columns = image.shape
-    first_y, down, down_slope, inside_y = _taps(at[:, 1] / spacing + (rows - 1) / 2, rows)
-    first_x, across, across_slope, inside_x = _taps(at[:, 0] / spacing + (columns - 1) / 2, columns)
+    spacing = grid.spacing_px
+    first_y, down, down_slope, inside_y = _taps(at[:, 1] / spacing + (grid.rows - 1) / 2, grid.rows)
+    first_x, across, across_slope, inside_x = _taps(at[:, 0] / spacing + (grid.columns - 1) / 2, grid.columns)
     step = jnp.arange(TAPS)
-    patch = image[(first_y[:, None] + step)[:, :, None], (first_x[:, None] + step)[:, None, :]]
-    value = thinner * jnp.einsum("nj,nji,ni->n", down, patch, across)
-    rise_x = jnp.einsum("nj,nji,ni->n", down, patch, across_slope)
-    rise_y = jnp.einsum("nj,nji,ni->n", down_slope, patch, across)
+    patch = image[(first_y[:, None] + step)[:, :, None] * grid.columns + (first_x[:, None] + step)[:, None, :]]
+    level, rising = (jnp.sum(patch * by[:, None, :], axis=2) for by in (across, across_slope))
+    value = thinner * jnp.sum(level * down, axis=1)
+    rise_x, rise_y = jnp.sum(rising * down, axis=1), jnp.sum(level * down_slope, axis=1)
     rise = thinner / spacing * jnp.stack([rise_x, rise_y], axis=1) @ inverse
     by_map = -rise[:, :, None] * at[:, None, :] - value[:, None, None] * inverse.T
     slopes = jnp.concatenate([-rise, by_map.reshape(-1, 4)], axis=1)
-    return Seen(value, slopes, first_y * columns + first_x, thinner * down, across, inside_y & inside_x)
+    return Seen(value, slopes, first_y * grid.columns + first_x, thinner * down, across, inside_y & inside_x)
 
 
 def _taps(
-    place: Float[Array, " samples"], nodes: int
+    place: Float[Array, " samples"], nodes: Int[Arrayish, ""]
 ) -> tuple[Int[Array, " samples"], Float[Array, "samples 4"], Float[Array, "samples 4"], Bool[Array, " samples"]]:
     """First node, weights and their slopes, and whether all four nodes exist (else the weights are zero)."""
     cell = jnp.floor(place)

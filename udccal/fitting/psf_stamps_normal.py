@@ -10,9 +10,8 @@ from jaxtyping import Float, Int
 from scipy.linalg import cholesky, solve_triangular
 
 from udccal.fitting.psf_stamps_blocks import Blocks, Factor, factor
-from udccal.fitting.psf_stamps_field import OWN, TAPS, PlaneField, image_basis
+from udccal.fitting.psf_stamps_field import OWN, TAPS, PlaneField, polynomials
 from udccal.fitting.psf_stamps_prior import BLOCK_ROWS
-from udccal.models.fields import polynomial_basis
 
 
 @dataclass(frozen=True)
@@ -108,7 +107,7 @@ def border_maps(
     for plane, field in enumerate(fields):
         parts = [(star, first + 2 + plane, one), (star + 1, first, one), (star + 2, first + 1, one)]
         for degree, numbers, own in ((field.warp_degree, 4, 3), (field.lateral_degree, 2, 1)):
-            for column in np.asarray(polynomial_basis(unit, degree))[:, 1:].T:
+            for column in polynomials(unit, degree)[:, 1:].T:
                 parts += [(star + own + i, np.full(stars, start + i), column) for i in range(numbers)]
                 start += numbers
         rows, columns, values = (np.concatenate(part) for part in zip(*parts, strict=True))
@@ -120,7 +119,7 @@ def normal_equations(
     field: PlaneField, unit: Float[np.ndarray, "stars 2"], seen: Weighted, border: scipy.sparse.csr_array
 ) -> Normal:
     """Of one colour."""
-    basis = np.asarray(image_basis(field, unit))
+    basis = polynomials(unit, field.image_degree)
     stars, terms = basis.shape
     rows, columns = field.nodes.shape[1:]
     weighted = np.concatenate([seen.slopes, seen.residual[..., None]], axis=2) * seen.weight[..., None]

@@ -65,7 +65,8 @@ def select(scene: Scene, stamps: Stamps, orders: Orders | None) -> Selected:
         found = improve(scene, finer, _ROUNDS_TO_JUDGE)
         tried.append(_trial(scene, found))
         gain = criterion(scene, best) - tried[-1].criterion
-        best = found if gain > 0 else best
+        best = _slim(found) if gain > 0 else best
+        del found
     best = improve(scene, without_outliers(scene, best.state), _ROUNDS_TO_END)
     return Selected(best, _table(scene, best, tried))
 
@@ -103,7 +104,7 @@ def criterion(scene: Scene, solved: Solved) -> float:
 def _degrees(scene: Scene, state: State) -> tuple[Solved, list[_Trial]]:
     """The best degrees, going from neighbour to neighbour until none is better; and all that were tried."""
     most = highest(scene, None)
-    best = improve(scene, state, _ROUNDS_TO_JUDGE + 1)
+    best = _slim(improve(scene, state, _ROUNDS_TO_JUDGE + 1))
     tried = [_trial(scene, best)]
     while True:
         own, better = orders_of(best.state), best
@@ -112,12 +113,17 @@ def _degrees(scene: Scene, state: State) -> tuple[Solved, list[_Trial]]:
             if pair in {(t.orders.warp, t.orders.image) for t in tried} or not _within(pair, most):
                 continue
             rounds = _ROUNDS_FOR_NEW if sum(change) > 0 else _ROUNDS_TO_JUDGE
-            found = _judged(scene, best, pair, rounds)
+            found = _slim(_judged(scene, best, pair, rounds))
             tried.append(_trial(scene, found))
             better = found if tried[-1].criterion < criterion(scene, better) else better
         if better is best:
             return best, tried
         best = better
+
+
+def _slim(solved: Solved) -> Solved:
+    """Without the factors of the nodes, the largest arrays of a fit: of a fit that is compared, none are asked for."""
+    return replace(solved, posterior=replace(solved.posterior, factors=(), half_meets=(), nodes=()))
 
 
 def _within(pair: tuple[int, int], most: Orders) -> bool:
@@ -154,9 +160,11 @@ def _loss(best: Solved, degree: int) -> float:
 
 
 def _trial(scene: Scene, solved: Solved) -> _Trial:
-    fields = solved.state.fields
-    numbers = sum(np.size(f.nodes) + np.size(f.warp) + np.size(f.lateral) for f in fields)
-    return _Trial(orders_of(solved.state), numbers, criterion(scene, solved))
+    return _Trial(orders_of(solved.state), _numbers(solved.state), criterion(scene, solved))
+
+
+def _numbers(state: State) -> int:
+    return sum(np.size(f.nodes) + np.size(f.warp) + np.size(f.lateral) for f in state.fields)
 
 
 def _table(scene: Scene, chosen: Solved, tried: list[_Trial]) -> tuple[Candidate, ...]:

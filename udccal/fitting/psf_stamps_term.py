@@ -10,8 +10,7 @@ import numpy as np
 import scipy.sparse
 from jaxtyping import Float
 
-from udccal.fitting.psf_stamps_field import TAPS, PlaneField, image_basis, see
-from udccal.models.fields import polynomial_basis
+from udccal.fitting.psf_stamps_field import TAPS, PlaneField, polynomials, see
 from udccal.numerics import in_float64
 
 _CHUNK = 8
@@ -204,7 +203,7 @@ class StampsPsf:
         field = self.fields[plane]
         seen = [np.asarray(part) for part in see(field, unit, centre, self._grid(len(unit)))]
         _, slopes, first, down, across, _ = seen
-        basis = np.asarray(image_basis(field, unit))
+        basis = polynomials(unit, field.image_degree)
         nodes = self.draws.nodes[plane]
         columns = field.nodes.shape[2]
         step = (np.arange(TAPS)[:, None] * columns + np.arange(TAPS)).ravel()
@@ -224,7 +223,7 @@ class StampsPsf:
 def _field_change(
     unit: Float[np.ndarray, "n 2"], degree: int, draws: Float[np.ndarray, "numbers draws"], each: int
 ) -> Float[np.ndarray, "n each draws"]:
-    basis = np.asarray(polynomial_basis(unit, degree))[:, 1:]
+    basis = polynomials(unit, degree)[:, 1:]
     return np.tensordot(basis, draws.reshape(basis.shape[1], each, draws.shape[1]), axes=1)
 
 

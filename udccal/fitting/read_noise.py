@@ -10,12 +10,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int, UInt16
+from jaxtyping import Float
 
+from udccal.fitting.information import scaled_inverse
 from udccal.fitting.iteration_log import LOG
+from udccal.fitting.noise_codes import DarkPair, centres_DN
 from udccal.fitting.noise_density import LEAST_SHAPE, MOST_SHAPE, NORMAL_SHAPE, dark_cdf
 
-_MOST_CODES = 160
 # Share of samples from anywhere in the window (hot and blinking pixels); keeps one outlier from deciding.
 _BACKGROUND = 1e-5
 # Prior on the shape, wide beside any real sensor's; it decides only where rounding hides the shape.
@@ -23,20 +24,6 @@ _SHAPE_SIGMA = 0.3
 # Nodes of the offset's normal distribution: this far out, this many per width of the temporal noise.
 _REACH, _NODES_PER_WIDTH, _FEWEST_NODES, _MOST_NODES = 5.5, 1.6, 13, 1201
 PARAMETERS = ("black_DN", "dark_DN_per_s", "variance_DN2", "DSNU_DN2", "lambda_read")
-
-
-@dataclass(frozen=True)
-class DarkPair:
-    """A pair of dark frames reduced to the joint histogram of the two codes of each pixel.
-
-    The outermost edges are infinite where the codes stop there (at 0, or at the converter's end).
-    """
-
-    exposure_s: float
-    edges_DN: Float[np.ndarray, " codes_plus_1"]
-    counts: Int[np.ndarray, "codes codes"]
-    outside: int
-    rows: int
 
 
 @dataclass(frozen=True)
@@ -61,57 +48,6 @@ class Surroundings:
 
     K_DN_per_e: float
     sigma_row_DN: float
-
-
-def dark_pair(
-    first: UInt16[np.ndarray, "rows columns"],
-    second: UInt16[np.ndarray, "rows columns"],
-    exposure_s: float,
-    q_DN: int = 1,
-    top_code: int = 65535,
-) -> DarkPair:
-    """Joint histogram over a window of codes around the median; codes beyond it are counted as outside."""
-    sample = first[:: max(1, first.size // 65536)]
-    low, middle, high = np.percentile(sample, [2.0, 50.0, 98.0])
-    # 98th minus 2nd percentile is 4.1 sigma; 1.9 times that each side is about 7.8 sigma.
-    half = int(np.ceil(1.9 * (high - low) / q_DN)) + 4
-    group = max(1, int(np.ceil((2 * half + 1) / _MOST_CODES)))
-    start = max(round(middle / q_DN) - half, 0)
-    codes = min((round(middle / q_DN) + half - start) // group, (top_code // q_DN - start) // group) + 1
-    # One more group takes all that lies outside the window, codes below it included: they wrap around.
-    side = codes + 1
-    index = _code_groups(first, start, group, q_DN, codes) * np.uint16(side)
-    index += _code_groups(second, start, group, q_DN, codes)
-    counts = np.bincount(index.ravel(), minlength=side * side).reshape(side, side)[:codes, :codes]
-    edges = (start + group * np.arange(codes + 1) - 0.5) * q_DN
-    edges[0] = -np.inf if start == 0 else edges[0]
-    edges[-1] = np.inf if edges[-1] >= top_code else edges[-1]
-    return DarkPair(exposure_s, edges.astype(np.float64), counts, int(first.size - counts.sum()), first.shape[0])
-
-
-def _code_groups(
-    frame: UInt16[np.ndarray, "rows columns"], start: int, group: int, q_DN: int, codes: int
-) -> UInt16[np.ndarray, "rows columns"]:
-    shifted = frame // np.uint16(q_DN) if q_DN > 1 else frame
-    below = shifted < np.uint16(start) if group > 1 else None
-    shifted = shifted - np.uint16(start)
-    if group > 1:
-        shifted //= np.uint16(group)
-        # A wrapped code may come to lie inside once it is divided.
-        shifted[below] = codes
-    return np.minimum(shifted, np.uint16(codes), out=shifted)
-
-
-def centres_DN(pair: DarkPair) -> Float[np.ndarray, " codes"]:
-    """Middle of each group of codes; of a cut-off end, where its neighbours would put it."""
-    edges = pair.edges_DN
-    step = float(np.median(np.diff(edges[np.isfinite(edges)]))) if np.isfinite(edges).sum() > 1 else 1.0
-    middle = 0.5 * (edges[1:] + edges[:-1])
-    if np.isinf(edges[0]):
-        middle[0] = edges[1] - 0.5 * step
-    if np.isinf(edges[-1]):
-        middle[-1] = edges[-2] + 0.5 * step
-    return middle
 
 
 def _nodes(spread: float, width: float) -> tuple[Float[np.ndarray, " nodes"], Float[np.ndarray, " nodes"]]:
@@ -246,13 +182,13 @@ def fit_dark(
     values[1] = 0.0 if one_exposure else values[1]
     values[4] = NORMAL_SHAPE if normal else values[4]
     best = _deviance(pairs, values, known)
-    converged, iterations = False, 0
+    converged, iterations, information = False, 0, np.zeros((5, 5))
     while not converged and iterations < max_iterations:
         iterations += 1
         score, information = _score_and_information(pairs, values, known, free)
         # At a bound with the score pointing outwards the bound is the answer.
         inside = free & ~((values <= _LOW) & (score < 0)) & ~((values >= _HIGH) & (score > 0))
-        step = inverse(np.where(np.outer(inside, inside), information, 0.0)) @ np.where(inside, score, 0.0)
+        step = scaled_inverse(np.where(np.outer(inside, inside), information, 0.0)) @ np.where(inside, score, 0.0)
         gained = 0.0
         for halving in range(12):
             trial = np.clip(values + step * 0.5**halving, _LOW, _HIGH)
@@ -263,10 +199,10 @@ def fit_dark(
         LOG.debug("noise, dark codes: iteration %d, deviance %.9g", iterations, best)
         # The squared step in units of sigma is twice what the likelihood can still gain.
         converged = bool(score[inside] @ step[inside] < 1e-3) or gained < 1e-4
-    _, information = _score_and_information(pairs, values, known, free)
+    # The last step was a small part of a sigma: the information is that before it.
     information = _least(information, pairs, free)
     widen = np.sqrt(np.array([1.0, 1.0, 1.0, len(pairs), 1.0]))
-    cov = inverse(information) * np.outer(widen, widen)
+    cov = scaled_inverse(information) * np.outer(widen, widen)
     return DarkFit(values, cov, _edge_gains(pairs, values, known), best, converged, iterations)
 
 
@@ -286,14 +222,6 @@ def _least(
         found[i, :] = found[:, i] = 0.0
         found[i, i] = least[i]
     return found
-
-
-def inverse(information: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
-    """Of a symmetric matrix of very unlike scales; rows and columns without information come back as zero."""
-    root = np.sqrt(np.maximum(np.diag(information), 0.0))
-    root = np.where(root > 1e-150, root, np.inf)
-    outer = np.outer(root, root)
-    return np.linalg.pinv(information / outer, rcond=1e-12, hermitian=True) / outer
 
 
 def dark_levels(

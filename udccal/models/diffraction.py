@@ -102,15 +102,43 @@ def average_transfer(
     """
     fx, fy = lattice_frequencies(frame, lattice)
     opened = open_fractions(model, frame)
-    columns, rows = slit_table(model, opened[0], fx, 0), slit_table(model, opened[1], fy, 0)
-    anchors, share = pupil_anchors(model)
-    lag_x, lag_y = relative_lag(model, frame, fx, fy)
+    columns, rows = slit_tables(model, opened[0], fx, 0)[0], slit_tables(model, opened[1], fy, 0)[0]
+    total = average_of(columns, rows, pupil_overlaps(model, frame, lattice), pupil_anchors(model)[1], spectra)
+    return through_sensor(total, sensor_transfer(frame, fx, fy, model.blur_px, disc_px))
+
+
+def pupil_overlaps(model: Diffraction, frame: LocalFrame, lattice: Lattice) -> Float[Array, "anchors rows half"]:
+    """Overlap of the pupil's footprint with itself moved, at the few wavelengths that it is computed for."""
+    lag_x, lag_y = relative_lag(model, frame, *lattice_frequencies(frame, lattice))
     distance = jnp.sqrt(lag_x**2 + lag_y**2 + 1e-30)
-    total = jnp.zeros((spectra.shape[0], lattice.rows, fx.shape[0]))
-    for a in range(PUPIL_NODES):
-        slits = jnp.einsum("cj,yj,xj->cyx", spectra * share[a], rows, columns)
-        total = total + slits * disc_autocorrelation(distance * (anchors[a] * 1e-6))
-    return total * sensor_transfer(frame, fx, fy, model.blur_px, disc_px)
+    anchors, _ = pupil_anchors(model)
+    return jnp.stack([disc_autocorrelation(distance * (anchors[a] * 1e-6)) for a in range(PUPIL_NODES)])
+
+
+def average_of(
+    columns: Float[Array, "half nodes"],
+    rows: Float[Array, "rows nodes"],
+    pupils: Float[Array, "anchors rows half"],
+    share: Float[Array, "anchors nodes"],
+    spectra: Float[Array, "c nodes"],
+) -> Float[Array, "c rows half"]:
+    """Transfer functions without the sensor; linear in the slits, in the pupil's overlaps and in the spectra."""
+
+    def add(
+        total: Float[Array, "c rows half"], anchor: tuple[Array, Array]
+    ) -> tuple[Float[Array, "c rows half"], None]:
+        pupil, own = anchor
+        return total + jnp.einsum("cj,yj,xj->cyx", spectra * own, rows, columns) * pupil, None
+
+    # As a loop, before which overlaps are worked out: the compiler would do so again for every channel.
+    return jax.lax.scan(add, jnp.zeros((spectra.shape[0], rows.shape[0], columns.shape[0])), (pupils, share))[0]
+
+
+def through_sensor(
+    transfer: Float[Array, "c rows half"], sensor: Float[Array, "rows half"]
+) -> Float[Array, "c rows half"]:
+    """Transfer functions times that of the sensor, which a loop lets be worked out only once."""
+    return jax.lax.map(lambda one: one * sensor, transfer)
 
 
 def lattice_frequencies(frame: LocalFrame, lattice: Lattice) -> tuple[Float[Array, " half"], Float[Array, " rows"]]:
@@ -141,27 +169,33 @@ def disc_autocorrelation(relative_lag: Float[Arrayish, "*n"]) -> Float[Array, "*
     return jnp.where(inside, (jnp.arccos(x) - x * jnp.sqrt(1.0 - x * x)) * (2.0 / jnp.pi), 0.0)
 
 
-def slit_coefficient(
-    relative_lag: Float[Arrayish, "*n"], opened: Float[Arrayish, ""], order: int
-) -> Float[Array, "*n"]:
-    """Fourier coefficient of a row of slits times itself moved by ``relative_lag`` pitches; 1 for order 0 at lag 0.
+def slit_coefficients(
+    relative_lag: Float[Arrayish, "*n"], opened: Float[Arrayish, ""], highest: int
+) -> Float[Array, "orders *n"]:
+    """Fourier coefficients of a row of slits times itself moved by ``relative_lag`` pitches; 1 for order 0 at lag 0.
 
     Where slits meet slits N pitches away, the common openings are ``opened`` - |lag - N| wide and lie half a pitch
-    further per N. The origin is the middle of an opening.
+    further per N. The origin is the middle of an opening. Orders are 0 to ``highest``.
     """
     lag = jnp.asarray(relative_lag)
     whole = jnp.floor(lag)
     here, next_one = jnp.maximum(opened - lag + whole, 0.0), jnp.maximum(opened - 1.0 + lag - whole, 0.0)
-    if order == 0:
-        return (here + next_one) / opened
-    parity = 1.0 - 2.0 * jnp.mod(order * whole, 2.0)
-    both = jnp.sin(jnp.pi * order * here) + (-1) ** order * jnp.sin(jnp.pi * order * next_one)
-    return parity * both / (jnp.pi * order * opened)
+    made = [(here + next_one) / opened]
+    odd = 1.0 - 2.0 * jnp.mod(whole, 2.0)
+    sines = [(jnp.zeros_like(lag), jnp.sin(jnp.pi * width)) for width in (here, next_one)]
+    twice = [2.0 * jnp.cos(jnp.pi * width) for width in (here, next_one)]
+    for order in range(1, highest + 1):
+        (_, near), (_, far) = sines
+        parity = odd if order % 2 else 1.0
+        made.append(parity * (near + (-1) ** order * far) / (jnp.pi * order * opened))
+        # sin((n + 1) x) = 2 cos(x) sin(n x) - sin((n - 1) x)
+        sines = [(now, two * now - before) for two, (before, now) in zip(twice, sines, strict=True)]
+    return jnp.stack(made)
 
 
-def slit_table(
-    model: Diffraction, opened: Float[Array, ""], frequency: Float[Array, " n"], order: int
-) -> Float[Array, "n nodes"]:
+def slit_tables(
+    model: Diffraction, opened: Float[Array, ""], frequency: Float[Array, " n"], highest: int
+) -> Float[Array, "orders n nodes"]:
     """Slit coefficients averaged over the light of each wavelength node, for lags lambda * frequency.
 
     A node's light is a triangle as wide as its distance to its neighbours, summed in steps of about a nanometre: so
@@ -174,11 +208,11 @@ def slit_table(
     triangle = (1.0 - jnp.abs(offset)) / count
     fine = nodes[:, None] + offset * step
 
-    def averaged(wavelengths_nm: Float[Array, " k"]) -> Float[Array, " n"]:
+    def averaged(wavelengths_nm: Float[Array, " k"]) -> Float[Array, "orders n"]:
         lag = frequency[:, None] * (wavelengths_nm * 1e-6 / model.pitch_mm)
-        return slit_coefficient(lag, opened, order) @ triangle
+        return slit_coefficients(lag, opened, highest) @ triangle
 
-    return jax.lax.map(averaged, fine).T
+    return jnp.moveaxis(jax.lax.map(averaged, fine), 0, -1)
 
 
 def _fine_count(model: Diffraction) -> int:

@@ -19,13 +19,15 @@ from udccal.models.diffraction import (
     open_fractions,
     relative_lag,
     sensor_transfer,
-    slit_table,
+    slit_tables,
+    through_sensor,
 )
 from udccal.models.lattice import Lattice
 
 # (g, h): periods along columns and rows. The opposite of each is contained in it.
 TERMS = ((0.0, 1.0), (0.0, 2.0), (1.0, 0.0), (2.0, 0.0), (1.0, 1.0), (1.0, -1.0))
 _COLUMN_OF, _ROW_OF = np.abs(np.array(TERMS, dtype=np.int32)).T
+HIGHEST_ORDER = int(max(_COLUMN_OF.max(), _ROW_OF.max()))
 _QUADRATURE = 32
 _TABLE = 128
 
@@ -41,10 +43,29 @@ def interference_transfer(
     """What to add to ``average_transfer``; ``overlaps`` come from ``node_overlaps``, and hardly change in a fit."""
     fx, fy = lattice_frequencies(frame, lattice)
     opened = open_fractions(model, frame)
-    columns = jnp.stack([slit_table(model, opened[0], fx, g) for g in range(_COLUMN_OF.max() + 1)])
-    rows = jnp.stack([slit_table(model, opened[1], fy, h) for h in range(_ROW_OF.max() + 1)])
-    place = jnp.asarray(model.offset) + model.standoff_per_pitch * frame.direction[:2] / frame.direction[2]
-    strength = model.visibility * 2.0 * jnp.cos(2.0 * jnp.pi * (jnp.array(TERMS) @ place))
+    columns, rows = (slit_tables(model, opened[axis], f, HIGHEST_ORDER) for axis, f in enumerate((fx, fy)))
+    total = interference_of(strengths(model, footprint_place(model, frame)), columns, rows, overlaps, spectra)
+    return through_sensor(total, sensor_transfer(frame, fx, fy, model.blur_px, disc_px))
+
+
+def footprint_place(model: Diffraction, frame: LocalFrame) -> Float[Array, "2"]:
+    """Where the footprint's centre lies on columns and rows, in pitches."""
+    return jnp.asarray(model.offset) + model.standoff_per_pitch * frame.direction[:2] / frame.direction[2]
+
+
+def strengths(model: Diffraction, place: Float[Arrayish, "2"]) -> Float[Array, " terms"]:
+    """How strongly, and with which sign, each term shows with the footprint at a place on columns and rows."""
+    return model.visibility * 2.0 * jnp.cos(2.0 * jnp.pi * (jnp.array(TERMS) @ jnp.asarray(place)))
+
+
+def interference_of(
+    strength: Float[Array, " terms"],
+    columns: Float[Array, "orders half nodes"],
+    rows: Float[Array, "orders rows nodes"],
+    overlaps: Float[Arrayish, "nodes terms rows half"],
+    spectra: Float[Array, "c nodes"],
+) -> Float[Array, "c rows half"]:
+    """Transfer functions without the sensor; linear in strengths, slits, overlaps and spectra."""
 
     def add(
         total: Float[Array, "c rows half"], node: tuple[Array, Array, Array, Array]
@@ -54,8 +75,7 @@ def interference_transfer(
         return total + share[:, None, None] * here, None
 
     nodes = (jnp.moveaxis(columns, -1, 0), jnp.moveaxis(rows, -1, 0), jnp.asarray(overlaps), spectra.T)
-    total, _ = jax.lax.scan(add, jnp.zeros((spectra.shape[0], lattice.rows, fx.shape[0])), nodes)
-    return total * sensor_transfer(frame, fx, fy, model.blur_px, disc_px)
+    return jax.lax.scan(add, jnp.zeros((spectra.shape[0], rows.shape[1], columns.shape[1])), nodes)[0]
 
 
 def node_overlaps(

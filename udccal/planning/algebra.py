@@ -5,11 +5,12 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
+from udccal.fitting.information import scaled_inverse
+
 
 def covariance(information: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
     """The inverse; what the data do not tell at all gets no variance, so that priors must hold it."""
-    unit = 1 / np.sqrt(np.diag(information))
-    return np.asarray(np.linalg.pinv(information * np.outer(unit, unit), hermitian=True) * np.outer(unit, unit))
+    return scaled_inverse(information, 1e-15)
 
 
 def without(information: Float[np.ndarray, "all all"], kept: int) -> Float[np.ndarray, "kept kept"]:

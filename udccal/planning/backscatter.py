@@ -35,7 +35,7 @@ from udccal.planning.steps import PlannedStep, planned_steps
 from udccal.rig import Captures
 
 # So many pictures of the procedure stand for all, since drawing them takes long: more are more of the same kind.
-_DRAWN = 9
+_DRAWN = 6
 # Of pictures that no calibration shows, whose light is to be predicted.
 _NEW_SEEDS = (9001, 9002, 9003)
 _NEW = len(_NEW_SEEDS)
@@ -67,6 +67,7 @@ class BackscatterPredictor:
         # Where in the field the light falls: what leaves the panel evenly is shaded like everything else.
         across = rig.camera.columns // self._step_px
         rows, columns = np.divmod(flat, across)
+        self._bins = across * (rig.camera.rows // self._step_px)
         pixels = self._step_px * (np.stack([columns, rows], axis=1) + 0.5) - 0.5
         self._shading = EvenField(state).at(pixels)
         self._white = _white_light(state, flat, self._shading)
@@ -75,13 +76,26 @@ class BackscatterPredictor:
 
     def sigma(self, captures: Captures) -> float:
         """Root mean square over sensor, colours and pictures, of these' peaks; see ``prediction.Predictor``."""
+        noise, count = self._of_captures(captures)
+        return float("inf") if noise is None else self._light_sigma(noise, count)
+
+    def used(self, captures: Captures) -> float:
+        """Of all bins, a part tells the kernel; see ``prediction.Predictor``."""
+        noise, count = self._of_captures(captures)
+        if noise is None:
+            return 1.0
+        return (
+            self._light_sigma(noise, count, self._bins / self._white.shape[1]) / self._light_sigma(noise, count)
+        ) ** 2
+
+    def _of_captures(self, captures: Captures) -> tuple[BinNoise | None, int]:
+        """Noise, and pictures beside white; None where there are too few."""
         steps = list(_planned(self._state.with_captures(captures)))
         pictures = [step for step in steps if isinstance(step.arrangement, PanelPicture)]
         darks = [step for step in steps if isinstance(step.arrangement, Dark)]
         if len(pictures) - 1 < _FEWEST_PICTURES or not darks:
-            return float("inf")
-        noise = self._noise(pictures[0], darks[0])
-        return self._light_sigma(noise, len(pictures) - 1)
+            return None, 0
+        return self._noise(pictures[0], darks[0]), len(pictures) - 1
 
     def floor(self) -> Floor:
         """What a profile's fit found its model to leave out, of a new picture's peak; nothing where there is none."""
@@ -91,8 +105,10 @@ class BackscatterPredictor:
             "That much of the light the fit of the present profile could not describe; no further picture changes it.",
         )
 
-    def _light_sigma(self, noise: BinNoise, count: int) -> float:
+    def _light_sigma(self, noise: BinNoise, count: int, each: float = 1.0) -> float:
+        """Bins that the fit looks at stand for ``each`` of them."""
         told = told_by(self._ratios.part(slice(-_NEW)), noise, count)
+        told = replace(told, kernel=each * told.kernel)
         new, inflation = self._ratios.part(slice(-_NEW, None)), self._state.unexplained.inflation
         return 100.0 * light_sigma(new, noise, told, self._precision, inflation)
 

@@ -53,6 +53,10 @@ class GeometryPredictor:
             "corners that scatter less, would lower that.",
         )
 
+    def used(self, captures: Captures) -> float:
+        """All corners; see ``prediction.Predictor``."""
+        return 1.0
+
     @in_float64
     def _views(self, captures: Captures) -> list[PlannedView]:
         views = []

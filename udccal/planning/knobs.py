@@ -17,11 +17,15 @@ _SHARE: Final = 0.25
 @final
 @dataclass(frozen=True)
 class Knob:
-    """One number of ``Captures``, with the least that the term's fit can judge itself by, and the most to be asked."""
+    """One number of ``Captures``, with the least that the term's fit can judge itself by, and the most to be asked.
+
+    ``counted`` says in words what the number counts.
+    """
 
     name: str
     least: int
     most: int
+    counted: str
 
     def of(self, captures: Captures) -> int:
         """What it is set to."""
@@ -42,16 +46,19 @@ class Knob:
 KNOBS: Final = MappingProxyType[TermName, tuple[Knob, ...]](
     {
         # PRNU and DSNU live on the stack, K on the levels: below these, noise's other numbers would suffer.
-        "noise": (Knob("noise_levels", 5, 400), Knob("noise_stack", 8, 1000)),
-        "geometry": (Knob("board_views", 3, 200),),
-        "wire": (Knob("flats", 2, 20_000),),
+        "noise": (Knob("noise_levels", 5, 400, "levels of light"), Knob("noise_stack", 8, 1000, "frames of a stack")),
+        "geometry": (Knob("board_views", 3, 200, "views of the board"),),
+        "wire": (Knob("flats", 2, 20_000, "flats"),),
         "psf": (
-            Knob("psf_columns", 2, 24),
-            Knob("psf_rows", 2, 24),
-            Knob("psf_shifts", 1, 64),
-            Knob("psf_exposures", 3, 12),
+            Knob("psf_columns", 2, 24, "columns of LED positions"),
+            Knob("psf_rows", 2, 24, "rows of LED positions"),
+            Knob("psf_shifts", 1, 64, "shifts at each position"),
+            Knob("psf_exposures", 3, 12, "exposures of a bracket"),
         ),
-        "backscatter": (Knob("backscatter_pictures", 6, 200), Knob("backscatter_frames", 2, 1000)),
+        "backscatter": (
+            Knob("backscatter_pictures", 6, 200, "pictures on the panel"),
+            Knob("backscatter_frames", 2, 1000, "frames of a picture"),
+        ),
     }
 )
 

@@ -21,8 +21,10 @@ from udccal.planning.state import WHITE, RigState
 from udccal.planning.steps import PlannedStep
 from udccal.rig import Captures
 
-# Places in fractions of the sensor, and shifts in px, that stand for all.
-_PLACES = ((0.45, 0.55), (0.15, 0.2), (0.85, 0.7))
+# Places in fractions of the sensor, and shifts in px, that stand for all: of the field, and of the procedure's grid,
+# which reaches nearly to the border.
+_FIELD = ((0.45, 0.55), (0.15, 0.2), (0.85, 0.7))
+_CAPTURED = ((0.05, 0.06), (0.5, 0.94), (0.9, 0.5))
 _SHIFTS_PX = np.array([[0.4, 1.3], [1.7, 0.2]])
 
 
@@ -31,7 +33,8 @@ _SHIFTS_PX = np.array([[0.4, 1.3], [1.7, 0.2]])
 class ExpectedShots:
     """Blocks of shots with their light (``rate``, 1 for the brightest sample of each), and the model that they are of.
 
-    ``share`` is how many samples of the window each of those chosen stands for.
+    ``share`` is how many samples of the window each of those chosen stands for; the first ``in_field`` blocks are at
+    places of the field, the others where the procedure captures.
     """
 
     evaluator: Evaluator
@@ -40,6 +43,7 @@ class ExpectedShots:
     locals: tuple[Local, ...]
     overlaps: tuple[np.ndarray, ...]
     share: Float[np.ndarray, "shots n"]
+    in_field: int = len(_FIELD)
 
     def parts(self) -> Iterator[tuple[Block, Local, np.ndarray]]:
         """Place by place."""
@@ -106,7 +110,7 @@ def _dark_shots(state: RigState, half: tuple[int, int]) -> Shots:
     """Where the shots are and what colour their samples have; their light is yet to come."""
     rig = state.rig
     size = np.array([rig.camera.columns, rig.camera.rows])
-    places = np.floor(np.array(_PLACES) * size / 2) * 2
+    places = np.floor(np.array([*_FIELD, *_CAPTURED]) * size / 2) * 2
     aims = (places[:, None] + _SHIFTS_PX).reshape(-1, 2)
     origins = np.round(aims).astype(np.int64)
     rows, columns = 2 * half[0] + 1, 2 * half[1] + 1

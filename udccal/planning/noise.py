@@ -56,6 +56,10 @@ class NoisePredictor:
         """None: every further pair tells more."""
         return Floor(0.0, "")
 
+    def used(self, captures: Captures) -> float:
+        """All pairs; see ``prediction.Predictor``."""
+        return 1.0
+
     def _information(self, step: PlannedStep) -> Float[np.ndarray, "2 2"]:
         """Of one pair, on (K, V0)."""
         noise = self._state.noise

@@ -28,3 +28,7 @@ class Predictor(Protocol):
     def floor(self) -> Floor:
         """In the limit of endless captures."""
         ...
+
+    def used(self, captures: Captures) -> float:
+        """Share of the captures' information on the target that the fit, at its default effort, spends; 1 is all."""
+        ...

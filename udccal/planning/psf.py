@@ -7,19 +7,24 @@ that more of them bring nothing.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Final, final
 
+import equinox as eqx
+import jax
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from udccal.arrangements import Led
 from udccal.fitting.calibrate import FitEffort
+from udccal.fitting.psf_blocks import Block, Local
 from udccal.fitting.psf_descent import Prior, without_locals
-from udccal.fitting.psf_normal import normal_equations
+from udccal.fitting.psf_normal import Evaluator, Normal, normal_equations
 from udccal.fitting.psf_start import start_model, start_prior, wire_shows
 from udccal.numerics import in_float64
 from udccal.planning.algebra import covariance
+from udccal.planning.knobs import KNOBS
 from udccal.planning.led_shots import ExpectedShots, expected_shots, sample_information
 from udccal.planning.prediction import Floor
 from udccal.planning.state import RigState, built_wire
@@ -31,6 +36,7 @@ _FEWEST_POSITIONS: Final = 3
 _HELD_OUT_EVERY: Final = 4
 # Steps of one term are alike but for their place: a design of so few shows how each is exposed.
 _SAMPLE: Final = {"psf_columns": 1, "psf_rows": 1, "psf_shifts": 1}
+_EXPOSURES: Final = next(knob for knob in KNOBS["psf"] if knob.name == "psf_exposures")
 
 
 @final
@@ -56,64 +62,115 @@ class PsfPredictor:
         self._shots: ExpectedShots = expected_shots(state, prior.mean, wire_shows(wire))
         effort = FitEffort().psf
         self._most = _Effort(effort.positions, effort.shifts)
-        self._by_sample = self._of_kernel()
         self._known: dict[tuple[float, ...], Float[np.ndarray, "p p"]] = {}
+        # All brackets that a plan may ask for: their slopes are the same, and what takes long.
+        captures = state.rig.captures
+        steps = [self._step(_EXPOSURES.set(captures, n)) for n in range(_EXPOSURES.least, _EXPOSURES.most + 1)]
+        self._by_sample = self._look_at(steps)
 
     def sigma(self, captures: Captures) -> float:
         """Root mean square over colours and field; see ``prediction.Predictor``."""
-        positions = captures.psf_columns * captures.psf_rows
-        if positions < _FEWEST_POSITIONS:
-            return float("inf")
-        held_out = len(range(1, positions, _HELD_OUT_EVERY))
-        used = min(positions - held_out, self._most.positions) * min(captures.psf_shifts, self._most.shifts)
-        return self._kernel_sigma(self._information(captures), used)
+        shots = self._shots_used(captures)
+        return self._kernel_sigma(self._information(captures), shots) if shots else float("inf")
+
+    def used(self, captures: Captures) -> float:
+        """Of all positions and shifts, a part; see ``prediction.Predictor``."""
+        shots = self._shots_used(captures)
+        if not shots:
+            return 1.0
+        every = captures.psf_columns * captures.psf_rows * captures.psf_shifts
+        one = self._information(captures)
+        by_all, by_part = (self._of_noise(one, count) for count in (every, shots))
+        return by_all / by_part
 
     def floor(self) -> Floor:
         """All that the fit looks at, endlessly bright."""
-        most = self._state.rig.captures.model_copy(update={"psf_exposures": 12})
-        return Floor(
-            self._kernel_sigma(self._information(most), self._most.positions * self._most.shifts),
-            f"The fit of diffraction looks at {self._most.positions} positions and {self._most.shifts} shifts of each, "
-            "and pixels differ in their response (PRNU): a larger effort (FitEffort's psf) would lower it.",
-        )
+        most = self._state.rig.captures.model_copy(update={"psf_exposures": _EXPOSURES.most})
+        shots = self._most.positions * self._most.shifts
+        if self._left_out() > self._of_noise(self._information(most), shots):
+            why = "That much of the kernel the fit of the present profile could not describe; no capture changes it."
+        else:
+            why = (
+                f"The fit of diffraction looks at {self._most.positions} positions and {self._most.shifts} shifts of "
+                "each, and pixels differ in their response (PRNU): a larger effort (FitEffort's psf) would lower it."
+            )
+        return Floor(self._kernel_sigma(self._information(most), shots), why)
 
-    @in_float64
+    def _shots_used(self, captures: Captures) -> int:
+        """Pictures that the fit of diffraction looks at; 0 where there are too few positions."""
+        positions = captures.psf_columns * captures.psf_rows
+        held_out = len(range(1, positions, _HELD_OUT_EVERY))
+        used = min(positions - held_out, self._most.positions) * min(captures.psf_shifts, self._most.shifts)
+        return used if positions >= _FEWEST_POSITIONS else 0
+
     def _information(self, captures: Captures) -> Float[np.ndarray, "p p"]:
         """Of one shot on the numbers of diffraction, mean over the places that stand for all."""
-        few = self._state.with_captures(captures.model_copy(update=_SAMPLE))
-        step = next(step for step in planned_steps("psf", few) if isinstance(step.arrangement, Led))
+        step = self._step(captures)
         if step.exposures_s not in self._known:
-            self._known[step.exposures_s] = self._mean_information(step)
+            self._look_at([step])
         return self._known[step.exposures_s]
 
-    def _mean_information(self, step: PlannedStep) -> Float[np.ndarray, "p p"]:
-        total, count = np.zeros_like(self._precision), 0
-        for block, local, overlaps in self._shots.parts():
-            weight = sample_information(self._state, np.asarray(block.rate), step)
-            here = replace(block, weight=weight * (np.asarray(block.known) > 0))
-            normal = normal_equations(self._shots.evaluator, self._shots.theta, here, local, overlaps)
-            total += without_locals(normal)[0]
-            count += len(local.flux)
-        return total / count
+    def _step(self, captures: Captures) -> PlannedStep:
+        few = self._state.with_captures(captures.model_copy(update=_SAMPLE))
+        return next(step for step in planned_steps("psf", few) if isinstance(step.arrangement, Led))
 
-    def _of_kernel(self) -> Float[np.ndarray, "p p"]:
-        """Takes a covariance to the squared relative L2 error of the kernel, mean over places and colours."""
-        total = np.zeros_like(self._precision)
-        for block, local, overlaps in self._shots.parts():
-            here = replace(block, weight=self._shots.relative_weight(block))
-            # The slopes of light by the numbers of diffraction, at weights that make every colour's kernel count 1.
-            normal = normal_equations(self._shots.evaluator, self._shots.theta, here, local, overlaps)
-            total += np.asarray(normal.gg) / len(np.asarray(block.index))
-        return total / len(self._shots.blocks)
+    @in_float64
+    def _look_at(self, steps: Sequence[PlannedStep]) -> Float[np.ndarray, "p p"]:
+        """Learn what shots of these steps tell.
+
+        Returns:
+            What takes a covariance to the squared relative L2 error of the kernel, mean over places and colours.
+        """
+        of_kernel, told = np.zeros_like(self._precision), np.zeros((len(steps), *self._precision.shape))
+        count, field = 0, self._shots.in_field
+        for number, (block, local, overlaps) in enumerate(self._shots.parts()):
+            known = np.asarray(block.known) > 0
+            light = [sample_information(self._state, np.asarray(block.rate), step) * known for step in steps]
+            # At weights that make every colour's kernel count 1, the slopes of light are those of the kernel.
+            weights = np.stack([self._shots.relative_weight(block), *light])
+            normal = _at_weights(self._shots.evaluator, self._shots.theta, block, local, overlaps, weights)
+            if number < field:
+                of_kernel += np.asarray(normal.gg[0]) / len(local.flux)
+            else:
+                told += [without_locals(_one(normal, k))[0] for k in range(1, len(weights))]
+                count += len(local.flux)
+        self._known |= {step.exposures_s: one / count for step, one in zip(steps, told, strict=True)}
+        return of_kernel / field
 
     def _left_out(self) -> float:
         """Squared relative L2 error that a profile's fit has found its model to have."""
         shares = [
             float(np.sum(self._shots.relative_weight(block) * np.asarray(block.rate) ** 1.5)) / len(block.rate)
-            for block in self._shots.blocks
+            for block in self._shots.blocks[: self._shots.in_field]
         ]
         return self._state.unexplained.psf**2 * float(np.mean(shares))
 
     def _kernel_sigma(self, one: Float[np.ndarray, "p p"], shots: int) -> float:
-        cov = covariance(self._precision + shots * one)
-        return 100.0 * float(np.sqrt(float(np.sum(self._by_sample * cov)) + self._left_out()))
+        return 100.0 * float(np.sqrt(self._of_noise(one, shots) + self._left_out()))
+
+    def _of_noise(self, one: Float[np.ndarray, "p p"], shots: int) -> float:
+        """Squared relative L2 error of the kernel by noise."""
+        return float(np.sum(self._by_sample * covariance(self._precision + shots * one)))
+
+
+@eqx.filter_jit
+def _at_weights(
+    evaluator: Evaluator,
+    theta: Float[Array, " p"],
+    block: Block,
+    local: Local,
+    overlaps: Array,
+    weights: Float[Array, "designs shots n"],
+) -> Normal:
+    """The normal equations of one block at several weights of its samples; slopes are found once."""
+
+    def one(weight: Float[Array, "shots n"]) -> Normal:
+        return normal_equations(evaluator, theta, replace(block, weight=weight), local, overlaps)
+
+    made: Callable[[Array], Normal] = jax.vmap(one)
+    return made(weights)
+
+
+def _one(normals: Normal, index: int) -> Normal:
+    taken: Normal = jax.tree.map(lambda part: np.asarray(part)[index], normals)
+    return taken

@@ -56,23 +56,35 @@ class WirePredictor:
 
     def sigma(self, captures: Captures) -> float:
         """Root mean square over the sensor; see ``prediction.Predictor``."""
-        steps = list(planned_steps("wire", self._state.with_captures(captures)))
-        flats = [step for step in steps if isinstance(step.arrangement, FlatLight)]
-        darks = [step for step in steps if isinstance(step.arrangement, Dark)]
-        if not flats or not darks:
-            return float("inf")
-        return self._map_sigma(self._relative_variance(flats[0], darks[0]))
+        relative = self._of_captures(captures)
+        return float("inf") if relative is None else self._map_sigma(relative, self._each)
+
+    def used(self, captures: Captures) -> float:
+        """Of all pixels, a part; see ``prediction.Predictor``."""
+        relative = self._of_captures(captures)
+        if relative is None:
+            return 1.0
+        every = self._state.rig.camera.rows * self._state.rig.camera.columns / self._used.sum()
+        by_all, by_part = (self._map_sigma(relative, each, model=0.0) for each in (every, self._each))
+        return min((by_all / by_part) ** 2, 1.0)
 
     def floor(self) -> Floor:
         """That of PRNU."""
         prnu = float(np.asarray(self._state.noise.PRNU1288))
         share = self._each * self._used.sum() / (self._state.rig.camera.rows * self._state.rig.camera.columns)
         return Floor(
-            self._map_sigma(np.full(len(self._used), prnu**2)),
+            self._map_sigma(np.full(len(self._used), prnu**2), self._each),
             f"Pixels differ in their response by {100 * prnu:.2g} % (PRNU), and that does not average over frames: "
             + ("a fit to more of the sensor's pixels (FitEffort's wire_samples)" if share < 0.9 else "more pixels")
             + " would lower it.",
         )
+
+    def _of_captures(self, captures: Captures) -> Float[np.ndarray, " n"] | None:
+        """Relative variance of each pixel; None without flats or darks."""
+        steps = list(planned_steps("wire", self._state.with_captures(captures)))
+        flats = [step for step in steps if isinstance(step.arrangement, FlatLight)]
+        darks = [step for step in steps if isinstance(step.arrangement, Dark)]
+        return self._relative_variance(flats[0], darks[0]) if flats and darks else None
 
     def _relative_variance(self, flat: PlannedStep, dark: PlannedStep) -> Float[np.ndarray, " n"]:
         """Of flat less dark, over the signal squared."""
@@ -81,13 +93,14 @@ class WirePredictor:
         variance = variance + sample_variance_e(self._state, np.zeros(1), dark.exposures_s[0]) / len(dark.exposures_s)
         return np.asarray(variance / signal**2 + float(np.asarray(self._state.noise.PRNU1288)) ** 2)
 
-    def _map_sigma(self, relative: Float[np.ndarray, " n"]) -> float:
-        """``relative`` is the variance of each pixel over its signal squared."""
-        weight = np.where(self._used, self._each / np.maximum(relative * self._value**2, 1e-12), 0.0)
+    def _map_sigma(self, relative: Float[np.ndarray, " n"], each: float, model: float | None = None) -> float:
+        """``relative`` is the variance of each pixel, which stands for ``each`` of them, over its signal squared."""
+        left_out = self._state.unexplained.wire if model is None else model
+        weight = np.where(self._used, each / np.maximum(relative * self._value**2, 1e-12), 0.0)
         information = (self._design * weight) @ self._design.T + np.diag(self._precision)
         cov = covariance(information)
         of_noise = np.mean(np.einsum("in,ij,jn->n", self._places, cov, self._places))
-        return 100.0 * float(np.sqrt(of_noise + self._state.unexplained.wire**2))
+        return 100.0 * float(np.sqrt(of_noise + left_out**2))
 
 
 def _odd_step(size: int, samples: int) -> int:

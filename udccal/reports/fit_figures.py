@@ -2,32 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
-from jaxtyping import Float
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullLocator
 
+from udccal.planning.outlook import Outlook, Trade
 from udccal.reports.figures import bare, row_of_axes
 from udccal.reports.residuals import ResidualHistogram, ResidualMap
 
 _BLUE, _RED = "#2f6fb5", "#c0392b"
-
-
-@dataclass(frozen=True)
-class TradeCurve:
-    """How sure a quantity is against how much is captured; ``now`` counts what was captured.
-
-    Attributes:
-        knob: what is counted, such as ``flats``.
-        quantity: what becomes surer, with its unit in brackets.
-    """
-
-    knob: str
-    quantity: str
-    counts: Float[np.ndarray, " n"]
-    sigma: Float[np.ndarray, " n"]
-    now: float
+# What is left is drawn where it is near enough to be seen; axes end this factor beyond the curves.
+_NEAR, _ROOM, _TICKS = 0.5, 1.08, 4
 
 
 def residual_figure(cells: ResidualMap, histogram: ResidualHistogram) -> Figure:
@@ -50,15 +36,35 @@ def residual_figure(cells: ResidualMap, histogram: ResidualHistogram) -> Figure:
     return figure
 
 
-def trade_figure(curves: tuple[TradeCurve, ...]) -> Figure:
-    """One panel per knob: sigma against the number captured, with what was captured marked."""
-    figure, panels = row_of_axes(len(curves), 3.4 * len(curves), 2.7)
-    for axes, curve in zip(panels, curves, strict=True):
-        axes.loglog(curve.counts, curve.sigma, "-", color=_BLUE, lw=1.5)
-        at = float(np.exp(np.interp(np.log(curve.now), np.log(curve.counts), np.log(curve.sigma))))
-        axes.plot([curve.now], [at], "o", color=_RED, ms=6, label=f"captured: {curve.now:g}")
-        axes.set_xlabel(curve.knob)
-        axes.set_ylabel(curve.quantity, fontsize=8)
-        axes.legend(frameon=False, fontsize=8)
+def trade_figure(ahead: Outlook) -> Figure:
+    """One panel per number of the captures: sigma against it, with what was captured and what is left marked."""
+    trades = ahead.trades
+    # One panel alone is as large as two, so that its labels have room.
+    figure, panels = row_of_axes(len(trades), max(3.0 * len(trades), 4.2), 2.7)
+    low = min(float(trade.sigma.min()) for trade in trades)
+    high = max(float(trade.sigma.max()) for trade in trades)
+    low = min(low, ahead.floor.sigma) if ahead.floor.sigma > _NEAR * low else low
+    for axes, trade in zip(panels, trades, strict=True):
+        axes.loglog(trade.counts, trade.sigma, "-", color=_BLUE, lw=1.8)
+        axes.plot([trade.now], [ahead.sigma], "o", color=_RED, ms=6, label=f"captured: {trade.now}")
+        if low <= ahead.floor.sigma:
+            axes.axhline(ahead.floor.sigma, color="0.4", ls="--", lw=1, label="left, however many")
+        axes.set(xlabel=trade.knob.counted, ylim=(low / _ROOM, high * _ROOM))
+        _plain_ticks(axes, trade)
+        axes.legend(frameon=False, fontsize=7.5, loc="upper right")
         axes.grid(alpha=0.25, which="both")
+    panels[0].set_ylabel(f"σ [{ahead.quantity.unit}]")
     return figure
+
+
+def _plain_ticks(axes: Axes, trade: Trade) -> None:
+    """Counts as the numbers that they are, and sigma without powers of ten."""
+    lowest, highest = float(trade.counts[0]), float(trade.counts[-1])
+    places = np.unique(np.rint(np.geomspace(lowest, highest, _TICKS)).astype(int))
+    axes.xaxis.set_major_locator(FixedLocator([float(place) for place in places]))
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.0f}"))
+    axes.xaxis.set_minor_locator(NullLocator())
+    axes.yaxis.set_major_locator(MaxNLocator(5, steps=[1, 2, 2.5, 5, 10]))
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.3g}"))
+    axes.yaxis.set_minor_locator(NullLocator())
+    axes.tick_params(labelsize=8)

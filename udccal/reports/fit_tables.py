@@ -5,6 +5,9 @@ from __future__ import annotations
 from udccal.fitting.result import FitResult
 from udccal.reports.tables import Table, number, spread
 
+MOST_ORDERS = 6
+_NUMBERS = frozenset({1, 2})
+
 
 def estimates_table(title: str, result: FitResult) -> Table:
     """Every estimate of a fit with its sigma."""
@@ -19,12 +22,34 @@ def diagnostics_table(title: str, result: FitResult) -> Table:
     return Table(title, ("about the fit", "value", "unit"), rows, frozenset({1}))
 
 
-def candidates_table(title: str, result: FitResult) -> Table:
-    """The orders that were tried, the chosen one marked."""
+def orders_table(result: FitResult) -> Table:
+    """The orders that were tried, and which was chosen.
+
+    Where one choice was made: best first, the likeliest alone and how much worse than the best they are. Where several
+    were made, one after the other, each has its own criterion: all of them, in their order.
+    """
+    if sum(one.chosen for one in result.candidates) != 1:
+        return candidates_table("Orders tried, choice by choice (lower is better)", result)
+    best = sorted(result.candidates, key=lambda one: (one.criterion, one.parameters))
     rows = tuple(
-        (c.name, str(c.parameters), f"{c.criterion:.1f}", "chosen" if c.chosen else "") for c in result.candidates
+        (one.name, str(one.parameters), f"{one.criterion - best[0].criterion:+.4g}", "chosen" if one.chosen else "")
+        for place, one in enumerate(best)
+        if place < MOST_ORDERS or one.chosen
     )
-    return Table(title, ("tried", "parameters", "criterion", ""), rows, frozenset({1, 2}))
+    return Table("Orders tried, best first", ("order", "parameters", "worse than the best by", ""), rows, _NUMBERS)
+
+
+def more_orders(result: FitResult) -> bool:
+    """Whether ``orders_table`` leaves some out."""
+    return sum(one.chosen for one in result.candidates) == 1 and len(result.candidates) > MOST_ORDERS
+
+
+def candidates_table(title: str, result: FitResult) -> Table:
+    """All orders that were tried, the chosen one marked; lower is better."""
+    rows = tuple(
+        (c.name, str(c.parameters), f"{c.criterion:.6g}", "chosen" if c.chosen else "") for c in result.candidates
+    )
+    return Table(title, ("tried", "parameters", "criterion", ""), rows, _NUMBERS)
 
 
 def outliers_table(title: str, result: FitResult) -> Table:

@@ -7,6 +7,7 @@ from jaxtyping import UInt8
 
 from udccal.fitting.calibrate import ORDER, Calibration
 from udccal.reports import figures
+from udccal.reports.accuracy import accuracies
 from udccal.reports.board_views import board_evidence
 from udccal.reports.evidence import photon_transfer
 from udccal.reports.maps import fitted_maps
@@ -28,6 +29,8 @@ def gather(
 ) -> Evidence:
     """Every number the report shows; ``light`` is the simulated rig's, None for a rig that is really there.
 
+    Where the truth is known the report shows that; else how accurate the terms are, and would be with more captures.
+
     Raises:
         SessionError: when a file of the session is damaged.
     """
@@ -42,6 +45,7 @@ def gather(
         rows,
         photon_transfer(session, noise),
         board_evidence(calibration.foundation.boards, geometry),
+        () if light is not None else accuracies(calibration),
     )
 
 

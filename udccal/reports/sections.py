@@ -7,28 +7,27 @@ from dataclasses import dataclass
 from matplotlib.figure import Figure
 
 from udccal.fitting.calibrate import ORDER, Calibration
-from udccal.fitting.result import FitResult, FitStatus
+from udccal.fitting.result import FitStatus
 from udccal.reports import figures, fit_figures
+from udccal.reports.accuracy import Accuracy, accuracy_table, trade_sentence
 from udccal.reports.board_views import BoardEvidence
 from udccal.reports.evidence import PhotonTransfer
-from udccal.reports.fit_figures import TradeCurve
-from udccal.reports.fit_tables import candidates_table, diagnostics_table, estimates_table, outliers_table
+from udccal.reports.fit_tables import (
+    candidates_table,
+    diagnostics_table,
+    estimates_table,
+    more_orders,
+    orders_table,
+    outliers_table,
+)
 from udccal.reports.maps import TermMaps
 from udccal.reports.page import Illustration, TermSection
 from udccal.reports.residuals import residual_histogram, residual_map
-from udccal.reports.tables import number, spread
+from udccal.reports.tables import Table, number, spread
 from udccal.reports.truth import TruthRow
 from udccal.sessions.schema import TermName
 
 _LONGEST_LIST = 14
-
-
-@dataclass(frozen=True)
-class TermTrade:
-    """How sure one term would be with more or fewer captures."""
-
-    term: TermName
-    curves: tuple[TradeCurve, ...]
 
 
 @dataclass(frozen=True)
@@ -41,7 +40,11 @@ class Evidence:
     rows: tuple[TruthRow, ...]
     transfer: PhotonTransfer | None
     boards: BoardEvidence | None
-    trades: tuple[TermTrade, ...] = ()
+    accuracies: tuple[Accuracy, ...] = ()
+
+    def accuracy(self, term: TermName) -> Accuracy | None:
+        """Of a term; None where nothing is known of it."""
+        return next((one for one in self.accuracies if one.outlook.term == term), None)
 
 
 _EXPLANATIONS: dict[TermName, str] = {
@@ -61,38 +64,52 @@ def sections(evidence: Evidence) -> tuple[TermSection, ...]:
 def _section(term: TermName, evidence: Evidence) -> TermSection:
     result = evidence.calibration.result(term)
     shown = () if result.status is FitStatus.ABSENT else (*_illustrations(term, evidence), *_quality(term, evidence))
-    estimates = estimates_table("Fitted", result)
-    long = len(estimates.rows) > _LONGEST_LIST
     details = [diagnostics_table("The fit itself", result)]
-    if result.candidates:
-        details.append(candidates_table("Orders tried (lower is better)", result))
+    estimates = estimates_table("Fitted", result)
+    shown_tables = _numbers(term, evidence)
+    if len(estimates.rows) > _LONGEST_LIST:
+        details.append(estimates)
+    elif estimates.rows:
+        shown_tables = (estimates, *shown_tables)
+    if more_orders(result):
+        details.append(candidates_table("All orders tried", result))
     if result.outliers:
         details.append(outliers_table("Left out", result))
-    if long:
-        details.append(estimates)
     return TermSection(
         term=term,
         heading=term.capitalize(),
         explanation=_EXPLANATIONS[term],
         status=result.status,
-        finding=_finding(term, result, evidence.rows),
+        finding=_finding(term, evidence),
         illustrations=shown,
-        tables=() if long or not estimates.rows else (estimates,),
+        tables=shown_tables,
         details=tuple(details) if result.samples else (),
         notes=result.notes,
     )
 
 
-def _finding(term: TermName, result: FitResult, rows: tuple[TruthRow, ...]) -> str:
-    """The one number that says most: the distance from the truth when it is known, else the first estimate."""
-    distances = [row for row in rows if row.term == term and row.fitted is None]
+def _numbers(term: TermName, evidence: Evidence) -> tuple[Table, ...]:
+    """Accuracy and orders."""
+    result, accuracy = evidence.calibration.result(term), evidence.accuracy(term)
+    tables = () if accuracy is None else (accuracy_table(accuracy),)
+    return (*tables, orders_table(result)) if result.candidates else tables
+
+
+def _finding(term: TermName, evidence: Evidence) -> str:
+    """The one number that says most: the distance from the truth when it is known, else how sure the term is."""
+    result, accuracy = evidence.calibration.result(term), evidence.accuracy(term)
+    distances = [row for row in evidence.rows if row.term == term and row.fitted is None]
     if distances:
         worst = distances[0]
         return f"{worst.quantity[0].upper()}{worst.quantity[1:]}: {worst.error:.2g} {worst.unit}."
     if not result.estimates:
         return "Nothing was fitted."
+    if accuracy is not None and term != "noise":
+        quantity = accuracy.outlook.quantity
+        return f"{quantity.meaning[0].upper()}{quantity.meaning[1:]}: known to {accuracy.sigma:.2g} {quantity.unit}."
     first = result.estimates[0]
-    return f"{first.name} = {number(first.value, first.sigma)} ± {spread(first.sigma)} {first.unit}."
+    unit = "" if first.unit == "1" else f" {first.unit}"
+    return f"{first.name} = {number(first.value, first.sigma)} ± {spread(first.sigma)}{unit}."
 
 
 def _illustrations(term: TermName, evidence: Evidence) -> tuple[Illustration, ...]:
@@ -111,11 +128,10 @@ def _quality(term: TermName, evidence: Evidence) -> tuple[Illustration, ...]:
             "Right: bars that follow the line are noise alone; wider ones are structure that the model lacks."
         )
         drawn += _illustration(fit_figures.residual_figure(cells, histogram), caption, f"residuals of {term}")
-    for trade in evidence.trades:
-        if trade.term == term:
-            caption = "How sure the result is against how much is captured. Where a curve is flat, more brings nothing."
-            figure = fit_figures.trade_figure(trade.curves)
-            drawn += _illustration(figure, caption, f"accuracy of {term} against captures")
+    accuracy = evidence.accuracy(term)
+    if accuracy is not None and accuracy.outlook.trades:
+        figure = fit_figures.trade_figure(accuracy.outlook)
+        drawn += _illustration(figure, trade_sentence(accuracy.outlook), f"accuracy of {term} against captures")
     return tuple(drawn)
 
 

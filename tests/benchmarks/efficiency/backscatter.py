@@ -16,9 +16,12 @@ from jaxtyping import Float
 from tests.benchmarks.efficiency.trials import Trials
 from udccal.displays.pictures import face_picture
 from udccal.fitting.backscatter import problem_of
-from udccal.fitting.backscatter_data import Binned, PanelShots, grid_step, nominal_term, visible_crop
+from udccal.fitting.backscatter_bins import Binned
+from udccal.fitting.backscatter_data import PanelShots, grid_step, nominal_term, visible_crop
+from udccal.fitting.backscatter_evidence import evidence, pictures_of, weights
 from udccal.fitting.backscatter_light import Knowledge, grid_rays, predict_light
-from udccal.fitting.backscatter_likelihood import evidence, linearised, log_values, weights
+from udccal.fitting.backscatter_likelihood import linearised
+from udccal.fitting.backscatter_ratios import window_logs, windows_at
 from udccal.fitting.backscatter_report import known_from, told
 from udccal.fitting.backscatter_select import choose
 from udccal.fitting.backscatter_solve import corners_of, window_for
@@ -42,8 +45,8 @@ POSITIONS = 24
 PICTURES = 8
 EXPOSURE_S = 0.05
 _READ_E = 2.5
-# Of samples and frames behind a bin's average.
-_SAMPLES = 64
+# Of samples and frames behind a bin's average: 16 x 16 pixels, four frames.
+_SAMPLES = 1024
 _PLACES = np.array([40, 95, 140, 190])
 
 
@@ -148,11 +151,10 @@ def best_knowledge(of: World, expected: PanelShots, flat: np.ndarray, template: 
     """Truth and the Cramér–Rao bound on its covariance, from shots without noise."""
     prior = prior_of(of.rig)
     rays = grid_rays(template, flat)
-    seen = evidence(expected, rays, flat)
-    mask = np.asarray(seen.light)[0]
-    weight = weights(seen, np.asarray(seen.light), mask, 0.0, np.asarray(seen.usable))
-    corner = corners_of(template, of.x, rays)
-    slopes = np.asarray(linearised(of.x, template, corner, seen, weight, log_values(template, seen, corner))[1])
+    seen = evidence(expected, rays, flat, pictures_of(expected.shown, expected.crop))
+    weight = weights(seen, seen.light, seen.light[0], 0.0, seen.usable)
+    at = windows_at(template.window, rays, corners_of(template, of.x, rays), seen.shown)
+    slopes = linearised(of.x, template, at, seen, weight, window_logs(at, seen.shown))[1]
     cov = np.linalg.inv(slopes.T @ slopes + np.diag(prior.sigma**-2.0))
     return Knowledge(template, of.x, cov, 0.0, (True,) * len(expected.seen) + (True,))
 

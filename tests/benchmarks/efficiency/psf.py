@@ -8,20 +8,23 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from tests.benchmarks.efficiency.trials import Trials
 from tests.benchmarks.psf_scene import Picture, Scene, pictures, shots_of, small_scene
-from udccal.fitting.information import cramer_rao, fisher_information
-from udccal.fitting.psf_blocks import LOCAL, Block, Local, blocks, fit_lattice
+from udccal.fitting.information import cramer_rao
+from udccal.fitting.psf_blocks import Block, blocks, fit_lattice
 from udccal.fitting.psf_descent import Prior, damped
 from udccal.fitting.psf_field import fit_field
 from udccal.fitting.psf_normal import Evaluator, kernel_coefficients, overlaps_of, unit_light
-from udccal.fitting.psf_posterior import kernel_and_slopes
+from udccal.fitting.psf_posterior import kernel_and_slopes, light_and_slopes
 from udccal.fitting.psf_start import WAVELENGTHS_NM, start_model, start_prior
 from udccal.fitting.psf_weights import sensor_variance
+from udccal.models.arrays import Arrayish
 from udccal.numerics import in_float64
 
 _REALISATIONS = 100
@@ -116,33 +119,42 @@ def _information(
     total = prior.root.T @ prior.root
     for block in blocks(shots, scene.geometry, np.ones(shots.rate.shape, dtype=bool)):
         index = np.asarray(block.index)
-        flux = np.stack([made[i].flux for i in index])
-        shots_own = np.concatenate([np.zeros((len(index), 2)), flux, np.zeros((len(index), 1))], axis=1)
-        x = np.concatenate([theta, shots_own.ravel()])
-        light, _ = _predict(x, evaluator, block, np.ones(np.shape(block.rate)))
-        variance = sensor_variance(block, np.asarray(light).reshape(np.shape(block.rate)))
-        both = fisher_information(_predict, x, evaluator, block, variance)
-        p = theta.size
-        parts = [np.s_[p + LOCAL * s : p + LOCAL * (s + 1)] for s in range(len(index))]
-        own = np.stack([both[part, part] for part in parts])
-        cross = both[:p, p:].reshape(p, len(index), LOCAL)
-        total = total + both[:p, :p] - np.einsum("psl,slm,qsm->pq", cross, np.linalg.inv(damped(own, 0.0)), cross)
+        by_global, by_local, light = _slopes(evaluator, theta, block, np.stack([made[i].flux for i in index]))
+        weight = 1.0 / sensor_variance(block, light)
+        own = np.einsum("snk,sn,snl->skl", by_local, weight, by_local)
+        cross = np.einsum("snp,sn,snl->psl", by_global, weight, by_local)
+        both = np.einsum("snp,sn,snq->pq", by_global, weight, by_global)
+        total = total + both - np.einsum("psl,slm,qsm->pq", cross, np.linalg.inv(damped(own, 0.0)), cross)
     return total
 
 
-def _predict(
-    x: Float[Array, " n"],
-    evaluator: Evaluator,
-    block: Block,
-    variance: Float[Array, "shots n"],
-) -> tuple[Float[Array, " samples"], Float[Array, " samples"]]:
-    """Mean and variance of all samples of a position; globals, then each shot's place, light and background."""
-    shots = np.shape(variance)[0]
-    theta, own = x[: -LOCAL * shots], x[-LOCAL * shots :].reshape(shots, LOCAL)
-    local = Local(own[:, :2], own[:, 2:5], own[:, 5])
-    # Interference tells of the pupil by its overlaps: they are part of the model.
-    overlaps = overlaps_of(evaluator, theta, block.frame)
-    unit = unit_light(evaluator, block, local.offset_px, kernel_coefficients(evaluator, theta, block, overlaps))
-    light = unit * jnp.einsum("snc,sc->sn", jnp.asarray(block.colour), jnp.asarray(local.flux))
-    mean = light + jnp.asarray(local.background)[:, None]
-    return mean.ravel(), jnp.asarray(variance).ravel()
+def _slopes(
+    evaluator: Evaluator, theta: Float[np.ndarray, " p"], block: Block, flux: Float[np.ndarray, "shots 3"]
+) -> tuple[Float[np.ndarray, "shots n p"], Float[np.ndarray, "shots n l"], Float[np.ndarray, "shots n"]]:
+    """Slopes of a position's samples by global parameters and by each shot's own, and the light of the samples."""
+    shape = np.shape(block.rate)
+    colour = np.asarray(block.colour)
+    points = np.asarray(block.points).reshape(-1, 2)
+    unit, by_theta = (
+        np.asarray(part)
+        for part in light_and_slopes(
+            evaluator, theta, block.frame, evaluator.lattice, points, np.ravel(block.density), block.disc_px
+        )
+    )
+    light = np.einsum("snc,sc->sn", colour, flux)
+    own = np.einsum("snc,snc->sn", unit.reshape(*shape, 3), colour)
+    by_global = np.einsum("psnc,snc,sn->snp", by_theta.reshape(-1, *shape, 3), colour, light)
+    moved = np.asarray(_by_move(evaluator, theta, block)) * light[..., None]
+    by_local = [moved, own[..., None] * colour, np.ones((*shape, 1))]
+    return by_global, np.concatenate(by_local, axis=-1), own * light
+
+
+@eqx.filter_jit
+def _by_move(evaluator: Evaluator, theta: Float[Arrayish, " p"], block: Block) -> Float[Array, "shots n 2"]:
+    """Of one unit of light, when its source moves by a pixel."""
+    kernel = kernel_coefficients(evaluator, theta, block, overlaps_of(evaluator, theta, block.frame))
+
+    def at(move: Float[Array, "2"]) -> Float[Array, "shots n"]:
+        return unit_light(evaluator, block, jnp.broadcast_to(move, (jnp.shape(block.rate)[0], 2)), kernel)
+
+    return jax.jacfwd(at)(jnp.zeros(2))

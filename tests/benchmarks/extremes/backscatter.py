@@ -20,7 +20,8 @@ from tests.benchmarks.efficiency.backscatter import (
 )
 from tests.benchmarks.extremes.case import Case, Outcome, outcome
 from udccal.fitting.backscatter import fit_shots
-from udccal.fitting.backscatter_data import Binned, PanelShots
+from udccal.fitting.backscatter_bins import Binned
+from udccal.fitting.backscatter_data import PanelShots
 from udccal.fitting.backscatter_vector import TWO_PLANES, prior_of
 from udccal.fitting.result import FitResult
 from udccal.rig import Nominal, RigDescription

@@ -1,0 +1,51 @@
+"""The order of the photon transfer model on levels that are made, not measured."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from udccal.fitting.noise_order import choose_transfer
+from udccal.fitting.photon_transfer import DarkVariance, Levels, Order
+
+DARK = DarkVariance(np.array([4.0]), np.array([0.01]), 1 / 12, 0.36, np.array([0.0]))
+
+
+def made_levels(seed: int) -> Levels:
+    """Ten levels of a linear sensor in bins of two brightnesses; in the last one only the dark half is usable."""
+    rng = np.random.default_rng(seed)
+    bins, samples = 32, 2e4
+    pattern = np.where(np.arange(bins) % 2 == 0, 1.3, 0.7)
+    light = np.append(np.linspace(0.05, 0.7, 9), 1.2)
+    mean = 3000 * light[:, None] * pattern
+    variance = 0.36 * mean + 4 + 1 / 12
+    usable = np.ones(mean.shape, bool)
+    usable[-1, ::2] = False
+    return Levels(
+        mean_DN=mean + np.sqrt(variance / samples) * rng.standard_normal(mean.shape),
+        variance_DN2=variance * (1 + np.sqrt(4 / samples) * rng.standard_normal(mean.shape)),
+        dof=np.full(mean.shape, samples / 2),
+        samples=np.full(mean.shape, samples),
+        usable=usable,
+        light=light,
+        steady=np.ones(10, bool),
+        dark_DN=np.zeros(10),
+        row_variance_DN2=np.zeros(10),
+    )
+
+
+def test_a_level_with_half_its_bins_does_not_make_the_light_unsteady() -> None:
+    for seed in range(5):
+        fit, order, _ = choose_transfer(made_levels(seed), DARK, 4000.0)
+        assert order == Order()
+        assert np.nanmax(np.abs(fit.level_z)) < 4.5
+
+
+def test_a_level_that_is_brighter_than_its_exposure_makes_it_unsteady() -> None:
+    levels = made_levels(0)
+    factor = np.ones((10, 1))
+    factor[[2, 5, 7]] = 1.004
+    factor[[3, 6]] = 0.995
+    _, order, _ = choose_transfer(replace(levels, mean_DN=levels.mean_DN * factor), DARK, 4000.0)
+    assert order.unsteady

@@ -1,0 +1,51 @@
+"""Fields of known order: the orders that the data choose are those, of map and images alike."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.fitting.test_psf_stamps import READ_E, SENSOR, places
+from udccal.fitting.psf_stamps import fit_psf_stamps
+from udccal.fitting.psf_stamps_data import Stamps
+
+# (map degree, image degree) of the truths.
+ORDERS = ((0, 0), (1, 0), (2, 0), (0, 1), (2, 1))
+_STAMPS, _SIZE, _LIGHT_E = 24, 11, 1e5
+_RUNS, _RIGHT = 100, 95
+
+
+def kernel(position: np.ndarray, shift: np.ndarray, order: tuple[int, int]) -> np.ndarray:
+    """Two Gaussians, behind a stretch that is a polynomial of the position, the second brighter towards one side."""
+    x, y = 2 * position / SENSOR - 1
+    stretch = 1 + (0.0, 0.08 * (x - 0.5 * y), 0.12 * (x * x + y * y))[order[0]]
+    v, u = np.mgrid[:_SIZE, :_SIZE] - _SIZE // 2
+    u, v = (u - shift[0]) / stretch, (v - shift[1]) / stretch
+    core = np.exp(-0.5 * (u**2 + v**2) / 1.2**2) / (2 * np.pi * 1.2**2)
+    lobe = np.exp(-0.5 * ((u - 3) ** 2 + v**2) / 1.1**2) / (2 * np.pi * 1.1**2)
+    return (core + 0.15 * (1 + 0.5 * x * order[1]) * lobe) / 1.15 / stretch**2
+
+
+def chosen(order: tuple[int, int], seed: int) -> tuple[int, int]:
+    """Degrees of map and images that a fit of noisy stamps comes to."""
+    rng = np.random.default_rng([seed, *order])
+    position = places(rng, _STAMPS)
+    middle = np.rint(position).astype(np.int64)
+    light = _LIGHT_E * rng.uniform(0.5, 1.5, _STAMPS)
+    values = [f * kernel(p, p - m, order) for f, p, m in zip(light, position, middle, strict=True)]
+    noisy = rng.poisson(values) + READ_E * rng.standard_normal(np.shape(values))
+    field = fit_psf_stamps(Stamps(noisy, middle, READ_E)).or_raise("psf_stamps").term.fields[0]
+    return field.warp_degree, field.image_degree
+
+
+def test_a_field_that_does_not_change_needs_no_order() -> None:
+    assert chosen((0, 0), 1) == (0, 0)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+def test_orders_are_right_in_95_of_100_runs() -> None:
+    runs = [(order, seed) for seed in range(_RUNS // len(ORDERS)) for order in ORDERS]
+    wrong = [(order, seed, found) for order, seed in runs if (found := chosen(order, seed)) != order]
+    assert len(runs) == _RUNS
+    assert len(wrong) <= _RUNS - _RIGHT, wrong

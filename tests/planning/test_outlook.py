@@ -1,0 +1,63 @@
+"""What more captures would bring: curves that fall, what does not matter named, and what a fit leaves unused."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import final
+
+import numpy as np
+import pytest
+
+from udccal.planning import outlook as module
+from udccal.planning.outlook import outlook
+from udccal.planning.prediction import Floor
+from udccal.planning.state import nominal_state
+from udccal.rig import Captures, load_rig
+
+
+@final
+@dataclass(frozen=True)
+class _Made:
+    """Sigma that falls with the pictures and not with the frames of each; none below ``fewest``."""
+
+    fewest: int = 0
+
+    def sigma(self, captures: Captures) -> float:
+        enough = captures.backscatter_pictures > self.fewest
+        return float(captures.backscatter_pictures) ** -0.5 if enough else float("inf")
+
+    def used(self, captures: Captures) -> float:
+        return 0.25
+
+    def floor(self) -> Floor:
+        return Floor(0.01, "Another model would lower it.")
+
+
+def test_curves_reach_from_a_quarter_to_four_times(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "predictor_for", lambda term, state: _Made())
+    found = outlook("backscatter", nominal_state(load_rig("lg55-aca2040")))
+    assert found is not None
+    (trade,) = found.trades
+    assert (trade.counts[0], trade.now, trade.counts[-1]) == (6, 24, 96)
+    assert np.all(np.diff(trade.sigma) < 0)
+    assert trade.most_gain == pytest.approx(2.0)
+    assert found.idle == ("frames of a picture",)
+    assert (found.used, found.floor.sigma) == (0.25, 0.01)
+
+
+def test_captures_that_do_not_suffice_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    state = nominal_state(load_rig("lg55-aca2040"))
+    monkeypatch.setattr(module, "predictor_for", lambda term, state: _Made(fewest=12))
+    found = outlook("backscatter", state)
+    assert found is not None
+    assert found.trades[0].counts[0] > 12
+    monkeypatch.setattr(module, "predictor_for", lambda term, state: _Made(fewest=1000))
+    assert outlook("backscatter", state) is None
+
+
+def test_levels_tell_the_gain_and_the_stack_does_not() -> None:
+    found = outlook("noise", nominal_state(load_rig("lg55-reduced")))
+    assert found is not None
+    assert [trade.knob.name for trade in found.trades] == ["noise_levels"]
+    assert found.idle == ("frames of a stack",)
+    assert found.trades[0].most_gain == pytest.approx(2.0, rel=0.1)
