@@ -21,7 +21,7 @@ from udccal.fitting.psf_descent import Prior
 from udccal.fitting.psf_field import fit_field
 from udccal.fitting.psf_normal import Evaluator
 from udccal.fitting.psf_posterior import kernel_and_slopes
-from udccal.fitting.psf_start import WAVELENGTHS_NM, start_model, start_prior
+from udccal.fitting.psf_start import start_model, start_prior
 from udccal.numerics import in_float64
 from udccal.planning.psf import PsfPredictor
 from udccal.planning.state import RigState
@@ -136,7 +136,7 @@ def _realisation(scene: Scene, prior: Prior, seed: int) -> tuple[float, float]:
 def _kernel(
     scene: Scene, theta: Float[np.ndarray, " p"], place: Float[np.ndarray, "2"]
 ) -> tuple[Float[np.ndarray, "3 rows columns"], Float[np.ndarray, "p 3 rows columns"]]:
-    evaluator = Evaluator(WAVELENGTHS_NM, fit_lattice(_HALF), True)
+    evaluator = Evaluator(prior.wavelengths_nm, fit_lattice(_HALF), True)
     rows, columns = (2 * half + 1 for half in _HALF)
     value, slopes = kernel_and_slopes(evaluator, theta, scene.geometry, place, fit_lattice(_HALF), rows, columns)
     return np.asarray(value), np.asarray(slopes)

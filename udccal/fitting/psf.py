@@ -23,7 +23,7 @@ from udccal.fitting.psf_residual import Sources, with_light_of_peak
 from udccal.fitting.psf_samples import share_of_information
 from udccal.fitting.psf_select import select_field
 from udccal.fitting.psf_shots import Shots
-from udccal.fitting.psf_start import start_model, start_prior, wire_shows
+from udccal.fitting.psf_start import pitch_tolerance, start_model, start_prior, wire_shows
 from udccal.fitting.result import FitResult, FitStatus
 from udccal.models.geometry import Geometry
 from udccal.models.noise import Noise
@@ -140,7 +140,8 @@ def fit_shots_fully(
     size = np.array([rig.camera.columns - 1, rig.camera.rows - 1]) / 2.0
     selection = select_field(shots, sources, explained, held_out, (shots.positions_px() - size) / size)
     used = share_of_information(field.diffraction, field.shots, geometry, close, shots.count, len(NAMES))
-    return FittedPsf(fit_result(shots, geometry, field, selection, size, used), posterior(field.diffraction, geometry))
+    result = fit_result(shots, geometry, field, selection, size, used, pitch_tolerance(rig))
+    return FittedPsf(result, posterior(field.diffraction, geometry))
 
 
 def held_out_positions(count: int) -> Bool[np.ndarray, " positions"]:

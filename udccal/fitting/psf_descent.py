@@ -22,10 +22,11 @@ _SMALL, _STALLED = 1.0, 0.05
 
 @dataclass(frozen=True)
 class Prior:
-    """Gaussian prior of the global parameters: mean, and a root of the inverse covariance."""
+    """Gaussian prior of the global parameters: mean, a root of the inverse covariance, and the nodes of the spectra."""
 
     mean: Float[np.ndarray, " p"]
     root: Float[np.ndarray, "rows p"]
+    wavelengths_nm: Float[np.ndarray, " nodes"]
 
 
 @dataclass(frozen=True)

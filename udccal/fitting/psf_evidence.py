@@ -6,20 +6,18 @@ import numpy as np
 from jaxtyping import Float
 
 from udccal.fitting.psf_blocks import BLUR
-from udccal.fitting.psf_diffraction import DiffractionFit, fitted_model
+from udccal.fitting.psf_diffraction import DiffractionFit, expected_light, fitted_model
 from udccal.fitting.psf_field import FieldFit
-from udccal.fitting.psf_normal import kernel_coefficients
-from udccal.fitting.psf_posterior import full_cov
+from udccal.fitting.psf_posterior import full_cov, light_and_slopes
 from udccal.fitting.psf_select import Selection
 from udccal.fitting.psf_shots import Shots
-from udccal.fitting.psf_start import HELD
-from udccal.fitting.result import Diagnostic, Estimate, FitResult, FitStatus
+from udccal.fitting.result import Diagnostic, Estimate, FitResult, FitStatus, ResidualSample
 from udccal.models.diffraction import Diffraction
 from udccal.models.geometry import Geometry
 from udccal.models.psf import PsfField, fine_oversample
 
 _POOR = 0.2
-_DRAWS = 6
+_MOST_RESIDUALS = 6000
 NAMES = ("pitch", "column_open_fraction", "row_open_fraction", "structure_thickness", "pupil_diameter", "blur")
 _UNITS = ("mm", "1", "1", "mm", "mm", "px")
 
@@ -27,6 +25,8 @@ _DIFFRACTION_NOTES = (
     "cov covers the numbers of diffraction; field coefficients of the residual and spectra are left out of it.",
     "chi2_dof is of the fit of diffraction and allows for the model error that its residuals tell.",
 )
+# Which of the numbers are lengths on the panel, told in pitches.
+_LENGTHS = np.array([name in ("pitch", "structure_thickness", "pupil_diameter") for name in NAMES])
 _FREE_NOTES = (
     "The blur is not that of a panel's grating: an image carries the kernel, no number of diffraction is known.",
     "chi2_dof is of that image, and allows for a model error of 1 % of the peak.",
@@ -40,8 +40,13 @@ def fit_result(
     selection: Selection,
     size: Float[np.ndarray, "2"],
     efficiency: float,
+    pitch_tolerance: float,
 ) -> FitResult[PsfField]:
-    """Everything together; ``size`` is the sensor's (half width, half height) in px, also its centre."""
+    """Everything together.
+
+    ``size`` is the sensor's (half width, half height) in px, also its centre; ``pitch_tolerance`` by what
+    fraction the pitch, which was held so that the spectra could move, may be off.
+    """
     fit = field.diffraction
     term = PsfField(
         geometry=geometry,
@@ -59,7 +64,7 @@ def fit_result(
         status = FitStatus.POOR_FIT
     elif selection.share and not fit.converged:
         status = FitStatus.NOT_CONVERGED
-    estimates, cov = _estimates(fit, selection)
+    estimates, cov = _estimates(fit, selection, pitch_tolerance)
     return FitResult(
         term=term,
         status=status,
@@ -71,7 +76,24 @@ def fit_result(
         diagnostics=(*_diagnostics(shots, fit, selection), *_of_diffraction(field, efficiency)),
         notes=_DIFFRACTION_NOTES if selection.share else _FREE_NOTES,
         outliers=fit.outliers,
+        residuals=_residuals(field) if selection.share else None,
     )
+
+
+def _residuals(field: FieldFit) -> ResidualSample:
+    """Of evenly drawn samples of the fit of diffraction, at the places of their LED, the model error in their sigma."""
+    problem, point = field.diffraction.problem, field.diffraction.point
+    places, z = [], []
+    lights = expected_light(problem, point)
+    for block, local, light in zip(problem.blocks, point.local, lights, strict=True):
+        weight = np.asarray(block.weight)
+        error = np.asarray(block.rate) - light - np.asarray(local.background)[:, None]
+        shot, _ = used = np.nonzero(weight > 0)
+        places.append(field.shots.centre_px[np.asarray(block.index)[shot]])
+        z.append((error * np.sqrt(weight))[used])
+    positions, values = np.concatenate(places), np.concatenate(z)
+    drawn = np.s_[:: max(1, -(-len(values) // _MOST_RESIDUALS))]
+    return ResidualSample(positions[drawn], values[drawn])
 
 
 def diffraction_alone(model: Diffraction, geometry: Geometry) -> PsfField:
@@ -94,7 +116,9 @@ def failed(start: Diffraction, geometry: Geometry, status: FitStatus, note: str)
     return FitResult(diffraction_alone(start, geometry), status, (), np.zeros((0, 0)), 0.0, 0, notes=(note,))
 
 
-def _estimates(fit: DiffractionFit, selection: Selection) -> tuple[tuple[Estimate, ...], Float[np.ndarray, "n n"]]:
+def _estimates(
+    fit: DiffractionFit, selection: Selection, pitch_tolerance: float
+) -> tuple[tuple[Estimate, ...], Float[np.ndarray, "n n"]]:
     error = float(selection.held_out.mean())
     spread = float(selection.held_out.std(ddof=1) / np.sqrt(selection.held_out.size))
     if not selection.share:
@@ -105,26 +129,21 @@ def _estimates(fit: DiffractionFit, selection: Selection) -> tuple[tuple[Estimat
     values, unit = fit.theta[: len(NAMES)].copy(), np.ones(len(NAMES))
     values[BLUR] = unit[BLUR] = np.exp(fit.theta[BLUR])
     cov = whole[: len(NAMES), : len(NAMES)] * np.outer(unit, unit)
-    # The pitch was held, so that the spectra could move; it may be off by what the rig's description allows.
-    cov[0, 0] += 1.0 / (HELD * fit.problem.prior.root[0, 0]) ** 2
+    by_pitch = np.where(_LENGTHS, values, 0.0) * pitch_tolerance
+    cov += np.outer(by_pitch, by_pitch)
     sigma = np.sqrt(np.diag(cov))
     numbers = tuple(Estimate(n, float(v), float(s), u) for n, v, s, u in zip(NAMES, values, sigma, _UNITS, strict=True))
     return (*numbers, kernel), cov
 
 
 def _kernel_sigma(fit: DiffractionFit, cov: Float[np.ndarray, "p p"]) -> float:
-    """Relative L2 spread of what the first position expects, for parameters drawn from their covariance."""
-    rng = np.random.default_rng(3)
-    values, vectors = np.linalg.eigh(cov)
-    root = vectors * np.sqrt(np.maximum(values, 0.0))
-    block, overlaps = fit.problem.blocks[0], fit.problem.overlaps[0]
-
-    def light(theta: Float[np.ndarray, " p"]) -> Float[np.ndarray, "rows columns 3"]:
-        return np.asarray(kernel_coefficients(fit.problem.evaluator, theta, block, overlaps))
-
-    middle = light(fit.theta)
-    drawn = [light(fit.theta + root @ rng.standard_normal(fit.theta.size)) - middle for _ in range(_DRAWS)]
-    return float(np.sqrt(np.mean([(d**2).sum() for d in drawn]) / (middle**2).sum()))
+    """Relative L2 spread of what the first position expects of its samples, in all colours."""
+    block, evaluator = fit.problem.blocks[0], fit.problem.evaluator
+    at = (np.asarray(block.points)[0], np.asarray(block.density)[0], block.disc_px)
+    found = light_and_slopes(evaluator, fit.theta, block.frame, evaluator.lattice, *at)
+    light, slopes = (np.asarray(part) for part in found)
+    variance = float(np.einsum("pnc,pq,qnc->", slopes, cov, slopes, optimize=True))
+    return float(np.sqrt(max(variance, 0.0) / (light**2).sum()))
 
 
 def _of_diffraction(field: FieldFit, efficiency: float) -> tuple[Diagnostic, ...]:

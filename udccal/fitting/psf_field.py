@@ -16,7 +16,6 @@ from udccal.fitting.psf_normal import Evaluator
 from udccal.fitting.psf_phase import PhaseEvidence, phase_evidence
 from udccal.fitting.psf_samples import choose_samples
 from udccal.fitting.psf_shots import Shots
-from udccal.fitting.psf_start import WAVELENGTHS_NM
 from udccal.models.geometry import Geometry
 
 
@@ -56,7 +55,7 @@ def fit_field(
         wire_shows: whether the footprint's place on the rows is known.
     """
     chosen = choose_samples(shots, close, far_share)
-    evaluator = Evaluator(WAVELENGTHS_NM, fit_lattice(close), wire_shows)
+    evaluator = Evaluator(prior.wavelengths_nm, fit_lattice(close), wire_shows)
     problem = pose(blocks(shots, geometry, chosen), evaluator, prior, prior.mean)
     near = approach(problem, iterations)
     shots = at_places(shots, _found(problem.blocks, near.local, shots.count))

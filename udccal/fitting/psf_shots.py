@@ -95,7 +95,7 @@ def cut_crop(
         None when no light stands out from the noise near the aim.
     """
     rate = merged.rate_e_per_s
-    weight = np.where(merged.used > 0, 1.0 / merged.sigma_e_per_s**2, 0.0)
+    weight = np.where(merged.used > 0, 1.0 / merged.sigma_e_per_s.astype(np.float64) ** 2, 0.0)
     place = _brightest(rate, weight, np.asarray(aim_px) - corner_px)
     if place is None:
         return None

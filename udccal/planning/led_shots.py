@@ -12,10 +12,10 @@ from jaxtyping import Float
 from udccal.cfa import channel_map
 from udccal.fitting.calibrate import FitEffort
 from udccal.fitting.psf_blocks import Block, Local, blocks, fit_lattice
+from udccal.fitting.psf_descent import Prior
 from udccal.fitting.psf_normal import Evaluator, kernel_coefficients, overlaps_of, unit_light
 from udccal.fitting.psf_samples import choose_samples
 from udccal.fitting.psf_shots import Shots
-from udccal.fitting.psf_start import WAVELENGTHS_NM
 from udccal.planning.light import sample_variance_e
 from udccal.planning.state import WHITE, RigState
 from udccal.planning.steps import PlannedStep
@@ -56,12 +56,13 @@ class ExpectedShots:
         return np.asarray(self.share * np.einsum("snc,sc->sn", colour, 1 / size) / 3)
 
 
-def expected_shots(state: RigState, theta: Float[np.ndarray, " p"], interference: bool) -> ExpectedShots:
-    """What the diffraction fit at its default effort would be given of each place."""
+def expected_shots(state: RigState, prior: Prior, interference: bool) -> ExpectedShots:
+    """What the diffraction fit at its default effort would be given of each place, light being that of its start."""
+    theta = prior.mean
     effort = FitEffort().psf
     half = _half(state.rig.captures, effort.half_px)
     close = (min(half[0], effort.close_px[0]), min(half[1], effort.close_px[1]))
-    evaluator = Evaluator(WAVELENGTHS_NM, fit_lattice(close), interference)
+    evaluator = Evaluator(prior.wavelengths_nm, fit_lattice(close), interference)
     shots = _dark_shots(state, half)
     chosen = choose_samples(shots, close, effort.far_share)
     every = choose_samples(shots, close, 1.0)

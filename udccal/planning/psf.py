@@ -59,7 +59,7 @@ class PsfPredictor:
         start = start_model(state.rig, state.geometry, wire)
         prior: Prior = start_prior(state.rig, start, wire_shows(wire))
         self._precision = prior.root.T @ prior.root
-        self._shots: ExpectedShots = expected_shots(state, prior.mean, wire_shows(wire))
+        self._shots: ExpectedShots = expected_shots(state, prior, wire_shows(wire))
         effort = FitEffort().psf
         self._most = _Effort(effort.positions, effort.shifts)
         self._known: dict[tuple[float, ...], Float[np.ndarray, "p p"]] = {}

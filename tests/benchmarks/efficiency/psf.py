@@ -22,7 +22,7 @@ from udccal.fitting.psf_descent import Prior, damped
 from udccal.fitting.psf_field import fit_field
 from udccal.fitting.psf_normal import Evaluator, kernel_coefficients, overlaps_of, unit_light
 from udccal.fitting.psf_posterior import kernel_and_slopes, light_and_slopes
-from udccal.fitting.psf_start import WAVELENGTHS_NM, start_model, start_prior
+from udccal.fitting.psf_start import start_model, start_prior
 from udccal.fitting.psf_weights import sensor_variance
 from udccal.models.arrays import Arrayish
 from udccal.numerics import in_float64
@@ -115,7 +115,7 @@ def _information(
     shots = shots_of(scene, made, np.random.default_rng(0))
     true = np.stack([picture.source_px for picture in made])
     shots = replace(shots, centre_px=true)
-    evaluator = Evaluator(WAVELENGTHS_NM, fit_lattice(scene.half), True)
+    evaluator = Evaluator(prior.wavelengths_nm, fit_lattice(scene.half), True)
     total = prior.root.T @ prior.root
     for block in blocks(shots, scene.geometry, np.ones(shots.rate.shape, dtype=bool)):
         index = np.asarray(block.index)

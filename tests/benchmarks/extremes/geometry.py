@@ -101,6 +101,11 @@ def _from_wrong(part: float) -> Callable[[], Outcome]:
     return lambda: _run(sight(), start=start)
 
 
+def off_by(factor: float) -> Outcome:
+    """The start's focal length off by a factor."""
+    return _run(sight(), start=replace(_START, focal=_START.focal * factor))
+
+
 def _at_standoff(standoff_mm: float) -> Callable[[], Outcome]:
     return lambda: _run(sight(), start=replace(_START, pupil=np.array([600.0, 190.0, -standoff_mm])))
 

@@ -20,15 +20,15 @@ _NUMBERS = ("column_open_fraction", "row_open_fraction", "structure_thickness", 
 
 
 @dataclass(frozen=True)
-class _Start:
-    """Errors of the rig description that the fit starts from, relatively; the truth stays."""
+class Off:
+    """Factors by which the rig description that the fit starts from is off; the truth stays."""
 
-    pitch: float = 0.0
-    standoff: float = 0.0
-    pupil: float = 0.0
+    pitch: float = 1.0
+    standoff: float = 1.0
+    pupil: float = 1.0
 
 
-def _fit(scene: Scene, start: _Start = _Start(), seed: int = 1) -> Outcome:
+def _fit(scene: Scene, off: Off = Off(), seed: int = 1) -> Outcome:
     """Pictures of a rig as it was built to be, fitted from a description that may be wrong."""
     true = start_prior(scene.rig, start_model(scene.rig, scene.geometry, scene.wire), True).mean
     rng = np.random.default_rng(seed)
@@ -36,14 +36,21 @@ def _fit(scene: Scene, start: _Start = _Start(), seed: int = 1) -> Outcome:
     wire, rig = scene.wire, scene.rig
     wire = replace(
         wire,
-        pupil_per_pitch=wire.pupil_per_pitch * (1 + start.pupil),
-        standoff_per_pitch=wire.standoff_per_pitch * (1 + start.standoff),
+        pupil_per_pitch=wire.pupil_per_pitch * off.pupil,
+        standoff_per_pitch=wire.standoff_per_pitch * off.standoff,
     )
     pitch = rig.panel.pitch_mm
-    wrong = pitch.model_copy(update={"value": pitch.value * (1 + start.pitch)})
+    # A description that is far off, and says that it may be.
+    tolerance = max(pitch.tolerance, 1.25 * abs(off.pitch - 1) * pitch.value)
+    wrong = pitch.model_copy(update={"value": pitch.value * off.pitch, "tolerance": tolerance})
     rig = rig.model_copy(update={"panel": rig.panel.model_copy(update={"pitch_mm": wrong})})
     found = fit_shots_fully(shots, rig, scene.geometry, wire, _EFFORT)
     return outcome(found.result, _errors(found.result, true))
+
+
+def fit_from(off: Off) -> Outcome:
+    """The same rig from a wrong description."""
+    return _fit(_SCENE, off)
 
 
 def _errors(result: FitResult[PsfField], true: np.ndarray) -> np.ndarray:
@@ -89,9 +96,9 @@ CASES = (
     Case("psf", "a window far smaller than the kernel", lambda: _fit(_with(half=(7, 5)))),
     Case("psf", "pupil 1 mm behind the panel", lambda: _standoff(1.0)),
     Case("psf", "pupil 100 mm behind the panel", lambda: _standoff(100.0)),
-    Case("psf", "start 20 % too wide a pupil", lambda: _fit(_SCENE, _Start(pupil=0.2))),
-    Case("psf", "start 20 % too narrow a pupil", lambda: _fit(_SCENE, _Start(pupil=-0.2))),
-    Case("psf", "start 20 % too large a pitch", lambda: _fit(_SCENE, _Start(pitch=0.2))),
-    Case("psf", "start 20 % too small a pitch", lambda: _fit(_SCENE, _Start(pitch=-0.2))),
-    Case("psf", "start 20 % too large a stand-off", lambda: _fit(_SCENE, _Start(standoff=0.2))),
+    Case("psf", "start 20 % too wide a pupil", lambda: fit_from(Off(pupil=1.2))),
+    Case("psf", "start 20 % too narrow a pupil", lambda: fit_from(Off(pupil=0.8))),
+    Case("psf", "start 20 % too large a pitch", lambda: fit_from(Off(pitch=1.2))),
+    Case("psf", "start 20 % too small a pitch", lambda: fit_from(Off(pitch=0.8))),
+    Case("psf", "start 20 % too large a stand-off", lambda: fit_from(Off(standoff=1.2))),
 )

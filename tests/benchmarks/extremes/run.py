@@ -8,31 +8,48 @@ import sys
 import time
 from pathlib import Path
 
+from tests.benchmarks.extremes import basin as basins
 from tests.benchmarks.extremes.case import Case, Outcome, table
 from tests.benchmarks.readme_tables import between
 
 # Each module has ``CASES``.
 MODULES = ("noise", "hdr", "geometry", "wire", "psf", "backscatter")
+_BASIN = "basin"
 _PAGE = Path(__file__).resolve().parents[3] / "docs" / "numerics.md"
 
 
 def main() -> None:
     """Run the chosen terms; non-zero exit where one fails."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("terms", nargs="*", default=list(MODULES), choices=[[], *MODULES], metavar="term")
-    terms = parser.parse_args().terms or list(MODULES)
-    fine = True
-    for term in terms:
-        rows: list[tuple[Case, Outcome, float]] = []
-        for case in importlib.import_module(f"tests.benchmarks.extremes.{term}").CASES:
-            start = time.perf_counter()
-            found = case.run()
-            rows.append((case, found, time.perf_counter() - start))
-            print(f"{term}: {case.name}: {found.status.name} {'ok' if found.ok else 'MISSED'}", flush=True)
-        text = _PAGE.read_text(encoding="utf-8")
-        _PAGE.write_text(between(text, f"extremes {term}", table(rows)), encoding="utf-8")
-        fine &= all(found.ok for _, found, _ in rows)
-    sys.exit(0 if fine else 1)
+    parser.add_argument("terms", nargs="*", default=[], choices=[[], *MODULES, _BASIN], metavar="term")
+    terms = parser.parse_args().terms or [*MODULES, _BASIN]
+    fine = [_basins() if term == _BASIN else _extremes(term) for term in terms]
+    sys.exit(0 if all(fine) else 1)
+
+
+def _extremes(term: str) -> bool:
+    """All cases of a term into the page; whether none was missed."""
+    rows: list[tuple[Case, Outcome, float]] = []
+    for case in importlib.import_module(f"tests.benchmarks.extremes.{term}").CASES:
+        start = time.perf_counter()
+        found = case.run()
+        rows.append((case, found, time.perf_counter() - start))
+        print(f"{term}: {case.name}: {found.status.name} {'ok' if found.ok else 'MISSED'}", flush=True)
+    _put(f"extremes {term}", table(rows))
+    return all(found.ok for _, found, _ in rows)
+
+
+def _basins() -> bool:
+    rows = []
+    for start in basins.STARTS:
+        rows.append(basins.basin(start))
+        print(f"{start.term}: {start.what}: {rows[-1].least:g} to {rows[-1].most:g}", flush=True)
+    _put(_BASIN, basins.table(rows))
+    return all(row.ok for row in rows)
+
+
+def _put(marker: str, content: str) -> None:
+    _PAGE.write_text(between(_PAGE.read_text(encoding="utf-8"), marker, content), encoding="utf-8")
 
 
 if __name__ == "__main__":
