@@ -10,7 +10,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from udccal.fitting.bundle import Gauge, calibrate_views
+from udccal.fitting.geometry import Gauge, calibrate_views
 
 SIZE = (1280, 960)
 MATRIX = np.array([[1100.0, 0.0, 652.0], [0.0, 1100.0, 470.0], [0.0, 0.0, 1.0]])

@@ -14,7 +14,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from udccal.fitting.bundle import CalibratedViews, calibrate_views
+from udccal.fitting.geometry import CalibratedViews, calibrate_views
 
 INNER = (9, 6)
 DEFAULT_DATA = Path(__file__).resolve().parents[1] / ".." / "shared" / "data"

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from udccal.fitting.noise_frames import ExposureLevel, fit_noise_frames
+from udccal.fitting.noise import ExposureLevel, fit_noise_frames
 
 GAIN_DN_PER_E, READ_E, BLACK_DN, WELL_E = 0.36, 4.0, 64.0, 10_000.0
 

@@ -28,14 +28,14 @@ from udccal.cli.jobs.capture import capture
 from udccal.cli.output import Output
 from udccal.compilation import keep_compilations
 from udccal.displays.pictures import face_picture
-from udccal.fitting.backscatter import problem_of
-from udccal.fitting.backscatter_data import read_shots as read_pictures
-from udccal.fitting.backscatter_data import visible_crop
-from udccal.fitting.backscatter_light import predict_light
-from udccal.fitting.backscatter_report import known_from
-from udccal.fitting.backscatter_select import choose
+from udccal.fitting.backscatter.data import read_shots as read_pictures
+from udccal.fitting.backscatter.data import visible_crop
+from udccal.fitting.backscatter.fit import problem_of
+from udccal.fitting.backscatter.light import predict_light
+from udccal.fitting.backscatter.report import known_from
+from udccal.fitting.backscatter.select import choose
 from udccal.fitting.calibrate import Calibration, FitEffort, fit_session
-from udccal.fitting.geometry import projection_sigma_px
+from udccal.fitting.geometry.fit import projection_sigma_px
 from udccal.planning.measured import Measured, measured_state
 from udccal.planning.predictors import predictor_for
 from udccal.planning.state import Unexplained, sensor_samples

@@ -15,13 +15,13 @@ from procedures.psf import led_positions_px
 from tests.benchmarks.psf_scene import DISC_PX, Scene, pictures, shots_of, small_scene
 from udccal.arrangements import Led
 from udccal.fitting.calibrate import FitEffort
-from udccal.fitting.psf import held_out_positions, some_shots
-from udccal.fitting.psf_blocks import fit_lattice
-from udccal.fitting.psf_descent import Prior
-from udccal.fitting.psf_field import fit_field
-from udccal.fitting.psf_normal import Evaluator
-from udccal.fitting.psf_posterior import kernel_and_slopes
-from udccal.fitting.psf_start import start_model, start_prior
+from udccal.fitting.psf.blocks import fit_lattice
+from udccal.fitting.psf.descent import Prior
+from udccal.fitting.psf.field import fit_field
+from udccal.fitting.psf.fit import held_out_positions, some_shots
+from udccal.fitting.psf.normal import Evaluator
+from udccal.fitting.psf.posterior import kernel_and_slopes
+from udccal.fitting.psf.start import start_model, start_prior
 from udccal.numerics import in_float64
 from udccal.planning.psf import PsfPredictor
 from udccal.planning.state import RigState

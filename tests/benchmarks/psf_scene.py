@@ -10,11 +10,11 @@ import numpy as np
 from jaxtyping import Array, Float, UInt16
 
 from udccal.cfa import channel_map
-from udccal.fitting.hdr import merge_bracket
+from udccal.fitting.hdr.merge import merge_bracket
 from udccal.fitting.nominal import nominal_geometry
-from udccal.fitting.psf_blocks import fit_lattice, unpack
-from udccal.fitting.psf_shots import Shots, cut_crop, stack
-from udccal.fitting.psf_start import WAVELENGTHS_NM
+from udccal.fitting.psf.blocks import fit_lattice, unpack
+from udccal.fitting.psf.shots import Shots, cut_crop, stack
+from udccal.fitting.psf.start import WAVELENGTHS_NM
 from udccal.models.diffraction import Diffraction, average_transfer, local_frame
 from udccal.models.geometry import Geometry
 from udccal.models.interference import interference_transfer, node_overlaps, overlap_tables

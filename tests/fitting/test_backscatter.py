@@ -12,10 +12,10 @@ from tests.simulation.toy import toy_rig, toy_truth
 from udccal.cameras.protocol import CameraIdentity, Region, Settings
 from udccal.cfa import channel_map
 from udccal.displays.pictures import face_picture
-from udccal.fitting.backscatter import fit_backscatter, fit_shots
-from udccal.fitting.backscatter_bins import Binned, Bins, block_weights
-from udccal.fitting.backscatter_data import PanelShots, grid_step, visible_crop
-from udccal.fitting.noise import nominal_noise
+from udccal.fitting.backscatter.bins import Binned, Bins, block_weights
+from udccal.fitting.backscatter.data import PanelShots, grid_step, visible_crop
+from udccal.fitting.backscatter.fit import fit_backscatter, fit_shots
+from udccal.fitting.noise.fit import nominal_noise
 from udccal.fitting.nominal import nominal_geometry
 from udccal.fitting.result import FitResult, FitStatus
 from udccal.models.backscatter import Backscatter, backscatter_rate

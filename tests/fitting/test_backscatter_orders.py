@@ -16,12 +16,12 @@ from tests.benchmarks.efficiency.backscatter import (
     small_rig,
     world,
 )
-from udccal.fitting.backscatter import fit_shots, problem_of
-from udccal.fitting.backscatter_data import PanelShots
-from udccal.fitting.backscatter_light import Other, predict_light
-from udccal.fitting.backscatter_report import known_from
-from udccal.fitting.backscatter_select import choose
-from udccal.fitting.backscatter_vector import KERNELS, TWO_PLANES, Order, without_crosstalk
+from udccal.fitting.backscatter.data import PanelShots
+from udccal.fitting.backscatter.fit import fit_shots, problem_of
+from udccal.fitting.backscatter.light import Other, predict_light
+from udccal.fitting.backscatter.report import known_from
+from udccal.fitting.backscatter.select import choose
+from udccal.fitting.backscatter.vector import KERNELS, TWO_PLANES, Order, without_crosstalk
 from udccal.fitting.result import FitResult
 from udccal.models.backscatter import Backscatter
 

@@ -9,15 +9,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from udccal.fitting.backscatter_blocks import BLOCK, in_blocks
-from udccal.fitting.backscatter_checks import typical_share
-from udccal.fitting.backscatter_data import PanelCrop, grid_step, nominal_term, sampled_rays, visible_crop
-from udccal.fitting.backscatter_evidence import Evidence, pictures_of, weights
-from udccal.fitting.backscatter_likelihood import reweighed
-from udccal.fitting.backscatter_profile import mask_slopes, profiled, whitened
-from udccal.fitting.backscatter_ratios import ratios, ratios_and_slopes, window_logs, windows_at
-from udccal.fitting.backscatter_solve import corners_of, window_for, with_room
-from udccal.fitting.backscatter_vector import KERNELS, TWO_PLANES, mix_and_slopes, mix_of, prior_of, without_crosstalk
+from udccal.fitting.backscatter.blocks import BLOCK, in_blocks
+from udccal.fitting.backscatter.checks import typical_share
+from udccal.fitting.backscatter.data import PanelCrop, grid_step, nominal_term, sampled_rays, visible_crop
+from udccal.fitting.backscatter.evidence import Evidence, pictures_of, weights
+from udccal.fitting.backscatter.likelihood import reweighed
+from udccal.fitting.backscatter.profile import mask_slopes, profiled, whitened
+from udccal.fitting.backscatter.ratios import ratios, ratios_and_slopes, window_logs, windows_at
+from udccal.fitting.backscatter.solve import corners_of, window_for, with_room
+from udccal.fitting.backscatter.vector import KERNELS, TWO_PLANES, mix_and_slopes, mix_of, prior_of, without_crosstalk
 from udccal.fitting.nominal import nominal_geometry
 from udccal.fitting.solvers import Solution
 from udccal.rig import load_rig

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from tests.fitting.test_bundle import SCENE, arrays
-from udccal.fitting.bundle import CalibratedViews, Gauge, calibrate_views
-from udccal.fitting.bundle_orders import ORDERS
-from udccal.fitting.bundle_projection import field_grid
+from udccal.fitting.geometry.bundle import CalibratedViews, Gauge, calibrate_views
+from udccal.fitting.geometry.bundle_orders import ORDERS
+from udccal.fitting.geometry.bundle_projection import field_grid
 
 PIXELS = np.array([[511.0, 383.0], [40.0, 60.0], [980.0, 700.0]])
 
@@ -32,8 +32,8 @@ def test_rays_are_surer_the_less_they_are_fixed_to(plain: CalibratedViews) -> No
 
 def test_a_turn_of_camera_and_poses_together_moves_no_ray_of_the_boards(plain: CalibratedViews) -> None:
     """The freedom itself, as a covariance: the centre moves by a pixel and all boards turn to make up for it."""
-    from udccal.fitting.bundle_projection import mean_turn, projection_covariance, ray_slopes
-    from udccal.fitting.bundle_solve import Bundle
+    from udccal.fitting.geometry.bundle_projection import mean_turn, projection_covariance, ray_slopes
+    from udccal.fitting.geometry.bundle_solve import Bundle
 
     bundle = Bundle(plain.intrinsics, plain.poses)
     lens, turn = ray_slopes(bundle.intrinsics, plain.intrinsics[None, 2:4])

@@ -6,11 +6,11 @@ import pytest
 
 from tests.fitting.boards import sight
 from tests.fitting.test_bundle import SCENE, arrays
-from udccal.fitting.bundle_noise import covariance
-from udccal.fitting.bundle_orders import free_intrinsics
-from udccal.fitting.bundle_points import blocks, bucket, gather
-from udccal.fitting.bundle_solve import NO_PRIOR, Bundle, Prior, linearised, solve
-from udccal.fitting.bundle_start import best_poses, facing, starts
+from udccal.fitting.geometry.bundle_noise import covariance
+from udccal.fitting.geometry.bundle_orders import free_intrinsics
+from udccal.fitting.geometry.bundle_points import blocks, bucket, gather
+from udccal.fitting.geometry.bundle_solve import NO_PRIOR, Bundle, Prior, linearised, solve
+from udccal.fitting.geometry.bundle_start import best_poses, facing, starts
 from udccal.models.geometry import project, rotation_matrix
 
 EVERY = free_intrinsics((1, 1, 1, 1, 1))

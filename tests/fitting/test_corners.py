@@ -7,7 +7,7 @@ from scipy.ndimage import convolve1d
 from tests.fitting.boards import SIZE, SPEC, draw, pose, true_corners
 from udccal.arrangements import BoardSpec
 from udccal.errors import FitError
-from udccal.fitting.corners import board_points_mm, charuco_board, detect_corners, luminance
+from udccal.fitting.geometry.corners import board_points_mm, charuco_board, detect_corners, luminance
 
 GAINS = np.array([[0.6, 1.0], [1.0, 0.7]])
 

@@ -10,10 +10,10 @@ import pytest
 from tests.fitting.boards import CAMERA, SIZE, SPEC, draw, pose, true_corners
 from udccal.cameras.protocol import CameraIdentity, Region, Settings
 from udccal.errors import FitError
-from udccal.fitting.bundle import CalibratedViews, Prior, calibrate_views
-from udccal.fitting.corners import BoardCorners, board_points_mm
-from udccal.fitting.geometry import BoardView, fit_geometry, fit_views, projection_sigma_px, rig_prior
-from udccal.fitting.noise import nominal_noise
+from udccal.fitting.geometry.bundle import CalibratedViews, Prior, calibrate_views
+from udccal.fitting.geometry.corners import BoardCorners, board_points_mm
+from udccal.fitting.geometry.fit import BoardView, fit_geometry, fit_views, projection_sigma_px, rig_prior
+from udccal.fitting.noise.fit import nominal_noise
 from udccal.fitting.nominal import nominal_geometry
 from udccal.fitting.result import FitResult, FitStatus
 from udccal.models.geometry import Geometry, mounting_rotation, project_directions, rotation_matrix

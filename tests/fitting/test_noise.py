@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from udccal.cameras.protocol import Region
-from udccal.fitting import noise_codes, noise_moments, nonuniformity, read_noise
-from udccal.fitting.noise import converter_step, fit_noise_data, nominal_noise
-from udccal.fitting.noise_data import NoiseData
-from udccal.fitting.noise_pairs import reduce_pair
-from udccal.fitting.noise_prnu import prnu
+from udccal.fitting.noise import codes, moments, nonuniformity, read_noise
+from udccal.fitting.noise.data import NoiseData
+from udccal.fitting.noise.fit import converter_step, fit_noise_data, nominal_noise
+from udccal.fitting.noise.pairs import reduce_pair
+from udccal.fitting.noise.prnu import prnu
 from udccal.fitting.result import FitResult, FitStatus
 from udccal.models.noise import Noise
 from udccal.rig import RigDescription, load_rig
@@ -46,7 +46,7 @@ def reduced(sensor: Sensor, levels: np.ndarray, seed: int, stack_level: float | 
     top = 2**sensor.truth.bits - 1
     for t in (0.0005, 0.002, 0.01, 0.02, 0.25, 1.0):
         pair = [sensor.expose(none, t, region, rng) for _ in range(2)]
-        darks.append(noise_codes.dark_pair(pair[0], pair[1], t, 1, top))
+        darks.append(codes.dark_pair(pair[0], pair[1], t, 1, top))
         rows.append(reduce_pair(pair[0], pair[1], t).rows)
     middle = 0.02 * float(levels[len(levels) // 2] if stack_level is None else stack_level)
     return NoiseData(
@@ -62,9 +62,9 @@ def reduced(sensor: Sensor, levels: np.ndarray, seed: int, stack_level: float | 
 
 def average(
     sensor: Sensor, light: np.ndarray, exposure_s: float, region: Region, rng: np.random.Generator
-) -> noise_moments.StackMoments:
+) -> moments.StackMoments:
     frames = [sensor.expose(light, exposure_s, region, rng) for _ in range(STACK)]
-    return noise_moments.StackMoments(exposure_s, np.mean(frames, axis=0).astype(np.float32), STACK)
+    return moments.StackMoments(exposure_s, np.mean(frames, axis=0).astype(np.float32), STACK)
 
 
 @pytest.fixture(scope="module", params=["lg55-aca2040", "mk31-imx1600"])
@@ -165,7 +165,7 @@ def test_rounding_coarser_than_the_noise(fraction: float) -> None:
     sigma, spread = 0.28, 0.08
     offset = 24 + fraction + spread * rng.standard_normal((400, 400))
     frames = [np.rint(offset + sigma * rng.standard_normal((400, 400))).astype(np.uint16) for _ in range(2)]
-    pair = noise_codes.dark_pair(frames[0], frames[1], 0.01)
+    pair = codes.dark_pair(frames[0], frames[1], 0.01)
     fit = read_noise.fit_dark((pair, replace(pair, exposure_s=0.02)), read_noise.Surroundings(0.06, 0.0))
     assert np.sqrt(fit.values[2]) == pytest.approx(sigma, rel=0.03)
     # What the textbook's white quantisation makes of the same frames is worse than what is asked for.
@@ -179,8 +179,7 @@ def test_codes_cut_off_at_zero_are_censored() -> None:
     black, sigma = 0.3, 2.0
     frames = [np.clip(np.rint(black + sigma * rng.standard_normal((300, 400))), 0, None) for _ in range(4)]
     pairs = tuple(
-        noise_codes.dark_pair(frames[i].astype(np.uint16), frames[i + 1].astype(np.uint16), 0.01 * (i + 1))
-        for i in (0, 2)
+        codes.dark_pair(frames[i].astype(np.uint16), frames[i + 1].astype(np.uint16), 0.01 * (i + 1)) for i in (0, 2)
     )
     assert pairs[0].edges_DN[0] == -np.inf
     fit = read_noise.fit_dark(pairs, read_noise.Surroundings(0.3, 0.0), normal=True)
@@ -194,7 +193,7 @@ def test_a_wide_window_of_codes_is_grouped_and_loses_nothing() -> None:
     rng = np.random.default_rng(9)
     frames = [np.rint(2000 + 200 * rng.standard_normal((200, 300))).astype(np.uint16) for _ in range(2)]
     frames[0][0, 0] = 3  # far below the window
-    pair = noise_codes.dark_pair(frames[0], frames[1], 0.01)
+    pair = codes.dark_pair(frames[0], frames[1], 0.01)
     assert pair.counts.shape[0] <= 161
     assert pair.outside >= 1
     assert pair.counts.sum() + pair.outside == frames[0].size

@@ -22,8 +22,8 @@ from tests.benchmarks.efficiency.noise import (
 )
 from tests.benchmarks.extremes.noise import PLAIN, errors_in_sigma
 from udccal.errors import FitError
-from udccal.fitting.noise_frames import ExposureLevel, Frame, SpatialStack, fit_noise_frames, measure_frames
-from udccal.fitting.noise_response import mean_response
+from udccal.fitting.noise.frames import ExposureLevel, Frame, SpatialStack, fit_noise_frames, measure_frames
+from udccal.fitting.noise.response import mean_response
 from udccal.fitting.result import FitStatus
 
 

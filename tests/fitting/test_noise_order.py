@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from udccal.fitting.noise_order import choose_transfer
-from udccal.fitting.photon_transfer import DarkVariance, Levels, Order
+from udccal.fitting.noise.order import choose_transfer
+from udccal.fitting.noise.photon_transfer import DarkVariance, Levels, Order
 
 DARK = DarkVariance(np.array([4.0]), np.array([0.01]), 1 / 12, 0.36, np.array([0.0]))
 

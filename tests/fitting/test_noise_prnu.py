@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from jaxtyping import Float
 
-from udccal.fitting.noise_prnu import prnu
-from udccal.fitting.noise_spectrum import white_coefficients
+from udccal.fitting.noise.prnu import prnu
+from udccal.fitting.noise.spectrum import white_coefficients
 
 ROWS, COLUMNS = 512, 768
 PRNU, SHOT = 0.006, 3e-5

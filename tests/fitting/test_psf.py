@@ -12,16 +12,16 @@ from scipy.special import ndtr
 from udccal.cameras.protocol import CameraIdentity, Frame, Region, Settings
 from udccal.cfa import channel_map
 from udccal.fitting.absent import absent_wire
-from udccal.fitting.hdr import HdrMerge
-from udccal.fitting.noise import nominal_noise
+from udccal.fitting.hdr.merge import HdrMerge
+from udccal.fitting.noise.fit import nominal_noise
 from udccal.fitting.nominal import nominal_geometry
-from udccal.fitting.psf import Effort, fit_psf, fit_shots, window_half
-from udccal.fitting.psf_residual import shifts
-from udccal.fitting.psf_shots import Shots, cut_crop, group, stack
-from udccal.fitting.psf_start import start_model, wire_shows
+from udccal.fitting.psf.fit import Effort, fit_psf, fit_shots, window_half
+from udccal.fitting.psf.residual import shifts
+from udccal.fitting.psf.shots import Shots, cut_crop, group, stack
+from udccal.fitting.psf.start import start_model, wire_shows
 from udccal.fitting.result import FitResult, FitStatus
-from udccal.fitting.wire_harmonics import wire_start
-from udccal.fitting.wire_scan import ideal_wire
+from udccal.fitting.wire.harmonics import wire_start
+from udccal.fitting.wire.scan import ideal_wire
 from udccal.models.geometry import Geometry
 from udccal.models.psf import PsfField, psf_kernels
 from udccal.models.wire import Wire

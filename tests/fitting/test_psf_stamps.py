@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from udccal.errors import FitError
-from udccal.fitting.psf_stamps import fit_psf_stamps
-from udccal.fitting.psf_stamps_data import Stamps, mosaic_channels
-from udccal.fitting.psf_stamps_orders import Orders
-from udccal.fitting.psf_stamps_term import StampsPsf
+from udccal.fitting.psf_stamps.data import Stamps, mosaic_channels
+from udccal.fitting.psf_stamps.fit import fit_psf_stamps
+from udccal.fitting.psf_stamps.orders import Orders
+from udccal.fitting.psf_stamps.term import StampsPsf
 from udccal.fitting.result import FitResult, FitStatus
 
 SENSOR = np.array([1000, 800])

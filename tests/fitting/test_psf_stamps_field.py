@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from udccal.fitting.psf_stamps_field import PlaneField, polynomials, see
+from udccal.fitting.psf_stamps.field import PlaneField, polynomials, see
 from udccal.models.fields import polynomial_basis
 
 _RNG = np.random.default_rng(8)

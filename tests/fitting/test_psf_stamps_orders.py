@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from tests.fitting.test_psf_stamps import READ_E, SENSOR, places
-from udccal.fitting.psf_stamps import fit_psf_stamps
-from udccal.fitting.psf_stamps_data import Stamps
+from udccal.fitting.psf_stamps.data import Stamps
+from udccal.fitting.psf_stamps.fit import fit_psf_stamps
 
 # (map degree, image degree) of the truths.
 ORDERS = ((0, 0), (1, 0), (2, 0), (0, 1), (2, 1))

@@ -11,13 +11,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.benchmarks.psf_scene import frames_of, small_scene
-from udccal.fitting.hdr import HdrMerge
-from udccal.fitting.psf_blocks import Block, Local
-from udccal.fitting.psf_outliers import without_outliers
-from udccal.fitting.psf_pattern import pattern_p_value
-from udccal.fitting.psf_samples import choose_samples
-from udccal.fitting.psf_shots import Shots, shot_noise
-from udccal.fitting.psf_weights import estimate_model_error, left_out, model_weights, sensor_variance
+from udccal.fitting.hdr.merge import HdrMerge
+from udccal.fitting.psf.blocks import Block, Local
+from udccal.fitting.psf.outliers import without_outliers
+from udccal.fitting.psf.pattern import pattern_p_value
+from udccal.fitting.psf.samples import choose_samples
+from udccal.fitting.psf.shots import Shots, shot_noise
+from udccal.fitting.psf.weights import estimate_model_error, left_out, model_weights, sensor_variance
 from udccal.models.diffraction import LocalFrame
 
 SHOTS, SAMPLES = 6, 400

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from udccal.cameras.protocol import CameraIdentity, Region, Settings
-from udccal.fitting.noise import nominal_noise
+from udccal.fitting.noise.fit import nominal_noise
 from udccal.fitting.result import FitResult, FitStatus
-from udccal.fitting.wire import WireFit, fit_wire, fit_wire_and_sigma, fit_wire_map, sensor_map
-from udccal.fitting.wire_harmonics import WireStart, wire_start
-from udccal.fitting.wire_select import select
+from udccal.fitting.wire.fit import WireFit, fit_wire, fit_wire_and_sigma, fit_wire_map, sensor_map
+from udccal.fitting.wire.harmonics import WireStart, wire_start
+from udccal.fitting.wire.select import select
 from udccal.models.geometry import Geometry
 from udccal.models.wire import Wire, wire_map
 from udccal.rig import load_rig

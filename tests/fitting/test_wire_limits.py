@@ -25,7 +25,7 @@ from tests.benchmarks.efficiency.wire import (
 )
 from tests.benchmarks.extremes.wire import constant
 from udccal.fitting.result import FitResult, FitStatus
-from udccal.fitting.wire import fit_wire_and_sigma, fit_wire_map
+from udccal.fitting.wire.fit import fit_wire_and_sigma, fit_wire_map
 from udccal.models.wire import Wire
 
 # Baseline up to degree 4, three site gains.

@@ -10,16 +10,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from udccal.fitting.wire_basis import Normal, Pixels, model_columns, sample_pixels
-from udccal.fitting.wire_harmonics import WireStart, full_basis, plain_basis
-from udccal.fitting.wire_joint import Joint
-from udccal.fitting.wire_misfit import SIGNIFICANT, misfit, robust_ratio
-from udccal.fitting.wire_noise import FlatNoise, Judged, flat_noise, judge, listed
-from udccal.fitting.wire_phase import solve
-from udccal.fitting.wire_prior import rig_prior
-from udccal.fitting.wire_scan import ideal_wire, scan_rows
-from udccal.fitting.wire_select import select
-from udccal.fitting.wire_slopes import move, shape_vector, wire_slopes
+from udccal.fitting.wire.basis import Normal, Pixels, model_columns, sample_pixels
+from udccal.fitting.wire.harmonics import WireStart, full_basis, plain_basis
+from udccal.fitting.wire.joint import Joint
+from udccal.fitting.wire.misfit import SIGNIFICANT, misfit, robust_ratio
+from udccal.fitting.wire.noise import FlatNoise, Judged, flat_noise, judge, listed
+from udccal.fitting.wire.phase import solve
+from udccal.fitting.wire.prior import rig_prior
+from udccal.fitting.wire.scan import ideal_wire, scan_rows
+from udccal.fitting.wire.select import select
+from udccal.fitting.wire.slopes import move, shape_vector, wire_slopes
 from udccal.models.geometry import Geometry
 from udccal.models.wire import Wire, log_baseline, modulation, slopes
 

@@ -12,8 +12,8 @@ from tests.toy_rigs import write_toy_rig
 from udccal.cli.jobs.benches import simulated_bench, simulated_rig
 from udccal.cli.jobs.capture import capture
 from udccal.cli.output import Output
-from udccal.fitting.noise import fit_noise
-from udccal.fitting.wire import fit_wire
+from udccal.fitting.noise.fit import fit_noise
+from udccal.fitting.wire.fit import fit_wire
 from udccal.planning.noise import NoisePredictor
 from udccal.planning.state import RigState, nominal_state
 from udccal.planning.wire import WirePredictor

@@ -21,7 +21,7 @@ from udccal.cli.jobs.capture import capture
 from udccal.cli.output import Output
 from udccal.displays.simulated import SimulatedDisplay
 from udccal.errors import CameraError, CameraLost
-from udccal.fitting.noise import fit_noise
+from udccal.fitting.noise.fit import fit_noise
 from udccal.fitting.result import FitStatus
 from udccal.rig import RigDescription, load_rig
 from udccal.sessions.store import Session

@@ -81,6 +81,7 @@ class WindowLink:
             line = self._lines.get(timeout=seconds)
         except queue.Empty:
             self._process.kill()  # its late answer must not be taken for that of the next request
+            self._process.wait()
             raise DisplayError(
                 f"Expected the panel's window to answer within {seconds:g} s, found it silent. Check that the desktop "
                 "responds, then try again: it is opened anew."

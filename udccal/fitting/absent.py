@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from udccal.fitting.wire_harmonics import wire_start
-from udccal.fitting.wire_scan import ideal_wire
+from udccal.fitting.wire.harmonics import wire_start
+from udccal.fitting.wire.scan import ideal_wire
 from udccal.models.backscatter import Backscatter
 from udccal.models.diffraction import Diffraction
 from udccal.models.geometry import Geometry

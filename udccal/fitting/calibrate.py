@@ -12,13 +12,13 @@ import numpy as np
 from jaxtyping import Float
 
 from udccal.fitting.absent import absent_backscatter, absent_psf, absent_wire
-from udccal.fitting.backscatter import fit_backscatter
-from udccal.fitting.geometry import BoardView, fit_views, read_views, rig_prior
-from udccal.fitting.noise import fit_noise, nominal_noise
+from udccal.fitting.backscatter.fit import fit_backscatter
+from udccal.fitting.geometry.fit import BoardView, fit_views, read_views, rig_prior
+from udccal.fitting.noise.fit import fit_noise, nominal_noise
 from udccal.fitting.nominal import nominal_geometry
-from udccal.fitting.psf import Effort, fit_psf
+from udccal.fitting.psf.fit import Effort, fit_psf
 from udccal.fitting.result import FitResult, FitStatus
-from udccal.fitting.wire import FIELD_SAMPLES, fit_wire, sensor_map
+from udccal.fitting.wire.fit import FIELD_SAMPLES, fit_wire, sensor_map
 from udccal.models.backscatter import Backscatter
 from udccal.models.geometry import Geometry
 from udccal.models.noise import Noise
@@ -38,7 +38,7 @@ class FitEffort:
 
     Attributes:
         wire_samples: pixels that the wire's fields are fitted to.
-        psf: see ``udccal.fitting.psf.Effort``.
+        psf: see ``udccal.fitting.psf.fit.Effort``.
         backscatter_positions: sensor positions that the footprint is fitted at.
         workers: with 2, psf and backscatter, which do not need each other, are fitted at once, in more memory.
     """

@@ -16,14 +16,14 @@ from jaxtyping import Array, Float, Int, UInt8
 from udccal.arrangements import Dark, PanelPicture
 from udccal.cfa import cell_channels
 from udccal.displays.pictures import face_picture
-from udccal.fitting.backscatter_data import (
+from udccal.fitting.backscatter.data import (
     grid_step,
     nominal_term,
     sampled_rays,
     visible_crop,
 )
-from udccal.fitting.backscatter_solve import SLACK_PX, corners_of, window_for
-from udccal.fitting.backscatter_vector import Prior, prior_of, values_of, with_vector
+from udccal.fitting.backscatter.solve import SLACK_PX, corners_of, window_for
+from udccal.fitting.backscatter.vector import Prior, prior_of, values_of, with_vector
 from udccal.fitting.calibrate import FitEffort
 from udccal.models.backscatter import Backscatter, emitter_shares, mixed_colours, panel_light
 from udccal.numerics import in_float64

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import erf
 
 from udccal.arrangements import Board, BoardSpec
-from udccal.fitting.corners import MIN_CORNERS, board_points_mm, charuco_board
+from udccal.fitting.geometry.corners import MIN_CORNERS, board_points_mm, charuco_board
 from udccal.models.geometry import Geometry, project, rotation_matrix
 from udccal.planning.algebra import without
 from udccal.planning.light import EvenField, sample_variance_e

@@ -11,11 +11,11 @@ from jaxtyping import Float
 
 from udccal.cfa import channel_map
 from udccal.fitting.calibrate import FitEffort
-from udccal.fitting.psf_blocks import Block, Local, blocks, fit_lattice
-from udccal.fitting.psf_descent import Prior
-from udccal.fitting.psf_normal import Evaluator, kernel_coefficients, overlaps_of, unit_light
-from udccal.fitting.psf_samples import choose_samples
-from udccal.fitting.psf_shots import Shots
+from udccal.fitting.psf.blocks import Block, Local, blocks, fit_lattice
+from udccal.fitting.psf.descent import Prior
+from udccal.fitting.psf.normal import Evaluator, kernel_coefficients, overlaps_of, unit_light
+from udccal.fitting.psf.samples import choose_samples
+from udccal.fitting.psf.shots import Shots
 from udccal.planning.light import sample_variance_e
 from udccal.planning.state import WHITE, RigState
 from udccal.planning.steps import PlannedStep

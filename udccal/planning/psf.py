@@ -18,10 +18,10 @@ from jaxtyping import Array, Float
 
 from udccal.arrangements import Led
 from udccal.fitting.calibrate import FitEffort
-from udccal.fitting.psf_blocks import Block, Local
-from udccal.fitting.psf_descent import Prior, without_locals
-from udccal.fitting.psf_normal import Evaluator, Normal, normal_equations
-from udccal.fitting.psf_start import start_model, start_prior, wire_shows
+from udccal.fitting.psf.blocks import Block, Local
+from udccal.fitting.psf.descent import Prior, without_locals
+from udccal.fitting.psf.normal import Evaluator, Normal, normal_equations
+from udccal.fitting.psf.start import start_model, start_prior, wire_shows
 from udccal.numerics import in_float64
 from udccal.planning.algebra import covariance
 from udccal.planning.knobs import KNOBS

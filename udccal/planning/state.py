@@ -122,8 +122,8 @@ def sensor_samples(rig: RigDescription, across: int) -> Float[np.ndarray, "n 2"]
 
 def built_wire(state: RigState) -> Wire:
     """The wire as the rig was built, with a round pupil and its strongest harmonics."""
-    from udccal.fitting.wire_harmonics import possible_harmonics, wire_start
-    from udccal.fitting.wire_scan import ideal_wire
+    from udccal.fitting.wire.harmonics import possible_harmonics, wire_start
+    from udccal.fitting.wire.scan import ideal_wire
 
     start = wire_start(state.rig)
     harmonics, _ = possible_harmonics(start)

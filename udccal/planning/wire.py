@@ -12,12 +12,12 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from udccal.arrangements import Dark, FlatLight
-from udccal.fitting.wire import FIELD_SAMPLES
-from udccal.fitting.wire_basis import SITES, Basis, Pixels, model_columns, sample_pixels
-from udccal.fitting.wire_harmonics import full_basis, plain_basis, possible_harmonics, wire_start
-from udccal.fitting.wire_prior import rig_prior
-from udccal.fitting.wire_scan import ideal_wire, with_harmonics
-from udccal.fitting.wire_slopes import SHAPE_PARAMETERS
+from udccal.fitting.wire.basis import SITES, Basis, Pixels, model_columns, sample_pixels
+from udccal.fitting.wire.fit import FIELD_SAMPLES
+from udccal.fitting.wire.harmonics import full_basis, plain_basis, possible_harmonics, wire_start
+from udccal.fitting.wire.prior import rig_prior
+from udccal.fitting.wire.scan import ideal_wire, with_harmonics
+from udccal.fitting.wire.slopes import SHAPE_PARAMETERS
 from udccal.models.wire import Wire
 from udccal.numerics import in_float64
 from udccal.planning.algebra import covariance

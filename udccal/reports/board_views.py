@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from udccal.fitting.corners import board_points_mm
-from udccal.fitting.geometry import BoardView
+from udccal.fitting.geometry.corners import board_points_mm
+from udccal.fitting.geometry.fit import BoardView
 from udccal.models.geometry import Geometry
 
 

@@ -15,17 +15,17 @@ from jaxtyping import Float
 
 from tests.benchmarks.efficiency.trials import Trials
 from udccal.displays.pictures import face_picture
-from udccal.fitting.backscatter import problem_of
-from udccal.fitting.backscatter_bins import Binned
-from udccal.fitting.backscatter_data import PanelShots, grid_step, nominal_term, visible_crop
-from udccal.fitting.backscatter_evidence import evidence, pictures_of, weights
-from udccal.fitting.backscatter_light import Knowledge, grid_rays, predict_light
-from udccal.fitting.backscatter_likelihood import linearised
-from udccal.fitting.backscatter_ratios import window_logs, windows_at
-from udccal.fitting.backscatter_report import known_from, told
-from udccal.fitting.backscatter_select import choose
-from udccal.fitting.backscatter_solve import corners_of, window_for
-from udccal.fitting.backscatter_vector import (
+from udccal.fitting.backscatter.bins import Binned
+from udccal.fitting.backscatter.data import PanelShots, grid_step, nominal_term, visible_crop
+from udccal.fitting.backscatter.evidence import evidence, pictures_of, weights
+from udccal.fitting.backscatter.fit import problem_of
+from udccal.fitting.backscatter.light import Knowledge, grid_rays, predict_light
+from udccal.fitting.backscatter.likelihood import linearised
+from udccal.fitting.backscatter.ratios import window_logs, windows_at
+from udccal.fitting.backscatter.report import known_from, told
+from udccal.fitting.backscatter.select import choose
+from udccal.fitting.backscatter.solve import corners_of, window_for
+from udccal.fitting.backscatter.vector import (
     NAMES,
     TWO_PLANES,
     Order,

@@ -14,10 +14,10 @@ from jaxtyping import Array, Float
 
 from tests.benchmarks.efficiency.trials import Trials
 from tests.fitting.boards import Sight, sight
-from udccal.fitting.bundle import CalibratedViews, Gauge, calibrate_views
-from udccal.fitting.bundle_projection import field_grid
-from udccal.fitting.corners import board_points_mm
-from udccal.fitting.geometry import fit_views, projection_sigma_px
+from udccal.fitting.geometry.bundle import CalibratedViews, Gauge, calibrate_views
+from udccal.fitting.geometry.bundle_projection import field_grid
+from udccal.fitting.geometry.corners import board_points_mm
+from udccal.fitting.geometry.fit import fit_views, projection_sigma_px
 from udccal.fitting.information import cramer_rao, fisher_information
 from udccal.fitting.result import FitResult
 from udccal.models.geometry import Geometry, project, rotation_matrix

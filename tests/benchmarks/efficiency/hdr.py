@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from tests.benchmarks.efficiency.trials import Trials, column
-from udccal.fitting.hdr import merge_bracket
+from udccal.fitting.hdr.merge import merge_bracket
 from udccal.fitting.information import cramer_rao, fisher_information
 from udccal.models.noise import Noise
 

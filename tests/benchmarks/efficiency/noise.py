@@ -15,11 +15,11 @@ import numpy as np
 from jaxtyping import Array, Float, UInt16
 
 from tests.benchmarks.efficiency.trials import Trials, column
-from udccal.fitting import noise_codes, read_noise
 from udccal.fitting.information import cramer_rao, fisher_information
-from udccal.fitting.noise_density import tukey_lambda_std
-from udccal.fitting.noise_frames import ExposureLevel, SpatialStack, fit_noise_frames
-from udccal.fitting.photon_transfer import temporal_variance
+from udccal.fitting.noise import codes, read_noise
+from udccal.fitting.noise.density import tukey_lambda_std
+from udccal.fitting.noise.frames import ExposureLevel, SpatialStack, fit_noise_frames
+from udccal.fitting.noise.photon_transfer import temporal_variance
 from udccal.fitting.result import FitResult
 from udccal.models.noise import Noise
 
@@ -210,7 +210,7 @@ def _histogram_information(sensor: ToySensor, x: Float[np.ndarray, "12"]) -> Flo
     pairs = []
     for t in sensor.dark_times_s:
         first, second = (expose(sensor, fixed, t, False, rng) for _ in range(2))
-        pairs.append(noise_codes.dark_pair(first, second, t, 1, 2**sensor.bits - 1))
+        pairs.append(codes.dark_pair(first, second, t, 1, 2**sensor.bits - 1))
     # The information is expected, not observed: the counts matter by their number alone.
     information = read_noise.information(tuple(pairs), values, known)
     return np.linalg.inv(np.linalg.inv(information)[np.ix_([2, 4], [2, 4])])

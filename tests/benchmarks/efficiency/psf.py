@@ -17,13 +17,13 @@ from jaxtyping import Array, Float
 from tests.benchmarks.efficiency.trials import Trials
 from tests.benchmarks.psf_scene import Picture, Scene, pictures, shots_of, small_scene
 from udccal.fitting.information import cramer_rao
-from udccal.fitting.psf_blocks import Block, blocks, fit_lattice
-from udccal.fitting.psf_descent import Prior, damped
-from udccal.fitting.psf_field import fit_field
-from udccal.fitting.psf_normal import Evaluator, kernel_coefficients, overlaps_of, unit_light
-from udccal.fitting.psf_posterior import kernel_and_slopes, light_and_slopes
-from udccal.fitting.psf_start import start_model, start_prior
-from udccal.fitting.psf_weights import sensor_variance
+from udccal.fitting.psf.blocks import Block, blocks, fit_lattice
+from udccal.fitting.psf.descent import Prior, damped
+from udccal.fitting.psf.field import fit_field
+from udccal.fitting.psf.normal import Evaluator, kernel_coefficients, overlaps_of, unit_light
+from udccal.fitting.psf.posterior import kernel_and_slopes, light_and_slopes
+from udccal.fitting.psf.start import start_model, start_prior
+from udccal.fitting.psf.weights import sensor_variance
 from udccal.models.arrays import Arrayish
 from udccal.numerics import in_float64
 

@@ -16,14 +16,14 @@ from scipy.linalg import block_diag
 
 from tests.benchmarks.efficiency.trials import Trials
 from udccal.fitting.information import cramer_rao, fisher_information
-from udccal.fitting.psf_stamps import fit_psf_stamps
-from udccal.fitting.psf_stamps_blocks import Blocks
-from udccal.fitting.psf_stamps_data import Stamps
-from udccal.fitting.psf_stamps_field import PlaneField, see, warps
-from udccal.fitting.psf_stamps_orders import Orders
-from udccal.fitting.psf_stamps_prior import envelope
-from udccal.fitting.psf_stamps_solve import by_degree
-from udccal.fitting.psf_stamps_start import grid_size
+from udccal.fitting.psf_stamps.blocks import Blocks
+from udccal.fitting.psf_stamps.data import Stamps
+from udccal.fitting.psf_stamps.field import PlaneField, see, warps
+from udccal.fitting.psf_stamps.fit import fit_psf_stamps
+from udccal.fitting.psf_stamps.orders import Orders
+from udccal.fitting.psf_stamps.prior import envelope
+from udccal.fitting.psf_stamps.solve import by_degree
+from udccal.fitting.psf_stamps.start import grid_size
 from udccal.numerics import in_float64
 
 STARS, SIZE, NODES, READ_E, ORDERS = 20, 11, 18, 4.0, Orders(2, 1, 1.0)

@@ -16,12 +16,12 @@ from jaxtyping import Array, Float
 
 from tests.benchmarks.efficiency.trials import Trials
 from udccal.fitting.information import cramer_rao, fisher_information
-from udccal.fitting.wire import WireFit, fit_wire_and_sigma
-from udccal.fitting.wire_harmonics import WireStart, possible_harmonics
-from udccal.fitting.wire_prior import rig_prior
-from udccal.fitting.wire_result import SHAPE_NAMES
-from udccal.fitting.wire_scan import ideal_wire
-from udccal.fitting.wire_slopes import move
+from udccal.fitting.wire.fit import WireFit, fit_wire_and_sigma
+from udccal.fitting.wire.harmonics import WireStart, possible_harmonics
+from udccal.fitting.wire.prior import rig_prior
+from udccal.fitting.wire.result import SHAPE_NAMES
+from udccal.fitting.wire.scan import ideal_wire
+from udccal.fitting.wire.slopes import move
 from udccal.models.geometry import Geometry
 from udccal.models.wire import Wire, wire_map, wire_values
 from udccal.numerics import in_float64

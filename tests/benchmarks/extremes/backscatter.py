@@ -19,10 +19,10 @@ from tests.benchmarks.efficiency.backscatter import (
     world_at,
 )
 from tests.benchmarks.extremes.case import Case, Outcome, outcome
-from udccal.fitting.backscatter import fit_shots
-from udccal.fitting.backscatter_bins import Binned
-from udccal.fitting.backscatter_data import PanelShots
-from udccal.fitting.backscatter_vector import TWO_PLANES, prior_of
+from udccal.fitting.backscatter.bins import Binned
+from udccal.fitting.backscatter.data import PanelShots
+from udccal.fitting.backscatter.fit import fit_shots
+from udccal.fitting.backscatter.vector import TWO_PLANES, prior_of
 from udccal.fitting.result import FitResult
 from udccal.rig import Nominal, RigDescription
 

@@ -9,9 +9,9 @@ import numpy as np
 
 from tests.benchmarks.extremes.case import Case, Outcome, outcome
 from tests.fitting.boards import MOUNTED_DEG, Sight, sight
-from udccal.fitting.bundle import Prior
-from udccal.fitting.corners import BoardCorners
-from udccal.fitting.geometry import BoardView, fit_views
+from udccal.fitting.geometry.bundle import Prior
+from udccal.fitting.geometry.corners import BoardCorners
+from udccal.fitting.geometry.fit import BoardView, fit_views
 from udccal.models.geometry import Geometry
 
 _FOCAL_SIGMA_PX, _CENTRE_SIGMA_PX = 15.0, 8.0

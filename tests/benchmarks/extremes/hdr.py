@@ -8,7 +8,7 @@ import equinox as eqx
 import numpy as np
 
 from tests.benchmarks.extremes.case import Case, Outcome
-from udccal.fitting.hdr import UNKNOWN_SIGMA, merge_bracket
+from udccal.fitting.hdr.merge import UNKNOWN_SIGMA, merge_bracket
 from udccal.fitting.result import FitStatus
 from udccal.models.noise import Noise
 

@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from tests.benchmarks.efficiency.noise import ToySensor, expose, measure, patterns, truth
 from tests.benchmarks.extremes.case import Case, Outcome, outcome
-from udccal.fitting.noise_frames import ExposureLevel, SpatialStack, fit_noise_frames
+from udccal.fitting.noise.frames import ExposureLevel, SpatialStack, fit_noise_frames
 from udccal.fitting.result import FitResult
 from udccal.models.noise import Noise
 

@@ -8,9 +8,9 @@ import numpy as np
 
 from tests.benchmarks.extremes.case import Case, Outcome, outcome
 from tests.benchmarks.psf_scene import Scene, pictures, shots_of, small_scene
-from udccal.fitting.psf import Effort, fit_shots_fully
-from udccal.fitting.psf_blocks import BLUR
-from udccal.fitting.psf_start import start_model, start_prior
+from udccal.fitting.psf.blocks import BLUR
+from udccal.fitting.psf.fit import Effort, fit_shots_fully
+from udccal.fitting.psf.start import start_model, start_prior
 from udccal.fitting.result import FitResult
 from udccal.models.psf import PsfField
 

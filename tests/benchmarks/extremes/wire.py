@@ -24,8 +24,8 @@ from tests.benchmarks.efficiency.wire import (
 )
 from tests.benchmarks.extremes.case import MOST_SINGLE, Case, Outcome, outcome
 from udccal.fitting.result import FitStatus
-from udccal.fitting.wire import WireFit, fit_wire_and_sigma
-from udccal.fitting.wire_harmonics import WireStart
+from udccal.fitting.wire.fit import WireFit, fit_wire_and_sigma
+from udccal.fitting.wire.harmonics import WireStart
 from udccal.models.geometry import Geometry
 from udccal.models.wire import wire_map
 

@@ -8,8 +8,8 @@ import numpy as np
 
 from tests.benchmarks.efficiency.backscatter import panel_pictures, shots_of, small_rig, world_at
 from tests.benchmarks.growth.cases import Case
-from udccal.fitting.backscatter import fit_shots
-from udccal.fitting.backscatter_vector import prior_of
+from udccal.fitting.backscatter.fit import fit_shots
+from udccal.fitting.backscatter.vector import prior_of
 from udccal.rig import RigDescription
 
 _PICTURES, _POSITIONS, _COLUMNS = 12, 96, 384

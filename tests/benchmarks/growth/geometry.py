@@ -10,8 +10,8 @@ import numpy as np
 from tests.benchmarks.growth.cases import Case
 from tests.fitting.boards import sight
 from udccal.arrangements import BoardSpec
-from udccal.fitting.corners import board_points_mm
-from udccal.fitting.geometry import fit_views
+from udccal.fitting.geometry.corners import board_points_mm
+from udccal.fitting.geometry.fit import fit_views
 from udccal.models.geometry import Geometry
 from udccal.numerics import in_float64
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from tests.benchmarks.efficiency.hdr import sensor
 from tests.benchmarks.growth.cases import Case
-from udccal.fitting.hdr import merge_bracket
+from udccal.fitting.hdr.merge import merge_bracket
 
 _COLUMNS, _ROWS, _FRAMES = 2048, 384, 10
 

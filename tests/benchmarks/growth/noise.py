@@ -10,7 +10,7 @@ import numpy as np
 
 from tests.benchmarks.efficiency.noise import ToySensor, expose, patterns
 from tests.benchmarks.growth.cases import Case
-from udccal.fitting.noise_frames import ExposureLevel, SpatialStack, fit_noise_frames
+from udccal.fitting.noise.frames import ExposureLevel, SpatialStack, fit_noise_frames
 
 _COLUMNS, _ROWS, _LEVELS, _STACK = 2048, 384, 10, 8
 

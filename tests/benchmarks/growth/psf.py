@@ -8,8 +8,8 @@ import numpy as np
 
 from tests.benchmarks.growth.cases import Case
 from tests.benchmarks.psf_scene import pictures, shots_of, small_scene
-from udccal.fitting.psf_field import fit_field
-from udccal.fitting.psf_start import start_model, start_prior
+from udccal.fitting.psf.field import fit_field
+from udccal.fitting.psf.start import start_model, start_prior
 from udccal.numerics import in_float64
 
 _ITERATIONS = 4

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 from tests.benchmarks.growth.cases import Case
 from tests.fitting.test_psf_stamps import make
-from udccal.fitting.psf_stamps import fit_psf_stamps
+from udccal.fitting.psf_stamps.fit import fit_psf_stamps
 
 # Pixels along a stamp's side, by its pixels.
 _SIDES = {225: 15, 441: 21, 961: 31}

@@ -9,9 +9,9 @@ import numpy as np
 
 from tests.benchmarks.efficiency.wire import PRNU, SITES, geometry, start
 from tests.benchmarks.growth.cases import Case
-from udccal.fitting.wire import fit_wire_and_sigma
-from udccal.fitting.wire_harmonics import possible_harmonics
-from udccal.fitting.wire_scan import ideal_wire
+from udccal.fitting.wire.fit import fit_wire_and_sigma
+from udccal.fitting.wire.harmonics import possible_harmonics
+from udccal.fitting.wire.scan import ideal_wire
 from udccal.models.geometry import Geometry
 from udccal.models.wire import wire_map
 from udccal.numerics import in_float64

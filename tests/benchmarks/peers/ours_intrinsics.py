@@ -19,7 +19,7 @@ from types import ModuleType
 import numpy as np
 
 from udccal import __version__
-from udccal.fitting.bundle import CalibratedViews, Gauge, calibrate_views
+from udccal.fitting.geometry import CalibratedViews, Gauge, calibrate_views
 from udccal.models.geometry import Geometry
 
 Boards = tuple[list[np.ndarray], list[np.ndarray]]

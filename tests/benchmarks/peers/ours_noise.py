@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 from tests.benchmarks.peers.works_module import arguments, load
-from udccal.fitting.noise_frames import ExposureLevel, SpatialStack, fit_noise_frames
-from udccal.fitting.noise_response import mean_response
+from udccal.fitting.noise import ExposureLevel, SpatialStack, fit_noise_frames
+from udccal.fitting.noise.response import mean_response
 from udccal.fitting.result import FitResult
 from udccal.models.noise import Noise
 

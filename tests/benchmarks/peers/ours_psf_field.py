@@ -17,9 +17,7 @@ from types import ModuleType
 import numpy as np
 
 import udccal
-from udccal.fitting.psf_stamps import fit_psf_stamps
-from udccal.fitting.psf_stamps_data import Stamps, mosaic_channels
-from udccal.fitting.psf_stamps_term import StampsPsf
+from udccal.fitting.psf_stamps import Stamps, StampsPsf, fit_psf_stamps, mosaic_channels
 from udccal.fitting.result import FitResult
 
 # Of red, green and blue: how much wider than green, light, and lateral colour at the field's edge (px).

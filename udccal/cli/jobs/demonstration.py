@@ -19,7 +19,7 @@ from udccal.cli.output import Output, StageTime
 from udccal.compilation import compilation_clock, keep_compilations
 from udccal.displays.pictures import face_picture
 from udccal.fitting.calibrate import ORDER, QUICK, Foundation, fit_foundation
-from udccal.fitting.psf import nominal_psf
+from udccal.fitting.psf.fit import nominal_psf
 from udccal.io.photograph import read_photograph
 from udccal.io.png import write_png16, write_rgb8
 from udccal.profiles.kernels import kernel_size, kernels_at

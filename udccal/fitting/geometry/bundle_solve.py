@@ -1,0 +1,279 @@
+"""Levenberg-Marquardt for a bundle: few intrinsics seen by all views, six numbers of a pose seen by one view only.
+
+The normal equations are
+
+    [ A    B ] [d intrinsics]     [g]        A: 9 x 9,  B_v: 9 x 6,  C_v: 6 x 6,
+    [ B^T  C ] [d poses     ] = - [h],
+
+with C block diagonal, so that the poses are eliminated view by view (Schur complement: Triggs et al., Bundle
+Adjustment - A Modern Synthesis, 2000, section 6.1). Slopes come from automatic differentiation of the model itself.
+One compiled function serves all orders of the distortion, all starts and all sizes padded alike.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from udccal.fitting.geometry.bundle_points import Blocks, Points, blocks
+from udccal.fitting.iteration_log import LOG
+from udccal.models.arrays import Arrayish
+from udccal.models.geometry import Geometry, project, rotation_matrix
+from udccal.numerics import in_float64
+
+INTRINSICS = 9
+# Residuals of a robust solve count as Cauchy's: half at this many sigma. A plain solve has no such bend in reach.
+CAUCHY_SIGMA = 2.5
+_PLAIN = 1e7
+# Converged: another step would lower chi2 by less than this part of one residual's share.
+_LEFT_TO_GAIN = 1e-7
+_MAX_ITERATIONS = 60
+_MOST_DAMPING = 1e12
+
+
+@dataclass(frozen=True)
+class Prior:
+    """Independent normal priors on the intrinsics; a precision (inverse variance) of 0 is none."""
+
+    mean: Float[np.ndarray, "9"]
+    precision: Float[np.ndarray, "9"]
+
+
+NO_PRIOR = Prior(np.zeros(INTRINSICS), np.zeros(INTRINSICS))
+
+
+@dataclass(frozen=True)
+class Bundle:
+    """Intrinsics (fx, fy, cx, cy, k1, k2, p1, p2, k3) and one pose per view: rotation vector, then translation."""
+
+    intrinsics: Float[np.ndarray, "9"]
+    poses: Float[np.ndarray, "views 6"]
+
+
+@dataclass(frozen=True)
+class Solved:
+    """A minimum, and the normal equations there.
+
+    ``cost`` is chi2 (Cauchy's in a robust solve) with the prior's share; ``gain`` what one more step would lower it.
+    """
+
+    bundle: Bundle
+    cost: float
+    iterations: int
+    converged: bool
+    common: Float[np.ndarray, "9 9"]
+    mixed: Float[np.ndarray, "views 9 6"]
+    own: Float[np.ndarray, "views 6 6"]
+
+
+class _Data(NamedTuple):
+    board: Arrayish
+    image: Arrayish
+    weight: Arrayish
+    free: Arrayish
+    prior_mean: Arrayish
+    prior_precision: Arrayish
+    bend: Arrayish
+
+
+class _Normal(NamedTuple):
+    common: Array
+    mixed: Array
+    own: Array
+    common_slope: Array
+    own_slope: Array
+
+
+class _State(NamedTuple):
+    intrinsics: Array
+    poses: Array
+    cost: Array
+    normal: _Normal
+    damping: Array
+    iteration: Array
+    done: Array
+    trace: Array
+
+
+def seen(
+    intrinsics: Float[Array, "9"], pose: Float[Array, "6"], board: Float[Array, "points 3"]
+) -> Float[Array, "points 2"]:
+    """Where the points of one board appear, in px."""
+    camera = Geometry(intrinsics[:2], intrinsics[2:4], intrinsics[4:9], jnp.zeros(3), jnp.zeros(3))
+    return project(camera, board @ rotation_matrix(pose[:3]).T + pose[3:])
+
+
+def _residuals(intrinsics: Array, poses: Array, data: _Data) -> Float[Array, "views points 2"]:
+    where = jax.vmap(seen, in_axes=(None, 0, 0))(intrinsics, poses, data.board)
+    # A padded view has weight zero everywhere; where it projects to must not matter, not even as infinity.
+    return jnp.where(data.weight[..., None] > 0, (where - data.image) * data.weight[..., None], 0.0)
+
+
+def _slopes(intrinsics: Array, poses: Array, data: _Data) -> Float[Array, "views points 2 15"]:
+    def one(pose: Array, board: Array) -> Array:
+        def at(x: Array) -> Array:
+            return seen(x[:INTRINSICS], x[INTRINSICS:], board)
+
+        return jax.jacfwd(at)(jnp.concatenate([intrinsics, pose]))
+
+    slopes = jax.vmap(one)(poses, data.board)
+    mask = jnp.concatenate([data.free, jnp.ones(6)])
+    return jnp.where(data.weight[..., None, None] > 0, slopes * data.weight[..., None, None], 0.0) * mask
+
+
+def _cost(residuals: Array, intrinsics: Array, data: _Data) -> Array:
+    square = (residuals**2).sum(axis=-1)
+    robust = data.bend**2 * jnp.log1p(square / data.bend**2)
+    off = (intrinsics - data.prior_mean) ** 2 * data.prior_precision * data.free
+    total = robust.sum() + off.sum()
+    return jnp.where(jnp.isfinite(total), total, jnp.inf)
+
+
+def _normal(intrinsics: Array, poses: Array, data: _Data) -> tuple[Array, _Normal]:
+    residuals = _residuals(intrinsics, poses, data)
+    slopes = _slopes(intrinsics, poses, data)
+    root = 1 / jnp.sqrt(1 + (residuals**2).sum(axis=-1, keepdims=True) / data.bend**2)
+    views = len(poses)
+    tall = (slopes * root[..., None]).reshape(views, -1, INTRINSICS + 6)
+    right = (residuals * root).reshape(views, -1)
+    blocks_ = jnp.einsum("vmi,vmj->vij", tall, tall)
+    slope = jnp.einsum("vmi,vm->vi", tall, right)
+    held, precision = 1 - data.free, data.prior_precision * data.free
+    common = blocks_[:, :INTRINSICS, :INTRINSICS].sum(axis=0) + jnp.diag(precision + held)
+    common_slope = slope[:, :INTRINSICS].sum(axis=0) + precision * (intrinsics - data.prior_mean)
+    own = blocks_[:, INTRINSICS:, INTRINSICS:]
+    # A view without points, there to fill the size, keeps its pose.
+    own = own + jnp.where(jnp.trace(own, axis1=1, axis2=2) > 0, 0.0, 1.0)[:, None, None] * jnp.eye(6)
+    parts = _Normal(common, blocks_[:, :INTRINSICS, INTRINSICS:], own, common_slope, slope[:, INTRINSICS:])
+    return _cost(residuals, intrinsics, data), parts
+
+
+def _step(normal: _Normal, damping: Array) -> tuple[Array, Array, Array]:
+    """Steps of intrinsics and poses, and how much the quadratic model of chi2 falls."""
+    # In units of their own slopes: focal lengths in px and distortions of 1e-3 are then alike.
+    unit = 1 / jnp.sqrt(jnp.diagonal(normal.common) + 1e-300)
+    own_unit = 1 / jnp.sqrt(jnp.diagonal(normal.own, axis1=1, axis2=2) + 1e-300)
+    common = normal.common * unit[:, None] * unit + damping * jnp.eye(INTRINSICS)
+    own = normal.own * own_unit[:, :, None] * own_unit[:, None, :] + damping * jnp.eye(6)
+    mixed = normal.mixed * unit[:, None] * own_unit[:, None, :]
+    slope, own_slope = normal.common_slope * unit, normal.own_slope * own_unit
+    # One solve for the slope and the mixed block: C^-1 [h, B^T].
+    both = jnp.concatenate([own_slope[..., None], jnp.swapaxes(mixed, 1, 2)], axis=-1)
+    solved = jnp.linalg.solve(own, both)
+    reduced = common - jnp.einsum("vip,vpj->ij", mixed, solved[..., 1:])
+    right = slope - jnp.einsum("vip,vp->i", mixed, solved[..., 0])
+    lens = -jnp.linalg.solve(reduced, right)
+    pose = -solved[..., 0] - jnp.einsum("vpj,j->vp", solved[..., 1:], lens)
+    fall = -(slope @ lens) - (own_slope * pose).sum() + damping * ((lens**2).sum() + (pose**2).sum())
+    return lens * unit, pose * own_unit, fall
+
+
+@jax.jit
+def _solve(intrinsics: Array, poses: Array, data: _Data) -> _State:
+    share = jnp.maximum(2 * (data.weight > 0).sum(), 1)
+
+    def unfinished(state: _State) -> Array:
+        return ~state.done & (state.iteration < _MAX_ITERATIONS)
+
+    def step(state: _State) -> _State:
+        lens, pose, fall = _step(state.normal, state.damping)
+        moved, turned = state.intrinsics + lens, state.poses + pose
+        cost, normal = _normal(moved, turned, data)
+        better = (cost <= state.cost) & jnp.isfinite(fall)
+        small = (fall <= _LEFT_TO_GAIN * state.cost / share) & (state.damping < 1e-3)
+        # The quadratic model foretells the fall well: trust it more; else less.
+        true_to_model = (state.cost - cost) > 0.5 * fall
+        lower = jnp.where(true_to_model, state.damping / 10, state.damping)
+        damping = jnp.where(better, jnp.maximum(lower, 1e-12), jnp.maximum(state.damping, 1e-9) * 8)
+        now = state.iteration + 1
+
+        def pick(new: Array, old: Array) -> Array:
+            return jnp.where(better, new, old)
+
+        return _State(
+            pick(moved, state.intrinsics),
+            pick(turned, state.poses),
+            pick(cost, state.cost),
+            jax.tree.map(pick, normal, state.normal),
+            damping,
+            now,
+            small | (damping > _MOST_DAMPING),
+            state.trace.at[now].set(pick(cost, state.cost)),
+        )
+
+    cost, normal = _normal(intrinsics, poses, data)
+    trace = jnp.zeros(_MAX_ITERATIONS + 1).at[0].set(cost)
+    first = _State(intrinsics, poses, cost, normal, jnp.asarray(1e-4), jnp.asarray(0), jnp.asarray(False), trace)
+    return jax.lax.while_loop(unfinished, step, first)
+
+
+_last_step = jax.jit(_step)
+
+
+@in_float64
+def solve(start: Bundle, points: Points, free: Bool[np.ndarray, "9"], prior: Prior, robust: bool = False) -> Solved:
+    """The minimum of chi2 next to ``start``.
+
+    Args:
+        start: where to begin; intrinsics that are held stay at this.
+        points: those in use take part, by their sigma.
+        free: which of the intrinsics are fitted.
+        prior: on the free intrinsics.
+        robust: residuals beyond ``CAUCHY_SIGMA`` count for less and less, as a Cauchy distribution has them.
+    """
+    padded = blocks(points)
+    count = len(points.names)
+    poses = np.tile(np.array([0.0, 0.0, 0.0, 0.0, 0.0, 1.0]), (len(padded.board), 1))
+    poses[:count] = start.poses
+    state = _solve(start.intrinsics, poses, _data(padded, free, prior, CAUCHY_SIGMA if robust else _PLAIN))
+    state = jax.tree.map(np.asarray, state)
+    for iteration, cost in enumerate(state.trace[: int(state.iteration) + 1]):
+        LOG.debug("bundle, %d of 5 distortions: iteration %d, chi2 %.9g", int(free[4:].sum()), iteration, cost)
+    fall = float(_last_step(state.normal, 1e-12)[2])
+    share = state.cost / max(2 * int(points.used.sum()), 1)
+    return Solved(
+        bundle=Bundle(state.intrinsics, state.poses[:count]),
+        cost=float(state.cost),
+        iterations=int(state.iteration),
+        # A solver that stalls at the limit of its arithmetic passes; one that ran out of iterations does not.
+        converged=bool(np.isfinite(state.cost) and fall < max(1e-3 * share, 1e-12)),
+        common=state.normal.common,
+        mixed=state.normal.mixed[:count],
+        own=state.normal.own[:count],
+    )
+
+
+def _data(padded: Blocks, free: np.ndarray, prior: Prior, bend: float) -> _Data:
+    mask = np.asarray(free, dtype=np.float64)
+    return _Data(padded.board, padded.image, padded.weight, mask, prior.mean, prior.precision, np.float64(bend))
+
+
+@jax.jit
+def _linear(intrinsics: Array, poses: Array, data: _Data) -> tuple[Array, Array]:
+    return _residuals(intrinsics, poses, data), _slopes(intrinsics, poses, data)
+
+
+@in_float64
+def residuals_px(bundle: Bundle, points: Points) -> Float[np.ndarray, "points 2"]:
+    """Projected minus seen, of all points."""
+    return linearised(bundle, points)[0]
+
+
+@in_float64
+def linearised(
+    bundle: Bundle, points: Points
+) -> tuple[Float[np.ndarray, "points 2"], Float[np.ndarray, "points 2 15"]]:
+    """Projected minus seen in px, and the slopes of that by intrinsics and own pose, of all points."""
+    padded = blocks(points)
+    poses = np.tile(np.array([0.0, 0.0, 0.0, 0.0, 0.0, 1.0]), (len(padded.board), 1))
+    poses[: len(points.names)] = bundle.poses
+    ones = np.zeros(padded.weight.shape)
+    ones[padded.row, padded.column] = 1.0
+    data = _Data(padded.board, padded.image, ones, np.ones(INTRINSICS), np.zeros(9), np.zeros(9), np.float64(1.0))
+    residuals, slopes = (np.asarray(part) for part in _linear(bundle.intrinsics, poses, data))
+    return residuals[padded.row, padded.column], slopes[padded.row, padded.column]

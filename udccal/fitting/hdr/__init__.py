@@ -1,0 +1,5 @@
+"""Brackets of exposures merged into one rate per sample."""
+
+from udccal.fitting.hdr.merge import HdrMerge, merge_bracket
+
+__all__ = ["HdrMerge", "merge_bracket"]

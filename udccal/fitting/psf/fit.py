@@ -1,0 +1,176 @@
+"""psf fit: from brackets of an LED at field positions to the kernel of a point source anywhere on the sensor.
+
+First the few numbers of diffraction by the panel are fitted to some of the shots; then it is tried on the others how
+much an image of smooth coefficients, on top of diffraction or instead of it, improves the prediction at positions that
+were left out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from udccal.fitting.psf.blocks import blocks, fit_lattice
+from udccal.fitting.psf.diffraction import DiffractionFit, fit_locals
+from udccal.fitting.psf.evidence import NAMES, diffraction_alone, failed, fit_result
+from udccal.fitting.psf.field import fit_field
+from udccal.fitting.psf.normal import Evaluator
+from udccal.fitting.psf.posterior import PsfPosterior, posterior
+from udccal.fitting.psf.read import read_shots
+from udccal.fitting.psf.residual import Sources, with_light_of_peak
+from udccal.fitting.psf.samples import share_of_information
+from udccal.fitting.psf.select import select_field
+from udccal.fitting.psf.shots import Shots
+from udccal.fitting.psf.start import pitch_tolerance, start_model, start_prior, wire_shows
+from udccal.fitting.result import FitResult, FitStatus
+from udccal.models.geometry import Geometry
+from udccal.models.noise import Noise
+from udccal.models.psf import PsfField
+from udccal.models.wire import Wire
+from udccal.numerics import in_float64
+from udccal.rig import RigDescription
+from udccal.sessions.store import Session
+
+_LEAST_POSITIONS = 3
+_LEAST_SHARE = 0.5
+
+
+@dataclass(frozen=True)
+class Effort:
+    """What the fit may spend: more is slower and more accurate.
+
+    Attributes:
+        positions, shifts: so many field positions, and pictures of each, go into the fit of diffraction.
+        half_px: largest window (rows, columns) to either side of the LED; the regions captured may bound it further.
+        close_px: the same for the fit of diffraction, whose time grows with it.
+        far_share: of the samples away from the peak, so many go into it; all of those about the peak do.
+        iterations: at most, of the fit of diffraction.
+    """
+
+    positions: int = 10
+    shifts: int = 3
+    half_px: tuple[int, int] = (48, 16)
+    close_px: tuple[int, int] = (40, 14)
+    far_share: float = 1 / 6
+    iterations: int = 30
+
+
+def fit_psf(
+    session: Session, noise: Noise, geometry: Geometry, wire: Wire, effort: Effort | None = None
+) -> FitResult[PsfField]:
+    """Fit the psf term to the steps ``psf/...`` of a session.
+
+    Args:
+        session: brackets of an LED at field positions, each at some sub-pixel shifts.
+        noise: for merging brackets.
+        geometry: where pixels look.
+        wire: divided out, and a start for the panel's numbers.
+        effort: what the fit may spend.
+
+    Raises:
+        SessionError: when a file of the session is missing or damaged.
+    """
+    effort = effort or Effort()
+    half = window_half(session, effort.half_px)
+    reading = read_shots(session, noise, wire, half)
+    start = start_model(session.rig, geometry, wire)
+    if reading.clipped > (1 - _LEAST_SHARE) * max(reading.taken, 1):
+        note = f"{reading.clipped} of {reading.taken} pictures are clipped."
+        return failed(start, geometry, FitStatus.SATURATED, note)
+    if reading.dark > (1 - _LEAST_SHARE) * max(reading.taken, 1):
+        note = f"{reading.dark} of {reading.taken} pictures show no LED."
+        return failed(start, geometry, FitStatus.TOO_DARK, note)
+    if reading.shots is None:
+        return failed(start, geometry, FitStatus.TOO_FEW_DATA, "No field position was captured.")
+    result = fit_shots(reading.shots, session.rig, geometry, wire, effort)
+    left_out = reading.clipped + reading.dark
+    note = f"{left_out} pictures were left out: {reading.dark} without an LED, {reading.clipped} clipped."
+    return replace(result, notes=(*result.notes, note)) if left_out else result
+
+
+def nominal_psf(rig: RigDescription, geometry: Geometry, wire: Wire) -> PsfField:
+    """What the fit starts from: diffraction by the panel as the rig's description and the wire have it."""
+    return diffraction_alone(start_model(rig, geometry, wire), geometry)
+
+
+def window_half(session: Session, largest: tuple[int, int]) -> tuple[int, int]:
+    """(rows, columns) to either side of the LED that the regions captured can fill."""
+    regions = [c.region for step in session.steps("psf") for c in step.captures]
+    rows, columns = (min((getattr(r, name) for r in regions), default=0) for name in ("rows", "columns"))
+    return max(4, min(largest[0], rows // 2 - 4)), max(4, min(largest[1], columns // 2 - 4))
+
+
+@dataclass(frozen=True)
+class FittedPsf:
+    """The result, and what ``psf_sigma`` needs to say how sure the kernel is at a field point (None: nothing known)."""
+
+    result: FitResult[PsfField]
+    posterior: PsfPosterior | None
+
+
+def fit_shots(
+    shots: Shots, rig: RigDescription, geometry: Geometry, wire: Wire, effort: Effort | None = None
+) -> FitResult[PsfField]:
+    """Fit the psf term to crops about the LED; see ``fit_psf``."""
+    return fit_shots_fully(shots, rig, geometry, wire, effort).result
+
+
+@in_float64
+def fit_shots_fully(
+    shots: Shots, rig: RigDescription, geometry: Geometry, wire: Wire, effort: Effort | None = None
+) -> FittedPsf:
+    """As ``fit_shots``, with the posterior of the numbers of diffraction."""
+    effort = effort or Effort()
+    start = start_model(rig, geometry, wire)
+    count = int(shots.position.max()) + 1
+    if count < _LEAST_POSITIONS:
+        note = f"{count} field positions were captured; {_LEAST_POSITIONS} are needed at least."
+        return FittedPsf(failed(start, geometry, FitStatus.TOO_FEW_DATA, note), None)
+    held_out = held_out_positions(count)
+    chosen = shots.pick(some_shots(shots, held_out, effort))
+    chosen = replace(chosen, position=np.unique(chosen.position, return_inverse=True)[1].reshape(-1))
+    half = (shots.rate.shape[1] // 2, shots.rate.shape[2] // 2)
+    close = (min(half[0], effort.close_px[0]), min(half[1], effort.close_px[1]))
+    seen = wire_shows(wire)
+    field = fit_field(chosen, geometry, start_prior(rig, start, seen), close, effort.far_share, effort.iterations, seen)
+    evaluator = replace(field.diffraction.problem.evaluator, lattice=fit_lattice(half))
+    sources, explained = _all_sources(shots, geometry, evaluator, field.diffraction)
+    size = np.array([rig.camera.columns - 1, rig.camera.rows - 1]) / 2.0
+    selection = select_field(shots, sources, explained, held_out, (shots.positions_px() - size) / size)
+    used = share_of_information(field.diffraction, field.shots, geometry, close, shots.count, len(NAMES))
+    result = fit_result(shots, geometry, field, selection, size, used, pitch_tolerance(rig))
+    return FittedPsf(result, posterior(field.diffraction, geometry))
+
+
+def held_out_positions(count: int) -> Bool[np.ndarray, " positions"]:
+    """Every fourth position, the second first, is left out while orders are compared; with three, one of them."""
+    return np.arange(count) % 4 == 1
+
+
+def some_shots(shots: Shots, held_out: Bool[np.ndarray, " positions"], effort: Effort) -> Bool[np.ndarray, " shots"]:
+    """Shots for the fit of diffraction: evenly spread over the positions not held out, and over their shifts."""
+    usable = np.flatnonzero(~held_out)
+    places = usable[np.unique(np.linspace(0, len(usable) - 1, effort.positions).round().astype(int))]
+    keep = np.zeros(shots.count, dtype=bool)
+    for place in places:
+        own = np.flatnonzero(shots.position == place)
+        keep[own[np.unique(np.linspace(0, len(own) - 1, effort.shifts).round().astype(int))]] = True
+    return keep
+
+
+def _all_sources(
+    shots: Shots, geometry: Geometry, evaluator: Evaluator, fit: DiffractionFit
+) -> tuple[Sources, Float[np.ndarray, "shots rows columns"]]:
+    """Places and light of all shots under the fitted model, and what it expects of every sample per unit of light."""
+    place, flux, background = shots.centre_px.copy(), np.zeros((shots.count, 3)), np.zeros(shots.count)
+    explained = np.zeros(shots.rate.shape)
+    for block in blocks(shots, geometry, np.ones(shots.rate.shape, dtype=bool)):
+        local, unit = fit_locals(evaluator, fit.theta, block, fit.model_error)
+        index = np.asarray(block.index)
+        real = index >= 0
+        place[index[real]] += np.asarray(local.offset_px)[real]
+        flux[index[real]], background[index[real]] = np.asarray(local.flux)[real], np.asarray(local.background)[real]
+        explained[index[real]] = unit[real].reshape(-1, *shots.rate.shape[1:])
+    return with_light_of_peak(shots, Sources(place, flux, background), explained), explained
