@@ -21,7 +21,7 @@ MODULES = ("noise", "hdr", "geometry", "wire", "psf", "psf_stamps", "backscatter
 def main() -> None:
     """Run the chosen terms; non-zero exit where a figure is missed."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("terms", nargs="*", default=list(MODULES), choices=[[], *MODULES], metavar="term")
+    parser.add_argument("terms", nargs="*", default=[], choices=[[], *MODULES], metavar="term")
     parser.add_argument("--out", type=Path, default=Path("efficiency"), help="folder for efficiency.json")
     parser.add_argument("--share", type=float, default=1.0, help="of the realisations; for a quick look")
     options = parser.parse_args()

@@ -60,7 +60,7 @@ def table(rows: list[Growth]) -> str:
 def main() -> None:
     """Measure the chosen terms, and put each one's table into docs/numerics.md."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("terms", nargs="*", default=list(MODULES), choices=[[], *MODULES], metavar="term")
+    parser.add_argument("terms", nargs="*", default=[], choices=[[], *MODULES], metavar="term")
     terms = parser.parse_args().terms or list(MODULES)
     for term in terms:
         rows: list[Growth] = []

@@ -60,7 +60,7 @@ OURS = {
 def main() -> None:
     """Run ours and theirs; the results stay in a JSON-lines file, from which the table is made."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("works", nargs="*", default=list(OURS), choices=[[], *OURS], metavar="work")
+    parser.add_argument("works", nargs="*", default=[], choices=[[], *OURS], metavar="work")
     parser.add_argument("--peers", type=Path, default=_ROOT.parent / "shared" / "peers", help="folder of works.py")
     parser.add_argument("--environments", type=Path, default=Path(tempfile.gettempdir()) / "peers")
     parser.add_argument("--ours-only", action="store_true", help="leave the peers' earlier results as they are")
