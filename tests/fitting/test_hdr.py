@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from udccal.errors import FitError
+from udccal.fitting.hdr import merge as merging
 from udccal.fitting.hdr.likelihood import merge_block
 from udccal.fitting.hdr.merge import UNKNOWN_SIGMA, merge_bracket
 from udccal.models.noise import Noise

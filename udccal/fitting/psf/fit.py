@@ -23,7 +23,7 @@ from udccal.fitting.psf.residual import Sources, with_light_of_peak
 from udccal.fitting.psf.samples import share_of_information
 from udccal.fitting.psf.select import select_field
 from udccal.fitting.psf.shots import Shots
-from udccal.fitting.psf.start import pitch_tolerance, start_model, start_prior, wire_shows
+from udccal.fitting.psf.start import LEAST_KNOWN, pitch_tolerance, start_model, start_prior, wire_shows
 from udccal.fitting.result import FitResult, FitStatus
 from udccal.models.geometry import Geometry
 from udccal.models.noise import Noise
@@ -128,6 +128,10 @@ def fit_shots_fully(
     if count < _LEAST_POSITIONS:
         note = f"{count} field positions were captured; {_LEAST_POSITIONS} are needed at least."
         return FittedPsf(failed(start, geometry, FitStatus.TOO_FEW_DATA, note), None)
+    if pitch_tolerance(rig) > LEAST_KNOWN:
+        pitch = rig.panel.pitch_mm
+        note = f"The panel's pitch is {pitch.value:g} ± {pitch.tolerance:g} mm in the rig's description. Measure it."
+        return FittedPsf(failed(start, geometry, FitStatus.POOR_FIT, note), None)
     held_out = held_out_positions(count)
     chosen = shots.pick(some_shots(shots, held_out, effort))
     chosen = replace(chosen, position=np.unique(chosen.position, return_inverse=True)[1].reshape(-1))

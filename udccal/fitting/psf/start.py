@@ -22,6 +22,8 @@ _BLUR_PX, _BLUR_LOG = 0.1, 1.0
 _MEASURED, _HELD = 0.3, 0.05
 # A pitch whose relative tolerance is larger takes more wavelengths to make up for it than there are in daylight.
 _WELL_KNOWN = 0.02
+# With a larger one nothing is known of the pitch, and no fit is tried.
+LEAST_KNOWN = 0.5
 _PLACE_PERIODS = 0.05
 
 
@@ -55,7 +57,7 @@ def wire_shows(wire: Wire) -> bool:
 
 def wavelengths_nm(rig: RigDescription) -> Float[np.ndarray, " nodes"]:
     """Nodes of the spectra: daylight's, or what it looks like behind a panel whose pitch is off by its tolerance."""
-    relative = pitch_tolerance(rig)
+    relative = min(pitch_tolerance(rig), LEAST_KNOWN)
     if relative <= _WELL_KNOWN:
         return WAVELENGTHS_NM
     first, last = WAVELENGTHS_NM[0] * (1 - relative), WAVELENGTHS_NM[-1] * (1 + relative)
