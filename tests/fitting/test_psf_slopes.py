@@ -1,0 +1,109 @@
+"""Slopes of the kernel, steps along them, and what is known of the pitch beforehand."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.special import softmax
+
+from tests.benchmarks.psf_scene import Scene, pictures, shots_of, small_scene
+from udccal.fitting.psf.blocks import HEAD, blocks, fit_lattice
+from udccal.fitting.psf.descent import Prior, stepped
+from udccal.fitting.psf.fit import Effort, fit_shots
+from udccal.fitting.psf.normal import Evaluator, kernel_coefficients, overlaps_of
+from udccal.fitting.psf.shots import Shots
+from udccal.fitting.psf.slopes import factors_by_parameter, kernel_slopes
+from udccal.fitting.psf.start import WAVELENGTHS_NM, start_model, start_prior, wavelengths_nm
+from udccal.fitting.result import FitStatus
+from udccal.numerics import in_float64
+from udccal.rig import RigDescription
+
+_HALF = (8, 6)
+# Forward and backward, of each parameter before the spectra.
+_STEPS = np.array([1e-6, 1e-5, 1e-5, 1e-5, 1e-4, 1e-3, 1e-4, 1e-4, 1e-4])
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return small_scene(positions=(3, 1), shifts=1, half=_HALF)
+
+
+@pytest.fixture(scope="module")
+def prior(scene: Scene) -> Prior:
+    return start_prior(scene.rig, start_model(scene.rig, scene.geometry, scene.wire), True)
+
+
+@pytest.fixture(scope="module")
+def shots(scene: Scene, prior: Prior) -> Shots:
+    rng = np.random.default_rng(4)
+    return shots_of(scene, pictures(scene, prior.mean, rng), rng)
+
+
+@pytest.mark.parametrize("interference", [True, False])
+def test_slopes_of_the_kernel_are_those_of_differences(
+    scene: Scene, prior: Prior, shots: Shots, interference: bool
+) -> None:
+    found, wanted = slopes_both_ways(scene, prior, shots, interference)
+    for own, other in zip(found, wanted, strict=True):
+        assert np.abs(own - other).max() <= 0.01 * np.abs(other).max()
+    swapped = np.abs(found[1] - wanted[2]).max()
+    assert swapped > 0.1 * np.abs(wanted[2]).max()  # that the comparison can fail
+
+
+@in_float64
+def slopes_both_ways(scene: Scene, prior: Prior, shots: Shots, interference: bool) -> tuple[np.ndarray, np.ndarray]:
+    evaluator = Evaluator(prior.wavelengths_nm, fit_lattice(_HALF), interference)
+    block = blocks(shots, scene.geometry, np.ones(shots.rate.shape, dtype=bool))[0]
+    theta = prior.mean
+    overlaps = overlaps_of(evaluator, theta, block.frame)
+    model = evaluator.model(theta)
+    used = overlaps if interference else None
+    _, by_factor = kernel_slopes(model, block, evaluator.lattice, model.spectrum, used)
+    chain = np.asarray(factors_by_parameter(model, block.frame))
+    found = np.einsum("yxfc,fp->pyxc", np.asarray(by_factor), chain)
+    wanted = []
+    for step in np.eye(HEAD, theta.size) * _STEPS[:, None]:
+        more, less = (np.asarray(kernel_coefficients(evaluator, theta + s * step, block, overlaps)) for s in (1, -1))
+        wanted.append((more - less) / (2 * step.sum()))
+    return found, np.stack(wanted)
+
+
+def test_a_step_makes_spectra_grow_by_what_it_says() -> None:
+    rng = np.random.default_rng(1)
+    logs = rng.normal(0, 1, (3, 5))
+    theta, step = np.concatenate([np.zeros(HEAD), logs.ravel()]), np.zeros(HEAD + 15)
+    step[HEAD : HEAD + 5] = [30.0, 0.0, 0.0, 0.0, 0.0]
+    before = softmax(logs, axis=1)
+    after = softmax(stepped(theta, step)[HEAD:].reshape(3, 5), axis=1)
+    np.testing.assert_allclose(after[1:], before[1:])
+    # Thirty-fold, not by the thirtieth power of e.
+    ratio = after[0, 0] / after[0, 1:] / (before[0, 0] / before[0, 1:])
+    assert (ratio > 10).all()
+    assert np.log(ratio.max()) < 30 * 0.99
+    small = stepped(theta, 1e-4 * step)
+    np.testing.assert_allclose(small, theta + 1e-4 * step, atol=1e-5)
+
+
+def with_pitch_tolerance(rig: RigDescription, share: float) -> RigDescription:
+    pitch = rig.panel.pitch_mm
+    known = pitch.model_copy(update={"tolerance": share * pitch.value})
+    return rig.model_copy(update={"panel": rig.panel.model_copy(update={"pitch_mm": known})})
+
+
+def test_a_pitch_that_may_be_far_off_takes_more_wavelengths(scene: Scene) -> None:
+    assert wavelengths_nm(scene.rig) is WAVELENGTHS_NM
+    wide = wavelengths_nm(with_pitch_tolerance(scene.rig, 0.25))
+    assert (wide[0], wide[-1]) == (300.0, 875.0)
+    np.testing.assert_allclose(np.diff(wide), 25.0)
+
+
+def test_a_pitch_of_which_nothing_is_known_is_said(scene: Scene, shots: Shots) -> None:
+    rig = with_pitch_tolerance(scene.rig, 0.7)
+    result = fit_shots(shots, rig, scene.geometry, scene.wire, Effort(half_px=_HALF, close_px=_HALF))
+    assert result.status is FitStatus.POOR_FIT
+    assert "0.63 ± 0.441 mm" in result.notes[0]
+    assert np.isfinite(np.asarray(result.term.diffraction.spectrum)).all()
+    two = replace(shots.pick(shots.position < 2))
+    assert fit_shots(two, scene.rig, scene.geometry, scene.wire).status is FitStatus.TOO_FEW_DATA
