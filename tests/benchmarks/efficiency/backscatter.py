@@ -40,7 +40,7 @@ from udccal.models.backscatter import Backscatter, panel_response, response_grid
 from udccal.numerics import in_float64
 from udccal.rig import Nominal, RigDescription, load_rig
 
-REALISATIONS = 120
+REALISATIONS = 240
 POSITIONS = 24
 PICTURES = 8
 EXPOSURE_S = 0.05
