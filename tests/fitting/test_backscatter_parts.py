@@ -11,14 +11,14 @@ import pytest
 
 from udccal.fitting.backscatter.blocks import BLOCK, in_blocks
 from udccal.fitting.backscatter.checks import typical_share
-from udccal.fitting.backscatter.data import PanelCrop, grid_step, nominal_term, sampled_rays, visible_crop
+from udccal.fitting.backscatter.data import PanelCrop, grid_step, sampled_rays, visible_crop
 from udccal.fitting.backscatter.evidence import Evidence, pictures_of, weights
 from udccal.fitting.backscatter.likelihood import reweighed
 from udccal.fitting.backscatter.profile import mask_slopes, profiled, whitened
 from udccal.fitting.backscatter.ratios import ratios, ratios_and_slopes, window_logs, windows_at
 from udccal.fitting.backscatter.solve import corners_of, window_for, with_room
 from udccal.fitting.backscatter.vector import KERNELS, TWO_PLANES, mix_and_slopes, mix_of, prior_of, without_crosstalk
-from udccal.fitting.nominal import nominal_geometry
+from udccal.fitting.nominal import nominal_backscatter, nominal_geometry
 from udccal.fitting.solvers import Solution
 from udccal.rig import load_rig
 
@@ -54,7 +54,7 @@ def test_slopes_of_ratios_are_those_of_differences() -> None:
     crop = visible_crop(geometry, RIG)
     shown = np.random.default_rng(0).integers(0, 256, (3, crop.rows, crop.columns, 3)).astype(np.uint8)
     pictures = pictures_of(shown, crop)
-    template = nominal_term(geometry, RIG, np.zeros((3, 1, 1)), grid_step(RIG), window=1)
+    template = nominal_backscatter(geometry, RIG, np.zeros((3, 1, 1)), grid_step(RIG), window=1)
     template = replace(template, window=window_for(template, X, rays, 1.0))
     at = windows_at(template.window, rays, corners_of(template, X, rays), pictures)
     ratio, slope = ratios_and_slopes(template, X, at, window_logs(at, pictures))
@@ -141,7 +141,7 @@ def test_an_order_without_something_has_to_be_better_for_it() -> None:
 def test_a_window_does_not_follow_a_fit_gone_astray() -> None:
     geometry = nominal_geometry(RIG)
     rays, _ = sampled_rays(geometry, RIG, grid_step(RIG), 7)
-    template = nominal_term(geometry, RIG, np.zeros((3, 1, 1)), grid_step(RIG), window=1)
+    template = nominal_backscatter(geometry, RIG, np.zeros((3, 1, 1)), grid_step(RIG), window=1)
     template = replace(template, window=window_for(template, PRIOR.mean, rays, 1.0))
     wider, astray = PRIOR.mean.copy(), PRIOR.mean.copy()
     wider[2] += np.log(2.2)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from scipy.special import softmax
@@ -105,5 +103,7 @@ def test_a_pitch_of_which_nothing_is_known_is_said(scene: Scene, shots: Shots) -
     assert result.status is FitStatus.POOR_FIT
     assert "0.63 ± 0.441 mm" in result.notes[0]
     assert np.isfinite(np.asarray(result.term.diffraction.spectrum)).all()
-    two = replace(shots.pick(shots.position < 2))
-    assert fit_shots(two, scene.rig, scene.geometry, scene.wire).status is FitStatus.TOO_FEW_DATA
+    assert (
+        fit_shots(shots.pick(shots.position < 2), scene.rig, scene.geometry, scene.wire).status
+        is FitStatus.TOO_FEW_DATA
+    )

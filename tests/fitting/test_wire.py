@@ -12,7 +12,7 @@ import pytest
 from udccal.cameras.protocol import CameraIdentity, Region, Settings
 from udccal.fitting.noise.fit import nominal_noise
 from udccal.fitting.result import FitResult, FitStatus
-from udccal.fitting.wire.fit import WireFit, fit_wire, fit_wire_and_sigma, fit_wire_map, sensor_map
+from udccal.fitting.wire.fit import WireFit, fit_wire, fit_wire_and_sigma, sensor_map
 from udccal.fitting.wire.harmonics import WireStart, wire_start
 from udccal.fitting.wire.select import select
 from udccal.models.geometry import Geometry
@@ -131,7 +131,7 @@ def test_no_panel_is_absent(bench: Bench) -> None:
     y, x = np.mgrid[:ROWS, :COLUMNS]
     shading = 1 - 0.2 * ((x / COLUMNS - 0.5) ** 2 + (y / ROWS - 0.5) ** 2)
     signal, variance = flat_of(shading / shading.mean(), 3)
-    result = fit_wire_map(signal, variance, bench.geometry, bench.start, PRNU)
+    result = fit_wire_and_sigma(signal, variance, bench.geometry, bench.start, PRNU).result
     assert result.status is FitStatus.ABSENT
     assert result.ok
     found = np.asarray(wire_map(result.term, ROWS, COLUMNS))
@@ -142,7 +142,7 @@ def test_no_panel_is_absent(bench: Bench) -> None:
 def test_no_light_is_too_dark(bench: Bench, level: float) -> None:
     rng = np.random.default_rng(0)
     signal = level + 0.1 * rng.standard_normal((ROWS, COLUMNS))
-    result = fit_wire_map(signal, np.full((ROWS, COLUMNS), 0.01), bench.geometry, bench.start, PRNU)
+    result = fit_wire_and_sigma(signal, np.full((ROWS, COLUMNS), 0.01), bench.geometry, bench.start, PRNU).result
     assert result.status is FitStatus.TOO_DARK
 
 

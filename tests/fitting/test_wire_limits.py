@@ -25,7 +25,7 @@ from tests.benchmarks.efficiency.wire import (
 )
 from tests.benchmarks.extremes.wire import constant
 from udccal.fitting.result import FitResult, FitStatus
-from udccal.fitting.wire.fit import fit_wire_and_sigma, fit_wire_map
+from udccal.fitting.wire.fit import fit_wire_and_sigma
 from udccal.models.wire import Wire
 
 # Baseline up to degree 4, three site gains.
@@ -67,7 +67,7 @@ def test_no_modulation_is_absent_and_costs_nothing() -> None:
 
 def test_saturated_flat_says_what_to_do() -> None:
     signal = np.full((ROWS, COLUMNS), 4095.0)
-    result = fit_wire_map(signal, signal, geometry(), start(), PRNU, clip=4000.0)
+    result = fit_wire_and_sigma(signal, signal, geometry(), start(), PRNU, clip=4000.0).result
     assert result.status is FitStatus.SATURATED
     assert "shorter" in " ".join(result.notes)
 

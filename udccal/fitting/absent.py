@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from udccal.fitting.nominal import nominal_backscatter
 from udccal.fitting.wire.harmonics import wire_start
 from udccal.fitting.wire.scan import ideal_wire
 from udccal.models.backscatter import Backscatter
@@ -51,23 +52,9 @@ def absent_psf(rig: RigDescription, geometry: Geometry) -> PsfField:
 
 def absent_backscatter(rig: RigDescription, geometry: Geometry) -> Backscatter:
     """A panel that sends no light back, with the rig's nominal measures."""
-    panel, camera = rig.panel, rig.camera
+    camera = rig.camera
     step = min(camera.columns, camera.rows) // 2
-    return Backscatter(
-        geometry=geometry,
-        mask=np.zeros((3, camera.rows // step, camera.columns // step)),
-        mix=np.eye(3),
-        gamma=np.float64(panel.gamma.value),
-        pitch_mm=np.float64(panel.pitch_mm.value),
-        pupil_mm=np.float64(rig.pupil_mm),
-        distance_mm=np.float64(rig.mounting.standoff_mm.value),
-        emitters_px=np.zeros((3, 2)),
-        softness_px=np.float64(0.2),
-        reflection=np.float64(0.0),
-        reflection_mm=np.float64(0.0),
-        columns=camera.columns,
-        rows=camera.rows,
-        cfa=camera.cfa,
-        step=step,
-        window=1,
-    )
+    mask = np.zeros((3, camera.rows // step, camera.columns // step))
+    term = nominal_backscatter(geometry, rig, mask, step, window=1)
+    nothing = np.float64(0.0)
+    return replace(term, softness_px=np.float64(0.2), reflection=nothing, reflection_mm=nothing)

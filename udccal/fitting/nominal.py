@@ -1,10 +1,12 @@
-"""The term geometry as the rig was built to have it: where every fit of rays starts."""
+"""Terms as the rig was built to have them: where fits start."""
 
 from __future__ import annotations
 
 import numpy as np
+from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
+from udccal.models.backscatter import Backscatter
 from udccal.models.geometry import Geometry
 from udccal.mounting import nominal_pupil_mm, nominal_rotation
 from udccal.rig import RigDescription
@@ -19,4 +21,29 @@ def nominal_geometry(rig: RigDescription) -> Geometry:
         distortion=np.zeros(5),
         rotation=np.asarray(Rotation.from_matrix(nominal_rotation(rig)).as_rotvec(), dtype=np.float64),
         pupil=nominal_pupil_mm(rig),
+    )
+
+
+def nominal_backscatter(
+    geometry: Geometry, rig: RigDescription, mask: Float[np.ndarray, "3 a b"], step: int, window: int
+) -> Backscatter:
+    """A term with the rig's nominal measures and the mask given: where the fit starts."""
+    panel = rig.panel
+    return Backscatter(
+        geometry=geometry,
+        mask=mask,
+        mix=np.eye(3),
+        gamma=np.float64(panel.gamma.value),
+        pitch_mm=np.float64(panel.pitch_mm.value),
+        pupil_mm=np.float64(rig.pupil_mm),
+        distance_mm=np.float64(rig.mounting.standoff_mm.value),
+        emitters_px=np.zeros((3, 2)),
+        softness_px=np.float64(0.15),
+        reflection=np.float64(0.5),
+        reflection_mm=np.float64(2 * panel.glass_thickness_mm / panel.glass_index),
+        columns=rig.camera.columns,
+        rows=rig.camera.rows,
+        cfa=rig.camera.cfa,
+        step=step,
+        window=window,
     )

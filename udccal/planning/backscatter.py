@@ -18,13 +18,13 @@ from udccal.cfa import cell_channels
 from udccal.displays.pictures import face_picture
 from udccal.fitting.backscatter.data import (
     grid_step,
-    nominal_term,
     sampled_rays,
     visible_crop,
 )
 from udccal.fitting.backscatter.solve import SLACK_PX, corners_of, window_for
 from udccal.fitting.backscatter.vector import Prior, prior_of, values_of, with_vector
 from udccal.fitting.calibrate import FitEffort
+from udccal.fitting.nominal import nominal_backscatter
 from udccal.models.backscatter import Backscatter, emitter_shares, mixed_colours, panel_light
 from udccal.numerics import in_float64
 from udccal.planning.light import EvenField, sample_variance_e
@@ -61,7 +61,7 @@ class BackscatterPredictor:
         prior = prior_of(rig)
         self._precision = np.diag(prior.sigma**-2.0)
         x = prior.mean if state.backscatter is None else _vector(state.backscatter, prior)
-        template = nominal_term(state.geometry, rig, np.zeros((3, 2, 2)), self._step_px, window=1)
+        template = nominal_backscatter(state.geometry, rig, np.zeros((3, 2, 2)), self._step_px, window=1)
         template = replace(template, window=window_for(template, x, rays, SLACK_PX))
         self._ratios = _ratios(state, template, x, rays)
         # Where in the field the light falls: what leaves the panel evenly is shaded like everything else.

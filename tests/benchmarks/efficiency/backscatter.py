@@ -16,7 +16,7 @@ from jaxtyping import Float
 from tests.benchmarks.efficiency.trials import Trials
 from udccal.displays.pictures import face_picture
 from udccal.fitting.backscatter.bins import Binned
-from udccal.fitting.backscatter.data import PanelShots, grid_step, nominal_term, visible_crop
+from udccal.fitting.backscatter.data import PanelShots, grid_step, visible_crop
 from udccal.fitting.backscatter.evidence import evidence, pictures_of, weights
 from udccal.fitting.backscatter.fit import problem_of
 from udccal.fitting.backscatter.light import Knowledge, grid_rays, predict_light
@@ -35,7 +35,7 @@ from udccal.fitting.backscatter.vector import (
     values_of,
     with_vector,
 )
-from udccal.fitting.nominal import nominal_geometry
+from udccal.fitting.nominal import nominal_backscatter, nominal_geometry
 from udccal.models.backscatter import Backscatter, panel_response, response_grid
 from udccal.numerics import in_float64
 from udccal.rig import Nominal, RigDescription, load_rig
@@ -94,7 +94,7 @@ def world_at(x: Float[np.ndarray, "18"], rig: RigDescription, white: Float[np.nd
     rows, columns = rig.camera.rows // step, rig.camera.columns // step
     v, u = np.mgrid[-1 : 1 : 1j * rows, -1 : 1 : 1j * columns]
     mask = white * (1 - 0.3 * (u**2 + v**2) / 2)
-    template = nominal_term(nominal_geometry(rig), rig, mask, step, window=1)
+    template = nominal_backscatter(nominal_geometry(rig), rig, mask, step, window=1)
     rays = grid_rays(template, np.arange(rows * columns))
     term = with_vector(replace(template, window=window_for(template, x, rays, 1.0)), jax.numpy.asarray(x))
     return World(rig, jax.tree.map(np.asarray, term), x)

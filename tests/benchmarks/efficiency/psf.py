@@ -8,11 +8,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from tests.benchmarks.efficiency.trials import Trials
 from tests.benchmarks.psf_scene import Picture, Scene, pictures, shots_of, small_scene
@@ -20,11 +17,10 @@ from udccal.fitting.information import cramer_rao
 from udccal.fitting.psf.blocks import Block, blocks, fit_lattice
 from udccal.fitting.psf.descent import Prior, damped
 from udccal.fitting.psf.field import fit_field
-from udccal.fitting.psf.normal import Evaluator, kernel_coefficients, overlaps_of, unit_light
+from udccal.fitting.psf.normal import Evaluator, kernel_coefficients, overlaps_of, unit_light_by_move
 from udccal.fitting.psf.posterior import kernel_and_slopes, light_and_slopes
 from udccal.fitting.psf.start import start_model, start_prior
 from udccal.fitting.psf.weights import sensor_variance
-from udccal.models.arrays import Arrayish
 from udccal.numerics import in_float64
 
 _REALISATIONS = 100
@@ -144,17 +140,7 @@ def _slopes(
     light = np.einsum("snc,sc->sn", colour, flux)
     own = np.einsum("snc,snc->sn", unit.reshape(*shape, 3), colour)
     by_global = np.einsum("psnc,snc,sn->snp", by_theta.reshape(-1, *shape, 3), colour, light)
-    moved = np.asarray(_by_move(evaluator, theta, block)) * light[..., None]
+    kernel = kernel_coefficients(evaluator, theta, block, overlaps_of(evaluator, theta, block.frame))
+    moved = np.asarray(unit_light_by_move(evaluator, block, np.zeros((shape[0], 2)), kernel)) * light[..., None]
     by_local = [moved, own[..., None] * colour, np.ones((*shape, 1))]
     return by_global, np.concatenate(by_local, axis=-1), own * light
-
-
-@eqx.filter_jit
-def _by_move(evaluator: Evaluator, theta: Float[Arrayish, " p"], block: Block) -> Float[Array, "shots n 2"]:
-    """Of one unit of light, when its source moves by a pixel."""
-    kernel = kernel_coefficients(evaluator, theta, block, overlaps_of(evaluator, theta, block.frame))
-
-    def at(move: Float[Array, "2"]) -> Float[Array, "shots n"]:
-        return unit_light(evaluator, block, jnp.broadcast_to(move, (jnp.shape(block.rate)[0], 2)), kernel)
-
-    return jax.jacfwd(at)(jnp.zeros(2))

@@ -10,6 +10,7 @@ from jaxtyping import Array, Float, Int, UInt8
 
 from udccal.fitting.backscatter.bins import Binned, Binning
 from udccal.fitting.backscatter.blocks import in_blocks
+from udccal.fitting.nominal import nominal_backscatter
 from udccal.models.arrays import Arrayish
 from udccal.models.backscatter import Backscatter, footprints, grid_positions
 from udccal.models.geometry import Geometry, panel_directions
@@ -99,7 +100,7 @@ def visible_crop(geometry: Geometry, rig: RigDescription) -> PanelCrop:
     camera, panel = rig.camera, rig.panel
     edge_x, edge_y = np.linspace(0, camera.columns - 1, 9), np.linspace(0, camera.rows - 1, 9)
     pixels = np.stack(np.meshgrid(edge_x, edge_y), axis=-1).reshape(-1, 2)
-    template = nominal_term(geometry, rig, np.zeros((3, 2, 2)), grid_step(rig), window=1)
+    template = nominal_backscatter(geometry, rig, np.zeros((3, 2, 2)), grid_step(rig), window=1)
     rays = directions(geometry, pixels)
     (centre,) = in_blocks(lambda part: (_centres(template, part),), rays)
     first = np.floor(centre.min(axis=0)).astype(int) - _MARGIN_PX
@@ -112,31 +113,6 @@ def visible_crop(geometry: Geometry, rig: RigDescription) -> PanelCrop:
 @jax.jit
 def _centres(term: Backscatter, rays: Float[Arrayish, "b 3"]) -> Float[Array, "b 2"]:
     return footprints(term, rays, term.distance_mm)[0]
-
-
-def nominal_term(
-    geometry: Geometry, rig: RigDescription, mask: Float[np.ndarray, "3 a b"], step: int, window: int
-) -> Backscatter:
-    """A term with the rig's nominal measures and the mask given: where the fit starts."""
-    panel = rig.panel
-    return Backscatter(
-        geometry=geometry,
-        mask=mask,
-        mix=np.eye(3),
-        gamma=np.float64(panel.gamma.value),
-        pitch_mm=np.float64(panel.pitch_mm.value),
-        pupil_mm=np.float64(rig.pupil_mm),
-        distance_mm=np.float64(rig.mounting.standoff_mm.value),
-        emitters_px=np.zeros((3, 2)),
-        softness_px=np.float64(0.15),
-        reflection=np.float64(0.5),
-        reflection_mm=np.float64(2 * panel.glass_thickness_mm / panel.glass_index),
-        columns=rig.camera.columns,
-        rows=rig.camera.rows,
-        cfa=rig.camera.cfa,
-        step=step,
-        window=window,
-    )
 
 
 @in_float64

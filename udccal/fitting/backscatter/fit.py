@@ -17,7 +17,6 @@ from udccal.fitting.backscatter.begin import Problem
 from udccal.fitting.backscatter.data import (
     PanelShots,
     grid_step,
-    nominal_term,
     read_shots,
     sampled_rays,
     visible_crop,
@@ -27,6 +26,7 @@ from udccal.fitting.backscatter.report import told
 from udccal.fitting.backscatter.select import choose
 from udccal.fitting.backscatter.solve import SLACK_PX, scan_offset, window_for
 from udccal.fitting.backscatter.vector import prior_of
+from udccal.fitting.nominal import nominal_backscatter
 from udccal.fitting.result import FitResult, FitStatus
 from udccal.models.backscatter import Backscatter
 from udccal.models.geometry import Geometry
@@ -92,7 +92,7 @@ def problem_of(shots: PanelShots, geometry: Geometry, rig: RigDescription, posit
     rays, flat = sampled_rays(geometry, rig, step, positions)
     prior = prior_of(rig)
     # The mask comes out of the likelihood; the template's is of no size.
-    template = nominal_term(geometry, rig, np.zeros((3, 1, 1)), step, window=1)
+    template = nominal_backscatter(geometry, rig, np.zeros((3, 1, 1)), step, window=1)
     wide = replace(template, window=window_for(template, prior.mean, rays, SLACK_PX))
     seen = evidence(shots, rays, flat, pictures_of(shots.shown, shots.crop))
     return Problem(wide, seen, flat, prior, scan_offset(wide, seen, rig, prior).x)

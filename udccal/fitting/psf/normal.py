@@ -122,7 +122,7 @@ def normal_equations(
     unit = jnp.einsum("snj,cj,snc->sn", nodes, spectra, colour)
     slopes = jnp.einsum("snfc,snc->snf", by_colour, colour) @ factors_by_parameter(model, block.frame)
     slopes = slopes.at[..., PUPIL].add(jnp.asarray(block.overlap_slope))
-    by_move = _by_move(evaluator, block, coefficients @ spectra.T, offset)
+    by_move = unit_light_by_move(evaluator, block, offset, coefficients @ spectra.T)
     by_logs = jnp.einsum("snc,cj,snj->sncj", colour, spectra, nodes - unit[..., None])
     flux = jnp.einsum("snc,sc->sn", colour, jnp.asarray(local.flux))
     by_global = flux[..., None] * jnp.concatenate([slopes, by_logs.reshape(*unit.shape, -1)], axis=-1)
@@ -146,9 +146,8 @@ def local_equations(
 ) -> tuple[Float[Array, "shots l l"], Float[Array, "shots l"]]:
     """Normal matrix and right side of every shot's own unknowns for a given kernel."""
     coefficients, offset = jnp.asarray(coefficients), jnp.asarray(local.offset_px)
-    unit = jnp.sum(_sampled(evaluator, block, coefficients, offset) * block.colour, axis=-1)
-    unit = unit + jnp.asarray(block.correction)
-    by_move = _by_move(evaluator, block, coefficients, offset)
+    unit = unit_light(evaluator, block, offset, coefficients) + jnp.asarray(block.correction)
+    by_move = unit_light_by_move(evaluator, block, offset, coefficients)
     by_local = _by_local(block, local, unit, by_move)
     residual = _residual(block, local, unit)
     huber, _ = _huber(block, residual)
@@ -168,18 +167,17 @@ def unit_light(
     return jnp.sum(values * block.colour, axis=-1)
 
 
-def _by_move(
+@eqx.filter_jit
+def unit_light_by_move(
     evaluator: Evaluator,
     block: Block,
-    coefficients: Float[Array, "rows columns 3"],
-    offset_px: Float[Array, "shots 2"],
+    offset_px: Float[Arrayish, "shots 2"],
+    coefficients: Float[Arrayish, "rows columns 3"],
 ) -> Float[Array, "shots n 2"]:
-    """Of one unit of light, when its source moves by a pixel."""
-
-    def light(move: Float[Array, "2"]) -> Float[Array, "shots n"]:
-        return jnp.sum(_sampled(evaluator, block, coefficients, offset_px + move) * block.colour, axis=-1)
-
-    return jax.jacfwd(light)(jnp.zeros(2))
+    """Slopes of ``unit_light`` by the place (x, y) of each shot's source, per pixel."""
+    return jax.jacfwd(lambda move: unit_light(evaluator, block, jnp.asarray(offset_px) + move, coefficients))(
+        jnp.zeros(2)
+    )
 
 
 def _by_local(

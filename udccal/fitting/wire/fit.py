@@ -77,21 +77,7 @@ def fit_wire(session: Session, noise: Noise, geometry: Geometry, field_samples: 
     headroom = saturation - float(np.mean(dark.mean))
     clip = headroom - _HEADROOM * np.sqrt(max(headroom * float(np.asarray(noise.K_DN_per_e)), 0.0))
     prnu = float(np.asarray(noise.PRNU1288))
-    return fit_wire_map(flat.mean - dark.mean, variance, geometry, start, prnu, field_samples, clip)
-
-
-def fit_wire_map(
-    signal: Float[np.ndarray, "rows columns"],
-    variance: Float[np.ndarray, "rows columns"],
-    geometry: Geometry,
-    start: WireStart,
-    prnu: float,
-    field_samples: int = FIELD_SAMPLES,
-    clip: float = np.inf,
-    all_pixels: bool = False,
-) -> FitResult[Wire]:
-    """The result of ``fit_wire_and_sigma``, whose arguments these are."""
-    return fit_wire_and_sigma(signal, variance, geometry, start, prnu, field_samples, clip, all_pixels).result
+    return fit_wire_and_sigma(flat.mean - dark.mean, variance, geometry, start, prnu, field_samples, clip).result
 
 
 @in_float64
