@@ -118,7 +118,8 @@ def compared(term: TermName, designs: list[tuple[str, Captures, Obtained]]) -> l
     fits = Measured(base.noise, base.geometry, base.wire, rest.psf, rest.backscatter)
     state = measured_state(first.session.rig, fits)
     # A corner's scatter goes for its noise, whatever it comes from.
-    by_noise = replace(state, unexplained=Unexplained(corner_px=state.unexplained.corner_px))
+    known = state.unexplained
+    by_noise = replace(state, unexplained=Unexplained(on_jig_px=known.on_jig_px, by_hand_px=known.by_hand_px))
     predictor = predictor_for(term, by_noise)
     rows = []
     for name, captures, made in designs:

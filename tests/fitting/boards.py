@@ -86,8 +86,8 @@ class Sight:
         return ((exact > 2) & (exact < np.array(self.size) - 3)).all(axis=-1)
 
     def views(self, rng: np.random.Generator, parallel: int = 1) -> list[BoardView]:
-        """With noise; corners outside the picture are not seen. ``sigma`` is what the fit's own floor leaves of it."""
-        own = np.sqrt(np.maximum(self.sigma_px**2 - FLOOR_PX**2, 0.0))
+        """With noise; corners outside the picture are not seen. ``sigma`` is without the scatter that all share."""
+        own = np.sqrt(np.maximum(self.sigma_px**2 - COMMON_PX**2, 0.0))
         found = []
         for k, (exact, inside) in enumerate(zip(self.corners_px(), self.seen(), strict=True)):
             seen = np.flatnonzero(inside)
@@ -97,8 +97,8 @@ class Sight:
         return found
 
 
-# Corners of a session are not believed to be better than this.
-FLOOR_PX = 0.04
+# Of all corners, beside their own noise.
+COMMON_PX = 0.04
 WIDE = (1024, 768)
 WIDE_SPEC = BoardSpec(columns=9, rows=7, square_mm=60.0, marker_mm=45.0)
 MOUNTED_DEG = (0.6, -0.4)
@@ -142,7 +142,7 @@ def sight(
         poses.append(np.concatenate([cv2.Rodrigues(matrix)[0].ravel(), centre - matrix @ middle]))
     corners = len(board_points_mm(WIDE_SPEC))
     sigma = sigma_px * rng.uniform(0.5, 1.5, (views, corners))
-    return Sight(camera, WIDE, WIDE_SPEC, np.array(poses), np.maximum(sigma, FLOOR_PX), tilt_deg)
+    return Sight(camera, WIDE, WIDE_SPEC, np.array(poses), np.maximum(sigma, COMMON_PX), tilt_deg)
 
 
 def _matrix(pose: np.ndarray) -> np.ndarray:

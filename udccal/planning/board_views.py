@@ -21,11 +21,9 @@ from udccal.planning.state import WHITE, RigState
 from udccal.planning.steps import PlannedStep
 
 LENS = 9
-# What a saddle leaves out of a corner of a board square to the ray, by axis, where no profile has measured it; squares
-# seen aslant are less like it, by this power of how much they are shortened. Over the procedure's poses together,
-# corners scatter this many times as much as on a square board.
-_COMMON_SCATTER_PX = 0.015
-_ASLANT_POWER, _ASLANT_ON_AVERAGE = 3.0, 1.75
+# What a saddle leaves out of a corner, by axis, where no profile has measured it. Edges of the board on the jig run
+# along the sensor's rows: samples meet them at few phases, and corners scatter more than on boards that lean.
+_ON_JIG_PX, _BY_HAND_PX = 0.0085, 0.006
 # White paper reflects so much more than black ink that half the difference is this part of white.
 _HALF_CONTRAST = 0.47
 # Edges after lens, pixel and the filter that makes a grey picture of a mosaic (one sigma).
@@ -65,11 +63,8 @@ def planned_view(state: RigState, field: EvenField, step: PlannedStep, board: Bo
     good = np.asarray(inside & _named(corners, markers, marked, board.spec))
     if depth <= 0 or good.sum() < MIN_CORNERS:
         return None
-    known = state.unexplained.corner_px
-    square = _COMMON_SCATTER_PX if known is None else known / _ASLANT_ON_AVERAGE
-    ray = rotation @ corners.mean(axis=0) + origin
-    aslant = abs(float(rotation[:, 2] @ ray)) / float(np.linalg.norm(ray))
-    scatter = np.hypot(noise_scatter_px(state, field, step, pixels[good], radius), square * aslant**-_ASLANT_POWER)
+    noise = noise_scatter_px(state, field, step, pixels[good], radius)
+    scatter = np.hypot(noise, _scatter_px(state, board))
     whole = slopes[good] / scatter[:, None, None]
     information = np.einsum("cai,caj->ij", whole, whole)
     kept = LENS + (3 if board.parallel_to_panel else 0)
@@ -78,14 +73,21 @@ def planned_view(state: RigState, field: EvenField, step: PlannedStep, board: Bo
     return PlannedView(reduced, int(good.sum()), board.parallel_to_panel)
 
 
+def _scatter_px(state: RigState, board: Board) -> float:
+    """Beside noise; the few views that lean so far that squares are scarcely resolved count for little in any fit."""
+    if board.parallel_to_panel:
+        return _ON_JIG_PX if state.unexplained.on_jig_px is None else state.unexplained.on_jig_px
+    return _BY_HAND_PX if state.unexplained.by_hand_px is None else state.unexplained.by_hand_px
+
+
 def noise_scatter_px(
     state: RigState, field: EvenField, step: PlannedStep, pixels: Float[np.ndarray, "n 2"], radius: float
 ) -> Float[np.ndarray, " n"]:
-    """Scatter of saddles by noise: temporal noise averages over frames, the pixels' unequal response does not."""
+    """Scatter of saddles by temporal noise of the board's frames; boards are divided by far more frames of the flat."""
     white = (step.level or 0.0) * state.full_well_e * field.at(pixels)
     signal = white[:, None] * np.array(WHITE)[[0, 1, 1, 2]] / max(WHITE)
     temporal = sample_variance_e(state, 0.5 * signal, step.exposures_s[0]) / len(step.exposures_s)
-    relative = temporal / signal**2 + (0.5 * float(np.asarray(state.noise.PRNU1288))) ** 2
+    relative = temporal / signal**2
     return np.asarray(np.sqrt(relative.mean(axis=1)) / _HALF_CONTRAST * saddle_scatter(radius, _EDGE_PX))
 
 

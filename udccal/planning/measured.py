@@ -7,6 +7,7 @@ from typing import Any, final
 
 import numpy as np
 
+from udccal.fitting.geometry.fit import BY_HAND, ON_JIG
 from udccal.fitting.result import FitResult, FitStatus
 from udccal.models.backscatter import Backscatter
 from udccal.models.geometry import Geometry
@@ -41,7 +42,8 @@ def measured_state(rig: RigDescription, fits: Measured) -> RigState:
         psf=fits.psf.term if _seen(fits.psf) else None,
         backscatter=fits.backscatter.term if _seen(fits.backscatter) else None,
         unexplained=Unexplained(
-            corner_px=corner_scatter_px(fits.geometry) if geometry_seen else None,
+            on_jig_px=_corners(fits.geometry, ON_JIG) if geometry_seen else None,
+            by_hand_px=_corners(fits.geometry, BY_HAND) if geometry_seen else None,
             wire=_diagnostic(fits.wire, "wire_map_model_sigma") / 100,
             psf=_diagnostic(fits.psf, "model_error"),
             backscatter=_diagnostic(fits.backscatter, "model_error_of_white"),
@@ -50,19 +52,15 @@ def measured_state(rig: RigDescription, fits: Measured) -> RigState:
     )
 
 
-def corner_scatter_px(geometry: FitResult[Geometry]) -> float | None:
-    """Scatter of corners by axis as a geometry fit found it, disagreement of views included; None where not known."""
-    views, rms_px = _diagnostic(geometry, "views"), _diagnostic(geometry, "rms_reprojection")
-    if views == 0 or rms_px == 0:
-        return None
-    free = sum(estimate.sigma > 0 for estimate in geometry.estimates)
-    spent = (free + 6 * views) / max(geometry.samples, 1)
-    by_axis = rms_px / np.sqrt(2 * max(1 - spent, 0.05))
-    return float(by_axis * np.sqrt(max(_diagnostic(geometry, "variance_factor"), 1.0)))
-
-
 def _seen(result: FitResult[Any]) -> bool:
     return result.status is FitStatus.CONVERGED
+
+
+def _corners(geometry: FitResult[Geometry], name: str) -> float | None:
+    """Scatter of corners beside noise, disagreement of views included; None where the fit does not tell."""
+    if all(item.name != name for item in geometry.diagnostics):
+        return None
+    return _diagnostic(geometry, name) * float(np.sqrt(max(_diagnostic(geometry, "variance_factor"), 1.0)))
 
 
 def _diagnostic(result: FitResult[Any], name: str) -> float:

@@ -34,13 +34,14 @@ class Unexplained:
     """What noise does not explain, as a profile's fits have found it.
 
     Attributes:
-        corner_px: scatter of a board's corners by axis over the procedure's poses; None where not known.
+        on_jig_px, by_hand_px: scatter of a board's corners by axis beside noise; None where not known.
         wire, psf: relative error of the model.
         backscatter: error of a ratio to white.
         inflation: of the variances of the backscatter's parameters, whose residuals hang together.
     """
 
-    corner_px: float | None = None
+    on_jig_px: float | None = None
+    by_hand_px: float | None = None
     wire: float = 0.0
     psf: float = 0.0
     backscatter: float = 0.0

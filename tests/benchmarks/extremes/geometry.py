@@ -134,7 +134,7 @@ _EXTREMES: tuple[tuple[str, Callable[[], Outcome]], ...] = (
     ("a view of corners on one line", lambda: _run(sight(), _one_line)),
     ("a tenth of the corners not a number", lambda: _run(sight(), _nan_corners)),
     ("corners to 1 px", lambda: _run(sight(sigma_px=1.0))),
-    ("corners to the fit's floor", lambda: _run(sight(sigma_px=0.0))),
+    ("corners without noise of their own", lambda: _run(sight(sigma_px=0.0))),
     ("no distortion", lambda: _run(sight(distortion=np.zeros(5)))),
     ("distortion of a third", lambda: _run(sight(distortion=np.array([-0.35, 0.15, 1e-3, -1e-3, -0.03])))),
 )

@@ -71,6 +71,13 @@ def _converged(line: Line) -> str:
     return f"{line.fields.get('converged', line.fields.get('seeds', _NONE))} of {line.fields.get('seeds', _NONE)} seeds"
 
 
+def _z_std(line: Line) -> str:
+    if "projection_z_std" not in line.fields:
+        return _NONE
+    z, error = line.fields["projection_z_std"], line.fields["projection_z_std_error"]
+    return f"{z:.2f} ± {error:.2f}, {line.fields['covered']} seeds"
+
+
 _SECONDS: tuple[tuple[str, Cell], ...] = (
     ("s", _number("seconds")),
     ("first run, s", _number("first_run_s")),
@@ -85,7 +92,7 @@ _COLUMNS: dict[str, tuple[tuple[str, Cell], ...]] = {
         ("saturation, %", _number("rel_err_rms", "sat", factor=100, digits=2)),
         ("dark current, %", _number("rel_err_rms", "dark_current", factor=100, digits=2)),
         ("linearity, points", _number("rel_err_rms", "lin_rms_pp", digits=2)),
-        ("K over its bound, many frames", _number("K_rmse_over_crb_20small")),
+        ("K over its bound, 20 small sets", _number("K_rmse_over_crb_20small")),
     ),
     "hdr": (
         ("over the bound per decade, dark to bright", _decades),
@@ -100,7 +107,7 @@ _COLUMNS: dict[str, tuple[tuple[str, Cell], ...]] = {
         ("error after rotation, px", _number("rot_rms")),
         ("largest, px", _number("rot_max")),
         ("right minimum", _converged),
-        ("projection z std", _number("projection_z_std")),
+        ("projection z std", _z_std),
     ),
 }
 

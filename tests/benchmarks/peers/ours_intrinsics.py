@@ -1,9 +1,10 @@
 """The work ``intrinsics`` of the peers' folder, through ``calibrate_views``. Prints one JSON line as the peers do.
 
-    python tests/benchmarks/peers/ours_intrinsics.py --peers ../shared/peers --seeds 10 --starts 1000
+    python -m tests.benchmarks.peers.ours_intrinsics --peers ../shared/peers --seeds 10 --starts 1000 --covered 200
 
 ``rot_rms`` is the pixel error over the field after the best common rotation, root mean square over the seeds, and
-``predicted_rms`` what the covariances say of it; ``projection_z_std`` compares the two place by place.
+``predicted_rms`` what the covariances say of it; ``projection_z_std`` compares the two place by place, over as many
+seeds as ``--covered`` says: the places of one seed share its noise, and ten seeds do not tell an error bar.
 ``seconds`` is the median of one calibration once compiled, ``first_run_s`` the very first with compilation.
 """
 
@@ -78,12 +79,29 @@ def aligned(works: ModuleType, intrinsics: np.ndarray) -> np.ndarray:
     return works.project(intrinsics, rays @ works.rodrigues(turn).T) - pixels
 
 
+def z_scores(works: ModuleType, result: CalibratedViews) -> np.ndarray:
+    """Errors after the best common rotation in units of the sigma stated for them, (81, 2)."""
+    cov = result.projection_covariance(works.intr_grid(), Gauge.ALIGNED)
+    return aligned(works, result.intrinsics) / np.sqrt(np.einsum("nii->ni", cov))
+
+
+def spread(works: ModuleType, seeds: int) -> tuple[float, float]:
+    """Root mean square of the z-scores over so many seeds, and its standard error."""
+    size = (works.W, works.H)
+    square = np.array(
+        [(z_scores(works, calibrate_views(*boards(works, seed), size)) ** 2).mean() for seed in range(seeds)]
+    )
+    rms = float(np.sqrt(square.mean()))
+    return rms, float(square.std(ddof=1) / np.sqrt(seeds) / (2 * rms))
+
+
 def main() -> None:
     """Calibrate all seeds, then start from anywhere."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--peers", type=Path, required=True, help="folder that holds works.py")
     parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--starts", type=int, default=0, help="random starts, spread over the seeds")
+    parser.add_argument("--covered", type=int, default=10, help="seeds over which error bars are compared with errors")
     options = parser.parse_args()
     sys.path.insert(0, str(options.peers.resolve()))
     works = importlib.import_module("works")
@@ -92,18 +110,17 @@ def main() -> None:
     begun = time.perf_counter()
     calibrate_views(*data[0], size)
     first = time.perf_counter() - begun
-    results, seconds, errors, sigmas = [], [], [], []
+    results, seconds, sigmas = [], [], []
     for views in data:
         calibrate_views(*views, size)  # other numbers of corners may be another padded size
         result, taken, _ = works.timed(lambda views=views: calibrate_views(*views, size))
         results.append(result)
         seconds.append(taken)
-        errors.append(aligned(works, result.intrinsics))
         cov = result.projection_covariance(works.intr_grid(), Gauge.ALIGNED)
         sigmas.append(np.sqrt(np.einsum("nii->ni", cov)))
     metrics = [works.intrinsics_metrics(result.intrinsics) for result in results]
     pooled = {key: float(np.sqrt(np.mean([m[key] ** 2 for m in metrics]))) for key in metrics[0]}
-    z = np.array(errors) / np.array(sigmas)
+    z_std, z_std_error = spread(works, options.covered)
     found = converged(works, data, results, options.starts) if options.starts else None
     works.emit(
         "intrinsics",
@@ -116,7 +133,9 @@ def main() -> None:
         orders=[next(c.name for c in result.candidates if c.chosen) for result in results],
         reproj_rms=[result.rms_px for result in results],
         predicted_rms=float(np.sqrt((np.square(sigmas).sum(axis=2)).mean())),
-        projection_z_std=float(np.sqrt(np.mean(z**2))),
+        projection_z_std=z_std,
+        projection_z_std_error=z_std_error,
+        covered=options.covered,
         starts=options.starts,
         starts_converged=found,
         uncertainty="projection covariance per pixel, in three gauges",

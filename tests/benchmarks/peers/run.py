@@ -50,10 +50,10 @@ PEERS = (
     Peer("intrinsics", None, "intrinsics_mrcal.py"),
 )
 OURS = {
-    "noise": ("ours_noise", "ours_noise --variant nonlin"),
+    "noise": ("ours_noise --small 20", "ours_noise --variant nonlin"),
     "hdr": ("ours_hdr",),
     "psf_field": ("ours_psf_field",),
-    "intrinsics": ("ours_intrinsics --starts 1000",),
+    "intrinsics": ("ours_intrinsics --starts 1000 --covered 200",),
 }
 
 
@@ -78,6 +78,7 @@ def main() -> None:
     results = options.out / "results.jsonl"
     kept = [line for line in _read(results) if not _measured_again(line, works, options.ours_only)]
     for work in works:
+        _read_once(Path(environment["PEERS_OUT"]), work)
         for script in OURS[work]:
             command = [sys.executable, "-m", *f"tests.benchmarks.peers.{script}".split(), "--peers", str(options.peers)]
             kept += _run(work, f"udccal ({script})", command, _ROOT, environment)
@@ -100,6 +101,14 @@ def _set_up(peers: Path, environment: dict[str, str]) -> None:
         if not line.startswith("mk ") or line.split()[1] in needed
     )
     subprocess.run(["sh", "-c", script], cwd=peers, env=environment, check=False, timeout=_LIMIT_S)
+
+
+def _read_once(data: Path, work: str) -> None:
+    """Read the work's inputs of earlier runs: else the script that comes first is timed with the disk, and no other."""
+    for path in data.glob(f"{work}_*/*"):
+        with path.open("rb") as file:
+            while file.read(1 << 24):
+                pass
 
 
 def _python(peer: Peer, environments: Path) -> str:

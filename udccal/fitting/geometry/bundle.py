@@ -18,6 +18,7 @@ from udccal.fitting.geometry.bundle_noise import (
     STRANGE_RULE,
     Scatter,
     covariance,
+    least_scale,
     leverages,
     maximum_likelihood,
     strange_views,
@@ -236,7 +237,7 @@ def _rescaled(ordered: Ordered, points: Points, prior: Prior) -> tuple[Solved, P
     use = points.used
     dof = float((2 - leverages(solved, points, ordered.free))[use].sum())
     square = ((residuals_px(solved.bundle, points) / points.sigma[:, None])[use] ** 2).sum()
-    factor = max(np.sqrt(square / max(dof, 1.0)), 1e-6)
+    factor = max(np.sqrt(square / max(dof, 1.0)), least_scale(points))
     points = points.scaled(np.full(len(points.names), factor))
     return solve(solved.bundle, points, ordered.free, prior), points, max(dof, 1.0)
 

@@ -27,7 +27,8 @@ _SETTLED_SCALE = 0.1
 _MEDIAN = 1.1774100225154747
 # A view of few points may fit them all by its pose: its robust sigma is not taken below this part of all views'.
 _LEAST_OF_ALL = 0.5
-_LEAST_SCALE = 1e-6
+# Below this, residuals are rounding: exact points must not count as surer than arithmetic.
+_LEAST_SIGMA_PX = 1e-8
 # Views differ in their scatter where equal ones would look so unequal this rarely (Bartlett, 1937).
 _DIFFER_P = 1e-3
 _SCALE_ROUNDS = 4
@@ -50,7 +51,12 @@ def robust_scales(bundle: Bundle, points: Points) -> Float[np.ndarray, " views"]
     length = np.linalg.norm(residuals_px(bundle, points), axis=1) / points.sigma
     own = np.array([_median(length[(points.view == k) & points.used]) for k in range(len(points.names))])
     every = _median(length[points.used])
-    return np.maximum(np.maximum(own, _LEAST_OF_ALL * every), _LEAST_SCALE)
+    return np.maximum(np.maximum(own, _LEAST_OF_ALL * every), least_scale(points))
+
+
+def least_scale(points: Points) -> float:
+    """The least by which the sigma of points may be scaled."""
+    return _LEAST_SIGMA_PX / float(np.median(points.sigma))
 
 
 def _median(length: np.ndarray) -> float:
@@ -145,7 +151,7 @@ def maximum_likelihood(
         per_view = _differ(square, dof)
         own = np.sqrt(square / np.maximum(dof, 1.0)) if per_view else np.full(len(dof), common)
         settled = np.allclose(own, scales, rtol=1e-3)
-        scales = np.maximum(own, _LEAST_SCALE)
+        scales = np.maximum(own, least_scale(given))
         points = given.scaled(scales)
         solved = solve(solved.bundle, points, free, prior)
         if settled or not per_view:

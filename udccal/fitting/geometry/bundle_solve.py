@@ -241,7 +241,7 @@ def solve(start: Bundle, points: Points, free: Bool[np.ndarray, "9"], prior: Pri
         cost=float(state.cost),
         iterations=int(state.iteration),
         # A solver that stalls at the limit of its arithmetic passes; one that ran out of iterations does not.
-        converged=bool(np.isfinite(state.cost) and fall < max(1e-3 * share, 1e-12)),
+        converged=bool(np.isfinite(state.cost) and fall < max(1e-3 * share, 1e-6)),
         common=state.normal.common,
         mixed=state.normal.mixed[:count],
         own=state.normal.own[:count],

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.ndimage import convolve1d
 
 from udccal.arrangements import BoardSpec
 from udccal.errors import FitError
+from udccal.fitting.geometry.luminance import Luminance
 from udccal.fitting.geometry.saddles import fit_saddles
 
 # Fewer corners than this do not hold a pose and say little about the lens.
@@ -25,7 +25,10 @@ _MAX_RADIUS_SQUARES = 0.4
 
 @dataclass(frozen=True)
 class BoardCorners:
-    """Corners found: their numbers on the board, where they are in sensor pixels, and one sigma of that in px."""
+    """Corners found: their numbers on the board, where they are in sensor pixels, and one sigma in px of that by noise.
+
+    What a board's print and the picture's blur add to it, the bundle tells from how corners scatter.
+    """
 
     ids: Int[np.ndarray, " n"]
     xy: Float[np.ndarray, "n 2"]
@@ -52,36 +55,20 @@ def board_points_mm(spec: BoardSpec) -> Float[np.ndarray, "corners 3"]:
     return np.asarray(charuco_board(spec).getChessboardCorners(), dtype=np.float64).reshape(-1, 3)
 
 
-def luminance(mosaic: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray, "rows columns"]:
-    """Grey picture of a black-and-white subject on the mosaic's own pixels; ``mosaic`` is black-free.
-
-    The four sites of the pattern are brought to one mean and averaged with the filter (1 2 1) x (1 2 1) / 16, which
-    gives each site exactly one quarter at every pixel and is symmetric: nothing moves, and no pattern is left.
-    """
-    grey = np.asarray(mosaic, dtype=np.float64).copy()
-    total = max(float(grey.mean()), 1e-12)
-    for row in (0, 1):
-        for column in (0, 1):
-            site = grey[row::2, column::2]
-            site *= total / max(float(site.mean()), 1e-12)
-    binomial = np.array([0.25, 0.5, 0.25])
-    return np.asarray(convolve1d(convolve1d(grey, binomial, axis=0), binomial, axis=1), dtype=np.float64)
-
-
-def detect_corners(grey: Float[np.ndarray, "rows columns"], spec: BoardSpec) -> BoardCorners:
+def detect_corners(picture: Luminance, spec: BoardSpec) -> BoardCorners:
     """Find a board's inner corners in a grey picture (any linear unit); none found gives empty arrays.
 
     Raises:
         FitError: when the board's dictionary is unknown.
     """
-    ids, rough = _detect(grey, spec)
+    ids, rough = _detect(picture.grey, spec)
     if len(ids) < MIN_CORNERS:
         return BoardCorners(np.zeros(0, dtype=np.int64), np.zeros((0, 2)), np.zeros(0))
     axis_x, axis_y = _axes_px(board_points_mm(spec)[ids, :2], rough, spec.square_mm)
     margin = _MARKER_MARGIN * np.sqrt(2.0) * (spec.square_mm - spec.marker_mm) / (2.0 * spec.square_mm)
     side = np.minimum(np.linalg.norm(axis_x, axis=1), np.linalg.norm(axis_y, axis=1))
     radius = np.clip(min(margin, _MAX_RADIUS_SQUARES) * side, 4.0, 25.0)
-    saddles = fit_saddles(grey, rough, np.stack([axis_x, axis_y], axis=1), radius)
+    saddles = fit_saddles(picture, rough, np.stack([axis_x, axis_y], axis=1), radius)
     good = saddles.ok
     return BoardCorners(ids[good], saddles.xy[good], saddles.sigma[good])
 

@@ -18,6 +18,7 @@ from udccal.fitting.geometry.angles import ANGLE_NAMES, panel_rotation, with_ang
 from udccal.fitting.geometry.bundle import INTRINSIC_NAMES, MIN_VIEWS, CalibratedViews, Prior, calibrate_views
 from udccal.fitting.geometry.bundle_noise import OUTLIER_RULE
 from udccal.fitting.geometry.bundle_points import bucket
+from udccal.fitting.geometry.corner_scatter import CornerScatter, excess_scatter
 from udccal.fitting.geometry.corners import MIN_CORNERS, board_points_mm
 from udccal.fitting.geometry.views import MAX_CLIPPED, BoardView, read_views
 from udccal.fitting.nominal import nominal_geometry
@@ -31,14 +32,16 @@ from udccal.sessions.store import Session
 __all__ = ["BoardView", "fit_geometry", "fit_views", "projection_sigma_px", "read_views", "rig_prior"]
 
 _WORST_RMS_PX, _WORST_CHI2_DOF = 1.0, 9.0
-# A corner's own sigma says little about what the saddle leaves out; this is added to it in quadrature.
-_SIGMA_FLOOR_PX = 0.04
+# Corners' scatter beside noise: where its estimate starts, and the change that ends it (relatively).
+_START_SCATTER_PX, _SETTLED, _SCATTER_ROUNDS = 0.02, 0.05, 4
 # Lenses sit on their sensors' middles to about this part of the width (one sigma).
 _CENTRE_SIGMA = 0.01
 # (k1, k2, p1, p2, k3) of lenses that this model describes.
 _BEND_SIGMA = (0.2, 0.2, 1e-3, 1e-3, 0.1)
 _MOST_RESIDUALS = 2000
 _PATTERN = "residual_pattern"
+# Diagnostics that a plan reads: scatter beside noise of the board on the jig, and of the median view of others.
+ON_JIG, BY_HAND = "corner_scatter_on_jig", "corner_scatter_by_hand"
 UNITS = ("px", "px", "px", "px", "1", "1", "1", "1", "1", "deg", "deg", "deg")
 
 
@@ -90,17 +93,27 @@ def fit_views(
         found = f"Expected {wanted} views with a board and one of them parallel to the panel, found {len(usable)} "
         return _failed(nominal, status, (*notes, f"{found}and {parallel}."))
     try:
-        bundle = calibrate_views(
-            [board_points_mm(view.spec)[view.corners.ids] for view in usable],
-            [view.corners.xy for view in usable],
-            image_size,
-            nominal,
-            [np.hypot(view.corners.sigma, _SIGMA_FLOOR_PX) for view in usable],
-            prior=prior,
-        )
+        bundle, scatter = _calibrated(usable, nominal, image_size, prior)
     except FitError as error:
         return _failed(nominal, FitStatus.TOO_FEW_DATA, (*notes, str(error)))
-    return _result(bundle, [usable[k] for k in bundle.names], nominal, (*notes, *bundle.notes))
+    return _result(bundle, scatter, [usable[k] for k in bundle.names], nominal, (*notes, *bundle.notes))
+
+
+def _calibrated(
+    views: Sequence[BoardView], nominal: Geometry, image_size: tuple[int, int], prior: Prior | None
+) -> tuple[CalibratedViews, CornerScatter]:
+    """The bundle; every corner has its noise and the scatter that all have beside it, estimated with the rest."""
+    scatter = CornerScatter(_START_SCATTER_PX)
+    points = [board_points_mm(view.spec)[view.corners.ids] for view in views]
+    seen = [view.corners.xy for view in views]
+    for _ in range(_SCATTER_ROUNDS):
+        sigmas = [scatter.of(view.corners.sigma) for view in views]
+        bundle = calibrate_views(points, seen, image_size, nominal, sigmas, prior=prior)
+        noise_px = [views[bundle.names[v]].corners.sigma[k] for v, k in zip(bundle.view, bundle.index, strict=True)]
+        before, scatter = scatter, excess_scatter(bundle, np.array(noise_px))
+        if abs(scatter.excess_px - before.excess_px) <= _SETTLED * before.excess_px:
+            break
+    return bundle, scatter
 
 
 def _notes(views: Sequence[BoardView]) -> tuple[str, ...]:
@@ -121,7 +134,11 @@ def _failed(nominal: Geometry, status: FitStatus, notes: tuple[str, ...]) -> Fit
 
 
 def _result(
-    bundle: CalibratedViews, views: list[BoardView], nominal: Geometry, notes: tuple[str, ...]
+    bundle: CalibratedViews,
+    scatter: CornerScatter,
+    views: list[BoardView],
+    nominal: Geometry,
+    notes: tuple[str, ...],
 ) -> FitResult[Geometry]:
     """``views`` are those that the bundle uses."""
     parallel = [k for k, view in enumerate(views) if view.parallel]
@@ -144,7 +161,7 @@ def _result(
         chi2_dof=bundle.chi2_dof,
         samples=2 * int(bundle.used.sum()),
         candidates=bundle.candidates,
-        diagnostics=_diagnostics(bundle),
+        diagnostics=_diagnostics(bundle, scatter, views),
         notes=(*notes, *_rejections(bundle, views), *_held(bundle)),
         outliers=_outliers(bundle, views),
         residuals=_residuals(bundle),
@@ -164,10 +181,15 @@ def _residuals(bundle: CalibratedViews) -> ResidualSample:
     return ResidualSample(np.repeat(bundle.points_px[drawn], 2, axis=0), z.ravel())
 
 
-def _diagnostics(bundle: CalibratedViews) -> tuple[Diagnostic, ...]:
+def _diagnostics(bundle: CalibratedViews, scatter: CornerScatter, views: list[BoardView]) -> tuple[Diagnostic, ...]:
     evidence = bundle.evidence
+    on_jig = [one for one, view in zip(scatter.by_view_px, views, strict=True) if view.parallel]
+    by_hand = [one for one, view in zip(scatter.by_view_px, views, strict=True) if not view.parallel]
     return (
         Diagnostic("rms_reprojection", bundle.rms_px, "px"),
+        Diagnostic("corner_scatter_beside_noise", scatter.excess_px, "px"),
+        Diagnostic(ON_JIG, float(np.median(on_jig)), "px"),
+        Diagnostic(BY_HAND, float(np.median(by_hand or on_jig)), "px"),
         Diagnostic("views", float(len(bundle.names)), "1"),
         Diagnostic("corners_used", float(bundle.used.sum()), "1"),
         Diagnostic("corners_rejected", float((~bundle.used).sum()), "1"),

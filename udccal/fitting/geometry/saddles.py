@@ -16,16 +16,17 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.special import erf
 
+from udccal.fitting.geometry.luminance import Luminance, filtered
+
 _ROUNDS = 12
-# A residual of the (1 2 1) x (1 2 1) / 16 filtered picture has 9/64 of the sample variance, but its noise is
-# correlated: at the low frequencies that move a corner it is the sample noise itself.
-_BINOMIAL_VARIANCE = 9.0 / 64.0
+# Of half the step over what the saddle leaves of the samples: less is no corner.
 _MIN_CONTRAST = 6.0
+_WORST_SIGMA_PX = 1.0
 
 
 @dataclass(frozen=True)
 class Saddles:
-    """Fitted corners; those not ``ok`` ran out of the picture, moved away, or have no contrast."""
+    """Fitted corners, their sigma by noise; not ``ok``: out of the picture, moved away, or without contrast."""
 
     xy: Float[np.ndarray, "n 2"]
     sigma: Float[np.ndarray, " n"]
@@ -33,7 +34,7 @@ class Saddles:
 
 
 def fit_saddles(
-    picture: Float[np.ndarray, "rows columns"],
+    picture: Luminance,
     start: Float[np.ndarray, "n 2"],
     axes: Float[np.ndarray, "n 2 2"],
     radius: Float[np.ndarray, " n"],
@@ -41,17 +42,18 @@ def fit_saddles(
     """Place corners (Gauss-Newton with damping, all corners at once).
 
     Args:
-        picture: filtered grey picture.
+        picture: grey, with the variance of its samples.
         start: rough corners in px, off by less than about half a radius.
         axes: per corner the two edge directions (rows), any length.
         radius: window radius per corner in px.
     """
-    rows, columns = picture.shape
+    rows, columns = picture.grey.shape
     half = int(np.ceil(radius.max())) + 1
     base = np.round(start).astype(np.int64)
     inside = np.all((base >= half) & (base < np.array([columns - half, rows - half])), axis=1)
     base = np.clip(base, half, np.array([columns - half - 1, rows - half - 1]))
-    samples, offsets = _windows(picture, base, half)
+    samples, offsets = _windows(picture.grey, base, half)
+    variance, _ = _windows(picture.variance, base, half)
     angles = np.arctan2(axes[..., 0], -axes[..., 1])
     shape = np.concatenate([start - base, angles, np.full((len(start), 2), np.log(1.5))], axis=1)
     damping = np.full(len(start), 1e-3)
@@ -66,7 +68,13 @@ def fit_saddles(
         linear = np.where(better[:, None], trial_linear, linear)
         cost = np.where(better, trial_cost, cost)
         damping = np.clip(np.where(better, damping / 5, damping * 10), 1e-9, 1e9)
-    return _finish(shape, samples, offsets, radius, start, base, np.asarray(inside))
+    sigma = _noise_sigma(shape, linear, variance, offsets, radius)
+    misfit = np.sqrt(cost / np.maximum(_parts(shape, offsets, radius)[1].sum(-1) - 10, 1.0))
+    xy = base + shape[:, :2]
+    near = np.linalg.norm(xy - start, axis=1) < np.maximum(radius / 2, 3.0)
+    contrast = np.abs(linear[:, 3]) > _MIN_CONTRAST * misfit
+    ok = inside & near & contrast & (sigma < _WORST_SIGMA_PX)
+    return Saddles(xy=xy, sigma=sigma, ok=ok & np.isfinite(xy).all(axis=1))
 
 
 def _windows(
@@ -156,24 +164,20 @@ def _step(
     return np.linalg.solve(normal, right[..., None])[:, :6, 0]
 
 
-def _finish(
+def _noise_sigma(
     shape: Float[np.ndarray, "n 6"],
-    samples: Float[np.ndarray, "n m"],
+    linear: Float[np.ndarray, "n 4"],
+    variance: Float[np.ndarray, "n m"],
     offsets: Float[np.ndarray, "m 2"],
     radius: Float[np.ndarray, " n"],
-    start: Float[np.ndarray, "n 2"],
-    base: Int[np.ndarray, "n 2"],
-    inside: Bool[np.ndarray, " n"],
-) -> Saddles:
-    """Positions with their sigma, and which of them can be believed."""
-    cost, linear, _, weight = _evaluate(shape, samples, offsets, radius)
-    jacobian, _ = _jacobian(shape, linear, offsets, radius)
-    variance = cost / np.maximum(weight.sum(-1) - 10, 1.0)
+) -> Float[np.ndarray, " n"]:
+    """One sigma by axis in px that the samples' noise gives, through the filter and the window's weights.
+
+    Least squares of weights W moves a corner by G = (J' W J)^-1 J' W per filtered sample: the covariance is a sandwich.
+    """
+    jacobian, weight = _jacobian(shape, linear, offsets, radius)
     normal = np.einsum("nmi,nm,nmj->nij", jacobian, weight, jacobian)
-    cov = np.linalg.pinv(normal, hermitian=True) * (variance / _BINOMIAL_VARIANCE)[:, None, None]
-    sigma = np.sqrt(np.maximum((cov[:, 0, 0] + cov[:, 1, 1]) / 2, 0.0))
-    xy = base + shape[:, :2]
-    moved = np.linalg.norm(xy - start, axis=1)
-    contrast = np.abs(linear[:, 3]) / np.sqrt(np.maximum(variance, 1e-30))
-    ok = inside & (moved < np.maximum(radius / 2, 3.0)) & (contrast > _MIN_CONTRAST) & (sigma < 1.0)
-    return Saddles(xy=xy, sigma=sigma, ok=ok & np.isfinite(xy).all(axis=1))
+    moves = np.einsum("nip,nmp,nm->nim", np.linalg.pinv(normal, hermitian=True)[:, :2], jacobian, weight)
+    side = int(np.sqrt(len(offsets)))
+    by_sample = filtered(moves.reshape(*moves.shape[:2], side, side)).reshape(moves.shape)
+    return np.sqrt(np.einsum("nim,nm->n", by_sample**2, variance) / 2)
