@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from tests.fitting.boards import VISIBLE_BEND, Sight, sight
 from udccal.errors import FitError
-from udccal.fitting.geometry.bundle import CalibratedViews, Prior, calibrate_views
+from udccal.fitting.geometry import CalibratedViews, Prior, calibrate_views
 from udccal.fitting.geometry.corners import board_points_mm
 from udccal.fitting.result import FitStatus
 from udccal.models.geometry import Geometry

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.fitting.test_bundle import SCENE, arrays
-from udccal.fitting.geometry.bundle import CalibratedViews, Gauge, calibrate_views
+from udccal.fitting.geometry import CalibratedViews, Gauge, calibrate_views
 from udccal.fitting.geometry.bundle_orders import ORDERS
 from udccal.fitting.geometry.bundle_projection import field_grid
 

@@ -10,7 +10,7 @@ import pytest
 from tests.fitting.boards import CAMERA, SIZE, SPEC, draw, pose, true_corners
 from udccal.cameras.protocol import CameraIdentity, Region, Settings
 from udccal.errors import FitError
-from udccal.fitting.geometry.bundle import CalibratedViews, Prior, calibrate_views
+from udccal.fitting.geometry import CalibratedViews, Prior, calibrate_views
 from udccal.fitting.geometry.corners import BoardCorners, board_points_mm
 from udccal.fitting.geometry.fit import BoardView, fit_geometry, fit_views, projection_sigma_px, rig_prior
 from udccal.fitting.noise.fit import nominal_noise

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from udccal.arrangements import Board
-from udccal.fitting.geometry.bundle import ORDERS
+from udccal.fitting.geometry.bundle_orders import ORDERS
 from udccal.fitting.geometry.fit import rig_prior
 from udccal.models.geometry import Geometry, project, rotation_matrix, unproject
 from udccal.numerics import in_float64

@@ -14,8 +14,9 @@ from jaxtyping import Array, Float
 
 from tests.benchmarks.efficiency.trials import Trials
 from tests.fitting.boards import Sight, sight
-from udccal.fitting.geometry.bundle import CalibratedViews, Gauge, calibrate_views
-from udccal.fitting.geometry.bundle_projection import field_grid
+from udccal.fitting.geometry.bundle import calibrate_views
+from udccal.fitting.geometry.bundle_projection import Gauge, field_grid
+from udccal.fitting.geometry.calibrated_views import CalibratedViews
 from udccal.fitting.geometry.corners import board_points_mm
 from udccal.fitting.geometry.fit import fit_views, projection_sigma_px
 from udccal.fitting.information import cramer_rao, fisher_information

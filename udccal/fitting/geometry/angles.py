@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy.spatial.transform import Rotation
 
-from udccal.fitting.geometry.bundle import CalibratedViews
+from udccal.fitting.geometry.calibrated_views import CalibratedViews
 from udccal.models.arrays import Arrayish
 from udccal.models.geometry import rotation_matrix
 from udccal.numerics import in_float64

@@ -15,8 +15,9 @@ from jaxtyping import Bool, Float
 from scipy.stats import f as f_distribution
 
 from udccal.fitting.geometry.bundle_noise import covariance
+from udccal.fitting.geometry.bundle_normal import INTRINSICS
 from udccal.fitting.geometry.bundle_points import Points
-from udccal.fitting.geometry.bundle_solve import INTRINSICS, Solved, linearised
+from udccal.fitting.geometry.bundle_solve import Solved, linearised
 
 # Chance alone flags one fit in a thousand, by either test.
 FLAGGED_P = 1e-3

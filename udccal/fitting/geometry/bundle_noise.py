@@ -12,8 +12,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.stats import chi2
 
+from udccal.fitting.geometry.bundle_normal import INTRINSICS
 from udccal.fitting.geometry.bundle_points import MIN_POINTS, Points
-from udccal.fitting.geometry.bundle_solve import INTRINSICS, Bundle, Prior, Solved, linearised, residuals_px, solve
+from udccal.fitting.geometry.bundle_solve import Bundle, Prior, Solved, linearised, residuals_px, solve
 
 # Points further from the model than this many robust sigma of their view are left out, then all is refit.
 OUTLIER_SIGMA = 5.0

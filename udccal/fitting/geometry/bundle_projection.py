@@ -14,8 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from udccal.fitting.geometry.bundle_normal import INTRINSICS
 from udccal.fitting.geometry.bundle_points import bucket
-from udccal.fitting.geometry.bundle_solve import INTRINSICS, Bundle
+from udccal.fitting.geometry.bundle_solve import Bundle
 from udccal.models.geometry import Geometry, project, rotation_matrix, unproject
 from udccal.numerics import in_float64
 

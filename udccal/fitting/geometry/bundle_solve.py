@@ -20,13 +20,19 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from udccal.fitting.geometry.bundle_normal import (
+    INTRINSICS,
+    BundleData,
+    NormalEquations,
+    damped_step,
+    normal_equations,
+    weighted_residuals,
+    weighted_slopes,
+)
 from udccal.fitting.geometry.bundle_points import Blocks, Points, blocks
 from udccal.fitting.iteration_log import LOG
-from udccal.models.arrays import Arrayish
-from udccal.models.geometry import Geometry, project, rotation_matrix
 from udccal.numerics import in_float64
 
-INTRINSICS = 9
 # Residuals of a robust solve count as Cauchy's: half at this many sigma. A plain solve has no such bend in reach.
 CAUCHY_SIGMA = 2.5
 _PLAIN = 1e7
@@ -71,119 +77,28 @@ class Solved:
     own: Float[np.ndarray, "views 6 6"]
 
 
-class _Data(NamedTuple):
-    board: Arrayish
-    image: Arrayish
-    weight: Arrayish
-    free: Arrayish
-    prior_mean: Arrayish
-    prior_precision: Arrayish
-    bend: Arrayish
-
-
-class _Normal(NamedTuple):
-    common: Array
-    mixed: Array
-    own: Array
-    common_slope: Array
-    own_slope: Array
-
-
 class _State(NamedTuple):
     intrinsics: Array
     poses: Array
     cost: Array
-    normal: _Normal
+    normal: NormalEquations
     damping: Array
     iteration: Array
     done: Array
     trace: Array
 
 
-def seen(
-    intrinsics: Float[Array, "9"], pose: Float[Array, "6"], board: Float[Array, "points 3"]
-) -> Float[Array, "points 2"]:
-    """Where the points of one board appear, in px."""
-    camera = Geometry(intrinsics[:2], intrinsics[2:4], intrinsics[4:9], jnp.zeros(3), jnp.zeros(3))
-    return project(camera, board @ rotation_matrix(pose[:3]).T + pose[3:])
-
-
-def _residuals(intrinsics: Array, poses: Array, data: _Data) -> Float[Array, "views points 2"]:
-    where = jax.vmap(seen, in_axes=(None, 0, 0))(intrinsics, poses, data.board)
-    # A padded view has weight zero everywhere; where it projects to must not matter, not even as infinity.
-    return jnp.where(data.weight[..., None] > 0, (where - data.image) * data.weight[..., None], 0.0)
-
-
-def _slopes(intrinsics: Array, poses: Array, data: _Data) -> Float[Array, "views points 2 15"]:
-    def one(pose: Array, board: Array) -> Array:
-        def at(x: Array) -> Array:
-            return seen(x[:INTRINSICS], x[INTRINSICS:], board)
-
-        return jax.jacfwd(at)(jnp.concatenate([intrinsics, pose]))
-
-    slopes = jax.vmap(one)(poses, data.board)
-    mask = jnp.concatenate([data.free, jnp.ones(6)])
-    return jnp.where(data.weight[..., None, None] > 0, slopes * data.weight[..., None, None], 0.0) * mask
-
-
-def _cost(residuals: Array, intrinsics: Array, data: _Data) -> Array:
-    square = (residuals**2).sum(axis=-1)
-    robust = data.bend**2 * jnp.log1p(square / data.bend**2)
-    off = (intrinsics - data.prior_mean) ** 2 * data.prior_precision * data.free
-    total = robust.sum() + off.sum()
-    return jnp.where(jnp.isfinite(total), total, jnp.inf)
-
-
-def _normal(intrinsics: Array, poses: Array, data: _Data) -> tuple[Array, _Normal]:
-    residuals = _residuals(intrinsics, poses, data)
-    slopes = _slopes(intrinsics, poses, data)
-    root = 1 / jnp.sqrt(1 + (residuals**2).sum(axis=-1, keepdims=True) / data.bend**2)
-    views = len(poses)
-    tall = (slopes * root[..., None]).reshape(views, -1, INTRINSICS + 6)
-    right = (residuals * root).reshape(views, -1)
-    blocks_ = jnp.einsum("vmi,vmj->vij", tall, tall)
-    slope = jnp.einsum("vmi,vm->vi", tall, right)
-    held, precision = 1 - data.free, data.prior_precision * data.free
-    common = blocks_[:, :INTRINSICS, :INTRINSICS].sum(axis=0) + jnp.diag(precision + held)
-    common_slope = slope[:, :INTRINSICS].sum(axis=0) + precision * (intrinsics - data.prior_mean)
-    own = blocks_[:, INTRINSICS:, INTRINSICS:]
-    # A view without points, there to fill the size, keeps its pose.
-    own = own + jnp.where(jnp.trace(own, axis1=1, axis2=2) > 0, 0.0, 1.0)[:, None, None] * jnp.eye(6)
-    parts = _Normal(common, blocks_[:, :INTRINSICS, INTRINSICS:], own, common_slope, slope[:, INTRINSICS:])
-    return _cost(residuals, intrinsics, data), parts
-
-
-def _step(normal: _Normal, damping: Array) -> tuple[Array, Array, Array]:
-    """Steps of intrinsics and poses, and how much the quadratic model of chi2 falls."""
-    # In units of their own slopes: focal lengths in px and distortions of 1e-3 are then alike.
-    unit = 1 / jnp.sqrt(jnp.diagonal(normal.common) + 1e-300)
-    own_unit = 1 / jnp.sqrt(jnp.diagonal(normal.own, axis1=1, axis2=2) + 1e-300)
-    common = normal.common * unit[:, None] * unit + damping * jnp.eye(INTRINSICS)
-    own = normal.own * own_unit[:, :, None] * own_unit[:, None, :] + damping * jnp.eye(6)
-    mixed = normal.mixed * unit[:, None] * own_unit[:, None, :]
-    slope, own_slope = normal.common_slope * unit, normal.own_slope * own_unit
-    # One solve for the slope and the mixed block: C^-1 [h, B^T].
-    both = jnp.concatenate([own_slope[..., None], jnp.swapaxes(mixed, 1, 2)], axis=-1)
-    solved = jnp.linalg.solve(own, both)
-    reduced = common - jnp.einsum("vip,vpj->ij", mixed, solved[..., 1:])
-    right = slope - jnp.einsum("vip,vp->i", mixed, solved[..., 0])
-    lens = -jnp.linalg.solve(reduced, right)
-    pose = -solved[..., 0] - jnp.einsum("vpj,j->vp", solved[..., 1:], lens)
-    fall = -(slope @ lens) - (own_slope * pose).sum() + damping * ((lens**2).sum() + (pose**2).sum())
-    return lens * unit, pose * own_unit, fall
-
-
 @jax.jit
-def _solve(intrinsics: Array, poses: Array, data: _Data) -> _State:
+def _solve(intrinsics: Array, poses: Array, data: BundleData) -> _State:
     share = jnp.maximum(2 * (data.weight > 0).sum(), 1)
 
     def unfinished(state: _State) -> Array:
         return ~state.done & (state.iteration < _MAX_ITERATIONS)
 
     def step(state: _State) -> _State:
-        lens, pose, fall = _step(state.normal, state.damping)
+        lens, pose, fall = damped_step(state.normal, state.damping)
         moved, turned = state.intrinsics + lens, state.poses + pose
-        cost, normal = _normal(moved, turned, data)
+        cost, normal = normal_equations(moved, turned, data)
         better = (cost <= state.cost) & jnp.isfinite(fall)
         small = (fall <= _LEFT_TO_GAIN * state.cost / share) & (state.damping < 1e-3)
         # The quadratic model foretells the fall well: trust it more; else less.
@@ -206,13 +121,13 @@ def _solve(intrinsics: Array, poses: Array, data: _Data) -> _State:
             state.trace.at[now].set(pick(cost, state.cost)),
         )
 
-    cost, normal = _normal(intrinsics, poses, data)
+    cost, normal = normal_equations(intrinsics, poses, data)
     trace = jnp.zeros(_MAX_ITERATIONS + 1).at[0].set(cost)
     first = _State(intrinsics, poses, cost, normal, jnp.asarray(1e-4), jnp.asarray(0), jnp.asarray(False), trace)
     return jax.lax.while_loop(unfinished, step, first)
 
 
-_last_step = jax.jit(_step)
+_last_step = jax.jit(damped_step)
 
 
 @in_float64
@@ -248,14 +163,14 @@ def solve(start: Bundle, points: Points, free: Bool[np.ndarray, "9"], prior: Pri
     )
 
 
-def _data(padded: Blocks, free: np.ndarray, prior: Prior, bend: float) -> _Data:
+def _data(padded: Blocks, free: np.ndarray, prior: Prior, bend: float) -> BundleData:
     mask = np.asarray(free, dtype=np.float64)
-    return _Data(padded.board, padded.image, padded.weight, mask, prior.mean, prior.precision, np.float64(bend))
+    return BundleData(padded.board, padded.image, padded.weight, mask, prior.mean, prior.precision, np.float64(bend))
 
 
 @jax.jit
-def _linear(intrinsics: Array, poses: Array, data: _Data) -> tuple[Array, Array]:
-    return _residuals(intrinsics, poses, data), _slopes(intrinsics, poses, data)
+def _linear(intrinsics: Array, poses: Array, data: BundleData) -> tuple[Array, Array]:
+    return weighted_residuals(intrinsics, poses, data), weighted_slopes(intrinsics, poses, data)
 
 
 @in_float64
@@ -274,6 +189,6 @@ def linearised(
     poses[: len(points.names)] = bundle.poses
     ones = np.zeros(padded.weight.shape)
     ones[padded.row, padded.column] = 1.0
-    data = _Data(padded.board, padded.image, ones, np.ones(INTRINSICS), np.zeros(9), np.zeros(9), np.float64(1.0))
+    data = BundleData(padded.board, padded.image, ones, np.ones(INTRINSICS), np.zeros(9), np.zeros(9), np.float64(1.0))
     residuals, slopes = (np.asarray(part) for part in _linear(bundle.intrinsics, poses, data))
     return residuals[padded.row, padded.column], slopes[padded.row, padded.column]

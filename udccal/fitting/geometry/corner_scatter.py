@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.optimize import brentq
 
-from udccal.fitting.geometry.bundle import CalibratedViews
+from udccal.fitting.geometry.calibrated_views import CalibratedViews
 
 # No lens follows its model more closely than this.
 _LEAST_PX = 1e-3

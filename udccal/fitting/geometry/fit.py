@@ -15,14 +15,24 @@ from jaxtyping import Array, Float
 
 from udccal.errors import FitError
 from udccal.fitting.geometry.angles import ANGLE_NAMES, panel_rotation, with_angles
-from udccal.fitting.geometry.bundle import INTRINSIC_NAMES, MIN_VIEWS, CalibratedViews, Prior, calibrate_views
-from udccal.fitting.geometry.bundle_noise import OUTLIER_RULE
+from udccal.fitting.geometry.bundle import MIN_VIEWS, calibrate_views
+from udccal.fitting.geometry.bundle_orders import INTRINSIC_NAMES
 from udccal.fitting.geometry.bundle_points import bucket
+from udccal.fitting.geometry.bundle_solve import Prior
+from udccal.fitting.geometry.calibrated_views import CalibratedViews
 from udccal.fitting.geometry.corner_scatter import CornerScatter, excess_scatter
 from udccal.fitting.geometry.corners import MIN_CORNERS, board_points_mm
+from udccal.fitting.geometry.report import (
+    PATTERN,
+    diagnostics_of,
+    held_notes,
+    outliers_of,
+    rejections,
+    residual_sample,
+)
 from udccal.fitting.geometry.views import MAX_CLIPPED, BoardView, read_views
 from udccal.fitting.nominal import nominal_geometry
-from udccal.fitting.result import Diagnostic, Estimate, FitResult, FitStatus, Outliers, ResidualSample
+from udccal.fitting.result import Estimate, FitResult, FitStatus
 from udccal.models.geometry import Geometry, mounting_rotation, panel_directions, project
 from udccal.models.noise import Noise
 from udccal.numerics import in_float64
@@ -38,10 +48,6 @@ _START_SCATTER_PX, _SETTLED, _SCATTER_ROUNDS = 0.02, 0.05, 4
 _CENTRE_SIGMA = 0.01
 # (k1, k2, p1, p2, k3) of lenses that this model describes.
 _BEND_SIGMA = (0.2, 0.2, 1e-3, 1e-3, 0.1)
-_MOST_RESIDUALS = 2000
-_PATTERN = "residual_pattern"
-# Diagnostics that a plan reads: scatter beside noise of the board on the jig, and of the median view of others.
-ON_JIG, BY_HAND = "corner_scatter_on_jig", "corner_scatter_by_hand"
 UNITS = ("px", "px", "px", "px", "1", "1", "1", "1", "1", "deg", "deg", "deg")
 
 
@@ -161,77 +167,16 @@ def _result(
         chi2_dof=bundle.chi2_dof,
         samples=2 * int(bundle.used.sum()),
         candidates=bundle.candidates,
-        diagnostics=_diagnostics(bundle, scatter, views),
-        notes=(*notes, *_rejections(bundle, views), *_held(bundle)),
-        outliers=_outliers(bundle, views),
-        residuals=_residuals(bundle),
+        diagnostics=diagnostics_of(bundle, scatter, views),
+        notes=(*notes, *rejections(bundle, views), *held_notes(bundle)),
+        outliers=outliers_of(bundle, views),
+        residuals=residual_sample(bundle),
     )
 
 
 def _poor(bundle: CalibratedViews) -> bool:
     """Far off in pixels, and far more so than the corners' own sigma allows."""
     return bundle.rms_px > _WORST_RMS_PX and bundle.chi2_dof > _WORST_CHI2_DOF
-
-
-def _residuals(bundle: CalibratedViews) -> ResidualSample:
-    """Both coordinates of evenly drawn corners in use, in sigma."""
-    use = np.flatnonzero(bundle.used)
-    drawn = use[:: max(1, -(-len(use) // _MOST_RESIDUALS))]
-    z = bundle.residuals_px[drawn] / bundle.sigma_px[drawn, None]
-    return ResidualSample(np.repeat(bundle.points_px[drawn], 2, axis=0), z.ravel())
-
-
-def _diagnostics(bundle: CalibratedViews, scatter: CornerScatter, views: list[BoardView]) -> tuple[Diagnostic, ...]:
-    evidence = bundle.evidence
-    on_jig = [one for one, view in zip(scatter.by_view_px, views, strict=True) if view.parallel]
-    by_hand = [one for one, view in zip(scatter.by_view_px, views, strict=True) if not view.parallel]
-    return (
-        Diagnostic("rms_reprojection", bundle.rms_px, "px"),
-        Diagnostic("corner_scatter_beside_noise", scatter.excess_px, "px"),
-        Diagnostic(ON_JIG, float(np.median(on_jig)), "px"),
-        Diagnostic(BY_HAND, float(np.median(by_hand or on_jig)), "px"),
-        Diagnostic("views", float(len(bundle.names)), "1"),
-        Diagnostic("corners_used", float(bundle.used.sum()), "1"),
-        Diagnostic("corners_rejected", float((~bundle.used).sum()), "1"),
-        Diagnostic("iterations", float(bundle.iterations), "1"),
-        Diagnostic("starts_agreeing", float(bundle.starts_agreeing), "1"),
-        Diagnostic("rms_held_out", evidence.held_out_rms_px, "px"),
-        Diagnostic("rms_held_out_expected", evidence.expected_rms_px, "px"),
-        Diagnostic("views_disagree_p", evidence.views.p_value, "1"),
-        Diagnostic("variance_factor", evidence.variance_factor, "1"),
-        Diagnostic("residual_pattern_p", evidence.pattern.p_value, "1"),
-        Diagnostic(_PATTERN, evidence.pattern_px, "px"),
-    )
-
-
-def _corners_out(bundle: CalibratedViews, views: list[BoardView]) -> list[tuple[str, list[int]]]:
-    """Steps that lost corners, and the numbers of those."""
-    lost = []
-    for k, view in enumerate(views):
-        out = bundle.index[(bundle.view == k) & ~bundle.used]
-        if len(out):
-            lost.append((view.step_id, [int(corner) for corner in view.corners.ids[out]]))
-    return lost
-
-
-def _rejections(bundle: CalibratedViews, views: list[BoardView]) -> tuple[str, ...]:
-    """One sentence per view that lost corners."""
-    return tuple(
-        f"{step}: corners {', '.join(map(str, corners))} left out, {OUTLIER_RULE}."
-        for step, corners in _corners_out(bundle, views)
-    )
-
-
-def _outliers(bundle: CalibratedViews, views: list[BoardView]) -> tuple[Outliers, ...]:
-    places = [f"{step} corner {corner}" for step, corners in _corners_out(bundle, views) for corner in corners]
-    found = (Outliers(OUTLIER_RULE, len(places), tuple(places[:20])),) if places else ()
-    return (*(other for other in bundle.outliers if other.rule != OUTLIER_RULE), *found)
-
-
-def _held(bundle: CalibratedViews) -> tuple[str, ...]:
-    held = [name for name, free in zip(INTRINSIC_NAMES, bundle.free, strict=True) if not free]
-    fixed = (f"Held at 0, as the data do not ask for it: {', '.join(held)}.",) if held else ()
-    return (*fixed, "Stand-off and panel position are the rig's nominal ones; the wire fit refines them.")
 
 
 @in_float64
@@ -248,7 +193,7 @@ def projection_sigma_px(result: FitResult[Geometry], pixels: Float[np.ndarray, "
     directions = np.asarray(_directions(result.term, padded))
     slopes = np.asarray(_slopes(np.array([e.value for e in result.estimates]), directions))[: len(pixels)]
     variance = np.maximum(np.einsum("nip,pq,niq->ni", slopes, result.cov, slopes), 0.0)
-    pattern = next((d.value for d in result.diagnostics if d.name == _PATTERN), 0.0)
+    pattern = next((d.value for d in result.diagnostics if d.name == PATTERN), 0.0)
     return np.sqrt(variance + pattern**2)
 
 
