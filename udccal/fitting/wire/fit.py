@@ -55,7 +55,12 @@ class WireFit:
 
 
 def fit_wire(session: Session, noise: Noise, geometry: Geometry, field_samples: int = FIELD_SAMPLES) -> FitResult[Wire]:
-    """Fit the wire term to the steps ``wire/dark`` and ``wire/flat`` of a session.
+    """Fit the wire term to the steps ``wire/dark`` and ``wire/flat`` of a session; see ``fit_wire_session``."""
+    return fit_wire_session(session, noise, geometry, field_samples).result
+
+
+def fit_wire_session(session: Session, noise: Noise, geometry: Geometry, field_samples: int = FIELD_SAMPLES) -> WireFit:
+    """The same, and how sure the map is at every pixel.
 
     Args:
         session: holds both averages at one exposure.
@@ -72,12 +77,13 @@ def fit_wire(session: Session, noise: Noise, geometry: Geometry, field_samples: 
     clipped = float(np.mean(flat.mean >= 0.98 * saturation))
     start = wire_start(session.rig)
     if clipped > _MOST_SATURATED:
-        return _failed(geometry, start, FitStatus.SATURATED, f"{100 * clipped:.1f} % of the flat is clipped.")
+        failed = _failed(geometry, start, FitStatus.SATURATED, f"{100 * clipped:.1f} % of the flat is clipped.")
+        return WireFit(failed, None)
     variance = flat.variance / flat.frames + dark.variance / dark.frames
     headroom = saturation - float(np.mean(dark.mean))
     clip = headroom - _HEADROOM * np.sqrt(max(headroom * float(np.asarray(noise.K_DN_per_e)), 0.0))
     prnu = float(np.asarray(noise.PRNU1288))
-    return fit_wire_and_sigma(flat.mean - dark.mean, variance, geometry, start, prnu, field_samples, clip).result
+    return fit_wire_and_sigma(flat.mean - dark.mean, variance, geometry, start, prnu, field_samples, clip)
 
 
 @in_float64

@@ -1,0 +1,191 @@
+"""Do stated error bars hold on rigs whose truth no model describes? Writes a table into docs/numerics.md.
+
+    python -m tests.benchmarks.coverage [--out DIR] [--rigs N]
+
+Every rig is another specimen of the reduced mirror: wave-optics psf, area-integrated wire, scattered light, a full
+sensor. It is captured, fitted, and compared with its truth where no fit has seen it: rays of the panel, the
+wire at any pixel, the light of new pictures, and the sensor's numbers. A 95 % interval must hold at least 90 % of them;
+exits with 1 where it does not.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import final
+
+import numpy as np
+from jaxtyping import Float
+
+from tests.benchmarks.readme_tables import between
+from udccal.cli.jobs.benches import simulated_bench
+from udccal.cli.jobs.capture import capture
+from udccal.cli.output import Output
+from udccal.compilation import keep_compilations
+from udccal.displays.pictures import face_picture
+from udccal.fitting.backscatter.bins import Bins
+from udccal.fitting.backscatter.data import read_shots, visible_crop
+from udccal.fitting.backscatter.fit import problem_of
+from udccal.fitting.backscatter.light import predict_light
+from udccal.fitting.backscatter.report import known_from
+from udccal.fitting.backscatter.select import choose
+from udccal.fitting.calibrate import FitEffort, Foundation, fit_foundation
+from udccal.fitting.geometry.fit import projection_sigma_px
+from udccal.fitting.wire.fit import fit_wire_session, sensor_map
+from udccal.models.geometry import project_directions
+from udccal.numerics import in_float64
+from udccal.planning.state import sensor_samples
+from udccal.reports.true_values import true_values
+from udccal.rig import load_rig
+from udccal.sessions.store import Session
+from udccal.simulation import backscatter, wire
+from udccal.simulation.truth import RigTruth, draw_truth, pixels_to_directions
+from udccal.simulation.world import SimulatedWorld
+
+_RIG = "lg55-reduced"
+_INSIDE, _LEAST = 1.96, 0.90
+_RAYS, _PIXELS = 17, 2000
+_PICTURES = (9101, 9102, 9103)
+_PAGE = Path(__file__).resolve().parents[2] / "docs" / "numerics.md"
+
+
+@final
+@dataclass(frozen=True)
+class Specimen:
+    """A rig as it really is, its session, and the fits that others stand on."""
+
+    truth: RigTruth
+    session: Session
+    base: Foundation
+
+
+@final
+@dataclass(frozen=True)
+class Coverage:
+    """z-scores of one quantity over the rigs, and the share of them inside the stated 95 %."""
+
+    name: str
+    by_rig: tuple[Float[np.ndarray, " n"], ...]
+
+    @property
+    def inside(self) -> float:
+        """Of all rigs together, each counted alike."""
+        return float(np.mean([np.mean(np.abs(z) < _INSIDE) for z in self.by_rig]))
+
+    @property
+    def worst(self) -> float:
+        """Of the rig that holds least."""
+        return float(min(np.mean(np.abs(z) < _INSIDE) for z in self.by_rig))
+
+    @property
+    def z_rms(self) -> float:
+        """1 where errors are as large as stated."""
+        return float(np.sqrt(np.mean([np.mean(z**2) for z in self.by_rig])))
+
+    @property
+    def ok(self) -> bool:
+        """Whether the interval holds what it should."""
+        return self.inside >= _LEAST
+
+
+def sensor_numbers(rig: Specimen) -> Float[np.ndarray, " n"]:
+    """K, dark noise, black level, dark current and the rest."""
+    found = {estimate.name: estimate for estimate in rig.base.noise.estimates}
+    true = [one for one in true_values(rig.truth) if one.term == "noise" and one.name in found]
+    return np.array([(found[one.name].value - one.value) / max(found[one.name].sigma, 1e-30) for one in true])
+
+
+@in_float64
+def rays(rig: Specimen) -> Float[np.ndarray, " n"]:
+    """Where rays of the panel land, by axis."""
+    pixels = sensor_samples(rig.session.rig, _RAYS)
+    directions = pixels_to_directions(rig.truth.optics, pixels)
+    error = np.asarray(project_directions(rig.base.geometry.term, directions)) - pixels
+    return (error / projection_sigma_px(rig.base.geometry, pixels)).ravel()
+
+
+def wire_pixels(rig: Specimen) -> Float[np.ndarray, " n"]:
+    """The wire's map at random pixels."""
+    true = wire.wire_map(rig.truth)
+    fit = fit_wire_session(rig.session, rig.base.noise.term, rig.base.geometry.term)
+    if fit.sigma is None:
+        raise ValueError(f"expected a fit of the wire, found {fit.result.status}")
+    y, x = np.divmod(np.random.default_rng(rig.truth.seed).choice(true.size, _PIXELS, replace=False), true.shape[1])
+    error = (sensor_map(fit.result.term, *true.shape) - true)[y, x]
+    return error / fit.sigma.at(np.stack([x, y], axis=-1).astype(np.float64))
+
+
+def new_pictures(rig: Specimen) -> Float[np.ndarray, " n"]:
+    """Light of pictures that were not shown, in bins."""
+    session, geometry = rig.session, rig.base.geometry.term
+    crop = visible_crop(geometry, session.rig)
+    shots = read_shots(session, rig.base.noise.term, crop, rig.base.wire_map)
+    if shots is None:
+        raise ValueError("expected pictures of the panel in the session, found none")
+    problem = problem_of(shots, geometry, session.rig, FitEffort().backscatter_positions)
+    choice = choose(problem)
+    panel, camera = session.rig.panel, session.rig.camera
+    pictures = [face_picture(seed, panel.columns, panel.rows) for seed in _PICTURES]
+    light = predict_light(known_from(choice), shots, np.stack([crop.of(one) for one in pictures]), problem.flat)
+    scatter, bins = backscatter.backscatterer(rig.truth), Bins(camera.cfa, choice.problem.template.step)
+    true = np.stack([bins.mean(scatter.rate(one)).reshape(3, -1)[:, problem.flat] for one in pictures])
+    return ((light.rate - true) / light.sigma).ravel()
+
+
+QUANTITIES: tuple[tuple[str, Callable[[Specimen], Float[np.ndarray, " n"]]], ...] = (
+    ("noise: the sensor's numbers", sensor_numbers),
+    ("geometry: where rays of the panel land", rays),
+    ("wire: the map at random pixels", wire_pixels),
+    ("backscatter: light of new pictures", new_pictures),
+)
+
+
+def specimen(seed: int, folder: Path) -> Specimen:
+    """Capture a rig in simulation (what the folder holds already is kept)."""
+    rig = load_rig(_RIG)
+    truth = draw_truth(rig, seed)
+    with simulated_bench(SimulatedWorld(truth)) as bench:
+        capture(Output(), rig, bench, folder, ("noise", "geometry", "wire", "backscatter"))
+    session = Session.open(folder)
+    return Specimen(truth, session, fit_foundation(session))
+
+
+def table(found: list[Coverage]) -> str:
+    """As Markdown."""
+    head = [
+        "| quantity | inside the 95 % interval | of the worst rig | z, RMS | rigs | |",
+        "| --- | ---: | ---: | ---: | ---: | --- |",
+    ]
+    body = [
+        f"| {one.name} | {one.inside:.1%} | {one.worst:.1%} | {one.z_rms:.2f} | {len(one.by_rig)} | "
+        f"{'ok' if one.ok else '**missed**'} |"
+        for one in found
+    ]
+    return "\n".join(head + body)
+
+
+def main() -> int:
+    """The exit status is 0 when every interval holds what it should."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, default=Path("coverage"), help="folder for sessions")
+    parser.add_argument("--rigs", type=int, default=6, help="specimens of the rig")
+    options = parser.parse_args()
+    options.out.mkdir(parents=True, exist_ok=True)
+    keep_compilations()
+    scores: list[list[Float[np.ndarray, " n"]]] = [[] for _ in QUANTITIES]
+    for seed in range(1, options.rigs + 1):
+        one = specimen(seed, options.out / f"rig-{seed}")
+        for part, (name, z_of) in zip(scores, QUANTITIES, strict=True):
+            part.append(z_of(one))
+            print(f"rig {seed}, {name}: {np.mean(np.abs(part[-1]) < _INSIDE):.1%} inside", flush=True)
+    found = [Coverage(name, tuple(part)) for (name, _), part in zip(QUANTITIES, scores, strict=True)]
+    print(table(found))
+    _PAGE.write_text(between(_PAGE.read_text(encoding="utf-8"), "coverage", table(found)), encoding="utf-8")
+    return 0 if all(one.ok for one in found) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
