@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from tests.fitting.test_psf_stamps import READ_E, SENSOR, places
-from udccal.fitting.psf_stamps.data import Stamps
+from udccal.fitting.psf_stamps.data import Stamps, split
 from udccal.fitting.psf_stamps.fit import fit_psf_stamps
+from udccal.fitting.psf_stamps.orders import Orders, with_degrees
+from udccal.fitting.psf_stamps.prospect import map_gains
+from udccal.fitting.psf_stamps.select import coarse
+from udccal.fitting.psf_stamps.solve import Solved, improve
+from udccal.fitting.psf_stamps.state import Scene
+from udccal.numerics import in_float64
 
 # (map degree, image degree) of the truths.
 ORDERS = ((0, 0), (1, 0), (2, 0), (0, 1), (2, 1))
@@ -26,20 +34,59 @@ def kernel(position: np.ndarray, shift: np.ndarray, order: tuple[int, int]) -> n
     return (core + 0.15 * (1 + 0.5 * x * order[1]) * lobe) / 1.15 / stretch**2
 
 
-def chosen(order: tuple[int, int], seed: int) -> tuple[int, int]:
-    """Degrees of map and images that a fit of noisy stamps comes to."""
+def made(order: tuple[int, int], seed: int) -> Stamps:
+    """Noisy stamps of a field of known order."""
     rng = np.random.default_rng([seed, *order])
     position = places(rng, _STAMPS)
     middle = np.rint(position).astype(np.int64)
     light = _LIGHT_E * rng.uniform(0.5, 1.5, _STAMPS)
     values = [f * kernel(p, p - m, order) for f, p, m in zip(light, position, middle, strict=True)]
     noisy = rng.poisson(values) + READ_E * rng.standard_normal(np.shape(values))
-    field = fit_psf_stamps(Stamps(noisy, middle, READ_E)).or_raise("psf_stamps").term.fields[0]
+    return Stamps(noisy, middle, READ_E)
+
+
+def chosen(order: tuple[int, int], seed: int) -> tuple[int, int]:
+    """Degrees of map and images that a fit comes to."""
+    field = fit_psf_stamps(made(order, seed)).or_raise("psf_stamps").term.fields[0]
     return field.warp_degree, field.image_degree
+
+
+@in_float64
+def fitted(order: tuple[int, int], degrees: tuple[int, int]) -> tuple[Scene, Solved]:
+    """Stamps of a field of known order, and a fit of other degrees."""
+    stamps = made(order, 3)
+    scene = Scene(split(stamps), 2 * stamps.position_px / SENSOR - 1, stamps.read_e, stamps.clip_e)
+    state = coarse(scene, stamps, Orders(*degrees, 1.0))
+    return scene, improve(scene, with_degrees(state, *degrees), 12)
 
 
 def test_a_field_that_does_not_change_needs_no_order() -> None:
     assert chosen((0, 0), 1) == (0, 0)
+
+
+def test_gains_of_maps_that_are_there_are_those_of_their_fits() -> None:
+    scene, lower = fitted((1, 0), (0, 0))
+    found = in_float64(map_gains)(scene, lower.state, 2)
+    fit = in_float64(improve)(scene, with_degrees(lower.state, 1, 0), 12)
+    assert fit.evidence - lower.evidence > 1000
+    assert found[0] == pytest.approx(fit.evidence - lower.evidence, rel=0.1)
+    assert found[1] == pytest.approx(found[0], abs=5.0)
+
+
+def test_maps_that_are_not_there_gain_nothing() -> None:
+    scene, lower = fitted((1, 0), (1, 0))
+    assert all(abs(gain) < 3.0 for gain in in_float64(map_gains)(scene, lower.state, 3))
+
+
+def test_what_stays_below_the_floor_is_left_after_a_round() -> None:
+    scene, fit = fitted((1, 0), (0, 0))
+    lowered = replace(fit.state, flux_e=0.97 * fit.state.flux_e)
+    again, left = (
+        in_float64(improve)(scene, lowered, 12, floor=floor) for floor in (fit.evidence - 50, fit.evidence + 1e6)
+    )
+    assert again.converged
+    assert again.rounds > 1
+    assert (left.rounds, left.converged) == (1, False)
 
 
 @pytest.mark.slow

@@ -16,13 +16,12 @@ from scipy.linalg import block_diag
 
 from tests.benchmarks.efficiency.trials import Trials
 from udccal.fitting.information import cramer_rao, fisher_information
-from udccal.fitting.psf_stamps.blocks import Blocks
 from udccal.fitting.psf_stamps.data import Stamps
 from udccal.fitting.psf_stamps.field import PlaneField, see, warps
 from udccal.fitting.psf_stamps.fit import fit_psf_stamps
+from udccal.fitting.psf_stamps.log_prior import by_degree
 from udccal.fitting.psf_stamps.orders import Orders
 from udccal.fitting.psf_stamps.prior import envelope
-from udccal.fitting.psf_stamps.solve import by_degree
 from udccal.fitting.psf_stamps.start import grid_size
 from udccal.numerics import in_float64
 
@@ -99,16 +98,7 @@ def reach(field: PlaneField, unit: Float[np.ndarray, "stars 2"]) -> float:
 
 def prior_matrix(base: Float[np.ndarray, "rows columns"], ab: Float[np.ndarray, "2"]) -> Float[np.ndarray, "n n"]:
     env = envelope(base, 1.0)
-    return np.diag(ab[0] / env.size.ravel() ** 2) + ab[1] * dense(env.roughness)
-
-
-def dense(matrix: Blocks) -> Float[np.ndarray, "n n"]:
-    out = block_diag(*matrix.diagonal)
-    n = matrix.diagonal.shape[1]
-    for i, block in enumerate(matrix.below):
-        out[(i + 1) * n : (i + 2) * n, i * n : (i + 1) * n] = block
-        out[i * n : (i + 1) * n, (i + 1) * n : (i + 2) * n] = block.T
-    return out
+    return np.diag(ab[0] / env.size.ravel() ** 2) + ab[1] * env.roughness.toarray()
 
 
 def unpack(x: Array, like: PlaneField) -> tuple[PlaneField, Array, Array]:

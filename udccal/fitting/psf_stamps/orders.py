@@ -10,8 +10,8 @@ from jaxtyping import Float
 
 from udccal.fitting.psf_stamps.field import PlaneField, warps
 from udccal.fitting.psf_stamps.prior import Precisions, envelope
-from udccal.fitting.psf_stamps.solve import State
 from udccal.fitting.psf_stamps.start import IMAGE_HIGHER, MAP, grid_size
+from udccal.fitting.psf_stamps.state import State
 from udccal.models.fields import polynomial_terms
 
 # A degree that comes new is nearly absent at first: where the data want it, one update makes it appear.

@@ -7,10 +7,13 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Bool, Float
 
-from udccal.fitting.psf_stamps.solve import Scene, State, expectation
+from udccal.fitting.psf_stamps.likelihood import expectation
+from udccal.fitting.psf_stamps.state import Scene, State
+from udccal.fitting.result import Outliers
 
-OUTLIER_SIGMA, STAR_RATIO, _MEDIAN_OF_CHI2 = 5.0, 3.0, 0.455
+_SIGMA, _STAR_RATIO, _MEDIAN_OF_CHI2 = 5.0, 3.0, 0.455
 _STEPS, _FARTHEST_PX = 4, 0.5
+_SHOWN = 8
 
 
 def without_outliers(scene: Scene, state: State) -> State:
@@ -25,9 +28,30 @@ def without_outliers(scene: Scene, state: State) -> State:
     # Noise that is larger than stated makes no outliers of all: the residuals' own median sets the scale.
     used = np.concatenate([z2[plane.usable] for z2, plane in zip(squares, scene.planes, strict=True)])
     scale = max(float(np.median(used[used > 0])) / _MEDIAN_OF_CHI2, 1.0) if (used > 0).any() else 1.0
-    keep = [z2 <= scale * OUTLIER_SIGMA**2 for z2 in squares]
+    keep = [z2 <= scale * _SIGMA**2 for z2 in squares]
     bad = _bad_stars(squares, keep, scene)
     return replace(state, keep=tuple(k & ~bad[:, None] for k in keep))
+
+
+def listed(scene: Scene, state: State) -> tuple[Outliers, ...]:
+    """What the state leaves out: the rules, how many, and the first places."""
+    stars = [k for k in range(len(scene.unit)) if not any(keep[k].any() for keep in state.keep)]
+    places = []
+    for plane, keep in zip(scene.planes, state.keep, strict=True):
+        for star, sample in np.argwhere(plane.usable & ~keep):
+            if star not in stars:
+                x, y = plane.offset_px[star, sample]
+                places.append(f"stamp {star}, {x:+.0f} px, {y:+.0f} px from its middle")
+    out = []
+    if places:
+        rule = f"samples off by more than {_SIGMA:g} sigma of their noise under the model"
+        out.append(Outliers(rule, len(places), tuple(places[:_SHOWN])))
+    if stars:
+        rule = (
+            f"stamps whose mean square is over {_STAR_RATIO:g} times the median's, or a fifth of whose samples are off"
+        )
+        out.append(Outliers(rule, len(stars), tuple(f"stamp {k}" for k in stars[:_SHOWN])))
+    return tuple(out)
 
 
 def _squares(scene: Scene, state: State, plane: int) -> Float[np.ndarray, "stars samples"]:
@@ -45,7 +69,7 @@ def _bad_stars(
     count = sum((u.sum(axis=1) for u in used), np.zeros(1))
     lost = sum(((plane.usable & ~k).sum(axis=1) for k, plane in zip(keep, scene.planes, strict=True)), np.zeros(1))
     mean = total / np.maximum(count, 1)
-    return (mean > STAR_RATIO * np.median(mean)) | (lost > 0.2 * np.maximum(count + lost, 1))
+    return (mean > _STAR_RATIO * np.median(mean)) | (lost > 0.2 * np.maximum(count + lost, 1))
 
 
 def _placed(scene: Scene, state: State, stars: Bool[np.ndarray, " stars"]) -> State:

@@ -8,7 +8,6 @@ generalized Fellner-Schall method for smoothing parameter optimization", Biometr
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,9 +15,6 @@ import scipy.ndimage
 import scipy.sparse
 from jaxtyping import Float
 
-from udccal.fitting.psf_stamps.blocks import Blocks
-
-BLOCK_ROWS = 3
 _NEAR_PX, _FLOOR = 1.5, 2e-5
 # Precisions change by no more than this factor at a time, and end here: such a term is absent.
 _STEP, _MOST = 30.0, 1e14
@@ -44,7 +40,7 @@ class Envelope:
     """The kernel's size E on the nodes, and how rough an image is beside it."""
 
     size: Float[np.ndarray, "grid_rows grid_columns"]
-    roughness: Blocks
+    roughness: scipy.sparse.csr_array
     eigenvalues: Float[np.ndarray, " nodes"]
 
     def scaled(self, images: Float[np.ndarray, "*n grid_rows grid_columns"]) -> Float[np.ndarray, "*n"]:
@@ -69,7 +65,7 @@ def envelope(image: Float[np.ndarray, "grid_rows grid_columns"], spacing_px: flo
     rows, columns = image.shape
     laplacian = _laplacian(rows, columns)
     weighted = laplacian @ scipy.sparse.diags_array(1.0 / size.ravel())
-    return Envelope(size, _blocks((weighted.T @ weighted).tocsr(), rows, columns), _eigenvalues(rows, columns))
+    return Envelope(size, (weighted.T @ weighted).tocsr(), _eigenvalues(rows, columns))
 
 
 def image_prior(
@@ -131,11 +127,3 @@ def _eigenvalues(rows: int, columns: int) -> Float[np.ndarray, " nodes"]:
     """Of the squared Laplacian, whose eigenvectors are those of the cosine transform."""
     y, x = (2 - 2 * np.cos(np.pi * np.arange(n) / n) for n in (rows, columns))
     return ((y[:, None] + x).ravel()) ** 2
-
-
-def _blocks(matrix: scipy.sparse.csr_array, rows: int, columns: int) -> Blocks:
-    n, count = BLOCK_ROWS * columns, rows // BLOCK_ROWS
-    cut = [slice(i * n, (i + 1) * n) for i in range(count)]
-    diagonal = np.stack([matrix[s, s].toarray() for s in cut])
-    below = [matrix[low, high].toarray() for high, low in itertools.pairwise(cut)]
-    return Blocks(diagonal, np.stack(below) if below else np.zeros((0, n, n)))

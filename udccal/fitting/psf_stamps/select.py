@@ -15,8 +15,10 @@ from scipy.linalg import solve_triangular
 from udccal.fitting.psf_stamps.data import Stamps
 from udccal.fitting.psf_stamps.orders import Orders, orders_of, with_degrees, with_envelopes, with_spacing
 from udccal.fitting.psf_stamps.outliers import without_outliers
-from udccal.fitting.psf_stamps.solve import Scene, Solved, State, improve
+from udccal.fitting.psf_stamps.prospect import map_gains
+from udccal.fitting.psf_stamps.solve import Solved, improve
 from udccal.fitting.psf_stamps.start import start
+from udccal.fitting.psf_stamps.state import Scene, State
 from udccal.fitting.result import Candidate
 from udccal.models.fields import polynomial_terms
 
@@ -28,6 +30,8 @@ _HIGHEST_MAP, _HIGHEST_IMAGE = 4, 3
 _ROUNDS_TO_JUDGE, _ROUNDS_TO_END = 3, 12
 # Two rounds show whether a degree that comes new appears; one whose loss is beyond doubt needs no fit without it.
 _ROUNDS_FOR_NEW, _BEYOND_DOUBT = 2, 200.0
+# Maps are fitted where they would bring at least this share of what they cost.
+_FAR_BELOW = 0.5
 
 
 @dataclass(frozen=True)
@@ -54,7 +58,7 @@ def select(scene: Scene, stamps: Stamps, orders: Orders | None) -> Selected:
     if orders is not None:
         spaced = with_spacing(state, orders.spacing_px, shape, scene.unit)
         best = improve(scene, with_degrees(spaced, orders.warp, orders.image), _ROUNDS_TO_END)
-        best = improve(scene, without_outliers(scene, best.state), _ROUNDS_TO_END)
+        best = improve(scene, without_outliers(scene, best.state), _ROUNDS_TO_END, best.evidence)
         return Selected(best, _table(scene, best, []))
     best, tried = _degrees(scene, state)
     gain = np.inf
@@ -67,7 +71,7 @@ def select(scene: Scene, stamps: Stamps, orders: Orders | None) -> Selected:
         gain = criterion(scene, best) - tried[-1].criterion
         best = _slim(found) if gain > 0 else best
         del found
-    best = improve(scene, without_outliers(scene, best.state), _ROUNDS_TO_END)
+    best = improve(scene, without_outliers(scene, best.state), _ROUNDS_TO_END, best.evidence)
     return Selected(best, _table(scene, best, tried))
 
 
@@ -98,7 +102,12 @@ def highest(scene: Scene, orders: Orders | None) -> Orders:
 def criterion(scene: Scene, solved: Solved) -> float:
     """Lower is better."""
     tuned = sum(p.image.size + p.warp.size + p.lateral.size for p in solved.state.precisions)
-    return -2 * solved.evidence + tuned * float(np.log(sum(int(plane.usable.sum()) for plane in scene.planes)))
+    return -2 * solved.evidence + tuned * _price(scene)
+
+
+def _price(scene: Scene) -> float:
+    """Of a precision that is tuned."""
+    return float(np.log(sum(int(plane.usable.sum()) for plane in scene.planes)))
 
 
 def _degrees(scene: Scene, state: State) -> tuple[Solved, list[_Trial]]:
@@ -108,12 +117,13 @@ def _degrees(scene: Scene, state: State) -> tuple[Solved, list[_Trial]]:
     tried = [_trial(scene, best)]
     while True:
         own, better = orders_of(best.state), best
-        for change in ((0, -1), (-1, 0), (-2, 0), (1, 0), (2, 0), (0, 1)):
-            pair = (own.warp + change[0], own.image + change[1])
-            if pair in {(t.orders.warp, t.orders.image) for t in tried} or not _within(pair, most):
-                continue
-            rounds = _ROUNDS_FOR_NEW if sum(change) > 0 else _ROUNDS_TO_JUDGE
-            found = _slim(_judged(scene, best, pair, rounds))
+        known = {(t.orders.warp, t.orders.image) for t in tried}
+        near = [(own.warp + w, own.image + i) for w, i in ((0, -1), (-1, 0), (-2, 0), (1, 0), (2, 0), (0, 1))]
+        pairs = [pair for pair in near if pair not in known and _within(pair, most)]
+        widest = max((warp for warp, _ in pairs), default=own.warp)
+        gains = map_gains(scene, best.state, widest) if widest > own.warp else ()
+        for pair in pairs:
+            found = _slim(_judged(scene, best, pair, gains))
             tried.append(_trial(scene, found))
             better = found if tried[-1].criterion < criterion(scene, better) else better
         if better is best:
@@ -123,26 +133,33 @@ def _degrees(scene: Scene, state: State) -> tuple[Solved, list[_Trial]]:
 
 def _slim(solved: Solved) -> Solved:
     """Without the factors of the nodes, the largest arrays of a fit: of a fit that is compared, none are asked for."""
-    return replace(solved, posterior=replace(solved.posterior, factors=(), half_meets=(), nodes=()))
+    return replace(solved, posterior=replace(solved.posterior, colours=(), nodes=()))
 
 
 def _within(pair: tuple[int, int], most: Orders) -> bool:
     return 0 <= pair[0] <= most.warp and 0 <= pair[1] <= most.image
 
 
-def _judged(scene: Scene, best: Solved, pair: tuple[int, int], rounds: int) -> Solved:
-    """A fit of these degrees; where maps that matter beyond doubt are left out, what the curvature says of it."""
-    state = with_degrees(best.state, *pair)
-    loss = _loss(best, pair[0])
-    if loss > _BEYOND_DOUBT:
-        return replace(best, state=state, evidence=best.evidence - loss, converged=False)
-    return improve(scene, state, rounds)
+def _judged(scene: Scene, best: Solved, pair: tuple[int, int], gains: tuple[float, ...]) -> Solved:
+    """A fit of these degrees, left early where it is worse beyond doubt.
+
+    Where maps that matter so much are left out, or maps are added that by far do not bring what they cost, what the
+    curvature says of it takes the place of a fit.
+    """
+    own, state = orders_of(best.state), with_degrees(best.state, *pair)
+    wider = pair[0] - own.warp
+    change = gains[wider - 1] if wider > 0 else -_loss(best, pair[0])
+    # Of the evidence, half the price of each precision is what counts against it.
+    enough = _FAR_BELOW * 0.5 * _price(scene) * len(scene.planes) * wider if wider > 0 else -_BEYOND_DOUBT
+    if change < enough:
+        return replace(best, state=state, evidence=best.evidence + change, converged=False)
+    rounds = _ROUNDS_FOR_NEW if sum(pair) > own.warp + own.image else _ROUNDS_TO_JUDGE
+    return improve(scene, state, rounds, floor=best.evidence - _BEYOND_DOUBT)
 
 
 def _loss(best: Solved, degree: int) -> float:
     """Of log posterior when all higher degrees of the maps are held at zero."""
-    stars, planes = best.state.flux_e.shape
-    start = stars * (2 + planes)
+    start = best.state.maps_from
     index, values = [], []
     for field in best.state.fields:
         flat = np.asarray(field.warp).ravel()

@@ -9,11 +9,13 @@ from jaxtyping import Float
 
 from udccal.fitting.psf_stamps.data import Plane, Stamps
 from udccal.fitting.psf_stamps.field import PlaneField
-from udccal.fitting.psf_stamps.prior import BLOCK_ROWS, Precisions, envelope
-from udccal.fitting.psf_stamps.solve import Scene, State
+from udccal.fitting.psf_stamps.prior import Precisions, envelope
+from udccal.fitting.psf_stamps.state import Scene, State
 from udccal.models.fields import polynomial_terms
 
 _WINDOW_PX, _ROUNDS = 1.6, 15
+# How many nodes there are changes by steps: an image's nodes do not move with every digit of a map.
+_STEP = 3
 _REACH = 1.1  # how far images reach beyond stamps, before it is known how far maps look
 # Priors before the data speak: of images (a, b) by degree 0 and higher, of maps and of lateral colour.
 IMAGE_FIRST, IMAGE_HIGHER, MAP, LATERAL = (1e-3, 1e-4), (30.0, 30.0), 100.0, 10.0
@@ -49,7 +51,7 @@ def reference(planes: int) -> int:
 
 def grid_size(shape: tuple[int, ...], spacing_px: float, reach: float = _REACH) -> tuple[int, int]:
     """Nodes that cover stamps, and by ``reach`` more where maps look beyond."""
-    rows, columns = (BLOCK_ROWS * math.ceil(((size + 1) * reach / spacing_px + 3) / BLOCK_ROWS) for size in shape)
+    rows, columns = (_STEP * math.ceil(((size + 1) * reach / spacing_px + 3) / _STEP) for size in shape)
     return rows, columns
 
 
