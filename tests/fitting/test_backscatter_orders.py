@@ -11,28 +11,89 @@ from tests.benchmarks.efficiency.backscatter import (
     PICTURES,
     POSITIONS,
     World,
+    noise_free,
     panel_pictures,
     shots_of,
     small_rig,
     world,
+    world_at,
 )
+from udccal.fitting.backscatter.begin import Problem, solved
 from udccal.fitting.backscatter.data import PanelShots
+from udccal.fitting.backscatter.evidence import weights
 from udccal.fitting.backscatter.fit import fit_shots, problem_of
 from udccal.fitting.backscatter.light import Other, predict_light
+from udccal.fitting.backscatter.likelihood import chi2_of
 from udccal.fitting.backscatter.report import known_from
 from udccal.fitting.backscatter.select import choose
-from udccal.fitting.backscatter.vector import KERNELS, TWO_PLANES, Order, without_crosstalk
+from udccal.fitting.backscatter.vector import (
+    CROSSTALK,
+    KERNELS,
+    REFLECTION,
+    TWO_PLANES,
+    Order,
+    prior_of,
+    values_of,
+    without_crosstalk,
+)
 from udccal.fitting.result import FitResult
 from udccal.models.backscatter import Backscatter
+from udccal.numerics import in_float64
 
 RIG = small_rig()
 ORDERS = (*KERNELS, without_crosstalk(TWO_PLANES))
 
 
+# Rise of chi2, for pictures without noise, from which a part is there to be found: five sigma.
+_SEEN = 25.0
+
+
 def _made(seed: int, order: Order) -> tuple[World, PanelShots]:
+    """A rig drawn until each part of its order shows in its pictures: what does not show, nobody can find."""
     rng = np.random.default_rng([seed, 0x0DE])
-    of = world(rng, RIG, order)
-    return of, shots_of(of, rng, panel_pictures(RIG, 100 * seed, PICTURES))
+    pictures = panel_pictures(RIG, 100 * seed, PICTURES)
+    while True:
+        of = world(rng, RIG, order)
+        shots = shots_of(of, rng, pictures)
+        if _shows(of, order, noise_free(shots, of, pictures)):
+            return of, shots
+
+
+@in_float64
+def _shows(of: World, order: Order, expected: PanelShots) -> bool:
+    """Whether pictures without noise are described so much worse without any one part of the order."""
+    problem = replace(problem_of(expected, of.term.geometry, RIG, POSITIONS), start=of.x)
+    problem = replace(problem, template=replace(problem.template, window=of.term.window))
+    seen = problem.seen
+    weight = weights(seen, seen.light, seen.light[0], 0.0, seen.usable)
+    crosstalk = bool(order.free[CROSSTALK].any())
+    kernels = KERNELS if crosstalk else tuple(without_crosstalk(kernel) for kernel in KERNELS)
+    rises = [_rise(problem, one, weight) for one in kernels if _simpler(one, order)]
+    if crosstalk:
+        rises.append(_crosstalk_rise(solved(problem, order, of.x, weight).solution.cov))
+    return min(rises, default=np.inf) > _SEEN
+
+
+def _simpler(one: Order, order: Order) -> bool:
+    return bool((one.free <= order.free).all()) and one.parameters < order.parameters
+
+
+def _rise(problem: Problem, order: Order, weight: np.ndarray) -> float:
+    """Least chi2 of an order, from the truth and from one plane that sends its light from where two did."""
+    merged = problem.start.copy()
+    distance, reflection, depth = values_of(problem.start)[[1, REFLECTION, 5]]
+    if order.free[REFLECTION] == 0:
+        merged[1] = np.log(distance + depth * reflection / (1 + reflection))
+    starts = (problem.start, merged) if reflection > 0 else (merged,)
+    return min(chi2_of(solved(problem, order, x, weight), problem.seen) for x in starts)
+
+
+def _crosstalk_rise(cov: np.ndarray) -> float:
+    """Of chi2 without crosstalk, by its parabola at the truth: a fit would wander far.
+
+    The covariance is of logarithms, that is of relative changes, and without crosstalk each changes by all of it.
+    """
+    return float(np.linalg.solve(cov[CROSSTALK, CROSSTALK], np.ones(6)) @ np.ones(6))
 
 
 def _chosen(result: FitResult[Backscatter]) -> str:
@@ -53,6 +114,14 @@ def test_the_right_order_is_chosen_in_95_of_100_runs() -> None:
 def test_the_order_of_a_rig_is_found(order: Order) -> None:
     of, shots = _made(4, order)
     assert _chosen(fit_shots(shots, of.term.geometry, RIG, POSITIONS)) == order.name
+
+
+def test_a_glass_that_reflects_next_to_nothing_does_not_show() -> None:
+    faint, pictures = prior_of(RIG).mean, panel_pictures(RIG, 0, PICTURES)
+    faint[REFLECTION] = np.log(1e-5)
+    of = world_at(faint, RIG, np.full((3, 1, 1), 2e4))
+    shots = shots_of(of, np.random.default_rng(0), pictures)
+    assert not _shows(of, TWO_PLANES, noise_free(shots, of, pictures))
 
 
 def test_predicted_light_is_as_unsure_as_its_order() -> None:

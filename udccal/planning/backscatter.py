@@ -14,8 +14,8 @@ import numpy as np
 from jaxtyping import Array, Float, Int, UInt8
 
 from udccal.arrangements import Dark, PanelPicture
-from udccal.cfa import cell_channels
 from udccal.displays.pictures import face_picture
+from udccal.fitting.backscatter.bins import Bins
 from udccal.fitting.backscatter.data import (
     grid_step,
     sampled_rays,
@@ -71,8 +71,10 @@ class BackscatterPredictor:
         pixels = self._step_px * (np.stack([columns, rows], axis=1) + 0.5) - 0.5
         self._shading = EvenField(state).at(pixels)
         self._white = _white_light(state, flat, self._shading)
-        sites = np.bincount(np.asarray(cell_channels(rig.camera.cfa)).ravel(), minlength=3)
-        self._samples = (sites * (self._step_px // 2) ** 2)[:, None].astype(np.float64)
+        # What a sample's variance, and that of a row's offset, come to in a bin's average.
+        bins, one = Bins(rig.camera.cfa, self._step_px), np.ones((rig.camera.rows, rig.camera.columns))
+        self._by_sample = bins.variance(one).reshape(3, -1)[:, flat]
+        self._by_row = bins.row_variance(one).reshape(3, -1)[:, flat]
 
     def sigma(self, captures: Captures) -> float:
         """Root mean square over sensor, colours and pictures, of these' peaks; see ``prediction.Predictor``."""
@@ -121,12 +123,11 @@ class BackscatterPredictor:
         """Variance of a bin per unit of its light, and in the dark."""
         state = self._state
         full = (step.level or 0.0) * state.full_well_e * np.ones((3, 1)) * self._shading
-        samples = len(step.exposures_s) * self._samples
         row = float(np.asarray(state.noise.sigma_row_DN / state.noise.K_DN_per_e)) ** 2
         dark = float(sample_variance_e(state, np.zeros(1), step.exposures_s[0])[0])
-        # A bin's rows share their row noise.
-        dark += row * (self._step_px // 2 - 1)
-        return 1.0 / (full * samples), dark / (full**2 * samples)
+        rest = max(dark - row, 0.0) * self._by_sample + row * self._by_row
+        frames = len(step.exposures_s)
+        return self._by_sample / (full * frames), rest / (full**2 * frames)
 
     def _noiseless(self) -> BinNoise:
         nothing = np.full(self._white.shape, _NEXT_TO_NOTHING)

@@ -2,7 +2,7 @@
 
 Truths are drawn from the fit's own prior (its tolerances), light from ``udccal.models.backscatter``, noise as shot
 noise of whole electrons and normal read noise. The bound is that of the likelihood with mask and dark profiled, the
-prior's information included.
+prior's information included; see ``Ideal``.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from udccal.fitting.backscatter.data import PanelShots, grid_step, visible_crop
 from udccal.fitting.backscatter.evidence import evidence, pictures_of, weights
 from udccal.fitting.backscatter.fit import problem_of
 from udccal.fitting.backscatter.light import Knowledge, grid_rays, predict_light
-from udccal.fitting.backscatter.likelihood import linearised
-from udccal.fitting.backscatter.ratios import window_logs, windows_at
+from udccal.fitting.backscatter.likelihood import errors_of
+from udccal.fitting.backscatter.posterior import posterior_moments
 from udccal.fitting.backscatter.report import known_from, told
 from udccal.fitting.backscatter.select import choose
 from udccal.fitting.backscatter.solve import corners_of, window_for
@@ -31,16 +31,16 @@ from udccal.fitting.backscatter.vector import (
     Order,
     footprint_share,
     prior_of,
-    value_slopes,
     values_of,
     with_vector,
 )
 from udccal.fitting.nominal import nominal_backscatter, nominal_geometry
+from udccal.fitting.solvers import most_probable
 from udccal.models.backscatter import Backscatter, panel_response, response_grid
 from udccal.numerics import in_float64
 from udccal.rig import Nominal, RigDescription, load_rig
 
-REALISATIONS = 240
+REALISATIONS = 400
 POSITIONS = 24
 PICTURES = 8
 EXPOSURE_S = 0.05
@@ -146,17 +146,37 @@ def noise_free(shots: PanelShots, of: World, pictures: list[np.ndarray]) -> Pane
     return replace(shots, white=replace(shots.white, rate=rates[0]), dark=dark, seen=seen)
 
 
+@dataclass(frozen=True)
+class Ideal:
+    """What the pictures tell at best: truth and bounds, from shots without noise that are weighed as if they had it.
+
+    Attributes:
+        knowledge: truth, with the Cramér–Rao bound on the covariance of the solver's coordinates, the prior's
+            information included.
+        sigma: of the reported values: how wide noise-free pictures leave the posterior. The mean of its square over the
+            prior is the least mean squared error of any estimate; where sigma is small it is the Cramér–Rao bound.
+    """
+
+    knowledge: Knowledge
+    sigma: Float[np.ndarray, "18"]
+
+
 @in_float64
-def best_knowledge(of: World, expected: PanelShots, flat: np.ndarray, template: Backscatter) -> Knowledge:
-    """Truth and the Cramér–Rao bound on its covariance, from shots without noise."""
-    prior = prior_of(of.rig)
+def ideal_of(of: World, expected: PanelShots, flat: np.ndarray, template: Backscatter) -> Ideal:
+    """The best that the positions with these flat indices allow."""
+    prior, free = prior_of(of.rig), TWO_PLANES.free > 0
     rays = grid_rays(template, flat)
     seen = evidence(expected, rays, flat, pictures_of(expected.shown, expected.crop))
     weight = weights(seen, seen.light, seen.light[0], 0.0, seen.usable)
-    at = windows_at(template.window, rays, corners_of(template, of.x, rays), seen.shown)
-    slopes = linearised(of.x, template, at, seen, weight, window_logs(at, seen.shown))[1]
+    errors_at = errors_of(template, seen, weight, corners_of(template, of.x, rays))
+    slopes = errors_at(of.x)[1]
     cov = np.linalg.inv(slopes.T @ slopes + np.diag(prior.sigma**-2.0))
-    return Knowledge(template, of.x, cov, 0.0, (True,) * len(expected.seen) + (True,))
+    known = Knowledge(template, of.x, cov, 0.0, (True,) * len(expected.seen) + (True,))
+    # The prior draws what is hardly seen towards its mean.
+    found = most_probable(errors_at, of.x, free, prior.mean, prior.sigma)
+    sigma = np.sqrt(np.diag(posterior_moments(errors_at, found, free, prior).cov))
+    sigma[2] /= footprint_share(of.rig)
+    return Ideal(known, sigma)
 
 
 @dataclass(frozen=True)
@@ -179,15 +199,13 @@ def realisation(seed: int) -> _One:
     choice = choose(problem, (TWO_PLANES,))
     result = told(choice, shots, of.rig, [])
     estimates = np.array([[e.value, e.sigma] for e in result.estimates]).T
-    ideal = best_knowledge(of, noise_free(shots, of, pictures), problem.flat, choice.problem.template)
-    slopes = value_slopes(of.x)
-    slopes[2] /= footprint_share(of.rig)
-    bound = np.sqrt(np.diag(ideal.cov)) * slopes
+    expected = noise_free(shots, of, pictures)
+    ideal = ideal_of(of, expected, problem.flat, choice.problem.template)
     shown = np.stack([shots.crop.of(picture) for picture in new])
     predicted = predict_light(known_from(choice), shots, shown, _PLACES)
-    limit = predict_light(ideal, noise_free(shots, of, pictures), shown, _PLACES)
+    limit = predict_light(ideal.knowledge, expected, shown, _PLACES)
     light = np.stack([predicted.rate - limit.rate, predicted.sigma, limit.sigma]).reshape(3, -1)
-    return _One(np.stack([estimates[0] - of.values, estimates[1], bound]), light)
+    return _One(np.stack([estimates[0] - of.values, estimates[1], ideal.sigma]), light)
 
 
 def trials(share: float) -> list[Trials]:

@@ -9,7 +9,7 @@ from jaxtyping import Float, Int, UInt8
 
 from udccal.fitting.backscatter.data import PanelShots, directions
 from udccal.fitting.backscatter.evidence import Evidence, Pictures, evidence, pictures_of, weights, weights_to_start
-from udccal.fitting.backscatter.profile import Profiled, mask_slopes, profiled, with_white
+from udccal.fitting.backscatter.profile import Profiled, mask_slopes, predicted_variance, profiled, with_white
 from udccal.fitting.backscatter.ratios import Windows, ratios, ratios_and_slopes, window_logs, windows_at
 from udccal.fitting.backscatter.solve import corners_of
 from udccal.models.backscatter import Backscatter, grid_positions
@@ -110,9 +110,8 @@ def _predicted(
     still = np.zeros((len(slope), 1, *slope.shape[2:]))
     old_slope = np.concatenate([still, slope[:, : len(shots.shown)]], axis=1)
     best, weight = _best(known, seen, old)
-    moves = best.mask * new_slope + new * mask_slopes(old, old_slope, best, seen, weight)[:, None]
-    variance = np.einsum("kicn,kl,licn->icn", moves, known.cov, moves, optimize=True)
-    variance = variance + new**2 / np.maximum(best.information, 1e-30)
+    by_mask = mask_slopes(old, old_slope, best, seen, weight)
+    variance = predicted_variance(new, new_slope, best, by_mask, known.cov)
     return Light(best.mask * new, np.sqrt(variance + (known.share * best.mask) ** 2))
 
 

@@ -18,7 +18,7 @@ from udccal.fitting.backscatter.evidence import Evidence
 from udccal.fitting.backscatter.profile import profiled, whitened, with_white
 from udccal.fitting.backscatter.ratios import Windows, ratios, ratios_and_slopes, window_logs, windows_at
 from udccal.fitting.backscatter.vector import Order, Prior
-from udccal.fitting.solvers import Solution, most_probable
+from udccal.fitting.solvers import Linearised, Solution, most_probable
 from udccal.models.backscatter import Backscatter
 
 
@@ -58,6 +58,19 @@ def linearised(
     return errors.ravel(), by_ratio.reshape(len(by_ratio), -1).T
 
 
+def errors_of(
+    template: Backscatter, seen: Evidence, weight: Float[np.ndarray, "shots 3 n"], corner: Int[np.ndarray, "n 2"]
+) -> Linearised:
+    """Whitened errors and their slopes as a function of the parameters, with windows from these corners on."""
+    at = windows_at(template.window, seen.rays, corner, seen.shown)
+    logs = window_logs(at, seen.shown)
+
+    def errors_at(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return linearised(x, template, at, seen, weight, logs)
+
+    return errors_at
+
+
 def solve(
     template: Backscatter,
     seen: Evidence,
@@ -68,12 +81,7 @@ def solve(
     corner: Int[np.ndarray, "n 2"],
 ) -> Fitted:
     """The most probable parameters of an order at given weights; ``corner`` is the window of each position."""
-    at = windows_at(template.window, seen.rays, corner, seen.shown)
-    logs = window_logs(at, seen.shown)
-
-    def errors_at(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        return linearised(x, template, at, seen, weight, logs)
-
+    errors_at = errors_of(template, seen, weight, corner)
     solution = most_probable(errors_at, order.start(start, prior), order.free > 0, prior.mean, prior.sigma)
     return fitted_at(template, seen, weight, solution, corner)
 

@@ -53,6 +53,26 @@ def mask_slopes(
     return np.asarray(np.where(known, -best.mask * along / np.where(known, best.information, 1.0), 0.0))
 
 
+def predicted_variance(
+    ratio: Float[np.ndarray, "pictures 3 n"],
+    slope: Float[np.ndarray, "k pictures 3 n"],
+    best: Profiled,
+    by_mask: Float[np.ndarray, "k 3 n"],
+    cov: Float[np.ndarray, "k k"],
+) -> Float[np.ndarray, "pictures 3 n"]:
+    """Of the light of pictures: the parameters' covariance, the mask's noise, and how the two hang together.
+
+    Args:
+        ratio, slope: of the pictures' light over that of white, and by the parameters.
+        best: the mask.
+        by_mask: how it follows the parameters, of ``mask_slopes``.
+        cov: of the parameters.
+    """
+    moves = best.mask * slope + ratio * by_mask[:, None]
+    variance = np.einsum("kicn,kl,licn->icn", moves, cov, moves, optimize=True)
+    return np.asarray(variance + ratio**2 / np.maximum(best.information, 1e-30))
+
+
 def whitened(
     ratio: Float[np.ndarray, "shots 3 n"],
     slope: Float[np.ndarray, "k shots 3 n"],

@@ -10,6 +10,7 @@ from udccal.fitting.backscatter.checks import Pattern, listed, pattern
 from udccal.fitting.backscatter.data import PanelShots, directions
 from udccal.fitting.backscatter.light import Knowledge, Other, mask_of
 from udccal.fitting.backscatter.likelihood import chi2_of
+from udccal.fitting.backscatter.posterior import stated
 from udccal.fitting.backscatter.select import Choice
 from udccal.fitting.backscatter.solve import window_for
 from udccal.fitting.backscatter.vector import (
@@ -17,7 +18,6 @@ from udccal.fitting.backscatter.vector import (
     UNITS,
     footprint_share,
     pitch_share,
-    value_slopes,
     values_of,
     with_vector,
 )
@@ -39,13 +39,17 @@ _MOST_RESIDUALS = 6000
 
 
 def told(choice: Choice, shots: PanelShots, rig: RigDescription, clipped: list[str]) -> FitResult[Backscatter]:
-    """The fit as a result; ``clipped`` names the pictures that were left out before it."""
-    state, solution = choice.state, choice.state.fitted.solution
+    """The fit as a result; ``clipped`` names the pictures that were left out before it.
+
+    The term has the most probable parameters. Estimates are means over what is possible, so that their errors are as
+    often to either side as sigma says; the two differ where a parameter is known to some tens of per cent only.
+    """
+    state = choice.state
     rest, known = residual_pattern(choice), known_from(choice)
-    values = values_of(solution.x)
-    moved = pitch_share(values, rig)
+    values = stated(choice, rest.inflation)
+    moved = pitch_share(values.mean, rig)
     scale = np.where(np.array(NAMES) == "pupil_mm", 1 / footprint_share(rig), 1.0)
-    cov = (_cov_over_orders(choice, known) + np.outer(moved, moved)) * np.outer(scale, scale)
+    cov = (values.cov + np.outer(moved, moved)) * np.outer(scale, scale)
     sigma = np.sqrt(np.maximum(np.diag(cov), 0.0))
     status, advice = _status(choice)
     return FitResult(
@@ -53,7 +57,7 @@ def told(choice: Choice, shots: PanelShots, rig: RigDescription, clipped: list[s
         status=status,
         estimates=tuple(
             Estimate(name, float(value), float(one), unit)
-            for name, value, one, unit in zip(NAMES, values * scale, sigma, UNITS, strict=True)
+            for name, value, one, unit in zip(NAMES, values.mean * scale, sigma, UNITS, strict=True)
         ),
         cov=cov,
         chi2_dof=chi2_of(state.fitted, choice.problem.seen) / choice.freedom,
@@ -77,22 +81,6 @@ def _residuals(choice: Choice) -> ResidualSample:
     given_back = np.sqrt(len(used) / max(choice.freedom, 1.0))
     places_px = _places(choice)[drawn % fitted.weight.shape[2]] * choice.problem.template.step
     return ResidualSample(places_px, fitted.z.ravel()[drawn] * given_back)
-
-
-def _cov_over_orders(choice: Choice, known: Knowledge) -> Float[np.ndarray, "18 18"]:
-    """Covariance of the values, over the candidates by their probability: that of each, and how they differ.
-
-    Hoeting et al., Statistical Science 14, 1999, around the chosen candidate's values.
-    """
-    values, slopes = values_of(known.x), value_slopes(known.x)
-    cov = np.zeros_like(known.cov)
-    for one, probability in zip(choice.rivals, choice.odds, strict=True):
-        chosen = one.order is choice.order
-        off = np.zeros(len(values)) if chosen else values_of(one.solution.x) - values
-        own = slopes if chosen else value_slopes(one.solution.x)
-        part = known.cov if chosen else one.solution.cov
-        cov += probability * (part * np.outer(own, own) + np.outer(off, off))
-    return cov
 
 
 def known_from(choice: Choice) -> Knowledge:
@@ -131,7 +119,7 @@ def _status(choice: Choice) -> tuple[FitStatus, tuple[str, ...]]:
     template = choice.problem.template
     if window_for(template, solution.x, choice.problem.seen.rays, slack=0.0) > template.window:
         return FitStatus.POOR_FIT, (
-            "The pictures ask for footprints on the panel of more than twice their nominal width. Check lens, "
+            "The pictures ask for footprints on the panel of more than three times their nominal width. Check lens, "
             "stand-off and pitch in the description, and that every frame was stored with the picture that was shown.",
         )
     unsure = np.sqrt(np.maximum(np.diag(solution.cov), 0.0)) > _UNDETERMINED * prior.sigma

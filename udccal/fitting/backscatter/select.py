@@ -6,18 +6,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.stats import chi2
 
 from udccal.fitting.backscatter.begin import Problem, calmed, solved, two_planes
 from udccal.fitting.backscatter.checks import (
-    SIGNIFICANT,
     lost_bins,
-    noise_variance,
     odd_pictures,
     odd_samples,
     undescribed_share,
 )
 from udccal.fitting.backscatter.evidence import weights, weights_to_start
+from udccal.fitting.backscatter.held_out import HeldOut, held_out
 from udccal.fitting.backscatter.likelihood import Fitted, degrees_of_freedom, reweighed
 from udccal.fitting.backscatter.solve import with_room
 from udccal.fitting.backscatter.vector import (
@@ -33,7 +31,6 @@ from udccal.fitting.backscatter.vector import (
 from udccal.fitting.solvers import Solution
 
 _ROUNDS = 4
-HELD_OUT_EVERY = 4
 # Model's error, as a share of white, from which no order describes anything and none is compared.
 _NOTHING_FITS = 0.05
 # Rise of chi2 from which a candidate is not fitted any more.
@@ -56,21 +53,6 @@ class Rival:
     order: Order
     solution: Solution
     criterion: float
-
-
-@dataclass(frozen=True)
-class HeldOut:
-    """How a fit without every fourth picture predicts those.
-
-    Attributes:
-        rms_of_peak: of measured less predicted light, as a share of each picture's peak.
-        excess_of_peak: the same with what noise gives taken out.
-        share: what the model leaves undescribed of ratios there; 0 where not significant.
-    """
-
-    rms_of_peak: float
-    excess_of_peak: float
-    share: float
 
 
 @dataclass(frozen=True)
@@ -120,7 +102,7 @@ def choose(problem: Problem, kernels: tuple[Order, ...] = KERNELS) -> Choice:
     order, start, rivals = _compared(problem, state, first.solution.x, kernels)
     chosen = solved(problem, order, start, state.fitted.weight)
     state = refit(problem, order, replace(state, fitted=chosen))
-    held = _held_out(problem, order, state)
+    held = held_out(problem, order, state.fitted)
     # Pictures that took no part tell what new ones will meet.
     return Choice(problem, order, replace(state, share=max(state.share, held.share)), rivals, odd, held)
 
@@ -196,27 +178,3 @@ def _criterion(solution: Solution, order: Order, prior: Prior) -> float:
     free = order.free > 0
     narrowed = solution.cov[np.ix_(free, free)] / np.outer(prior.sigma[free], prior.sigma[free])
     return solution.chi2 - float(np.linalg.slogdet(narrowed)[1]) + order.against
-
-
-def _held_out(problem: Problem, order: Order, state: State) -> HeldOut:
-    """A fit without every fourth picture, and its errors there."""
-    weight = state.fitted.weight.copy()
-    weight[HELD_OUT_EVERY::HELD_OUT_EVERY] = 0.0
-    fitted = solved(problem, order, state.fitted.solution.x, weight)
-    used = (state.fitted.weight > 0) & (weight == 0)
-    if not used.any():
-        return HeldOut(0.0, 0.0, 0.0)
-    noise = noise_variance(fitted, problem.seen)
-    # The mask of these bins is known from the other pictures only so well.
-    information = (weight**2 * fitted.ratio**2).sum(axis=0)
-    noise = noise + fitted.ratio**2 / np.maximum(information, 1e-30)
-    light = fitted.mask * fitted.ratio
-    peak = np.maximum(np.where(used, light, 0.0).max(axis=(1, 2), keepdims=True), 1e-12)
-    square, expected = ((part / peak**2)[used] for part in (fitted.errors**2, noise))
-    excess = float((square - expected).mean())
-    unlikely = chi2.sf(float((fitted.errors**2 / noise)[used].sum()), used.sum()) < SIGNIFICANT
-    unit = np.broadcast_to(fitted.mask**2, used.shape)[used]
-    over = float((fitted.errors**2 - noise)[used].sum() / max(unit.sum(), 1e-30))
-    return HeldOut(
-        float(np.sqrt(square.mean())), float(np.sqrt(max(excess, 0.0))), float(np.sqrt(max(over, 0.0))) * unlikely
-    )

@@ -29,7 +29,7 @@ from udccal.rig import RigDescription
 
 # Room that a window leaves for the footprint to move during a fit.
 SLACK_PX = 0.7
-_MOST_WIDER = 2
+_MOST_WIDER = 3
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ def window_for(template: Backscatter, x: Float[np.ndarray, "18"], rays: Float[np
 def with_room(template: Backscatter, x: Float[np.ndarray, "18"], rays: Float[np.ndarray, "n 3"]) -> Backscatter:
     """The template with a window that holds the footprints and lets them move, never smaller than it was.
 
-    It stays where it would have to be more than twice as wide: such a fit has gone astray.
+    It stays where it would have to be more than three times as wide: such a fit has gone astray.
     """
     if not template.window < window_for(template, x, rays, 0.0) <= _MOST_WIDER * template.window:
         return template

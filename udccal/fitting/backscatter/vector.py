@@ -26,13 +26,18 @@ _LOGARITHMIC = np.array([1, 2, 3, 4, 5, 12, 13, 14, 15, 16, 17])
 _LENGTHS_BY_PITCH = [1, 2, 5]
 # Stands for the logarithm of nothing.
 _ABSENT = -40.0
-_DISTANCE, _REFLECTION, _DEPTH, CROSSTALK = 1, 4, 5, slice(12, 18)
+_DISTANCE, REFLECTION, _DEPTH, CROSSTALK = 1, 4, 5, slice(12, 18)
 # Of the green emitters from the centres of their pixels, and of red and blue from green.
 OFFSET, EMITTERS = slice(6, 8), slice(8, 12)
 # Those that tell where footprints lie and how they look.
 PLACES = slice(1, 12)
 _OFF_DIAGONAL = (np.array([0, 0, 1, 1, 2, 2]), np.array([1, 2, 0, 2, 0, 1]))
 _SOFTNESS_PX, _CROSSTALK = 0.15, 0.1
+# Light by way of the glass over light straight from the emitters: of what these send forwards, the outer face reflects
+# 4 % (Fresnel, index 1.5), and a part that no data sheet states leaks past their opaque backs. That part is taken to be
+# 4 %, too, give or take a factor of e: from 1.5 to 11 % within one sigma. Two sigma hold a leak of half a per cent on
+# one side, and a coated face, which reflects a tenth as much, on the other.
+_REFLECTION, _REFLECTION_LN_SIGMA = 1.0, 1.0
 # -2 ln(1 / 2)
 _ODDS_AGAINST = 1.4
 
@@ -64,7 +69,7 @@ class Order:
         Panels have a cover glass, their primaries lie side by side and cameras' colours overlap: an order that does
         without one of these has to be twice as good.
         """
-        without = (~self.free[[_REFLECTION, EMITTERS.start, CROSSTALK.start]].astype(bool)).sum()
+        without = (~self.free[[REFLECTION, EMITTERS.start, CROSSTALK.start]].astype(bool)).sum()
         return float(without) * _ODDS_AGAINST
 
     def held(self) -> tuple[str, ...]:
@@ -77,8 +82,8 @@ class Order:
         neutral[EMITTERS] = 0.0
         if not self.free[CROSSTALK].any():
             neutral[CROSSTALK] = _ABSENT
-        if not self.free[_REFLECTION]:
-            neutral[_REFLECTION] = _ABSENT
+        if not self.free[REFLECTION]:
+            neutral[REFLECTION] = _ABSENT
         begun = np.where((self.free > 0) & (x <= _ABSENT), prior.mean, x)
         return np.where(self.free > 0, begun, neutral)
 
@@ -89,11 +94,11 @@ def _kernel(name: str, *held: int) -> Order:
     return Order(name, free)
 
 
-ONE_PLANE = _kernel("one plane", _REFLECTION, _DEPTH)
+ONE_PLANE = _kernel("one plane", REFLECTION, _DEPTH)
 TWO_PLANES = _kernel("two planes")
 # Simplest first.
 KERNELS = (
-    _kernel("one plane, primaries in one place", _REFLECTION, _DEPTH, 8, 9, 10, 11),
+    _kernel("one plane, primaries in one place", REFLECTION, _DEPTH, 8, 9, 10, 11),
     ONE_PLANE,
     TWO_PLANES,
 )
@@ -110,7 +115,7 @@ def split_plane(x: Float[np.ndarray, "18"], prior: Prior, reflection: float) -> 
     """One plane's parameters with a reflection added: the two planes' light comes from where the one's came from."""
     split = x.copy()
     depth = np.exp(prior.mean[_DEPTH])
-    split[_REFLECTION], split[_DEPTH] = np.log(reflection), prior.mean[_DEPTH]
+    split[REFLECTION], split[_DEPTH] = np.log(reflection), prior.mean[_DEPTH]
     between = np.exp(x[_DISTANCE]) - depth * reflection / (1 + reflection)
     split[_DISTANCE] = np.log(between) if between > 0 else x[_DISTANCE]
     return split
@@ -134,11 +139,11 @@ def prior_of(rig: RigDescription) -> Prior:
     """What the rig's description says about every parameter."""
     panel, lens, mounting = rig.panel, rig.lens, rig.mounting
     depth = 2 * panel.glass_thickness_mm / panel.glass_index
-    lengths = [mounting.standoff_mm.value, rig.pupil_mm * footprint_share(rig), _SOFTNESS_PX, 1.0, depth]
+    lengths = [mounting.standoff_mm.value, rig.pupil_mm * footprint_share(rig), _SOFTNESS_PX, _REFLECTION, depth]
     pupil = lens.focal_mm.tolerance / lens.focal_mm.value + lens.f_number.tolerance / lens.f_number.value + 0.02
     distance = (mounting.standoff_mm.tolerance + 0.1) / mounting.standoff_mm.value
     mean = np.concatenate([[panel.gamma.value], np.log(lengths), np.zeros(6), np.full(6, np.log(_CROSSTALK))])
-    scales = [panel.gamma.tolerance + 0.02, distance, pupil, 0.7, 1.0, 0.3]
+    scales = [panel.gamma.tolerance + 0.02, distance, pupil, 0.7, _REFLECTION_LN_SIGMA, 0.3]
     return Prior(mean, np.concatenate([scales, offset_reach_px(rig), np.full(4, 0.3), np.full(6, 0.7)]))
 
 
@@ -150,11 +155,31 @@ def values_of(x: Float[np.ndarray, "18"]) -> Float[np.ndarray, "18"]:
     return values
 
 
-def value_slopes(x: Float[np.ndarray, "18"]) -> Float[np.ndarray, "18"]:
-    """Slope of each value by its own coordinate."""
-    slopes = np.ones(len(NAMES))
-    slopes[_LOGARITHMIC] = np.exp(np.asarray(x)[_LOGARITHMIC])
-    return slopes
+@dataclass(frozen=True)
+class Moments:
+    """Mean and covariance of the values, in the units of ``UNITS``."""
+
+    mean: Float[np.ndarray, "18"]
+    cov: Float[np.ndarray, "18 18"]
+
+
+def moments_of(x: Float[np.ndarray, "18"], cov: Float[np.ndarray, "18 18"]) -> Moments:
+    """Of the values where the solver's coordinates are normal: those of a logarithm are log-normal."""
+    logarithmic = np.zeros(len(NAMES), dtype=bool)
+    logarithmic[_LOGARITHMIC] = True
+    mean = values_of(x)
+    mean[logarithmic] *= np.exp(0.5 * np.diag(cov)[logarithmic])
+    scale = np.where(logarithmic, mean, 1.0)
+    both = np.outer(logarithmic, logarithmic)
+    return Moments(mean, np.outer(scale, scale) * np.where(both, np.expm1(cov), cov))
+
+
+def moments_over(parts: list[Moments], weights: Float[np.ndarray, " parts"]) -> Moments:
+    """Of a mixture: the covariance of each part, and how their means differ."""
+    mean = np.einsum("p,pk->k", weights, np.stack([one.mean for one in parts]))
+    off = np.stack([one.mean for one in parts]) - mean
+    within = np.einsum("p,pkl->kl", weights, np.stack([one.cov for one in parts]))
+    return Moments(mean, within + np.einsum("p,pk,pl->kl", weights, off, off))
 
 
 def pitch_share(values: Float[np.ndarray, "18"], rig: RigDescription) -> Float[np.ndarray, "18"]:
