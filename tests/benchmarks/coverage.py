@@ -147,7 +147,7 @@ def specimen(seed: int, folder: Path) -> Specimen:
     """Capture a rig in simulation (what the folder holds already is kept)."""
     rig = load_rig(_RIG)
     truth = draw_truth(rig, seed)
-    with simulated_bench(SimulatedWorld(truth)) as bench:
+    with simulated_bench(SimulatedWorld(truth, seed=seed)) as bench:
         capture(Output(), rig, bench, folder, ("noise", "geometry", "wire", "backscatter"))
     session = Session.open(folder)
     return Specimen(truth, session, fit_foundation(session))

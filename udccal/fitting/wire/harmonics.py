@@ -11,8 +11,9 @@ from udccal.fitting.wire.basis import SITES, Basis
 from udccal.models.wire import HIGHEST_ORDER
 from udccal.rig import RigDescription
 
-# Harmonics of a smaller relative size are left out; hundreds of them together stay under 0.01 %.
-LEAST_AMPLITUDE = 3e-5
+# Harmonics of a smaller relative size are left out: a thousand of them, 0.01 % together, which is part of the map's
+# sigma. Those below the second number do not add to that.
+LEAST_AMPLITUDE, _LEAST_COUNTED = 3e-5, 1e-6
 _STRONG, _MIDDLE = 2e-3, 2e-4
 SMOOTH_DEGREE = 8
 _ALWAYS_SMOOTH = 4
@@ -69,6 +70,17 @@ def possible_harmonics(start: WireStart) -> tuple[Float[np.ndarray, "harmonics 2
 
     The bound is the slits' times the envelope of 2 J1(z) / z, z = pi D kappa / pitch, for a round pupil.
     """
+    return _harmonics_between(start, LEAST_AMPLITUDE, np.inf)
+
+
+def omitted_harmonics(start: WireStart) -> Float[np.ndarray, "harmonics 2"]:
+    """(n, m) of those that a fit leaves out, as far as they matter together."""
+    return _harmonics_between(start, _LEAST_COUNTED, LEAST_AMPLITUDE)[0]
+
+
+def _harmonics_between(
+    start: WireStart, least: float, below: float
+) -> tuple[Float[np.ndarray, "harmonics 2"], Float[np.ndarray, " harmonics"]]:
     found = []
     for m in range(HIGHEST_ORDER + 1):
         for n in range(-HIGHEST_ORDER if m else 1, HIGHEST_ORDER + 1):
@@ -77,7 +89,7 @@ def possible_harmonics(start: WireStart) -> tuple[Float[np.ndarray, "harmonics 2
             z = np.pi * start.pupil_per_pitch * np.hypot(n, m)
             size = (0.5 if n and m else 1.0) * _slit(m, start.row_open) * _slit(abs(n), start.column_open)
             size *= min(1.0, 2 * np.sqrt(2 / np.pi) / z**1.5)
-            if size >= LEAST_AMPLITUDE:
+            if least <= size < below:
                 found.append((size, float(n), float(m)))
     found.sort(key=lambda item: -item[0])
     return np.array([item[1:] for item in found]).reshape(-1, 2), np.array([item[0] for item in found])

@@ -33,12 +33,14 @@ class Misfit:
     """How far the model may be off the truth.
 
     Attributes:
-        sigma: of the map, relative, RMS over the sensor; 0 where the residuals show no pattern.
+        sigma: of the map, relative, RMS over the sensor: of patterned residuals (0 where there is no pattern) and
+            of the harmonics left out.
         by_tile: the same, tile by tile; nowhere less than its RMS.
         resolution: the smallest such sigma that would have been seen.
         p_value: of noise alone to leave such patterns.
         bins: that were compared.
         residual_rms: relative, of single pixels.
+        omitted: of the harmonics left out, relative, RMS over the sensor.
     """
 
     sigma: float
@@ -47,6 +49,7 @@ class Misfit:
     p_value: float
     bins: int
     residual_rms: float
+    omitted: float = 0.0
 
     @property
     def found(self) -> bool:

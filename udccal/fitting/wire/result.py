@@ -65,6 +65,7 @@ def wire_result(
         diagnostics=(
             Diagnostic("wire_map_rms_sigma", 100 * sigma.rms(), "%"),
             Diagnostic("wire_map_model_sigma", 100 * found.sigma, "%"),
+            Diagnostic("harmonics_left_out", 100 * found.omitted, "%"),
             Diagnostic("model_sigma_that_would_be_seen", 100 * found.resolution, "%"),
             Diagnostic("residual_pattern_p_value", found.p_value, "1"),
             Diagnostic("efficiency", spent.used / pixels, "1"),
