@@ -124,8 +124,8 @@ def _realisation(scene: Scene, prior: Prior, seed: int) -> tuple[float, float]:
     found, stated = 0.0, 0.0
     places = _PLACES * [scene.rig.camera.columns, scene.rig.camera.rows]
     for place in places:
-        true, _ = _kernel(scene, theta, place)
-        kernel, slopes = _kernel(scene, fit.theta, place)
+        true, _ = _kernel(scene, prior, theta, place)
+        kernel, slopes = _kernel(scene, prior, fit.theta, place)
         size = (true**2).sum(axis=(1, 2))
         found += float((((kernel - true) ** 2).sum(axis=(1, 2)) / size).mean())
         variance = np.einsum("pcyx,pq,qcyx->cyx", slopes, fit.cov, slopes)
@@ -134,7 +134,7 @@ def _realisation(scene: Scene, prior: Prior, seed: int) -> tuple[float, float]:
 
 
 def _kernel(
-    scene: Scene, theta: Float[np.ndarray, " p"], place: Float[np.ndarray, "2"]
+    scene: Scene, prior: Prior, theta: Float[np.ndarray, " p"], place: Float[np.ndarray, "2"]
 ) -> tuple[Float[np.ndarray, "3 rows columns"], Float[np.ndarray, "p 3 rows columns"]]:
     evaluator = Evaluator(prior.wavelengths_nm, fit_lattice(_HALF), True)
     rows, columns = (2 * half + 1 for half in _HALF)

@@ -134,9 +134,11 @@ class Picture:
 
 
 @in_float64
-def pictures(scene: Scene, theta: Float[np.ndarray, " p"], rng: np.random.Generator) -> list[Picture]:
-    """All LEDs of a scene under the model that ``theta`` packs."""
-    model = unpack(theta, WAVELENGTHS_NM, True)
+def pictures(
+    scene: Scene, theta: Float[np.ndarray, " p"], rng: np.random.Generator, interference: bool = True
+) -> list[Picture]:
+    """All LEDs of a scene under the model that ``theta`` packs, with the wire's phase or averaged over it."""
+    model = unpack(theta, WAVELENGTHS_NM, interference)
     rows, columns = (2 * (h + _SPARE) + 1 for h in scene.half)
     # That of the fit: what a lattice of this size leaves out is no matter of efficiency.
     lattice = fit_lattice(scene.half)

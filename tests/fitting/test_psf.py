@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.special import ndtr
 
+from tests.benchmarks.psf_wave_optics import seen_by_the_wire, true_geometry
 from udccal.cameras.protocol import CameraIdentity, Frame, Region, Settings
 from udccal.cfa import channel_map
 from udccal.fitting.absent import absent_wire
@@ -20,11 +21,7 @@ from udccal.fitting.psf.residual import shifts
 from udccal.fitting.psf.shots import Shots, cut_crop, group, stack
 from udccal.fitting.psf.start import start_model, wire_shows
 from udccal.fitting.result import FitResult, FitStatus
-from udccal.fitting.wire.harmonics import wire_start
-from udccal.fitting.wire.scan import ideal_wire
-from udccal.models.geometry import Geometry
 from udccal.models.psf import PsfField, psf_kernels
-from udccal.models.wire import Wire
 from udccal.numerics import in_float64
 from udccal.rig import RigDescription, load_rig
 from udccal.sessions.captured import SingleFrame
@@ -33,11 +30,12 @@ from udccal.sessions.store import Session
 from udccal.sessions.writer import SessionWriter
 from udccal.simulation.psf import captured_light
 from udccal.simulation.psf import kernels as simulated_kernels
-from udccal.simulation.truth import RigTruth, draw_truth
+from udccal.simulation.truth import draw_truth
 
-HALF = (20, 10)
-MIDDLE = np.array([16, 26])
-TOY = Effort(positions=5, shifts=2, half_px=HALF, close_px=(16, 8), iterations=25)
+HALF = (14, 7)
+SIZE = (41, 27)
+MIDDLE = np.array([13, 20])
+TOY = Effort(positions=5, shifts=2, half_px=HALF, close_px=(12, 6), iterations=25)
 FLUX = 1e8 * np.array([0.7, 1.0, 0.6])
 
 
@@ -56,7 +54,7 @@ def relative_l2(found: np.ndarray, expected: np.ndarray) -> np.ndarray:
 
 
 def shots_of(light, rig: RigDescription, places: np.ndarray, shifts: int, disc_px: float, seed: int = 0) -> Shots:
-    """Crops of LEDs about ``places``; ``light(x, y, middle)`` is the image (3, 53, 33) about an integer middle."""
+    """Crops of LEDs about ``places``; ``light(x, y, middle)`` is the image of ``SIZE`` about an integer middle."""
     rng = np.random.default_rng(seed)
     crops, aims = [], []
     for place in places:
@@ -66,7 +64,7 @@ def shots_of(light, rig: RigDescription, places: np.ndarray, shifts: int, disc_p
             middle = np.round(aim)
             corner = (middle - MIDDLE) // 2 * 2
             image = light(source, corner + MIDDLE)
-            channel = channel_map(rig.camera.cfa, 53, 33)
+            channel = channel_map(rig.camera.cfa, *SIZE)
             rate = np.take_along_axis(image * FLUX[:, None, None], channel[None], axis=0)[0]
             sigma = np.hypot(0.003 * rate, 20.0)
             merged = HdrMerge(
@@ -84,35 +82,6 @@ def places_on(rig: RigDescription, columns: int, rows: int) -> np.ndarray:
     return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2).round()
 
 
-def seen_by_the_wire(truth: RigTruth, geometry: Geometry) -> Wire:
-    """A wire as its own fit would find it, a little off."""
-    panel, pitch = truth.panel, truth.panel.pitch_mm
-    ideal = in_float64(lambda: ideal_wire(geometry, wire_start(truth.description), np.array([[0.0, 1.0]])))()
-    return replace(
-        ideal,
-        offset=truth.optics.pupil_mm[:2] / pitch + 0.01,
-        standoff_per_pitch=np.float64((panel.structure_thickness_mm / 2 - truth.optics.pupil_mm[2]) / pitch),
-        pupil_per_pitch=np.float64(truth.optics.pupil_diameter_mm / pitch * 1.005),
-        row_open=np.float64(panel.row_open + 0.003),
-        column_open=np.float64(panel.column_open - 0.002),
-        depth_per_pitch=np.float64(panel.structure_thickness_mm / pitch),
-    )
-
-
-def true_geometry(truth: RigTruth) -> Geometry:
-    optics = truth.optics
-    matrix = optics.R_panel_camera
-    angle = np.arccos((np.trace(matrix) - 1) / 2)
-    axis = np.array([matrix[2, 1] - matrix[1, 2], matrix[0, 2] - matrix[2, 0], matrix[1, 0] - matrix[0, 1]])
-    return Geometry(
-        focal=np.array([optics.fx_px, optics.fy_px]),
-        centre=np.array([optics.cx_px, optics.cy_px]),
-        distortion=np.array(optics.distortion),
-        rotation=axis * angle / (2 * np.sin(angle)),
-        pupil=optics.pupil_mm,
-    )
-
-
 @pytest.fixture(scope="module")
 def grating() -> Fitted:
     truth = draw_truth(load_rig("lg55-reduced"), seed=1)
@@ -120,12 +89,12 @@ def grating() -> Fitted:
     disc = 1.0
 
     def light(source: np.ndarray, middle: np.ndarray) -> np.ndarray:
-        return captured_light(truth, middle.astype(float), 53, 33, tuple(source - middle), disc)
+        return captured_light(truth, middle.astype(float), *SIZE, tuple(source - middle), disc)
 
-    shots = shots_of(light, rig, places_on(rig, 3, 3), 3, disc)
+    shots = shots_of(light, rig, places_on(rig, 3, 3), 2, disc)
     result = fit_shots(shots, rig, geometry, seen_by_the_wire(truth, geometry), TOY)
     places = np.array([[300.0, 240.0], [720.0, 610.0]])
-    error = relative_l2(kernels(result.term, places, 65, 33), simulated_kernels(truth, places, 65, 33))
+    error = relative_l2(kernels(result.term, places, 41, 21), simulated_kernels(truth, places, 41, 21))
     return Fitted(result, float(error.max()))
 
 
@@ -142,20 +111,23 @@ def test_a_grating_is_predicted_where_it_was_not_captured(grating: Fitted) -> No
     # The model has the lowest terms of the interference only: its strength is about 1, and far from 0.
     assert numbers["wire_phase_strength"] == pytest.approx(1.0, abs=0.4)
     assert 0.0 < numbers["efficiency"] <= 1.05
-    assert 0.0 <= numbers["residual_pattern_p"] <= 1.0
+    # Wave optics has more terms than the model: that is seen, said, and part of what the kernel is off by.
+    assert numbers["residual_pattern_p"] < 1e-3
+    assert "have a pattern" in grating.result.notes[-1]
+    assert 0.3 < numbers["kernel_error_l2"] / grating.worst_l2 < 2.0
     assert grating.result.chi2_dof == pytest.approx(1.0, abs=0.15)
 
 
 def streak(source: np.ndarray, middle: np.ndarray, disc_px: float, rig: RigDescription) -> np.ndarray:
     """Two Gaussians that grow over the field; not a grating's."""
     down, across = source[1] / rig.camera.rows - 0.5, source[0] / rig.camera.columns - 0.5
-    image = np.zeros((3, 53, 33))
+    image = np.zeros((3, *SIZE))
     for channel, size in enumerate((1.1, 1.0, 0.9)):
-        for weight, sigma_x, sigma_y in ((0.85, 0.8 + 0.1 * across, 0.9 + 0.2 * down), (0.15, 1.4, 5.0 + 1.5 * down)):
+        for weight, sigma_x, sigma_y in ((0.85, 0.8 + 0.1 * across, 0.9 + 0.2 * down), (0.15, 1.2, 3.4 + down)):
             sx, sy = (np.hypot(sigma * size, disc_px / 4) for sigma in (sigma_x, sigma_y))
             x, y = (
                 np.diff(ndtr((np.arange(n + 1) - n // 2 - 0.5 - o) / s))
-                for n, o, s in ((33, source[0] - middle[0], sx), (53, source[1] - middle[1], sy))
+                for n, o, s in ((SIZE[1], source[0] - middle[0], sx), (SIZE[0], source[1] - middle[1], sy))
             )
             image[channel] += weight * np.outer(y, x)
     return image
@@ -172,10 +144,10 @@ def test_blur_without_a_grating_is_carried_by_the_image() -> None:
     assert "not that of a panel's grating" in result.notes[0]
     place = np.array([[430.0, 300.0]])
     truth = streak(place[0], place[0], 0.0, rig)[None, :, 6:-6, 6:-6]
-    error = relative_l2(kernels(result.term, place, 41, 21), truth)
+    error = relative_l2(kernels(result.term, place, 29, 15), truth)
     assert error.max() < 0.03
     other = streak(place[0] + [0.0, 0.4], place[0], 0.0, rig)[None, :, 6:-6, 6:-6]
-    assert relative_l2(kernels(result.term, place, 41, 21), other).min() > 0.1
+    assert relative_l2(kernels(result.term, place, 29, 15), other).min() > 0.1
 
 
 @pytest.mark.parametrize("per_px", [1, 2])

@@ -7,10 +7,11 @@ import pytest
 from scipy.special import softmax
 
 from tests.benchmarks.psf_scene import Scene, pictures, shots_of, small_scene
-from udccal.fitting.psf.blocks import HEAD, blocks, fit_lattice
-from udccal.fitting.psf.descent import Prior, stepped
+from udccal.fitting.psf.blocks import HEAD, PITCH, PUPIL, Local, blocks, fit_lattice
+from udccal.fitting.psf.descent import Point, Prior, pose, stepped
+from udccal.fitting.psf.diffraction import with_interference
 from udccal.fitting.psf.fit import Effort, fit_shots
-from udccal.fitting.psf.normal import Evaluator, kernel_coefficients, overlaps_of
+from udccal.fitting.psf.normal import Evaluator, kernel_coefficients, overlaps_of, unit_light
 from udccal.fitting.psf.shots import Shots
 from udccal.fitting.psf.slopes import factors_by_parameter, kernel_slopes
 from udccal.fitting.psf.start import WAVELENGTHS_NM, start_model, start_prior, wavelengths_nm
@@ -66,6 +67,35 @@ def slopes_both_ways(scene: Scene, prior: Prior, shots: Shots, interference: boo
         more, less = (np.asarray(kernel_coefficients(evaluator, theta + s * step, block, overlaps)) for s in (1, -1))
         wanted.append((more - less) / (2 * step.sum()))
     return found, np.stack(wanted)
+
+
+def test_slopes_by_pupil_and_pitch_follow_overlaps(scene: Scene, prior: Prior, shots: Shots) -> None:
+    found, wanted = overlap_slopes(scene, prior, shots)
+    for own, other in zip(found, wanted, strict=True):
+        assert np.linalg.norm(own - other) <= 0.01 * np.linalg.norm(other)
+    assert np.linalg.norm(wanted[0]) > 0.0
+
+
+@in_float64
+def overlap_slopes(scene: Scene, prior: Prior, shots: Shots) -> tuple[np.ndarray, np.ndarray]:
+    """What the fit adds for interference per mm of (pupil, pitch) and unit of light, and differences of kernels."""
+    evaluator, theta = Evaluator(prior.wavelengths_nm, fit_lattice(_HALF), True), prior.mean
+    made = blocks(shots, scene.geometry, np.ones(shots.rate.shape, dtype=bool))[:1]
+    count = np.shape(made[0].rate)[0]
+    local = Local(np.zeros((count, 2)), np.ones((count, 3)), np.zeros(count))
+    problem = pose(made, evaluator, prior, theta)
+    (block,) = with_interference(problem, Point(theta, (local,), 0.0, (), 0, True))
+    wanted = []
+    for number, step_mm in ((PUPIL, 0.002), (PITCH, 0.0004)):
+        lit = []
+        for move in (step_mm, -step_mm):
+            other = theta.copy()
+            other[number] += move
+            # The kernel of the same numbers: what changes is the overlaps.
+            kernel = kernel_coefficients(evaluator, theta, block, overlaps_of(evaluator, other, block.frame))
+            lit.append(np.asarray(unit_light(evaluator, block, local.offset_px, kernel)))
+        wanted.append((lit[0] - lit[1]) / (2 * step_mm))
+    return np.stack([block.overlap_slope, block.pitch_slope]), np.stack(wanted)
 
 
 def test_a_step_makes_spectra_grow_by_what_it_says() -> None:

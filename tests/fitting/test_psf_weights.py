@@ -42,7 +42,9 @@ def block_of(rate: np.ndarray, variance: np.ndarray, noise_per_rate: float = 0.0
         weight=1.0 / variance,
         correction=np.zeros_like(rate),
         overlap_slope=np.zeros_like(rate),
+        pitch_slope=np.zeros_like(rate),
         overlaps_pupil_mm=1.0,
+        overlaps_pitch_mm=1.0,
         disc_px=1.0,
         index=np.arange(shots),
     )

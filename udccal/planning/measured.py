@@ -46,6 +46,7 @@ def measured_state(rig: RigDescription, fits: Measured) -> RigState:
             by_hand_px=_corners(fits.geometry, BY_HAND) if geometry_seen else None,
             wire=_diagnostic(fits.wire, "wire_map_model_sigma") / 100,
             psf=_diagnostic(fits.psf, "model_error"),
+            psf_kernel=_diagnostic(fits.psf, "kernel_error_l2"),
             backscatter=_diagnostic(fits.backscatter, "model_error_of_white"),
             inflation=max(_diagnostic(fits.backscatter, "pattern_inflation"), 1.0),
         ),

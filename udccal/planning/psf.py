@@ -87,7 +87,7 @@ class PsfPredictor:
         """All that the fit looks at, endlessly bright."""
         most = self._state.rig.captures.model_copy(update={"psf_exposures": _EXPOSURES.most})
         shots = self._most.positions * self._most.shifts
-        if self._left_out() > self._of_noise(self._information(most), shots):
+        if self._state.unexplained.psf_kernel**2 > self._of_noise(self._information(most), shots):
             why = "That much of the kernel the fit of the present profile could not describe; no capture changes it."
         else:
             why = (
@@ -137,16 +137,8 @@ class PsfPredictor:
         self._known |= {step.exposures_s: one / count for step, one in zip(steps, told, strict=True)}
         return of_kernel / field
 
-    def _left_out(self) -> float:
-        """Squared relative L2 error that a profile's fit has found its model to have."""
-        shares = [
-            float(np.sum(self._shots.relative_weight(block) * np.asarray(block.rate) ** 1.5)) / len(block.rate)
-            for block in self._shots.blocks[: self._shots.in_field]
-        ]
-        return self._state.unexplained.psf**2 * float(np.mean(shares))
-
     def _kernel_sigma(self, one: Float[np.ndarray, "p p"], shots: int) -> float:
-        return 100.0 * float(np.sqrt(self._of_noise(one, shots) + self._left_out()))
+        return 100.0 * float(np.sqrt(self._of_noise(one, shots) + self._state.unexplained.psf_kernel**2))
 
     def _of_noise(self, one: Float[np.ndarray, "p p"], shots: int) -> float:
         """Squared relative L2 error of the kernel by noise."""

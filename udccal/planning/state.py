@@ -35,7 +35,8 @@ class Unexplained:
 
     Attributes:
         on_jig_px, by_hand_px: scatter of a board's corners by axis beside noise; None where not known.
-        wire, psf: relative error of the model.
+        wire, psf: relative error of the model; the psf's is what its fit allows for, see ``fitting.psf.weights``.
+        psf_kernel: relative L2 error of the kernel beside noise where it was not captured.
         backscatter: error of a ratio to white.
         inflation: of the variances of the backscatter's parameters, whose residuals hang together.
     """
@@ -44,6 +45,7 @@ class Unexplained:
     by_hand_px: float | None = None
     wire: float = 0.0
     psf: float = 0.0
+    psf_kernel: float = 0.0
     backscatter: float = 0.0
     inflation: float = 1.0
 

@@ -19,6 +19,7 @@ from udccal.models.psf import lattice_points
 
 LOCAL = 6  # a shot's own unknowns: x, y, red, green, blue, background
 HEAD = 9  # global parameters before the spectra
+PITCH = 0  # of these: the pitch of the panel in mm
 PUPIL = 4  # of these: its diameter in mm
 BLUR = 5  # of these: the logarithm of the blur in px
 FOOTPRINT = slice(6, 9)  # of these: where its centre lies on columns and rows, and its stand-off, in pitches
@@ -39,8 +40,8 @@ class Block(eqx.Module):
         weight: inverse variance that the fit goes by; see ``psf.weights``.
         correction: per unit of light of a sample's colour, what a shot has more because the pupil's footprint lies
             elsewhere on the rows than at the mean place.
-        overlap_slope: by how much interference changes with the pupil because its overlaps do, per mm of pupil and
-            unit of light; overlaps_pupil_mm: the pupil that the overlaps are those of.
+        overlap_slope, pitch_slope: by how much interference changes with the pupil, and with the pitch, because
+            overlaps do, per mm and unit of light; overlaps_pupil_mm, overlaps_pitch_mm: those that overlaps are of.
         index: which shots these are.
     """
 
@@ -56,7 +57,9 @@ class Block(eqx.Module):
     weight: Float[Arrayish, "shots n"]
     correction: Float[Arrayish, "shots n"]
     overlap_slope: Float[Arrayish, "shots n"]
+    pitch_slope: Float[Arrayish, "shots n"]
     overlaps_pupil_mm: Float[Arrayish, ""]
+    overlaps_pitch_mm: Float[Arrayish, ""]
     disc_px: Float[Arrayish, ""]
     index: Int[Arrayish, " shots"]
 
@@ -99,8 +102,10 @@ def unpack(theta: Float[Arrayish, " p"], wavelengths_nm: Float[Arrayish, " nodes
 
 def corrected(block: Block, theta: Float[Arrayish, " p"], unit: Float[Arrayish, "shots n"]) -> Float[Array, "shots n"]:
     """Light per unit with what the lattice's kernel at the mean place, and with fixed overlaps, does not have."""
-    bigger = jnp.asarray(theta)[PUPIL] - jnp.asarray(block.overlaps_pupil_mm)
-    return jnp.asarray(unit) + jnp.asarray(block.correction) + jnp.asarray(block.overlap_slope) * bigger
+    theta = jnp.asarray(theta)
+    by_pupil = jnp.asarray(block.overlap_slope) * (theta[PUPIL] - jnp.asarray(block.overlaps_pupil_mm))
+    by_pitch = jnp.asarray(block.pitch_slope) * (theta[PITCH] - jnp.asarray(block.overlaps_pitch_mm))
+    return jnp.asarray(unit) + jnp.asarray(block.correction) + by_pupil + by_pitch
 
 
 _frame = eqx.filter_jit(local_frame)
@@ -156,7 +161,9 @@ def _block(
         weight=weight,
         correction=np.zeros_like(rate),
         overlap_slope=np.zeros_like(rate),
+        pitch_slope=np.zeros_like(rate),
         overlaps_pupil_mm=0.0,
+        overlaps_pitch_mm=0.0,
         disc_px=float(shots.disc_px[group].mean()),
         index=index,
     )

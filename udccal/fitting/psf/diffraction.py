@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from udccal.fitting.iteration_log import LOG
-from udccal.fitting.psf.blocks import FOOTPRINT, PUPIL, Block, Local, corrected
+from udccal.fitting.psf.blocks import FOOTPRINT, PITCH, PUPIL, Block, Local, corrected
 from udccal.fitting.psf.descent import Point, Problem, damped, descend, moved, pose, reduced, stand
 from udccal.fitting.psf.normal import (
     Evaluator,
@@ -36,8 +36,9 @@ _ROUNDS = 5
 _ROUGHLY, _FULLY, _NEARLY = 1e-3, 1e-2, 1.0
 # In sigma: a round that moves every parameter by less is the last; the weights are about those of the end.
 _STILL, _SETTLED = 0.1, 1.0
-# Overlaps are in single precision: by such a step of the pupil, their difference is not.
-_PUPIL_STEP_MM = 0.01
+# Overlaps change with these numbers. They are in single precision: by such steps, their difference is not. Over steps
+# ten times as long slopes bend by some percent.
+_OVERLAP_STEPS_MM = ((PITCH, 0.0002), (PUPIL, 0.001))
 
 
 @dataclass(frozen=True)
@@ -150,21 +151,39 @@ def with_interference(problem: Problem, point: Point) -> tuple[Block, ...]:
     if not problem.evaluator.interference:
         return problem.blocks
     theta, evaluator, made = point.theta, problem.evaluator, []
-    larger = theta.copy()
-    larger[PUPIL] += _PUPIL_STEP_MM
     for block, local, overlaps in zip(problem.blocks, point.local, problem.overlaps, strict=True):
-        changed = np.asarray(overlaps_of(evaluator, larger, block.frame)) - overlaps
-        # The kernel is linear in its overlaps: what the change alone brings, beside what no overlap brings.
-        without = _unit(evaluator, theta, block, local, np.zeros_like(overlaps))
+        by_pitch, by_pupil = (
+            _by_overlaps(problem.evaluator, theta, block, local, overlaps, step) for step in _OVERLAP_STEPS_MM
+        )
         made.append(
             replace(
                 block,
                 correction=_by_phase(evaluator, theta, block, local, overlaps),
-                overlap_slope=(_unit(evaluator, theta, block, local, changed) - without) / _PUPIL_STEP_MM,
+                overlap_slope=by_pupil,
+                pitch_slope=by_pitch,
                 overlaps_pupil_mm=theta[PUPIL],
+                overlaps_pitch_mm=theta[PITCH],
             )
         )
     return tuple(made)
+
+
+def _by_overlaps(
+    evaluator: Evaluator,
+    theta: Float[np.ndarray, " p"],
+    block: Block,
+    local: Local,
+    overlaps: np.ndarray,
+    step: tuple[int, float],
+) -> Float[np.ndarray, "shots n"]:
+    """By how much one unit of light changes per mm of a global parameter because overlaps do."""
+    number, step_mm = step
+    larger = theta.copy()
+    larger[number] += step_mm
+    changed = np.asarray(overlaps_of(evaluator, larger, block.frame)) - overlaps
+    # The kernel is linear in its overlaps: what the change alone brings, beside what no overlap brings.
+    brought, without = (_unit(evaluator, theta, block, local, own) for own in (changed, np.zeros_like(changed)))
+    return (brought - without) / step_mm
 
 
 def _by_phase(

@@ -17,6 +17,8 @@ from udccal.models.geometry import Geometry
 from udccal.models.psf import PsfField, fine_oversample
 
 _POOR = 0.2
+# A pattern less likely than this by chance is said.
+_PATTERN_P = 1e-3
 _MOST_RESIDUALS = 6000
 NAMES = ("pitch", "column_open_fraction", "row_open_fraction", "structure_thickness", "pupil_diameter", "blur")
 _UNITS = ("mm", "1", "1", "mm", "mm", "px")
@@ -29,7 +31,7 @@ _DIFFRACTION_NOTES = (
 _LENGTHS = np.array([name in ("pitch", "structure_thickness", "pupil_diameter") for name in NAMES])
 _FREE_NOTES = (
     "The blur is not that of a panel's grating: an image carries the kernel, no number of diffraction is known.",
-    "chi2_dof is of that image, and allows for a model error of 1 % of the peak.",
+    "chi2_dof is of that image at positions held out, and allows for the model error that these tell.",
 )
 
 
@@ -74,10 +76,20 @@ def fit_result(
         samples=fit.problem.samples if selection.share else selection.samples,
         candidates=(*(field.phase.candidates if field.phase else ()), *selection.candidates),
         diagnostics=(*_diagnostics(shots, fit, selection), *_of_diffraction(field, efficiency)),
-        notes=_DIFFRACTION_NOTES if selection.share else _FREE_NOTES,
+        notes=_notes(fit, selection),
         outliers=fit.outliers,
         residuals=_residuals(field) if selection.share else None,
     )
+
+
+def _notes(fit: DiffractionFit, selection: Selection) -> tuple[str, ...]:
+    if not selection.share:
+        return _FREE_NOTES
+    if fit.pattern_p > _PATTERN_P:
+        return _DIFFRACTION_NOTES
+    off = f"The kernel is off by {100 * selection.relative_l2:.2g} % where it was not captured; sigmas include that."
+    pattern = f"Residuals of diffraction have a pattern (p = {fit.pattern_p:.1g})."
+    return (*_DIFFRACTION_NOTES, f"{pattern} {off}" if selection.error.size else pattern)
 
 
 def _residuals(field: FieldFit) -> ResidualSample:
@@ -170,6 +182,7 @@ def _diagnostics(shots: Shots, fit: DiffractionFit, selection: Selection) -> tup
         Diagnostic("pictures", float(shots.count), "1"),
         Diagnostic("samples_left_out", left_out, "1"),
         Diagnostic("iterations", float(fit.point.iterations), "1"),
+        Diagnostic("kernel_error_l2", selection.relative_l2, "1"),
         Diagnostic("residual_degree", float(selection.degree), "1"),
         Diagnostic("diffraction_share", selection.share, "1"),
     )

@@ -104,7 +104,10 @@ def window_half(session: Session, largest: tuple[int, int]) -> tuple[int, int]:
 
 @dataclass(frozen=True)
 class FittedPsf:
-    """The result, and what ``psf_sigma`` needs to say how sure the kernel is at a field point (None: nothing known)."""
+    """The result, and what ``psf_sigma`` needs to say how sure the kernel is at a field point.
+
+    ``posterior`` is None where there is no fit, or none with diffraction in it.
+    """
 
     result: FitResult[PsfField]
     posterior: PsfPosterior | None
@@ -142,10 +145,12 @@ def fit_shots_fully(
     evaluator = replace(field.diffraction.problem.evaluator, lattice=fit_lattice(half))
     sources, explained = _all_sources(shots, geometry, evaluator, field.diffraction)
     size = np.array([rig.camera.columns - 1, rig.camera.rows - 1]) / 2.0
-    selection = select_field(shots, sources, explained, held_out, (shots.positions_px() - size) / size)
+    unit = (shots.positions_px() - size) / size
+    selection = select_field(shots, sources, explained, held_out, unit, field.diffraction.model_error)
     used = share_of_information(field.diffraction, field.shots, geometry, close, shots.count, len(NAMES))
     result = fit_result(shots, geometry, field, selection, size, used, pitch_tolerance(rig))
-    return FittedPsf(result, posterior(field.diffraction, geometry))
+    known = posterior(field.diffraction, geometry, selection.error) if selection.share else None
+    return FittedPsf(result, known)
 
 
 def held_out_positions(count: int) -> Bool[np.ndarray, " positions"]:

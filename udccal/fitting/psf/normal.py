@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 from jaxtyping import ArrayLike as Arrayish
 
-from udccal.fitting.psf.blocks import PUPIL, Block, Local, corrected, unpack
+from udccal.fitting.psf.blocks import PITCH, PUPIL, Block, Local, corrected, unpack
 from udccal.fitting.psf.slopes import factors_by_parameter, kernel_slopes
 from udccal.models.diffraction import Diffraction, LocalFrame, average_transfer
 from udccal.models.interference import interference_transfer, node_overlaps, overlap_tables
@@ -122,6 +122,7 @@ def normal_equations(
     unit = jnp.einsum("snj,cj,snc->sn", nodes, spectra, colour)
     slopes = jnp.einsum("snfc,snc->snf", by_colour, colour) @ factors_by_parameter(model, block.frame)
     slopes = slopes.at[..., PUPIL].add(jnp.asarray(block.overlap_slope))
+    slopes = slopes.at[..., PITCH].add(jnp.asarray(block.pitch_slope))
     by_move = unit_light_by_move(evaluator, block, offset, coefficients @ spectra.T)
     by_logs = jnp.einsum("snc,cj,snj->sncj", colour, spectra, nodes - unit[..., None])
     flux = jnp.einsum("snc,sc->sn", colour, jnp.asarray(local.flux))

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from udccal.fitting.psf.blocks import FOOTPRINT
+from udccal.fitting.psf.blocks import FOOTPRINT, Block
 from udccal.fitting.psf.descent import reduced
 from udccal.fitting.psf.diffraction import DiffractionFit, expected_light
 from udccal.fitting.psf.normal import normal_equations
@@ -38,10 +38,7 @@ def phase_evidence(fit: DiffractionFit) -> PhaseEvidence:
     bare = replace(
         problem,
         overlaps=tuple(np.zeros_like(overlaps) for overlaps in problem.overlaps),
-        blocks=tuple(
-            replace(block, correction=np.zeros_like(block.correction), overlap_slope=np.zeros_like(block.correction))
-            for block in problem.blocks
-        ),
+        blocks=tuple(_without_interference(block) for block in problem.blocks),
     )
     matrix, _, inverses = reduced(problem, point)
     score, own, cross = 0.0, 0.0, np.zeros(fit.theta.size)
@@ -74,3 +71,8 @@ def phase_evidence(fit: DiffractionFit) -> PhaseEvidence:
             Candidate("diffraction averaged over the phase (BIC)", unknowns - footprint, without_it, not wanted),
         ),
     )
+
+
+def _without_interference(block: Block) -> Block:
+    nothing = np.zeros_like(block.correction)
+    return replace(block, correction=nothing, overlap_slope=nothing, pitch_slope=nothing)

@@ -38,7 +38,16 @@ def _core(block: Block) -> Block:
     near = np.argsort((points**2).sum(axis=-1), axis=1, kind="stable")[:, :_CORE_SAMPLES]
     fields = {
         name: np.take_along_axis(np.asarray(getattr(block, name)), near, axis=1)
-        for name in ("density", "rate", "known", "noise_per_rate", "weight", "correction", "overlap_slope")
+        for name in (
+            "density",
+            "rate",
+            "known",
+            "noise_per_rate",
+            "weight",
+            "correction",
+            "overlap_slope",
+            "pitch_slope",
+        )
     }
     pairs = {
         name: np.take_along_axis(np.asarray(getattr(block, name)), near[..., None], axis=1)

@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 from udccal.fitting.psf.blocks import HEAD, PUPIL
 from udccal.fitting.psf.descent import reduced, without_locals
 from udccal.fitting.psf.diffraction import DiffractionFit
+from udccal.fitting.psf.kernel_error import KernelError
 from udccal.fitting.psf.normal import Evaluator
 from udccal.models.arrays import Arrayish
 from udccal.models.diffraction import LocalFrame, average_transfer, local_frame
@@ -35,19 +36,19 @@ class PsfPosterior:
         geometry: where pixels look.
         evaluator, theta: the model and its global parameters; ``evaluator.model(theta)`` is the fitted one.
         cov: their covariance, model error included.
-        model_error: what the model leaves out, as a fraction of the peak; see ``psf.weights``.
+        error: of the kernel, residual included, at positions that were held out.
     """
 
     geometry: Geometry
     evaluator: Evaluator
     theta: Float[np.ndarray, " p"]
     cov: Float[np.ndarray, "p p"]
-    model_error: float
+    error: KernelError
 
 
-def posterior(fit: DiffractionFit, geometry: Geometry) -> PsfPosterior:
+def posterior(fit: DiffractionFit, geometry: Geometry, error: KernelError) -> PsfPosterior:
     """Of a fit, with the spread between positions added where a model error was found."""
-    return PsfPosterior(geometry, fit.problem.evaluator, fit.theta, full_cov(fit), fit.model_error)
+    return PsfPosterior(geometry, fit.problem.evaluator, fit.theta, full_cov(fit), error)
 
 
 def full_cov(fit: DiffractionFit) -> Float[np.ndarray, "p p"]:
@@ -73,9 +74,10 @@ def full_cov(fit: DiffractionFit) -> Float[np.ndarray, "p p"]:
 def psf_sigma(
     known: PsfPosterior, positions_px: Float[np.ndarray, "n 2"], rows: int, columns: int
 ) -> Float[np.ndarray, "n 3 rows columns"]:
-    """One standard deviation of the diffraction kernel's samples at field positions, in the kernel's own unit.
+    """One standard deviation of the kernel's samples at field positions, in the kernel's own unit.
 
-    By the slopes of the kernel, plus what the model leaves out. ``rows`` and ``columns`` are odd.
+    By the slopes of diffraction, or what was found at positions held out where that is more: the numbers' own errors
+    are part of that. ``rows`` and ``columns`` are odd.
     """
     grid = lattice_for(rows * _MARGIN + 8, columns * _MARGIN + 8, _PER_PX, _PER_PX)
     made = []
@@ -85,9 +87,7 @@ def psf_sigma(
             for part in kernel_and_slopes(known.evaluator, known.theta, known.geometry, position, grid, rows, columns)
         )
         variance = np.einsum("pcyx,pq,qcyx->cyx", slopes, known.cov, slopes)
-        size = np.maximum(kernel, 0.0)
-        left = known.model_error * size**0.75 * size.max(axis=(1, 2), keepdims=True) ** 0.25
-        made.append(np.sqrt(np.maximum(variance, 0.0) + left**2))
+        made.append(np.maximum(np.sqrt(np.maximum(variance, 0.0)), known.error.of_kernels(kernel)))
     return np.stack(made)
 
 

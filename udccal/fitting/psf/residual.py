@@ -21,6 +21,7 @@ import scipy.ndimage
 from jaxtyping import Array, Float
 
 from udccal.fitting.psf.shots import Shots
+from udccal.fitting.psf.weights import noise_at
 from udccal.models.arrays import Arrayish
 from udccal.models.fields import polynomial_basis
 
@@ -38,7 +39,9 @@ class Windows(eqx.Module):
         colour: one-hot.
         explained: per unit of light, what diffraction brings to each sample.
         rate: e-/s without background.
-        weight: inverse variance of the rate.
+        variance: of the rate as it was measured, 1 where nothing is known; it grows with the light by noise_per_rate.
+        left_out: what a model error of 1 would add to the rate's standard deviation; see ``psf.weights``.
+        weight: inverse variance of the rate that solutions go by, 0 where nothing is known.
     """
 
     basis: Float[Arrayish, "shots terms"]
@@ -48,6 +51,9 @@ class Windows(eqx.Module):
     colour: Float[Arrayish, "shots rows columns 3"]
     explained: Float[Arrayish, "shots rows columns"]
     rate: Float[Arrayish, "shots rows columns"]
+    variance: Float[Arrayish, "shots rows columns"]
+    noise_per_rate: Float[Arrayish, "shots rows columns"]
+    left_out: Float[Arrayish, "shots rows columns"]
     weight: Float[Arrayish, "shots rows columns"]
 
 
@@ -87,7 +93,7 @@ def make_windows(
 
     Args:
         unit: positions scaled to about [-1, 1].
-        model_error: relative error of the peak that is allowed for, beside the noise of the data.
+        model_error: relative error of the peak that solutions allow for, beside the noise of the data.
         per_px: nodes of the image to a pixel; its first and last lie on the first and last pixels.
     """
     rows, columns = shots.rate.shape[1:]
@@ -98,8 +104,10 @@ def make_windows(
     known = shots.weight[cut] > 0
     smooth = np.maximum(scipy.ndimage.uniform_filter(np.abs(rate), (0, 3, 3)), np.abs(flux * explained))
     peak = smooth.max(axis=(1, 2), keepdims=True)
-    # As in ``psf.normal.weighted``: what a smooth field leaves out matters the more, relatively, the fainter a sample.
-    variance = 1.0 / np.where(known, shots.weight[cut], 1.0) + (model_error * smooth**0.75 * peak**0.25) ** 2
+    # As in ``psf.weights``: what a smooth field leaves out matters the more, relatively, the fainter a sample.
+    left_out = smooth**0.75 * peak**0.25
+    measured, slope = 1.0 / np.where(known, shots.weight[cut], 1.0), shots.noise_per_rate[cut]
+    variance = noise_at(smooth, rate, measured, slope) + (model_error * left_out) ** 2
     offset = sources.place_px - shots.origin_px
     return Windows(
         basis=np.asarray(polynomial_basis(unit, degree)),
@@ -109,6 +117,9 @@ def make_windows(
         colour=colour,
         explained=explained,
         rate=rate * known,
+        variance=measured,
+        noise_per_rate=slope,
+        left_out=left_out,
         weight=np.where(known, 1.0 / variance, 0.0),
     )
 
@@ -209,24 +220,6 @@ def mismatch(
     colour, known = np.asarray(windows.colour), np.asarray(windows.weight) > 0
     size = np.einsum("syx,syxc->c", light**2 * known, colour)
     return np.sqrt(np.einsum("syx,syxc->c", error * known, colour) / np.maximum(size, 1e-30))
-
-
-def normalised_errors(
-    windows: Windows, share: float, image: Float[np.ndarray, "terms 3 node_rows node_columns"]
-) -> Float[np.ndarray, " samples"]:
-    """Errors of all samples in units of their sigma."""
-    weight = np.asarray(windows.weight)
-    errors = (np.asarray(windows.rate) - expected(windows, share, image)) * np.sqrt(weight)
-    return errors[weight > 0]
-
-
-def loss_by_shot(
-    windows: Windows, share: float, image: Float[np.ndarray, "terms 3 node_rows node_columns"]
-) -> Float[np.ndarray, " shots"]:
-    """Mean squared error of each shot's samples in units of their sigma."""
-    weight = np.asarray(windows.weight)
-    square = (np.asarray(windows.rate) - expected(windows, share, image)) ** 2 * weight
-    return square.sum(axis=(1, 2)) / np.maximum((weight > 0).sum(axis=(1, 2)), 1)
 
 
 def expected(

@@ -77,6 +77,7 @@ def _parts(block: Block, size: int) -> list[Block]:
             "weight",
             "correction",
             "overlap_slope",
+            "pitch_slope",
         )
         part = replace(block, **{name: np.asarray(getattr(block, name))[:, index] for name in names})
         made.append(replace(part, weight=np.asarray(part.weight) * real, known=np.asarray(part.known) * real))

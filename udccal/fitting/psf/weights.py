@@ -28,13 +28,23 @@ def left_out(light: Float[np.ndarray, "shots n"], model_error: float) -> Float[n
     return model_error * size**0.75 * size.max(axis=-1, keepdims=True) ** 0.25
 
 
+def noise_at(
+    level: Float[np.ndarray, "*n"],
+    rate: Float[np.ndarray, "*n"],
+    measured: Float[np.ndarray, "*n"],
+    noise_per_rate: Float[np.ndarray, "*n"],
+) -> Float[np.ndarray, "*n"]:
+    """Variance of samples whose true rate is ``level``, if it was ``measured`` to be that of the ``rate`` found."""
+    change = noise_per_rate * (np.maximum(level, 0.0) - np.maximum(rate, 0.0))
+    # A sensor without read noise has no variance at all where no light is expected.
+    return np.maximum(measured + change, _LEAST_VARIANCE * measured)
+
+
 def sensor_variance(block: Block, level: Float[np.ndarray, "shots n"]) -> Float[np.ndarray, "shots n"]:
     """Variance of the samples' noise if their true rate is ``level``; 1 where there is no sample."""
     known, rate = np.asarray(block.known), np.asarray(block.rate)
     measured = 1.0 / np.where(known > 0, known, 1.0)
-    change = np.asarray(block.noise_per_rate) * (np.maximum(level, 0.0) - np.maximum(rate, 0.0)) * (known > 0)
-    # A sensor without read noise has no variance at all where no light is expected.
-    return np.maximum(measured + change, _LEAST_VARIANCE * measured)
+    return noise_at(level, rate, measured, np.asarray(block.noise_per_rate) * (known > 0))
 
 
 def first_weights(block: Block, model_error: float) -> Block:

@@ -1,0 +1,133 @@
+"""Which residual the psf fit chooses beside diffraction on rigs where it is known.
+
+    python -m tests.benchmarks.psf_orders [--runs N]
+
+Every kind of rig is drawn N times; prints how often which degree was chosen, and exits with 1 where the right one was
+in fewer than 95 of 100.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections import Counter
+from dataclasses import dataclass, replace
+from typing import Final, final
+
+import numpy as np
+from jaxtyping import Float
+
+from tests.benchmarks.psf_scene import DISC_PX, Picture, Scene, pictures, shots_of, small_scene
+from udccal.cfa import channel_map
+from udccal.fitting.psf.fit import held_out_positions
+from udccal.fitting.psf.residual import Sources, prior_spread, shifts, with_light_of_peak
+from udccal.fitting.psf.select import select_field
+from udccal.fitting.psf.shots import Shots
+from udccal.fitting.psf.start import start_model, start_prior
+from udccal.models.fields import polynomial_basis, polynomial_terms
+from udccal.numerics import in_float64
+
+ENOUGH: Final = 0.95
+DEGREES: Final = (-1, 0, 1)
+_HALF: Final = (10, 6)
+# A residual is so much of the kernel, and turns over about three times as many rows.
+_BENT: Final = 0.03
+_ROWS_PX: Final = 1.5
+_PLACE_SIGMA_PX: Final = 0.002
+
+
+@final
+@dataclass(frozen=True)
+class World:
+    """A scene, its LEDs without noise and without a residual: those of diffraction alone, and what
+    size a residual may have."""
+
+    scene: Scene
+    pictures: tuple[Picture, ...]
+    room: Float[np.ndarray, "rows columns"]
+
+
+@in_float64
+def world() -> World:
+    """LEDs at 4 x 3 positions of the rig as built."""
+    scene = small_scene(positions=(4, 3), shifts=3, half=_HALF)
+    theta = start_prior(scene.rig, start_model(scene.rig, scene.geometry, scene.wire), True).mean
+    made = pictures(scene, theta, np.random.default_rng(5))
+    return World(scene, tuple(made), _room(scene, made))
+
+
+@in_float64
+def chosen(known: World, degree: int, seed: int) -> int:
+    """Degree that is chosen where the residual has ``degree``, its coefficients drawn and the pictures noisy."""
+    scene, rng = known.scene, np.random.default_rng([seed, degree + 1])
+    # So much more light in the mean that there is nowhere less than none.
+    drawn = _BENT * np.array([1.0, *rng.choice([-0.5, 0.5], 2)])[: polynomial_terms(degree)]
+    phase = rng.uniform(-np.pi, np.pi)
+    shots = shots_of(scene, [_bent(picture, known, drawn, phase) for picture in known.pictures], rng)
+    explained = np.stack([_explained(p, shots, i) for i, p in enumerate(known.pictures)])
+    place = np.stack([p.source_px for p in known.pictures])
+    place = place + _PLACE_SIGMA_PX * rng.standard_normal(place.shape)
+    light = np.stack([p.flux for p in known.pictures])
+    sources = with_light_of_peak(shots, Sources(place, light, np.zeros(shots.count)), explained)
+    half = _half_sensor(scene)
+    positions = (shots.positions_px() - half) / half
+    return select_field(shots, sources, explained, held_out_positions(len(positions)), positions, 0.0).degree
+
+
+def _half_sensor(scene: Scene) -> Float[np.ndarray, "2"]:
+    camera = scene.rig.camera
+    return (np.array([camera.columns, camera.rows]) - 1) / 2
+
+
+def _bent(picture: Picture, known: World, drawn: Float[np.ndarray, " terms"], phase: float) -> Picture:
+    """The picture with a residual that goes up and down along columns."""
+    if not drawn.size:
+        return picture
+    rows, columns = picture.rate.shape
+    degree = next(n for n in DEGREES if polynomial_terms(n) == drawn.size)
+    half = _half_sensor(known.scene)
+    basis = np.asarray(polynomial_basis(((picture.source_px - half) / half)[None], degree))[0]
+    image = (basis @ drawn) * known.room * (1.0 + np.sin(np.arange(rows) / _ROWS_PX + phase)[:, None])
+    x, y = picture.source_px - picture.corner_px - [columns // 2, rows // 2]
+    disc = np.array([DISC_PX])
+    light = shifts(np.array([y]), disc, rows)[0] @ image @ shifts(np.array([x]), disc, columns)[0].T
+    flux = picture.flux[channel_map(known.scene.rig.camera.cfa, rows, columns)]
+    return replace(picture, rate=picture.rate + np.maximum(flux * light, 0.0))
+
+
+def _room(scene: Scene, made: list[Picture]) -> Float[np.ndarray, "rows columns"]:
+    """The residual's standard deviation beforehand where it may be all of the kernel, on whole pixels."""
+    total = np.zeros_like(made[0].rate)
+    for picture in made:
+        rows, columns = picture.rate.shape
+        unit = picture.rate / picture.flux[channel_map(scene.rig.camera.cfa, rows, columns)]
+        off = np.round(picture.source_px - picture.corner_px - [columns // 2, rows // 2]).astype(int)
+        total += np.roll(unit, (-off[1], -off[0]), axis=(0, 1)) / len(made)
+    return prior_spread(np.stack([total] * 3), 1, 1.0)[0, 1]
+
+
+def _explained(picture: Picture, shots: Shots, index: int) -> Float[np.ndarray, "rows columns"]:
+    """What diffraction brings to the samples of a crop per unit of light."""
+    rows, columns = shots.rate.shape[1:]
+    first = shots.origin_px[index] - picture.corner_px - [columns // 2, rows // 2]
+    part = picture.rate[first[1] : first[1] + rows, first[0] : first[0] + columns]
+    return np.asarray(part / picture.flux[shots.channel[index]])
+
+
+def main() -> int:
+    """Run all kinds; the exit status is 0 where the right degree is chosen often enough."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--runs", type=int, default=100, help="of every kind of rig")
+    runs: int = parser.parse_args().runs
+    known, good = world(), True
+    print("| residual's degree (-1: none) | chosen | of runs |\n| ---: | ---: | ---: |")
+    for degree in DEGREES:
+        counts = Counter(chosen(known, degree, seed) for seed in range(runs))
+        good &= counts[degree] >= ENOUGH * runs
+        for found, count in counts.most_common():
+            print(f"| {degree} | {found} | {count} of {runs} |", flush=True)
+    return 0 if good else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

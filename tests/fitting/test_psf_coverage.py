@@ -1,0 +1,60 @@
+"""Error bars of the kernel where no LED was, on a rig whose truth no candidate of the fit can be."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.benchmarks.psf_wave_optics import COVERED, coverage
+from udccal.fitting.psf.kernel_error import NONE, KernelError, estimate_kernel_error
+
+SIZES = np.geomspace(1e-5, 1.0, 4000)
+
+
+def residuals(error: KernelError, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Noise of 0.3 % at the peak and less below, with an error of the kernel."""
+    variance = 1e-5 * SIZES + 1e-13
+    return np.sqrt(variance + error.of_peak(SIZES) ** 2) * rng.standard_normal(SIZES.size), variance
+
+
+@pytest.mark.parametrize(
+    "true", [KernelError(0.01, 0.3, 0.75), KernelError(0.03, 1.0, 0.6), KernelError(0.1, 0.1, 0.9)]
+)
+def test_the_error_of_a_kernel_is_found_as_large_as_it_is(true: KernelError) -> None:
+    residual, variance = residuals(true, np.random.default_rng(1))
+    found = estimate_kernel_error(residual, variance, SIZES)
+    for size in (1e-3, 1e-2, 0.1):
+        assert found.of_peak(np.array([size]))[0] == pytest.approx(true.of_peak(np.array([size]))[0], rel=0.2)
+
+
+def test_noise_is_no_error_of_the_kernel() -> None:
+    rng = np.random.default_rng(2)
+    found = [estimate_kernel_error(*residuals(NONE, rng), SIZES) for _ in range(20)]
+    assert sum(error.size > 0 for error in found) <= 1
+
+
+def test_hits_are_no_error_of_the_kernel() -> None:
+    true = KernelError(0.01, 0.3, 0.75)
+    residual, variance = residuals(true, np.random.default_rng(3))
+    residual[::400] += 0.5
+    found = estimate_kernel_error(residual, variance, SIZES)
+    assert found.of_peak(np.array([1e-2]))[0] == pytest.approx(true.of_peak(np.array([1e-2]))[0], rel=0.4)
+
+
+def test_an_error_is_in_the_unit_of_its_kernels() -> None:
+    error = KernelError(0.02, 1.0, 0.5)
+    kernel = np.array([[[1.0, 4.0], [0.0, 16.0]]])
+    part = kernel / 16.0
+    np.testing.assert_allclose(error.of_kernels(kernel), 16.0 * 0.02 * np.sqrt(part / (1 + part)))
+    wanted = np.sqrt((error.of_kernels(kernel) ** 2).sum() / (kernel**2).sum())
+    np.testing.assert_allclose(error.relative_l2(kernel), wanted)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [1, 2])
+def test_the_stated_interval_covers_the_kernel_of_wave_optics(seed: int) -> None:
+    found = coverage(seed)
+    assert found.covered >= COVERED
+    # Neither too small, nor so large that it would cover anything.
+    assert 0.6 <= found.stated / found.found <= 1.7
+    assert found.pattern_p < 1e-3
