@@ -17,9 +17,10 @@ from udccal.models.fields import polynomial_terms
 
 # On top of diffraction the residual may be one of these fractions of the kernel nearby; free, it may be all of it.
 BESIDE, FREE = (0.1, 0.03, 0.01), 1.0
-# A higher order must lower the held-out loss of a sample by so much, and by more than the places held out leave in
-# doubt, to be worth its coefficients.
-_WORTH = 0.02
+# A higher order must lower the held-out loss of a sample by so much (what is left of the samples then narrows by a
+# twentieth), and by more than the places held out leave in doubt, to be worth its ten thousand coefficients: every
+# restoration pays for them.
+_WORTH = 0.1
 
 
 @dataclass(frozen=True)
