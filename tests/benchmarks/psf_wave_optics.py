@@ -45,6 +45,7 @@ class Coverage:
 
     Attributes:
         covered: part of its samples within 1.96 sigma of the truth.
+        z: of these samples.
         stated, found: relative L2 error, root mean square over places and colours.
         error_l2: what the fit says of positions that were held out; pattern_p of its residuals.
     """
@@ -54,6 +55,7 @@ class Coverage:
     found: float
     error_l2: float
     pattern_p: float
+    z: Float[np.ndarray, " n"]
 
 
 def coverage(seed: int, columns: int = 4, rows: int = 3, shifts: int = 3) -> Coverage:
@@ -73,6 +75,7 @@ def coverage(seed: int, columns: int = 4, rows: int = 3, shifts: int = 3) -> Cov
         found=_relative_l2(found - true, true),
         error_l2=told["kernel_error_l2"],
         pattern_p=told["residual_pattern_p"],
+        z=((found - true) / np.maximum(sigma, 1e-30)).ravel(),
     )
 
 
