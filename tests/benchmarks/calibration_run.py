@@ -22,7 +22,8 @@ def calibrate(rig: str, session: Path, profile: Path, seed: int) -> CalibrationR
     command = [sys.executable, "-m", "udccal.cli.main", "calibrate"]
     command += ["--rig", rig, "--session", str(session), "--profile", str(profile), "--seed", str(seed)]
     start = time.monotonic()
-    child = os.posix_spawn(sys.executable, command, dict(os.environ))
+    # JAX, imported here, has asked XLA in the environment to be more talkative than the command does.
+    child = os.posix_spawn(sys.executable, command, {**os.environ, "TF_CPP_MIN_LOG_LEVEL": "3"})
     _, status, usage = os.wait4(child, 0)
     if status != 0:
         code = os.waitstatus_to_exitcode(status)
