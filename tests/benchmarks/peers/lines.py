@@ -72,7 +72,7 @@ def _converged(line: Line) -> str:
 
 
 def _z_std(line: Line) -> str:
-    if "projection_z_std" not in line.fields:
+    if "projection_z_std_error" not in line.fields:
         return _NONE
     z, error = line.fields["projection_z_std"], line.fields["projection_z_std_error"]
     return f"{z:.2f} ± {error:.2f}, {line.fields['covered']} seeds"
