@@ -29,6 +29,7 @@ from udccal.models.geometry import Geometry
 from udccal.models.psf import psf_kernels
 from udccal.models.wire import Wire
 from udccal.numerics import in_float64
+from udccal.reports.true_values import true_geometry
 from udccal.rig import load_rig
 from udccal.simulation.psf import captured_light, kernels, spread_at
 from udccal.simulation.truth import RigTruth, draw_truth
@@ -44,18 +45,21 @@ class Coverage:
     """Of the kernel at places without an LED.
 
     Attributes:
-        covered: part of its samples within 1.96 sigma of the truth.
-        z: of these samples.
+        z: of its samples.
         stated, found: relative L2 error, root mean square over places and colours.
         error_l2: what the fit says of positions that were held out; pattern_p of its residuals.
     """
 
-    covered: float
     stated: float
     found: float
     error_l2: float
     pattern_p: float
     z: Float[np.ndarray, " n"]
+
+    @property
+    def covered(self) -> float:
+        """Part of the samples within 1.96 sigma of the truth."""
+        return float((np.abs(self.z) <= 1.96).mean())
 
 
 def coverage(seed: int, columns: int = 4, rows: int = 3, shifts: int = 3) -> Coverage:
@@ -70,7 +74,6 @@ def coverage(seed: int, columns: int = 4, rows: int = 3, shifts: int = 3) -> Cov
     sigma = psf_sigma(fitted.posterior, places, *window)
     told = {item.name: item.value for item in fitted.result.diagnostics}
     return Coverage(
-        covered=float((np.abs(found - true) <= 1.96 * sigma).mean()),
         stated=_relative_l2(sigma, true),
         found=_relative_l2(found - true, true),
         error_l2=told["kernel_error_l2"],
@@ -126,21 +129,6 @@ def seen_by_the_wire(truth: RigTruth, geometry: Geometry) -> Wire:
         row_open=np.float64(panel.row_open + 0.003),
         column_open=np.float64(panel.column_open - 0.002),
         depth_per_pitch=np.float64(panel.structure_thickness_mm / pitch),
-    )
-
-
-def true_geometry(truth: RigTruth) -> Geometry:
-    """The geometry term of a simulated rig."""
-    optics = truth.optics
-    matrix = optics.R_panel_camera
-    angle = np.arccos((np.trace(matrix) - 1) / 2)
-    axis = np.array([matrix[2, 1] - matrix[1, 2], matrix[0, 2] - matrix[2, 0], matrix[1, 0] - matrix[0, 1]])
-    return Geometry(
-        focal=np.array([optics.fx_px, optics.fy_px]),
-        centre=np.array([optics.cx_px, optics.cy_px]),
-        distortion=np.array(optics.distortion),
-        rotation=axis * angle / (2 * np.sin(angle)),
-        pupil=optics.pupil_mm,
     )
 
 

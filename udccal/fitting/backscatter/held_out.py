@@ -11,7 +11,7 @@ from scipy.stats import chi2
 from udccal.fitting.backscatter.begin import Problem, solved
 from udccal.fitting.backscatter.checks import SIGNIFICANT, noise_variance
 from udccal.fitting.backscatter.likelihood import Fitted
-from udccal.fitting.backscatter.profile import mask_slopes, predicted_variance, profiled, with_white
+from udccal.fitting.backscatter.profile import mask_slopes, predicted_variance, profiled, with_still_white, with_white
 from udccal.fitting.backscatter.ratios import ratios_and_slopes, window_logs, windows_at
 from udccal.fitting.backscatter.vector import Order
 
@@ -60,8 +60,7 @@ def _prediction_variance(problem: Problem, fitted: Fitted) -> Float[np.ndarray, 
     seen, x = problem.seen, fitted.solution.x
     at = windows_at(problem.template.window, seen.rays, fitted.corner, seen.shown)
     ratio, slope = ratios_and_slopes(problem.template, x, at, window_logs(at, seen.shown))
-    ratio = with_white(ratio)
-    slope = np.concatenate([np.zeros((len(slope), 1, *slope.shape[2:])), slope], axis=1)
+    ratio, slope = with_white(ratio), with_still_white(slope)
     best = profiled(ratio, seen, fitted.weight)
     by_mask = mask_slopes(ratio, slope, best, seen, fitted.weight)
     return predicted_variance(ratio, slope, best, by_mask, fitted.solution.cov)

@@ -9,7 +9,14 @@ from jaxtyping import Float, Int, UInt8
 
 from udccal.fitting.backscatter.data import PanelShots, directions
 from udccal.fitting.backscatter.evidence import Evidence, Pictures, evidence, pictures_of, weights, weights_to_start
-from udccal.fitting.backscatter.profile import Profiled, mask_slopes, predicted_variance, profiled, with_white
+from udccal.fitting.backscatter.profile import (
+    Profiled,
+    mask_slopes,
+    predicted_variance,
+    profiled,
+    with_still_white,
+    with_white,
+)
 from udccal.fitting.backscatter.ratios import Windows, ratios, ratios_and_slopes, window_logs, windows_at
 from udccal.fitting.backscatter.solve import corners_of
 from udccal.models.backscatter import Backscatter, grid_positions
@@ -107,8 +114,7 @@ def _predicted(
     ratio, slope = ratios_and_slopes(known.template, known.x, at, window_logs(at, every))
     new, new_slope = ratio[len(shots.shown) :], slope[:, len(shots.shown) :]
     old = with_white(ratio[: len(shots.shown)])
-    still = np.zeros((len(slope), 1, *slope.shape[2:]))
-    old_slope = np.concatenate([still, slope[:, : len(shots.shown)]], axis=1)
+    old_slope = with_still_white(slope[:, : len(shots.shown)])
     best, weight = _best(known, seen, old)
     by_mask = mask_slopes(old, old_slope, best, seen, weight)
     variance = predicted_variance(new, new_slope, best, by_mask, known.cov)

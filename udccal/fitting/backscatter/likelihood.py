@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from udccal.fitting.backscatter.evidence import Evidence
-from udccal.fitting.backscatter.profile import profiled, whitened, with_white
+from udccal.fitting.backscatter.profile import profiled, whitened, with_still_white, with_white
 from udccal.fitting.backscatter.ratios import Windows, ratios, ratios_and_slopes, window_logs, windows_at
 from udccal.fitting.backscatter.vector import Order, Prior
 from udccal.fitting.solvers import Linearised, Solution, most_probable
@@ -53,8 +53,7 @@ def linearised(
 ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m 18"]]:
     """Whitened errors at ``x`` and their slopes; ``logs`` is of ``window_logs``."""
     ratio, slope = ratios_and_slopes(template, x, at, logs)
-    still = np.zeros((len(slope), 1, *slope.shape[2:]))
-    errors, by_ratio = whitened(with_white(ratio), np.concatenate([still, slope], axis=1), seen, weight)
+    errors, by_ratio = whitened(with_white(ratio), with_still_white(slope), seen, weight)
     return errors.ravel(), by_ratio.reshape(len(by_ratio), -1).T
 
 

@@ -25,6 +25,12 @@ def with_white(pictures: Float[np.ndarray, "*k pictures 3 n"]) -> Float[np.ndarr
     return np.concatenate([white, pictures], axis=-3)
 
 
+def with_still_white(slopes: Float[np.ndarray, "k pictures 3 n"]) -> Float[np.ndarray, "k shots 3 n"]:
+    """Slopes of the ratios of all shots: white's stays 1, whatever moves."""
+    still = np.zeros((len(slopes), 1, *slopes.shape[2:]))
+    return np.concatenate([still, slopes], axis=1)
+
+
 def profiled(ratio: Float[np.ndarray, "shots 3 n"], seen: Evidence, weight: Float[np.ndarray, "shots 3 n"]) -> Profiled:
     """Mask and dark signal by weighted linear least squares, bin by bin."""
     square, apart, sure = weight**2, seen.exposure[:, None, None], 1 / seen.dark_variance

@@ -27,6 +27,21 @@ _PER_PX = 4
 _MARGIN = 1.25
 
 
+# Of a block, what it has by shot and sample.
+_BY_SAMPLE = (
+    "points",
+    "density",
+    "colour",
+    "rate",
+    "known",
+    "noise_per_rate",
+    "weight",
+    "correction",
+    "overlap_slope",
+    "pitch_slope",
+)
+
+
 class Block(eqx.Module):
     """The chosen samples of all shots of one field position, padded to one size with samples of weight 0.
 
@@ -62,6 +77,12 @@ class Block(eqx.Module):
     overlaps_pitch_mm: Float[Arrayish, ""]
     disc_px: Float[Arrayish, ""]
     index: Int[Arrayish, " shots"]
+
+
+def picked(block: Block, samples: Int[np.ndarray, "shots_or_1 m"]) -> Block:
+    """The block with these samples of every shot alone, by number; one row of them serves all shots."""
+    shots = np.arange(np.shape(block.rate)[0])[:, None]
+    return replace(block, **{name: np.asarray(getattr(block, name))[shots, samples] for name in _BY_SAMPLE})
 
 
 class Local(eqx.Module):

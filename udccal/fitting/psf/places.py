@@ -6,12 +6,10 @@ each colour unevenly, so it can be off by a pixel; a descent from there ends on 
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 from jaxtyping import Float
 
-from udccal.fitting.psf.blocks import Block, Local
+from udccal.fitting.psf.blocks import Block, Local, picked
 from udccal.fitting.psf.normal import Evaluator, unit_light, unit_light_at
 
 _GRID_PX = np.linspace(-1.25, 1.25, 11)
@@ -36,24 +34,7 @@ def _core(block: Block) -> Block:
     """The samples next to the brightest spot alone."""
     points = np.asarray(block.points)
     near = np.argsort((points**2).sum(axis=-1), axis=1, kind="stable")[:, :_CORE_SAMPLES]
-    fields = {
-        name: np.take_along_axis(np.asarray(getattr(block, name)), near, axis=1)
-        for name in (
-            "density",
-            "rate",
-            "known",
-            "noise_per_rate",
-            "weight",
-            "correction",
-            "overlap_slope",
-            "pitch_slope",
-        )
-    }
-    pairs = {
-        name: np.take_along_axis(np.asarray(getattr(block, name)), near[..., None], axis=1)
-        for name in ("points", "colour")
-    }
-    return replace(block, **fields, **pairs)
+    return picked(block, near)
 
 
 def _linear(

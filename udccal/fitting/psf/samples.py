@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Bool
 
-from udccal.fitting.psf.blocks import Block, blocks
+from udccal.fitting.psf.blocks import Block, blocks, picked
 from udccal.fitting.psf.descent import reduced, without_locals
 from udccal.fitting.psf.diffraction import DiffractionFit, with_interference
 from udccal.fitting.psf.normal import Normal, normal_equations
@@ -67,19 +67,7 @@ def _parts(block: Block, size: int) -> list[Block]:
     for start in range(0, count, size):
         index = np.minimum(np.arange(start, start + size), count - 1)
         real = np.arange(start, start + size) < count
-        names = (
-            "points",
-            "density",
-            "colour",
-            "rate",
-            "known",
-            "noise_per_rate",
-            "weight",
-            "correction",
-            "overlap_slope",
-            "pitch_slope",
-        )
-        part = replace(block, **{name: np.asarray(getattr(block, name))[:, index] for name in names})
+        part = picked(block, index[None])
         made.append(replace(part, weight=np.asarray(part.weight) * real, known=np.asarray(part.known) * real))
     return made
 

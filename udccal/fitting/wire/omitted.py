@@ -5,18 +5,15 @@ from __future__ import annotations
 from dataclasses import replace
 
 import equinox as eqx
-import jax
 import numpy as np
 
 from udccal.fitting.wire.basis import Pixels
 from udccal.fitting.wire.harmonics import WireStart, omitted_harmonics
 from udccal.fitting.wire.misfit import Misfit
-from udccal.fitting.wire.scan import with_harmonics
-from udccal.models.wire import Wire, modulation, slopes
+from udccal.fitting.wire.scan import modulation_at, with_harmonics
+from udccal.models.wire import Wire
 
 _PIXELS = 1024
-
-_modulation = jax.jit(lambda wire, ideal, scaled: modulation(wire, slopes(wire, ideal), scaled))
 
 
 def omitted_rms(start: WireStart, wire: Wire, pixels: Pixels) -> float:
@@ -33,7 +30,7 @@ def omitted_rms(start: WireStart, wire: Wire, pixels: Pixels) -> float:
     plain = eqx.tree_at(lambda w: w.amplitudes, wire, np.zeros((0, 2, 1, 1)))
     some = slice(None, None, max(1, len(pixels.ideal) // _PIXELS))
     weak = with_harmonics(plain, harmonics, pixels)
-    return float(np.std(np.asarray(_modulation(weak, pixels.ideal[some][:_PIXELS], pixels.scaled[some][:_PIXELS]))))
+    return float(np.std(np.asarray(modulation_at(weak, pixels.ideal[some][:_PIXELS], pixels.scaled[some][:_PIXELS]))))
 
 
 def with_omitted(found: Misfit, omitted: float) -> Misfit:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import jax
 import numpy as np
 from jaxtyping import Float
 
@@ -11,9 +10,10 @@ from udccal.fitting.wire.joint import Joint
 from udccal.fitting.wire.misfit import Misfit, robust_ratio
 from udccal.fitting.wire.noise import Judged, listed
 from udccal.fitting.wire.phase import PhaseFit
+from udccal.fitting.wire.scan import modulation_at
 from udccal.fitting.wire.sigma import MapSigma
 from udccal.models.geometry import tilt_rad
-from udccal.models.wire import Wire, modulation, panel_rotation, slopes
+from udccal.models.wire import Wire, panel_rotation
 
 SHAPE_NAMES = (
     "rotation_x_deg",
@@ -34,8 +34,6 @@ _WORST_CHI2 = 2.0
 _DOUBTED = 3.0
 _FEW = 16_384
 _MOST_RESIDUALS = 6000
-
-_modulation = jax.jit(lambda wire, ideal, scaled: modulation(wire, slopes(wire, ideal), scaled))
 
 
 def wire_result(
@@ -143,7 +141,7 @@ def _doubts(joint: Joint, phase: PhaseFit, wire: Wire) -> list[str]:
 def _peak_to_peak(joint: Joint, wire: Wire) -> float:
     spent = joint.judged.pixels
     few = np.s_[:: max(1, len(spent.ideal) // _FEW)]
-    return float(np.ptp(np.asarray(_modulation(wire, spent.ideal[few][:_FEW], spent.scaled[few][:_FEW]))))
+    return float(np.ptp(np.asarray(modulation_at(wire, spent.ideal[few][:_FEW], spent.scaled[few][:_FEW]))))
 
 
 def _tilts(wire: Wire) -> tuple[Diagnostic, Diagnostic]:

@@ -15,7 +15,7 @@ from udccal.fitting.wire.basis import Pixels, residuals_and_base
 from udccal.fitting.wire.harmonics import FIELD_DEGREES, SMOOTH_DEGREE, WireStart
 from udccal.fitting.wire.prior import Prior
 from udccal.models.geometry import Geometry
-from udccal.models.wire import Wire, carriers, kappa, slopes, waves
+from udccal.models.wire import Wire, carriers, kappa, modulation, slopes, waves
 
 # Stand-off in periods and pupil in periods, relative to the rig description: twenty per cent wrong in each of two
 # lengths that are divided is a factor 1.5.
@@ -38,6 +38,7 @@ class Place:
 
 _kappa = jax.jit(lambda wire, ideal: kappa(wire, slopes(wire, ideal)))
 _slopes = jax.jit(slopes)
+modulation_at = jax.jit(lambda wire, ideal, scaled: modulation(wire, slopes(wire, ideal), scaled))
 _carrier = jax.jit(lambda wire, ideal: carriers(wire, slopes(wire, ideal), kappa(wire, slopes(wire, ideal)))[0, 0])
 _wave = jax.jit(lambda wire, ideal: waves(wire, slopes(wire, ideal))[:, 0])
 
