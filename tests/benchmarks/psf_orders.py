@@ -2,8 +2,8 @@
 
     python -m tests.benchmarks.psf_orders [--runs N]
 
-Every kind of rig is drawn N times; prints how often which degree was chosen, and exits with 1 where the right one was
-in fewer than 95 of 100.
+Every kind of rig is drawn N times; prints how often which degree and width were chosen, and exits with 1 where the
+right ones were in fewer than 95 of 100.
 """
 
 from __future__ import annotations
@@ -28,12 +28,23 @@ from udccal.models.fields import polynomial_basis, polynomial_terms
 from udccal.numerics import in_float64
 
 ENOUGH: Final = 0.95
-DEGREES: Final = (-1, 0, 1)
 _HALF: Final = (10, 6)
 # A residual is so much of the kernel, and turns over about three times as many rows.
 _BENT: Final = 0.03
 _ROWS_PX: Final = 1.5
 _PLACE_SIGMA_PX: Final = 0.002
+
+
+@final
+@dataclass(frozen=True, order=True)
+class Kind:
+    """A residual: degree of its polynomials, -1 for none, and (rows, columns) to either side of the source it has."""
+
+    degree: int
+    half_px: tuple[int, int]
+
+
+KINDS: Final = (Kind(-1, (0, 0)), Kind(0, _HALF), Kind(0, (5, 3)), Kind(1, _HALF))
 
 
 @final
@@ -57,13 +68,13 @@ def world() -> World:
 
 
 @in_float64
-def chosen(known: World, degree: int, seed: int) -> int:
-    """Degree that is chosen where the residual has ``degree``, its coefficients drawn and the pictures noisy."""
-    scene, rng = known.scene, np.random.default_rng([seed, degree + 1])
+def chosen(known: World, kind: Kind, seed: int) -> Kind:
+    """What is chosen where the residual is of a ``kind``, its coefficients drawn and the pictures noisy."""
+    scene, rng = known.scene, np.random.default_rng([seed, kind.degree + 1, kind.half_px[0]])
     # So much more light in the mean that there is nowhere less than none.
-    drawn = _BENT * np.array([1.0, *rng.choice([-0.5, 0.5], 2)])[: polynomial_terms(degree)]
+    drawn = _BENT * np.array([1.0, *rng.choice([-0.5, 0.5], 2)])[: polynomial_terms(kind.degree)]
     phase = rng.uniform(-np.pi, np.pi)
-    shots = shots_of(scene, [_bent(picture, known, drawn, phase) for picture in known.pictures], rng)
+    shots = shots_of(scene, [_bent(picture, known, drawn, phase, kind) for picture in known.pictures], rng)
     explained = np.stack([_explained(p, shots, i) for i, p in enumerate(known.pictures)])
     place = np.stack([p.source_px for p in known.pictures])
     place = place + _PLACE_SIGMA_PX * rng.standard_normal(place.shape)
@@ -71,7 +82,9 @@ def chosen(known: World, degree: int, seed: int) -> int:
     sources = with_light_of_peak(shots, Sources(place, light, np.zeros(shots.count)), explained)
     half = _half_sensor(scene)
     positions = (shots.positions_px() - half) / half
-    return select_field(shots, sources, explained, held_out_positions(len(positions)), positions, 0.0).degree
+    found = select_field(shots, sources, explained, held_out_positions(len(positions)), positions, 0.0)
+    rows, columns = found.image.shape[2:]
+    return Kind(found.degree, (rows // 2, columns // 2))
 
 
 def _half_sensor(scene: Scene) -> Float[np.ndarray, "2"]:
@@ -79,20 +92,25 @@ def _half_sensor(scene: Scene) -> Float[np.ndarray, "2"]:
     return (np.array([camera.columns, camera.rows]) - 1) / 2
 
 
-def _bent(picture: Picture, known: World, drawn: Float[np.ndarray, " terms"], phase: float) -> Picture:
+def _bent(picture: Picture, known: World, drawn: Float[np.ndarray, " terms"], phase: float, kind: Kind) -> Picture:
     """The picture with a residual that goes up and down along columns."""
     if not drawn.size:
         return picture
     rows, columns = picture.rate.shape
-    degree = next(n for n in DEGREES if polynomial_terms(n) == drawn.size)
     half = _half_sensor(known.scene)
-    basis = np.asarray(polynomial_basis(((picture.source_px - half) / half)[None], degree))[0]
+    basis = np.asarray(polynomial_basis(((picture.source_px - half) / half)[None], kind.degree))[0]
     image = (basis @ drawn) * known.room * (1.0 + np.sin(np.arange(rows) / _ROWS_PX + phase)[:, None])
+    if kind.half_px != _HALF:
+        down, across = (np.abs(np.arange(size) - size // 2) for size in (rows, columns))
+        room = known.room * ((down <= kind.half_px[0])[:, None] & (across <= kind.half_px[1]))
+        image = image * (room > 0)
+        # An LED that looked brighter by it would look as if it lacked light all around.
+        image = image - room * (image * known.room).sum() / (room * known.room).sum()
     x, y = picture.source_px - picture.corner_px - [columns // 2, rows // 2]
     disc = np.array([DISC_PX])
     light = shifts(np.array([y]), disc, rows)[0] @ image @ shifts(np.array([x]), disc, columns)[0].T
     flux = picture.flux[channel_map(known.scene.rig.camera.cfa, rows, columns)]
-    return replace(picture, rate=picture.rate + np.maximum(flux * light, 0.0))
+    return replace(picture, rate=np.maximum(picture.rate + flux * light, 0.0))
 
 
 def _room(scene: Scene, made: list[Picture]) -> Float[np.ndarray, "rows columns"]:
@@ -120,12 +138,14 @@ def main() -> int:
     parser.add_argument("--runs", type=int, default=100, help="of every kind of rig")
     runs: int = parser.parse_args().runs
     known, good = world(), True
-    print("| residual's degree (-1: none) | chosen | of runs |\n| ---: | ---: | ---: |")
-    for degree in DEGREES:
-        counts = Counter(chosen(known, degree, seed) for seed in range(runs))
-        good &= counts[degree] >= ENOUGH * runs
+    print("| residual's degree (-1: none), width | chosen | of runs |\n| ---: | ---: | ---: |")
+    for kind in KINDS:
+        counts = Counter(chosen(known, kind, seed) for seed in range(runs))
+        good &= counts[kind] >= ENOUGH * runs
         for found, count in counts.most_common():
-            print(f"| {degree} | {found} | {count} of {runs} |", flush=True)
+            print(
+                f"| {kind.degree}, {kind.half_px} | {found.degree}, {found.half_px} | {count} of {runs} |", flush=True
+            )
     return 0 if good else 1
 
 

@@ -58,6 +58,7 @@ def true_field(truth: RigTruth) -> PsfField:
         residual=np.zeros((1, 3, 1, 1)),
         centre_px=np.array([511.5, 383.5]),
         half_px=np.array([511.5, 383.5]),
+        support_px=np.array([1024.0, 768.0]),
         degree=0,
         fine=14,
     )

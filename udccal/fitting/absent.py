@@ -46,6 +46,7 @@ def absent_psf(rig: RigDescription, geometry: Geometry) -> PsfField:
         residual=np.ones((1, 3, 1, 1)),
         centre_px=half,
         half_px=half,
+        support_px=np.zeros(2),
         degree=0,
     )
 

@@ -40,6 +40,8 @@ class PsfField(eqx.Module):
         diffraction_share: 1, or 0 when the residual carries the whole kernel.
         residual: coefficients of the residual image; its terms are ``fields.polynomial_basis`` of ``degree``.
         centre_px, half_px: positions scale as (p - centre) / half for the polynomials.
+        support_px: (across, down) to either side of the source, beyond which pictures showed none of the kernel's
+            light; the sensor's size where they showed no end of it.
         degree: of the residual's polynomials; -1 for no residual.
         fine: lattice nodes to a pixel where detail matters; see ``fine_oversample``.
     """
@@ -50,6 +52,7 @@ class PsfField(eqx.Module):
     residual: Float[Arrayish, "terms 3 window_rows window_columns"]
     centre_px: Float[Arrayish, "2"]
     half_px: Float[Arrayish, "2"]
+    support_px: Float[Arrayish, "2"]
     degree: int = eqx.field(static=True)
     fine: int = eqx.field(static=True, default=8)
 

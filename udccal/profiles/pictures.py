@@ -8,10 +8,10 @@ import numpy as np
 from jaxtyping import Float32
 
 from udccal.cfa import channel_map
+from udccal.kernels import fitted_size, kernels_at
 from udccal.models.backscatter import Backscatter, backscatter_rate
 from udccal.models.psf import PsfField
 from udccal.numerics import in_float64
-from udccal.profiles.kernels import kernel_size, kernels_at
 from udccal.rig import RigDescription
 
 ATLAS_COLUMNS, ATLAS_ROWS = 5, 3
@@ -34,7 +34,7 @@ def psf_atlas(term: PsfField, rig: RigDescription) -> Mapping[str, Float32[np.nd
     """Kernels on a grid of field positions, tiled as the positions lie on the sensor; channels R, G, B."""
     x = np.linspace(_INSET, 1 - _INSET, ATLAS_COLUMNS) * (rig.camera.columns - 1)
     y = np.linspace(_INSET, 1 - _INSET, ATLAS_ROWS) * (rig.camera.rows - 1)
-    rows, columns = kernel_size(rig)
+    rows, columns = fitted_size(term, rig)
     kernels = kernels_at(term, np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2), rows, columns)
     tiles = kernels.reshape(ATLAS_ROWS, ATLAS_COLUMNS, 3, rows, columns)
     atlas = tiles.transpose(2, 0, 3, 1, 4).reshape(3, ATLAS_ROWS * rows, -1)

@@ -10,10 +10,10 @@ from jaxtyping import Float, UInt8
 from scipy.ndimage import gaussian_filter
 
 from udccal.fitting.calibrate import Calibration
+from udccal.kernels import kernel_size, kernels_at
 from udccal.models.backscatter import backscatter_rate
 from udccal.models.geometry import Geometry, panel_points_mm
 from udccal.numerics import in_float64
-from udccal.profiles.kernels import kernel_size, kernels_at
 from udccal.rig import RigDescription
 
 # Reach of the smoothing that stands for the shading, as a share of the picture's height.

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from udccal.kernels import KERNEL_COLUMNS, KERNEL_ROWS, fitted_size, kernels_at
 from udccal.models.psf import PsfField
-from udccal.profiles.kernels import KERNEL_COLUMNS, KERNEL_ROWS, kernel_size, kernels_at
 from udccal.restoration.deblur import Deblurrer
 from udccal.restoration.lowrank import KernelGrid, decompose
 from udccal.restoration.operator import Blur, Canvas
@@ -21,7 +21,8 @@ class PlanOptions:
     """Accuracy against time; the defaults were measured on full-size simulated scenes.
 
     Attributes:
-        kernel_rows, kernel_columns: largest size of the kernels in px, odd; a smaller sensor gets smaller ones.
+        kernel_rows, kernel_columns: largest size of the kernels in px, odd; a smaller sensor gets smaller ones, and so
+            does a psf of less support.
         grid_rows, grid_columns: field positions at which the psf is evaluated.
         rank_tolerance: RMS over the field of the kernels' relative L2 error, at which the rank is cut. 3 % costs less
             than 0.1 dB against full rank.
@@ -55,7 +56,7 @@ def kernel_grid(psf: PsfField, rig: RigDescription, options: PlanOptions) -> Ker
     camera = rig.camera
     x = np.linspace(0.0, camera.columns - 1.0, options.grid_columns)
     y = np.linspace(0.0, camera.rows - 1.0, options.grid_rows)
-    rows, columns = kernel_size(rig, options.kernel_rows, options.kernel_columns)
+    rows, columns = fitted_size(psf, rig, options.kernel_rows, options.kernel_columns)
     positions = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
     kernels = kernels_at(psf, positions, rows, columns, options.workers)
     return KernelGrid(x, y, kernels.reshape(len(y), len(x), _CHANNELS, rows, columns))

@@ -22,7 +22,7 @@ from udccal.fitting.calibrate import ORDER, QUICK, Foundation, fit_foundation
 from udccal.fitting.psf.fit import nominal_psf
 from udccal.io.photograph import read_photograph
 from udccal.io.png import write_png16, write_rgb8
-from udccal.profiles.kernels import kernel_size, kernels_at
+from udccal.kernels import kernel_size, kernels_at
 from udccal.profiles.store import check_replaceable, read_profile
 from udccal.reports.page import write_page
 from udccal.reports.pictures import PictureComparison, Score, compare_pictures

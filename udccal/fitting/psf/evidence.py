@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from jaxtyping import Float
 
@@ -11,10 +13,12 @@ from udccal.fitting.psf.field import FieldFit
 from udccal.fitting.psf.posterior import full_cov, light_and_slopes
 from udccal.fitting.psf.select import Selection
 from udccal.fitting.psf.shots import Shots
+from udccal.fitting.psf.support import Support
 from udccal.fitting.result import Diagnostic, Estimate, FitResult, FitStatus, ResidualSample
 from udccal.models.diffraction import Diffraction
 from udccal.models.geometry import Geometry
 from udccal.models.psf import PsfField, fine_oversample
+from udccal.rig import RigDescription
 
 _POOR = 0.2
 # A pattern less likely than this by chance is said.
@@ -57,6 +61,7 @@ def fit_result(
         residual=selection.image,
         centre_px=size,
         half_px=size,
+        support_px=2 * size + 1,
         degree=max(selection.degree, 0),
         fine=fine_oversample(float(fit.theta[4]), float(np.mean(np.asarray(geometry.focal)))),
     )
@@ -118,8 +123,31 @@ def diffraction_alone(model: Diffraction, geometry: Geometry) -> PsfField:
         residual=np.zeros((1, 3, 1, 1)),
         centre_px=half,
         half_px=half,
+        support_px=2 * half + 1,
         degree=0,
         fine=fine_oversample(float(model.pupil_mm), float(np.mean(np.asarray(geometry.focal)))),
+    )
+
+
+def with_support(result: FitResult[PsfField], support: Support, rig: RigDescription) -> FitResult[PsfField]:
+    """The result with a term that says how far its kernel was seen.
+
+    Where no end of diffraction was seen, it goes on over the whole sensor; an image ends where it ends.
+    """
+    down, across = support.half_px
+    goes_on = [seen and bool(result.term.diffraction_share) for seen in support.open_ended]
+    reach = [rig.camera.columns if goes_on[1] else across, rig.camera.rows if goes_on[0] else down]
+    seen = (Diagnostic("support_rows", float(down), "px"), Diagnostic("support_columns", float(across), "px"))
+    along = " and ".join(name for name, on in zip(("columns", "rows"), goes_on, strict=True) if on)
+    note = (
+        f"Light was seen up to the border of the pictures along {along}: beyond it the kernel is the panel's as fitted."
+    )
+    return replace(
+        result,
+        term=replace(result.term, support_px=np.array(reach, dtype=np.float64)),
+        candidates=(*result.candidates, *support.candidates),
+        diagnostics=(*result.diagnostics, *seen),
+        notes=(*result.notes, *([note] if along else [])),
     )
 
 

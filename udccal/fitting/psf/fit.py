@@ -2,7 +2,7 @@
 
 First the few numbers of diffraction by the panel are fitted to some of the shots; then it is tried on the others how
 much an image of smooth coefficients, on top of diffraction or instead of it, improves the prediction at positions that
-were left out.
+were left out, and how far from the LED these show the kernel's light.
 """
 
 from __future__ import annotations
@@ -10,20 +10,18 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 
-from udccal.fitting.psf.blocks import blocks, fit_lattice
-from udccal.fitting.psf.diffraction import DiffractionFit, fit_locals
-from udccal.fitting.psf.evidence import NAMES, diffraction_alone, failed, fit_result
+from udccal.fitting.psf.evidence import NAMES, diffraction_alone, failed, fit_result, with_support
+from udccal.fitting.psf.explained import explain
 from udccal.fitting.psf.field import fit_field
-from udccal.fitting.psf.normal import Evaluator
 from udccal.fitting.psf.posterior import PsfPosterior, posterior
 from udccal.fitting.psf.read import read_shots
-from udccal.fitting.psf.residual import Sources, with_light_of_peak
 from udccal.fitting.psf.samples import share_of_information
-from udccal.fitting.psf.select import select_field
+from udccal.fitting.psf.select import Selection, select_field
 from udccal.fitting.psf.shots import Shots
 from udccal.fitting.psf.start import LEAST_KNOWN, pitch_tolerance, start_model, start_prior, wire_shows
+from udccal.fitting.psf.wide import wide_support
 from udccal.fitting.result import FitResult, FitStatus
 from udccal.models.geometry import Geometry
 from udccal.models.noise import Noise
@@ -84,7 +82,12 @@ def fit_psf(
         return failed(start, geometry, FitStatus.TOO_DARK, note)
     if reading.shots is None:
         return failed(start, geometry, FitStatus.TOO_FEW_DATA, "No field position was captured.")
-    result = fit_shots(reading.shots, session.rig, geometry, wire, effort)
+    parts = _fit(reading.shots, session.rig, geometry, wire, effort)
+    result, selection = parts.result, parts.selection
+    if selection is not None:
+        held_out = held_out_positions(int(reading.shots.position.max()) + 1)
+        wide = wide_support(session, noise, wire, reading, selection.sources, result.term, held_out)
+        result = with_support(result, wide or selection.support, session.rig)
     left_out = reading.clipped + reading.dark
     note = f"{left_out} pictures were left out: {reading.dark} without an LED, {reading.clipped} clipped."
     return replace(result, notes=(*result.notes, note)) if left_out else result
@@ -120,21 +123,36 @@ def fit_shots(
     return fit_shots_fully(shots, rig, geometry, wire, effort).result
 
 
-@in_float64
 def fit_shots_fully(
     shots: Shots, rig: RigDescription, geometry: Geometry, wire: Wire, effort: Effort | None = None
 ) -> FittedPsf:
     """As ``fit_shots``, with the posterior of the numbers of diffraction."""
-    effort = effort or Effort()
+    parts = _fit(shots, rig, geometry, wire, effort or Effort())
+    if parts.selection is None:
+        return FittedPsf(parts.result, None)
+    return FittedPsf(with_support(parts.result, parts.selection.support, rig), parts.posterior)
+
+
+@dataclass(frozen=True)
+class _Parts:
+    """The result without a support, and what it stands on; nothing where there is no fit."""
+
+    result: FitResult[PsfField]
+    posterior: PsfPosterior | None = None
+    selection: Selection | None = None
+
+
+@in_float64
+def _fit(shots: Shots, rig: RigDescription, geometry: Geometry, wire: Wire, effort: Effort) -> _Parts:
     start = start_model(rig, geometry, wire)
     count = int(shots.position.max()) + 1
     if count < _LEAST_POSITIONS:
         note = f"{count} field positions were captured; {_LEAST_POSITIONS} are needed at least."
-        return FittedPsf(failed(start, geometry, FitStatus.TOO_FEW_DATA, note), None)
+        return _Parts(failed(start, geometry, FitStatus.TOO_FEW_DATA, note))
     if pitch_tolerance(rig) > LEAST_KNOWN:
         pitch = rig.panel.pitch_mm
         note = f"The panel's pitch is {pitch.value:g} ± {pitch.tolerance:g} mm in the rig's description. Measure it."
-        return FittedPsf(failed(start, geometry, FitStatus.POOR_FIT, note), None)
+        return _Parts(failed(start, geometry, FitStatus.POOR_FIT, note))
     held_out = held_out_positions(count)
     chosen = shots.pick(some_shots(shots, held_out, effort))
     chosen = replace(chosen, position=np.unique(chosen.position, return_inverse=True)[1].reshape(-1))
@@ -142,15 +160,14 @@ def fit_shots_fully(
     close = (min(half[0], effort.close_px[0]), min(half[1], effort.close_px[1]))
     seen = wire_shows(wire)
     field = fit_field(chosen, geometry, start_prior(rig, start, seen), close, effort.far_share, effort.iterations, seen)
-    evaluator = replace(field.diffraction.problem.evaluator, lattice=fit_lattice(half))
-    sources, explained = _all_sources(shots, geometry, evaluator, field.diffraction)
+    sources, explained = explain(shots, geometry, field.diffraction, half)
     size = np.array([rig.camera.columns - 1, rig.camera.rows - 1]) / 2.0
     unit = (shots.positions_px() - size) / size
     selection = select_field(shots, sources, explained, held_out, unit, field.diffraction.model_error)
     used = share_of_information(field.diffraction, field.shots, geometry, close, shots.count, len(NAMES))
     result = fit_result(shots, geometry, field, selection, size, used, pitch_tolerance(rig))
     known = posterior(field.diffraction, geometry, selection.error) if selection.share else None
-    return FittedPsf(result, known)
+    return _Parts(result, known, selection)
 
 
 def held_out_positions(count: int) -> Bool[np.ndarray, " positions"]:
@@ -167,19 +184,3 @@ def some_shots(shots: Shots, held_out: Bool[np.ndarray, " positions"], effort: E
         own = np.flatnonzero(shots.position == place)
         keep[own[np.unique(np.linspace(0, len(own) - 1, effort.shifts).round().astype(int))]] = True
     return keep
-
-
-def _all_sources(
-    shots: Shots, geometry: Geometry, evaluator: Evaluator, fit: DiffractionFit
-) -> tuple[Sources, Float[np.ndarray, "shots rows columns"]]:
-    """Places and light of all shots under the fitted model, and what it expects of every sample per unit of light."""
-    place, flux, background = shots.centre_px.copy(), np.zeros((shots.count, 3)), np.zeros(shots.count)
-    explained = np.zeros(shots.rate.shape)
-    for block in blocks(shots, geometry, np.ones(shots.rate.shape, dtype=bool)):
-        local, unit = fit_locals(evaluator, fit.theta, block, fit.model_error)
-        index = np.asarray(block.index)
-        real = index >= 0
-        place[index[real]] += np.asarray(local.offset_px)[real]
-        flux[index[real]], background[index[real]] = np.asarray(local.flux)[real], np.asarray(local.background)[real]
-        explained[index[real]] = unit[real].reshape(-1, *shots.rate.shape[1:])
-    return with_light_of_peak(shots, Sources(place, flux, background), explained), explained

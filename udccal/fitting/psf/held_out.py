@@ -9,9 +9,7 @@ from jaxtyping import Bool, Float, Int
 
 from udccal.fitting.psf.kernel_error import KernelError, estimate_kernel_error
 from udccal.fitting.psf.residual import Sources, Windows, expected
-from udccal.fitting.psf.weights import estimate_model_error, noise_at
-
-_ROBUST = 3.0
+from udccal.fitting.psf.weights import estimate_model_error, huber, noise_at
 
 
 @dataclass(frozen=True)
@@ -49,8 +47,7 @@ class Judged:
         Pictures of a position share what the model leaves out there. Of a single position, it is by picture.
         """
         size = np.abs(self.residual) / np.sqrt(self.total)
-        huber = np.where(size < _ROBUST, size**2, 2 * _ROBUST * size - _ROBUST**2)
-        each = (np.log(self.total / self.measured) + huber) * self.known
+        each = (np.log(self.total / self.measured) + huber(size)) * self.known
         by_shot = each.sum(axis=(1, 2)) / np.maximum(self.known.sum(axis=(1, 2)), 1)
         places = np.unique(position)
         return np.array([by_shot[position == place].mean() for place in places]) if len(places) > 1 else by_shot

@@ -25,22 +25,28 @@ _values = eqx.filter_jit(wire_values)
 
 @dataclass(frozen=True)
 class Reading:
-    """What was found: ``shots`` is None when there is none to use; counts of shots by what was wrong with them."""
+    """What was found: ``shots`` is None when there is none to use; counts of shots by what was wrong with them.
+
+    ``steps`` are those that the shots are of.
+    """
 
     shots: Shots | None
+    steps: tuple[StoredStep, ...]
     taken: int
     dark: int
     clipped: int
 
 
-def read_shots(session: Session, noise: Noise, wire: Wire, half: tuple[int, int]) -> Reading:
-    """Crops of ``half`` (rows, columns) to either side of the LED, from all steps of the term psf.
+def read_shots(
+    session: Session, noise: Noise, wire: Wire, half: tuple[int, int], steps: tuple[StoredStep, ...] | None = None
+) -> Reading:
+    """Crops of ``half`` (rows, columns) to either side of the LED, from all steps of the term psf or some of them.
 
     Raises:
         SessionError: when a file is missing or damaged.
     """
-    crops, aims, discs, dark, clipped = [], [], [], 0, 0
-    steps = session.steps("psf")
+    crops, aims, discs, used, dark, clipped = [], [], [], [], 0, 0
+    steps = tuple(session.steps("psf")) if steps is None else steps
     for step in steps:
         subject = step.subject
         if not isinstance(subject, LedSubject):
@@ -50,15 +56,17 @@ def read_shots(session: Session, noise: Noise, wire: Wire, half: tuple[int, int]
         dark += crop is None and not full
         if crop is not None and not full:
             crops.append(crop)
+            used.append(step)
             aims.append((subject.x_px, subject.y_px))
             # The pupil is a few mm behind the panel: less than a percent of any useful distance.
             behind = session.rig.mounting.standoff_mm.value
             discs.append(subject.diameter_mm / (subject.distance_mm + behind) * session.rig.focal_px)
     if not crops:
-        return Reading(None, len(steps), dark, clipped)
+        return Reading(None, (), len(steps), dark, clipped)
     shots = stack(crops, np.array(aims), np.array(discs))
     camera = session.rig.camera
-    return Reading(without_wire(shots, wire, camera.rows, camera.columns), len(steps), dark, clipped)
+    shots = without_wire(shots, wire, camera.rows, camera.columns)
+    return Reading(shots, tuple(used), len(steps), dark, clipped)
 
 
 def without_wire(shots: Shots, wire: Wire, rows: int, columns: int) -> Shots:

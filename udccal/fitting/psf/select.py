@@ -1,4 +1,4 @@
-"""Which residual the kernel needs: tried order by order, judged at positions that were left out."""
+"""Which residual the kernel needs, how wide, and how far light reaches: judged at positions that were left out."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from udccal.fitting.psf.free import PER_PX, fixed, image_of, movable, on_pixels,
 from udccal.fitting.psf.kernel_error import KernelError
 from udccal.fitting.psf.residual import Sources, prior_spread
 from udccal.fitting.psf.shots import Shots
+from udccal.fitting.psf.support import Support, choose_support
 from udccal.fitting.psf.trial import BESIDE, FREE, Data, Order, Trial, attempt, solve
 from udccal.fitting.result import Candidate
 from udccal.models.fields import polynomial_terms
@@ -20,6 +21,8 @@ _FIRST_MODEL_ERROR = 0.01
 # Beyond this mismatch of diffraction alone, an image without diffraction is tried too.
 _DOUBTFUL = 0.05
 _HIGHEST, _IN_VAIN = 3, 2
+# Parts of the window that may be enough for a residual, the narrowest first.
+_REACHES = (0.25, 0.5)
 # Of places and light together with a free image, which change by less than this (px; relatively).
 _ROUNDS, _FARTHEST = 2, 0.7
 
@@ -31,10 +34,11 @@ class Selection:
     Attributes:
         degree: of the residual's polynomials, -1 for none.
         share: of diffraction, 1 or 0.
-        image: the residual on pixels; a single zero for none.
+        image: the residual on pixels, as wide as it is needed; a single zero for none.
         sources: every shot's place and light.
         held_out: relative L2 by colour at positions that were left out, noise included.
         error: of the kernel at these positions, beside noise.
+        support: how far they show its light.
         relative_l2: what that error makes of the kernel, mean over colours.
         chi2_dof: mean square of the errors of their samples in units of sigma, a model error included.
         samples: how many they are.
@@ -47,6 +51,7 @@ class Selection:
     sources: Sources
     held_out: Float[np.ndarray, "3"]
     error: KernelError
+    support: Support
     relative_l2: float
     chi2_dof: float
     samples: int
@@ -74,24 +79,27 @@ def select_field(
     data = Data(shots, explained, unit_positions[shots.position], magnitude)
     test = held_out[shots.position]
     plain = attempt(data, sources, test, Order(-1, 1.0, 0.0, model_error))
-    trials = [plain, *_rising(data, sources, test, 1.0, plain, model_error)]
+    trials = [plain, *_rising(data, sources, test, 1.0, plain, plain.judged.model_error)]
     if plain.relative_l2 > _DOUBTFUL:
         free = _free_sources(data, sources)
         trials += _rising(data, free, test, 0.0, None, _FIRST_MODEL_ERROR)
     best = trials[0]
     for trial in trials[1:]:
         best = trial if trial.beats(best) else best
-    order = best.order
-    image = solve(data, best.sources, np.ones(shots.count, dtype=bool), order)
+    if best.order.degree >= 0 and best.order.share:
+        best, narrower = _narrowed(data, test, best)
+        trials += narrower
+    support = choose_support(best.judged)
     errors = best.judged.errors()
     size = shots.rate.shape[1:]
     return Selection(
-        degree=order.degree,
-        share=order.share,
-        image=np.zeros((1, 3, 1, 1)) if order.degree < 0 else image if order.share else on_pixels(image),
+        degree=best.order.degree,
+        share=best.order.share,
+        image=_image(data, best, support),
         sources=best.sources,
         held_out=best.mismatch,
         error=best.error,
+        support=support,
         relative_l2=float(best.error.relative_l2(magnitude).mean()),
         chi2_dof=float(np.mean(errors**2)),
         samples=len(errors),
@@ -127,6 +135,29 @@ def _rising(
         helps = before is None or trials[-1].beats(before)
         before, useless = (trials[-1], 0) if helps else (before, useless + 1)
     return trials
+
+
+def _narrowed(data: Data, test: Bool[np.ndarray, " shots"], best: Trial) -> tuple[Trial, list[Trial]]:
+    """The narrowest residual that the whole window does not improve on, and those that were tried for it."""
+    tried: list[Trial] = []
+    for reach in _REACHES:
+        tried.append(attempt(data, best.sources, test, replace(best.order, reach=reach)))
+        if not best.predicts_better(tried[-1]):
+            return tried[-1], tried
+    return best, tried
+
+
+def _image(data: Data, best: Trial, support: Support) -> Float[np.ndarray, "terms 3 rows columns"]:
+    """The residual from all shots: beside diffraction as wide as it is needed, alone as far as light was seen."""
+    order = best.order
+    if order.degree < 0:
+        return np.zeros((1, 3, 1, 1))
+    image = solve(data, best.sources, np.ones(data.shots.count, dtype=bool), order)
+    image = image if order.share else on_pixels(image)
+    middle = [size // 2 for size in image.shape[2:]]
+    half = order.half_px(*image.shape[2:]) if order.share else support.half_px
+    rows, columns = (slice(m - h, m + h + 1) for m, h in zip(middle, half, strict=True))
+    return image[:, :, rows, columns]
 
 
 def _mean_kernel(shots: Shots, sources: Sources) -> Float[np.ndarray, "3 rows columns"]:

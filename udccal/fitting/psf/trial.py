@@ -33,12 +33,14 @@ class Order:
         share: of diffraction, 1 or 0.
         freedom: its standard deviation beforehand, as a fraction of the kernel nearby.
         model_error: what solutions allow for, see ``psf.weights``.
+        reach: of the window, so large a part has a residual, about the source.
     """
 
     degree: int
     share: float
     freedom: float
     model_error: float
+    reach: float = 1.0
 
     @property
     def per_px(self) -> int:
@@ -57,12 +59,17 @@ class Order:
             return "diffraction"
         if not self.share:
             return f"free image, degree {self.degree}"
-        return f"diffraction, residual degree {self.degree} of {100 * self.freedom:g} %"
+        within = "" if self.reach == 1 else f" within {self.reach:g} of the window"
+        return f"diffraction, residual degree {self.degree} of {100 * self.freedom:g} %{within}"
 
     def coefficients(self, rows: int, columns: int) -> int:
         """Of the image for windows of this size."""
-        node_rows, node_columns = (self.per_px * (size - 1) + 1 for size in (rows, columns))
-        return 3 * node_rows * node_columns * self.terms
+        half_rows, half_columns = self.half_px(rows, columns)
+        return 3 * (2 * self.per_px * half_rows + 1) * (2 * self.per_px * half_columns + 1) * self.terms
+
+    def half_px(self, rows: int, columns: int) -> tuple[int, int]:
+        """(rows, columns) to either side of the source that have a residual, in windows of this size."""
+        return round(self.reach * (rows // 2)), round(self.reach * (columns // 2))
 
 
 @dataclass(frozen=True)
@@ -117,9 +124,18 @@ class Trial:
 
     def beats(self, other: Trial) -> bool:
         """Whether it predicts what was held out better, beyond what the places held out leave in doubt."""
+        gain, doubt = self._gain(other)
+        return gain > max(doubt, _WORTH)
+
+    def predicts_better(self, other: Trial) -> bool:
+        """The same, however little the gain."""
+        gain, doubt = self._gain(other)
+        return gain > doubt
+
+    def _gain(self, other: Trial) -> tuple[float, float]:
         gain = other.loss - self.loss
         doubt = float(gain.std(ddof=1) / np.sqrt(gain.size)) if gain.size > 1 else np.inf
-        return float(gain.mean()) > max(doubt, _WORTH)
+        return float(gain.mean()), doubt
 
 
 def attempt(data: Data, sources: Sources, test: Bool[np.ndarray, " shots"], order: Order) -> Trial:
@@ -144,6 +160,9 @@ def solve(
     spread = prior_spread(data.magnitude, polynomial_terms(max(order.degree, 0)), order.freedom, order.per_px)
     if order.degree < 0:
         return np.zeros_like(spread)
+    y, x = (np.abs(np.arange(nodes) - nodes // 2) for nodes in spread.shape[2:])
+    half_rows, half_columns = (order.per_px * half for half in order.half_px(*data.shots.rate.shape[1:]))
+    spread = spread * ((y <= half_rows)[:, None] & (x <= half_columns))
     windows = data.windows(sources, order, keep)
     if order.share:
         return np.asarray(solve_residual(windows, jnp.asarray(order.share), jnp.asarray(spread)))

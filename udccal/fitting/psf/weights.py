@@ -16,7 +16,6 @@ from jaxtyping import Float
 
 from udccal.fitting.psf.blocks import Block, Local
 
-# Residuals beyond this many sigma count no more than linearly when the model error is estimated.
 _ROBUST = 3.0
 _LEAST, _MOST = 1e-4, 0.5
 _LEAST_VARIANCE = 1e-2
@@ -62,6 +61,11 @@ def model_weights(block: Block, light: Float[np.ndarray, "shots n"], local: Loca
     return replace(block, weight=np.where(seen, 1.0 / variance, 0.0))
 
 
+def huber(size: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
+    """Squares of residuals in units of their sigma, growing no more than linearly beyond three."""
+    return np.where(size < _ROBUST, size**2, 2 * _ROBUST * size - _ROBUST**2)
+
+
 def estimate_model_error(
     residual: Float[np.ndarray, " samples"],
     variance: Float[np.ndarray, " samples"],
@@ -80,9 +84,7 @@ def estimate_model_error(
 
     def loss(model_error: float) -> float:
         total = variance + (model_error * share) ** 2
-        size = np.sqrt(raised / total)
-        huber = np.where(size < _ROBUST, size**2, 2 * _ROBUST * size - _ROBUST**2)
-        return float(np.sum(np.log(total) + huber))
+        return float(np.sum(np.log(total) + huber(np.sqrt(raised / total))))
 
     found = scipy.optimize.minimize_scalar(
         lambda log: loss(float(np.exp(log))), bounds=(np.log(_LEAST), np.log(_MOST)), method="bounded"

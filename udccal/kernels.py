@@ -30,6 +30,15 @@ def kernel_size(
     return rows - 1 + rows % 2, columns - 1 + columns % 2
 
 
+def fitted_size(
+    psf: PsfField, rig: RigDescription, most_rows: int = KERNEL_ROWS, most_columns: int = KERNEL_COLUMNS
+) -> tuple[int, int]:
+    """As ``kernel_size``, and no more than the psf's support: where its pictures showed no light, none is undone."""
+    rows, columns = kernel_size(rig, most_rows, most_columns)
+    across, down = (2 * int(half) + 1 for half in np.asarray(psf.support_px))
+    return min(rows, down), min(columns, across)
+
+
 def kernels_at(
     psf: PsfField, positions_px: Float[np.ndarray, "n 2"], rows: int, columns: int, workers: int = 2
 ) -> Float32[np.ndarray, "n 3 rows columns"]:

@@ -1,0 +1,160 @@
+"""How far a kernel reaches, on pictures whose light ends where it is known to, or does not end."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import hypothesis.strategies as st
+import numpy as np
+import pytest
+from hypothesis import given
+
+from udccal.cameras.protocol import CameraIdentity, Frame, Region, Settings
+from udccal.cfa import channel_map
+from udccal.fitting.absent import absent_wire
+from udccal.fitting.noise.fit import nominal_noise
+from udccal.fitting.nominal import nominal_geometry
+from udccal.fitting.psf.evidence import with_support
+from udccal.fitting.psf.fit import nominal_psf
+from udccal.fitting.psf.held_out import Judged
+from udccal.fitting.psf.read import read_shots
+from udccal.fitting.psf.residual import Sources
+from udccal.fitting.psf.support import Support, choose_support, ladder
+from udccal.fitting.psf.wide import wide_support, widest_half
+from udccal.fitting.result import FitResult, FitStatus
+from udccal.kernels import fitted_size, kernel_size, kernels_at
+from udccal.models.psf import PsfField
+from udccal.rig import load_rig
+from udccal.sessions.captured import SingleFrame
+from udccal.sessions.schema import LedSubject
+from udccal.sessions.store import Session
+from udccal.sessions.writer import SessionWriter
+
+HALF = (64, 16)
+SHOTS = 6
+ROWS, COLUMNS = ladder(HALF[0]), ladder(HALF[1])
+
+
+def cross() -> np.ndarray:
+    """Light of a streak along columns and a fainter one along rows, 1 at the peak."""
+    y, x = (np.abs(np.arange(-half, half + 1)) for half in HALF)
+    down, across = 1.0 / (1.0 + (y / 1.5) ** 2), 1.0 / (1.0 + (x / 1.0) ** 2)
+    return np.outer(down, np.exp(-0.5 * (x / 0.8) ** 2)) + 0.3 * np.outer(np.exp(-0.5 * (y / 0.8) ** 2), across)
+
+
+def judged_of(true_half: tuple[int, int], rng: np.random.Generator, background: float = 0.0) -> Judged:
+    """Pictures whose light ends at ``true_half``, under a model whose light goes on; noise of 1e-4 of the peak."""
+    light = np.broadcast_to(cross(), (SHOTS, *cross().shape)).copy()
+    y, x = (np.abs(np.arange(-half, half + 1)) for half in HALF)
+    inside = (y <= true_half[0])[:, None] & (x <= true_half[1])
+    sigma = np.hypot(1e-4, 2e-3 * light)
+    residual = sigma * rng.standard_normal(light.shape) - light * ~inside + background
+    return Judged(residual, light, sigma**2, sigma**2, light, np.ones(light.shape, dtype=bool), 0.0)
+
+
+def test_the_right_window_is_chosen_in_95_of_100_runs() -> None:
+    rng = np.random.default_rng(7)
+    right = 0
+    for _ in range(100):
+        true = (int(rng.choice(ROWS)), int(rng.choice(COLUMNS)))
+        right += choose_support(judged_of(true, rng)).half_px == true
+    assert right >= 95
+
+
+@given(st.integers(0, 400))
+def test_windows_rise_to_the_largest(largest: int) -> None:
+    steps = ladder(largest)
+    assert steps[-1] == largest
+    assert all(a < b <= 1.51 * a for a, b in itertools.pairwise(steps))
+
+
+def test_light_up_to_the_border_has_no_end() -> None:
+    found = choose_support(judged_of(HALF, np.random.default_rng(1)))
+    assert found.open_ended == (True, True)
+    found = choose_support(judged_of((HALF[0], 8), np.random.default_rng(1)))
+    assert found.open_ended == (True, False)
+
+
+def test_an_even_background_is_no_light_of_the_kernel() -> None:
+    assert choose_support(judged_of((16, 8), np.random.default_rng(2), background=3e-3)).half_px == (16, 8)
+
+
+def test_hits_are_no_light_of_the_kernel() -> None:
+    judged = judged_of((16, 8), np.random.default_rng(3))
+    judged.residual[:, 5::40, ::7] += 0.3
+    assert choose_support(judged).half_px == (16, 8)
+
+
+def test_no_light_and_no_sample_is_the_narrowest_window() -> None:
+    judged = judged_of((16, 8), np.random.default_rng(3))
+    assert choose_support(replace(judged, known=np.zeros_like(judged.known))).half_px == (ROWS[0], COLUMNS[0])
+    dark = replace(judged, residual=judged.residual * 0.0 - judged.light)
+    assert choose_support(dark).half_px == (ROWS[0], COLUMNS[0])
+
+
+@dataclass(frozen=True)
+class Captured:
+    session: Session
+    places: np.ndarray
+    term: PsfField
+
+
+def captured(folder: Path, ends_px: int) -> Captured:
+    """Brackets of four LEDs whose kernel is the rig's nominal one, but ends ``ends_px`` rows from its middle."""
+    rig = load_rig("lg55-reduced")
+    geometry, noise, rng = nominal_geometry(rig), nominal_noise(rig), np.random.default_rng(4)
+    term = nominal_psf(rig, geometry, absent_wire(rig, geometry))
+    places = np.array([[200.0, 200.0], [800.0, 200.0], [200.0, 600.0], [800.0, 600.0]])
+    rows, columns = kernel_size(rig)
+    writer = SessionWriter.create(folder, rig, CameraIdentity("maker", "model", "1", "test"))
+    for index, (place, kernel) in enumerate(zip(places, kernels_at(term, places, rows, columns), strict=True)):
+        region = Region(int(place[0]) - 24, int(place[1]) - 72, 48, 144)
+        lit = np.zeros((3, 144, 48))
+        most = min(ends_px, rows // 2)
+        left = 24 - columns // 2
+        lit[:, 72 - most : 73 + most, left : left + columns] = kernel[:, rows // 2 - most : rows // 2 + most + 1]
+        light = np.take_along_axis(lit, channel_map(rig.camera.cfa, 144, 48)[None], 0)[0]
+        frames = [bracketed(light, exposure, noise, region, rng) for exposure in 1e-4 * 4.0 ** np.arange(7)]
+        subject = LedSubject(x_px=float(place[0]), y_px=float(place[1]), distance_mm=2000.0, diameter_mm=0.01)
+        writer.add_step(f"psf/p{index:02d}_s0", "psf", subject, frames)
+    return Captured(Session.open(folder), places, term)
+
+
+def bracketed(light, exposure, noise, region, rng) -> SingleFrame:
+    electrons = rng.poisson(6000.0 * light / light.max() * exposure / 1e-4)
+    counts = 64.0 + float(noise.K_DN_per_e) * electrons + rng.normal(0, 1.5, light.shape)
+    frame = Frame(np.clip(counts.round(), 0, 4095).astype(np.uint16), Settings(exposure, 0.0, region), 0.0, 0, True)
+    return SingleFrame(frame)
+
+
+@pytest.mark.parametrize("ends_px", [23, 200])
+def test_whole_pictures_show_where_light_ends(tmp_path: Path, ends_px: int) -> None:
+    made = captured(tmp_path / "session", ends_px)
+    rig = made.session.rig
+    noise, wire = nominal_noise(rig), absent_wire(rig, nominal_geometry(rig))
+    reading = read_shots(made.session, noise, wire, (16, 8))
+    assert reading.shots is not None
+    sources = Sources(made.places, np.full((4, 3), 1e8), np.zeros(4))
+    everywhere = np.ones(4, dtype=bool)
+    support = wide_support(made.session, noise, wire, reading, sources, made.term, everywhere)
+    assert support is not None
+    assert support.seen_px == widest_half(made.session) == (64, 16)
+    assert support.half_px[0] == min(ends_px, 64)
+    result = with_support(FitResult(made.term, FitStatus.CONVERGED, (), np.zeros((0, 0)), 1.0, 1), support, rig)
+    rows, _ = fitted_size(result.term, rig)
+    assert rows == (47 if ends_px == 23 else kernel_size(rig)[0])
+    assert any("border" in note for note in result.notes) == (ends_px == 200 or support.open_ended[1])
+
+
+def test_an_image_ends_where_it_ends() -> None:
+    rig = load_rig("lg55-reduced")
+    geometry = nominal_geometry(rig)
+    term = nominal_psf(rig, geometry, absent_wire(rig, geometry))
+    image = replace(term, diffraction_share=np.float64(0.0), residual=np.ones((1, 3, 21, 11)))
+    result = FitResult(image, FitStatus.CONVERGED, (), np.zeros((0, 0)), 1.0, 1)
+    found = with_support(result, Support((10, 5), (10, 5), ()), rig)
+    np.testing.assert_array_equal(found.term.support_px, [5, 10])
+    assert fitted_size(found.term, rig) == (21, 11)
+    assert not found.notes
