@@ -110,3 +110,10 @@ def test_several_choices_stay_in_their_order() -> None:
     table = orders_table(_result(*tried))
     assert [row[0] for row in table.rows] == ["without a", "with a", "b"]
     assert not more_orders(_result(*tried))
+
+
+def test_of_many_choices_those_made_are_shown_and_the_others_under_the_fit_itself() -> None:
+    tried = [Candidate(f"{axis} within {k}", k, float(k), k == 4) for axis in ("rows", "columns") for k in range(9)]
+    table = orders_table(_result(*tried))
+    assert [row[0] for row in table.rows] == ["rows within 4", "columns within 4"]
+    assert more_orders(_result(*tried))

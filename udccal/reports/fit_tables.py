@@ -5,7 +5,7 @@ from __future__ import annotations
 from udccal.fitting.result import FitResult
 from udccal.reports.tables import Table, number, spread
 
-MOST_ORDERS = 6
+MOST_ORDERS, MOST_CHOICES = 6, 16
 _NUMBERS = frozenset({1, 2})
 
 
@@ -26,9 +26,13 @@ def orders_table(result: FitResult) -> Table:
     """The orders that were tried, and which was chosen.
 
     Where one choice was made: best first, the likeliest alone and how much worse than the best they are. Where several
-    were made, one after the other, each has its own criterion: all of them, in their order.
+    were made, one after the other, each has its own criterion: all of them, in their order, or if these are many those
+    chosen.
     """
-    if sum(one.chosen for one in result.candidates) != 1:
+    if _choices(result) != 1 and more_orders(result):
+        chosen = tuple((one.name, str(one.parameters)) for one in result.candidates if one.chosen)
+        return Table("Orders chosen, choice by choice", ("order", "parameters"), chosen, frozenset({1}))
+    if _choices(result) != 1:
         return candidates_table("Orders tried, choice by choice (lower is better)", result)
     best = sorted(result.candidates, key=lambda one: (one.criterion, one.parameters))
     rows = tuple(
@@ -41,7 +45,11 @@ def orders_table(result: FitResult) -> Table:
 
 def more_orders(result: FitResult) -> bool:
     """Whether ``orders_table`` leaves some out."""
-    return sum(one.chosen for one in result.candidates) == 1 and len(result.candidates) > MOST_ORDERS
+    return len(result.candidates) > (MOST_ORDERS if _choices(result) == 1 else MOST_CHOICES)
+
+
+def _choices(result: FitResult) -> int:
+    return sum(one.chosen for one in result.candidates)
 
 
 def candidates_table(title: str, result: FitResult) -> Table:
