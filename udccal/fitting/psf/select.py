@@ -142,7 +142,7 @@ def _narrowed(data: Data, test: Bool[np.ndarray, " shots"], best: Trial) -> tupl
     tried: list[Trial] = []
     for reach in _REACHES:
         tried.append(attempt(data, best.sources, test, replace(best.order, reach=reach)))
-        if not best.predicts_better(tried[-1]):
+        if not best.needs_room_of(tried[-1]):
             return tried[-1], tried
     return best, tried
 

@@ -22,6 +22,8 @@ BESIDE, FREE = (0.1, 0.03, 0.01), 1.0
 # restoration pays for them. Pictures held out share what their makers did with the others: on a full-size rig of wave
 # optics a residual gained 0.17, and made the kernel at new places a fifth worse.
 _WORTH = 0.25
+# Room around a residual costs less: no component more, only a larger one.
+_WORTH_OF_ROOM = 0.05
 
 
 @dataclass(frozen=True)
@@ -127,10 +129,10 @@ class Trial:
         gain, doubt = self._gain(other)
         return gain > max(doubt, _WORTH)
 
-    def predicts_better(self, other: Trial) -> bool:
-        """The same, however little the gain."""
+    def needs_room_of(self, other: Trial) -> bool:
+        """Whether it predicts so much better than a narrower residual that it has to be as wide as it is."""
         gain, doubt = self._gain(other)
-        return gain > doubt
+        return gain > max(doubt, _WORTH_OF_ROOM)
 
     def _gain(self, other: Trial) -> tuple[float, float]:
         gain = other.loss - self.loss

@@ -21,7 +21,7 @@ from udccal.fitting.wire.harmonics import WireStart, full_basis, possible_harmon
 from udccal.fitting.wire.joint import fit_joint, settle
 from udccal.fitting.wire.misfit import misfit
 from udccal.fitting.wire.noise import FlatNoise, flat_noise, judge, site_numbers
-from udccal.fitting.wire.omitted import omitted_rms, with_omitted
+from udccal.fitting.wire.omitted import omitted, with_omitted
 from udccal.fitting.wire.phase import fit_phase
 from udccal.fitting.wire.result import wire_result
 from udccal.fitting.wire.scan import ideal_wire
@@ -159,9 +159,10 @@ def _fitted(
     sigma = map_sigma(joint, wire, *values.shape)
     # In steps of three, for a sample of all CFA sites that the fit has not seen.
     unseen = sample_pixels(values, variance, geometry, 3 * step, step // 2) if step > 1 else joint.judged.pixels
-    found = misfit(joint, judge(joint.wire, joint.gains, unseen, noise), sigma.rms(), held_out=step > 1)
-    if phase.present:
-        found = with_omitted(found, omitted_rms(start, joint.wire, joint.judged.pixels))
+    judged = judge(joint.wire, joint.gains, unseen, noise)
+    found = misfit(joint, judged, sigma.rms(), held_out=step > 1)
+    left_out = omitted(start, joint.wire, joint.judged.pixels, judged) if phase.present else None
+    found = with_omitted(found, left_out) if left_out else found
     sigma = replace(sigma, model=found.by_tile)
     term = _trimmed(wire) if phase.present else _bare(wire)
     return WireFit(wire_result(phase, joint, found, sigma, term, values.size), sigma)

@@ -1,40 +1,99 @@
-"""What the harmonics that a fit leaves out would add to the map: known beforehand, and part of the map's sigma."""
+"""What the harmonics that a fit leaves out add to the map: known beforehand if they are there, and part of its sigma.
+
+Hundreds of them are each too weak to be fitted. A panel has them all, as its open fractions and a round pupil have it;
+a map that was made without has none. The residuals tell which: as a whole they are one template, and how much of it is
+in the residuals is one number with an error.
+"""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Final, final
 
 import equinox as eqx
+import jax
 import numpy as np
+from jaxtyping import Float
 
 from udccal.fitting.wire.basis import Pixels
 from udccal.fitting.wire.harmonics import WireStart, omitted_harmonics
 from udccal.fitting.wire.misfit import Misfit
+from udccal.fitting.wire.noise import Judged
 from udccal.fitting.wire.scan import modulation_at, with_harmonics
 from udccal.models.wire import Wire
 
-_PIXELS = 1024
+# So many pixels at most, a few seconds' worth; so many at a time, for the memory's sake.
+_PIXELS: Final = 2**16
+_CHUNK: Final = 2**13
+# A real pupil's share of a round one's template is one within this.
+_REAL_PUPILS: Final = 0.3
 
 
-def omitted_rms(start: WireStart, wire: Wire, pixels: Pixels) -> float:
-    """Relative RMS over the sensor, at the fitted shape and with a round pupil.
+@final
+@dataclass(frozen=True)
+class Omitted:
+    """The harmonics left out.
+
+    Attributes:
+        rms: relative, over the sensor, if they are there.
+        share, share_sigma: of them, how much the residuals have, and its error.
+    """
+
+    rms: float
+    share: float
+    share_sigma: float
+
+    @property
+    def probability(self) -> float:
+        """That they are there, which beforehand is as likely as not.
+
+        By the likelihoods of the share found: 0 with its error, or 1 with that and what real pupils differ by.
+        """
+        wide = np.hypot(self.share_sigma, _REAL_PUPILS)
+        present = -0.5 * ((self.share - 1) / wide) ** 2 - np.log(wide)
+        absent = -0.5 * (self.share / self.share_sigma) ** 2 - np.log(self.share_sigma)
+        return float(1.0 / (1.0 + np.exp(np.clip(absent - present, -700.0, 700.0))))
+
+    @property
+    def sigma(self) -> float:
+        """What they are expected to add to the map's error, relative, RMS over the sensor."""
+        return self.rms * float(np.sqrt(self.probability))
+
+
+def omitted(start: WireStart, wire: Wire, fitted: Pixels, judged: Judged) -> Omitted | None:
+    """Look for them, at the fitted shape and with a round pupil; None where there are none to leave out.
 
     Args:
         start: says which harmonics a fit has.
-        wire: as fitted.
-        pixels: spread over the sensor; about a thousand of them are looked at.
+        wire: as fitted. fitted: pixels it was fitted to, spread over the sensor.
+        judged: pixels whose residuals are looked at.
     """
     harmonics = omitted_harmonics(start)
     if not len(harmonics):
-        return 0.0
+        return None
     plain = eqx.tree_at(lambda w: w.amplitudes, wire, np.zeros((0, 2, 1, 1)))
-    some = slice(None, None, max(1, len(pixels.ideal) // _PIXELS))
-    weak = with_harmonics(plain, harmonics, pixels)
-    return float(np.std(np.asarray(modulation_at(weak, pixels.ideal[some][:_PIXELS], pixels.scaled[some][:_PIXELS]))))
+    some = slice(None, None, -(-len(judged.expected) // _PIXELS))
+    pixels, expected = jax.tree.map(lambda values: values[some], judged.pixels), judged.expected[some]
+    template = _modulation(with_harmonics(plain, harmonics, fitted), pixels)
+    used = (pixels.weight > 0) & (expected > 0)
+    relative = np.where(used, pixels.value / np.where(used, expected, 1.0) - 1, 0.0)
+    weight = np.where(used, pixels.weight * expected**2, 0.0)
+    information = max(float(np.sum(weight * template**2)), 1e-300)
+    share = float(np.sum(weight * relative * template)) / information
+    return Omitted(float(np.std(template)), share, information**-0.5)
 
 
-def with_omitted(found: Misfit, omitted: float) -> Misfit:
-    """The misfit and what is known to be left out, together."""
-    return replace(
-        found, sigma=float(np.hypot(found.sigma, omitted)), by_tile=np.hypot(found.by_tile, omitted), omitted=omitted
-    )
+def with_omitted(found: Misfit, left_out: Omitted) -> Misfit:
+    """The misfit and what is likely left out, together."""
+    sigma = left_out.sigma
+    by_tile = np.hypot(found.by_tile, sigma)
+    return replace(found, sigma=float(np.hypot(found.sigma, sigma)), by_tile=by_tile, omitted=sigma)
+
+
+def _modulation(wire: Wire, pixels: Pixels) -> Float[np.ndarray, " n"]:
+    count = len(pixels.ideal)
+    parts = -(-count // _CHUNK)
+    # All chunks of one size: one compilation.
+    rows = np.minimum(np.arange(parts * _CHUNK), count - 1).reshape(parts, _CHUNK)
+    made = [np.asarray(modulation_at(wire, pixels.ideal[row], pixels.scaled[row])) for row in rows]
+    return np.concatenate(made)[:count]

@@ -1,0 +1,75 @@
+"""Harmonics too weak to be fitted: in the map's sigma where the residuals have them, and not where they have not."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import numpy as np
+import pytest
+
+from tests.benchmarks.efficiency.wire import start
+from tests.fitting.test_wire_parts import GEOMETRY, even_pixels
+from udccal.fitting.wire.harmonics import omitted_harmonics, possible_harmonics
+from udccal.fitting.wire.misfit import Misfit
+from udccal.fitting.wire.noise import FlatNoise, Judged, judge
+from udccal.fitting.wire.omitted import Omitted, omitted, with_omitted
+from udccal.fitting.wire.scan import ideal_wire, modulation_at, with_harmonics
+from udccal.models.wire import Wire
+
+START = start()
+NOISE = 5e-4
+# Of the template; two of three panels are there, to a share.
+SHARES = (0.0, 0.85, 1.0)
+
+
+@pytest.fixture(scope="module")
+def wire() -> Wire:
+    with jax.enable_x64(True):
+        return ideal_wire(GEOMETRY, START, possible_harmonics(START)[0])
+
+
+def found(wire: Wire, share: float, seed: int, noise: float = NOISE) -> tuple[Omitted, float]:
+    """What is found of a flat that has a share of the harmonics left out, and their RMS."""
+    with jax.enable_x64(True):
+        pixels = even_pixels(wire, noise, seed)
+        weak = with_harmonics(wire, omitted_harmonics(START), pixels)
+        template = np.asarray(modulation_at(weak, pixels.ideal, pixels.scaled))
+        pixels = eqx.tree_at(lambda p: p.value, pixels, pixels.value * (1 + share * template))
+        line = FlatNoise(np.full(4, noise**2), np.zeros(4), 0.0, np.full(4, np.inf))
+        judged: Judged = judge(wire, np.ones(4), pixels, line)
+        left = omitted(START, wire, pixels, judged)
+    assert left is not None
+    return left, float(template[pixels.weight > 0].std())
+
+
+@pytest.mark.parametrize("share", SHARES)
+def test_the_share_is_found_within_its_error(wire: Wire, share: float) -> None:
+    errors = []
+    for seed in range(4):
+        left, rms = found(wire, share, seed)
+        errors.append((left.share - share) / left.share_sigma)
+        assert left.rms == pytest.approx(rms, rel=0.05)
+        assert left.share_sigma < 0.2
+        assert (left.probability > 0.95) == (share > 0)
+    assert np.abs(errors).max() < 3.5
+
+
+def test_where_noise_hides_them_they_are_as_likely_as_not(wire: Wire) -> None:
+    left, _ = found(wire, 1.0, 0, noise=0.5)
+    assert left.share_sigma > 50
+    assert 0.3 < left.probability < 0.7
+    assert left.sigma == pytest.approx(left.rms * np.sqrt(left.probability))
+
+
+def test_what_is_likely_left_out_is_part_of_the_misfit(wire: Wire) -> None:
+    nothing = Misfit(0.0, np.zeros((2, 3)), 1e-5, 0.5, 6, NOISE)
+    there, not_there = (with_omitted(nothing, Omitted(2e-4, share, 0.1)) for share in (1.0, 0.0))
+    assert there.sigma == pytest.approx(2e-4, rel=0.01)
+    assert (there.by_tile == there.sigma).all()
+    assert not_there.sigma < 2e-5
+
+
+def test_extreme_shares_have_a_probability() -> None:
+    for share, sigma in ((0.0, 1e150), (40.0, 1e-6), (-40.0, 1e-6), (1.0, 1e-9), (0.0, 1e-9)):
+        probability = Omitted(1e-4, share, sigma).probability
+        assert 0.0 <= probability <= 1.0
