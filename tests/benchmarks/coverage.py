@@ -35,7 +35,6 @@ from udccal.fitting.backscatter.report import known_from
 from udccal.fitting.backscatter.select import choose
 from udccal.fitting.calibrate import FitEffort, Foundation, fit_foundation
 from udccal.fitting.geometry.fit import projection_sigma_px
-from udccal.fitting.wire.fit import fit_wire_session, sensor_map
 from udccal.models.geometry import project_directions
 from udccal.numerics import in_float64
 from udccal.planning.state import sensor_samples
@@ -112,12 +111,11 @@ def rays(rig: Specimen) -> Float[np.ndarray, " n"]:
 def wire_pixels(rig: Specimen) -> Float[np.ndarray, " n"]:
     """The wire's map at random pixels."""
     true = wire.wire_map(rig.truth)
-    fit = fit_wire_session(rig.session, rig.base.noise.term, rig.base.geometry.term)
-    if fit.sigma is None:
-        raise ValueError(f"expected a fit of the wire, found {fit.result.status}")
+    if rig.base.wire_sigma is None:
+        raise ValueError(f"expected a fit of the wire, found {rig.base.wire.status}")
     y, x = np.divmod(np.random.default_rng(rig.truth.seed).choice(true.size, _PIXELS, replace=False), true.shape[1])
-    error = (sensor_map(fit.result.term, *true.shape) - true)[y, x]
-    return error / fit.sigma.at(np.stack([x, y], axis=-1).astype(np.float64))
+    error = (rig.base.wire_map - true)[y, x]
+    return error / rig.base.wire_sigma.at(np.stack([x, y], axis=-1).astype(np.float64))
 
 
 def new_pictures(rig: Specimen) -> Float[np.ndarray, " n"]:

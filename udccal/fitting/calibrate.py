@@ -18,7 +18,8 @@ from udccal.fitting.noise.fit import fit_noise, nominal_noise
 from udccal.fitting.nominal import nominal_geometry
 from udccal.fitting.psf.fit import Effort, fit_psf
 from udccal.fitting.result import FitResult, FitStatus
-from udccal.fitting.wire.fit import FIELD_SAMPLES, fit_wire, sensor_map
+from udccal.fitting.wire.fit import FIELD_SAMPLES, fit_wire_session, sensor_map
+from udccal.fitting.wire.sigma import MapSigma
 from udccal.models.backscatter import Backscatter
 from udccal.models.geometry import Geometry
 from udccal.models.noise import Noise
@@ -73,6 +74,7 @@ class Foundation:
     Attributes:
         times: how long these took.
         wire_map: the fitted wire over the sensor, which takes long enough to be kept.
+        wire_sigma: how sure the map is at any pixel; None where no wire was fitted.
         boards: what the geometry was fitted to.
     """
 
@@ -81,6 +83,7 @@ class Foundation:
     wire: FitResult[Wire]
     times: tuple[FitTime, ...]
     wire_map: Float[np.ndarray, "rows columns"]
+    wire_sigma: MapSigma | None
     boards: tuple[BoardView, ...]
 
 
@@ -149,13 +152,17 @@ def fit_foundation(
         return fit_views(boards, nominal_geometry(rig), size, rig_prior(rig))
 
     geometry = clock.run("geometry", geometry_of_boards, lambda: nominal_geometry(rig))
-    wire = clock.run(
-        "wire",
-        lambda: fit_wire(session, noise.term, geometry.term, effort.wire_samples),
-        lambda: absent_wire(rig, geometry.term),
-    )
+    sigmas: list[MapSigma | None] = []
+
+    def wire_of_flats() -> FitResult[Wire]:
+        fit = fit_wire_session(session, noise.term, geometry.term, effort.wire_samples)
+        sigmas.append(fit.sigma)
+        return fit.result
+
+    wire = clock.run("wire", wire_of_flats, lambda: absent_wire(rig, geometry.term))
     wire_map = sensor_map(wire.term, rig.camera.rows, rig.camera.columns)
-    return Foundation(noise, geometry, wire, tuple(clock.times), wire_map, tuple(boards))
+    sigma = sigmas[0] if sigmas else None
+    return Foundation(noise, geometry, wire, tuple(clock.times), wire_map, sigma, tuple(boards))
 
 
 def fit_session(
