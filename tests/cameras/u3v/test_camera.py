@@ -25,11 +25,6 @@ SETTINGS = Settings(4e-3, 3.0, REGION)
 
 
 @pytest.fixture
-def device() -> VirtualCamera:
-    return VirtualCamera()
-
-
-@pytest.fixture
 def camera(device: VirtualCamera) -> Iterator[U3vCamera]:
     with U3vCamera(backend=VirtualBackend([device])) as opened:
         yield opened
