@@ -36,8 +36,8 @@ class CaptureBench:
 
 
 def simulated_rig(rig: RigDescription, seed: int) -> SimulatedWorld:
-    """A simulated rig of that description; another seed is another specimen."""
-    return SimulatedWorld(draw_truth(rig, seed))
+    """A simulated rig of that description; another seed is another specimen, and other noise."""
+    return SimulatedWorld(draw_truth(rig, seed), seed=seed)
 
 
 @contextmanager
