@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from tests.benchmarks.efficiency.trials import Trials
-from tests.fitting.boards import Sight, sight
+from tests.fitting.geometry.boards import Sight, sight
 from udccal.fitting.geometry.bundle import calibrate_views
 from udccal.fitting.geometry.bundle_projection import Gauge, field_grid
 from udccal.fitting.geometry.calibrated_views import CalibratedViews

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from tests.benchmarks.extremes.case import Case, Outcome, outcome
-from tests.fitting.boards import MOUNTED_DEG, Sight, sight
+from tests.fitting.geometry.boards import MOUNTED_DEG, Sight, sight
 from udccal.fitting.geometry.bundle_solve import Prior
 from udccal.fitting.geometry.corners import BoardCorners
 from udccal.fitting.geometry.fit import BoardView, fit_views

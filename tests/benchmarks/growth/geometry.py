@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from tests.benchmarks.growth.cases import Case
-from tests.fitting.boards import sight
+from tests.fitting.geometry.boards import sight
 from udccal.arrangements import BoardSpec
 from udccal.fitting.geometry.corners import board_points_mm
 from udccal.fitting.geometry.fit import fit_views

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tests.fitting.test_bundle import SCENE, arrays
+from tests.fitting.geometry.test_bundle import SCENE, arrays
 from udccal.fitting.geometry import CalibratedViews, Gauge, calibrate_views
 from udccal.fitting.geometry.bundle_orders import ORDERS
 from udccal.fitting.geometry.bundle_projection import field_grid
@@ -88,7 +88,7 @@ VISIBLE = {
 @pytest.mark.timeout(1200)
 @pytest.mark.parametrize("order", list(VISIBLE))
 def test_the_right_order_is_chosen_in_95_of_100(order: str) -> None:
-    from tests.fitting.boards import sight
+    from tests.fitting.geometry.boards import sight
 
     scene, right = sight(views=8, distortion=np.array(VISIBLE[order]), sigma_px=0.06), 0
     for seed in range(100):

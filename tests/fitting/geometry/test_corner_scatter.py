@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.fitting.boards import COMMON_PX, sight
+from tests.fitting.geometry.boards import COMMON_PX, sight
 from udccal.fitting.geometry.corner_scatter import CornerScatter
 from udccal.fitting.geometry.corners import BoardCorners
 from udccal.fitting.geometry.fit import fit_views

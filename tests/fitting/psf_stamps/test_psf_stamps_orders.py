@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.fitting.test_psf_stamps import READ_E, SENSOR, places
+from tests.fitting.psf_stamps.test_psf_stamps import READ_E, SENSOR, places
 from udccal.fitting.psf_stamps.data import Stamps, split
 from udccal.fitting.psf_stamps.fit import fit_psf_stamps
 from udccal.fitting.psf_stamps.orders import Orders, with_degrees

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
-from tests.fitting.boards import VISIBLE_BEND, Sight, sight
+from tests.fitting.geometry.boards import VISIBLE_BEND, Sight, sight
 from udccal.errors import FitError
 from udccal.fitting.geometry import CalibratedViews, Prior, calibrate_views
 from udccal.fitting.geometry.corners import board_points_mm

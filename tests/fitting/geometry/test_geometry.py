@@ -7,7 +7,7 @@ import jax
 import numpy as np
 import pytest
 
-from tests.fitting.boards import CAMERA, SIZE, SPEC, draw, pose, true_corners
+from tests.fitting.geometry.boards import CAMERA, SIZE, SPEC, draw, pose, true_corners
 from udccal.cameras.protocol import CameraIdentity, Region, Settings
 from udccal.errors import FitError
 from udccal.fitting.geometry import CalibratedViews, Prior, calibrate_views

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import convolve1d
 
-from tests.fitting.boards import SIZE, SPEC, draw, pose, true_corners
+from tests.fitting.geometry.boards import SIZE, SPEC, draw, pose, true_corners
 from udccal.arrangements import BoardSpec
 from udccal.errors import FitError
 from udccal.fitting.geometry.corners import board_points_mm, charuco_board, detect_corners

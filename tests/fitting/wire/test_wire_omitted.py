@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.benchmarks.efficiency.wire import start
-from tests.fitting.test_wire_parts import GEOMETRY, even_pixels
+from tests.fitting.wire.test_wire_parts import GEOMETRY, even_pixels
 from udccal.fitting.wire.harmonics import omitted_harmonics, possible_harmonics
 from udccal.fitting.wire.misfit import Misfit
 from udccal.fitting.wire.noise import FlatNoise, Judged, judge

@@ -4,8 +4,8 @@ import jax
 import numpy as np
 import pytest
 
-from tests.fitting.boards import sight
-from tests.fitting.test_bundle import SCENE, arrays
+from tests.fitting.geometry.boards import sight
+from tests.fitting.geometry.test_bundle import SCENE, arrays
 from udccal.fitting.geometry.bundle_noise import covariance
 from udccal.fitting.geometry.bundle_orders import free_intrinsics
 from udccal.fitting.geometry.bundle_points import blocks, bucket, gather

@@ -8,7 +8,7 @@ import jax
 import numpy as np
 import pytest
 
-from tests.fitting.test_psf_stamps import make
+from tests.fitting.psf_stamps.test_psf_stamps import make
 from udccal.fitting.psf_stamps.bands import AHEAD, Band, factor
 from udccal.fitting.psf_stamps.data import split
 from udccal.fitting.psf_stamps.field import TAPS, polynomials
