@@ -32,12 +32,12 @@ def found(wire: Wire, share: float, seed: int, noise: float = NOISE) -> tuple[Om
     """What is found of a flat that has a share of the harmonics left out, and their RMS."""
     with jax.enable_x64(True):
         pixels = even_pixels(wire, noise, seed)
-        weak = with_harmonics(wire, omitted_harmonics(START), pixels)
+        weak = with_harmonics(wire, omitted_harmonics(START)[0], pixels)
         template = np.asarray(modulation_at(weak, pixels.ideal, pixels.scaled))
         pixels = eqx.tree_at(lambda p: p.value, pixels, pixels.value * (1 + share * template))
         line = FlatNoise(np.full(4, noise**2), np.zeros(4), 0.0, np.full(4, np.inf))
         judged: Judged = judge(wire, np.ones(4), pixels, line)
-        left = omitted(START, wire, pixels, judged)
+        left = omitted(START, wire, judged)
     assert left is not None
     return left, float(template[pixels.weight > 0].std())
 
@@ -48,7 +48,7 @@ def test_the_share_is_found_within_its_error(wire: Wire, share: float) -> None:
     for seed in range(4):
         left, rms = found(wire, share, seed)
         errors.append((left.share - share) / left.share_sigma)
-        assert left.rms == pytest.approx(rms, rel=0.05)
+        assert left.rms == pytest.approx(rms, rel=0.1)
         assert left.share_sigma < 0.2
         assert (left.probability > 0.95) == (share > 0)
     assert np.abs(errors).max() < 3.5
@@ -57,7 +57,7 @@ def test_the_share_is_found_within_its_error(wire: Wire, share: float) -> None:
 def test_where_noise_hides_them_they_are_as_likely_as_not(wire: Wire) -> None:
     left, _ = found(wire, 1.0, 0, noise=0.5)
     assert left.share_sigma > 50
-    assert 0.3 < left.probability < 0.7
+    assert left.probability == pytest.approx(0.5, abs=0.05)
     assert left.sigma == pytest.approx(left.rms * np.sqrt(left.probability))
 
 

@@ -157,11 +157,14 @@ def _fitted(
         joint, step = settle(phase, joint.wire, joint.gains, every, noise, joint.basis, joint.candidates), 1
     wire = _mean_one(joint.wire, values.shape)
     sigma = map_sigma(joint, wire, *values.shape)
-    # In steps of three, for a sample of all CFA sites that the fit has not seen.
-    unseen = sample_pixels(values, variance, geometry, 3 * step, step // 2) if step > 1 else joint.judged.pixels
-    judged = judge(joint.wire, joint.gains, unseen, noise)
+    seen = judge(joint.wire, joint.gains, joint.judged.pixels, noise)
+    judged = seen
+    if step > 1:
+        # In steps of three, for a sample of all CFA sites that the fit has not seen.
+        unseen = sample_pixels(values, variance, geometry, 3 * step, step // 2)
+        judged = judge(joint.wire, joint.gains, unseen, noise)
     found = misfit(joint, judged, sigma.rms(), held_out=step > 1)
-    left_out = omitted(start, joint.wire, joint.judged.pixels, judged) if phase.present else None
+    left_out = omitted(start, joint.wire, seen) if phase.present else None
     found = with_omitted(found, left_out) if left_out else found
     sigma = replace(sigma, model=found.by_tile)
     term = _trimmed(wire) if phase.present else _bare(wire)

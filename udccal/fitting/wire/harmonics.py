@@ -73,9 +73,11 @@ def possible_harmonics(start: WireStart) -> tuple[Float[np.ndarray, "harmonics 2
     return _harmonics_between(start, LEAST_AMPLITUDE, np.inf)
 
 
-def omitted_harmonics(start: WireStart) -> Float[np.ndarray, "harmonics 2"]:
-    """(n, m) of those that a fit leaves out, as far as they matter together."""
-    return _harmonics_between(start, _LEAST_COUNTED, LEAST_AMPLITUDE)[0]
+def omitted_harmonics(
+    start: WireStart,
+) -> tuple[Float[np.ndarray, "harmonics 2"], Float[np.ndarray, " harmonics"]]:
+    """(n, m) of those that a fit leaves out, as far as they matter together, and their bounds; largest first."""
+    return _harmonics_between(start, _LEAST_COUNTED, LEAST_AMPLITUDE)
 
 
 def _harmonics_between(

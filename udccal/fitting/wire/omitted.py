@@ -22,9 +22,13 @@ from udccal.fitting.wire.noise import Judged
 from udccal.fitting.wire.scan import modulation_at, with_harmonics
 from udccal.models.wire import Wire
 
-# So many pixels at most, a few seconds' worth; so many at a time, for the memory's sake.
-_PIXELS: Final = 2**16
+# Their strongest, with so much of their power, are looked for, what the others would tell not being worth the seconds;
+# at so many pixels at most, and so many at a time for the memory's sake.
+_LOOKED_FOR: Final = 0.9
+_PIXELS: Final = 300_000
 _CHUNK: Final = 2**13
+# For their RMS, all of them at so many pixels.
+_RMS_PIXELS: Final = 2**10
 # A real pupil's share of a round one's template is one within this.
 _REAL_PUPILS: Final = 0.3
 
@@ -60,27 +64,32 @@ class Omitted:
         return self.rms * float(np.sqrt(self.probability))
 
 
-def omitted(start: WireStart, wire: Wire, fitted: Pixels, judged: Judged) -> Omitted | None:
+def omitted(start: WireStart, wire: Wire, judged: Judged) -> Omitted | None:
     """Look for them, at the fitted shape and with a round pupil; None where there are none to leave out.
 
     Args:
         start: says which harmonics a fit has.
-        wire: as fitted. fitted: pixels it was fitted to, spread over the sensor.
-        judged: pixels whose residuals are looked at.
+        wire: as fitted.
+        judged: pixels whose residuals are looked at, spread over the sensor; those that were fitted do, as a fit takes
+            up little of so many harmonics.
     """
-    harmonics = omitted_harmonics(start)
+    fitted = judged.pixels
+    harmonics, bounds = omitted_harmonics(start)
     if not len(harmonics):
         return None
     plain = eqx.tree_at(lambda w: w.amplitudes, wire, np.zeros((0, 2, 1, 1)))
+    few = slice(None, None, -(-len(fitted.ideal) // _RMS_PIXELS))
+    whole = modulation_at(with_harmonics(plain, harmonics, fitted), fitted.ideal[few], fitted.scaled[few])
+    strongest = harmonics[: int(np.searchsorted(np.cumsum(bounds**2), _LOOKED_FOR * np.sum(bounds**2))) + 1]
     some = slice(None, None, -(-len(judged.expected) // _PIXELS))
     pixels, expected = jax.tree.map(lambda values: values[some], judged.pixels), judged.expected[some]
-    template = _modulation(with_harmonics(plain, harmonics, fitted), pixels)
+    template = _modulation(with_harmonics(plain, strongest, fitted), pixels)
     used = (pixels.weight > 0) & (expected > 0)
     relative = np.where(used, pixels.value / np.where(used, expected, 1.0) - 1, 0.0)
     weight = np.where(used, pixels.weight * expected**2, 0.0)
     information = max(float(np.sum(weight * template**2)), 1e-300)
     share = float(np.sum(weight * relative * template)) / information
-    return Omitted(float(np.std(template)), share, information**-0.5)
+    return Omitted(float(np.std(np.asarray(whole))), share, information**-0.5)
 
 
 def with_omitted(found: Misfit, left_out: Omitted) -> Misfit:
