@@ -16,7 +16,8 @@ from udccal.fitting.absent import absent_wire
 from udccal.fitting.hdr.merge import HdrMerge
 from udccal.fitting.noise.fit import nominal_noise
 from udccal.fitting.nominal import nominal_geometry
-from udccal.fitting.psf.fit import Effort, fit_psf, fit_shots, window_half
+from udccal.fitting.psf.fit import Effort, fit_psf, fit_shots
+from udccal.fitting.psf.read import window_half
 from udccal.fitting.psf.residual import shifts
 from udccal.fitting.psf.shots import Shots, cut_crop, group, stack
 from udccal.fitting.psf.start import start_model, wire_shows

@@ -139,9 +139,7 @@ def with_support(result: FitResult[PsfField], support: Support, rig: RigDescript
     reach = [rig.camera.columns if goes_on[1] else across, rig.camera.rows if goes_on[0] else down]
     seen = (Diagnostic("support_rows", float(down), "px"), Diagnostic("support_columns", float(across), "px"))
     along = " and ".join(name for name, on in zip(("columns", "rows"), goes_on, strict=True) if on)
-    note = (
-        f"Light was seen up to the border of the pictures along {along}: beyond it the kernel is the panel's as fitted."
-    )
+    note = f"Along {along} light was seen as far as was looked; beyond, the kernel is diffraction as fitted."
     return replace(
         result,
         term=replace(result.term, support_px=np.array(reach, dtype=np.float64)),

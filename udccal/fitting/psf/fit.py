@@ -16,7 +16,7 @@ from udccal.fitting.psf.evidence import NAMES, diffraction_alone, failed, fit_re
 from udccal.fitting.psf.explained import explain
 from udccal.fitting.psf.field import fit_field
 from udccal.fitting.psf.posterior import PsfPosterior, posterior
-from udccal.fitting.psf.read import read_shots
+from udccal.fitting.psf.read import read_shots, window_half
 from udccal.fitting.psf.samples import share_of_information
 from udccal.fitting.psf.select import Selection, select_field
 from udccal.fitting.psf.shots import Shots
@@ -96,13 +96,6 @@ def fit_psf(
 def nominal_psf(rig: RigDescription, geometry: Geometry, wire: Wire) -> PsfField:
     """What the fit starts from: diffraction by the panel as the rig's description and the wire have it."""
     return diffraction_alone(start_model(rig, geometry, wire), geometry)
-
-
-def window_half(session: Session, largest: tuple[int, int]) -> tuple[int, int]:
-    """(rows, columns) to either side of the LED that the regions captured can fill."""
-    regions = [c.region for step in session.steps("psf") for c in step.captures]
-    rows, columns = (min((getattr(r, name) for r in regions), default=0) for name in ("rows", "columns"))
-    return max(4, min(largest[0], rows // 2 - 4)), max(4, min(largest[1], columns // 2 - 4))
 
 
 @dataclass(frozen=True)

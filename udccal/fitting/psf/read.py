@@ -37,6 +37,13 @@ class Reading:
     clipped: int
 
 
+def window_half(session: Session, largest: tuple[int, int]) -> tuple[int, int]:
+    """(rows, columns) to either side of the LED that the regions captured can fill."""
+    regions = [c.region for step in session.steps("psf") for c in step.captures]
+    rows, columns = (min((getattr(r, name) for r in regions), default=0) for name in ("rows", "columns"))
+    return max(4, min(largest[0], rows // 2 - 4)), max(4, min(largest[1], columns // 2 - 4))
+
+
 def read_shots(
     session: Session, noise: Noise, wire: Wire, half: tuple[int, int], steps: tuple[StoredStep, ...] | None = None
 ) -> Reading:

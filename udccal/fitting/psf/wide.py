@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from udccal.fitting.psf.held_out import judge
-from udccal.fitting.psf.read import Reading, read_shots
+from udccal.fitting.psf.read import Reading, read_shots, window_half
 from udccal.fitting.psf.residual import Sources, make_windows, predict, with_light_of_peak
 from udccal.fitting.psf.shots import Shots
 from udccal.fitting.psf.support import Support, choose_support
@@ -25,14 +25,6 @@ from udccal.sessions.store import Session
 _PICTURES: Final = 2
 # About the source, whole pixels are too coarse for a kernel that is moved by fractions of one; all windows hold it.
 _CORE_PX: Final = 4
-
-
-def widest_half(session: Session) -> tuple[int, int]:
-    """(rows, columns) to either side of the LED: of a whole kernel, or what the regions captured hold of it."""
-    regions = [capture.region for step in session.steps("psf") for capture in step.captures]
-    rows, columns = kernel_size(session.rig)
-    least_rows, least_columns = min(r.rows for r in regions), min(r.columns for r in regions)
-    return min(rows // 2, least_rows // 2 - _CORE_PX), min(columns // 2, least_columns // 2 - _CORE_PX)
 
 
 @in_float64
@@ -54,14 +46,15 @@ def wide_support(
         held_out: positions that the fit has not seen.
 
     Returns:
-        None where an image carries the kernel, which ends with the crops; or where a picture is unusable as a whole.
+        None where an image carries the kernel, which ends with the crops; or where kernel or pictures are too small.
     """
     assert reading.shots is not None
-    if not term.diffraction_share:
+    rows, columns = kernel_size(session.rig)
+    half = window_half(session, (rows // 2, columns // 2))
+    if not term.diffraction_share or half[0] > rows // 2 or half[1] > columns // 2:
         return None
     position = reading.shots.position
     chosen = np.concatenate([np.flatnonzero(position == p)[:_PICTURES] for p in np.flatnonzero(held_out)])
-    half = widest_half(session)
     wide = read_shots(session, noise, wire, half, tuple(reading.steps[index] for index in chosen)).shots
     if wide is None or wide.count != len(chosen):
         return None
