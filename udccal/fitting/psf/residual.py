@@ -148,6 +148,12 @@ def _lanczos(distance: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
     return np.where(np.abs(distance) < _LANCZOS, np.sinc(distance) * np.sinc(distance / _LANCZOS), 0.0)
 
 
+def about_middle(images: Float[np.ndarray, "*k rows columns"], half: tuple[int, int]) -> np.ndarray:
+    """The middle of images of odd size, ``half`` (rows, columns) to either side."""
+    rows, columns = (slice(n // 2 - h, n // 2 + h + 1) for n, h in zip(images.shape[-2:], half, strict=True))
+    return images[..., rows, columns]
+
+
 @eqx.filter_jit
 def predict(
     windows: Windows, image: Float[Array, "terms 3 node_rows node_columns"]

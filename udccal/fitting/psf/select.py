@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 
 from udccal.fitting.psf.free import PER_PX, fixed, image_of, movable, on_pixels, solve_free
 from udccal.fitting.psf.kernel_error import KernelError
-from udccal.fitting.psf.residual import Sources, prior_spread
+from udccal.fitting.psf.residual import Sources, about_middle, prior_spread
 from udccal.fitting.psf.shots import Shots
 from udccal.fitting.psf.support import Support, choose_support
 from udccal.fitting.psf.trial import BESIDE, FREE, Data, Order, Trial, attempt, solve
@@ -154,10 +154,7 @@ def _image(data: Data, best: Trial, support: Support) -> Float[np.ndarray, "term
         return np.zeros((1, 3, 1, 1))
     image = solve(data, best.sources, np.ones(data.shots.count, dtype=bool), order)
     image = image if order.share else on_pixels(image)
-    middle = [size // 2 for size in image.shape[2:]]
-    half = order.half_px(*image.shape[2:]) if order.share else support.half_px
-    rows, columns = (slice(m - h, m + h + 1) for m, h in zip(middle, half, strict=True))
-    return image[:, :, rows, columns]
+    return about_middle(image, order.half_px(*image.shape[2:]) if order.share else support.half_px)
 
 
 def _mean_kernel(shots: Shots, sources: Sources) -> Float[np.ndarray, "3 rows columns"]:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import Final, final
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Int
 
 from udccal.fitting.psf.held_out import Judged
 from udccal.fitting.psf.weights import huber
@@ -49,8 +49,8 @@ def choose_support(judged: Judged) -> Support:
     """The window of least criterion, from samples that the model has not seen in windows about each source."""
     rows, columns = judged.residual.shape[1:]
     down, across = np.abs(np.arange(rows) - rows // 2), np.abs(np.arange(columns) - columns // 2)
-    by_rows = _along(judged, "rows", down, np.broadcast_to(down[:, None], (rows, columns)))
-    by_columns = _along(judged, "columns", across, np.broadcast_to(across, (rows, columns)))
+    by_rows = _along(judged, "rows", np.broadcast_to(down[:, None], (rows, columns)))
+    by_columns = _along(judged, "columns", np.broadcast_to(across, (rows, columns)))
     return Support(
         half_px=(by_rows.half_px, by_columns.half_px),
         seen_px=(rows // 2, columns // 2),
@@ -72,8 +72,8 @@ class _Axis:
     candidates: tuple[Candidate, ...]
 
 
-def _along(judged: Judged, name: str, sides: np.ndarray, distance: np.ndarray) -> _Axis:
-    halves = ladder(int(sides.max()))
+def _along(judged: Judged, name: str, distance: Int[np.ndarray, "rows columns"]) -> _Axis:
+    halves = ladder(int(distance.max()))
     penalty = np.log(max(int(judged.known.sum()), 1))
     criteria = np.array([_loss(judged, distance <= half) + step * penalty for step, half in enumerate(halves)])
     best = int(np.argmin(criteria))

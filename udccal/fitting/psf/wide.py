@@ -11,8 +11,7 @@ from jaxtyping import Bool
 
 from udccal.fitting.psf.held_out import judge
 from udccal.fitting.psf.read import Reading, read_shots, window_half
-from udccal.fitting.psf.residual import Sources, make_windows, predict, with_light_of_peak
-from udccal.fitting.psf.shots import Shots
+from udccal.fitting.psf.residual import Sources, about_middle, make_windows, predict, with_light_of_peak
 from udccal.fitting.psf.support import Support, choose_support
 from udccal.kernels import kernel_size, kernels_at
 from udccal.models.noise import Noise
@@ -60,20 +59,11 @@ def wide_support(
         return None
     sources = sources.pick(chosen)
     windows = make_windows(wide, sources, np.zeros_like(wide.rate), half, np.zeros((wide.count, 2)), 0, 0.0)
-    kernels = _kernels(term, wide, session, half)
-    which = np.eye(len(kernels))[np.unique(wide.position, return_inverse=True)[1].reshape(-1)]
-    light = np.asarray(predict(replace(windows, basis=which), jnp.asarray(kernels)))
+    # Of the size that a profile holds: compiled but once.
+    kernels = about_middle(kernels_at(term, wide.positions_px(), rows, columns).astype(np.float64), half)
+    light = np.asarray(predict(replace(windows, basis=np.eye(len(kernels))[wide.position]), jnp.asarray(kernels)))
     sources = with_light_of_peak(wide, sources, light)
     windows = make_windows(wide, sources, light, half, np.zeros((wide.count, 2)), 0, 0.0)
     judged = judge(windows, 1.0, np.zeros((1, 3, 2 * half[0] + 1, 2 * half[1] + 1)))
     core = (np.abs(wide.offsets()) <= _CORE_PX).all(axis=-1)
     return choose_support(replace(judged, known=judged.known & ~core))
-
-
-def _kernels(term: PsfField, wide: Shots, session: Session, half: tuple[int, int]) -> np.ndarray:
-    """Of each position, in windows of ``half``; cut from such as the profile holds, which are compiled but once."""
-    places = wide.positions_px()
-    whole = kernels_at(term, places, *kernel_size(session.rig)).astype(np.float64)
-    middle = [size // 2 for size in whole.shape[2:]]
-    rows, columns = (slice(m - h, m + h + 1) for m, h in zip(middle, half, strict=True))
-    return whole[:, :, rows, columns]
