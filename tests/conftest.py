@@ -1,12 +1,33 @@
-"""Shared by all tests: where the shared pictures are, and the strictest numerics."""
+"""Shared by all tests: where the shared pictures are, and the compilations that every process of a run reads."""
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import pytest
 
 REPOSITORY = Path(__file__).resolve().parent.parent
+# What takes four minutes on an idle machine takes four times as long on a busy one.
+SLOW_TEST_TIMEOUT_S = 1200
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_configure(config: pytest.Config) -> None:
+    """What one worker, or one program under test, has compiled, the others read; so does the next run."""
+    if config.cache is not None:
+        # Not before jaxtyping's plugin has put its checks where modules are imported.
+        from udccal.compilation import FOLDER_VARIABLE, keep_compilations
+
+        os.environ.setdefault(FOLDER_VARIABLE, str(config.cache.mkdir("compilations")))
+        keep_compilations()
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Slow tests may take longer than others before they count as hung."""
+    for item in items:
+        if item.get_closest_marker("slow") and not item.get_closest_marker("timeout"):
+            item.add_marker(pytest.mark.timeout(SLOW_TEST_TIMEOUT_S))
 
 
 @pytest.fixture(scope="session")

@@ -15,7 +15,7 @@ from udccal.io.exr import read_rgb_exr
 from udccal.io.png import read_png16, read_rgb8, write_png16
 
 PORTRAIT = Path(__file__).resolve().parents[2] / "udccal" / "data" / "portrait.jpg"
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
+pytestmark = pytest.mark.slow
 
 
 def udccal(*words: str | Path) -> subprocess.CompletedProcess[str]:

@@ -46,7 +46,6 @@ def test_its_numbers_mean_what_the_page_says(session: Session, world: dict) -> N
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(1200)
 def test_it_fits(session: Session, world: dict) -> None:
     from udccal.fitting.calibrate import fit_session
     from udccal.models.psf import psf_kernels

@@ -85,7 +85,6 @@ VISIBLE = {
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(1200)
 @pytest.mark.parametrize("order", list(VISIBLE))
 def test_the_right_order_is_chosen_in_95_of_100(order: str) -> None:
     from tests.fitting.geometry.boards import sight

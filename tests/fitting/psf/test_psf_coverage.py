@@ -51,7 +51,6 @@ def test_an_error_is_in_the_unit_of_its_kernels() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(900)
 @pytest.mark.parametrize("seed", [1, 2])
 def test_the_stated_interval_covers_the_kernel_of_wave_optics(seed: int) -> None:
     found = coverage(seed)

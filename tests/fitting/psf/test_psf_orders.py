@@ -19,7 +19,6 @@ def known() -> World:
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(1200)
 def test_the_right_degree_and_width_are_chosen_in_95_of_100_runs(known: World) -> None:
     counts = Counter((kind, chosen(known, kind, seed)) for kind in KINDS for seed in range(RUNS))
     right = sum(counts[kind, kind] for kind in KINDS)
@@ -27,7 +26,6 @@ def test_the_right_degree_and_width_are_chosen_in_95_of_100_runs(known: World) -
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(1200)
 def test_the_right_degree_of_an_image_without_diffraction_is_chosen() -> None:
     degrees = psf_free_orders.DEGREES
     counts = Counter((d, psf_free_orders.chosen(d, seed)) for d in degrees for seed in range(FREE_RUNS))

@@ -6,11 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.stats import chi2, norm
+from scipy.special import ndtri
 
 from udccal.fitting.backscatter.evidence import LEAST_VARIANCE, Evidence
 from udccal.fitting.backscatter.likelihood import Fitted
 from udccal.fitting.result import Outliers
+from udccal.fitting.tails import chi2_tail
 
 # Samples further off than this many robust sigma of all samples are left out.
 _SAMPLE_SIGMA = 6.0
@@ -33,7 +34,7 @@ def odd_pictures(fitted: Fitted) -> Bool[np.ndarray, " shots"]:
     z = np.abs(fitted.z)
     used = fitted.weight > 0
     typical = np.array([np.median(z[i][used[i]]) if used[i].any() else 0.0 for i in range(len(z))])
-    bad = typical > _SHAPE_TIMES * max(float(np.median(typical)), norm.ppf(0.75))
+    bad = typical > _SHAPE_TIMES * max(float(np.median(typical)), ndtri(0.75))
     off, sigma = _brightness(fitted)
     centre = np.median(off)
     robust = np.maximum(_MAD * np.median(np.abs(off - centre)), sigma)
@@ -75,7 +76,7 @@ def undescribed_share(fitted: Fitted, seen: Evidence, freedom: float) -> float:
     unit = unit[used]
     # White and dark have no part in the model's error.
     dark = float((fitted.dark_errors**2 / seen.dark_variance).sum())
-    if not unit.any() or chi2.sf(float((square / noise).sum()) + dark, freedom) > SIGNIFICANT:
+    if not unit.any() or chi2_tail((square / noise).sum() + dark, freedom) > SIGNIFICANT:
         return 0.0
     low, high = 0.0, float(np.sqrt(square.max() / unit[unit > 0].min()))
     for _ in range(60):
@@ -132,7 +133,7 @@ def pattern(fitted: Fitted, places: Float[np.ndarray, "n 2"], freedom: float) ->
     worst, least = 1.0, 1.0
     for cells in (_cells(places, _CELLS), np.zeros(len(places), dtype=int)):
         square, count = _square_of_means(z, used, cells)
-        p_value = float(chi2.sf(square / max(per_sample, 1.0), count))
+        p_value = chi2_tail(square / max(per_sample, 1.0), count)
         least = min(least, p_value)
         if p_value < SIGNIFICANT:
             worst = max(worst, square / max(per_sample, 1.0) / count)

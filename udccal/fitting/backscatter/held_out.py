@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
-from scipy.stats import chi2
 
 from udccal.fitting.backscatter.begin import Problem, solved
 from udccal.fitting.backscatter.checks import SIGNIFICANT, noise_variance
@@ -14,6 +13,7 @@ from udccal.fitting.backscatter.likelihood import Fitted
 from udccal.fitting.backscatter.profile import mask_slopes, predicted_variance, profiled, with_still_white, with_white
 from udccal.fitting.backscatter.ratios import ratios_and_slopes, window_logs, windows_at
 from udccal.fitting.backscatter.vector import Order
+from udccal.fitting.tails import chi2_tail
 
 EVERY = 4
 
@@ -47,7 +47,7 @@ def held_out(problem: Problem, order: Order, full: Fitted) -> HeldOut:
     square, expected = ((part / peak**2)[used] for part in (fitted.errors**2, noise))
     excess = float((square - expected).mean())
     # By how much pictures that come in raise chi2 is their own chi2 by the prediction's whole covariance.
-    unlikely = chi2.sf(full.solution.chi2 - fitted.solution.chi2, used.sum()) < SIGNIFICANT
+    unlikely = chi2_tail(full.solution.chi2 - fitted.solution.chi2, used.sum()) < SIGNIFICANT
     unit = np.broadcast_to(fitted.mask**2, used.shape)[used]
     over = float((fitted.errors**2 - noise)[used].sum() / max(unit.sum(), 1e-30))
     return HeldOut(

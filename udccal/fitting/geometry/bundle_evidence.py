@@ -12,12 +12,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.stats import f as f_distribution
 
 from udccal.fitting.geometry.bundle_noise import covariance
 from udccal.fitting.geometry.bundle_normal import INTRINSICS
 from udccal.fitting.geometry.bundle_points import Points
 from udccal.fitting.geometry.bundle_solve import Solved, linearised
+from udccal.fitting.tails import f_tail
 
 # Chance alone flags one fit in a thousand, by either test.
 FLAGGED_P = 1e-3
@@ -170,4 +170,4 @@ def _test(statistic: float, rank: int, dof: float) -> FTest:
         return FTest(1.0, 1.0)
     within = max(dof - statistic, 1e-9) / rest
     ratio = statistic / rank / within
-    return FTest(float(ratio), float(f_distribution.sf(ratio, rank, rest)))
+    return FTest(float(ratio), f_tail(ratio, rank, rest))

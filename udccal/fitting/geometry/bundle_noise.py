@@ -10,11 +10,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.stats import chi2
 
 from udccal.fitting.geometry.bundle_normal import INTRINSICS
 from udccal.fitting.geometry.bundle_points import MIN_POINTS, Points
 from udccal.fitting.geometry.bundle_solve import Bundle, Prior, Solved, linearised, residuals_px, solve
+from udccal.fitting.tails import chi2_tail
 
 # Points further from the model than this many robust sigma of their view are left out, then all is refit.
 OUTLIER_SIGMA = 5.0
@@ -188,4 +188,4 @@ def _differ(square: Float[np.ndarray, " views"], dof: Float[np.ndarray, " views"
     ratio = float((dof * np.log(mean / (square / dof))).sum())
     views = len(dof)
     correction = 1 + ((1 / dof).sum() - 1 / dof.sum()) / (3 * (views - 1))
-    return bool(chi2.sf(ratio / correction, views - 1) < _DIFFER_P)
+    return chi2_tail(ratio / correction, views - 1) < _DIFFER_P

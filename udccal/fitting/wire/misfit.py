@@ -13,8 +13,8 @@ from typing import final
 import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.stats import chi2 as chi_squared
 
+from udccal.fitting.tails import chi2_tail
 from udccal.fitting.wire.basis import TILES, Pixels, tile_numbers
 from udccal.fitting.wire.joint import Joint
 from udccal.fitting.wire.noise import Judged
@@ -110,10 +110,10 @@ def _test(seen: _Seen, inside: Int[np.ndarray, " n"], per_tile: int) -> Misfit:
     fit = seen.statistical**2 if seen.held_out else -(seen.statistical**2)
     if seen.held_out:
         statistic = float(np.sum(mean[full] ** 2 / (1 / precision[full] + fit)))
-        p_value = float(chi_squared.sf(statistic, compared))
+        p_value = chi2_tail(statistic, compared)
     else:
         degrees = max(compared + fit * float(precision.sum()), 1.0)
-        p_value = float(chi_squared.sf(np.sum(mean**2 * precision), degrees))
+        p_value = chi2_tail(np.sum(mean**2 * precision), degrees)
     p_value = min(1.0, len(_BINNINGS) * p_value)
     left = np.where(full, mean**2 * precision - 1 - fit * precision, 0.0).reshape(tiles, per_tile).sum(axis=1)
     weights = precision.reshape(tiles, per_tile).sum(axis=1)
