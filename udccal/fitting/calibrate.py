@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import TypeVar, get_args
 
@@ -126,13 +127,18 @@ class _Clock:
         self._session, self._progress = session, progress
         self.times: list[FitTime] = []
 
-    def run(self, term: TermName, fit: Callable[[], FitResult[Term]], otherwise: Callable[[], Term]) -> FitResult[Term]:
-        """The fit of a term, or what stands for it when the session has no steps of it."""
+    @contextmanager
+    def of(self, term: TermName) -> Iterator[bool]:
+        """Times what is done within; gives whether the session has steps of the term."""
         self._progress(term)
         start = time.perf_counter()
-        result = fit() if self._session.steps(term) else _left_out(term, otherwise())
+        yield bool(self._session.steps(term))
         self.times.append(FitTime(term, time.perf_counter() - start))
-        return result
+
+    def run(self, term: TermName, fit: Callable[[], FitResult[Term]], otherwise: Callable[[], Term]) -> FitResult[Term]:
+        """The fit of a term, or what stands for it when the session has no steps of it."""
+        with self.of(term) as captured:
+            return fit() if captured else _left_out(term, otherwise())
 
 
 def fit_foundation(
@@ -144,25 +150,19 @@ def fit_foundation(
     """
     rig, effort, clock = session.rig, effort or FitEffort(), _Clock(session, progress)
     noise = clock.run("noise", lambda: fit_noise(session), lambda: nominal_noise(rig))
-    boards: list[BoardView] = []
-
-    def geometry_of_boards() -> FitResult[Geometry]:
-        boards.extend(read_views(session, noise.term))
-        size = (rig.camera.columns, rig.camera.rows)
-        return fit_views(boards, nominal_geometry(rig), size, rig_prior(rig))
-
-    geometry = clock.run("geometry", geometry_of_boards, lambda: nominal_geometry(rig))
-    sigmas: list[MapSigma | None] = []
-
-    def wire_of_flats() -> FitResult[Wire]:
-        fit = fit_wire_session(session, noise.term, geometry.term, effort.wire_samples)
-        sigmas.append(fit.sigma)
-        return fit.result
-
-    wire = clock.run("wire", wire_of_flats, lambda: absent_wire(rig, geometry.term))
+    with clock.of("geometry") as captured:
+        boards = tuple(read_views(session, noise.term)) if captured else ()
+        geometry = (
+            fit_views(boards, nominal_geometry(rig), (rig.camera.columns, rig.camera.rows), rig_prior(rig))
+            if captured
+            else _left_out("geometry", nominal_geometry(rig))
+        )
+    with clock.of("wire") as captured:
+        wire_fit = fit_wire_session(session, noise.term, geometry.term, effort.wire_samples) if captured else None
+        wire = wire_fit.result if wire_fit else _left_out("wire", absent_wire(rig, geometry.term))
     wire_map = sensor_map(wire.term, rig.camera.rows, rig.camera.columns)
-    sigma = sigmas[0] if sigmas else None
-    return Foundation(noise, geometry, wire, tuple(clock.times), wire_map, sigma, tuple(boards))
+    sigma = wire_fit.sigma if wire_fit else None
+    return Foundation(noise, geometry, wire, tuple(clock.times), wire_map, sigma, boards)
 
 
 def fit_session(

@@ -200,7 +200,7 @@ def fit_dark(
         # The squared step in units of sigma is twice what the likelihood can still gain.
         converged = bool(score[inside] @ step[inside] < 1e-3) or gained < 1e-4
     # The last step was a small part of a sigma: the information is that before it.
-    information = _least(information, pairs, free)
+    information = _least(information, pairs, free & _hidden(pairs, values))
     widen = np.sqrt(np.array([1.0, 1.0, 1.0, len(pairs), 1.0]))
     cov = scaled_inverse(information) * np.outer(widen, widen)
     return DarkFit(values, cov, _edge_gains(pairs, values, known), best, converged, iterations)
@@ -210,15 +210,20 @@ def _code_step(pair: DarkPair) -> float:
     return float(np.min(np.diff(pair.edges_DN)))
 
 
+def _hidden(pairs: tuple[DarkPair, ...], values: Float[np.ndarray, "5"]) -> bool:
+    """Noise and offsets within a code: their number may then be hidden by rounding, and else by nothing but chance."""
+    return bool(values[2] + values[3] < _code_step(pairs[0]) ** 2)
+
+
 def _least(
-    information: Float[np.ndarray, "5 5"], pairs: tuple[DarkPair, ...], free: np.ndarray
+    information: Float[np.ndarray, "5 5"], pairs: tuple[DarkPair, ...], hidden: np.ndarray
 ) -> Float[np.ndarray, "5 5"]:
     """What rounding hides is no larger than rounding: that much is known of codes that are all the same."""
-    hidden = _code_step(pairs[0]) ** 2 / 12.0
+    step2 = _code_step(pairs[0]) ** 2 / 12.0
     longest = max(max(pair.exposure_s for pair in pairs), 1e-9)
-    least = np.array([1 / hidden, longest**2 / hidden, 1 / hidden**2, 1 / hidden**2, 1 / _SHAPE_SIGMA**2])
+    least = np.array([1 / step2, longest**2 / step2, 1 / step2**2, 1 / step2**2, 1 / _SHAPE_SIGMA**2])
     found = information.copy()
-    for i in np.flatnonzero(free & (np.diag(information) < least)):
+    for i in np.flatnonzero(hidden & (np.diag(information) < least)):
         found[i, :] = found[:, i] = 0.0
         found[i, i] = least[i]
     return found
