@@ -63,6 +63,20 @@ def test_no_modulation_is_absent_and_costs_nothing() -> None:
     assert fit.sigma is not None
     error = map_at(fit.result.term, places()) - map_at(flat.truth, places())
     assert np.all(np.abs(error) < 4.5 * fit.sigma.at(places()))
+    assert float(np.max(fit.sigma.at(places()))) < 0.002
+    assert "too noisy" not in " ".join(fit.result.notes)
+
+
+@pytest.mark.parametrize("electrons", [24.0, 100.0])
+def test_rows_that_noise_may_hide_are_in_the_error_bars(electrons: float) -> None:
+    flat = noisy(drawn_truth(854, start(), geometry()), 854, electrons, 0.0)
+    fit = fit_wire_and_sigma(flat.signal, flat.variance, geometry(), start(), 0.0, flat.signal.size)
+    assert fit.result.status is FitStatus.ABSENT
+    assert "too noisy to tell" in " ".join(fit.result.notes)
+    assert fit.sigma is not None
+    z = (map_at(fit.result.term, places()) - map_at(flat.truth, places())) / fit.sigma.at(places())
+    assert np.abs(z).max() < 3.5
+    assert np.std(z) > 0.2
 
 
 def test_saturated_flat_says_what_to_do() -> None:

@@ -63,7 +63,7 @@ def test_where_noise_hides_them_they_are_as_likely_as_not(wire: Wire) -> None:
 
 def test_what_is_likely_left_out_is_part_of_the_misfit(wire: Wire) -> None:
     nothing = Misfit(0.0, np.zeros((2, 3)), 1e-5, 0.5, 6, NOISE)
-    there, not_there = (with_omitted(nothing, Omitted(2e-4, share, 0.1)) for share in (1.0, 0.0))
+    there, not_there = (with_omitted(nothing, Omitted(2e-4, share, 0.1).sigma) for share in (1.0, 0.0))
     assert there.sigma == pytest.approx(2e-4, rel=0.01)
     assert (there.by_tile == there.sigma).all()
     assert not_there.sigma < 2e-5

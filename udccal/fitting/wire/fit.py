@@ -21,7 +21,7 @@ from udccal.fitting.wire.harmonics import WireStart, full_basis, possible_harmon
 from udccal.fitting.wire.joint import fit_joint, settle
 from udccal.fitting.wire.misfit import misfit
 from udccal.fitting.wire.noise import FlatNoise, flat_noise, judge, site_numbers
-from udccal.fitting.wire.omitted import omitted, with_omitted
+from udccal.fitting.wire.omitted import omitted, unseen, with_omitted
 from udccal.fitting.wire.phase import fit_phase
 from udccal.fitting.wire.result import wire_result
 from udccal.fitting.wire.scan import ideal_wire
@@ -161,11 +161,14 @@ def _fitted(
     judged = seen
     if step > 1:
         # In steps of three, for a sample of all CFA sites that the fit has not seen.
-        unseen = sample_pixels(values, variance, geometry, 3 * step, step // 2)
-        judged = judge(joint.wire, joint.gains, unseen, noise)
+        others = sample_pixels(values, variance, geometry, 3 * step, step // 2)
+        judged = judge(joint.wire, joint.gains, others, noise)
     found = misfit(joint, judged, sigma.rms(), held_out=step > 1)
-    left_out = omitted(start, joint.wire, seen) if phase.present else None
-    found = with_omitted(found, left_out) if left_out else found
+    if phase.present:
+        left_out = omitted(start, joint.wire, seen)
+        found = with_omitted(found, left_out.sigma) if left_out else found
+    else:
+        found = with_omitted(found, unseen(sizes, few))
     sigma = replace(sigma, model=found.by_tile)
     term = _trimmed(wire) if phase.present else _bare(wire)
     return WireFit(wire_result(phase, joint, found, sigma, term, values.size), sigma)

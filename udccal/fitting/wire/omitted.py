@@ -19,6 +19,7 @@ from udccal.fitting.wire.basis import Pixels
 from udccal.fitting.wire.harmonics import WireStart, omitted_harmonics
 from udccal.fitting.wire.misfit import Misfit
 from udccal.fitting.wire.noise import Judged
+from udccal.fitting.wire.phase import LEAST_GAIN
 from udccal.fitting.wire.scan import modulation_at, with_harmonics
 from udccal.models.wire import Wire
 
@@ -31,6 +32,8 @@ _CHUNK: Final = 2**13
 _RMS_PIXELS: Final = 2**10
 # A real pupil's share of a round one's template is one within this.
 _REAL_PUPILS: Final = 0.3
+# Rows of half the amplitude that is expected would still have been noticed.
+_SURELY_SEEN: Final = 4.0
 
 
 @final
@@ -92,9 +95,22 @@ def omitted(start: WireStart, wire: Wire, judged: Judged) -> Omitted | None:
     return Omitted(float(np.std(np.asarray(whole))), share, information**-0.5)
 
 
-def with_omitted(found: Misfit, left_out: Omitted) -> Misfit:
-    """The misfit and what is likely left out, together."""
-    sigma = left_out.sigma
+def unseen(bounds: Float[np.ndarray, " harmonics"], searched: Pixels) -> float:
+    """What the rig's rows may modulate by, relative RMS, though none were seen; 0 where they would have been.
+
+    Args:
+        bounds: of the relative amplitudes of the harmonics that a fit has.
+        searched: the pixels that rows were looked for in.
+    """
+    power = float(np.sum(bounds**2)) / 2
+    expected_gain = power * float(np.sum(searched.weight * searched.value**2))
+    if expected_gain > _SURELY_SEEN * LEAST_GAIN:
+        return 0.0
+    return float(np.sqrt(power * min(1.0, LEAST_GAIN / max(expected_gain, 1e-300))))
+
+
+def with_omitted(found: Misfit, sigma: float) -> Misfit:
+    """The misfit and what is likely left out, relative, RMS over the sensor, together."""
     by_tile = np.hypot(found.by_tile, sigma)
     return replace(found, sigma=float(np.hypot(found.sigma, sigma)), by_tile=by_tile, omitted=sigma)
 

@@ -114,6 +114,11 @@ def _notes(phase: PhaseFit, joint: Joint, found: Misfit, wire: Wire) -> tuple[st
         notes += _doubts(joint, phase, wire)
     else:
         notes.append("No modulation by rows is visible; the map is the shading alone.")
+        if found.omitted > 0:
+            notes.append(
+                f"These flats are too noisy to tell: rows may modulate by {100 * found.omitted:.2g} % unseen, which "
+                "the stated sigmas include. Average more frames, or expose longer."
+            )
     if found.found:
         notes.append(
             f"The residuals are patterned (p = {found.p_value:.1g}): the model may be {100 * found.sigma:.3f} % off, "
