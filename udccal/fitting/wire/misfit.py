@@ -34,13 +34,13 @@ class Misfit:
 
     Attributes:
         sigma: of the map, relative, RMS over the sensor: of patterned residuals (0 where there is no pattern) and
-            of the harmonics left out.
+            of what is omitted.
         by_tile: the same, tile by tile; nowhere less than its RMS.
         resolution: the smallest such sigma that would have been seen.
         p_value: of noise alone to leave such patterns.
         bins: that were compared.
         residual_rms: relative, of single pixels.
-        omitted: of the harmonics left out, relative, RMS over the sensor.
+        omitted: of the harmonics left out, or of rows that may be there unseen; relative, RMS over the sensor.
     """
 
     sigma: float

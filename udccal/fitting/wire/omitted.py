@@ -103,7 +103,8 @@ def unseen(bounds: Float[np.ndarray, " harmonics"], searched: Pixels) -> float:
         searched: the pixels that rows were looked for in.
     """
     power = float(np.sum(bounds**2)) / 2
-    expected_gain = power * float(np.sum(searched.weight * searched.value**2))
+    # Values are 1 but for shading, and a few that are far off must not count as light.
+    expected_gain = power * float(np.sum(searched.weight))
     if expected_gain > _SURELY_SEEN * LEAST_GAIN:
         return 0.0
     return float(np.sqrt(power * min(1.0, LEAST_GAIN / max(expected_gain, 1e-300))))
