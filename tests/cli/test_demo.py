@@ -30,5 +30,8 @@ def test_the_demonstration_beats_the_panel(tmp_path: Path) -> None:
     for made in ("session/session.json", "profile/profile.json", "portrait/after.png", "report.html"):
         assert (out / made).is_file()
     report = (out / "report.html").read_text(encoding="utf-8")
-    assert report.count("data:image/png;base64,") >= 9
+    for term in TERMS:
+        assert f'alt="residuals of {term}"' in report
+        assert f'alt="accuracy of {term} against captures"' in report
+    assert report.count("information left on the table") == len(TERMS)
     assert "http://" not in report

@@ -29,8 +29,6 @@ def gather(
 ) -> Evidence:
     """Every number the report shows; ``light`` is the simulated rig's, None for a rig that is really there.
 
-    Where the truth is known the report shows that; else how accurate the terms are, and would be with more captures.
-
     Raises:
         SessionError: when a file of the session is damaged.
     """
@@ -45,7 +43,7 @@ def gather(
         rows,
         photon_transfer(session, noise),
         board_evidence(calibration.foundation.boards, geometry),
-        () if light is not None else accuracies(calibration),
+        accuracies(calibration),
     )
 
 

@@ -40,7 +40,7 @@ class Evidence:
     rows: tuple[TruthRow, ...]
     transfer: PhotonTransfer | None
     boards: BoardEvidence | None
-    accuracies: tuple[Accuracy, ...] = ()
+    accuracies: tuple[Accuracy, ...]
 
     def accuracy(self, term: TermName) -> Accuracy | None:
         """Of a term; None where nothing is known of it."""
