@@ -59,9 +59,10 @@ def _nodes(spread: float, width: float) -> tuple[Float[np.ndarray, " nodes"], Fl
     return spread * z, weights / weights.sum()
 
 
-def _pair_probability(
+def pair_probability(
     pair: DarkPair, values: Float[np.ndarray, "5"], known: Surroundings
 ) -> Float[np.ndarray, "codes codes"]:
+    """Of the two codes of a pixel in a pair of dark frames; ``values`` in the order of ``PARAMETERS``."""
     black, per_s, variance, spread2, shape = (float(v) for v in values)
     drift = per_s * pair.exposure_s
     grid, cdf = dark_cdf(np.sqrt(variance), shape, known.sigma_row_DN, drift, known.K_DN_per_e)
@@ -75,7 +76,7 @@ def _pair_probability(
 
 
 def _deviance(pairs: tuple[DarkPair, ...], values: Float[np.ndarray, "5"], known: Surroundings) -> float:
-    likelihood = sum(float(np.sum(pair.counts * np.log(_pair_probability(pair, values, known)))) for pair in pairs)
+    likelihood = sum(float(np.sum(pair.counts * np.log(pair_probability(pair, values, known)))) for pair in pairs)
     return -2.0 * likelihood - 2.0 * _log_prior(values)
 
 
@@ -108,7 +109,7 @@ def _slopes(
     slopes = []
     for index, step in enumerate(np.diag(steps)):
         moved = values + step if values[index] + steps[index] <= _HIGH[index] else values - step
-        rise = _pair_probability(pair, moved, known) - at
+        rise = pair_probability(pair, moved, known) - at
         slopes.append(rise.ravel() / (moved[index] - values[index]))
     return np.stack(slopes)
 
@@ -119,20 +120,13 @@ def _score_and_information(
     steps = _steps(pairs, values)
     score, information = np.zeros(5), np.zeros((5, 5))
     for pair in pairs:
-        joint = _pair_probability(pair, values, known)
+        joint = pair_probability(pair, values, known)
         slopes, p = _slopes(pair, joint, values, steps, known), joint.ravel()
         score += slopes @ (pair.counts.ravel() / p)
         information += float(pair.counts.sum()) * (slopes / p) @ slopes.T
     score[4] -= (values[4] - NORMAL_SHAPE) / _SHAPE_SIGMA**2
     information[4, 4] += 1 / _SHAPE_SIGMA**2
     return np.where(free, score, 0.0), np.where(np.outer(free, free), information, 0.0)
-
-
-def information(
-    pairs: tuple[DarkPair, ...], values: Float[np.ndarray, "5"], known: Surroundings
-) -> Float[np.ndarray, "5 5"]:
-    """Expected information on ``values`` in histograms of that many samples, for bounds; the prior's is in it."""
-    return _score_and_information(pairs, values, known, np.ones(5, bool))[1]
 
 
 def start_values(pairs: tuple[DarkPair, ...]) -> Float[np.ndarray, "5"]:
@@ -240,10 +234,10 @@ def dark_levels(
     means, variances = [], []
     steps = _steps(pairs, fit.values)
     for pair in pairs:
-        joint = _pair_probability(pair, fit.values, known)
+        joint = pair_probability(pair, fit.values, known)
         p = joint.ravel()
         moved = fit.values + np.array([steps[0], 0.0, 0.0, 0.0, 0.0])
-        slope = (_pair_probability(pair, moved, known) - joint).ravel() / steps[0]
+        slope = (pair_probability(pair, moved, known) - joint).ravel() / steps[0]
         total = float(pair.counts.sum())
         information = total * float((slope / p) @ slope)
         score = float(slope @ (pair.counts.ravel() / p))
@@ -265,6 +259,6 @@ def _edge_gains(
     step = np.array([0.01 * np.sqrt(values[2]), 0.0, 0.0, 0.0, 0.0])
     gains = []
     for pair in pairs:
-        rise = _pair_probability(pair, values + step, known) - _pair_probability(pair, values - step, known)
+        rise = pair_probability(pair, values + step, known) - pair_probability(pair, values - step, known)
         gains.append(float(rise.sum(axis=1) @ centres_DN(pair) / (2 * step[0])))
     return np.array(gains)
