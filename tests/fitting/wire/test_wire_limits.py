@@ -146,6 +146,7 @@ def test_the_right_order_is_chosen() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(3600)  # two hundred fits
 def test_absent_and_present_are_told_apart() -> None:
     """Present: the first harmonic explains 200 of chi-squared, twice what is asked for."""
     told = 0

@@ -29,7 +29,9 @@ from udccal.rig import RigDescription
 _WORST_ERROR = 0.05
 # A fit of pictures that do not determine where the footprints lie: sigma over that of the prior.
 _UNDETERMINED = 0.5
-_PLACE = [1, 2, 6, 7]
+_PLACE = np.array([1, 2, 6, 7])
+# Known as well as this from the rig's description, smooth pictures need not tell it: a tenth of a length, half a pixel.
+_KNOWN = np.array([0.1, 0.1, 0.5, 0.5])
 # Rates between frames of one shot vary this much more than noise when the panel flickers.
 _STEADY = 1.3
 _MOST_ODD = 0.25
@@ -122,9 +124,10 @@ def _status(choice: Choice) -> tuple[FitStatus, tuple[str, ...]]:
             "The pictures ask for footprints on the panel of more than three times their nominal width. Check lens, "
             "stand-off and pitch in the description, and that every frame was stored with the picture that was shown.",
         )
-    unsure = np.sqrt(np.maximum(np.diag(solution.cov), 0.0)) > _UNDETERMINED * prior.sigma
-    if unsure[_PLACE].any():
-        names = ", ".join(NAMES[k] for k in _PLACE if unsure[k])
+    sigma = np.sqrt(np.maximum(np.diag(solution.cov), 0.0))[_PLACE]
+    unsure = (sigma > _UNDETERMINED * prior.sigma[_PLACE]) & (sigma > _KNOWN)
+    if unsure.any():
+        names = ", ".join(NAMES[k] for k in _PLACE[unsure])
         return FitStatus.TOO_FEW_DATA, (
             f"The pictures do not determine {names}. Show pictures that differ in brightness, colour and shapes, "
             "or expose longer.",
