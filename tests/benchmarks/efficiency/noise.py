@@ -51,6 +51,11 @@ class ToySensor:
     stack_level: float = 0.5
     stack_frames: int = 8
 
+    @property
+    def shape(self) -> float:
+        """Of the read noise; None stands for normal noise."""
+        return NORMAL_SHAPE if self.lambda_read is None else self.lambda_read
+
     def exposure_s(self, level: float) -> float:
         """Time that fills the well to this fraction."""
         return level * self.full_well_e / self.flux_e_per_s
@@ -116,7 +121,7 @@ def truth(sensor: ToySensor) -> dict[str, float]:
         "black_DN": sensor.black_DN,
         "saturation_DN": full,
         "sigma_d_e": float(np.hypot(sensor.read_e, sensor.row_DN / sensor.K_DN_per_e)),
-        "lambda_read": NORMAL_SHAPE if sensor.lambda_read is None else sensor.lambda_read,
+        "lambda_read": sensor.shape,
         "sigma_row_DN": sensor.row_DN,
         "dark_current_e_per_s": sensor.dark_e_per_s,
         "DSNU1288_e": sensor.DSNU_e,
@@ -146,7 +151,7 @@ def bounds(sensor: ToySensor) -> dict[str, float]:
             sensor.PRNU**2,
             full,
             0.0,
-            NORMAL_SHAPE if sensor.lambda_read is None else sensor.lambda_read,
+            sensor.shape,
         ]
     )
     information = fisher_information(partial(_statistics, sensor), x)
@@ -186,7 +191,7 @@ def _statistics(sensor: ToySensor, x: Float[Array, "12"]) -> tuple[Float[Array, 
         row = row2 + v / sensor.columns
         parts.append((row, 2 * row**2 / (sensor.rows * (count - 1))))
         if count > 2:
-            tails = excess_kurtosis(sensor.lambda_read or NORMAL_SHAPE) * (V0 / v) ** 2
+            tails = excess_kurtosis(sensor.shape) * (V0 / v) ** 2
             parts.append((v, (2 + tails * (1 - 1 / count)) * v**2 / (pixels * (count - 1))))
     parts.append((offset, spread2 / pixels))
     averaged = spread2 + (V0 + 1 / 12 + K * rate * stack_s + row2) / frames

@@ -12,9 +12,9 @@ REGION = Region(8, 4, 64, 48)
 SETTINGS = Settings(4e-3, 3.0, REGION)
 
 
-def pattern(frame: Frame, block_id: int) -> np.ndarray:
+def pattern(frame: Frame, block_id: int, bits: int = 12) -> np.ndarray:
     region = frame.settings.region
-    return PatternSource()(Exposure(block_id, 0, 4000.0, 0, 12, region.x, region.y, region.columns, region.rows))
+    return PatternSource()(Exposure(block_id, 0, 4000.0, 0, bits, region.x, region.y, region.columns, region.rows))
 
 
 def check_whole(frames: list[Frame], whole: dict[int, int]) -> None:

@@ -8,20 +8,18 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
+from tests.cameras.u3v.small_frames import REGION, SETTINGS, pattern
 from tests.virtual_u3v import registers as at
 from tests.virtual_u3v.backend import VirtualBackend
 from tests.virtual_u3v.camera import VirtualCamera
 from tests.virtual_u3v.model import CameraModel, Speed
 from tests.virtual_u3v.pixel_formats import delivered
-from tests.virtual_u3v.sources import Exposure, PatternSource
 from udccal.cameras.pixel_formats import pixel_format
 from udccal.cameras.protocol import Camera, CameraIdentity, Counts, Frame, Mode, Range, Region, Settings, Trigger
 from udccal.cameras.u3v.camera import U3vCamera
 from udccal.errors import CameraError, CameraTimeout
 
 SENTENCE = r"Expected .* found .*\. \w+"
-REGION = Region(8, 4, 64, 48)
-SETTINGS = Settings(4e-3, 3.0, REGION)
 
 
 @pytest.fixture
@@ -30,11 +28,9 @@ def camera(device: VirtualCamera) -> Iterator[U3vCamera]:
         yield opened
 
 
-def pattern(device: VirtualCamera, frame: Frame, block_id: int, name: str) -> np.ndarray:
-    region = frame.settings.region
-    place = (region.x, region.y, region.columns, region.rows)
-    mosaic = PatternSource()(Exposure(block_id, 0, 4000.0, 0, device.model.bits, *place))
-    return delivered(mosaic, device.model.bits, pixel_format(name).bits)
+def sent(device: VirtualCamera, frame: Frame, block_id: int, name: str) -> np.ndarray:
+    """The pattern as the camera sends it in a format."""
+    return delivered(pattern(frame, block_id, device.model.bits), device.model.bits, pixel_format(name).bits)
 
 
 def test_is_a_camera_that_says_what_it_is(camera: U3vCamera) -> None:
@@ -83,11 +79,11 @@ def test_samples_are_those_of_the_sensor_in_every_format(camera: U3vCamera, devi
     assert camera.set_mode(Mode(name)) == Mode(name)
     assert camera.bits == pixel_format(name).bits
     for i, frame in enumerate(camera.frames(3)):
-        np.testing.assert_array_equal(frame.data, pattern(device, frame, i, name))
+        np.testing.assert_array_equal(frame.data, sent(device, frame, i, name))
     # With 120 samples of 10 or 12 bits the lines do not end on whole bytes of a word.
     camera.configure(Settings(4e-3, 0.0, Region(4, 2, 120, 6)))
     for i, frame in enumerate(camera.frames(2)):
-        np.testing.assert_array_equal(frame.data, pattern(device, frame, i, name))
+        np.testing.assert_array_equal(frame.data, sent(device, frame, i, name))
 
 
 @pytest.mark.parametrize("cfa", ["RGGB", "GRBG", "GBRG", "BGGR", "mono"])
@@ -98,7 +94,7 @@ def test_every_colour_filter(cfa: str) -> None:
         name = next(n for n in camera.features.pixel_formats if n.endswith("12p"))
         camera.set_mode(Mode(name))
         (frame,) = camera.frames(1)
-        np.testing.assert_array_equal(frame.data, pattern(device, frame, 0, name))
+        np.testing.assert_array_equal(frame.data, sent(device, frame, 0, name))
         assert camera.cfa == cfa
 
 
@@ -121,7 +117,7 @@ def test_frames_are_the_callers_own(camera: U3vCamera, device: VirtualCamera) ->
     frames = list(camera.frames(80))
     frames[0].data[:] = 7
     for i, frame in enumerate(frames[1:], start=1):
-        np.testing.assert_array_equal(frame.data, pattern(device, frame, i, "BayerRG8"))
+        np.testing.assert_array_equal(frame.data, sent(device, frame, i, "BayerRG8"))
 
 
 def test_chunks_say_what_each_frame_was_taken_with(camera: U3vCamera, device: VirtualCamera) -> None:
@@ -165,7 +161,7 @@ def test_software_trigger_exposes_when_a_frame_is_asked_for(camera: U3vCamera, d
         asked_s = device.clock.now_ns() / 1e9
         frame = next(frames)
         assert frame.timestamp_s >= asked_s
-        np.testing.assert_array_equal(frame.data, pattern(device, frame, i, "BayerRG12p"))
+        np.testing.assert_array_equal(frame.data, sent(device, frame, i, "BayerRG12p"))
     with pytest.raises(StopIteration):
         next(frames)
 
@@ -302,7 +298,7 @@ def test_a_camera_left_running_by_a_killed_program_is_stopped_first(device: Virt
         camera.set_mode(Mode("BayerRG12p"))
         for i, frame in enumerate(camera.frames(4)):
             assert frame.complete
-            np.testing.assert_array_equal(frame.data, pattern(device, frame, i, "BayerRG12p"))
+            np.testing.assert_array_equal(frame.data, sent(device, frame, i, "BayerRG12p"))
 
 
 def test_at_a_usb_2_port_it_works_too() -> None:
@@ -310,7 +306,7 @@ def test_at_a_usb_2_port_it_works_too() -> None:
     with U3vCamera(backend=VirtualBackend([device])) as camera:
         camera.set_mode(Mode("BayerRG12"))
         for i, frame in enumerate(camera.frames(3)):
-            np.testing.assert_array_equal(frame.data, pattern(device, frame, i, "BayerRG12"))
+            np.testing.assert_array_equal(frame.data, sent(device, frame, i, "BayerRG12"))
 
 
 @pytest.mark.parametrize("alignment", [1, 4, 512, 1024, 8192])
@@ -319,7 +315,7 @@ def test_every_alignment_of_transfers(alignment: int) -> None:
     with U3vCamera(backend=VirtualBackend([device])) as camera:
         camera.set_mode(Mode("BayerRG12p"))
         for i, frame in enumerate(camera.frames(3)):
-            np.testing.assert_array_equal(frame.data, pattern(device, frame, i, "BayerRG12p"))
+            np.testing.assert_array_equal(frame.data, sent(device, frame, i, "BayerRG12p"))
 
 
 @pytest.mark.parametrize("max_transfer", [76, 128, 65_536])
@@ -333,5 +329,5 @@ def test_pictures_of_more_than_one_transfer() -> None:
     with U3vCamera(backend=VirtualBackend([device])) as camera:
         camera.set_mode(Mode("BayerRG12p"))
         for i, frame in enumerate(camera.frames(3)):
-            np.testing.assert_array_equal(frame.data, pattern(device, frame, i, "BayerRG12p"))
+            np.testing.assert_array_equal(frame.data, sent(device, frame, i, "BayerRG12p"))
             time.sleep(0.02)  # the reader goes on meanwhile

@@ -73,8 +73,8 @@ def dark_variance(data: NoiseData, dark: DarkTerms) -> DarkVariance:
         drifts.append(drift)
         values.append(observed - rounding - drift * dark.K_DN_per_e)
         # The read noise's tails, among rounding and counts of dark current, which have none to speak of.
-        tails = dark.excess * min(dark.read_DN2.value / observed, 1.0) ** 2 if observed > 0 else 0.0
-        sigmas.append(observed * np.sqrt((2 + tails * (1 - 1 / data.dark_stack.frames)) / dof))
+        tails = dark.excess * min(dark.read_DN2.value, observed) ** 2 * (1 - 1 / data.dark_stack.frames)
+        sigmas.append(np.sqrt((2 * observed**2 + tails) / dof))
     # Black off by so much acts on the curve as read noise off by K times that.
     K = dark.K_DN_per_e
     shifted = K * np.sqrt(max(float(dark.levels_cov[0, 0]) - dark.pixels_DN2, 0.0))
