@@ -49,7 +49,7 @@ def report(session: Session) -> None:
         print(f"  {estimate.name:22} {estimate.value:12.5g} ± {estimate.sigma:.2g} {estimate.unit}")
     print(f"  reduced chi-squared {result.chi2_dof:.3f} over {result.samples} samples")
 
-    noise = result.or_raise("noise").term  # a bad status becomes a FitError that says what to do
+    noise = result.or_raise().term  # a bad status becomes a FitError that says what to do
     signal_e = float(electrons(noise, 1000.0))
     sigma_e = float(variance_e(noise, signal_e, 0.01)) ** 0.5
     print(f"A sample of 1000 DN at 10 ms is {signal_e:.0f} ± {sigma_e:.0f} electrons.")

@@ -31,7 +31,7 @@ def main() -> None:
     print(f"{result.status.name}: {result.status.value}")
     for candidate in result.candidates:
         print(f"  {'>' if candidate.chosen else ' '} {candidate.name:50} {candidate.criterion:.1f}")
-    term = result.or_raise("psf").term
+    term = result.or_raise().term
 
     corner = np.array([[60.0, 40.0]])
     kernel, sigma = term.predict(corner)[0], term.sigma(corner)[0]

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from udccal.cli.output import Output, plain
-from udccal.fitting.result import FitStatus
 from udccal.reports.tables import Table
+from udccal.result import FitStatus
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ import pytest
 from jaxtyping import Array, Float
 from scipy.stats import norm
 
-from udccal.fitting.information import cramer_rao, fisher_information
+from udccal.fitting.engine.information import cramer_rao, fisher_information
 
 
 def _shot_noise(x: Float[Array, "2"], times: Float[Array, " n"]) -> tuple[Float[Array, " n"], Float[Array, " n"]]:

@@ -7,11 +7,11 @@ import pytest
 
 from udccal.fitting.absent import absent_backscatter, absent_psf, absent_wire
 from udccal.fitting.nominal import nominal_geometry
-from udccal.fitting.result import Candidate, Diagnostic, Estimate, FitResult, FitStatus
 from udccal.fitting.wire.fit import sensor_map
 from udccal.models.noise import Noise
 from udccal.profiles.profile import Profile, build_profile
 from udccal.profiles.provenance import provenance_now
+from udccal.result import Candidate, Diagnostic, Estimate, FitResult, FitStatus
 from udccal.rig import RigDescription, load_rig
 from udccal.sessions.schema import StoredCamera
 
@@ -20,6 +20,7 @@ def fitted(term: object, estimates: tuple[Estimate, ...] = (), status: FitStatus
     """A fit's result with some of everything, its numbers awkward to print."""
     count = len(estimates)
     return FitResult(
+        name="test",
         term=term,
         status=status,
         estimates=estimates,

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 from udccal.errors import FitError, ProfileError
-from udccal.fitting.result import FitStatus
 from udccal.profiles.profile import Profile, build_profile
 from udccal.profiles.provenance import PROFILE_NAME, profile_sha256
 from udccal.profiles.store import RIG_PROFILE, find_profile, read_profile, read_stored, write_profile
+from udccal.result import FitStatus
 from udccal.rig import load_rig, shipped_rig_folder
 
 TERMS = ("noise", "geometry", "wire", "psf", "backscatter")

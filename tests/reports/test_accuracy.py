@@ -9,7 +9,6 @@ import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from udccal.fitting.nominal import nominal_geometry
-from udccal.fitting.result import Candidate, Diagnostic, Estimate, FitResult, FitStatus
 from udccal.planning.knobs import KNOBS
 from udccal.planning.outlook import Outlook, Trade
 from udccal.planning.prediction import Floor
@@ -17,6 +16,7 @@ from udccal.planning.targets import QUANTITIES
 from udccal.reports.accuracy import Accuracy, accuracy_table, stated, trade_sentence
 from udccal.reports.fit_figures import trade_figure
 from udccal.reports.fit_tables import MOST_ORDERS, more_orders, orders_table
+from udccal.result import Candidate, Diagnostic, Estimate, FitResult, FitStatus
 from udccal.rig import load_rig
 
 
@@ -31,7 +31,7 @@ def _outlook(floor: float = 0.05, gain: float = 0.5) -> Outlook:
 def _result(*candidates: Candidate) -> FitResult[None]:
     estimates = (Estimate("K_DN_per_e", 0.5, 0.001, "DN/e"),)
     made = (Diagnostic("wire_map_rms_sigma", 0.2, "%"),)
-    return FitResult(None, FitStatus.CONVERGED, estimates, np.eye(1), 1.0, 9, candidates, made)
+    return FitResult("noise", None, FitStatus.CONVERGED, estimates, np.eye(1), 1.0, 9, candidates, made)
 
 
 def _cells(accuracy: Accuracy) -> dict[str, str]:

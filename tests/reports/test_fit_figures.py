@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-from udccal.fitting.result import ResidualSample
 from udccal.reports.fit_figures import residual_figure
 from udccal.reports.residuals import residual_histogram, residual_map
+from udccal.result import ResidualSample
 
 _COLUMNS, _ROWS = 640, 480
 

@@ -6,9 +6,9 @@ import re
 from html.parser import HTMLParser
 from pathlib import Path
 
-from udccal.fitting.result import FitStatus
 from udccal.reports.page import Fact, Illustration, Page, TermSection, render, write_page
 from udccal.reports.tables import Table
+from udccal.result import FitStatus
 
 DOT = "data:image/png;base64,iVBORw0KGgo="
 

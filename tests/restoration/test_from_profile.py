@@ -10,7 +10,6 @@ import pytest
 
 from udccal.fitting.absent import absent_backscatter, absent_psf, absent_wire
 from udccal.fitting.nominal import nominal_geometry
-from udccal.fitting.result import FitResult, FitStatus
 from udccal.fitting.wire.fit import sensor_map
 from udccal.models.noise import Noise
 from udccal.profiles.profile import Profile, build_profile
@@ -18,6 +17,7 @@ from udccal.profiles.provenance import provenance_now
 from udccal.profiles.store import read_profile, write_profile
 from udccal.restoration.plan import PlanOptions
 from udccal.restoration.runtime import Restorer
+from udccal.result import FitResult, FitStatus
 from udccal.rig import RigDescription
 
 
@@ -38,7 +38,7 @@ def profile(small_rig: RigDescription, toy_noise: Noise) -> Profile:
     lit = type(dark)(**{**vars(dark), "mask": np.full(np.shape(dark.mask), 2.0e4), "window": 24})
 
     def fitted(term: object) -> FitResult:
-        return FitResult(term, FitStatus.CONVERGED, (), np.zeros((0, 0)), 1.0, 100)
+        return FitResult("test", term, FitStatus.CONVERGED, (), np.zeros((0, 0)), 1.0, 100)
 
     wire = absent_wire(small_rig, geometry)
     return build_profile(

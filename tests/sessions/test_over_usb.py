@@ -22,7 +22,7 @@ from udccal.cli.output import Output
 from udccal.displays.simulated import SimulatedDisplay
 from udccal.errors import CameraError, CameraLost
 from udccal.fitting.noise.fit import fit_noise
-from udccal.fitting.result import FitStatus
+from udccal.result import FitStatus
 from udccal.rig import RigDescription, load_rig
 from udccal.sessions.store import Session
 from udccal.simulation.world import SimulatedWorld

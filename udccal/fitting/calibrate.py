@@ -18,7 +18,6 @@ from udccal.fitting.geometry.fit import BoardView, fit_views, read_views, rig_pr
 from udccal.fitting.noise.fit import fit_noise, nominal_noise
 from udccal.fitting.nominal import nominal_geometry
 from udccal.fitting.psf.fit import Effort, fit_psf
-from udccal.fitting.result import FitResult, FitStatus
 from udccal.fitting.wire.fit import FIELD_SAMPLES, fit_wire_session, sensor_map
 from udccal.fitting.wire.sigma import MapSigma
 from udccal.models.backscatter import Backscatter
@@ -26,6 +25,7 @@ from udccal.models.geometry import Geometry
 from udccal.models.noise import Noise
 from udccal.models.psf import PsfField
 from udccal.models.wire import Wire
+from udccal.result import FitResult, FitStatus
 from udccal.rig import RigDescription
 from udccal.sessions.schema import TermName
 from udccal.sessions.store import Session
@@ -116,7 +116,7 @@ class Calibration:
             FitError: with the advice of the first bad status otherwise.
         """
         for term in ORDER:
-            self.result(term).or_raise(term)
+            self.result(term).or_raise()
         return self
 
 
@@ -203,12 +203,5 @@ def fit_session(
 
 
 def _left_out(name: TermName, term: Term) -> FitResult[Term]:
-    return FitResult(
-        term=term,
-        status=FitStatus.ABSENT,
-        estimates=(),
-        cov=np.zeros((0, 0)),
-        chi2_dof=0.0,
-        samples=0,
-        notes=(f"The session has no {name} steps; the term stands at what the rig description says, or is absent.",),
-    )
+    note = f"The session has no {name} steps; the term stands at what the rig description says, or is absent."
+    return FitResult.failed(name, term, FitStatus.ABSENT, note)

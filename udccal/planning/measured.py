@@ -8,13 +8,13 @@ from typing import Any, final
 import numpy as np
 
 from udccal.fitting.geometry.report import BY_HAND, ON_JIG
-from udccal.fitting.result import FitResult, FitStatus
 from udccal.models.backscatter import Backscatter
 from udccal.models.geometry import Geometry
 from udccal.models.noise import Noise
 from udccal.models.psf import PsfField
 from udccal.models.wire import Wire
 from udccal.planning.state import RigState, Unexplained, nominal_state
+from udccal.result import FitResult, FitStatus
 from udccal.rig import RigDescription
 
 

@@ -10,7 +10,6 @@ import numpy as np
 from jaxtyping import Float
 
 from udccal.errors import ProfileError
-from udccal.fitting.result import FitResult
 from udccal.io.exr import write_exr
 from udccal.io.hashing import sha256_file
 from udccal.models.backscatter import Backscatter
@@ -24,6 +23,7 @@ from udccal.profiles.packing import Packed, pack, unpack
 from udccal.profiles.pictures import ATLAS_COLUMNS, ATLAS_ROWS, psf_atlas
 from udccal.profiles.profile import Profile
 from udccal.profiles.schema import FORMAT, VERSION, Lineage, Section, StoredPicture, StoredProfile, Terms
+from udccal.result import FitResult
 
 Channels = Mapping[str, Float[np.ndarray, "rows columns"]]
 
@@ -56,7 +56,7 @@ def decode(stored: StoredProfile, folder: Path) -> Profile:
         ProfileError: when a file or a value is not in order.
     """
     terms, camera = stored.terms, stored.rig.camera
-    geometry = _load_section(terms.geometry, Geometry, folder, None)
+    geometry = _load_section("geometry", terms.geometry, Geometry, folder, None)
     shared = geometry.term
     pictures = {picture.name: picture for picture in stored.pictures}
     for name in ("wire_map", "psf_atlas", "backscatter_white"):
@@ -70,11 +70,11 @@ def decode(stored: StoredProfile, folder: Path) -> Profile:
         rig=stored.rig,
         provenance=stored.provenance,
         parent=stored.lineage.parent,
-        noise=_load_section(terms.noise, Noise, folder, shared),
+        noise=_load_section("noise", terms.noise, Noise, folder, shared),
         geometry=geometry,
-        wire=_load_section(terms.wire, Wire, folder, shared),
-        psf=_load_section(terms.psf, PsfField, folder, shared),
-        backscatter=_load_section(terms.backscatter, Backscatter, folder, shared),
+        wire=_load_section("wire", terms.wire, Wire, folder, shared),
+        psf=_load_section("psf", terms.psf, PsfField, folder, shared),
+        backscatter=_load_section("backscatter", terms.backscatter, Backscatter, folder, shared),
         wire_map=np.array(wire["wire"], dtype=np.float32),
         backscatter_mask=np.stack([mask[name] for name in "RGB"], axis=-1).astype(np.float32),
         invalidated_by=stored.invalidated_by,
@@ -92,11 +92,11 @@ def _store_section(result: FitResult, name: str, folder: Path, geometry: Geometr
     )
 
 
-def _load_section(section: Section, kind: type, folder: Path, geometry: Geometry | None) -> FitResult[Any]:
+def _load_section(name: str, section: Section, kind: type, folder: Path, geometry: Geometry | None) -> FitResult[Any]:
     if section.model != kind.__name__:
         raise ProfileError(f"Expected the model {kind.__name__}, found '{section.model}'. Update udccal to read it.")
     term = unpack(Packed(section.parameters, section.arrays), kind, folder, geometry)
-    return load_fit(section.fit, term, folder)
+    return load_fit(name, section.fit, term, folder)
 
 
 def _store_pictures(profile: Profile, folder: Path) -> tuple[StoredPicture, ...]:

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from udccal.errors import ProfileError
-from udccal.fitting.result import Candidate, Diagnostic, Estimate, FitResult, FitStatus
 from udccal.profiles import arrays
 from udccal.profiles.schema import Numbers, StoredArray, StoredCandidate, StoredDiagnostic, StoredEstimate, StoredFit
+from udccal.result import Candidate, Diagnostic, Estimate, FitResult, FitStatus
 
 
 def store_fit(result: FitResult, section: str, folder: Path) -> StoredFit:
@@ -38,7 +38,7 @@ def store_fit(result: FitResult, section: str, folder: Path) -> StoredFit:
     )
 
 
-def load_fit(stored: StoredFit, term: Any, folder: Path) -> FitResult:
+def load_fit(name: str, stored: StoredFit, term: Any, folder: Path) -> FitResult:
     """The fit result of a stored section.
 
     Raises:
@@ -48,6 +48,7 @@ def load_fit(stored: StoredFit, term: Any, folder: Path) -> FitResult:
         known = ", ".join(FitStatus.__members__)
         raise ProfileError(f"Expected one of the statuses {known}, found '{stored.status}'. Update udccal to read it.")
     return FitResult(
+        name=name,
         term=term,
         status=FitStatus[stored.status],
         estimates=tuple(Estimate(e.name, e.value, e.sigma, e.unit) for e in stored.estimates),

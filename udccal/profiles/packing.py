@@ -17,11 +17,11 @@ from typing import Any
 import numpy as np
 
 from udccal.errors import ProfileError
-from udccal.fitting.result import Estimate
 from udccal.models.geometry import Geometry
 from udccal.profiles import arrays
 from udccal.profiles.schema import Choice, Group, Number, Numbers, Parameter, Reference, Sequence, StoredArray
 from udccal.profiles.units import unit_of
+from udccal.result import Estimate
 
 
 @dataclass(frozen=True)

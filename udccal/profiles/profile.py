@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Float32
 
-from udccal.fitting.result import FitResult
 from udccal.models.backscatter import Backscatter
 from udccal.models.geometry import Geometry
 from udccal.models.noise import Noise
@@ -15,6 +14,7 @@ from udccal.models.psf import PsfField
 from udccal.models.wire import Wire
 from udccal.profiles.pictures import backscatter_mask
 from udccal.profiles.schema import Provenance
+from udccal.result import FitResult
 from udccal.rig import RigDescription
 from udccal.sessions.schema import TermName
 
@@ -82,10 +82,8 @@ def build_profile(
     Raises:
         FitError: with the advice of the first fit that ended in a bad status.
     """
-    for name, result in (
-        ("noise", noise), ("geometry", geometry), ("wire", wire), ("psf", psf), ("backscatter", backscatter)
-    ):  # fmt: skip
-        result.or_raise(name)
+    for result in (noise, geometry, wire, psf, backscatter):
+        result.or_raise()
     return Profile(
         rig=rig,
         provenance=provenance,

@@ -9,11 +9,11 @@ import numpy as np
 from udccal.errors import UdccalError
 from udccal.fitting.calibrate import ORDER, Calibration
 from udccal.fitting.geometry.fit import projection_sigma_px
-from udccal.fitting.result import FitResult, FitStatus
 from udccal.planning.measured import Measured, measured_state
 from udccal.planning.outlook import Outlook, Trade, outlook
 from udccal.planning.state import sensor_samples
 from udccal.reports.tables import Table
+from udccal.result import FitResult, FitStatus
 from udccal.rig import RigDescription
 from udccal.sessions.schema import TermName
 

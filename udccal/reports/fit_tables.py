@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from udccal.fitting.result import FitResult
 from udccal.reports.tables import Table, number, spread
+from udccal.result import FitResult
 
 MOST_ORDERS, MOST_CHOICES = 6, 16
 _NUMBERS = frozenset({1, 2})

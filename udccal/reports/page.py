@@ -7,9 +7,9 @@ from pathlib import Path
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
-from udccal.fitting.result import FitStatus
 from udccal.io.atomic import write_atomically
 from udccal.reports.tables import Table
+from udccal.result import FitStatus
 from udccal.sessions.schema import TermName
 
 

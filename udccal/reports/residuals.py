@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from udccal.fitting.result import ResidualSample
+from udccal.result import ResidualSample
 
 # Cells of the map need some residuals each to say anything; so many are wanted in the mean.
 _WANTED = 12

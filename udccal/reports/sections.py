@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from matplotlib.figure import Figure
 
 from udccal.fitting.calibrate import ORDER, Calibration
-from udccal.fitting.result import FitStatus
 from udccal.reports import figures, fit_figures
 from udccal.reports.accuracy import Accuracy, accuracy_table, trade_sentence
 from udccal.reports.board_views import BoardEvidence
@@ -25,6 +24,7 @@ from udccal.reports.page import Illustration, TermSection
 from udccal.reports.residuals import residual_histogram, residual_map
 from udccal.reports.tables import Table, number, spread
 from udccal.reports.truth import TruthRow
+from udccal.result import FitStatus
 from udccal.sessions.schema import TermName
 
 _LONGEST_LIST = 14

@@ -8,13 +8,13 @@ import numpy as np
 from jaxtyping import Float
 
 from udccal.fitting.calibrate import Calibration
-from udccal.fitting.result import FitResult
 from udccal.kernels import kernel_size
 from udccal.models.geometry import Geometry, project
 from udccal.numerics import in_float64
 from udccal.reports.maps import TermMaps
 from udccal.reports.tables import Table, number, spread
 from udccal.reports.true_values import true_values
+from udccal.result import FitResult
 from udccal.sessions.schema import TermName
 from udccal.simulation.light import RigLight
 from udccal.simulation.psf import kernels

@@ -12,7 +12,6 @@ import numpy as np
 from jaxtyping import Bool, Float32, UInt8, UInt16
 
 from udccal.errors import RestorationError
-from udccal.fitting.result import FitStatus
 from udccal.models.backscatter import PanelResponse
 from udccal.models.geometry import VirtualView
 from udccal.models.noise import Noise
@@ -25,6 +24,7 @@ from udccal.restoration.linear import mean_variance_e2, saturated, scalar, to_el
 from udccal.restoration.plan import PlanOptions, build_deblurrers, kernel_grid
 from udccal.restoration.rectify import Rectification
 from udccal.restoration.view import inscribed_view
+from udccal.result import FitStatus
 from udccal.rig import RigDescription
 
 Mosaic = Float32[np.ndarray, "rows columns"]

@@ -14,15 +14,15 @@ from jaxtyping import Array, Float
 
 from tests.benchmarks.efficiency.trials import Trials
 from tests.fitting.geometry.boards import Sight, sight
+from udccal.fitting.engine.information import cramer_rao, fisher_information
 from udccal.fitting.geometry.bundle import calibrate_views
 from udccal.fitting.geometry.bundle_projection import Gauge, field_grid
 from udccal.fitting.geometry.calibrated_views import CalibratedViews
 from udccal.fitting.geometry.corners import board_points_mm
 from udccal.fitting.geometry.fit import fit_views, projection_sigma_px
-from udccal.fitting.information import cramer_rao, fisher_information
-from udccal.fitting.result import FitResult
 from udccal.models.geometry import Geometry, project, rotation_matrix
 from udccal.numerics import in_float64
+from udccal.result import FitResult
 
 _REALISATIONS = 400
 _NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "tilt_deg", "roll_deg", "yaw_deg")
@@ -89,7 +89,7 @@ def trials(share: float = 1.0) -> list[Trials]:
     rng = np.random.default_rng(4)
     for _ in range(count):
         views = scene.views(rng)
-        result = fit_views(views, _START, scene.size).or_raise("geometry")
+        result = fit_views(views, _START, scene.size).or_raise()
         ids = [view.corners.ids for view in views]
         sigmas = [scene.sigma_px[k, seen] for k, seen in enumerate(ids)]
         bundle = calibrate_views([board[i] for i in ids], [v.corners.xy for v in views], scene.size, None, sigmas)

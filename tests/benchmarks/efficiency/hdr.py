@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from tests.benchmarks.efficiency.trials import Trials, column
+from udccal.fitting.engine.information import cramer_rao, fisher_information
 from udccal.fitting.hdr.merge import merge_bracket
-from udccal.fitting.information import cramer_rao, fisher_information
 from udccal.models.noise import Noise
 
 _K, _BLACK, _TOP, _SIGMA = 0.36, 64.0, 4095.0, 4.0

@@ -15,13 +15,13 @@ import numpy as np
 from jaxtyping import Array, Float, UInt16
 
 from tests.benchmarks.efficiency.trials import Trials, column
-from udccal.fitting.information import cramer_rao, fisher_information
+from udccal.fitting.engine.information import cramer_rao, fisher_information
 from udccal.fitting.noise import codes, read_noise
 from udccal.fitting.noise.density import NORMAL_SHAPE, excess_kurtosis, tukey_lambda_std
 from udccal.fitting.noise.frames import ExposureLevel, SpatialStack, fit_noise_frames
 from udccal.fitting.noise.photon_transfer import temporal_variance
-from udccal.fitting.result import FitResult
 from udccal.models.noise import Noise
+from udccal.result import FitResult
 
 _REALISATIONS = 1000
 
@@ -238,7 +238,7 @@ def trials(share: float) -> list[Trials]:
     sensor = ToySensor()
     count = max(40, int(share * _REALISATIONS))
     true, bound = truth(sensor), bounds(sensor)
-    results = [measure(sensor, seed).or_raise("noise") for seed in range(count)]
+    results = [measure(sensor, seed).or_raise() for seed in range(count)]
     found = []
     for name, value in true.items():
         estimates = [result.estimate(name) for result in results]

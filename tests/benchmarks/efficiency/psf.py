@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from tests.benchmarks.efficiency.trials import Trials
 from tests.benchmarks.psf_scene import Picture, Scene, pictures, shots_of, small_scene
-from udccal.fitting.information import cramer_rao
+from udccal.fitting.engine.information import cramer_rao
 from udccal.fitting.psf.blocks import Block, blocks, fit_lattice
 from udccal.fitting.psf.descent import Prior, damped
 from udccal.fitting.psf.field import fit_field

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 from scipy.linalg import block_diag
 
 from tests.benchmarks.efficiency.trials import Trials
-from udccal.fitting.information import cramer_rao, fisher_information
+from udccal.fitting.engine.information import cramer_rao, fisher_information
 from udccal.fitting.psf_stamps.data import Stamps
 from udccal.fitting.psf_stamps.field import PlaneField, see, warps
 from udccal.fitting.psf_stamps.fit import fit_psf_stamps

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from tests.benchmarks.efficiency.trials import Trials
-from udccal.fitting.information import cramer_rao, fisher_information
+from udccal.fitting.engine.information import cramer_rao, fisher_information
 from udccal.fitting.wire.fit import WireFit, fit_wire_and_sigma
 from udccal.fitting.wire.harmonics import WireStart, possible_harmonics
 from udccal.fitting.wire.prior import rig_prior
@@ -194,7 +194,7 @@ class Errors:
 
 def errors(fit: WireFit, truth: Wire, bound: tuple[Float[np.ndarray, "10"], Float[np.ndarray, " places"]]) -> Errors:
     """Estimate minus truth, stated sigma, bound."""
-    result = fit.result.or_raise("wire")
+    result = fit.result.or_raise()
     assert fit.sigma is not None
     found = np.array([e.value for e in result.estimates])
     off = found - shape_values(truth)

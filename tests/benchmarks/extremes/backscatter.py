@@ -23,7 +23,7 @@ from udccal.fitting.backscatter.bins import Binned
 from udccal.fitting.backscatter.data import PanelShots
 from udccal.fitting.backscatter.fit import fit_shots
 from udccal.fitting.backscatter.vector import TWO_PLANES, prior_of
-from udccal.fitting.result import FitResult
+from udccal.result import FitResult
 from udccal.rig import Nominal, RigDescription
 
 PICTURES = 10

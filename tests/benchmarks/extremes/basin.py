@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from tests.benchmarks.extremes import backscatter, geometry, psf, wire
 from tests.benchmarks.extremes.case import Outcome
-from udccal.fitting.result import FitStatus
+from udccal.result import FitStatus
 
 # Tried one after the other, away from 1, until one fails.
 _LOWER = (0.8, 0.67, 0.5, 0.33)

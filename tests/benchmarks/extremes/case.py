@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from udccal.fitting.result import FitResult, FitStatus
+from udccal.result import FitResult, FitStatus
 
 # Of the errors in units of the stated sigma: the largest of a handful of numbers, where each is normal.
 WORST_Z = 4.5

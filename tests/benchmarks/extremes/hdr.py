@@ -9,8 +9,8 @@ import numpy as np
 
 from tests.benchmarks.extremes.case import Case, Outcome
 from udccal.fitting.hdr.merge import UNKNOWN_SIGMA, merge_bracket
-from udccal.fitting.result import FitStatus
 from udccal.models.noise import Noise
+from udccal.result import FitStatus
 
 _TIMES = 1e-4 * 4.0 ** np.arange(8)
 _PIXELS, _GROUPS = 8000, 20

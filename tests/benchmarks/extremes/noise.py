@@ -11,8 +11,8 @@ from jaxtyping import Float
 from tests.benchmarks.efficiency.noise import ToySensor, expose, measure, patterns, truth
 from tests.benchmarks.extremes.case import Case, Outcome, outcome
 from udccal.fitting.noise.frames import ExposureLevel, SpatialStack, fit_noise_frames
-from udccal.fitting.result import FitResult
 from udccal.models.noise import Noise
+from udccal.result import FitResult
 
 _DIM = tuple(np.geomspace(1.0, 60.0, 8) / 10_000)
 # Light enough to have no curvature to speak of; a shorter way than the efficiency bench's.

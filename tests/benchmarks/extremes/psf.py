@@ -11,8 +11,8 @@ from tests.benchmarks.psf_scene import Scene, pictures, shots_of, small_scene
 from udccal.fitting.psf.blocks import BLUR
 from udccal.fitting.psf.fit import Effort, fit_shots_fully
 from udccal.fitting.psf.start import start_model, start_prior
-from udccal.fitting.result import FitResult
 from udccal.models.psf import PsfField
+from udccal.result import FitResult
 
 _EFFORT = Effort(positions=8, shifts=3, half_px=(14, 7), close_px=(14, 7), far_share=1.0, iterations=60)
 _SCENE = small_scene(positions=(3, 2), shifts=2, half=(14, 7))

@@ -23,11 +23,11 @@ from tests.benchmarks.efficiency.wire import (
     start,
 )
 from tests.benchmarks.extremes.case import MOST_SINGLE, Case, Outcome, outcome
-from udccal.fitting.result import FitStatus
 from udccal.fitting.wire.fit import WireFit, fit_wire_and_sigma
 from udccal.fitting.wire.harmonics import WireStart
 from udccal.models.geometry import Geometry
 from udccal.models.wire import wire_map
+from udccal.result import FitStatus
 
 _SEED = 3
 # Of lenses that still resolve the rows.

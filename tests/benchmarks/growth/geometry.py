@@ -29,7 +29,7 @@ def _work(views: int, corners: int) -> Callable[[], object]:
     seen = sight(views=views)
     scene = replace(seen, spec=spec, sigma_px=np.full((views, corners), float(seen.sigma_px.mean())))
     found = scene.views(np.random.default_rng(1))
-    return lambda: fit_views(found, _START, scene.size).or_raise("geometry")
+    return lambda: fit_views(found, _START, scene.size).or_raise()
 
 
 CASES = (

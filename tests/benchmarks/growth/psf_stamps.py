@@ -15,7 +15,7 @@ _STAMPS, _PIXELS = 30, 225
 
 def _work(stamps: int, pixels: int) -> Callable[[], object]:
     made, _ = make(1, stamps, _SIDES[pixels])
-    return lambda: fit_psf_stamps(made).or_raise("psf_stamps")
+    return lambda: fit_psf_stamps(made).or_raise()
 
 
 CASES = (

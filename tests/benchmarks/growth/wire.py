@@ -49,7 +49,7 @@ def _work(flats: int, pixels: int) -> Callable[[], object]:
         signal = moments.mean().astype(np.float64)
         # The frames that are taken again are the same.
         variance = moments.variance().astype(np.float64) / min(flats, _DRAWN)
-        return fit_wire_and_sigma(signal, variance, lens, built, PRNU, signal.size).result.or_raise("wire")
+        return fit_wire_and_sigma(signal, variance, lens, built, PRNU, signal.size).result.or_raise()
 
     return work
 

@@ -17,8 +17,8 @@ import numpy as np
 from tests.benchmarks.peers.works_module import arguments, load
 from udccal.fitting.noise import ExposureLevel, SpatialStack, fit_noise_frames
 from udccal.fitting.noise.response import mean_response
-from udccal.fitting.result import FitResult
 from udccal.models.noise import Noise
+from udccal.result import FitResult
 
 # EMVA 1288 judges linearity from 5 % to 95 % of saturation.
 _LEAST, _MOST = 0.05, 0.95
@@ -40,7 +40,7 @@ def fit(works: ModuleType, data: dict[str, Any]) -> FitResult[Noise]:
     middle = works.NOISE["spatial_level"]
     dark, bright = data["spatial"]
     stack = SpatialStack(float(data["t"][middle]), loaders(dark), loaders(bright), float(data["u_p"][middle]))
-    return fit_noise_frames(levels, stack).or_raise("noise")
+    return fit_noise_frames(levels, stack).or_raise()
 
 
 def metrics(works: ModuleType, data: dict[str, Any], result: FitResult[Noise]) -> dict[str, float]:

@@ -18,7 +18,7 @@ import numpy as np
 
 import udccal
 from udccal.fitting.psf_stamps import Stamps, StampsPsf, fit_psf_stamps, mosaic_channels
-from udccal.fitting.result import FitResult
+from udccal.result import FitResult
 
 # Of red, green and blue: how much wider than green, light, and lateral colour at the field's edge (px).
 SCALES, LIGHT, LATERAL_PX = (1.12, 1.0, 0.9), (0.6, 1.0, 0.7), (0.25, 0.0, -0.2)

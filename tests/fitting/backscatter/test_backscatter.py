@@ -17,9 +17,9 @@ from udccal.fitting.backscatter.data import PanelShots, grid_step, visible_crop
 from udccal.fitting.backscatter.fit import fit_backscatter, fit_shots
 from udccal.fitting.noise.fit import nominal_noise
 from udccal.fitting.nominal import nominal_geometry
-from udccal.fitting.result import FitResult, FitStatus
 from udccal.models.backscatter import Backscatter, backscatter_rate
 from udccal.models.geometry import Geometry
+from udccal.result import FitResult, FitStatus
 from udccal.rig import RigDescription, load_rig
 from udccal.sessions.captured import AveragedFrames
 from udccal.sessions.schema import DarkSubject

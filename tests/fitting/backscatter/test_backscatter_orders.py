@@ -36,9 +36,9 @@ from udccal.fitting.backscatter.vector import (
     values_of,
     without_crosstalk,
 )
-from udccal.fitting.result import FitResult
 from udccal.models.backscatter import Backscatter
 from udccal.numerics import in_float64
+from udccal.result import FitResult
 
 RIG = small_rig()
 ORDERS = (*KERNELS, without_crosstalk(TWO_PLANES))

@@ -11,8 +11,8 @@ from tests.fitting.geometry.boards import VISIBLE_BEND, Sight, sight
 from udccal.errors import FitError
 from udccal.fitting.geometry import CalibratedViews, Prior, calibrate_views
 from udccal.fitting.geometry.corners import board_points_mm
-from udccal.fitting.result import FitStatus
 from udccal.models.geometry import Geometry
+from udccal.result import FitStatus
 
 SCENE = sight(views=8)
 NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")

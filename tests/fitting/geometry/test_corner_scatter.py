@@ -11,8 +11,8 @@ from tests.fitting.geometry.boards import COMMON_PX, sight
 from udccal.fitting.geometry.corner_scatter import CornerScatter
 from udccal.fitting.geometry.corners import BoardCorners
 from udccal.fitting.geometry.fit import fit_views
-from udccal.fitting.result import FitResult, FitStatus
 from udccal.models.geometry import Geometry
+from udccal.result import FitResult, FitStatus
 
 START = Geometry(np.full(2, 850.0), np.array([511.5, 383.5]), np.zeros(5), np.zeros(3), np.zeros(3))
 

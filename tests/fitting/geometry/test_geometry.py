@@ -15,8 +15,8 @@ from udccal.fitting.geometry.corners import BoardCorners, board_points_mm
 from udccal.fitting.geometry.fit import BoardView, fit_geometry, fit_views, projection_sigma_px, rig_prior
 from udccal.fitting.noise.fit import nominal_noise
 from udccal.fitting.nominal import nominal_geometry
-from udccal.fitting.result import FitResult, FitStatus
 from udccal.models.geometry import Geometry, mounting_rotation, project_directions, rotation_matrix
+from udccal.result import FitResult, FitStatus
 from udccal.rig import load_rig
 from udccal.sessions.captured import AveragedFrames
 from udccal.sessions.schema import BoardSubject
@@ -147,7 +147,7 @@ def test_boards_never_found_are_too_few_data() -> None:
     assert result.term is START
     np.testing.assert_array_equal(projection_sigma_px(result, np.zeros((3, 2))), 0.0)
     with pytest.raises(FitError, match="TOO_FEW_DATA"):
-        result.or_raise("geometry")
+        result.or_raise()
 
 
 def test_without_the_parallel_view_there_is_no_tilt() -> None:

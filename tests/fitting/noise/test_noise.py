@@ -13,8 +13,8 @@ from udccal.fitting.noise.data import NoiseData
 from udccal.fitting.noise.fit import converter_step, fit_noise_data, nominal_noise
 from udccal.fitting.noise.pairs import reduce_pair
 from udccal.fitting.noise.prnu import prnu
-from udccal.fitting.result import FitResult, FitStatus
 from udccal.models.noise import Noise
+from udccal.result import FitResult, FitStatus
 from udccal.rig import RigDescription, load_rig
 from udccal.simulation.sensor import Sensor
 from udccal.simulation.truth import draw_truth
@@ -75,7 +75,7 @@ def fitted(request: pytest.FixtureRequest) -> tuple[Sensor, FitResult[Noise]]:
 
 def test_recovers_what_the_rig_needs(fitted: tuple[Sensor, FitResult[Noise]]) -> None:
     sensor, result = fitted
-    truth, term = sensor.truth, result.or_raise("noise").term
+    truth, term = sensor.truth, result.or_raise().term
     assert term.K_DN_per_e == pytest.approx(truth.K_DN_per_e, rel=0.01)
     assert term.sigma_d_e == pytest.approx(sensor.sigma_d_e, rel=0.03)
     assert pytest.approx(truth.PRNU1288, rel=0.05) == term.PRNU1288

@@ -21,9 +21,9 @@ from udccal.fitting.psf.read import window_half
 from udccal.fitting.psf.residual import shifts
 from udccal.fitting.psf.shots import Shots, cut_crop, group, stack
 from udccal.fitting.psf.start import start_model, wire_shows
-from udccal.fitting.result import FitResult, FitStatus
 from udccal.models.psf import PsfField, psf_kernels
 from udccal.numerics import in_float64
+from udccal.result import FitResult, FitStatus
 from udccal.rig import RigDescription, load_rig
 from udccal.sessions.captured import SingleFrame
 from udccal.sessions.schema import LedSubject

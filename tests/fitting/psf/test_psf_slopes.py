@@ -15,8 +15,8 @@ from udccal.fitting.psf.normal import Evaluator, kernel_coefficients, overlaps_o
 from udccal.fitting.psf.shots import Shots
 from udccal.fitting.psf.slopes import factors_by_parameter, kernel_slopes
 from udccal.fitting.psf.start import WAVELENGTHS_NM, start_model, start_prior, wavelengths_nm
-from udccal.fitting.result import FitStatus
 from udccal.numerics import in_float64
+from udccal.result import FitStatus
 from udccal.rig import RigDescription
 
 _HALF = (8, 6)

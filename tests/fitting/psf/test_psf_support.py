@@ -23,9 +23,9 @@ from udccal.fitting.psf.read import read_shots
 from udccal.fitting.psf.residual import Sources
 from udccal.fitting.psf.support import Support, choose_support, ladder
 from udccal.fitting.psf.wide import wide_support
-from udccal.fitting.result import FitResult, FitStatus
 from udccal.kernels import fitted_size, kernel_size, kernels_at
 from udccal.models.psf import PsfField
+from udccal.result import FitResult, FitStatus
 from udccal.rig import load_rig
 from udccal.sessions.captured import SingleFrame
 from udccal.sessions.schema import LedSubject
@@ -142,7 +142,7 @@ def test_whole_pictures_show_where_light_ends(tmp_path: Path, ends_px: int) -> N
     assert support is not None
     assert support.seen_px == (64, 16)
     assert support.half_px[0] == min(ends_px, 64)
-    result = with_support(FitResult(made.term, FitStatus.CONVERGED, (), np.zeros((0, 0)), 1.0, 1), support, rig)
+    result = with_support(FitResult("psf", made.term, FitStatus.CONVERGED, (), np.zeros((0, 0)), 1.0, 1), support, rig)
     rows, _ = fitted_size(result.term, rig)
     assert rows == (47 if ends_px == 23 else kernel_size(rig)[0])
     assert any("as far as was looked" in note for note in result.notes) == (ends_px == 200 or support.open_ended[1])
@@ -153,7 +153,7 @@ def test_an_image_ends_where_it_ends() -> None:
     geometry = nominal_geometry(rig)
     term = nominal_psf(rig, geometry, absent_wire(rig, geometry))
     image = replace(term, diffraction_share=np.float64(0.0), residual=np.ones((1, 3, 21, 11)))
-    result = FitResult(image, FitStatus.CONVERGED, (), np.zeros((0, 0)), 1.0, 1)
+    result = FitResult("psf", image, FitStatus.CONVERGED, (), np.zeros((0, 0)), 1.0, 1)
     found = with_support(result, Support((10, 5), (10, 5), ()), rig)
     np.testing.assert_array_equal(found.term.support_px, [5, 10])
     assert fitted_size(found.term, rig) == (21, 11)

@@ -12,7 +12,7 @@ from udccal.fitting.psf_stamps.data import Stamps, mosaic_channels
 from udccal.fitting.psf_stamps.fit import fit_psf_stamps
 from udccal.fitting.psf_stamps.orders import Orders
 from udccal.fitting.psf_stamps.term import StampsPsf
-from udccal.fitting.result import FitResult, FitStatus
+from udccal.result import FitResult, FitStatus
 
 SENSOR = np.array([1000, 800])
 READ_E = 4.0

@@ -47,7 +47,7 @@ def made(order: tuple[int, int], seed: int) -> Stamps:
 
 def chosen(order: tuple[int, int], seed: int) -> tuple[int, int]:
     """Degrees of map and images that a fit comes to."""
-    field = fit_psf_stamps(made(order, seed)).or_raise("psf_stamps").term.fields[0]
+    field = fit_psf_stamps(made(order, seed)).or_raise().term.fields[0]
     return field.warp_degree, field.image_degree
 
 

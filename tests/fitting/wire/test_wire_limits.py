@@ -24,9 +24,9 @@ from tests.benchmarks.efficiency.wire import (
     start,
 )
 from tests.benchmarks.extremes.wire import constant
-from udccal.fitting.result import FitResult, FitStatus
 from udccal.fitting.wire.fit import fit_wire_and_sigma
 from udccal.models.wire import Wire
+from udccal.result import FitResult, FitStatus
 
 # Baseline up to degree 4, three site gains.
 _PLAIN = 18
@@ -43,7 +43,7 @@ def test_map_and_shape_are_within_their_errors_from_a_start_that_is_a_fifth_off(
         built, standoff_per_pitch=0.8 * built.standoff_per_pitch, pupil_per_pitch=1.2 * built.pupil_per_pitch
     )
     fit = fitted(flat, wrong, geometry())
-    result = fit.result.or_raise("wire")
+    result = fit.result.or_raise()
     assert fit.sigma is not None
     off = np.array([e.value for e in result.estimates]) - shape_values(flat.truth)
     off[4:6] -= np.round(off[4:6])

@@ -27,10 +27,10 @@ from udccal.fitting.backscatter.select import choose
 from udccal.fitting.backscatter.solve import SLACK_PX, scan_offset, window_for
 from udccal.fitting.backscatter.vector import prior_of
 from udccal.fitting.nominal import nominal_backscatter
-from udccal.fitting.result import FitResult, FitStatus
 from udccal.models.backscatter import Backscatter
 from udccal.models.geometry import Geometry
 from udccal.models.noise import Noise
+from udccal.result import FitResult, FitStatus
 from udccal.rig import RigDescription
 from udccal.sessions.store import Session
 
@@ -115,4 +115,4 @@ def _only(shots: PanelShots, keep: np.ndarray) -> PanelShots:
 
 def _without(rig: RigDescription, geometry: Geometry, status: FitStatus, note: str) -> FitResult[Backscatter]:
     term = absent_backscatter(rig, geometry)
-    return FitResult(term, status, estimates=(), cov=np.zeros((0, 0)), chi2_dof=0.0, samples=0, notes=(note,))
+    return FitResult.failed("backscatter", term, status, note)

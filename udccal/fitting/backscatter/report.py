@@ -21,9 +21,9 @@ from udccal.fitting.backscatter.vector import (
     values_of,
     with_vector,
 )
-from udccal.fitting.result import Candidate, Diagnostic, Estimate, FitResult, FitStatus, Outliers, ResidualSample
 from udccal.models.backscatter import Backscatter, grid_positions
 from udccal.numerics import in_float64
+from udccal.result import Candidate, Diagnostic, Estimate, FitResult, FitStatus, Outliers, ResidualSample
 from udccal.rig import RigDescription
 
 _WORST_ERROR = 0.05
@@ -55,6 +55,7 @@ def told(choice: Choice, shots: PanelShots, rig: RigDescription, clipped: list[s
     sigma = np.sqrt(np.maximum(np.diag(cov), 0.0))
     status, advice = _status(choice)
     return FitResult(
+        name="backscatter",
         term=_term(known, mask_of(known, shots)),
         status=status,
         estimates=tuple(

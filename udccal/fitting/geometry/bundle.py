@@ -33,8 +33,8 @@ from udccal.fitting.geometry.bundle_points import MIN_POINTS, Gathered, Points, 
 from udccal.fitting.geometry.bundle_solve import NO_PRIOR, Bundle, Prior, Solved, residuals_px, solve
 from udccal.fitting.geometry.bundle_start import facing, starts
 from udccal.fitting.geometry.calibrated_views import CalibratedViews
-from udccal.fitting.result import FitStatus, Outliers
 from udccal.models.geometry import Geometry
+from udccal.result import FitStatus, Outliers
 
 # Without a prior, fewer views do not tell a lens; with one, a single view tells at least its pose.
 MIN_VIEWS = 3

@@ -11,7 +11,7 @@ from udccal.fitting.geometry.bundle_noise import covariance, robust_scales, with
 from udccal.fitting.geometry.bundle_points import Points
 from udccal.fitting.geometry.bundle_solve import Bundle, Prior, Solved, residuals_px, solve
 from udccal.fitting.geometry.bundle_start import best_poses, facing
-from udccal.fitting.result import Candidate
+from udccal.result import Candidate
 
 # Distortion orders, simplest first: which of (k1, k2, p1, p2, k3) are free.
 ORDERS = (

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from udccal.fitting.result import Outliers
+from udccal.result import Outliers
 
 # Four points hold a homography; two more tell whether it is the right one.
 MIN_POINTS = 6

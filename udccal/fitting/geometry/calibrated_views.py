@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 from udccal.fitting.geometry.bundle_evidence import Evidence
 from udccal.fitting.geometry.bundle_projection import Gauge, projection_covariance
 from udccal.fitting.geometry.bundle_solve import Bundle
-from udccal.fitting.result import Candidate, FitStatus, Outliers
+from udccal.result import Candidate, FitStatus, Outliers
 
 
 @dataclass(frozen=True)

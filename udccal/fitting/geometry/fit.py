@@ -32,10 +32,10 @@ from udccal.fitting.geometry.report import (
 )
 from udccal.fitting.geometry.views import MAX_CLIPPED, BoardView, read_views
 from udccal.fitting.nominal import nominal_geometry
-from udccal.fitting.result import Estimate, FitResult, FitStatus
 from udccal.models.geometry import Geometry, mounting_rotation, panel_directions, project
 from udccal.models.noise import Noise
 from udccal.numerics import in_float64
+from udccal.result import Estimate, FitResult, FitStatus
 from udccal.rig import RigDescription
 from udccal.sessions.store import Session
 
@@ -134,9 +134,7 @@ def _notes(views: Sequence[BoardView]) -> tuple[str, ...]:
 
 
 def _failed(nominal: Geometry, status: FitStatus, notes: tuple[str, ...]) -> FitResult[Geometry]:
-    return FitResult(
-        term=nominal, status=status, estimates=(), cov=np.zeros((0, 0)), chi2_dof=0.0, samples=0, notes=notes
-    )
+    return FitResult.failed("geometry", nominal, status, *notes)
 
 
 def _result(
@@ -157,6 +155,7 @@ def _result(
     sigma = np.sqrt(np.maximum(np.diag(cov), 0.0))
     names = INTRINSIC_NAMES + ANGLE_NAMES
     return FitResult(
+        name="geometry",
         term=Geometry(bundle.focal, bundle.centre, bundle.distortion, rotation, pupil),
         status=FitStatus.POOR_FIT if _poor(bundle) else bundle.status,
         estimates=tuple(

@@ -9,7 +9,7 @@ from udccal.fitting.geometry.bundle_orders import INTRINSIC_NAMES
 from udccal.fitting.geometry.calibrated_views import CalibratedViews
 from udccal.fitting.geometry.corner_scatter import CornerScatter
 from udccal.fitting.geometry.views import BoardView
-from udccal.fitting.result import Diagnostic, Outliers, ResidualSample
+from udccal.result import Diagnostic, Outliers, ResidualSample
 
 # Scatter beside noise of the board on the jig, and of the median view of others: a plan reads them.
 ON_JIG, BY_HAND = "corner_scatter_on_jig", "corner_scatter_by_hand"

@@ -11,8 +11,8 @@ from jaxtyping import Bool, Float, Int, UInt16
 
 from udccal.errors import FitError
 from udccal.fitting.hdr.likelihood import BELIEVED_SIGMA, SensorNumbers, merge_block
-from udccal.fitting.result import Outliers
 from udccal.models.noise import Noise
+from udccal.result import Outliers
 
 # What sigma says where no sample could be used: larger than any rate a sensor can tell, and finite.
 UNKNOWN_SIGMA = 1e12

@@ -7,11 +7,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from udccal.fitting.information import scaled_inverse
+from udccal.fitting.engine.information import scaled_inverse
 from udccal.fitting.noise import codes, nonuniformity, read_noise
 from udccal.fitting.noise.density import NORMAL_SHAPE, excess_kurtosis
 from udccal.fitting.noise.moments import RowMoments, StackMoments
-from udccal.fitting.result import Candidate
+from udccal.result import Candidate
 
 # Where the mean code follows black to this, rounding is white and nothing is cut off: plain moments are exact.
 _WHITE = 0.005

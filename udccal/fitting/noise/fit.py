@@ -14,8 +14,8 @@ from udccal.fitting.noise.moments import PairMoments, RowMoments, StackMoments
 from udccal.fitting.noise.pairs import reduce_pair
 from udccal.fitting.noise.read_noise import start_values
 from udccal.fitting.noise.report import NAMES, UNITS, assemble, assumed_noise, failed
-from udccal.fitting.result import FitResult, FitStatus
 from udccal.models.noise import Noise
+from udccal.result import FitResult, FitStatus
 from udccal.rig import RigDescription
 from udccal.sessions.schema import StoredStep
 from udccal.sessions.store import Session

@@ -22,8 +22,8 @@ from udccal.fitting.noise.moments import PairMoments, StackMoments
 from udccal.fitting.noise.pairs import reduce_pair
 from udccal.fitting.noise.report import assumed_noise, failed
 from udccal.fitting.noise.stacks import reduce_stack
-from udccal.fitting.result import FitResult, FitStatus
 from udccal.models.noise import Noise
+from udccal.result import FitResult, FitStatus
 
 # A level may hold frames of unlike size, until they are loaded: the sizes are not compared here.
 Frame = UInt16[np.ndarray, "_rows _columns"] | UInt8[np.ndarray, "_rows _columns"] | Callable[[], np.ndarray]

@@ -11,8 +11,8 @@ from udccal.fitting.noise.data import NoiseData
 from udccal.fitting.noise.levels import OUTLIER_SIGMA
 from udccal.fitting.noise.light import LightTerms
 from udccal.fitting.noise.tiling import tiling
-from udccal.fitting.result import Candidate, Diagnostic, Estimate, FitResult, FitStatus, Outliers, ResidualSample
 from udccal.models.noise import Noise
+from udccal.result import Candidate, Diagnostic, Estimate, FitResult, FitStatus, Outliers, ResidualSample
 
 UNITS = ("DN/e", "DN", "DN", "e", "1", "DN", "DN", "e/s", "e", "1")
 NAMES = (
@@ -50,9 +50,7 @@ def assumed_noise(K_DN_per_e: float, black_DN: float, saturation_DN: float) -> N
 
 def failed(nominal: Noise, status: FitStatus, note: str) -> FitResult[Noise]:
     """The nominal term, with the reason and the advice."""
-    return FitResult(
-        term=nominal, status=status, estimates=(), cov=np.zeros((0, 0)), chi2_dof=0.0, samples=0, notes=(note,)
-    )
+    return FitResult.failed("noise", nominal, status, note)
 
 
 def assemble(data: NoiseData, dark: DarkTerms, light: LightTerms, status: FitStatus) -> FitResult[Noise]:
@@ -64,6 +62,7 @@ def assemble(data: NoiseData, dark: DarkTerms, light: LightTerms, status: FitSta
         names, units, values, cov = NAMES, UNITS, values[:-1], cov[:-1, :-1]
     sigma = np.sqrt(np.maximum(np.diag(cov), 0.0))
     return FitResult(
+        name="noise",
         term=Noise(**{name: float(value) for name, value in zip(NAMES, values, strict=False)}),
         status=status,
         estimates=tuple(

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-from udccal.fitting.result import FitResult
 from udccal.models.noise import Noise
+from udccal.result import FitResult
 
 
 def mean_response(result: FitResult[Noise], light: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:

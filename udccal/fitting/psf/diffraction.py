@@ -25,8 +25,8 @@ from udccal.fitting.psf.outliers import without_outliers
 from udccal.fitting.psf.pattern import pattern_p_value
 from udccal.fitting.psf.places import start_local
 from udccal.fitting.psf.weights import estimate_model_error, first_weights, left_out, model_weights, sensor_variance
-from udccal.fitting.result import Outliers
 from udccal.models.diffraction import Diffraction
+from udccal.result import Outliers
 
 # Until the residuals tell; it also keeps a fit that is still far off from trusting the brightest samples alone.
 FIRST_MODEL_ERROR = 0.015

@@ -14,10 +14,10 @@ from udccal.fitting.psf.posterior import full_cov, light_and_slopes
 from udccal.fitting.psf.select import Selection
 from udccal.fitting.psf.shots import Shots
 from udccal.fitting.psf.support import Support
-from udccal.fitting.result import Diagnostic, Estimate, FitResult, FitStatus, ResidualSample
 from udccal.models.diffraction import Diffraction
 from udccal.models.geometry import Geometry
 from udccal.models.psf import PsfField, fine_oversample
+from udccal.result import Diagnostic, Estimate, FitResult, FitStatus, ResidualSample
 from udccal.rig import RigDescription
 
 _POOR = 0.2
@@ -73,6 +73,7 @@ def fit_result(
         status = FitStatus.NOT_CONVERGED
     estimates, cov = _estimates(fit, selection, pitch_tolerance)
     return FitResult(
+        name="psf",
         term=term,
         status=status,
         estimates=estimates,
@@ -151,7 +152,7 @@ def with_support(result: FitResult[PsfField], support: Support, rig: RigDescript
 
 def failed(start: Diffraction, geometry: Geometry, status: FitStatus, note: str) -> FitResult[PsfField]:
     """No fit: the term is the nominal diffraction."""
-    return FitResult(diffraction_alone(start, geometry), status, (), np.zeros((0, 0)), 0.0, 0, notes=(note,))
+    return FitResult.failed("psf", diffraction_alone(start, geometry), status, note)
 
 
 def _estimates(

@@ -22,12 +22,12 @@ from udccal.fitting.psf.select import Selection, select_field
 from udccal.fitting.psf.shots import Shots
 from udccal.fitting.psf.start import LEAST_KNOWN, pitch_tolerance, start_model, start_prior, wire_shows
 from udccal.fitting.psf.wide import wide_support
-from udccal.fitting.result import FitResult, FitStatus
 from udccal.models.geometry import Geometry
 from udccal.models.noise import Noise
 from udccal.models.psf import PsfField
 from udccal.models.wire import Wire
 from udccal.numerics import in_float64
+from udccal.result import FitResult, FitStatus
 from udccal.rig import RigDescription
 from udccal.sessions.store import Session
 

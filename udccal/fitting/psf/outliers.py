@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from udccal.fitting.psf.blocks import Block, Local
-from udccal.fitting.result import Outliers
+from udccal.result import Outliers
 
 SAMPLE_SIGMA = 5.0
 # Of residuals of at most so many sigma, so that one cosmic hit does not condemn its picture.

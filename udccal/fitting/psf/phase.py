@@ -12,7 +12,7 @@ from udccal.fitting.psf.blocks import FOOTPRINT, Block
 from udccal.fitting.psf.descent import reduced
 from udccal.fitting.psf.diffraction import DiffractionFit, expected_light
 from udccal.fitting.psf.normal import normal_equations
-from udccal.fitting.result import Candidate
+from udccal.result import Candidate
 
 # Residuals are moved by this share of the phase's light: too little to change which of them are outliers.
 _TRIED = 1e-3

@@ -13,8 +13,8 @@ from udccal.fitting.psf.residual import Sources, about_middle, prior_spread
 from udccal.fitting.psf.shots import Shots
 from udccal.fitting.psf.support import Support, choose_support
 from udccal.fitting.psf.trial import BESIDE, FREE, Data, Order, Trial, attempt, solve
-from udccal.fitting.result import Candidate
 from udccal.models.fields import polynomial_terms
+from udccal.result import Candidate
 
 # Of a free image, until positions that were held out tell.
 _FIRST_MODEL_ERROR = 0.01

@@ -17,7 +17,7 @@ from jaxtyping import Bool, Int
 
 from udccal.fitting.psf.held_out import Judged
 from udccal.fitting.psf.weights import huber
-from udccal.fitting.result import Candidate
+from udccal.result import Candidate
 
 _LEAST_PX: Final = 4
 _STEP: Final = np.sqrt(2.0)

@@ -15,8 +15,8 @@ from udccal.fitting.psf_stamps.report import Verdict, report
 from udccal.fitting.psf_stamps.select import SPACINGS_PX, select
 from udccal.fitting.psf_stamps.state import Scene
 from udccal.fitting.psf_stamps.term import StampsPsf
-from udccal.fitting.result import FitResult, FitStatus
 from udccal.numerics import in_float64
+from udccal.result import FitResult, FitStatus
 
 _FEWEST_STARS = 4
 # Stars with an unclipped core, at least so many; light over noise in the median stamp, at least so much.

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 
 from udccal.fitting.psf_stamps.likelihood import expectation
 from udccal.fitting.psf_stamps.state import Scene, State
-from udccal.fitting.result import Outliers
+from udccal.result import Outliers
 
 _SIGMA, _STAR_RATIO, _MEDIAN_OF_CHI2 = 5.0, 3.0, 0.455
 _STEPS, _FARTHEST_PX = 4, 0.5

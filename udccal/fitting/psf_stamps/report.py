@@ -17,7 +17,7 @@ from udccal.fitting.psf_stamps.solve import Solved
 from udccal.fitting.psf_stamps.start import reference
 from udccal.fitting.psf_stamps.state import Scene, State
 from udccal.fitting.psf_stamps.term import Draws, StampsPsf
-from udccal.fitting.result import Diagnostic, Estimate, FitResult, FitStatus
+from udccal.result import Diagnostic, Estimate, FitResult, FitStatus
 
 _DRAWS = 192
 # Reduced chi2: beyond the first, sigmas grow with it; beyond the second, this is no psf field.
@@ -66,6 +66,7 @@ def report(
     full[0, 0], full[1:, 1:] = spread**2, cov
     verdict = bad or _verdict(solved, chi2_dof)
     return FitResult(
+        name="psf",
         term=term,
         status=verdict.status,
         estimates=(Estimate("kernel_relative_l2", float(size), float(spread), "1"), *maps),

@@ -19,8 +19,8 @@ from udccal.fitting.psf_stamps.prospect import map_gains
 from udccal.fitting.psf_stamps.solve import Solved, improve
 from udccal.fitting.psf_stamps.start import start
 from udccal.fitting.psf_stamps.state import Scene, State
-from udccal.fitting.result import Candidate
 from udccal.models.fields import polynomial_terms
+from udccal.result import Candidate
 
 SPACINGS_PX = (1.0, 0.75, 0.5)
 # The error of cubic splines falls with the fourth power of their spacing, what it costs in likelihood with the eighth:

@@ -15,7 +15,6 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from udccal.fitting.result import FitResult, FitStatus
 from udccal.fitting.wire.basis import sample_pixels
 from udccal.fitting.wire.harmonics import WireStart, full_basis, possible_harmonics, wire_start
 from udccal.fitting.wire.joint import fit_joint, settle
@@ -30,6 +29,7 @@ from udccal.models.geometry import Geometry
 from udccal.models.noise import Noise
 from udccal.models.wire import Wire, wire_map, wire_values
 from udccal.numerics import in_float64
+from udccal.result import FitResult, FitStatus
 from udccal.sessions.store import Session
 
 # Of the pixels that the joint fit has: so many for the search of the phase, and for its fit.
@@ -223,4 +223,4 @@ _values = jax.jit(wire_values, static_argnums=(2, 3))
 
 def _failed(geometry: Geometry, start: WireStart, status: FitStatus, note: str) -> FitResult[Wire]:
     flat = ideal_wire(geometry, start, np.zeros((0, 2)))
-    return FitResult(flat, status, (), np.zeros((0, 0)), 0.0, 0, notes=(note,))
+    return FitResult.failed("wire", flat, status, note)

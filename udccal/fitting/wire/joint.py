@@ -9,7 +9,6 @@ import numpy as np
 from jaxtyping import Float
 
 from udccal.fitting.iteration_log import LOG
-from udccal.fitting.result import Candidate
 from udccal.fitting.wire.basis import LEAST_VARIANCE, Basis, Normal, Pixels, accumulate
 from udccal.fitting.wire.noise import FlatNoise, Judged, judge
 from udccal.fitting.wire.phase import PhaseFit, add_increment, moved, solve
@@ -17,6 +16,7 @@ from udccal.fitting.wire.prior import Prior
 from udccal.fitting.wire.select import select
 from udccal.fitting.wire.slopes import SHAPE_PARAMETERS
 from udccal.models.wire import Wire
+from udccal.result import Candidate
 
 # A step that moves no parameter by more of its sigma than this is the last; one that still moves some by more than
 # the second number when the rounds are over has not converged.

@@ -14,9 +14,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.optimize import nnls
 
-from udccal.fitting.result import Outliers
 from udccal.fitting.wire.basis import SITES, Pixels, residuals_and_base
 from udccal.models.wire import Wire
+from udccal.result import Outliers
 
 _LEAST_PRNU = 1e-5
 _OUTLIER = 6.0

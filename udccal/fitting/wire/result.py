@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-from udccal.fitting.result import Diagnostic, Estimate, FitResult, FitStatus, ResidualSample
 from udccal.fitting.wire.joint import Joint
 from udccal.fitting.wire.misfit import Misfit, robust_ratio
 from udccal.fitting.wire.noise import Judged, listed
@@ -14,6 +13,7 @@ from udccal.fitting.wire.scan import modulation_at
 from udccal.fitting.wire.sigma import MapSigma
 from udccal.models.geometry import tilt_rad
 from udccal.models.wire import Wire, panel_rotation
+from udccal.result import Diagnostic, Estimate, FitResult, FitStatus, ResidualSample
 
 SHAPE_NAMES = (
     "rotation_x_deg",
@@ -53,6 +53,7 @@ def wire_result(
     estimates, cov = _estimates(wire, joint, found) if joint.shape else ((), np.zeros((0, 0)))
     left_out = joint.judged.clipped + int(np.count_nonzero(joint.judged.outlying))
     return FitResult(
+        name="wire",
         term=wire,
         status=_status(phase, joint),
         estimates=estimates,

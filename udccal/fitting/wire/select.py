@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from udccal.fitting.result import Candidate
+from udccal.result import Candidate
 
 _ROUNDS = 24
 # In each round the weaker half of the groups that do not pay for themselves goes; the rest is judged again.

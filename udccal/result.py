@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import enum
-from dataclasses import dataclass, field
-from typing import Generic, TypeVar
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 from jaxtyping import Float
@@ -12,6 +13,7 @@ from jaxtyping import Float
 from udccal.errors import FitError
 
 Term = TypeVar("Term")
+_Term_co = TypeVar("_Term_co", covariant=True)
 
 
 class FitStatus(enum.Enum):
@@ -78,14 +80,37 @@ class ResidualSample:
     z: Float[np.ndarray, " n"]
 
 
+class TermPosterior(Protocol[_Term_co]):
+    """How sure a fit is of its whole term, field coefficients included."""
+
+    def sigma_of(self, f: Callable[[_Term_co], Float[np.ndarray, "*shape"]]) -> Float[np.ndarray, "*shape"]:
+        """One standard deviation of every number that ``f`` makes of the term."""
+
+    def draws(self, rng: np.random.Generator, count: int) -> tuple[_Term_co, ...]:
+        """Terms drawn from the posterior."""
+
+
 @dataclass(frozen=True)
 class FitResult(Generic[Term]):
     """A fitted term and the evidence for it.
 
-    ``estimates`` and ``cov`` are in the same order; ``cov`` may cover the leading estimates only when the term has
-    thousands of field coefficients (then ``notes`` says so).
+    Attributes:
+        name: of the term: noise, geometry, wire, psf or backscatter.
+        term: as fitted, or as the rig description has it where the fit failed.
+        status: how the fit ended.
+        estimates: named numbers of the term with one standard deviation each.
+        cov: covariance of the leading estimates, in their units; all of them unless a note says otherwise.
+        chi2_dof: reduced chi-squared, 1 where model and noise describe the data.
+        samples: how many took part.
+        candidates: the orders that were tried.
+        diagnostics: numbers about the fit.
+        notes: sentences for a person.
+        outliers: what was left out, by rule.
+        residuals: some of them, evenly drawn.
+        posterior: of the whole term; None where the fit failed, and in a profile that was read from a file.
     """
 
+    name: str
     term: Term
     status: FitStatus
     estimates: tuple[Estimate, ...]
@@ -94,9 +119,15 @@ class FitResult(Generic[Term]):
     samples: int
     candidates: tuple[Candidate, ...] = ()
     diagnostics: tuple[Diagnostic, ...] = ()
-    notes: tuple[str, ...] = field(default=())
+    notes: tuple[str, ...] = ()
     outliers: tuple[Outliers, ...] = ()
     residuals: ResidualSample | None = None
+    posterior: TermPosterior[Term] | None = None
+
+    @classmethod
+    def failed(cls, name: str, term: Term, status: FitStatus, *notes: str) -> FitResult[Term]:
+        """A result without estimates: the fit could not begin, or the session has no data for it."""
+        return cls(name, term, status, (), np.zeros((0, 0)), 0.0, 0, notes=notes)
 
     @property
     def ok(self) -> bool:
@@ -110,7 +141,26 @@ class FitResult(Generic[Term]):
                 return item
         raise KeyError(f"no estimate '{name}'; there are {', '.join(e.name for e in self.estimates)}")
 
-    def or_raise(self, term_name: str) -> FitResult[Term]:
+    def sigma_of(self, f: Callable[[Term], Float[np.ndarray, "*shape"]]) -> Float[np.ndarray, "*shape"]:
+        """One standard deviation of any function of the term, such as its wire map, a kernel or a ray.
+
+        Args:
+            f: pure function from a term to an array. It is called twice for every direction of the posterior.
+
+        Returns:
+            an array of the shape and in the units of ``f(term)``.
+
+        Raises:
+            FitError: when the fit failed, or when the result was read from a profile.
+        """
+        if self.posterior is None:
+            raise FitError(
+                f"Expected a {self.name} fit with a posterior, found none: the fit failed, or the result was read from "
+                "a profile, which keeps the covariance of the estimates alone. Fit the session again."
+            )
+        return self.posterior.sigma_of(f)
+
+    def or_raise(self) -> FitResult[Term]:
         """Itself when usable.
 
         Raises:
@@ -119,4 +169,4 @@ class FitResult(Generic[Term]):
         if self.ok:
             return self
         detail = f" {' '.join(self.notes)}" if self.notes else ""
-        raise FitError(f"The {term_name} fit ended as {self.status.name}: {self.status.value}{detail}")
+        raise FitError(f"The {self.name} fit ended as {self.status.name}: {self.status.value}{detail}")
