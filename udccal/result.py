@@ -5,7 +5,7 @@ from __future__ import annotations
 import enum
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Generic, Protocol, TypeVar
+from typing import Generic, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
@@ -80,6 +80,7 @@ class ResidualSample:
     z: Float[np.ndarray, " n"]
 
 
+@runtime_checkable
 class TermPosterior(Protocol[_Term_co]):
     """How sure a fit is of its whole term, field coefficients included."""
 

@@ -5,7 +5,7 @@ import logging
 import numpy as np
 import pytest
 
-from udccal.fitting.iteration_log import LOG
+from udccal.fitting.engine.iteration_log import LOG
 from udccal.fitting.solvers import Solution, most_probable
 
 _TIMES = np.linspace(0.0, 3.0, 50)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-from udccal.fitting.engine.information import scaled_inverse
+from udccal.fitting.engine.gaussian import scaled_inverse
 
 
 def covariance(information: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:

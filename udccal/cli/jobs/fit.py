@@ -13,7 +13,7 @@ from udccal.compilation import compilation_clock, keep_compilations
 from udccal.displays.pictures import face_picture
 from udccal.errors import FitError, UdccalError
 from udccal.fitting.calibrate import ORDER, Calibration, FitEffort, Foundation, fit_session
-from udccal.fitting.iteration_log import LOG
+from udccal.fitting.engine.iteration_log import LOG
 from udccal.profiles.profile import build_profile
 from udccal.profiles.provenance import provenance_now
 from udccal.profiles.store import check_replaceable, write_profile

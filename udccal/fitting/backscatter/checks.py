@@ -10,7 +10,7 @@ from scipy.special import ndtri
 
 from udccal.fitting.backscatter.evidence import LEAST_VARIANCE, Evidence
 from udccal.fitting.backscatter.likelihood import Fitted
-from udccal.fitting.tails import chi2_tail
+from udccal.fitting.engine.tails import chi2_tail
 from udccal.result import Outliers
 
 # Samples further off than this many robust sigma of all samples are left out.

@@ -13,7 +13,7 @@ from udccal.fitting.backscatter.likelihood import Fitted
 from udccal.fitting.backscatter.profile import mask_slopes, predicted_variance, profiled, with_still_white, with_white
 from udccal.fitting.backscatter.ratios import ratios_and_slopes, window_logs, windows_at
 from udccal.fitting.backscatter.vector import Order
-from udccal.fitting.tails import chi2_tail
+from udccal.fitting.engine.tails import chi2_tail
 
 EVERY = 4
 

@@ -22,6 +22,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy.special import log_ndtr, ndtr
 
+from udccal.fitting.engine.gaussian import scaled_inverse
 from udccal.numerics import in_float64
 
 # Parameters to (mean, variance) of every sample.
@@ -67,19 +68,6 @@ def cramer_rao(
     short = (directions @ (inverse @ information) - directions) / scale
     lost = np.linalg.norm(short, axis=1) > 1e-6 * np.linalg.norm(directions / scale, axis=1)
     return np.where(lost, np.inf, np.sqrt(np.maximum(variance, 0.0)))
-
-
-def scaled_inverse(information: Float[np.ndarray, "n n"], rcond: float = 1e-12) -> Float[np.ndarray, "n n"]:
-    """Inverse of a symmetric matrix of very unlike scales; what it does not tell at all comes back as zero.
-
-    Args:
-        information: positive semi-definite.
-        rcond: eigenvalues of the matrix with a unit diagonal below this share of the largest count as none.
-    """
-    root = np.sqrt(np.maximum(np.diag(information), 0.0))
-    root = np.where(root > 1e-150, root, np.inf)
-    outer = np.outer(root, root)
-    return np.linalg.pinv(information / outer, rcond=rcond, hermitian=True) / outer
 
 
 @functools.lru_cache(maxsize=32)

@@ -13,11 +13,11 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
+from udccal.fitting.engine.tails import f_tail
 from udccal.fitting.geometry.bundle_noise import covariance
 from udccal.fitting.geometry.bundle_normal import INTRINSICS
 from udccal.fitting.geometry.bundle_points import Points
 from udccal.fitting.geometry.bundle_solve import Solved, linearised
-from udccal.fitting.tails import f_tail
 
 # Chance alone flags one fit in a thousand, by either test.
 FLAGGED_P = 1e-3

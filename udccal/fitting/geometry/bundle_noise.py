@@ -11,10 +11,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float
 
+from udccal.fitting.engine.tails import chi2_tail
 from udccal.fitting.geometry.bundle_normal import INTRINSICS
 from udccal.fitting.geometry.bundle_points import MIN_POINTS, Points
 from udccal.fitting.geometry.bundle_solve import Bundle, Prior, Solved, linearised, residuals_px, solve
-from udccal.fitting.tails import chi2_tail
 
 # Points further from the model than this many robust sigma of their view are left out, then all is refit.
 OUTLIER_SIGMA = 5.0

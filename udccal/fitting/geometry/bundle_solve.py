@@ -20,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from udccal.fitting.engine.iteration_log import LOG
 from udccal.fitting.geometry.bundle_normal import (
     INTRINSICS,
     BundleData,
@@ -30,7 +31,6 @@ from udccal.fitting.geometry.bundle_normal import (
     weighted_slopes,
 )
 from udccal.fitting.geometry.bundle_points import Blocks, Points, blocks
-from udccal.fitting.iteration_log import LOG
 from udccal.numerics import in_float64
 
 # Residuals of a robust solve count as Cauchy's: half at this many sigma. A plain solve has no such bend in reach.

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from udccal.fitting.engine.information import scaled_inverse
+from udccal.fitting.engine.gaussian import scaled_inverse
 from udccal.fitting.noise import codes, nonuniformity, read_noise
 from udccal.fitting.noise.density import NORMAL_SHAPE, excess_kurtosis
 from udccal.fitting.noise.moments import RowMoments, StackMoments

@@ -15,8 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-from udccal.fitting.engine.information import scaled_inverse
-from udccal.fitting.iteration_log import LOG
+from udccal.fitting.engine.gaussian import scaled_inverse
+from udccal.fitting.engine.iteration_log import LOG
 
 PARAMETERS = ("K_DN_per_e", "V0_DN2", "curvature_per_DN", "response_DN_per_light", "light_offset")
 # Bent by more than this share at full scale, the quadratic is no description (and soon has no inverse).

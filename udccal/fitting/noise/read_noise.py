@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from udccal.fitting.engine.information import scaled_inverse
-from udccal.fitting.iteration_log import LOG
+from udccal.fitting.engine.gaussian import scaled_inverse
+from udccal.fitting.engine.iteration_log import LOG
 from udccal.fitting.noise.codes import DarkPair, centres_DN
 from udccal.fitting.noise.density import LEAST_SHAPE, MOST_SHAPE, NORMAL_SHAPE, dark_cdf
 

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.special import softmax
 
-from udccal.fitting.iteration_log import LOG
+from udccal.fitting.engine.iteration_log import LOG
 from udccal.fitting.psf.blocks import HEAD, LOCAL, Block, Local
 from udccal.fitting.psf.normal import Evaluator, Normal, normal_equations, overlaps_of
 

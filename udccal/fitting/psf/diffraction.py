@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from udccal.fitting.iteration_log import LOG
+from udccal.fitting.engine.iteration_log import LOG
 from udccal.fitting.psf.blocks import FOOTPRINT, PITCH, PUPIL, Block, Local, corrected
 from udccal.fitting.psf.descent import Point, Problem, damped, descend, moved, pose, reduced, stand
 from udccal.fitting.psf.normal import (

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from udccal.fitting.iteration_log import LOG
+from udccal.fitting.engine.iteration_log import LOG
 from udccal.fitting.psf_stamps.field import Seen
 from udccal.fitting.psf_stamps.likelihood import Weighted, expectation, look
 from udccal.fitting.psf_stamps.log_prior import border_prior, log_prior, quadratic, with_prior

@@ -8,7 +8,7 @@ from typing import final
 import numpy as np
 from jaxtyping import Float
 
-from udccal.fitting.iteration_log import LOG
+from udccal.fitting.engine.iteration_log import LOG
 from udccal.fitting.wire.basis import LEAST_VARIANCE, Basis, Normal, Pixels, accumulate
 from udccal.fitting.wire.noise import FlatNoise, Judged, judge
 from udccal.fitting.wire.phase import PhaseFit, add_increment, moved, solve

@@ -14,7 +14,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from udccal.fitting.tails import chi2_tail
+from udccal.fitting.engine.tails import chi2_tail
 from udccal.fitting.wire.basis import TILES, Pixels, tile_numbers
 from udccal.fitting.wire.joint import Joint
 from udccal.fitting.wire.noise import Judged

@@ -13,7 +13,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from udccal.fitting.iteration_log import LOG
+from udccal.fitting.engine.iteration_log import LOG
 from udccal.fitting.wire.basis import LEAST_VARIANCE, SITES, Basis, Normal, Pixels, accumulate, merit
 from udccal.fitting.wire.harmonics import WireStart, free_basis, plain_basis
 from udccal.fitting.wire.noise import FlatNoise, judge

@@ -1,0 +1,61 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from jaxtyping import Float
+
+from udccal.errors import FitError
+from udccal.fitting.engine.gaussian import Posterior, Prior, scaled_inverse, square_root
+from udccal.result import FitResult, FitStatus
+
+COV = np.array([[4.0, 1e-3, 0.0], [1e-3, 1e-6, 0.0], [0.0, 0.0, 0.0]])
+
+
+def _posterior() -> Posterior[Float[np.ndarray, "3"]]:
+    return Posterior.from_cov(np.array([10.0, 0.02, 5.0]), COV, lambda x: x)
+
+
+def test_a_prior_adds_cost_and_the_slope_of_it() -> None:
+    prior, x, step = Prior.independent(np.array([1.0, 2.0]), np.array([0.5, np.inf])), np.array([2.0, 9.0]), 1e-6
+    assert prior.cost(x) == pytest.approx(4.0)
+    along = np.array([step, 0.0])
+    slope = (prior.cost(x + along) - prior.cost(x - along)) / (2 * step)
+    assert prior.right(x) == pytest.approx([-slope / 2, 0.0], rel=1e-6)
+
+
+def test_sigma_of_a_linear_function_is_exact() -> None:
+    slopes = np.array([[1.0, 0.0, 0.0], [1.0, 100.0, 3.0]])
+    expected = np.sqrt(np.diag(slopes @ COV @ slopes.T))
+    assert _posterior().sigma_of(lambda x: slopes @ x) == pytest.approx(expected, rel=1e-9)
+
+
+def test_sigma_of_a_curved_function_is_that_of_its_draws() -> None:
+    posterior = _posterior()
+
+    def f(x: Float[np.ndarray, "3"]) -> Float[np.ndarray, "2"]:
+        return np.array([np.exp(x[1]), x[0] * x[1]])
+
+    drawn = np.std([f(x) for x in posterior.draws(np.random.default_rng(3), 20_000)], axis=0)
+    assert posterior.sigma_of(f) == pytest.approx(drawn, rel=0.03)
+    # A posterior without covariance between the two would be off by more.
+    alone = Posterior.from_cov(posterior.mean, np.diag(np.diag(COV)), lambda x: x)
+    assert abs(alone.sigma_of(f)[1] / drawn[1] - 1) > 0.03
+
+
+def test_parameters_of_unlike_size_keep_their_digits() -> None:
+    cov = np.array([[1e18, 3e5], [3e5, 1e-6]])
+    root = square_root(cov)
+    assert root @ root.T == pytest.approx(cov, rel=1e-9)
+    inverse = np.array([[1e-6, -3e5], [-3e5, 1e18]]) / (1e12 - 9e10)
+    assert scaled_inverse(cov) == pytest.approx(inverse, rel=1e-9)
+
+
+def test_directions_without_information_have_no_inverse() -> None:
+    assert scaled_inverse(np.diag([4.0, 0.0])) == pytest.approx(np.diag([0.25, 0.0]))
+
+
+def test_results_answer_for_functions_of_their_term_or_say_why_not() -> None:
+    fitted = FitResult("wire", np.zeros(3), FitStatus.CONVERGED, (), COV, 1.0, 9, posterior=_posterior())
+    assert fitted.sigma_of(lambda x: x[:1]) == pytest.approx([2.0])
+    with pytest.raises(FitError, match="wire fit with a posterior, found none"):
+        FitResult.failed("wire", np.zeros(3), FitStatus.TOO_DARK, "No light.").sigma_of(lambda x: x)

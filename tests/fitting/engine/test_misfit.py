@@ -1,0 +1,64 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from udccal.fitting.engine.misfit import chi2_test, clustered_cov, excess_sigma, f_test, group_means_test, sharper
+
+
+def test_chance_alone_is_flagged_once_in_a_thousand() -> None:
+    rng = np.random.default_rng(0)
+    p = [chi2_test(float(rng.chisquare(20)), 20.0).p_value for _ in range(4000)]
+    assert np.mean(np.array(p) < 0.05) == pytest.approx(0.05, abs=0.012)
+    assert np.mean(np.array(p) < 1e-3) < 0.003
+
+
+def test_f_test_with_an_estimated_scale_holds_its_level() -> None:
+    rng = np.random.default_rng(1)
+    draws = 7.0 * rng.chisquare(1, (4000, 40))
+    p = np.array([f_test(float(d[:5].sum() / d.mean()), 5, 40.0).p_value for d in draws])
+    assert np.mean(p < 0.05) == pytest.approx(0.05, abs=0.012)
+
+
+def test_a_pattern_is_found_in_groups_and_noise_has_none() -> None:
+    rng = np.random.default_rng(2)
+    group, z = np.arange(4000) % 40, rng.standard_normal(4000)
+    used = np.ones(4000, dtype=bool)
+    assert not group_means_test(z, group, used).found
+    assert group_means_test(z + 0.3 * np.sin(group), group, used).found
+    assert not group_means_test(z + 100.0 * (group == 3), group, used & (group != 3)).found
+
+
+def test_the_sharper_of_two_tests_pays_for_the_choice() -> None:
+    dull, sharp = chi2_test(10.0, 10.0), chi2_test(40.0, 10.0)
+    assert sharper(dull, sharp).p_value == pytest.approx(2 * sharp.p_value)
+
+
+@pytest.mark.parametrize("size", [0.0, 0.02, 0.5])
+def test_an_error_beside_noise_is_measured(size: float) -> None:
+    rng = np.random.default_rng(3)
+    light = rng.uniform(1, 30, 5000)
+    noise = 0.01 * light
+    residual = np.sqrt(noise) * rng.standard_normal(5000) + size * light * rng.standard_normal(5000)
+    assert excess_sigma(residual**2, noise, light**2, 5000.0) == pytest.approx(size, rel=0.05, abs=1e-12)
+
+
+@pytest.mark.parametrize("with_information", [True, False])
+def test_groups_that_differ_widen_the_covariance_to_the_true_scatter(with_information: bool) -> None:
+    """A straight line through groups that each have an offset of their own, which the model lacks."""
+    rng, groups, each = np.random.default_rng(5), 30, 20
+    x = rng.uniform(-1, 1, (groups, each))
+    slopes = np.stack([np.ones_like(x), x], axis=-1)
+    own = np.einsum("gei,gej->gij", slopes, slopes)
+    cov = np.linalg.inv(own.sum(axis=0))
+    found, stated = [], []
+    for _ in range(400):
+        y = rng.standard_normal((groups, each)) + 0.8 * rng.standard_normal((groups, 1))
+        best = cov @ np.einsum("gei,ge->i", slopes, y)
+        scores = np.einsum("gei,ge->gi", slopes, y - slopes @ best)
+        wide = clustered_cov(cov, scores, own if with_information else None)
+        assert (np.diag(wide) >= np.diag(cov)).all()
+        found.append(best)
+        stated.append(wide[0, 0])
+    assert np.sqrt(np.mean(stated)) == pytest.approx(np.std(np.array(found)[:, 0]), rel=0.15)
+    assert np.sqrt(cov[0, 0]) < 0.5 * np.std(np.array(found)[:, 0])

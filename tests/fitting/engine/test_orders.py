@@ -1,0 +1,54 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from udccal.fitting.engine.orders import Attempt, bic, choose, evidence, held_out_beats, rising
+
+
+def _attempt(name: str, criterion: float) -> Attempt[str]:
+    return Attempt(name, len(name), criterion, name)
+
+
+def test_the_lowest_criterion_wins_and_all_are_listed() -> None:
+    choice = choose([_attempt("flat", 9.0), _attempt("straight", 3.0), _attempt("bent", 4.0)])
+    assert choice.best.fit == "straight"
+    assert [c.chosen for c in choice.candidates] == [False, True, False]
+    assert choice.probabilities[1] / choice.probabilities[2] == pytest.approx(np.exp(0.5))
+
+
+def test_failed_orders_are_never_chosen() -> None:
+    assert choose([_attempt("failed", np.inf), _attempt("poor", 1e9)]).best.name == "poor"
+
+
+def test_rising_orders_end_after_two_in_vain() -> None:
+    criteria = [9.0, 9.5, 5.0, 6.0, 7.0, 0.0]
+    tried = rising(
+        (lambda k=k, c=c: _attempt("x" * k, c) for k, c in enumerate(criteria)), lambda a, b: a.criterion < b.criterion
+    )
+    assert [t.criterion for t in tried] == criteria[:5]
+
+
+def test_evidence_is_the_exact_integral_of_a_linear_model() -> None:
+    """Of y ~ N(slopes x, 1), x ~ N(0, prior): -2 ln p(y) by the covariance of y itself."""
+    rng = np.random.default_rng(4)
+    slopes, prior, y = rng.standard_normal((30, 2)), np.array([0.5, 3.0]), rng.standard_normal(30)
+    whole = np.eye(30) + (slopes * prior**2) @ slopes.T
+    exact = y @ np.linalg.solve(whole, y) + np.linalg.slogdet(whole)[1]
+    cov = np.linalg.inv(slopes.T @ slopes + np.diag(prior**-2.0))
+    x = cov @ slopes.T @ y
+    cost = float(((y - slopes @ x) ** 2).sum() + ((x / prior) ** 2).sum())
+    assert evidence(cost, cov, prior) == pytest.approx(exact, rel=1e-9)
+    assert evidence(cost, cov, prior, against=2.0) == pytest.approx(exact + 2.0, rel=1e-9)
+
+
+def test_bic_prices_a_parameter_at_the_logarithm_of_the_samples() -> None:
+    assert bic(10.0, 3.0, 100) - bic(10.0, 2.0, 100) == pytest.approx(np.log(100))
+
+
+def test_one_lucky_group_is_no_gain() -> None:
+    before = np.full(8, 2.0)
+    assert held_out_beats(before - 0.1, before)
+    assert not held_out_beats(before - np.array([0.8, *[0.0] * 7]), before)
+    assert not held_out_beats(before - 0.1, before, worth=0.2)
+    assert not held_out_beats(np.array([1.0]), np.array([2.0]))

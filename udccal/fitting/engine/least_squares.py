@@ -1,0 +1,249 @@
+"""Levenberg-Marquardt on normal equations by blocks: shared parameters, and small groups that belong to one datum each.
+
+The equations of one step are
+
+    [ A    B ] [shared]     [a]        A: p x p,  B_k: p x l,  C_k: l x l, one block per view, shot or star,
+    [ B^T  C ] [ own  ]  =  [c],
+
+with C block diagonal, so that the groups' own parameters are eliminated one by one (Schur's complement: Triggs et al.,
+Bundle Adjustment - A Modern Synthesis, 2000, section 6.1). The damping follows Nielsen (IMM-REP-1999-05, 1999).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Generic, Protocol, TypeVar, final, runtime_checkable
+
+import numpy as np
+from jaxtyping import Float
+
+from udccal.fitting.engine.gaussian import Prior, scaled_inverse
+from udccal.fitting.engine.iteration_log import LOG
+
+Place = TypeVar("Place")
+_Place_contra = TypeVar("_Place_contra", contravariant=True)
+
+_TINY = 1e-300
+
+
+@final
+@dataclass(frozen=True)
+class SolverRules:
+    """When a descent ends, and how carefully it steps.
+
+    Attributes:
+        least_gain: converged when one more step is expected to lower the cost by less than this, in units of the
+            reduced chi-squared where that is above 1. 1e-4 is a hundredth of a sigma.
+        stalled_gain: converged, too, when less than ``small_gain`` is expected and the last step brought less than
+            this: slopes that are themselves sums may promise a little for ever. 0 asks for the promise alone.
+        small_gain: see ``stalled_gain``; also what may be left where rounding lets no step lower the cost.
+        iterations: at most.
+        first_damping: relative to the diagonal of the equations.
+        most_damping: no step, however small, lowers the cost.
+    """
+
+    least_gain: float = 1e-4
+    stalled_gain: float = 0.0
+    small_gain: float = 1.0
+    iterations: int = 200
+    first_damping: float = 1e-4
+    most_damping: float = 1e10
+
+
+@final
+@dataclass(frozen=True)
+class Step:
+    """A step of the shared parameters and of the groups' own, and by how much it is expected to lower the cost."""
+
+    shared: Float[np.ndarray, " p"]
+    own: Float[np.ndarray, "k l"]
+    gain: float
+
+
+@runtime_checkable
+class Equations(Protocol):
+    """What the solver asks of a problem's equations at a place; ``Blocks`` has it, and so may others."""
+
+    @property
+    def cost(self) -> float:
+        """Chi-squared and what the prior adds."""
+
+    @property
+    def samples(self) -> int:
+        """Data that count."""
+
+    def step(self, damping: float) -> Step:
+        """To the minimum of the quadratic model, whose diagonal is raised by the part ``damping``."""
+
+
+_Equations = TypeVar("_Equations", bound=Equations)
+_Equations_co = TypeVar("_Equations_co", bound=Equations, covariant=True)
+
+
+@runtime_checkable
+class Problem(Protocol[Place, _Equations_co]):
+    """What an adapter gives: equations at a place, and the place after a step."""
+
+    @property
+    def name(self) -> str:
+        """For the iteration log."""
+
+    def equations_at(self, place: Place) -> _Equations_co:
+        """Cost and normal equations, the prior's included."""
+
+    def moved(self, place: Place, step: Step) -> Place:
+        """The place after a step."""
+
+
+@final
+@dataclass(frozen=True)
+class Blocks:
+    """Normal equations by blocks; ``k`` groups of ``l`` own parameters each, none where ``k`` is 0.
+
+    Attributes:
+        cost: chi-squared, and what priors add.
+        samples: data that count.
+        shared, right: of the shared parameters: half the Hessian and minus half the gradient of the cost.
+        own, own_right: of the groups' own.
+        cross: shared by own.
+    """
+
+    cost: float
+    samples: int
+    shared: Float[np.ndarray, "p p"]
+    right: Float[np.ndarray, " p"]
+    own: Float[np.ndarray, "k l l"]
+    own_right: Float[np.ndarray, "k l"]
+    cross: Float[np.ndarray, "k p l"]
+
+    @classmethod
+    def dense(
+        cls, cost: float, samples: int, matrix: Float[np.ndarray, "p p"], right: Float[np.ndarray, " p"]
+    ) -> Blocks:
+        """Without groups."""
+        size = len(right)
+        return cls(cost, samples, matrix, right, np.zeros((0, 1, 1)), np.zeros((0, 1)), np.zeros((0, size, 1)))
+
+    @classmethod
+    def of_errors(cls, errors: Float[np.ndarray, " m"], slopes: Float[np.ndarray, "m p"]) -> Blocks:
+        """Without groups, from errors in units of their sigma and their slopes by the parameters."""
+        return cls.dense(float(errors @ errors), len(errors), slopes.T @ slopes, -slopes.T @ errors)
+
+    def with_prior(self, prior: Prior, x: Float[np.ndarray, " p"]) -> Blocks:
+        """With what is known of the shared parameters beforehand, which are ``x``."""
+        cost, matrix = self.cost + prior.cost(x), self.shared + prior.precision
+        return Blocks(cost, self.samples, matrix, self.right + prior.right(x), self.own, self.own_right, self.cross)
+
+    def marginal(self, damping: float = 0.0) -> tuple[Float[np.ndarray, "p p"], Float[np.ndarray, " p"]]:
+        """Matrix and right side of the shared parameters once the groups' own are eliminated."""
+        solved = self.cross @ self._own_inverse(damping)
+        matrix = _damped(self.shared, damping) - np.einsum("kpl,kql->pq", solved, self.cross)
+        return matrix, self.right - np.einsum("kpl,kl->p", solved, self.own_right)
+
+    def step(self, damping: float) -> Step:
+        """To the minimum of the quadratic model, whose diagonal is raised by the part ``damping``."""
+        matrix, right = self.marginal(damping)
+        shared = solve(matrix, right)
+        left = self.own_right - np.einsum("kpl,p->kl", self.cross, shared)
+        own = np.einsum("klm,km->kl", self._own_inverse(damping), left)
+        return Step(shared, own, float(self.right @ shared + (self.own_right * own).sum()))
+
+    def cov(self) -> Float[np.ndarray, "p p"]:
+        """Covariance of the shared parameters with the groups' own marginalised; 0 in what the data do not tell."""
+        return scaled_inverse(self.marginal()[0])
+
+    def joint_cov(self) -> Float[np.ndarray, "n n"]:
+        """Covariance of the shared parameters and then of every group's own; ``n`` is p + k l."""
+        shared, inverse = self.cov(), self._own_inverse(0.0)
+        carried = -(inverse @ np.swapaxes(self.cross, 1, 2)).reshape(-1, len(self.right))
+        cov = np.block([[shared, shared @ carried.T], [carried @ shared, carried @ shared @ carried.T]])
+        size = inverse.shape[1]
+        for group, block in enumerate(inverse):
+            mine = slice(len(self.right) + group * size, len(self.right) + (group + 1) * size)
+            cov[mine, mine] += block
+        return cov
+
+    def _own_inverse(self, damping: float) -> Float[np.ndarray, "k l l"]:
+        """A group that only fills up a block has nothing on its diagonal, and stays where it is."""
+        return scaled_inverse(_damped(self.own, damping), 1e-14)
+
+
+def _damped(matrix: Float[np.ndarray, "*k n n"], damping: float) -> Float[np.ndarray, "*k n n"]:
+    if damping == 0.0:
+        return matrix
+    diagonal = np.einsum("...ii->...i", matrix)
+    return matrix + damping * diagonal[..., None] * np.eye(matrix.shape[-1])
+
+
+def solve(matrix: Float[np.ndarray, "p p"], right: Float[np.ndarray, " p"]) -> Float[np.ndarray, " p"]:
+    """Solution of symmetric positive equations of very unlike scales; no step in what they do not tell."""
+    unit = 1 / np.sqrt(np.maximum(np.diag(matrix), _TINY))
+    try:
+        root = np.linalg.cholesky(matrix * np.outer(unit, unit))
+    except np.linalg.LinAlgError:
+        return np.asarray(scaled_inverse(matrix) @ right)
+    half = np.linalg.solve(root, right * unit)
+    return np.asarray(np.linalg.solve(root.T, half) * unit)
+
+
+@final
+@dataclass(frozen=True)
+class Solution(Generic[Place, _Equations]):
+    """Where a descent ended.
+
+    Attributes:
+        place: of the lowest cost.
+        equations: there.
+        gain: by how much one more step is expected to lower the cost.
+        converged: whether that is no more than the rules ask for.
+        history: the cost at the start and after each iteration that lowered it.
+        iterations: steps that were tried.
+    """
+
+    place: Place
+    equations: _Equations
+    gain: float
+    converged: bool
+    history: tuple[float, ...]
+    iterations: int
+
+
+def minimise(
+    problem: Problem[Place, _Equations], start: Place, rules: SolverRules | None = None
+) -> Solution[Place, _Equations]:
+    """The minimum of the cost next to ``start``.
+
+    The one rule of convergence: another step is expected to lower the cost by less than ``rules.least_gain``. Where the
+    cost is not finite at the start, the start comes back, not converged.
+
+    Args:
+        problem: gives equations and moves.
+        start: where to begin.
+        rules: see ``SolverRules``.
+    """
+    rules = rules or SolverRules()
+    place, here = start, problem.equations_at(start)
+    history, damping, raise_by, lowered, iteration = [here.cost], rules.first_damping, 2.0, np.inf, 0
+    while True:
+        gain = here.step(0.0).gain if np.isfinite(here.cost) else np.inf
+        LOG.debug("%s: iteration %d, cost %.9g, to gain %.3g", problem.name, iteration, here.cost, gain)
+        enough = rules.least_gain * max(here.cost / max(here.samples, 1), 1.0)
+        stalled = damping > rules.most_damping or lowered < rules.stalled_gain
+        converged = bool(gain < enough or (stalled and gain < rules.small_gain))
+        if converged or iteration >= rules.iterations or damping > rules.most_damping or not np.isfinite(here.cost):
+            return Solution(place, here, float(gain), converged, tuple(history), iteration)
+        following = None
+        while following is None and iteration < rules.iterations and damping <= rules.most_damping:
+            iteration += 1
+            step = here.step(damping)
+            tried = problem.moved(place, step)
+            there = problem.equations_at(tried)
+            if np.isfinite(there.cost) and there.cost < here.cost:
+                lowered, following = here.cost - there.cost, (tried, there)
+                kept = lowered / max(step.gain, _TINY)
+                damping, raise_by = damping * float(np.clip(1.0 - (2.0 * kept - 1.0) ** 3, 0.1, 2.0)), 2.0
+            else:
+                damping, raise_by = damping * raise_by, 2.0 * raise_by
+        if following is not None:
+            place, here = following
+            history.append(here.cost)

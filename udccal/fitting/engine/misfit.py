@@ -1,0 +1,140 @@
+"""What a model leaves undescribed: whether residuals have a pattern, how large it is, and what that adds to error bars.
+
+One policy for all terms. Noise is independent from sample to sample; a misfit is not. Residuals are gathered in groups
+that a misfit shares (views, positions, tiles of the sensor, pictures) and tested against chance: beyond one in a
+thousand the misfit counts as found. Then (1) a note says so, with its size; (2) the parameters' covariance is that of
+groups that differ by more than their noise; (3) what is predicted carries the misfit's size besides.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import final
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from udccal.fitting.engine.tails import chi2_tail, f_tail
+
+# Chance finds a misfit where there is none once in a thousand fits.
+SIGNIFICANT = 1e-3
+_HALVINGS = 60
+
+
+@final
+@dataclass(frozen=True)
+class MisfitTest:
+    """A statistic over its degrees of freedom (1 where the model holds), and how often chance makes it as large."""
+
+    ratio: float
+    p_value: float
+
+    @property
+    def found(self) -> bool:
+        """Whether chance is no explanation."""
+        return self.p_value < SIGNIFICANT
+
+    @property
+    def inflation(self) -> float:
+        """What a variance is multiplied with: 1 unless a misfit was found."""
+        return max(self.ratio, 1.0) if self.found else 1.0
+
+
+NO_TEST = MisfitTest(1.0, 1.0)
+
+
+def chi2_test(statistic: float, dof: float) -> MisfitTest:
+    """Of a sum of squares of independent unit normals; no test where there are no degrees of freedom."""
+    return MisfitTest(statistic / dof, chi2_tail(statistic, dof)) if dof > 0 and np.isfinite(statistic) else NO_TEST
+
+
+def f_test(statistic: float, rank: int, dof: float) -> MisfitTest:
+    """The same where the scale of the noise is estimated from ``dof`` degrees of freedom that hold those of the test.
+
+    The numerator is part of the residuals behind the scale, so that it is taken out of the denominator.
+    """
+    rest = dof - rank
+    if rank < 1 or rest < 1 or not np.isfinite(statistic):
+        return NO_TEST
+    ratio = statistic / rank / (max(dof - statistic, 1e-9) / rest)
+    return MisfitTest(float(ratio), f_tail(ratio, rank, rest))
+
+
+def sharper(*tests: MisfitTest) -> MisfitTest:
+    """The test of the lowest p-value; that it was chosen from several is paid for (Bonferroni)."""
+    best = min(tests, key=lambda t: t.p_value)
+    return MisfitTest(best.ratio, min(1.0, len(tests) * best.p_value))
+
+
+def group_means_test(
+    z: Float[np.ndarray, " n"], group: Int[np.ndarray, " n"], used: Bool[np.ndarray, " n"], scale: float = 1.0
+) -> MisfitTest:
+    """Whether means of groups scatter as those of independent residuals do.
+
+    Args:
+        z: residuals in units of their sigma, freed of what the fit took up.
+        group: number of each sample's group.
+        used: samples that count.
+        scale: variance of ``z`` where the model holds.
+    """
+    count = np.bincount(group[used])
+    total = np.bincount(group[used], z[used])
+    seen = count > 0
+    return chi2_test(float((total[seen] ** 2 / count[seen]).sum()) / scale, float(seen.sum()))
+
+
+def excess_sigma(
+    square: Float[np.ndarray, " n"],
+    noise: Float[np.ndarray, " n"],
+    unit: Float[np.ndarray, " n"],
+    dof: float,
+    constant: float = 0.0,
+) -> float:
+    """Size of an error beside noise that brings chi-squared to its degrees of freedom; 0 unless it is significant.
+
+    The estimate of Paule and Mandel (J. Res. NBS 87, 1982).
+
+    Args:
+        square: of residuals.
+        noise: variance of each.
+        unit: variance that an error of size 1 adds to each.
+        dof: degrees of freedom.
+        constant: chi-squared of data that have no such error.
+    """
+    if not unit.any() or chi2_tail(float((square / noise).sum()) + constant, dof) > SIGNIFICANT:
+        return 0.0
+    low, high = 0.0, float(np.sqrt(square.max() / unit[unit > 0].min()))
+    for _ in range(_HALVINGS):
+        middle = 0.5 * (low + high)
+        above = float((square / (noise + middle**2 * unit)).sum()) + constant > dof
+        low, high = (middle, high) if above else (low, middle)
+    return 0.5 * (low + high)
+
+
+def clustered_cov(
+    cov: Float[np.ndarray, "n n"],
+    scores: Float[np.ndarray, "groups n"],
+    information: Float[np.ndarray, "groups n n"] | None = None,
+) -> Float[np.ndarray, "n n"]:
+    """Covariance of parameters whose groups of data differ by more than their noise, never below ``cov``.
+
+    Each group is left out in one Newton step (jackknife: Efron, CBMS 38, 1982); without the groups' own information the
+    step is that of the whole (sandwich: Huber, Proc. 5th Berkeley Symposium, 1967).
+
+    Args:
+        cov: of the fit, by noise alone, other parameters marginalised.
+        scores: minus half the gradient of each group's chi-squared at the minimum.
+        information: half its Hessian.
+    """
+    groups = len(scores)
+    if groups < 2:
+        return cov
+    if information is None:
+        shifts = scores @ cov
+    else:
+        matrix = np.linalg.pinv(cov, hermitian=True)
+        shifts = np.stack(
+            [np.linalg.pinv(matrix - own, hermitian=True) @ one for own, one in zip(information, scores, strict=True)]
+        )
+    spread = shifts - shifts.mean(axis=0)
+    return np.asarray(cov + spread.T @ spread * (groups - 1) / groups)
