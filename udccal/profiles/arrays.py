@@ -17,6 +17,7 @@ from jaxtyping import Float, Shaped
 from udccal.errors import FileFormatError, ProfileError
 from udccal.io.exr import read_exr, write_exr
 from udccal.io.hashing import sha256_file
+from udccal.io.links import is_plain_file
 from udccal.profiles.schema import INLINE_VALUES, DType, Numbers, StoredArray
 
 _CHANNELS = ("value", "remainder", "remainder2")
@@ -92,7 +93,7 @@ def read_checked(folder: Path, file: str, sha256: str) -> Mapping[str, Float[np.
         ProfileError: when it is missing, a link out of the folder, too large, altered, or no EXR file.
     """
     path = folder / file
-    if path.is_symlink() or not path.is_file():
+    if not is_plain_file(folder, path):
         raise ProfileError(f"Expected the file {file} in {folder}, found none. Copy the whole profile again.")
     size = path.stat().st_size
     if size > _MAX_FILE_BYTES:

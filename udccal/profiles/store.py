@@ -14,6 +14,7 @@ from pathlib import Path
 from pydantic import ValidationError
 
 from udccal.errors import ProfileError, RigError
+from udccal.io.links import is_plain_file
 from udccal.profiles.archive import pack_archive, unpack_archive
 from udccal.profiles.encode import decode, encode
 from udccal.profiles.profile import Profile
@@ -80,7 +81,7 @@ def read_stored(folder: Path) -> StoredProfile:
         ProfileError: as ``read_profile``.
     """
     file = folder / PROFILE_NAME
-    if not file.is_file():
+    if not is_plain_file(folder, file):
         raise ProfileError(
             f"Expected a profile with a {PROFILE_NAME} at {folder}, found none. Check the path, or calibrate the rig."
         )

@@ -12,6 +12,7 @@ from jaxtyping import Float32, UInt8, UInt16
 from udccal.errors import FileFormatError, SessionError
 from udccal.io.exr import read_exr
 from udccal.io.hashing import sha256_file
+from udccal.io.links import is_plain_file
 from udccal.io.png import read_png16, read_rgb8
 from udccal.rig import RigDescription
 from udccal.sessions.manifest import read_manifest
@@ -125,7 +126,7 @@ class Session:
 
     def _read(self, name: str, sha256: str, reader):  # type: ignore[no-untyped-def]
         file = self.path / name
-        if not file.is_file() or not file.resolve().is_relative_to(self.path.resolve()):
+        if not is_plain_file(self.path, file):
             raise SessionError(
                 f"Expected the file '{name}' inside the session {self.path}, found none. Restore it, or capture again."
             )
