@@ -7,7 +7,6 @@ import zipfile
 from pathlib import Path
 
 from udccal.errors import ProfileError
-from udccal.io.atomic import atomic_path
 
 _ENTRY = re.compile(r"(profile\.json|[a-z][a-z0-9_]{0,95}\.exr)")
 _MAX_ENTRIES = 256
@@ -16,9 +15,10 @@ _CHUNK = 1024 * 1024
 
 
 def pack_archive(folder: Path, path: Path) -> None:
-    """Write a profile's folder to one zip file, atomically. EXR files are compressed already and only stored."""
-    with atomic_path(path) as temporary, zipfile.ZipFile(temporary, "w") as archive:
-        for file in sorted(folder.iterdir()):
+    """Write the files of a profile's folder to one new zip file. EXR files are compressed already and only stored."""
+    files = sorted(folder.iterdir())
+    with zipfile.ZipFile(path, "x") as archive:
+        for file in files:
             kind = zipfile.ZIP_STORED if file.suffix == ".exr" else zipfile.ZIP_DEFLATED
             archive.write(file, file.name, compress_type=kind)
 
