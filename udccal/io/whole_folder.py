@@ -61,7 +61,7 @@ def replace_whole(new: Path, path: Path) -> None:
 
 
 def standing(path: Path) -> Path:
-    """Where the folder of that name is to be read: there, or where a process that ended while it replaced it left it."""
+    """Where the folder of that name is to be read: there, or where a process that ended while replacing it left it."""
     left = () if os.path.lexists(path) else _beside(path, "old")
     return next(iter(left), path)
 

@@ -15,14 +15,13 @@ from udccal.io.whole_folder import folder_beside, replace_whole, standing
 from udccal.profiles.archive import pack_archive, unpack_archive
 from udccal.profiles.encode import decode, encode
 from udccal.profiles.profile import Profile
-from udccal.profiles.provenance import PROFILE_NAME
+from udccal.profiles.provenance import MAX_JSON_BYTES, PROFILE_NAME
 from udccal.profiles.schema import StoredArray, StoredProfile
 from udccal.profiles.versions import migrated
 from udccal.rig import find_rig
 
 # In a rig's folder, beside its rig.toml.
 RIG_PROFILE = "profile"
-_MAX_JSON_BYTES = 32 * 1024 * 1024
 
 
 def write_profile(path: Path, profile: Profile) -> None:
@@ -101,8 +100,8 @@ def read_stored(folder: Path) -> StoredProfile:
             f"Expected a profile with a {PROFILE_NAME} at {folder}, found none. Check the path, or calibrate the rig."
         )
     size = file.stat().st_size
-    if size > _MAX_JSON_BYTES:
-        raise ProfileError(f"Expected {file} to hold at most {_MAX_JSON_BYTES} bytes, found {size}. It is not ours.")
+    if size > MAX_JSON_BYTES:
+        raise ProfileError(f"Expected {file} to hold at most {MAX_JSON_BYTES} bytes, found {size}. It is not ours.")
     try:
         found = json.loads(file.read_bytes())
     except (ValueError, RecursionError) as error:
