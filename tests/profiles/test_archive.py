@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import tracemalloc
 import zipfile
 from pathlib import Path
 
@@ -65,3 +66,49 @@ def test_other_files_are_refused(tmp_path: Path, target: Path) -> None:
     (tmp_path / "p.zip").write_bytes(b"PK not really")
     with pytest.raises(ProfileError, match="whole zip file"):
         unpack_archive(tmp_path / "p.zip", target)
+
+
+BOMB = 64 * 1024 * 1024
+
+
+def bomb(path: Path, kind: int, claimed: int, name: str = "profile.json") -> Path:
+    """An archive whose one file unpacks to 64 MiB of zeros, and claims to be of another size."""
+    with zipfile.ZipFile(path, "w", kind) as archive, archive.open(name, "w") as stream:
+        for _ in range(BOMB >> 20):
+            stream.write(bytes(1 << 20))
+    content = path.read_bytes()
+    assert len(content) < 2 << 20
+    path.write_bytes(content.replace(BOMB.to_bytes(4, "little"), claimed.to_bytes(4, "little")))
+    return path
+
+
+@pytest.mark.parametrize("kind", [zipfile.ZIP_DEFLATED, zipfile.ZIP_LZMA])
+@pytest.mark.parametrize("claimed", [10, 1 << 20, (32 << 20) + 1, BOMB])
+def test_a_bomb_takes_neither_memory_nor_disk(tmp_path: Path, target: Path, kind: int, claimed: int) -> None:
+    path = bomb(tmp_path / "p.zip", kind, claimed)
+    tracemalloc.start()
+    try:
+        with pytest.raises(ProfileError, match="Expected"):
+            unpack_archive(path, target)
+        most = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert most < 8 << 20
+    assert sum(item.stat().st_size for item in target.iterdir()) <= (claimed if claimed <= 1 << 20 else 0)
+
+
+def test_an_array_that_no_profile_holds_is_refused_before_it_is_unpacked(tmp_path: Path, target: Path) -> None:
+    path = bomb(tmp_path / "p.zip", zipfile.ZIP_DEFLATED, (512 << 20) + 1, "wire_map.exr")
+    with pytest.raises(ProfileError, match=r"'wire_map\.exr' .* at most 536870912 bytes"):
+        unpack_archive(path, target)
+    assert list(target.iterdir()) == []
+
+
+@pytest.mark.parametrize("large", [False, True])
+def test_a_long_list_of_files_is_refused_before_it_is_read(tmp_path: Path, target: Path, large: bool) -> None:
+    path = archive_with(tmp_path / "p.zip", *(f"{'a' * 90}{i}.exr" for i in range(100 if large else 8000)), content=b"")
+    if large:
+        content = path.read_bytes()
+        path.write_bytes(content[:-22] + b"PK\6\7" + bytes(16) + content[-22:])
+    with pytest.raises(ProfileError, match="short list of files"):
+        unpack_archive(path, target)

@@ -119,7 +119,7 @@ def test_a_link_out_of_the_session_is_refused(folder: Path, tmp_path: Path) -> N
     ("channels", "message"),
     [
         ({"mean": np.full((24, 32), 9.0)}, "channels mean and variance"),
-        ({"mean": np.full((24, 30), 9.0), "variance": np.ones((24, 30))}, "32 x 24 samples as its region says"),
+        ({"mean": np.full((24, 30), 9.0), "variance": np.ones((24, 30))}, "to have 32 x 24 samples, found 30 x 24"),
         ({"mean": np.full((24, 32), 9e4), "variance": np.ones((24, 32))}, "at most 4095 DN"),
         ({"mean": np.full((24, 32), 9.0), "variance": -np.ones((24, 32))}, "no negative values"),
     ],
@@ -136,7 +136,7 @@ def test_averages_that_do_not_fit_are_refused(folder: Path, channels: dict, mess
 def test_a_picture_of_another_size_is_refused(folder: Path) -> None:
     edit(folder, lambda m: m["rig"]["panel"].update(columns=1280))
     session = Session.open(folder)
-    with pytest.raises(SessionError, match="1280 x 1080 pixels as the panel"):
+    with pytest.raises(SessionError, match="to have 1280 x 1080 samples"):
         session.picture(session.steps("backscatter")[0].subject)
 
 

@@ -13,21 +13,26 @@ from jaxtyping import Float, Float32
 
 from udccal.errors import FileFormatError
 from udccal.io.atomic import atomic_path
-from udccal.io.limits import check_size
+from udccal.io.limits import Shape, check_size
 
 # Measured on 2048 x 1536 x 2 channels of noisy averages: ZIPS 0.18 s and 25.0 MB, ZIP 0.29 s and 23.7 MB,
 # PIZ 0.61 s and 21.2 MB, none 0.05 s and 25.2 MB. ZIPS is quick and still shrinks maps that are smooth or empty.
 _COMPRESSION = OpenEXR.ZIPS_COMPRESSION
+# Of what udccal writes, whose shape is known; a rendered photograph may have more.
+_MOST_CHANNELS = 3
 
 
-def read_exr(path: Path) -> dict[str, Float32[np.ndarray, "rows columns"]]:
+def read_exr(path: Path, shape: Shape | None = None) -> dict[str, Float32[np.ndarray, "rows columns"]]:
     """Read every channel of a single-part EXR as float32, by name.
 
+    Where a ``shape`` (rows, columns) is given, another one, and more than three channels, are refused undecoded.
+
     Raises:
-        FileFormatError: when the file is missing, truncated, too large, has subsampled channels, or is not finite.
+        FileFormatError: when the file is missing, truncated, too large, of another shape, has subsampled channels, or
+            is not finite.
     """
     try:
-        names = _checked_channel_names(path)
+        names = _checked_channel_names(path, shape)
         with OpenEXR.File(str(path), separate_channels=True) as file:
             if not file.parts:  # the library warns and goes on when pixel data cannot be decoded
                 raise FileFormatError(_unreadable(path, "pixel data cut short or damaged"))
@@ -87,7 +92,7 @@ def write_rgb_exr(path: Path, picture: Float[np.ndarray, "rows columns 3"]) -> N
     write_exr(path, {name: picture[..., index] for index, name in enumerate("RGB")})
 
 
-def _checked_channel_names(path: Path) -> list[str]:
+def _checked_channel_names(path: Path, shape: Shape | None) -> list[str]:
     """Channel names from the header alone, after refusing what is too large to read."""
     if not path.is_file():
         raise FileFormatError(f"Expected an EXR file at {path}, found none. Check the path.")
@@ -97,7 +102,9 @@ def _checked_channel_names(path: Path) -> list[str]:
         header = dict(file.header(0))  # the file empties its own when it closes
     (left, top), (right, bottom) = header["dataWindow"]
     described = header["channels"]
-    check_size(path, int(bottom) - int(top) + 1, int(right) - int(left) + 1, len(described))
+    check_size(path, int(bottom) - int(top) + 1, int(right) - int(left) + 1, len(described), shape)
+    if shape is not None and len(described) > _MOST_CHANNELS:
+        raise FileFormatError(_unreadable(path, f"{len(described)} channels"))
     if any(channel.xSampling != 1 or channel.ySampling != 1 for channel in described):
         raise FileFormatError(_unreadable(path, "subsampled channels"))
     return [channel.name for channel in described]

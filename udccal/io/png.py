@@ -12,7 +12,7 @@ from jaxtyping import UInt8, UInt16
 
 from udccal.errors import FileFormatError
 from udccal.io.atomic import write_atomically
-from udccal.io.limits import check_size
+from udccal.io.limits import Shape, check_size
 from udccal.io.png_chunks import SIGNATURE, png_fault
 
 _GREY, _RGB = 0, 2
@@ -35,13 +35,13 @@ class _Header(NamedTuple):
     colour: int
 
 
-def read_png16(path: Path) -> UInt16[np.ndarray, "rows columns"]:
-    """Read a 16-bit one-channel mosaic.
+def read_png16(path: Path, shape: Shape | None = None) -> UInt16[np.ndarray, "rows columns"]:
+    """Read a 16-bit one-channel mosaic; of another ``shape`` (rows, columns) than the one given, it is not decoded.
 
     Raises:
-        FileFormatError: when the file is missing, truncated, too large, or not 16-bit greyscale.
+        FileFormatError: when the file is missing, truncated, too large, of another shape, or not 16-bit greyscale.
     """
-    return _read(path, 16, _GREY, "a 16-bit greyscale PNG")
+    return _read(path, 16, _GREY, "a 16-bit greyscale PNG", shape)
 
 
 def write_png16(path: Path, mosaic: UInt16[np.ndarray, "rows columns"]) -> None:
@@ -49,13 +49,13 @@ def write_png16(path: Path, mosaic: UInt16[np.ndarray, "rows columns"]) -> None:
     _write(path, mosaic, _MOSAIC)
 
 
-def read_rgb8(path: Path) -> UInt8[np.ndarray, "rows columns 3"]:
-    """Read an 8-bit RGB picture, in the order R, G, B.
+def read_rgb8(path: Path, shape: Shape | None = None) -> UInt8[np.ndarray, "rows columns 3"]:
+    """Read an 8-bit RGB picture, in the order R, G, B; ``shape`` as ``read_png16``.
 
     Raises:
-        FileFormatError: when the file is missing, truncated, too large, or not 8-bit RGB.
+        FileFormatError: when the file is missing, truncated, too large, of another shape, or not 8-bit RGB.
     """
-    return np.ascontiguousarray(_read(path, 8, _RGB, "an 8-bit RGB PNG")[..., ::-1])
+    return np.ascontiguousarray(_read(path, 8, _RGB, "an 8-bit RGB PNG", shape)[..., ::-1])
 
 
 def write_rgb8(path: Path, picture: UInt8[np.ndarray, "rows columns 3"]) -> None:
@@ -71,8 +71,8 @@ def _write(path: Path, picture: np.ndarray, parameters: list[int]) -> None:
     write_atomically(path, encoded.tobytes())
 
 
-def _read(path: Path, bits: int, colour: int, expected: str) -> np.ndarray:
-    header = _checked_header(path)
+def _read(path: Path, bits: int, colour: int, expected: str, shape: Shape | None) -> np.ndarray:
+    header = _checked_header(path, shape)
     if (header.bits, header.colour) != (bits, colour):
         raise FileFormatError(
             f"Expected {path} to be {expected}, found {header.bits} bits of colour type {header.colour}. "
@@ -92,7 +92,7 @@ def _read(path: Path, bits: int, colour: int, expected: str) -> np.ndarray:
     return picture
 
 
-def _checked_header(path: Path) -> _Header:
+def _checked_header(path: Path, shape: Shape | None) -> _Header:
     """The IHDR chunk, read and bounded before the rest of the file is."""
     if not path.is_file():
         raise FileFormatError(f"Expected a PNG file at {path}, found none. Check the path.")
@@ -101,5 +101,5 @@ def _checked_header(path: Path) -> _Header:
     if len(start) < 33 or not start.startswith(SIGNATURE) or start[12:16] != b"IHDR":
         raise FileFormatError(f"Expected {path} to be a PNG file, found other content. Check the file.")
     header = _Header(*struct.unpack(">IIBB", start[16:26]))
-    check_size(path, header.rows, header.columns, 3 if header.colour == _RGB else 1)
+    check_size(path, header.rows, header.columns, 3 if header.colour == _RGB else 1, shape)
     return header

@@ -3,22 +3,32 @@
 from __future__ import annotations
 
 import re
+import struct
 import zipfile
 from pathlib import Path
 
 from udccal.errors import ProfileError
-from udccal.io.atomic import atomic_path
+from udccal.profiles.arrays import MAX_FILE_BYTES
+from udccal.profiles.provenance import MAX_JSON_BYTES, PROFILE_NAME
 
 _ENTRY = re.compile(r"(profile\.json|[a-z][a-z0-9_]{0,95}\.exr)")
 _MAX_ENTRIES = 256
 _MAX_TOTAL_BYTES = 1024 * 1024 * 1024
 _CHUNK = 1024 * 1024
+# What a profile needs, and what zipfile unpacks in bounded pieces: of the other kinds it takes each piece whole.
+_KINDS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+# Of the list of files at the archive's end, which zipfile reads whole (APPNOTE 6.3.10, sections 4.3.15 and 4.3.16).
+_MAX_LIST_BYTES = 1024 * 1024
+_END = struct.Struct("<4s8xI4x2s")
+_END_SIGNATURE, _LARGE_SIGNATURE, _NO_COMMENT = b"PK\5\6", b"PK\6\7", b"\0\0"
+_LARGE_BYTES = 20
 
 
 def pack_archive(folder: Path, path: Path) -> None:
-    """Write a profile's folder to one zip file, atomically. EXR files are compressed already and only stored."""
-    with atomic_path(path) as temporary, zipfile.ZipFile(temporary, "w") as archive:
-        for file in sorted(folder.iterdir()):
+    """Write the files of a profile's folder to one new zip file. EXR files are compressed already and only stored."""
+    files = sorted(folder.iterdir())
+    with zipfile.ZipFile(path, "x") as archive:
+        for file in files:
             kind = zipfile.ZIP_STORED if file.suffix == ".exr" else zipfile.ZIP_DEFLATED
             archive.write(file, file.name, compress_type=kind)
 
@@ -31,6 +41,7 @@ def unpack_archive(path: Path, folder: Path) -> None:
             paths, links), or would unpack to more than a profile can hold.
     """
     try:
+        _check_list(path)
         with zipfile.ZipFile(path) as archive:
             entries = archive.infolist()
             _check_entries(path, entries)
@@ -38,6 +49,17 @@ def unpack_archive(path: Path, folder: Path) -> None:
                 _unpack_entry(path, archive, entry, folder / entry.filename)
     except (zipfile.BadZipFile, EOFError, NotImplementedError, RuntimeError, OSError) as error:
         raise ProfileError(f"Expected {path} to be a whole zip file, found: {error}. Copy it again.") from error
+
+
+def _check_list(path: Path) -> None:
+    with path.open("rb") as stream:
+        stream.seek(max(path.stat().st_size - _END.size - _LARGE_BYTES, 0))
+        tail = stream.read()
+    signature, size, comment = _END.unpack(tail[-_END.size :]) if len(tail) >= _END.size else (b"", 0, b"")
+    if signature != _END_SIGNATURE or comment != _NO_COMMENT:
+        raise zipfile.BadZipFile("no list of files at its end")
+    if size > _MAX_LIST_BYTES or tail.startswith(_LARGE_SIGNATURE):
+        raise ProfileError(f"Expected a short list of files in {path}, found a large one. It is not ours.")
 
 
 def _check_entries(path: Path, entries: list[zipfile.ZipInfo]) -> None:
@@ -48,6 +70,13 @@ def _check_entries(path: Path, entries: list[zipfile.ZipInfo]) -> None:
     if strange or len(set(names)) != len(names):
         found = f"'{strange[0]}'" if strange else "a name twice"
         raise ProfileError(f"Expected only profile.json and EXR files in {path}, found {found}. It is not ours.")
+    for entry in entries:
+        most = MAX_JSON_BYTES if entry.filename == PROFILE_NAME else MAX_FILE_BYTES
+        if entry.file_size > most or entry.compress_type not in _KINDS:
+            raise ProfileError(
+                f"Expected '{entry.filename}' in {path} to unpack to at most {most} bytes, stored or deflated, found "
+                f"{entry.file_size} bytes coded by method {entry.compress_type}. It is not ours."
+            )
     total = sum(entry.file_size for entry in entries)
     if total > _MAX_TOTAL_BYTES:
         raise ProfileError(

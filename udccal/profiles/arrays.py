@@ -17,10 +17,12 @@ from jaxtyping import Float, Shaped
 from udccal.errors import FileFormatError, ProfileError
 from udccal.io.exr import read_exr, write_exr
 from udccal.io.hashing import sha256_file
+from udccal.io.limits import Shape
+from udccal.io.links import is_plain_file
 from udccal.profiles.schema import INLINE_VALUES, DType, Numbers, StoredArray
 
 _CHANNELS = ("value", "remainder", "remainder2")
-_MAX_FILE_BYTES = 512 * 1024 * 1024
+MAX_FILE_BYTES = 512 * 1024 * 1024
 _DTYPES = {name: np.dtype(name) for name in get_args(DType)}
 
 
@@ -73,11 +75,13 @@ def load(folder: Path, stored: StoredArray) -> Shaped[np.ndarray, "..."]:
     Raises:
         ProfileError: when the file is missing, altered, too large or of another shape.
     """
-    channels = read_checked(folder, stored.file, stored.sha256)
+    columns = stored.shape[-1] if stored.shape else 1
+    rows = math.prod(stored.shape[:-1])
+    channels = read_checked(folder, stored.file, stored.sha256, (rows, columns))
     planes = [channels[name].astype(np.float64) for name in _CHANNELS if name in channels]
-    if len(planes) != len(channels) or not planes or planes[0].size != math.prod(stored.shape):
+    if len(planes) != len(channels) or not planes:
         raise ProfileError(
-            f"Expected the channel 'value' with {math.prod(stored.shape)} samples in {stored.file}, found channels "
+            f"Expected the channels {', '.join(_CHANNELS)} in {stored.file}, or the first of them, found "
             f"{', '.join(channels)}. Restore the profile from a copy."
         )
     # Smallest first: the partial sums are then exact.
@@ -85,18 +89,20 @@ def load(folder: Path, stored: StoredArray) -> Shaped[np.ndarray, "..."]:
     return total.reshape(stored.shape).astype(_DTYPES[stored.dtype])
 
 
-def read_checked(folder: Path, file: str, sha256: str) -> Mapping[str, Float[np.ndarray, "rows columns"]]:
-    """The channels of an EXR file of a profile, once its size and checksum are right.
+def read_checked(
+    folder: Path, file: str, sha256: str, shape: Shape | None = None
+) -> Mapping[str, Float[np.ndarray, "rows columns"]]:
+    """The channels of an EXR file of a profile, once its size, checksum and (rows, columns) are right.
 
     Raises:
-        ProfileError: when it is missing, a link out of the folder, too large, altered, or no EXR file.
+        ProfileError: when it is missing, a link, too large, altered, of another shape, or no EXR file.
     """
     path = folder / file
-    if path.is_symlink() or not path.is_file():
+    if not is_plain_file(folder, path):
         raise ProfileError(f"Expected the file {file} in {folder}, found none. Copy the whole profile again.")
     size = path.stat().st_size
-    if size > _MAX_FILE_BYTES:
-        raise ProfileError(f"Expected {path} to hold at most {_MAX_FILE_BYTES} bytes, found {size}. It is not ours.")
+    if size > MAX_FILE_BYTES:
+        raise ProfileError(f"Expected {path} to hold at most {MAX_FILE_BYTES} bytes, found {size}. It is not ours.")
     found = sha256_file(path)
     if found != sha256:
         raise ProfileError(
@@ -104,7 +110,7 @@ def read_checked(folder: Path, file: str, sha256: str) -> Mapping[str, Float[np.
             "the profile was made. Restore it from a copy, or make the profile again."
         )
     try:
-        return read_exr(path)
+        return read_exr(path, shape)
     except FileFormatError as error:
         raise ProfileError(str(error)) from error
 

@@ -15,6 +15,7 @@ from udccal.profiles.schema import Provenance
 from udccal.sessions.schema import StoredCamera
 
 PROFILE_NAME = "profile.json"
+MAX_JSON_BYTES = 32 * 1024 * 1024
 
 
 def provenance_now(session_manifest: Path | None, camera: StoredCamera | None) -> Provenance:

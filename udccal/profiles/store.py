@@ -3,28 +3,25 @@
 from __future__ import annotations
 
 import json
-import os
-import secrets
-import shutil
 import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 from pydantic import ValidationError
 
 from udccal.errors import ProfileError, RigError
+from udccal.io.atomic import write_atomically
+from udccal.io.links import is_plain_file
+from udccal.io.whole_folder import folder_beside, replace_whole, standing
 from udccal.profiles.archive import pack_archive, unpack_archive
 from udccal.profiles.encode import decode, encode
 from udccal.profiles.profile import Profile
-from udccal.profiles.provenance import PROFILE_NAME
+from udccal.profiles.provenance import MAX_JSON_BYTES, PROFILE_NAME
 from udccal.profiles.schema import StoredArray, StoredProfile
 from udccal.profiles.versions import migrated
 from udccal.rig import find_rig
 
 # In a rig's folder, beside its rig.toml.
 RIG_PROFILE = "profile"
-_MAX_JSON_BYTES = 32 * 1024 * 1024
 
 
 def write_profile(path: Path, profile: Profile) -> None:
@@ -35,22 +32,40 @@ def write_profile(path: Path, profile: Profile) -> None:
     """
     check_replaceable(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    with _temporary_beside(path) as folder:
+    with folder_beside(path) as folder:
         stored = encode(profile, folder)
-        (folder / PROFILE_NAME).write_text(stored.model_dump_json(indent=1) + "\n", encoding="utf-8")
+        write_atomically(folder / PROFILE_NAME, stored.model_dump_json(indent=1).encode() + b"\n")
         if path.suffix == ".zip":
-            pack_archive(folder, path)
+            pack_archive(folder, folder / path.name)
+            replace_whole(folder / path.name, path)
         else:
-            _flush(folder)
-            _replace(folder, path)
+            replace_whole(folder, path)
 
 
 def read_profile(path: Path) -> Profile:
-    """Read a profile from a folder or a zip file.
+    """Read a profile from a folder or a zip file; one that is replaced meanwhile is read anew.
 
     Raises:
         ProfileError: when it is missing, damaged, altered, too large, newer, or does not follow docs/profile.md.
     """
+    while True:
+        place, before = standing(path), _identity(path)
+        try:
+            return _read(place)
+        except (ProfileError, OSError):
+            if _identity(path) == before:
+                raise
+
+
+def _identity(path: Path) -> int | None:
+    """Another number when another profile stands there; None when none does."""
+    try:
+        return standing(path).stat().st_ino
+    except OSError:
+        return None
+
+
+def _read(path: Path) -> Profile:
     if path.is_file():
         with tempfile.TemporaryDirectory(prefix="udccal-") as folder:
             unpack_archive(path, Path(folder))
@@ -64,13 +79,13 @@ def find_profile(name_or_path: str | Path) -> Path:
     What is there at the path goes first; a path at which nothing is comes back as it is, for a reader to complain of.
     """
     path = Path(name_or_path)
-    if path.exists():
+    if standing(path).exists():
         return path
     try:
         of_rig = find_rig(name_or_path) / RIG_PROFILE
     except RigError:
         return path
-    return of_rig if of_rig.is_dir() else path
+    return of_rig if standing(of_rig).is_dir() else path
 
 
 def read_stored(folder: Path) -> StoredProfile:
@@ -80,13 +95,13 @@ def read_stored(folder: Path) -> StoredProfile:
         ProfileError: as ``read_profile``.
     """
     file = folder / PROFILE_NAME
-    if not file.is_file():
+    if not is_plain_file(folder, file):
         raise ProfileError(
             f"Expected a profile with a {PROFILE_NAME} at {folder}, found none. Check the path, or calibrate the rig."
         )
     size = file.stat().st_size
-    if size > _MAX_JSON_BYTES:
-        raise ProfileError(f"Expected {file} to hold at most {_MAX_JSON_BYTES} bytes, found {size}. It is not ours.")
+    if size > MAX_JSON_BYTES:
+        raise ProfileError(f"Expected {file} to hold at most {MAX_JSON_BYTES} bytes, found {size}. It is not ours.")
     try:
         found = json.loads(file.read_bytes())
     except (ValueError, RecursionError) as error:
@@ -102,31 +117,6 @@ def read_stored(folder: Path) -> StoredProfile:
         raise ProfileError(
             f"Expected a valid '{where}' in {file}, found: {first['msg']}. Restore it from a copy."
         ) from error
-
-
-@contextmanager
-def _temporary_beside(path: Path) -> Iterator[Path]:
-    folder = path.with_name(f".{path.name}-{secrets.token_hex(6)}.partial")
-    folder.mkdir()
-    try:
-        yield folder
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
-
-
-def _replace(folder: Path, path: Path) -> None:
-    """Move a finished folder into place; an older profile is moved aside first and removed last."""
-    if not path.exists():
-        os.replace(folder, path)
-        return
-    aside = path.with_name(f".{path.name}-{secrets.token_hex(6)}.old")
-    os.replace(path, aside)
-    try:
-        os.replace(folder, path)
-    except OSError:
-        os.replace(aside, path)
-        raise
-    shutil.rmtree(aside, ignore_errors=True)
 
 
 def check_replaceable(path: Path) -> None:
@@ -168,10 +158,3 @@ def stored_files(stored: StoredProfile) -> set[str]:
         if isinstance(covariance, StoredArray):
             files.add(covariance.file)
     return files
-
-
-def _flush(folder: Path) -> None:
-    """Have every byte on disk before the name appears."""
-    for file in folder.iterdir():
-        with file.open("rb+") as stream:
-            os.fsync(stream.fileno())

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Literal
 
 from udccal.io.hashing import sha256_file
+from udccal.io.links import is_plain_file
 from udccal.sessions.schema import Manifest, PanelSubject, StoredStep
 
 _LEFTOVER = re.compile(r"\..+-[0-9a-f]{12}\.partial\.(png|exr|json)")
@@ -47,7 +48,7 @@ def is_leftover(path: Path) -> bool:
 def _damage(folder: Path, step: StoredStep) -> Iterator[Damage]:
     for name, expected in _named_files(step):
         file = folder / name
-        if not file.is_file() or not file.resolve().is_relative_to(folder.resolve()):
+        if not is_plain_file(folder, file):
             yield Damage(step.id, name, "missing")
             continue
         try:

@@ -7,6 +7,7 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from udccal.errors import SessionError
+from udccal.io.links import refuse_links
 
 LOCK_NAME = ".session.lock"
 
@@ -19,6 +20,7 @@ def lock_session(folder: Path) -> FileLock:
     """
     lock = FileLock(folder / LOCK_NAME, timeout=0, thread_local=False)
     try:
+        refuse_links(folder, folder / LOCK_NAME)  # older versions of filelock follow one
         lock.acquire()
     except Timeout as error:
         raise SessionError(

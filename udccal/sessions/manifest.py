@@ -5,13 +5,13 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-import shutil
 from pathlib import Path
 
 from pydantic import ValidationError
 
 from udccal.errors import SessionError
-from udccal.io.atomic import atomic_path, write_atomically
+from udccal.io.atomic import write_atomically
+from udccal.io.links import is_plain_file
 from udccal.sessions.schema import Manifest
 
 MANIFEST_NAME = "session.json"
@@ -35,13 +35,7 @@ def read_manifest(folder: Path, name: str = MANIFEST_NAME) -> Manifest:
         SessionError: when it is missing, too large, not JSON, of a newer version, changed after it was written, or
             does not follow docs/session.md.
     """
-    file = folder / name
-    if not file.is_file():
-        raise SessionError(f"Expected a session with a {name} at {folder}, found none. Check the path, or capture one.")
-    size = file.stat().st_size
-    if size > _MAX_BYTES:
-        raise SessionError(f"Expected {file} to hold at most {_MAX_BYTES} bytes, found {size}. It is not a manifest.")
-    content = file.read_bytes()
+    file, content = folder / name, _content(folder, name)
     _check_seal(file, content)
     _check_version(file, content)
     try:
@@ -60,8 +54,20 @@ def write_manifest(folder: Path, manifest: Manifest) -> None:
 
 def keep_previous(folder: Path) -> None:
     """Copy the manifest as it stands, so that damage to the next one costs one step only."""
-    with atomic_path(folder / PREVIOUS_NAME) as temporary:
-        shutil.copyfile(folder / MANIFEST_NAME, temporary)
+    write_atomically(folder / PREVIOUS_NAME, _content(folder, MANIFEST_NAME))
+
+
+def _content(folder: Path, name: str) -> bytes:
+    file = folder / name
+    if not is_plain_file(folder, file):
+        found = "a link" if file.is_symlink() else "none"
+        raise SessionError(
+            f"Expected a session with a {name} at {folder}, found {found}. Check the path, or capture one."
+        )
+    size = file.stat().st_size
+    if size > _MAX_BYTES:
+        raise SessionError(f"Expected {file} to hold at most {_MAX_BYTES} bytes, found {size}. It is not a manifest.")
+    return file.read_bytes()
 
 
 def _check_seal(file: Path, content: bytes) -> None:

@@ -13,6 +13,7 @@ from udccal.cameras.protocol import Region
 from udccal.errors import SessionError
 from udccal.io.exr import write_exr
 from udccal.io.hashing import sha256_file
+from udccal.io.links import make_folder
 from udccal.io.png import write_png16, write_rgb8
 from udccal.sessions.captured import AveragedFrames, Capture, SingleFrame
 from udccal.sessions.schema import RELATIVE_PATH, PanelSubject, StoredCapture, StoredRegion
@@ -63,9 +64,7 @@ def _place(folder: Path, name: str) -> Path:
     if not re.fullmatch(RELATIVE_PATH, name):
         raise SessionError(f"Expected a step id of letters, digits, '_', '-' and '/', found a file name '{name}'.")
     file = folder / name
-    file.parent.mkdir(parents=True, exist_ok=True)
-    if not file.parent.resolve().is_relative_to(folder.resolve()):
-        raise SessionError(f"Expected {file.parent} to be a folder, found a link out of the session. Remove it.")
+    make_folder(folder, file.parent)
     return file
 
 

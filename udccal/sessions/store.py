@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import final
+from typing import TypeVar, final
 
 import numpy as np
 from jaxtyping import Float32, UInt8, UInt16
@@ -12,10 +13,14 @@ from jaxtyping import Float32, UInt8, UInt16
 from udccal.errors import FileFormatError, SessionError
 from udccal.io.exr import read_exr
 from udccal.io.hashing import sha256_file
+from udccal.io.limits import Shape
+from udccal.io.links import is_plain_file
 from udccal.io.png import read_png16, read_rgb8
 from udccal.rig import RigDescription
 from udccal.sessions.manifest import read_manifest
 from udccal.sessions.schema import Manifest, PanelSubject, StoredCamera, StoredCapture, StoredStep, TermName
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -82,8 +87,7 @@ class Session:
         """
         if capture.kind != "frame":
             raise SessionError(f"Expected '{capture.file}' of {self.path} to be a single frame, found an average.")
-        data = self._read(capture.file, capture.sha256, read_png16)
-        self._check_shape(capture, data.shape)
+        data = self._read(capture.file, capture.sha256, _shape(capture), read_png16)
         self._check_range(capture, float(data.max()))
         return data
 
@@ -95,14 +99,13 @@ class Session:
         """
         if capture.kind != "average":
             raise SessionError(f"Expected '{capture.file}' of {self.path} to be an average, found a single frame.")
-        channels = self._read(capture.file, capture.sha256, read_exr)
+        channels = self._read(capture.file, capture.sha256, _shape(capture), read_exr)
         if set(channels) != {"mean", "variance"}:
             raise SessionError(
                 f"Expected the channels mean and variance in '{capture.file}' of {self.path}, "
                 f"found {', '.join(sorted(channels))}. Write it as docs/session.md says."
             )
         mean, variance = channels["mean"], channels["variance"]
-        self._check_shape(capture, mean.shape)
         self._check_range(capture, float(mean.max()))
         if float(min(mean.min(), variance.min())) < 0:
             raise SessionError(f"Expected no negative values in '{capture.file}' of {self.path}, found some.")
@@ -114,18 +117,12 @@ class Session:
         Raises:
             SessionError: when the file is missing, changed or of another size.
         """
-        picture = self._read(subject.picture, subject.picture_sha256, read_rgb8)
-        expected = (self.rig.panel.rows, self.rig.panel.columns)
-        if picture.shape[:2] != expected:
-            raise SessionError(
-                f"Expected '{subject.picture}' of {self.path} to have {expected[1]} x {expected[0]} pixels as the "
-                f"panel, found {picture.shape[1]} x {picture.shape[0]}. Store what the panel showed, pixel for pixel."
-            )
-        return picture
+        panel = self.rig.panel
+        return self._read(subject.picture, subject.picture_sha256, (panel.rows, panel.columns), read_rgb8)
 
-    def _read(self, name: str, sha256: str, reader):  # type: ignore[no-untyped-def]
+    def _read(self, name: str, sha256: str, shape: Shape, reader: Callable[[Path, Shape], T]) -> T:
         file = self.path / name
-        if not file.is_file() or not file.resolve().is_relative_to(self.path.resolve()):
+        if not is_plain_file(self.path, file):
             raise SessionError(
                 f"Expected the file '{name}' inside the session {self.path}, found none. Restore it, or capture again."
             )
@@ -138,17 +135,9 @@ class Session:
                 )
             self._verified.add((name, sha256))
         try:
-            return reader(file)
+            return reader(file, shape)
         except FileFormatError as error:
             raise SessionError(str(error)) from error
-
-    def _check_shape(self, capture: StoredCapture, shape: tuple[int, ...]) -> None:
-        region = capture.region
-        if shape != (region.rows, region.columns):
-            raise SessionError(
-                f"Expected '{capture.file}' of {self.path} to have {region.columns} x {region.rows} samples as its "
-                f"region says, found {shape[1]} x {shape[0]}. Correct the region, or capture again."
-            )
 
     def _check_range(self, capture: StoredCapture, largest: float) -> None:
         limit = self.rig.saturation_DN
@@ -157,6 +146,10 @@ class Session:
                 f"Expected samples of at most {limit} DN in '{capture.file}' of {self.path} ({self.rig.camera.bits} "
                 f"bits), found {largest:g}. Store them right-aligned, as the converter delivers them."
             )
+
+
+def _shape(capture: StoredCapture) -> Shape:
+    return capture.region.rows, capture.region.columns
 
 
 def _checksum(file: Path) -> str:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import errno
-import shutil
+import os
 from collections.abc import Callable, Iterator, Sequence, Set
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from types import TracebackType
@@ -257,8 +257,8 @@ def _read_or_recover(folder: Path) -> tuple[Manifest, bool]:
         if manifest is None:
             raise
     with _sentences("the manifest", folder):
-        if (folder / MANIFEST_NAME).exists():  # a person may have edited it, and want that back
-            shutil.copyfile(folder / MANIFEST_NAME, folder / DAMAGED_NAME)
+        with suppress(FileNotFoundError):  # a person may have edited it, and want that back; a link is moved as it is
+            os.replace(folder / MANIFEST_NAME, folder / DAMAGED_NAME)
         write_manifest(folder, manifest)
     return manifest, True
 

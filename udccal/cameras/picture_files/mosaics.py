@@ -15,6 +15,7 @@ from udccal.cameras.picture_files.raw import RAW_SUFFIXES, raw_mosaic
 from udccal.cameras.picture_files.tiff import read_tiff16
 from udccal.errors import FileFormatError
 from udccal.io.exr import read_exr
+from udccal.io.limits import Shape
 from udccal.io.png import read_png16
 
 PICTURE_SUFFIXES: Final = (".png", ".tif", ".tiff", ".exr", *RAW_SUFFIXES)
@@ -30,13 +31,13 @@ class Layout:
     bits: int
 
 
-def read_raw(path: Path) -> Mosaic:
-    """Read a camera raw file with what it states.
+def read_raw(path: Path, shape: Shape | None = None) -> Mosaic:
+    """Read a camera raw file with what it states; ``shape`` as ``raw_mosaic``.
 
     Raises:
         FileFormatError: when it is missing, not a raw file, damaged, too large, or not a 2 x 2 Bayer mosaic.
     """
-    return replace(raw_mosaic(path), exposure_s=read_facts(path).exposure_s)
+    return replace(raw_mosaic(path, shape), exposure_s=read_facts(path).exposure_s)
 
 
 def read_mosaic(path: Path, layout: Layout) -> Mosaic:

@@ -12,7 +12,7 @@ import rawpy
 
 from udccal.cameras.picture_files.mosaic import Mosaic
 from udccal.errors import FileFormatError
-from udccal.io.limits import check_size
+from udccal.io.limits import Shape, check_size
 
 RAW_SUFFIXES = (
     *(".dng", ".cr2", ".cr3", ".nef", ".nrw", ".arw", ".srf", ".sr2", ".raf", ".rw2", ".orf"),
@@ -20,14 +20,18 @@ RAW_SUFFIXES = (
 )
 
 
-def raw_mosaic(path: Path) -> Mosaic:
+def raw_mosaic(path: Path, shape: Shape | None = None) -> Mosaic:
     """Read the visible part of a Bayer mosaic, unprocessed but for what the maker's coding needs.
 
+    Of another ``shape`` (rows, columns) than the one given, it is not decoded.
+
     Raises:
-        FileFormatError: when it is missing, not a raw file, damaged, too large, or not a 2 x 2 Bayer mosaic.
+        FileFormatError: when it is missing, not a raw file, damaged, too large, of another shape, or not a 2 x 2
+            Bayer mosaic.
     """
     with _opened(path) as raw:
         check_size(path, raw.sizes.raw_height, raw.sizes.raw_width)
+        check_size(path, raw.sizes.height, raw.sizes.width, shape=shape)
         raw.unpack()
         return Mosaic(
             data=raw.raw_image_visible.copy(),

@@ -20,6 +20,7 @@ from udccal.compilation import compilation_clock, keep_compilations
 from udccal.displays.pictures import face_picture
 from udccal.fitting.calibrate import ORDER, QUICK, Foundation, fit_foundation
 from udccal.fitting.psf.fit import nominal_psf
+from udccal.io.links import make_folder
 from udccal.io.photograph import read_photograph
 from udccal.io.png import write_png16, write_rgb8
 from udccal.kernels import kernel_size, kernels_at
@@ -141,7 +142,7 @@ def _restore_portrait(
         after = restorer.restore(scene.mosaic, scene.exposure_s, panel_picture)
         before = restorer.before(scene.mosaic, scene.exposure_s)
     folder = out / "portrait"
-    folder.mkdir(exist_ok=True)
+    make_folder(out, folder)
     write_png16(folder / "mosaic.png", scene.mosaic)
     write_rgb8(folder / "panel.png", panel_picture)
     tone = Tone(display_exposure(scene.ideal))

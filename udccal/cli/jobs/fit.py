@@ -14,6 +14,7 @@ from udccal.displays.pictures import face_picture
 from udccal.errors import FitError, UdccalError
 from udccal.fitting.calibrate import ORDER, Calibration, FitEffort, Foundation, fit_session
 from udccal.fitting.engine.iteration_log import LOG
+from udccal.io.links import refuse_links
 from udccal.profiles.profile import build_profile
 from udccal.profiles.provenance import provenance_now
 from udccal.profiles.store import check_replaceable, write_profile
@@ -94,6 +95,7 @@ def _iterations_to(path: Path | None) -> Iterator[None]:
         yield
         return
     try:
+        refuse_links(path.parent, path)
         handler = logging.FileHandler(path, mode="w", encoding="utf-8")
     except OSError as error:
         raise UdccalError(

@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import UInt8
 
-from udccal.errors import FileFormatError
 from udccal.io.png import read_rgb8
 from udccal.rig import RigDescription
 
@@ -18,10 +17,4 @@ def read_panel_picture(path: Path, rig: RigDescription) -> UInt8[np.ndarray, "pa
     Raises:
         FileFormatError: when it cannot be read or has another size.
     """
-    picture = read_rgb8(path)
-    if picture.shape[:2] != (rig.panel.rows, rig.panel.columns):
-        raise FileFormatError(
-            f"Expected {path} to have {rig.panel.columns} x {rig.panel.rows} pixels as the panel has, found "
-            f"{picture.shape[1]} x {picture.shape[0]}. Give the picture as the panel showed it."
-        )
-    return picture
+    return read_rgb8(path, (rig.panel.rows, rig.panel.columns))

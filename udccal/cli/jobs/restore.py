@@ -14,6 +14,7 @@ from udccal.cli.jobs.panel_picture import read_panel_picture
 from udccal.cli.output import Output
 from udccal.compilation import keep_compilations
 from udccal.errors import RestorationError
+from udccal.io.limits import Shape
 from udccal.io.png import read_png16
 from udccal.profiles.store import find_profile, read_profile
 from udccal.restoration.runtime import Restorer, check_frame
@@ -92,7 +93,7 @@ def _checked_frame(
     image: Path, given_s: float | None, rig: RigDescription
 ) -> tuple[UInt16[np.ndarray, "rows columns"], float]:
     """A frame that belongs to the rig, and its exposure: the one given goes before the file's own."""
-    mosaic, in_file = _read_mosaic(image)
+    mosaic, in_file = _read_mosaic(image, (rig.camera.rows, rig.camera.columns))
     exposure = in_file if given_s is None else given_s
     if exposure is None:
         raise RestorationError(
@@ -105,9 +106,9 @@ def _checked_frame(
     return mosaic, exposure
 
 
-def _read_mosaic(image: Path) -> tuple[UInt16[np.ndarray, "rows columns"], float | None]:
+def _read_mosaic(image: Path, shape: Shape) -> tuple[UInt16[np.ndarray, "rows columns"], float | None]:
     """A mosaic and the exposure its file states, if any."""
     if image.suffix.lower() == ".png":
-        return read_png16(image), None
-    raw = read_raw(image)
+        return read_png16(image, shape), None
+    raw = read_raw(image, shape)
     return raw.data, raw.exposure_s

@@ -1,0 +1,21 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from udccal.cameras.protocol import CameraIdentity
+from udccal.cli.jobs.fit import fit_to_profile
+from udccal.cli.output import Output
+from udccal.errors import UdccalError
+from udccal.rig import load_rig
+from udccal.sessions.writer import SessionWriter
+
+
+def test_iterations_are_not_written_through_a_link(tmp_path: Path) -> None:
+    SessionWriter.create(tmp_path / "session", load_rig("lg55-reduced"), CameraIdentity("a", "b", "c", "d")).close()
+    (tmp_path / "mine").write_text("mine")
+    (tmp_path / "session" / "fit.log").symlink_to(tmp_path / "mine")
+    with pytest.raises(UdccalError, match=r"fit\.log is a link; remove it"):
+        fit_to_profile(Output(), tmp_path / "session", tmp_path / "profile", tmp_path / "session" / "fit.log")
+    assert (tmp_path / "mine").read_text() == "mine"
