@@ -1,59 +1,48 @@
-"""Fit from Python: estimators take a session and return a term with its covariance, its status and how it was reached.
+"""From a rig to a restored picture in Python: capture, fit, ask how sure, write a profile, restore.
 
-python examples/fit_api.py                # captures a toy session of a simulated sensor first
-python examples/fit_api.py SESSION        # fits the noise term of a session of your own
+python examples/fit_api.py                # a toy session of a simulated sensor: its noise
+python examples/fit_api.py SESSION OUT    # a whole session of your own, to a profile
 """
 
 from __future__ import annotations
 
-import argparse
+import sys
 import tempfile
 from pathlib import Path
 
-from udccal.cli.jobs.benches import simulated_bench, simulated_rig
-from udccal.cli.jobs.capture import capture
-from udccal.cli.output import Output
-from udccal.fitting.noise import fit_noise
-from udccal.models.noise import electrons, variance_e
-from udccal.rig import RigDescription, load_rig
-from udccal.sessions.store import Session
+import udccal
+from udccal.models.noise import electrons
 
 
-def toy_rig() -> RigDescription:
+def toy_rig() -> udccal.RigDescription:
     """A shipped rig with a quarter of its sensor and few captures."""
-    rig = load_rig("lg55-reduced")
+    rig = udccal.load_rig("lg55-reduced")
     camera = rig.camera.model_copy(update={"columns": 256, "rows": 192})
     captures = rig.captures.model_copy(update={"noise_levels": 8, "noise_stack": 4})
     return rig.model_copy(update={"name": "toy", "camera": camera, "captures": captures})
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("session", type=Path, nargs="?")
-    arguments = parser.parse_args()
-    with tempfile.TemporaryDirectory() as folder:
-        path = arguments.session
-        if path is None:
-            path = Path(folder) / "session"
-            rig = toy_rig()
-            with simulated_bench(simulated_rig(rig, seed=0)) as bench:
-                capture(Output(), rig, bench, path, ("noise",))
-        report(Session.open(path))
-
-
-def report(session: Session) -> None:
-    """Fit, look at the result, and use the term."""
-    result = fit_noise(session)
-    print(f"{result.status.name}: {result.status.value}")
+def report(result: udccal.FitResult) -> None:
+    """What a fit found, and what to do where it failed."""
+    print(f"{result.name}: {result.status.name}: {result.status.value}")
     for estimate in result.estimates:
         print(f"  {estimate.name:22} {estimate.value:12.5g} ± {estimate.sigma:.2g} {estimate.unit}")
-    print(f"  reduced chi-squared {result.chi2_dof:.3f} over {result.samples} samples")
 
-    noise = result.or_raise().term  # a bad status becomes a FitError that says what to do
-    signal_e = float(electrons(noise, 1000.0))
-    sigma_e = float(variance_e(noise, signal_e, 0.01)) ** 0.5
-    print(f"A sample of 1000 DN at 10 ms is {signal_e:.0f} ± {sigma_e:.0f} electrons.")
+
+def main(arguments: list[str]) -> None:
+    if len(arguments) == 2:
+        calibration = udccal.calibrate(udccal.Session.open(arguments[0]))
+        for result in calibration.results:
+            report(result)
+        print(f"Wrote {calibration.or_raise().write(arguments[1])}")
+        return
+    with tempfile.TemporaryDirectory() as folder, udccal.simulate(toy_rig(), seed=0) as bench:
+        session = udccal.capture(Path(folder) / "session", bench, terms=["noise"])
+        noise = udccal.fit(session, "noise")
+    report(noise)
+    sigma = float(noise.sigma_of(lambda term: electrons(term, 1000.0)))
+    print(f"A sample of 1000 DN is {float(electrons(noise.or_raise().term, 1000.0)):.1f} ± {sigma:.1f} electrons.")
 
 
 if __name__ == "__main__":
-    main()
+    main(sys.argv[1:])

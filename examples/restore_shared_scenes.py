@@ -19,8 +19,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from udccal.cli.jobs.benches import simulated_rig
-from udccal.cli.jobs.scene import capture_photograph
+from udccal.benches.bench import simulated_rig
+from udccal.benches.photograph import capture_photograph
 from udccal.displays.pictures import face_picture
 from udccal.io.photograph import read_photograph
 from udccal.io.png import write_rgb8

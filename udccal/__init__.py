@@ -1,3 +1,65 @@
-"""udccal: calibrate a camera that looks through a transparent display, and restore what it sees."""
+"""udccal: calibrate a camera that looks through a transparent display, and restore what it sees.
+
+    rig = udccal.load_rig("lg55-reduced")
+    with udccal.simulate(rig) as bench:
+        session = udccal.capture("session", bench)
+    calibration = udccal.calibrate(session)
+    calibration.or_raise().write("profile")
+    picture = udccal.Restorer.load("profile").restore(frame, exposure_s=8e-3)
+
+Every name is loaded when it is first used: importing udccal alone takes no time.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from udccal.benches.bench import simulate as simulate
+    from udccal.benches.capture import capture as capture
+    from udccal.calibration import Calibration as Calibration
+    from udccal.calibration import calibrate as calibrate
+    from udccal.calibration import fit as fit
+    from udccal.errors import UdccalError as UdccalError
+    from udccal.profiles.profile import Profile as Profile
+    from udccal.profiles.store import load_profile as load_profile
+    from udccal.restoration.runtime import Restorer as Restorer
+    from udccal.result import FitResult as FitResult
+    from udccal.result import FitStatus as FitStatus
+    from udccal.rig import RigDescription as RigDescription
+    from udccal.rig import load_rig as load_rig
+    from udccal.sessions.store import Session as Session
 
 __version__ = "0.1.0"
+
+_HOMES = {
+    "Calibration": "udccal.calibration",
+    "FitResult": "udccal.result",
+    "FitStatus": "udccal.result",
+    "Profile": "udccal.profiles.profile",
+    "Restorer": "udccal.restoration.runtime",
+    "RigDescription": "udccal.rig",
+    "Session": "udccal.sessions.store",
+    "UdccalError": "udccal.errors",
+    "calibrate": "udccal.calibration",
+    "capture": "udccal.benches.capture",
+    "fit": "udccal.calibration",
+    "load_profile": "udccal.profiles.store",
+    "load_rig": "udccal.rig",
+    "simulate": "udccal.benches.bench",
+}
+
+__all__ = list(_HOMES)
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module 'udccal' has no attribute '{name}'; it has {', '.join(__all__)}")
+    value = getattr(importlib.import_module(_HOMES[name]), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

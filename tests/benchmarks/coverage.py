@@ -22,9 +22,9 @@ from jaxtyping import Float
 
 from tests.benchmarks.psf_wave_optics import coverage as psf_coverage
 from tests.benchmarks.readme_tables import between
-from udccal.cli.jobs.benches import simulated_bench
-from udccal.cli.jobs.capture import capture
-from udccal.cli.output import Output
+from udccal.benches.bench import simulated_bench
+from udccal.benches.capture import capture
+from udccal.calibration import FitEffort, Foundation, fit_foundation
 from udccal.compilation import keep_compilations
 from udccal.displays.pictures import face_picture
 from udccal.fitting.backscatter.bins import Bins
@@ -33,7 +33,6 @@ from udccal.fitting.backscatter.fit import problem_of
 from udccal.fitting.backscatter.light import predict_light
 from udccal.fitting.backscatter.report import known_from
 from udccal.fitting.backscatter.select import choose
-from udccal.fitting.calibrate import FitEffort, Foundation, fit_foundation
 from udccal.fitting.geometry.fit import projection_sigma_px
 from udccal.models.geometry import project_directions
 from udccal.numerics import in_float64
@@ -159,7 +158,7 @@ def specimen(seed: int, folder: Path) -> Specimen:
     rig = load_rig(_RIG)
     truth = draw_truth(rig, seed)
     with simulated_bench(SimulatedWorld(truth, seed=seed)) as bench:
-        capture(Output(), rig, bench, folder, ("noise", "geometry", "wire", "backscatter"))
+        capture(folder, bench, ("noise", "geometry", "wire", "backscatter"))
     session = Session.open(folder)
     return Specimen(truth, session, fit_foundation(session))
 

@@ -23,9 +23,9 @@ import numpy as np
 from tests.benchmarks.planning_psf import Compared, compared_psf
 from tests.benchmarks.readme_tables import between
 from tests.benchmarks.rows import Row, table, write_json
-from udccal.cli.jobs.benches import simulated_bench, simulated_rig
-from udccal.cli.jobs.capture import capture
-from udccal.cli.output import Output
+from udccal.benches.bench import simulated_bench, simulated_rig
+from udccal.benches.capture import capture
+from udccal.calibration import Calibration, FitEffort, calibrate
 from udccal.compilation import keep_compilations
 from udccal.displays.pictures import face_picture
 from udccal.fitting.backscatter.data import read_shots as read_pictures
@@ -34,7 +34,6 @@ from udccal.fitting.backscatter.fit import problem_of
 from udccal.fitting.backscatter.light import predict_light
 from udccal.fitting.backscatter.report import known_from
 from udccal.fitting.backscatter.select import choose
-from udccal.fitting.calibrate import Calibration, FitEffort, fit_session
 from udccal.fitting.geometry.fit import projection_sigma_px
 from udccal.planning.measured import Measured, measured_state
 from udccal.planning.predictors import predictor_for
@@ -71,14 +70,14 @@ class Obtained:
         """What the fit states, in the unit of the term's target."""
         match term:
             case "noise":
-                K = self.calibration.foundation.noise.estimate("K_DN_per_e")
+                K = self.calibration.noise.estimate("K_DN_per_e")
                 return 100 * K.sigma / K.value
             case "geometry":
                 places = sensor_samples(self.session.rig, 17)
-                sigma = projection_sigma_px(self.calibration.foundation.geometry, places)
+                sigma = projection_sigma_px(self.calibration.geometry, places)
                 return float(np.sqrt(np.mean(sigma**2)))
             case "wire":
-                found = {item.name: item.value for item in self.calibration.foundation.wire.diagnostics}
+                found = {item.name: item.value for item in self.calibration.wire.diagnostics}
                 return float(np.sqrt(found["wire_map_rms_sigma"] ** 2 - found["wire_map_model_sigma"] ** 2))
             case "backscatter":
                 return _backscatter_percent(self)
@@ -89,9 +88,9 @@ class Obtained:
 def obtained(rig: RigDescription, folder: Path, seed: int = 0) -> Obtained:
     """Capture a rig in simulation (what the folder holds already is kept), and fit it."""
     with simulated_bench(simulated_rig(rig, seed)) as bench:
-        capture(Output(), rig, bench, folder, _OF_SESSIONS)
+        capture(folder, bench, _OF_SESSIONS)
     session = Session.open(folder)
-    return Obtained(session, fit_session(session))
+    return Obtained(session, calibrate(session))
 
 
 def _backscatter_percent(made: Obtained) -> float:

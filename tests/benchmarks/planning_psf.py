@@ -14,7 +14,7 @@ from jaxtyping import Float
 from procedures.psf import led_positions_px
 from tests.benchmarks.psf_scene import DISC_PX, Scene, pictures, shots_of, small_scene
 from udccal.arrangements import Led
-from udccal.fitting.calibrate import FitEffort
+from udccal.calibration import FitEffort
 from udccal.fitting.psf.blocks import fit_lattice
 from udccal.fitting.psf.descent import Prior
 from udccal.fitting.psf.field import fit_field

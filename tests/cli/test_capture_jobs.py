@@ -10,10 +10,11 @@ from procedures.noise import NoiseProcedure
 from procedures.plans import Fixed, Metered, Stack
 from tests.toy_rigs import write_toy_rig
 from udccal.arrangements import Dark, FlatLight, Occasion
+from udccal.benches.bench import CaptureBench, simulated_bench, simulated_rig
+from udccal.benches.capture import capture
 from udccal.cameras.protocol import Settings
 from udccal.cameras.simulated import SimulatedCamera
-from udccal.cli.jobs.benches import CaptureBench, files_bench, simulated_bench, simulated_rig
-from udccal.cli.jobs.capture import capture
+from udccal.cli.jobs.benches import files_bench
 from udccal.cli.jobs.person import PersonStage
 from udccal.cli.output import Output
 from udccal.errors import CameraError, CaptureError, UdccalError
@@ -63,10 +64,10 @@ def test_pictures_of_any_camera_make_a_session(tmp_path: Path, rig: RigDescripti
         files_bench(Output(), rig, root, tmp_path / "shown") as bench,
         pytest.raises(CameraError, match=r"pictures of the step noise/dark_2 .* Cap the lens.* Put the files there"),
     ):
-        capture(Output(), rig, bench, tmp_path / "session", ("noise",))
+        capture(tmp_path / "session", bench, ("noise",))
     (tmp_path / "late").rename(late)
     with files_bench(Output(), rig, root, tmp_path / "shown") as bench:
-        capture(Output(), rig, bench, tmp_path / "session", ("noise",))
+        capture(tmp_path / "session", bench, ("noise",))
     session = Session.open(tmp_path / "session")
     assert session.camera.backend == "files"
     result = fit_noise(session)
@@ -123,11 +124,11 @@ class Forgetful:
 def test_a_step_that_was_refused_is_repeated_alone(tmp_path: Path, rig: RigDescription) -> None:
     with simulated_bench(simulated_rig(rig, seed=0)) as plain:
         stage = Forgetful(plain)
-        bench = CaptureBench(plain.camera, plain.display, stage, plain.now, stage.try_again)
-        capture(Output(), rig, bench, tmp_path / "session", ("noise",))
+        bench = CaptureBench(plain.rig, plain.camera, plain.display, stage, plain.now, stage.try_again)
+        capture(tmp_path / "session", bench, ("noise",))
         assert len(stage.said) == 1
         assert "noise/flat_stack: Expected to see the light" in stage.said[0]
         stage.forgot = False
         with pytest.raises(CaptureError, match="wire/flat"):
-            capture(Output(), rig, bench, tmp_path / "session", ("wire",))
+            capture(tmp_path / "session", bench, ("wire",))
     assert len(Session.open(tmp_path / "session").steps("noise")) == sum(1 for _ in NoiseProcedure().steps(rig))

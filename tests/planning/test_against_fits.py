@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 from tests.toy_rigs import write_toy_rig
-from udccal.cli.jobs.benches import simulated_bench, simulated_rig
-from udccal.cli.jobs.capture import capture
-from udccal.cli.output import Output
+from udccal.benches.bench import simulated_bench, simulated_rig
+from udccal.benches.capture import capture
 from udccal.fitting.noise.fit import fit_noise
 from udccal.fitting.wire.fit import fit_wire
 from udccal.planning.noise import NoisePredictor
@@ -28,7 +27,7 @@ _OFF = 0.15
 
 def captured(rig: RigDescription, term: TermName, folder: Path) -> Session:
     with simulated_bench(simulated_rig(rig, 0)) as bench:
-        capture(Output(), rig, bench, folder, [term])
+        capture(folder, bench, [term])
     return Session.open(folder)
 
 

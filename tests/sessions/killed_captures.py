@@ -18,10 +18,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from udccal.cli.jobs.benches import simulated_bench, simulated_rig
-from udccal.cli.jobs.capture import capture
-from udccal.cli.output import Output
-from udccal.fitting.calibrate import ORDER
+from udccal.benches.bench import simulated_bench, simulated_rig
+from udccal.benches.capture import capture
+from udccal.calibration import ORDER
 from udccal.rig import RigDescription, load_rig
 from udccal.sessions.manifest import read_manifest
 from udccal.sessions.schema import TermName
@@ -64,7 +63,7 @@ def small_rig(coarser: int) -> RigDescription:
 def capture_once(work: Work, folder: Path) -> None:
     """What ``udccal calibrate`` captures, in this process."""
     with simulated_bench(work.world) as bench:
-        capture(Output(), work.rig, bench, folder, work.terms)
+        capture(folder, bench, work.terms)
 
 
 def contents(folder: Path) -> dict[str, str]:

@@ -47,21 +47,21 @@ def test_its_numbers_mean_what_the_page_says(session: Session, world: dict) -> N
 
 @pytest.mark.slow
 def test_it_fits(session: Session, world: dict) -> None:
-    from udccal.fitting.calibrate import fit_session
+    from udccal.calibration import calibrate
     from udccal.models.psf import psf_kernels
     from udccal.models.wire import wire_map
 
-    results = fit_session(session, lambda *_: None)
+    results = calibrate(session, lambda *_: None)
     for term in ("noise", "geometry", "wire", "psf", "backscatter"):
         found = results.result(term)
         assert found.ok, (term, found.status, found.notes)
-    noise = results.foundation.noise
+    noise = results.noise
     assert noise.estimate("K_DN_per_e").value == pytest.approx(world["K_DN_PER_E"], rel=0.02)
     assert noise.estimate("PRNU1288").value == pytest.approx(world["PRNU"], rel=0.1)
-    focal = np.asarray(results.foundation.geometry.term.focal)
+    focal = np.asarray(results.geometry.term.focal)
     np.testing.assert_allclose(focal, world["FOCAL_PX"], rtol=2e-3)
     rows, columns = world["ROWS"], world["COLUMNS"]
-    wire = np.asarray(wire_map(results.foundation.wire.term, rows, columns))
+    wire = np.asarray(wire_map(results.wire.term, rows, columns))
     assert np.sqrt(np.mean((wire / world["wire"]() - 1) ** 2)) < 2e-3
     position = np.array([[250.0, 120.0]])
     kernel = np.asarray(psf_kernels(results.psf.term, position, 61, 41))[0]

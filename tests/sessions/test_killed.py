@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from tests.sessions.killed_captures import Work, capture_once, contents, small_rig
-from udccal.cli.jobs.benches import simulated_rig
+from udccal.benches.bench import simulated_rig
 
 ROOT = Path(__file__).resolve().parents[2]
 

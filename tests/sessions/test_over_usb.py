@@ -14,11 +14,10 @@ from tests.virtual_u3v.backend import VirtualBackend
 from tests.virtual_u3v.camera import VirtualCamera
 from tests.virtual_u3v.faults import Faults
 from tests.virtual_u3v.rig_source import RigSource, model_of_rig
+from udccal.benches.bench import CaptureBench, simulated_rig
+from udccal.benches.capture import capture
 from udccal.cameras.choice import mode_for
 from udccal.cameras.u3v.camera import U3vCamera
-from udccal.cli.jobs.benches import CaptureBench, simulated_rig
-from udccal.cli.jobs.capture import capture
-from udccal.cli.output import Output
 from udccal.displays.simulated import SimulatedDisplay
 from udccal.errors import CameraError, CameraLost
 from udccal.fitting.noise.fit import fit_noise
@@ -37,7 +36,8 @@ def rig(tmp_path: Path) -> RigDescription:
 def bench_over_usb(rig: RigDescription, world: SimulatedWorld, device: VirtualCamera) -> Iterator[CaptureBench]:
     with U3vCamera(backend=VirtualBackend([device])) as camera:
         camera.set_mode(mode_for(camera.features, camera.sensor, rig.camera.cfa, rig.camera.bits))
-        yield CaptureBench(camera, SimulatedDisplay(world), world, world.now, lambda sentence: False)
+        description = world.truth.description
+        yield CaptureBench(description, camera, SimulatedDisplay(world), world, world.now, lambda sentence: False)
 
 
 def rejections(session: Session) -> Counter[str]:
@@ -49,7 +49,7 @@ def test_a_session_over_usb_fits_like_one_without(tmp_path: Path, rig: RigDescri
     world = simulated_rig(rig, seed=2)
     with bench_over_usb(rig, world, VirtualCamera(model_of_rig(world), RigSource(world))) as bench:
         assert bench.camera.mode.pixel_format == "BayerRG12p"
-        capture(Output(), rig, bench, tmp_path / "session", ("noise",))
+        capture(tmp_path / "session", bench, ("noise",))
         assert bench.camera.counts.dropped == bench.camera.counts.incomplete == 0
     session = Session.open(tmp_path / "session")
     assert session.camera.backend == "u3v"
@@ -65,7 +65,7 @@ def test_what_the_cable_spoils_is_replaced_and_counted(tmp_path: Path, rig: RigD
     faults = Faults(short_frames=tuple(frames[25::9]), dropped_frames=tuple(frames[20::7]))
     with bench_over_usb(rig, world, device) as bench:
         device.inject(faults)
-        capture(Output(), rig, bench, tmp_path / "session", ("wire",))
+        capture(tmp_path / "session", bench, ("wire",))
         counts = bench.camera.counts
     session = Session.open(tmp_path / "session")
     found = rejections(session)
@@ -81,7 +81,7 @@ def test_an_unplugged_camera_costs_the_step_in_hand(tmp_path: Path, rig: RigDesc
     with bench_over_usb(rig, world, device) as bench:
         device.inject(Faults(unplug_at_frame=40))
         with pytest.raises(CameraLost, match=r"Expected .* found"):
-            capture(Output(), rig, bench, tmp_path / "session", ("noise", "wire"))
+            capture(tmp_path / "session", bench, ("noise", "wire"))
     before = Session.open(tmp_path / "session").manifest.steps
     assert 0 < len(before) < 20
     with pytest.raises(CameraError, match=r"Expected .* found"), bench_over_usb(rig, world, device):
@@ -89,7 +89,7 @@ def test_an_unplugged_camera_costs_the_step_in_hand(tmp_path: Path, rig: RigDesc
     device.inject(Faults())
     device.plug()
     with bench_over_usb(rig, world, device) as bench:
-        capture(Output(), rig, bench, tmp_path / "session", ("noise", "wire"))
+        capture(tmp_path / "session", bench, ("noise", "wire"))
     after = Session.open(tmp_path / "session").manifest.steps
     assert after[: len(before)] == before
     assert {"wire/flat", "wire/dark"} <= {step.id for step in after}

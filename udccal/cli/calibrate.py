@@ -14,7 +14,7 @@ from udccal.cli.output import Output
 from udccal.errors import CameraError
 
 if TYPE_CHECKING:
-    from udccal.cli.jobs.benches import CaptureBench
+    from udccal.benches.bench import CaptureBench
     from udccal.rig import RigDescription
 
 
@@ -75,7 +75,7 @@ def calibrate(
     log: IterationLog = None,
 ) -> None:
     """Capture every calibration step of a rig, then fit them. An interrupted session goes on where it stopped."""
-    from udccal.cli.jobs.capture import capture
+    from udccal.cli.jobs.capture import capture_watched
     from udccal.cli.jobs.fit import fit_to_profile
     from udccal.profiles.store import check_replaceable
     from udccal.rig import load_rig
@@ -94,12 +94,12 @@ def calibrate(
             opened = _real(output, description, camera, serial, display, monitor, pictures)
     with opened as bench:
         parts = {Exchanged(part.value) for part in exchanged or ()}
-        capture(output, description, bench, session, [t.value for t in term or TermChoice], parts)
+        capture_watched(output, bench, session, [t.value for t in term or TermChoice], parts)
     fit_to_profile(output, session, profile, log)
 
 
 def _simulated(rig: RigDescription, seed: int) -> AbstractContextManager[CaptureBench]:
-    from udccal.cli.jobs.benches import simulated_bench, simulated_rig
+    from udccal.benches.bench import simulated_bench, simulated_rig
 
     return simulated_bench(simulated_rig(rig, seed))
 

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, UInt8
 
 from udccal.arrangements import Dark, PanelPicture
+from udccal.calibration import FitEffort
 from udccal.displays.pictures import face_picture
 from udccal.fitting.backscatter.bins import Bins
 from udccal.fitting.backscatter.data import (
@@ -23,7 +24,6 @@ from udccal.fitting.backscatter.data import (
 )
 from udccal.fitting.backscatter.solve import SLACK_PX, corners_of, window_for
 from udccal.fitting.backscatter.vector import Prior, prior_of, values_of, with_vector
-from udccal.fitting.calibrate import FitEffort
 from udccal.fitting.nominal import nominal_backscatter
 from udccal.models.backscatter import Backscatter, emitter_shares, mixed_colours, panel_light
 from udccal.numerics import in_float64

@@ -9,8 +9,8 @@ from typing import final
 import numpy as np
 from jaxtyping import Float
 
+from udccal.calibration import FitEffort
 from udccal.cfa import channel_map
-from udccal.fitting.calibrate import FitEffort
 from udccal.fitting.psf.blocks import Block, Local, blocks, fit_lattice
 from udccal.fitting.psf.descent import Prior
 from udccal.fitting.psf.normal import Evaluator, kernel_coefficients, overlaps_of, unit_light

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from udccal.arrangements import Led
-from udccal.fitting.calibrate import FitEffort
+from udccal.calibration import FitEffort
 from udccal.fitting.psf.blocks import Block, Local
 from udccal.fitting.psf.descent import Prior, without_locals
 from udccal.fitting.psf.normal import Evaluator, Normal, normal_equations

@@ -73,6 +73,11 @@ def _read(path: Path) -> Profile:
     return decode(read_stored(path), path)
 
 
+def load_profile(name_or_path: str | Path) -> Profile:
+    """Read a profile given by path, or by the name of a rig that has one; errors as for ``read_profile``."""
+    return read_profile(find_profile(name_or_path))
+
+
 def find_profile(name_or_path: str | Path) -> Path:
     """A profile given by path, or by the name of a rig whose folder holds one as ``profile``.
 

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from udccal.calibration import ORDER, Calibration
 from udccal.errors import UdccalError
-from udccal.fitting.calibrate import ORDER, Calibration
 from udccal.fitting.geometry.fit import projection_sigma_px
 from udccal.planning.measured import Measured, measured_state
 from udccal.planning.outlook import Outlook, Trade, outlook

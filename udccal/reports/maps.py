@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from scipy.ndimage import gaussian_filter
 
-from udccal.fitting.calibrate import Calibration
+from udccal.calibration import Calibration
 from udccal.kernels import kernel_size, kernels_at
 from udccal.models.backscatter import backscatter_rate
 from udccal.models.geometry import Geometry, panel_points_mm
@@ -58,7 +58,7 @@ def fitted_maps(calibration: Calibration, picture: UInt8[np.ndarray, "panel_rows
         positions_px=positions,
         kernels=kernels_at(calibration.psf.term, positions, *kernel_size(rig)),
         picture=picture,
-        seen_px=_seen_px(calibration.foundation.geometry.term, rig),
+        seen_px=_seen_px(calibration.geometry.term, rig),
         backscatter=np.asarray(backscatter_rate(calibration.backscatter.term, picture)),
     )
 

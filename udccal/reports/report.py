@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import UInt8
 
-from udccal.fitting.calibrate import ORDER, Calibration
+from udccal.calibration import ORDER, Calibration
 from udccal.reports import figures
 from udccal.reports.accuracy import accuracies
 from udccal.reports.board_views import board_evidence
@@ -35,7 +35,7 @@ def gather(
     fitted = fitted_maps(calibration, picture)
     true = None if light is None else true_maps(light, fitted)
     rows = () if light is None or true is None else compare_with_truth(calibration, light.truth, fitted, true)
-    noise, geometry = calibration.foundation.noise.term, calibration.foundation.geometry.term
+    noise, geometry = calibration.noise.term, calibration.geometry.term
     return Evidence(
         calibration,
         fitted,

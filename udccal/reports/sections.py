@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from matplotlib.figure import Figure
 
-from udccal.fitting.calibrate import ORDER, Calibration
+from udccal.calibration import ORDER, Calibration
 from udccal.reports import figures, fit_figures
 from udccal.reports.accuracy import Accuracy, accuracy_table, trade_sentence
 from udccal.reports.board_views import BoardEvidence

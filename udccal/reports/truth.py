@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from udccal.fitting.calibrate import Calibration
+from udccal.calibration import Calibration
 from udccal.kernels import kernel_size
 from udccal.models.geometry import Geometry, project
 from udccal.numerics import in_float64
@@ -65,10 +65,10 @@ def compare_with_truth(
         if estimate.name == value.name
         for error in (estimate.value - value.value,)
     ]
-    ray = ray_error_px(calibration.foundation.geometry.term, truth)
+    ray = ray_error_px(calibration.geometry.term, truth)
     distances = (
         TruthRow("geometry", "rays, 95th percentile", "px", None, None, ray, None),
-        _wire_distance(calibration.foundation.wire, fitted, true),
+        _wire_distance(calibration.wire, fitted, true),
         *_psf_distances(fitted, true),
         _backscatter_distance(fitted, true),
     )

@@ -7,6 +7,7 @@ Units: a restored picture is linear light in e-/s of each camera colour, on the 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8, UInt16
@@ -16,6 +17,7 @@ from udccal.models.backscatter import PanelResponse
 from udccal.models.geometry import VirtualView
 from udccal.models.noise import Noise
 from udccal.profiles.profile import Profile
+from udccal.profiles.store import load_profile
 from udccal.restoration.adapt import adapted
 from udccal.restoration.backscatter import estimated_rate, known_rate, mask_mosaic, prepared_response
 from udccal.restoration.deblur import Deblurrer, expected_smoothness
@@ -52,6 +54,16 @@ class Restorer:
     deblurrers: tuple[Deblurrer, ...]
     rectification: Rectification
     options: PlanOptions
+
+    @classmethod
+    def load(cls, profile: str | Path, options: PlanOptions | None = None) -> Restorer:
+        """Read a profile, by path or by the name of a rig that has one, and make it ready.
+
+        Raises:
+            ProfileError: when it cannot be read.
+            RestorationError: when its geometry leaves no view through the panel.
+        """
+        return cls.from_profile(load_profile(profile), options)
 
     @classmethod
     def from_profile(cls, profile: Profile, options: PlanOptions | None = None) -> Restorer:

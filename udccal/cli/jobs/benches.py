@@ -1,50 +1,22 @@
-"""What a capture works with: a camera, a display, and whoever puts things in front of the camera."""
+"""Benches of this world: a camera, a display, and the person who puts things in front of the camera."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 
-from udccal.arrangements import Stage
+from udccal.benches.bench import CaptureBench
 from udccal.cameras.choice import mode_for
 from udccal.cameras.protocol import Camera
-from udccal.cameras.simulated import SimulatedCamera
 from udccal.cameras.step_folders import StepFolders
 from udccal.cli.jobs.person import PersonStage
 from udccal.cli.output import Output
 from udccal.displays.manual import ManualDisplay
 from udccal.displays.mirrored import MirroredDisplay
 from udccal.displays.protocol import Display, PanelSize
-from udccal.displays.simulated import SimulatedDisplay
 from udccal.rig import RigDescription
-from udccal.sessions.writer import Now, utc_now
-from udccal.simulation.truth import draw_truth
-from udccal.simulation.world import SimulatedWorld
-
-
-@dataclass(frozen=True)
-class CaptureBench:
-    """An open camera, a display, a stage, the time of day there, and whether to repeat a step that was refused."""
-
-    camera: Camera
-    display: Display
-    stage: Stage
-    now: Now
-    try_again: Callable[[str], bool]
-
-
-def simulated_rig(rig: RigDescription, seed: int) -> SimulatedWorld:
-    """A simulated rig of that description; another seed is another specimen, and other noise."""
-    return SimulatedWorld(draw_truth(rig, seed), seed=seed)
-
-
-@contextmanager
-def simulated_bench(world: SimulatedWorld) -> Iterator[CaptureBench]:
-    """Camera, display, stage and clock of a simulated world, where nothing gets better by trying again."""
-    with SimulatedCamera(world) as camera, SimulatedDisplay(world) as display:
-        yield CaptureBench(camera, display, world, world.now, lambda sentence: False)
+from udccal.sessions.writer import utc_now
 
 
 @contextmanager
@@ -58,7 +30,7 @@ def real_bench(output: Output, rig: RigDescription, camera: Camera, display: Dis
     person = PersonStage(output)
     with camera, display:
         camera.set_mode(mode_for(camera.features, camera.sensor, rig.camera.cfa, rig.camera.bits))
-        yield CaptureBench(camera, MirroredDisplay(display), person, utc_now, person.try_again)
+        yield CaptureBench(rig, camera, MirroredDisplay(display), person, utc_now, person.try_again)
 
 
 @contextmanager
@@ -72,7 +44,7 @@ def files_bench(output: Output, rig: RigDescription, root: Path, pictures: Path)
     folders = StepFolders(root, rig.camera.cfa, rig.camera.bits)
     display = MirroredDisplay(ManualDisplay(pictures, panel_size(rig), output.say, lambda question: True))
     with folders.camera as camera, display:
-        yield CaptureBench(camera, display, folders, utc_now, lambda sentence: False)
+        yield CaptureBench(rig, camera, display, folders, utc_now, lambda sentence: False)
 
 
 def u3v_camera(serial: str | None) -> Camera:

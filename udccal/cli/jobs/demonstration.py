@@ -11,20 +11,20 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from udccal.cli.jobs.benches import simulated_bench, simulated_rig
-from udccal.cli.jobs.capture import capture
+from udccal.benches.bench import simulated_bench, simulated_rig
+from udccal.benches.photograph import capture_photograph
+from udccal.calibration import ORDER, QUICK, Foundation, fit_foundation
+from udccal.cli.jobs.capture import capture_watched
 from udccal.cli.jobs.fit import UNSEEN_PICTURE, run_fits, show_status, store_profile
-from udccal.cli.jobs.scene import capture_photograph
 from udccal.cli.output import Output, StageTime
 from udccal.compilation import compilation_clock, keep_compilations
 from udccal.displays.pictures import face_picture
-from udccal.fitting.calibrate import ORDER, QUICK, Foundation, fit_foundation
 from udccal.fitting.psf.fit import nominal_psf
 from udccal.io.links import make_folder
 from udccal.io.photograph import read_photograph
 from udccal.io.png import write_png16, write_rgb8
 from udccal.kernels import kernel_size, kernels_at
-from udccal.profiles.store import check_replaceable, read_profile
+from udccal.profiles.store import check_replaceable
 from udccal.reports.page import write_page
 from udccal.reports.pictures import PictureComparison, Score, compare_pictures
 from udccal.reports.report import calibration_page, gather, scene_table
@@ -82,15 +82,15 @@ def demonstrate(output: Output, rig_name: str, out: Path, seed: int) -> None:
         # Beside the captures: first what only the simulated world needs, then the fits of what has been captured, at
         # last the evidence of the report.
         pool.submit(lambda: (world.light.blur, world.light.backscatterer))
-        capture(output, rig, bench, out / "session", _EARLY)
+        capture_watched(output, bench, out / "session", _EARLY)
         foundation = pool.submit(fit_foundation, Session.open(out / "session"), effort=QUICK)
         pool.submit(lambda: _prepare_kernels(rig, foundation.result()))
-        capture(output, rig, bench, out / "session", [term for term in ORDER if term not in _EARLY])
+        capture_watched(output, bench, out / "session", [term for term in ORDER if term not in _EARLY])
         session = Session.open(out / "session")
         calibration = run_fits(output, session, QUICK, foundation.result())
         show_status(output, calibration)
         gathered = pool.submit(gather, session, calibration, panel_picture, world.light)
-        store_profile(output, session, calibration, out / "profile")
+        store_profile(output, calibration, out / "profile")
         scene = _restore_portrait(output, world, panel_picture, out)
     with output.stage("report"):
         evidence = gathered.result()
@@ -135,7 +135,7 @@ def _restore_portrait(
 ) -> PictureComparison:
     """Photograph, capture and restore, with what is stored on disk; writes the frames and pictures."""
     with output.stage("restorer"):
-        restorer = Restorer.from_profile(read_profile(out / "profile"), _PLAN)
+        restorer = Restorer.load(out / "profile", _PLAN)
     with output.stage("photograph through the rig"):
         scene = capture_photograph(world, _ROOM_LIGHT * portrait(), restorer.view, panel_picture)
     with output.stage("restoration"):

@@ -8,20 +8,17 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+from udccal.calibration import ORDER, Calibration, FitEffort, Foundation, calibrate
 from udccal.cli.output import Output, StageTime
 from udccal.compilation import compilation_clock, keep_compilations
 from udccal.displays.pictures import face_picture
 from udccal.errors import FitError, UdccalError
-from udccal.fitting.calibrate import ORDER, Calibration, FitEffort, Foundation, fit_session
 from udccal.fitting.engine.iteration_log import LOG
 from udccal.io.links import refuse_links
-from udccal.profiles.profile import build_profile
-from udccal.profiles.provenance import provenance_now
-from udccal.profiles.store import check_replaceable, write_profile
+from udccal.profiles.store import check_replaceable
 from udccal.reports.page import write_page
 from udccal.reports.report import calibration_page, gather
 from udccal.reports.tables import Table
-from udccal.sessions.manifest import MANIFEST_NAME
 from udccal.sessions.schema import TermName
 from udccal.sessions.store import Session
 
@@ -80,7 +77,7 @@ def fit_to_profile(output: Output, session_path: Path, profile_path: Path, log: 
         write_page(report, calibration_page(session, evidence, None))
     show_status(output, calibration)
     try:
-        store_profile(output, session, calibration, profile_path)
+        store_profile(output, calibration, profile_path)
     except FitError as error:
         raise FitError(f"{error} No profile was written; the report {report} shows every term.") from error
     output.say(f"Of all this, compilation (less in the next run): {clock.seconds:.1f} s")
@@ -123,13 +120,13 @@ def run_fits(
         def progress(term: TermName) -> None:
             stage.update(ORDER.index(term), len(ORDER), f"fitting {term}")
 
-        calibration = fit_session(session, progress, effort, foundation)
+        calibration = calibrate(session, progress, effort, foundation)
     for time in calibration.times:
         output.say(f"  {time.term}: {time.seconds:.1f} s")
     return calibration
 
 
-def store_profile(output: Output, session: Session, calibration: Calibration, path: Path) -> None:
+def store_profile(output: Output, calibration: Calibration, path: Path) -> None:
     """Write the profile of a calibration.
 
     Raises:
@@ -137,17 +134,7 @@ def store_profile(output: Output, session: Session, calibration: Calibration, pa
         ProfileError: when something else stands at ``path``.
     """
     with output.stage("profile"):
-        profile = build_profile(
-            calibration.rig,
-            provenance_now(session.path / MANIFEST_NAME, session.camera),
-            calibration.foundation.noise,
-            calibration.foundation.geometry,
-            calibration.foundation.wire,
-            calibration.psf,
-            calibration.backscatter,
-            calibration.foundation.wire_map,
-        )
-        write_profile(path, profile)
+        calibration.write(path)
 
 
 def summaries(calibration: Calibration) -> tuple[TermSummary, ...]:

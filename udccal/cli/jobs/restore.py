@@ -16,7 +16,7 @@ from udccal.compilation import keep_compilations
 from udccal.errors import RestorationError
 from udccal.io.limits import Shape
 from udccal.io.png import read_png16
-from udccal.profiles.store import find_profile, read_profile
+from udccal.profiles.store import load_profile
 from udccal.restoration.runtime import Restorer, check_frame
 from udccal.restoration.sinks import write_picture
 from udccal.restoration.tone import Tone, display_exposure
@@ -57,7 +57,7 @@ def restore_files(
         RestorationError: when an image does not fit the profile's rig, or its exposure is not known.
     """
     keep_compilations()
-    profile = read_profile(find_profile(profile_path))
+    profile = load_profile(profile_path)
     shown = None if panel_picture is None else read_panel_picture(panel_picture, profile.rig)
     targets = _targets(images, out, picture_format)
     for image in images:  # so that a bad file is told before the long work begins

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import get_args
 
 from udccal.cli.output import Output
-from udccal.profiles.store import find_profile, read_profile
+from udccal.profiles.store import load_profile
 from udccal.reports.fit_tables import estimates_table
 from udccal.sessions.schema import TermName
 
@@ -50,7 +50,7 @@ def show_profile(output: Output, path: Path) -> None:
     Raises:
         ProfileError: when the profile cannot be read.
     """
-    profile = read_profile(find_profile(path))
+    profile = load_profile(path)
     results = [(term, profile.result(term)) for term in get_args(TermName)]
     output.say(f"Profile of {profile.rig.name}, made {profile.provenance.created_at}")
     for term, result in results:

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from udccal.cli.jobs.benches import simulated_rig
+from udccal.benches.bench import simulated_rig
+from udccal.benches.photograph import CapturedScene, capture_photograph
 from udccal.cli.jobs.panel_picture import read_panel_picture
-from udccal.cli.jobs.scene import CapturedScene, capture_photograph
 from udccal.cli.output import Output
 from udccal.io.photograph import read_photograph
 from udccal.io.png import write_png16

@@ -1,0 +1,44 @@
+"""What ``import udccal`` gives: quickly, lazily, and all of it there."""
+
+from __future__ import annotations
+
+import statistics
+import subprocess
+import sys
+
+import pytest
+
+import udccal
+
+# A process that imports nothing, against one that imports udccal, in turns: the difference is the import's own.
+_PAIRS, _MOST_S = 5, 0.2
+_TIMED = "import time; start = time.perf_counter(); {}; print(time.perf_counter() - start)"
+
+
+def _seconds(statement: str) -> float:
+    command = [sys.executable, "-c", _TIMED.format(statement)]
+    return float(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
+
+
+def test_importing_udccal_takes_no_time() -> None:
+    assert statistics.median(_seconds("import udccal") for _ in range(_PAIRS)) < _MOST_S
+
+
+def test_importing_udccal_loads_no_heavy_package() -> None:
+    code = "import sys, udccal; print(sorted({'jax', 'cv2', 'scipy', 'numpy', 'pydantic'} & set(sys.modules)))"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "[]\n"
+
+
+@pytest.mark.parametrize("name", udccal.__all__)
+def test_every_name_is_there_and_documented(name: str) -> None:
+    assert getattr(udccal, name).__doc__
+
+
+def test_an_unknown_name_is_answered_with_those_there_are() -> None:
+    with pytest.raises(AttributeError, match=r"no attribute 'calibrat'; it has .*calibrate"):
+        udccal.calibrat  # noqa: B018
+
+
+def test_a_term_that_is_none_is_refused() -> None:
+    with pytest.raises(udccal.UdccalError, match="one of noise, geometry, wire, psf, backscatter, found 'wires'"):
+        udccal.fit(object.__new__(udccal.Session), "wires")

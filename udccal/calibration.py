@@ -1,0 +1,287 @@
+"""All five fits of a session, each with what the ones before it found, and the profile that they make."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import TypeVar, get_args
+
+import numpy as np
+from jaxtyping import Float
+
+from udccal.errors import UdccalError
+from udccal.fitting.absent import absent_backscatter, absent_psf, absent_wire
+from udccal.fitting.backscatter.fit import fit_backscatter
+from udccal.fitting.geometry.fit import BoardView, fit_views, read_views, rig_prior
+from udccal.fitting.noise.fit import fit_noise, nominal_noise
+from udccal.fitting.nominal import nominal_geometry
+from udccal.fitting.psf.fit import Effort, fit_psf
+from udccal.fitting.wire.fit import FIELD_SAMPLES, fit_wire, sensor_map
+from udccal.models.backscatter import Backscatter
+from udccal.models.geometry import Geometry
+from udccal.models.noise import Noise
+from udccal.models.psf import PsfField
+from udccal.models.wire import Wire
+from udccal.profiles.profile import build_profile
+from udccal.profiles.provenance import provenance_now
+from udccal.profiles.store import write_profile
+from udccal.result import FitResult, FitStatus
+from udccal.rig import RigDescription
+from udccal.sessions.manifest import MANIFEST_NAME
+from udccal.sessions.schema import TermName
+from udccal.sessions.store import Session
+
+Term = TypeVar("Term")
+ORDER: tuple[TermName, ...] = get_args(TermName)
+
+
+@dataclass(frozen=True)
+class FitEffort:
+    """What the fits may spend; less is quicker and less accurate.
+
+    Attributes:
+        wire_samples: pixels that the wire's fields are fitted to.
+        psf: see ``udccal.fitting.psf.fit.Effort``.
+        backscatter_positions: sensor positions that the footprint is fitted at.
+        workers: with 2, psf and backscatter, which do not need each other, are fitted at once, in more memory.
+    """
+
+    wire_samples: int = FIELD_SAMPLES
+    psf: Effort = field(default_factory=Effort)
+    backscatter_positions: int = 96
+    workers: int = 1
+
+
+# For a demonstration.
+QUICK = FitEffort(
+    wire_samples=60_000,
+    psf=Effort(positions=5, shifts=2, half_px=(36, 12), close_px=(32, 12), iterations=30),
+    backscatter_positions=32,
+    workers=2,
+)
+
+
+@dataclass(frozen=True)
+class FitTime:
+    """How long one term's fit took."""
+
+    term: TermName
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Foundation:
+    """The fits that psf and backscatter stand on.
+
+    Attributes:
+        times: how long these took.
+        wire_map: the fitted wire over the sensor, which takes long enough to be kept.
+        boards: what the geometry was fitted to.
+    """
+
+    noise: FitResult[Noise]
+    geometry: FitResult[Geometry]
+    wire: FitResult[Wire]
+    times: tuple[FitTime, ...]
+    wire_map: Float[np.ndarray, "rows columns"]
+    boards: tuple[BoardView, ...]
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """The five results of one session, and how long each took."""
+
+    session: Session
+    foundation: Foundation
+    psf: FitResult[PsfField]
+    backscatter: FitResult[Backscatter]
+    times: tuple[FitTime, ...]
+
+    @property
+    def rig(self) -> RigDescription:
+        """As it was built to be."""
+        return self.session.rig
+
+    @property
+    def noise(self) -> FitResult[Noise]:
+        """The noise fit."""
+        return self.foundation.noise
+
+    @property
+    def geometry(self) -> FitResult[Geometry]:
+        """The geometry fit."""
+        return self.foundation.geometry
+
+    @property
+    def wire(self) -> FitResult[Wire]:
+        """The wire fit."""
+        return self.foundation.wire
+
+    @property
+    def results(self) -> tuple[FitResult, FitResult, FitResult, FitResult, FitResult]:
+        """All five, in the order of ``TermName``."""
+        return self.noise, self.geometry, self.wire, self.psf, self.backscatter
+
+    def result(self, term: TermName) -> FitResult:
+        """The result of a term by its name."""
+        return next(result for result in self.results if result.name == term)
+
+    def or_raise(self) -> Calibration:
+        """Itself when every term can be used.
+
+        Raises:
+            FitError: with the advice of the first bad status otherwise.
+        """
+        for result in self.results:
+            result.or_raise()
+        return self
+
+    def write(self, path: str | Path) -> Path:
+        """Write the profile as a folder, or as one file where ``path`` ends in ``.zip``; replaces one that is there.
+
+        Returns:
+            where it was written.
+
+        Raises:
+            FitError: when a term cannot be used; nothing is written then.
+            ProfileError: when something that is not a profile stands at ``path``.
+        """
+        provenance = provenance_now(self.session.path / MANIFEST_NAME, self.session.camera)
+        write_profile(Path(path), build_profile(self.rig, provenance, *self.results, self.foundation.wire_map))
+        return Path(path)
+
+
+class _Fits:
+    """The fits of a session: each runs when it is first asked for, after those whose terms it needs."""
+
+    def __init__(
+        self,
+        session: Session,
+        progress: Callable[[TermName], None] = lambda term: None,
+        effort: FitEffort | None = None,
+    ) -> None:
+        self._session, self._progress, self._effort = session, progress, effort or FitEffort()
+        self.boards: tuple[BoardView, ...] = ()
+        self.times: list[FitTime] = []
+
+    @cached_property
+    def noise(self) -> FitResult[Noise]:
+        return self._run("noise", lambda: fit_noise(self._session), lambda: nominal_noise(self._session.rig))
+
+    @cached_property
+    def geometry(self) -> FitResult[Geometry]:
+        rig, noise = self._session.rig, self.noise.term
+
+        def fit() -> FitResult[Geometry]:
+            self.boards = tuple(read_views(self._session, noise))
+            size = (rig.camera.columns, rig.camera.rows)
+            return fit_views(self.boards, nominal_geometry(rig), size, rig_prior(rig))
+
+        return self._run("geometry", fit, lambda: nominal_geometry(rig))
+
+    @cached_property
+    def wire(self) -> FitResult[Wire]:
+        noise, geometry = self.noise.term, self.geometry.term
+        return self._run(
+            "wire",
+            lambda: fit_wire(self._session, noise, geometry, self._effort.wire_samples),
+            lambda: absent_wire(self._session.rig, geometry),
+        )
+
+    @cached_property
+    def wire_map(self) -> Float[np.ndarray, "rows columns"]:
+        camera = self._session.rig.camera
+        return sensor_map(self.wire.term, camera.rows, camera.columns)
+
+    @cached_property
+    def psf(self) -> FitResult[PsfField]:
+        noise, geometry, wire = self.noise.term, self.geometry.term, self.wire.term
+        return self._run(
+            "psf",
+            lambda: fit_psf(self._session, noise, geometry, wire, self._effort.psf),
+            lambda: absent_psf(self._session.rig, geometry),
+        )
+
+    @cached_property
+    def backscatter(self) -> FitResult[Backscatter]:
+        noise, geometry, wire_map = self.noise.term, self.geometry.term, self.wire_map
+        return self._run(
+            "backscatter",
+            lambda: fit_backscatter(self._session, noise, geometry, wire_map, self._effort.backscatter_positions),
+            lambda: absent_backscatter(self._session.rig, geometry),
+        )
+
+    def _run(self, term: TermName, fit: Callable[[], FitResult[Term]], absent: Callable[[], Term]) -> FitResult[Term]:
+        """The fit of a term, timed, or what stands for it where the session has no steps of it."""
+        self._progress(term)
+        start = time.perf_counter()
+        if self._session.steps(term):
+            result = fit()
+        else:
+            note = f"The session has no {term} steps; the term stands at what the rig description says, or is absent."
+            result = FitResult.failed(term, absent(), FitStatus.ABSENT, note)
+        self.times.append(FitTime(term, time.perf_counter() - start))
+        return result
+
+
+def fit(session: Session, term: str, effort: FitEffort | None = None) -> FitResult:
+    """Fit one term of a session, and before it those whose terms it needs.
+
+    Args:
+        session: what was captured.
+        term: noise, geometry, wire, psf or backscatter.
+        effort: what the fits may spend.
+
+    Returns:
+        the term with its covariance; a term without steps comes back as ``calibrate`` has it.
+
+    Raises:
+        SessionError: when a file of the session is missing or damaged.
+    """
+    if term not in ORDER:
+        raise UdccalError(f"Expected a term, one of {', '.join(ORDER)}, found '{term}'. Name one of these.")
+    return getattr(_Fits(session, effort), term)
+
+
+def fit_foundation(
+    session: Session, progress: Callable[[TermName], None] = lambda term: None, effort: FitEffort | None = None
+) -> Foundation:
+    """Fit noise, geometry and wire; arguments and errors as for ``calibrate``.
+
+    This needs the steps of these terms only: it can go on while the others are captured.
+    """
+    fits = _Fits(session, effort, progress)
+    base = fits.noise, fits.geometry, fits.wire
+    return Foundation(*base, tuple(fits.times), fits.wire_map, fits.boards)
+
+
+def calibrate(
+    session: Session,
+    progress: Callable[[TermName], None] = lambda term: None,
+    effort: FitEffort | None = None,
+    foundation: Foundation | None = None,
+) -> Calibration:
+    """Fit every term of a session; a term without steps gets its nominal or absent form, a note and status ABSENT.
+
+    Args:
+        session: what was captured.
+        progress: called with a term's name when its fit begins.
+        effort: what the fits may spend.
+        foundation: what ``fit_foundation`` found in the same session, when it has been run already.
+
+    Raises:
+        SessionError: when a file of the session is missing or damaged.
+    """
+    effort = effort or FitEffort()
+    base = foundation or fit_foundation(session, progress, effort)
+    fits = _Fits(session, effort, progress)
+    # A cached property that is set is not run.
+    fits.noise, fits.geometry, fits.wire, fits.wire_map = base.noise, base.geometry, base.wire, base.wire_map
+    with ThreadPoolExecutor(effort.workers) as pool:
+        late = [pool.submit(getattr, fits, term) for term in ("psf", "backscatter")]
+    times = sorted(fits.times, key=lambda taken: ORDER.index(taken.term))
+    return Calibration(session, base, late[0].result(), late[1].result(), (*base.times, *times))
