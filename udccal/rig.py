@@ -8,12 +8,14 @@ from importlib import resources
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from udccal.errors import RigError
 
 CfaPattern = Literal["RGGB", "BGGR", "GRBG", "GBRG"]
 _MAX_TOML_BYTES = 64 * 1024
+# 8K UHD and a little more.
+_MOST_VIEW_PX = 2**25
 
 
 class _Strict(BaseModel):
@@ -24,7 +26,18 @@ class Nominal(_Strict):
     """A value the rig was built to have, and how far off it may be (same unit)."""
 
     value: float
-    tolerance: Annotated[float, Field(ge=0)]
+    tolerance: Annotated[float, Field(ge=0, le=1e6)]
+
+
+def _within(low: float, high: float) -> AfterValidator:
+    """Bounds of a nominal value."""
+
+    def check(nominal: Nominal) -> Nominal:
+        if not low <= nominal.value <= high:
+            raise ValueError(f"a value of {nominal.value:g}, which should be from {low:g} to {high:g}")
+        return nominal
+
+    return AfterValidator(check)
 
 
 class Panel(_Strict):
@@ -33,13 +46,13 @@ class Panel(_Strict):
     model: str
     columns: Annotated[int, Field(ge=8, le=16384)]
     rows: Annotated[int, Field(ge=8, le=16384)]
-    pitch_mm: Nominal
-    row_open_fraction: Nominal
-    column_open_fraction: Nominal
-    structure_thickness_mm: Nominal
+    pitch_mm: Annotated[Nominal, _within(0.001, 100.0)]
+    row_open_fraction: Annotated[Nominal, _within(0.001, 1.0)]
+    column_open_fraction: Annotated[Nominal, _within(0.001, 1.0)]
+    structure_thickness_mm: Annotated[Nominal, _within(0.0, 100.0)]
     glass_thickness_mm: Annotated[float, Field(gt=0, le=20)]
     glass_index: Annotated[float, Field(ge=1, le=2.5)]
-    gamma: Nominal
+    gamma: Annotated[Nominal, _within(0.1, 10.0)]
 
 
 class Camera(_Strict):
@@ -48,24 +61,24 @@ class Camera(_Strict):
     model: str
     columns: Annotated[int, Field(ge=64, le=16384)]
     rows: Annotated[int, Field(ge=64, le=16384)]
-    pitch_um: Annotated[float, Field(gt=0, le=100)]
+    pitch_um: Annotated[float, Field(ge=0.1, le=100)]
     cfa: CfaPattern
     bits: Annotated[int, Field(ge=8, le=16)]
-    full_well_e: Nominal
-    black_DN: Nominal
-    K_DN_per_e: Nominal
-    frame_rate_hz: Annotated[float, Field(gt=0)]
-    min_exposure_s: Annotated[float, Field(gt=0)]
-    max_exposure_s: Annotated[float, Field(gt=0)]
+    full_well_e: Annotated[Nominal, _within(1.0, 1e9)]
+    black_DN: Annotated[Nominal, _within(-65536.0, 65536.0)]
+    K_DN_per_e: Annotated[Nominal, _within(1e-4, 1e5)]
+    frame_rate_hz: Annotated[float, Field(gt=0, le=1e6)]
+    min_exposure_s: Annotated[float, Field(gt=0, le=1e6)]
+    max_exposure_s: Annotated[float, Field(gt=0, le=1e6)]
 
 
 class Lens(_Strict):
     """The lens; its entrance pupil has the diameter ``focal_mm / f_number``."""
 
     model: str
-    focal_mm: Nominal
-    f_number: Nominal
-    focus_mm: Annotated[float, Field(gt=0)]
+    focal_mm: Annotated[Nominal, _within(0.01, 1e5)]
+    f_number: Annotated[Nominal, _within(0.1, 1000.0)]
+    focus_mm: Annotated[float, Field(gt=0, le=1e9)]
 
 
 class Mounting(_Strict):
@@ -75,12 +88,12 @@ class Mounting(_Strict):
     ``panel_x_px``, ``panel_y_px`` is the panel pixel straight in front of the pupil.
     """
 
-    standoff_mm: Nominal
-    tilt_deg: Nominal
-    roll_deg: Nominal
-    yaw_deg: Nominal
-    panel_x_px: Nominal
-    panel_y_px: Nominal
+    standoff_mm: Annotated[Nominal, _within(0.01, 1e5)]
+    tilt_deg: Annotated[Nominal, _within(-180.0, 180.0)]
+    roll_deg: Annotated[Nominal, _within(-360.0, 360.0)]
+    yaw_deg: Annotated[Nominal, _within(-180.0, 180.0)]
+    panel_x_px: Annotated[Nominal, _within(-1e6, 1e6)]
+    panel_y_px: Annotated[Nominal, _within(-1e6, 1e6)]
 
 
 class Captures(_Strict):
@@ -107,6 +120,12 @@ class View(_Strict):
 
     columns: Annotated[int, Field(ge=16, le=16384)] = 1920
     rows: Annotated[int, Field(ge=16, le=16384)] = 1080
+
+    @model_validator(mode="after")
+    def _holds_no_more_than_8k(self) -> View:
+        if self.columns * self.rows > _MOST_VIEW_PX:
+            raise ValueError(f"{self.columns} x {self.rows} pixels, which should be {_MOST_VIEW_PX} together at most")
+        return self
 
 
 class RigDescription(_Strict):

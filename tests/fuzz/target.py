@@ -18,12 +18,16 @@ class Target:
         read: takes any bytes; may raise an ``UdccalError``, and nothing else.
         seeds: whole examples, from which broken ones are made.
         max_bytes: longest input to try.
+        one_in: how many inputs of others there are for each of this target; above 1 where one takes long.
+        longest_s: what an input may take; hung is what takes five times as long on a machine that does nothing else.
     """
 
     name: str
     read: Callable[[bytes], object]
     seeds: Callable[[], tuple[bytes, ...]]
     max_bytes: int = 4096
+    one_in: int = 1
+    longest_s: float = 2.0
 
     def try_out(self, data: bytes) -> bool:
         """Whether the reader took the bytes; a refusal in words is as good."""

@@ -40,7 +40,11 @@ def test_broken_inputs_are_refused_in_words(name: str) -> None:
     for seed in target.seeds():
         target.read(seed)  # the whole ones are taken
 
-    @settings(max_examples=200, deadline=2000, derandomize=True, suppress_health_check=list(HealthCheck))
+    deadline_ms = 1000 * target.longest_s
+
+    examples = max(100, 200 // target.one_in)
+
+    @settings(max_examples=examples, deadline=deadline_ms, derandomize=True, suppress_health_check=list(HealthCheck))
     @given(broken(target.seeds()))
     def try_out(data: bytes) -> None:
         target.try_out(data[: target.max_bytes])

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from udccal.errors import RestorationError
 from udccal.fitting.absent import absent_backscatter, absent_psf, absent_wire
 from udccal.fitting.nominal import nominal_geometry
 from udccal.fitting.wire.fit import sensor_map
@@ -93,3 +94,14 @@ def test_the_shading_of_a_wire_that_is_not_there_stays(profile: Profile) -> None
         wire_map=profile.wire_map * np.linspace(0.8, 1.2, profile.rig.camera.columns, dtype=np.float32),
     )
     assert Restorer.from_profile(shaded, PlanOptions(grid_rows=2, grid_columns=2)).wire is not None
+
+
+def test_terms_that_give_no_numbers_are_refused_when_made_ready(profile: Profile) -> None:
+    options = PlanOptions(grid_rows=2, grid_columns=2)
+    psf, backscatter = profile.psf.term, profile.backscatter.term
+    dark = replace(psf, residual=np.zeros(np.shape(psf.residual)))
+    with pytest.raises(RestorationError, match="Expected kernels that sum to 1"):
+        Restorer.from_profile(replace(profile, psf=replace(profile.psf, term=dark)), options)
+    nowhere = replace(backscatter, geometry=replace(backscatter.geometry, centre=np.array([np.nan, 0.0])))
+    with pytest.raises(RestorationError, match="Expected a footprint"):
+        Restorer.from_profile(replace(profile, backscatter=replace(profile.backscatter, term=nowhere)), options)

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from udccal.models.noise import Noise
@@ -18,6 +20,12 @@ def test_saturation_is_a_margin_below_the_full_well(toy_noise: Noise) -> None:
 def test_variance_of_a_frame(toy_noise: Noise) -> None:
     mosaic = np.full((4, 4), 64 + 355, np.uint16)
     assert abs(mean_variance_e2(mosaic, toy_noise, 0.0) - (1000 + 25 + (1 / 0.355) ** 2 / 12)) < 0.1
+
+
+def test_less_than_no_dark_current_makes_no_noise(toy_noise: Noise) -> None:
+    mosaic = np.full((4, 4), 64, np.uint16)
+    negative = replace(toy_noise, dark_current_e_per_s=-1e4)
+    assert mean_variance_e2(mosaic, negative, 1.0) > mean_variance_e2(mosaic, toy_noise, 0.0) > 0
 
 
 def test_hot_and_dead_samples_are_replaced(toy_noise: Noise) -> None:

@@ -46,3 +46,11 @@ def test_a_camera_that_looks_away_is_refused(toy_geometry: Geometry) -> None:
     away = Geometry(**{**vars(toy_geometry), "rotation": np.array([0.0, 2.5, 0.0])})
     with pytest.raises(RestorationError, match="front of the panel"):
         inscribed_view(away, 128, 96, 96, 54)
+
+
+def test_a_view_that_looks_beside_the_sensor_is_refused(toy_geometry: Geometry) -> None:
+    view = inscribed_view(toy_geometry, 128, 96, 96, 54)
+    Rectification.within(toy_geometry, view, 128, 96)
+    wider = VirtualView(96, 54, view.focal_px * 0.8, view.centre)
+    with pytest.raises(RestorationError, match="look beside it"):
+        Rectification.within(toy_geometry, wider, 128, 96)

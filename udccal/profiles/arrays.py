@@ -49,7 +49,7 @@ def from_inline(stored: Numbers) -> Shaped[np.ndarray, "..."]:
             f"Expected {math.prod(stored.shape)} values for '{stored.name}' of shape {stored.shape}, "
             f"found {len(stored.value)}. Restore the profile from a copy."
         )
-    return np.array(stored.value, dtype=np.float64).reshape(stored.shape).astype(_DTYPES[stored.dtype])
+    return _shaped(np.array(stored.value, dtype=np.float64), stored)
 
 
 def store(folder: Path, file: str, name: str, array: Shaped[np.ndarray, "..."], unit: str) -> StoredArray:
@@ -85,8 +85,9 @@ def load(folder: Path, stored: StoredArray) -> Shaped[np.ndarray, "..."]:
             f"{', '.join(channels)}. Restore the profile from a copy."
         )
     # Smallest first: the partial sums are then exact.
-    total = sum(reversed(planes[:-1]), start=planes[-1])
-    return total.reshape(stored.shape).astype(_DTYPES[stored.dtype])
+    with np.errstate(invalid="ignore", over="ignore"):
+        total = sum(reversed(planes[:-1]), start=planes[-1])
+    return _shaped(total, stored)
 
 
 def read_checked(
@@ -113,6 +114,20 @@ def read_checked(
         return read_exr(path, shape)
     except FileFormatError as error:
         raise ProfileError(str(error)) from error
+
+
+def _shaped(values: Float[np.ndarray, "..."], stored: Numbers | StoredArray) -> Shaped[np.ndarray, "..."]:
+    """Values in the stored shape and type, as far as both can hold them."""
+    # An empty array may name any sizes beside its zero; numpy takes them up to a point.
+    sizes = math.prod(size for size in stored.shape if size)
+    with np.errstate(invalid="ignore", over="ignore"):
+        typed = values.astype(_DTYPES[stored.dtype])
+    if sizes > _MAX_FILE_BYTES or not np.all(np.isfinite(typed)):
+        raise ProfileError(
+            f"Expected '{stored.name}' to hold finite numbers of {stored.dtype} and at most {_MAX_FILE_BYTES} of them, "
+            f"found others in shape {stored.shape}. Restore the profile from a copy."
+        )
+    return typed.reshape(stored.shape)
 
 
 def _dtype_name(array: Shaped[np.ndarray, "..."]) -> DType:

@@ -22,10 +22,14 @@ from udccal.profiles.evidence import load_fit, store_fit
 from udccal.profiles.packing import Packed, pack, unpack
 from udccal.profiles.pictures import ATLAS_COLUMNS, ATLAS_ROWS, psf_atlas
 from udccal.profiles.profile import Profile
+from udccal.profiles.ranges import check_term
 from udccal.profiles.schema import FORMAT, VERSION, Lineage, Section, StoredPicture, StoredProfile, Terms
 from udccal.result import FitResult
+from udccal.sessions.schema import TermName
 
 Channels = Mapping[str, Float[np.ndarray, "rows columns"]]
+# What maps can hold: the wire as a factor, backscatter in e-/s, kernels that sum to 1.
+_WIRE_RANGE, _RATE_RANGE, _KERNEL_RANGE = (1e-4, 1e4), (-1e10, 1e10), (-10.0, 10.0)
 
 
 def encode(profile: Profile, folder: Path) -> StoredProfile:
@@ -55,26 +59,27 @@ def decode(stored: StoredProfile, folder: Path) -> Profile:
     Raises:
         ProfileError: when a file or a value is not in order.
     """
-    terms, camera = stored.terms, stored.rig.camera
-    geometry = _load_section("geometry", terms.geometry, Geometry, folder, None)
+    camera = stored.rig.camera
+    geometry = _load_section(stored, "geometry", Geometry, folder, None)
     shared = geometry.term
     pictures = {picture.name: picture for picture in stored.pictures}
     for name in ("wire_map", "psf_atlas", "backscatter_white"):
         if name not in pictures:
             raise ProfileError(f"Expected the picture '{name}' in {folder}, found none. Make the profile again.")
-    wire = _load_picture(pictures["wire_map"], folder, ("wire",), camera.rows, camera.columns)
-    mask = _load_picture(pictures["backscatter_white"], folder, tuple("RGB"), camera.rows // 2, camera.columns // 2)
+    size, half_size = (camera.rows, camera.columns), (camera.rows // 2, camera.columns // 2)
+    wire = _load_picture(pictures["wire_map"], folder, ("wire",), size, _WIRE_RANGE)
+    mask = _load_picture(pictures["backscatter_white"], folder, tuple("RGB"), half_size, _RATE_RANGE)
     atlas = pictures["psf_atlas"]
-    _load_picture(atlas, folder, tuple("RGB"), atlas.rows, atlas.columns)
+    _load_picture(atlas, folder, tuple("RGB"), (atlas.rows, atlas.columns), _KERNEL_RANGE)
     return Profile(
         rig=stored.rig,
         provenance=stored.provenance,
         parent=stored.lineage.parent,
-        noise=_load_section("noise", terms.noise, Noise, folder, shared),
+        noise=_load_section(stored, "noise", Noise, folder, shared),
         geometry=geometry,
-        wire=_load_section("wire", terms.wire, Wire, folder, shared),
-        psf=_load_section("psf", terms.psf, PsfField, folder, shared),
-        backscatter=_load_section("backscatter", terms.backscatter, Backscatter, folder, shared),
+        wire=_load_section(stored, "wire", Wire, folder, shared),
+        psf=_load_section(stored, "psf", PsfField, folder, shared),
+        backscatter=_load_section(stored, "backscatter", Backscatter, folder, shared),
         wire_map=np.array(wire["wire"], dtype=np.float32),
         backscatter_mask=np.stack([mask[name] for name in "RGB"], axis=-1).astype(np.float32),
         invalidated_by=stored.invalidated_by,
@@ -92,10 +97,14 @@ def _store_section(result: FitResult, name: str, folder: Path, geometry: Geometr
     )
 
 
-def _load_section(name: str, section: Section, kind: type, folder: Path, geometry: Geometry | None) -> FitResult[Any]:
+def _load_section(
+    stored: StoredProfile, name: TermName, kind: type, folder: Path, geometry: Geometry | None
+) -> FitResult[Any]:
+    section: Section = getattr(stored.terms, name)
     if section.model != kind.__name__:
         raise ProfileError(f"Expected the model {kind.__name__}, found '{section.model}'. Update udccal to read it.")
     term = unpack(Packed(section.parameters, section.arrays), kind, folder, geometry)
+    check_term(term, name, stored.rig)
     return load_fit(name, section.fit, term, folder)
 
 
@@ -139,12 +148,22 @@ def _store_picture(folder: Path, name: str, channels: Channels, unit: str, what:
     )
 
 
-def _load_picture(picture: StoredPicture, folder: Path, names: tuple[str, ...], rows: int, columns: int) -> Channels:
-    channels = read_checked(folder, picture.file, picture.sha256)
+def _load_picture(
+    picture: StoredPicture, folder: Path, names: tuple[str, ...], size: tuple[int, int], allowed: tuple[float, float]
+) -> Channels:
+    channels = read_checked(folder, picture.file, picture.sha256, (rows, columns))
     found = next(iter(channels.values())).shape
-    if set(channels) != set(names) or found != (rows, columns) or (picture.rows, picture.columns) != found:
+    if set(channels) != set(names) or found != size or (picture.rows, picture.columns) != found:
         raise ProfileError(
-            f"Expected {picture.file} to have the channels {', '.join(names)} of {columns} x {rows} samples, found "
+            f"Expected {picture.file} to have the channels {', '.join(names)} of {size[1]} x {size[0]} samples, found "
             f"{', '.join(channels)} of {found[1]} x {found[0]}. Restore the profile from a copy."
         )
+    low, high = allowed
+    for name, values in channels.items():
+        wrong = values[~((values >= low) & (values <= high))]
+        if wrong.size:
+            raise ProfileError(
+                f"Expected values from {low:g} to {high:g} in the channel {name} of {picture.file}, found "
+                f"{wrong[0]:g}. Make the profile again."
+            )
     return channels

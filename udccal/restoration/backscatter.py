@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
 from udccal.cfa import channel_map
+from udccal.errors import RestorationError
 from udccal.models.backscatter import Backscatter, PanelResponse, panel_response, response_rate
 from udccal.numerics import in_float64
 from udccal.rig import RigDescription
@@ -20,9 +21,18 @@ _PERCENTILE = 1.0
 
 @in_float64
 def prepared_response(term: Backscatter, rig: RigDescription) -> PanelResponse:
-    """The term worked out for the rig's panel, in float32 numpy arrays."""
-    response = panel_response(term, rig.panel.rows, rig.panel.columns)
-    return jax.tree.map(_single, response)
+    """The term worked out for the rig's panel, in float32 numpy arrays.
+
+    Raises:
+        RestorationError: when it is no number anywhere on the sensor.
+    """
+    response = jax.tree.map(_single, panel_response(term, rig.panel.rows, rig.panel.columns))
+    if not (np.all(np.isfinite(response.shares)) and np.all(np.isfinite(response.gain))):
+        raise RestorationError(
+            "Expected a footprint of the pupil on the panel for every pixel, found places without one. Check the "
+            "backscatter and geometry terms, or calibrate the rig again."
+        )
+    return response
 
 
 def _single(leaf: Any) -> np.ndarray:

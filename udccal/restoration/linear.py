@@ -38,10 +38,14 @@ def saturated(
 
 
 def mean_variance_e2(mosaic: UInt16[np.ndarray, "rows columns"], noise: Noise, exposure_s: float) -> float:
-    """Temporal variance of a frame's samples in e-^2, averaged over the frame (EMVA 1288's linear model)."""
+    """Temporal variance of a frame's samples in e-^2, averaged over the frame (EMVA 1288's linear model).
+
+    A dark current that was measured as slightly less than nothing makes no noise.
+    """
     mean_e = (float(mosaic.mean()) - scalar(noise.black_DN)) / scalar(noise.K_DN_per_e)
     dark_e = scalar(noise.dark_current_e_per_s) * exposure_s
-    return float(variance_e(noise, max(mean_e - dark_e, 0.0), exposure_s))
+    signal_e = max(mean_e - dark_e, 0.0)
+    return float(variance_e(noise, signal_e, exposure_s)) + max(-dark_e, 0.0)
 
 
 def without_defects(signal_e: Float32[np.ndarray, "rows columns"], noise: Noise) -> Float32[np.ndarray, "rows columns"]:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from udccal.errors import RestorationError
 from udccal.kernels import KERNEL_COLUMNS, KERNEL_ROWS, fitted_size, kernels_at
 from udccal.models.psf import PsfField
 from udccal.restoration.deblur import Deblurrer
@@ -14,6 +15,8 @@ from udccal.restoration.operator import Blur, Canvas
 from udccal.rig import RigDescription
 
 _CHANNELS = 3
+# A kernel sums to 1; one whose positive and negative values together reach so much is none.
+_MOST_LIGHT = 10.0
 
 
 @dataclass(frozen=True)
@@ -52,13 +55,23 @@ class PlanOptions:
 
 
 def kernel_grid(psf: PsfField, rig: RigDescription, options: PlanOptions) -> KernelGrid:
-    """The psf at a grid of positions that spans the sensor, border to border."""
+    """The psf at a grid of positions that spans the sensor, border to border.
+
+    Raises:
+        RestorationError: when the psf gives no kernels there.
+    """
     camera = rig.camera
     x = np.linspace(0.0, camera.columns - 1.0, options.grid_columns)
     y = np.linspace(0.0, camera.rows - 1.0, options.grid_rows)
     rows, columns = fitted_size(psf, rig, options.kernel_rows, options.kernel_columns)
     positions = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
     kernels = kernels_at(psf, positions, rows, columns, options.workers)
+    light = np.abs(kernels).sum(axis=(2, 3))
+    if not np.all(light <= _MOST_LIGHT):
+        raise RestorationError(
+            f"Expected kernels that sum to 1 and are hardly negative, found one whose values sum to "
+            f"{light.max():g} without their signs. Check the psf and geometry terms, or calibrate the rig again."
+        )
     return KernelGrid(x, y, kernels.reshape(len(y), len(x), _CHANNELS, rows, columns))
 
 

@@ -9,6 +9,7 @@ import jax
 import numpy as np
 from jaxtyping import Float, Float32
 
+from udccal.errors import RestorationError
 from udccal.models.geometry import Geometry, VirtualView, view_to_sensor
 from udccal.numerics import in_float64
 
@@ -25,6 +26,22 @@ class Rectification:
         """Evaluate the map once."""
         pixels = _sensor_pixels(geometry, view)
         return cls(*(np.ascontiguousarray(pixels[..., axis], dtype=np.float32) for axis in range(2)))
+
+    @classmethod
+    def within(cls, geometry: Geometry, view: VirtualView, sensor_columns: int, sensor_rows: int) -> Rectification:
+        """As ``of``, of a view whose every pixel looks at the sensor.
+
+        Raises:
+            RestorationError: when one looks beside it, although the view's border does not: the distortion folds.
+        """
+        found = cls.of(geometry, view)
+        for places, size in ((found.map_x, sensor_columns), (found.map_y, sensor_rows)):
+            if not np.all((places > -1) & (places < size)):
+                raise RestorationError(
+                    "Expected every pixel of the view to look at the sensor, found some that look beside it. Check the "
+                    "geometry term's distortion, or calibrate the rig again."
+                )
+        return found
 
     def apply(self, picture: Float32[np.ndarray, "rows columns 3"]) -> Float32[np.ndarray, "view_rows view_columns 3"]:
         """Resample a sensor picture onto the view (Lanczos over 8 x 8 pixels)."""

@@ -70,7 +70,7 @@ class Restorer:
         """Work everything out for a profile.
 
         Raises:
-            RestorationError: when the profile's geometry leaves no view through the panel.
+            RestorationError: when the profile's geometry leaves no view through the panel, or a term gives no numbers.
         """
         options = options or PlanOptions()
         rig, geometry = profile.rig, profile.geometry.term
@@ -87,7 +87,7 @@ class Restorer:
             mask=mask_mosaic(profile.backscatter_mask, camera.cfa, camera.rows, camera.columns),
             response=None if unscattered else prepared_response(profile.backscatter.term, rig),
             deblurrers=() if unblurred else build_deblurrers(kernel_grid(profile.psf.term, rig, options), rig, options),
-            rectification=Rectification.of(geometry, view),
+            rectification=Rectification.within(geometry, view, camera.columns, camera.rows),
             options=options,
         )
 
