@@ -8,6 +8,7 @@ ACCURACY_OUT ?= accuracy
 EFFICIENCY_OUT ?= efficiency
 COVERAGE_OUT ?= coverage
 PEERS ?=
+USB ?=
 
 .PHONY: install demo test test-slow test-usb fuzz load lint types contracts check accuracy tables efficiency coverage extremes peers growth clean
 
@@ -29,8 +30,9 @@ test-slow: $(STAMP)
 	$(BIN)/python -m pytest -m slow
 
 # The USB3 Vision driver through libusb and a real kernel's USB: boots one in qemu, with a virtual camera plugged in.
+# USB: arguments, such as --if-possible, which says so and goes on where qemu cannot be had.
 test-usb: $(STAMP)
-	$(BIN)/python -m tests.usb_stack
+	$(BIN)/python -m tests.usb_stack $(USB)
 
 # A hundred thousand broken inputs for every reader of bytes from outside.
 fuzz: $(STAMP)

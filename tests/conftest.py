@@ -15,11 +15,12 @@ SLOW_TEST_TIMEOUT_S = 1200
 @pytest.hookimpl(trylast=True)
 def pytest_configure(config: pytest.Config) -> None:
     """What one worker, or one program under test, has compiled, the others read; so does the next run."""
-    if config.cache is not None:
+    cache = getattr(config, "cache", None)  # absent where pytest runs without its cache
+    if cache is not None:
         # Not before jaxtyping's plugin has put its checks where modules are imported.
         from udccal.compilation import FOLDER_VARIABLE, keep_compilations
 
-        os.environ.setdefault(FOLDER_VARIABLE, str(config.cache.mkdir("compilations")))
+        os.environ.setdefault(FOLDER_VARIABLE, str(cache.mkdir("compilations")))
         keep_compilations()
 
 

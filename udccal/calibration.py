@@ -161,8 +161,8 @@ class _Fits:
     def __init__(
         self,
         session: Session,
+        effort: FitEffort | None,
         progress: Callable[[TermName], None] = lambda term: None,
-        effort: FitEffort | None = None,
     ) -> None:
         self._session, self._progress, self._effort = session, progress, effort or FitEffort()
         self.boards: tuple[BoardView, ...] = ()

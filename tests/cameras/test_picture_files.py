@@ -8,6 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import rawpy
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -26,7 +27,7 @@ from tests.cameras.small_tiff import (
 )
 from udccal.cameras.picture_files.facts import Facts, read_facts
 from udccal.cameras.picture_files.listing import pictures_in
-from udccal.cameras.picture_files.raw import libraw_facts
+from udccal.cameras.picture_files.raw import libraw_facts, raw_mosaic
 from udccal.cameras.picture_files.sidecar import list_folder
 from udccal.cameras.picture_files.tiff import read_tiff16
 from udccal.errors import CameraError, FileFormatError, UdccalError
@@ -219,6 +220,34 @@ def test_libraw_is_believed_only_where_a_file_says_something(tmp_path: Path) -> 
     (tmp_path / "c.raf").write_bytes(b"FUJIFILMCCD-RAW " + bytes(400))
     with pytest.raises(FileFormatError, match="whole camera raw file"):
         read_facts(tmp_path / "c.raf")
+
+
+# LibRaw takes any file of 307 200 bytes for 640 x 480 samples of 8 bits, RGGB.
+HEADERLESS = np.random.default_rng(5).integers(0, 256, 640 * 480, np.uint8).tobytes()
+
+
+@pytest.mark.parametrize("start", [b"", b"IIII", b"MM\0\0"])
+def test_a_raw_file_without_a_header_is_refused_though_libraw_guesses_one(start: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "a.RAW"
+    path.write_bytes(start + HEADERLESS[len(start) :])
+    with rawpy.imread(str(path)) as guessed:
+        assert guessed.raw_image.shape == (480, 640)
+    for read in (raw_mosaic, read_facts):
+        with pytest.raises(FileFormatError, match=r"begin as a camera raw file .* found no header.*\. Convert it"):
+            read(path)
+
+
+@pytest.mark.parametrize(
+    "start",
+    [
+        *(b"II*\0", b"MM\0*", b"IIU\0", b"IIRO", b"IIRS", b"MMOR", b"IIIITwaR", b"MMMMRawT"),
+        *(b"FUJIFILM", b"\0MRM", b"\0\0\0\x18ftypcrx ", bytes(25) + b"ARECOYK"),
+    ],
+)
+def test_headers_of_raw_files_are_left_to_libraw(start: bytes, tmp_path: Path) -> None:
+    (tmp_path / "a.raw").write_bytes(start + bytes(400))
+    with pytest.raises(FileFormatError, match="whole camera raw file"):
+        raw_mosaic(tmp_path / "a.raw")
 
 
 # --- folders

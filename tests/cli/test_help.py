@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import re
 import resource
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
+
+from udccal.cli.demo import demo
 
 VERBS = (
     [],
@@ -90,3 +94,10 @@ def test_a_heavy_import_would_be_noticed() -> None:
     done = subprocess.run([sys.executable, "-c", code, "--help"], capture_output=True, text=True, timeout=60)
     assert done.returncode != 0
     assert "numpy" in done.stderr
+
+
+def test_the_demonstrations_help_states_the_readmes_minutes() -> None:
+    readme = (Path(__file__).resolve().parents[2] / "README.md").read_text(encoding="utf-8")
+    stated = re.search(r"make demo +# .*: (.* minutes .*)", readme)
+    assert stated is not None
+    assert stated.group(1) in (demo.__doc__ or "")

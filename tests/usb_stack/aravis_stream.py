@@ -12,9 +12,11 @@ import ctypes
 import hashlib
 import os
 import sys
+import time
 
 _LIBRARY = "libaravis-0.8.so.0"
 _TIMEOUT_US = 10_000_000
+_OPEN_S = 30.0
 _BUFFERS = 4
 _MODES = {"sync": 0, "async": 1}  # ArvUvUsbMode
 
@@ -53,7 +55,9 @@ def _describe(library: ctypes.CDLL, buffer: int) -> str:
 def main(device: str, count: int, mode: str) -> int:
     """Take ``count`` frames; 1 when the camera cannot be had or a frame does not come."""
     library = _library()
-    camera = library.arv_camera_new(device.encode(), None)
+    end_s = time.monotonic() + _OPEN_S
+    while not (camera := library.arv_camera_new(device.encode(), None)) and time.monotonic() < end_s:
+        pass  # aravis's waits of 32 ms can be too short for an emulated processor that is shared
     if not camera:
         print(f"Expected aravis to open {device}, found that it cannot.")
         return 1

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import shlex
-import shutil
 from pathlib import Path
 
-from tests.usb_stack.errors import CannotRun
 from tests.usb_stack.kernel import Kernel
 
 BOOTED = "usb-stack-guest: booted after"
@@ -39,21 +37,14 @@ poweroff -f
 """
 
 
-def initramfs(kernel: Kernel, command: str) -> bytes:
-    """An archive that loads the kernel's modules, runs ``command`` as root in the host's files, and powers off.
-
-    Raises:
-        CannotRun: when there is no busybox.
-    """
-    busybox = shutil.which("busybox")
-    if busybox is None:
-        raise CannotRun("Expected a static busybox, found none. Install it: apt-get install busybox-static.")
+def initramfs(kernel: Kernel, busybox: Path, command: str) -> bytes:
+    """An archive that loads the kernel's modules, runs ``command`` as root in the host's files, and powers off."""
     names = " ".join(path.name for path in kernel.modules)
     script = _INIT.format(modules=names, tag=TAG, booted=BOOTED, exit=EXIT, command=shlex.quote(command))
     folders = ("bin", "dev", "proc", "sys", "host", "scratch", "root", "modules")
     entries = [_entry(folder, _FOLDER, b"") for folder in folders]
     entries.append(_entry("dev/console", _DEVICE, b"", device=(5, 1)))
-    entries.append(_entry("bin/busybox", _FILE, Path(busybox).read_bytes()))
+    entries.append(_entry("bin/busybox", _FILE, busybox.read_bytes()))
     entries += [_entry(f"modules/{path.name}", _FILE, path.read_bytes()) for path in kernel.modules]
     entries.append(_entry("init", _FILE, script.encode()))
     entries.append(_entry("TRAILER!!!", 0, b""))

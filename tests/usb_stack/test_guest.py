@@ -12,10 +12,12 @@ from pathlib import Path
 import pytest
 
 from tests.usb_stack import __main__ as command
-from tests.usb_stack.errors import CannotRun
+from tests.usb_stack import host
+from tests.usb_stack.errors import CannotRun, GuestFailed
 from tests.usb_stack.initramfs import BOOTED, EXIT, initramfs
 from tests.usb_stack.kernel import Kernel, kernel_in
 from tests.usb_stack.machine import run_guest
+from tests.usb_stack.needs import PROMISED
 from tests.usb_stack.serial_line import SerialLine
 
 
@@ -84,7 +86,7 @@ def test_guests_first_files_can_be_unpacked(tmp_path: Path) -> None:
     if shutil.which("busybox") is None:
         pytest.skip("needs busybox: apt-get install busybox-static")
     kernel = kernel_files(tmp_path)
-    archive = initramfs(kernel, "echo 'a quoted' word")
+    archive = initramfs(kernel, host.busybox(), "echo 'a quoted' word")
     unpack = ("busybox", "cpio")
     listing = subprocess.run((*unpack, "-t"), input=archive, capture_output=True, check=True, timeout=60)
     names = listing.stdout.decode().split()
@@ -97,9 +99,25 @@ def test_guests_first_files_can_be_unpacked(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("no_programs")
-def test_without_busybox_a_sentence_says_so(tmp_path: Path) -> None:
-    with pytest.raises(CannotRun, match="busybox-static"):
-        initramfs(kernel_files(tmp_path), "true")
+def test_without_its_programs_a_sentence_names_them_and_their_packages() -> None:
+    found = r"Expected qemu-system-x86_64, busybox, arv-tool-0.8, found none\. Install them: apt-get install "
+    with pytest.raises(CannotRun, match=found + "qemu-system-x86 busybox-static aravis-tools-cli"):
+        host.check_host()
+
+
+@pytest.mark.parametrize("content", [Path(sys.executable).read_bytes(), b"#!/bin/sh\n"], ids=["libraries", "script"])
+def test_a_busybox_that_needs_more_than_itself_is_refused(programs: Path, content: bytes) -> None:
+    for name in ("qemu-system-x86_64", "busybox", "arv-tool-0.8"):
+        program(programs, name, "exit 0")
+    (programs / "busybox").write_bytes(content)
+    with pytest.raises(CannotRun, match="Expected a static busybox, found one that needs libraries"):
+        host.check_host()
+
+
+def test_a_machine_of_another_kind_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("platform.machine", lambda: "aarch64")
+    with pytest.raises(CannotRun, match=r"Expected an x86_64 machine, .* found aarch64"):
+        host.check_host()
 
 
 def test_serial_line_is_cleaned_and_cut_into_lines() -> None:
@@ -134,36 +152,62 @@ def test_guests_exit_status_comes_back(programs: Path, status: int, capsys: pyte
 
 
 def test_guest_that_does_not_boot_is_an_error(programs: Path) -> None:
-    with pytest.raises(CannotRun, match="Expected the guest to boot"):
+    with pytest.raises(GuestFailed, match="Expected the guest to boot"):
         guest(programs, "echo 'Kernel panic'; exit 1")
 
 
 def test_guest_that_never_ends_is_ended(programs: Path) -> None:
     begun = time.monotonic()
-    with pytest.raises(CannotRun, match="Expected the guest to end in 0 s"):
+    with pytest.raises(GuestFailed, match="Expected the guest to end in 0 s"):
         guest(programs, f"echo '{BOOTED} 3.21 s'; exec sleep 60", limit_s=0.3)
     assert time.monotonic() - begun < 10
 
 
 def test_guest_that_dies_before_it_says_how_it_went_is_an_error(programs: Path) -> None:
-    with pytest.raises(CannotRun, match="Expected the guest to end"):
+    with pytest.raises(GuestFailed, match="Expected the guest to end"):
         guest(programs, f"echo '{BOOTED} 3.21 s'; echo '12 passed in 3.4s'")
 
 
-@pytest.mark.usefixtures("no_programs")
-def test_without_qemu_a_sentence_says_so(tmp_path: Path) -> None:
-    with pytest.raises(CannotRun, match=r"Expected qemu-system-x86_64, found none\. Install it"):
-        run_guest(tmp_path, tmp_path, 1.0)
+@pytest.mark.parametrize("said", ["no tests ran in 0.1s", "3 skipped in 0.1s", "0 passed in 0.1s"])
+def test_guest_that_is_content_without_a_test_is_an_error(programs: Path, said: str) -> None:
+    with pytest.raises(GuestFailed, match="Expected tests to pass in the guest, found none"):
+        guest(programs, f"echo '{BOOTED} 3.21 s'; echo '{said}'; echo '{EXIT} 0'")
 
 
 @pytest.mark.usefixtures("no_programs")
-def test_command_ends_with_2_and_a_sentence_when_it_cannot_run(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize(("arguments", "status"), [([], 2), (["--if-possible"], 0)])
+def test_command_says_that_it_cannot_run_before_it_fetches_a_kernel(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], arguments: list[str], status: int
 ) -> None:
-    monkeypatch.setattr(command, "_CACHE", tmp_path / "cache")
-    monkeypatch.setattr(sys, "argv", ["usb_stack"])
+    monkeypatch.setattr(command, "kernel_in", lambda cache: pytest.fail("a kernel was fetched"))
+    monkeypatch.setattr(sys, "argv", ["usb_stack", *arguments])
+    assert command.main() == status
+    assert "The USB tests were not run. Expected qemu-system-x86_64, " in capsys.readouterr().err
+
+
+def test_a_guest_that_fails_is_a_failure_also_where_it_need_not_be_had(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, programs: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    program(programs, "qemu-system-x86_64", "exit 1")
+    kernel = kernel_files(tmp_path)
+    monkeypatch.setattr(command, "check_host", lambda: None)
+    monkeypatch.setattr(command, "busybox", lambda: kernel.image)
+    monkeypatch.setattr(command, "kernel_in", lambda cache: kernel)
+    monkeypatch.setattr(sys, "argv", ["usb_stack", "--if-possible"])
     assert command.main() == 2
-    assert "Expected Debian's apt-get" in capsys.readouterr().err
+    assert "Expected the guest to boot, found it did not" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("promised", "status", "said"), [("", 0, "1 passed"), ("1", 5, "1 deselected")])
+def test_the_guests_command_runs_tests_and_there_those_that_need_its_kernel(
+    promised: str, status: int, said: str
+) -> None:
+    run = (sys.executable, *command._PYTEST, "tests/usb_stack/test_needs.py")
+    environment = os.environ | {PROMISED: promised}
+    done = subprocess.run(
+        run, cwd=command._REPOSITORY, env=environment, capture_output=True, text=True, timeout=120, check=False
+    )
+    assert (done.returncode, said in done.stdout) == (status, True), done.stdout + done.stderr
 
 
 @pytest.mark.parametrize(
@@ -183,8 +227,10 @@ def test_tests_run_in_the_guest_are_those_named_or_these(
         archives.append(archive.read_bytes())
         return 7
 
+    monkeypatch.setattr(command, "check_host", lambda: None)
+    monkeypatch.setattr(command, "busybox", lambda: tmp_path)
     monkeypatch.setattr(command, "kernel_in", lambda cache: kernel_files(tmp_path))
-    monkeypatch.setattr(command, "initramfs", lambda kernel, inside: inside.encode())
+    monkeypatch.setattr(command, "initramfs", lambda kernel, busybox, inside: inside.encode())
     monkeypatch.setattr(command, "run_guest", run_guest)
     monkeypatch.setattr(sys, "argv", ["usb_stack", *asked])
     assert command.main() == 7

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import socket
 import time
 from collections.abc import Callable
@@ -60,6 +61,12 @@ class Plug:
         if not _within(_CHANGE_S, lambda: self._status() == _FREE and not _present(self._camera.model.serial)):
             raise TimeoutError(f"expected the kernel to let the port go within {_CHANGE_S:.0f} s, found it does not")
 
+    def unconfigure(self) -> None:
+        """Take the camera's configuration away, as on a system that has given it none."""
+        folder = _folder(self._camera.model.serial)
+        assert folder is not None
+        (folder / "bConfigurationValue").write_text("-1")
+
     def _status(self) -> str:
         return next(port.status for port in ports() if port.number == self._port)
 
@@ -69,13 +76,21 @@ PlugIn = Callable[[VirtualCamera], Plug]
 
 def _present(serial: str) -> bool:
     """Whether the kernel has found and configured a device with this serial number."""
+    folder = _folder(serial)
+    try:
+        return folder is not None and (folder / "bConfigurationValue").read_text().strip() == "1"
+    except OSError:  # devices may go while one looks
+        return False
+
+
+def _folder(serial: str) -> Path | None:
+    """Where the kernel tells of the device with this serial number; None when it has found none."""
     for folder in _DEVICES.glob("*-*"):
-        try:
+        # Interfaces have no serial number, and devices may go while one looks.
+        with contextlib.suppress(OSError):
             if (folder / "serial").read_text().strip() == serial:
-                return (folder / "bConfigurationValue").read_text().strip() == "1"
-        except OSError:  # interfaces have no serial number, and devices may go while one looks
-            continue
-    return False
+                return folder
+    return None
 
 
 def _within(limit_s: float, condition: Callable[[], bool]) -> bool:

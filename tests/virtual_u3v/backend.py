@@ -24,6 +24,8 @@ from tests.virtual_u3v.usb_faults import Overflowed, Stalled, Unplugged
 
 _MS = 1_000_000
 _HALT_REQUEST = 0x02
+_GET_CONFIGURATION = Setup(0x80, Request.GET_CONFIGURATION, 0, 0, 1)
+_CONFIGURE = Setup(0x00, Request.SET_CONFIGURATION, 1, 0, 0)
 _NO_DEVICE, _NOT_FOUND, _BUSY, _TIMEOUT, _OVERFLOW, _PIPE, _ACCESS = -4, -5, -6, -7, -8, -9, -3
 # libusb's own texts and errno, as pyusb's libusb1 backend reports them.
 _ERRORS = {
@@ -61,7 +63,12 @@ class VirtualBackend(usb.backend.IBackend):
         self._handles: list[_Handle] = []
 
     def enumerate_devices(self) -> Iterator[_Device]:
-        return iter([_Device(camera, camera.address) for camera in self._cameras if camera.plugged])
+        present = [camera for camera in self._cameras if camera.plugged]
+        for camera in present:
+            # Linux does this when a device is plugged in; a host program finds it done.
+            if not camera.faults.unconfigured and camera.control(_GET_CONFIGURATION) == b"\0":
+                camera.control(_CONFIGURE)
+        return iter([_Device(camera, camera.address) for camera in present])
 
     def get_parent(self, dev: _Device) -> None:
         return None
@@ -99,9 +106,7 @@ class VirtualBackend(usb.backend.IBackend):
         self._request(dev_handle, Setup(0x00, Request.SET_CONFIGURATION, config_value, 0, 0))
 
     def get_configuration(self, dev_handle: _Handle) -> int:
-        # Linux configures a device when it is plugged in; a host program finds it so.
-        self._check_present(dev_handle)
-        return 1
+        return self._request(dev_handle, _GET_CONFIGURATION)[0]
 
     def set_interface_altsetting(self, dev_handle: _Handle, intf: int, altsetting: int) -> None:
         self._check_claimed(dev_handle, intf)
@@ -113,7 +118,8 @@ class VirtualBackend(usb.backend.IBackend):
         others = [handle for handle in same if handle is not dev_handle]
         if dev_handle.camera.faults.interface_busy or any(intf in handle.claimed for handle in others):
             raise _error(_BUSY)
-        if intf >= dev_handle.camera.descriptors.configuration.bNumInterfaces:
+        configured = self.get_configuration(dev_handle) == 1
+        if not configured or intf >= dev_handle.camera.descriptors.configuration.bNumInterfaces:
             raise _error(_NOT_FOUND)
         dev_handle.claimed.add(intf)
 
@@ -162,7 +168,7 @@ class VirtualBackend(usb.backend.IBackend):
         self._request(dev_handle, Setup(_HALT_REQUEST, Request.CLEAR_FEATURE, 0, ep, 0))
 
     def reset_device(self, dev_handle: _Handle) -> None:
-        self._request(dev_handle, Setup(0x00, Request.SET_CONFIGURATION, 1, 0, 0))
+        self._request(dev_handle, _CONFIGURE)
 
     def is_kernel_driver_active(self, dev_handle: _Handle, intf: int) -> bool:
         return False

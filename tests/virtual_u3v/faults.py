@@ -65,6 +65,7 @@ class Faults:
         unplug_at_frame: the frame in the middle of which the camera goes away.
         access_denied: the device node may not be opened.
         interface_busy: another program holds the interfaces.
+        unconfigured: the host's system leaves the device without a configuration.
         description: what is wrong with the GenICam file; looked at when the camera gets power.
     """
 
@@ -97,6 +98,7 @@ class Faults:
     unplug_at_frame: int | None = None
     access_denied: bool = False
     interface_busy: bool = False
+    unconfigured: bool = False
     description: DescriptionFault = DescriptionFault.NONE
 
 

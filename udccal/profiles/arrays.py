@@ -122,9 +122,9 @@ def _shaped(values: Float[np.ndarray, "..."], stored: Numbers | StoredArray) -> 
     sizes = math.prod(size for size in stored.shape if size)
     with np.errstate(invalid="ignore", over="ignore"):
         typed = values.astype(_DTYPES[stored.dtype])
-    if sizes > _MAX_FILE_BYTES or not np.all(np.isfinite(typed)):
+    if sizes > MAX_FILE_BYTES or not np.all(np.isfinite(typed)):
         raise ProfileError(
-            f"Expected '{stored.name}' to hold finite numbers of {stored.dtype} and at most {_MAX_FILE_BYTES} of them, "
+            f"Expected '{stored.name}' to hold finite numbers of {stored.dtype} and at most {MAX_FILE_BYTES} of them, "
             f"found others in shape {stored.shape}. Restore the profile from a copy."
         )
     return typed.reshape(stored.shape)

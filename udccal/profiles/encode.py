@@ -151,7 +151,7 @@ def _store_picture(folder: Path, name: str, channels: Channels, unit: str, what:
 def _load_picture(
     picture: StoredPicture, folder: Path, names: tuple[str, ...], size: tuple[int, int], allowed: tuple[float, float]
 ) -> Channels:
-    channels = read_checked(folder, picture.file, picture.sha256, (rows, columns))
+    channels = read_checked(folder, picture.file, picture.sha256, size)
     found = next(iter(channels.values())).shape
     if set(channels) != set(names) or found != size or (picture.rows, picture.columns) != found:
         raise ProfileError(

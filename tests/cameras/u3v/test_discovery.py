@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import errno
 import sys
 
 import pytest
@@ -68,6 +69,36 @@ def test_cameras_held_by_others_are_listed_by_name() -> None:
     (seen,) = found_devices(backend)
     assert (seen.identity.serial, seen.trouble is None) == ("A1", False)
     assert list_cameras(backend)[0].serial == "A1"
+
+
+def test_cameras_that_are_not_configured_yet_are_listed_and_opened() -> None:
+    backend = VirtualBackend(cameras("A1", "B2", faults=Faults(unconfigured=True)))
+    with U3vCamera("B2", backend=backend) as camera:
+        assert camera.identity.serial == "B2"
+        assert len(list(camera.frames(1))) == 1
+    backend = VirtualBackend(cameras("A1", "B2", faults=Faults(unconfigured=True)))
+    assert [identity.serial for identity in list_cameras(backend)] == ["A1", "B2"]
+    assert [seen.trouble for seen in found_devices(backend)] == [None, None]
+
+
+def test_cameras_that_are_configured_are_not_configured_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delattr(VirtualBackend, "set_configuration")
+    with U3vCamera("A1", backend=VirtualBackend(cameras("A1"))) as camera:
+        assert camera.identity.serial == "A1"
+
+
+@pytest.mark.parametrize(("code", "number"), [(-6, errno.EBUSY), (-6, None)])
+def test_a_configuration_that_cannot_be_asked_for_is_not_set(
+    monkeypatch: pytest.MonkeyPatch, code: int, number: int | None
+) -> None:
+    def refuse(self: VirtualBackend, dev_handle: object) -> int:
+        raise usb.core.USBError("Resource busy", code, number)
+
+    monkeypatch.setattr(VirtualBackend, "get_configuration", refuse)
+    monkeypatch.delattr(VirtualBackend, "set_configuration")
+    (seen,) = found_devices(VirtualBackend(cameras("A1")))
+    assert seen.trouble is not None
+    assert "held by another program" in seen.trouble
 
 
 def test_chooses_by_serial() -> None:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from datetime import UTC
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 import rawpy
@@ -18,6 +20,12 @@ RAW_SUFFIXES = (
     *(".dng", ".cr2", ".cr3", ".nef", ".nrw", ".arw", ".srf", ".sr2", ".raf", ".rw2", ".orf"),
     *(".pef", ".srw", ".3fr", ".fff", ".iiq", ".erf", ".mrw", ".kdc", ".dcr", ".mos", ".raw"),
 )
+# How files of these kinds begin (LibRaw 0.22, identify.cpp). A file that begins otherwise LibRaw takes for one of some
+# camera whose files have the same length.
+_START: Final = re.compile(
+    rb"II\*\0|MM\0\*|II(U\0|RO|RS)|MMOR|IIII.waR|MMMMRaw|FUJIFILM|\0MRM|.{4}ftypcrx |.{25}ARECOYK", re.DOTALL
+)
+_START_BYTES: Final = 32
 
 
 def raw_mosaic(path: Path, shape: Shape | None = None) -> Mosaic:
@@ -62,6 +70,7 @@ def libraw_facts(path: Path) -> tuple[float | None, float | None, float | None]:
 def _opened(path: Path) -> Iterator[rawpy.RawPy]:
     if not path.is_file():
         raise FileFormatError(f"Expected a camera raw file at {path}, found none. Check the path.")
+    _check_start(path)
     try:
         with closing(rawpy.RawPy()) as raw:
             raw.open_file(str(path))
@@ -71,6 +80,16 @@ def _opened(path: Path) -> Iterator[rawpy.RawPy]:
         shown = reason.decode("ascii", "replace") if isinstance(reason, bytes) else str(reason)
         message = f"Expected {path} to be a whole camera raw file, found: {shown}. Copy it again."
         raise FileFormatError(message) from error
+
+
+def _check_start(path: Path) -> None:
+    with path.open("rb") as stream:
+        start = stream.read(_START_BYTES)
+    if _START.match(start) is None:
+        raise FileFormatError(
+            f"Expected {path} to begin as a camera raw file does, found no header, so that its size and pattern would "
+            "be a guess. Convert it to DNG, or to 16-bit TIFF or PNG with its pattern and bits given."
+        )
 
 
 def _cfa(path: Path, raw: rawpy.RawPy) -> str:

@@ -119,6 +119,20 @@ def find_camera(serial: str | None, backend: Any = None) -> tuple[FoundDevice, U
     raise CameraLost(f"Expected {wanted}, found {seen}. Plug it in and check that it has power.")
 
 
+def configure(device: Any) -> None:
+    """Configure a pyusb device where the system has not; doing it again would disturb it.
+
+    Raises:
+        usb.core.USBError: as USB has it.
+    """
+    try:
+        device.get_active_configuration()
+    except usb.core.USBError as error:
+        if (error.errno, error.backend_error_code) != (None, None):  # pyusb's own, of no configuration, has neither
+            raise
+        device.set_configuration()
+
+
 def _usb_cameras(backend: Any) -> Iterator[UsbCamera]:
     with usb_errors("looking for cameras"):
         devices = list(usb.core.find(find_all=True, backend=backend or _libusb()))
@@ -202,7 +216,7 @@ def _texts_and_trouble(camera: UsbCamera, indices: tuple[int, ...]) -> tuple[tup
     control = camera.interfaces.numbers[0]
     try:
         with usb_errors("asking the camera for its name"):
-            device.get_active_configuration()  # opens it, so that a refusal is not taken for a camera without strings
+            configure(device)  # opens it, so that a refusal is not taken for a camera without strings
             for i, index in enumerate(indices):
                 texts[i] = _text(device, index)
             usb.util.claim_interface(device, control)

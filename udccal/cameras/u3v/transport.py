@@ -11,7 +11,7 @@ import usb.control
 import usb.core
 import usb.util
 
-from udccal.cameras.u3v.discovery import UsbCamera, UsbInterfaces
+from udccal.cameras.u3v.discovery import UsbCamera, UsbInterfaces, configure
 from udccal.cameras.u3v.usb_errors import TransferFailed, usb_errors
 from udccal.errors import CameraError, CameraLost
 
@@ -30,7 +30,7 @@ class UsbLink:
         self._interfaces: UsbInterfaces = camera.interfaces
         try:
             with self._errors("opening the camera"):
-                self._configure()
+                configure(self._device)
                 for number in self._interfaces.numbers:
                     self._claim(number)
                 self._stream_in = self._endpoint(self._interfaces.stream_in)
@@ -126,15 +126,6 @@ class UsbLink:
         except usb.core.USBError:
             return False
         return True
-
-    def _configure(self) -> None:
-        """Most systems configure a device when it is plugged in; doing it again would disturb it."""
-        try:
-            self._device.get_active_configuration()
-        except usb.core.USBError as error:
-            if error.errno is not None:
-                raise
-            self._device.set_configuration()
 
     def _claim(self, number: int) -> None:
         with contextlib.suppress(NotImplementedError):  # only Linux has drivers to detach
