@@ -24,10 +24,10 @@ demo: $(STAMP)
 	$(BIN)/udccal demo --out $(DEMO_OUT)
 
 test: $(STAMP)
-	$(BIN)/python -m pytest -m "not slow" -n 2 --dist worksteal
+	$(BIN)/python -m pytest -m "not slow" -n 2 --dist worksteal --durations=30
 
 test-slow: $(STAMP)
-	$(BIN)/python -m pytest -m slow
+	$(BIN)/python -m pytest -m slow -n 2 --dist worksteal --durations=30
 
 # The USB3 Vision driver through libusb and a real kernel's USB: boots one in qemu, with a virtual camera plugged in.
 # USB: arguments, such as --if-possible, which says so and goes on where qemu cannot be had.

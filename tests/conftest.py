@@ -22,6 +22,12 @@ def pytest_configure(config: pytest.Config) -> None:
 
         os.environ.setdefault(FOLDER_VARIABLE, str(cache.mkdir("compilations")))
         keep_compilations()
+    if config.pluginmanager.hasplugin("hypothesispytest"):
+        from hypothesis import settings
+
+        # The same examples in every run, and none that fails because the machine is busy.
+        settings.register_profile("udccal", derandomize=True)
+        settings.load_profile("udccal")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

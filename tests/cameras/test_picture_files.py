@@ -131,7 +131,7 @@ def test_tiff_cut_short_anywhere_is_refused(tmp_path: Path) -> None:
                 read_tiff16(tmp_path / "cut.tif")
 
 
-@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(at=st.integers(0, 2000), value=st.binary(min_size=1, max_size=8))
 def test_damaged_tiffs_are_read_or_refused(at: int, value: bytes, tmp_path: Path) -> None:
     content = bytearray(write_grey(tmp_path / "a.tif").read_bytes())
