@@ -13,7 +13,7 @@ from pathlib import Path
 from udccal.cli.jobs.benches import simulated_bench, simulated_rig
 from udccal.cli.jobs.capture import capture
 from udccal.cli.output import Output
-from udccal.fitting.noise import fit_noise
+from udccal.fitting.noise import fit_noise, nominal_noise, read_noise
 from udccal.models.noise import electrons, variance_e
 from udccal.rig import RigDescription, load_rig
 from udccal.sessions.store import Session
@@ -43,7 +43,7 @@ def main() -> None:
 
 def report(session: Session) -> None:
     """Fit, look at the result, and use the term."""
-    result = fit_noise(session)
+    result = fit_noise(read_noise(session), nominal_noise(session.rig))
     print(f"{result.status.name}: {result.status.value}")
     for estimate in result.estimates:
         print(f"  {estimate.name:22} {estimate.value:12.5g} ± {estimate.sigma:.2g} {estimate.unit}")

@@ -15,7 +15,7 @@ from jaxtyping import Float
 from udccal.fitting.absent import absent_backscatter, absent_psf, absent_wire
 from udccal.fitting.backscatter.fit import fit_backscatter
 from udccal.fitting.geometry.fit import BoardView, fit_views, read_views, rig_prior
-from udccal.fitting.noise.fit import fit_noise, nominal_noise
+from udccal.fitting.noise import fit_noise, nominal_noise, read_noise
 from udccal.fitting.nominal import nominal_geometry
 from udccal.fitting.psf.fit import Effort, fit_psf
 from udccal.fitting.wire.fit import FIELD_SAMPLES, fit_wire_session, sensor_map
@@ -149,7 +149,7 @@ def fit_foundation(
     This needs the steps of these terms only: it can go on while the others are captured.
     """
     rig, effort, clock = session.rig, effort or FitEffort(), _Clock(session, progress)
-    noise = clock.run("noise", lambda: fit_noise(session), lambda: nominal_noise(rig))
+    noise = clock.run("noise", lambda: fit_noise(read_noise(session), nominal_noise(rig)), lambda: nominal_noise(rig))
     with clock.of("geometry") as captured:
         boards = tuple(read_views(session, noise.term)) if captured else ()
         geometry = (
