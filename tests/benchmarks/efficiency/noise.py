@@ -18,6 +18,7 @@ from tests.benchmarks.efficiency.trials import Trials, column
 from udccal.fitting.engine.information import cramer_rao, fisher_information
 from udccal.fitting.noise import ExposureLevel, NoiseData, NoiseRules, SpatialStack, codes, fit_noise
 from udccal.fitting.noise.codes import NORMAL_SHAPE, excess_kurtosis, tukey_lambda_std
+from udccal.fitting.noise.data import DarkPair, dark_pair
 from udccal.fitting.noise.transfer import temporal_variance
 from udccal.models.noise import Noise
 from udccal.result import FitResult
@@ -219,9 +220,9 @@ def _histogram_information(sensor: ToySensor, x: Float[np.ndarray, "12"]) -> Flo
     for t in sensor.dark_times_s:
         first, second = (expose(sensor, fixed, t, False, rng) for _ in range(2))
         # The information is expected, not observed: the counts matter by their number alone.
-        pair = codes.dark_pair(first, second, t, 1, 2**sensor.bits - 1)
+        pair = dark_pair(first, second, t, 1, 2**sensor.bits - 1)
 
-        def probability(at: Float[np.ndarray, "6"], pair: codes.DarkPair = pair) -> Float[np.ndarray, " cells"]:
+        def probability(at: Float[np.ndarray, "6"], pair: DarkPair = pair) -> Float[np.ndarray, " cells"]:
             K, V0, shape, black, rate, spread2 = at
             known = codes.Surroundings(K, sensor.row_DN, NoiseRules().background)
             return codes.pair_probability(pair, np.array([black, rate, V0, spread2, shape]), known).ravel()

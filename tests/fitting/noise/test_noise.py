@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from udccal.cameras.protocol import Region
-from udccal.fitting.noise import NoiseRules, codes, dark_fit, moments, nominal_noise
+from udccal.fitting.noise import NoiseRules, codes, moments, nominal_noise
 from udccal.fitting.noise.dark import dsnu
-from udccal.fitting.noise.data import NoiseMoments, converter_step
+from udccal.fitting.noise.data import NoiseMoments, converter_step, dark_pair
 from udccal.fitting.noise.fit import fit_moments
 from udccal.fitting.noise.prnu import prnu
 from udccal.models.noise import Noise
@@ -53,7 +53,7 @@ def reduced(sensor: Sensor, levels: np.ndarray, seed: int, stack_level: float | 
     top = 2**sensor.truth.bits - 1
     for t in (0.0005, 0.002, 0.01, 0.02, 0.25, 1.0):
         pair = [sensor.expose(none, t, region, rng) for _ in range(2)]
-        darks.append(codes.dark_pair(pair[0], pair[1], t, 1, top))
+        darks.append(dark_pair(pair[0], pair[1], t, 1, top))
         rows.append(reduce_pair(pair[0], pair[1], t))
     middle = 0.02 * float(levels[len(levels) // 2] if stack_level is None else stack_level)
     return NoiseMoments(
@@ -172,8 +172,8 @@ def test_rounding_coarser_than_the_noise(fraction: float) -> None:
     sigma, spread = 0.28, 0.08
     offset = 24 + fraction + spread * rng.standard_normal((400, 400))
     frames = [np.rint(offset + sigma * rng.standard_normal((400, 400))).astype(np.uint16) for _ in range(2)]
-    pair = codes.dark_pair(frames[0], frames[1], 0.01)
-    fit = dark_fit.fit_dark((pair, replace(pair, exposure_s=0.02)), codes.Surroundings(0.06, 0.0, 1e-5), RULES)
+    pair = dark_pair(frames[0], frames[1], 0.01)
+    fit = codes.fit_dark((pair, replace(pair, exposure_s=0.02)), codes.Surroundings(0.06, 0.0, 1e-5), RULES)
     assert np.sqrt(fit.values[2]) == pytest.approx(sigma, rel=0.03)
     # What the textbook's white quantisation makes of the same frames is worse than what is asked for.
     naive = 0.5 * np.var(frames[0].astype(float) - frames[1]) - 1 / 12
@@ -186,10 +186,10 @@ def test_codes_cut_off_at_zero_are_censored() -> None:
     black, sigma = 0.3, 2.0
     frames = [np.clip(np.rint(black + sigma * rng.standard_normal((300, 400))), 0, None) for _ in range(4)]
     pairs = tuple(
-        codes.dark_pair(frames[i].astype(np.uint16), frames[i + 1].astype(np.uint16), 0.01 * (i + 1)) for i in (0, 2)
+        dark_pair(frames[i].astype(np.uint16), frames[i + 1].astype(np.uint16), 0.01 * (i + 1)) for i in (0, 2)
     )
     assert pairs[0].edges_DN[0] == -np.inf
-    fit = dark_fit.fit_dark(pairs, codes.Surroundings(0.3, 0.0, 1e-5), RULES, normal=True)
+    fit = codes.fit_dark(pairs, codes.Surroundings(0.3, 0.0, 1e-5), RULES, normal=True)
     assert fit.values[0] == pytest.approx(black, abs=0.05)
     assert np.sqrt(fit.values[2]) == pytest.approx(sigma, rel=0.02)
     # Moments of the cut-off codes are far away.
@@ -200,11 +200,11 @@ def test_a_wide_window_of_codes_is_grouped_and_loses_nothing() -> None:
     rng = np.random.default_rng(9)
     frames = [np.rint(2000 + 200 * rng.standard_normal((200, 300))).astype(np.uint16) for _ in range(2)]
     frames[0][0, 0] = 3  # far below the window
-    pair = codes.dark_pair(frames[0], frames[1], 0.01)
+    pair = dark_pair(frames[0], frames[1], 0.01)
     assert pair.counts.shape[0] <= 161
     assert pair.outside >= 1
     assert pair.counts.sum() + pair.outside == frames[0].size
-    assert np.sqrt(dark_fit.start_values((pair,))[2]) == pytest.approx(200, rel=0.02)
+    assert np.sqrt(codes.start_values((pair,))[2]) == pytest.approx(200, rel=0.02)
 
 
 def test_hot_pixels_do_not_carry_the_prnu() -> None:
@@ -237,3 +237,24 @@ def test_counts_hot_pixels_and_converter_steps() -> None:
     frame = rng.integers(100, 200, (50, 50)).astype(np.uint16)
     assert converter_step(frame) == 1
     assert converter_step(frame * np.uint16(16)) == 16
+
+
+def test_the_posterior_gives_the_sigma_of_any_function_of_the_term(fitted: tuple[Sensor, FitResult[Noise]]) -> None:
+    result = fitted[1]
+    well = result.sigma_of(lambda noise: np.array((noise.saturation_DN - noise.black_DN) / noise.K_DN_per_e))
+    K, sigma = result.estimate("K_DN_per_e"), result.sigma_of(lambda noise: np.array(noise.K_DN_per_e))
+    assert sigma == pytest.approx(K.sigma, rel=1e-6)
+    level = result.estimate("saturation_DN").value - result.estimate("black_DN").value
+    assert well > level * K.sigma / K.value**2 * (1 - 1e-6)
+
+
+def test_a_flat_that_lies_off_the_curve_is_left_out_of_it() -> None:
+    rig, sensor = toy("lg55-aca2040", 4)
+    data = reduced(sensor, np.linspace(0.05, 1.6, 10), 4)
+    flats = list(data.flats)
+    flats[3] = replace(flats[3], variance_DN2=flats[3].variance_DN2 * np.where(np.arange(16) == 5, 1.5, 1.0))
+    result = fit_moments(replace(data, flats=tuple(flats)), nominal_noise(rig), RULES)
+    clean = fit_moments(data, nominal_noise(rig), RULES)
+    assert any(one.rule.startswith("bins of flats off") and one.count == 1 for one in result.outliers)
+    K = clean.estimate("K_DN_per_e")
+    assert result.estimate("K_DN_per_e").value == pytest.approx(K.value, abs=0.5 * K.sigma)

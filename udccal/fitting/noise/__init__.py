@@ -1,8 +1,7 @@
 """Noise after EMVA 1288: what dark frames and flats tell of the sensor."""
 
 from udccal.fitting.noise.data import ExposureLevel, NoiseData, SpatialStack, read_noise
-from udccal.fitting.noise.fit import fit_noise, nominal_noise
-from udccal.fitting.noise.report import mean_response
+from udccal.fitting.noise.fit import fit_noise, mean_response, nominal_noise
 from udccal.fitting.noise.rules import NoiseRules
 
 __all__ = [

@@ -11,8 +11,15 @@ from jaxtyping import Bool, Float, Float32
 from udccal.fitting.engine.gaussian import scaled_inverse
 from udccal.fitting.engine.orders import Attempt, bic, choose
 from udccal.fitting.engine.robust import MAD_TO_SIGMA
-from udccal.fitting.noise.codes import NORMAL_SHAPE, Surroundings, excess_kurtosis
-from udccal.fitting.noise.dark_fit import LEAST_VARIANCE, DarkFit, dark_levels, fit_dark
+from udccal.fitting.noise.codes import (
+    LEAST_VARIANCE,
+    NORMAL_SHAPE,
+    DarkFit,
+    Surroundings,
+    dark_levels,
+    excess_kurtosis,
+    fit_dark,
+)
 from udccal.fitting.noise.data import NoiseMoments
 from udccal.fitting.noise.rules import NoiseRules
 from udccal.result import Candidate
@@ -94,16 +101,16 @@ def fit_dark_terms(
 
     ``start`` is a fit with another gain to begin from.
     """
-    gains = np.ones(len(data.darks))
-    row, known = row_noise(data, rules, gains), _known(data, rules, K_DN_per_e, gains)
+    row, in_pairs = row_noise(data, rules, np.ones(len(data.darks)))
+    known = Surroundings(K_DN_per_e, in_pairs, rules.background)
     tukey = fit_dark(data.darks, known, rules, start=None if start is None else start.fit.values)
     if not _follows(tukey, rules):
-        gains = tukey.edge_gains
-        row, known = row_noise(data, rules, gains), _known(data, rules, K_DN_per_e, gains)
+        row, in_pairs = row_noise(data, rules, tukey.edge_gains)
+        known = replace(known, sigma_row_DN=in_pairs)
         tukey = fit_dark(data.darks, known, rules, start=tukey.values)
     # Temporal noise too small beside a code is not told from the pattern of rounding.
     resolved = float(tukey.values[2]) + known.sigma_row_DN**2 >= (rules.resolved * data.q_DN) ** 2
-    row = row if resolved else row_noise(data, rules, 0.0 * gains)
+    row = row if resolved else row_noise(data, rules, np.zeros(len(data.darks)))[0]
     samples = sum(int(pair.counts.sum()) for pair in data.darks)
     told, variance = float(tukey.values[4]), float(tukey.cov[4, 4])
     name = f"read noise of another shape than normal ({NORMAL_SHAPE:.2f})"
@@ -128,41 +135,36 @@ def fit_dark_terms(
         dsnu_DN2=Quantity.asked("DSNU", uneven.variance, uneven.sigma**2, uneven.samples),
         pixels_DN2=uneven.mean_variance,
         white=white,
-        fit=replace(fit, values=tukey.values, iterations=tukey.iterations),
+        fit=replace(fit, values=tukey.values),
         samples=samples,
         defects=uneven,
     )
 
 
-def _known(
-    data: NoiseMoments, rules: NoiseRules, K_DN_per_e: float, edge_gains: Float[np.ndarray, " pairs"]
-) -> Surroundings:
-    """Row noise as it happened to be in the pairs alone: that is what widened their histograms."""
-    alone = replace(data, dark_stack=replace(data.dark_stack, temporal=None))
-    there = row_noise(data, rules, edge_gains).there
-    sigma = float(np.sqrt(row_noise(alone, rules, edge_gains).value)) if there else 0.0
-    return Surroundings(K_DN_per_e, sigma, rules.background)
+def row_noise(data: NoiseMoments, rules: NoiseRules, edge_gains: Float[np.ndarray, " pairs"]) -> tuple[Quantity, float]:
+    """Variance by rows, and its root as it happened to be in the pairs alone: that is what widened their histograms.
 
+    Rounding and cut-off codes pass only the square of ``edge_gains`` of it, pair by pair.
+    """
+    seen = [(one.rows, float(gain)) for one, gain in zip(data.dark_moments, edge_gains, strict=True)]
+    samples = sum(int(pair.counts.sum()) for pair in data.darks)
 
-def row_noise(data: NoiseMoments, rules: NoiseRules, edge_gains: Float[np.ndarray, " pairs"]) -> Quantity:
-    """Variance by rows; rounding and cut-off codes pass only the square of ``edge_gains`` of it, pair by pair."""
-    seen = [(m.rows, float(gain)) for m, gain in zip(data.dark_moments, edge_gains, strict=True)]
+    def told() -> Quantity:
+        rows = [
+            ((of.variance_DN2 + of.sampling_DN2) / gain**2, of.sampling_DN2 / gain**2, of.dof)
+            for of, gain in seen
+            if gain >= rules.row_visible and of.variance_DN2 + of.sampling_DN2 > 0
+        ]
+        # Where rounding hides all of it, it may be as large as rounding itself.
+        found = excess_variance(*np.array(rows).T) if rows else (0.0, (data.q_DN**2 / 12.0) ** 2, 0.0)
+        return Quantity.asked("row noise", found[0], found[1], samples, found[2])
+
+    alone = told()
     if data.dark_stack.temporal is not None:
         nearest = int(np.argmin([abs(pair.exposure_s - data.dark_stack.exposure_s) for pair in data.darks]))
         seen.append((data.dark_stack.temporal.rows, float(edge_gains[nearest])))
-    samples = sum(int(pair.counts.sum()) for pair in data.darks)
-    rows = np.array(
-        [
-            ((m.variance_DN2 + m.sampling_DN2) / gain**2, m.sampling_DN2 / gain**2, m.dof)
-            for m, gain in seen
-            if gain >= rules.row_visible and m.variance_DN2 + m.sampling_DN2 > 0
-        ]
-    )
-    if not rows.size:
-        # Rounding hides all of it: it may be as large as rounding itself.
-        return Quantity.asked("row noise", 0.0, (data.q_DN**2 / 12.0) ** 2, samples, gain=0.0)
-    value, variance, gain = excess_variance(*rows.T)
-    return Quantity.asked("row noise", value, variance, samples, gain)
+    row = told()
+    return row, float(np.sqrt(alone.value)) if row.there else 0.0
 
 
 def excess_variance(

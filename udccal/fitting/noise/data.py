@@ -12,11 +12,11 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import final
 
+import cv2
 import numpy as np
-from jaxtyping import UInt8, UInt16
+from jaxtyping import Float, Int, UInt8, UInt16
 
 from udccal.errors import FitError
-from udccal.fitting.noise.codes import DarkPair, dark_pair
 from udccal.fitting.noise.moments import Averaged, Codes, Moments, reduce_frames
 from udccal.fitting.noise.rules import NoiseRules
 from udccal.sessions.store import Session
@@ -27,6 +27,8 @@ Frame = UInt16[np.ndarray, "_rows _columns"] | UInt8[np.ndarray, "_rows _columns
 _MOST_SIDE, _LEAST_SIDE = 65536, 16
 _MOST_FRAMES = 4096
 _THREADS = 2
+# Groups of codes of a histogram, and samples of a strip, which stays in the processor's cache.
+_MOST_CODES, _STRIP = 160, 1 << 18
 
 
 @final
@@ -74,6 +76,35 @@ class NoiseData:
     stack: SpatialStack | None = None
     bayer: bool = False
     top_code: int | None = None
+
+
+@final
+@dataclass(frozen=True)
+class DarkPair:
+    """A pair of dark frames reduced to the joint histogram of the two codes of each pixel.
+
+    The outermost edges are infinite where the codes stop there (at 0, or at the converter's end).
+    """
+
+    exposure_s: float
+    edges_DN: Float[np.ndarray, " codes_plus_1"]
+    counts: Int[np.ndarray, "codes codes"]
+    outside: int
+    rows: int
+
+    @property
+    def step_DN(self) -> float:
+        """The smallest width of a group of codes."""
+        return float(np.min(np.diff(self.edges_DN)))
+
+    @property
+    def centres_DN(self) -> Float[np.ndarray, " codes"]:
+        """Middle of each group of codes; of a cut-off end, where its neighbours would put it."""
+        edges = self.edges_DN.copy()
+        step = self.step_DN if np.isfinite(self.step_DN) else 1.0
+        edges[0] = edges[0] if np.isfinite(edges[0]) else edges[1] - step
+        edges[-1] = edges[-1] if np.isfinite(edges[-1]) else edges[-2] + step
+        return np.asarray(0.5 * (edges[1:] + edges[:-1]))
 
 
 @final
@@ -178,6 +209,35 @@ def reduced(data: NoiseData, rules: NoiseRules) -> NoiseMoments | None:
         stacks = [replace(one, temporal=None) for one in stacks]
     histograms, dark_moments = tuple(one for one, _ in found), tuple(one for _, one in found)
     return NoiseMoments(histograms, dark_moments, flats, stacks[0], stacks[1], q_DN, float(top), period)
+
+
+def dark_pair(first: Codes, second: Codes, exposure_s: float, q_DN: int = 1, top_code: int = 65535) -> DarkPair:
+    """Joint histogram over a window of codes around the median; codes beyond it are counted as outside."""
+    low, middle, high = np.percentile(first[:: max(1, first.size // 65536)], [2.0, 50.0, 98.0])
+    # 98th minus 2nd percentile is 4.1 sigma; 1.9 times that each side is about 7.8 sigma.
+    half = int(np.ceil(1.9 * (high - low) / q_DN)) + 4
+    group = max(1, int(np.ceil((2 * half + 1) / _MOST_CODES)))
+    start = max(round(middle / q_DN) - half, 0)
+    codes = min((round(middle / q_DN) + half - start) // group, (top_code // q_DN - start) // group) + 1
+    # One more group takes all that lies outside the window, codes below it included: they wrap around.
+    side = codes + 1
+    joint = np.zeros(side * side, np.int64)
+
+    def groups(frame: Codes) -> Codes:
+        shifted = (frame // np.uint16(q_DN) if q_DN > 1 else frame) - np.uint16(start)
+        if group > 1:
+            shifted = np.where(shifted < group * codes, shifted // np.uint16(group), np.uint16(codes))
+        return np.minimum(shifted, np.uint16(codes))
+
+    height = max(_STRIP // first.shape[1], 1)
+    for top in range(0, first.shape[0], height):
+        index = groups(first[top : top + height]) * np.uint16(side) + groups(second[top : top + height])
+        joint += cv2.calcHist([index], [0], None, [joint.size], [0, joint.size]).ravel().astype(np.int64)
+    counts = joint.reshape(side, side)[:codes, :codes]
+    edges = (start + group * np.arange(codes + 1) - 0.5) * q_DN
+    edges[0] = -np.inf if start == 0 else edges[0]
+    edges[-1] = np.inf if edges[-1] >= top_code else edges[-1]
+    return DarkPair(exposure_s, edges.astype(np.float64), counts, int(first.size - counts.sum()), first.shape[0])
 
 
 def converter_step(frame: Codes) -> int:

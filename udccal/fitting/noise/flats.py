@@ -11,8 +11,8 @@ from scipy.special import ndtri
 
 from udccal.fitting.engine.orders import Choice
 from udccal.fitting.engine.robust import OutlierRule, robust_sigma
+from udccal.fitting.noise.codes import start_values
 from udccal.fitting.noise.dark import DarkTerms
-from udccal.fitting.noise.dark_fit import start_values
 from udccal.fitting.noise.data import NoiseMoments
 from udccal.fitting.noise.moments import Moments
 from udccal.fitting.noise.rules import NoiseRules
@@ -87,7 +87,8 @@ def _fitted(data: NoiseMoments, dark: DarkTerms, curve: Curve, rules: NoiseRules
     if usable < 1:
         return curve
     point, full_DN = _dark_variance(data, dark), max(curve.ceiling_DN - dark.black_DN, 1.0)
-    choice, left, off = choose_transfer(levels, point, full_DN, rules), 0, ()
+    choice, left = choose_transfer(levels, point, full_DN, rules), 0
+    off: tuple[int, ...] = ()
     for _ in range(3):
         cleaned, bins, now_off = without_outliers(levels, choice.best.fit, rules)
         if not (bins or now_off) or not cleaned.usable[: len(data.flats)].any():
@@ -151,13 +152,13 @@ def _dark_variance(data: NoiseMoments, dark: DarkTerms) -> DarkVariance:
     drift = rate * np.array([pair.exposure_s for pair in data.darks])
     # Dark signal in the pairs as their read noise depends on it: long exposures, being noisier, tell less.
     total = dark.read_DN2.value + dark.row_DN2.value + rounding + K * drift
-    points = [(dark.read_DN2.value, np.sqrt(dark.read_DN2.variance), np.average(drift, weights=1 / total**2))]
+    points = [(dark.read_DN2.value, dark.read_DN2.variance**0.5, float(np.average(drift, weights=1 / total**2)))]
     seen = data.dark_stack.temporal
     if seen is not None and dark.white:
         observed = float(np.average(seen.variance_DN2, weights=seen.dof))
         # The read noise's tails, among rounding and counts of dark current, which have none to speak of.
         tails = dark.excess * min(dark.read_DN2.value, observed) ** 2 * (1 - 1 / data.dark_stack.frames)
-        sigma = np.sqrt((2 * observed**2 + tails) / float(seen.dof.sum()))
+        sigma = float(np.sqrt((2 * observed**2 + tails) / float(seen.dof.sum())))
         points.append((observed - rounding - K * rate * seen.exposure_s, sigma, rate * seen.exposure_s))
     values, sigmas, drifts = np.array(points).T
     # Black off by so much acts on the curve as read noise off by K times that.

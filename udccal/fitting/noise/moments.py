@@ -18,6 +18,7 @@ from jaxtyping import Float, Float32, Int, UInt16
 from udccal.fitting.noise.rules import NoiseRules
 
 Codes = UInt16[np.ndarray, "rows columns"]
+Grid = Float[np.ndarray, "groups_y groups_x"]
 # Samples of a strip, which stays in the processor's cache; and rows that tell the usual size of a difference.
 _STRIP, _SAMPLED_ROWS = 1 << 17, 128
 
@@ -39,7 +40,7 @@ class Tiling:
     starts: Int[np.ndarray, "period tiles"]
     width: Float[np.ndarray, " groups_x"]
     down: Float[np.ndarray, "groups_y rows"]
-    counts: Float[np.ndarray, "groups_y groups_x"]
+    counts: Grid
 
     def across(self, values: Float32[np.ndarray, "rows columns"]) -> Float[np.ndarray, "rows groups_x"]:
         """Sums over the columns of each group."""
@@ -48,20 +49,9 @@ class Tiling:
             sums[:, phase :: self.period] = np.add.reduceat(values[:, phase :: self.period], starts, axis=1)
         return sums
 
-    def means(self, values: Float32[np.ndarray, "rows columns"]) -> Float[np.ndarray, "groups_y groups_x"]:
+    def means(self, values: Float32[np.ndarray, "rows columns"]) -> Grid:
         """Means over the samples of each bin."""
         return self.down @ self.across(values) / self.counts
-
-    @property
-    def centres_px(self) -> Float[np.ndarray, "bins 2"]:
-        """Column and row of the middle of each bin, in the order of the bins."""
-        rows = self.down @ np.arange(self.down.shape[1]) / self.down.sum(axis=1)
-        # Groups of one tile share its columns; the phases are a sample or so apart.
-        ends = np.cumsum(self.width.reshape(-1, self.period).sum(axis=1))
-        tiles = np.repeat(ends - 0.5 * np.diff(ends, prepend=0.0), self.period)
-        columns = tiles + np.tile(np.arange(self.period), len(ends)) - 0.5 * self.period
-        across, down = np.meshgrid(columns, rows)
-        return np.column_stack([across.ravel(), down.ravel()])
 
 
 @functools.lru_cache(maxsize=8)
@@ -235,12 +225,7 @@ def _temporal(
     by_row: Float[np.ndarray, "frames rows groups_x"],
     squares: Float[np.ndarray, "rows groups_x"],
     columns: int,
-) -> tuple[
-    Float[np.ndarray, "groups_y groups_x"],
-    Float[np.ndarray, "groups_y groups_x"],
-    Float[np.ndarray, "frames groups_y groups_x"],
-    RowMoments,
-]:
+) -> tuple[Grid, Grid, Float[np.ndarray, "frames groups_y groups_x"], RowMoments]:
     """Variances of bins, their degrees of freedom, the frames' shifts, and row noise."""
     frames, height = by_row.shape[:2]
     about = by_row - by_row.mean(axis=0)

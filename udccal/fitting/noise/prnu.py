@@ -9,7 +9,7 @@ again.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import final
 
 import cv2
@@ -19,8 +19,11 @@ from scipy.fft import dctn
 from scipy.special import ndtri
 
 from udccal.fitting.engine.robust import MAD_TO_SIGMA
-from udccal.fitting.noise.dark import Unevenness, first_places
+from udccal.fitting.noise.dark import DarkTerms, Unevenness, first_places
+from udccal.fitting.noise.data import NoiseMoments
+from udccal.fitting.noise.flats import Curve
 from udccal.fitting.noise.rules import NoiseRules
+from udccal.fitting.noise.transfer import linear_signal
 
 # Side of the window whose median stands for a defect; of a picture's rows, one in so many tells how unlike its pixels'
 # noise is.
@@ -31,6 +34,10 @@ _SIDES = sorted(((down, across) for down in (1, 4, 16) for across in (1, 4, 16))
 _ROUNDS = 8
 # Where the light has less than three quarters of the blocks, this quantile of them is of the floor.
 _QUANTILE = 0.25
+
+Picture = Float[np.ndarray, "rows columns"] | Float32[np.ndarray, "rows columns"]
+Grid = Float[np.ndarray, "down across"]
+Mask = Bool[np.ndarray, "down across"]
 
 
 @final
@@ -45,13 +52,30 @@ class _Site:
     power: Float32[np.ndarray, "rows columns"]
 
 
-def prnu(
-    signal_DN: Float[np.ndarray, "rows columns"] | Float32[np.ndarray, "rows columns"],
-    temporal_DN2: float,
-    shot_DN: float,
-    period: int,
-    rules: NoiseRules,
-) -> Unevenness:
+def photo_response(data: NoiseMoments, dark: DarkTerms, curve: Curve, rules: NoiseRules) -> Unevenness:
+    """PRNU from the stacks; the temporal variance that averaging left comes from the photon transfer curve."""
+    K, V0, c = (float(v) for v in curve.fit.values[:3])
+    bright, stack, rate = data.flat_stack, data.dark_stack, dark.dark_DN_per_s.value
+    quiet = max(V0, 0.0) + data.q_DN**2 / 12.0
+    at_no_light = (quiet + K * rate * bright.exposure_s) / bright.frames
+    if dark.white:
+        signal = bright.mean_DN.astype(np.float32) - stack.mean_DN.astype(np.float32)
+        at_no_light += (quiet + K * rate * stack.exposure_s) / stack.frames
+    else:
+        # Dark codes that are cut off or coarse do not show the offsets: their variance is taken off instead.
+        signal = bright.mean_DN.astype(np.float32) - np.float32(dark.black_DN + rate * bright.exposure_s)
+        at_no_light += dark.dsnu_DN2.value
+    level = max(rough_median(signal), 1e-6)
+    z = float(linear_signal(np.array(level), c, K))
+    steep = 1 - 2 * c * z
+    found = prnu(signal, at_no_light, K * z * steep**2 / level / bright.frames, data.period, rules)
+    # Where the response bends, a relative change of light is a smaller relative change of signal.
+    scale = (level / (z * steep)) ** 2
+    offsets = 0.0 if dark.white else float(np.sqrt(dark.dsnu_DN2.variance)) / level**2
+    return replace(found, variance=found.variance * scale, sigma=float(np.hypot(found.sigma, offsets)) * scale)
+
+
+def prnu(signal_DN: Picture, temporal_DN2: float, shot_DN: float, period: int, rules: NoiseRules) -> Unevenness:
     """Variance of the photo response, relative.
 
     Per colour the picture is divided by its shading, and the floor of its spectrum (cosine transform) is taken where
@@ -147,7 +171,7 @@ def _mean_product(
     return float(np.einsum("ij,ij->i", first, second).sum(dtype=np.float64)) / count
 
 
-def rough_median(picture: Float[np.ndarray, "rows columns"] | Float32[np.ndarray, "rows columns"]) -> float:
+def rough_median(picture: Picture) -> float:
     """Median over some 128 evenly drawn rows, an odd number apart: of all rows of a mosaic alike."""
     return float(np.median(picture[:: int(picture.shape[0] // 128) | 1]))
 
@@ -185,7 +209,7 @@ def white_coefficients(
     return white & keep
 
 
-def _by_block(values: np.ndarray, block: int) -> Float[np.ndarray, "down across"]:
+def _by_block(values: np.ndarray, block: int) -> Grid:
     """Sums over blocks; coefficients that fill no block are left out."""
     high, wide = (n // block * block for n in values.shape)
     # Rows first: sums along contiguous memory are the slow part.
@@ -193,7 +217,7 @@ def _by_block(values: np.ndarray, block: int) -> Float[np.ndarray, "down across"
     return by_row.reshape(high // block, block, wide // block).sum(axis=1, dtype=np.float64)
 
 
-def _floor(count: Float[np.ndarray, "down across"], total: Float[np.ndarray, "down across"]) -> float:
+def _floor(count: Grid, total: Grid) -> float:
     """Power of the floor from a low quantile of the blocks, put right for its being low."""
     full = count >= count.max()
     low = float(np.quantile(total[full] / count[full], _QUANTILE))
@@ -206,9 +230,7 @@ def _mean_square(count: Float[np.ndarray, "*n"], z: float) -> Float[np.ndarray, 
     return np.asarray((1 - spread + z * np.sqrt(spread)) ** 3)
 
 
-def _light(
-    count: Float[np.ndarray, "down across"], total: Float[np.ndarray, "down across"], sigma: float
-) -> Bool[np.ndarray, "down across"]:
+def _light(count: Grid, total: Grid, sigma: float) -> Mask:
     """Blocks with more power than the floor, alone or as part of a rectangle; small rectangles are tested first.
 
     Args:
@@ -231,13 +253,13 @@ def _light(
     return light
 
 
-def _sums(values: Float[np.ndarray, "down across"], side: tuple[int, int]) -> Float[np.ndarray, "down across"]:
+def _sums(values: Grid, side: tuple[int, int]) -> Grid:
     """Sums over the rectangles that begin at each block; those that reach over the end are cut there."""
     sums = cv2.boxFilter(values, -1, side[::-1], anchor=(0, 0), normalize=False, borderType=cv2.BORDER_CONSTANT)
     return np.maximum(sums, 0.0)
 
 
-def _covered(high: Bool[np.ndarray, "down across"], side: tuple[int, int]) -> Bool[np.ndarray, "down across"]:
+def _covered(high: Mask, side: tuple[int, int]) -> Mask:
     """Blocks of the rectangles that are high; those half a side apart are looked at."""
     marks = np.zeros(high.shape, np.uint8)
     apart = tuple(np.s_[:: max(length // 2, 1)] for length in side)
@@ -245,7 +267,7 @@ def _covered(high: Bool[np.ndarray, "down across"], side: tuple[int, int]) -> Bo
     return cv2.dilate(marks, np.ones(side, np.uint8), anchor=(side[1] - 1, side[0] - 1)) > 0
 
 
-def _reached(seen: Bool[np.ndarray, "down across"], reach: float) -> Bool[np.ndarray, "down across"]:
+def _reached(seen: Mask, reach: float) -> Mask:
     """All blocks at lower frequencies than ``reach`` times those seen."""
     reached = np.zeros_like(seen)
     for row, column in np.argwhere(seen):

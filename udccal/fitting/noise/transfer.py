@@ -25,6 +25,9 @@ from udccal.fitting.noise.rules import NoiseRules
 PARAMETERS = ("K_DN_per_e", "V0_DN2", "curvature_per_DN", "response_DN_per_light", "light_offset")
 _SOLVER = SolverRules(iterations=40)
 
+# Values in the order of ``PARAMETERS``.
+Five = Float[np.ndarray, "5"]
+
 
 @final
 @dataclass(frozen=True)
@@ -113,7 +116,7 @@ class TransferFit:
     """
 
     order: Order
-    values: Float[np.ndarray, "5"]
+    values: Five
     cov: Float[np.ndarray, "5 5"]
     scatter: float
     deviance: float
@@ -144,7 +147,7 @@ class _Transfer:
     dark: DarkVariance
     order: Order
     bound: float
-    sizes: Float[np.ndarray, "5"]
+    sizes: Five
     name: str = "noise, photon transfer"
 
     @property
@@ -154,7 +157,7 @@ class _Transfer:
         return np.array([True, True, self.order.curved, responds, self.order.offset and responds])
 
     def modelled(
-        self, x: Float[np.ndarray, "5"]
+        self, x: Five
     ) -> tuple[Float[np.ndarray, "levels bins"], Float[np.ndarray, " points"], Float[np.ndarray, " levels"]]:
         """Variances; estimates of V0; and how far the levels' brightness, relative, is above that modelled."""
         K, V0, c, gain, offset = x
@@ -170,17 +173,16 @@ class _Transfer:
         known = self.levels.brightness_variance[self.levels.responding]
         return excess_variance(relative**2, known, np.ones(len(known)))[0] if self.order.unsteady else 0.0
 
-    def equations_at(self, place: Float[np.ndarray, "5"]) -> Blocks:
+    def equations_at(self, place: Five) -> Blocks:
         """Score and Fisher information; the scatter of the light is that of the greatest likelihood there."""
         levels, dark, use, responds = self.levels, self.dark, self.levels.usable, self.levels.responding
 
-        def predicted(at: Float[np.ndarray, "5"]) -> Float[np.ndarray, " data"]:
+        def predicted(at: Five) -> Float[np.ndarray, " data"]:
             variance, floor, relative = self.modelled(at)
             return np.concatenate([variance[use], floor, -relative[responds]])
 
-        variance, floor, relative = (
-            part[of] for part, of in zip(self.modelled(place), (use, np.s_[:], responds), strict=True)
-        )
+        everywhere, floor, above = self.modelled(place)
+        variance, relative = everywhere[use], above[responds]
         spread2 = levels.brightness_variance[responds] + self.scatter2(relative)
         dof, ratio = levels.dof[use], np.maximum(levels.variance_DN2[use] / variance, 1e-12)
         off = np.concatenate([levels.variance_DN2[use] - variance, dark.V0_DN2 - floor, relative])
@@ -196,7 +198,7 @@ class _Transfer:
         held[2] |= abs(place[2]) >= self.bound and score[2] * place[2] > 0
         return replace(Blocks.dense(cost, len(off), information, score), held=held)
 
-    def moved(self, place: Float[np.ndarray, "5"], step: Step) -> Float[np.ndarray, "5"]:
+    def moved(self, place: Five, step: Step) -> Five:
         """With the curvature inside its bound."""
         x = place + step.shared
         x[2] = np.clip(x[2], -self.bound, self.bound)
@@ -242,7 +244,7 @@ def _fit_transfer(
     return TransferFit(order, x, cov, scatter, cost, chi2_dof, converged, variance_z, level_z)
 
 
-def _start(levels: Levels, dark: DarkVariance) -> Float[np.ndarray, "5"]:
+def _start(levels: Levels, dark: DarkVariance) -> Five:
     """A straight line with rough weights, and the response through the origin."""
     use = levels.usable
     signal, variance = levels.mean_DN[use], levels.variance_DN2[use]
