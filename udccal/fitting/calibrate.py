@@ -14,7 +14,8 @@ from jaxtyping import Float
 
 from udccal.fitting.absent import absent_backscatter, absent_psf, absent_wire
 from udccal.fitting.backscatter.fit import fit_backscatter
-from udccal.fitting.geometry.fit import BoardView, fit_views, read_views, rig_prior
+from udccal.fitting.geometry.boards import fit_boards
+from udccal.fitting.geometry.data import BoardView, read_geometry
 from udccal.fitting.noise.fit import fit_noise, nominal_noise
 from udccal.fitting.nominal import nominal_geometry
 from udccal.fitting.psf.fit import Effort, fit_psf
@@ -151,18 +152,14 @@ def fit_foundation(
     rig, effort, clock = session.rig, effort or FitEffort(), _Clock(session, progress)
     noise = clock.run("noise", lambda: fit_noise(session), lambda: nominal_noise(rig))
     with clock.of("geometry") as captured:
-        boards = tuple(read_views(session, noise.term)) if captured else ()
-        geometry = (
-            fit_views(boards, nominal_geometry(rig), (rig.camera.columns, rig.camera.rows), rig_prior(rig))
-            if captured
-            else _left_out("geometry", nominal_geometry(rig))
-        )
+        data = read_geometry(session, noise.term) if captured else None
+        geometry = fit_boards(data) if data else _left_out("geometry", nominal_geometry(rig))
     with clock.of("wire") as captured:
         wire_fit = fit_wire_session(session, noise.term, geometry.term, effort.wire_samples) if captured else None
         wire = wire_fit.result if wire_fit else _left_out("wire", absent_wire(rig, geometry.term))
     wire_map = sensor_map(wire.term, rig.camera.rows, rig.camera.columns)
     sigma = wire_fit.sigma if wire_fit else None
-    return Foundation(noise, geometry, wire, tuple(clock.times), wire_map, sigma, boards)
+    return Foundation(noise, geometry, wire, tuple(clock.times), wire_map, sigma, data.views if data else ())
 
 
 def fit_session(

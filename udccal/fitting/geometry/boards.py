@@ -41,8 +41,8 @@ _STEP_RAD = 1e-5
 def fit_boards(data: GeometryData, rules: GeometryRules | None = None) -> FitResult[Geometry]:
     """Fit the geometry term to boards, with ``fit_geometry``.
 
-    Every corner has its noise and a scatter that all have beside it (paper that is not flat, blur that a saddle does not
-    describe), which is estimated with the rest.
+    Every corner has its noise and a scatter that all have beside it (paper that is not flat, blur that a saddle does
+    not describe), which is estimated with the rest.
 
     Args:
         data: boards, one of them parallel to the panel; at least 3 usable ones, or any number with a prior.
@@ -109,7 +109,7 @@ def _calibrated(
 
 
 def _scatter_px(bundle: CalibratedViews, views: Sequence[BoardView]) -> Float[np.ndarray, " n"]:
-    """The scatter at which residuals have the size that they should; with no gate, as plans need the estimate itself."""
+    """The scatter at which residuals have the size that they should; not gated, as plans need the estimate itself."""
     points = bundle.points
     noise = [views[points.names[v]].corners.sigma[k] for v, k in zip(points.view, points.index, strict=True)]
     variance = np.maximum(np.array(noise), _LEAST_PX) ** 2

@@ -6,8 +6,7 @@ Places and their Jacobian are OpenCV's (``cv2.projectPoints``): the five-coeffic
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import final
 
 import cv2
@@ -24,10 +23,16 @@ from udccal.models.geometry import Geometry
 INTRINSIC_NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
 INTRINSIC_UNITS = ("px", "px", "px", "px", "1", "1", "1", "1", "1")
 LENS = len(INTRINSIC_NAMES)
-# A descent ends a thousandth of a sigma from the minimum.
-_SOLVER = SolverRules(least_gain=1e-6, iterations=60)
-# Each intrinsic gets this part of the information that known poses would bring: what views do not tell at all has then a
-# very large variance, not none. It is above rounding, and moves no sigma that is told.
+# Orders of the distortion, simplest first: which intrinsics are free. Each has the coefficients of the one before it.
+ORDERS = {
+    name: np.arange(LENS) < count
+    for name, count in (("no distortion", 4), ("k1", 5), ("k1 k2", 6), ("k1 k2 p1 p2", 8), ("k1 k2 p1 p2 k3", 9))
+}
+EVERY = np.ones(LENS, dtype=bool)
+# A descent ends a thousandth of a sigma from the minimum, one that another follows a tenth.
+_SOLVER, _ROUGH = SolverRules(least_gain=1e-6, iterations=60), SolverRules(least_gain=1e-2, iterations=60)
+# Each intrinsic gets this part of the information that known poses would bring: what views do not tell at all has then
+# a very large variance, not none. It is above rounding, and moves no sigma of what they do tell.
 _RIDGE = 1e-11
 
 
@@ -73,8 +78,8 @@ class GeometryRules:
     centre_sigma: float = 0.01
     distortion_sigma: tuple[float, ...] = (0.2, 0.2, 1e-3, 1e-3, 0.1)
     default_sigma_px: float = 0.1
-    robust: Cauchy = Cauchy()
-    corners: OutlierRule = OutlierRule("corners")
+    robust: Cauchy = field(default_factory=Cauchy)
+    corners: OutlierRule = field(default_factory=lambda: OutlierRule("corners"))
     strange_view: float = 20.0
     loud_view: float = 3.0
     rounds: int = 8
@@ -178,7 +183,7 @@ class Points:
         """Of a number of each point in use, by view."""
         return np.bincount(self.view[self.used], values[self.used], len(self.names))
 
-    def places(self, points: Iterable[int]) -> tuple[str, ...]:
+    def places(self, points: Int[np.ndarray, " some"]) -> tuple[str, ...]:
         """Points by their view and their number there, as given."""
         return tuple(f"view {self.names[self.view[k]]}, point {self.index[k]}" for k in points)
 
@@ -204,10 +209,10 @@ def linearised(
     turns = [cv2.Rodrigues(np.ascontiguousarray(pose[:3])) for pose in bundle.poses]
     rotation = np.array([matrix for matrix, _ in turns])[points.view]
     by_vector = np.array([by.reshape(3, 3, 3) for _, by in turns])[points.view]
-    camera = (rotation @ points.board[:, :, None])[..., 0] + bundle.poses[points.view, 3:]
+    camera = np.einsum("nij,nj->ni", rotation, points.board) + bundle.poses[points.view, 3:]
     places, jacobian = projected(bundle.intrinsics, camera)
-    turned = (by_vector @ points.board[:, None, :, None])[..., 0]
-    jacobian[:, :, LENS : LENS + 3] = jacobian[:, :, LENS + 3 :] @ np.swapaxes(turned, 1, 2)
+    turned = np.einsum("nkij,nj->nki", by_vector, points.board)
+    jacobian[:, :, LENS : LENS + 3] = np.einsum("nai,nki->nak", jacobian[:, :, LENS + 3 :], turned)
     return places - points.image, jacobian
 
 
@@ -216,13 +221,11 @@ def residuals_px(bundle: Bundle, points: Points) -> Float[np.ndarray, "points 2"
     return linearised(bundle, points)[0]
 
 
-def in_sigma(
-    bundle: Bundle, points: Points
-) -> tuple[Float[np.ndarray, "points 2"], Float[np.ndarray, "points 2 15"]]:
+def in_sigma(bundle: Bundle, points: Points) -> tuple[Float[np.ndarray, "points 2"], Float[np.ndarray, "points 2 15"]]:
     """As ``linearised``, in units of sigma; zero for points that are not used."""
     residuals, jacobian = linearised(bundle, points)
-    use, weight = points.used[:, None], 1 / points.sigma[:, None]
-    return np.where(use, residuals * weight, 0.0), np.where(use[..., None], jacobian * weight[..., None], 0.0)
+    weight = (points.used / points.sigma)[:, None]
+    return residuals * weight, jacobian * weight[..., None]
 
 
 def by_view(
@@ -230,7 +233,9 @@ def by_view(
 ) -> tuple[Float[np.ndarray, "views 15 15"], Float[np.ndarray, "views 15"]]:
     """Half the Hessian and minus half the gradient of each view's chi-squared, by intrinsics and own pose."""
     ends = np.cumsum(np.bincount(points.view, minlength=len(points.names)))[:-1]
-    tall = [(j.reshape(-1, LENS + 6), r.ravel()) for j, r in zip(np.split(jacobian, ends), np.split(z, ends), strict=True)]
+    tall = [
+        (j.reshape(-1, LENS + 6), r.ravel()) for j, r in zip(np.split(jacobian, ends), np.split(z, ends), strict=True)
+    ]
     return np.array([j.T @ j for j, _ in tall]), np.array([-j.T @ r for j, r in tall])
 
 
@@ -285,5 +290,6 @@ Solved = Solution[Bundle, Blocks]
 def solve(
     start: Bundle, points: Points, free: Bool[np.ndarray, "9"], prior: Prior, robust: Cauchy | None = None
 ) -> Solved:
-    """The minimum next to ``start``; arguments as for ``BundleProblem``."""
-    return minimise(BundleProblem(points, free, prior, robust), start, _SOLVER)
+    """The minimum next to ``start``, roughly if robust or of poses alone; arguments as for ``BundleProblem``."""
+    rough = robust is not None or not free.any()
+    return minimise(BundleProblem(points, free, prior, robust), start, _ROUGH if rough else _SOLVER)

@@ -1,9 +1,9 @@
 """What a bundle of views gives: lens, poses, whether the model holds, and how sure it is where a ray lands.
 
 Two ways to be wrong are told apart from chance. Views that disagree: each view alone would have the intrinsics a little
-elsewhere, further than its noise explains (Cochran's Q, as in meta-analysis); the intrinsics without a view then predict
-its corners worse than noise does. A pattern over the picture: residuals of neighbouring places in the sensor, over all
-views, share a direction. Both statistics are exact for a linear model with normal noise.
+elsewhere, further than its noise explains (Cochran's Q, as in meta-analysis); the intrinsics without a view then
+predict its corners worse than noise does. A pattern over the picture: residuals of neighbouring places in the sensor,
+over all views, share a direction. Both statistics are exact for a linear model with normal noise.
 """
 
 from __future__ import annotations
@@ -260,8 +260,8 @@ def _pattern(
 ) -> tuple[MisfitTest, float]:
     """Sums over the cells of a grid, against their covariance under the model, and the pattern's size in px.
 
-    Not ``group_means_test``: the fit takes up most of what is smooth over the picture, so that means of cells scatter far
-    less than those of independent residuals; their covariance accounts for that.
+    Not ``group_means_test``: the fit takes up most of what is smooth over the picture, so that means of cells scatter
+    far less than those of independent residuals; their covariance accounts for that.
     """
     place = np.clip(points.image / np.array(image_size) * cells, 0, cells - 1).astype(np.int64)
     cell = np.where(points.used, place[:, 1] * cells + place[:, 0], -1)

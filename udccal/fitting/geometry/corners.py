@@ -4,9 +4,9 @@ OpenCV's detector names the corners. Each is then placed by a blurred saddle, fi
 
     I(u) = b + g . u + A erf(n1 . u / (sqrt(2) s1)) erf(n2 . u / (sqrt(2) s2)),
 
-with u the offset from the corner and n1, n2 the unit normals of the two edges. Each edge has its own width, so that blur
-along one direction (diffraction streaks) fits. Model and window are even about the corner: blur that the model does not
-describe, but which is symmetric, moves nothing.
+with u the offset from the corner and n1, n2 the unit normals of the two edges. Each edge has its own width, so that
+blur along one direction (diffraction streaks) fits. Model and window are even about the corner: blur that the model
+does not describe, but which is symmetric, moves nothing.
 """
 
 from __future__ import annotations

@@ -18,10 +18,12 @@ from udccal.errors import FitError
 from udccal.fitting.engine.gaussian import Prior
 from udccal.fitting.engine.misfit import SIGNIFICANT
 from udccal.fitting.engine.orders import Attempt, Choice, bic, choose
-from udccal.fitting.engine.robust import outliers, robust_sigma
+from udccal.fitting.engine.robust import outliers
 from udccal.fitting.engine.tails import chi2_tail
 from udccal.fitting.geometry.bundle import (
+    EVERY,
     LENS,
+    ORDERS,
     Bundle,
     GeometryRules,
     Intrinsics,
@@ -33,29 +35,14 @@ from udccal.fitting.geometry.bundle import (
     solve,
 )
 from udccal.fitting.geometry.calibrated import CalibratedViews, Evidence, weigh
-from udccal.fitting.geometry.start import best_poses, facing, gather, starts
+from udccal.fitting.geometry.start import Settled, costs, facing, gather, least_scale, settle, strange_views
 from udccal.models.geometry import Geometry
 from udccal.numerics import in_float64
 from udccal.result import FitStatus
 
-# Orders of the distortion, simplest first: which of the nine intrinsics are free. Focal lengths and centre always are.
-ORDERS = {
-    name: np.array([1, 1, 1, 1, *bend], dtype=bool)
-    for name, bend in (
-        ("no distortion", (0, 0, 0, 0, 0)),
-        ("k1", (1, 0, 0, 0, 0)),
-        ("k1 k2", (1, 1, 0, 0, 0)),
-        ("k1 k2 p1 p2", (1, 1, 1, 1, 0)),
-        ("k1 k2 p1 p2 k3", (1, 1, 1, 1, 1)),
-    )
-}
-EVERY = np.ones(LENS, dtype=bool)
 NO_PRIOR = Prior(np.zeros(LENS), np.zeros((0, LENS)))
-# A view of few points may fit them all by its pose: its robust sigma is not taken below this part of all views'.
-_LEAST_OF_ALL = 0.5
-# Below these, residuals and sigmas are rounding: exact points must not count as surer than arithmetic.
-_ROUNDING_PX, _LEAST_SIGMA_PX = 1e-7, 1e-8
-_SAME_SCORE = 1e-6
+# A residual below this is rounding, not noise: orders that differ there only are equally good.
+_ROUNDING_PX = 1e-7
 
 
 @in_float64
@@ -102,13 +89,13 @@ def fit_geometry(
             f"views, {len(given.names)} of them usable. {' '.join(gathered.notes)} Capture more views of the board."
         )
     lens = None if start is None else Intrinsics.of_geometry(start)
-    settled = _settle(given, image_size, lens, start_poses, known, rules)
-    strange = _strange_views(settled.points, given, rules)
+    settled = settle(given, image_size, lens, start_poses, known, rules)
+    strange = strange_views(settled.points, given, rules)
     if strange.any() and (~strange).sum() >= least:
         rule = f"of a view that scatters more than {rules.strange_view:g} times as much as the median view"
         left_out = (*left_out, *outliers(rule, (f"view {given.names[k]}" for k in np.flatnonzero(strange))))
         given = given.without(strange)
-        settled = _settle(given, image_size, lens, start_poses, known, rules)
+        settled = settle(given, image_size, lens, start_poses, known, rules)
     full, points, scales = _maximum_likelihood(settled, given, known, rules)
     chosen, by_prior = _choose_order(full, points, known, rules)
     final, points, dof = _rescaled(chosen.best.fit, points, known)
@@ -136,112 +123,17 @@ def fit_geometry(
     )
 
 
-@final
-@dataclass(frozen=True)
-class _Settled:
-    """The robust minimum, the points with each view's own scatter and outliers marked, how many starts led there."""
-
-    solved: Solved
-    points: Points
-    agreeing: int
-
-
-def _settle(
-    given: Points,
-    image_size: tuple[int, int],
-    lens: Intrinsics | None,
-    poses: Float[np.ndarray, "views 6"] | None,
-    prior: Prior,
-    rules: GeometryRules,
-) -> _Settled:
-    """The best minimum with all distortions free that any start leads to."""
-    own = None if poses is None else np.asarray(poses, dtype=np.float64)[list(given.names)]
-    found = [_descended(one, given, prior, rules) for one in starts(given, image_size, lens, own)]
-    scores = np.array([_score(solved.place, given) for solved, _ in found])
-    agreeing = int((scores <= scores.min() + _SAME_SCORE * max(abs(scores.min()), 1.0)).sum())
-    solved, points = found[int(scores.argmin())]
-    for _ in range(rules.rounds):  # Views whose mirrored pose fits better take it, and all is solved again.
-        other = Bundle(solved.place.intrinsics, best_poses(points, solved.place.intrinsics)[1])
-        other = solve(other, points, ~EVERY, prior).place
-        better = _costs(other, points) < 0.99 * _costs(solved.place, points)
-        if not better.any():
-            break
-        swapped = np.where(better[:, None], facing(other.poses), solved.place.poses)
-        solved, points = _without_outliers(Bundle(solved.place.intrinsics, swapped), given, prior, rules)
-    return _Settled(solved, points, agreeing)
-
-
-def _descended(start: Bundle, given: Points, prior: Prior, rules: GeometryRules) -> tuple[Solved, Points]:
-    """Robustly and with few coefficients first: from far off, five bend the picture into any minimum."""
-    bundle = start
-    for free in (ORDERS["k1"], EVERY):
-        scaled = given.scaled(_robust_scales(bundle, given))
-        bundle = solve(bundle, scaled, free, prior, rules.robust).place
-        bundle = replace(bundle, poses=facing(bundle.poses))
-    return _without_outliers(bundle, given, prior, rules)
-
-
-def _score(bundle: Bundle, given: Points) -> float:
-    """Robust spread of all points over the given sigma, comparable between starts that leave out different points."""
-    square = (residuals_px(bundle, given) ** 2).sum(axis=1) / given.sigma**2
-    return float(np.log1p(square).mean()) if np.isfinite(square).all() else np.inf
-
-
-def _costs(bundle: Bundle, points: Points) -> Float[np.ndarray, " views"]:
-    square = (residuals_px(bundle, points) ** 2).sum(axis=1) / points.sigma**2
-    return points.sums(np.where(np.isfinite(square), square, np.inf))
-
-
-def _robust_scales(bundle: Bundle, points: Points) -> Float[np.ndarray, " views"]:
-    """Scatter over sigma of each view, from medians."""
-    z = np.where(points.used[:, None], residuals_px(bundle, points) / points.sigma[:, None], np.nan)
-    own = np.array([robust_sigma(z[points.view == k]) for k in range(len(points.names))])
-    return np.maximum(np.maximum(own, _LEAST_OF_ALL * robust_sigma(z)), _least_scale(points))
-
-
-def _least_scale(points: Points) -> float:
-    return _LEAST_SIGMA_PX / float(np.median(points.sigma))
-
-
-def _without_outliers(start: Bundle, given: Points, prior: Prior, rules: GeometryRules) -> tuple[Solved, Points]:
-    """Leave out what is too far off and solve again, until nothing changes; what fits again comes back."""
-    scales = _robust_scales(start, given)
-    points = _marked(start, given.scaled(scales), rules)
-    solved = solve(start, points, EVERY, prior)
-    for _ in range(rules.rounds):
-        before, used = scales, points.used
-        scales = _robust_scales(solved.place, replace(given, used=used))
-        points = _marked(solved.place, given.scaled(scales), rules)
-        if (used == points.used).all() and np.allclose(scales, before, rtol=0.1):
-            break
-        solved = solve(solved.place, points, EVERY, prior)
-    return solved, points
-
-
-def _marked(bundle: Bundle, points: Points, rules: GeometryRules) -> Points:
-    """With outliers marked as not used, but where too little would be left of a view to hold its pose."""
-    off = rules.corners.off(residuals_px(bundle, points) / points.sigma[:, None]).any(axis=1)
-    kept = np.bincount(points.view[~off], minlength=len(points.names))
-    return replace(points, used=~off | (kept < rules.least_corners)[points.view])
-
-
-def _strange_views(scattered: Points, given: Points, rules: GeometryRules) -> Bool[np.ndarray, " views"]:
-    """Views that are better left out: read in another order, another board, moved while captured."""
-    ratio = np.array([np.median((scattered.sigma / given.sigma)[given.view == k]) for k in range(len(given.names))])
-    return np.asarray(ratio > rules.strange_view * np.median(ratio))
-
-
 def _maximum_likelihood(
-    settled: _Settled, given: Points, prior: Prior, rules: GeometryRules
+    settled: Settled, given: Points, prior: Prior, rules: GeometryRules
 ) -> tuple[Solved, Points, Float[np.ndarray, " views"]]:
     """Scales from residuals and their degrees of freedom, the points with them, and the solution weighted by them."""
     solved, points = settled.solved, settled.points
     given, scales = replace(given, used=points.used), np.ones(len(given.names))
     for _ in range(rules.rounds):
-        square, dof = _costs(solved.place, given), 2 * given.sums(np.ones(len(given.view))) - _spent(solved, points)
+        square, dof = costs(solved.place, given), 2 * given.sums(np.ones(len(given.view))) - _spent(solved, points)
         differ = _differ(square, dof)
         own = square / np.maximum(dof, 1.0) if differ else np.full(len(dof), square.sum() / max(dof.sum(), 1.0))
-        before, scales = scales, np.maximum(np.sqrt(own), _least_scale(given))
+        before, scales = scales, np.maximum(np.sqrt(own), least_scale(given))
         points = given.scaled(scales)
         solved = solve(solved.place, points, EVERY, prior)
         if not differ or np.allclose(scales, before, rtol=1e-3):
@@ -306,15 +198,15 @@ def _held(above: _Order, free: Bool[np.ndarray, "9"]) -> Bundle:
 def _criterion(solved: Solved, points: Points, parameters: int) -> float:
     """BIC with the scale of the noise estimated, too: n ln(chi2 / n) for chi2. Residuals of rounding are all equal."""
     samples = 2 * int(points.used.sum())
-    chi2 = float(_costs(solved.place, points).sum())
+    chi2 = float(costs(solved.place, points).sum())
     least = float((_ROUNDING_PX**2 / points.sigma[points.used] ** 2).sum())
-    return bic(samples * float(np.log(max(chi2, least) / samples)), parameters, samples)
+    return bic(samples * float(np.log(max(chi2, least) / samples)), float(parameters), samples)
 
 
 def _rescaled(order: _Order, points: Points, prior: Prior) -> tuple[Solved, Points, float]:
     """The chosen order with the scale of its own residuals, and the degrees of freedom behind that."""
     dof = max(2 * float(points.used.sum()) - float(_spent(order.solved, points).sum()), 1.0)
-    factor = max(np.sqrt(float(_costs(order.solved.place, points).sum()) / dof), _least_scale(points))
+    factor = max(np.sqrt(float(costs(order.solved.place, points).sum()) / dof), least_scale(points))
     points = points.scaled(np.full(len(points.names), factor))
     return solve(order.solved.place, points, order.free, prior), points, dof
 

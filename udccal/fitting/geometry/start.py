@@ -1,14 +1,14 @@
-"""Where a bundle starts: views of arrays checked, focal length from homographies (Zhang, IEEE PAMI 22, 2000), poses
-from flat boards (Collins and Bartoli, IJCV 109, 2014).
+"""From arrays to the robust minimum of a bundle: views checked, starts, outliers left out.
 
-A flat board seen from afar looks almost the same in two poses, mirrored at the line of sight. Both are kept: the
-second is tried again once the lens is known.
+Focal length starts from homographies (Zhang, IEEE PAMI 22, 2000), poses from flat boards (Collins and Bartoli, IJCV
+109, 2014). A flat board seen from afar looks almost the same in two poses, mirrored at the line of sight. Both are
+kept: the second is tried again once the lens is known.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import final
 
 import cv2
@@ -16,8 +16,19 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from udccal.errors import FitError
-from udccal.fitting.engine.robust import outliers
-from udccal.fitting.geometry.bundle import Bundle, GeometryRules, Intrinsics, Points
+from udccal.fitting.engine.gaussian import Prior
+from udccal.fitting.engine.robust import outliers, robust_sigma
+from udccal.fitting.geometry.bundle import (
+    EVERY,
+    ORDERS,
+    Bundle,
+    GeometryRules,
+    Intrinsics,
+    Points,
+    Solved,
+    residuals_px,
+    solve,
+)
 from udccal.result import Outliers
 
 # Across to along: points closer to one line than this hold no pose, points closer to a plane are flat.
@@ -28,6 +39,11 @@ _OFF_HOMOGRAPHY = 0.005
 _OFF_BOARD = 0.02
 # Focal lengths outside this range, in units of the larger side, are no lens that the model describes.
 _SHORTEST, _LONGEST = 0.15, 30.0
+# A view of few points may fit them all by its pose: its robust sigma is not taken below this part of all views'.
+_LEAST_OF_ALL = 0.5
+# Below this, sigma is rounding: exact points must not count as surer than arithmetic.
+_LEAST_SIGMA_PX = 1e-8
+_SAME_SCORE = 1e-6
 
 
 @final
@@ -77,12 +93,11 @@ def _views(
     for number, (points, pixels) in enumerate(zip(board, image, strict=True)):
         there, here = np.asarray(points, dtype=np.float64), np.asarray(pixels, dtype=np.float64)
         own = np.full(len(here), rules.default_sigma_px) if sigmas is None else np.asarray(sigmas[number], dtype=float)
-        shapes = (there.shape, here.shape, own.shape)
         n = len(here)
         if there.shape not in ((n, 3), (n, 1, 3)) or here.shape not in ((n, 2), (n, 1, 2)) or own.shape != (n,):
             raise FitError(
-                f"Expected board points (n, 3), image points (n, 2) or (n, 1, 2) and sigmas (n,) of equal n in view "
-                f"{number}, found {', '.join(map(str, shapes))}. Give each seen corner its point on the board."
+                f"Expected board points (n, 3), image points (n, 2) and sigmas (n,) of equal n in view {number}, found "
+                f"{there.shape}, {here.shape} and {own.shape}. Give each seen corner its point on the board."
             )
         found.append((there.reshape(-1, 3), here.reshape(-1, 2), own))
     return found
@@ -91,11 +106,9 @@ def _views(
 def _complaint(part: tuple[np.ndarray, ...], before: list[tuple[np.ndarray, ...]], rules: GeometryRules) -> str:
     """Why a view cannot be used; empty when it can."""
     board, image = part[:2]
-    if len(board) < rules.least_corners:
-        return (
-            f"expected at least {rules.least_corners} points, found {len(board)}. "
-            "Bring more of the board into the picture."
-        )
+    least = rules.least_corners
+    if len(board) < least:
+        return f"expected at least {least} points, found {len(board)}. Bring more of the board into the picture."
     for points, what in ((board, "on the board"), (image, "in the picture")):
         spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
         if spread[1] <= _LINE * spread[0]:
@@ -174,17 +187,14 @@ def _consistent(board: np.ndarray, image: np.ndarray) -> Bool[np.ndarray, " n"]:
 
 def _focal_px(points: Points, size: tuple[int, int]) -> float | None:
     """One focal length for both axes with the centre in the middle; None where the views do not tell it."""
-    middle, unit = (np.array(size) - 1) / 2, float(max(size))
-    rows, right = [], []
+    unit, rows, right = float(max(size)), [], []
+    centred = (points.image - (np.array(size) - 1) / 2) / unit
     for view in range(len(points.names)):
         mine = points.view == view
-        matrix, _ = cv2.findHomography(
-            points.board[mine, :2], (points.image[mine] - middle) / unit, cv2.RANSAC, _OFF_HOMOGRAPHY
-        )
+        matrix, _ = cv2.findHomography(points.board[mine, :2], centred[mine], cv2.RANSAC, _OFF_HOMOGRAPHY)
         if matrix is None or not np.isfinite(matrix).all() or not matrix[:, :2].any(axis=0).all():
             continue
-        size_ = np.sqrt(np.linalg.norm(matrix[:, 0]) * np.linalg.norm(matrix[:, 1]))
-        first, second = matrix[:, 0] / size_, matrix[:, 1] / size_
+        first, second = matrix[:, :2].T / np.sqrt(np.prod(np.linalg.norm(matrix[:, :2], axis=0)))
         # Both columns are images of orthogonal directions of equal length.
         rows += [first[:2] @ second[:2], first[:2] @ first[:2] - second[:2] @ second[:2]]
         right += [-first[2] * second[2], second[2] ** 2 - first[2] ** 2]
@@ -192,3 +202,104 @@ def _focal_px(points: Points, size: tuple[int, int]) -> float | None:
     inverse = float(x @ y / (x @ x)) if len(x) and x @ x > 0 else 0.0
     focal = 1 / np.sqrt(inverse) if inverse > 0 else 0.0
     return float(focal * unit) if _SHORTEST <= focal <= _LONGEST else None
+
+
+@final
+@dataclass(frozen=True)
+class Settled:
+    """The robust minimum, the points with each view's own scatter and outliers marked, how many starts led there."""
+
+    solved: Solved
+    points: Points
+    agreeing: int
+
+
+def settle(
+    given: Points,
+    image_size: tuple[int, int],
+    lens: Intrinsics | None,
+    poses: Float[np.ndarray, "views 6"] | None,
+    prior: Prior,
+    rules: GeometryRules,
+) -> Settled:
+    """The best minimum with all distortions free that any start leads to."""
+    own = None if poses is None else np.asarray(poses, dtype=np.float64)[list(given.names)]
+    found = [_descended(one, given, prior, rules) for one in starts(given, image_size, lens, own)]
+    scores = np.array([_score(solved.place, given) for solved, _ in found])
+    agreeing = int((scores <= scores.min() + _SAME_SCORE * max(abs(scores.min()), 1.0)).sum())
+    solved, points = found[int(scores.argmin())]
+    for _ in range(rules.rounds):  # Views whose mirrored pose fits better take it, and all is solved again.
+        other = Bundle(solved.place.intrinsics, best_poses(points, solved.place.intrinsics)[1])
+        other = solve(other, points, ~EVERY, prior).place
+        better = costs(other, points) < 0.99 * costs(solved.place, points)
+        if not better.any():
+            break
+        swapped = np.where(better[:, None], facing(other.poses), solved.place.poses)
+        solved, points = _without_outliers(Bundle(solved.place.intrinsics, swapped), given, prior, rules)
+    return Settled(solved, points, agreeing)
+
+
+def _descended(start: Bundle, given: Points, prior: Prior, rules: GeometryRules) -> tuple[Solved, Points]:
+    """Robustly and with few coefficients first: from far off, five bend the picture into any minimum."""
+    bundle = start
+    for free in (ORDERS["k1"], EVERY):
+        scaled = given.scaled(_robust_scales(bundle, given))
+        bundle = solve(bundle, scaled, free, prior, rules.robust).place
+        bundle = replace(bundle, poses=facing(bundle.poses))
+    return _without_outliers(bundle, given, prior, rules)
+
+
+def _score(bundle: Bundle, given: Points) -> float:
+    """Robust spread of all points over the given sigma, comparable between starts that leave out different points."""
+    return float(np.log1p(_squares(bundle, given)).mean())
+
+
+def costs(bundle: Bundle, points: Points) -> Float[np.ndarray, " views"]:
+    """Chi-squared of each view."""
+    return points.sums(_squares(bundle, points))
+
+
+def _squares(bundle: Bundle, points: Points) -> Float[np.ndarray, " points"]:
+    """Infinite where the lens bends a point out of reach."""
+    square = (residuals_px(bundle, points) ** 2).sum(axis=1) / points.sigma**2
+    return np.where(np.isfinite(square), square, np.inf)
+
+
+def _robust_scales(bundle: Bundle, points: Points) -> Float[np.ndarray, " views"]:
+    """Scatter over sigma of each view, from medians."""
+    z = np.where(points.used[:, None], residuals_px(bundle, points) / points.sigma[:, None], np.nan)
+    own = np.array([robust_sigma(z[points.view == k]) for k in range(len(points.names))])
+    return np.maximum(np.maximum(own, _LEAST_OF_ALL * robust_sigma(z)), least_scale(points))
+
+
+def least_scale(points: Points) -> float:
+    """The least by which sigma may be scaled."""
+    return _LEAST_SIGMA_PX / float(np.median(points.sigma))
+
+
+def _without_outliers(start: Bundle, given: Points, prior: Prior, rules: GeometryRules) -> tuple[Solved, Points]:
+    """Leave out what is too far off and solve again, until nothing changes; what fits again comes back."""
+    scales = _robust_scales(start, given)
+    points = _marked(start, given.scaled(scales), rules)
+    solved = solve(start, points, EVERY, prior)
+    for _ in range(rules.rounds):
+        before, used = scales, points.used
+        scales = _robust_scales(solved.place, replace(given, used=used))
+        points = _marked(solved.place, given.scaled(scales), rules)
+        if (used == points.used).all() and np.allclose(scales, before, rtol=0.1):
+            break
+        solved = solve(solved.place, points, EVERY, prior)
+    return solved, points
+
+
+def _marked(bundle: Bundle, points: Points, rules: GeometryRules) -> Points:
+    """With outliers marked as not used, but where too little would be left of a view to hold its pose."""
+    off = rules.corners.off(residuals_px(bundle, points) / points.sigma[:, None]).any(axis=1)
+    kept = np.bincount(points.view[~off], minlength=len(points.names))
+    return replace(points, used=~off | (kept < rules.least_corners)[points.view])
+
+
+def strange_views(scattered: Points, given: Points, rules: GeometryRules) -> Bool[np.ndarray, " views"]:
+    """Views that are better left out: read in another order, another board, moved while captured."""
+    ratio = np.array([np.median((scattered.sigma / given.sigma)[given.view == k]) for k in range(len(given.names))])
+    return np.asarray(ratio > rules.strange_view * np.median(ratio))
