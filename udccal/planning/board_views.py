@@ -13,14 +13,14 @@ from scipy.spatial.transform import Rotation
 from scipy.special import erf
 
 from udccal.arrangements import Board, BoardSpec
-from udccal.fitting.geometry.corners import MIN_CORNERS, board_points_mm, charuco_board
+from udccal.fitting.geometry.bundle import LENS, GeometryRules, Intrinsics
+from udccal.fitting.geometry.corners import board_points_mm, charuco_board
 from udccal.models.geometry import Geometry, project, rotation_matrix
 from udccal.planning.algebra import without
 from udccal.planning.light import EvenField, sample_variance_e
 from udccal.planning.state import WHITE, RigState
 from udccal.planning.steps import PlannedStep
 
-LENS = 9
 # What a saddle leaves out of a corner, by axis, where no profile has measured it. Edges of the board on the jig run
 # along the sensor's rows: samples meet them at few phases, and corners scatter more than on boards that lean.
 _ON_JIG_PX, _BY_HAND_PX = 0.0085, 0.006
@@ -42,17 +42,11 @@ class PlannedView:
     parallel: bool
 
 
-def lens_vector(geometry: Geometry) -> Float[np.ndarray, "9"]:
-    """(fx, fy, cx, cy, k1, k2, p1, p2, k3)."""
-    parts = (geometry.focal, geometry.centre, geometry.distortion)
-    return np.concatenate([np.asarray(part, dtype=np.float64) for part in parts])
-
-
 def planned_view(state: RigState, field: EvenField, step: PlannedStep, board: Board) -> PlannedView | None:
     """None where the board shows too few corners to hold its pose."""
     corners = board_points_mm(board.spec)
     rotation, origin = _pose(board, state.geometry)
-    lens = lens_vector(state.geometry)
+    lens = Intrinsics.of_geometry(state.geometry).vector
     pixels, slopes = (np.asarray(part) for part in _seen(lens, rotation, origin, corners))
     depth = float((rotation @ corners.mean(axis=0) + origin)[2])
     radius = float(np.clip(_WINDOW_SQUARES * board.spec.square_mm / depth * lens[0], *_WINDOW_PX))
@@ -61,7 +55,7 @@ def planned_view(state: RigState, field: EvenField, step: PlannedStep, board: Bo
     marked = np.asarray(np.all(seen_markers.reshape(-1, 4), axis=1), dtype=bool)
     inside = _inside(state, pixels, np.ceil(radius) + 1)
     good = np.asarray(inside & _named(corners, markers, marked, board.spec))
-    if depth <= 0 or good.sum() < MIN_CORNERS:
+    if depth <= 0 or good.sum() < GeometryRules().least_corners:
         return None
     noise = noise_scatter_px(state, field, step, pixels[good], radius)
     scatter = np.hypot(noise, _scatter_px(state, board))
@@ -127,8 +121,7 @@ def _seen(
 def _places(
     lens: Float[Array, "9"], rotation: Float[Array, "3 3"], origin: Float[Array, "3"], points: Float[Array, "n 3"]
 ) -> Float[Array, "n 2"]:
-    camera = Geometry(lens[:2], lens[2:4], lens[4:], jnp.zeros(3), jnp.zeros(3))
-    return project(camera, points @ rotation.T + origin)
+    return project(Intrinsics.of(lens).camera(), points @ rotation.T + origin)
 
 
 _jitted_places = jax.jit(_places)

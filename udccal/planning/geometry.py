@@ -13,12 +13,12 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from udccal.arrangements import Board
-from udccal.fitting.geometry.bundle_orders import ORDERS
-from udccal.fitting.geometry.fit import rig_prior
-from udccal.models.geometry import Geometry, project, rotation_matrix, unproject
+from udccal.fitting.geometry.bundle import LENS, ORDERS, Intrinsics
+from udccal.fitting.geometry.data import rig_prior
+from udccal.models.geometry import project, rotation_matrix, unproject
 from udccal.numerics import in_float64
 from udccal.planning.algebra import covariance
-from udccal.planning.board_views import LENS, PlannedView, lens_vector, planned_view
+from udccal.planning.board_views import PlannedView, planned_view
 from udccal.planning.light import EvenField
 from udccal.planning.prediction import Floor
 from udccal.planning.state import RigState, sensor_samples
@@ -37,7 +37,7 @@ class GeometryPredictor:
     def __init__(self, state: RigState) -> None:
         self._state = state
         self._field = EvenField(state)
-        self._lens = lens_vector(state.geometry)
+        self._lens = Intrinsics.of_geometry(state.geometry).vector
         self._rays = _ray_slopes(self._lens, sensor_samples(state.rig, _GRID))
         self._known: dict[Board, PlannedView | None] = {}
 
@@ -77,7 +77,7 @@ class GeometryPredictor:
         information = sum(
             (view.information * (1.0 if view.parallel else weight) for view in views), start=np.zeros((12, 12))
         )
-        information[:LENS, :LENS] += np.diag(rig_prior(self._state.rig).precision)
+        information[:LENS, :LENS] += rig_prior(self._state.rig).precision
         samples = 2 * sum(view.corners for view in views)
         free = self._order(information, 12 + 6 * len(views) - 9, samples)
         cov, slopes = covariance(information[np.ix_(free, free)]), self._rays[:, :, free]
@@ -88,12 +88,11 @@ class GeometryPredictor:
         cov = covariance(information)
         freedom = max(samples - others, 1)
         scores = []
-        for _, order in ORDERS:
-            held = 4 + np.flatnonzero(1 - np.array(order))
+        for free in ORDERS.values():
+            held = np.flatnonzero(~free)
             rise = float(self._lens[held] @ covariance(cov[np.ix_(held, held)]) @ self._lens[held])
-            scores.append(samples * np.log1p(rise / freedom) + sum(order) * np.log(samples))
-        chosen = ORDERS[int(np.argmin(scores))][1]
-        return np.array((1, 1, 1, 1, *chosen, 1, 1, 1), dtype=bool)
+            scores.append(samples * np.log1p(rise / freedom) + free.sum() * np.log(samples))
+        return np.append(list(ORDERS.values())[int(np.argmin(scores))], [True, True, True])
 
 
 @in_float64
@@ -104,14 +103,10 @@ def _ray_slopes(lens: Float[np.ndarray, "9"], pixels: Float[np.ndarray, "n 2"]) 
 @jax.jit
 def _slopes(lens: Float[Array, "9"], pixels: Float[Array, "n 2"]) -> Float[Array, "n 2 12"]:
     """Of where the rays of these pixels land, by the lens and by a turn of the panel in camera coordinates."""
-
-    def camera(x: Float[Array, "9"]) -> Geometry:
-        return Geometry(x[:2], x[2:4], x[4:9], jnp.zeros(3), jnp.zeros(3))
-
-    ideal = unproject(camera(lens), pixels)
+    ideal = unproject(Intrinsics.of(lens).camera(), pixels)
     rays = jnp.concatenate([ideal, jnp.ones_like(ideal[:, :1])], axis=1)
 
     def seen(x: Float[Array, "12"]) -> Float[Array, "n 2"]:
-        return project(camera(x[:LENS]), rays @ rotation_matrix(x[LENS:]).T)
+        return project(Intrinsics.of(x[:LENS]).camera(), rays @ rotation_matrix(x[LENS:]).T)
 
     return jax.jacfwd(seen)(jnp.concatenate([lens, jnp.zeros(3)]))

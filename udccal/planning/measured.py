@@ -7,7 +7,7 @@ from typing import Any, final
 
 import numpy as np
 
-from udccal.fitting.geometry.report import BY_HAND, ON_JIG
+from udccal.fitting.geometry.boards import BY_HAND, ON_JIG
 from udccal.models.backscatter import Backscatter
 from udccal.models.geometry import Geometry
 from udccal.models.noise import Noise

@@ -8,7 +8,7 @@ import numpy as np
 
 from udccal.calibration import ORDER, Calibration
 from udccal.errors import UdccalError
-from udccal.fitting.geometry.fit import projection_sigma_px
+from udccal.fitting.geometry.boards import projection_sigma_px
 from udccal.planning.measured import Measured, measured_state
 from udccal.planning.outlook import Outlook, Trade, outlook
 from udccal.planning.state import sensor_samples

@@ -139,19 +139,25 @@ class Blocks:
 
     def marginal(self, damping: float = 0.0) -> tuple[Float[np.ndarray, "p p"], Float[np.ndarray, " p"]]:
         """Matrix and right side of the shared parameters once the groups' own are eliminated."""
-        solved = self.cross @ self._own_inverse(damping)
-        matrix = _damped(self.shared, damping) - np.einsum("kpl,kql->pq", solved, self.cross)
-        return matrix, self.right - np.einsum("kpl,kl->p", solved, self.own_right)
+        return self._marginal(damping, self._own_inverse(damping))
+
+    def _marginal(
+        self, damping: float, own_inverse: Float[np.ndarray, "k l l"]
+    ) -> tuple[Float[np.ndarray, "p p"], Float[np.ndarray, " p"]]:
+        solved = self.cross @ own_inverse
+        matrix = _damped(self.shared, damping) - np.tensordot(solved, self.cross, ((0, 2), (0, 2)))
+        return matrix, self.right - np.tensordot(solved, self.own_right, ((0, 2), (0, 1)))
 
     def step(self, damping: float) -> Step:
         """To the minimum of the quadratic model, whose diagonal is raised by the part ``damping``."""
-        matrix, right = self.marginal(damping)
+        inverse = self._own_inverse(damping)
+        matrix, right = self._marginal(damping, inverse)
         if self.held is not None:
             matrix = np.where(self.held[:, None] | self.held, np.diag(np.where(self.held, 1.0, 0.0)), matrix)
             right = np.where(self.held, 0.0, right)
         shared = solve(matrix, right)
         left = self.own_right - np.einsum("kpl,p->kl", self.cross, shared)
-        own = np.einsum("klm,km->kl", self._own_inverse(damping), left)
+        own = np.einsum("klm,km->kl", inverse, left)
         return Step(shared, own, float(self.right @ shared + (self.own_right * own).sum()))
 
     def cov(self) -> Float[np.ndarray, "p p"]:
