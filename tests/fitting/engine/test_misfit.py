@@ -3,7 +3,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from udccal.fitting.engine.misfit import chi2_test, clustered_cov, excess_sigma, f_test, group_means_test, sharper
+from udccal.fitting.engine.misfit import (
+    chi2_test,
+    clustered_cov,
+    excess_sigma,
+    f_test,
+    group_means_test,
+    robust_excess_sigma,
+    sharper,
+)
 
 
 def test_chance_alone_is_flagged_once_in_a_thousand() -> None:
@@ -41,6 +49,16 @@ def test_an_error_beside_noise_is_measured(size: float) -> None:
     noise = 0.01 * light
     residual = np.sqrt(noise) * rng.standard_normal(5000) + size * light * rng.standard_normal(5000)
     assert excess_sigma(residual**2, noise, light**2, 5000.0) == pytest.approx(size, rel=0.05, abs=1e-12)
+
+
+def test_a_robust_size_is_that_of_most_residuals() -> None:
+    rng = np.random.default_rng(4)
+    light = rng.uniform(1, 30, 5000)
+    noise = 0.01 * light
+    residual = np.sqrt(noise) * rng.standard_normal(5000) + 0.02 * light * rng.standard_normal(5000)
+    residual[:300] += 50.0
+    assert robust_excess_sigma(residual**2, noise, light**2) == pytest.approx(0.02, rel=0.15)
+    assert excess_sigma(residual**2, noise, light**2, 5000.0) > 0.1
 
 
 @pytest.mark.parametrize("with_information", [True, False])
