@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from udccal.fitting.absent import absent_backscatter, absent_psf, absent_wire
-from udccal.fitting.backscatter.fit import fit_backscatter
+from udccal.fitting.backscatter import BackscatterRules, fit_backscatter, read_backscatter
 from udccal.fitting.geometry.fit import BoardView, fit_views, read_views, rig_prior
 from udccal.fitting.noise.fit import fit_noise, nominal_noise
 from udccal.fitting.nominal import nominal_geometry
@@ -195,7 +195,12 @@ def fit_session(
         backscatter = pool.submit(
             clock.run,
             "backscatter",
-            lambda: fit_backscatter(session, noise, geometry, base.wire_map, effort.backscatter_positions),
+            lambda: fit_backscatter(
+                read_backscatter(session, noise, geometry, base.wire_map),
+                geometry,
+                rig,
+                BackscatterRules(positions=effort.backscatter_positions),
+            ),
             lambda: absent_backscatter(rig, geometry),
         )
     late = sorted(clock.times, key=lambda taken: ORDER.index(taken.term))
