@@ -30,8 +30,9 @@ from udccal.cli.output import Output
 from udccal.compilation import keep_compilations
 from udccal.displays.pictures import face_picture
 from udccal.fitting.backscatter import read_backscatter
-from udccal.fitting.backscatter.orders import Problem, search
+from udccal.fitting.backscatter.orders import search
 from udccal.fitting.backscatter.posterior import term_posterior
+from udccal.fitting.backscatter.solve import Problem
 from udccal.fitting.calibrate import Calibration, fit_session
 from udccal.fitting.geometry.fit import projection_sigma_px
 from udccal.planning.measured import Measured, measured_state

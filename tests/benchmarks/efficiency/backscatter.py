@@ -18,8 +18,8 @@ from udccal.displays.pictures import face_picture
 from udccal.fitting.backscatter import BackscatterData, BackscatterRules
 from udccal.fitting.backscatter.data import Binned, grid_rays, grid_step, visible_crop
 from udccal.fitting.backscatter.fit import result_of
-from udccal.fitting.backscatter.likelihood import SampleErrors, Samples, most_probable
-from udccal.fitting.backscatter.orders import Problem, search
+from udccal.fitting.backscatter.likelihood import Samples
+from udccal.fitting.backscatter.orders import search
 from udccal.fitting.backscatter.parameters import (
     NAMES,
     TWO_PLANES,
@@ -33,6 +33,7 @@ from udccal.fitting.backscatter.parameters import (
 )
 from udccal.fitting.backscatter.posterior import TermAt, moments_along_reflection, posterior_around
 from udccal.fitting.backscatter.ratios import corners_of, window_for
+from udccal.fitting.backscatter.solve import Problem, SampleErrors, most_probable
 from udccal.fitting.engine.gaussian import Posterior
 from udccal.fitting.nominal import nominal_backscatter, nominal_geometry
 from udccal.models.backscatter import Backscatter, panel_response, response_grid

@@ -21,9 +21,10 @@ from tests.benchmarks.efficiency.backscatter import (
     world_at,
 )
 from udccal.fitting.backscatter import BackscatterData, fit_backscatter
-from udccal.fitting.backscatter.orders import OrderFit, Problem, search
+from udccal.fitting.backscatter.orders import OrderFit, search
 from udccal.fitting.backscatter.parameters import KERNELS, MIX, REFLECTION, TWO_PLANES, Order, prior_of, values_of
 from udccal.fitting.backscatter.posterior import term_posterior
+from udccal.fitting.backscatter.solve import Problem
 from udccal.fitting.engine.gaussian import Posterior
 from udccal.fitting.engine.orders import Attempt, Choice
 from udccal.models.backscatter import Backscatter

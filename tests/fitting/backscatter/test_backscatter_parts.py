@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from udccal.fitting.backscatter.data import grid_step, sampled_rays, visible_crop
-from udccal.fitting.backscatter.likelihood import Fitted, MostProbable, Profile, Samples, of_all_shots
+from udccal.fitting.backscatter.likelihood import Profile, Samples, of_all_shots
 from udccal.fitting.backscatter.orders import typical_error
 from udccal.fitting.backscatter.parameters import (
     KERNELS,
@@ -34,6 +34,7 @@ from udccal.fitting.backscatter.ratios import (
     window_for,
     with_room,
 )
+from udccal.fitting.backscatter.solve import Fitted, MostProbable
 from udccal.fitting.nominal import nominal_backscatter, nominal_geometry
 from udccal.rig import load_rig
 
@@ -147,8 +148,7 @@ def test_a_typical_error_is_that_of_most_pictures() -> None:
 
     def error_of(ratios_of: np.ndarray) -> float:
         weight, corner = _weights(samples), np.zeros((60, 2), dtype=np.int64)
-        fitted = Fitted(nothing, corner, ratios_of, np.zeros((3, 60)), ratios_of, weight)
-        return typical_error(fitted.reweighed(samples, weight), samples)
+        return typical_error(Fitted.of(nothing, corner, ratios_of, samples, weight), samples)
 
     assert error_of(ratio) < 0.004
     assert error_of(off) == pytest.approx(0.03, rel=0.15)

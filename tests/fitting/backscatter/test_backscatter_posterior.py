@@ -16,10 +16,10 @@ from tests.benchmarks.efficiency.backscatter import (
     small_rig,
     world,
 )
-from udccal.fitting.backscatter.likelihood import MostProbable, most_probable
-from udccal.fitting.backscatter.orders import Problem, held_out, search
+from udccal.fitting.backscatter.orders import held_out, search
 from udccal.fitting.backscatter.parameters import NAMES, REFLECTION, TWO_PLANES, Moments, prior_of
 from udccal.fitting.backscatter.posterior import moments_along_reflection
+from udccal.fitting.backscatter.solve import MostProbable, Problem, most_probable
 from udccal.rig import load_rig
 
 PRIOR = prior_of(load_rig("lg55-reduced"))

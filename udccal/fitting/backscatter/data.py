@@ -230,7 +230,7 @@ def visible_crop(geometry: Geometry, rig: RigDescription) -> PanelCrop:
     camera, panel = rig.camera, rig.panel
     edge_x, edge_y = np.linspace(0, camera.columns - 1, 9), np.linspace(0, camera.rows - 1, 9)
     pixels = np.stack(np.meshgrid(edge_x, edge_y), axis=-1).reshape(-1, 2)
-    template = nominal_backscatter(geometry, rig, np.zeros((3, 2, 2)), grid_step(rig), window=1)
+    template = nominal_backscatter(geometry, rig, np.zeros((3, 1, 1)), grid_step(rig), window=1)
     middle = corners_of(template, linear_of(prior_of(rig).mean), directions(geometry, pixels))
     first = np.clip(middle.min(axis=0) - _MARGIN_PX, 0, [panel.columns - 8, panel.rows - 8])
     last = np.clip(middle.max(axis=0) + _MARGIN_PX + 1, first + 8, [panel.columns, panel.rows])

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 from udccal.fitting.absent import absent_backscatter
 from udccal.fitting.backscatter.data import BackscatterData, grid_rays
 from udccal.fitting.backscatter.likelihood import LEAST_VARIANCE
-from udccal.fitting.backscatter.orders import BAD_BINS, BAD_PICTURES, Found, Problem, search
+from udccal.fitting.backscatter.orders import BAD_BINS, BAD_PICTURES, Found, search
 from udccal.fitting.backscatter.parameters import (
     DISTANCE,
     NAMES,
@@ -24,6 +24,7 @@ from udccal.fitting.backscatter.parameters import (
 from udccal.fitting.backscatter.posterior import term_posterior, value_moments
 from udccal.fitting.backscatter.ratios import window_for
 from udccal.fitting.backscatter.rules import BackscatterRules
+from udccal.fitting.backscatter.solve import Problem
 from udccal.fitting.engine.misfit import MisfitTest, group_means_test, sharper
 from udccal.fitting.engine.report import estimates, residual_sample
 from udccal.fitting.engine.robust import outliers

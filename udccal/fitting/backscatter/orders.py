@@ -11,86 +11,30 @@ from dataclasses import dataclass, replace
 from typing import final
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool
 from scipy.special import ndtri
 
-from udccal.fitting.backscatter.data import BackscatterData, grid_step, sampled_rays
-from udccal.fitting.backscatter.likelihood import Fitted, MostProbable, Profile, SampleErrors, Samples, most_probable
+from udccal.fitting.backscatter.likelihood import PerShot, Profile
 from udccal.fitting.backscatter.parameters import (
     KERNELS,
     MIX,
-    OFFSET,
     ONE_PLANE,
     REFLECTION,
     TWO_PLANES,
     Order,
-    linear_of,
-    offset_reach_px,
-    prior_of,
+    Vector,
     split_plane,
     values_of,
 )
-from udccal.fitting.backscatter.ratios import (
-    Windows,
-    corners_of,
-    mixed_ratios,
-    primary_light,
-    shares_at,
-    window_for,
-    with_room,
-)
 from udccal.fitting.backscatter.rules import BackscatterRules
+from udccal.fitting.backscatter.solve import Fitted, MostProbable, Problem, SampleErrors
 from udccal.fitting.engine.gaussian import Prior
 from udccal.fitting.engine.misfit import chi2_test, excess_sigma, robust_excess_sigma
 from udccal.fitting.engine.orders import Attempt, Choice, choose, evidence
 from udccal.fitting.engine.robust import MAD_TO_SIGMA, OutlierRule
-from udccal.fitting.nominal import nominal_backscatter
-from udccal.models.backscatter import Backscatter
-from udccal.models.geometry import Geometry
-from udccal.rig import RigDescription
 
 BAD_PICTURES = OutlierRule("pictures in brightness or pattern")
 BAD_BINS = OutlierRule("bins")
-
-
-@final
-@dataclass(frozen=True)
-class Problem:
-    """What all orders share; ``flat`` are the grid indices of the positions."""
-
-    template: Backscatter
-    samples: Samples
-    flat: Int[np.ndarray, " n"]
-    prior: Prior
-    start: Float[np.ndarray, "18"]
-    rules: BackscatterRules
-
-    @classmethod
-    def of(
-        cls, data: BackscatterData, geometry: Geometry, rig: RigDescription, rules: BackscatterRules | None = None
-    ) -> Problem:
-        """Samples at positions spread over the sensor, with a start found by scanning."""
-        rules, step, prior = rules or BackscatterRules(), grid_step(rig), prior_of(rig)
-        rays, flat = sampled_rays(geometry, rig, step, rules.positions)
-        # The mask comes out of the likelihood; the template's is of no size.
-        template = nominal_backscatter(geometry, rig, np.zeros((3, 1, 1)), step, window=1)
-        template = replace(template, window=window_for(template, linear_of(prior.mean), rays, rules.slack_px))
-        samples = Samples.at(data, rays, flat, data.pictures)
-        return cls(template, samples, flat, prior, _scanned(template, samples, rig, prior), rules)
-
-    def solved(self, order: Order, x: Float[np.ndarray, "18"], weight: Float[np.ndarray, "shots 3 n"]) -> Fitted:
-        """The most probable parameters of an order at given weights, from ``x`` on."""
-        start = order.start(x, self.prior)
-        corner = corners_of(self.template, linear_of(start), self.samples.rays)
-        errors_at = SampleErrors.of(self.template, self.samples, weight, corner)
-        found = most_probable(errors_at, start, order.free, self.prior, self.rules.solver)
-        return Fitted.of(self.template, self.samples, weight, found, corner)
-
-    def with_room(self, x: Float[np.ndarray, "18"]) -> Problem:
-        """With windows that hold the footprints of these parameters."""
-        rules = self.rules
-        wider = with_room(self.template, linear_of(x), self.samples.rays, rules.slack_px, rules.most_wider)
-        return replace(self, template=wider)
 
 
 @final
@@ -200,9 +144,7 @@ def degrees_of_freedom(fitted: Fitted, order: Order, prior: Prior) -> float:
     return max(float(used.sum() - used.any(axis=0).sum() - np.maximum(1.0 - narrowed, 0.0).sum()), 1.0)
 
 
-def _from_afar(
-    problem: Problem, order: Order, x: Float[np.ndarray, "18"], noise: Float[np.ndarray, "shots 3 n"], error: float
-) -> Fitted:
+def _from_afar(problem: Problem, order: Order, x: Vector, noise: PerShot, error: float) -> Fitted:
     """A fit whose start leaves much undescribed, which counts as noise, so that the prior keeps its say.
 
     Against noise alone, errors of a poor start outweigh any prior and throw the parameters far off. ``error`` is the
@@ -226,7 +168,7 @@ def typical_error(fitted: Fitted, samples: Samples) -> float:
     return robust_excess_sigma(fitted.errors[1:][used] ** 2, noise[used], unit[used])
 
 
-def _two_planes(problem: Problem, simple: Fitted, noise: Float[np.ndarray, "shots 3 n"]) -> Fitted:
+def _two_planes(problem: Problem, simple: Fitted, noise: PerShot) -> Fitted:
     """The best of some fits, with reflections brighter and fainter than the emitters themselves to begin with."""
     prior, samples = problem.prior, problem.samples
     # No more than one plane leaves: against much more, all starts would end at the prior's mean.
@@ -268,9 +210,7 @@ def _without_outliers(
     return np.concatenate([usable[:-1] & ~lost, usable[-1:]])
 
 
-def _compared(
-    problem: Problem, rich: Fitted, simple: Float[np.ndarray, "18"], kernels: tuple[Order, ...]
-) -> Choice[OrderFit]:
+def _compared(problem: Problem, rich: Fitted, simple: Vector, kernels: tuple[Order, ...]) -> Choice[OrderFit]:
     """All orders at the same weights."""
     prior = problem.prior
 
@@ -315,36 +255,3 @@ def held_out(problem: Problem, order: Order, full: Fitted) -> HeldOut:
     unit = np.broadcast_to(fitted.mask**2, used.shape)[used]
     over = float((square - noise)[used].sum() / max(unit.sum(), 1e-30))
     return HeldOut(float(np.sqrt(relative)), float(np.sqrt(max(excess, 0.0))), float(np.sqrt(max(over, 0.0)) * found))
-
-
-def _scanned(template: Backscatter, samples: Samples, rig: RigDescription, prior: Prior) -> Float[np.ndarray, "18"]:
-    """Panel offset at which a free mix of primaries explains the ratios best: where least squares may start.
-
-    Offsets are whole panel pixels: a window that moves with them sees the same shares of its emitters.
-    """
-    weight = samples.first_weights()
-    lit = samples.excess[0] * weight[0] > 1.0
-    white = np.where(lit, samples.excess[0], 1.0)
-    ratio, weight = (np.where(lit, part, 0.0)[1:-1] for part in (samples.excess / white, weight * white))
-    theta = linear_of(TWO_PLANES.without_crosstalk().start(prior.mean, prior))
-    corner = corners_of(template, theta, samples.rays)
-    shares = shares_at(template, theta, samples.rays, corner)
-
-    def cost(offset: tuple[int, int]) -> float:
-        moved = Windows.at(template.window, samples.rays, corner - np.array(offset), samples.shown)
-        primaries = mixed_ratios(*primary_light(shares, float(theta[0]), moved, samples.shown), np.eye(3))
-        total = 0.0
-        for channel in range(3):
-            every = weight[:, channel].ravel()
-            design, wanted = (
-                np.moveaxis(primaries, 1, -1).reshape(-1, 3) * every[:, None],
-                ratio[:, channel].ravel() * every,
-            )
-            mix = np.linalg.lstsq(design, wanted, rcond=None)[0]
-            total += float(((design @ mix - wanted) ** 2).sum())
-        return total
-
-    across, down = (range(-int(np.ceil(reach)), int(np.ceil(reach)) + 1) for reach in offset_reach_px(rig))
-    start = prior.mean.copy()
-    start[OFFSET] = min(((x, y) for y in down for x in across), key=cost)
-    return start

@@ -20,6 +20,7 @@ from udccal.fitting.engine.gaussian import Prior
 from udccal.models.backscatter import Backscatter
 from udccal.rig import RigDescription
 
+Vector = Float[np.ndarray, "18"]
 NAMES = (
     "gamma", "distance_mm", "pupil_mm", "softness_px", "reflection", "reflection_mm", "offset_x_px", "offset_y_px",
     "red_x_px", "red_y_px", "blue_x_px", "blue_y_px", "mix_rg", "mix_rb", "mix_gr", "mix_gb", "mix_br", "mix_bg",
@@ -68,7 +69,7 @@ class Order:
         """
         return float((~self.free[[REFLECTION, EMITTERS.start, MIX.start]]).sum()) * _ODDS_AGAINST
 
-    def start(self, x: Float[np.ndarray, "18"], prior: Prior) -> Float[np.ndarray, "18"]:
+    def start(self, x: Vector, prior: Prior) -> Vector:
         """``x`` with the held parameters at where this order has them."""
         held = prior.mean.copy()
         held[EMITTERS] = 0.0
@@ -96,7 +97,7 @@ ONE_PLANE = _order("one plane", TWO_PLANES.free, REFLECTION, DEPTH)
 KERNELS = (_order("one plane, primaries in one place", ONE_PLANE.free, EMITTERS), ONE_PLANE, TWO_PLANES)
 
 
-def split_plane(x: Float[np.ndarray, "18"], prior: Prior, reflection: float) -> Float[np.ndarray, "18"]:
+def split_plane(x: Vector, prior: Prior, reflection: float) -> Vector:
     """One plane's parameters with a reflection added: the two planes' light comes from where the one's came from."""
     split = x.copy()
     split[REFLECTION], split[DEPTH] = np.log(reflection), prior.mean[DEPTH]
@@ -132,7 +133,7 @@ def prior_of(rig: RigDescription) -> Prior:
     return Prior.independent(mean, sigma)
 
 
-def values_of(x: Float[np.ndarray, "18"]) -> Float[np.ndarray, "18"]:
+def values_of(x: Vector) -> Vector:
     """The parameters in the units of ``UNITS``, lengths for the nominal pitch, the pupil as its footprint."""
     values = np.array(x, dtype=np.float64)
     logarithms = values[_LOGARITHMIC]
@@ -145,11 +146,11 @@ def values_of(x: Float[np.ndarray, "18"]) -> Float[np.ndarray, "18"]:
 class Moments:
     """Mean and covariance of the values, in the units of ``UNITS``."""
 
-    mean: Float[np.ndarray, "18"]
+    mean: Vector
     cov: Float[np.ndarray, "18 18"]
 
     @classmethod
-    def log_normal(cls, x: Float[np.ndarray, "18"], cov: Float[np.ndarray, "18 18"]) -> Moments:
+    def log_normal(cls, x: Vector, cov: Float[np.ndarray, "18 18"]) -> Moments:
         """Where the solver's coordinates are normal."""
         logarithmic = np.isin(np.arange(len(NAMES)), _LOGARITHMIC)
         mean = values_of(x)
@@ -167,7 +168,7 @@ class Moments:
         return cls(mean, within + np.einsum("p,pk,pl->kl", weights, off, off))
 
 
-def pitch_error(values: Float[np.ndarray, "18"], rig: RigDescription) -> Float[np.ndarray, "18"]:
+def pitch_error(values: Vector, rig: RigDescription) -> Vector:
     """By how much each value moves with one sigma of the pitch: pictures tell lengths in panel pixels only."""
     pitch = rig.panel.pitch_mm
     moved = np.zeros(len(NAMES))
@@ -175,7 +176,7 @@ def pitch_error(values: Float[np.ndarray, "18"], rig: RigDescription) -> Float[n
     return moved
 
 
-def linear_of(x: Float[np.ndarray, "18"]) -> Float[np.ndarray, "18"]:
+def linear_of(x: Vector) -> Vector:
     """The parameters with the reflected share of all light, and crosstalk, for their logarithms: 0 where absent."""
     theta, values = np.array(x, dtype=np.float64), values_of(x)
     theta[REFLECTION] = values[REFLECTION] / (1 + values[REFLECTION])
@@ -183,7 +184,7 @@ def linear_of(x: Float[np.ndarray, "18"]) -> Float[np.ndarray, "18"]:
     return theta
 
 
-def linear_slope(x: Float[np.ndarray, "18"]) -> Float[np.ndarray, "18"]:
+def linear_slope(x: Vector) -> Vector:
     """Derivative of each of ``linear_of`` by the solver's coordinate."""
     theta, slope = linear_of(x), np.ones(len(NAMES))
     slope[REFLECTION] = theta[REFLECTION] * (1 - theta[REFLECTION])
@@ -210,7 +211,7 @@ def with_linear(term: Backscatter, theta: Float[Array, "18"]) -> Backscatter:
     )  # fmt: skip
 
 
-def mix_and_jacobian(theta: Float[np.ndarray, "18"]) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "6 3 3"]]:
+def mix_and_jacobian(theta: Vector) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "6 3 3"]]:
     """Camera colour from primary, rows sum to 1, and its derivatives by the crosstalk."""
     row, column = _OFF_DIAGONAL
     mix, jacobian, each = np.eye(3), np.zeros((6, 3, 3)), np.arange(6)

@@ -17,19 +17,12 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from udccal.fitting.backscatter.data import BackscatterData, grid_rays
-from udccal.fitting.backscatter.likelihood import (
-    ErrorsAt,
-    MostProbable,
-    Profile,
-    SampleErrors,
-    Samples,
-    most_probable,
-    of_all_shots,
-)
+from udccal.fitting.backscatter.likelihood import Profile, Samples, of_all_shots
 from udccal.fitting.backscatter.orders import Found
-from udccal.fitting.backscatter.parameters import REFLECTION, Moments, linear_of, linear_slope, with_linear
+from udccal.fitting.backscatter.parameters import REFLECTION, Moments, Vector, linear_of, linear_slope, with_linear
 from udccal.fitting.backscatter.ratios import Windows, corners_of, ratios, ratios_and_jacobian
 from udccal.fitting.backscatter.rules import BackscatterRules
+from udccal.fitting.backscatter.solve import ErrorsAt, MostProbable, SampleErrors, most_probable
 from udccal.fitting.engine.gaussian import Posterior, Prior, square_root
 from udccal.fitting.engine.orders import evidence
 from udccal.models.backscatter import Backscatter
@@ -79,7 +72,7 @@ def moments_along_reflection(
         return Moments.log_normal(solved.x, solved.cov)
     others = free & (np.arange(len(free)) != REFLECTION)
 
-    def node(start: Float[np.ndarray, "18"]) -> tuple[MostProbable, float]:
+    def node(start: Vector) -> tuple[MostProbable, float]:
         """The others at this reflection, and the posterior's logarithm there."""
         held = most_probable(errors_at, start, others, prior, rules.solver)
         off = (start[REFLECTION] - prior.mean[REFLECTION]) / prior.sigma[REFLECTION]
@@ -120,7 +113,7 @@ class TermAt:
     data: BackscatterData
     used: Bool[np.ndarray, " shots"]
     model_error: float
-    theta: Float[np.ndarray, "18"]
+    theta: Vector
 
     @in_float64
     def __call__(self, parameters: Float[np.ndarray, " n"]) -> Backscatter:

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Shaped, UInt8
 from scipy import sparse
 
-from udccal.fitting.backscatter.parameters import EMITTERS, MIX, PLACES, SOFTNESS, mix_and_jacobian, with_linear
+from udccal.fitting.backscatter.parameters import EMITTERS, MIX, PLACES, SOFTNESS, Vector, mix_and_jacobian, with_linear
 from udccal.models.arrays import Arrayish
 from udccal.models.backscatter import Backscatter, emitter_shares, footprints, window_corners
 from udccal.models.geometry import Geometry, panel_directions
@@ -59,16 +59,12 @@ def directions(geometry: Geometry, pixels: Float[np.ndarray, "n 2"]) -> Float[np
 _directions = jax.jit(panel_directions)
 
 
-def corners_of(
-    template: Backscatter, theta: Float[np.ndarray, "18"], rays: Float[np.ndarray, "n 3"]
-) -> Int[np.ndarray, "n 2"]:
+def corners_of(template: Backscatter, theta: Vector, rays: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, "n 2"]:
     """(column, row) of the first panel pixel of each position's window."""
     return _middle_and_reach(template, theta, rays)[0] - (template.window - 1) // 2
 
 
-def window_for(
-    template: Backscatter, theta: Float[np.ndarray, "18"], rays: Float[np.ndarray, "n 3"], slack: float
-) -> int:
+def window_for(template: Backscatter, theta: Vector, rays: Float[np.ndarray, "n 3"], slack: float) -> int:
     """Odd number of panel pixels across a window that holds both footprints at every position."""
     reach_px = _middle_and_reach(template, theta, rays)[1]
     emitters = np.insert(theta[EMITTERS].reshape(2, 2), 1, 0.0, axis=0)
@@ -77,7 +73,7 @@ def window_for(
 
 
 def with_room(
-    template: Backscatter, theta: Float[np.ndarray, "18"], rays: Float[np.ndarray, "n 3"], slack: float, most: float
+    template: Backscatter, theta: Vector, rays: Float[np.ndarray, "n 3"], slack: float, most: float
 ) -> Backscatter:
     """The template with a window that holds the footprints and lets them move, never smaller than it was.
 
@@ -90,7 +86,7 @@ def with_room(
 
 @in_float64
 def _middle_and_reach(
-    template: Backscatter, theta: Float[np.ndarray, "18"], rays: Float[np.ndarray, "n 3"]
+    template: Backscatter, theta: Vector, rays: Float[np.ndarray, "n 3"]
 ) -> tuple[Int[np.ndarray, "n 2"], Float[np.ndarray, " n"]]:
     """Middle panel pixel of each position's window, and how far the footprints reach from it."""
     # For a window of one pixel: windows of any size then share one compilation.
@@ -177,7 +173,7 @@ class Windows:
 @in_float64
 def shares_at(
     template: Backscatter,
-    theta: Float[np.ndarray, "18"],
+    theta: Vector,
     rays: Float[np.ndarray, "n 3"],
     corner: Int[np.ndarray, "n 2"],
 ) -> Float[np.ndarray, "n window2 3"]:
@@ -207,9 +203,7 @@ def _shares_and_jacobian(
     return jnp.moveaxis(jnp.concatenate([shares[..., None], by_place], axis=-1), 2, 1)
 
 
-def ratios(
-    template: Backscatter, theta: Float[np.ndarray, "18"], at: Windows, shown: Pictures
-) -> Float[np.ndarray, "pictures 3 n"]:
+def ratios(template: Backscatter, theta: Vector, at: Windows, shown: Pictures) -> Float[np.ndarray, "pictures 3 n"]:
     """Light of pictures over that of white."""
     shares = shares_at(template, theta, at.rays, at.corner)
     return mixed_ratios(*primary_light(shares, float(theta[0]), at, shown), mix_and_jacobian(theta)[0])
@@ -239,7 +233,7 @@ def mixed_ratios(
 
 @in_float64
 def ratios_and_jacobian(
-    template: Backscatter, theta: Float[np.ndarray, "18"], at: Windows, logs: Float[np.ndarray, "n 3 pictures window2"]
+    template: Backscatter, theta: Vector, at: Windows, logs: Float[np.ndarray, "n 3 pictures window2"]
 ) -> tuple[Float[np.ndarray, "pictures 3 n"], Float[np.ndarray, "18 pictures 3 n"]]:
     """Light of pictures over that of white, and its derivatives; ``logs`` is of ``Windows.logs``."""
     (shares,) = in_blocks(
@@ -261,3 +255,35 @@ def ratios_and_jacobian(
     over = np.einsum("kcp,npi->kicn", by_mix, light[..., 0])
     jacobian[MIX] = (over - ratio * np.einsum("kcp,np->kcn", by_mix, white[..., 0])[:, None]) / below
     return ratio, jacobian
+
+
+@in_float64
+def best_offset(
+    template: Backscatter,
+    theta: Vector,
+    rays: Float[np.ndarray, "n 3"],
+    shown: Pictures,
+    ratio: Float[np.ndarray, "pictures 3 n"],
+    weight: Float[np.ndarray, "pictures 3 n"],
+    reach_px: Float[np.ndarray, "2"],
+) -> tuple[int, int]:
+    """Panel offset (x, y) at which a free mix of primaries explains measured ratios best: where a fit may start.
+
+    Offsets are whole panel pixels: a window that moves with them sees the same shares of its emitters.
+    """
+    corner = corners_of(template, theta, rays)
+    shares = shares_at(template, theta, rays, corner)
+
+    def cost(offset: tuple[int, int]) -> float:
+        moved = Windows.at(template.window, rays, corner - np.array(offset), shown)
+        primaries, total = mixed_ratios(*primary_light(shares, float(theta[0]), moved, shown), np.eye(3)), 0.0
+        for channel in range(3):
+            every = weight[:, channel].ravel()
+            design = np.moveaxis(primaries, 1, -1).reshape(-1, 3) * every[:, None]
+            wanted = ratio[:, channel].ravel() * every
+            mix = np.linalg.lstsq(design, wanted, rcond=None)[0]
+            total += float(((design @ mix - wanted) ** 2).sum())
+        return total
+
+    across, down = (range(-int(np.ceil(reach)), int(np.ceil(reach)) + 1) for reach in reach_px)
+    return min(((x, y) for y in down for x in across), key=cost)
