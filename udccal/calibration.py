@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from udccal.errors import UdccalError
 from udccal.fitting.absent import absent_backscatter, absent_psf, absent_wire
-from udccal.fitting.backscatter.fit import fit_backscatter
+from udccal.fitting.backscatter import BackscatterRules, fit_backscatter, read_backscatter
 from udccal.fitting.geometry import fit_boards, read_geometry
 from udccal.fitting.geometry.data import BoardView
 from udccal.fitting.noise import fit_noise, nominal_noise, read_noise
@@ -211,10 +211,11 @@ class _Fits:
     @cached_property
     def backscatter(self) -> FitResult[Backscatter]:
         noise, geometry, wire_map = self.noise.term, self.geometry.term, self.wire_map
+        rig, rules = self._session.rig, BackscatterRules(positions=self._effort.backscatter_positions)
         return self._run(
             "backscatter",
-            lambda: fit_backscatter(self._session, noise, geometry, wire_map, self._effort.backscatter_positions),
-            lambda: absent_backscatter(self._session.rig, geometry),
+            lambda: fit_backscatter(read_backscatter(self._session, noise, geometry, wire_map), geometry, rig, rules),
+            lambda: absent_backscatter(rig, geometry),
         )
 
     def _run(self, term: TermName, fit: Callable[[], FitResult[Term]], absent: Callable[[], Term]) -> FitResult[Term]:

@@ -16,14 +16,11 @@ from jaxtyping import Array, Float, Int, UInt8
 from udccal.arrangements import Dark, PanelPicture
 from udccal.calibration import FitEffort
 from udccal.displays.pictures import face_picture
-from udccal.fitting.backscatter.bins import Bins
-from udccal.fitting.backscatter.data import (
-    grid_step,
-    sampled_rays,
-    visible_crop,
-)
-from udccal.fitting.backscatter.solve import SLACK_PX, corners_of, window_for
-from udccal.fitting.backscatter.vector import Prior, prior_of, values_of, with_vector
+from udccal.fitting.backscatter.data import Bins, grid_step, sampled_rays, visible_crop
+from udccal.fitting.backscatter.parameters import linear_of, linear_slope, prior_of, values_of, with_linear
+from udccal.fitting.backscatter.ratios import corners_of, window_for
+from udccal.fitting.backscatter.rules import BackscatterRules
+from udccal.fitting.engine.gaussian import Prior
 from udccal.fitting.nominal import nominal_backscatter
 from udccal.models.backscatter import Backscatter, emitter_shares, mixed_colours, panel_light
 from udccal.numerics import in_float64
@@ -59,10 +56,10 @@ class BackscatterPredictor:
         self._step_px = grid_step(rig)
         rays, flat = sampled_rays(state.geometry, rig, self._step_px, FitEffort().backscatter_positions)
         prior = prior_of(rig)
-        self._precision = np.diag(prior.sigma**-2.0)
+        self._precision = prior.precision
         x = prior.mean if state.backscatter is None else _vector(state.backscatter, prior)
         template = nominal_backscatter(state.geometry, rig, np.zeros((3, 2, 2)), self._step_px, window=1)
-        template = replace(template, window=window_for(template, x, rays, SLACK_PX))
+        template = replace(template, window=window_for(template, linear_of(x), rays, BackscatterRules().slack_px))
         self._ratios = _ratios(state, template, x, rays)
         # Where in the field the light falls: what leaves the panel evenly is shaded like everything else.
         across = rig.camera.columns // self._step_px
@@ -178,10 +175,11 @@ def _ratios(
         if isinstance(step.arrangement, PanelPicture) and step.arrangement.picture.min() < _WHITE_VALUE
     ]
     shown += [crop.of(face_picture(seed, panel.columns, panel.rows)) for seed in _NEW_SEEDS]
-    corner = corners_of(template, x, rays)
+    theta = linear_of(x)
+    corner = corners_of(template, theta, rays)
     seen = _in_windows(np.stack(shown), corner - np.array([crop.column, crop.row]), template.window)
-    value, slope = _with_slopes(x, template, rays, corner, seen)
-    return Ratios(np.asarray(value), np.asarray(slope))
+    value, slope = _with_slopes(theta, template, rays, corner, seen)
+    return Ratios(np.asarray(value), np.asarray(slope) * linear_slope(x))
 
 
 def _in_windows(
@@ -198,14 +196,14 @@ def _in_windows(
 
 @jax.jit
 def _with_slopes(
-    x: Float[Array, "18"], template: Backscatter, rays: Array, corner: Array, seen: Array
+    theta: Float[Array, "18"], template: Backscatter, rays: Array, corner: Array, seen: Array
 ) -> tuple[Float[Array, "pictures 3 n"], Float[Array, "pictures 3 n 18"]]:
     """Light of pictures over that of white, and its slopes by the parameters."""
 
     def ratios(values: Float[Array, "18"]) -> Float[Array, "pictures 3 n"]:
-        term = with_vector(template, values)
+        term = with_linear(template, values)
         shares = emitter_shares(term, rays, corner)
         light = mixed_colours(term, jnp.einsum("nwp,inwp->inp", shares, panel_light(term, seen)))
         return jnp.moveaxis(light / mixed_colours(term, shares.sum(axis=1)), 1, 2)
 
-    return ratios(x), jax.jacfwd(ratios)(x)
+    return ratios(theta), jax.jacfwd(ratios)(theta)
