@@ -18,8 +18,7 @@ from udccal.fitting.geometry.fit import BoardView, fit_views, read_views, rig_pr
 from udccal.fitting.noise.fit import fit_noise, nominal_noise
 from udccal.fitting.nominal import nominal_geometry
 from udccal.fitting.psf.fit import Effort, fit_psf
-from udccal.fitting.wire.fit import FIELD_SAMPLES, fit_wire_session, sensor_map
-from udccal.fitting.wire.sigma import MapSigma
+from udccal.fitting.wire import WireRules, fit_wire, read_wire, sensor_map
 from udccal.models.backscatter import Backscatter
 from udccal.models.geometry import Geometry
 from udccal.models.noise import Noise
@@ -45,7 +44,7 @@ class FitEffort:
         workers: with 2, psf and backscatter, which do not need each other, are fitted at once, in more memory.
     """
 
-    wire_samples: int = FIELD_SAMPLES
+    wire_samples: int = WireRules().samples
     psf: Effort = field(default_factory=Effort)
     backscatter_positions: int = 96
     workers: int = 1
@@ -75,7 +74,6 @@ class Foundation:
     Attributes:
         times: how long these took.
         wire_map: the fitted wire over the sensor, which takes long enough to be kept.
-        wire_sigma: how sure the map is at any pixel; None where no wire was fitted.
         boards: what the geometry was fitted to.
     """
 
@@ -84,7 +82,6 @@ class Foundation:
     wire: FitResult[Wire]
     times: tuple[FitTime, ...]
     wire_map: Float[np.ndarray, "rows columns"]
-    wire_sigma: MapSigma | None
     boards: tuple[BoardView, ...]
 
 
@@ -157,12 +154,14 @@ def fit_foundation(
             if captured
             else _left_out("geometry", nominal_geometry(rig))
         )
-    with clock.of("wire") as captured:
-        wire_fit = fit_wire_session(session, noise.term, geometry.term, effort.wire_samples) if captured else None
-        wire = wire_fit.result if wire_fit else _left_out("wire", absent_wire(rig, geometry.term))
+    rules = WireRules(samples=effort.wire_samples)
+    wire = clock.run(
+        "wire",
+        lambda: fit_wire(read_wire(session, noise.term, geometry.term, rules), rules),
+        lambda: absent_wire(rig, geometry.term),
+    )
     wire_map = sensor_map(wire.term, rig.camera.rows, rig.camera.columns)
-    sigma = wire_fit.sigma if wire_fit else None
-    return Foundation(noise, geometry, wire, tuple(clock.times), wire_map, sigma, boards)
+    return Foundation(noise, geometry, wire, tuple(clock.times), wire_map, boards)
 
 
 def fit_session(
