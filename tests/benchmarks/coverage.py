@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import final
 
+import jax
 import numpy as np
 from jaxtyping import Float
 
@@ -32,6 +33,7 @@ from udccal.fitting.backscatter import fit_backscatter, read_backscatter
 from udccal.fitting.backscatter.data import Bins, sampled_rays
 from udccal.fitting.geometry.boards import projection_sigma_px
 from udccal.models.geometry import project_directions
+from udccal.models.wire import wire_values
 from udccal.numerics import in_float64
 from udccal.planning.state import sensor_samples
 from udccal.reports.true_values import true_values
@@ -107,11 +109,13 @@ def rays(rig: Specimen) -> Float[np.ndarray, " n"]:
 def wire_pixels(rig: Specimen) -> Float[np.ndarray, " n"]:
     """The wire's map at random pixels."""
     true = wire.wire_map(rig.truth)
-    if rig.base.wire_sigma is None:
-        raise ValueError(f"expected a fit of the wire, found {rig.base.wire.status}")
     y, x = np.divmod(np.random.default_rng(rig.truth.seed).choice(true.size, _PIXELS, replace=False), true.shape[1])
     error = (rig.base.wire_map - true)[y, x]
-    return error / rig.base.wire_sigma.at(np.stack([x, y], axis=-1).astype(np.float64))
+    pixels = np.stack([x, y], axis=-1).astype(np.float64)
+    return error / rig.base.wire.sigma_of(lambda term: _wire_values(term, pixels, *true.shape))
+
+
+_wire_values = jax.jit(wire_values, static_argnums=(2, 3))
 
 
 def new_pictures(rig: Specimen) -> Float[np.ndarray, " n"]:

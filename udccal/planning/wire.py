@@ -12,12 +12,16 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from udccal.arrangements import Dark, FlatLight
-from udccal.fitting.wire.basis import SITES, Basis, Pixels, model_columns, sample_pixels
-from udccal.fitting.wire.fit import FIELD_SAMPLES
-from udccal.fitting.wire.harmonics import full_basis, plain_basis, possible_harmonics, wire_start
-from udccal.fitting.wire.prior import rig_prior
-from udccal.fitting.wire.scan import ideal_wire, with_harmonics
-from udccal.fitting.wire.slopes import SHAPE_PARAMETERS
+from udccal.fitting.wire.data import Pixels, odd_step, sample_pixels
+from udccal.fitting.wire.jacobian import block_jacobian, with_harmonics
+from udccal.fitting.wire.parameters import (
+    Parameters,
+    WireRules,
+    ideal_wire,
+    parameters_of,
+    possible_harmonics,
+    wire_start,
+)
 from udccal.models.wire import Wire
 from udccal.numerics import in_float64
 from udccal.planning.algebra import covariance
@@ -40,15 +44,14 @@ class WirePredictor:
     def __init__(self, state: RigState) -> None:
         self._state = state
         camera = state.rig.camera
-        shape = (camera.rows, camera.columns)
-        size = camera.rows * camera.columns
-        pixels = sample_pixels(np.ones(shape), np.ones(shape), state.geometry, _odd_step(size, _PIXELS))
-        wire, basis = _as_expected(state, pixels)
-        self._precision = rig_prior(wire_start(state.rig)).precision(basis, shape=True)
-        self._value, self._design, self._places = _columns(wire, pixels, basis)
+        size, rules = camera.rows * camera.columns, WireRules()
+        pixels = sample_pixels(np.ones((camera.rows, camera.columns)), state.geometry, _PIXELS)
+        wire, parameters = _as_expected(state, pixels)
+        self._precision = parameters.prior(wire_start(state.rig), rules).precision
+        self._value, self._design, self._places = _columns(wire, pixels, parameters)
         used = pixels.place >= 0
         # The fit spends so many pixels for each of these.
-        self._each = size / _odd_step(size, FIELD_SAMPLES) / used.sum()
+        self._each = size / odd_step(size, rules.samples) / used.sum()
         y, x = np.divmod(np.maximum(pixels.place, 0), camera.columns)
         field = EvenField(state)
         self._signal_e = np.where(used, state.full_well_e * field.signal(np.stack([x, y], axis=1).astype(float)), 0.0)
@@ -97,39 +100,33 @@ class WirePredictor:
         """``relative`` is the variance of each pixel, which stands for ``each`` of them, over its signal squared."""
         left_out = self._state.unexplained.wire if model is None else model
         weight = np.where(self._used, each / np.maximum(relative * self._value**2, 1e-12), 0.0)
-        information = (self._design * weight) @ self._design.T + np.diag(self._precision)
+        information = (self._design * weight) @ self._design.T + self._precision
         cov = covariance(information)
         of_noise = np.mean(np.einsum("in,ij,jn->n", self._places, cov, self._places))
         return 100.0 * float(np.sqrt(of_noise + left_out**2))
 
 
-def _odd_step(size: int, samples: int) -> int:
-    step = max(1, size // samples)
-    return step + 1 - step % 2
-
-
-def _as_expected(state: RigState, pixels: Pixels) -> tuple[Wire, Basis]:
-    """The wire as measured or as built, with the columns that a fit of it is expected to keep."""
+def _as_expected(state: RigState, pixels: Pixels) -> tuple[Wire, Parameters]:
+    """The wire as measured or as built, with the parameters that a fit of it is expected to keep."""
     start = wire_start(state.rig)
-    harmonics, sizes = possible_harmonics(start)
-    harmonics, sizes = harmonics[:_HARMONICS], sizes[:_HARMONICS]
-    built = with_harmonics(ideal_wire(state.geometry, start, harmonics), harmonics, pixels)
-    basis = full_basis(sizes, plain_basis())
+    possible = possible_harmonics(start)
+    harmonics, bounds = possible.orders[:_HARMONICS], possible.bounds[:_HARMONICS]
+    built = with_harmonics(ideal_wire(state.geometry, start, harmonics), harmonics, pixels.ideal)
+    parameters = parameters_of(built, WireRules(), bounds)
     if state.wire is None or not len(np.asarray(state.wire.harmonics)):
-        return built, basis.kept(basis.groups < 0)
+        return built, parameters.kept(parameters.groups < 0)
     # What a profile's wire has of shading and of departures from a round pupil is what the data asked for.
-    return built, basis.kept((basis.groups < 0) | _present(state.wire, basis))
+    return built, parameters.kept((parameters.groups < 0) | _present(state.wire, parameters))
 
 
-def _present(wire: Wire, basis: Basis) -> Bool[np.ndarray, " all"]:
+def _present(wire: Wire, parameters: Parameters) -> Bool[np.ndarray, " n"]:
     baseline, fields = np.asarray(wire.baseline), np.asarray(wire.fields)
-    smooth = np.array([_at(baseline, tuple(pair)) != 0 for pair in basis.baseline], dtype=bool)
-    linear = []
-    for column in basis.fields:
+    present = parameters.groups < 0
+    present[: len(parameters.baseline)] |= [_at(baseline, tuple(pair)) != 0 for pair in parameters.baseline]
+    for number, column in enumerate(parameters.fields, parameters.linear - len(parameters.fields)):
         neutral = 1.0 if not column[1:].any() else 0.0
-        linear.append(_at(fields, tuple(column), neutral) != neutral)
-    sites = np.ones(SITES - 1, dtype=bool)
-    return np.concatenate([smooth, sites, np.zeros(len(basis.amplitudes), bool), np.array(linear, dtype=bool)])
+        present[number] |= _at(fields, tuple(column), neutral) != neutral
+    return present
 
 
 def _at(values: np.ndarray, place: tuple[int, ...], otherwise: float = 0.0) -> float:
@@ -138,17 +135,16 @@ def _at(values: np.ndarray, place: tuple[int, ...], otherwise: float = 0.0) -> f
 
 
 def _columns(
-    wire: Wire, pixels: Pixels, basis: Basis
+    wire: Wire, pixels: Pixels, parameters: Parameters
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "columns n"], Float[np.ndarray, "columns n"]]:
     """The map at pixels, its slopes by what is fitted, and those of the map once scaled to a mean of 1."""
-    parts = [model_columns(wire, part, basis, shape=True) for part in pixels.blocks()]
+    parts = [block_jacobian(parameters, wire, part.ideal, part.scaled, part.site) for part in pixels.blocks()]
     whole, base, design = (np.concatenate(same, axis=-1) for same in zip(*parts, strict=True))
     # Scaled to a mean of 1.
     used = pixels.place >= 0
     mean = float((whole * base)[used].mean())
     value, design = whole * base / mean, design * base / mean
     places = design[:, used].copy()
-    places[basis.gains_at : basis.gains_at + SITES - 1] = 0.0
+    places[parameters.sites] = 0.0
     places -= (value[used][None, :]) * places.mean(axis=1, keepdims=True)
-    assert len(design) == basis.size + SHAPE_PARAMETERS
     return value, design, places
