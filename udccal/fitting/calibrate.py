@@ -17,7 +17,9 @@ from udccal.fitting.backscatter.fit import fit_backscatter
 from udccal.fitting.geometry.fit import BoardView, fit_views, read_views, rig_prior
 from udccal.fitting.noise.fit import fit_noise, nominal_noise
 from udccal.fitting.nominal import nominal_geometry
-from udccal.fitting.psf.fit import Effort, fit_psf
+from udccal.fitting.psf.data import read_psf
+from udccal.fitting.psf.fit import fit_psf
+from udccal.fitting.psf.start import PsfRules
 from udccal.fitting.wire.fit import FIELD_SAMPLES, fit_wire_session, sensor_map
 from udccal.fitting.wire.sigma import MapSigma
 from udccal.models.backscatter import Backscatter
@@ -40,13 +42,13 @@ class FitEffort:
 
     Attributes:
         wire_samples: pixels that the wire's fields are fitted to.
-        psf: see ``udccal.fitting.psf.fit.Effort``.
+        psf: see ``udccal.fitting.psf.start.PsfRules``.
         backscatter_positions: sensor positions that the footprint is fitted at.
         workers: with 2, psf and backscatter, which do not need each other, are fitted at once, in more memory.
     """
 
     wire_samples: int = FIELD_SAMPLES
-    psf: Effort = field(default_factory=Effort)
+    psf: PsfRules = field(default_factory=PsfRules)
     backscatter_positions: int = 96
     workers: int = 1
 
@@ -54,7 +56,7 @@ class FitEffort:
 # For a demonstration.
 QUICK = FitEffort(
     wire_samples=60_000,
-    psf=Effort(positions=5, shifts=2, half_px=(36, 12), close_px=(32, 12), iterations=30),
+    psf=PsfRules(positions=5, shifts=2, half_px=(36, 12), close_px=(32, 12), iterations=30),
     backscatter_positions=32,
     workers=2,
 )
@@ -189,7 +191,9 @@ def fit_session(
         psf = pool.submit(
             clock.run,
             "psf",
-            lambda: fit_psf(session, noise, geometry, base.wire.term, effort.psf),
+            lambda: fit_psf(
+                read_psf(session, noise, base.wire.term, effort.psf), rig, geometry, base.wire.term, effort.psf
+            ),
             lambda: absent_psf(rig, geometry),
         )
         backscatter = pool.submit(
