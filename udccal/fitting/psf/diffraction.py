@@ -18,8 +18,8 @@ from udccal.fitting.engine.misfit import clustered_cov
 from udccal.fitting.engine.orders import Attempt, Choice, bic, choose
 from udccal.fitting.psf.data import Shots
 from udccal.fitting.psf.kernel import FOOTPRINT, Evaluator, fit_lattice
-from udccal.fitting.psf.problem import MAX_STEP_PX, DiffractionProblem, Place
-from udccal.fitting.psf.samples import OWN, Block, blocks, choose_samples, own_equations, start_own, unit_light
+from udccal.fitting.psf.problem import DiffractionProblem, Place
+from udccal.fitting.psf.samples import Block, blocks, choose_samples, start_own
 from udccal.fitting.psf.start import PsfRules
 from udccal.fitting.psf.weights import (
     estimate_model_error,
@@ -34,7 +34,6 @@ from udccal.models.diffraction import Diffraction
 from udccal.models.geometry import Geometry
 from udccal.result import Outliers
 
-_OWN_ROUNDS: Final = 3
 # Converged near the minimum: by the part of the cost that a step would gain. Then by what it would gain in units of the
 # reduced chi-squared: in rounds after which the weights hardly change anything, and in the others.
 _ROUGHLY, _FULLY, _NEARLY = 1e-3, 1e-2, 1.0
@@ -281,32 +280,3 @@ def kernel_sigma(fit: DiffractionFit, cov: Float[np.ndarray, "p p"]) -> float:
     (light,) = one.light_at(there)
     (sums,) = replace(one, blocks=(replace(one.blocks[0], rate=light),)).by_position(there)
     return float(np.sqrt(max(float((sums.shared * cov).sum()), 0.0) / float((even.sum(axis=-1) * light**2).sum())))
-
-
-def explain(
-    shots: Shots, geometry: Geometry, fit: DiffractionFit, rules: PsfRules
-) -> tuple[Float[np.ndarray, "shots l"], Float[np.ndarray, "shots rows columns"]]:
-    """Own parameters of all shots under the fitted model, with places on the sensor, and its light per unit."""
-    evaluator = Evaluator(
-        fit.problem.evaluator.wavelengths_nm, fit_lattice(shots.half), fit.problem.evaluator.interference
-    )
-    every = blocks(shots, geometry, np.ones(shots.rate.shape, dtype=bool))
-    found, explained = np.zeros((shots.count, OWN)), np.zeros(shots.rate.shape)
-    allowed = max(fit.model_error, rules.first_model_error)
-    for block in every:
-        problem = DiffractionProblem((first_weights(block, allowed),), evaluator, fit.problem.prior)
-        (weighed,) = problem.with_overlaps(fit.theta).blocks
-        coefficients = problem.coefficients(fit.theta, weighed)
-        own = start_own(evaluator, weighed, coefficients)
-        for _ in range(_OWN_ROUNDS):
-            matrix, right = (np.asarray(part) for part in own_equations(evaluator, weighed, own, coefficients))
-            step = np.einsum("slm,sm->sl", scaled_inverse(matrix, 1e-14), right)
-            own = np.concatenate(
-                [own[:, :2] + np.clip(step[:, :2], -MAX_STEP_PX, MAX_STEP_PX), own[:, 2:] + step[:, 2:]], 1
-            )
-        unit = np.asarray(unit_light(evaluator, block, own[:, :2], coefficients))
-        real = np.asarray(block.index) >= 0
-        index = np.asarray(block.index)[real]
-        found[index], explained[index] = own[real], unit[real].reshape(-1, *shots.rate.shape[1:])
-    found[:, :2] += shots.centre_px
-    return found, explained

@@ -14,10 +14,11 @@ import numpy as np
 from jaxtyping import Bool
 
 from udccal.fitting.psf.data import PsfData, Shots, held_out_positions
-from udccal.fitting.psf.diffraction import explain, fit_diffraction
+from udccal.fitting.psf.diffraction import fit_diffraction
 from udccal.fitting.psf.held_out import Support, choose_support, compare
 from udccal.fitting.psf.image import Sources, about_middle, make_windows, predict
 from udccal.fitting.psf.orders import select_field
+from udccal.fitting.psf.problem import explain
 from udccal.fitting.psf.report import Evidence, as_numpy, report, with_support
 from udccal.fitting.psf.start import PsfRules, pitch_tolerance, start_model, start_prior, wire_shows
 from udccal.kernels import kernel_size, kernels_at
@@ -64,7 +65,8 @@ def fit_psf(
     chosen = shots.pick(some_shots(shots, rules))
     chosen = replace(chosen, position=np.unique(chosen.position, return_inverse=True)[1].reshape(-1))
     fit = fit_diffraction(chosen, geometry, start, start_prior(rig, start, seen, rules), rules, seen)
-    own, explained = explain(shots, geometry, fit, rules)
+    allowed = max(fit.model_error, rules.first_model_error)
+    own, explained = explain(fit.problem, fit.theta, shots, geometry, allowed)
     sources = Sources(own[:, :2], own[:, 2:5], own[:, 5]).with_light_of_peak(shots, explained)
     size = np.array([rig.camera.columns - 1, rig.camera.rows - 1]) / 2.0
     unit = (shots.positions_px() - size) / size

@@ -12,13 +12,12 @@ from jaxtyping import Bool, Float
 
 from udccal.fitting.engine.orders import Attempt, Choice, choose, held_out_beats, rising
 from udccal.fitting.psf.data import Shots, held_out_positions
+from udccal.fitting.psf.free import FREE_PER_PX, free_sources
 from udccal.fitting.psf.held_out import Compared, KernelError, Support, choose_support, compare, kernel_error
 from udccal.fitting.psf.image import (
-    FREE_PER_PX,
     Sources,
     Windows,
     about_middle,
-    free_sources,
     image_of,
     make_windows,
     prior_sigma,

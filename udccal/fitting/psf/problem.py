@@ -13,12 +13,26 @@ import numpy as np
 from jaxtyping import Float
 from scipy.special import softmax
 
-from udccal.fitting.engine.gaussian import Prior
+from udccal.fitting.engine.gaussian import Prior, scaled_inverse
 from udccal.fitting.engine.least_squares import Blocks, Step
-from udccal.fitting.psf.kernel import FOOTPRINT, HEAD, Evaluator, kernel_coefficients, overlaps_of
-from udccal.fitting.psf.samples import IN_OVERLAPS, OWN, Block, corrected, normal_equations, unit_light
+from udccal.fitting.psf.data import Shots
+from udccal.fitting.psf.kernel import FOOTPRINT, HEAD, Evaluator, fit_lattice, kernel_coefficients, overlaps_of
+from udccal.fitting.psf.samples import (
+    IN_OVERLAPS,
+    OWN,
+    Block,
+    blocks,
+    corrected,
+    normal_equations,
+    own_equations,
+    start_own,
+    unit_light,
+)
+from udccal.fitting.psf.weights import first_weights
+from udccal.models.geometry import Geometry
 
-MAX_STEP_PX: Final = 0.5
+_MAX_STEP_PX: Final = 0.5
+_OWN_ROUNDS: Final = 3
 # Overlaps are in single precision: by such steps of the pitch and the pupil, their difference is not. Over steps ten
 # times as long derivatives bend by some percent.
 _OVERLAP_STEPS_MM: Final = np.array([0.0002, 0.001])
@@ -70,10 +84,8 @@ class DiffractionProblem:
         return whole.with_prior(self.prior, place.theta)
 
     def moved(self, place: Place, step: Step) -> Place:
-        """Places of LEDs move by no more than half a pixel in a step."""
-        own = step.own.reshape(place.own.shape).copy()
-        own[..., :2] = np.clip(own[..., :2], -MAX_STEP_PX, MAX_STEP_PX)
-        return Place(stepped(place.theta, step.shared), place.own + own)
+        """The place after a step."""
+        return Place(stepped(place.theta, step.shared), _moved(place.own, step.own.reshape(place.own.shape)))
 
     def coefficients(self, theta: Float[np.ndarray, " p"], block: Block) -> np.ndarray:
         """Of the kernel at a block's place."""
@@ -147,3 +159,41 @@ def stepped(theta: Float[np.ndarray, " p"], step: Float[np.ndarray, " p"]) -> Fl
     grown = logs - mean
     grown = np.where(grown > 0, np.log1p(np.maximum(grown, 0.0)), grown)
     return theta + np.concatenate([step[:HEAD], (mean + grown).ravel()])
+
+
+def explain(
+    problem: DiffractionProblem, theta: Float[np.ndarray, " p"], shots: Shots, geometry: Geometry, model_error: float
+) -> tuple[Float[np.ndarray, "shots l"], Float[np.ndarray, "shots rows columns"]]:
+    """What diffraction brings to whole crops.
+
+    Args:
+        problem: fitted. theta: its solution.
+        shots: all there are.
+        geometry: where pixels look.
+        model_error: allowed for beside noise.
+
+    Returns:
+        (own parameters of all shots, with (x, y) on the sensor; light per unit of every sample).
+    """
+    evaluator = replace(problem.evaluator, lattice=fit_lattice(shots.half))
+    found, explained = np.zeros((shots.count, OWN)), np.zeros(shots.rate.shape)
+    for block in blocks(shots, geometry, np.ones(shots.rate.shape, dtype=bool)):
+        alone = replace(problem, blocks=(first_weights(block, model_error),), evaluator=evaluator).with_overlaps(theta)
+        (block,), coefficients = alone.blocks, alone.coefficients(theta, alone.blocks[0])
+        own = start_own(evaluator, block, coefficients)
+        for _ in range(_OWN_ROUNDS):
+            matrix, right = (np.asarray(part) for part in own_equations(evaluator, block, own, coefficients))
+            own = _moved(own, np.einsum("slm,sm->sl", scaled_inverse(matrix, 1e-14), right))
+        unit = np.asarray(unit_light(evaluator, block, own[:, :2], coefficients))
+        index = np.asarray(block.index)
+        real = index >= 0
+        found[index[real]], explained[index[real]] = own[real], unit[real].reshape(-1, *shots.rate.shape[1:])
+    found[:, :2] += shots.centre_px
+    return found, explained
+
+
+def _moved(own: Float[np.ndarray, "*k l"], step: Float[np.ndarray, "*k l"]) -> Float[np.ndarray, "*k l"]:
+    """Places of LEDs move by no more than half a pixel in a step."""
+    bounded = step.copy()
+    bounded[..., :2] = np.clip(bounded[..., :2], -_MAX_STEP_PX, _MAX_STEP_PX)
+    return own + bounded
