@@ -189,8 +189,11 @@ def test_aims_fall_into_groups() -> None:
     np.testing.assert_array_equal(group(aims), [0, 0, 1, 0])
 
 
-def session_of(folder: Path, level_DN: int, places: int = 6) -> Session:
-    """Brackets whose LED is a square of ``level_DN`` at the shortest exposure, clipped beyond 12 bit."""
+def session_of(folder: Path, level_DN: int, places: int = 6, hot: tuple[int, int] | None = None) -> Session:
+    """Brackets whose LED is a square of ``level_DN`` at the shortest exposure, clipped beyond 12 bit.
+
+    ``hot`` is the (row, column) of a pixel that is full in all pictures.
+    """
     rig = load_rig("lg55-reduced")
     writer = SessionWriter.create(folder, rig, CameraIdentity("maker", "model", "1", "test"))
     rng = np.random.default_rng(0)
@@ -200,6 +203,8 @@ def session_of(folder: Path, level_DN: int, places: int = 6) -> Session:
         for exposure in (1e-4, 4e-4):
             data = 64.0 + rng.normal(0, 2, (64, 48))
             data[30:34, 22:26] += level_DN * exposure / 1e-4
+            if hot:
+                data[hot] = 4095
             settings = Settings(exposure, 0.0, region)
             frame = Frame(np.clip(data.round(), 0, 4095).astype(np.uint16), settings, 0.0, 0, True)
             frames.append(SingleFrame(frame))
@@ -221,6 +226,14 @@ def test_bad_captures_are_said_to_be_bad(tmp_path: Path, level_DN: int, places: 
     assert result.notes
     assert not result.ok
     assert window_half(session, (48, 16)) == (28, 16)
+
+
+@pytest.mark.parametrize(("hot", "clipped"), [((2, 2), 0), ((30, 30), 3)])
+def test_a_hot_pixel_costs_a_picture_only_next_to_its_led(tmp_path: Path, hot: tuple[int, int], clipped: int) -> None:
+    session = session_of(tmp_path / "session", 2000, 3, hot)
+    wire = absent_wire(session.rig, nominal_geometry(session.rig))
+    data = read_psf(session, nominal_noise(session.rig), wire)
+    assert (data.taken, data.dark, data.clipped) == (3, 0, clipped)
 
 
 def test_where_no_wire_shows_the_rig_says_where_to_start() -> None:

@@ -18,9 +18,9 @@ from udccal.fitting.psf.start import PsfRules
 from udccal.fitting.psf.weights import (
     estimate_model_error,
     left_out,
-    model_weights,
     pattern_test,
     sensor_variance,
+    weighed,
     without_outliers,
 )
 from udccal.models.diffraction import LocalFrame
@@ -103,8 +103,7 @@ def test_variance_follows_the_expected_light_not_the_noisy_one() -> None:
     rate = np.array([[90.0, 110.0]])
     block = block_of(rate, (rate + 4.0) / 2.0, noise_per_rate=0.5)
     np.testing.assert_allclose(sensor_variance(block, np.full((1, 2), 100.0)), 52.0)
-    weighed = model_weights(block, np.full((1, 2), 100.0), np.zeros(1), 0.0)
-    np.testing.assert_allclose(weighed.weight, 1 / 52.0)
+    np.testing.assert_allclose(weighed(block, 0.0, np.full((1, 2), 100.0)).weight, 1 / 52.0)
 
 
 def test_the_slope_of_the_variance_is_that_of_the_exposure() -> None:

@@ -240,10 +240,11 @@ def _read_shot(
     frames = np.stack([session.frame(c)[down, across] for c in captures])
     exposures_s = np.array([c.exposure_s for c in captures])
     merged = merge_bracket(frames, exposures_s, noise)
-    shortest = frames[int(np.argmin(exposures_s))]
-    if (merged.used == 0).any() and (shortest >= _FULL * float(noise.saturation_DN)).any():
-        return None, True
     corner, aim = (region.x + across.start, region.y + down.start), (subject.x_px, subject.y_px)
+    clipped = (merged.used == 0) & (frames[int(np.argmin(exposures_s))] >= _FULL * float(noise.saturation_DN))
+    # A hot pixel elsewhere is not the LED's.
+    if clipped[tuple(_part(aim[i] - corner[i], _SEARCH_PX, clipped.shape[1 - i]) for i in (1, 0))].any():
+        return None, True
     # The pupil is a few mm behind the panel: less than a percent of any useful distance.
     away_mm = subject.distance_mm + session.rig.mounting.standoff_mm.value
     disc_px = subject.diameter_mm / away_mm * session.rig.focal_px

@@ -23,11 +23,10 @@ from udccal.fitting.psf.samples import Block, blocks, choose_samples, start_own
 from udccal.fitting.psf.start import PsfRules
 from udccal.fitting.psf.weights import (
     estimate_model_error,
-    first_weights,
     left_out,
-    model_weights,
     pattern_test,
     sensor_variance,
+    weighed,
     without_outliers,
 )
 from udccal.models.diffraction import Diffraction
@@ -143,7 +142,7 @@ def fit_diffraction(
 
 def _approach(problem: DiffractionProblem, rules: PsfRules) -> Solution[Place, Blocks]:
     """From the prior's mean to about the minimum, with weights that the data give."""
-    problem = replace(problem, blocks=tuple(first_weights(b, rules.first_model_error) for b in problem.blocks))
+    problem = replace(problem, blocks=tuple(weighed(b, rules.first_model_error) for b in problem.blocks))
     theta = problem.prior.mean
     own = [start_own(problem.evaluator, block, problem.coefficients(theta, block)) for block in problem.blocks]
     return minimise(problem, Place(theta.copy(), np.stack(own)), _solver(_ROUGHLY * problem.samples, rules.iterations))
@@ -188,11 +187,9 @@ def _reweighed(
         parts.append([one[seen] for one in of_sample])
     residual, variance, share = (np.concatenate(column) for column in zip(*parts, strict=True))
     model_error = estimate_model_error(residual, variance, share, problem.unknowns)
-    weighed = [
-        model_weights(block, light, own[:, 5], model_error)
-        for block, own, light in zip(problem.blocks, place.own, lights, strict=True)
-    ]
-    kept, found = without_outliers(weighed, replace(problem, blocks=tuple(weighed)).errors(place, lights), rules)
+    triples = zip(problem.blocks, lights, place.own, strict=True)
+    problem = replace(problem, blocks=tuple(weighed(b, model_error, light, own[:, 5]) for b, light, own in triples))
+    kept, found = without_outliers(problem.blocks, problem.errors(place, lights), rules)
     return replace(problem, blocks=kept), model_error, found
 
 

@@ -84,8 +84,8 @@ def fit_psf(
     # An image that carries the kernel ends with the crops.
     if term.diffraction_share and data.shots.half != shots.half:
         held_out = np.flatnonzero(held_out_positions(shots.positions))
-        chosen = np.concatenate([np.flatnonzero(shots.position == p)[:_WIDE_PICTURES] for p in held_out])
-        support = wide_support(data.shots.pick(chosen), selection.sources.pick(chosen), term, rig)
+        looked_at = np.concatenate([np.flatnonzero(shots.position == p)[:_WIDE_PICTURES] for p in held_out])
+        support = wide_support(data.shots.pick(looked_at), selection.sources.pick(looked_at), term, rig)
     known = Evidence(shots, data, rig, fit, selection, support, pitch_tolerance(rig))
     return report(known, with_support(term, support, rig), rules)
 
@@ -150,6 +150,6 @@ def wide_support(wide: Shots, sources: Sources, term: PsfField, rig: RigDescript
     windows = make_windows(wide, sources, np.zeros_like(wide.rate), at_position, 0.0)
     light = np.asarray(predict(windows, kernels))
     windows = make_windows(wide, sources.with_light_of_peak(wide, light), light, at_position, 0.0)
-    found = compare(windows, light * np.asarray(windows.flux), np.arange(wide.count))
+    found = compare(wide, windows, light * np.asarray(windows.flux), np.arange(wide.count))
     core = (np.abs(wide.offsets()) <= _CORE_PX).all(axis=-1)
     return choose_support(replace(found, known=found.known & ~core))

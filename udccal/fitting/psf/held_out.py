@@ -18,6 +18,7 @@ import scipy.optimize
 from jaxtyping import Bool, Float, Int
 
 from udccal.fitting.engine.orders import Attempt, Choice, bic, choose
+from udccal.fitting.psf.data import Shots
 from udccal.fitting.psf.image import Sources, Windows
 from udccal.fitting.psf.weights import HUBER, estimate_model_error, noise_at
 from udccal.result import Candidate
@@ -80,11 +81,15 @@ class Compared:
         return np.array([by_shot[position == place].mean() for place in places]) if len(places) > 1 else by_shot
 
 
-def compare(windows: Windows, light: Float[np.ndarray, "shots rows columns"], pick: np.ndarray) -> Compared:
+def compare(
+    shots: Shots, windows: Windows, light: Float[np.ndarray, "shots rows columns"], pick: np.ndarray
+) -> Compared:
     """The data of the shots picked, and the ``light`` (e-/s) that is expected of all."""
-    parts = (windows.rate, windows.variance, windows.noise_per_rate, windows.left_out, windows.weight, light)
-    rate, measured, slope, one, weight, light = (np.asarray(part)[pick] for part in parts)
-    variance, known = noise_at(light, rate, measured, slope), weight > 0
+    parts = (windows.rate, shots.weight, shots.noise_per_rate, windows.left_out, light)
+    rate, weight, slope, one, light = (np.asarray(part)[pick] for part in parts)
+    known = weight > 0
+    measured = 1.0 / np.where(known, weight, 1.0)
+    variance = noise_at(light, rate, measured, slope)
     # What is left out is the same for all orders, and not nothing where one of them expects no light.
     model_error = estimate_model_error((rate - light)[known], variance[known], one[known], 0)
     return Compared(rate - light, light, measured, variance, one, known, model_error)

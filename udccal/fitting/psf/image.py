@@ -66,7 +66,6 @@ class Windows(eqx.Module):
         colour: one-hot.
         explained: per unit of light, what diffraction brings to each sample.
         rate: e-/s without background.
-        variance: of the rate as it was measured, 1 where nothing is known; it grows with the light by noise_per_rate.
         left_out: what a model error of 1 would add to the rate's standard deviation; see ``psf.weights``.
         weight: inverse variance of the rate that solutions go by, 0 where nothing is known.
     """
@@ -78,8 +77,6 @@ class Windows(eqx.Module):
     colour: Float[Arrayish, "shots rows columns 3"]
     explained: Float[Arrayish, "shots rows columns"]
     rate: Float[Arrayish, "shots rows columns"]
-    variance: Float[Arrayish, "shots rows columns"]
-    noise_per_rate: Float[Arrayish, "shots rows columns"]
     left_out: Float[Arrayish, "shots rows columns"]
     weight: Float[Arrayish, "shots rows columns"]
 
@@ -128,8 +125,6 @@ def make_windows(
         colour=colour,
         explained=explained,
         rate=rate * known,
-        variance=measured,
-        noise_per_rate=shots.noise_per_rate,
         left_out=unexplained,
         weight=np.where(known, 1.0 / variance, 0.0),
     )

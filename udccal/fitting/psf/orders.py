@@ -124,7 +124,8 @@ class _Orders:
     def attempt(self, sources: Sources, order: Order) -> Attempt[Trial]:
         """Solve from all shots but those held out, and compare with these."""
         windows = self._windows(sources, order)
-        found = compare(windows, windows.expected(order.share, self._solve(windows.only(~self.test), order)), self.test)
+        image = self._solve(windows.only(~self.test), order)
+        found = compare(self.shots, windows, windows.expected(order.share, image), self.test)
         loss = found.loss(self.shots.position[self.test])
         trial = Trial(order, sources, found, loss)
         return Attempt(order.name, order.coefficients(self.shots.half), float(loss.mean()), trial)

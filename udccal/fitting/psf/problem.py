@@ -28,7 +28,7 @@ from udccal.fitting.psf.samples import (
     start_own,
     unit_light,
 )
-from udccal.fitting.psf.weights import first_weights
+from udccal.fitting.psf.weights import weighed
 from udccal.models.geometry import Geometry
 
 _MAX_STEP_PX: Final = 0.5
@@ -178,7 +178,7 @@ def explain(
     evaluator = replace(problem.evaluator, lattice=fit_lattice(shots.half))
     found, explained = np.zeros((shots.count, OWN)), np.zeros(shots.rate.shape)
     for block in blocks(shots, geometry, np.ones(shots.rate.shape, dtype=bool)):
-        alone = replace(problem, blocks=(first_weights(block, model_error),), evaluator=evaluator).with_overlaps(theta)
+        alone = replace(problem, blocks=(weighed(block, model_error),), evaluator=evaluator).with_overlaps(theta)
         (block,), coefficients = alone.blocks, alone.coefficients(theta, alone.blocks[0])
         own = start_own(evaluator, block, coefficients)
         for _ in range(_OWN_ROUNDS):

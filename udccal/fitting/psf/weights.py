@@ -55,19 +55,17 @@ def sensor_variance(block: Block, level: Float[np.ndarray, "shots n"]) -> Float[
     return noise_at(level, rate, measured, np.asarray(block.noise_per_rate) * (known > 0))
 
 
-def first_weights(block: Block, model_error: float) -> Block:
-    """Weights before there is a model: the data stand for it."""
-    rate, known = np.asarray(block.rate), np.asarray(block.known)
-    variance = 1.0 / np.where(known > 0, known, 1.0) + left_out(rate * (known > 0), model_error) ** 2
-    return replace(block, weight=np.where(known > 0, 1.0 / variance, 0.0))
-
-
-def model_weights(
-    block: Block, light: Float[np.ndarray, "shots n"], background: Float[np.ndarray, " shots"], model_error: float
+def weighed(
+    block: Block, model_error: float, light: np.ndarray | None = None, background: np.ndarray | None = None
 ) -> Block:
-    """Weights at the light that the model expects, without background."""
+    """The block with weights at the ``light`` (shots n) and ``background`` (shots) that a model expects, in e-/s.
+
+    Before there is a model the data stand for it.
+    """
     seen = np.asarray(block.known) > 0
-    variance = sensor_variance(block, light + background[:, None]) + left_out(light * seen, model_error) ** 2
+    light = np.asarray(block.rate) if light is None else light
+    level = light if background is None else light + background[:, None]
+    variance = sensor_variance(block, level) + left_out(light * seen, model_error) ** 2
     return replace(block, weight=np.where(seen, 1.0 / variance, 0.0))
 
 
