@@ -13,7 +13,7 @@ from udccal.fitting.engine.gaussian import Posterior, square_root
 from udccal.fitting.engine.report import estimates, residual_sample
 from udccal.fitting.psf.data import PsfData, Shots
 from udccal.fitting.psf.diffraction import DiffractionFit, efficiency, kernel_sigma
-from udccal.fitting.psf.held_out import Support
+from udccal.fitting.psf.held_out import KernelError, Support
 from udccal.fitting.psf.kernel import BLUR
 from udccal.fitting.psf.orders import Selection
 from udccal.fitting.psf.start import PsfRules
@@ -132,11 +132,13 @@ def _posterior(known: Evidence, term: PsfField, whole: Float[np.ndarray, "p p"])
         factor[:count, :count] = square_root(whole)
         factor[count, count] = known.pitch_tolerance
     factor[count + 1 :, count + 1 :] = np.eye(patterns) / np.sqrt(max(patterns, 1))
-    size_and_signs = cache(lambda: _error_patterns(known, term, patterns))
+    # No more is held than is needed: a result lives long, and what was fitted is large.
+    evaluator, rig = fit.problem.evaluator, known.rig
+    size_and_signs = cache(lambda: _error_patterns(term, error, rig, patterns))
 
     def term_at(x: Float[np.ndarray, " n"]) -> PsfField:
         longer = 1.0 + x[count]
-        model = as_numpy(fit.problem.evaluator.model(x[:count]))
+        model = as_numpy(evaluator.model(x[:count]))
         scaled = {name: getattr(model, name) * longer for name in ("pitch_mm", "thickness_mm", "pupil_mm")}
         model = replace(model, wavelengths_nm=model.wavelengths_nm * longer, **scaled)
         if not patterns:
@@ -146,20 +148,20 @@ def _posterior(known: Evidence, term: PsfField, whole: Float[np.ndarray, "p p"])
         terms, _, rows, columns = term.residual.shape
         down, across = ((n - m) // 2 for n, m in zip(residual.shape[2:], (rows, columns), strict=True))
         residual[:terms, :, down : down + rows, across : across + columns] += term.residual
-        return replace(term, diffraction=model, residual=residual, degree=_DEGREE)
+        return replace(term, diffraction=model, residual=residual, degree=max(_DEGREE, term.degree))
 
     return Posterior(np.concatenate([fit.theta, np.zeros(1 + patterns)]), factor, term_at)
 
 
 def _error_patterns(
-    known: Evidence, term: PsfField, patterns: int
+    term: PsfField, error: KernelError, rig: RigDescription, patterns: int
 ) -> tuple[Float[np.ndarray, "terms 3 rows columns"], Float[np.ndarray, "patterns 3 rows columns"]]:
     """Size of the kernel's error as a residual whose pixels are polynomials of the position, and signs."""
     along = np.stack(np.meshgrid(*2 * (np.linspace(-0.9, 0.9, _PLACES),)), axis=-1).reshape(-1, 2)
     places = np.asarray(term.centre_px) + along * np.asarray(term.half_px)
-    rows, columns = (max(pair) for pair in zip(kernel_size(known.rig), term.residual.shape[2:], strict=True))
-    sizes = known.selection.error.of_kernels(kernels_at(term, places, rows, columns).astype(np.float64))
-    basis = np.asarray(polynomial_basis(along, _DEGREE), dtype=np.float64)
+    rows, columns = (max(pair) for pair in zip(kernel_size(rig), term.residual.shape[2:], strict=True))
+    sizes = error.of_kernels(kernels_at(term, places, rows, columns).astype(np.float64))
+    basis = np.asarray(polynomial_basis(along, max(_DEGREE, term.degree)), dtype=np.float64)
     signs = np.random.default_rng(0).choice([-1.0, 1.0], (patterns, *sizes.shape[1:]))
     return np.tensordot(np.linalg.pinv(basis), sizes, axes=1), signs
 
