@@ -11,11 +11,11 @@ from jaxtyping import Float
 
 from udccal.calibration import FitEffort
 from udccal.cfa import channel_map
-from udccal.fitting.psf.blocks import Block, Local, blocks, fit_lattice
-from udccal.fitting.psf.descent import Prior
-from udccal.fitting.psf.normal import Evaluator, kernel_coefficients, overlaps_of, unit_light
-from udccal.fitting.psf.samples import choose_samples
-from udccal.fitting.psf.shots import Shots
+from udccal.fitting.engine.gaussian import Prior
+from udccal.fitting.psf.data import Shots
+from udccal.fitting.psf.kernel import Evaluator, fit_lattice
+from udccal.fitting.psf.problem import DiffractionProblem
+from udccal.fitting.psf.samples import Block, blocks, choose_samples, unit_light
 from udccal.planning.light import sample_variance_e
 from udccal.planning.state import WHITE, RigState
 from udccal.planning.steps import PlannedStep
@@ -33,21 +33,21 @@ _SHIFTS_PX = np.array([[0.4, 1.3], [1.7, 0.2]])
 class ExpectedShots:
     """Blocks of shots with their light (``rate``, 1 for the brightest sample of each), and the model that they are of.
 
-    ``share`` is how many samples of the window each of those chosen stands for; the first ``in_field`` blocks are at
-    places of the field, the others where the procedure captures.
+    ``own`` are the shots' own parameters, see ``psf.samples``. ``share`` is how many samples of the window each of
+    those chosen stands for. The first ``in_field`` blocks are at places of the field, the others where the procedure
+    captures.
     """
 
     evaluator: Evaluator
     theta: Float[np.ndarray, " p"]
     blocks: tuple[Block, ...]
-    locals: tuple[Local, ...]
-    overlaps: tuple[np.ndarray, ...]
+    own: tuple[Float[np.ndarray, "shots l"], ...]
     share: Float[np.ndarray, "shots n"]
     in_field: int = len(_FIELD)
 
-    def parts(self) -> Iterator[tuple[Block, Local, np.ndarray]]:
+    def parts(self) -> Iterator[tuple[Block, Float[np.ndarray, "shots l"]]]:
         """Place by place."""
-        return zip(self.blocks, self.locals, self.overlaps, strict=True)
+        return zip(self.blocks, self.own, strict=True)
 
     def relative_weight(self, block: Block) -> Float[np.ndarray, "shots n"]:
         """Weights at which squared errors of light sum up to the squared relative L2 error, mean over colours."""
@@ -56,27 +56,20 @@ class ExpectedShots:
         return np.asarray(self.share * np.einsum("snc,sc->sn", colour, 1 / size) / 3)
 
 
-def expected_shots(state: RigState, prior: Prior, interference: bool) -> ExpectedShots:
-    """What the diffraction fit at its default effort would be given of each place, light being that of its start."""
-    theta = prior.mean
-    effort = FitEffort().psf
-    half = _half(state.rig.captures, effort.half_px)
-    close = (min(half[0], effort.close_px[0]), min(half[1], effort.close_px[1]))
-    evaluator = Evaluator(prior.wavelengths_nm, fit_lattice(close), interference)
+def expected_shots(
+    state: RigState, prior: Prior, wavelengths_nm: Float[np.ndarray, " nodes"], interference: bool
+) -> ExpectedShots:
+    """What the diffraction fit by its default rules would be given of each place, light being that of its start."""
+    theta, rules = prior.mean, FitEffort().psf
+    half = _half(state.rig.captures, rules.half_px)
+    evaluator = Evaluator(wavelengths_nm, fit_lattice(rules.close(half)), interference)
     shots = _dark_shots(state, half)
-    chosen = choose_samples(shots, close, effort.far_share)
-    every = choose_samples(shots, close, 1.0)
-    near = choose_samples(shots, close, 0.0)
+    chosen, every, near = (choose_samples(shots, rules, part) for part in (rules.far_share, 1.0, 0.0))
     per_far = (every[0].sum() - near[0].sum()) / max(chosen[0].sum() - near[0].sum(), 1)
-    made, own, overlaps = [], [], []
-    for block in blocks(shots, state.geometry, chosen):
-        overlap = np.asarray(overlaps_of(evaluator, theta, block.frame))
-        lit, local = _lit(evaluator, theta, block, overlap)
-        made.append(lit)
-        own.append(local)
-        overlaps.append(overlap)
+    problem = DiffractionProblem(blocks(shots, state.geometry, chosen), evaluator, prior).with_overlaps(theta)
+    made, own = zip(*(_lit(problem, block) for block in problem.blocks), strict=True)
     share = np.where(near[chosen].reshape(shots.count, -1)[: len(_SHIFTS_PX)], 1.0, per_far)
-    return ExpectedShots(evaluator, theta, tuple(made), tuple(own), tuple(overlaps), share)
+    return ExpectedShots(evaluator, theta, made, own, share)
 
 
 def sample_information(
@@ -133,14 +126,11 @@ def _dark_shots(state: RigState, half: tuple[int, int]) -> Shots:
     )
 
 
-def _lit(
-    evaluator: Evaluator, theta: Float[np.ndarray, " p"], block: Block, overlaps: np.ndarray
-) -> tuple[Block, Local]:
-    """The block with its light, the brightest sample of every shot 1."""
-    shots = len(np.asarray(block.index))
-    coefficients = np.asarray(kernel_coefficients(evaluator, theta, block, overlaps))
-    unit = np.asarray(unit_light(evaluator, block, np.zeros((shots, 2)), coefficients))
-    light = unit * (np.asarray(block.colour) @ np.array(WHITE))
+def _lit(problem: DiffractionProblem, block: Block) -> tuple[Block, Float[np.ndarray, "shots l"]]:
+    """The block with its light, the brightest sample of every shot 1, and its shots' own parameters."""
+    shots, theta = len(np.asarray(block.index)), problem.prior.mean
+    unit = unit_light(problem.evaluator, block, np.zeros((shots, 2)), problem.coefficients(theta, block))
+    light = np.asarray(unit) * (np.asarray(block.colour) @ np.array(WHITE))
     peak = light.max(axis=1, keepdims=True)
-    local = Local(np.zeros((shots, 2)), np.array(WHITE) / peak, np.zeros(shots))
-    return replace(block, rate=light / peak), local
+    own = np.concatenate([np.zeros((shots, 2)), np.array(WHITE) / peak, np.zeros((shots, 1))], axis=1)
+    return replace(block, rate=light / peak), own

@@ -18,9 +18,9 @@ from jaxtyping import Array, Float
 
 from udccal.arrangements import Led
 from udccal.calibration import FitEffort
-from udccal.fitting.psf.blocks import Block, Local
-from udccal.fitting.psf.descent import Prior, without_locals
-from udccal.fitting.psf.normal import Evaluator, Normal, normal_equations
+from udccal.fitting.engine.least_squares import Blocks
+from udccal.fitting.psf.kernel import Evaluator
+from udccal.fitting.psf.samples import Block, Sums, normal_equations
 from udccal.fitting.psf.start import start_model, start_prior, wire_shows
 from udccal.numerics import in_float64
 from udccal.planning.algebra import covariance
@@ -57,9 +57,9 @@ class PsfPredictor:
         self._state = state
         wire = built_wire(state) if state.wire is None else state.wire
         start = start_model(state.rig, state.geometry, wire)
-        prior: Prior = start_prior(state.rig, start, wire_shows(wire))
-        self._precision = prior.root.T @ prior.root
-        self._shots: ExpectedShots = expected_shots(state, prior, wire_shows(wire))
+        prior = start_prior(state.rig, start, wire_shows(wire))
+        self._precision = prior.precision
+        self._shots: ExpectedShots = expected_shots(state, prior, np.asarray(start.wavelengths_nm), wire_shows(wire))
         effort = FitEffort().psf
         self._most = _Effort(effort.positions, effort.shifts)
         self._known: dict[tuple[float, ...], Float[np.ndarray, "p p"]] = {}
@@ -123,17 +123,17 @@ class PsfPredictor:
         """
         of_kernel, told = np.zeros_like(self._precision), np.zeros((len(steps), *self._precision.shape))
         count, field = 0, self._shots.in_field
-        for number, (block, local, overlaps) in enumerate(self._shots.parts()):
+        for number, (block, own) in enumerate(self._shots.parts()):
             known = np.asarray(block.known) > 0
             light = [sample_information(self._state, np.asarray(block.rate), step) * known for step in steps]
             # At weights that make every colour's kernel count 1, the slopes of light are those of the kernel.
             weights = np.stack([self._shots.relative_weight(block), *light])
-            normal = _at_weights(self._shots.evaluator, self._shots.theta, block, local, overlaps, weights)
+            sums = _at_weights(self._shots.evaluator, self._shots.theta, block, own, weights)
             if number < field:
-                of_kernel += np.asarray(normal.gg[0]) / len(local.flux)
+                of_kernel += np.asarray(sums.shared[0]) / len(own)
             else:
-                told += [without_locals(_one(normal, k))[0] for k in range(1, len(weights))]
-                count += len(local.flux)
+                told += [_one(sums, k).marginal()[0] for k in range(1, len(weights))]
+                count += len(own)
         self._known |= {step.exposures_s: one / count for step, one in zip(steps, told, strict=True)}
         return of_kernel / field
 
@@ -150,19 +150,18 @@ def _at_weights(
     evaluator: Evaluator,
     theta: Float[Array, " p"],
     block: Block,
-    local: Local,
-    overlaps: Array,
+    own: Float[Array, "shots l"],
     weights: Float[Array, "designs shots n"],
-) -> Normal:
-    """The normal equations of one block at several weights of its samples; slopes are found once."""
+) -> Sums:
+    """The normal equations of one block at several weights of its samples; derivatives are found once."""
 
-    def one(weight: Float[Array, "shots n"]) -> Normal:
-        return normal_equations(evaluator, theta, replace(block, weight=weight), local, overlaps)
+    def one(weight: Float[Array, "shots n"]) -> Sums:
+        return normal_equations(evaluator, theta, replace(block, weight=weight), own)
 
-    made: Callable[[Array], Normal] = jax.vmap(one)
+    made: Callable[[Array], Sums] = jax.vmap(one)
     return made(weights)
 
 
-def _one(normals: Normal, index: int) -> Normal:
-    taken: Normal = jax.tree.map(lambda part: np.asarray(part)[index], normals)
-    return taken
+def _one(sums: Sums, index: int) -> Blocks:
+    cost, *parts = (np.asarray(part)[index] for part in sums)
+    return Blocks(float(cost), 0, *parts)
