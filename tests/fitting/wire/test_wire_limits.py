@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 
 from tests.benchmarks.efficiency.wire import (
     COLUMNS,
-    PRNU,
     ROWS,
     Flat,
     drawn_truth,
