@@ -24,7 +24,8 @@ from udccal.compilation import keep_compilations
 from udccal.fitting.psf.data import PsfData
 from udccal.fitting.psf.fit import fit_psf
 from udccal.fitting.psf.start import PsfRules
-from udccal.fitting.wire.parameters import ideal_wire, wire_start
+from udccal.fitting.wire import wire_start
+from udccal.fitting.wire.parameters import ideal_wire
 from udccal.models.geometry import Geometry
 from udccal.models.psf import PsfField, psf_kernels
 from udccal.models.wire import Wire

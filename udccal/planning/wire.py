@@ -12,15 +12,14 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from udccal.arrangements import Dark, FlatLight
+from udccal.fitting.wire import WireRules, wire_start
 from udccal.fitting.wire.data import Pixels, odd_step, sample_pixels
 from udccal.fitting.wire.jacobian import block_jacobian, with_harmonics
 from udccal.fitting.wire.parameters import (
     Parameters,
-    WireRules,
     ideal_wire,
     parameters_of,
     possible_harmonics,
-    wire_start,
 )
 from udccal.models.wire import Wire
 from udccal.numerics import in_float64
