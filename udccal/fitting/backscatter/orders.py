@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool
 from scipy.special import ndtri
 
-from udccal.fitting.backscatter.likelihood import PerShot, Profile
+from udccal.fitting.backscatter.likelihood import PerShot, Profile, Samples
 from udccal.fitting.backscatter.parameters import (
     KERNELS,
     MIX,
