@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.benchmarks.psf_scene import frames_of, small_scene
+from tests.scenes.psf import frames_of, small_scene
 from udccal.fitting.hdr.merge import HdrMerge
 from udccal.fitting.psf.data import Shots, shot_noise
 from udccal.fitting.psf.samples import Block, choose_samples
