@@ -18,7 +18,7 @@ from udccal.fitting.psf.start import PsfRules
 from udccal.fitting.psf.weights import (
     estimate_model_error,
     left_out,
-    pattern_test,
+    pattern_p_value,
     sensor_variance,
     weighed,
     without_outliers,
@@ -145,12 +145,12 @@ def test_noise_has_no_pattern_and_a_common_misfit_has_one() -> None:
     values = []
     for seed in range(60):
         light, block = noisy(np.random.default_rng(seed))
-        values.append(pattern_test((block,), [errors(block, light)]).p_value)
+        values.append(pattern_p_value((block,), [errors(block, light)]))
     assert 0.3 < np.mean(values) < 0.7
     assert np.mean(np.array(values) < 0.05) < 0.2
     light, block = noisy(np.random.default_rng(5))
     wave = 0.005 * light * np.sin(np.arange(SAMPLES) / 7.0)
-    assert pattern_test((block,), [errors(block, light - wave)]).p_value < 1e-6
+    assert pattern_p_value((block,), [errors(block, light - wave)]) < 1e-6
 
 
 def test_samples_are_drawn_as_many_in_every_picture() -> None:

@@ -24,7 +24,7 @@ from udccal.fitting.psf.start import PsfRules
 from udccal.fitting.psf.weights import (
     estimate_model_error,
     left_out,
-    pattern_test,
+    pattern_p_value,
     sensor_variance,
     weighed,
     without_outliers,
@@ -99,7 +99,7 @@ class DiffractionFit:
 
     def pattern_p(self) -> float:
         """How likely such a pattern in the residuals is by chance; see ``psf.weights``."""
-        return pattern_test(self.problem.blocks, self.errors()).p_value
+        return pattern_p_value(self.problem.blocks, self.errors())
 
     def errors(self) -> list[Float[np.ndarray, "shots n"]]:
         """Data less expectation in units of sigma, position by position."""
@@ -253,13 +253,11 @@ def efficiency(fit: DiffractionFit, rules: PsfRules, available: int, reported: i
         available: pictures there are.
         reported: so many numbers are looked at.
     """
-    every, peak = [], np.array([rules.peak_half_px[1], rules.peak_half_px[0]]) + 0.5
-    for block in fit.problem.blocks:
-        far = (np.abs(np.asarray(block.points)) > peak).any(axis=-1)
-        every.append(replace(block, weight=np.asarray(block.weight) * np.where(far, 1.0 / rules.far_share, 1.0)))
-    positions = replace(fit.problem, blocks=tuple(every)).by_position(fit.solution.place)
-    used = sum(int((np.asarray(block.index) >= 0).sum()) for block in every)
-    information = sum(position.marginal()[0] for position in positions) * available / used
+    chosen, near = (choose_samples(fit.shots, rules, part) for part in (rules.far_share, 0.0))
+    stands_for = np.where(near[chosen].reshape(fit.shots.count, -1), 1.0, 1.0 / rules.far_share)
+    weighed_up = (replace(b, weight=np.asarray(b.weight) * stands_for[np.asarray(b.index)]) for b in fit.problem.blocks)
+    positions = replace(fit.problem, blocks=tuple(weighed_up)).by_position(fit.solution.place)
+    information = sum(position.marginal()[0] for position in positions) * available / fit.shots.count
     best = scaled_inverse(fit.problem.prior.precision + information)
     return float(np.mean(np.diag(best)[:reported] / np.diag(fit.noise_cov)[:reported]))
 
