@@ -1,5 +1,6 @@
 """Brackets of exposures merged into one rate per sample."""
 
+from udccal.fitting.hdr.likelihood import HdrRules
 from udccal.fitting.hdr.merge import HdrMerge, merge_bracket
 
-__all__ = ["HdrMerge", "merge_bracket"]
+__all__ = ["HdrMerge", "HdrRules", "merge_bracket"]

@@ -2,6 +2,7 @@
 
 from udccal.fitting.psf_stamps.data import Stamps, mosaic_channels
 from udccal.fitting.psf_stamps.fit import fit_psf_stamps
+from udccal.fitting.psf_stamps.rules import StampsRules
 from udccal.fitting.psf_stamps.term import StampsPsf
 
-__all__ = ["Stamps", "StampsPsf", "fit_psf_stamps", "mosaic_channels"]
+__all__ = ["Stamps", "StampsPsf", "StampsRules", "fit_psf_stamps", "mosaic_channels"]
