@@ -20,7 +20,7 @@ from udccal.fitting.psf_stamps.data import Stamps
 from udccal.fitting.psf_stamps.field import PlaneField, see, warps
 from udccal.fitting.psf_stamps.fit import fit_psf_stamps
 from udccal.fitting.psf_stamps.orders import Orders, grid_size
-from udccal.fitting.psf_stamps.prior import by_degree, envelope
+from udccal.fitting.psf_stamps.probability import by_degree, envelope
 from udccal.numerics import in_float64
 
 STARS, SIZE, NODES, READ_E, ORDERS = 20, 11, 18, 4.0, Orders(2, 1, 1.0)

@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 from udccal.errors import FitError
-from udccal.fitting.hdr import merge as merging
-from udccal.fitting.hdr.likelihood import HdrRules, merge_block
-from udccal.fitting.hdr.merge import UNKNOWN_SIGMA, merge_bracket
+from udccal.fitting.hdr.likelihood import merge_block
+from udccal.fitting.hdr.merge import UNKNOWN_SIGMA, HdrRules, merge_bracket, sensor_numbers
 from udccal.models.noise import Noise
 from udccal.result import FitStatus
 
@@ -140,10 +139,10 @@ def test_a_frame_of_other_light_is_left_out_and_listed() -> None:
 def test_single_precision_moves_no_rate_by_a_hundredth_of_its_sigma() -> None:
     frames = np.concatenate([bracket(rate, EXPOSURES, 11, (20, 20)) for rate in (0.0, 30.0, 1e3, 1e5, 1e7)], axis=1)
     merge = merge_bracket(frames, EXPOSURES, NOISE)
-    numbers = jax.tree.map(lambda n: np.float64(n), merging._sensor_numbers(NOISE, float(EXPOSURES.max()), HdrRules()))
+    numbers = jax.tree.map(lambda n: np.float64(n), sensor_numbers(NOISE, float(EXPOSURES.max()), HdrRules()))
     with jax.enable_x64(True):
         double = jax.tree.map(
-            np.asarray, merge_block(frames.reshape(7, -1), EXPOSURES / EXPOSURES.max(), numbers, None, HdrRules())
+            np.asarray, merge_block(frames.reshape(7, -1), EXPOSURES / EXPOSURES.max(), numbers, None, 6.0)
         )
     off = merge.rate_e_per_s.ravel() - double.rate / EXPOSURES.max()
     assert np.abs(off / merge.sigma_e_per_s.ravel()).max() < 0.01

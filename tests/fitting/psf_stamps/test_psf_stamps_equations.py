@@ -10,12 +10,11 @@ import pytest
 
 from tests.fitting.psf_stamps.test_psf_stamps import make
 from udccal.fitting.psf_stamps.banded import AHEAD, Band, band_of, factor, node_sums
-from udccal.fitting.psf_stamps.data import split
+from udccal.fitting.psf_stamps.data import Scene, StampsRules, split
 from udccal.fitting.psf_stamps.equations import factors, marginal_cov, normal_equations, shared_by
 from udccal.fitting.psf_stamps.field import TAPS, polynomials
-from udccal.fitting.psf_stamps.likelihood import Scene, State, Weighted, expectation
 from udccal.fitting.psf_stamps.orders import start, with_degrees
-from udccal.fitting.psf_stamps.rules import StampsRules
+from udccal.fitting.psf_stamps.probability import State, Weighted, expectation
 from udccal.fitting.psf_stamps.solve import Evidence, improve
 
 _ROWS, _N = 6, 5

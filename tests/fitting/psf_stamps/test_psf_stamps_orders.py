@@ -9,12 +9,9 @@ import numpy as np
 import pytest
 
 from tests.fitting.psf_stamps.test_psf_stamps import READ_E, SENSOR, places
-from udccal.fitting.psf_stamps.data import Stamps, split
+from udccal.fitting.psf_stamps.data import Scene, Stamps, StampsRules, split
 from udccal.fitting.psf_stamps.fit import fit_psf_stamps
-from udccal.fitting.psf_stamps.likelihood import Scene
-from udccal.fitting.psf_stamps.orders import Orders, coarse, with_degrees
-from udccal.fitting.psf_stamps.rules import StampsRules
-from udccal.fitting.psf_stamps.search import Found, expected_gains
+from udccal.fitting.psf_stamps.orders import Found, Orders, coarse, expected_gains, with_degrees
 from udccal.fitting.psf_stamps.solve import improve
 from udccal.numerics import in_float64
 

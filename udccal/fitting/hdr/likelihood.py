@@ -13,8 +13,6 @@ with h the inverse Mills ratio of the normal distribution.
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass
-from typing import final
 
 import equinox as eqx
 import jax
@@ -23,38 +21,11 @@ from jaxtyping import Array, Bool, Float, Int, UInt16
 
 from udccal.models.arrays import Arrayish
 
+# Rounds that know the open samples only, then rounds with the clipped ones too. More move no pixel by 1 % of its sigma.
+_OPEN_ROUNDS, _ALL_ROUNDS = 1, 2
+# Below zero rate the variance goes on falling, so that the estimate stays unbiased in the dark, down to this share.
+_LEAST_VARIANCE = 0.25
 _TINY = 1e-30
-
-
-@final
-@dataclass(frozen=True)
-class HdrRules:
-    """The constants of a merge.
-
-    Attributes:
-        open_rounds, all_rounds: of Newton's method with the open samples only, then with the clipped ones too. More
-            move no pixel by 1 % of its sigma.
-        believed_sigma: a sample that the others of its pixel put farther off is a hit, no light, be it clipped or not.
-        margin_sigma: a full well holds its charge before the dark noise is added: so far below it, no sample is full.
-        least_variance: below zero rate the variance goes on falling, down to this part of that in the dark, so that
-            the estimate stays unbiased there.
-        frame_off, frame_sigma: a frame whose light is off by more than both is left out.
-        frame_pixels: that a frame is judged by, at most.
-        frame_least_pixels, frame_snr: and at least, of so much light over noise each.
-        least_to_judge: samples of a pixel that hits and frames are judged by.
-    """
-
-    open_rounds: int = 1
-    all_rounds: int = 2
-    believed_sigma: float = 6.0
-    margin_sigma: float = 6.0
-    least_variance: float = 0.25
-    frame_off: float = 0.02
-    frame_sigma: float = 5.0
-    frame_pixels: int = 20_000
-    frame_least_pixels: int = 8
-    frame_snr: float = 10.0
-    least_to_judge: int = 3
 
 
 class SensorNumbers(eqx.Module):
@@ -88,13 +59,13 @@ def _mills(z: Float[Array, " pixels"]) -> Float[Array, " pixels"]:
     return jnp.where(z >= 0, 0.79788456 / tail, 0.39894228 * bell / (1 - 0.5 * tail * bell))
 
 
-@functools.partial(jax.jit, static_argnames="rules")
+@functools.partial(jax.jit, static_argnames="believed_sigma")
 def merge_block(
     frames: UInt16[Array, "n pixels"],
     times: Float[Array, " n"],
     sensor: SensorNumbers,
     left_out: Bool[Array, "n pixels"] | None,
-    rules: HdrRules,
+    believed_sigma: float,
 ) -> BlockMerge:
     """Maximum-likelihood rates. Loops over samples are written out: a pixel stays in the processor's registers."""
     count = len(frames)
@@ -105,30 +76,30 @@ def merge_block(
     time_open = sum(jnp.where(o, times[i], 0.0) for i, o in enumerate(is_open))
     total = sum(jnp.where(o, light[i] - sensor.dark_e_per_s * times[i], 0.0) for i, o in enumerate(is_open))
     rate = total / jnp.maximum(time_open, _TINY)
-    for k in range(rules.open_rounds + rules.all_rounds):
+    for k in range(_OPEN_ROUNDS + _ALL_ROUNDS):
         score, information = jnp.zeros_like(rate), jnp.zeros_like(rate)
         for i in range(count):
-            mean, variance = _expected(rate, times[i], sensor, rules)
+            mean, variance = _expected(rate, times[i], sensor)
             slope = times[i] / variance
             s, own = jnp.where(is_open[i], slope * (light[i] - mean), 0.0), jnp.where(is_open[i], slope * times[i], 0.0)
-            if k >= rules.open_rounds:
+            if k >= _OPEN_ROUNDS:
                 z = (sensor.level_e - mean) * jax.lax.rsqrt(variance)
-                believed = allowed[i] & ~is_open[i] & (z < rules.believed_sigma)
+                believed = allowed[i] & ~is_open[i] & (z < believed_sigma)
                 ratio = _mills(z)
                 s = jnp.where(believed, times[i] * jax.lax.rsqrt(variance) * ratio, s)
                 own = jnp.where(believed, slope * times[i] * ratio * (ratio - z), own)
             score, information = score + s, information + own
         rate = rate + score / jnp.maximum(information, _TINY)
-    worst, deviation2 = _worst(light, is_open, allowed, rate, information, times, sensor, rules)
+    worst, deviation2 = _worst(light, is_open, allowed, rate, information, times, sensor)
     used = sum(o.astype(jnp.int32) for o in is_open)
     return BlockMerge(rate, jax.lax.rsqrt(jnp.maximum(information, _TINY)), used, worst, deviation2)
 
 
 def _expected(
-    rate: Float[Array, " pixels"], time: Float[Array, ""], sensor: SensorNumbers, rules: HdrRules
+    rate: Float[Array, " pixels"], time: Float[Array, ""], sensor: SensorNumbers
 ) -> tuple[Float[Array, " pixels"], Float[Array, " pixels"]]:
     mean = (rate + sensor.dark_e_per_s) * time
-    return mean, jnp.maximum(mean + sensor.floor_e2, rules.least_variance * sensor.floor_e2)
+    return mean, jnp.maximum(mean + sensor.floor_e2, _LEAST_VARIANCE * sensor.floor_e2)
 
 
 def _worst(
@@ -139,11 +110,10 @@ def _worst(
     information: Float[Array, " pixels"],
     times: Float[Array, " n"],
     sensor: SensorNumbers,
-    rules: HdrRules,
 ) -> tuple[Int[Array, " pixels"], Float[Array, " pixels"]]:
     worst, largest = jnp.zeros(rate.shape, jnp.int32), jnp.zeros_like(rate)
     for i, x in enumerate(light):
-        mean, variance = _expected(rate, times[i], sensor, rules)
+        mean, variance = _expected(rate, times[i], sensor)
         share = times[i] ** 2 / (variance * jnp.maximum(information, _TINY))
         # Clipped although the others promise far less: how far, at least.
         beyond = jnp.where(is_open[i], x - mean, jnp.maximum(sensor.level_e - mean, 0.0))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import final
 
 import jax
@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int, UInt16
 
 from udccal.errors import FitError
 from udccal.fitting.engine.robust import outliers
-from udccal.fitting.hdr.likelihood import BlockMerge, HdrRules, SensorNumbers, merge_block
+from udccal.fitting.hdr.likelihood import BlockMerge, SensorNumbers, merge_block
 from udccal.models.noise import Noise
 from udccal.result import FitStatus, Outliers
 
@@ -22,6 +22,30 @@ UNKNOWN_SIGMA = 1e12
 # Pixels of one compiled pass: large pictures, and crops.
 _BLOCKS = (1 << 16, 1 << 12)
 _THREADS = 2
+
+
+@final
+@dataclass(frozen=True)
+class HdrRules:
+    """The constants of a merge.
+
+    Attributes:
+        believed_sigma: a sample that the others of its pixel put farther off is a hit, no light, be it clipped or not.
+        margin_sigma: a full well holds its charge before the dark noise is added: so far below it, no sample is full.
+        frame_off, frame_sigma: a frame whose light is off by more than both is left out.
+        frame_pixels: that a frame is judged by, at most.
+        frame_least_pixels, frame_snr: and at least, of so much light over noise each.
+        least_to_judge: samples of a pixel that hits and frames are judged by.
+    """
+
+    believed_sigma: float = 6.0
+    margin_sigma: float = 6.0
+    frame_off: float = 0.02
+    frame_sigma: float = 5.0
+    frame_pixels: int = 20_000
+    frame_least_pixels: int = 8
+    frame_snr: float = 10.0
+    least_to_judge: int = 3
 
 
 @final
@@ -79,41 +103,38 @@ def merge_bracket(
             "Give the exposures in seconds."
         )
     # Times in units of the longest: sums of their squares stay in single precision's range.
-    unit = float(times.max())
-    sensor = _sensor_numbers(noise, unit, rules)
-    flat = np.ascontiguousarray(frames).reshape(len(frames), -1)
-    scaled = (times / unit).astype(np.float32)
-    keep = np.arange(len(frames))
-    merged = _merge(flat, scaled, sensor, rules)
-    dropped: list[str] = []
-    while (bad := _frame_off(flat[keep], scaled[keep], sensor, rules, merged)) is not None:
-        dropped.append(f"frame {keep[bad]}")
-        keep = np.delete(keep, bad)
-        merged = _merge(flat[keep], scaled[keep], sensor, rules)
-    hits = _mend_hits(flat[keep], scaled[keep], sensor, rules, merged)
+    unit, shape, kept = float(times.max()), frames.shape[1:], np.arange(len(frames))
+    codes = np.ascontiguousarray(frames).reshape(len(frames), -1)
+    bracket = _Bracket(codes, (times / unit).astype(np.float32), sensor_numbers(noise, unit, rules), rules)
+    merged = bracket.merged()
+    while (bad := bracket.frame_off(merged)) is not None:
+        kept = np.delete(kept, bad)
+        bracket = replace(bracket, codes=np.delete(bracket.codes, bad, 0), times=np.delete(bracket.times, bad))
+        merged = bracket.merged()
+    hits = bracket.mend_hits(merged)
     # In place: copies of a full frame would cost as much as a third of the merging.
     for values in (merged.rate, merged.sigma):
         values /= np.float32(unit)
-    unknown, notes = merged.used <= 0, ()
+    unknown = merged.used <= 0
     if unknown.any():
         merged.rate[unknown], merged.sigma[unknown] = 0.0, UNKNOWN_SIGMA
-        notes = (f"{np.count_nonzero(unknown)} of {unknown.size} pixels have no sample that could be used.",)
-    shape = frames.shape[1:]
-    off = f"{100 * rules.frame_off:g} % and {rules.frame_sigma:g} sigma"
-    hit = f"more than {rules.believed_sigma:g} sigma from what its other samples say; that sample is left out"
+    note = f"{np.count_nonzero(unknown)} of {unknown.size} pixels have no sample that could be used."
+    off = f"frames whose light is off by more than {100 * rules.frame_off:g} % and {rules.frame_sigma:g} sigma"
+    hit = f"pixels with a sample more than {rules.believed_sigma:g} sigma from what its other samples say; that sample"
+    dropped = (f"frame {i}" for i in np.setdiff1d(np.arange(len(frames)), kept))
     places = (str(tuple(int(k) for k in np.unravel_index(pixel, shape))) for pixel in hits)
     return HdrMerge(
         merged.rate.reshape(shape),
         merged.sigma.reshape(shape),
         merged.used.reshape(shape),
-        outliers(f"frames whose light is off by more than {off}", dropped)
-        + outliers(f"pixels with a sample {hit}", places),
+        outliers(off, dropped) + outliers(f"{hit} is left out", places),
         FitStatus.SATURATED if unknown.size and unknown.all() else FitStatus.CONVERGED,
-        notes,
+        (note,) if unknown.any() else (),
     )
 
 
-def _sensor_numbers(noise: Noise, unit_s: float, rules: HdrRules) -> SensorNumbers:
+def sensor_numbers(noise: Noise, unit_s: float, rules: HdrRules) -> SensorNumbers:
+    """What the likelihood needs of a noise model, times in units of ``unit_s``."""
     K, black = float(np.asarray(noise.K_DN_per_e)), float(np.asarray(noise.black_DN))
     floor = float(np.asarray(noise.sigma_d_e)) ** 2 + (float(np.asarray(noise.q_DN)) / K) ** 2 / 12.0
     # A sensor without any dark noise still has a least variance: the likelihood of its dark pixels stays finite.
@@ -123,100 +144,81 @@ def _sensor_numbers(noise: Noise, unit_s: float, rules: HdrRules) -> SensorNumbe
     return SensorNumbers(*(np.float32(n) for n in numbers))
 
 
-def _merge(
-    flat: UInt16[np.ndarray, "n pixels"],
-    times: Float[np.ndarray, " n"],
-    sensor: SensorNumbers,
-    rules: HdrRules,
-    left_out: Bool[np.ndarray, "n pixels"] | None = None,
-) -> BlockMerge:
-    """In blocks of one size, on two threads; the last block overlaps the one before it."""
-    pixels = flat.shape[1]
-    size = next((b for b in _BLOCKS if b <= pixels), _BLOCKS[-1])
-    short = size - pixels
-    if short > 0:
-        flat = np.pad(flat, ((0, 0), (0, short)))
-        left_out = None if left_out is None else np.pad(left_out, ((0, 0), (0, short)))
-    out = BlockMerge(
-        *(np.empty(flat.shape[1], dtype) for dtype in (np.float32, np.float32, *[np.int32] * 2, np.float32))
-    )
+@dataclass(frozen=True)
+class _Bracket:
+    codes: UInt16[np.ndarray, "n pixels"]
+    times: Float[np.ndarray, " n"]
+    sensor: SensorNumbers
+    rules: HdrRules
 
-    def run(start: int) -> None:
-        part = np.s_[start : start + size]
-        block = merge_block(flat[:, part], times, sensor, None if left_out is None else left_out[:, part], rules)
-        _into(out, part, block)
+    def merged(self, left_out: Bool[np.ndarray, "n pixels"] | None = None) -> BlockMerge:
+        """In numpy; in blocks of one size, on two threads; the last block overlaps the one before it."""
+        codes, pixels = self.codes, self.codes.shape[1]
+        size = next((b for b in _BLOCKS if b <= pixels), _BLOCKS[-1])
+        if (short := size - pixels) > 0:
+            codes = np.pad(codes, ((0, 0), (0, short)))
+            left_out = None if left_out is None else np.pad(left_out, ((0, 0), (0, short)))
+        kinds = (np.float32, np.float32, np.int32, np.int32, np.float32)
+        out = BlockMerge(*(np.empty(codes.shape[1], kind) for kind in kinds))
 
-    starts = [min(s, flat.shape[1] - size) for s in range(0, flat.shape[1], size)]
-    with ThreadPoolExecutor(_THREADS) as pool:
-        list(pool.map(run, starts))
-    return BlockMerge(*(part[:pixels] for part in jax.tree.leaves(out)))
+        def run(start: int) -> None:
+            part = np.s_[start : start + size]
+            own = None if left_out is None else left_out[:, part]
+            _put(out, part, merge_block(codes[:, part], self.times, self.sensor, own, self.rules.believed_sigma))
+
+        with ThreadPoolExecutor(_THREADS) as pool:
+            list(pool.map(run, [min(s, codes.shape[1] - size) for s in range(0, codes.shape[1], size)]))
+        return BlockMerge(*(part[:pixels] for part in jax.tree.leaves(out)))
+
+    def frame_off(self, merged: BlockMerge) -> int | None:
+        """The frame whose light differs most from the others', when that is too much."""
+        rules, sensor = self.rules, self.sensor
+        if len(self.times) < rules.least_to_judge:
+            return None
+        lit = np.flatnonzero((merged.used >= rules.least_to_judge) & (merged.rate > 0))
+        lit = lit[:: max(1, len(lit) // rules.frame_pixels)]
+        light = (self.codes[:, lit].astype(np.float64) - float(sensor.black_DN)) * float(sensor.e_per_DN)
+        signal = merged.rate[lit].astype(np.float64) * self.times[:, None]
+        dark = float(sensor.dark_e_per_s) * self.times[:, None]
+        sigma = np.sqrt(signal + dark + float(sensor.floor_e2))
+        # The open samples near the level are the low ones of their kind: stay clear of them.
+        clear = signal + dark + 5 * sigma < float(sensor.level_e)
+        score = [
+            self._off_in_sigma((x - d)[c] / s[c] - 1, (v / s)[c])
+            for x, d, s, v, c in zip(light, dark, signal, sigma, clear, strict=True)
+        ]
+        worst = int(np.argmax(score))
+        return worst if score[worst] > rules.frame_sigma else None
+
+    def _off_in_sigma(self, relative: Float[np.ndarray, " pixels"], sigma: Float[np.ndarray, " pixels"]) -> float:
+        """How many sigma the median of one frame's relative deviations is from 0; 0 where it is too small to matter.
+
+        A median of clear signals: hits do not count as a lamp that flickers, nor the skew of a few electrons.
+        """
+        clear = sigma < 1 / self.rules.frame_snr
+        if np.count_nonzero(clear) < self.rules.frame_least_pixels:
+            return 0.0
+        off = abs(float(np.median(relative[clear])))
+        # A median's standard error is 1.2533 times a mean's.
+        error = 1.2533 * float(np.median(sigma[clear])) / math.sqrt(np.count_nonzero(clear))
+        return off / error if off > self.rules.frame_off else 0.0
+
+    def mend_hits(self, merged: BlockMerge) -> Int[np.ndarray, " hits"]:
+        """Leave out the worst sample of a pixel while it is too far off; changes ``merged``, returns the pixels."""
+        limit, least = self.rules.believed_sigma**2, self.rules.least_to_judge
+        touched: list[np.ndarray] = [np.zeros(0, dtype=np.int64)]
+        suspects = np.flatnonzero((merged.deviation2 > limit) & (len(self.times) >= least))
+        left_out = np.zeros((len(self.times), len(suspects)), dtype=bool)
+        while len(suspects):
+            left_out[merged.worst[suspects], np.arange(len(suspects))] = True
+            again = replace(self, codes=np.ascontiguousarray(self.codes[:, suspects])).merged(left_out)
+            _put(merged, suspects, again)
+            touched.append(suspects)
+            more = (again.deviation2 > limit) & (len(self.times) - left_out.sum(axis=0) >= least)
+            suspects, left_out = suspects[more], np.ascontiguousarray(left_out[:, more])
+        return np.unique(np.concatenate(touched))
 
 
-def _into(out: BlockMerge, where: slice | Int[np.ndarray, " some"], part: BlockMerge) -> None:
+def _put(out: BlockMerge, where: slice | Int[np.ndarray, " some"], part: BlockMerge) -> None:
     for into, values in zip(jax.tree.leaves(out), jax.tree.leaves(part), strict=True):
         into[where] = values
-
-
-def _frame_off(
-    flat: UInt16[np.ndarray, "n pixels"],
-    times: Float[np.ndarray, " n"],
-    sensor: SensorNumbers,
-    rules: HdrRules,
-    merged: BlockMerge,
-) -> int | None:
-    """The frame whose light differs most from the others', when that is too much."""
-    if len(times) < rules.least_to_judge:
-        return None
-    lit = np.flatnonzero((merged.used >= rules.least_to_judge) & (merged.rate > 0))
-    lit = lit[:: max(1, len(lit) // rules.frame_pixels)]
-    light = (flat[:, lit].astype(np.float64) - float(sensor.black_DN)) * float(sensor.e_per_DN)
-    signal = merged.rate[lit].astype(np.float64) * times[:, None]
-    dark = float(sensor.dark_e_per_s) * times[:, None]
-    variance = signal + dark + float(sensor.floor_e2)
-    # The open samples near the level are the low ones of their kind: stay clear of them.
-    clear = signal + dark + 5 * np.sqrt(variance) < float(sensor.level_e)
-    score = [
-        _off_in_sigma((x - d)[c] / s[c] - 1, (np.sqrt(v) / s)[c], rules)
-        for x, d, s, v, c in zip(light, dark, signal, variance, clear, strict=True)
-    ]
-    worst = int(np.argmax(score))
-    return worst if score[worst] > rules.frame_sigma else None
-
-
-def _off_in_sigma(
-    relative: Float[np.ndarray, " pixels"], sigma: Float[np.ndarray, " pixels"], rules: HdrRules
-) -> float:
-    """How many sigma the median of one frame's relative deviations is from 0; 0 where it is too small to matter.
-
-    A median of clear signals: hits do not count as a lamp that flickers, nor the skew of a few electrons.
-    """
-    clear = sigma < 1 / rules.frame_snr
-    if np.count_nonzero(clear) < rules.frame_least_pixels:
-        return 0.0
-    off = abs(float(np.median(relative[clear])))
-    # A median's standard error is 1.2533 times a mean's.
-    error = 1.2533 * float(np.median(sigma[clear])) / math.sqrt(np.count_nonzero(clear))
-    return off / error if off > rules.frame_off else 0.0
-
-
-def _mend_hits(
-    flat: UInt16[np.ndarray, "n pixels"],
-    times: Float[np.ndarray, " n"],
-    sensor: SensorNumbers,
-    rules: HdrRules,
-    merged: BlockMerge,
-) -> Int[np.ndarray, " hits"]:
-    """Leave out the worst sample of a pixel while it is too far off; changes ``merged``, returns the pixels mended."""
-    touched: list[np.ndarray] = []
-    suspects = np.flatnonzero((merged.deviation2 > rules.believed_sigma**2) & (len(times) >= rules.least_to_judge))
-    left_out = np.zeros((len(times), len(suspects)), dtype=bool)
-    while len(suspects):
-        left_out[merged.worst[suspects], np.arange(len(suspects))] = True
-        again = _merge(np.ascontiguousarray(flat[:, suspects]), times, sensor, rules, left_out)
-        _into(merged, suspects, again)
-        touched.append(suspects)
-        more = (again.deviation2 > rules.believed_sigma**2) & (
-            len(times) - left_out.sum(axis=0) >= rules.least_to_judge
-        )
-        suspects, left_out = suspects[more], np.ascontiguousarray(left_out[:, more])
-    return np.unique(np.concatenate(touched)) if touched else np.zeros(0, dtype=np.int64)

@@ -20,7 +20,7 @@ from scipy.linalg.blas import dtrsm
 from scipy.linalg.lapack import dpotrf
 
 from udccal.fitting.psf_stamps.field import TAPS
-from udccal.fitting.psf_stamps.likelihood import Weighted
+from udccal.fitting.psf_stamps.probability import Weighted
 
 AHEAD = TAPS - 1  # rows of nodes beyond its own that a row of nodes has entries with
 _PAIRS = tuple(itertools.combinations_with_replacement(range(TAPS), 2))

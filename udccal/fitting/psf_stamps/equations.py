@@ -14,8 +14,9 @@ from jaxtyping import Float, Int
 from scipy.linalg import cholesky, solve_triangular
 
 from udccal.fitting.psf_stamps.banded import Band, band_of, factor, node_sums, stencil_of
+from udccal.fitting.psf_stamps.data import Scene
 from udccal.fitting.psf_stamps.field import TAPS, PlaneField, degrees, polynomials
-from udccal.fitting.psf_stamps.likelihood import OWN, Scene, State, Weighted, expectation
+from udccal.fitting.psf_stamps.probability import OWN, State, Weighted, by_degree, expectation
 
 
 @dataclass(frozen=True)
@@ -234,3 +235,25 @@ def marginal_cov(root: Float[np.ndarray, "dense dense"], index: Int[np.ndarray, 
     columns[index, np.arange(len(index))] = 1.0
     half = solve_triangular(root, columns, lower=True)
     return half.T @ half
+
+
+@dataclass(frozen=True)
+class MapCoefficients:
+    """Coefficients of maps above some degree: where in the dense block, of which degree and colour, and values."""
+
+    index: Int[np.ndarray, " n"]
+    degree: Int[np.ndarray, " n"]
+    colour: Int[np.ndarray, " n"]
+    value: Float[np.ndarray, " n"]
+    precision: Float[np.ndarray, " n"]
+
+    @classmethod
+    def above(cls, state: State, degree: int) -> MapCoefficients:
+        """Of all colours."""
+        start, columns = state.maps_from, []
+        for plane, (field, own) in enumerate(zip(state.fields, state.precisions, strict=True)):
+            group, flat = by_degree(own.warp, 4), np.ravel(field.warp)
+            parts = start + np.arange(len(flat)), 1 + group, np.full(len(flat), plane), flat, own.warp[group]
+            columns.append([part[1 + group > degree] for part in parts])
+            start += len(flat) + np.size(field.lateral)
+        return cls(*(np.concatenate(parts) for parts in zip(*columns, strict=True)))

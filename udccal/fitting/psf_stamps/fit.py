@@ -15,12 +15,10 @@ from udccal.errors import FitError
 from udccal.fitting.engine.gaussian import Posterior
 from udccal.fitting.engine.orders import Choice
 from udccal.fitting.engine.report import estimates, residual_sample
-from udccal.fitting.psf_stamps.data import Stamps, split
-from udccal.fitting.psf_stamps.equations import factors, marginal_cov
-from udccal.fitting.psf_stamps.likelihood import Scene, State, Weighted, expectation
-from udccal.fitting.psf_stamps.orders import Orders, reference
-from udccal.fitting.psf_stamps.rules import StampsRules
-from udccal.fitting.psf_stamps.search import Found, MapCoefficients, search
+from udccal.fitting.psf_stamps.data import Scene, Stamps, StampsRules, split
+from udccal.fitting.psf_stamps.equations import MapCoefficients, factors, marginal_cov
+from udccal.fitting.psf_stamps.orders import Found, Orders, reference, search
+from udccal.fitting.psf_stamps.probability import State, Weighted, expectation
 from udccal.fitting.psf_stamps.solve import left_out
 from udccal.fitting.psf_stamps.term import StampsPsf
 from udccal.numerics import in_float64

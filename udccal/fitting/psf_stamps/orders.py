@@ -1,4 +1,9 @@
-"""Orders of a psf field, changes of them that keep what is known, and the first field, from the stamps themselves."""
+"""Which orders a psf field needs: tried from a middle one, a degree at a time, by how likely each makes the data.
+
+The criterion is -2 log of the evidence (fields, places and light integrated out by Laplace's method), plus the
+logarithm of the number of samples for each precision that was tuned (Schwarz, "Estimating the dimension of a model",
+Annals of Statistics 6, 1978).
+"""
 
 from __future__ import annotations
 
@@ -8,22 +13,28 @@ from typing import final
 
 import numpy as np
 import scipy.ndimage
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
-from udccal.fitting.psf_stamps.data import Plane
+from udccal.fitting.engine.least_squares import Solution
+from udccal.fitting.engine.orders import Attempt, Choice, choose
+from udccal.fitting.psf_stamps.data import WINDOW_PX, Scene, StampsRules, centroids, light_of
+from udccal.fitting.psf_stamps.equations import MapCoefficients, marginal_cov
 from udccal.fitting.psf_stamps.field import PlaneField, warps
-from udccal.fitting.psf_stamps.likelihood import Scene, State
-from udccal.fitting.psf_stamps.prior import Precisions, envelope
-from udccal.fitting.psf_stamps.rules import StampsRules
-from udccal.fitting.psf_stamps.solve import improve, without_outliers
+from udccal.fitting.psf_stamps.probability import Precisions, State, envelope, updated
+from udccal.fitting.psf_stamps.solve import Evidence, Laplace, improve, without_outliers
 from udccal.models.fields import polynomial_terms
 
-_WINDOW_PX, _ROUNDS = 1.6, 15
+Found = Solution[State, Laplace]
+Tried = Attempt[Found]
+
 # How many nodes there are changes by steps: an image's nodes do not move with every digit of a map.
 _STEP = 3
 # How far images reach beyond stamps: at the start; and at least and at most, once it is known how far maps look.
 _REACH, _LEAST_REACH, _MOST_REACH = 1.1, 1.0, 1.7
 _LATERAL_DEGREE = 2
+# The error of cubic splines falls with the fourth power of their spacing, what it costs in likelihood with the eighth.
+_ERROR_POWER = 8
+_ROUNDS = 30
 
 
 @final
@@ -67,7 +78,7 @@ def start(scene: Scene, rules: StampsRules) -> State:
     """A state of the lowest orders: a round image of the stamps' size."""
     spacing_px = rules.spacings_px[0]
     y, x = (np.arange(n) - (n - 1) / 2 for n in grid_size(scene.shape, spacing_px))
-    image = np.exp(-0.5 * (y[:, None] ** 2 + x**2) * (spacing_px / _WINDOW_PX) ** 2) + 1e-3
+    image = np.exp(-0.5 * (y[:, None] ** 2 + x**2) * (spacing_px / WINDOW_PX) ** 2) + 1e-3
     image /= image.sum() * spacing_px**2
     fields, precisions = [], []
     for plane in range(len(scene.planes)):
@@ -78,8 +89,8 @@ def start(scene: Scene, rules: StampsRules) -> State:
         precisions.append(Precisions(first, np.zeros(0), np.full(lateral, rules.first_lateral)))
     return State(
         fields=tuple(fields),
-        centre_px=_centroids(scene.planes, len(scene.unit)),
-        flux_e=np.stack([_light(plane, scene.read_e) for plane in scene.planes], axis=1),
+        centre_px=centroids(scene.planes, len(scene.unit)),
+        flux_e=np.stack([light_of(plane, scene.read_e) for plane in scene.planes], axis=1),
         precisions=tuple(precisions),
         envelopes=(envelope(image, spacing_px),) * len(fields),
         keep=tuple(np.ones(plane.usable.shape, dtype=bool) for plane in scene.planes),
@@ -146,27 +157,132 @@ def _resampled(
     return np.asarray(scipy.ndimage.spline_filter(values, order=3, mode="mirror"))
 
 
-def _centroids(planes: tuple[Plane, ...], stars: int) -> Float[np.ndarray, "stars 2"]:
-    """Under a Gaussian that follows, all colours alike: of light per sample, each colour by its own number of them."""
-    centre = np.zeros((stars, 2))
+def search(scene: Scene, rules: StampsRules, orders: Orders | None) -> Choice[Found]:
+    """The orders, found unless they are given, and their fit.
+
+    Raises:
+        numpy.linalg.LinAlgError: when the equations are singular.
+    """
+    most = orders or _highest(scene, rules)
+    state, tried = coarse(scene, rules, most), []
+    if orders is not None:
+        state = with_degrees(with_spacing(scene, state, orders.spacing_px), orders.warp, orders.image, rules)
+        state = improve(scene, state, rules, rules.steps_to_end).place
+    else:
+        tried = _spacings(scene, _degrees(scene, state, rules, most), rules)
+        state = choose(tried).best.fit.place
+    final = attempt(scene, improve(scene, without_outliers(scene, state, rules), rules, rules.steps_to_end))
+    return Choice(final, (*(t for t in tried if t.name != final.name), final))
+
+
+def attempt(scene: Scene, found: Found, more: float = 0.0) -> Tried:
+    """With its criterion; ``more`` log evidence than the equations have."""
+    state = found.place
+    criterion = _price(scene) * sum(len(own.flat) for own in state.precisions) - 2 * (found.equations.evidence + more)
+    return Attempt(orders_of(state).name, state.numbers, criterion, found)
+
+
+def _price(scene: Scene) -> float:
+    """Of a precision that is tuned."""
+    return float(np.log(scene.samples))
+
+
+def _highest(scene: Scene, rules: StampsRules) -> Orders:
+    """No more polynomials than half the stars."""
+
+    def most(limit: int) -> int:
+        return max(d for d in range(limit + 1) if d == 0 or 2 * polynomial_terms(d) <= len(scene.unit))
+
+    return Orders(most(rules.highest_map), most(rules.highest_image), rules.spacings_px[0])
+
+
+def _degrees(scene: Scene, state: State, rules: StampsRules, most: Orders) -> list[Tried]:
+    """All that were tried, going from neighbour to neighbour until none is better."""
+    best = attempt(scene, improve(scene, state, rules, rules.steps_to_judge + 1))
+    tried, known = [best], {orders_of(state)}
+    while True:
+        own = orders_of(best.fit.place)
+        steps = ((0, -1), (-1, 0), (-2, 0), (1, 0), (2, 0), (0, 1))
+        near = [Orders(own.warp + w, own.image + i, own.spacing_px) for w, i in steps]
+        near = [o for o in near if o not in known and 0 <= o.warp <= most.warp and 0 <= o.image <= most.image]
+        widest = max((o.warp for o in near), default=own.warp)
+        gains = expected_gains(scene, best.fit.place, widest, rules) if widest > own.warp else ()
+        tried += [_judged(scene, best, o, gains, rules) for o in near]
+        known.update(near)
+        if (better := choose(tried).best) is best:
+            return tried
+        best = better
+
+
+def _judged(scene: Scene, best: Tried, orders: Orders, gains: tuple[float, ...], rules: StampsRules) -> Tried:
+    """A fit of these degrees, or what the curvature says of it, where that is beyond doubt.
+
+    Maps are fitted neither where those that matter so much are left out, nor where they by far do not bring what they
+    cost.
+    """
+    own = orders_of(best.fit.place)
+    state = with_degrees(best.fit.place, orders.warp, orders.image, rules)
+    wider = orders.warp - own.warp
+    change = gains[wider - 1] if wider > 0 else -_loss(best.fit, orders.warp)
+    # Of the evidence, half the price of each precision is what counts against it.
+    cost = 0.5 * _price(scene) * len(scene.planes) * wider
+    if change < (rules.worth_fitting * cost if wider > 0 else -rules.beyond_doubt):
+        return attempt(scene, replace(best.fit, place=state), change)
+    new = orders.warp + orders.image > own.warp + own.image
+    return attempt(scene, improve(scene, state, rules, rules.steps_to_judge_new if new else rules.steps_to_judge))
+
+
+def _spacings(scene: Scene, tried: list[Tried], rules: StampsRules) -> list[Tried]:
+    """With the best degrees on denser nodes, as long as the last gain lets expect another that is worth it."""
+    gain, first, *finer = np.inf, *rules.spacings_px
+    for spacing in finer:
+        best = choose(tried).best
+        if gain * (finer[0] / first) ** _ERROR_POWER < rules.worth_finer:
+            break
+        state = without_outliers(scene, with_spacing(scene, best.fit.place, spacing), rules)
+        tried = [*tried, attempt(scene, improve(scene, state, rules, rules.steps_to_judge))]
+        gain = best.criterion - tried[-1].criterion
+    return tried
+
+
+def _loss(best: Found, degree: int) -> float:
+    """Of log posterior when all higher degrees of the maps are held at zero."""
+    dropped = MapCoefficients.above(best.place, degree)
+    if not dropped.value.size:
+        return 0.0
+    return 0.5 * float(dropped.value @ np.linalg.solve(marginal_cov(best.equations.root, dropped.index), dropped.value))
+
+
+def expected_gains(scene: Scene, state: State, highest: int, rules: StampsRules) -> tuple[float, ...]:
+    """By how much the log evidence would rise with maps of each degree above the state's, up to ``highest``.
+
+    From one expansion instead of a fit for each. To second order, what the data say of coefficients at zero is a
+    Gaussian; a prior of precision L makes it raise the evidence by h' (Q + L)^-1 h / 2 - log |1 + L^-1 Q| / 2, where Q
+    is the information that all other unknowns leave and h the gradient of the log likelihood. The precisions that raise
+    it most follow without another look at the data.
+    """
+    own = orders_of(state)
+    wider = with_degrees(state, highest, own.image, rules)
+    found, new = Evidence(scene, rules).equations_at(wider), MapCoefficients.above(wider, own.warp)
+    posterior = np.linalg.inv(marginal_cov(found.root, new.index))
+    information, gradient = posterior - np.diag(new.precision), posterior @ found.mode[new.index]
+    return tuple(_gain(new, information, gradient, new.degree <= d) for d in range(own.warp + 1, highest + 1))
+
+
+def _gain(
+    new: MapCoefficients,
+    information: Float[np.ndarray, "n n"],
+    gradient: Float[np.ndarray, " n"],
+    among: Bool[np.ndarray, " n"],
+) -> float:
+    """With the likeliest precisions, one by degree and colour, of those ``among``; the others are held at zero."""
+    information, gradient = information[np.ix_(among, among)], gradient[among]
+    _, group = np.unique(new.degree[among] + 100 * new.colour[among], return_inverse=True)
+    precision = new.precision[among]
     for _ in range(_ROUNDS):
-        top, bottom = np.zeros((stars, 2)), np.zeros(stars)
-        for plane in planes:
-            off = plane.offset_px - centre[:, None]
-            weight = plane.usable * np.exp(-0.5 * (off**2).sum(axis=2) / _WINDOW_PX**2)
-            light = weight * np.maximum(plane.value_e, 0.0)
-            # The mean under the weight alone is taken off: samples of a mosaic do not lie evenly about the centre.
-            mean = np.einsum("ks,ksi->ki", weight, off) / np.maximum(weight.sum(axis=1), 1e-300)[:, None]
-            top += np.einsum("ks,ksi->ki", light, off - mean[:, None])
-            bottom += light.sum(axis=1)
-        move = 2 * top / np.maximum(bottom, 1e-300)[:, None]
-        centre = np.clip(centre + np.clip(move, -1.0, 1.0), -3.0, 3.0)
-    return centre
-
-
-def _light(plane: Plane, read_e: float) -> Float[np.ndarray, " stars"]:
-    """Sums, scaled up for samples that are missing; in light per pixel of all colours."""
-    known = np.maximum(plane.usable.sum(axis=1), 1)
-    total = (plane.value_e * plane.usable).sum(axis=1)
-    pixels = int(plane.place.max()) + 1
-    return np.maximum(total * pixels / known, 10 * read_e)
+        cov = np.linalg.inv(information + np.diag(precision))
+        sums = [np.bincount(group, part)[group] for part in (1 / precision, np.diag(cov), (cov @ gradient) ** 2)]
+        precision = updated(precision, *sums)
+    posterior = information + np.diag(precision)
+    volume = np.linalg.slogdet(posterior)[1] - np.log(precision).sum()
+    return 0.5 * float(gradient @ np.linalg.solve(posterior, gradient) - volume)

@@ -11,10 +11,9 @@ from jaxtyping import Bool, Float
 from udccal.fitting.engine.gaussian import scaled_inverse
 from udccal.fitting.engine.least_squares import Solution, SolverRules, Step, minimise
 from udccal.fitting.engine.robust import OutlierRule, outliers
+from udccal.fitting.psf_stamps.data import Scene, StampsRules
 from udccal.fitting.psf_stamps.equations import factors
-from udccal.fitting.psf_stamps.likelihood import Scene, State, expectation
-from udccal.fitting.psf_stamps.prior import expected_squares, updated
-from udccal.fitting.psf_stamps.rules import StampsRules
+from udccal.fitting.psf_stamps.probability import State, expectation, expected_squares, updated
 from udccal.result import Outliers
 
 _ROUNDS_OF_PLACES, _FARTHEST_PX = 4, 0.5
