@@ -25,7 +25,7 @@ from tests.scenes.wire import (
     shape_values,
     start,
 )
-from udccal.models.wire import Wire
+from udccal.models.wire import Wire, wire_map
 from udccal.result import FitResult, FitStatus
 
 # Baseline up to degree 4, three site gains.
