@@ -92,3 +92,10 @@ def test_array_calibration_says_how_sure_it_is() -> None:
 @pytest.mark.slow
 def test_psf_from_stamps() -> None:
     assert "CONVERGED" in run("examples/psf_from_stamps.py")
+
+
+@pytest.mark.slow
+def test_wire_from_flat() -> None:
+    said = run("examples/wire_from_flat.py")
+    assert "CONVERGED" in said
+    assert "standoff_per_pitch" in said
