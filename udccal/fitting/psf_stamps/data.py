@@ -64,8 +64,9 @@ class StampsRules:
         highest_map, highest_image: degrees.
         steps_to_judge, steps_to_judge_new, steps_to_end: of one fit at most: of candidates, of those with a degree that
             comes new, and of the fit that is given.
-        gain, evidence: converged when one more step would raise the log posterior by less, and the last one raised the
-            log evidence by less.
+        gain, evidence: converged when one more step promises less log posterior, and the last one brought less log
+            evidence; that step is taken, too. What it promises is not what the evidence gains near its maximum: there
+            precisions and unknowns go on to trade places by hundredths.
         beyond_doubt: log evidence; candidates expected to lose more are not fitted.
         worth_fitting: nor those expected to gain less than this part of what their precisions cost.
         first_image, first_map, first_lateral: precisions before the data: of images of degree 0 (size, roughness) and
@@ -94,7 +95,7 @@ class StampsRules:
     steps_to_judge: int = 2
     steps_to_judge_new: int = 1
     steps_to_end: int = 12
-    gain: float = 0.3
+    gain: float = 1.0
     evidence: float = 2.0
     beyond_doubt: float = 200.0
     worth_fitting: float = 0.5
