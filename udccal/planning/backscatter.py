@@ -27,10 +27,9 @@ from udccal.fitting.backscatter.vector import Prior, prior_of, values_of, with_v
 from udccal.fitting.nominal import nominal_backscatter
 from udccal.models.backscatter import Backscatter, emitter_shares, mixed_colours, panel_light
 from udccal.numerics import in_float64
-from udccal.planning.light import EvenField, sample_variance_e
+from udccal.planning.forecast import Floor
 from udccal.planning.panel_bins import BinNoise, Ratios, light_sigma, told_by
-from udccal.planning.prediction import Floor
-from udccal.planning.state import WHITE, RigState
+from udccal.planning.state import WHITE, EvenField, RigState, sample_variance_e
 from udccal.planning.steps import PlannedStep, planned_steps
 from udccal.rig import Captures
 

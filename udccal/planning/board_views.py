@@ -13,11 +13,10 @@ from scipy.spatial.transform import Rotation
 from scipy.special import erf
 
 from udccal.arrangements import Board, BoardSpec
+from udccal.fitting.engine.gaussian import marginal_information
 from udccal.fitting.geometry.corners import MIN_CORNERS, board_points_mm, charuco_board
 from udccal.models.geometry import Geometry, project, rotation_matrix
-from udccal.planning.algebra import without
-from udccal.planning.light import EvenField, sample_variance_e
-from udccal.planning.state import WHITE, RigState
+from udccal.planning.state import WHITE, EvenField, RigState, sample_variance_e
 from udccal.planning.steps import PlannedStep
 
 LENS = 9
@@ -69,7 +68,7 @@ def planned_view(state: RigState, field: EvenField, step: PlannedStep, board: Bo
     information = np.einsum("cai,caj->ij", whole, whole)
     kept = LENS + (3 if board.parallel_to_panel else 0)
     reduced = np.zeros((LENS + 3, LENS + 3))
-    reduced[:kept, :kept] = without(information, kept)
+    reduced[:kept, :kept] = marginal_information(information, kept)
     return PlannedView(reduced, int(good.sum()), board.parallel_to_panel)
 
 

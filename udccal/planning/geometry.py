@@ -13,15 +13,14 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from udccal.arrangements import Board
+from udccal.fitting.engine.gaussian import scaled_inverse
 from udccal.fitting.geometry.bundle_orders import ORDERS
 from udccal.fitting.geometry.fit import rig_prior
 from udccal.models.geometry import Geometry, project, rotation_matrix, unproject
 from udccal.numerics import in_float64
-from udccal.planning.algebra import covariance
 from udccal.planning.board_views import LENS, PlannedView, lens_vector, planned_view
-from udccal.planning.light import EvenField
-from udccal.planning.prediction import Floor
-from udccal.planning.state import RigState, sensor_samples
+from udccal.planning.forecast import Floor
+from udccal.planning.state import EvenField, RigState, sensor_samples
 from udccal.planning.steps import planned_steps
 from udccal.rig import Captures
 
@@ -80,17 +79,17 @@ class GeometryPredictor:
         information[:LENS, :LENS] += np.diag(rig_prior(self._state.rig).precision)
         samples = 2 * sum(view.corners for view in views)
         free = self._order(information, 12 + 6 * len(views) - 9, samples)
-        cov, slopes = covariance(information[np.ix_(free, free)]), self._rays[:, :, free]
+        cov, slopes = scaled_inverse(information[np.ix_(free, free)]), self._rays[:, :, free]
         return float(np.sqrt(np.einsum("nai,ij,naj->na", slopes, cov, slopes).mean()))
 
     def _order(self, information: Float[np.ndarray, "12 12"], others: int, samples: int) -> Bool[np.ndarray, "12"]:
         """The distortions that the data are expected to ask for, by the fit's own criterion, n ln(chi2) + k ln(n)."""
-        cov = covariance(information)
+        cov = scaled_inverse(information)
         freedom = max(samples - others, 1)
         scores = []
         for _, order in ORDERS:
             held = 4 + np.flatnonzero(1 - np.array(order))
-            rise = float(self._lens[held] @ covariance(cov[np.ix_(held, held)]) @ self._lens[held])
+            rise = float(self._lens[held] @ scaled_inverse(cov[np.ix_(held, held)]) @ self._lens[held])
             scores.append(samples * np.log1p(rise / freedom) + sum(order) * np.log(samples))
         chosen = ORDERS[int(np.argmin(scores))][1]
         return np.array((1, 1, 1, 1, *chosen, 1, 1, 1), dtype=bool)

@@ -16,8 +16,7 @@ from udccal.fitting.psf.descent import Prior
 from udccal.fitting.psf.normal import Evaluator, kernel_coefficients, overlaps_of, unit_light
 from udccal.fitting.psf.samples import choose_samples
 from udccal.fitting.psf.shots import Shots
-from udccal.planning.light import sample_variance_e
-from udccal.planning.state import WHITE, RigState
+from udccal.planning.state import WHITE, RigState, sample_variance_e
 from udccal.planning.steps import PlannedStep
 from udccal.rig import Captures
 

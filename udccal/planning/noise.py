@@ -13,10 +13,9 @@ import numpy as np
 from jaxtyping import Float
 
 from udccal.arrangements import Dark, FlatLight
-from udccal.planning.algebra import covariance
-from udccal.planning.light import EvenField
-from udccal.planning.prediction import Floor
-from udccal.planning.state import RigState, sensor_samples
+from udccal.fitting.engine.gaussian import scaled_inverse
+from udccal.planning.forecast import Floor
+from udccal.planning.state import EvenField, RigState, sensor_samples
 from udccal.planning.steps import PlannedStep, planned_steps
 from udccal.rig import Captures
 
@@ -50,7 +49,7 @@ class NoisePredictor:
         if usable < _FEWEST_LEVELS:
             return float("inf")
         K = float(np.asarray(self._state.noise.K_DN_per_e))
-        return 100.0 * float(np.sqrt(covariance(information)[0, 0])) / K
+        return 100.0 * float(np.sqrt(scaled_inverse(information)[0, 0])) / K
 
     def floor(self) -> Floor:
         """None: every further pair tells more."""

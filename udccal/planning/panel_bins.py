@@ -12,7 +12,7 @@ from typing import final
 import numpy as np
 from jaxtyping import Float
 
-from udccal.planning.algebra import covariance
+from udccal.fitting.engine.gaussian import scaled_inverse
 
 
 @final
@@ -81,7 +81,7 @@ def light_sigma(new: Ratios, noise: BinNoise, told: Told, prior: Float[np.ndarra
         prior: information on the kernel from before.
         inflation: of its variances.
     """
-    cov = covariance(told.kernel + prior) * inflation
+    cov = scaled_inverse(told.kernel + prior) * inflation
     slope = noise.mask[..., None] * new.slope - new.value[..., None] * told.following
     variance = np.einsum("icnk,kl,icnl->icn", slope, cov, slope, optimize=True) + new.value**2 / told.mask
     peak = (noise.mask * new.value).max(axis=(1, 2))

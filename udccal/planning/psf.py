@@ -18,15 +18,15 @@ from jaxtyping import Array, Float
 
 from udccal.arrangements import Led
 from udccal.calibration import FitEffort
+from udccal.fitting.engine.gaussian import scaled_inverse
 from udccal.fitting.psf.blocks import Block, Local
 from udccal.fitting.psf.descent import Prior, without_locals
 from udccal.fitting.psf.normal import Evaluator, Normal, normal_equations
 from udccal.fitting.psf.start import start_model, start_prior, wire_shows
 from udccal.numerics import in_float64
-from udccal.planning.algebra import covariance
-from udccal.planning.knobs import KNOBS
+from udccal.planning.design import DESIGN_VARIABLES
+from udccal.planning.forecast import Floor
 from udccal.planning.led_shots import ExpectedShots, expected_shots, sample_information
-from udccal.planning.prediction import Floor
 from udccal.planning.state import RigState, built_wire
 from udccal.planning.steps import PlannedStep, planned_steps
 from udccal.rig import Captures
@@ -36,7 +36,7 @@ _FEWEST_POSITIONS: Final = 3
 _HELD_OUT_EVERY: Final = 4
 # Steps of one term are alike but for their place: a design of so few shows how each is exposed.
 _SAMPLE: Final = {"psf_columns": 1, "psf_rows": 1, "psf_shifts": 1}
-_EXPOSURES: Final = next(knob for knob in KNOBS["psf"] if knob.name == "psf_exposures")
+_EXPOSURES: Final = next(one for one in DESIGN_VARIABLES["psf"] if one.name == "psf_exposures")
 
 
 @final
@@ -142,7 +142,7 @@ class PsfPredictor:
 
     def _of_noise(self, one: Float[np.ndarray, "p p"], shots: int) -> float:
         """Squared relative L2 error of the kernel by noise."""
-        return float(np.sum(self._by_sample * covariance(self._precision + shots * one)))
+        return float(np.sum(self._by_sample * scaled_inverse(self._precision + shots * one)))
 
 
 @eqx.filter_jit

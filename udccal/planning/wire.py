@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from udccal.arrangements import Dark, FlatLight
+from udccal.fitting.engine.gaussian import scaled_inverse
 from udccal.fitting.wire.basis import SITES, Basis, Pixels, model_columns, sample_pixels
 from udccal.fitting.wire.fit import FIELD_SAMPLES
 from udccal.fitting.wire.harmonics import full_basis, plain_basis, possible_harmonics, wire_start
@@ -20,10 +21,8 @@ from udccal.fitting.wire.scan import ideal_wire, with_harmonics
 from udccal.fitting.wire.slopes import SHAPE_PARAMETERS
 from udccal.models.wire import Wire
 from udccal.numerics import in_float64
-from udccal.planning.algebra import covariance
-from udccal.planning.light import EvenField, sample_variance_e
-from udccal.planning.prediction import Floor
-from udccal.planning.state import RigState
+from udccal.planning.forecast import Floor
+from udccal.planning.state import EvenField, RigState, sample_variance_e
 from udccal.planning.steps import PlannedStep, planned_steps
 from udccal.rig import Captures
 
@@ -98,7 +97,7 @@ class WirePredictor:
         left_out = self._state.unexplained.wire if model is None else model
         weight = np.where(self._used, each / np.maximum(relative * self._value**2, 1e-12), 0.0)
         information = (self._design * weight) @ self._design.T + np.diag(self._precision)
-        cov = covariance(information)
+        cov = scaled_inverse(information)
         of_noise = np.mean(np.einsum("in,ij,jn->n", self._places, cov, self._places))
         return 100.0 * float(np.sqrt(of_noise + left_out**2))
 
