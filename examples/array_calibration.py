@@ -10,7 +10,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from udccal.fitting.geometry import Gauge, calibrate_views
+from udccal.fitting.geometry import Gauge, fit_geometry
 
 SIZE = (1280, 960)
 MATRIX = np.array([[1100.0, 0.0, 652.0], [0.0, 1100.0, 470.0], [0.0, 0.0, 1.0]])
@@ -35,11 +35,11 @@ def views(count: int, rng: np.random.Generator) -> tuple[list[np.ndarray], list[
 def main() -> None:
     """Fit, and print the lens, the evidence and the sigma of three rays."""
     board, pictures = views(12, np.random.default_rng(0))
-    found = calibrate_views(board, pictures, SIZE)
+    found = fit_geometry(board, pictures, SIZE)
     sigma = np.sqrt(np.diag(found.cov))
     order = next(c.name for c in found.candidates if c.chosen)
     print(f"{found.status.name}: rms {found.rms_px:.3f} px, distortion: {order}")
-    for name, value, one in zip(("fx", "fy", "cx", "cy"), found.intrinsics, sigma, strict=False):
+    for name, value, one in zip(("fx", "fy", "cx", "cy"), found.intrinsics.vector, sigma, strict=False):
         print(f"  {name} {value:9.2f} ± {one:.2f} px")
     pixels = np.array([[640.0, 480.0], [100.0, 80.0], [1200.0, 900.0]])
     for gauge in (Gauge.BOARDS, Gauge.ALIGNED):

@@ -14,19 +14,19 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from udccal.fitting.geometry import CalibratedViews, calibrate_views
+from udccal.fitting.geometry import CalibratedViews, fit_geometry
 
 INNER = (9, 6)
 DEFAULT_DATA = Path(__file__).resolve().parents[1] / ".." / "shared" / "data"
 
 
 def chessboard_corners(picture: np.ndarray) -> np.ndarray | None:
-    """Inner corners of a chessboard in px, or None when there is none."""
+    """Inner corners of a chessboard in px as OpenCV gives them, or None when there is none."""
     found, corners = cv2.findChessboardCorners(picture, INNER)
     if not found:
         return None
     stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 60, 1e-4)
-    return cv2.cornerSubPix(picture, corners, (5, 5), (-1, -1), stop).reshape(-1, 2)
+    return cv2.cornerSubPix(picture, corners, (5, 5), (-1, -1), stop)
 
 
 def calibrate(name: str, files: list[Path]) -> CalibratedViews | None:
@@ -39,15 +39,17 @@ def calibrate(name: str, files: list[Path]) -> CalibratedViews | None:
     rows, columns = pictures[0].shape
     x, y = np.meshgrid(np.arange(INNER[0]), np.arange(INNER[1]))
     board = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1).astype(np.float64)
-    ours = calibrate_views([board] * len(found), [c.astype(np.float64) for c in found], (columns, rows))
+    ours = fit_geometry([board] * len(found), found, (columns, rows))
     theirs, matrix, distortion, _, _ = cv2.calibrateCamera(
         [board.astype(np.float32)] * len(found), [c.astype(np.float32) for c in found], (columns, rows), None, None
     )
+    lens = ours.intrinsics
     order = next(c.name for c in ours.candidates if c.chosen)
-    print(f"{name}: board found in {len(found)} of {len(files)} pictures, {int((~ours.used).sum())} corners left out")
+    lost = int((~ours.points.used).sum())
+    print(f"{name}: board found in {len(found)} of {len(files)} pictures, {lost} corners left out")
     print(
-        f"  udccal  rms {ours.rms_px:.3f} px   fx {ours.focal[0]:.2f} fy {ours.focal[1]:.2f} "
-        f"cx {ours.centre[0]:.2f} cy {ours.centre[1]:.2f}   distortion: {order} {np.round(ours.distortion, 4)}"
+        f"  udccal  rms {ours.rms_px:.3f} px   fx {lens.focal[0]:.2f} fy {lens.focal[1]:.2f} "
+        f"cx {lens.centre[0]:.2f} cy {lens.centre[1]:.2f}   distortion: {order} {np.round(lens.distortion, 4)}"
     )
     print(
         f"  OpenCV  rms {theirs:.3f} px   fx {matrix[0, 0]:.2f} fy {matrix[1, 1]:.2f} "

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from udccal.fitting.noise import ExposureLevel, fit_noise_frames
+from udccal.fitting.noise import ExposureLevel, NoiseData, fit_noise
 
 GAIN_DN_PER_E, READ_E, BLACK_DN, WELL_E = 0.36, 4.0, 64.0, 10_000.0
 
@@ -50,7 +50,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folder", type=Path, nargs="?")
     folder = parser.parse_args().folder
-    result = fit_noise_frames(toy_levels() if folder is None else levels_of(folder))
+    result = fit_noise(NoiseData(toy_levels() if folder is None else levels_of(folder)))
     print(f"{result.status.name}: {result.status.value}")
     for estimate in result.estimates:
         print(f"  {estimate.name:22} {estimate.value:12.5g} ± {estimate.sigma:.2g} {estimate.unit}")

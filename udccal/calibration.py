@@ -16,8 +16,9 @@ from jaxtyping import Float
 from udccal.errors import UdccalError
 from udccal.fitting.absent import absent_backscatter, absent_psf, absent_wire
 from udccal.fitting.backscatter.fit import fit_backscatter
-from udccal.fitting.geometry.fit import BoardView, fit_views, read_views, rig_prior
-from udccal.fitting.noise.fit import fit_noise, nominal_noise
+from udccal.fitting.geometry import fit_boards, read_geometry
+from udccal.fitting.geometry.data import BoardView
+from udccal.fitting.noise import fit_noise, nominal_noise, read_noise
 from udccal.fitting.nominal import nominal_geometry
 from udccal.fitting.psf.fit import Effort, fit_psf
 from udccal.fitting.wire.fit import FIELD_SAMPLES, fit_wire, sensor_map
@@ -170,16 +171,17 @@ class _Fits:
 
     @cached_property
     def noise(self) -> FitResult[Noise]:
-        return self._run("noise", lambda: fit_noise(self._session), lambda: nominal_noise(self._session.rig))
+        nominal = nominal_noise(self._session.rig)
+        return self._run("noise", lambda: fit_noise(read_noise(self._session), nominal), lambda: nominal)
 
     @cached_property
     def geometry(self) -> FitResult[Geometry]:
         rig, noise = self._session.rig, self.noise.term
 
         def fit() -> FitResult[Geometry]:
-            self.boards = tuple(read_views(self._session, noise))
-            size = (rig.camera.columns, rig.camera.rows)
-            return fit_views(self.boards, nominal_geometry(rig), size, rig_prior(rig))
+            data = read_geometry(self._session, noise)
+            self.boards = data.views
+            return fit_boards(data)
 
         return self._run("geometry", fit, lambda: nominal_geometry(rig))
 

@@ -33,7 +33,7 @@ from udccal.fitting.backscatter.fit import problem_of
 from udccal.fitting.backscatter.light import predict_light
 from udccal.fitting.backscatter.report import known_from
 from udccal.fitting.backscatter.select import choose
-from udccal.fitting.geometry.fit import projection_sigma_px
+from udccal.fitting.geometry.boards import projection_sigma_px
 from udccal.models.geometry import project_directions
 from udccal.numerics import in_float64
 from udccal.planning.state import sensor_samples

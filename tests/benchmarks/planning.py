@@ -34,7 +34,7 @@ from udccal.fitting.backscatter.fit import problem_of
 from udccal.fitting.backscatter.light import predict_light
 from udccal.fitting.backscatter.report import known_from
 from udccal.fitting.backscatter.select import choose
-from udccal.fitting.geometry.fit import projection_sigma_px
+from udccal.fitting.geometry.boards import projection_sigma_px
 from udccal.planning.forecast import predictor_for
 from udccal.planning.state import Unexplained, measured_state, sensor_samples
 from udccal.rig import Captures, RigDescription, load_rig

@@ -18,7 +18,7 @@ from udccal.cli.jobs.benches import files_bench
 from udccal.cli.jobs.person import PersonStage
 from udccal.cli.output import Output
 from udccal.errors import CameraError, CaptureError, UdccalError
-from udccal.fitting.noise.fit import fit_noise
+from udccal.fitting.noise import fit_noise, read_noise
 from udccal.io.png import write_png16
 from udccal.rig import RigDescription, load_rig
 from udccal.sessions.store import Session
@@ -70,7 +70,7 @@ def test_pictures_of_any_camera_make_a_session(tmp_path: Path, rig: RigDescripti
         capture(tmp_path / "session", bench, ("noise",))
     session = Session.open(tmp_path / "session")
     assert session.camera.backend == "files"
-    result = fit_noise(session)
+    result = fit_noise(read_noise(session))
     truth = simulated_rig(rig, seed=2).truth.sensor
     assert float(result.term.K_DN_per_e) == pytest.approx(truth.K_DN_per_e, rel=0.02)
 

@@ -21,7 +21,6 @@ from unittest import mock
 
 import jax
 import numpy as np
-from udccal.fitting.result import Estimate, FitResult, FitStatus
 
 from tests.fuzz.target import Target
 from udccal.cli.jobs.show import show_profile
@@ -40,6 +39,7 @@ from udccal.restoration import runtime
 from udccal.restoration.lowrank import KernelGrid
 from udccal.restoration.plan import PlanOptions, kernel_grid
 from udccal.restoration.view import inscribed_view
+from udccal.result import Estimate, FitResult, FitStatus
 from udccal.rig import RigDescription, load_rig
 
 T = TypeVar("T")

@@ -11,7 +11,7 @@ import pytest
 from tests.toy_rigs import write_toy_rig
 from udccal.benches.bench import simulated_bench, simulated_rig
 from udccal.benches.capture import capture
-from udccal.fitting.noise.fit import fit_noise
+from udccal.fitting.noise import fit_noise, read_noise
 from udccal.fitting.wire.fit import fit_wire
 from udccal.planning.noise import NoisePredictor
 from udccal.planning.state import RigState, nominal_state
@@ -49,7 +49,7 @@ def test_the_gain_is_known_as_well_as_foretold(toy: RigDescription, tmp_path: Pa
     for levels in (6, 24):
         captures = toy.captures.model_copy(update={"noise_levels": levels, "noise_stack": 4})
         rig = toy.model_copy(update={"captures": captures})
-        K = fit_noise(captured(rig, "noise", tmp_path / str(levels))).estimate("K_DN_per_e")
+        K = fit_noise(read_noise(captured(rig, "noise", tmp_path / str(levels)))).estimate("K_DN_per_e")
         stated.append(100 * K.sigma / K.value)
         assert predictor.sigma(captures) == pytest.approx(stated[-1], rel=_OFF)
     # A prediction that does not scale would miss one of them.

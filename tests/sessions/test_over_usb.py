@@ -20,7 +20,7 @@ from udccal.cameras.choice import mode_for
 from udccal.cameras.u3v.camera import U3vCamera
 from udccal.displays.simulated import SimulatedDisplay
 from udccal.errors import CameraError, CameraLost
-from udccal.fitting.noise.fit import fit_noise
+from udccal.fitting.noise import fit_noise, read_noise
 from udccal.result import FitStatus
 from udccal.rig import RigDescription, load_rig
 from udccal.sessions.store import Session
@@ -53,7 +53,7 @@ def test_a_session_over_usb_fits_like_one_without(tmp_path: Path, rig: RigDescri
         assert bench.camera.counts.dropped == bench.camera.counts.incomplete == 0
     session = Session.open(tmp_path / "session")
     assert session.camera.backend == "u3v"
-    result = fit_noise(session)
+    result = fit_noise(read_noise(session))
     assert result.status is FitStatus.CONVERGED
     assert float(result.term.K_DN_per_e) == pytest.approx(world.truth.sensor.K_DN_per_e, rel=0.03)
 

@@ -9,8 +9,9 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
+from udccal.fitting.geometry.bundle import Intrinsics
 from udccal.fitting.geometry.corners import board_points_mm
-from udccal.fitting.geometry.fit import BoardView
+from udccal.fitting.geometry.data import BoardView
 from udccal.models.geometry import Geometry
 
 
@@ -25,7 +26,7 @@ class BoardEvidence:
 
 def board_evidence(boards: Sequence[BoardView], geometry: Geometry) -> BoardEvidence | None:
     """Corners and residuals of all usable board views; None when there are none."""
-    views = [view for view in boards if view.usable]
+    views = [view for view in boards if view.usable()]
     if not views:
         return None
     residuals = [_residuals(view, geometry) for view in views]
@@ -34,10 +35,9 @@ def board_evidence(boards: Sequence[BoardView], geometry: Geometry) -> BoardEvid
 
 def _residuals(view: BoardView, geometry: Geometry) -> Float[np.ndarray, "n 2"]:
     """Found minus projected, after the pose that fits this view best."""
-    (fx, fy), (cx, cy) = np.asarray(geometry.focal), np.asarray(geometry.centre)
-    matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-    distortion = np.asarray(geometry.distortion, dtype=np.float64)
+    lens = Intrinsics.of_geometry(geometry)
+    distortion = np.asarray(lens.distortion, dtype=np.float64)
     points_mm = board_points_mm(view.spec)[view.corners.ids]
-    _, rotation, translation = cv2.solvePnP(points_mm, view.corners.xy, matrix, distortion)
-    projected, _ = cv2.projectPoints(points_mm, rotation, translation, matrix, distortion)
+    _, rotation, translation = cv2.solvePnP(points_mm, view.corners.xy, lens.matrix, distortion)
+    projected, _ = cv2.projectPoints(points_mm, rotation, translation, lens.matrix, distortion)
     return view.corners.xy - projected.reshape(-1, 2)

@@ -15,11 +15,10 @@ from jaxtyping import Array, Float
 from tests.benchmarks.efficiency.trials import Trials
 from tests.fitting.geometry.boards import Sight, sight
 from udccal.fitting.engine.information import cramer_rao, fisher_information
-from udccal.fitting.geometry.bundle import calibrate_views
-from udccal.fitting.geometry.bundle_projection import Gauge, field_grid
-from udccal.fitting.geometry.calibrated_views import CalibratedViews
+from udccal.fitting.geometry import CalibratedViews, Gauge, GeometryData, fit_boards, fit_geometry
+from udccal.fitting.geometry.boards import projection_sigma_px
+from udccal.fitting.geometry.calibrated import field_grid
 from udccal.fitting.geometry.corners import board_points_mm
-from udccal.fitting.geometry.fit import fit_views, projection_sigma_px
 from udccal.models.geometry import Geometry, project, rotation_matrix
 from udccal.numerics import in_float64
 from udccal.result import FitResult
@@ -89,10 +88,10 @@ def trials(share: float = 1.0) -> list[Trials]:
     rng = np.random.default_rng(4)
     for _ in range(count):
         views = scene.views(rng)
-        result = fit_views(views, _START, scene.size).or_raise()
+        result = fit_boards(GeometryData(tuple(views), _START, scene.size)).or_raise()
         ids = [view.corners.ids for view in views]
         sigmas = [scene.sigma_px[k, seen] for k, seen in enumerate(ids)]
-        bundle = calibrate_views([board[i] for i in ids], [v.corners.xy for v in views], scene.size, None, sigmas)
+        bundle = fit_geometry([board[i] for i in ids], [v.corners.xy for v in views], scene.size, None, sigmas)
         parts = (
             *_parameters(result, values),
             *_panel_rays(result, turned, pixels),
@@ -141,7 +140,7 @@ def _panel_rays(result: FitResult[Geometry], turned: np.ndarray, pixels: np.ndar
 
 
 def _lens_rays(bundle: CalibratedViews, rays: np.ndarray, grid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    camera = Geometry(bundle.focal, bundle.centre, bundle.distortion, np.zeros(3), np.zeros(3))
+    camera = bundle.intrinsics.camera()
     turn = np.zeros(3)
     for _ in range(4):
         now = rays @ np.asarray(rotation_matrix(turn)).T

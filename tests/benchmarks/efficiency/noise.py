@@ -16,10 +16,10 @@ from jaxtyping import Array, Float, UInt16
 
 from tests.benchmarks.efficiency.trials import Trials, column
 from udccal.fitting.engine.information import cramer_rao, fisher_information
-from udccal.fitting.noise import codes, read_noise
-from udccal.fitting.noise.density import NORMAL_SHAPE, excess_kurtosis, tukey_lambda_std
-from udccal.fitting.noise.frames import ExposureLevel, SpatialStack, fit_noise_frames
-from udccal.fitting.noise.photon_transfer import temporal_variance
+from udccal.fitting.noise import ExposureLevel, NoiseData, NoiseRules, SpatialStack, codes, fit_noise
+from udccal.fitting.noise.codes import NORMAL_SHAPE, excess_kurtosis, tukey_lambda_std
+from udccal.fitting.noise.data import DarkPair, dark_pair
+from udccal.fitting.noise.transfer import temporal_variance
 from udccal.models.noise import Noise
 from udccal.result import FitResult
 
@@ -110,7 +110,7 @@ def measure(sensor: ToySensor, seed: int) -> FitResult[Noise]:
     levels += [ExposureLevel(t, dark=(shoot(t, False), shoot(t, False))) for t in sensor.dark_times_s]
     t = sensor.exposure_s(sensor.stack_level)
     dark, bright = ([shoot(t, lit) for _ in range(sensor.stack_frames)] for lit in (False, True))
-    return fit_noise_frames(levels, SpatialStack(t, dark, bright), top_code=2**sensor.bits - 1)
+    return fit_noise(NoiseData(levels, SpatialStack(t, dark, bright), top_code=2**sensor.bits - 1))
 
 
 def truth(sensor: ToySensor) -> dict[str, float]:
@@ -220,12 +220,12 @@ def _histogram_information(sensor: ToySensor, x: Float[np.ndarray, "12"]) -> Flo
     for t in sensor.dark_times_s:
         first, second = (expose(sensor, fixed, t, False, rng) for _ in range(2))
         # The information is expected, not observed: the counts matter by their number alone.
-        pair = codes.dark_pair(first, second, t, 1, 2**sensor.bits - 1)
+        pair = dark_pair(first, second, t, 1, 2**sensor.bits - 1)
 
-        def probability(at: Float[np.ndarray, "6"], pair: codes.DarkPair = pair) -> Float[np.ndarray, " cells"]:
+        def probability(at: Float[np.ndarray, "6"], pair: DarkPair = pair) -> Float[np.ndarray, " cells"]:
             K, V0, shape, black, rate, spread2 = at
-            known = read_noise.Surroundings(K, sensor.row_DN)
-            return read_noise.pair_probability(pair, np.array([black, rate, V0, spread2, shape]), known).ravel()
+            known = codes.Surroundings(K, sensor.row_DN, NoiseRules().background)
+            return codes.pair_probability(pair, np.array([black, rate, V0, spread2, shape]), known).ravel()
 
         p = probability(x[places])
         slopes = [(probability(x[places] + d) - probability(x[places] - d)) / (2 * d.sum()) for d in steps]

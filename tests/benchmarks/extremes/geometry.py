@@ -9,9 +9,10 @@ import numpy as np
 
 from tests.benchmarks.extremes.case import Case, Outcome, outcome
 from tests.fitting.geometry.boards import MOUNTED_DEG, Sight, sight
-from udccal.fitting.geometry.bundle_solve import Prior
+from udccal.fitting.engine.gaussian import Prior
+from udccal.fitting.geometry import GeometryData, fit_boards
 from udccal.fitting.geometry.corners import BoardCorners
-from udccal.fitting.geometry.fit import BoardView, fit_views
+from udccal.fitting.geometry.data import BoardView
 from udccal.models.geometry import Geometry
 
 _FOCAL_SIGMA_PX, _CENTRE_SIGMA_PX = 15.0, 8.0
@@ -19,9 +20,9 @@ _BEND, _BEND_SIGMA = np.array([-0.07, 0.035, 0.0, 0.0, 0.0]), np.array([0.03, 0.
 _START = Geometry(
     np.full(2, 870.0), np.array([511.5, 383.5]), np.zeros(5), np.zeros(3), np.array([600.0, 190.0, -14.0])
 )
-_PRIOR = Prior(
+_PRIOR = Prior.independent(
     np.array([870.0, 870.0, 511.5, 383.5, *_BEND]),
-    1 / np.array([*[_FOCAL_SIGMA_PX] * 2, *[_CENTRE_SIGMA_PX] * 2, *_BEND_SIGMA]) ** 2,
+    np.array([*[_FOCAL_SIGMA_PX] * 2, *[_CENTRE_SIGMA_PX] * 2, *_BEND_SIGMA]),
 )
 Change = Callable[[list[BoardView], np.random.Generator], list[BoardView]]
 
@@ -71,7 +72,8 @@ def _run(
 ) -> Outcome:
     """Fit a scene; the errors are those of the lens and the mounting that the fit frees."""
     rng = np.random.default_rng(8)
-    result = fit_views(change(scene.views(rng, parallel), rng), start, scene.size, prior)
+    views = change(scene.views(rng, parallel), rng)
+    result = fit_boards(GeometryData(tuple(views), start, scene.size, prior))
     if not result.ok:
         return outcome(result)
     truth = _truth(scene)

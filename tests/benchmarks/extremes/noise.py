@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from tests.benchmarks.efficiency.noise import ToySensor, expose, measure, patterns, truth
 from tests.benchmarks.extremes.case import Case, Outcome, outcome
-from udccal.fitting.noise.frames import ExposureLevel, SpatialStack, fit_noise_frames
+from udccal.fitting.noise import ExposureLevel, NoiseData, SpatialStack, fit_noise
 from udccal.models.noise import Noise
 from udccal.result import FitResult
 
@@ -47,14 +47,15 @@ def _without_stack() -> Outcome:
     shoot = functools.partial(expose, sensor, fixed, rng=rng)
     times = [sensor.exposure_s(level) for level in sensor.levels]
     levels = [ExposureLevel(t, (shoot(t, False), shoot(t, False)), (shoot(t, True), shoot(t, True))) for t in times]
-    result = fit_noise_frames(levels, top_code=4095)
+    result = fit_noise(NoiseData(levels, top_code=4095))
     return outcome(result, errors_in_sigma(result, sensor))
 
 
 def _one_frame_everywhere(code: int) -> Outcome:
     frame = np.full((96, 128), code, np.uint16)
     levels = [ExposureLevel(0.01 * i, (frame, frame), (frame, frame)) for i in range(1, 6)]
-    return outcome(fit_noise_frames(levels, SpatialStack(0.03, [frame] * 4, [frame] * 4), top_code=4095))
+    stack = SpatialStack(0.03, [frame] * 4, [frame] * 4)
+    return outcome(fit_noise(NoiseData(levels, stack, top_code=4095)))
 
 
 def _case(name: str, sensor: ToySensor) -> Case:

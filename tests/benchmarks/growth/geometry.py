@@ -10,8 +10,8 @@ import numpy as np
 from tests.benchmarks.growth.cases import Case
 from tests.fitting.geometry.boards import sight
 from udccal.arrangements import BoardSpec
+from udccal.fitting.geometry import GeometryData, fit_boards
 from udccal.fitting.geometry.corners import board_points_mm
-from udccal.fitting.geometry.fit import fit_views
 from udccal.models.geometry import Geometry
 from udccal.numerics import in_float64
 
@@ -28,8 +28,8 @@ def _work(views: int, corners: int) -> Callable[[], object]:
     assert len(board_points_mm(spec)) == corners
     seen = sight(views=views)
     scene = replace(seen, spec=spec, sigma_px=np.full((views, corners), float(seen.sigma_px.mean())))
-    found = scene.views(np.random.default_rng(1))
-    return lambda: fit_views(found, _START, scene.size).or_raise()
+    data = GeometryData(tuple(scene.views(np.random.default_rng(1))), _START, scene.size)
+    return lambda: fit_boards(data).or_raise()
 
 
 CASES = (

@@ -10,7 +10,7 @@ import numpy as np
 
 from tests.benchmarks.efficiency.noise import ToySensor, expose, patterns
 from tests.benchmarks.growth.cases import Case
-from udccal.fitting.noise.frames import ExposureLevel, SpatialStack, fit_noise_frames
+from udccal.fitting.noise import ExposureLevel, NoiseData, SpatialStack, fit_noise
 
 _COLUMNS, _ROWS, _LEVELS, _STACK = 2048, 384, 10, 8
 
@@ -23,7 +23,7 @@ def _work(levels: int, stack: int, rows: int) -> Callable[[], object]:
     pairs = [ExposureLevel(t, (shoot(t, False), shoot(t, False)), (shoot(t, True), shoot(t, True))) for t in times]
     t = sensor.exposure_s(sensor.stack_level)
     dark, bright = ([shoot(t, lit) for _ in range(stack)] for lit in (False, True))
-    return lambda: fit_noise_frames(pairs, SpatialStack(t, dark, bright), top_code=2**sensor.bits - 1)
+    return lambda: fit_noise(NoiseData(pairs, SpatialStack(t, dark, bright), top_code=2**sensor.bits - 1))
 
 
 CASES = (

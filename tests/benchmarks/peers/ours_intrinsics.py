@@ -1,4 +1,4 @@
-"""The work ``intrinsics`` of the peers' folder, through ``calibrate_views``. Prints one JSON line as the peers do.
+"""The work ``intrinsics`` of the peers' folder, through ``fit_geometry``. Prints one JSON line as the peers do.
 
     python -m tests.benchmarks.peers.ours_intrinsics --peers ../shared/peers --seeds 10 --starts 1000 --covered 200
 
@@ -20,7 +20,7 @@ from types import ModuleType
 import numpy as np
 
 from udccal import __version__
-from udccal.fitting.geometry import CalibratedViews, Gauge, calibrate_views
+from udccal.fitting.geometry import CalibratedViews, Gauge, fit_geometry
 from udccal.models.geometry import Geometry
 
 Boards = tuple[list[np.ndarray], list[np.ndarray]]
@@ -51,7 +51,7 @@ def same(found: CalibratedViews, reference: CalibratedViews) -> bool:
     """Whether two calibrations are one minimum: within a hundredth of a sigma in everything."""
     sigma = np.sqrt(np.diag(reference.cov))[:9]
     told = sigma > 0
-    off = np.abs(found.intrinsics - reference.intrinsics)
+    off = np.abs(found.intrinsics.vector - reference.intrinsics.vector)
     return found.free == reference.free and bool((off[told] < 0.01 * sigma[told]).all())
 
 
@@ -61,7 +61,7 @@ def converged(works: ModuleType, data: list[Boards], references: list[Calibrated
     for k in range(starts):
         board, image = data[k % len(data)]
         start, poses = random_start(works, len(board), rng)
-        found = calibrate_views(board, image, (works.W, works.H), start, start_poses=poses)
+        found = fit_geometry(board, image, (works.W, works.H), start, start_poses=poses)
         count += found.converged and same(found, references[k % len(data)])
     return count
 
@@ -82,14 +82,14 @@ def aligned(works: ModuleType, intrinsics: np.ndarray) -> np.ndarray:
 def z_scores(works: ModuleType, result: CalibratedViews) -> np.ndarray:
     """Errors after the best common rotation in units of the sigma stated for them, (81, 2)."""
     cov = result.projection_covariance(works.intr_grid(), Gauge.ALIGNED)
-    return aligned(works, result.intrinsics) / np.sqrt(np.einsum("nii->ni", cov))
+    return aligned(works, result.intrinsics.vector) / np.sqrt(np.einsum("nii->ni", cov))
 
 
 def spread(works: ModuleType, seeds: int) -> tuple[float, float]:
     """Root mean square of the z-scores over so many seeds, and its standard error."""
     size = (works.W, works.H)
     square = np.array(
-        [(z_scores(works, calibrate_views(*boards(works, seed), size)) ** 2).mean() for seed in range(seeds)]
+        [(z_scores(works, fit_geometry(*boards(works, seed), size)) ** 2).mean() for seed in range(seeds)]
     )
     rms = float(np.sqrt(square.mean()))
     return rms, float(square.std(ddof=1) / np.sqrt(seeds) / (2 * rms))
@@ -108,17 +108,17 @@ def main() -> None:
     size = (works.W, works.H)
     data = [boards(works, seed) for seed in range(options.seeds)]
     begun = time.perf_counter()
-    calibrate_views(*data[0], size)
+    fit_geometry(*data[0], size)
     first = time.perf_counter() - begun
     results, seconds, sigmas = [], [], []
     for views in data:
-        calibrate_views(*views, size)  # other numbers of corners may be another padded size
-        result, taken, _ = works.timed(lambda views=views: calibrate_views(*views, size))
+        fit_geometry(*views, size)  # other numbers of corners may be another padded size
+        result, taken, _ = works.timed(lambda views=views: fit_geometry(*views, size))
         results.append(result)
         seconds.append(taken)
         cov = result.projection_covariance(works.intr_grid(), Gauge.ALIGNED)
         sigmas.append(np.sqrt(np.einsum("nii->ni", cov)))
-    metrics = [works.intrinsics_metrics(result.intrinsics) for result in results]
+    metrics = [works.intrinsics_metrics(result.intrinsics.vector) for result in results]
     pooled = {key: float(np.sqrt(np.mean([m[key] ** 2 for m in metrics]))) for key in metrics[0]}
     z_std, z_std_error = spread(works, options.covered)
     found = converged(works, data, results, options.starts) if options.starts else None

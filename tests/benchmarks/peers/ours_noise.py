@@ -15,8 +15,7 @@ from typing import Any
 import numpy as np
 
 from tests.benchmarks.peers.works_module import arguments, load
-from udccal.fitting.noise import ExposureLevel, SpatialStack, fit_noise_frames
-from udccal.fitting.noise.response import mean_response
+from udccal.fitting.noise import ExposureLevel, NoiseData, SpatialStack, fit_noise, mean_response
 from udccal.models.noise import Noise
 from udccal.result import FitResult
 
@@ -40,7 +39,7 @@ def fit(works: ModuleType, data: dict[str, Any]) -> FitResult[Noise]:
     middle = works.NOISE["spatial_level"]
     dark, bright = data["spatial"]
     stack = SpatialStack(float(data["t"][middle]), loaders(dark), loaders(bright), float(data["u_p"][middle]))
-    return fit_noise_frames(levels, stack).or_raise()
+    return fit_noise(NoiseData(levels, stack)).or_raise()
 
 
 def metrics(works: ModuleType, data: dict[str, Any], result: FitResult[Noise]) -> dict[str, float]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -126,3 +126,14 @@ def test_damping_shortens_the_step() -> None:
     free, damped = blocks.step(0.0), blocks.step(10.0)
     assert np.abs(damped.shared[0]) < np.abs(free.shared[0])
     assert damped.gain < free.gain
+
+
+def test_held_parameters_stay_and_the_others_step_as_if_they_were_known() -> None:
+    blocks, whole = _blocks(np.random.default_rng(3))
+    step = replace(blocks, held=np.array([False, True, False])).step(0.0)
+    used = [0, 2, *range(3, whole.shape[0] - 2)]
+    expected = np.linalg.solve(whole[np.ix_(used, used)], whole[used, -1])
+    assert step.shared[1] == 0.0
+    assert np.concatenate([step.shared[[0, 2]], step.own.ravel()[:-2]]) == pytest.approx(expected, rel=1e-8)
+    assert step.gain == pytest.approx(whole[used, -1] @ expected, rel=1e-9)
+    assert step.gain < blocks.step(0.0).gain

@@ -43,6 +43,14 @@ def test_an_error_beside_noise_is_measured(size: float) -> None:
     assert excess_sigma(residual**2, noise, light**2, 5000.0) == pytest.approx(size, rel=0.05, abs=1e-12)
 
 
+def test_an_error_that_chance_may_explain_is_estimated_only_where_asked() -> None:
+    residual = 1.05 * np.random.default_rng(8).standard_normal(200)
+    ones = np.ones(200)
+    assert excess_sigma(residual**2, ones, ones, 200.0) == 0.0
+    assert excess_sigma(residual**2, ones, ones, 200.0, chance=0.5) > 0.1
+    assert excess_sigma(0.8 * ones, ones, ones, 200.0, chance=0.5) == 0.0
+
+
 @pytest.mark.parametrize("with_information", [True, False])
 def test_groups_that_differ_widen_the_covariance_to_the_true_scatter(with_information: bool) -> None:
     """A straight line through groups that each have an offset of their own, which the model lacks."""

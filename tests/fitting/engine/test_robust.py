@@ -37,3 +37,9 @@ def test_robust_losses_are_squares_near_zero_and_smooth() -> None:
         assert np.allclose(loss[np.abs(z) < 0.05], z[np.abs(z) < 0.05] ** 2, rtol=1e-3)
         assert (loss <= z**2 + 1e-12).all()
         assert np.abs(np.diff(loss, 2)).max() < 3e-4
+
+
+def test_a_weight_is_the_loss_by_its_square() -> None:
+    z, step = np.array([0.1, 2.5, 30.0]), 1e-6
+    slope = (Cauchy().loss(z + step) - Cauchy().loss(z - step)) / ((z + step) ** 2 - (z - step) ** 2)
+    assert np.allclose(Cauchy().weight(z), slope, rtol=1e-6)

@@ -10,7 +10,7 @@ import numpy as np
 
 from udccal.arrangements import BoardSpec
 from udccal.fitting.geometry.corners import BoardCorners, board_points_mm, charuco_board
-from udccal.fitting.geometry.views import BoardView
+from udccal.fitting.geometry.data import BoardView
 from udccal.models.geometry import Geometry, mounting_rotation, project, unproject
 
 SPEC = BoardSpec(columns=7, rows=5, square_mm=40.0, marker_mm=30.0)

@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 
 from tests.fitting.geometry.boards import VISIBLE_BEND, Sight, sight
 from udccal.errors import FitError
-from udccal.fitting.geometry import CalibratedViews, Prior, calibrate_views
+from udccal.fitting.engine.gaussian import Prior
+from udccal.fitting.geometry import CalibratedViews, fit_geometry
 from udccal.fitting.geometry.corners import board_points_mm
 from udccal.models.geometry import Geometry
 from udccal.result import FitStatus
@@ -29,14 +30,14 @@ def arrays(scene: Sight = SCENE, seed: int = 1) -> tuple[list[np.ndarray], list[
 
 def calibrate(scene: Sight = SCENE, **options: object) -> CalibratedViews:
     board, image, sigma = arrays(scene)
-    return calibrate_views(board, image, scene.size, sigmas=sigma, **options)
+    return fit_geometry(board, image, scene.size, sigmas=sigma, **options)
 
 
 def errors(found: CalibratedViews, scene: Sight = SCENE) -> np.ndarray:
     """Of the free intrinsics, in sigma."""
     truth = np.concatenate([scene.camera.focal, scene.camera.centre, scene.camera.distortion])
     free = np.array(found.free)
-    return ((found.intrinsics - truth) / np.sqrt(np.maximum(np.diag(found.cov)[:9], 1e-300)))[free]
+    return ((found.intrinsics.vector - truth) / np.sqrt(np.maximum(np.diag(found.cov)[:9], 1e-300)))[free]
 
 
 @pytest.fixture(scope="module")
@@ -49,8 +50,8 @@ def test_the_lens_is_found_within_its_sigma(plain: CalibratedViews) -> None:
     assert next(c.name for c in plain.candidates if c.chosen) == "k1 k2 p1 p2"
     assert np.abs(errors(plain)).max() < 4
     assert plain.chi2_dof == pytest.approx(1.0, abs=0.15)
-    assert not plain.evidence.views.flagged
-    assert not plain.evidence.pattern.flagged
+    assert not plain.evidence.views.found
+    assert not plain.evidence.pattern.found
 
 
 @pytest.mark.parametrize("factor", [0.3, 0.8, 1.2, 4.0])
@@ -59,7 +60,7 @@ def test_any_start_leads_to_the_same_lens(plain: CalibratedViews, factor: float)
     start = Geometry(SCENE.camera.focal * factor, np.array([300.0, 600.0]), np.zeros(5), np.zeros(3), np.zeros(3))
     poses = np.hstack([rng.uniform(-3, 3, (8, 3)), rng.uniform([-500, -500, -900], [500, 500, 2000], (8, 3))])
     found = calibrate(start=start, start_poses=poses)
-    np.testing.assert_allclose(found.intrinsics, plain.intrinsics, atol=1e-3)
+    np.testing.assert_allclose(found.intrinsics.vector, plain.intrinsics.vector, atol=1e-3)
     assert (found.poses[:, 5] > 0).all()
 
 
@@ -67,7 +68,7 @@ def test_points_that_are_no_numbers_are_listed_and_left_out(plain: CalibratedVie
     unseen = int((~SCENE.seen()).sum())
     rule, count = plain.outliers[0].rule, plain.outliers[0].count
     assert unseen > 0
-    assert (count, len(plain.used)) == (unseen, SCENE.seen().sum())
+    assert (count, len(plain.points.used)) == (unseen, SCENE.seen().sum())
     assert "finite" in rule
     assert np.isfinite(plain.cov).all()
 
@@ -75,7 +76,7 @@ def test_points_that_are_no_numbers_are_listed_and_left_out(plain: CalibratedVie
 def test_a_corner_in_glare_is_left_out_by_name() -> None:
     board, image, sigma = arrays()
     image[2][20] += [2.0, -1.0]
-    found = calibrate_views(board, image, SCENE.size, sigmas=sigma)
+    found = fit_geometry(board, image, SCENE.size, sigmas=sigma)
     assert "view 2, point 20" in found.outliers[-1].places
     assert found.outliers[-1].count <= 3
     assert np.abs(errors(found)).max() < 4
@@ -84,16 +85,16 @@ def test_a_corner_in_glare_is_left_out_by_name() -> None:
 def test_a_view_in_the_wrong_order_is_left_out_whole() -> None:
     board, image, sigma = arrays()
     image[3] = np.random.default_rng(2).permutation(image[3])
-    found = calibrate_views(board, image, SCENE.size, sigmas=sigma)
-    assert 3 not in found.names
+    found = fit_geometry(board, image, SCENE.size, sigmas=sigma)
+    assert 3 not in found.points.names
     assert any(one.places == ("view 3",) and "median view" in one.rule for one in found.outliers)
     assert np.abs(errors(found)).max() < 4
 
 
 def test_a_view_twice_counts_once(plain: CalibratedViews) -> None:
     board, image, sigma = arrays()
-    found = calibrate_views(board + board[:2], image + image[:2], SCENE.size, sigmas=sigma + sigma[:2])
-    assert found.names == plain.names
+    found = fit_geometry(board + board[:2], image + image[:2], SCENE.size, sigmas=sigma + sigma[:2])
+    assert found.points.names == plain.points.names
     assert "repeats" in found.notes[0]
     np.testing.assert_allclose(found.cov, plain.cov, rtol=1e-6, atol=1e-12)
 
@@ -102,8 +103,8 @@ def test_points_on_one_line_hold_no_pose() -> None:
     board, image, sigma = arrays()
     row = slice(0, SCENE.spec.columns - 1)
     board[4], image[4], sigma[4] = board[4][row], image[4][row], sigma[4][row]
-    found = calibrate_views(board, image, SCENE.size, sigmas=sigma)
-    assert 4 not in found.names
+    found = fit_geometry(board, image, SCENE.size, sigmas=sigma)
+    assert 4 not in found.points.names
     assert "one line" in found.notes[0]
 
 
@@ -111,8 +112,9 @@ def test_views_of_another_scatter_get_their_own_scale() -> None:
     board, image, sigma = arrays()
     rng = np.random.default_rng(3)
     image[1] = image[1] + 0.8 * rng.standard_normal(image[1].shape)
-    found = calibrate_views(board, image, SCENE.size, sigmas=sigma)
-    ratio = [np.median(found.sigma_px[found.view == k] / found.sigma_px[found.view == 0].mean()) for k in (1, 2)]
+    found = fit_geometry(board, image, SCENE.size, sigmas=sigma)
+    view, sigma_px = found.points.view, found.points.sigma
+    ratio = [np.median(sigma_px[view == k] / sigma_px[view == 0].mean()) for k in (1, 2)]
     assert ratio[0] > 4
     assert 0.5 < ratio[1] < 2
     assert np.abs(errors(found)).max() < 4
@@ -128,7 +130,7 @@ def test_boards_never_leaned_do_not_tell_the_focal_length() -> None:
 def test_a_prior_holds_what_the_views_do_not_tell() -> None:
     sigma = np.array([15.0, 15.0, 8.0, 8.0, 0.03, 0.02, 1e-3, 1e-3, 0.01])
     mean = np.array([870.0, 870.0, 515.0, 380.0, *VISIBLE_BEND])
-    found = calibrate(sight(views=8, lean_rad=0.0, tilt_deg=0.0), prior=Prior(mean, 1 / sigma**2))
+    found = calibrate(sight(views=8, lean_rad=0.0, tilt_deg=0.0), prior=Prior.independent(mean, sigma))
     assert found.status is FitStatus.CONVERGED
     assert np.sqrt(found.cov[0, 0]) == pytest.approx(15.0 / np.sqrt(2), rel=0.1)  # fx and fy are as good as one
     assert all(found.free)
@@ -139,7 +141,7 @@ def test_too_few_views_are_refused_with_the_reason() -> None:
     board, image, _ = arrays()
     image[1] = np.full_like(image[1], np.nan)
     with pytest.raises(FitError, match="View 1 is left out: expected at least 6 points, found 0"):
-        calibrate_views(board[:3], image[:3], SCENE.size)
+        fit_geometry(board[:3], image[:3], SCENE.size)
 
 
 @settings(
@@ -162,13 +164,13 @@ def test_whatever_the_views_a_lens_or_advice(seed: int, tilt: float, lean: float
     rng = np.random.default_rng(seed)
     image = [np.where(rng.uniform(size=(len(view), 1)) < lost, np.nan, view) for view in image]
     try:
-        found = calibrate_views(board, image, scene.size, sigmas=sigma)
+        found = fit_geometry(board, image, scene.size, sigmas=sigma)
     except FitError:
         # Only where too little was left to begin with.
         assert sum((np.isfinite(view[:, 0]).sum() >= 6) for view in image) < 8
         return
     sigma_of_ray = found.projection_covariance(np.array([[100.0, 100.0]]))
-    numbers = (found.intrinsics, found.poses, found.cov, found.residuals_px, sigma_of_ray)
+    numbers = (found.intrinsics.vector, found.poses, found.cov, found.residuals_px, sigma_of_ray)
     assert all(np.isfinite(part).all() for part in numbers)
     if found.converged:
         assert np.abs(errors(found, scene)[:2]).max() < 5

@@ -3,52 +3,53 @@ from __future__ import annotations
 import jax
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from tests.fitting.geometry.boards import sight
 from tests.fitting.geometry.test_bundle import SCENE, arrays
-from udccal.fitting.geometry.bundle_noise import covariance
-from udccal.fitting.geometry.bundle_orders import free_intrinsics
-from udccal.fitting.geometry.bundle_points import blocks, bucket, gather
-from udccal.fitting.geometry.bundle_solve import NO_PRIOR, Bundle, Prior, linearised, solve
-from udccal.fitting.geometry.bundle_start import best_poses, facing, starts
+from udccal.errors import FitError
+from udccal.fitting.engine.gaussian import Prior
+from udccal.fitting.geometry import GeometryRules, Intrinsics
+from udccal.fitting.geometry.bundle import EVERY, ORDERS, Bundle, Solved, linearised, solve
+from udccal.fitting.geometry.fit import NO_PRIOR
+from udccal.fitting.geometry.start import best_poses, facing, gather, starts
 from udccal.models.geometry import project, rotation_matrix
 
-EVERY = free_intrinsics((1, 1, 1, 1, 1))
-POINTS = gather(*arrays()).points
-TRUTH = Bundle(np.concatenate([SCENE.camera.focal, SCENE.camera.centre, SCENE.camera.distortion]), SCENE.poses)
+POINTS = gather(*arrays(), GeometryRules()).points
+TRUTH = Bundle(Intrinsics.of_geometry(SCENE.camera).vector, SCENE.poses)
 
 
-def test_buckets_recur_and_are_never_too_small() -> None:
-    sizes = [bucket(count) for count in range(1, 400)]
-    assert all(size >= count for count, size in enumerate(sizes, 1))
-    assert len(set(sizes)) == 15
-    assert max(size / count for count, size in enumerate(sizes, 1) if count > 4) < 1.5
+@pytest.fixture(scope="module")
+def solved() -> Solved:
+    return solve(TRUTH, POINTS, EVERY, NO_PRIOR)
 
 
-def test_padding_changes_nothing() -> None:
-    padded = blocks(POINTS)
-    assert padded.weight.shape == (8, 48)
-    assert (padded.weight > 0).sum() == len(POINTS.board)
-    np.testing.assert_array_equal(padded.image[padded.row, padded.column], POINTS.image)
+def test_the_packing_is_one_and_goes_both_ways() -> None:
+    lens = Intrinsics.of(np.arange(9.0))
+    np.testing.assert_array_equal(lens.vector, np.arange(9.0))
+    np.testing.assert_array_equal(lens.camera().distortion, [4.0, 5.0, 6.0, 7.0, 8.0])
+    np.testing.assert_array_equal(lens.matrix, [[0, 0, 2], [0, 1, 3], [0, 0, 1]])
+    assert [int(free.sum()) for free in ORDERS.values()] == [4, 5, 6, 8, 9]
 
 
-def test_slopes_are_those_of_the_model() -> None:
+def test_places_and_slopes_are_those_of_the_model() -> None:
+    """OpenCV's Jacobian against the term's own projection, traced by JAX, in all 15 directions."""
     residuals, slopes = linearised(TRUTH, POINTS)
+    mine = POINTS.view == 2
+    board = POINTS.board[mine]
+
+    def seen(x: jax.Array) -> jax.Array:
+        return project(Intrinsics.of(x[:9]).camera(), board @ rotation_matrix(x[9:12]).T + x[12:])
+
     with jax.enable_x64(True):
-        matrix = np.asarray(rotation_matrix(SCENE.poses[2, :3]))
-        mine = POINTS.view == 2
-        there = POINTS.board[mine] @ matrix.T + SCENE.poses[2, 3:]
-        np.testing.assert_allclose(residuals[mine], np.asarray(project(SCENE.camera, there)) - POINTS.image[mine])
-    step = 1e-6 * np.array([1e3, 1e3, 1e3, 1e3, 1, 1, 1, 1, 1])
-    for k in (0, 3, 4, 6, 8):
-        nudge = step * (np.arange(9) == k)
-        above = linearised(Bundle(TRUTH.intrinsics + nudge, TRUTH.poses), POINTS)[0]
-        np.testing.assert_allclose((above - residuals) / step[k], slopes[:, :, k], rtol=1e-3, atol=1e-3)
+        x = np.concatenate([TRUTH.intrinsics, SCENE.poses[2]])
+        np.testing.assert_allclose(residuals[mine], np.asarray(seen(x)) - POINTS.image[mine], atol=1e-9)
+        expected = np.asarray(jax.jacfwd(seen)(x))
+    np.testing.assert_allclose(slopes[mine], expected, rtol=1e-8, atol=1e-8 * np.abs(expected).max())
 
 
-def test_blockwise_covariance_is_the_inverse_of_the_whole() -> None:
-    solved = solve(TRUTH, POINTS, EVERY, NO_PRIOR)
-    _, slopes = linearised(solved.bundle, POINTS)
+def test_blockwise_covariance_is_the_inverse_of_the_whole(solved: Solved) -> None:
+    _, slopes = linearised(solved.place, POINTS)
     size = 9 + 6 * len(POINTS.names)
     whole = np.zeros((len(POINTS.board), 2, size))
     whole[:, :, :9] = slopes[:, :, :9]
@@ -59,37 +60,45 @@ def test_blockwise_covariance_is_the_inverse_of_the_whole() -> None:
     unit = np.linalg.norm(tall, axis=0)
     expected = np.linalg.inv((tall / unit).T @ (tall / unit)) / np.outer(unit, unit)
     sigma = np.sqrt(np.diag(expected))
-    np.testing.assert_allclose(
-        covariance(solved, EVERY) / np.outer(sigma, sigma), expected / np.outer(sigma, sigma), atol=1e-6
-    )
+    found = solved.equations.joint_cov()
+    np.testing.assert_allclose(found / np.outer(sigma, sigma), expected / np.outer(sigma, sigma), atol=1e-6)
 
 
-def test_the_solver_stands_where_the_slope_vanishes() -> None:
-    solved = solve(TRUTH, POINTS, EVERY, NO_PRIOR)
-    residuals, slopes = linearised(solved.bundle, POINTS)
+def test_the_solver_stands_where_the_slope_vanishes(solved: Solved) -> None:
+    residuals, slopes = linearised(solved.place, POINTS)
     slope = np.einsum("nai,na->i", slopes[..., :9], residuals / POINTS.sigma[:, None] ** 2)
-    sigma = np.sqrt(np.diag(covariance(solved, EVERY))[:9])
     assert solved.converged
-    assert np.abs(slope * sigma).max() < 0.01
+    assert np.abs(slope * np.sqrt(np.diag(solved.equations.cov()))).max() < 0.01
     assert solved.iterations < 10
 
 
 def test_held_coefficients_stay_and_have_no_sigma() -> None:
-    free = free_intrinsics((1, 0, 0, 0, 0))
-    start = Bundle(np.where(free, TRUTH.intrinsics, 0.0), TRUTH.poses)
-    solved = solve(start, POINTS, free, NO_PRIOR)
-    np.testing.assert_array_equal(solved.bundle.intrinsics[5:], 0.0)
-    np.testing.assert_array_equal(np.diag(covariance(solved, free))[5:9], 0.0)
+    free = ORDERS["k1"]
+    found = solve(Bundle(np.where(free, TRUTH.intrinsics, 0.0), TRUTH.poses), POINTS, free, NO_PRIOR)
+    np.testing.assert_array_equal(found.place.intrinsics[5:], 0.0)
+    np.testing.assert_array_equal(np.diag(found.equations.joint_cov())[5:9], 0.0)
 
 
-def test_a_prior_pulls_by_its_share() -> None:
-    free = solve(TRUTH, POINTS, EVERY, NO_PRIOR)
-    sigma = np.sqrt(covariance(free, EVERY)[0, 0])
-    mean, precision = np.zeros(9), np.zeros(9)
-    mean[0], precision[0] = free.bundle.intrinsics[0] + 2 * sigma, 1 / sigma**2
-    pulled = solve(TRUTH, POINTS, EVERY, Prior(mean, precision))
-    assert pulled.bundle.intrinsics[0] - free.bundle.intrinsics[0] == pytest.approx(sigma, rel=0.02)
-    assert covariance(pulled, EVERY)[0, 0] == pytest.approx(sigma**2 / 2, rel=0.02)
+def test_a_prior_pulls_by_its_share(solved: Solved) -> None:
+    sigma = np.sqrt(solved.equations.cov()[0, 0])
+    mean, width = np.zeros(9), np.full(9, np.inf)
+    mean[0], width[0] = solved.place.intrinsics[0] + 2 * sigma, sigma
+    pulled = solve(TRUTH, POINTS, EVERY, Prior.independent(mean, width))
+    assert pulled.place.intrinsics[0] - solved.place.intrinsics[0] == pytest.approx(sigma, rel=0.02)
+    assert pulled.equations.cov()[0, 0] == pytest.approx(sigma**2 / 2, rel=0.02)
+
+
+def test_what_exact_parallel_boards_do_not_tell_is_very_unsure() -> None:
+    """All boards of one orientation, without noise: focal length and distance are one unknown."""
+    poses = SCENE.poses.copy()
+    poses[:, :3] = 0.0
+    places = linearised(Bundle(TRUTH.intrinsics, poses), POINTS)[0] + POINTS.image
+    board, view = POINTS.board, POINTS.view
+    parallel = gather(
+        [board[view == k] for k in range(8)], [places[view == k] for k in range(8)], None, GeometryRules()
+    ).points
+    found = solve(Bundle(TRUTH.intrinsics, poses), parallel, EVERY, NO_PRIOR)
+    assert np.sqrt(found.equations.joint_cov()[0, 0]) > 0.05 * TRUTH.intrinsics[0]
 
 
 def test_starting_poses_are_near_and_their_mirrors_are_not() -> None:
@@ -103,15 +112,30 @@ def test_the_first_focal_length_comes_from_the_views() -> None:
     begun = starts(POINTS, SCENE.size, None, None)
     assert len(begun) == 1
     np.testing.assert_allclose(begun[0].intrinsics[:2], 870.0, rtol=0.1)
-    flat = gather(*arrays(sight(views=8, lean_rad=0.0, tilt_deg=0.0))).points
+    flat = gather(*arrays(sight(views=8, lean_rad=0.0, tilt_deg=0.0)), GeometryRules()).points
     assert np.isfinite(starts(flat, SCENE.size, None, None)[0].intrinsics).all()
 
 
 def test_boards_behind_the_camera_are_turned_to_its_front() -> None:
     behind = SCENE.poses.copy()
-    with jax.enable_x64(True):
-        from scipy.spatial.transform import Rotation
-
-        turned = Rotation.from_rotvec(behind[:, :3]) * Rotation.from_euler("z", 180, degrees=True)
+    turned = Rotation.from_rotvec(behind[:, :3]) * Rotation.from_euler("z", 180, degrees=True)
     behind[:, :3], behind[:, 3:] = turned.as_rotvec(), -behind[:, 3:]
     np.testing.assert_allclose(facing(behind), facing(SCENE.poses), atol=1e-9)
+
+
+def test_corners_come_in_the_shapes_that_opencv_gives() -> None:
+    board, image, sigma = arrays()
+    stacked = [view.astype(np.float32)[:, None] for view in board], [view[:, None] for view in image], sigma
+    again = gather(*stacked, GeometryRules()).points
+    np.testing.assert_array_equal(again.image, POINTS.image)
+    np.testing.assert_array_equal(again.board, POINTS.board)
+
+
+def test_arrays_that_do_not_belong_together_are_refused() -> None:
+    board, image, sigma = arrays()
+    with pytest.raises(FitError, match="as many views"):
+        gather(board[1:], image, sigma, GeometryRules())
+    with pytest.raises(FitError, match=r"view 3, found \(48, 3\), \(47, 2\)"):
+        gather(board, [*image[:3], image[3][1:], *image[4:]], None, GeometryRules())
+    with pytest.raises(FitError, match="view 0"):
+        gather(board, [view.T for view in image], None, GeometryRules())

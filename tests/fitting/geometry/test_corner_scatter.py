@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from tests.fitting.geometry.boards import COMMON_PX, sight
-from udccal.fitting.geometry.corner_scatter import CornerScatter
+from udccal.fitting.geometry import GeometryData, fit_boards
 from udccal.fitting.geometry.corners import BoardCorners
-from udccal.fitting.geometry.fit import fit_views
 from udccal.models.geometry import Geometry
 from udccal.result import FitResult, FitStatus
 
@@ -25,7 +24,7 @@ def fitted(sigma_scale: float) -> FitResult[Geometry]:
         replace(view, corners=replace(view.corners, sigma=sigma_scale * view.corners.sigma + (sigma_scale > 1) * 0.2))
         for view in views
     ]
-    return fit_views(told, START, scene.size)
+    return fit_boards(GeometryData(tuple(told), START, scene.size))
 
 
 def scatter_px(result: FitResult[Geometry]) -> float:
@@ -50,11 +49,7 @@ def test_corners_without_any_scatter_give_the_lens_itself() -> None:
         replace(view, corners=BoardCorners(view.corners.ids, truth[view.corners.ids], np.zeros(len(view.corners.ids))))
         for view, truth in zip(scene.views(np.random.default_rng(0)), scene.corners_px(), strict=True)
     ]
-    result = fit_views(exact, START, scene.size)
+    result = fit_boards(GeometryData(tuple(exact), START, scene.size))
     assert result.status is FitStatus.CONVERGED
     assert np.isfinite(result.cov).all()
     np.testing.assert_allclose(result.term.focal, scene.camera.focal, atol=1e-4)
-
-
-def test_scatter_adds_in_squares() -> None:
-    np.testing.assert_allclose(CornerScatter(0.03).of(np.array([0.0, 0.04])), [0.03, 0.05])

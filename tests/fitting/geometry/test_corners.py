@@ -7,9 +7,8 @@ from scipy.ndimage import convolve1d
 from tests.fitting.geometry.boards import SIZE, SPEC, draw, pose, true_corners
 from udccal.arrangements import BoardSpec
 from udccal.errors import FitError
-from udccal.fitting.geometry.corners import board_points_mm, charuco_board, detect_corners
-from udccal.fitting.geometry.flat_field import flat_field
-from udccal.fitting.geometry.luminance import Luminance, luminance
+from udccal.fitting.geometry.corners import Luminance, board_points_mm, charuco_board, detect_corners, luminance
+from udccal.fitting.geometry.data import flat_field
 
 GAINS = np.array([[0.6, 1.0], [1.0, 0.7]])
 

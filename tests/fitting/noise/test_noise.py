@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from udccal.cameras.protocol import Region
-from udccal.fitting.noise import codes, moments, nonuniformity, read_noise
-from udccal.fitting.noise.data import NoiseData
-from udccal.fitting.noise.fit import converter_step, fit_noise_data, nominal_noise
-from udccal.fitting.noise.pairs import reduce_pair
+from udccal.fitting.noise import NoiseRules, codes, moments, nominal_noise
+from udccal.fitting.noise.dark import dsnu
+from udccal.fitting.noise.data import NoiseMoments, converter_step, dark_pair
+from udccal.fitting.noise.fit import fit_moments
 from udccal.fitting.noise.prnu import prnu
 from udccal.models.noise import Noise
 from udccal.result import FitResult, FitStatus
@@ -21,6 +21,13 @@ from udccal.simulation.truth import draw_truth
 
 ROWS, COLUMNS = 240, 320
 STACK = 12
+RULES = NoiseRules()
+
+
+def reduce_pair(first: moments.Codes, second: moments.Codes, exposure_s: float) -> moments.Moments:
+    found = moments.reduce_frames([lambda: first, lambda: second], exposure_s, None, 2, RULES).temporal
+    assert found is not None
+    return found
 
 
 def toy(name: str, seed: int) -> tuple[RigDescription, Sensor]:
@@ -29,7 +36,7 @@ def toy(name: str, seed: int) -> tuple[RigDescription, Sensor]:
     return rig, Sensor(draw_truth(rig, seed))
 
 
-def reduced(sensor: Sensor, levels: np.ndarray, seed: int, stack_level: float | None = None) -> NoiseData:
+def reduced(sensor: Sensor, levels: np.ndarray, seed: int, stack_level: float | None = None) -> NoiseMoments:
     """Frames as the noise procedure takes them; ``levels`` are fractions of the full well."""
     rng = np.random.default_rng(seed)
     region = Region(0, 0, COLUMNS, ROWS)
@@ -46,12 +53,12 @@ def reduced(sensor: Sensor, levels: np.ndarray, seed: int, stack_level: float | 
     top = 2**sensor.truth.bits - 1
     for t in (0.0005, 0.002, 0.01, 0.02, 0.25, 1.0):
         pair = [sensor.expose(none, t, region, rng) for _ in range(2)]
-        darks.append(codes.dark_pair(pair[0], pair[1], t, 1, top))
-        rows.append(reduce_pair(pair[0], pair[1], t).rows)
+        darks.append(dark_pair(pair[0], pair[1], t, 1, top))
+        rows.append(reduce_pair(pair[0], pair[1], t))
     middle = 0.02 * float(levels[len(levels) // 2] if stack_level is None else stack_level)
-    return NoiseData(
+    return NoiseMoments(
         darks=tuple(darks),
-        dark_rows=tuple(rows),
+        dark_moments=tuple(rows),
         flats=tuple(flats),
         flat_stack=average(sensor, light, middle, region, rng),
         dark_stack=average(sensor, none, middle, region, rng),
@@ -62,15 +69,15 @@ def reduced(sensor: Sensor, levels: np.ndarray, seed: int, stack_level: float | 
 
 def average(
     sensor: Sensor, light: np.ndarray, exposure_s: float, region: Region, rng: np.random.Generator
-) -> moments.StackMoments:
+) -> moments.Averaged:
     frames = [sensor.expose(light, exposure_s, region, rng) for _ in range(STACK)]
-    return moments.StackMoments(exposure_s, np.mean(frames, axis=0).astype(np.float32), STACK)
+    return moments.Averaged(exposure_s, np.mean(frames, axis=0).astype(np.float32), STACK)
 
 
 @pytest.fixture(scope="module", params=["lg55-aca2040", "mk31-imx1600"])
 def fitted(request: pytest.FixtureRequest) -> tuple[Sensor, FitResult[Noise]]:
     rig, sensor = toy(request.param, seed=3)
-    return sensor, fit_noise_data(reduced(sensor, np.linspace(0.02, 1.6, 14), 5), nominal_noise(rig))
+    return sensor, fit_moments(reduced(sensor, np.linspace(0.02, 1.6, 14), 5), nominal_noise(rig), RULES)
 
 
 def test_recovers_what_the_rig_needs(fitted: tuple[Sensor, FitResult[Noise]]) -> None:
@@ -115,27 +122,27 @@ def test_hot_pixels_are_listed(fitted: tuple[Sensor, FitResult[Noise]]) -> None:
 
 def test_no_light_is_too_dark() -> None:
     rig, sensor = toy("lg55-aca2040", 1)
-    result = fit_noise_data(reduced(sensor, np.full(6, 1e-5), 1), nominal_noise(rig))
+    result = fit_moments(reduced(sensor, np.full(6, 1e-5), 1), nominal_noise(rig), RULES)
     assert result.status is FitStatus.TOO_DARK
     assert result.term.K_DN_per_e == rig.camera.K_DN_per_e.value
 
 
 def test_clipped_flats_are_saturated() -> None:
     rig, sensor = toy("lg55-aca2040", 1)
-    result = fit_noise_data(reduced(sensor, np.linspace(3.0, 4.0, 6), 1), nominal_noise(rig))
+    result = fit_moments(reduced(sensor, np.linspace(3.0, 4.0, 6), 1), nominal_noise(rig), RULES)
     assert result.status is FitStatus.SATURATED
 
 
 def test_a_clipped_stack_is_saturated() -> None:
     rig, sensor = toy("lg55-aca2040", 1)
-    result = fit_noise_data(reduced(sensor, np.linspace(0.05, 1.6, 10), 1, stack_level=3.0), nominal_noise(rig))
+    result = fit_moments(reduced(sensor, np.linspace(0.05, 1.6, 10), 1, stack_level=3.0), nominal_noise(rig), RULES)
     assert result.status is FitStatus.SATURATED
     assert "flat stack" in result.notes[0]
 
 
 def test_two_levels_are_too_few() -> None:
     rig, sensor = toy("lg55-aca2040", 1)
-    result = fit_noise_data(reduced(sensor, np.array([0.2, 0.4]), 1), nominal_noise(rig))
+    result = fit_moments(reduced(sensor, np.array([0.2, 0.4]), 1), nominal_noise(rig), RULES)
     assert result.status is FitStatus.TOO_FEW_DATA
 
 
@@ -143,7 +150,7 @@ def test_a_lamp_of_changing_pattern_is_a_poor_fit() -> None:
     rig, sensor = toy("lg55-aca2040", 1)
     data = reduced(sensor, np.linspace(0.05, 0.6, 8), 1)
     bent = tuple(replace(flat, variance_DN2=flat.variance_DN2 * (1 + flat.mean_DN / 1000)) for flat in data.flats)
-    assert fit_noise_data(replace(data, flats=bent), nominal_noise(rig)).status is FitStatus.POOR_FIT
+    assert fit_moments(replace(data, flats=bent), nominal_noise(rig), RULES).status is FitStatus.POOR_FIT
 
 
 def test_pairs_of_one_frame_twice_are_a_poor_fit() -> None:
@@ -154,7 +161,7 @@ def test_pairs_of_one_frame_twice_are_a_poor_fit() -> None:
     for t in 0.02 * np.linspace(0.05, 0.6, 8):
         frame = sensor.expose(light, float(t), Region(0, 0, COLUMNS, ROWS), np.random.default_rng(0))
         twice.append(reduce_pair(frame, frame, float(t)))
-    result = fit_noise_data(replace(data, flats=tuple(twice)), nominal_noise(rig))
+    result = fit_moments(replace(data, flats=tuple(twice)), nominal_noise(rig), RULES)
     assert result.status is FitStatus.POOR_FIT
     assert "copies of each other" in result.notes[0]
 
@@ -165,8 +172,8 @@ def test_rounding_coarser_than_the_noise(fraction: float) -> None:
     sigma, spread = 0.28, 0.08
     offset = 24 + fraction + spread * rng.standard_normal((400, 400))
     frames = [np.rint(offset + sigma * rng.standard_normal((400, 400))).astype(np.uint16) for _ in range(2)]
-    pair = codes.dark_pair(frames[0], frames[1], 0.01)
-    fit = read_noise.fit_dark((pair, replace(pair, exposure_s=0.02)), read_noise.Surroundings(0.06, 0.0))
+    pair = dark_pair(frames[0], frames[1], 0.01)
+    fit = codes.fit_dark((pair, replace(pair, exposure_s=0.02)), codes.Surroundings(0.06, 0.0, 1e-5), RULES)
     assert np.sqrt(fit.values[2]) == pytest.approx(sigma, rel=0.03)
     # What the textbook's white quantisation makes of the same frames is worse than what is asked for.
     naive = 0.5 * np.var(frames[0].astype(float) - frames[1]) - 1 / 12
@@ -179,10 +186,10 @@ def test_codes_cut_off_at_zero_are_censored() -> None:
     black, sigma = 0.3, 2.0
     frames = [np.clip(np.rint(black + sigma * rng.standard_normal((300, 400))), 0, None) for _ in range(4)]
     pairs = tuple(
-        codes.dark_pair(frames[i].astype(np.uint16), frames[i + 1].astype(np.uint16), 0.01 * (i + 1)) for i in (0, 2)
+        dark_pair(frames[i].astype(np.uint16), frames[i + 1].astype(np.uint16), 0.01 * (i + 1)) for i in (0, 2)
     )
     assert pairs[0].edges_DN[0] == -np.inf
-    fit = read_noise.fit_dark(pairs, read_noise.Surroundings(0.3, 0.0), normal=True)
+    fit = codes.fit_dark(pairs, codes.Surroundings(0.3, 0.0, 1e-5), RULES, normal=True)
     assert fit.values[0] == pytest.approx(black, abs=0.05)
     assert np.sqrt(fit.values[2]) == pytest.approx(sigma, rel=0.02)
     # Moments of the cut-off codes are far away.
@@ -193,19 +200,19 @@ def test_a_wide_window_of_codes_is_grouped_and_loses_nothing() -> None:
     rng = np.random.default_rng(9)
     frames = [np.rint(2000 + 200 * rng.standard_normal((200, 300))).astype(np.uint16) for _ in range(2)]
     frames[0][0, 0] = 3  # far below the window
-    pair = codes.dark_pair(frames[0], frames[1], 0.01)
+    pair = dark_pair(frames[0], frames[1], 0.01)
     assert pair.counts.shape[0] <= 161
     assert pair.outside >= 1
     assert pair.counts.sum() + pair.outside == frames[0].size
-    assert np.sqrt(read_noise.start_values((pair,))[2]) == pytest.approx(200, rel=0.02)
+    assert np.sqrt(codes.start_values((pair,))[2]) == pytest.approx(200, rel=0.02)
 
 
 def test_hot_pixels_do_not_carry_the_prnu() -> None:
     rng = np.random.default_rng(2)
     signal = 1000 * (1 + 0.005 * rng.standard_normal((200, 300)))
-    clean = prnu(signal, 0.0, 0.0)
+    clean = prnu(signal, 0.0, 0.0, 2, RULES)
     signal[rng.random(signal.shape) < 1e-3] *= 3
-    hot = prnu(signal, 0.0, 0.0)
+    hot = prnu(signal, 0.0, 0.0, 2, RULES)
     assert np.sqrt(clean.variance) == pytest.approx(0.005, rel=0.03)
     assert np.sqrt(hot.variance) == pytest.approx(0.005, rel=0.03)
     assert hot.outliers > clean.outliers
@@ -217,7 +224,7 @@ def test_shading_and_waves_do_not_carry_the_prnu() -> None:
     y, x = np.mgrid[:240, :320]
     light = (1 - 0.3 * ((x / 320 - 0.5) ** 2 + (y / 240 - 0.5) ** 2)) * (1 + 0.02 * np.cos(2 * np.pi * y / 40))
     signal = 1000 * light * (1 + 0.005 * rng.standard_normal(light.shape))
-    found = prnu(signal, 0.0, 0.0)
+    found = prnu(signal, 0.0, 0.0, 2, RULES)
     assert np.sqrt(found.variance) == pytest.approx(0.005, rel=0.02)
     assert np.std(signal) / 1000 > 0.02
 
@@ -226,7 +233,28 @@ def test_counts_hot_pixels_and_converter_steps() -> None:
     rng = np.random.default_rng(2)
     dark = 64 + 0.3 * rng.standard_normal((100, 100))
     dark[3, 4] = dark[50, 60] = 90.0
-    assert nonuniformity.count_hot(dark) == 2
+    assert dsnu(dark, 0.09, 0.0, RULES).places == ((3, 4), (50, 60))
     frame = rng.integers(100, 200, (50, 50)).astype(np.uint16)
     assert converter_step(frame) == 1
     assert converter_step(frame * np.uint16(16)) == 16
+
+
+def test_the_posterior_gives_the_sigma_of_any_function_of_the_term(fitted: tuple[Sensor, FitResult[Noise]]) -> None:
+    result = fitted[1]
+    well = result.sigma_of(lambda noise: np.array((noise.saturation_DN - noise.black_DN) / noise.K_DN_per_e))
+    K, sigma = result.estimate("K_DN_per_e"), result.sigma_of(lambda noise: np.array(noise.K_DN_per_e))
+    assert sigma == pytest.approx(K.sigma, rel=1e-6)
+    level = result.estimate("saturation_DN").value - result.estimate("black_DN").value
+    assert well > level * K.sigma / K.value**2 * (1 - 1e-6)
+
+
+def test_a_flat_that_lies_off_the_curve_is_left_out_of_it() -> None:
+    rig, sensor = toy("lg55-aca2040", 4)
+    data = reduced(sensor, np.linspace(0.05, 1.6, 10), 4)
+    flats = list(data.flats)
+    flats[3] = replace(flats[3], variance_DN2=flats[3].variance_DN2 * np.where(np.arange(16) == 5, 1.5, 1.0))
+    result = fit_moments(replace(data, flats=tuple(flats)), nominal_noise(rig), RULES)
+    clean = fit_moments(data, nominal_noise(rig), RULES)
+    assert any(one.rule.startswith("bins of flats off") and one.count == 1 for one in result.outliers)
+    K = clean.estimate("K_DN_per_e")
+    assert result.estimate("K_DN_per_e").value == pytest.approx(K.value, abs=0.5 * K.sigma)

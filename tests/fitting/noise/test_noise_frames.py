@@ -22,8 +22,8 @@ from tests.benchmarks.efficiency.noise import (
 )
 from tests.benchmarks.extremes.noise import PLAIN, errors_in_sigma
 from udccal.errors import FitError
-from udccal.fitting.noise.frames import ExposureLevel, Frame, SpatialStack, fit_noise_frames, measure_frames
-from udccal.fitting.noise.response import mean_response
+from udccal.fitting.noise import ExposureLevel, NoiseData, NoiseRules, SpatialStack, fit_noise, mean_response
+from udccal.fitting.noise.data import Frame, reduced
 from udccal.result import FitStatus
 
 
@@ -83,7 +83,7 @@ def test_loaders_and_arrays_and_bytes_give_the_same(tmp_path) -> None:  # type: 
 
     late = [replace(level, dark=lazy(level.dark), bright=lazy(level.bright)) for level in levels]
     late_stack = replace(stack, dark=lazy(tuple(stack.dark)), bright=lazy(tuple(stack.bright)))
-    here, there = (fit_noise_frames(*frames, top_code=255) for frames in ((levels, stack), (late, late_stack)))
+    here, there = (fit_noise(NoiseData(*frames, top_code=255)) for frames in ((levels, stack), (late, late_stack)))
     assert here.ok
     assert [e.value for e in here.estimates] == [e.value for e in there.estimates]
 
@@ -91,12 +91,12 @@ def test_loaders_and_arrays_and_bytes_give_the_same(tmp_path) -> None:  # type: 
 def test_colours_of_a_mosaic_are_kept_apart() -> None:
     sensor = PLAIN
     levels, stack = capture(sensor, 4)
-    data = measure_frames(levels, stack, bayer=True, top_code=4095)
+    data = reduced(NoiseData(levels, stack, bayer=True, top_code=4095), NoiseRules())
     assert data is not None
-    grey = measure_frames(levels, stack, top_code=4095)
+    grey = reduced(NoiseData(levels, stack, top_code=4095), NoiseRules())
     assert grey is not None
     assert (data.flats[0].mean_DN.size, grey.flats[0].mean_DN.size) == (4, 1)
-    result = fit_noise_frames(levels, stack, bayer=True, top_code=4095)
+    result = fit_noise(NoiseData(levels, stack, bayer=True, top_code=4095))
     assert np.abs(errors_in_sigma(result, sensor)).max() < 4.5
 
 
@@ -108,7 +108,7 @@ def test_a_flickering_pair_and_cosmic_hits_are_listed_and_left_out() -> None:
     first, second = (frame.copy() for frame in levels[2].dark)
     first[10:14, 20:24] += 3000
     levels[2] = replace(levels[2], dark=(first, second))
-    result = fit_noise_frames(levels, stack, top_code=4095)
+    result = fit_noise(NoiseData(levels, stack, top_code=4095))
     rules = {outliers.rule.split(" ")[0]: outliers for outliers in result.outliers}
     assert rules["flats"].places[0].startswith("flat 4 ")
     assert rules["two"].count == 16
@@ -119,7 +119,7 @@ def test_hot_pixels_are_named() -> None:
     levels, stack = capture(PLAIN, 6)
     for frame in stack.dark:
         frame[7, 9] += 500
-    result = fit_noise_frames(levels, stack, top_code=4095)
+    result = fit_noise(NoiseData(levels, stack, top_code=4095))
     hot = next(outliers for outliers in result.outliers if "hot" in outliers.rule)
     assert "row 7, column 9" in hot.places
 
@@ -127,7 +127,7 @@ def test_hot_pixels_are_named() -> None:
 def test_residuals_are_those_of_normal_noise_and_lie_on_the_sensor() -> None:
     sensor = replace(PLAIN, rows=256, columns=384)
     levels, stack = capture(sensor, 8)
-    sample = fit_noise_frames(levels, stack, bayer=True, top_code=4095).residuals
+    sample = fit_noise(NoiseData(levels, stack, bayer=True, top_code=4095)).residuals
     assert sample is not None
     assert len(sample.z) > 100
     assert sample.z.std() == pytest.approx(1.0, abs=4 / np.sqrt(2 * len(sample.z)))
@@ -157,11 +157,11 @@ FRAME = np.full((32, 32), 100, np.uint16)
 )
 def test_what_is_no_frame_is_refused(levels: list[ExposureLevel], stack: SpatialStack | None, sentence: str) -> None:
     with pytest.raises(FitError, match=sentence):
-        fit_noise_frames(levels, stack, top_code=4095)
+        fit_noise(NoiseData(levels, stack, top_code=4095))
 
 
 def test_nothing_at_all_is_too_few() -> None:
-    assert fit_noise_frames([]).status is FitStatus.TOO_FEW_DATA
+    assert fit_noise(NoiseData([])).status is FitStatus.TOO_FEW_DATA
 
 
 # A failing example is shown as drawn: to shrink it would take hundreds of fits.

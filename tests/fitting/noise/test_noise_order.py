@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from udccal.fitting.noise.order import choose_transfer
-from udccal.fitting.noise.photon_transfer import DarkVariance, Levels, Order
+from udccal.fitting.noise import NoiseRules
+from udccal.fitting.noise.transfer import DarkVariance, Levels, Order, choose_transfer
 
 DARK = DarkVariance(np.array([4.0]), np.array([0.01]), 1 / 12, 0.36, np.array([0.0]))
 
@@ -37,8 +37,8 @@ def made_levels(seed: int) -> Levels:
 
 def test_a_level_with_half_its_bins_does_not_make_the_light_unsteady() -> None:
     for seed in range(5):
-        fit, order, _ = choose_transfer(made_levels(seed), DARK, 4000.0)
-        assert order == Order()
+        fit = choose_transfer(made_levels(seed), DARK, 4000.0, NoiseRules()).best.fit
+        assert fit.order == Order()
         assert np.nanmax(np.abs(fit.level_z)) < 4.5
 
 
@@ -47,5 +47,5 @@ def test_a_level_that_is_brighter_than_its_exposure_makes_it_unsteady() -> None:
     factor = np.ones((10, 1))
     factor[[2, 5, 7]] = 1.004
     factor[[3, 6]] = 0.995
-    _, order, _ = choose_transfer(replace(levels, mean_DN=levels.mean_DN * factor), DARK, 4000.0)
-    assert order.unsteady
+    choice = choose_transfer(replace(levels, mean_DN=levels.mean_DN * factor), DARK, 4000.0, NoiseRules())
+    assert choice.best.fit.order.unsteady

@@ -145,4 +145,8 @@ def scaled_inverse(matrix: Float[np.ndarray, "*k n n"], rcond: float = 1e-12) ->
     size = np.sqrt(np.maximum(np.einsum("...ii->...i", matrix), 0.0))
     unit = np.where(size > 1e-150, size, np.inf)
     outer = unit[..., :, None] * unit[..., None, :]
-    return np.asarray(np.linalg.pinv(matrix / outer, rcond=rcond, hermitian=True) / outer)
+    values, vectors = np.linalg.eigh(matrix / outer)
+    size = np.abs(values)
+    seen = size > rcond * size.max(axis=-1, keepdims=True, initial=0.0)
+    values = np.where(seen, 1 / np.where(seen, values, 1.0), 0.0)
+    return np.asarray((vectors * values[..., None, :]) @ np.swapaxes(vectors, -1, -2) / outer)

@@ -11,11 +11,11 @@ Bundle Adjustment - A Modern Synthesis, 2000, section 6.1). The damping follows 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Generic, Protocol, TypeVar, final, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from udccal.fitting.engine.gaussian import Prior, scaled_inverse
 from udccal.fitting.engine.iteration_log import LOG
@@ -106,6 +106,8 @@ class Blocks:
         shared, right: of the shared parameters: half the Hessian and minus half the gradient of the cost.
         own, own_right: of the groups' own.
         cross: shared by own.
+        held: shared parameters that make no step, such as those at a bound that the data would have them pass; their
+            covariance is that without the bound.
     """
 
     cost: float
@@ -115,6 +117,7 @@ class Blocks:
     own: Float[np.ndarray, "k l l"]
     own_right: Float[np.ndarray, "k l"]
     cross: Float[np.ndarray, "k p l"]
+    held: Bool[np.ndarray, " p"] | None = None
 
     @classmethod
     def dense(
@@ -132,20 +135,29 @@ class Blocks:
     def with_prior(self, prior: Prior, x: Float[np.ndarray, " p"]) -> Blocks:
         """With what is known of the shared parameters beforehand, which are ``x``."""
         cost, matrix = self.cost + prior.cost(x), self.shared + prior.precision
-        return Blocks(cost, self.samples, matrix, self.right + prior.right(x), self.own, self.own_right, self.cross)
+        return replace(self, cost=cost, shared=matrix, right=self.right + prior.right(x))
 
     def marginal(self, damping: float = 0.0) -> tuple[Float[np.ndarray, "p p"], Float[np.ndarray, " p"]]:
         """Matrix and right side of the shared parameters once the groups' own are eliminated."""
-        solved = self.cross @ self._own_inverse(damping)
-        matrix = _damped(self.shared, damping) - np.einsum("kpl,kql->pq", solved, self.cross)
-        return matrix, self.right - np.einsum("kpl,kl->p", solved, self.own_right)
+        return self._marginal(damping, self._own_inverse(damping))
+
+    def _marginal(
+        self, damping: float, own_inverse: Float[np.ndarray, "k l l"]
+    ) -> tuple[Float[np.ndarray, "p p"], Float[np.ndarray, " p"]]:
+        solved = self.cross @ own_inverse
+        matrix = _damped(self.shared, damping) - np.tensordot(solved, self.cross, ((0, 2), (0, 2)))
+        return matrix, self.right - np.tensordot(solved, self.own_right, ((0, 2), (0, 1)))
 
     def step(self, damping: float) -> Step:
         """To the minimum of the quadratic model, whose diagonal is raised by the part ``damping``."""
-        matrix, right = self.marginal(damping)
+        inverse = self._own_inverse(damping)
+        matrix, right = self._marginal(damping, inverse)
+        if self.held is not None:
+            matrix = np.where(self.held[:, None] | self.held, np.diag(np.where(self.held, 1.0, 0.0)), matrix)
+            right = np.where(self.held, 0.0, right)
         shared = solve(matrix, right)
         left = self.own_right - np.einsum("kpl,p->kl", self.cross, shared)
-        own = np.einsum("klm,km->kl", self._own_inverse(damping), left)
+        own = np.einsum("klm,km->kl", inverse, left)
         return Step(shared, own, float(self.right @ shared + (self.own_right * own).sum()))
 
     def cov(self) -> Float[np.ndarray, "p p"]:

@@ -89,6 +89,7 @@ def excess_sigma(
     unit: Float[np.ndarray, " n"],
     dof: float,
     constant: float = 0.0,
+    chance: float = SIGNIFICANT,
 ) -> float:
     """Size of an error beside noise that brings chi-squared to its degrees of freedom; 0 unless it is significant.
 
@@ -100,8 +101,9 @@ def excess_sigma(
         unit: variance that an error of size 1 adds to each.
         dof: degrees of freedom.
         constant: chi-squared of data that have no such error.
+        chance: how often chance may find an error where there is none; 0.5 gives an estimate wherever one is above 0.
     """
-    if not unit.any() or chi2_tail(float((square / noise).sum()) + constant, dof) > SIGNIFICANT:
+    if not unit.any() or chi2_tail(float((square / noise).sum()) + constant, dof) > chance:
         return 0.0
     low, high = 0.0, float(np.sqrt(square.max() / unit[unit > 0].min()))
     for _ in range(_HALVINGS):

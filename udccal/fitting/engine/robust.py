@@ -82,3 +82,7 @@ class Cauchy:
     def loss(self, z: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
         """What each residual adds to chi-squared."""
         return np.asarray(self.sigma**2 * np.log1p((z / self.sigma) ** 2))
+
+    def weight(self, z: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
+        """What each squared residual counts for in a step: the derivative of ``loss`` by the square."""
+        return np.asarray(1 / (1 + (z / self.sigma) ** 2))

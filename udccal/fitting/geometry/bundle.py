@@ -1,213 +1,295 @@
-"""Bundle adjustment: intrinsics, distortion and one pose per view from points of known position on a flat board.
+"""Bundle adjustment of flat boards: nine intrinsics seen by all views, six numbers of a pose by one view each.
 
-Array functions only: corners from a ChArUco board through a panel and from a chessboard in a plain photograph alike.
+Places and their Jacobian are OpenCV's (``cv2.projectPoints``): the five-coefficient model of Brown and Conrady that
+``udccal.models.geometry`` has, in one compiled call for all points.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import final
 
+import cv2
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
-from udccal.errors import FitError
-from udccal.fitting.geometry.bundle_evidence import Evidence, weigh
-from udccal.fitting.geometry.bundle_noise import (
-    OUTLIER_RULE,
-    STRANGE_RULE,
-    Scatter,
-    covariance,
-    least_scale,
-    leverages,
-    maximum_likelihood,
-    strange_views,
-)
-from udccal.fitting.geometry.bundle_orders import (
-    ORDERS,
-    Ordered,
-    choose_order,
-    free_intrinsics,
-    settle,
-)
-from udccal.fitting.geometry.bundle_points import MIN_POINTS, Gathered, Points, gather
-from udccal.fitting.geometry.bundle_solve import NO_PRIOR, Bundle, Prior, Solved, residuals_px, solve
-from udccal.fitting.geometry.bundle_start import facing, starts
-from udccal.fitting.geometry.calibrated_views import CalibratedViews
+from udccal.fitting.engine.gaussian import Prior
+from udccal.fitting.engine.least_squares import Blocks, Solution, SolverRules, Step, minimise
+from udccal.fitting.engine.robust import Cauchy, OutlierRule
+from udccal.models.arrays import Arrayish
 from udccal.models.geometry import Geometry
-from udccal.result import FitStatus, Outliers
 
-# Without a prior, fewer views do not tell a lens; with one, a single view tells at least its pose.
-MIN_VIEWS = 3
-# A focal length or centre less certain than this (of the focal length, of the picture's width) counts as not told:
-# beyond it the model is not linear over a sigma, and an error bar would not be true.
-MOST_UNCERTAIN = 0.05
-_MOST_PLACES = 20
-# A view that scatters this many times as much as the median view is worth a sentence.
-_SCATTERS_MORE = 3.0
+INTRINSIC_NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
+INTRINSIC_UNITS = ("px", "px", "px", "px", "1", "1", "1", "1", "1")
+LENS = len(INTRINSIC_NAMES)
+# Orders of the distortion, simplest first: which intrinsics are free. Each has the coefficients of the one before it.
+ORDERS = {
+    name: np.arange(LENS) < count
+    for name, count in (("no distortion", 4), ("k1", 5), ("k1 k2", 6), ("k1 k2 p1 p2", 8), ("k1 k2 p1 p2 k3", 9))
+}
+EVERY = np.ones(LENS, dtype=bool)
+# A descent ends a thousandth of a sigma from the minimum, one that another follows a tenth.
+_SOLVER, _ROUGH = SolverRules(least_gain=1e-6, iterations=60), SolverRules(least_gain=1e-2, iterations=60)
+# Each intrinsic gets this part of the information that known poses would bring: what views do not tell at all has then
+# a very large variance, not none. It is above rounding, and moves no sigma of what they do tell.
+_RIDGE = 1e-11
 
 
-def calibrate_views(
-    object_points: Sequence[Float[np.ndarray, "_ 3"]],
-    image_points: Sequence[Float[np.ndarray, "_ 2"]],
-    image_size: tuple[int, int],
-    start: Geometry | None = None,
-    sigmas: Sequence[Float[np.ndarray, " _"]] | None = None,
-    *,
-    prior: Prior | None = None,
-    start_poses: Float[np.ndarray, "views 6"] | None = None,
-) -> CalibratedViews:
-    """Calibrate a camera from views of flat boards.
+@final
+@dataclass(frozen=True)
+class GeometryRules:
+    """What the fit of lens and boards goes by.
 
-    Args:
-        object_points: per view, points on the board (z = 0) in any unit of length.
-        image_points: per view, the same points in px, (0, 0) the centre of the top-left pixel; NaN where not seen.
-        image_size: (columns, rows).
-        start: intrinsics to start from. The views' vanishing points (Zhang, 2000) give another start in any case; the
-            lower minimum wins.
-        sigmas: per view, one sigma in px of each point, up to a common factor; without it all points count alike.
-        prior: what is known of the intrinsics beforehand; with it a single view may do.
-        start_poses: per view, a pose to start from, with ``start``.
-
-    The order of the distortion is the one with the lowest BIC (Schwarz, 1978) on the points that remain after
-    outliers are left out.
-
-    Raises:
-        FitError: with fewer than 3 usable views (1 with a prior), each of 6 finite points that are not on one line.
+    Attributes:
+        least_views: usable views that may tell a lens; with a prior, one tells at least its pose.
+        least_corners: of a usable view. Four hold a homography; two more tell whether it is the right one.
+        most_clipped: part of a board's samples at saturation. Beyond it edges have bloomed.
+        clipped: samples from this part of saturation on count as clipped.
+        least_response: samples with less than this part of the flat field are dead, or behind an opaque row.
+        centre_sigma: lenses sit on their sensors' middles to about this part of the width.
+        distortion_sigma: of (k1, k2, p1, p2, k3) of lenses that the model describes.
+        default_sigma_px: of points without one; their scatter then sets the scale.
+        robust: how residuals count on the way from a start that may be far off.
+        corners: which corners are left out, compared with their view's own scatter.
+        strange_view: a view is left out whole when it scatters this many times as much as the median view.
+        loud_view: a view is mentioned when it scatters this many times as much.
+        rounds: at most, of each loop that estimates scatter or leaves out corners again.
+        further_order: odds before any data against each further order of the distortion: a coefficient that is not
+            there costs the others much of their certainty.
+        prior_share: beyond this part of the information on focal length or centre, the prior chooses the order.
+        most_uncertain: sigma of focal length (of itself) and centre (of the width) that count as not told; beyond it
+            the model is not linear over a sigma.
+        worst_rms_px, worst_chi2_dof: beyond both, the fit is poor.
+        pattern_cells: on a side of the grid that residuals are averaged over.
+        start_scatter_px: of corners beside their noise, before it is estimated.
+        marker_margin, window_squares: radius of a corner's window, of the distance to the markers and of a square.
+        window_px: least and largest radius.
+        saddle_rounds: of Gauss-Newton on each corner.
+        least_contrast: half the step at a corner over what the saddle leaves of the samples.
+        worst_corner_sigma_px: of a corner by noise.
     """
-    gathered = gather(object_points, image_points, sigmas)
-    wanted, known = (MIN_VIEWS, NO_PRIOR) if prior is None else (1, prior)
-    _check(gathered, len(object_points), wanted)
-    points, outliers = gathered.points, gathered.outliers
-    full, scattered, agree = _settled(points, image_size, start, start_poses, known)
-    strange = strange_views(scattered, points)
-    if strange.any() and (~strange).sum() >= wanted:
-        outliers = (*outliers, _whole_views(points, strange))
-        points = points.without(strange)
-        full, scattered, agree = _settled(points, image_size, start, start_poses, known)
-    every = free_intrinsics(ORDERS[-1][1])
-    full, scatter = maximum_likelihood(full, scattered, points, every, known)
-    ordered = choose_order(full, scatter.points, known)
-    finished, final, dof = _rescaled(ordered, scatter.points, known)
-    evidence = weigh(finished, final, ordered.free, image_size, dof)
-    cov = covariance(finished, ordered.free) * evidence.variance_factor
-    status, advice = _judge(finished, cov, image_size)
-    bundle = Bundle(finished.bundle.intrinsics, facing(finished.bundle.poses))
-    return CalibratedViews(
-        focal=bundle.intrinsics[:2],
-        centre=bundle.intrinsics[2:4],
-        distortion=bundle.intrinsics[4:],
-        poses=bundle.poses,
-        cov=cov,
-        points_px=final.image,
-        residuals_px=residuals_px(bundle, final),
-        view=final.view,
-        index=final.index,
-        used=final.used,
-        names=final.names,
-        sigma_px=final.sigma,
-        free=tuple(bool(one) for one in ordered.free),
-        chi2_dof=1.0 if sigmas is None else _scale2(final, points),
-        candidates=ordered.candidates,
-        evidence=evidence,
-        status=status,
-        notes=(*gathered.notes, *advice, *_remarks(scatter, evidence, ordered)),
-        outliers=(*outliers, *_listed(final)),
-        iterations=full.iterations,
-        starts_agreeing=agree,
-        image_size=image_size,
-    )
+
+    least_views: int = 3
+    least_corners: int = 6
+    most_clipped: float = 0.02
+    clipped: float = 0.995
+    least_response: float = 0.05
+    centre_sigma: float = 0.01
+    distortion_sigma: tuple[float, ...] = (0.2, 0.2, 1e-3, 1e-3, 0.1)
+    default_sigma_px: float = 0.1
+    robust: Cauchy = field(default_factory=Cauchy)
+    corners: OutlierRule = field(default_factory=lambda: OutlierRule("corners"))
+    strange_view: float = 20.0
+    loud_view: float = 3.0
+    rounds: int = 8
+    further_order: float = 10.0
+    prior_share: float = 0.1
+    most_uncertain: float = 0.05
+    worst_rms_px: float = 1.0
+    worst_chi2_dof: float = 9.0
+    pattern_cells: int = 6
+    start_scatter_px: float = 0.02
+    marker_margin: float = 0.9
+    window_squares: float = 0.4
+    window_px: tuple[float, float] = (4.0, 25.0)
+    saddle_rounds: int = 12
+    least_contrast: float = 6.0
+    worst_corner_sigma_px: float = 1.0
 
 
-def _settled(
-    points: Points,
-    image_size: tuple[int, int],
-    start: Geometry | None,
-    start_poses: Float[np.ndarray, "views 6"] | None,
-    prior: Prior,
-) -> tuple[Solved, Points, int]:
-    poses = None if start_poses is None else np.asarray(start_poses, dtype=np.float64)[list(points.names)]
-    return settle(starts(points, image_size, _vector(start), poses), points, prior)
+@final
+@dataclass(frozen=True)
+class Intrinsics:
+    """A lens; as one vector (fx, fy, cx, cy, k1, k2, p1, p2, k3), the order of ``INTRINSIC_NAMES``.
+
+    Attributes:
+        focal: (fx, fy) in px. centre: (cx, cy) in px.
+        distortion: (k1, k2, p1, p2, k3), OpenCV's order and signs.
+    """
+
+    focal: Float[Arrayish, "2"]
+    centre: Float[Arrayish, "2"]
+    distortion: Float[Arrayish, "5"]
+
+    @classmethod
+    def of(cls, vector: Float[Arrayish, "9"]) -> Intrinsics:
+        """From the vector, traced by JAX or not."""
+        return cls(vector[:2], vector[2:4], vector[4:])
+
+    @classmethod
+    def of_geometry(cls, geometry: Geometry) -> Intrinsics:
+        """Of a fitted or nominal term."""
+        return cls(geometry.focal, geometry.centre, geometry.distortion)
+
+    @property
+    def vector(self) -> Float[np.ndarray, "9"]:
+        """In double precision."""
+        return np.concatenate([np.asarray(p, dtype=np.float64) for p in (self.focal, self.centre, self.distortion)])
+
+    @property
+    def matrix(self) -> Float[np.ndarray, "3 3"]:
+        """OpenCV's camera matrix."""
+        (fx, fy), (cx, cy) = np.asarray(self.focal), np.asarray(self.centre)
+        return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+
+    def camera(self) -> Geometry:
+        """The term with the lens alone: camera coordinates are the panel's."""
+        return Geometry(self.focal, self.centre, self.distortion, jnp.zeros(3), jnp.zeros(3))
 
 
-def _whole_views(points: Points, views: Bool[np.ndarray, " views"]) -> Outliers:
-    names = tuple(f"view {points.names[k]}" for k in np.flatnonzero(views))
-    return Outliers(STRANGE_RULE, int(views[points.view].sum()), names[:_MOST_PLACES])
+@final
+@dataclass(frozen=True)
+class Bundle:
+    """Intrinsics and one pose per view, board to camera: rotation vector (rad), then translation (board's unit)."""
+
+    intrinsics: Float[np.ndarray, "9"]
+    poses: Float[np.ndarray, "views 6"]
 
 
-def _check(gathered: Gathered, given: int, wanted: int) -> None:
-    if len(gathered.points.names) < wanted:
-        raise FitError(
-            f"Expected at least {wanted} views of at least {MIN_POINTS} points each, found {given} views, "
-            f"{len(gathered.points.names)} of them usable. {' '.join(gathered.notes)} Capture more views of the board."
-        )
+@final
+@dataclass(frozen=True)
+class Points:
+    """Points of all usable views one after another.
+
+    Attributes:
+        board: on the board, any unit of length. image: in px. sigma: of each coordinate in px.
+        view: whose point it is, counted over the usable views. index: its place in its view as given.
+        used: whether it takes part in the fit.
+        names: the usable views by their place in what was given.
+    """
+
+    board: Float[np.ndarray, "points 3"]
+    image: Float[np.ndarray, "points 2"]
+    sigma: Float[np.ndarray, " points"]
+    view: Int[np.ndarray, " points"]
+    index: Int[np.ndarray, " points"]
+    used: Bool[np.ndarray, " points"]
+    names: tuple[int, ...]
+
+    def scaled(self, factor: Float[np.ndarray, " views"]) -> Points:
+        """With the sigma of each view's points multiplied by that view's factor."""
+        return replace(self, sigma=self.sigma * factor[self.view])
+
+    def without(self, views: Bool[np.ndarray, " views"]) -> Points:
+        """Without these views; the others move up."""
+        stay = ~views[self.view]
+        number = np.cumsum(~views) - 1
+        names = tuple(name for name, gone in zip(self.names, views, strict=True) if not gone)
+        parts = (self.board[stay], self.image[stay], self.sigma[stay], number[self.view[stay]])
+        return Points(*parts, self.index[stay], self.used[stay], names)
+
+    def sums(self, values: Float[np.ndarray, " points"]) -> Float[np.ndarray, " views"]:
+        """Of a number of each point in use, by view."""
+        return np.bincount(self.view[self.used], values[self.used], len(self.names))
+
+    def places(self, points: Int[np.ndarray, " some"]) -> tuple[str, ...]:
+        """Points by their view and their number there, as given."""
+        return tuple(f"view {self.names[self.view[k]]}, point {self.index[k]}" for k in points)
 
 
-def _vector(start: Geometry | None) -> Float[np.ndarray, "9"] | None:
-    if start is None:
-        return None
-    parts = (start.focal, start.centre, start.distortion)
-    return np.concatenate([np.asarray(part, dtype=np.float64) for part in parts])
+def projected(
+    intrinsics: Float[np.ndarray, "9"], camera: Float[np.ndarray, "n 3"]
+) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2 15"]]:
+    """Where points in camera coordinates appear, in px.
+
+    Returns:
+        the places, and their derivatives by the intrinsics, a small turn of the points, and a shift of the points.
+    """
+    lens = Intrinsics.of(intrinsics)
+    places, slopes = cv2.projectPoints(camera, np.zeros(3), np.zeros(3), lens.matrix, lens.distortion)
+    by = slopes.reshape(-1, 2, 15)
+    return places.reshape(-1, 2), np.concatenate([by[..., 6:], by[..., :6]], axis=2)
 
 
-def _rescaled(ordered: Ordered, points: Points, prior: Prior) -> tuple[Solved, Points, float]:
-    """The chosen order with the scale of its own residuals, and the degrees of freedom behind that."""
-    solved = ordered.solved
-    use = points.used
-    dof = float((2 - leverages(solved, points, ordered.free))[use].sum())
-    square = ((residuals_px(solved.bundle, points) / points.sigma[:, None])[use] ** 2).sum()
-    factor = max(np.sqrt(square / max(dof, 1.0)), least_scale(points))
-    points = points.scaled(np.full(len(points.names), factor))
-    return solve(solved.bundle, points, ordered.free, prior), points, max(dof, 1.0)
+def linearised(
+    bundle: Bundle, points: Points
+) -> tuple[Float[np.ndarray, "points 2"], Float[np.ndarray, "points 2 15"]]:
+    """Projected minus seen in px, and the derivatives of that by the intrinsics and the view's own pose."""
+    turns = [cv2.Rodrigues(np.ascontiguousarray(pose[:3])) for pose in bundle.poses]
+    rotation = np.array([matrix for matrix, _ in turns])[points.view]
+    by_vector = np.array([by.reshape(3, 3, 3) for _, by in turns])[points.view]
+    camera = np.einsum("nij,nj->ni", rotation, points.board) + bundle.poses[points.view, 3:]
+    places, jacobian = projected(bundle.intrinsics, camera)
+    turned = np.einsum("nkij,nj->nki", by_vector, points.board)
+    jacobian[:, :, LENS : LENS + 3] = np.einsum("nai,nki->nak", jacobian[:, :, LENS + 3 :], turned)
+    return places - points.image, jacobian
 
 
-def _scale2(points: Points, given: Points) -> float:
-    return float(((points.sigma / given.sigma)[points.used] ** 2).mean())
+def residuals_px(bundle: Bundle, points: Points) -> Float[np.ndarray, "points 2"]:
+    """Projected minus seen, of all points."""
+    return linearised(bundle, points)[0]
 
 
-def _judge(
-    solved: Solved, cov: Float[np.ndarray, "n n"], image_size: tuple[int, int]
-) -> tuple[FitStatus, tuple[str, ...]]:
-    """Whether the views tell the lens; else what to capture."""
-    sigma = np.sqrt(np.diag(cov))
-    by_focal = float((sigma[:2] / np.abs(solved.bundle.intrinsics[:2])).max())
-    by_centre = float(sigma[2:4].max() / image_size[0])
-    if by_focal > MOST_UNCERTAIN or by_centre > MOST_UNCERTAIN:
-        what = "focal length" if by_focal > by_centre else "centre of the picture"
-        return FitStatus.TOO_FEW_DATA, (
-            f"The views do not tell the {what} (one sigma is {min(max(by_focal, by_centre), 99.0):.0%}). "
-            "Lean the board by 20 to 40 degrees, another way in each view, and let it fill the picture.",
-        )
-    if not solved.converged:
-        return FitStatus.NOT_CONVERGED, ("Check that the points of each view are in the order of the board's.",)
-    return FitStatus.CONVERGED, ()
+def in_sigma(bundle: Bundle, points: Points) -> tuple[Float[np.ndarray, "points 2"], Float[np.ndarray, "points 2 15"]]:
+    """As ``linearised``, in units of sigma; zero for points that are not used."""
+    residuals, jacobian = linearised(bundle, points)
+    weight = (points.used / points.sigma)[:, None]
+    return residuals * weight, jacobian * weight[..., None]
 
 
-def _remarks(scatter: Scatter, evidence: Evidence, ordered: Ordered) -> tuple[str, ...]:
-    notes = []
-    if ordered.by_prior:
-        notes.append(
-            "The views alone do not tell the whole lens: what is known beforehand stands for part of it, and every "
-            "distortion coefficient stays free within that. Lean the board another way in each view to know more."
-        )
-    relative = scatter.scales / np.median(scatter.scales)
-    loud = [f"{scatter.points.names[k]} ({relative[k]:.1f} x)" for k in np.flatnonzero(relative > _SCATTERS_MORE)]
-    if loud:
-        notes.append(f"Views that scatter more than the median view, and count for less: {', '.join(loud)}.")
-    if evidence.views.flagged:
-        notes.append(
-            f"The views disagree on the lens beyond their noise (ratio {evidence.views.ratio:.1f}, "
-            f"p = {evidence.views.p_value:.1g}): every variance is multiplied by that ratio. Is the board flat?"
-        )
-    if evidence.pattern.flagged:
-        notes.append(
-            f"The residuals follow a pattern over the picture (p = {evidence.pattern.p_value:.1g}, about "
-            f"{evidence.pattern_px:.3f} px): the lens bends rays in a way that no order has."
-        )
-    return tuple(notes)
+def by_view(
+    z: Float[np.ndarray, "points 2"], jacobian: Float[np.ndarray, "points 2 15"], points: Points
+) -> tuple[Float[np.ndarray, "views 15 15"], Float[np.ndarray, "views 15"]]:
+    """Half the Hessian and minus half the gradient of each view's chi-squared, by intrinsics and own pose."""
+    ends = np.cumsum(np.bincount(points.view, minlength=len(points.names)))[:-1]
+    tall = [
+        (j.reshape(-1, LENS + 6), r.ravel()) for j, r in zip(np.split(jacobian, ends), np.split(z, ends), strict=True)
+    ]
+    return np.array([j.T @ j for j, _ in tall]), np.array([-j.T @ r for j, r in tall])
 
 
-def _listed(points: Points) -> tuple[Outliers, ...]:
-    out = np.flatnonzero(~points.used)
-    if not len(out):
-        return ()
-    return (Outliers(OUTLIER_RULE, len(out), tuple(points.place(int(k)) for k in out[:_MOST_PLACES])),)
+@final
+@dataclass(frozen=True)
+class BundleProblem:
+    """What the solver asks of a bundle.
+
+    Attributes:
+        points: those in use count, by their sigma.
+        free: which of the intrinsics are fitted; the others stay where they start.
+        prior: on the intrinsics.
+        robust: how residuals count; None for their squares.
+    """
+
+    points: Points
+    free: Bool[np.ndarray, "9"]
+    prior: Prior
+    robust: Cauchy | None = None
+
+    @property
+    def name(self) -> str:
+        """For the iteration log."""
+        return f"bundle, {int(self.free[4:].sum())} of 5 distortions"
+
+    def moved(self, place: Bundle, step: Step) -> Bundle:
+        """The place after a step."""
+        return Bundle(place.intrinsics + step.shared, place.poses + step.own)
+
+    def equations_at(self, place: Bundle) -> Blocks:
+        """Shared are the intrinsics, with zeros for those held; a group is a view."""
+        with np.errstate(all="ignore"):  # A step too far may lead to points behind the camera; the cost refuses it.
+            z, jacobian = in_sigma(place, self.points)
+            size = np.sqrt((z**2).sum(axis=1))
+            if self.robust is None:
+                cost = float((size**2).sum())
+            else:
+                cost, root = float(self.robust.loss(size).sum()), np.sqrt(self.robust.weight(size))
+                z, jacobian = z * root[:, None], jacobian * root[:, None, None]
+            matrix, right = by_view(z, jacobian, self.points)
+        shared = matrix[:, :LENS, :LENS].sum(axis=0) + self.prior.precision
+        shared = (shared + _RIDGE * np.diag(np.diag(shared))) * np.outer(self.free, self.free)
+        shared_right = (right[:, :LENS].sum(axis=0) + self.prior.right(place.intrinsics)) * self.free
+        cross = matrix[:, :LENS, LENS:] * self.free[:, None]
+        cost, samples = cost + self.prior.cost(place.intrinsics), 2 * int(self.points.used.sum())
+        return Blocks(cost, samples, shared, shared_right, matrix[:, LENS:, LENS:], right[:, LENS:], cross)
+
+
+Solved = Solution[Bundle, Blocks]
+
+
+def solve(
+    start: Bundle, points: Points, free: Bool[np.ndarray, "9"], prior: Prior, robust: Cauchy | None = None
+) -> Solved:
+    """The minimum next to ``start``, roughly if robust or of poses alone; arguments as for ``BundleProblem``."""
+    rough = robust is not None or not free.any()
+    return minimise(BundleProblem(points, free, prior, robust), start, _ROUGH if rough else _SOLVER)

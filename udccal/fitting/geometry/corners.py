@@ -1,28 +1,75 @@
 """Inner corners of a ChArUco board in a raw mosaic, to a few hundredths of a pixel.
 
-The detector of OpenCV names the corners; each is then placed by fitting a blurred saddle to the samples around it.
+OpenCV's detector names the corners. Each is then placed by a blurred saddle, fitted to the samples around it:
+
+    I(u) = b + g . u + A erf(n1 . u / (sqrt(2) s1)) erf(n2 . u / (sqrt(2) s2)),
+
+with u the offset from the corner and n1, n2 the unit normals of the two edges. Each edge has its own width, so that
+blur along one direction (diffraction streaks) fits. Model and window are even about the corner: blur that the model
+does not describe, but which is symmetric, moves nothing.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import final
 
 import cv2
 import numpy as np
 from jaxtyping import Float, Int
+from scipy.ndimage import convolve1d
+from scipy.special import erf
 
 from udccal.arrangements import BoardSpec
 from udccal.errors import FitError
-from udccal.fitting.geometry.luminance import Luminance
-from udccal.fitting.geometry.saddles import fit_saddles
+from udccal.fitting.geometry.bundle import GeometryRules
 
-# Fewer corners than this do not hold a pose and say little about the lens.
-MIN_CORNERS = 6
-# A corner keeps this much distance (in units of the square) from the markers inside the white squares.
-_MARKER_MARGIN = 0.9
-_MAX_RADIUS_SQUARES = 0.4
+# Along one axis; it gives each of the four sites of the pattern one quarter at every pixel and is symmetric.
+_BINOMIAL = np.array([0.25, 0.5, 0.25])
 
 
+@final
+@dataclass(frozen=True)
+class Luminance:
+    """Grey picture of a black-and-white subject.
+
+    Attributes:
+        grey: filtered.
+        variance: of the samples before the filter, brought to one mean as they were.
+    """
+
+    grey: Float[np.ndarray, "rows columns"]
+    variance: Float[np.ndarray, "rows columns"]
+
+
+def luminance(mosaic: Float[np.ndarray, "rows columns"], variance: Float[np.ndarray, "rows columns"]) -> Luminance:
+    """Grey picture on the mosaic's own pixels.
+
+    The four sites of the pattern are brought to one mean and averaged with the filter (1 2 1) x (1 2 1) / 16: nothing
+    moves, and no pattern is left.
+
+    Args:
+        mosaic: free of black, in any linear unit. variance: of its samples, in that unit squared.
+    """
+    grey, spread = np.asarray(mosaic, dtype=np.float64).copy(), np.asarray(variance, dtype=np.float64).copy()
+    total = max(float(grey.mean()), 1e-12)
+    for site in sites():
+        gain = total / max(float(grey[site].mean()), 1e-12)
+        grey[site] *= gain
+        spread[site] *= gain**2
+    return Luminance(_filtered(grey), spread)
+
+
+def sites() -> list[tuple[slice, slice]]:
+    """The four sites of a colour filter's pattern."""
+    return [(slice(row, None, 2), slice(column, None, 2)) for row in (0, 1) for column in (0, 1)]
+
+
+def _filtered(picture: Float[np.ndarray, "*stack rows columns"]) -> Float[np.ndarray, "*stack rows columns"]:
+    return np.asarray(convolve1d(convolve1d(picture, _BINOMIAL, axis=-2), _BINOMIAL, axis=-1), dtype=np.float64)
+
+
+@final
 @dataclass(frozen=True)
 class BoardCorners:
     """Corners found: their numbers on the board, where they are in sensor pixels, and one sigma in px of that by noise.
@@ -55,22 +102,21 @@ def board_points_mm(spec: BoardSpec) -> Float[np.ndarray, "corners 3"]:
     return np.asarray(charuco_board(spec).getChessboardCorners(), dtype=np.float64).reshape(-1, 3)
 
 
-def detect_corners(picture: Luminance, spec: BoardSpec) -> BoardCorners:
-    """Find a board's inner corners in a grey picture (any linear unit); none found gives empty arrays.
+def detect_corners(picture: Luminance, spec: BoardSpec, rules: GeometryRules | None = None) -> BoardCorners:
+    """Find a board's inner corners in a grey picture; none found gives empty arrays.
 
     Raises:
         FitError: when the board's dictionary is unknown.
     """
+    rules = rules or GeometryRules()
     ids, rough = _detect(picture.grey, spec)
-    if len(ids) < MIN_CORNERS:
+    if len(ids) < rules.least_corners:
         return BoardCorners(np.zeros(0, dtype=np.int64), np.zeros((0, 2)), np.zeros(0))
-    axis_x, axis_y = _axes_px(board_points_mm(spec)[ids, :2], rough, spec.square_mm)
-    margin = _MARKER_MARGIN * np.sqrt(2.0) * (spec.square_mm - spec.marker_mm) / (2.0 * spec.square_mm)
-    side = np.minimum(np.linalg.norm(axis_x, axis=1), np.linalg.norm(axis_y, axis=1))
-    radius = np.clip(min(margin, _MAX_RADIUS_SQUARES) * side, 4.0, 25.0)
-    saddles = fit_saddles(picture, rough, np.stack([axis_x, axis_y], axis=1), radius)
-    good = saddles.ok
-    return BoardCorners(ids[good], saddles.xy[good], saddles.sigma[good])
+    edges = _edges_px(board_points_mm(spec)[ids, :2], rough, spec.square_mm)
+    margin = rules.marker_margin * np.sqrt(2.0) * (spec.square_mm - spec.marker_mm) / (2.0 * spec.square_mm)
+    side = np.linalg.norm(edges, axis=2).min(axis=1)
+    radius = np.clip(min(margin, rules.window_squares) * side, *rules.window_px)
+    return _saddles(picture, BoardCorners(ids, rough, np.zeros(len(ids))), edges, radius, rules)
 
 
 def _detect(
@@ -82,12 +128,10 @@ def _detect(
     picture = np.round(255.0 * scaled).astype(np.uint8)
     detector = cv2.aruco.CharucoDetector(charuco_board(spec))
     best = (np.zeros(0, dtype=np.int64), np.zeros((0, 2)))
-    inner = (spec.columns - 1) * (spec.rows - 1)
-    for halvings in (0, 1):
-        if len(best[0]) == inner:
+    for shrink in (1, 2):
+        if len(best[0]) == (spec.columns - 1) * (spec.rows - 1):
             break
-        shrink = 2**halvings
-        small = picture if halvings == 0 else cv2.resize(picture, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+        small = picture if shrink == 1 else cv2.resize(picture, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
         corners, ids, _, _ = detector.detectBoard(small)
         if ids is not None and len(ids) > len(best[0]):
             xy = (np.asarray(corners, dtype=np.float64).reshape(-1, 2) + 0.5) * shrink - 0.5
@@ -95,17 +139,113 @@ def _detect(
     return best
 
 
-def _axes_px(
+def _edges_px(
     board: Float[np.ndarray, "n 2"], image: Float[np.ndarray, "n 2"], square_mm: float
-) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"]]:
+) -> Float[np.ndarray, "n 2 2"]:
     """How one square's side to the right and one side down look in the picture at each corner."""
     homography, _ = cv2.findHomography(board, image, cv2.RANSAC, 5.0)
     if homography is None:
         homography = np.eye(3)
 
     def seen(points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
-        return cv2.perspectiveTransform(points.reshape(-1, 1, 2), homography).reshape(-1, 2)
+        return np.asarray(cv2.perspectiveTransform(points.reshape(-1, 1, 2), homography).reshape(-1, 2))
 
-    half = square_mm / 2
-    right, down = np.array([half, 0.0]), np.array([0.0, half])
-    return seen(board + right) - seen(board - right), seen(board + down) - seen(board - down)
+    half = square_mm / 2 * np.eye(2)
+    return np.stack([seen(board + step) - seen(board - step) for step in half], axis=1)
+
+
+@final
+@dataclass(frozen=True)
+class _Windows:
+    """Samples in squares around whole pixels near corners, and the radius of the round part that counts."""
+
+    offsets: Float[np.ndarray, "m 2"]
+    samples: Float[np.ndarray, "n m"]
+    radius: Float[np.ndarray, " n"]
+
+
+@final
+class _Saddle:
+    """The model at a shape (px, py, angle1, angle2, log s1, log s2), its linear part (b, gx, gy, A) at its best."""
+
+    def __init__(self, shape: Float[np.ndarray, "n 6"], windows: _Windows) -> None:
+        self.u = windows.offsets[None] - shape[:, None, :2]
+        self.weight = np.clip(1 - (self.u**2).sum(-1) / windows.radius[:, None] ** 2, 0.0, None)
+        self.normals = np.stack([np.cos(shape[:, 2:4]), np.sin(shape[:, 2:4])], axis=-1)
+        self.width = np.exp(shape[:, 4:6])
+        self.across = np.einsum("nmi,nki->nkm", self.u, self.normals) / self.width[..., None]
+        self.profile = erf(self.across / np.sqrt(2.0))
+        ones, product = np.ones_like(windows.samples), self.profile[:, 0] * self.profile[:, 1]
+        self.design = np.stack([ones, self.u[..., 0], self.u[..., 1], product], axis=-1)
+        normal = np.einsum("nmi,nm,nmj->nij", self.design, self.weight, self.design) + 1e-9 * np.eye(4)
+        right = np.einsum("nmi,nm,nm->ni", self.design, self.weight, windows.samples)
+        self.linear = np.linalg.solve(normal, right[..., None])[..., 0]
+        self.residual = windows.samples - np.einsum("nmi,ni->nm", self.design, self.linear)
+        self.cost = (self.weight * self.residual**2).sum(-1)
+
+    def jacobian(self) -> Float[np.ndarray, "n m 10"]:
+        """By the shape and the linear part."""
+        bell = np.sqrt(2 / np.pi) * np.exp(-(self.across**2) / 2)
+        common = self.linear[:, 3, None, None] * bell * self.profile[:, ::-1]
+        by_width = common / self.width[..., None]
+        position = -np.einsum("nkm,nki->nmi", by_width, self.normals) - self.linear[:, None, 1:3]
+        tangents = np.stack([-self.normals[..., 1], self.normals[..., 0]], axis=-1)
+        turn, grow = by_width * np.einsum("nmi,nki->nkm", self.u, tangents), -common * self.across
+        return np.concatenate([position, np.moveaxis(turn, 1, 2), np.moveaxis(grow, 1, 2), self.design], axis=-1)
+
+    def step(self, damping: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 6"]:
+        """Damped Gauss-Newton step of the shape; the linear part follows by itself."""
+        jacobian = self.jacobian()
+        normal = np.einsum("nmi,nm,nmj->nij", jacobian, self.weight, jacobian)
+        diagonal = np.einsum("nii->ni", normal)
+        raised = damping[:, None] * diagonal + 1e-12 * diagonal.max(1, keepdims=True) + 1e-30
+        right = np.einsum("nmi,nm,nm->ni", jacobian, self.weight, self.residual)
+        return np.linalg.solve(normal + raised[:, :, None] * np.eye(10), right[..., None])[:, :6, 0]
+
+    def noise_sigma(self, variance: Float[np.ndarray, "n m"]) -> Float[np.ndarray, " n"]:
+        """One sigma by axis in px that the samples' noise gives, through the filter and the window's weights.
+
+        Weighted least squares moves a corner by G = (J' W J)^-1 J' W per filtered sample: the covariance is a sandwich.
+        """
+        jacobian = self.jacobian()
+        normal = np.einsum("nmi,nm,nmj->nij", jacobian, self.weight, jacobian)
+        inverse = np.linalg.pinv(normal, hermitian=True)[:, :2]
+        moves = np.einsum("nip,nmp,nm->nim", inverse, jacobian, self.weight)
+        side = int(np.sqrt(moves.shape[2]))
+        by_sample = _filtered(moves.reshape(*moves.shape[:2], side, side)).reshape(moves.shape)
+        return np.sqrt(np.einsum("nim,nm->n", by_sample**2, variance) / 2)
+
+
+def _saddles(
+    picture: Luminance,
+    start: BoardCorners,
+    edges: Float[np.ndarray, "n 2 2"],
+    radius: Float[np.ndarray, " n"],
+    rules: GeometryRules,
+) -> BoardCorners:
+    """Place all corners at once; those out of the picture, moved away or without contrast are left out."""
+    rows, columns = picture.grey.shape
+    half = int(np.ceil(radius.max())) + 1
+    base = np.round(start.xy).astype(np.int64)
+    inside = np.all((base >= half) & (base < np.array([columns - half, rows - half])), axis=1)
+    base = np.clip(base, half, np.array([columns - half - 1, rows - half - 1]))
+    dy, dx = (a.ravel() for a in np.mgrid[-half : half + 1, -half : half + 1])
+    where = (base[:, 1, None] + dy, base[:, 0, None] + dx)
+    windows = _Windows(np.stack([dx, dy], axis=1).astype(np.float64), picture.grey[where], radius)
+    angles = np.arctan2(edges[..., 0], -edges[..., 1])
+    shape = np.concatenate([start.xy - base, angles, np.full((len(base), 2), np.log(1.5))], axis=1)
+    saddle, damping = _Saddle(shape, windows), np.full(len(base), 1e-3)
+    for _ in range(rules.saddle_rounds):
+        trial = shape + np.clip(saddle.step(damping), -1.0, 1.0)
+        trial[:, 4:] = np.clip(trial[:, 4:], np.log(0.3), np.log(20.0))
+        better = _Saddle(trial, windows).cost < saddle.cost
+        shape = np.where(better[:, None], trial, shape)
+        saddle = _Saddle(shape, windows)
+        damping = np.clip(np.where(better, damping / 5, damping * 10), 1e-9, 1e9)
+    sigma = saddle.noise_sigma(picture.variance[where])
+    misfit = np.sqrt(saddle.cost / np.maximum(saddle.weight.sum(-1) - 10, 1.0))
+    xy = base + shape[:, :2]
+    near = np.linalg.norm(xy - start.xy, axis=1) < np.maximum(radius / 2, 3.0)
+    contrast = np.abs(saddle.linear[:, 3]) > rules.least_contrast * misfit
+    good = inside & near & contrast & (sigma < rules.worst_corner_sigma_px) & np.isfinite(xy).all(axis=1)
+    return BoardCorners(start.ids[good], xy[good], sigma[good])

@@ -1,209 +1,245 @@
-"""Geometry fit: views of a ChArUco board through the panel -> intrinsics, distortion, and the camera's tilt.
+"""Lens and poses from arrays of corners, of a ChArUco board through a panel and of a chessboard in a photograph alike.
 
-One view shows the board parallel to the panel. Its axes are then the panel's, so that the inverse of its pose is
-``R_panel_camera``. Stand-off and panel position stay nominal here: a far board does not show them; the wire fit does.
+The robust minimum of the best start, without outliers; then scatter by likelihood; then the order of the distortion.
+The sigma that comes with a point tells how it compares with others; its scale is estimated. One scale serves all views
+unless a test says that the views differ (blur, light and distance do that): then each has its own.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import final
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Bool, Float
 
 from udccal.errors import FitError
-from udccal.fitting.geometry.angles import ANGLE_NAMES, panel_rotation, with_angles
-from udccal.fitting.geometry.bundle import MIN_VIEWS, calibrate_views
-from udccal.fitting.geometry.bundle_orders import INTRINSIC_NAMES
-from udccal.fitting.geometry.bundle_points import bucket
-from udccal.fitting.geometry.bundle_solve import Prior
-from udccal.fitting.geometry.calibrated_views import CalibratedViews
-from udccal.fitting.geometry.corner_scatter import CornerScatter, excess_scatter
-from udccal.fitting.geometry.corners import MIN_CORNERS, board_points_mm
-from udccal.fitting.geometry.report import (
-    PATTERN,
-    diagnostics_of,
-    held_notes,
-    outliers_of,
-    rejections,
-    residual_sample,
+from udccal.fitting.engine.gaussian import Prior
+from udccal.fitting.engine.misfit import SIGNIFICANT
+from udccal.fitting.engine.orders import Attempt, Choice, bic, choose
+from udccal.fitting.engine.robust import outliers
+from udccal.fitting.engine.tails import chi2_tail
+from udccal.fitting.geometry.bundle import (
+    EVERY,
+    LENS,
+    ORDERS,
+    Bundle,
+    GeometryRules,
+    Intrinsics,
+    Points,
+    Solved,
+    by_view,
+    in_sigma,
+    residuals_px,
+    solve,
 )
-from udccal.fitting.geometry.views import MAX_CLIPPED, BoardView, read_views
-from udccal.fitting.nominal import nominal_geometry
-from udccal.models.geometry import Geometry, mounting_rotation, panel_directions, project
-from udccal.models.noise import Noise
+from udccal.fitting.geometry.calibrated import CalibratedViews, Evidence, weigh
+from udccal.fitting.geometry.start import Settled, costs, facing, gather, least_scale, settle, strange_views
+from udccal.models.geometry import Geometry
 from udccal.numerics import in_float64
-from udccal.result import Estimate, FitResult, FitStatus
-from udccal.rig import RigDescription
-from udccal.sessions.store import Session
+from udccal.result import FitStatus
 
-__all__ = ["BoardView", "fit_geometry", "fit_views", "projection_sigma_px", "read_views", "rig_prior"]
-
-_WORST_RMS_PX, _WORST_CHI2_DOF = 1.0, 9.0
-# Corners' scatter beside noise: where its estimate starts, and the change that ends it (relatively).
-_START_SCATTER_PX, _SETTLED, _SCATTER_ROUNDS = 0.02, 0.05, 4
-# Lenses sit on their sensors' middles to about this part of the width (one sigma).
-_CENTRE_SIGMA = 0.01
-# (k1, k2, p1, p2, k3) of lenses that this model describes.
-_BEND_SIGMA = (0.2, 0.2, 1e-3, 1e-3, 0.1)
-UNITS = ("px", "px", "px", "px", "1", "1", "1", "1", "1", "deg", "deg", "deg")
-
-
-def fit_geometry(session: Session, noise: Noise) -> FitResult[Geometry]:
-    """Fit the geometry term to the steps ``geometry/*`` of a session.
-
-    What the rig's description says of the lens is the prior: where the views do not tell the focal length, it stays
-    nominal with the sigma of its tolerance.
-
-    Args:
-        session: holds views of a board, one of them ``parallel_to_panel``.
-        noise: gives the black level and saturation.
-
-    Raises:
-        SessionError: when a file is missing or damaged.
-    """
-    rig = session.rig
-    size = (rig.camera.columns, rig.camera.rows)
-    return fit_views(read_views(session, noise), nominal_geometry(rig), size, rig_prior(rig))
-
-
-def rig_prior(rig: RigDescription) -> Prior:
-    """What a rig's description says of its lens: the focal length by its tolerance, the rest as lenses commonly are."""
-    nominal = nominal_geometry(rig)
-    sigma = np.array([0.0, 0.0, 0.0, 0.0, *_BEND_SIGMA])
-    sigma[:2] = rig.focal_px * max(rig.lens.focal_mm.tolerance / rig.lens.focal_mm.value, 1e-4)
-    sigma[2:4] = _CENTRE_SIGMA * rig.camera.columns
-    return Prior(np.concatenate([nominal.focal, nominal.centre, nominal.distortion]), 1 / sigma**2)
-
-
-def fit_views(
-    views: Sequence[BoardView], nominal: Geometry, image_size: tuple[int, int], prior: Prior | None = None
-) -> FitResult[Geometry]:
-    """Fit the geometry term to boards already found.
-
-    Args:
-        views: boards, one of them parallel to the panel; at least 3 usable ones, or any number with a prior.
-        nominal: where to start; its pupil is kept.
-        image_size: (columns, rows).
-        prior: on the intrinsics, such as ``rig_prior`` gives.
-    """
-    usable = [view for view in views if view.usable]
-    notes = _notes(views)
-    wanted = MIN_VIEWS if prior is None else 1
-    parallel = sum(view.parallel for view in usable)
-    if len(usable) < wanted or not parallel:
-        clipped = sum(view.clipped > MAX_CLIPPED for view in views)
-        status = FitStatus.SATURATED if clipped > len(views) / 2 else FitStatus.TOO_FEW_DATA
-        found = f"Expected {wanted} views with a board and one of them parallel to the panel, found {len(usable)} "
-        return _failed(nominal, status, (*notes, f"{found}and {parallel}."))
-    try:
-        bundle, scatter = _calibrated(usable, nominal, image_size, prior)
-    except FitError as error:
-        return _failed(nominal, FitStatus.TOO_FEW_DATA, (*notes, str(error)))
-    return _result(bundle, scatter, [usable[k] for k in bundle.names], nominal, (*notes, *bundle.notes))
-
-
-def _calibrated(
-    views: Sequence[BoardView], nominal: Geometry, image_size: tuple[int, int], prior: Prior | None
-) -> tuple[CalibratedViews, CornerScatter]:
-    """The bundle; every corner has its noise and the scatter that all have beside it, estimated with the rest."""
-    scatter = CornerScatter(_START_SCATTER_PX)
-    points = [board_points_mm(view.spec)[view.corners.ids] for view in views]
-    seen = [view.corners.xy for view in views]
-    for _ in range(_SCATTER_ROUNDS):
-        sigmas = [scatter.of(view.corners.sigma) for view in views]
-        bundle = calibrate_views(points, seen, image_size, nominal, sigmas, prior=prior)
-        noise_px = [views[bundle.names[v]].corners.sigma[k] for v, k in zip(bundle.view, bundle.index, strict=True)]
-        before, scatter = scatter, excess_scatter(bundle, np.array(noise_px))
-        if abs(scatter.excess_px - before.excess_px) <= _SETTLED * before.excess_px:
-            break
-    return bundle, scatter
-
-
-def _notes(views: Sequence[BoardView]) -> tuple[str, ...]:
-    lost = [view.step_id for view in views if len(view.corners.ids) < MIN_CORNERS]
-    clipped = [view.step_id for view in views if view.clipped > MAX_CLIPPED]
-    notes = []
-    if lost:
-        notes.append(f"No board (fewer than {MIN_CORNERS} corners) in {', '.join(lost)}.")
-    if clipped:
-        notes.append(f"More than {MAX_CLIPPED:.0%} of the samples clipped in {', '.join(clipped)}.")
-    return tuple(notes)
-
-
-def _failed(nominal: Geometry, status: FitStatus, notes: tuple[str, ...]) -> FitResult[Geometry]:
-    return FitResult.failed("geometry", nominal, status, *notes)
-
-
-def _result(
-    bundle: CalibratedViews,
-    scatter: CornerScatter,
-    views: list[BoardView],
-    nominal: Geometry,
-    notes: tuple[str, ...],
-) -> FitResult[Geometry]:
-    """``views`` are those that the bundle uses."""
-    parallel = [k for k, view in enumerate(views) if view.parallel]
-    if bundle.status is FitStatus.TOO_FEW_DATA or not parallel:
-        lost = () if parallel else ("No usable view shows the board parallel to the panel; capture that view again.",)
-        return _failed(nominal, FitStatus.TOO_FEW_DATA, (*notes, *lost))
-    rotation = panel_rotation(bundle, parallel)
-    pupil = np.asarray(nominal.pupil, dtype=np.float64)
-    values, cov = with_angles(bundle, parallel, rotation)
-    sigma = np.sqrt(np.maximum(np.diag(cov), 0.0))
-    names = INTRINSIC_NAMES + ANGLE_NAMES
-    return FitResult(
-        name="geometry",
-        term=Geometry(bundle.focal, bundle.centre, bundle.distortion, rotation, pupil),
-        status=FitStatus.POOR_FIT if _poor(bundle) else bundle.status,
-        estimates=tuple(
-            Estimate(name, float(value), float(one), unit)
-            for name, value, one, unit in zip(names, values, sigma, UNITS, strict=True)
-        ),
-        cov=cov,
-        chi2_dof=bundle.chi2_dof,
-        samples=2 * int(bundle.used.sum()),
-        candidates=bundle.candidates,
-        diagnostics=diagnostics_of(bundle, scatter, views),
-        notes=(*notes, *rejections(bundle, views), *held_notes(bundle)),
-        outliers=outliers_of(bundle, views),
-        residuals=residual_sample(bundle),
-    )
-
-
-def _poor(bundle: CalibratedViews) -> bool:
-    """Far off in pixels, and far more so than the corners' own sigma allows."""
-    return bundle.rms_px > _WORST_RMS_PX and bundle.chi2_dof > _WORST_CHI2_DOF
+NO_PRIOR = Prior(np.zeros(LENS), np.zeros((0, LENS)))
+# A residual below this is rounding, not noise: orders that differ there only are equally good.
+_ROUNDING_PX = 1e-7
 
 
 @in_float64
-def projection_sigma_px(result: FitResult[Geometry], pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
-    """One sigma in px (x, y) of where directions fixed in panel coordinates appear, at the sensor pixels given.
+def fit_geometry(
+    board_points: Sequence[Float[np.ndarray, "..."]],
+    image_points: Sequence[Float[np.ndarray, "..."]],
+    image_size: tuple[int, int],
+    start: Geometry | None = None,
+    sigmas: Sequence[Float[np.ndarray, " _"]] | None = None,
+    *,
+    prior: Prior | None = None,
+    start_poses: Float[np.ndarray, "views 6"] | None = None,
+    rules: GeometryRules | None = None,
+) -> CalibratedViews:
+    """Calibrate a camera from views of flat boards.
 
-    What the residuals show of the model's own error is part of it. Zero everywhere when the fit failed and has no
-    covariance.
+    Args:
+        board_points: per view, points on the board (z = 0) in any unit of length, (n, 3) or (n, 1, 3).
+        image_points: per view, the same points in px, (n, 2) or (n, 1, 2) as OpenCV gives them. (0, 0) is the centre of
+            the top-left pixel; NaN where not seen.
+        image_size: (columns, rows).
+        start: intrinsics to start from. The views' vanishing points (Zhang, 2000) give another start in any case; the
+            lower minimum wins.
+        sigmas: per view, one sigma in px of each point, up to a common factor; without it all points count alike.
+        prior: what is known of the intrinsics beforehand, in the order of ``Intrinsics``; with it a single view may do.
+        start_poses: per view, a pose to start from, with ``start``.
+        rules: see ``GeometryRules``.
+
+    Returns:
+        lens and poses with their covariance, and the evidence for them. The order of the distortion is the one with the
+        lowest BIC (Schwarz, 1978) on the points that remain after outliers are left out.
+
+    Raises:
+        FitError: with fewer than 3 usable views (1 with a prior), each of 6 finite points that are not on one line; or
+            when the arrays do not belong together.
     """
-    if not len(result.cov):
-        return np.zeros((len(pixels), 2))
-    padded = np.tile(np.asarray(result.term.centre, dtype=np.float64), (bucket(len(pixels)), 1))
-    padded[: len(pixels)] = pixels
-    directions = np.asarray(_directions(result.term, padded))
-    slopes = np.asarray(_slopes(np.array([e.value for e in result.estimates]), directions))[: len(pixels)]
-    variance = np.maximum(np.einsum("nip,pq,niq->ni", slopes, result.cov, slopes), 0.0)
-    pattern = next((d.value for d in result.diagnostics if d.name == PATTERN), 0.0)
-    return np.sqrt(variance + pattern**2)
+    rules = rules or GeometryRules()
+    gathered = gather(board_points, image_points, sigmas, rules)
+    least, known = (rules.least_views, NO_PRIOR) if prior is None else (1, prior)
+    given, left_out = gathered.points, gathered.outliers
+    if len(given.names) < least:
+        raise FitError(
+            f"Expected at least {least} views of at least {rules.least_corners} points each, found {len(board_points)} "
+            f"views, {len(given.names)} of them usable. {' '.join(gathered.notes)} Capture more views of the board."
+        )
+    lens = None if start is None else Intrinsics.of_geometry(start)
+    settled = settle(given, image_size, lens, start_poses, known, rules)
+    strange = strange_views(settled.points, given, rules)
+    if strange.any() and (~strange).sum() >= least:
+        rule = f"of a view that scatters more than {rules.strange_view:g} times as much as the median view"
+        left_out = (*left_out, *outliers(rule, (f"view {given.names[k]}" for k in np.flatnonzero(strange))))
+        given = given.without(strange)
+        settled = settle(given, image_size, lens, start_poses, known, rules)
+    full, points, scales = _maximum_likelihood(settled, given, known, rules)
+    chosen, by_prior = _choose_order(full, points, known, rules)
+    final, points, dof = _rescaled(chosen.best.fit, points, known)
+    evidence = weigh(final.place, final.equations.joint_cov(), points, chosen.best.fit.free, image_size, dof, rules)
+    cov = final.equations.joint_cov() * evidence.variance_factor
+    status, advice = _judged(final, cov, image_size, rules)
+    bundle = Bundle(final.place.intrinsics, facing(final.place.poses))
+    out = np.flatnonzero(~points.used)
+    return CalibratedViews(
+        intrinsics=Intrinsics.of(bundle.intrinsics),
+        poses=bundle.poses,
+        cov=cov,
+        points=points,
+        residuals_px=residuals_px(bundle, points),
+        free=tuple(bool(one) for one in chosen.best.fit.free),
+        chi2_dof=1.0 if sigmas is None else float(((points.sigma / given.sigma)[points.used] ** 2).mean()),
+        candidates=chosen.candidates,
+        evidence=evidence,
+        status=status,
+        notes=(*gathered.notes, *advice, *_remarks(points, scales, evidence, by_prior, rules)),
+        outliers=(*left_out, *rules.corners.listed(points.places(out))),
+        iterations=full.iterations,
+        starts_agreeing=settled.agreeing,
+        image_size=image_size,
+    )
 
 
-_directions = jax.jit(panel_directions)
+def _maximum_likelihood(
+    settled: Settled, given: Points, prior: Prior, rules: GeometryRules
+) -> tuple[Solved, Points, Float[np.ndarray, " views"]]:
+    """Scales from residuals and their degrees of freedom, the points with them, and the solution weighted by them."""
+    solved, points = settled.solved, settled.points
+    given, scales = replace(given, used=points.used), np.ones(len(given.names))
+    for _ in range(rules.rounds):
+        square, dof = costs(solved.place, given), 2 * given.sums(np.ones(len(given.view))) - _spent(solved, points)
+        differ = _differ(square, dof)
+        own = square / np.maximum(dof, 1.0) if differ else np.full(len(dof), square.sum() / max(dof.sum(), 1.0))
+        before, scales = scales, np.maximum(np.sqrt(own), least_scale(given))
+        points = given.scaled(scales)
+        solved = solve(solved.place, points, EVERY, prior)
+        if not differ or np.allclose(scales, before, rtol=1e-3):
+            break
+    return solved, points, scales
 
 
-@jax.jit
-def _slopes(parameters: Float[Array, "12"], directions: Float[Array, "n 3"]) -> Float[Array, "n 2 12"]:
-    def seen(x: Float[Array, "12"]) -> Float[Array, "n 2"]:
-        camera = Geometry(x[:2], x[2:4], x[4:9], jnp.zeros(3), jnp.zeros(3))
-        tilt, roll, yaw = jnp.deg2rad(x[9:])
-        return project(camera, directions @ mounting_rotation(tilt, roll, yaw))
+def _spent(solved: Solved, points: Points) -> Float[np.ndarray, " views"]:
+    """Degrees of freedom that the fit takes up of each view: the trace of information times covariance."""
+    information, _ = by_view(*in_sigma(solved.place, points), points)
+    views = np.arange(len(points.names))[:, None]
+    mine = np.hstack([np.arange(LENS) + 0 * views, LENS + 6 * views + np.arange(6)])
+    cov = solved.equations.joint_cov()[mine[:, :, None], mine[:, None, :]]
+    return np.einsum("kij,kji->k", information, cov)
 
-    return jax.jacfwd(seen)(parameters)
+
+def _differ(square: Float[np.ndarray, " views"], dof: Float[np.ndarray, " views"]) -> bool:
+    """Bartlett's test of equal variances (1937), over views that have at least four degrees of freedom."""
+    if len(dof) < 2 or not ((dof >= 4) & (square > 0)).all():
+        return False
+    ratio = float((dof * np.log(square.sum() / dof.sum() / (square / dof))).sum())
+    correction = 1 + ((1 / dof).sum() - 1 / dof.sum()) / (3 * (len(dof) - 1))
+    return chi2_tail(ratio / correction, len(dof) - 1) < SIGNIFICANT
+
+
+@final
+@dataclass(frozen=True)
+class _Order:
+    """One order of the distortion, solved."""
+
+    solved: Solved
+    free: Bool[np.ndarray, "9"]
+
+
+def _choose_order(full: Solved, points: Points, prior: Prior, rules: GeometryRules) -> tuple[Choice[_Order], bool]:
+    """Every order, solved from the quadratic model of the one above; and whether the prior chose.
+
+    Where the prior brings a good part of what is known of focal length or centre, the data are too few to tell a
+    coefficient from a pose. All then stay free, each within its prior.
+    """
+    tried: list[Attempt[_Order]] = []
+    for place, (name, free) in reversed(list(enumerate(ORDERS.items()))):
+        above = tried[0].fit if tried else _Order(full, EVERY)
+        solved = solve(_held(above, free), points, free, prior) if tried else full
+        parameters = int(free.sum()) + 6 * len(points.names)
+        criterion = _criterion(solved, points, parameters) + 2 * place * np.log(rules.further_order)
+        tried.insert(0, Attempt(name, parameters, float(criterion), _Order(solved, free)))
+    known = np.diag(full.equations.cov())[:4] * np.diag(prior.precision)[:4]
+    by_prior = bool((known > rules.prior_share).any())
+    return (Choice(tried[-1], tuple(tried)) if by_prior else choose(tried)), by_prior
+
+
+def _held(above: _Order, free: Bool[np.ndarray, "9"]) -> Bundle:
+    """Where the minimum moves when coefficients are held at 0, by the quadratic model of the order above."""
+    place = above.solved.place
+    x, cov = np.concatenate([place.intrinsics, place.poses.ravel()]), above.solved.equations.joint_cov()
+    drop = np.flatnonzero(above.free & ~free)
+    moved = x - cov[:, drop] @ np.linalg.pinv(cov[np.ix_(drop, drop)], hermitian=True) @ x[drop]
+    return Bundle(np.where(free, moved[:LENS], 0.0), moved[LENS:].reshape(-1, 6))
+
+
+def _criterion(solved: Solved, points: Points, parameters: int) -> float:
+    """BIC with the scale of the noise estimated, too: n ln(chi2 / n) for chi2. Residuals of rounding are all equal."""
+    samples = 2 * int(points.used.sum())
+    chi2 = float(costs(solved.place, points).sum())
+    least = float((_ROUNDING_PX**2 / points.sigma[points.used] ** 2).sum())
+    return bic(samples * float(np.log(max(chi2, least) / samples)), float(parameters), samples)
+
+
+def _rescaled(order: _Order, points: Points, prior: Prior) -> tuple[Solved, Points, float]:
+    """The chosen order with the scale of its own residuals, and the degrees of freedom behind that."""
+    dof = max(2 * float(points.used.sum()) - float(_spent(order.solved, points).sum()), 1.0)
+    factor = max(np.sqrt(float(costs(order.solved.place, points).sum()) / dof), least_scale(points))
+    points = points.scaled(np.full(len(points.names), factor))
+    return solve(order.solved.place, points, order.free, prior), points, dof
+
+
+def _judged(
+    solved: Solved, cov: Float[np.ndarray, "n n"], image_size: tuple[int, int], rules: GeometryRules
+) -> tuple[FitStatus, tuple[str, ...]]:
+    """Whether the views tell the lens; else what to capture."""
+    sigma = np.sqrt(np.diag(cov)[:4])
+    by_focal = float((sigma[:2] / np.abs(solved.place.intrinsics[:2])).max())
+    by_centre = float(sigma[2:].max() / image_size[0])
+    if max(by_focal, by_centre) > rules.most_uncertain:
+        what = "focal length" if by_focal > by_centre else "centre of the picture"
+        return FitStatus.TOO_FEW_DATA, (
+            f"The views do not tell the {what} (one sigma is {min(max(by_focal, by_centre), 99.0):.0%}). "
+            "Lean the board by 20 to 40 degrees, another way in each view, and let it fill the picture.",
+        )
+    if not solved.converged:
+        return FitStatus.NOT_CONVERGED, ("Check that the points of each view are in the order of the board's.",)
+    return FitStatus.CONVERGED, ()
+
+
+def _remarks(
+    points: Points, scales: Float[np.ndarray, " views"], evidence: Evidence, by_prior: bool, rules: GeometryRules
+) -> tuple[str, ...]:
+    notes = []
+    if by_prior:
+        notes.append(
+            "The views alone do not tell the whole lens: what is known beforehand stands for part of it, and every "
+            "distortion coefficient stays free within that. Lean the board another way in each view to know more."
+        )
+    relative = scales / np.median(scales)
+    loud = [f"{points.names[k]} ({relative[k]:.1f} x)" for k in np.flatnonzero(relative > rules.loud_view)]
+    if loud:
+        notes.append(f"Views that scatter more than the median view, and count for less: {', '.join(loud)}.")
+    return (*notes, *evidence.notes)

@@ -1,0 +1,261 @@
+"""A rig's geometry from its boards: intrinsics, distortion, and how the camera is mounted behind the panel.
+
+One view shows the board parallel to the panel. Its axes are then the panel's, so that the inverse of its pose is
+``R_panel_camera``. Stand-off and panel position stay nominal here: a far board does not show them; the wire fit does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+
+import jax
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from udccal.errors import FitError
+from udccal.fitting.engine.gaussian import Posterior, square_root
+from udccal.fitting.engine.misfit import excess_sigma
+from udccal.fitting.engine.report import estimates, residual_sample
+from udccal.fitting.geometry.bundle import INTRINSIC_NAMES, INTRINSIC_UNITS, LENS, GeometryRules, Intrinsics
+from udccal.fitting.geometry.calibrated import CalibratedViews
+from udccal.fitting.geometry.corners import board_points_mm
+from udccal.fitting.geometry.data import BoardView, GeometryData
+from udccal.fitting.geometry.fit import fit_geometry
+from udccal.models.geometry import Geometry, panel_directions, project_directions
+from udccal.numerics import in_float64
+from udccal.result import Diagnostic, FitResult, FitStatus, Outliers
+
+ANGLE_NAMES = ("tilt_deg", "roll_deg", "yaw_deg")
+# Scatter beside noise of the board on the jig, and of the median view of others: a plan reads them.
+ON_JIG, BY_HAND = "corner_scatter_on_jig", "corner_scatter_by_hand"
+# No lens follows its model more closely than this.
+_LEAST_PX = 1e-3
+# The scatter of corners is settled when it changes by less than this part.
+_SETTLED = 0.05
+# Radians over which an angle's derivative is taken.
+_STEP_RAD = 1e-5
+
+
+def fit_boards(data: GeometryData, rules: GeometryRules | None = None) -> FitResult[Geometry]:
+    """Fit the geometry term to boards, with ``fit_geometry``.
+
+    Every corner has its noise and a scatter that all have beside it (paper that is not flat, blur that a saddle does
+    not describe), which is estimated with the rest.
+
+    Args:
+        data: boards, one of them parallel to the panel; at least 3 usable ones, or any number with a prior.
+        rules: see ``GeometryRules``.
+
+    Returns:
+        the term, with estimates of the intrinsics and of tilt, roll and yaw. Status ``TOO_FEW_DATA``, ``SATURATED`` or
+        ``POOR_FIT`` says what to capture.
+    """
+    rules = rules or GeometryRules()
+    usable = [view for view in data.views if view.usable(rules)]
+    notes = _lost(data.views, rules)
+    least = rules.least_views if data.prior is None else 1
+    parallel = sum(view.parallel for view in usable)
+    if len(usable) < least or not parallel:
+        clipped = sum(view.clipped > rules.most_clipped for view in data.views)
+        status = FitStatus.SATURATED if clipped > len(data.views) / 2 else FitStatus.TOO_FEW_DATA
+        found = f"Expected {least} views with a board and one of them parallel to the panel, found {len(usable)} "
+        return FitResult.failed("geometry", data.nominal, status, *notes, f"{found}and {parallel}.")
+    try:
+        bundle, scatter_px = _calibrated(usable, data, rules)
+    except FitError as error:
+        return FitResult.failed("geometry", data.nominal, FitStatus.TOO_FEW_DATA, *notes, str(error))
+    return _result(bundle, scatter_px, [usable[k] for k in bundle.points.names], data.nominal, notes, rules)
+
+
+def projection_sigma_px(result: FitResult[Geometry], pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
+    """One sigma in px (x, y) of where directions fixed in panel coordinates appear, at the sensor pixels given.
+
+    What the residuals show of the model's own error is part of it.
+
+    Raises:
+        FitError: when the fit failed, or was read from a profile.
+    """
+    directions = _directions(result.term, pixels)
+    return result.sigma_of(lambda term: np.asarray(_places(term, directions)))
+
+
+_places = jax.jit(project_directions)
+
+
+@in_float64
+def _directions(term: Geometry, pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 3"]:
+    return np.asarray(_jitted_directions(term, pixels))
+
+
+_jitted_directions = jax.jit(panel_directions)
+
+
+def _calibrated(
+    views: Sequence[BoardView], data: GeometryData, rules: GeometryRules
+) -> tuple[CalibratedViews, Float[np.ndarray, " n"]]:
+    """The bundle, and the scatter beside noise in px by axis: of all views together, then of each in use."""
+    points = [board_points_mm(view.spec)[view.corners.ids] for view in views]
+    scatter_px = np.full(1, rules.start_scatter_px)
+    for _ in range(rules.rounds):
+        sigmas = [np.maximum(np.hypot(view.corners.sigma, scatter_px[0]), _LEAST_PX) for view in views]
+        seen = [view.corners.xy for view in views]
+        bundle = fit_geometry(points, seen, data.image_size, data.nominal, sigmas, prior=data.prior, rules=rules)
+        before, scatter_px = scatter_px, _scatter_px(bundle, views)
+        if abs(scatter_px[0] - before[0]) <= _SETTLED * before[0]:
+            break
+    return bundle, scatter_px
+
+
+def _scatter_px(bundle: CalibratedViews, views: Sequence[BoardView]) -> Float[np.ndarray, " n"]:
+    """The scatter at which residuals have the size that they should; not gated, as plans need the estimate itself."""
+    points = bundle.points
+    noise = [views[points.names[v]].corners.sigma[k] for v, k in zip(points.view, points.index, strict=True)]
+    variance = np.maximum(np.array(noise), _LEAST_PX) ** 2
+    square = (bundle.residuals_px**2).sum(axis=1)
+    spent = (sum(bundle.free) + 6 * len(points.names)) / (2 * points.used.sum())
+    # A floor keeps fits that spend nearly all of their data from having no degrees of freedom.
+    left = max(1 - spent, 0.05)
+    groups = [points.used, *(points.used & (points.view == view) for view in range(len(points.names)))]
+    return np.array(
+        [excess_sigma(square[g], variance[g], np.ones(g.sum()), 2 * left * g.sum(), chance=0.5) for g in groups]
+    )
+
+
+def _lost(views: Sequence[BoardView], rules: GeometryRules) -> tuple[str, ...]:
+    lost = [view.step_id for view in views if len(view.corners.ids) < rules.least_corners]
+    clipped = [view.step_id for view in views if view.clipped > rules.most_clipped]
+    notes = []
+    if lost:
+        notes.append(f"No board (fewer than {rules.least_corners} corners) in {', '.join(lost)}.")
+    if clipped:
+        notes.append(f"More than {rules.most_clipped:.0%} of the samples clipped in {', '.join(clipped)}.")
+    return tuple(notes)
+
+
+def _result(
+    bundle: CalibratedViews,
+    scatter_px: Float[np.ndarray, " n"],
+    views: list[BoardView],
+    nominal: Geometry,
+    notes: tuple[str, ...],
+    rules: GeometryRules,
+) -> FitResult[Geometry]:
+    """``views`` are those that the bundle uses."""
+    notes = (*notes, *bundle.notes)
+    parallel = [k for k, view in enumerate(views) if view.parallel]
+    if bundle.status is FitStatus.TOO_FEW_DATA or not parallel:
+        lost = () if parallel else ("No usable view shows the board parallel to the panel; capture that view again.",)
+        return FitResult.failed("geometry", nominal, FitStatus.TOO_FEW_DATA, *notes, *lost)
+    x, cov = with_angles(bundle.intrinsics.vector, bundle.poses, bundle.cov, parallel)
+    # A pattern in the residuals moves every place by its size, as a centre does that is off by as much.
+    pattern = bundle.evidence.pattern_px * np.eye(len(x))[:, 2:4]
+    pupil = np.asarray(nominal.pupil, dtype=np.float64)
+    posterior = Posterior(x, np.hstack([square_root(cov), pattern]), partial(term_at, pupil=pupil))
+    poor = bundle.rms_px > rules.worst_rms_px and bundle.chi2_dof > rules.worst_chi2_dof
+    points, use = bundle.points, bundle.points.used
+    z = bundle.residuals_px[use] / points.sigma[use, None]
+    left_out, sentences = _outliers(bundle, views, rules)
+    return FitResult(
+        name="geometry",
+        term=posterior.term_at(x),
+        status=FitStatus.POOR_FIT if poor else bundle.status,
+        estimates=estimates(INTRINSIC_NAMES + ANGLE_NAMES, (*INTRINSIC_UNITS, "deg", "deg", "deg"), x, cov),
+        cov=cov,
+        chi2_dof=bundle.chi2_dof,
+        samples=2 * int(use.sum()),
+        candidates=bundle.candidates,
+        diagnostics=_diagnostics(bundle, scatter_px, views),
+        notes=(*notes, *sentences, *_held(bundle)),
+        outliers=left_out,
+        residuals=residual_sample(np.repeat(points.image[use], 2, axis=0), z.ravel()),
+        posterior=posterior,
+    )
+
+
+def with_angles(
+    intrinsics: Float[np.ndarray, "9"],
+    poses: Float[np.ndarray, "views 6"],
+    cov: Float[np.ndarray, "n n"],
+    parallel: Sequence[int],
+) -> tuple[Float[np.ndarray, "12"], Float[np.ndarray, "12 12"]]:
+    """Values and covariance of intrinsics and angles; several parallel views count as their mean.
+
+    Args:
+        intrinsics: in the order of ``INTRINSIC_NAMES``.
+        poses: board to camera, as ``bundle.Bundle`` has them.
+        cov: of intrinsics and all poses one after another.
+        parallel: which views show the board parallel to the panel.
+
+    Returns:
+        what ``term_at`` takes; angles in degrees.
+    """
+    rotation = np.asarray(Rotation.from_rotvec(-poses[parallel, :3]).mean().as_rotvec())
+    steps = _STEP_RAD * np.eye(3)
+    slope = np.array([_angles_deg(rotation + step) - _angles_deg(rotation - step) for step in steps]).T / 2 / _STEP_RAD
+    picks = np.zeros((LENS + 3, len(cov)))
+    picks[:LENS, :LENS] = np.eye(LENS)
+    for view in parallel:
+        picks[LENS:, LENS + 6 * view : LENS + 6 * view + 3] = -slope / len(parallel)
+    return np.concatenate([intrinsics, _angles_deg(rotation)]), picks @ cov @ picks.T
+
+
+def _angles_deg(rotation: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
+    """(tilt, roll, yaw) of R_panel_camera = Ry(yaw) Rx(-tilt) Rz(roll)."""
+    yaw, tilt, roll = Rotation.from_rotvec(rotation).as_euler("YXZ", degrees=True)
+    return np.array([-tilt, roll, yaw])
+
+
+def term_at(x: Float[np.ndarray, "12"], pupil: Float[np.ndarray, "3"]) -> Geometry:
+    """The term of intrinsics and angles."""
+    lens, (tilt, roll, yaw) = Intrinsics.of(x[:LENS]), x[LENS:]
+    rotation = Rotation.from_euler("YXZ", [yaw, -tilt, roll], degrees=True).as_rotvec()
+    return Geometry(lens.focal, lens.centre, lens.distortion, np.asarray(rotation), pupil)
+
+
+def _diagnostics(
+    bundle: CalibratedViews, scatter_px: Float[np.ndarray, " n"], views: list[BoardView]
+) -> tuple[Diagnostic, ...]:
+    evidence, used = bundle.evidence, bundle.points.used
+    on_jig = [one for one, view in zip(scatter_px[1:], views, strict=True) if view.parallel]
+    by_hand = [one for one, view in zip(scatter_px[1:], views, strict=True) if not view.parallel]
+    return (
+        Diagnostic("rms_reprojection", bundle.rms_px, "px"),
+        Diagnostic("corner_scatter_beside_noise", float(scatter_px[0]), "px"),
+        Diagnostic(ON_JIG, float(np.median(on_jig)), "px"),
+        Diagnostic(BY_HAND, float(np.median(by_hand or on_jig)), "px"),
+        Diagnostic("views", float(len(views)), "1"),
+        Diagnostic("corners_used", float(used.sum()), "1"),
+        Diagnostic("corners_rejected", float((~used).sum()), "1"),
+        Diagnostic("iterations", float(bundle.iterations), "1"),
+        Diagnostic("starts_agreeing", float(bundle.starts_agreeing), "1"),
+        Diagnostic("rms_held_out", evidence.held_out_rms_px, "px"),
+        Diagnostic("rms_held_out_expected", evidence.expected_rms_px, "px"),
+        Diagnostic("views_disagree_p", evidence.views.p_value, "1"),
+        Diagnostic("variance_factor", evidence.variance_factor, "1"),
+        Diagnostic("residual_pattern_p", evidence.pattern.p_value, "1"),
+        Diagnostic("residual_pattern", evidence.pattern_px, "px"),
+    )
+
+
+def _outliers(
+    bundle: CalibratedViews, views: list[BoardView], rules: GeometryRules
+) -> tuple[tuple[Outliers, ...], tuple[str, ...]]:
+    """What was left out, corners by step and number, and one sentence per view that lost corners."""
+    points, places, sentences = bundle.points, [], []
+    for k, view in enumerate(views):
+        ids = view.corners.ids[points.index[(points.view == k) & ~points.used]]
+        places += [f"{view.step_id} corner {corner}" for corner in ids]
+        if len(ids):
+            far = f"further than {rules.corners.sigma:g} robust sigma of their view from the model"
+            sentences.append(f"{view.step_id}: corners {', '.join(map(str, ids))} left out, {far}.")
+    found = rules.corners.listed(places)
+    return (*(other for other in bundle.outliers if all(other.rule != f.rule for f in found)), *found), tuple(sentences)
+
+
+def _held(bundle: CalibratedViews) -> tuple[str, ...]:
+    """What was not fitted."""
+    held = [name for name, free in zip(INTRINSIC_NAMES, bundle.free, strict=True) if not free]
+    fixed = (f"Held at 0, as the data do not ask for it: {', '.join(held)}.",) if held else ()
+    return (*fixed, "Stand-off and panel position are the rig's nominal ones; the wire fit refines them.")

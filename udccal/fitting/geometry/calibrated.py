@@ -1,0 +1,281 @@
+"""What a bundle of views gives: lens, poses, whether the model holds, and how sure it is where a ray lands.
+
+Two ways to be wrong are told apart from chance. Views that disagree: each view alone would have the intrinsics a little
+elsewhere, further than its noise explains (Cochran's Q, as in meta-analysis); the intrinsics without a view then
+predict its corners worse than noise does. A pattern over the picture: residuals of neighbouring places in the sensor,
+over all views, share a direction. Both statistics are exact for a linear model with normal noise.
+"""
+
+from __future__ import annotations
+
+import enum
+from dataclasses import dataclass
+from typing import final
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float
+
+from udccal.errors import FitError
+from udccal.fitting.engine.gaussian import scaled_inverse
+from udccal.fitting.engine.misfit import MisfitTest, f_test
+from udccal.fitting.geometry.bundle import LENS, Bundle, GeometryRules, Intrinsics, Points, by_view, in_sigma, projected
+from udccal.result import Candidate, FitStatus, Outliers
+
+# Newton's method on the distortion: rounds at most, and how near a ray must come to its pixel.
+_NEWTON_ROUNDS, _NEAR_PX = 40, 1e-7
+_GRID, _EDGE = 9, 0.02
+
+
+class Gauge(enum.Enum):
+    """What a ray stays fixed to while the calibration varies.
+
+    Intrinsics and poses share a freedom: a lens whose centre is a pixel off and a camera that is turned by as much see
+    nearly the same. Compare Kogan, "Projection uncertainty" in the documentation of mrcal, whose choice is ``BOARDS``.
+    """
+
+    CAMERA = "the camera's axes as fitted: the freedom between centre and rotation shows in full"
+    BOARDS = "the boards, on average over the views: the camera's axes turn with the poses"
+    ALIGNED = "the rotation that brings the whole picture into its best agreement: the shape of the lens alone"
+
+
+@final
+@dataclass(frozen=True)
+class Evidence:
+    """What the residuals say about the model.
+
+    Attributes:
+        pattern: residuals averaged over the cells of a grid on the sensor, against independence.
+        views: the intrinsics that each view prefers, against one set for all.
+        held_out_rms_px: of points of a view against intrinsics from the other views, with the view's own pose.
+        expected_rms_px: what that would be if the model held.
+        pattern_px: size of the pattern per axis beyond noise; 0 unless found.
+    """
+
+    pattern: MisfitTest
+    views: MisfitTest
+    held_out_rms_px: float
+    expected_rms_px: float
+    pattern_px: float
+
+    @property
+    def variance_factor(self) -> float:
+        """What the covariance is multiplied with: 1 unless the views disagree beyond chance (Birge, 1932)."""
+        return self.views.inflation
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What was found, for a person."""
+        notes = []
+        if self.views.found:
+            notes.append(
+                f"The views disagree on the lens beyond their noise (ratio {self.views.ratio:.1f}, "
+                f"p = {self.views.p_value:.1g}): every variance is multiplied by that ratio. Is the board flat?"
+            )
+        if self.pattern.found:
+            notes.append(
+                f"The residuals follow a pattern over the picture (p = {self.pattern.p_value:.1g}, about "
+                f"{self.pattern_px:.3f} px): the lens bends rays in a way that no order has."
+            )
+        return tuple(notes)
+
+
+@final
+@dataclass(frozen=True)
+class CalibratedViews:
+    """Intrinsics and poses with their uncertainty, and the evidence for them.
+
+    Attributes:
+        intrinsics: the lens; distortion coefficients that the data do not ask for are 0.
+        poses: of the views in use, board to camera: rotation vector (rad), then translation (board's unit).
+        cov: of the intrinsics as a vector, then 6 per view in use. The scale of the noise is estimated, and where the
+            views disagree beyond it, what they disagree by is added.
+        points: the finite points of all views in use, with their sigma as estimated: that given times its scatter.
+        residuals_px: projected minus seen, of these points.
+        free: which intrinsics were fitted.
+        chi2_dof: scatter over the sigma given, squared; 1 where none was given.
+        candidates: the orders of the distortion, by BIC.
+        evidence: tests of the model.
+        status: ``CONVERGED``, or why not to use this; ``notes`` say what to do.
+        outliers: points left out.
+        iterations: of the last solve with all distortions free.
+        starts_agreeing: how many of the starts led to this minimum.
+        image_size: (columns, rows).
+    """
+
+    intrinsics: Intrinsics
+    poses: Float[np.ndarray, "views 6"]
+    cov: Float[np.ndarray, "n n"]
+    points: Points
+    residuals_px: Float[np.ndarray, "points 2"]
+    free: tuple[bool, ...]
+    chi2_dof: float
+    candidates: tuple[Candidate, ...]
+    evidence: Evidence
+    status: FitStatus
+    notes: tuple[str, ...]
+    outliers: tuple[Outliers, ...]
+    iterations: int
+    starts_agreeing: int
+    image_size: tuple[int, int]
+
+    @property
+    def converged(self) -> bool:
+        """Whether this can be used."""
+        return self.status is FitStatus.CONVERGED
+
+    @property
+    def rms_px(self) -> float:
+        """Root of the mean squared distance between seen and projected points, as OpenCV's calibrateCamera counts."""
+        return float(np.sqrt((self.residuals_px[self.points.used] ** 2).sum(axis=1).mean()))
+
+    def projection_covariance(
+        self, pixels: Float[np.ndarray, "rays 2"], gauge: Gauge = Gauge.BOARDS
+    ) -> Float[np.ndarray, "rays 2 2"]:
+        """Covariance in px^2 of where the rays that the fit puts at these pixels land.
+
+        A pattern that the residuals show beyond chance is an error of the model; its size is added.
+
+        Raises:
+            FitError: when the fitted distortion folds before a pixel, so that no ray lands there.
+        """
+        by_lens, by_turn = self._ray_slopes(np.asarray(pixels, dtype=np.float64))
+        slope = np.einsum("nai,ij->naj", by_turn, self.turn(gauge))
+        slope[..., :LENS] += by_lens
+        return np.einsum("nai,ij,nbj->nab", slope, self.cov, slope) + self.evidence.pattern_px**2 * np.eye(2)
+
+    def turn(self, gauge: Gauge) -> Float[np.ndarray, "3 n"]:
+        """How the rays turn, in camera coordinates, with the intrinsics and poses."""
+        turn = np.zeros((3, len(self.cov)))
+        if gauge is Gauge.BOARDS:
+            for view, pose in enumerate(self.poses):
+                turn[:, LENS + 6 * view : LENS + 6 * view + 3] = _turn_by_vector(pose[:3]) / len(self.poses)
+        elif gauge is Gauge.ALIGNED:
+            lens, by_turn = self._ray_slopes(field_grid(self.image_size))
+            turn[:, :LENS] = -np.linalg.lstsq(by_turn.reshape(-1, 3), lens.reshape(-1, LENS), rcond=None)[0]
+        return turn
+
+    def _ray_slopes(
+        self, pixels: Float[np.ndarray, "rays 2"]
+    ) -> tuple[Float[np.ndarray, "rays 2 9"], Float[np.ndarray, "rays 2 3"]]:
+        """Of where fixed rays land: by the intrinsics, and by a small rotation of the rays in camera coordinates."""
+        lens = self.intrinsics
+        rays = np.hstack([(pixels - lens.centre) / lens.focal, np.ones((len(pixels), 1))])
+        with np.errstate(all="ignore"):  # Rays that do not come near are found below.
+            for _ in range(_NEWTON_ROUNDS):
+                places, by = projected(lens.vector, rays)
+                (xx, xy), (yx, yy) = np.moveaxis(by[:, :, LENS + 3 : LENS + 5], 0, -1)
+                area, (dx, dy) = xx * yy - xy * yx, (pixels - places).T
+                if (np.hypot(dx, dy) < _NEAR_PX).all():
+                    break
+                rays[:, :2] += np.stack([yy * dx - xy * dy, xx * dy - yx * dx], axis=1) / area[:, None]
+        lost = ~((np.hypot(dx, dy) < _NEAR_PX) & (area > 0))
+        if lost.any():
+            x, y = pixels[lost][0]
+            raise FitError(
+                f"Expected pixels that a ray lands on, found ({x:g}, {y:g}) and {int(lost.sum()) - 1} more where the "
+                "fitted distortion folds. Ask within the corners that were seen, or capture boards at the edges."
+            )
+        return by[:, :, :LENS], by[:, :, LENS : LENS + 3]
+
+
+def field_grid(image_size: tuple[int, int]) -> Float[np.ndarray, "81 2"]:
+    """9 x 9 pixels over the picture, 2 % away from its edges."""
+    place = np.linspace(_EDGE, 1 - _EDGE, _GRID)
+    x, y = np.meshgrid(place * (image_size[0] - 1), place * (image_size[1] - 1))
+    return np.stack([x.ravel(), y.ravel()], axis=1)
+
+
+def _turn_by_vector(vector: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
+    """Small rotation that a change of a rotation vector adds after it (the left Jacobian of SO(3))."""
+    matrix, by = cv2.Rodrigues(np.ascontiguousarray(vector))
+    small = by.reshape(3, 3, 3) @ matrix.T
+    return np.array([small[:, 2, 1], small[:, 0, 2], small[:, 1, 0]])
+
+
+def weigh(
+    bundle: Bundle,
+    cov: Float[np.ndarray, "n n"],
+    points: Points,
+    free: Bool[np.ndarray, "9"],
+    image_size: tuple[int, int],
+    dof: float,
+    rules: GeometryRules,
+) -> Evidence:
+    """Test a solution whose points carry their scaled sigma; ``dof`` are the degrees of freedom behind that scale."""
+    z, jacobian = in_sigma(bundle, points)
+    jacobian = jacobian * np.concatenate([free, np.ones(6)])
+    information, score = _of_views(*by_view(z, jacobian, points), free)
+    views = _disagreement(information, score, dof)
+    held, expected = _held_out(z, information, score, points)
+    pattern, size = _pattern(z, jacobian, points, cov, image_size, dof, rules.pattern_cells)
+    return Evidence(pattern, views, held, expected, size if pattern.found else 0.0)
+
+
+def _of_views(
+    matrix: Float[np.ndarray, "views 15 15"], right: Float[np.ndarray, "views 15"], free: Bool[np.ndarray, "9"]
+) -> tuple[Float[np.ndarray, "views k k"], Float[np.ndarray, "views k"]]:
+    """Information of each view on the free intrinsics once its pose is eliminated, and minus half its chi2's gradient.
+
+    In units that make the information of all views together alike in size.
+    """
+    carried = matrix[:, :LENS, LENS:] @ scaled_inverse(matrix[:, LENS:, LENS:], 1e-14)
+    information = matrix[:, :LENS, :LENS] - carried @ matrix[:, LENS:, :LENS]
+    score = right[:, :LENS] - np.einsum("kij,kj->ki", carried, right[:, LENS:])
+    unit = 1 / np.sqrt(np.maximum(np.einsum("kii->i", information)[free], 1e-300))
+    return information[:, free][:, :, free] * np.outer(unit, unit), score[:, free] * unit
+
+
+def _disagreement(information: np.ndarray, score: np.ndarray, dof: float) -> MisfitTest:
+    """Q = sum over views of score' information^+ score: how far the views' own minima lie from the common one."""
+    values, vectors = np.linalg.eigh(information)
+    seen = values > 1e-9 * np.maximum(values[:, -1:], 1e-9)
+    along = np.einsum("kij,ki->kj", vectors, score)
+    total = float((along[seen] ** 2 / values[seen]).sum())
+    return f_test(total, int(seen.sum()) - score.shape[1], dof)
+
+
+def _held_out(z: np.ndarray, information: np.ndarray, score: np.ndarray, points: Points) -> tuple[float, float]:
+    """Root mean square of held-out residuals in px, and what it would be for noise alone."""
+    count = points.sums(np.ones(len(z)))
+    others = np.linalg.pinv(information.sum(axis=0) - information, rcond=1e-10, hermitian=True)
+    # The gradients of all views cancel at the common minimum: without this view it moves by the step.
+    step = -np.einsum("kij,kj->ki", others, score)
+    rise = np.einsum("ki,kij,kj->k", step, information, step) - 2 * (score * step).sum(axis=1)
+    seen = points.sums((z**2).sum(axis=1)) + rise
+    expected = 2 * count - 6 + np.einsum("kij,kji->k", information, others)
+    variance = points.sums(points.sigma**2) / count
+    held = [float(np.sqrt(max(float(variance @ one), 0.0) / count.sum())) for one in (seen, expected)]
+    return held[0], held[1]
+
+
+def _pattern(
+    z: np.ndarray,
+    jacobian: np.ndarray,
+    points: Points,
+    cov: np.ndarray,
+    image_size: tuple[int, int],
+    dof: float,
+    cells: int,
+) -> tuple[MisfitTest, float]:
+    """Sums over the cells of a grid, against their covariance under the model, and the pattern's size in px.
+
+    Not ``group_means_test``: the fit takes up most of what is smooth over the picture, so that means of cells scatter
+    far less than those of independent residuals; their covariance accounts for that.
+    """
+    place = np.clip(points.image / np.array(image_size) * cells, 0, cells - 1).astype(np.int64)
+    cell = np.where(points.used, place[:, 1] * cells + place[:, 0], -1)
+    inside = np.equal.outer(np.unique(cell[points.used]), cell).astype(np.float64)
+    count, sums = np.repeat(inside.sum(axis=1), 2), (inside @ z).ravel()
+    whole = np.zeros((len(z), 2, len(cov)))
+    whole[:, :, :LENS] = jacobian[:, :, :LENS]
+    columns = LENS + 6 * points.view[:, None, None] + np.arange(6)
+    np.put_along_axis(whole, np.repeat(columns, 2, axis=1), jacobian[:, :, LENS:], axis=2)
+    gathered = np.tensordot(inside, whole, 1).reshape(len(sums), -1)
+    expected = np.diag(count) - gathered @ cov @ gathered.T
+    values, vectors = np.linalg.eigh(expected)
+    seen = values > 1e-6 * count.max()
+    found = f_test(float(((vectors[:, seen].T @ sums) ** 2 / values[seen]).sum()), int(seen.sum()), dof)
+    # Mean over the points of the squared mean of their cell, less what noise makes of it.
+    excess = float(((sums**2 - np.diag(expected)) / count).sum() / count.sum())
+    return found, float(np.sqrt(max(excess, 0.0) * np.mean(points.sigma[points.used] ** 2)))

@@ -1,0 +1,176 @@
+"""A session's boards: corners in the first capture of each step ``geometry/*``, behind the flat field if there is one.
+
+A gradient of the picture's brightness beside a corner moves it. Rows of the panel out of focus make such gradients: on
+a rig whose wire modulates by 3 % corners scatter half as much once they are divided out (EMVA 1288's flat-field
+correction, with the panel as part of the camera). Unequal pixels go with it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import final
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from udccal.arrangements import BoardSpec
+from udccal.fitting.engine.gaussian import Prior
+from udccal.fitting.geometry.bundle import GeometryRules, Intrinsics
+from udccal.fitting.geometry.corners import BoardCorners, Luminance, detect_corners, luminance, sites
+from udccal.fitting.nominal import nominal_geometry
+from udccal.models.geometry import Geometry
+from udccal.models.noise import Noise, variance_e
+from udccal.rig import RigDescription
+from udccal.sessions.schema import BoardSubject, StoredCapture, StoredStep
+from udccal.sessions.store import Session
+
+_DARK, _FLAT = "wire/dark", "wire/flat"
+
+
+@final
+@dataclass(frozen=True)
+class BoardView:
+    """The corners of one step's board.
+
+    Attributes:
+        step_id: for a person. spec: of the board. corners: found.
+        parallel: whether the board stands parallel to the panel, its axes the panel's.
+        clipped: part of the picture's samples at saturation.
+    """
+
+    step_id: str
+    spec: BoardSpec
+    parallel: bool
+    corners: BoardCorners
+    clipped: float
+
+    def usable(self, rules: GeometryRules | None = None) -> bool:
+        """Whether enough corners were found in an unclipped picture."""
+        rules = rules or GeometryRules()
+        return len(self.corners.ids) >= rules.least_corners and self.clipped <= rules.most_clipped
+
+
+@final
+@dataclass(frozen=True)
+class GeometryData:
+    """What a rig's geometry is fitted to.
+
+    Attributes:
+        views: of boards, at least one of them parallel to the panel.
+        nominal: where to start; its pupil is kept.
+        image_size: (columns, rows).
+        prior: on the intrinsics, in the order of ``Intrinsics``; None where nothing is known.
+    """
+
+    views: tuple[BoardView, ...]
+    nominal: Geometry
+    image_size: tuple[int, int]
+    prior: Prior | None = None
+
+
+def read_geometry(session: Session, noise: Noise, rules: GeometryRules | None = None) -> GeometryData:
+    """The boards of all steps ``geometry/*``, and what the rig's description says of the lens.
+
+    Args:
+        session: where they were captured. noise: gives the black level, the saturation and the corners' sigma.
+
+    Raises:
+        SessionError: when a file is missing or damaged.
+        FitError: when a board's dictionary is unknown.
+    """
+    rules, rig = rules or GeometryRules(), session.rig
+    steps = [step for step in session.steps("geometry") if isinstance(step.subject, BoardSubject)]
+    flat = _read_flat_field(session, noise, rules) if steps else None
+    views = tuple(_read_view(session, step, noise, flat, rules) for step in steps)
+    return GeometryData(views, nominal_geometry(rig), (rig.camera.columns, rig.camera.rows), rig_prior(rig, rules))
+
+
+def rig_prior(rig: RigDescription, rules: GeometryRules | None = None) -> Prior:
+    """What a rig's description says of its lens: the focal length by its tolerance, the rest as lenses commonly are."""
+    rules = rules or GeometryRules()
+    focal = rig.focal_px * max(rig.lens.focal_mm.tolerance / rig.lens.focal_mm.value, 1e-4)
+    centre = rules.centre_sigma * rig.camera.columns
+    sigma = Intrinsics(np.full(2, focal), np.full(2, centre), np.array(rules.distortion_sigma))
+    return Prior.independent(Intrinsics.of_geometry(nominal_geometry(rig)).vector, sigma.vector)
+
+
+@final
+@dataclass(frozen=True)
+class FlatField:
+    """Response of every sample over the mean of its site of the pattern, and the relative variance of that by noise."""
+
+    response: Float[np.ndarray, "rows columns"]
+    relative_variance: Float[np.ndarray, "rows columns"]
+
+
+def flat_field(
+    light: Float[np.ndarray, "rows columns"],
+    variance: Float[np.ndarray, "rows columns"],
+    unclipped: Bool[np.ndarray, "rows columns"],
+    rules: GeometryRules | None = None,
+) -> FlatField:
+    """Response of a sensor to an even field; clipped, dead and covered samples are left as they are.
+
+    Args:
+        light: free of black, in any linear unit. variance: of that, in the unit squared. unclipped: which samples are.
+    """
+    least = (rules or GeometryRules()).least_response
+    response, relative = np.ones_like(light), np.zeros_like(light)
+    for site in sites():
+        own = light[site] / max(float(light[site].mean()), 1e-12)
+        good = unclipped[site] & (own > least)
+        response[site] = np.where(good, own, 1.0)
+        relative[site] = np.where(good, variance[site] / np.where(good, light[site], 1.0) ** 2, 0.0)
+    return FlatField(response, relative)
+
+
+def _read_flat_field(session: Session, noise: Noise, rules: GeometryRules) -> FlatField | None:
+    """From the averages that the wire is fitted to; None where the session has none."""
+    if not {_DARK, _FLAT} <= {step.id for step in session.steps("wire")}:
+        return None
+    capture = session.step(_FLAT).captures[0]
+    flat = session.average(capture).mean.astype(np.float64)
+    light = flat - session.average(session.step(_DARK).captures[0]).mean
+    unclipped = flat < rules.clipped * float(np.asarray(noise.saturation_DN))
+    return flat_field(light, _temporal_variance_DN2(noise, light, capture), unclipped, rules)
+
+
+def _temporal_variance_DN2(
+    noise: Noise, light_DN: Float[np.ndarray, "rows columns"], capture: StoredCapture
+) -> Float[np.ndarray, "rows columns"]:
+    """Of a capture's mean (EMVA 1288's photon transfer)."""
+    gain, exposure_s = float(np.asarray(noise.K_DN_per_e)), np.float64(capture.exposure_s)
+    return gain**2 * np.asarray(variance_e(noise, light_DN / gain, exposure_s), dtype=np.float64) / capture.frames
+
+
+def _read_view(
+    session: Session, step: StoredStep, noise: Noise, flat: FlatField | None, rules: GeometryRules
+) -> BoardView:
+    """The board in the first capture of a step (its average, or a single frame)."""
+    subject, capture = step.subject, step.captures[0]
+    if not isinstance(subject, BoardSubject):
+        raise TypeError(f"step {step.id} shows no board")
+    mean = session.frame(capture) if capture.kind == "frame" else session.average(capture).mean
+    spec = BoardSpec(subject.columns, subject.rows, subject.square_mm, subject.marker_mm, subject.dictionary)
+    light = mean.astype(np.float64) - float(np.asarray(noise.black_DN))
+    variance, area = _temporal_variance_DN2(noise, light, capture), capture.region
+    part = np.s_[area.y : area.y + area.rows, area.x : area.x + area.columns]
+    crop = None if flat is None else FlatField(flat.response[part], flat.relative_variance[part])
+    corners = detect_corners(_evened(light, variance, noise, crop), spec, rules)
+    moved = BoardCorners(corners.ids, corners.xy + np.array([area.x, area.y], dtype=np.float64), corners.sigma)
+    clipped = float(np.mean(mean >= rules.clipped * float(np.asarray(noise.saturation_DN))))
+    return BoardView(step.id, spec, subject.parallel_to_panel, moved, clipped)
+
+
+def _evened(
+    light: Float[np.ndarray, "rows columns"],
+    temporal: Float[np.ndarray, "rows columns"],
+    noise: Noise,
+    flat: FlatField | None,
+) -> Luminance:
+    """As even pixels would see it; noise of pixels that stay unequal adds to the temporal noise."""
+    offsets = (float(np.asarray(noise.K_DN_per_e)) * float(np.asarray(noise.DSNU1288_e))) ** 2
+    if flat is None:
+        return luminance(light, temporal + offsets + (float(np.asarray(noise.PRNU1288)) * light) ** 2)
+    even = light / flat.response
+    return luminance(even, (temporal + offsets) / flat.response**2 + flat.relative_variance * even**2)

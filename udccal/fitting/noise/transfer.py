@@ -1,0 +1,293 @@
+"""Photon transfer and response at once: gain K, read noise V0, curvature by maximum likelihood (EMVA 1288, clause 6).
+
+The sensor turns a linear signal z (DN above black) into y = z - c (z^2 + K z): c is 0 for a linear one. Then
+
+    temporal variance = K z (1 - 2 c z)^2 + V0 + q^2/12,     light part of z = A (u + u0),
+
+with u the relative exposure to light. Sample variances are chi-squared: their weights come from the model, not from the
+data. Both relations bear on c; the first alone where the light is unsteady, which is one of the orders.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import final
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from udccal.fitting.engine.least_squares import Blocks, SolverRules, Step, minimise
+from udccal.fitting.engine.orders import Attempt, Choice, bic, choose
+from udccal.fitting.engine.robust import OutlierRule
+from udccal.fitting.noise.dark import excess_variance
+from udccal.fitting.noise.rules import NoiseRules
+
+PARAMETERS = ("K_DN_per_e", "V0_DN2", "curvature_per_DN", "response_DN_per_light", "light_offset")
+_SOLVER = SolverRules(iterations=40)
+
+# Values in the order of ``PARAMETERS``.
+Five = Float[np.ndarray, "5"]
+
+
+@final
+@dataclass(frozen=True)
+class Levels:
+    """Bright exposures, already reduced: one row per level, one column per bin (CFA site x tile).
+
+    Attributes:
+        mean_DN: above black.
+        variance_DN2: temporal.
+        dof: of the variances.
+        samples: per bin and level, frames times pixels: the mean's weight.
+        usable: bins safely inside the range of the sensor.
+        light: relative exposure; nan where unknown.
+        steady: levels whose frames agree in brightness; the others tell nothing about the response.
+        dark_DN: dark signal in each level.
+        row_variance_DN2: variance of each level's mean from row noise.
+    """
+
+    mean_DN: Float[np.ndarray, "levels bins"]
+    variance_DN2: Float[np.ndarray, "levels bins"]
+    dof: Float[np.ndarray, "levels bins"]
+    samples: Float[np.ndarray, "levels bins"]
+    usable: Bool[np.ndarray, "levels bins"]
+    light: Float[np.ndarray, " levels"]
+    steady: Bool[np.ndarray, " levels"]
+    dark_DN: Float[np.ndarray, " levels"]
+    row_variance_DN2: Float[np.ndarray, " levels"]
+
+    @property
+    def responding(self) -> Bool[np.ndarray, " levels"]:
+        """Levels whose brightness tells about the response."""
+        seen = self.usable.any(axis=1) & self.steady & np.isfinite(self.light)
+        known = self.light[seen]
+        # Levels of one and the same exposure differ by the lamp's power, which nobody measured.
+        return seen if known.size > 2 and float(np.ptp(known)) > 0 else np.zeros_like(seen)
+
+    @property
+    def brightness_variance(self) -> Float[np.ndarray, " levels"]:
+        """Relative variance of each level's brightness by shot, read and row noise."""
+        count = np.maximum(self.usable.sum(axis=1), 1)
+        mean = np.where(self.usable, self.mean_DN, 0.0).sum(axis=1) / count
+        noise = np.where(self.usable, self.variance_DN2 / self.samples, 0.0).sum(axis=1) / count**2
+        return np.asarray((noise + self.row_variance_DN2) / np.maximum(mean, 1e-9) ** 2)
+
+
+@final
+@dataclass(frozen=True)
+class DarkVariance:
+    """What dark frames tell about V0: each estimate (DN^2) with its standard deviation; and the rounding to add.
+
+    The estimates hold for the gain ``K_DN_per_e``; with another one the shot noise of their dark signal ``drift_DN``
+    changes, and they by as much.
+    """
+
+    V0_DN2: Float[np.ndarray, " points"]
+    sigma_DN2: Float[np.ndarray, " points"]
+    rounding_DN2: float
+    K_DN_per_e: float
+    drift_DN: Float[np.ndarray, " points"]
+
+
+@final
+@dataclass(frozen=True)
+class Order:
+    """Which parts of the model are free: curvature, offset of the exposures, light that differs by level."""
+
+    curved: bool = False
+    offset: bool = False
+    unsteady: bool = False
+
+    @property
+    def name(self) -> str:
+        """For the table of candidates."""
+        parts = ["curved" if self.curved else "linear"]
+        parts += ["exposure offset"] * self.offset + ["unsteady light"] * self.unsteady
+        return "response: " + ", ".join(parts)
+
+
+@final
+@dataclass(frozen=True)
+class TransferFit:
+    """Values in the order of ``PARAMETERS`` with their covariance, and how well they describe the data.
+
+    ``scatter`` is the relative standard deviation of the light from level to level; ``variance_z`` and ``level_z`` are
+    residuals in units of sigma, nan where unused.
+    """
+
+    order: Order
+    values: Five
+    cov: Float[np.ndarray, "5 5"]
+    scatter: float
+    deviance: float
+    chi2_dof: float
+    converged: bool
+    variance_z: Float[np.ndarray, "levels bins"]
+    level_z: Float[np.ndarray, " levels"]
+
+
+def linear_signal(mean_DN, curvature_per_DN, K_DN_per_e):  # type: ignore[no-untyped-def]
+    """z from y = z - c (z^2 + K z); works on numpy and JAX arrays alike."""
+    slope = 1 - curvature_per_DN * K_DN_per_e
+    # The root that goes to y / slope for c -> 0, in the form without cancellation.
+    return 2 * mean_DN / (slope + (slope**2 - 4 * curvature_per_DN * mean_DN) ** 0.5)
+
+
+def temporal_variance(signal_DN, K_DN_per_e, V0_DN2, curvature_per_DN, rounding_DN2):  # type: ignore[no-untyped-def]
+    """Temporal variance in DN^2 at the linear signal z; works on numpy and JAX arrays alike."""
+    return K_DN_per_e * signal_DN * (1 - 2 * curvature_per_DN * signal_DN) ** 2 + V0_DN2 + rounding_DN2
+
+
+@final
+@dataclass(frozen=True)
+class TransferProblem:
+    """The engine's problem: the deviance of variances, read noise and brightness from what is modelled of them."""
+
+    levels: Levels
+    dark: DarkVariance
+    order: Order
+    bound: float
+    sizes: Five
+    name: str = "noise, photon transfer"
+
+    @property
+    def free(self) -> Bool[np.ndarray, "5"]:
+        """Parameters that the order leaves free, and the data tell."""
+        responds = bool(self.levels.responding.any())
+        return np.array([True, True, self.order.curved, responds, self.order.offset and responds])
+
+    def modelled(
+        self, x: Five
+    ) -> tuple[Float[np.ndarray, "levels bins"], Float[np.ndarray, " points"], Float[np.ndarray, " levels"]]:
+        """Variances; estimates of V0; and how far the levels' brightness, relative, is above that modelled."""
+        K, V0, c, gain, offset = x
+        levels, dark = self.levels, self.dark
+        with np.errstate(divide="ignore", invalid="ignore"):
+            signal = np.nan_to_num(linear_signal(np.where(levels.usable, levels.mean_DN, 0.0), c, K), posinf=0.0)
+            variance = np.maximum(temporal_variance(signal, K, V0, c, dark.rounding_DN2), 1e-9)
+            bright = _brightness(signal - levels.dark_DN[:, None], levels.usable) / (gain * (levels.light + offset))
+        return variance, V0 + (K - dark.K_DN_per_e) * dark.drift_DN, bright - 1
+
+    def scatter2(self, relative: Float[np.ndarray, " levels"]) -> float:
+        """Maximum-likelihood variance of the light from level to level, beyond what noise explains."""
+        known = self.levels.brightness_variance[self.levels.responding]
+        return excess_variance(relative**2, known, np.ones(len(known)))[0] if self.order.unsteady else 0.0
+
+    def equations_at(self, place: Five) -> Blocks:
+        """Score and Fisher information; the scatter of the light is that of the greatest likelihood there."""
+        levels, dark, use, responds = self.levels, self.dark, self.levels.usable, self.levels.responding
+
+        def predicted(at: Five) -> Float[np.ndarray, " data"]:
+            variance, floor, relative = self.modelled(at)
+            return np.concatenate([variance[use], floor, -relative[responds]])
+
+        everywhere, floor, above = self.modelled(place)
+        variance, relative = everywhere[use], above[responds]
+        spread2 = levels.brightness_variance[responds] + self.scatter2(relative)
+        dof, ratio = levels.dof[use], np.maximum(levels.variance_DN2[use] / variance, 1e-12)
+        off = np.concatenate([levels.variance_DN2[use] - variance, dark.V0_DN2 - floor, relative])
+        weight = np.concatenate([0.5 * dof / variance**2, dark.sigma_DN2**-2, 1 / spread2])
+        jacobian = np.zeros((len(off), 5))
+        for i in np.flatnonzero(self.free):
+            step = 1e-4 * self.sizes[i] * np.eye(5)[i]
+            jacobian[:, i] = (predicted(place + step) - predicted(place - step)) / (2 * step[i])
+        cost = float(np.sum(dof * (ratio - 1 - np.log(ratio))) + np.sum(np.log(spread2)))
+        cost += float(np.sum((weight * off**2)[len(dof) :]))
+        score, information = jacobian.T @ (weight * off), jacobian.T @ (weight[:, None] * jacobian)
+        held = ~self.free
+        held[2] |= abs(place[2]) >= self.bound and score[2] * place[2] > 0
+        return replace(Blocks.dense(cost, len(off), information, score), held=held)
+
+    def moved(self, place: Five, step: Step) -> Five:
+        """With the curvature inside its bound."""
+        x = place + step.shared
+        x[2] = np.clip(x[2], -self.bound, self.bound)
+        return x
+
+
+def _brightness(light_DN: Float[np.ndarray, "levels bins"], usable: np.ndarray) -> Float[np.ndarray, " levels"]:
+    """Mean light of each level as if every bin were usable in it: bins share one pattern through all levels."""
+    complete = np.flatnonzero(usable.all(axis=1))
+    if complete.size == np.count_nonzero(usable.any(axis=1)):
+        return light_DN.mean(axis=1)
+    # Alternating from the complete levels' pattern, the others add little; from none the first rounds would be rough.
+    pattern = light_DN[complete].sum(axis=0) if complete.size else np.ones(usable.shape[1])
+    pattern = pattern / max(float(pattern.mean()), 1e-9)
+    seen = np.where(usable, light_DN, 0.0)
+    for _ in range(6):
+        level = seen.sum(axis=1) / np.maximum(usable @ pattern, 1e-9)
+        weight = level**2 @ usable
+        pattern = np.where(weight > 0, level @ seen / np.maximum(weight, 1e-12), 1.0)
+        pattern /= max(float(pattern.mean()), 1e-9)
+    return np.asarray(level)
+
+
+def _fit_transfer(
+    levels: Levels, dark: DarkVariance, full_DN: float, order: Order, start: np.ndarray, rules: NoiseRules
+) -> TransferFit:
+    """The fit of one order."""
+    known = levels.light[np.isfinite(levels.light)]
+    brightest = max(float(np.max(known, initial=0.0)), 1e-30)
+    sizes = np.abs(start) + np.array([1e-9, dark.rounding_DN2 + 1e-3, 0.1 / full_DN, 1e-9, brightest])
+    problem = TransferProblem(levels, dark, order, rules.most_bent / full_DN, sizes)
+    found = minimise(problem, np.where([True, True, order.curved, True, order.offset], start, 0.0), _SOLVER)
+    x, cov = found.place, found.equations.cov()
+    variance, _, relative = problem.modelled(x)
+    use, responds = levels.usable, levels.responding
+    scatter2 = problem.scatter2(relative[responds])
+    variance_z = np.where(use, (levels.variance_DN2 / variance - 1) * np.sqrt(levels.dof / 2), np.nan)
+    spread2 = np.where(responds, levels.brightness_variance + scatter2, np.inf)
+    level_z = np.where(responds, relative / np.sqrt(spread2), np.nan)
+    chi2_dof = float(np.nansum(variance_z**2)) / max(int(use.sum()) - 1, 1)
+    converged = bool(found.converged and np.isfinite(x).all() and np.isfinite(cov).all())
+    scatter, cost = float(np.sqrt(scatter2)), found.equations.cost
+    return TransferFit(order, x, cov, scatter, cost, chi2_dof, converged, variance_z, level_z)
+
+
+def _start(levels: Levels, dark: DarkVariance) -> Five:
+    """A straight line with rough weights, and the response through the origin."""
+    use = levels.usable
+    signal, variance = levels.mean_DN[use], levels.variance_DN2[use]
+    floor = float(np.average(dark.V0_DN2, weights=1 / dark.sigma_DN2**2))
+    K = float(np.median((variance - floor - dark.rounding_DN2) / np.maximum(signal, 1e-9)))
+    light = np.where(np.isfinite(levels.light), levels.light, 0.0)
+    gain = float(light @ _brightness(levels.mean_DN - levels.dark_DN[:, None], use)) / max(float(light @ light), 1e-30)
+    return np.array([K, floor, 0.0, gain if gain > 0 else 1.0, 0.0])
+
+
+def choose_transfer(levels: Levels, dark: DarkVariance, full_DN: float, rules: NoiseRules) -> Choice[TransferFit]:
+    """The order with the least BIC, its fit, and the criterion of every order.
+
+    Args:
+        levels: bright exposures; at least one usable bin.
+        dark: what dark frames tell about V0.
+        full_DN: saturation above black; sets the scale of the curvature.
+        rules: how far the response may bend.
+    """
+    start = _start(levels, dark)
+    # A variance is set against the mean of the same bin: of Poisson counts the two err together, of read noise apart.
+    apart = start[0] ** 2 * max(start[1], 0.0) / levels.samples
+    measured = np.maximum(levels.variance_DN2, 1e-9) ** 2
+    weighed = replace(levels, dof=levels.dof / (1 + 0.5 * levels.dof * apart / measured))
+    orders = [Order(*(bool(n >> k & 1) for k in range(3))) for n in range(8)]
+    if not levels.responding.any():
+        orders = [Order(), Order(curved=True)]
+    samples = int(levels.dof[levels.usable].sum())
+    tried: list[Attempt[TransferFit]] = []
+    for order in orders:
+        fit = _fit_transfer(weighed, dark, full_DN, order, start, rules)
+        number = order.curved + order.offset + order.unsteady
+        criterion = bic(fit.deviance, float(number), samples) if fit.converged and np.isfinite(fit.deviance) else np.inf
+        tried.append(Attempt(order.name, number, criterion, fit))
+        # The simplest is where the others begin.
+        start = tried[0].fit.values if tried[0].fit.converged else start
+    return choose(tried)
+
+
+def without_outliers(levels: Levels, fit: TransferFit, rules: NoiseRules) -> tuple[Levels, int, tuple[int, ...]]:
+    """Levels less what lies off the fit; how many bins, and which levels' brightness."""
+    bins = OutlierRule("bins of flats", rules.outlier_sigma).off(np.nan_to_num(fit.variance_z), levels.usable)
+    seen = np.isfinite(fit.level_z)
+    off = OutlierRule("levels", rules.outlier_sigma).off(np.nan_to_num(fit.level_z), seen)
+    cleaned = replace(levels, usable=levels.usable & ~bins, steady=levels.steady & ~off)
+    return cleaned, int(bins.sum()), tuple(int(i) for i in np.flatnonzero(off))
