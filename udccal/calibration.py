@@ -15,13 +15,13 @@ from jaxtyping import Float
 
 from udccal.errors import UdccalError
 from udccal.fitting.absent import absent_backscatter, absent_psf, absent_wire
-from udccal.fitting.backscatter.fit import fit_backscatter
+from udccal.fitting.backscatter import BackscatterRules, fit_backscatter, read_backscatter
 from udccal.fitting.geometry import fit_boards, read_geometry
 from udccal.fitting.geometry.data import BoardView
 from udccal.fitting.noise import fit_noise, nominal_noise, read_noise
 from udccal.fitting.nominal import nominal_geometry
 from udccal.fitting.psf.fit import Effort, fit_psf
-from udccal.fitting.wire.fit import FIELD_SAMPLES, fit_wire, sensor_map
+from udccal.fitting.wire import WireRules, fit_wire, read_wire, sensor_map
 from udccal.models.backscatter import Backscatter
 from udccal.models.geometry import Geometry
 from udccal.models.noise import Noise
@@ -51,7 +51,7 @@ class FitEffort:
         workers: with 2, psf and backscatter, which do not need each other, are fitted at once, in more memory.
     """
 
-    wire_samples: int = FIELD_SAMPLES
+    wire_samples: int = WireRules().samples
     psf: Effort = field(default_factory=Effort)
     backscatter_positions: int = 96
     workers: int = 1
@@ -188,9 +188,10 @@ class _Fits:
     @cached_property
     def wire(self) -> FitResult[Wire]:
         noise, geometry = self.noise.term, self.geometry.term
+        rules = WireRules(samples=self._effort.wire_samples)
         return self._run(
             "wire",
-            lambda: fit_wire(self._session, noise, geometry, self._effort.wire_samples),
+            lambda: fit_wire(read_wire(self._session, noise, geometry, rules), rules),
             lambda: absent_wire(self._session.rig, geometry),
         )
 
@@ -211,10 +212,11 @@ class _Fits:
     @cached_property
     def backscatter(self) -> FitResult[Backscatter]:
         noise, geometry, wire_map = self.noise.term, self.geometry.term, self.wire_map
+        rig, rules = self._session.rig, BackscatterRules(positions=self._effort.backscatter_positions)
         return self._run(
             "backscatter",
-            lambda: fit_backscatter(self._session, noise, geometry, wire_map, self._effort.backscatter_positions),
-            lambda: absent_backscatter(self._session.rig, geometry),
+            lambda: fit_backscatter(read_backscatter(self._session, noise, geometry, wire_map), geometry, rig, rules),
+            lambda: absent_backscatter(rig, geometry),
         )
 
     def _run(self, term: TermName, fit: Callable[[], FitResult[Term]], absent: Callable[[], Term]) -> FitResult[Term]:

@@ -6,6 +6,8 @@ import numpy as np
 from jaxtyping import Int
 
 RED, GREEN, BLUE = 0, 1, 2
+# Of the 2 x 2 cell.
+SITES = 4
 _CHANNELS = {"R": RED, "G": GREEN, "B": BLUE}
 
 
@@ -28,7 +30,7 @@ def channel_map(cfa: str, rows: int, columns: int) -> Int[np.ndarray, "rows colu
 
 def site_map(rows: int, columns: int) -> Int[np.ndarray, "rows columns"]:
     """Site 0..3 in the 2 x 2 cell (row-major from the top left) of every sample of a mosaic."""
-    return np.tile(np.arange(4).reshape(2, 2), (-(-rows // 2), -(-columns // 2)))[:rows, :columns]
+    return np.tile(np.arange(SITES).reshape(2, 2), (-(-rows // 2), -(-columns // 2)))[:rows, :columns]
 
 
 def offset_pattern(cfa: str, x: int, y: int) -> str:

@@ -17,9 +17,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import final
 
+import jax
 import numpy as np
 from jaxtyping import Float
 
+from tests.benchmarks.efficiency.backscatter import predicted_light
 from tests.benchmarks.psf_wave_optics import coverage as psf_coverage
 from tests.benchmarks.readme_tables import between
 from udccal.benches.bench import simulated_bench
@@ -27,14 +29,11 @@ from udccal.benches.capture import capture
 from udccal.calibration import FitEffort, Foundation, fit_foundation
 from udccal.compilation import keep_compilations
 from udccal.displays.pictures import face_picture
-from udccal.fitting.backscatter.bins import Bins
-from udccal.fitting.backscatter.data import read_shots, visible_crop
-from udccal.fitting.backscatter.fit import problem_of
-from udccal.fitting.backscatter.light import predict_light
-from udccal.fitting.backscatter.report import known_from
-from udccal.fitting.backscatter.select import choose
+from udccal.fitting.backscatter import fit_backscatter, read_backscatter
+from udccal.fitting.backscatter.data import Bins, sampled_rays
 from udccal.fitting.geometry.boards import projection_sigma_px
 from udccal.models.geometry import project_directions
+from udccal.models.wire import wire_values
 from udccal.numerics import in_float64
 from udccal.planning.state import sensor_samples
 from udccal.reports.true_values import true_values
@@ -110,11 +109,13 @@ def rays(rig: Specimen) -> Float[np.ndarray, " n"]:
 def wire_pixels(rig: Specimen) -> Float[np.ndarray, " n"]:
     """The wire's map at random pixels."""
     true = wire.wire_map(rig.truth)
-    if rig.base.wire_sigma is None:
-        raise ValueError(f"expected a fit of the wire, found {rig.base.wire.status}")
     y, x = np.divmod(np.random.default_rng(rig.truth.seed).choice(true.size, _PIXELS, replace=False), true.shape[1])
     error = (rig.base.wire_map - true)[y, x]
-    return error / rig.base.wire_sigma.at(np.stack([x, y], axis=-1).astype(np.float64))
+    pixels = np.stack([x, y], axis=-1).astype(np.float64)
+    return error / rig.base.wire.sigma_of(lambda term: _wire_values(term, pixels, *true.shape))
+
+
+_wire_values = jax.jit(wire_values, static_argnums=(2, 3))
 
 
 def new_pictures(rig: Specimen) -> Float[np.ndarray, " n"]:
@@ -123,19 +124,18 @@ def new_pictures(rig: Specimen) -> Float[np.ndarray, " n"]:
     A mask holds the unequal response of its pixels, and rates are in electrons by the fitted gain.
     """
     session, geometry = rig.session, rig.base.geometry.term
-    crop = visible_crop(geometry, session.rig)
-    shots = read_shots(session, rig.base.noise.term, crop, rig.base.wire_map)
-    if shots is None:
-        raise ValueError("expected pictures of the panel in the session, found none")
-    problem = problem_of(shots, geometry, session.rig, FitEffort().backscatter_positions)
-    choice = choose(problem)
-    panel, camera = session.rig.panel, session.rig.camera
+    fit = fit_backscatter(
+        read_backscatter(session, rig.base.noise.term, geometry, rig.base.wire_map), geometry, session.rig
+    ).or_raise()
+    panel, camera, step = session.rig.panel, session.rig.camera, fit.term.step
+    flat = sampled_rays(geometry, session.rig, step, FitEffort().backscatter_positions)[1]
     pictures = [face_picture(seed, panel.columns, panel.rows) for seed in _PICTURES]
-    light = predict_light(known_from(choice), shots, np.stack([crop.of(one) for one in pictures]), problem.flat)
-    scatter, bins = backscatter.backscatterer(rig.truth), Bins(camera.cfa, choice.problem.template.step)
+    model_error = next(one.value for one in fit.diagnostics if one.name == "model_error_of_white")
+    light = predicted_light(fit.term, fit, model_error, session.rig, pictures, flat)
+    scatter, bins = backscatter.backscatterer(rig.truth), Bins(camera.cfa, step)
     gain = rig.truth.sensor.K_DN_per_e / float(np.asarray(rig.base.noise.term.K_DN_per_e))
     response = gain * Sensor(rig.truth).response.astype(np.float64)
-    true = np.stack([bins.mean(response * scatter.rate(one)).reshape(3, -1)[:, problem.flat] for one in pictures])
+    true = np.stack([bins.mean(response * scatter.rate(one)).reshape(3, -1)[:, flat] for one in pictures])
     return ((light.rate - true) / light.sigma).ravel()
 
 

@@ -20,20 +20,19 @@ from typing import final, get_args
 
 import numpy as np
 
+from tests.benchmarks.efficiency.backscatter import predicted_light
 from tests.benchmarks.planning_psf import Compared, compared_psf
 from tests.benchmarks.readme_tables import between
 from tests.benchmarks.rows import Row, table, write_json
 from udccal.benches.bench import simulated_bench, simulated_rig
 from udccal.benches.capture import capture
-from udccal.calibration import Calibration, FitEffort, calibrate
+from udccal.calibration import Calibration, calibrate
 from udccal.compilation import keep_compilations
 from udccal.displays.pictures import face_picture
-from udccal.fitting.backscatter.data import read_shots as read_pictures
-from udccal.fitting.backscatter.data import visible_crop
-from udccal.fitting.backscatter.fit import problem_of
-from udccal.fitting.backscatter.light import predict_light
-from udccal.fitting.backscatter.report import known_from
-from udccal.fitting.backscatter.select import choose
+from udccal.fitting.backscatter import read_backscatter
+from udccal.fitting.backscatter.orders import search
+from udccal.fitting.backscatter.posterior import term_posterior
+from udccal.fitting.backscatter.solve import Problem
 from udccal.fitting.geometry.boards import projection_sigma_px
 from udccal.planning.forecast import predictor_for
 from udccal.planning.state import Unexplained, measured_state, sensor_samples
@@ -96,15 +95,15 @@ def _backscatter_percent(made: Obtained) -> float:
     """Stated sigma of pictures that were not shown, of their peak."""
     base, rig = made.calibration.foundation, made.session.rig
     geometry = base.geometry.term
-    crop = visible_crop(geometry, rig)
-    shots = read_pictures(made.session, base.noise.term, crop, base.wire_map)
-    if shots is None:
+    data = read_backscatter(made.session, base.noise.term, geometry, base.wire_map)
+    if not data.names:
         return float("inf")
-    problem = problem_of(shots, geometry, rig, FitEffort().backscatter_positions)
-    new = np.stack([crop.of(face_picture(seed, rig.panel.columns, rig.panel.rows)) for seed in _NEW_PICTURES])
-    choice = choose(problem)
-    known = replace(known_from(choice), share=0.0, cov=choice.state.fitted.solution.cov)
-    light = predict_light(known, shots, new, problem.flat)
+    new = [face_picture(seed, rig.panel.columns, rig.panel.rows) for seed in _NEW_PICTURES]
+    found = search(Problem.of(data, geometry, rig))
+    # By noise alone.
+    found = replace(found, state=replace(found.state, model_error=0.0))
+    posterior = term_posterior(found.problem.template, data, found, 1.0)
+    light = predicted_light(posterior.term_at(posterior.mean), posterior, 0.0, rig, new, found.problem.flat)
     peak = light.rate.max(axis=(1, 2))
     return 100 * float(np.sqrt((light.sigma**2).mean() / (peak**2).mean()))
 

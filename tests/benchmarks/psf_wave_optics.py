@@ -23,8 +23,7 @@ from udccal.cfa import channel_map
 from udccal.compilation import keep_compilations
 from udccal.fitting.psf.fit import Effort, FittedPsf, fit_shots_fully
 from udccal.fitting.psf.posterior import psf_sigma
-from udccal.fitting.wire.harmonics import wire_start
-from udccal.fitting.wire.scan import ideal_wire
+from udccal.fitting.wire.parameters import ideal_wire, wire_start
 from udccal.models.geometry import Geometry
 from udccal.models.psf import psf_kernels
 from udccal.models.wire import Wire

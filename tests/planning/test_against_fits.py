@@ -12,7 +12,7 @@ from tests.toy_rigs import write_toy_rig
 from udccal.benches.bench import simulated_bench, simulated_rig
 from udccal.benches.capture import capture
 from udccal.fitting.noise import fit_noise, read_noise
-from udccal.fitting.wire.fit import fit_wire
+from udccal.fitting.wire import fit_wire, read_wire
 from udccal.planning.noise import NoisePredictor
 from udccal.planning.state import RigState, nominal_state
 from udccal.planning.wire import WirePredictor
@@ -63,7 +63,7 @@ def test_the_wire_map_is_known_as_well_as_foretold(toy: RigDescription, tmp_path
     for flats in (2, 60):
         captures = toy.captures.model_copy(update={"flats": flats})
         session = captured(toy.model_copy(update={"captures": captures}), "wire", tmp_path / str(flats))
-        fit = fit_wire(session, state.noise, state.geometry)
+        fit = fit_wire(read_wire(session, state.noise, state.geometry))
         stated.append(next(item.value for item in fit.diagnostics if item.name == "wire_map_rms_sigma"))
         model = next(item.value for item in fit.diagnostics if item.name == "wire_map_model_sigma")
         assert np.sqrt(predictor.sigma(captures) ** 2 + model**2) == pytest.approx(stated[-1], rel=_OFF)

@@ -15,33 +15,35 @@ from jaxtyping import Float
 
 from tests.benchmarks.efficiency.trials import Trials
 from udccal.displays.pictures import face_picture
-from udccal.fitting.backscatter.bins import Binned
-from udccal.fitting.backscatter.data import PanelShots, grid_step, visible_crop
-from udccal.fitting.backscatter.evidence import evidence, pictures_of, weights
-from udccal.fitting.backscatter.fit import problem_of
-from udccal.fitting.backscatter.light import Knowledge, grid_rays, predict_light
-from udccal.fitting.backscatter.likelihood import errors_of
-from udccal.fitting.backscatter.posterior import posterior_moments
-from udccal.fitting.backscatter.report import known_from, told
-from udccal.fitting.backscatter.select import choose
-from udccal.fitting.backscatter.solve import corners_of, window_for
-from udccal.fitting.backscatter.vector import (
+from udccal.fitting.backscatter import BackscatterData, BackscatterRules
+from udccal.fitting.backscatter.data import Binned, grid_rays, grid_step, visible_crop
+from udccal.fitting.backscatter.fit import result_of
+from udccal.fitting.backscatter.likelihood import Samples
+from udccal.fitting.backscatter.orders import search
+from udccal.fitting.backscatter.parameters import (
     NAMES,
     TWO_PLANES,
     Order,
     footprint_share,
+    linear_of,
+    linear_slope,
     prior_of,
     values_of,
-    with_vector,
+    with_linear,
 )
+from udccal.fitting.backscatter.posterior import TermAt, moments_along_reflection, posterior_around
+from udccal.fitting.backscatter.ratios import corners_of, window_for
+from udccal.fitting.backscatter.solve import Problem, SampleErrors, most_probable
+from udccal.fitting.engine.gaussian import Posterior
 from udccal.fitting.nominal import nominal_backscatter, nominal_geometry
-from udccal.fitting.solvers import most_probable
 from udccal.models.backscatter import Backscatter, panel_response, response_grid
 from udccal.numerics import in_float64
+from udccal.result import FitResult
 from udccal.rig import Nominal, RigDescription, load_rig
 
 REALISATIONS = 400
 POSITIONS = 24
+RULES = BackscatterRules(positions=POSITIONS)
 PICTURES = 8
 EXPOSURE_S = 0.05
 _READ_E = 2.5
@@ -95,8 +97,8 @@ def world_at(x: Float[np.ndarray, "18"], rig: RigDescription, white: Float[np.nd
     v, u = np.mgrid[-1 : 1 : 1j * rows, -1 : 1 : 1j * columns]
     mask = white * (1 - 0.3 * (u**2 + v**2) / 2)
     template = nominal_backscatter(nominal_geometry(rig), rig, mask, step, window=1)
-    rays = grid_rays(template, np.arange(rows * columns))
-    term = with_vector(replace(template, window=window_for(template, x, rays, 1.0)), jax.numpy.asarray(x))
+    rays, theta = grid_rays(template.geometry, (rows, columns), step, np.arange(rows * columns)), linear_of(x)
+    term = with_linear(replace(template, window=window_for(template, theta, rays, 1.0)), jax.numpy.asarray(theta))
     return World(rig, jax.tree.map(np.asarray, term), x)
 
 
@@ -115,35 +117,60 @@ def clean_light(of: World, pictures: list[np.ndarray]) -> list[Float[np.ndarray,
 def measured(
     rate: Float[np.ndarray, "3 a b"], rng: np.random.Generator, exposure_s: float = EXPOSURE_S, read_e: float = _READ_E
 ) -> Binned:
-    """A shot in bins of ``_SAMPLES`` samples (frames included): whole electrons, then read noise."""
+    """One shot in bins of ``_SAMPLES`` samples (frames included): whole electrons, then read noise."""
     shot = np.full_like(rate, 1 / (exposure_s * _SAMPLES))
     rest = np.full_like(rate, read_e**2 / exposure_s**2 / _SAMPLES)
     light = rng.poisson(np.maximum(rate, 0.0) / shot) * shot + rng.normal(size=rate.shape) * np.sqrt(rest)
-    return Binned(light, shot, rest, np.zeros(rate.shape, dtype=bool), exposure_s)
+    parts = (light, shot, rest, np.zeros(rate.shape, dtype=bool))
+    return Binned(*(part[None] for part in parts), np.array([exposure_s]), np.array([np.nan]))
 
 
 def shots_of(
     of: World, rng: np.random.Generator, pictures: list[np.ndarray], exposure_s: float = EXPOSURE_S
-) -> PanelShots:
+) -> BackscatterData:
     """White, dark and pictures with noise."""
     crop = visible_crop(of.term.geometry, of.rig)
     panel = of.rig.panel
     white = np.full((panel.rows, panel.columns, 3), 255, np.uint8)
     rates = clean_light(of, [white, *pictures])
-    seen = [measured(rate, rng, exposure_s) for rate in rates]
-    dark = measured(np.zeros_like(rates[0]), rng, exposure_s)
+    shots = Binned.joined([measured(rate, rng, exposure_s) for rate in (*rates, np.zeros_like(rates[0]))])
     shown = np.stack([crop.of(picture) for picture in pictures])
-    return PanelShots(seen[0], dark, tuple(seen[1:]), shown, crop, tuple(f"picture_{k}" for k in range(len(pictures))))
+    return BackscatterData(shots, shown, crop, tuple(f"picture_{k}" for k in range(len(pictures))))
 
 
-def noise_free(shots: PanelShots, of: World, pictures: list[np.ndarray]) -> PanelShots:
+def noise_free(data: BackscatterData, of: World, pictures: list[np.ndarray]) -> BackscatterData:
     """The same shots with the light that they have on average."""
     panel = of.rig.panel
     white = np.full((panel.rows, panel.columns, 3), 255, np.uint8)
     rates = clean_light(of, [white, *pictures])
-    seen = tuple(replace(one, rate=rate) for one, rate in zip(shots.seen, rates[1:], strict=True))
-    dark = replace(shots.dark, rate=np.zeros_like(rates[0]))
-    return replace(shots, white=replace(shots.white, rate=rates[0]), dark=dark, seen=seen)
+    return replace(data, shots=replace(data.shots, rate=np.stack([*rates, np.zeros_like(rates[0])])))
+
+
+@dataclass(frozen=True)
+class Light:
+    """Predicted rates in e-/s at positions, by camera colour, and one sigma of each."""
+
+    rate: Float[np.ndarray, "pictures 3 n"]
+    sigma: Float[np.ndarray, "pictures 3 n"]
+
+
+@in_float64
+def predicted_light(
+    term: Backscatter,
+    posterior: FitResult[Backscatter] | Posterior[Backscatter],
+    model_error: float,
+    rig: RigDescription,
+    pictures: list[np.ndarray],
+    flat: np.ndarray,
+) -> Light:
+    """Light of new pictures at grid positions, as sure as the term is, and as its model is of any new picture."""
+
+    def light(one: Backscatter) -> np.ndarray:
+        response = panel_response(one, rig.panel.rows, rig.panel.columns)
+        return np.stack([np.asarray(response_grid(response, shown)).reshape(3, -1)[:, flat] for shown in pictures])
+
+    of_model = model_error * np.asarray(term.mask).reshape(3, -1)[:, flat]
+    return Light(light(term), np.hypot(posterior.sigma_of(light), of_model))
 
 
 @dataclass(frozen=True)
@@ -151,32 +178,31 @@ class Ideal:
     """What the pictures tell at best: truth and bounds, from shots without noise that are weighed as if they had it.
 
     Attributes:
-        knowledge: truth, with the Cramér–Rao bound on the covariance of the solver's coordinates, the prior's
-            information included.
+        posterior: the truth, with the Cramér–Rao bound on the parameters' covariance, the prior's information included.
         sigma: of the reported values: how wide noise-free pictures leave the posterior. The mean of its square over the
             prior is the least mean squared error of any estimate; where sigma is small it is the Cramér–Rao bound.
     """
 
-    knowledge: Knowledge
+    posterior: Posterior[Backscatter]
     sigma: Float[np.ndarray, "18"]
 
 
 @in_float64
-def ideal_of(of: World, expected: PanelShots, flat: np.ndarray, template: Backscatter) -> Ideal:
+def ideal_of(of: World, expected: BackscatterData, flat: np.ndarray, template: Backscatter) -> Ideal:
     """The best that the positions with these flat indices allow."""
-    prior, free = prior_of(of.rig), TWO_PLANES.free > 0
-    rays = grid_rays(template, flat)
-    seen = evidence(expected, rays, flat, pictures_of(expected.shown, expected.crop))
-    weight = weights(seen, seen.light, seen.light[0], 0.0, seen.usable)
-    errors_at = errors_of(template, seen, weight, corners_of(template, of.x, rays))
-    slopes = errors_at(of.x)[1]
-    cov = np.linalg.inv(slopes.T @ slopes + np.diag(prior.sigma**-2.0))
-    known = Knowledge(template, of.x, cov, 0.0, (True,) * len(expected.seen) + (True,))
+    prior, free, theta = prior_of(of.rig), TWO_PLANES.free, linear_of(of.x)
+    rays = grid_rays(template.geometry, expected.shots.rate.shape[2:], template.step, flat)
+    samples = Samples.at(expected, rays, flat, expected.pictures)
+    weight = samples.weights(samples.light, samples.light[0], 0.0, samples.usable)
+    errors_at = SampleErrors.of(template, samples, weight, corners_of(template, theta, rays))
+    jacobian = errors_at(of.x)[1] / linear_slope(of.x)
+    cov = np.linalg.inv(jacobian.T @ jacobian + np.diag((prior.sigma * linear_slope(of.x)) ** -2.0))
+    used = np.ones(len(samples.light), dtype=bool)
     # The prior draws what is hardly seen towards its mean.
-    found = most_probable(errors_at, of.x, free, prior.mean, prior.sigma)
-    sigma = np.sqrt(np.diag(posterior_moments(errors_at, found, free, prior).cov))
+    found = most_probable(errors_at, of.x, free, prior)
+    sigma = np.sqrt(np.diag(moments_along_reflection(errors_at, found, free, prior, RULES).cov))
     sigma[2] /= footprint_share(of.rig)
-    return Ideal(known, sigma)
+    return Ideal(posterior_around(TermAt(template, expected, used, 0.0, theta), cov), sigma)
 
 
 @dataclass(frozen=True)
@@ -193,19 +219,18 @@ def realisation(seed: int) -> _One:
     of = world(rng, small_rig())
     pictures = panel_pictures(of.rig, 100 * seed, PICTURES + 1)
     new, pictures = pictures[-1:], pictures[:-1]
-    shots = shots_of(of, rng, pictures)
-    problem = problem_of(shots, of.term.geometry, of.rig, POSITIONS)
+    data = shots_of(of, rng, pictures)
     # The order is known here; whether it is found is another question.
-    choice = choose(problem, (TWO_PLANES,))
-    result = told(choice, shots, of.rig, [])
-    estimates = np.array([[e.value, e.sigma] for e in result.estimates]).T
-    expected = noise_free(shots, of, pictures)
-    ideal = ideal_of(of, expected, problem.flat, choice.problem.template)
-    shown = np.stack([shots.crop.of(picture) for picture in new])
-    predicted = predict_light(known_from(choice), shots, shown, _PLACES)
-    limit = predict_light(ideal.knowledge, expected, shown, _PLACES)
+    found = search(Problem.of(data, of.term.geometry, of.rig, RULES), (TWO_PLANES,))
+    result = result_of(found, data, of.rig, [])
+    values = np.array([[e.value, e.sigma] for e in result.estimates]).T
+    expected = noise_free(data, of, pictures)
+    ideal = ideal_of(of, expected, found.problem.flat, found.problem.template)
+    model_error = found.state.model_error
+    predicted = predicted_light(result.term, result, model_error, of.rig, new, _PLACES)
+    limit = predicted_light(of.term, ideal.posterior, 0.0, of.rig, new, _PLACES)
     light = np.stack([predicted.rate - limit.rate, predicted.sigma, limit.sigma]).reshape(3, -1)
-    return _One(np.stack([estimates[0] - of.values, estimates[1], ideal.sigma]), light)
+    return _One(np.stack([values[0] - of.values, values[1], ideal.sigma]), light)
 
 
 def trials(share: float) -> list[Trials]:

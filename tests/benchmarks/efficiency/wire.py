@@ -16,15 +16,20 @@ from jaxtyping import Array, Float
 
 from tests.benchmarks.efficiency.trials import Trials
 from udccal.fitting.engine.information import cramer_rao, fisher_information
-from udccal.fitting.wire.fit import WireFit, fit_wire_and_sigma
-from udccal.fitting.wire.harmonics import WireStart, possible_harmonics
-from udccal.fitting.wire.prior import rig_prior
-from udccal.fitting.wire.result import SHAPE_NAMES
-from udccal.fitting.wire.scan import ideal_wire
-from udccal.fitting.wire.slopes import move
+from udccal.fitting.wire import WireData, WireRules, fit_wire
+from udccal.fitting.wire.parameters import (
+    SHAPE_NAMES,
+    WireStart,
+    ideal_wire,
+    possible_harmonics,
+    shape_sigma,
+    shape_vector,
+    with_shape,
+)
 from udccal.models.geometry import Geometry
 from udccal.models.wire import Wire, wire_map, wire_values
 from udccal.numerics import in_float64
+from udccal.result import FitResult
 
 ROWS, COLUMNS = 120, 160
 PRNU = 0.004
@@ -78,9 +83,9 @@ class Flat:
 def drawn_truth(seed: int, built: WireStart, lens: Geometry, modulated: bool = True) -> Wire:
     """A wire drawn from the fit's prior, with shading."""
     rng = np.random.default_rng([seed, 1])
-    harmonics, _ = possible_harmonics(built)
+    harmonics = possible_harmonics(built).orders
     wire = ideal_wire(lens, built, harmonics if modulated else harmonics[:0])
-    steps = rig_prior(built).sigma * np.clip(rng.standard_normal(10), -2.5, 2.5)
+    steps = shape_sigma(built, WireRules()) * np.clip(rng.standard_normal(10), -2.5, 2.5)
     steps[4:6] = rng.uniform(-0.5, 0.5, 2)
     # Beyond a degree the geometry fit would be to blame.
     steps[:3] *= 0.2
@@ -91,7 +96,7 @@ def drawn_truth(seed: int, built: WireStart, lens: Geometry, modulated: bool = T
     baseline[tuple(_PAIRS.T)] = 0.01 * rng.standard_normal(len(_PAIRS))
     baseline[2, 0] -= 0.08
     baseline[0, 2] -= 0.1
-    moved = eqx.tree_at(lambda w: w.baseline, move(wire, steps), baseline)
+    moved = eqx.tree_at(lambda w: w.baseline, with_shape(wire, shape_vector(wire) + steps), baseline)
     # The map's mean is 1.
     baseline[0, 0] -= np.log(float(np.mean(np.asarray(wire_map(moved, ROWS, COLUMNS)))))
     moved = eqx.tree_at(lambda w: w.baseline, moved, baseline)
@@ -114,14 +119,20 @@ def noisy(truth: Wire, seed: int, electrons: float = ELECTRONS, prnu: float = PR
     return Flat(truth, signal, level)
 
 
-def fitted(flat: Flat, built: WireStart, lens: Geometry, prnu: float = PRNU) -> WireFit:
+def fitted(flat: Flat, built: WireStart, lens: Geometry, prnu: float = PRNU, clip: float = np.inf) -> FitResult[Wire]:
     """The fit with all pixels."""
-    return fit_wire_and_sigma(flat.signal, flat.variance, lens, built, prnu, flat.signal.size)
+    data = WireData(flat.signal, flat.variance, lens, built, prnu, clip)
+    return fit_wire(data, WireRules(samples=flat.signal.size))
+
+
+def map_sigma(result: FitResult[Wire], pixels: Float[np.ndarray, "places 2"]) -> Float[np.ndarray, " places"]:
+    """Stated sigma of the map at pixels."""
+    return result.sigma_of(lambda wire: map_at(wire, pixels))
 
 
 def predict(x: Float[Array, " n"], truth: Wire, pixels: Array, site: Array, prnu: Array) -> tuple[Array, Array]:
     """Mean and variance of every pixel in electrons; ``x``: shape, baseline, three site gains."""
-    wire = eqx.tree_at(lambda w: w.baseline, move(truth, x[:10]), _with_baseline(truth, x))
+    wire = _moved(truth, x)
     gains = jnp.exp(jnp.append(x[-3:], -jnp.sum(x[-3:])))
     mean = ELECTRONS * jnp.asarray(SITES.ravel())[site] * gains[site] * wire_values(wire, pixels, ROWS, COLUMNS)
     return mean, mean + (prnu * mean) ** 2
@@ -129,13 +140,14 @@ def predict(x: Float[Array, " n"], truth: Wire, pixels: Array, site: Array, prnu
 
 def normalised(x: Float[Array, " n"], truth: Wire, pixels: Array, grid: Array) -> Array:
     """The map at ``pixels``, its mean over ``grid`` 1."""
-    wire = eqx.tree_at(lambda w: w.baseline, move(truth, x[:10]), _with_baseline(truth, x))
+    wire = _moved(truth, x)
     whole = wire_values(wire, jnp.concatenate([pixels, grid]), ROWS, COLUMNS)
     return whole[: len(pixels)] / jnp.mean(whole[len(pixels) :])
 
 
-def _with_baseline(truth: Wire, x: Array) -> Array:
-    return jnp.asarray(truth.baseline).at[tuple(_PAIRS.T)].add(x[10 : 10 + len(_PAIRS)])
+def _moved(truth: Wire, x: Array) -> Wire:
+    baseline = jnp.asarray(truth.baseline).at[tuple(_PAIRS.T)].add(x[10 : 10 + len(_PAIRS)])
+    return eqx.tree_at(lambda w: w.baseline, with_shape(truth, shape_vector(truth) + x[:10]), baseline)
 
 
 _map_slopes = jax.jit(jax.jacfwd(normalised))
@@ -158,7 +170,7 @@ def bounds(truth: Wire, built: WireStart) -> tuple[Float[np.ndarray, "10"], Floa
     y, x = np.divmod(np.arange(ROWS * COLUMNS), COLUMNS)
     pixels, site = np.stack([x, y], axis=-1).astype(np.float64), 2 * (y % 2) + x % 2
     at = np.zeros(10 + len(_PAIRS) + 3)
-    information = np.diag(np.append(rig_prior(built).sigma ** -2.0, np.zeros(len(at) - 10)))
+    information = np.diag(np.append(shape_sigma(built, WireRules()) ** -2.0, np.zeros(len(at) - 10)))
     for part in np.array_split(np.arange(len(pixels)), 4):
         information += fisher_information(predict, at, truth, pixels[part], site[part], np.float64(PRNU))
     unit = np.ones(10)
@@ -192,17 +204,18 @@ class Errors:
     places: Float[np.ndarray, "3 places"]
 
 
-def errors(fit: WireFit, truth: Wire, bound: tuple[Float[np.ndarray, "10"], Float[np.ndarray, " places"]]) -> Errors:
+def errors(
+    fit: FitResult[Wire], truth: Wire, bound: tuple[Float[np.ndarray, "10"], Float[np.ndarray, " places"]]
+) -> Errors:
     """Estimate minus truth, stated sigma, bound."""
-    result = fit.result.or_raise()
-    assert fit.sigma is not None
+    result = fit.or_raise()
     found = np.array([e.value for e in result.estimates])
     off = found - shape_values(truth)
     off[4:6] -= np.round(off[4:6])
     whole = map_at(truth, _grid(192, 256)).mean()
     error = map_at(result.term, places()) - map_at(truth, places()) / whole
     stated = np.array([e.sigma for e in result.estimates])
-    return Errors(np.stack([off, stated, bound[0]]), np.stack([error, fit.sigma.at(places()), bound[1]]))
+    return Errors(np.stack([off, stated, bound[0]]), np.stack([error, map_sigma(result, places()), bound[1]]))
 
 
 def trials(share: float) -> list[Trials]:

@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from tests.benchmarks.efficiency.backscatter import (
     EXPOSURE_S,
-    POSITIONS,
+    RULES,
     World,
     panel_pictures,
     shots_of,
@@ -19,10 +19,9 @@ from tests.benchmarks.efficiency.backscatter import (
     world_at,
 )
 from tests.benchmarks.extremes.case import Case, Outcome, outcome
-from udccal.fitting.backscatter.bins import Binned
-from udccal.fitting.backscatter.data import PanelShots
-from udccal.fitting.backscatter.fit import fit_shots
-from udccal.fitting.backscatter.vector import TWO_PLANES, prior_of
+from udccal.fitting.backscatter import BackscatterData, fit_backscatter
+from udccal.fitting.backscatter.data import Binned
+from udccal.fitting.backscatter.parameters import TWO_PLANES, prior_of
 from udccal.result import FitResult
 from udccal.rig import Nominal, RigDescription
 
@@ -37,7 +36,7 @@ class Made:
 
     of: World
     pictures: tuple[np.ndarray, ...]
-    shots: PanelShots
+    shots: BackscatterData
 
 
 def made(
@@ -62,7 +61,7 @@ def made(
 
 def fitted(made_of: Made, rig: RigDescription | None = None) -> FitResult:
     """The fit of shots, by the true rig's description or by another."""
-    return fit_shots(made_of.shots, made_of.of.term.geometry, rig or made_of.of.rig, POSITIONS)
+    return fit_backscatter(made_of.shots, made_of.of.term.geometry, rig or made_of.of.rig, RULES)
 
 
 def errors(result: FitResult, of: World) -> Float[np.ndarray, " n"]:
@@ -81,9 +80,11 @@ def _even(levels: list[int], rig: RigDescription) -> tuple[np.ndarray, ...]:
     return tuple(np.full((rig.panel.rows, rig.panel.columns, 3), level, np.uint8) for level in levels)
 
 
-def with_seen(shots: PanelShots, change: Callable[[int, Binned], Binned]) -> PanelShots:
+def with_seen(data: BackscatterData, change: Callable[[int, Binned], Binned]) -> BackscatterData:
     """Shots with every picture's bins changed."""
-    return replace(shots, seen=tuple(change(k, one) for k, one in enumerate(shots.seen)))
+    shots = [data.shots.part(slice(k, k + 1)) for k in range(len(data.names) + 2)]
+    shots[1:-1] = [change(k, one) for k, one in enumerate(shots[1:-1])]
+    return replace(data, shots=Binned.joined(shots))
 
 
 def _scaled(one: Binned, by: float) -> Binned:
@@ -106,9 +107,7 @@ def _white_only() -> Outcome:
 
 def _first(count: int) -> Outcome:
     found = made()
-    shots = found.shots
-    few = replace(shots, seen=shots.seen[:count], shown=shots.shown[:count], names=shots.names[:count])
-    return _judged(replace(found, shots=few))
+    return _judged(replace(found, shots=found.shots.only(np.arange(PICTURES) < count)))
 
 
 def _wrong_order() -> Outcome:
@@ -118,7 +117,7 @@ def _wrong_order() -> Outcome:
 
 def _dropped() -> Outcome:
     found = made()
-    dark = found.shots.dark
+    dark = found.shots.shots.part(slice(-1, None))
     return _judged(replace(found, shots=with_seen(found.shots, lambda k, one: dark if k == 4 else one)))
 
 

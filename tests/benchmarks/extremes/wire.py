@@ -11,35 +11,34 @@ import numpy as np
 from tests.benchmarks.efficiency.wire import (
     COLUMNS,
     ELECTRONS,
-    PRNU,
     ROWS,
     Flat,
     drawn_truth,
     fitted,
     geometry,
     map_at,
+    map_sigma,
     noisy,
     places,
     start,
 )
 from tests.benchmarks.extremes.case import MOST_SINGLE, Case, Outcome, outcome
-from udccal.fitting.wire.fit import WireFit, fit_wire_and_sigma
-from udccal.fitting.wire.harmonics import WireStart
+from udccal.fitting.wire.parameters import WireStart
 from udccal.models.geometry import Geometry
-from udccal.models.wire import wire_map
-from udccal.result import FitStatus
+from udccal.models.wire import Wire, wire_map
+from udccal.result import FitResult, FitStatus
 
 _SEED = 3
 # Of lenses that still resolve the rows.
 _FAR_FOCAL_PX, _STEEP_FOCAL_PX = 1500.0, 400.0
 
 
-def judged(fit: WireFit, flat: Flat) -> Outcome:
+def judged(fit: FitResult[Wire], flat: Flat) -> Outcome:
     """The map's errors at places over the sensor, in its stated sigmas."""
-    if not fit.result.ok or fit.sigma is None:
-        return outcome(fit.result)
-    error = map_at(fit.result.term, places()) - map_at(flat.truth, places())
-    return outcome(fit.result, error / fit.sigma.at(places()))
+    if not fit.ok:
+        return outcome(fit)
+    error = map_at(fit.term, places()) - map_at(flat.truth, places())
+    return outcome(fit, error / map_sigma(fit, places()))
 
 
 def of_rig(
@@ -75,37 +74,35 @@ def wrong_start(standoff: float, pupil: float, seed: int = _SEED) -> Outcome:
 def constant(value: float) -> Outcome:
     """A flat that is the same everywhere."""
     signal = np.full((ROWS, COLUMNS), value)
-    variance = np.full(signal.shape, max(value, 1.0))
-    return outcome(fit_wire_and_sigma(signal, variance, geometry(), start(), PRNU, signal.size).result)
+    flat = Flat(drawn_truth(_SEED, start(), geometry()), signal, np.full(signal.shape, max(value, 1.0)))
+    return outcome(fitted(flat, start(), geometry()))
 
 
 def saturated() -> Outcome:
     """Every pixel above the level from which frames clip."""
     signal = np.full((ROWS, COLUMNS), 4095.0)
-    fit = fit_wire_and_sigma(signal, signal, geometry(), start(), PRNU, signal.size, clip=4000.0)
-    return outcome(fit.result)
+    flat = Flat(drawn_truth(_SEED, start(), geometry()), signal, signal)
+    return outcome(fitted(flat, start(), geometry(), clip=4000.0))
 
 
 def clipped_middle() -> Outcome:
     """The brightest parts clip, pixel by pixel as their noise has it."""
     flat = noisy(drawn_truth(_SEED, start(), geometry()), _SEED)
     clip = float(np.quantile(flat.signal, 0.99))
-    signal = np.minimum(flat.signal, clip)
-    fit = fit_wire_and_sigma(signal, flat.variance, geometry(), start(), PRNU, signal.size, clip=clip)
-    return judged(fit, flat)
+    flat = replace(flat, signal=np.minimum(flat.signal, clip))
+    return judged(fitted(flat, start(), geometry(), clip=clip), flat)
 
 
 def single_precision() -> Outcome:
     """The map in float32 against the map in float64, in sigmas of the fit."""
     flat = noisy(drawn_truth(_SEED, start(), geometry()), _SEED)
     fit = fitted(flat, start(), geometry())
-    assert fit.sigma is not None
-    single = np.asarray(wire_map(fit.result.term, ROWS, COLUMNS), dtype=np.float64)
+    single = np.asarray(wire_map(fit.term, ROWS, COLUMNS), dtype=np.float64)
     with jax.enable_x64(True):
-        double = np.asarray(wire_map(fit.result.term, ROWS, COLUMNS))
+        double = np.asarray(wire_map(fit.term, ROWS, COLUMNS))
     y, x = np.divmod(np.arange(0, single.size, 37), COLUMNS)
-    off = np.abs(single - double)[y, x] / fit.sigma.at(np.stack([x, y], axis=-1).astype(np.float64))
-    found = outcome(fit.result, off)
+    off = np.abs(single - double)[y, x] / map_sigma(fit, np.stack([x, y], axis=-1).astype(np.float64))
+    found = outcome(fit, off)
     if off.max() <= MOST_SINGLE:
         return found
     return replace(found, status=FitStatus.POOR_FIT, advice="")

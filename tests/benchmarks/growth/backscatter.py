@@ -8,8 +8,8 @@ import numpy as np
 
 from tests.benchmarks.efficiency.backscatter import panel_pictures, shots_of, small_rig, world_at
 from tests.benchmarks.growth.cases import Case
-from udccal.fitting.backscatter.fit import fit_shots
-from udccal.fitting.backscatter.vector import prior_of
+from udccal.fitting.backscatter import BackscatterRules, fit_backscatter
+from udccal.fitting.backscatter.parameters import prior_of
 from udccal.rig import RigDescription
 
 _PICTURES, _POSITIONS, _COLUMNS = 12, 96, 384
@@ -26,8 +26,8 @@ def _rig(columns: int) -> RigDescription:
 def _work(pictures: int, positions: int, columns: int) -> Callable[[], object]:
     rig, rng = _rig(columns), np.random.default_rng(1)
     of = world_at(prior_of(rig).mean, rig, np.array([1.6e4, 2e4, 1.4e4])[:, None, None])
-    shots = shots_of(of, rng, panel_pictures(rig, 0, pictures))
-    return lambda: fit_shots(shots, of.term.geometry, rig, positions)
+    data = shots_of(of, rng, panel_pictures(rig, 0, pictures))
+    return lambda: fit_backscatter(data, of.term.geometry, rig, BackscatterRules(positions=positions))
 
 
 CASES = (

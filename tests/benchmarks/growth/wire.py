@@ -9,9 +9,8 @@ import numpy as np
 
 from tests.benchmarks.efficiency.wire import PRNU, SITES, geometry, start
 from tests.benchmarks.growth.cases import Case
-from udccal.fitting.wire.fit import fit_wire_and_sigma
-from udccal.fitting.wire.harmonics import possible_harmonics
-from udccal.fitting.wire.scan import ideal_wire
+from udccal.fitting.wire import WireData, WireRules, fit_wire
+from udccal.fitting.wire.parameters import ideal_wire, possible_harmonics
 from udccal.models.geometry import Geometry
 from udccal.models.wire import wire_map
 from udccal.numerics import in_float64
@@ -35,7 +34,7 @@ def _work(flats: int, pixels: int) -> Callable[[], object]:
     rows = 2 * round(np.sqrt(0.75 * pixels) / 2)
     columns = 2 * round(pixels / rows / 2)
     lens, built = _lens(rows), start()
-    harmonics, _ = possible_harmonics(built)
+    harmonics = possible_harmonics(built).orders
     shape = np.asarray(wire_map(ideal_wire(lens, built, harmonics), rows, columns), dtype=np.float64)
     rng = np.random.default_rng(1)
     light = _LEVEL * shape / shape.mean() * np.tile(SITES, (rows // 2, columns // 2))
@@ -49,7 +48,8 @@ def _work(flats: int, pixels: int) -> Callable[[], object]:
         signal = moments.mean().astype(np.float64)
         # The frames that are taken again are the same.
         variance = moments.variance().astype(np.float64) / min(flats, _DRAWN)
-        return fit_wire_and_sigma(signal, variance, lens, built, PRNU, signal.size).result.or_raise()
+        data = WireData(signal, variance, lens, built, PRNU)
+        return fit_wire(data, WireRules(samples=signal.size)).or_raise()
 
     return work
 

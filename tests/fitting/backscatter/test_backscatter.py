@@ -12,9 +12,8 @@ from tests.simulation.toy import toy_rig, toy_truth
 from udccal.cameras.protocol import CameraIdentity, Region, Settings
 from udccal.cfa import channel_map
 from udccal.displays.pictures import face_picture
-from udccal.fitting.backscatter.bins import Binned, Bins, block_weights
-from udccal.fitting.backscatter.data import PanelShots, grid_step, visible_crop
-from udccal.fitting.backscatter.fit import fit_backscatter, fit_shots
+from udccal.fitting.backscatter import BackscatterRules, fit_backscatter, read_backscatter
+from udccal.fitting.backscatter.data import BackscatterData, Binned, Bins, block_weights, grid_step, visible_crop
 from udccal.fitting.noise.fit import nominal_noise
 from udccal.fitting.nominal import nominal_geometry
 from udccal.models.backscatter import Backscatter, backscatter_rate
@@ -79,7 +78,7 @@ def simulator():  # type: ignore[no-untyped-def]
 
 
 @pytest.fixture(scope="module")
-def shots(simulator) -> PanelShots:  # type: ignore[no-untyped-def]
+def data(simulator) -> BackscatterData:  # type: ignore[no-untyped-def]
     rng = np.random.default_rng(1)
     crop = visible_crop(known_geometry(), RIG)
 
@@ -88,12 +87,13 @@ def shots(simulator) -> PanelShots:  # type: ignore[no-untyped-def]
         bins, one = Bins(RIG.camera.cfa, grid_step(RIG)), np.ones_like(rate)
         mean = bins.mean(rate)
         shot, rest = bins.variance(one / EXPOSURE_S / FRAMES), bins.variance(one * 25.0 / FRAMES / EXPOSURE_S**2)
-        return Binned(mean, shot, rest, np.zeros(mean.shape, dtype=bool), EXPOSURE_S)
+        clipped = np.zeros(mean.shape, dtype=bool)
+        return Binned(*(part[None] for part in (mean, shot, rest, clipped)), np.array([EXPOSURE_S]), np.array([np.nan]))
 
-    return PanelShots(
-        white=binned(simulator.rate(WHITE)),
-        dark=binned(np.zeros((RIG.camera.rows, RIG.camera.columns))),
-        seen=tuple(binned(simulator.rate(one)) for one in SHOWN),
+    dark = np.zeros((RIG.camera.rows, RIG.camera.columns))
+    lit = [simulator.rate(one) for one in (WHITE, *SHOWN)]
+    return BackscatterData(
+        shots=Binned.joined([binned(light) for light in (*lit, dark)]),
         shown=np.stack([crop.of(one) for one in SHOWN]),
         crop=crop,
         names=tuple(f"picture_{seed}" for seed in range(len(SHOWN))),
@@ -101,8 +101,8 @@ def shots(simulator) -> PanelShots:  # type: ignore[no-untyped-def]
 
 
 @pytest.fixture(scope="module")
-def fitted(shots: PanelShots) -> FitResult[Backscatter]:
-    return fit_shots(shots, known_geometry(), RIG, positions=60)
+def fitted(data: BackscatterData) -> FitResult[Backscatter]:
+    return fit_backscatter(data, known_geometry(), RIG, BackscatterRules(positions=60))
 
 
 def rate(term: Backscatter, shown: np.ndarray) -> np.ndarray:
@@ -155,35 +155,39 @@ def test_what_the_model_leaves_out_counts_as_noise(fitted: FitResult[Backscatter
     assert any("counts as noise" in note for note in fitted.notes)
 
 
-def test_a_clipped_white_is_saturated(shots: PanelShots) -> None:
-    clipped = np.random.default_rng(0).random(shots.white.clipped.shape) < 0.3
-    result = fit_shots(replace(shots, white=replace(shots.white, clipped=clipped)), known_geometry(), RIG)
+def test_a_clipped_white_is_saturated(data: BackscatterData) -> None:
+    clipped = data.shots.clipped.copy()
+    clipped[0] = np.random.default_rng(0).random(clipped[0].shape) < 0.3
+    result = fit_backscatter(replace(data, shots=replace(data.shots, clipped=clipped)), known_geometry(), RIG)
     assert result.status is FitStatus.SATURATED
     assert rate(result.term, WHITE).max() == 0.0
 
 
-def test_a_black_panel_is_absent(shots: PanelShots) -> None:
+def test_a_black_panel_is_absent(data: BackscatterData) -> None:
     """In each of 100 captures, and it costs nothing later."""
     rng = np.random.default_rng(0)
     for _ in range(100):
-        sigma = np.sqrt(shots.white.rest)
-        dark = [replace(shots.white, rate=sigma * rng.normal(size=sigma.shape)) for _ in range(2)]
-        result = fit_shots(replace(shots, white=dark[0], dark=dark[1]), known_geometry(), RIG)
+        black = data.shots.rate.copy()
+        black[[0, -1]] = np.sqrt(data.shots.rest[0]) * rng.normal(size=(2, *black.shape[1:]))
+        result = fit_backscatter(replace(data, shots=replace(data.shots, rate=black)), known_geometry(), RIG)
         assert result.status is FitStatus.ABSENT
     assert result.ok
     assert rate(result.term, WHITE).max() == 0.0
 
 
-def test_few_pictures_are_too_few(shots: PanelShots) -> None:
-    few = replace(shots, seen=shots.seen[:3], shown=shots.shown[:3], names=shots.names[:3])
-    assert fit_shots(few, known_geometry(), RIG).status is FitStatus.TOO_FEW_DATA
-    clipped = tuple(replace(one, clipped=np.ones_like(one.clipped)) for one in shots.seen)
-    assert "clipped" in fit_shots(replace(shots, seen=clipped), known_geometry(), RIG).notes[0]
+def test_few_pictures_are_too_few(data: BackscatterData) -> None:
+    few = data.only(np.arange(len(data.names)) < 3)
+    assert fit_backscatter(few, known_geometry(), RIG).status is FitStatus.TOO_FEW_DATA
+    clipped = data.shots.clipped.copy()
+    clipped[1:-1] = True
+    bright = replace(data, shots=replace(data.shots, clipped=clipped))
+    assert "clipped" in fit_backscatter(bright, known_geometry(), RIG).notes[0]
 
 
 @pytest.mark.slow
-def test_pictures_in_the_wrong_order_are_a_poor_fit(shots: PanelShots) -> None:
-    result = fit_shots(replace(shots, shown=shots.shown[::-1].copy()), known_geometry(), RIG, positions=60)
+def test_pictures_in_the_wrong_order_are_a_poor_fit(data: BackscatterData) -> None:
+    backwards = replace(data, shown=data.shown[::-1].copy())
+    result = fit_backscatter(backwards, known_geometry(), RIG, BackscatterRules(positions=60))
     assert not result.ok
 
 
@@ -243,7 +247,8 @@ def test_a_session(simulator, tmp_path: Path) -> None:  # type: ignore[no-untype
         subject = writer.store_picture(name, shown, "white" if index == 0 else "picture")
         writer.add_step(name, "backscatter", subject, [average(simulator.rate(shown))])
     session = Session.open(tmp_path / "s")
-    result = fit_backscatter(session, noise, known_geometry(), np.ones(dark.shape), positions=60)
+    data = read_backscatter(session, noise, known_geometry(), np.ones(dark.shape))
+    result = fit_backscatter(data, known_geometry(), RIG, BackscatterRules(positions=60))
     assert result.status is FitStatus.CONVERGED
     assert error_of_peak(result.term, picture(100), simulator) < 0.02
 
@@ -251,6 +256,7 @@ def test_a_session(simulator, tmp_path: Path) -> None:  # type: ignore[no-untype
 def test_a_session_without_white_is_too_few_data(tmp_path: Path) -> None:
     SessionWriter.create(tmp_path / "s", RIG, CameraIdentity("a", "b", "c", "test"))
     flat = np.ones((RIG.camera.rows, RIG.camera.columns))
-    result = fit_backscatter(Session.open(tmp_path / "s"), nominal_noise(RIG), known_geometry(), flat)
+    data = read_backscatter(Session.open(tmp_path / "s"), nominal_noise(RIG), known_geometry(), flat)
+    result = fit_backscatter(data, known_geometry(), RIG)
     assert result.status is FitStatus.TOO_FEW_DATA
     assert "backscatter/white" in result.notes[0]

@@ -10,27 +10,16 @@ from scipy.special import expit
 
 from tests.benchmarks.efficiency.backscatter import (
     PICTURES,
-    POSITIONS,
+    RULES,
     panel_pictures,
     shots_of,
     small_rig,
     world,
 )
-from udccal.fitting.backscatter.fit import problem_of
-from udccal.fitting.backscatter.held_out import EVERY, held_out
-from udccal.fitting.backscatter.likelihood import solve
-from udccal.fitting.backscatter.posterior import posterior_moments
-from udccal.fitting.backscatter.select import choose
-from udccal.fitting.backscatter.vector import (
-    NAMES,
-    REFLECTION,
-    TWO_PLANES,
-    Moments,
-    moments_of,
-    moments_over,
-    prior_of,
-)
-from udccal.fitting.solvers import Solution, most_probable
+from udccal.fitting.backscatter.orders import held_out, search
+from udccal.fitting.backscatter.parameters import NAMES, REFLECTION, TWO_PLANES, Moments, prior_of
+from udccal.fitting.backscatter.posterior import moments_along_reflection
+from udccal.fitting.backscatter.solve import MostProbable, Problem, most_probable
 from udccal.rig import load_rig
 
 PRIOR = prior_of(load_rig("lg55-reduced"))
@@ -72,25 +61,25 @@ def _by_counting(share: float, place: float) -> tuple[np.ndarray, np.ndarray]:
 def test_a_skewed_posterior_has_the_moments_of_a_sum_over_it(share: float) -> None:
     place = float(PRIOR.mean[DISTANCE] + 0.1 * share)
     errors_at = _errors_at(share, place)
-    found = most_probable(errors_at, PRIOR.mean, FREE, PRIOR.mean, PRIOR.sigma)
-    moments, wanted = posterior_moments(errors_at, found, FREE, PRIOR), _by_counting(share, place)
+    found = most_probable(errors_at, PRIOR.mean, FREE, PRIOR)
+    moments, wanted = moments_along_reflection(errors_at, found, FREE, PRIOR, RULES), _by_counting(share, place)
     pair = np.ix_([DISTANCE, REFLECTION], [DISTANCE, REFLECTION])
     np.testing.assert_allclose(moments.mean[[DISTANCE, REFLECTION]], wanted[0], rtol=0.02)
     np.testing.assert_allclose(moments.cov[pair], wanted[1], rtol=0.05)
     # The parabola at the minimum says something else.
-    assert abs(moments_of(found.x, found.cov).cov[REFLECTION, REFLECTION] / wanted[1][1, 1] - 1) > 0.1
+    assert abs(Moments.log_normal(found.x, found.cov).cov[REFLECTION, REFLECTION] / wanted[1][1, 1] - 1) > 0.1
 
 
 def test_a_narrow_posterior_is_normal() -> None:
-    nothing = Solution(PRIOR.mean, np.diag(np.full(18, 1e-4)), 0.0, 1, True, np.zeros(1))
-    moments = posterior_moments(_errors_at(0.5, 0.0), nothing, FREE, PRIOR)
-    np.testing.assert_array_equal(moments.cov, moments_of(nothing.x, nothing.cov).cov)
+    narrow = MostProbable(PRIOR.mean, np.diag(np.full(18, 1e-4)), 0.0, True, 1)
+    moments = moments_along_reflection(_errors_at(0.5, 0.0), narrow, FREE, PRIOR, RULES)
+    np.testing.assert_array_equal(moments.cov, Moments.log_normal(narrow.x, narrow.cov).cov)
 
 
 def test_logarithms_that_are_normal_give_log_normal_values() -> None:
     rng = np.random.default_rng(0)
     root = 0.1 * rng.normal(size=(18, 18)) / np.sqrt(18)
-    moments = moments_of(PRIOR.mean, root @ root.T)
+    moments = Moments.log_normal(PRIOR.mean, root @ root.T)
     drawn = PRIOR.mean + rng.normal(size=(200_000, 18)) @ root.T
     logarithmic = np.arange(18) != GAMMA
     logarithmic[6:12] = False
@@ -102,7 +91,7 @@ def test_logarithms_that_are_normal_give_log_normal_values() -> None:
 
 def test_a_mixture_is_as_wide_as_its_parts_and_their_distance() -> None:
     parts = [Moments(np.full(18, float(k)), np.eye(18)) for k in (0, 4)]
-    both = moments_over(parts, np.array([0.75, 0.25]))
+    both = Moments.mixture(parts, np.array([0.75, 0.25]))
     np.testing.assert_allclose(both.mean, 1.0)
     np.testing.assert_allclose(both.cov, np.eye(18) + 3.0)
 
@@ -112,14 +101,13 @@ def test_held_out_pictures_of_the_model_leave_nothing_undescribed() -> None:
     rng = np.random.default_rng([0, 0x4E1D])
     of = world(rng, small_rig())
     shots = shots_of(of, rng, panel_pictures(of.rig, 0, PICTURES))
-    choice = choose(problem_of(shots, of.term.geometry, of.rig, POSITIONS), (TWO_PLANES,))
-    assert held_out(choice.problem, TWO_PLANES, choice.state.fitted).share == 0.0
+    found = search(Problem.of(shots, of.term.geometry, of.rig, RULES), (TWO_PLANES,))
+    fitted = found.state.fitted
+    assert held_out(found.problem, TWO_PLANES, fitted).model_error == 0.0
     # The pictures that are held out, with an error of 1 % of white that differs from place to place.
-    light = choice.problem.seen.light.copy()
-    light[EVERY::EVERY] += 0.01 * light[0] * rng.choice([-1.0, 1.0], light[EVERY::EVERY].shape)
-    problem = replace(choice.problem, seen=replace(choice.problem.seen, light=light))
-    fitted = choice.state.fitted
-    off = solve(
-        problem.template, problem.seen, fitted.weight, TWO_PLANES, problem.prior, fitted.solution.x, fitted.corner
-    )
-    assert held_out(problem, TWO_PLANES, off).share == pytest.approx(0.01, rel=0.2)
+    samples = found.problem.samples
+    light, out = samples.light.copy(), slice(RULES.held_out, -1, RULES.held_out)
+    light[out] += 0.01 * light[0] * rng.choice([-1.0, 1.0], light[out].shape)
+    problem = replace(found.problem, samples=replace(samples, light=light))
+    off = problem.solved(TWO_PLANES, fitted.found.x, fitted.weight)
+    assert held_out(problem, TWO_PLANES, off).model_error == pytest.approx(0.01, rel=0.2)

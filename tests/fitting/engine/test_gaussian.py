@@ -18,6 +18,7 @@ def _posterior() -> Posterior[Float[np.ndarray, "3"]]:
 def test_a_prior_adds_cost_and_the_slope_of_it() -> None:
     prior, x, step = Prior.independent(np.array([1.0, 2.0]), np.array([0.5, np.inf])), np.array([2.0, 9.0]), 1e-6
     assert prior.cost(x) == pytest.approx(4.0)
+    assert prior.sigma == pytest.approx([0.5, np.inf])
     along = np.array([step, 0.0])
     slope = (prior.cost(x + along) - prior.cost(x - along)) / (2 * step)
     assert prior.right(x) == pytest.approx([-slope / 2, 0.0], rel=1e-6)

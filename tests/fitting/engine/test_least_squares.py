@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -10,6 +11,7 @@ import pytest
 from jaxtyping import Float
 
 from udccal.fitting.engine.gaussian import Prior
+from udccal.fitting.engine.iteration_log import LOG
 from udccal.fitting.engine.least_squares import Blocks, SolverRules, Step, minimise
 
 Errors = Callable[[Float[np.ndarray, " p"]], Float[np.ndarray, " m"]]
@@ -83,6 +85,41 @@ def test_a_prior_counts_as_further_data() -> None:
     found = minimise(Curve(lambda x: x - 3.0, prior), np.array([10.0]), SolverRules(least_gain=1e-14))
     assert found.place == pytest.approx([1.5])
     assert found.equations.cov() == pytest.approx(np.array([[0.5]]))
+
+
+def test_slopes_that_mislead_are_told_as_not_converged() -> None:
+    @dataclass(frozen=True)
+    class Misled:
+        name: str = "misled"
+
+        def equations_at(self, place: Float[np.ndarray, " p"]) -> Blocks:
+            return Blocks.of_errors(1e3 * (place - 3.0), np.array([[-1e3]]))
+
+        def moved(self, place: Float[np.ndarray, " p"], step: Step) -> Float[np.ndarray, " p"]:
+            return place + step.shared
+
+    found = minimise(Misled(), np.zeros(1))
+    assert not found.converged
+    assert found.place[0] == 0.0
+
+
+def test_every_iteration_is_logged(caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.DEBUG, logger=LOG.name):
+        found = minimise(Curve(rosenbrock), np.array([-1.2, 1.0]))
+    assert sum("iteration" in line for line in caplog.messages) == len(found.history)
+
+
+def test_the_covariance_is_that_of_many_fits() -> None:
+    rng, times = np.random.default_rng(0), np.linspace(0.0, 3.0, 50)
+
+    def fitted() -> tuple[np.ndarray, np.ndarray]:
+        y = 100 * np.exp(-1.3 * times) + rng.normal(size=50)
+        found = minimise(Curve(lambda x: y - x[0] * np.exp(-x[1] * times)), np.array([90.0, 1.0]))
+        return found.place, found.equations.cov()
+
+    found = [fitted() for _ in range(60)]
+    spread = np.cov(np.array([place for place, _ in found]).T)
+    np.testing.assert_allclose(found[0][1], spread, rtol=0.4)
 
 
 def _blocks(rng: np.random.Generator, groups: int = 5, shared: int = 3, own: int = 2) -> tuple[Blocks, np.ndarray]:

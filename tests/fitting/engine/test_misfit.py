@@ -3,7 +3,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from udccal.fitting.engine.misfit import chi2_test, clustered_cov, excess_sigma, f_test, group_means_test, sharper
+from udccal.fitting.engine.misfit import (
+    chi2_test,
+    clustered_cov,
+    excess_sigma,
+    f_test,
+    group_means_test,
+    robust_excess_sigma,
+    sharper,
+)
 
 
 def test_chance_alone_is_flagged_once_in_a_thousand() -> None:
@@ -49,6 +57,16 @@ def test_an_error_that_chance_may_explain_is_estimated_only_where_asked() -> Non
     assert excess_sigma(residual**2, ones, ones, 200.0) == 0.0
     assert excess_sigma(residual**2, ones, ones, 200.0, chance=0.5) > 0.1
     assert excess_sigma(0.8 * ones, ones, ones, 200.0, chance=0.5) == 0.0
+
+
+def test_a_robust_size_is_that_of_most_residuals() -> None:
+    rng = np.random.default_rng(4)
+    light = rng.uniform(1, 30, 5000)
+    noise = 0.01 * light
+    residual = np.sqrt(noise) * rng.standard_normal(5000) + 0.02 * light * rng.standard_normal(5000)
+    residual[:100] += 50.0
+    assert robust_excess_sigma(residual**2, noise, light**2) == pytest.approx(0.02, rel=0.15)
+    assert excess_sigma(residual**2, noise, light**2, 5000.0) > 0.1
 
 
 @pytest.mark.parametrize("with_information", [True, False])

@@ -12,19 +12,19 @@ from hypothesis import strategies as st
 
 from tests.benchmarks.efficiency.wire import (
     COLUMNS,
-    PRNU,
     ROWS,
+    Flat,
     drawn_truth,
     fitted,
     geometry,
     map_at,
+    map_sigma,
     noisy,
     places,
     shape_values,
     start,
 )
 from tests.benchmarks.extremes.wire import constant
-from udccal.fitting.wire.fit import fit_wire_and_sigma
 from udccal.models.wire import Wire
 from udccal.result import FitResult, FitStatus
 
@@ -43,13 +43,12 @@ def test_map_and_shape_are_within_their_errors_from_a_start_that_is_a_fifth_off(
         built, standoff_per_pitch=0.8 * built.standoff_per_pitch, pupil_per_pitch=1.2 * built.pupil_per_pitch
     )
     fit = fitted(flat, wrong, geometry())
-    result = fit.result.or_raise()
-    assert fit.sigma is not None
+    result = fit.or_raise()
     off = np.array([e.value for e in result.estimates]) - shape_values(flat.truth)
     off[4:6] -= np.round(off[4:6])
     assert np.all(np.abs(off) < 4 * np.array([e.sigma for e in result.estimates]))
     error = map_at(result.term, places()) - map_at(flat.truth, places())
-    assert np.all(np.abs(error) < 4.5 * fit.sigma.at(places()))
+    assert np.all(np.abs(error) < 4.5 * map_sigma(fit, places()))
     assert columns_kept(result) == _PLAIN
     # A start so far beyond its tolerance is doubted in words.
     assert any("standoff_per_pitch" in note for note in result.notes)
@@ -58,30 +57,29 @@ def test_map_and_shape_are_within_their_errors_from_a_start_that_is_a_fifth_off(
 def test_no_modulation_is_absent_and_costs_nothing() -> None:
     flat = noisy(drawn_truth(2, start(), geometry(), modulated=False), 2)
     fit = fitted(flat, start(), geometry())
-    assert fit.result.status is FitStatus.ABSENT
-    assert np.shape(fit.result.term.harmonics) == (0, 2)
-    assert fit.sigma is not None
-    error = map_at(fit.result.term, places()) - map_at(flat.truth, places())
-    assert np.all(np.abs(error) < 4.5 * fit.sigma.at(places()))
-    assert float(np.max(fit.sigma.at(places()))) < 0.002
-    assert "too noisy" not in " ".join(fit.result.notes)
+    assert fit.status is FitStatus.ABSENT
+    assert np.shape(fit.term.harmonics) == (0, 2)
+    error = map_at(fit.term, places()) - map_at(flat.truth, places())
+    assert np.all(np.abs(error) < 4.5 * map_sigma(fit, places()))
+    assert float(np.max(map_sigma(fit, places()))) < 0.002
+    assert "too noisy" not in " ".join(fit.notes)
 
 
 @pytest.mark.parametrize("electrons", [24.0, 100.0])
 def test_rows_that_noise_may_hide_are_in_the_error_bars(electrons: float) -> None:
     flat = noisy(drawn_truth(854, start(), geometry()), 854, electrons, 0.0)
-    fit = fit_wire_and_sigma(flat.signal, flat.variance, geometry(), start(), 0.0, flat.signal.size)
-    assert fit.result.status is FitStatus.ABSENT
-    assert "too noisy to tell" in " ".join(fit.result.notes)
-    assert fit.sigma is not None
-    z = (map_at(fit.result.term, places()) - map_at(flat.truth, places())) / fit.sigma.at(places())
+    fit = fitted(flat, start(), geometry(), 0.0)
+    assert fit.status is FitStatus.ABSENT
+    assert "too noisy to tell" in " ".join(fit.notes)
+    z = (map_at(fit.term, places()) - map_at(flat.truth, places())) / map_sigma(fit, places())
     assert np.abs(z).max() < 3.5
     assert np.std(z) > 0.2
 
 
 def test_saturated_flat_says_what_to_do() -> None:
     signal = np.full((ROWS, COLUMNS), 4095.0)
-    result = fit_wire_and_sigma(signal, signal, geometry(), start(), PRNU, clip=4000.0).result
+    flat = Flat(drawn_truth(0, start(), geometry()), signal, signal)
+    result = fitted(flat, start(), geometry(), clip=4000.0)
     assert result.status is FitStatus.SATURATED
     assert "shorter" in " ".join(result.notes)
 
@@ -91,16 +89,15 @@ def finite_or_told(seed: int, electrons: float, prnu: float, broken: float, leve
     signal = flat.signal + level
     rng = np.random.default_rng(seed)
     signal[rng.random(signal.shape) < broken] = rng.choice([np.nan, np.inf, -1e9, 0.0, 1e9])
-    fit = fit_wire_and_sigma(signal, flat.variance, geometry(), start(), prnu, signal.size)
-    numbers = [np.asarray(e) for e in (fit.result.cov, [e.value for e in fit.result.estimates])]
+    fit = fitted(replace(flat, signal=signal), start(), geometry(), prnu)
+    numbers = [np.asarray(e) for e in (fit.cov, [e.value for e in fit.estimates])]
     assert all(np.isfinite(part).all() for part in numbers)
-    assert np.isfinite(map_at(fit.result.term, places())).all()
-    if fit.result.ok and not level:
-        assert fit.sigma is not None
-        error = map_at(fit.result.term, places()) - map_at(flat.truth, places())
-        assert np.all(np.abs(error) < 5 * fit.sigma.at(places()))
-    if not fit.result.ok:
-        assert fit.result.notes
+    assert np.isfinite(map_at(fit.term, places())).all()
+    if fit.ok and not level:
+        error = map_at(fit.term, places()) - map_at(flat.truth, places())
+        assert np.all(np.abs(error) < 5 * map_sigma(fit, places()))
+    if not fit.ok:
+        assert fit.notes
 
 
 _INPUTS = {
@@ -140,7 +137,7 @@ def test_the_right_order_is_chosen() -> None:
         if leaning:
             baseline[[0, 3, 6], [6, 3, 0]] += 1.5e-3
         truth = eqx.tree_at(lambda w, b=baseline: w.baseline, truth, baseline)
-        result = fitted(noisy(truth, seed), start(), geometry()).result
+        result = fitted(noisy(truth, seed), start(), geometry())
         right += columns_kept(result) == _PLAIN + (7 if leaning else 0)
     assert right >= 95
 
@@ -154,7 +151,7 @@ def test_absent_and_present_are_told_apart() -> None:
         present = seed % 2 == 0
         # Fewer electrons: the harmonic explains less.
         flat = noisy(drawn_truth(seed, start(), geometry(), modulated=present), seed, 3e3)
-        status = fitted(flat, start(), geometry()).result.status
+        status = fitted(flat, start(), geometry()).status
         told += status is (FitStatus.CONVERGED if present else FitStatus.ABSENT)
     assert told >= 190
 

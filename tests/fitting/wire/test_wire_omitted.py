@@ -9,14 +9,13 @@ import pytest
 
 from tests.benchmarks.efficiency.wire import start
 from tests.fitting.wire.test_wire_parts import GEOMETRY, even_pixels
-from udccal.fitting.wire.harmonics import omitted_harmonics, possible_harmonics
-from udccal.fitting.wire.misfit import Misfit
-from udccal.fitting.wire.noise import FlatNoise, Judged, judge
-from udccal.fitting.wire.omitted import Omitted, omitted, with_omitted
-from udccal.fitting.wire.scan import ideal_wire, modulation_at, with_harmonics
+from udccal.fitting.wire.data import FlatNoise, weighed
+from udccal.fitting.wire.jacobian import expected_of
+from udccal.fitting.wire.parameters import WireRules, ideal_wire, possible_harmonics
+from udccal.fitting.wire.report import Omitted, harmonics_alone, omitted
 from udccal.models.wire import Wire
 
-START = start()
+START, RULES = start(), WireRules()
 NOISE = 5e-4
 # Of the template; two of three panels are there, to a share.
 SHARES = (0.0, 0.85, 1.0)
@@ -25,19 +24,19 @@ SHARES = (0.0, 0.85, 1.0)
 @pytest.fixture(scope="module")
 def wire() -> Wire:
     with jax.enable_x64(True):
-        return ideal_wire(GEOMETRY, START, possible_harmonics(START)[0])
+        return ideal_wire(GEOMETRY, START, possible_harmonics(START).orders)
 
 
 def found(wire: Wire, share: float, seed: int, noise: float = NOISE) -> tuple[Omitted, float]:
     """What is found of a flat that has a share of the harmonics left out, and their RMS."""
     with jax.enable_x64(True):
         pixels = even_pixels(wire, noise, seed)
-        weak = with_harmonics(wire, omitted_harmonics(START)[0], pixels)
-        template = np.asarray(modulation_at(weak, pixels.ideal, pixels.scaled))
+        weak = possible_harmonics(START, RULES.least_counted, RULES.least_amplitude)
+        template = harmonics_alone(wire, weak.orders, pixels)
         pixels = eqx.tree_at(lambda p: p.value, pixels, pixels.value * (1 + share * template))
         line = FlatNoise(np.full(4, noise**2), np.zeros(4), 0.0, np.full(4, np.inf))
-        judged: Judged = judge(wire, np.ones(4), pixels, line)
-        left = omitted(START, wire, judged)
+        judged = weighed(pixels, expected_of(wire, np.ones(4), pixels), line)
+        left = omitted(START, wire, judged, RULES)
     assert left is not None
     return left, float(template[pixels.weight > 0].std())
 
@@ -47,26 +46,24 @@ def test_the_share_is_found_within_its_error(wire: Wire, share: float) -> None:
     errors = []
     for seed in range(4):
         left, rms = found(wire, share, seed)
-        errors.append((left.share - share) / left.share_sigma)
+        errors.append((left.part - share) / left.part_sigma)
         assert left.rms == pytest.approx(rms, rel=0.1)
-        assert left.share_sigma < 0.2
+        assert left.part_sigma < 0.2
         assert (left.probability > 0.95) == (share > 0)
     assert np.abs(errors).max() < 3.5
 
 
 def test_where_noise_hides_them_they_are_as_likely_as_not(wire: Wire) -> None:
     left, _ = found(wire, 1.0, 0, noise=0.5)
-    assert left.share_sigma > 50
+    assert left.part_sigma > 50
     assert left.probability == pytest.approx(0.5, abs=0.05)
     assert left.sigma == pytest.approx(left.rms * np.sqrt(left.probability))
 
 
-def test_what_is_likely_left_out_is_part_of_the_misfit(wire: Wire) -> None:
-    nothing = Misfit(0.0, np.zeros((2, 3)), 1e-5, 0.5, 6, NOISE)
-    there, not_there = (with_omitted(nothing, Omitted(2e-4, share, 0.1).sigma) for share in (1.0, 0.0))
-    assert there.sigma == pytest.approx(2e-4, rel=0.01)
-    assert (there.by_tile == there.sigma).all()
-    assert not_there.sigma < 2e-5
+def test_what_is_surely_left_out_counts_whole_and_what_is_not_there_hardly() -> None:
+    there, not_there = (Omitted(2e-4, share, 0.1).sigma for share in (1.0, 0.0))
+    assert there == pytest.approx(2e-4, rel=0.01)
+    assert not_there < 2e-5
 
 
 def test_extreme_shares_have_a_probability() -> None:

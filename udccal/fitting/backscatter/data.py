@@ -1,88 +1,218 @@
-"""What the backscatter fit looks at: binned rates of the panel's light, colour by colour, and what the panel showed."""
+"""What the backscatter fit looks at: the panel's light as rates in bins, colour by colour, and what was shown."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import final
 
-import jax
 import numpy as np
-from jaxtyping import Array, Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, Shaped, UInt8
+from scipy import sparse
 
-from udccal.fitting.backscatter.bins import Binned, Binning
-from udccal.fitting.backscatter.blocks import in_blocks
+from udccal.cfa import cell_channels
+from udccal.fitting.backscatter.parameters import linear_of, prior_of
+from udccal.fitting.backscatter.ratios import PanelCrop, Pictures, corners_of, directions
 from udccal.fitting.nominal import nominal_backscatter
-from udccal.models.arrays import Arrayish
-from udccal.models.backscatter import Backscatter, footprints, grid_positions
-from udccal.models.geometry import Geometry, panel_directions
-from udccal.models.noise import Noise
+from udccal.models.geometry import Geometry
+from udccal.models.noise import Noise, variance_e
 from udccal.numerics import in_float64
 from udccal.rig import RigDescription
 from udccal.sessions.schema import DarkSubject, PanelSubject, StoredStep
-from udccal.sessions.store import Session
+from udccal.sessions.store import Average, Session
 
+# Part of saturation from which a mean counts as clipped.
+_CLIPPED = 0.98
 # Panel pixels around the nominally visible part that are kept: the footprint's own size and the nominal's tolerances.
 _MARGIN_PX = 12
 
 
+@final
 @dataclass(frozen=True)
-class PanelCrop:
-    """The part of the panel that the camera can see: its first pixel and its size."""
+class Binned:
+    """Shots on the term's grid by camera colour.
 
-    column: int
-    row: int
-    columns: int
-    rows: int
+    Attributes:
+        rate: e-/s above the black level, the dark signal included.
+        shot: variance per rate, (e-/s)^2 per e-/s: what one electron in a bin amounts to.
+        rest: variance that a rate of 0 has, (e-/s)^2: read and row noise, quantisation, dark current.
+        clipped: bins in which a sample is clipped.
+        exposure_s: of each shot.
+        scatter: variance between the frames of a shot over what the noise model says; NaN where not known.
+    """
 
-    def of(self, picture: UInt8[np.ndarray, "panel_rows panel_columns 3"]) -> UInt8[np.ndarray, "rows columns 3"]:
-        """That part of a picture."""
-        return picture[self.row : self.row + self.rows, self.column : self.column + self.columns].copy()
+    rate: Float[np.ndarray, "shots 3 grid_rows grid_columns"]
+    shot: Float[np.ndarray, "shots 3 grid_rows grid_columns"]
+    rest: Float[np.ndarray, "shots 3 grid_rows grid_columns"]
+    clipped: Bool[np.ndarray, "shots 3 grid_rows grid_columns"]
+    exposure_s: Float[np.ndarray, " shots"]
+    scatter: Float[np.ndarray, " shots"]
+
+    @classmethod
+    def joined(cls, parts: Sequence[Binned]) -> Binned:
+        """Shots one after the other."""
+        return cls(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(cls)))
+
+    def part(self, which: slice | Shaped[np.ndarray, " n"]) -> Binned:
+        """Some of the shots."""
+        return Binned(*(getattr(self, f.name)[which] for f in fields(self)))
 
 
+@final
 @dataclass(frozen=True)
-class PanelShots:
-    """White, dark, and the pictures with what the camera saw of them; ``names`` are of the pictures."""
+class BackscatterData:
+    """What the camera saw of the panel, and what the panel showed.
 
-    white: Binned
-    dark: Binned
-    seen: tuple[Binned, ...]
+    Attributes:
+        shots: white, then the pictures, and the dark frame last; none at all where white or dark are missing.
+        shown: the pictures, values 0 to 255, in the crop.
+        crop: the part of the panel that the camera can see.
+        names: of the pictures.
+    """
+
+    shots: Binned
     shown: UInt8[np.ndarray, "pictures crop_rows crop_columns 3"]
     crop: PanelCrop
     names: tuple[str, ...]
 
+    @property
+    def pictures(self) -> Pictures:
+        """What the panel showed, ready for a fit of gamma."""
+        return Pictures.of(self.shown, self.crop)
 
-def read_shots(
-    session: Session, noise: Noise, crop: PanelCrop, shading: Float[np.ndarray, "rows columns"]
-) -> PanelShots | None:
-    """Bin every picture of a session, one at a time; None when white or dark was not captured.
+    def only(self, keep: Bool[np.ndarray, " pictures"]) -> BackscatterData:
+        """White, dark, and some of the pictures."""
+        names = tuple(name for name, kept in zip(self.names, keep, strict=True) if kept)
+        shots = self.shots.part(np.concatenate([[True], keep, [True]]))
+        return BackscatterData(shots, self.shown[keep], self.crop, names)
+
+
+def read_backscatter(
+    session: Session, noise: Noise, geometry: Geometry, shading: Float[np.ndarray, "rows columns"]
+) -> BackscatterData:
+    """Bin the averages of the steps ``backscatter/*`` of a session, one at a time.
 
     Args:
-        shading: the wire's map of the sensor, divided out.
+        session: holds ``backscatter/white``, ``backscatter/dark`` and other pictures, as averages.
+        noise: gives K, black level and saturation, and the variance of samples.
+        geometry: where rays go.
+        shading: the wire's map of the sensor (``fitting.wire.sensor_map``), divided out of what was measured.
+
+    Returns:
+        rates in e-/s by bin and colour; without shots where white or dark were not captured.
 
     Raises:
         SessionError: when a file is missing or damaged.
     """
-    panels = [(step, step.subject) for step in session.steps("backscatter") if isinstance(step.subject, PanelSubject)]
+    crop, step_px = visible_crop(geometry, session.rig), grid_step(session.rig)
+    steps = session.steps("backscatter")
+    panels = [(step, step.subject) for step in steps if isinstance(step.subject, PanelSubject)]
     white = [step for step, subject in panels if subject.role == "white"]
-    dark = [step for step in session.steps("backscatter") if isinstance(step.subject, DarkSubject)]
-    if not white or not dark:
-        return None
-    binning = Binning(noise, shading, session.rig.camera.cfa, grid_step(session.rig))
+    dark = [step for step in steps if isinstance(step.subject, DarkSubject)]
+    others = [(step, subject) for step, subject in panels if subject.role != "white"]
+    binning = Binning(noise, shading, session.rig.camera.cfa, step_px)
 
     def binned(step: StoredStep) -> Binned:
         capture = step.captures[0]
         return binning.of(session.average(capture), capture.exposure_s)
 
-    others = [(step, subject) for step, subject in panels if subject.role != "white"]
+    if not white or not dark:
+        nothing, none = np.zeros((0, 3, 1, 1)), np.zeros(0)
+        shots = Binned(nothing, nothing, nothing, nothing > 0, none, none)
+        return BackscatterData(shots, np.zeros((0, crop.rows, crop.columns, 3), np.uint8), crop, ())
     shown = [crop.of(session.picture(subject)) for _, subject in others]
-    empty = np.zeros((0, crop.rows, crop.columns, 3), np.uint8)
-    return PanelShots(
-        white=binned(white[0]),
-        dark=binned(dark[0]),
-        seen=tuple(binned(step) for step, _ in others),
-        shown=np.stack(shown) if shown else empty,
-        crop=crop,
-        names=tuple(step.id for step, _ in others),
+    return BackscatterData(
+        Binned.joined([binned(step) for step in (white[0], *(step for step, _ in others), dark[0])]),
+        np.stack(shown) if shown else np.zeros((0, crop.rows, crop.columns, 3), np.uint8),
+        crop,
+        tuple(step.id for step, _ in others),
     )
+
+
+@final
+@dataclass(frozen=True)
+class Binning:
+    """How averages become rates in bins: the noise of single samples, and the wire's map, which is divided out."""
+
+    noise: Noise
+    shading: Float[np.ndarray, "rows columns"]
+    cfa: str
+    step: int
+
+    def of(self, average: Average, exposure_s: float) -> Binned:
+        """One shot in bins, from its average in DN."""
+        noise, bins = self.noise, Bins(self.cfa, self.step)
+        gain = float(np.asarray(noise.K_DN_per_e))
+        to_rate = 1.0 / (exposure_s * self.shading)
+        signal_e = (average.mean - float(np.asarray(noise.black_DN))) / gain
+        clipped = average.mean >= _CLIPPED * float(np.asarray(noise.saturation_DN))
+        # Variance in the dark, e-^2: what a row's samples share, and the rest.
+        row_e2 = float(np.asarray(noise.sigma_row_DN / noise.K_DN_per_e)) ** 2
+        rest_e2 = max(float(np.asarray(variance_e(noise, np.zeros(()), np.float64(exposure_s)))) - row_e2, 0.0)
+        per_frame = to_rate**2 / average.frames
+        expected = np.maximum(signal_e, 0.0) + rest_e2
+        scatter = average.variance.mean(dtype=np.float64) / gain**2 / expected.mean()
+        return Binned(
+            rate=bins.mean(signal_e * to_rate)[None],
+            shot=bins.variance(to_rate / average.frames)[None],
+            rest=(rest_e2 * bins.variance(per_frame) + row_e2 * bins.row_variance(per_frame))[None],
+            clipped=(bins.mean(clipped.astype(np.float64)) > 0)[None],
+            exposure_s=np.array([exposure_s]),
+            scatter=np.array([scatter], dtype=np.float64),
+        )
+
+
+@final
+@dataclass(frozen=True)
+class Bins:
+    """Averages of a mosaic over blocks of ``step`` x ``step`` (even) pixels, colour by colour.
+
+    A sample of a colour stands for the 2 x 2 pixels around it and counts by the part of them inside the block: then
+    every colour's average is of the block's centre, though its samples are not.
+    """
+
+    cfa: str
+    step: int
+
+    def mean(self, mosaic: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray, "3 grid_rows grid_columns"]:
+        """Averages of the samples."""
+        return self._sum(mosaic, 1, 1)
+
+    def variance(self, mosaic: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray, "3 grid_rows grid_columns"]:
+        """Variances of the averages from those of the samples, each by itself."""
+        return self._sum(mosaic, 2, 2)
+
+    def row_variance(self, mosaic: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray, "3 grid_rows grid_columns"]:
+        """The same where the samples of a row go up and down together."""
+        return self._sum(mosaic, 2, 1)
+
+    def _sum(self, mosaic: np.ndarray, row_power: int, column_power: int) -> Float[np.ndarray, "3 a b"]:
+        sums = np.zeros((3, *(size // self.step for size in mosaic.shape)))
+        cells = np.asarray(cell_channels(self.cfa))
+        # A colour with two samples in a cell averages them.
+        share = 1.0 / np.bincount(cells.ravel(), minlength=3) ** max(row_power, column_power)
+        for (j, i), channel in np.ndenumerate(cells):
+            part = mosaic[j::2, i::2].astype(np.float64)
+            by_row, by_column = (
+                sparse.csr_array(block_weights(samples, size // self.step, self.step, first) ** power)
+                for samples, size, first, power in zip(
+                    part.shape, mosaic.shape, (j, i), (row_power, column_power), strict=True
+                )
+            )
+            sums[channel] += share[channel] * (by_column @ (by_row @ part).T).T
+        return sums
+
+
+def block_weights(samples: int, blocks: int, step: int, first: int) -> Float[np.ndarray, "blocks samples"]:
+    """Weights of the samples at ``first``, ``first`` + 2, ... px in the averages over blocks of ``step`` px.
+
+    A sample covers one pixel to either side of it; what the sensor's edge cuts off, the others of the block take over.
+    """
+    centre = first + 2.0 * np.arange(samples)
+    edge = step * np.arange(blocks)[:, None] - 0.5
+    overlap = np.minimum(centre + 1, edge + step) - np.maximum(centre - 1, edge)
+    weights = np.maximum(overlap, 0.0)
+    return np.asarray(weights / weights.sum(axis=1, keepdims=True))
 
 
 def grid_step(rig: RigDescription) -> int:
@@ -100,29 +230,11 @@ def visible_crop(geometry: Geometry, rig: RigDescription) -> PanelCrop:
     camera, panel = rig.camera, rig.panel
     edge_x, edge_y = np.linspace(0, camera.columns - 1, 9), np.linspace(0, camera.rows - 1, 9)
     pixels = np.stack(np.meshgrid(edge_x, edge_y), axis=-1).reshape(-1, 2)
-    template = nominal_backscatter(geometry, rig, np.zeros((3, 2, 2)), grid_step(rig), window=1)
-    rays = directions(geometry, pixels)
-    (centre,) = in_blocks(lambda part: (_centres(template, part),), rays)
-    first = np.floor(centre.min(axis=0)).astype(int) - _MARGIN_PX
-    last = np.ceil(centre.max(axis=0)).astype(int) + _MARGIN_PX
-    first = np.clip(first, 0, [panel.columns - 8, panel.rows - 8])
-    last = np.clip(last, first + 8, [panel.columns, panel.rows])
+    template = nominal_backscatter(geometry, rig, np.zeros((3, 1, 1)), grid_step(rig), window=1)
+    middle = corners_of(template, linear_of(prior_of(rig).mean), directions(geometry, pixels))
+    first = np.clip(middle.min(axis=0) - _MARGIN_PX, 0, [panel.columns - 8, panel.rows - 8])
+    last = np.clip(middle.max(axis=0) + _MARGIN_PX + 1, first + 8, [panel.columns, panel.rows])
     return PanelCrop(int(first[0]), int(first[1]), int(last[0] - first[0]), int(last[1] - first[1]))
-
-
-@jax.jit
-def _centres(term: Backscatter, rays: Float[Arrayish, "b 3"]) -> Float[Array, "b 2"]:
-    return footprints(term, rays, term.distance_mm)[0]
-
-
-@in_float64
-def directions(geometry: Geometry, pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 3"]:
-    """Rays of sensor pixels in panel coordinates."""
-    (rays,) = in_blocks(lambda part: (_directions(geometry, part),), np.asarray(pixels, dtype=np.float64))
-    return np.asarray(rays)
-
-
-_directions = jax.jit(panel_directions)
 
 
 @in_float64
@@ -130,10 +242,18 @@ def sampled_rays(
     geometry: Geometry, rig: RigDescription, step: int, count: int
 ) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, " n"]]:
     """About ``count`` grid positions spread evenly (the R2 sequence): their rays and flat grid indices."""
-    x, y = (np.asarray(axis) for axis in grid_positions(rig.camera.columns, rig.camera.rows, step))
+    shape = rig.camera.rows // step, rig.camera.columns // step
     plastic = 1.32471795724474602596
     sequence = (0.5 + np.arange(count)[:, None] / np.array([plastic, plastic**2])) % 1.0
-    columns, rows = (sequence * [len(x), len(y)]).astype(int).T
-    flat = np.unique(rows * len(x) + columns)
-    rows, columns = np.divmod(flat, len(x))
-    return directions(geometry, np.stack([x[columns], y[rows]], axis=1)), flat
+    columns, rows = (sequence * shape[::-1]).astype(int).T
+    flat = np.unique(rows * shape[1] + columns)
+    return grid_rays(geometry, shape, step, flat), flat
+
+
+@in_float64
+def grid_rays(
+    geometry: Geometry, shape: tuple[int, int], step: int, flat: Int[np.ndarray, " n"]
+) -> Float[np.ndarray, "n 3"]:
+    """Rays of positions of a grid of that many rows and columns, by their flat indices, in panel coordinates."""
+    rows, columns = np.divmod(flat, shape[1])
+    return directions(geometry, step * (np.stack([columns, rows], axis=1) + 0.5) - 0.5)

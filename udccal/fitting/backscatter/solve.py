@@ -1,141 +1,220 @@
-"""Where the footprints lie on the panel, and where a fit of the backscatter term may start."""
+"""The most probable parameters of an order: the problem, its errors as the engine sees them, and the descent."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import final
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Bool, Float, Int
 
-from udccal.fitting.backscatter.blocks import in_blocks
-from udccal.fitting.backscatter.evidence import Evidence, weights_to_start
-from udccal.fitting.backscatter.ratios import mixed_ratios, primary_light, shares_at, windows_at
-from udccal.fitting.backscatter.vector import (
-    EMITTERS,
+from udccal.fitting.backscatter.data import BackscatterData, grid_step, sampled_rays
+from udccal.fitting.backscatter.likelihood import PerBin, PerShot, Profile, Samples, of_all_shots
+from udccal.fitting.backscatter.parameters import (
     OFFSET,
     TWO_PLANES,
-    Prior,
+    Order,
+    Vector,
+    linear_of,
+    linear_slope,
     offset_reach_px,
-    values_of,
-    with_vector,
-    without_crosstalk,
+    prior_of,
 )
-from udccal.models.arrays import Arrayish
-from udccal.models.backscatter import Backscatter, footprints, window_corners
+from udccal.fitting.backscatter.ratios import (
+    Windows,
+    best_offset,
+    corners_of,
+    ratios,
+    ratios_and_jacobian,
+    window_for,
+    with_room,
+)
+from udccal.fitting.backscatter.rules import BackscatterRules
+from udccal.fitting.engine.gaussian import Prior
+from udccal.fitting.engine.least_squares import Blocks, SolverRules, Step, minimise
+from udccal.fitting.nominal import nominal_backscatter
+from udccal.models.backscatter import Backscatter
+from udccal.models.geometry import Geometry
 from udccal.numerics import in_float64
 from udccal.rig import RigDescription
 
-# Room that a window leaves for the footprint to move during a fit.
-SLACK_PX = 0.7
-_MOST_WIDER = 3
+# Parameters in the solver's coordinates to whitened errors and their Jacobian.
+ErrorsAt = Callable[[Vector], tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m 18"]]]
 
 
+@final
 @dataclass(frozen=True)
-class Start:
-    """Parameters to begin with, and how well they describe the pictures (a sum of squares, lower is better)."""
+class SampleErrors:
+    """Errors of samples as a function of the parameters: windows on the panel stay where they are."""
 
-    x: Float[np.ndarray, "18"]
+    template: Backscatter
+    samples: Samples
+    weight: PerShot
+    at: Windows
+    logs: Float[np.ndarray, "n 3 pictures window2"]
+
+    @classmethod
+    def of(
+        cls,
+        template: Backscatter,
+        samples: Samples,
+        weight: PerShot,
+        corner: Int[np.ndarray, "n 2"],
+    ) -> SampleErrors:
+        """With windows from these corners on."""
+        at = Windows.at(template.window, samples.rays, corner, samples.shown)
+        return cls(template, samples, weight, at, at.logs(samples.shown))
+
+    def ratios(self, x: Vector) -> tuple[PerShot, Float[np.ndarray, "18 shots 3 n"]]:
+        """Light over that of white, and its derivatives by the solver's coordinates."""
+        ratio, jacobian = ratios_and_jacobian(self.template, linear_of(x), self.at, self.logs)
+        return of_all_shots(ratio, 1.0), of_all_shots(jacobian * linear_slope(x)[:, None, None, None], 0.0)
+
+    def __call__(self, x: Vector) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m 18"]]:
+        """Whitened errors, mask and dark at their best, and their Jacobian."""
+        ratio, of_ratio = self.ratios(x)
+        best = Profile.of(ratio, self.samples, self.weight)
+        errors = best.errors(ratio, self.samples) * self.weight
+        return errors.ravel(), best.jacobian(of_ratio).reshape(len(x), -1).T
+
+
+@final
+@dataclass(frozen=True)
+class MostProbable:
+    """The most probable parameters; ``cov`` is 0 for those that are held, ``cost`` holds what the prior adds."""
+
+    x: Vector
+    cov: Float[np.ndarray, "18 18"]
     cost: float
+    converged: bool
+    iterations: int
 
 
-def corners_of(
-    template: Backscatter, x: Float[np.ndarray, "18"], rays: Float[np.ndarray, "n 3"]
-) -> Int[np.ndarray, "n 2"]:
-    """First panel pixel of the window of each position."""
-    return _extents(template, x, rays).corner
-
-
-def window_for(template: Backscatter, x: Float[np.ndarray, "18"], rays: Float[np.ndarray, "n 3"], slack: float) -> int:
-    """Odd number of panel pixels across a window that holds both footprints at every position."""
-    found = _extents(template, x, rays)
-    emitters = np.insert(x[EMITTERS].reshape(2, 2), 1, 0.0, axis=0)
-    spread = np.abs(emitters - emitters.mean(axis=0)).max()
-    return 2 * int(np.ceil(found.reach_px.max() + spread + 4 * float(values_of(x)[3]) + slack)) + 1
-
-
-def with_room(template: Backscatter, x: Float[np.ndarray, "18"], rays: Float[np.ndarray, "n 3"]) -> Backscatter:
-    """The template with a window that holds the footprints and lets them move, never smaller than it was.
-
-    It stays where it would have to be more than three times as wide: such a fit has gone astray.
-    """
-    if not template.window < window_for(template, x, rays, 0.0) <= _MOST_WIDER * template.window:
-        return template
-    return replace(template, window=window_for(template, x, rays, SLACK_PX))
-
-
+@final
 @dataclass(frozen=True)
-class _Extents:
-    """Per position: the window's first panel pixel, and how far the footprints reach from its middle."""
+class _Free:
+    """The free parameters as the engine's problem; the others are held."""
 
+    errors_at: ErrorsAt
+    free: Bool[np.ndarray, "18"]
+    prior: Prior
+    name: str = "backscatter"
+
+    def equations_at(self, place: Vector) -> Blocks:
+        errors, jacobian = self.errors_at(place)
+        return Blocks.of_errors(errors, jacobian[:, self.free]).with_prior(self.prior, place[self.free])
+
+    def moved(self, place: Vector, step: Step) -> Vector:
+        moved = place.copy()
+        moved[self.free] += step.shared
+        return moved
+
+
+@in_float64
+def most_probable(
+    errors_at: ErrorsAt,
+    start: Vector,
+    free: Bool[np.ndarray, "18"],
+    prior: Prior,
+    rules: SolverRules | None = None,
+) -> MostProbable:
+    """Where errors and prior together are least, over the free parameters."""
+    problem = _Free(errors_at, free, Prior(prior.mean[free], prior.root[:, free]))
+    found, cov = minimise(problem, start, rules), np.zeros((len(free), len(free)))
+    cost = found.equations.cost
+    if np.isfinite(cost):
+        cov[np.ix_(free, free)] = found.equations.cov()
+    return MostProbable(found.place, cov, cost, found.converged, found.iterations)
+
+
+@final
+@dataclass(frozen=True)
+class Fitted:
+    """Parameters and what follows from them at some positions; ``errors`` are measured less modelled rates."""
+
+    found: MostProbable
     corner: Int[np.ndarray, "n 2"]
-    reach_px: Float[np.ndarray, " n"]
+    ratio: PerShot
+    mask: PerBin
+    errors: PerShot
+    weight: PerShot
+
+    @classmethod
+    def of(
+        cls, found: MostProbable, corner: Int[np.ndarray, "n 2"], ratio: PerShot, samples: Samples, weight: PerShot
+    ) -> Fitted:
+        """With mask and dark at their best."""
+        best = Profile.of(ratio, samples, weight)
+        return cls(found, corner, ratio, best.mask, best.errors(ratio, samples), weight)
+
+    def reweighed(self, samples: Samples, weight: PerShot) -> Fitted:
+        """The same parameters at other weights."""
+        return Fitted.of(self.found, self.corner, self.ratio, samples, weight)
+
+    @property
+    def light(self) -> PerShot:
+        """Modelled light, the dark signal left out."""
+        return self.mask * self.ratio
+
+    @property
+    def z(self) -> PerShot:
+        """Errors in units of their sigma, 0 where not used."""
+        return self.errors * self.weight
+
+    @property
+    def chi2(self) -> float:
+        """The prior left out."""
+        return float((self.z**2).sum())
+
+    @property
+    def used(self) -> Bool[np.ndarray, "shots 3 n"]:
+        """Samples that count, dark left out."""
+        return np.concatenate([self.weight[:-1] > 0, np.zeros((1, *self.mask.shape), dtype=bool)])
 
 
-@in_float64
-def _extents(template: Backscatter, x: Float[np.ndarray, "18"], rays: Float[np.ndarray, "n 3"]) -> _Extents:
-    # The corner is worked out for a window of one pixel: windows of any size then share one compilation.
-    single = replace(template, window=1)
-    middle, reach = in_blocks(lambda part: _middle_and_reach(single, x, part), rays)
-    return _Extents((middle - (template.window - 1) // 2).astype(np.int64), reach)
-
-
-@jax.jit
-def _middle_and_reach(
-    template: Backscatter, x: Float[Arrayish, "18"], rays: Float[Arrayish, "b 3"]
-) -> tuple[Int[Array, "b 2"], Float[Array, " b"]]:
-    term = with_vector(template, jnp.asarray(x))
-    near, shape = footprints(term, rays, term.distance_mm)
-    far, far_shape = footprints(term, rays, term.distance_mm + term.reflection_mm)
-    extent = jnp.maximum(jnp.linalg.norm(shape, axis=2), jnp.linalg.norm(far_shape, axis=2)).max(axis=1)
-    return window_corners(term, rays), extent + jnp.abs(far - near).max(axis=1) / 2
-
-
-@in_float64
-def scan_offset(template: Backscatter, seen: Evidence, rig: RigDescription, prior: Prior) -> Start:
-    """Panel offset at which a free mix of primaries explains the ratios best: where least squares may start.
-
-    Offsets are whole panel pixels: a window that moves with them sees the same shares of its emitters.
-    """
-    across, down = (int(np.ceil(reach)) for reach in offset_reach_px(rig))
-    target = _ratios_seen(seen)
-    plain = without_crosstalk(TWO_PLANES).start(prior.mean, prior)
-    corner = corners_of(template, plain, seen.rays)
-    shares = shares_at(template, plain, seen.rays, corner)
-    best = Start(prior.mean, np.inf)
-    for y in range(-down, down + 1):
-        for x in range(-across, across + 1):
-            moved = windows_at(template.window, seen.rays, corner - np.array([x, y]), seen.shown)
-            light, white = primary_light(shares, float(plain[0]), moved, seen.shown)
-            primaries = mixed_ratios(light, white, np.eye(3))
-            cost = sum(_free_mix_cost(primaries, target, channel) for channel in range(3))
-            if cost < best.cost:
-                vector = prior.mean.copy()
-                vector[OFFSET] = x, y
-                best = Start(vector, cost)
-    return best
-
-
+@final
 @dataclass(frozen=True)
-class _Target:
-    """Light of pictures over that of white, and weights of it: enough to find a start."""
+class Problem:
+    """What all orders share; ``flat`` are the grid indices of the positions."""
 
-    ratio: Float[np.ndarray, "pictures 3 n"]
-    weight: Float[np.ndarray, "pictures 3 n"]
+    template: Backscatter
+    samples: Samples
+    flat: Int[np.ndarray, " n"]
+    prior: Prior
+    start: Vector
+    rules: BackscatterRules
 
+    @classmethod
+    def of(
+        cls, data: BackscatterData, geometry: Geometry, rig: RigDescription, rules: BackscatterRules | None = None
+    ) -> Problem:
+        """Samples at positions spread over the sensor, with a start found by scanning."""
+        rules, step, prior = rules or BackscatterRules(), grid_step(rig), prior_of(rig)
+        rays, flat = sampled_rays(geometry, rig, step, rules.positions)
+        # The mask comes out of the likelihood; the template's is of no size.
+        template = nominal_backscatter(geometry, rig, np.zeros((3, 1, 1)), step, window=1)
+        template = replace(template, window=window_for(template, linear_of(prior.mean), rays, rules.slack_px))
+        samples = Samples.at(data, rays, flat, data.pictures)
+        weight, start = samples.first_weights(), prior.mean.copy()
+        lit = samples.excess[0] * weight[0] > 1.0
+        white = np.where(lit, samples.excess[0], 1.0)
+        ratio, weight = (np.where(lit, part, 0.0)[1:-1] for part in (samples.excess / white, weight * white))
+        theta = linear_of(TWO_PLANES.without_crosstalk().start(prior.mean, prior))
+        start[OFFSET] = best_offset(template, theta, rays, samples.shown, ratio, weight, offset_reach_px(rig))
+        return cls(template, samples, flat, prior, start, rules)
 
-def _ratios_seen(seen: Evidence) -> _Target:
-    light = seen.light - seen.exposure[:, None, None] * seen.dark
-    weight = weights_to_start(seen)
-    lit = light[0] * weight[0] > 1.0
-    white = np.where(lit, light[0], 1.0)
-    return _Target(np.where(lit, light[1:] / white, 0.0), np.where(lit, weight[1:] * white, 0.0))
+    def solved(self, order: Order, x: Vector, weight: PerShot) -> Fitted:
+        """The most probable parameters of an order at given weights, from ``x`` on."""
+        start = order.start(x, self.prior)
+        corner = corners_of(self.template, linear_of(start), self.samples.rays)
+        errors_at = SampleErrors.of(self.template, self.samples, weight, corner)
+        found = most_probable(errors_at, start, order.free, self.prior, self.rules.solver)
+        ratio = of_all_shots(ratios(self.template, linear_of(found.x), errors_at.at, self.samples.shown), 1.0)
+        return Fitted.of(found, corner, ratio, self.samples, weight)
 
-
-def _free_mix_cost(primaries: Float[np.ndarray, "pictures 3 n"], target: _Target, channel: int) -> float:
-    weight = target.weight[:, channel].ravel()
-    design = np.moveaxis(primaries, 1, -1).reshape(-1, 3) * weight[:, None]
-    wanted = target.ratio[:, channel].ravel() * weight
-    solution = np.linalg.lstsq(design, wanted, rcond=None)[0]
-    return float(((design @ solution - wanted) ** 2).sum())
+    def with_room(self, x: Vector) -> Problem:
+        """With windows that hold the footprints of these parameters."""
+        rules = self.rules
+        wider = with_room(self.template, linear_of(x), self.samples.rays, rules.slack_px, rules.most_wider)
+        return replace(self, template=wider)

@@ -40,6 +40,12 @@ class Prior:
         """Inverse covariance."""
         return np.asarray(self.root.T @ self.root)
 
+    @property
+    def sigma(self) -> Float[np.ndarray, " n"]:
+        """One standard deviation of each parameter while the others are known; infinite where nothing is known."""
+        with np.errstate(divide="ignore"):
+            return np.asarray(1.0 / np.linalg.norm(self.root, axis=0))
+
     def cost(self, x: Float[np.ndarray, " n"]) -> float:
         """What the prior adds to chi-squared at ``x``."""
         off = self.root @ (x - self.mean)

@@ -8,12 +8,14 @@ groups that differ by more than their noise; (3) what is predicted carries the m
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import final
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from udccal.fitting.engine.robust import MAD_TO_SIGMA
 from udccal.fitting.engine.tails import chi2_tail, f_tail
 
 # Chance finds a misfit where there is none once in a thousand fits.
@@ -105,11 +107,33 @@ def excess_sigma(
     """
     if not unit.any() or chi2_tail(float((square / noise).sum()) + constant, dof) > chance:
         return 0.0
+    return _halved(square, unit, lambda size: float((square / (noise + size**2 * unit)).sum()) + constant > dof)
+
+
+def robust_excess_sigma(
+    square: Float[np.ndarray, " n"], noise: Float[np.ndarray, " n"], unit: Float[np.ndarray, " n"]
+) -> float:
+    """The same, significant or not, by half of the residuals being below their probable error: outliers have no say.
+
+    Args:
+        square: of residuals.
+        noise: variance of each.
+        unit: variance that an error of size 1 adds to each.
+    """
+    probable = MAD_TO_SIGMA**-2
+    return _halved(square, unit, lambda size: float(np.median(square / (noise + size**2 * unit))) > probable)
+
+
+def _halved(
+    square: Float[np.ndarray, " n"], unit: Float[np.ndarray, " n"], too_small: Callable[[float], bool]
+) -> float:
+    """The size from which an error is no more too small."""
+    if not unit.any():
+        return 0.0
     low, high = 0.0, float(np.sqrt(square.max() / unit[unit > 0].min()))
     for _ in range(_HALVINGS):
         middle = 0.5 * (low + high)
-        above = float((square / (noise + middle**2 * unit)).sum()) + constant > dof
-        low, high = (middle, high) if above else (low, middle)
+        low, high = (middle, high) if too_small(middle) else (low, middle)
     return 0.5 * (low + high)
 
 

@@ -11,167 +11,73 @@ from dataclasses import dataclass, replace
 from typing import final
 
 import equinox as eqx
-import jax
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 
-from udccal.fitting.wire.basis import sample_pixels
-from udccal.fitting.wire.harmonics import WireStart, full_basis, possible_harmonics, wire_start
-from udccal.fitting.wire.joint import fit_joint, settle
-from udccal.fitting.wire.misfit import misfit
-from udccal.fitting.wire.noise import FlatNoise, flat_noise, judge, site_numbers
-from udccal.fitting.wire.omitted import omitted, unseen, with_omitted
-from udccal.fitting.wire.phase import fit_phase
-from udccal.fitting.wire.result import wire_result
-from udccal.fitting.wire.scan import ideal_wire
-from udccal.fitting.wire.sigma import MapSigma, map_sigma
-from udccal.models.geometry import Geometry
-from udccal.models.noise import Noise
-from udccal.models.wire import Wire, wire_map, wire_values
+from udccal.cfa import SITES, site_map
+from udccal.fitting.engine.gaussian import Posterior, square_root
+from udccal.fitting.engine.least_squares import SolverRules, minimise
+from udccal.fitting.engine.misfit import clustered_cov
+from udccal.fitting.engine.orders import Attempt, Choice, bic, choose
+from udccal.fitting.wire.data import FlatNoise, Pixels, WireData, flat_noise, ideal_points, sample_pixels, weighed
+from udccal.fitting.wire.jacobian import BLOCK, WireProblem, block_jacobian, expected_of, values_at
+from udccal.fitting.wire.parameters import WireRules, ideal_wire, parameters_of, possible_harmonics
+from udccal.fitting.wire.report import Joint, misfit, omitted, unseen, wire_result
+from udccal.fitting.wire.search import Found, Search
+from udccal.models.wire import Wire, scaled_positions, wire_map
 from udccal.numerics import in_float64
 from udccal.result import FitResult, FitStatus
-from udccal.sessions.store import Session
 
-# Of the pixels that the joint fit has: so many for the search of the phase, and for its fit.
-SEARCH_SHARE, PHASE_SHARE = 1 / 15, 1 / 6
-PHASE_HARMONICS = 24
-# More samples than this gain little: the map's sigma is PRNU sqrt(parameters / samples).
-FIELD_SAMPLES = 300_000
-_LEAST_SAMPLES = 4000
-# Of one pixel of the average; there are thousands.
-_LEAST_SIGNAL_TO_NOISE = 1.0
-_MOST_SATURATED = 0.05
-# Single frames must stay so many sigma below saturation, or their average is bent.
-_HEADROOM = 5.0
-_MEAN_GRID = (192, 256)
-
-
-@final
-@dataclass(frozen=True)
-class WireFit:
-    """The fitted term, and how sure its map is at any pixel; none where the fit failed."""
-
-    result: FitResult[Wire]
-    sigma: MapSigma | None
-
-
-def fit_wire(session: Session, noise: Noise, geometry: Geometry, field_samples: int = FIELD_SAMPLES) -> FitResult[Wire]:
-    """Fit the wire term to the steps ``wire/dark`` and ``wire/flat`` of a session; see ``fit_wire_session``."""
-    return fit_wire_session(session, noise, geometry, field_samples).result
-
-
-def fit_wire_session(session: Session, noise: Noise, geometry: Geometry, field_samples: int = FIELD_SAMPLES) -> WireFit:
-    """The same, and how sure the map is at every pixel.
-
-    Args:
-        session: holds both averages at one exposure.
-        noise: for saturation and PRNU.
-        geometry: where the rays go.
-        field_samples: pixels of the joint fit; time grows with it, the map's sigma falls with its square root.
-
-    Raises:
-        SessionError: when a file of the session is missing or damaged.
-    """
-    flat = session.average(session.step("wire/flat").captures[0])
-    dark = session.average(session.step("wire/dark").captures[0])
-    saturation = float(np.asarray(noise.saturation_DN))
-    clipped = float(np.mean(flat.mean >= 0.98 * saturation))
-    start = wire_start(session.rig)
-    if clipped > _MOST_SATURATED:
-        failed = _failed(geometry, start, FitStatus.SATURATED, f"{100 * clipped:.1f} % of the flat is clipped.")
-        return WireFit(failed, None)
-    variance = flat.variance / flat.frames + dark.variance / dark.frames
-    headroom = saturation - float(np.mean(dark.mean))
-    clip = headroom - _HEADROOM * np.sqrt(max(headroom * float(np.asarray(noise.K_DN_per_e)), 0.0))
-    prnu = float(np.asarray(noise.PRNU1288))
-    return fit_wire_and_sigma(flat.mean - dark.mean, variance, geometry, start, prnu, field_samples, clip)
+# A step that is expected to gain less is taken without looking: it is a tenth of a sigma.
+_JOINT = SolverRules(least_gain=1e-2, stalled_gain=0.1)
+# Rows and columns of grids over the sensor, whole blocks, for the map's mean and its sigma.
+_MEAN_GRID, _SIGMA_GRID = (192, 256), (64, 64)
+# Of a dropped column, the part that the kept ones cannot say; less is rounding.
+_LEAST_NEW = 1e-8
 
 
 @in_float64
-def fit_wire_and_sigma(
-    signal: Float[np.ndarray, "rows columns"],
-    variance: Float[np.ndarray, "rows columns"],
-    geometry: Geometry,
-    start: WireStart,
-    prnu: float,
-    field_samples: int = FIELD_SAMPLES,
-    clip: float = np.inf,
-    all_pixels: bool = False,
-) -> WireFit:
+def fit_wire(data: WireData, rules: WireRules | None = None) -> FitResult[Wire]:
     """Fit the wire to an averaged flat.
 
     Args:
-        signal: flat minus dark, in any linear unit; colours need not be balanced.
-        variance: of ``signal`` itself (after averaging), in its unit squared; PRNU not included. It is smoothed to a
-            straight line against the signal before it weighs anything.
-        geometry: where the rays go.
-        start: from the rig description; its tolerances are the prior.
-        prnu: relative pixel-to-pixel response, added to the variance.
-        field_samples: pixels of the joint fit; the search makes do with a part of them.
-        clip: signal from which on single frames clip; pixels that the model puts there are left out.
-        all_pixels: take a last step with every pixel of the sensor, in some ten times the time.
+        data: see ``WireData``.
+        rules: constants of the fit.
+
+    Returns:
+        the wire, whose map has a mean of 1, and its posterior: ``result.sigma_of`` gives the error of the map at any
+        pixels, what the model may be off included. A flat that cannot be used gives a status that says why.
     """
-    means = _site_means(signal, clip)
-    if not (np.isfinite(means).all() and (means > 0).all()):
-        if not np.isfinite(means).all():
-            note = "All of a CFA site is clipped, or no number; expose shorter."
-            return WireFit(_failed(geometry, start, FitStatus.SATURATED, note), None)
-        return WireFit(_failed(geometry, start, FitStatus.TOO_DARK, "A CFA site has no light; check the lamp."), None)
-    rows, columns = signal.shape
-    sites = site_numbers(rows, columns)
-    values = signal / means[sites]
-    noise = flat_noise(values, variance, means, prnu, clip)
-    if signal.size < _LEAST_SAMPLES:
-        note = f"There are {signal.size} pixels; use a larger region of the sensor."
-        return WireFit(_failed(geometry, start, FitStatus.TOO_FEW_DATA, note), None)
-    expected = np.sqrt(noise.variance(np.arange(4), np.ones(4)))
-    if float(np.min(1 / expected)) < _LEAST_SIGNAL_TO_NOISE:
-        note = f"A pixel's noise is {float(expected.max()):.2g} of its signal. Average more frames, or expose longer."
-        return WireFit(_failed(geometry, start, FitStatus.TOO_DARK, note), None)
-    return _fitted(values, noise, geometry, start, field_samples, all_pixels)
-
-
-def _fitted(
-    values: Float[np.ndarray, "rows columns"],
-    noise: FlatNoise,
-    geometry: Geometry,
-    start: WireStart,
-    field_samples: int,
-    all_pixels: bool,
-) -> WireFit:
-    sites = site_numbers(*values.shape)
-    variance = noise.variance(sites, np.ones(values.shape))
-    # To begin with, pixels that clip are left out by their own values; later, by the model's.
-    variance = np.where(values < noise.clip[sites], variance, 0.0)
-    step = _odd_step(values.size, field_samples)
-    few, coarse = (
-        sample_pixels(values, variance, geometry, _odd_step(values.size, max(int(share * field_samples), 1)))
-        for share in (SEARCH_SHARE, PHASE_SHARE)
+    rules = rules or WireRules()
+    means = _site_means(data.signal, data.clip)
+    refused = _unusable(data, means, rules)
+    if refused:
+        return FitResult.failed("wire", ideal_wire(data.geometry, data.start, np.zeros((0, 2)), rules), *refused)
+    noise, values = flat_noise(data, means), data.signal / means[site_map(*data.signal.shape)]
+    few, coarse, every = (
+        sample_pixels(values, data.geometry, max(int(part * rules.samples), 1))
+        for part in (rules.search_share, rules.shape_share, 1.0)
     )
-    harmonics, sizes = possible_harmonics(start)
-    phase = fit_phase(geometry, start, noise, few, coarse, harmonics, PHASE_HARMONICS)
-    basis = full_basis(sizes if phase.present else sizes[:0], phase.basis)
-    joint = fit_joint(phase, sample_pixels(values, variance, geometry, step), noise, basis, phase.wire)
-    if all_pixels and step > 1:
-        every = sample_pixels(values, variance, geometry, 1)
-        joint, step = settle(phase, joint.wire, joint.gains, every, noise, joint.basis, joint.candidates), 1
-    wire = _mean_one(joint.wire, values.shape)
-    sigma = map_sigma(joint, wire, *values.shape)
-    seen = judge(joint.wire, joint.gains, joint.judged.pixels, noise)
-    judged = seen
-    if step > 1:
-        # In steps of three, for a sample of all CFA sites that the fit has not seen.
-        others = sample_pixels(values, variance, geometry, 3 * step, step // 2)
-        judged = judge(joint.wire, joint.gains, others, noise)
-    found = misfit(joint, judged, sigma.rms(), held_out=step > 1)
-    if phase.present:
-        left_out = omitted(start, joint.wire, seen)
-        found = with_omitted(found, left_out.sigma) if left_out else found
+    found = Search(data.start, noise, rules).found(data.geometry, few, coarse)
+    joint = _joint(found, every, data, noise, rules)
+    joint = replace(joint, x=mean_one(joint.parameters, joint.x, data.geometry, values.shape))
+    held_out = every.used < values.size / 2
+    jacobian = map_jacobian(joint.parameters, joint.x, data.geometry, values.shape)
+    judged = joint.seen
+    if held_out:
+        others = sample_pixels(values, data.geometry, rules.samples, other=True)
+        judged = weighed(others, expected_of(joint.wire, joint.parameters.gains(joint.x), others), noise)
+    off = misfit(judged, joint.wire if found.present else None, jacobian.sigma(joint.cov), held_out)
+    if off.test.found:
+        joint = replace(joint, cov=clustered_cov(joint.cov, joint.by_tile))
+    if found.present:
+        missing = omitted(data.start, joint.wire, joint.seen, rules)
+        left_out = missing.sigma if missing else 0.0
     else:
-        found = with_omitted(found, unseen(sizes, few))
-    sigma = replace(sigma, model=found.by_tile)
-    term = _trimmed(wire) if phase.present else _bare(wire)
-    return WireFit(wire_result(phase, joint, found, sigma, term, values.size), sigma)
+        left_out = unseen(possible_harmonics(data.start, rules.least_amplitude), found.searched, rules)
+    model = float(np.hypot(off.sigma, left_out))
+    posterior = _posterior(joint, jacobian, model)
+    return wire_result(joint, off, left_out, jacobian.sigma(joint.cov, model), posterior, values.shape, rules)
 
 
 @in_float64
@@ -180,47 +86,230 @@ def sensor_map(wire: Wire, rows: int, columns: int) -> Float[np.ndarray, "rows c
     return np.asarray(wire_map(wire, rows, columns), dtype=np.float64)
 
 
-def _odd_step(pixels: int, samples: int) -> int:
-    step = max(1, pixels // samples)
-    return step + 1 - step % 2
-
-
 def _site_means(signal: Float[np.ndarray, "rows columns"], clip: float) -> Float[np.ndarray, "4"]:
     """Of what is neither clipped nor not a number; not a number where nothing is left."""
-    means = []
-    for k in range(4):
-        site = signal[k // 2 :: 2, k % 2 :: 2]
-        good = site[np.isfinite(site) & (site < clip)]
-        means.append(float(good.mean(dtype=np.float64)) if good.size else np.nan)
-    return np.array(means)
+    sites = site_map(*signal.shape)
+    good = [signal[(sites == k) & np.isfinite(signal) & (signal < clip)] for k in range(SITES)]
+    return np.array([float(some.mean(dtype=np.float64)) if some.size else np.nan for some in good])
 
 
-def _trimmed(wire: Wire) -> Wire:
-    """Without the Legendre degrees that no harmonic uses: the map costs less to compute."""
-    used = np.flatnonzero(np.any(np.asarray(wire.fields) != 0, axis=(0, 1, 2)))
-    count = int(used.max()) + 1 if used.size else 1
-    return eqx.tree_at(lambda w: w.fields, wire, np.asarray(wire.fields)[..., :count])
+def _unusable(data: WireData, means: Float[np.ndarray, "4"], rules: WireRules) -> tuple[FitStatus, str] | None:
+    """Why a flat cannot be fitted."""
+    if data.clipped > rules.most_clipped:
+        return FitStatus.SATURATED, f"{100 * data.clipped:.1f} % of the flat is clipped."
+    if not np.isfinite(means).all():
+        return FitStatus.SATURATED, "All of a CFA site is clipped, or no number; expose shorter."
+    if not (means > 0).all():
+        return FitStatus.TOO_DARK, "A CFA site has no light; check the lamp."
+    if data.signal.size < rules.least_samples:
+        return FitStatus.TOO_FEW_DATA, f"There are {data.signal.size} pixels; use a larger region of the sensor."
+    worst = float(np.sqrt(flat_noise(data, means).variance(np.arange(SITES), np.ones(SITES)).max()))
+    if worst > 1.0:
+        note = f"A pixel's noise is {worst:.2g} of its signal. Average more frames, or expose longer."
+        return FitStatus.TOO_DARK, note
+    return None
 
 
-def _bare(wire: Wire) -> Wire:
-    """Without harmonics: an absent panel costs nothing later."""
-    leaves = (np.zeros((0, 2)), np.zeros((0, 2)), np.zeros((0, 2, 2, 1)), np.zeros((0, 2, 1, 1)))
-    return eqx.tree_at(lambda w: (w.harmonics, w.frequency, w.fields, w.amplitudes), wire, leaves)
+def _joint(found: Found, every: Pixels, data: WireData, noise: FlatNoise, rules: WireRules) -> Joint:
+    """Choose the columns that the data ask for, and fit them with the shape until nothing moves."""
+    wire, gains = found.descent.wire, found.descent.gains
+    bounds = possible_harmonics(data.start, rules.least_amplitude).bounds if found.present else np.zeros(0)
+    full = parameters_of(wire, rules, bounds, found.present)
+    prior, x = full.prior(data.start, rules), full.vector(wire, gains)
+    pixels = weighed(every, expected_of(wire, gains, every), noise).pixels
+    here = WireProblem("wire, orders", full, pixels, prior).equations_at(x).blocks
+    # What is in the wire already counts as the column's own: the equations are moved to where there is none of it.
+    already = np.where(full.groups >= 0, x - prior.mean, 0.0)
+    right = here.right + here.shared @ already
+    power = here.samples - len(x) + prior.cost(x) + float((here.right + right) @ already)
+    orders = select(here.shared, right, power, here.samples, full.groups)
+    chosen = orders.best.fit
+    kept, x = full.kept(chosen.keep), (x - already + chosen.values)[chosen.keep]
+    prior = kept.prior(data.start, rules)
+    pixels = weighed(every, expected_of(kept.wire(x), kept.gains(x), every), noise).pixels
+    solution = minimise(WireProblem("wire, joint", kept, pixels, prior), x, _JOINT)
+    equations = solution.equations
+    x = solution.place + (equations.step(0.0).shared if solution.converged else 0.0)
+    return Joint(
+        parameters=kept,
+        x=x,
+        cov=equations.blocks.cov(),
+        prior=prior,
+        variance=equations.variance,
+        by_tile=equations.by_tile,
+        seen=weighed(every, expected_of(kept.wire(x), kept.gains(x), every), noise),
+        orders=orders,
+        converged=solution.converged and found.descent.solution.converged,
+        iterations=found.descent.solution.iterations + solution.iterations,
+        gain=found.gain,
+    )
 
 
-def _mean_one(wire: Wire, shape: tuple[int, ...]) -> Wire:
-    """Scale the map to a mean of one over the sensor, by the midpoint rule on a regular grid."""
-    down, across = ((np.arange(n) + 0.5) / n * size - 0.5 for n, size in zip(_MEAN_GRID, shape, strict=True))
-    grid = np.stack(np.meshgrid(across, down), axis=-1).reshape(_MEAN_GRID[0] // 16, -1, 2)
-    mean = float(np.mean([np.asarray(_values(wire, part, shape[0], shape[1])) for part in grid]))
-    baseline = np.array(wire.baseline)
-    baseline[0, 0] -= np.log(mean)
-    return eqx.tree_at(lambda w: w.baseline, wire, baseline)
+@final
+@dataclass(frozen=True)
+class Kept:
+    """Columns that are kept, the solution with them alone, and its covariance."""
+
+    keep: Bool[np.ndarray, " all"]
+    values: Float[np.ndarray, " all"]
+    inverse: Float[np.ndarray, "kept kept"]
 
 
-_values = jax.jit(wire_values, static_argnums=(2, 3))
+@final
+@dataclass(frozen=True)
+class _Columns:
+    """A linear least-squares problem whose columns are kept or dropped by groups; -1 is always kept."""
+
+    matrix: Float[np.ndarray, "all all"]
+    right: Float[np.ndarray, " all"]
+    power: float
+    samples: int
+    groups: Int[np.ndarray, " all"]
+
+    def solved(self, keep: Bool[np.ndarray, " all"]) -> Kept:
+        """With these alone."""
+        part = self.matrix[np.ix_(keep, keep)]
+        scale = np.sqrt(np.maximum(np.diag(part), 1e-300))
+        # The tiny ridge only decides between columns that the data cannot tell apart.
+        inverse = np.linalg.inv(part / np.outer(scale, scale) + 1e-10 * np.eye(len(scale))) / np.outer(scale, scale)
+        values = np.zeros(len(keep))
+        values[keep] = inverse @ self.right[keep]
+        return Kept(keep, values, inverse)
+
+    def attempt(self, fit: Kept, variance: float, note: str = "") -> Attempt[Kept]:
+        """By the Bayesian information criterion, chi-squared in units of ``variance``."""
+        count, terms = int(fit.keep.sum()), (len(np.unique(g[g >= 0])) for g in (self.groups[fit.keep], self.groups))
+        chi2 = (self.power - float(self.right @ fit.values)) / variance
+        return Attempt("{} of {} terms".format(*terms) + note, count, bic(chi2, count, self.samples), fit)
+
+    def weak(self, fit: Kept, variance: float) -> list[int]:
+        """Groups that do not pay for themselves, the weakest by column first."""
+        kept, found = self.groups[fit.keep], []
+        for group in np.unique(kept[kept >= 0]):
+            inside = kept == group
+            v = fit.values[fit.keep][inside]
+            # Exact rise of chi-squared when this group alone is left out.
+            rise = float(v @ np.linalg.solve(fit.inverse[np.ix_(inside, inside)], v)) / variance
+            found.append((rise / len(v), int(group)))
+        return [group for rise, group in sorted(found) if rise < np.log(self.samples)]
+
+    def missed(self, fit: Kept, variance: float) -> int | None:
+        """The dropped group whose return would lower the criterion most; rounds of many groups may drop too much."""
+        left, found, best = self.right - self.matrix @ fit.values, None, 0.0
+        for group in np.unique(self.groups[~fit.keep]):
+            inside = self.groups == group
+            cross = self.matrix[np.ix_(inside, fit.keep)]
+            own = self.matrix[np.ix_(inside, inside)] - cross @ fit.inverse @ cross.T
+            scale = np.sqrt(np.maximum(np.diag(self.matrix)[inside], 1e-300))
+            eigen, vectors = np.linalg.eigh(own / np.outer(scale, scale))
+            new = eigen > _LEAST_NEW
+            gain = float(np.sum((vectors.T @ (left[inside] / scale))[new] ** 2 / eigen[new])) / variance
+            if gain - inside.sum() * np.log(self.samples) > best:
+                found, best = int(group), gain - inside.sum() * np.log(self.samples)
+        return found
 
 
-def _failed(geometry: Geometry, start: WireStart, status: FitStatus, note: str) -> FitResult[Wire]:
-    flat = ideal_wire(geometry, start, np.zeros((0, 2)))
-    return FitResult.failed("wire", flat, status, note)
+def select(
+    matrix: Float[np.ndarray, "all all"],
+    right: Float[np.ndarray, " all"],
+    power: float,
+    samples: int,
+    groups: Int[np.ndarray, " all"],
+) -> Choice[Kept]:
+    """Drop groups of columns while that lowers the criterion, and take back what was dropped in error; -1 stays.
+
+    A group of k columns pays for itself when leaving it out raises chi-squared, in units of the residual variance of
+    the full model (so that PRNU counts as noise), by more than k ln(samples). In each round the weaker half of the
+    groups that do not goes; the rest is judged again.
+
+    Args:
+        matrix, right: normal equations of all columns.
+        power: weighted sum of the squared data.
+        samples: how many.
+        groups: of the columns.
+    """
+    columns = _Columns(matrix, right, power, samples, groups)
+    fit = columns.solved(np.ones(len(right), dtype=bool))
+    variance = max((power - float(right @ fit.values)) / max(samples - len(right), 1), 1e-300)
+    tried = [columns.attempt(fit, variance)]
+    while weak := columns.weak(fit, variance):
+        fit = columns.solved(fit.keep & ~np.isin(groups, weak[: -(-len(weak) // 2)]))
+        tried.append(columns.attempt(fit, variance))
+    fit = choose(tried).best.fit
+    while (missed := columns.missed(fit, variance)) is not None:
+        fit = columns.solved(fit.keep | (groups == missed))
+        tried.append(columns.attempt(fit, variance, ", one taken back"))
+    return choose(tried)
+
+
+def _grid(
+    geometry: Geometry, shape: tuple[int, int], parts: tuple[int, int]
+) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"]]:
+    """Ideal and scaled points of the middles of so many parts of a sensor of that shape, down and across."""
+    y, x = ((np.arange(n) + 0.5) / n * size - 0.5 for n, size in zip(parts, shape, strict=True))
+    pixels = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    return ideal_points(geometry, pixels), np.asarray(scaled_positions(pixels, *shape))
+
+
+def mean_one(
+    parameters: Parameters, x: Float[np.ndarray, " n"], geometry: Geometry, shape: tuple[int, int]
+) -> Float[np.ndarray, " n"]:
+    """The parameters scaled to a map with a mean of one over a sensor of that shape, by the midpoint rule."""
+    whole, base = values_at(parameters.wire(x), *_grid(geometry, shape, _MEAN_GRID))
+    scaled = x.copy()
+    scaled[0] -= np.log(float(np.mean(whole * base)))
+    return scaled
+
+
+@final
+@dataclass(frozen=True)
+class MapJacobian:
+    """Derivatives of the map, its mean kept at 1, on a grid over the sensor; of its mean, were that not kept."""
+
+    value: Float[np.ndarray, " places"]
+    rows: Float[np.ndarray, "n places"]
+    of_mean: Float[np.ndarray, " n"]
+
+    def sigma(self, cov: Float[np.ndarray, "n n"], model: float = 0.0) -> float:
+        """Relative, RMS over the sensor; ``model`` is what the model itself may be off."""
+        variance = np.einsum("ip,ij,jp->p", self.rows, cov, self.rows, optimize=True)
+        return float(np.sqrt(np.mean(variance + (model * self.value) ** 2)))
+
+
+def map_jacobian(
+    parameters: Parameters, x: Float[np.ndarray, " n"], geometry: Geometry, shape: tuple[int, int]
+) -> MapJacobian:
+    """Of the map that these parameters make on a sensor of that shape; its mean is 1 (``mean_one``)."""
+    site = np.zeros(BLOCK, dtype=np.int64)
+    blocks = zip(*(part.reshape(-1, BLOCK, 2) for part in _grid(geometry, shape, _SIGMA_GRID)), strict=True)
+    parts = [block_jacobian(parameters, parameters.wire(x), *block, site) for block in blocks]
+    whole, base, rows = (np.concatenate(same, axis=-1) for same in zip(*parts, strict=True))
+    value, rows = whole * base, rows * base
+    # Site gains are not in the map.
+    rows[parameters.sites] = 0.0
+    of_mean = rows.mean(axis=1)
+    return MapJacobian(value, rows - of_mean[:, None] * value, of_mean)
+
+
+def _posterior(joint: Joint, jacobian: MapJacobian, model: float) -> Posterior[Wire]:
+    """Of all that was fitted, and of what the model may be off.
+
+    That is a modulation of unknown phase beside the pupil's: its cosine and sine are two further parameters, so that
+    the map's variance is the same everywhere. To first order, the map's mean stays 1.
+    """
+
+    def term_at(values: Float[np.ndarray, " n_2"]) -> Wire:
+        x, beside = values[:-2].copy(), values[-2:]
+        x[0] -= jacobian.of_mean @ (x - joint.x)
+        wire = joint.parameters.wire(x)
+        room = max(np.shape(wire.amplitudes), (1, 2, 1, 1))
+        amplitudes = np.zeros(room)
+        amplitudes[: len(wire.amplitudes)] = wire.amplitudes
+        amplitudes[0, :, 0, 0] += beside
+        return eqx.tree_at(lambda w: w.amplitudes, wire, amplitudes)
+
+    size = len(joint.x)
+    factor = np.zeros((size + 2, size + 2))
+    factor[:size, :size] = square_root(joint.cov)
+    factor[size:, size:] = model * np.eye(2)
+    return Posterior(np.append(joint.x, [0.0, 0.0]), factor, term_at)

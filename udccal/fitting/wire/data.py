@@ -1,0 +1,255 @@
+"""From averaged flats to weighted pixels: shot and read noise by the expected signal, PRNU, clipping, outliers.
+
+Weights come from the model's signal, not from the sample's own: a pixel that happens to be high would otherwise count
+for more (or less) than its neighbours, and the map would be biased.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import final
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.optimize import nnls
+
+from udccal.cfa import site_map
+from udccal.fitting.engine.robust import OutlierRule
+from udccal.fitting.wire.parameters import WireRules, WireStart, wire_start
+from udccal.models.geometry import Geometry, unproject
+from udccal.models.noise import Noise
+from udccal.models.wire import scaled_positions
+from udccal.numerics import in_float64
+from udccal.result import Outliers
+from udccal.sessions.store import Session
+
+# What is compiled is compiled for so many pixels.
+BLOCK = 2048
+_OFF = OutlierRule("pixels (row, column)")
+_LEAST_PRNU = 1e-5
+_BINS = 32
+# A sample variance beyond so many medians of its bin is a pixel that blinks, not noise.
+_BLINKING = 30.0
+# Weights go by signals of at least this part of the mean.
+_LEAST_SIGNAL = 0.01
+
+
+@final
+@dataclass(frozen=True)
+class WireData:
+    """An averaged flat, and what is known of the rig.
+
+    Attributes:
+        signal: flat minus dark, in any linear unit; colours need not be balanced.
+        variance: of ``signal`` itself (after averaging), in its unit squared; PRNU not included. It is smoothed to a
+            straight line against the signal before it weighs anything.
+        geometry: where the rays go.
+        start: the rig as built; its tolerances are the prior.
+        PRNU1288: relative response from pixel to pixel, added to the variance.
+        clip: signal from which on single frames clip; pixels that the model puts there are left out.
+        clipped: part of the flat's pixels whose average is clipped.
+    """
+
+    signal: Float[np.ndarray, "rows columns"]
+    variance: Float[np.ndarray, "rows columns"]
+    geometry: Geometry
+    start: WireStart
+    PRNU1288: float
+    clip: float = np.inf
+    clipped: float = 0.0
+
+
+def read_wire(session: Session, noise: Noise, geometry: Geometry, rules: WireRules | None = None) -> WireData:
+    """What the steps ``wire/dark`` and ``wire/flat`` of a session hold.
+
+    Args:
+        session: both averages are at one exposure.
+        noise: for saturation and PRNU.
+        geometry: where the rays go.
+        rules: for the distance that single frames keep from saturation.
+
+    Raises:
+        SessionError: when a file of the session is missing or damaged.
+    """
+    rules = rules or WireRules()
+    flat, dark = (session.average(session.step(f"wire/{step}").captures[0]) for step in ("flat", "dark"))
+    saturation = float(np.asarray(noise.saturation_DN))
+    headroom = saturation - float(np.mean(dark.mean))
+    shot = np.sqrt(max(headroom * float(np.asarray(noise.K_DN_per_e)), 0.0))
+    return WireData(
+        signal=flat.mean - dark.mean,
+        variance=flat.variance / flat.frames + dark.variance / dark.frames,
+        geometry=geometry,
+        start=wire_start(session.rig),
+        PRNU1288=float(np.asarray(noise.PRNU1288)),
+        clip=headroom - rules.headroom_sigma * float(shot),
+        clipped=float(np.mean(flat.mean >= 0.98 * saturation)),
+    )
+
+
+@final
+@dataclass(frozen=True)
+class FlatNoise:
+    """Variance of an averaged flat whose CFA sites have been divided by their means.
+
+    At a relative signal s of a site: ``floor + by_signal s + (PRNU1288 s)^2``. From the site's relative signal ``clip``
+    on, single frames clip: such pixels are left out by what the model says of them.
+    """
+
+    floor: Float[np.ndarray, "4"]
+    by_signal: Float[np.ndarray, "4"]
+    PRNU1288: float
+    clip: Float[np.ndarray, "4"]
+
+    def variance(self, site: Int[np.ndarray, "*n"], signal: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
+        """Of pixels of these sites at these relative signals."""
+        some = np.maximum(signal, _LEAST_SIGNAL)
+        unequal = max(self.PRNU1288, _LEAST_PRNU) * some
+        return np.asarray(self.floor[site] + self.by_signal[site] * some + unequal**2)
+
+
+def flat_noise(data: WireData, means: Float[np.ndarray, "4"]) -> FlatNoise:
+    """Straight lines through variance against signal, site by site (EMVA 1288's photon transfer).
+
+    The variance of few frames is itself too noisy to weigh single pixels with. ``means`` are the sites' mean signals.
+    """
+    sites = site_map(*data.signal.shape)
+    lines = np.array(
+        [_line(data.signal[sites == k] / m, data.variance[sites == k] / m**2) for k, m in enumerate(means)]
+    )
+    return FlatNoise(lines[:, 0], lines[:, 1], data.PRNU1288, data.clip / means)
+
+
+def _line(signal: Float[np.ndarray, " n"], variance: Float[np.ndarray, " n"]) -> Float[np.ndarray, "2"]:
+    """Constant and slope, neither negative, through the means of bins of equal counts."""
+    good = np.isfinite(variance) & np.isfinite(signal) & (variance >= 0)
+    if not good.any():
+        return np.zeros(2)
+    order = np.argsort(signal[good], kind="stable")
+    bins = []
+    for x, y in zip(*(np.array_split(part[good][order], _BINS) for part in (signal, variance)), strict=True):
+        kept = y <= _BLINKING * np.median(y) if len(y) else np.zeros(0, dtype=bool)
+        if kept.any():
+            bins.append((max(float(x[kept].mean()), 0.0), float(y[kept].mean())))
+    at, mean = np.array(bins).T
+    # Sample variances scatter in proportion to themselves.
+    weight = 1.0 / np.maximum(mean, 1e-3 * mean.max() + 1e-300)
+    line, _ = nnls(np.stack([weight, at * weight], axis=1), mean * weight)
+    return np.asarray(line, dtype=np.float64)
+
+
+@final
+class Pixels(eqx.Module):
+    """A sample of the sensor with what does not change during the fit; ``weight`` 0 leaves a pixel out.
+
+    ``place`` is the index in reading order; padding and what is no number have -1.
+    """
+
+    ideal: Float[np.ndarray, "n 2"]
+    scaled: Float[np.ndarray, "n 2"]
+    site: Int[np.ndarray, " n"]
+    value: Float[np.ndarray, " n"]
+    weight: Float[np.ndarray, " n"]
+    place: Int[np.ndarray, " n"]
+
+    def blocks(self) -> list[Pixels]:
+        """In pieces of one size; samples are padded to whole blocks when they are drawn."""
+        starts = range(0, len(self.value), BLOCK)
+        return [jax.tree.map(lambda a, s=s: a[s : s + BLOCK], self) for s in starts]
+
+    def thinned(self, most: int) -> Pixels:
+        """At most so many of them, evenly drawn, in whole blocks."""
+        drawn = np.arange(0, len(self.value), -(-len(self.value) // most))
+        return jax.tree.map(lambda a: a[np.resize(drawn, -(-len(drawn) // BLOCK) * BLOCK)], self)
+
+    @property
+    def used(self) -> int:
+        """How many have a weight."""
+        return int(np.count_nonzero(self.weight))
+
+
+@in_float64
+def sample_pixels(
+    value: Float[np.ndarray, "rows columns"], geometry: Geometry, samples: int, other: bool = False
+) -> Pixels:
+    """About so many pixels in reading order, shifted along from row to row so that all CFA sites are visited.
+
+    Args:
+        value: what is no number gets weight 0, others 1.
+        geometry: where the rays go.
+        samples: as many or somewhat more; all where there are fewer.
+        other: a third as many that share no pixel with the sample drawn otherwise, where that is not all.
+    """
+    rows, columns = value.shape
+    step = odd_step(value.size, samples)
+    flat = np.arange(step // 2, rows * columns, 3 * step) if other else np.arange(0, rows * columns, step)
+    count, padded = len(flat), -(-len(flat) // BLOCK) * BLOCK
+    y, x = np.divmod(np.resize(flat, padded), columns)
+    if columns % step == 0:
+        x = (x + y) % columns
+    positions = np.stack([x, y], axis=-1).astype(np.float64)
+    seen = value[y, x].astype(np.float64)
+    real = (np.arange(padded) < count) & np.isfinite(seen)
+    return Pixels(
+        ideal=ideal_points(geometry, positions),
+        scaled=np.asarray(scaled_positions(positions, rows, columns)),
+        site=site_map(rows, columns)[y, x],
+        value=np.where(real, seen, 0.0),
+        weight=np.where(real, 1.0, 0.0),
+        place=np.where(real, y * columns + x, -1),
+    )
+
+
+def odd_step(size: int, samples: int) -> int:
+    """From pixel to pixel of a sample of ``size`` pixels; odd steps visit all CFA sites."""
+    step = max(1, size // max(samples, 1))
+    return step + 1 - step % 2
+
+
+def ideal_points(geometry: Geometry, positions_px: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
+    """Undistorted image points of pixels (x, y), which are as many as fill whole blocks."""
+    return np.concatenate([np.asarray(_unproject(geometry, part)) for part in positions_px.reshape(-1, BLOCK, 2)])
+
+
+_unproject = jax.jit(unproject)
+
+
+@final
+@dataclass(frozen=True)
+class Weighed:
+    """A sample weighed by a model, with what was left out: by the model's clipping, and as outliers.
+
+    ``expected`` is the model's signal in CFA-balanced units.
+    """
+
+    pixels: Pixels
+    expected: Float[np.ndarray, " n"]
+    clipped: int
+    outlying: Bool[np.ndarray, " n"]
+
+    @property
+    def z(self) -> Float[np.ndarray, " n"]:
+        """Residuals in units of their expected sigma; 0 of what is left out."""
+        return np.asarray((self.pixels.value - self.expected) * np.sqrt(self.pixels.weight))
+
+    def outliers(self, columns: int) -> tuple[Outliers, ...]:
+        """What was left out, for a person to look at; the sensor has so many columns."""
+        y, x = np.divmod(np.sort(self.pixels.place[self.outlying]), columns)
+        found = _OFF.listed(f"({row}, {column})" for row, column in zip(y, x, strict=True))
+        clipped = (Outliers("so bright, by the fitted map, that single frames clip", self.clipped),)
+        return (*found, *(clipped if self.clipped else ()))
+
+
+def weighed(pixels: Pixels, expected: Float[np.ndarray, " n"], noise: FlatNoise) -> Weighed:
+    """Weigh a sample by the signal that a model expects; leave out what clips and what no noise explains.
+
+    Outliers of an earlier model are looked at anew.
+    """
+    variance = noise.variance(pixels.site, expected)
+    real = (pixels.place >= 0) & np.isfinite(pixels.value)
+    usable = real & (expected + 3 * np.sqrt(variance) < noise.clip[pixels.site])
+    outlying = _OFF.off((pixels.value - expected) / np.sqrt(variance), usable)
+    kept = eqx.tree_at(lambda p: p.weight, pixels, np.where(usable & ~outlying, 1.0 / variance, 0.0))
+    return Weighed(kept, expected, int(np.count_nonzero(real & ~usable)), outlying)

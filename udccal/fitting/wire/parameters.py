@@ -1,0 +1,329 @@
+"""What a wire fit solves for: the rig as built, the harmonics its panel can show, and the vector of the parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import final
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from udccal.cfa import SITES
+from udccal.fitting.engine.gaussian import Prior
+from udccal.models.geometry import Geometry
+from udccal.models.wire import HIGHEST_ORDER, Wire
+from udccal.rig import RigDescription
+
+SHAPE_NAMES = (
+    "rotation_x_deg",
+    "rotation_y_deg",
+    "rotation_z_deg",
+    "standoff_per_pitch",
+    "offset_x",
+    "offset_y",
+    "pupil_per_pitch",
+    "row_open",
+    "column_open",
+    "depth_per_pitch",
+)
+SHAPE_UNITS = ("deg", "deg", "deg", "1", "period", "period", "1", "1", "1", "1")
+_FIELD_DEGREES = 4
+_LEAST_SIGMA = 1e-6
+
+
+@final
+@dataclass(frozen=True)
+class WireRules:
+    """The constants of a wire fit.
+
+    Attributes:
+        samples: pixels of the joint fit; time grows with it, the map's sigma falls with its square root.
+        search_share, shape_share: of these, for the search of the shape and for its first full fit.
+        search_harmonics: the strongest are enough for the search.
+        least_samples: pixels that a flat must have.
+        most_clipped: part of the flat's pixels that may be clipped.
+        headroom_sigma: single frames must stay so far below saturation, or their average is bent.
+        rotation_sigma_rad: how far the geometry's own rotation may be off.
+        widening: the rig's tolerances are bounds on a careful build; the prior's sigma is so many of them.
+        amplitude_sigma, field_sigma: prior of amplitudes beside the pupil's, and of relative changes of its transform.
+        least_amplitude: relative size from which harmonics are fitted; the others are part of the map's sigma.
+        least_counted: relative size from which they count there.
+        strong, middle: relative sizes from which a harmonic may have many or few corrections to the round pupil.
+        smooth_degree: highest total degree of the shading; up to ``always_smooth`` it is not asked for.
+        scan_range: of stand-off and of pupil, relative to the rig description: two lengths that are divided, 20 % off.
+        scan_periods: step of the scan, in periods at the edge of the field.
+        scan_z: the same in radians of z, the argument of the pupil's transform.
+        places: most of the scan's places that are looked into.
+        rival: minus twice the log posterior; places that differ by less may change their order with more pixels.
+        unfinished: the same after the first steps only.
+        doubtful_variance: residual variance beyond which amplitudes that no pupil explains are tried, of
+            ``free_harmonics`` harmonics up to ``free_degree`` over the sensor.
+        least_gain: chi-squared that rows must explain; chance does not reach a third of it in 300 trials.
+        worst_variance: structure that the model lacks, as strong as shot noise and PRNU together.
+        doubted_sigma: beyond so many prior sigmas the rig description is doubted.
+    """
+
+    samples: int = 300_000
+    search_share: float = 1 / 15
+    shape_share: float = 1 / 6
+    search_harmonics: int = 24
+    least_samples: int = 4000
+    most_clipped: float = 0.05
+    headroom_sigma: float = 5.0
+    rotation_sigma_rad: float = 0.04
+    widening: float = 2.0
+    amplitude_sigma: float = 0.05
+    field_sigma: float = 0.5
+    least_amplitude: float = 3e-5
+    least_counted: float = 1e-6
+    strong: float = 2e-3
+    middle: float = 2e-4
+    smooth_degree: int = 8
+    always_smooth: int = 4
+    scan_range: tuple[float, float] = (0.64, 1.56)
+    scan_periods: float = 0.06
+    scan_z: float = 0.8
+    places: int = 5
+    rival: float = 60.0
+    unfinished: float = 400.0
+    doubtful_variance: float = 1.15
+    free_harmonics: int = 3
+    free_degree: int = 3
+    least_gain: float = 100.0
+    worst_variance: float = 2.0
+    doubted_sigma: float = 3.0
+
+
+@final
+@dataclass(frozen=True)
+class WireStart:
+    """The rig as built, lengths in panel periods. Tolerances are absolute but those of stand-off and pupil."""
+
+    standoff_per_pitch: float
+    standoff_tolerance: float
+    pupil_per_pitch: float
+    pupil_tolerance: float
+    row_open: float
+    row_tolerance: float
+    column_open: float
+    column_tolerance: float
+    depth_per_pitch: float
+    depth_tolerance: float
+
+
+def wire_start(rig: RigDescription) -> WireStart:
+    """Start values of a rig description."""
+    panel, lens, standoff = rig.panel, rig.lens, rig.mounting.standoff_mm
+    pitch, depth = panel.pitch_mm.value, panel.structure_thickness_mm
+    pitch_tolerance = panel.pitch_mm.tolerance / pitch
+    lens_tolerance = lens.focal_mm.tolerance / lens.focal_mm.value + lens.f_number.tolerance / lens.f_number.value
+    return WireStart(
+        standoff_per_pitch=standoff.value / pitch,
+        standoff_tolerance=standoff.tolerance / standoff.value + pitch_tolerance,
+        # The beam narrows a little from the pupil to the panel on its way to the focus distance.
+        pupil_per_pitch=rig.pupil_mm * (1 - standoff.value / lens.focus_mm) / pitch,
+        pupil_tolerance=lens_tolerance + pitch_tolerance,
+        row_open=panel.row_open_fraction.value,
+        row_tolerance=panel.row_open_fraction.tolerance,
+        column_open=panel.column_open_fraction.value,
+        column_tolerance=panel.column_open_fraction.tolerance,
+        depth_per_pitch=depth.value / pitch,
+        depth_tolerance=depth.tolerance / pitch,
+    )
+
+
+@final
+@dataclass(frozen=True)
+class Harmonics:
+    """Whole numbers (n, m), and the bound of each one's relative amplitude, largest first."""
+
+    orders: Float[np.ndarray, "harmonics 2"]
+    bounds: Float[np.ndarray, " harmonics"]
+
+
+def possible_harmonics(start: WireStart, least: float | None = None, below: float = np.inf) -> Harmonics:
+    """Harmonics whose bound is at least ``least`` (by default what is fitted) and less than ``below``.
+
+    The bound is the slits' times the envelope of 2 J1(z) / z, z = pi D kappa / pitch, for a round pupil.
+    """
+    least = WireRules().least_amplitude if least is None else least
+    orders = np.arange(HIGHEST_ORDER + 1.0)
+    m, n = (part.ravel() for part in np.meshgrid(orders, np.concatenate([-orders[:0:-1], orders]), indexing="ij"))
+    n, m = n[(m > 0) | (n > 0)], m[(m > 0) | (n > 0)]
+    z = np.pi * start.pupil_per_pitch * np.hypot(n, m)
+    size = np.where((n != 0) & (m != 0), 0.5, 1.0) * np.minimum(1.0, 2 * np.sqrt(2 / np.pi) / z**1.5)
+    for order, opening in ((m, start.row_open), (np.abs(n), start.column_open)):
+        slit = np.minimum(2.0 / (np.pi * np.maximum(order, 1) * opening), 2.0 * (1 - opening) / opening)
+        size = size * np.where(order == 0, 1.0, slit)
+    found = [i for i in np.argsort(-size, kind="stable") if least <= size[i] < below]
+    return Harmonics(np.stack([n[found], m[found]], axis=1), size[found])
+
+
+def ideal_wire(
+    geometry: Geometry, start: WireStart, harmonics: Float[np.ndarray, "harmonics 2"], rules: WireRules | None = None
+) -> Wire:
+    """The rig as built, with a round pupil and an even field; the harmonics' ranges of kappa are not set."""
+    degrees = (rules or WireRules()).smooth_degree + 1
+    fields = np.zeros((len(harmonics), 2, 2, _FIELD_DEGREES))
+    fields[:, 0, 0, 0] = 1.0
+    return Wire(
+        geometry=geometry,
+        rotation=np.zeros(3),
+        standoff_per_pitch=np.float64(start.standoff_per_pitch),
+        offset=np.zeros(2),
+        pupil_per_pitch=np.float64(start.pupil_per_pitch),
+        row_open=np.float64(start.row_open),
+        column_open=np.float64(start.column_open),
+        depth_per_pitch=np.float64(start.depth_per_pitch),
+        harmonics=harmonics,
+        frequency=np.tile([0.0, 1.0], (len(harmonics), 1)),
+        fields=fields,
+        amplitudes=np.zeros((0, 2, 1, 1)),
+        baseline=np.zeros((degrees, degrees)),
+    )
+
+
+def shape_vector(wire: Wire) -> Float[Array, "10"]:
+    """Rotation (3, rad), log stand-off, offset (2), log pupil, row and column openings, depth."""
+    lengths = wire.row_open, wire.column_open, wire.depth_per_pitch
+    parts = wire.rotation, jnp.log(wire.standoff_per_pitch), wire.offset, jnp.log(wire.pupil_per_pitch), *lengths
+    return jnp.concatenate([jnp.atleast_1d(jnp.asarray(part)) for part in parts])
+
+
+def with_shape(wire: Wire, shape: Float[np.ndarray, "10"] | Float[Array, "10"]) -> Wire:
+    """The wire with other shape parameters, in the order of ``shape_vector``."""
+    leaves = shape[:3], jnp.exp(shape[3]), shape[4:6], jnp.exp(shape[6]), shape[7], shape[8], shape[9]
+    return eqx.tree_at(_shape_leaves, wire, leaves)
+
+
+def _shape_leaves(w: Wire) -> tuple[object, ...]:
+    placed = w.rotation, w.standoff_per_pitch, w.offset, w.pupil_per_pitch
+    return *placed, w.row_open, w.column_open, w.depth_per_pitch
+
+
+@final
+@dataclass(frozen=True)
+class Parameters:
+    """Which numbers of a wire are fitted: they make the vector ``x``, in the order of the attributes.
+
+    Attributes:
+        nothing: the wire where all linear coefficients are nothing; others that no column has stay as they are here.
+        baseline: Legendre pairs (degree in y, in x). After them come the logarithms of three CFA-site gains; the
+            fourth follows, as their sum is 0.
+        amplitudes: (harmonic, phase, degree in y, in x).
+        fields: (harmonic, phase, carrier, degree).
+        groups: numbers columns that are kept or dropped together; -1 is always kept.
+        panel: whether the ten shape parameters end the vector.
+    """
+
+    nothing: Wire
+    baseline: Int[np.ndarray, "smooth 2"]
+    amplitudes: Int[np.ndarray, "beside 4"]
+    fields: Int[np.ndarray, "columns 4"]
+    groups: Int[np.ndarray, " n"]
+    panel: bool
+
+    @property
+    def sites(self) -> slice:
+        """Where the site gains are: they are no part of the map."""
+        return slice(len(self.baseline), len(self.baseline) + SITES - 1)
+
+    @property
+    def linear(self) -> int:
+        """How many there are but the shape."""
+        return self.sites.stop + len(self.amplitudes) + len(self.fields)
+
+    def kept(self, keep: Bool[np.ndarray, " n"]) -> Parameters:
+        """Only the columns marked; site gains and shape always stay."""
+        baseline, _, amplitudes, fields, _ = self._split(keep)
+        keep = np.concatenate([baseline, np.ones(SITES - 1, bool), amplitudes, fields, np.ones(10 * self.panel, bool)])
+        columns = self.baseline[baseline], self.amplitudes[amplitudes], self.fields[fields]
+        return Parameters(self.nothing, *columns, self.groups[keep], self.panel)
+
+    def vector(self, wire: Wire, gains: Float[np.ndarray, "4"]) -> Float[np.ndarray, " n"]:
+        """``x`` of a wire and the gains of the CFA sites."""
+        linear = (
+            np.asarray(wire.baseline)[tuple(self.baseline.T)],
+            np.log(gains)[: SITES - 1],
+            np.asarray(wire.amplitudes)[tuple(self.amplitudes.T)],
+            np.asarray(wire.fields)[tuple(self.fields.T)],
+        )
+        return np.concatenate([*linear, np.asarray(shape_vector(wire))[: 10 * self.panel]])
+
+    def wire(self, x: Float[np.ndarray, " n"]) -> Wire:
+        """The wire of these parameters."""
+        smooth, _, beside, pupil, shape = self._split(x)
+        leaves = [np.array(leaf) for leaf in (self.nothing.baseline, self.nothing.amplitudes, self.nothing.fields)]
+        for leaf, columns, values in zip(
+            leaves, (self.baseline, self.amplitudes, self.fields), (smooth, beside, pupil), strict=True
+        ):
+            leaf[tuple(columns.T)] = values
+        wire = eqx.tree_at(lambda w: (w.baseline, w.amplitudes, w.fields), self.nothing, tuple(leaves))
+        wire = with_shape(wire, shape) if self.panel else wire
+        return jax.tree.map(lambda leaf: np.asarray(leaf, dtype=np.float64), wire)
+
+    def gains(self, x: Float[np.ndarray, " n"]) -> Float[np.ndarray, "4"]:
+        """Gains of the CFA sites."""
+        logs = x[self.sites]
+        return np.exp(np.append(logs, -logs.sum()))
+
+    def prior(self, start: WireStart, rules: WireRules) -> Prior:
+        """From the rig description, widened; of the origin no more is known than where ``nothing`` has it."""
+        mean, sigma = np.zeros(self.linear), np.full(self.linear, np.inf)
+        mean[self.linear - len(self.fields) :] = np.asarray(self.nothing.fields)[tuple(self.fields.T)]
+        sigma[self.sites.stop :] = rules.amplitude_sigma
+        sigma[self.linear - len(self.fields) :] = rules.field_sigma
+        if not self.panel:
+            return Prior.independent(mean, sigma)
+        built = [np.log(start.standoff_per_pitch), *np.asarray(self.nothing.offset), np.log(start.pupil_per_pitch)]
+        shape = [0.0, 0.0, 0.0, *built, start.row_open, start.column_open, start.depth_per_pitch]
+        return Prior.independent(np.append(mean, shape), np.append(sigma, shape_sigma(start, rules)))
+
+    def _split(self, x: np.ndarray) -> list[np.ndarray]:
+        ends = self.sites.start, self.sites.stop, self.sites.stop + len(self.amplitudes), self.linear
+        return np.split(x, ends)
+
+
+def shape_sigma(start: WireStart, rules: WireRules) -> Float[np.ndarray, "10"]:
+    """One standard deviation of the shape parameters by the rig description; the origin is anywhere in a period."""
+    openings = start.row_tolerance, start.column_tolerance, start.depth_tolerance
+    tolerances = rules.widening * np.array([start.standoff_tolerance, start.pupil_tolerance, *openings])
+    turned = [rules.rotation_sigma_rad] * 3
+    return np.maximum([*turned, tolerances[0], 1.0, 1.0, *tolerances[1:]], _LEAST_SIGMA)
+
+
+def parameters_of(wire: Wire, rules: WireRules, bounds: Iterable[float] = (), panel: bool = True) -> Parameters:
+    """Shading, site gains, the amplitudes that a wire has room for, and corrections to the round pupil.
+
+    Args:
+        wire: what no column has stays as it is here: its fields, and its shape where there is no panel.
+        rules: for the degrees.
+        bounds: of the harmonics' relative amplitudes; stronger ones have more corrections.
+        panel: whether there is one; without, there is no shape.
+    """
+    linear = np.zeros_like(wire.baseline), np.zeros_like(wire.amplitudes)
+    nothing = eqx.tree_at(lambda w: (w.baseline, w.amplitudes), wire, linear)
+    smooth = _pairs(len(nothing.baseline))
+    strongest, _, degrees, _ = np.shape(nothing.amplitudes)
+    beside = [(h, phase, *pair) for h in range(strongest) for phase in (0, 1) for pair in _pairs(degrees)]
+    fields = []
+    for h, bound in enumerate(bounds):
+        # What a real pupil changes of the weakest harmonics is too small to be seen.
+        counts = (4, 3) if bound > rules.strong else (2, 1) if bound > rules.middle else (0, 0)
+        # The two carriers of a degree stand or fall together.
+        fields += [(h, phase, c, degree) for phase in (0, 1) for degree in range(counts[phase]) for c in (0, 1)]
+    keys: list[tuple[int, ...] | None] = [(i + j,) if i + j > rules.always_smooth else None for i, j in smooth]
+    keys += [None] * (SITES - 1) + [(h, phase, i + j) for h, phase, i, j in beside]
+    keys += [(h, phase, 0, degree) for h, phase, _, degree in fields] + [None] * (10 * panel)
+    numbers: dict[tuple[int, ...], int] = {}
+    groups = np.array([-1 if key is None else numbers.setdefault(key, len(numbers)) for key in keys])
+    columns = (np.array(rows, dtype=np.int64).reshape(-1, 4) for rows in (beside, fields))
+    return Parameters(nothing, np.array(smooth), *columns, groups, panel)
+
+
+def _pairs(count: int) -> list[tuple[int, int]]:
+    return [(i, j) for i in range(count) for j in range(count - i)]
