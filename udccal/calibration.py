@@ -20,7 +20,7 @@ from udccal.fitting.geometry import fit_boards, read_geometry
 from udccal.fitting.geometry.data import BoardView
 from udccal.fitting.noise import fit_noise, nominal_noise, read_noise
 from udccal.fitting.nominal import nominal_geometry
-from udccal.fitting.psf.fit import Effort, fit_psf
+from udccal.fitting.psf import PsfRules, fit_psf, read_psf
 from udccal.fitting.wire import WireRules, fit_wire, read_wire, sensor_map
 from udccal.models.backscatter import Backscatter
 from udccal.models.geometry import Geometry
@@ -46,13 +46,13 @@ class FitEffort:
 
     Attributes:
         wire_samples: pixels that the wire's fields are fitted to.
-        psf: see ``udccal.fitting.psf.fit.Effort``.
+        psf: see ``udccal.fitting.psf.PsfRules``.
         backscatter_positions: sensor positions that the footprint is fitted at.
         workers: with 2, psf and backscatter, which do not need each other, are fitted at once, in more memory.
     """
 
     wire_samples: int = WireRules().samples
-    psf: Effort = field(default_factory=Effort)
+    psf: PsfRules = field(default_factory=PsfRules)
     backscatter_positions: int = 96
     workers: int = 1
 
@@ -60,7 +60,7 @@ class FitEffort:
 # For a demonstration.
 QUICK = FitEffort(
     wire_samples=60_000,
-    psf=Effort(positions=5, shifts=2, half_px=(36, 12), close_px=(32, 12), iterations=30),
+    psf=PsfRules(positions=5, shifts=2, half_px=(36, 12), close_px=(32, 12), iterations=30),
     backscatter_positions=32,
     workers=2,
 )
@@ -203,10 +203,11 @@ class _Fits:
     @cached_property
     def psf(self) -> FitResult[PsfField]:
         noise, geometry, wire = self.noise.term, self.geometry.term, self.wire.term
+        rig, rules = self._session.rig, self._effort.psf
         return self._run(
             "psf",
-            lambda: fit_psf(self._session, noise, geometry, wire, self._effort.psf),
-            lambda: absent_psf(self._session.rig, geometry),
+            lambda: fit_psf(read_psf(self._session, noise, wire, rules), rig, geometry, wire, rules),
+            lambda: absent_psf(rig, geometry),
         )
 
     @cached_property

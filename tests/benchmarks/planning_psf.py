@@ -12,16 +12,15 @@ import numpy as np
 from jaxtyping import Float
 
 from procedures.psf import led_positions_px
+from tests.benchmarks.psf_kernels import kernel_and_slopes
 from tests.benchmarks.psf_scene import DISC_PX, Scene, pictures, shots_of, small_scene
 from udccal.arrangements import Led
 from udccal.calibration import FitEffort
-from udccal.fitting.psf.blocks import fit_lattice
-from udccal.fitting.psf.descent import Prior
-from udccal.fitting.psf.field import fit_field
-from udccal.fitting.psf.fit import held_out_positions, some_shots
-from udccal.fitting.psf.normal import Evaluator
-from udccal.fitting.psf.posterior import kernel_and_slopes
-from udccal.fitting.psf.start import start_model, start_prior
+from udccal.fitting.engine.gaussian import Prior
+from udccal.fitting.psf.diffraction import fit_diffraction
+from udccal.fitting.psf.fit import some_shots
+from udccal.fitting.psf.kernel import Evaluator, fit_lattice
+from udccal.fitting.psf.start import WAVELENGTHS_NM, start_model, start_prior
 from udccal.numerics import in_float64
 from udccal.planning.psf import PsfPredictor
 from udccal.planning.state import RigState
@@ -116,27 +115,27 @@ def _realisation(scene: Scene, prior: Prior, seed: int) -> tuple[float, float]:
     """Squared relative L2 error of the kernel, mean over places and colours: found, and stated."""
     rng, theta = np.random.default_rng([seed, 5]), prior.mean
     shots = shots_of(scene, pictures(scene, theta, rng), rng)
-    effort = FitEffort().psf
-    held_out = held_out_positions(int(shots.position.max()) + 1)
-    chosen = shots.pick(some_shots(shots, held_out, effort))
+    rules = replace(FitEffort().psf, close_px=_HALF)
+    chosen = shots.pick(some_shots(shots, rules))
     chosen = replace(chosen, position=np.unique(chosen.position, return_inverse=True)[1].reshape(-1))
-    fit = fit_field(chosen, scene.geometry, prior, _HALF, effort.far_share, effort.iterations, True).diffraction
+    start = start_model(scene.rig, scene.geometry, scene.wire)
+    fit = fit_diffraction(chosen, scene.geometry, start, prior, rules, True)
     found, stated = 0.0, 0.0
     places = _PLACES * [scene.rig.camera.columns, scene.rig.camera.rows]
     for place in places:
-        true, _ = _kernel(scene, prior, theta, place)
-        kernel, slopes = _kernel(scene, prior, fit.theta, place)
+        true, _ = _kernel(scene, theta, place)
+        kernel, slopes = _kernel(scene, fit.theta, place)
         size = (true**2).sum(axis=(1, 2))
         found += float((((kernel - true) ** 2).sum(axis=(1, 2)) / size).mean())
-        variance = np.einsum("pcyx,pq,qcyx->cyx", slopes, fit.cov, slopes)
+        variance = np.einsum("pcyx,pq,qcyx->cyx", slopes, fit.noise_cov, slopes)
         stated += float((variance.sum(axis=(1, 2)) / size).mean())
     return found / len(places), stated / len(places)
 
 
 def _kernel(
-    scene: Scene, prior: Prior, theta: Float[np.ndarray, " p"], place: Float[np.ndarray, "2"]
+    scene: Scene, theta: Float[np.ndarray, " p"], place: Float[np.ndarray, "2"]
 ) -> tuple[Float[np.ndarray, "3 rows columns"], Float[np.ndarray, "p 3 rows columns"]]:
-    evaluator = Evaluator(prior.wavelengths_nm, fit_lattice(_HALF), True)
+    evaluator = Evaluator(WAVELENGTHS_NM, fit_lattice(_HALF), True)
     rows, columns = (2 * half + 1 for half in _HALF)
-    value, slopes = kernel_and_slopes(evaluator, theta, scene.geometry, place, fit_lattice(_HALF), rows, columns)
+    value, slopes = kernel_and_slopes(evaluator, theta, scene.geometry, place, rows, columns)
     return np.asarray(value), np.asarray(slopes)

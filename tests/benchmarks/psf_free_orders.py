@@ -19,10 +19,10 @@ from scipy.special import ndtr
 
 from udccal.cfa import channel_map
 from udccal.fitting.hdr.merge import HdrMerge
-from udccal.fitting.psf.fit import held_out_positions
-from udccal.fitting.psf.residual import Sources
-from udccal.fitting.psf.select import select_field
-from udccal.fitting.psf.shots import Shots, cut_crop, stack
+from udccal.fitting.psf.data import Shots, cut_crop, joined
+from udccal.fitting.psf.image import Sources
+from udccal.fitting.psf.orders import select_field
+from udccal.fitting.psf.start import PsfRules
 from udccal.models.fields import polynomial_basis, polynomial_terms
 from udccal.numerics import in_float64
 
@@ -63,8 +63,8 @@ def _select(shots: Shots) -> int:
     explained = np.full(shots.rate.shape, 1.0 / shots.rate[0].size)
     sources = Sources(shots.centre_px, light, np.zeros(shots.count))
     unit = unit_of(shots.positions_px())
-    found = select_field(shots, sources, explained, held_out_positions(len(unit)), unit, 0.0)
-    return -1 if found.share else found.degree
+    order = select_field(shots, sources, explained, unit, 0.0, PsfRules()).order
+    return -1 if order.share else order.degree
 
 
 def _shots(mix: Float[np.ndarray, " terms"], degree: int, rng: np.random.Generator) -> Shots:
@@ -82,11 +82,12 @@ def _shots(mix: Float[np.ndarray, " terms"], degree: int, rng: np.random.Generat
             sigma = np.hypot(_NOISE[0] * rate, _NOISE[1])
             seen = rate + sigma * rng.standard_normal(rate.shape)
             merged = HdrMerge(seen, sigma, np.ones(rate.shape, dtype=np.int64))
-            crop = cut_crop(merged, (int(corner[0]), int(corner[1])), (float(aim[0]), float(aim[1])), _CFA, _HALF)
+            at, aimed = (int(corner[0]), int(corner[1])), (float(aim[0]), float(aim[1]))
+            crop = cut_crop(merged, at, aimed, _CFA, _HALF, _DISC_PX)
             assert crop is not None
             crops.append(crop)
             aims.append(aim)
-    return stack(crops, np.array(aims), np.full(len(aims), _DISC_PX))
+    return joined(crops, np.array(aims))
 
 
 def _light(

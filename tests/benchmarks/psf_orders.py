@@ -19,11 +19,10 @@ from jaxtyping import Float
 
 from tests.benchmarks.psf_scene import DISC_PX, Picture, Scene, pictures, shots_of, small_scene
 from udccal.cfa import channel_map
-from udccal.fitting.psf.fit import held_out_positions
-from udccal.fitting.psf.residual import Sources, prior_spread, shifts, with_light_of_peak
-from udccal.fitting.psf.select import select_field
-from udccal.fitting.psf.shots import Shots
-from udccal.fitting.psf.start import start_model, start_prior
+from udccal.fitting.psf.data import Shots
+from udccal.fitting.psf.image import Sources, prior_sigma, shifts
+from udccal.fitting.psf.orders import select_field
+from udccal.fitting.psf.start import PsfRules, start_model, start_prior
 from udccal.models.fields import polynomial_basis, polynomial_terms
 from udccal.numerics import in_float64
 
@@ -79,12 +78,12 @@ def chosen(known: World, kind: Kind, seed: int) -> Kind:
     place = np.stack([p.source_px for p in known.pictures])
     place = place + _PLACE_SIGMA_PX * rng.standard_normal(place.shape)
     light = np.stack([p.flux for p in known.pictures])
-    sources = with_light_of_peak(shots, Sources(place, light, np.zeros(shots.count)), explained)
+    sources = Sources(place, light, np.zeros(shots.count)).with_light_of_peak(shots, explained)
     half = _half_sensor(scene)
     positions = (shots.positions_px() - half) / half
-    found = select_field(shots, sources, explained, held_out_positions(len(positions)), positions, 0.0)
+    found = select_field(shots, sources, explained, positions, 0.0, PsfRules())
     rows, columns = found.image.shape[2:]
-    return Kind(found.degree, (rows // 2, columns // 2))
+    return Kind(found.order.degree, (rows // 2, columns // 2))
 
 
 def _half_sensor(scene: Scene) -> Float[np.ndarray, "2"]:
@@ -121,7 +120,7 @@ def _room(scene: Scene, made: list[Picture]) -> Float[np.ndarray, "rows columns"
         unit = picture.rate / picture.flux[channel_map(scene.rig.camera.cfa, rows, columns)]
         off = np.round(picture.source_px - picture.corner_px - [columns // 2, rows // 2]).astype(int)
         total += np.roll(unit, (-off[1], -off[0]), axis=(0, 1)) / len(made)
-    return prior_spread(np.stack([total] * 3), 1, 1.0)[0, 1]
+    return prior_sigma(np.stack([total] * 3), 1.0)[1]
 
 
 def _explained(picture: Picture, shots: Shots, index: int) -> Float[np.ndarray, "rows columns"]:

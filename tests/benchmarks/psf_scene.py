@@ -12,8 +12,8 @@ from jaxtyping import Array, Float, UInt16
 from udccal.cfa import channel_map
 from udccal.fitting.hdr.merge import merge_bracket
 from udccal.fitting.nominal import nominal_geometry
-from udccal.fitting.psf.blocks import fit_lattice, unpack
-from udccal.fitting.psf.shots import Shots, cut_crop, stack
+from udccal.fitting.psf.data import Shots, cut_crop, joined
+from udccal.fitting.psf.kernel import fit_lattice, unpack
 from udccal.fitting.psf.start import WAVELENGTHS_NM
 from udccal.models.diffraction import Diffraction, average_transfer, local_frame
 from udccal.models.geometry import Geometry
@@ -176,7 +176,7 @@ def shots_of(scene: Scene, made: list[Picture], rng: np.random.Generator) -> Sho
     crops = []
     for picture in made:
         merged = merge_bracket(frames_of(scene, picture.rate, rng), np.array(scene.exposures_s), scene.noise)
-        crop = cut_crop(merged, picture.corner_px, picture.aim_px, scene.rig.camera.cfa, scene.half)
+        crop = cut_crop(merged, picture.corner_px, picture.aim_px, scene.rig.camera.cfa, scene.half, DISC_PX)
         assert crop is not None
         crops.append(crop)
-    return stack(crops, np.array([p.aim_px for p in made]), np.full(len(made), DISC_PX))
+    return joined(crops, np.array([p.aim_px for p in made]))

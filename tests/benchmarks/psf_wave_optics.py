@@ -21,21 +21,24 @@ from tests.benchmarks.psf_scene import DISC_PX, FLUX, Picture, Scene, noise_of, 
 from tests.benchmarks.terms import held_out_positions
 from udccal.cfa import channel_map
 from udccal.compilation import keep_compilations
-from udccal.fitting.psf.fit import Effort, FittedPsf, fit_shots_fully
-from udccal.fitting.psf.posterior import psf_sigma
-from udccal.fitting.wire.parameters import ideal_wire, wire_start
+from udccal.fitting.psf.data import PsfData
+from udccal.fitting.psf.fit import fit_psf
+from udccal.fitting.psf.start import PsfRules
+from udccal.fitting.wire import wire_start
+from udccal.fitting.wire.parameters import ideal_wire
 from udccal.models.geometry import Geometry
-from udccal.models.psf import psf_kernels
+from udccal.models.psf import PsfField, psf_kernels
 from udccal.models.wire import Wire
 from udccal.numerics import in_float64
 from udccal.reports.true_values import true_geometry
+from udccal.result import FitResult
 from udccal.rig import load_rig
 from udccal.simulation.psf import captured_light, kernels, spread_at
 from udccal.simulation.truth import RigTruth, draw_truth
 
 COVERED: Final = 0.90
 _HALF, _SPARE, _BORDER_PX = (16, 8), 4, 40
-_EFFORT: Final = Effort(positions=9, shifts=2, half_px=_HALF, close_px=_HALF, iterations=40)
+_RULES: Final = PsfRules(positions=9, shifts=2, half_px=_HALF, close_px=_HALF, iterations=40)
 
 
 @final
@@ -64,14 +67,16 @@ class Coverage:
 def coverage(seed: int, columns: int = 4, rows: int = 3, shifts: int = 3) -> Coverage:
     """Of one rig, fitted from LEDs at ``columns`` x ``rows`` positions."""
     truth = draw_truth(load_rig("lg55-reduced"), seed)
-    fitted = fit_truth(truth, columns, rows, shifts, np.random.default_rng([seed, 7]))
+    result = fit_truth(truth, columns, rows, shifts, np.random.default_rng([seed, 7]))
     places = held_out_positions(truth)
     window = (2 * _HALF[0] + 1, 2 * _HALF[1] + 1)
     true = kernels(truth, places, *window)
-    found = in_float64(lambda: np.asarray(psf_kernels(fitted.result.term, places, *window)))()
-    assert fitted.posterior is not None
-    sigma = psf_sigma(fitted.posterior, places, *window)
-    told = {item.name: item.value for item in fitted.result.diagnostics}
+
+    def kernels_of(term: PsfField) -> Float[np.ndarray, "n 3 rows columns"]:
+        return np.asarray(psf_kernels(term, places, *window))
+
+    found, sigma = in_float64(kernels_of)(result.term), result.sigma_of(kernels_of)
+    told = {item.name: item.value for item in result.diagnostics}
     return Coverage(
         stated=_relative_l2(sigma, true),
         found=_relative_l2(found - true, true),
@@ -81,7 +86,7 @@ def coverage(seed: int, columns: int = 4, rows: int = 3, shifts: int = 3) -> Cov
     )
 
 
-def fit_truth(truth: RigTruth, columns: int, rows: int, shifts: int, rng: np.random.Generator) -> FittedPsf:
+def fit_truth(truth: RigTruth, columns: int, rows: int, shifts: int, rng: np.random.Generator) -> FitResult[PsfField]:
     """Brackets of LEDs over the whole field, fitted."""
     geometry, rig = true_geometry(truth), truth.description
     wire = seen_by_the_wire(truth, geometry)
@@ -92,7 +97,8 @@ def fit_truth(truth: RigTruth, columns: int, rows: int, shifts: int, rng: np.ran
     places = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2).round()
     exposures_s = tuple(1e-3 * 4.0**k for k in range(6))
     scene = Scene(rig, geometry, wire, noise_of(rig), _HALF, places, shifts, exposures_s)
-    return fit_shots_fully(shots_of(scene, _pictures(truth, scene, rng), rng), rig, geometry, wire, _EFFORT)
+    shots = shots_of(scene, _pictures(truth, scene, rng), rng)
+    return fit_psf(PsfData(shots), rig, geometry, wire, _RULES)
 
 
 def _pictures(truth: RigTruth, scene: Scene, rng: np.random.Generator) -> list[Picture]:

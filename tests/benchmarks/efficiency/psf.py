@@ -12,14 +12,15 @@ import numpy as np
 from jaxtyping import Float
 
 from tests.benchmarks.efficiency.trials import Trials
+from tests.benchmarks.psf_kernels import kernel_and_slopes, light_and_slopes
 from tests.benchmarks.psf_scene import Picture, Scene, pictures, shots_of, small_scene
+from udccal.fitting.engine.gaussian import Prior, scaled_inverse
 from udccal.fitting.engine.information import cramer_rao
-from udccal.fitting.psf.blocks import Block, blocks, fit_lattice
-from udccal.fitting.psf.descent import Prior, damped
-from udccal.fitting.psf.field import fit_field
-from udccal.fitting.psf.normal import Evaluator, kernel_coefficients, overlaps_of, unit_light_by_move
-from udccal.fitting.psf.posterior import kernel_and_slopes, light_and_slopes
-from udccal.fitting.psf.start import start_model, start_prior
+from udccal.fitting.psf.diffraction import fit_diffraction
+from udccal.fitting.psf.kernel import Evaluator, fit_lattice
+from udccal.fitting.psf.problem import DiffractionProblem
+from udccal.fitting.psf.samples import Block, blocks, unit_light
+from udccal.fitting.psf.start import WAVELENGTHS_NM, PsfRules, start_model, start_prior
 from udccal.fitting.psf.weights import sensor_variance
 from udccal.numerics import in_float64
 
@@ -35,6 +36,8 @@ _NUMBERS = {
 }
 _POINTS_PX = np.array([[350.0, 260.0], [700.0, 480.0]])
 _WINDOW = (17, 9)
+# For differences, forward and backward.
+_MOVE_PX = 1e-3
 # (row, column) of the green kernel: peak, beside it, and on the series of orders.
 _SAMPLES = ((8, 4), (8, 5), (7, 4), (5, 4), (2, 4))
 
@@ -65,10 +68,12 @@ def trials(share: float) -> list[Trials]:
 @in_float64
 def _realisation(scene: Scene, prior: Prior, seed: int) -> _Outcome:
     rng = np.random.default_rng(seed)
-    cov = np.linalg.inv(prior.root.T @ prior.root)
+    cov = np.linalg.inv(prior.precision)
     theta = prior.mean + np.linalg.cholesky(cov) @ rng.standard_normal(len(cov))
     made = pictures(scene, theta, rng)
-    fit = fit_field(shots_of(scene, made, rng), scene.geometry, prior, scene.half, 1.0, _ITERATIONS, True).diffraction
+    start = start_model(scene.rig, scene.geometry, scene.wire)
+    rules = PsfRules(close_px=scene.half, far_share=1.0, iterations=_ITERATIONS)
+    fit = fit_diffraction(shots_of(scene, made, rng), scene.geometry, start, prior, rules, True)
     evaluator = fit.problem.evaluator
     information = _information(scene, prior, theta, made)
     true, slopes = _at_points(scene, evaluator, theta)
@@ -78,7 +83,7 @@ def _realisation(scene: Scene, prior: Prior, seed: int) -> _Outcome:
     stated = np.concatenate([np.eye(theta.size)[pick], fitted_slopes])
     return _Outcome(
         error=np.concatenate([(fit.theta - theta)[pick], found - true]),
-        sigma=np.sqrt(np.einsum("qi,ij,qj->q", stated, fit.cov, stated)),
+        sigma=np.sqrt(np.einsum("qi,ij,qj->q", stated, fit.noise_cov, stated)),
         bound=cramer_rao(information, every),
     )
 
@@ -89,10 +94,7 @@ def _at_points(
     """Samples of the green kernel relative to its peak, at all field points, and their slopes."""
     values, slopes = [], []
     for point in _POINTS_PX:
-        kernel, by = (
-            np.asarray(part)
-            for part in kernel_and_slopes(evaluator, theta, scene.geometry, point, fit_lattice(scene.half), *_WINDOW)
-        )
+        kernel, by = (np.asarray(part) for part in kernel_and_slopes(evaluator, theta, scene.geometry, point, *_WINDOW))
         peak, peak_slope = kernel[1, 8, 4], by[:, 1, 8, 4]
         for row, column in _SAMPLES[1:]:
             ratio = kernel[1, row, column] / peak
@@ -111,21 +113,23 @@ def _information(
     shots = shots_of(scene, made, np.random.default_rng(0))
     true = np.stack([picture.source_px for picture in made])
     shots = replace(shots, centre_px=true)
-    evaluator = Evaluator(prior.wavelengths_nm, fit_lattice(scene.half), True)
-    total = prior.root.T @ prior.root
-    for block in blocks(shots, scene.geometry, np.ones(shots.rate.shape, dtype=bool)):
+    evaluator = Evaluator(WAVELENGTHS_NM, fit_lattice(scene.half), True)
+    total = prior.precision
+    every = blocks(shots, scene.geometry, np.ones(shots.rate.shape, dtype=bool))
+    problem = DiffractionProblem(every, evaluator, prior).with_overlaps(theta)
+    for block in problem.blocks:
         index = np.asarray(block.index)
-        by_global, by_local, light = _slopes(evaluator, theta, block, np.stack([made[i].flux for i in index]))
+        by_global, by_local, light = _slopes(problem, theta, block, np.stack([made[i].flux for i in index]))
         weight = 1.0 / sensor_variance(block, light)
         own = np.einsum("snk,sn,snl->skl", by_local, weight, by_local)
         cross = np.einsum("snp,sn,snl->psl", by_global, weight, by_local)
         both = np.einsum("snp,sn,snq->pq", by_global, weight, by_global)
-        total = total + both - np.einsum("psl,slm,qsm->pq", cross, np.linalg.inv(damped(own, 0.0)), cross)
+        total = total + both - np.einsum("psl,slm,qsm->pq", cross, scaled_inverse(own, 1e-14), cross)
     return total
 
 
 def _slopes(
-    evaluator: Evaluator, theta: Float[np.ndarray, " p"], block: Block, flux: Float[np.ndarray, "shots 3"]
+    problem: DiffractionProblem, theta: Float[np.ndarray, " p"], block: Block, flux: Float[np.ndarray, "shots 3"]
 ) -> tuple[Float[np.ndarray, "shots n p"], Float[np.ndarray, "shots n l"], Float[np.ndarray, "shots n"]]:
     """Slopes of a position's samples by global parameters and by each shot's own, and the light of the samples."""
     shape = np.shape(block.rate)
@@ -134,13 +138,18 @@ def _slopes(
     unit, by_theta = (
         np.asarray(part)
         for part in light_and_slopes(
-            evaluator, theta, block.frame, evaluator.lattice, points, np.ravel(block.density), block.disc_px
+            problem.evaluator, theta, block.frame, points, np.ravel(block.density), block.disc_px
         )
     )
     light = np.einsum("snc,sc->sn", colour, flux)
     own = np.einsum("snc,snc->sn", unit.reshape(*shape, 3), colour)
     by_global = np.einsum("psnc,snc,sn->snp", by_theta.reshape(-1, *shape, 3), colour, light)
-    kernel = kernel_coefficients(evaluator, theta, block, overlaps_of(evaluator, theta, block.frame))
-    moved = np.asarray(unit_light_by_move(evaluator, block, np.zeros((shape[0], 2)), kernel)) * light[..., None]
+    kernel = problem.coefficients(theta, block)
+    moves = [
+        np.asarray(unit_light(problem.evaluator, block, np.zeros((shape[0], 2)) + move, kernel))
+        for move in _MOVE_PX * np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])
+    ]
+    by_move = np.stack([moves[0] - moves[1], moves[2] - moves[3]], axis=-1) / (2 * _MOVE_PX)
+    moved = by_move * light[..., None]
     by_local = [moved, own[..., None] * colour, np.ones((*shape, 1))]
     return by_global, np.concatenate(by_local, axis=-1), own * light

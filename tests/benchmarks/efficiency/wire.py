@@ -16,10 +16,9 @@ from jaxtyping import Array, Float
 
 from tests.benchmarks.efficiency.trials import Trials
 from udccal.fitting.engine.information import cramer_rao, fisher_information
-from udccal.fitting.wire import WireData, WireRules, fit_wire
+from udccal.fitting.wire import WireData, WireRules, WireStart, fit_wire
 from udccal.fitting.wire.parameters import (
     SHAPE_NAMES,
-    WireStart,
     ideal_wire,
     possible_harmonics,
     shape_sigma,

@@ -8,13 +8,14 @@ import numpy as np
 
 from tests.benchmarks.extremes.case import Case, Outcome, outcome
 from tests.benchmarks.psf_scene import Scene, pictures, shots_of, small_scene
-from udccal.fitting.psf.blocks import BLUR
-from udccal.fitting.psf.fit import Effort, fit_shots_fully
-from udccal.fitting.psf.start import start_model, start_prior
+from udccal.fitting.psf.data import PsfData
+from udccal.fitting.psf.fit import fit_psf
+from udccal.fitting.psf.kernel import BLUR
+from udccal.fitting.psf.start import PsfRules, start_model, start_prior
 from udccal.models.psf import PsfField
 from udccal.result import FitResult
 
-_EFFORT = Effort(positions=8, shifts=3, half_px=(14, 7), close_px=(14, 7), far_share=1.0, iterations=60)
+_RULES = PsfRules(positions=8, shifts=3, half_px=(14, 7), close_px=(14, 7), far_share=1.0, iterations=60)
 _SCENE = small_scene(positions=(3, 2), shifts=2, half=(14, 7))
 _NUMBERS = ("column_open_fraction", "row_open_fraction", "structure_thickness", "pupil_diameter")
 
@@ -44,8 +45,8 @@ def _fit(scene: Scene, off: Off = Off(), seed: int = 1) -> Outcome:
     tolerance = max(pitch.tolerance, 1.25 * abs(off.pitch - 1) * pitch.value)
     wrong = pitch.model_copy(update={"value": pitch.value * off.pitch, "tolerance": tolerance})
     rig = rig.model_copy(update={"panel": rig.panel.model_copy(update={"pitch_mm": wrong})})
-    found = fit_shots_fully(shots, rig, scene.geometry, wire, _EFFORT)
-    return outcome(found.result, _errors(found.result, true))
+    result = fit_psf(PsfData(shots), rig, scene.geometry, wire, _RULES)
+    return outcome(result, _errors(result, true))
 
 
 def fit_from(off: Off) -> Outcome:

@@ -23,7 +23,7 @@ from tests.benchmarks.efficiency.wire import (
     start,
 )
 from tests.benchmarks.extremes.case import MOST_SINGLE, Case, Outcome, outcome
-from udccal.fitting.wire.parameters import WireStart
+from udccal.fitting.wire import WireStart
 from udccal.models.geometry import Geometry
 from udccal.models.wire import Wire, wire_map
 from udccal.result import FitResult, FitStatus

@@ -8,8 +8,8 @@ import numpy as np
 
 from tests.benchmarks.growth.cases import Case
 from tests.benchmarks.psf_scene import pictures, shots_of, small_scene
-from udccal.fitting.psf.field import fit_field
-from udccal.fitting.psf.start import start_model, start_prior
+from udccal.fitting.psf.diffraction import fit_diffraction
+from udccal.fitting.psf.start import PsfRules, start_model, start_prior
 from udccal.numerics import in_float64
 
 _ITERATIONS = 4
@@ -22,13 +22,15 @@ _POSITIONS, _PIXELS = 6, 231
 @in_float64
 def _work(positions: int, pixels: int) -> Callable[[], object]:
     scene = small_scene(_GRIDS[positions], shifts=2, half=_HALVES[pixels])
-    prior = start_prior(scene.rig, start_model(scene.rig, scene.geometry, scene.wire), True)
+    start = start_model(scene.rig, scene.geometry, scene.wire)
+    prior = start_prior(scene.rig, start, True)
+    rules = PsfRules(close_px=scene.half, far_share=1.0, iterations=_ITERATIONS)
     rng = np.random.default_rng(1)
     shots = shots_of(scene, pictures(scene, prior.mean, rng), rng)
 
     @in_float64
     def work() -> object:
-        return fit_field(shots, scene.geometry, prior, scene.half, 1.0, _ITERATIONS, True)
+        return fit_diffraction(shots, scene.geometry, start, prior, rules, True)
 
     return work
 

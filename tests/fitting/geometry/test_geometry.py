@@ -107,6 +107,15 @@ def test_rays_land_where_they_should(fitted: FitResult[Geometry]) -> None:
     assert 0 < np.median(sigma) < 0.15
 
 
+def test_the_posterior_has_the_sigma_of_every_estimate(fitted: FitResult[Geometry]) -> None:
+    stated = [e.sigma for e in fitted.estimates]
+    lens = fitted.sigma_of(lambda term: np.concatenate([term.focal, term.centre, term.distortion]))
+    np.testing.assert_allclose(lens, stated[:9], rtol=1e-3, atol=1e-9)
+    with jax.enable_x64(True):
+        tilt = fitted.sigma_of(lambda term: np.rad2deg(np.arcsin(np.asarray(rotation_matrix(term.rotation))[1, 2])))
+    assert float(tilt) == pytest.approx(stated[9], rel=1e-3)
+
+
 def test_the_outlier_is_left_out_and_named(fitted: FitResult[Geometry]) -> None:
     assert any("geometry/view_2" in note and " 7 " in f" {note} ".replace(",", " ") for note in fitted.notes)
     rejected = next(d.value for d in fitted.diagnostics if d.name == "corners_rejected")

@@ -115,6 +115,13 @@ def test_a_flickering_pair_and_cosmic_hits_are_listed_and_left_out() -> None:
     assert np.abs(errors_in_sigma(result, sensor)).max() < 4.5
 
 
+def test_pixels_patterns_in_a_flickering_stack_are_not_taken_for_shot_noise() -> None:
+    # Frames that differ by 20 % of light differ by as much of every pixel's response: of K that would be 3.6 sigma.
+    result = measure(replace(PLAIN, flicker=0.2), 0)
+    K = result.estimate("K_DN_per_e")
+    assert abs(K.value - PLAIN.K_DN_per_e) < 2.5 * K.sigma
+
+
 def test_hot_pixels_are_named() -> None:
     levels, stack = capture(PLAIN, 6)
     for frame in stack.dark:

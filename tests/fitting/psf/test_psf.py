@@ -16,11 +16,10 @@ from udccal.fitting.absent import absent_wire
 from udccal.fitting.hdr.merge import HdrMerge
 from udccal.fitting.noise.fit import nominal_noise
 from udccal.fitting.nominal import nominal_geometry
-from udccal.fitting.psf.fit import Effort, fit_psf, fit_shots
-from udccal.fitting.psf.read import window_half
-from udccal.fitting.psf.residual import shifts
-from udccal.fitting.psf.shots import Shots, cut_crop, group, stack
-from udccal.fitting.psf.start import start_model, wire_shows
+from udccal.fitting.psf.data import PsfData, Shots, cut_crop, group, joined, read_psf, window_half
+from udccal.fitting.psf.fit import fit_psf
+from udccal.fitting.psf.image import shifts
+from udccal.fitting.psf.start import PsfRules, start_model, wire_shows
 from udccal.models.psf import PsfField, psf_kernels
 from udccal.numerics import in_float64
 from udccal.result import FitResult, FitStatus
@@ -36,7 +35,7 @@ from udccal.simulation.truth import draw_truth
 HALF = (14, 7)
 SIZE = (41, 27)
 MIDDLE = np.array([13, 20])
-TOY = Effort(positions=5, shifts=2, half_px=HALF, close_px=(12, 6), iterations=25)
+TOY = PsfRules(positions=5, shifts=2, half_px=HALF, close_px=(12, 6), iterations=25)
 FLUX = 1e8 * np.array([0.7, 1.0, 0.6])
 
 
@@ -71,11 +70,12 @@ def shots_of(light, rig: RigDescription, places: np.ndarray, shifts: int, disc_p
             merged = HdrMerge(
                 rate + sigma * rng.standard_normal(rate.shape), sigma, np.ones(rate.shape, dtype=np.int64)
             )
-            crop = cut_crop(merged, tuple(int(v) for v in corner), tuple(float(v) for v in aim), rig.camera.cfa, HALF)
+            at, aimed = tuple(int(v) for v in corner), tuple(float(v) for v in aim)
+            crop = cut_crop(merged, at, aimed, rig.camera.cfa, HALF, disc_px)
             assert crop is not None
             crops.append(crop)
             aims.append(aim)
-    return stack(crops, np.array(aims), np.full(len(aims), disc_px))
+    return joined(crops, np.array(aims))
 
 
 def places_on(rig: RigDescription, columns: int, rows: int) -> np.ndarray:
@@ -93,7 +93,7 @@ def grating() -> Fitted:
         return captured_light(truth, middle.astype(float), *SIZE, tuple(source - middle), disc)
 
     shots = shots_of(light, rig, places_on(rig, 3, 3), 2, disc)
-    result = fit_shots(shots, rig, geometry, seen_by_the_wire(truth, geometry), TOY)
+    result = fit_psf(PsfData(shots), rig, geometry, seen_by_the_wire(truth, geometry), TOY)
     places = np.array([[300.0, 240.0], [720.0, 610.0]])
     error = relative_l2(kernels(result.term, places, 41, 21), simulated_kernels(truth, places, 41, 21))
     return Fitted(result, float(error.max()))
@@ -121,6 +121,24 @@ def test_a_grating_is_predicted_where_it_was_not_captured(grating: Fitted) -> No
     assert grating.result.chi2_dof == pytest.approx(1.0, abs=0.15)
 
 
+def test_the_posterior_knows_the_numbers_and_what_the_kernel_is_off_by(grating: Fitted) -> None:
+    result = grating.result
+    for estimate, of in (
+        (result.estimate("pitch"), lambda term: term.diffraction.pitch_mm),
+        (result.estimate("row_open_fraction"), lambda term: term.diffraction.open_fraction[1]),
+        (result.estimate("pupil_diameter"), lambda term: term.diffraction.pupil_mm),
+        (result.estimate("blur"), lambda term: term.diffraction.blur_px),
+    ):
+        assert float(result.sigma_of(of)) == pytest.approx(estimate.sigma, rel=0.02)
+    # Found at positions held out, it is part of every kernel's sigma, and of what may be drawn.
+    off = result.sigma_of(lambda term: term.residual[0, 1])
+    brightest = np.unravel_index(off.argmax(), off.shape)
+    assert np.abs(np.subtract(brightest, np.array(off.shape) // 2)).max() <= 1
+    (drawn,) = result.posterior.draws(np.random.default_rng(1), 1)
+    assert np.isfinite(np.asarray(drawn.residual)).all()
+    assert np.abs(drawn.residual).max() > 0
+
+
 def streak(source: np.ndarray, middle: np.ndarray, disc_px: float, rig: RigDescription) -> np.ndarray:
     """Two Gaussians that grow over the field; not a grating's."""
     down, across = source[1] / rig.camera.rows - 0.5, source[0] / rig.camera.columns - 0.5
@@ -140,7 +158,7 @@ def test_blur_without_a_grating_is_carried_by_the_image() -> None:
     rig = load_rig("lg55-reduced")
     geometry = nominal_geometry(rig)
     shots = shots_of(lambda s, m: streak(s, m, 1.0, rig), rig, places_on(rig, 4, 3), 4, 1.0)
-    result = fit_shots(shots, rig, geometry, absent_wire(rig, geometry), TOY)
+    result = fit_psf(PsfData(shots), rig, geometry, absent_wire(rig, geometry), TOY)
     assert result.status is FitStatus.CONVERGED
     assert float(result.term.diffraction_share) == 0.0
     assert result.chi2_dof < 10.0
@@ -171,8 +189,11 @@ def test_aims_fall_into_groups() -> None:
     np.testing.assert_array_equal(group(aims), [0, 0, 1, 0])
 
 
-def session_of(folder: Path, level_DN: int, places: int = 6) -> Session:
-    """Brackets whose LED is a square of ``level_DN`` at the shortest exposure, clipped beyond 12 bit."""
+def session_of(folder: Path, level_DN: int, places: int = 6, hot: tuple[int, int] | None = None) -> Session:
+    """Brackets whose LED is a square of ``level_DN`` at the shortest exposure, clipped beyond 12 bit.
+
+    ``hot`` is the (row, column) of a pixel that is full in all pictures.
+    """
     rig = load_rig("lg55-reduced")
     writer = SessionWriter.create(folder, rig, CameraIdentity("maker", "model", "1", "test"))
     rng = np.random.default_rng(0)
@@ -182,6 +203,8 @@ def session_of(folder: Path, level_DN: int, places: int = 6) -> Session:
         for exposure in (1e-4, 4e-4):
             data = 64.0 + rng.normal(0, 2, (64, 48))
             data[30:34, 22:26] += level_DN * exposure / 1e-4
+            if hot:
+                data[hot] = 4095
             settings = Settings(exposure, 0.0, region)
             frame = Frame(np.clip(data.round(), 0, 4095).astype(np.uint16), settings, 0.0, 0, True)
             frames.append(SingleFrame(frame))
@@ -196,12 +219,21 @@ def session_of(folder: Path, level_DN: int, places: int = 6) -> Session:
 )
 def test_bad_captures_are_said_to_be_bad(tmp_path: Path, level_DN: int, places: int, status: FitStatus) -> None:
     session = session_of(tmp_path / "session", level_DN, places)
-    geometry = nominal_geometry(session.rig)
-    result = fit_psf(session, nominal_noise(session.rig), geometry, absent_wire(session.rig, geometry))
+    rig, geometry = session.rig, nominal_geometry(session.rig)
+    wire = absent_wire(rig, geometry)
+    result = fit_psf(read_psf(session, nominal_noise(rig), wire), rig, geometry, wire)
     assert result.status is status
     assert result.notes
     assert not result.ok
     assert window_half(session, (48, 16)) == (28, 16)
+
+
+@pytest.mark.parametrize(("hot", "clipped"), [((2, 2), 0), ((30, 30), 3)])
+def test_a_hot_pixel_costs_a_picture_only_next_to_its_led(tmp_path: Path, hot: tuple[int, int], clipped: int) -> None:
+    session = session_of(tmp_path / "session", 2000, 3, hot)
+    wire = absent_wire(session.rig, nominal_geometry(session.rig))
+    data = read_psf(session, nominal_noise(session.rig), wire)
+    assert (data.taken, data.dark, data.clipped) == (3, 0, clipped)
 
 
 def test_where_no_wire_shows_the_rig_says_where_to_start() -> None:

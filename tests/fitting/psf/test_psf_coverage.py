@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.benchmarks.psf_wave_optics import COVERED, coverage
-from udccal.fitting.psf.kernel_error import NONE, KernelError, estimate_kernel_error
+from udccal.fitting.psf.held_out import NONE, KernelError, estimate_kernel_error
 
 SIZES = np.geomspace(1e-5, 1.0, 4000)
 

@@ -16,16 +16,13 @@ from udccal.cfa import channel_map
 from udccal.fitting.absent import absent_wire
 from udccal.fitting.noise.fit import nominal_noise
 from udccal.fitting.nominal import nominal_geometry
-from udccal.fitting.psf.evidence import with_support
-from udccal.fitting.psf.fit import nominal_psf
-from udccal.fitting.psf.held_out import Judged
-from udccal.fitting.psf.read import read_shots
-from udccal.fitting.psf.residual import Sources
-from udccal.fitting.psf.support import Support, choose_support, ladder
-from udccal.fitting.psf.wide import wide_support
+from udccal.fitting.psf.data import read_psf
+from udccal.fitting.psf.fit import nominal_psf, wide_support
+from udccal.fitting.psf.held_out import Compared, Support, choose_support, windows_to_try
+from udccal.fitting.psf.image import Sources
+from udccal.fitting.psf.report import support_notes, with_support
 from udccal.kernels import fitted_size, kernel_size, kernels_at
 from udccal.models.psf import PsfField
-from udccal.result import FitResult, FitStatus
 from udccal.rig import load_rig
 from udccal.sessions.captured import SingleFrame
 from udccal.sessions.schema import LedSubject
@@ -34,7 +31,7 @@ from udccal.sessions.writer import SessionWriter
 
 HALF = (64, 16)
 SHOTS = 6
-ROWS, COLUMNS = ladder(HALF[0]), ladder(HALF[1])
+ROWS, COLUMNS = windows_to_try(HALF[0]), windows_to_try(HALF[1])
 
 
 def cross() -> np.ndarray:
@@ -44,14 +41,14 @@ def cross() -> np.ndarray:
     return np.outer(down, np.exp(-0.5 * (x / 0.8) ** 2)) + 0.3 * np.outer(np.exp(-0.5 * (y / 0.8) ** 2), across)
 
 
-def judged_of(true_half: tuple[int, int], rng: np.random.Generator, background: float = 0.0) -> Judged:
+def compared_of(true_half: tuple[int, int], rng: np.random.Generator, background: float = 0.0) -> Compared:
     """Pictures whose light ends at ``true_half``, under a model whose light goes on; noise of 1e-4 of the peak."""
     light = np.broadcast_to(cross(), (SHOTS, *cross().shape)).copy()
     y, x = (np.abs(np.arange(-half, half + 1)) for half in HALF)
     inside = (y <= true_half[0])[:, None] & (x <= true_half[1])
     sigma = np.hypot(1e-4, 2e-3 * light)
     residual = sigma * rng.standard_normal(light.shape) - light * ~inside + background
-    return Judged(residual, light, sigma**2, sigma**2, light, np.ones(light.shape, dtype=bool), 0.0)
+    return Compared(residual, light, sigma**2, sigma**2, light, np.ones(light.shape, dtype=bool), 0.0)
 
 
 def test_the_right_window_is_chosen_in_95_of_100_runs() -> None:
@@ -59,38 +56,38 @@ def test_the_right_window_is_chosen_in_95_of_100_runs() -> None:
     right = 0
     for _ in range(100):
         true = (int(rng.choice(ROWS)), int(rng.choice(COLUMNS)))
-        right += choose_support(judged_of(true, rng)).half_px == true
+        right += choose_support(compared_of(true, rng)).half_px == true
     assert right >= 95
 
 
 @given(st.integers(0, 400))
 def test_windows_rise_to_the_largest(largest: int) -> None:
-    steps = ladder(largest)
+    steps = windows_to_try(largest)
     assert steps[-1] == largest
     assert all(a < b <= 1.51 * a for a, b in itertools.pairwise(steps))
 
 
 def test_light_up_to_the_border_has_no_end() -> None:
-    found = choose_support(judged_of(HALF, np.random.default_rng(1)))
+    found = choose_support(compared_of(HALF, np.random.default_rng(1)))
     assert found.open_ended == (True, True)
-    found = choose_support(judged_of((HALF[0], 8), np.random.default_rng(1)))
+    found = choose_support(compared_of((HALF[0], 8), np.random.default_rng(1)))
     assert found.open_ended == (True, False)
 
 
 def test_an_even_background_is_no_light_of_the_kernel() -> None:
-    assert choose_support(judged_of((16, 8), np.random.default_rng(2), background=3e-3)).half_px == (16, 8)
+    assert choose_support(compared_of((16, 8), np.random.default_rng(2), background=3e-3)).half_px == (16, 8)
 
 
 def test_hits_are_no_light_of_the_kernel() -> None:
-    judged = judged_of((16, 8), np.random.default_rng(3))
-    judged.residual[:, 5::40, ::7] += 0.3
-    assert choose_support(judged).half_px == (16, 8)
+    compared = compared_of((16, 8), np.random.default_rng(3))
+    compared.residual[:, 5::40, ::7] += 0.3
+    assert choose_support(compared).half_px == (16, 8)
 
 
 def test_no_light_and_no_sample_is_the_narrowest_window() -> None:
-    judged = judged_of((16, 8), np.random.default_rng(3))
-    assert choose_support(replace(judged, known=np.zeros_like(judged.known))).half_px == (ROWS[0], COLUMNS[0])
-    dark = replace(judged, residual=judged.residual * 0.0 - judged.light)
+    compared = compared_of((16, 8), np.random.default_rng(3))
+    assert choose_support(replace(compared, known=np.zeros_like(compared.known))).half_px == (ROWS[0], COLUMNS[0])
+    dark = replace(compared, residual=compared.residual * 0.0 - compared.light)
     assert choose_support(dark).half_px == (ROWS[0], COLUMNS[0])
 
 
@@ -134,18 +131,16 @@ def test_whole_pictures_show_where_light_ends(tmp_path: Path, ends_px: int) -> N
     made = captured(tmp_path / "session", ends_px)
     rig = made.session.rig
     noise, wire = nominal_noise(rig), absent_wire(rig, nominal_geometry(rig))
-    reading = read_shots(made.session, noise, wire, (16, 8))
-    assert reading.shots is not None
+    data = read_psf(made.session, noise, wire)
+    assert data.shots is not None
     sources = Sources(made.places, np.full((4, 3), 1e8), np.zeros(4))
-    everywhere = np.ones(4, dtype=bool)
-    support = wide_support(made.session, noise, wire, reading, sources, made.term, everywhere)
-    assert support is not None
+    support = wide_support(data.shots, sources, made.term, rig)
     assert support.seen_px == (64, 16)
     assert support.half_px[0] == min(ends_px, 64)
-    result = with_support(FitResult("psf", made.term, FitStatus.CONVERGED, (), np.zeros((0, 0)), 1.0, 1), support, rig)
-    rows, _ = fitted_size(result.term, rig)
+    rows, _ = fitted_size(with_support(made.term, support, rig), rig)
     assert rows == (47 if ends_px == 23 else kernel_size(rig)[0])
-    assert any("as far as was looked" in note for note in result.notes) == (ends_px == 200 or support.open_ended[1])
+    notes = support_notes(made.term, support)
+    assert any("as far as was looked" in note for note in notes) == (ends_px == 200 or support.open_ended[1])
 
 
 def test_an_image_ends_where_it_ends() -> None:
@@ -153,8 +148,8 @@ def test_an_image_ends_where_it_ends() -> None:
     geometry = nominal_geometry(rig)
     term = nominal_psf(rig, geometry, absent_wire(rig, geometry))
     image = replace(term, diffraction_share=np.float64(0.0), residual=np.ones((1, 3, 21, 11)))
-    result = FitResult("psf", image, FitStatus.CONVERGED, (), np.zeros((0, 0)), 1.0, 1)
-    found = with_support(result, Support((10, 5), (10, 5), ()), rig)
-    np.testing.assert_array_equal(found.term.support_px, [5, 10])
-    assert fitted_size(found.term, rig) == (21, 11)
-    assert not found.notes
+    support = Support((10, 5), (10, 5), ())
+    found = with_support(image, support, rig)
+    np.testing.assert_array_equal(found.support_px, [5, 10])
+    assert fitted_size(found, rig) == (21, 11)
+    assert not support_notes(image, support)

@@ -12,12 +12,17 @@ from hypothesis import strategies as st
 
 from tests.benchmarks.psf_scene import frames_of, small_scene
 from udccal.fitting.hdr.merge import HdrMerge
-from udccal.fitting.psf.blocks import Block, Local
-from udccal.fitting.psf.outliers import without_outliers
-from udccal.fitting.psf.pattern import pattern_p_value
-from udccal.fitting.psf.samples import choose_samples
-from udccal.fitting.psf.shots import Shots, shot_noise
-from udccal.fitting.psf.weights import estimate_model_error, left_out, model_weights, sensor_variance
+from udccal.fitting.psf.data import Shots, shot_noise
+from udccal.fitting.psf.samples import Block, choose_samples
+from udccal.fitting.psf.start import PsfRules
+from udccal.fitting.psf.weights import (
+    estimate_model_error,
+    left_out,
+    pattern_test,
+    sensor_variance,
+    weighed,
+    without_outliers,
+)
 from udccal.models.diffraction import LocalFrame
 
 SHOTS, SAMPLES = 6, 400
@@ -41,11 +46,10 @@ def block_of(rate: np.ndarray, variance: np.ndarray, noise_per_rate: float = 0.0
         noise_per_rate=np.full_like(rate, noise_per_rate),
         weight=1.0 / variance,
         correction=np.zeros_like(rate),
-        overlap_slope=np.zeros_like(rate),
-        pitch_slope=np.zeros_like(rate),
-        overlaps_pupil_mm=1.0,
-        overlaps_pitch_mm=1.0,
-        disc_px=1.0,
+        by_overlaps=np.zeros((*rate.shape, 2)),
+        overlaps_at=np.ones(2),
+        overlaps=np.zeros((0, 0, 0, 0)),
+        disc_px=np.asarray(1.0),
         index=np.arange(shots),
     )
 
@@ -99,8 +103,7 @@ def test_variance_follows_the_expected_light_not_the_noisy_one() -> None:
     rate = np.array([[90.0, 110.0]])
     block = block_of(rate, (rate + 4.0) / 2.0, noise_per_rate=0.5)
     np.testing.assert_allclose(sensor_variance(block, np.full((1, 2), 100.0)), 52.0)
-    weighed = model_weights(block, np.full((1, 2), 100.0), Local(np.zeros((1, 2)), np.ones((1, 3)), np.zeros(1)), 0.0)
-    np.testing.assert_allclose(weighed.weight, 1 / 52.0)
+    np.testing.assert_allclose(weighed(block, 0.0, np.full((1, 2), 100.0)).weight, 1 / 52.0)
 
 
 def test_the_slope_of_the_variance_is_that_of_the_exposure() -> None:
@@ -113,8 +116,8 @@ def test_the_slope_of_the_variance_is_that_of_the_exposure() -> None:
     np.testing.assert_allclose(slope, [[1 / exposure, 1 / exposure, 0.0]], rtol=1e-9)
 
 
-def own(light: np.ndarray) -> tuple[list[np.ndarray], tuple[Local, ...]]:
-    return [light], (Local(np.zeros((SHOTS, 2)), np.ones((SHOTS, 3)), np.zeros(SHOTS)),)
+def errors(block: Block, light: np.ndarray) -> np.ndarray:
+    return (np.asarray(block.rate) - light) * np.sqrt(np.asarray(block.weight))
 
 
 def test_a_cosmic_hit_and_a_picture_that_moved_are_left_out_and_listed() -> None:
@@ -122,7 +125,8 @@ def test_a_cosmic_hit_and_a_picture_that_moved_are_left_out_and_listed() -> None
     rate = np.array(block.rate)
     rate[1, 200] += 40 * np.sqrt(1 / np.asarray(block.known)[1, 200])
     rate[4] = np.roll(rate[4], 3)
-    (kept,), found = without_outliers([replace(block, rate=rate)], *own(light))
+    block = replace(block, rate=rate)
+    (kept,), found = without_outliers([block], [errors(block, light)], PsfRules())
     pictures_out, samples_out = found
     assert pictures_out.places == ("picture 4 at position 0",)
     assert samples_out.count == 1
@@ -132,7 +136,7 @@ def test_a_cosmic_hit_and_a_picture_that_moved_are_left_out_and_listed() -> None
 
 def test_good_pictures_all_stay() -> None:
     light, block = noisy(np.random.default_rng(4))
-    (kept,), found = without_outliers([block], *own(light))
+    (kept,), found = without_outliers([block], [errors(block, light)], PsfRules())
     assert found == ()
     np.testing.assert_array_equal(kept.weight, block.weight)
 
@@ -141,12 +145,12 @@ def test_noise_has_no_pattern_and_a_common_misfit_has_one() -> None:
     values = []
     for seed in range(60):
         light, block = noisy(np.random.default_rng(seed))
-        values.append(pattern_p_value((block,), [np.asarray(block.rate) - light]))
+        values.append(pattern_test((block,), [errors(block, light)]).p_value)
     assert 0.3 < np.mean(values) < 0.7
     assert np.mean(np.array(values) < 0.05) < 0.2
     light, block = noisy(np.random.default_rng(5))
     wave = 0.005 * light * np.sin(np.arange(SAMPLES) / 7.0)
-    assert pattern_p_value((block,), [np.asarray(block.rate) + wave - light]) < 1e-6
+    assert pattern_test((block,), [errors(block, light - wave)]).p_value < 1e-6
 
 
 def test_samples_are_drawn_as_many_in_every_picture() -> None:
@@ -156,7 +160,7 @@ def test_samples_are_drawn_as_many_in_every_picture() -> None:
     channel = np.zeros(rate.shape, dtype=np.int64)
     origin = np.zeros((3, 2), dtype=np.int64)
     shots = Shots(np.zeros((3, 2)), origin, np.arange(3), np.ones(3), rate, zeros + 1.0, channel, zeros)
-    every, some = (choose_samples(shots, (18, 9), share).sum(axis=(1, 2)) for share in (1.0, 0.2))
+    every, some = (choose_samples(shots, PsfRules(close_px=(18, 9)), share).sum(axis=(1, 2)) for share in (1.0, 0.2))
     assert (every == 37 * 19).all()
     assert len(set(some.tolist())) == 1
     assert some[0] < every[0]

@@ -12,9 +12,8 @@ import pytest
 
 from udccal.cameras.protocol import CameraIdentity, Region, Settings
 from udccal.fitting.noise.fit import nominal_noise
-from udccal.fitting.wire import WireData, fit_wire, read_wire, sensor_map
-from udccal.fitting.wire.fit import select
-from udccal.fitting.wire.parameters import WireStart, wire_start
+from udccal.fitting.wire import WireData, WireStart, fit_wire, read_wire, sensor_map, wire_start
+from udccal.fitting.wire.orders import select
 from udccal.models.geometry import Geometry
 from udccal.models.wire import Wire, wire_map, wire_values
 from udccal.result import FitResult, FitStatus

@@ -9,10 +9,11 @@ import pytest
 
 from tests.benchmarks.efficiency.wire import start
 from tests.fitting.wire.test_wire_parts import GEOMETRY, even_pixels
+from udccal.fitting.wire import WireRules
 from udccal.fitting.wire.data import FlatNoise, weighed
 from udccal.fitting.wire.jacobian import expected_of
-from udccal.fitting.wire.parameters import WireRules, ideal_wire, possible_harmonics
-from udccal.fitting.wire.report import Omitted, harmonics_alone, omitted
+from udccal.fitting.wire.misfit import Omitted, harmonics_alone, omitted
+from udccal.fitting.wire.parameters import ideal_wire, possible_harmonics
 from udccal.models.wire import Wire
 
 START, RULES = start(), WireRules()

@@ -35,7 +35,7 @@ from udccal.fitting.geometry.bundle import (
     solve,
 )
 from udccal.fitting.geometry.calibrated import CalibratedViews, Evidence, weigh
-from udccal.fitting.geometry.start import Settled, costs, facing, gather, least_scale, settle, strange_views
+from udccal.fitting.geometry.start import Settled, costs, facing, gather, least_scale, settle
 from udccal.models.geometry import Geometry
 from udccal.numerics import in_float64
 from udccal.result import FitStatus
@@ -90,7 +90,7 @@ def fit_geometry(
         )
     lens = None if start is None else Intrinsics.of_geometry(start)
     settled = settle(given, image_size, lens, start_poses, known, rules)
-    strange = strange_views(settled.points, given, rules)
+    strange = _strange_views(settled.points, given, rules)
     if strange.any() and (~strange).sum() >= least:
         rule = f"of a view that scatters more than {rules.strange_view:g} times as much as the median view"
         left_out = (*left_out, *outliers(rule, (f"view {given.names[k]}" for k in np.flatnonzero(strange))))
@@ -99,8 +99,7 @@ def fit_geometry(
     full, points, scales = _maximum_likelihood(settled, given, known, rules)
     chosen, by_prior = _choose_order(full, points, known, rules)
     final, points, dof = _rescaled(chosen.best.fit, points, known)
-    evidence = weigh(final.place, final.equations.joint_cov(), points, chosen.best.fit.free, image_size, dof, rules)
-    cov = final.equations.joint_cov() * evidence.variance_factor
+    evidence, cov = weigh(final, points, chosen.best.fit.free, image_size, dof, rules)
     status, advice = _judged(final, cov, image_size, rules)
     bundle = Bundle(final.place.intrinsics, facing(final.place.poses))
     out = np.flatnonzero(~points.used)
@@ -121,6 +120,12 @@ def fit_geometry(
         starts_agreeing=settled.agreeing,
         image_size=image_size,
     )
+
+
+def _strange_views(scattered: Points, given: Points, rules: GeometryRules) -> Bool[np.ndarray, " views"]:
+    """Views that are better left out: read in another order, another board, moved while captured."""
+    ratio = np.array([np.median((scattered.sigma / given.sigma)[given.view == k]) for k in range(len(given.names))])
+    return np.asarray(ratio > rules.strange_view * np.median(ratio))
 
 
 def _maximum_likelihood(

@@ -169,10 +169,10 @@ def _pose_pair(points: Points, view: int, lens: Intrinsics) -> tuple[np.ndarray,
 
 def _ahead(board: np.ndarray, image: np.ndarray, lens: Intrinsics) -> np.ndarray:
     """Facing the camera, at the distance and place that the points' spread says."""
+    (across, down), middle = image.mean(axis=0), board.mean(axis=0)
     seen = max(float(np.linalg.norm(image - image.mean(axis=0))), 1e-9)
-    distance = lens.matrix[0, 0] * float(np.linalg.norm(board - board.mean(axis=0))) / seen
-    middle = np.linalg.solve(lens.matrix, np.append(image.mean(axis=0), 1.0)) * distance
-    return np.concatenate([np.zeros(3), middle - board.mean(axis=0)])
+    distance = lens.matrix[0, 0] * float(np.linalg.norm(board - middle)) / seen
+    return np.concatenate([np.zeros(3), np.linalg.solve(lens.matrix, [across, down, 1.0]) * distance - middle])
 
 
 def _consistent(board: np.ndarray, image: np.ndarray) -> Bool[np.ndarray, " n"]:
@@ -229,8 +229,8 @@ def settle(
     agreeing = int((scores <= scores.min() + _SAME_SCORE * max(abs(scores.min()), 1.0)).sum())
     solved, points = found[int(scores.argmin())]
     for _ in range(rules.rounds):  # Views whose mirrored pose fits better take it, and all is solved again.
-        other = Bundle(solved.place.intrinsics, best_poses(points, solved.place.intrinsics)[1])
-        other = solve(other, points, ~EVERY, prior).place
+        mirrored = Bundle(solved.place.intrinsics, best_poses(points, solved.place.intrinsics)[1])
+        other = solve(mirrored, points, ~EVERY, prior).place
         better = costs(other, points) < 0.99 * costs(solved.place, points)
         if not better.any():
             break
@@ -297,9 +297,3 @@ def _marked(bundle: Bundle, points: Points, rules: GeometryRules) -> Points:
     off = rules.corners.off(residuals_px(bundle, points) / points.sigma[:, None]).any(axis=1)
     kept = np.bincount(points.view[~off], minlength=len(points.names))
     return replace(points, used=~off | (kept < rules.least_corners)[points.view])
-
-
-def strange_views(scattered: Points, given: Points, rules: GeometryRules) -> Bool[np.ndarray, " views"]:
-    """Views that are better left out: read in another order, another board, moved while captured."""
-    ratio = np.array([np.median((scattered.sigma / given.sigma)[given.view == k]) for k in range(len(given.names))])
-    return np.asarray(ratio > rules.strange_view * np.median(ratio))

@@ -1,5 +1,4 @@
-"""Fit of the diffraction field to LED pictures: maximum likelihood with the sensor's noise and a model error that the
-residuals tell.
+"""Fit of diffraction to LED pictures: maximum likelihood with the sensor's noise and a model error that residuals tell.
 
 Rounds of a descent with fixed weights; between them the weights follow the model, and outliers go.
 """
@@ -7,243 +6,271 @@ Rounds of a descent with fixed weights; between them the weights follow the mode
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Final, final
 
 import numpy as np
 from jaxtyping import Float
 
+from udccal.fitting.engine.gaussian import Prior, scaled_inverse
 from udccal.fitting.engine.iteration_log import LOG
-from udccal.fitting.psf.blocks import FOOTPRINT, PITCH, PUPIL, Block, Local, corrected
-from udccal.fitting.psf.descent import Point, Problem, damped, descend, moved, pose, reduced, stand
-from udccal.fitting.psf.normal import (
-    Evaluator,
-    kernel_coefficients,
-    local_equations,
-    overlaps_of,
-    unit_light,
+from udccal.fitting.engine.least_squares import Blocks, Solution, SolverRules, minimise
+from udccal.fitting.engine.misfit import clustered_cov
+from udccal.fitting.engine.orders import Attempt, Choice, bic, choose
+from udccal.fitting.psf.data import Shots
+from udccal.fitting.psf.kernel import FOOTPRINT, Evaluator, fit_lattice
+from udccal.fitting.psf.problem import DiffractionProblem, Place
+from udccal.fitting.psf.samples import Block, blocks, choose_samples, for_all_samples, start_own
+from udccal.fitting.psf.start import PsfRules
+from udccal.fitting.psf.weights import (
+    estimate_model_error,
+    left_out,
+    pattern_test,
+    sensor_variance,
+    weighed,
+    without_outliers,
 )
-from udccal.fitting.psf.outliers import without_outliers
-from udccal.fitting.psf.pattern import pattern_p_value
-from udccal.fitting.psf.places import start_local
-from udccal.fitting.psf.weights import estimate_model_error, first_weights, left_out, model_weights, sensor_variance
 from udccal.models.diffraction import Diffraction
+from udccal.models.geometry import Geometry
 from udccal.result import Outliers
 
-# Until the residuals tell; it also keeps a fit that is still far off from trusting the brightest samples alone.
-FIRST_MODEL_ERROR = 0.015
-_ROUNDS = 5
-# The first descent ends where it would gain this share of the cost; rounds where they would gain so much, those after
-# which the weights hardly change anything and the others.
+# Converged near the minimum: by the part of the cost that a step would gain. Then by what it would gain in units of the
+# reduced chi-squared: in rounds after which the weights hardly change anything, and in the others.
 _ROUGHLY, _FULLY, _NEARLY = 1e-3, 1e-2, 1.0
 # In sigma: a round that moves every parameter by less is the last; the weights are about those of the end.
 _STILL, _SETTLED = 0.1, 1.0
-# Overlaps change with these numbers. They are in single precision: by such steps, their difference is not. Over steps
-# ten times as long slopes bend by some percent.
-_OVERLAP_STEPS_MM = ((PITCH, 0.0002), (PUPIL, 0.001))
+# Derivatives that are themselves sums over a lattice promise a little for ever; see ``SolverRules.stalled_gain``.
+_STALLED: Final = 0.05
+# Residuals are moved by this part of the phase's light: too little to change which of them are outliers.
+_TRIED: Final = 1e-3
 
 
+@final
 @dataclass(frozen=True)
 class DiffractionFit:
     """What was found.
 
     Attributes:
-        theta: the global parameters that ``unpack`` understands. cov: their covariance, the model error taken as
-            independent from sample to sample.
-        problem, point: the equations at the solution.
+        problem, solution: the equations, and where they ended.
+        shots: what was fitted, at the places that the blocks are about.
         model_error: as a fraction of the peak, see ``psf.weights``; 0 where the residuals are noise.
-        chi2_dof: with that model error.
-        pattern_p: how likely such a pattern in the residuals is by chance; see ``psf.pattern``.
+        outliers: what was left out.
+        iterations: of all descents together.
+        phase: strength of the wire's phase in the kernel, its sigma, and both orders; None where no wire was seen.
     """
 
-    theta: Float[np.ndarray, " p"]
-    cov: Float[np.ndarray, "p p"]
-    problem: Problem
-    point: Point
+    problem: DiffractionProblem
+    solution: Solution[Place, Blocks]
+    shots: Shots
     model_error: float
-    chi2_dof: float
-    pattern_p: float
     outliers: tuple[Outliers, ...]
+    iterations: int
+    phase: PhaseEvidence | None = None
+
+    @property
+    def theta(self) -> Float[np.ndarray, " p"]:
+        """The shared parameters."""
+        return self.solution.place.theta
 
     @property
     def converged(self) -> bool:
         """Whether a minimum was reached."""
-        return self.point.converged and bool(np.isfinite(self.theta).all() and np.isfinite(self.cov).all())
+        return self.solution.converged and bool(np.isfinite(self.theta).all() and np.isfinite(self.noise_cov).all())
+
+    @property
+    def noise_cov(self) -> Float[np.ndarray, "p p"]:
+        """Covariance of the shared parameters, the model error taken as independent from sample to sample."""
+        return self.solution.equations.cov()
+
+    def cov(self) -> Float[np.ndarray, "p p"]:
+        """Covariance of the shared parameters.
+
+        What the model leaves out is alike in all samples of a position, so that it averages out over positions only.
+        """
+        if self.model_error == 0.0:
+            return self.noise_cov
+        alone = [position.marginal() for position in self.problem.by_position(self.solution.place)]
+        return clustered_cov(self.noise_cov, np.stack([a[1] for a in alone]), np.stack([a[0] for a in alone]))
+
+    @property
+    def chi2_dof(self) -> float:
+        """Reduced chi-squared, with that model error."""
+        dof = max(self.problem.samples - self.problem.unknowns, 1)
+        return (self.solution.equations.cost - self.problem.prior.cost(self.theta)) / dof
+
+    def pattern_p(self) -> float:
+        """How likely such a pattern in the residuals is by chance; see ``psf.weights``."""
+        return pattern_test(self.problem.blocks, self.errors()).p_value
+
+    def errors(self) -> list[Float[np.ndarray, "shots n"]]:
+        """Data less expectation in units of sigma, position by position."""
+        return self.problem.errors(self.solution.place, self.problem.light_at(self.solution.place))
 
 
-def approach(problem: Problem, max_iterations: int) -> Point:
-    """From the prior's mean to about the minimum, with weights that the data give."""
-    problem = replace(problem, blocks=tuple(first_weights(block, FIRST_MODEL_ERROR) for block in problem.blocks))
-    theta = problem.prior.mean.copy()
-    local = tuple(
-        start_local(
-            problem.evaluator, block, np.asarray(kernel_coefficients(problem.evaluator, theta, block, overlaps))
-        )
-        for block, overlaps in zip(problem.blocks, problem.overlaps, strict=True)
-    )
-    point = stand(problem, theta, local)
-    return descend(problem, point, max_iterations, _ROUGHLY * point.cost)
-
-
-def refine(problem: Problem, point: Point, max_iterations: int) -> DiffractionFit:
-    """From about the minimum to the maximum of the likelihood.
+def fit_diffraction(
+    shots: Shots, geometry: Geometry, start: Diffraction, prior: Prior, rules: PsfRules, wire_shows: bool
+) -> DiffractionFit:
+    """Fit the numbers of diffraction: near the minimum, then to it at the places found there.
 
     Args:
-        problem: what to fit; each shot's own unknowns in ``point`` are about its blocks' places.
-        point: where to start; its normal equations are not looked at.
-        max_iterations: of all descents together.
+        shots: what to fit, positions numbered without gaps.
+        geometry: where pixels look.
+        start: its nodes of the spectra are kept.
+        prior: of the parameters of ``kernel.pack``; its mean is the start.
+        rules: see there.
+        wire_shows: whether the footprint's place on the rows is known; it is then tested whether the data show it.
     """
-    whole: DiffractionFit | None = None
-    enough = _NEARLY
-    for _ in range(_ROUNDS):
-        # What interference depends on hardly changes in a descent, but it does.
-        there = pose(problem.blocks, problem.evaluator, problem.prior, point.theta)
-        corrected = replace(there, blocks=with_interference(there, point))
-        problem, model_error, found = _reweighed(corrected, point)
-        before = point.theta
-        point = descend(problem, stand(problem, before, point.local, point.iterations), max_iterations, enough)
-        matrix, _, _ = reduced(problem, point)
-        change = point.theta - before
-        LOG.debug("psf: model error %.3g, moved by %.3g sigma", model_error, float(np.sqrt(change @ matrix @ change)))
-        if not point.converged:
-            # Out of iterations: the round before, whose weights are those of a model not quite this one, has an end.
-            return whole or _result(problem, point, model_error, found)
-        whole = _result(problem, point, model_error, found)
-        moved_by = change @ matrix @ change
-        if enough == _FULLY and moved_by < _STILL**2:
+    chosen = choose_samples(shots, rules, rules.far_share)
+    evaluator = Evaluator(np.asarray(start.wavelengths_nm), fit_lattice(rules.close(shots.half)), wire_shows)
+    problem = DiffractionProblem(blocks(shots, geometry, chosen), evaluator, prior).with_overlaps(prior.mean)
+    near = _approach(problem, rules)
+    own = near.place.own.copy()
+    index = np.stack([np.asarray(block.index) for block in problem.blocks])
+    places = shots.centre_px.copy()
+    places[index[index >= 0]] += own[index >= 0][:, :2]
+    shots = replace(shots, centre_px=places)
+    own[..., :2] = 0.0
+    problem = replace(problem, blocks=blocks(shots, geometry, chosen))
+    fit = _refine(problem, shots, Place(near.place.theta, own), rules, near.iterations)
+    if not wire_shows:
+        return fit
+    evidence = phase_evidence(fit)
+    if not evidence.wanted:
+        averaged = replace(problem, evaluator=Evaluator(evaluator.wavelengths_nm, evaluator.lattice, False))
+        fit = _refine(averaged, shots, fit.solution.place, rules, 0)
+    return replace(fit, phase=evidence)
+
+
+def _approach(problem: DiffractionProblem, rules: PsfRules) -> Solution[Place, Blocks]:
+    """From the prior's mean to about the minimum, with weights that the data give."""
+    problem = replace(problem, blocks=tuple(weighed(b, rules.first_model_error) for b in problem.blocks))
+    theta = problem.prior.mean
+    own = [start_own(problem.evaluator, block, problem.coefficients(theta, block)) for block in problem.blocks]
+    return minimise(problem, Place(theta.copy(), np.stack(own)), _solver(_ROUGHLY * problem.samples, rules.iterations))
+
+
+def _refine(
+    problem: DiffractionProblem, shots: Shots, place: Place, rules: PsfRules, iterations: int
+) -> DiffractionFit:
+    """From about the minimum to the maximum of the likelihood."""
+    whole, enough = None, _NEARLY
+    for _ in range(rules.rounds):
+        problem, model_error, found = _reweighed(problem.with_corrections(place), place, rules)
+        solution = minimise(problem, place, _solver(enough, rules.iterations - iterations))
+        iterations += solution.iterations
+        change = solution.place.theta - place.theta
+        moved = float(np.sqrt(change @ solution.equations.marginal()[0] @ change))
+        LOG.debug("psf: model error %.3g, moved by %.3g sigma", model_error, moved)
+        fit = DiffractionFit(problem, solution, shots, model_error, found, iterations)
+        # Out of iterations: the round before, whose weights are those of a model not quite this one, has an end.
+        if not solution.converged:
+            return whole or fit
+        whole, place, last = fit, solution.place, enough == _FULLY and moved < _STILL
+        if last:
             break
-        enough = _FULLY if moved_by < _SETTLED**2 else _NEARLY
+        enough = _FULLY if moved < _SETTLED else _NEARLY
     assert whole is not None  # there is a first round
     return whole
 
 
-def fit_locals(
-    evaluator: Evaluator, theta: Float[np.ndarray, " p"], block: Block, model_error: float, rounds: int = 3
-) -> tuple[Local, Float[np.ndarray, "shots n"]]:
-    """Own unknowns of one position's shots for a given model, and what one unit of light brings to their samples."""
-    overlaps = overlaps_of(evaluator, theta, block.frame)
-    coefficients = np.asarray(kernel_coefficients(evaluator, theta, block, overlaps))
-    block = first_weights(block, max(model_error, FIRST_MODEL_ERROR))
-    local = start_local(evaluator, block, coefficients)
-    for _ in range(rounds):
-        matrix, right = (np.asarray(part) for part in local_equations(evaluator, block, local, coefficients))
-        local = moved(local, np.linalg.solve(damped(matrix, 1e-9), right[..., None])[..., 0])
-    return local, np.asarray(unit_light(evaluator, block, local.offset_px, coefficients))
+def _solver(enough: float, iterations: int) -> SolverRules:
+    return SolverRules(enough, _STALLED, iterations=iterations, first_damping=1e-2, most_damping=1e6)
 
 
-def expected_light(problem: Problem, point: Point) -> list[Float[np.ndarray, "shots n"]]:
-    """What each position's samples hold under the model, in e-/s, without background."""
-    lights = []
-    for block, local, overlaps in zip(problem.blocks, point.local, problem.overlaps, strict=True):
-        unit = _unit(problem.evaluator, point.theta, block, local, overlaps)
-        flux = np.einsum("snc,sc->sn", np.asarray(block.colour), np.asarray(local.flux))
-        lights.append(np.asarray(corrected(block, point.theta, unit)) * flux)
-    return lights
-
-
-def _unit(
-    evaluator: Evaluator, theta: Float[np.ndarray, " p"], block: Block, local: Local, overlaps: np.ndarray
-) -> Float[np.ndarray, "shots n"]:
-    coefficients = np.asarray(kernel_coefficients(evaluator, theta, block, overlaps))
-    return np.asarray(unit_light(evaluator, block, local.offset_px, coefficients))
-
-
-def with_interference(problem: Problem, point: Point) -> tuple[Block, ...]:
-    """Blocks that know each shot's own place on the rows, and how overlaps change with the pupil."""
-    if not problem.evaluator.interference:
-        return problem.blocks
-    theta, evaluator, made = point.theta, problem.evaluator, []
-    for block, local, overlaps in zip(problem.blocks, point.local, problem.overlaps, strict=True):
-        by_pitch, by_pupil = (
-            _by_overlaps(problem.evaluator, theta, block, local, overlaps, step) for step in _OVERLAP_STEPS_MM
-        )
-        made.append(
-            replace(
-                block,
-                correction=_by_phase(evaluator, theta, block, local, overlaps),
-                overlap_slope=by_pupil,
-                pitch_slope=by_pitch,
-                overlaps_pupil_mm=theta[PUPIL],
-                overlaps_pitch_mm=theta[PITCH],
-            )
-        )
-    return tuple(made)
-
-
-def _by_overlaps(
-    evaluator: Evaluator,
-    theta: Float[np.ndarray, " p"],
-    block: Block,
-    local: Local,
-    overlaps: np.ndarray,
-    step: tuple[int, float],
-) -> Float[np.ndarray, "shots n"]:
-    """By how much one unit of light changes per mm of a global parameter because overlaps do."""
-    number, step_mm = step
-    larger = theta.copy()
-    larger[number] += step_mm
-    changed = np.asarray(overlaps_of(evaluator, larger, block.frame)) - overlaps
-    # The kernel is linear in its overlaps: what the change alone brings, beside what no overlap brings.
-    brought, without = (_unit(evaluator, theta, block, local, own) for own in (changed, np.zeros_like(changed)))
-    return (brought - without) / step_mm
-
-
-def _by_phase(
-    evaluator: Evaluator, theta: Float[np.ndarray, " p"], block: Block, local: Local, overlaps: np.ndarray
-) -> Float[np.ndarray, "shots n"]:
-    """What one unit of light brings more where each shot has the footprint at its own place, not at their mean one."""
-    common = _unit(evaluator, theta, block, local, overlaps)
-    direction = np.asarray(block.frame.direction)
-    tangent = (np.eye(2) + np.outer(direction[:2], direction[:2]) / direction[2] ** 2) / direction[2]
-    along = (np.asarray(block.begun_px) + np.asarray(local.offset_px)) @ (tangent @ np.asarray(block.frame.jacobian)).T
-    units = []
-    for shot, move in enumerate(theta[FOOTPRINT][2] * along):
-        own = theta.copy()
-        own[FOOTPRINT] += [*move, 0.0]
-        units.append(_unit(evaluator, own, block, local, overlaps)[shot])
-    return np.stack(units) - common
-
-
-def _reweighed(problem: Problem, point: Point) -> tuple[Problem, float, tuple[Outliers, ...]]:
+def _reweighed(
+    problem: DiffractionProblem, place: Place, rules: PsfRules
+) -> tuple[DiffractionProblem, float, tuple[Outliers, ...]]:
     """Weights at the model's light, with the model error that the residuals tell, and without outliers."""
-    lights = expected_light(problem, point)
-    residuals, variances, shares = [], [], []
-    for block, local, light in zip(problem.blocks, point.local, lights, strict=True):
-        seen = np.asarray(block.known) > 0
-        expected = light + np.asarray(local.background)[:, None]
-        residuals.append((np.asarray(block.rate) - expected)[seen])
-        variances.append(sensor_variance(block, expected)[seen])
-        shares.append(left_out(light * seen, 1.0)[seen])
-    model_error = estimate_model_error(
-        np.concatenate(residuals), np.concatenate(variances), np.concatenate(shares), problem.unknowns
-    )
-    weighed = [
-        model_weights(block, light, local, model_error)
-        for block, local, light in zip(problem.blocks, point.local, lights, strict=True)
-    ]
-    kept, found = without_outliers(weighed, lights, point.local)
+    lights, parts = problem.light_at(place), []
+    for block, own, light in zip(problem.blocks, place.own, lights, strict=True):
+        seen, level = np.asarray(block.known) > 0, light + own[:, 5:]
+        of_sample = (np.asarray(block.rate) - level, sensor_variance(block, level), left_out(light * seen, 1.0))
+        parts.append([one[seen] for one in of_sample])
+    residual, variance, share = (np.concatenate(column) for column in zip(*parts, strict=True))
+    model_error = estimate_model_error(residual, variance, share, problem.unknowns)
+    triples = zip(problem.blocks, lights, place.own, strict=True)
+    problem = replace(problem, blocks=tuple(weighed(b, model_error, light, own[:, 5]) for b, light, own in triples))
+    kept, found = without_outliers(problem.blocks, problem.errors(place, lights), rules)
     return replace(problem, blocks=kept), model_error, found
 
 
-def _result(problem: Problem, point: Point, model_error: float, found: tuple[Outliers, ...]) -> DiffractionFit:
-    matrix, _, _ = reduced(problem, point)
-    residuals = [
-        np.asarray(block.rate) - light - np.asarray(local.background)[:, None]
-        for block, light, local in zip(problem.blocks, expected_light(problem, point), point.local, strict=True)
-    ]
-    strain = problem.prior.root @ (point.theta - problem.prior.mean)
-    return DiffractionFit(
-        theta=point.theta,
-        cov=np.linalg.pinv(matrix, hermitian=True),
-        problem=problem,
-        point=point,
-        model_error=model_error,
-        chi2_dof=(point.cost - float(strain @ strain)) / max(problem.samples - problem.unknowns, 1),
-        pattern_p=pattern_p_value(problem.blocks, residuals),
-        outliers=found,
-    )
+@final
+@dataclass(frozen=True)
+class PhaseEvidence:
+    """Whether the data show the wire's phase in the kernel.
+
+    Attributes:
+        strength: of what the phase changes, estimated beside all other parameters: 1 where the footprint lies where the
+            wire has it, 0 where the kernel knows nothing of it.
+        sigma: of the strength.
+        choice: with the phase or averaged over it, by BIC; the fits are their strengths.
+    """
+
+    strength: float
+    sigma: float
+    choice: Choice[float]
+
+    @property
+    def wanted(self) -> bool:
+        """Whether the kernel with the wire's phase is the better one."""
+        return self.choice.best.fit > 0
 
 
-def fitted_model(evaluator: Evaluator, theta: Float[np.ndarray, " p"]) -> Diffraction:
-    """The fitted model with numpy leaves."""
-    model = evaluator.model(theta)
-    leaves = (np.asarray(getattr(model, name), dtype=np.float64) for name in Diffraction.__dataclass_fields__)
-    return Diffraction(*leaves)
+def phase_evidence(fit: DiffractionFit) -> PhaseEvidence:
+    """Compare a fit with interference to the same without, to second order about the fit."""
+    problem, place, here = fit.problem, fit.solution.place, fit.solution.equations
+    plain = replace(problem, blocks=tuple(_without_interference(block) for block in problem.blocks))
+    lights = problem.light_at(place)
+    by_phase = [light - without for light, without in zip(lights, plain.light_at(place), strict=True)]
+    moved, score, alone = [], 0.0, 0.0
+    for block, change, z in zip(problem.blocks, by_phase, problem.errors(place, lights), strict=True):
+        in_sigma = change * np.sqrt(np.asarray(block.weight))
+        score += float((in_sigma * z).sum())
+        alone += float((in_sigma**2).sum())
+        moved.append(replace(block, rate=np.asarray(block.rate) + _TRIED * change))
+    there = replace(problem, blocks=tuple(moved)).equations_at(place)
+    shared, own = (there.right - here.right) / _TRIED, (there.own_right - here.own_right) / _TRIED
+    # What the other parameters can make up for is no information on the strength.
+    information = max(alone - replace(here, right=shared, own_right=own).step(0.0).gain, 1e-12)
+    strength, unknowns = 1.0 + score / information, problem.unknowns
+    fewer = unknowns - (FOOTPRINT.stop - FOOTPRINT.start)
+    worse = here.cost + information * (2.0 * strength - 1.0)
+    orders = (("with the wire's phase", unknowns, here.cost, 1.0), ("averaged over the phase", fewer, worse, 0.0))
+    tried = [Attempt(f"diffraction {n} (BIC)", k, bic(cost, float(k), here.samples), fit) for n, k, cost, fit in orders]
+    return PhaseEvidence(strength, information**-0.5, choose(tried))
+
+
+def _without_interference(block: Block) -> Block:
+    parts = {name: np.zeros_like(getattr(block, name)) for name in ("correction", "by_overlaps", "overlaps")}
+    return replace(block, **parts)
+
+
+def efficiency(fit: DiffractionFit, rules: PsfRules, available: int, reported: int) -> float:
+    """Variance that all samples of all pictures would leave over the variance of the fit, mean of its first numbers.
+
+    Args:
+        fit: the samples drawn away from the peak stand for all of them there.
+        rules: how many were drawn.
+        available: pictures there are.
+        reported: so many numbers are looked at.
+    """
+    every = tuple(for_all_samples(block, rules) for block in fit.problem.blocks)
+    positions = replace(fit.problem, blocks=every).by_position(fit.solution.place)
+    used = sum(int((np.asarray(block.index) >= 0).sum()) for block in every)
+    information = sum(position.marginal()[0] for position in positions) * available / used
+    best = scaled_inverse(fit.problem.prior.precision + information)
+    return float(np.mean(np.diag(best)[:reported] / np.diag(fit.noise_cov)[:reported]))
+
+
+def kernel_sigma(fit: DiffractionFit, cov: Float[np.ndarray, "p p"]) -> float:
+    """Relative L2 sigma of the kernel at the first position, in all colours.
+
+    At weights that make every sample of the kernel count alike, the equations hold the sum of its squared derivatives.
+    """
+    block, place = fit.problem.blocks[0], fit.solution.place
+    even = np.asarray(block.colour) / np.maximum(np.asarray(block.colour).sum(axis=1, keepdims=True), 1)
+    unit = np.tile([0.0, 0.0, 1.0, 1.0, 1.0, 0.0], (len(even), 1)) + place.own[0] * [1, 1, 0, 0, 0, 0]
+    one = replace(fit.problem, blocks=(replace(block, weight=even.sum(axis=-1)),))
+    there = Place(place.theta, unit[None])
+    (light,) = one.light_at(there)
+    (sums,) = replace(one, blocks=(replace(one.blocks[0], rate=light),)).by_position(there)
+    return float(np.sqrt(max(float((sums.shared * cov).sum()), 0.0) / float((even.sum(axis=-1) * light**2).sum())))

@@ -1,19 +1,42 @@
-"""What positions that were held out say of a kernel: how likely they are, and how far it is off there."""
+"""What positions that were held out say of a kernel: how likely they are, how far it is off there, how far it reaches.
+
+Whatever is wrong there counts: what the model leaves out, and what its numbers are off by because of that.
+
+The support is the smallest window outside of which pictures held out show none of the kernel's light, along rows and
+along columns by itself, since a kernel of pixel rows is a cross. Inside it the kernel is the model's, outside there is
+none but an even background. Its criterion is BIC, one parameter for every larger window that is tried: light that is
+there pays for it many times, light that only the model sees does not.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final, final
 
 import numpy as np
+import scipy.optimize
 from jaxtyping import Bool, Float, Int
 
-from udccal.fitting.psf.kernel_error import KernelError, estimate_kernel_error
-from udccal.fitting.psf.residual import Sources, Windows, expected
-from udccal.fitting.psf.weights import estimate_model_error, huber, noise_at
+from udccal.fitting.engine.orders import Attempt, Choice, bic, choose
+from udccal.fitting.psf.data import Shots
+from udccal.fitting.psf.image import Sources, Windows
+from udccal.fitting.psf.weights import HUBER, estimate_model_error, noise_at
+from udccal.result import Candidate
+
+# Of the logarithms of a kernel error's knee and of its power: means and standard deviations beforehand.
+_KNEE, _KNEE_SIGMA, _POWER, _POWER_SIGMA = np.log(0.3), 1.0, 0.75, 0.15
+_BOUNDS: Final = ((np.log(1e-5), np.log(2.0)), (np.log(3e-3), np.log(10.0)), (0.3, 1.2))
+_SIZES: Final = (1e-3, 1e-2, 1e-1)
+_LEAST_BRIGHT: Final = 1e-7
+# Beyond so many sigma the loss grows with the logarithm alone: of a hit, but where the model is far off counts.
+_FAR_SIGMA: Final = 5.0
+_LEAST_PX: Final = 4
+_STEP: Final = np.sqrt(2.0)
 
 
+@final
 @dataclass(frozen=True)
-class Judged:
+class Compared:
     """Samples that a solution has not seen, next to what it expects of them.
 
     Attributes:
@@ -41,39 +64,164 @@ class Judged:
         """Of all samples, in units of their sigma."""
         return (self.residual / np.sqrt(self.total))[self.known]
 
+    def relative_l2(self, channel: Int[np.ndarray, "shots rows columns"]) -> Float[np.ndarray, "3"]:
+        """Error of the expectation by colour, the data's own noise included."""
+        seen = [self.known & (channel == colour) for colour in range(3)]
+        squares = ((float((part[one] ** 2).sum()) for part in (self.residual, self.light)) for one in seen)
+        return np.array([np.sqrt(error / max(light, 1e-30)) for error, light in squares])
+
     def loss(self, position: Int[np.ndarray, " shots"]) -> Float[np.ndarray, " places"]:
         """Minus twice the logarithm of the likelihood per sample, but for a constant, by position.
 
         Pictures of a position share what the model leaves out there. Of a single position, it is by picture.
         """
-        size = np.abs(self.residual) / np.sqrt(self.total)
-        each = (np.log(self.total / self.measured) + huber(size)) * self.known
+        each = (np.log(self.total / self.measured) + HUBER.loss(self.residual / np.sqrt(self.total))) * self.known
         by_shot = each.sum(axis=(1, 2)) / np.maximum(self.known.sum(axis=(1, 2)), 1)
         places = np.unique(position)
         return np.array([by_shot[position == place].mean() for place in places]) if len(places) > 1 else by_shot
 
 
-def judge(windows: Windows, share: float, image: Float[np.ndarray, "terms 3 node_rows node_columns"]) -> Judged:
-    """Compare the expectation of diffraction (``share`` of it) and image with the data."""
-    light = expected(windows, share, image)
-    rate, known = np.asarray(windows.rate), np.asarray(windows.weight) > 0
-    measured = np.asarray(windows.variance)
-    variance = noise_at(light, rate, measured, np.asarray(windows.noise_per_rate))
-    # The same for all candidates, and not nothing where one of them expects no light.
-    one = np.asarray(windows.left_out)
+def compare(
+    shots: Shots, windows: Windows, light: Float[np.ndarray, "shots rows columns"], pick: np.ndarray
+) -> Compared:
+    """The data of the shots picked, and the ``light`` (e-/s) that is expected of all."""
+    parts = (windows.rate, shots.weight, shots.noise_per_rate, windows.left_out, light)
+    rate, weight, slope, one, light = (np.asarray(part)[pick] for part in parts)
+    known = weight > 0
+    measured = 1.0 / np.where(known, weight, 1.0)
+    variance = noise_at(light, rate, measured, slope)
+    # What is left out is the same for all orders, and not nothing where one of them expects no light.
     model_error = estimate_model_error((rate - light)[known], variance[known], one[known], 0)
-    return Judged(rate - light, light, measured, variance, one, known, model_error)
+    return Compared(rate - light, light, measured, variance, one, known, model_error)
 
 
-def kernel_error(judged: Judged, windows: Windows, sources: Sources) -> KernelError:
+@final
+@dataclass(frozen=True)
+class KernelError:
+    """Standard deviation of a kernel's samples, where 1 is the kernel's peak: size (s / (1 + s / knee))^power at s.
+
+    A power of the kernel's size that flattens off above a knee: near the peak each picture's own place and light take
+    up part of what is wrong. A ``size`` of 0 says that nothing was found beside noise.
+    """
+
+    size: float
+    knee: float
+    power: float
+
+    def of_peak(self, brightness: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
+        """Of samples that have this part of their peak's light."""
+        part = np.maximum(brightness, 0.0)
+        return self.size * (part / (1.0 + part / self.knee)) ** self.power
+
+    def of_kernels(self, kernels: Float[np.ndarray, "*n rows columns"]) -> Float[np.ndarray, "*n rows columns"]:
+        """In the kernels' own unit."""
+        peak = np.maximum(kernels.max(axis=(-2, -1), keepdims=True), 1e-300)
+        return self.of_peak(kernels / peak) * peak
+
+    def relative_l2(self, kernels: Float[np.ndarray, "*n rows columns"]) -> Float[np.ndarray, "*n"]:
+        """What that makes of a whole kernel."""
+        square = (kernels**2).sum(axis=(-2, -1))
+        return np.asarray(np.sqrt((self.of_kernels(kernels) ** 2).sum(axis=(-2, -1)) / np.maximum(square, 1e-300)))
+
+
+NONE: Final = KernelError(0.0, 1.0, _POWER)
+
+
+def estimate_kernel_error(
+    residual: Float[np.ndarray, " samples"],
+    variance: Float[np.ndarray, " samples"],
+    brightness: Float[np.ndarray, " samples"],
+) -> KernelError:
+    """The error of greatest posterior; ``NONE`` where noise alone explains the residuals as well, by BIC.
+
+    Args:
+        residual: data less expectation at positions that were held out, as a part of the peak's light.
+        variance: of the sensor's noise, in the same unit.
+        brightness: expected light as a part of the peak's.
+    """
+    seen = brightness > _LEAST_BRIGHT
+    residual, variance, brightness = residual[seen], variance[seen], brightness[seen]
+    if residual.size < len(_BOUNDS):
+        return NONE
+
+    def of(values: Float[np.ndarray, "3"]) -> KernelError:
+        return KernelError(float(np.exp(values[0])), float(np.exp(values[1])), float(values[2]))
+
+    def misfit(total: Float[np.ndarray, " samples"]) -> float:
+        square = residual**2 / (total * _FAR_SIGMA**2)
+        far = 1 + np.log(np.maximum(square, 1))
+        return float(np.sum(np.log(total) + _FAR_SIGMA**2 * np.where(square < 1, square, far)))
+
+    def loss(values: Float[np.ndarray, "3"]) -> float:
+        off = ((values[1] - _KNEE) / _KNEE_SIGMA) ** 2 + ((values[2] - _POWER) / _POWER_SIGMA) ** 2
+        return misfit(variance + of(values).of_peak(brightness) ** 2) + float(off)
+
+    tried = [
+        scipy.optimize.minimize(loss, (np.log(size), _KNEE, _POWER), method="L-BFGS-B", bounds=_BOUNDS)
+        for size in _SIZES
+    ]
+    found = min(tried, key=lambda one: float(one.fun))
+    return of(found.x) if bic(float(found.fun), float(len(_BOUNDS)), residual.size) < misfit(variance) else NONE
+
+
+def kernel_error(found: Compared, channel: Int[np.ndarray, "shots rows columns"], sources: Sources) -> KernelError:
     """How far the kernel is off beside noise, from samples that it has not seen."""
-    colour, flux = np.asarray(windows.colour), np.abs(sources.flux)
-    unit = judged.light / np.maximum(np.einsum("syxc,sc->syx", colour, flux), 1e-300)
+    flux = np.take_along_axis(np.abs(sources.flux), channel.reshape(len(channel), -1), axis=1).reshape(channel.shape)
+    unit = found.light / np.maximum(flux, 1e-300) * found.known
     # Pictures see the peak at different fractions of a pixel: the highest of all is nearest to it.
-    peaks = np.maximum((unit[..., None] * colour * judged.known[..., None]).max(axis=(0, 1, 2)), 1e-300)
-    full = np.einsum("syxc,sc,c->syx", colour, flux, peaks)
-    seen = judged.known & (full > 0)
+    peaks = np.array([unit[channel == colour].max(initial=1e-300) for colour in range(3)])
+    full = flux * peaks[channel]
+    seen = found.known & (full > 0)
     full = full[seen]
-    return estimate_kernel_error(
-        judged.residual[seen] / full, judged.variance[seen] / full**2, judged.light[seen] / full
-    )
+    return estimate_kernel_error(found.residual[seen] / full, found.variance[seen] / full**2, found.light[seen] / full)
+
+
+@final
+@dataclass(frozen=True)
+class Support:
+    """How far the kernel reaches.
+
+    Attributes:
+        half_px: (rows, columns) to either side of the source.
+        seen_px: (rows, columns) to either side that the pictures held.
+        candidates: every window tried, both axes.
+    """
+
+    half_px: tuple[int, int]
+    seen_px: tuple[int, int]
+    candidates: tuple[Candidate, ...]
+
+    @property
+    def open_ended(self) -> tuple[bool, bool]:
+        """Along (rows, columns), whether light was seen up to the border of what the pictures held."""
+        rows, columns = (chosen >= seen for chosen, seen in zip(self.half_px, self.seen_px, strict=True))
+        return rows, columns
+
+
+def choose_support(found: Compared) -> Support:
+    """The window of least criterion, from samples that the model has not seen in windows about each source."""
+    rows, columns = found.residual.shape[1:]
+    y, x = np.mgrid[:rows, :columns]
+    down = _along(found, "rows", np.abs(y - rows // 2))
+    across = _along(found, "columns", np.abs(x - columns // 2))
+    half = (down.best.fit, across.best.fit)
+    return Support(half, (rows // 2, columns // 2), (*down.candidates, *across.candidates))
+
+
+def windows_to_try(largest_px: int) -> tuple[int, ...]:
+    """Sizes to either side: each half as large again as the one before the last, up to the largest."""
+    count = int(np.ceil(np.log(max(largest_px / _LEAST_PX, 1.0)) / np.log(_STEP)))
+    steps = np.round(_LEAST_PX * _STEP ** np.arange(count)).astype(int)
+    return (*(int(step) for step in steps if step < largest_px), largest_px)
+
+
+def _along(found: Compared, name: str, distance: Int[np.ndarray, "rows columns"]) -> Choice[int]:
+    """With the kernel's light within each window alone, and each picture's background found anew."""
+    weight, samples = np.where(found.known, 1.0 / found.total, 0.0), int(found.known.sum())
+    tried = []
+    for step, half in enumerate(windows_to_try(int(distance.max()))):
+        error = found.residual + found.light * (distance > half)
+        background = (weight * error).sum(axis=(1, 2)) / np.maximum(weight.sum(axis=(1, 2)), 1e-300)
+        loss = float(HUBER.loss((error - background[:, None, None]) * np.sqrt(weight)).sum())
+        tried.append(Attempt(f"{name}: light within {half} px", step, bic(loss, float(step), samples), half))
+    return choose(tried)

@@ -1,5 +1,4 @@
-"""What the diffraction fit goes by, sample by sample: the sensor's noise at the light that the model expects, and how
-far the model itself is off there.
+"""What samples count for: the sensor's noise at the light that a model expects, how far the model is off, outliers.
 
 What a model leaves out matters the more, relatively, the fainter a sample is: its standard deviation is taken as the
 model error times light^(3/4) peak^(1/4), e.g. at 10^-4 of the peak ten times the model error. How large the model error
@@ -8,17 +7,27 @@ is, the residuals tell: it is the one of greatest likelihood, and none where tha
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
+from typing import Final
 
 import numpy as np
 import scipy.optimize
 from jaxtyping import Float
 
-from udccal.fitting.psf.blocks import Block, Local
+from udccal.fitting.engine.misfit import MisfitTest, group_means_test
+from udccal.fitting.engine.orders import bic
+from udccal.fitting.engine.robust import Huber, OutlierRule, outliers
+from udccal.fitting.psf.samples import Block
+from udccal.fitting.psf.start import PsfRules
+from udccal.result import Outliers
 
-_ROBUST = 3.0
-_LEAST, _MOST = 1e-4, 0.5
-_LEAST_VARIANCE = 1e-2
+HUBER: Final = Huber()
+_MODEL_ERRORS: Final = (1e-4, 0.5)
+_LEAST_VARIANCE: Final = 1e-2
+# Of residuals of at most so many sigma, so that one cosmic hit does not condemn its picture.
+_PICTURE_SIGMA: Final = 3.0
+_FEWEST_PICTURES: Final = 4
 
 
 def left_out(light: Float[np.ndarray, "shots n"], model_error: float) -> Float[np.ndarray, "shots n"]:
@@ -46,24 +55,18 @@ def sensor_variance(block: Block, level: Float[np.ndarray, "shots n"]) -> Float[
     return noise_at(level, rate, measured, np.asarray(block.noise_per_rate) * (known > 0))
 
 
-def first_weights(block: Block, model_error: float) -> Block:
-    """Weights before there is a model: the data stand for it."""
-    rate, known = np.asarray(block.rate), np.asarray(block.known)
-    variance = 1.0 / np.where(known > 0, known, 1.0) + left_out(rate * (known > 0), model_error) ** 2
-    return replace(block, weight=np.where(known > 0, 1.0 / variance, 0.0))
+def weighed(
+    block: Block, model_error: float, light: np.ndarray | None = None, background: np.ndarray | None = None
+) -> Block:
+    """The block with weights at the ``light`` (shots n) and ``background`` (shots) that a model expects, in e-/s.
 
-
-def model_weights(block: Block, light: Float[np.ndarray, "shots n"], local: Local, model_error: float) -> Block:
-    """Weights at the light that the model expects, without background."""
+    Before there is a model the data stand for it.
+    """
     seen = np.asarray(block.known) > 0
-    variance = sensor_variance(block, light + np.asarray(local.background)[:, None])
-    variance = variance + left_out(light * seen, model_error) ** 2
+    light = np.asarray(block.rate) if light is None else light
+    level = light if background is None else light + background[:, None]
+    variance = sensor_variance(block, level) + left_out(light * seen, model_error) ** 2
     return replace(block, weight=np.where(seen, 1.0 / variance, 0.0))
-
-
-def huber(size: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
-    """Squares of residuals in units of their sigma, growing no more than linearly beyond three."""
-    return np.where(size < _ROBUST, size**2, 2 * _ROBUST * size - _ROBUST**2)
 
 
 def estimate_model_error(
@@ -84,10 +87,55 @@ def estimate_model_error(
 
     def loss(model_error: float) -> float:
         total = variance + (model_error * share) ** 2
-        return float(np.sum(np.log(total) + huber(np.sqrt(raised / total))))
+        return float(np.sum(np.log(total) + HUBER.loss(np.sqrt(raised / total))))
 
-    found = scipy.optimize.minimize_scalar(
-        lambda log: loss(float(np.exp(log))), bounds=(np.log(_LEAST), np.log(_MOST)), method="bounded"
+    log_bounds = (np.log(_MODEL_ERRORS[0]), np.log(_MODEL_ERRORS[1]))
+    found = scipy.optimize.minimize_scalar(lambda log: loss(float(np.exp(log))), bounds=log_bounds, method="bounded")
+    return float(np.exp(found.x)) if bic(float(found.fun), 1.0, residual.size) < loss(0.0) else 0.0
+
+
+def without_outliers(
+    blocks: Sequence[Block], errors: Sequence[Float[np.ndarray, "shots n"]], rules: PsfRules
+) -> tuple[tuple[Block, ...], tuple[Outliers, ...]]:
+    """Blocks in which outliers have no weight, and what was left out: pictures first, then samples of the others.
+
+    ``errors`` are data less expectation in units of sigma. A picture that fits so much worse than the others shows that
+    something moved, flickered or was in the way: that needs a rule of its own beside the engine's of single samples.
+    """
+    used = np.stack([np.asarray(block.weight) > 0 for block in blocks])
+    index, z = np.stack([np.asarray(block.index) for block in blocks]), np.stack(errors)
+    square = (np.minimum(z**2, _PICTURE_SIGMA**2) * used).sum(axis=-1) / np.maximum(used.sum(axis=-1), 1)
+    real = index >= 0
+    worst = rules.picture_times * max(float(np.median(square[real])), 1.0)
+    moved = real & (square > worst) & (real.sum() >= _FEWEST_PICTURES)
+    rule = OutlierRule("samples")
+    off = rule.off(z, used & ~moved[..., None])
+    pictures = (f"picture {index[at]} at position {at[0]}" for at in zip(*np.nonzero(moved), strict=True))
+    samples = (
+        f"picture {index[at[:2]]} at position {at[0]}, {z[at]:+.0f} sigma" for at in zip(*np.nonzero(off), strict=True)
     )
-    gain = loss(0.0) - float(found.fun)
-    return float(np.exp(found.x)) if gain > np.log(residual.size) else 0.0
+    said = f"pictures whose mean squared residual is over {rules.picture_times:g} times the median picture's"
+    kept = np.stack([np.asarray(block.weight) for block in blocks]) * ~(off | moved[..., None])
+    cleaned = tuple(replace(block, weight=weight) for block, weight in zip(blocks, kept, strict=True))
+    return cleaned, (*outliers(said, pictures), *rule.listed(samples))
+
+
+def pattern_test(blocks: Sequence[Block], errors: Sequence[Float[np.ndarray, "shots n"]]) -> MisfitTest:
+    """Whether residuals are alike in different pictures of a position more than noise would be.
+
+    Each picture has its own noise, and each samples the kernel at its own fraction of a pixel. Samples of one colour
+    that see the same place of the kernel, within a pixel, are a group.
+
+    Args:
+        blocks: with their weights. errors: data less expectation, in units of sigma.
+    """
+    keys, z, used = [], [], []
+    for number, (block, error) in enumerate(zip(blocks, errors, strict=True)):
+        cells = np.floor(np.asarray(block.points)).astype(np.int64)
+        colour = np.asarray(block.colour).argmax(axis=-1)
+        keys.append((((number * 4096 + cells[..., 1]) * 4096 + cells[..., 0]) * 3 + colour).ravel())
+        z.append(np.clip(error, -HUBER.sigma, HUBER.sigma).ravel())
+        used.append(np.asarray(block.weight).ravel() > 0)
+    group = np.unique(np.concatenate(keys), return_inverse=True)[1].reshape(-1)
+    every, counted = np.concatenate(z), np.concatenate(used)
+    return group_means_test(every, group, counted, float((every[counted] ** 2).mean()) if counted.any() else 1.0)

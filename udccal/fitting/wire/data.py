@@ -17,7 +17,7 @@ from scipy.optimize import nnls
 
 from udccal.cfa import site_map
 from udccal.fitting.engine.robust import OutlierRule
-from udccal.fitting.wire.parameters import WireRules, WireStart, wire_start
+from udccal.fitting.wire.rules import WireRules, WireStart, wire_start
 from udccal.models.geometry import Geometry, unproject
 from udccal.models.noise import Noise
 from udccal.models.wire import scaled_positions

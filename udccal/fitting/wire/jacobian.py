@@ -83,8 +83,7 @@ _block_rays = jax.jit(_rays)
 def rays_at(wire: Wire, ideal: Float[np.ndarray, "n 2"]) -> Rays:
     """Where rays of ideal image points, which fill whole blocks, meet the panel."""
     found = [_block_rays(wire, part) for part in ideal.reshape(-1, BLOCK, 2)]
-    *parts, log_pupils = zip(*found, strict=True)
-    return Rays(*(np.concatenate(part, axis=-1) for part in parts), log_pupils[0])
+    return jax.tree.map(lambda *parts: np.concatenate(parts, axis=-1) if np.ndim(parts[0]) else parts[0], *found)
 
 
 def with_harmonics(wire: Wire, harmonics: Float[np.ndarray, "harmonics 2"], ideal: Float[np.ndarray, "n 2"]) -> Wire:
@@ -211,7 +210,7 @@ def block_jacobian(
     scaled: Float[np.ndarray, "n 2"],
     site: Int[np.ndarray, " n"],
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.ndarray, "parameters n"]]:
-    """1 + modulation, exp(B), and derivatives by the parameters relative to exp(B) and the gain of the site, by block."""
+    """1 + modulation, exp(B), and derivatives by the parameters relative to exp(B) and the gain, for one block."""
     found = jax.tree.map(np.asarray, wire_derivatives(wire, ideal, scaled))
     in_x, in_y = np.polynomial.legendre.legvander(scaled.T, np.shape(wire.baseline)[0] - 1).transpose(0, 2, 1)
     sites = np.append(np.eye(SITES - 1), -np.ones((SITES - 1, 1)), axis=1)[:, site]

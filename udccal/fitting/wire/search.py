@@ -15,15 +15,8 @@ from scipy.special import j1
 from udccal.fitting.engine.least_squares import Solution, SolverRules, minimise
 from udccal.fitting.wire.data import FlatNoise, Pixels, weighed
 from udccal.fitting.wire.jacobian import WireEquations, WireProblem, expected_of, rays_at, values_at, with_harmonics
-from udccal.fitting.wire.parameters import (
-    Parameters,
-    WireRules,
-    WireStart,
-    ideal_wire,
-    parameters_of,
-    possible_harmonics,
-    shape_sigma,
-)
+from udccal.fitting.wire.parameters import Parameters, ideal_wire, parameters_of, possible_harmonics, shape_sigma
+from udccal.fitting.wire.rules import WireRules, WireStart
 from udccal.models.geometry import Geometry
 from udccal.models.wire import Wire
 

@@ -2,19 +2,29 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.special import softmax
 
 from tests.benchmarks.psf_scene import Scene, pictures, shots_of, small_scene
-from udccal.fitting.psf.blocks import HEAD, PITCH, PUPIL, Local, blocks, fit_lattice
-from udccal.fitting.psf.descent import Point, Prior, pose, stepped
-from udccal.fitting.psf.diffraction import with_interference
-from udccal.fitting.psf.fit import Effort, fit_shots
-from udccal.fitting.psf.normal import Evaluator, kernel_coefficients, overlaps_of, unit_light
-from udccal.fitting.psf.shots import Shots
-from udccal.fitting.psf.slopes import factors_by_parameter, kernel_slopes
-from udccal.fitting.psf.start import WAVELENGTHS_NM, start_model, start_prior, wavelengths_nm
+from udccal.fitting.engine.gaussian import Prior
+from udccal.fitting.psf.data import PsfData, Shots
+from udccal.fitting.psf.fit import fit_psf
+from udccal.fitting.psf.kernel import (
+    HEAD,
+    PITCH,
+    PUPIL,
+    Evaluator,
+    factor_jacobian,
+    fit_lattice,
+    kernel_jacobian,
+    overlaps_of,
+)
+from udccal.fitting.psf.problem import DiffractionProblem, Place, stepped
+from udccal.fitting.psf.samples import blocks, unit_light
+from udccal.fitting.psf.start import WAVELENGTHS_NM, PsfRules, start_model, start_prior, wavelengths_nm
 from udccal.numerics import in_float64
 from udccal.result import FitStatus
 from udccal.rig import RigDescription
@@ -53,20 +63,24 @@ def test_slopes_of_the_kernel_are_those_of_differences(
 
 @in_float64
 def slopes_both_ways(scene: Scene, prior: Prior, shots: Shots, interference: bool) -> tuple[np.ndarray, np.ndarray]:
-    evaluator = Evaluator(prior.wavelengths_nm, fit_lattice(_HALF), interference)
-    block = blocks(shots, scene.geometry, np.ones(shots.rate.shape, dtype=bool))[0]
-    theta = prior.mean
-    overlaps = overlaps_of(evaluator, theta, block.frame)
+    problem = problem_of(scene, prior, shots, interference)
+    (block,), theta, evaluator = problem.blocks, prior.mean, problem.evaluator
     model = evaluator.model(theta)
-    used = overlaps if interference else None
-    _, by_factor = kernel_slopes(model, block, evaluator.lattice, model.spectrum, used)
-    chain = np.asarray(factors_by_parameter(model, block.frame))
+    _, by_factor = kernel_jacobian(evaluator, model, block.frame, block.disc_px, block.overlaps)
+    chain = np.asarray(factor_jacobian(model, block.frame))
     found = np.einsum("yxfc,fp->pyxc", np.asarray(by_factor), chain)
     wanted = []
     for step in np.eye(HEAD, theta.size) * _STEPS[:, None]:
-        more, less = (np.asarray(kernel_coefficients(evaluator, theta + s * step, block, overlaps)) for s in (1, -1))
+        more, less = (problem.coefficients(theta + sign * step, block) for sign in (1, -1))
         wanted.append((more - less) / (2 * step.sum()))
     return found, np.stack(wanted)
+
+
+def problem_of(scene: Scene, prior: Prior, shots: Shots, interference: bool) -> DiffractionProblem:
+    """Of the first position alone, overlaps at the prior's mean."""
+    evaluator = Evaluator(WAVELENGTHS_NM, fit_lattice(_HALF), interference)
+    made = blocks(shots, scene.geometry, np.ones(shots.rate.shape, dtype=bool))[:1]
+    return DiffractionProblem(made, evaluator, prior).with_overlaps(prior.mean)
 
 
 def test_slopes_by_pupil_and_pitch_follow_overlaps(scene: Scene, prior: Prior, shots: Shots) -> None:
@@ -78,24 +92,22 @@ def test_slopes_by_pupil_and_pitch_follow_overlaps(scene: Scene, prior: Prior, s
 
 @in_float64
 def overlap_slopes(scene: Scene, prior: Prior, shots: Shots) -> tuple[np.ndarray, np.ndarray]:
-    """What the fit adds for interference per mm of (pupil, pitch) and unit of light, and differences of kernels."""
-    evaluator, theta = Evaluator(prior.wavelengths_nm, fit_lattice(_HALF), True), prior.mean
-    made = blocks(shots, scene.geometry, np.ones(shots.rate.shape, dtype=bool))[:1]
-    count = np.shape(made[0].rate)[0]
-    local = Local(np.zeros((count, 2)), np.ones((count, 3)), np.zeros(count))
-    problem = pose(made, evaluator, prior, theta)
-    (block,) = with_interference(problem, Point(theta, (local,), 0.0, (), 0, True))
+    """What the fit adds for interference per mm of (pitch, pupil) and unit of light, and differences of kernels."""
+    problem, theta = problem_of(scene, prior, shots, True), prior.mean
+    own = np.zeros((1, shots.position.tolist().count(0), 6))
+    (block,) = problem.with_corrections(Place(theta, own)).blocks
     wanted = []
-    for number, step_mm in ((PUPIL, 0.002), (PITCH, 0.0004)):
+    for number, step_mm in ((PITCH, 0.0004), (PUPIL, 0.002)):
         lit = []
         for move in (step_mm, -step_mm):
             other = theta.copy()
             other[number] += move
             # The kernel of the same numbers: what changes is the overlaps.
-            kernel = kernel_coefficients(evaluator, theta, block, overlaps_of(evaluator, other, block.frame))
-            lit.append(np.asarray(unit_light(evaluator, block, local.offset_px, kernel)))
+            changed = replace(block, overlaps=np.asarray(overlaps_of(problem.evaluator, other, block.frame)))
+            kernel = problem.coefficients(theta, changed)
+            lit.append(np.asarray(unit_light(problem.evaluator, block, own[0, :, :2], kernel)))
         wanted.append((lit[0] - lit[1]) / (2 * step_mm))
-    return np.stack([block.overlap_slope, block.pitch_slope]), np.stack(wanted)
+    return np.moveaxis(np.asarray(block.by_overlaps), -1, 0), np.stack(wanted)
 
 
 def test_a_step_makes_spectra_grow_by_what_it_says() -> None:
@@ -121,19 +133,18 @@ def with_pitch_tolerance(rig: RigDescription, share: float) -> RigDescription:
 
 
 def test_a_pitch_that_may_be_far_off_takes_more_wavelengths(scene: Scene) -> None:
-    assert wavelengths_nm(scene.rig) is WAVELENGTHS_NM
-    wide = wavelengths_nm(with_pitch_tolerance(scene.rig, 0.25))
+    assert wavelengths_nm(scene.rig, PsfRules()) is WAVELENGTHS_NM
+    wide = wavelengths_nm(with_pitch_tolerance(scene.rig, 0.25), PsfRules())
     assert (wide[0], wide[-1]) == (300.0, 875.0)
     np.testing.assert_allclose(np.diff(wide), 25.0)
 
 
 def test_a_pitch_of_which_nothing_is_known_is_said(scene: Scene, shots: Shots) -> None:
     rig = with_pitch_tolerance(scene.rig, 0.7)
-    result = fit_shots(shots, rig, scene.geometry, scene.wire, Effort(half_px=_HALF, close_px=_HALF))
+    rules = PsfRules(half_px=_HALF, close_px=_HALF)
+    result = fit_psf(PsfData(shots), rig, scene.geometry, scene.wire, rules)
     assert result.status is FitStatus.POOR_FIT
     assert "0.63 ± 0.441 mm" in result.notes[0]
     assert np.isfinite(np.asarray(result.term.diffraction.spectrum)).all()
-    assert (
-        fit_shots(shots.pick(shots.position < 2), scene.rig, scene.geometry, scene.wire).status
-        is FitStatus.TOO_FEW_DATA
-    )
+    few = PsfData(shots.pick(shots.position < 2))
+    assert fit_psf(few, scene.rig, scene.geometry, scene.wire).status is FitStatus.TOO_FEW_DATA
