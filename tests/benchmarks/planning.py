@@ -35,7 +35,7 @@ from udccal.fitting.backscatter.posterior import term_posterior
 from udccal.fitting.backscatter.solve import Problem
 from udccal.fitting.geometry.boards import projection_sigma_px
 from udccal.planning.forecast import predictor_for
-from udccal.planning.state import Unexplained, measured_state, sensor_samples
+from udccal.planning.state import ModelErrors, measured_state, sensor_samples
 from udccal.rig import Captures, RigDescription, load_rig
 from udccal.sessions.schema import TermName
 from udccal.sessions.store import Session
@@ -113,8 +113,8 @@ def compared(term: TermName, designs: list[tuple[str, Captures, Obtained]]) -> l
     first = designs[0][2]
     state = measured_state(first.session.rig, first.calibration)
     # A corner's scatter goes for its noise, whatever it comes from.
-    known = state.unexplained
-    by_noise = replace(state, unexplained=Unexplained(on_jig_px=known.on_jig_px, by_hand_px=known.by_hand_px))
+    known = state.model_errors
+    by_noise = replace(state, model_errors=ModelErrors(on_jig_px=known.on_jig_px, by_hand_px=known.by_hand_px))
     predictor = predictor_for(term, by_noise)
     rows = []
     for name, captures, made in designs:

@@ -94,7 +94,7 @@ class BackscatterPredictor:
     def floor(self) -> Floor:
         """What a profile's fit found its model to leave out, of a new picture's peak; nothing where there is none."""
         nothing = np.full(self._mask.shape, _NEXT_TO_NOTHING)
-        explained = self._state.unexplained.backscatter == 0
+        explained = self._state.model_errors.backscatter == 0
         return Floor(
             0.0 if explained else self._light_sigma(_Noise(nothing, nothing, nothing, _MANY)),
             "That much of the light the fit of the present profile could not describe; no further picture changes it.",
@@ -106,7 +106,7 @@ class BackscatterPredictor:
         rest[-1] = noise.dark
         light = self._mask * self._ratio
         samples = replace(self._samples, light=light, shot=np.broadcast_to(noise.shot, light.shape), rest=rest)
-        error = self._state.unexplained.backscatter
+        error = self._state.model_errors.backscatter
         weight = samples.weights(light, self._mask, error, samples.usable)
         shown = weight[1 : _NEW.start]
         shown *= np.sqrt(noise.pictures / len(shown))
@@ -114,7 +114,7 @@ class BackscatterPredictor:
         profile = Profile.of(self._ratio, samples, weight)
         jacobian = np.sqrt(count) * profile.jacobian(self._jacobian).reshape(len(self._x), -1).T
         equations = Blocks.of_errors(np.zeros(len(jacobian)), jacobian).with_prior(self._prior, self._x)
-        cov = equations.cov() * self._state.unexplained.inflation
+        cov = equations.cov() * self._state.model_errors.inflation
         variance = profile.light_variance(self._ratio, self._jacobian, cov)[_NEW] + (error * self._mask) ** 2
         peak = light[_NEW].max(axis=(1, 2))
         return 100.0 * float(np.sqrt(variance.mean() / (peak**2).mean()))

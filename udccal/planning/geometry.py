@@ -159,9 +159,9 @@ def _planned_view(state: RigState, field: EvenField, step: PlannedStep, board: B
     if depth <= 0 or good.sum() < _RULES.least_corners:
         return None
     known, common = (
-        (state.unexplained.on_jig_px, _ON_JIG_PX)
+        (state.model_errors.on_jig_px, _ON_JIG_PX)
         if board.parallel_to_panel
-        else (state.unexplained.by_hand_px, _BY_HAND_PX)
+        else (state.model_errors.by_hand_px, _BY_HAND_PX)
     )
     sigma = np.hypot(_noise_px(state, field, step, image[good], radius), common if known is None else known)
     pose = np.concatenate([rotation.as_rotvec(), origin])

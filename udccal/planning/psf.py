@@ -75,7 +75,7 @@ class PsfPredictor:
     def floor(self) -> Floor:
         """All that the fit looks at, endlessly bright."""
         most, shots = _EXPOSURES.set(self._state.rig.captures, _EXPOSURES.most), _RULES.positions * _RULES.shifts
-        if self._state.unexplained.psf_kernel**2 > self._of_noise(most, shots):
+        if self._state.model_errors.psf_kernel**2 > self._of_noise(most, shots):
             why = "That much of the kernel the fit of the present profile could not describe; no capture changes it."
         else:
             why = (
@@ -92,7 +92,7 @@ class PsfPredictor:
         return used if positions >= _FEWEST_POSITIONS else 0
 
     def _kernel_sigma(self, captures: Captures, shots: int) -> float:
-        return 100.0 * float(np.sqrt(self._of_noise(captures, shots) + self._state.unexplained.psf_kernel**2))
+        return 100.0 * float(np.sqrt(self._of_noise(captures, shots) + self._state.model_errors.psf_kernel**2))
 
     def _of_noise(self, captures: Captures, shots: int) -> float:
         """Squared relative L2 error of the kernel by noise, mean over places and colours."""
@@ -127,7 +127,7 @@ def _merged(state: RigState, block: Block, step: PlannedStep) -> Block:
         variance = sample_variance_e(state, signal_e, exposure_s)
         known += np.where(signal_e < state.full_well_e, (full_e * ratio) ** 2 / variance, 0.0)
     known /= 1 + known * (float(np.asarray(state.noise.PRNU1288)) * light) ** 2
-    return weighed(replace(block, known=known * (np.asarray(block.known) > 0)), state.unexplained.psf)
+    return weighed(replace(block, known=known * (np.asarray(block.known) > 0)), state.model_errors.psf)
 
 
 def _relative(block: Block) -> Block:

@@ -7,7 +7,7 @@ from typing import Any, final
 
 import jax
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from scipy.ndimage import map_coordinates
 
 from udccal.arrangements import Arrangement, Board, Dark, FlatLight, Led, PanelPicture, Photograph
@@ -41,8 +41,8 @@ _wire_values = jax.jit(wire_values, static_argnums=(2, 3))
 
 @final
 @dataclass(frozen=True)
-class Unexplained:
-    """What noise does not explain, as a profile's fits have found it.
+class ModelErrors:
+    """What the models leave undescribed, beside noise, as a profile's fits have found it.
 
     Attributes:
         on_jig_px, by_hand_px: scatter of a board's corners by axis beside noise; None where not known.
@@ -70,7 +70,7 @@ class RigState:
         rig: with the captures that are looked at.
         noise, geometry: as expected.
         wire, psf, backscatter: as a profile has measured them; None: as built.
-        unexplained: errors beside noise.
+        model_errors: errors beside noise.
     """
 
     rig: RigDescription
@@ -79,7 +79,7 @@ class RigState:
     wire: Wire | None = None
     psf: PsfField | None = None
     backscatter: Backscatter | None = None
-    unexplained: Unexplained = Unexplained()
+    model_errors: ModelErrors = ModelErrors()
 
     def of(self, rig: RigDescription) -> RigState:
         """The same of another description."""
@@ -126,7 +126,7 @@ def measured_state(rig: RigDescription, fits: Calibration | Profile) -> RigState
         wire=fits.wire.term if _converged(fits.wire) else None,
         psf=fits.psf.term if _converged(fits.psf) else None,
         backscatter=fits.backscatter.term if _converged(fits.backscatter) else None,
-        unexplained=Unexplained(
+        model_errors=ModelErrors(
             on_jig_px=_corners_px(fits.geometry, ON_JIG) if geometry_seen else None,
             by_hand_px=_corners_px(fits.geometry, BY_HAND) if geometry_seen else None,
             wire=_diagnostic(fits.wire, "wire_map_model_sigma") / 100,
@@ -200,14 +200,10 @@ class EvenField:
         places = (pixels / (self._size - 1) * (np.array(_FIELD_GRID[::-1]) - 1)).T[::-1]
         return np.asarray(map_coordinates(self._grid, places, order=1, mode="nearest"))
 
-    def channels(self, pixels: Float[np.ndarray, "n 2"]) -> Int[np.ndarray, " n"]:
-        """Colour (0, 1, 2 for R, G, B) of the samples at pixels."""
-        x, y = np.round(pixels).astype(np.int64).T
-        return np.asarray(self._cell[y % 2, x % 2])
-
     def signal(self, pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
         """What samples of a white field give, 1 for the brightest of all."""
-        return np.asarray(self.at(pixels) * (np.array(WHITE) / max(WHITE))[self.channels(pixels)])
+        x, y = np.round(pixels).astype(np.int64).T
+        return np.asarray(self.at(pixels) * (np.array(WHITE) / max(WHITE))[self._cell[y % 2, x % 2]])
 
 
 def _by_field_angle(state: RigState, pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:

@@ -100,7 +100,7 @@ class WirePredictor:
         pixels = eqx.tree_at(lambda p: p.weight, self._pixels, weight)
         information, _, _ = WireProblem("wire, planned", self._parameters, pixels, self._prior).sums(self._x)
         cov = scaled_inverse(information + self._prior.precision)
-        return 100.0 * self._jacobian.sigma(cov, self._state.unexplained.wire if model is None else model)
+        return 100.0 * self._jacobian.sigma(cov, self._state.model_errors.wire if model is None else model)
 
 
 def _expected(state: RigState, pixels: Pixels) -> tuple[Parameters, Float[np.ndarray, " n"]]:

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from tests.benchmarks.psf_scene import frames_of, small_scene
 from udccal.fitting.hdr.merge import HdrMerge
 from udccal.fitting.psf.data import Shots, shot_noise
-from udccal.fitting.psf.samples import Block, choose_samples
+from udccal.fitting.psf.samples import Block, choose_samples, for_all_samples
 from udccal.fitting.psf.start import PsfRules
 from udccal.fitting.psf.weights import (
     estimate_model_error,
@@ -63,6 +63,17 @@ def noisy(rng: np.random.Generator, model_error: float = 0.0) -> tuple[np.ndarra
     sigma = np.hypot(np.hypot(0.005 * light, 30.0), left_out(light, model_error))
     noise = np.hypot(0.005 * light, 30.0) ** 2
     return light, block_of(light + sigma * rng.standard_normal(light.shape), noise)
+
+
+def test_samples_drawn_away_from_a_pictures_peak_stand_for_its_others() -> None:
+    block, rules = block_of(light_of(), np.ones((SHOTS, SAMPLES))), PsfRules(peak_half_px=(4, 2), far_share=0.25)
+    # Each picture has its peak elsewhere in the order of the samples.
+    apart = 3.0 * np.arange(SHOTS)[:, None, None] * np.array([1.0, 0.0])
+    weight = np.asarray(for_all_samples(replace(block, points=np.asarray(block.points) - apart), rules).weight)
+    x, y = np.arange(SAMPLES) % 20, np.arange(SAMPLES) // 20
+    for shot in range(SHOTS):
+        near = (np.abs(x - 3 * shot) <= 2) & (y <= 4)
+        np.testing.assert_array_equal(weight[shot], np.where(near, 1.0, 4.0))
 
 
 @pytest.mark.parametrize("true", [0.003, 0.015, 0.08])
