@@ -21,9 +21,9 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from tests.benchmarks.efficiency.backscatter import predicted_light
-from tests.benchmarks.psf_wave_optics import coverage as psf_coverage
 from tests.benchmarks.readme_tables import between
+from tests.scenes.backscatter import predicted_light
+from tests.scenes.psf_wave_optics import coverage as psf_coverage
 from udccal.benches.bench import simulated_bench
 from udccal.benches.capture import capture
 from udccal.calibration import FitEffort, Foundation, fit_foundation

@@ -20,10 +20,10 @@ from typing import final, get_args
 
 import numpy as np
 
-from tests.benchmarks.efficiency.backscatter import predicted_light
 from tests.benchmarks.planning_psf import Compared, compared_psf
 from tests.benchmarks.readme_tables import between
 from tests.benchmarks.rows import Row, table, write_json
+from tests.scenes.backscatter import predicted_light
 from udccal.benches.bench import simulated_bench, simulated_rig
 from udccal.benches.capture import capture
 from udccal.calibration import Calibration, calibrate

@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from procedures.psf import led_positions_px
 from tests.benchmarks.psf_kernels import kernel_and_slopes
-from tests.benchmarks.psf_scene import DISC_PX, Scene, pictures, shots_of, small_scene
+from tests.scenes.psf import DISC_PX, Scene, pictures, shots_of, small_scene
 from udccal.arrangements import Led
 from udccal.calibration import FitEffort
 from udccal.fitting.engine.gaussian import Prior

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float
 
 from tests.benchmarks.rows import Row, at_most
+from tests.scenes.psf_wave_optics import held_out_positions
 from udccal.displays.pictures import face_picture
 from udccal.models.backscatter import backscatter_rate as fitted_backscatter
 from udccal.models.geometry import project_directions, tilt_rad
@@ -16,7 +16,6 @@ from udccal.profiles.profile import Profile
 from udccal.simulation import backscatter, psf, wire
 from udccal.simulation.truth import RigTruth, pixels_to_directions
 
-_PSF_PLACES = 8
 _VISIBLE = 1e-4
 _BACKSCATTER_SEEDS = (7001, 7002, 7003, 7004, 7005)
 
@@ -37,14 +36,6 @@ def _wire_rows(profile: Profile, truth: RigTruth) -> list[Row]:
     true = wire.wire_map(truth)
     ratio = np.asarray(fitted_wire(profile.wire.term, *true.shape)) / true
     return [at_most("wire map, RMS", 100 * float(np.sqrt(np.mean((ratio - 1) ** 2))), 0.05, "%")]
-
-
-def held_out_positions(truth: RigTruth) -> Float[np.ndarray, "n 2"]:
-    """Places spread over the sensor that no capture used: random fractions of a pixel included."""
-    camera = truth.description.camera
-    index = np.arange(1, _PSF_PLACES + 1)[:, None]
-    spread = np.mod(0.5 + index * np.array([0.7548776662, 0.5698402910]), 1.0)
-    return (0.04 + 0.92 * spread) * np.array([camera.columns - 1.0, camera.rows - 1.0])
 
 
 def _psf_rows(profile: Profile, truth: RigTruth) -> list[Row]:

@@ -19,7 +19,7 @@ from udccal.fitting.engine.gaussian import Prior, scaled_inverse
 from udccal.fitting.psf.data import Shots, held_out_positions
 from udccal.fitting.psf.kernel import Evaluator, fit_lattice
 from udccal.fitting.psf.problem import DiffractionProblem, Place
-from udccal.fitting.psf.samples import Block, blocks, choose_samples, for_all_samples
+from udccal.fitting.psf.samples import Block, blocks, choose_samples, stands_for
 from udccal.fitting.psf.start import PsfRules, start_model, start_prior, wire_shows
 from udccal.fitting.psf.weights import weighed
 from udccal.numerics import in_float64
@@ -53,11 +53,12 @@ class PsfPredictor:
         self._prior = start_prior(state.rig, start, wire_shows(wire))
         half = _half(state.rig.captures)
         evaluator = Evaluator(np.asarray(start.wavelengths_nm), fit_lattice(_RULES.close(half)), wire_shows(wire))
-        problem, place = _expected(state, half, evaluator, self._prior)
+        shots = _dark_shots(state, half)
+        problem, place = _expected(state, shots, evaluator, self._prior)
         field, field_place = _part(problem, place, slice(len(_FIELD)))
         self._captured, self._place = _part(problem, place, slice(len(_FIELD), None))
         # At weights that make every colour's kernel count 1, the equations hold its squared derivatives.
-        relative = tuple(_relative(block) for block in field.blocks)
+        relative = tuple(_relative(block, shots) for block in field.blocks)
         self._of_kernel = _per_shot([one.shared for one in replace(field, blocks=relative).by_position(field_place)])
         self._known: dict[tuple[float, ...], Float[np.ndarray, "p p"]] = {}
 
@@ -130,19 +131,15 @@ def _merged(state: RigState, block: Block, step: PlannedStep) -> Block:
     return weighed(replace(block, known=known * (np.asarray(block.known) > 0)), state.model_errors.psf)
 
 
-def _relative(block: Block) -> Block:
+def _relative(block: Block, shots: Shots) -> Block:
     """At weights by which squared errors of light sum up to the squared relative L2 error, mean over colours."""
-    even = for_all_samples(replace(block, weight=np.asarray(block.known)), _RULES)
-    share, light, colour = (np.asarray(part) for part in (even.weight, block.rate, block.colour))
-    size = np.einsum("sn,snc,sn->sc", light**2, colour, share)
-    return replace(block, weight=share * np.einsum("snc,sc->sn", colour, 1 / size) / 3)
+    count, light, colour = stands_for(shots, _RULES)[block.index], np.asarray(block.rate), np.asarray(block.colour)
+    size = np.einsum("sn,snc,sn->sc", light**2, colour, count)
+    return replace(block, weight=count * np.einsum("snc,sc->sn", colour, 1 / size) / 3)
 
 
-def _expected(
-    state: RigState, half: tuple[int, int], evaluator: Evaluator, prior: Prior
-) -> tuple[DiffractionProblem, Place]:
+def _expected(state: RigState, shots: Shots, evaluator: Evaluator, prior: Prior) -> tuple[DiffractionProblem, Place]:
     """What the diffraction fit would be given of each place; light is that of its start, 1 for the brightest sample."""
-    shots = _dark_shots(state, half)
     made = blocks(shots, state.geometry, choose_samples(shots, _RULES, _RULES.far_share))
     problem = DiffractionProblem(made, evaluator, prior).with_overlaps(prior.mean)
     own = np.tile([0.0, 0.0, *WHITE, 0.0], (shots.positions, len(_SHIFTS_PX), 1))

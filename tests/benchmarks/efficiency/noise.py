@@ -6,128 +6,22 @@ the figures is of a term that is there.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
 from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, UInt16
+from jaxtyping import Array, Float
 
 from tests.benchmarks.efficiency.trials import Trials, column
+from tests.scenes.noise import ToySensor, expose, measure, patterns, truth
 from udccal.fitting.engine.information import cramer_rao, fisher_information
-from udccal.fitting.noise import ExposureLevel, NoiseData, NoiseRules, SpatialStack, codes, fit_noise
-from udccal.fitting.noise.codes import NORMAL_SHAPE, excess_kurtosis, tukey_lambda_std
+from udccal.fitting.noise import NoiseRules, codes
+from udccal.fitting.noise.codes import excess_kurtosis
 from udccal.fitting.noise.data import DarkPair, dark_pair
 from udccal.fitting.noise.transfer import temporal_variance
-from udccal.models.noise import Noise
-from udccal.result import FitResult
 
 _REALISATIONS = 1000
-
-
-@dataclass(frozen=True)
-class ToySensor:
-    """A sensor and how it is measured; noise is drawn in electrons, then K, row noise, rounding and clipping."""
-
-    rows: int = 96
-    columns: int = 128
-    K_DN_per_e: float = 0.36
-    black_DN: float = 64.0
-    full_well_e: float = 10_000.0
-    read_e: float = 4.0
-    lambda_read: float | None = 0.05
-    row_DN: float = 0.4
-    dark_e_per_s: float = 40.0
-    DSNU_e: float = 3.0
-    PRNU: float = 0.008
-    bend: float = 0.02
-    bits: int = 12
-    flux_e_per_s: float = 50_000.0
-    flicker: float = 0.0
-    lamp: float = 1.0
-    levels: tuple[float, ...] = (0.04, 0.12, 0.22, 0.32, 0.42, 0.52, 0.62, 0.72, 0.82, 1.4)
-    dark_times_s: tuple[float, ...] = (0.01, 0.05, 0.1, 0.3, 0.6, 1.0)
-    stack_level: float = 0.5
-    stack_frames: int = 8
-
-    @property
-    def shape(self) -> float:
-        """Of the read noise; None stands for normal noise."""
-        return NORMAL_SHAPE if self.lambda_read is None else self.lambda_read
-
-    def exposure_s(self, level: float) -> float:
-        """Time that fills the well to this fraction."""
-        return level * self.full_well_e / self.flux_e_per_s
-
-
-@dataclass(frozen=True)
-class Patterns:
-    """What one sensor keeps from frame to frame."""
-
-    response: Float[np.ndarray, "rows columns"]
-    offset_e: Float[np.ndarray, "rows columns"]
-
-
-def patterns(sensor: ToySensor, rng: np.random.Generator) -> Patterns:
-    """Fixed patterns of one sensor of this kind."""
-    shape = (sensor.rows, sensor.columns)
-    return Patterns(1 + sensor.PRNU * rng.standard_normal(shape), sensor.DSNU_e * rng.standard_normal(shape))
-
-
-def expose(
-    sensor: ToySensor, fixed: Patterns, exposure_s: float, lit: bool, rng: np.random.Generator
-) -> UInt16[np.ndarray, "rows columns"]:
-    """One frame."""
-    shape = fixed.response.shape
-    light = sensor.lamp * sensor.flux_e_per_s * (1 + sensor.flicker * rng.standard_normal()) if lit else 0.0
-    mean = exposure_s * (np.maximum(light * fixed.response, 0.0) + sensor.dark_e_per_s)
-    counts = rng.poisson(mean).astype(np.float64)
-    bent = np.minimum(counts * (1 - sensor.bend * counts / sensor.full_well_e), sensor.full_well_e)
-    signal = bent + fixed.offset_e + sensor.read_e * _read_noise(sensor.lambda_read, shape, rng)
-    codes = sensor.black_DN + sensor.K_DN_per_e * signal + sensor.row_DN * rng.standard_normal((shape[0], 1))
-    return np.clip(np.rint(codes), 0, 2**sensor.bits - 1).astype(np.uint16)
-
-
-def _read_noise(
-    shape: float | None, size: tuple[int, ...], rng: np.random.Generator
-) -> Float[np.ndarray, "rows columns"]:
-    if shape is None:
-        return rng.standard_normal(size)
-    p = rng.random(size)
-    return (p**shape - (1 - p) ** shape) / shape / tukey_lambda_std(shape)
-
-
-def measure(sensor: ToySensor, seed: int) -> FitResult[Noise]:
-    """Capture a new sensor of this kind and fit it through the public API."""
-    rng = np.random.default_rng([seed, 77])
-    fixed = patterns(sensor, rng)
-    shoot = partial(expose, sensor, fixed, rng=rng)
-    levels = []
-    for level in sensor.levels:
-        t = sensor.exposure_s(level)
-        levels.append(ExposureLevel(t, bright=(shoot(t, True), shoot(t, True))))
-    levels += [ExposureLevel(t, dark=(shoot(t, False), shoot(t, False))) for t in sensor.dark_times_s]
-    t = sensor.exposure_s(sensor.stack_level)
-    dark, bright = ([shoot(t, lit) for _ in range(sensor.stack_frames)] for lit in (False, True))
-    return fit_noise(NoiseData(levels, SpatialStack(t, dark, bright), top_code=2**sensor.bits - 1))
-
-
-def truth(sensor: ToySensor) -> dict[str, float]:
-    """The estimates' true values, by name."""
-    full = min(sensor.black_DN + sensor.K_DN_per_e * sensor.full_well_e, 2.0**sensor.bits - 1)
-    return {
-        "K_DN_per_e": sensor.K_DN_per_e,
-        "black_DN": sensor.black_DN,
-        "saturation_DN": full,
-        "sigma_d_e": float(np.hypot(sensor.read_e, sensor.row_DN / sensor.K_DN_per_e)),
-        "lambda_read": sensor.shape,
-        "sigma_row_DN": sensor.row_DN,
-        "dark_current_e_per_s": sensor.dark_e_per_s,
-        "DSNU1288_e": sensor.DSNU_e,
-        "PRNU1288": sensor.PRNU,
-        "nonlinearity": sensor.bend * (full - sensor.black_DN) / (sensor.K_DN_per_e * sensor.full_well_e),
-    }
 
 
 # Parameters of the bound: K, V0, c, A, sigma_row^2, black, dark current, DSNU, PRNU, well (all DN), this sensor's mean
@@ -245,37 +139,3 @@ def trials(share: float) -> list[Trials]:
         errors, sigmas = [e.value - value for e in estimates], [e.sigma for e in estimates]
         found.append(column(f"noise/{name}", errors, sigmas, bound[name]))
     return found
-
-
-def right_orders(share: float) -> tuple[int, int]:
-    """Of sensors with and without each term, how many were found to have just the terms they have; and of how many."""
-    rng = np.random.default_rng(1)
-    count, right = max(20, int(share * 100)), 0
-    for seed in range(count):
-        there = rng.random(6) < 0.5
-        sensor = sensor_with(there)
-        right += chosen_terms(measure(sensor, 10_000 + seed)) == tuple(there.tolist())
-    return right, count
-
-
-def sensor_with(there: np.ndarray) -> ToySensor:
-    """The toy sensor with some of: row noise, heavy tails, dark current, DSNU, PRNU, curvature."""
-    full = ToySensor()
-    return replace(
-        full,
-        row_DN=full.row_DN if there[0] else 0.0,
-        lambda_read=full.lambda_read if there[1] else None,
-        dark_e_per_s=full.dark_e_per_s if there[2] else 0.0,
-        DSNU_e=full.DSNU_e if there[3] else 0.0,
-        PRNU=full.PRNU if there[4] else 0.0,
-        bend=full.bend if there[5] else 0.0,
-    )
-
-
-def chosen_terms(result: FitResult[Noise]) -> tuple[bool, ...]:
-    """The same six, as the fit has them; another order of the light than steady and without offset counts as wrong."""
-    chosen = [candidate.name for candidate in result.candidates if candidate.chosen]
-    starts = ("with row", "with read", "with dark", "with DSNU", "with PRNU")
-    curved = {"response: linear": (False,), "response: curved": (True,)}
-    response = next(name for name in chosen if name.startswith("response"))
-    return (*(any(name.startswith(start) for name in chosen) for start in starts), *curved.get(response, ()))

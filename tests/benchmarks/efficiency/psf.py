@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from tests.benchmarks.efficiency.trials import Trials
 from tests.benchmarks.psf_kernels import kernel_and_slopes, light_and_slopes
-from tests.benchmarks.psf_scene import Picture, Scene, pictures, shots_of, small_scene
+from tests.scenes.psf import Picture, Scene, pictures, shots_of, small_scene
 from udccal.fitting.engine.gaussian import Prior, scaled_inverse
 from udccal.fitting.engine.information import cramer_rao
 from udccal.fitting.psf.diffraction import fit_diffraction

@@ -19,10 +19,8 @@ from udccal.fitting.engine.information import cramer_rao, fisher_information
 from udccal.fitting.psf_stamps.data import Stamps
 from udccal.fitting.psf_stamps.field import PlaneField, see, warps
 from udccal.fitting.psf_stamps.fit import fit_psf_stamps
-from udccal.fitting.psf_stamps.log_prior import by_degree
-from udccal.fitting.psf_stamps.orders import Orders
-from udccal.fitting.psf_stamps.prior import envelope
-from udccal.fitting.psf_stamps.start import grid_size
+from udccal.fitting.psf_stamps.orders import Orders, grid_size
+from udccal.fitting.psf_stamps.probability import by_degree, envelope
 from udccal.numerics import in_float64
 
 STARS, SIZE, NODES, READ_E, ORDERS = 20, 11, 18, 4.0, Orders(2, 1, 1.0)
@@ -84,7 +82,7 @@ def make_truth(rng: np.random.Generator) -> Truth:
     draw = np.linalg.cholesky(np.linalg.inv(prior_matrix(base, IMAGE[1])))
     images = (draw @ rng.standard_normal((NODES**2, 2))).T.reshape(2, NODES, NODES)
     while True:
-        warp = rng.standard_normal((5, 2, 2)) / np.sqrt(by_degree(MAP, 20)).reshape(5, 2, 2)
+        warp = rng.standard_normal((5, 2, 2)) / np.sqrt(MAP[by_degree(MAP, 4)]).reshape(5, 2, 2)
         field = PlaneField(np.stack([base, *images]), warp, np.zeros((0, 2)), 1, 2, 0, 1.0)
         # The model class is that of the nodes: those of the fit, whose number follows from the map, are the truth's.
         if grid_size((SIZE, SIZE), 1.0, reach(field, unit)) == (NODES, NODES):
@@ -145,7 +143,7 @@ def at_best(truth: Truth) -> tuple[Float[np.ndarray, " q"], Float[np.ndarray, " 
     information = fisher_information(expected, x, truth.field, truth.unit)
     base = np.asarray(truth.field.nodes[0])
     first, second = prior_matrix(base, IMAGE[0]), prior_matrix(base, IMAGE[1])
-    prior = block_diag(first, second, second, np.diag(by_degree(MAP, 20)))
+    prior = block_diag(first, second, second, np.diag(MAP[by_degree(MAP, 4)]))
     information[: len(prior), : len(prior)] += prior
     args = (truth.field, jnp.asarray(truth.unit), jnp.asarray(truth.window_px))
     slopes = np.asarray(jax.jacfwd(wanted)(jnp.asarray(x), *args))

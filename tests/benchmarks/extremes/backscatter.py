@@ -9,16 +9,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from tests.benchmarks.efficiency.backscatter import (
-    EXPOSURE_S,
-    RULES,
-    World,
-    panel_pictures,
-    shots_of,
-    small_rig,
-    world_at,
-)
 from tests.benchmarks.extremes.case import Case, Outcome, outcome
+from tests.scenes.backscatter import EXPOSURE_S, RULES, World, panel_pictures, shots_of, small_rig, world_at
 from udccal.fitting.backscatter import BackscatterData, fit_backscatter
 from udccal.fitting.backscatter.data import Binned
 from udccal.fitting.backscatter.parameters import TWO_PLANES, prior_of

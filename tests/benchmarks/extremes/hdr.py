@@ -10,7 +10,6 @@ import numpy as np
 from tests.benchmarks.extremes.case import Case, Outcome
 from udccal.fitting.hdr.merge import UNKNOWN_SIGMA, merge_bracket
 from udccal.models.noise import Noise
-from udccal.result import FitStatus
 
 _TIMES = 1e-4 * 4.0 ** np.arange(8)
 _PIXELS, _GROUPS = 8000, 20
@@ -35,7 +34,7 @@ def _merged(sensor: Noise, rates: tuple[float, float], times: np.ndarray = _TIME
     finite = bool(np.isfinite(merged.rate_e_per_s).all() and np.isfinite(merged.sigma_e_per_s).all())
     if not merged.used.any():
         unknown = bool(np.all(merged.sigma_e_per_s == UNKNOWN_SIGMA))
-        return Outcome(FitStatus.SATURATED, np.zeros(0), finite, "every sigma says unknown" if unknown else "")
+        return Outcome(merged.status, np.zeros(0), finite, "every sigma says unknown" if unknown else "")
     error = (merged.rate_e_per_s - rate).reshape(_GROUPS, -1)
     sigma = np.sqrt(np.mean(merged.sigma_e_per_s.reshape(_GROUPS, -1) ** 2, axis=1, keepdims=True))
     z, size = error / sigma, error.shape[1]
@@ -43,7 +42,7 @@ def _merged(sensor: Noise, rates: tuple[float, float], times: np.ndarray = _TIME
     # In units of their own errors; offsets of less than a tenth of a pixel's sigma are within its error bars.
     off = np.where(np.abs(offsets) < 0.1, 0.0, offsets * np.sqrt(size))
     wide = np.where(np.abs(spreads) < 0.1, 0.0, spreads * np.sqrt(2 * size))
-    return Outcome(FitStatus.CONVERGED, np.concatenate([off, wide]), finite, "")
+    return Outcome(merged.status, np.concatenate([off, wide]), finite, "")
 
 
 def _case(name: str, sensor: Noise, rates: tuple[float, float], times: np.ndarray = _TIMES) -> Case:

@@ -6,29 +6,12 @@ import functools
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float
 
-from tests.benchmarks.efficiency.noise import ToySensor, expose, measure, patterns, truth
 from tests.benchmarks.extremes.case import Case, Outcome, outcome
+from tests.scenes.noise import PLAIN, ToySensor, errors_in_sigma, expose, measure, patterns
 from udccal.fitting.noise import ExposureLevel, NoiseData, SpatialStack, fit_noise
-from udccal.models.noise import Noise
-from udccal.result import FitResult
 
 _DIM = tuple(np.geomspace(1.0, 60.0, 8) / 10_000)
-# Light enough to have no curvature to speak of; a shorter way than the efficiency bench's.
-PLAIN = ToySensor(lambda_read=None, bend=0.0)
-
-
-def errors_in_sigma(result: FitResult[Noise], sensor: ToySensor) -> Float[np.ndarray, " n"]:
-    """Of every estimate that has a true value; one stated as certain must be right."""
-    z = []
-    for name, value in truth(sensor).items():
-        found = next((item for item in result.estimates if item.name == name), None)
-        if found is None:
-            continue
-        # What rounding leaves of the shape is known to its prior alone, and a saturation of codes is exact.
-        z.append((found.value - value) / found.sigma if found.sigma > 0 else 1e6 * float(found.value != value))
-    return np.array(z)
 
 
 def _measured(sensor: ToySensor, seed: int = 0) -> Outcome:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from tests.benchmarks.extremes.case import Case, Outcome, outcome
-from tests.benchmarks.psf_scene import Scene, pictures, shots_of, small_scene
+from tests.scenes.psf import Scene, pictures, shots_of, small_scene
 from udccal.fitting.psf.data import PsfData
 from udccal.fitting.psf.fit import fit_psf
 from udccal.fitting.psf.kernel import BLUR

@@ -8,11 +8,14 @@ from dataclasses import replace
 import jax
 import numpy as np
 
-from tests.benchmarks.efficiency.wire import (
+from tests.benchmarks.extremes.case import MOST_SINGLE, Case, Outcome, outcome
+from tests.scenes.wire import (
     COLUMNS,
     ELECTRONS,
     ROWS,
+    SEED,
     Flat,
+    constant,
     drawn_truth,
     fitted,
     geometry,
@@ -22,13 +25,11 @@ from tests.benchmarks.efficiency.wire import (
     places,
     start,
 )
-from tests.benchmarks.extremes.case import MOST_SINGLE, Case, Outcome, outcome
 from udccal.fitting.wire import WireStart
 from udccal.models.geometry import Geometry
 from udccal.models.wire import Wire, wire_map
 from udccal.result import FitResult, FitStatus
 
-_SEED = 3
 # Of lenses that still resolve the rows.
 _FAR_FOCAL_PX, _STEEP_FOCAL_PX = 1500.0, 400.0
 
@@ -46,7 +47,7 @@ def of_rig(
 ) -> Outcome:
     """A truth near ``built``, and its fit."""
     lens = lens or geometry()
-    flat = noisy(drawn_truth(_SEED, built, lens, modulated), _SEED, electrons)
+    flat = noisy(drawn_truth(SEED, built, lens, modulated), SEED, electrons)
     return judged(fitted(flat, built, lens), flat)
 
 
@@ -59,7 +60,7 @@ def _rows_only(pupil_per_pitch: float) -> WireStart:
     return replace(start(), pupil_per_pitch=pupil_per_pitch, column_open=0.9995, column_tolerance=1e-4)
 
 
-def wrong_start(standoff: float, pupil: float, seed: int = _SEED) -> Outcome:
+def wrong_start(standoff: float, pupil: float, seed: int = SEED) -> Outcome:
     """The rig description off by these factors."""
     built = start()
     flat = noisy(drawn_truth(seed, built, geometry()), seed)
@@ -71,23 +72,16 @@ def wrong_start(standoff: float, pupil: float, seed: int = _SEED) -> Outcome:
     return judged(fitted(flat, wrong, geometry()), flat)
 
 
-def constant(value: float) -> Outcome:
-    """A flat that is the same everywhere."""
-    signal = np.full((ROWS, COLUMNS), value)
-    flat = Flat(drawn_truth(_SEED, start(), geometry()), signal, np.full(signal.shape, max(value, 1.0)))
-    return outcome(fitted(flat, start(), geometry()))
-
-
 def saturated() -> Outcome:
     """Every pixel above the level from which frames clip."""
     signal = np.full((ROWS, COLUMNS), 4095.0)
-    flat = Flat(drawn_truth(_SEED, start(), geometry()), signal, signal)
+    flat = Flat(drawn_truth(SEED, start(), geometry()), signal, signal)
     return outcome(fitted(flat, start(), geometry(), clip=4000.0))
 
 
 def clipped_middle() -> Outcome:
     """The brightest parts clip, pixel by pixel as their noise has it."""
-    flat = noisy(drawn_truth(_SEED, start(), geometry()), _SEED)
+    flat = noisy(drawn_truth(SEED, start(), geometry()), SEED)
     clip = float(np.quantile(flat.signal, 0.99))
     flat = replace(flat, signal=np.minimum(flat.signal, clip))
     return judged(fitted(flat, start(), geometry(), clip=clip), flat)
@@ -95,7 +89,7 @@ def clipped_middle() -> Outcome:
 
 def single_precision() -> Outcome:
     """The map in float32 against the map in float64, in sigmas of the fit."""
-    flat = noisy(drawn_truth(_SEED, start(), geometry()), _SEED)
+    flat = noisy(drawn_truth(SEED, start(), geometry()), SEED)
     fit = fitted(flat, start(), geometry())
     single = np.asarray(wire_map(fit.term, ROWS, COLUMNS), dtype=np.float64)
     with jax.enable_x64(True):
@@ -129,8 +123,8 @@ CASES: tuple[Case, ...] = (
     ),
     _case("tilt 0°", lambda: of_rig(start(), geometry(0.0))),
     _case("tilt 60°", lambda: of_rig(start(), _narrow(geometry(60.0), _STEEP_FOCAL_PX))),
-    _case("constant flat", lambda: constant(1000.0)),
-    _case("black flat", lambda: constant(0.0)),
+    _case("constant flat", lambda: outcome(constant(1000.0))),
+    _case("black flat", lambda: outcome(constant(0.0))),
     _case("saturated flat", saturated),
     _case("1 % of the flat clipped", clipped_middle),
     _case("10 frames of 1 e⁻", lambda: of_rig(start(), electrons=10.0)),

@@ -6,8 +6,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from tests.benchmarks.efficiency.backscatter import panel_pictures, shots_of, small_rig, world_at
 from tests.benchmarks.growth.cases import Case
+from tests.scenes.backscatter import panel_pictures, shots_of, small_rig, world_at
 from udccal.fitting.backscatter import BackscatterRules, fit_backscatter
 from udccal.fitting.backscatter.parameters import prior_of
 from udccal.rig import RigDescription

@@ -8,8 +8,8 @@ from functools import partial
 
 import numpy as np
 
-from tests.benchmarks.efficiency.noise import ToySensor, expose, patterns
 from tests.benchmarks.growth.cases import Case
+from tests.scenes.noise import ToySensor, expose, patterns
 from udccal.fitting.noise import ExposureLevel, NoiseData, SpatialStack, fit_noise
 
 _COLUMNS, _ROWS, _LEVELS, _STACK = 2048, 384, 10, 8

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from tests.benchmarks.growth.cases import Case
-from tests.benchmarks.psf_scene import pictures, shots_of, small_scene
+from tests.scenes.psf import pictures, shots_of, small_scene
 from udccal.fitting.psf.diffraction import fit_diffraction
 from udccal.fitting.psf.start import PsfRules, start_model, start_prior
 from udccal.numerics import in_float64

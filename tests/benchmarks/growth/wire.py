@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from tests.benchmarks.efficiency.wire import PRNU, SITES, geometry, start
 from tests.benchmarks.growth.cases import Case
+from tests.scenes.wire import PRNU, SITES, geometry, start
 from udccal.fitting.wire import WireData, WireRules, fit_wire
 from udccal.fitting.wire.parameters import ideal_wire, possible_harmonics
 from udccal.models.geometry import Geometry

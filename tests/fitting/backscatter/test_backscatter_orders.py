@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.benchmarks.efficiency.backscatter import (
+from tests.scenes.backscatter import (
     PICTURES,
     RULES,
     Light,

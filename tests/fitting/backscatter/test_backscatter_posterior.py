@@ -8,14 +8,7 @@ import numpy as np
 import pytest
 from scipy.special import expit
 
-from tests.benchmarks.efficiency.backscatter import (
-    PICTURES,
-    RULES,
-    panel_pictures,
-    shots_of,
-    small_rig,
-    world,
-)
+from tests.scenes.backscatter import PICTURES, RULES, panel_pictures, shots_of, small_rig, world
 from udccal.fitting.backscatter.orders import held_out, search
 from udccal.fitting.backscatter.parameters import NAMES, REFLECTION, TWO_PLANES, Moments, prior_of
 from udccal.fitting.backscatter.posterior import moments_along_reflection

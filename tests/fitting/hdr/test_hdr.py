@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from udccal.errors import FitError
-from udccal.fitting.hdr import merge as merging
 from udccal.fitting.hdr.likelihood import merge_block
-from udccal.fitting.hdr.merge import UNKNOWN_SIGMA, merge_bracket
+from udccal.fitting.hdr.merge import UNKNOWN_SIGMA, HdrRules, merge_bracket, sensor_numbers
 from udccal.models.noise import Noise
+from udccal.result import FitStatus
 
 NOISE = Noise(
     K_DN_per_e=0.355,
@@ -68,6 +68,24 @@ def test_a_pixel_saturated_everywhere_is_marked_and_finite() -> None:
     assert np.all(merge.used == 0)
     assert np.all(merge.rate_e_per_s == 0)
     assert np.all(merge.sigma_e_per_s == UNKNOWN_SIGMA)
+    assert merge.status is FitStatus.SATURATED
+    assert merge.notes == ("16 of 16 pixels have no sample that could be used.",)
+
+
+def test_some_saturated_pixels_are_counted_and_the_rest_is_merged() -> None:
+    frames = bracket(1e4, EXPOSURES, 12, (4, 4))
+    frames[:, 1, 2] = 4095
+    merge = merge_bracket(frames, EXPOSURES, NOISE)
+    assert merge.status is FitStatus.CONVERGED
+    assert merge.notes == ("1 of 16 pixels have no sample that could be used.",)
+    assert merge_bracket(frames[:, 2:], EXPOSURES, NOISE).notes == ()
+
+
+def test_rules_decide_what_is_left_out() -> None:
+    frames = bracket(2e3, EXPOSURES, 8, (30, 40))
+    frames[6, 3, 5] = 3000
+    assert merge_bracket(frames, EXPOSURES, NOISE).outliers
+    assert not merge_bracket(frames, EXPOSURES, NOISE, HdrRules(believed_sigma=1e4)).outliers
 
 
 def test_level_near_saturation_is_not_pulled_down() -> None:
@@ -121,10 +139,10 @@ def test_a_frame_of_other_light_is_left_out_and_listed() -> None:
 def test_single_precision_moves_no_rate_by_a_hundredth_of_its_sigma() -> None:
     frames = np.concatenate([bracket(rate, EXPOSURES, 11, (20, 20)) for rate in (0.0, 30.0, 1e3, 1e5, 1e7)], axis=1)
     merge = merge_bracket(frames, EXPOSURES, NOISE)
-    numbers = jax.tree.map(lambda n: np.float64(n), merging._sensor_numbers(NOISE, float(EXPOSURES.max())))
+    numbers = jax.tree.map(lambda n: np.float64(n), sensor_numbers(NOISE, float(EXPOSURES.max()), HdrRules()))
     with jax.enable_x64(True):
         double = jax.tree.map(
-            np.asarray, merge_block(frames.reshape(7, -1), EXPOSURES / EXPOSURES.max(), numbers, None)
+            np.asarray, merge_block(frames.reshape(7, -1), EXPOSURES / EXPOSURES.max(), numbers, None, 6.0)
         )
     off = merge.rate_e_per_s.ravel() - double.rate / EXPOSURES.max()
     assert np.abs(off / merge.sigma_e_per_s.ravel()).max() < 0.01

@@ -11,16 +11,17 @@ import pytest
 from hypothesis import HealthCheck, Phase, example, given, settings
 from hypothesis import strategies as st
 
-from tests.benchmarks.efficiency.noise import (
+from tests.scenes.noise import (
+    PLAIN,
     ToySensor,
     chosen_terms,
+    errors_in_sigma,
     expose,
     measure,
     patterns,
     sensor_with,
     truth,
 )
-from tests.benchmarks.extremes.noise import PLAIN, errors_in_sigma
 from udccal.errors import FitError
 from udccal.fitting.noise import ExposureLevel, NoiseData, NoiseRules, SpatialStack, fit_noise, mean_response
 from udccal.fitting.noise.data import Frame, reduced
@@ -65,7 +66,7 @@ def test_the_terms_that_are_there_are_chosen(seed: int) -> None:
 
 @pytest.mark.slow
 def test_the_right_terms_in_95_of_100_runs() -> None:
-    from tests.benchmarks.efficiency.noise import right_orders
+    from tests.scenes.noise import right_orders
 
     right, count = right_orders(1.0)
     assert right >= 0.95 * count

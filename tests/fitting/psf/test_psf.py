@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.special import ndtr
 
-from tests.benchmarks.psf_wave_optics import seen_by_the_wire, true_geometry
+from tests.scenes.psf_wave_optics import seen_by_the_wire
 from udccal.cameras.protocol import CameraIdentity, Frame, Region, Settings
 from udccal.cfa import channel_map
 from udccal.fitting.absent import absent_wire
@@ -22,6 +22,7 @@ from udccal.fitting.psf.image import shifts
 from udccal.fitting.psf.start import PsfRules, start_model, wire_shows
 from udccal.models.psf import PsfField, psf_kernels
 from udccal.numerics import in_float64
+from udccal.reports.true_values import true_geometry
 from udccal.result import FitResult, FitStatus
 from udccal.rig import RigDescription, load_rig
 from udccal.sessions.captured import SingleFrame

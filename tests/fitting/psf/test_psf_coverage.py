@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tests.benchmarks.psf_wave_optics import COVERED, coverage
+from tests.scenes.psf_wave_optics import COVERED, coverage
 from udccal.fitting.psf.held_out import NONE, KernelError, estimate_kernel_error
 
 SIZES = np.geomspace(1e-5, 1.0, 4000)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.special import softmax
 
-from tests.benchmarks.psf_scene import Scene, pictures, shots_of, small_scene
+from tests.scenes.psf import Scene, pictures, shots_of, small_scene
 from udccal.fitting.engine.gaussian import Prior
 from udccal.fitting.psf.data import PsfData, Shots
 from udccal.fitting.psf.fit import fit_psf

@@ -6,8 +6,8 @@ from collections import Counter
 
 import pytest
 
-from tests.benchmarks import psf_free_orders
-from tests.benchmarks.psf_orders import ENOUGH, KINDS, World, chosen, world
+from tests.scenes import psf_free_orders
+from tests.scenes.psf_orders import ENOUGH, KINDS, World, chosen, world
 
 RUNS = 25
 FREE_RUNS = 8

@@ -10,15 +10,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.benchmarks.psf_scene import frames_of, small_scene
+from tests.scenes.psf import frames_of, small_scene
 from udccal.fitting.hdr.merge import HdrMerge
 from udccal.fitting.psf.data import Shots, shot_noise
-from udccal.fitting.psf.samples import Block, choose_samples, for_all_samples
+from udccal.fitting.psf.samples import Block, choose_samples, stands_for
 from udccal.fitting.psf.start import PsfRules
 from udccal.fitting.psf.weights import (
     estimate_model_error,
     left_out,
-    pattern_test,
+    pattern_p_value,
     sensor_variance,
     weighed,
     without_outliers,
@@ -63,17 +63,6 @@ def noisy(rng: np.random.Generator, model_error: float = 0.0) -> tuple[np.ndarra
     sigma = np.hypot(np.hypot(0.005 * light, 30.0), left_out(light, model_error))
     noise = np.hypot(0.005 * light, 30.0) ** 2
     return light, block_of(light + sigma * rng.standard_normal(light.shape), noise)
-
-
-def test_samples_drawn_away_from_a_pictures_peak_stand_for_its_others() -> None:
-    block, rules = block_of(light_of(), np.ones((SHOTS, SAMPLES))), PsfRules(peak_half_px=(4, 2), far_share=0.25)
-    # Each picture has its peak elsewhere in the order of the samples.
-    apart = 3.0 * np.arange(SHOTS)[:, None, None] * np.array([1.0, 0.0])
-    weight = np.asarray(for_all_samples(replace(block, points=np.asarray(block.points) - apart), rules).weight)
-    x, y = np.arange(SAMPLES) % 20, np.arange(SAMPLES) // 20
-    for shot in range(SHOTS):
-        near = (np.abs(x - 3 * shot) <= 2) & (y <= 4)
-        np.testing.assert_array_equal(weight[shot], np.where(near, 1.0, 4.0))
 
 
 @pytest.mark.parametrize("true", [0.003, 0.015, 0.08])
@@ -156,12 +145,12 @@ def test_noise_has_no_pattern_and_a_common_misfit_has_one() -> None:
     values = []
     for seed in range(60):
         light, block = noisy(np.random.default_rng(seed))
-        values.append(pattern_test((block,), [errors(block, light)]).p_value)
+        values.append(pattern_p_value((block,), [errors(block, light)]))
     assert 0.3 < np.mean(values) < 0.7
     assert np.mean(np.array(values) < 0.05) < 0.2
     light, block = noisy(np.random.default_rng(5))
     wave = 0.005 * light * np.sin(np.arange(SAMPLES) / 7.0)
-    assert pattern_test((block,), [errors(block, light - wave)]).p_value < 1e-6
+    assert pattern_p_value((block,), [errors(block, light - wave)]) < 1e-6
 
 
 def test_samples_are_drawn_as_many_in_every_picture() -> None:
@@ -175,6 +164,12 @@ def test_samples_are_drawn_as_many_in_every_picture() -> None:
     assert (every == 37 * 19).all()
     assert len(set(some.tolist())) == 1
     assert some[0] < every[0]
+    # Those drawn stand for the others of their own picture, to a whole number of them.
+    chosen, count = choose_samples(shots, PsfRules(), 1 / 6), stands_for(shots, PsfRules())
+    far = np.abs(shots.offsets()[..., 0])[None].repeat(3, axis=0)[chosen].reshape(3, -1) > PsfRules().peak_half_px[1]
+    assert count[far] == pytest.approx(6.0)
+    assert (count == 1.0).any(axis=1).all()
+    assert count.sum(axis=1) == pytest.approx(choose_samples(shots, PsfRules(), 1.0).sum(axis=(1, 2)), abs=6)
 
 
 def test_brackets_are_clipped_and_quantised() -> None:

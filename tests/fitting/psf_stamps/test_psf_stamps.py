@@ -101,6 +101,16 @@ def test_the_table_has_one_choice_and_it_needs_the_map(fitted: FitResult[StampsP
     assert chosen[0].name.startswith("map degree 2, image degree 1")
 
 
+def test_sigma_of_any_function_is_that_of_kernels_and_stars_written_out(fitted: FitResult[StampsPsf]) -> None:
+    place = test_positions()[:2]
+    np.testing.assert_allclose(fitted.sigma_of(lambda t: t.predict(place)), fitted.term.sigma(place), rtol=0.01)
+    stars = fitted.term.sources()
+    found = fitted.sigma_of(lambda t: np.log(t.star_light_e))
+    assert found.shape == stars.light_e.shape
+    peaks = [term.predict(place)[:, 7, 7] for term in fitted.posterior.draws(np.random.default_rng(0), 200)]
+    np.testing.assert_allclose(np.std(peaks, axis=0), fitted.term.sigma(place)[:, 7, 7], rtol=0.2)
+
+
 def test_kernels_sum_to_one_and_are_centred(fitted: FitResult[StampsPsf]) -> None:
     predicted = fitted.term.predict(test_positions())
     v, u = np.mgrid[:15, :15] - 7

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from udccal.fitting.psf_stamps.field import PlaneField, polynomials, see
+from udccal.fitting.psf_stamps.field import Changes, PlaneField, polynomials, see
 from udccal.models.fields import polynomial_basis
 
 _RNG = np.random.default_rng(8)
@@ -45,3 +45,14 @@ def test_slopes_are_those_of_the_values() -> None:
     with jax.enable_x64(True):
         _, by_x = jax.jvp(values, (jnp.asarray(_CENTRE),), (jnp.ones((5, 2)) * jnp.array([1.0, 0.0]),))
         np.testing.assert_allclose(see(field, _UNIT, _CENTRE, _OFFSET).slopes[..., 0], by_x, atol=1e-10)
+
+
+def test_changes_are_applied_where_their_vector_says() -> None:
+    field, zeros = _field(), np.zeros((10 + 5 + 20 + 4 + 540, 1))
+    nothing = Changes.of((field,), 5, zeros).applied((field,))[0]
+    np.testing.assert_array_equal(nothing.nodes, field.nodes)
+    one = zeros.copy()
+    # The second image of the fourth node, behind five stars, a map of five polynomials and a lateral colour of two.
+    one[15 + 20 + 4 + 3 * 3 + 1] = 1.0
+    change = Changes.of((field,), 5, one).applied((field,))[0].nodes - field.nodes
+    assert np.flatnonzero(change).tolist() == [180 + 3]

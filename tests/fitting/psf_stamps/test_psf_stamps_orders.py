@@ -2,25 +2,24 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from tests.fitting.psf_stamps.test_psf_stamps import READ_E, SENSOR, places
-from udccal.fitting.psf_stamps.data import Stamps, split
+from udccal.fitting.psf_stamps.data import Scene, Stamps, StampsRules, split
 from udccal.fitting.psf_stamps.fit import fit_psf_stamps
-from udccal.fitting.psf_stamps.orders import Orders, with_degrees
-from udccal.fitting.psf_stamps.prospect import map_gains
-from udccal.fitting.psf_stamps.select import coarse
-from udccal.fitting.psf_stamps.solve import Solved, improve
-from udccal.fitting.psf_stamps.state import Scene
+from udccal.fitting.psf_stamps.orders import Found, Orders, coarse, expected_gains, with_degrees
+from udccal.fitting.psf_stamps.solve import improve
 from udccal.numerics import in_float64
 
 # (map degree, image degree) of the truths.
 ORDERS = ((0, 0), (1, 0), (2, 0), (0, 1), (2, 1))
 _STAMPS, _SIZE, _LIGHT_E = 24, 11, 1e5
 _RUNS, _RIGHT = 100, 95
+RULES = StampsRules()
 
 
 def kernel(position: np.ndarray, shift: np.ndarray, order: tuple[int, int]) -> np.ndarray:
@@ -52,12 +51,13 @@ def chosen(order: tuple[int, int], seed: int) -> tuple[int, int]:
 
 
 @in_float64
-def fitted(order: tuple[int, int], degrees: tuple[int, int]) -> tuple[Scene, Solved]:
+def fitted(order: tuple[int, int], degrees: tuple[int, int]) -> tuple[Scene, Found]:
     """Stamps of a field of known order, and a fit of other degrees."""
     stamps = made(order, 3)
-    scene = Scene(split(stamps), 2 * stamps.position_px / SENSOR - 1, stamps.read_e, stamps.clip_e)
-    state = coarse(scene, stamps, Orders(*degrees, 1.0))
-    return scene, improve(scene, with_degrees(state, *degrees), 12)
+    unit = 2 * stamps.position_px / SENSOR - 1
+    scene = Scene(split(stamps), unit, (_SIZE, _SIZE), stamps.read_e, stamps.clip_e)
+    state = coarse(scene, RULES, Orders(*degrees, 1.0))
+    return scene, improve(scene, with_degrees(state, *degrees, RULES), RULES, 12)
 
 
 def test_a_field_that_does_not_change_needs_no_order() -> None:
@@ -66,27 +66,26 @@ def test_a_field_that_does_not_change_needs_no_order() -> None:
 
 def test_gains_of_maps_that_are_there_are_those_of_their_fits() -> None:
     scene, lower = fitted((1, 0), (0, 0))
-    found = in_float64(map_gains)(scene, lower.state, 2)
-    fit = in_float64(improve)(scene, with_degrees(lower.state, 1, 0), 12)
-    assert fit.evidence - lower.evidence > 1000
-    assert found[0] == pytest.approx(fit.evidence - lower.evidence, rel=0.1)
+    found = in_float64(expected_gains)(scene, lower.place, 2, RULES)
+    fit = in_float64(improve)(scene, with_degrees(lower.place, 1, 0, RULES), RULES, 12)
+    gained = fit.equations.evidence - lower.equations.evidence
+    assert gained > 1000
+    assert found[0] == pytest.approx(gained, rel=0.1)
     assert found[1] == pytest.approx(found[0], abs=5.0)
 
 
 def test_maps_that_are_not_there_gain_nothing() -> None:
     scene, lower = fitted((1, 0), (1, 0))
-    assert all(abs(gain) < 3.0 for gain in in_float64(map_gains)(scene, lower.state, 3))
+    assert all(abs(gain) < 3.0 for gain in in_float64(expected_gains)(scene, lower.place, 3, RULES))
 
 
-def test_what_stays_below_the_floor_is_left_after_a_round() -> None:
-    scene, fit = fitted((1, 0), (0, 0))
-    lowered = replace(fit.state, flux_e=0.97 * fit.state.flux_e)
-    again, left = (
-        in_float64(improve)(scene, lowered, 12, floor=floor) for floor in (fit.evidence - 50, fit.evidence + 1e6)
-    )
+def test_every_step_raises_the_evidence_and_the_last_ones_are_the_same_from_elsewhere() -> None:
+    scene, fit = fitted((1, 0), (1, 0))
+    again = in_float64(improve)(scene, replace(fit.place, flux_e=0.97 * fit.place.flux_e), RULES, 12)
     assert again.converged
-    assert again.rounds > 1
-    assert (left.rounds, left.converged) == (1, False)
+    assert again.iterations > 1
+    assert all(later < earlier for earlier, later in itertools.pairwise(again.history))
+    assert again.equations.evidence == pytest.approx(fit.equations.evidence, abs=2.0)
 
 
 @pytest.mark.slow

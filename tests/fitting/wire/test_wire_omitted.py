@@ -7,8 +7,8 @@ import jax
 import numpy as np
 import pytest
 
-from tests.benchmarks.efficiency.wire import start
 from tests.fitting.wire.test_wire_parts import GEOMETRY, even_pixels
+from tests.scenes.wire import start
 from udccal.fitting.wire import WireRules
 from udccal.fitting.wire.data import FlatNoise, weighed
 from udccal.fitting.wire.jacobian import expected_of

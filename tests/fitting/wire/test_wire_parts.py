@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tests.benchmarks.efficiency import wire as drawn
+from tests.scenes import wire as drawn
 from udccal.fitting.engine.least_squares import minimise
 from udccal.fitting.wire import WireData, WireRules, WireStart
 from udccal.fitting.wire.data import FlatNoise, Pixels, Weighed, flat_noise, sample_pixels, weighed

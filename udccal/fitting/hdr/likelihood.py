@@ -12,6 +12,8 @@ with h the inverse Mills ratio of the normal distribution.
 
 from __future__ import annotations
 
+import functools
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -21,8 +23,6 @@ from udccal.models.arrays import Arrayish
 
 # Rounds that know the open samples only, then rounds with the clipped ones too. More move no pixel by 1 % of its sigma.
 _OPEN_ROUNDS, _ALL_ROUNDS = 1, 2
-# A clipped sample this many sigma below the clipping level is a hit, not light: it is no part of the likelihood.
-BELIEVED_SIGMA = 6.0
 # Below zero rate the variance goes on falling, so that the estimate stays unbiased in the dark, down to this share.
 _LEAST_VARIANCE = 0.25
 _TINY = 1e-30
@@ -44,11 +44,11 @@ class BlockMerge(eqx.Module):
     The deviation is that from the rate that the other samples give (leave one out).
     """
 
-    rate: Float[Array, " pixels"]
-    sigma: Float[Array, " pixels"]
-    used: Int[Array, " pixels"]
-    worst: Int[Array, " pixels"]
-    deviation2: Float[Array, " pixels"]
+    rate: Float[Arrayish, " pixels"]
+    sigma: Float[Arrayish, " pixels"]
+    used: Int[Arrayish, " pixels"]
+    worst: Int[Arrayish, " pixels"]
+    deviation2: Float[Arrayish, " pixels"]
 
 
 def _mills(z: Float[Array, " pixels"]) -> Float[Array, " pixels"]:
@@ -59,12 +59,13 @@ def _mills(z: Float[Array, " pixels"]) -> Float[Array, " pixels"]:
     return jnp.where(z >= 0, 0.79788456 / tail, 0.39894228 * bell / (1 - 0.5 * tail * bell))
 
 
-@jax.jit
+@functools.partial(jax.jit, static_argnames="believed_sigma")
 def merge_block(
     frames: UInt16[Array, "n pixels"],
     times: Float[Array, " n"],
     sensor: SensorNumbers,
     left_out: Bool[Array, "n pixels"] | None,
+    believed_sigma: float,
 ) -> BlockMerge:
     """Maximum-likelihood rates. Loops over samples are written out: a pixel stays in the processor's registers."""
     count = len(frames)
@@ -83,7 +84,7 @@ def merge_block(
             s, own = jnp.where(is_open[i], slope * (light[i] - mean), 0.0), jnp.where(is_open[i], slope * times[i], 0.0)
             if k >= _OPEN_ROUNDS:
                 z = (sensor.level_e - mean) * jax.lax.rsqrt(variance)
-                believed = allowed[i] & ~is_open[i] & (z < BELIEVED_SIGMA)
+                believed = allowed[i] & ~is_open[i] & (z < believed_sigma)
                 ratio = _mills(z)
                 s = jnp.where(believed, times[i] * jax.lax.rsqrt(variance) * ratio, s)
                 own = jnp.where(believed, slope * times[i] * ratio * (ratio - z), own)

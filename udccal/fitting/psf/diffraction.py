@@ -19,12 +19,12 @@ from udccal.fitting.engine.orders import Attempt, Choice, bic, choose
 from udccal.fitting.psf.data import Shots
 from udccal.fitting.psf.kernel import FOOTPRINT, Evaluator, fit_lattice
 from udccal.fitting.psf.problem import DiffractionProblem, Place
-from udccal.fitting.psf.samples import Block, blocks, choose_samples, for_all_samples, start_own
+from udccal.fitting.psf.samples import Block, blocks, choose_samples, stands_for, start_own
 from udccal.fitting.psf.start import PsfRules
 from udccal.fitting.psf.weights import (
     estimate_model_error,
     left_out,
-    pattern_test,
+    pattern_p_value,
     sensor_variance,
     weighed,
     without_outliers,
@@ -99,7 +99,7 @@ class DiffractionFit:
 
     def pattern_p(self) -> float:
         """How likely such a pattern in the residuals is by chance; see ``psf.weights``."""
-        return pattern_test(self.problem.blocks, self.errors()).p_value
+        return pattern_p_value(self.problem.blocks, self.errors())
 
     def errors(self) -> list[Float[np.ndarray, "shots n"]]:
         """Data less expectation in units of sigma, position by position."""
@@ -253,10 +253,10 @@ def efficiency(fit: DiffractionFit, rules: PsfRules, available: int, reported: i
         available: pictures there are.
         reported: so many numbers are looked at.
     """
-    every = tuple(for_all_samples(block, rules) for block in fit.problem.blocks)
-    positions = replace(fit.problem, blocks=every).by_position(fit.solution.place)
-    used = sum(int((np.asarray(block.index) >= 0).sum()) for block in every)
-    information = sum(position.marginal()[0] for position in positions) * available / used
+    count = stands_for(fit.shots, rules)
+    weighed_up = (replace(b, weight=np.asarray(b.weight) * count[np.asarray(b.index)]) for b in fit.problem.blocks)
+    positions = replace(fit.problem, blocks=tuple(weighed_up)).by_position(fit.solution.place)
+    information = sum(position.marginal()[0] for position in positions) * available / fit.shots.count
     best = scaled_inverse(fit.problem.prior.precision + information)
     return float(np.mean(np.diag(best)[:reported] / np.diag(fit.noise_cov)[:reported]))
 

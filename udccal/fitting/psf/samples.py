@@ -87,10 +87,10 @@ def choose_samples(shots: Shots, rules: PsfRules, far_share: float) -> Bool[np.n
     return chosen.reshape(shots.rate.shape)
 
 
-def for_all_samples(block: Block, rules: PsfRules) -> Block:
-    """The block with weights by which the samples drawn away from the peak stand for all of them there."""
-    far = (np.abs(np.asarray(block.points)) > np.array([rules.peak_half_px[1], rules.peak_half_px[0]]) + 0.5).any(-1)
-    return replace(block, weight=np.asarray(block.weight) * np.where(far, 1.0 / rules.far_share, 1.0))
+def stands_for(shots: Shots, rules: PsfRules) -> Float[np.ndarray, "shots n"]:
+    """How many samples of its picture each chosen one stands for: those away from the peak were drawn."""
+    chosen, near = (choose_samples(shots, rules, part) for part in (rules.far_share, 0.0))
+    return np.where(near[chosen].reshape(shots.count, -1), 1.0, 1.0 / rules.far_share)
 
 
 _frame = eqx.filter_jit(local_frame)

@@ -14,8 +14,8 @@ from typing import Final
 import numpy as np
 import scipy.optimize
 from jaxtyping import Float
+from scipy.special import ndtr
 
-from udccal.fitting.engine.misfit import MisfitTest, group_means_test
 from udccal.fitting.engine.orders import bic
 from udccal.fitting.engine.robust import Huber, OutlierRule, outliers
 from udccal.fitting.psf.samples import Block
@@ -120,22 +120,28 @@ def without_outliers(
     return cleaned, (*outliers(said, pictures), *rule.listed(samples))
 
 
-def pattern_test(blocks: Sequence[Block], errors: Sequence[Float[np.ndarray, "shots n"]]) -> MisfitTest:
-    """Whether residuals are alike in different pictures of a position more than noise would be.
+def pattern_p_value(blocks: Sequence[Block], errors: Sequence[Float[np.ndarray, "shots n"]]) -> float:
+    """Probability of residuals at least as alike in different pictures of a position, were they noise.
 
-    Each picture has its own noise, and each samples the kernel at its own fraction of a pixel. Samples of one colour
-    that see the same place of the kernel, within a pixel, are a group.
+    Each picture has its own noise, and each samples the kernel at its own fraction of a pixel. Residuals of samples of
+    one colour that see the same place of the kernel in two pictures, within a pixel, are therefore uncorrelated unless
+    the model is wrong there; the mean of their products, in units of its standard error, is normal. Means of groups
+    (``engine.misfit``) hold squares besides, which tell nothing and hide what two pictures have in common.
 
     Args:
         blocks: with their weights. errors: data less expectation, in units of sigma.
     """
-    keys, z, used = [], [], []
-    for number, (block, error) in enumerate(zip(blocks, errors, strict=True)):
-        cells = np.floor(np.asarray(block.points)).astype(np.int64)
-        colour = np.asarray(block.colour).argmax(axis=-1)
-        keys.append((((number * 4096 + cells[..., 1]) * 4096 + cells[..., 0]) * 3 + colour).ravel())
-        z.append(np.clip(error, -HUBER.sigma, HUBER.sigma).ravel())
-        used.append(np.asarray(block.weight).ravel() > 0)
-    group = np.unique(np.concatenate(keys), return_inverse=True)[1].reshape(-1)
-    every, counted = np.concatenate(z), np.concatenate(used)
-    return group_means_test(every, group, counted, float((every[counted] ** 2).mean()) if counted.any() else 1.0)
+    total, variance = 0.0, 0.0
+    for block, error in zip(blocks, errors, strict=True):
+        z = np.clip(error, -HUBER.sigma, HUBER.sigma).ravel()
+        x, y = np.moveaxis(np.floor(np.asarray(block.points)).astype(np.int64), -1, 0)
+        key = (y * 4096 + x) * 3 + np.asarray(block.colour).argmax(axis=-1)
+        cell = np.unique(key, return_inverse=True)[1].reshape(-1)
+        shot = np.repeat(np.arange(len(error)), error.shape[1])
+        sums, squares = (np.zeros((int(cell.max()) + 1, len(error))) for _ in range(2))
+        np.add.at(sums, (cell, shot), z)
+        np.add.at(squares, (cell, shot), z**2)
+        # Of pairs of different pictures alone.
+        total += float((sums.sum(axis=1) ** 2 - (sums**2).sum(axis=1)).sum()) / 2.0
+        variance += float((squares.sum(axis=1) ** 2 - (squares**2).sum(axis=1)).sum()) / 2.0
+    return float(ndtr(-total / np.sqrt(variance))) if variance > 0 else 1.0

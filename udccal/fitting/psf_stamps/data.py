@@ -1,4 +1,4 @@
-"""Stamps of point sources as arrays, checked, and sorted by colour."""
+"""Stamps of point sources as arrays, checked, and sorted by colour; the constants of their fit."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from udccal.errors import FitError
 
 _FEWEST_PX, _MOST_PX = 7, 255
 _MOST_SAMPLES = 2**26
+WINDOW_PX, _CENTRING = 1.6, 15  # of first centroids: a Gaussian's standard deviation, and rounds
 
 
 @final
@@ -41,6 +42,71 @@ class Stamps:
     def planes(self) -> int:
         """How many colours there are."""
         return 1 if self.channel is None else int(self.channel.max()) + 1
+
+
+@final
+@dataclass(frozen=True)
+class StampsRules:
+    """The constants of a fit of stamps.
+
+    Attributes:
+        fewest_stars: that are fitted at all.
+        least_snr: light over noise of the median stamp.
+        fewest_unclipped: stamps, at least, whose core (``core_px`` about the middle) is neither clipped nor missing.
+        outlier_sigma: samples further off, in robust sigma, are left out.
+        star_ratio, star_lost: stamps are left out whose mean square is over so many times the median's, or that lose
+            more than such a part of their samples.
+        coarse: degrees of map and images, and the relative error of the model that is allowed for, of the fits that
+            lead from a round star to a field.
+        coarse_steps: of each of these.
+        spacings_px: of nodes, the coarsest first.
+        worth_finer: nodes are made denser again where the criterion may still fall by so much.
+        highest_map, highest_image: degrees.
+        steps_to_judge, steps_to_judge_new, steps_to_end: of one fit at most: of candidates, of those with a degree that
+            comes new, and of the fit that is given.
+        gain, evidence: converged when one more step would raise the log posterior by less, and the last one raised the
+            log evidence by less.
+        beyond_doubt: log evidence; candidates expected to lose more are not fitted.
+        worth_fitting: nor those expected to gain less than this part of what their precisions cost.
+        first_image, first_map, first_lateral: precisions before the data: of images of degree 0 (size, roughness) and
+            of higher ones, of maps and of lateral colour by degree.
+        new_image, new_map: of a degree that comes new, relative to the degree below it, and as it is: nearly absent.
+            Where the data ask for it, one update makes it appear.
+        update_draws, draws: of the posterior: for updates of precisions, and for error bars (5 % of a sigma).
+        inflate_above: reduced chi-squared above which every sigma grows with its root. Counts are skewed: theirs
+            scatters more than that of normal samples.
+        poor_above: reduced chi-squared beyond which this is no psf field.
+    """
+
+    fewest_stars: int = 4
+    least_snr: float = 10.0
+    fewest_unclipped: int = 3
+    core_px: float = 1.5
+    outlier_sigma: float = 5.0
+    star_ratio: float = 3.0
+    star_lost: float = 0.2
+    coarse: tuple[tuple[int, int, float], ...] = ((0, 0, 0.3), (0, 0, 0.1), (2, 0, 0.05), (2, 1, 0.02))
+    coarse_steps: int = 2
+    spacings_px: tuple[float, ...] = (1.0, 0.75, 0.5)
+    worth_finer: float = 200.0
+    highest_map: int = 4
+    highest_image: int = 3
+    steps_to_judge: int = 2
+    steps_to_judge_new: int = 1
+    steps_to_end: int = 12
+    gain: float = 0.3
+    evidence: float = 2.0
+    beyond_doubt: float = 200.0
+    worth_fitting: float = 0.5
+    first_image: tuple[tuple[float, float], tuple[float, float]] = ((1e-3, 1e-4), (30.0, 30.0))
+    first_map: float = 100.0
+    first_lateral: float = 10.0
+    new_image: float = 20.0
+    new_map: float = 3e4
+    update_draws: int = 16
+    draws: int = 192
+    inflate_above: float = 1.05
+    poor_above: float = 2.0
 
 
 def mosaic_channels(
@@ -76,6 +142,29 @@ class Plane:
     place: Int[np.ndarray, "stars samples"]
 
 
+@dataclass(frozen=True)
+class Scene:
+    """What does not change during a fit.
+
+    Attributes:
+        planes: samples by colour.
+        unit: positions scaled to about [-1, 1].
+        shape: rows and columns of a stamp.
+        read_e, clip_e: of the samples' noise.
+    """
+
+    planes: tuple[Plane, ...]
+    unit: Float[np.ndarray, "stars 2"]
+    shape: tuple[int, int]
+    read_e: float
+    clip_e: float
+
+    @property
+    def samples(self) -> int:
+        """That tell something."""
+        return sum(int(plane.usable.sum()) for plane in self.planes)
+
+
 def split(stamps: Stamps) -> tuple[Plane, ...]:
     """The stamps colour by colour."""
     count, rows, columns = stamps.values_e.shape
@@ -83,6 +172,32 @@ def split(stamps: Stamps) -> tuple[Plane, ...]:
     if stamps.channel is not None:
         channel = stamps.channel.reshape(count, -1).astype(np.int64)
     return tuple(_plane(stamps, channel == colour) for colour in range(stamps.planes))
+
+
+def centroids(planes: tuple[Plane, ...], stars: int) -> Float[np.ndarray, "stars 2"]:
+    """Under a Gaussian that follows, all colours alike: of light per sample, each colour by its own number of them."""
+    centre = np.zeros((stars, 2))
+    for _ in range(_CENTRING):
+        top, bottom = np.zeros((stars, 2)), np.zeros(stars)
+        for plane in planes:
+            off = plane.offset_px - centre[:, None]
+            weight = plane.usable * np.exp(-0.5 * (off**2).sum(axis=2) / WINDOW_PX**2)
+            light = weight * np.maximum(plane.value_e, 0.0)
+            # The mean under the weight alone is taken off: samples of a mosaic do not lie evenly about the centre.
+            mean = np.einsum("ks,ksi->ki", weight, off) / np.maximum(weight.sum(axis=1), 1e-300)[:, None]
+            top += np.einsum("ks,ksi->ki", light, off - mean[:, None])
+            bottom += light.sum(axis=1)
+        move = 2 * top / np.maximum(bottom, 1e-300)[:, None]
+        centre = np.clip(centre + np.clip(move, -1.0, 1.0), -3.0, 3.0)
+    return centre
+
+
+def light_of(plane: Plane, read_e: float) -> Float[np.ndarray, " stars"]:
+    """Sums, scaled up for samples that are missing; in light per pixel of all colours."""
+    known = np.maximum(plane.usable.sum(axis=1), 1)
+    total = (plane.value_e * plane.usable).sum(axis=1)
+    pixels = int(plane.place.max()) + 1
+    return np.maximum(total * pixels / known, 10 * read_e)
 
 
 def _plane(stamps: Stamps, own: Bool[np.ndarray, "stars pixels"]) -> Plane:

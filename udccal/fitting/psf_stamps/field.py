@@ -11,6 +11,7 @@ that all colours of a stamp share.
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import equinox as eqx
@@ -23,9 +24,7 @@ from numpy.polynomial.legendre import legvander
 from udccal.models.arrays import Arrayish
 from udccal.models.fields import polynomial_basis, polynomial_terms
 
-TAPS = 4  # nodes along an axis that a cubic B-spline listens to
-# What a star may change by itself: relative light, centre (x, y), and the four numbers of its map, row by row.
-OWN = 7
+TAPS = 4  # nodes along an axis under a cubic B-spline
 # Arrays are filled up to a multiple of so many nodes and stars, and to polynomials of at least this degree.
 _NODES, _STARS, _HIGHEST = 4096, 8, 4
 
@@ -49,6 +48,46 @@ class PlaneField(eqx.Module):
     spacing_px: float = eqx.field(static=True)
 
 
+@dataclass(frozen=True)
+class Changes:
+    """Changes of all that is unknown, ``k`` of them at a time: parts of one vector, whose order is that of the fields.
+
+    Attributes:
+        stars: (x, y) in px, then relative light by colour.
+        warp, lateral: by colour, flat. With ``stars`` they make the dense block of the equations.
+        nodes: by colour; in the vector node by node, the images of a node together.
+    """
+
+    stars: Float[np.ndarray, "stars own k"]
+    warp: tuple[Float[np.ndarray, "_warp k"], ...]
+    lateral: tuple[Float[np.ndarray, "_lateral k"], ...]
+    nodes: tuple[Float[np.ndarray, "_terms _nodes k"], ...]
+
+    @classmethod
+    def of(cls, fields: tuple[PlaneField, ...], stars: int, vector: Float[np.ndarray, "unknowns k"]) -> Changes:
+        """The parts of a vector."""
+        sizes = [stars * (2 + len(fields))]
+        sizes += [np.size(part) for field in fields for part in (field.warp, field.lateral)]
+        own, *parts = np.split(vector, np.cumsum(sizes + [np.size(field.nodes) for field in fields])[:-1])
+        k, maps, nodes = vector.shape[1], parts[: 2 * len(fields)], parts[2 * len(fields) :]
+        images = (
+            part.reshape(-1, len(field.nodes), k).transpose(1, 0, 2) for field, part in zip(fields, nodes, strict=True)
+        )
+        return cls(own.reshape(stars, -1, k), tuple(maps[::2]), tuple(maps[1::2]), tuple(images))
+
+    def applied(self, fields: tuple[PlaneField, ...]) -> tuple[PlaneField, ...]:
+        """The fields after the first of the changes."""
+        return tuple(
+            replace(
+                field,
+                nodes=field.nodes + nodes[..., 0].reshape(field.nodes.shape),
+                warp=field.warp + warp[:, 0].reshape(-1, 2, 2),
+                lateral=field.lateral + lateral[:, 0].reshape(-1, 2),
+            )
+            for field, nodes, warp, lateral in zip(fields, self.nodes, self.warp, self.lateral, strict=True)
+        )
+
+
 class Seen(NamedTuple):
     """What a field brings to samples of stamps, per unit of light, and how it answers to its unknowns.
 
@@ -66,6 +105,11 @@ class Seen(NamedTuple):
     down: Float[Arrayish, "stars samples 4"]
     across: Float[Arrayish, "stars samples 4"]
     inside: Bool[Arrayish, "stars samples"]
+
+
+def degrees(highest: int) -> Int[np.ndarray, " terms"]:
+    """Of every polynomial up to a degree, in their order."""
+    return np.repeat(np.arange(highest + 1), np.arange(1, highest + 2))
 
 
 def polynomials(unit: Float[Arrayish, "stars 2"], degree: int) -> Float[np.ndarray, "stars terms"]:

@@ -3,34 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import final
 
 import numpy as np
 import scipy.sparse
 from jaxtyping import Float
 
-from udccal.fitting.psf_stamps.field import TAPS, PlaneField, polynomials, see
+from udccal.fitting.psf_stamps.field import TAPS, Changes, PlaneField, polynomials, see
 from udccal.numerics import in_float64
 
 _CHUNK = 8
 _CENTRING = 20
-
-
-@dataclass(frozen=True)
-class Draws:
-    """Draws of the posterior about its mode; their covariance is that of the fit.
-
-    Attributes:
-        nodes: by colour. warp, lateral: by colour, flat.
-        centre_px, light: of the stars in the fit; light relatively, by colour.
-    """
-
-    nodes: tuple[Float[np.ndarray, "_terms _nodes draws"], ...]
-    warp: tuple[Float[np.ndarray, "_numbers draws"], ...]
-    lateral: tuple[Float[np.ndarray, "_numbers draws"], ...]
-    centre_px: Float[np.ndarray, "stars 2 draws"]
-    light: Float[np.ndarray, "stars planes draws"]
 
 
 @dataclass(frozen=True)
@@ -41,16 +25,17 @@ class Kernels:
         value: each sums to 1.
         centre_px: where the model's own centre lies beside the kernel's, (x, y).
         total: light in the window per unit of the model's light.
-        change: of the kernels, of the centre and, relatively, of the total, draw by draw.
+        change: of the kernels, of the centre and, relatively, of the total, along the columns of the term's factor.
+        jacobian: of the model's light by its centre.
     """
 
     value: Float[np.ndarray, "n rows columns"]
     centre_px: Float[np.ndarray, "n 2"]
     total: Float[np.ndarray, " n"]
-    change: Float[np.ndarray, "n pixels draws"]
-    centre_change: Float[np.ndarray, "n 2 draws"]
-    total_change: Float[np.ndarray, "n draws"]
-    slope: Float[np.ndarray, "n pixels 2"]
+    change: Float[np.ndarray, "n pixels k"]
+    centre_change: Float[np.ndarray, "n 2 k"]
+    total_change: Float[np.ndarray, "n k"]
+    jacobian: Float[np.ndarray, "n pixels 2"]
 
 
 @final
@@ -74,18 +59,18 @@ class StampsPsf:
 
     Attributes:
         fields: by colour.
-        draws: of the posterior.
+        factor: of the covariance of all unknowns, in the order of ``Changes``: draws of the posterior over the root of
+            their number, so that sigmas are known to 5 %. It holds what the model leaves unexplained.
         centre_px, half_px: positions scale as (p - centre) / half; beyond one half the field is extrapolated.
         rows, columns: of kernels.
         window_px: standard deviation of the Gaussian that weights centroids.
         reference: the plane that centres are of.
         star_px, star_place_px, star_light_e: of the stars in the fit: middle samples on the sensor; the model's own
             centres and light, of which ``sources`` are the convention's.
-        inflation: of every sigma, for what the model leaves unexplained; 1 when it explains all.
     """
 
     fields: tuple[PlaneField, ...]
-    draws: Draws
+    factor: Float[np.ndarray, "unknowns k"]
     centre_px: Float[np.ndarray, "2"]
     half_px: Float[np.ndarray, "2"]
     rows: int
@@ -95,7 +80,6 @@ class StampsPsf:
     star_px: Float[np.ndarray, "stars 2"]
     star_place_px: Float[np.ndarray, "stars 2"]
     star_light_e: Float[np.ndarray, "stars planes"]
-    inflation: float
 
     @in_float64
     def predict(self, position_px: Float[np.ndarray, "n 2"], plane: int = 0) -> Float[np.ndarray, "n rows columns"]:
@@ -105,8 +89,8 @@ class StampsPsf:
     @in_float64
     def sigma(self, position_px: Float[np.ndarray, "n 2"], plane: int = 0) -> Float[np.ndarray, "n rows columns"]:
         """One standard deviation of every pixel of ``predict``."""
-        parts = [kernels.change.std(axis=2) for kernels in self.kernels(position_px, plane)]
-        return self.inflation * np.concatenate(parts).reshape(-1, self.rows, self.columns)
+        parts = [_spread(kernels.change) for kernels in self.kernels(position_px, plane)]
+        return np.concatenate(parts).reshape(-1, self.rows, self.columns)
 
     @in_float64
     def relative_l2(self, position_px: Float[np.ndarray, "n 2"], plane: int = 0) -> Float[np.ndarray, "n 2"]:
@@ -118,34 +102,46 @@ class StampsPsf:
 
     def _relative(self, kernels: Kernels) -> Float[np.ndarray, "n 2"]:
         flat = kernels.value.reshape(len(kernels.value), -1)
-        free, _ = np.linalg.qr(np.concatenate([flat[..., None], kernels.slope], axis=2))
+        free, _ = np.linalg.qr(np.concatenate([flat[..., None], kernels.jacobian], axis=2))
         change = kernels.change - free @ (free.transpose(0, 2, 1) @ kernels.change)
         each = np.sqrt((change**2).sum(axis=1)) / np.linalg.norm(flat, axis=1)[:, None]
-        return self.inflation * np.stack([np.sqrt((each**2).mean(axis=1)), each.std(axis=1)], axis=1)
+        return np.stack([_spread(each), np.sqrt(each.shape[1]) * each.std(axis=1)], axis=1)
 
     @in_float64
     def sources(self) -> Sources:
         """Places and light of the stars in the fit, with one standard deviation."""
-        place, place_change = self.star_place_px, self.draws.centre_px
-        light, light_change = [], []
+        change = self._changes.stars
+        place, place_change, light, light_sigma = self.star_place_px, change[:, :2], [], []
         for plane in range(len(self.fields)):
             parts = list(self.kernels(self.star_px, plane))
-            total = np.concatenate([part.total for part in parts])
-            light.append(self.star_light_e[:, plane] * total)
-            light_change.append(self.draws.light[:, plane] + np.concatenate([part.total_change for part in parts]))
+            light.append(self.star_light_e[:, plane] * np.concatenate([part.total for part in parts]))
+            relative = change[:, 2 + plane] + np.concatenate([part.total_change for part in parts])
+            light_sigma.append(light[-1] * _spread(relative))
             if plane == self.reference:
                 place = place - np.concatenate([part.centre_px for part in parts])
                 place_change = place_change - np.concatenate([part.centre_change for part in parts])
-        size = np.stack(light, axis=1)
-        relative = np.stack([change.std(axis=1) for change in light_change], axis=1)
-        return Sources(place, self.inflation * place_change.std(axis=2), size, self.inflation * relative * size)
+        return Sources(place, _spread(place_change), np.stack(light, axis=1), np.stack(light_sigma, axis=1))
+
+    def changed(self, vector: Float[np.ndarray, " unknowns"]) -> StampsPsf:
+        """The term with changes of its unknowns, in the order of ``Changes``: what the posterior of a fit draws."""
+        changes = Changes.of(self.fields, len(self.star_px), vector[:, None])
+        return replace(
+            self,
+            fields=changes.applied(self.fields),
+            star_place_px=self.star_place_px + changes.stars[:, :2, 0],
+            star_light_e=self.star_light_e * np.exp(changes.stars[:, 2:, 0]),
+        )
+
+    @property
+    def _changes(self) -> Changes:
+        return Changes.of(self.fields, len(self.star_px), self.factor)
 
     def unit(self, position_px: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
         """Positions scaled for the polynomials."""
         return (np.asarray(position_px, dtype=np.float64) - self.centre_px) / self.half_px
 
     def kernels(self, position_px: Float[np.ndarray, "n 2"], plane: int) -> Iterator[Kernels]:
-        """Kernels with their draws, some positions at a time. Call in double precision."""
+        """Kernels with their changes, some positions at a time. Call in double precision."""
         for part in _parts(position_px):
             yield self._drawn(part, plane)
 
@@ -185,46 +181,47 @@ class StampsPsf:
         unit = self.unit(position_px)
         value, centre, total = self._plain(position_px, plane)
         window = self._window()
-        own, own_slope = self._change(unit, centre, self.reference)
-        moved = np.einsum("pi,npd->nid", window, own)
-        by_centre = np.einsum("pj,npi->nji", window, own_slope)
+        own, own_jacobian = self._change(unit, centre, self.reference)
+        moved = np.einsum("pi,npk->nik", window, own)
+        by_centre = np.einsum("pj,npi->nji", window, own_jacobian)
         centre_change = -np.linalg.solve(by_centre, moved)
-        change, slope = (own, own_slope) if plane == self.reference else self._change(unit, centre, plane)
-        change = change + slope @ centre_change
+        change, jacobian = (own, own_jacobian) if plane == self.reference else self._change(unit, centre, plane)
+        change = change + jacobian @ centre_change
         relative = change.sum(axis=1) / total[:, None]
         flat = value.reshape(len(unit), -1)
         shape = change / total[:, None, None] - flat[..., None] * relative[:, None]
-        return Kernels(value, centre, total, shape, centre_change, relative, slope)
+        return Kernels(value, centre, total, shape, centre_change, relative, jacobian)
 
     def _change(
         self, unit: Float[np.ndarray, "n 2"], centre: Float[np.ndarray, "n 2"], plane: int
-    ) -> tuple[Float[np.ndarray, "n pixels draws"], Float[np.ndarray, "n pixels 2"]]:
-        """Of the model's light with the posterior's draws, and its slopes to the centre."""
-        field = self.fields[plane]
-        seen = [np.asarray(part) for part in see(field, unit, centre, self._grid(len(unit)))]
-        _, slopes, first, down, across, _ = seen
-        basis = polynomials(unit, field.image_degree)
-        nodes = self.draws.nodes[plane]
-        columns = field.nodes.shape[2]
+    ) -> tuple[Float[np.ndarray, "n pixels k"], Float[np.ndarray, "n pixels 2"]]:
+        """Of the model's light along the columns of the factor, and its derivatives by the centre."""
+        field, changes = self.fields[plane], self._changes
+        seen = see(field, unit, centre, self._grid(len(unit)))
+        basis, columns = polynomials(unit, field.image_degree), field.nodes.shape[2]
         step = (np.arange(TAPS)[:, None] * columns + np.arange(TAPS)).ravel()
-        taps = (down[..., :, None] * across[..., None, :]).reshape(*first.shape, -1)
         out = []
-        for k in range(len(unit)):
-            ends = np.arange(0, taps[k].size + 1, TAPS**2)
-            index = (first[k][:, None] + step).ravel()
-            matrix = scipy.sparse.csr_array((taps[k].ravel(), index, ends), shape=(first.shape[1], nodes.shape[1]))
-            out.append(matrix @ np.tensordot(basis[k], nodes, axes=1))
-        warp = _field_change(unit, field.warp_degree, self.draws.warp[plane], 4)
-        lateral = _field_change(unit, field.lateral_degree, self.draws.lateral[plane], 2)
-        change = np.stack(out) + slopes[..., 2:] @ warp + slopes[..., :2] @ lateral
-        return change, slopes[..., :2]
+        for k, terms in enumerate(basis):
+            weights = seen.down[k][:, :, None] * seen.across[k][:, None, :]
+            index = (seen.first[k][:, None] + step).ravel()
+            ends = np.arange(0, index.size + 1, TAPS**2)
+            shape = (len(seen.first[k]), changes.nodes[plane].shape[1])
+            matrix = scipy.sparse.csr_array((weights.ravel(), index, ends), shape=shape)
+            out.append(matrix @ np.tensordot(terms, changes.nodes[plane], axes=1))
+        jacobian = np.asarray(seen.slopes)
+        maps = (
+            (field.warp_degree, changes.warp[plane], jacobian[..., 2:]),
+            (field.lateral_degree, changes.lateral[plane], jacobian[..., :2]),
+        )
+        change = np.stack(out)
+        for degree, own, by in maps:
+            values = polynomials(unit, degree)[:, 1:]
+            change += by @ np.tensordot(values, own.reshape(values.shape[1], by.shape[2], own.shape[1]), axes=1)
+        return change, jacobian[..., :2]
 
 
-def _field_change(
-    unit: Float[np.ndarray, "n 2"], degree: int, draws: Float[np.ndarray, "numbers draws"], each: int
-) -> Float[np.ndarray, "n each draws"]:
-    basis = polynomials(unit, degree)[:, 1:]
-    return np.tensordot(basis, draws.reshape(basis.shape[1], each, draws.shape[1]), axes=1)
+def _spread(change: Float[np.ndarray, "*n k"]) -> Float[np.ndarray, "*n"]:
+    return np.asarray(np.sqrt((change**2).sum(axis=-1)))
 
 
 def _parts(position_px: Float[np.ndarray, "n 2"]) -> Iterator[Float[np.ndarray, "m 2"]]:

@@ -39,7 +39,7 @@ from udccal.models.wire import (
 TILES = (6, 8)
 _TILE_NUMBERS = np.arange(TILES[0] * TILES[1])[:, None]
 # Residual variance in units of what noise makes: less is none at all, and what is divided by it stays finite.
-_LEAST_VARIANCE = 1e-12
+LEAST_VARIANCE = 1e-12
 
 
 class Rays(NamedTuple):
@@ -268,7 +268,7 @@ class WireProblem:
         matrix, by_tile, chi2 = self.sums(place)
         used = self.pixels.used
         dof = max(used - len(place), 1)
-        variance = chi2 / dof + _LEAST_VARIANCE
+        variance = chi2 / dof + LEAST_VARIANCE
         right = by_tile.sum(axis=0) / variance
         blocks = Blocks.dense(dof * float(np.log(variance)), used, matrix / variance, right)
         return WireEquations(blocks.with_prior(self.prior, place), variance, by_tile / variance)

@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 
 from udccal.fitting.engine.misfit import NO_TEST, MisfitTest, chi2_test, excess_sigma, sharper
 from udccal.fitting.wire.data import BLOCK, Pixels, Weighed
-from udccal.fitting.wire.jacobian import TILES, rays_at, tile_numbers, values_at, with_harmonics
+from udccal.fitting.wire.jacobian import LEAST_VARIANCE, TILES, rays_at, tile_numbers, values_at, with_harmonics
 from udccal.fitting.wire.parameters import Harmonics, possible_harmonics
 from udccal.fitting.wire.rules import WireRules, WireStart
 from udccal.models.wire import Wire
@@ -62,7 +62,7 @@ def misfit(judged: Weighed, wire: Wire | None, statistical: float, held_out: boo
     used = (pixels.weight > 0) & (expected > 0)
     relative = np.where(used, pixels.value / np.where(used, expected, 1.0) - 1, 0.0)
     weight = np.where(used, pixels.weight * expected**2, 0.0)
-    scale = float(np.sum(weight * relative**2)) / max(int(used.sum()), 1) + 1e-300
+    scale = max(float(np.sum(weight * relative**2)) / max(int(used.sum()), 1), LEAST_VARIANCE)
     tests, sizes, resolution = [], [], np.inf
     for binning in _BINNINGS:
         bins = _bins(pixels, wire, *binning)

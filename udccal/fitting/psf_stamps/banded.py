@@ -1,4 +1,7 @@
-"""How nodes of a grid meet in the normal equations: each with its neighbours within three rows and columns.
+"""Banded symmetric matrices of a grid's nodes: their sums over samples, Cholesky's factor, solutions.
+
+A cubic B-spline spans four rows, so that a row of nodes has entries with itself and the three that follow. All is done
+in place: a factor lies where its matrix was, a solution where its right side was.
 
 Light of a star at position X enters the image t with the factor B_t(X), whatever the sample, and the weights of a
 sample's 4 x 4 nodes are products of four down and four across. So do their squares: what samples of a cell of the grid
@@ -8,18 +11,85 @@ bring is a product of pairs down, pairs across, and pairs of polynomials.
 from __future__ import annotations
 
 import itertools
+from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse
 from jaxtyping import Float, Int
+from scipy.linalg.blas import dtrsm
+from scipy.linalg.lapack import dpotrf
 
-from udccal.fitting.psf_stamps.bands import AHEAD, Band
 from udccal.fitting.psf_stamps.field import TAPS
-from udccal.fitting.psf_stamps.likelihood import Weighted
+from udccal.fitting.psf_stamps.probability import Weighted
 
+AHEAD = TAPS - 1  # rows of nodes beyond its own that a row of nodes has entries with
 _PAIRS = tuple(itertools.combinations_with_replacement(range(TAPS), 2))
 _FIRST, _SECOND = np.array(_PAIRS).T
 _NEAR = 2 * AHEAD + 1
+
+
+@dataclass(frozen=True)
+class Band:
+    """Upper half of a symmetric matrix, or its factor U: the matrix is U^T U.
+
+    Attributes:
+        diagonal: a row of nodes with itself.
+        beyond: a row of nodes with the three that follow; zero where there are none.
+    """
+
+    diagonal: Float[np.ndarray, "rows n n"]
+    beyond: Float[np.ndarray, "rows n 3*n"]
+
+    @property
+    def log_det(self) -> float:
+        """Of the matrix whose factor this is."""
+        return float(2 * np.log(np.einsum("rii->ri", self.diagonal)).sum())
+
+    def forward(self, right: Float[np.ndarray, "size k"]) -> Float[np.ndarray, "size k"]:
+        """U^-T right, of a factor; ``right`` is overwritten."""
+        rows, n = self.diagonal.shape[:2]
+        out = right.reshape(rows, n, -1)
+        for i in range(rows):
+            _divide(self.diagonal[i], out[i], True)
+            ahead = out[i + 1 : i + 1 + AHEAD].reshape(-1, out.shape[2])
+            ahead -= self.beyond[i, :, : len(ahead)].T @ out[i]
+        return right
+
+    def backward(self, right: Float[np.ndarray, "size k"]) -> Float[np.ndarray, "size k"]:
+        """U^-1 right, of a factor; ``right`` is overwritten."""
+        rows, n = self.diagonal.shape[:2]
+        out = right.reshape(rows, n, -1)
+        for i in range(rows - 1, -1, -1):
+            ahead = out[i + 1 : i + 1 + AHEAD].reshape(-1, out.shape[2])
+            out[i] -= self.beyond[i, :, : len(ahead)] @ ahead
+            _divide(self.diagonal[i], out[i], False)
+        return right
+
+
+def factor(matrix: Band) -> Band:
+    """Cholesky's factor, in the place of the matrix.
+
+    Raises:
+        numpy.linalg.LinAlgError: when the matrix is not positive definite.
+    """
+    rows, n = matrix.diagonal.shape[:2]
+    for i in range(rows):
+        _, failed = dpotrf(matrix.diagonal[i].T, lower=1, clean=1, overwrite_a=1)
+        if failed:
+            raise np.linalg.LinAlgError(f"row {i} of nodes: minor {failed} is not positive")
+        beyond = matrix.beyond[i]
+        _divide(matrix.diagonal[i], beyond, True)
+        taken = beyond.T @ beyond
+        for j in range(min(AHEAD, rows - 1 - i)):
+            own = taken[j * n : (j + 1) * n, j * n :]
+            matrix.diagonal[i + 1 + j] -= own[:, :n]
+            matrix.beyond[i + 1 + j, :, : own.shape[1] - n] -= own[:, n:]
+    return matrix
+
+
+def _divide(upper: Float[np.ndarray, "n n"], right: Float[np.ndarray, "n k"], transposed: bool) -> None:
+    """U^-T right or U^-1 right, in place; BLAS sees the transposes, whose columns are contiguous."""
+    dtrsm(1.0, upper.T, right.T, side=1, lower=1, trans_a=int(transposed), overwrite_b=1)
 
 
 def node_sums(
