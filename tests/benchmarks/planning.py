@@ -34,9 +34,8 @@ from udccal.fitting.backscatter.orders import search
 from udccal.fitting.backscatter.posterior import term_posterior
 from udccal.fitting.backscatter.solve import Problem
 from udccal.fitting.geometry.boards import projection_sigma_px
-from udccal.planning.measured import Measured, measured_state
-from udccal.planning.predictors import predictor_for
-from udccal.planning.state import Unexplained, sensor_samples
+from udccal.planning.forecast import predictor_for
+from udccal.planning.state import ModelErrors, measured_state, sensor_samples
 from udccal.rig import Captures, RigDescription, load_rig
 from udccal.sessions.schema import TermName
 from udccal.sessions.store import Session
@@ -112,12 +111,10 @@ def _backscatter_percent(made: Obtained) -> float:
 def compared(term: TermName, designs: list[tuple[str, Captures, Obtained]]) -> list[Row]:
     """Predictions at the values of the first design's fits, a row per design."""
     first = designs[0][2]
-    base, rest = first.calibration.foundation, first.calibration
-    fits = Measured(base.noise, base.geometry, base.wire, rest.psf, rest.backscatter)
-    state = measured_state(first.session.rig, fits)
+    state = measured_state(first.session.rig, first.calibration)
     # A corner's scatter goes for its noise, whatever it comes from.
-    known = state.unexplained
-    by_noise = replace(state, unexplained=Unexplained(on_jig_px=known.on_jig_px, by_hand_px=known.by_hand_px))
+    known = state.model_errors
+    by_noise = replace(state, model_errors=ModelErrors(on_jig_px=known.on_jig_px, by_hand_px=known.by_hand_px))
     predictor = predictor_for(term, by_noise)
     rows = []
     for name, captures, made in designs:

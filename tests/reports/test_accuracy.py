@@ -1,4 +1,4 @@
-"""Accuracy of a term as a technician reads it: figures, tables and sentences, by hand-made outlooks."""
+"""Accuracy of a term as a technician reads it: figures, tables and sentences, by hand-made forecasts."""
 
 from __future__ import annotations
 
@@ -9,23 +9,21 @@ import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from udccal.fitting.nominal import nominal_geometry
-from udccal.planning.knobs import KNOBS
-from udccal.planning.outlook import Outlook, Trade
-from udccal.planning.prediction import Floor
-from udccal.planning.targets import QUANTITIES
-from udccal.reports.accuracy import Accuracy, accuracy_table, stated, trade_sentence
-from udccal.reports.fit_figures import trade_figure
+from udccal.planning.design import DESIGN_VARIABLES
+from udccal.planning.forecast import QUANTITIES, Curve, Floor, Forecast
+from udccal.reports.accuracy import Accuracy, accuracy_table, forecast_sentence, stated
+from udccal.reports.fit_figures import forecast_figure
 from udccal.reports.fit_tables import MOST_ORDERS, more_orders, orders_table
 from udccal.result import Candidate, Diagnostic, Estimate, FitResult, FitStatus
 from udccal.rig import load_rig
 
 
-def _outlook(floor: float = 0.05, gain: float = 0.5) -> Outlook:
+def _forecast(floor: float = 0.05, gain: float = 0.5) -> Forecast:
     """Sigma falls as counts to the power of -gain, from 0.1 % at 100 flats, towards a floor."""
     counts = np.array([25.0, 50.0, 100.0, 200.0, 400.0])
     sigma = 0.1 * (counts / 100) ** -gain
-    trade = Trade(KNOBS["wire"][0], 100, counts, sigma)
-    return Outlook("wire", QUANTITIES["wire"], 0.1, Floor(floor, "More pixels would lower it."), 0.33, (trade,), ())
+    curve = Curve(DESIGN_VARIABLES["wire"][0], 100, counts, sigma)
+    return Forecast("wire", QUANTITIES["wire"], 0.1, Floor(floor, "More pixels would lower it."), 0.33, (curve,), ())
 
 
 def _result(*candidates: Candidate) -> FitResult[None]:
@@ -40,8 +38,8 @@ def _cells(accuracy: Accuracy) -> dict[str, str]:
 
 def test_the_curve_is_drawn_with_what_was_captured() -> None:
     pictures = []
-    for ahead in (_outlook(), _outlook(gain=1.5)):
-        canvas = FigureCanvasAgg(trade_figure(ahead))
+    for ahead in (_forecast(), _forecast(gain=1.5)):
+        canvas = FigureCanvasAgg(forecast_figure(ahead))
         canvas.draw()
         pictures.append(np.asarray(canvas.buffer_rgba())[..., :3].astype(int))
     red = (np.abs(pictures[0] - [192, 57, 43]).sum(axis=-1) < 30).sum()
@@ -50,35 +48,37 @@ def test_the_curve_is_drawn_with_what_was_captured() -> None:
 
 
 def test_every_number_of_the_captures_has_its_panel() -> None:
-    one = _outlook().trades[0]
-    figure = trade_figure(replace(_outlook(), trades=(one, replace(one, knob=KNOBS["psf"][2]))))
+    one = _forecast().curves[0]
+    figure = forecast_figure(replace(_forecast(), curves=(one, replace(one, variable=DESIGN_VARIABLES["psf"][2]))))
     assert [axes.get_xlabel() for axes in figure.axes] == ["flats", "shifts at each position"]
     assert figure.axes[0].get_ylim() == figure.axes[1].get_ylim()
 
 
 def test_the_sentence_names_what_helps_most() -> None:
-    weak = replace(_outlook().trades[0], knob=KNOBS["psf"][2], sigma=np.array([0.102, 0.101, 0.1, 0.099, 0.098]))
-    said = trade_sentence(replace(_outlook(), trades=(weak, _outlook().trades[0]), idle=("frames of a stack",)))
+    weak = replace(
+        _forecast().curves[0], variable=DESIGN_VARIABLES["psf"][2], sigma=np.array([0.102, 0.101, 0.1, 0.099, 0.098])
+    )
+    said = forecast_sentence(replace(_forecast(), curves=(weak, _forecast().curves[0]), idle=("frames of a stack",)))
     assert "more flats, 400 for 100: 0.05 % for 0.1 %" in said
     assert "does not depend on frames of a stack" in said
 
 
 def test_where_nothing_helps_the_floor_is_explained() -> None:
-    said = trade_sentence(_outlook(floor=0.0995, gain=0.001))
+    said = forecast_sentence(_forecast(floor=0.0995, gain=0.001))
     assert "next to nothing" in said
     assert "More pixels would lower it." in said
-    assert "More pixels" not in trade_sentence(_outlook(floor=0.001))
+    assert "More pixels" not in forecast_sentence(_forecast(floor=0.001))
 
 
 def test_what_a_fit_wastes_is_left_on_the_table() -> None:
-    cells = _cells(Accuracy(_outlook(), None, 0.25))
+    cells = _cells(Accuracy(_forecast(), None, 0.25))
     assert cells["information left on the table"] == "75 %"
     assert "stated by the fit" not in cells
-    twice = _cells(Accuracy(_outlook(), 0.2, 1.0))
+    twice = _cells(Accuracy(_forecast(), 0.2, 1.0))
     assert twice["stated by the fit"] == "0.2 %"
     assert twice["information left on the table"] == "75 %"
     # Stated surer than foretold is within what a prediction is good to, and no information from nowhere.
-    assert _cells(Accuracy(_outlook(), 0.09, 1.0))["information left on the table"] == "0 %"
+    assert _cells(Accuracy(_forecast(), 0.09, 1.0))["information left on the table"] == "0 %"
 
 
 def test_what_fits_state_is_in_the_unit_of_the_target() -> None:

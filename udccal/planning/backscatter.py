@@ -1,48 +1,53 @@
 """Prediction for backscatter: the fit's likelihood at its own positions, for pictures as the procedure shows them.
 
-Some pictures are drawn as the procedure draws them; others, which it does not show, are to be predicted.
+Some pictures are drawn as the procedure draws them and stand for all. Others, which it does not show, are to be
+predicted: they are samples without weight.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Final, final
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, UInt8
+from jaxtyping import Float, Int
 
 from udccal.arrangements import Dark, PanelPicture
-from udccal.calibration import FitEffort
 from udccal.displays.pictures import face_picture
 from udccal.fitting.backscatter.data import Bins, grid_step, sampled_rays, visible_crop
-from udccal.fitting.backscatter.parameters import linear_of, linear_slope, prior_of, values_of, with_linear
-from udccal.fitting.backscatter.ratios import corners_of, window_for
+from udccal.fitting.backscatter.likelihood import PerBin, Profile, Samples
+from udccal.fitting.backscatter.parameters import linear_of, prior_of, vector_of
+from udccal.fitting.backscatter.ratios import Pictures, corners_of, window_for
 from udccal.fitting.backscatter.rules import BackscatterRules
-from udccal.fitting.engine.gaussian import Prior
+from udccal.fitting.backscatter.solve import SampleErrors
+from udccal.fitting.engine.least_squares import Blocks
 from udccal.fitting.nominal import nominal_backscatter
-from udccal.models.backscatter import Backscatter, emitter_shares, mixed_colours, panel_light
 from udccal.numerics import in_float64
-from udccal.planning.light import EvenField, sample_variance_e
-from udccal.planning.panel_bins import BinNoise, Ratios, light_sigma, told_by
-from udccal.planning.prediction import Floor
-from udccal.planning.state import WHITE, RigState
-from udccal.planning.steps import PlannedStep, planned_steps
+from udccal.planning.forecast import Floor
+from udccal.planning.state import WHITE, EvenField, RigState, sample_variance_e
+from udccal.planning.steps import PlannedStep, planned_steps, without_pictures
 from udccal.rig import Captures
 
 # So many pictures of the procedure stand for all, since drawing them takes long: more are more of the same kind.
-_DRAWN = 6
+_DRAWN: Final = 6
 # Of pictures that no calibration shows, whose light is to be predicted.
-_NEW_SEEDS = (9001, 9002, 9003)
-_NEW = len(_NEW_SEEDS)
-# Frames are counted with pictures of no size.
-_COUNTING_PX = 8
-_FEWEST_PICTURES = 6
+_NEW_SEEDS: Final = (9001, 9002, 9003)
+_NEW: Final = slice(-1 - len(_NEW_SEEDS), -1)
 _WHITE_VALUE: Final = 255
-_LEAST: Final = 1e-6
 _NEXT_TO_NOTHING: Final = 1e-15
 _MANY: Final = 1_000_000
+_RULES: Final = BackscatterRules()
+
+
+@final
+@dataclass(frozen=True)
+class _Noise:
+    """Variance of a bin per unit of its light, in the dark, and of the dark frame; how many pictures there are."""
+
+    shot: PerBin
+    rest: PerBin
+    dark: PerBin
+    pictures: int
 
 
 @final
@@ -51,72 +56,80 @@ class BackscatterPredictor:
 
     @in_float64
     def __init__(self, state: RigState) -> None:
-        self._state = state
-        rig = state.rig
-        self._step_px = grid_step(rig)
-        rays, flat = sampled_rays(state.geometry, rig, self._step_px, FitEffort().backscatter_positions)
-        prior = prior_of(rig)
-        self._precision = prior.precision
-        x = prior.mean if state.backscatter is None else _vector(state.backscatter, prior)
-        template = nominal_backscatter(state.geometry, rig, np.zeros((3, 2, 2)), self._step_px, window=1)
-        template = replace(template, window=window_for(template, linear_of(x), rays, BackscatterRules().slack_px))
-        self._ratios = _ratios(state, template, x, rays)
+        self._state, rig, step_px = state, state.rig, grid_step(state.rig)
+        rays, flat = sampled_rays(state.geometry, rig, step_px, _RULES.positions)
+        self._prior = prior_of(rig)
+        self._x = self._prior.mean if state.backscatter is None else vector_of(state.backscatter)
+        template = nominal_backscatter(state.geometry, rig, np.zeros((3, 1, 1)), step_px, window=1)
+        template = replace(template, window=window_for(template, linear_of(self._x), rays, _RULES.slack_px))
         # Where in the field the light falls: what leaves the panel evenly is shaded like everything else.
-        across = rig.camera.columns // self._step_px
-        rows, columns = np.divmod(flat, across)
-        self._bins = across * (rig.camera.rows // self._step_px)
-        pixels = self._step_px * (np.stack([columns, rows], axis=1) + 0.5) - 0.5
-        self._shading = EvenField(state).at(pixels)
-        self._white = _white_light(state, flat, self._shading)
+        grid = rig.camera.rows // step_px, rig.camera.columns // step_px
+        rows, columns = np.divmod(flat, grid[1])
+        self._shading = EvenField(state).at(step_px * (np.stack([columns, rows], axis=1) + 0.5) - 0.5)
+        self._mask = _white_light(state, flat, self._shading)
+        # The fit looks at some of the sensor's bins.
+        self._every = grid[0] * grid[1] / len(flat)
         # What a sample's variance, and that of a row's offset, come to in a bin's average.
-        bins, one = Bins(rig.camera.cfa, self._step_px), np.ones((rig.camera.rows, rig.camera.columns))
+        bins, one = Bins(rig.camera.cfa, step_px), np.ones((rig.camera.rows, rig.camera.columns))
         self._by_sample = bins.variance(one).reshape(3, -1)[:, flat]
         self._by_row = bins.row_variance(one).reshape(3, -1)[:, flat]
+        shown = _pictures(state)
+        light = np.zeros((len(shown.logs) + 2, *self._mask.shape))
+        usable = np.ones(light.shape, dtype=bool)
+        self._samples = Samples(rays, light, light, light, usable, np.ones(len(light)), shown)
+        corner = corners_of(template, linear_of(self._x), rays)
+        errors_at = SampleErrors.of(template, self._samples, light, corner)
+        self._ratio, self._jacobian = errors_at.ratios(self._x)
 
     def sigma(self, captures: Captures) -> float:
-        """Root mean square over sensor, colours and pictures, of these' peaks; see ``prediction.Predictor``."""
-        noise, count = self._of_captures(captures)
-        return float("inf") if noise is None else self._light_sigma(noise, count)
+        """Root mean square over sensor, colours and pictures, of these' peaks; see ``forecast.Predictor``."""
+        noise = self._noise(captures)
+        return float("inf") if noise is None else self._light_sigma(noise)
 
     def used(self, captures: Captures) -> float:
-        """Of all bins, a part tells the kernel; see ``prediction.Predictor``."""
-        noise, count = self._of_captures(captures)
-        if noise is None:
-            return 1.0
-        return (
-            self._light_sigma(noise, count, self._bins / self._white.shape[1]) / self._light_sigma(noise, count)
-        ) ** 2
-
-    def _of_captures(self, captures: Captures) -> tuple[BinNoise | None, int]:
-        """Noise, and pictures beside white; None where there are too few."""
-        steps = list(_planned(self._state.with_captures(captures)))
-        pictures = [step for step in steps if isinstance(step.arrangement, PanelPicture)]
-        darks = [step for step in steps if isinstance(step.arrangement, Dark)]
-        if len(pictures) - 1 < _FEWEST_PICTURES or not darks:
-            return None, 0
-        return self._noise(pictures[0], darks[0]), len(pictures) - 1
+        """Of all bins, a part tells the kernel; see ``forecast.Predictor``."""
+        noise = self._noise(captures)
+        return 1.0 if noise is None else (self._light_sigma(noise, self._every) / self._light_sigma(noise)) ** 2
 
     def floor(self) -> Floor:
         """What a profile's fit found its model to leave out, of a new picture's peak; nothing where there is none."""
-        explained = self._state.unexplained.backscatter == 0
+        nothing = np.full(self._mask.shape, _NEXT_TO_NOTHING)
+        explained = self._state.model_errors.backscatter == 0
         return Floor(
-            0.0 if explained else self._light_sigma(self._noiseless(), _MANY),
+            0.0 if explained else self._light_sigma(_Noise(nothing, nothing, nothing, _MANY)),
             "That much of the light the fit of the present profile could not describe; no further picture changes it.",
         )
 
-    def _light_sigma(self, noise: BinNoise, count: int, each: float = 1.0) -> float:
-        """Bins that the fit looks at stand for ``each`` of them."""
-        told = told_by(self._ratios.part(slice(-_NEW)), noise, count)
-        told = replace(told, kernel=each * told.kernel)
-        new, inflation = self._ratios.part(slice(-_NEW, None)), self._state.unexplained.inflation
-        return 100.0 * light_sigma(new, noise, told, self._precision, inflation)
+    def _light_sigma(self, noise: _Noise, count: float = 1.0) -> float:
+        """Bins stand for ``count`` of them each where the parameters are concerned."""
+        rest = np.broadcast_to(noise.rest, self._ratio.shape).copy()
+        rest[-1] = noise.dark
+        light = self._mask * self._ratio
+        samples = replace(self._samples, light=light, shot=np.broadcast_to(noise.shot, light.shape), rest=rest)
+        error = self._state.model_errors.backscatter
+        weight = samples.weights(light, self._mask, error, samples.usable)
+        shown = weight[1 : _NEW.start]
+        shown *= np.sqrt(noise.pictures / len(shown))
+        weight[_NEW] = 0.0
+        profile = Profile.of(self._ratio, samples, weight)
+        jacobian = np.sqrt(count) * profile.jacobian(self._jacobian).reshape(len(self._x), -1).T
+        equations = Blocks.of_errors(np.zeros(len(jacobian)), jacobian).with_prior(self._prior, self._x)
+        cov = equations.cov() * self._state.model_errors.inflation
+        variance = profile.light_variance(self._ratio, self._jacobian, cov)[_NEW] + (error * self._mask) ** 2
+        peak = light[_NEW].max(axis=(1, 2))
+        return 100.0 * float(np.sqrt(variance.mean() / (peak**2).mean()))
 
-    def _noise(self, white: PlannedStep, dark: PlannedStep) -> BinNoise:
-        """In units in which white, shaded, is 1 where it is brightest."""
-        shot, rest = self._of_step(white)
-        return replace(self._noiseless(), shot=shot, rest=rest, dark=self._of_step(dark)[1])
+    def _noise(self, captures: Captures) -> _Noise | None:
+        """In units in which white, shaded, is 1 where it is brightest; None where there are too few pictures."""
+        steps = list(planned_steps("backscatter", without_pictures(self._state.with_captures(captures))))
+        pictures = [step for step in steps if isinstance(step.arrangement, PanelPicture)]
+        darks = [step for step in steps if isinstance(step.arrangement, Dark)]
+        if len(pictures) - 1 < _RULES.fewest_pictures or not darks:
+            return None
+        (shot, rest), (_, dark) = (self._of_step(step) for step in (pictures[0], darks[0]))
+        return _Noise(shot, rest, dark, len(pictures) - 1)
 
-    def _of_step(self, step: PlannedStep) -> tuple[Float[np.ndarray, "3 n"], Float[np.ndarray, "3 n"]]:
+    def _of_step(self, step: PlannedStep) -> tuple[PerBin, PerBin]:
         """Variance of a bin per unit of its light, and in the dark."""
         state = self._state
         full = (step.level or 0.0) * state.full_well_e * np.ones((3, 1)) * self._shading
@@ -126,14 +139,8 @@ class BackscatterPredictor:
         frames = len(step.exposures_s)
         return self._by_sample / (full * frames), rest / (full**2 * frames)
 
-    def _noiseless(self) -> BinNoise:
-        nothing = np.full(self._white.shape, _NEXT_TO_NOTHING)
-        return BinNoise(self._white, nothing, nothing, nothing, self._state.unexplained.backscatter)
 
-
-def _white_light(
-    state: RigState, flat: Int[np.ndarray, " n"], shading: Float[np.ndarray, " n"]
-) -> Float[np.ndarray, "3 n"]:
+def _white_light(state: RigState, flat: Int[np.ndarray, " n"], shading: Float[np.ndarray, " n"]) -> PerBin:
     """Light of white at grid positions: even, or as a profile's mask has it."""
     light = (np.array(WHITE) / max(WHITE))[:, None] * np.ones(len(flat))
     if state.backscatter is not None and np.max(state.backscatter.mask) > 0:
@@ -142,68 +149,14 @@ def _white_light(
     return np.asarray(light / (light * shading).max())
 
 
-def _planned(state: RigState) -> list[PlannedStep]:
-    """The steps with pictures of no size: only exposures and frames matter."""
-    return list(planned_steps("backscatter", _smaller(state)))
-
-
-def _smaller(state: RigState) -> RigState:
-    cut = state.rig.panel.model_copy(update={"columns": _COUNTING_PX, "rows": _COUNTING_PX})
-    return state.of(state.rig.model_copy(update={"panel": cut}))
-
-
-def _vector(term: Backscatter, prior: Prior) -> Float[np.ndarray, "18"]:
-    """A fitted term in the solver's coordinates, some of which are logarithms."""
-    emitters, mix = np.asarray(term.emitters_px), np.asarray(term.mix)
-    lengths = (term.distance_mm, term.pupil_mm, term.softness_px, term.reflection, term.reflection_mm)
-    crosstalk = (mix / np.diag(mix)[:, None])[~np.eye(3, dtype=bool)]
-    places = (emitters[1], emitters[0] - emitters[1], emitters[2] - emitters[1])
-    values = np.concatenate([[float(np.asarray(one)) for one in (term.gamma, *lengths)], *places, crosstalk])
-    logarithmic = np.isclose(values_of(prior.mean), np.exp(prior.mean))
-    return np.where(logarithmic, np.log(np.maximum(values, _LEAST)), values)
-
-
-def _ratios(
-    state: RigState, template: Backscatter, x: Float[np.ndarray, "18"], rays: Float[np.ndarray, "n 3"]
-) -> Ratios:
-    """Of pictures as the procedure shows them, and last of those for the prediction."""
+def _pictures(state: RigState) -> Pictures:
+    """As the procedure shows them, and last those for the prediction."""
     panel, crop = state.rig.panel, visible_crop(state.geometry, state.rig)
     few = state.with_captures(state.rig.captures.model_copy(update={"backscatter_pictures": _DRAWN}))
     shown = [
-        crop.of(step.arrangement.picture)
+        step.arrangement.picture
         for step in planned_steps("backscatter", few)
         if isinstance(step.arrangement, PanelPicture) and step.arrangement.picture.min() < _WHITE_VALUE
     ]
-    shown += [crop.of(face_picture(seed, panel.columns, panel.rows)) for seed in _NEW_SEEDS]
-    theta = linear_of(x)
-    corner = corners_of(template, theta, rays)
-    seen = _in_windows(np.stack(shown), corner - np.array([crop.column, crop.row]), template.window)
-    value, slope = _with_slopes(theta, template, rays, corner, seen)
-    return Ratios(np.asarray(value), np.asarray(slope) * linear_slope(x))
-
-
-def _in_windows(
-    shown: UInt8[np.ndarray, "pictures rows columns 3"], first: Int[np.ndarray, "n 2"], window: int
-) -> Float[np.ndarray, "pictures n window2 3"]:
-    """Picture values, 0 to 255, in a window of panel pixels per position; dark beyond the part that is seen."""
-    padded = np.pad(shown, [(0, 0), (window, window), (window, window), (0, 0)])
-    span = np.arange(window)
-    # (x, y) of the windows' first pixels, held inside the padding.
-    start = np.clip(first + window, 0, np.array(padded.shape[2:0:-1]) - window)
-    rows, columns = start[:, 1, None, None] + span[:, None], start[:, 0, None, None] + span[None, :]
-    return padded[:, rows, columns].reshape(len(shown), len(first), -1, 3).astype(np.float64)
-
-
-@jax.jit
-def _with_slopes(
-    theta: Float[Array, "18"], template: Backscatter, rays: Array, corner: Array, seen: Array
-) -> tuple[Float[Array, "pictures 3 n"], Float[Array, "pictures 3 n 18"]]:
-    """Light of pictures over that of white, and its slopes by the parameters."""
-
-    def ratios(values: Float[Array, "18"]) -> Float[Array, "pictures 3 n"]:
-        term = with_linear(template, values)
-        shares = emitter_shares(term, rays, corner)
-        light = mixed_colours(term, jnp.einsum("nwp,inwp->inp", shares, panel_light(term, seen)))
-        return jnp.moveaxis(light / mixed_colours(term, shares.sum(axis=1)), 1, 2)
-
-    return ratios(theta), jax.jacfwd(ratios)(theta)
+    shown += [face_picture(seed, panel.columns, panel.rows) for seed in _NEW_SEEDS]
+    return Pictures.of(np.stack([crop.of(picture) for picture in shown]), crop)

@@ -1,33 +1,70 @@
-"""Prediction for geometry: a bundle of boards where the procedure asks for them, and how sure rays are for the panel.
+"""Prediction for geometry: the bundle of the boards that the procedure asks for, and how sure rays are for the panel.
 
-Lens and one pose per view are estimated together; the board on the jig has the panel's rotation.
+A planned view holds the corners that it would show and their scatter; the fit's own equations give the covariance of
+intrinsics and poses, of which the board on the jig has the panel's rotation.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from functools import partial
 from typing import final
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float
+from scipy.spatial.transform import Rotation
+from scipy.special import erf
 
 from udccal.arrangements import Board
-from udccal.fitting.geometry.bundle import LENS, ORDERS, Intrinsics
+from udccal.fitting.engine.gaussian import Posterior, scaled_inverse
+from udccal.fitting.engine.orders import bic
+from udccal.fitting.geometry.boards import term_at, with_angles
+from udccal.fitting.geometry.bundle import (
+    EVERY,
+    ORDERS,
+    Bundle,
+    BundleProblem,
+    GeometryRules,
+    Intrinsics,
+    Points,
+    projected,
+)
+from udccal.fitting.geometry.corners import board_points_mm, charuco_board
 from udccal.fitting.geometry.data import rig_prior
-from udccal.models.geometry import project, rotation_matrix, unproject
+from udccal.models.geometry import panel_directions, project_directions
 from udccal.numerics import in_float64
-from udccal.planning.algebra import covariance
-from udccal.planning.board_views import PlannedView, planned_view
-from udccal.planning.light import EvenField
-from udccal.planning.prediction import Floor
-from udccal.planning.state import RigState, sensor_samples
-from udccal.planning.steps import planned_steps
+from udccal.planning.forecast import Floor
+from udccal.planning.state import WHITE, EvenField, RigState, sample_variance_e, sensor_samples
+from udccal.planning.steps import PlannedStep, planned_steps
 from udccal.rig import Captures
 
-_GRID = 17
+_ACROSS = 17
 # Stands for endless views.
 _MANY = 1e6
+# What a saddle leaves out of a corner, by axis, where no profile has measured it. Edges of the board on the jig run
+# along the sensor's rows: samples meet them at few phases, and corners scatter more than on boards that lean.
+_ON_JIG_PX, _BY_HAND_PX = 0.0085, 0.006
+# White paper reflects so much more than black ink that half the difference is this part of white.
+_HALF_CONTRAST = 0.47
+# Edges after lens, pixel and the filter that makes a grey picture of a mosaic (one sigma).
+_EDGE_PX = 1.0
+# Radius of a saddle's window in squares: markers stand beyond it.
+_WINDOW_SQUARES = 0.16
+_RULES = GeometryRules()
+_places, _directions = jax.jit(project_directions), jax.jit(panel_directions)
+
+
+@final
+@dataclass(frozen=True)
+class _View:
+    """Corners that a planned view would show, on the board, in px and with their scatter; its pose, board to camera."""
+
+    board: Float[np.ndarray, "n 3"]
+    image: Float[np.ndarray, "n 2"]
+    sigma: Float[np.ndarray, " n"]
+    pose: Float[np.ndarray, "6"]
+    parallel: bool
 
 
 @final
@@ -37,76 +74,123 @@ class GeometryPredictor:
     def __init__(self, state: RigState) -> None:
         self._state = state
         self._field = EvenField(state)
-        self._lens = Intrinsics.of_geometry(state.geometry).vector
-        self._rays = _ray_slopes(self._lens, sensor_samples(state.rig, _GRID))
-        self._known: dict[Board, PlannedView | None] = {}
+        self._intrinsics = Intrinsics.of_geometry(state.geometry).vector
+        self._prior = rig_prior(state.rig)
+        self._known: dict[Board, _View | None] = {}
 
     def sigma(self, captures: Captures) -> float:
-        """Root mean square over the sensor and both axes; see ``prediction.Predictor``."""
-        return self._projection(self._views(captures), 1.0)
+        """Root mean square over the sensor and both axes; see ``forecast.Predictor``."""
+        return self._ray_sigma(self._views(captures), 1.0)
 
     def floor(self) -> Floor:
         """Where endless views have told all of the lens."""
         return Floor(
-            self._projection(self._views(self._state.rig.captures), _MANY),
+            self._ray_sigma(self._views(self._state.rig.captures), _MANY),
             "The panel's rotation rests on the one view of the board on the jig: a larger or nearer board there, or "
             "corners that scatter less, would lower that.",
         )
 
     def used(self, captures: Captures) -> float:
-        """All corners; see ``prediction.Predictor``."""
+        """All corners; see ``forecast.Predictor``."""
         return 1.0
 
-    @in_float64
-    def _views(self, captures: Captures) -> list[PlannedView]:
+    def _views(self, captures: Captures) -> list[_View]:
         views = []
         for step in planned_steps("geometry", self._state.with_captures(captures)):
-            board = step.arrangement
-            if not isinstance(board, Board):
-                continue
-            if board not in self._known:
-                self._known[board] = planned_view(self._state, self._field, step, board)
-            if (view := self._known[board]) is not None:
-                views.append(view)
-        return views
+            if isinstance(board := step.arrangement, Board):
+                if board not in self._known:
+                    self._known[board] = _planned_view(self._state, self._field, step, board)
+                views.append(self._known[board])
+        return [view for view in views if view is not None]
 
-    def _projection(self, views: list[PlannedView], weight: float) -> float:
-        """Views held by hand count ``weight`` times."""
-        if not any(view.parallel for view in views):
+    @in_float64
+    def _ray_sigma(self, views: list[_View], count: float) -> float:
+        """Views held by hand stand for ``count`` of them each."""
+        parallel = [k for k, view in enumerate(views) if view.parallel]
+        if not parallel:
             return float("inf")
-        information = sum(
-            (view.information * (1.0 if view.parallel else weight) for view in views), start=np.zeros((12, 12))
-        )
-        information[:LENS, :LENS] += rig_prior(self._state.rig).precision
-        samples = 2 * sum(view.corners for view in views)
-        free = self._order(information, 12 + 6 * len(views) - 9, samples)
-        cov, slopes = covariance(information[np.ix_(free, free)]), self._rays[:, :, free]
-        return float(np.sqrt(np.einsum("nai,ij,naj->na", slopes, cov, slopes).mean()))
+        sizes = [len(view.sigma) for view in views]
+        points = Points(
+            board=np.concatenate([view.board for view in views]),
+            image=np.concatenate([view.image for view in views]),
+            sigma=np.concatenate([view.sigma for view in views]),
+            view=np.repeat(np.arange(len(views)), sizes),
+            index=np.concatenate([np.arange(size) for size in sizes]),
+            used=np.ones(sum(sizes), dtype=bool),
+            names=tuple(range(len(views))),
+        ).scaled(np.array([1.0 if view.parallel else count**-0.5 for view in views]))
+        bundle = Bundle(self._intrinsics, np.array([view.pose for view in views]))
+        free = self._order(points, bundle)
+        cov = BundleProblem(points, free, self._prior).equations_at(bundle).joint_cov()
+        x, cov = with_angles(bundle.intrinsics, bundle.poses, cov, parallel)
+        posterior = Posterior.from_cov(x, cov, partial(term_at, pupil=np.asarray(self._state.geometry.pupil)))
+        directions = np.asarray(_directions(posterior.term_at(x), sensor_samples(self._state.rig, _ACROSS)))
+        sigma = posterior.sigma_of(lambda term: np.asarray(_places(term, directions)))
+        return float(np.sqrt((sigma**2).mean()))
 
-    def _order(self, information: Float[np.ndarray, "12 12"], others: int, samples: int) -> Bool[np.ndarray, "12"]:
+    def _order(self, points: Points, bundle: Bundle) -> Bool[np.ndarray, "9"]:
         """The distortions that the data are expected to ask for, by the fit's own criterion, n ln(chi2) + k ln(n)."""
-        cov = covariance(information)
-        freedom = max(samples - others, 1)
-        scores = []
-        for free in ORDERS.values():
-            held = np.flatnonzero(~free)
-            rise = float(self._lens[held] @ covariance(cov[np.ix_(held, held)]) @ self._lens[held])
-            scores.append(samples * np.log1p(rise / freedom) + free.sum() * np.log(samples))
-        return np.append(list(ORDERS.values())[int(np.argmin(scores))], [True, True, True])
+        equations = BundleProblem(points, EVERY, self._prior).equations_at(bundle)
+        cov, samples = equations.cov(), equations.samples
+        freedom = max(samples - EVERY.sum() - bundle.poses.size, 1)
+
+        def criterion(free: Bool[np.ndarray, "9"]) -> float:
+            held = self._intrinsics * ~free
+            rise = float(held @ scaled_inverse(cov * np.outer(~free, ~free)) @ held)
+            return bic(samples * float(np.log1p(rise / freedom)), float(free.sum()), samples)
+
+        return min(ORDERS.values(), key=criterion)
 
 
-@in_float64
-def _ray_slopes(lens: Float[np.ndarray, "9"], pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2 12"]:
-    return np.asarray(_slopes(lens, pixels), dtype=np.float64)
+def _planned_view(state: RigState, field: EvenField, step: PlannedStep, board: Board) -> _View | None:
+    """None where the board shows too few corners to hold its pose."""
+    to_camera = Rotation.from_rotvec(np.asarray(state.geometry.rotation)).inv()
+    rotation = to_camera * Rotation.from_rotvec(np.array(board.rotation_vector))
+    origin = to_camera.apply(np.array(board.translation_mm) - np.asarray(state.geometry.pupil))
+    intrinsics, corners = Intrinsics.of_geometry(state.geometry).vector, board_points_mm(board.spec)
+    markers = np.asarray(charuco_board(board.spec).getObjPoints(), dtype=np.float64).reshape(-1, 3)
+    image, marks = (projected(intrinsics, rotation.apply(points) + origin)[0] for points in (corners, markers))
+    depth = float((rotation.apply(corners.mean(axis=0)) + origin)[2])
+    radius = float(np.clip(_WINDOW_SQUARES * board.spec.square_mm / depth * intrinsics[0], *_RULES.window_px))
+    whole = _inside(state, marks, 1.0).reshape(-1, 4).all(axis=1)
+    # Corners both of whose markers are in the picture: without them the detector does not know their numbers.
+    near = np.linalg.norm(corners[:, None] - markers.reshape(-1, 4, 3).mean(axis=1), axis=2) < board.spec.square_mm
+    good = _inside(state, image, np.ceil(radius) + 1) & ~(near & ~whole).any(axis=1)
+    if depth <= 0 or good.sum() < _RULES.least_corners:
+        return None
+    known, common = (
+        (state.model_errors.on_jig_px, _ON_JIG_PX)
+        if board.parallel_to_panel
+        else (state.model_errors.by_hand_px, _BY_HAND_PX)
+    )
+    sigma = np.hypot(_noise_px(state, field, step, image[good], radius), common if known is None else known)
+    pose = np.concatenate([rotation.as_rotvec(), origin])
+    return _View(corners[good], image[good], sigma, pose, board.parallel_to_panel)
 
 
-@jax.jit
-def _slopes(lens: Float[Array, "9"], pixels: Float[Array, "n 2"]) -> Float[Array, "n 2 12"]:
-    """Of where the rays of these pixels land, by the lens and by a turn of the panel in camera coordinates."""
-    ideal = unproject(Intrinsics.of(lens).camera(), pixels)
-    rays = jnp.concatenate([ideal, jnp.ones_like(ideal[:, :1])], axis=1)
+def _noise_px(
+    state: RigState, field: EvenField, step: PlannedStep, pixels: Float[np.ndarray, "n 2"], radius: float
+) -> Float[np.ndarray, " n"]:
+    """Scatter of saddles by temporal noise of the board's frames; boards are divided by far more frames of the flat."""
+    white = (step.level or 0.0) * state.full_well_e * field.at(pixels)
+    signal = white[:, None] * np.array(WHITE)[[0, 1, 1, 2]] / max(WHITE)
+    temporal = sample_variance_e(state, 0.5 * signal, step.exposures_s[0]) / len(step.exposures_s)
+    relative = temporal / signal**2
+    return np.asarray(np.sqrt(relative.mean(axis=1)) / _HALF_CONTRAST * _saddle_scatter(radius))
 
-    def seen(x: Float[Array, "12"]) -> Float[Array, "n 2"]:
-        return project(Intrinsics.of(x[:LENS]).camera(), rays @ rotation_matrix(x[LENS:]).T)
 
-    return jax.jacfwd(seen)(jnp.concatenate([lens, jnp.zeros(3)]))
+def _saddle_scatter(radius_px: float) -> float:
+    """Scatter by axis in px of a weighted fit of erf(x) erf(y) with a free slope, at unit noise over contrast."""
+    half = int(np.ceil(radius_px))
+    y, x = np.mgrid[-half : half + 1, -half : half + 1].astype(np.float64) / _EDGE_PX
+    weight = np.clip(1 - (x**2 + y**2) * (_EDGE_PX / radius_px) ** 2, 0.0, None).ravel()
+    across = np.sqrt(2 / np.pi) / _EDGE_PX * np.exp(-0.5 * x**2) * erf(y / np.sqrt(2))
+    design = np.stack([across.ravel(), y.ravel()], axis=1)
+    # Windows weigh samples unlike their noise: the covariance is a sandwich.
+    solved = np.linalg.solve(design.T @ (design * weight[:, None]), (design * weight[:, None]).T)
+    return float(np.linalg.norm(solved[0]))
+
+
+def _inside(state: RigState, pixels: Float[np.ndarray, "n 2"], margin: float) -> Bool[np.ndarray, " n"]:
+    last = np.array([state.rig.camera.columns, state.rig.camera.rows]) - 1 - margin
+    return np.asarray(np.all((pixels >= margin) & (pixels <= last), axis=1))

@@ -1,9 +1,4 @@
-"""Prediction for noise: the gain K from pairs of flats, read noise along with it (EMVA 1288, photon transfer).
-
-The variance of the difference of two frames over n samples is known to its part sqrt(2 / n). With V = K s + V0 at a
-signal of s DN above black, each pair brings  n / (2 V^2) [s, 1]^T [s, 1]  on (K, V0), and each dark pair the same at s
-of the dark current.
-"""
+"""Prediction for noise: gain K and read noise from pairs of flats and darks, by the photon transfer's equations."""
 
 from __future__ import annotations
 
@@ -13,17 +8,15 @@ import numpy as np
 from jaxtyping import Float
 
 from udccal.arrangements import Dark, FlatLight
-from udccal.planning.algebra import covariance
-from udccal.planning.light import EvenField
-from udccal.planning.prediction import Floor
-from udccal.planning.state import RigState, sensor_samples
-from udccal.planning.steps import PlannedStep, planned_steps
+from udccal.fitting.noise.rules import NoiseRules
+from udccal.fitting.noise.transfer import DarkVariance, Levels, Order, TransferProblem, temporal_variance
+from udccal.planning.forecast import Floor
+from udccal.planning.state import EvenField, RigState, sensor_samples
+from udccal.planning.steps import planned_steps
 from udccal.rig import Captures
 
-# Samples brighter than this part of saturation are no part of the photon transfer fit.
-_FIT_UP_TO = 0.9
 _SAMPLES_ACROSS = 64
-_FEWEST_LEVELS = 3
+_RULES = NoiseRules()
 
 
 @final
@@ -35,44 +28,61 @@ class NoisePredictor:
         pixels = sensor_samples(state.rig, _SAMPLES_ACROSS)
         # Neighbours in both directions: every site of the CFA has its share.
         sites = np.concatenate([pixels + shift for shift in np.mgrid[0:2, 0:2].reshape(2, -1).T])
-        self._full_e = state.full_well_e * EvenField(state).signal(sites)
-        self._each = state.rig.camera.rows * state.rig.camera.columns / len(sites)
+        self._light = EvenField(state).signal(sites)
+        noise = state.noise
+        self._K, sigma_d, row_DN, q_DN, self._dark_e_per_s = (
+            float(np.asarray(one))
+            for one in (noise.K_DN_per_e, noise.sigma_d_e, noise.sigma_row_DN, noise.q_DN, noise.dark_current_e_per_s)
+        )
+        self._V0, self._rounding = max((self._K * sigma_d) ** 2 - row_DN**2, 1e-4), q_DN**2 / 12
 
     def sigma(self, captures: Captures) -> float:
-        """Of K, in per cent; see ``prediction.Predictor``."""
-        information, usable = np.zeros((2, 2)), 0
-        for step in planned_steps("noise", self._state.with_captures(captures)):
-            if len(step.exposures_s) != 2:
-                continue
-            one = self._information(step)
-            information += one
-            usable += isinstance(step.arrangement, FlatLight) and bool(one.any())
-        if usable < _FEWEST_LEVELS:
+        """Of K, in per cent; see ``forecast.Predictor``."""
+        steps = list(planned_steps("noise", self._state.with_captures(captures)))
+        pairs = [step for step in steps if len(step.exposures_s) == 2]
+        flats = [step for step in pairs if isinstance(step.arrangement, FlatLight)]
+        darks = [step for step in pairs if isinstance(step.arrangement, Dark)]
+        levels = self._levels(
+            np.array([step.level or 0.0 for step in flats]), np.array([step.exposures_s[0] for step in flats])
+        )
+        if levels.usable.any(axis=1).sum() < _RULES.levels:
             return float("inf")
-        K = float(np.asarray(self._state.noise.K_DN_per_e))
-        return 100.0 * float(np.sqrt(covariance(information)[0, 0])) / K
+        dark = self._dark(np.array([step.exposures_s[0] for step in darks]))
+        x = np.array([self._K, self._V0, 0.0, 1.0, 0.0])
+        sizes = np.array([self._K, self._V0, 1.0, 1.0, 1.0])
+        cov = TransferProblem(levels, dark, Order(), _RULES.most_bent, sizes).equations_at(x).cov()
+        return 100.0 * float(np.sqrt(cov[0, 0])) / self._K
 
     def floor(self) -> Floor:
         """None: every further pair tells more."""
         return Floor(0.0, "")
 
     def used(self, captures: Captures) -> float:
-        """All pairs; see ``prediction.Predictor``."""
+        """All pairs; see ``forecast.Predictor``."""
         return 1.0
 
-    def _information(self, step: PlannedStep) -> Float[np.ndarray, "2 2"]:
-        """Of one pair, on (K, V0)."""
-        noise = self._state.noise
-        K = float(np.asarray(noise.K_DN_per_e))
-        read_DN2 = (K * float(np.asarray(noise.sigma_d_e))) ** 2 - float(np.asarray(noise.sigma_row_DN)) ** 2
-        V0 = max(read_DN2, 1e-4) + float(np.asarray(noise.q_DN)) ** 2 / 12
-        dark_e = float(np.asarray(noise.dark_current_e_per_s)) * step.exposures_s[0]
-        light_e = np.zeros_like(self._full_e) if isinstance(step.arrangement, Dark) else self._lit(step)
-        # Samples above the limit clip in part of the frames and are left out.
-        signal = K * (light_e[light_e <= _FIT_UP_TO * self._state.full_well_e] + dark_e)
-        weight = self._each / (2 * (K * signal + V0) ** 2)
-        by = np.stack([signal, np.ones_like(signal)])
-        return np.asarray((by * weight) @ by.T)
+    def _levels(self, level: Float[np.ndarray, " levels"], exposure_s: Float[np.ndarray, " levels"]) -> Levels:
+        """Pairs of flats, of which every place looked at is a bin; their light is not known."""
+        full_DN = self._K * self._state.full_well_e
+        dark_DN = self._K * self._dark_e_per_s * exposure_s
+        light_DN = full_DN * level[:, None] * self._light
+        each = np.full(light_DN.shape, self._state.rig.camera.rows * self._state.rig.camera.columns / len(self._light))
+        signal_DN = light_DN + dark_DN[:, None]
+        return Levels(
+            mean_DN=signal_DN,
+            variance_DN2=temporal_variance(signal_DN, self._K, self._V0, 0.0, self._rounding),
+            dof=each,
+            samples=2 * each,
+            usable=light_DN <= _RULES.fit_up_to * full_DN,
+            light=np.full(len(level), np.nan),
+            steady=np.zeros(len(level), dtype=bool),
+            dark_DN=dark_DN,
+            row_variance_DN2=np.zeros(len(level)),
+        )
 
-    def _lit(self, step: PlannedStep) -> Float[np.ndarray, " n"]:
-        return np.asarray((step.level or 0.0) * self._full_e)
+    def _dark(self, exposure_s: Float[np.ndarray, " pairs"]) -> DarkVariance:
+        """Pairs of dark frames."""
+        dark_DN = self._K * self._dark_e_per_s * exposure_s
+        variance = temporal_variance(dark_DN, self._K, self._V0, 0.0, self._rounding)
+        sigma = variance * np.sqrt(2 / (self._state.rig.camera.rows * self._state.rig.camera.columns))
+        return DarkVariance(np.full(len(dark_DN), self._V0), sigma, self._rounding, self._K, dark_DN)

@@ -4,28 +4,38 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable, Sequence
+import re
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import final, get_args
+from typing import Final, final, get_args
 
-from udccal.planning.knobs import KNOBS
-from udccal.planning.prediction import Predictor
-from udccal.planning.predictors import predictor_for
-from udccal.planning.search import Addition, Oracle, cheapest, worthwhile
+from udccal.errors import UdccalError
+from udccal.planning.design import DESIGN_VARIABLES, Addition, Objective, cheapest, worthwhile
+from udccal.planning.forecast import QUANTITIES, predictor_for
 from udccal.planning.state import RigState
 from udccal.planning.steps import NOTHING, Cost, cost_of
-from udccal.planning.targets import QUANTITIES, Target
 from udccal.rig import Captures
 from udccal.sessions.schema import TermName
 
 # A target this much above the floor takes captures without end.
-_NEAR_FLOOR = 1.001
+_NEAR_FLOOR: Final = 1.001
+_FORM: Final = re.compile(r"(?P<term>[^=\s]+)=(?P<value>[-+.0-9]*(?:[eE][-+]?[0-9]+)?)(?P<unit>%|[a-zA-Z]*)")
+_EXAMPLE: Final = "Write, for example, wire=0.05% or geometry=0.1px."
+
+
+@final
+@dataclass(frozen=True)
+class Target:
+    """One standard deviation that a term is to reach, in the unit of ``QUANTITIES``."""
+
+    term: TermName
+    sigma: float
 
 
 @final
 @dataclass(frozen=True)
 class Setting:
-    """One number of the captures: as the rig has it, and as planned."""
+    """One design variable: as the rig has it, and as planned."""
 
     name: str
     before: int
@@ -35,7 +45,7 @@ class Setting:
 @final
 @dataclass(frozen=True)
 class Suggestion:
-    """One number one step up: by how much sigma falls in per cent of itself, and what that takes."""
+    """One design variable one step up: by how much sigma falls in per cent of itself, and what that takes."""
 
     term: TermName
     setting: Setting
@@ -90,6 +100,41 @@ class CapturePlan:
         return all(term.reached for term in self.terms)
 
 
+def parse_targets(words: Sequence[str]) -> tuple[Target, ...]:
+    """Targets such as ``wire=0.05%``, in the order of the terms.
+
+    Raises:
+        UdccalError: when a word is no target, names no term or another unit, or the terms repeat.
+    """
+    targets = [_target(word) for word in words]
+    terms = [target.term for target in targets]
+    for term in terms:
+        if terms.count(term) > 1:
+            raise UdccalError(f"Expected one target for {term}, found {terms.count(term)}. Keep one of them.")
+    return tuple(sorted(targets, key=lambda target: get_args(TermName).index(target.term)))
+
+
+def _target(word: str) -> Target:
+    match = _FORM.fullmatch(word.strip())
+    if match is None:
+        raise UdccalError(f"Expected a target such as wire=0.05%, found '{word}'. {_EXAMPLE}")
+    names: tuple[TermName, ...] = get_args(TermName)
+    term = next((name for name in names if name == match["term"]), None)
+    if term is None:
+        raise UdccalError(f"Expected a target for {', '.join(names)}, found one for '{match['term']}'. {_EXAMPLE}")
+    try:
+        sigma = float(match["value"])
+    except ValueError:
+        sigma = math.nan
+    if not (math.isfinite(sigma) and sigma > 0):
+        raise UdccalError(f"Expected a target above zero, found '{word}'. {_EXAMPLE}")
+    unit = QUANTITIES[term].unit
+    if match["unit"] != unit:
+        found = f"'{match['unit']}'" if match["unit"] else "none"
+        raise UdccalError(f"Expected the target of {term} in {unit}, found the unit {found} in '{word}'. {_EXAMPLE}")
+    return Target(term, sigma)
+
+
 def make_plan(
     state: RigState, targets: Sequence[Target], progress: Callable[[TermName], None] = lambda term: None
 ) -> CapturePlan:
@@ -110,78 +155,57 @@ def make_plan(
         plans.append(plan)
     untouched = tuple(term for term in get_args(TermName) if term not in {plan.term for plan in plans})
     rest = sum((cost_of(term, state) for term in untouched), start=NOTHING)
-    suggestions = [plan for plan in plans if plan.per_second is not None]
     return CapturePlan(
         captures=captures,
         terms=tuple(plans),
         untouched=untouched,
         cost=sum((plan.cost for plan in plans), start=rest),
         cost_before=sum((plan.cost_before for plan in plans), start=rest),
-        per_second=_first([plan.per_second for plan in suggestions], _per_second),
-        per_set_up=_first([plan.per_set_up for plan in suggestions], _per_set_up),
+        per_second=_most_per_second(plan.per_second for plan in plans),
+        per_set_up=_most_per_set_up(plan.per_set_up for plan in plans),
     )
 
 
 def _plan_term(state: RigState, target: Target, captures: Captures) -> tuple[Captures, TermPlan]:
     term, before = target.term, state.rig.captures
     predictor = predictor_for(term, state)
-    oracle = _oracle(term, state, predictor)
+    objective = Objective(
+        term, functools.cache(predictor.sigma), functools.cache(lambda some: cost_of(term, state.with_captures(some)))
+    )
     floor = predictor.floor()
-    found = cheapest(oracle, captures, target.sigma) if target.sigma > _NEAR_FLOOR * floor.sigma else None
+    found = cheapest(objective, captures, target.sigma) if target.sigma > _NEAR_FLOOR * floor.sigma else None
     planned = captures if found is None else found
-    more = [_suggestion(term, planned, one) for one in worthwhile(oracle, planned)]
+    more = [_suggestion(term, planned, one) for one in worthwhile(objective, planned)]
     return planned, TermPlan(
         term=term,
         unit=QUANTITIES[term].unit,
         meaning=QUANTITIES[term].meaning,
         target=target.sigma,
-        sigma=oracle.sigma(planned),
-        sigma_before=oracle.sigma(before),
+        sigma=objective.sigma(planned),
+        sigma_before=objective.sigma(before),
         floor=floor.sigma,
-        reached=oracle.sigma(planned) <= target.sigma,
+        reached=objective.sigma(planned) <= target.sigma,
         lowered_by=floor.lowered_by,
-        settings=tuple(Setting(knob.name, knob.of(before), knob.of(planned)) for knob in KNOBS[term]),
-        cost=oracle.cost(planned),
-        cost_before=oracle.cost(before),
-        per_second=_first(more, _per_second),
-        per_set_up=_first(more, _per_set_up),
+        settings=tuple(Setting(one.name, one.of(before), one.of(planned)) for one in DESIGN_VARIABLES[term]),
+        cost=objective.cost(planned),
+        cost_before=objective.cost(before),
+        per_second=_most_per_second(more),
+        per_set_up=_most_per_set_up(more),
     )
 
 
-def _oracle(term: TermName, state: RigState, predictor: Predictor) -> Oracle:
-    """What was asked once is remembered, by the numbers that matter for the term."""
-    knobs = KNOBS[term]
-
-    def restored(numbers: tuple[int, ...]) -> Captures:
-        captures = state.rig.captures
-        for knob, value in zip(knobs, numbers, strict=True):
-            captures = knob.set(captures, value)
-        return captures
-
-    sigma = functools.cache(lambda numbers: predictor.sigma(restored(numbers)))
-    cost = functools.cache(lambda numbers: cost_of(term, state.with_captures(restored(numbers))))
-
-    def numbers_of(captures: Captures) -> tuple[int, ...]:
-        return tuple(knob.of(captures) for knob in knobs)
-
-    return Oracle(term, lambda captures: sigma(numbers_of(captures)), lambda captures: cost(numbers_of(captures)))
-
-
 def _suggestion(term: TermName, planned: Captures, addition: Addition) -> Suggestion:
-    setting = Setting(addition.knob.name, addition.knob.of(planned), addition.knob.of(addition.captures))
+    one = addition.variable
+    setting = Setting(one.name, one.of(planned), one.of(addition.captures))
     return Suggestion(term, setting, 100 * (1 - math.exp(-addition.gain)), addition.cost)
 
 
-def _per_second(one: Suggestion) -> float:
-    return one.gain_percent / max(one.cost.seconds, 1e-9)
+def _most_per_second(suggestions: Iterable[Suggestion | None]) -> Suggestion | None:
+    made = (one for one in suggestions if one is not None)
+    return max(made, key=lambda one: one.gain_percent / max(one.cost.seconds, 1e-9), default=None)
 
 
-def _per_set_up(one: Suggestion) -> tuple[bool, float]:
+def _most_per_set_up(suggestions: Iterable[Suggestion | None]) -> Suggestion | None:
     """What takes no set-up goes first."""
-    return one.cost.set_ups <= 0, one.gain_percent / max(one.cost.set_ups, 1)
-
-
-def _first(
-    suggestions: Sequence[Suggestion | None], worth: Callable[[Suggestion], float | tuple[bool, float]]
-) -> Suggestion | None:
-    return max((one for one in suggestions if one is not None), key=worth, default=None)
+    made = (one for one in suggestions if one is not None)
+    return max(made, key=lambda one: (one.cost.set_ups <= 0, one.gain_percent / max(one.cost.set_ups, 1)), default=None)

@@ -1,51 +1,44 @@
-"""Prediction for the psf: the normal equations of the diffraction fit, for LEDs as they are expected to be seen.
+"""Prediction for the psf: the equations of the diffraction fit, for LEDs as they are expected to be seen.
 
-A few places stand for all; each shot's own unknowns (place, light per colour, background) are estimated along. A sample
-has what its bracket tells of its rate, and PRNU. The fit looks at no more positions and shifts than its effort says, so
-that more of them bring nothing.
+A few places stand for all; each shot's own parameters (place, light per colour, background) are estimated along. A
+sample has what its bracket tells of its rate, and PRNU. The fit looks at no more positions and shifts than its rules
+say, so that more of them bring nothing.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Final, final
 
-import equinox as eqx
-import jax
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from udccal.arrangements import Led
-from udccal.calibration import FitEffort
-from udccal.fitting.engine.least_squares import Blocks
-from udccal.fitting.psf.kernel import Evaluator
-from udccal.fitting.psf.samples import Block, Sums, normal_equations
-from udccal.fitting.psf.start import start_model, start_prior, wire_shows
+from udccal.cfa import channel_map
+from udccal.fitting.engine.gaussian import Prior, scaled_inverse
+from udccal.fitting.psf.data import Shots, held_out_positions
+from udccal.fitting.psf.kernel import Evaluator, fit_lattice
+from udccal.fitting.psf.problem import DiffractionProblem, Place
+from udccal.fitting.psf.samples import Block, blocks, choose_samples, stands_for
+from udccal.fitting.psf.start import PsfRules, start_model, start_prior, wire_shows
+from udccal.fitting.psf.weights import weighed
 from udccal.numerics import in_float64
-from udccal.planning.algebra import covariance
-from udccal.planning.knobs import KNOBS
-from udccal.planning.led_shots import ExpectedShots, expected_shots, sample_information
-from udccal.planning.prediction import Floor
-from udccal.planning.state import RigState, built_wire
+from udccal.planning.design import DESIGN_VARIABLES
+from udccal.planning.forecast import Floor
+from udccal.planning.state import WHITE, RigState, built_wire, sample_variance_e
 from udccal.planning.steps import PlannedStep, planned_steps
 from udccal.rig import Captures
 
 _FEWEST_POSITIONS: Final = 3
-# Every so many positions one is held out of the fit while orders are compared.
-_HELD_OUT_EVERY: Final = 4
 # Steps of one term are alike but for their place: a design of so few shows how each is exposed.
 _SAMPLE: Final = {"psf_columns": 1, "psf_rows": 1, "psf_shifts": 1}
-_EXPOSURES: Final = next(knob for knob in KNOBS["psf"] if knob.name == "psf_exposures")
-
-
-@final
-@dataclass(frozen=True)
-class _Effort:
-    """Positions and shifts that the fit looks at."""
-
-    positions: int
-    shifts: int
+_EXPOSURES: Final = next(one for one in DESIGN_VARIABLES["psf"] if one.name == "psf_exposures")
+# Places in fractions of the sensor, and shifts in px, that stand for all: of the field, and of the procedure's grid,
+# which reaches nearly to the border.
+_FIELD: Final = ((0.45, 0.55), (0.15, 0.2), (0.85, 0.7))
+_CAPTURED: Final = ((0.05, 0.06), (0.5, 0.94), (0.9, 0.5))
+_SHIFTS_PX: Final = np.array([[0.4, 1.3], [1.7, 0.2]])
+_RULES: Final = PsfRules()
 
 
 @final
@@ -57,111 +50,135 @@ class PsfPredictor:
         self._state = state
         wire = built_wire(state) if state.wire is None else state.wire
         start = start_model(state.rig, state.geometry, wire)
-        prior = start_prior(state.rig, start, wire_shows(wire))
-        self._precision = prior.precision
-        self._shots: ExpectedShots = expected_shots(state, prior, np.asarray(start.wavelengths_nm), wire_shows(wire))
-        effort = FitEffort().psf
-        self._most = _Effort(effort.positions, effort.shifts)
+        self._prior = start_prior(state.rig, start, wire_shows(wire))
+        half = _half(state.rig.captures)
+        evaluator = Evaluator(np.asarray(start.wavelengths_nm), fit_lattice(_RULES.close(half)), wire_shows(wire))
+        shots = _dark_shots(state, half)
+        problem, place = _expected(state, shots, evaluator, self._prior)
+        field, field_place = _part(problem, place, slice(len(_FIELD)))
+        self._captured, self._place = _part(problem, place, slice(len(_FIELD), None))
+        # At weights that make every colour's kernel count 1, the equations hold its squared derivatives.
+        relative = tuple(_relative(block, shots) for block in field.blocks)
+        self._of_kernel = _per_shot([one.shared for one in replace(field, blocks=relative).by_position(field_place)])
         self._known: dict[tuple[float, ...], Float[np.ndarray, "p p"]] = {}
-        # All brackets that a plan may ask for: their slopes are the same, and what takes long.
-        captures = state.rig.captures
-        steps = [self._step(_EXPOSURES.set(captures, n)) for n in range(_EXPOSURES.least, _EXPOSURES.most + 1)]
-        self._by_sample = self._look_at(steps)
 
     def sigma(self, captures: Captures) -> float:
-        """Root mean square over colours and field; see ``prediction.Predictor``."""
+        """Root mean square over colours and field; see ``forecast.Predictor``."""
         shots = self._shots_used(captures)
-        return self._kernel_sigma(self._information(captures), shots) if shots else float("inf")
+        return self._kernel_sigma(captures, shots) if shots else float("inf")
 
     def used(self, captures: Captures) -> float:
-        """Of all positions and shifts, a part; see ``prediction.Predictor``."""
+        """Of all positions and shifts, a part; see ``forecast.Predictor``."""
         shots = self._shots_used(captures)
-        if not shots:
-            return 1.0
         every = captures.psf_columns * captures.psf_rows * captures.psf_shifts
-        one = self._information(captures)
-        by_all, by_part = (self._of_noise(one, count) for count in (every, shots))
-        return by_all / by_part
+        return self._of_noise(captures, every) / self._of_noise(captures, shots) if shots else 1.0
 
     def floor(self) -> Floor:
         """All that the fit looks at, endlessly bright."""
-        most = self._state.rig.captures.model_copy(update={"psf_exposures": _EXPOSURES.most})
-        shots = self._most.positions * self._most.shifts
-        if self._state.unexplained.psf_kernel**2 > self._of_noise(self._information(most), shots):
+        most, shots = _EXPOSURES.set(self._state.rig.captures, _EXPOSURES.most), _RULES.positions * _RULES.shifts
+        if self._state.model_errors.psf_kernel**2 > self._of_noise(most, shots):
             why = "That much of the kernel the fit of the present profile could not describe; no capture changes it."
         else:
             why = (
-                f"The fit of diffraction looks at {self._most.positions} positions and {self._most.shifts} shifts of "
-                "each, and pixels differ in their response (PRNU): a larger effort (FitEffort's psf) would lower it."
+                f"The fit of diffraction looks at {_RULES.positions} positions and {_RULES.shifts} shifts of each, and "
+                "pixels differ in their response (PRNU): a larger effort (FitEffort's psf) would lower it."
             )
-        return Floor(self._kernel_sigma(self._information(most), shots), why)
+        return Floor(self._kernel_sigma(most, shots), why)
 
     def _shots_used(self, captures: Captures) -> int:
         """Pictures that the fit of diffraction looks at; 0 where there are too few positions."""
         positions = captures.psf_columns * captures.psf_rows
-        held_out = len(range(1, positions, _HELD_OUT_EVERY))
-        used = min(positions - held_out, self._most.positions) * min(captures.psf_shifts, self._most.shifts)
+        fitted = int((~held_out_positions(positions)).sum())
+        used = min(fitted, _RULES.positions) * min(captures.psf_shifts, _RULES.shifts)
         return used if positions >= _FEWEST_POSITIONS else 0
 
-    def _information(self, captures: Captures) -> Float[np.ndarray, "p p"]:
-        """Of one shot on the numbers of diffraction, mean over the places that stand for all."""
-        step = self._step(captures)
-        if step.exposures_s not in self._known:
-            self._look_at([step])
-        return self._known[step.exposures_s]
+    def _kernel_sigma(self, captures: Captures, shots: int) -> float:
+        return 100.0 * float(np.sqrt(self._of_noise(captures, shots) + self._state.model_errors.psf_kernel**2))
 
-    def _step(self, captures: Captures) -> PlannedStep:
+    def _of_noise(self, captures: Captures, shots: int) -> float:
+        """Squared relative L2 error of the kernel by noise, mean over places and colours."""
         few = self._state.with_captures(captures.model_copy(update=_SAMPLE))
-        return next(step for step in planned_steps("psf", few) if isinstance(step.arrangement, Led))
+        step = next(step for step in planned_steps("psf", few) if isinstance(step.arrangement, Led))
+        if step.exposures_s not in self._known:
+            self._known[step.exposures_s] = self._information(step)
+        cov = scaled_inverse(self._prior.precision + shots * self._known[step.exposures_s])
+        return float(np.sum(self._of_kernel * cov))
 
     @in_float64
-    def _look_at(self, steps: Sequence[PlannedStep]) -> Float[np.ndarray, "p p"]:
-        """Learn what shots of these steps tell.
-
-        Returns:
-            What takes a covariance to the squared relative L2 error of the kernel, mean over places and colours.
-        """
-        of_kernel, told = np.zeros_like(self._precision), np.zeros((len(steps), *self._precision.shape))
-        count, field = 0, self._shots.in_field
-        for number, (block, own) in enumerate(self._shots.parts()):
-            known = np.asarray(block.known) > 0
-            light = [sample_information(self._state, np.asarray(block.rate), step) * known for step in steps]
-            # At weights that make every colour's kernel count 1, the slopes of light are those of the kernel.
-            weights = np.stack([self._shots.relative_weight(block), *light])
-            sums = _at_weights(self._shots.evaluator, self._shots.theta, block, own, weights)
-            if number < field:
-                of_kernel += np.asarray(sums.shared[0]) / len(own)
-            else:
-                told += [_one(sums, k).marginal()[0] for k in range(1, len(weights))]
-                count += len(own)
-        self._known |= {step.exposures_s: one / count for step, one in zip(steps, told, strict=True)}
-        return of_kernel / field
-
-    def _kernel_sigma(self, one: Float[np.ndarray, "p p"], shots: int) -> float:
-        return 100.0 * float(np.sqrt(self._of_noise(one, shots) + self._state.unexplained.psf_kernel**2))
-
-    def _of_noise(self, one: Float[np.ndarray, "p p"], shots: int) -> float:
-        """Squared relative L2 error of the kernel by noise."""
-        return float(np.sum(self._by_sample * covariance(self._precision + shots * one)))
+    def _information(self, step: PlannedStep) -> Float[np.ndarray, "p p"]:
+        """Of one shot on the parameters of diffraction, mean over the places that stand for all."""
+        merged = tuple(_merged(self._state, block, step) for block in self._captured.blocks)
+        return _per_shot([one.marginal()[0] for one in replace(self._captured, blocks=merged).by_position(self._place)])
 
 
-@eqx.filter_jit
-def _at_weights(
-    evaluator: Evaluator,
-    theta: Float[Array, " p"],
-    block: Block,
-    own: Float[Array, "shots l"],
-    weights: Float[Array, "designs shots n"],
-) -> Sums:
-    """The normal equations of one block at several weights of its samples; derivatives are found once."""
-
-    def one(weight: Float[Array, "shots n"]) -> Sums:
-        return normal_equations(evaluator, theta, replace(block, weight=weight), own)
-
-    made: Callable[[Array], Sums] = jax.vmap(one)
-    return made(weights)
+def _per_shot(matrices: list[Float[np.ndarray, "p p"]]) -> Float[np.ndarray, "p p"]:
+    return np.asarray(np.mean(matrices, axis=0) / len(_SHIFTS_PX))
 
 
-def _one(sums: Sums, index: int) -> Blocks:
-    cost, *parts = (np.asarray(part)[index] for part in sums)
-    return Blocks(float(cost), 0, *parts)
+def _merged(state: RigState, block: Block, step: PlannedStep) -> Block:
+    """The block with what its bracket tells of every sample, PRNU, and what a profile's fit has left out.
+
+    Exposures that would fill a sample's well tell nothing of it.
+    """
+    full_e, light = (step.level or 0.0) * state.full_well_e, np.maximum(np.asarray(block.rate), 0.0)
+    known = np.zeros_like(light)
+    for exposure_s in step.exposures_s:
+        ratio = exposure_s / step.exposures_s[0]
+        signal_e = full_e * ratio * light
+        variance = sample_variance_e(state, signal_e, exposure_s)
+        known += np.where(signal_e < state.full_well_e, (full_e * ratio) ** 2 / variance, 0.0)
+    known /= 1 + known * (float(np.asarray(state.noise.PRNU1288)) * light) ** 2
+    return weighed(replace(block, known=known * (np.asarray(block.known) > 0)), state.model_errors.psf)
+
+
+def _relative(block: Block, shots: Shots) -> Block:
+    """At weights by which squared errors of light sum up to the squared relative L2 error, mean over colours."""
+    count, light, colour = stands_for(shots, _RULES)[block.index], np.asarray(block.rate), np.asarray(block.colour)
+    size = np.einsum("sn,snc,sn->sc", light**2, colour, count)
+    return replace(block, weight=count * np.einsum("snc,sc->sn", colour, 1 / size) / 3)
+
+
+def _expected(state: RigState, shots: Shots, evaluator: Evaluator, prior: Prior) -> tuple[DiffractionProblem, Place]:
+    """What the diffraction fit would be given of each place; light is that of its start, 1 for the brightest sample."""
+    made = blocks(shots, state.geometry, choose_samples(shots, _RULES, _RULES.far_share))
+    problem = DiffractionProblem(made, evaluator, prior).with_overlaps(prior.mean)
+    own = np.tile([0.0, 0.0, *WHITE, 0.0], (shots.positions, len(_SHIFTS_PX), 1))
+    lights = np.stack(problem.light_at(Place(prior.mean, own)))
+    peak = lights.max(axis=2, keepdims=True)
+    own[..., 2:5] /= peak
+    lit = (replace(block, rate=rate) for block, rate in zip(problem.blocks, lights / peak, strict=True))
+    return replace(problem, blocks=tuple(lit)), Place(prior.mean, own)
+
+
+def _part(problem: DiffractionProblem, place: Place, which: slice) -> tuple[DiffractionProblem, Place]:
+    return replace(problem, blocks=problem.blocks[which]), Place(place.theta, place.own[which])
+
+
+def _half(captures: Captures) -> tuple[int, int]:
+    """(rows, columns) to either side of the LED that a region fills, as the fit has it."""
+    sides = (captures.psf_region_rows, captures.psf_region_columns)
+    rows, columns = (max(4, min(most, side // 2 - 4)) for most, side in zip(_RULES.half_px, sides, strict=True))
+    return rows, columns
+
+
+def _dark_shots(state: RigState, half: tuple[int, int]) -> Shots:
+    """Where the shots are and what colour their samples have; their light is yet to come."""
+    rig, captures = state.rig, state.rig.captures
+    middles = np.floor(np.array([*_FIELD, *_CAPTURED]) * [rig.camera.columns, rig.camera.rows] / 2) * 2
+    aims = (middles[:, None] + _SHIFTS_PX).reshape(-1, 2)
+    origins = np.round(aims).astype(np.int64)
+    rows, columns = 2 * half[0] + 1, 2 * half[1] + 1
+    whole = channel_map(rig.camera.cfa, rows + 1, columns + 1)
+    first = (origins - np.array([half[1], half[0]])) % 2
+    nothing = np.zeros((len(aims), rows, columns))
+    disc = captures.psf_led_mm / (captures.psf_distance_mm + rig.mounting.standoff_mm.value) * rig.focal_px
+    return Shots(
+        centre_px=aims,
+        origin_px=origins,
+        position=np.repeat(np.arange(len(middles)), len(_SHIFTS_PX)),
+        disc_px=np.full(len(aims), disc),
+        rate=nothing,
+        weight=nothing + 1.0,
+        channel=np.stack([whole[y : y + rows, x : x + columns] for x, y in first]),
+        noise_per_rate=nothing,
+    )

@@ -1,20 +1,28 @@
-"""What a plan takes for true: the rig's nominal values, or those that a profile has measured."""
+"""What a plan takes for true: the rig's nominal values or those that fits have measured, and light in an even field."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import final
+from typing import Any, final
 
+import jax
 import numpy as np
 from jaxtyping import Float
+from scipy.ndimage import map_coordinates
 
 from udccal.arrangements import Arrangement, Board, Dark, FlatLight, Led, PanelPicture, Photograph
+from udccal.calibration import Calibration
+from udccal.cfa import cell_channels
+from udccal.fitting.geometry.boards import BY_HAND, ON_JIG
 from udccal.fitting.nominal import nominal_geometry
 from udccal.models.backscatter import Backscatter
 from udccal.models.geometry import Geometry
 from udccal.models.noise import Noise
 from udccal.models.psf import PsfField
-from udccal.models.wire import Wire
+from udccal.models.wire import Wire, wire_values
+from udccal.numerics import in_float64
+from udccal.profiles.profile import Profile
+from udccal.result import FitResult, FitStatus
 from udccal.rig import Captures, RigDescription
 
 # What no data sheet of an industrial camera says: EMVA 1288 numbers as its reports commonly show them.
@@ -24,14 +32,17 @@ _DARK_E_PER_S, _DSNU_E, _PRNU = 15.0, 2.0, 0.0055
 WHITE = (0.6, 1.0, 0.7)
 # Lenses of a short focal length bend about so much (k1, k2).
 _DISTORTION = (-0.07, 0.035, 0.0, 0.0, -0.005)
+# Shading is smooth; the ripple of rows on top of it hardly matters to how many electrons there are.
+_FIELD_GRID = (49, 65)
 # How long things take to fill the wells: flats and boards are lit so that they do within a frame.
 _LED_FULL_S, _PANEL_FULL_S = 125e-6, 0.1
+_wire_values = jax.jit(wire_values, static_argnums=(2, 3))
 
 
 @final
 @dataclass(frozen=True)
-class Unexplained:
-    """What noise does not explain, as a profile's fits have found it.
+class ModelErrors:
+    """What the models leave undescribed, beside noise, as a profile's fits have found it.
 
     Attributes:
         on_jig_px, by_hand_px: scatter of a board's corners by axis beside noise; None where not known.
@@ -59,7 +70,7 @@ class RigState:
         rig: with the captures that are looked at.
         noise, geometry: as expected.
         wire, psf, backscatter: as a profile has measured them; None: as built.
-        unexplained: errors beside noise.
+        model_errors: errors beside noise.
     """
 
     rig: RigDescription
@@ -68,7 +79,7 @@ class RigState:
     wire: Wire | None = None
     psf: PsfField | None = None
     backscatter: Backscatter | None = None
-    unexplained: Unexplained = Unexplained()
+    model_errors: ModelErrors = ModelErrors()
 
     def of(self, rig: RigDescription) -> RigState:
         """The same of another description."""
@@ -104,6 +115,45 @@ def nominal_state(rig: RigDescription) -> RigState:
     return RigState(rig, noise, replace(nominal_geometry(rig), distortion=np.array(_DISTORTION)))
 
 
+def measured_state(rig: RigDescription, fits: Calibration | Profile) -> RigState:
+    """A rig at the values of its fits; terms that these hold as absent, or could not tell, stand as built."""
+    nominal = nominal_state(rig)
+    geometry_seen = _converged(fits.geometry)
+    return RigState(
+        rig=rig,
+        noise=fits.noise.term if _converged(fits.noise) else nominal.noise,
+        geometry=fits.geometry.term if geometry_seen else nominal.geometry,
+        wire=fits.wire.term if _converged(fits.wire) else None,
+        psf=fits.psf.term if _converged(fits.psf) else None,
+        backscatter=fits.backscatter.term if _converged(fits.backscatter) else None,
+        model_errors=ModelErrors(
+            on_jig_px=_corners_px(fits.geometry, ON_JIG) if geometry_seen else None,
+            by_hand_px=_corners_px(fits.geometry, BY_HAND) if geometry_seen else None,
+            wire=_diagnostic(fits.wire, "wire_map_model_sigma") / 100,
+            psf=_diagnostic(fits.psf, "model_error"),
+            psf_kernel=_diagnostic(fits.psf, "kernel_error_l2"),
+            backscatter=_diagnostic(fits.backscatter, "model_error_of_white"),
+            inflation=max(_diagnostic(fits.backscatter, "pattern_inflation"), 1.0),
+        ),
+    )
+
+
+def _converged(result: FitResult[Any]) -> bool:
+    return result.status is FitStatus.CONVERGED
+
+
+def _corners_px(geometry: FitResult[Geometry], name: str) -> float | None:
+    """Scatter of corners beside noise, disagreement of views included; None where the fit does not tell."""
+    if all(item.name != name for item in geometry.diagnostics):
+        return None
+    return _diagnostic(geometry, name) * float(np.sqrt(max(_diagnostic(geometry, "variance_factor"), 1.0)))
+
+
+def _diagnostic(result: FitResult[Any], name: str) -> float:
+    """0 where the fit does not tell."""
+    return next((item.value for item in result.diagnostics if item.name == name), 0.0)
+
+
 def full_s(arrangement: Arrangement, state: RigState) -> float:
     """Exposure at which the brightest sample of what stands before the camera would fill its well."""
     match arrangement:
@@ -130,3 +180,45 @@ def built_wire(state: RigState) -> Wire:
 
     start = wire_start(state.rig)
     return ideal_wire(state.geometry, start, possible_harmonics(start).orders)
+
+
+@final
+class EvenField:
+    """An even white field as one rig sees it, 1 at its brightest: as the wire measured it, or the cos^4 law."""
+
+    def __init__(self, state: RigState) -> None:
+        camera = state.rig.camera
+        self._size = np.array([camera.columns, camera.rows])
+        self._cell = np.asarray(cell_channels(camera.cfa), dtype=np.int64)
+        y, x = (np.linspace(0, size - 1, count) for size, count in zip(self._size[::-1], _FIELD_GRID, strict=True))
+        pixels = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+        values = _by_field_angle(state, pixels) if state.wire is None else _by_wire(state.wire, pixels, *self._size)
+        self._grid = (values / values.max()).reshape(_FIELD_GRID)
+
+    def at(self, pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
+        """Light at pixels, by linear interpolation."""
+        places = (pixels / (self._size - 1) * (np.array(_FIELD_GRID[::-1]) - 1)).T[::-1]
+        return np.asarray(map_coordinates(self._grid, places, order=1, mode="nearest"))
+
+    def signal(self, pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
+        """What samples of a white field give, 1 for the brightest of all."""
+        x, y = np.round(pixels).astype(np.int64).T
+        return np.asarray(self.at(pixels) * (np.array(WHITE) / max(WHITE))[self._cell[y % 2, x % 2]])
+
+
+def _by_field_angle(state: RigState, pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
+    ideal = (pixels - np.asarray(state.geometry.centre)) / np.asarray(state.geometry.focal)
+    return np.asarray((1 + (ideal**2).sum(axis=1)) ** -2.0)
+
+
+@in_float64
+def _by_wire(wire: Wire, pixels: Float[np.ndarray, "n 2"], columns: int, rows: int) -> Float[np.ndarray, " n"]:
+    return np.asarray(_wire_values(wire, pixels, int(rows), int(columns)), dtype=np.float64)
+
+
+def sample_variance_e(state: RigState, signal_e: Float[np.ndarray, "*n"], exposure_s: float) -> Float[np.ndarray, "*n"]:
+    """Temporal variance of single samples in e-^2 (EMVA 1288: shot, dark current, dark noise, quantisation)."""
+    noise = state.noise
+    K, q_DN, sigma_d = (float(np.asarray(part)) for part in (noise.K_DN_per_e, noise.q_DN, noise.sigma_d_e))
+    dark = float(np.asarray(noise.dark_current_e_per_s)) * exposure_s
+    return np.asarray(np.maximum(signal_e, 0.0) + dark + sigma_d**2 + (q_DN / K) ** 2 / 12)

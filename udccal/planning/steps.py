@@ -85,7 +85,7 @@ def planned_steps(term: TermName, state: RigState) -> Iterator[PlannedStep]:
 def cost_of(term: TermName, state: RigState) -> Cost:
     """Frames, seconds and set-ups of a term's procedure; errors as ``planned_steps``."""
     total, standing = NOTHING, ""
-    for step in planned_steps(term, state.of(_for_counting(state.rig))):
+    for step in planned_steps(term, without_pictures(state)):
         period_s = 1.0 / state.rig.camera.frame_rate_hz
         seconds = sum(max(period_s, exposure_s) for exposure_s in step.exposures_s)
         seconds += step.test_frames * max(period_s, step.exposures_s[0])
@@ -105,6 +105,7 @@ def _within(exposure_s: float, rig: RigDescription) -> float:
     return min(max(exposure_s, rig.camera.min_exposure_s), rig.camera.max_exposure_s)
 
 
-def _for_counting(rig: RigDescription) -> RigDescription:
-    small = rig.panel.model_copy(update={"columns": _COUNTING_PX, "rows": _COUNTING_PX})
-    return rig.model_copy(update={"panel": small})
+def without_pictures(state: RigState) -> RigState:
+    """The same with a panel of next to no size: frames and exposures of its steps do not depend on it."""
+    small = state.rig.panel.model_copy(update={"columns": _COUNTING_PX, "rows": _COUNTING_PX})
+    return state.of(state.rig.model_copy(update={"panel": small}))

@@ -1,4 +1,4 @@
-"""Prediction for the wire: the columns that the joint fit has, on a part of the pixels that it spends.
+"""Prediction for the wire: the equations of the joint fit, on a part of the pixels that it spends.
 
 The map's sigma follows from the covariance of shape, shading and site gains together, with the prior that the fit has.
 A pixel's variance is shot and dark noise over the frames, and PRNU, which no number of frames averages down.
@@ -8,31 +8,33 @@ from __future__ import annotations
 
 from typing import final
 
+import equinox as eqx
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from udccal.arrangements import Dark, FlatLight
+from udccal.cfa import SITES
+from udccal.fitting.engine.gaussian import scaled_inverse
 from udccal.fitting.wire import WireRules, wire_start
 from udccal.fitting.wire.data import Pixels, odd_step, sample_pixels
-from udccal.fitting.wire.jacobian import block_jacobian, with_harmonics
+from udccal.fitting.wire.fit import map_jacobian, mean_one
+from udccal.fitting.wire.jacobian import WireProblem, expected_of, with_harmonics
 from udccal.fitting.wire.parameters import (
     Parameters,
     ideal_wire,
     parameters_of,
     possible_harmonics,
 )
-from udccal.models.wire import Wire
 from udccal.numerics import in_float64
-from udccal.planning.algebra import covariance
-from udccal.planning.light import EvenField, sample_variance_e
-from udccal.planning.prediction import Floor
-from udccal.planning.state import RigState
-from udccal.planning.steps import PlannedStep, planned_steps
+from udccal.planning.forecast import Floor
+from udccal.planning.state import EvenField, RigState, sample_variance_e
+from udccal.planning.steps import planned_steps
 from udccal.rig import Captures
 
 _PIXELS = 8_000
 # The strongest tell all of the shape that matters.
 _HARMONICS = 24
+_RULES = WireRules()
 
 
 @final
@@ -42,108 +44,88 @@ class WirePredictor:
     @in_float64
     def __init__(self, state: RigState) -> None:
         self._state = state
-        camera = state.rig.camera
-        size, rules = camera.rows * camera.columns, WireRules()
-        pixels = sample_pixels(np.ones((camera.rows, camera.columns)), state.geometry, _PIXELS)
-        wire, parameters = _as_expected(state, pixels)
-        self._precision = parameters.prior(wire_start(state.rig), rules).precision
-        self._value, self._design, self._places = _columns(wire, pixels, parameters)
-        used = pixels.place >= 0
-        # The fit spends so many pixels for each of these.
-        self._each = size / odd_step(size, rules.samples) / used.sum()
-        y, x = np.divmod(np.maximum(pixels.place, 0), camera.columns)
-        field = EvenField(state)
-        self._signal_e = np.where(used, state.full_well_e * field.signal(np.stack([x, y], axis=1).astype(float)), 0.0)
-        self._used = used
+        shape = (state.rig.camera.rows, state.rig.camera.columns)
+        self._pixels = sample_pixels(np.ones(shape), state.geometry, _PIXELS)
+        parameters, x = _expected(state, self._pixels)
+        self._parameters, self._x = parameters, mean_one(parameters, x, state.geometry, shape)
+        self._prior = parameters.prior(wire_start(state.rig), _RULES)
+        self._jacobian = map_jacobian(parameters, self._x, state.geometry, shape)
+        self._value = expected_of(parameters.wire(self._x), np.ones(SITES), self._pixels)
+        y, x_px = np.divmod(np.maximum(self._pixels.place, 0), shape[1])
+        self._signal_e = state.full_well_e * EvenField(state).signal(np.stack([x_px, y], axis=1).astype(float))
+        # Each pixel looked at stands for so many of the sensor's, and of those that the fit spends.
+        self._every = shape[0] * shape[1] / self._pixels.used
+        self._spent = self._every / odd_step(shape[0] * shape[1], _RULES.samples)
 
     def sigma(self, captures: Captures) -> float:
-        """Root mean square over the sensor; see ``prediction.Predictor``."""
-        relative = self._of_captures(captures)
-        return float("inf") if relative is None else self._map_sigma(relative, self._each)
+        """Root mean square over the sensor; see ``forecast.Predictor``."""
+        relative = self._relative_variance(captures)
+        return float("inf") if relative is None else self._map_sigma(relative, self._spent)
 
     def used(self, captures: Captures) -> float:
-        """Of all pixels, a part; see ``prediction.Predictor``."""
-        relative = self._of_captures(captures)
+        """Of all pixels, a part; see ``forecast.Predictor``."""
+        relative = self._relative_variance(captures)
         if relative is None:
             return 1.0
-        every = self._state.rig.camera.rows * self._state.rig.camera.columns / self._used.sum()
-        by_all, by_part = (self._map_sigma(relative, each, model=0.0) for each in (every, self._each))
+        by_all, by_part = (self._map_sigma(relative, count, model=0.0) for count in (self._every, self._spent))
         return min((by_all / by_part) ** 2, 1.0)
 
     def floor(self) -> Floor:
         """That of PRNU."""
-        prnu = float(np.asarray(self._state.noise.PRNU1288))
-        share = self._each * self._used.sum() / (self._state.rig.camera.rows * self._state.rig.camera.columns)
+        PRNU1288 = float(np.asarray(self._state.noise.PRNU1288))
+        more = "a fit to more of the sensor's pixels (FitEffort's wire_samples)"
         return Floor(
-            self._map_sigma(np.full(len(self._used), prnu**2), self._each),
-            f"Pixels differ in their response by {100 * prnu:.2g} % (PRNU), and that does not average over frames: "
-            + ("a fit to more of the sensor's pixels (FitEffort's wire_samples)" if share < 0.9 else "more pixels")
-            + " would lower it.",
+            self._map_sigma(np.full(len(self._value), PRNU1288**2), self._spent),
+            f"Pixels differ in their response by {100 * PRNU1288:.2g} % (PRNU), and that does not average over frames: "
+            f"{more if self._spent < 0.9 * self._every else 'more pixels'} would lower it.",
         )
 
-    def _of_captures(self, captures: Captures) -> Float[np.ndarray, " n"] | None:
-        """Relative variance of each pixel; None without flats or darks."""
-        steps = list(planned_steps("wire", self._state.with_captures(captures)))
-        flats = [step for step in steps if isinstance(step.arrangement, FlatLight)]
-        darks = [step for step in steps if isinstance(step.arrangement, Dark)]
-        return self._relative_variance(flats[0], darks[0]) if flats and darks else None
-
-    def _relative_variance(self, flat: PlannedStep, dark: PlannedStep) -> Float[np.ndarray, " n"]:
-        """Of flat less dark, over the signal squared."""
+    def _relative_variance(self, captures: Captures) -> Float[np.ndarray, " n"] | None:
+        """Of flat less dark at each pixel, over the signal squared; None without flats or darks."""
+        state = self._state
+        steps = list(planned_steps("wire", state.with_captures(captures)))
+        flat = next((step for step in steps if isinstance(step.arrangement, FlatLight)), None)
+        dark = next((step for step in steps if isinstance(step.arrangement, Dark)), None)
+        if flat is None or dark is None:
+            return None
         signal = np.maximum((flat.level or 0.0) * self._signal_e, 1e-3)
-        variance = sample_variance_e(self._state, signal, flat.exposures_s[0]) / len(flat.exposures_s)
-        variance = variance + sample_variance_e(self._state, np.zeros(1), dark.exposures_s[0]) / len(dark.exposures_s)
-        return np.asarray(variance / signal**2 + float(np.asarray(self._state.noise.PRNU1288)) ** 2)
+        variance = sample_variance_e(state, signal, flat.exposures_s[0]) / len(flat.exposures_s)
+        variance = variance + sample_variance_e(state, np.zeros(1), dark.exposures_s[0]) / len(dark.exposures_s)
+        return np.asarray(variance / signal**2 + float(np.asarray(state.noise.PRNU1288)) ** 2)
 
-    def _map_sigma(self, relative: Float[np.ndarray, " n"], each: float, model: float | None = None) -> float:
-        """``relative`` is the variance of each pixel, which stands for ``each`` of them, over its signal squared."""
-        left_out = self._state.unexplained.wire if model is None else model
-        weight = np.where(self._used, each / np.maximum(relative * self._value**2, 1e-12), 0.0)
-        information = (self._design * weight) @ self._design.T + self._precision
-        cov = covariance(information)
-        of_noise = np.mean(np.einsum("in,ij,jn->n", self._places, cov, self._places))
-        return 100.0 * float(np.sqrt(of_noise + left_out**2))
+    @in_float64
+    def _map_sigma(self, relative: Float[np.ndarray, " n"], count: float, model: float | None = None) -> float:
+        """At this relative variance of each pixel, which stands for ``count`` of them."""
+        weight = np.where(self._pixels.place >= 0, count / np.maximum(relative * self._value**2, 1e-12), 0.0)
+        pixels = eqx.tree_at(lambda p: p.weight, self._pixels, weight)
+        information, _, _ = WireProblem("wire, planned", self._parameters, pixels, self._prior).sums(self._x)
+        cov = scaled_inverse(information + self._prior.precision)
+        return 100.0 * self._jacobian.sigma(cov, self._state.model_errors.wire if model is None else model)
 
 
-def _as_expected(state: RigState, pixels: Pixels) -> tuple[Wire, Parameters]:
-    """The wire as measured or as built, with the parameters that a fit of it is expected to keep."""
+def _expected(state: RigState, pixels: Pixels) -> tuple[Parameters, Float[np.ndarray, " n"]]:
+    """The wire as built, and the parameters that a fit of it is expected to keep.
+
+    What a profile's wire has of shading and of departures from a round pupil is what the data asked for.
+    """
     start = wire_start(state.rig)
     possible = possible_harmonics(start)
     harmonics, bounds = possible.orders[:_HARMONICS], possible.bounds[:_HARMONICS]
     built = with_harmonics(ideal_wire(state.geometry, start, harmonics), harmonics, pixels.ideal)
-    parameters = parameters_of(built, WireRules(), bounds)
-    if state.wire is None or not len(np.asarray(state.wire.harmonics)):
-        return built, parameters.kept(parameters.groups < 0)
-    # What a profile's wire has of shading and of departures from a round pupil is what the data asked for.
-    return built, parameters.kept((parameters.groups < 0) | _present(state.wire, parameters))
+    parameters = parameters_of(built, _RULES, bounds)
+    gains = np.ones(SITES)
+    x = parameters.vector(built, gains)
+    keep = parameters.groups < 0
+    if state.wire is not None and len(np.asarray(state.wire.harmonics)):
+        leaves = _over(built.baseline, state.wire.baseline), _over(built.fields, state.wire.fields)
+        keep |= parameters.vector(eqx.tree_at(lambda w: (w.baseline, w.fields), built, leaves), gains) != x
+    kept = parameters.kept(keep)
+    return kept, kept.vector(built, gains)
 
 
-def _present(wire: Wire, parameters: Parameters) -> Bool[np.ndarray, " n"]:
-    baseline, fields = np.asarray(wire.baseline), np.asarray(wire.fields)
-    present = parameters.groups < 0
-    present[: len(parameters.baseline)] |= [_at(baseline, tuple(pair)) != 0 for pair in parameters.baseline]
-    for number, column in enumerate(parameters.fields, parameters.linear - len(parameters.fields)):
-        neutral = 1.0 if not column[1:].any() else 0.0
-        present[number] |= _at(fields, tuple(column), neutral) != neutral
-    return present
-
-
-def _at(values: np.ndarray, place: tuple[int, ...], otherwise: float = 0.0) -> float:
-    inside = all(int(i) < size for i, size in zip(place, values.shape, strict=True))
-    return float(values[place]) if inside else otherwise
-
-
-def _columns(
-    wire: Wire, pixels: Pixels, parameters: Parameters
-) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "columns n"], Float[np.ndarray, "columns n"]]:
-    """The map at pixels, its slopes by what is fitted, and those of the map once scaled to a mean of 1."""
-    parts = [block_jacobian(parameters, wire, part.ideal, part.scaled, part.site) for part in pixels.blocks()]
-    whole, base, design = (np.concatenate(same, axis=-1) for same in zip(*parts, strict=True))
-    # Scaled to a mean of 1.
-    used = pixels.place >= 0
-    mean = float((whole * base)[used].mean())
-    value, design = whole * base / mean, design * base / mean
-    places = design[:, used].copy()
-    places[parameters.sites] = 0.0
-    places -= (value[used][None, :]) * places.mean(axis=1, keepdims=True)
-    return value, design, places
+def _over(values: object, others: object) -> Float[np.ndarray, "..."]:
+    """Values with others in their place as far as these go."""
+    made, put = np.array(values), np.asarray(others)
+    both = tuple(slice(min(sizes)) for sizes in zip(made.shape, put.shape, strict=True))
+    made[both] = put[both]
+    return made

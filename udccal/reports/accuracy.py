@@ -9,9 +9,8 @@ import numpy as np
 from udccal.calibration import ORDER, Calibration
 from udccal.errors import UdccalError
 from udccal.fitting.geometry.boards import projection_sigma_px
-from udccal.planning.measured import Measured, measured_state
-from udccal.planning.outlook import Outlook, Trade, outlook
-from udccal.planning.state import sensor_samples
+from udccal.planning.forecast import Curve, Forecast, forecast
+from udccal.planning.state import measured_state, sensor_samples
 from udccal.reports.tables import Table
 from udccal.result import FitResult, FitStatus
 from udccal.rig import RigDescription
@@ -24,39 +23,37 @@ _LEAST_GAIN = 1.02
 
 @dataclass(frozen=True)
 class Accuracy:
-    """One term's accuracy: as foretold of its captures, and as its fit states it (None where it states another).
+    """One term's accuracy: as forecast for its captures, and as its fit states it (None where it states another).
 
     Attributes:
         used: share of the information in the frames that the fit spent, by the fit's own count where it has one.
     """
 
-    outlook: Outlook
+    forecast: Forecast
     stated: float | None
     used: float
 
     @property
     def sigma(self) -> float:
-        """By the fit where it says so, else as foretold."""
-        return self.outlook.sigma if self.stated is None else self.stated
+        """By the fit where it says so, else the forecast."""
+        return self.forecast.sigma if self.stated is None else self.stated
 
     @property
     def efficiency(self) -> float:
         """Cramér-Rao variance of all frames over the one stated; what the fit spent may be spent less than well."""
-        return self.used * min((self.outlook.sigma / self.sigma) ** 2, 1.0)
+        return self.used * min((self.forecast.sigma / self.sigma) ** 2, 1.0)
 
 
 def accuracies(calibration: Calibration) -> tuple[Accuracy, ...]:
     """Of the terms that were fitted; those whose procedure does not tell what it takes are left out."""
-    base = calibration.foundation
-    fits = Measured(base.noise, base.geometry, base.wire, calibration.psf, calibration.backscatter)
-    state = measured_state(calibration.rig, fits)
+    state = measured_state(calibration.rig, calibration)
     found = []
     for term in ORDER:
         result = calibration.result(term)
         if result.status is not FitStatus.CONVERGED:
             continue
         try:
-            ahead = outlook(term, state)
+            ahead = forecast(term, state)
         except UdccalError:
             continue
         if ahead is not None:
@@ -84,8 +81,8 @@ def stated(term: TermName, result: FitResult, rig: RigDescription) -> float | No
 
 def accuracy_table(accuracy: Accuracy) -> Table:
     """The numbers beside the figure."""
-    ahead, unit = accuracy.outlook, accuracy.outlook.quantity.unit
-    rows = [("foretold by the frames captured (to 15 %)", f"{ahead.sigma:.3g} {unit}")]
+    ahead, unit = accuracy.forecast, accuracy.forecast.quantity.unit
+    rows = [("forecast for the frames captured (to 15 %)", f"{ahead.sigma:.3g} {unit}")]
     if accuracy.stated is not None:
         rows.append(("stated by the fit", f"{accuracy.stated:.3g} {unit}"))
     rows.append(("left, however much is captured", f"{ahead.floor.sigma:.3g} {unit}" if ahead.floor.sigma else "–"))
@@ -95,10 +92,10 @@ def accuracy_table(accuracy: Accuracy) -> Table:
     return Table(title, ("", ""), tuple(rows), frozenset({1}))
 
 
-def trade_sentence(ahead: Outlook) -> str:
+def forecast_sentence(ahead: Forecast) -> str:
     """What to capture more of, in words."""
     said = "How sure the result is against how much is captured, all else as it was. "
-    best = max(ahead.trades, key=lambda trade: trade.most_gain)
+    best = max(ahead.curves, key=lambda curve: curve.most_gain)
     if best.most_gain < _LEAST_GAIN:
         said += "More captures bring next to nothing. "
     else:
@@ -110,9 +107,9 @@ def trade_sentence(ahead: Outlook) -> str:
     return said.strip()
 
 
-def _gain(ahead: Outlook, best: Trade) -> str:
+def _gain(ahead: Forecast, best: Curve) -> str:
     unit = ahead.quantity.unit
-    counted = f"{best.knob.counted}, {best.counts[-1]:.0f} for {best.now}"
+    counted = f"{best.variable.counted}, {best.counts[-1]:.0f} for {best.now}"
     return f"Most would come from more {counted}: {best.sigma[-1]:.3g} {unit} for {ahead.sigma:.3g} {unit}."
 
 

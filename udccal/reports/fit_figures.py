@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullLocator
 
-from udccal.planning.outlook import Outlook, Trade
+from udccal.planning.forecast import Curve, Forecast
 from udccal.reports.figures import bare, row_of_axes
 from udccal.reports.residuals import ResidualHistogram, ResidualMap
 
@@ -36,30 +36,30 @@ def residual_figure(cells: ResidualMap, histogram: ResidualHistogram) -> Figure:
     return figure
 
 
-def trade_figure(ahead: Outlook) -> Figure:
+def forecast_figure(ahead: Forecast) -> Figure:
     """One panel per number of the captures: sigma against it, with what was captured and what is left marked."""
-    trades = ahead.trades
+    curves = ahead.curves
     # One panel alone is as large as two, so that its labels have room.
-    figure, panels = row_of_axes(len(trades), max(3.0 * len(trades), 4.2), 2.7)
-    low = min(float(trade.sigma.min()) for trade in trades)
-    high = max(float(trade.sigma.max()) for trade in trades)
+    figure, panels = row_of_axes(len(curves), max(3.0 * len(curves), 4.2), 2.7)
+    low = min(float(curve.sigma.min()) for curve in curves)
+    high = max(float(curve.sigma.max()) for curve in curves)
     low = min(low, ahead.floor.sigma) if ahead.floor.sigma > _NEAR * low else low
-    for axes, trade in zip(panels, trades, strict=True):
-        axes.loglog(trade.counts, trade.sigma, "-", color=_BLUE, lw=1.8)
-        axes.plot([trade.now], [ahead.sigma], "o", color=_RED, ms=6, label=f"captured: {trade.now}")
+    for axes, curve in zip(panels, curves, strict=True):
+        axes.loglog(curve.counts, curve.sigma, "-", color=_BLUE, lw=1.8)
+        axes.plot([curve.now], [ahead.sigma], "o", color=_RED, ms=6, label=f"captured: {curve.now}")
         if low <= ahead.floor.sigma:
             axes.axhline(ahead.floor.sigma, color="0.4", ls="--", lw=1, label="left, however many")
-        axes.set(xlabel=trade.knob.counted, ylim=(low / _ROOM, high * _ROOM))
-        _plain_ticks(axes, trade)
+        axes.set(xlabel=curve.variable.counted, ylim=(low / _ROOM, high * _ROOM))
+        _plain_ticks(axes, curve)
         axes.legend(frameon=False, fontsize=7.5, loc="upper right")
         axes.grid(alpha=0.25, which="both")
     panels[0].set_ylabel(f"σ [{ahead.quantity.unit}]")
     return figure
 
 
-def _plain_ticks(axes: Axes, trade: Trade) -> None:
+def _plain_ticks(axes: Axes, curve: Curve) -> None:
     """Counts as the numbers that they are, and sigma without powers of ten."""
-    lowest, highest = float(trade.counts[0]), float(trade.counts[-1])
+    lowest, highest = float(curve.counts[0]), float(curve.counts[-1])
     places = np.unique(np.rint(np.geomspace(lowest, highest, _TICKS)).astype(int))
     axes.xaxis.set_major_locator(FixedLocator([float(place) for place in places]))
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.0f}"))

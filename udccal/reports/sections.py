@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 
 from udccal.calibration import ORDER, Calibration
 from udccal.reports import figures, fit_figures
-from udccal.reports.accuracy import Accuracy, accuracy_table, trade_sentence
+from udccal.reports.accuracy import Accuracy, accuracy_table, forecast_sentence
 from udccal.reports.board_views import BoardEvidence
 from udccal.reports.evidence import PhotonTransfer
 from udccal.reports.fit_tables import (
@@ -44,7 +44,7 @@ class Evidence:
 
     def accuracy(self, term: TermName) -> Accuracy | None:
         """Of a term; None where nothing is known of it."""
-        return next((one for one in self.accuracies if one.outlook.term == term), None)
+        return next((one for one in self.accuracies if one.forecast.term == term), None)
 
 
 _EXPLANATIONS: dict[TermName, str] = {
@@ -105,7 +105,7 @@ def _finding(term: TermName, evidence: Evidence) -> str:
     if not result.estimates:
         return "Nothing was fitted."
     if accuracy is not None and term != "noise":
-        quantity = accuracy.outlook.quantity
+        quantity = accuracy.forecast.quantity
         return f"{quantity.meaning[0].upper()}{quantity.meaning[1:]}: known to {accuracy.sigma:.2g} {quantity.unit}."
     first = result.estimates[0]
     unit = "" if first.unit == "1" else f" {first.unit}"
@@ -129,9 +129,9 @@ def _quality(term: TermName, evidence: Evidence) -> tuple[Illustration, ...]:
         )
         drawn += _illustration(fit_figures.residual_figure(cells, histogram), caption, f"residuals of {term}")
     accuracy = evidence.accuracy(term)
-    if accuracy is not None and accuracy.outlook.trades:
-        figure = fit_figures.trade_figure(accuracy.outlook)
-        drawn += _illustration(figure, trade_sentence(accuracy.outlook), f"accuracy of {term} against captures")
+    if accuracy is not None and accuracy.forecast.curves:
+        figure = fit_figures.forecast_figure(accuracy.forecast)
+        drawn += _illustration(figure, forecast_sentence(accuracy.forecast), f"accuracy of {term} against captures")
     return tuple(drawn)
 
 

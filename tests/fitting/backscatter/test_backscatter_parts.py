@@ -20,6 +20,7 @@ from udccal.fitting.backscatter.parameters import (
     linear_slope,
     mix_and_jacobian,
     prior_of,
+    vector_of,
     with_linear,
 )
 from udccal.fitting.backscatter.ratios import (
@@ -102,6 +103,13 @@ def test_linear_parameters_have_the_slopes_of_differences() -> None:
     for start in (X, TWO_PLANES.without_crosstalk().start(X, PRIOR), KERNELS[0].start(X, PRIOR)):
         wanted = (linear_of(start + 1e-6) - linear_of(start - 1e-6)) / 2e-6
         np.testing.assert_allclose(linear_slope(start), wanted, atol=1e-8)
+
+
+def test_a_term_has_the_parameters_that_made_it() -> None:
+    template = nominal_backscatter(nominal_geometry(RIG), RIG, np.zeros((3, 1, 1)), 8, window=5)
+    with jax.enable_x64(True):
+        term = with_linear(template, jnp.asarray(THETA))
+        np.testing.assert_allclose(vector_of(term), X, rtol=1e-12, atol=1e-12)
 
 
 def test_mask_and_dark_are_those_of_least_squares() -> None:

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from tests.scenes.psf import frames_of, small_scene
 from udccal.fitting.hdr.merge import HdrMerge
 from udccal.fitting.psf.data import Shots, shot_noise
-from udccal.fitting.psf.samples import Block, choose_samples
+from udccal.fitting.psf.samples import Block, choose_samples, stands_for
 from udccal.fitting.psf.start import PsfRules
 from udccal.fitting.psf.weights import (
     estimate_model_error,
@@ -164,6 +164,12 @@ def test_samples_are_drawn_as_many_in_every_picture() -> None:
     assert (every == 37 * 19).all()
     assert len(set(some.tolist())) == 1
     assert some[0] < every[0]
+    # Those drawn stand for the others of their own picture, to a whole number of them.
+    chosen, count = choose_samples(shots, PsfRules(), 1 / 6), stands_for(shots, PsfRules())
+    far = np.abs(shots.offsets()[..., 0])[None].repeat(3, axis=0)[chosen].reshape(3, -1) > PsfRules().peak_half_px[1]
+    assert count[far] == pytest.approx(6.0)
+    assert (count == 1.0).any(axis=1).all()
+    assert count.sum(axis=1) == pytest.approx(choose_samples(shots, PsfRules(), 1.0).sum(axis=(1, 2)), abs=6)
 
 
 def test_brackets_are_clipped_and_quantised() -> None:

@@ -11,12 +11,10 @@ from typing import final, get_args
 from udccal.cli.output import Output
 from udccal.compilation import keep_compilations
 from udccal.errors import RigError
-from udccal.planning.measured import Measured, measured_state
-from udccal.planning.plan import CapturePlan, Setting, Suggestion, TermPlan, make_plan
+from udccal.planning.plan import CapturePlan, Suggestion, TermPlan, make_plan, parse_targets
 from udccal.planning.rig_file import check_absent, write_planned_rig
-from udccal.planning.state import RigState, nominal_state
+from udccal.planning.state import RigState, measured_state, nominal_state
 from udccal.planning.steps import Cost
-from udccal.planning.targets import parse_targets
 from udccal.profiles.store import RIG_PROFILE, find_profile, read_profile
 from udccal.reports.tables import Table
 from udccal.rig import RigDescription, find_rig, load_rig
@@ -109,8 +107,7 @@ def _measured(rig: RigDescription, path: Path) -> RigState:
             f"Expected a profile of the rig '{rig.name}' at {path}, found one of '{profile.rig.name}'"
             f"{' with another camera or panel' if profile.rig.name == rig.name else ''}. Give that rig's profile."
         )
-    fits = Measured(profile.noise, profile.geometry, profile.wire, profile.psf, profile.backscatter)
-    return measured_state(rig, fits)
+    return measured_state(rig, profile)
 
 
 def _show(output: Output, made: CapturePlan) -> None:
@@ -185,14 +182,6 @@ def _out_of_reach(term: TermPlan) -> str:
 
 def _addition(one: Suggestion) -> str:
     return f"{one.setting.name} {one.setting.before} to {one.setting.planned}"
-
-
-def _fall(one: Suggestion) -> str:
-    return f"{one.gain_percent:.2g} %"
-
-
-def _setting(one: Setting) -> str:
-    return f"{one.name} {one.planned}" + (f" (now {one.before})" if one.planned != one.before else "")
 
 
 def _amount(value: float, unit: str) -> str:

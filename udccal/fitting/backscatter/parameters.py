@@ -184,6 +184,17 @@ def linear_of(x: Vector) -> Vector:
     return theta
 
 
+def vector_of(term: Backscatter) -> Vector:
+    """The solver's coordinates of a term, whose logarithms have 1e-6 for what is absent."""
+    emitters, mix = np.asarray(term.emitters_px), np.asarray(term.mix)
+    lengths = (term.distance_mm, term.pupil_mm, term.softness_px, term.reflection, term.reflection_mm)
+    places = (emitters[1], emitters[0] - emitters[1], emitters[2] - emitters[1])
+    crosstalk = (mix / np.diag(mix)[:, None])[_OFF_DIAGONAL]
+    x = np.concatenate([[float(np.asarray(one)) for one in (term.gamma, *lengths)], *places, crosstalk])
+    x[_LOGARITHMIC] = np.log(np.maximum(x[_LOGARITHMIC], 1e-6))
+    return x
+
+
 def linear_slope(x: Vector) -> Vector:
     """Derivative of each of ``linear_of`` by the solver's coordinate."""
     theta, slope = linear_of(x), np.ones(len(NAMES))

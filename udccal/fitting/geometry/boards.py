@@ -148,11 +148,11 @@ def _result(
     if bundle.status is FitStatus.TOO_FEW_DATA or not parallel:
         lost = () if parallel else ("No usable view shows the board parallel to the panel; capture that view again.",)
         return FitResult.failed("geometry", nominal, FitStatus.TOO_FEW_DATA, *notes, *lost)
-    x, cov = _with_angles(bundle, parallel)
+    x, cov = with_angles(bundle.intrinsics.vector, bundle.poses, bundle.cov, parallel)
     # A pattern in the residuals moves every place by its size, as a centre does that is off by as much.
     pattern = bundle.evidence.pattern_px * np.eye(len(x))[:, 2:4]
     pupil = np.asarray(nominal.pupil, dtype=np.float64)
-    posterior = Posterior(x, np.hstack([square_root(cov), pattern]), partial(_term_at, pupil=pupil))
+    posterior = Posterior(x, np.hstack([square_root(cov), pattern]), partial(term_at, pupil=pupil))
     poor = bundle.rms_px > rules.worst_rms_px and bundle.chi2_dof > rules.worst_chi2_dof
     points, use = bundle.points, bundle.points.used
     z = bundle.residuals_px[use] / points.sigma[use, None]
@@ -174,18 +174,31 @@ def _result(
     )
 
 
-def _with_angles(
-    bundle: CalibratedViews, parallel: list[int]
+def with_angles(
+    intrinsics: Float[np.ndarray, "9"],
+    poses: Float[np.ndarray, "views 6"],
+    cov: Float[np.ndarray, "n n"],
+    parallel: Sequence[int],
 ) -> tuple[Float[np.ndarray, "12"], Float[np.ndarray, "12 12"]]:
-    """Values and covariance of intrinsics and angles; several parallel views count as their mean."""
-    rotation = np.asarray(Rotation.from_rotvec(-bundle.poses[parallel, :3]).mean().as_rotvec())
+    """Values and covariance of intrinsics and angles; several parallel views count as their mean.
+
+    Args:
+        intrinsics: in the order of ``INTRINSIC_NAMES``.
+        poses: board to camera, as ``bundle.Bundle`` has them.
+        cov: of intrinsics and all poses one after another.
+        parallel: which views show the board parallel to the panel.
+
+    Returns:
+        what ``term_at`` takes; angles in degrees.
+    """
+    rotation = np.asarray(Rotation.from_rotvec(-poses[parallel, :3]).mean().as_rotvec())
     steps = _STEP_RAD * np.eye(3)
     slope = np.array([_angles_deg(rotation + step) - _angles_deg(rotation - step) for step in steps]).T / 2 / _STEP_RAD
-    picks = np.zeros((LENS + 3, len(bundle.cov)))
+    picks = np.zeros((LENS + 3, len(cov)))
     picks[:LENS, :LENS] = np.eye(LENS)
     for view in parallel:
         picks[LENS:, LENS + 6 * view : LENS + 6 * view + 3] = -slope / len(parallel)
-    return np.concatenate([bundle.intrinsics.vector, _angles_deg(rotation)]), picks @ bundle.cov @ picks.T
+    return np.concatenate([intrinsics, _angles_deg(rotation)]), picks @ cov @ picks.T
 
 
 def _angles_deg(rotation: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
@@ -194,7 +207,7 @@ def _angles_deg(rotation: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
     return np.array([-tilt, roll, yaw])
 
 
-def _term_at(x: Float[np.ndarray, "12"], pupil: Float[np.ndarray, "3"]) -> Geometry:
+def term_at(x: Float[np.ndarray, "12"], pupil: Float[np.ndarray, "3"]) -> Geometry:
     """The term of intrinsics and angles."""
     lens, (tilt, roll, yaw) = Intrinsics.of(x[:LENS]), x[LENS:]
     rotation = Rotation.from_euler("YXZ", [yaw, -tilt, roll], degrees=True).as_rotvec()

@@ -140,7 +140,7 @@ def temporal_variance(signal_DN, K_DN_per_e, V0_DN2, curvature_per_DN, rounding_
 
 @final
 @dataclass(frozen=True)
-class _Transfer:
+class TransferProblem:
     """The engine's problem: the deviance of variances, read noise and brightness from what is modelled of them."""
 
     levels: Levels
@@ -229,7 +229,7 @@ def _fit_transfer(
     known = levels.light[np.isfinite(levels.light)]
     brightest = max(float(np.max(known, initial=0.0)), 1e-30)
     sizes = np.abs(start) + np.array([1e-9, dark.rounding_DN2 + 1e-3, 0.1 / full_DN, 1e-9, brightest])
-    problem = _Transfer(levels, dark, order, rules.most_bent / full_DN, sizes)
+    problem = TransferProblem(levels, dark, order, rules.most_bent / full_DN, sizes)
     found = minimise(problem, np.where([True, True, order.curved, True, order.offset], start, 0.0), _SOLVER)
     x, cov = found.place, found.equations.cov()
     variance, _, relative = problem.modelled(x)

@@ -19,7 +19,7 @@ from udccal.fitting.engine.orders import Attempt, Choice, bic, choose
 from udccal.fitting.psf.data import Shots
 from udccal.fitting.psf.kernel import FOOTPRINT, Evaluator, fit_lattice
 from udccal.fitting.psf.problem import DiffractionProblem, Place
-from udccal.fitting.psf.samples import Block, blocks, choose_samples, start_own
+from udccal.fitting.psf.samples import Block, blocks, choose_samples, stands_for, start_own
 from udccal.fitting.psf.start import PsfRules
 from udccal.fitting.psf.weights import (
     estimate_model_error,
@@ -253,9 +253,8 @@ def efficiency(fit: DiffractionFit, rules: PsfRules, available: int, reported: i
         available: pictures there are.
         reported: so many numbers are looked at.
     """
-    chosen, near = (choose_samples(fit.shots, rules, part) for part in (rules.far_share, 0.0))
-    stands_for = np.where(near[chosen].reshape(fit.shots.count, -1), 1.0, 1.0 / rules.far_share)
-    weighed_up = (replace(b, weight=np.asarray(b.weight) * stands_for[np.asarray(b.index)]) for b in fit.problem.blocks)
+    count = stands_for(fit.shots, rules)
+    weighed_up = (replace(b, weight=np.asarray(b.weight) * count[np.asarray(b.index)]) for b in fit.problem.blocks)
     positions = replace(fit.problem, blocks=tuple(weighed_up)).by_position(fit.solution.place)
     information = sum(position.marginal()[0] for position in positions) * available / fit.shots.count
     best = scaled_inverse(fit.problem.prior.precision + information)

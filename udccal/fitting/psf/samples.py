@@ -87,6 +87,12 @@ def choose_samples(shots: Shots, rules: PsfRules, far_share: float) -> Bool[np.n
     return chosen.reshape(shots.rate.shape)
 
 
+def stands_for(shots: Shots, rules: PsfRules) -> Float[np.ndarray, "shots n"]:
+    """How many samples of its picture each chosen one stands for: those away from the peak were drawn."""
+    chosen, near = (choose_samples(shots, rules, part) for part in (rules.far_share, 0.0))
+    return np.where(near[chosen].reshape(shots.count, -1), 1.0, 1.0 / rules.far_share)
+
+
 _frame = eqx.filter_jit(local_frame)
 _points = eqx.filter_jit(lattice_points)
 

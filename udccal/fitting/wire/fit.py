@@ -22,10 +22,11 @@ from udccal.fitting.wire.data import FlatNoise, Pixels, WireData, flat_noise, id
 from udccal.fitting.wire.jacobian import BLOCK, WireProblem, block_jacobian, expected_of, values_at
 from udccal.fitting.wire.misfit import misfit, omitted, unseen
 from udccal.fitting.wire.orders import select
-from udccal.fitting.wire.parameters import ideal_wire, parameters_of, possible_harmonics
+from udccal.fitting.wire.parameters import Parameters, ideal_wire, parameters_of, possible_harmonics
 from udccal.fitting.wire.report import Joint, wire_result
 from udccal.fitting.wire.rules import WireRules
 from udccal.fitting.wire.search import Found, Search
+from udccal.models.geometry import Geometry
 from udccal.models.wire import Wire, scaled_positions, wire_map
 from udccal.numerics import in_float64
 from udccal.result import FitResult, FitStatus
@@ -59,9 +60,10 @@ def fit_wire(data: WireData, rules: WireRules | None = None) -> FitResult[Wire]:
         for part in (rules.search_share, rules.shape_share, 1.0)
     )
     found = Search(data.start, noise, rules).found(data.geometry, few, coarse)
-    joint = _mean_one(_joint(found, every, data, noise, rules), data)
+    joint = _joint(found, every, data, noise, rules)
+    joint = replace(joint, x=mean_one(joint.parameters, joint.x, data.geometry, values.shape))
     held_out = every.used < values.size / 2
-    jacobian = _map_jacobian(joint, data)
+    jacobian = map_jacobian(joint.parameters, joint.x, data.geometry, values.shape)
     judged = joint.seen
     if held_out:
         others = sample_pixels(values, data.geometry, rules.samples, other=True)
@@ -144,24 +146,28 @@ def _joint(found: Found, every: Pixels, data: WireData, noise: FlatNoise, rules:
     )
 
 
-def _grid(data: WireData, down: int, across: int) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"]]:
-    """Ideal and scaled points of the middles of so many parts of the sensor."""
-    y, x = ((np.arange(n) + 0.5) / n * size - 0.5 for n, size in zip((down, across), data.signal.shape, strict=True))
+def _grid(
+    geometry: Geometry, shape: tuple[int, int], parts: tuple[int, int]
+) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"]]:
+    """Ideal and scaled points of the middles of so many parts of a sensor of that shape, down and across."""
+    y, x = ((np.arange(n) + 0.5) / n * size - 0.5 for n, size in zip(parts, shape, strict=True))
     pixels = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-    return ideal_points(data.geometry, pixels), np.asarray(scaled_positions(pixels, *data.signal.shape))
+    return ideal_points(geometry, pixels), np.asarray(scaled_positions(pixels, *shape))
 
 
-def _mean_one(joint: Joint, data: WireData) -> Joint:
-    """Scaled to a map with a mean of one over the sensor, by the midpoint rule."""
-    whole, base = values_at(joint.wire, *_grid(data, *_MEAN_GRID))
-    x = joint.x.copy()
-    x[0] -= np.log(float(np.mean(whole * base)))
-    return replace(joint, x=x)
+def mean_one(
+    parameters: Parameters, x: Float[np.ndarray, " n"], geometry: Geometry, shape: tuple[int, int]
+) -> Float[np.ndarray, " n"]:
+    """The parameters scaled to a map with a mean of one over a sensor of that shape, by the midpoint rule."""
+    whole, base = values_at(parameters.wire(x), *_grid(geometry, shape, _MEAN_GRID))
+    scaled = x.copy()
+    scaled[0] -= np.log(float(np.mean(whole * base)))
+    return scaled
 
 
 @final
 @dataclass(frozen=True)
-class _MapJacobian:
+class MapJacobian:
     """Derivatives of the map, its mean kept at 1, on a grid over the sensor; of its mean, were that not kept."""
 
     value: Float[np.ndarray, " places"]
@@ -174,19 +180,23 @@ class _MapJacobian:
         return float(np.sqrt(np.mean(variance + (model * self.value) ** 2)))
 
 
-def _map_jacobian(joint: Joint, data: WireData) -> _MapJacobian:
+def map_jacobian(
+    parameters: Parameters, x: Float[np.ndarray, " n"], geometry: Geometry, shape: tuple[int, int]
+) -> MapJacobian:
+    """Of the map that these parameters make on a sensor of that shape; its mean is 1 (``mean_one``)."""
     site = np.zeros(BLOCK, dtype=np.int64)
-    ideal, scaled = (part.reshape(-1, BLOCK, 2) for part in _grid(data, *_SIGMA_GRID))
-    parts = [block_jacobian(joint.parameters, joint.wire, i, s, site) for i, s in zip(ideal, scaled, strict=True)]
+    ideal, scaled = (part.reshape(-1, BLOCK, 2) for part in _grid(geometry, shape, _SIGMA_GRID))
+    wire = parameters.wire(x)
+    parts = [block_jacobian(parameters, wire, i, s, site) for i, s in zip(ideal, scaled, strict=True)]
     whole, base, rows = (np.concatenate(same, axis=-1) for same in zip(*parts, strict=True))
     value, rows = whole * base, rows * base
     # Site gains are not in the map.
-    rows[joint.parameters.sites] = 0.0
+    rows[parameters.sites] = 0.0
     of_mean = rows.mean(axis=1)
-    return _MapJacobian(value, rows - of_mean[:, None] * value, of_mean)
+    return MapJacobian(value, rows - of_mean[:, None] * value, of_mean)
 
 
-def _posterior(joint: Joint, jacobian: _MapJacobian, model: float) -> Posterior[Wire]:
+def _posterior(joint: Joint, jacobian: MapJacobian, model: float) -> Posterior[Wire]:
     """Of all that was fitted, and of what the model may be off.
 
     That is a modulation of unknown phase beside the pupil's: its cosine and sine are two further parameters, so that

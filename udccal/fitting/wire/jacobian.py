@@ -264,7 +264,19 @@ class WireProblem:
     prior: Prior
 
     def equations_at(self, place: Float[np.ndarray, " n"]) -> WireEquations:
-        """Cost and normal equations, summed up block by block."""
+        """Cost and normal equations."""
+        matrix, by_tile, chi2 = self.sums(place)
+        used = self.pixels.used
+        dof = max(used - len(place), 1)
+        variance = chi2 / dof + LEAST_VARIANCE
+        right = by_tile.sum(axis=0) / variance
+        blocks = Blocks.dense(dof * float(np.log(variance)), used, matrix / variance, right)
+        return WireEquations(blocks.with_prior(self.prior, place), variance, by_tile / variance)
+
+    def sums(
+        self, place: Float[np.ndarray, " n"]
+    ) -> tuple[Float[np.ndarray, "n n"], Float[np.ndarray, "tiles n"], float]:
+        """Block by block: the information at the noise that the weights state, the right side by tile, chi-squared."""
         wire, gains, size = self.parameters.wire(place), self.parameters.gains(place), len(place)
         matrix, by_tile, chi2 = np.zeros((size, size)), np.zeros((len(_TILE_NUMBERS), size)), 0.0
         for part in self.pixels.blocks():
@@ -275,12 +287,7 @@ class WireProblem:
             matrix += rows @ rows.T
             by_tile += np.where(tile_numbers(part.scaled) == _TILE_NUMBERS, errors, 0.0) @ rows.T
             chi2 += float(errors @ errors)
-        used = self.pixels.used
-        dof = max(used - size, 1)
-        variance = chi2 / dof + LEAST_VARIANCE
-        right = by_tile.sum(axis=0) / variance
-        blocks = Blocks.dense(dof * float(np.log(variance)), used, matrix / variance, right)
-        return WireEquations(blocks.with_prior(self.prior, place), variance, by_tile / variance)
+        return matrix, by_tile, chi2
 
     def moved(self, place: Float[np.ndarray, " n"], step: Step) -> Float[np.ndarray, " n"]:
         """The place after a step."""

@@ -8,9 +8,8 @@ from typing import final
 import numpy as np
 import pytest
 
-from udccal.planning import outlook as module
-from udccal.planning.outlook import outlook
-from udccal.planning.prediction import Floor
+from udccal.planning import forecast as module
+from udccal.planning.forecast import Floor, forecast
 from udccal.planning.state import nominal_state
 from udccal.rig import Captures, load_rig
 
@@ -35,12 +34,12 @@ class _Made:
 
 def test_curves_reach_from_a_quarter_to_four_times(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "predictor_for", lambda term, state: _Made())
-    found = outlook("backscatter", nominal_state(load_rig("lg55-aca2040")))
+    found = forecast("backscatter", nominal_state(load_rig("lg55-aca2040")))
     assert found is not None
-    (trade,) = found.trades
-    assert (trade.counts[0], trade.now, trade.counts[-1]) == (6, 24, 96)
-    assert np.all(np.diff(trade.sigma) < 0)
-    assert trade.most_gain == pytest.approx(2.0)
+    (curve,) = found.curves
+    assert (curve.counts[0], curve.now, curve.counts[-1]) == (6, 24, 96)
+    assert np.all(np.diff(curve.sigma) < 0)
+    assert curve.most_gain == pytest.approx(2.0)
     assert found.idle == ("frames of a picture",)
     assert (found.used, found.floor.sigma) == (0.25, 0.01)
 
@@ -48,16 +47,16 @@ def test_curves_reach_from_a_quarter_to_four_times(monkeypatch: pytest.MonkeyPat
 def test_captures_that_do_not_suffice_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
     state = nominal_state(load_rig("lg55-aca2040"))
     monkeypatch.setattr(module, "predictor_for", lambda term, state: _Made(fewest=12))
-    found = outlook("backscatter", state)
+    found = forecast("backscatter", state)
     assert found is not None
-    assert found.trades[0].counts[0] > 12
+    assert found.curves[0].counts[0] > 12
     monkeypatch.setattr(module, "predictor_for", lambda term, state: _Made(fewest=1000))
-    assert outlook("backscatter", state) is None
+    assert forecast("backscatter", state) is None
 
 
 def test_levels_tell_the_gain_and_the_stack_does_not() -> None:
-    found = outlook("noise", nominal_state(load_rig("lg55-reduced")))
+    found = forecast("noise", nominal_state(load_rig("lg55-reduced")))
     assert found is not None
-    assert [trade.knob.name for trade in found.trades] == ["noise_levels"]
+    assert [curve.variable.name for curve in found.curves] == ["noise_levels"]
     assert found.idle == ("frames of a stack",)
-    assert found.trades[0].most_gain == pytest.approx(2.0, rel=0.1)
+    assert found.curves[0].most_gain == pytest.approx(2.0, rel=0.1)

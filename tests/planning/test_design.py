@@ -6,22 +6,21 @@ import math
 
 import pytest
 
-from udccal.planning.knobs import KNOBS, additions, least_captures
-from udccal.planning.search import Oracle, cheapest, worthwhile
+from udccal.planning.design import DESIGN_VARIABLES, Objective, cheapest, least_captures, one_step_up, worthwhile
 from udccal.planning.steps import Cost
 from udccal.rig import Captures
 from udccal.sessions.schema import TermName
 
 
-def wire(floor: float = 0.0) -> Oracle:
-    return Oracle(
+def wire(floor: float = 0.0) -> Objective:
+    return Objective(
         "wire",
         lambda captures: math.sqrt(floor**2 + 1 / captures.flats),
         lambda captures: Cost(captures.flats, 0.01 * captures.flats, 2),
     )
 
 
-def psf(dear: str) -> Oracle:
+def psf(dear: str) -> Objective:
     """Positions and shifts tell alike; one of them takes ten times as long."""
 
     def cost(captures: Captures) -> Cost:
@@ -32,7 +31,7 @@ def psf(dear: str) -> Oracle:
     def sigma(captures: Captures) -> float:
         return 1 / math.sqrt(captures.psf_columns * captures.psf_rows * captures.psf_shifts)
 
-    return Oracle("psf", sigma, cost)
+    return Objective("psf", sigma, cost)
 
 
 @pytest.mark.parametrize("target", [0.5, 0.123, 0.0421, 0.01])
@@ -54,12 +53,12 @@ def test_what_is_cheap_is_added() -> None:
 
 
 def test_nothing_can_be_taken_away_from_a_plan() -> None:
-    oracle = psf("positions")
-    found = cheapest(oracle, Captures(), 0.087)
+    objective = psf("positions")
+    found = cheapest(objective, Captures(), 0.087)
     assert found is not None
-    for knob in KNOBS["psf"]:
-        if knob.of(found) > knob.least:
-            assert oracle.sigma(knob.set(found, knob.of(found) - 1)) > 0.087
+    for variable in DESIGN_VARIABLES["psf"]:
+        if variable.of(found) > variable.least:
+            assert objective.sigma(variable.set(found, variable.of(found) - 1)) > 0.087
 
 
 def test_the_same_question_has_the_same_answer_whatever_the_rig_had_before() -> None:
@@ -73,7 +72,7 @@ def test_a_target_at_or_below_the_floor_is_not_reached(target: float) -> None:
 
 
 def test_a_sigma_that_nothing_lowers_ends_the_search() -> None:
-    stuck = Oracle("psf", lambda captures: 1.0, lambda captures: Cost(1, 1.0, 1))
+    stuck = Objective("psf", lambda captures: 1.0, lambda captures: Cost(1, 1.0, 1))
     assert cheapest(stuck, Captures(), 0.5) is None
     assert worthwhile(stuck, Captures()) == []
 
@@ -82,16 +81,18 @@ def test_captures_too_few_for_a_fit_are_added_to() -> None:
     def sigma(captures: Captures) -> float:
         return math.inf if captures.board_views < 7 else 1 / captures.board_views
 
-    oracle = Oracle("geometry", sigma, lambda captures: Cost(1, float(captures.board_views), captures.board_views))
-    assert cheapest(oracle, Captures(), 0.15) == Captures(board_views=7)
+    objective = Objective(
+        "geometry", sigma, lambda captures: Cost(1, float(captures.board_views), captures.board_views)
+    )
+    assert cheapest(objective, Captures(), 0.15) == Captures(board_views=7)
 
 
-@pytest.mark.parametrize("term", list(KNOBS))
+@pytest.mark.parametrize("term", list(DESIGN_VARIABLES))
 def test_every_least_design_is_a_valid_one_and_can_grow(term: TermName) -> None:
     least = least_captures(term, Captures())
     assert Captures.model_validate(least.model_dump()) == least
-    grown = list(additions(term, least))
-    assert len(grown) == len(KNOBS[term])
-    for knob, more in grown:
-        assert knob.of(more) > knob.of(least)
+    grown = list(one_step_up(term, least))
+    assert len(grown) == len(DESIGN_VARIABLES[term])
+    for variable, more in grown:
+        assert variable.of(more) > variable.of(least)
         assert Captures.model_validate(more.model_dump()) == more

@@ -1,0 +1,149 @@
+"""Design variables of a capture, and the cheapest design that reaches a sigma.
+
+The design of the best gain per second is added to until the sigma is reached, then pruned. No chance in it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Final, final
+
+from udccal.planning.steps import Cost
+from udccal.rig import Captures
+from udccal.sessions.schema import TermName
+
+# One step up adds this share of what there is, and one at least.
+_SHARE: Final = 0.25
+_MOST_ADDITIONS: Final = 200
+# An addition that lowers the logarithm of sigma by less than this is none.
+_LEAST_GAIN: Final = 1e-6
+
+
+@final
+@dataclass(frozen=True)
+class DesignVariable:
+    """One number of ``Captures``, with the least that the term's fit can judge itself by, and the most to be asked.
+
+    ``counted`` says in words what the number counts.
+    """
+
+    name: str
+    least: int
+    most: int
+    counted: str
+
+    def of(self, captures: Captures) -> int:
+        """Its value."""
+        return int(getattr(captures, self.name))
+
+    def set(self, captures: Captures, value: int) -> Captures:
+        """The captures with this value."""
+        return captures.model_copy(update={self.name: value})
+
+
+DESIGN_VARIABLES: Final = MappingProxyType[TermName, tuple[DesignVariable, ...]](
+    {
+        # PRNU and DSNU live on the stack, K on the levels: below these, noise's other numbers would suffer.
+        "noise": (
+            DesignVariable("noise_levels", 5, 400, "levels of light"),
+            DesignVariable("noise_stack", 8, 1000, "frames of a stack"),
+        ),
+        "geometry": (DesignVariable("board_views", 3, 200, "views of the board"),),
+        "wire": (DesignVariable("flats", 2, 20_000, "flats"),),
+        "psf": (
+            DesignVariable("psf_columns", 2, 24, "columns of LED positions"),
+            DesignVariable("psf_rows", 2, 24, "rows of LED positions"),
+            DesignVariable("psf_shifts", 1, 64, "shifts at each position"),
+            DesignVariable("psf_exposures", 3, 12, "exposures of a bracket"),
+        ),
+        "backscatter": (
+            DesignVariable("backscatter_pictures", 6, 200, "pictures on the panel"),
+            DesignVariable("backscatter_frames", 2, 1000, "frames of a picture"),
+        ),
+    }
+)
+
+
+@final
+@dataclass(frozen=True)
+class Objective:
+    """What captures of one term would give, and what they take."""
+
+    term: TermName
+    sigma: Callable[[Captures], float]
+    cost: Callable[[Captures], Cost]
+
+
+@final
+@dataclass(frozen=True)
+class Addition:
+    """One design variable one step up: by how much the logarithm of sigma falls, and what it takes."""
+
+    variable: DesignVariable
+    captures: Captures
+    gain: float
+    cost: Cost
+
+
+def least_captures(term: TermName, captures: Captures) -> Captures:
+    """The captures with a term's design variables at their least."""
+    return captures.model_copy(update={variable.name: variable.least for variable in DESIGN_VARIABLES[term]})
+
+
+def one_step_up(term: TermName, captures: Captures) -> Iterator[tuple[DesignVariable, Captures]]:
+    """The captures with one of a term's design variables one step up, variable by variable."""
+    for variable in DESIGN_VARIABLES[term]:
+        value = variable.of(captures)
+        if value < variable.most:
+            yield variable, variable.set(captures, min(variable.most, value + max(1, round(_SHARE * value))))
+
+
+def worthwhile(objective: Objective, design: Captures) -> list[Addition]:
+    """Additions that lower sigma at all, in the order of the design variables."""
+    before, spent = objective.sigma(design), objective.cost(design)
+    found = []
+    for variable, more in one_step_up(objective.term, design):
+        after = objective.sigma(more)
+        # From what cannot be told at all, anything that can is a gain.
+        gain = math.log(before / after) if math.isfinite(before) else 100.0 if math.isfinite(after) else 1.0
+        if gain > _LEAST_GAIN:
+            found.append(Addition(variable, more, gain, objective.cost(more) - spent))
+    return found
+
+
+def cheapest(objective: Objective, captures: Captures, target: float) -> Captures | None:
+    """The captures with the term's design variables such that sigma is at most ``target``; None where none are."""
+    design = least_captures(objective.term, captures)
+    for _ in range(_MOST_ADDITIONS):
+        if objective.sigma(design) <= target:
+            return _pruned(objective, design, target)
+        additions = worthwhile(objective, design)
+        if not additions:
+            return None
+        design = max(additions, key=lambda one: one.gain / max(one.cost.seconds, 1e-9)).captures
+    return None
+
+
+def _pruned(objective: Objective, design: Captures, target: float) -> Captures:
+    """Every variable at its least that still reaches the target, the one that saves most time first."""
+    while True:
+        lower = [_lowered(objective, design, target, variable) for variable in DESIGN_VARIABLES[objective.term]]
+        best = min(lower, key=lambda one: objective.cost(one).seconds)
+        if objective.cost(best).seconds >= objective.cost(design).seconds:
+            return design
+        design = best
+
+
+def _lowered(objective: Objective, design: Captures, target: float, variable: DesignVariable) -> Captures:
+    """Halving the interval: more captures never tell less."""
+    low, high = variable.least - 1, variable.of(design)
+    while high - low > 1:
+        middle = (low + high) // 2
+        if objective.sigma(variable.set(design, middle)) <= target:
+            high = middle
+        else:
+            low = middle
+    return variable.set(design, high)

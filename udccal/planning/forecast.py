@@ -1,0 +1,157 @@
+"""The sigma expected of a term's captures: as planned, of endless ones, and against the number of each.
+
+Every term has a predictor: expected data at the planned exposures, through the equations of the term's own fit, give
+its information and with it the sigma of one quantity, in which people speak of the term.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Final, Protocol, final, runtime_checkable
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from udccal.planning.design import DESIGN_VARIABLES, DesignVariable
+from udccal.planning.state import RigState
+from udccal.rig import Captures
+from udccal.sessions.schema import TermName
+
+# From a quarter of what was captured to four times as much.
+_REACH: Final = 4.0
+_POINTS: Final = 9
+# Design variables that change sigma by less than this share of it do not matter to the quantity.
+_FLAT: Final = 1e-3
+
+
+@final
+@dataclass(frozen=True)
+class Quantity:
+    """What the sigma of a term is of, and its unit."""
+
+    unit: str
+    meaning: str
+
+
+QUANTITIES: Final = MappingProxyType[TermName, Quantity](
+    {
+        "noise": Quantity("%", "conversion gain K, relative"),
+        "geometry": Quantity("px", "where a ray lands, root mean square over the sensor"),
+        "wire": Quantity("%", "wire map, root mean square over the sensor"),
+        "psf": Quantity("%", "kernel, relative L2"),
+        "backscatter": Quantity("%", "predicted light, root mean square, of its peak"),
+    }
+)
+
+
+@final
+@dataclass(frozen=True)
+class Floor:
+    """The sigma that is left however much is captured, in the quantity's unit, and what would lower it."""
+
+    sigma: float
+    lowered_by: str
+
+
+@runtime_checkable
+class Predictor(Protocol):
+    """Predicts one term of one rig; remembers what does not change with the captures."""
+
+    def sigma(self, captures: Captures) -> float:
+        """Of the term's quantity; infinite where the captures do not suffice for a fit."""
+        ...
+
+    def floor(self) -> Floor:
+        """In the limit of endless captures."""
+        ...
+
+    def used(self, captures: Captures) -> float:
+        """Share of the captures' information on the quantity that the fit, at its default effort, spends; 1 is all."""
+        ...
+
+
+def predictor_for(term: TermName, state: RigState) -> Predictor:
+    """What predicts a term of a rig."""
+    from udccal.planning import backscatter, geometry, noise, psf, wire
+
+    predictors: dict[TermName, Callable[[RigState], Predictor]] = {
+        "noise": noise.NoisePredictor,
+        "geometry": geometry.GeometryPredictor,
+        "wire": wire.WirePredictor,
+        "psf": psf.PsfPredictor,
+        "backscatter": backscatter.BackscatterPredictor,
+    }
+    return predictors[term](state)
+
+
+@final
+@dataclass(frozen=True)
+class Curve:
+    """Sigma against one design variable, all others as they were; ``now`` is what was captured."""
+
+    variable: DesignVariable
+    now: int
+    counts: Float[np.ndarray, " n"]
+    sigma: Float[np.ndarray, " n"]
+
+    @property
+    def most_gain(self) -> float:
+        """By which factor sigma falls from what was captured to the most that is looked at."""
+        at = float(np.exp(np.interp(np.log(self.now), np.log(self.counts), np.log(self.sigma))))
+        return at / float(self.sigma[-1])
+
+
+@final
+@dataclass(frozen=True)
+class Forecast:
+    """What a term's captures bring, and what more or fewer of them would.
+
+    Attributes:
+        quantity: what ``sigma`` is of, and its unit.
+        sigma: predicted at what was captured.
+        floor: what no captures get below.
+        used: share of the frames' information on the quantity that the fit, at its default effort, spends; 1 is all.
+        curves: one per design variable that matters.
+        idle: what the variables count that do not matter to the quantity.
+    """
+
+    term: TermName
+    quantity: Quantity
+    sigma: float
+    floor: Floor
+    used: float
+    curves: tuple[Curve, ...]
+    idle: tuple[str, ...]
+
+
+def forecast(term: TermName, state: RigState) -> Forecast | None:
+    """Of one term at a state's captures; None where these do not suffice for a fit.
+
+    Raises:
+        UdccalError: when no procedure is installed, or the one that is does not tell what it will take.
+    """
+    predictor, captures = predictor_for(term, state), state.rig.captures
+    sigma = predictor.sigma(captures)
+    if not (np.isfinite(sigma) and sigma > 0):
+        return None
+    curves = [_curve(predictor, captures, variable) for variable in DESIGN_VARIABLES[term]]
+    matter = [curve for curve in curves if len(curve.counts) > 1 and np.ptp(curve.sigma) > _FLAT * sigma]
+    idle = tuple(curve.variable.counted for curve in curves if curve not in matter)
+    used = predictor.used(captures)
+    return Forecast(term, QUANTITIES[term], sigma, predictor.floor(), used, tuple(matter), idle)
+
+
+def _curve(predictor: Predictor, captures: Captures, variable: DesignVariable) -> Curve:
+    now = variable.of(captures)
+    counts = _counts(variable, now)
+    sigma = np.array([predictor.sigma(variable.set(captures, int(count))) for count in counts])
+    finite = np.isfinite(sigma)
+    return Curve(variable, now, counts[finite].astype(np.float64), sigma[finite])
+
+
+def _counts(variable: DesignVariable, now: int) -> Int[np.ndarray, " n"]:
+    """From a quarter of ``now`` to four times as many, within what can be asked for."""
+    wanted = np.rint(now * np.geomspace(1 / _REACH, _REACH, _POINTS)).astype(int)
+    return np.unique(np.clip(wanted, min(variable.least, now), max(variable.most, now)))
