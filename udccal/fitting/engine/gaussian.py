@@ -130,17 +130,6 @@ def square_root(cov: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
     return np.asarray(unit[:, None] * vectors * np.sqrt(np.maximum(values, 0.0)))
 
 
-def marginal_information(information: Float[np.ndarray, "n n"], kept: int) -> Float[np.ndarray, "kept kept"]:
-    """Information on the first ``kept`` parameters where the others are estimated along (Schur's complement).
-
-    Args:
-        information: on all parameters, positive semi-definite; on parameters of very unlike scales.
-        kept: how many are of interest.
-    """
-    cross = information[:kept, kept:]
-    return np.asarray(information[:kept, :kept] - cross @ scaled_inverse(information[kept:, kept:], 1e-15) @ cross.T)
-
-
 def scaled_inverse(matrix: Float[np.ndarray, "*k n n"], rcond: float = 1e-12) -> Float[np.ndarray, "*k n n"]:
     """Inverse of symmetric matrices of very unlike scales; what they do not tell at all comes back as zero.
 
