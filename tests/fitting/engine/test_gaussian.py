@@ -5,7 +5,7 @@ import pytest
 from jaxtyping import Float
 
 from udccal.errors import FitError
-from udccal.fitting.engine.gaussian import Posterior, Prior, marginal_information, scaled_inverse, square_root
+from udccal.fitting.engine.gaussian import Posterior, Prior, scaled_inverse, square_root
 from udccal.result import FitResult, FitStatus
 
 COV = np.array([[4.0, 1e-3, 0.0], [1e-3, 1e-6, 0.0], [0.0, 0.0, 0.0]])
@@ -53,11 +53,6 @@ def test_parameters_of_unlike_size_keep_their_digits() -> None:
 
 def test_directions_without_information_have_no_inverse() -> None:
     assert scaled_inverse(np.diag([4.0, 0.0])) == pytest.approx(np.diag([0.25, 0.0]))
-
-
-def test_parameters_that_nothing_is_told_of_take_no_information_away() -> None:
-    information = np.diag([4.0, 9.0, 0.0])
-    assert marginal_information(information, 2) == pytest.approx(np.diag([4.0, 9.0]))
 
 
 def test_results_answer_for_functions_of_their_term_or_say_why_not() -> None:
