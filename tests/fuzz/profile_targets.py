@@ -84,18 +84,18 @@ def _profile() -> Profile:
     residual = np.pad(np.asarray(point.residual), ((0, 0), (0, 0), (3, 3), (3, 3)))
     mask = np.full(np.shape(dark.mask), 2.0e4)
 
-    def fitted(term: object, estimates: tuple[Estimate, ...] = ()) -> FitResult:
-        return FitResult(term, FitStatus.CONVERGED, estimates, np.eye(len(estimates)), 1.0, 100)
+    def fitted(name: str, term: object, estimates: tuple[Estimate, ...] = ()) -> FitResult:
+        return FitResult(name, term, FitStatus.CONVERGED, estimates, np.eye(len(estimates)), 1.0, 100)
 
     wire = absent_wire(rig, geometry)
     return build_profile(
         rig,
         provenance_now(None, None),
-        noise=fitted(noise, (Estimate("K_DN_per_e", 0.355, 1e-3, "DN/e-"),)),
-        geometry=fitted(geometry),
-        wire=fitted(wire),
-        psf=fitted(type(point)(**{**vars(point), "residual": residual})),
-        backscatter=fitted(type(dark)(**{**vars(dark), "mask": mask, "window": 5})),
+        noise=fitted("noise", noise, (Estimate("K_DN_per_e", 0.355, 1e-3, "DN/e-"),)),
+        geometry=fitted("geometry", geometry),
+        wire=fitted("wire", wire),
+        psf=fitted("psf", type(point)(**{**vars(point), "residual": residual})),
+        backscatter=fitted("backscatter", type(dark)(**{**vars(dark), "mask": mask, "window": 5})),
         wire_map=sensor_map(wire, rig.camera.rows, rig.camera.columns),
     )
 

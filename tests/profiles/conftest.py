@@ -16,11 +16,13 @@ from udccal.rig import RigDescription, load_rig
 from udccal.sessions.schema import StoredCamera
 
 
-def fitted(term: object, estimates: tuple[Estimate, ...] = (), status: FitStatus = FitStatus.CONVERGED) -> FitResult:
+def fitted(
+    name: str, term: object, estimates: tuple[Estimate, ...] = (), status: FitStatus = FitStatus.CONVERGED
+) -> FitResult:
     """A fit's result with some of everything, its numbers awkward to print."""
     count = len(estimates)
     return FitResult(
-        name="test",
+        name=name,
         term=term,
         status=status,
         estimates=estimates,
@@ -57,11 +59,11 @@ def toy_profile(toy_rig: RigDescription) -> Profile:
     return build_profile(
         toy_rig,
         provenance_now(None, StoredCamera(vendor="Basler", model="acA2040", serial="1", backend="simulated")),
-        noise=fitted(noise, estimates),
-        geometry=fitted(geometry),
-        wire=fitted(wire),
-        psf=fitted(type(psf)(**{**vars(psf), "residual": residual})),
-        backscatter=fitted(absent_backscatter(toy_rig, geometry), status=FitStatus.ABSENT),
+        noise=fitted("noise", noise, estimates),
+        geometry=fitted("geometry", geometry),
+        wire=fitted("wire", wire),
+        psf=fitted("psf", type(psf)(**{**vars(psf), "residual": residual})),
+        backscatter=fitted("backscatter", absent_backscatter(toy_rig, geometry), status=FitStatus.ABSENT),
         wire_map=sensor_map(wire, toy_rig.camera.rows, toy_rig.camera.columns),
         parent="ab" * 32,
     )
