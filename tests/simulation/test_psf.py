@@ -105,6 +105,7 @@ def test_whole_pixel_offset_shifts_the_samples(truth: RigTruth):
     assert np.abs(shifted[:, 1:, 2:] - plain[:, :-1, :-2]).max() < 1e-3 * plain.max()
 
 
+@pytest.mark.slow
 def test_disc_averages_points_and_keeps_the_light(truth: RigTruth):
     point, disc = captured_light(truth, MIDDLE, 65, 33), captured_light(truth, MIDDLE, 65, 33, source_disc_px=1.6)
     assert np.allclose(disc.sum(axis=(1, 2)), point.sum(axis=(1, 2)), rtol=2e-3)

@@ -101,7 +101,9 @@ def test_the_right_order_is_chosen_in_95_of_100_runs() -> None:
     assert right >= 95
 
 
-@pytest.mark.parametrize("order", [KERNELS[0], TWO_PLANES], ids=lambda order: order.name)
+@pytest.mark.parametrize(
+    "order", [pytest.param(KERNELS[0], marks=pytest.mark.slow), TWO_PLANES], ids=lambda order: order.name
+)
 def test_the_order_of_a_rig_is_found(order: Order) -> None:
     of, shots = _made(4, order)
     assert _chosen(fit_backscatter(shots, of.term.geometry, RIG, RULES)) == order.name
@@ -115,6 +117,7 @@ def test_a_glass_that_reflects_next_to_nothing_does_not_show() -> None:
     assert not _shows(of, TWO_PLANES, noise_free(shots, of, pictures))
 
 
+@pytest.mark.slow
 def test_predicted_light_is_as_unsure_as_its_order() -> None:
     """With an order that predicts something else and may be right, error bars hold the difference."""
     of, shots = _made(0, TWO_PLANES)

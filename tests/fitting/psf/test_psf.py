@@ -155,6 +155,7 @@ def streak(source: np.ndarray, middle: np.ndarray, disc_px: float, rig: RigDescr
     return image
 
 
+@pytest.mark.slow
 def test_blur_without_a_grating_is_carried_by_the_image() -> None:
     rig = load_rig("lg55-reduced")
     geometry = nominal_geometry(rig)

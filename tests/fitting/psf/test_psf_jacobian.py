@@ -50,7 +50,7 @@ def shots(scene: Scene, prior: Prior) -> Shots:
     return shots_of(scene, pictures(scene, prior.mean, rng), rng)
 
 
-@pytest.mark.parametrize("interference", [True, False])
+@pytest.mark.parametrize("interference", [pytest.param(True, marks=pytest.mark.slow), False])
 def test_slopes_of_the_kernel_are_those_of_differences(
     scene: Scene, prior: Prior, shots: Shots, interference: bool
 ) -> None:

@@ -36,6 +36,7 @@ def columns_kept(result: FitResult[Wire]) -> int:
     return int(next(d.value for d in result.diagnostics if d.name == "parameters"))
 
 
+@pytest.mark.slow
 def test_map_and_shape_are_within_their_errors_from_a_start_that_is_a_fifth_off() -> None:
     built = start()
     flat = noisy(drawn_truth(1, built, geometry()), 1)
@@ -109,6 +110,7 @@ _INPUTS = {
 }
 
 
+@pytest.mark.slow
 @settings(max_examples=3, deadline=None, derandomize=True)
 @given(**_INPUTS)
 def test_any_flat_is_finite_and_within_its_errors_or_told(
