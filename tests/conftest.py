@@ -26,7 +26,7 @@ def pytest_configure(config: pytest.Config) -> None:
         from hypothesis import settings
 
         # The same examples in every run, and none that fails because the machine is busy.
-        settings.register_profile("udccal", derandomize=True)
+        settings.register_profile("udccal", deadline=None, derandomize=True)
         settings.load_profile("udccal")
 
 

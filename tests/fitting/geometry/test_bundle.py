@@ -146,8 +146,6 @@ def test_too_few_views_are_refused_with_the_reason() -> None:
 
 @settings(
     max_examples=12,
-    deadline=None,
-    derandomize=True,
     phases=(Phase.explicit, Phase.generate),
     suppress_health_check=[HealthCheck.too_slow],
 )

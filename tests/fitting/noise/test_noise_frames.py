@@ -176,8 +176,6 @@ def test_nothing_at_all_is_too_few() -> None:
 def _examples(count: int) -> settings:
     return settings(
         max_examples=count,
-        deadline=None,
-        derandomize=True,
         phases=(Phase.explicit, Phase.generate),
         suppress_health_check=list(HealthCheck),
     )

@@ -83,7 +83,7 @@ def test_noise_is_not_taken_for_a_model_error() -> None:
     assert np.count_nonzero(found) <= 2
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     scale=st.floats(1e-6, 1e6), spread=st.floats(0.0, 1e3), outlier=st.floats(-1e9, 1e9), parameters=st.integers(0, 50)
 )

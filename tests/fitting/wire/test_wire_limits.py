@@ -111,7 +111,7 @@ _INPUTS = {
 
 
 @pytest.mark.slow
-@settings(max_examples=3, deadline=None, derandomize=True)
+@settings(max_examples=3)
 @given(**_INPUTS)
 def test_any_flat_is_finite_and_within_its_errors_or_told(
     seed: int, electrons: float, prnu: float, broken: float, level: float
@@ -120,7 +120,7 @@ def test_any_flat_is_finite_and_within_its_errors_or_told(
 
 
 @pytest.mark.slow
-@settings(max_examples=60, deadline=None, derandomize=True)
+@settings(max_examples=60)
 @given(**_INPUTS)
 def test_many_flats_are_finite_and_within_their_errors_or_told(
     seed: int, electrons: float, prnu: float, broken: float, level: float
