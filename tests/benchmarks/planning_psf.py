@@ -60,7 +60,7 @@ def compared(design: tuple[int, int, int, int], realisations: int) -> Compared:
     scene, captures = _scene(design)
     state = RigState(scene.rig, scene.noise, scene.geometry, wire=scene.wire)
     predicted = PsfPredictor(state).sigma(captures)
-    prior = start_prior(scene.rig, start_model(scene.rig, scene.geometry, scene.wire), True)
+    prior = start_prior(scene.rig, start_model(scene.rig, scene.geometry, scene.wire))
     found = np.array([_realisation(scene, prior, seed) for seed in range(realisations)])
     squared, stated = found.mean(axis=0)
     spread = 0.5 * found[:, 0].std() / np.sqrt(max(realisations - 1, 1)) / squared
@@ -117,9 +117,8 @@ def _realisation(scene: Scene, prior: Prior, seed: int) -> tuple[float, float]:
     shots = shots_of(scene, pictures(scene, theta, rng), rng)
     rules = replace(FitEffort().psf, close_px=_HALF)
     chosen = shots.pick(some_shots(shots, rules))
-    chosen = replace(chosen, position=np.unique(chosen.position, return_inverse=True)[1].reshape(-1))
     start = start_model(scene.rig, scene.geometry, scene.wire)
-    fit = fit_diffraction(chosen, scene.geometry, start, prior, rules, True)
+    fit = fit_diffraction(chosen, scene.geometry, start, prior, rules)
     found, stated = 0.0, 0.0
     places = _PLACES * [scene.rig.camera.columns, scene.rig.camera.rows]
     for place in places:

@@ -13,7 +13,7 @@ from udccal.cfa import channel_map
 from udccal.fitting.hdr.merge import merge_bracket
 from udccal.fitting.nominal import nominal_geometry
 from udccal.fitting.psf.data import Shots, cut_crop, joined
-from udccal.fitting.psf.kernel import fit_lattice, unpack
+from udccal.fitting.psf.kernel import Evaluator, fit_lattice
 from udccal.fitting.psf.start import WAVELENGTHS_NM
 from udccal.models.diffraction import Diffraction, average_transfer, local_frame
 from udccal.models.geometry import Geometry
@@ -138,11 +138,10 @@ def pictures(
     scene: Scene, theta: Float[np.ndarray, " p"], rng: np.random.Generator, interference: bool = True
 ) -> list[Picture]:
     """All LEDs of a scene under the model that ``theta`` packs, with the wire's phase or averaged over it."""
-    model = unpack(theta, WAVELENGTHS_NM, interference)
     rows, columns = (2 * (h + _SPARE) + 1 for h in scene.half)
     # That of the fit: what a lattice of this size leaves out is no matter of efficiency.
     lattice = fit_lattice(scene.half)
-    made = []
+    model, made = Evaluator(WAVELENGTHS_NM, lattice, interference).model(theta), []
     for place in scene.places_px:
         for _ in range(scene.shifts):
             aim = place + rng.uniform(0, 2, 2)

@@ -73,8 +73,8 @@ def _select(shots: Shots) -> int:
     explained = np.full(shots.rate.shape, 1.0 / shots.rate[0].size)
     sources = Sources(shots.centre_px, light, np.zeros(shots.count))
     unit = unit_of(shots.positions_px())
-    order = select_field(shots, sources, explained, unit, 0.0, PsfRules()).order
-    return -1 if order.share else order.degree
+    order = select_field(shots, sources, explained, unit, 0.0, PsfRules()).trial.order
+    return order.degree if order.free else -1
 
 
 def _shots(mix: Float[np.ndarray, " terms"], degree: int, rng: np.random.Generator) -> Shots:

@@ -60,7 +60,7 @@ class World:
 def world() -> World:
     """LEDs at 4 x 3 positions of the rig as built."""
     scene = small_scene(positions=(4, 3), shifts=3, half=_HALF)
-    theta = start_prior(scene.rig, start_model(scene.rig, scene.geometry, scene.wire), True).mean
+    theta = start_prior(scene.rig, start_model(scene.rig, scene.geometry, scene.wire)).mean
     made = pictures(scene, theta, np.random.default_rng(5))
     return World(scene, tuple(made), _room(scene, made))
 
@@ -82,7 +82,7 @@ def chosen(known: World, kind: Kind, seed: int) -> Kind:
     positions = (shots.positions_px() - half) / half
     found = select_field(shots, sources, explained, positions, 0.0, PsfRules())
     rows, columns = found.image.shape[2:]
-    return Kind(found.order.degree, (rows // 2, columns // 2))
+    return Kind(found.trial.order.degree, (rows // 2, columns // 2))
 
 
 def _half_sensor(scene: Scene) -> Float[np.ndarray, "2"]:

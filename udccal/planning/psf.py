@@ -19,9 +19,8 @@ from udccal.fitting.engine.gaussian import Prior, scaled_inverse
 from udccal.fitting.psf.data import Shots, held_out_positions
 from udccal.fitting.psf.kernel import Evaluator, fit_lattice
 from udccal.fitting.psf.problem import DiffractionProblem, Place
-from udccal.fitting.psf.samples import Block, blocks, choose_samples, stands_for
-from udccal.fitting.psf.start import PsfRules, start_model, start_prior, wire_shows
-from udccal.fitting.psf.weights import weighed
+from udccal.fitting.psf.samples import Samples, choose_samples, gather, stands_for, weighed
+from udccal.fitting.psf.start import PsfRules, start_model, start_prior
 from udccal.numerics import in_float64
 from udccal.planning.design import DESIGN_VARIABLES
 from udccal.planning.forecast import Floor
@@ -29,7 +28,6 @@ from udccal.planning.state import WHITE, RigState, built_wire, sample_variance_e
 from udccal.planning.steps import PlannedStep, planned_steps
 from udccal.rig import Captures
 
-_FEWEST_POSITIONS: Final = 3
 # Steps of one term are alike but for their place: a design of so few shows how each is exposed.
 _SAMPLE: Final = {"psf_columns": 1, "psf_rows": 1, "psf_shifts": 1}
 _EXPOSURES: Final = next(one for one in DESIGN_VARIABLES["psf"] if one.name == "psf_exposures")
@@ -50,16 +48,16 @@ class PsfPredictor:
         self._state = state
         wire = built_wire(state) if state.wire is None else state.wire
         start = start_model(state.rig, state.geometry, wire)
-        self._prior = start_prior(state.rig, start, wire_shows(wire))
+        self._prior = start_prior(state.rig, start)
         half = _half(state.rig.captures)
-        evaluator = Evaluator(np.asarray(start.wavelengths_nm), fit_lattice(_RULES.close(half)), wire_shows(wire))
+        evaluator = Evaluator(np.asarray(start.wavelengths_nm), fit_lattice(_RULES.close(half)), bool(start.visibility))
         shots = _dark_shots(state, half)
         problem, place = _expected(state, shots, evaluator, self._prior)
         field, field_place = _part(problem, place, slice(len(_FIELD)))
         self._captured, self._place = _part(problem, place, slice(len(_FIELD), None))
         # At weights that make every colour's kernel count 1, the equations hold its squared derivatives.
-        relative = tuple(_relative(block, shots) for block in field.blocks)
-        self._of_kernel = _per_shot([one.shared for one in replace(field, blocks=relative).by_position(field_place)])
+        relative = replace(field, samples=_relative(field.samples, shots))
+        self._of_kernel = _per_shot([one.shared for one in relative.by_position(field_place)])
         self._known: dict[tuple[float, ...], Float[np.ndarray, "p p"]] = {}
 
     def sigma(self, captures: Captures) -> float:
@@ -90,7 +88,7 @@ class PsfPredictor:
         positions = captures.psf_columns * captures.psf_rows
         fitted = int((~held_out_positions(positions)).sum())
         used = min(fitted, _RULES.positions) * min(captures.psf_shifts, _RULES.shifts)
-        return used if positions >= _FEWEST_POSITIONS else 0
+        return used if positions >= _RULES.least_positions else 0
 
     def _kernel_sigma(self, captures: Captures, shots: int) -> float:
         return 100.0 * float(np.sqrt(self._of_noise(captures, shots) + self._state.model_errors.psf_kernel**2))
@@ -107,20 +105,20 @@ class PsfPredictor:
     @in_float64
     def _information(self, step: PlannedStep) -> Float[np.ndarray, "p p"]:
         """Of one shot on the parameters of diffraction, mean over the places that stand for all."""
-        merged = tuple(_merged(self._state, block, step) for block in self._captured.blocks)
-        return _per_shot([one.marginal()[0] for one in replace(self._captured, blocks=merged).by_position(self._place)])
+        merged = replace(self._captured, samples=_merged(self._state, self._captured.samples, step))
+        return _per_shot([one.marginal()[0] for one in merged.by_position(self._place)])
 
 
 def _per_shot(matrices: list[Float[np.ndarray, "p p"]]) -> Float[np.ndarray, "p p"]:
     return np.asarray(np.mean(matrices, axis=0) / len(_SHIFTS_PX))
 
 
-def _merged(state: RigState, block: Block, step: PlannedStep) -> Block:
-    """The block with what its bracket tells of every sample, PRNU, and what a profile's fit has left out.
+def _merged(state: RigState, samples: Samples, step: PlannedStep) -> Samples:
+    """The samples with what its bracket tells of every sample, PRNU, and what a profile's fit has left out.
 
     Exposures that would fill a sample's well tell nothing of it.
     """
-    full_e, light = (step.level or 0.0) * state.full_well_e, np.maximum(np.asarray(block.rate), 0.0)
+    full_e, light = (step.level or 0.0) * state.full_well_e, np.maximum(np.asarray(samples.rate), 0.0)
     known = np.zeros_like(light)
     for exposure_s in step.exposures_s:
         ratio = exposure_s / step.exposures_s[0]
@@ -128,30 +126,33 @@ def _merged(state: RigState, block: Block, step: PlannedStep) -> Block:
         variance = sample_variance_e(state, signal_e, exposure_s)
         known += np.where(signal_e < state.full_well_e, (full_e * ratio) ** 2 / variance, 0.0)
     known /= 1 + known * (float(np.asarray(state.noise.PRNU1288)) * light) ** 2
-    return weighed(replace(block, known=known * (np.asarray(block.known) > 0)), state.model_errors.psf)
+    return weighed(replace(samples, known=known * (np.asarray(samples.known) > 0)), state.model_errors.psf)
 
 
-def _relative(block: Block, shots: Shots) -> Block:
+def _relative(samples: Samples, shots: Shots) -> Samples:
     """At weights by which squared errors of light sum up to the squared relative L2 error, mean over colours."""
-    count, light, colour = stands_for(shots, _RULES)[block.index], np.asarray(block.rate), np.asarray(block.colour)
-    size = np.einsum("sn,snc,sn->sc", light**2, colour, count)
-    return replace(block, weight=count * np.einsum("snc,sc->sn", colour, 1 / size) / 3)
+    count, light, colour = (
+        stands_for(shots, _RULES)[samples.index],
+        np.asarray(samples.rate),
+        np.asarray(samples.colour),
+    )
+    size = np.einsum("psn,psnc,psn->psc", light**2, colour, count)
+    return replace(samples, weight=count * np.einsum("psnc,psc->psn", colour, 1 / size) / 3)
 
 
 def _expected(state: RigState, shots: Shots, evaluator: Evaluator, prior: Prior) -> tuple[DiffractionProblem, Place]:
     """What the diffraction fit would be given of each place; light is that of its start, 1 for the brightest sample."""
-    made = blocks(shots, state.geometry, choose_samples(shots, _RULES, _RULES.far_share))
+    made = gather(shots, state.geometry, choose_samples(shots, _RULES))
     problem = DiffractionProblem(made, evaluator, prior).with_overlaps(prior.mean)
     own = np.tile([0.0, 0.0, *WHITE, 0.0], (shots.positions, len(_SHIFTS_PX), 1))
-    lights = np.stack(problem.light_at(Place(prior.mean, own)))
-    peak = lights.max(axis=2, keepdims=True)
+    light = problem.light_at(Place(prior.mean, own))
+    peak = light.max(axis=2, keepdims=True)
     own[..., 2:5] /= peak
-    lit = (replace(block, rate=rate) for block, rate in zip(problem.blocks, lights / peak, strict=True))
-    return replace(problem, blocks=tuple(lit)), Place(prior.mean, own)
+    return replace(problem, samples=replace(problem.samples, rate=light / peak)), Place(prior.mean, own)
 
 
 def _part(problem: DiffractionProblem, place: Place, which: slice) -> tuple[DiffractionProblem, Place]:
-    return replace(problem, blocks=problem.blocks[which]), Place(place.theta, place.own[which])
+    return replace(problem, samples=problem.samples.at(which)), Place(place.theta, place.own[which])
 
 
 def _half(captures: Captures) -> tuple[int, int]:

@@ -18,10 +18,9 @@ from udccal.fitting.engine.gaussian import Prior, scaled_inverse
 from udccal.fitting.engine.information import cramer_rao
 from udccal.fitting.psf.diffraction import fit_diffraction
 from udccal.fitting.psf.kernel import Evaluator, fit_lattice
-from udccal.fitting.psf.problem import DiffractionProblem
-from udccal.fitting.psf.samples import Block, blocks, unit_light
+from udccal.fitting.psf.problem import DiffractionProblem, coefficients_of, unit_light
+from udccal.fitting.psf.samples import Samples, gather, sensor_variance
 from udccal.fitting.psf.start import WAVELENGTHS_NM, PsfRules, start_model, start_prior
-from udccal.fitting.psf.weights import sensor_variance
 from udccal.numerics import in_float64
 
 _REALISATIONS = 100
@@ -54,7 +53,7 @@ class _Outcome:
 def trials(share: float) -> list[Trials]:
     """All realisations, by quantity."""
     scene = small_scene(positions=(3, 1), shifts=2, half=(14, 7))
-    prior = start_prior(scene.rig, start_model(scene.rig, scene.geometry, scene.wire), True)
+    prior = start_prior(scene.rig, start_model(scene.rig, scene.geometry, scene.wire))
     outcomes = [_realisation(scene, prior, seed) for seed in range(max(round(_REALISATIONS * share), 3))]
     error, sigma, bound = (np.stack([getattr(o, name) for o in outcomes]) for name in ("error", "sigma", "bound"))
     numbers = [
@@ -72,8 +71,8 @@ def _realisation(scene: Scene, prior: Prior, seed: int) -> _Outcome:
     theta = prior.mean + np.linalg.cholesky(cov) @ rng.standard_normal(len(cov))
     made = pictures(scene, theta, rng)
     start = start_model(scene.rig, scene.geometry, scene.wire)
-    rules = PsfRules(close_px=scene.half, far_share=1.0, iterations=_ITERATIONS)
-    fit = fit_diffraction(shots_of(scene, made, rng), scene.geometry, start, prior, rules, True)
+    rules = PsfRules(close_px=scene.half, far_fraction=1.0, iterations=_ITERATIONS)
+    fit = fit_diffraction(shots_of(scene, made, rng), scene.geometry, start, prior, rules)
     evaluator = fit.problem.evaluator
     information = _information(scene, prior, theta, made)
     true, slopes = _at_points(scene, evaluator, theta)
@@ -115,12 +114,14 @@ def _information(
     shots = replace(shots, centre_px=true)
     evaluator = Evaluator(WAVELENGTHS_NM, fit_lattice(scene.half), True)
     total = prior.precision
-    every = blocks(shots, scene.geometry, np.ones(shots.rate.shape, dtype=bool))
+    every = gather(shots, scene.geometry, np.ones(shots.rate.shape, dtype=bool))
     problem = DiffractionProblem(every, evaluator, prior).with_overlaps(theta)
-    for block in problem.blocks:
-        index = np.asarray(block.index)
-        by_global, by_local, light = _slopes(problem, theta, block, np.stack([made[i].flux for i in index]))
-        weight = 1.0 / sensor_variance(block, light)
+    kernels = coefficients_of(evaluator, theta, problem.samples)
+    for position, kernel in enumerate(kernels):
+        one = problem.samples.at(position)
+        flux = np.stack([made[i].flux for i in one.index])
+        by_global, by_local, light = _slopes(evaluator, theta, one, np.asarray(kernel), flux)
+        weight = 1.0 / sensor_variance(one, light)
         own = np.einsum("snk,sn,snl->skl", by_local, weight, by_local)
         cross = np.einsum("snp,sn,snl->psl", by_global, weight, by_local)
         both = np.einsum("snp,sn,snq->pq", by_global, weight, by_global)
@@ -129,24 +130,25 @@ def _information(
 
 
 def _slopes(
-    problem: DiffractionProblem, theta: Float[np.ndarray, " p"], block: Block, flux: Float[np.ndarray, "shots 3"]
+    evaluator: Evaluator,
+    theta: Float[np.ndarray, " p"],
+    one: Samples,
+    kernel: Float[np.ndarray, "y x 3"],
+    flux: Float[np.ndarray, "shots 3"],
 ) -> tuple[Float[np.ndarray, "shots n p"], Float[np.ndarray, "shots n l"], Float[np.ndarray, "shots n"]]:
     """Slopes of a position's samples by global parameters and by each shot's own, and the light of the samples."""
-    shape = np.shape(block.rate)
-    colour = np.asarray(block.colour)
-    points = np.asarray(block.points).reshape(-1, 2)
+    shape = np.shape(one.rate)
+    colour = np.asarray(one.colour)
+    points = np.asarray(one.points).reshape(-1, 2)
     unit, by_theta = (
         np.asarray(part)
-        for part in light_and_slopes(
-            problem.evaluator, theta, block.frame, points, np.ravel(block.density), block.disc_px
-        )
+        for part in light_and_slopes(evaluator, theta, one.frame, points, np.ravel(one.density), one.disc_px)
     )
     light = np.einsum("snc,sc->sn", colour, flux)
     own = np.einsum("snc,snc->sn", unit.reshape(*shape, 3), colour)
     by_global = np.einsum("psnc,snc,sn->snp", by_theta.reshape(-1, *shape, 3), colour, light)
-    kernel = problem.coefficients(theta, block)
     moves = [
-        np.asarray(unit_light(problem.evaluator, block, np.zeros((shape[0], 2)) + move, kernel))
+        np.asarray(unit_light(evaluator, one, np.zeros((shape[0], 2)) + move, kernel))
         for move in _MOVE_PX * np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])
     ]
     by_move = np.stack([moves[0] - moves[1], moves[2] - moves[3]], axis=-1) / (2 * _MOVE_PX)

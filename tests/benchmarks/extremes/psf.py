@@ -15,7 +15,7 @@ from udccal.fitting.psf.start import PsfRules, start_model, start_prior
 from udccal.models.psf import PsfField
 from udccal.result import FitResult
 
-_RULES = PsfRules(positions=8, shifts=3, half_px=(14, 7), close_px=(14, 7), far_share=1.0, iterations=60)
+_RULES = PsfRules(positions=8, shifts=3, half_px=(14, 7), close_px=(14, 7), far_fraction=1.0, iterations=60)
 _SCENE = small_scene(positions=(3, 2), shifts=2, half=(14, 7))
 _NUMBERS = ("column_open_fraction", "row_open_fraction", "structure_thickness", "pupil_diameter")
 
@@ -31,7 +31,7 @@ class Off:
 
 def _fit(scene: Scene, off: Off = Off(), seed: int = 1) -> Outcome:
     """Pictures of a rig as it was built to be, fitted from a description that may be wrong."""
-    true = start_prior(scene.rig, start_model(scene.rig, scene.geometry, scene.wire), True).mean
+    true = start_prior(scene.rig, start_model(scene.rig, scene.geometry, scene.wire)).mean
     rng = np.random.default_rng(seed)
     shots = shots_of(scene, pictures(scene, true, rng), rng)
     wire, rig = scene.wire, scene.rig

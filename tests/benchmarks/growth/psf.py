@@ -23,14 +23,14 @@ _POSITIONS, _PIXELS = 6, 231
 def _work(positions: int, pixels: int) -> Callable[[], object]:
     scene = small_scene(_GRIDS[positions], shifts=2, half=_HALVES[pixels])
     start = start_model(scene.rig, scene.geometry, scene.wire)
-    prior = start_prior(scene.rig, start, True)
-    rules = PsfRules(close_px=scene.half, far_share=1.0, iterations=_ITERATIONS)
+    prior = start_prior(scene.rig, start)
+    rules = PsfRules(close_px=scene.half, far_fraction=1.0, iterations=_ITERATIONS)
     rng = np.random.default_rng(1)
     shots = shots_of(scene, pictures(scene, prior.mean, rng), rng)
 
     @in_float64
     def work() -> object:
-        return fit_diffraction(shots, scene.geometry, start, prior, rules, True)
+        return fit_diffraction(shots, scene.geometry, start, prior, rules)
 
     return work
 

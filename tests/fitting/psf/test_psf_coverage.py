@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from tests.scenes.psf_wave_optics import COVERED, coverage
-from udccal.fitting.psf.held_out import NONE, KernelError, estimate_kernel_error
+from udccal.fitting.psf.held_out import KernelError, estimate_kernel_error
+from udccal.fitting.psf.start import PsfRules
 
 SIZES = np.geomspace(1e-5, 1.0, 4000)
 
@@ -22,14 +23,14 @@ def residuals(error: KernelError, rng: np.random.Generator) -> tuple[np.ndarray,
 )
 def test_the_error_of_a_kernel_is_found_as_large_as_it_is(true: KernelError) -> None:
     residual, variance = residuals(true, np.random.default_rng(1))
-    found = estimate_kernel_error(residual, variance, SIZES)
+    found = estimate_kernel_error(residual, variance, SIZES, PsfRules())
     for size in (1e-3, 1e-2, 0.1):
         assert found.of_peak(np.array([size]))[0] == pytest.approx(true.of_peak(np.array([size]))[0], rel=0.2)
 
 
 def test_noise_is_no_error_of_the_kernel() -> None:
     rng = np.random.default_rng(2)
-    found = [estimate_kernel_error(*residuals(NONE, rng), SIZES) for _ in range(20)]
+    found = [estimate_kernel_error(*residuals(KernelError(0.0), rng), SIZES, PsfRules()) for _ in range(20)]
     assert sum(error.size > 0 for error in found) <= 1
 
 
@@ -37,7 +38,7 @@ def test_hits_are_no_error_of_the_kernel() -> None:
     true = KernelError(0.01, 0.3, 0.75)
     residual, variance = residuals(true, np.random.default_rng(3))
     residual[::400] += 0.5
-    found = estimate_kernel_error(residual, variance, SIZES)
+    found = estimate_kernel_error(residual, variance, SIZES, PsfRules())
     assert found.of_peak(np.array([1e-2]))[0] == pytest.approx(true.of_peak(np.array([1e-2]))[0], rel=0.4)
 
 

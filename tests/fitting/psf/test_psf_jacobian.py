@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from scipy.special import softmax
@@ -19,11 +17,12 @@ from udccal.fitting.psf.kernel import (
     Evaluator,
     factor_jacobian,
     fit_lattice,
+    kernel_coefficients,
     kernel_jacobian,
     overlaps_of,
 )
-from udccal.fitting.psf.problem import DiffractionProblem, Place, stepped
-from udccal.fitting.psf.samples import blocks, unit_light
+from udccal.fitting.psf.problem import DiffractionProblem, Place, stepped, unit_light
+from udccal.fitting.psf.samples import gather
 from udccal.fitting.psf.start import WAVELENGTHS_NM, PsfRules, start_model, start_prior, wavelengths_nm
 from udccal.numerics import in_float64
 from udccal.result import FitStatus
@@ -41,7 +40,7 @@ def scene() -> Scene:
 
 @pytest.fixture(scope="module")
 def prior(scene: Scene) -> Prior:
-    return start_prior(scene.rig, start_model(scene.rig, scene.geometry, scene.wire), True)
+    return start_prior(scene.rig, start_model(scene.rig, scene.geometry, scene.wire))
 
 
 @pytest.fixture(scope="module")
@@ -64,14 +63,16 @@ def test_slopes_of_the_kernel_are_those_of_differences(
 @in_float64
 def slopes_both_ways(scene: Scene, prior: Prior, shots: Shots, interference: bool) -> tuple[np.ndarray, np.ndarray]:
     problem = problem_of(scene, prior, shots, interference)
-    (block,), theta, evaluator = problem.blocks, prior.mean, problem.evaluator
-    model = evaluator.model(theta)
-    _, by_factor = kernel_jacobian(evaluator, model, block.frame, block.disc_px, block.overlaps)
-    chain = np.asarray(factor_jacobian(model, block.frame))
+    one, theta, evaluator = problem.samples.at(0), prior.mean, problem.evaluator
+    _, by_factor = kernel_jacobian(evaluator, evaluator.model(theta), one.frame, one.disc_px, one.overlaps)
+    chain = np.asarray(factor_jacobian(evaluator, theta, one.frame))
     found = np.einsum("yxfc,fp->pyxc", np.asarray(by_factor), chain)
     wanted = []
     for step in np.eye(HEAD, theta.size) * _STEPS[:, None]:
-        more, less = (problem.coefficients(theta + sign * step, block) for sign in (1, -1))
+        more, less = (
+            np.asarray(kernel_coefficients(evaluator, theta + sign * step, one.frame, one.disc_px, one.overlaps))
+            for sign in (1, -1)
+        )
         wanted.append((more - less) / (2 * step.sum()))
     return found, np.stack(wanted)
 
@@ -79,7 +80,7 @@ def slopes_both_ways(scene: Scene, prior: Prior, shots: Shots, interference: boo
 def problem_of(scene: Scene, prior: Prior, shots: Shots, interference: bool) -> DiffractionProblem:
     """Of the first position alone, overlaps at the prior's mean."""
     evaluator = Evaluator(WAVELENGTHS_NM, fit_lattice(_HALF), interference)
-    made = blocks(shots, scene.geometry, np.ones(shots.rate.shape, dtype=bool))[:1]
+    made = gather(shots, scene.geometry, np.ones(shots.rate.shape, dtype=bool)).at(slice(1))
     return DiffractionProblem(made, evaluator, prior).with_overlaps(prior.mean)
 
 
@@ -95,7 +96,7 @@ def overlap_slopes(scene: Scene, prior: Prior, shots: Shots) -> tuple[np.ndarray
     """What the fit adds for interference per mm of (pitch, pupil) and unit of light, and differences of kernels."""
     problem, theta = problem_of(scene, prior, shots, True), prior.mean
     own = np.zeros((1, shots.position.tolist().count(0), 6))
-    (block,) = problem.with_corrections(Place(theta, own)).blocks
+    one = problem.about(Place(theta, own)).samples.at(0)
     wanted = []
     for number, step_mm in ((PITCH, 0.0004), (PUPIL, 0.002)):
         lit = []
@@ -103,11 +104,11 @@ def overlap_slopes(scene: Scene, prior: Prior, shots: Shots) -> tuple[np.ndarray
             other = theta.copy()
             other[number] += move
             # The kernel of the same numbers: what changes is the overlaps.
-            changed = replace(block, overlaps=np.asarray(overlaps_of(problem.evaluator, other, block.frame)))
-            kernel = problem.coefficients(theta, changed)
-            lit.append(np.asarray(unit_light(problem.evaluator, block, own[0, :, :2], kernel)))
+            overlaps = overlaps_of(problem.evaluator, other, one.frame)
+            kernel = kernel_coefficients(problem.evaluator, theta, one.frame, one.disc_px, overlaps)
+            lit.append(np.asarray(unit_light(problem.evaluator, one, own[0, :, :2], kernel)))
         wanted.append((lit[0] - lit[1]) / (2 * step_mm))
-    return np.moveaxis(np.asarray(block.by_overlaps), -1, 0), np.stack(wanted)
+    return np.moveaxis(np.asarray(one.by_overlaps), -1, 0), np.stack(wanted)
 
 
 def test_a_step_makes_spectra_grow_by_what_it_says() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -13,28 +14,21 @@ from hypothesis import strategies as st
 from tests.scenes.psf import frames_of, small_scene
 from udccal.fitting.hdr.merge import HdrMerge
 from udccal.fitting.psf.data import Shots, shot_noise
-from udccal.fitting.psf.samples import Block, choose_samples, stands_for
-from udccal.fitting.psf.start import PsfRules
-from udccal.fitting.psf.weights import (
-    estimate_model_error,
-    left_out,
-    pattern_p_value,
-    sensor_variance,
-    weighed,
-    without_outliers,
-)
+from udccal.fitting.psf.diffraction import pattern_p_value, without_outliers
+from udccal.fitting.psf.samples import Samples, choose_samples, sensor_variance, stands_for, weighed
+from udccal.fitting.psf.start import PsfRules, estimate_model_error, left_out
 from udccal.models.diffraction import LocalFrame
 
 SHOTS, SAMPLES = 6, 400
 
 
-def block_of(rate: np.ndarray, variance: np.ndarray, noise_per_rate: float = 0.0) -> Block:
-    """Samples on whole pixels, three colours in turn."""
+def samples_of(rate: np.ndarray, variance: np.ndarray, noise_per_rate: float = 0.0) -> Samples:
+    """One position: samples on whole pixels, three colours in turn."""
     shots, samples = rate.shape
     x = np.arange(samples)
     points = np.broadcast_to(np.stack([x % 20, x // 20], axis=-1) * 1.0, (shots, samples, 2))
     frame = LocalFrame(jnp.array([0.0, 0.0, 1.0]), jnp.eye(2), jnp.eye(2))
-    return Block(
+    made = Samples(
         frame=frame,
         points=points,
         density=np.ones_like(rate),
@@ -52,33 +46,34 @@ def block_of(rate: np.ndarray, variance: np.ndarray, noise_per_rate: float = 0.0
         disc_px=np.asarray(1.0),
         index=np.arange(shots),
     )
+    return jax.tree.map(lambda part: part[None], made)
 
 
 def light_of() -> np.ndarray:
-    return np.tile(1e6 * np.exp(-np.arange(SAMPLES) / 60.0), (SHOTS, 1))
+    return np.tile(1e6 * np.exp(-np.arange(SAMPLES) / 60.0), (1, SHOTS, 1))
 
 
-def noisy(rng: np.random.Generator, model_error: float = 0.0) -> tuple[np.ndarray, Block]:
+def noisy(rng: np.random.Generator, model_error: float = 0.0) -> tuple[np.ndarray, Samples]:
     light = light_of()
     sigma = np.hypot(np.hypot(0.005 * light, 30.0), left_out(light, model_error))
     noise = np.hypot(0.005 * light, 30.0) ** 2
-    return light, block_of(light + sigma * rng.standard_normal(light.shape), noise)
+    return light, samples_of((light + sigma * rng.standard_normal(light.shape))[0], noise[0])
 
 
 @pytest.mark.parametrize("true", [0.003, 0.015, 0.08])
 def test_a_model_error_is_found_as_large_as_it_is(true: float) -> None:
-    light, block = noisy(np.random.default_rng(1), true)
-    residual = (np.asarray(block.rate) - light).ravel()
-    found = estimate_model_error(residual, 1 / np.asarray(block.known).ravel(), left_out(light, 1.0).ravel(), 0)
+    light, samples = noisy(np.random.default_rng(1), true)
+    residual = (np.asarray(samples.rate) - light).ravel()
+    found = estimate_model_error(residual, 1 / np.asarray(samples.known).ravel(), left_out(light, 1.0).ravel(), 0)
     assert found == pytest.approx(true, rel=0.1)
 
 
 def test_noise_is_not_taken_for_a_model_error() -> None:
     found = []
     for seed in range(40):
-        light, block = noisy(np.random.default_rng(seed))
-        residual = (np.asarray(block.rate) - light).ravel()
-        variance = 1 / np.asarray(block.known).ravel()
+        light, samples = noisy(np.random.default_rng(seed))
+        residual = (np.asarray(samples.rate) - light).ravel()
+        variance = 1 / np.asarray(samples.known).ravel()
         found.append(estimate_model_error(residual, variance, left_out(light, 1.0).ravel(), 0))
     assert np.count_nonzero(found) <= 2
 
@@ -101,9 +96,9 @@ def test_the_model_error_is_always_a_number_within_bounds(
 
 def test_variance_follows_the_expected_light_not_the_noisy_one() -> None:
     rate = np.array([[90.0, 110.0]])
-    block = block_of(rate, (rate + 4.0) / 2.0, noise_per_rate=0.5)
-    np.testing.assert_allclose(sensor_variance(block, np.full((1, 2), 100.0)), 52.0)
-    np.testing.assert_allclose(weighed(block, 0.0, np.full((1, 2), 100.0)).weight, 1 / 52.0)
+    samples = samples_of(rate, (rate + 4.0) / 2.0, noise_per_rate=0.5)
+    np.testing.assert_allclose(sensor_variance(samples, np.full((1, 1, 2), 100.0)), 52.0)
+    np.testing.assert_allclose(weighed(samples, 0.0, np.full((1, 1, 2), 100.0)).weight, 1 / 52.0)
 
 
 def test_the_slope_of_the_variance_is_that_of_the_exposure() -> None:
@@ -116,17 +111,17 @@ def test_the_slope_of_the_variance_is_that_of_the_exposure() -> None:
     np.testing.assert_allclose(slope, [[1 / exposure, 1 / exposure, 0.0]], rtol=1e-9)
 
 
-def errors(block: Block, light: np.ndarray) -> np.ndarray:
-    return (np.asarray(block.rate) - light) * np.sqrt(np.asarray(block.weight))
+def errors(samples: Samples, light: np.ndarray) -> np.ndarray:
+    return (np.asarray(samples.rate) - light) * np.sqrt(np.asarray(samples.weight))
 
 
 def test_a_cosmic_hit_and_a_picture_that_moved_are_left_out_and_listed() -> None:
-    light, block = noisy(np.random.default_rng(3))
-    rate = np.array(block.rate)
-    rate[1, 200] += 40 * np.sqrt(1 / np.asarray(block.known)[1, 200])
-    rate[4] = np.roll(rate[4], 3)
-    block = replace(block, rate=rate)
-    (kept,), found = without_outliers([block], [errors(block, light)], PsfRules())
+    light, samples = noisy(np.random.default_rng(3))
+    rate = np.array(samples.rate)
+    rate[0, 1, 200] += 40 * np.sqrt(1 / np.asarray(samples.known)[0, 1, 200])
+    rate[0, 4] = np.roll(rate[0, 4], 3)
+    samples = replace(samples, rate=rate)
+    kept, found = without_outliers(samples, errors(samples, light), PsfRules())
     pictures_out, samples_out = found
     assert pictures_out.places == ("picture 4 at position 0",)
     assert samples_out.count == 1
@@ -135,22 +130,22 @@ def test_a_cosmic_hit_and_a_picture_that_moved_are_left_out_and_listed() -> None
 
 
 def test_good_pictures_all_stay() -> None:
-    light, block = noisy(np.random.default_rng(4))
-    (kept,), found = without_outliers([block], [errors(block, light)], PsfRules())
+    light, samples = noisy(np.random.default_rng(4))
+    kept, found = without_outliers(samples, errors(samples, light), PsfRules())
     assert found == ()
-    np.testing.assert_array_equal(kept.weight, block.weight)
+    np.testing.assert_array_equal(kept.weight, samples.weight)
 
 
 def test_noise_has_no_pattern_and_a_common_misfit_has_one() -> None:
     values = []
     for seed in range(60):
-        light, block = noisy(np.random.default_rng(seed))
-        values.append(pattern_p_value((block,), [errors(block, light)]))
+        light, samples = noisy(np.random.default_rng(seed))
+        values.append(pattern_p_value(samples, errors(samples, light)))
     assert 0.3 < np.mean(values) < 0.7
     assert np.mean(np.array(values) < 0.05) < 0.2
-    light, block = noisy(np.random.default_rng(5))
+    light, samples = noisy(np.random.default_rng(5))
     wave = 0.005 * light * np.sin(np.arange(SAMPLES) / 7.0)
-    assert pattern_p_value((block,), [errors(block, light - wave)]) < 1e-6
+    assert pattern_p_value(samples, errors(samples, light - wave)) < 1e-6
 
 
 def test_samples_are_drawn_as_many_in_every_picture() -> None:
@@ -160,16 +155,18 @@ def test_samples_are_drawn_as_many_in_every_picture() -> None:
     channel = np.zeros(rate.shape, dtype=np.int64)
     origin = np.zeros((3, 2), dtype=np.int64)
     shots = Shots(np.zeros((3, 2)), origin, np.arange(3), np.ones(3), rate, zeros + 1.0, channel, zeros)
-    every, some = (choose_samples(shots, PsfRules(close_px=(18, 9)), share).sum(axis=(1, 2)) for share in (1.0, 0.2))
+    every, some = (
+        choose_samples(shots, PsfRules(close_px=(18, 9), far_fraction=part)).sum(axis=(1, 2)) for part in (1.0, 0.2)
+    )
     assert (every == 37 * 19).all()
     assert len(set(some.tolist())) == 1
     assert some[0] < every[0]
     # Those drawn stand for the others of their own picture, to a whole number of them.
-    chosen, count = choose_samples(shots, PsfRules(), 1 / 6), stands_for(shots, PsfRules())
+    chosen, count = choose_samples(shots, PsfRules()), stands_for(shots, PsfRules())
     far = np.abs(shots.offsets()[..., 0])[None].repeat(3, axis=0)[chosen].reshape(3, -1) > PsfRules().peak_half_px[1]
     assert count[far] == pytest.approx(6.0)
     assert (count == 1.0).any(axis=1).all()
-    assert count.sum(axis=1) == pytest.approx(choose_samples(shots, PsfRules(), 1.0).sum(axis=(1, 2)), abs=6)
+    assert count.sum(axis=1) == pytest.approx(choose_samples(shots, PsfRules(far_fraction=1.0)).sum(axis=(1, 2)), abs=6)
 
 
 def test_brackets_are_clipped_and_quantised() -> None:

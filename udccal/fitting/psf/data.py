@@ -20,13 +20,8 @@ from udccal.models.wire import Wire, wire_values
 from udccal.sessions.schema import LedSubject, StoredStep
 from udccal.sessions.store import Session
 
-# Aims that lie this close together are shifts of one field position.
-_GROUP_PX: Final = 4.0
+# How far from its aim an LED is looked for.
 _SEARCH_PX: Final = 16
-# An LED stands out of the noise by so many sigma.
-_SEEN_SIGMA: Final = 8.0
-# So much of the range is clipped. Without its brightest sample neither an LED's light nor its place is known.
-_FULL: Final = 0.98
 
 _wire_values = eqx.filter_jit(wire_values)
 
@@ -70,26 +65,36 @@ class Shots:
         """(rows, columns) to either side of the LED."""
         return self.rate.shape[1] // 2, self.rate.shape[2] // 2
 
+    @property
+    def colour(self) -> Float[np.ndarray, "shots rows columns 3"]:
+        """Which of three colours a sample has (one-hot)."""
+        return np.eye(3)[self.channel]
+
     def offsets(self) -> Int[np.ndarray, "rows columns 2"]:
         """(x, y) of every sample from the crop's middle sample."""
         y, x = np.mgrid[: self.rate.shape[1], : self.rate.shape[2]]
         return np.stack([x - self.half[1], y - self.half[0]], axis=-1)
 
     def pick(self, keep: np.ndarray) -> Shots:
-        """The shots selected by an index or mask."""
-        return Shots(*(getattr(self, field.name)[keep] for field in fields(self)))
+        """The shots selected by an index or mask, their positions numbered without gaps."""
+        picked = {field.name: getattr(self, field.name)[keep] for field in fields(self)}
+        return Shots(**picked | {"position": np.unique(self.position[keep], return_inverse=True)[1].reshape(-1)})
 
     def within(self, largest: tuple[int, int]) -> Shots:
         """The middle of the crops, at most ``largest`` (rows, columns) to either side."""
-        middle = tuple(
-            slice(h - min(h, most), h + min(h, most) + 1) for h, most in zip(self.half, largest, strict=True)
-        )
         names = ("rate", "weight", "channel", "noise_per_rate")
-        return replace(self, **{name: getattr(self, name)[:, *middle] for name in names})
+        return replace(self, **{name: about_middle(getattr(self, name), largest) for name in names})
 
     def positions_px(self) -> Float[np.ndarray, "positions 2"]:
         """Mean place of the shots of every field position."""
         return np.stack([self.centre_px[self.position == g].mean(axis=0) for g in range(self.positions)])
+
+
+def about_middle(images: np.ndarray, largest: tuple[int, int]) -> np.ndarray:
+    """The middle of images of odd size, at most ``largest`` (rows, columns) to either side."""
+    halves = zip(images.shape[-2:], largest, strict=True)
+    rows, columns = (slice(max(n // 2 - most, 0), n // 2 + most + 1) for n, most in halves)
+    return images[..., rows, columns]
 
 
 def joined(crops: Sequence[Shots], aims_px: Float[np.ndarray, "shots 2"]) -> Shots:
@@ -99,11 +104,11 @@ def joined(crops: Sequence[Shots], aims_px: Float[np.ndarray, "shots 2"]) -> Sho
 
 
 def group(aims_px: Float[np.ndarray, "shots 2"]) -> Int[np.ndarray, " shots"]:
-    """Index of the field position of each shot: aims within a few pixels of a position's first belong to it."""
+    """Index of the field position of each shot: aims within 4 px of a position's first are shifts of it."""
     firsts: list[Float[np.ndarray, "2"]] = []
     index = np.zeros(len(aims_px), dtype=np.int64)
     for i, aim in enumerate(aims_px):
-        near = [g for g, first in enumerate(firsts) if np.abs(aim - first).max() <= _GROUP_PX]
+        near = [g for g, first in enumerate(firsts) if np.abs(aim - first).max() <= 4.0]
         index[i] = near[0] if near else len(firsts)
         if not near:
             firsts.append(aim)
@@ -113,54 +118,6 @@ def group(aims_px: Float[np.ndarray, "shots 2"]) -> Int[np.ndarray, " shots"]:
 def held_out_positions(count: int) -> Bool[np.ndarray, " positions"]:
     """Every fourth position, the second first, is left out while orders are compared; with three, one of them."""
     return np.arange(count) % 4 == 1
-
-
-def cut_crop(
-    merged: HdrMerge,
-    corner_px: tuple[int, int],
-    aim_px: tuple[float, float],
-    cfa: str,
-    half: tuple[int, int],
-    disc_px: float,
-    noise_per_rate: Float[np.ndarray, "rows columns"] | None = None,
-) -> Shots | None:
-    """One shot of 2 * half + 1 samples (rows, columns) about the LED; what lies outside the region gets no weight.
-
-    Args:
-        merged: the merged bracket of one region.
-        corner_px: (x, y) of the region's first sample; even.
-        aim_px: where the LED was aimed at, on the sensor.
-        cfa: pattern of the sensor.
-        half: (rows, columns) to either side of the LED.
-        disc_px: diameter of the LED's image.
-        noise_per_rate: see ``shot_noise``; without it the merged sigma is taken as it is.
-
-    Returns:
-        None when no light stands out from the noise near the aim.
-    """
-    rate = merged.rate_e_per_s
-    weight = np.where(merged.used > 0, 1.0 / merged.sigma_e_per_s.astype(np.float64) ** 2, 0.0)
-    place = _brightest(rate, weight, np.asarray(aim_px) - corner_px)
-    if place is None:
-        return None
-    middle = np.round(place).astype(np.int64)
-    slope = np.zeros_like(rate) if noise_per_rate is None else noise_per_rate
-    windows = (_window(part, middle, half)[None] for part in (rate, weight, channel_map(cfa, *rate.shape), slope))
-    where = (place + corner_px)[None], (middle + corner_px)[None], np.zeros(1, dtype=np.int64), np.array([disc_px])
-    return Shots(*where, *windows)
-
-
-def shot_noise(merged: HdrMerge, noise: Noise) -> Float[np.ndarray, "rows columns"]:
-    """How fast a merged sample's variance grows with its rate, in (e-/s)^2 per e-/s.
-
-    Variance (r + d) u + f u^2 is that of one exposure of 1/u seconds, f being what a dark sample has; a bracket is
-    taken for the single exposure that has its variance.
-    """
-    K, dark = float(np.asarray(noise.K_DN_per_e)), float(np.asarray(noise.dark_current_e_per_s))
-    floor = float(np.asarray(noise.sigma_d_e)) ** 2 + (float(np.asarray(noise.q_DN)) / K) ** 2 / 12.0
-    light, variance = np.maximum(merged.rate_e_per_s + dark, 0.0), merged.sigma_e_per_s**2
-    slope = 2.0 * variance / (light + np.sqrt(light**2 + 4.0 * floor * variance))
-    return np.where(merged.used > 0, slope, 0.0)
 
 
 @final
@@ -232,16 +189,15 @@ def _read_shot(
     session: Session, step: StoredStep, subject: LedSubject, noise: Noise, half: tuple[int, int]
 ) -> tuple[Shots | None, bool]:
     """The crop, and whether the LED is clipped in all exposures. Only the part about the aim is merged."""
-    region = step.captures[0].region
-    reach = [h + _SEARCH_PX + 2 for h in half]
-    down = _part(subject.y_px - region.y, reach[0], region.rows)
-    across = _part(subject.x_px - region.x, reach[1], region.columns)
+    region, aim = step.captures[0].region, (subject.x_px, subject.y_px)
+    down = _part(aim[1] - region.y, half[0] + _SEARCH_PX + 2, region.rows)
+    across = _part(aim[0] - region.x, half[1] + _SEARCH_PX + 2, region.columns)
     captures = [c for c in step.captures if c.region == region]
     frames = np.stack([session.frame(c)[down, across] for c in captures])
     exposures_s = np.array([c.exposure_s for c in captures])
-    merged = merge_bracket(frames, exposures_s, noise)
-    corner, aim = (region.x + across.start, region.y + down.start), (subject.x_px, subject.y_px)
-    clipped = (merged.used == 0) & (frames[int(np.argmin(exposures_s))] >= _FULL * float(noise.saturation_DN))
+    merged, corner = merge_bracket(frames, exposures_s, noise), (region.x + across.start, region.y + down.start)
+    # Without its brightest sample neither an LED's light nor its place is known.
+    clipped = (merged.used == 0) & (frames[int(np.argmin(exposures_s))] >= 0.98 * float(noise.saturation_DN))
     # A hot pixel elsewhere is not the LED's.
     if clipped[tuple(_part(aim[i] - corner[i], _SEARCH_PX, clipped.shape[1 - i]) for i in (1, 0))].any():
         return None, True
@@ -255,6 +211,34 @@ def _part(aim: float, reach: int, size: int) -> slice:
     """Even start, so that the pattern of the mosaic stays the sensor's."""
     start = int(np.clip(np.floor(aim) - reach, 0, max(size - 2, 0))) // 2 * 2
     return slice(start, int(np.clip(np.ceil(aim) + reach + 1, start + 2, size)))
+
+
+def cut_crop(
+    merged: HdrMerge,
+    corner_px: tuple[int, int],
+    aim_px: tuple[float, float],
+    cfa: str,
+    half: tuple[int, int],
+    disc_px: float,
+    noise_per_rate: Float[np.ndarray, "rows columns"] | None = None,
+) -> Shots | None:
+    """One shot about the LED, ``half`` (rows, columns) to either side; None when no light stands out near the aim.
+
+    ``merged`` is the bracket of a region whose first sample is ``corner_px`` (x, y; even); beside it samples have no
+    weight. The aim is on the sensor; ``disc_px`` is the diameter of the LED's image. Without ``noise_per_rate`` (see
+    ``shot_noise``) the merged sigma is taken as it is.
+    """
+    rate = merged.rate_e_per_s
+    weight = np.where(merged.used > 0, 1.0 / merged.sigma_e_per_s.astype(np.float64) ** 2, 0.0)
+    place = _brightest(rate, weight, np.asarray(aim_px) - corner_px)
+    if place is None:
+        return None
+    x, y = middle = np.round(place).astype(np.int64)
+    slope = np.zeros_like(rate) if noise_per_rate is None else noise_per_rate
+    parts = (np.pad(part, [2 * (h,) for h in half]) for part in (rate, weight, channel_map(cfa, *rate.shape), slope))
+    windows = (part[None, y : y + 2 * half[0] + 1, x : x + 2 * half[1] + 1] for part in parts)
+    where = (place + corner_px)[None], (middle + corner_px)[None], np.zeros(1, dtype=np.int64), np.array([disc_px])
+    return Shots(*where, *windows)
 
 
 def _brightest(
@@ -274,13 +258,20 @@ def _brightest(
     about = (np.abs(x - column) <= 2) & (np.abs(y - row) <= 2)
     signal = np.maximum(known[about], 0.0)
     noise = np.sqrt((1.0 / np.maximum(weight[about], 1e-300)).clip(max=1e24))
-    if signal.max(initial=0.0) < _SEEN_SIGMA * np.median(noise) or signal.sum() <= 0:
+    # An LED stands out of the noise by 8 sigma.
+    if signal.max(initial=0.0) < 8.0 * np.median(noise) or signal.sum() <= 0:
         return None
     return np.array([np.average(x[about], weights=signal), np.average(y[about], weights=signal)])
 
 
-def _window(values: np.ndarray, middle: Int[np.ndarray, "2"], half: tuple[int, int]) -> np.ndarray:
-    """Cut about (x, y) ``middle``; zeros outside."""
-    padded = np.pad(values, [(half[0], half[0]), (half[1], half[1])])
-    x, y = int(middle[0]), int(middle[1])
-    return padded[y : y + 2 * half[0] + 1, x : x + 2 * half[1] + 1]
+def shot_noise(merged: HdrMerge, noise: Noise) -> Float[np.ndarray, "rows columns"]:
+    """How fast a merged sample's variance grows with its rate, in (e-/s)^2 per e-/s.
+
+    Variance (r + d) u + f u^2 is that of one exposure of 1/u seconds, f being what a dark sample has; a bracket is
+    taken for the single exposure that has its variance.
+    """
+    K, dark = float(np.asarray(noise.K_DN_per_e)), float(np.asarray(noise.dark_current_e_per_s))
+    floor = float(np.asarray(noise.sigma_d_e)) ** 2 + (float(np.asarray(noise.q_DN)) / K) ** 2 / 12.0
+    light, variance = np.maximum(merged.rate_e_per_s + dark, 0.0), merged.sigma_e_per_s**2
+    slope = 2.0 * variance / (light + np.sqrt(light**2 + 4.0 * floor * variance))
+    return np.where(merged.used > 0, slope, 0.0)

@@ -1,4 +1,4 @@
-"""Fit of diffraction to LED pictures: maximum likelihood with the sensor's noise and a model error that residuals tell.
+"""Fit of diffraction to LED pictures: maximum likelihood with the sensor's noise and a model error from the residuals.
 
 Rounds of a descent with fixed weights; between them the weights follow the model, and outliers go.
 """
@@ -6,42 +6,34 @@ Rounds of a descent with fixed weights; between them the weights follow the mode
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Final, final
+from typing import final
 
 import numpy as np
 from jaxtyping import Float
+from scipy.special import ndtr
 
 from udccal.fitting.engine.gaussian import Prior, scaled_inverse
 from udccal.fitting.engine.iteration_log import LOG
 from udccal.fitting.engine.least_squares import Blocks, Solution, SolverRules, minimise
 from udccal.fitting.engine.misfit import clustered_cov
 from udccal.fitting.engine.orders import Attempt, Choice, bic, choose
+from udccal.fitting.engine.robust import OutlierRule, outliers
 from udccal.fitting.psf.data import Shots
 from udccal.fitting.psf.kernel import FOOTPRINT, Evaluator, fit_lattice
-from udccal.fitting.psf.problem import DiffractionProblem, Place
-from udccal.fitting.psf.samples import Block, blocks, choose_samples, stands_for, start_own
-from udccal.fitting.psf.start import PsfRules
-from udccal.fitting.psf.weights import (
-    estimate_model_error,
-    left_out,
-    pattern_p_value,
-    sensor_variance,
-    weighed,
-    without_outliers,
+from udccal.fitting.psf.problem import (
+    OWN,
+    DiffractionProblem,
+    Place,
+    coefficients_of,
+    moved_own,
+    own_equations,
+    start_own,
 )
+from udccal.fitting.psf.samples import Samples, choose_samples, gather, sensor_variance, stands_for, weighed
+from udccal.fitting.psf.start import HUBER, PsfRules, estimate_model_error, left_out
 from udccal.models.diffraction import Diffraction
 from udccal.models.geometry import Geometry
 from udccal.result import Outliers
-
-# Converged near the minimum: by the part of the cost that a step would gain. Then by what it would gain in units of the
-# reduced chi-squared: in rounds after which the weights hardly change anything, and in the others.
-_ROUGHLY, _FULLY, _NEARLY = 1e-3, 1e-2, 1.0
-# In sigma: a round that moves every parameter by less is the last; the weights are about those of the end.
-_STILL, _SETTLED = 0.1, 1.0
-# Derivatives that are themselves sums over a lattice promise a little for ever; see ``SolverRules.stalled_gain``.
-_STALLED: Final = 0.05
-# Residuals are moved by this part of the phase's light: too little to change which of them are outliers.
-_TRIED: Final = 1e-3
 
 
 @final
@@ -51,11 +43,13 @@ class DiffractionFit:
 
     Attributes:
         problem, solution: the equations, and where they ended.
-        shots: what was fitted, at the places that the blocks are about.
-        model_error: as a fraction of the peak, see ``psf.weights``; 0 where the residuals are noise.
+        shots: what was fitted, at the places that the samples are about.
+        model_error: as a fraction of the peak, see ``start.left_out``; 0 where the residuals are noise.
         outliers: what was left out.
         iterations: of all descents together.
-        phase: strength of the wire's phase in the kernel, its sigma, and both orders; None where no wire was seen.
+        phase: with the wire's phase or averaged over it, by BIC; the fits are its strength in the kernel (1 where the
+            footprint lies where the wire has it, 0 where the kernel shows nothing of it) and its sigma. None where no
+            wire was seen.
     """
 
     problem: DiffractionProblem
@@ -64,7 +58,7 @@ class DiffractionFit:
     model_error: float
     outliers: tuple[Outliers, ...]
     iterations: int
-    phase: PhaseEvidence | None = None
+    phase: Choice[tuple[float, float]] | None = None
 
     @property
     def theta(self) -> Float[np.ndarray, " p"]:
@@ -94,67 +88,67 @@ class DiffractionFit:
     @property
     def chi2_dof(self) -> float:
         """Reduced chi-squared, with that model error."""
-        dof = max(self.problem.samples - self.problem.unknowns, 1)
+        dof = max(self.problem.used - self.problem.unknowns, 1)
         return (self.solution.equations.cost - self.problem.prior.cost(self.theta)) / dof
 
-    def pattern_p(self) -> float:
-        """How likely such a pattern in the residuals is by chance; see ``psf.weights``."""
-        return pattern_p_value(self.problem.blocks, self.errors())
-
-    def errors(self) -> list[Float[np.ndarray, "shots n"]]:
-        """Data less expectation in units of sigma, position by position."""
+    def errors(self) -> Float[np.ndarray, "positions shots n"]:
+        """Data less expectation in units of sigma."""
         return self.problem.errors(self.solution.place, self.problem.light_at(self.solution.place))
 
 
 def fit_diffraction(
-    shots: Shots, geometry: Geometry, start: Diffraction, prior: Prior, rules: PsfRules, wire_shows: bool
+    shots: Shots, geometry: Geometry, start: Diffraction, prior: Prior, rules: PsfRules
 ) -> DiffractionFit:
     """Fit the numbers of diffraction: near the minimum, then to it at the places found there.
 
     Args:
         shots: what to fit, positions numbered without gaps.
         geometry: where pixels look.
-        start: its nodes of the spectra are kept.
+        start: its nodes of the spectra are kept; where it has a ``visibility``, the footprint's place on the rows is
+            known, and it is tested whether the data show it.
         prior: of the parameters of ``kernel.pack``; its mean is the start.
         rules: see there.
-        wire_shows: whether the footprint's place on the rows is known; it is then tested whether the data show it.
     """
-    chosen = choose_samples(shots, rules, rules.far_share)
-    evaluator = Evaluator(np.asarray(start.wavelengths_nm), fit_lattice(rules.close(shots.half)), wire_shows)
-    problem = DiffractionProblem(blocks(shots, geometry, chosen), evaluator, prior).with_overlaps(prior.mean)
+    chosen = choose_samples(shots, rules)
+    evaluator = Evaluator(
+        np.asarray(start.wavelengths_nm), fit_lattice(rules.close(shots.half)), bool(start.visibility)
+    )
+    problem = DiffractionProblem(gather(shots, geometry, chosen), evaluator, prior).with_overlaps(prior.mean)
     near = _approach(problem, rules)
-    own = near.place.own.copy()
-    index = np.stack([np.asarray(block.index) for block in problem.blocks])
-    places = shots.centre_px.copy()
+    own, index, places = near.place.own.copy(), np.asarray(problem.samples.index), shots.centre_px.copy()
     places[index[index >= 0]] += own[index >= 0][:, :2]
-    shots = replace(shots, centre_px=places)
     own[..., :2] = 0.0
-    problem = replace(problem, blocks=blocks(shots, geometry, chosen))
+    shots = replace(shots, centre_px=places)
+    problem = replace(problem, samples=gather(shots, geometry, chosen))
     fit = _refine(problem, shots, Place(near.place.theta, own), rules, near.iterations)
-    if not wire_shows:
+    if not evaluator.interference:
         return fit
-    evidence = phase_evidence(fit)
-    if not evidence.wanted:
+    phase = phase_evidence(fit)
+    if phase.best is not phase.tried[0]:
         averaged = replace(problem, evaluator=Evaluator(evaluator.wavelengths_nm, evaluator.lattice, False))
         fit = _refine(averaged, shots, fit.solution.place, rules, 0)
-    return replace(fit, phase=evidence)
+    return replace(fit, phase=phase)
 
 
 def _approach(problem: DiffractionProblem, rules: PsfRules) -> Solution[Place, Blocks]:
-    """From the prior's mean to about the minimum, with weights that the data give."""
-    problem = replace(problem, blocks=tuple(weighed(b, rules.first_model_error) for b in problem.blocks))
-    theta = problem.prior.mean
-    own = [start_own(problem.evaluator, block, problem.coefficients(theta, block)) for block in problem.blocks]
-    return minimise(problem, Place(theta.copy(), np.stack(own)), _solver(_ROUGHLY * problem.samples, rules.iterations))
+    """From the prior's mean to about the minimum, where a step gains a thousandth of the cost; weights by the data."""
+    theta, problem = problem.prior.mean, replace(problem, samples=weighed(problem.samples, rules.first_model_error))
+    coefficients = coefficients_of(problem.evaluator, theta, problem.samples)
+    own = start_own(problem.evaluator, problem.samples, coefficients)
+    return minimise(problem, Place(theta.copy(), own), _solver(1e-3 * problem.used, rules.iterations))
 
 
 def _refine(
     problem: DiffractionProblem, shots: Shots, place: Place, rules: PsfRules, iterations: int
 ) -> DiffractionFit:
-    """From about the minimum to the maximum of the likelihood."""
-    whole, enough = None, _NEARLY
-    for _ in range(rules.rounds):
-        problem, model_error, found = _reweighed(problem.with_corrections(place), place, rules)
+    """From about the minimum to the maximum of the likelihood.
+
+    The last round is the one that moves no parameter by a tenth of a sigma; descents go to a hundredth of chi-squared
+    once weights hardly change anything.
+    """
+    whole, enough = None, 1.0
+    for _ in range(5):
+        problem, model_error, found = _reweighed(problem.about(place), place, rules)
         solution = minimise(problem, place, _solver(enough, rules.iterations - iterations))
         iterations += solution.iterations
         change = solution.place.theta - place.theta
@@ -164,98 +158,140 @@ def _refine(
         # Out of iterations: the round before, whose weights are those of a model not quite this one, has an end.
         if not solution.converged:
             return whole or fit
-        whole, place, last = fit, solution.place, enough == _FULLY and moved < _STILL
+        whole, place, last = fit, solution.place, enough < 1.0 and moved < 0.1
         if last:
             break
-        enough = _FULLY if moved < _SETTLED else _NEARLY
+        enough = 1e-2 if moved < 1.0 else 1.0
     assert whole is not None  # there is a first round
     return whole
 
 
 def _solver(enough: float, iterations: int) -> SolverRules:
-    return SolverRules(enough, _STALLED, iterations=iterations, first_damping=1e-2, most_damping=1e6)
+    # Derivatives that are themselves sums over a lattice promise a little for ever.
+    return SolverRules(enough, stalled_gain=0.05, iterations=iterations, first_damping=1e-2, most_damping=1e6)
 
 
 def _reweighed(
     problem: DiffractionProblem, place: Place, rules: PsfRules
 ) -> tuple[DiffractionProblem, float, tuple[Outliers, ...]]:
-    """Weights at the model's light, with the model error that the residuals tell, and without outliers."""
-    lights, parts = problem.light_at(place), []
-    for block, own, light in zip(problem.blocks, place.own, lights, strict=True):
-        seen, level = np.asarray(block.known) > 0, light + own[:, 5:]
-        of_sample = (np.asarray(block.rate) - level, sensor_variance(block, level), left_out(light * seen, 1.0))
-        parts.append([one[seen] for one in of_sample])
-    residual, variance, share = (np.concatenate(column) for column in zip(*parts, strict=True))
-    model_error = estimate_model_error(residual, variance, share, problem.unknowns)
-    triples = zip(problem.blocks, lights, place.own, strict=True)
-    problem = replace(problem, blocks=tuple(weighed(b, model_error, light, own[:, 5]) for b, light, own in triples))
-    kept, found = without_outliers(problem.blocks, problem.errors(place, lights), rules)
-    return replace(problem, blocks=kept), model_error, found
+    """Weights at the model's light, with the model error of the residuals, and without outliers."""
+    samples, light, background = problem.samples, problem.light_at(place), place.own[..., 5:]
+    seen, level = np.asarray(samples.known) > 0, light + background
+    of_samples = (np.asarray(samples.rate) - level, sensor_variance(samples, level), left_out(light * seen, 1.0))
+    model_error = estimate_model_error(*(part[seen] for part in of_samples), problem.unknowns)
+    problem = replace(problem, samples=weighed(samples, model_error, light, background))
+    kept, found = without_outliers(problem.samples, problem.errors(place, light), rules)
+    return replace(problem, samples=kept), model_error, found
 
 
-@final
-@dataclass(frozen=True)
-class PhaseEvidence:
-    """Whether the data show the wire's phase in the kernel.
+def without_outliers(
+    samples: Samples, z: Float[np.ndarray, "positions shots n"], rules: PsfRules
+) -> tuple[Samples, tuple[Outliers, ...]]:
+    """Samples in which outliers have no weight, and what was left out: pictures first, then samples of the others.
 
-    Attributes:
-        strength: of what the phase changes, estimated beside all other parameters: 1 where the footprint lies where the
-            wire has it, 0 where the kernel knows nothing of it.
-        sigma: of the strength.
-        choice: with the phase or averaged over it, by BIC; the fits are their strengths.
+    ``z`` is data less expectation in units of sigma. A picture that fits so much worse than the others shows that
+    something moved, flickered or was in the way: that needs a rule of its own beside the engine's of single samples.
     """
+    weight, index = np.asarray(samples.weight), np.asarray(samples.index)
+    used, real = weight > 0, index >= 0
+    # Residuals are bounded, so that one cosmic hit does not condemn its picture.
+    square = (np.minimum(z**2, HUBER.sigma**2) * used).sum(axis=-1) / np.maximum(used.sum(axis=-1), 1)
+    worst = rules.picture_times * max(float(np.median(square[real])), 1.0)
+    moved = real & (square > worst) & (real.sum() >= 4)
+    rule = OutlierRule("samples")
+    off = rule.off(z, used & ~moved[..., None])
+    pictures = (f"picture {index[at]} at position {at[0]}" for at in zip(*np.nonzero(moved), strict=True))
+    named = (
+        f"picture {index[at[:2]]} at position {at[0]}, {z[at]:+.0f} sigma" for at in zip(*np.nonzero(off), strict=True)
+    )
+    why = f"pictures whose mean squared residual is over {rules.picture_times:g} times the median picture's"
+    kept = replace(samples, weight=weight * ~(off | moved[..., None]))
+    return kept, (*outliers(why, pictures), *rule.listed(named))
 
-    strength: float
-    sigma: float
-    choice: Choice[float]
 
-    @property
-    def wanted(self) -> bool:
-        """Whether the kernel with the wire's phase is the better one."""
-        return self.choice.best.fit > 0
-
-
-def phase_evidence(fit: DiffractionFit) -> PhaseEvidence:
+def phase_evidence(fit: DiffractionFit) -> Choice[tuple[float, float]]:
     """Compare a fit with interference to the same without, to second order about the fit."""
     problem, place, here = fit.problem, fit.solution.place, fit.solution.equations
-    plain = replace(problem, blocks=tuple(_without_interference(block) for block in problem.blocks))
-    lights = problem.light_at(place)
-    by_phase = [light - without for light, without in zip(lights, plain.light_at(place), strict=True)]
-    moved, score, alone = [], 0.0, 0.0
-    for block, change, z in zip(problem.blocks, by_phase, problem.errors(place, lights), strict=True):
-        in_sigma = change * np.sqrt(np.asarray(block.weight))
-        score += float((in_sigma * z).sum())
-        alone += float((in_sigma**2).sum())
-        moved.append(replace(block, rate=np.asarray(block.rate) + _TRIED * change))
-    there = replace(problem, blocks=tuple(moved)).equations_at(place)
-    shared, own = (there.right - here.right) / _TRIED, (there.own_right - here.own_right) / _TRIED
+    none = {n: np.zeros_like(getattr(problem.samples, n)) for n in ("correction", "by_overlaps", "overlaps")}
+    light = problem.light_at(place)
+    change = light - replace(problem, samples=replace(problem.samples, **none)).light_at(place)
+    in_sigma = change * np.sqrt(np.asarray(problem.samples.weight))
+    score, alone = float((in_sigma * problem.errors(place, light)).sum()), float((in_sigma**2).sum())
+    # Residuals are moved by a part of the phase's light too small to change which of them are outliers.
+    part = 1e-3
+    moved = replace(problem.samples, rate=np.asarray(problem.samples.rate) + part * change)
+    there = replace(problem, samples=moved).equations_at(place)
+    shared, own = (there.right - here.right) / part, (there.own_right - here.own_right) / part
     # What the other parameters can make up for is no information on the strength.
     information = max(alone - replace(here, right=shared, own_right=own).step(0.0).gain, 1e-12)
-    strength, unknowns = 1.0 + score / information, problem.unknowns
-    fewer = unknowns - (FOOTPRINT.stop - FOOTPRINT.start)
-    worse = here.cost + information * (2.0 * strength - 1.0)
-    orders = (("with the wire's phase", unknowns, here.cost, 1.0), ("averaged over the phase", fewer, worse, 0.0))
-    tried = [Attempt(f"diffraction {n} (BIC)", k, bic(cost, float(k), here.samples), fit) for n, k, cost, fit in orders]
-    return PhaseEvidence(strength, information**-0.5, choose(tried))
+    found, unknowns = (1.0 + score / information, information**-0.5), problem.unknowns
+    fewer, worse = unknowns - (FOOTPRINT.stop - FOOTPRINT.start), here.cost + information * (2.0 * found[0] - 1.0)
+    orders = (("with the wire's phase", unknowns, here.cost), ("averaged over the phase", fewer, worse))
+    return choose(
+        Attempt(f"diffraction {n} (BIC)", k, bic(cost, float(k), here.samples), found) for n, k, cost in orders
+    )
 
 
-def _without_interference(block: Block) -> Block:
-    parts = {name: np.zeros_like(getattr(block, name)) for name in ("correction", "by_overlaps", "overlaps")}
-    return replace(block, **parts)
+def explain(
+    problem: DiffractionProblem, theta: Float[np.ndarray, " p"], shots: Shots, geometry: Geometry, model_error: float
+) -> tuple[Float[np.ndarray, "shots l"], Float[np.ndarray, "shots rows columns"]]:
+    """What diffraction brings to whole crops: own parameters of all shots, with (x, y) on the sensor; unit light.
+
+    Args:
+        problem, theta: of the fit.
+        shots: all there are.
+        geometry: where pixels look.
+        model_error: allowed for beside noise.
+    """
+    evaluator = replace(problem.evaluator, lattice=fit_lattice(shots.half))
+    samples = weighed(gather(shots, geometry, np.ones(shots.rate.shape, dtype=bool)), model_error)
+    coefficients = coefficients_of(evaluator, theta, samples)
+    own = start_own(evaluator, samples, coefficients)
+    for _ in range(3):
+        matrix, right, _ = (np.asarray(part) for part in own_equations(evaluator, samples, own, coefficients))
+        own = moved_own(own, np.einsum("pslm,psm->psl", scaled_inverse(matrix, 1e-14), right))
+    unit = np.asarray(own_equations(evaluator, samples, own, coefficients)[2])
+    index = np.asarray(samples.index)
+    found, explained = np.zeros((shots.count, OWN)), np.zeros(shots.rate.shape)
+    found[index[index >= 0]] = own[index >= 0]
+    explained[index[index >= 0]] = unit[index >= 0].reshape(-1, *shots.rate.shape[1:])
+    found[:, :2] += shots.centre_px
+    return found, explained
+
+
+def pattern_p_value(samples: Samples, z: Float[np.ndarray, "positions shots n"]) -> float:
+    """Probability of residuals at least as alike in different pictures of a position, were they noise.
+
+    Each picture has its own noise, and each samples the kernel at its own fraction of a pixel. Residuals of samples of
+    one colour that see the same place of the kernel in two pictures, within a pixel, are therefore uncorrelated unless
+    the model is wrong there; the mean of their products, in units of its standard error, is normal. Means of groups
+    (``engine.misfit``) hold squares besides, which are no evidence and hide what two pictures have in common.
+    ``z`` is data less expectation, in units of sigma.
+    """
+    z = np.clip(z, -HUBER.sigma, HUBER.sigma)
+    cell = np.concatenate(
+        [np.floor(np.asarray(samples.points)), np.asarray(samples.colour).argmax(axis=-1)[..., None]], axis=-1
+    ).astype(np.int64)
+    position = np.broadcast_to(np.arange(len(z))[:, None, None, None], (*z.shape, 1))
+    number = np.unique(np.concatenate([position, cell], axis=-1).reshape(-1, 4), axis=0, return_inverse=True)[1]
+    shot = np.broadcast_to(np.arange(z.shape[1])[:, None], z.shape).ravel()
+    sums, squares = (np.zeros((int(number.max()) + 1, z.shape[1])) for _ in range(2))
+    np.add.at(sums, (number.reshape(-1), shot), z.ravel())
+    np.add.at(squares, (number.reshape(-1), shot), z.ravel() ** 2)
+    # Of pairs of different pictures alone.
+    total, variance = (float((part.sum(axis=1) ** 2 - (part**2).sum(axis=1)).sum()) / 2.0 for part in (sums, squares))
+    return float(ndtr(-total / np.sqrt(variance))) if variance > 0 else 1.0
 
 
 def efficiency(fit: DiffractionFit, rules: PsfRules, available: int, reported: int) -> float:
     """Variance that all samples of all pictures would leave over the variance of the fit, mean of its first numbers.
 
-    Args:
-        fit: the samples drawn away from the peak stand for all of them there.
-        rules: how many were drawn.
-        available: pictures there are.
-        reported: so many numbers are looked at.
+    The samples drawn away from the peak stand for all of them there, and the fit's pictures for all that there are
+    ``available``. The first ``reported`` numbers are looked at.
     """
-    count = stands_for(fit.shots, rules)
-    weighed_up = (replace(b, weight=np.asarray(b.weight) * count[np.asarray(b.index)]) for b in fit.problem.blocks)
-    positions = replace(fit.problem, blocks=tuple(weighed_up)).by_position(fit.solution.place)
+    samples, count = fit.problem.samples, stands_for(fit.shots, rules)[np.asarray(fit.problem.samples.index)]
+    weighed_up = replace(samples, weight=np.asarray(samples.weight) * count)
+    positions = replace(fit.problem, samples=weighed_up).by_position(fit.solution.place)
     information = sum(position.marginal()[0] for position in positions) * available / fit.shots.count
     best = scaled_inverse(fit.problem.prior.precision + information)
     return float(np.mean(np.diag(best)[:reported] / np.diag(fit.noise_cov)[:reported]))
@@ -266,11 +302,10 @@ def kernel_sigma(fit: DiffractionFit, cov: Float[np.ndarray, "p p"]) -> float:
 
     At weights that make every sample of the kernel count alike, the equations hold the sum of its squared derivatives.
     """
-    block, place = fit.problem.blocks[0], fit.solution.place
-    even = np.asarray(block.colour) / np.maximum(np.asarray(block.colour).sum(axis=1, keepdims=True), 1)
-    unit = np.tile([0.0, 0.0, 1.0, 1.0, 1.0, 0.0], (len(even), 1)) + place.own[0] * [1, 1, 0, 0, 0, 0]
-    one = replace(fit.problem, blocks=(replace(block, weight=even.sum(axis=-1)),))
-    there = Place(place.theta, unit[None])
-    (light,) = one.light_at(there)
-    (sums,) = replace(one, blocks=(replace(one.blocks[0], rate=light),)).by_position(there)
+    samples = fit.problem.samples.at(slice(1))
+    even = np.asarray(samples.colour) / np.maximum(np.asarray(samples.colour).sum(axis=2, keepdims=True), 1)
+    own = np.concatenate([fit.solution.place.own[:1, :, :2], np.tile([1.0, 1.0, 1.0, 0.0], (1, even.shape[1], 1))], -1)
+    place, one = Place(fit.theta, own), replace(fit.problem, samples=replace(samples, weight=even.sum(axis=-1)))
+    light = one.light_at(place)
+    (sums,) = replace(one, samples=replace(one.samples, rate=light)).by_position(place)
     return float(np.sqrt(max(float((sums.shared * cov).sum()), 0.0) / float((even.sum(axis=-1) * light**2).sum())))

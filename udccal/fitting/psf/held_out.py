@@ -1,17 +1,12 @@
 """What positions that were held out say of a kernel: how likely they are, how far it is off there, how far it reaches.
 
 Whatever is wrong there counts: what the model leaves out, and what its numbers are off by because of that.
-
-The support is the smallest window outside of which pictures held out show none of the kernel's light, along rows and
-along columns by itself, since a kernel of pixel rows is a cross. Inside it the kernel is the model's, outside there is
-none but an even background. Its criterion is BIC, one parameter for every larger window that is tried: light that is
-there pays for it many times, light that only the model sees does not.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final, final
+from typing import final
 
 import numpy as np
 import scipy.optimize
@@ -20,18 +15,8 @@ from jaxtyping import Bool, Float, Int
 from udccal.fitting.engine.orders import Attempt, Choice, bic, choose
 from udccal.fitting.psf.data import Shots
 from udccal.fitting.psf.image import Sources, Windows
-from udccal.fitting.psf.weights import HUBER, estimate_model_error, noise_at
+from udccal.fitting.psf.start import HUBER, PsfRules, estimate_model_error, noise_at
 from udccal.result import Candidate
-
-# Of the logarithms of a kernel error's knee and of its power: means and standard deviations beforehand.
-_KNEE, _KNEE_SIGMA, _POWER, _POWER_SIGMA = np.log(0.3), 1.0, 0.75, 0.15
-_BOUNDS: Final = ((np.log(1e-5), np.log(2.0)), (np.log(3e-3), np.log(10.0)), (0.3, 1.2))
-_SIZES: Final = (1e-3, 1e-2, 1e-1)
-_LEAST_BRIGHT: Final = 1e-7
-# Beyond so many sigma the loss grows with the logarithm alone: of a hit, but where the model is far off counts.
-_FAR_SIGMA: Final = 5.0
-_LEAST_PX: Final = 4
-_STEP: Final = np.sqrt(2.0)
 
 
 @final
@@ -66,14 +51,15 @@ class Compared:
 
     def relative_l2(self, channel: Int[np.ndarray, "shots rows columns"]) -> Float[np.ndarray, "3"]:
         """Error of the expectation by colour, the data's own noise included."""
-        seen = [self.known & (channel == colour) for colour in range(3)]
-        squares = ((float((part[one] ** 2).sum()) for part in (self.residual, self.light)) for one in seen)
-        return np.array([np.sqrt(error / max(light, 1e-30)) for error, light in squares])
+        error, light = (
+            np.bincount(channel[self.known], (part**2)[self.known], 3) for part in (self.residual, self.light)
+        )
+        return np.sqrt(error / np.maximum(light, 1e-30))
 
     def loss(self, position: Int[np.ndarray, " shots"]) -> Float[np.ndarray, " places"]:
         """Minus twice the logarithm of the likelihood per sample, but for a constant, by position.
 
-        Pictures of a position share what the model leaves out there. Of a single position, it is by picture.
+        What the model leaves out is common to the pictures of a position. Of a single position, it is by picture.
         """
         each = (np.log(self.total / self.measured) + HUBER.loss(self.residual / np.sqrt(self.total))) * self.known
         by_shot = each.sum(axis=(1, 2)) / np.maximum(self.known.sum(axis=(1, 2)), 1)
@@ -105,8 +91,8 @@ class KernelError:
     """
 
     size: float
-    knee: float
-    power: float
+    knee: float = 1.0
+    power: float = 1.0
 
     def of_peak(self, brightness: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
         """Of samples that have this part of their peak's light."""
@@ -120,60 +106,60 @@ class KernelError:
 
     def relative_l2(self, kernels: Float[np.ndarray, "*n rows columns"]) -> Float[np.ndarray, "*n"]:
         """What that makes of a whole kernel."""
-        square = (kernels**2).sum(axis=(-2, -1))
-        return np.asarray(np.sqrt((self.of_kernels(kernels) ** 2).sum(axis=(-2, -1)) / np.maximum(square, 1e-300)))
-
-
-NONE: Final = KernelError(0.0, 1.0, _POWER)
+        error, light = ((part**2).sum(axis=(-2, -1)) for part in (self.of_kernels(kernels), kernels))
+        return np.asarray(np.sqrt(error / np.maximum(light, 1e-300)))
 
 
 def estimate_kernel_error(
     residual: Float[np.ndarray, " samples"],
     variance: Float[np.ndarray, " samples"],
     brightness: Float[np.ndarray, " samples"],
+    rules: PsfRules,
 ) -> KernelError:
-    """The error of greatest posterior; ``NONE`` where noise alone explains the residuals as well, by BIC.
+    """The error of greatest posterior; a size of 0 where noise alone explains the residuals as well, by BIC.
 
-    Args:
-        residual: data less expectation at positions that were held out, as a part of the peak's light.
-        variance: of the sensor's noise, in the same unit.
-        brightness: expected light as a part of the peak's.
+    All are parts of the peak's light: data less expectation at positions held out, the variance of the sensor's noise,
+    and the expected light.
     """
-    seen = brightness > _LEAST_BRIGHT
+    seen = brightness > 1e-7
     residual, variance, brightness = residual[seen], variance[seen], brightness[seen]
-    if residual.size < len(_BOUNDS):
-        return NONE
+    bounds = ((np.log(1e-5), np.log(2.0)), (np.log(3e-3), np.log(10.0)), (0.3, 1.2))
+    if residual.size < len(bounds):
+        return KernelError(0.0)
+    mean, sigma = zip((np.log(rules.error_knee[0]), rules.error_knee[1]), rules.error_power, strict=True)
 
     def of(values: Float[np.ndarray, "3"]) -> KernelError:
         return KernelError(float(np.exp(values[0])), float(np.exp(values[1])), float(values[2]))
 
     def misfit(total: Float[np.ndarray, " samples"]) -> float:
-        square = residual**2 / (total * _FAR_SIGMA**2)
-        far = 1 + np.log(np.maximum(square, 1))
-        return float(np.sum(np.log(total) + _FAR_SIGMA**2 * np.where(square < 1, square, far)))
+        # Beyond 5 sigma the loss grows with the logarithm alone: of a hit, but where the model is far off counts.
+        square = residual**2 / (total * 25.0)
+        return float(np.sum(np.log(total) + 25.0 * np.where(square < 1, square, 1 + np.log(np.maximum(square, 1)))))
 
     def loss(values: Float[np.ndarray, "3"]) -> float:
-        off = ((values[1] - _KNEE) / _KNEE_SIGMA) ** 2 + ((values[2] - _POWER) / _POWER_SIGMA) ** 2
-        return misfit(variance + of(values).of_peak(brightness) ** 2) + float(off)
+        off = ((values[1:] - np.array(mean)) / np.array(sigma)) ** 2
+        return misfit(variance + of(values).of_peak(brightness) ** 2) + float(off.sum())
 
-    tried = [
-        scipy.optimize.minimize(loss, (np.log(size), _KNEE, _POWER), method="L-BFGS-B", bounds=_BOUNDS)
-        for size in _SIZES
-    ]
+    starts = ((np.log(size), *mean) for size in (1e-3, 1e-2, 1e-1))
+    tried = [scipy.optimize.minimize(loss, start, method="L-BFGS-B", bounds=bounds) for start in starts]
     found = min(tried, key=lambda one: float(one.fun))
-    return of(found.x) if bic(float(found.fun), float(len(_BOUNDS)), residual.size) < misfit(variance) else NONE
+    worth = bic(float(found.fun), float(len(bounds)), residual.size) < misfit(variance)
+    return of(found.x) if worth else KernelError(0.0)
 
 
-def kernel_error(found: Compared, channel: Int[np.ndarray, "shots rows columns"], sources: Sources) -> KernelError:
+def kernel_error(
+    found: Compared, channel: Int[np.ndarray, "shots rows columns"], sources: Sources, rules: PsfRules
+) -> KernelError:
     """How far the kernel is off beside noise, from samples that it has not seen."""
     flux = np.take_along_axis(np.abs(sources.flux), channel.reshape(len(channel), -1), axis=1).reshape(channel.shape)
     unit = found.light / np.maximum(flux, 1e-300) * found.known
     # Pictures see the peak at different fractions of a pixel: the highest of all is nearest to it.
-    peaks = np.array([unit[channel == colour].max(initial=1e-300) for colour in range(3)])
-    full = flux * peaks[channel]
+    full = flux * np.array([unit[channel == colour].max(initial=1e-300) for colour in range(3)])[channel]
     seen = found.known & (full > 0)
     full = full[seen]
-    return estimate_kernel_error(found.residual[seen] / full, found.variance[seen] / full**2, found.light[seen] / full)
+    return estimate_kernel_error(
+        found.residual[seen] / full, found.variance[seen] / full**2, found.light[seen] / full, rules
+    )
 
 
 @final
@@ -193,25 +179,28 @@ class Support:
 
     @property
     def open_ended(self) -> tuple[bool, bool]:
-        """Along (rows, columns), whether light was seen up to the border of what the pictures held."""
+        """Along (rows, columns), whether light was seen up to the end of what the pictures held."""
         rows, columns = (chosen >= seen for chosen, seen in zip(self.half_px, self.seen_px, strict=True))
         return rows, columns
 
 
 def choose_support(found: Compared) -> Support:
-    """The window of least criterion, from samples that the model has not seen in windows about each source."""
-    rows, columns = found.residual.shape[1:]
-    y, x = np.mgrid[:rows, :columns]
-    down = _along(found, "rows", np.abs(y - rows // 2))
-    across = _along(found, "columns", np.abs(x - columns // 2))
-    half = (down.best.fit, across.best.fit)
-    return Support(half, (rows // 2, columns // 2), (*down.candidates, *across.candidates))
+    """The smallest window outside of which samples that the model has not seen show none of the kernel's light.
+
+    Along rows and along columns by itself, since a kernel of pixel rows is a cross. Inside it the kernel is the
+    model's, outside there is none but an even background. Its criterion is BIC, one parameter for every larger window
+    that is tried: light that is there pays for it many times, light that only the model sees does not.
+    """
+    rows, columns = (size // 2 for size in found.residual.shape[1:])
+    y, x = np.mgrid[-rows : rows + 1, -columns : columns + 1]
+    down, across = _along(found, "rows", np.abs(y)), _along(found, "columns", np.abs(x))
+    return Support((down.best.fit, across.best.fit), (rows, columns), (*down.candidates, *across.candidates))
 
 
 def windows_to_try(largest_px: int) -> tuple[int, ...]:
-    """Sizes to either side: each half as large again as the one before the last, up to the largest."""
-    count = int(np.ceil(np.log(max(largest_px / _LEAST_PX, 1.0)) / np.log(_STEP)))
-    steps = np.round(_LEAST_PX * _STEP ** np.arange(count)).astype(int)
+    """Sizes to either side from 4 px: each half as large again as the one before the last, up to the largest."""
+    count = int(np.ceil(2.0 * np.log2(max(largest_px / 4.0, 1.0))))
+    steps = np.round(4.0 * 2.0 ** (np.arange(count) / 2.0)).astype(int)
     return (*(int(step) for step in steps if step < largest_px), largest_px)
 
 

@@ -5,7 +5,12 @@ the matrix. A shot's expectation is the image at its position, moved by a fracti
 disc. Along rows and along columns that is one small matrix each (for a disc of a pixel or two, which pixels cannot tell
 from the product of its shadows).
 
-Beside diffraction one node to a pixel is enough; see ``psf.free`` for an image that carries the whole kernel.
+Beside diffraction one node to a pixel is enough. A free image carries the whole kernel, whose core about as narrow as a
+pixel is not determined by its values on whole pixels; undoing the LED's disc makes more of what is wrong. It has two
+nodes to a pixel: no shot sees all of these, but all shots at their places do together, and it is smooth over about one.
+Where its LEDs are and how bright is estimated along: in every round the model is linear in both, and each shot's own
+parameters are eliminated exactly (Golub and Pereyra, "The differentiation of pseudo-inverses and nonlinear least
+squares problems whose variables separate", 1973).
 """
 
 from __future__ import annotations
@@ -17,20 +22,15 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy.linalg
 import scipy.ndimage
 from jaxtyping import Array, Bool, Float
 
 from udccal.fitting.psf.data import Shots
-from udccal.fitting.psf.weights import left_out, noise_at
+from udccal.fitting.psf.start import PsfRules, left_out, noise_at
 from udccal.models.arrays import Arrayish
 
-_LANCZOS: Final = 3
-_DISC_POINTS: Final = 8
-_SMOOTH_NODES: Final = 1.0
-# Iterations at most and relative residual of conjugate gradients: beside diffraction, and without it.
-_BESIDE, _FREE = (60, 1e-4), (150, 1e-5)
-# Centroids are this good, in px; sums of a crop's light, relatively.
-_PLACE_SIGMA_PX, _LIGHT_SIGMA = 0.05, 0.03
+FREE_PER_PX: Final = 2
 
 
 @final
@@ -48,10 +48,9 @@ class Sources:
 
     def with_light_of_peak(self, shots: Shots, explained: Float[np.ndarray, "shots rows columns"]) -> Sources:
         """Light from unweighted least squares: set by the peak, where relative weights listen to the wings."""
-        colour = np.eye(3)[shots.channel] * (shots.weight > 0)[..., None]
+        colour = shots.colour * (shots.weight > 0)[..., None]
         rate = shots.rate - self.background[:, None, None]
-        top = np.einsum("syx,syx,syxc->sc", rate, explained, colour)
-        bottom = np.einsum("syx,syx,syxc->sc", explained, explained, colour)
+        top, bottom = (np.einsum("syx,syx,syxc->sc", part, explained, colour) for part in (rate, explained))
         return replace(self, flux=np.where(bottom > 0, top / np.where(bottom > 0, bottom, 1.0), self.flux))
 
 
@@ -66,7 +65,7 @@ class Windows(eqx.Module):
         colour: one-hot.
         explained: per unit of light, what diffraction brings to each sample.
         rate: e-/s without background.
-        left_out: what a model error of 1 would add to the rate's standard deviation; see ``psf.weights``.
+        left_out: what a model error of 1 would add to the rate's standard deviation; see ``start.left_out``.
         weight: inverse variance of the rate that solutions go by, 0 where nothing is known.
     """
 
@@ -85,10 +84,11 @@ class Windows(eqx.Module):
         return replace(self, weight=self.weight * keep[:, None, None])
 
     def expected(
-        self, share: float, image: Float[np.ndarray, "terms 3 node_rows node_columns"]
+        self, free: bool, image: Float[np.ndarray, "terms 3 node_rows node_columns"]
     ) -> Float[np.ndarray, "shots rows columns"]:
-        """What a ``share`` of diffraction and an image together bring to each sample, in e-/s."""
-        return (share * np.asarray(self.explained) + np.asarray(predict(self, image))) * np.asarray(self.flux)
+        """What an image brings to each sample, and diffraction unless it is ``free``, in e-/s."""
+        unit = np.asarray(predict(self, image)) + (0.0 if free else np.asarray(self.explained))
+        return unit * np.asarray(self.flux)
 
 
 def make_windows(
@@ -101,17 +101,13 @@ def make_windows(
 ) -> Windows:
     """What images are solved from.
 
-    Args:
-        shots: the data. sources: their places and light.
-        explained: per unit of light, what diffraction brings to each sample.
-        basis: polynomials at each shot's position.
-        model_error: relative error of the peak that solutions allow for, beside the noise of the data.
-        per_px: nodes of the image to a pixel; its first and last lie on the first and last pixels.
+    ``explained`` is what diffraction brings to each sample per unit of light; ``model_error``, relative to the peak, is
+    allowed for beside the data's noise. The image has ``per_px`` nodes to a pixel, the first and last on the first and
+    last pixels.
     """
-    colour = np.eye(3)[shots.channel]
+    colour, known = shots.colour, shots.weight > 0
     rate = shots.rate - sources.background[:, None, None]
     flux = np.einsum("syxc,sc->syx", colour, sources.flux)
-    known = shots.weight > 0
     smooth = np.maximum(scipy.ndimage.uniform_filter(np.abs(rate), (0, 3, 3)), np.abs(flux * explained))
     unexplained = left_out(smooth.reshape(shots.count, -1), 1.0).reshape(smooth.shape)
     measured = 1.0 / np.where(known, shots.weight, 1.0)
@@ -135,26 +131,20 @@ def shifts(
 ) -> Float[np.ndarray, "shots samples nodes"]:
     """Matrices along one axis that move an image by an offset and average it over a disc's shadow.
 
-    Lanczos's interpolation over six nodes; the shadow of a disc is summed by Gauss and Chebyshev's rule.
+    Lanczos's interpolation over six nodes; a disc's shadow is summed by Gauss and Chebyshev's rule at eight points.
     """
-    angle = np.pi * np.arange(1, _DISC_POINTS + 1) / (_DISC_POINTS + 1)
+    angle, reach = np.pi * np.arange(1, 9) / 9, 3
     shots, nodes = len(offset_px), per_px * (samples - 1) + 1
-    matrix = np.zeros((shots, samples, nodes + 2 * _LANCZOS))  # what falls beside the nodes is cut off at the end
+    matrix = np.zeros((shots, samples, nodes + 2 * reach))  # what falls beside the nodes is cut off at the end
     index = np.ogrid[:shots, :samples]
-    for part, weight in zip(np.cos(angle) / 2, 2 / (_DISC_POINTS + 1) * np.sin(angle) ** 2, strict=True):
+    for part, weight in zip(np.cos(angle) / 2, 2 / 9 * np.sin(angle) ** 2, strict=True):
         place = per_px * (np.arange(samples) - (offset_px + part * disc_px)[:, None])
-        first = np.floor(place).astype(np.int64) - _LANCZOS + 1
-        away = np.stack([place - first - tap for tap in range(2 * _LANCZOS)])
-        taps = np.where(np.abs(away) < _LANCZOS, np.sinc(away) * np.sinc(away / _LANCZOS), 0.0)
+        first = np.floor(place).astype(np.int64) - reach + 1
+        away = np.stack([place - first - tap for tap in range(2 * reach)])
+        taps = np.where(np.abs(away) < reach, np.sinc(away) * np.sinc(away / reach), 0.0)
         for tap, value in enumerate(weight * taps / taps.sum(axis=0)):
-            matrix[(*index, np.clip(first + tap + _LANCZOS, 0, matrix.shape[2] - 1))] += value
-    return matrix[:, :, _LANCZOS:-_LANCZOS]
-
-
-def about_middle(images: Float[np.ndarray, "*k rows columns"], half: tuple[int, int]) -> np.ndarray:
-    """The middle of images of odd size, ``half`` (rows, columns) to either side."""
-    rows, columns = (slice(n // 2 - h, n // 2 + h + 1) for n, h in zip(images.shape[-2:], half, strict=True))
-    return images[..., rows, columns]
+            matrix[(*index, np.clip(first + tap + reach, 0, matrix.shape[2] - 1))] += value
+    return matrix[:, :, reach:-reach]
 
 
 def prior_sigma(
@@ -189,63 +179,65 @@ class Moves(eqx.Module):
     Attributes:
         design: what a change brings to each sample, in e-/s.
         changed: by how much they have been changed.
+        sigma: prior standard deviations of the whole changes.
     """
 
     design: Float[Arrayish, "shots 5 rows columns"]
     changed: Float[Arrayish, "shots 5"]
+    sigma: Float[Arrayish, "5"]
 
 
 @eqx.filter_jit
 def solve_image(
     windows: Windows,
     sigma: Float[Arrayish, "terms 3 node_rows node_columns"],
-    share: Float[Arrayish, ""],
-    before: Float[Arrayish, "terms 3 node_rows node_columns"] | None = None,
+    free: bool,
+    start: Float[Arrayish, "terms 3 node_rows node_columns"],
     moves: Moves | None = None,
-) -> tuple[Float[Array, "terms 3 node_rows node_columns"], Float[Array, "shots 5"] | None]:
-    """Ridge estimate of an image, beside a ``share`` of diffraction.
+) -> tuple[Float[Array, "terms 3 node_rows node_columns"], Float[Array, "shots 5"]]:
+    """Ridge estimate of an image, beside diffraction or ``free`` of it.
 
     Args:
         windows: the data.
         sigma: prior standard deviations of the image, before it is smoothed.
-        share: 1, or 0 without diffraction.
-        before: for a free image, one that was returned before; None beside diffraction.
+        free: whether the image carries the whole kernel.
+        start: in units of ``sigma``. The prior is about what is added: about the whole, it would trade a smaller image
+            for brighter LEDs.
         moves: places and light of the shots, which are estimated along; None where they stay.
 
     Returns:
         (image in units of ``sigma``, for ``image_of``; by how much each shot's own parameters are changed now).
     """
-    sigma, flux, weight = (jnp.asarray(part) for part in (sigma, windows.flux, windows.weight))
-    free, start = before is not None, jnp.zeros_like(sigma) if before is None else jnp.asarray(before)
-    data = jnp.asarray(windows.rate) - flux * share * jnp.asarray(windows.explained)
-    design = None if moves is None else jnp.asarray(moves.design)
+    sigma, start, flux, weight = (jnp.asarray(part) for part in (sigma, start, windows.flux, windows.weight))
+    data = jnp.asarray(windows.rate) - (0.0 if free else flux * jnp.asarray(windows.explained))
 
     def own_of(light: Float[Array, "shots rows columns"]) -> Float[Array, "shots 5"]:
-        prior = jnp.array([_PLACE_SIGMA_PX] * 2 + [_LIGHT_SIGMA] * 3) ** -2.0
-        inverse = jnp.linalg.inv(jnp.einsum("spyx,sqyx,syx->spq", design, design, weight) + jnp.diag(prior))
-        return jnp.einsum("spq,sqyx,syx->sp", inverse, design, weight * light)
+        if moves is None:
+            return jnp.zeros((len(light), 5))
+        normal = jnp.einsum("spyx,sqyx,syx->spq", moves.design, moves.design, weight)
+        inverse = jnp.linalg.inv(normal + jnp.diag(jnp.asarray(moves.sigma) ** -2.0))
+        return jnp.einsum("spq,sqyx,syx->sp", inverse, moves.design, weight * light)
 
-    def weigh(light: Float[Array, "shots rows columns"]) -> Float[Array, "shots rows columns"]:
-        return weight * (light if design is None else light - jnp.einsum("spyx,sp->syx", design, own_of(light)))
+    def by_own(own: Float[Array, "shots 5"]) -> Float[Array, "shots rows columns"] | float:
+        return 0.0 if moves is None else jnp.einsum("spyx,sp->syx", moves.design, own)
 
     def forward(scaled: Float[Array, "terms 3 node_rows node_columns"]) -> Float[Array, "shots rows columns"]:
         return flux * predict(windows, image_of(scaled, sigma, free))
 
+    def backward(light: Float[Array, "shots rows columns"]) -> Float[Array, "terms 3 node_rows node_columns"]:
+        return jax.linear_transpose(forward, start)(weight * (light - by_own(own_of(light))))[0]
+
     if moves is not None:
         # As if nothing had been changed yet: the model is linear, and the prior is about the whole change.
-        data = data + jnp.einsum("spyx,sp->syx", design, jnp.asarray(moves.changed))
-    # The prior is about what is added. About the whole, it would trade a smaller image for brighter LEDs.
-    missing = data - forward(start) if free else data
-    backward = jax.linear_transpose(forward, jax.ShapeDtypeStruct(sigma.shape, sigma.dtype))
-    iterations, tolerance = _FREE if free else _BESIDE
-    scaled, _ = jax.scipy.sparse.linalg.cg(
-        lambda image: image + backward(weigh(forward(image)))[0],
-        backward(weigh(missing))[0],
+        data = data + by_own(jnp.asarray(moves.changed))
+    iterations, tolerance = (150, 1e-5) if free else (60, 1e-4)
+    added, _ = jax.scipy.sparse.linalg.cg(
+        lambda image: image + backward(forward(image)),
+        backward(data - forward(start)),
         tol=tolerance,
         maxiter=iterations,
     )
-    scaled = start + scaled
-    return scaled, None if moves is None else own_of(data - forward(scaled))
+    return start + added, own_of(data - forward(start + added))
 
 
 def image_of(
@@ -253,16 +245,65 @@ def image_of(
     sigma: Float[Arrayish, "terms 3 node_rows node_columns"],
     free: bool,
 ) -> Float[Array, "terms 3 node_rows node_columns"]:
-    """The image: what has the prior's standard deviations, smoothed by a Gaussian along both axes where it is free."""
+    """The image: what has the prior's standard deviations, smoothed by a Gaussian of one node where it is free."""
     image = jnp.asarray(scaled) * jnp.asarray(sigma)
     if not free:
         return image
-    reach = int(np.ceil(4 * _SMOOTH_NODES))
-    taps = np.exp(-0.5 * (np.arange(-reach, reach + 1) / _SMOOTH_NODES) ** 2)
-    taps /= taps.sum()
-    planes = image.reshape(-1, 1, *image.shape[-2:])
-    for axis in (0, 1):
-        kernel = jnp.asarray(np.expand_dims(taps, 1 - axis))[None, None]
-        around = [(reach, reach) if a == axis else (0, 0) for a in (0, 1)]
-        planes = jax.lax.conv_general_dilated(planes, kernel, (1, 1), around)
-    return planes.reshape(image.shape)
+    taps = [np.where(np.arange(n) <= 4, np.exp(-0.5 * np.arange(n) ** 2.0), 0.0) for n in image.shape[-2:]]
+    down, across = (scipy.linalg.toeplitz(half) / (2.0 * half.sum() - 1.0) for half in taps)
+    return down @ image @ across
+
+
+def free_sources(
+    shots: Shots,
+    basis: Float[np.ndarray, "shots terms"],
+    terms: int,
+    magnitude: Float[np.ndarray, "3 rows columns"],
+    rules: PsfRules,
+) -> Sources:
+    """Places and light when diffraction explains nothing: from the crops themselves, then along with a free image.
+
+    The image has the first ``terms`` of the ``basis``; ``magnitude`` is how large the kernel is on average.
+    """
+    colour = shots.colour * (shots.weight > 0)[..., None]
+    light, covered = (np.einsum("syx,syxc->sc", shots.rate, colour), np.einsum("cyx,syxc->sc", magnitude, colour))
+    start = Sources(shots.centre_px, light / np.maximum(covered, 1e-6), np.zeros(shots.count))
+    nothing = np.zeros_like(shots.rate)
+    room = (np.arange(basis.shape[1]) < terms)[:, None, None, None]
+    sigma = room * prior_sigma(magnitude, 1.0, FREE_PER_PX)
+    sources, changed = start, np.zeros((shots.count, 5))
+    windows = make_windows(shots, sources, nothing, basis, rules.free_model_error, FREE_PER_PX)
+    scaled, _ = solve_image(windows, sigma, True, np.zeros_like(sigma))
+    for _ in range(2):
+        moves = _moves(shots, sources, windows, np.asarray(image_of(scaled, sigma, True)), changed, rules)
+        scaled, found = solve_image(windows, sigma, True, scaled, moves)
+        # What is common to the shots of a position, a change of the image there does as well.
+        mean = np.stack([np.asarray(found)[shots.position == g].mean(axis=0) for g in range(shots.positions)])
+        # Places and light change by less than this (px; relatively).
+        changed = np.clip(np.asarray(found) - mean[shots.position], -0.7, 0.7)
+        sources = replace(start, place_px=start.place_px + changed[:, :2], flux=start.flux * (1.0 + changed[:, 2:]))
+        windows = make_windows(shots, sources, nothing, basis, rules.free_model_error, FREE_PER_PX)
+    return sources
+
+
+def _moves(
+    shots: Shots,
+    sources: Sources,
+    windows: Windows,
+    image: Float[np.ndarray, "terms 3 node_rows node_columns"],
+    changed: Float[np.ndarray, "shots 5"],
+    rules: PsfRules,
+) -> Moves:
+    """About ``sources``, at which places and light have been ``changed`` by so much."""
+    x, y = (sources.place_px - shots.origin_px).T
+
+    def at(right: float, below: float) -> Float[np.ndarray, "shots rows columns"]:
+        down = shifts(y + below, shots.disc_px, shots.rate.shape[1], FREE_PER_PX)
+        across = shifts(x + right, shots.disc_px, shots.rate.shape[2], FREE_PER_PX)
+        return np.asarray(predict(replace(windows, down=down, across=across), image))
+
+    h = 0.05
+    by_place = [(at(h, 0.0) - at(-h, 0.0)) / (2 * h), (at(0.0, h) - at(0.0, -h)) / (2 * h)]
+    light = np.moveaxis(at(0.0, 0.0)[..., None] * np.asarray(windows.colour), -1, 1)
+    design = np.concatenate([np.stack(by_place, 1), light], 1) * np.asarray(windows.flux)[:, None]
+    return Moves(design, changed, np.repeat(rules.own_sigma, (2, 3)))

@@ -21,7 +21,6 @@ from udccal.models.arrays import Arrayish
 from udccal.models.diffraction import (
     Diffraction,
     LocalFrame,
-    average_of,
     average_transfer,
     lattice_frequencies,
     open_fractions,
@@ -33,6 +32,7 @@ from udccal.models.diffraction import (
 )
 from udccal.models.interference import (
     HIGHEST_ORDER,
+    TERMS,
     footprint_place,
     interference_of,
     interference_transfer,
@@ -46,8 +46,6 @@ from udccal.models.lattice import Lattice, lattice_for, spline_coefficients
 # the blur in px, and where the footprint's centre lies on columns and rows, with its stand-off, in pitches.
 HEAD: Final = 9
 PITCH, PUPIL, BLUR, FOOTPRINT = 0, 4, 5, slice(6, 9)
-_PER_PX: Final = 4
-_MARGIN: Final = 1.25
 
 
 def pack(model: Diffraction) -> Float[np.ndarray, " p"]:
@@ -59,23 +57,6 @@ def pack(model: Diffraction) -> Float[np.ndarray, " p"]:
     head = [model.pitch_mm, *np.asarray(model.open_fraction), model.thickness_mm, model.pupil_mm, np.log(model.blur_px)]
     head += [*np.asarray(model.offset), model.standoff_per_pitch]
     return np.concatenate([np.array(head, dtype=float), (logs - logs.mean(axis=1, keepdims=True)).ravel()])
-
-
-def unpack(theta: Float[Arrayish, " p"], wavelengths_nm: Float[Arrayish, " nodes"], interference: bool) -> Diffraction:
-    """The model that a vector of parameters stands for."""
-    theta = jnp.asarray(theta)
-    return Diffraction(
-        pitch_mm=theta[PITCH],
-        open_fraction=theta[1:3],
-        thickness_mm=theta[3],
-        pupil_mm=theta[PUPIL],
-        blur_px=jnp.exp(theta[BLUR]),
-        offset=theta[6:8],
-        standoff_per_pitch=theta[8],
-        visibility=float(interference),
-        wavelengths_nm=jnp.asarray(wavelengths_nm),
-        spectrum=jax.nn.softmax(theta[HEAD:].reshape(3, -1), axis=1),
-    )
 
 
 @final
@@ -93,14 +74,29 @@ class Evaluator(eqx.Module):
     interference: bool = eqx.field(static=True)
 
     def model(self, theta: Float[Arrayish, " p"]) -> Diffraction:
-        """The model that a vector of parameters stands for."""
-        return unpack(theta, self.wavelengths_nm, self.interference)
+        """The model of a vector of parameters; see ``pack``."""
+        theta = jnp.asarray(theta)
+        return Diffraction(
+            pitch_mm=theta[PITCH],
+            open_fraction=theta[1:3],
+            thickness_mm=theta[3],
+            pupil_mm=theta[PUPIL],
+            blur_px=jnp.exp(theta[BLUR]),
+            offset=theta[6:8],
+            standoff_per_pitch=theta[8],
+            visibility=float(self.interference),
+            wavelengths_nm=jnp.asarray(self.wavelengths_nm),
+            spectrum=jax.nn.softmax(theta[HEAD:].reshape(3, -1), axis=1),
+        )
 
 
 def fit_lattice(half: tuple[int, int]) -> Lattice:
-    """Lattice that holds windows of ``half`` (rows, columns) to either side, sources off the middle included."""
+    """Lattice that holds windows of ``half`` (rows, columns) to either side, sources off the middle included.
+
+    It has four nodes to a pixel, and a quarter more room than the window.
+    """
     rows, columns = (2 * h + 9 for h in half)
-    return lattice_for(rows * _MARGIN, columns * _MARGIN, _PER_PX, _PER_PX)
+    return lattice_for(rows * 1.25, columns * 1.25, 4, 4)
 
 
 @eqx.filter_jit
@@ -108,10 +104,10 @@ def overlaps_of(
     evaluator: Evaluator, theta: Float[Arrayish, " p"], frame: LocalFrame
 ) -> Float[Array, "nodes terms rows half"]:
     """The slow part of interference, in single precision: it hardly changes in the course of a fit."""
-    model = evaluator.model(theta)
+    model, lattice = evaluator.model(theta), evaluator.lattice
     if not evaluator.interference:
-        return jnp.zeros((0, 0, 0, 0), jnp.float32)
-    return node_overlaps(model, frame, evaluator.lattice, overlap_tables(model, frame)).astype(jnp.float32)
+        return jnp.zeros((len(evaluator.wavelengths_nm), 0, lattice.rows, lattice.columns // 2 + 1), jnp.float32)
+    return node_overlaps(model, frame, lattice, overlap_tables(model, frame)).astype(jnp.float32)
 
 
 @eqx.filter_jit
@@ -120,8 +116,8 @@ def kernel_coefficients(
     theta: Float[Arrayish, " p"],
     frame: LocalFrame,
     disc_px: Float[Arrayish, ""],
-    overlaps: Float[Arrayish, "n_nodes n_terms n_rows n_half"],
-) -> Float[Array, "rows columns 3"]:
+    overlaps: Float[Arrayish, "nodes terms rows half"],
+) -> Float[Array, "lattice_rows lattice_columns 3"]:
     """Spline coefficients of the three colours' kernel of a source whose image is ``disc_px`` wide."""
     model, lattice = evaluator.model(theta), evaluator.lattice
     spectra = jnp.asarray(model.spectrum)
@@ -131,78 +127,90 @@ def kernel_coefficients(
     return spline_coefficients(lattice, transfer)
 
 
+def interference_coefficients(
+    evaluator: Evaluator, model: Diffraction, frame: LocalFrame, disc_px: Float[Arrayish, ""]
+) -> Callable[[Float[Array, " terms"], Float[Array, "nodes terms rows half"]], Float[Array, "y x 3"]]:
+    """Part of ``kernel_coefficients`` that interference brings, as a function of its strengths and overlaps."""
+    lattice, spectra = evaluator.lattice, jnp.asarray(model.spectrum)
+    opened, (fx, fy) = open_fractions(model, frame), lattice_frequencies(frame, lattice)
+    columns, rows = (slit_tables(model, opened[axis], f, HIGHEST_ORDER) for axis, f in enumerate((fx, fy)))
+    sensor = sensor_transfer(frame, fx, fy, model.blur_px, disc_px)
+
+    def of(strength: Float[Array, " terms"], overlaps: Float[Array, "nodes terms rows half"]) -> Float[Array, "y x 3"]:
+        total = interference_of(strength, columns, rows, overlaps, spectra)
+        return spline_coefficients(lattice, through_sensor(total, sensor))
+
+    return of
+
+
 def kernel_jacobian(
     evaluator: Evaluator,
     model: Diffraction,
     frame: LocalFrame,
     disc_px: Float[Arrayish, ""],
-    overlaps: Float[Arrayish, "n_nodes n_terms n_rows n_half"],
-) -> tuple[Float[Array, "rows columns nodes"], Float[Array, "rows columns factors 3"]]:
+    overlaps: Float[Arrayish, "nodes terms rows half"],
+) -> tuple[Float[Array, "y x nodes"], Float[Array, "y x factors 3"]]:
     """Spline coefficients of the kernel in the light of every wavelength node, and derivatives in all colours.
 
-    Derivatives are by the factors of ``factor_jacobian``, the ``overlaps`` of interference held.
+    Derivatives are by the factors of ``factor_jacobian``, the ``overlaps`` of interference held. The average over the
+    footprint's place is one more term of interference, (0, 0), of strength 1.
     """
     lattice, spectra = evaluator.lattice, jnp.asarray(model.spectrum)
     fx, fy = lattice_frequencies(frame, lattice)
-    (columns, by_column), (rows, by_row) = (_slits(model, frame, axis, f) for axis, f in enumerate((fx, fy)))
+    slits = (_slits(model, frame, axis, f) for axis, f in enumerate((fx, fy)))
     pupils, by_pupil = _with_derivative(
         lambda mm: pupil_overlaps(eqx.tree_at(lambda m: m.pupil_mm, model, mm), frame, lattice), model.pupil_mm
     )
     sensor, by_blur = _with_derivative(
         lambda log: sensor_transfer(frame, fx, fy, jnp.exp(log), disc_px), jnp.log(model.blur_px)
     )
-    place = footprint_place(model, frame)
-    strength, share = strengths(model, place), pupil_anchors(model)[1]
+    place, terms = footprint_place(model, frame), np.array([(0.0, 0.0), *TERMS][: 1 + np.shape(overlaps)[1]])
+    column_of, row_of = np.abs(terms).astype(np.int32).T
+    strength = jnp.append(1.0, strengths(model, place))[: len(terms), None]
+    by_place = jnp.pad(jax.jacfwd(lambda at: strengths(model, at))(place), ((1, 0), (0, 0)))[: len(terms)]
 
-    def light(factors: tuple[Array, ...], own: Float[Array, "c nodes"]) -> Float[Array, "c rows half"]:
-        s, x, y, pupil = factors
-        total = average_of(x[0], y[0], pupil, share, own)
-        return total + interference_of(s, x, y, overlaps, own) if evaluator.interference else total
+    def at_node(node: tuple[Array, Array, Array, Array]) -> Float[Array, "variants rows half"]:
+        columns, rows, own, part = node
+        average, narrower = (jnp.tensordot(part, anchors, 1) for anchors in (pupils, by_pupil))
+        overlap = jnp.concatenate([average[None], own])
+        x, by_open_x, by_pitch_x = columns[:, column_of, None, :] * overlap
+        y, by_open_y, by_pitch_y = strength * rows[:, row_of]
 
-    by_place = jax.jacfwd(lambda at: strengths(model, at))(place)
-    none = jnp.zeros_like(pupils)
-    replaced = [
-        (strength, by_column[0], rows, pupils),
-        (strength, columns, by_row[0], pupils),
-        (strength, by_column[1], rows, pupils),
-        (strength, columns, by_row[1], pupils),
-        (jnp.zeros_like(strength), columns, rows, by_pupil),
-        (by_place[:, 0], columns, rows, none),
-        (by_place[:, 1], columns, rows, none),
-    ]
-    stacked = tuple(jnp.stack(parts) for parts in zip(*replaced, strict=True))
-    by_factor = jax.lax.map(lambda factors: light(factors, spectra), stacked)
-    nodes = light((strength, columns, rows, pupils), jnp.eye(spectra.shape[1]))
-    mixed = (spectra @ nodes.reshape(nodes.shape[0], -1)).reshape(3, *sensor.shape)
-    channels = jnp.concatenate([nodes, by_factor.reshape(-1, *sensor.shape)])
-    seen = jnp.concatenate([through_sensor(channels, sensor), through_sensor(mixed, by_blur)])
-    flat = spline_coefficients(lattice, seen)
-    count = spectra.shape[1]
+        def light(
+            down: Float[Array, "terms rows"], across: Float[Array, "terms rows half"]
+        ) -> Float[Array, "rows half"]:
+            return jnp.sum(down[..., None] * across, axis=0)
+
+        by_pitch, pupil = light(y, by_pitch_x) + light(by_pitch_y, x), rows[0, 0][:, None] * columns[0, 0] * narrower
+        moved = [light(by[:, None] * rows[0, row_of], x) for by in by_place.T]
+        return jnp.stack([light(y, x), light(y, by_open_x), light(by_open_y, x), by_pitch, pupil, *moved])
+
+    every = jax.lax.map(at_node, (*slits, jnp.asarray(overlaps), pupil_anchors(model)[1].T))
+    mixed = jnp.einsum("cj,jfyx->fcyx", spectra, every)
+    channels = jnp.concatenate([every[:, 0], mixed[1:].reshape(-1, *sensor.shape)])
+    seen = jnp.concatenate([through_sensor(channels, sensor), through_sensor(mixed[0], by_blur)])
+    flat, count = spline_coefficients(lattice, seen), spectra.shape[1]
     return flat[..., :count], flat[..., count:].reshape(*flat.shape[:2], -1, 3)
 
 
-def factor_jacobian(model: Diffraction, frame: LocalFrame) -> Float[Array, "factors head"]:
+def factor_jacobian(evaluator: Evaluator, theta: Float[Array, " p"], frame: LocalFrame) -> Float[Array, "factors head"]:
     """Derivatives of the factors of ``kernel_jacobian`` by the parameters before the spectra, in their order.
 
-    Factors: open part of columns and of rows along the ray, the pitch where it scales lags along columns and along
-    rows, the pupil, the footprint's place (x, y), and the logarithm of the blur.
+    Factors: open part of columns and of rows along the ray, the pitch where it scales lags, the pupil, the footprint's
+    place (x, y), and the logarithm of the blur.
     """
 
     def factors(head: Float[Array, " head"]) -> Float[Array, " factors"]:
-        panel = (head[0], head[1:3], head[3])
-        own = eqx.tree_at(lambda m: (m.pitch_mm, m.open_fraction, m.thickness_mm), model, panel)
-        own = eqx.tree_at(lambda m: (m.offset, m.standoff_per_pitch), own, (head[6:8], head[8]))
-        opened, place = open_fractions(own, frame), footprint_place(own, frame)
-        return jnp.stack([*opened, head[PITCH], head[PITCH], head[PUPIL], *place, head[BLUR]])
+        model = evaluator.model(jnp.concatenate([head, theta[HEAD:]]))
+        opened, place = open_fractions(model, frame), footprint_place(model, frame)
+        return jnp.stack([*opened, head[PITCH], head[PUPIL], *place, head[BLUR]])
 
-    numbers = [model.pitch_mm, *jnp.asarray(model.open_fraction), model.thickness_mm, model.pupil_mm]
-    numbers += [jnp.log(model.blur_px), *jnp.asarray(model.offset), model.standoff_per_pitch]
-    return jax.jacfwd(factors)(jnp.stack([jnp.asarray(number) for number in numbers]))
+    return jax.jacfwd(factors)(theta[:HEAD])
 
 
 def _slits(
     model: Diffraction, frame: LocalFrame, axis: int, frequency: Float[Array, " n"]
-) -> tuple[Float[Array, "orders n nodes"], Float[Array, "2 orders n nodes"]]:
+) -> Float[Array, "nodes 3 orders n"]:
     """Slits along an axis, and derivatives by the open part of a ray and by the pitch, each with the other held."""
 
     def table(opened: Float[Array, ""], pitch_mm: Float[Array, ""]) -> Float[Array, "orders n nodes"]:
@@ -210,7 +218,7 @@ def _slits(
 
     at = (open_fractions(model, frame)[axis], jnp.asarray(model.pitch_mm))
     value, derivatives = jax.vmap(lambda way: jax.jvp(table, at, (way[0], way[1])), out_axes=(None, 0))(jnp.eye(2))
-    return value, derivatives
+    return jnp.moveaxis(jnp.concatenate([value[None], derivatives]), -1, 0)
 
 
 def _with_derivative(of: Callable[[Array], Array], at: Float[Arrayish, ""]) -> tuple[Array, Array]:

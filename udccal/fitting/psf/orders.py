@@ -11,13 +11,13 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from udccal.fitting.engine.orders import Attempt, Choice, choose, held_out_beats, rising
-from udccal.fitting.psf.data import Shots, held_out_positions
-from udccal.fitting.psf.free import FREE_PER_PX, free_sources
+from udccal.fitting.psf.data import Shots, about_middle, held_out_positions
 from udccal.fitting.psf.held_out import Compared, KernelError, Support, choose_support, compare, kernel_error
 from udccal.fitting.psf.image import (
+    FREE_PER_PX,
     Sources,
     Windows,
-    about_middle,
+    free_sources,
     image_of,
     make_windows,
     prior_sigma,
@@ -35,14 +35,14 @@ class Order:
 
     Attributes:
         degree: of its polynomials, -1 for none.
-        share: of diffraction, 1 or 0.
+        free: whether it carries the whole kernel, without diffraction.
         size: its standard deviation beforehand, as a fraction of the kernel nearby.
-        model_error: what solutions allow for, see ``psf.weights``.
+        model_error: what solutions allow for, see ``start.left_out``.
         reach: of the window, so large a part has a residual, about the source.
     """
 
     degree: int
-    share: float
+    free: bool
     size: float
     model_error: float
     reach: float = 1.0
@@ -50,14 +50,14 @@ class Order:
     @property
     def per_px(self) -> int:
         """Nodes of the image to a pixel."""
-        return 1 if self.share else FREE_PER_PX
+        return FREE_PER_PX if self.free else 1
 
     @property
     def name(self) -> str:
         """For the table of candidates."""
         if self.degree < 0:
             return "diffraction"
-        if not self.share:
+        if self.free:
             return f"free image, degree {self.degree}"
         within = "" if self.reach == 1 else f" within {self.reach:g} of the window"
         return f"diffraction, residual degree {self.degree} of {100 * self.size:g} %{within}"
@@ -89,20 +89,16 @@ class Selection:
     """The residual chosen, and how well it predicts.
 
     Attributes:
-        order: chosen, and ``candidates`` tried.
+        trial: chosen, and ``candidates`` tried.
         image: the residual on pixels, as wide as it is needed; a single zero for none.
-        sources: every shot's place and light.
-        compared: what it expects of positions that were left out.
-        held_out: its relative L2 error by colour there, noise included.
+        held_out: relative L2 error by colour at positions that were left out, noise included.
         error: of the kernel there, beside noise. relative_l2: what that makes of the kernel, mean over colours.
         support: how far these positions show its light.
     """
 
-    order: Order
+    trial: Trial
     candidates: tuple[Candidate, ...]
     image: Float[np.ndarray, "terms 3 rows columns"]
-    sources: Sources
-    compared: Compared
     held_out: Float[np.ndarray, "3"]
     error: KernelError
     relative_l2: float
@@ -124,11 +120,10 @@ class _Orders:
     def attempt(self, sources: Sources, order: Order) -> Attempt[Trial]:
         """Solve from all shots but those held out, and compare with these."""
         windows = self._windows(sources, order)
-        image = self._solve(windows.only(~self.test), order)
-        found = compare(self.shots, windows, windows.expected(order.share, image), self.test)
-        loss = found.loss(self.shots.position[self.test])
-        trial = Trial(order, sources, found, loss)
-        return Attempt(order.name, order.coefficients(self.shots.half), float(loss.mean()), trial)
+        light = windows.expected(order.free, self._solve(windows.only(~self.test), order))
+        found = compare(self.shots, windows, light, self.test)
+        trial = Trial(order, sources, found, found.loss(self.shots.position[self.test]))
+        return Attempt(order.name, order.coefficients(self.shots.half), float(trial.loss.mean()), trial)
 
     def image(self, trial: Trial, support: Support) -> Float[np.ndarray, "terms 3 rows columns"]:
         """The residual from all shots: beside diffraction as wide as it is needed, alone as far as light was seen."""
@@ -136,12 +131,11 @@ class _Orders:
         if order.degree < 0:
             return np.zeros((1, 3, 1, 1))
         image = self._solve(self._windows(trial.sources, order), order)[: polynomial_terms(order.degree)]
-        if order.share:
-            return about_middle(image, order.half_px(self.shots.half))
-        return about_middle(image[..., ::FREE_PER_PX, ::FREE_PER_PX], support.half_px)
+        half = support.half_px if order.free else order.half_px(self.shots.half)
+        return about_middle(image[..., :: order.per_px, :: order.per_px], half)
 
     def rising(
-        self, sources: Sources, share: float, sizes: Sequence[float], allowed: float, first: tuple[Attempt[Trial], ...]
+        self, sources: Sources, free: bool, sizes: Sequence[float], allowed: float, first: tuple[Attempt[Trial], ...]
     ) -> tuple[Attempt[Trial], ...]:
         """Rising degrees while they help, each of the size that predicts best; see ``engine.orders.rising``.
 
@@ -151,7 +145,7 @@ class _Orders:
         allowances = [allowed]
 
         def attempt(degree: int) -> Attempt[Trial]:
-            orders = (Order(degree, share, size, allowances[-1]) for size in sizes)
+            orders = (Order(degree, free, size, allowances[-1]) for size in sizes)
             best = choose(self.attempt(sources, order) for order in orders).best
             allowances.append(best.fit.compared.model_error)
             return best
@@ -180,14 +174,14 @@ class _Orders:
         """The residual's image. Terms of higher degrees are there, too, without room: all orders compile to one."""
         sigma = prior_sigma(self.magnitude, order.size, order.per_px)
         y, x = (np.abs(np.arange(nodes) - nodes // 2) for nodes in sigma.shape[1:])
-        half_rows, half_columns = (order.per_px * half for half in order.half_px(self.shots.half))
-        room = (y <= half_rows)[:, None] & (x <= half_columns)
+        rows, columns = (order.per_px * half for half in order.half_px(self.shots.half))
         terms = np.arange(self.basis.shape[1]) < polynomial_terms(order.degree)
-        sigmas = terms[:, None, None, None] * (sigma * room)
+        sigmas = terms[:, None, None, None] * (sigma * ((y <= rows)[:, None] & (x <= columns)))
         if order.degree < 0:
             return np.zeros_like(sigmas)
-        scaled, _ = solve_image(windows, sigmas, order.share, None if order.share else np.zeros_like(sigmas))
-        return np.asarray(image_of(scaled, sigmas, not order.share))
+        return np.asarray(
+            image_of(solve_image(windows, sigmas, order.free, np.zeros_like(sigmas))[0], sigmas, order.free)
+        )
 
 
 def select_field(
@@ -204,35 +198,33 @@ def select_field(
         shots: all of them. sources: their places and light under the diffraction model.
         explained: per unit of light, what diffraction brings to every sample.
         unit_positions: of all positions, scaled to about [-1, 1].
-        model_error: of diffraction alone, see ``psf.weights``.
+        model_error: of diffraction alone, see ``start.left_out``.
         rules: see there.
     """
     magnitude = _mean_kernel(shots, sources)
     test = held_out_positions(shots.positions)[shots.position]
     basis = np.asarray(polynomial_basis(unit_positions, rules.highest_degree))[shots.position]
     orders = _Orders(shots, explained, basis, magnitude, test, rules)
-    plain = orders.attempt(sources, Order(-1, 1.0, 0.0, model_error))
-    tried = orders.rising(sources, 1.0, rules.residual_sizes, plain.fit.compared.model_error, (plain,))
-    if np.sqrt((plain.fit.compared.relative_l2(shots.channel[test]) ** 2).mean()) > rules.doubtful:
+    channel = shots.channel[test]
+    plain = orders.attempt(sources, Order(-1, False, 0.0, model_error))
+    tried = orders.rising(sources, False, rules.residual_sizes, plain.fit.compared.model_error, (plain,))
+    if np.sqrt((plain.fit.compared.relative_l2(channel) ** 2).mean()) > rules.doubtful:
         linear = polynomial_terms(1) if polynomial_terms(1) <= shots.positions else 1
-        free = free_sources(shots, basis, linear, magnitude, rules.free_model_error)
-        tried += orders.rising(free, 0.0, (1.0,), rules.free_model_error, ())
+        free = free_sources(shots, basis, linear, magnitude, rules)
+        tried += orders.rising(free, True, (1.0,), rules.free_model_error, ())
     best = tried[0]
     for attempt in tried[1:]:
         best = attempt if orders.beats(attempt, best) else best
-    if best.fit.order.degree >= 0 and best.fit.order.share:
+    if best.fit.order.degree >= 0 and not best.fit.order.free:
         narrower = orders.narrowed(best)
         tried, best = (*tried, *(one for one in narrower if one is not best)), narrower[-1]
-    trial, channel = best.fit, shots.channel[test]
-    support = choose_support(trial.compared)
-    error = kernel_error(trial.compared, channel, trial.sources.pick(test))
+    compared = best.fit.compared
+    support, error = choose_support(compared), kernel_error(compared, channel, best.fit.sources.pick(test), rules)
     return Selection(
-        order=trial.order,
+        trial=best.fit,
         candidates=Choice(best, tried).candidates,
-        image=orders.image(trial, support),
-        sources=trial.sources,
-        compared=trial.compared,
-        held_out=trial.compared.relative_l2(channel),
+        image=orders.image(best.fit, support),
+        held_out=compared.relative_l2(channel),
         error=error,
         relative_l2=float(error.relative_l2(magnitude).mean()),
         support=support,
@@ -240,12 +232,9 @@ def select_field(
 
 
 def _mean_kernel(shots: Shots, sources: Sources) -> Float[np.ndarray, "3 rows columns"]:
-    """How large the kernel is on average, by colour: data over light, smoothed across the mosaic."""
-    colour = np.eye(3)[shots.channel] * (shots.weight > 0)[..., None]
-    total = sources.flux.sum(axis=0) / max(len(sources.flux), 1)
+    """How large the kernel is on average, by colour, on samples that any picture has."""
+    colour = shots.colour * (shots.weight > 0)[..., None]
     rate = np.abs(shots.rate - sources.background[:, None, None])
-    summed = np.einsum("syx,syxc->cyx", rate, colour)
-    kernel = (
-        summed / np.maximum(colour.sum(axis=0).transpose(2, 0, 1), 1) / np.maximum(np.abs(total), 1e-30)[:, None, None]
-    )
+    seen = np.maximum(colour.sum(axis=0), 1.0).transpose(2, 0, 1)
+    kernel = np.einsum("syx,syxc->cyx", rate, colour) / seen
     return kernel / np.maximum(kernel.sum(axis=(1, 2), keepdims=True), 1e-30)
