@@ -20,9 +20,9 @@ from udccal.fitting.geometry import fit_boards, read_geometry
 from udccal.fitting.geometry.data import BoardView
 from udccal.fitting.noise import fit_noise, nominal_noise, read_noise
 from udccal.fitting.nominal import nominal_geometry
-from udccal.fitting.psf.data import read_psf
+from udccal.fitting.psf.data import PsfRules
 from udccal.fitting.psf.fit import fit_psf
-from udccal.fitting.psf.start import PsfRules
+from udccal.fitting.psf.read import read_psf
 from udccal.fitting.wire import WireRules, fit_wire, read_wire, sensor_map
 from udccal.models.backscatter import Backscatter
 from udccal.models.geometry import Geometry
@@ -48,7 +48,7 @@ class FitEffort:
 
     Attributes:
         wire_samples: pixels that the wire's fields are fitted to.
-        psf: see ``udccal.fitting.psf.start.PsfRules``.
+        psf: see ``udccal.fitting.psf.data.PsfRules``.
         backscatter_positions: sensor positions that the footprint is fitted at.
         workers: with 2, psf and backscatter, which do not need each other, are fitted at once, in more memory.
     """

@@ -10,10 +10,10 @@ from jaxtyping import Float
 
 from tests.scenes.psf import DISC_PX, Picture, Scene, pictures, shots_of, small_scene
 from udccal.cfa import channel_map
-from udccal.fitting.psf.data import Shots
+from udccal.fitting.psf.data import PsfRules, Shots
+from udccal.fitting.psf.fit import start_model, start_prior
 from udccal.fitting.psf.image import Sources, prior_sigma, shifts
 from udccal.fitting.psf.orders import select_field
-from udccal.fitting.psf.start import PsfRules, start_model, start_prior
 from udccal.models.fields import polynomial_basis, polynomial_terms
 from udccal.numerics import in_float64
 

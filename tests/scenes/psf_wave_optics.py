@@ -10,9 +10,8 @@ from jaxtyping import Float
 
 from tests.scenes.psf import DISC_PX, FLUX, Picture, Scene, noise_of, shots_of
 from udccal.cfa import channel_map
-from udccal.fitting.psf.data import PsfData
+from udccal.fitting.psf.data import PsfData, PsfRules
 from udccal.fitting.psf.fit import fit_psf
-from udccal.fitting.psf.start import PsfRules
 from udccal.fitting.wire import wire_start
 from udccal.fitting.wire.parameters import ideal_wire
 from udccal.models.geometry import Geometry

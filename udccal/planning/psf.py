@@ -16,11 +16,11 @@ from jaxtyping import Float
 from udccal.arrangements import Led
 from udccal.cfa import channel_map
 from udccal.fitting.engine.gaussian import Prior, scaled_inverse
-from udccal.fitting.psf.data import Shots, held_out_positions
+from udccal.fitting.psf.data import PsfRules, Shots, held_out_positions
+from udccal.fitting.psf.fit import start_model, start_prior
 from udccal.fitting.psf.kernel import Evaluator, fit_lattice
 from udccal.fitting.psf.problem import DiffractionProblem, Place
 from udccal.fitting.psf.samples import Samples, choose_samples, gather, stands_for, weighed
-from udccal.fitting.psf.start import PsfRules, start_model, start_prior
 from udccal.numerics import in_float64
 from udccal.planning.design import DESIGN_VARIABLES
 from udccal.planning.forecast import Floor

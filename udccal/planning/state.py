@@ -46,7 +46,7 @@ class ModelErrors:
 
     Attributes:
         on_jig_px, by_hand_px: scatter of a board's corners by axis beside noise; None where not known.
-        wire, psf: relative error of the model; the psf's is what fit allows for, see ``fitting.psf.start.left_out``.
+        wire, psf: relative error of the model; the psf's is what fit allows for, see ``fitting.psf.data.left_out``.
         psf_kernel: relative L2 error of the kernel beside noise where it was not captured.
         backscatter: error of a ratio to white.
         inflation: of the variances of the backscatter's parameters, whose residuals hang together.

@@ -16,11 +16,12 @@ from tests.benchmarks.psf_kernels import kernel_and_slopes, light_and_slopes
 from tests.scenes.psf import Picture, Scene, pictures, shots_of, small_scene
 from udccal.fitting.engine.gaussian import Prior, scaled_inverse
 from udccal.fitting.engine.information import cramer_rao
+from udccal.fitting.psf.data import PsfRules
 from udccal.fitting.psf.diffraction import fit_diffraction
+from udccal.fitting.psf.fit import WAVELENGTHS_NM, start_model, start_prior
 from udccal.fitting.psf.kernel import Evaluator, fit_lattice
-from udccal.fitting.psf.problem import DiffractionProblem, coefficients_of, unit_light
-from udccal.fitting.psf.samples import Samples, gather, sensor_variance
-from udccal.fitting.psf.start import WAVELENGTHS_NM, PsfRules, start_model, start_prior
+from udccal.fitting.psf.problem import DiffractionProblem, coefficients_of
+from udccal.fitting.psf.samples import Samples, gather, sensor_variance, unit_light
 from udccal.numerics import in_float64
 
 _REALISATIONS = 100

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from tests.scenes.psf_wave_optics import COVERED, coverage
+from udccal.fitting.psf.data import PsfRules
 from udccal.fitting.psf.held_out import KernelError, estimate_kernel_error
-from udccal.fitting.psf.start import PsfRules
 
 SIZES = np.geomspace(1e-5, 1.0, 4000)
 

@@ -8,8 +8,8 @@ from scipy.special import softmax
 
 from tests.scenes.psf import Scene, pictures, shots_of, small_scene
 from udccal.fitting.engine.gaussian import Prior
-from udccal.fitting.psf.data import PsfData, Shots
-from udccal.fitting.psf.fit import fit_psf
+from udccal.fitting.psf.data import PsfData, PsfRules, Shots
+from udccal.fitting.psf.fit import WAVELENGTHS_NM, fit_psf, start_model, start_prior, wavelengths_nm
 from udccal.fitting.psf.kernel import (
     HEAD,
     PITCH,
@@ -21,9 +21,8 @@ from udccal.fitting.psf.kernel import (
     kernel_jacobian,
     overlaps_of,
 )
-from udccal.fitting.psf.problem import DiffractionProblem, Place, stepped, unit_light
-from udccal.fitting.psf.samples import gather
-from udccal.fitting.psf.start import WAVELENGTHS_NM, PsfRules, start_model, start_prior, wavelengths_nm
+from udccal.fitting.psf.problem import DiffractionProblem, Place, stepped
+from udccal.fitting.psf.samples import gather, unit_light
 from udccal.numerics import in_float64
 from udccal.result import FitStatus
 from udccal.rig import RigDescription

@@ -1,4 +1,9 @@
-"""What the psf fit works on: crops of merged LED pictures, the wire divided out, from a session or from arrays."""
+"""What the psf fit works on: its rules, crops of merged LED pictures, and the variance of their samples.
+
+What a model leaves out matters the more, relatively, the fainter a sample is: its standard deviation is taken as the
+model error times light^(3/4) peak^(1/4), e.g. at 10^-4 of the peak ten times the model error. The model error is that
+of greatest likelihood of the residuals, and none where that is no better by BIC.
+"""
 
 from __future__ import annotations
 
@@ -6,24 +11,92 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Final, final
 
-import equinox as eqx
 import numpy as np
-import scipy.ndimage
+import scipy.optimize
 from jaxtyping import Bool, Float, Int
 
-from udccal.cfa import channel_map
-from udccal.fitting.hdr.merge import HdrMerge, merge_bracket
-from udccal.fitting.psf.start import PsfRules
-from udccal.kernels import kernel_size
-from udccal.models.noise import Noise
-from udccal.models.wire import Wire, wire_values
-from udccal.sessions.schema import LedSubject, StoredStep
-from udccal.sessions.store import Session
+from udccal.fitting.engine.orders import bic
+from udccal.fitting.engine.robust import Huber
 
-# How far from its aim an LED is looked for.
-_SEARCH_PX: Final = 16
+HUBER: Final = Huber()
+Crops = Float[np.ndarray, "shots rows columns"]
 
-_wire_values = eqx.filter_jit(wire_values)
+
+@final
+@dataclass(frozen=True)
+class PsfRules:
+    """What the fit may spend, and its constants. More positions, shifts and samples are slower and more accurate.
+
+    Attributes:
+        positions, shifts: the most field positions, and pictures of each, in the fit of diffraction.
+        least_positions: the fewest field positions that are fitted.
+        half_px: largest window (rows, columns) to either side of the LED; the captured regions may bound it further.
+        close_px: the same for the fit of diffraction, whose time grows with it.
+        peak_half_px: all samples this close (rows, columns) to the LED go into the fit of diffraction.
+        far_fraction: of the samples farther away, this fraction does.
+        iterations: at most, of the fit of diffraction.
+        first_model_error: of diffraction, before residuals give it; it also keeps a fit that is still far off from
+            trusting the brightest samples alone.
+        spectrum_bend, spectrum_sigma: prior standard deviations of the logarithm of a spectrum: of its bend from node
+            to node, and about its start.
+        blur_px, blur_log_sigma: prior of the blur beside pixel and disc: its value, and the sigma of its logarithm.
+        wire_tolerance: part of the rig's tolerances that is left after the wire's fit.
+        pitch_tolerance: part of the pitch's tolerance that the fit may use; see ``start_prior``.
+        pitch_well_known: a pitch of larger relative tolerance takes more wavelengths to make up for it than daylight
+            has.
+        pitch_least_known: with a larger tolerance nothing is known of the pitch, and no fit is tried.
+        footprint_periods: prior sigma of the footprint's place on the rows, after the wire's fit.
+        picture_times: pictures whose mean squared residual is this many times the median picture's are outliers.
+        residual_sizes: prior sizes of a residual beside diffraction, as fractions of the kernel nearby.
+        highest_degree: of the residual's polynomials.
+        reaches: parts of the window that may be enough for a residual, the narrowest first.
+        worth: a higher order must lower the held-out loss of a sample by this (what is left of the samples then
+            narrows by an eighth) to be worth its ten thousand coefficients: every restoration pays for them. Pictures
+            held out have errors in common with the others: on a full-size rig of wave optics a residual gained 0.17,
+            and made the kernel at new places a fifth worse.
+        worth_of_room: the same for a wider residual, which costs less: no component more, only a larger one.
+        doubtful: beyond this relative L2 error of diffraction alone, an image without diffraction is tried too.
+        free_model_error: of such an image, before positions held out give it.
+        own_sigma: prior standard deviations of a shot's place, in px, and relative light, beside such an image:
+            centroids and sums of a crop's light are this good.
+        error_knee, error_power: priors of the kernel error's knee and power; the knee's sigma is of its logarithm.
+        poor: beyond this relative L2 error at positions held out the fit is poor.
+    """
+
+    positions: int = 10
+    shifts: int = 3
+    least_positions: int = 3
+    half_px: tuple[int, int] = (48, 16)
+    close_px: tuple[int, int] = (40, 14)
+    peak_half_px: tuple[int, int] = (12, 6)
+    far_fraction: float = 1 / 6
+    iterations: int = 30
+    first_model_error: float = 0.015
+    spectrum_bend: float = 1.0
+    spectrum_sigma: float = 5.0
+    blur_px: float = 0.1
+    blur_log_sigma: float = 1.0
+    wire_tolerance: float = 0.3
+    pitch_tolerance: float = 0.05
+    pitch_well_known: float = 0.02
+    pitch_least_known: float = 0.5
+    footprint_periods: float = 0.05
+    picture_times: float = 2.5
+    residual_sizes: tuple[float, ...] = (0.1, 0.03, 0.01)
+    highest_degree: int = 3
+    reaches: tuple[float, ...] = (0.25, 0.5)
+    worth: float = 0.25
+    worth_of_room: float = 0.05
+    doubtful: float = 0.05
+    free_model_error: float = 0.01
+    own_sigma: tuple[float, float] = (0.05, 0.03)
+    error_knee: tuple[float, float] = (0.3, 1.0)
+    error_power: tuple[float, float] = (0.75, 0.15)
+    poor: float = 0.2
+
+    def close(self, half: tuple[int, int]) -> tuple[int, int]:
+        """(rows, columns) to either side of the LED that diffraction is fitted to, of windows of this size."""
+        return min(half[0], self.close_px[0]), min(half[1], self.close_px[1])
 
 
 @final
@@ -45,10 +118,10 @@ class Shots:
     origin_px: Int[np.ndarray, "shots 2"]
     position: Int[np.ndarray, " shots"]
     disc_px: Float[np.ndarray, " shots"]
-    rate: Float[np.ndarray, "shots rows columns"]
-    weight: Float[np.ndarray, "shots rows columns"]
+    rate: Crops
+    weight: Crops
     channel: Int[np.ndarray, "shots rows columns"]
-    noise_per_rate: Float[np.ndarray, "shots rows columns"]
+    noise_per_rate: Crops
 
     @property
     def count(self) -> int:
@@ -137,141 +210,41 @@ class PsfData:
     clipped: int = 0
 
 
-def read_psf(session: Session, noise: Noise, wire: Wire, rules: PsfRules | None = None) -> PsfData:
-    """The LED pictures of the steps ``psf/...`` of a session, in windows as wide as a profile's kernel or the fit's.
+def left_out(light: Float[np.ndarray, "*shots n"], model_error: float) -> Float[np.ndarray, "*shots n"]:
+    """Standard deviation of what the model leaves out of samples that it expects to be this bright."""
+    size = np.maximum(light, 0.0)
+    return model_error * size**0.75 * size.max(axis=-1, keepdims=True) ** 0.25
 
-    Args:
-        session: brackets of an LED at field positions, each at some sub-pixel shifts.
-        noise: for merging brackets.
-        wire: divided out.
-        rules: how large windows may be.
 
-    Raises:
-        SessionError: when a file of the session is missing or damaged.
+def noise_at(
+    level: Float[np.ndarray, "*n"],
+    rate: Float[np.ndarray, "*n"],
+    measured: Float[np.ndarray, "*n"],
+    noise_per_rate: Float[np.ndarray, "*n"],
+) -> Float[np.ndarray, "*n"]:
+    """Variance of samples whose true rate is ``level``, if it was ``measured`` to be that of the ``rate`` found."""
+    change = noise_per_rate * (np.maximum(level, 0.0) - np.maximum(rate, 0.0))
+    # A sensor without read noise has no variance at all where no light is expected.
+    return np.maximum(measured + change, 1e-2 * measured)
+
+
+def estimate_model_error(
+    residual: Float[np.ndarray, " samples"],
+    variance: Float[np.ndarray, " samples"],
+    unit: Float[np.ndarray, " samples"],
+    parameters: int,
+) -> float:
+    """Model error of greatest likelihood; 0 where the noise alone explains the residuals as well, by BIC.
+
+    ``unit`` is the standard deviation that a model error of 1 adds to a sample. The residuals of a fit of so many
+    ``parameters`` are smaller than the errors; that is made up for. ``variance`` is of the sensor's noise.
     """
-    kernel, least = kernel_size(session.rig), (rules or PsfRules()).half_px
-    half = window_half(session, (max(kernel[0] // 2, least[0]), max(kernel[1] // 2, least[1])))
-    crops, aims, dark, clipped = [], [], 0, 0
-    steps = session.steps("psf")
-    for step in steps:
-        subject = step.subject
-        if not isinstance(subject, LedSubject):
-            continue
-        crop, full = _read_shot(session, step, subject, noise, half)
-        clipped += full
-        dark += crop is None and not full
-        if crop is not None:
-            crops.append(crop)
-            aims.append((subject.x_px, subject.y_px))
-    camera = session.rig.camera
-    shots = _without_wire(joined(crops, np.array(aims)), wire, camera.rows, camera.columns) if crops else None
-    return PsfData(shots, len(steps), dark, clipped)
+    raised = residual**2 * (residual.size / max(residual.size - parameters, 1))
 
+    def loss(model_error: float) -> float:
+        total = variance + (model_error * unit) ** 2
+        return float(np.sum(np.log(total) + HUBER.loss(np.sqrt(raised / total))))
 
-def window_half(session: Session, largest: tuple[int, int]) -> tuple[int, int]:
-    """(rows, columns) to either side of the LED that the regions captured can fill."""
-    regions = [c.region for step in session.steps("psf") for c in step.captures]
-    rows, columns = (min((getattr(r, name) for r in regions), default=0) for name in ("rows", "columns"))
-    return max(4, min(largest[0], rows // 2 - 4)), max(4, min(largest[1], columns // 2 - 4))
-
-
-def _without_wire(shots: Shots, wire: Wire, rows: int, columns: int) -> Shots:
-    """Rates divided by the wire's map of a sensor of ``rows`` x ``columns``."""
-    pixels = shots.offsets()[None] + shots.origin_px[:, None, None]
-    gains = np.stack([np.asarray(_wire_values(wire, p.reshape(-1, 2) * 1.0, rows, columns)) for p in pixels])
-    gain = gains.reshape(shots.rate.shape)
-    return replace(
-        shots, rate=shots.rate / gain, weight=shots.weight * gain**2, noise_per_rate=shots.noise_per_rate / gain
-    )
-
-
-def _read_shot(
-    session: Session, step: StoredStep, subject: LedSubject, noise: Noise, half: tuple[int, int]
-) -> tuple[Shots | None, bool]:
-    """The crop, and whether the LED is clipped in all exposures. Only the part about the aim is merged."""
-    region, aim = step.captures[0].region, (subject.x_px, subject.y_px)
-    down = _part(aim[1] - region.y, half[0] + _SEARCH_PX + 2, region.rows)
-    across = _part(aim[0] - region.x, half[1] + _SEARCH_PX + 2, region.columns)
-    captures = [c for c in step.captures if c.region == region]
-    frames = np.stack([session.frame(c)[down, across] for c in captures])
-    exposures_s = np.array([c.exposure_s for c in captures])
-    merged, corner = merge_bracket(frames, exposures_s, noise), (region.x + across.start, region.y + down.start)
-    # Without its brightest sample neither an LED's light nor its place is known.
-    clipped = (merged.used == 0) & (frames[int(np.argmin(exposures_s))] >= 0.98 * float(noise.saturation_DN))
-    # A hot pixel elsewhere is not the LED's.
-    if clipped[tuple(_part(aim[i] - corner[i], _SEARCH_PX, clipped.shape[1 - i]) for i in (1, 0))].any():
-        return None, True
-    # The pupil is a few mm behind the panel: less than a percent of any useful distance.
-    away_mm = subject.distance_mm + session.rig.mounting.standoff_mm.value
-    disc_px = subject.diameter_mm / away_mm * session.rig.focal_px
-    return cut_crop(merged, corner, aim, session.rig.camera.cfa, half, disc_px, shot_noise(merged, noise)), False
-
-
-def _part(aim: float, reach: int, size: int) -> slice:
-    """Even start, so that the pattern of the mosaic stays the sensor's."""
-    start = int(np.clip(np.floor(aim) - reach, 0, max(size - 2, 0))) // 2 * 2
-    return slice(start, int(np.clip(np.ceil(aim) + reach + 1, start + 2, size)))
-
-
-def cut_crop(
-    merged: HdrMerge,
-    corner_px: tuple[int, int],
-    aim_px: tuple[float, float],
-    cfa: str,
-    half: tuple[int, int],
-    disc_px: float,
-    noise_per_rate: Float[np.ndarray, "rows columns"] | None = None,
-) -> Shots | None:
-    """One shot about the LED, ``half`` (rows, columns) to either side; None when no light stands out near the aim.
-
-    ``merged`` is the bracket of a region whose first sample is ``corner_px`` (x, y; even); beside it samples have no
-    weight. The aim is on the sensor; ``disc_px`` is the diameter of the LED's image. Without ``noise_per_rate`` (see
-    ``shot_noise``) the merged sigma is taken as it is.
-    """
-    rate = merged.rate_e_per_s
-    weight = np.where(merged.used > 0, 1.0 / merged.sigma_e_per_s.astype(np.float64) ** 2, 0.0)
-    place = _brightest(rate, weight, np.asarray(aim_px) - corner_px)
-    if place is None:
-        return None
-    x, y = middle = np.round(place).astype(np.int64)
-    slope = np.zeros_like(rate) if noise_per_rate is None else noise_per_rate
-    parts = (np.pad(part, [2 * (h,) for h in half]) for part in (rate, weight, channel_map(cfa, *rate.shape), slope))
-    windows = (part[None, y : y + 2 * half[0] + 1, x : x + 2 * half[1] + 1] for part in parts)
-    where = (place + corner_px)[None], (middle + corner_px)[None], np.zeros(1, dtype=np.int64), np.array([disc_px])
-    return Shots(*where, *windows)
-
-
-def _brightest(
-    rate: Float[np.ndarray, "rows columns"], weight: Float[np.ndarray, "rows columns"], aim: Float[np.ndarray, "2"]
-) -> Float[np.ndarray, "2"] | None:
-    """(x, y) of the LED: centroid about the brightest 2 x 2 cell near the aim, or None when it is not there.
-
-    A cell holds every colour, so that the mosaic does not steer the search; hot pixels are too narrow to win it.
-    """
-    known = np.where(weight > 0, rate, 0.0)
-    cells = scipy.ndimage.uniform_filter(scipy.ndimage.median_filter(known, size=3) + 0.02 * known, size=3)
-    y, x = np.mgrid[: rate.shape[0], : rate.shape[1]]
-    near = (np.abs(x - aim[0]) <= _SEARCH_PX) & (np.abs(y - aim[1]) <= _SEARCH_PX)
-    if not near.any():
-        return None
-    row, column = np.unravel_index(np.argmax(np.where(near, cells, -np.inf)), rate.shape)
-    about = (np.abs(x - column) <= 2) & (np.abs(y - row) <= 2)
-    signal = np.maximum(known[about], 0.0)
-    noise = np.sqrt((1.0 / np.maximum(weight[about], 1e-300)).clip(max=1e24))
-    # An LED stands out of the noise by 8 sigma.
-    if signal.max(initial=0.0) < 8.0 * np.median(noise) or signal.sum() <= 0:
-        return None
-    return np.array([np.average(x[about], weights=signal), np.average(y[about], weights=signal)])
-
-
-def shot_noise(merged: HdrMerge, noise: Noise) -> Float[np.ndarray, "rows columns"]:
-    """How fast a merged sample's variance grows with its rate, in (e-/s)^2 per e-/s.
-
-    Variance (r + d) u + f u^2 is that of one exposure of 1/u seconds, f being what a dark sample has; a bracket is
-    taken for the single exposure that has its variance.
-    """
-    K, dark = float(np.asarray(noise.K_DN_per_e)), float(np.asarray(noise.dark_current_e_per_s))
-    floor = float(np.asarray(noise.sigma_d_e)) ** 2 + (float(np.asarray(noise.q_DN)) / K) ** 2 / 12.0
-    light, variance = np.maximum(merged.rate_e_per_s + dark, 0.0), merged.sigma_e_per_s**2
-    slope = 2.0 * variance / (light + np.sqrt(light**2 + 4.0 * floor * variance))
-    return np.where(merged.used > 0, slope, 0.0)
+    bounds = (np.log(1e-4), np.log(0.5))
+    found = scipy.optimize.minimize_scalar(lambda log: loss(float(np.exp(log))), bounds=bounds, method="bounded")
+    return float(np.exp(found.x)) if bic(float(found.fun), 1.0, residual.size) < loss(0.0) else 0.0

@@ -10,7 +10,6 @@ from typing import final
 
 import numpy as np
 from jaxtyping import Float
-from scipy.special import ndtr
 
 from udccal.fitting.engine.gaussian import Prior, scaled_inverse
 from udccal.fitting.engine.iteration_log import LOG
@@ -18,19 +17,19 @@ from udccal.fitting.engine.least_squares import Blocks, Solution, SolverRules, m
 from udccal.fitting.engine.misfit import clustered_cov
 from udccal.fitting.engine.orders import Attempt, Choice, bic, choose
 from udccal.fitting.engine.robust import OutlierRule, outliers
-from udccal.fitting.psf.data import Shots
+from udccal.fitting.psf.data import HUBER, PsfRules, Shots, estimate_model_error, left_out
 from udccal.fitting.psf.kernel import FOOTPRINT, Evaluator, fit_lattice
-from udccal.fitting.psf.problem import (
-    OWN,
-    DiffractionProblem,
-    Place,
-    coefficients_of,
-    moved_own,
-    own_equations,
+from udccal.fitting.psf.problem import DiffractionProblem, Place, coefficients_of
+from udccal.fitting.psf.samples import (
+    Lights,
+    Samples,
+    choose_samples,
+    gather,
+    sensor_variance,
+    stands_for,
     start_own,
+    weighed,
 )
-from udccal.fitting.psf.samples import Samples, choose_samples, gather, sensor_variance, stands_for, weighed
-from udccal.fitting.psf.start import HUBER, PsfRules, estimate_model_error, left_out
 from udccal.models.diffraction import Diffraction
 from udccal.models.geometry import Geometry
 from udccal.result import Outliers
@@ -44,7 +43,7 @@ class DiffractionFit:
     Attributes:
         problem, solution: the equations, and where they ended.
         shots: what was fitted, at the places that the samples are about.
-        model_error: as a fraction of the peak, see ``start.left_out``; 0 where the residuals are noise.
+        model_error: as a fraction of the peak, see ``data.left_out``; 0 where the residuals are noise.
         outliers: what was left out.
         iterations: of all descents together.
         phase: with the wire's phase or averaged over it, by BIC; the fits are its strength in the kernel (1 where the
@@ -91,7 +90,7 @@ class DiffractionFit:
         dof = max(self.problem.used - self.problem.unknowns, 1)
         return (self.solution.equations.cost - self.problem.prior.cost(self.theta)) / dof
 
-    def errors(self) -> Float[np.ndarray, "positions shots n"]:
+    def errors(self) -> Lights:
         """Data less expectation in units of sigma."""
         return self.problem.errors(self.solution.place, self.problem.light_at(self.solution.place))
 
@@ -178,15 +177,14 @@ def _reweighed(
     samples, light, background = problem.samples, problem.light_at(place), place.own[..., 5:]
     seen, level = np.asarray(samples.known) > 0, light + background
     of_samples = (np.asarray(samples.rate) - level, sensor_variance(samples, level), left_out(light * seen, 1.0))
-    model_error = estimate_model_error(*(part[seen] for part in of_samples), problem.unknowns)
+    residual, variance, unit = (part[seen] for part in of_samples)
+    model_error = estimate_model_error(residual, variance, unit, problem.unknowns)
     problem = replace(problem, samples=weighed(samples, model_error, light, background))
     kept, found = without_outliers(problem.samples, problem.errors(place, light), rules)
     return replace(problem, samples=kept), model_error, found
 
 
-def without_outliers(
-    samples: Samples, z: Float[np.ndarray, "positions shots n"], rules: PsfRules
-) -> tuple[Samples, tuple[Outliers, ...]]:
+def without_outliers(samples: Samples, z: Lights, rules: PsfRules) -> tuple[Samples, tuple[Outliers, ...]]:
     """Samples in which outliers have no weight, and what was left out: pictures first, then samples of the others.
 
     ``z`` is data less expectation in units of sigma. A picture that fits so much worse than the others shows that
@@ -230,57 +228,6 @@ def phase_evidence(fit: DiffractionFit) -> Choice[tuple[float, float]]:
     return choose(
         Attempt(f"diffraction {n} (BIC)", k, bic(cost, float(k), here.samples), found) for n, k, cost in orders
     )
-
-
-def explain(
-    problem: DiffractionProblem, theta: Float[np.ndarray, " p"], shots: Shots, geometry: Geometry, model_error: float
-) -> tuple[Float[np.ndarray, "shots l"], Float[np.ndarray, "shots rows columns"]]:
-    """What diffraction brings to whole crops: own parameters of all shots, with (x, y) on the sensor; unit light.
-
-    Args:
-        problem, theta: of the fit.
-        shots: all there are.
-        geometry: where pixels look.
-        model_error: allowed for beside noise.
-    """
-    evaluator = replace(problem.evaluator, lattice=fit_lattice(shots.half))
-    samples = weighed(gather(shots, geometry, np.ones(shots.rate.shape, dtype=bool)), model_error)
-    coefficients = coefficients_of(evaluator, theta, samples)
-    own = start_own(evaluator, samples, coefficients)
-    for _ in range(3):
-        matrix, right, _ = (np.asarray(part) for part in own_equations(evaluator, samples, own, coefficients))
-        own = moved_own(own, np.einsum("pslm,psm->psl", scaled_inverse(matrix, 1e-14), right))
-    unit = np.asarray(own_equations(evaluator, samples, own, coefficients)[2])
-    index = np.asarray(samples.index)
-    found, explained = np.zeros((shots.count, OWN)), np.zeros(shots.rate.shape)
-    found[index[index >= 0]] = own[index >= 0]
-    explained[index[index >= 0]] = unit[index >= 0].reshape(-1, *shots.rate.shape[1:])
-    found[:, :2] += shots.centre_px
-    return found, explained
-
-
-def pattern_p_value(samples: Samples, z: Float[np.ndarray, "positions shots n"]) -> float:
-    """Probability of residuals at least as alike in different pictures of a position, were they noise.
-
-    Each picture has its own noise, and each samples the kernel at its own fraction of a pixel. Residuals of samples of
-    one colour that see the same place of the kernel in two pictures, within a pixel, are therefore uncorrelated unless
-    the model is wrong there; the mean of their products, in units of its standard error, is normal. Means of groups
-    (``engine.misfit``) hold squares besides, which are no evidence and hide what two pictures have in common.
-    ``z`` is data less expectation, in units of sigma.
-    """
-    z = np.clip(z, -HUBER.sigma, HUBER.sigma)
-    cell = np.concatenate(
-        [np.floor(np.asarray(samples.points)), np.asarray(samples.colour).argmax(axis=-1)[..., None]], axis=-1
-    ).astype(np.int64)
-    position = np.broadcast_to(np.arange(len(z))[:, None, None, None], (*z.shape, 1))
-    number = np.unique(np.concatenate([position, cell], axis=-1).reshape(-1, 4), axis=0, return_inverse=True)[1]
-    shot = np.broadcast_to(np.arange(z.shape[1])[:, None], z.shape).ravel()
-    sums, squares = (np.zeros((int(number.max()) + 1, z.shape[1])) for _ in range(2))
-    np.add.at(sums, (number.reshape(-1), shot), z.ravel())
-    np.add.at(squares, (number.reshape(-1), shot), z.ravel() ** 2)
-    # Of pairs of different pictures alone.
-    total, variance = (float((part.sum(axis=1) ** 2 - (part**2).sum(axis=1)).sum()) / 2.0 for part in (sums, squares))
-    return float(ndtr(-total / np.sqrt(variance))) if variance > 0 else 1.0
 
 
 def efficiency(fit: DiffractionFit, rules: PsfRules, available: int, reported: int) -> float:

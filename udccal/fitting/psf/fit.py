@@ -8,17 +8,20 @@ were left out, and how far from the LED these show the kernel's light.
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Final
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 
-from udccal.fitting.psf.data import PsfData, Shots, about_middle, held_out_positions
-from udccal.fitting.psf.diffraction import explain, fit_diffraction
+from udccal.fitting.engine.gaussian import Prior
+from udccal.fitting.psf.data import PsfData, PsfRules, Shots, about_middle, held_out_positions
+from udccal.fitting.psf.diffraction import fit_diffraction
 from udccal.fitting.psf.held_out import Support, choose_support, compare
 from udccal.fitting.psf.image import Sources, make_windows, predict
+from udccal.fitting.psf.kernel import HEAD, pack
 from udccal.fitting.psf.orders import select_field
+from udccal.fitting.psf.problem import explain
 from udccal.fitting.psf.report import as_numpy, report
-from udccal.fitting.psf.start import PsfRules, pitch_tolerance, start_model, start_prior
 from udccal.kernels import kernel_size, kernels_at
 from udccal.models.diffraction import Diffraction
 from udccal.models.geometry import Geometry
@@ -27,6 +30,8 @@ from udccal.models.wire import Wire
 from udccal.numerics import in_float64
 from udccal.result import FitResult, FitStatus
 from udccal.rig import RigDescription
+
+WAVELENGTHS_NM: Final = np.linspace(400.0, 700.0, 13)
 
 
 @in_float64
@@ -158,3 +163,83 @@ def with_support(term: PsfField, support: Support, rig: RigDescription) -> PsfFi
     onward = (seen and bool(term.diffraction_share) for seen in support.open_ended)
     down, across = (most if on else half for half, on, most in zip(support.half_px, onward, size, strict=True))
     return replace(term, support_px=np.array([across, down], dtype=np.float64))
+
+
+def start_model(rig: RigDescription, geometry: Geometry, wire: Wire, rules: PsfRules | None = None) -> Diffraction:
+    """The rig's nominal panel and pupil, or the wire's where the wire shows; the spectra of common colour filters.
+
+    Args:
+        rig: the panel and the lens as described.
+        geometry: has the pupil's place, in mm.
+        wire: its numbers are in pitches of the panel.
+        rules: the blur, and which pitches are well known.
+    """
+    panel, pitch, rules = rig.panel, rig.panel.pitch_mm.value, rules or PsfRules()
+    nodes = wavelengths_nm(rig, rules)
+    responses = np.exp(-0.5 * ((nodes - np.array([[600.0], [535.0], [460.0]])) / 45.0) ** 2) + 1e-3
+    pupil = np.asarray(geometry.pupil, dtype=np.float64)
+    if seen := wire_shows(wire):
+        opened, offset = (wire.column_open, wire.row_open), wire.offset
+        lengths = (wire.depth_per_pitch, wire.pupil_per_pitch, wire.standoff_per_pitch)
+    else:
+        opened, offset = (panel.column_open_fraction.value, panel.row_open_fraction.value), pupil[:2] / pitch
+        lengths = (panel.structure_thickness_mm.value / pitch, rig.pupil_mm / pitch, -pupil[2] / pitch)
+    return Diffraction(
+        pitch_mm=np.float64(pitch),
+        open_fraction=np.array([float(part) for part in opened]),
+        thickness_mm=np.float64(float(lengths[0]) * pitch),
+        pupil_mm=np.float64(float(lengths[1]) * pitch),
+        blur_px=np.float64(rules.blur_px),
+        offset=np.asarray(offset, dtype=np.float64),
+        standoff_per_pitch=np.float64(float(lengths[2])),
+        visibility=np.float64(seen),
+        wavelengths_nm=nodes,
+        spectrum=responses / responses.sum(axis=1, keepdims=True),
+    )
+
+
+def wire_shows(wire: Wire) -> bool:
+    """Whether the wire fit saw the rows: only then is it known where the pupil's footprint lies on them."""
+    return np.shape(wire.harmonics)[0] > 0
+
+
+def wavelengths_nm(rig: RigDescription, rules: PsfRules) -> Float[np.ndarray, " nodes"]:
+    """Nodes of the spectra: daylight's, or what it looks like behind a panel whose pitch is off by its tolerance."""
+    relative = min(pitch_tolerance(rig), rules.pitch_least_known)
+    if relative <= rules.pitch_well_known:
+        return WAVELENGTHS_NM
+    first, last = WAVELENGTHS_NM[0] * (1 - relative), WAVELENGTHS_NM[-1] * (1 + relative)
+    return np.linspace(first, last, round((last - first) / (WAVELENGTHS_NM[1] - WAVELENGTHS_NM[0])) + 1)
+
+
+def pitch_tolerance(rig: RigDescription) -> float:
+    """Of the pitch, relatively: the psf measures all lengths in pitches."""
+    return rig.panel.pitch_mm.tolerance / rig.panel.pitch_mm.value
+
+
+def start_prior(rig: RigDescription, start: Diffraction, rules: PsfRules | None = None) -> Prior:
+    """Tolerances of the rig on the panel's numbers, tighter where the wire has measured them; smooth spectra.
+
+    Diffraction shows wavelength / pitch only. The pitch is therefore held where the rig has it, and the spectra are
+    free to move: a pitch that is off by its tolerance then comes out as wavelengths that are.
+
+    Args:
+        rig: its tolerances are taken for standard deviations.
+        start: the mean; its ``visibility`` says whether the wire has measured the panel's numbers.
+        rules: how much tighter, and the sigmas of what the rig does not describe.
+    """
+    panel, theta, rules = rig.panel, pack(start), rules or PsfRules()
+    tighter = rules.wire_tolerance if start.visibility else 1.0
+    sigma = [
+        rules.pitch_tolerance * min(panel.pitch_mm.tolerance, rules.pitch_well_known * panel.pitch_mm.value),
+        tighter * panel.column_open_fraction.tolerance,
+        tighter * panel.row_open_fraction.tolerance,
+        tighter * panel.structure_thickness_mm.tolerance,
+        tighter * 2.0 * rig.pupil_mm * rig.lens.f_number.tolerance / rig.lens.f_number.value,
+        rules.blur_log_sigma,
+        *(3 * (rules.footprint_periods,)),
+    ]
+    roots = [np.eye(HEAD, theta.size) / np.maximum(np.array(sigma), 1e-6)[:, None]]
+    for pick in np.eye(theta.size)[HEAD:].reshape(3, -1, theta.size):
+        roots += [np.diff(pick, 2, axis=0) / rules.spectrum_bend, pick / rules.spectrum_sigma]
+    return Prior(theta.copy(), np.concatenate(roots))

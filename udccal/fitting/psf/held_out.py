@@ -13,9 +13,8 @@ import scipy.optimize
 from jaxtyping import Bool, Float, Int
 
 from udccal.fitting.engine.orders import Attempt, Choice, bic, choose
-from udccal.fitting.psf.data import Shots
+from udccal.fitting.psf.data import HUBER, Crops, PsfRules, Shots, estimate_model_error, noise_at
 from udccal.fitting.psf.image import Sources, Windows
-from udccal.fitting.psf.start import HUBER, PsfRules, estimate_model_error, noise_at
 from udccal.result import Candidate
 
 
@@ -32,16 +31,16 @@ class Compared:
         model_error: the one under which the residuals are most likely.
     """
 
-    residual: Float[np.ndarray, "shots rows columns"]
-    light: Float[np.ndarray, "shots rows columns"]
-    measured: Float[np.ndarray, "shots rows columns"]
-    variance: Float[np.ndarray, "shots rows columns"]
-    left_out: Float[np.ndarray, "shots rows columns"]
+    residual: Crops
+    light: Crops
+    measured: Crops
+    variance: Crops
+    left_out: Crops
     known: Bool[np.ndarray, "shots rows columns"]
     model_error: float
 
     @property
-    def total(self) -> Float[np.ndarray, "shots rows columns"]:
+    def total(self) -> Crops:
         """Variance with the model error."""
         return self.variance + (self.model_error * self.left_out) ** 2
 
@@ -67,9 +66,7 @@ class Compared:
         return np.array([by_shot[position == place].mean() for place in places]) if len(places) > 1 else by_shot
 
 
-def compare(
-    shots: Shots, windows: Windows, light: Float[np.ndarray, "shots rows columns"], pick: np.ndarray
-) -> Compared:
+def compare(shots: Shots, windows: Windows, light: Crops, pick: np.ndarray) -> Compared:
     """The data of the shots picked, and the ``light`` (e-/s) that is expected of all."""
     parts = (windows.rate, shots.weight, shots.noise_per_rate, windows.left_out, light)
     rate, weight, slope, one, light = (np.asarray(part)[pick] for part in parts)

@@ -26,11 +26,11 @@ import scipy.linalg
 import scipy.ndimage
 from jaxtyping import Array, Bool, Float
 
-from udccal.fitting.psf.data import Shots
-from udccal.fitting.psf.start import PsfRules, left_out, noise_at
+from udccal.fitting.psf.data import Crops, PsfRules, Shots, left_out, noise_at
 from udccal.models.arrays import Arrayish
 
 FREE_PER_PX: Final = 2
+Image = Float[Arrayish, "terms 3 node_rows node_columns"]
 
 
 @final
@@ -46,7 +46,7 @@ class Sources:
         """The shots selected by an index or mask."""
         return Sources(self.place_px[keep], self.flux[keep], self.background[keep])
 
-    def with_light_of_peak(self, shots: Shots, explained: Float[np.ndarray, "shots rows columns"]) -> Sources:
+    def with_light_of_peak(self, shots: Shots, explained: Crops) -> Sources:
         """Light from unweighted least squares: set by the peak, where relative weights listen to the wings."""
         colour = shots.colour * (shots.weight > 0)[..., None]
         rate = shots.rate - self.background[:, None, None]
@@ -65,7 +65,7 @@ class Windows(eqx.Module):
         colour: one-hot.
         explained: per unit of light, what diffraction brings to each sample.
         rate: e-/s without background.
-        left_out: what a model error of 1 would add to the rate's standard deviation; see ``start.left_out``.
+        left_out: what a model error of 1 would add to the rate's standard deviation; see ``data.left_out``.
         weight: inverse variance of the rate that solutions go by, 0 where nothing is known.
     """
 
@@ -83,9 +83,7 @@ class Windows(eqx.Module):
         """With no weight on the other shots: of one shape whichever are kept, compiled but once."""
         return replace(self, weight=self.weight * keep[:, None, None])
 
-    def expected(
-        self, free: bool, image: Float[np.ndarray, "terms 3 node_rows node_columns"]
-    ) -> Float[np.ndarray, "shots rows columns"]:
+    def expected(self, free: bool, image: Image) -> Crops:
         """What an image brings to each sample, and diffraction unless it is ``free``, in e-/s."""
         unit = np.asarray(predict(self, image)) + (0.0 if free else np.asarray(self.explained))
         return unit * np.asarray(self.flux)
@@ -94,7 +92,7 @@ class Windows(eqx.Module):
 def make_windows(
     shots: Shots,
     sources: Sources,
-    explained: Float[np.ndarray, "shots rows columns"],
+    explained: Crops,
     basis: Float[np.ndarray, "shots terms"],
     model_error: float,
     per_px: int = 1,
@@ -158,9 +156,7 @@ def prior_sigma(
 
 
 @eqx.filter_jit
-def predict(
-    windows: Windows, image: Float[Arrayish, "terms 3 node_rows node_columns"]
-) -> Float[Array, "shots rows columns"]:
+def predict(windows: Windows, image: Image) -> Float[Array, "shots rows columns"]:
     """What an image brings to each sample per unit of light."""
 
     def one(shot: tuple[Array, Array, Array, Array]) -> Float[Array, "rows columns"]:
@@ -189,24 +185,13 @@ class Moves(eqx.Module):
 
 @eqx.filter_jit
 def solve_image(
-    windows: Windows,
-    sigma: Float[Arrayish, "terms 3 node_rows node_columns"],
-    free: bool,
-    start: Float[Arrayish, "terms 3 node_rows node_columns"],
-    moves: Moves | None = None,
-) -> tuple[Float[Array, "terms 3 node_rows node_columns"], Float[Array, "shots 5"]]:
-    """Ridge estimate of an image, beside diffraction or ``free`` of it.
+    windows: Windows, sigma: Image, free: bool, start: Image, moves: Moves | None = None
+) -> tuple[Image, Float[Array, "shots 5"]]:
+    """Ridge estimate of an image, beside diffraction or ``free`` of it, and by how much own parameters are changed now.
 
-    Args:
-        windows: the data.
-        sigma: prior standard deviations of the image, before it is smoothed.
-        free: whether the image carries the whole kernel.
-        start: in units of ``sigma``. The prior is about what is added: about the whole, it would trade a smaller image
-            for brighter LEDs.
-        moves: places and light of the shots, which are estimated along; None where they stay.
-
-    Returns:
-        (image in units of ``sigma``, for ``image_of``; by how much each shot's own parameters are changed now).
+    The image, like its ``start``, is in units of ``sigma``, its prior standard deviations; see ``image_of``. The prior
+    is about what is added: about the whole, it would trade a smaller image for brighter LEDs. Where there are
+    ``moves``, places and light of the shots are estimated along.
     """
     sigma, start, flux, weight = (jnp.asarray(part) for part in (sigma, start, windows.flux, windows.weight))
     data = jnp.asarray(windows.rate) - (0.0 if free else flux * jnp.asarray(windows.explained))
@@ -221,10 +206,10 @@ def solve_image(
     def by_own(own: Float[Array, "shots 5"]) -> Float[Array, "shots rows columns"] | float:
         return 0.0 if moves is None else jnp.einsum("spyx,sp->syx", moves.design, own)
 
-    def forward(scaled: Float[Array, "terms 3 node_rows node_columns"]) -> Float[Array, "shots rows columns"]:
+    def forward(scaled: Image) -> Float[Array, "shots rows columns"]:
         return flux * predict(windows, image_of(scaled, sigma, free))
 
-    def backward(light: Float[Array, "shots rows columns"]) -> Float[Array, "terms 3 node_rows node_columns"]:
+    def backward(light: Float[Array, "shots rows columns"]) -> Image:
         return jax.linear_transpose(forward, start)(weight * (light - by_own(own_of(light))))[0]
 
     if moves is not None:
@@ -240,11 +225,7 @@ def solve_image(
     return start + added, own_of(data - forward(start + added))
 
 
-def image_of(
-    scaled: Float[Arrayish, "terms 3 node_rows node_columns"],
-    sigma: Float[Arrayish, "terms 3 node_rows node_columns"],
-    free: bool,
-) -> Float[Array, "terms 3 node_rows node_columns"]:
+def image_of(scaled: Image, sigma: Image, free: bool) -> Image:
     """The image: what has the prior's standard deviations, smoothed by a Gaussian of one node where it is free."""
     image = jnp.asarray(scaled) * jnp.asarray(sigma)
     if not free:
@@ -290,14 +271,14 @@ def _moves(
     shots: Shots,
     sources: Sources,
     windows: Windows,
-    image: Float[np.ndarray, "terms 3 node_rows node_columns"],
+    image: Image,
     changed: Float[np.ndarray, "shots 5"],
     rules: PsfRules,
 ) -> Moves:
     """About ``sources``, at which places and light have been ``changed`` by so much."""
     x, y = (sources.place_px - shots.origin_px).T
 
-    def at(right: float, below: float) -> Float[np.ndarray, "shots rows columns"]:
+    def at(right: float, below: float) -> Crops:
         down = shifts(y + below, shots.disc_px, shots.rate.shape[1], FREE_PER_PX)
         across = shifts(x + right, shots.disc_px, shots.rate.shape[2], FREE_PER_PX)
         return np.asarray(predict(replace(windows, down=down, across=across), image))

@@ -201,11 +201,11 @@ def factor_jacobian(evaluator: Evaluator, theta: Float[Array, " p"], frame: Loca
     """
 
     def factors(head: Float[Array, " head"]) -> Float[Array, " factors"]:
-        model = evaluator.model(jnp.concatenate([head, theta[HEAD:]]))
+        model = evaluator.model(jnp.concatenate([head, jnp.asarray(theta)[HEAD:]]))
         opened, place = open_fractions(model, frame), footprint_place(model, frame)
         return jnp.stack([*opened, head[PITCH], head[PUPIL], *place, head[BLUR]])
 
-    return jax.jacfwd(factors)(theta[:HEAD])
+    return jax.jacfwd(factors)(jnp.asarray(theta)[:HEAD])
 
 
 def _slits(

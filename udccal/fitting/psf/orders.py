@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from udccal.fitting.engine.orders import Attempt, Choice, choose, held_out_beats, rising
-from udccal.fitting.psf.data import Shots, about_middle, held_out_positions
+from udccal.fitting.psf.data import Crops, PsfRules, Shots, about_middle, held_out_positions
 from udccal.fitting.psf.held_out import Compared, KernelError, Support, choose_support, compare, kernel_error
 from udccal.fitting.psf.image import (
     FREE_PER_PX,
@@ -23,7 +23,6 @@ from udccal.fitting.psf.image import (
     prior_sigma,
     solve_image,
 )
-from udccal.fitting.psf.start import PsfRules
 from udccal.models.fields import polynomial_basis, polynomial_terms
 from udccal.result import Candidate
 
@@ -37,7 +36,7 @@ class Order:
         degree: of its polynomials, -1 for none.
         free: whether it carries the whole kernel, without diffraction.
         size: its standard deviation beforehand, as a fraction of the kernel nearby.
-        model_error: what solutions allow for, see ``start.left_out``.
+        model_error: what solutions allow for, see ``data.left_out``.
         reach: of the window, so large a part has a residual, about the source.
     """
 
@@ -111,7 +110,7 @@ class _Orders:
     """All shots with what diffraction ``explained`` of them per unit of light; ``magnitude`` of the mean kernel."""
 
     shots: Shots
-    explained: Float[np.ndarray, "shots rows columns"]
+    explained: Crops
     basis: Float[np.ndarray, "shots terms"]
     magnitude: Float[np.ndarray, "3 rows columns"]
     test: Bool[np.ndarray, " shots"]
@@ -187,19 +186,15 @@ class _Orders:
 def select_field(
     shots: Shots,
     sources: Sources,
-    explained: Float[np.ndarray, "shots rows columns"],
+    explained: Crops,
     unit_positions: Float[np.ndarray, "positions 2"],
     model_error: float,
     rules: PsfRules,
 ) -> Selection:
     """Try no residual, then residuals of rising degree while they help; if diffraction fails, do without it.
 
-    Args:
-        shots: all of them. sources: their places and light under the diffraction model.
-        explained: per unit of light, what diffraction brings to every sample.
-        unit_positions: of all positions, scaled to about [-1, 1].
-        model_error: of diffraction alone, see ``start.left_out``.
-        rules: see there.
+    ``sources``, ``explained`` (light per unit) and ``model_error`` are those of diffraction; ``unit_positions`` is
+    where the field positions lie, scaled to about [-1, 1].
     """
     magnitude = _mean_kernel(shots, sources)
     test = held_out_positions(shots.positions)[shots.position]

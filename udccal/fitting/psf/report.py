@@ -8,16 +8,17 @@ from typing import Final
 
 import numpy as np
 from jaxtyping import Float
+from scipy.special import ndtr
 
 from udccal.fitting.engine.gaussian import Posterior, square_root
 from udccal.fitting.engine.misfit import SIGNIFICANT
 from udccal.fitting.engine.report import estimates, residual_sample
-from udccal.fitting.psf.data import PsfData
-from udccal.fitting.psf.diffraction import DiffractionFit, efficiency, kernel_sigma, pattern_p_value
+from udccal.fitting.psf.data import HUBER, PsfData, PsfRules
+from udccal.fitting.psf.diffraction import DiffractionFit, efficiency, kernel_sigma
 from udccal.fitting.psf.held_out import KernelError, Support
 from udccal.fitting.psf.kernel import BLUR
 from udccal.fitting.psf.orders import Selection
-from udccal.fitting.psf.start import PsfRules, pitch_tolerance
+from udccal.fitting.psf.samples import Lights, Samples
 from udccal.kernels import kernel_size, kernels_at
 from udccal.models.diffraction import Diffraction
 from udccal.models.fields import polynomial_basis
@@ -47,7 +48,7 @@ def report(
         status = FitStatus.POOR_FIT
     elif diffracts and not fit.converged:
         status = FitStatus.NOT_CONVERGED
-    cov, tolerance = fit.cov(), pitch_tolerance(rig)
+    cov, tolerance = fit.cov(), rig.panel.pitch_mm.tolerance / rig.panel.pitch_mm.value
     numbers, cov_of_numbers = _estimates(fit, selection, cov, tolerance)
     errors, held_out = fit.errors(), selection.trial.compared.errors()
     used, pattern_p = np.asarray(samples.weight) > 0, pattern_p_value(samples, errors)
@@ -60,16 +61,12 @@ def report(
         cov=cov_of_numbers,
         chi2_dof=fit.chi2_dof if diffracts else float(np.mean(held_out**2)),
         samples=fit.problem.used if diffracts else len(held_out),
-        candidates=(
-            *(fit.phase.candidates if fit.phase else ()),
-            *selection.candidates,
-            *selection.support.candidates,
-        ),
+        candidates=(*(fit.phase.candidates if fit.phase else ()), *selection.candidates, *selection.support.candidates),
         diagnostics=_diagnostics(data, fit, selection, pattern_p, rules),
         notes=_notes(data, selection, term, pattern_p),
         outliers=fit.outliers,
         residuals=residual_sample(places, errors[used]) if diffracts else None,
-        posterior=_posterior(fit, selection, term, rig, cov),
+        posterior=_posterior(fit, selection, term, rig, cov, tolerance),
     )
 
 
@@ -91,7 +88,12 @@ def _estimates(
 
 
 def _posterior(
-    fit: DiffractionFit, selection: Selection, term: PsfField, rig: RigDescription, cov: Float[np.ndarray, "p p"]
+    fit: DiffractionFit,
+    selection: Selection,
+    term: PsfField,
+    rig: RigDescription,
+    cov: Float[np.ndarray, "p p"],
+    pitch_tolerance: float,
 ) -> Posterior[PsfField]:
     """Of the parameters of diffraction, of the pitch, and of what the kernel is off by beside noise.
 
@@ -104,7 +106,7 @@ def _posterior(
     factor = np.zeros((count + 1 + patterns, count + 1 + patterns))
     if not selection.trial.order.free:
         factor[:count, :count] = square_root(cov)
-        factor[count, count] = pitch_tolerance(rig)
+        factor[count, count] = pitch_tolerance
     factor[count + 1 :, count + 1 :] = np.eye(patterns) / np.sqrt(max(patterns, 1))
     # No more is held than is needed: a result lives long, and what was fitted is large.
     size_and_signs = cache(lambda: _error_patterns(term, error, rig, patterns))
@@ -145,6 +147,30 @@ def _error_patterns(
 def as_numpy(model: Diffraction) -> Diffraction:
     """The model with numpy leaves."""
     return Diffraction(*(np.asarray(getattr(model, name), np.float64) for name in Diffraction.__dataclass_fields__))
+
+
+def pattern_p_value(samples: Samples, z: Lights) -> float:
+    """Probability of residuals at least as alike in different pictures of a position, were they noise.
+
+    Each picture has its own noise, and each samples the kernel at its own fraction of a pixel. Residuals of samples of
+    one colour that see the same place of the kernel in two pictures, within a pixel, are therefore uncorrelated unless
+    the model is wrong there; the mean of their products, in units of its standard error, is normal. Means of groups
+    (``engine.misfit``) hold squares besides, which are no evidence and hide what two pictures have in common.
+    ``z`` is data less expectation, in units of sigma.
+    """
+    z = np.clip(z, -HUBER.sigma, HUBER.sigma)
+    cell = np.concatenate(
+        [np.floor(np.asarray(samples.points)), np.asarray(samples.colour).argmax(axis=-1)[..., None]], axis=-1
+    ).astype(np.int64)
+    position = np.broadcast_to(np.arange(len(z))[:, None, None, None], (*z.shape, 1))
+    number = np.unique(np.concatenate([position, cell], axis=-1).reshape(-1, 4), axis=0, return_inverse=True)[1]
+    shot = np.broadcast_to(np.arange(z.shape[1])[:, None], z.shape).ravel()
+    sums, squares = (np.zeros((int(number.max()) + 1, z.shape[1])) for _ in range(2))
+    np.add.at(sums, (number.reshape(-1), shot), z.ravel())
+    np.add.at(squares, (number.reshape(-1), shot), z.ravel() ** 2)
+    # Of pairs of different pictures alone.
+    total, variance = (float((part.sum(axis=1) ** 2 - (part**2).sum(axis=1)).sum()) / 2.0 for part in (sums, squares))
+    return float(ndtr(-total / np.sqrt(variance))) if variance > 0 else 1.0
 
 
 def support_notes(term: PsfField, support: Support) -> tuple[str, ...]:

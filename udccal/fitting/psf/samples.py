@@ -1,9 +1,12 @@
-"""The samples of all field positions that a fit of diffraction goes by, and what they count for."""
+"""The samples of all field positions: what they count for, the light of a kernel, and each shot's own parameters.
+
+Own parameters of a shot are (x, y) in px from the place first assumed, light per colour and background in e-/s.
+"""
 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import final
+from typing import Final, final
 
 import equinox as eqx
 import jax
@@ -11,12 +14,22 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from udccal.fitting.psf.data import Shots
-from udccal.fitting.psf.start import PsfRules, left_out, noise_at
+from udccal.fitting.engine.gaussian import scaled_inverse
+from udccal.fitting.psf.data import HUBER, PsfRules, Shots, left_out, noise_at
+from udccal.fitting.psf.kernel import Evaluator
 from udccal.models.arrays import Arrayish
 from udccal.models.diffraction import LocalFrame, local_frame
 from udccal.models.geometry import Geometry
+from udccal.models.lattice import sample
 from udccal.models.psf import lattice_points
+
+OWN: Final = 6
+# Parameters of diffraction; own parameters and light of the shots of one position, and of all positions.
+Theta = Float[Arrayish, " p"]
+Own = Float[Arrayish, "shots l"]
+Light = Float[Arrayish, "shots n"]
+Owns = Float[Arrayish, "positions shots l"]
+Lights = Float[Arrayish, "positions shots n"]
 
 
 @final
@@ -161,3 +174,119 @@ def weighed(
     light = np.asarray(samples.rate) if light is None else light
     variance = sensor_variance(samples, light + background) + left_out(light * seen, model_error) ** 2
     return replace(samples, weight=np.where(seen, 1.0 / variance, 0.0))
+
+
+@eqx.filter_jit
+def unit_light(
+    evaluator: Evaluator, one: Samples, offset_px: Float[Arrayish, "shots 2"], coefficients: Float[Arrayish, "y x 3"]
+) -> Light:
+    """What one unit of light of its own colour brings to every sample of one position, corrections left out."""
+    values = sampled(evaluator, one, jnp.asarray(coefficients), jnp.asarray(offset_px))
+    return jnp.sum(values * one.colour, axis=-1)
+
+
+def flux_of(one: Samples, own: Own) -> Light:
+    """Light of each sample's own colour, in e-/s."""
+    return jnp.einsum("snc,sc->sn", one.colour, own[:, 2:5])
+
+
+def sampled(
+    evaluator: Evaluator, one: Samples, coefficients: Float[Array, "y x c"], offset_px: Float[Array, "shots 2"]
+) -> Float[Array, "shots n c"]:
+    """What one unit of light brings to every sample."""
+    points = one.points - (offset_px @ one.slope.T)[:, None]
+    values = sample(evaluator.lattice, coefficients, points.reshape(-1, 2)).reshape(*points.shape[:2], -1)
+    return values * one.density[..., None]
+
+
+@eqx.filter_jit
+def own_equations(
+    evaluator: Evaluator, samples: Samples, own: Owns, coefficients: Float[Arrayish, "positions y x 3"]
+) -> tuple[Float[Array, "positions shots l l"], Float[Array, "positions shots l"], Lights]:
+    """Normal matrix and right side of every shot's own parameters for given kernels, and light per unit."""
+
+    def one(group: tuple[Samples, Array, Array]) -> tuple[Array, Array, Array]:
+        here, mine, kernel = group
+        unit = unit_light(evaluator, here, mine[:, :2], kernel)
+        by_own, residual, huber = own_jacobian(evaluator, here, mine, unit, kernel)
+        matrix = jnp.einsum("snk,sn,snl->skl", by_own, huber, by_own)
+        return matrix, jnp.einsum("snl,sn->sl", by_own, huber * residual), unit
+
+    return jax.lax.map(one, (samples, jnp.asarray(own), jnp.asarray(coefficients)))
+
+
+def own_jacobian(
+    evaluator: Evaluator, one: Samples, own: Own, unit: Light, coefficients: Float[Array, "y x 3"]
+) -> tuple[Float[Array, "shots n l"], Light, Light]:
+    """Derivatives of the light by each shot's own parameters, data less expectation, and Huber's weights."""
+    by_move = jax.jacfwd(lambda move: unit_light(evaluator, one, own[:, :2] + move, coefficients))(jnp.zeros(2))
+    flux = flux_of(one, own)
+    by_own = [flux[..., None] * by_move, unit[..., None] * one.colour, jnp.ones_like(unit)[..., None]]
+    residual = one.rate - unit * flux - own[:, 5:]
+    size = jnp.abs(residual) * jnp.sqrt(one.weight)
+    huber = one.weight * jnp.minimum(1.0, HUBER.sigma / jnp.maximum(size, 1e-12))
+    return jnp.concatenate(by_own, axis=-1), residual, huber
+
+
+def start_own(evaluator: Evaluator, samples: Samples, coefficients: Float[Arrayish, "positions y x 3"]) -> Owns:
+    """Start of every shot's own parameters: the best of a grid of places, light and background by least squares.
+
+    A centroid will not do: neighbouring diffraction orders are half as bright as the middle one, and the mosaic samples
+    each colour unevenly, so it can be off by a pixel; a descent from there ends on a neighbouring order.
+    """
+    # Places are compared on the samples about the brightest spot; 117 of them are enough.
+    core = np.argsort((np.asarray(samples.points) ** 2).sum(axis=-1), axis=-1, kind="stable")[..., :117]
+    by_sample = (
+        "points",
+        "density",
+        "colour",
+        "rate",
+        "known",
+        "noise_per_rate",
+        "weight",
+        "correction",
+        "by_overlaps",
+    )
+    near = replace(samples, **{name: _taken(np.asarray(getattr(samples, name)), core) for name in by_sample})
+    moves = np.stack(np.meshgrid(*2 * (np.linspace(-1.25, 1.25, 11),)), axis=-1).reshape(-1, 2)
+    every = np.broadcast_to(moves[None, :, None], (len(core), len(moves), core.shape[1], 2))
+    _, cost = _linear(near, np.asarray(_unit_lights(evaluator, near, every, coefficients)))
+    offset = moves[cost.argmin(axis=1)]
+    linear, _ = _linear(samples, np.asarray(_unit_lights(evaluator, samples, offset[:, None], coefficients)))
+    return np.concatenate([offset, linear[:, 0]], axis=-1)
+
+
+def _taken(values: np.ndarray, core: Int[np.ndarray, "positions shots few"]) -> np.ndarray:
+    return np.take_along_axis(values, core.reshape(*core.shape, *(1,) * (values.ndim - core.ndim)), axis=2)
+
+
+@eqx.filter_jit
+def _unit_lights(
+    evaluator: Evaluator,
+    samples: Samples,
+    offsets_px: Float[Arrayish, "positions moves shots 2"],
+    coefficients: Float[Arrayish, "positions y x 3"],
+) -> Float[Array, "positions moves shots n"]:
+    """``unit_light`` for each of several moves of all shots."""
+
+    def one(group: tuple[Samples, Array, Array]) -> Float[Array, "moves shots n"]:
+        here, offsets, kernel = group
+        return jax.lax.map(lambda offset: unit_light(evaluator, here, offset, kernel), offsets)
+
+    return jax.lax.map(one, (samples, jnp.asarray(offsets_px), jnp.asarray(coefficients)))
+
+
+def _linear(
+    samples: Samples, units: Float[np.ndarray, "positions moves shots n"]
+) -> tuple[Float[np.ndarray, "positions moves shots 4"], Float[np.ndarray, "positions moves shots"]]:
+    """Light per colour and background of the shots for each of several expectations, and the cost that remains."""
+    rate, weight, colour = (np.asarray(part)[:, None] for part in (samples.rate, samples.weight, samples.colour))
+    # Far from the solution the model is no better than a tenth of the signal.
+    variance = 1.0 / np.where(weight > 0, weight, 1.0) + (0.1 * np.maximum(rate, 0.0)) ** 2
+    root = np.where(weight > 0, 1.0 / np.sqrt(variance), 0.0)
+    design = np.concatenate([units[..., None] * colour, np.ones((*units.shape, 1))], axis=-1) * root[..., None]
+    data, across = (rate * root)[..., None], np.swapaxes(design, -1, -2)
+    solution = scaled_inverse(across @ design) @ (across @ data)
+    # Without the bound a place where nothing is expected would fit a dark neighbourhood best.
+    left = np.minimum(np.abs(data - design @ solution), 10.0)
+    return solution[..., 0], (left[..., 0] ** 2).sum(axis=-1)

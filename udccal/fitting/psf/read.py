@@ -1,0 +1,165 @@
+"""Reads a session's LED pictures: brackets merged, crops cut about the LED, the wire divided out."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Final
+
+import equinox as eqx
+import numpy as np
+import scipy.ndimage
+from jaxtyping import Float
+
+from udccal.cfa import channel_map
+from udccal.fitting.hdr.merge import HdrMerge, merge_bracket
+from udccal.fitting.psf.data import PsfData, PsfRules, Shots, joined
+from udccal.kernels import kernel_size
+from udccal.models.noise import Noise
+from udccal.models.wire import Wire, wire_values
+from udccal.sessions.schema import LedSubject, StoredStep
+from udccal.sessions.store import Session
+
+# How far from its aim an LED is looked for.
+_SEARCH_PX: Final = 16
+
+_wire_values = eqx.filter_jit(wire_values)
+
+
+def read_psf(session: Session, noise: Noise, wire: Wire, rules: PsfRules | None = None) -> PsfData:
+    """The LED pictures of the steps ``psf/...`` of a session, in windows as wide as a profile's kernel or the fit's.
+
+    Args:
+        session: brackets of an LED at field positions, each at some sub-pixel shifts.
+        noise: for merging brackets.
+        wire: divided out.
+        rules: how large windows may be.
+
+    Raises:
+        SessionError: when a file of the session is missing or damaged.
+    """
+    kernel, least = kernel_size(session.rig), (rules or PsfRules()).half_px
+    half = window_half(session, (max(kernel[0] // 2, least[0]), max(kernel[1] // 2, least[1])))
+    crops, aims, dark, clipped = [], [], 0, 0
+    steps = session.steps("psf")
+    for step in steps:
+        subject = step.subject
+        if not isinstance(subject, LedSubject):
+            continue
+        crop, full = _read_shot(session, step, subject, noise, half)
+        clipped += full
+        dark += crop is None and not full
+        if crop is not None:
+            crops.append(crop)
+            aims.append((subject.x_px, subject.y_px))
+    camera = session.rig.camera
+    shots = _without_wire(joined(crops, np.array(aims)), wire, camera.rows, camera.columns) if crops else None
+    return PsfData(shots, len(steps), dark, clipped)
+
+
+def window_half(session: Session, largest: tuple[int, int]) -> tuple[int, int]:
+    """(rows, columns) to either side of the LED that the regions captured can fill."""
+    regions = [c.region for step in session.steps("psf") for c in step.captures]
+    rows, columns = (min((getattr(r, name) for r in regions), default=0) for name in ("rows", "columns"))
+    return max(4, min(largest[0], rows // 2 - 4)), max(4, min(largest[1], columns // 2 - 4))
+
+
+def _without_wire(shots: Shots, wire: Wire, rows: int, columns: int) -> Shots:
+    """Rates divided by the wire's map of a sensor of ``rows`` x ``columns``."""
+    pixels = shots.offsets()[None] + shots.origin_px[:, None, None]
+    gains = np.stack([np.asarray(_wire_values(wire, p.reshape(-1, 2) * 1.0, rows, columns)) for p in pixels])
+    gain = gains.reshape(shots.rate.shape)
+    return replace(
+        shots, rate=shots.rate / gain, weight=shots.weight * gain**2, noise_per_rate=shots.noise_per_rate / gain
+    )
+
+
+def _read_shot(
+    session: Session, step: StoredStep, subject: LedSubject, noise: Noise, half: tuple[int, int]
+) -> tuple[Shots | None, bool]:
+    """The crop, and whether the LED is clipped in all exposures. Only the part about the aim is merged."""
+    region, aim = step.captures[0].region, (subject.x_px, subject.y_px)
+    down = _part(aim[1] - region.y, half[0] + _SEARCH_PX + 2, region.rows)
+    across = _part(aim[0] - region.x, half[1] + _SEARCH_PX + 2, region.columns)
+    captures = [c for c in step.captures if c.region == region]
+    frames = np.stack([session.frame(c)[down, across] for c in captures])
+    exposures_s = np.array([c.exposure_s for c in captures])
+    merged, corner = merge_bracket(frames, exposures_s, noise), (region.x + across.start, region.y + down.start)
+    # Without its brightest sample neither an LED's light nor its place is known.
+    clipped = (merged.used == 0) & (frames[int(np.argmin(exposures_s))] >= 0.98 * float(noise.saturation_DN))
+    # A hot pixel elsewhere is not the LED's.
+    if clipped[tuple(_part(aim[i] - corner[i], _SEARCH_PX, clipped.shape[1 - i]) for i in (1, 0))].any():
+        return None, True
+    # The pupil is a few mm behind the panel: less than a percent of any useful distance.
+    away_mm = subject.distance_mm + session.rig.mounting.standoff_mm.value
+    disc_px = subject.diameter_mm / away_mm * session.rig.focal_px
+    return cut_crop(merged, corner, aim, session.rig.camera.cfa, half, disc_px, shot_noise(merged, noise)), False
+
+
+def _part(aim: float, reach: int, size: int) -> slice:
+    """Even start, so that the pattern of the mosaic stays the sensor's."""
+    start = int(np.clip(np.floor(aim) - reach, 0, max(size - 2, 0))) // 2 * 2
+    return slice(start, int(np.clip(np.ceil(aim) + reach + 1, start + 2, size)))
+
+
+def cut_crop(
+    merged: HdrMerge,
+    corner_px: tuple[int, int],
+    aim_px: tuple[float, float],
+    cfa: str,
+    half: tuple[int, int],
+    disc_px: float,
+    noise_per_rate: Float[np.ndarray, "rows columns"] | None = None,
+) -> Shots | None:
+    """One shot about the LED, ``half`` (rows, columns) to either side; None when no light stands out near the aim.
+
+    ``merged`` is the bracket of a region whose first sample is ``corner_px`` (x, y; even); beside it samples have no
+    weight. The aim is on the sensor; ``disc_px`` is the diameter of the LED's image. Without ``noise_per_rate`` (see
+    ``shot_noise``) the merged sigma is taken as it is.
+    """
+    rate = merged.rate_e_per_s
+    weight = np.where(merged.used > 0, 1.0 / merged.sigma_e_per_s.astype(np.float64) ** 2, 0.0)
+    place = _brightest(rate, weight, np.asarray(aim_px) - corner_px)
+    if place is None:
+        return None
+    x, y = middle = np.round(place).astype(np.int64)
+    slope = np.zeros_like(rate) if noise_per_rate is None else noise_per_rate
+    parts = (np.pad(part, [2 * (h,) for h in half]) for part in (rate, weight, channel_map(cfa, *rate.shape), slope))
+    windows = (part[None, y : y + 2 * half[0] + 1, x : x + 2 * half[1] + 1] for part in parts)
+    where = (place + corner_px)[None], (middle + corner_px)[None], np.zeros(1, dtype=np.int64), np.array([disc_px])
+    return Shots(*where, *windows)
+
+
+def _brightest(
+    rate: Float[np.ndarray, "rows columns"], weight: Float[np.ndarray, "rows columns"], aim: Float[np.ndarray, "2"]
+) -> Float[np.ndarray, "2"] | None:
+    """(x, y) of the LED: centroid about the brightest 2 x 2 cell near the aim, or None when it is not there.
+
+    A cell holds every colour, so that the mosaic does not steer the search; hot pixels are too narrow to win it.
+    """
+    known = np.where(weight > 0, rate, 0.0)
+    cells = scipy.ndimage.uniform_filter(scipy.ndimage.median_filter(known, size=3) + 0.02 * known, size=3)
+    y, x = np.mgrid[: rate.shape[0], : rate.shape[1]]
+    near = (np.abs(x - aim[0]) <= _SEARCH_PX) & (np.abs(y - aim[1]) <= _SEARCH_PX)
+    if not near.any():
+        return None
+    row, column = np.unravel_index(np.argmax(np.where(near, cells, -np.inf)), rate.shape)
+    about = (np.abs(x - column) <= 2) & (np.abs(y - row) <= 2)
+    signal = np.maximum(known[about], 0.0)
+    noise = np.sqrt((1.0 / np.maximum(weight[about], 1e-300)).clip(max=1e24))
+    # An LED stands out of the noise by 8 sigma.
+    if signal.max(initial=0.0) < 8.0 * np.median(noise) or signal.sum() <= 0:
+        return None
+    return np.array([np.average(x[about], weights=signal), np.average(y[about], weights=signal)])
+
+
+def shot_noise(merged: HdrMerge, noise: Noise) -> Float[np.ndarray, "rows columns"]:
+    """How fast a merged sample's variance grows with its rate, in (e-/s)^2 per e-/s.
+
+    Variance (r + d) u + f u^2 is that of one exposure of 1/u seconds, f being what a dark sample has; a bracket is
+    taken for the single exposure that has its variance.
+    """
+    K, dark = float(np.asarray(noise.K_DN_per_e)), float(np.asarray(noise.dark_current_e_per_s))
+    floor = float(np.asarray(noise.sigma_d_e)) ** 2 + (float(np.asarray(noise.q_DN)) / K) ** 2 / 12.0
+    light, variance = np.maximum(merged.rate_e_per_s + dark, 0.0), merged.sigma_e_per_s**2
+    slope = 2.0 * variance / (light + np.sqrt(light**2 + 4.0 * floor * variance))
+    return np.where(merged.used > 0, slope, 0.0)
