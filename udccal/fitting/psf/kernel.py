@@ -193,7 +193,9 @@ def kernel_jacobian(
     return flat[..., :count], flat[..., count:].reshape(*flat.shape[:2], -1, 3)
 
 
-def factor_jacobian(evaluator: Evaluator, theta: Float[Array, " p"], frame: LocalFrame) -> Float[Array, "factors head"]:
+def factor_jacobian(
+    evaluator: Evaluator, theta: Float[Arrayish, " p"], frame: LocalFrame
+) -> Float[Array, "factors head"]:
     """Derivatives of the factors of ``kernel_jacobian`` by the parameters before the spectra, in their order.
 
     Factors: open part of columns and of rows along the ray, the pitch where it scales lags, the pupil, the footprint's
