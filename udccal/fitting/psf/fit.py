@@ -67,7 +67,7 @@ def fit_psf(
     order, support = selection.trial.order, selection.support
     term = replace(
         _field(as_numpy(fit.problem.evaluator.model(fit.theta)), geometry),
-        diffraction_share=np.float64(not order.free),
+        diffraction_fraction=np.float64(not order.free),
         residual=selection.image,
         centre_px=size,
         half_px=size,
@@ -124,17 +124,17 @@ def _unfit(data: PsfData, rig: RigDescription, rules: PsfRules) -> tuple[FitStat
 
 def _field(model: Diffraction, geometry: Geometry) -> PsfField:
     """Without a residual."""
-    half = np.maximum(np.asarray(geometry.centre, dtype=np.float64), 1.0)
+    half = np.maximum(np.asarray(geometry.principal_point_px, dtype=np.float64), 1.0)
     return PsfField(
         geometry=geometry,
         diffraction=model,
-        diffraction_share=np.float64(1.0),
+        diffraction_fraction=np.float64(1.0),
         residual=np.zeros((1, 3, 1, 1)),
         centre_px=half,
         half_px=half,
         support_px=2 * half + 1,
         degree=0,
-        fine=fine_oversample(float(model.pupil_mm), float(np.mean(np.asarray(geometry.focal)))),
+        fine=fine_oversample(float(model.pupil_diameter_mm), float(np.mean(np.asarray(geometry.focal_px)))),
     )
 
 
@@ -160,7 +160,7 @@ def with_support(term: PsfField, support: Support, rig: RigDescription) -> PsfFi
     Where no end of diffraction was seen, it goes on over the whole sensor; an image ends where it ends.
     """
     size = (rig.camera.rows, rig.camera.columns)
-    onward = (seen and bool(term.diffraction_share) for seen in support.open_ended)
+    onward = (seen and bool(term.diffraction_fraction) for seen in support.open_ended)
     down, across = (most if on else half for half, on, most in zip(support.half_px, onward, size, strict=True))
     return replace(term, support_px=np.array([across, down], dtype=np.float64))
 
@@ -177,20 +177,20 @@ def start_model(rig: RigDescription, geometry: Geometry, wire: Wire, rules: PsfR
     panel, pitch, rules = rig.panel, rig.panel.pitch_mm.value, rules or PsfRules()
     nodes = wavelengths_nm(rig, rules)
     responses = np.exp(-0.5 * ((nodes - np.array([[600.0], [535.0], [460.0]])) / 45.0) ** 2) + 1e-3
-    pupil = np.asarray(geometry.pupil, dtype=np.float64)
+    pupil = np.asarray(geometry.pupil_mm, dtype=np.float64)
     if seen := wire_shows(wire):
-        opened, offset = (wire.column_open, wire.row_open), wire.offset
-        lengths = (wire.depth_per_pitch, wire.pupil_per_pitch, wire.standoff_per_pitch)
+        opened, offset = (wire.column_open, wire.row_open), wire.offset_periods
+        lengths = (wire.depth_per_pitch, wire.footprint_per_pitch, wire.standoff_per_pitch)
     else:
-        opened, offset = (panel.column_open_fraction.value, panel.row_open_fraction.value), pupil[:2] / pitch
-        lengths = (panel.structure_thickness_mm.value / pitch, rig.pupil_mm / pitch, -pupil[2] / pitch)
+        opened, offset = (panel.column_open.value, panel.row_open.value), pupil[:2] / pitch
+        lengths = (panel.depth_mm.value / pitch, rig.pupil_diameter_mm / pitch, -pupil[2] / pitch)
     return Diffraction(
         pitch_mm=np.float64(pitch),
-        open_fraction=np.array([float(part) for part in opened]),
-        thickness_mm=np.float64(float(lengths[0]) * pitch),
-        pupil_mm=np.float64(float(lengths[1]) * pitch),
+        openings=np.array([float(part) for part in opened]),
+        depth_mm=np.float64(float(lengths[0]) * pitch),
+        pupil_diameter_mm=np.float64(float(lengths[1]) * pitch),
         blur_px=np.float64(rules.blur_px),
-        offset=np.asarray(offset, dtype=np.float64),
+        offset_periods=np.asarray(offset, dtype=np.float64),
         standoff_per_pitch=np.float64(float(lengths[2])),
         visibility=np.float64(seen),
         wavelengths_nm=nodes,
@@ -232,10 +232,10 @@ def start_prior(rig: RigDescription, start: Diffraction, rules: PsfRules | None 
     tighter = rules.wire_tolerance if start.visibility else 1.0
     sigma = [
         rules.pitch_tolerance * min(panel.pitch_mm.tolerance, rules.pitch_well_known * panel.pitch_mm.value),
-        tighter * panel.column_open_fraction.tolerance,
-        tighter * panel.row_open_fraction.tolerance,
-        tighter * panel.structure_thickness_mm.tolerance,
-        tighter * 2.0 * rig.pupil_mm * rig.lens.f_number.tolerance / rig.lens.f_number.value,
+        tighter * panel.column_open.tolerance,
+        tighter * panel.row_open.tolerance,
+        tighter * panel.depth_mm.tolerance,
+        tighter * 2.0 * rig.pupil_diameter_mm * rig.lens.f_number.tolerance / rig.lens.f_number.value,
         rules.blur_log_sigma,
         *(3 * (rules.footprint_periods,)),
     ]

@@ -28,12 +28,12 @@ from udccal.rig import RigDescription
 
 # The first parameters: name, unit, and whether it is a length on the panel, which is measured in pitches.
 _NUMBERS: Final = (
-    ("pitch", "mm", True),
-    ("column_open_fraction", "1", False),
-    ("row_open_fraction", "1", False),
-    ("structure_thickness", "mm", True),
-    ("pupil_diameter", "mm", True),
-    ("blur", "px", False),
+    ("pitch_mm", "mm", True),
+    ("column_open", "1", False),
+    ("row_open", "1", False),
+    ("depth_mm", "mm", True),
+    ("pupil_diameter_mm", "mm", True),
+    ("blur_px", "px", False),
 )
 
 
@@ -114,7 +114,7 @@ def _posterior(
     def term_at(x: Float[np.ndarray, " n"]) -> PsfField:
         longer = 1.0 + x[count]
         model = as_numpy(evaluator.model(x[:count]))
-        scaled = {name: getattr(model, name) * longer for name in ("pitch_mm", "thickness_mm", "pupil_mm")}
+        scaled = {name: getattr(model, name) * longer for name in ("pitch_mm", "depth_mm", "pupil_diameter_mm")}
         model = replace(model, wavelengths_nm=model.wavelengths_nm * longer, **scaled)
         if not patterns:
             return replace(term, diffraction=model)
@@ -176,7 +176,7 @@ def pattern_p_value(samples: Samples, z: Lights) -> float:
 def support_notes(term: PsfField, support: Support) -> tuple[str, ...]:
     """What is to be said where no end of the kernel's light was seen."""
     along = [name for name, on in zip(("columns", "rows"), support.open_ended, strict=True) if on]
-    if not along or not term.diffraction_share:
+    if not along or not term.diffraction_fraction:
         return ()
     seen = "light was seen as far as was looked; beyond, the kernel is diffraction as fitted."
     return (f"Along {' and '.join(along)} {seen}",)
@@ -220,7 +220,7 @@ def _diagnostics(
         "iterations": fit.iterations,
         "kernel_error_l2": selection.relative_l2,
         "residual_degree": order.degree,
-        "diffraction_share": not order.free,
+        "diffraction_fraction": not order.free,
         "model_error": fit.model_error,
         "efficiency": efficiency(fit, rules, everything.count, len(_NUMBERS)),
         "residual_pattern_p": pattern_p,
