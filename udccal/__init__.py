@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from udccal.calibration import calibrate as calibrate
     from udccal.calibration import fit as fit
     from udccal.errors import UdccalError as UdccalError
-    from udccal.fitting.backscatter import fit_backscatter as fit_backscatter
+    from udccal.fitting.backscatter.fit import fit_backscatter as fit_backscatter
     from udccal.fitting.geometry import fit_geometry as fit_geometry
     from udccal.fitting.noise import fit_noise as fit_noise
     from udccal.fitting.psf import fit_psf as fit_psf
@@ -50,7 +50,7 @@ _HOMES = {
     "calibrate": "udccal.calibration",
     "capture": "udccal.benches.capture",
     "fit": "udccal.calibration",
-    "fit_backscatter": "udccal.fitting.backscatter",
+    "fit_backscatter": "udccal.fitting.backscatter.fit",
     "fit_geometry": "udccal.fitting.geometry",
     "fit_noise": "udccal.fitting.noise",
     "fit_psf": "udccal.fitting.psf",

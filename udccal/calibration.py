@@ -15,7 +15,9 @@ from jaxtyping import Float
 
 from udccal.errors import UdccalError
 from udccal.fitting.absent import absent_backscatter, absent_psf, absent_wire
-from udccal.fitting.backscatter import BackscatterRules, fit_backscatter, read_backscatter
+from udccal.fitting.backscatter.data import read_backscatter
+from udccal.fitting.backscatter.fit import fit_backscatter
+from udccal.fitting.backscatter.parameters import BackscatterRules
 from udccal.fitting.geometry import fit_boards, read_geometry
 from udccal.fitting.geometry.data import BoardView
 from udccal.fitting.noise import fit_noise, nominal_noise, read_noise

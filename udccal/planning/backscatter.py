@@ -15,11 +15,9 @@ from jaxtyping import Float, Int
 from udccal.arrangements import Dark, PanelPicture
 from udccal.displays.pictures import face_picture
 from udccal.fitting.backscatter.data import Bins, grid_step, sampled_rays, visible_crop
-from udccal.fitting.backscatter.likelihood import PerBin, Profile, Samples
-from udccal.fitting.backscatter.parameters import linear_of, prior_of, vector_of
-from udccal.fitting.backscatter.ratios import Pictures, corners_of, window_for
-from udccal.fitting.backscatter.rules import BackscatterRules
-from udccal.fitting.backscatter.solve import SampleErrors
+from udccal.fitting.backscatter.model import PerBin, Pictures, Windows, window_for
+from udccal.fitting.backscatter.parameters import BackscatterRules, linear_of, prior_of, vector_of
+from udccal.fitting.backscatter.solve import SampleErrors, Samples
 from udccal.fitting.engine.least_squares import Blocks
 from udccal.fitting.nominal import nominal_backscatter
 from udccal.numerics import in_float64
@@ -74,12 +72,11 @@ class BackscatterPredictor:
         self._by_sample = bins.variance(one).reshape(3, -1)[:, flat]
         self._by_row = bins.row_variance(one).reshape(3, -1)[:, flat]
         shown = _pictures(state)
-        light = np.zeros((len(shown.logs) + 2, *self._mask.shape))
+        light = np.zeros((shown.values.shape[2], *self._mask.shape))
         usable = np.ones(light.shape, dtype=bool)
         self._samples = Samples(rays, light, light, light, usable, np.ones(len(light)), shown)
-        corner = corners_of(template, linear_of(self._x), rays)
-        errors_at = SampleErrors.of(template, self._samples, light, corner)
-        self._ratio, self._jacobian = errors_at.ratios(self._x)
+        at = Windows.around(template, linear_of(self._x), rays, shown.crop)
+        self._ratio, self._jacobian = SampleErrors(template, self._samples, light, at).ratios(self._x)
 
     def sigma(self, captures: Captures) -> float:
         """Root mean square over sensor, colours and pictures, of these' peaks; see ``forecast.Predictor``."""
@@ -111,7 +108,7 @@ class BackscatterPredictor:
         shown = weight[1 : _NEW.start]
         shown *= np.sqrt(noise.pictures / len(shown))
         weight[_NEW] = 0.0
-        profile = Profile.of(self._ratio, samples, weight)
+        profile = samples.profile(self._ratio, weight)
         jacobian = np.sqrt(count) * profile.jacobian(self._jacobian).reshape(len(self._x), -1).T
         equations = Blocks.of_errors(np.zeros(len(jacobian)), jacobian).with_prior(self._prior, self._x)
         cov = equations.cov() * self._state.model_errors.inflation

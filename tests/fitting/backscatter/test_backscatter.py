@@ -12,8 +12,17 @@ from tests.simulation.toy import toy_rig, toy_truth
 from udccal.cameras.protocol import CameraIdentity, Region, Settings
 from udccal.cfa import channel_map
 from udccal.displays.pictures import face_picture
-from udccal.fitting.backscatter import BackscatterRules, fit_backscatter, read_backscatter
-from udccal.fitting.backscatter.data import BackscatterData, Binned, Bins, block_weights, grid_step, visible_crop
+from udccal.fitting.backscatter.data import (
+    BackscatterData,
+    Binned,
+    Bins,
+    block_weights,
+    grid_step,
+    read_backscatter,
+    visible_crop,
+)
+from udccal.fitting.backscatter.fit import fit_backscatter
+from udccal.fitting.backscatter.parameters import BackscatterRules
 from udccal.fitting.noise.fit import nominal_noise
 from udccal.fitting.nominal import nominal_geometry
 from udccal.models.backscatter import Backscatter, backscatter_rate
@@ -143,7 +152,7 @@ def test_the_candidate_of_the_largest_evidence_is_chosen(fitted: FitResult[Backs
     assert sum(c.chosen for c in fitted.candidates) == 1
     chosen = next(c for c in fitted.candidates if c.chosen)
     assert chosen.criterion == min(c.criterion for c in fitted.candidates)
-    held_out = next(d for d in fitted.diagnostics if d.name == "held_out_rms_of_peak")
+    held_out = next(d for d in fitted.diagnostics if d.name == "held_out_without_noise_of_peak")
     assert 0 < held_out.value < 0.02
 
 

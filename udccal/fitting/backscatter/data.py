@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import final
@@ -11,20 +12,15 @@ from jaxtyping import Bool, Float, Int, Shaped, UInt8
 from scipy import sparse
 
 from udccal.cfa import cell_channels
-from udccal.fitting.backscatter.parameters import linear_of, prior_of
-from udccal.fitting.backscatter.ratios import PanelCrop, Pictures, corners_of, directions
+from udccal.fitting.backscatter.model import PanelCrop, Pictures, corners_of, directions
+from udccal.fitting.backscatter.parameters import BackscatterRules, linear_of, prior_of
 from udccal.fitting.nominal import nominal_backscatter
 from udccal.models.geometry import Geometry
 from udccal.models.noise import Noise, variance_e
 from udccal.numerics import in_float64
 from udccal.rig import RigDescription
-from udccal.sessions.schema import DarkSubject, PanelSubject, StoredStep
+from udccal.sessions.schema import DarkSubject, PanelSubject
 from udccal.sessions.store import Average, Session
-
-# Part of saturation from which a mean counts as clipped.
-_CLIPPED = 0.98
-# Panel pixels around the nominally visible part that are kept: the footprint's own size and the nominal's tolerances.
-_MARGIN_PX = 12
 
 
 @final
@@ -66,7 +62,7 @@ class BackscatterData:
     Attributes:
         shots: white, then the pictures, and the dark frame last; none at all where white or dark are missing.
         shown: the pictures, values 0 to 255, in the crop.
-        crop: the part of the panel that the camera can see.
+        crop: the part of the panel that the camera can see (``visible_crop``).
         names: of the pictures.
     """
 
@@ -75,9 +71,9 @@ class BackscatterData:
     crop: PanelCrop
     names: tuple[str, ...]
 
-    @property
+    @functools.cached_property
     def pictures(self) -> Pictures:
-        """What the panel showed, ready for a fit of gamma."""
+        """What the panel showed during every shot."""
         return Pictures.of(self.shown, self.crop)
 
     def only(self, keep: Bool[np.ndarray, " pictures"]) -> BackscatterData:
@@ -88,7 +84,11 @@ class BackscatterData:
 
 
 def read_backscatter(
-    session: Session, noise: Noise, geometry: Geometry, shading: Float[np.ndarray, "rows columns"]
+    session: Session,
+    noise: Noise,
+    geometry: Geometry,
+    shading: Float[np.ndarray, "rows columns"],
+    rules: BackscatterRules | None = None,
 ) -> BackscatterData:
     """Bin the averages of the steps ``backscatter/*`` of a session, one at a time.
 
@@ -97,6 +97,7 @@ def read_backscatter(
         noise: gives K, black level and saturation, and the variance of samples.
         geometry: where rays go.
         shading: the wire's map of the sensor (``fitting.wire.sensor_map``), divided out of what was measured.
+        rules: say what is clipped.
 
     Returns:
         rates in e-/s by bin and colour; without shots where white or dark were not captured.
@@ -104,62 +105,52 @@ def read_backscatter(
     Raises:
         SessionError: when a file is missing or damaged.
     """
-    crop, step_px = visible_crop(geometry, session.rig), grid_step(session.rig)
+    crop, bins = visible_crop(geometry, session.rig), Bins(session.rig.camera.cfa, grid_step(session.rig))
+    clipped = (rules or BackscatterRules()).clipped
     steps = session.steps("backscatter")
     panels = [(step, step.subject) for step in steps if isinstance(step.subject, PanelSubject)]
     white = [step for step, subject in panels if subject.role == "white"]
     dark = [step for step in steps if isinstance(step.subject, DarkSubject)]
     others = [(step, subject) for step, subject in panels if subject.role != "white"]
-    binning = Binning(noise, shading, session.rig.camera.cfa, step_px)
-
-    def binned(step: StoredStep) -> Binned:
-        capture = step.captures[0]
-        return binning.of(session.average(capture), capture.exposure_s)
-
+    shown = np.zeros((0, crop.rows, crop.columns, 3), np.uint8)
     if not white or not dark:
         nothing, none = np.zeros((0, 3, 1, 1)), np.zeros(0)
-        shots = Binned(nothing, nothing, nothing, nothing > 0, none, none)
-        return BackscatterData(shots, np.zeros((0, crop.rows, crop.columns, 3), np.uint8), crop, ())
-    shown = [crop.of(session.picture(subject)) for _, subject in others]
-    return BackscatterData(
-        Binned.joined([binned(step) for step in (white[0], *(step for step, _ in others), dark[0])]),
-        np.stack(shown) if shown else np.zeros((0, crop.rows, crop.columns, 3), np.uint8),
-        crop,
-        tuple(step.id for step, _ in others),
+        return BackscatterData(Binned(nothing, nothing, nothing, nothing > 0, none, none), shown, crop, ())
+    shots = [
+        binned(session.average(step.captures[0]), step.captures[0].exposure_s, noise, shading, bins, clipped)
+        for step in (white[0], *(step for step, _ in others), dark[0])
+    ]
+    shown = np.concatenate([shown, *(crop.of(session.picture(subject))[None] for _, subject in others)])
+    return BackscatterData(Binned.joined(shots), shown, crop, tuple(step.id for step, _ in others))
+
+
+def binned(
+    average: Average,
+    exposure_s: float,
+    noise: Noise,
+    shading: Float[np.ndarray, "rows columns"],
+    bins: Bins,
+    most: float,
+) -> Binned:
+    """One shot in bins, from its average in DN; from the fraction ``most`` of saturation on, means count as clipped."""
+    gain = float(np.asarray(noise.K_DN_per_e))
+    to_rate = 1.0 / (exposure_s * shading)
+    signal_e = (average.mean - float(np.asarray(noise.black_DN))) / gain
+    clipped = average.mean >= most * float(np.asarray(noise.saturation_DN))
+    # Variance in the dark, e-^2: that of a row's offset, and that of each sample by itself.
+    row_e2 = float(np.asarray(noise.sigma_row_DN / noise.K_DN_per_e)) ** 2
+    rest_e2 = max(float(np.asarray(variance_e(noise, np.zeros(()), np.float64(exposure_s)))) - row_e2, 0.0)
+    per_frame = to_rate**2 / average.frames
+    expected = np.maximum(signal_e, 0.0) + rest_e2
+    scatter = average.variance.mean(dtype=np.float64) / gain**2 / expected.mean()
+    return Binned(
+        rate=bins.mean(signal_e * to_rate)[None],
+        shot=bins.variance(to_rate / average.frames)[None],
+        rest=(rest_e2 * bins.variance(per_frame) + row_e2 * bins.row_variance(per_frame))[None],
+        clipped=(bins.mean(clipped.astype(np.float64)) > 0)[None],
+        exposure_s=np.array([exposure_s]),
+        scatter=np.array([scatter], dtype=np.float64),
     )
-
-
-@final
-@dataclass(frozen=True)
-class Binning:
-    """How averages become rates in bins: the noise of single samples, and the wire's map, which is divided out."""
-
-    noise: Noise
-    shading: Float[np.ndarray, "rows columns"]
-    cfa: str
-    step: int
-
-    def of(self, average: Average, exposure_s: float) -> Binned:
-        """One shot in bins, from its average in DN."""
-        noise, bins = self.noise, Bins(self.cfa, self.step)
-        gain = float(np.asarray(noise.K_DN_per_e))
-        to_rate = 1.0 / (exposure_s * self.shading)
-        signal_e = (average.mean - float(np.asarray(noise.black_DN))) / gain
-        clipped = average.mean >= _CLIPPED * float(np.asarray(noise.saturation_DN))
-        # Variance in the dark, e-^2: what a row's samples share, and the rest.
-        row_e2 = float(np.asarray(noise.sigma_row_DN / noise.K_DN_per_e)) ** 2
-        rest_e2 = max(float(np.asarray(variance_e(noise, np.zeros(()), np.float64(exposure_s)))) - row_e2, 0.0)
-        per_frame = to_rate**2 / average.frames
-        expected = np.maximum(signal_e, 0.0) + rest_e2
-        scatter = average.variance.mean(dtype=np.float64) / gain**2 / expected.mean()
-        return Binned(
-            rate=bins.mean(signal_e * to_rate)[None],
-            shot=bins.variance(to_rate / average.frames)[None],
-            rest=(rest_e2 * bins.variance(per_frame) + row_e2 * bins.row_variance(per_frame))[None],
-            clipped=(bins.mean(clipped.astype(np.float64)) > 0)[None],
-            exposure_s=np.array([exposure_s]),
-            scatter=np.array([scatter], dtype=np.float64),
-        )
 
 
 @final
@@ -167,7 +158,7 @@ class Binning:
 class Bins:
     """Averages of a mosaic over blocks of ``step`` x ``step`` (even) pixels, colour by colour.
 
-    A sample of a colour stands for the 2 x 2 pixels around it and counts by the part of them inside the block: then
+    A sample of a colour represents the 2 x 2 pixels around it and counts by the part of them inside the block: then
     every colour's average is of the block's centre, though its samples are not.
     """
 
@@ -190,16 +181,16 @@ class Bins:
         sums = np.zeros((3, *(size // self.step for size in mosaic.shape)))
         cells = np.asarray(cell_channels(self.cfa))
         # A colour with two samples in a cell averages them.
-        share = 1.0 / np.bincount(cells.ravel(), minlength=3) ** max(row_power, column_power)
+        factor = 1.0 / np.bincount(cells.ravel(), minlength=3) ** max(row_power, column_power)
         for (j, i), channel in np.ndenumerate(cells):
             part = mosaic[j::2, i::2].astype(np.float64)
             by_row, by_column = (
-                sparse.csr_array(block_weights(samples, size // self.step, self.step, first) ** power)
-                for samples, size, first, power in zip(
-                    part.shape, mosaic.shape, (j, i), (row_power, column_power), strict=True
+                sparse.csr_array(block_weights(samples, blocks, self.step, first) ** power)
+                for samples, blocks, first, power in zip(
+                    part.shape, sums.shape[1:], (j, i), (row_power, column_power), strict=True
                 )
             )
-            sums[channel] += share[channel] * (by_column @ (by_row @ part).T).T
+            sums[channel] += factor[channel] * (by_column @ (by_row @ part).T).T
         return sums
 
 
@@ -210,8 +201,7 @@ def block_weights(samples: int, blocks: int, step: int, first: int) -> Float[np.
     """
     centre = first + 2.0 * np.arange(samples)
     edge = step * np.arange(blocks)[:, None] - 0.5
-    overlap = np.minimum(centre + 1, edge + step) - np.maximum(centre - 1, edge)
-    weights = np.maximum(overlap, 0.0)
+    weights = np.maximum(np.minimum(centre + 1, edge + step) - np.maximum(centre - 1, edge), 0.0)
     return np.asarray(weights / weights.sum(axis=1, keepdims=True))
 
 
@@ -226,14 +216,19 @@ def grid_step(rig: RigDescription) -> int:
 
 @in_float64
 def visible_crop(geometry: Geometry, rig: RigDescription) -> PanelCrop:
-    """The part of the panel that any sensor pixel may see, with room for the tolerances of the mounting."""
-    camera, panel = rig.camera, rig.panel
+    """The part of the panel that any sensor pixel may see, with room for the tolerances of the mounting.
+
+    Args:
+        geometry: where rays go.
+        rig: gives the panel's size and the nominal footprints.
+    """
+    camera, panel, room_px = rig.camera, rig.panel, 12
     edge_x, edge_y = np.linspace(0, camera.columns - 1, 9), np.linspace(0, camera.rows - 1, 9)
     pixels = np.stack(np.meshgrid(edge_x, edge_y), axis=-1).reshape(-1, 2)
     template = nominal_backscatter(geometry, rig, np.zeros((3, 1, 1)), grid_step(rig), window=1)
     middle = corners_of(template, linear_of(prior_of(rig).mean), directions(geometry, pixels))
-    first = np.clip(middle.min(axis=0) - _MARGIN_PX, 0, [panel.columns - 8, panel.rows - 8])
-    last = np.clip(middle.max(axis=0) + _MARGIN_PX + 1, first + 8, [panel.columns, panel.rows])
+    first = np.clip(middle.min(axis=0) - room_px, 0, [panel.columns - 8, panel.rows - 8])
+    last = np.clip(middle.max(axis=0) + room_px + 1, first + 8, [panel.columns, panel.rows])
     return PanelCrop(int(first[0]), int(first[1]), int(last[0] - first[0]), int(last[1] - first[1]))
 
 

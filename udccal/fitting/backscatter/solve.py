@@ -1,4 +1,11 @@
-"""The most probable parameters of an order: the problem, its errors as the engine sees them, and the descent."""
+"""Likelihood of the backscatter term, and the most probable parameters of an order.
+
+Light of shot i at a position and colour is  y_i = m r_i + u_i d + noise: r_i is the picture's light over that of white
+(1 for white itself, 0 for the dark frame), m the mask and d the dark signal there, u_i the dark frame's exposure over
+the shot's. m and d have no prior and enter linearly: they are profiled out exactly, bin by bin, so that the noise of
+white and dark, which all pictures of a bin depend on, is weighed as it should be. Variances are of the model: shot
+noise, what is left in the dark, and (e m)^2 for what the model leaves undescribed, e the model error relative to white.
+"""
 
 from __future__ import annotations
 
@@ -10,27 +17,25 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from udccal.fitting.backscatter.data import BackscatterData, grid_step, sampled_rays
-from udccal.fitting.backscatter.likelihood import PerBin, PerShot, Profile, Samples, of_all_shots
+from udccal.fitting.backscatter.model import (
+    PerBin,
+    PerShot,
+    Pictures,
+    Profile,
+    Windows,
+    ratios,
+    ratios_and_jacobian,
+    window_for,
+)
 from udccal.fitting.backscatter.parameters import (
     OFFSET,
-    TWO_PLANES,
+    BackscatterRules,
     Order,
     Vector,
     linear_of,
     linear_slope,
-    offset_reach_px,
     prior_of,
 )
-from udccal.fitting.backscatter.ratios import (
-    Windows,
-    best_offset,
-    corners_of,
-    ratios,
-    ratios_and_jacobian,
-    window_for,
-    with_room,
-)
-from udccal.fitting.backscatter.rules import BackscatterRules
 from udccal.fitting.engine.gaussian import Prior
 from udccal.fitting.engine.least_squares import Blocks, SolverRules, Step, minimise
 from udccal.fitting.nominal import nominal_backscatter
@@ -39,8 +44,73 @@ from udccal.models.geometry import Geometry
 from udccal.numerics import in_float64
 from udccal.rig import RigDescription
 
+# Variance of a bin's count is never below this many e-^2: a black picture in a camera without read noise.
+LEAST_VARIANCE = 1 / 12
 # Parameters in the solver's coordinates to whitened errors and their Jacobian.
 ErrorsAt = Callable[[Vector], tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m 18"]]]
+
+
+@final
+@dataclass(frozen=True)
+class Samples:
+    """Shots at some positions, as in ``Binned``.
+
+    Attributes:
+        rays: of the positions, in panel coordinates.
+        light: rates in e-/s above the black level.
+        shot, rest: variance per rate, and that of light in the dark.
+        usable: False where samples are clipped.
+        exposure: that of the dark frame over that of each shot.
+        shown: what the panel showed.
+    """
+
+    rays: Float[np.ndarray, "n 3"]
+    light: PerShot
+    shot: PerShot
+    rest: PerShot
+    usable: Bool[np.ndarray, "shots 3 n"]
+    exposure: Float[np.ndarray, " shots"]
+    shown: Pictures
+
+    @classmethod
+    def at(cls, data: BackscatterData, rays: Float[np.ndarray, "n 3"], flat: Int[np.ndarray, " n"]) -> Samples:
+        """At grid positions with these rays and flat indices."""
+        shots = data.shots
+        light, shot, rest, clipped = (
+            part.reshape(*part.shape[:2], -1)[:, :, flat]
+            for part in (shots.rate, shots.shot, shots.rest, shots.clipped)
+        )
+        usable = ~clipped
+        usable[-1] = True
+        return cls(rays, light, shot, rest, usable, shots.exposure_s[-1] / shots.exposure_s, data.pictures)
+
+    @property
+    def excess(self) -> PerShot:
+        """Light above that of the dark frame, as measured."""
+        return self.light - self.exposure[:, None, None] * self.light[-1]
+
+    def variance(self, rate: PerShot) -> PerShot:
+        """Of every sample by noise, at this light."""
+        return np.maximum(self.shot * np.maximum(rate, 0.0) + self.rest, LEAST_VARIANCE * self.shot**2)
+
+    def weights(
+        self, rate: PerShot, mask: PerBin, model_error: float, usable: Bool[np.ndarray, "shots 3 n"]
+    ) -> PerShot:
+        """1 / sigma of every sample, 0 where not usable, at this light of this mask."""
+        variance = self.variance(rate)
+        # White is the mask by definition, dark has no light: the model's error is in neither.
+        variance[1:-1] += (model_error * mask) ** 2
+        return np.where(usable, 1 / np.sqrt(variance), 0.0)
+
+    def first_weights(self) -> PerShot:
+        """Weights by what was measured, one electron on the safe side."""
+        rate = np.maximum(self.excess, 0.0) + self.shot
+        rate[-1] = 0.0
+        return self.weights(rate, np.zeros(rate.shape[1:]), 0.0, self.usable)
+
+    def profile(self, ratio: PerShot, weight: PerShot) -> Profile:
+        """Mask and dark signal at their best."""
+        return Profile.of(ratio, self.light, self.exposure, weight)
 
 
 @final
@@ -52,31 +122,17 @@ class SampleErrors:
     samples: Samples
     weight: PerShot
     at: Windows
-    logs: Float[np.ndarray, "n 3 pictures window2"]
-
-    @classmethod
-    def of(
-        cls,
-        template: Backscatter,
-        samples: Samples,
-        weight: PerShot,
-        corner: Int[np.ndarray, "n 2"],
-    ) -> SampleErrors:
-        """With windows from these corners on."""
-        at = Windows.at(template.window, samples.rays, corner, samples.shown)
-        return cls(template, samples, weight, at, at.logs(samples.shown))
 
     def ratios(self, x: Vector) -> tuple[PerShot, Float[np.ndarray, "18 shots 3 n"]]:
         """Light over that of white, and its derivatives by the solver's coordinates."""
-        ratio, jacobian = ratios_and_jacobian(self.template, linear_of(x), self.at, self.logs)
-        return of_all_shots(ratio, 1.0), of_all_shots(jacobian * linear_slope(x)[:, None, None, None], 0.0)
+        ratio, jacobian = ratios_and_jacobian(self.template, linear_of(x), self.at, self.samples.shown)
+        return ratio, jacobian * linear_slope(x)[:, None, None, None]
 
     def __call__(self, x: Vector) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m 18"]]:
         """Whitened errors, mask and dark at their best, and their Jacobian."""
         ratio, of_ratio = self.ratios(x)
-        best = Profile.of(ratio, self.samples, self.weight)
-        errors = best.errors(ratio, self.samples) * self.weight
-        return errors.ravel(), best.jacobian(of_ratio).reshape(len(x), -1).T
+        best = self.samples.profile(ratio, self.weight)
+        return (best.errors * self.weight).ravel(), best.jacobian(of_ratio).reshape(len(x), -1).T
 
 
 @final
@@ -88,7 +144,6 @@ class MostProbable:
     cov: Float[np.ndarray, "18 18"]
     cost: float
     converged: bool
-    iterations: int
 
 
 @final
@@ -113,70 +168,62 @@ class _Free:
 
 @in_float64
 def most_probable(
-    errors_at: ErrorsAt,
-    start: Vector,
-    free: Bool[np.ndarray, "18"],
-    prior: Prior,
-    rules: SolverRules | None = None,
+    errors_at: ErrorsAt, start: Vector, free: Bool[np.ndarray, "18"], prior: Prior, rules: SolverRules | None = None
 ) -> MostProbable:
     """Where errors and prior together are least, over the free parameters."""
     problem = _Free(errors_at, free, Prior(prior.mean[free], prior.root[:, free]))
     found, cov = minimise(problem, start, rules), np.zeros((len(free), len(free)))
-    cost = found.equations.cost
-    if np.isfinite(cost):
+    if np.isfinite(found.equations.cost):
         cov[np.ix_(free, free)] = found.equations.cov()
-    return MostProbable(found.place, cov, cost, found.converged, found.iterations)
+    return MostProbable(found.place, cov, found.equations.cost, found.converged)
 
 
 @final
 @dataclass(frozen=True)
 class Fitted:
-    """Parameters and what follows from them at some positions; ``errors`` are measured less modelled rates."""
+    """An order's parameters, and what they make of the samples with mask and dark at their best."""
 
+    order: Order
     found: MostProbable
-    corner: Int[np.ndarray, "n 2"]
+    at: Windows
     ratio: PerShot
-    mask: PerBin
-    errors: PerShot
-    weight: PerShot
-
-    @classmethod
-    def of(
-        cls, found: MostProbable, corner: Int[np.ndarray, "n 2"], ratio: PerShot, samples: Samples, weight: PerShot
-    ) -> Fitted:
-        """With mask and dark at their best."""
-        best = Profile.of(ratio, samples, weight)
-        return cls(found, corner, ratio, best.mask, best.errors(ratio, samples), weight)
-
-    def reweighed(self, samples: Samples, weight: PerShot) -> Fitted:
-        """The same parameters at other weights."""
-        return Fitted.of(self.found, self.corner, self.ratio, samples, weight)
+    best: Profile
 
     @property
     def light(self) -> PerShot:
         """Modelled light, the dark signal left out."""
-        return self.mask * self.ratio
+        return self.best.mask * self.ratio
 
     @property
     def z(self) -> PerShot:
         """Errors in units of their sigma, 0 where not used."""
-        return self.errors * self.weight
-
-    @property
-    def chi2(self) -> float:
-        """The prior left out."""
-        return float((self.z**2).sum())
+        return self.best.errors * self.best.weight
 
     @property
     def used(self) -> Bool[np.ndarray, "shots 3 n"]:
         """Samples that count, dark left out."""
-        return np.concatenate([self.weight[:-1] > 0, np.zeros((1, *self.mask.shape), dtype=bool)])
+        used = self.best.weight > 0
+        used[-1] = False
+        return used
+
+    def weighed(self, weight: PerShot) -> Fitted:
+        """The same, mask and dark too, looked at with other weights."""
+        return replace(self, best=replace(self.best, weight=weight))
+
+    def dof(self, prior: Prior) -> float:
+        """Samples less one mask per bin (the dark signal has a sample of its own) less parameters.
+
+        A parameter that its prior holds takes less than one.
+        """
+        narrowed = np.where(self.order.free, np.diag(self.found.cov) / prior.sigma**2, 1.0)
+        used = self.used
+        return max(float(used.sum() - used.any(axis=0).sum() - np.maximum(1.0 - narrowed, 0.0).sum()), 1.0)
 
 
 @final
 @dataclass(frozen=True)
 class Problem:
-    """What all orders share; ``flat`` are the grid indices of the positions."""
+    """What all orders have in common; ``flat`` are the grid indices of the positions."""
 
     template: Backscatter
     samples: Samples
@@ -189,32 +236,41 @@ class Problem:
     def of(
         cls, data: BackscatterData, geometry: Geometry, rig: RigDescription, rules: BackscatterRules | None = None
     ) -> Problem:
-        """Samples at positions spread over the sensor, with a start found by scanning."""
+        """Samples at positions spread over the sensor; the start is at the best offset of whole panel pixels."""
         rules, step, prior = rules or BackscatterRules(), grid_step(rig), prior_of(rig)
         rays, flat = sampled_rays(geometry, rig, step, rules.positions)
         # The mask comes out of the likelihood; the template's is of no size.
         template = nominal_backscatter(geometry, rig, np.zeros((3, 1, 1)), step, window=1)
         template = replace(template, window=window_for(template, linear_of(prior.mean), rays, rules.slack_px))
-        samples = Samples.at(data, rays, flat, data.pictures)
-        weight, start = samples.first_weights(), prior.mean.copy()
-        lit = samples.excess[0] * weight[0] > 1.0
-        white = np.where(lit, samples.excess[0], 1.0)
-        ratio, weight = (np.where(lit, part, 0.0)[1:-1] for part in (samples.excess / white, weight * white))
-        theta = linear_of(TWO_PLANES.without_crosstalk().start(prior.mean, prior))
-        start[OFFSET] = best_offset(template, theta, rays, samples.shown, ratio, weight, offset_reach_px(rig))
+        samples, start = Samples.at(data, rays, flat), prior.mean.copy()
+        weight = samples.first_weights()
+
+        def cost(offset: tuple[int, int]) -> float:
+            start[OFFSET] = offset
+            at = Windows.around(template, linear_of(start), rays, samples.shown.crop)
+            return samples.profile(ratios(template, linear_of(start), at, samples.shown), weight).chi2
+
+        across, down = (range(-int(np.ceil(reach)), int(np.ceil(reach)) + 1) for reach in prior.sigma[OFFSET])
+        start[OFFSET] = min(((x, y) for y in down for x in across), key=cost)
         return cls(template, samples, flat, prior, start, rules)
 
     def solved(self, order: Order, x: Vector, weight: PerShot) -> Fitted:
         """The most probable parameters of an order at given weights, from ``x`` on."""
-        start = order.start(x, self.prior)
-        corner = corners_of(self.template, linear_of(start), self.samples.rays)
-        errors_at = SampleErrors.of(self.template, self.samples, weight, corner)
+        start, samples = order.start(x, self.prior), self.samples
+        at = Windows.around(self.template, linear_of(start), samples.rays, samples.shown.crop)
+        errors_at = SampleErrors(self.template, samples, weight, at)
         found = most_probable(errors_at, start, order.free, self.prior, self.rules.solver)
-        ratio = of_all_shots(ratios(self.template, linear_of(found.x), errors_at.at, self.samples.shown), 1.0)
-        return Fitted.of(found, corner, ratio, self.samples, weight)
+        ratio = ratios(self.template, linear_of(found.x), at, samples.shown)
+        return Fitted(order, found, at, ratio, samples.profile(ratio, weight))
 
     def with_room(self, x: Vector) -> Problem:
-        """With windows that hold the footprints of these parameters."""
-        rules = self.rules
-        wider = with_room(self.template, linear_of(x), self.samples.rays, rules.slack_px, rules.most_wider)
-        return replace(self, template=wider)
+        """With windows that hold the footprints of these parameters and let them move, never smaller than before.
+
+        They stay where they would have to be far wider: such a fit has gone astray.
+        """
+        theta, rays, window, rules = linear_of(x), self.samples.rays, self.template.window, self.rules
+        if not window < window_for(self.template, theta, rays, 0.0) <= rules.most_wider * window:
+            return self
+        return replace(
+            self, template=replace(self.template, window=window_for(self.template, theta, rays, rules.slack_px))
+        )
