@@ -11,7 +11,8 @@ from typing import Final, final, get_args
 
 from udccal.errors import UdccalError
 from udccal.planning.design import DESIGN_VARIABLES, Addition, Objective, cheapest, worthwhile
-from udccal.planning.forecast import QUANTITIES, predictor_for
+from udccal.planning.forecast import predictor_for
+from udccal.planning.predictor import QUANTITIES
 from udccal.planning.state import RigState
 from udccal.planning.steps import NOTHING, Cost, cost_of
 from udccal.rig import Captures

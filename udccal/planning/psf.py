@@ -24,7 +24,7 @@ from udccal.fitting.psf.start import PsfRules, start_model, start_prior, wire_sh
 from udccal.fitting.psf.weights import weighed
 from udccal.numerics import in_float64
 from udccal.planning.design import DESIGN_VARIABLES
-from udccal.planning.forecast import Floor
+from udccal.planning.predictor import Floor
 from udccal.planning.state import WHITE, RigState, built_wire, sample_variance_e
 from udccal.planning.steps import PlannedStep, planned_steps
 from udccal.rig import Captures
@@ -63,12 +63,12 @@ class PsfPredictor:
         self._known: dict[tuple[float, ...], Float[np.ndarray, "p p"]] = {}
 
     def sigma(self, captures: Captures) -> float:
-        """Root mean square over colours and field; see ``forecast.Predictor``."""
+        """Root mean square over colours and field; see ``Predictor``."""
         shots = self._shots_used(captures)
         return self._kernel_sigma(captures, shots) if shots else float("inf")
 
     def used(self, captures: Captures) -> float:
-        """Of all positions and shifts, a part; see ``forecast.Predictor``."""
+        """Of all positions and shifts, a part; see ``Predictor``."""
         shots = self._shots_used(captures)
         every = captures.psf_columns * captures.psf_rows * captures.psf_shifts
         return self._of_noise(captures, every) / self._of_noise(captures, shots) if shots else 1.0

@@ -26,7 +26,7 @@ from udccal.fitting.wire.parameters import (
     possible_harmonics,
 )
 from udccal.numerics import in_float64
-from udccal.planning.forecast import Floor
+from udccal.planning.predictor import Floor
 from udccal.planning.state import EvenField, RigState, sample_variance_e
 from udccal.planning.steps import planned_steps
 from udccal.rig import Captures
@@ -58,12 +58,12 @@ class WirePredictor:
         self._spent = self._every / odd_step(shape[0] * shape[1], _RULES.samples)
 
     def sigma(self, captures: Captures) -> float:
-        """Root mean square over the sensor; see ``forecast.Predictor``."""
+        """Root mean square over the sensor; see ``Predictor``."""
         relative = self._relative_variance(captures)
         return float("inf") if relative is None else self._map_sigma(relative, self._spent)
 
     def used(self, captures: Captures) -> float:
-        """Of all pixels, a part; see ``forecast.Predictor``."""
+        """Of all pixels, a part; see ``Predictor``."""
         relative = self._relative_variance(captures)
         if relative is None:
             return 1.0

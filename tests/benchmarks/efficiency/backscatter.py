@@ -25,7 +25,7 @@ from tests.scenes.backscatter import (
     world,
 )
 from udccal.fitting.backscatter.data import BackscatterData, grid_rays
-from udccal.fitting.backscatter.fit import TermAt, posterior_around, result_of
+from udccal.fitting.backscatter.fit import result_of
 from udccal.fitting.backscatter.model import Windows
 from udccal.fitting.backscatter.orders import moments_along_reflection, search
 from udccal.fitting.backscatter.parameters import (
@@ -36,7 +36,7 @@ from udccal.fitting.backscatter.parameters import (
     linear_slope,
     prior_of,
 )
-from udccal.fitting.backscatter.solve import Problem, SampleErrors, Samples, most_probable
+from udccal.fitting.backscatter.solve import Problem, TermAt, most_probable, posterior_around
 from udccal.fitting.engine.gaussian import Posterior
 from udccal.models.backscatter import Backscatter
 from udccal.numerics import in_float64
@@ -64,12 +64,13 @@ def ideal_of(of: World, expected: BackscatterData, flat: np.ndarray, template: B
     """The best that the positions with these flat indices allow."""
     prior, free, theta = prior_of(of.rig), TWO_PLANES.free, linear_of(of.x)
     rays = grid_rays(template.geometry, expected.shots.rate.shape[2:], template.step, flat)
-    samples = Samples.at(expected, rays, flat)
-    weight = samples.weights(samples.light, samples.light[0], 0.0, samples.usable)
-    errors_at = SampleErrors(template, samples, weight, Windows.around(template, theta, rays, expected.crop))
+    seen = expected.shots.at(flat)
+    weight = seen.weights(seen.rate, seen.rate[0], 0.0, seen.usable)
+    problem = Problem(template, seen, expected.pictures, rays, flat, prior, of.x, RULES)
+    errors_at = problem.errors_at(weight, Windows.around(template, theta, rays, expected.crop))
     jacobian = errors_at(of.x)[1] / linear_slope(of.x)
     cov = np.linalg.inv(jacobian.T @ jacobian + np.diag((prior.sigma * linear_slope(of.x)) ** -2.0))
-    used = np.ones(len(samples.light), dtype=bool)
+    used = np.ones(len(seen.rate), dtype=bool)
     # The prior draws what is hardly seen towards its mean.
     found = most_probable(errors_at, of.x, free, prior)
     sigma = np.sqrt(np.diag(moments_along_reflection(errors_at, found, free, prior, RULES).cov))

@@ -15,14 +15,13 @@ from udccal.displays.pictures import face_picture
 from udccal.fitting.backscatter.data import (
     BackscatterData,
     Binned,
-    Bins,
-    block_weights,
     grid_step,
     read_backscatter,
     visible_crop,
 )
 from udccal.fitting.backscatter.fit import fit_backscatter
 from udccal.fitting.backscatter.parameters import BackscatterRules
+from udccal.fitting.bins import Bins, block_weights
 from udccal.fitting.noise.fit import nominal_noise
 from udccal.fitting.nominal import nominal_geometry
 from udccal.models.backscatter import Backscatter, backscatter_rate

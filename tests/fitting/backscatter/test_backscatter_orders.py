@@ -55,8 +55,8 @@ def _shows(of: World, order: Order, expected: BackscatterData) -> bool:
     """Whether pictures without noise are described so much worse without any one part of the order."""
     problem = replace(Problem.of(expected, of.term.geometry, RIG, RULES), start=of.x)
     problem = replace(problem, template=replace(problem.template, window=of.term.window))
-    samples = problem.samples
-    weight = samples.weights(samples.light, samples.light[0], 0.0, samples.usable)
+    seen = problem.seen
+    weight = seen.weights(seen.rate, seen.rate[0], 0.0, seen.usable)
     crosstalk = bool(order.free[MIX].any())
     kernels = KERNELS if crosstalk else tuple(kernel.without_crosstalk() for kernel in KERNELS)
     rises = [_rise(problem, one, weight) for one in kernels if _simpler(one, order)]

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from udccal.fitting.backscatter.data import grid_step, sampled_rays, visible_crop
+from udccal.fitting.backscatter.data import Binned, grid_step, sampled_rays, visible_crop
 from udccal.fitting.backscatter.model import (
     BLOCK,
     PanelCrop,
@@ -31,7 +31,7 @@ from udccal.fitting.backscatter.parameters import (
     vector_of,
     with_linear,
 )
-from udccal.fitting.backscatter.solve import Fitted, MostProbable, Problem, Samples
+from udccal.fitting.backscatter.solve import Fitted, MostProbable, Problem
 from udccal.fitting.nominal import nominal_backscatter, nominal_geometry
 from udccal.models.backscatter import panel_response, response_grid
 from udccal.rig import load_rig
@@ -42,7 +42,7 @@ X = PRIOR.mean + 0.3 * PRIOR.sigma * np.random.default_rng(3).normal(size=18)
 THETA = linear_of(X)
 
 
-def _seen(shots: int = 5, n: int = 4, seed: int = 0) -> tuple[np.ndarray, Samples]:
+def _seen(shots: int = 5, n: int = 4, seed: int = 0) -> tuple[np.ndarray, Binned]:
     """Ratios, and light that follows them with noise; dark comes last."""
     rng = np.random.default_rng(seed)
     ratio = rng.uniform(0.1, 0.9, (shots + 1, 3, n))
@@ -52,15 +52,14 @@ def _seen(shots: int = 5, n: int = 4, seed: int = 0) -> tuple[np.ndarray, Sample
     rest[-1] = 0.01
     exposure = np.append(np.full(shots, 0.5), 1.0)
     light = mask * ratio + exposure[:, None, None] * dark + np.sqrt(rest) * rng.normal(size=ratio.shape)
-    shown = Pictures.of(np.zeros((shots - 1, 1, 1, 3), np.uint8), PanelCrop(0, 0, 1, 1))
-    usable = np.ones(ratio.shape, dtype=bool)
-    return ratio, Samples(np.zeros((n, 3)), light, np.full(ratio.shape, 0.01), rest, usable, exposure, shown)
+    clipped = np.zeros(ratio.shape, dtype=bool)
+    return ratio, Binned(light, np.full(ratio.shape, 0.01), rest, clipped, 1 / exposure, np.full(shots + 1, np.nan))
 
 
-def _weights(samples: Samples) -> np.ndarray:
-    light = samples.light.copy()
+def _weights(seen: Binned) -> np.ndarray:
+    light = seen.rate.copy()
     light[-1] = 0.0
-    return samples.weights(light, light[0], 0.0, samples.usable)
+    return seen.weights(light, light[0], 0.0, seen.usable)
 
 
 def test_derivatives_of_ratios_are_those_of_differences() -> None:
@@ -83,9 +82,12 @@ def test_derivatives_of_ratios_are_those_of_differences() -> None:
 
 
 def test_nothing_comes_from_beyond_the_crop() -> None:
-    pictures = Pictures.of(np.full((1, 2, 3, 3), 255, np.uint8), PanelCrop(10, 20, 3, 2))
-    at = Windows.at(3, np.zeros((2, 3)), np.array([[9, 19], [100, 100]]), pictures.crop)
-    assert at.inside.sum(axis=1).tolist() == [4, 0]
+    template = nominal_backscatter(nominal_geometry(RIG), RIG, np.zeros((3, 1, 1)), grid_step(RIG), window=3)
+    rays = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 1.0]])
+    column, row = Windows.around(template, THETA, rays, PanelCrop(0, 0, 1, 1)).corner[0]
+    pictures = Pictures.of(np.full((1, 2, 3, 3), 255, np.uint8), PanelCrop(int(column) + 1, int(row) + 1, 3, 2))
+    at = Windows.around(template, THETA, rays, pictures.crop)
+    assert (at.places < 6).sum(axis=1).tolist() == [4, 0]
     sums = at.sums(np.ones((2, 3, 1, 9)), pictures.light(2.2)[0])
     np.testing.assert_array_equal(sums[0, :, 1], np.tile([4.0, 0.0], (3, 1)))
 
@@ -121,21 +123,21 @@ def test_a_term_has_the_parameters_that_made_it() -> None:
 
 
 def test_mask_and_dark_are_those_of_least_squares() -> None:
-    ratio, samples = _seen()
-    weight = _weights(samples)
-    best = samples.profile(ratio, weight)
+    ratio, seen = _seen()
+    weight = _weights(seen)
+    best = seen.profile(ratio, weight)
     for c, n in np.ndindex(best.mask.shape):
-        rows = np.stack([ratio[:, c, n], samples.exposure], axis=1) * weight[:, c, n, None]
-        found, *_ = np.linalg.lstsq(rows, samples.light[:, c, n] * weight[:, c, n], rcond=None)
+        rows = np.stack([ratio[:, c, n], 1 / seen.exposure_s], axis=1) * weight[:, c, n, None]
+        found, *_ = np.linalg.lstsq(rows, seen.rate[:, c, n] * weight[:, c, n], rcond=None)
         np.testing.assert_allclose([best.mask[c, n], best.dark[c, n]], found, rtol=1e-10)
         assert best.information[c, n] == pytest.approx(1 / np.linalg.inv(rows.T @ rows)[0, 0], rel=1e-10)
 
 
 def test_the_mask_follows_ratios_as_said() -> None:
-    ratio, samples = _seen()
-    weight = _weights(samples)
-    best = samples.profile(ratio, weight)
-    expected = replace(samples, light=best.mask * ratio)
+    ratio, seen = _seen()
+    weight = _weights(seen)
+    best = seen.profile(ratio, weight)
+    expected = replace(seen, rate=best.mask * ratio)
     way = np.random.default_rng(1).normal(size=(2, *ratio.shape))
     found = best.mask_jacobian(way)
     for k in range(2):
@@ -144,28 +146,29 @@ def test_the_mask_follows_ratios_as_said() -> None:
 
 
 def test_whitened_errors_are_at_right_angles_to_mask_and_dark() -> None:
-    ratio, samples = _seen()
-    weight = _weights(samples)
-    best = samples.profile(ratio, weight)
+    ratio, seen = _seen()
+    weight = _weights(seen)
+    best = seen.profile(ratio, weight)
     errors = best.errors * weight
     jacobian = best.jacobian(np.random.default_rng(1).normal(size=(2, *ratio.shape)))
-    for way in (ratio * weight, samples.exposure[:, None, None] * weight):
+    for way in (ratio * weight, (1 / seen.exposure_s)[:, None, None] * weight):
         np.testing.assert_allclose((way * errors).sum(axis=0), 0.0, atol=1e-6)
         np.testing.assert_allclose((way * jacobian).sum(axis=1), 0.0, atol=1e-6)
 
 
 def test_a_typical_error_is_that_of_most_pictures() -> None:
     """A model error of 3 % in all pictures is found, one picture that is another altogether is not counted."""
-    ratio, samples = _seen(shots=12, n=60)
+    ratio, seen = _seen(shots=12, n=60)
     rng = np.random.default_rng(2)
     off = ratio.copy()
     off[1:-1] += 0.03 * rng.normal(size=(11, 3, 60))
     nothing = MostProbable(np.zeros(18), np.zeros((18, 18)), 0.0, True)
 
     def error_of(ratios_of: np.ndarray) -> float:
-        at = Windows.at(1, samples.rays, np.zeros((60, 2), dtype=np.int64), samples.shown.crop)
-        best = samples.profile(ratios_of, _weights(samples))
-        return typical_error(Fitted(TWO_PLANES, nothing, at, ratios_of, best), samples)
+        nowhere = np.zeros((60, 2), dtype=np.int64)
+        at = Windows(np.zeros((60, 3)), nowhere, nowhere)
+        best = seen.profile(ratios_of, _weights(seen))
+        return typical_error(Fitted(TWO_PLANES, nothing, at, ratios_of, best), seen)
 
     assert error_of(ratio) < 0.004
     assert error_of(off) == pytest.approx(0.03, rel=0.15)
@@ -187,8 +190,9 @@ def test_a_window_does_not_follow_a_fit_gone_astray() -> None:
     wider, astray = PRIOR.mean.copy(), PRIOR.mean.copy()
     wider[2] += np.log(2.2)
     astray[2] += np.log(50.0)
-    samples = replace(_seen(n=len(rays))[1], rays=rays)
-    problem = Problem(template, samples, np.arange(len(rays)), PRIOR, PRIOR.mean, BackscatterRules())
+    shown = Pictures.of(np.zeros((5, 1, 1, 3), np.uint8), PanelCrop(0, 0, 1, 1))
+    seen, flat = _seen(n=len(rays))[1], np.arange(len(rays))
+    problem = Problem(template, seen, shown, rays, flat, PRIOR, PRIOR.mean, BackscatterRules())
     assert problem.with_room(wider).template.window > template.window
     assert problem.with_room(astray) is problem
 

@@ -95,11 +95,11 @@ def test_held_out_pictures_of_the_model_leave_nothing_undescribed() -> None:
     shots = shots_of(of, rng, panel_pictures(of.rig, 0, PICTURES))
     found = search(Problem.of(shots, of.term.geometry, of.rig, RULES), (TWO_PLANES,))
     fitted = found.fitted
-    assert held_out(found.problem, fitted).model_error == 0.0
+    assert held_out(found.problem, fitted)[1] == 0.0
     # The pictures that are held out, with an error of 1 % of white that differs from place to place.
-    samples = found.problem.samples
-    light, out = samples.light.copy(), slice(RULES.held_out, -1, RULES.held_out)
+    seen = found.problem.seen
+    light, out = seen.rate.copy(), slice(RULES.held_out, -1, RULES.held_out)
     light[out] += 0.01 * light[0] * rng.choice([-1.0, 1.0], light[out].shape)
-    problem = replace(found.problem, samples=replace(samples, light=light))
+    problem = replace(found.problem, seen=replace(seen, rate=light))
     off = problem.solved(TWO_PLANES, fitted.found.x, fitted.best.weight)
-    assert held_out(problem, off).model_error == pytest.approx(0.01, rel=0.2)
+    assert held_out(problem, off)[1] == pytest.approx(0.01, rel=0.2)

@@ -9,11 +9,19 @@ from typing import final
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped, UInt8
-from scipy import sparse
 
-from udccal.cfa import cell_channels
-from udccal.fitting.backscatter.model import PanelCrop, Pictures, corners_of, directions
+from udccal.fitting.backscatter.model import (
+    PanelCrop,
+    PerBin,
+    PerShot,
+    Pictures,
+    Profile,
+    Usable,
+    corners_of,
+    directions,
+)
 from udccal.fitting.backscatter.parameters import BackscatterRules, linear_of, prior_of
+from udccal.fitting.bins import Bins
 from udccal.fitting.nominal import nominal_backscatter
 from udccal.models.geometry import Geometry
 from udccal.models.noise import Noise, variance_e
@@ -26,7 +34,7 @@ from udccal.sessions.store import Average, Session
 @final
 @dataclass(frozen=True)
 class Binned:
-    """Shots on the term's grid by camera colour.
+    """Shots on the term's grid, or at some of its bins, by camera colour: white first and dark last.
 
     Attributes:
         rate: e-/s above the black level, the dark signal included.
@@ -37,10 +45,10 @@ class Binned:
         scatter: variance between the frames of a shot over what the noise model says; NaN where not known.
     """
 
-    rate: Float[np.ndarray, "shots 3 grid_rows grid_columns"]
-    shot: Float[np.ndarray, "shots 3 grid_rows grid_columns"]
-    rest: Float[np.ndarray, "shots 3 grid_rows grid_columns"]
-    clipped: Bool[np.ndarray, "shots 3 grid_rows grid_columns"]
+    rate: Float[np.ndarray, "shots 3 *grid"]
+    shot: Float[np.ndarray, "shots 3 *grid"]
+    rest: Float[np.ndarray, "shots 3 *grid"]
+    clipped: Bool[np.ndarray, "shots 3 *grid"]
     exposure_s: Float[np.ndarray, " shots"]
     scatter: Float[np.ndarray, " shots"]
 
@@ -52,6 +60,46 @@ class Binned:
     def part(self, which: slice | Shaped[np.ndarray, " n"]) -> Binned:
         """Some of the shots."""
         return Binned(*(getattr(self, f.name)[which] for f in fields(self)))
+
+    def at(self, flat: Int[np.ndarray, " n"]) -> Binned:
+        """All shots at some bins, by their flat indices."""
+        whole = (self.rate, self.shot, self.rest, self.clipped)
+        parts = (part.reshape(*part.shape[:2], -1)[:, :, flat] for part in whole)
+        return Binned(*parts, self.exposure_s, self.scatter)
+
+    @property
+    def usable(self) -> Bool[np.ndarray, "shots 3 *grid"]:
+        """False where samples are clipped."""
+        usable = ~self.clipped
+        usable[-1] = True
+        return usable
+
+    @property
+    def excess(self) -> Float[np.ndarray, "shots 3 *grid"]:
+        """Light above that of the dark frame, as measured."""
+        return self.rate - np.multiply.outer(self.exposure_s[-1] / self.exposure_s, self.rate[-1])
+
+    def variance(self, rate: Float[np.ndarray, "shots 3 *grid"]) -> Float[np.ndarray, "shots 3 *grid"]:
+        """Of every bin by noise, at this light."""
+        # Never below rounding's: a black picture in a camera without read noise.
+        return np.maximum(self.shot * np.maximum(rate, 0.0) + self.rest, self.shot**2 / 12)
+
+    def weights(self, rate: PerShot, mask: PerBin, model_error: float, usable: Usable) -> PerShot:
+        """1 / sigma of every bin, 0 where not usable, at this light of this mask."""
+        variance = self.variance(rate)
+        # White is the mask by definition, dark has no light: the model's error is in neither.
+        variance[1:-1] += (model_error * mask) ** 2
+        return np.where(usable, 1 / np.sqrt(variance), 0.0)
+
+    def first_weights(self) -> PerShot:
+        """Weights by what was measured, one electron on the safe side."""
+        rate = np.maximum(self.excess, 0.0) + self.shot
+        rate[-1] = 0.0
+        return self.weights(rate, np.zeros(rate.shape[1:]), 0.0, self.usable)
+
+    def profile(self, ratio: PerShot, weight: PerShot) -> Profile:
+        """Mask and dark signal at their best."""
+        return Profile.of(ratio, self.rate, self.exposure_s[-1] / self.exposure_s, weight)
 
 
 @final
@@ -151,58 +199,6 @@ def binned(
         exposure_s=np.array([exposure_s]),
         scatter=np.array([scatter], dtype=np.float64),
     )
-
-
-@final
-@dataclass(frozen=True)
-class Bins:
-    """Averages of a mosaic over blocks of ``step`` x ``step`` (even) pixels, colour by colour.
-
-    A sample of a colour represents the 2 x 2 pixels around it and counts by the part of them inside the block: then
-    every colour's average is of the block's centre, though its samples are not.
-    """
-
-    cfa: str
-    step: int
-
-    def mean(self, mosaic: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray, "3 grid_rows grid_columns"]:
-        """Averages of the samples."""
-        return self._sum(mosaic, 1, 1)
-
-    def variance(self, mosaic: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray, "3 grid_rows grid_columns"]:
-        """Variances of the averages from those of the samples, each by itself."""
-        return self._sum(mosaic, 2, 2)
-
-    def row_variance(self, mosaic: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray, "3 grid_rows grid_columns"]:
-        """The same where the samples of a row go up and down together."""
-        return self._sum(mosaic, 2, 1)
-
-    def _sum(self, mosaic: np.ndarray, row_power: int, column_power: int) -> Float[np.ndarray, "3 a b"]:
-        sums = np.zeros((3, *(size // self.step for size in mosaic.shape)))
-        cells = np.asarray(cell_channels(self.cfa))
-        # A colour with two samples in a cell averages them.
-        factor = 1.0 / np.bincount(cells.ravel(), minlength=3) ** max(row_power, column_power)
-        for (j, i), channel in np.ndenumerate(cells):
-            part = mosaic[j::2, i::2].astype(np.float64)
-            by_row, by_column = (
-                sparse.csr_array(block_weights(samples, blocks, self.step, first) ** power)
-                for samples, blocks, first, power in zip(
-                    part.shape, sums.shape[1:], (j, i), (row_power, column_power), strict=True
-                )
-            )
-            sums[channel] += factor[channel] * (by_column @ (by_row @ part).T).T
-        return sums
-
-
-def block_weights(samples: int, blocks: int, step: int, first: int) -> Float[np.ndarray, "blocks samples"]:
-    """Weights of the samples at ``first``, ``first`` + 2, ... px in the averages over blocks of ``step`` px.
-
-    A sample covers one pixel to either side of it; what the sensor's edge cuts off, the others of the block take over.
-    """
-    centre = first + 2.0 * np.arange(samples)
-    edge = step * np.arange(blocks)[:, None] - 0.5
-    weights = np.maximum(np.minimum(centre + 1, edge + step) - np.maximum(centre - 1, edge), 0.0)
-    return np.asarray(weights / weights.sum(axis=1, keepdims=True))
 
 
 def grid_step(rig: RigDescription) -> int:

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import functools
-from dataclasses import dataclass, replace
-from typing import final
+from dataclasses import replace
 
-import jax
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
 from udccal.fitting.absent import absent_backscatter
 from udccal.fitting.backscatter.data import BackscatterData, grid_rays
-from udccal.fitting.backscatter.model import Profile, Windows, ratios, ratios_and_jacobian, window_for
+from udccal.fitting.backscatter.model import Usable, window_for
 from udccal.fitting.backscatter.orders import BAD_BINS, BAD_PICTURES, Found, search, value_moments
 from udccal.fitting.backscatter.parameters import (
     DEPTH,
@@ -23,14 +20,12 @@ from udccal.fitting.backscatter.parameters import (
     UNITS,
     BackscatterRules,
     Moments,
-    Vector,
     footprint_per_pupil,
     linear_of,
     linear_slope,
-    with_linear,
 )
-from udccal.fitting.backscatter.solve import LEAST_VARIANCE, Problem, Samples
-from udccal.fitting.engine.gaussian import Posterior, square_root
+from udccal.fitting.backscatter.solve import Problem, TermAt, posterior_around
+from udccal.fitting.engine.gaussian import Posterior
 from udccal.fitting.engine.misfit import MisfitTest, group_means_test, sharper
 from udccal.fitting.engine.report import estimates, residual_sample
 from udccal.fitting.engine.robust import outliers
@@ -39,10 +34,6 @@ from udccal.models.geometry import Geometry
 from udccal.numerics import in_float64
 from udccal.result import Diagnostic, FitResult, FitStatus, Outliers
 from udccal.rig import RigDescription
-
-# Bins so far apart are never interpolated between.
-_TILE = 4
-_with_linear = jax.jit(with_linear)
 
 
 def fit_backscatter(
@@ -82,8 +73,7 @@ def _usable(
         return FitStatus.TOO_FEW_DATA, note
     if (clipped := shots.clipped[0].mean()) > rules.most_clipped:
         return FitStatus.SATURATED, f"{clipped:.0%} of the white picture's bins hold clipped samples."
-    excess = shots.rate[0] - shots.rate[-1] * (shots.exposure_s[-1] / shots.exposure_s[0])
-    sigma = excess / np.sqrt(np.maximum(shots.rest[0] + shots.rest[-1], LEAST_VARIANCE * shots.shot[0] ** 2))
+    sigma = shots.excess[0] / np.sqrt(shots.variance(np.zeros(shots.rate.shape))[0] + shots.rest[-1])
     present = float(sigma.sum()) > rules.present_sigma * np.sqrt(sigma.size)
     if not (present and float(np.percentile(sigma, 90)) > rules.visible_sigma):
         return FitStatus.ABSENT, "The white picture gives no light that shows above noise."
@@ -121,7 +111,7 @@ def result_of(found: Found, data: BackscatterData, rig: RigDescription, clipped:
         samples=int(used.sum()),
         candidates=found.orders.candidates,
         diagnostics=(
-            Diagnostic("held_out_without_noise_of_peak", found.held_out.excess_of_peak, "1"),
+            Diagnostic("held_out_without_noise_of_peak", found.held_out, "1"),
             Diagnostic("model_error_of_white", found.model_error, "1"),
             Diagnostic("pattern_p_value", rest.p_value, "1"),
             Diagnostic("pattern_inflation", rest.inflation, "1"),
@@ -161,7 +151,7 @@ def _status(found: Found) -> tuple[FitStatus, tuple[str, ...]]:
     solved, problem, rules = found.fitted.found, found.problem, found.problem.rules
     if not solved.converged:
         return FitStatus.NOT_CONVERGED, ("Check panel and mounting in the rig's description.",)
-    if window_for(problem.template, linear_of(solved.x), problem.samples.rays, slack=0.0) > problem.template.window:
+    if window_for(problem.template, linear_of(solved.x), problem.rays, slack=0.0) > problem.template.window:
         return FitStatus.POOR_FIT, (
             "The pictures ask for footprints on the panel of more than three times their nominal width. Check lens, "
             "stand-off and pitch in the description, and that every frame was stored with the picture that was shown.",
@@ -174,9 +164,9 @@ def _status(found: Found) -> tuple[FitStatus, tuple[str, ...]]:
             f"The pictures do not determine {', '.join(NAMES[k] for k in place[unsure])}. Show pictures that differ in "
             "brightness, colour and shapes, or expose longer.",
         )
-    if found.held_out.excess_of_peak > rules.worst_error:
+    if found.held_out > rules.worst_error:
         return FitStatus.POOR_FIT, (
-            f"Pictures held out of the fit are predicted {found.held_out.excess_of_peak:.0%} of their peak wrong, "
+            f"Pictures held out of the fit are predicted {found.held_out:.0%} of their peak wrong, "
             "noise apart. Check that every frame was stored with the picture that the panel showed.",
         )
     bad = found.bad_shots[:-1]
@@ -216,10 +206,10 @@ def _notes(found: Found, rest: MisfitTest, data: BackscatterData, clipped: list[
 
 def _outliers(found: Found, data: BackscatterData, clipped: list[str]) -> tuple[Outliers, ...]:
     """What was left out, by rule."""
-    names, usable, bad = ("white", *data.names), found.problem.samples.usable[:-1], found.bad_shots[:-1]
+    names, usable, bad = ("white", *data.names), found.problem.seen.usable[:-1], found.bad_shots[:-1]
     places = _places(found).astype(int)
 
-    def named(which: Bool[np.ndarray, "shots 3 n"]) -> list[str]:
+    def named(which: Usable) -> list[str]:
         return [f"{names[i]} {'RGB'[c]} bin ({places[n, 0]}, {places[n, 1]})" for i, c, n in np.argwhere(which)]
 
     return (
@@ -228,74 +218,6 @@ def _outliers(found: Found, data: BackscatterData, clipped: list[str]) -> tuple[
         *outliers("bins with clipped samples", named(~usable)),
         *BAD_BINS.listed(named(usable & ~found.usable[:-1] & ~bad[:, None, None])),
     )
-
-
-@final
-@dataclass(frozen=True)
-class TermAt:
-    """The term as a function of its parameters (``linear_of``), and of ``_TILE`` squared numbers of the mask's noise.
-
-    The mask is the best one for all shots, which know it better than white alone. It follows the parameters linearly.
-    Bins with the same number are so far from each other that nothing interpolated depends on two of them, and go up
-    and down by chance, so that sums over the sensor are right on average.
-    """
-
-    template: Backscatter
-    data: BackscatterData
-    used: Bool[np.ndarray, " shots"]
-    model_error: float
-    theta: Vector
-
-    @in_float64
-    def __call__(self, parameters: Float[np.ndarray, " n"]) -> Backscatter:
-        """The term, its mask never below 0."""
-        theta, noise = parameters[: len(self.theta)], parameters[len(self.theta) :].reshape(_TILE, _TILE)
-        mask, sigma = self._mask
-        rows, columns = mask.shape[1:]
-        mask = mask + sigma * np.tile(noise, (-(-rows // _TILE), -(-columns // _TILE)))[:rows, :columns]
-        if (moved := theta - self.theta).any():
-            mask = mask + np.einsum("k,kcij->cij", moved, self._mask_jacobian)
-        with_parameters = _with_linear(self.template, theta)
-        term = jax.tree.map(lambda leaf: np.asarray(leaf, dtype=np.float64), with_parameters)
-        return replace(term, geometry=self.template.geometry, mask=np.maximum(mask, 0.0))
-
-    @functools.cached_property
-    def _mask(self) -> tuple[Float[np.ndarray, "3 a b"], Float[np.ndarray, "3 a b"]]:
-        """Light of white over the whole grid, and one sigma of it, whose sign is drawn."""
-        found = [self._best(flat)[1] for flat in self._parts(4096)]
-        mask = np.concatenate([one.mask for one in found], axis=1)
-        sigma = np.concatenate([np.maximum(one.information, 1e-30) for one in found], axis=1) ** -0.5
-        sign = np.random.default_rng(0).choice([-1.0, 1.0], mask.shape)
-        shape = self.data.shots.rate.shape[1:]
-        return np.maximum(mask, 0.0).reshape(shape), (sign * sigma).reshape(shape)
-
-    @functools.cached_property
-    def _mask_jacobian(self) -> Float[np.ndarray, "18 3 a b"]:
-        """How the mask follows the parameters: worked out for those who ask how sure the term is."""
-        parts = []
-        for flat in self._parts(256):
-            at, best = self._best(flat)
-            of_ratio = ratios_and_jacobian(self.template, self.theta, at, self.data.pictures)[1]
-            parts.append(best.mask_jacobian(of_ratio))
-        return np.concatenate(parts, axis=2).reshape(-1, *self.data.shots.rate.shape[1:])
-
-    def _parts(self, size: int) -> list[Int[np.ndarray, " n"]]:
-        """As many grid positions as are held in memory at a time."""
-        flat = np.arange(self.data.shots.rate[0, 0].size)
-        return np.split(flat, flat[size::size])
-
-    def _best(self, flat: Int[np.ndarray, " n"]) -> tuple[Windows, Profile]:
-        """Windows, and mask and dark signal, once by weights of what was measured, then by those of the model."""
-        rays = grid_rays(self.template.geometry, self.data.shots.rate.shape[2:], self.template.step, flat)
-        at = Windows.around(self.template, self.theta, rays, self.data.crop)
-        samples = Samples.at(self.data, rays, flat)
-        samples = replace(samples, usable=samples.usable & self.used[:, None, None])
-        ratio = ratios(self.template, self.theta, at, self.data.pictures)
-        best = samples.profile(ratio, samples.first_weights())
-        for _ in range(2):
-            weight = samples.weights(best.mask * ratio, best.mask, self.model_error, samples.usable)
-            best = samples.profile(ratio, weight)
-        return at, best
 
 
 @in_float64
@@ -319,11 +241,3 @@ def term_posterior(
         parts.append(Moments(linear_of(fit.x), factor * fit.cov * np.outer(slope, slope)))
     cov = Moments.mixture(parts, orders.probabilities, theta).cov
     return posterior_around(TermAt(template, data, ~found.bad_shots, found.model_error, theta), cov)
-
-
-def posterior_around(term_at: TermAt, cov: Float[np.ndarray, "18 18"]) -> Posterior[Backscatter]:
-    """With this covariance of the parameters, and the mask's noise."""
-    count, noise = len(cov), _TILE**2
-    factor = np.eye(count + noise)
-    factor[:count, :count] = square_root(cov)
-    return Posterior(np.concatenate([term_at.theta, np.zeros(noise)]), factor, term_at)

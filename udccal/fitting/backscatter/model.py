@@ -25,9 +25,12 @@ from udccal.models.backscatter import Backscatter, emitter_shares, footprints, w
 from udccal.models.geometry import Geometry, panel_directions
 from udccal.numerics import in_float64
 
-# By shot, colour and position; by bin: colour and position.
+# By shot, colour and position; by bin: colour and position; by parameter, too; in panel coordinates.
 PerShot = Float[np.ndarray, "shots 3 n"]
 PerBin = Float[np.ndarray, "3 n"]
+Usable = Bool[np.ndarray, "shots 3 n"]
+Rays = Float[np.ndarray, "n 3"]
+Moves = Float[np.ndarray, "k shots 3 n"]
 BLOCK = 32
 _LEAST_WHITE = 1e-9
 
@@ -56,12 +59,12 @@ def directions(geometry: Geometry, pixels: Float[np.ndarray, "n 2"]) -> Float[np
     return in_blocks(lambda part: (_directions(geometry, part),), np.asarray(pixels, dtype=np.float64))[0]
 
 
-def corners_of(template: Backscatter, theta: Vector, rays: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, "n 2"]:
+def corners_of(template: Backscatter, theta: Vector, rays: Rays) -> Int[np.ndarray, "n 2"]:
     """(column, row) of the first panel pixel of each position's window."""
     return _middle_and_reach(template, theta, rays)[0] - (template.window - 1) // 2
 
 
-def window_for(template: Backscatter, theta: Vector, rays: Float[np.ndarray, "n 3"], slack: float) -> int:
+def window_for(template: Backscatter, theta: Vector, rays: Rays, slack: float) -> int:
     """Odd number of panel pixels across a window that holds both footprints at every position.
 
     Args:
@@ -78,7 +81,7 @@ def window_for(template: Backscatter, theta: Vector, rays: Float[np.ndarray, "n 
 
 @in_float64
 def _middle_and_reach(
-    template: Backscatter, theta: Vector, rays: Float[np.ndarray, "n 3"]
+    template: Backscatter, theta: Vector, rays: Rays
 ) -> tuple[Int[np.ndarray, "n 2"], Float[np.ndarray, " n"]]:
     """Middle panel pixel of each position's window, and how far the footprints reach from it."""
     # For a window of one pixel: windows of any size then use one compilation.
@@ -116,7 +119,10 @@ class PanelCrop:
 @final
 @dataclass(frozen=True)
 class Pictures:
-    """What the panel showed in the part that the camera sees, by primary and pixel: white first, and black last."""
+    """What the panel showed in the part that the camera sees: white first, and black last.
+
+    Values 0 to 255 by primary; the pixels of the crop row by row, and then a black one in place of all beyond it.
+    """
 
     values: UInt8[np.ndarray, "3 pixels shots"]
     crop: PanelCrop
@@ -125,7 +131,8 @@ class Pictures:
     def of(cls, shown: UInt8[np.ndarray, "pictures crop_rows crop_columns 3"], crop: PanelCrop) -> Pictures:
         """From pictures in the crop, values 0 to 255; white and black are added."""
         values = shown.reshape(len(shown), crop.rows * crop.columns, 3).transpose(2, 1, 0)
-        return cls(np.pad(values, ((0, 0), (0, 0), (1, 1)), constant_values=((0, 0), (0, 0), (255, 0))), crop)
+        white = np.full((3, values.shape[1], 1), 255, np.uint8)
+        return cls(np.pad(np.concatenate([white, values], axis=2), ((0, 0), (0, 1), (0, 1))), crop)
 
     def light(self, gamma: float) -> Float[np.ndarray, "2 3 pixels shots"]:
         """Light of the panel's primaries, 1 at most, and its derivative by gamma."""
@@ -142,45 +149,34 @@ class Windows:
     Attributes:
         rays: of the positions, in panel coordinates.
         corner: (column, row) of each window's first panel pixel.
-        places: indices of a window's pixels in a row-major crop; ``inside`` tells which of them lie in it.
+        places: indices of a window's pixels among those of ``Pictures``.
     """
 
-    rays: Float[np.ndarray, "n 3"]
+    rays: Rays
     corner: Int[np.ndarray, "n 2"]
     places: Int[np.ndarray, "n window2"]
-    inside: Bool[np.ndarray, "n window2"]
 
     @classmethod
-    def at(
-        cls, window: int, rays: Float[np.ndarray, "n 3"], corner: Int[np.ndarray, "n 2"], crop: PanelCrop
-    ) -> Windows:
-        """Of ``window`` x ``window`` pixels from these corners on."""
-        span = np.arange(window)
+    def around(cls, template: Backscatter, theta: Vector, rays: Rays, crop: PanelCrop) -> Windows:
+        """As wide as the template says, around the footprints of these parameters."""
+        corner, span = corners_of(template, theta, rays), np.arange(template.window)
         columns = corner[:, 0, None, None] - crop.column + span[None, None, :]
         rows = corner[:, 1, None, None] - crop.row + span[None, :, None]
         inside = (columns >= 0) & (columns < crop.columns) & (rows >= 0) & (rows < crop.rows)
-        flat = np.clip(rows, 0, crop.rows - 1) * crop.columns + np.clip(columns, 0, crop.columns - 1)
-        return cls(rays, corner, flat.reshape(len(corner), -1), inside.reshape(len(corner), -1))
-
-    @classmethod
-    def around(cls, template: Backscatter, theta: Vector, rays: Float[np.ndarray, "n 3"], crop: PanelCrop) -> Windows:
-        """As wide as the template says, around the footprints of these parameters."""
-        return cls.at(template.window, rays, corners_of(template, theta, rays), crop)
+        places = np.where(inside, rows * crop.columns + columns, crop.rows * crop.columns)
+        return cls(rays, corner, places.reshape(len(corner), -1))
 
     def sums(
         self, shares: Float[np.ndarray, "n 3 k window2"], panel: Float[np.ndarray, "3 pixels shots"]
     ) -> Float[np.ndarray, "k 3 shots n"]:
         """Each primary's light from the panel; nothing comes from beyond the crop."""
-        count, _, kinds, window2 = shares.shape
-        shares = shares * self.inside[:, None, None]
-        places = np.repeat(self.places, kinds, axis=0).ravel()
-        row_ends = np.arange(count * kinds + 1) * window2
-        light = np.empty((3, count, kinds, panel.shape[2]))
-        for primary in range(3):
-            every = (shares[:, primary].ravel(), places, row_ends)
-            collect = sparse.csr_array(every, shape=(count * kinds, panel.shape[1]))
-            light[primary] = (collect @ panel[primary]).reshape(count, kinds, -1)
-        return light.transpose(2, 0, 3, 1)
+        pixels = panel.shape[1]
+        places = self.places[:, None, None] + pixels * np.arange(3)[:, None, None]
+        columns = np.broadcast_to(places, shares.shape).ravel()
+        ends = np.arange(0, shares.size + 1, shares.shape[3])
+        collect = sparse.csr_array((shares.ravel(), columns, ends), shape=(len(ends) - 1, 3 * pixels))
+        light = (collect @ panel.reshape(3 * pixels, -1)).reshape(*shares.shape[:3], -1)
+        return light.transpose(2, 1, 3, 0)
 
 
 @in_float64
@@ -214,37 +210,33 @@ def _shares(
 
 def ratios(template: Backscatter, theta: Vector, at: Windows, shown: Pictures) -> PerShot:
     """Light of pictures over that of white."""
-    light = at.sums(_shares_at(template, theta, at, derivatives=False), shown.light(float(theta[0]))[0])[0]
-    return _over_white(np.einsum("cp,psn->scn", _mix(theta), light))
+    shares = _shares_at(template, theta, at, derivatives=False)
+    light = _mixed(theta, at.sums(shares, shown.light(float(theta[0]))[0]))[0]
+    return light / np.maximum(light[0], _LEAST_WHITE)
 
 
-def ratios_and_jacobian(
-    template: Backscatter, theta: Vector, at: Windows, shown: Pictures
-) -> tuple[PerShot, Float[np.ndarray, "18 shots 3 n"]]:
+def ratios_and_jacobian(template: Backscatter, theta: Vector, at: Windows, shown: Pictures) -> tuple[PerShot, Moves]:
     """Light of pictures over that of white, and its derivatives by ``theta``."""
-    shares, mix = _shares_at(template, theta, at, derivatives=True), _mix(theta)
+    shares = _shares_at(template, theta, at, derivatives=True)
     panel, by_gamma = shown.light(float(theta[0]))
-    light = at.sums(shares, panel)
-    mixed = np.einsum("cp,kpsn->kscn", mix, light)
-    ratio, white = _over_white(mixed[0]), np.maximum(mixed[0, 0], _LEAST_WHITE)
+    primaries = at.sums(shares, panel)
+    light = _mixed(theta, primaries)
+    white = np.maximum(light[0, 0], _LEAST_WHITE)
+    ratio = light[0] / white
     jacobian = np.zeros((len(theta), *ratio.shape))
-    jacobian[0] = np.einsum("cp,psn->scn", mix, at.sums(shares[:, :, :1], by_gamma)[0]) / white
-    jacobian[PLACES] = (mixed[1:] - ratio * mixed[1:, :1]) / white
+    jacobian[0] = _mixed(theta, at.sums(shares[:, :, :1], by_gamma))[0] / white
+    jacobian[PLACES] = (light[1:] - ratio * light[1:, :1]) / white
     for k, (colour, primary) in enumerate(zip(*OFF_DIAGONAL, strict=True), MIX.start):
-        one = light[0, primary]
+        one = primaries[0, primary]
         jacobian[k, :, colour] = (one - ratio[:, colour] * one[0]) / white[colour]
     return ratio, jacobian
 
 
-def _mix(theta: Vector) -> Float[np.ndarray, "3 3"]:
-    """Camera colour from primary but for the factor of each row, which ratios do not depend on."""
+def _mixed(theta: Vector, primaries: Float[np.ndarray, "k 3 shots n"]) -> Moves:
+    """Camera colours from primaries, but for a factor of each colour, on which ratios do not depend."""
     mix = np.eye(3)
     mix[OFF_DIAGONAL] = theta[MIX]
-    return mix
-
-
-def _over_white(light: PerShot) -> PerShot:
-    return light / np.maximum(light[0], _LEAST_WHITE)
+    return np.einsum("cp,kpsn->kscn", mix, primaries)
 
 
 @final
@@ -287,7 +279,7 @@ class Profile:
         errors = light - mask * ratio - exposure[:, None, None] * dark
         return cls(mask, dark, errors, weight, information, by_mask, by_dark)
 
-    def jacobian(self, of_ratio: Float[np.ndarray, "k shots 3 n"]) -> Float[np.ndarray, "k shots 3 n"]:
+    def jacobian(self, of_ratio: Moves) -> Moves:
         """Of the whitened errors, off what mask and dark can take up (Kaufman, BIT 15, 1975).
 
         Its square is the information of the profiled likelihood.
@@ -297,14 +289,12 @@ class Profile:
             jacobian -= way * np.einsum("scn,kscn->kcn", way, jacobian)[:, None]
         return jacobian
 
-    def mask_jacobian(self, of_ratio: Float[np.ndarray, "k shots 3 n"]) -> Float[np.ndarray, "k 3 n"]:
+    def mask_jacobian(self, of_ratio: Moves) -> Float[np.ndarray, "k 3 n"]:
         """How the mask follows the ratios, for the light that is expected; what noise adds is of second order."""
         along = np.einsum("scn,kscn->kcn", self.by_mask * self.weight, of_ratio)
         return -self.mask * along / np.sqrt(np.where(self.information > 0, self.information, 1.0))
 
-    def light_variance(
-        self, ratio: PerShot, of_ratio: Float[np.ndarray, "k shots 3 n"], cov: Float[np.ndarray, "k k"]
-    ) -> PerShot:
+    def light_variance(self, ratio: PerShot, of_ratio: Moves, cov: Float[np.ndarray, "k k"]) -> PerShot:
         """Of predicted light: the parameters' covariance with the mask that follows them, and the mask's noise."""
         moves = self.mask * of_ratio + ratio * self.mask_jacobian(of_ratio)[:, None]
         by_parameters = np.einsum("kicn,kl,licn->icn", moves, cov, moves, optimize=True)

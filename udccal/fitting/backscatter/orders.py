@@ -14,7 +14,8 @@ import numpy as np
 from jaxtyping import Bool
 from scipy.special import ndtri
 
-from udccal.fitting.backscatter.model import PerShot
+from udccal.fitting.backscatter.data import Binned
+from udccal.fitting.backscatter.model import PerShot, Usable
 from udccal.fitting.backscatter.parameters import (
     KERNELS,
     MIX,
@@ -33,8 +34,6 @@ from udccal.fitting.backscatter.solve import (
     Fitted,
     MostProbable,
     Problem,
-    SampleErrors,
-    Samples,
     most_probable,
 )
 from udccal.fitting.engine.gaussian import Prior
@@ -48,20 +47,6 @@ BAD_BINS = OutlierRule("bins")
 
 @final
 @dataclass(frozen=True)
-class HeldOut:
-    """How a fit without some pictures predicts those.
-
-    Attributes:
-        excess_of_peak: rms of measured less predicted light over each picture's peak, what noise gives taken out.
-        model_error: what the model leaves undescribed of ratios there; 0 where not significant.
-    """
-
-    excess_of_peak: float
-    model_error: float
-
-
-@final
-@dataclass(frozen=True)
 class Found:
     """The order that was chosen and its fit.
 
@@ -70,15 +55,16 @@ class Found:
         model_error: what the model leaves undescribed of a ratio, as one sigma.
         orders: all that were compared.
         bad_shots: left out whole (white first, dark last).
+        held_out: rms of errors of pictures that took no part over their peaks, noise taken out.
     """
 
     problem: Problem
     fitted: Fitted
-    usable: Bool[np.ndarray, "shots 3 n"]
+    usable: Usable
     model_error: float
     orders: Choice[Fitted]
     bad_shots: Bool[np.ndarray, " shots"]
-    held_out: HeldOut
+    held_out: float
 
     @property
     def dof(self) -> float:
@@ -88,7 +74,7 @@ class Found:
 
 def search(problem: Problem, kernels: tuple[Order, ...] = KERNELS) -> Found:
     """Fit the orders and take the one of the largest evidence; ``kernels`` holds one where the order is known."""
-    noise, rules = problem.samples.first_weights(), problem.rules
+    noise, rules = problem.seen.first_weights(), problem.rules
     simple = _from_afar(problem, ONE_PLANE, problem.start, noise, rules.first_error)
     bad = _bad_shots(simple.weighed(noise), rules)
     problem = problem.with_room(simple.found.x)
@@ -103,12 +89,12 @@ def search(problem: Problem, kernels: tuple[Order, ...] = KERNELS) -> Found:
     best = orders.best.fit
     best = problem.solved(best.order, best.found.x, rich.best.weight)
     fitted, error = refit(problem, best, usable)
-    held = held_out(problem, fitted)
+    held, new = held_out(problem, fitted)
     # Pictures that took no part say what is to be expected of new ones.
-    return Found(problem, fitted, usable, max(error, held.model_error), orders, bad, held)
+    return Found(problem, fitted, usable, max(error, new), orders, bad, held)
 
 
-def refit(problem: Problem, fitted: Fitted, usable: Bool[np.ndarray, "shots 3 n"]) -> tuple[Fitted, float]:
+def refit(problem: Problem, fitted: Fitted, usable: Usable) -> tuple[Fitted, float]:
     """With weights of the model, and with what it leaves undescribed, which comes back too, until both stay."""
     error = 0.0
     for _ in range(2):
@@ -116,9 +102,9 @@ def refit(problem: Problem, fitted: Fitted, usable: Bool[np.ndarray, "shots 3 n"
         unit = np.broadcast_to(mask**2, used.shape).copy()
         # White and dark have no part in the model's error.
         unit[[0, -1]] = 0.0
-        noise = problem.samples.variance(fitted.light)
+        noise = problem.seen.variance(fitted.light)
         error = excess_sigma(fitted.best.errors[used] ** 2, noise[used], unit[used], fitted.dof(problem.prior))
-        weight = problem.samples.weights(fitted.light, mask, error, usable)
+        weight = problem.seen.weights(fitted.light, mask, error, usable)
         fitted = problem.solved(fitted.order, fitted.found.x, weight)
     return fitted, error
 
@@ -129,20 +115,20 @@ def _from_afar(problem: Problem, order: Order, x: Vector, noise: PerShot, error:
     Against noise alone, errors of a poor start outweigh any prior and throw the parameters far off. ``error`` is the
     model error that the start is taken to have.
     """
-    light, used = np.maximum(problem.samples.excess[0], 0.0), noise > 0
+    light, used = np.maximum(problem.seen.excess[0], 0.0), noise > 0
     for _ in range(4):
         variance = 1 / np.where(used, noise, 1.0) ** 2
         variance[1:-1] += (error * light) ** 2
         fitted = problem.solved(order, x, np.where(used, 1 / np.sqrt(variance), 0.0))
-        x, before, error = fitted.found.x, error, typical_error(fitted, problem.samples)
+        x, before, error = fitted.found.x, error, typical_error(fitted, problem.seen)
         if error > problem.rules.settled * before:
             break
     return fitted
 
 
-def typical_error(fitted: Fitted, samples: Samples) -> float:
+def typical_error(fitted: Fitted, seen: Binned) -> float:
     """Model error relative to white that half of the pictures' samples have: bad pictures do not count."""
-    used, noise = fitted.used, samples.variance(fitted.light)
+    used, noise = fitted.used, seen.variance(fitted.light)
     used[0] = False
     unit = np.broadcast_to(fitted.best.mask**2, used.shape)
     return robust_excess_sigma(fitted.best.errors[used] ** 2, noise[used], unit[used])
@@ -150,12 +136,12 @@ def typical_error(fitted: Fitted, samples: Samples) -> float:
 
 def _two_planes(problem: Problem, simple: Fitted, noise: PerShot) -> Fitted:
     """The best of some fits, with reflections brighter and fainter than the emitters themselves to begin with."""
-    prior, samples = problem.prior, problem.samples
+    prior, seen = problem.prior, problem.seen
     # No more than one plane leaves: against much more, all starts would end at the prior's mean.
-    error = typical_error(simple, samples)
+    error = typical_error(simple, seen)
     starts = [split_plane(simple.found.x, prior, reflection) for reflection in problem.rules.reflections]
     fits = [_from_afar(problem, TWO_PLANES, x, noise, error) for x in starts]
-    return min(fits, key=lambda one: samples.profile(one.ratio, noise).chi2 + prior.cost(one.found.x))
+    return min(fits, key=lambda one: seen.profile(one.ratio, noise).chi2 + prior.cost(one.found.x))
 
 
 def _bad_shots(fitted: Fitted, rules: BackscatterRules) -> Bool[np.ndarray, " shots"]:
@@ -173,21 +159,17 @@ def _bad_shots(fitted: Fitted, rules: BackscatterRules) -> Bool[np.ndarray, " sh
     return bad
 
 
-def _without_outliers(
-    problem: Problem, fitted: Fitted, good: Bool[np.ndarray, " shots"]
-) -> Bool[np.ndarray, "shots 3 n"]:
+def _without_outliers(problem: Problem, fitted: Fitted, good: Bool[np.ndarray, " shots"]) -> Usable:
     """Samples that stay: the worst of a bin goes, which may have pulled the others off, and its mask is fitted anew."""
-    samples = problem.samples
-    begun = usable = samples.usable & good[:, None, None]
+    seen = problem.seen
+    usable = seen.usable & good[:, None, None]
     for _ in range(4):
-        best = samples.profile(fitted.ratio, np.where(usable, fitted.best.weight, 0.0))
+        best = seen.profile(fitted.ratio, np.where(usable, fitted.best.weight, 0.0))
         used = best.weight > 0
         used[-1] = False
         z = np.where(used, np.abs(best.errors * best.weight), 0.0)
         usable = usable & ~(BAD_BINS.off(z, used) & (z == z.max(axis=0)))
-    # Of a bin that lost so many, the others are not trusted either.
-    lost = (begun & ~usable)[:-1].sum(axis=0) > problem.rules.lost_bin * np.maximum(begun[:-1].sum(axis=0), 1)
-    return np.concatenate([usable[:-1] & ~lost, usable[-1:]])
+    return usable
 
 
 def _compared(problem: Problem, rich: Fitted, simple: Vector, kernels: tuple[Order, ...]) -> Choice[Fitted]:
@@ -214,17 +196,22 @@ def _compared(problem: Problem, rich: Fitted, simple: Vector, kernels: tuple[Ord
     return choose([*tried, attempt(problem.solved(plain, best.found.x, weight))])
 
 
-def held_out(problem: Problem, full: Fitted) -> HeldOut:
-    """A fit without some pictures, and its errors there; ``full`` is the fit with them."""
-    every, samples = problem.rules.held_out, problem.samples
+def held_out(problem: Problem, full: Fitted) -> tuple[float, float]:
+    """How a fit without some pictures predicts those; ``full`` is the fit with them.
+
+    Returns:
+        rms of measured less predicted light over each picture's peak, what noise gives taken out; and what the model
+        leaves undescribed of ratios there, 0 where not significant.
+    """
+    every, seen = problem.rules.held_out, problem.seen
     weight = full.best.weight.copy()
     weight[every:-1:every] = 0.0
     fitted = problem.solved(full.order, full.found.x, weight)
     used = full.used & (weight == 0)
     if not used.any():
-        return HeldOut(0.0, 0.0)
-    ratio, of_ratio = SampleErrors(problem.template, samples, weight, fitted.at).ratios(fitted.found.x)
-    noise = samples.variance(fitted.light) + fitted.best.light_variance(ratio, of_ratio, fitted.found.cov)
+        return 0.0, 0.0
+    ratio, of_ratio = problem.ratios(fitted.found.x, fitted.at)
+    noise = seen.variance(fitted.light) + fitted.best.light_variance(ratio, of_ratio, fitted.found.cov)
     excess = fitted.best.errors**2 - noise
     peak = np.maximum(np.where(used, fitted.light, 0.0).max(axis=(1, 2), keepdims=True), 1e-12)
     of_peak = float((excess / peak**2)[used].mean())
@@ -232,7 +219,7 @@ def held_out(problem: Problem, full: Fitted) -> HeldOut:
     found = chi2_test(full.found.cost - fitted.found.cost, float(used.sum())).found
     unit = np.broadcast_to(fitted.best.mask**2, used.shape)[used].sum()
     of_white = float(excess[used].sum() / max(float(unit), 1e-30))
-    return HeldOut(float(np.sqrt(max(of_peak, 0.0))), float(np.sqrt(max(of_white, 0.0)) * found))
+    return float(np.sqrt(max(of_peak, 0.0))), float(np.sqrt(max(of_white, 0.0)) * found)
 
 
 def value_moments(found: Found, inflation: float) -> Moments:
@@ -244,7 +231,7 @@ def value_moments(found: Found, inflation: float) -> Moments:
     """
     problem, fitted = found.problem, found.fitted
     free, solved, weight = fitted.order.free, fitted.found, fitted.best.weight / np.sqrt(inflation)
-    errors_at = SampleErrors(problem.template, problem.samples, weight, fitted.at)
+    errors_at = problem.errors_at(weight, fitted.at)
     if inflation > 1:
         # The prior is as sure as before: only the pictures say less.
         solved = most_probable(errors_at, solved.x, free, problem.prior, problem.rules.solver)

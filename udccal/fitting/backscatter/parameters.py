@@ -8,10 +8,9 @@ Light is close to linear in other coordinates (``linear_of``), in which orders w
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import final
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
@@ -57,7 +56,6 @@ class BackscatterRules:
         reflections: light of the second plane over that of the first, where fits of two planes start. Where the farther
             one is the brighter, a fit that begins with the nearer one brighter may end at its mirror image.
         worse_pictures: a picture described so many times worse than the others does not belong.
-        lost_bin: a bin goes altogether when more than this fraction of its shots is left out: dust, or a hot sample.
         nothing_fits: model error, as a fraction of white, from which orders are not compared.
         held_out: every so-manyth picture is predicted by a fit without it.
         cells: residuals are averaged over so many parts of the sensor, across and down, in search of a pattern.
@@ -81,7 +79,6 @@ class BackscatterRules:
     settled: float = 0.7
     reflections: tuple[float, ...] = (4.0, 1.0, 0.2)
     worse_pictures: float = 4.0
-    lost_bin: float = 0.5
     nothing_fits: float = 0.05
     held_out: int = 4
     cells: int = 3
@@ -239,17 +236,17 @@ def vector_of(term: Backscatter) -> Vector:
 def with_linear(term: Backscatter, theta: Float[Array, "18"]) -> Backscatter:
     """The term with parameters of ``linear_of``."""
     offset = theta[OFFSET]
-    emitters = jnp.stack([offset + theta[8:10], offset, offset + theta[10:12]])
     distance, pupil, softness, _, depth = jnp.exp(theta[1:6])
     reflected = jnp.minimum(theta[REFLECTION], 1 - 1e-9)
     mix = jnp.eye(3, dtype=theta.dtype).at[OFF_DIAGONAL].set(theta[MIX])
-    return eqx.tree_at(
-        lambda t: (
-            t.gamma, t.distance_mm, t.pupil_mm, t.softness_px, t.reflection, t.reflection_mm, t.emitters_px, t.mix
-        ),
+    return replace(
         term,
-        (
-            theta[0], distance, pupil, softness, reflected / (1 - reflected), depth, emitters,
-            mix / mix.sum(axis=1, keepdims=True),
-        ),
-    )  # fmt: skip
+        gamma=theta[0],
+        distance_mm=distance,
+        pupil_mm=pupil,
+        softness_px=softness,
+        reflection=reflected / (1 - reflected),
+        reflection_mm=depth,
+        emitters_px=jnp.stack([offset + theta[8:10], offset, offset + theta[10:12]]),
+        mix=mix / mix.sum(axis=1, keepdims=True),
+    )

@@ -9,19 +9,23 @@ noise, what is left in the dark, and (e m)^2 for what the model leaves undescrib
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import final
 
+import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from udccal.fitting.backscatter.data import BackscatterData, grid_step, sampled_rays
+from udccal.fitting.backscatter.data import BackscatterData, Binned, grid_rays, grid_step, sampled_rays
 from udccal.fitting.backscatter.model import (
-    PerBin,
+    Moves,
     PerShot,
     Pictures,
     Profile,
+    Rays,
+    Usable,
     Windows,
     ratios,
     ratios_and_jacobian,
@@ -35,8 +39,9 @@ from udccal.fitting.backscatter.parameters import (
     linear_of,
     linear_slope,
     prior_of,
+    with_linear,
 )
-from udccal.fitting.engine.gaussian import Prior
+from udccal.fitting.engine.gaussian import Posterior, Prior, square_root
 from udccal.fitting.engine.least_squares import Blocks, SolverRules, Step, minimise
 from udccal.fitting.nominal import nominal_backscatter
 from udccal.models.backscatter import Backscatter
@@ -44,95 +49,11 @@ from udccal.models.geometry import Geometry
 from udccal.numerics import in_float64
 from udccal.rig import RigDescription
 
-# Variance of a bin's count is never below this many e-^2: a black picture in a camera without read noise.
-LEAST_VARIANCE = 1 / 12
+# Bins so far apart are never interpolated between.
+_TILE = 4
+_with_linear = jax.jit(with_linear)
 # Parameters in the solver's coordinates to whitened errors and their Jacobian.
 ErrorsAt = Callable[[Vector], tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m 18"]]]
-
-
-@final
-@dataclass(frozen=True)
-class Samples:
-    """Shots at some positions, as in ``Binned``.
-
-    Attributes:
-        rays: of the positions, in panel coordinates.
-        light: rates in e-/s above the black level.
-        shot, rest: variance per rate, and that of light in the dark.
-        usable: False where samples are clipped.
-        exposure: that of the dark frame over that of each shot.
-        shown: what the panel showed.
-    """
-
-    rays: Float[np.ndarray, "n 3"]
-    light: PerShot
-    shot: PerShot
-    rest: PerShot
-    usable: Bool[np.ndarray, "shots 3 n"]
-    exposure: Float[np.ndarray, " shots"]
-    shown: Pictures
-
-    @classmethod
-    def at(cls, data: BackscatterData, rays: Float[np.ndarray, "n 3"], flat: Int[np.ndarray, " n"]) -> Samples:
-        """At grid positions with these rays and flat indices."""
-        shots = data.shots
-        light, shot, rest, clipped = (
-            part.reshape(*part.shape[:2], -1)[:, :, flat]
-            for part in (shots.rate, shots.shot, shots.rest, shots.clipped)
-        )
-        usable = ~clipped
-        usable[-1] = True
-        return cls(rays, light, shot, rest, usable, shots.exposure_s[-1] / shots.exposure_s, data.pictures)
-
-    @property
-    def excess(self) -> PerShot:
-        """Light above that of the dark frame, as measured."""
-        return self.light - self.exposure[:, None, None] * self.light[-1]
-
-    def variance(self, rate: PerShot) -> PerShot:
-        """Of every sample by noise, at this light."""
-        return np.maximum(self.shot * np.maximum(rate, 0.0) + self.rest, LEAST_VARIANCE * self.shot**2)
-
-    def weights(
-        self, rate: PerShot, mask: PerBin, model_error: float, usable: Bool[np.ndarray, "shots 3 n"]
-    ) -> PerShot:
-        """1 / sigma of every sample, 0 where not usable, at this light of this mask."""
-        variance = self.variance(rate)
-        # White is the mask by definition, dark has no light: the model's error is in neither.
-        variance[1:-1] += (model_error * mask) ** 2
-        return np.where(usable, 1 / np.sqrt(variance), 0.0)
-
-    def first_weights(self) -> PerShot:
-        """Weights by what was measured, one electron on the safe side."""
-        rate = np.maximum(self.excess, 0.0) + self.shot
-        rate[-1] = 0.0
-        return self.weights(rate, np.zeros(rate.shape[1:]), 0.0, self.usable)
-
-    def profile(self, ratio: PerShot, weight: PerShot) -> Profile:
-        """Mask and dark signal at their best."""
-        return Profile.of(ratio, self.light, self.exposure, weight)
-
-
-@final
-@dataclass(frozen=True)
-class SampleErrors:
-    """Errors of samples as a function of the parameters: windows on the panel stay where they are."""
-
-    template: Backscatter
-    samples: Samples
-    weight: PerShot
-    at: Windows
-
-    def ratios(self, x: Vector) -> tuple[PerShot, Float[np.ndarray, "18 shots 3 n"]]:
-        """Light over that of white, and its derivatives by the solver's coordinates."""
-        ratio, jacobian = ratios_and_jacobian(self.template, linear_of(x), self.at, self.samples.shown)
-        return ratio, jacobian * linear_slope(x)[:, None, None, None]
-
-    def __call__(self, x: Vector) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m 18"]]:
-        """Whitened errors, mask and dark at their best, and their Jacobian."""
-        ratio, of_ratio = self.ratios(x)
-        best = self.samples.profile(ratio, self.weight)
-        return (best.errors * self.weight).ravel(), best.jacobian(of_ratio).reshape(len(x), -1).T
 
 
 @final
@@ -200,7 +121,7 @@ class Fitted:
         return self.best.errors * self.best.weight
 
     @property
-    def used(self) -> Bool[np.ndarray, "shots 3 n"]:
+    def used(self) -> Usable:
         """Samples that count, dark left out."""
         used = self.best.weight > 0
         used[-1] = False
@@ -223,10 +144,12 @@ class Fitted:
 @final
 @dataclass(frozen=True)
 class Problem:
-    """What all orders have in common; ``flat`` are the grid indices of the positions."""
+    """What all orders have in common; ``flat`` are the grid indices of the positions, ``rays`` in panel coordinates."""
 
     template: Backscatter
-    samples: Samples
+    seen: Binned
+    shown: Pictures
+    rays: Rays
     flat: Int[np.ndarray, " n"]
     prior: Prior
     start: Vector
@@ -242,35 +165,123 @@ class Problem:
         # The mask comes out of the likelihood; the template's is of no size.
         template = nominal_backscatter(geometry, rig, np.zeros((3, 1, 1)), step, window=1)
         template = replace(template, window=window_for(template, linear_of(prior.mean), rays, rules.slack_px))
-        samples, start = Samples.at(data, rays, flat), prior.mean.copy()
-        weight = samples.first_weights()
+        seen, shown, start = data.shots.at(flat), data.pictures, prior.mean.copy()
+        weight = seen.first_weights()
 
         def cost(offset: tuple[int, int]) -> float:
             start[OFFSET] = offset
-            at = Windows.around(template, linear_of(start), rays, samples.shown.crop)
-            return samples.profile(ratios(template, linear_of(start), at, samples.shown), weight).chi2
+            at = Windows.around(template, linear_of(start), rays, shown.crop)
+            return seen.profile(ratios(template, linear_of(start), at, shown), weight).chi2
 
         across, down = (range(-int(np.ceil(reach)), int(np.ceil(reach)) + 1) for reach in prior.sigma[OFFSET])
         start[OFFSET] = min(((x, y) for y in down for x in across), key=cost)
-        return cls(template, samples, flat, prior, start, rules)
+        return cls(template, seen, shown, rays, flat, prior, start, rules)
 
     def solved(self, order: Order, x: Vector, weight: PerShot) -> Fitted:
         """The most probable parameters of an order at given weights, from ``x`` on."""
-        start, samples = order.start(x, self.prior), self.samples
-        at = Windows.around(self.template, linear_of(start), samples.rays, samples.shown.crop)
-        errors_at = SampleErrors(self.template, samples, weight, at)
-        found = most_probable(errors_at, start, order.free, self.prior, self.rules.solver)
-        ratio = ratios(self.template, linear_of(found.x), at, samples.shown)
-        return Fitted(order, found, at, ratio, samples.profile(ratio, weight))
+        start = order.start(x, self.prior)
+        at = Windows.around(self.template, linear_of(start), self.rays, self.shown.crop)
+        found = most_probable(self.errors_at(weight, at), start, order.free, self.prior, self.rules.solver)
+        ratio = ratios(self.template, linear_of(found.x), at, self.shown)
+        return Fitted(order, found, at, ratio, self.seen.profile(ratio, weight))
+
+    def ratios(self, x: Vector, at: Windows) -> tuple[PerShot, Moves]:
+        """Light over that of white, and its derivatives by the solver's coordinates."""
+        ratio, jacobian = ratios_and_jacobian(self.template, linear_of(x), at, self.shown)
+        return ratio, jacobian * linear_slope(x)[:, None, None, None]
+
+    def errors_at(self, weight: PerShot, at: Windows) -> ErrorsAt:
+        """Whitened errors, mask and dark at their best, and their Jacobian; windows stay where they are."""
+
+        def of(x: Vector) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m 18"]]:
+            ratio, of_ratio = self.ratios(x, at)
+            best = self.seen.profile(ratio, weight)
+            return (best.errors * weight).ravel(), best.jacobian(of_ratio).reshape(len(x), -1).T
+
+        return of
 
     def with_room(self, x: Vector) -> Problem:
         """With windows that hold the footprints of these parameters and let them move, never smaller than before.
 
         They stay where they would have to be far wider: such a fit has gone astray.
         """
-        theta, rays, window, rules = linear_of(x), self.samples.rays, self.template.window, self.rules
-        if not window < window_for(self.template, theta, rays, 0.0) <= rules.most_wider * window:
+        theta, rules, template = linear_of(x), self.rules, self.template
+        if not template.window < window_for(template, theta, self.rays, 0.0) <= rules.most_wider * template.window:
             return self
-        return replace(
-            self, template=replace(self.template, window=window_for(self.template, theta, rays, rules.slack_px))
-        )
+        window = window_for(template, theta, self.rays, rules.slack_px)
+        return replace(self, template=replace(template, window=window))
+
+
+@final
+@dataclass(frozen=True)
+class TermAt:
+    """The term as a function of its parameters (``linear_of``), and of ``_TILE`` squared numbers of the mask's noise.
+
+    The mask is the best one for all shots, which know it better than white alone. It follows the parameters linearly.
+    Bins with the same number are so far from each other that nothing interpolated depends on two of them, and go up
+    and down by chance, so that sums over the sensor are right on average.
+    """
+
+    template: Backscatter
+    data: BackscatterData
+    used: Bool[np.ndarray, " shots"]
+    model_error: float
+    theta: Vector
+
+    @in_float64
+    def __call__(self, parameters: Float[np.ndarray, " n"]) -> Backscatter:
+        """The term, its mask never below 0."""
+        theta, noise = parameters[: len(self.theta)], parameters[len(self.theta) :].reshape(_TILE, _TILE)
+        mask, sigma = self._mask
+        rows, columns = mask.shape[1:]
+        mask = mask + sigma * np.tile(noise, (-(-rows // _TILE), -(-columns // _TILE)))[:rows, :columns]
+        if (moved := theta - self.theta).any():
+            mask = mask + np.einsum("k,kcij->cij", moved, self._mask_jacobian)
+        with_parameters = _with_linear(self.template, theta)
+        term = jax.tree.map(lambda leaf: np.asarray(leaf, dtype=np.float64), with_parameters)
+        return replace(term, geometry=self.template.geometry, mask=np.maximum(mask, 0.0))
+
+    @functools.cached_property
+    def _mask(self) -> tuple[Float[np.ndarray, "3 a b"], Float[np.ndarray, "3 a b"]]:
+        """Light of white over the whole grid, and one sigma of it, whose sign is drawn."""
+        found = [self._best(flat)[1] for flat in self._parts(4096)]
+        mask = np.concatenate([one.mask for one in found], axis=1)
+        sigma = np.concatenate([np.maximum(one.information, 1e-30) for one in found], axis=1) ** -0.5
+        sign = np.random.default_rng(0).choice([-1.0, 1.0], mask.shape)
+        shape = self.data.shots.rate.shape[1:]
+        return np.maximum(mask, 0.0).reshape(shape), (sign * sigma).reshape(shape)
+
+    @functools.cached_property
+    def _mask_jacobian(self) -> Float[np.ndarray, "18 3 a b"]:
+        """How the mask follows the parameters: worked out for those who ask how sure the term is."""
+        parts = []
+        for flat in self._parts(256):
+            at, best = self._best(flat)
+            of_ratio = ratios_and_jacobian(self.template, self.theta, at, self.data.pictures)[1]
+            parts.append(best.mask_jacobian(of_ratio))
+        return np.concatenate(parts, axis=2).reshape(-1, *self.data.shots.rate.shape[1:])
+
+    def _parts(self, size: int) -> list[Int[np.ndarray, " n"]]:
+        """As many grid positions as are held in memory at a time."""
+        flat = np.arange(self.data.shots.rate[0, 0].size)
+        return np.split(flat, flat[size::size])
+
+    def _best(self, flat: Int[np.ndarray, " n"]) -> tuple[Windows, Profile]:
+        """Windows, and mask and dark signal, once by weights of what was measured, then by those of the model."""
+        rays = grid_rays(self.template.geometry, self.data.shots.rate.shape[2:], self.template.step, flat)
+        at = Windows.around(self.template, self.theta, rays, self.data.crop)
+        seen = self.data.shots.at(flat)
+        usable = seen.usable & self.used[:, None, None]
+        ratio = ratios(self.template, self.theta, at, self.data.pictures)
+        best = seen.profile(ratio, np.where(usable, seen.first_weights(), 0.0))
+        for _ in range(2):
+            best = seen.profile(ratio, seen.weights(best.mask * ratio, best.mask, self.model_error, usable))
+        return at, best
+
+
+def posterior_around(term_at: TermAt, cov: Float[np.ndarray, "18 18"]) -> Posterior[Backscatter]:
+    """With this covariance of the parameters, and the mask's noise."""
+    count, noise = len(cov), _TILE**2
+    factor = np.eye(count + noise)
+    factor[:count, :count] = square_root(cov)
+    return Posterior(np.concatenate([term_at.theta, np.zeros(noise)]), factor, term_at)
