@@ -110,11 +110,7 @@ def refit(problem: Problem, fitted: Fitted, usable: Usable) -> tuple[Fitted, flo
 
 
 def _from_afar(problem: Problem, order: Order, x: Vector, noise: PerShot, error: float) -> Fitted:
-    """A fit whose start leaves much undescribed, which counts as noise, so that the prior keeps its weight.
-
-    Against noise alone, errors of a poor start outweigh any prior and throw the parameters far off. ``error`` is the
-    model error that the start is taken to have.
-    """
+    """A fit whose start has this model error, which counts as noise: against noise alone, no prior would count."""
     light, used = np.maximum(problem.seen.excess[0], 0.0), noise > 0
     for _ in range(4):
         variance = 1 / np.where(used, noise, 1.0) ** 2
@@ -197,11 +193,9 @@ def _compared(problem: Problem, rich: Fitted, simple: Vector, kernels: tuple[Ord
 
 
 def held_out(problem: Problem, full: Fitted) -> tuple[float, float]:
-    """How a fit without some pictures predicts those; ``full`` is the fit with them.
+    """How badly pictures left out of a fit are predicted: relative to their peaks, and as a model error of ratios.
 
-    Returns:
-        rms of measured less predicted light over each picture's peak, what noise gives taken out; and what the model
-        leaves undescribed of ratios there, 0 where not significant.
+    Noise is taken out of both; the model error is 0 where it is not significant. ``full`` is the fit with them.
     """
     every, seen = problem.rules.held_out, problem.seen
     weight = full.best.weight.copy()
@@ -223,11 +217,9 @@ def held_out(problem: Problem, full: Fitted) -> tuple[float, float]:
 
 
 def value_moments(found: Found, inflation: float) -> Moments:
-    """Of the values by the chosen order; where other orders may be right, the covariance holds them, too.
+    """Of the values by the chosen order; the covariance holds the others by their probability (``Choice``).
 
-    What they add is their own covariance and by how much they differ from the chosen one, by their probability
-    (Hoeting et al., Statistical Science 14, 1999). ``inflation`` is of the noise's variance, where residuals have a
-    pattern.
+    ``inflation`` is of the noise's variance, where residuals have a pattern.
     """
     problem, fitted = found.problem, found.fitted
     free, solved, weight = fitted.order.free, fitted.found, fitted.best.weight / np.sqrt(inflation)
@@ -266,16 +258,14 @@ def moments_along_reflection(
         return held, -0.5 * evidence(held.cost + off**2, held.cov[np.ix_(others, others)], prior.sigma[others])
 
     nodes = [node(solved.x)]
-    middle, top = nodes[0]
     for sign in (1.0, -1.0):
-        last, way = middle, sign * solved.cov[:, REFLECTION] / step
+        x, way = nodes[0][0].x, sign * solved.cov[:, REFLECTION] / step
         for _ in range(12):
-            here, log = node(last.x + way)
-            nodes.append((here, log))
-            way, last = here.x - last.x, here
+            nodes.append(node(x + way))
+            x, way = nodes[-1][0].x, nodes[-1][0].x - x
             # In squares of the value, to which its variance goes, values further up weigh more.
-            ahead = 2 * max(float(here.x[REFLECTION] - middle.x[REFLECTION]), 0.0)
-            if not log - top + ahead > -6.0:
+            ahead = 2 * max(float(x[REFLECTION] - nodes[0][0].x[REFLECTION]), 0.0)
+            if not nodes[-1][1] - nodes[0][1] + ahead > -6.0:
                 break
     # Equal steps: sums are integrals, to many digits for what falls off this smoothly.
     weights = np.exp([log - max(log for _, log in nodes) for _, log in nodes])

@@ -132,10 +132,8 @@ class Fitted:
         return replace(self, best=replace(self.best, weight=weight))
 
     def dof(self, prior: Prior) -> float:
-        """Samples less one mask per bin (the dark signal has a sample of its own) less parameters.
-
-        A parameter that its prior holds takes less than one.
-        """
+        """Samples less one mask per bin (the dark signal has a sample of its own) less parameters."""
+        # A parameter that its prior holds takes less than one.
         narrowed = np.where(self.order.free, np.diag(self.found.cov) / prior.sigma**2, 1.0)
         used = self.used
         return max(float(used.sum() - used.any(axis=0).sum() - np.maximum(1.0 - narrowed, 0.0).sum()), 1.0)
@@ -201,10 +199,7 @@ class Problem:
         return of
 
     def with_room(self, x: Vector) -> Problem:
-        """With windows that hold the footprints of these parameters and let them move, never smaller than before.
-
-        They stay where they would have to be far wider: such a fit has gone astray.
-        """
+        """With windows that let the footprints of these parameters move, unless the fit has gone far astray."""
         theta, rules, template = linear_of(x), self.rules, self.template
         if not template.window < window_for(template, theta, self.rays, 0.0) <= rules.most_wider * template.window:
             return self

@@ -90,7 +90,6 @@ def excess_sigma(
     noise: Float[np.ndarray, " n"],
     unit: Float[np.ndarray, " n"],
     dof: float,
-    constant: float = 0.0,
     chance: float = SIGNIFICANT,
 ) -> float:
     """Size of an error beside noise that brings chi-squared to its degrees of freedom; 0 unless it is significant.
@@ -102,23 +101,19 @@ def excess_sigma(
         noise: variance of each.
         unit: variance that an error of size 1 adds to each.
         dof: degrees of freedom.
-        constant: chi-squared of data that have no such error.
         chance: how often chance may find an error where there is none; 0.5 gives an estimate wherever one is above 0.
     """
-    if not unit.any() or chi2_tail(float((square / noise).sum()) + constant, dof) > chance:
+    if not unit.any() or chi2_tail(float((square / noise).sum()), dof) > chance:
         return 0.0
-    return _halved(square, unit, lambda size: float((square / (noise + size**2 * unit)).sum()) + constant > dof)
+    return _halved(square, unit, lambda size: float((square / (noise + size**2 * unit)).sum()) > dof)
 
 
 def robust_excess_sigma(
     square: Float[np.ndarray, " n"], noise: Float[np.ndarray, " n"], unit: Float[np.ndarray, " n"]
 ) -> float:
-    """The same, significant or not, by half of the residuals being below their probable error: outliers have no say.
+    """The same, significant or not, by half of the residuals being below their probable error: outliers do not count.
 
-    Args:
-        square: of residuals.
-        noise: variance of each.
-        unit: variance that an error of size 1 adds to each.
+    Arguments as for ``excess_sigma``.
     """
     probable = MAD_TO_SIGMA**-2
     return _halved(square, unit, lambda size: float(np.median(square / (noise + size**2 * unit))) > probable)

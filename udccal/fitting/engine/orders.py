@@ -97,7 +97,7 @@ def evidence(
     A parameter that the data cannot tell costs nothing and stays, with its true error bar.
 
     Args:
-        cost: chi-squared at the minimum, the prior's share included.
+        cost: chi-squared at the minimum, what the prior adds included.
         cov: of the free parameters, after the data.
         prior_sigma: of the same.
         against: -2 ln of how probable the order is beforehand.
