@@ -36,7 +36,7 @@ from udccal.fitting.backscatter.parameters import (
     linear_slope,
     prior_of,
 )
-from udccal.fitting.backscatter.solve import Problem, TermAt, most_probable, posterior_around
+from udccal.fitting.backscatter.solve import Problem, TermAt, most_probable
 from udccal.fitting.engine.gaussian import Posterior
 from udccal.models.backscatter import Backscatter
 from udccal.numerics import in_float64
@@ -75,7 +75,7 @@ def ideal_of(of: World, expected: BackscatterData, flat: np.ndarray, template: B
     found = most_probable(errors_at, of.x, free, prior)
     sigma = np.sqrt(np.diag(moments_along_reflection(errors_at, found, free, prior, RULES).cov))
     sigma[2] /= footprint_per_pupil(of.rig)
-    return Ideal(posterior_around(TermAt(template, expected, used, 0.0, theta), cov), sigma)
+    return Ideal(TermAt(template, expected, used, 0.0, theta).posterior(cov), sigma)
 
 
 @dataclass(frozen=True)

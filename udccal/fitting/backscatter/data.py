@@ -63,9 +63,10 @@ class Binned:
 
     def at(self, flat: Int[np.ndarray, " n"]) -> Binned:
         """All shots at some bins, by their flat indices."""
-        whole = (self.rate, self.shot, self.rest, self.clipped)
-        parts = (part.reshape(*part.shape[:2], -1)[:, :, flat] for part in whole)
-        return Binned(*parts, self.exposure_s, self.scatter)
+        rate, shot, rest, clipped = (
+            part.reshape(*part.shape[:2], -1)[:, :, flat] for part in (self.rate, self.shot, self.rest, self.clipped)
+        )
+        return Binned(rate, shot, rest, clipped, self.exposure_s, self.scatter)
 
     @property
     def usable(self) -> Bool[np.ndarray, "shots 3 *grid"]:

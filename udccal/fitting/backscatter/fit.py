@@ -24,7 +24,7 @@ from udccal.fitting.backscatter.parameters import (
     linear_of,
     linear_slope,
 )
-from udccal.fitting.backscatter.solve import Problem, TermAt, posterior_around
+from udccal.fitting.backscatter.solve import Problem, TermAt
 from udccal.fitting.engine.gaussian import Posterior
 from udccal.fitting.engine.misfit import MisfitTest, group_means_test, sharper
 from udccal.fitting.engine.report import estimates, residual_sample
@@ -99,6 +99,9 @@ def result_of(found: Found, data: BackscatterData, rig: RigDescription, clipped:
     window = window_for(template, linear_of(fitted.found.x), rays, slack=0.5)
     posterior = term_posterior(replace(template, window=window), data, found, rest.inflation)
     status, advice = _status(found)
+    # Between the frames of a shot, over what the noise model says, as the median of all shots; 0: unknown.
+    known = data.shots.scatter[:-1][np.isfinite(data.shots.scatter[:-1])]
+    scatter = float(np.median(known)) if known.size else 0.0
     # What the profiled mask took from the residuals' variance is given back.
     z = fitted.z[used] * np.sqrt(used.sum() / found.dof)
     return FitResult(
@@ -115,10 +118,10 @@ def result_of(found: Found, data: BackscatterData, rig: RigDescription, clipped:
             Diagnostic("model_error_of_white", found.model_error, "1"),
             Diagnostic("pattern_p_value", rest.p_value, "1"),
             Diagnostic("pattern_inflation", rest.inflation, "1"),
-            Diagnostic("frame_scatter_over_noise", _scatter(data), "1"),
+            Diagnostic("frame_scatter_over_noise", scatter, "1"),
             Diagnostic("pictures", float((~found.bad_shots[1:-1]).sum()), "1"),
         ),
-        notes=(*advice, *_notes(found, rest, data, clipped)),
+        notes=(*advice, *_notes(found, rest, scatter, clipped)),
         outliers=_outliers(found, data, clipped),
         residuals=residual_sample(_places(found)[np.nonzero(used)[2]] * template.step, z),
         posterior=posterior,
@@ -178,13 +181,7 @@ def _status(found: Found) -> tuple[FitStatus, tuple[str, ...]]:
     return FitStatus.CONVERGED, ()
 
 
-def _scatter(data: BackscatterData) -> float:
-    """Variance between the frames of a shot over what the noise model says, as the median of all shots; 0: unknown."""
-    known = data.shots.scatter[:-1][np.isfinite(data.shots.scatter[:-1])]
-    return float(np.median(known)) if known.size else 0.0
-
-
-def _notes(found: Found, rest: MisfitTest, data: BackscatterData, clipped: list[str]) -> tuple[str, ...]:
+def _notes(found: Found, rest: MisfitTest, scatter: float, clipped: list[str]) -> tuple[str, ...]:
     notes = [f"{len(clipped)} clipped pictures left out."] if clipped else []
     if found.model_error > 0:
         notes.append(f"Ratios to white are modelled to {found.model_error:.2%} only; that counts as noise.")
@@ -193,9 +190,9 @@ def _notes(found: Found, rest: MisfitTest, data: BackscatterData, clipped: list[
             f"Residuals have a pattern (p = {rest.p_value:.1g}); all sigmas are {np.sqrt(rest.inflation):.1f} times "
             "those of independent ones."
         )
-    if _scatter(data) > found.problem.rules.steady:
+    if scatter > found.problem.rules.steady:
         notes.append(
-            f"Frames of one picture vary {_scatter(data):.1f} times as much as noise: the panel may flicker. Expose "
+            f"Frames of one picture vary {scatter:.1f} times as much as noise: the panel may flicker. Expose "
             "for whole periods of its refresh."
         )
     held = [name for name, free in zip(NAMES, found.fitted.order.free, strict=True) if not free]
@@ -240,4 +237,4 @@ def term_posterior(
         slope = linear_slope(fit.x)
         parts.append(Moments(linear_of(fit.x), factor * fit.cov * np.outer(slope, slope)))
     cov = Moments.mixture(parts, orders.probabilities, theta).cov
-    return posterior_around(TermAt(template, data, ~found.bad_shots, found.model_error, theta), cov)
+    return TermAt(template, data, ~found.bad_shots, found.model_error, theta).posterior(cov)

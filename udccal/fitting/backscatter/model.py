@@ -38,13 +38,11 @@ _LEAST_WHITE = 1e-9
 def in_blocks(
     function: Callable[..., tuple[Array, ...]], *columns: Shaped[np.ndarray, "n ..."]
 ) -> tuple[Shaped[np.ndarray, "n ..."], ...]:
-    """``function`` of arrays with one row per position, ``BLOCK`` rows at a time: it is compiled once.
-
-    The last block repeats the last row; what it gives for the copies is left out.
-    """
+    """``function`` of arrays with one row per position, ``BLOCK`` rows at a time: it is compiled once."""
     count = len(columns[0])
     found = []
     for first in range(0, count, BLOCK):
+        # The last block repeats the last row.
         rows = np.minimum(np.arange(first, first + BLOCK), count - 1)
         found.append([np.asarray(part) for part in function(*(column[rows] for column in columns))])
     return tuple(np.concatenate(parts)[:count] for parts in zip(*found, strict=True))
@@ -280,10 +278,7 @@ class Profile:
         return cls(mask, dark, errors, weight, information, by_mask, by_dark)
 
     def jacobian(self, of_ratio: Moves) -> Moves:
-        """Of the whitened errors, off what mask and dark can take up (Kaufman, BIT 15, 1975).
-
-        Its square is the information of the profiled likelihood.
-        """
+        """Of the whitened errors, off what mask and dark can take up (Kaufman, BIT 15, 1975)."""
         jacobian = -(self.mask * self.weight) * of_ratio
         for way in (self.by_dark, self.by_mask):
             jacobian -= way * np.einsum("scn,kscn->kcn", way, jacobian)[:, None]

@@ -273,10 +273,9 @@ class TermAt:
             best = seen.profile(ratio, seen.weights(best.mask * ratio, best.mask, self.model_error, usable))
         return at, best
 
-
-def posterior_around(term_at: TermAt, cov: Float[np.ndarray, "18 18"]) -> Posterior[Backscatter]:
-    """With this covariance of the parameters, and the mask's noise."""
-    count, noise = len(cov), _TILE**2
-    factor = np.eye(count + noise)
-    factor[:count, :count] = square_root(cov)
-    return Posterior(np.concatenate([term_at.theta, np.zeros(noise)]), factor, term_at)
+    def posterior(self, cov: Float[np.ndarray, "18 18"]) -> Posterior[Backscatter]:
+        """With this covariance of the parameters, and the mask's noise."""
+        count, noise = len(cov), _TILE**2
+        factor = np.eye(count + noise)
+        factor[:count, :count] = square_root(cov)
+        return Posterior(np.concatenate([self.theta, np.zeros(noise)]), factor, self)
