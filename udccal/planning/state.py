@@ -18,7 +18,6 @@ from udccal.fitting.nominal import nominal_geometry
 from udccal.models.backscatter import Backscatter
 from udccal.models.geometry import Geometry
 from udccal.models.noise import Noise, variance_e
-from udccal.models.psf import PsfField
 from udccal.models.wire import Wire, wire_values
 from udccal.numerics import in_float64
 from udccal.profiles.profile import Profile
@@ -69,7 +68,7 @@ class RigState:
     Attributes:
         rig: with the captures that are looked at.
         noise, geometry: as expected.
-        wire, psf, backscatter: as a profile has measured them; None: as built.
+        wire, backscatter: as a profile has measured them; None: as built.
         model_errors: errors beside noise.
     """
 
@@ -77,17 +76,12 @@ class RigState:
     noise: Noise
     geometry: Geometry
     wire: Wire | None = None
-    psf: PsfField | None = None
     backscatter: Backscatter | None = None
     model_errors: ModelErrors = ModelErrors()
 
-    def of(self, rig: RigDescription) -> RigState:
-        """The same of another description."""
-        return replace(self, rig=rig)
-
     def with_captures(self, captures: Captures) -> RigState:
         """The same with other captures."""
-        return self.of(self.rig.model_copy(update={"captures": captures}))
+        return replace(self, rig=self.rig.model_copy(update={"captures": captures}))
 
     @property
     def full_well_e(self) -> float:
@@ -124,7 +118,6 @@ def measured_state(rig: RigDescription, fits: Calibration | Profile) -> RigState
         noise=fits.noise.term if _converged(fits.noise) else nominal.noise,
         geometry=fits.geometry.term if geometry_seen else nominal.geometry,
         wire=fits.wire.term if _converged(fits.wire) else None,
-        psf=fits.psf.term if _converged(fits.psf) else None,
         backscatter=fits.backscatter.term if _converged(fits.backscatter) else None,
         model_errors=ModelErrors(
             on_jig_px=_corners_px(fits.geometry, ON_JIG) if geometry_seen else None,
