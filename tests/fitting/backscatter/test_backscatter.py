@@ -15,6 +15,7 @@ from udccal.displays.pictures import face_picture
 from udccal.fitting.backscatter.data import (
     BackscatterData,
     Binned,
+    binned,
     grid_step,
     read_backscatter,
     visible_crop,
@@ -30,7 +31,7 @@ from udccal.result import FitResult, FitStatus
 from udccal.rig import RigDescription, load_rig
 from udccal.sessions.captured import AveragedFrames
 from udccal.sessions.schema import DarkSubject
-from udccal.sessions.store import Session
+from udccal.sessions.store import Average, Session
 from udccal.sessions.writer import SessionWriter
 from udccal.simulation.backscatter import backscatterer
 
@@ -90,7 +91,7 @@ def data(simulator) -> BackscatterData:  # type: ignore[no-untyped-def]
     rng = np.random.default_rng(1)
     crop = visible_crop(known_geometry(), RIG)
 
-    def binned(light: np.ndarray) -> Binned:
+    def one_shot(light: np.ndarray) -> Binned:
         rate, _ = noisy(light, rng)
         bins, one = Bins(RIG.camera.cfa, grid_step(RIG)), np.ones_like(rate)
         mean = bins.mean(rate)
@@ -101,7 +102,7 @@ def data(simulator) -> BackscatterData:  # type: ignore[no-untyped-def]
     dark = np.zeros((RIG.camera.rows, RIG.camera.columns))
     lit = [simulator.rate(one) for one in (WHITE, *SHOWN)]
     return BackscatterData(
-        shots=Binned.joined([binned(light) for light in (*lit, dark)]),
+        shots=Binned.joined([one_shot(light) for light in (*lit, dark)]),
         shown=np.stack([crop.of(one) for one in SHOWN]),
         crop=crop,
         names=tuple(f"picture_{seed}" for seed in range(len(SHOWN))),
@@ -210,6 +211,16 @@ def test_bins_are_means_of_one_colour() -> None:
     np.testing.assert_allclose(bins.variance(np.ones((rows, columns))), many.var(axis=0), rtol=0.2)
     rowwise = np.stack([bins.mean(np.repeat(rng.normal(size=(rows, 1)), columns, axis=1)) for _ in range(1000)])
     np.testing.assert_allclose(bins.row_variance(np.ones((rows, columns))), rowwise.var(axis=0), rtol=0.2)
+
+
+@pytest.mark.parametrize(("most", "clipped"), [(0.98, 1), (0.5, 2), (1.0, 0)])
+def test_a_bin_is_clipped_from_the_fraction_of_saturation_that_the_rules_say(most: float, clipped: int) -> None:
+    noise = nominal_noise(RIG)
+    mean = np.full((8, 8), float(noise.black_DN), np.float32)
+    mean[0, 0], mean[0, 4] = 0.99 * float(noise.saturation_DN), 0.7 * float(noise.saturation_DN)
+    average = Average(mean, np.ones_like(mean), FRAMES)
+    found = binned(average, EXPOSURE_S, noise, np.ones(mean.shape), Bins("RGGB", 4), most)
+    assert found.clipped.sum() == clipped
 
 
 @pytest.mark.parametrize("cfa", ["RGGB", "BGGR", "GRBG", "GBRG"])
