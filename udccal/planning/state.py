@@ -187,7 +187,7 @@ class EvenField:
         y, x = (np.linspace(0, size - 1, count) for size, count in zip(self._size[::-1], _FIELD_GRID, strict=True))
         pixels = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
         if wire is None:
-            ideal = (pixels - np.asarray(geometry.centre)) / np.asarray(geometry.focal)
+            ideal = (pixels - np.asarray(geometry.principal_point_px)) / np.asarray(geometry.focal_px)
             values = (1 + (ideal**2).sum(axis=1)) ** -2.0
         else:
             values = np.asarray(_wire_values(wire, pixels, camera.rows, camera.columns), dtype=np.float64)

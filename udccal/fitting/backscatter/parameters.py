@@ -22,7 +22,7 @@ from udccal.rig import RigDescription
 
 Vector = Float[np.ndarray, "18"]
 NAMES = (
-    "gamma", "distance_mm", "pupil_mm", "softness_px", "reflection", "reflection_mm", "offset_x_px", "offset_y_px",
+    "gamma", "standoff_mm", "pupil_diameter_mm", "softness_px", "reflection", "reflection_mm", "offset_x_px", "offset_y_px",
     "red_x_px", "red_y_px", "blue_x_px", "blue_y_px", "mix_rg", "mix_rb", "mix_gr", "mix_gb", "mix_br", "mix_bg",
 )  # fmt: skip
 UNITS = ("1", "mm", "mm", "px", "1", "mm", *["px"] * 6, *["1"] * 6)
@@ -162,7 +162,7 @@ def prior_of(rig: RigDescription) -> Prior:
     standoff, pitch = mounting.standoff_mm, panel.pitch_mm
     depth = 2 * panel.glass_thickness_mm / panel.glass_index
     softness_px, reflection, crosstalk = 0.15, 1.0, 0.1
-    lengths = [standoff.value, rig.pupil_mm * footprint_per_pupil(rig), softness_px, reflection, depth]
+    lengths = [standoff.value, rig.pupil_diameter_mm * footprint_per_pupil(rig), softness_px, reflection, depth]
     pupil = lens.focal_mm.tolerance / lens.focal_mm.value + lens.f_number.tolerance / lens.f_number.value + 0.02
     mean = np.concatenate([[panel.gamma.value], np.log(lengths), np.zeros(6), np.full(6, np.log(crosstalk))])
     scales = [panel.gamma.tolerance + 0.02, (standoff.tolerance + 0.1) / standoff.value, pupil, 0.7, 1.0, 0.3]
@@ -226,7 +226,7 @@ def linear_slope(x: Vector) -> Vector:
 def vector_of(term: Backscatter) -> Vector:
     """The solver's coordinates of a term, whose logarithms have 1e-6 for what is absent."""
     emitters, mix = np.asarray(term.emitters_px), np.asarray(term.mix)
-    lengths = (term.distance_mm, term.pupil_mm, term.softness_px, term.reflection, term.reflection_mm)
+    lengths = (term.standoff_mm, term.pupil_diameter_mm, term.softness_px, term.reflection, term.reflection_mm)
     places = (emitters[1], emitters[0] - emitters[1], emitters[2] - emitters[1])
     crosstalk = (mix / np.diag(mix)[:, None])[OFF_DIAGONAL]
     x = np.concatenate([[float(np.asarray(one)) for one in (term.gamma, *lengths)], *places, crosstalk])
@@ -242,8 +242,8 @@ def with_linear(term: Backscatter, theta: Float[Array, "18"]) -> Backscatter:
     return replace(
         term,
         gamma=theta[0],
-        distance_mm=distance,
-        pupil_mm=pupil,
+        standoff_mm=distance,
+        pupil_diameter_mm=pupil,
         softness_px=softness,
         reflection=reflected / (1 - reflected),
         reflection_mm=depth,
