@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from udccal.errors import UdccalError as UdccalError
     from udccal.fitting.backscatter import fit_backscatter as fit_backscatter
     from udccal.fitting.geometry import fit_geometry as fit_geometry
-    from udccal.fitting.noise import fit_noise as fit_noise
+    from udccal.fitting.noise.fit import fit_noise as fit_noise
     from udccal.fitting.psf import fit_psf as fit_psf
     from udccal.fitting.wire import fit_wire as fit_wire
     from udccal.profiles.profile import Profile as Profile
@@ -52,7 +52,7 @@ _HOMES = {
     "fit": "udccal.calibration",
     "fit_backscatter": "udccal.fitting.backscatter",
     "fit_geometry": "udccal.fitting.geometry",
-    "fit_noise": "udccal.fitting.noise",
+    "fit_noise": "udccal.fitting.noise.fit",
     "fit_psf": "udccal.fitting.psf",
     "fit_wire": "udccal.fitting.wire",
     "load_profile": "udccal.profiles.store",

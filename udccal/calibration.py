@@ -18,7 +18,8 @@ from udccal.fitting.absent import absent_backscatter, absent_psf, absent_wire
 from udccal.fitting.backscatter import BackscatterRules, fit_backscatter, read_backscatter
 from udccal.fitting.geometry import fit_boards, read_geometry
 from udccal.fitting.geometry.data import BoardView
-from udccal.fitting.noise import fit_noise, nominal_noise, read_noise
+from udccal.fitting.noise.data import read_noise
+from udccal.fitting.noise.fit import fit_noise, nominal_noise
 from udccal.fitting.nominal import nominal_geometry
 from udccal.fitting.psf import PsfRules, fit_psf, read_psf
 from udccal.fitting.wire import WireRules, fit_wire, read_wire, sensor_map

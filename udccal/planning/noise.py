@@ -75,7 +75,6 @@ class NoisePredictor:
             samples=2 * each,
             usable=light_DN <= _RULES.fit_up_to * full_DN,
             light=np.full(len(level), np.nan),
-            steady=np.zeros(len(level), dtype=bool),
             dark_DN=dark_DN,
             row_variance_DN2=np.zeros(len(level)),
         )

@@ -23,8 +23,9 @@ from tests.scenes.noise import (
     truth,
 )
 from udccal.errors import FitError
-from udccal.fitting.noise import ExposureLevel, NoiseData, NoiseRules, SpatialStack, fit_noise, mean_response
-from udccal.fitting.noise.data import Frame, reduced
+from udccal.fitting.noise.data import ExposureLevel, Frame, NoiseData, NoiseRules, SpatialStack
+from udccal.fitting.noise.fit import fit_noise, mean_response
+from udccal.fitting.noise.moments import reduced
 from udccal.result import FitStatus
 
 
@@ -161,6 +162,7 @@ FRAME = np.full((32, 32), 100, np.uint16)
         ([ExposureLevel(0.1, (FRAME[:4], FRAME[:4]), (FRAME, FRAME))], None, "samples a side"),
         ([ExposureLevel(0.1, (FRAME, FRAME), (FRAME, FRAME))], SpatialStack(0.1, [FRAME], [FRAME]), "stack"),
         ([ExposureLevel(0.1, (FRAME, FRAME), (FRAME + np.uint16(60000),) * 2)], None, "top_code"),
+        ([ExposureLevel(0.1, (FRAME + np.uint16(60000),) * 2, (FRAME, FRAME))], None, "top_code"),
     ],
 )
 def test_what_is_no_frame_is_refused(levels: list[ExposureLevel], stack: SpatialStack | None, sentence: str) -> None:
