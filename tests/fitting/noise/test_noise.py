@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from udccal.cameras.protocol import Region
-from udccal.fitting.noise import codes, moments
+from udccal.fitting.noise import dark, moments
 from udccal.fitting.noise.data import Averaged, Codes, NoiseRules, converter_step
 from udccal.fitting.noise.fit import fit_moments, nominal_noise
 from udccal.fitting.noise.moments import NoiseMoments, dark_pair
@@ -169,7 +169,7 @@ def test_rounding_coarser_than_the_noise(fraction: float) -> None:
     offset = 24 + fraction + spread * rng.standard_normal((400, 400))
     frames = [np.rint(offset + sigma * rng.standard_normal((400, 400))).astype(np.uint16) for _ in range(2)]
     pair = dark_pair(frames[0], frames[1], 0.01)
-    fit = codes.fit_dark((pair, replace(pair, exposure_s=0.02)), codes.Surroundings(0.06, 0.0, 1e-5), RULES)
+    fit = dark.fit_dark((pair, replace(pair, exposure_s=0.02)), dark.Surroundings(0.06, 0.0, 1e-5), RULES)
     assert np.sqrt(fit.values[2]) == pytest.approx(sigma, rel=0.03)
     # What the textbook's white quantisation makes of the same frames is worse than what is asked for.
     naive = 0.5 * np.var(frames[0].astype(float) - frames[1]) - 1 / 12
@@ -185,7 +185,7 @@ def test_codes_cut_off_at_zero_are_censored() -> None:
         dark_pair(frames[i].astype(np.uint16), frames[i + 1].astype(np.uint16), 0.01 * (i + 1)) for i in (0, 2)
     )
     assert pairs[0].edges_DN[0] == -np.inf
-    fit = codes.fit_dark(pairs, codes.Surroundings(0.3, 0.0, 1e-5), RULES, normal=True)
+    fit = dark.fit_dark(pairs, dark.Surroundings(0.3, 0.0, 1e-5), RULES, normal=True)
     assert fit.values[0] == pytest.approx(black, abs=0.05)
     assert np.sqrt(fit.values[2]) == pytest.approx(sigma, rel=0.02)
     # Moments of the cut-off codes are far away.
@@ -199,7 +199,7 @@ def test_a_wide_window_of_codes_is_grouped_and_loses_nothing() -> None:
     pair = dark_pair(frames[0], frames[1], 0.01)
     assert pair.counts.shape[0] <= 161
     assert frames[0].size - 100 < pair.counts.sum() < frames[0].size
-    assert np.sqrt(codes.start_values((pair,))[2]) == pytest.approx(200, rel=0.02)
+    assert np.sqrt(dark.start_values((pair,))[2]) == pytest.approx(200, rel=0.02)
 
 
 def test_hot_pixels_do_not_carry_the_prnu() -> None:

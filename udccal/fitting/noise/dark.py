@@ -1,27 +1,238 @@
-"""All that dark frames show: black, dark current, read noise and its shape, row noise, DSNU; each if it is there."""
+"""Dark frames: black, dark current, read noise and its shape, row noise and DSNU; each if it is there.
+
+The likelihood is that of the two integer codes of a pixel, with the rounding inside it. Rounding is therefore exact
+where the noise is a fraction of a code, and not the usual 1/12; codes that stop at 0 or at the converter's end are
+censored: the signal lies beyond, and no more is known. Nothing is taken for normal that is not: few electrons of dark
+current are as skewed as Poisson says.
+"""
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass, replace
 from typing import final
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
+from scipy.special import beta, xlogy
 
 from udccal.fitting.engine.gaussian import scaled_inverse
-from udccal.fitting.noise.codes import LEAST_VARIANCE, NORMAL_SHAPE, DarkFit, Five, Surroundings, fit_dark
+from udccal.fitting.engine.least_squares import Blocks, SolverRules, Step, minimise
 from udccal.fitting.noise.data import NoiseRules
-from udccal.fitting.noise.moments import Moments, NoiseMoments
-from udccal.fitting.noise.patterns import Pattern, Quantity, dsnu, excess_variance
+from udccal.fitting.noise.moments import DarkPair, NoiseMoments
+from udccal.fitting.noise.patterns import Pattern, Quantity, dsnu, row_noise
+
+# The shape with the kurtosis of a normal distribution.
+NORMAL_SHAPE = 0.1349
+# Variances at this are those of none: three hundredths of a code.
+LEAST_VARIANCE = 1e-3
+# Bounds of black [DN], dark current [DN/s], variance of single samples without row noise [DN^2], variance of the
+# pixels' offsets [DN^2], and Tukey-lambda shape: the order of ``Five``.
+_LOW = np.array([-np.inf, -np.inf, LEAST_VARIANCE, 1e-6, -0.1])
+_HIGH = np.array([np.inf, np.inf, np.inf, np.inf, 0.45])
+Five = Float[np.ndarray, "5"]
+
+
+def tukey_lambda_std(shape: float) -> float:
+    """Standard deviation of the Tukey-lambda distribution with quantile (p^l - (1-p)^l) / l."""
+    # The formula has no value at 0.
+    safe = shape if abs(shape) >= 1e-4 else 1e-4
+    return float(np.sqrt(2.0 / safe**2 * (1.0 / (1 + 2 * safe) - beta(safe + 1, safe + 1))))
+
+
+@functools.lru_cache(maxsize=64)
+def _standard_cdf(shape: float) -> tuple[Float[np.ndarray, " grid"], Float[np.ndarray, " grid"]]:
+    """Quantiles of the Tukey-lambda distribution of unit variance, and their probabilities."""
+    p, tail = (1.0 / (1.0 + np.exp(sign * np.linspace(-24.0, 24.0, 6001))) for sign in (-1, 1))
+    safe = shape if abs(shape) >= 1e-4 else 1e-4
+    return (p**safe - tail**safe) / safe / tukey_lambda_std(safe), p
+
+
+def excess_kurtosis(shape: float) -> float:
+    """Of the Tukey-lambda distribution: 1.2 for the logistic (0), 0 at 0.1349, negative above."""
+    x, p = _standard_cdf(shape)
+    return float(0.5 * (x[1:] ** 4 + x[:-1] ** 4) @ np.diff(p)) - 3.0
+
+
+@functools.lru_cache(maxsize=128)
+def _dark_cdf(
+    sigma_DN: float, shape: float, row_DN: float, dark_DN: float, K_DN_per_e: float
+) -> tuple[Float[np.ndarray, " grid"], Float[np.ndarray, " grid"]]:
+    """Places (DN from the mean) and the probability that a dark sample lies below them before rounding.
+
+    Tukey-lambda read noise, normal row noise and Poisson counts of ``dark_DN`` in all are independent: their
+    distribution is a convolution, made as a product of spectra.
+    """
+    reach = 14 * np.sqrt(sigma_DN**2 + row_DN**2 + K_DN_per_e * max(dark_DN, 0.0)) + 2 * K_DN_per_e * (dark_DN > 0)
+    # Peaks of single counts are as narrow as the read noise: three points to its sigma, down to 0.02 DN.
+    points = int(np.clip(2 ** np.ceil(np.log2(6 * reach / max(sigma_DN, 0.06))), 4096, 65536))
+    step = 2 * reach / points
+    edges = step * (np.arange(points + 1) - points // 2 - 0.5)
+    grid, cdf = _standard_cdf(shape)
+    mass = np.diff(np.interp(edges / max(sigma_DN, 1e-12), grid, cdf, left=0.0, right=1.0))
+    u = 2 * np.pi * np.fft.rfftfreq(points, step)
+    # Narrower than the grid it would ring: then it is widened to one step.
+    smear = step if sigma_DN < 2 * step else 0.0
+    log_phase = -0.5 * (row_DN**2 + smear**2) * u**2 + 0j
+    if dark_DN > 0 and K_DN_per_e > 0:
+        log_phase = log_phase + dark_DN / K_DN_per_e * (np.exp(-1j * u * K_DN_per_e) - 1 + 1j * u * K_DN_per_e)
+    mass = np.fft.irfft(np.fft.rfft(mass) * np.exp(log_phase), points)
+    return edges[1:], np.clip(np.maximum.accumulate(np.cumsum(mass)), 0.0, 1.0)
+
+
+@final
+@dataclass(frozen=True)
+class Surroundings:
+    """What is known apart from the histograms; ``background`` is the fraction of samples of any code."""
+
+    K_DN_per_e: float
+    sigma_row_DN: float
+    background: float
+
+
+def pair_probability(pair: DarkPair, values: Five, known: Surroundings) -> Float[np.ndarray, "codes codes"]:
+    """Of the two codes of a pixel in a pair of dark frames, in its groups of codes."""
+    black, per_s, variance, spread2, shape = (float(v) for v in values)
+    drift = per_s * pair.exposure_s
+    grid, cdf = _dark_cdf(np.sqrt(variance), shape, known.sigma_row_DN, drift, known.K_DN_per_e)
+    # Counts of dark current widen the distribution but leave its peaks as narrow as the read noise. Evenly spaced
+    # nodes are for a smooth integrand as good as any quadrature.
+    width, spread = max(np.sqrt(variance + known.sigma_row_DN**2), 1e-9), np.sqrt(spread2)
+    z = np.linspace(-5.5, 5.5, int(np.clip(np.ceil(17.6 * spread / width), 13, 1201)) | 1)
+    weights = np.exp(-0.5 * z**2)
+    below = np.interp(pair.edges_DN - (black + drift + spread * z)[:, None], grid, cdf, left=0.0, right=1.0)
+    single = np.diff(below, axis=1)
+    joint = (single * (weights / weights.sum())[:, None]).T @ single
+    return np.asarray((1 - known.background) * joint + known.background / joint.size)
+
+
+@final
+@dataclass(frozen=True)
+class DarkFit:
+    """Values in the order of the bounds, with their covariance; and what follows per pair.
+
+    ``edge_gains`` is d(mean code)/d(black): 1, and ``follows``, where rounding is white and no code is cut off.
+    ``means_DN`` is the mean signal with rounding and censoring undone, of variance ``variances_DN2``.
+    """
+
+    values: Five
+    cov: Float[np.ndarray, "5 5"]
+    converged: bool
+    follows: bool
+    edge_gains: Float[np.ndarray, " pairs"]
+    means_DN: Float[np.ndarray, " pairs"]
+    variances_DN2: Float[np.ndarray, " pairs"]
+
+
+@final
+@dataclass(frozen=True)
+class _DarkCodes:
+    """The engine's problem: the deviance of all histograms from those expected, the shape's prior added."""
+
+    pairs: tuple[DarkPair, ...]
+    known: Surroundings
+    free: Bool[np.ndarray, "5"]
+    shape_sigma: float
+    name: str = "noise, dark codes"
+
+    def equations_at(self, place: Five) -> Blocks:
+        """Score and Fisher information; at a bound with the score pointing outwards the bound is the answer."""
+        off = (place[4] - NORMAL_SHAPE) / self.shape_sigma
+        cost, samples, shape = off**2, 0, self.free[4] * np.eye(5)[4] / self.shape_sigma
+        score, information = -off * shape, np.outer(shape, shape)
+        # For slopes by differences: small beside the noise, large beside the arithmetic.
+        width2 = place[2] + 0.01
+        longest = max(max(pair.exposure_s for pair in self.pairs), 1e-9)
+        steps = 2e-3 * np.array([width2**0.5, width2**0.5 / longest, width2, max(0.5 * place[3], 1e-4 * width2), 1.0])
+        steps = np.where(place + steps <= _HIGH, steps, -steps)
+        for pair in self.pairs:
+            p, counts = pair_probability(pair, place, self.known).ravel(), pair.counts.ravel()
+            total = int(counts.sum())
+            # One-sided: the second order, which that leaves, sums to nothing in the score at the truth.
+            slopes = np.zeros((5, p.size))
+            for i in np.flatnonzero(self.free):
+                moved = pair_probability(pair, place + steps[i] * np.eye(5)[i], self.known)
+                slopes[i] = (moved.ravel() - p) / steps[i]
+            cost += 2 * float(np.sum(xlogy(counts, counts / (total * p))))
+            score += slopes @ (counts / p)
+            information += total * (slopes / p) @ slopes.T
+            samples += total
+        held = ~self.free | ((place <= _LOW) & (score < 0)) | ((place >= _HIGH) & (score > 0))
+        return replace(Blocks.dense(cost, samples, information, score), held=held)
+
+    def moved(self, place: Five, step: Step) -> Five:
+        """Inside the bounds."""
+        return np.clip(place + step.shared, _LOW, _HIGH)
+
+
+def start_values(pairs: tuple[DarkPair, ...]) -> Five:
+    """Moments of the histograms: the covariance of the two codes is the variance of the offsets."""
+    found = []
+    for pair in pairs:
+        centres, part = pair.centres_DN, pair.counts / max(pair.counts.sum(), 1)
+        first, second = part.sum(axis=1), part.sum(axis=0)
+        spread = float((centres - first @ centres) @ part @ (centres - second @ centres))
+        total = float(first @ (centres - first @ centres) ** 2)
+        found.append((pair.exposure_s, 0.5 * (first + second) @ centres, total - spread, spread))
+    times, means, variances, spreads = np.array(found).T
+    centred = times - times.mean()
+    slope = centred @ means / max(centred @ centred, 1e-300)
+    least = max(variances.min() - 1.0 / 12.0, 0.05), max(spreads.min(), 0.003)
+    return np.array([means.mean() - slope * times.mean(), slope, *least, NORMAL_SHAPE])
+
+
+def fit_dark(
+    pairs: tuple[DarkPair, ...], known: Surroundings, rules: NoiseRules, start: Five | None = None, normal: bool = False
+) -> DarkFit:
+    """Fisher scoring on the likelihood of all pairs; ``normal`` holds the shape at that of normal noise.
+
+    The pairs have their pixels' offsets in common, so the information on DSNU does not add up over pairs: its sigma is
+    widened by the square root of their number. Row noise in ``known`` is that of these frames.
+    """
+    values = np.clip(start_values(pairs) if start is None else start, _LOW, _HIGH)
+    one_exposure = len({pair.exposure_s for pair in pairs}) < 2
+    free = np.array([True, not one_exposure, True, True, not normal])
+    values = np.where(free, values, [0.0, 0.0, 0.0, 0.0, NORMAL_SHAPE])
+    # One-sided slopes promise a little for ever.
+    solver = SolverRules(least_gain=1e-3, stalled_gain=1e-4, iterations=40)
+    found = minimise(_DarkCodes(pairs, known, free, rules.shape_sigma), values, solver)
+    values, information = found.place, found.equations.shared
+    # What rounding hides is no larger than rounding: that much is known of codes that are all the same. Noise and
+    # offsets within a code may be hidden by rounding, and else by nothing but chance.
+    step2, longest = pairs[0].step_DN ** 2 / 12.0, max(max(pair.exposure_s for pair in pairs), 1e-9)
+    least = np.array([1 / step2, longest**2 / step2, step2**-2, step2**-2, rules.shape_sigma**-2])
+    lost = free & bool(values[2] + values[3] < 12 * step2) & (np.diag(information) < least)
+    information = np.where(lost[:, None] | lost, np.diag(np.where(lost, least, 0.0)), information)
+    widen = np.sqrt(np.array([1.0, 1.0, 1.0, len(pairs), 1.0]))
+    cov = scaled_inverse(information) * np.outer(widen, widen)
+    levels = np.array([_level(pair, values, known) for pair in pairs]).T
+    return DarkFit(values, cov, found.converged, bool(np.abs(levels[0] - 1).max() < rules.white), *levels)
+
+
+def _level(pair: DarkPair, values: Five, known: Surroundings) -> tuple[float, float, float]:
+    """``DarkFit.edge_gains``, ``means_DN`` and ``variances_DN2`` of a pair, by one scoring step from the common fit.
+
+    The part of the offsets in the variance is the same in every pair and does not count here.
+    """
+    black = 0.01 * float(np.sqrt(values[2])) * np.eye(5)[0]
+    up, down = (pair_probability(pair, values + sign * black, known) for sign in (1, -1))
+    slope, p, total = (up - down) / (2 * black[0]), 0.5 * (up + down), float(pair.counts.sum())
+    gain, information = float(slope.sum(axis=1) @ pair.centres_DN), total * float(np.sum(slope**2 / p))
+    mean, blind = float(values[0] + values[1] * pair.exposure_s), pair.step_DN**2 / 12.0
+    if information * blind < 1:
+        # Where all codes are one code, the level is known to rounding alone.
+        return gain, mean, blind
+    shift = float(np.sum(slope * pair.counts / p)) / information
+    temporal = max(1 / information - float(values[3]) / total, 0.05 / information)
+    return gain, mean + shift, temporal + known.sigma_row_DN**2 / (2 * pair.rows)
 
 
 @final
 @dataclass(frozen=True)
 class DarkTerms:
-    """Dark quantities in DN.
+    """Dark quantities in DN, for a gain that was taken for known.
 
-    ``K_DN_per_e`` is the gain that was taken for known; ``levels_cov`` is the covariance of (black, dark current);
-    ``read_DN2`` is the variance of single samples without row noise; ``white``: rounding shows in no pixel's mean.
+    ``levels_cov`` is the covariance of (black, dark current); ``white``: rounding shows in no pixel's mean.
     """
 
     K_DN_per_e: float
@@ -39,16 +250,16 @@ class DarkTerms:
 
 def fit_dark_terms(data: NoiseMoments, K_DN_per_e: float, rules: NoiseRules, start: Five | None = None) -> DarkTerms:
     """Fit everything dark; ``K_DN_per_e`` is used for the shot noise of the dark current alone."""
-    row, in_pairs = _row_noise(data, np.ones(len(data.darks)))
+    row, in_pairs = row_noise(data, np.ones(len(data.darks)))
     known = Surroundings(K_DN_per_e, in_pairs, rules.background)
     fit = fit_dark(data.darks, known, rules, start)
-    if not _follows(fit, rules):
-        row, in_pairs = _row_noise(data, fit.edge_gains)
+    if not fit.follows:
+        row, in_pairs = row_noise(data, fit.edge_gains)
         known = replace(known, sigma_row_DN=in_pairs)
         fit = fit_dark(data.darks, known, rules, fit.values)
     # Temporal noise too small beside a code is not told from the pattern of rounding.
     resolved = float(fit.values[2]) + in_pairs**2 >= (rules.resolved * data.q_DN) ** 2
-    row = row if resolved else _row_noise(data, np.zeros(len(data.darks)))[0]
+    row = row if resolved else row_noise(data, np.zeros(len(data.darks)))[0]
     value, variance = float(fit.values[4]), float(fit.cov[4, 4])
     name, gain = f"read noise of another shape than normal ({NORMAL_SHAPE:.2f})", (value - NORMAL_SHAPE) ** 2 / variance
     shape = Quantity.asked(name, value, variance, data.dark_samples, gain, without=NORMAL_SHAPE)
@@ -59,64 +270,25 @@ def fit_dark_terms(data: NoiseMoments, K_DN_per_e: float, rules: NoiseRules, sta
     single = read + K_DN_per_e * max(float(fit.values[1]), 0.0) * stack.exposure_s + rounding
     offsets = dsnu(stack.mean_DN, single / stack.frames, in_pairs**2 / stack.frames, rules)
     # Offsets that differ smear the rounding of the mean over all pixels; that of one pixel, its own noise alone.
-    white = _follows(fit, rules) and 4 * np.pi**2 * read >= rules.smeared * data.q_DN**2
+    white = fit.follows and 4 * np.pi**2 * read >= rules.smeared * data.q_DN**2
     if not white:
         pixels, sigma = stack.mean_DN.size, float(np.hypot(fit.cov[3, 3] ** 0.5, 0.0 if resolved else rounding))
         offsets = replace(offsets, variance=spread2, sigma=sigma, samples=pixels, mean_variance=spread2 / pixels)
-    black, levels_cov, current = _levels(data, fit, in_pairs**2, single, _follows(fit, rules), offsets)
+    black, levels_cov, current = _levels(data, fit, in_pairs**2, single, offsets)
     if read <= 1.001 * LEAST_VARIANCE:
         read, read_variance = 0.0, max(read_variance, LEAST_VARIANCE**2)
-    return DarkTerms(
-        K_DN_per_e=K_DN_per_e,
-        black_DN=black,
-        dark_DN_per_s=current,
-        levels_cov=levels_cov,
-        read_DN2=Quantity(read, read_variance),
-        shape=shape,
-        row_DN2=row,
-        dsnu_DN2=Quantity.asked("DSNU", offsets.variance, offsets.sigma**2, offsets.samples),
-        white=white,
-        fit=fit,
-        offsets=offsets,
-    )
-
-
-def _follows(fit: DarkFit, rules: NoiseRules) -> bool:
-    """Mean codes follow the mean signal: nothing is cut off."""
-    return bool(np.abs(fit.edge_gains - 1).max() < rules.white)
-
-
-def _row_noise(data: NoiseMoments, edge_gains: Float[np.ndarray, " pairs"]) -> tuple[Quantity, float]:
-    """Variance by rows, and its root as it happened to be in the pairs alone: that is what widened their histograms.
-
-    Rounding and cut-off codes pass only the square of ``edge_gains`` of it, pair by pair.
-    """
-    nearest = int(np.argmin([abs(pair.exposure_s - data.dark_stack.exposure_s) for pair in data.darks]))
-    pairs = list(zip(data.dark_moments, edge_gains, strict=True))
-    stack = [] if data.dark_seen is None else [(data.dark_seen, edge_gains[nearest])]
-
-    def asked(seen: list[tuple[Moments, float]]) -> Quantity:
-        # Of row noise that follows black to less than a fifth nothing can be said.
-        rows = [
-            (of.rows_DN2 / gain**2, of.sampling_DN2 / gain**2, (of.frames - 1) * max(of.height - 1, 1))
-            for of, gain in seen
-            if gain >= 0.2 and of.rows_DN2 > 0
-        ]
-        # Where rounding hides all of it, it may be as large as rounding itself.
-        found = excess_variance(*np.array(rows).T) if rows else (0.0, (data.q_DN**2 / 12.0) ** 2, 0.0)
-        return Quantity.asked("row noise", found[0], found[1], data.dark_samples, found[2])
-
-    row = asked(pairs + stack)
-    return row, float(np.sqrt(asked(pairs).value)) if row.there else 0.0
+    DSNU2 = Quantity.asked("DSNU", offsets.variance, offsets.sigma**2, offsets.samples)
+    read_DN2 = Quantity(read, read_variance)
+    return DarkTerms(K_DN_per_e, black, current, levels_cov, read_DN2, shape, row, DSNU2, white, fit, offsets)
 
 
 def _levels(
-    data: NoiseMoments, fit: DarkFit, row_DN2: float, single_DN2: float, follows: bool, offsets: Pattern
+    data: NoiseMoments, fit: DarkFit, row_DN2: float, single_DN2: float, offsets: Pattern
 ) -> tuple[float, Float[np.ndarray, "2 2"], Quantity]:
     """Black and dark current from the mean of every dark exposure, with its own weight."""
     means, variances, times = fit.means_DN, fit.variances_DN2, np.array([pair.exposure_s for pair in data.darks])
     stack, rounding = data.dark_stack, data.q_DN**2 / 12.0
-    if follows:
+    if fit.follows:
         means, times = np.append(means, offsets.mean), np.append(times, stack.exposure_s)
         rows = row_DN2 / len(stack.mean_DN)
         variances = np.append(variances, (single_DN2 / stack.mean_DN.size + rows) / stack.frames)
@@ -126,7 +298,7 @@ def _levels(
     current = Quantity.asked("dark current", float(line[1]), float(cov[1, 1]), data.dark_samples)
     # The offsets of this sensor's pixels are one draw: their mean is not that of all sensors alike.
     cov[0, 0] += offsets.mean_variance
-    if not follows:
+    if not fit.follows:
         # Black, spread and noise of coarse or cut-off codes err together, and alike in every pair.
         cov[0, 0] = max(float(cov[0, 0]), len(data.darks) * float(fit.cov[0, 0]))
     if (variances >= rounding).any():

@@ -10,11 +10,10 @@ from jaxtyping import Float
 
 from udccal.fitting.engine.gaussian import Posterior
 from udccal.fitting.engine.report import estimates, residual_sample
-from udccal.fitting.noise.codes import start_values
-from udccal.fitting.noise.dark import DarkTerms, fit_dark_terms
+from udccal.fitting.noise.dark import DarkTerms, fit_dark_terms, start_values
 from udccal.fitting.noise.data import NoiseData, NoiseRules
 from udccal.fitting.noise.flats import Curve, find_saturation, fit_curve, rough_gain, stacked
-from udccal.fitting.noise.moments import NoiseMoments, reduced, tiling
+from udccal.fitting.noise.moments import NoiseMoments, bins, reduced
 from udccal.fitting.noise.patterns import Pattern, Quantity, prnu, rough_median
 from udccal.fitting.noise.transfer import linear_signal
 from udccal.models.noise import Noise
@@ -189,9 +188,9 @@ def _assembled(data: NoiseMoments, dark: DarkTerms, curve: Curve, rules: NoiseRu
     terms = (dark.row_DN2, dark.shape, dark.dark_DN_per_s, dark.dsnu_DN2, PRNU2)
     candidates = [*(one for term in terms for one in term.candidates), *response.candidates]
     height, width = data.flat_stack.mean_DN.shape
-    pixels = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
-    tiles, used = tiling(height, width, data.period, rules), np.isfinite(fit.variance_z)
-    places = np.column_stack([tiles.means(of).ravel() for of in pixels])
+    (down, right), used = bins(height, width, data.period, rules), np.isfinite(fit.variance_z)
+    x, y = np.arange(width) @ right / right.sum(axis=0), down @ np.arange(height) / down.sum(axis=1)
+    places = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
     return FitResult(
         name="noise",
         term=_term(values[:-1]),

@@ -11,8 +11,7 @@ from scipy.special import ndtri
 
 from udccal.fitting.engine.orders import Choice
 from udccal.fitting.engine.robust import OutlierRule, robust_sigma
-from udccal.fitting.noise.codes import excess_kurtosis
-from udccal.fitting.noise.dark import DarkTerms
+from udccal.fitting.noise.dark import DarkTerms, excess_kurtosis
 from udccal.fitting.noise.data import NoiseRules
 from udccal.fitting.noise.moments import Moments, NoiseMoments
 from udccal.fitting.noise.transfer import DarkVariance, Levels, TransferFit, choose_transfer, without_outliers

@@ -32,27 +32,11 @@ from udccal.fitting.noise.data import (
 Grid = Float[np.ndarray, "groups_y groups_x"]
 
 
-@final
-@dataclass(frozen=True)
-class Tiling:
-    """Bins of a sensor: ``down`` and ``right`` are 1 where a row and a column belong to a group of bins."""
-
-    down: Float[np.ndarray, "groups_y rows"]
-    right: Float32[np.ndarray, "columns groups_x"]
-
-    @property
-    def counts(self) -> Grid:
-        """Samples per bin."""
-        return np.outer(self.down.sum(axis=1), self.right.sum(axis=0, dtype=np.float64))
-
-    def means(self, values: Float32[np.ndarray, "rows columns"]) -> Grid:
-        """Means over the samples of each bin."""
-        return np.asarray(self.down @ (values @ self.right) / self.counts)
-
-
 @functools.lru_cache(maxsize=8)
-def tiling(rows: int, columns: int, period: int, rules: NoiseRules) -> Tiling:
-    """Tiles of a sensor whose colour sites repeat every ``period`` samples (1: monochrome)."""
+def bins(
+    rows: int, columns: int, period: int, rules: NoiseRules
+) -> tuple[Float[np.ndarray, "groups_y rows"], Float32[np.ndarray, "columns groups_x"]]:
+    """Ones where a row and a column belong to a group of bins; colour sites repeat every ``period`` samples."""
     tiles = int(np.clip(np.sqrt(rows * columns / period**2 / rules.tile_samples), 1, rules.tiles))
 
     def groups(length: int) -> Float[np.ndarray, "length groups"]:
@@ -60,28 +44,20 @@ def tiling(rows: int, columns: int, period: int, rules: NoiseRules) -> Tiling:
         tile = np.minimum(np.arange(length) // period // max(length // period // tiles, 1), tiles - 1)
         return np.eye(tiles * period)[tile * period + np.arange(length) % period]
 
-    return Tiling(groups(rows).T.copy(), groups(columns).astype(np.float32))
+    return groups(rows).T.copy(), groups(columns).astype(np.float32)
 
 
 @final
 @dataclass(frozen=True)
 class Moments:
-    """Two or more frames of the same scene.
+    """Two or more frames of the same scene; arrays are per bin.
 
-    Attributes:
-        exposure_s: of the frames.
-        light: relative exposure to light, in any unit common to all levels (photons per pixel, or seconds).
-        mean_DN: mean code per bin.
-        variance_DN2: temporal variance of one frame per bin, row noise and common changes of brightness removed.
-        dof: degrees of freedom of ``variance_DN2``.
-        samples: frames times pixels of each bin.
-        spread_DN: standard deviation over the samples of the bin, spatial and temporal.
-        shift_DN: mean of each frame in each bin, less that of all frames.
-        rows_DN2: variance of the rows' means; and the part of it that is sampling, ``sampling_DN2``.
-        height: rows of a frame.
-        peak_DN: the largest code.
-        at_peak: fraction of the samples with that code.
-        outliers: samples that differ too much from the first frame's to be noise; left out.
+    ``light`` is the relative exposure to light, in any unit common to all levels (photons per pixel, or seconds).
+    ``variance_DN2`` is the temporal variance of one frame, row noise and common changes of brightness removed, and
+    ``dof`` its degrees of freedom; ``samples`` are frames times pixels; ``spread_DN`` is the standard deviation over
+    these, spatial and temporal; ``shift_DN`` is the mean of each frame less that of all. ``rows_DN2`` is the variance
+    of the rows' means, and ``sampling_DN2`` the part of it that is sampling; frames have ``height`` rows. ``at_peak``
+    is the fraction of the samples with the largest code. ``outliers`` were hits, and left out.
     """
 
     exposure_s: float
@@ -119,37 +95,37 @@ def reduce_frames(
     """
     source = iter(frames)
     first = next(source)
-    tiles, outliers = tiling(*first.shape, period, rules), 0
-    total = np.zeros(first.shape, np.float32)
+    down, right = bins(*first.shape, period, rules)
+    counts, total, outliers = np.outer(down.sum(axis=1), right.sum(axis=0)), np.zeros(first.shape, np.float32), 0
     # The first frame differs from itself by nothing.
-    by_row, peaks = [np.zeros((len(first), tiles.right.shape[1]))], [_peak(first)]
+    by_row, peaks = [np.zeros((len(first), right.shape[1]))], [_peak(first)]
     squares = np.zeros_like(by_row[0])
     for frame in source:
         difference = cv2.subtract(frame, first, dtype=cv2.CV_32F)
         square = cv2.multiply(difference, difference)
         # The usual difference is the median over some rows, which hits do not move; ten codes are never a hit.
-        usual = np.median(square[:: max(len(first) // 128, 1)] @ tiles.right, axis=0) / tiles.right.sum(axis=0)
+        usual = np.median(square[:: max(len(first) // 128, 1)] @ right, axis=0) / right.sum(axis=0)
         hits = square > max(rules.hit_sigma**2 * float(usual.max()), 10.0**2)
         difference[hits] = square[hits] = 0.0
         outliers += int(np.count_nonzero(hits))
         total += difference
-        squares += square @ tiles.right
-        by_row.append(np.asarray(difference @ tiles.right, dtype=np.float64))
+        squares += square @ right
+        by_row.append(np.asarray(difference @ right, dtype=np.float64))
         peaks.append(_peak(frame))
     number, middle, peak = len(by_row), float(np.median(first[:: max(len(first) // 64, 1)])), max(peaks)[0]
-    squares -= cv2.multiply(total, total, scale=1.0 / number) @ tiles.right
+    squares -= cv2.multiply(total, total, scale=1.0 / number) @ right
     mean = cv2.addWeighted(first, 1.0, total, 1.0 / number, 0.0, dtype=cv2.CV_32F)
-    variance, dof, shift, rows, sampling = _temporal(tiles, np.stack(by_row), squares, first.shape[1])
+    variance, dof, shift, rows, sampling = _temporal(down, right, np.stack(by_row), squares)
     about = cv2.subtract(mean, middle)
-    level = tiles.means(about)
-    spatial = np.maximum(tiles.means(cv2.multiply(about, about)) - level**2, 0.0)
+    level, square = (down @ (of @ right) / counts for of in (about, cv2.multiply(about, about)))
+    spatial = np.maximum(square - level**2, 0.0)
     return Averaged(exposure_s, mean, number), Moments(
         exposure_s=exposure_s,
         light=exposure_s if light is None else light,
         mean_DN=(level + middle).ravel(),
         variance_DN2=variance.ravel(),
         dof=dof.ravel(),
-        samples=number * tiles.counts.ravel(),
+        samples=number * counts.ravel(),
         spread_DN=np.sqrt(spatial + np.maximum(variance, 0.0) * (1 - 1 / number)).ravel(),
         shift_DN=shift.reshape(number, -1),
         rows_DN2=rows,
@@ -168,42 +144,41 @@ def _peak(frame: Codes) -> tuple[int, int]:
 
 
 def _temporal(
-    tiles: Tiling,
+    down: Float[np.ndarray, "groups_y rows"],
+    right: Float32[np.ndarray, "columns groups_x"],
     by_row: Float[np.ndarray, "frames rows groups_x"],
     squares: Float[np.ndarray, "rows groups_x"],
-    columns: int,
 ) -> tuple[Grid, Grid, Float[np.ndarray, "frames groups_y groups_x"], float, float]:
     """Variances of bins, their degrees of freedom, the frames' shifts, the rows' variance and the sampling in it."""
-    frames, height = by_row.shape[:2]
-    width, counts = tiles.right.sum(axis=0, dtype=np.float64), tiles.counts
+    (frames, height), columns = by_row.shape[:2], len(right)
+    width = right.sum(axis=0, dtype=np.float64)
+    counts = np.outer(down.sum(axis=1), width)
     about = by_row - by_row.mean(axis=0)
     rows = about.sum(axis=2) / columns
     within = squares - 2 * np.einsum("kr,krm->rm", rows, about) + np.square(rows).sum(axis=0)[:, None] * width
-    left = tiles.down @ (about - rows[:, :, None] * width)
+    left = down @ (about - rows[:, :, None] * width)
     dof = np.maximum((frames - 1) * (counts * (1 - 1 / columns) - 1), 1.0)
-    mixed = (tiles.down @ within - np.square(left).sum(axis=0) / counts) / dof
+    mixed = (down @ within - np.square(left).sum(axis=0) / counts) / dof
     # The rows' means were taken from all of a row: a quiet bin beside noisy ones gains their part of the mean's
     # variance, v' (1 - 1/n) = v (1 - 2/n) + row average / n.
     average = (mixed @ width / columns)[:, None]
     variance = (mixed * (1 - 1 / columns) - average / columns) / (1 - 2 / columns)
     observed = float(np.sum((rows - rows.mean(axis=1, keepdims=True)) ** 2)) / ((frames - 1) * max(height - 1, 1))
-    return variance, dof, tiles.down @ about / counts, observed, float(np.average(variance, weights=counts)) / columns
+    return variance, dof, down @ about / counts, observed, float(np.average(variance, weights=counts)) / columns
 
 
 @final
 @dataclass(frozen=True)
 class DarkPair:
-    """A pair of dark frames reduced to the joint histogram of the two codes of each pixel.
+    """A pair of dark frames reduced to the joint histogram of the two codes of each pixel, in groups of ``step_DN``.
 
-    The outermost edges are infinite where the codes stop there (at 0, or at the converter's end); ``step_DN`` is the
-    width of a group of codes.
+    The outermost edges are infinite where the codes stop there (at 0, or at the converter's end).
     """
 
     exposure_s: float
     edges_DN: Float[np.ndarray, " codes_plus_1"]
     step_DN: float
     counts: Int[np.ndarray, "codes codes"]
-    outside: int
     rows: int
 
     @property
@@ -215,7 +190,7 @@ class DarkPair:
 
 
 def dark_pair(first: Codes, second: Codes, exposure_s: float, q_DN: int = 1, top_code: int = 65535) -> DarkPair:
-    """Joint histogram over a window of codes around the median; codes beyond it are counted as outside."""
+    """Joint histogram over a window of codes around the median; codes beyond it are left out."""
     low, middle, high = np.percentile(first[:: max(1, first.size // 65536)], [2.0, 50.0, 98.0])
     # 98th minus 2nd percentile is 4.1 sigma; 1.9 times that each side is about 7.8 sigma.
     half = int(np.ceil(1.9 * (high - low) / q_DN)) + 4
@@ -227,19 +202,13 @@ def dark_pair(first: Codes, second: Codes, exposure_s: float, q_DN: int = 1, top
     side = codes + 1
     group_of = (np.arange(65536) // q_DN - start) // group
     group_of = np.where((group_of >= 0) & (group_of < codes), group_of, codes).astype(np.uint16)
-    joint = np.zeros(side * side, np.int64)
-    # Some rows at a time: they stay in the processor's cache.
-    height = max((1 << 18) // first.shape[1], 1)
-    for top in range(0, len(first), height):
-        part = np.s_[top : top + height]
-        both = group_of[first[part]] * np.uint16(side) + group_of[second[part]]
-        joint += np.bincount(both.ravel(), minlength=side**2)
+    both = group_of[first] * np.uint16(side) + group_of[second]
+    joint = cv2.calcHist([both], [0], None, [side**2], [0, side**2]).astype(np.int64)
     counts = joint.reshape(side, side)[:codes, :codes]
     edges = (start + group * np.arange(codes + 1) - 0.5) * q_DN
     edges[0] = -np.inf if start == 0 else edges[0]
     edges[-1] = np.inf if edges[-1] >= top_code else edges[-1]
-    outside = int(first.size - counts.sum())
-    return DarkPair(exposure_s, edges, float(group * q_DN), counts, outside, len(first))
+    return DarkPair(exposure_s, edges, float(group * q_DN), counts, len(first))
 
 
 @final
@@ -247,15 +216,10 @@ def dark_pair(first: Codes, second: Codes, exposure_s: float, q_DN: int = 1, top
 class NoiseMoments:
     """The frames, reduced.
 
-    Attributes:
-        darks: joint histograms of dark pairs; and ``dark_moments`` of the same pairs.
-        flats: moments of bright pairs.
-        dark_stack, flat_stack: averages of about the same exposure.
-        q_DN: the converter's step.
-        top_DN: its largest code.
-        period: colour sites repeat after so many samples (1: monochrome).
-        dark_seen, flat_seen: moments of the stacks' frames. None for an average that was made elsewhere, whose variance
-            would hold the lamp's flicker, and for frames of a pair, which must not count twice.
+    ``dark_moments`` are of the pairs in ``darks``; both stacks are of about the same exposure; colour sites repeat
+    after ``period`` samples (1: monochrome). ``dark_seen`` and ``flat_seen`` are moments of the stacks' frames:
+    None for an average that was made elsewhere, whose variance would hold the lamp's flicker, and for frames of a pair,
+    which must not count twice.
     """
 
     darks: tuple[DarkPair, ...]

@@ -21,6 +21,7 @@ from scipy.special import ndtri
 from udccal.fitting.engine.orders import Attempt, bic, choose
 from udccal.fitting.engine.robust import MAD_TO_SIGMA
 from udccal.fitting.noise.data import NoiseRules
+from udccal.fitting.noise.moments import Moments, NoiseMoments
 from udccal.result import Candidate
 
 Picture = Float[np.ndarray, "rows columns"] | Float32[np.ndarray, "rows columns"]
@@ -64,6 +65,30 @@ def excess_variance(
     without, total = observed / known, observed / (found + known)
     gain = np.sum(dof * (np.log(known) + without - np.log(found + known) - total))
     return found, float(2 / np.sum(dof / (found + known) ** 2)), float(gain)
+
+
+def row_noise(data: NoiseMoments, edge_gains: Float[np.ndarray, " pairs"]) -> tuple[Quantity, float]:
+    """Variance by rows, and its root as it happened to be in the pairs alone: that is what widened their histograms.
+
+    Rounding and cut-off codes pass only the square of ``edge_gains`` of it, pair by pair.
+    """
+    nearest = int(np.argmin([abs(pair.exposure_s - data.dark_stack.exposure_s) for pair in data.darks]))
+    pairs = list(zip(data.dark_moments, edge_gains, strict=True))
+    stack = [] if data.dark_seen is None else [(data.dark_seen, edge_gains[nearest])]
+
+    def asked(seen: list[tuple[Moments, float]]) -> Quantity:
+        # Of row noise that follows black to less than a fifth nothing can be said.
+        rows = [
+            (of.rows_DN2 / gain**2, of.sampling_DN2 / gain**2, (of.frames - 1) * max(of.height - 1, 1))
+            for of, gain in seen
+            if gain >= 0.2 and of.rows_DN2 > 0
+        ]
+        # Where rounding hides all of it, it may be as large as rounding itself.
+        found = excess_variance(*np.array(rows).T) if rows else (0.0, (data.q_DN**2 / 12.0) ** 2, 0.0)
+        return Quantity.asked("row noise", found[0], found[1], data.dark_samples, found[2])
+
+    row = asked(pairs + stack)
+    return row, float(np.sqrt(asked(pairs).value)) if row.there else 0.0
 
 
 @final
