@@ -18,9 +18,10 @@ from scipy.special import beta, xlogy
 
 from udccal.fitting.engine.gaussian import scaled_inverse
 from udccal.fitting.engine.least_squares import Blocks, SolverRules, Step, minimise
+from udccal.fitting.engine.orders import Quantity
 from udccal.fitting.noise.data import NoiseRules
 from udccal.fitting.noise.moments import DarkPair, NoiseMoments
-from udccal.fitting.noise.patterns import Pattern, Quantity, dsnu, row_noise
+from udccal.fitting.noise.patterns import Pattern, dsnu, row_noise
 
 # The shape with the kurtosis of a normal distribution.
 NORMAL_SHAPE = 0.1349

@@ -1,4 +1,4 @@
-"""Variances between pixels, rows or levels: whether one is there, DSNU of dark averages, and PRNU behind a panel.
+"""Variances between rows and between pixels: row noise, DSNU of dark averages, and PRNU behind a panel.
 
 The response of pixels is white; light is not. Light that passed a panel is modulated, and the modulation's harmonics
 and their products sink slowly below the floor that the pixels' own response makes. What sinks below the floor is not
@@ -18,53 +18,15 @@ from jaxtyping import Bool, Float, Float32
 from scipy.fft import dctn
 from scipy.special import ndtri
 
-from udccal.fitting.engine.orders import Attempt, bic, choose
+from udccal.fitting.engine.misfit import excess_variance
+from udccal.fitting.engine.orders import Quantity
 from udccal.fitting.engine.robust import MAD_TO_SIGMA
 from udccal.fitting.noise.data import NoiseRules
 from udccal.fitting.noise.moments import Moments, NoiseMoments
-from udccal.result import Candidate
 
 Picture = Float[np.ndarray, "rows columns"] | Float32[np.ndarray, "rows columns"]
 Mask = Bool[np.ndarray, "rows columns"]
 Grid = Float[np.ndarray, "down across"]
-
-
-@final
-@dataclass(frozen=True)
-class Quantity:
-    """A value with its variance; where ``there`` is False the data do not ask for it and the value is that without."""
-
-    value: float
-    variance: float
-    there: bool = True
-    candidates: tuple[Candidate, ...] = ()
-
-    @classmethod
-    def asked(
-        cls, name: str, value: float, variance: float, samples: int, gain: float | None = None, without: float = 0.0
-    ) -> Quantity:
-        """The value where the likelihood gains more by it (minus twice the logarithm) than BIC asks."""
-        own = value**2 / variance if value > 0 and variance > 0 else 0.0
-        simple = Attempt(f"without {name}", 0, own if gain is None else gain, without)
-        choice = choose((simple, Attempt(f"with {name}", 1, bic(0.0, 1.0, samples), value)))
-        return cls(choice.best.fit, variance, choice.best.parameters > 0, choice.candidates)
-
-
-def excess_variance(
-    observed: Float[np.ndarray, " n"], known: Float[np.ndarray, " n"], dof: Float[np.ndarray, " n"]
-) -> tuple[float, float, float]:
-    """Variance that chi-squared estimates have beside a known part, by maximum likelihood; not below 0.
-
-    Returns:
-        the variance, its own variance, and what the likelihood gains by it (minus twice the logarithm).
-    """
-    known = known + 1e-12 * float(observed.max()) + 1e-300
-    found = float(np.average(observed, weights=dof))
-    for _ in range(50):
-        found = max(float(np.average(observed - known, weights=dof / (found + known) ** 2)), 0.0)
-    without, total = observed / known, observed / (found + known)
-    gain = np.sum(dof * (np.log(known) + without - np.log(found + known) - total))
-    return found, float(2 / np.sum(dof / (found + known) ** 2)), float(gain)
 
 
 def row_noise(data: NoiseMoments, edge_gains: Float[np.ndarray, " pairs"]) -> tuple[Quantity, float]:

@@ -18,10 +18,10 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from udccal.fitting.engine.least_squares import Blocks, SolverRules, Step, minimise
+from udccal.fitting.engine.misfit import excess_variance
 from udccal.fitting.engine.orders import Attempt, Choice, bic, choose
 from udccal.fitting.engine.robust import OutlierRule
 from udccal.fitting.noise.data import NoiseRules
-from udccal.fitting.noise.patterns import excess_variance
 
 # K [DN/e], V0 [DN^2], curvature [1/DN], response [DN per light], offset of the light.
 Five = Float[np.ndarray, "5"]
