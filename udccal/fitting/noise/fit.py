@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -262,7 +262,7 @@ def _values(
 def _outliers(
     data: NoiseMoments, dark: DarkTerms, curve: Curve, saturation_DN: float, uneven: Pattern, rules: NoiseRules
 ) -> Iterable[Outliers]:
-    def named(levels: tuple[int, ...]) -> tuple[str, ...]:
+    def named(levels: Sequence[int]) -> tuple[str, ...]:
         stack = len(data.flats)
         return tuple("flat stack" if i >= stack else f"flat {i} ({data.flats[i].exposure_s:.4g} s)" for i in levels)[:8]
 
@@ -271,10 +271,12 @@ def _outliers(
     seen = (*(flat for flat in data.flats if float(flat.mean_DN.max()) < ceiling), *data.dark_moments)
     hits, sigma = sum(moments.outliers for moments in seen), f"{rules.outlier_sigma:g} robust sigma"
     yield Outliers(f"two codes of a pixel {rules.hit_sigma:g} sigma apart in a pair (hits, blinking pixels)", hits)
+    unlike = np.flatnonzero(np.isnan(curve.levels.light) & ~np.isnan(curve.inside.light)).tolist()
     for what, levels in (("flats of a pair that differ in brightness by", curve.flickering),
-                         ("brightness off the response by", curve.off)):  # fmt: skip
+                         ("brightness off the response by", unlike)):  # fmt: skip
         yield Outliers(f"{what} {sigma}", len(levels), named(levels))
-    yield Outliers(f"bins of flats off the photon transfer curve by {sigma}", curve.bins_left_out)
+    bins = int(np.sum(curve.inside.usable & ~curve.levels.usable))
+    yield Outliers(f"bins of flats off the photon transfer curve by {sigma}", bins)
     for what, beside, found in (("dark", "(hot)", dark.offsets), ("flat", "their surroundings", uneven)):
         places = tuple(f"row {row}, column {column}" for row, column in found.places)
         rule = f"averaged {what} pixels {rules.defect_sigma:g} robust sigma off {beside}"

@@ -14,7 +14,7 @@ from udccal.fitting.engine.robust import OutlierRule, robust_sigma
 from udccal.fitting.noise.dark import DarkTerms, excess_kurtosis
 from udccal.fitting.noise.data import NoiseRules
 from udccal.fitting.noise.moments import Moments, NoiseMoments
-from udccal.fitting.noise.transfer import DarkVariance, Levels, TransferFit, choose_transfer, without_outliers
+from udccal.fitting.noise.transfer import DarkVariance, Levels, TransferFit, robust_transfer
 
 Bins = Bool[np.ndarray, "flats bins"]
 
@@ -22,22 +22,19 @@ Bins = Bool[np.ndarray, "flats bins"]
 @final
 @dataclass(frozen=True)
 class Curve:
-    """The photon transfer curve and what it rests on.
+    """The photon transfer curve: the fits of all orders, None where no exposure is inside the range.
 
-    ``full`` are bins at saturation, whose rough level is ``ceiling_DN``; ``fit_up_to`` is the fraction of it that the
-    fit reaches. ``choice`` holds the fits of all orders; None where no exposure is inside the range. Flats are named by
-    their index: the frames of those that are ``flickering`` differ in brightness; others lie ``off`` the response.
+    ``full`` are bins at saturation, whose rough level is ``ceiling_DN``; the fit reaches ``fit_up_to`` of it. The two
+    frames of ``flickering`` flats differ in brightness. ``levels`` are those ``inside`` the range, less outliers.
     """
 
     full: Bins
     ceiling_DN: float
     fit_up_to: float
     flickering: tuple[int, ...]
+    inside: Levels
     levels: Levels
-    usable_levels: int
-    choice: Choice[TransferFit] | None = None
-    bins_left_out: int = 0
-    off: tuple[int, ...] = ()
+    choice: Choice[TransferFit] | None
 
     @property
     def fit(self) -> TransferFit:
@@ -45,42 +42,33 @@ class Curve:
         assert self.choice is not None, "asked for where there are usable levels"
         return self.choice.best.fit
 
+    @property
+    def usable_levels(self) -> int:
+        """Exposures inside the range of the fit, the stack not counted."""
+        return int(self.inside.usable[: len(self.full)].any(axis=1).sum())
+
 
 def fit_curve(data: NoiseMoments, dark: DarkTerms, rules: NoiseRules) -> Curve:
     """The curve up to 90 % of saturation, or up to 70 % where that is described far better."""
-    full = _saturated(data, dark, rules)
+    full, flickering = _saturated(data, dark, rules), _flickering(data.flats, dark, rules)
     # Upper median of the saturated bins, or the converter's largest code where there is none.
     ceiling = float(np.quantile(stacked(data.flats, "mean_DN")[full], 0.75)) if full.any() else data.top_DN
-    found = _fit_up_to(rules.fit_up_to, data, dark, full, ceiling, rules)
+
+    def up_to(part: float) -> Curve:
+        inside = _inside(data, dark, part * (ceiling - dark.black_DN), ceiling, rules)
+        inside.usable[list(flickering)] = False
+        empty = Curve(full, ceiling, part, flickering, inside, inside, None)
+        if not empty.usable_levels:
+            return empty
+        choice, levels = robust_transfer(inside, _dark_variance(data, dark), max(ceiling - dark.black_DN, 1.0), rules)
+        return replace(empty, levels=levels, choice=choice)
+
+    found = up_to(rules.fit_up_to)
     if found.choice and found.fit.chi2_dof > 2:
-        narrow = _fit_up_to(rules.narrow_up_to, data, dark, full, ceiling, rules)
+        narrow = up_to(rules.narrow_up_to)
         if narrow.usable_levels >= rules.levels and narrow.fit.chi2_dof < 0.5 * found.fit.chi2_dof:
-            found = narrow
+            return narrow
     return found
-
-
-def _fit_up_to(
-    fit_up_to: float, data: NoiseMoments, dark: DarkTerms, full: Bins, ceiling_DN: float, rules: NoiseRules
-) -> Curve:
-    """The fit to bins up to this fraction of saturation, outliers left out."""
-    flickering, number, off = _flickering(data.flats, dark, rules), len(data.flats), []
-    full_DN, at_dark = max(ceiling_DN - dark.black_DN, 1.0), dark_variance(data, dark)
-    levels = _bright_levels(data, dark, fit_up_to * (ceiling_DN - dark.black_DN), ceiling_DN, rules)
-    levels.usable[list(flickering)] = False
-    usable = int(levels.usable[:number].any(axis=1).sum())
-    curve = Curve(full, ceiling_DN, fit_up_to, flickering, levels, usable)
-    if usable < 1:
-        return curve
-    choice = choose_transfer(levels, at_dark, full_DN, rules)
-    for _ in range(3):
-        cleaned, now_off = without_outliers(levels, choice.best.fit, rules)
-        same = not now_off and np.array_equal(cleaned.usable, levels.usable)
-        if same or not cleaned.usable[:number].any():
-            break
-        levels, off = cleaned, [*off, *now_off]
-        choice = choose_transfer(levels, at_dark, full_DN, rules)
-    left_out = int(np.sum(curve.levels.usable & ~levels.usable))
-    return replace(curve, levels=levels, choice=choice, bins_left_out=left_out, off=tuple(off))
 
 
 def stacked(flats: tuple[Moments, ...], name: str) -> Float[np.ndarray, "levels bins"]:
@@ -88,9 +76,7 @@ def stacked(flats: tuple[Moments, ...], name: str) -> Float[np.ndarray, "levels 
     return np.stack([getattr(flat, name) for flat in flats])
 
 
-def _bright_levels(
-    data: NoiseMoments, dark: DarkTerms, up_to_DN: float, ceiling_DN: float, rules: NoiseRules
-) -> Levels:
+def _inside(data: NoiseMoments, dark: DarkTerms, up_to_DN: float, ceiling_DN: float, rules: NoiseRules) -> Levels:
     """The flats as the transfer fit takes them, with the bins that lie safely inside the sensor's range."""
     flats = data.flats if data.flat_seen is None else (*data.flats, data.flat_seen)
     mean, variance, spread = (stacked(flats, name) for name in ("mean_DN", "variance_DN2", "spread_DN"))
@@ -120,7 +106,7 @@ def _bright_levels(
     )
 
 
-def dark_variance(data: NoiseMoments, dark: DarkTerms) -> DarkVariance:
+def _dark_variance(data: NoiseMoments, dark: DarkTerms) -> DarkVariance:
     """V0 from the histograms, and from the temporal variance of the dark stack where its frames were seen."""
     rounding, K, rate, read = data.q_DN**2 / 12.0, dark.K_DN_per_e, dark.dark_DN_per_s.value, dark.read_DN2
     drift = rate * np.array([pair.exposure_s for pair in data.darks])

@@ -105,21 +105,23 @@ class Order:
 @final
 @dataclass(frozen=True)
 class TransferFit:
-    """K, V0, curvature, response and offset of the light with their covariance, and how well they describe the data.
+    """One order: values with their covariance, and residuals in units of sigma (nan where unused).
 
-    ``scatter`` is the relative standard deviation of the light from level to level; ``variance_z`` and ``level_z`` are
-    residuals in units of sigma, nan where unused.
+    ``scatter`` is the relative standard deviation of the light from level to level.
     """
 
     order: Order
     values: Five
     cov: Float[np.ndarray, "5 5"]
     scatter: float
-    deviance: float
-    chi2_dof: float
     converged: bool
     variance_z: Float[np.ndarray, "levels bins"]
     level_z: Float[np.ndarray, " levels"]
+
+    @property
+    def chi2_dof(self) -> float:
+        """Reduced chi-squared of the variances."""
+        return float(np.nansum(self.variance_z**2)) / max(int(np.isfinite(self.variance_z).sum()) - 1, 1)
 
 
 def linear_signal(mean_DN, curvature_per_DN, K_DN_per_e):  # type: ignore[no-untyped-def]
@@ -216,24 +218,23 @@ def _brightness(light_DN: Float[np.ndarray, "levels bins"], usable: np.ndarray) 
 
 def _fit_order(
     levels: Levels, dark: DarkVariance, full_DN: float, order: Order, start: Five, rules: NoiseRules
-) -> TransferFit:
-    known = levels.light[np.isfinite(levels.light)]
-    brightest = max(float(np.max(known, initial=0.0)), 1e-30)
+) -> Attempt[TransferFit]:
+    brightest = max(float(np.nan_to_num(levels.light).max()), 1e-30)
     sizes = np.abs(start) + np.array([1e-9, dark.rounding_DN2 + 1e-3, 0.1 / full_DN, 1e-9, brightest])
     problem = TransferProblem(levels, dark, order, rules.most_bent / full_DN, sizes)
     start = np.where([True, True, order.curved, True, order.offset], start, 0.0)
     found = minimise(problem, start, SolverRules(iterations=40))
-    x, cov = found.place, found.equations.cov()
+    x, cov, cost = found.place, found.equations.cov(), found.equations.cost
     variance, _, relative = problem.modelled(x)
-    use, responds = levels.usable, levels.responding
-    scatter2 = problem.scatter2(relative[responds])
-    variance_z = np.where(use, (levels.variance_DN2 / variance - 1) * np.sqrt(levels.dof / 2), np.nan)
-    spread2 = np.where(responds, levels.brightness_variance + scatter2, np.inf)
-    level_z = np.where(responds, relative / np.sqrt(spread2), np.nan)
-    chi2_dof = float(np.nansum(variance_z**2)) / max(int(use.sum()) - 1, 1)
-    converged = bool(found.converged and np.isfinite(x).all() and np.isfinite(cov).all())
-    scatter = float(np.sqrt(scatter2))
-    return TransferFit(order, x, cov, scatter, found.equations.cost, chi2_dof, converged, variance_z, level_z)
+    scatter2 = problem.scatter2(relative[levels.responding])
+    variance_z = np.where(levels.usable, (levels.variance_DN2 / variance - 1) * np.sqrt(levels.dof / 2), np.nan)
+    spread2 = np.where(levels.responding, levels.brightness_variance + scatter2, np.inf)
+    level_z = np.where(levels.responding, relative / np.sqrt(spread2), np.nan)
+    converged = bool(found.converged and np.isfinite(x).all() and np.isfinite(cov).all() and np.isfinite(cost))
+    parameters = order.curved + order.offset + order.unsteady
+    criterion = bic(cost, float(parameters), int(levels.dof[levels.usable].sum())) if converged else np.inf
+    fit = TransferFit(order, x, cov, float(np.sqrt(scatter2)), converged, variance_z, level_z)
+    return Attempt(order.name, parameters, criterion, fit)
 
 
 def choose_transfer(levels: Levels, dark: DarkVariance, full_DN: float, rules: NoiseRules) -> Choice[TransferFit]:
@@ -241,7 +242,7 @@ def choose_transfer(levels: Levels, dark: DarkVariance, full_DN: float, rules: N
 
     Args:
         levels: bright exposures; at least one usable bin.
-        dark: what dark frames tell about V0.
+        dark: V0 by dark frames.
         full_DN: saturation above black; sets the scale of the curvature.
         rules: how far the response may bend.
     """
@@ -254,25 +255,26 @@ def choose_transfer(levels: Levels, dark: DarkVariance, full_DN: float, rules: N
     start = np.array([K, V0, 0.0, gain if gain > 0 else 1.0, 0.0])
     # A variance is set against the mean of the same bin: of Poisson counts the two err together, of read noise apart.
     apart = K**2 * max(V0, 0.0) / levels.samples / np.maximum(levels.variance_DN2, 1e-9) ** 2
-    weighed = replace(levels, dof=levels.dof / (1 + 0.5 * levels.dof * apart))
+    levels = replace(levels, dof=levels.dof / (1 + 0.5 * levels.dof * apart))
     orders = [Order(curved, offset, unsteady) for unsteady, offset, curved in product((False, True), repeat=3)]
-    if not levels.responding.any():
-        orders = [Order(), Order(curved=True)]
-    samples = int(levels.dof[use].sum())
-    tried: list[Attempt[TransferFit]] = []
-    for order in orders:
-        fit = _fit_order(weighed, dark, full_DN, order, start, rules)
-        number = order.curved + order.offset + order.unsteady
-        criterion = bic(fit.deviance, float(number), samples) if fit.converged and np.isfinite(fit.deviance) else np.inf
-        tried.append(Attempt(order.name, number, criterion, fit))
-        # The simplest is where the others begin.
-        start = tried[0].fit.values if tried[0].fit.converged else start
-    return choose(tried)
+    first = _fit_order(levels, dark, full_DN, Order(), start, rules)
+    # The simplest is where the others begin.
+    start = first.fit.values if first.fit.converged else start
+    others = orders[1:] if levels.responding.any() else [Order(curved=True)]
+    return choose([first, *(_fit_order(levels, dark, full_DN, order, start, rules) for order in others)])
 
 
-def without_outliers(levels: Levels, fit: TransferFit, rules: NoiseRules) -> tuple[Levels, tuple[int, ...]]:
-    """Levels less what lies off the fit; and which levels' brightness does."""
-    bins = OutlierRule("bins of flats", rules.outlier_sigma).off(np.nan_to_num(fit.variance_z), levels.usable)
-    off = OutlierRule("levels", rules.outlier_sigma).off(np.nan_to_num(fit.level_z), np.isfinite(fit.level_z))
-    cleaned = replace(levels, usable=levels.usable & ~bins, light=np.where(off, np.nan, levels.light))
-    return cleaned, tuple(int(i) for i in np.flatnonzero(off))
+def robust_transfer(
+    levels: Levels, dark: DarkVariance, full_DN: float, rules: NoiseRules
+) -> tuple[Choice[TransferFit], Levels]:
+    """The same, and the levels less what lies off it: bins are not usable, the light of whole levels not known."""
+    choice, rule = choose_transfer(levels, dark, full_DN, rules), OutlierRule("bins and levels", rules.outlier_sigma)
+    for _ in range(3):
+        fit = choice.best.fit
+        off = rule.off(np.nan_to_num(fit.variance_z), levels.usable)
+        unlike = rule.off(np.nan_to_num(fit.level_z), np.isfinite(fit.level_z))
+        if not (off.any() or unlike.any()) or not (levels.usable & ~off).any():
+            break
+        levels = replace(levels, usable=levels.usable & ~off, light=np.where(unlike, np.nan, levels.light))
+        choice = choose_transfer(levels, dark, full_DN, rules)
+    return choice, levels
