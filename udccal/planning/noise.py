@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from udccal.arrangements import Dark, FlatLight
-from udccal.fitting.noise.rules import NoiseRules
+from udccal.fitting.noise.data import NoiseRules
 from udccal.fitting.noise.transfer import DarkVariance, Levels, Order, TransferProblem, temporal_variance
 from udccal.planning.forecast import Floor
 from udccal.planning.state import EvenField, RigState, sensor_samples

@@ -61,3 +61,9 @@ def test_a_quantity_stays_where_the_data_ask_for_it() -> None:
         lost = Quantity.asked("spread", value, 1.0, 1000, gain, without=0.1)
         assert (lost.value, lost.variance, lost.there) == (0.1, 1.0, False)
         assert [candidate.chosen for candidate in lost.candidates] == [True, False]
+
+
+def test_the_root_of_a_variance_that_is_lost_in_its_error_is_as_uncertain_as_that() -> None:
+    assert Quantity(4.0, 0.01).root() == (2.0, 0.25)
+    value, slope = Quantity(0.0, 1e-4).root()
+    assert (value, slope * 1e-2) == (0.0, pytest.approx(0.1))

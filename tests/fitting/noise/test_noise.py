@@ -9,9 +9,9 @@ import pytest
 
 from udccal.cameras.protocol import Region
 from udccal.fitting.noise import dark, moments
-from udccal.fitting.noise.data import Averaged, Codes, NoiseRules, converter_step
+from udccal.fitting.noise.data import Averaged, Codes, NoiseRules
 from udccal.fitting.noise.fit import fit_moments, nominal_noise
-from udccal.fitting.noise.moments import NoiseMoments, dark_pair
+from udccal.fitting.noise.moments import NoiseMoments, converter_step, dark_pair
 from udccal.fitting.noise.patterns import dsnu, prnu
 from udccal.models.noise import Noise
 from udccal.result import FitResult, FitStatus

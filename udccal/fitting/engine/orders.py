@@ -148,3 +148,11 @@ class Quantity:
         simple = Attempt(f"without {name}", 0, own if gain is None else gain, without)
         choice = choose((simple, Attempt(f"with {name}", 1, bic(0.0, 1.0, samples), value)))
         return cls(choice.best.fit, variance, choice.best.parameters > 0, choice.candidates)
+
+    def root(self) -> tuple[float, float]:
+        """Where the value is a variance: the standard deviation, and its derivative by the variance.
+
+        Where the value is lost in its error the root is that far from zero at most, not to first order.
+        """
+        value, error = float(np.sqrt(max(self.value, 0.0))), float(np.sqrt(self.variance))
+        return value, 0.5 / value if value**2 > error else float(1 / np.sqrt(max(error, 1e-300)))

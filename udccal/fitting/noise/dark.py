@@ -25,11 +25,9 @@ from udccal.fitting.noise.patterns import Pattern, dsnu, row_noise
 
 # The shape with the kurtosis of a normal distribution.
 NORMAL_SHAPE = 0.1349
-# Variances at this are those of none: three hundredths of a code.
-LEAST_VARIANCE = 1e-3
 # Bounds of black [DN], dark current [DN/s], variance of single samples without row noise [DN^2], variance of the
-# pixels' offsets [DN^2], and Tukey-lambda shape: the order of ``Five``.
-_LOW = np.array([-np.inf, -np.inf, LEAST_VARIANCE, 1e-6, -0.1])
+# pixels' offsets [DN^2], and Tukey-lambda shape: the order of ``Five``. Variances at the bound are those of none.
+_LOW = np.array([-np.inf, -np.inf, 1e-3, 1e-6, -0.1])
 _HIGH = np.array([np.inf, np.inf, np.inf, np.inf, 0.45])
 Five = Float[np.ndarray, "5"]
 
@@ -191,8 +189,7 @@ def fit_dark(
     widened by the square root of their number. Row noise in ``known`` is that of these frames.
     """
     values = np.clip(start_values(pairs) if start is None else start, _LOW, _HIGH)
-    one_exposure = len({pair.exposure_s for pair in pairs}) < 2
-    free = np.array([True, not one_exposure, True, True, not normal])
+    free = np.array([True, len({pair.exposure_s for pair in pairs}) > 1, True, True, not normal])
     values = np.where(free, values, [0.0, 0.0, 0.0, 0.0, NORMAL_SHAPE])
     # One-sided slopes promise a little for ever.
     solver = SolverRules(least_gain=1e-3, stalled_gain=1e-4, iterations=40)
@@ -211,19 +208,16 @@ def fit_dark(
 
 
 def _level(pair: DarkPair, values: Five, known: Surroundings) -> tuple[float, float, float]:
-    """``DarkFit.edge_gains``, ``means_DN`` and ``variances_DN2`` of a pair, by one scoring step from the common fit.
-
-    The part of the offsets in the variance is the same in every pair and does not count here.
-    """
+    """``DarkFit.edge_gains``, ``means_DN`` and ``variances_DN2`` of a pair, by one scoring step from the common fit."""
     black = 0.01 * float(np.sqrt(values[2])) * np.eye(5)[0]
     up, down = (pair_probability(pair, values + sign * black, known) for sign in (1, -1))
     slope, p, total = (up - down) / (2 * black[0]), 0.5 * (up + down), float(pair.counts.sum())
     gain, information = float(slope.sum(axis=1) @ pair.centres_DN), total * float(np.sum(slope**2 / p))
     mean, blind = float(values[0] + values[1] * pair.exposure_s), pair.step_DN**2 / 12.0
     if information * blind < 1:
-        # Where all codes are one code, the level is known to rounding alone.
-        return gain, mean, blind
+        return gain, mean, blind  # Where all codes are one code, the level is known to rounding alone.
     shift = float(np.sum(slope * pair.counts / p)) / information
+    # The part of the offsets in the variance is the same in every pair and does not count here.
     temporal = max(1 / information - float(values[3]) / total, 0.05 / information)
     return gain, mean + shift, temporal + known.sigma_row_DN**2 / (2 * pair.rows)
 
@@ -231,10 +225,7 @@ def _level(pair: DarkPair, values: Five, known: Surroundings) -> tuple[float, fl
 @final
 @dataclass(frozen=True)
 class DarkTerms:
-    """Dark quantities in DN, for a gain that was taken for known.
-
-    ``levels_cov`` is the covariance of (black, dark current); ``white``: rounding shows in no pixel's mean.
-    """
+    """Dark quantities; ``levels_cov`` is that of (black, dark current); ``white``: no pixel's mean shows rounding."""
 
     K_DN_per_e: float
     black_DN: float
@@ -265,7 +256,7 @@ def fit_dark_terms(data: NoiseMoments, K_DN_per_e: float, rules: NoiseRules, sta
     name, gain = f"read noise of another shape than normal ({NORMAL_SHAPE:.2f})", (value - NORMAL_SHAPE) ** 2 / variance
     shape = Quantity.asked(name, value, variance, data.dark_samples, gain, without=NORMAL_SHAPE)
     fit = fit if shape.there else fit_dark(data.darks, known, rules, fit.values, normal=True)
-    read, read_variance, spread2 = float(fit.values[2]), float(fit.cov[2, 2]), float(fit.values[3])
+    read, spread2 = float(fit.values[2]), float(fit.values[3])
     # DSNU is that of the stack's average, unless rounding bends it: then that of the histograms.
     stack, rounding = data.dark_stack, data.q_DN**2 / 12.0
     single = read + K_DN_per_e * max(float(fit.values[1]), 0.0) * stack.exposure_s + rounding
@@ -276,10 +267,9 @@ def fit_dark_terms(data: NoiseMoments, K_DN_per_e: float, rules: NoiseRules, sta
         pixels, sigma = stack.mean_DN.size, float(np.hypot(fit.cov[3, 3] ** 0.5, 0.0 if resolved else rounding))
         offsets = replace(offsets, variance=spread2, sigma=sigma, samples=pixels, mean_variance=spread2 / pixels)
     black, levels_cov, current = _levels(data, fit, in_pairs**2, single, offsets)
-    if read <= 1.001 * LEAST_VARIANCE:
-        read, read_variance = 0.0, max(read_variance, LEAST_VARIANCE**2)
+    none = read <= 1.001 * _LOW[2]
+    read_DN2 = Quantity(0.0 if none else read, max(float(fit.cov[2, 2]), _LOW[2] ** 2 if none else 0.0))
     DSNU2 = Quantity.asked("DSNU", offsets.variance, offsets.sigma**2, offsets.samples)
-    read_DN2 = Quantity(read, read_variance)
     return DarkTerms(K_DN_per_e, black, current, levels_cov, read_DN2, shape, row, DSNU2, white, fit, offsets)
 
 

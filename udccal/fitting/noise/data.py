@@ -173,21 +173,6 @@ def loaded(frame: Frame, shape: tuple[int, ...] | None = None) -> Codes:
     return array if array.dtype == np.uint16 else array.astype(np.uint16)
 
 
-def converter_step(frame: Codes) -> int:
-    """Smallest step between codes: greater than 1 where a converter's bits are shifted up in 16-bit samples."""
-    codes = np.flatnonzero(np.bincount(frame.ravel(), minlength=2))
-    return int(np.gcd.reduce(np.diff(codes))) if codes.size > 2 else 1
-
-
-def converter_top(peak: int, declared: int | None, q_DN: int) -> int:
-    """Largest code there is; a FitError where a code that was seen is larger than the one declared."""
-    if declared is None:
-        return int(2 ** max(int(np.ceil(np.log2(peak + q_DN))), 8) - q_DN)
-    if peak > declared:
-        raise FitError(f"Expected codes up to {declared}, found {peak}. Give the converter's largest code as top_code.")
-    return declared
-
-
 def read_noise(session: Session) -> NoiseData:
     """The steps ``noise/*`` of a session; frames are read when the fit comes to them.
 

@@ -223,22 +223,13 @@ def _term(values: Float[np.ndarray, "10"]) -> Noise:
     return Noise(*(float(value) for value in values))
 
 
-def _root(of: Quantity) -> tuple[float, float]:
-    """Standard deviation from a variance, and its slope.
-
-    Where the variance is lost in its error the root is that far from zero at most, not to first order.
-    """
-    value, error = float(np.sqrt(max(of.value, 0.0))), float(np.sqrt(of.variance))
-    return value, 0.5 / value if value**2 > error else float(1 / np.sqrt(max(error, 1e-300)))
-
-
 def _values(
     data: NoiseMoments, dark: DarkTerms, curve: Curve, saturation: tuple[float, float], PRNU2: Quantity
 ) -> tuple[Float[np.ndarray, "11"], Float[np.ndarray, "11 11"]]:
     """The estimates and their covariance, from that of what was fitted."""
     (K, V0, c), transfer = (float(v) for v in curve.fit.values[:3]), curve.fit.cov[:3, :3]
     total = Quantity(V0 + dark.row_DN2.value, float(transfer[1, 1]) + dark.row_DN2.variance)
-    roots = [_root(one) for one in (total, dark.row_DN2, dark.dsnu_DN2, PRNU2)]
+    roots = [one.root() for one in (total, dark.row_DN2, dark.dsnu_DN2, PRNU2)]
     (sigma_d, by_total), (row, by_row), (spread, by_spread), (response, by_response) = roots
     (level, level_sigma), rate = saturation, dark.dark_DN_per_s.value
     full_DN = level - dark.black_DN

@@ -16,18 +16,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32, Int
 
-from udccal.fitting.noise.data import (
-    Averaged,
-    Codes,
-    ExposureLevel,
-    Frame,
-    NoiseData,
-    NoiseRules,
-    SpatialStack,
-    converter_step,
-    converter_top,
-    loaded,
-)
+from udccal.errors import FitError
+from udccal.fitting.noise.data import Averaged, Codes, ExposureLevel, Frame, NoiseData, NoiseRules, loaded
 
 Grid = Float[np.ndarray, "groups_y groups_x"]
 
@@ -211,6 +201,21 @@ def dark_pair(first: Codes, second: Codes, exposure_s: float, q_DN: int = 1, top
     return DarkPair(exposure_s, edges, float(group * q_DN), counts, len(first))
 
 
+def converter_step(frame: Codes) -> int:
+    """Smallest step between codes: greater than 1 where a converter's bits are shifted up in 16-bit samples."""
+    codes = np.flatnonzero(np.bincount(frame.ravel(), minlength=2))
+    return int(np.gcd.reduce(np.diff(codes))) if codes.size > 2 else 1
+
+
+def _converter_top(peak: int, declared: int | None, q_DN: int) -> int:
+    """Largest code there is; a FitError where a code that was seen is larger than the one declared."""
+    if declared is None:
+        return int(2 ** max(int(np.ceil(np.log2(peak + q_DN))), 8) - q_DN)
+    if peak > declared:
+        raise FitError(f"Expected codes up to {declared}, found {peak}. Give the converter's largest code as top_code.")
+    return declared
+
+
 @final
 @dataclass(frozen=True)
 class NoiseMoments:
@@ -254,30 +259,34 @@ def reduced(data: NoiseData, rules: NoiseRules) -> NoiseMoments | None:
     q_DN = converter_step(sample)
     metered = all(level.photons is not None for level in brights) and (stack is None or stack.photons is not None)
 
-    def moments(frames: Sequence[Frame], of: ExposureLevel | SpatialStack) -> tuple[Averaged, Moments]:
+    def moments(frames: Sequence[Frame], exposure_s: float, photons: float | None = None) -> tuple[Averaged, Moments]:
         checked = (loaded(frame, sample.shape) for frame in frames)
-        return reduce_frames(checked, of.exposure_s, of.photons if metered else None, period, rules)
+        return reduce_frames(checked, exposure_s, photons if metered else None, period, rules)
 
     def dark(level: ExposureLevel) -> tuple[DarkPair, Moments]:
         first, second = (loaded(frame, sample.shape) for frame in level.dark)
-        converter_top(int(np.median(first[::64])), top, q_DN)
-        return dark_pair(first, second, level.exposure_s, q_DN, top), moments((first, second), level)[1]
+        _converter_top(int(np.median(first[::64])), top, q_DN)
+        return dark_pair(first, second, level.exposure_s, q_DN, top), moments((first, second), level.exposure_s)[1]
 
-    def average(frames: Sequence[Frame] | Averaged) -> tuple[Averaged, Moments | None]:
-        return (frames, None) if isinstance(frames, Averaged) else moments(frames, stack)
+    def average(
+        frames: Sequence[Frame] | Averaged, exposure_s: float, photons: float | None
+    ) -> tuple[Averaged, Moments | None]:
+        return (frames, None) if isinstance(frames, Averaged) else moments(frames, exposure_s, photons)
 
     with ThreadPoolExecutor(2) as pool:
         # The stacks are the longest tasks: they go first.
-        tasks = [] if stack is None else [pool.submit(average, frames) for frames in (stack.dark, stack.bright)]
-        flats = tuple(pool.map(lambda level: moments(level.bright, level)[1], brights))
-        top = converter_top(max(flat.peak_DN for flat in flats), data.top_code, q_DN)
+        tasks = [] if stack is None else [
+            pool.submit(average, frames, stack.exposure_s, stack.photons) for frames in (stack.dark, stack.bright)
+        ]  # fmt: skip
+        flats = tuple(pool.map(lambda level: moments(level.bright, level.exposure_s, level.photons)[1], brights))
+        top = _converter_top(max(flat.peak_DN for flat in flats), data.top_code, q_DN)
         histograms, dark_moments = zip(*pool.map(dark, darks), strict=True)
         stacks = [task.result() for task in tasks]
     if not stacks:
         means = np.array([flat.mean_DN.mean() for flat in flats])
         middle = brights[int(np.argmin(np.abs(means - 0.5 * min(means.max(), top))))]
         near = min(darks, key=lambda level: abs(level.exposure_s - middle.exposure_s))
-        stacks = [(moments(near.dark, near)[0], None), (moments(middle.bright, middle)[0], None)]
+        stacks = [(moments(near.dark, near.exposure_s)[0], None), (moments(middle.bright, middle.exposure_s)[0], None)]
     (dark_stack, dark_seen), (flat_stack, flat_seen) = stacks
     return NoiseMoments(
         histograms, dark_moments, flats, dark_stack, flat_stack, q_DN, float(top), period, dark_seen, flat_seen

@@ -209,7 +209,7 @@ def white_coefficients(
     """
     keep = np.ones(powers[0].shape, bool)
     keep[0] = keep[:, 0] = keep[: taken[0], : taken[1]] = False
-    block = min(16, *(side // 4 for side in keep.shape))
+    block = min(16, keep.shape[0] // 4, keep.shape[1] // 4)
     if block < 2:
         return keep
     count = _by_block(keep, block)

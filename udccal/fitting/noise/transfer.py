@@ -204,11 +204,11 @@ class TransferProblem:
 
 def _brightness(light_DN: Float[np.ndarray, "levels bins"], usable: np.ndarray) -> Float[np.ndarray, " levels"]:
     """Mean light of each level as if every bin were usable in it: all levels have one pattern of bins."""
-    complete = usable.all(axis=1)
+    complete = np.asarray(usable.all(axis=1))
     # Alternating from the complete levels' pattern, the others add little; from none the first rounds would be rough.
     pattern = light_DN[complete].sum(axis=0) if complete.any() else np.ones(usable.shape[1])
     seen, pattern = np.where(usable, light_DN, 0.0), pattern / max(float(pattern.mean()), 1e-9)
-    for _ in range(6 if usable.any(axis=1)[~complete].any() else 1):
+    for _ in range(6 if usable[~complete].any() else 1):
         level = seen.sum(axis=1) / np.maximum(usable @ pattern, 1e-9)
         weight = level**2 @ usable
         pattern = np.where(weight > 0, level @ seen / np.maximum(weight, 1e-12), 1.0)
