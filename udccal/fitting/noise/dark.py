@@ -139,7 +139,7 @@ class _DarkCodes:
         off = (place[4] - NORMAL_SHAPE) / self.shape_sigma
         cost, samples, shape = off**2, 0, self.free[4] * np.eye(5)[4] / self.shape_sigma
         score, information = -off * shape, np.outer(shape, shape)
-        # For slopes by differences: small beside the noise, large beside the arithmetic.
+        # For derivatives by differences: small beside the noise, large beside the arithmetic.
         width2 = place[2] + 0.01
         longest = max(max(pair.exposure_s for pair in self.pairs), 1e-9)
         steps = 2e-3 * np.array([width2**0.5, width2**0.5 / longest, width2, max(0.5 * place[3], 1e-4 * width2), 1.0])
@@ -148,13 +148,13 @@ class _DarkCodes:
             p, counts = pair_probability(pair, place, self.known).ravel(), pair.counts.ravel()
             total = int(counts.sum())
             # One-sided: the second order, which that leaves, sums to nothing in the score at the truth.
-            slopes = np.zeros((5, p.size))
+            jacobian = np.zeros((5, p.size))
             for i in np.flatnonzero(self.free):
                 moved = pair_probability(pair, place + steps[i] * np.eye(5)[i], self.known)
-                slopes[i] = (moved.ravel() - p) / steps[i]
+                jacobian[i] = (moved.ravel() - p) / steps[i]
             cost += 2 * float(np.sum(xlogy(counts, counts / (total * p))))
-            score += slopes @ (counts / p)
-            information += total * (slopes / p) @ slopes.T
+            score += jacobian @ (counts / p)
+            information += total * (jacobian / p) @ jacobian.T
             samples += total
         held = ~self.free | ((place <= _LOW) & (score < 0)) | ((place >= _HIGH) & (score > 0))
         return replace(Blocks.dense(cost, samples, information, score), held=held)
@@ -191,7 +191,7 @@ def fit_dark(
     values = np.clip(start_values(pairs) if start is None else start, _LOW, _HIGH)
     free = np.array([True, len({pair.exposure_s for pair in pairs}) > 1, True, True, not normal])
     values = np.where(free, values, [0.0, 0.0, 0.0, 0.0, NORMAL_SHAPE])
-    # One-sided slopes promise a little for ever.
+    # One-sided derivatives promise a little for ever.
     solver = SolverRules(least_gain=1e-3, stalled_gain=1e-4, iterations=40)
     found = minimise(_DarkCodes(pairs, known, free, rules.shape_sigma), values, solver)
     values, information = found.place, found.equations.shared
@@ -211,12 +211,12 @@ def _level(pair: DarkPair, values: Five, known: Surroundings) -> tuple[float, fl
     """``DarkFit.edge_gains``, ``means_DN`` and ``variances_DN2`` of a pair, by one scoring step from the common fit."""
     black = 0.01 * float(np.sqrt(values[2])) * np.eye(5)[0]
     up, down = (pair_probability(pair, values + sign * black, known) for sign in (1, -1))
-    slope, p, total = (up - down) / (2 * black[0]), 0.5 * (up + down), float(pair.counts.sum())
-    gain, information = float(slope.sum(axis=1) @ pair.centres_DN), total * float(np.sum(slope**2 / p))
+    by_black, p, total = (up - down) / (2 * black[0]), 0.5 * (up + down), float(pair.counts.sum())
+    gain, information = float(by_black.sum(axis=1) @ pair.centres_DN), total * float(np.sum(by_black**2 / p))
     mean, blind = float(values[0] + values[1] * pair.exposure_s), pair.step_DN**2 / 12.0
     if information * blind < 1:
         return gain, mean, blind  # Where all codes are one code, the level is known to rounding alone.
-    shift = float(np.sum(slope * pair.counts / p)) / information
+    shift = float(np.sum(by_black * pair.counts / p)) / information
     # The part of the offsets in the variance is the same in every pair and does not count here.
     temporal = max(1 / information - float(values[3]) / total, 0.05 / information)
     return gain, mean + shift, temporal + known.sigma_row_DN**2 / (2 * pair.rows)
@@ -249,7 +249,7 @@ def fit_dark_terms(data: NoiseMoments, K_DN_per_e: float, rules: NoiseRules, sta
         row, in_pairs = row_noise(data, fit.edge_gains)
         known = replace(known, sigma_row_DN=in_pairs)
         fit = fit_dark(data.darks, known, rules, fit.values)
-    # Temporal noise too small beside a code is not told from the pattern of rounding.
+    # Temporal noise too small beside a code cannot be distinguished from the pattern of rounding.
     resolved = float(fit.values[2]) + in_pairs**2 >= (rules.resolved * data.q_DN) ** 2
     row = row if resolved else row_noise(data, np.zeros(len(data.darks)))[0]
     value, variance = float(fit.values[4]), float(fit.cov[4, 4])

@@ -18,6 +18,7 @@ from udccal.fitting.noise.moments import NoiseMoments, bins, reduced
 from udccal.fitting.noise.patterns import Pattern, prnu, rough_median
 from udccal.fitting.noise.transfer import linear_signal
 from udccal.models.noise import Noise
+from udccal.numerics import in_float64
 from udccal.result import Diagnostic, FitResult, FitStatus, Outliers
 from udccal.rig import RigDescription
 
@@ -36,6 +37,7 @@ def _assumed(K_DN_per_e: float, black_DN: float, saturation_DN: float) -> Noise:
     return Noise(K_DN_per_e, black_DN, saturation_DN, 5.0, 0.14, 0.0, 1.0, 0.0, 0.0, 0.0)
 
 
+@in_float64
 def fit_noise(data: NoiseData, nominal: Noise | None = None, rules: NoiseRules | None = None) -> FitResult[Noise]:
     """Fit the noise term: K, black, saturation, dark noise and its shape, row noise, dark current, DSNU, PRNU.
 
@@ -116,7 +118,7 @@ def _too_little(data: NoiseMoments, rules: NoiseRules) -> tuple[FitStatus, str] 
 
 def _no_gain(data: NoiseMoments, dark: DarkTerms, curve: Curve, rules: NoiseRules) -> tuple[FitStatus, str] | None:
     """Darks that do not show black; flats that are copies, too few, too dark, or clipped."""
-    # Codes cut off at 0, and offsets of pixels far larger than their noise: no code tells where black is.
+    # Codes cut off at 0, and offsets of pixels far larger than their noise: no code shows where black is.
     cut = any(pair.edges_DN[0] == -np.inf and pair.counts[0].sum() > 0.01 * pair.counts.sum() for pair in data.darks)
     quiet = max(dark.read_DN2.value + dark.row_DN2.value, 1e-9)
     if cut and not dark.white and dark.dsnu_DN2.value > 30.0**2 * quiet:
@@ -262,9 +264,9 @@ def _outliers(
     seen = (*(flat for flat in data.flats if float(flat.mean_DN.max()) < ceiling), *data.dark_moments)
     hits, sigma = sum(moments.outliers for moments in seen), f"{rules.outlier_sigma:g} robust sigma"
     yield Outliers(f"two codes of a pixel {rules.hit_sigma:g} sigma apart in a pair (hits, blinking pixels)", hits)
-    unlike = np.flatnonzero(np.isnan(curve.levels.light) & ~np.isnan(curve.inside.light)).tolist()
+    off_response = np.flatnonzero(np.isnan(curve.levels.light) & ~np.isnan(curve.inside.light)).tolist()
     for what, levels in (("flats of a pair that differ in brightness by", curve.flickering),
-                         ("brightness off the response by", unlike)):  # fmt: skip
+                         ("brightness off the response by", off_response)):  # fmt: skip
         yield Outliers(f"{what} {sigma}", len(levels), named(levels))
     bins = int(np.sum(curve.inside.usable & ~curve.levels.usable))
     yield Outliers(f"bins of flats off the photon transfer curve by {sigma}", bins)

@@ -207,9 +207,10 @@ def white_coefficients(
         taken: so many of the lowest rows and columns were changed by taking off shading.
         rules: what is light, and how far it reaches.
     """
-    keep = np.ones(powers[0].shape, bool)
+    rows, columns = powers[0].shape
+    keep = np.ones((rows, columns), bool)
     keep[0] = keep[:, 0] = keep[: taken[0], : taken[1]] = False
-    block = min(16, keep.shape[0] // 4, keep.shape[1] // 4)
+    block = min(16, rows // 4, columns // 4)
     if block < 2:
         return keep
     count = _by_block(keep, block)
