@@ -190,6 +190,7 @@ def _assembled(data: NoiseMoments, dark: DarkTerms, curve: Curve, rules: NoiseRu
     shown = len(NAMES) - (not fit.order.curved)
     terms = (dark.row_DN2, dark.shape, dark.dark_DN_per_s, dark.dsnu_DN2, PRNU2)
     candidates = [*(one for term in terms for one in term.candidates), *response.candidates]
+    outside = len(data.darks) * data.flat_stack.mean_DN.size - data.dark_samples
     height, width = data.flat_stack.mean_DN.shape
     (down, right), used = bins(height, width, data.period, rules), np.isfinite(fit.variance_z)
     x, y = np.arange(width) @ right / right.sum(axis=0), down @ np.arange(height) / down.sum(axis=1)
@@ -212,6 +213,7 @@ def _assembled(data: NoiseMoments, dark: DarkTerms, curve: Curve, rules: NoiseRu
             Diagnostic("response_DN_per_light", float(fit.values[3]), "DN"),
             Diagnostic("light_offset", float(fit.values[4]), "light"),
             Diagnostic("light_scatter", fit.scatter, "1"),
+            Diagnostic("dark_samples_outside_histogram", float(outside), "1"),
             Diagnostic("edge_gain", float(np.sqrt(np.mean(dark.fit.edge_gains**2))), "1"),
         ),
         notes=tuple(_notes(dark, curve, values, bent_too_far)),
