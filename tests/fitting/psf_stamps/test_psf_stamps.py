@@ -10,7 +10,7 @@ import pytest
 from udccal.errors import FitError
 from udccal.fitting.psf_stamps.data import Stamps, mosaic_channels
 from udccal.fitting.psf_stamps.fit import fit_psf_stamps
-from udccal.fitting.psf_stamps.orders import Orders
+from udccal.fitting.psf_stamps.search import Orders
 from udccal.fitting.psf_stamps.term import StampsPsf
 from udccal.result import FitResult, FitStatus
 

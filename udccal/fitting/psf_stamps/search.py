@@ -1,0 +1,283 @@
+"""Which orders a psf field needs: tried from a middle one, a degree at a time, by how likely each makes the data.
+
+The criterion is -2 log of the evidence (fields, places and light integrated out by Laplace's method), plus the
+logarithm of the number of samples for each precision that was tuned (Schwarz, "Estimating the dimension of a model",
+Annals of Statistics 6, 1978).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import final
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from udccal.fitting.engine.gaussian import scaled_inverse
+from udccal.fitting.engine.least_squares import Solution, SolverRules, Step, minimise
+from udccal.fitting.engine.orders import Attempt, Choice, choose
+from udccal.fitting.engine.robust import OutlierRule
+from udccal.fitting.psf_stamps.data import Stamps, StampsRules, centroids, light_of
+from udccal.fitting.psf_stamps.equations import factors, marginal_cov
+from udccal.fitting.psf_stamps.field import PsfField
+from udccal.fitting.psf_stamps.probability import State, envelope, expectation, updated
+from udccal.models.fields import polynomial_terms
+
+WINDOW_PX = 1.6  # standard deviation of a Gaussian as wide as a star, before the kernel is known
+
+
+@final
+@dataclass(frozen=True)
+class Laplace:
+    """The evidence at a state by Laplace's method, and where to go from there.
+
+    The factors that it was made with, the largest arrays of a fit, are not kept: never are there two of them.
+
+    Attributes:
+        cost: -2 log of the evidence, of an expansion about the state.
+        samples: that tell something.
+        mode: as changes of the state.
+        tuned: logarithm of what each precision changes by.
+        gain: of the log posterior up to the mode.
+        root: Cholesky's, of the dense block's precision.
+    """
+
+    cost: float
+    samples: int
+    mode: Float[np.ndarray, " unknowns"]
+    tuned: Float[np.ndarray, " groups"]
+    gain: float
+    root: Float[np.ndarray, "dense dense"]
+
+    @property
+    def evidence(self) -> float:
+        """Its logarithm, of an expansion about the mode."""
+        return self.gain - 0.5 * self.cost
+
+    def step(self, damping: float) -> Step:
+        """A part of the way: a raised diagonal would ask for the factors anew."""
+        part = 1.0 / (1.0 + damping)
+        return Step(part * self.mode, part * self.tuned[None], 2 * self.gain * part * (2 - part))
+
+
+Found = Solution[State, Laplace]
+Tried = Attempt[Found]
+
+
+@final
+@dataclass(frozen=True)
+class Evidence:
+    """The engine's problem: a step goes to the likeliest state, and sets the precisions by empirical Bayes."""
+
+    stamps: Stamps
+    rules: StampsRules
+    name: str = "psf field of stamps"
+
+    def equations_at(self, place: State) -> Laplace:
+        """Of infinite cost where the equations are singular."""
+        try:
+            found = factors(self.stamps, place)
+        except np.linalg.LinAlgError:
+            none = np.zeros(0)
+            return Laplace(np.inf, 1, none, none, np.inf, np.zeros((0, 0)))
+        # The same draws every time, so that a descent comes to an end.
+        left = place.squares(found.draws(np.random.default_rng(0), self.rules.draws[0]))
+        before = place.precisions
+        after = updated(before, place.expected_squares(), left, place.shifted(found.mode).squares())
+        cost = found.log_det - 2 * (found.log_likelihood + place.log_prior)
+        return Laplace(cost, int(self.stamps.known.sum()), found.mode, np.log(after / before), found.gain, found.root)
+
+    def moved(self, place: State, step: Step) -> State:
+        """Along all unknowns, and along the logarithms of the precisions."""
+        return replace(place.shifted(step.shared), precisions=place.precisions * np.exp(step.own[0]))
+
+
+def improve(stamps: Stamps, state: State, rules: StampsRules, steps: int) -> Found:
+    """The likeliest state next to ``state``, or what so many steps, and one more that is not looked at, lead to.
+
+    Raises:
+        numpy.linalg.LinAlgError: when the equations are singular.
+    """
+    # The last step tells more than the next one's promise: that knows nothing of the precisions.
+    solver = SolverRules(
+        least_gain=0.0,
+        stalled_gain=2 * rules.evidence,
+        small_gain=rules.evidence,
+        iterations=steps,
+        first_damping=0.03,
+        most_damping=10.0,
+    )
+    problem = Evidence(stamps, rules)
+    found = minimise(problem, state, solver)
+    if not np.isfinite(found.equations.cost):
+        raise np.linalg.LinAlgError("singular at the start")
+    return replace(found, place=problem.moved(found.place, found.equations.step(0.0)))
+
+
+def without_outliers(stamps: Stamps, state: State, rules: StampsRules) -> State:
+    """The state without samples, and stars, that the model does not explain; those it does explain come back."""
+    everything = replace(state, keep=np.ones_like(state.keep))
+    if state.out.any():
+        # Left alone, a star that was out would be compared at the place and light it had when the field was coarse.
+        everything = _placed(stamps, everything, state.out)
+    seen = expectation(stamps, everything)
+    # Clipped samples cannot be far off in one direction.
+    used = (seen.weight > 0) & ~stamps.clipped
+    z = np.where(used, seen.residual * np.sqrt(seen.weight), 0.0)
+    keep = ~OutlierRule("samples", rules.outlier_sigma).off(z, used)
+    kept, lost = stamps.known & keep, stamps.known & ~keep
+    mean = np.where(kept, z**2, 0.0).sum(axis=1) / np.maximum(kept.sum(axis=1), 1)
+    bad = mean > rules.star_ratio * np.median(mean)
+    bad |= lost.sum(axis=1) > rules.star_lost * np.maximum(stamps.known.sum(axis=1), 1)
+    return replace(everything, keep=keep & ~bad[:, None])
+
+
+def _placed(stamps: Stamps, state: State, stars: Bool[np.ndarray, " stars"]) -> State:
+    """Some stars' places and light fitted anew, the field being as it is."""
+    for _ in range(4):
+        seen = expectation(stamps, state)
+        by_light = seen.jacobian[..., :1] * np.moveaxis(stamps.by_plane, 0, 2)
+        jacobian = np.concatenate([seen.jacobian[..., 1:3], by_light], axis=2)
+        weighted = (jacobian * seen.weight[..., None]).transpose(0, 2, 1)
+        step = (scaled_inverse(weighted @ jacobian) @ weighted @ seen.residual[..., None])[..., 0]
+        centre, light = np.split(np.clip(step, -0.5, 0.5) * stars[:, None], [2], axis=1)
+        state = replace(state, centre_px=state.centre_px + centre, light_e=state.light_e * np.exp(light))
+    return state
+
+
+@final
+@dataclass(frozen=True)
+class Orders:
+    """Degrees of the map and of the images over the field, and how many px lie between nodes."""
+
+    warp: int
+    image: int
+    spacing_px: float
+
+    @classmethod
+    def of(cls, state: State) -> Orders:
+        """Of a state."""
+        return cls(*state.field.degrees, state.field.spacing_px)
+
+    @property
+    def name(self) -> str:
+        """For the table of candidates."""
+        return f"map degree {self.warp}, image degree {self.image}, nodes every {self.spacing_px:g} px"
+
+
+def grid_size(shape: tuple[int, int], spacing_px: float, reach: float) -> tuple[int, int]:
+    """Nodes that cover stamps ``reach`` times; by steps of 3, so that they do not move with every digit of a map."""
+    rows, columns = (3 * math.ceil(((size + 1) * reach / spacing_px + 3) / 3) for size in shape)
+    return rows, columns
+
+
+def start(stamps: Stamps, rules: StampsRules) -> State:
+    """A state of the lowest orders: a round image of the stamps' size."""
+    planes, spacing_px = len(stamps.by_plane), rules.spacings_px[0]
+    y, x = (np.arange(n) - (n - 1) / 2 for n in grid_size(stamps.grid, spacing_px, 1.1))
+    image = np.exp(-0.5 * (y[:, None] ** 2 + x**2) * (spacing_px / WINDOW_PX) ** 2) + 1e-3
+    nodes = np.tile(image / (image.sum() * spacing_px**2), (planes, 1, 1, 1))
+    # Lateral colour of degree 2.
+    field = PsfField(nodes, np.zeros((planes, 0, 2, 2)), np.zeros((planes - 1, 5, 2)), spacing_px)
+    first = np.concatenate([np.tile(rules.first_image[0], planes), np.full(2 * planes - 2, rules.first_lateral)])
+    return State(
+        field=field,
+        centre_px=centroids(stamps, WINDOW_PX),
+        light_e=light_of(stamps),
+        precisions=first,
+        size=envelope(nodes[:, 0], spacing_px),
+        keep=np.ones(stamps.value_e.shape, dtype=bool),
+    )
+
+
+def coarse(stamps: Stamps, rules: StampsRules, most: Orders) -> State:
+    """Places, light and a first field; what the model cannot follow yet is allowed for as an error of its own."""
+    state = start(stamps, rules)
+    for warp, image, allowed in rules.coarse:
+        state = replace(state.with_degrees(min(warp, most.warp), min(image, most.image), rules), model_error=allowed)
+        state = without_outliers(stamps, state, rules) if warp else state
+        state = improve(stamps, state, rules, 1).place
+        state = replace(state, size=envelope(state.field.nodes[:, 0], state.field.spacing_px))
+    state = on_nodes(stamps, state, rules.spacings_px[0])
+    return without_outliers(stamps, replace(state, model_error=0.0), rules)
+
+
+def on_nodes(stamps: Stamps, state: State, spacing_px: float) -> State:
+    """The state on other nodes, which reach as far as maps look; between 1 and 1.7 times as far as stamps."""
+    inverse = np.linalg.inv(state.field.maps(stamps.unit))
+    reach = float(np.clip(np.abs(inverse).sum(axis=3).max(), 1.0, 1.7))
+    return state.with_spacing(spacing_px, grid_size(stamps.grid, spacing_px, reach))
+
+
+def search(stamps: Stamps, rules: StampsRules, orders: Orders | None) -> Choice[Found]:
+    """The orders, found unless they are given, and their fit.
+
+    Raises:
+        numpy.linalg.LinAlgError: when the equations are singular.
+    """
+    # No more polynomials than half the stars.
+    enough = (d for d in range(9, -1, -1) if d == 0 or 2 * polynomial_terms(d) <= stamps.count)
+    limit, tried = next(enough), []
+    most = orders or Orders(*(min(limit, highest) for highest in rules.highest), rules.spacings_px[0])
+    state = coarse(stamps, rules, most)
+    if orders is not None:
+        state = on_nodes(stamps, state, orders.spacing_px).with_degrees(orders.warp, orders.image, rules)
+        found = improve(stamps, state, rules, rules.steps_to_end)
+    else:
+        tried = _spacings(stamps, _degrees(stamps, state, rules, most), rules)
+        found = choose(tried).best.fit
+    state = without_outliers(stamps, found.place, rules)
+    if not (found.converged and np.array_equal(state.keep, found.place.keep)):
+        found = improve(stamps, state, rules, rules.steps_to_end)
+    final = attempt(stamps, found)
+    return Choice(final, (*(t for t in tried if t.name != final.name), final))
+
+
+def attempt(stamps: Stamps, found: Found, more: float = 0.0) -> Tried:
+    """With its criterion; ``more`` log evidence than the equations have."""
+    state = found.place
+    criterion = np.log(stamps.known.sum()) * len(state.precisions) - 2 * (found.equations.evidence + more)
+    return Attempt(Orders.of(state).name, state.field.numbers, float(criterion), found)
+
+
+def _degrees(stamps: Stamps, state: State, rules: StampsRules, most: Orders) -> list[Tried]:
+    """All that were tried, going from neighbour to neighbour until none is better."""
+    best = attempt(stamps, improve(stamps, state, rules, rules.steps_to_judge + 1))
+    tried, known = [best], {Orders.of(state)}
+    while True:
+        own = Orders.of(best.fit.place)
+        steps = ((0, -1), (-1, 0), (-2, 0), (1, 0), (2, 0), (0, 1))
+        near = [Orders(own.warp + w, own.image + i, own.spacing_px) for w, i in steps]
+        near = [o for o in near if o not in known and 0 <= o.warp <= most.warp and 0 <= o.image <= most.image]
+        tried += [_judged(stamps, best, o, rules) for o in near]
+        known.update(near)
+        if (better := choose(tried).best) is best:
+            return tried
+        best = better
+
+
+def _judged(stamps: Stamps, best: Tried, orders: Orders, rules: StampsRules) -> Tried:
+    """A fit of these degrees, or what the curvature says of it, where a map that matters is left out beyond doubt."""
+    place, dropped = best.fit.place, best.fit.place.maps_above(orders.warp)
+    value, cov = place.maps[dropped], marginal_cov(best.fit.equations.root, place.maps_from + dropped)
+    loss = 0.5 * float(value @ np.linalg.solve(cov, value))
+    state = place.with_degrees(orders.warp, orders.image, rules)
+    if loss > rules.beyond_doubt:
+        return attempt(stamps, replace(best.fit, place=state), -loss)
+    return attempt(stamps, improve(stamps, state, rules, rules.steps_to_judge))
+
+
+def _spacings(stamps: Stamps, tried: list[Tried], rules: StampsRules) -> list[Tried]:
+    """With the best degrees on denser nodes, as long as the last gain lets expect another that is worth it."""
+    gain, first, *finer = np.inf, *rules.spacings_px
+    for spacing in finer:
+        best = choose(tried).best
+        # The error of cubic splines falls with the fourth power of their spacing, its cost in likelihood with the
+        # eighth.
+        if gain * (finer[0] / first) ** 8 < rules.worth_finer:
+            break
+        state = without_outliers(stamps, on_nodes(stamps, best.fit.place, spacing), rules)
+        tried = [*tried, attempt(stamps, improve(stamps, state, rules, rules.steps_to_end))]
+        gain = best.criterion - tried[-1].criterion
+    return tried
