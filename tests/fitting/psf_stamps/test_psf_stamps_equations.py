@@ -13,7 +13,7 @@ from udccal.fitting.psf_stamps.data import Stamps, StampsRules
 from udccal.fitting.psf_stamps.equations import (
     divided,
     factor,
-    factors,
+    laplace,
     marginal_cov,
     node_sums,
     normal_equations,
@@ -149,7 +149,7 @@ def test_a_star_that_is_left_out_brings_nothing() -> None:
 def test_the_mode_and_its_covariance_are_those_of_equations_written_out() -> None:
     stamps, state = stamps_and_state()
     with jax.enable_x64(True):
-        found, seen = factors(stamps, state), expectation(stamps, state)
+        found, seen = laplace(stamps, state), expectation(stamps, state)
         normal = normal_equations(stamps, state.field, seen, 0)
     size, nodes = state.maps_from + len(state.maps), len(normal.right_nodes)
     matrix, pull = np.zeros((2, size + nodes, size + nodes)), np.zeros(size + nodes)
@@ -170,7 +170,8 @@ def test_the_mode_and_its_covariance_are_those_of_equations_written_out() -> Non
     whole = matrix.sum(axis=0) + held.T @ held
     mode = np.linalg.solve(whole, pull - matrix[1] @ here)
     np.testing.assert_allclose(found.mode, mode, atol=1e-6 * np.abs(mode).max())
-    assert found.log_det == pytest.approx(np.linalg.slogdet(whole)[1], rel=1e-9)
+    cost = np.linalg.slogdet(whole)[1] - 2 * seen.log_likelihood - state.volume()[0] + here @ matrix[1] @ here
+    assert found.cost == pytest.approx(cost, abs=1e-3)
     cov = np.linalg.inv(whole)
     index = np.array([0, 5, size - 1])
     np.testing.assert_allclose(marginal_cov(found.root, index), cov[np.ix_(index, index)], rtol=1e-6)
@@ -189,7 +190,16 @@ def test_the_prior_is_that_of_its_eigenvalues() -> None:
         prior = (a * np.eye(len(scale)) + b * (matrix.T @ matrix).toarray()) * np.outer(scale, scale)
         volume += np.linalg.slogdet(prior)[1]
         squares += image.ravel() @ prior @ image.ravel()
-    assert state.log_prior == pytest.approx(0.5 * (volume - squares))
+    assert state.volume()[0] == pytest.approx(volume)
+    assert state.precisions @ state.squares() == pytest.approx(squares)
+
+
+def test_squares_that_a_prior_expects_are_its_derivatives() -> None:
+    _, state = stamps_and_state()
+    for index, precision in enumerate(state.precisions):
+        step = 1e-5 * precision * (np.arange(len(state.precisions)) == index)
+        up, down = (replace(state, precisions=state.precisions + s * step).volume()[0] for s in (1.0, -1.0))
+        assert state.volume()[1][index] == pytest.approx((up - down) / (2e-5 * precision), rel=1e-6)
 
 
 def test_equations_that_are_singular_have_no_step() -> None:

@@ -1,4 +1,4 @@
-"""Values of a field in stamps: derivatives that are those of the values, and changes that go where their vector says."""
+"""Values of a field in stamps: derivatives that are those of the values; changes go where their vector says."""
 
 from __future__ import annotations
 

@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float, Int
 
 from udccal.cfa import channel_map
 from udccal.errors import FitError
+from udccal.result import FitStatus
 
 
 @final
@@ -52,25 +53,15 @@ class Stamps:
         if not np.array_equal(found, np.arange(len(found))) or len(found) > 3:
             raise FitError(f"Expected channels 0, 1 and 2 without gaps, found {found.tolist()}. Number them from 0.")
 
-    @property
-    def count(self) -> int:
-        """How many stamps there are."""
-        return len(self.values_e)
-
-    @property
-    def grid(self) -> tuple[int, int]:
-        """Rows and columns of a stamp."""
-        return self.values_e.shape[1], self.values_e.shape[2]
+    @cached_property
+    def known(self) -> Bool[np.ndarray, "stars samples"]:
+        """Which samples of each stamp, row by row, tell something."""
+        return np.isfinite(self.values_e).reshape(len(self.values_e), -1)
 
     @cached_property
     def value_e(self) -> Float[np.ndarray, "stars samples"]:
-        """Samples of each stamp, row by row; zero where nothing is known."""
-        return np.where(self.known, self.values_e.reshape(self.count, -1), 0.0)
-
-    @cached_property
-    def known(self) -> Bool[np.ndarray, "stars samples"]:
-        """Which samples tell something."""
-        return np.isfinite(self.values_e).reshape(self.count, -1)
+        """The samples, zero where nothing is known."""
+        return np.where(self.known, self.values_e.reshape(self.known.shape), 0.0)
 
     @cached_property
     def clipped(self) -> Bool[np.ndarray, "stars samples"]:
@@ -80,8 +71,7 @@ class Stamps:
     @cached_property
     def plane(self) -> Int[np.ndarray, "stars samples"]:
         """Colour of every sample."""
-        zeros = np.zeros(self.values_e.shape, dtype=np.int64)
-        return (zeros if self.channel is None else self.channel).reshape(self.count, -1)
+        return (np.zeros(self.known.shape, int) if self.channel is None else self.channel).reshape(self.known.shape)
 
     @cached_property
     def by_plane(self) -> Bool[np.ndarray, "planes stars samples"]:
@@ -91,19 +81,18 @@ class Stamps:
     @cached_property
     def offset_px(self) -> Float[np.ndarray, "samples 2"]:
         """(x, y) of every sample from the middle one."""
-        return offsets(*self.grid)
+        return offsets(*self.values_e.shape[1:])
 
     @cached_property
     def frame_px(self) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
-        """Centre c and half size h of the stamps' positions p: (p - c) / h is within [-1, 1]."""
+        """Centre c and half size h of the stamps' positions p, for which (p - c) / h is within [-1, 1]."""
         low, high = self.position_px.min(axis=0), self.position_px.max(axis=0)
         return (low + high) / 2.0, np.maximum((high - low) / 2.0, 1.0)
 
     @cached_property
     def unit(self) -> Float[np.ndarray, "stars 2"]:
         """Positions scaled to [-1, 1]."""
-        centre, half = self.frame_px
-        return (self.position_px - centre) / half
+        return (self.position_px - self.frame_px[0]) / self.frame_px[1]
 
 
 @final
@@ -184,7 +173,7 @@ def mosaic_channels(
 
 def centroids(stamps: Stamps, window_px: float) -> Float[np.ndarray, "stars 2"]:
     """Under a Gaussian that follows, all colours alike: of light per sample, each colour by its own number of them."""
-    centre = np.zeros((stamps.count, 2))
+    centre = np.zeros((len(stamps.unit), 2))
     for _ in range(15):
         off = stamps.offset_px - centre[:, None]
         weight = stamps.by_plane * np.exp(-0.5 * (off**2).sum(axis=2) / window_px**2)
@@ -202,6 +191,23 @@ def light_of(stamps: Stamps) -> Float[np.ndarray, "stars planes"]:
     known = np.maximum(stamps.by_plane.sum(axis=2), 1)
     total = (stamps.value_e * stamps.by_plane).sum(axis=2) * stamps.value_e.shape[1] / known
     return np.maximum(total, 10 * stamps.read_e).T
+
+
+def unusable(stamps: Stamps, rules: StampsRules) -> tuple[FitStatus, str] | None:
+    """What makes a fit impossible, if anything."""
+    core = stamps.by_plane & (np.abs(stamps.offset_px).max(axis=1) <= 1.5)
+    for own, near in zip(stamps.by_plane, core, strict=True):
+        light = (stamps.value_e * own).sum(axis=1)
+        noise = np.sqrt(np.maximum(light, 0.0) + own.sum(axis=1) * stamps.read_e**2)
+        snr = float(np.median(light / np.maximum(noise, 1e-300)))
+        if snr < rules.least_snr:
+            needed = f"at least {rules.least_snr:.0f} are needed."
+            return FitStatus.TOO_DARK, f"Light over noise of a stamp is {snr:.1f} in the median; {needed}"
+        clear = int((near.any(axis=1) & ~(near & stamps.clipped).any(axis=1)).sum())
+        if clear < rules.fewest_unclipped:
+            needed = f"{rules.fewest_unclipped} are needed."
+            return FitStatus.SATURATED, f"{clear} stamps have a core that is not clipped or missing; {needed}"
+    return None
 
 
 def offsets(rows: int, columns: int) -> Float[np.ndarray, "samples 2"]:

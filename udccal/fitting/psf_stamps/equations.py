@@ -14,6 +14,7 @@ import scipy.sparse
 from jaxtyping import Float, Int
 from scipy.linalg import cholesky, solve_triangular
 
+from udccal.fitting.engine.least_squares import Step
 from udccal.fitting.psf_stamps.data import Stamps
 from udccal.fitting.psf_stamps.field import TAPS, PsfField, degree_of, degrees, polynomials, taps
 from udccal.fitting.psf_stamps.probability import State, Weighted, expectation, laplacian
@@ -24,16 +25,10 @@ OWN = 7
 
 @dataclass(frozen=True)
 class Colour:
-    """H x = g of one colour; nodes come node by node, the images of a node together.
+    """H x = g of one colour, whose part of the dense block is ``index``; nodes come node by node, not image by image.
 
     Once nodes are eliminated, ``band`` is their factor U, ``cross`` and ``right_nodes`` are U^-T times theirs, and
     ``dense`` and ``right_dense`` are what the colour adds to the dense block.
-
-    Attributes:
-        index: of the colour's part in the dense block.
-        band: of nodes, each row of them with itself and the three that follow.
-        cross: block of nodes with the colour's part of the dense block.
-        dense: that part with itself.
     """
 
     index: Int[np.ndarray, " own"]
@@ -45,27 +40,34 @@ class Colour:
 
 
 @dataclass(frozen=True)
-class Factors:
-    """The Gaussian about the mode next to a state, as factors.
+class Laplace:
+    """The Gaussian about the mode next to a state, and the evidence there by Laplace's method.
 
     Attributes:
-        colours: with their nodes eliminated.
+        cost: -2 log of the evidence, of an expansion about the state. samples: that tell something.
+        mode: relative to the state. gain: of the log posterior up to the mode.
         root: lower Cholesky factor of the dense block's precision.
-        mode: as changes of the state. gain: of the log posterior on the way there.
-        log_likelihood: at the state.
+        colours: with their nodes eliminated.
+        tuned: logarithm of what each precision changes by in a step.
     """
 
-    colours: tuple[Colour, ...]
-    root: Float[np.ndarray, "dense dense"]
+    cost: float
+    samples: int
     mode: Float[np.ndarray, " unknowns"]
     gain: float
-    log_likelihood: float
+    root: Float[np.ndarray, "dense dense"]
+    colours: tuple[Colour, ...]
+    tuned: Float[np.ndarray, " groups"]
 
     @property
-    def log_det(self) -> float:
-        """Of the precision."""
-        diagonals = [np.einsum("rii->ri", c.band[:, :, : c.band.shape[1]]).ravel() for c in self.colours]
-        return float(2 * np.log(np.concatenate([np.diag(self.root), *diagonals])).sum())
+    def evidence(self) -> float:
+        """Its logarithm, of an expansion about the mode."""
+        return self.gain - 0.5 * self.cost
+
+    def step(self, damping: float) -> Step:
+        """A part of the way: a raised diagonal would ask for the factors anew."""
+        part = 1.0 / (1.0 + damping)
+        return Step(part * self.mode, part * self.tuned[None], 2 * self.gain * part * (2 - part))
 
     def draws(self, rng: np.random.Generator, count: int) -> Float[np.ndarray, "unknowns draws"]:
         """Draws about the mode."""
@@ -74,12 +76,8 @@ class Factors:
         return np.concatenate([dense, *(divided(c.band, x, False) for c, x in zip(self.colours, own, strict=True))])
 
 
-def factors(stamps: Stamps, state: State) -> Factors:
-    """Of the equations at a state, priors included.
-
-    Raises:
-        numpy.linalg.LinAlgError: when the equations are singular.
-    """
+def laplace(stamps: Stamps, state: State) -> Laplace:
+    """From the equations at a state, priors included; LinAlgError when they are singular."""
     seen, colours = expectation(stamps, state), []
     size = np.zeros(state.maps_from + len(state.maps))
     for plane in range(state.light_e.shape[1]):
@@ -95,7 +93,12 @@ def factors(stamps: Stamps, state: State) -> Factors:
     dense = solve_triangular(root, half, lower=True, trans=1)
     nodes = [divided(c.band, (c.right_nodes - c.cross @ dense[c.index])[:, None], False)[:, 0] for c in colours]
     gain = 0.5 * float(half @ half + sum(c.right_nodes @ c.right_nodes for c in colours))
-    return Factors(tuple(colours), root, np.concatenate([dense, *nodes]), gain, seen.log_likelihood)
+    diagonals = [np.einsum("rii->ri", c.band[:, :, : c.band.shape[1]]).ravel() for c in colours]
+    log_det = 2 * np.log(np.concatenate([np.diag(root), *diagonals])).sum()
+    # Minus twice the log prior, but for constants that all orders share.
+    prior = float(state.precisions @ state.squares()) - state.volume()[0]
+    cost, mode = float(log_det - 2 * seen.log_likelihood + prior), np.concatenate([dense, *nodes])
+    return Laplace(cost, int(stamps.known.sum()), mode, gain, root, tuple(colours), np.zeros_like(state.precisions))
 
 
 def marginal_cov(root: Float[np.ndarray, "dense dense"], index: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n n"]:
@@ -128,7 +131,7 @@ def normal_equations(stamps: Stamps, field: PsfField, seen: Weighted, plane: int
     weight = seen.weight * stamps.by_plane[plane]
     weighted = np.concatenate([seen.jacobian, seen.residual[..., None]], axis=2) * weight[..., None]
     used = np.flatnonzero(weight)
-    onto = (taps(seen.seen, used, grid).T @ weighted.reshape(-1, OWN + 1)[used]).reshape(-1, stamps.count, OWN + 1)
+    onto = (taps(seen.seen, used, grid).T @ weighted.reshape(-1, OWN + 1)[used]).reshape(-1, len(stamps.unit), OWN + 1)
     cross = [(onto[..., :OWN] * part[:, None]).reshape(len(onto), -1) @ shared for part in basis.T]
     own = seen.jacobian.transpose(0, 2, 1) @ weighted
     return Colour(
@@ -144,12 +147,10 @@ def normal_equations(stamps: Stamps, field: PsfField, seen: Weighted, plane: int
 def node_sums(
     basis: Float[np.ndarray, "stars terms"], seen: Weighted, used: Int[np.ndarray, " used"], grid: tuple[int, ...]
 ) -> Float[np.ndarray, "rows n 4*n"]:
-    """Sums over samples of products of what two nodes bring, as a band.
-
-    Light of a star at position X enters the image t with the factor B_t(X), whatever the sample, and the weights of a
-    sample's 4 x 4 nodes are products of four down and four across: so what samples of a cell of the grid bring is a
-    product of pairs down, pairs across, and pairs of polynomials.
-    """
+    """Sums over samples of products of what two nodes bring, as a band."""
+    # Light of a star at position X enters the image t with the factor B_t(X), whatever the sample, and the weights of
+    # a sample's 4 x 4 nodes are products of four down and four across: so what samples of a cell of the grid bring is
+    # a product of pairs down, pairs across, and pairs of polynomials.
     (rows, columns), terms, reach = grid, basis.shape[1], TAPS - 1
     used = used[np.argsort(seen.seen.first.ravel()[used], kind="stable")]
     ends = np.searchsorted(seen.seen.first.ravel()[used], np.arange(rows * columns + 1))
@@ -178,11 +179,7 @@ def node_sums(
 
 
 def factor(band: Float[np.ndarray, "rows n 4*n"]) -> Float[np.ndarray, "rows n 4*n"]:
-    """Cholesky's factor U of U^T U, in the place of the matrix.
-
-    Raises:
-        numpy.linalg.LinAlgError: when the matrix is not positive definite.
-    """
+    """Cholesky's factor U of U^T U, in the place of the matrix; LinAlgError when that is not positive definite."""
     rows, n = band.shape[:2]
     for i, row in enumerate(band):
         row[:, :n] = cholesky(row[:, :n], check_finite=False)

@@ -54,11 +54,6 @@ class PsfField(eqx.Module):
         """Of the map and of the images."""
         return degree_of(1 + self.warp.shape[1]), degree_of(self.nodes.shape[1])
 
-    @property
-    def numbers(self) -> int:
-        """Parameters."""
-        return int(np.size(self.nodes) + np.size(self.warp) + np.size(self.lateral))
-
     def maps(self, unit: Float[np.ndarray, "stars 2"]) -> Float[np.ndarray, "stars planes 2 2"]:
         """M at positions scaled to about [-1, 1]."""
         return np.eye(2) + np.einsum("sm,pmij->spij", polynomials(unit, self.degrees[0])[:, 1:], self.warp)
@@ -102,10 +97,9 @@ class Changes(NamedTuple):
 
 
 class Seen(NamedTuple):
-    """What a field brings to samples of stamps, per unit of light, and how it answers to its unknowns.
+    """What a field brings to samples of stamps, per unit of light.
 
     Attributes:
-        value: per unit of light.
         jacobian: of the value by the centre (x, y) and by the map (row by row).
         first: flat index of the first of 4 x 4 nodes.
         down, across: weights of these nodes times 1 / |M|, as a product.
@@ -144,11 +138,7 @@ def see(
     offset_px: Float[np.ndarray, "samples 2"],
     plane: Int[np.ndarray, "stars samples"],
 ) -> Seen:
-    """Values and their derivatives at samples, as numpy arrays.
-
-    ``centre_px`` and ``offset_px`` are (x, y) from each stamp's middle sample: the centre of the light that all colours
-    share, and the samples. ``plane`` is the samples' colour.
-    """
+    """Values and derivatives at samples of colours ``plane``; centres and samples are (x, y) from the middle ones."""
     planes, terms, rows, columns = field.nodes.shape
     images = polynomials(unit, field.degrees[1]) @ np.asarray(field.nodes).reshape(planes, terms, -1)
     # Compiled once for all orders, and for numbers of nodes and stars up to multiples of these.
@@ -190,12 +180,7 @@ def response(
 ) -> Seen:
     """``see`` of images, maps and centres at each star; nodes beyond ``rows * columns`` only fill up."""
 
-    def star(
-        image: Float[Array, "planes nodes"],
-        warp: Float[Array, "planes 2 2"],
-        centre: Float[Array, "planes 2"],
-        own: Int[Array, " samples"],
-    ) -> Seen:
+    def star(image: Array, warp: Array, centre: Array, own: Array) -> Seen:
         # By hand: a decomposition, even of 2 x 2, takes long to compile.
         thinner = 1.0 / (warp[:, 0, 0] * warp[:, 1, 1] - warp[:, 0, 1] * warp[:, 1, 0])
         turned = jnp.stack([warp[:, 1, 1], -warp[:, 0, 1], -warp[:, 1, 0], warp[:, 0, 0]], axis=1)

@@ -46,20 +46,6 @@ def laplacian(rows: int, columns: int) -> tuple[scipy.sparse.csr_array, Float[np
     return scipy.sparse.csr_array(matrix), (y[:, None] + x).ravel() ** 2
 
 
-def updated(
-    precision: Float[np.ndarray, " n"],
-    expected: Float[np.ndarray, " n"],
-    left: Float[np.ndarray, " n"],
-    found: Float[np.ndarray, " n"],
-) -> Float[np.ndarray, " n"]:
-    """Fellner and Schall's: squares that the prior expects, less those that the data leave open, over those found.
-
-    Precisions change by no more than a factor of 30 at a time, and end at 1e14: such a term is absent.
-    """
-    ratio = np.maximum(expected - left, 1e-6 * expected) / np.maximum(found, 1e-300)
-    return np.minimum(precision * np.clip(ratio, 1 / 30, 30.0), 1e14)
-
-
 @dataclass(frozen=True)
 class State:
     """Where a fit has come to.
@@ -95,12 +81,10 @@ class State:
     @property
     def map_groups(self) -> Int[np.ndarray, " numbers"]:
         """For every number of maps and lateral colour: which of the precisions is its."""
-        each = [
-            np.tile(numbers * np.arange(2, degree_of(1 + part.shape[1]) + 2), len(part))
-            for part, numbers in ((self.field.warp, 4), (self.field.lateral, 2))
-        ]
-        sizes = np.concatenate(each).astype(int)
-        return np.repeat(self.of_images.size + np.arange(len(sizes)), sizes)
+        parts = (self.field.warp, 4), (self.field.lateral, 2)
+        sizes = [np.tile(k * np.arange(2, degree_of(1 + part.shape[1]) + 2), len(part)) for part, k in parts]
+        every = np.concatenate(sizes).astype(int)
+        return np.repeat(self.of_images.size + np.arange(len(every)), every)
 
     @property
     def maps(self) -> Float[np.ndarray, " numbers"]:
@@ -112,21 +96,12 @@ class State:
         planes, terms = self.field.warp.shape[:2]
         return np.arange(planes * terms * 4).reshape(planes, terms, 4)[:, len(degrees(degree)) - 1 :].ravel()
 
-    @property
-    def out(self) -> Bool[np.ndarray, " stars"]:
-        """Stars that are left out altogether."""
-        return ~self.keep.any(axis=1)
-
     def shifted(self, vector: Float[np.ndarray, " unknowns"]) -> State:
         """The state with changes added, in the order of ``Changes``."""
         changes = Changes.of(self.field, len(self.light_e), vector[:, None])
         centre, light = np.split(changes.stars[..., 0], [2], axis=1)
-        return replace(
-            self,
-            field=self.field.moved(changes),
-            centre_px=self.centre_px + centre,
-            light_e=self.light_e * np.exp(light),
-        )
+        field, light = self.field.moved(changes), self.light_e * np.exp(light)
+        return replace(self, field=field, centre_px=self.centre_px + centre, light_e=light)
 
     def with_degrees(self, warp: int, image: int, rules: StampsRules) -> State:
         """The state with other degrees: what is new starts at zero, what is dropped is forgotten."""
@@ -165,26 +140,18 @@ class State:
         image = np.moveaxis(np.add.reduceat(each, first, axis=2), 0, 2).ravel()
         return np.concatenate([image, np.bincount(self.map_groups, (maps**2).mean(axis=1))[image.size :]])
 
-    def expected_squares(self) -> Float[np.ndarray, " groups"]:
-        """The same, as the prior itself expects it."""
-        prior, eigenvalues, images, maps = self._prior()
-        image = np.stack([(1 / prior).sum(axis=2), (eigenvalues / prior).sum(axis=2)], axis=2) * images[:, None]
-        return np.concatenate([image.ravel(), maps / self.precisions[image.size :]])
-
-    @property
-    def log_prior(self) -> float:
-        """Log prior; constants that all orders share are left out."""
-        prior, _, images, maps = self._prior()
-        volume = maps @ np.log(self.precisions[self.of_images.size :])
-        volume += (np.log(prior).sum(axis=2) @ images).sum() - 2 * images.sum() * np.log(self.size).sum()
-        return float(0.5 * (volume - self.precisions @ self.squares()))
-
-    def _prior(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Eigenvalues a + b D^2 by colour and degree, and D^2; images of a degree, and numbers of a map's precision."""
-        eigenvalues = laplacian(*self.size.shape[1:])[1]
+    def volume(self) -> tuple[float, Float[np.ndarray, " groups"]]:
+        """Log determinant of the priors' precision, and its derivatives: the squares that the priors expect."""
+        images, count = self.of_images.size, 1.0 + np.arange(self.of_images.shape[1])
+        maps, own = np.bincount(self.map_groups)[images:], self.precisions[images:]
         a, b = np.moveaxis(self.of_images, 2, 0)[..., None]
-        maps = np.bincount(self.map_groups)[self.of_images.size :]
-        return a + b * eigenvalues, eigenvalues, 1.0 + np.arange(a.shape[1]), maps
+        eigenvalues = laplacian(*self.size.shape[1:])[1]
+        prior = a + b * eigenvalues
+        log_det = (
+            maps @ np.log(own) + (np.log(prior).sum(axis=2) @ count).sum() - 2 * count.sum() * np.log(self.size).sum()
+        )
+        squares = np.stack([(1 / prior).sum(axis=2), (eigenvalues / prior).sum(axis=2)], axis=2) * count[:, None]
+        return float(log_det), np.concatenate([squares.ravel(), maps / own])
 
 
 def _resized(values: Float[np.ndarray, "planes n *rest"], count: int) -> Float[np.ndarray, "planes count *rest"]:
@@ -205,13 +172,12 @@ def _resampled(
 
 @dataclass(frozen=True)
 class Weighted:
-    """Samples under the present model.
+    """Samples under the present model, in electrons.
 
     Attributes:
-        seen: what a star of unit light brings; ``down`` has the star's light in it.
+        seen: what stars bring; ``down`` has the star's light in it.
         jacobian: by what a star may change by itself: relative light, centre (x, y), map (row by row).
-        residual: what is left, in electrons. weight: inverse variances, 0 where nothing is known.
-        log_likelihood: of all samples.
+        weight: inverse variances, 0 where nothing is known.
     """
 
     seen: Seen

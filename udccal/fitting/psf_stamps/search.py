@@ -12,57 +12,22 @@ from dataclasses import dataclass, replace
 from typing import final
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 
 from udccal.fitting.engine.gaussian import scaled_inverse
 from udccal.fitting.engine.least_squares import Solution, SolverRules, Step, minimise
 from udccal.fitting.engine.orders import Attempt, Choice, choose
 from udccal.fitting.engine.robust import OutlierRule
 from udccal.fitting.psf_stamps.data import Stamps, StampsRules, centroids, light_of
-from udccal.fitting.psf_stamps.equations import factors, marginal_cov
+from udccal.fitting.psf_stamps.equations import Laplace, laplace, marginal_cov
 from udccal.fitting.psf_stamps.field import PsfField
-from udccal.fitting.psf_stamps.probability import State, envelope, expectation, updated
+from udccal.fitting.psf_stamps.probability import State, envelope, expectation
 from udccal.models.fields import polynomial_terms
 
 WINDOW_PX = 1.6  # standard deviation of a Gaussian as wide as a star, before the kernel is known
 
 
-@final
-@dataclass(frozen=True)
-class Laplace:
-    """The evidence at a state by Laplace's method, and where to go from there.
-
-    The factors that it was made with, the largest arrays of a fit, are not kept: never are there two of them.
-
-    Attributes:
-        cost: -2 log of the evidence, of an expansion about the state.
-        samples: that tell something.
-        mode: as changes of the state.
-        tuned: logarithm of what each precision changes by.
-        gain: of the log posterior up to the mode.
-        root: Cholesky's, of the dense block's precision.
-    """
-
-    cost: float
-    samples: int
-    mode: Float[np.ndarray, " unknowns"]
-    tuned: Float[np.ndarray, " groups"]
-    gain: float
-    root: Float[np.ndarray, "dense dense"]
-
-    @property
-    def evidence(self) -> float:
-        """Its logarithm, of an expansion about the mode."""
-        return self.gain - 0.5 * self.cost
-
-    def step(self, damping: float) -> Step:
-        """A part of the way: a raised diagonal would ask for the factors anew."""
-        part = 1.0 / (1.0 + damping)
-        return Step(part * self.mode, part * self.tuned[None], 2 * self.gain * part * (2 - part))
-
-
 Found = Solution[State, Laplace]
-Tried = Attempt[Found]
 
 
 @final
@@ -77,16 +42,18 @@ class Evidence:
     def equations_at(self, place: State) -> Laplace:
         """Of infinite cost where the equations are singular."""
         try:
-            found = factors(self.stamps, place)
+            found = laplace(self.stamps, place)
         except np.linalg.LinAlgError:
-            none = np.zeros(0)
-            return Laplace(np.inf, 1, none, none, np.inf, np.zeros((0, 0)))
+            return Laplace(np.inf, 1, np.zeros(0), np.inf, np.zeros((0, 0)), (), np.zeros(0))
         # The same draws every time, so that a descent comes to an end.
         left = place.squares(found.draws(np.random.default_rng(0), self.rules.draws[0]))
-        before = place.precisions
-        after = updated(before, place.expected_squares(), left, place.shifted(found.mode).squares())
-        cost = found.log_det - 2 * (found.log_likelihood + place.log_prior)
-        return Laplace(cost, int(self.stamps.known.sum()), found.mode, np.log(after / before), found.gain, found.root)
+        (_, expected), there = place.volume(), place.shifted(found.mode).squares()
+        # Fellner and Schall: squares that the prior expects, less those that the data leave open, over those found;
+        # no more than 30 times as much at once, and no more than 1e14, where a term is absent.
+        ratio = np.clip(np.maximum(expected - left, 1e-6 * expected) / np.maximum(there, 1e-300), 1 / 30, 30.0)
+        tuned = np.minimum(np.log(ratio), np.log(1e14 / place.precisions))
+        # Without the factors, the largest arrays of a fit: never are there two of them.
+        return replace(found, tuned=tuned, colours=())
 
     def moved(self, place: State, step: Step) -> State:
         """Along all unknowns, and along the logarithms of the precisions."""
@@ -94,20 +61,10 @@ class Evidence:
 
 
 def improve(stamps: Stamps, state: State, rules: StampsRules, steps: int) -> Found:
-    """The likeliest state next to ``state``, or what so many steps, and one more that is not looked at, lead to.
-
-    Raises:
-        numpy.linalg.LinAlgError: when the equations are singular.
-    """
+    """The likeliest state nearby, or where so many steps, and one more, lead to; LinAlgError when singular at first."""
     # The last step tells more than the next one's promise: that knows nothing of the precisions.
-    solver = SolverRules(
-        least_gain=0.0,
-        stalled_gain=2 * rules.evidence,
-        small_gain=rules.evidence,
-        iterations=steps,
-        first_damping=0.03,
-        most_damping=10.0,
-    )
+    ends = dict(least_gain=0.0, stalled_gain=2 * rules.evidence, small_gain=rules.evidence)
+    solver = SolverRules(iterations=steps, first_damping=0.03, most_damping=10.0, **ends)
     problem = Evidence(stamps, rules)
     found = minimise(problem, state, solver)
     if not np.isfinite(found.equations.cost):
@@ -118,9 +75,9 @@ def improve(stamps: Stamps, state: State, rules: StampsRules, steps: int) -> Fou
 def without_outliers(stamps: Stamps, state: State, rules: StampsRules) -> State:
     """The state without samples, and stars, that the model does not explain; those it does explain come back."""
     everything = replace(state, keep=np.ones_like(state.keep))
-    if state.out.any():
+    if not state.keep.any(axis=1).all():
         # Left alone, a star that was out would be compared at the place and light it had when the field was coarse.
-        everything = _placed(stamps, everything, state.out)
+        everything = _placed(stamps, everything, ~state.keep.any(axis=1))
     seen = expectation(stamps, everything)
     # Clipped samples cannot be far off in one direction.
     used = (seen.weight > 0) & ~stamps.clipped
@@ -175,7 +132,7 @@ def grid_size(shape: tuple[int, int], spacing_px: float, reach: float) -> tuple[
 def start(stamps: Stamps, rules: StampsRules) -> State:
     """A state of the lowest orders: a round image of the stamps' size."""
     planes, spacing_px = len(stamps.by_plane), rules.spacings_px[0]
-    y, x = (np.arange(n) - (n - 1) / 2 for n in grid_size(stamps.grid, spacing_px, 1.1))
+    y, x = (np.arange(n) - (n - 1) / 2 for n in grid_size(stamps.values_e.shape[1:], spacing_px, 1.1))
     image = np.exp(-0.5 * (y[:, None] ** 2 + x**2) * (spacing_px / WINDOW_PX) ** 2) + 1e-3
     nodes = np.tile(image / (image.sum() * spacing_px**2), (planes, 1, 1, 1))
     # Lateral colour of degree 2.
@@ -207,17 +164,13 @@ def on_nodes(stamps: Stamps, state: State, spacing_px: float) -> State:
     """The state on other nodes, which reach as far as maps look; between 1 and 1.7 times as far as stamps."""
     inverse = np.linalg.inv(state.field.maps(stamps.unit))
     reach = float(np.clip(np.abs(inverse).sum(axis=3).max(), 1.0, 1.7))
-    return state.with_spacing(spacing_px, grid_size(stamps.grid, spacing_px, reach))
+    return state.with_spacing(spacing_px, grid_size(stamps.values_e.shape[1:], spacing_px, reach))
 
 
 def search(stamps: Stamps, rules: StampsRules, orders: Orders | None) -> Choice[Found]:
-    """The orders, found unless they are given, and their fit.
-
-    Raises:
-        numpy.linalg.LinAlgError: when the equations are singular.
-    """
+    """The orders, found unless they are given, and their fit; LinAlgError when equations are singular."""
     # No more polynomials than half the stars.
-    enough = (d for d in range(9, -1, -1) if d == 0 or 2 * polynomial_terms(d) <= stamps.count)
+    enough = (d for d in range(9, -1, -1) if d == 0 or 2 * polynomial_terms(d) <= len(stamps.unit))
     limit, tried = next(enough), []
     most = orders or Orders(*(min(limit, highest) for highest in rules.highest), rules.spacings_px[0])
     state = coarse(stamps, rules, most)
@@ -234,14 +187,14 @@ def search(stamps: Stamps, rules: StampsRules, orders: Orders | None) -> Choice[
     return Choice(final, (*(t for t in tried if t.name != final.name), final))
 
 
-def attempt(stamps: Stamps, found: Found, more: float = 0.0) -> Tried:
+def attempt(stamps: Stamps, found: Found, more: float = 0.0) -> Attempt[Found]:
     """With its criterion; ``more`` log evidence than the equations have."""
     state = found.place
     criterion = np.log(stamps.known.sum()) * len(state.precisions) - 2 * (found.equations.evidence + more)
-    return Attempt(Orders.of(state).name, state.field.numbers, float(criterion), found)
+    return Attempt(Orders.of(state).name, state.field.nodes.size + len(state.maps), float(criterion), found)
 
 
-def _degrees(stamps: Stamps, state: State, rules: StampsRules, most: Orders) -> list[Tried]:
+def _degrees(stamps: Stamps, state: State, rules: StampsRules, most: Orders) -> list[Attempt[Found]]:
     """All that were tried, going from neighbour to neighbour until none is better."""
     best = attempt(stamps, improve(stamps, state, rules, rules.steps_to_judge + 1))
     tried, known = [best], {Orders.of(state)}
@@ -257,7 +210,7 @@ def _degrees(stamps: Stamps, state: State, rules: StampsRules, most: Orders) -> 
         best = better
 
 
-def _judged(stamps: Stamps, best: Tried, orders: Orders, rules: StampsRules) -> Tried:
+def _judged(stamps: Stamps, best: Attempt[Found], orders: Orders, rules: StampsRules) -> Attempt[Found]:
     """A fit of these degrees, or what the curvature says of it, where a map that matters is left out beyond doubt."""
     place, dropped = best.fit.place, best.fit.place.maps_above(orders.warp)
     value, cov = place.maps[dropped], marginal_cov(best.fit.equations.root, place.maps_from + dropped)
@@ -268,13 +221,12 @@ def _judged(stamps: Stamps, best: Tried, orders: Orders, rules: StampsRules) -> 
     return attempt(stamps, improve(stamps, state, rules, rules.steps_to_judge))
 
 
-def _spacings(stamps: Stamps, tried: list[Tried], rules: StampsRules) -> list[Tried]:
+def _spacings(stamps: Stamps, tried: list[Attempt[Found]], rules: StampsRules) -> list[Attempt[Found]]:
     """With the best degrees on denser nodes, as long as the last gain lets expect another that is worth it."""
     gain, first, *finer = np.inf, *rules.spacings_px
     for spacing in finer:
         best = choose(tried).best
-        # The error of cubic splines falls with the fourth power of their spacing, its cost in likelihood with the
-        # eighth.
+        # The error of cubic splines falls with the spacing's fourth power, its cost in likelihood with the eighth.
         if gain * (finer[0] / first) ** 8 < rules.worth_finer:
             break
         state = without_outliers(stamps, on_nodes(stamps, best.fit.place, spacing), rules)
