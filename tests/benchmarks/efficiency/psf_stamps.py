@@ -19,8 +19,8 @@ from udccal.fitting.engine.information import cramer_rao, fisher_information
 from udccal.fitting.psf_stamps.data import Stamps, offsets
 from udccal.fitting.psf_stamps.field import PsfField, Seen, response
 from udccal.fitting.psf_stamps.fit import fit_psf_stamps
-from udccal.fitting.psf_stamps.probability import envelope, laplacian
-from udccal.fitting.psf_stamps.search import Orders, grid_size
+from udccal.fitting.psf_stamps.probability import envelope, grid_size, laplacian
+from udccal.fitting.psf_stamps.search import Orders
 from udccal.models.fields import polynomial_basis
 from udccal.numerics import in_float64
 
@@ -134,7 +134,7 @@ def wanted(x: Array, like: PsfField, unit: Array, window_px: Array) -> Array:
     own = jnp.zeros((len(everywhere), 2))
     for _ in range(6):
         seen = seen_at(field, everywhere, own)
-        slope = jnp.einsum("npi,pj->nji", seen.jacobian[..., :2], weight)
+        slope = jnp.einsum("npi,pj->nji", seen.jacobian[..., 1:3], weight)
         own = own - jnp.linalg.solve(slope, (seen.value @ weight)[..., None])[..., 0]
     value = seen_at(field, everywhere, own).value
     total = value.sum(axis=1)

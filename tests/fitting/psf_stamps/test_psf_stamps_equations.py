@@ -101,9 +101,9 @@ def test_right_sides_and_blocks_are_those_of_the_jacobian(weighted: tuple[Stamps
     stamps, state, seen = weighted
     _, shared = shared_by(state.field, stamps.unit, 0)
     taps = design(seen, polynomials(stamps.unit, 1), state.field.nodes.shape[2:])
-    stars, samples, own = seen.jacobian.shape
+    stars, samples, own = seen.seen.jacobian.shape
     spread = np.zeros((stars, samples, stars, own))
-    spread[np.arange(stars), :, np.arange(stars)] = seen.jacobian
+    spread[np.arange(stars), :, np.arange(stars)] = seen.seen.jacobian
     jacobian = spread.reshape(stars * samples, -1) @ shared.toarray()
     normal, weight = normal_equations(stamps, state.field, seen, 0), seen.weight.ravel()[:, None]
     for found, expected in (
@@ -128,7 +128,7 @@ def test_the_jacobian_of_the_dense_block_is_that_of_the_expectation() -> None:
     for plane in range(3):
         index, shared = shared_by(state.field, mosaic.unit, plane)
         own = (shared @ change[index]).reshape(12, -1)
-        expected = np.einsum("kso,ko->ks", seen.jacobian, own)
+        expected = np.einsum("kso,ko->ks", seen.seen.jacobian, own)
         seen_here = mosaic.by_plane[plane] & (seen.weight > 0)
         found = (ends[0] - ends[1])[seen_here] / 2
         np.testing.assert_allclose(found, expected[seen_here], atol=1e-4 * np.abs(expected).max())

@@ -35,7 +35,7 @@ def test_derivatives_are_those_of_the_values() -> None:
     with jax.enable_x64(True):
         seen = see(field, _UNIT, _CENTRE, _OFFSET, _PLANE)
         ends = [see(field, _UNIT, _CENTRE + s * np.array([step, 0.0]), _OFFSET, _PLANE).value for s in (1.0, -1.0)]
-        np.testing.assert_allclose(seen.jacobian[..., 0], (ends[0] - ends[1]) / (2 * step), atol=1e-6)
+        np.testing.assert_allclose(seen.jacobian[..., 1], (ends[0] - ends[1]) / (2 * step), atol=1e-6)
         # The second number of the map's first polynomial, which is the position's y.
         turned = [
             field.warp + s * step * (np.arange(4).reshape(2, 2) == 1) * (np.arange(5) == 0)[:, None, None]
@@ -43,7 +43,7 @@ def test_derivatives_are_those_of_the_values() -> None:
         ]
         ends = [see(replace(field, warp=warp), _UNIT, _CENTRE, _OFFSET, _PLANE).value for warp in turned]
         expected = (ends[0] - ends[1]) / (2 * step)
-        np.testing.assert_allclose(seen.jacobian[..., 3] * polynomials(_UNIT, 1)[:, 1, None], expected, atol=1e-6)
+        np.testing.assert_allclose(seen.jacobian[..., 4] * polynomials(_UNIT, 1)[:, 1, None], expected, atol=1e-6)
 
 
 def test_a_colour_has_its_own_image_map_and_place() -> None:

@@ -113,13 +113,12 @@ class StampsRules:
         highest: degrees of map and images.
         steps_to_judge, steps_to_end: of one fit at most: of orders that are compared, and of those that are chosen.
         evidence: converged when the last step brought less log evidence, and the next promises half of it in log
-            posterior; that step is taken, too. What it promises is not what the evidence gains near its maximum: there
-            precisions and unknowns go on to trade places by hundredths.
+            posterior. Near the maximum precisions and unknowns go on to trade places by hundredths.
         beyond_doubt: log posterior; maps of lower degrees that are expected to lose more are not fitted.
-        first_image, first_map, first_lateral: precisions before the data: of images of degree 0 (size, roughness) and
-            of higher ones, of maps and of lateral colour by degree.
-        new_image, new_map: of a degree that comes new, relative to the degree below it, and as it is: nearly absent.
-            Where the data ask for it, one update makes it appear.
+        first_image: precisions before the data: of images of degree 0 (size, roughness) and of higher ones.
+        first_map, first_lateral: of maps of degrees 1 and 2, and of lateral colour.
+        new_image, new_map: of higher degrees, relative to the degree below, and as it is: nearly absent. Where the data
+            ask for them, one update makes them appear.
         draws: of the posterior: for updates of precisions, and for error bars (5 % of a sigma).
         inflate_above: reduced chi-squared above which every sigma grows with its root. Counts are skewed: theirs
             scatters more than that of normal samples.
@@ -196,17 +195,16 @@ def light_of(stamps: Stamps) -> Float[np.ndarray, "stars planes"]:
 def unusable(stamps: Stamps, rules: StampsRules) -> tuple[FitStatus, str] | None:
     """What makes a fit impossible, if anything."""
     core = stamps.by_plane & (np.abs(stamps.offset_px).max(axis=1) <= 1.5)
-    for own, near in zip(stamps.by_plane, core, strict=True):
-        light = (stamps.value_e * own).sum(axis=1)
-        noise = np.sqrt(np.maximum(light, 0.0) + own.sum(axis=1) * stamps.read_e**2)
-        snr = float(np.median(light / np.maximum(noise, 1e-300)))
-        if snr < rules.least_snr:
-            needed = f"at least {rules.least_snr:.0f} are needed."
-            return FitStatus.TOO_DARK, f"Light over noise of a stamp is {snr:.1f} in the median; {needed}"
-        clear = int((near.any(axis=1) & ~(near & stamps.clipped).any(axis=1)).sum())
-        if clear < rules.fewest_unclipped:
-            needed = f"{rules.fewest_unclipped} are needed."
-            return FitStatus.SATURATED, f"{clear} stamps have a core that is not clipped or missing; {needed}"
+    light = (stamps.value_e * stamps.by_plane).sum(axis=2)
+    noise = np.sqrt(np.maximum(light, 0.0) + stamps.by_plane.sum(axis=2) * stamps.read_e**2)
+    snr = float(np.median(light / np.maximum(noise, 1e-300), axis=1).min())
+    if snr < rules.least_snr:
+        needed = f"at least {rules.least_snr:.0f} are needed."
+        return FitStatus.TOO_DARK, f"Light over noise of a stamp is {snr:.1f} in the median; {needed}"
+    clear = int((core.any(axis=2) & ~(core & stamps.clipped).any(axis=2)).sum(axis=1).min())
+    if clear < rules.fewest_unclipped:
+        needed = f"{rules.fewest_unclipped} are needed."
+        return FitStatus.SATURATED, f"{clear} stamps have a core that is not clipped or missing; {needed}"
     return None
 
 

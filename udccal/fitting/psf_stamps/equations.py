@@ -129,11 +129,11 @@ def normal_equations(stamps: Stamps, field: PsfField, seen: Weighted, plane: int
     basis, grid = polynomials(stamps.unit, field.degrees[1]), field.nodes.shape[2:]
     index, shared = shared_by(field, stamps.unit, plane)
     weight = seen.weight * stamps.by_plane[plane]
-    weighted = np.concatenate([seen.jacobian, seen.residual[..., None]], axis=2) * weight[..., None]
+    weighted = np.concatenate([seen.seen.jacobian, seen.residual[..., None]], axis=2) * weight[..., None]
     used = np.flatnonzero(weight)
     onto = (taps(seen.seen, used, grid).T @ weighted.reshape(-1, OWN + 1)[used]).reshape(-1, len(stamps.unit), OWN + 1)
     cross = [(onto[..., :OWN] * part[:, None]).reshape(len(onto), -1) @ shared for part in basis.T]
-    own = seen.jacobian.transpose(0, 2, 1) @ weighted
+    own = seen.seen.jacobian.transpose(0, 2, 1) @ weighted
     return Colour(
         index=index,
         band=node_sums(basis, seen, used, grid),
@@ -232,14 +232,11 @@ def _dense_prior(
     state: State, size: Float[np.ndarray, " dense"]
 ) -> tuple[Float[np.ndarray, "dense dense"], Float[np.ndarray, " dense"]]:
     """Precision of the dense block and its right side; what images could do as well (all light, all places) is held."""
-    stars, planes = state.light_e.shape
-    own, values = np.zeros(len(size)), np.zeros(len(size))
-    own[state.maps_from :] = state.precisions[state.map_groups]
-    values[state.maps_from :] = state.maps
+    seen = size[: state.maps_from].reshape(len(state.light_e), -1)
     # Stars that are left out altogether stay where they are.
-    seen = size[: state.maps_from].reshape(stars, 2 + planes)
-    own[: state.maps_from] = np.where(seen > 0, 0.0, 1.0).ravel()
-    held = np.sqrt(seen.mean(axis=0))[:, None, None] * np.eye(2 + planes)[:, None] * (seen > 0)
-    rows = np.zeros((2 + planes, len(size)))
-    rows[:, : state.maps_from] = held.reshape(2 + planes, -1)
-    return np.diag(own) + rows.T @ rows, -own * values
+    own = np.concatenate([np.where(seen > 0, 0.0, 1.0).ravel(), state.precisions[state.map_groups]])
+    values = np.concatenate([np.zeros(seen.size), state.maps])
+    held = (np.sqrt(seen.mean(axis=0)) * (seen > 0))[:, :, None] * np.eye(seen.shape[1])
+    matrix, held = np.diag(own), held.reshape(seen.size, -1)
+    matrix[: seen.size, : seen.size] += held @ held.T
+    return matrix, -own * values

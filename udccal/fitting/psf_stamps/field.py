@@ -100,14 +100,14 @@ class Seen(NamedTuple):
     """What a field brings to samples of stamps, per unit of light.
 
     Attributes:
-        jacobian: of the value by the centre (x, y) and by the map (row by row).
+        jacobian: by what a star may change by itself: relative light, centre (x, y), map (row by row).
         first: flat index of the first of 4 x 4 nodes.
         down, across: weights of these nodes times 1 / |M|, as a product.
         inside: whether the sample lies on the grid.
     """
 
     value: Float[Arrayish, "stars samples"]
-    jacobian: Float[Arrayish, "stars samples 6"]
+    jacobian: Float[Arrayish, "stars samples 7"]
     first: Int[Arrayish, "stars samples"]
     down: Float[Arrayish, "stars samples 4"]
     across: Float[Arrayish, "stars samples 4"]
@@ -196,7 +196,7 @@ def response(
         rise = jnp.stack([jnp.sum(rising * down, axis=1), jnp.sum(level * by_y, axis=1)], axis=1)
         rise = jnp.sum((scale / spacing_px)[:, None, None] * rise[:, :, None] * inverse, axis=1)
         by_map = -rise[:, :, None] * at[:, None, :] - value[:, None, None] * inverse.transpose(0, 2, 1)
-        jacobian = jnp.concatenate([-rise, by_map.reshape(-1, 4)], axis=1)
+        jacobian = jnp.concatenate([value[:, None], -rise, by_map.reshape(-1, 4)], axis=1)
         return Seen(value, jacobian, first, scale[:, None] * down, across, inside_y & inside_x)
 
     return jax.vmap(star)(images, maps, centres, plane)

@@ -111,7 +111,7 @@ class StampsPsf:
     def sources(self) -> Sources:
         """Places and light of the stars in the fit, with one standard deviation."""
         own = Changes.of(self.field, len(self.star_px), self.factor).stars
-        light, relative = self.star_light_e.copy(), np.zeros(self.star_light_e.shape)
+        light, relative = self.star_light_e.copy(), np.zeros_like(self.star_light_e)
         for plane in range(light.shape[1]):
             every = self._kernels(self.star_px, plane)
             parts = zip(*((k.centre_px, k.total, k.centre_change, k.total_change) for k in every), strict=True)
@@ -157,7 +157,7 @@ class StampsPsf:
         for _ in range(20):
             seen = see(self.field, unit, centre, grid, plane)
             off = window.T @ seen.value[..., None]
-            move = -np.linalg.solve(window.T @ seen.jacobian[..., :2], off)[..., 0]
+            move = -np.linalg.solve(window.T @ seen.jacobian[..., 1:3], off)[..., 0]
             centre = centre + np.clip(move, -0.5, 0.5)
             if np.abs(move).max() < 1e-9:
                 break
@@ -176,10 +176,10 @@ class StampsPsf:
         maps, centres = np.split(changes.maps, [field.warp.size])
         warp = maps.reshape(*field.warp.shape[:2], 4, k)
         lateral = np.insert(centres.reshape(*field.lateral.shape, k), field.reference, 0.0, axis=0)
-        for own, by in ((lateral[plane], seen.jacobian[..., :2]), (warp[plane], seen.jacobian[..., 2:])):
+        for own, by in ((lateral[plane], seen.jacobian[..., 1:3]), (warp[plane], seen.jacobian[..., 3:])):
             basis = polynomials(unit, degree_of(1 + len(own)))[:, 1:]
             change += by @ np.tensordot(basis, own, axes=1)
-        return seen.value, change, seen.jacobian[..., :2]
+        return seen.value, change, seen.jacobian[..., 1:3]
 
 
 @in_float64
@@ -210,19 +210,15 @@ def fit_psf_stamps(
     except np.linalg.LinAlgError:
         bad = FitStatus.NOT_CONVERGED, "The equations were singular; what is given is one psf for all places."
         chosen = search(stamps, rules, lowest)
-    return _report(stamps, chosen, np.random.default_rng(seed), rules, bad)
+    return _report(stamps, chosen, seed, rules, bad)
 
 
 def _report(
-    stamps: Stamps,
-    chosen: Choice[Found],
-    rng: np.random.Generator,
-    rules: StampsRules,
-    bad: tuple[FitStatus, str] | None,
+    stamps: Stamps, chosen: Choice[Found], seed: int, rules: StampsRules, bad: tuple[FitStatus, str] | None
 ) -> FitResult[StampsPsf]:
     found, state = chosen.best.fit, chosen.best.fit.place
     posterior, seen = laplace(stamps, state), expectation(stamps, state)
-    draws, used = posterior.draws(rng, rules.draws[1]), seen.weight > 0
+    draws, used = posterior.draws(np.random.default_rng(seed), rules.draws[1]), seen.weight > 0
     z = (seen.residual * np.sqrt(seen.weight))[used]
     # All unknowns (but all light and all places together, which are held), less what the priors say of them.
     held = float(state.precisions @ state.squares(draws))
@@ -261,12 +257,10 @@ def _report(
 
 
 def _term(stamps: Stamps, state: State, factor: np.ndarray) -> StampsPsf:
-    centre, half = stamps.frame_px
-    star_px = stamps.position_px.astype(np.float64)
-    stars = star_px, state.centre_px, state.light_e
-    term = StampsPsf(state.field, factor, centre, half, *stamps.values_e.shape[1:], WINDOW_PX, *stars)
+    stars = stamps.position_px.astype(np.float64), state.centre_px, state.light_e
+    term = StampsPsf(state.field, factor, *stamps.frame_px, *stamps.values_e.shape[1:], WINDOW_PX, *stars)
     # A Gaussian as wide as the kernel, by its noise-equivalent area of 4 pi sigma^2.
-    kernel = term.predict(centre[None], state.field.reference)
+    kernel = term.predict(term.centre_px[None], state.field.reference)
     return replace(term, window_px=float(1 / np.sqrt(4 * np.pi * (kernel**2).sum())))
 
 
@@ -279,14 +273,12 @@ def _verdict(found: Found, chi2_dof: float, rules: StampsRules) -> tuple[FitStat
 
 
 def _names(state: State) -> list[str]:
-    planes = len(state.field.warp)
     powers = [(i, d - i) for d in range(1, state.field.degrees[0] + 1) for i in range(d, -1, -1)]
-    prefixes = [f"map_{'rgb'[plane]}" for plane in range(planes)] if planes > 1 else ["map"]
+    prefixes = ["map_r", "map_g", "map_b"][: len(state.field.warp)] if len(state.field.warp) > 1 else ["map"]
     return [f"{p}_{e}_{i}{j}" for p in prefixes for i, j in powers for e in ("xx", "xy", "yx", "yy")]
 
 
 def _left_out(stamps: Stamps, state: State, rules: StampsRules) -> tuple[Outliers, ...]:
-    """What the state leaves out: the rules, how many, and the first places."""
     stars = state.keep.any(axis=1)
     left = np.argwhere(stamps.known & ~state.keep & stars[:, None])
     samples = ((star, *stamps.offset_px[sample]) for star, sample in left)

@@ -12,6 +12,7 @@ method for smoothing parameter optimization", Biometrics 73, 2017).
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -19,6 +20,7 @@ import numpy as np
 import scipy.ndimage
 import scipy.sparse
 from jaxtyping import Bool, Float, Int
+from scipy.sparse.linalg import LaplacianNd
 from scipy.special import log_ndtr
 
 from udccal.fitting.psf_stamps.data import Stamps, StampsRules
@@ -26,24 +28,24 @@ from udccal.fitting.psf_stamps.field import Changes, PsfField, Seen, degree_of, 
 from udccal.models.fields import polynomial_terms
 
 
-def envelope(
-    nodes: Float[np.ndarray, "*planes rows columns"], spacing_px: float
-) -> Float[np.ndarray, "*planes rows columns"]:
+def envelope(nodes: Float[np.ndarray, "*k rows columns"], spacing_px: float) -> Float[np.ndarray, "*k rows columns"]:
     """The kernel's size E on the nodes of images of degree 0: their root mean square nearby."""
     width = [0.0] * (nodes.ndim - 2) + [1.5 / spacing_px] * 2
     peak = np.abs(nodes).max(axis=(-2, -1), keepdims=True)
     return np.sqrt(scipy.ndimage.gaussian_filter(nodes**2, width, mode="nearest") + (2e-5 * peak) ** 2)
 
 
+def grid_size(shape: tuple[int, ...], spacing_px: float, reach: float) -> tuple[int, int]:
+    """Nodes that cover stamps ``reach`` times; by steps of 3, so that they do not move with every digit of a map."""
+    rows, columns = (3 * math.ceil(((size + 1) * reach / spacing_px + 3) / 3) for size in shape)
+    return rows, columns
+
+
 @lru_cache(maxsize=4)
 def laplacian(rows: int, columns: int) -> tuple[scipy.sparse.csr_array, Float[np.ndarray, " nodes"]]:
-    """Of a grid, and the eigenvalues of its square: its eigenvectors are those of the cosine transform."""
-    differences = (scipy.sparse.diags_array([-1.0, 1.0], offsets=[0, 1], shape=(n - 1, n)) for n in (rows, columns))
-    down, across = (step.T @ step for step in differences)
-    matrix = scipy.sparse.kron(down, scipy.sparse.eye_array(columns))
-    matrix = -matrix - scipy.sparse.kron(scipy.sparse.eye_array(rows), across)
-    y, x = (2 - 2 * np.cos(np.pi * np.arange(n) / n) for n in (rows, columns))
-    return scipy.sparse.csr_array(matrix), (y[:, None] + x).ravel() ** 2
+    """Of a grid, and the eigenvalues of its square."""
+    grid = LaplacianNd((rows, columns), dtype=np.float64)
+    return scipy.sparse.csr_array(grid.tosparse()), grid.eigenvalues() ** 2
 
 
 @dataclass(frozen=True)
@@ -91,11 +93,6 @@ class State:
         """Numbers of the maps, then of lateral colour."""
         return np.concatenate([np.ravel(self.field.warp), np.ravel(self.field.lateral)])
 
-    def maps_above(self, degree: int) -> Int[np.ndarray, " n"]:
-        """Which of the numbers of the maps are of a higher degree."""
-        planes, terms = self.field.warp.shape[:2]
-        return np.arange(planes * terms * 4).reshape(planes, terms, 4)[:, len(degrees(degree)) - 1 :].ravel()
-
     def shifted(self, vector: Float[np.ndarray, " unknowns"]) -> State:
         """The state with changes added, in the order of ``Changes``."""
         changes = Changes.of(self.field, len(self.light_e), vector[:, None])
@@ -117,9 +114,11 @@ class State:
         warps = np.concatenate([warps.reshape(planes, old_warp), new[:, old_warp:]], axis=1)[:, :warp]
         return replace(self, field=field, precisions=np.concatenate([images.ravel(), warps.ravel(), lateral]))
 
-    def with_spacing(self, spacing_px: float, grid: tuple[int, int]) -> State:
-        """The state on other nodes, which give the same images."""
+    def with_spacing(self, stamps: Stamps, spacing_px: float) -> State:
+        """The state on other nodes, which give the same images and reach as far as maps look."""
+        reach = np.abs(np.linalg.inv(self.field.maps(stamps.unit))).sum(axis=3).max()
         ratio = spacing_px / self.field.spacing_px
+        grid = grid_size(stamps.values_e.shape[1:], spacing_px, float(np.clip(reach, 1.0, 1.7)))
         nodes = np.array([[_resampled(image, ratio, grid) for image in own] for own in self.field.nodes])
         # A squared Laplacian is a difference of fourth order; there are more nodes for what is as rough.
         precisions = self.precisions.copy()
@@ -161,8 +160,8 @@ def _resized(values: Float[np.ndarray, "planes n *rest"], count: int) -> Float[n
 
 
 def _resampled(
-    image: Float[np.ndarray, "rows columns"], ratio: float, grid: tuple[int, int]
-) -> Float[np.ndarray, "grid_rows grid_columns"]:
+    image: Float[np.ndarray, "m n"], ratio: float, grid: tuple[int, int]
+) -> Float[np.ndarray, "rows columns"]:
     """On nodes ``ratio`` as far from each other: coefficients to values at these, and values to coefficients."""
     grids = [(np.arange(n) - (n - 1) / 2) * ratio + (size - 1) / 2 for n, size in zip(grid, image.shape, strict=True)]
     places = np.stack(np.meshgrid(*grids, indexing="ij"))
@@ -175,24 +174,20 @@ class Weighted:
     """Samples under the present model, in electrons.
 
     Attributes:
-        seen: what stars bring; ``down`` has the star's light in it.
-        jacobian: by what a star may change by itself: relative light, centre (x, y), map (row by row).
+        seen: what stars bring; ``down`` and ``jacobian`` have the star's light in them.
         weight: inverse variances, 0 where nothing is known.
     """
 
     seen: Seen
-    jacobian: Float[np.ndarray, "stars samples own"]
     residual: Float[np.ndarray, "stars samples"]
     weight: Float[np.ndarray, "stars samples"]
     log_likelihood: float
 
 
 def expectation(stamps: Stamps, state: State) -> Weighted:
-    """Samples under the model.
-
-    Shot noise and read noise r together are those of y + r^2 ~ Poisson(m + r^2) (Snyder et al., J. Opt. Soc. Am. A 10,
-    1993), whose score (y - m) / (m + r^2) asks for nothing but the variance.
-    """
+    """Samples under the model."""
+    # Shot noise and read noise r together are those of y + r^2 ~ Poisson(m + r^2) (Snyder et al., J. Opt. Soc. Am. A
+    # 10, 1993), whose score (y - m) / (m + r^2) asks for nothing but the variance.
     seen = see(state.field, stamps.unit, state.centre_px, stamps.offset_px, stamps.plane)
     light = np.take_along_axis(state.light_e, stamps.plane, axis=1)
     mean, read = light * seen.value, stamps.read_e**2
@@ -213,7 +208,6 @@ def expectation(stamps: Stamps, state: State) -> Weighted:
     information = np.maximum(score * (score - z), 1e-12)
     residual[cut], weight[cut], likelihood[cut] = sigma * score / information, information / variance[cut], log_ndtr(-z)
     used = stamps.known & state.keep & seen.inside
-    jacobian = light[..., None] * np.concatenate([seen.value[..., None], seen.jacobian], axis=2)
     residual, weight = np.where(used, residual, 0.0), np.where(used, weight, 0.0)
-    seen = seen._replace(down=light[..., None] * seen.down)
-    return Weighted(seen, jacobian, residual, weight, float(likelihood[used].sum()))
+    seen = seen._replace(down=light[..., None] * seen.down, jacobian=light[..., None] * seen.jacobian)
+    return Weighted(seen, residual, weight, float(likelihood[used].sum()))

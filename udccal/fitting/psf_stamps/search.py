@@ -7,7 +7,6 @@ Annals of Statistics 6, 1978).
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 from typing import final
 
@@ -21,7 +20,7 @@ from udccal.fitting.engine.robust import OutlierRule
 from udccal.fitting.psf_stamps.data import Stamps, StampsRules, centroids, light_of
 from udccal.fitting.psf_stamps.equations import Laplace, laplace, marginal_cov
 from udccal.fitting.psf_stamps.field import PsfField
-from udccal.fitting.psf_stamps.probability import State, envelope, expectation
+from udccal.fitting.psf_stamps.probability import State, envelope, expectation, grid_size
 from udccal.models.fields import polynomial_terms
 
 WINDOW_PX = 1.6  # standard deviation of a Gaussian as wide as a star, before the kernel is known
@@ -94,8 +93,8 @@ def _placed(stamps: Stamps, state: State, stars: Bool[np.ndarray, " stars"]) -> 
     """Some stars' places and light fitted anew, the field being as it is."""
     for _ in range(4):
         seen = expectation(stamps, state)
-        by_light = seen.jacobian[..., :1] * np.moveaxis(stamps.by_plane, 0, 2)
-        jacobian = np.concatenate([seen.jacobian[..., 1:3], by_light], axis=2)
+        by_light = seen.seen.jacobian[..., :1] * np.moveaxis(stamps.by_plane, 0, 2)
+        jacobian = np.concatenate([seen.seen.jacobian[..., 1:3], by_light], axis=2)
         weighted = (jacobian * seen.weight[..., None]).transpose(0, 2, 1)
         step = (scaled_inverse(weighted @ jacobian) @ weighted @ seen.residual[..., None])[..., 0]
         centre, light = np.split(np.clip(step, -0.5, 0.5) * stars[:, None], [2], axis=1)
@@ -121,12 +120,6 @@ class Orders:
     def name(self) -> str:
         """For the table of candidates."""
         return f"map degree {self.warp}, image degree {self.image}, nodes every {self.spacing_px:g} px"
-
-
-def grid_size(shape: tuple[int, int], spacing_px: float, reach: float) -> tuple[int, int]:
-    """Nodes that cover stamps ``reach`` times; by steps of 3, so that they do not move with every digit of a map."""
-    rows, columns = (3 * math.ceil(((size + 1) * reach / spacing_px + 3) / 3) for size in shape)
-    return rows, columns
 
 
 def start(stamps: Stamps, rules: StampsRules) -> State:
@@ -156,15 +149,8 @@ def coarse(stamps: Stamps, rules: StampsRules, most: Orders) -> State:
         state = without_outliers(stamps, state, rules) if warp else state
         state = improve(stamps, state, rules, 1).place
         state = replace(state, size=envelope(state.field.nodes[:, 0], state.field.spacing_px))
-    state = on_nodes(stamps, state, rules.spacings_px[0])
+    state = state.with_spacing(stamps, rules.spacings_px[0])
     return without_outliers(stamps, replace(state, model_error=0.0), rules)
-
-
-def on_nodes(stamps: Stamps, state: State, spacing_px: float) -> State:
-    """The state on other nodes, which reach as far as maps look; between 1 and 1.7 times as far as stamps."""
-    inverse = np.linalg.inv(state.field.maps(stamps.unit))
-    reach = float(np.clip(np.abs(inverse).sum(axis=3).max(), 1.0, 1.7))
-    return state.with_spacing(spacing_px, grid_size(stamps.values_e.shape[1:], spacing_px, reach))
 
 
 def search(stamps: Stamps, rules: StampsRules, orders: Orders | None) -> Choice[Found]:
@@ -175,7 +161,7 @@ def search(stamps: Stamps, rules: StampsRules, orders: Orders | None) -> Choice[
     most = orders or Orders(*(min(limit, highest) for highest in rules.highest), rules.spacings_px[0])
     state = coarse(stamps, rules, most)
     if orders is not None:
-        state = on_nodes(stamps, state, orders.spacing_px).with_degrees(orders.warp, orders.image, rules)
+        state = state.with_spacing(stamps, orders.spacing_px).with_degrees(orders.warp, orders.image, rules)
         found = improve(stamps, state, rules, rules.steps_to_end)
     else:
         tried = _spacings(stamps, _degrees(stamps, state, rules, most), rules)
@@ -212,7 +198,8 @@ def _degrees(stamps: Stamps, state: State, rules: StampsRules, most: Orders) -> 
 
 def _judged(stamps: Stamps, best: Attempt[Found], orders: Orders, rules: StampsRules) -> Attempt[Found]:
     """A fit of these degrees, or what the curvature says of it, where a map that matters is left out beyond doubt."""
-    place, dropped = best.fit.place, best.fit.place.maps_above(orders.warp)
+    place, warp = best.fit.place, best.fit.place.field.warp
+    dropped = np.arange(warp.size).reshape(warp.shape)[:, polynomial_terms(orders.warp) - 1 :].ravel()
     value, cov = place.maps[dropped], marginal_cov(best.fit.equations.root, place.maps_from + dropped)
     loss = 0.5 * float(value @ np.linalg.solve(cov, value))
     state = place.with_degrees(orders.warp, orders.image, rules)
@@ -229,7 +216,7 @@ def _spacings(stamps: Stamps, tried: list[Attempt[Found]], rules: StampsRules) -
         # The error of cubic splines falls with the spacing's fourth power, its cost in likelihood with the eighth.
         if gain * (finer[0] / first) ** 8 < rules.worth_finer:
             break
-        state = without_outliers(stamps, on_nodes(stamps, best.fit.place, spacing), rules)
+        state = without_outliers(stamps, best.fit.place.with_spacing(stamps, spacing), rules)
         tried = [*tried, attempt(stamps, improve(stamps, state, rules, rules.steps_to_end))]
         gain = best.criterion - tried[-1].criterion
     return tried
