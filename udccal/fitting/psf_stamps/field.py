@@ -65,13 +65,9 @@ class PsfField(eqx.Module):
 
     def moved(self, changes: Changes) -> PsfField:
         """The field after the first of some changes."""
-        warp, lateral = np.split(changes.maps[:, 0], [np.size(self.warp)])
-        return replace(
-            self,
-            nodes=self.nodes + changes.nodes[..., 0],
-            warp=self.warp + warp.reshape(self.warp.shape),
-            lateral=self.lateral + lateral.reshape(self.lateral.shape),
-        )
+        maps = np.split(changes.maps[:, 0], [np.size(self.warp)])
+        warp, lateral = (old + own.reshape(old.shape) for old, own in zip((self.warp, self.lateral), maps, strict=True))
+        return replace(self, nodes=self.nodes + changes.nodes[..., 0], warp=warp, lateral=lateral)
 
 
 class Changes(NamedTuple):

@@ -1,7 +1,4 @@
-"""Fit a psf field to stamps of point sources: orders, places and light found along with it, and true error bars.
-
-The data are arrays: stamps in electrons, each about one source, of a sensor without colours or of a raw mosaic.
-"""
+"""Fit a psf field to stamps of point sources: orders, places and light found along with it, and true error bars."""
 
 from __future__ import annotations
 
@@ -231,7 +228,12 @@ def _report(
     warp = state.field.warp
     cov = inflation**2 * marginal_cov(posterior.root, state.maps_from + np.arange(warp.size))
     cov, names = block_diag(spread**2, cov), ["kernel_relative_l2", *_names(state)]
-    status, note = bad or _verdict(found, chi2_dof, rules)
+    status, note = bad or (FitStatus.CONVERGED, "")
+    if not bad and chi2_dof > rules.poor_above:
+        status, note = FitStatus.POOR_FIT, "Check the noise given, and that each stamp holds one point source."
+    elif not bad and not found.converged:
+        note = f"It was left after {found.iterations} steps; use more or brighter stamps."
+        status = FitStatus.NOT_CONVERGED
     return FitResult(
         name="psf",
         term=term,
@@ -262,14 +264,6 @@ def _term(stamps: Stamps, state: State, factor: np.ndarray) -> StampsPsf:
     # A Gaussian as wide as the kernel, by its noise-equivalent area of 4 pi sigma^2.
     kernel = term.predict(term.centre_px[None], state.field.reference)
     return replace(term, window_px=float(1 / np.sqrt(4 * np.pi * (kernel**2).sum())))
-
-
-def _verdict(found: Found, chi2_dof: float, rules: StampsRules) -> tuple[FitStatus, str]:
-    if chi2_dof > rules.poor_above:
-        return FitStatus.POOR_FIT, "Check the noise given, and that each stamp holds one point source."
-    if not found.converged:
-        return FitStatus.NOT_CONVERGED, f"It was left after {found.iterations} steps; use more or brighter stamps."
-    return FitStatus.CONVERGED, ""
 
 
 def _names(state: State) -> list[str]:

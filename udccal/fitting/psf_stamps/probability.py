@@ -171,12 +171,7 @@ def _resampled(
 
 @dataclass(frozen=True)
 class Weighted:
-    """Samples under the present model, in electrons.
-
-    Attributes:
-        seen: what stars bring; ``down`` and ``jacobian`` have the star's light in them.
-        weight: inverse variances, 0 where nothing is known.
-    """
+    """Samples under the model; ``seen`` has stars' light in ``down`` and ``jacobian``; unused ones weigh nothing."""
 
     seen: Seen
     residual: Float[np.ndarray, "stars samples"]
@@ -191,9 +186,8 @@ def expectation(stamps: Stamps, state: State) -> Weighted:
     seen = see(state.field, stamps.unit, state.centre_px, stamps.offset_px, stamps.plane)
     light = np.take_along_axis(state.light_e, stamps.plane, axis=1)
     mean, read = light * seen.value, stamps.read_e**2
-    variance = np.maximum(mean, 0.0) + read  # expected light below zero has no shot noise
-    if state.model_error:
-        variance = variance + (state.model_error * np.abs(mean)) ** 2
+    # Expected light below zero has no shot noise.
+    variance = np.maximum(mean, 0.0) + read + (state.model_error * mean) ** 2
     residual, weight = stamps.value_e - mean, 1.0 / variance
     if state.model_error:
         likelihood = -0.5 * (residual**2 * weight + np.log(variance / read))

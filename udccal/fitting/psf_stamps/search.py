@@ -25,7 +25,6 @@ from udccal.models.fields import polynomial_terms
 
 WINDOW_PX = 1.6  # standard deviation of a Gaussian as wide as a star, before the kernel is known
 
-
 Found = Solution[State, Laplace]
 
 
@@ -131,14 +130,8 @@ def start(stamps: Stamps, rules: StampsRules) -> State:
     # Lateral colour of degree 2.
     field = PsfField(nodes, np.zeros((planes, 0, 2, 2)), np.zeros((planes - 1, 5, 2)), spacing_px)
     first = np.concatenate([np.tile(rules.first_image[0], planes), np.full(2 * planes - 2, rules.first_lateral)])
-    return State(
-        field=field,
-        centre_px=centroids(stamps, WINDOW_PX),
-        light_e=light_of(stamps),
-        precisions=first,
-        size=envelope(nodes[:, 0], spacing_px),
-        keep=np.ones(stamps.value_e.shape, dtype=bool),
-    )
+    centre_px, size = centroids(stamps, WINDOW_PX), envelope(nodes[:, 0], spacing_px)
+    return State(field, centre_px, light_of(stamps), first, size, np.ones_like(stamps.known))
 
 
 def coarse(stamps: Stamps, rules: StampsRules, most: Orders) -> State:
