@@ -61,7 +61,7 @@ def test_weights_of_nodes_give_the_values() -> None:
     field = _field()
     with jax.enable_x64(True):
         seen = see(field, _UNIT, _CENTRE, _OFFSET, np.ones((5, 49), dtype=int))
-    images = np.einsum("st,tn->ns", polynomials(_UNIT, 1), field.nodes[1].reshape(3, -1))
+    images = np.einsum("st,tn->sn", polynomials(_UNIT, 1), field.nodes[1].reshape(3, -1))
     used = np.array([0, 50, 60, 200])
     np.testing.assert_allclose(taps(seen, used, (12, 15)) @ images.ravel(), seen.value.ravel()[used], atol=1e-12)
 

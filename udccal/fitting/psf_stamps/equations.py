@@ -13,6 +13,7 @@ import numpy as np
 import scipy.sparse
 from jaxtyping import Float, Int
 from scipy.linalg import cholesky, solve_triangular
+from scipy.linalg.blas import dtrsm
 
 from udccal.fitting.engine.least_squares import Step
 from udccal.fitting.psf_stamps.data import Stamps
@@ -131,7 +132,8 @@ def normal_equations(stamps: Stamps, field: PsfField, seen: Weighted, plane: int
     weight = seen.weight * stamps.by_plane[plane]
     weighted = np.concatenate([seen.seen.jacobian, seen.residual[..., None]], axis=2) * weight[..., None]
     used = np.flatnonzero(weight)
-    onto = (taps(seen.seen, used, grid).T @ weighted.reshape(-1, OWN + 1)[used]).reshape(-1, len(stamps.unit), OWN + 1)
+    onto = taps(seen.seen, used, grid).T @ weighted.reshape(-1, OWN + 1)[used]
+    onto = onto.reshape(len(stamps.unit), -1, OWN + 1).transpose(1, 0, 2)
     cross = [(onto[..., :OWN] * part[:, None]).reshape(len(onto), -1) @ shared for part in basis.T]
     own = seen.seen.jacobian.transpose(0, 2, 1) @ weighted
     return Colour(
@@ -152,29 +154,28 @@ def node_sums(
     # a sample's 4 x 4 nodes are products of four down and four across: so what samples of a cell of the grid bring is
     # a product of pairs down, pairs across, and pairs of polynomials.
     (rows, columns), terms, reach = grid, basis.shape[1], TAPS - 1
-    used = used[np.argsort(seen.seen.first.ravel()[used], kind="stable")]
-    ends = np.searchsorted(seen.seen.first.ravel()[used], np.arange(rows * columns + 1))
     down, across = (part.reshape(-1, TAPS)[used] for part in (seen.seen.down, seen.seen.across))
     (one, other), (t, u) = np.triu_indices(TAPS), np.triu_indices(terms)
     both = (basis[:, t] * basis[:, u])[used // seen.weight.shape[1]] * seen.weight.ravel()[used, None]
     right = ((down[:, one] * down[:, other])[:, :, None] * both[:, None]).reshape(len(used), -1)
+    index = seen.seen.first.ravel()[used, None] * len(one) + np.arange(len(one))
+    products = (across[:, one] * across[:, other]).ravel(), index.ravel(), np.arange(0, index.size + 1, len(one))
+    sums = scipy.sparse.csc_array(products, shape=(rows * columns * len(one), len(used))) @ right
+    sums = sums.reshape(rows, columns, len(one), len(one), -1)[:-reach, :-reach]
     # Nodes that lie so many columns beside, for all pairs down; then these.
     spread = np.zeros((rows - reach, columns, 2 * reach + 1, len(one), len(t)))
-    for j, k in zip(one, other, strict=True):
-        products = (across[:, j] * across[:, k], np.arange(len(used)), ends)
-        sums = scipy.sparse.csr_array(products, shape=(rows * columns, len(used))) @ right
-        sums = sums.reshape(rows, columns, len(one), -1)[:-reach, :-reach]
+    for pair, (j, k) in enumerate(zip(one, other, strict=True)):
         for first, beside in {(j, k - j), (k, j - k)}:
-            spread[:, first : first + columns - reach, reach + beside] += sums
+            spread[:, first : first + columns - reach, reach + beside] += sums[:, :, pair]
     stencil = np.zeros((rows, TAPS, columns, 2 * reach + 1, len(t)))
     for pair, (i, k) in enumerate(zip(one, other, strict=True)):
         stencil[i : i + rows - reach, k - i] += spread[:, :, :, pair]
     place = np.empty((terms, terms), dtype=int)
     place[t, u] = place[u, t] = np.arange(len(t))
     out = np.zeros((rows, columns, terms, TAPS, columns, terms))
-    for beside in range(-reach, TAPS):
-        own, there = (slice(max(e, 0), columns + min(e, 0)) for e in (-beside, beside))
-        np.einsum("rctdcu->rdctu", out[:, own, :, :, there])[...] = stencil[:, :, own, reach + beside][..., place]
+    for away in range(-reach, TAPS):
+        own, there = (slice(max(e, 0), columns + min(e, 0)) for e in (-away, away))
+        np.einsum("rctdcu->rdctu", out[:, own, :, :, there])[...] = stencil[:, :, own, reach + away][..., place]
     return out.reshape(rows, columns * terms, -1)
 
 
@@ -183,7 +184,7 @@ def factor(band: Float[np.ndarray, "rows n 4*n"]) -> Float[np.ndarray, "rows n 4
     rows, n = band.shape[:2]
     for i, row in enumerate(band):
         row[:, :n] = cholesky(row[:, :n], check_finite=False)
-        beyond = row[:, n:] = solve_triangular(row[:, :n], row[:, n:], trans=1, check_finite=False)
+        beyond = row[:, n:] = _divide(row[:, :n], row[:, n:], True)
         for j in range(min(TAPS, rows - i) - 1):
             band[i + 1 + j, :, : (TAPS - 1 - j) * n] -= beyond[:, j * n : (j + 1) * n].T @ beyond[:, j * n :]
     return band
@@ -200,10 +201,15 @@ def divided(
         beyond = band[i, :, n : n + len(ahead)]
         if not transposed:
             out[i] -= beyond @ ahead
-        out[i] = solve_triangular(band[i, :, :n], out[i], trans=int(transposed), check_finite=False)
+        out[i] = _divide(band[i, :, :n], out[i], transposed)
         if transposed:
             ahead -= beyond.T @ out[i]
     return right
+
+
+def _divide(upper: Float[np.ndarray, "n n"], right: Float[np.ndarray, "n k"], transposed: bool) -> np.ndarray:
+    """U^-1 right, or U^-T right; BLAS sees the transposes, whose columns are contiguous."""
+    return np.asarray(dtrsm(1.0, upper.T, right.T, side=1, lower=1, trans_a=int(transposed), overwrite_b=1)).T
 
 
 def _eliminated(colour: Colour, state: State, plane: int) -> Colour:

@@ -146,10 +146,10 @@ def see(
 
 
 def taps(seen: Seen, used: Int[np.ndarray, " used"], grid: tuple[int, ...]) -> scipy.sparse.csr_array:
-    """From nodes of each star's image, the stars of a node together, to the samples ``used`` (flat, in order)."""
+    """From the nodes of each star's image to the samples ``used`` (flat, in order)."""
     stars, samples = seen.first.shape
     step = (np.arange(TAPS)[:, None] * grid[1] + np.arange(TAPS)).ravel()
-    index = (seen.first.ravel()[used, None] + step) * stars + (used // samples)[:, None]
+    index = seen.first.ravel()[used, None] + step + grid[0] * grid[1] * (used // samples)[:, None]
     down, across = (part.reshape(-1, TAPS)[used] for part in (seen.down, seen.across))
     ends, shape = np.arange(0, index.size + 1, TAPS**2), (len(used), grid[0] * grid[1] * stars)
     return scipy.sparse.csr_array(((down[:, :, None] * across[:, None]).ravel(), index.ravel(), ends), shape=shape)

@@ -167,7 +167,7 @@ class StampsPsf:
         field, grid, k = self.field, offsets(self.rows, self.columns), self.factor.shape[1]
         changes = Changes.of(field, len(self.star_px), self.factor)
         seen = see(field, unit, centre, grid, np.full((len(unit), len(grid)), plane))
-        images = np.einsum("nt,trck->rcnk", polynomials(unit, field.degrees[1]), changes.nodes[plane], optimize=True)
+        images = np.tensordot(polynomials(unit, field.degrees[1]), changes.nodes[plane], axes=1)
         every = taps(seen, np.arange(seen.value.size), field.nodes.shape[2:])
         change = (every @ images.reshape(every.shape[1], k)).reshape(*seen.value.shape, k)
         maps, centres = np.split(changes.maps, [field.warp.size])
