@@ -25,10 +25,7 @@ from udccal.result import Diagnostic, FitResult, FitStatus, Outliers
 
 
 class Kernels(NamedTuple):
-    """Kernels, the model's centres beside theirs, light in the window, and changes of these along the term's factor.
-
-    ``jacobian`` is that of the model's light by its centre; the change of the light is relative.
-    """
+    """Kernels, the model's centres beside theirs, light in the window; changes along the factor, of light relative."""
 
     value: Float[np.ndarray, "n pixels"]
     centre_px: Float[np.ndarray, "n 2"]
@@ -232,8 +229,8 @@ def _report(
     if not bad and chi2_dof > rules.poor_above:
         status, note = FitStatus.POOR_FIT, "Check the noise given, and that each stamp holds one point source."
     elif not bad and not found.converged:
-        note = f"It was left after {found.iterations} steps; use more or brighter stamps."
-        status = FitStatus.NOT_CONVERGED
+        left = f"It was left after {found.iterations} steps; use more or brighter stamps."
+        status, note = FitStatus.NOT_CONVERGED, left
     return FitResult(
         name="psf",
         term=term,
@@ -248,7 +245,6 @@ def _report(
             Diagnostic("effective_parameters", effective, "1"),
             Diagnostic("clipped_samples", float(stamps.clipped.sum()), "1"),
             Diagnostic("samples_beyond_the_image", float((stamps.known & state.keep).sum() - z.size), "1"),
-            Diagnostic("centroid_window", term.window_px, "px"),
             Diagnostic("sigma_inflation", inflation, "1"),
         ),
         notes=(note,) if note else (),
@@ -260,7 +256,8 @@ def _report(
 
 def _term(stamps: Stamps, state: State, factor: np.ndarray) -> StampsPsf:
     stars = stamps.position_px.astype(np.float64), state.centre_px, state.light_e
-    term = StampsPsf(state.field, factor, *stamps.frame_px, *stamps.values_e.shape[1:], WINDOW_PX, *stars)
+    (centre, half), (_, rows, columns) = stamps.frame_px, stamps.values_e.shape
+    term = StampsPsf(state.field, factor, centre, half, rows, columns, WINDOW_PX, *stars)
     # A Gaussian as wide as the kernel, by its noise-equivalent area of 4 pi sigma^2.
     kernel = term.predict(term.centre_px[None], state.field.reference)
     return replace(term, window_px=float(1 / np.sqrt(4 * np.pi * (kernel**2).sum())))
@@ -273,7 +270,7 @@ def _names(state: State) -> list[str]:
 
 
 def _left_out(stamps: Stamps, state: State, rules: StampsRules) -> tuple[Outliers, ...]:
-    stars = state.keep.any(axis=1)
+    stars = np.asarray(state.keep.any(axis=1))
     left = np.argwhere(stamps.known & ~state.keep & stars[:, None])
     samples = ((star, *stamps.offset_px[sample]) for star, sample in left)
     places = (f"stamp {star}, {x:+.0f} px, {y:+.0f} px from its middle" for star, x, y in samples)

@@ -72,10 +72,10 @@ def improve(stamps: Stamps, state: State, rules: StampsRules, steps: int) -> Fou
 
 def without_outliers(stamps: Stamps, state: State, rules: StampsRules) -> State:
     """The state without samples, and stars, that the model does not explain; those it does explain come back."""
-    everything = replace(state, keep=np.ones_like(state.keep))
-    if not state.keep.any(axis=1).all():
+    everything, out = replace(state, keep=np.ones_like(state.keep)), np.asarray(~state.keep.any(axis=1))
+    if out.any():
         # Left alone, a star that was out would be compared at the place and light it had when the field was coarse.
-        everything = _placed(stamps, everything, ~state.keep.any(axis=1))
+        everything = _placed(stamps, everything, out)
     seen = expectation(stamps, everything)
     # Clipped samples cannot be far off in one direction.
     used = (seen.weight > 0) & ~stamps.clipped
@@ -149,10 +149,10 @@ def coarse(stamps: Stamps, rules: StampsRules, most: Orders) -> State:
 def search(stamps: Stamps, rules: StampsRules, orders: Orders | None) -> Choice[Found]:
     """The orders, found unless they are given, and their fit; LinAlgError when equations are singular."""
     # No more polynomials than half the stars.
-    enough = (d for d in range(9, -1, -1) if d == 0 or 2 * polynomial_terms(d) <= len(stamps.unit))
-    limit, tried = next(enough), []
-    most = orders or Orders(*(min(limit, highest) for highest in rules.highest), rules.spacings_px[0])
-    state = coarse(stamps, rules, most)
+    limit = max(d for d in range(9) if d == 0 or 2 * polynomial_terms(d) <= len(stamps.unit))
+    warp, image = (min(limit, highest) for highest in rules.highest)
+    most = orders or Orders(warp, image, rules.spacings_px[0])
+    state, tried = coarse(stamps, rules, most), []
     if orders is not None:
         state = state.with_spacing(stamps, orders.spacing_px).with_degrees(orders.warp, orders.image, rules)
         found = improve(stamps, state, rules, rules.steps_to_end)
