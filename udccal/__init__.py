@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from udccal.fitting.geometry import fit_geometry as fit_geometry
     from udccal.fitting.noise import fit_noise as fit_noise
     from udccal.fitting.psf import fit_psf as fit_psf
-    from udccal.fitting.wire import fit_wire as fit_wire
+    from udccal.fitting.wire.fit import fit_wire as fit_wire
     from udccal.profiles.profile import Profile as Profile
     from udccal.profiles.store import load_profile as load_profile
     from udccal.restoration.runtime import Restorer as Restorer
@@ -54,7 +54,7 @@ _HOMES = {
     "fit_geometry": "udccal.fitting.geometry",
     "fit_noise": "udccal.fitting.noise",
     "fit_psf": "udccal.fitting.psf",
-    "fit_wire": "udccal.fitting.wire",
+    "fit_wire": "udccal.fitting.wire.fit",
     "load_profile": "udccal.profiles.store",
     "load_rig": "udccal.rig",
     "simulate": "udccal.benches.bench",

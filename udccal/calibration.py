@@ -21,7 +21,9 @@ from udccal.fitting.geometry.data import BoardView
 from udccal.fitting.noise import fit_noise, nominal_noise, read_noise
 from udccal.fitting.nominal import nominal_geometry
 from udccal.fitting.psf import PsfRules, fit_psf, read_psf
-from udccal.fitting.wire import WireRules, fit_wire, read_wire, sensor_map
+from udccal.fitting.wire.data import read_wire
+from udccal.fitting.wire.fit import fit_wire, sensor_map
+from udccal.fitting.wire.rules import WireRules
 from udccal.models.backscatter import Backscatter
 from udccal.models.geometry import Geometry
 from udccal.models.noise import Noise

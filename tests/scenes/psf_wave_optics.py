@@ -13,8 +13,7 @@ from udccal.cfa import channel_map
 from udccal.fitting.psf.data import PsfData
 from udccal.fitting.psf.fit import fit_psf
 from udccal.fitting.psf.start import PsfRules
-from udccal.fitting.wire import wire_start
-from udccal.fitting.wire.parameters import ideal_wire
+from udccal.fitting.wire.rules import ideal_wire, wire_start
 from udccal.models.geometry import Geometry
 from udccal.models.psf import PsfField, psf_kernels
 from udccal.models.wire import Wire
