@@ -14,7 +14,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from udccal.fitting.geometry import CalibratedViews, fit_geometry
+from udccal.fitting.geometry.calibrated import CalibratedViews
+from udccal.fitting.geometry.fit import fit_geometry
 
 INNER = (9, 6)
 DEFAULT_DATA = Path(__file__).resolve().parents[1] / ".." / "shared" / "data"

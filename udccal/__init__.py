@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from udccal.calibration import fit as fit
     from udccal.errors import UdccalError as UdccalError
     from udccal.fitting.backscatter import fit_backscatter as fit_backscatter
-    from udccal.fitting.geometry import fit_geometry as fit_geometry
+    from udccal.fitting.geometry.fit import fit_geometry as fit_geometry
     from udccal.fitting.noise import fit_noise as fit_noise
     from udccal.fitting.psf import fit_psf as fit_psf
     from udccal.fitting.wire.fit import fit_wire as fit_wire
@@ -51,7 +51,7 @@ _HOMES = {
     "capture": "udccal.benches.capture",
     "fit": "udccal.calibration",
     "fit_backscatter": "udccal.fitting.backscatter",
-    "fit_geometry": "udccal.fitting.geometry",
+    "fit_geometry": "udccal.fitting.geometry.fit",
     "fit_noise": "udccal.fitting.noise",
     "fit_psf": "udccal.fitting.psf",
     "fit_wire": "udccal.fitting.wire.fit",

@@ -10,8 +10,9 @@ from hypothesis import strategies as st
 from tests.fitting.geometry.boards import VISIBLE_BEND, Sight, sight
 from udccal.errors import FitError
 from udccal.fitting.engine.gaussian import Prior
-from udccal.fitting.geometry import CalibratedViews, fit_geometry
+from udccal.fitting.geometry.calibrated import CalibratedViews
 from udccal.fitting.geometry.corners import board_points_mm
+from udccal.fitting.geometry.fit import fit_geometry
 from udccal.models.geometry import Geometry
 from udccal.result import FitStatus
 

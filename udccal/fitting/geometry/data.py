@@ -24,8 +24,6 @@ from udccal.rig import RigDescription
 from udccal.sessions.schema import BoardSubject, StoredCapture, StoredStep
 from udccal.sessions.store import Session
 
-_DARK, _FLAT = "wire/dark", "wire/flat"
-
 
 @final
 @dataclass(frozen=True)
@@ -126,11 +124,11 @@ def flat_field(
 
 def _read_flat_field(session: Session, noise: Noise, rules: GeometryRules) -> FlatField | None:
     """From the averages that the wire is fitted to; None where the session has none."""
-    if not {_DARK, _FLAT} <= {step.id for step in session.steps("wire")}:
+    if not {"wire/dark", "wire/flat"} <= {step.id for step in session.steps("wire")}:
         return None
-    capture = session.step(_FLAT).captures[0]
+    capture = session.step("wire/flat").captures[0]
     flat = session.average(capture).mean.astype(np.float64)
-    light = flat - session.average(session.step(_DARK).captures[0]).mean
+    light = flat - session.average(session.step("wire/dark").captures[0]).mean
     unclipped = flat < rules.clipped * float(np.asarray(noise.saturation_DN))
     return flat_field(light, _temporal_variance_DN2(noise, light, capture), unclipped, rules)
 

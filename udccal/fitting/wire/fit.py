@@ -188,7 +188,7 @@ def map_jacobian(
     """Of the map that these parameters make on a sensor of that shape; its mean is 1 (``mean_one``)."""
     site, wire = np.zeros(BLOCK, dtype=np.int64), parameters.wire(x)
     grid = _grid(geometry, shape, (64, 64))
-    whole, base, rows = over_blocks(lambda *part: block_jacobian(parameters, wire, *part, site), *grid)
+    whole, base, rows = over_blocks(lambda *at: block_jacobian(parameters, wire, at[0], at[1], site), *grid)
     value, rows = whole * base, rows * base
     # Site gains are not in the map.
     rows[parameters.of(Kind.SITE)] = 0.0

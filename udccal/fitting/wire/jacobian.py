@@ -148,7 +148,8 @@ def wire_derivatives(wire: Wire, ideal: Float[Array, "n 2"], scaled: Float[Array
     by_open = jnp.stack([jnp.sum(along * slit_slope[i] * slit[1 - i], axis=0) for i in (0, 1)])
     by_ellipse, by_pupil = _by_footprint(wire, kappa, bessel, both, series, powers, wave)
     by_rays = Rays(by_periods, by_open + whole / rays.openings, by_ellipse, by_pupil)
-    shape = sum(jnp.einsum("in,ink->kn", one, by) for one, by in zip(by_rays, by_shape, strict=True))
+    parts = [jnp.einsum("in,ink->kn", one, by) for one, by in zip(by_rays, by_shape, strict=True)]
+    shape = jnp.sum(jnp.stack(parts), axis=0)
     base = jnp.exp(log_baseline(wire, scaled, slopes(wire, ideal)))
     return Derivatives(whole, base, shape, wave, both * bessel[:2], powers)
 
