@@ -135,7 +135,7 @@ def test_a_prior_holds_what_the_views_do_not_tell() -> None:
     assert found.status is FitStatus.CONVERGED
     assert np.sqrt(found.cov[0, 0]) == pytest.approx(15.0 / np.sqrt(2), rel=0.1)  # fx and fy are as good as one
     assert all(found.free)
-    assert "do not tell the whole lens" in " ".join(found.notes)
+    assert "do not determine the whole lens" in " ".join(found.notes)
 
 
 def test_too_few_views_are_refused_with_the_reason() -> None:

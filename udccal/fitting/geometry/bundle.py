@@ -37,7 +37,7 @@ class GeometryRules:
     """What the fit of lens and boards goes by.
 
     Attributes:
-        least_views: usable views that may tell a lens; with a prior, one tells at least its pose.
+        least_views: usable views that may determine a lens; with a prior, one determines at least its pose.
         least_corners: of a usable view. Four hold a homography; two more tell whether it is the right one.
         most_clipped: part of a board's samples at saturation. Beyond it edges have bloomed.
         clipped: samples from this part of saturation on count as clipped.

@@ -160,7 +160,7 @@ def _differ(square: Float[np.ndarray, " views"], dof: Float[np.ndarray, " views"
 def _choose_order(full: Solved, points: Points, prior: Prior, rules: GeometryRules) -> tuple[Choice[Solved], bool]:
     """Every order, each solved from the one above with its further coefficients at 0; and whether the prior chose.
 
-    Where the prior brings a good part of what is known of focal length or centre, the data are too few to tell a
+    Where the prior brings a good part of what is known of focal length or centre, the data are too few to part a
     coefficient from a pose. All then stay free, each within its prior.
     """
     tried: list[Attempt[Solved]] = []
@@ -201,14 +201,14 @@ def _rescaled(
 def _status(
     solved: Solved, cov: Float[np.ndarray, "n n"], image_size: tuple[int, int], rules: GeometryRules
 ) -> tuple[FitStatus, tuple[str, ...]]:
-    """Whether the views tell the lens; else what to capture."""
+    """Whether the views determine the lens; else what to capture."""
     sigma, lens = Intrinsics.of(np.sqrt(np.diag(cov))), Intrinsics.of(solved.place.intrinsics)
     by_focal = float(np.max(sigma.focal / np.abs(lens.focal)))
     by_centre = float(np.max(sigma.centre)) / image_size[0]
     if max(by_focal, by_centre) > rules.most_uncertain:
         what = "focal length" if by_focal > by_centre else "centre of the picture"
         return FitStatus.TOO_FEW_DATA, (
-            f"The views do not tell the {what} (one sigma is {min(max(by_focal, by_centre), 99.0):.0%}). "
+            f"The views do not determine the {what} (one sigma is {min(max(by_focal, by_centre), 99.0):.0%}). "
             "Lean the board by 20 to 40 degrees, another way in each view, and let it fill the picture.",
         )
     if not solved.converged:
@@ -221,7 +221,7 @@ def _remarks(
 ) -> Iterator[str]:
     if by_prior:
         yield (
-            "The views alone do not tell the whole lens: what is known beforehand gives part of it, and every "
+            "The views alone do not determine the whole lens: what is known beforehand gives part of it, and every "
             "distortion coefficient stays free within that. Lean the board another way in each view to know more."
         )
     relative = scales / np.median(scales)

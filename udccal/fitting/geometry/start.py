@@ -101,8 +101,7 @@ def starts(
     points: Points, size: tuple[int, int], given: Intrinsics | None, poses: Float[np.ndarray, "views 6"] | None
 ) -> list[Bundle]:
     """Bundles to begin from: from what is given, from the views' vanishing points, else from a common lens."""
-    focal = _focal_px(points, size) or float(max(size))
-    centred = Intrinsics(np.full(2, focal), (np.array(size) - 1) / 2, np.zeros(5)).vector
+    centred = Intrinsics(np.full(2, _focal_px(points, size)), (np.array(size) - 1) / 2, np.zeros(5)).vector
     found = [Bundle(centred, best_poses(points, centred)[0])]
     if given is not None:
         found.insert(0, Bundle(given.vector, poses if poses is not None else best_poses(points, given.vector)[0]))
@@ -164,24 +163,14 @@ def _consistent(board: np.ndarray, image: np.ndarray) -> Bool[np.ndarray, " n"]:
     return np.ones(len(board), dtype=bool)
 
 
-def _focal_px(points: Points, size: tuple[int, int]) -> float | None:
-    """One focal length for both axes with the centre in the middle; None where the views do not tell it."""
-    unit, rows, right = float(max(size)), [], []
-    centred = (points.image - (np.array(size) - 1) / 2) / unit
-    for view in range(len(points.names)):
-        mine = points.view == view
-        matrix, _ = cv2.findHomography(points.board[mine, :2], centred[mine], cv2.RANSAC, 0.005)
-        if matrix is None or not np.isfinite(matrix).all() or not matrix[:, :2].any(axis=0).all():
-            continue
-        first, second = matrix[:, :2].T / np.sqrt(np.prod(np.linalg.norm(matrix[:, :2], axis=0)))
-        # Both columns are images of orthogonal directions of equal length.
-        rows += [first[:2] @ second[:2], first[:2] @ first[:2] - second[:2] @ second[:2]]
-        right += [-first[2] * second[2], second[2] ** 2 - first[2] ** 2]
-    x, y = np.array(rows), np.array(right)
-    inverse = float(x @ y / (x @ x)) if len(x) and x @ x > 0 else 0.0
-    focal = 1 / np.sqrt(inverse) if inverse > 0 else 0.0
+def _focal_px(points: Points, size: tuple[int, int]) -> float:
+    """One focal length for both axes by the views' vanishing points; where they give none, that of a common lens."""
+    views = [points.view == k for k in range(len(points.names))]
+    board = [(points.board[mine] * np.array([1.0, 1.0, 0.0])).astype(np.float32) for mine in views]
+    image = [points.image[mine].astype(np.float32) for mine in views]
+    focal, usual = float(cv2.initCameraMatrix2D(board, image, size, 1.0)[0, 0]), float(max(size))
     # Others are no lenses that the model describes.
-    return float(focal * unit) if 0.15 <= focal <= 30.0 else None
+    return focal if 0.15 * usual <= focal <= 30.0 * usual else usual
 
 
 def settle(

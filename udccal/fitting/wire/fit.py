@@ -68,10 +68,10 @@ def fit_wire(data: WireData, rules: WireRules | None = None) -> FitResult[Wire]:
         tested = weighed_at(joint.parameters, joint.x, others, noise)
     joint = replace(joint, x=mean_one(joint.parameters, joint.x, data.geometry, shape))
     jacobian, wire = map_jacobian(joint.parameters, joint.x, data.geometry, shape), joint.parameters.wire(joint.x)
-    off = misfit(tested, wire if found.present else None, jacobian.sigma(joint.cov), held_out)
+    off = misfit(tested, wire if joint.parameters.panel else None, jacobian.sigma(joint.cov), held_out)
     if off.test.found:
         joint = replace(joint, cov=clustered_cov(joint.cov, joint.by_tile))
-    if found.present:
+    if joint.parameters.panel:
         missing = omitted(data.start, wire, joint.seen, rules)
         left_out = missing.sigma if missing else 0.0
     else:
@@ -113,9 +113,9 @@ def _unusable(data: WireData, means: Float[np.ndarray, "4"], rules: WireRules) -
 
 def _joint(found: Found, every: Pixels, data: WireData, noise: FlatNoise, rules: WireRules) -> Joint:
     """Choose the columns that the data ask for, and fit them with the shape until nothing moves."""
-    wire, gains = found.descent.wire, found.descent.gains
-    bounds = possible_harmonics(data.start, rules.least_amplitude).bounds if found.present else np.zeros(0)
-    full = parameters_of(wire, rules, bounds, found.present)
+    wire, gains, panel = found.descent.wire, found.descent.gains, found.descent.problem.parameters.panel
+    bounds = possible_harmonics(data.start, rules.least_amplitude).bounds
+    full = parameters_of(wire, rules, bounds if panel else (), panel)
     prior, x = full.prior(data.start, rules), full.vector(wire, gains)
     pixels = found.descent.weighs(every, noise)
     here = WireProblem("wire, orders", full, pixels, prior).equations_at(x)

@@ -151,18 +151,10 @@ def unseen(harmonics: Harmonics, searched: Pixels, rules: WireRules) -> float:
 @final
 @dataclass(frozen=True)
 class Joint:
-    """A fitted wire, and what tells how sure it is.
+    """A fitted wire: the parameters kept, their values and covariance, and how it was fitted.
 
-    Attributes:
-        parameters: those kept, of all orders of ``orders``.
-        x: their values.
-        cov: theirs, misfit included where it was found.
-        prior: of the same.
-        variance: of the residuals, in units of what noise makes.
-        seen: the pixels of the fit, weighed by the fitted wire.
-        by_tile: each tile's part of the score.
-        converged, iterations: of the descents.
-        gain: chi-squared that the rows' first harmonic explained in the scan.
+    ``variance`` is that of the residuals in units of what noise makes, ``seen`` the pixels of the fit, weighed by it,
+    ``by_tile`` each tile's part of the score, ``gain`` the chi-squared that the rows explained in the scan.
     """
 
     parameters: Parameters
@@ -265,12 +257,12 @@ def _notes(joint: Joint, found: Misfit, left_out: float, rules: WireRules) -> It
         if left_out > 0:
             yield (
                 f"These flats are too noisy to tell: rows may modulate by {100 * left_out:.2g} % unseen, which "
-                "the stated sigmas include. Average more frames, or expose longer."
+                "the sigmas include. Average more frames, or expose longer."
             )
     if found.test.found:
         yield (
             f"The residuals are patterned (p = {found.test.p_value:.1g}): the model may be {100 * found.sigma:.3f} % "
-            "off, which the stated sigmas include."
+            "off, which the sigmas include."
         )
     if joint.impossible:
         yield "An opening came out wider than its period: check panel, pitch and lens in the rig description."

@@ -59,7 +59,6 @@ class Found:
     descent: Descent
     searched: Pixels
     gain: float
-    present: bool
 
 
 @final
@@ -87,13 +86,13 @@ class Search:
             if gain >= self.rules.least_gain:
                 break
         else:
-            return Found(bare, sample, gain, False)
+            return Found(bare, sample, gain)
         rivals = self._search(places, bare, strongest, sample)
         weights, finished = rivals[0].weighs(many, self.noise), []
         for one in rivals:
             wire = with_harmonics(_best_columns(one, weights, self.start.column_open), harmonics, few.ideal)
             finished.append(self._descent(wire, one.gains, weights, SOLVER))
-        return Found(_rivals(finished, self.rules.rival)[0], sample, gain, True)
+        return Found(_rivals(finished, self.rules.rival)[0], sample, gain)
 
     def _shading(self, built: Wire, sample: Pixels) -> Descent:
         """Without any panel: no waves, and nothing that narrows with obliquity."""
@@ -131,7 +130,7 @@ class Search:
             return rivals
         room = np.zeros((min(count, len(harmonics)), 2, degree + 1, degree + 1))
         other = self._descent(replace(best.wire, amplitudes=room), best.gains, sample, SOLVER)
-        # Chance, and noise that is somewhat larger than stated, must not bring so many parameters in.
+        # Chance, and noise that is somewhat larger than given, must not bring so many parameters in.
         return [other] if other.variance < 0.95 * variance else rivals
 
     def _descent(self, wire: Wire, gains: Float[np.ndarray, "4"], pixels: Pixels, rules: SolverRules) -> Descent:
