@@ -90,7 +90,7 @@ class GeometryRules:
 @final
 @dataclass(frozen=True)
 class Intrinsics:
-    """A lens, or one number (a sigma, whether it is fitted) of each of its nine.
+    """A lens, or something else (a sigma, a row of a matrix) of each of its nine numbers.
 
     ``of`` and ``vector`` alone know where each is in a vector, whose order is ``INTRINSIC_NAMES``.
 

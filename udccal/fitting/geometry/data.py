@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float
 from udccal.arrangements import BoardSpec
 from udccal.fitting.engine.gaussian import Prior
 from udccal.fitting.geometry.bundle import GeometryRules, Intrinsics
-from udccal.fitting.geometry.corners import BoardCorners, Luminance, detect_corners, luminance, sites
+from udccal.fitting.geometry.corners import BoardCorners, detect_corners, luminance, sites
 from udccal.fitting.nominal import nominal_geometry
 from udccal.models.geometry import Geometry
 from udccal.models.noise import Noise, variance_e
@@ -151,24 +151,15 @@ def _read_view(
     mean = session.frame(capture) if capture.kind == "frame" else session.average(capture).mean
     spec = BoardSpec(subject.columns, subject.rows, subject.square_mm, subject.marker_mm, subject.dictionary)
     light = mean.astype(np.float64) - float(np.asarray(noise.black_DN))
-    variance, area = _temporal_variance_DN2(noise, light, capture), capture.region
+    area, offsets_DN = capture.region, float(np.asarray(noise.K_DN_per_e)) * float(np.asarray(noise.DSNU1288_e))
+    variance = _temporal_variance_DN2(noise, light, capture) + offsets_DN**2
     part = np.s_[area.y : area.y + area.rows, area.x : area.x + area.columns]
-    crop = None if flat is None else FlatField(flat.response[part], flat.relative_variance[part])
-    corners = detect_corners(_evened(light, variance, noise, crop), spec, rules)
+    # As even pixels would see it; noise of pixels that stay unequal adds to the temporal noise.
+    response, unequal = np.ones_like(light), np.full_like(light, float(np.asarray(noise.PRNU1288)) ** 2)
+    if flat is not None:
+        response, unequal = flat.response[part], flat.relative_variance[part]
+    even = light / response
+    corners = detect_corners(luminance(even, variance / response**2 + unequal * even**2), spec, rules)
     moved = BoardCorners(corners.ids, corners.xy + np.array([area.x, area.y], dtype=np.float64), corners.sigma)
     clipped = float(np.mean(mean >= rules.clipped * float(np.asarray(noise.saturation_DN))))
     return BoardView(step.id, spec, subject.parallel_to_panel, moved, clipped)
-
-
-def _evened(
-    light: Float[np.ndarray, "rows columns"],
-    temporal: Float[np.ndarray, "rows columns"],
-    noise: Noise,
-    flat: FlatField | None,
-) -> Luminance:
-    """As even pixels would see it; noise of pixels that stay unequal adds to the temporal noise."""
-    offsets = (float(np.asarray(noise.K_DN_per_e)) * float(np.asarray(noise.DSNU1288_e))) ** 2
-    if flat is None:
-        return luminance(light, temporal + offsets + (float(np.asarray(noise.PRNU1288)) * light) ** 2)
-    even = light / flat.response
-    return luminance(even, (temporal + offsets) / flat.response**2 + flat.relative_variance * even**2)
