@@ -47,9 +47,9 @@ class Panel(_Strict):
     columns: Annotated[int, Field(ge=8, le=16384)]
     rows: Annotated[int, Field(ge=8, le=16384)]
     pitch_mm: Annotated[Nominal, _within(0.001, 100.0)]
-    row_open_fraction: Annotated[Nominal, _within(0.001, 1.0)]
-    column_open_fraction: Annotated[Nominal, _within(0.001, 1.0)]
-    structure_thickness_mm: Annotated[Nominal, _within(0.0, 100.0)]
+    row_open: Annotated[Nominal, _within(0.001, 1.0)]
+    column_open: Annotated[Nominal, _within(0.001, 1.0)]
+    depth_mm: Annotated[Nominal, _within(0.0, 100.0)]
     glass_thickness_mm: Annotated[float, Field(gt=0, le=20)]
     glass_index: Annotated[float, Field(ge=1, le=2.5)]
     gamma: Annotated[Nominal, _within(0.1, 10.0)]
@@ -147,7 +147,7 @@ class RigDescription(_Strict):
         return self.lens.focal_mm.value * 1000.0 / self.camera.pitch_um
 
     @property
-    def pupil_mm(self) -> float:
+    def pupil_diameter_mm(self) -> float:
         """Nominal entrance-pupil diameter."""
         return self.lens.focal_mm.value / self.lens.f_number.value
 

@@ -19,7 +19,7 @@ _SUFFIXES = (
     ("_s", "s"),
 )
 # The parameters of Geometry, whose names are OpenCV's and carry no unit.
-_NAMED = {"focal": "px", "centre": "px", "distortion": "1", "rotation": "rad", "pupil": "mm"}
+_NAMED = {"focal": "px", "centre": "px", "distortion": "1", "rotation": "rad", "pupil_mm": "mm"}
 
 
 def unit_of(name: str) -> str:

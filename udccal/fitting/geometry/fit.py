@@ -173,7 +173,7 @@ def _choose_order(full: Solved, points: Points, prior: Prior, rules: GeometryRul
         criterion = _criterion(solved, points, parameters) + 2 * place * np.log(rules.further_order)
         tried.insert(0, Attempt(name, parameters, float(criterion), solved))
     known = Intrinsics.of(np.diag(full.equations.cov()) * np.diag(prior.precision))
-    by_prior = bool(max(*known.focal, *known.centre) > rules.prior_share)
+    by_prior = bool(max(*known.focal_px, *known.principal_point_px) > rules.prior_share)
     return (Choice(tried[-1], tuple(tried)) if by_prior else choose(tried)), by_prior
 
 
@@ -203,8 +203,8 @@ def _status(
 ) -> tuple[FitStatus, tuple[str, ...]]:
     """Whether the views determine the lens; else what to capture."""
     sigma, lens = Intrinsics.of(np.sqrt(np.diag(cov))), Intrinsics.of(solved.place.intrinsics)
-    by_focal = float(np.max(sigma.focal / np.abs(lens.focal)))
-    by_centre = float(np.max(sigma.centre)) / image_size[0]
+    by_focal = float(np.max(sigma.focal_px / np.abs(lens.focal_px)))
+    by_centre = float(np.max(sigma.principal_point_px)) / image_size[0]
     if max(by_focal, by_centre) > rules.most_uncertain:
         what = "focal length" if by_focal > by_centre else "centre of the picture"
         return FitStatus.TOO_FEW_DATA, (

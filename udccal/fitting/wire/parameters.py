@@ -19,8 +19,15 @@ from udccal.fitting.wire.rules import WireRules, WireStart, ideal_wire
 from udccal.models.wire import Wire
 
 SHAPE_NAMES = (
-    *("rotation_x_deg", "rotation_y_deg", "rotation_z_deg", "standoff_per_pitch", "offset_x", "offset_y"),
-    *("pupil_per_pitch", "row_open", "column_open", "depth_per_pitch"),
+    *(
+        "rotation_x_deg",
+        "rotation_y_deg",
+        "rotation_z_deg",
+        "standoff_per_pitch",
+        "offset_x_periods",
+        "offset_y_periods",
+    ),
+    *("footprint_per_pitch", "row_open", "column_open", "depth_per_pitch"),
 )
 SHAPE_UNITS = ("deg", "deg", "deg", "1", "period", "period", "1", "1", "1", "1")
 
@@ -28,7 +35,13 @@ SHAPE_UNITS = ("deg", "deg", "deg", "1", "period", "period", "1", "1", "1", "1")
 def shape_vector(wire: Wire) -> Float[Array, "10"]:
     """Rotation (3, rad), log stand-off, offset (2), log pupil, row and column openings, depth."""
     lengths = wire.row_open, wire.column_open, wire.depth_per_pitch
-    parts = wire.rotation, jnp.log(wire.standoff_per_pitch), wire.offset, jnp.log(wire.pupil_per_pitch), *lengths
+    parts = (
+        wire.rotation_rad,
+        jnp.log(wire.standoff_per_pitch),
+        wire.offset_periods,
+        jnp.log(wire.footprint_per_pitch),
+        *lengths,
+    )
     return jnp.concatenate([jnp.atleast_1d(jnp.asarray(part)) for part in parts])
 
 
@@ -36,10 +49,10 @@ def with_shape(wire: Wire, shape: Float[np.ndarray, "10"] | Float[Array, "10"]) 
     """The wire with other shape parameters, in the order of ``shape_vector``."""
     return replace(
         wire,
-        rotation=shape[:3],
+        rotation_rad=shape[:3],
         standoff_per_pitch=jnp.exp(shape[3]),
-        offset=shape[4:6],
-        pupil_per_pitch=jnp.exp(shape[6]),
+        offset_periods=shape[4:6],
+        footprint_per_pitch=jnp.exp(shape[6]),
         row_open=shape[7],
         column_open=shape[8],
         depth_per_pitch=shape[9],
@@ -127,7 +140,9 @@ class Parameters:
 
     def prior(self, start: WireStart, rules: WireRules) -> Prior:
         """From the rig description, widened; of the origin no more is known than where ``nothing`` has it."""
-        built = replace(ideal_wire(self.nothing.geometry, start, np.zeros((0, 2))), offset=self.nothing.offset)
+        built = replace(
+            ideal_wire(self.nothing.geometry, start, np.zeros((0, 2))), offset_periods=self.nothing.offset_periods
+        )
         mean, shape = self.vector(self.nothing, np.ones(SITES)), self.indices(Kind.SHAPE)[0]
         sigma = np.array([np.inf, np.inf, rules.amplitude_sigma, rules.field_sigma, np.nan])[self.columns[:, 0]]
         mean[self.linear :] = np.asarray(shape_vector(built))[shape]

@@ -79,7 +79,7 @@ class WireStart:
 
     standoff_per_pitch: float
     standoff_tolerance: float
-    pupil_per_pitch: float
+    footprint_per_pitch: float
     pupil_tolerance: float
     row_open: float
     row_tolerance: float
@@ -92,19 +92,19 @@ class WireStart:
 def wire_start(rig: RigDescription) -> WireStart:
     """Start values of a rig description."""
     panel, lens, standoff = rig.panel, rig.lens, rig.mounting.standoff_mm
-    pitch, depth = panel.pitch_mm.value, panel.structure_thickness_mm
+    pitch, depth = panel.pitch_mm.value, panel.depth_mm
     pitch_tolerance = panel.pitch_mm.tolerance / pitch
     lens_tolerance = lens.focal_mm.tolerance / lens.focal_mm.value + lens.f_number.tolerance / lens.f_number.value
     return WireStart(
         standoff_per_pitch=standoff.value / pitch,
         standoff_tolerance=standoff.tolerance / standoff.value + pitch_tolerance,
         # The beam narrows a little from the pupil to the panel on its way to the focus distance.
-        pupil_per_pitch=rig.pupil_mm * (1 - standoff.value / lens.focus_mm) / pitch,
+        footprint_per_pitch=rig.pupil_diameter_mm * (1 - standoff.value / lens.focus_mm) / pitch,
         pupil_tolerance=lens_tolerance + pitch_tolerance,
-        row_open=panel.row_open_fraction.value,
-        row_tolerance=panel.row_open_fraction.tolerance,
-        column_open=panel.column_open_fraction.value,
-        column_tolerance=panel.column_open_fraction.tolerance,
+        row_open=panel.row_open.value,
+        row_tolerance=panel.row_open.tolerance,
+        column_open=panel.column_open.value,
+        column_tolerance=panel.column_open.tolerance,
         depth_per_pitch=depth.value / pitch,
         depth_tolerance=depth.tolerance / pitch,
     )
@@ -128,7 +128,7 @@ def possible_harmonics(start: WireStart, least: float | None = None, below: floa
     orders = np.arange(HIGHEST_ORDER + 1.0)
     m, n = (part.ravel() for part in np.meshgrid(orders, np.concatenate([-orders[:0:-1], orders]), indexing="ij"))
     n, m = n[(m > 0) | (n > 0)], m[(m > 0) | (n > 0)]
-    z = np.pi * start.pupil_per_pitch * np.hypot(n, m)
+    z = np.pi * start.footprint_per_pitch * np.hypot(n, m)
     size = np.where((n != 0) & (m != 0), 0.5, 1.0) * np.minimum(1.0, 2 * np.sqrt(2 / np.pi) / z**1.5)
     for order, opening in ((m, start.row_open), (np.abs(n), start.column_open)):
         slit = np.minimum(2.0 / (np.pi * np.maximum(order, 1) * opening), 2.0 * (1 - opening) / opening)
@@ -146,10 +146,10 @@ def ideal_wire(
     fields[:, 0, 0, 0] = 1.0
     return Wire(
         geometry=geometry,
-        rotation=np.zeros(3),
+        rotation_rad=np.zeros(3),
         standoff_per_pitch=np.float64(start.standoff_per_pitch),
-        offset=np.zeros(2),
-        pupil_per_pitch=np.float64(start.pupil_per_pitch),
+        offset_periods=np.zeros(2),
+        footprint_per_pitch=np.float64(start.footprint_per_pitch),
         row_open=np.float64(start.row_open),
         column_open=np.float64(start.column_open),
         depth_per_pitch=np.float64(start.depth_per_pitch),

@@ -146,7 +146,7 @@ def _best_columns(descent: Descent, pixels: Pixels, column_open: float) -> Wire:
     In few pixels, faint columns may have been seen half a period off, with openings wider than their period.
     """
     wire = replace(descent.wire, column_open=np.float64(column_open))
-    shifted = [replace(wire, offset=np.asarray(wire.offset) + np.array([k / 8, 0.0])) for k in range(8)]
+    shifted = [replace(wire, offset_periods=np.asarray(wire.offset_periods) + np.array([k / 8, 0.0])) for k in range(8)]
     errors = (pixels.value - expected_of(one, descent.gains, pixels) for one in shifted)
     return shifted[int(np.argmin([np.sum(error**2 * pixels.weight) for error in errors]))]
 
@@ -168,10 +168,10 @@ def scan_rows(
     """
     rays, sigma = rays_at(wire, pixels.ideal), shape_sigma(start, rules)
     half_field = max(float(np.ptp(rays.periods[1])) / 2, 1.0)
-    z = max(np.pi * start.pupil_per_pitch * float(np.sqrt(np.max(rays.ellipse[2]))), 1.0)
+    z = max(np.pi * start.footprint_per_pitch * float(np.sqrt(np.max(rays.ellipse[2]))), 1.0)
     step, step_z = rules.scan_steps
     off = _trials(rules.scan_range, step / half_field, 2500), _trials(rules.scan_range, step_z / z, 80)
-    standoffs, pupils = start.standoff_per_pitch * np.exp(off[0]), start.pupil_per_pitch * np.exp(off[1])
+    standoffs, pupils = start.standoff_per_pitch * np.exp(off[0]), start.footprint_per_pitch * np.exp(off[1])
     gain, angle = _demodulate(wire, gains, pixels, 1, standoffs, pupils)
     unlikely = (off[0] / sigma[3])[:, None] ** 2 + (off[1] / sigma[6]) ** 2
     score = np.where(gain > 0, gain - np.minimum(unlikely, 0.5 * gain), 0.0)
@@ -187,14 +187,14 @@ def beside(place: Wire) -> list[Wire]:
 
     In the pupil's transform a period of diameter is one zero more, or less, for a pupil of several periods.
     """
-    pupil, standoff = float(place.pupil_per_pitch), float(place.standoff_per_pitch)
-    angle = 2 * np.pi * (float(np.asarray(place.offset)[1]) + 0.5)
+    pupil, standoff = float(place.footprint_per_pitch), float(place.standoff_per_pitch)
+    angle = 2 * np.pi * (float(np.asarray(place.offset_periods)[1]) + 0.5)
     return [_placed(place, standoff, size, 1, angle) for size in (pupil - 1.0, pupil + 1.0) if size > 1.0]
 
 
 def scan_columns(wire: Wire, gains: Float[np.ndarray, "4"], pixels: Pixels) -> Wire:
     """The origin along X from the columns' first harmonic; the rest is known from the rows."""
-    standoff, pupil = float(wire.standoff_per_pitch), float(wire.pupil_per_pitch)
+    standoff, pupil = float(wire.standoff_per_pitch), float(wire.footprint_per_pitch)
     _gain, angle = _demodulate(wire, gains, pixels, 0, np.array([standoff]), np.array([pupil]))
     return _placed(wire, standoff, pupil, 0, angle[0, 0])
 
@@ -222,7 +222,7 @@ def _demodulate(
     errors = (pixels.value / level - whole) * root
     variance = max(float(np.sum(errors**2)) / max(pixels.used, 1), 1e-300)
     rays = rays_at(wire, pixels.ideal)
-    slope = (rays.periods[axis] - np.asarray(wire.offset)[axis]) / float(wire.standoff_per_pitch)
+    slope = (rays.periods[axis] - np.asarray(wire.offset_periods)[axis]) / float(wire.standoff_per_pitch)
     z = np.pi * pupils[:, None] * np.sqrt(rays.ellipse[2 * axis])
     sizes = root * 2.0 * np.sinc(rays.openings[axis]) * 2.0 * j1(z) / z
     power = np.maximum(np.sum(sizes**2, axis=1), 1e-300)
@@ -233,6 +233,8 @@ def _demodulate(
 
 
 def _placed(wire: Wire, standoff: float, pupil: float, axis: int, angle: float) -> Wire:
-    offset = np.array(wire.offset, dtype=np.float64)
+    offset = np.array(wire.offset_periods, dtype=np.float64)
     offset[axis] = float(angle) / (2 * np.pi)
-    return replace(wire, standoff_per_pitch=np.float64(standoff), pupil_per_pitch=np.float64(pupil), offset=offset)
+    return replace(
+        wire, standoff_per_pitch=np.float64(standoff), footprint_per_pitch=np.float64(pupil), offset_periods=offset
+    )
