@@ -6,11 +6,12 @@ import os
 import tomllib
 from importlib import resources
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from udccal.errors import RigError
+from udccal.rig_versions import present_rig
 
 CfaPattern = Literal["RGGB", "BGGR", "GRBG", "GBRG"]
 _MAX_TOML_BYTES = 64 * 1024
@@ -47,9 +48,9 @@ class Panel(_Strict):
     columns: Annotated[int, Field(ge=8, le=16384)]
     rows: Annotated[int, Field(ge=8, le=16384)]
     pitch_mm: Annotated[Nominal, _within(0.001, 100.0)]
-    row_open_fraction: Annotated[Nominal, _within(0.001, 1.0)]
-    column_open_fraction: Annotated[Nominal, _within(0.001, 1.0)]
-    structure_thickness_mm: Annotated[Nominal, _within(0.0, 100.0)]
+    row_open: Annotated[Nominal, _within(0.001, 1.0)]
+    column_open: Annotated[Nominal, _within(0.001, 1.0)]
+    depth_mm: Annotated[Nominal, _within(0.0, 100.0)]
     glass_thickness_mm: Annotated[float, Field(gt=0, le=20)]
     glass_index: Annotated[float, Field(ge=1, le=2.5)]
     gamma: Annotated[Nominal, _within(0.1, 10.0)]
@@ -129,10 +130,10 @@ class View(_Strict):
 
 
 class RigDescription(_Strict):
-    """One rig as it was built to be."""
+    """One rig as it was built to be. Older versions are read too, from files, sessions and profiles alike."""
 
     format: Literal["udccal-rig"]
-    version: Literal[1]
+    version: Literal[2]
     name: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9._-]{0,63}$")]
     panel: Panel
     camera: Camera
@@ -141,13 +142,18 @@ class RigDescription(_Strict):
     captures: Captures
     view: View
 
+    @model_validator(mode="before")
+    @classmethod
+    def _of_present_version(cls, found: Any) -> Any:
+        return present_rig(found)
+
     @property
     def focal_px(self) -> float:
         """Nominal focal length in sensor pixels."""
         return self.lens.focal_mm.value * 1000.0 / self.camera.pitch_um
 
     @property
-    def pupil_mm(self) -> float:
+    def pupil_diameter_mm(self) -> float:
         """Nominal entrance-pupil diameter."""
         return self.lens.focal_mm.value / self.lens.f_number.value
 

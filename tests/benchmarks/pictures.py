@@ -84,7 +84,7 @@ class PictureBench:
 
     def _shot(self, index: int, scene: Scene) -> Shot:
         view = self._restorer.view
-        centre = (float(np.asarray(view.centre)[0]), float(np.asarray(view.centre)[1]))
+        centre = (float(np.asarray(view.principal_point_px)[0]), float(np.asarray(view.principal_point_px)[1]))
         photograph = Photograph(scene.radiance, _WIDTH_MM, _DISTANCE_MM)
         ideal = ideal_view(self._truth, photograph, float(view.focal_px), centre, view.columns, view.rows)
         gain = display_exposure(ideal)

@@ -20,18 +20,18 @@ def term(columns: int = 64, rows: int = 48, step: int = 4) -> b.Backscatter:
     )
     return b.Backscatter(
         geometry=Geometry(
-            focal=np.array([54.0, 54.0]),
-            centre=np.array([31.5, 23.5]),
+            focal_px=np.array([54.0, 54.0]),
+            principal_point_px=np.array([31.5, 23.5]),
             distortion=np.array([-0.07, 0.03, 0.0, 0.0, 0.0]),
-            rotation=np.array([-0.3, 0.02, 0.01]),
-            pupil=np.array([50.0, 30.0, -14.0]),
+            rotation_rad=np.array([-0.3, 0.02, 0.01]),
+            pupil_mm=np.array([50.0, 30.0, -14.0]),
         ),
         mask=mask,
         mix=np.array([[0.8, 0.15, 0.05], [0.1, 0.8, 0.1], [0.02, 0.18, 0.8]]),
         gamma=np.float64(2.2),
         pitch_mm=np.float64(0.63),
-        pupil_mm=np.float64(3.2),
-        distance_mm=np.float64(14.3),
+        pupil_diameter_mm=np.float64(3.2),
+        standoff_mm=np.float64(14.3),
         emitters_px=np.array([[-0.3, 0.5], [0.0, 0.5], [0.3, 0.5]]),
         softness_px=np.float64(0.1),
         reflection=np.float64(0.6),
@@ -82,11 +82,11 @@ def test_the_footprint_is_where_rays_from_the_pupil_meet_the_panel() -> None:
     with jax.enable_x64(True):
         centre, shape = (np.asarray(a) for a in b.footprints(one, b.panel_directions(one.geometry, pixels), 14.3))
         rays = np.asarray(b.panel_directions(one.geometry, pixels))
-        rotation = np.asarray(b.rotation_matrix(one.geometry.rotation))
+        rotation = np.asarray(b.rotation_matrix(one.geometry.rotation_rad))
     angles = np.linspace(0, 2 * np.pi, 12)
     rim = np.stack([np.cos(angles), np.sin(angles)])
     for ray, middle, ellipse in zip(rays, centre, shape, strict=True):
-        start = one.geometry.pupil + (rotation[:, :2] @ rim).T * 1.6
+        start = one.geometry.pupil_mm + (rotation[:, :2] @ rim).T * 1.6
         start[:, 2] += 14.0 - 14.3
         met = start - ray * (start[:, 2:] / ray[2])
         np.testing.assert_allclose((middle + (ellipse @ rim).T) * 0.63, met[:, :2], atol=1e-9)
@@ -147,7 +147,7 @@ def test_interpolation_from_the_grid_keeps_a_slanted_plane() -> None:
 def test_a_long_grid_compiled_is_the_same_as_step_by_step() -> None:
     """Some versions of jaxlib miscompile small matrix products over more than 16384 positions."""
     large = term(columns=512, rows=384, step=2)
-    wider = replace(large.geometry, focal=np.array([430.0, 430.0]), centre=np.array([255.0, 191.0]))
+    wider = replace(large.geometry, focal_px=np.array([430.0, 430.0]), principal_point_px=np.array([255.0, 191.0]))
     large = replace(large, geometry=wider)
     picture = np.random.default_rng(0).integers(0, 256, (PANEL_ROWS, PANEL_COLUMNS, 3)).astype(np.uint8)
     with jax.enable_x64(True):

@@ -10,11 +10,11 @@ from udccal.models import geometry as g
 from udccal.numerics import in_float64
 
 GEOMETRY = g.Geometry(
-    focal=np.array([1740.0, 1741.0]),
-    centre=np.array([1020.0, 770.0]),
+    focal_px=np.array([1740.0, 1741.0]),
+    principal_point_px=np.array([1020.0, 770.0]),
     distortion=np.array([-0.07, 0.03, 3e-4, -2e-4, -0.006]),
-    rotation=np.array([-0.3, 0.02, 0.01]),
-    pupil=np.array([600.0, 190.0, -14.0]),
+    rotation_rad=np.array([-0.3, 0.02, 0.01]),
+    pupil_mm=np.array([600.0, 190.0, -14.0]),
 )
 
 
@@ -29,8 +29,8 @@ def projected(geometry: g.Geometry, points: np.ndarray) -> np.ndarray:
 
 
 def opencv(points: np.ndarray) -> np.ndarray:
-    fx, fy = GEOMETRY.focal
-    cx, cy = GEOMETRY.centre
+    fx, fy = GEOMETRY.focal_px
+    cx, cy = GEOMETRY.principal_point_px
     matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
     seen, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), matrix, GEOMETRY.distortion)
     return seen.reshape(-1, 2)
@@ -44,7 +44,11 @@ def test_projection_is_that_of_opencv() -> None:
 def test_exchanged_tangential_terms_do_not_pass_for_opencv() -> None:
     k1, k2, p1, p2, k3 = GEOMETRY.distortion
     wrong = g.Geometry(
-        GEOMETRY.focal, GEOMETRY.centre, np.array([k1, k2, p2, p1, k3]), GEOMETRY.rotation, GEOMETRY.pupil
+        GEOMETRY.focal_px,
+        GEOMETRY.principal_point_px,
+        np.array([k1, k2, p2, p1, k3]),
+        GEOMETRY.rotation_rad,
+        GEOMETRY.pupil_mm,
     )
     points = np.random.default_rng(0).uniform([-500, -400, 900], [500, 400, 1500], (50, 3))
     assert np.abs(projected(wrong, points) - opencv(points)).max() > 0.05
@@ -94,12 +98,14 @@ def test_a_ray_meets_the_panel_in_front_of_the_pupil() -> None:
         point = np.asarray(g.panel_points_mm(GEOMETRY, pixels()))
         rays = np.asarray(g.panel_directions(GEOMETRY, pixels()))
     distance = 14.0 / rays[:, 2]
-    np.testing.assert_allclose(point, GEOMETRY.pupil[:2] + rays[:, :2] * distance[:, None], atol=1e-9)
+    np.testing.assert_allclose(point, GEOMETRY.pupil_mm[:2] + rays[:, :2] * distance[:, None], atol=1e-9)
 
 
 def test_without_distortion_the_virtual_view_is_a_homography() -> None:
-    plain = g.Geometry(GEOMETRY.focal, GEOMETRY.centre, np.zeros(5), GEOMETRY.rotation, GEOMETRY.pupil)
-    view = g.VirtualView(columns=1920, rows=1080, focal_px=1700.0, centre=np.array([950.0, 100.0]))
+    plain = g.Geometry(
+        GEOMETRY.focal_px, GEOMETRY.principal_point_px, np.zeros(5), GEOMETRY.rotation_rad, GEOMETRY.pupil_mm
+    )
+    view = g.VirtualView(columns=1920, rows=1080, focal_px=1700.0, principal_point_px=np.array([950.0, 100.0]))
     points = np.array([[10.0, 20.0], [1900.0, 30.0], [700.0, 1000.0]])
     with jax.enable_x64(True):
         sensor = np.asarray(g.view_to_sensor(plain, view, points))

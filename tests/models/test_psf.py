@@ -33,20 +33,20 @@ def true_field(truth: RigTruth) -> PsfField:
     """The model with the simulator's own numbers."""
     optics, panel, spectrum = truth.optics, truth.panel, camera_spectrum(truth)
     geometry = Geometry(
-        focal=np.array([optics.fx_px, optics.fy_px]),
-        centre=np.array([optics.cx_px, optics.cy_px]),
+        focal_px=np.array([optics.fx_px, optics.fy_px]),
+        principal_point_px=np.array([optics.cx_px, optics.cy_px]),
         distortion=np.array(optics.distortion),
-        rotation=Rotation.from_matrix(optics.R_panel_camera).as_rotvec(),
-        pupil=optics.pupil_mm,
+        rotation_rad=Rotation.from_matrix(optics.R_panel_camera).as_rotvec(),
+        pupil_mm=optics.pupil_mm,
     )
     diffraction = Diffraction(
         pitch_mm=np.float64(panel.pitch_mm),
-        open_fraction=np.array([panel.column_open, panel.row_open]),
-        thickness_mm=np.float64(panel.structure_thickness_mm),
-        pupil_mm=np.float64(optics.pupil_diameter_mm),
+        openings=np.array([panel.column_open, panel.row_open]),
+        depth_mm=np.float64(panel.depth_mm),
+        pupil_diameter_mm=np.float64(optics.pupil_diameter_mm),
         blur_px=np.float64(0.0),
-        offset=optics.pupil_mm[:2] / panel.pitch_mm,
-        standoff_per_pitch=np.float64((panel.structure_thickness_mm / 2 - optics.pupil_mm[2]) / panel.pitch_mm),
+        offset_periods=optics.pupil_mm[:2] / panel.pitch_mm,
+        standoff_per_pitch=np.float64((panel.depth_mm / 2 - optics.pupil_mm[2]) / panel.pitch_mm),
         visibility=np.float64(1.0),
         wavelengths_nm=spectrum.wavelengths_nm,
         spectrum=spectrum.weights,
@@ -54,7 +54,7 @@ def true_field(truth: RigTruth) -> PsfField:
     return PsfField(
         geometry=geometry,
         diffraction=diffraction,
-        diffraction_share=np.float64(1.0),
+        diffraction_fraction=np.float64(1.0),
         residual=np.zeros((1, 3, 1, 1)),
         centre_px=np.array([511.5, 383.5]),
         half_px=np.array([511.5, 383.5]),
@@ -130,7 +130,7 @@ def test_kernels_agree_with_wave_optics(truth: RigTruth) -> None:
     assert relative_l2(found, expected).max() < 0.02
     bright = expected > 1e-3 * expected.max(axis=(2, 3), keepdims=True)
     assert np.sqrt((((found - expected) / expected)[bright] ** 2).mean()) < 0.08
-    wrong = replace(field, diffraction=replace(field.diffraction, open_fraction=np.array([0.94, 0.5])))
+    wrong = replace(field, diffraction=replace(field.diffraction, openings=np.array([0.94, 0.5])))
     assert relative_l2(as_numpy(lambda p: psf_kernels(wrong, p, ROWS, COLUMNS))(positions), expected).min() > 0.05
 
 
@@ -142,7 +142,7 @@ def test_the_residual_follows_its_polynomial_and_is_cut_or_padded(truth: RigTrut
     residual = np.zeros((3, 3, 5, 5))
     residual[0, :, 2, 2] = 1.0
     residual[1, :, 2, 4] = 0.5
-    field = replace(true_field(truth), diffraction_share=np.float64(0.0), residual=residual, degree=1)
+    field = replace(true_field(truth), diffraction_fraction=np.float64(0.0), residual=residual, degree=1)
     places = np.array([[511.5, 383.5], [511.5, 767.0], [1023.0, 383.5]])
     wide = as_numpy(lambda p: psf_kernels(field, p, 7, 7))(places)
     first_order = as_numpy(lambda p: polynomial_basis((p - field.centre_px) / field.half_px, 1))(places)[:, 1]

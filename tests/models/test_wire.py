@@ -22,16 +22,16 @@ def make_wire(pupil: float = 5.0) -> Wire:
     fields[:, 0, 0, 0] = 1.0
     return Wire(
         geometry=Geometry(
-            focal=np.array([60.0, 60.0]),
-            centre=np.array([31.5, 23.5]),
+            focal_px=np.array([60.0, 60.0]),
+            principal_point_px=np.array([31.5, 23.5]),
             distortion=np.array([-0.05, 0.01, 0.0, 0.0, 0.0]),
-            rotation=np.array([-0.3, 0.01, 0.02]),
-            pupil=np.array([10.0, 5.0, -14.0]),
+            rotation_rad=np.array([-0.3, 0.01, 0.02]),
+            pupil_mm=np.array([10.0, 5.0, -14.0]),
         ),
-        rotation=np.zeros(3),
+        rotation_rad=np.zeros(3),
         standoff_per_pitch=22.0,
-        offset=np.array([0.3, 0.7]),
-        pupil_per_pitch=pupil,
+        offset_periods=np.array([0.3, 0.7]),
+        footprint_per_pitch=pupil,
         row_open=0.4,
         column_open=0.9,
         depth_per_pitch=0.05,
@@ -80,7 +80,9 @@ def test_rays_follow_the_geometry() -> None:
 
 def test_kappa_of_a_level_camera_is_the_order() -> None:
     wire = make_wire()
-    level = Geometry(wire.geometry.focal, wire.geometry.centre, np.zeros(5), np.zeros(3), wire.geometry.pupil)
+    level = Geometry(
+        wire.geometry.focal_px, wire.geometry.principal_point_px, np.zeros(5), np.zeros(3), wire.geometry.pupil_mm
+    )
     straight = Wire(**{**wire.__dict__, "geometry": level})
     seen = np.asarray(jax.jit(kappa)(straight, np.zeros((2, 1))))[:, 0]
     assert np.allclose(seen, np.hypot(*np.asarray(wire.harmonics).T), rtol=1e-6)

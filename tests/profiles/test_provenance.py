@@ -12,6 +12,6 @@ def test_a_command_says_nothing_about_the_machine() -> None:
 def test_units_follow_names() -> None:
     assert unit_of("diffraction.pitch_mm") == "mm"
     assert unit_of("fields_px.0") == "px"
-    assert unit_of("geometry.focal") == "px"
+    assert unit_of("geometry.focal_px") == "px"
     assert unit_of("dark_current_e_per_s") == "e-/s"
     assert unit_of("degree") == "1"

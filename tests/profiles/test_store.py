@@ -64,7 +64,7 @@ def test_geometry_is_stored_once(stored: Path) -> None:
 
 def test_a_term_with_another_geometry_keeps_it(tmp_path: Path, toy_profile: Profile) -> None:
     wire = toy_profile.wire.term
-    geometry = type(wire.geometry)(**{**vars(wire.geometry), "pupil": np.array([1.0, 2.0, -3.0])})
+    geometry = type(wire.geometry)(**{**vars(wire.geometry), "pupil_mm": np.array([1.0, 2.0, -3.0])})
     other = type(wire)(**{**vars(wire), "geometry": geometry})
     changed = dataclasses.replace(toy_profile, wire=dataclasses.replace(toy_profile.wire, term=other))
     write_profile(tmp_path / "p", changed)
@@ -131,7 +131,7 @@ DAMAGES: dict[str, tuple[Callable[[Path], object], str]] = {
     "no profile.json": (lambda f: (f / PROFILE_NAME).unlink(), "found none"),
     "cut short": (lambda f: (f / PROFILE_NAME).write_bytes((f / PROFILE_NAME).read_bytes()[:500]), "to be JSON"),
     "not an object": (lambda f: (f / PROFILE_NAME).write_text("[1]"), "JSON object"),
-    "newer": (damaged(lambda d: d.update(version=2)), "newer version 2"),
+    "newer": (damaged(lambda d: d.update(version=3)), "newer version 3"),
     "another format": (damaged(lambda d: d.update(format="udccal-session")), "format 'udccal-profile'"),
     "unknown entry": (damaged(lambda d: d.update(extra=1)), "'extra'"),
     "missing entry": (damaged(lambda d: d.pop("rig")), "'rig'"),
@@ -139,7 +139,7 @@ DAMAGES: dict[str, tuple[Callable[[Path], object], str]] = {
     "wrong type": (damaged(lambda d: parameter(d, "noise", "black_DN").update(value="64")), "value"),
     "missing parameter": (damaged(lambda d: d["terms"]["noise"]["parameters"].pop()), "found none"),
     "unknown parameter": (damaged(lambda d: parameter(d, "noise", "q_DN").update(name="os")), "found none|found also"),
-    "wrong shape": (damaged(lambda d: parameter(d, "geometry", "focal").update(shape=[3])), "3 values"),
+    "wrong shape": (damaged(lambda d: parameter(d, "geometry", "focal_px").update(shape=[3])), "3 values"),
     "another model": (damaged(lambda d: d["terms"]["wire"].update(model="Path")), "found 'Path'"),
     "another nested model": (
         damaged(lambda d: parameter(d, "psf", "diffraction").update(model="Popen")), "found 'Popen'"

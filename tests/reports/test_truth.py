@@ -30,20 +30,22 @@ def test_true_geometry_looks_where_the_simulated_camera_looks(truth: RigTruth) -
 def test_a_perfect_lens_has_no_ray_error_however_it_is_turned(truth: RigTruth) -> None:
     exact = true_geometry(truth)
     assert ray_error_px(exact, truth) < 1e-6
-    turned = Rotation.from_rotvec([0.002, -0.003, 0.004]) * Rotation.from_rotvec(np.asarray(exact.rotation))
-    assert ray_error_px(replace(exact, rotation=turned.as_rotvec()), truth) < 1e-6
+    turned = Rotation.from_rotvec([0.002, -0.003, 0.004]) * Rotation.from_rotvec(np.asarray(exact.rotation_rad))
+    assert ray_error_px(replace(exact, rotation_rad=turned.as_rotvec()), truth) < 1e-6
 
 
 def test_a_wrong_centre_is_forgiven_as_far_as_a_rotation_explains_it(truth: RigTruth) -> None:
     exact = true_geometry(truth)
-    moved = ray_error_px(replace(exact, centre=np.asarray(exact.centre) + np.array([1.0, 0.0])), truth)
+    moved = ray_error_px(
+        replace(exact, principal_point_px=np.asarray(exact.principal_point_px) + np.array([1.0, 0.0])), truth
+    )
     assert 1e-3 < moved < 1.0
 
 
 def test_a_wrong_focal_length_shows(truth: RigTruth) -> None:
     exact = true_geometry(truth)
     # 0.1 % at the edge of the picture, some 600 px from the middle.
-    error = ray_error_px(replace(exact, focal=1.001 * np.asarray(exact.focal)), truth)
+    error = ray_error_px(replace(exact, focal_px=1.001 * np.asarray(exact.focal_px)), truth)
     assert error == pytest.approx(0.55, abs=0.12)
 
 

@@ -30,11 +30,11 @@ def toy_noise() -> Noise:
 @pytest.fixture(scope="session")
 def toy_geometry(toy_rig: RigDescription) -> Geometry:
     return Geometry(
-        focal=np.array([108.7, 108.7]),
-        centre=np.array([(COLUMNS - 1) / 2 + 1.0, (ROWS - 1) / 2 - 1.0]),
+        focal_px=np.array([108.7, 108.7]),
+        principal_point_px=np.array([(COLUMNS - 1) / 2 + 1.0, (ROWS - 1) / 2 - 1.0]),
         distortion=np.array([-0.06, 0.02, 2e-4, -2e-4, -0.005]),
-        rotation=np.array([-0.29, 0.01, 0.02]),
-        pupil=np.array([600.0, 190.0, -14.0]),
+        rotation_rad=np.array([-0.29, 0.01, 0.02]),
+        pupil_mm=np.array([600.0, 190.0, -14.0]),
     )
 
 

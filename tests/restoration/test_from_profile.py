@@ -102,6 +102,6 @@ def test_terms_that_give_no_numbers_are_refused_when_made_ready(profile: Profile
     dark = replace(psf, residual=np.zeros(np.shape(psf.residual)))
     with pytest.raises(RestorationError, match="Expected kernels that sum to 1"):
         Restorer.from_profile(replace(profile, psf=replace(profile.psf, term=dark)), options)
-    nowhere = replace(backscatter, geometry=replace(backscatter.geometry, centre=np.array([np.nan, 0.0])))
+    nowhere = replace(backscatter, geometry=replace(backscatter.geometry, principal_point_px=np.array([np.nan, 0.0])))
     with pytest.raises(RestorationError, match="Expected a footprint"):
         Restorer.from_profile(replace(profile, backscatter=replace(profile.backscatter, term=nowhere)), options)

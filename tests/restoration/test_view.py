@@ -22,7 +22,7 @@ def test_the_view_fills_the_sensor_and_no_more(toy_geometry: Geometry) -> None:
     assert corners_fit(toy_geometry, view, 0.05)
     # Anything a few percent wider, whatever its centre, sticks out on one side or the other.
     for shift in ((0, 0), (1.5, 0), (-1.5, 0), (0, 1.5), (0, -1.5)):
-        wider = VirtualView(96, 54, view.focal_px * 0.95, np.asarray(view.centre) + shift)
+        wider = VirtualView(96, 54, view.focal_px * 0.95, np.asarray(view.principal_point_px) + shift)
         assert not corners_fit(toy_geometry, wider, 0.05)
 
 
@@ -43,7 +43,7 @@ def test_a_rectified_picture_shows_what_the_map_says(toy_geometry: Geometry) -> 
 
 
 def test_a_camera_that_looks_away_is_refused(toy_geometry: Geometry) -> None:
-    away = Geometry(**{**vars(toy_geometry), "rotation": np.array([0.0, 2.5, 0.0])})
+    away = Geometry(**{**vars(toy_geometry), "rotation_rad": np.array([0.0, 2.5, 0.0])})
     with pytest.raises(RestorationError, match="front of the panel"):
         inscribed_view(away, 128, 96, 96, 54)
 
@@ -51,6 +51,6 @@ def test_a_camera_that_looks_away_is_refused(toy_geometry: Geometry) -> None:
 def test_a_view_that_looks_beside_the_sensor_is_refused(toy_geometry: Geometry) -> None:
     view = inscribed_view(toy_geometry, 128, 96, 96, 54)
     Rectification.within(toy_geometry, view, 128, 96)
-    wider = VirtualView(96, 54, view.focal_px * 0.8, view.centre)
+    wider = VirtualView(96, 54, view.focal_px * 0.8, view.principal_point_px)
     with pytest.raises(RestorationError, match="look beside it"):
         Rectification.within(toy_geometry, wider, 128, 96)

@@ -131,12 +131,12 @@ def seen_by_the_wire(truth: RigTruth, geometry: Geometry) -> Wire:
     ideal = in_float64(lambda: ideal_wire(geometry, wire_start(truth.description), np.array([[0.0, 1.0]])))()
     return replace(
         ideal,
-        offset=truth.optics.pupil_mm[:2] / pitch + 0.01,
-        standoff_per_pitch=np.float64((panel.structure_thickness_mm / 2 - truth.optics.pupil_mm[2]) / pitch),
-        pupil_per_pitch=np.float64(truth.optics.pupil_diameter_mm / pitch * 1.005),
+        offset_periods=truth.optics.pupil_mm[:2] / pitch + 0.01,
+        standoff_per_pitch=np.float64((panel.depth_mm / 2 - truth.optics.pupil_mm[2]) / pitch),
+        footprint_per_pitch=np.float64(truth.optics.pupil_diameter_mm / pitch * 1.005),
         row_open=np.float64(panel.row_open + 0.003),
         column_open=np.float64(panel.column_open - 0.002),
-        depth_per_pitch=np.float64(panel.structure_thickness_mm / pitch),
+        depth_per_pitch=np.float64(panel.depth_mm / pitch),
     )
 
 

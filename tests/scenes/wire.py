@@ -50,7 +50,7 @@ def start() -> WireStart:
     return WireStart(
         standoff_per_pitch=12.0,
         standoff_tolerance=0.03,
-        pupil_per_pitch=6.0,
+        footprint_per_pitch=6.0,
         pupil_tolerance=0.04,
         row_open=0.4,
         row_tolerance=0.02,
@@ -64,11 +64,11 @@ def start() -> WireStart:
 def geometry(tilt_deg: float = 17.0) -> Geometry:
     """A wide lens on the reduced sensor."""
     return Geometry(
-        focal=np.array([150.0, 150.0]),
-        centre=np.array([79.0, 60.5]),
+        focal_px=np.array([150.0, 150.0]),
+        principal_point_px=np.array([79.0, 60.5]),
         distortion=np.array([-0.05, 0.01, 0.0, 0.0, 0.0]),
-        rotation=np.array([-np.deg2rad(tilt_deg), 0.01, 0.02]),
-        pupil=np.array([60.0, 30.0, -7.5]),
+        rotation_rad=np.array([-np.deg2rad(tilt_deg), 0.01, 0.02]),
+        pupil_mm=np.array([60.0, 30.0, -7.5]),
     )
 
 
@@ -141,8 +141,8 @@ def places() -> Float[np.ndarray, "places 2"]:
 
 def shape_values(truth: Wire) -> Float[np.ndarray, "10"]:
     """The shape in the order and units of the estimates."""
-    shape = (truth.standoff_per_pitch, *np.mod(truth.offset, 1.0), truth.pupil_per_pitch)
-    return np.array([*np.rad2deg(truth.rotation), *shape, truth.row_open, truth.column_open, truth.depth_per_pitch])
+    shape = (truth.standoff_per_pitch, *np.mod(truth.offset_periods, 1.0), truth.footprint_per_pitch)
+    return np.array([*np.rad2deg(truth.rotation_rad), *shape, truth.row_open, truth.column_open, truth.depth_per_pitch])
 
 
 @in_float64

@@ -86,16 +86,16 @@ def rig():
 
     return {
         "format": "udccal-rig",
-        "version": 1,
+        "version": 2,
         "name": "foreign-tiny",
         "panel": {
             "model": "other display",
             "columns": world.PANEL_COLUMNS,
             "rows": world.PANEL_ROWS,
             "pitch_mm": about(0.63, 0.002),
-            "row_open_fraction": about(0.4, 0.05),
-            "column_open_fraction": about(0.94, 0.02),
-            "structure_thickness_mm": about(0.03, 0.01),
+            "row_open": about(0.4, 0.05),
+            "column_open": about(0.94, 0.02),
+            "depth_mm": about(0.03, 0.01),
             "glass_thickness_mm": 0.7,
             "glass_index": 1.52,
             "gamma": about(2.2, 0.05),

@@ -58,7 +58,7 @@ def test_it_fits(session: Session, world: dict) -> None:
     noise = results.noise
     assert noise.estimate("K_DN_per_e").value == pytest.approx(world["K_DN_PER_E"], rel=0.02)
     assert noise.estimate("PRNU1288").value == pytest.approx(world["PRNU"], rel=0.1)
-    focal = np.asarray(results.geometry.term.focal)
+    focal = np.asarray(results.geometry.term.focal_px)
     np.testing.assert_allclose(focal, world["FOCAL_PX"], rtol=2e-3)
     rows, columns = world["ROWS"], world["COLUMNS"]
     wire = np.asarray(wire_map(results.wire.term, rows, columns))

@@ -19,7 +19,7 @@ def test_opening_is_centred_without_obliquity():
 
 def test_opening_narrows_on_the_side_of_the_slope():
     truth = toy_truth()
-    thickness = truth.panel.structure_thickness_mm / truth.panel.pitch_mm
+    thickness = truth.panel.depth_mm / truth.panel.pitch_mm
     start, width = row_open_interval(truth, np.array([-0.5, 0.5, 1e3]))
     assert np.allclose(width, [truth.panel.row_open - thickness / 2] * 2 + [0.0])
     # A ray that rises with z must start low enough to leave the far side of the structure still inside the opening.

@@ -121,7 +121,7 @@ def test_disc_averages_points_and_keeps_the_light(truth: RigTruth):
 
 
 def test_thicker_structure_changes_the_kernel(truth: RigTruth):
-    panel = replace(truth.panel, structure_thickness_mm=0.15)
+    panel = replace(truth.panel, depth_mm=0.15)
     thick = kernels(replace(truth, panel=panel), MIDDLE[None], 33, 17)
     plain = kernels(truth, MIDDLE[None], 33, 17)
     assert np.linalg.norm(thick - plain) > 0.01 * np.linalg.norm(plain)

@@ -28,7 +28,7 @@ def brute_force(truth: RigTruth, direction: np.ndarray, samples: int = 3000) -> 
         offset = sum(u[i] * (across[0][i] - slope[axis_index] * across[1][i]) for i in (0, 1))
         offset = offset * optics.pupil_diameter_mm / 2 * (1 + optics.pupil_mm[2] / optics.focus_mm)
         enter = optics.pupil_mm[axis_index] - slope[axis_index] * optics.pupil_mm[2] + offset
-        leave = enter + slope[axis_index] * panel.structure_thickness_mm
+        leave = enter + slope[axis_index] * panel.depth_mm
         cells = enter / panel.pitch_mm, leave / panel.pitch_mm
         for cell in cells:
             passed &= np.abs(cell - np.rint(cell)) < fraction / 2
@@ -55,7 +55,7 @@ def test_area_check_notices_a_panel_moved_by_a_hundredth_of_a_pitch() -> None:
 
 def test_panel_without_structure_passes_everything() -> None:
     truth = toy_truth()
-    bare = replace(truth, panel=replace(truth.panel, row_open=1.0, column_open=1.0, structure_thickness_mm=0.0))
+    bare = replace(truth, panel=replace(truth.panel, row_open=1.0, column_open=1.0, depth_mm=0.0))
     directions = pixels_to_directions(truth.optics, PIXELS)
     np.testing.assert_allclose(open_fraction(bare, directions), 1.0, rtol=1e-12)
 

@@ -45,7 +45,7 @@ def capture_photograph(
         exposure_s = _exposure(camera, world)
         camera.configure(Settings(exposure_s, 0.0, camera.sensor))
         (frame,) = camera.frames(1)
-    centre = (float(np.asarray(view.centre)[0]), float(np.asarray(view.centre)[1]))
+    centre = (float(np.asarray(view.principal_point_px)[0]), float(np.asarray(view.principal_point_px)[1]))
     ideal = ideal_view(world.truth, photograph, float(view.focal_px), centre, view.columns, view.rows)
     return CapturedScene(frame.data, frame.settings.exposure_s, ideal)
 
@@ -62,7 +62,7 @@ def _hung(
     scale = _MARGIN * max(view.columns / columns, view.rows / rows)
     camera = world.truth.description.camera
     ray = pixels_to_directions(world.truth.optics, np.array([(camera.columns - 1) / 2, (camera.rows - 1) / 2]))
-    middle = np.asarray(view.centre) + float(view.focal_px) * ray[:2] / ray[2]
+    middle = np.asarray(view.principal_point_px) + float(view.focal_px) * ray[:2] / ray[2]
     off = np.array([(view.columns - 1) / 2, (view.rows - 1) / 2]) - middle
     more_x, more_y = (round(2 * float(v) / scale) for v in off)
     margins = [(max(more_y, 0), max(-more_y, 0)), (max(more_x, 0), max(-more_x, 0)), (0, 0)]

@@ -16,11 +16,11 @@ def nominal_geometry(rig: RigDescription) -> Geometry:
     """Distortion-free geometry of a rig description: focal length of the lens, centred, at its nominal mounting."""
     camera = rig.camera
     return Geometry(
-        focal=np.array([rig.focal_px, rig.focal_px]),
-        centre=np.array([(camera.columns - 1) / 2, (camera.rows - 1) / 2]),
+        focal_px=np.array([rig.focal_px, rig.focal_px]),
+        principal_point_px=np.array([(camera.columns - 1) / 2, (camera.rows - 1) / 2]),
         distortion=np.zeros(5),
-        rotation=np.asarray(Rotation.from_matrix(nominal_rotation(rig)).as_rotvec(), dtype=np.float64),
-        pupil=nominal_pupil_mm(rig),
+        rotation_rad=np.asarray(Rotation.from_matrix(nominal_rotation(rig)).as_rotvec(), dtype=np.float64),
+        pupil_mm=nominal_pupil_mm(rig),
     )
 
 
@@ -35,8 +35,8 @@ def nominal_backscatter(
         mix=np.eye(3),
         gamma=np.float64(panel.gamma.value),
         pitch_mm=np.float64(panel.pitch_mm.value),
-        pupil_mm=np.float64(rig.pupil_mm),
-        distance_mm=np.float64(rig.mounting.standoff_mm.value),
+        pupil_diameter_mm=np.float64(rig.pupil_diameter_mm),
+        standoff_mm=np.float64(rig.mounting.standoff_mm.value),
         emitters_px=np.zeros((3, 2)),
         softness_px=np.float64(0.15),
         reflection=np.float64(0.5),

@@ -37,8 +37,8 @@ class Backscatter(eqx.Module):
         mix: camera colour from primary; rows sum to 1.
         gamma: exponent of the panel's transfer curve.
         pitch_mm: panel pixels' distance.
-        pupil_mm: diameter of the entrance pupil as the footprint shows it.
-        distance_mm: from the pupil to the plane of the emitters.
+        pupil_diameter_mm: diameter of the entrance pupil as the footprint shows it.
+        standoff_mm: from the pupil to the plane of the emitters.
         emitters_px: (x, y) of each primary's emitter from the centre of its panel pixel.
         softness_px: width (one sigma) of the footprint's edge, the size of an emitter included.
         reflection: light of the reflected copy relative to the direct one.
@@ -52,8 +52,8 @@ class Backscatter(eqx.Module):
     mix: Float[Arrayish, "3 3"]
     gamma: Float[Arrayish, ""]
     pitch_mm: Float[Arrayish, ""]
-    pupil_mm: Float[Arrayish, ""]
-    distance_mm: Float[Arrayish, ""]
+    pupil_diameter_mm: Float[Arrayish, ""]
+    standoff_mm: Float[Arrayish, ""]
     emitters_px: Float[Arrayish, "3 2"]
     softness_px: Float[Arrayish, ""]
     reflection: Float[Arrayish, ""]
@@ -87,9 +87,9 @@ def grid_positions(
 
 
 def footprints(
-    term: Backscatter, rays: Float[Arrayish, "n 3"], distance_mm: Float[Arrayish, ""]
+    term: Backscatter, rays: Float[Arrayish, "n 3"], standoff_mm: Float[Arrayish, ""]
 ) -> tuple[Float[Array, "n 2"], Float[Array, "n 2 2"]]:
-    """The pupil's footprint along ``rays`` (panel coordinates) on a plane at ``distance_mm`` from the pupil.
+    """The pupil's footprint along ``rays`` (panel coordinates) on a plane at ``standoff_mm`` from the pupil.
 
     Returns:
         (centre, shape) in panel pixels: the ellipse ``centre + shape @ u`` over the unit disc of u. A pupil point lies
@@ -98,8 +98,8 @@ def footprints(
     """
     rays = jnp.asarray(rays)
     slopes = rays[:, :2] / rays[:, 2:]
-    across = rotation_matrix(term.geometry.rotation)[:, :2] * (term.pupil_mm / 2)
-    centre = jnp.asarray(term.geometry.pupil)[:2] + distance_mm * slopes
+    across = rotation_matrix(term.geometry.rotation_rad)[:, :2] * (term.pupil_diameter_mm / 2)
+    centre = jnp.asarray(term.geometry.pupil_mm)[:2] + standoff_mm * slopes
     shape = across[:2] - slopes[:, :, None] * across[2]
     return centre / term.pitch_mm, shape / term.pitch_mm
 
@@ -115,8 +115,8 @@ def emitter_shares(
     span = jnp.arange(term.window)
     inner = jnp.stack(jnp.meshgrid(span, span), axis=-1).reshape(-1, 2)
     places = jnp.asarray(corner)[:, None, None] + inner[None, :, None] + jnp.asarray(term.emitters_px)
-    direct = _inside(term, places, *footprints(term, rays, term.distance_mm))
-    reflected = _inside(term, places, *footprints(term, rays, term.distance_mm + term.reflection_mm))
+    direct = _inside(term, places, *footprints(term, rays, term.standoff_mm))
+    reflected = _inside(term, places, *footprints(term, rays, term.standoff_mm + term.reflection_mm))
     return (direct + term.reflection * reflected) / (1 + term.reflection)
 
 
@@ -140,7 +140,7 @@ def _inside(
 
 def window_corners(term: Backscatter, rays: Float[Arrayish, "n 3"]) -> Int[Array, "n 2"]:
     """(column, row) of the first panel pixel of the window around each ray's footprints."""
-    centre, _ = footprints(term, rays, term.distance_mm + term.reflection_mm * 0.5)
+    centre, _ = footprints(term, rays, term.standoff_mm + term.reflection_mm * 0.5)
     middle = centre - jnp.asarray(term.emitters_px).mean(axis=0)
     return jnp.round(middle - (term.window - 1) / 2).astype(jnp.int32)
 

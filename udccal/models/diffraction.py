@@ -33,10 +33,11 @@ class Diffraction(eqx.Module):
 
     Attributes:
         pitch_mm: pitch of rows and columns.
-        open_fraction: open part of the (columns, rows) for a ray along the panel's normal.
-        thickness_mm: depth of the opaque structure; it narrows slits by thickness * |tangent of the obliquity|.
-        pupil_mm: diameter of the entrance pupil.
-        offset: footprint centre (X, Y) of a ray along the normal, in pitches from the middle of an opening, modulo 1.
+        openings: open part of the (columns, rows) for a ray along the panel's normal.
+        depth_mm: depth of the opaque structure; it narrows slits by thickness * |tangent of the obliquity|.
+        pupil_diameter_mm: diameter of the entrance pupil.
+        offset_periods: centre (X, Y) of the footprint of a ray along the normal, in periods from the middle of an
+            opening, modulo 1.
         standoff_per_pitch: distance from the pupil to the openings, in pitches: the centre moves by this times slope.
         visibility: 1, or 0 to leave interference between orders out (the footprint's place is then not known).
         blur_px: standard deviation of a Gaussian that stands for what else blurs a little.
@@ -45,10 +46,10 @@ class Diffraction(eqx.Module):
     """
 
     pitch_mm: Float[Arrayish, ""]
-    open_fraction: Float[Arrayish, "2"]
-    thickness_mm: Float[Arrayish, ""]
-    pupil_mm: Float[Arrayish, ""]
-    offset: Float[Arrayish, "2"]
+    openings: Float[Arrayish, "2"]
+    depth_mm: Float[Arrayish, ""]
+    pupil_diameter_mm: Float[Arrayish, ""]
+    offset_periods: Float[Arrayish, "2"]
     standoff_per_pitch: Float[Arrayish, ""]
     visibility: Float[Arrayish, ""]
     blur_px: Float[Arrayish, ""]
@@ -79,7 +80,7 @@ def local_frame(geometry: Geometry, position_px: Float[Arrayish, "2"]) -> LocalF
     position = jnp.asarray(position_px)
     direction = cosines(position)
     jacobian = jax.jacfwd(cosines)(position)[:2]
-    across = rotation_matrix(geometry.rotation)[:, :2]
+    across = rotation_matrix(geometry.rotation_rad)[:, :2]
     footprint = across[:2] - jnp.outer(direction[:2] / direction[2], across[2])
     return LocalFrame(direction, jacobian, footprint)
 
@@ -149,15 +150,15 @@ def lattice_frequencies(frame: LocalFrame, lattice: Lattice) -> tuple[Float[Arra
 
 def open_fractions(model: Diffraction, frame: LocalFrame) -> Float[Array, "2"]:
     """Open part of (columns, rows) along the source's ray."""
-    shadow = model.thickness_mm / model.pitch_mm * jnp.abs(frame.direction[:2] / frame.direction[2])
-    return jnp.clip(jnp.asarray(model.open_fraction) - shadow, 0.02, 1.0)
+    shadow = model.depth_mm / model.pitch_mm * jnp.abs(frame.direction[:2] / frame.direction[2])
+    return jnp.clip(jnp.asarray(model.openings) - shadow, 0.02, 1.0)
 
 
 def relative_lag(
     model: Diffraction, frame: LocalFrame, fx: Float[Array, " half"], fy: Float[Array, " rows"]
 ) -> tuple[Float[Array, "rows half"], Float[Array, "rows half"]]:
     """Lag of a frequency per mm of wavelength, in diameters of the pupil and in its own axes."""
-    inverse = jnp.linalg.inv(frame.footprint * model.pupil_mm)
+    inverse = jnp.linalg.inv(frame.footprint * model.pupil_diameter_mm)
     column = fy[:, None]
     return inverse[0, 0] * fx + inverse[0, 1] * column, inverse[1, 0] * fx + inverse[1, 1] * column
 

@@ -17,17 +17,17 @@ class Geometry(eqx.Module):
     """Where rays go.
 
     Attributes:
-        focal: (fx, fy) in px. centre: (cx, cy) in px.
+        focal_px: (fx, fy). principal_point_px: (cx, cy).
         distortion: (k1, k2, p1, p2, k3), OpenCV's order and signs.
-        rotation: rotation vector in rad of ``R_panel_camera`` (camera coordinates to panel coordinates).
-        pupil: entrance pupil in panel coordinates in mm; z is minus the stand-off.
+        rotation_rad: rotation vector in rad of ``R_panel_camera`` (camera coordinates to panel coordinates).
+        pupil_mm: entrance pupil in panel coordinates in mm; z is minus the stand-off.
     """
 
-    focal: Float[Arrayish, "2"]
-    centre: Float[Arrayish, "2"]
+    focal_px: Float[Arrayish, "2"]
+    principal_point_px: Float[Arrayish, "2"]
     distortion: Float[Arrayish, "5"]
-    rotation: Float[Arrayish, "3"]
-    pupil: Float[Arrayish, "3"]
+    rotation_rad: Float[Arrayish, "3"]
+    pupil_mm: Float[Arrayish, "3"]
 
 
 class VirtualView(eqx.Module):
@@ -36,7 +36,7 @@ class VirtualView(eqx.Module):
     columns: int = eqx.field(static=True)
     rows: int = eqx.field(static=True)
     focal_px: float
-    centre: Float[Arrayish, "2"]
+    principal_point_px: Float[Arrayish, "2"]
 
 
 def rotation_matrix(vector: Float[Arrayish, "3"]) -> Float[Array, "3 3"]:
@@ -66,7 +66,7 @@ def mounting_rotation(
 
 def tilt_rad(geometry: Geometry) -> Float[Array, ""]:
     """Angle by which the camera's axis points below the panel's normal, in rad."""
-    axis = rotation_matrix(geometry.rotation)[:, 2]
+    axis = rotation_matrix(geometry.rotation_rad)[:, 2]
     return jnp.arcsin(jnp.clip(axis[1], -1.0, 1.0))
 
 
@@ -105,7 +105,7 @@ def project(geometry: Geometry, points: Float[Arrayish, "*n 3"]) -> Float[Array,
     """Points in camera coordinates (any unit, z > 0) to sensor pixels."""
     points = jnp.asarray(points)
     ideal = points[..., :2] / points[..., 2:]
-    return distort(geometry, ideal) * jnp.asarray(geometry.focal) + jnp.asarray(geometry.centre)
+    return distort(geometry, ideal) * jnp.asarray(geometry.focal_px) + jnp.asarray(geometry.principal_point_px)
 
 
 def unproject(geometry: Geometry, pixels: Float[Arrayish, "*n 2"], iterations: int = 12) -> Float[Array, "*n 2"]:
@@ -113,7 +113,7 @@ def unproject(geometry: Geometry, pixels: Float[Arrayish, "*n 2"], iterations: i
 
     Fixed-point inversion of the distortion; 12 rounds leave less than 1e-9 px for distortions up to 10 %.
     """
-    measured = (jnp.asarray(pixels) - jnp.asarray(geometry.centre)) / jnp.asarray(geometry.focal)
+    measured = (jnp.asarray(pixels) - jnp.asarray(geometry.principal_point_px)) / jnp.asarray(geometry.focal_px)
 
     # A loop of the compiler's: written out, it would take most of the time that compiling a fit takes.
     def closer(_: Int[Array, ""], ideal: Float[Array, "*n 2"]) -> Float[Array, "*n 2"]:
@@ -126,7 +126,7 @@ def panel_directions(geometry: Geometry, pixels: Float[Arrayish, "*n 2"]) -> Flo
     """Unit vectors in panel coordinates of the rays through sensor pixels, pointing to the viewer's side."""
     ideal = unproject(geometry, pixels)
     rays = jnp.concatenate([ideal, jnp.ones_like(ideal[..., :1])], axis=-1)
-    rays = rays @ rotation_matrix(geometry.rotation).T
+    rays = rays @ rotation_matrix(geometry.rotation_rad).T
     return rays / jnp.linalg.norm(rays, axis=-1, keepdims=True)
 
 
@@ -139,35 +139,35 @@ def area_of_pixels(geometry: Geometry, pixels: Float[Arrayish, "*n 2"]) -> Float
     ideal = unproject(geometry, pixels)
     rays = jnp.concatenate([ideal, jnp.ones_like(ideal[..., :1])], axis=-1)
     length = jnp.linalg.norm(rays, axis=-1)
-    along = jnp.abs(rays @ rotation_matrix(geometry.rotation)[2]) / length
-    return along / (length**3 * jnp.abs(stretch(geometry, ideal)) * jnp.prod(jnp.asarray(geometry.focal)))
+    along = jnp.abs(rays @ rotation_matrix(geometry.rotation_rad)[2]) / length
+    return along / (length**3 * jnp.abs(stretch(geometry, ideal)) * jnp.prod(jnp.asarray(geometry.focal_px)))
 
 
 def panel_points_mm(geometry: Geometry, pixels: Float[Arrayish, "*n 2"]) -> Float[Array, "*n 2"]:
     """Where the rays through sensor pixels cross the panel plane, in panel coordinates in mm."""
     rays = panel_directions(geometry, pixels)
-    pupil = jnp.asarray(geometry.pupil)
+    pupil = jnp.asarray(geometry.pupil_mm)
     return pupil[:2] - pupil[2] * rays[..., :2] / rays[..., 2:]
 
 
 def project_directions(geometry: Geometry, directions: Float[Arrayish, "*n 3"]) -> Float[Array, "*n 2"]:
     """Directions in panel coordinates to sensor pixels; the inverse of ``panel_directions``."""
-    return project(geometry, jnp.asarray(directions) @ rotation_matrix(geometry.rotation))
+    return project(geometry, jnp.asarray(directions) @ rotation_matrix(geometry.rotation_rad))
 
 
 def view_to_sensor(geometry: Geometry, view: VirtualView, view_pixels: Float[Arrayish, "*n 2"]) -> Float[Array, "*n 2"]:
     """Sensor pixel that each pixel of the virtual view looks at: virtual rotation and distortion in one map."""
-    plane = (jnp.asarray(view_pixels) - jnp.asarray(view.centre)) / view.focal_px
+    plane = (jnp.asarray(view_pixels) - jnp.asarray(view.principal_point_px)) / view.focal_px
     directions = jnp.concatenate([plane, jnp.ones_like(plane[..., :1])], axis=-1)
     return project_directions(geometry, directions)
 
 
 def virtual_rotation_homography(geometry: Geometry, view: VirtualView) -> Float[Array, "3 3"]:
     """Homography from undistorted sensor pixels to pixels of the virtual view: K_view R_panel_camera K^-1."""
-    fx, fy = jnp.asarray(geometry.focal)
-    cx, cy = jnp.asarray(geometry.centre)
-    vx, vy = jnp.asarray(view.centre)
+    fx, fy = jnp.asarray(geometry.focal_px)
+    cx, cy = jnp.asarray(geometry.principal_point_px)
+    vx, vy = jnp.asarray(view.principal_point_px)
     one, zero = jnp.ones_like(fx), jnp.zeros_like(fx)
     inverse = jnp.array([[one / fx, zero, -cx / fx], [zero, one / fy, -cy / fy], [zero, zero, one]])
     outer = jnp.array([[view.focal_px, 0.0, vx], [0.0, view.focal_px, vy], [0.0, 0.0, 1.0]])
-    return outer @ rotation_matrix(geometry.rotation) @ inverse
+    return outer @ rotation_matrix(geometry.rotation_rad) @ inverse

@@ -50,7 +50,7 @@ def interference_transfer(
 
 def footprint_place(model: Diffraction, frame: LocalFrame) -> Float[Array, "2"]:
     """Where the footprint's centre lies on columns and rows, in pitches."""
-    return jnp.asarray(model.offset) + model.standoff_per_pitch * frame.direction[:2] / frame.direction[2]
+    return jnp.asarray(model.offset_periods) + model.standoff_per_pitch * frame.direction[:2] / frame.direction[2]
 
 
 def strengths(model: Diffraction, place: Float[Arrayish, "2"]) -> Float[Array, " terms"]:
@@ -115,7 +115,7 @@ def disc_overlap_coefficient(lag: Float[Arrayish, "*n 2"], wave: Float[Arrayish,
 def overlap_tables(model: Diffraction, frame: LocalFrame) -> Float[Array, "terms y x"]:
     """H_gh of every term on a grid of lags: x from 0 to 1, y from -1 to 1 diameters of the pupil."""
     # Single precision: a millionth of what is a hundredth of the light. It takes half the time.
-    waves = (jnp.array(TERMS) @ frame.footprint * (model.pupil_mm / model.pitch_mm)).astype(jnp.float32)
+    waves = (jnp.array(TERMS) @ frame.footprint * (model.pupil_diameter_mm / model.pitch_mm)).astype(jnp.float32)
     x, y = jnp.linspace(0.0, 1.0, _TABLE + 1), jnp.linspace(-1.0, 1.0, 2 * _TABLE + 1)
     grid = jnp.stack(jnp.meshgrid(x, y), axis=-1).astype(jnp.float32)
     return jax.lax.map(lambda wave: disc_overlap_coefficient(grid, wave), waves)

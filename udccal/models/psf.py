@@ -37,7 +37,7 @@ class PsfField(eqx.Module):
     Attributes:
         geometry: where pixels look.
         diffraction: the panel's diffraction.
-        diffraction_share: 1, or 0 when the residual carries the whole kernel.
+        diffraction_fraction: 1, or 0 when the residual carries the whole kernel.
         residual: coefficients of the residual image; its terms are ``fields.polynomial_basis`` of ``degree``.
         centre_px, half_px: positions scale as (p - centre) / half for the polynomials.
         support_px: (across, down) to either side of the source, beyond which pictures showed none of the kernel's
@@ -48,7 +48,7 @@ class PsfField(eqx.Module):
 
     geometry: Geometry
     diffraction: Diffraction
-    diffraction_share: Float[Arrayish, ""]
+    diffraction_fraction: Float[Arrayish, ""]
     residual: Float[Arrayish, "terms 3 window_rows window_columns"]
     centre_px: Float[Arrayish, "2"]
     half_px: Float[Arrayish, "2"]
@@ -67,7 +67,7 @@ def psf_kernels(
     """
 
     def one(position: Float[Array, "2"]) -> Float[Array, "3 rows columns"]:
-        kernel = field.diffraction_share * diffraction_kernel(
+        kernel = field.diffraction_fraction * diffraction_kernel(
             field.diffraction, field.geometry, position, rows, columns, field.fine
         ) + residual_kernel(field, position, rows, columns)
         return kernel / jnp.sum(kernel, axis=(1, 2), keepdims=True)
@@ -75,9 +75,9 @@ def psf_kernels(
     return jax.lax.map(one, jnp.asarray(positions_px))
 
 
-def fine_oversample(pupil_mm: float, focal_px: float) -> int:
+def fine_oversample(pupil_diameter_mm: float, focal_px: float) -> int:
     """Nodes to a pixel that hold nearly all detail a diffraction-limited lens delivers in blue, within reason."""
-    cycles_per_px = pupil_mm / 480e-6 / focal_px
+    cycles_per_px = pupil_diameter_mm / 480e-6 / focal_px
     return min(max(2 * round(0.95 * cycles_per_px), 6), 14)
 
 

@@ -39,10 +39,10 @@ class Wire(eqx.Module):
 
     Attributes:
         geometry: as fitted on its own; the wire turns it by ``rotation``.
-        rotation: rotation vector in rad, in panel coordinates, applied after the geometry's own.
+        rotation_rad: rotation vector in rad, in panel coordinates, applied after the geometry's own.
         standoff_per_pitch: distance of the entrance pupil from the openings, in panel periods.
-        offset: panel coordinates (X, Y) of the pupil in periods, from the centre of an opening.
-        pupil_per_pitch: diameter of the footprint in periods.
+        offset_periods: panel coordinates (X, Y) of the pupil in periods, from the centre of an opening.
+        footprint_per_pitch: diameter of the footprint in periods.
         row_open, column_open: open fraction of a period along Y and X for a ray along the normal.
         depth_per_pitch: depth of the opaque structure in periods; it narrows an opening by depth |slope|.
         harmonics: whole numbers (n, m) per harmonic: periods along X (columns) and along Y (rows).
@@ -56,10 +56,10 @@ class Wire(eqx.Module):
     """
 
     geometry: Geometry
-    rotation: Float[Arrayish, "3"]
+    rotation_rad: Float[Arrayish, "3"]
     standoff_per_pitch: Float[Arrayish, ""]
-    offset: Float[Arrayish, "2"]
-    pupil_per_pitch: Float[Arrayish, ""]
+    offset_periods: Float[Arrayish, "2"]
+    footprint_per_pitch: Float[Arrayish, ""]
     row_open: Float[Arrayish, ""]
     column_open: Float[Arrayish, ""]
     depth_per_pitch: Float[Arrayish, ""]
@@ -81,7 +81,7 @@ def legendre(x: Float[Arrayish, "*n"], count: int) -> Float[Array, "count *n"]:
 
 def panel_rotation(wire: Wire) -> Float[Array, "3 3"]:
     """``R_panel_camera`` as the wire sees it."""
-    return rotation_matrix(wire.rotation) @ rotation_matrix(wire.geometry.rotation)
+    return rotation_matrix(wire.rotation_rad) @ rotation_matrix(wire.geometry.rotation_rad)
 
 
 def slopes(wire: Wire, ideal: Float[Arrayish, "n 2"]) -> Float[Array, "2 n"]:
@@ -113,7 +113,7 @@ def carriers(
     slit = jnp.where(harmonics == 0, 1.0, 2.0 * jnp.sinc(harmonics * openings(wire, slope)))
     # cos(nX) cos(mY) is half the sum over (n, m) and (-n, m).
     crossed = jnp.where(jnp.all(harmonics != 0, axis=1), 0.5, 1.0)
-    z = jnp.pi * wire.pupil_per_pitch * jnp.asarray(seen)
+    z = jnp.pi * wire.footprint_per_pitch * jnp.asarray(seen)
     j0, j1 = bessel_j0_j1(z)
     g = 2.0 * j1 / z
     return crossed * slit[:, 0] * slit[:, 1] * jnp.stack([g, 2.0 * (j0 - g)])
@@ -121,7 +121,7 @@ def carriers(
 
 def waves(wire: Wire, slope: Float[Arrayish, "2 n"]) -> Float[Array, "2 harmonics n"]:
     """cos and sin of each harmonic's phase 2 pi (n X + m Y)."""
-    periods = jnp.asarray(wire.offset)[:, None] + wire.standoff_per_pitch * jnp.asarray(slope)
+    periods = jnp.asarray(wire.offset_periods)[:, None] + wire.standoff_per_pitch * jnp.asarray(slope)
     # Whole periods leave before single precision would feel them.
     phase = 2 * jnp.pi * (periods - jnp.round(periods))
     order = jnp.asarray(wire.harmonics)

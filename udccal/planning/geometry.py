@@ -123,7 +123,7 @@ class GeometryPredictor:
         free = self._order(points, bundle)
         cov = BundleProblem(points, free, self._prior).equations_at(bundle).joint_cov()
         x, cov = with_angles(bundle.intrinsics, bundle.poses, cov, parallel)
-        posterior = Posterior.from_cov(x, cov, partial(term_at, pupil=np.asarray(self._state.geometry.pupil)))
+        posterior = Posterior.from_cov(x, cov, partial(term_at, pupil=np.asarray(self._state.geometry.pupil_mm)))
         directions = np.asarray(_directions(posterior.term_at(x), sensor_samples(self._state.rig, _ACROSS)))
         sigma = posterior.sigma_of(lambda term: np.asarray(_places(term, directions)))
         return float(np.sqrt((sigma**2).mean()))
@@ -144,9 +144,9 @@ class GeometryPredictor:
 
 def _planned_view(state: RigState, field: EvenField, step: PlannedStep, board: Board) -> _View | None:
     """None where the board shows too few corners to hold its pose."""
-    to_camera = Rotation.from_rotvec(np.asarray(state.geometry.rotation)).inv()
+    to_camera = Rotation.from_rotvec(np.asarray(state.geometry.rotation_rad)).inv()
     rotation = to_camera * Rotation.from_rotvec(np.array(board.rotation_vector))
-    origin = to_camera.apply(np.array(board.translation_mm) - np.asarray(state.geometry.pupil))
+    origin = to_camera.apply(np.array(board.translation_mm) - np.asarray(state.geometry.pupil_mm))
     intrinsics, corners = Intrinsics.of_geometry(state.geometry).vector, board_points_mm(board.spec)
     markers = np.asarray(charuco_board(board.spec).getObjPoints(), dtype=np.float64).reshape(-1, 3)
     image, marks = (projected(intrinsics, rotation.apply(points) + origin)[0] for points in (corners, markers))

@@ -207,7 +207,7 @@ class EvenField:
 
 
 def _by_field_angle(state: RigState, pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
-    ideal = (pixels - np.asarray(state.geometry.centre)) / np.asarray(state.geometry.focal)
+    ideal = (pixels - np.asarray(state.geometry.principal_point_px)) / np.asarray(state.geometry.focal_px)
     return np.asarray((1 + (ideal**2).sum(axis=1)) ** -2.0)
 
 

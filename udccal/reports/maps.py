@@ -71,7 +71,7 @@ def _seen_px(geometry: Geometry, rig: RigDescription) -> tuple[int, int, int, in
     x, y = rig.camera.columns - 1.0, rig.camera.rows - 1.0
     corners = np.array([[0, 0], [x / 2, 0], [x, 0], [x, y / 2], [x, y], [x / 2, y], [0, y], [0, y / 2]])
     points = np.asarray(_panel_points_mm(geometry, corners)) / rig.panel.pitch_mm.value
-    reach = rig.pupil_mm / rig.panel.pitch_mm.value
+    reach = rig.pupil_diameter_mm / rig.panel.pitch_mm.value
     low = np.clip(np.floor(points.min(axis=0) - reach), 0, [rig.panel.columns - 2, rig.panel.rows - 2])
     high = np.clip(np.ceil(points.max(axis=0) + reach), low + 1, [rig.panel.columns - 1, rig.panel.rows - 1])
     return int(low[0]), int(low[1]), int(high[0]), int(high[1])

@@ -41,17 +41,17 @@ def true_values(truth: RigTruth) -> tuple[TrueValue, ...]:
         TrueValue("geometry", "cy", optics.cy_px),
         TrueValue("geometry", "tilt_deg", optics.tilt_deg),
         # An opening of some depth lets light through as a thin one half-way through it would.
-        TrueValue("wire", "standoff_per_pitch", (standoff_mm + panel.structure_thickness_mm / 2) / panel.pitch_mm),
+        TrueValue("wire", "standoff_per_pitch", (standoff_mm + panel.depth_mm / 2) / panel.pitch_mm),
         TrueValue("wire", "row_open", panel.row_open),
         TrueValue("wire", "column_open", panel.column_open),
-        TrueValue("psf", "pitch", panel.pitch_mm),
-        TrueValue("psf", "row_open_fraction", panel.row_open),
-        TrueValue("psf", "column_open_fraction", panel.column_open),
-        TrueValue("psf", "structure_thickness", panel.structure_thickness_mm),
-        TrueValue("psf", "pupil_diameter", optics.pupil_diameter_mm),
+        TrueValue("psf", "pitch_mm", panel.pitch_mm),
+        TrueValue("psf", "row_open", panel.row_open),
+        TrueValue("psf", "column_open", panel.column_open),
+        TrueValue("psf", "depth_mm", panel.depth_mm),
+        TrueValue("psf", "pupil_diameter_mm", optics.pupil_diameter_mm),
         TrueValue("backscatter", "gamma", panel.gamma),
-        TrueValue("backscatter", "pupil_mm", optics.pupil_diameter_mm),
-        TrueValue("backscatter", "distance_mm", standoff_mm),
+        TrueValue("backscatter", "pupil_diameter_mm", optics.pupil_diameter_mm),
+        TrueValue("backscatter", "standoff_mm", standoff_mm),
     )
 
 
@@ -59,9 +59,9 @@ def true_geometry(truth: RigTruth) -> Geometry:
     """The simulated rig's geometry as the term that a perfect fit would find."""
     optics = truth.optics
     return Geometry(
-        focal=np.array([optics.fx_px, optics.fy_px]),
-        centre=np.array([optics.cx_px, optics.cy_px]),
+        focal_px=np.array([optics.fx_px, optics.fy_px]),
+        principal_point_px=np.array([optics.cx_px, optics.cy_px]),
         distortion=np.array(optics.distortion),
-        rotation=np.asarray(Rotation.from_matrix(optics.R_panel_camera).as_rotvec(), dtype=np.float64),
-        pupil=np.array(optics.pupil_mm),
+        rotation_rad=np.asarray(Rotation.from_matrix(optics.R_panel_camera).as_rotvec(), dtype=np.float64),
+        pupil_mm=np.array(optics.pupil_mm),
     )

@@ -107,7 +107,7 @@ def ray_error_px(geometry: Geometry, truth: RigTruth) -> float:
     rays = pixels_to_directions(truth.optics, pixels) @ truth.optics.R_panel_camera
     for _ in range(_ROTATIONS):  # the projection is almost linear in so small a rotation
         errors = np.asarray(project(geometry, rays)) - pixels
-        rays = rays @ _rotation_against(rays, errors / np.asarray(geometry.focal)).T
+        rays = rays @ _rotation_against(rays, errors / np.asarray(geometry.focal_px)).T
     errors = np.asarray(project(geometry, rays)) - pixels
     return float(np.percentile(np.hypot(errors[:, 0], errors[:, 1]), 95))
 

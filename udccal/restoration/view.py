@@ -59,7 +59,7 @@ def inscribed_view(
         )
     focal_px = (columns - 1) / 2 / half_width
     middle = np.array([(columns - 1) / 2, (rows - 1) / 2])
-    return VirtualView(columns=columns, rows=rows, focal_px=focal_px, centre=middle - centre * focal_px)
+    return VirtualView(columns=columns, rows=rows, focal_px=focal_px, principal_point_px=middle - centre * focal_px)
 
 
 def _largest(inside, centres: Float[np.ndarray, "n 2"], limit: float) -> Float[np.ndarray, " n"]:  # type: ignore[no-untyped-def]

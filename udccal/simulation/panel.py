@@ -27,14 +27,14 @@ def row_open_interval(
         (start, width) in fractions of a pitch: open for Y / pitch in [i + start, i + start + width], i an integer.
         ``start`` lies near -row_open / 2; ``width`` is never negative.
     """
-    return _open_interval(truth.panel.row_open, truth.panel.structure_thickness_mm / truth.panel.pitch_mm, tan_y)
+    return _open_interval(truth.panel.row_open, truth.panel.depth_mm / truth.panel.pitch_mm, tan_y)
 
 
 def column_open_interval(
     truth: RigTruth, tan_x: Float[np.ndarray, "*n"]
 ) -> tuple[Float[np.ndarray, "*n"], Float[np.ndarray, "*n"]]:
     """Where rays of slope ``tan_x`` = s_x / s_z pass the columns; see ``row_open_interval``."""
-    return _open_interval(truth.panel.column_open, truth.panel.structure_thickness_mm / truth.panel.pitch_mm, tan_x)
+    return _open_interval(truth.panel.column_open, truth.panel.depth_mm / truth.panel.pitch_mm, tan_x)
 
 
 def pupil_footprint(

@@ -37,7 +37,7 @@ class PanelTruth:
     pitch_mm: float
     row_open: float
     column_open: float
-    structure_thickness_mm: float
+    depth_mm: float
     glass_thickness_mm: float
     glass_index: float
     gamma: float
@@ -96,9 +96,9 @@ def draw_truth(description: RigDescription, seed: int = 0) -> RigTruth:
     mix = np.array([[1.0, 0.09, 0.02], [0.12, 1.0, 0.10], [0.03, 0.14, 1.0]])
     panel = PanelTruth(
         pitch_mm=drawn(description.panel.pitch_mm),
-        row_open=drawn(description.panel.row_open_fraction),
-        column_open=drawn(description.panel.column_open_fraction),
-        structure_thickness_mm=drawn(description.panel.structure_thickness_mm),
+        row_open=drawn(description.panel.row_open),
+        column_open=drawn(description.panel.column_open),
+        depth_mm=drawn(description.panel.depth_mm),
         glass_thickness_mm=description.panel.glass_thickness_mm,
         glass_index=description.panel.glass_index,
         gamma=drawn(description.panel.gamma),

@@ -70,7 +70,9 @@ def _lens_alone(x: Float[Array, " n"], rays: Float[Array, "rays 3"]) -> Float[Ar
 def trials(share: float = 1.0) -> list[Trials]:
     """Realisations of the intrinsics, the mounting and where rays land."""
     scene, count = sight(views=11), max(int(_REALISATIONS * share), 20)
-    truth = np.concatenate([scene.camera.focal, scene.camera.centre, scene.camera.distortion[:4], scene.poses.ravel()])
+    truth = np.concatenate(
+        [scene.camera.focal_px, scene.camera.principal_point_px, scene.camera.distortion[:4], scene.poses.ravel()]
+    )
     board = board_points_mm(scene.spec)
     variance = np.repeat(np.where(scene.seen(), scene.sigma_px**2, _UNSEEN_PX2).ravel(), 2)
     information = fisher_information(corners_seen, truth, board, variance)
@@ -111,10 +113,10 @@ def trials(share: float = 1.0) -> list[Trials]:
 
 def _rays(scene: Sight, pixels: Float[np.ndarray, "rays 2"]) -> Float[np.ndarray, "rays 3"]:
     """Through pixels, in camera coordinates, by Newton's method on the truth."""
-    ideal = (pixels - scene.camera.centre) / scene.camera.focal
+    ideal = (pixels - scene.camera.principal_point_px) / scene.camera.focal_px
     for _ in range(40):
         rays = np.concatenate([ideal, np.ones((len(ideal), 1))], axis=1)
-        ideal = ideal - (np.asarray(project(scene.camera, rays)) - pixels) / scene.camera.focal
+        ideal = ideal - (np.asarray(project(scene.camera, rays)) - pixels) / scene.camera.focal_px
     return np.concatenate([ideal, np.ones((len(ideal), 1))], axis=1)
 
 
@@ -135,7 +137,7 @@ def _parameters(result: FitResult[Geometry], truth: np.ndarray) -> tuple[np.ndar
 
 
 def _panel_rays(result: FitResult[Geometry], turned: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    seen = np.asarray(project(result.term, turned @ np.asarray(rotation_matrix(result.term.rotation))))
+    seen = np.asarray(project(result.term, turned @ np.asarray(rotation_matrix(result.term.rotation_rad))))
     return (seen - pixels).ravel(), projection_sigma_px(result, seen).ravel()
 
 

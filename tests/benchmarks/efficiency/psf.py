@@ -28,10 +28,10 @@ _REALISATIONS = 100
 _ITERATIONS = 60
 # By name: index among the fit's global parameters.
 _NUMBERS = {
-    "column_open_fraction": 1,
-    "row_open_fraction": 2,
-    "structure_thickness": 3,
-    "pupil_diameter": 4,
+    "column_open": 1,
+    "row_open": 2,
+    "depth_mm": 3,
+    "pupil_diameter_mm": 4,
     "log_blur": 5,
 }
 _POINTS_PX = np.array([[350.0, 260.0], [700.0, 480.0]])

@@ -86,7 +86,7 @@ def bounds(truth: Wire, built: WireStart) -> tuple[Float[np.ndarray, "10"], Floa
         information += fisher_information(predict, at, truth, pixels[part], site[part], np.float64(PRNU))
     unit = np.ones(10)
     unit[:3] = 180 / np.pi
-    unit[3], unit[6] = float(truth.standoff_per_pitch), float(truth.pupil_per_pitch)
+    unit[3], unit[6] = float(truth.standoff_per_pitch), float(truth.footprint_per_pitch)
     slopes = np.asarray(_map_slopes(at, truth, places(), _grid(48, 64)))
     return cramer_rao(information)[:10] * unit, cramer_rao(information, slopes)
 

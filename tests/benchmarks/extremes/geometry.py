@@ -85,7 +85,7 @@ def _truth(scene: Sight) -> dict[str, float]:
     camera = scene.camera
     names = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "tilt_deg", "roll_deg", "yaw_deg")
     angles = (scene.tilt_deg, *MOUNTED_DEG)
-    return dict(zip(names, (*camera.focal, *camera.centre, *camera.distortion, *angles), strict=True))
+    return dict(zip(names, (*camera.focal_px, *camera.principal_point_px, *camera.distortion, *angles), strict=True))
 
 
 def _drawn_from_prior(**options: float | int | bool) -> Sight:
@@ -99,17 +99,19 @@ def _drawn_from_prior(**options: float | int | bool) -> Sight:
 
 def _from_wrong(part: float) -> Callable[[], Outcome]:
     """The start's focal length and centre wrong by that part."""
-    start = replace(_START, focal=_START.focal * (1 + part), centre=_START.centre * (1 - part))
+    start = replace(
+        _START, focal_px=_START.focal_px * (1 + part), principal_point_px=_START.principal_point_px * (1 - part)
+    )
     return lambda: _run(sight(), start=start)
 
 
 def off_by(factor: float) -> Outcome:
     """The start's focal length off by a factor."""
-    return _run(sight(), start=replace(_START, focal=_START.focal * factor))
+    return _run(sight(), start=replace(_START, focal_px=_START.focal_px * factor))
 
 
 def _at_standoff(standoff_mm: float) -> Callable[[], Outcome]:
-    return lambda: _run(sight(), start=replace(_START, pupil=np.array([600.0, 190.0, -standoff_mm])))
+    return lambda: _run(sight(), start=replace(_START, pupil_mm=np.array([600.0, 190.0, -standoff_mm])))
 
 
 def _tilted(tilt_deg: float) -> Callable[[], Outcome]:

@@ -17,7 +17,7 @@ from udccal.result import FitResult
 
 _RULES = PsfRules(positions=8, shifts=3, half_px=(14, 7), close_px=(14, 7), far_share=1.0, iterations=60)
 _SCENE = small_scene(positions=(3, 2), shifts=2, half=(14, 7))
-_NUMBERS = ("column_open_fraction", "row_open_fraction", "structure_thickness", "pupil_diameter")
+_NUMBERS = ("column_open", "row_open", "depth_mm", "pupil_diameter_mm")
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ def _fit(scene: Scene, off: Off = Off(), seed: int = 1) -> Outcome:
     wire, rig = scene.wire, scene.rig
     wire = replace(
         wire,
-        pupil_per_pitch=wire.pupil_per_pitch * off.pupil,
+        footprint_per_pitch=wire.footprint_per_pitch * off.pupil,
         standoff_per_pitch=wire.standoff_per_pitch * off.standoff,
     )
     pitch = rig.panel.pitch_mm
@@ -55,7 +55,7 @@ def fit_from(off: Off) -> Outcome:
 
 
 def _errors(result: FitResult[PsfField], true: np.ndarray) -> np.ndarray:
-    if not result.ok or not float(result.term.diffraction_share):
+    if not result.ok or not float(result.term.diffraction_fraction):
         return np.zeros(0)
     estimates = [result.estimate(name) for name in _NUMBERS]
     return np.array([(e.value - t) / e.sigma for e, t in zip(estimates, true[1:BLUR], strict=True)])
@@ -70,12 +70,12 @@ def _standoff(distance_mm: float) -> Outcome:
     mounting = _SCENE.rig.mounting
     moved = mounting.model_copy(update={"standoff_mm": mounting.standoff_mm.model_copy(update={"value": distance_mm})})
     pitch = _SCENE.rig.panel.pitch_mm.value
-    pupil = np.array([*np.asarray(_SCENE.geometry.pupil)[:2], -distance_mm])
+    pupil = np.array([*np.asarray(_SCENE.geometry.pupil_mm)[:2], -distance_mm])
     return _fit(
         replace(
             _SCENE,
             rig=_SCENE.rig.model_copy(update={"mounting": moved}),
-            geometry=replace(_SCENE.geometry, pupil=pupil),
+            geometry=replace(_SCENE.geometry, pupil_mm=pupil),
             wire=replace(_SCENE.wire, standoff_per_pitch=np.float64(distance_mm / pitch)),
         )
     )

@@ -52,12 +52,12 @@ def of_rig(
 
 
 def _narrow(lens: Geometry, focal_px: float) -> Geometry:
-    return replace(lens, focal=np.array([focal_px, focal_px]))
+    return replace(lens, focal_px=np.array([focal_px, focal_px]))
 
 
-def _rows_only(pupil_per_pitch: float) -> WireStart:
+def _rows_only(footprint_per_pitch: float) -> WireStart:
     """A small pupil shows many harmonics of columns, too; without those, fits are quick."""
-    return replace(start(), pupil_per_pitch=pupil_per_pitch, column_open=0.9995, column_tolerance=1e-4)
+    return replace(start(), footprint_per_pitch=footprint_per_pitch, column_open=0.9995, column_tolerance=1e-4)
 
 
 def wrong_start(standoff: float, pupil: float, seed: int = SEED) -> Outcome:
@@ -67,7 +67,7 @@ def wrong_start(standoff: float, pupil: float, seed: int = SEED) -> Outcome:
     wrong = replace(
         built,
         standoff_per_pitch=built.standoff_per_pitch * standoff,
-        pupil_per_pitch=built.pupil_per_pitch * pupil,
+        footprint_per_pitch=built.footprint_per_pitch * pupil,
     )
     return judged(fitted(flat, wrong, geometry()), flat)
 

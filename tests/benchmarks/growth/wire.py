@@ -26,7 +26,7 @@ _DRAWN = 10
 def _lens(rows: int) -> Geometry:
     """That of the efficiency benchmark, on a sensor of other pixels."""
     lens, by = geometry(), rows / 120
-    return replace(lens, focal=lens.focal * by, centre=(lens.centre + 0.5) * by - 0.5)
+    return replace(lens, focal_px=lens.focal_px * by, principal_point_px=(lens.principal_point_px + 0.5) * by - 0.5)
 
 
 @in_float64

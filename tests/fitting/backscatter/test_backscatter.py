@@ -51,11 +51,11 @@ def known_geometry() -> Geometry:
     """What a geometry fit would know: all but the pupil's place, which is nominal."""
     optics = TRUTH.optics
     return Geometry(
-        focal=np.array([optics.fx_px, optics.fy_px]),
-        centre=np.array([optics.cx_px, optics.cy_px]),
+        focal_px=np.array([optics.fx_px, optics.fy_px]),
+        principal_point_px=np.array([optics.cx_px, optics.cy_px]),
         distortion=np.array(optics.distortion),
-        rotation=Rotation.from_matrix(optics.R_panel_camera).as_rotvec(),
-        pupil=nominal_geometry(RIG).pupil,
+        rotation_rad=Rotation.from_matrix(optics.R_panel_camera).as_rotvec(),
+        pupil_mm=nominal_geometry(RIG).pupil_mm,
     )
 
 
@@ -131,8 +131,8 @@ def test_a_shifted_picture_does_not_pass(fitted: FitResult[Backscatter], simulat
 
 def test_what_the_simulator_was_built_with_is_found(fitted: FitResult[Backscatter]) -> None:
     assert fitted.estimate("gamma").value == pytest.approx(TRUTH.panel.gamma, abs=0.01)
-    assert fitted.estimate("distance_mm").value == pytest.approx(-TRUTH.optics.pupil_mm[2], abs=0.3)
-    nominal_px = known_geometry().pupil[0] / RIG.panel.pitch_mm.value
+    assert fitted.estimate("standoff_mm").value == pytest.approx(-TRUTH.optics.pupil_mm[2], abs=0.3)
+    nominal_px = known_geometry().pupil_mm[0] / RIG.panel.pitch_mm.value
     offset = nominal_px - TRUTH.optics.pupil_mm[0] / TRUTH.panel.pitch_mm
     assert fitted.term.emitters_px[1, 0] == pytest.approx(offset, abs=0.2)
     np.testing.assert_allclose(np.asarray(fitted.term.mix).sum(axis=1), 1.0, atol=1e-12)

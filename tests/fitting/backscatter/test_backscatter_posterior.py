@@ -16,7 +16,7 @@ from udccal.fitting.backscatter.solve import MostProbable, Problem, most_probabl
 from udccal.rig import load_rig
 
 PRIOR = prior_of(load_rig("lg55-reduced"))
-DISTANCE, GAMMA = NAMES.index("distance_mm"), NAMES.index("gamma")
+DISTANCE, GAMMA = NAMES.index("standoff_mm"), NAMES.index("gamma")
 FREE = np.isin(np.arange(18), [DISTANCE, REFLECTION])
 # Sigma of the reflected share of the light, and of where light comes from as a share of the distance.
 _SHARE, _PLACE = 0.08, 2e-3

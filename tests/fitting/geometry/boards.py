@@ -16,11 +16,11 @@ from udccal.models.geometry import Geometry, mounting_rotation, project, unproje
 SPEC = BoardSpec(columns=7, rows=5, square_mm=40.0, marker_mm=30.0)
 SIZE = (320, 240)
 CAMERA = Geometry(
-    focal=np.array([300.0, 300.4]),
-    centre=np.array([161.0, 118.0]),
+    focal_px=np.array([300.0, 300.4]),
+    principal_point_px=np.array([161.0, 118.0]),
     distortion=np.array([-0.08, 0.03, 4e-4, -3e-4, 0.0]),
-    rotation=np.zeros(3),
-    pupil=np.zeros(3),
+    rotation_rad=np.zeros(3),
+    pupil_mm=np.zeros(3),
 )
 _TEXELS = 40
 

@@ -35,7 +35,7 @@ def calibrate(scene: Sight = SCENE, **options: object) -> CalibratedViews:
 
 def errors(found: CalibratedViews, scene: Sight = SCENE) -> np.ndarray:
     """Of the free intrinsics, in sigma."""
-    truth = np.concatenate([scene.camera.focal, scene.camera.centre, scene.camera.distortion])
+    truth = np.concatenate([scene.camera.focal_px, scene.camera.principal_point_px, scene.camera.distortion])
     free = np.array(found.free)
     return ((found.intrinsics.vector - truth) / np.sqrt(np.maximum(np.diag(found.cov)[:9], 1e-300)))[free]
 
@@ -57,7 +57,7 @@ def test_the_lens_is_found_within_its_sigma(plain: CalibratedViews) -> None:
 @pytest.mark.parametrize("factor", [0.3, 0.8, 1.2, 4.0])
 def test_any_start_leads_to_the_same_lens(plain: CalibratedViews, factor: float) -> None:
     rng = np.random.default_rng(int(10 * factor))
-    start = Geometry(SCENE.camera.focal * factor, np.array([300.0, 600.0]), np.zeros(5), np.zeros(3), np.zeros(3))
+    start = Geometry(SCENE.camera.focal_px * factor, np.array([300.0, 600.0]), np.zeros(5), np.zeros(3), np.zeros(3))
     poses = np.hstack([rng.uniform(-3, 3, (8, 3)), rng.uniform([-500, -500, -900], [500, 500, 2000], (8, 3))])
     found = calibrate(start=start, start_poses=poses)
     np.testing.assert_allclose(found.intrinsics.vector, plain.intrinsics.vector, atol=1e-3)

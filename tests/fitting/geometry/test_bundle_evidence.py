@@ -38,7 +38,7 @@ def test_rays_are_surer_the_less_they_are_fixed_to(plain: CalibratedViews) -> No
 
 def test_a_turn_of_camera_and_poses_together_moves_no_ray_of_the_boards(plain: CalibratedViews) -> None:
     """The freedom itself, as a covariance: the centre moves by a pixel and all boards turn to make up for it."""
-    middle = plain.intrinsics.centre[None]
+    middle = plain.intrinsics.principal_point_px[None]
     _, slopes = projected(plain.intrinsics.vector, np.array([[0.0, 0.0, 1.0]]))
     direction = np.zeros(len(plain.cov))
     direction[2] = 1.0

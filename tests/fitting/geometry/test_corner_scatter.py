@@ -52,4 +52,4 @@ def test_corners_without_any_scatter_give_the_lens_itself() -> None:
     result = fit_boards(GeometryData(tuple(exact), START, scene.size))
     assert result.status is FitStatus.CONVERGED
     assert np.isfinite(result.cov).all()
-    np.testing.assert_allclose(result.term.focal, scene.camera.focal, atol=1e-4)
+    np.testing.assert_allclose(result.term.focal_px, scene.camera.focal_px, atol=1e-4)

@@ -28,11 +28,11 @@ from udccal.sessions.writer import SessionWriter
 TILT_DEG, ROLL_DEG, YAW_DEG = 17.0, 0.6, -0.4
 NOISE_PX = 0.02
 START = Geometry(
-    focal=np.array([295.0, 295.0]),
-    centre=np.array([159.5, 119.5]),
+    focal_px=np.array([295.0, 295.0]),
+    principal_point_px=np.array([159.5, 119.5]),
     distortion=np.zeros(5),
-    rotation=np.zeros(3),
-    pupil=np.array([500.0, 100.0, -14.0]),
+    rotation_rad=np.zeros(3),
+    pupil_mm=np.array([500.0, 100.0, -14.0]),
 )
 
 
@@ -91,11 +91,13 @@ def test_intrinsics_and_tilt_are_found(fitted: FitResult[Geometry]) -> None:
 
 
 def test_rays_land_where_they_should(fitted: FitResult[Geometry]) -> None:
-    truth = Geometry(CAMERA.focal, CAMERA.centre, CAMERA.distortion, fitted.term.rotation, CAMERA.pupil)
+    truth = Geometry(
+        CAMERA.focal_px, CAMERA.principal_point_px, CAMERA.distortion, fitted.term.rotation_rad, CAMERA.pupil_mm
+    )
     x, y = np.meshgrid(np.linspace(0, SIZE[0] - 1, 9), np.linspace(0, SIZE[1] - 1, 7))
     pixels = np.stack([x.ravel(), y.ravel()], axis=1)
     with jax.enable_x64(True):
-        ideal = np.asarray(rotation_matrix(fitted.term.rotation)).T @ mounting()
+        ideal = np.asarray(rotation_matrix(fitted.term.rotation_rad)).T @ mounting()
         assert np.rad2deg(np.abs(ideal - np.eye(3)).max()) < 0.05
         directions = np.random.default_rng(0).uniform([-0.4, 0.0, 1.0], [0.4, 0.6, 1.0], (60, 3))
         error = np.asarray(project_directions(fitted.term, directions)) - np.asarray(
@@ -109,10 +111,10 @@ def test_rays_land_where_they_should(fitted: FitResult[Geometry]) -> None:
 
 def test_the_posterior_has_the_sigma_of_every_estimate(fitted: FitResult[Geometry]) -> None:
     stated = [e.sigma for e in fitted.estimates]
-    lens = fitted.sigma_of(lambda term: np.concatenate([term.focal, term.centre, term.distortion]))
+    lens = fitted.sigma_of(lambda term: np.concatenate([term.focal_px, term.principal_point_px, term.distortion]))
     np.testing.assert_allclose(lens, stated[:9], rtol=1e-3, atol=1e-9)
     with jax.enable_x64(True):
-        tilt = fitted.sigma_of(lambda term: np.rad2deg(np.arcsin(np.asarray(rotation_matrix(term.rotation))[1, 2])))
+        tilt = fitted.sigma_of(lambda term: np.rad2deg(np.arcsin(np.asarray(rotation_matrix(term.rotation_rad))[1, 2])))
     assert float(tilt) == pytest.approx(stated[9], rel=1e-3)
 
 
@@ -195,7 +197,7 @@ def test_a_plain_camera_needs_no_start() -> None:
     found = views()
     bundle: CalibratedViews = fit_geometry([board_points_mm(SPEC)] * 9, [v.corners.xy for v in found], SIZE)
     assert bundle.converged
-    np.testing.assert_allclose(bundle.intrinsics.focal, CAMERA.focal, atol=0.5)
+    np.testing.assert_allclose(bundle.intrinsics.focal_px, CAMERA.focal_px, atol=0.5)
     assert bundle.rms_px < 2 * NOISE_PX * np.sqrt(2)
 
 
@@ -222,4 +224,4 @@ def test_a_session_of_drawn_boards(tmp_path: Path) -> None:
     assert result.status is FitStatus.CONVERGED
     assert abs(result.estimate("tilt_deg").value - TILT_DEG) < 0.2  # a sixth of the pixels across
     assert result.estimate("fx").value == pytest.approx(300.0, abs=1.0)
-    np.testing.assert_allclose(result.term.pupil, nominal_geometry(rig).pupil)
+    np.testing.assert_allclose(result.term.pupil_mm, nominal_geometry(rig).pupil_mm)

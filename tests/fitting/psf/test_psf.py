@@ -103,7 +103,7 @@ def grating() -> Fitted:
 def test_a_grating_is_predicted_where_it_was_not_captured(grating: Fitted) -> None:
     assert grating.result.status is FitStatus.CONVERGED
     assert grating.worst_l2 < 0.03
-    assert grating.result.estimate("row_open_fraction").value == pytest.approx(0.3917, abs=0.004)
+    assert grating.result.estimate("row_open").value == pytest.approx(0.3917, abs=0.004)
     assert all(estimate.sigma > 0 for estimate in grating.result.estimates)
     assert grating.result.cov.shape == (6, 6)
     # One of the wire's phase, one of the residual's orders, and how far light reaches along rows and along columns.
@@ -125,10 +125,10 @@ def test_a_grating_is_predicted_where_it_was_not_captured(grating: Fitted) -> No
 def test_the_posterior_knows_the_numbers_and_what_the_kernel_is_off_by(grating: Fitted) -> None:
     result = grating.result
     for estimate, of in (
-        (result.estimate("pitch"), lambda term: term.diffraction.pitch_mm),
-        (result.estimate("row_open_fraction"), lambda term: term.diffraction.open_fraction[1]),
-        (result.estimate("pupil_diameter"), lambda term: term.diffraction.pupil_mm),
-        (result.estimate("blur"), lambda term: term.diffraction.blur_px),
+        (result.estimate("pitch_mm"), lambda term: term.diffraction.pitch_mm),
+        (result.estimate("row_open"), lambda term: term.diffraction.openings[1]),
+        (result.estimate("pupil_diameter_mm"), lambda term: term.diffraction.pupil_diameter_mm),
+        (result.estimate("blur_px"), lambda term: term.diffraction.blur_px),
     ):
         assert float(result.sigma_of(of)) == pytest.approx(estimate.sigma, rel=0.02)
     # Found at positions held out, it is part of every kernel's sigma, and of what may be drawn.
@@ -162,7 +162,7 @@ def test_blur_without_a_grating_is_carried_by_the_image() -> None:
     shots = shots_of(lambda s, m: streak(s, m, 1.0, rig), rig, places_on(rig, 4, 3), 4, 1.0)
     result = fit_psf(PsfData(shots), rig, geometry, absent_wire(rig, geometry), TOY)
     assert result.status is FitStatus.CONVERGED
-    assert float(result.term.diffraction_share) == 0.0
+    assert float(result.term.diffraction_fraction) == 0.0
     assert result.chi2_dof < 10.0
     assert "not that of a panel's grating" in result.notes[0]
     assert result.term.residual.shape[2:] == tuple(2 * result.term.support_px[::-1].astype(int) + 1)
@@ -244,4 +244,4 @@ def test_where_no_wire_shows_the_rig_says_where_to_start() -> None:
     model = start_model(rig, geometry, absent_wire(rig, geometry))
     assert not wire_shows(absent_wire(rig, geometry))
     assert float(model.visibility) == 0.0
-    np.testing.assert_allclose(model.open_fraction, [0.94, 0.40])
+    np.testing.assert_allclose(model.openings, [0.94, 0.40])

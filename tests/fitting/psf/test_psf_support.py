@@ -147,7 +147,7 @@ def test_an_image_ends_where_it_ends() -> None:
     rig = load_rig("lg55-reduced")
     geometry = nominal_geometry(rig)
     term = nominal_psf(rig, geometry, absent_wire(rig, geometry))
-    image = replace(term, diffraction_share=np.float64(0.0), residual=np.ones((1, 3, 21, 11)))
+    image = replace(term, diffraction_fraction=np.float64(0.0), residual=np.ones((1, 3, 21, 11)))
     support = Support((10, 5), (10, 5), ())
     found = with_support(image, support, rig)
     np.testing.assert_array_equal(found.support_px, [5, 10])

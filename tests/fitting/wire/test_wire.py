@@ -49,14 +49,14 @@ def bench() -> Bench:
     angle = np.arccos((np.trace(tilt) - 1) / 2)
     axis = np.array([tilt[2, 1] - tilt[1, 2], tilt[0, 2] - tilt[2, 0], tilt[1, 0] - tilt[0, 1]])
     geometry = Geometry(
-        focal=np.array([optics.fx_px, optics.fy_px]),
-        centre=np.array([optics.cx_px, optics.cy_px]),
+        focal_px=np.array([optics.fx_px, optics.fy_px]),
+        principal_point_px=np.array([optics.cx_px, optics.cy_px]),
         distortion=np.array(optics.distortion),
-        rotation=axis / (2 * np.sin(angle)) * angle + np.array([5e-4, -3e-4, 4e-4]),
-        pupil=np.array([605.0, 189.0, -rig.mounting.standoff_mm.value]),
+        rotation_rad=axis / (2 * np.sin(angle)) * angle + np.array([5e-4, -3e-4, 4e-4]),
+        pupil_mm=np.array([605.0, 189.0, -rig.mounting.standoff_mm.value]),
     )
     # The opening seen by oblique rays lies half the structure's depth further on.
-    depth = truth.panel.structure_thickness_mm
+    depth = truth.panel.depth_mm
     return Bench(
         truth=true_wire_map(truth),
         geometry=geometry,

@@ -41,7 +41,7 @@ def test_map_and_shape_are_within_their_errors_from_a_start_that_is_a_fifth_off(
     built = start()
     flat = noisy(drawn_truth(1, built, geometry()), 1)
     wrong = replace(
-        built, standoff_per_pitch=0.8 * built.standoff_per_pitch, pupil_per_pitch=1.2 * built.pupil_per_pitch
+        built, standoff_per_pitch=0.8 * built.standoff_per_pitch, footprint_per_pitch=1.2 * built.footprint_per_pitch
     )
     fit = fitted(flat, wrong, geometry())
     result = fit.or_raise()

@@ -34,11 +34,11 @@ HARMONICS = np.array([[0.0, 1.0], [1.0, 0.0], [1.0, 1.0], [-1.0, 2.0], [0.0, 3.0
 RULES = WireRules()
 START = WireStart(12.0, 0.03, 3.0, 0.04, 0.4, 0.02, 0.9, 0.01, 0.05, 0.01)
 GEOMETRY = Geometry(
-    focal=np.array([120.0, 120.0]),
-    centre=np.array([63.0, 48.5]),
+    focal_px=np.array([120.0, 120.0]),
+    principal_point_px=np.array([63.0, 48.5]),
     distortion=np.array([-0.05, 0.01, 0.0, 0.0, 0.0]),
-    rotation=np.array([-0.3, 0.01, 0.02]),
-    pupil=np.array([60.0, 30.0, -7.5]),
+    rotation_rad=np.array([-0.3, 0.01, 0.02]),
+    pupil_mm=np.array([60.0, 30.0, -7.5]),
 )
 
 
@@ -46,7 +46,7 @@ def uneven_wire(seed: int = 0) -> Wire:
     rng = np.random.default_rng(seed)
     wire = ideal_wire(GEOMETRY, START, HARMONICS)
     return eqx.tree_at(
-        lambda w: (w.fields, w.baseline, w.amplitudes, w.rotation, w.frequency),
+        lambda w: (w.fields, w.baseline, w.amplitudes, w.rotation_rad, w.frequency),
         wire,
         (
             np.asarray(wire.fields) + 0.05 * rng.standard_normal(np.shape(wire.fields)),

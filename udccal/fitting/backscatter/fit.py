@@ -102,7 +102,7 @@ def result_of(found: Found, data: BackscatterData, rig: RigDescription, clipped:
     rest = residual_pattern(found)
     values = value_moments(found, rest.inflation)
     moved = pitch_error(values.mean, rig)
-    scale = np.where(np.array(NAMES) == "pupil_mm", 1 / footprint_share(rig), 1.0)
+    scale = np.where(np.array(NAMES) == "pupil_diameter_mm", 1 / footprint_share(rig), 1.0)
     cov = (values.cov + np.outer(moved, moved)) * np.outer(scale, scale)
     shape = data.shots.rate.shape[2:]
     rays = grid_rays(template.geometry, shape, template.step, np.arange(shape[0] * shape[1]))

@@ -22,8 +22,9 @@ from udccal.rig import RigDescription
 
 Vector = Float[np.ndarray, "18"]
 NAMES = (
-    "gamma", "distance_mm", "pupil_mm", "softness_px", "reflection", "reflection_mm", "offset_x_px", "offset_y_px",
-    "red_x_px", "red_y_px", "blue_x_px", "blue_y_px", "mix_rg", "mix_rb", "mix_gr", "mix_gb", "mix_br", "mix_bg",
+    "gamma", "standoff_mm", "pupil_diameter_mm", "softness_px", "reflection", "reflection_mm",
+    "offset_x_px", "offset_y_px", "red_x_px", "red_y_px",
+    "blue_x_px", "blue_y_px", "mix_rg", "mix_rb", "mix_gr", "mix_gb", "mix_br", "mix_bg",
 )  # fmt: skip
 UNITS = ("1", "mm", "mm", "px", "1", "mm", *["px"] * 6, *["1"] * 6)
 DISTANCE, PUPIL, SOFTNESS, REFLECTION, DEPTH = range(1, 6)
@@ -124,7 +125,13 @@ def prior_of(rig: RigDescription) -> Prior:
     """What the rig's description says about every parameter, in the solver's coordinates."""
     panel, lens, mounting = rig.panel, rig.lens, rig.mounting
     depth = 2 * panel.glass_thickness_mm / panel.glass_index
-    lengths = [mounting.standoff_mm.value, rig.pupil_mm * footprint_share(rig), _SOFTNESS_PX, _REFLECTION, depth]
+    lengths = [
+        mounting.standoff_mm.value,
+        rig.pupil_diameter_mm * footprint_share(rig),
+        _SOFTNESS_PX,
+        _REFLECTION,
+        depth,
+    ]
     pupil = lens.focal_mm.tolerance / lens.focal_mm.value + lens.f_number.tolerance / lens.f_number.value + 0.02
     distance = (mounting.standoff_mm.tolerance + 0.1) / mounting.standoff_mm.value
     mean = np.concatenate([[panel.gamma.value], np.log(lengths), np.zeros(6), np.full(6, np.log(_CROSSTALK))])
@@ -187,7 +194,7 @@ def linear_of(x: Vector) -> Vector:
 def vector_of(term: Backscatter) -> Vector:
     """The solver's coordinates of a term, whose logarithms have 1e-6 for what is absent."""
     emitters, mix = np.asarray(term.emitters_px), np.asarray(term.mix)
-    lengths = (term.distance_mm, term.pupil_mm, term.softness_px, term.reflection, term.reflection_mm)
+    lengths = (term.standoff_mm, term.pupil_diameter_mm, term.softness_px, term.reflection, term.reflection_mm)
     places = (emitters[1], emitters[0] - emitters[1], emitters[2] - emitters[1])
     crosstalk = (mix / np.diag(mix)[:, None])[_OFF_DIAGONAL]
     x = np.concatenate([[float(np.asarray(one)) for one in (term.gamma, *lengths)], *places, crosstalk])
@@ -212,7 +219,8 @@ def with_linear(term: Backscatter, theta: Float[Array, "18"]) -> Backscatter:
     mix = jnp.eye(3, dtype=theta.dtype).at[_OFF_DIAGONAL].set(theta[MIX])
     return eqx.tree_at(
         lambda t: (
-            t.gamma, t.distance_mm, t.pupil_mm, t.softness_px, t.reflection, t.reflection_mm, t.emitters_px, t.mix
+            t.gamma, t.standoff_mm, t.pupil_diameter_mm, t.softness_px, t.reflection, t.reflection_mm, t.emitters_px,
+            t.mix,
         ),
         term,
         (

@@ -100,8 +100,8 @@ def _middle_and_reach_of_block(
     template: Backscatter, theta: Float[Arrayish, "18"], rays: Float[Arrayish, "b 3"]
 ) -> tuple[Int[Array, "b 2"], Float[Array, " b"]]:
     term = with_linear(template, jnp.asarray(theta))
-    near, shape = footprints(term, rays, term.distance_mm)
-    far, far_shape = footprints(term, rays, term.distance_mm + term.reflection_mm)
+    near, shape = footprints(term, rays, term.standoff_mm)
+    far, far_shape = footprints(term, rays, term.standoff_mm + term.reflection_mm)
     extent = jnp.maximum(jnp.linalg.norm(shape, axis=2), jnp.linalg.norm(far_shape, axis=2)).max(axis=1)
     return window_corners(term, rays), extent + jnp.abs(far - near).max(axis=1) / 2
 

@@ -151,7 +151,7 @@ def _result(
     x, cov = with_angles(bundle.intrinsics.vector, bundle.poses, bundle.cov, parallel)
     # A pattern in the residuals moves every place by its size, as a centre does that is off by as much.
     pattern = bundle.evidence.pattern_px * np.eye(len(x))[:, 2:4]
-    pupil = np.asarray(nominal.pupil, dtype=np.float64)
+    pupil = np.asarray(nominal.pupil_mm, dtype=np.float64)
     posterior = Posterior(x, np.hstack([square_root(cov), pattern]), partial(term_at, pupil=pupil))
     poor = bundle.rms_px > rules.worst_rms_px and bundle.chi2_dof > rules.worst_chi2_dof
     points, use = bundle.points, bundle.points.used
@@ -211,7 +211,7 @@ def term_at(x: Float[np.ndarray, "12"], pupil: Float[np.ndarray, "3"]) -> Geomet
     """The term of intrinsics and angles."""
     lens, (tilt, roll, yaw) = Intrinsics.of(x[:LENS]), x[LENS:]
     rotation = Rotation.from_euler("YXZ", [yaw, -tilt, roll], degrees=True).as_rotvec()
-    return Geometry(lens.focal, lens.centre, lens.distortion, np.asarray(rotation), pupil)
+    return Geometry(lens.focal_px, lens.principal_point_px, lens.distortion, np.asarray(rotation), pupil)
 
 
 def _diagnostics(

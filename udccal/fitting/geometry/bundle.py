@@ -104,12 +104,12 @@ class Intrinsics:
     """A lens; as one vector (fx, fy, cx, cy, k1, k2, p1, p2, k3), the order of ``INTRINSIC_NAMES``.
 
     Attributes:
-        focal: (fx, fy) in px. centre: (cx, cy) in px.
+        focal_px: (fx, fy). principal_point_px: (cx, cy).
         distortion: (k1, k2, p1, p2, k3), OpenCV's order and signs.
     """
 
-    focal: Float[Arrayish, "2"]
-    centre: Float[Arrayish, "2"]
+    focal_px: Float[Arrayish, "2"]
+    principal_point_px: Float[Arrayish, "2"]
     distortion: Float[Arrayish, "5"]
 
     @classmethod
@@ -120,22 +120,24 @@ class Intrinsics:
     @classmethod
     def of_geometry(cls, geometry: Geometry) -> Intrinsics:
         """Of a fitted or nominal term."""
-        return cls(geometry.focal, geometry.centre, geometry.distortion)
+        return cls(geometry.focal_px, geometry.principal_point_px, geometry.distortion)
 
     @property
     def vector(self) -> Float[np.ndarray, "9"]:
         """In double precision."""
-        return np.concatenate([np.asarray(p, dtype=np.float64) for p in (self.focal, self.centre, self.distortion)])
+        return np.concatenate(
+            [np.asarray(p, dtype=np.float64) for p in (self.focal_px, self.principal_point_px, self.distortion)]
+        )
 
     @property
     def matrix(self) -> Float[np.ndarray, "3 3"]:
         """OpenCV's camera matrix."""
-        (fx, fy), (cx, cy) = np.asarray(self.focal), np.asarray(self.centre)
+        (fx, fy), (cx, cy) = np.asarray(self.focal_px), np.asarray(self.principal_point_px)
         return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
     def camera(self) -> Geometry:
         """The term with the lens alone: camera coordinates are the panel's."""
-        return Geometry(self.focal, self.centre, self.distortion, jnp.zeros(3), jnp.zeros(3))
+        return Geometry(self.focal_px, self.principal_point_px, self.distortion, jnp.zeros(3), jnp.zeros(3))
 
 
 @final

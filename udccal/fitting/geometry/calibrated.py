@@ -160,7 +160,7 @@ class CalibratedViews:
     ) -> tuple[Float[np.ndarray, "rays 2 9"], Float[np.ndarray, "rays 2 3"]]:
         """Of where fixed rays land: by the intrinsics, and by a small rotation of the rays in camera coordinates."""
         lens = self.intrinsics
-        rays = np.hstack([(pixels - lens.centre) / lens.focal, np.ones((len(pixels), 1))])
+        rays = np.hstack([(pixels - lens.principal_point_px) / lens.focal_px, np.ones((len(pixels), 1))])
         with np.errstate(all="ignore"):  # Rays that do not come near are found below.
             for _ in range(_NEWTON_ROUNDS):
                 places, by = projected(lens.vector, rays)

@@ -74,7 +74,7 @@ def fit_psf(
     model = as_numpy(fit.problem.evaluator.model(fit.theta))
     term = replace(
         _field(model, geometry),
-        diffraction_share=np.float64(selection.order.share),
+        diffraction_fraction=np.float64(selection.order.share),
         residual=selection.image,
         centre_px=size,
         half_px=size,
@@ -82,7 +82,7 @@ def fit_psf(
     )
     support = selection.support
     # An image that carries the kernel ends with the crops.
-    if term.diffraction_share and data.shots.half != shots.half:
+    if term.diffraction_fraction and data.shots.half != shots.half:
         held_out = np.flatnonzero(held_out_positions(shots.positions))
         looked_at = np.concatenate([np.flatnonzero(shots.position == p)[:_WIDE_PICTURES] for p in held_out])
         support = wide_support(data.shots.pick(looked_at), selection.sources.pick(looked_at), term, rig)
@@ -125,17 +125,17 @@ def _unfit(data: PsfData, rig: RigDescription, rules: PsfRules) -> tuple[FitStat
 
 def _field(model: Diffraction, geometry: Geometry) -> PsfField:
     """Without a residual."""
-    half = np.maximum(np.asarray(geometry.centre, dtype=np.float64), 1.0)
+    half = np.maximum(np.asarray(geometry.principal_point_px, dtype=np.float64), 1.0)
     return PsfField(
         geometry=geometry,
         diffraction=model,
-        diffraction_share=np.float64(1.0),
+        diffraction_fraction=np.float64(1.0),
         residual=np.zeros((1, 3, 1, 1)),
         centre_px=half,
         half_px=half,
         support_px=2 * half + 1,
         degree=0,
-        fine=fine_oversample(float(model.pupil_mm), float(np.mean(np.asarray(geometry.focal)))),
+        fine=fine_oversample(float(model.pupil_diameter_mm), float(np.mean(np.asarray(geometry.focal_px)))),
     )
 
 

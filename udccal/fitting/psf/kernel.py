@@ -56,8 +56,8 @@ def pack(model: Diffraction) -> Float[np.ndarray, " p"]:
     The kernel depends on the square of the blur: about none at all it would have no derivative, and two signs.
     """
     logs = np.log(np.maximum(np.asarray(model.spectrum), 1e-6))
-    head = [model.pitch_mm, *np.asarray(model.open_fraction), model.thickness_mm, model.pupil_mm, np.log(model.blur_px)]
-    head += [*np.asarray(model.offset), model.standoff_per_pitch]
+    head = [model.pitch_mm, *np.asarray(model.openings), model.depth_mm, model.pupil_diameter_mm, np.log(model.blur_px)]
+    head += [*np.asarray(model.offset_periods), model.standoff_per_pitch]
     return np.concatenate([np.array(head, dtype=float), (logs - logs.mean(axis=1, keepdims=True)).ravel()])
 
 
@@ -66,11 +66,11 @@ def unpack(theta: Float[Arrayish, " p"], wavelengths_nm: Float[Arrayish, " nodes
     theta = jnp.asarray(theta)
     return Diffraction(
         pitch_mm=theta[PITCH],
-        open_fraction=theta[1:3],
-        thickness_mm=theta[3],
-        pupil_mm=theta[PUPIL],
+        openings=theta[1:3],
+        depth_mm=theta[3],
+        pupil_diameter_mm=theta[PUPIL],
         blur_px=jnp.exp(theta[BLUR]),
-        offset=theta[6:8],
+        offset_periods=theta[6:8],
         standoff_per_pitch=theta[8],
         visibility=float(interference),
         wavelengths_nm=jnp.asarray(wavelengths_nm),
@@ -146,7 +146,8 @@ def kernel_jacobian(
     fx, fy = lattice_frequencies(frame, lattice)
     (columns, by_column), (rows, by_row) = (_slits(model, frame, axis, f) for axis, f in enumerate((fx, fy)))
     pupils, by_pupil = _with_derivative(
-        lambda mm: pupil_overlaps(eqx.tree_at(lambda m: m.pupil_mm, model, mm), frame, lattice), model.pupil_mm
+        lambda mm: pupil_overlaps(eqx.tree_at(lambda m: m.pupil_diameter_mm, model, mm), frame, lattice),
+        model.pupil_diameter_mm,
     )
     sensor, by_blur = _with_derivative(
         lambda log: sensor_transfer(frame, fx, fy, jnp.exp(log), disc_px), jnp.log(model.blur_px)
@@ -190,13 +191,13 @@ def factor_jacobian(model: Diffraction, frame: LocalFrame) -> Float[Array, "fact
 
     def factors(head: Float[Array, " head"]) -> Float[Array, " factors"]:
         panel = (head[0], head[1:3], head[3])
-        own = eqx.tree_at(lambda m: (m.pitch_mm, m.open_fraction, m.thickness_mm), model, panel)
-        own = eqx.tree_at(lambda m: (m.offset, m.standoff_per_pitch), own, (head[6:8], head[8]))
+        own = eqx.tree_at(lambda m: (m.pitch_mm, m.openings, m.depth_mm), model, panel)
+        own = eqx.tree_at(lambda m: (m.offset_periods, m.standoff_per_pitch), own, (head[6:8], head[8]))
         opened, place = open_fractions(own, frame), footprint_place(own, frame)
         return jnp.stack([*opened, head[PITCH], head[PITCH], head[PUPIL], *place, head[BLUR]])
 
-    numbers = [model.pitch_mm, *jnp.asarray(model.open_fraction), model.thickness_mm, model.pupil_mm]
-    numbers += [jnp.log(model.blur_px), *jnp.asarray(model.offset), model.standoff_per_pitch]
+    numbers = [model.pitch_mm, *jnp.asarray(model.openings), model.depth_mm, model.pupil_diameter_mm]
+    numbers += [jnp.log(model.blur_px), *jnp.asarray(model.offset_periods), model.standoff_per_pitch]
     return jax.jacfwd(factors)(jnp.stack([jnp.asarray(number) for number in numbers]))
 
 

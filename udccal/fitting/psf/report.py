@@ -29,10 +29,10 @@ _PATTERN_P: Final = 1e-3
 # The kernel's error is drawn with so many patterns of signs; its size changes over the field with polynomials of a
 # degree, which so many places along each axis tell.
 _PATTERNS, _DEGREE, _PLACES = 16, 3, 4
-NAMES: Final = ("pitch", "column_open_fraction", "row_open_fraction", "structure_thickness", "pupil_diameter", "blur")
+NAMES: Final = ("pitch_mm", "column_open", "row_open", "depth_mm", "pupil_diameter_mm", "blur_px")
 _UNITS: Final = ("mm", "1", "1", "mm", "mm", "px")
 # Which of the numbers are lengths on the panel, told in pitches.
-_LENGTHS: Final = np.array([name in ("pitch", "structure_thickness", "pupil_diameter") for name in NAMES])
+_LENGTHS: Final = np.array([name in ("pitch_mm", "depth_mm", "pupil_diameter_mm") for name in NAMES])
 _DIFFRACTION_NOTES: Final = (
     "cov covers the numbers of diffraction; field coefficients of the residual and spectra are left out of it.",
     "chi2_dof is of the fit of diffraction and allows for the model error that its residuals tell.",
@@ -96,7 +96,7 @@ def with_support(term: PsfField, support: Support, rig: RigDescription) -> PsfFi
 
     Where no end of diffraction was seen, it goes on over the whole sensor; an image ends where it ends.
     """
-    ends = [not (seen and bool(term.diffraction_share)) for seen in support.open_ended]
+    ends = [not (seen and bool(term.diffraction_fraction)) for seen in support.open_ended]
     size = (rig.camera.rows, rig.camera.columns)
     down, across = (half if end else most for half, end, most in zip(support.half_px, ends, size, strict=True))
     return replace(term, support_px=np.array([across, down], dtype=np.float64))
@@ -139,7 +139,7 @@ def _posterior(known: Evidence, term: PsfField, whole: Float[np.ndarray, "p p"])
     def term_at(x: Float[np.ndarray, " n"]) -> PsfField:
         longer = 1.0 + x[count]
         model = as_numpy(evaluator.model(x[:count]))
-        scaled = {name: getattr(model, name) * longer for name in ("pitch_mm", "thickness_mm", "pupil_mm")}
+        scaled = {name: getattr(model, name) * longer for name in ("pitch_mm", "depth_mm", "pupil_diameter_mm")}
         model = replace(model, wavelengths_nm=model.wavelengths_nm * longer, **scaled)
         if not patterns:
             return replace(term, diffraction=model)
@@ -174,7 +174,7 @@ def as_numpy(model: Diffraction) -> Diffraction:
 def support_notes(term: PsfField, support: Support) -> tuple[str, ...]:
     """What is to be said where no end of the kernel's light was seen."""
     along = [name for name, on in zip(("columns", "rows"), support.open_ended, strict=True) if on]
-    if not along or not term.diffraction_share:
+    if not along or not term.diffraction_fraction:
         return ()
     seen = "light was seen as far as was looked; beyond, the kernel is diffraction as fitted."
     return (f"Along {' and '.join(along)} {seen}",)
@@ -216,7 +216,7 @@ def _diagnostics(known: Evidence, pattern_p: float, part: float) -> tuple[Diagno
         "iterations": fit.iterations,
         "kernel_error_l2": selection.relative_l2,
         "residual_degree": selection.order.degree,
-        "diffraction_share": selection.order.share,
+        "diffraction_fraction": selection.order.share,
         "model_error": fit.model_error,
         "efficiency": part,
         "residual_pattern_p": pattern_p,

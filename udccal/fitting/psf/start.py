@@ -97,16 +97,16 @@ def start_model(rig: RigDescription, geometry: Geometry, wire: Wire, rules: PsfR
     seen = wire_shows(wire)
     nodes = wavelengths_nm(rig, rules)
     responses = np.exp(-0.5 * ((nodes - np.array(_PEAKS_NM)[:, None]) / _WIDTH_NM) ** 2) + 1e-3
-    nominal_open = np.array([panel.column_open_fraction.value, panel.row_open_fraction.value])
+    nominal_open = np.array([panel.column_open.value, panel.row_open.value])
     measured_open = np.array([float(wire.column_open), float(wire.row_open)])
-    pupil = np.asarray(geometry.pupil, dtype=np.float64)
+    pupil = np.asarray(geometry.pupil_mm, dtype=np.float64)
     return Diffraction(
         pitch_mm=np.float64(pitch),
-        open_fraction=measured_open if seen else nominal_open,
-        thickness_mm=np.float64(float(wire.depth_per_pitch) * pitch if seen else panel.structure_thickness_mm.value),
-        pupil_mm=np.float64(float(wire.pupil_per_pitch) * pitch if seen else rig.pupil_mm),
+        openings=measured_open if seen else nominal_open,
+        depth_mm=np.float64(float(wire.depth_per_pitch) * pitch if seen else panel.depth_mm.value),
+        pupil_diameter_mm=np.float64(float(wire.footprint_per_pitch) * pitch if seen else rig.pupil_diameter_mm),
         blur_px=np.float64(rules.blur_px),
-        offset=np.asarray(wire.offset, dtype=np.float64) if seen else pupil[:2] / pitch,
+        offset_periods=np.asarray(wire.offset_periods, dtype=np.float64) if seen else pupil[:2] / pitch,
         standoff_per_pitch=np.float64(float(wire.standoff_per_pitch) if seen else -pupil[2] / pitch),
         visibility=np.float64(1.0 if seen else 0.0),
         wavelengths_nm=nodes,
@@ -143,10 +143,10 @@ def start_prior(rig: RigDescription, start: Diffraction, measured: bool, rules: 
     tighter = rules.wire_tolerance if measured else 1.0
     sigma = [
         rules.pitch_tolerance * min(panel.pitch_mm.tolerance, rules.pitch_well_known * panel.pitch_mm.value),
-        tighter * panel.column_open_fraction.tolerance,
-        tighter * panel.row_open_fraction.tolerance,
-        tighter * panel.structure_thickness_mm.tolerance,
-        tighter * 2.0 * rig.pupil_mm * rig.lens.f_number.tolerance / rig.lens.f_number.value,
+        tighter * panel.column_open.tolerance,
+        tighter * panel.row_open.tolerance,
+        tighter * panel.depth_mm.tolerance,
+        tighter * 2.0 * rig.pupil_diameter_mm * rig.lens.f_number.tolerance / rig.lens.f_number.value,
         rules.blur_log_sigma,
         *(3 * (rules.footprint_periods,)),
     ]

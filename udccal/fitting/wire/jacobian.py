@@ -73,8 +73,8 @@ def _rays(wire: Wire, ideal: Float[Array, "n 2"]) -> Rays:
     slope, rotation = slopes(wire, ideal), panel_rotation(wire)
     right, down = (rotation[:2, i : i + 1] - slope * rotation[2, i] for i in (0, 1))
     ellipse = jnp.stack([right[i] * right[j] + down[i] * down[j] for i, j in ((0, 0), (0, 1), (1, 1))])
-    periods = jnp.asarray(wire.offset)[:, None] + wire.standoff_per_pitch * slope
-    return Rays(periods, openings(wire, slope), ellipse, jnp.log(jnp.asarray(wire.pupil_per_pitch)))
+    periods = jnp.asarray(wire.offset_periods)[:, None] + wire.standoff_per_pitch * slope
+    return Rays(periods, openings(wire, slope), ellipse, jnp.log(jnp.asarray(wire.footprint_per_pitch)))
 
 
 _block_rays = jax.jit(_rays)

@@ -23,9 +23,9 @@ SHAPE_NAMES = (
     "rotation_y_deg",
     "rotation_z_deg",
     "standoff_per_pitch",
-    "offset_x",
-    "offset_y",
-    "pupil_per_pitch",
+    "offset_x_periods",
+    "offset_y_periods",
+    "footprint_per_pitch",
     "row_open",
     "column_open",
     "depth_per_pitch",
@@ -53,7 +53,7 @@ def possible_harmonics(start: WireStart, least: float | None = None, below: floa
     orders = np.arange(HIGHEST_ORDER + 1.0)
     m, n = (part.ravel() for part in np.meshgrid(orders, np.concatenate([-orders[:0:-1], orders]), indexing="ij"))
     n, m = n[(m > 0) | (n > 0)], m[(m > 0) | (n > 0)]
-    z = np.pi * start.pupil_per_pitch * np.hypot(n, m)
+    z = np.pi * start.footprint_per_pitch * np.hypot(n, m)
     size = np.where((n != 0) & (m != 0), 0.5, 1.0) * np.minimum(1.0, 2 * np.sqrt(2 / np.pi) / z**1.5)
     for order, opening in ((m, start.row_open), (np.abs(n), start.column_open)):
         slit = np.minimum(2.0 / (np.pi * np.maximum(order, 1) * opening), 2.0 * (1 - opening) / opening)
@@ -71,10 +71,10 @@ def ideal_wire(
     fields[:, 0, 0, 0] = 1.0
     return Wire(
         geometry=geometry,
-        rotation=np.zeros(3),
+        rotation_rad=np.zeros(3),
         standoff_per_pitch=np.float64(start.standoff_per_pitch),
-        offset=np.zeros(2),
-        pupil_per_pitch=np.float64(start.pupil_per_pitch),
+        offset_periods=np.zeros(2),
+        footprint_per_pitch=np.float64(start.footprint_per_pitch),
         row_open=np.float64(start.row_open),
         column_open=np.float64(start.column_open),
         depth_per_pitch=np.float64(start.depth_per_pitch),
@@ -89,7 +89,13 @@ def ideal_wire(
 def shape_vector(wire: Wire) -> Float[Array, "10"]:
     """Rotation (3, rad), log stand-off, offset (2), log pupil, row and column openings, depth."""
     lengths = wire.row_open, wire.column_open, wire.depth_per_pitch
-    parts = wire.rotation, jnp.log(wire.standoff_per_pitch), wire.offset, jnp.log(wire.pupil_per_pitch), *lengths
+    parts = (
+        wire.rotation_rad,
+        jnp.log(wire.standoff_per_pitch),
+        wire.offset_periods,
+        jnp.log(wire.footprint_per_pitch),
+        *lengths,
+    )
     return jnp.concatenate([jnp.atleast_1d(jnp.asarray(part)) for part in parts])
 
 
@@ -100,7 +106,7 @@ def with_shape(wire: Wire, shape: Float[np.ndarray, "10"] | Float[Array, "10"]) 
 
 
 def _shape_leaves(w: Wire) -> tuple[object, ...]:
-    placed = w.rotation, w.standoff_per_pitch, w.offset, w.pupil_per_pitch
+    placed = w.rotation_rad, w.standoff_per_pitch, w.offset_periods, w.footprint_per_pitch
     return *placed, w.row_open, w.column_open, w.depth_per_pitch
 
 
@@ -178,7 +184,11 @@ class Parameters:
         sigma[self.linear - len(self.fields) :] = rules.field_sigma
         if not self.panel:
             return Prior.independent(mean, sigma)
-        built = [np.log(start.standoff_per_pitch), *np.asarray(self.nothing.offset), np.log(start.pupil_per_pitch)]
+        built = [
+            np.log(start.standoff_per_pitch),
+            *np.asarray(self.nothing.offset_periods),
+            np.log(start.footprint_per_pitch),
+        ]
         shape = [0.0, 0.0, 0.0, *built, start.row_open, start.column_open, start.depth_per_pitch]
         return Prior.independent(np.append(mean, shape), np.append(sigma, shape_sigma(start, rules)))
 

@@ -78,7 +78,7 @@ class WireStart:
 
     standoff_per_pitch: float
     standoff_tolerance: float
-    pupil_per_pitch: float
+    footprint_per_pitch: float
     pupil_tolerance: float
     row_open: float
     row_tolerance: float
@@ -91,19 +91,19 @@ class WireStart:
 def wire_start(rig: RigDescription) -> WireStart:
     """Start values of a rig description."""
     panel, lens, standoff = rig.panel, rig.lens, rig.mounting.standoff_mm
-    pitch, depth = panel.pitch_mm.value, panel.structure_thickness_mm
+    pitch, depth = panel.pitch_mm.value, panel.depth_mm
     pitch_tolerance = panel.pitch_mm.tolerance / pitch
     lens_tolerance = lens.focal_mm.tolerance / lens.focal_mm.value + lens.f_number.tolerance / lens.f_number.value
     return WireStart(
         standoff_per_pitch=standoff.value / pitch,
         standoff_tolerance=standoff.tolerance / standoff.value + pitch_tolerance,
         # The beam narrows a little from the pupil to the panel on its way to the focus distance.
-        pupil_per_pitch=rig.pupil_mm * (1 - standoff.value / lens.focus_mm) / pitch,
+        footprint_per_pitch=rig.pupil_diameter_mm * (1 - standoff.value / lens.focus_mm) / pitch,
         pupil_tolerance=lens_tolerance + pitch_tolerance,
-        row_open=panel.row_open_fraction.value,
-        row_tolerance=panel.row_open_fraction.tolerance,
-        column_open=panel.column_open_fraction.value,
-        column_tolerance=panel.column_open_fraction.tolerance,
+        row_open=panel.row_open.value,
+        row_tolerance=panel.row_open.tolerance,
+        column_open=panel.column_open.value,
+        column_tolerance=panel.column_open.tolerance,
         depth_per_pitch=depth.value / pitch,
         depth_tolerance=depth.tolerance / pitch,
     )

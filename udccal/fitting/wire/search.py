@@ -165,9 +165,9 @@ class Search:
 
         In few pixels, faint columns may have been seen half a period off, with openings wider than their period.
         """
-        at, built = np.asarray(descent.wire.offset), np.float64(self.start.column_open)
+        at, built = np.asarray(descent.wire.offset_periods), np.float64(self.start.column_open)
         shifted = [
-            eqx.tree_at(lambda w: (w.offset, w.column_open), descent.wire, (at + np.array([shift, 0.0]), built))
+            eqx.tree_at(lambda w: (w.offset_periods, w.column_open), descent.wire, (at + np.array([shift, 0.0]), built))
             for shift in _SHIFTS
         ]
         chi2 = [
@@ -200,12 +200,12 @@ def scan_rows(
     rays = rays_at(wire, pixels.ideal)
     half_field = max(float(np.ptp(rays.periods[1])) / 2, 1.0)
     standoffs = start.standoff_per_pitch * _trials(rules.scan_range, rules.scan_periods / half_field, _MOST_STANDOFFS)
-    z = np.pi * start.pupil_per_pitch * float(np.sqrt(np.max(rays.ellipse[2])))
-    pupils = start.pupil_per_pitch * _trials(rules.scan_range, rules.scan_z / max(z, 1.0), _MOST_PUPILS)
+    z = np.pi * start.footprint_per_pitch * float(np.sqrt(np.max(rays.ellipse[2])))
+    pupils = start.footprint_per_pitch * _trials(rules.scan_range, rules.scan_z / max(z, 1.0), _MOST_PUPILS)
     gain, angle = _demodulate(wire, gains, pixels, 1, standoffs, pupils)
     sigma = shape_sigma(start, rules)
     unlikely = (np.log(standoffs / start.standoff_per_pitch) / sigma[3])[:, None] ** 2
-    unlikely = unlikely + (np.log(pupils / start.pupil_per_pitch) / sigma[6]) ** 2
+    unlikely = unlikely + (np.log(pupils / start.footprint_per_pitch) / sigma[6]) ** 2
     score = np.where(gain > 0, gain - np.minimum(unlikely, 0.5 * gain), 0.0)
     peaks = np.argwhere((maximum_filter(score, size=3, mode="nearest") == score) & (score >= _PART * score.max()))
     order = np.argsort([-score[i, j] for i, j in peaks], kind="stable")[: rules.places]
@@ -217,15 +217,15 @@ def beside(place: Place) -> list[Place]:
 
     In the pupil's transform a period of diameter is one zero more, or less, for a pupil of several periods.
     """
-    pupil, standoff = float(place.wire.pupil_per_pitch), float(place.wire.standoff_per_pitch)
-    angle = 2 * np.pi * (float(np.asarray(place.wire.offset)[1]) + 0.5)
+    pupil, standoff = float(place.wire.footprint_per_pitch), float(place.wire.standoff_per_pitch)
+    angle = 2 * np.pi * (float(np.asarray(place.wire.offset_periods)[1]) + 0.5)
     other = (pupil - 1.0, pupil + 1.0)
     return [Place(_placed(place.wire, standoff, size, 1, angle), place.gain) for size in other if size > 1.0]
 
 
 def scan_columns(wire: Wire, gains: Float[np.ndarray, "4"], pixels: Pixels) -> Wire:
     """The origin along X from the columns' first harmonic; the rest is known from the rows."""
-    standoff, pupil = float(wire.standoff_per_pitch), float(wire.pupil_per_pitch)
+    standoff, pupil = float(wire.standoff_per_pitch), float(wire.footprint_per_pitch)
     _gain, angle = _demodulate(wire, gains, pixels, 0, np.array([standoff]), np.array([pupil]))
     return _placed(wire, standoff, pupil, 0, angle[0, 0])
 
@@ -253,7 +253,7 @@ def _demodulate(
     errors = (pixels.value / level - whole) * root
     variance = max(float(np.sum(errors**2)) / max(pixels.used, 1), 1e-300)
     rays = rays_at(wire, pixels.ideal)
-    slope = (rays.periods[axis] - np.asarray(wire.offset)[axis]) / float(wire.standoff_per_pitch)
+    slope = (rays.periods[axis] - np.asarray(wire.offset_periods)[axis]) / float(wire.standoff_per_pitch)
     z = np.pi * pupils[:, None] * np.sqrt(rays.ellipse[2 * axis])
     sizes = root * 2.0 * np.sinc(rays.openings[axis]) * 2.0 * j1(z) / z
     power = np.maximum(np.sum(sizes**2, axis=1), 1e-300)
@@ -264,7 +264,7 @@ def _demodulate(
 
 
 def _placed(wire: Wire, standoff: float, pupil: float, axis: int, angle: float) -> Wire:
-    offset = np.array(wire.offset, dtype=np.float64)
+    offset = np.array(wire.offset_periods, dtype=np.float64)
     offset[axis] = float(angle) / (2 * np.pi)
     leaves = np.float64(standoff), np.float64(pupil), offset
-    return eqx.tree_at(lambda w: (w.standoff_per_pitch, w.pupil_per_pitch, w.offset), wire, leaves)
+    return eqx.tree_at(lambda w: (w.standoff_per_pitch, w.footprint_per_pitch, w.offset_periods), wire, leaves)
