@@ -1,4 +1,4 @@
-"""A few hundred broken inputs for every target, made of whole ones, and every input that once was trouble."""
+"""Up to two hundred broken inputs for every target, made of whole ones, and every input that once was trouble."""
 
 from __future__ import annotations
 
@@ -42,7 +42,8 @@ def test_broken_inputs_are_refused_in_words(name: str) -> None:
 
     deadline_ms = 1000 * target.longest_s
 
-    examples = max(100, 200 // target.one_in)
+    # Each that restores may compile for seconds; `make fuzz` tries a hundred thousand.
+    examples = max(15, 200 // target.one_in)
 
     @settings(max_examples=examples, deadline=deadline_ms, derandomize=True, suppress_health_check=list(HealthCheck))
     @given(broken(target.seeds()))
