@@ -111,7 +111,7 @@ class StampsRules:
         spacings_px: of nodes, the coarsest first.
         worth_finer: nodes are made denser again where the criterion may still fall by so much.
         highest: degrees of map and images.
-        steps_to_judge, steps_to_end: of one fit at most: of orders that are compared, and of those that are chosen.
+        steps_to_compare, steps_to_end: of one fit at most: of orders that are compared, and of those that are chosen.
         evidence: converged when the last step brought less log evidence, and the next promises half of it in log
             posterior. Near the maximum precisions and unknowns go on to trade places by hundredths.
         beyond_doubt: log posterior; maps of lower degrees that are expected to lose more are not fitted.
@@ -134,7 +134,7 @@ class StampsRules:
     spacings_px: tuple[float, ...] = (1.0, 0.75, 0.5)
     worth_finer: float = 200.0
     highest: tuple[int, int] = (4, 3)
-    steps_to_judge: int = 1
+    steps_to_compare: int = 1
     steps_to_end: int = 12
     evidence: float = 2.0
     beyond_doubt: float = 200.0

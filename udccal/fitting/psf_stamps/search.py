@@ -175,7 +175,7 @@ def attempt(stamps: Stamps, found: Found, more: float = 0.0) -> Attempt[Found]:
 
 def _degrees(stamps: Stamps, state: State, rules: StampsRules, most: Orders) -> list[Attempt[Found]]:
     """All that were tried, going from neighbour to neighbour until none is better."""
-    best = attempt(stamps, improve(stamps, state, rules, rules.steps_to_judge + 1))
+    best = attempt(stamps, improve(stamps, state, rules, rules.steps_to_compare + 1))
     tried, known = [best], {Orders.of(state)}
     while True:
         own = Orders.of(best.fit.place)
@@ -198,7 +198,7 @@ def _judged(stamps: Stamps, best: Attempt[Found], orders: Orders, rules: StampsR
     state = place.with_degrees(orders.warp, orders.image, rules)
     if loss > rules.beyond_doubt:
         return attempt(stamps, replace(best.fit, place=state), -loss)
-    return attempt(stamps, improve(stamps, state, rules, rules.steps_to_judge))
+    return attempt(stamps, improve(stamps, state, rules, rules.steps_to_compare))
 
 
 def _spacings(stamps: Stamps, tried: list[Attempt[Found]], rules: StampsRules) -> list[Attempt[Found]]:
