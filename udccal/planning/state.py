@@ -175,8 +175,7 @@ def sensor_samples(rig: RigDescription, across: int) -> Float[np.ndarray, "n 2"]
 
 def built_wire(state: RigState) -> Wire:
     """The wire as the rig was built, with a round pupil and its strongest harmonics."""
-    from udccal.fitting.wire.parameters import ideal_wire, possible_harmonics
-    from udccal.fitting.wire.rules import wire_start
+    from udccal.fitting.wire.rules import ideal_wire, possible_harmonics, wire_start
 
     start = wire_start(state.rig)
     return ideal_wire(state.geometry, start, possible_harmonics(start).orders)
