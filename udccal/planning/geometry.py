@@ -151,7 +151,8 @@ def _planned_view(state: RigState, field: EvenField, step: PlannedStep, board: B
     markers = np.asarray(charuco_board(board.spec).getObjPoints(), dtype=np.float64).reshape(-1, 3)
     image, marks = (projected(intrinsics, rotation.apply(points) + origin)[0] for points in (corners, markers))
     depth = float((rotation.apply(corners.mean(axis=0)) + origin)[2])
-    radius = float(np.clip(_WINDOW_SQUARES * board.spec.square_mm / depth * intrinsics[0], *_RULES.window_px))
+    square_px = board.spec.square_mm / depth * Intrinsics.of(intrinsics).focal_px[0]
+    radius = float(np.clip(_WINDOW_SQUARES * square_px, *_RULES.window_px))
     whole = _inside(state, marks, 1.0).reshape(-1, 4).all(axis=1)
     # Corners both of whose markers are in the picture: without them the detector does not know their numbers.
     near = np.linalg.norm(corners[:, None] - markers.reshape(-1, 4, 3).mean(axis=1), axis=2) < board.spec.square_mm

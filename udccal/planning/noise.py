@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from udccal.arrangements import Dark, FlatLight
-from udccal.fitting.noise.rules import NoiseRules
+from udccal.fitting.noise.data import NoiseRules
 from udccal.fitting.noise.transfer import DarkVariance, Levels, Order, TransferProblem, temporal_variance
 from udccal.planning.predictor import Floor
 from udccal.planning.state import EvenField, RigState, sensor_samples
@@ -75,7 +75,6 @@ class NoisePredictor:
             samples=2 * each,
             usable=light_DN <= _RULES.fit_up_to * full_DN,
             light=np.full(len(level), np.nan),
-            steady=np.zeros(len(level), dtype=bool),
             dark_DN=dark_DN,
             row_variance_DN2=np.zeros(len(level)),
         )

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from tests.simulation.toy import toy_rig, toy_truth
 from udccal.cameras.protocol import CameraIdentity, Region, Settings
-from udccal.cfa import channel_map
+from udccal.cfa import cfa_named
 from udccal.displays.pictures import face_picture
 from udccal.fitting.backscatter.data import (
     BackscatterData,
@@ -202,7 +202,7 @@ def test_pictures_in_the_wrong_order_are_a_poor_fit(data: BackscatterData) -> No
 
 def test_bins_are_means_of_one_colour() -> None:
     rows, columns, step = 24, 32, 4
-    channels = channel_map("GBRG", rows, columns)
+    channels = cfa_named("GBRG").channel_map(rows, columns)
     bins = Bins("GBRG", step)
     mean = bins.mean(np.array([10.0, 20.0, 30.0])[channels])
     np.testing.assert_allclose(mean, np.broadcast_to([[[10.0]], [[20.0]], [[30.0]]], (3, 6, 8)))

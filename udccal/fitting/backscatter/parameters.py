@@ -22,8 +22,9 @@ from udccal.rig import RigDescription
 
 Vector = Float[np.ndarray, "18"]
 NAMES = (
-    "gamma", "standoff_mm", "pupil_diameter_mm", "softness_px", "reflection", "reflection_mm", "offset_x_px", "offset_y_px",
-    "red_x_px", "red_y_px", "blue_x_px", "blue_y_px", "mix_rg", "mix_rb", "mix_gr", "mix_gb", "mix_br", "mix_bg",
+    "gamma", "standoff_mm", "pupil_diameter_mm", "softness_px", "reflection", "reflection_mm",
+    "offset_x_px", "offset_y_px", "red_x_px", "red_y_px", "blue_x_px", "blue_y_px",
+    "mix_rg", "mix_rb", "mix_gr", "mix_gb", "mix_br", "mix_bg",
 )  # fmt: skip
 UNITS = ("1", "mm", "mm", "px", "1", "mm", *["px"] * 6, *["1"] * 6)
 DISTANCE, PUPIL, SOFTNESS, REFLECTION, DEPTH = range(1, 6)

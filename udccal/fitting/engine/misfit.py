@@ -119,6 +119,28 @@ def robust_excess_sigma(
     return _halved(square, unit, lambda size: float(np.median(square / (noise + size**2 * unit))) > probable)
 
 
+def excess_variance(
+    observed: Float[np.ndarray, " n"], known: Float[np.ndarray, " n"], dof: Float[np.ndarray, " n"]
+) -> tuple[float, float, float]:
+    """Variance that chi-squared estimates have beside a known part, by maximum likelihood; not below 0.
+
+    Args:
+        observed: estimates of a variance.
+        known: part of each that has another cause, in the same unit.
+        dof: degrees of freedom of each.
+
+    Returns:
+        the variance, its own variance, and what the likelihood gains by it (minus twice the logarithm).
+    """
+    known = known + 1e-12 * float(observed.max()) + 1e-300
+    found = float(np.average(observed, weights=dof))
+    for _ in range(50):
+        found = max(float(np.average(observed - known, weights=dof / (found + known) ** 2)), 0.0)
+    without, total = observed / known, observed / (found + known)
+    gain = np.sum(dof * (np.log(known) + without - np.log(found + known) - total))
+    return found, float(2 / np.sum(dof / (found + known) ** 2)), float(gain)
+
+
 def _halved(
     square: Float[np.ndarray, " n"], unit: Float[np.ndarray, " n"], too_small: Callable[[float], bool]
 ) -> float:
