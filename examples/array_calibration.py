@@ -10,7 +10,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from udccal.fitting.geometry import Gauge, fit_geometry
+from udccal.fitting.geometry.calibrated import Gauge
+from udccal.fitting.geometry.fit import fit_geometry
 
 SIZE = (1280, 960)
 MATRIX = np.array([[1100.0, 0.0, 652.0], [0.0, 1100.0, 470.0], [0.0, 0.0, 1.0]])

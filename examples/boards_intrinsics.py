@@ -14,7 +14,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from udccal.fitting.geometry import CalibratedViews, fit_geometry
+from udccal.fitting.geometry.calibrated import CalibratedViews
+from udccal.fitting.geometry.fit import fit_geometry
 
 INNER = (9, 6)
 DEFAULT_DATA = Path(__file__).resolve().parents[1] / ".." / "shared" / "data"
@@ -47,9 +48,10 @@ def calibrate(name: str, files: list[Path]) -> CalibratedViews | None:
     order = next(c.name for c in ours.candidates if c.chosen)
     lost = int((~ours.points.used).sum())
     print(f"{name}: board found in {len(found)} of {len(files)} pictures, {lost} corners left out")
+    (fx, fy), (cx, cy) = lens.focal_px, lens.principal_point_px
     print(
-        f"  udccal  rms {ours.rms_px:.3f} px   fx {lens.focal_px[0]:.2f} fy {lens.focal_px[1]:.2f} "
-        f"cx {lens.principal_point_px[0]:.2f} cy {lens.principal_point_px[1]:.2f}   distortion: {order} {np.round(lens.distortion, 4)}"
+        f"  udccal  rms {ours.rms_px:.3f} px   fx {fx:.2f} fy {fy:.2f} cx {cx:.2f} cy {cy:.2f}   "
+        f"distortion: {order} {np.round(lens.distortion, 4)}"
     )
     print(
         f"  OpenCV  rms {theirs:.3f} px   fx {matrix[0, 0]:.2f} fy {matrix[1, 1]:.2f} "

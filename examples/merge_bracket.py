@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from udccal.fitting.hdr import merge_bracket
+from udccal.fitting.hdr.merge import merge_bracket
 from udccal.models.noise import Noise
 
 SENSOR = Noise(

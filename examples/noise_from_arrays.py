@@ -13,7 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from udccal.fitting.noise import ExposureLevel, NoiseData, fit_noise
+from udccal.fitting.noise.data import ExposureLevel, NoiseData
+from udccal.fitting.noise.fit import fit_noise
 
 GAIN_DN_PER_E, READ_E, BLACK_DN, WELL_E = 0.36, 4.0, 64.0, 10_000.0
 

@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from udccal.fitting.psf_stamps import Stamps, fit_psf_stamps
+from udccal.fitting.psf_stamps.data import Stamps
+from udccal.fitting.psf_stamps.fit import fit_psf_stamps
 
 COLUMNS, ROWS, SIZE, READ_E = 1000, 800, 15, 4.0
 

@@ -22,11 +22,11 @@ if TYPE_CHECKING:
     from udccal.calibration import calibrate as calibrate
     from udccal.calibration import fit as fit
     from udccal.errors import UdccalError as UdccalError
-    from udccal.fitting.backscatter import fit_backscatter as fit_backscatter
-    from udccal.fitting.geometry import fit_geometry as fit_geometry
-    from udccal.fitting.noise import fit_noise as fit_noise
+    from udccal.fitting.backscatter.fit import fit_backscatter as fit_backscatter
+    from udccal.fitting.geometry.fit import fit_geometry as fit_geometry
+    from udccal.fitting.noise.fit import fit_noise as fit_noise
     from udccal.fitting.psf.fit import fit_psf as fit_psf
-    from udccal.fitting.wire import fit_wire as fit_wire
+    from udccal.fitting.wire.fit import fit_wire as fit_wire
     from udccal.profiles.profile import Profile as Profile
     from udccal.profiles.store import load_profile as load_profile
     from udccal.restoration.runtime import Restorer as Restorer
@@ -50,11 +50,11 @@ _HOMES = {
     "calibrate": "udccal.calibration",
     "capture": "udccal.benches.capture",
     "fit": "udccal.calibration",
-    "fit_backscatter": "udccal.fitting.backscatter",
-    "fit_geometry": "udccal.fitting.geometry",
-    "fit_noise": "udccal.fitting.noise",
+    "fit_backscatter": "udccal.fitting.backscatter.fit",
+    "fit_geometry": "udccal.fitting.geometry.fit",
+    "fit_noise": "udccal.fitting.noise.fit",
     "fit_psf": "udccal.fitting.psf.fit",
-    "fit_wire": "udccal.fitting.wire",
+    "fit_wire": "udccal.fitting.wire.fit",
     "load_profile": "udccal.profiles.store",
     "load_rig": "udccal.rig",
     "simulate": "udccal.benches.bench",

@@ -15,15 +15,20 @@ from jaxtyping import Float
 
 from udccal.errors import UdccalError
 from udccal.fitting.absent import absent_backscatter, absent_psf, absent_wire
-from udccal.fitting.backscatter import BackscatterRules, fit_backscatter, read_backscatter
-from udccal.fitting.geometry import fit_boards, read_geometry
-from udccal.fitting.geometry.data import BoardView
-from udccal.fitting.noise import fit_noise, nominal_noise, read_noise
+from udccal.fitting.backscatter.data import read_backscatter
+from udccal.fitting.backscatter.fit import fit_backscatter
+from udccal.fitting.backscatter.parameters import BackscatterRules
+from udccal.fitting.geometry.boards import fit_boards
+from udccal.fitting.geometry.data import BoardView, read_geometry
+from udccal.fitting.noise.data import read_noise
+from udccal.fitting.noise.fit import fit_noise, nominal_noise
 from udccal.fitting.nominal import nominal_geometry
 from udccal.fitting.psf.data import PsfRules
 from udccal.fitting.psf.fit import fit_psf
 from udccal.fitting.psf.read import read_psf
-from udccal.fitting.wire import WireRules, fit_wire, read_wire, sensor_map
+from udccal.fitting.wire.data import read_wire
+from udccal.fitting.wire.fit import fit_wire, sensor_map
+from udccal.fitting.wire.rules import WireRules
 from udccal.models.backscatter import Backscatter
 from udccal.models.geometry import Geometry
 from udccal.models.noise import Noise

@@ -6,11 +6,12 @@ import os
 import tomllib
 from importlib import resources
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from udccal.errors import RigError
+from udccal.rig_versions import present_rig
 
 CfaPattern = Literal["RGGB", "BGGR", "GRBG", "GBRG"]
 _MAX_TOML_BYTES = 64 * 1024
@@ -129,10 +130,10 @@ class View(_Strict):
 
 
 class RigDescription(_Strict):
-    """One rig as it was built to be."""
+    """One rig as it was built to be. Older versions are read too, from files, sessions and profiles alike."""
 
     format: Literal["udccal-rig"]
-    version: Literal[1]
+    version: Literal[2]
     name: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9._-]{0,63}$")]
     panel: Panel
     camera: Camera
@@ -140,6 +141,11 @@ class RigDescription(_Strict):
     mounting: Mounting
     captures: Captures
     view: View
+
+    @model_validator(mode="before")
+    @classmethod
+    def _of_present_version(cls, found: Any) -> Any:
+        return present_rig(found)
 
     @property
     def focal_px(self) -> float:

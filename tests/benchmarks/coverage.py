@@ -29,8 +29,9 @@ from udccal.benches.capture import capture
 from udccal.calibration import FitEffort, Foundation, fit_foundation
 from udccal.compilation import keep_compilations
 from udccal.displays.pictures import face_picture
-from udccal.fitting.backscatter import fit_backscatter, read_backscatter
-from udccal.fitting.backscatter.data import Bins, sampled_rays
+from udccal.fitting.backscatter.data import read_backscatter, sampled_rays
+from udccal.fitting.backscatter.fit import fit_backscatter
+from udccal.fitting.bins import Bins
 from udccal.fitting.geometry.boards import projection_sigma_px
 from udccal.models.geometry import project_directions
 from udccal.models.wire import wire_values

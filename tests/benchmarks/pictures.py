@@ -16,7 +16,7 @@ from jaxtyping import Float, Float32, UInt8, UInt16
 from tests.benchmarks.scenes import Scene
 from udccal.arrangements import Photograph
 from udccal.cameras.protocol import Region
-from udccal.cfa import channel_map
+from udccal.cfa import cfa_named
 from udccal.displays.pictures import face_picture
 from udccal.restoration.metrics import display_exposure, encode_srgb, least_squares_gain, psnr, ssim
 from udccal.restoration.runtime import Restorer
@@ -67,7 +67,7 @@ class PictureBench:
     def __init__(self, truth: RigTruth, blur: SpaceVariantBlur, restorer: Restorer) -> None:
         self._truth, self._blur, self._restorer = truth, blur, restorer
         camera, panel = truth.description.camera, truth.description.panel
-        self._channels = channel_map(camera.cfa, camera.rows, camera.columns)
+        self._channels = cfa_named(camera.cfa).channel_map(camera.rows, camera.columns)
         self._wire = wire_map(truth)
         self._sensor = Sensor(truth)
         self._region = Region(0, 0, camera.columns, camera.rows)

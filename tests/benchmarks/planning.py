@@ -29,9 +29,9 @@ from udccal.benches.capture import capture
 from udccal.calibration import Calibration, calibrate
 from udccal.compilation import keep_compilations
 from udccal.displays.pictures import face_picture
-from udccal.fitting.backscatter import read_backscatter
+from udccal.fitting.backscatter.data import read_backscatter
+from udccal.fitting.backscatter.fit import term_posterior
 from udccal.fitting.backscatter.orders import search
-from udccal.fitting.backscatter.posterior import term_posterior
 from udccal.fitting.backscatter.solve import Problem
 from udccal.fitting.geometry.boards import projection_sigma_px
 from udccal.planning.forecast import predictor_for
@@ -101,7 +101,7 @@ def _backscatter_percent(made: Obtained) -> float:
     new = [face_picture(seed, rig.panel.columns, rig.panel.rows) for seed in _NEW_PICTURES]
     found = search(Problem.of(data, geometry, rig))
     # By noise alone.
-    found = replace(found, state=replace(found.state, model_error=0.0))
+    found = replace(found, model_error=0.0)
     posterior = term_posterior(found.problem.template, data, found, 1.0)
     light = predicted_light(posterior.term_at(posterior.mean), posterior, 0.0, rig, new, found.problem.flat)
     peak = light.rate.max(axis=(1, 2))

@@ -18,7 +18,8 @@ from udccal.cli.jobs.benches import files_bench
 from udccal.cli.jobs.person import PersonStage
 from udccal.cli.output import Output
 from udccal.errors import CameraError, CaptureError, UdccalError
-from udccal.fitting.noise import fit_noise, read_noise
+from udccal.fitting.noise.data import read_noise
+from udccal.fitting.noise.fit import fit_noise
 from udccal.io.png import write_png16
 from udccal.rig import RigDescription, load_rig
 from udccal.sessions.store import Session

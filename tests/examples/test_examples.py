@@ -13,6 +13,7 @@ import pytest
 from tests.toy_rigs import write_toy_rig
 from udccal.io.exr import write_rgb_exr
 from udccal.io.png import read_rgb8, write_rgb8
+from udccal.profiles.store import load_profile
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -99,3 +100,13 @@ def test_wire_from_flat() -> None:
     said = run("examples/wire_from_flat.py")
     assert "CONVERGED" in said
     assert "standoff_per_pitch" in said
+
+
+@pytest.mark.slow
+def test_backscatter_from_arrays() -> None:
+    said = run("examples/backscatter_from_arrays.py")
+    assert said.startswith("CONVERGED")
+    gamma = next(line.split() for line in said.splitlines() if line.startswith("gamma"))
+    value, sigma = float(gamma[1]), float(gamma[3])
+    assert abs(value - load_profile("lg55-reduced").backscatter.estimate("gamma").value) < 1e-3
+    assert 0 < sigma < 1e-3

@@ -19,7 +19,7 @@ class Target:
         seeds: whole examples, from which broken ones are made.
         max_bytes: longest input to try.
         one_in: how many inputs of others there are for each of this target; above 1 where one takes long.
-        longest_s: what an input may take; hung is what takes five times as long on a machine that does nothing else.
+        longest_s: seconds of the processor that an input may take; an input that takes five times as long hangs.
     """
 
     name: str

@@ -1,7 +1,8 @@
-"""A few hundred broken inputs for every target, made of whole ones, and every input that once was trouble."""
+"""Up to two hundred broken inputs for every target, made of whole ones, and every input that once was trouble."""
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 
 import pytest
@@ -40,14 +41,16 @@ def test_broken_inputs_are_refused_in_words(name: str) -> None:
     for seed in target.seeds():
         target.read(seed)  # the whole ones are taken
 
-    deadline_ms = 1000 * target.longest_s
+    # Each that restores may compile for seconds; `make fuzz` tries a hundred thousand.
+    examples = max(15, 200 // target.one_in)
 
-    examples = max(100, 200 // target.one_in)
-
-    @settings(max_examples=examples, deadline=deadline_ms, derandomize=True, suppress_health_check=list(HealthCheck))
+    @settings(max_examples=examples, suppress_health_check=list(HealthCheck))
     @given(broken(target.seeds()))
     def try_out(data: bytes) -> None:
+        start = time.process_time()
         target.try_out(data[: target.max_bytes])
+        # The processor's time, so that a busy machine fails nobody.
+        assert time.process_time() - start < target.longest_s
 
     try_out()
 

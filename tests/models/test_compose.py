@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from udccal.cfa import channel_map
+from udccal.cfa import cfa_named
 from udccal.models.compose import bilinear_weights, expected_frame, mosaic_rate, space_varying_blur
 from udccal.models.noise import Noise
 from udccal.numerics import in_float64
@@ -39,7 +39,9 @@ def test_light_is_kept_inside_and_lost_beyond_the_edge(kernels: np.ndarray) -> N
 
 def test_samples_see_their_own_colour_and_the_wire_covers_the_backscatter() -> None:
     blurred = np.broadcast_to(np.array([1.0, 10.0, 100.0]), (4, 6, 3))
-    rate = np.asarray(mosaic_rate(blurred, np.full((4, 6), 5.0), np.full((4, 6), 0.5), channel_map("GBRG", 4, 6)))
+    rate = np.asarray(
+        mosaic_rate(blurred, np.full((4, 6), 5.0), np.full((4, 6), 0.5), cfa_named("GBRG").channel_map(4, 6))
+    )
     np.testing.assert_allclose(rate[:2, :2], [[7.5, 52.5], [3.0, 7.5]])
 
 

@@ -15,7 +15,7 @@ from udccal.models.fields import polynomial_basis, polynomial_terms
 from udccal.models.geometry import Geometry
 from udccal.models.interference import disc_overlap_coefficient
 from udccal.models.lattice import lattice_for, sample, spline_coefficients
-from udccal.models.psf import PsfField, psf_kernels
+from udccal.models.psf import PsfField, psf_kernels, residual_kernel
 from udccal.numerics import in_float64
 from udccal.rig import load_rig
 from udccal.simulation.psf import kernels as simulated_kernels
@@ -142,14 +142,18 @@ def test_the_residual_follows_its_polynomial_and_is_cut_or_padded(truth: RigTrut
     residual = np.zeros((3, 3, 5, 5))
     residual[0, :, 2, 2] = 1.0
     residual[1, :, 2, 4] = 0.5
-    field = replace(true_field(truth), diffraction_fraction=np.float64(0.0), residual=residual, degree=1)
+    field = replace(true_field(truth), residual=residual, degree=1)
+
+    @as_numpy
+    def images(size: int) -> jnp.ndarray:
+        return jnp.stack([residual_kernel(field, jnp.asarray(place), size, size) for place in places])
+
     places = np.array([[511.5, 383.5], [511.5, 767.0], [1023.0, 383.5]])
-    wide = as_numpy(lambda p: psf_kernels(field, p, 7, 7))(places)
     first_order = as_numpy(lambda p: polynomial_basis((p - field.centre_px) / field.half_px, 1))(places)[:, 1]
-    share = 0.5 * first_order
-    np.testing.assert_allclose(wide[:, 0, 3, 5], share / (1 + share), atol=1e-12)
-    narrow = as_numpy(lambda p: psf_kernels(field, p, 3, 3))(places)
-    np.testing.assert_allclose(narrow[:, :, 1, 1], 1.0, atol=1e-12)
+    wide = images(7)
+    np.testing.assert_allclose(wide[:, 0, 3, 5], 0.5 * first_order, atol=1e-12)
+    np.testing.assert_allclose(wide[:, 0, 3, 3], 1.0, atol=1e-12)
+    np.testing.assert_array_equal(images(3), wide[:, :, 2:5, 2:5])
 
 
 def test_the_footprint_grows_with_obliquity(truth: RigTruth) -> None:

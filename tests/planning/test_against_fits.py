@@ -11,8 +11,10 @@ import pytest
 from tests.toy_rigs import write_toy_rig
 from udccal.benches.bench import simulated_bench, simulated_rig
 from udccal.benches.capture import capture
-from udccal.fitting.noise import fit_noise, read_noise
-from udccal.fitting.wire import fit_wire, read_wire
+from udccal.fitting.noise.data import read_noise
+from udccal.fitting.noise.fit import fit_noise
+from udccal.fitting.wire.data import read_wire
+from udccal.fitting.wire.fit import fit_wire
 from udccal.planning.noise import NoisePredictor
 from udccal.planning.state import RigState, nominal_state
 from udccal.planning.wire import WirePredictor

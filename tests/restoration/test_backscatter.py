@@ -3,11 +3,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from udccal.cfa import channel_map
+from udccal.cfa import cfa_named
 from udccal.restoration.backscatter import estimated_rate, mask_mosaic
 
 ROWS, COLUMNS = 96, 128
-CHANNELS = channel_map("RGGB", ROWS, COLUMNS)
+CHANNELS = cfa_named("RGGB").channel_map(ROWS, COLUMNS)
 
 
 @pytest.fixture

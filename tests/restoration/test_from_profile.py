@@ -11,7 +11,7 @@ import pytest
 from udccal.errors import RestorationError
 from udccal.fitting.absent import absent_backscatter, absent_psf, absent_wire
 from udccal.fitting.nominal import nominal_geometry
-from udccal.fitting.wire import sensor_map
+from udccal.fitting.wire.fit import sensor_map
 from udccal.models.noise import Noise
 from udccal.profiles.profile import Profile, build_profile
 from udccal.profiles.provenance import provenance_now

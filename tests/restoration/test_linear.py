@@ -33,7 +33,7 @@ def test_hot_and_dead_samples_are_replaced(toy_noise: Noise) -> None:
     frame = rng.normal(500.0, 22.0, (64, 64)).astype(np.float32)
     broken = frame.copy()
     broken[20, 21], broken[41, 40] = 5000.0, -800.0
-    mended = without_defects(broken, toy_noise)
+    mended = without_defects(broken, toy_noise, "RGGB")
     assert abs(mended[20, 21] - 500) < 60
     assert abs(mended[41, 40] - 500) < 60
     untouched = mended == broken
@@ -44,4 +44,4 @@ def test_a_star_behind_the_panel_is_no_defect(toy_noise: Noise) -> None:
     """Every second sample down the middle of a panel's psf: a star one pixel wide, seen by one colour of the CFA."""
     frame = np.full((64, 64), 10.0, np.float32)
     frame[28:37, 30] += 10000 * np.array([0.02, 0.02, 0.1, 0.1, 0.38, 0.1, 0.1, 0.02, 0.02], np.float32)
-    np.testing.assert_array_equal(without_defects(frame, toy_noise), frame)
+    np.testing.assert_array_equal(without_defects(frame, toy_noise, "RGGB"), frame)

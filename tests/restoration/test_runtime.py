@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from udccal.cfa import channel_map
+from udccal.cfa import cfa_named
 from udccal.errors import RestorationError
 from udccal.models.geometry import Geometry
 from udccal.models.noise import Noise
@@ -46,7 +46,7 @@ def frame(restorer: Restorer, toy_scene: np.ndarray) -> np.ndarray:
     for channel, deblurrer in enumerate(restorer.deblurrers):
         canvas = deblurrer.blur.canvas
         planes.append(canvas.frame(deblurrer.blur.forward(canvas.extended(toy_scene[..., channel]))))
-    channels = channel_map(rig.camera.cfa, rig.camera.rows, rig.camera.columns)
+    channels = cfa_named(rig.camera.cfa).channel_map(rig.camera.rows, rig.camera.columns)
     signal = np.take_along_axis(np.stack(planes, -1), channels[..., None], 2)[..., 0] * restorer.wire
     counts = rng.poisson(np.maximum(signal, 0.0)) + rng.normal(0, 5.0, signal.shape)
     return np.clip(np.rint(64 + 0.355 * counts), 0, 4095).astype(np.uint16)

@@ -9,18 +9,18 @@ import numpy as np
 from jaxtyping import Float
 
 from udccal.displays.pictures import face_picture
-from udccal.fitting.backscatter import BackscatterData, BackscatterRules
-from udccal.fitting.backscatter.data import Binned, grid_rays, grid_step, visible_crop
+from udccal.fitting.backscatter.data import BackscatterData, Binned, grid_rays, grid_step, visible_crop
+from udccal.fitting.backscatter.model import window_for
 from udccal.fitting.backscatter.parameters import (
     TWO_PLANES,
+    BackscatterRules,
     Order,
-    footprint_share,
+    footprint_per_pupil,
     linear_of,
     prior_of,
     values_of,
     with_linear,
 )
-from udccal.fitting.backscatter.ratios import window_for
 from udccal.fitting.engine.gaussian import Posterior
 from udccal.fitting.nominal import nominal_backscatter, nominal_geometry
 from udccal.models.backscatter import Backscatter, panel_response, response_grid
@@ -72,7 +72,7 @@ class World:
     def values(self) -> Float[np.ndarray, "18"]:
         """The truth as the fit reports it."""
         values = values_of(self.x)
-        values[2] /= footprint_share(self.rig)
+        values[2] /= footprint_per_pupil(self.rig)
         return values
 
 

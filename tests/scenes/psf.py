@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, UInt16
 
-from udccal.cfa import channel_map
+from udccal.cfa import cfa_named
 from udccal.fitting.hdr.merge import merge_bracket
 from udccal.fitting.nominal import nominal_geometry
 from udccal.fitting.psf.data import Shots, joined
@@ -152,7 +152,9 @@ def pictures(
             offsets = np.stack([x.ravel(), y.ravel()], axis=-1) + corner - source
             light = np.asarray(_light(model, scene.geometry, source, offsets, lattice))
             light = light.reshape(rows, columns, 3) * FLUX
-            rate = np.take_along_axis(light, channel_map(scene.rig.camera.cfa, rows, columns)[..., None], 2)[..., 0]
+            rate = np.take_along_axis(light, cfa_named(scene.rig.camera.cfa).channel_map(rows, columns)[..., None], 2)[
+                ..., 0
+            ]
             top = scene.level * (scene.rig.saturation_DN - float(scene.noise.black_DN)) / float(scene.noise.K_DN_per_e)
             full = top / scene.exposures_s[0] / rate.max()
             aimed, at = (float(aim[0]), float(aim[1])), (int(corner[0]), int(corner[1]))

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.special import ndtr
 
-from udccal.cfa import channel_map
+from udccal.cfa import cfa_named
 from udccal.fitting.hdr.merge import HdrMerge
 from udccal.fitting.psf.data import PsfRules, Shots, joined
 from udccal.fitting.psf.image import Sources
@@ -88,7 +88,7 @@ def _shots(mix: Float[np.ndarray, " terms"], degree: int, rng: np.random.Generat
             rows, columns = (2 * (half + _SPARE) + 1 for half in _HALF)
             corner = (np.round(aim).astype(int) - [columns // 2, rows // 2]) // 2 * 2
             light = _light(source, corner, (rows, columns), mix, degree)
-            rate = light * _FLUX[channel_map(_CFA, rows, columns)]
+            rate = light * _FLUX[cfa_named(_CFA).channel_map(rows, columns)]
             sigma = np.hypot(_NOISE[0] * rate, _NOISE[1])
             seen = rate + sigma * rng.standard_normal(rate.shape)
             merged = HdrMerge(seen, sigma, np.ones(rate.shape, dtype=np.int64))

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from tests.scenes.psf import DISC_PX, Picture, Scene, pictures, shots_of, small_scene
-from udccal.cfa import channel_map
+from udccal.cfa import cfa_named
 from udccal.fitting.psf.data import PsfRules, Shots
 from udccal.fitting.psf.fit import start_model, start_prior
 from udccal.fitting.psf.image import Sources, prior_sigma, shifts
@@ -107,7 +107,7 @@ def _bent(picture: Picture, known: World, drawn: Float[np.ndarray, " terms"], ph
     x, y = picture.source_px - picture.corner_px - [columns // 2, rows // 2]
     disc = np.array([DISC_PX])
     light = shifts(np.array([y]), disc, rows)[0] @ image @ shifts(np.array([x]), disc, columns)[0].T
-    flux = picture.flux[channel_map(known.scene.rig.camera.cfa, rows, columns)]
+    flux = picture.flux[cfa_named(known.scene.rig.camera.cfa).channel_map(rows, columns)]
     return replace(picture, rate=np.maximum(picture.rate + flux * light, 0.0))
 
 
@@ -116,7 +116,7 @@ def _room(scene: Scene, made: list[Picture]) -> Float[np.ndarray, "rows columns"
     total = np.zeros_like(made[0].rate)
     for picture in made:
         rows, columns = picture.rate.shape
-        unit = picture.rate / picture.flux[channel_map(scene.rig.camera.cfa, rows, columns)]
+        unit = picture.rate / picture.flux[cfa_named(scene.rig.camera.cfa).channel_map(rows, columns)]
         off = np.round(picture.source_px - picture.corner_px - [columns // 2, rows // 2]).astype(int)
         total += np.roll(unit, (-off[1], -off[0]), axis=(0, 1)) / len(made)
     return prior_sigma(np.stack([total] * 3), 1.0)[1]

@@ -9,11 +9,10 @@ import numpy as np
 from jaxtyping import Float
 
 from tests.scenes.psf import DISC_PX, FLUX, Picture, Scene, noise_of, shots_of
-from udccal.cfa import channel_map
+from udccal.cfa import cfa_named
 from udccal.fitting.psf.data import PsfData, PsfRules
 from udccal.fitting.psf.fit import fit_psf
-from udccal.fitting.wire import wire_start
-from udccal.fitting.wire.parameters import ideal_wire
+from udccal.fitting.wire.rules import ideal_wire, wire_start
 from udccal.models.geometry import Geometry
 from udccal.models.psf import PsfField, psf_kernels
 from udccal.models.wire import Wire
@@ -107,7 +106,7 @@ def _pictures(truth: RigTruth, scene: Scene, rng: np.random.Generator) -> list[P
     rows, columns = (2 * (h + _SPARE) + 1 for h in scene.half)
     noise, made = scene.noise, []
     top_e = scene.level * (scene.rig.saturation_DN - float(noise.black_DN)) / float(noise.K_DN_per_e)
-    channel = channel_map(scene.rig.camera.cfa, rows, columns)[None]
+    channel = cfa_named(scene.rig.camera.cfa).channel_map(rows, columns)[None]
     for place in scene.places_px:
         spread = spread_at(truth, place + 1.0, (columns / 2 + 4.0, rows / 2 + 4.0))
         for _ in range(scene.shifts):

@@ -86,7 +86,7 @@ def rig():
 
     return {
         "format": "udccal-rig",
-        "version": 1,
+        "version": 2,
         "name": "foreign-tiny",
         "panel": {
             "model": "other display",

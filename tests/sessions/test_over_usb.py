@@ -20,7 +20,8 @@ from udccal.cameras.choice import mode_for
 from udccal.cameras.u3v.camera import U3vCamera
 from udccal.displays.simulated import SimulatedDisplay
 from udccal.errors import CameraError, CameraLost
-from udccal.fitting.noise import fit_noise, read_noise
+from udccal.fitting.noise.data import read_noise
+from udccal.fitting.noise.fit import fit_noise
 from udccal.result import FitStatus
 from udccal.rig import RigDescription, load_rig
 from udccal.sessions.store import Session

@@ -10,12 +10,13 @@ from types import TracebackType
 from typing import Final, final
 
 from udccal.cameras.checks import check_mode, check_region, not_open, superseded
-from udccal.cameras.format_names import PATTERNS, unpacked_format_name
+from udccal.cameras.format_names import unpacked_format_name
 from udccal.cameras.picture_files.facts import Facts, read_facts
 from udccal.cameras.picture_files.listing import ListedPicture, list_files
 from udccal.cameras.picture_files.mosaics import Layout, read_mosaic
 from udccal.cameras.picture_files.sidecar import list_folder
 from udccal.cameras.protocol import CameraIdentity, Counts, Features, Frame, Mode, Range, Region, Settings, Trigger
+from udccal.cfa import PATTERNS
 from udccal.errors import CameraError
 
 Source = str | Path | Sequence[str | Path]

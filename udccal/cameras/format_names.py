@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import Final
 
-_FAMILIES: Final = {"mono": "Mono", "RGGB": "BayerRG", "GRBG": "BayerGR", "GBRG": "BayerGB", "BGGR": "BayerBG"}
-PATTERNS: Final = tuple(_FAMILIES)
+from udccal.cfa import cfa_named
+
 _BITS: Final = (8, 10, 12, 14, 16)
 
 
 def unpacked_format_name(cfa: str, bits: int) -> str:
     """The name of unpacked samples of that pattern, at the next of the convention's sizes that holds the bits."""
-    return f"{_FAMILIES[cfa]}{next(size for size in _BITS if size >= bits)}"
+    return f"{cfa_named(cfa).family}{next(size for size in _BITS if size >= bits)}"

@@ -15,6 +15,7 @@ from typing import Final, final
 import numpy as np
 from jaxtyping import UInt8, UInt16
 
+from udccal.cfa import PATTERNS
 from udccal.errors import CameraError
 
 # Four samples of 10 or 12 bits are 5 or 6 whole bytes, and four 16-bit results fill one 64-bit word.
@@ -60,7 +61,7 @@ class PixelFormat:
         return self.packing is not Packing.BYTES
 
 
-_CFA: Final = {"Mono": "mono", "BayerGR": "GRBG", "BayerRG": "RGGB", "BayerGB": "GBRG", "BayerBG": "BGGR"}
+_CFA: Final = {pattern.family: name for name, pattern in PATTERNS.items()}
 
 # PFNC's own order of patterns differs from one family of codes to the next.
 _CODES: Final = {

@@ -7,8 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from udccal.fitting.nominal import nominal_backscatter
-from udccal.fitting.wire.parameters import ideal_wire
-from udccal.fitting.wire.rules import wire_start
+from udccal.fitting.wire.rules import ideal_wire, wire_start
 from udccal.models.backscatter import Backscatter
 from udccal.models.diffraction import Diffraction
 from udccal.models.geometry import Geometry

@@ -22,10 +22,9 @@ import jax.numpy as jnp
 from jax.scipy.special import erf
 from jaxtyping import Array, Float, Int, Num
 
+from udccal.cfa import cfa_named
 from udccal.models.arrays import Arrayish
 from udccal.models.geometry import Geometry, panel_directions, rotation_matrix
-
-_CHANNELS = {"R": 0, "G": 1, "B": 2}
 
 
 class Backscatter(eqx.Module):
@@ -233,10 +232,9 @@ def mosaic_of_grid(
     by_column = _cubic_weights(term.columns, term.step, grid.shape[2], grid.dtype)
     by_row = _cubic_weights(term.rows, term.step, grid.shape[1], grid.dtype)
     mosaic = jnp.zeros((term.rows, term.columns), grid.dtype)
-    for site, letter in enumerate(term.cfa):
-        j, i = divmod(site, 2)
-        plane = by_row[j::2] @ grid[_CHANNELS[letter]] @ by_column[i::2].T
-        mosaic = mosaic.at[j::2, i::2].set(plane)
+    for site in cfa_named(term.cfa).sites:
+        down, across = site.samples
+        mosaic = mosaic.at[site.samples].set(by_row[down] @ grid[site.channel] @ by_column[across].T)
     return mosaic
 
 

@@ -36,7 +36,8 @@ class Diffraction(eqx.Module):
         openings: open part of the (columns, rows) for a ray along the panel's normal.
         depth_mm: depth of the opaque structure; it narrows slits by thickness * |tangent of the obliquity|.
         pupil_diameter_mm: diameter of the entrance pupil.
-        offset_periods: footprint centre (X, Y) of a ray along the normal, in pitches from the middle of an opening, modulo 1.
+        offset_periods: centre (X, Y) of the footprint of a ray along the normal, in periods from the middle of an
+            opening, modulo 1.
         standoff_per_pitch: distance from the pupil to the openings, in pitches: the centre moves by this times slope.
         visibility: 1, or 0 to leave interference between orders out (the footprint's place is then not known).
         blur_px: standard deviation of a Gaussian that stands for what else blurs a little.
@@ -112,7 +113,7 @@ def pupil_overlaps(model: Diffraction, frame: LocalFrame, lattice: Lattice) -> F
     lag_x, lag_y = relative_lag(model, frame, *lattice_frequencies(frame, lattice))
     distance = jnp.sqrt(lag_x**2 + lag_y**2 + 1e-30)
     anchors, _ = pupil_anchors(model)
-    return jnp.stack([disc_autocorrelation(distance * (anchors[a] * 1e-6)) for a in range(PUPIL_NODES)])
+    return jax.lax.map(lambda anchor: disc_autocorrelation(distance * (anchor * 1e-6)), anchors)
 
 
 def average_of(
@@ -157,9 +158,9 @@ def relative_lag(
     model: Diffraction, frame: LocalFrame, fx: Float[Array, " half"], fy: Float[Array, " rows"]
 ) -> tuple[Float[Array, "rows half"], Float[Array, "rows half"]]:
     """Lag of a frequency per mm of wavelength, in diameters of the pupil and in its own axes."""
-    inverse = jnp.linalg.inv(frame.footprint * model.pupil_diameter_mm)
-    column = fy[:, None]
-    return inverse[0, 0] * fx + inverse[0, 1] * column, inverse[1, 0] * fx + inverse[1, 1] * column
+    (a, b), (c, d) = frame.footprint * model.pupil_diameter_mm
+    fx, fy = fx / (a * d - b * c), fy[:, None] / (a * d - b * c)
+    return d * fx - b * fy, a * fy - c * fx
 
 
 def disc_autocorrelation(relative_lag: Float[Arrayish, "*n"]) -> Float[Array, "*n"]:
@@ -228,9 +229,10 @@ def pupil_anchors(model: Diffraction) -> tuple[Float[Array, " a"], Float[Array, 
     nodes = jnp.asarray(model.wavelengths_nm)
     angle = np.pi * (np.arange(PUPIL_NODES) + 0.5) / PUPIL_NODES
     anchors = (nodes[0] + nodes[-1]) / 2.0 + (nodes[-1] - nodes[0]) / 2.0 * jnp.asarray(np.cos(angle))
-    others = [jnp.delete(anchors, a) for a in range(PUPIL_NODES)]
-    share = [jnp.prod((nodes - rest[:, None]) / (anchors[a] - rest[:, None]), axis=0) for a, rest in enumerate(others)]
-    return anchors, jnp.stack(share)
+    # Lagrange's polynomials: one is 1 at its own anchor and 0 at the others.
+    own = jnp.eye(PUPIL_NODES, dtype=bool)[:, :, None]
+    above, below = nodes - anchors[:, None], anchors[:, None] - anchors
+    return anchors, jnp.prod(jnp.where(own, 1.0, above / jnp.where(own, 1.0, below[..., None])), axis=1)
 
 
 def sensor_transfer(
@@ -252,8 +254,12 @@ def sensor_transfer(
 def _disc_transfer(z: Float[Array, "*n"]) -> Float[Array, "*n"]:
     """2 J1(z) / z by Gauss-Chebyshev quadrature; exact to 1e-6 for z up to 8."""
     count = 8
-    angle = np.pi * np.arange(1, count + 1) / (count + 1)
-    total = jnp.zeros_like(z)
-    for t, w in zip(np.cos(angle), 2.0 / (count + 1) * np.sin(angle) ** 2, strict=True):
-        total = total + w * jnp.cos(z * t)
-    return total
+    angle = jnp.asarray(np.pi * np.arange(1, count + 1) / (count + 1))
+    weights = 2.0 / (count + 1) * jnp.sin(angle) ** 2
+
+    def add(total: Float[Array, "*n"], node: tuple[Array, Array]) -> tuple[Float[Array, "*n"], None]:
+        cosine, weight = node
+        return total + weight * jnp.cos(z * cosine), None
+
+    # As a loop: written out, its cosines take longer to compile than all else.
+    return jax.lax.scan(add, jnp.zeros_like(z), (jnp.cos(angle), weights))[0]

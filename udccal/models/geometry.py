@@ -17,7 +17,7 @@ class Geometry(eqx.Module):
     """Where rays go.
 
     Attributes:
-        focal_px: (fx, fy) in px. centre: (cx, cy) in px.
+        focal_px: (fx, fy). principal_point_px: (cx, cy).
         distortion: (k1, k2, p1, p2, k3), OpenCV's order and signs.
         rotation_rad: rotation vector in rad of ``R_panel_camera`` (camera coordinates to panel coordinates).
         pupil_mm: entrance pupil in panel coordinates in mm; z is minus the stand-off.

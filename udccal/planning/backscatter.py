@@ -1,12 +1,12 @@
 """Prediction for backscatter: the fit's likelihood at its own positions, for pictures as the procedure shows them.
 
-Some pictures are drawn as the procedure draws them and stand for all. Others, which it does not show, are to be
+Some pictures are drawn as the procedure draws them and represent all. Others, which it does not show, are to be
 predicted: they are samples without weight.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Final, final
 
 import numpy as np
@@ -14,40 +14,25 @@ from jaxtyping import Float, Int
 
 from udccal.arrangements import Dark, PanelPicture
 from udccal.displays.pictures import face_picture
-from udccal.fitting.backscatter.data import Bins, grid_step, sampled_rays, visible_crop
-from udccal.fitting.backscatter.likelihood import PerBin, Profile, Samples
-from udccal.fitting.backscatter.parameters import linear_of, prior_of, vector_of
-from udccal.fitting.backscatter.ratios import Pictures, corners_of, window_for
-from udccal.fitting.backscatter.rules import BackscatterRules
-from udccal.fitting.backscatter.solve import SampleErrors
+from udccal.fitting.backscatter.data import Binned, grid_step, sampled_rays, visible_crop
+from udccal.fitting.backscatter.model import PerBin, Pictures, Windows, ratios_and_jacobian, window_for
+from udccal.fitting.backscatter.parameters import BackscatterRules, linear_of, linear_slope, prior_of, vector_of
+from udccal.fitting.bins import Bins
 from udccal.fitting.engine.least_squares import Blocks
 from udccal.fitting.nominal import nominal_backscatter
 from udccal.numerics import in_float64
-from udccal.planning.forecast import Floor
+from udccal.planning.predictor import Floor
 from udccal.planning.state import WHITE, EvenField, RigState, sample_variance_e
 from udccal.planning.steps import PlannedStep, planned_steps, without_pictures
 from udccal.rig import Captures
 
-# So many pictures of the procedure stand for all, since drawing them takes long: more are more of the same kind.
+# So many pictures of the procedure represent all, since drawing them takes long: more are more of the same kind.
 _DRAWN: Final = 6
 # Of pictures that no calibration shows, whose light is to be predicted.
 _NEW_SEEDS: Final = (9001, 9002, 9003)
-_NEW: Final = slice(-1 - len(_NEW_SEEDS), -1)
-_WHITE_VALUE: Final = 255
-_NEXT_TO_NOTHING: Final = 1e-15
-_MANY: Final = 1_000_000
+_SHOWN: Final = slice(1, -1 - len(_NEW_SEEDS))
+_NEW: Final = slice(_SHOWN.stop, -1)
 _RULES: Final = BackscatterRules()
-
-
-@final
-@dataclass(frozen=True)
-class _Noise:
-    """Variance of a bin per unit of its light, in the dark, and of the dark frame; how many pictures there are."""
-
-    shot: PerBin
-    rest: PerBin
-    dark: PerBin
-    pictures: int
 
 
 @final
@@ -60,8 +45,9 @@ class BackscatterPredictor:
         rays, flat = sampled_rays(state.geometry, rig, step_px, _RULES.positions)
         self._prior = prior_of(rig)
         self._x = self._prior.mean if state.backscatter is None else vector_of(state.backscatter)
+        theta = linear_of(self._x)
         template = nominal_backscatter(state.geometry, rig, np.zeros((3, 1, 1)), step_px, window=1)
-        template = replace(template, window=window_for(template, linear_of(self._x), rays, _RULES.slack_px))
+        template = replace(template, window=window_for(template, theta, rays, _RULES.slack_px))
         # Where in the field the light falls: what leaves the panel evenly is shaded like everything else.
         grid = rig.camera.rows // step_px, rig.camera.columns // step_px
         rows, columns = np.divmod(flat, grid[1])
@@ -74,60 +60,60 @@ class BackscatterPredictor:
         self._by_sample = bins.variance(one).reshape(3, -1)[:, flat]
         self._by_row = bins.row_variance(one).reshape(3, -1)[:, flat]
         shown = _pictures(state)
-        light = np.zeros((len(shown.logs) + 2, *self._mask.shape))
-        usable = np.ones(light.shape, dtype=bool)
-        self._samples = Samples(rays, light, light, light, usable, np.ones(len(light)), shown)
-        corner = corners_of(template, linear_of(self._x), rays)
-        errors_at = SampleErrors.of(template, self._samples, light, corner)
-        self._ratio, self._jacobian = errors_at.ratios(self._x)
+        at = Windows.around(template, theta, rays, shown.crop)
+        self._ratio, jacobian = ratios_and_jacobian(template, theta, at, shown)
+        self._jacobian = jacobian * linear_slope(self._x)[:, None, None, None]
 
     def sigma(self, captures: Captures) -> float:
-        """Root mean square over sensor, colours and pictures, of these' peaks; see ``forecast.Predictor``."""
-        noise = self._noise(captures)
-        return float("inf") if noise is None else self._light_sigma(noise)
+        """Root mean square over sensor, colours and pictures, of these' peaks; see ``Predictor``."""
+        planned = self._planned(captures)
+        return float("inf") if planned is None else self._light_sigma(*planned)
 
     def used(self, captures: Captures) -> float:
-        """Of all bins, a part tells the kernel; see ``forecast.Predictor``."""
-        noise = self._noise(captures)
-        return 1.0 if noise is None else (self._light_sigma(noise, self._every) / self._light_sigma(noise)) ** 2
+        """Of all bins, a part tells the kernel; see ``Predictor``."""
+        planned = self._planned(captures)
+        return 1.0 if planned is None else (self._light_sigma(*planned, self._every) / self._light_sigma(*planned)) ** 2
 
     def floor(self) -> Floor:
         """What a profile's fit found its model to leave out, of a new picture's peak; nothing where there is none."""
-        nothing = np.full(self._mask.shape, _NEXT_TO_NOTHING)
-        explained = self._state.model_errors.backscatter == 0
+        almost_none = np.full(self._mask.shape, 1e-15)
+        endless = self._binned(almost_none, almost_none, almost_none)
         return Floor(
-            0.0 if explained else self._light_sigma(_Noise(nothing, nothing, nothing, _MANY)),
+            0.0 if self._state.model_errors.backscatter == 0 else self._light_sigma(endless, 1_000_000),
             "That much of the light the fit of the present profile could not describe; no further picture changes it.",
         )
 
-    def _light_sigma(self, noise: _Noise, count: float = 1.0) -> float:
-        """Bins stand for ``count`` of them each where the parameters are concerned."""
-        rest = np.broadcast_to(noise.rest, self._ratio.shape).copy()
-        rest[-1] = noise.dark
-        light = self._mask * self._ratio
-        samples = replace(self._samples, light=light, shot=np.broadcast_to(noise.shot, light.shape), rest=rest)
+    def _light_sigma(self, seen: Binned, pictures: int, count: float = 1.0) -> float:
+        """Bins represent ``count`` of them each where the parameters are concerned."""
         error = self._state.model_errors.backscatter
-        weight = samples.weights(light, self._mask, error, samples.usable)
-        shown = weight[1 : _NEW.start]
-        shown *= np.sqrt(noise.pictures / len(shown))
+        weight = seen.weights(seen.rate, self._mask, error, seen.usable)
+        weight[_SHOWN] *= np.sqrt(pictures / len(weight[_SHOWN]))
         weight[_NEW] = 0.0
-        profile = Profile.of(self._ratio, samples, weight)
+        profile = seen.profile(self._ratio, weight)
         jacobian = np.sqrt(count) * profile.jacobian(self._jacobian).reshape(len(self._x), -1).T
         equations = Blocks.of_errors(np.zeros(len(jacobian)), jacobian).with_prior(self._prior, self._x)
         cov = equations.cov() * self._state.model_errors.inflation
         variance = profile.light_variance(self._ratio, self._jacobian, cov)[_NEW] + (error * self._mask) ** 2
-        peak = light[_NEW].max(axis=(1, 2))
+        peak = seen.rate[_NEW].max(axis=(1, 2))
         return 100.0 * float(np.sqrt(variance.mean() / (peak**2).mean()))
 
-    def _noise(self, captures: Captures) -> _Noise | None:
-        """In units in which white, shaded, is 1 where it is brightest; None where there are too few pictures."""
+    def _planned(self, captures: Captures) -> tuple[Binned, int] | None:
+        """Shots of the pictures drawn, and how many pictures there are; None where these are too few."""
         steps = list(planned_steps("backscatter", without_pictures(self._state.with_captures(captures))))
-        pictures = [step for step in steps if isinstance(step.arrangement, PanelPicture)]
+        shown = [step for step in steps if isinstance(step.arrangement, PanelPicture)]
         darks = [step for step in steps if isinstance(step.arrangement, Dark)]
-        if len(pictures) - 1 < _RULES.fewest_pictures or not darks:
+        if len(shown) - 1 < _RULES.fewest_pictures or not darks:
             return None
-        (shot, rest), (_, dark) = (self._of_step(step) for step in (pictures[0], darks[0]))
-        return _Noise(shot, rest, dark, len(pictures) - 1)
+        (shot, rest), (_, dark) = self._of_step(shown[0]), self._of_step(darks[0])
+        return self._binned(shot, rest, dark), len(shown) - 1
+
+    def _binned(self, shot: PerBin, rest: PerBin, dark: PerBin) -> Binned:
+        """Shots with these variances, in units in which white, shaded, is 1 where it is brightest."""
+        light = self._mask * self._ratio
+        by_shot = np.broadcast_to(rest, light.shape).copy()
+        by_shot[-1] = dark
+        one = np.ones(len(light))
+        return Binned(light, np.broadcast_to(shot, light.shape), by_shot, np.zeros(light.shape, dtype=bool), one, one)
 
     def _of_step(self, step: PlannedStep) -> tuple[PerBin, PerBin]:
         """Variance of a bin per unit of its light, and in the dark."""
@@ -156,7 +142,7 @@ def _pictures(state: RigState) -> Pictures:
     shown = [
         step.arrangement.picture
         for step in planned_steps("backscatter", few)
-        if isinstance(step.arrangement, PanelPicture) and step.arrangement.picture.min() < _WHITE_VALUE
+        if isinstance(step.arrangement, PanelPicture) and step.arrangement.picture.min() < 255
     ]
     shown += [face_picture(seed, panel.columns, panel.rows) for seed in _NEW_SEEDS]
     return Pictures.of(np.stack([crop.of(picture) for picture in shown]), crop)

@@ -9,81 +9,43 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Final, Protocol, final, runtime_checkable
+from typing import Final, final
 
 import numpy as np
 from jaxtyping import Float, Int
 
+from udccal.planning.backscatter import BackscatterPredictor
 from udccal.planning.design import DESIGN_VARIABLES, DesignVariable
+from udccal.planning.geometry import GeometryPredictor
+from udccal.planning.noise import NoisePredictor
+from udccal.planning.predictor import QUANTITIES, Floor, Predictor, Quantity
+from udccal.planning.psf import PsfPredictor
 from udccal.planning.state import RigState
+from udccal.planning.wire import WirePredictor
 from udccal.rig import Captures
 from udccal.sessions.schema import TermName
 
 # From a quarter of what was captured to four times as much.
 _REACH: Final = 4.0
 _POINTS: Final = 9
-# Design variables that change sigma by less than this share of it do not matter to the quantity.
+# Design variables that change sigma by less than this part of it do not matter to the quantity.
 _FLAT: Final = 1e-3
 
 
-@final
-@dataclass(frozen=True)
-class Quantity:
-    """What the sigma of a term is of, and its unit."""
-
-    unit: str
-    meaning: str
-
-
-QUANTITIES: Final = MappingProxyType[TermName, Quantity](
+_PREDICTORS: Final = MappingProxyType[TermName, Callable[[RigState], Predictor]](
     {
-        "noise": Quantity("%", "conversion gain K, relative"),
-        "geometry": Quantity("px", "where a ray lands, root mean square over the sensor"),
-        "wire": Quantity("%", "wire map, root mean square over the sensor"),
-        "psf": Quantity("%", "kernel, relative L2"),
-        "backscatter": Quantity("%", "predicted light, root mean square, of its peak"),
+        "noise": NoisePredictor,
+        "geometry": GeometryPredictor,
+        "wire": WirePredictor,
+        "psf": PsfPredictor,
+        "backscatter": BackscatterPredictor,
     }
 )
 
 
-@final
-@dataclass(frozen=True)
-class Floor:
-    """The sigma that is left however much is captured, in the quantity's unit, and what would lower it."""
-
-    sigma: float
-    lowered_by: str
-
-
-@runtime_checkable
-class Predictor(Protocol):
-    """Predicts one term of one rig; remembers what does not change with the captures."""
-
-    def sigma(self, captures: Captures) -> float:
-        """Of the term's quantity; infinite where the captures do not suffice for a fit."""
-        ...
-
-    def floor(self) -> Floor:
-        """In the limit of endless captures."""
-        ...
-
-    def used(self, captures: Captures) -> float:
-        """Share of the captures' information on the quantity that the fit, at its default effort, spends; 1 is all."""
-        ...
-
-
 def predictor_for(term: TermName, state: RigState) -> Predictor:
     """What predicts a term of a rig."""
-    from udccal.planning import backscatter, geometry, noise, psf, wire
-
-    predictors: dict[TermName, Callable[[RigState], Predictor]] = {
-        "noise": noise.NoisePredictor,
-        "geometry": geometry.GeometryPredictor,
-        "wire": wire.WirePredictor,
-        "psf": psf.PsfPredictor,
-        "backscatter": backscatter.BackscatterPredictor,
-    }
-    return predictors[term](state)
+    return _PREDICTORS[term](state)
 
 
 @final
@@ -112,7 +74,7 @@ class Forecast:
         quantity: what ``sigma`` is of, and its unit.
         sigma: predicted at what was captured.
         floor: what no captures get below.
-        used: share of the frames' information on the quantity that the fit, at its default effort, spends; 1 is all.
+        used: part of the frames' information on the quantity that the fit, at its default effort, spends; 1 is all.
         curves: one per design variable that matters.
         idle: what the variables count that do not matter to the quantity.
     """

@@ -34,7 +34,7 @@ from udccal.fitting.geometry.corners import board_points_mm, charuco_board
 from udccal.fitting.geometry.data import rig_prior
 from udccal.models.geometry import panel_directions, project_directions
 from udccal.numerics import in_float64
-from udccal.planning.forecast import Floor
+from udccal.planning.predictor import Floor
 from udccal.planning.state import WHITE, EvenField, RigState, sample_variance_e, sensor_samples
 from udccal.planning.steps import PlannedStep, planned_steps
 from udccal.rig import Captures
@@ -79,7 +79,7 @@ class GeometryPredictor:
         self._known: dict[Board, _View | None] = {}
 
     def sigma(self, captures: Captures) -> float:
-        """Root mean square over the sensor and both axes; see ``forecast.Predictor``."""
+        """Root mean square over the sensor and both axes; see ``Predictor``."""
         return self._ray_sigma(self._views(captures), 1.0)
 
     def floor(self) -> Floor:
@@ -91,7 +91,7 @@ class GeometryPredictor:
         )
 
     def used(self, captures: Captures) -> float:
-        """All corners; see ``forecast.Predictor``."""
+        """All corners; see ``Predictor``."""
         return 1.0
 
     def _views(self, captures: Captures) -> list[_View]:
@@ -151,7 +151,8 @@ def _planned_view(state: RigState, field: EvenField, step: PlannedStep, board: B
     markers = np.asarray(charuco_board(board.spec).getObjPoints(), dtype=np.float64).reshape(-1, 3)
     image, marks = (projected(intrinsics, rotation.apply(points) + origin)[0] for points in (corners, markers))
     depth = float((rotation.apply(corners.mean(axis=0)) + origin)[2])
-    radius = float(np.clip(_WINDOW_SQUARES * board.spec.square_mm / depth * intrinsics[0], *_RULES.window_px))
+    square_px = board.spec.square_mm / depth * Intrinsics.of(intrinsics).focal_px[0]
+    radius = float(np.clip(_WINDOW_SQUARES * square_px, *_RULES.window_px))
     whole = _inside(state, marks, 1.0).reshape(-1, 4).all(axis=1)
     # Corners both of whose markers are in the picture: without them the detector does not know their numbers.
     near = np.linalg.norm(corners[:, None] - markers.reshape(-1, 4, 3).mean(axis=1), axis=2) < board.spec.square_mm

@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import Float
 
 from udccal.arrangements import Dark, FlatLight
-from udccal.fitting.noise.rules import NoiseRules
+from udccal.fitting.noise.data import NoiseRules
 from udccal.fitting.noise.transfer import DarkVariance, Levels, Order, TransferProblem, temporal_variance
-from udccal.planning.forecast import Floor
+from udccal.planning.predictor import Floor
 from udccal.planning.state import EvenField, RigState, sensor_samples
 from udccal.planning.steps import planned_steps
 from udccal.rig import Captures
@@ -37,7 +37,7 @@ class NoisePredictor:
         self._V0, self._rounding = max((self._K * sigma_d) ** 2 - row_DN**2, 1e-4), q_DN**2 / 12
 
     def sigma(self, captures: Captures) -> float:
-        """Of K, in per cent; see ``forecast.Predictor``."""
+        """Of K, in per cent; see ``Predictor``."""
         steps = list(planned_steps("noise", self._state.with_captures(captures)))
         pairs = [step for step in steps if len(step.exposures_s) == 2]
         flats = [step for step in pairs if isinstance(step.arrangement, FlatLight)]
@@ -58,7 +58,7 @@ class NoisePredictor:
         return Floor(0.0, "")
 
     def used(self, captures: Captures) -> float:
-        """All pairs; see ``forecast.Predictor``."""
+        """All pairs; see ``Predictor``."""
         return 1.0
 
     def _levels(self, level: Float[np.ndarray, " levels"], exposure_s: Float[np.ndarray, " levels"]) -> Levels:
@@ -75,7 +75,6 @@ class NoisePredictor:
             samples=2 * each,
             usable=light_DN <= _RULES.fit_up_to * full_DN,
             light=np.full(len(level), np.nan),
-            steady=np.zeros(len(level), dtype=bool),
             dark_DN=dark_DN,
             row_variance_DN2=np.zeros(len(level)),
         )

@@ -11,7 +11,8 @@ from typing import Final, final, get_args
 
 from udccal.errors import UdccalError
 from udccal.planning.design import DESIGN_VARIABLES, Addition, Objective, cheapest, worthwhile
-from udccal.planning.forecast import QUANTITIES, predictor_for
+from udccal.planning.forecast import predictor_for
+from udccal.planning.predictor import QUANTITIES
 from udccal.planning.state import RigState
 from udccal.planning.steps import NOTHING, Cost, cost_of
 from udccal.rig import Captures
@@ -201,11 +202,11 @@ def _suggestion(term: TermName, planned: Captures, addition: Addition) -> Sugges
 
 
 def _most_per_second(suggestions: Iterable[Suggestion | None]) -> Suggestion | None:
-    made = (one for one in suggestions if one is not None)
+    made = filter(None, suggestions)
     return max(made, key=lambda one: one.gain_percent / max(one.cost.seconds, 1e-9), default=None)
 
 
 def _most_per_set_up(suggestions: Iterable[Suggestion | None]) -> Suggestion | None:
     """What takes no set-up goes first."""
-    made = (one for one in suggestions if one is not None)
+    made = filter(None, suggestions)
     return max(made, key=lambda one: (one.cost.set_ups <= 0, one.gain_percent / max(one.cost.set_ups, 1)), default=None)

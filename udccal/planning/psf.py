@@ -23,7 +23,7 @@ from udccal.fitting.psf.problem import DiffractionProblem, Place
 from udccal.fitting.psf.samples import Samples, choose_samples, gather, stands_for, weighed
 from udccal.numerics import in_float64
 from udccal.planning.design import DESIGN_VARIABLES
-from udccal.planning.forecast import Floor
+from udccal.planning.predictor import Floor
 from udccal.planning.state import WHITE, RigState, built_wire, sample_variance_e
 from udccal.planning.steps import PlannedStep, planned_steps
 from udccal.rig import Captures
@@ -61,12 +61,12 @@ class PsfPredictor:
         self._known: dict[tuple[float, ...], Float[np.ndarray, "p p"]] = {}
 
     def sigma(self, captures: Captures) -> float:
-        """Root mean square over colours and field; see ``forecast.Predictor``."""
+        """Root mean square over colours and field; see ``Predictor``."""
         shots = self._shots_used(captures)
         return self._kernel_sigma(captures, shots) if shots else float("inf")
 
     def used(self, captures: Captures) -> float:
-        """Of all positions and shifts, a part; see ``forecast.Predictor``."""
+        """Of all positions and shifts, a part; see ``Predictor``."""
         shots = self._shots_used(captures)
         every = captures.psf_columns * captures.psf_rows * captures.psf_shifts
         return self._of_noise(captures, every) / self._of_noise(captures, shots) if shots else 1.0

@@ -17,8 +17,7 @@ from udccal.fitting.geometry.boards import BY_HAND, ON_JIG
 from udccal.fitting.nominal import nominal_geometry
 from udccal.models.backscatter import Backscatter
 from udccal.models.geometry import Geometry
-from udccal.models.noise import Noise
-from udccal.models.psf import PsfField
+from udccal.models.noise import Noise, variance_e
 from udccal.models.wire import Wire, wire_values
 from udccal.numerics import in_float64
 from udccal.profiles.profile import Profile
@@ -46,7 +45,7 @@ class ModelErrors:
 
     Attributes:
         on_jig_px, by_hand_px: scatter of a board's corners by axis beside noise; None where not known.
-        wire, psf: relative error of the model; the psf's is what fit allows for, see ``fitting.psf.data.left_out``.
+        wire, psf: relative error of the model; the psf's is what its fit allows for, see ``fitting.psf.data.left_out``.
         psf_kernel: relative L2 error of the kernel beside noise where it was not captured.
         backscatter: error of a ratio to white.
         inflation: of the variances of the backscatter's parameters, whose residuals hang together.
@@ -69,7 +68,7 @@ class RigState:
     Attributes:
         rig: with the captures that are looked at.
         noise, geometry: as expected.
-        wire, psf, backscatter: as a profile has measured them; None: as built.
+        wire, backscatter: as a profile has measured them; None: as built.
         model_errors: errors beside noise.
     """
 
@@ -77,17 +76,12 @@ class RigState:
     noise: Noise
     geometry: Geometry
     wire: Wire | None = None
-    psf: PsfField | None = None
     backscatter: Backscatter | None = None
     model_errors: ModelErrors = ModelErrors()
 
-    def of(self, rig: RigDescription) -> RigState:
-        """The same of another description."""
-        return replace(self, rig=rig)
-
     def with_captures(self, captures: Captures) -> RigState:
         """The same with other captures."""
-        return self.of(self.rig.model_copy(update={"captures": captures}))
+        return replace(self, rig=self.rig.model_copy(update={"captures": captures}))
 
     @property
     def full_well_e(self) -> float:
@@ -124,7 +118,6 @@ def measured_state(rig: RigDescription, fits: Calibration | Profile) -> RigState
         noise=fits.noise.term if _converged(fits.noise) else nominal.noise,
         geometry=fits.geometry.term if geometry_seen else nominal.geometry,
         wire=fits.wire.term if _converged(fits.wire) else None,
-        psf=fits.psf.term if _converged(fits.psf) else None,
         backscatter=fits.backscatter.term if _converged(fits.backscatter) else None,
         model_errors=ModelErrors(
             on_jig_px=_corners_px(fits.geometry, ON_JIG) if geometry_seen else None,
@@ -175,8 +168,7 @@ def sensor_samples(rig: RigDescription, across: int) -> Float[np.ndarray, "n 2"]
 
 def built_wire(state: RigState) -> Wire:
     """The wire as the rig was built, with a round pupil and its strongest harmonics."""
-    from udccal.fitting.wire.parameters import ideal_wire, possible_harmonics
-    from udccal.fitting.wire.rules import wire_start
+    from udccal.fitting.wire.rules import ideal_wire, possible_harmonics, wire_start
 
     start = wire_start(state.rig)
     return ideal_wire(state.geometry, start, possible_harmonics(start).orders)
@@ -186,13 +178,18 @@ def built_wire(state: RigState) -> Wire:
 class EvenField:
     """An even white field as one rig sees it, 1 at its brightest: as the wire measured it, or the cos^4 law."""
 
+    @in_float64
     def __init__(self, state: RigState) -> None:
-        camera = state.rig.camera
+        camera, geometry, wire = state.rig.camera, state.geometry, state.wire
         self._size = np.array([camera.columns, camera.rows])
         self._cell = np.asarray(cell_channels(camera.cfa), dtype=np.int64)
         y, x = (np.linspace(0, size - 1, count) for size, count in zip(self._size[::-1], _FIELD_GRID, strict=True))
         pixels = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-        values = _by_field_angle(state, pixels) if state.wire is None else _by_wire(state.wire, pixels, *self._size)
+        if wire is None:
+            ideal = (pixels - np.asarray(geometry.principal_point_px)) / np.asarray(geometry.focal_px)
+            values = (1 + (ideal**2).sum(axis=1)) ** -2.0
+        else:
+            values = np.asarray(_wire_values(wire, pixels, camera.rows, camera.columns), dtype=np.float64)
         self._grid = (values / values.max()).reshape(_FIELD_GRID)
 
     def at(self, pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
@@ -206,19 +203,7 @@ class EvenField:
         return np.asarray(self.at(pixels) * (np.array(WHITE) / max(WHITE))[self._cell[y % 2, x % 2]])
 
 
-def _by_field_angle(state: RigState, pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
-    ideal = (pixels - np.asarray(state.geometry.principal_point_px)) / np.asarray(state.geometry.focal_px)
-    return np.asarray((1 + (ideal**2).sum(axis=1)) ** -2.0)
-
-
 @in_float64
-def _by_wire(wire: Wire, pixels: Float[np.ndarray, "n 2"], columns: int, rows: int) -> Float[np.ndarray, " n"]:
-    return np.asarray(_wire_values(wire, pixels, int(rows), int(columns)), dtype=np.float64)
-
-
 def sample_variance_e(state: RigState, signal_e: Float[np.ndarray, "*n"], exposure_s: float) -> Float[np.ndarray, "*n"]:
-    """Temporal variance of single samples in e-^2 (EMVA 1288: shot, dark current, dark noise, quantisation)."""
-    noise = state.noise
-    K, q_DN, sigma_d = (float(np.asarray(part)) for part in (noise.K_DN_per_e, noise.q_DN, noise.sigma_d_e))
-    dark = float(np.asarray(noise.dark_current_e_per_s)) * exposure_s
-    return np.asarray(np.maximum(signal_e, 0.0) + dark + sigma_d**2 + (q_DN / K) ** 2 / 12)
+    """Temporal variance of single samples in e-^2; see ``models.noise.variance_e``."""
+    return np.asarray(variance_e(state.noise, signal_e, exposure_s))

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, final
 
 from udccal.arrangements import Arrangement
-from udccal.cameras.protocol import Region
 from udccal.errors import UdccalError
 from udccal.planning.state import RigState, full_s
 from udccal.plugins import find_procedure
@@ -33,7 +32,6 @@ class PlannedStep:
     id: str
     arrangement: Arrangement
     instruction: str
-    region: Region
     exposures_s: tuple[float, ...]
     level: float | None
     test_frames: int
@@ -77,9 +75,7 @@ def planned_steps(term: TermName, state: RigState) -> Iterator[PlannedStep]:
                 f"does not ({error}). Give its plan and exposure the methods of those in procedures.plans."
             ) from error
         earlier[step.id] = at
-        yield PlannedStep(
-            step.id, step.arrangement, step.instruction, step.region, exposures_s, at.level, at.test_frames
-        )
+        yield PlannedStep(step.id, step.arrangement, step.instruction, exposures_s, at.level, at.test_frames)
 
 
 def cost_of(term: TermName, state: RigState) -> Cost:
@@ -108,4 +104,4 @@ def _within(exposure_s: float, rig: RigDescription) -> float:
 def without_pictures(state: RigState) -> RigState:
     """The same with a panel of next to no size: frames and exposures of its steps do not depend on it."""
     small = state.rig.panel.model_copy(update={"columns": _COUNTING_PX, "rows": _COUNTING_PX})
-    return state.of(state.rig.model_copy(update={"panel": small}))
+    return replace(state, rig=state.rig.model_copy(update={"panel": small}))

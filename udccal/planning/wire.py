@@ -15,18 +15,13 @@ from jaxtyping import Float
 from udccal.arrangements import Dark, FlatLight
 from udccal.cfa import SITES
 from udccal.fitting.engine.gaussian import scaled_inverse
-from udccal.fitting.wire import WireRules, wire_start
 from udccal.fitting.wire.data import Pixels, odd_step, sample_pixels
 from udccal.fitting.wire.fit import map_jacobian, mean_one
 from udccal.fitting.wire.jacobian import WireProblem, expected_of, with_harmonics
-from udccal.fitting.wire.parameters import (
-    Parameters,
-    ideal_wire,
-    parameters_of,
-    possible_harmonics,
-)
+from udccal.fitting.wire.parameters import Parameters, parameters_of
+from udccal.fitting.wire.rules import WireRules, ideal_wire, possible_harmonics, wire_start
 from udccal.numerics import in_float64
-from udccal.planning.forecast import Floor
+from udccal.planning.predictor import Floor
 from udccal.planning.state import EvenField, RigState, sample_variance_e
 from udccal.planning.steps import planned_steps
 from udccal.rig import Captures
@@ -58,12 +53,12 @@ class WirePredictor:
         self._spent = self._every / odd_step(shape[0] * shape[1], _RULES.samples)
 
     def sigma(self, captures: Captures) -> float:
-        """Root mean square over the sensor; see ``forecast.Predictor``."""
+        """Root mean square over the sensor; see ``Predictor``."""
         relative = self._relative_variance(captures)
         return float("inf") if relative is None else self._map_sigma(relative, self._spent)
 
     def used(self, captures: Captures) -> float:
-        """Of all pixels, a part; see ``forecast.Predictor``."""
+        """Of all pixels, a part; see ``Predictor``."""
         relative = self._relative_variance(captures)
         if relative is None:
             return 1.0

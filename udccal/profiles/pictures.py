@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 from jaxtyping import Float32
 
-from udccal.cfa import channel_map
+from udccal.cfa import cfa_named
 from udccal.kernels import fitted_size, kernels_at
 from udccal.models.backscatter import Backscatter, backscatter_rate
 from udccal.models.psf import PsfField
@@ -23,11 +23,7 @@ def backscatter_mask(term: Backscatter, rig: RigDescription) -> Float32[np.ndarr
     """Backscatter of an all-white panel in e-/s before the wire, one sample per 2 x 2 cell and channel."""
     white = np.full((rig.panel.rows, rig.panel.columns, 3), 255, dtype=np.uint8)
     mosaic = np.asarray(backscatter_rate(term, white), dtype=np.float64)
-    rows, columns = mosaic.shape[0] // 2 * 2, mosaic.shape[1] // 2 * 2
-    cells = mosaic[:rows, :columns].reshape(rows // 2, 2, columns // 2, 2)
-    channels = channel_map(rig.camera.cfa, 2, 2)
-    planes = [cells.transpose(0, 2, 1, 3)[:, :, channels == channel].mean(axis=-1) for channel in range(3)]
-    return np.stack(planes, axis=-1).astype(np.float32)
+    return cfa_named(rig.camera.cfa).cell_means(mosaic).astype(np.float32)
 
 
 def psf_atlas(term: PsfField, rig: RigDescription) -> Mapping[str, Float32[np.ndarray, "rows columns"]]:

@@ -1,4 +1,4 @@
-"""``profile.json``, format version 1. docs/profile.md says the same to people and to other programs."""
+"""``profile.json``, format version 2. docs/profile.md says the same to people and to other programs."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from udccal.rig import RigDescription
 from udccal.sessions.schema import Sha256, StoredCamera
 
 FORMAT: Final = "udccal-profile"
-VERSION: Final = 1
+VERSION: Final = 2
 # Arrays of at most so many values stand in profile.json, where a person can read and compare them.
 INLINE_VALUES = 512
 
@@ -193,7 +193,7 @@ class StoredProfile(_Strict):
     """The whole of ``profile.json``."""
 
     format: Literal["udccal-profile"]
-    version: Literal[1]
+    version: Literal[2]
     rig: RigDescription
     lineage: Lineage
     provenance: Provenance

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 # Longest suffixes first: the first that fits decides.
 _SUFFIXES = (
+    ("_periods", "period"),
     ("_e_per_s", "e-/s"),
     ("_DN_per_e", "DN/e-"),
     ("_per_px", "1/px"),
@@ -18,14 +19,10 @@ _SUFFIXES = (
     ("_e", "e-"),
     ("_s", "s"),
 )
-# The parameters of Geometry, whose names are OpenCV's and carry no unit.
-_NAMED = {"focal": "px", "centre": "px", "distortion": "1", "rotation": "rad", "pupil_mm": "mm"}
 
 
 def unit_of(name: str) -> str:
     """Unit of a parameter by its (dotted) name; ``1`` where the name carries none."""
     parts = [part for part in name.split(".") if not part.isdigit()]
     own = parts[-1] if parts else name
-    if own in _NAMED:
-        return _NAMED[own]
     return next((unit for suffix, unit in _SUFFIXES if own.endswith(suffix)), "1")

@@ -16,8 +16,77 @@ from udccal.profiles.schema import FORMAT, VERSION
 JsonObject = dict[str, Any]
 Migration = Callable[[JsonObject], JsonObject]
 
+# From version 1 to 2 one quantity has one name: by section, the parameters (the last part of their dotted names).
+_GEOMETRY = {"focal": "focal_px", "centre": "principal_point_px", "rotation": "rotation_rad", "pupil": "pupil_mm"}
+_PARAMETERS_OF_2: Mapping[str, Mapping[str, str]] = {
+    "geometry": _GEOMETRY,
+    "wire": {**_GEOMETRY, "offset": "offset_periods", "pupil_per_pitch": "footprint_per_pitch"},
+    "psf": {
+        **_GEOMETRY,
+        "open_fraction": "openings",
+        "thickness_mm": "depth_mm",
+        "pupil_mm": "pupil_diameter_mm",
+        "offset": "offset_periods",
+        "diffraction_share": "diffraction_fraction",
+    },
+    "backscatter": {**_GEOMETRY, "pupil_mm": "pupil_diameter_mm", "distance_mm": "standoff_mm"},
+}
+_ESTIMATES_OF_2: Mapping[str, Mapping[str, str]] = {
+    "wire": {
+        "offset_x": "offset_x_periods",
+        "offset_y": "offset_y_periods",
+        "pupil_per_pitch": "footprint_per_pitch",
+    },
+    "psf": {
+        "pitch": "pitch_mm",
+        "column_open_fraction": "column_open",
+        "row_open_fraction": "row_open",
+        "structure_thickness": "depth_mm",
+        "pupil_diameter": "pupil_diameter_mm",
+        "blur": "blur_px",
+    },
+    "backscatter": {"pupil_mm": "pupil_diameter_mm", "distance_mm": "standoff_mm"},
+}
+
+
+def _first_to_second(found: JsonObject) -> JsonObject:
+    """Names change, numbers do not; the rig reads its own older versions (``udccal/rig_versions.py``)."""
+    terms = found.get("terms")
+    if isinstance(terms, dict):
+        terms = {name: _renamed_section(name, section) for name, section in terms.items()}
+    return {**found, "version": 2, "terms": terms}
+
+
+def _renamed_section(name: str, section: Any) -> Any:
+    if not isinstance(section, dict):
+        return section
+    parameters = _PARAMETERS_OF_2.get(name, {})
+    found = {
+        **section,
+        **{key: _renamed(section[key], parameters) for key in ("parameters", "arrays") if key in section},
+    }
+    fit = found.get("fit")
+    if isinstance(fit, dict) and "estimates" in fit:
+        found["fit"] = {**fit, "estimates": _renamed(fit["estimates"], _ESTIMATES_OF_2.get(name, {}))}
+    return found
+
+
+def _renamed(entries: Any, names: Mapping[str, str]) -> Any:
+    """Entries with their names replaced; whatever is no list of named objects is left for the schema to refuse."""
+    return [_renamed_entry(entry, names) for entry in entries] if isinstance(entries, list) else entries
+
+
+def _renamed_entry(entry: Any, names: Mapping[str, str]) -> Any:
+    if not isinstance(entry, dict) or not isinstance(entry.get("name"), str):
+        return entry
+    group, dot, own = entry["name"].rpartition(".")
+    name = names.get(own, own)
+    unit = {"unit": "period"} if name == "offset_periods" and "unit" in entry else {}
+    return {**entry, "name": f"{group}{dot}{name}", **unit}
+
+
 # Keyed by the version a function starts from; it returns the next version.
-MIGRATIONS: Mapping[int, Migration] = {}
+MIGRATIONS: Mapping[int, Migration] = {1: _first_to_second}
 
 
 def migrated(

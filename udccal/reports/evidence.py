@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from udccal.cfa import channel_map
+from udccal.cfa import cfa_named
 from udccal.models.noise import Noise
 from udccal.sessions.schema import StoredStep
 from udccal.sessions.store import Session
@@ -53,7 +53,7 @@ def _is_pair(step: StoredStep) -> bool:
 def _pair(session: Session, step: StoredStep) -> Float[np.ndarray, "2 3"]:
     """Mean and temporal variance per colour of two frames alike; EMVA 1288 equations 16 and 17."""
     first, second = (session.frame(capture).astype(np.float64) for capture in step.captures)
-    channels = channel_map(session.rig.camera.cfa, *first.shape)
+    channels = cfa_named(session.rig.camera.cfa).channel_map(*first.shape)
     masks = [channels == c for c in range(_CHANNELS)]
     mean = [0.5 * float((first[m] + second[m]).mean()) for m in masks]
     variance = [0.5 * float((first[m] - second[m]).var()) for m in masks]

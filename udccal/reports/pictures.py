@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, UInt16
 
-from udccal.cfa import cell_channels
+from udccal.cfa import cfa_named
 from udccal.restoration.metrics import least_squares_gain, psnr, ssim
 from udccal.restoration.tone import display_exposure, encode_srgb
 
@@ -62,7 +62,4 @@ def mosaic_preview(
     mosaic: UInt16[np.ndarray, "rows columns"], cfa: str, black_DN: float
 ) -> Float[np.ndarray, "half_rows half_columns 3"]:
     """A linear picture of half the size, each 2 x 2 cell one pixel: quick, and free of interpolation."""
-    rows, columns = mosaic.shape[0] // 2 * 2, mosaic.shape[1] // 2 * 2
-    signal = np.maximum(mosaic[:rows, :columns].astype(np.float32) - np.float32(black_DN), 0.0)
-    sites = [(channel, signal[j::2, i::2]) for (j, i), channel in np.ndenumerate(cell_channels(cfa))]
-    return np.stack([np.mean([s for c, s in sites if c == channel], axis=0) for channel in range(3)], axis=-1)
+    return cfa_named(cfa).cell_means(np.maximum(mosaic.astype(np.float32) - np.float32(black_DN), 0.0))

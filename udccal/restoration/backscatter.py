@@ -8,7 +8,7 @@ import jax
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
-from udccal.cfa import channel_map
+from udccal.cfa import cfa_named
 from udccal.errors import RestorationError
 from udccal.models.backscatter import Backscatter, PanelResponse, panel_response, response_rate
 from udccal.numerics import in_float64
@@ -51,11 +51,12 @@ def known_rate(
 def mask_mosaic(
     mask: Float32[np.ndarray, "half_rows half_columns 3"], cfa: str, rows: int, columns: int
 ) -> Float32[np.ndarray, "rows columns"]:
-    """The profile's mask (one value per 2 x 2 cell and channel) at every sample, each of its own colour."""
+    """The profile's mask (one value per cell of the pattern and channel) at every sample, each of its own colour."""
     last_row, last_column = mask.shape[0] - 1, mask.shape[1] - 1
-    cell_rows = np.minimum(np.arange(rows) // 2, last_row)[:, None]
-    cell_columns = np.minimum(np.arange(columns) // 2, last_column)[None, :]
-    return mask[cell_rows, cell_columns, channel_map(cfa, rows, columns)]
+    pattern = cfa_named(cfa)
+    cell_rows = np.minimum(np.arange(rows) // pattern.rows, last_row)[:, None]
+    cell_columns = np.minimum(np.arange(columns) // pattern.columns, last_column)[None, :]
+    return mask[cell_rows, cell_columns, pattern.channel_map(rows, columns)]
 
 
 def estimated_rate(
@@ -67,7 +68,7 @@ def estimated_rate(
     percentile of 16 x 16 blocks) allow, between 0 and 1. A scene without dark places gets too much taken away, by at
     most its own darkest percent.
     """
-    channels = channel_map(cfa, *signal_rate.shape)
+    channels = cfa_named(cfa).channel_map(*signal_rate.shape)
     levels = np.array([_level(signal_rate, mask, channels == channel) for channel in range(3)], dtype=np.float32)
     return mask * levels[channels]
 

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32
 
-from udccal.cfa import BLUE, GREEN, RED, cell_channels, channel_map
+from udccal.cfa import BLUE, GREEN, RED, cfa_named
 
 # Figure 2 of the paper, in eighths. The picture's own sample is in the middle.
 _GREEN_AT_COLOUR = np.array(
@@ -30,23 +30,21 @@ _FOOTPRINT = np.ones((5, 5), dtype=np.uint8)
 
 def demosaic(mosaic: Float32[np.ndarray, "rows columns"], cfa: str) -> Float32[np.ndarray, "rows columns 3"]:
     """A colour at every sample. Borders continue by mirroring, which keeps the pattern."""
-    cell = cell_channels(cfa)
+    pattern = cfa_named(cfa)
     picture = np.empty((*mosaic.shape, 3), dtype=np.float32)
     green = _filtered(mosaic, _GREEN_AT_COLOUR)
     along_row, along_column, across = (
         _filtered(mosaic, kernel) for kernel in (_COLOUR_ALONG_ROW, _COLOUR_ALONG_COLUMN, _COLOUR_ACROSS)
     )
-    for j in (0, 1):
-        for i in (0, 1):
-            site = (slice(j, None, 2), slice(i, None, 2))
-            own = int(cell[j, i])
-            picture[(*site, own)] = mosaic[site]
-            if own == GREEN:
-                picture[(*site, int(cell[j, 1 - i]))] = along_row[site]
-                picture[(*site, int(cell[1 - j, i]))] = along_column[site]
-            else:
-                picture[(*site, GREEN)] = green[site]
-                picture[(*site, RED + BLUE - own)] = across[site]
+    for site in pattern.sites:
+        at, own = site.samples, site.channel
+        picture[(*at, own)] = mosaic[at]
+        if own == GREEN:
+            picture[(*at, int(pattern.channels[site.row, 1 - site.column]))] = along_row[at]
+            picture[(*at, int(pattern.channels[1 - site.row, site.column]))] = along_column[at]
+        else:
+            picture[(*at, GREEN)] = green[at]
+            picture[(*at, RED + BLUE - own)] = across[at]
     return picture
 
 
@@ -63,7 +61,7 @@ def demosaic_clipped(
     if not saturated.any():
         return picture, valid
     spoilt = cv2.dilate(saturated.astype(np.uint8), _FOOTPRINT).astype(bool)
-    channels = channel_map(cfa, *mosaic.shape)
+    channels = cfa_named(cfa).channel_map(*mosaic.shape)
     for channel in range(3):
         own = (channels == channel).astype(np.float32)
         alone = _filtered(mosaic * own, _BILINEAR) / _filtered(own, _BILINEAR)

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 from jaxtyping import ArrayLike, Bool, Float32, UInt16
 
+from udccal.cfa import cfa_named
 from udccal.models.noise import Noise, variance_e
 
 # A sample stands out when it differs from all its neighbours by so many sigma of temporal noise ...
@@ -48,7 +49,9 @@ def mean_variance_e2(mosaic: UInt16[np.ndarray, "rows columns"], noise: Noise, e
     return float(variance_e(noise, signal_e, exposure_s)) + max(-dark_e, 0.0)
 
 
-def without_defects(signal_e: Float32[np.ndarray, "rows columns"], noise: Noise) -> Float32[np.ndarray, "rows columns"]:
+def without_defects(
+    signal_e: Float32[np.ndarray, "rows columns"], noise: Noise, cfa: str
+) -> Float32[np.ndarray, "rows columns"]:
     """Hot and dead samples replaced by the median of their 3 x 3 neighbourhood of the same colour.
 
     A sample counts as defective when it lies outside the range of its eight neighbours of the same colour by more than
@@ -56,12 +59,11 @@ def without_defects(signal_e: Float32[np.ndarray, "rows columns"], noise: Noise)
     """
     cleaned = signal_e.copy()
     floor = scalar(noise.sigma_d_e) ** 2
-    for j in (0, 1):
-        for i in (0, 1):
-            plane = np.ascontiguousarray(signal_e[j::2, i::2])
-            high, low = cv2.dilate(plane, _NEIGHBOURS), cv2.erode(plane, _NEIGHBOURS)
-            sigma = np.sqrt(np.maximum(high, 0.0) + floor)
-            allowed = np.maximum(_OUTLIER_SIGMA * sigma, _OUTLIER_RATIO * (high - low))
-            defective = (plane > high + allowed) | (plane < low - allowed)
-            cleaned[j::2, i::2] = np.where(defective, cv2.medianBlur(plane, 3), plane)
+    for site in cfa_named(cfa).sites:
+        plane = np.ascontiguousarray(signal_e[site.samples])
+        high, low = cv2.dilate(plane, _NEIGHBOURS), cv2.erode(plane, _NEIGHBOURS)
+        sigma = np.sqrt(np.maximum(high, 0.0) + floor)
+        allowed = np.maximum(_OUTLIER_SIGMA * sigma, _OUTLIER_RATIO * (high - low))
+        defective = (plane > high + allowed) | (plane < low - allowed)
+        cleaned[site.samples] = np.where(defective, cv2.medianBlur(plane, 3), plane)
     return cleaned

@@ -108,7 +108,7 @@ class Restorer:
         """
         check_frame(mosaic, exposure_s, self.rig)
         check_panel_picture(panel_picture, self.rig)
-        signal = without_defects(to_electrons(mosaic, self.noise, exposure_s), self.noise)
+        signal = without_defects(to_electrons(mosaic, self.noise, exposure_s), self.noise, self.rig.camera.cfa)
         if self.wire is not None:
             signal /= self.wire
         if self.response is not None:

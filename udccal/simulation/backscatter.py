@@ -14,7 +14,7 @@ from jaxtyping import Float, UInt8
 from scipy import sparse
 from scipy.interpolate import RectBivariateSpline
 
-from udccal.cfa import cell_channels
+from udccal.cfa import cfa_named
 from udccal.errors import UdccalError
 from udccal.simulation.emission import emitter_shares
 from udccal.simulation.truth import RigTruth, pixels_to_directions
@@ -54,9 +54,10 @@ class Backscatterer:
         camera = self.truth.description.camera
         mosaic = np.empty((camera.rows, camera.columns))
         splines = [RectBivariateSpline(self.y, self.x, channel, kx=3, ky=3) for channel in coarse]
-        for (j, i), channel in np.ndenumerate(cell_channels(camera.cfa)):
-            rows, columns = np.arange(j, camera.rows, 2.0), np.arange(i, camera.columns, 2.0)
-            mosaic[j::2, i::2] = splines[channel](rows, columns)
+        rows, columns = np.arange(float(camera.rows)), np.arange(float(camera.columns))
+        for site in cfa_named(camera.cfa).sites:
+            down, across = site.samples
+            mosaic[site.samples] = splines[site.channel](rows[down], columns[across])
         return np.maximum(mosaic, 0.0)
 
 

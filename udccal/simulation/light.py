@@ -13,7 +13,7 @@ from jaxtyping import Float, UInt8
 
 from udccal.arrangements import Board, Led, Photograph
 from udccal.cameras.protocol import Region
-from udccal.cfa import cell_channels, channel_map
+from udccal.cfa import cfa_named
 from udccal.simulation.backscatter import Backscatterer, backscatterer
 from udccal.simulation.blur import SpaceVariantBlur, build_blur
 from udccal.simulation.psf import SHARED_PX, captured_light, spread_at
@@ -74,7 +74,7 @@ class RigLight:
         """An even white field that fills the wells to about 65 % (green, mean) in 8 ms."""
         camera = self.truth.description.camera
         rate = _FLAT_FILL * self.truth.sensor.full_well_e / _FLAT_EXPOSURE_S
-        return rate * LED_WHITE[channel_map(camera.cfa, camera.rows, camera.columns)] * self.wire
+        return rate * LED_WHITE[cfa_named(camera.cfa).channel_map(camera.rows, camera.columns)] * self.wire
 
     def board(self, board: Board) -> Float[np.ndarray, "rows columns"]:
         """A board in even surroundings."""
@@ -101,7 +101,7 @@ class RigLight:
         light = captured_light(self.truth, middle, rows, columns, offset, disc_px, spread=spread)
         light = light[:, : region.rows, : region.columns]
         down, across = slice(region.y, region.y + region.rows), slice(region.x, region.x + region.columns)
-        channels = channel_map(self.truth.description.camera.cfa, region.rows, region.columns)
+        channels = cfa_named(self.truth.description.camera.cfa).channel_map(region.rows, region.columns)
         coloured = LED_WHITE[channels] * np.take_along_axis(light, channels[None], axis=0)[0]
         return self._led_flux(disc_px) * coloured * self.wire[down, across]
 
@@ -131,6 +131,6 @@ class RigLight:
 
     def _mosaic(self, colours: Float[np.ndarray, "rows columns 3"]) -> Float[np.ndarray, "rows columns"]:
         mosaic = np.empty(colours.shape[:2])
-        for (j, i), channel in np.ndenumerate(cell_channels(self.truth.description.camera.cfa)):
-            mosaic[j::2, i::2] = colours[j::2, i::2, channel]
+        for site in cfa_named(self.truth.description.camera.cfa).sites:
+            mosaic[site.samples] = colours[(*site.samples, site.channel)]
         return mosaic

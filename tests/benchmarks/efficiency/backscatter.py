@@ -24,22 +24,19 @@ from tests.scenes.backscatter import (
     small_rig,
     world,
 )
-from udccal.fitting.backscatter import BackscatterData
-from udccal.fitting.backscatter.data import grid_rays
+from udccal.fitting.backscatter.data import BackscatterData, grid_rays
 from udccal.fitting.backscatter.fit import result_of
-from udccal.fitting.backscatter.likelihood import Samples
-from udccal.fitting.backscatter.orders import search
+from udccal.fitting.backscatter.model import Windows
+from udccal.fitting.backscatter.orders import moments_along_reflection, search
 from udccal.fitting.backscatter.parameters import (
     NAMES,
     TWO_PLANES,
-    footprint_share,
+    footprint_per_pupil,
     linear_of,
     linear_slope,
     prior_of,
 )
-from udccal.fitting.backscatter.posterior import TermAt, moments_along_reflection, posterior_around
-from udccal.fitting.backscatter.ratios import corners_of
-from udccal.fitting.backscatter.solve import Problem, SampleErrors, most_probable
+from udccal.fitting.backscatter.solve import Problem, TermAt, most_probable
 from udccal.fitting.engine.gaussian import Posterior
 from udccal.models.backscatter import Backscatter
 from udccal.numerics import in_float64
@@ -67,17 +64,18 @@ def ideal_of(of: World, expected: BackscatterData, flat: np.ndarray, template: B
     """The best that the positions with these flat indices allow."""
     prior, free, theta = prior_of(of.rig), TWO_PLANES.free, linear_of(of.x)
     rays = grid_rays(template.geometry, expected.shots.rate.shape[2:], template.step, flat)
-    samples = Samples.at(expected, rays, flat, expected.pictures)
-    weight = samples.weights(samples.light, samples.light[0], 0.0, samples.usable)
-    errors_at = SampleErrors.of(template, samples, weight, corners_of(template, theta, rays))
+    seen = expected.shots.at(flat)
+    weight = seen.weights(seen.rate, seen.rate[0], 0.0, seen.usable)
+    problem = Problem(template, seen, expected.pictures, rays, flat, prior, of.x, RULES)
+    errors_at = problem.errors_at(weight, Windows.around(template, theta, rays, expected.crop))
     jacobian = errors_at(of.x)[1] / linear_slope(of.x)
     cov = np.linalg.inv(jacobian.T @ jacobian + np.diag((prior.sigma * linear_slope(of.x)) ** -2.0))
-    used = np.ones(len(samples.light), dtype=bool)
+    used = np.ones(len(seen.rate), dtype=bool)
     # The prior draws what is hardly seen towards its mean.
     found = most_probable(errors_at, of.x, free, prior)
     sigma = np.sqrt(np.diag(moments_along_reflection(errors_at, found, free, prior, RULES).cov))
-    sigma[2] /= footprint_share(of.rig)
-    return Ideal(posterior_around(TermAt(template, expected, used, 0.0, theta), cov), sigma)
+    sigma[2] /= footprint_per_pupil(of.rig)
+    return Ideal(TermAt(template, expected, used, 0.0, theta).posterior(cov), sigma)
 
 
 @dataclass(frozen=True)
@@ -101,7 +99,7 @@ def realisation(seed: int) -> _One:
     values = np.array([[e.value, e.sigma] for e in result.estimates]).T
     expected = noise_free(data, of, pictures)
     ideal = ideal_of(of, expected, found.problem.flat, found.problem.template)
-    model_error = found.state.model_error
+    model_error = found.model_error
     predicted = predicted_light(result.term, result, model_error, of.rig, new, _PLACES)
     limit = predicted_light(of.term, ideal.posterior, 0.0, of.rig, new, _PLACES)
     light = np.stack([predicted.rate - limit.rate, predicted.sigma, limit.sigma]).reshape(3, -1)

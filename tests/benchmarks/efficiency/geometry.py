@@ -15,10 +15,11 @@ from jaxtyping import Array, Float
 from tests.benchmarks.efficiency.trials import Trials
 from tests.fitting.geometry.boards import Sight, sight
 from udccal.fitting.engine.information import cramer_rao, fisher_information
-from udccal.fitting.geometry import CalibratedViews, Gauge, GeometryData, fit_boards, fit_geometry
-from udccal.fitting.geometry.boards import projection_sigma_px
-from udccal.fitting.geometry.calibrated import field_grid
+from udccal.fitting.geometry.boards import fit_boards, projection_sigma_px
+from udccal.fitting.geometry.calibrated import CalibratedViews, Gauge, field_grid
 from udccal.fitting.geometry.corners import board_points_mm
+from udccal.fitting.geometry.data import GeometryData
+from udccal.fitting.geometry.fit import fit_geometry
 from udccal.models.geometry import Geometry, project, rotation_matrix
 from udccal.numerics import in_float64
 from udccal.result import FitResult

@@ -16,9 +16,10 @@ from jaxtyping import Array, Float
 from tests.benchmarks.efficiency.trials import Trials, column
 from tests.scenes.noise import ToySensor, expose, measure, patterns, truth
 from udccal.fitting.engine.information import cramer_rao, fisher_information
-from udccal.fitting.noise import NoiseRules, codes
-from udccal.fitting.noise.codes import excess_kurtosis
-from udccal.fitting.noise.data import DarkPair, dark_pair
+from udccal.fitting.noise import dark
+from udccal.fitting.noise.dark import excess_kurtosis
+from udccal.fitting.noise.data import NoiseRules
+from udccal.fitting.noise.moments import DarkPair, dark_pair
 from udccal.fitting.noise.transfer import temporal_variance
 
 _REALISATIONS = 1000
@@ -118,8 +119,8 @@ def _histogram_information(sensor: ToySensor, x: Float[np.ndarray, "12"]) -> Flo
 
         def probability(at: Float[np.ndarray, "6"], pair: DarkPair = pair) -> Float[np.ndarray, " cells"]:
             K, V0, shape, black, rate, spread2 = at
-            known = codes.Surroundings(K, sensor.row_DN, NoiseRules().background)
-            return codes.pair_probability(pair, np.array([black, rate, V0, spread2, shape]), known).ravel()
+            known = dark.Surroundings(K, sensor.row_DN, NoiseRules().background)
+            return dark.pair_probability(pair, np.array([black, rate, V0, spread2, shape]), known).ravel()
 
         p = probability(x[places])
         slopes = [(probability(x[places] + d) - probability(x[places] - d)) / (2 * d.sum()) for d in steps]

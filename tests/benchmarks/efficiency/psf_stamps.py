@@ -16,11 +16,12 @@ from scipy.linalg import block_diag
 
 from tests.benchmarks.efficiency.trials import Trials
 from udccal.fitting.engine.information import cramer_rao, fisher_information
-from udccal.fitting.psf_stamps.data import Stamps
-from udccal.fitting.psf_stamps.field import PlaneField, see, warps
+from udccal.fitting.psf_stamps.data import Stamps, offsets
+from udccal.fitting.psf_stamps.field import PsfField, Seen, response
 from udccal.fitting.psf_stamps.fit import fit_psf_stamps
-from udccal.fitting.psf_stamps.orders import Orders, grid_size
-from udccal.fitting.psf_stamps.probability import by_degree, envelope
+from udccal.fitting.psf_stamps.probability import envelope, grid_size, laplacian
+from udccal.fitting.psf_stamps.search import Orders
+from udccal.models.fields import polynomial_basis
 from udccal.numerics import in_float64
 
 STARS, SIZE, NODES, READ_E, ORDERS = 20, 11, 18, 4.0, Orders(2, 1, 1.0)
@@ -28,6 +29,7 @@ TRUTHS, PER_TRUTH = 6, 20
 # Prior precisions: (a, b) of the images by degree, and of the map by degree.
 IMAGE = np.array([[0.05, 0.5], [300.0, 300.0]])
 MAP = np.array([1e3, 300.0])
+OF_MAP = np.repeat(MAP, [8, 12])
 SENSOR = np.array([1000, 800])
 POINTS = np.array([[0.3, 0.4], [-0.6, 0.5], [0.7, -0.7]])
 
@@ -36,7 +38,7 @@ POINTS = np.array([[0.3, 0.4], [-0.6, 0.5], [0.7, -0.7]])
 class Truth:
     """A field, stars, and what can be known of them at best."""
 
-    field: PlaneField
+    field: PsfField
     unit: Float[np.ndarray, "stars 2"]
     centre_px: Float[np.ndarray, "stars 2"]
     flux_e: Float[np.ndarray, " stars"]
@@ -82,54 +84,59 @@ def make_truth(rng: np.random.Generator) -> Truth:
     draw = np.linalg.cholesky(np.linalg.inv(prior_matrix(base, IMAGE[1])))
     images = (draw @ rng.standard_normal((NODES**2, 2))).T.reshape(2, NODES, NODES)
     while True:
-        warp = rng.standard_normal((5, 2, 2)) / np.sqrt(MAP[by_degree(MAP, 4)]).reshape(5, 2, 2)
-        field = PlaneField(np.stack([base, *images]), warp, np.zeros((0, 2)), 1, 2, 0, 1.0)
+        warp = rng.standard_normal((5, 2, 2)) / np.sqrt(OF_MAP).reshape(5, 2, 2)
+        field = PsfField(np.stack([base, *images])[None], warp[None], np.zeros((0, 5, 2)), 1.0)
         # The model class is that of the nodes: those of the fit, whose number follows from the map, are the truth's.
         if grid_size((SIZE, SIZE), 1.0, reach(field, unit)) == (NODES, NODES):
             break
     return Truth(field, unit, position - middle, 1e5 * rng.uniform(0.5, 1.5, STARS), middle, 2.0)
 
 
-def reach(field: PlaneField, unit: Float[np.ndarray, "stars 2"]) -> float:
-    return float(np.abs(np.linalg.inv(np.asarray(warps(field, unit)))).sum(axis=2).max())
+def reach(field: PsfField, unit: Float[np.ndarray, "stars 2"]) -> float:
+    return float(np.abs(np.linalg.inv(field.maps(unit))).sum(axis=3).max())
 
 
 def prior_matrix(base: Float[np.ndarray, "rows columns"], ab: Float[np.ndarray, "2"]) -> Float[np.ndarray, "n n"]:
-    env = envelope(base, 1.0)
-    return np.diag(ab[0] / env.size.ravel() ** 2) + ab[1] * env.roughness.toarray()
+    scale = np.diag(1 / envelope(base, 1.0).ravel())
+    rough = laplacian(*base.shape)[0].toarray() @ scale
+    return ab[0] * scale**2 + ab[1] * rough.T @ rough
 
 
-def unpack(x: Array, like: PlaneField) -> tuple[PlaneField, Array, Array]:
+def unpack(x: Array, like: PsfField) -> tuple[PsfField, Array, Array]:
     count = np.size(like.nodes)
     nodes, warp, centre, light = jnp.split(x, [count, count + np.size(like.warp), len(x) - STARS])
     field = replace(like, nodes=nodes.reshape(like.nodes.shape), warp=warp.reshape(like.warp.shape))
     return field, centre.reshape(-1, 2), jnp.exp(light)
 
 
-def offsets(count: int) -> Float[np.ndarray, "n pixels 2"]:
-    y, x = np.mgrid[:SIZE, :SIZE].reshape(2, -1) - SIZE // 2
-    return np.broadcast_to(np.stack([x, y], axis=1).astype(np.float64), (count, SIZE**2, 2))
+def seen_at(field: PsfField, unit: Array, centre: Array) -> Seen:
+    """What a field brings to samples of stamps, traced."""
+    basis = polynomial_basis(unit, 2)
+    images = basis[:, :3] @ field.nodes.reshape(3, -1)
+    maps = jnp.eye(2) + jnp.einsum("sm,mij->sij", basis[:, 1:], field.warp[0])
+    plane = np.zeros((len(images), SIZE**2), dtype=int)
+    return response(images[:, None], maps[:, None], centre[:, None], plane, offsets(SIZE, SIZE), NODES, NODES, 1.0)
 
 
-def expected(x: Array, like: PlaneField, unit: Array) -> tuple[Array, Array]:
+def expected(x: Array, like: PsfField, unit: Array) -> tuple[Array, Array]:
     """Mean and variance of every sample."""
     field, centre, light = unpack(x, like)
-    mean = (light[:, None] * see(field, unit, centre, offsets(STARS)).value).ravel()
+    mean = (light[:, None] * seen_at(field, unit, centre).value).ravel()
     return mean, jnp.maximum(mean, 0.0) + READ_E**2
 
 
-def wanted(x: Array, like: PlaneField, unit: Array, window_px: Array) -> Array:
+def wanted(x: Array, like: PsfField, unit: Array, window_px: Array) -> Array:
     """Kernels at the points, places, logarithms of light, all in the term's convention."""
     field, centre, light = unpack(x, like)
     everywhere = jnp.concatenate([jnp.asarray(POINTS), unit])
-    grid = offsets(len(everywhere))
-    weight = grid[0] * jnp.exp(-0.5 * (grid[0] ** 2).sum(axis=1) / window_px**2)[:, None]
+    grid = offsets(SIZE, SIZE)
+    weight = grid * jnp.exp(-0.5 * (grid**2).sum(axis=1) / window_px**2)[:, None]
     own = jnp.zeros((len(everywhere), 2))
     for _ in range(6):
-        seen = see(field, everywhere, own, grid)
-        slope = jnp.einsum("npi,pj->nji", seen.slopes[..., :2], weight)
+        seen = seen_at(field, everywhere, own)
+        slope = jnp.einsum("npi,pj->nji", seen.jacobian[..., 1:3], weight)
         own = own - jnp.linalg.solve(slope, (seen.value @ weight)[..., None])[..., 0]
-    value = see(field, everywhere, own, grid).value
+    value = seen_at(field, everywhere, own).value
     total = value.sum(axis=1)
     kernels = (value / total[:, None])[: len(POINTS)]
     stars = slice(len(POINTS), None)
@@ -141,9 +148,9 @@ def at_best(truth: Truth) -> tuple[Float[np.ndarray, " q"], Float[np.ndarray, " 
     """The true quantities, and the smallest standard deviation of estimates."""
     x = truth.vector
     information = fisher_information(expected, x, truth.field, truth.unit)
-    base = np.asarray(truth.field.nodes[0])
+    base = np.asarray(truth.field.nodes[0, 0])
     first, second = prior_matrix(base, IMAGE[0]), prior_matrix(base, IMAGE[1])
-    prior = block_diag(first, second, second, np.diag(MAP[by_degree(MAP, 4)]))
+    prior = block_diag(first, second, second, np.diag(OF_MAP))
     information[: len(prior), : len(prior)] += prior
     args = (truth.field, jnp.asarray(truth.unit), jnp.asarray(truth.window_px))
     slopes = np.asarray(jax.jacfwd(wanted)(jnp.asarray(x), *args))

@@ -33,13 +33,8 @@ from tests.scenes.wire import (
     start,
 )
 from udccal.fitting.engine.information import cramer_rao, fisher_information
-from udccal.fitting.wire import WireRules, WireStart
-from udccal.fitting.wire.parameters import (
-    SHAPE_NAMES,
-    shape_sigma,
-    shape_vector,
-    with_shape,
-)
+from udccal.fitting.wire.parameters import SHAPE_NAMES, shape_sigma, shape_vector, with_shape
+from udccal.fitting.wire.rules import WireRules, WireStart
 from udccal.models.wire import Wire, wire_values
 from udccal.numerics import in_float64
 from udccal.result import FitResult

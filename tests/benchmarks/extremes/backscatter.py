@@ -11,8 +11,8 @@ from jaxtyping import Float
 
 from tests.benchmarks.extremes.case import Case, Outcome, outcome
 from tests.scenes.backscatter import EXPOSURE_S, RULES, World, panel_pictures, shots_of, small_rig, world_at
-from udccal.fitting.backscatter import BackscatterData, fit_backscatter
-from udccal.fitting.backscatter.data import Binned
+from udccal.fitting.backscatter.data import BackscatterData, Binned
+from udccal.fitting.backscatter.fit import fit_backscatter
 from udccal.fitting.backscatter.parameters import TWO_PLANES, prior_of
 from udccal.result import FitResult
 from udccal.rig import Nominal, RigDescription

@@ -9,7 +9,8 @@ import numpy as np
 
 from tests.benchmarks.extremes.case import Case, Outcome, outcome
 from tests.scenes.noise import PLAIN, ToySensor, errors_in_sigma, expose, measure, patterns
-from udccal.fitting.noise import ExposureLevel, NoiseData, SpatialStack, fit_noise
+from udccal.fitting.noise.data import ExposureLevel, NoiseData, SpatialStack
+from udccal.fitting.noise.fit import fit_noise
 
 _DIM = tuple(np.geomspace(1.0, 60.0, 8) / 10_000)
 

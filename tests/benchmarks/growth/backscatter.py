@@ -8,8 +8,8 @@ import numpy as np
 
 from tests.benchmarks.growth.cases import Case
 from tests.scenes.backscatter import panel_pictures, shots_of, small_rig, world_at
-from udccal.fitting.backscatter import BackscatterRules, fit_backscatter
-from udccal.fitting.backscatter.parameters import prior_of
+from udccal.fitting.backscatter.fit import fit_backscatter
+from udccal.fitting.backscatter.parameters import BackscatterRules, prior_of
 from udccal.rig import RigDescription
 
 _PICTURES, _POSITIONS, _COLUMNS = 12, 96, 384

@@ -10,7 +10,8 @@ import numpy as np
 
 from tests.benchmarks.growth.cases import Case
 from tests.scenes.noise import ToySensor, expose, patterns
-from udccal.fitting.noise import ExposureLevel, NoiseData, SpatialStack, fit_noise
+from udccal.fitting.noise.data import ExposureLevel, NoiseData, SpatialStack
+from udccal.fitting.noise.fit import fit_noise
 
 _COLUMNS, _ROWS, _LEVELS, _STACK = 2048, 384, 10, 8
 

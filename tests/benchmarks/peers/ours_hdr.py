@@ -6,7 +6,7 @@ import numpy as np
 
 import udccal
 from tests.benchmarks.peers.works_module import arguments, load, timed
-from udccal.fitting.hdr import merge_bracket
+from udccal.fitting.hdr.merge import merge_bracket
 from udccal.models.noise import Noise
 
 _PICTURES = 24

@@ -20,7 +20,8 @@ from types import ModuleType
 import numpy as np
 
 from udccal import __version__
-from udccal.fitting.geometry import CalibratedViews, Gauge, fit_geometry
+from udccal.fitting.geometry.calibrated import CalibratedViews, Gauge
+from udccal.fitting.geometry.fit import fit_geometry
 from udccal.models.geometry import Geometry
 
 Boards = tuple[list[np.ndarray], list[np.ndarray]]

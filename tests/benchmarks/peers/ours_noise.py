@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 
 from tests.benchmarks.peers.works_module import arguments, load
-from udccal.fitting.noise import ExposureLevel, NoiseData, SpatialStack, fit_noise, mean_response
+from udccal.fitting.noise.data import ExposureLevel, NoiseData, SpatialStack
+from udccal.fitting.noise.fit import fit_noise, mean_response
 from udccal.models.noise import Noise
 from udccal.result import FitResult
 

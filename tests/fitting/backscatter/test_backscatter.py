@@ -10,10 +10,19 @@ from scipy.spatial.transform import Rotation
 
 from tests.simulation.toy import toy_rig, toy_truth
 from udccal.cameras.protocol import CameraIdentity, Region, Settings
-from udccal.cfa import channel_map
+from udccal.cfa import cfa_named
 from udccal.displays.pictures import face_picture
-from udccal.fitting.backscatter import BackscatterRules, fit_backscatter, read_backscatter
-from udccal.fitting.backscatter.data import BackscatterData, Binned, Bins, block_weights, grid_step, visible_crop
+from udccal.fitting.backscatter.data import (
+    BackscatterData,
+    Binned,
+    binned,
+    grid_step,
+    read_backscatter,
+    visible_crop,
+)
+from udccal.fitting.backscatter.fit import fit_backscatter
+from udccal.fitting.backscatter.parameters import BackscatterRules
+from udccal.fitting.bins import Bins, block_weights
 from udccal.fitting.noise.fit import nominal_noise
 from udccal.fitting.nominal import nominal_geometry
 from udccal.models.backscatter import Backscatter, backscatter_rate
@@ -22,7 +31,7 @@ from udccal.result import FitResult, FitStatus
 from udccal.rig import RigDescription, load_rig
 from udccal.sessions.captured import AveragedFrames
 from udccal.sessions.schema import DarkSubject
-from udccal.sessions.store import Session
+from udccal.sessions.store import Average, Session
 from udccal.sessions.writer import SessionWriter
 from udccal.simulation.backscatter import backscatterer
 
@@ -82,7 +91,7 @@ def data(simulator) -> BackscatterData:  # type: ignore[no-untyped-def]
     rng = np.random.default_rng(1)
     crop = visible_crop(known_geometry(), RIG)
 
-    def binned(light: np.ndarray) -> Binned:
+    def one_shot(light: np.ndarray) -> Binned:
         rate, _ = noisy(light, rng)
         bins, one = Bins(RIG.camera.cfa, grid_step(RIG)), np.ones_like(rate)
         mean = bins.mean(rate)
@@ -93,7 +102,7 @@ def data(simulator) -> BackscatterData:  # type: ignore[no-untyped-def]
     dark = np.zeros((RIG.camera.rows, RIG.camera.columns))
     lit = [simulator.rate(one) for one in (WHITE, *SHOWN)]
     return BackscatterData(
-        shots=Binned.joined([binned(light) for light in (*lit, dark)]),
+        shots=Binned.joined([one_shot(light) for light in (*lit, dark)]),
         shown=np.stack([crop.of(one) for one in SHOWN]),
         crop=crop,
         names=tuple(f"picture_{seed}" for seed in range(len(SHOWN))),
@@ -143,7 +152,7 @@ def test_the_candidate_of_the_largest_evidence_is_chosen(fitted: FitResult[Backs
     assert sum(c.chosen for c in fitted.candidates) == 1
     chosen = next(c for c in fitted.candidates if c.chosen)
     assert chosen.criterion == min(c.criterion for c in fitted.candidates)
-    held_out = next(d for d in fitted.diagnostics if d.name == "held_out_rms_of_peak")
+    held_out = next(d for d in fitted.diagnostics if d.name == "held_out_without_noise_of_peak")
     assert 0 < held_out.value < 0.02
 
 
@@ -193,7 +202,7 @@ def test_pictures_in_the_wrong_order_are_a_poor_fit(data: BackscatterData) -> No
 
 def test_bins_are_means_of_one_colour() -> None:
     rows, columns, step = 24, 32, 4
-    channels = channel_map("GBRG", rows, columns)
+    channels = cfa_named("GBRG").channel_map(rows, columns)
     bins = Bins("GBRG", step)
     mean = bins.mean(np.array([10.0, 20.0, 30.0])[channels])
     np.testing.assert_allclose(mean, np.broadcast_to([[[10.0]], [[20.0]], [[30.0]]], (3, 6, 8)))
@@ -202,6 +211,16 @@ def test_bins_are_means_of_one_colour() -> None:
     np.testing.assert_allclose(bins.variance(np.ones((rows, columns))), many.var(axis=0), rtol=0.2)
     rowwise = np.stack([bins.mean(np.repeat(rng.normal(size=(rows, 1)), columns, axis=1)) for _ in range(1000)])
     np.testing.assert_allclose(bins.row_variance(np.ones((rows, columns))), rowwise.var(axis=0), rtol=0.2)
+
+
+@pytest.mark.parametrize(("most", "clipped"), [(0.98, 1), (0.5, 2), (1.0, 0)])
+def test_a_bin_is_clipped_from_the_fraction_of_saturation_that_the_rules_say(most: float, clipped: int) -> None:
+    noise = nominal_noise(RIG)
+    mean = np.full((8, 8), float(noise.black_DN), np.float32)
+    mean[0, 0], mean[0, 4] = 0.99 * float(noise.saturation_DN), 0.7 * float(noise.saturation_DN)
+    average = Average(mean, np.ones_like(mean), FRAMES)
+    found = binned(average, EXPOSURE_S, noise, np.ones(mean.shape), Bins("RGGB", 4), most)
+    assert found.clipped.sum() == clipped
 
 
 @pytest.mark.parametrize("cfa", ["RGGB", "BGGR", "GRBG", "GBRG"])

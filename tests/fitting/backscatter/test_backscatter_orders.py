@@ -20,11 +20,11 @@ from tests.scenes.backscatter import (
     world,
     world_at,
 )
-from udccal.fitting.backscatter import BackscatterData, fit_backscatter
-from udccal.fitting.backscatter.orders import OrderFit, search
+from udccal.fitting.backscatter.data import BackscatterData
+from udccal.fitting.backscatter.fit import fit_backscatter, term_posterior
+from udccal.fitting.backscatter.orders import search
 from udccal.fitting.backscatter.parameters import KERNELS, MIX, REFLECTION, TWO_PLANES, Order, prior_of, values_of
-from udccal.fitting.backscatter.posterior import term_posterior
-from udccal.fitting.backscatter.solve import Problem
+from udccal.fitting.backscatter.solve import Fitted, Problem
 from udccal.fitting.engine.gaussian import Posterior
 from udccal.fitting.engine.orders import Attempt, Choice
 from udccal.models.backscatter import Backscatter
@@ -55,8 +55,8 @@ def _shows(of: World, order: Order, expected: BackscatterData) -> bool:
     """Whether pictures without noise are described so much worse without any one part of the order."""
     problem = replace(Problem.of(expected, of.term.geometry, RIG, RULES), start=of.x)
     problem = replace(problem, template=replace(problem.template, window=of.term.window))
-    samples = problem.samples
-    weight = samples.weights(samples.light, samples.light[0], 0.0, samples.usable)
+    seen = problem.seen
+    weight = seen.weights(seen.rate, seen.rate[0], 0.0, seen.usable)
     crosstalk = bool(order.free[MIX].any())
     kernels = KERNELS if crosstalk else tuple(kernel.without_crosstalk() for kernel in KERNELS)
     rises = [_rise(problem, one, weight) for one in kernels if _simpler(one, order)]
@@ -76,7 +76,7 @@ def _rise(problem: Problem, order: Order, weight: np.ndarray) -> float:
     if order.free[REFLECTION] == 0:
         merged[1] = np.log(distance + depth * reflection / (1 + reflection))
     starts = (problem.start, merged) if reflection > 0 else (merged,)
-    return min(problem.solved(order, x, weight).chi2 for x in starts)
+    return min(problem.solved(order, x, weight).best.chi2 for x in starts)
 
 
 def _crosstalk_rise(cov: np.ndarray) -> float:
@@ -122,14 +122,14 @@ def test_predicted_light_is_as_unsure_as_its_order() -> None:
     """With an order that predicts something else and may be right, error bars hold the difference."""
     of, shots = _made(0, TWO_PLANES)
     found = search(Problem.of(shots, of.term.geometry, RIG, RULES), (TWO_PLANES,))
-    best, chosen = found.orders.best, found.state.fitted.found
+    best, chosen = found.orders.best, found.fitted.found
     moved = chosen.x.copy()
     moved[6] += 0.1
     # As probable as e to minus half the criterion's rise: 0.4 of both together.
-    fit = OrderFit(TWO_PLANES, replace(chosen, x=moved))
+    fit = replace(best.fit, found=replace(chosen, x=moved))
     other = Attempt("other", 18, best.criterion - 2 * np.log(0.4 / 0.6), fit)
 
-    def predicted(*tried: Attempt[OrderFit]) -> tuple[Posterior[Backscatter], Light]:
+    def predicted(*tried: Attempt[Fitted]) -> tuple[Posterior[Backscatter], Light]:
         known = replace(found, orders=Choice(tried[0], tried))
         posterior = term_posterior(found.problem.template, shots, known, 1.0)
         term = posterior.term_at(posterior.mean)

@@ -9,34 +9,31 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from udccal.fitting.backscatter.data import grid_step, sampled_rays, visible_crop
-from udccal.fitting.backscatter.likelihood import Profile, Samples, of_all_shots
-from udccal.fitting.backscatter.orders import typical_error
-from udccal.fitting.backscatter.parameters import (
-    KERNELS,
-    MIX,
-    TWO_PLANES,
-    linear_of,
-    linear_slope,
-    mix_and_jacobian,
-    prior_of,
-    vector_of,
-    with_linear,
-)
-from udccal.fitting.backscatter.ratios import (
+from udccal.fitting.backscatter.data import Binned, grid_step, sampled_rays, visible_crop
+from udccal.fitting.backscatter.model import (
     BLOCK,
     PanelCrop,
     Pictures,
     Windows,
-    corners_of,
     in_blocks,
     ratios,
     ratios_and_jacobian,
     window_for,
-    with_room,
 )
-from udccal.fitting.backscatter.solve import Fitted, MostProbable
+from udccal.fitting.backscatter.orders import typical_error
+from udccal.fitting.backscatter.parameters import (
+    KERNELS,
+    TWO_PLANES,
+    BackscatterRules,
+    linear_of,
+    linear_slope,
+    prior_of,
+    vector_of,
+    with_linear,
+)
+from udccal.fitting.backscatter.solve import Fitted, MostProbable, Problem
 from udccal.fitting.nominal import nominal_backscatter, nominal_geometry
+from udccal.models.backscatter import panel_response, response_grid
 from udccal.rig import load_rig
 
 RIG = load_rig("lg55-reduced")
@@ -45,24 +42,24 @@ X = PRIOR.mean + 0.3 * PRIOR.sigma * np.random.default_rng(3).normal(size=18)
 THETA = linear_of(X)
 
 
-def _seen(shots: int = 5, n: int = 4, seed: int = 0) -> tuple[np.ndarray, Samples]:
+def _seen(shots: int = 5, n: int = 4, seed: int = 0) -> tuple[np.ndarray, Binned]:
     """Ratios, and light that follows them with noise; dark comes last."""
     rng = np.random.default_rng(seed)
-    ratio = of_all_shots(rng.uniform(0.1, 0.9, (shots - 1, 3, n)), 1.0)
+    ratio = rng.uniform(0.1, 0.9, (shots + 1, 3, n))
+    ratio[0], ratio[-1] = 1.0, 0.0
     mask, dark = rng.uniform(50, 100, (3, n)), rng.uniform(1, 2, (3, n))
     rest = np.full(ratio.shape, 0.3)
     rest[-1] = 0.01
     exposure = np.append(np.full(shots, 0.5), 1.0)
     light = mask * ratio + exposure[:, None, None] * dark + np.sqrt(rest) * rng.normal(size=ratio.shape)
-    shown = Pictures.of(np.zeros((shots - 1, 1, 1, 3), np.uint8), PanelCrop(0, 0, 1, 1))
-    usable = np.ones(ratio.shape, dtype=bool)
-    return ratio, Samples(np.zeros((n, 3)), light, np.full(ratio.shape, 0.01), rest, usable, exposure, shown)
+    clipped = np.zeros(ratio.shape, dtype=bool)
+    return ratio, Binned(light, np.full(ratio.shape, 0.01), rest, clipped, 1 / exposure, np.full(shots + 1, np.nan))
 
 
-def _weights(samples: Samples) -> np.ndarray:
-    light = samples.light.copy()
+def _weights(seen: Binned) -> np.ndarray:
+    light = seen.rate.copy()
     light[-1] = 0.0
-    return samples.weights(light, light[0], 0.0, samples.usable)
+    return seen.weights(light, light[0], 0.0, seen.usable)
 
 
 def test_derivatives_of_ratios_are_those_of_differences() -> None:
@@ -73,8 +70,10 @@ def test_derivatives_of_ratios_are_those_of_differences() -> None:
     pictures = Pictures.of(shown, crop)
     template = nominal_backscatter(geometry, RIG, np.zeros((3, 1, 1)), grid_step(RIG), window=1)
     template = replace(template, window=window_for(template, THETA, rays, 1.0))
-    at = Windows.at(template.window, rays, corners_of(template, THETA, rays), pictures)
-    ratio, jacobian = ratios_and_jacobian(template, THETA, at, at.logs(pictures))
+    at = Windows.around(template, THETA, rays, crop)
+    ratio, jacobian = ratios_and_jacobian(template, THETA, at, pictures)
+    np.testing.assert_allclose(ratio[0], 1.0, rtol=1e-12)
+    np.testing.assert_array_equal(ratio[-1], 0.0)
     np.testing.assert_allclose(ratio, ratios(template, THETA, at, pictures), rtol=1e-12)
     for k in range(18):
         step = 1e-5 * np.eye(18)[k]
@@ -83,20 +82,31 @@ def test_derivatives_of_ratios_are_those_of_differences() -> None:
 
 
 def test_nothing_comes_from_beyond_the_crop() -> None:
-    pictures = Pictures.of(np.full((1, 2, 3, 3), 255, np.uint8), PanelCrop(10, 20, 3, 2))
-    at = Windows.at(3, np.zeros((2, 3)), np.array([[9, 19], [100, 100]]), pictures)
-    assert at.inside.sum(axis=1).tolist() == [4, 0]
-    assert (at.logs(pictures)[1] < -100).all()
+    template = nominal_backscatter(nominal_geometry(RIG), RIG, np.zeros((3, 1, 1)), grid_step(RIG), window=3)
+    rays = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 1.0]])
+    column, row = Windows.around(template, THETA, rays, PanelCrop(0, 0, 1, 1)).corner[0]
+    pictures = Pictures.of(np.full((1, 2, 3, 3), 255, np.uint8), PanelCrop(int(column) + 1, int(row) + 1, 3, 2))
+    at = Windows.around(template, THETA, rays, pictures.crop)
+    assert (at.places < 6).sum(axis=1).tolist() == [4, 0]
+    sums = at.sums(np.ones((2, 3, 1, 9)), pictures.light(2.2)[0])
+    np.testing.assert_array_equal(sums[0, :, 1], np.tile([4.0, 0.0], (3, 1)))
 
 
-def test_the_mix_has_the_derivatives_of_its_model() -> None:
-    template = nominal_backscatter(nominal_geometry(RIG), RIG, np.zeros((3, 1, 1)), grid_step(RIG), window=1)
+def test_ratios_are_those_of_the_model() -> None:
+    """The model's own pictures over its white, crosstalk included."""
+    geometry, crop = nominal_geometry(RIG), visible_crop(nominal_geometry(RIG), RIG)
+    rays, flat = sampled_rays(geometry, RIG, grid_step(RIG), 7)
+    shape = RIG.camera.rows // grid_step(RIG), RIG.camera.columns // grid_step(RIG)
+    template = nominal_backscatter(geometry, RIG, np.ones((3, *shape)), grid_step(RIG), window=1)
+    template = replace(template, window=window_for(template, THETA, rays, 1.0))
+    shown = np.random.default_rng(0).integers(0, 256, (RIG.panel.rows, RIG.panel.columns, 3)).astype(np.uint8)
     with jax.enable_x64(True):
-        wanted = np.moveaxis(np.asarray(jax.jacfwd(lambda t: with_linear(template, t).mix)(THETA))[..., MIX], -1, 0)
-        value = np.asarray(with_linear(template, jnp.asarray(THETA)).mix)
-    mix, jacobian = mix_and_jacobian(THETA)
-    np.testing.assert_allclose(mix, value, rtol=1e-13)
-    np.testing.assert_allclose(jacobian, wanted, atol=1e-13)
+        response = panel_response(with_linear(template, jnp.asarray(THETA)), RIG.panel.rows, RIG.panel.columns)
+        wanted = np.asarray(response_grid(response, shown)).reshape(3, -1)[:, flat]
+    found = ratios(
+        template, THETA, Windows.around(template, THETA, rays, crop), Pictures.of(crop.of(shown)[None], crop)
+    )
+    np.testing.assert_allclose(found[1], wanted, rtol=1e-9)
 
 
 def test_linear_parameters_have_the_slopes_of_differences() -> None:
@@ -113,50 +123,52 @@ def test_a_term_has_the_parameters_that_made_it() -> None:
 
 
 def test_mask_and_dark_are_those_of_least_squares() -> None:
-    ratio, samples = _seen()
-    weight = _weights(samples)
-    best = Profile.of(ratio, samples, weight)
+    ratio, seen = _seen()
+    weight = _weights(seen)
+    best = seen.profile(ratio, weight)
     for c, n in np.ndindex(best.mask.shape):
-        rows = np.stack([ratio[:, c, n], samples.exposure], axis=1) * weight[:, c, n, None]
-        found, *_ = np.linalg.lstsq(rows, samples.light[:, c, n] * weight[:, c, n], rcond=None)
+        rows = np.stack([ratio[:, c, n], 1 / seen.exposure_s], axis=1) * weight[:, c, n, None]
+        found, *_ = np.linalg.lstsq(rows, seen.rate[:, c, n] * weight[:, c, n], rcond=None)
         np.testing.assert_allclose([best.mask[c, n], best.dark[c, n]], found, rtol=1e-10)
         assert best.information[c, n] == pytest.approx(1 / np.linalg.inv(rows.T @ rows)[0, 0], rel=1e-10)
 
 
 def test_the_mask_follows_ratios_as_said() -> None:
-    ratio, samples = _seen()
-    weight = _weights(samples)
-    best = Profile.of(ratio, samples, weight)
-    expected = replace(samples, light=best.mask * ratio)
+    ratio, seen = _seen()
+    weight = _weights(seen)
+    best = seen.profile(ratio, weight)
+    expected = replace(seen, rate=best.mask * ratio)
     way = np.random.default_rng(1).normal(size=(2, *ratio.shape))
     found = best.mask_jacobian(way)
     for k in range(2):
-        up, down = (Profile.of(ratio + sign * 1e-6 * way[k], expected, weight).mask for sign in (1, -1))
+        up, down = (expected.profile(ratio + sign * 1e-6 * way[k], weight).mask for sign in (1, -1))
         np.testing.assert_allclose(found[k], (up - down) / 2e-6, rtol=1e-4, atol=1e-3)
 
 
 def test_whitened_errors_are_at_right_angles_to_mask_and_dark() -> None:
-    ratio, samples = _seen()
-    weight = _weights(samples)
-    best = Profile.of(ratio, samples, weight)
-    errors = best.errors(ratio, samples) * weight
+    ratio, seen = _seen()
+    weight = _weights(seen)
+    best = seen.profile(ratio, weight)
+    errors = best.errors * weight
     jacobian = best.jacobian(np.random.default_rng(1).normal(size=(2, *ratio.shape)))
-    for way in (ratio * weight, samples.exposure[:, None, None] * weight):
+    for way in (ratio * weight, (1 / seen.exposure_s)[:, None, None] * weight):
         np.testing.assert_allclose((way * errors).sum(axis=0), 0.0, atol=1e-6)
         np.testing.assert_allclose((way * jacobian).sum(axis=1), 0.0, atol=1e-6)
 
 
 def test_a_typical_error_is_that_of_most_pictures() -> None:
     """A model error of 3 % in all pictures is found, one picture that is another altogether is not counted."""
-    ratio, samples = _seen(shots=12, n=60)
+    ratio, seen = _seen(shots=12, n=60)
     rng = np.random.default_rng(2)
     off = ratio.copy()
     off[1:-1] += 0.03 * rng.normal(size=(11, 3, 60))
-    nothing = MostProbable(np.zeros(18), np.zeros((18, 18)), 0.0, True, 0)
+    nothing = MostProbable(np.zeros(18), np.zeros((18, 18)), 0.0, True)
 
     def error_of(ratios_of: np.ndarray) -> float:
-        weight, corner = _weights(samples), np.zeros((60, 2), dtype=np.int64)
-        return typical_error(Fitted.of(nothing, corner, ratios_of, samples, weight), samples)
+        nowhere = np.zeros((60, 2), dtype=np.int64)
+        at = Windows(np.zeros((60, 3)), nowhere, nowhere)
+        best = seen.profile(ratios_of, _weights(seen))
+        return typical_error(Fitted(TWO_PLANES, nothing, at, ratios_of, best), seen)
 
     assert error_of(ratio) < 0.004
     assert error_of(off) == pytest.approx(0.03, rel=0.15)
@@ -178,8 +190,11 @@ def test_a_window_does_not_follow_a_fit_gone_astray() -> None:
     wider, astray = PRIOR.mean.copy(), PRIOR.mean.copy()
     wider[2] += np.log(2.2)
     astray[2] += np.log(50.0)
-    assert with_room(template, linear_of(wider), rays, 0.7, 3.0).window > template.window
-    assert with_room(template, linear_of(astray), rays, 0.7, 3.0).window == template.window
+    shown = Pictures.of(np.zeros((5, 1, 1, 3), np.uint8), PanelCrop(0, 0, 1, 1))
+    seen, flat = _seen(n=len(rays))[1], np.arange(len(rays))
+    problem = Problem(template, seen, shown, rays, flat, PRIOR, PRIOR.mean, BackscatterRules())
+    assert problem.with_room(wider).template.window > template.window
+    assert problem.with_room(astray) is problem
 
 
 def test_blocks_give_what_the_whole_gives() -> None:

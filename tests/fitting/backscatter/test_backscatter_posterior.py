@@ -9,9 +9,8 @@ import pytest
 from scipy.special import expit
 
 from tests.scenes.backscatter import PICTURES, RULES, panel_pictures, shots_of, small_rig, world
-from udccal.fitting.backscatter.orders import held_out, search
+from udccal.fitting.backscatter.orders import held_out, moments_along_reflection, search
 from udccal.fitting.backscatter.parameters import NAMES, REFLECTION, TWO_PLANES, Moments, prior_of
-from udccal.fitting.backscatter.posterior import moments_along_reflection
 from udccal.fitting.backscatter.solve import MostProbable, Problem, most_probable
 from udccal.rig import load_rig
 
@@ -64,7 +63,7 @@ def test_a_skewed_posterior_has_the_moments_of_a_sum_over_it(share: float) -> No
 
 
 def test_a_narrow_posterior_is_normal() -> None:
-    narrow = MostProbable(PRIOR.mean, np.diag(np.full(18, 1e-4)), 0.0, True, 1)
+    narrow = MostProbable(PRIOR.mean, np.diag(np.full(18, 1e-4)), 0.0, True)
     moments = moments_along_reflection(_errors_at(0.5, 0.0), narrow, FREE, PRIOR, RULES)
     np.testing.assert_array_equal(moments.cov, Moments.log_normal(narrow.x, narrow.cov).cov)
 
@@ -95,12 +94,12 @@ def test_held_out_pictures_of_the_model_leave_nothing_undescribed() -> None:
     of = world(rng, small_rig())
     shots = shots_of(of, rng, panel_pictures(of.rig, 0, PICTURES))
     found = search(Problem.of(shots, of.term.geometry, of.rig, RULES), (TWO_PLANES,))
-    fitted = found.state.fitted
-    assert held_out(found.problem, TWO_PLANES, fitted).model_error == 0.0
+    fitted = found.fitted
+    assert held_out(found.problem, fitted)[1] == 0.0
     # The pictures that are held out, with an error of 1 % of white that differs from place to place.
-    samples = found.problem.samples
-    light, out = samples.light.copy(), slice(RULES.held_out, -1, RULES.held_out)
+    seen = found.problem.seen
+    light, out = seen.rate.copy(), slice(RULES.held_out, -1, RULES.held_out)
     light[out] += 0.01 * light[0] * rng.choice([-1.0, 1.0], light[out].shape)
-    problem = replace(found.problem, samples=replace(samples, light=light))
-    off = problem.solved(TWO_PLANES, fitted.found.x, fitted.weight)
-    assert held_out(problem, TWO_PLANES, off).model_error == pytest.approx(0.01, rel=0.2)
+    problem = replace(found.problem, seen=replace(seen, rate=light))
+    off = problem.solved(TWO_PLANES, fitted.found.x, fitted.best.weight)
+    assert held_out(problem, off)[1] == pytest.approx(0.01, rel=0.2)

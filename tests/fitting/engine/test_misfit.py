@@ -7,6 +7,7 @@ from udccal.fitting.engine.misfit import (
     chi2_test,
     clustered_cov,
     excess_sigma,
+    excess_variance,
     f_test,
     group_means_test,
     robust_excess_sigma,
@@ -88,3 +89,17 @@ def test_groups_that_differ_widen_the_covariance_to_the_true_scatter(with_inform
         stated.append(wide[0, 0])
     assert np.sqrt(np.mean(stated)) == pytest.approx(np.std(np.array(found)[:, 0]), rel=0.15)
     assert np.sqrt(cov[0, 0]) < 0.5 * np.std(np.array(found)[:, 0])
+
+
+def test_an_excess_variance_is_found_within_its_error_and_none_where_there_is_none() -> None:
+    rng = np.random.default_rng(3)
+    known, dof = np.array([1.0, 2.0, 4.0]), np.array([200.0, 400.0, 100.0])
+    draws = rng.chisquare(dof, (400, 3)) / dof
+    found = np.array([excess_variance(one * (known + 0.5), known, dof) for one in draws])
+    z = (found[:, 0] - 0.5) / np.sqrt(found[:, 1])
+    assert abs(z.mean()) < 0.2
+    assert z.std() == pytest.approx(1.0, abs=0.15)
+    none = np.array([excess_variance(one * known, known, dof) for one in draws])
+    assert np.mean(none[:, 0] == 0) == pytest.approx(0.5, abs=0.1)
+    # Half of a chi-squared of one degree of freedom (Chernoff, Ann. Math. Stat. 25, 1954).
+    assert np.mean(none[:, 2] > 2.71) == pytest.approx(0.05, abs=0.03)

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from udccal.fitting.engine.orders import Attempt, bic, choose, evidence, held_out_beats, rising
+from udccal.fitting.engine.orders import Attempt, Quantity, bic, choose, evidence, held_out_beats, rising
 
 
 def _attempt(name: str, criterion: float) -> Attempt[str]:
@@ -52,3 +52,18 @@ def test_one_lucky_group_is_no_gain() -> None:
     assert not held_out_beats(before - np.array([0.8, *[0.0] * 7]), before)
     assert not held_out_beats(before - 0.1, before, worth=0.2)
     assert not held_out_beats(np.array([1.0]), np.array([2.0]))
+
+
+def test_a_quantity_stays_where_the_data_ask_for_it() -> None:
+    found = Quantity.asked("spread", 5.0, 1.0, 1000)
+    assert (found.value, found.there, found.candidates[1].name) == (5.0, True, "with spread")
+    for value, gain in ((2.0, None), (-9.0, None), (9.0, 0.0)):
+        lost = Quantity.asked("spread", value, 1.0, 1000, gain, without=0.1)
+        assert (lost.value, lost.variance, lost.there) == (0.1, 1.0, False)
+        assert [candidate.chosen for candidate in lost.candidates] == [True, False]
+
+
+def test_the_root_of_a_variance_that_is_lost_in_its_error_is_as_uncertain_as_that() -> None:
+    assert Quantity(4.0, 0.01).root() == (2.0, 0.25)
+    value, slope = Quantity(0.0, 1e-4).root()
+    assert (value, slope * 1e-2) == (0.0, pytest.approx(0.1))

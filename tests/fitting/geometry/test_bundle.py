@@ -10,8 +10,9 @@ from hypothesis import strategies as st
 from tests.fitting.geometry.boards import VISIBLE_BEND, Sight, sight
 from udccal.errors import FitError
 from udccal.fitting.engine.gaussian import Prior
-from udccal.fitting.geometry import CalibratedViews, fit_geometry
+from udccal.fitting.geometry.calibrated import CalibratedViews
 from udccal.fitting.geometry.corners import board_points_mm
+from udccal.fitting.geometry.fit import fit_geometry
 from udccal.models.geometry import Geometry
 from udccal.result import FitStatus
 
@@ -134,7 +135,7 @@ def test_a_prior_holds_what_the_views_do_not_tell() -> None:
     assert found.status is FitStatus.CONVERGED
     assert np.sqrt(found.cov[0, 0]) == pytest.approx(15.0 / np.sqrt(2), rel=0.1)  # fx and fy are as good as one
     assert all(found.free)
-    assert "do not tell the whole lens" in " ".join(found.notes)
+    assert "do not determine the whole lens" in " ".join(found.notes)
 
 
 def test_too_few_views_are_refused_with_the_reason() -> None:

@@ -11,10 +11,10 @@ from scipy.spatial.transform import Rotation
 from tests.fitting.geometry.boards import sight
 from tests.fitting.geometry.test_bundle import SCENE, arrays
 from udccal.errors import FitError
-from udccal.fitting.geometry import CalibratedViews, Gauge, Intrinsics, fit_geometry
-from udccal.fitting.geometry.bundle import ORDERS, projected
-from udccal.fitting.geometry.calibrated import field_grid
+from udccal.fitting.geometry.bundle import ORDERS, Intrinsics, projected
+from udccal.fitting.geometry.calibrated import CalibratedViews, Gauge, field_grid
 from udccal.fitting.geometry.corners import board_points_mm
+from udccal.fitting.geometry.fit import fit_geometry
 
 PIXELS = np.array([[511.0, 383.0], [40.0, 60.0], [980.0, 700.0]])
 
@@ -68,8 +68,6 @@ def test_views_of_different_lenses_disagree_and_widen_all(plain: CalibratedViews
     found = fit_geometry(board, squeezed, SCENE.size, sigmas=sigma)
     assert found.evidence.views.found
     assert not plain.evidence.views.found
-    assert found.evidence.held_out_rms_px > 1.05 * found.evidence.expected_rms_px
-    assert plain.evidence.held_out_rms_px == pytest.approx(plain.evidence.expected_rms_px, rel=0.05)
     assert found.cov[0, 0] > 4 * plain.cov[0, 0]
     assert any("disagree" in note for note in found.notes)
 

@@ -9,14 +9,22 @@ from tests.fitting.geometry.boards import sight
 from tests.fitting.geometry.test_bundle import SCENE, arrays
 from udccal.errors import FitError
 from udccal.fitting.engine.gaussian import Prior
-from udccal.fitting.geometry import GeometryRules, Intrinsics
-from udccal.fitting.geometry.bundle import EVERY, ORDERS, Bundle, Solved, linearised, solve
-from udccal.fitting.geometry.fit import NO_PRIOR
+from udccal.fitting.geometry.bundle import (
+    EVERY,
+    ORDERS,
+    Bundle,
+    GeometryRules,
+    Intrinsics,
+    Solved,
+    linearised,
+    solve,
+)
 from udccal.fitting.geometry.start import best_poses, facing, gather, starts
 from udccal.models.geometry import project, rotation_matrix
 
 POINTS = gather(*arrays(), GeometryRules()).points
 TRUTH = Bundle(Intrinsics.of_geometry(SCENE.camera).vector, SCENE.poses)
+NO_PRIOR = Prior(np.zeros(9), np.zeros((0, 9)))
 
 
 @pytest.fixture(scope="module")

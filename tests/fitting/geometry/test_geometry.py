@@ -11,10 +11,11 @@ from tests.fitting.geometry.boards import CAMERA, SIZE, SPEC, draw, pose, true_c
 from udccal.cameras.protocol import CameraIdentity, Region, Settings
 from udccal.errors import FitError
 from udccal.fitting.engine.gaussian import Prior
-from udccal.fitting.geometry import CalibratedViews, GeometryData, fit_boards, fit_geometry, read_geometry
-from udccal.fitting.geometry.boards import projection_sigma_px
+from udccal.fitting.geometry.boards import fit_boards, projection_sigma_px
+from udccal.fitting.geometry.calibrated import CalibratedViews
 from udccal.fitting.geometry.corners import BoardCorners, board_points_mm
-from udccal.fitting.geometry.data import BoardView, rig_prior
+from udccal.fitting.geometry.data import BoardView, GeometryData, read_geometry, rig_prior
+from udccal.fitting.geometry.fit import fit_geometry
 from udccal.fitting.noise.fit import nominal_noise
 from udccal.fitting.nominal import nominal_geometry
 from udccal.models.geometry import Geometry, mounting_rotation, project_directions, rotation_matrix

@@ -23,8 +23,9 @@ from tests.scenes.noise import (
     truth,
 )
 from udccal.errors import FitError
-from udccal.fitting.noise import ExposureLevel, NoiseData, NoiseRules, SpatialStack, fit_noise, mean_response
-from udccal.fitting.noise.data import Frame, reduced
+from udccal.fitting.noise.data import ExposureLevel, Frame, NoiseData, NoiseRules, SpatialStack
+from udccal.fitting.noise.fit import fit_noise, mean_response
+from udccal.fitting.noise.moments import reduced
 from udccal.result import FitStatus
 
 
@@ -123,6 +124,14 @@ def test_pixels_patterns_in_a_flickering_stack_are_not_taken_for_shot_noise() ->
     assert abs(K.value - PLAIN.K_DN_per_e) < 2.5 * K.sigma
 
 
+@pytest.mark.parametrize("read_e", [0.3, 1.2])
+def test_rounding_is_in_the_sigma_of_a_saturation_between_codes(read_e: float) -> None:
+    sensor = replace(PLAIN, read_e=read_e, row_DN=0.0, DSNU_e=0.0, full_well_e=10_001.25)
+    found, true = measure(sensor, 3).estimate("saturation_DN"), truth(sensor)["saturation_DN"]
+    assert abs(found.value - true) < 3 * found.sigma
+    assert found.sigma < 0.35
+
+
 def test_hot_pixels_are_named() -> None:
     levels, stack = capture(PLAIN, 6)
     for frame in stack.dark:
@@ -161,6 +170,7 @@ FRAME = np.full((32, 32), 100, np.uint16)
         ([ExposureLevel(0.1, (FRAME[:4], FRAME[:4]), (FRAME, FRAME))], None, "samples a side"),
         ([ExposureLevel(0.1, (FRAME, FRAME), (FRAME, FRAME))], SpatialStack(0.1, [FRAME], [FRAME]), "stack"),
         ([ExposureLevel(0.1, (FRAME, FRAME), (FRAME + np.uint16(60000),) * 2)], None, "top_code"),
+        ([ExposureLevel(0.1, (FRAME + np.uint16(60000),) * 2, (FRAME, FRAME))], None, "top_code"),
     ],
 )
 def test_what_is_no_frame_is_refused(levels: list[ExposureLevel], stack: SpatialStack | None, sentence: str) -> None:

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from udccal.fitting.noise import NoiseRules
+from udccal.fitting.noise.data import NoiseRules
 from udccal.fitting.noise.transfer import DarkVariance, Levels, Order, choose_transfer
 
 DARK = DarkVariance(np.array([4.0]), np.array([0.01]), 1 / 12, 0.36, np.array([0.0]))
@@ -29,7 +29,6 @@ def made_levels(seed: int) -> Levels:
         samples=np.full(mean.shape, samples),
         usable=usable,
         light=light,
-        steady=np.ones(10, bool),
         dark_DN=np.zeros(10),
         row_variance_DN2=np.zeros(10),
     )

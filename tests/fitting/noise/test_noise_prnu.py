@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from jaxtyping import Float
 
-from udccal.fitting.noise import NoiseRules
-from udccal.fitting.noise.prnu import prnu, white_coefficients
+from udccal.fitting.noise.data import NoiseRules
+from udccal.fitting.noise.patterns import prnu, white_coefficients
 
 ROWS, COLUMNS = 512, 768
 PRNU, SHOT = 0.006, 3e-5

@@ -11,7 +11,7 @@ from scipy.special import ndtr
 
 from tests.scenes.psf_wave_optics import seen_by_the_wire
 from udccal.cameras.protocol import CameraIdentity, Frame, Region, Settings
-from udccal.cfa import channel_map
+from udccal.cfa import cfa_named
 from udccal.fitting.absent import absent_wire
 from udccal.fitting.hdr.merge import HdrMerge
 from udccal.fitting.noise.fit import nominal_noise
@@ -65,7 +65,7 @@ def shots_of(light, rig: RigDescription, places: np.ndarray, shifts: int, disc_p
             middle = np.round(aim)
             corner = (middle - MIDDLE) // 2 * 2
             image = light(source, corner + MIDDLE)
-            channel = channel_map(rig.camera.cfa, *SIZE)
+            channel = cfa_named(rig.camera.cfa).channel_map(*SIZE)
             rate = np.take_along_axis(image * FLUX[:, None, None], channel[None], axis=0)[0]
             sigma = np.hypot(0.003 * rate, 20.0)
             merged = HdrMerge(

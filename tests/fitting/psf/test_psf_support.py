@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 
 from udccal.cameras.protocol import CameraIdentity, Frame, Region, Settings
-from udccal.cfa import channel_map
+from udccal.cfa import cfa_named
 from udccal.fitting.absent import absent_wire
 from udccal.fitting.noise.fit import nominal_noise
 from udccal.fitting.nominal import nominal_geometry
@@ -112,7 +112,7 @@ def captured(folder: Path, ends_px: int) -> Captured:
         most = min(ends_px, rows // 2)
         left = 24 - columns // 2
         lit[:, 72 - most : 73 + most, left : left + columns] = kernel[:, rows // 2 - most : rows // 2 + most + 1]
-        light = np.take_along_axis(lit, channel_map(rig.camera.cfa, 144, 48)[None], 0)[0]
+        light = np.take_along_axis(lit, cfa_named(rig.camera.cfa).channel_map(144, 48)[None], 0)[0]
         frames = [bracketed(light, exposure, noise, region, rng) for exposure in 1e-4 * 4.0 ** np.arange(7)]
         subject = LedSubject(x_px=float(place[0]), y_px=float(place[1]), distance_mm=2000.0, diameter_mm=0.01)
         writer.add_step(f"psf/p{index:02d}_s0", "psf", subject, frames)

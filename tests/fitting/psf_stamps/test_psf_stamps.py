@@ -9,9 +9,8 @@ import pytest
 
 from udccal.errors import FitError
 from udccal.fitting.psf_stamps.data import Stamps, mosaic_channels
-from udccal.fitting.psf_stamps.fit import fit_psf_stamps
-from udccal.fitting.psf_stamps.orders import Orders
-from udccal.fitting.psf_stamps.term import StampsPsf
+from udccal.fitting.psf_stamps.fit import StampsPsf, fit_psf_stamps
+from udccal.fitting.psf_stamps.search import Orders
 from udccal.result import FitResult, FitStatus
 
 SENSOR = np.array([1000, 800])

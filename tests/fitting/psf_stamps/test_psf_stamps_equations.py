@@ -9,101 +9,103 @@ import numpy as np
 import pytest
 
 from tests.fitting.psf_stamps.test_psf_stamps import make
-from udccal.fitting.psf_stamps.banded import AHEAD, Band, band_of, factor, node_sums
-from udccal.fitting.psf_stamps.data import Scene, StampsRules, split
-from udccal.fitting.psf_stamps.equations import factors, marginal_cov, normal_equations, shared_by
+from udccal.fitting.psf_stamps.data import Stamps, StampsRules
+from udccal.fitting.psf_stamps.equations import (
+    divided,
+    factor,
+    laplace,
+    marginal_cov,
+    node_sums,
+    normal_equations,
+    shared_by,
+)
 from udccal.fitting.psf_stamps.field import TAPS, polynomials
-from udccal.fitting.psf_stamps.orders import start, with_degrees
-from udccal.fitting.psf_stamps.probability import State, Weighted, expectation
-from udccal.fitting.psf_stamps.solve import Evidence, improve
+from udccal.fitting.psf_stamps.probability import State, Weighted, expectation, laplacian
+from udccal.fitting.psf_stamps.search import Evidence, improve, start
 
-_ROWS, _N = 6, 5
+_ROWS, _N, _RULES = 6, 5, StampsRules()
 
 
-def dense(band: Band) -> np.ndarray:
-    """All of a symmetric matrix whose upper half is a band's."""
-    rows, n = band.diagonal.shape[:2]
-    out = np.zeros(((rows + AHEAD) * n, (rows + AHEAD) * n))
+def dense(band: np.ndarray) -> np.ndarray:
+    """All of a symmetric matrix whose upper half is a band."""
+    rows, n = band.shape[:2]
+    out = np.zeros((rows * n, (rows + TAPS) * n))
     for i in range(rows):
-        out[i * n : (i + 1) * n, i * n : (i + 1) * n] = np.triu(band.diagonal[i])
-        out[i * n : (i + 1) * n, (i + 1) * n : (i + 1 + AHEAD) * n] = band.beyond[i]
-    out = out[: rows * n, : rows * n]
+        out[i * n : (i + 1) * n, i * n : (i + TAPS) * n] = band[i]
+        out[i * n : (i + 1) * n, i * n : (i + 1) * n] = np.triu(band[i, :, :n])
+    out = out[:, : rows * n]
     return out + np.triu(out, 1).T
 
 
-def band(seed: int) -> Band:
+def band(seed: int) -> np.ndarray:
     """Positive definite."""
-    rng = np.random.default_rng(seed)
-    beyond = rng.standard_normal((_ROWS, _N, AHEAD * _N))
-    for i in range(1, AHEAD + 1):
-        beyond[-i, :, (i - 1) * _N :] = 0
-    return Band(np.tile(40.0 * np.eye(_N), (_ROWS, 1, 1)) + rng.uniform(0, 0.1), beyond)
+    out = np.random.default_rng(seed).standard_normal((_ROWS, _N, TAPS * _N))
+    out[:, :, :_N] = 40.0 * np.eye(_N)
+    for i in range(1, TAPS):
+        out[-i, :, i * _N :] = 0
+    return out
 
 
-def scene_and_state() -> tuple[Scene, State]:
+def stamps_and_state() -> tuple[Stamps, State]:
     stamps, _ = make(1, count=12, size=9)
-    unit = 2 * stamps.position_px / np.array([1000, 800]) - 1
-    scene = Scene(split(stamps), unit, (9, 9), stamps.read_e, stamps.clip_e)
-    return scene, with_degrees(start(scene, StampsRules()), 1, 1, StampsRules())
+    return stamps, start(stamps, _RULES).with_degrees(1, 1, _RULES)
 
 
 @pytest.fixture
-def weighted() -> tuple[Scene, State, Weighted]:
-    scene, state = scene_and_state()
+def weighted() -> tuple[Stamps, State, Weighted]:
+    stamps, state = stamps_and_state()
     with jax.enable_x64(True):
-        return scene, state, expectation(scene, state, 0)[0]
+        return stamps, state, expectation(stamps, state)
 
 
-def design(seen: Weighted, basis: np.ndarray, nodes: tuple[int, int]) -> np.ndarray:
+def design(seen: Weighted, basis: np.ndarray, nodes: tuple[int, ...]) -> np.ndarray:
     """Of every sample: weights of all nodes' images, node by node."""
-    stars, samples = seen.mean.shape
+    stars, samples = seen.weight.shape
     out = np.zeros((stars, samples, nodes[0] * nodes[1], basis.shape[1]))
     for i in range(TAPS):
         for j in range(TAPS):
-            weight = (seen.down[..., i] * seen.across[..., j])[..., None] * basis[:, None, :]
-            np.put_along_axis(out, (seen.first + i * nodes[1] + j)[..., None, None], weight[:, :, None, :], axis=2)
+            weight = (seen.seen.down[..., i] * seen.seen.across[..., j])[..., None] * basis[:, None, :]
+            index = (seen.seen.first + i * nodes[1] + j)[..., None, None]
+            np.put_along_axis(out, index, weight[:, :, None, :], axis=2)
     return out.reshape(stars * samples, -1)
 
 
-def test_factor_solutions_and_determinant_are_those_of_the_dense_matrix() -> None:
+def test_factor_and_solutions_are_those_of_the_dense_matrix() -> None:
     matrix = dense(band(3))
     found = factor(band(3))
     upper = np.triu(dense(found))
     np.testing.assert_allclose(upper.T @ upper, matrix, atol=1e-10)
     right = np.random.default_rng(4).standard_normal((_ROWS * _N, 3))
-    solution = found.backward(found.forward(right.copy()))
+    solution = divided(found, divided(found, right.copy(), True), False)
     np.testing.assert_allclose(matrix @ solution, right, atol=1e-10)
-    assert found.log_det == pytest.approx(np.linalg.slogdet(matrix)[1])
 
 
 def test_a_matrix_that_is_not_positive_is_refused() -> None:
     broken = band(3)
-    broken.diagonal[4] -= 200 * np.eye(_N)
-    with pytest.raises(np.linalg.LinAlgError, match="row 4 of nodes"):
+    broken[4, :, :_N] -= 200 * np.eye(_N)
+    with pytest.raises(np.linalg.LinAlgError, match="not positive definite"):
         factor(broken)
 
 
-def test_sums_over_samples_are_those_of_the_design(weighted: tuple[Scene, State, Weighted]) -> None:
-    scene, state, seen = weighted
-    grid = state.fields[0].nodes.shape[1:]
-    basis = polynomials(scene.unit, 1)
+def test_sums_over_samples_are_those_of_the_design(weighted: tuple[Stamps, State, Weighted]) -> None:
+    stamps, state, seen = weighted
+    grid, basis = state.field.nodes.shape[2:], polynomials(stamps.unit, 1)
     seen.weight[2, 5] = 0.0
     taps = design(seen, basis, grid)
     expected = taps.T @ (seen.weight.ravel()[:, None] * taps)
-    np.testing.assert_allclose(
-        dense(band_of(node_sums(basis, seen, grid))), expected, atol=1e-10 * np.abs(expected).max()
-    )
+    found = node_sums(basis, seen, np.flatnonzero(seen.weight), grid)
+    np.testing.assert_allclose(dense(found), expected, atol=1e-10 * np.abs(expected).max())
 
 
-def test_right_sides_and_blocks_are_those_of_the_jacobian(weighted: tuple[Scene, State, Weighted]) -> None:
-    scene, state, seen = weighted
-    field, shared = state.fields[0], shared_by(state.fields, scene.unit)[0]
-    taps = design(seen, polynomials(scene.unit, 1), field.nodes.shape[1:])
-    stars, samples, own = seen.slopes.shape
+def test_right_sides_and_blocks_are_those_of_the_jacobian(weighted: tuple[Stamps, State, Weighted]) -> None:
+    stamps, state, seen = weighted
+    _, shared = shared_by(state.field, stamps.unit, 0)
+    taps = design(seen, polynomials(stamps.unit, 1), state.field.nodes.shape[2:])
+    stars, samples, own = seen.seen.jacobian.shape
     spread = np.zeros((stars, samples, stars, own))
-    spread[np.arange(stars), :, np.arange(stars)] = seen.slopes
-    jacobian = spread.reshape(stars * samples, -1) @ shared.matrix.toarray()
-    normal, weight = normal_equations(field, scene.unit, seen, shared.matrix), seen.weight.ravel()[:, None]
+    spread[np.arange(stars), :, np.arange(stars)] = seen.seen.jacobian
+    jacobian = spread.reshape(stars * samples, -1) @ shared.toarray()
+    normal, weight = normal_equations(stamps, state.field, seen, 0), seen.weight.ravel()[:, None]
     for found, expected in (
         (normal.cross, taps.T @ (weight * jacobian)),
         (normal.dense, jacobian.T @ (weight * jacobian)),
@@ -114,45 +116,52 @@ def test_right_sides_and_blocks_are_those_of_the_jacobian(weighted: tuple[Scene,
 
 
 def test_the_jacobian_of_the_dense_block_is_that_of_the_expectation() -> None:
-    scene, state = scene_and_state()
-    shared = shared_by(state.fields, scene.unit)[0]
-    change = 1e-5 * np.random.default_rng(2).standard_normal(shared.size)
+    stamps, _ = make(1, count=12, size=9)
+    mosaic = replace(stamps, channel=np.arange(12 * 81).reshape(12, 9, 9) % 3)
+    state = start(mosaic, _RULES).with_degrees(1, 1, _RULES)
+    size = state.maps_from + len(state.maps)
+    change = 1e-5 * np.random.default_rng(2).standard_normal(size)
+    whole = np.concatenate([change, np.zeros(np.size(state.field.nodes))])
     with jax.enable_x64(True):
-        seen, _ = expectation(scene, state, 0)
-        whole = np.concatenate([change, np.zeros(np.size(state.fields[0].nodes))])
-        ends = [expectation(scene, state.shifted(s * whole), 0)[0].mean for s in (1.0, -1.0)]
-    own = (shared.matrix @ change[shared.index]).reshape(len(scene.unit), -1)
-    expected = np.einsum("kso,ko->ks", seen.slopes, own)
-    np.testing.assert_allclose((ends[0] - ends[1]) / 2, expected, atol=1e-4 * np.abs(expected).max())
+        seen = expectation(mosaic, state)
+        ends = [mosaic.value_e - expectation(mosaic, state.shifted(s * whole)).residual for s in (1.0, -1.0)]
+    for plane in range(3):
+        index, shared = shared_by(state.field, mosaic.unit, plane)
+        own = (shared @ change[index]).reshape(12, -1)
+        expected = np.einsum("kso,ko->ks", seen.seen.jacobian, own)
+        seen_here = mosaic.by_plane[plane] & (seen.weight > 0)
+        found = (ends[0] - ends[1])[seen_here] / 2
+        np.testing.assert_allclose(found, expected[seen_here], atol=1e-4 * np.abs(expected).max())
 
 
 def test_a_star_that_is_left_out_brings_nothing() -> None:
-    scene, state = scene_and_state()
-    keep = state.keep[0].copy()
+    stamps, state = stamps_and_state()
+    keep = state.keep.copy()
     keep[4] = False
     with jax.enable_x64(True):
-        seen, likelihood = expectation(scene, replace(state, keep=(keep,)), 0)
+        seen, every = expectation(stamps, replace(state, keep=keep)), expectation(stamps, state)
+        alone = expectation(stamps, replace(state, keep=~keep))
     assert not seen.weight[4].any()
-    assert not likelihood[4].any()
+    assert seen.log_likelihood + alone.log_likelihood == pytest.approx(every.log_likelihood)
     assert seen.weight[3].any()
 
 
 def test_the_mode_and_its_covariance_are_those_of_equations_written_out() -> None:
-    scene, state = scene_and_state()
+    stamps, state = stamps_and_state()
     with jax.enable_x64(True):
-        found, (seen, _) = factors(scene, state), expectation(scene, state, 0)
-        shared = shared_by(state.fields, scene.unit)[0]
-        normal = normal_equations(state.fields[0], scene.unit, seen, shared.matrix)
-    size, nodes = shared.size, len(normal.right_nodes)
+        found, seen = laplace(stamps, state), expectation(stamps, state)
+        normal = normal_equations(stamps, state.field, seen, 0)
+    size, nodes = state.maps_from + len(state.maps), len(normal.right_nodes)
     matrix, pull = np.zeros((2, size + nodes, size + nodes)), np.zeros(size + nodes)
-    matrix[0, :size, :size], matrix[0, size:, size:] = normal.dense, dense(band_of(normal.sums))
+    matrix[0, :size, :size], matrix[0, size:, size:] = normal.dense, dense(normal.band)
     matrix[0, size:, :size], matrix[0, :size, size:] = normal.cross, normal.cross.T
-    env, own = state.envelopes[0], state.precisions[0]
-    matrix[1, size - 8 : size, size - 8 : size] = np.diag(own.of_maps)
-    for term, (a, b) in enumerate(own.image[[0, 1, 1]]):
+    scale = np.diag(1 / state.size[0].ravel())
+    matrix[1, size - 8 : size, size - 8 : size] = np.diag(state.precisions[state.map_groups])
+    rough = laplacian(*state.size.shape[1:])[0].toarray() @ scale
+    for term, (a, b) in enumerate(state.of_images[0, [0, 1, 1]]):
         image = np.s_[size + term :: 3]
-        matrix[1, image, image] = np.diag(a / env.size.ravel() ** 2) + b * env.roughness.toarray()
-    here = np.concatenate([np.zeros(size), np.reshape(state.fields[0].nodes, (3, -1)).T.ravel()])
+        matrix[1, image, image] = a * scale**2 + b * rough.T @ rough
+    here = np.concatenate([np.zeros(size), np.reshape(state.field.nodes, (3, -1)).T.ravel()])
     pull[: len(normal.right_dense)], pull[size:] = normal.right_dense, normal.right_nodes
     held = np.zeros((3, size + nodes))
     for j in range(3):
@@ -161,7 +170,8 @@ def test_the_mode_and_its_covariance_are_those_of_equations_written_out() -> Non
     whole = matrix.sum(axis=0) + held.T @ held
     mode = np.linalg.solve(whole, pull - matrix[1] @ here)
     np.testing.assert_allclose(found.mode, mode, atol=1e-6 * np.abs(mode).max())
-    assert found.log_det == pytest.approx(np.linalg.slogdet(whole)[1], rel=1e-9)
+    cost = np.linalg.slogdet(whole)[1] - 2 * seen.log_likelihood - state.volume()[0] + here @ matrix[1] @ here
+    assert found.cost == pytest.approx(cost, abs=1e-3)
     cov = np.linalg.inv(whole)
     index = np.array([0, 5, size - 1])
     np.testing.assert_allclose(marginal_cov(found.root, index), cov[np.ix_(index, index)], rtol=1e-6)
@@ -169,10 +179,33 @@ def test_the_mode_and_its_covariance_are_those_of_equations_written_out() -> Non
     np.testing.assert_allclose(drawn.std(axis=1), np.sqrt(cov.diagonal()), rtol=0.06)
 
 
+def test_the_prior_is_that_of_its_eigenvalues() -> None:
+    _, state = stamps_and_state()
+    rows, columns = state.size.shape[1:]
+    matrix, eigenvalues = laplacian(rows, columns)
+    np.testing.assert_allclose(np.linalg.eigvalsh((matrix.T @ matrix).toarray()), np.sort(eigenvalues), atol=1e-9)
+    scale = 1 / state.size[0].ravel()
+    volume, squares = float(np.log(state.precisions[state.map_groups]).sum()), 0.0
+    for image, (a, b) in zip(state.field.nodes[0], state.of_images[0, [0, 1, 1]], strict=True):
+        prior = (a * np.eye(len(scale)) + b * (matrix.T @ matrix).toarray()) * np.outer(scale, scale)
+        volume += np.linalg.slogdet(prior)[1]
+        squares += image.ravel() @ prior @ image.ravel()
+    assert state.volume()[0] == pytest.approx(volume)
+    assert state.precisions @ state.squares() == pytest.approx(squares)
+
+
+def test_squares_that_a_prior_expects_are_its_derivatives() -> None:
+    _, state = stamps_and_state()
+    for index, precision in enumerate(state.precisions):
+        step = 1e-5 * precision * (np.arange(len(state.precisions)) == index)
+        up, down = (replace(state, precisions=state.precisions + s * step).volume()[0] for s in (1.0, -1.0))
+        assert state.volume()[1][index] == pytest.approx((up - down) / (2e-5 * precision), rel=1e-6)
+
+
 def test_equations_that_are_singular_have_no_step() -> None:
-    scene, state = scene_and_state()
-    broken = replace(state, precisions=tuple(own.times(np.full(len(own.flat), -1e9)) for own in state.precisions))
+    stamps, state = stamps_and_state()
+    broken = replace(state, precisions=-1e9 * state.precisions)
     with jax.enable_x64(True):
-        assert Evidence(scene, StampsRules()).equations_at(broken).cost == np.inf
+        assert Evidence(stamps, _RULES).equations_at(broken).cost == np.inf
         with pytest.raises(np.linalg.LinAlgError, match="singular"):
-            improve(scene, broken, StampsRules(), 3)
+            improve(stamps, broken, _RULES, 3)

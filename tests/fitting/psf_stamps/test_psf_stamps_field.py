@@ -1,58 +1,79 @@
-"""Values of a field in stamps: the same however they are asked for, and slopes that are those of the values."""
+"""Values of a field in stamps: derivatives that are those of the values; changes go where their vector says."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import jax
-import jax.numpy as jnp
 import numpy as np
 
-from udccal.fitting.psf_stamps.field import Changes, PlaneField, polynomials, see
+from udccal.fitting.psf_stamps.field import Changes, PsfField, degree_of, degrees, polynomials, see, taps
 from udccal.models.fields import polynomial_basis
 
 _RNG = np.random.default_rng(8)
 _UNIT = _RNG.uniform(-1, 1, (5, 2))
 _CENTRE = _RNG.uniform(-0.5, 0.5, (5, 2))
-_OFFSET = np.broadcast_to(np.stack(np.meshgrid(np.arange(-3.0, 4), np.arange(-3.0, 4)), -1).reshape(-1, 2), (5, 49, 2))
+_OFFSET = np.stack(np.meshgrid(np.arange(-3.0, 4), np.arange(-3.0, 4)), -1).reshape(-1, 2)
+_PLANE = np.broadcast_to(np.arange(49) % 2, (5, 49))
 
 
-def _field() -> PlaneField:
-    nodes = _RNG.standard_normal((3, 12, 15))
-    return PlaneField(nodes, 0.05 * _RNG.standard_normal((5, 2, 2)), 0.1 * np.ones((2, 2)), 1, 2, 1, 0.9)
+def _field() -> PsfField:
+    """Of two colours."""
+    nodes = _RNG.standard_normal((2, 3, 12, 15))
+    return PsfField(nodes, 0.05 * _RNG.standard_normal((2, 5, 2, 2)), 0.1 * np.ones((1, 2, 2)), 0.9)
 
 
 def test_polynomials_are_those_of_the_models() -> None:
     with jax.enable_x64(True):
         for degree in range(6):
             np.testing.assert_allclose(polynomials(_UNIT, degree), polynomial_basis(_UNIT, degree), atol=1e-14)
+            assert degree_of(len(degrees(degree))) == degree
 
 
-def test_traced_and_plain_values_agree() -> None:
+def test_derivatives_are_those_of_the_values() -> None:
+    field, step = _field(), 1e-6
+    with jax.enable_x64(True):
+        seen = see(field, _UNIT, _CENTRE, _OFFSET, _PLANE)
+        ends = [see(field, _UNIT, _CENTRE + s * np.array([step, 0.0]), _OFFSET, _PLANE).value for s in (1.0, -1.0)]
+        np.testing.assert_allclose(seen.jacobian[..., 1], (ends[0] - ends[1]) / (2 * step), atol=1e-6)
+        # The second number of the map's first polynomial, which is the position's y.
+        turned = [
+            field.warp + s * step * (np.arange(4).reshape(2, 2) == 1) * (np.arange(5) == 0)[:, None, None]
+            for s in (1, -1)
+        ]
+        ends = [see(replace(field, warp=warp), _UNIT, _CENTRE, _OFFSET, _PLANE).value for warp in turned]
+        expected = (ends[0] - ends[1]) / (2 * step)
+        np.testing.assert_allclose(seen.jacobian[..., 4] * polynomials(_UNIT, 1)[:, 1, None], expected, atol=1e-6)
+
+
+def test_a_colour_has_its_own_image_map_and_place() -> None:
+    field = _field()
+    alone = PsfField(field.nodes[1:], field.warp[1:], np.zeros((0, 2, 2)), 0.9)
+    beside = _CENTRE + 0.1 * polynomials(_UNIT, 1)[:, 1:].sum(axis=1)[:, None]
+    with jax.enable_x64(True):
+        both = see(field, _UNIT, _CENTRE, _OFFSET, _PLANE).value
+        own = see(alone, _UNIT, beside, _OFFSET, np.zeros((5, 49), dtype=int)).value
+    np.testing.assert_allclose(both[:, 1::2], own[:, 1::2], atol=1e-12)
+    assert np.abs(both[:, ::2] - own[:, ::2]).max() > 0.1
+
+
+def test_weights_of_nodes_give_the_values() -> None:
     field = _field()
     with jax.enable_x64(True):
-        plain = see(field, _UNIT, _CENTRE, _OFFSET)
-        traced = jax.jit(lambda unit, centre: see(field, unit, centre, _OFFSET))(_UNIT, _CENTRE)
-        for one, other in zip(plain, traced, strict=True):
-            assert isinstance(one, np.ndarray)
-            np.testing.assert_allclose(one, other, atol=1e-12)
-
-
-def test_slopes_are_those_of_the_values() -> None:
-    field = _field()
-
-    def values(centre: jax.Array) -> jax.Array:
-        return jnp.asarray(see(field, _UNIT, centre, _OFFSET).value)
-
-    with jax.enable_x64(True):
-        _, by_x = jax.jvp(values, (jnp.asarray(_CENTRE),), (jnp.ones((5, 2)) * jnp.array([1.0, 0.0]),))
-        np.testing.assert_allclose(see(field, _UNIT, _CENTRE, _OFFSET).slopes[..., 0], by_x, atol=1e-10)
+        seen = see(field, _UNIT, _CENTRE, _OFFSET, np.ones((5, 49), dtype=int))
+    images = np.einsum("st,tn->sn", polynomials(_UNIT, 1), field.nodes[1].reshape(3, -1))
+    used = np.array([0, 50, 60, 200])
+    np.testing.assert_allclose(taps(seen, used, (12, 15)) @ images.ravel(), seen.value.ravel()[used], atol=1e-12)
 
 
 def test_changes_are_applied_where_their_vector_says() -> None:
-    field, zeros = _field(), np.zeros((10 + 5 + 20 + 4 + 540, 1))
-    nothing = Changes.of((field,), 5, zeros).applied((field,))[0]
+    field, zeros = _field(), np.zeros((20 + 40 + 4 + 1080, 1))
+    nothing = field.moved(Changes.of(field, 5, zeros))
     np.testing.assert_array_equal(nothing.nodes, field.nodes)
     one = zeros.copy()
-    # The second image of the fourth node, behind five stars, a map of five polynomials and a lateral colour of two.
-    one[15 + 20 + 4 + 3 * 3 + 1] = 1.0
-    change = Changes.of((field,), 5, one).applied((field,))[0].nodes - field.nodes
-    assert np.flatnonzero(change).tolist() == [180 + 3]
+    # The second image of the second colour's fourth node, behind five stars, two maps and a lateral colour.
+    one[20 + 40 + 4 + 540 + 3 * 3 + 1] = 1.0
+    one[20 + 40] = 2.0
+    moved = field.moved(Changes.of(field, 5, one))
+    assert np.flatnonzero(moved.nodes - field.nodes).tolist() == [540 + 180 + 3]
+    assert (moved.lateral - field.lateral).ravel().tolist() == [2.0, 0.0, 0.0, 0.0]

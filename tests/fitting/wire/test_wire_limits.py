@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from tests.scenes.wire import (
     COLUMNS,
+    PRNU,
     ROWS,
     Flat,
     constant,
@@ -25,6 +26,9 @@ from tests.scenes.wire import (
     shape_values,
     start,
 )
+from udccal.fitting.wire.data import WireData
+from udccal.fitting.wire.fit import fit_wire
+from udccal.fitting.wire.rules import WireRules
 from udccal.models.wire import Wire, wire_map
 from udccal.result import FitResult, FitStatus
 
@@ -83,6 +87,17 @@ def test_saturated_flat_says_what_to_do() -> None:
     result = fitted(flat, start(), geometry(), clip=4000.0)
     assert result.status is FitStatus.SATURATED
     assert "shorter" in " ".join(result.notes)
+
+
+def test_clipped_light_is_no_misfit_of_the_pixels_held_out() -> None:
+    """The mean of what is not clipped is not the map's, which is 1: residuals must not show the difference."""
+    flat = noisy(drawn_truth(1, start(), geometry()), 1)
+    clip = float(np.quantile(flat.signal, 0.9))
+    data = WireData(np.minimum(flat.signal, clip), flat.variance, geometry(), start(), PRNU, clip)
+    result = fit_wire(data, WireRules(samples=flat.signal.size // 3)).or_raise()
+    assert next(d.value for d in result.diagnostics if d.name == "residual_pattern_p_value") > 1e-3
+    error = map_at(result.term, places()) - map_at(flat.truth, places())
+    assert np.all(np.abs(error) < 4.5 * map_sigma(result, places()))
 
 
 def finite_or_told(seed: int, electrons: float, prnu: float, broken: float, level: float) -> None:

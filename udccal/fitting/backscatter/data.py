@@ -2,35 +2,39 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import final
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped, UInt8
-from scipy import sparse
 
-from udccal.cfa import cell_channels
-from udccal.fitting.backscatter.parameters import linear_of, prior_of
-from udccal.fitting.backscatter.ratios import PanelCrop, Pictures, corners_of, directions
+from udccal.fitting.backscatter.model import (
+    PanelCrop,
+    PerBin,
+    PerShot,
+    Pictures,
+    Profile,
+    Usable,
+    corners_of,
+    directions,
+)
+from udccal.fitting.backscatter.parameters import BackscatterRules, linear_of, prior_of
+from udccal.fitting.bins import Bins
 from udccal.fitting.nominal import nominal_backscatter
 from udccal.models.geometry import Geometry
 from udccal.models.noise import Noise, variance_e
 from udccal.numerics import in_float64
 from udccal.rig import RigDescription
-from udccal.sessions.schema import DarkSubject, PanelSubject, StoredStep
+from udccal.sessions.schema import DarkSubject, PanelSubject
 from udccal.sessions.store import Average, Session
-
-# Part of saturation from which a mean counts as clipped.
-_CLIPPED = 0.98
-# Panel pixels around the nominally visible part that are kept: the footprint's own size and the nominal's tolerances.
-_MARGIN_PX = 12
 
 
 @final
 @dataclass(frozen=True)
 class Binned:
-    """Shots on the term's grid by camera colour.
+    """Shots on the term's grid, or at some of its bins, by camera colour: white first and dark last.
 
     Attributes:
         rate: e-/s above the black level, the dark signal included.
@@ -41,10 +45,10 @@ class Binned:
         scatter: variance between the frames of a shot over what the noise model says; NaN where not known.
     """
 
-    rate: Float[np.ndarray, "shots 3 grid_rows grid_columns"]
-    shot: Float[np.ndarray, "shots 3 grid_rows grid_columns"]
-    rest: Float[np.ndarray, "shots 3 grid_rows grid_columns"]
-    clipped: Bool[np.ndarray, "shots 3 grid_rows grid_columns"]
+    rate: Float[np.ndarray, "shots 3 *grid"]
+    shot: Float[np.ndarray, "shots 3 *grid"]
+    rest: Float[np.ndarray, "shots 3 *grid"]
+    clipped: Bool[np.ndarray, "shots 3 *grid"]
     exposure_s: Float[np.ndarray, " shots"]
     scatter: Float[np.ndarray, " shots"]
 
@@ -57,6 +61,47 @@ class Binned:
         """Some of the shots."""
         return Binned(*(getattr(self, f.name)[which] for f in fields(self)))
 
+    def at(self, flat: Int[np.ndarray, " n"]) -> Binned:
+        """All shots at some bins, by their flat indices."""
+        rate, shot, rest, clipped = (
+            part.reshape(*part.shape[:2], -1)[:, :, flat] for part in (self.rate, self.shot, self.rest, self.clipped)
+        )
+        return Binned(rate, shot, rest, clipped, self.exposure_s, self.scatter)
+
+    @property
+    def usable(self) -> Bool[np.ndarray, "shots 3 *grid"]:
+        """False where samples are clipped."""
+        usable = ~self.clipped
+        usable[-1] = True
+        return usable
+
+    @property
+    def excess(self) -> Float[np.ndarray, "shots 3 *grid"]:
+        """Light above that of the dark frame, as measured."""
+        return self.rate - np.multiply.outer(self.exposure_s[-1] / self.exposure_s, self.rate[-1])
+
+    def variance(self, rate: Float[np.ndarray, "shots 3 *grid"]) -> Float[np.ndarray, "shots 3 *grid"]:
+        """Of every bin by noise, at this light."""
+        # Never below rounding's: a black picture in a camera without read noise.
+        return np.maximum(self.shot * np.maximum(rate, 0.0) + self.rest, self.shot**2 / 12)
+
+    def weights(self, rate: PerShot, mask: PerBin, model_error: float, usable: Usable) -> PerShot:
+        """1 / sigma of every bin, 0 where not usable, at this light of this mask."""
+        variance = self.variance(rate)
+        # White is the mask by definition, dark has no light: the model's error is in neither.
+        variance[1:-1] += (model_error * mask) ** 2
+        return np.where(usable, 1 / np.sqrt(variance), 0.0)
+
+    def first_weights(self) -> PerShot:
+        """Weights by what was measured, one electron on the safe side."""
+        rate = np.maximum(self.excess, 0.0) + self.shot
+        rate[-1] = 0.0
+        return self.weights(rate, np.zeros(rate.shape[1:]), 0.0, self.usable)
+
+    def profile(self, ratio: PerShot, weight: PerShot) -> Profile:
+        """Mask and dark signal at their best."""
+        return Profile.of(ratio, self.rate, self.exposure_s[-1] / self.exposure_s, weight)
+
 
 @final
 @dataclass(frozen=True)
@@ -66,7 +111,7 @@ class BackscatterData:
     Attributes:
         shots: white, then the pictures, and the dark frame last; none at all where white or dark are missing.
         shown: the pictures, values 0 to 255, in the crop.
-        crop: the part of the panel that the camera can see.
+        crop: the part of the panel that the camera can see (``visible_crop``).
         names: of the pictures.
     """
 
@@ -75,9 +120,9 @@ class BackscatterData:
     crop: PanelCrop
     names: tuple[str, ...]
 
-    @property
+    @functools.cached_property
     def pictures(self) -> Pictures:
-        """What the panel showed, ready for a fit of gamma."""
+        """What the panel showed during every shot."""
         return Pictures.of(self.shown, self.crop)
 
     def only(self, keep: Bool[np.ndarray, " pictures"]) -> BackscatterData:
@@ -88,7 +133,11 @@ class BackscatterData:
 
 
 def read_backscatter(
-    session: Session, noise: Noise, geometry: Geometry, shading: Float[np.ndarray, "rows columns"]
+    session: Session,
+    noise: Noise,
+    geometry: Geometry,
+    shading: Float[np.ndarray, "rows columns"],
+    rules: BackscatterRules | None = None,
 ) -> BackscatterData:
     """Bin the averages of the steps ``backscatter/*`` of a session, one at a time.
 
@@ -97,6 +146,7 @@ def read_backscatter(
         noise: gives K, black level and saturation, and the variance of samples.
         geometry: where rays go.
         shading: the wire's map of the sensor (``fitting.wire.sensor_map``), divided out of what was measured.
+        rules: say what is clipped.
 
     Returns:
         rates in e-/s by bin and colour; without shots where white or dark were not captured.
@@ -104,115 +154,52 @@ def read_backscatter(
     Raises:
         SessionError: when a file is missing or damaged.
     """
-    crop, step_px = visible_crop(geometry, session.rig), grid_step(session.rig)
+    crop, bins = visible_crop(geometry, session.rig), Bins(session.rig.camera.cfa, grid_step(session.rig))
+    clipped = (rules or BackscatterRules()).clipped
     steps = session.steps("backscatter")
     panels = [(step, step.subject) for step in steps if isinstance(step.subject, PanelSubject)]
     white = [step for step, subject in panels if subject.role == "white"]
     dark = [step for step in steps if isinstance(step.subject, DarkSubject)]
     others = [(step, subject) for step, subject in panels if subject.role != "white"]
-    binning = Binning(noise, shading, session.rig.camera.cfa, step_px)
-
-    def binned(step: StoredStep) -> Binned:
-        capture = step.captures[0]
-        return binning.of(session.average(capture), capture.exposure_s)
-
+    shown = np.zeros((0, crop.rows, crop.columns, 3), np.uint8)
     if not white or not dark:
         nothing, none = np.zeros((0, 3, 1, 1)), np.zeros(0)
-        shots = Binned(nothing, nothing, nothing, nothing > 0, none, none)
-        return BackscatterData(shots, np.zeros((0, crop.rows, crop.columns, 3), np.uint8), crop, ())
-    shown = [crop.of(session.picture(subject)) for _, subject in others]
-    return BackscatterData(
-        Binned.joined([binned(step) for step in (white[0], *(step for step, _ in others), dark[0])]),
-        np.stack(shown) if shown else np.zeros((0, crop.rows, crop.columns, 3), np.uint8),
-        crop,
-        tuple(step.id for step, _ in others),
+        return BackscatterData(Binned(nothing, nothing, nothing, nothing > 0, none, none), shown, crop, ())
+    shots = [
+        binned(session.average(step.captures[0]), step.captures[0].exposure_s, noise, shading, bins, clipped)
+        for step in (white[0], *(step for step, _ in others), dark[0])
+    ]
+    shown = np.concatenate([shown, *(crop.of(session.picture(subject))[None] for _, subject in others)])
+    return BackscatterData(Binned.joined(shots), shown, crop, tuple(step.id for step, _ in others))
+
+
+def binned(
+    average: Average,
+    exposure_s: float,
+    noise: Noise,
+    shading: Float[np.ndarray, "rows columns"],
+    bins: Bins,
+    most: float,
+) -> Binned:
+    """One shot in bins, from its average in DN; from the fraction ``most`` of saturation on, means count as clipped."""
+    gain = float(np.asarray(noise.K_DN_per_e))
+    to_rate = 1.0 / (exposure_s * shading)
+    signal_e = (average.mean - float(np.asarray(noise.black_DN))) / gain
+    clipped = average.mean >= most * float(np.asarray(noise.saturation_DN))
+    # Variance in the dark, e-^2: that of a row's offset, and that of each sample by itself.
+    row_e2 = float(np.asarray(noise.sigma_row_DN / noise.K_DN_per_e)) ** 2
+    rest_e2 = max(float(np.asarray(variance_e(noise, np.zeros(()), np.float64(exposure_s)))) - row_e2, 0.0)
+    per_frame = to_rate**2 / average.frames
+    expected = np.maximum(signal_e, 0.0) + rest_e2
+    scatter = average.variance.mean(dtype=np.float64) / gain**2 / expected.mean()
+    return Binned(
+        rate=bins.mean(signal_e * to_rate)[None],
+        shot=bins.variance(to_rate / average.frames)[None],
+        rest=(rest_e2 * bins.variance(per_frame) + row_e2 * bins.row_variance(per_frame))[None],
+        clipped=(bins.mean(clipped.astype(np.float64)) > 0)[None],
+        exposure_s=np.array([exposure_s]),
+        scatter=np.array([scatter], dtype=np.float64),
     )
-
-
-@final
-@dataclass(frozen=True)
-class Binning:
-    """How averages become rates in bins: the noise of single samples, and the wire's map, which is divided out."""
-
-    noise: Noise
-    shading: Float[np.ndarray, "rows columns"]
-    cfa: str
-    step: int
-
-    def of(self, average: Average, exposure_s: float) -> Binned:
-        """One shot in bins, from its average in DN."""
-        noise, bins = self.noise, Bins(self.cfa, self.step)
-        gain = float(np.asarray(noise.K_DN_per_e))
-        to_rate = 1.0 / (exposure_s * self.shading)
-        signal_e = (average.mean - float(np.asarray(noise.black_DN))) / gain
-        clipped = average.mean >= _CLIPPED * float(np.asarray(noise.saturation_DN))
-        # Variance in the dark, e-^2: what a row's samples share, and the rest.
-        row_e2 = float(np.asarray(noise.sigma_row_DN / noise.K_DN_per_e)) ** 2
-        rest_e2 = max(float(np.asarray(variance_e(noise, np.zeros(()), np.float64(exposure_s)))) - row_e2, 0.0)
-        per_frame = to_rate**2 / average.frames
-        expected = np.maximum(signal_e, 0.0) + rest_e2
-        scatter = average.variance.mean(dtype=np.float64) / gain**2 / expected.mean()
-        return Binned(
-            rate=bins.mean(signal_e * to_rate)[None],
-            shot=bins.variance(to_rate / average.frames)[None],
-            rest=(rest_e2 * bins.variance(per_frame) + row_e2 * bins.row_variance(per_frame))[None],
-            clipped=(bins.mean(clipped.astype(np.float64)) > 0)[None],
-            exposure_s=np.array([exposure_s]),
-            scatter=np.array([scatter], dtype=np.float64),
-        )
-
-
-@final
-@dataclass(frozen=True)
-class Bins:
-    """Averages of a mosaic over blocks of ``step`` x ``step`` (even) pixels, colour by colour.
-
-    A sample of a colour stands for the 2 x 2 pixels around it and counts by the part of them inside the block: then
-    every colour's average is of the block's centre, though its samples are not.
-    """
-
-    cfa: str
-    step: int
-
-    def mean(self, mosaic: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray, "3 grid_rows grid_columns"]:
-        """Averages of the samples."""
-        return self._sum(mosaic, 1, 1)
-
-    def variance(self, mosaic: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray, "3 grid_rows grid_columns"]:
-        """Variances of the averages from those of the samples, each by itself."""
-        return self._sum(mosaic, 2, 2)
-
-    def row_variance(self, mosaic: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray, "3 grid_rows grid_columns"]:
-        """The same where the samples of a row go up and down together."""
-        return self._sum(mosaic, 2, 1)
-
-    def _sum(self, mosaic: np.ndarray, row_power: int, column_power: int) -> Float[np.ndarray, "3 a b"]:
-        sums = np.zeros((3, *(size // self.step for size in mosaic.shape)))
-        cells = np.asarray(cell_channels(self.cfa))
-        # A colour with two samples in a cell averages them.
-        share = 1.0 / np.bincount(cells.ravel(), minlength=3) ** max(row_power, column_power)
-        for (j, i), channel in np.ndenumerate(cells):
-            part = mosaic[j::2, i::2].astype(np.float64)
-            by_row, by_column = (
-                sparse.csr_array(block_weights(samples, size // self.step, self.step, first) ** power)
-                for samples, size, first, power in zip(
-                    part.shape, mosaic.shape, (j, i), (row_power, column_power), strict=True
-                )
-            )
-            sums[channel] += share[channel] * (by_column @ (by_row @ part).T).T
-        return sums
-
-
-def block_weights(samples: int, blocks: int, step: int, first: int) -> Float[np.ndarray, "blocks samples"]:
-    """Weights of the samples at ``first``, ``first`` + 2, ... px in the averages over blocks of ``step`` px.
-
-    A sample covers one pixel to either side of it; what the sensor's edge cuts off, the others of the block take over.
-    """
-    centre = first + 2.0 * np.arange(samples)
-    edge = step * np.arange(blocks)[:, None] - 0.5
-    overlap = np.minimum(centre + 1, edge + step) - np.maximum(centre - 1, edge)
-    weights = np.maximum(overlap, 0.0)
-    return np.asarray(weights / weights.sum(axis=1, keepdims=True))
 
 
 def grid_step(rig: RigDescription) -> int:
@@ -226,14 +213,19 @@ def grid_step(rig: RigDescription) -> int:
 
 @in_float64
 def visible_crop(geometry: Geometry, rig: RigDescription) -> PanelCrop:
-    """The part of the panel that any sensor pixel may see, with room for the tolerances of the mounting."""
-    camera, panel = rig.camera, rig.panel
+    """The part of the panel that any sensor pixel may see, with room for the tolerances of the mounting.
+
+    Args:
+        geometry: where rays go.
+        rig: gives the panel's size and the nominal footprints.
+    """
+    camera, panel, room_px = rig.camera, rig.panel, 12
     edge_x, edge_y = np.linspace(0, camera.columns - 1, 9), np.linspace(0, camera.rows - 1, 9)
     pixels = np.stack(np.meshgrid(edge_x, edge_y), axis=-1).reshape(-1, 2)
     template = nominal_backscatter(geometry, rig, np.zeros((3, 1, 1)), grid_step(rig), window=1)
     middle = corners_of(template, linear_of(prior_of(rig).mean), directions(geometry, pixels))
-    first = np.clip(middle.min(axis=0) - _MARGIN_PX, 0, [panel.columns - 8, panel.rows - 8])
-    last = np.clip(middle.max(axis=0) + _MARGIN_PX + 1, first + 8, [panel.columns, panel.rows])
+    first = np.clip(middle.min(axis=0) - room_px, 0, [panel.columns - 8, panel.rows - 8])
+    last = np.clip(middle.max(axis=0) + room_px + 1, first + 8, [panel.columns, panel.rows])
     return PanelCrop(int(first[0]), int(first[1]), int(last[0] - first[0]), int(last[1] - first[1]))
 
 

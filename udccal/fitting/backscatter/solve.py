@@ -1,37 +1,47 @@
-"""The most probable parameters of an order: the problem, its errors as the engine sees them, and the descent."""
+"""Likelihood of the backscatter term, and the most probable parameters of an order.
+
+Light of shot i at a position and colour is  y_i = m r_i + u_i d + noise: r_i is the picture's light over that of white
+(1 for white itself, 0 for the dark frame), m the mask and d the dark signal there, u_i the dark frame's exposure over
+the shot's. m and d have no prior and enter linearly: they are profiled out exactly, bin by bin, so that the noise of
+white and dark, which all pictures of a bin depend on, is weighed as it should be. Variances are of the model: shot
+noise, what is left in the dark, and (e m)^2 for what the model leaves undescribed, e the model error relative to white.
+"""
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import final
 
+import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from udccal.fitting.backscatter.data import BackscatterData, grid_step, sampled_rays
-from udccal.fitting.backscatter.likelihood import PerBin, PerShot, Profile, Samples, of_all_shots
+from udccal.fitting.backscatter.data import BackscatterData, Binned, grid_rays, grid_step, sampled_rays
+from udccal.fitting.backscatter.model import (
+    Moves,
+    PerShot,
+    Pictures,
+    Profile,
+    Rays,
+    Usable,
+    Windows,
+    ratios,
+    ratios_and_jacobian,
+    window_for,
+)
 from udccal.fitting.backscatter.parameters import (
     OFFSET,
-    TWO_PLANES,
+    BackscatterRules,
     Order,
     Vector,
     linear_of,
     linear_slope,
-    offset_reach_px,
     prior_of,
+    with_linear,
 )
-from udccal.fitting.backscatter.ratios import (
-    Windows,
-    best_offset,
-    corners_of,
-    ratios,
-    ratios_and_jacobian,
-    window_for,
-    with_room,
-)
-from udccal.fitting.backscatter.rules import BackscatterRules
-from udccal.fitting.engine.gaussian import Prior
+from udccal.fitting.engine.gaussian import Posterior, Prior, square_root
 from udccal.fitting.engine.least_squares import Blocks, SolverRules, Step, minimise
 from udccal.fitting.nominal import nominal_backscatter
 from udccal.models.backscatter import Backscatter
@@ -39,44 +49,11 @@ from udccal.models.geometry import Geometry
 from udccal.numerics import in_float64
 from udccal.rig import RigDescription
 
+# Bins so far apart are never interpolated between.
+_TILE = 4
+_with_linear = jax.jit(with_linear)
 # Parameters in the solver's coordinates to whitened errors and their Jacobian.
 ErrorsAt = Callable[[Vector], tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m 18"]]]
-
-
-@final
-@dataclass(frozen=True)
-class SampleErrors:
-    """Errors of samples as a function of the parameters: windows on the panel stay where they are."""
-
-    template: Backscatter
-    samples: Samples
-    weight: PerShot
-    at: Windows
-    logs: Float[np.ndarray, "n 3 pictures window2"]
-
-    @classmethod
-    def of(
-        cls,
-        template: Backscatter,
-        samples: Samples,
-        weight: PerShot,
-        corner: Int[np.ndarray, "n 2"],
-    ) -> SampleErrors:
-        """With windows from these corners on."""
-        at = Windows.at(template.window, samples.rays, corner, samples.shown)
-        return cls(template, samples, weight, at, at.logs(samples.shown))
-
-    def ratios(self, x: Vector) -> tuple[PerShot, Float[np.ndarray, "18 shots 3 n"]]:
-        """Light over that of white, and its derivatives by the solver's coordinates."""
-        ratio, jacobian = ratios_and_jacobian(self.template, linear_of(x), self.at, self.logs)
-        return of_all_shots(ratio, 1.0), of_all_shots(jacobian * linear_slope(x)[:, None, None, None], 0.0)
-
-    def __call__(self, x: Vector) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m 18"]]:
-        """Whitened errors, mask and dark at their best, and their Jacobian."""
-        ratio, of_ratio = self.ratios(x)
-        best = Profile.of(ratio, self.samples, self.weight)
-        errors = best.errors(ratio, self.samples) * self.weight
-        return errors.ravel(), best.jacobian(of_ratio).reshape(len(x), -1).T
 
 
 @final
@@ -88,7 +65,6 @@ class MostProbable:
     cov: Float[np.ndarray, "18 18"]
     cost: float
     converged: bool
-    iterations: int
 
 
 @final
@@ -113,73 +89,65 @@ class _Free:
 
 @in_float64
 def most_probable(
-    errors_at: ErrorsAt,
-    start: Vector,
-    free: Bool[np.ndarray, "18"],
-    prior: Prior,
-    rules: SolverRules | None = None,
+    errors_at: ErrorsAt, start: Vector, free: Bool[np.ndarray, "18"], prior: Prior, rules: SolverRules | None = None
 ) -> MostProbable:
     """Where errors and prior together are least, over the free parameters."""
     problem = _Free(errors_at, free, Prior(prior.mean[free], prior.root[:, free]))
     found, cov = minimise(problem, start, rules), np.zeros((len(free), len(free)))
-    cost = found.equations.cost
-    if np.isfinite(cost):
+    if np.isfinite(found.equations.cost):
         cov[np.ix_(free, free)] = found.equations.cov()
-    return MostProbable(found.place, cov, cost, found.converged, found.iterations)
+    return MostProbable(found.place, cov, found.equations.cost, found.converged)
 
 
 @final
 @dataclass(frozen=True)
 class Fitted:
-    """Parameters and what follows from them at some positions; ``errors`` are measured less modelled rates."""
+    """An order's parameters, and what they make of the samples with mask and dark at their best."""
 
+    order: Order
     found: MostProbable
-    corner: Int[np.ndarray, "n 2"]
+    at: Windows
     ratio: PerShot
-    mask: PerBin
-    errors: PerShot
-    weight: PerShot
-
-    @classmethod
-    def of(
-        cls, found: MostProbable, corner: Int[np.ndarray, "n 2"], ratio: PerShot, samples: Samples, weight: PerShot
-    ) -> Fitted:
-        """With mask and dark at their best."""
-        best = Profile.of(ratio, samples, weight)
-        return cls(found, corner, ratio, best.mask, best.errors(ratio, samples), weight)
-
-    def reweighed(self, samples: Samples, weight: PerShot) -> Fitted:
-        """The same parameters at other weights."""
-        return Fitted.of(self.found, self.corner, self.ratio, samples, weight)
+    best: Profile
 
     @property
     def light(self) -> PerShot:
         """Modelled light, the dark signal left out."""
-        return self.mask * self.ratio
+        return self.best.mask * self.ratio
 
     @property
     def z(self) -> PerShot:
         """Errors in units of their sigma, 0 where not used."""
-        return self.errors * self.weight
+        return self.best.errors * self.best.weight
 
     @property
-    def chi2(self) -> float:
-        """The prior left out."""
-        return float((self.z**2).sum())
-
-    @property
-    def used(self) -> Bool[np.ndarray, "shots 3 n"]:
+    def used(self) -> Usable:
         """Samples that count, dark left out."""
-        return np.concatenate([self.weight[:-1] > 0, np.zeros((1, *self.mask.shape), dtype=bool)])
+        used = self.best.weight > 0
+        used[-1] = False
+        return used
+
+    def weighed(self, weight: PerShot) -> Fitted:
+        """The same, mask and dark too, looked at with other weights."""
+        return replace(self, best=replace(self.best, weight=weight))
+
+    def dof(self, prior: Prior) -> float:
+        """Samples less one mask per bin (the dark signal has a sample of its own) less parameters."""
+        # A parameter that its prior holds takes less than one.
+        narrowed = np.where(self.order.free, np.diag(self.found.cov) / prior.sigma**2, 1.0)
+        used = self.used
+        return max(float(used.sum() - used.any(axis=0).sum() - np.maximum(1.0 - narrowed, 0.0).sum()), 1.0)
 
 
 @final
 @dataclass(frozen=True)
 class Problem:
-    """What all orders share; ``flat`` are the grid indices of the positions."""
+    """What all orders have in common; ``flat`` are the grid indices of the positions, ``rays`` in panel coordinates."""
 
     template: Backscatter
-    samples: Samples
+    seen: Binned
+    shown: Pictures
+    rays: Rays
     flat: Int[np.ndarray, " n"]
     prior: Prior
     start: Vector
@@ -189,32 +157,125 @@ class Problem:
     def of(
         cls, data: BackscatterData, geometry: Geometry, rig: RigDescription, rules: BackscatterRules | None = None
     ) -> Problem:
-        """Samples at positions spread over the sensor, with a start found by scanning."""
+        """Samples at positions spread over the sensor; the start is at the best offset of whole panel pixels."""
         rules, step, prior = rules or BackscatterRules(), grid_step(rig), prior_of(rig)
         rays, flat = sampled_rays(geometry, rig, step, rules.positions)
         # The mask comes out of the likelihood; the template's is of no size.
         template = nominal_backscatter(geometry, rig, np.zeros((3, 1, 1)), step, window=1)
         template = replace(template, window=window_for(template, linear_of(prior.mean), rays, rules.slack_px))
-        samples = Samples.at(data, rays, flat, data.pictures)
-        weight, start = samples.first_weights(), prior.mean.copy()
-        lit = samples.excess[0] * weight[0] > 1.0
-        white = np.where(lit, samples.excess[0], 1.0)
-        ratio, weight = (np.where(lit, part, 0.0)[1:-1] for part in (samples.excess / white, weight * white))
-        theta = linear_of(TWO_PLANES.without_crosstalk().start(prior.mean, prior))
-        start[OFFSET] = best_offset(template, theta, rays, samples.shown, ratio, weight, offset_reach_px(rig))
-        return cls(template, samples, flat, prior, start, rules)
+        seen, shown, start = data.shots.at(flat), data.pictures, prior.mean.copy()
+        weight = seen.first_weights()
+
+        def cost(offset: tuple[int, int]) -> float:
+            start[OFFSET] = offset
+            at = Windows.around(template, linear_of(start), rays, shown.crop)
+            return seen.profile(ratios(template, linear_of(start), at, shown), weight).chi2
+
+        across, down = (range(-int(np.ceil(reach)), int(np.ceil(reach)) + 1) for reach in prior.sigma[OFFSET])
+        start[OFFSET] = min(((x, y) for y in down for x in across), key=cost)
+        return cls(template, seen, shown, rays, flat, prior, start, rules)
 
     def solved(self, order: Order, x: Vector, weight: PerShot) -> Fitted:
         """The most probable parameters of an order at given weights, from ``x`` on."""
         start = order.start(x, self.prior)
-        corner = corners_of(self.template, linear_of(start), self.samples.rays)
-        errors_at = SampleErrors.of(self.template, self.samples, weight, corner)
-        found = most_probable(errors_at, start, order.free, self.prior, self.rules.solver)
-        ratio = of_all_shots(ratios(self.template, linear_of(found.x), errors_at.at, self.samples.shown), 1.0)
-        return Fitted.of(found, corner, ratio, self.samples, weight)
+        at = Windows.around(self.template, linear_of(start), self.rays, self.shown.crop)
+        found = most_probable(self.errors_at(weight, at), start, order.free, self.prior, self.rules.solver)
+        ratio = ratios(self.template, linear_of(found.x), at, self.shown)
+        return Fitted(order, found, at, ratio, self.seen.profile(ratio, weight))
+
+    def ratios(self, x: Vector, at: Windows) -> tuple[PerShot, Moves]:
+        """Light over that of white, and its derivatives by the solver's coordinates."""
+        ratio, jacobian = ratios_and_jacobian(self.template, linear_of(x), at, self.shown)
+        return ratio, jacobian * linear_slope(x)[:, None, None, None]
+
+    def errors_at(self, weight: PerShot, at: Windows) -> ErrorsAt:
+        """Whitened errors, mask and dark at their best, and their Jacobian; windows stay where they are."""
+
+        def of(x: Vector) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m 18"]]:
+            ratio, of_ratio = self.ratios(x, at)
+            best = self.seen.profile(ratio, weight)
+            return (best.errors * weight).ravel(), best.jacobian(of_ratio).reshape(len(x), -1).T
+
+        return of
 
     def with_room(self, x: Vector) -> Problem:
-        """With windows that hold the footprints of these parameters."""
-        rules = self.rules
-        wider = with_room(self.template, linear_of(x), self.samples.rays, rules.slack_px, rules.most_wider)
-        return replace(self, template=wider)
+        """With windows that let the footprints of these parameters move, unless the fit has gone far astray."""
+        theta, rules, template = linear_of(x), self.rules, self.template
+        if not template.window < window_for(template, theta, self.rays, 0.0) <= rules.most_wider * template.window:
+            return self
+        window = window_for(template, theta, self.rays, rules.slack_px)
+        return replace(self, template=replace(template, window=window))
+
+
+@final
+@dataclass(frozen=True)
+class TermAt:
+    """The term as a function of its parameters (``linear_of``), and of ``_TILE`` squared numbers of the mask's noise.
+
+    The mask is the best one for all shots, which know it better than white alone. It follows the parameters linearly.
+    Bins with the same number are so far from each other that nothing interpolated depends on two of them, and go up
+    and down by chance, so that sums over the sensor are right on average.
+    """
+
+    template: Backscatter
+    data: BackscatterData
+    used: Bool[np.ndarray, " shots"]
+    model_error: float
+    theta: Vector
+
+    @in_float64
+    def __call__(self, parameters: Float[np.ndarray, " n"]) -> Backscatter:
+        """The term, its mask never below 0."""
+        theta, noise = parameters[: len(self.theta)], parameters[len(self.theta) :].reshape(_TILE, _TILE)
+        mask, sigma = self._mask
+        rows, columns = mask.shape[1:]
+        mask = mask + sigma * np.tile(noise, (-(-rows // _TILE), -(-columns // _TILE)))[:rows, :columns]
+        if (moved := theta - self.theta).any():
+            mask = mask + np.einsum("k,kcij->cij", moved, self._mask_jacobian)
+        with_parameters = _with_linear(self.template, theta)
+        term = jax.tree.map(lambda leaf: np.asarray(leaf, dtype=np.float64), with_parameters)
+        return replace(term, geometry=self.template.geometry, mask=np.maximum(mask, 0.0))
+
+    @functools.cached_property
+    def _mask(self) -> tuple[Float[np.ndarray, "3 a b"], Float[np.ndarray, "3 a b"]]:
+        """Light of white over the whole grid, and one sigma of it, whose sign is drawn."""
+        found = [self._best(flat)[1] for flat in self._parts(4096)]
+        mask = np.concatenate([one.mask for one in found], axis=1)
+        sigma = np.concatenate([np.maximum(one.information, 1e-30) for one in found], axis=1) ** -0.5
+        sign = np.random.default_rng(0).choice([-1.0, 1.0], mask.shape)
+        shape = self.data.shots.rate.shape[1:]
+        return np.maximum(mask, 0.0).reshape(shape), (sign * sigma).reshape(shape)
+
+    @functools.cached_property
+    def _mask_jacobian(self) -> Float[np.ndarray, "18 3 a b"]:
+        """How the mask follows the parameters: worked out for those who ask how sure the term is."""
+        parts = []
+        for flat in self._parts(256):
+            at, best = self._best(flat)
+            of_ratio = ratios_and_jacobian(self.template, self.theta, at, self.data.pictures)[1]
+            parts.append(best.mask_jacobian(of_ratio))
+        return np.concatenate(parts, axis=2).reshape(-1, *self.data.shots.rate.shape[1:])
+
+    def _parts(self, size: int) -> list[Int[np.ndarray, " n"]]:
+        """As many grid positions as are held in memory at a time."""
+        flat = np.arange(self.data.shots.rate[0, 0].size)
+        return np.split(flat, flat[size::size])
+
+    def _best(self, flat: Int[np.ndarray, " n"]) -> tuple[Windows, Profile]:
+        """Windows, and mask and dark signal, once by weights of what was measured, then by those of the model."""
+        rays = grid_rays(self.template.geometry, self.data.shots.rate.shape[2:], self.template.step, flat)
+        at = Windows.around(self.template, self.theta, rays, self.data.crop)
+        seen = self.data.shots.at(flat)
+        usable = seen.usable & self.used[:, None, None]
+        ratio = ratios(self.template, self.theta, at, self.data.pictures)
+        best = seen.profile(ratio, np.where(usable, seen.first_weights(), 0.0))
+        for _ in range(2):
+            best = seen.profile(ratio, seen.weights(best.mask * ratio, best.mask, self.model_error, usable))
+        return at, best
+
+    def posterior(self, cov: Float[np.ndarray, "18 18"]) -> Posterior[Backscatter]:
+        """With this covariance of the parameters, and the mask's noise."""
+        count, noise = len(cov), _TILE**2
+        factor = np.eye(count + noise)
+        factor[:count, :count] = square_root(cov)
+        return Posterior(np.concatenate([self.theta, np.zeros(noise)]), factor, self)

@@ -131,11 +131,11 @@ def square_root(cov: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
 
 
 def scaled_inverse(matrix: Float[np.ndarray, "*k n n"], rcond: float = 1e-12) -> Float[np.ndarray, "*k n n"]:
-    """Inverse of symmetric matrices of very unlike scales; what they do not tell at all comes back as zero.
+    """Inverse of symmetric matrices of very unlike scales; what they do not determine comes back as zero.
 
     Args:
         matrix: positive semi-definite.
-        rcond: eigenvalues of the matrix with a unit diagonal below this share of the largest count as none.
+        rcond: eigenvalues of the matrix with a unit diagonal below this part of the largest count as none.
     """
     size = np.sqrt(np.maximum(np.einsum("...ii->...i", matrix), 0.0))
     unit = np.where(size > 1e-150, size, np.inf)

@@ -1,4 +1,4 @@
-"""Where every solver tells its iterations, at level DEBUG: `udccal fit --log`, or logging's own settings."""
+"""Where every solver logs its iterations, at level DEBUG: `udccal fit --log`, or logging's own settings."""
 
 from __future__ import annotations
 

@@ -90,7 +90,6 @@ def excess_sigma(
     noise: Float[np.ndarray, " n"],
     unit: Float[np.ndarray, " n"],
     dof: float,
-    constant: float = 0.0,
     chance: float = SIGNIFICANT,
 ) -> float:
     """Size of an error beside noise that brings chi-squared to its degrees of freedom; 0 unless it is significant.
@@ -102,26 +101,44 @@ def excess_sigma(
         noise: variance of each.
         unit: variance that an error of size 1 adds to each.
         dof: degrees of freedom.
-        constant: chi-squared of data that have no such error.
         chance: how often chance may find an error where there is none; 0.5 gives an estimate wherever one is above 0.
     """
-    if not unit.any() or chi2_tail(float((square / noise).sum()) + constant, dof) > chance:
+    if not unit.any() or chi2_tail(float((square / noise).sum()), dof) > chance:
         return 0.0
-    return _halved(square, unit, lambda size: float((square / (noise + size**2 * unit)).sum()) + constant > dof)
+    return _halved(square, unit, lambda size: float((square / (noise + size**2 * unit)).sum()) > dof)
 
 
 def robust_excess_sigma(
     square: Float[np.ndarray, " n"], noise: Float[np.ndarray, " n"], unit: Float[np.ndarray, " n"]
 ) -> float:
-    """The same, significant or not, by half of the residuals being below their probable error: outliers have no say.
+    """The same, significant or not, by half of the residuals being below their probable error: outliers do not count.
 
-    Args:
-        square: of residuals.
-        noise: variance of each.
-        unit: variance that an error of size 1 adds to each.
+    Arguments as for ``excess_sigma``.
     """
     probable = MAD_TO_SIGMA**-2
     return _halved(square, unit, lambda size: float(np.median(square / (noise + size**2 * unit))) > probable)
+
+
+def excess_variance(
+    observed: Float[np.ndarray, " n"], known: Float[np.ndarray, " n"], dof: Float[np.ndarray, " n"]
+) -> tuple[float, float, float]:
+    """Variance that chi-squared estimates have beside a known part, by maximum likelihood; not below 0.
+
+    Args:
+        observed: estimates of a variance.
+        known: part of each that has another cause, in the same unit.
+        dof: degrees of freedom of each.
+
+    Returns:
+        the variance, its own variance, and what the likelihood gains by it (minus twice the logarithm).
+    """
+    known = known + 1e-12 * float(observed.max()) + 1e-300
+    found = float(np.average(observed, weights=dof))
+    for _ in range(50):
+        found = max(float(np.average(observed - known, weights=dof / (found + known) ** 2)), 0.0)
+    without, total = observed / known, observed / (found + known)
+    gain = np.sum(dof * (np.log(known) + without - np.log(found + known) - total))
+    return found, float(2 / np.sum(dof / (found + known) ** 2)), float(gain)
 
 
 def _halved(

@@ -97,7 +97,7 @@ def evidence(
     A parameter that the data cannot tell costs nothing and stays, with its true error bar.
 
     Args:
-        cost: chi-squared at the minimum, the prior's share included.
+        cost: chi-squared at the minimum, what the prior adds included.
         cov: of the free parameters, after the data.
         prior_sigma: of the same.
         against: -2 ln of how probable the order is beforehand.
@@ -119,3 +119,40 @@ def held_out_beats(
     gain = before - losses
     doubt = float(gain.std(ddof=1) / np.sqrt(gain.size)) if gain.size > 1 else np.inf
     return float(gain.mean()) > max(doubt, worth)
+
+
+@final
+@dataclass(frozen=True)
+class Quantity:
+    """A value with its variance; where ``there`` is False the data do not ask for it and the value is that without."""
+
+    value: float
+    variance: float
+    there: bool = True
+    candidates: tuple[Candidate, ...] = ()
+
+    @classmethod
+    def asked(
+        cls, name: str, value: float, variance: float, samples: int, gain: float | None = None, without: float = 0.0
+    ) -> Quantity:
+        """The value where the likelihood gains more by it (minus twice the logarithm) than BIC asks.
+
+        Args:
+            name: for the table of candidates.
+            value, variance: as the data have them; the variance is kept where the value is not.
+            samples: data that bear on it.
+            gain: of the likelihood; by default that of a normal estimate, which is none below 0.
+            without: the value where the data do not ask for it.
+        """
+        own = value**2 / variance if value > 0 and variance > 0 else 0.0
+        simple = Attempt(f"without {name}", 0, own if gain is None else gain, without)
+        choice = choose((simple, Attempt(f"with {name}", 1, bic(0.0, 1.0, samples), value)))
+        return cls(choice.best.fit, variance, choice.best.parameters > 0, choice.candidates)
+
+    def root(self) -> tuple[float, float]:
+        """Where the value is a variance: the standard deviation, and its derivative by the variance.
+
+        Where the value is lost in its error the root is that far from zero at most, not to first order.
+        """
+        value, error = float(np.sqrt(max(self.value, 0.0))), float(np.sqrt(self.variance))
+        return value, 0.5 / value if value**2 > error else float(1 / np.sqrt(max(error, 1e-300)))

@@ -1,7 +1,7 @@
 """Samples that no noise explains: what they count for in a fit, and by which rule they are left out.
 
 One contract for all terms: an ``OutlierRule`` compares residuals in units of their sigma with the residuals' own robust
-scatter, so that noise larger than stated makes no outliers of all. Five robust sigma leave out one of two million
+scatter, so that noise larger than expected makes no outliers of all. Five robust sigma leave out one of two million
 normal samples.
 """
 
@@ -42,7 +42,7 @@ class OutlierRule:
     sigma: float = 5.0
 
     def off(self, z: Float[np.ndarray, "*n"], used: Bool[np.ndarray, "*n"] | None = None) -> Bool[np.ndarray, "*n"]:
-        """Which of the residuals, in units of their stated sigma, are too far off; the scatter is of those ``used``."""
+        """Which of the residuals, in units of their sigma, are too far off; the scatter is of those ``used``."""
         scatter = max(1.0, robust_sigma(z if used is None else z[used]))
         off = ~(np.abs(z) <= self.sigma * scatter)
         return np.asarray(off if used is None else off & used)

@@ -6,7 +6,7 @@ One view shows the board parallel to the panel. Its axes are then the panel's, s
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
 
 import jax
@@ -27,15 +27,8 @@ from udccal.models.geometry import Geometry, panel_directions, project_direction
 from udccal.numerics import in_float64
 from udccal.result import Diagnostic, FitResult, FitStatus, Outliers
 
-ANGLE_NAMES = ("tilt_deg", "roll_deg", "yaw_deg")
 # Scatter beside noise of the board on the jig, and of the median view of others: a plan reads them.
 ON_JIG, BY_HAND = "corner_scatter_on_jig", "corner_scatter_by_hand"
-# No lens follows its model more closely than this.
-_LEAST_PX = 1e-3
-# The scatter of corners is settled when it changes by less than this part.
-_SETTLED = 0.05
-# Radians over which an angle's derivative is taken.
-_STEP_RAD = 1e-5
 
 
 def fit_boards(data: GeometryData, rules: GeometryRules | None = None) -> FitResult[Geometry]:
@@ -54,7 +47,7 @@ def fit_boards(data: GeometryData, rules: GeometryRules | None = None) -> FitRes
     """
     rules = rules or GeometryRules()
     usable = [view for view in data.views if view.usable(rules)]
-    notes = _lost(data.views, rules)
+    notes = tuple(_lost(data.views, rules))
     least = rules.least_views if data.prior is None else 1
     parallel = sum(view.parallel for view in usable)
     if len(usable) < least or not parallel:
@@ -78,18 +71,13 @@ def projection_sigma_px(result: FitResult[Geometry], pixels: Float[np.ndarray, "
         FitError: when the fit failed, or was read from a profile.
     """
     directions = _directions(result.term, pixels)
-    return result.sigma_of(lambda term: np.asarray(_places(term, directions)))
-
-
-_places = jax.jit(project_directions)
+    places = jax.jit(project_directions)
+    return result.sigma_of(lambda term: np.asarray(places(term, directions)))
 
 
 @in_float64
 def _directions(term: Geometry, pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 3"]:
-    return np.asarray(_jitted_directions(term, pixels))
-
-
-_jitted_directions = jax.jit(panel_directions)
+    return np.asarray(jax.jit(panel_directions)(term, pixels))
 
 
 def _calibrated(
@@ -97,13 +85,13 @@ def _calibrated(
 ) -> tuple[CalibratedViews, Float[np.ndarray, " n"]]:
     """The bundle, and the scatter beside noise in px by axis: of all views together, then of each in use."""
     points = [board_points_mm(view.spec)[view.corners.ids] for view in views]
-    scatter_px = np.full(1, rules.start_scatter_px)
-    for _ in range(rules.rounds):
-        sigmas = [np.maximum(np.hypot(view.corners.sigma, scatter_px[0]), _LEAST_PX) for view in views]
-        seen = [view.corners.xy for view in views]
+    seen, scatter_px = [view.corners.xy for view in views], np.full(1, rules.start_scatter_px)
+    for _ in range(8):
+        # No lens follows its model more closely than a thousandth of a pixel.
+        sigmas = [np.maximum(np.hypot(view.corners.sigma, scatter_px[0]), 1e-3) for view in views]
         bundle = fit_geometry(points, seen, data.image_size, data.nominal, sigmas, prior=data.prior, rules=rules)
         before, scatter_px = scatter_px, _scatter_px(bundle, views)
-        if abs(scatter_px[0] - before[0]) <= _SETTLED * before[0]:
+        if abs(scatter_px[0] - before[0]) <= 0.05 * before[0]:
             break
     return bundle, scatter_px
 
@@ -112,7 +100,7 @@ def _scatter_px(bundle: CalibratedViews, views: Sequence[BoardView]) -> Float[np
     """The scatter at which residuals have the size that they should; not gated, as plans need the estimate itself."""
     points = bundle.points
     noise = [views[points.names[v]].corners.sigma[k] for v, k in zip(points.view, points.index, strict=True)]
-    variance = np.maximum(np.array(noise), _LEAST_PX) ** 2
+    variance = np.maximum(np.array(noise), 1e-3) ** 2
     square = (bundle.residuals_px**2).sum(axis=1)
     spent = (sum(bundle.free) + 6 * len(points.names)) / (2 * points.used.sum())
     # A floor keeps fits that spend nearly all of their data from having no degrees of freedom.
@@ -123,15 +111,13 @@ def _scatter_px(bundle: CalibratedViews, views: Sequence[BoardView]) -> Float[np
     )
 
 
-def _lost(views: Sequence[BoardView], rules: GeometryRules) -> tuple[str, ...]:
+def _lost(views: Sequence[BoardView], rules: GeometryRules) -> Iterator[str]:
     lost = [view.step_id for view in views if len(view.corners.ids) < rules.least_corners]
     clipped = [view.step_id for view in views if view.clipped > rules.most_clipped]
-    notes = []
     if lost:
-        notes.append(f"No board (fewer than {rules.least_corners} corners) in {', '.join(lost)}.")
+        yield f"No board (fewer than {rules.least_corners} corners) in {', '.join(lost)}."
     if clipped:
-        notes.append(f"More than {rules.most_clipped:.0%} of the samples clipped in {', '.join(clipped)}.")
-    return tuple(notes)
+        yield f"More than {rules.most_clipped:.0%} of the samples clipped in {', '.join(clipped)}."
 
 
 def _result(
@@ -150,7 +136,7 @@ def _result(
         return FitResult.failed("geometry", nominal, FitStatus.TOO_FEW_DATA, *notes, *lost)
     x, cov = with_angles(bundle.intrinsics.vector, bundle.poses, bundle.cov, parallel)
     # A pattern in the residuals moves every place by its size, as a centre does that is off by as much.
-    pattern = bundle.evidence.pattern_px * np.eye(len(x))[:, 2:4]
+    pattern = bundle.evidence.pattern_px * np.asarray(Intrinsics.of(np.eye(LENS, len(x))).principal_point_px).T
     pupil = np.asarray(nominal.pupil_mm, dtype=np.float64)
     posterior = Posterior(x, np.hstack([square_root(cov), pattern]), partial(term_at, pupil=pupil))
     poor = bundle.rms_px > rules.worst_rms_px and bundle.chi2_dof > rules.worst_chi2_dof
@@ -161,7 +147,9 @@ def _result(
         name="geometry",
         term=posterior.term_at(x),
         status=FitStatus.POOR_FIT if poor else bundle.status,
-        estimates=estimates(INTRINSIC_NAMES + ANGLE_NAMES, (*INTRINSIC_UNITS, "deg", "deg", "deg"), x, cov),
+        estimates=estimates(
+            (*INTRINSIC_NAMES, "tilt_deg", "roll_deg", "yaw_deg"), (*INTRINSIC_UNITS, "deg", "deg", "deg"), x, cov
+        ),
         cov=cov,
         chi2_dof=bundle.chi2_dof,
         samples=2 * int(use.sum()),
@@ -192,8 +180,8 @@ def with_angles(
         what ``term_at`` takes; angles in degrees.
     """
     rotation = np.asarray(Rotation.from_rotvec(-poses[parallel, :3]).mean().as_rotvec())
-    steps = _STEP_RAD * np.eye(3)
-    slope = np.array([_angles_deg(rotation + step) - _angles_deg(rotation - step) for step in steps]).T / 2 / _STEP_RAD
+    steps = 1e-5 * np.eye(3)
+    slope = np.array([_angles_deg(rotation + step) - _angles_deg(rotation - step) for step in steps]).T / 2e-5
     picks = np.zeros((LENS + 3, len(cov)))
     picks[:LENS, :LENS] = np.eye(LENS)
     for view in parallel:
@@ -229,11 +217,8 @@ def _diagnostics(
         Diagnostic("corners_used", float(used.sum()), "1"),
         Diagnostic("corners_rejected", float((~used).sum()), "1"),
         Diagnostic("iterations", float(bundle.iterations), "1"),
-        Diagnostic("starts_agreeing", float(bundle.starts_agreeing), "1"),
-        Diagnostic("rms_held_out", evidence.held_out_rms_px, "px"),
-        Diagnostic("rms_held_out_expected", evidence.expected_rms_px, "px"),
         Diagnostic("views_disagree_p", evidence.views.p_value, "1"),
-        Diagnostic("variance_factor", evidence.variance_factor, "1"),
+        Diagnostic("variance_factor", evidence.views.inflation, "1"),
         Diagnostic("residual_pattern_p", evidence.pattern.p_value, "1"),
         Diagnostic("residual_pattern", evidence.pattern_px, "px"),
     )
@@ -254,8 +239,8 @@ def _outliers(
     return (*(other for other in bundle.outliers if all(other.rule != f.rule for f in found)), *found), tuple(sentences)
 
 
-def _held(bundle: CalibratedViews) -> tuple[str, ...]:
-    """What was not fitted."""
+def _held(bundle: CalibratedViews) -> Iterator[str]:
     held = [name for name, free in zip(INTRINSIC_NAMES, bundle.free, strict=True) if not free]
-    fixed = (f"Held at 0, as the data do not ask for it: {', '.join(held)}.",) if held else ()
-    return (*fixed, "Stand-off and panel position are the rig's nominal ones; the wire fit refines them.")
+    if held:
+        yield f"Held at 0, as the data do not ask for it: {', '.join(held)}."
+    yield "Stand-off and panel position are the rig's nominal ones; the wire fit refines them."

@@ -29,11 +29,6 @@ ORDERS = {
     for name, count in (("no distortion", 4), ("k1", 5), ("k1 k2", 6), ("k1 k2 p1 p2", 8), ("k1 k2 p1 p2 k3", 9))
 }
 EVERY = np.ones(LENS, dtype=bool)
-# A descent ends a thousandth of a sigma from the minimum, one that another follows a tenth.
-_SOLVER, _ROUGH = SolverRules(least_gain=1e-6, iterations=60), SolverRules(least_gain=1e-2, iterations=60)
-# Each intrinsic gets this part of the information that known poses would bring: what views do not tell at all has then
-# a very large variance, not none. It is above rounding, and moves no sigma of what they do tell.
-_RIDGE = 1e-11
 
 
 @final
@@ -42,30 +37,27 @@ class GeometryRules:
     """What the fit of lens and boards goes by.
 
     Attributes:
-        least_views: usable views that may tell a lens; with a prior, one tells at least its pose.
+        least_views: usable views that may determine a lens; with a prior, one determines at least its pose.
         least_corners: of a usable view. Four hold a homography; two more tell whether it is the right one.
         most_clipped: part of a board's samples at saturation. Beyond it edges have bloomed.
         clipped: samples from this part of saturation on count as clipped.
         least_response: samples with less than this part of the flat field are dead, or behind an opaque row.
         centre_sigma: lenses sit on their sensors' middles to about this part of the width.
         distortion_sigma: of (k1, k2, p1, p2, k3) of lenses that the model describes.
-        default_sigma_px: of points without one; their scatter then sets the scale.
         robust: how residuals count on the way from a start that may be far off.
         corners: which corners are left out, compared with their view's own scatter.
         strange_view: a view is left out whole when it scatters this many times as much as the median view.
         loud_view: a view is mentioned when it scatters this many times as much.
-        rounds: at most, of each loop that estimates scatter or leaves out corners again.
         further_order: odds before any data against each further order of the distortion: a coefficient that is not
             there costs the others much of their certainty.
         prior_share: beyond this part of the information on focal length or centre, the prior chooses the order.
-        most_uncertain: sigma of focal length (of itself) and centre (of the width) that count as not told; beyond it
-            the model is not linear over a sigma.
+        most_uncertain: sigma of focal length (of itself) and centre (of the width) beyond which the views do not
+            determine the lens; the model is not linear over such a sigma.
         worst_rms_px, worst_chi2_dof: beyond both, the fit is poor.
         pattern_cells: on a side of the grid that residuals are averaged over.
         start_scatter_px: of corners beside their noise, before it is estimated.
         marker_margin, window_squares: radius of a corner's window, of the distance to the markers and of a square.
         window_px: least and largest radius.
-        saddle_rounds: of Gauss-Newton on each corner.
         least_contrast: half the step at a corner over what the saddle leaves of the samples.
         worst_corner_sigma_px: of a corner by noise.
     """
@@ -77,12 +69,10 @@ class GeometryRules:
     least_response: float = 0.05
     centre_sigma: float = 0.01
     distortion_sigma: tuple[float, ...] = (0.2, 0.2, 1e-3, 1e-3, 0.1)
-    default_sigma_px: float = 0.1
     robust: Cauchy = field(default_factory=Cauchy)
     corners: OutlierRule = field(default_factory=lambda: OutlierRule("corners"))
     strange_view: float = 20.0
     loud_view: float = 3.0
-    rounds: int = 8
     further_order: float = 10.0
     prior_share: float = 0.1
     most_uncertain: float = 0.05
@@ -93,7 +83,6 @@ class GeometryRules:
     marker_margin: float = 0.9
     window_squares: float = 0.4
     window_px: tuple[float, float] = (4.0, 25.0)
-    saddle_rounds: int = 12
     least_contrast: float = 6.0
     worst_corner_sigma_px: float = 1.0
 
@@ -101,21 +90,23 @@ class GeometryRules:
 @final
 @dataclass(frozen=True)
 class Intrinsics:
-    """A lens; as one vector (fx, fy, cx, cy, k1, k2, p1, p2, k3), the order of ``INTRINSIC_NAMES``.
+    """A lens, or something else (a sigma, a row of a matrix) of each of its nine numbers.
+
+    ``of`` and ``vector`` alone know where each is in a vector, whose order is ``INTRINSIC_NAMES``.
 
     Attributes:
         focal_px: (fx, fy). principal_point_px: (cx, cy).
         distortion: (k1, k2, p1, p2, k3), OpenCV's order and signs.
     """
 
-    focal_px: Float[Arrayish, "2"]
-    principal_point_px: Float[Arrayish, "2"]
-    distortion: Float[Arrayish, "5"]
+    focal_px: Float[Arrayish, "2 ..."]
+    principal_point_px: Float[Arrayish, "2 ..."]
+    distortion: Float[Arrayish, "5 ..."]
 
     @classmethod
-    def of(cls, vector: Float[Arrayish, "9"]) -> Intrinsics:
-        """From the vector, traced by JAX or not."""
-        return cls(vector[:2], vector[2:4], vector[4:])
+    def of(cls, vector: Float[Arrayish, "n ..."]) -> Intrinsics:
+        """From the vector, or rows of a matrix that begin with it, traced by JAX or not."""
+        return cls(vector[:2], vector[2:4], vector[4:LENS])
 
     @classmethod
     def of_geometry(cls, geometry: Geometry) -> Intrinsics:
@@ -218,11 +209,6 @@ def linearised(
     return places - points.image, jacobian
 
 
-def residuals_px(bundle: Bundle, points: Points) -> Float[np.ndarray, "points 2"]:
-    """Projected minus seen, of all points."""
-    return linearised(bundle, points)[0]
-
-
 def in_sigma(bundle: Bundle, points: Points) -> tuple[Float[np.ndarray, "points 2"], Float[np.ndarray, "points 2 15"]]:
     """As ``linearised``, in units of sigma; zero for points that are not used."""
     residuals, jacobian = linearised(bundle, points)
@@ -261,7 +247,7 @@ class BundleProblem:
     @property
     def name(self) -> str:
         """For the iteration log."""
-        return f"bundle, {int(self.free[4:].sum())} of 5 distortions"
+        return f"bundle, {int(self.free.sum())} of {LENS} intrinsics"
 
     def moved(self, place: Bundle, step: Step) -> Bundle:
         """The place after a step."""
@@ -279,7 +265,9 @@ class BundleProblem:
                 z, jacobian = z * root[:, None], jacobian * root[:, None, None]
             matrix, right = by_view(z, jacobian, self.points)
         shared = matrix[:, :LENS, :LENS].sum(axis=0) + self.prior.precision
-        shared = (shared + _RIDGE * np.diag(np.diag(shared))) * np.outer(self.free, self.free)
+        # Each intrinsic gets this part of the information that known poses would bring: what views do not tell at all
+        # has then a very large variance, not none. It is above rounding, and moves no sigma of what they do tell.
+        shared = (shared + 1e-11 * np.diag(np.diag(shared))) * np.outer(self.free, self.free)
         shared_right = (right[:, :LENS].sum(axis=0) + self.prior.right(place.intrinsics)) * self.free
         cross = matrix[:, :LENS, LENS:] * self.free[:, None]
         cost, samples = cost + self.prior.cost(place.intrinsics), 2 * int(self.points.used.sum())
@@ -293,5 +281,7 @@ def solve(
     start: Bundle, points: Points, free: Bool[np.ndarray, "9"], prior: Prior, robust: Cauchy | None = None
 ) -> Solved:
     """The minimum next to ``start``, roughly if robust or of poses alone; arguments as for ``BundleProblem``."""
+    # A descent ends a thousandth of a sigma from the minimum, one that another follows a tenth.
     rough = robust is not None or not free.any()
-    return minimise(BundleProblem(points, free, prior, robust), start, _ROUGH if rough else _SOLVER)
+    rules = SolverRules(least_gain=1e-2 if rough else 1e-6, iterations=60)
+    return minimise(BundleProblem(points, free, prior, robust), start, rules)

@@ -1,14 +1,15 @@
 """What a bundle of views gives: lens, poses, whether the model holds, and how sure it is where a ray lands.
 
 Two ways to be wrong are told apart from chance. Views that disagree: each view alone would have the intrinsics a little
-elsewhere, further than its noise explains (Cochran's Q, as in meta-analysis); the intrinsics without a view then
-predict its corners worse than noise does. A pattern over the picture: residuals of neighbouring places in the sensor,
-over all views, share a direction. Both statistics are exact for a linear model with normal noise.
+elsewhere, further than its noise explains (Cochran's Q, as in meta-analysis). A pattern over the picture: residuals of
+neighbouring places in the sensor, over all views, have a common direction. Both statistics are exact for a linear model
+with normal noise.
 """
 
 from __future__ import annotations
 
 import enum
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import final
 
@@ -22,19 +23,15 @@ from udccal.fitting.engine.misfit import MisfitTest, clustered_cov, f_test
 from udccal.fitting.geometry.bundle import LENS, GeometryRules, Intrinsics, Points, Solved, by_view, in_sigma, projected
 from udccal.result import Candidate, FitStatus, Outliers
 
-# Newton's method on the distortion: rounds at most, and how near a ray must come to its pixel.
-_NEWTON_ROUNDS, _NEAR_PX = 40, 1e-7
-_GRID, _EDGE = 9, 0.02
-
 
 class Gauge(enum.Enum):
     """What a ray stays fixed to while the calibration varies.
 
-    Intrinsics and poses share a freedom: a lens whose centre is a pixel off and a camera that is turned by as much see
-    nearly the same. Compare Kogan, "Projection uncertainty" in the documentation of mrcal, whose choice is ``BOARDS``.
+    A lens whose centre is a pixel off and a camera that is turned by as much see nearly the same. Compare Kogan,
+    "Projection uncertainty" in the documentation of mrcal, whose choice is ``BOARDS``.
     """
 
-    CAMERA = "the camera's axes as fitted: the freedom between centre and rotation shows in full"
+    CAMERA = "the camera's axes as fitted: what centre and rotation can exchange shows in full"
     BOARDS = "the boards, on average over the views: the camera's axes turn with the poses"
     ALIGNED = "the rotation that brings the whole picture into its best agreement: the shape of the lens alone"
 
@@ -47,37 +44,26 @@ class Evidence:
     Attributes:
         pattern: residuals averaged over the cells of a grid on the sensor, against independence.
         views: the intrinsics that each view prefers, against one set for all.
-        held_out_rms_px: of points of a view against intrinsics from the other views, with the view's own pose.
-        expected_rms_px: what that would be if the model held.
         pattern_px: size of the pattern per axis beyond noise; 0 unless found.
     """
 
     pattern: MisfitTest
     views: MisfitTest
-    held_out_rms_px: float
-    expected_rms_px: float
     pattern_px: float
 
     @property
-    def variance_factor(self) -> float:
-        """Variance of the views' disagreement over that of their noise; 1 unless they disagree beyond chance."""
-        return self.views.inflation
-
-    @property
-    def notes(self) -> tuple[str, ...]:
+    def notes(self) -> Iterator[str]:
         """What was found, for a person."""
-        notes = []
         if self.views.found:
-            notes.append(
+            yield (
                 f"The views disagree on the lens beyond their noise (ratio {self.views.ratio:.1f}, "
                 f"p = {self.views.p_value:.1g}); sigma is that of views that differ so. Is the board flat?"
             )
         if self.pattern.found:
-            notes.append(
+            yield (
                 f"The residuals follow a pattern over the picture (p = {self.pattern.p_value:.1g}, about "
                 f"{self.pattern_px:.3f} px): the lens bends rays in a way that no order has."
             )
-        return tuple(notes)
 
 
 @final
@@ -99,7 +85,6 @@ class CalibratedViews:
         status: ``CONVERGED``, or why not to use this; ``notes`` say what to do.
         outliers: points left out.
         iterations: of the last solve with all distortions free.
-        starts_agreeing: how many of the starts led to this minimum.
         image_size: (columns, rows).
     """
 
@@ -116,7 +101,6 @@ class CalibratedViews:
     notes: tuple[str, ...]
     outliers: tuple[Outliers, ...]
     iterations: int
-    starts_agreeing: int
     image_size: tuple[int, int]
 
     @property
@@ -162,11 +146,11 @@ class CalibratedViews:
         lens = self.intrinsics
         rays = np.hstack([(pixels - lens.principal_point_px) / lens.focal_px, np.ones((len(pixels), 1))])
         with np.errstate(all="ignore"):  # Rays that do not come near are found below.
-            for _ in range(_NEWTON_ROUNDS):
+            for _ in range(40):  # Newton's method on the distortion.
                 places, by = projected(lens.vector, rays)
                 (xx, xy), (yx, yy) = np.moveaxis(by[:, :, LENS + 3 : LENS + 5], 0, -1)
                 area, (dx, dy) = xx * yy - xy * yx, (pixels - places).T
-                lost = ~((np.hypot(dx, dy) < _NEAR_PX) & (area > 0))
+                lost = ~((np.hypot(dx, dy) < 1e-7) & (area > 0))
                 if not lost.any():
                     break
                 rays[:, :2] += np.stack([yy * dx - xy * dy, xx * dy - yx * dx], axis=1) / area[:, None]
@@ -181,7 +165,7 @@ class CalibratedViews:
 
 def field_grid(image_size: tuple[int, int]) -> Float[np.ndarray, "81 2"]:
     """9 x 9 pixels over the picture, 2 % away from its edges."""
-    place = np.linspace(_EDGE, 1 - _EDGE, _GRID)
+    place = np.linspace(0.02, 0.98, 9)
     x, y = np.meshgrid(place * (image_size[0] - 1), place * (image_size[1] - 1))
     return np.stack([x.ravel(), y.ravel()], axis=1)
 
@@ -216,14 +200,13 @@ def weigh(
     unit = 1 / np.sqrt(np.maximum(np.einsum("kii->i", information), 1e-300))
     information, score = information * np.outer(unit, unit), score * unit
     views, cov = _disagreement(information, score, dof), solved.equations.joint_cov()
-    held, expected = _held_out(z, information, score, points)
     pattern, size = _pattern(z, jacobian, points, cov, image_size, dof, rules.pattern_cells)
     if views.found:
         lens = solved.equations.cov()[np.ix_(free, free)] / np.outer(unit, unit)
         spread = np.zeros((LENS, LENS))
         spread[np.ix_(free, free)] = (clustered_cov(lens, score, information) - lens) * np.outer(unit, unit)
         cov = _widened(cov, spread, carried, own * (views.inflation - 1))
-    return Evidence(pattern, views, held, expected, size if pattern.found else 0.0), cov
+    return Evidence(pattern, views, size if pattern.found else 0.0), cov
 
 
 def _widened(
@@ -252,20 +235,6 @@ def _disagreement(information: np.ndarray, score: np.ndarray, dof: float) -> Mis
     along = np.einsum("kij,ki->kj", vectors, score)
     total = float((along[seen] ** 2 / values[seen]).sum())
     return f_test(total, int(seen.sum()) - score.shape[1], dof)
-
-
-def _held_out(z: np.ndarray, information: np.ndarray, score: np.ndarray, points: Points) -> tuple[float, float]:
-    """Root mean square of held-out residuals in px, and what it would be for noise alone."""
-    count = points.sums(np.ones(len(z)))
-    others = np.linalg.pinv(information.sum(axis=0) - information, rcond=1e-10, hermitian=True)
-    # The gradients of all views cancel at the common minimum: without this view it moves by the step.
-    step = -np.einsum("kij,kj->ki", others, score)
-    rise = np.einsum("ki,kij,kj->k", step, information, step) - 2 * (score * step).sum(axis=1)
-    seen = points.sums((z**2).sum(axis=1)) + rise
-    expected = 2 * count - 6 + np.einsum("kij,kji->k", information, others)
-    variance = points.sums(points.sigma**2) / count
-    held = [float(np.sqrt(max(float(variance @ one), 0.0) / count.sum())) for one in (seen, expected)]
-    return held[0], held[1]
 
 
 def _pattern(

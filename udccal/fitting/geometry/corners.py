@@ -24,9 +24,6 @@ from udccal.arrangements import BoardSpec
 from udccal.errors import FitError
 from udccal.fitting.geometry.bundle import GeometryRules
 
-# Along one axis; it gives each of the four sites of the pattern one quarter at every pixel and is symmetric.
-_BINOMIAL = np.array([0.25, 0.5, 0.25])
-
 
 @final
 @dataclass(frozen=True)
@@ -66,7 +63,9 @@ def sites() -> list[tuple[slice, slice]]:
 
 
 def _filtered(picture: Float[np.ndarray, "*stack rows columns"]) -> Float[np.ndarray, "*stack rows columns"]:
-    return np.asarray(convolve1d(convolve1d(picture, _BINOMIAL, axis=-2), _BINOMIAL, axis=-1), dtype=np.float64)
+    # It gives each of the four sites of the pattern one quarter at every pixel and is symmetric.
+    taps = np.array([0.25, 0.5, 0.25])
+    return np.asarray(convolve1d(convolve1d(picture, taps, axis=-2), taps, axis=-1), dtype=np.float64)
 
 
 @final
@@ -116,7 +115,7 @@ def detect_corners(picture: Luminance, spec: BoardSpec, rules: GeometryRules | N
     margin = rules.marker_margin * np.sqrt(2.0) * (spec.square_mm - spec.marker_mm) / (2.0 * spec.square_mm)
     side = np.linalg.norm(edges, axis=2).min(axis=1)
     radius = np.clip(min(margin, rules.window_squares) * side, *rules.window_px)
-    return _saddles(picture, BoardCorners(ids, rough, np.zeros(len(ids))), edges, radius, rules)
+    return _saddles(picture, ids, rough, edges, radius, rules)
 
 
 def _detect(
@@ -155,32 +154,31 @@ def _edges_px(
 
 
 @final
-@dataclass(frozen=True)
-class _Windows:
-    """Samples in squares around whole pixels near corners, and the radius of the round part that counts."""
-
-    offsets: Float[np.ndarray, "m 2"]
-    samples: Float[np.ndarray, "n m"]
-    radius: Float[np.ndarray, " n"]
-
-
-@final
 class _Saddle:
-    """The model at a shape (px, py, angle1, angle2, log s1, log s2), its linear part (b, gx, gy, A) at its best."""
+    """The model at a shape (px, py, angle1, angle2, log s1, log s2), its linear part (b, gx, gy, A) at its best.
 
-    def __init__(self, shape: Float[np.ndarray, "n 6"], windows: _Windows) -> None:
-        self.u = windows.offsets[None] - shape[:, None, :2]
-        self.weight = np.clip(1 - (self.u**2).sum(-1) / windows.radius[:, None] ** 2, 0.0, None)
+    Samples lie in squares around whole pixels near corners, at ``offsets``; the round part within ``radius`` counts.
+    """
+
+    def __init__(
+        self,
+        shape: Float[np.ndarray, "n 6"],
+        offsets: Float[np.ndarray, "m 2"],
+        samples: Float[np.ndarray, "n m"],
+        radius: Float[np.ndarray, " n"],
+    ) -> None:
+        self.u = offsets[None] - shape[:, None, :2]
+        self.weight = np.clip(1 - (self.u**2).sum(-1) / radius[:, None] ** 2, 0.0, None)
         self.normals = np.stack([np.cos(shape[:, 2:4]), np.sin(shape[:, 2:4])], axis=-1)
         self.width = np.exp(shape[:, 4:6])
         self.across = np.einsum("nmi,nki->nkm", self.u, self.normals) / self.width[..., None]
         self.profile = erf(self.across / np.sqrt(2.0))
-        ones, product = np.ones_like(windows.samples), self.profile[:, 0] * self.profile[:, 1]
-        self.design = np.stack([ones, self.u[..., 0], self.u[..., 1], product], axis=-1)
+        product = self.profile[:, 0] * self.profile[:, 1]
+        self.design = np.stack([np.ones_like(samples), self.u[..., 0], self.u[..., 1], product], axis=-1)
         normal = np.einsum("nmi,nm,nmj->nij", self.design, self.weight, self.design) + 1e-9 * np.eye(4)
-        right = np.einsum("nmi,nm,nm->ni", self.design, self.weight, windows.samples)
+        right = np.einsum("nmi,nm,nm->ni", self.design, self.weight, samples)
         self.linear = np.linalg.solve(normal, right[..., None])[..., 0]
-        self.residual = windows.samples - np.einsum("nmi,ni->nm", self.design, self.linear)
+        self.residual = samples - np.einsum("nmi,ni->nm", self.design, self.linear)
         self.cost = (self.weight * self.residual**2).sum(-1)
 
     def jacobian(self) -> Float[np.ndarray, "n m 10"]:
@@ -218,7 +216,8 @@ class _Saddle:
 
 def _saddles(
     picture: Luminance,
-    start: BoardCorners,
+    ids: Int[np.ndarray, " n"],
+    rough: Float[np.ndarray, "n 2"],
     edges: Float[np.ndarray, "n 2 2"],
     radius: Float[np.ndarray, " n"],
     rules: GeometryRules,
@@ -226,26 +225,26 @@ def _saddles(
     """Place all corners at once; those out of the picture, moved away or without contrast are left out."""
     rows, columns = picture.grey.shape
     half = int(np.ceil(radius.max())) + 1
-    base = np.round(start.xy).astype(np.int64)
+    base = np.round(rough).astype(np.int64)
     inside = np.all((base >= half) & (base < np.array([columns - half, rows - half])), axis=1)
     base = np.clip(base, half, np.array([columns - half - 1, rows - half - 1]))
     dy, dx = (a.ravel() for a in np.mgrid[-half : half + 1, -half : half + 1])
     where = (base[:, 1, None] + dy, base[:, 0, None] + dx)
-    windows = _Windows(np.stack([dx, dy], axis=1).astype(np.float64), picture.grey[where], radius)
+    windows = np.stack([dx, dy], axis=1).astype(np.float64), picture.grey[where], radius
     angles = np.arctan2(edges[..., 0], -edges[..., 1])
-    shape = np.concatenate([start.xy - base, angles, np.full((len(base), 2), np.log(1.5))], axis=1)
-    saddle, damping = _Saddle(shape, windows), np.full(len(base), 1e-3)
-    for _ in range(rules.saddle_rounds):
+    shape = np.concatenate([rough - base, angles, np.full((len(base), 2), np.log(1.5))], axis=1)
+    saddle, damping = _Saddle(shape, *windows), np.full(len(base), 1e-3)
+    for _ in range(12):
         trial = shape + np.clip(saddle.step(damping), -1.0, 1.0)
         trial[:, 4:] = np.clip(trial[:, 4:], np.log(0.3), np.log(20.0))
-        better = _Saddle(trial, windows).cost < saddle.cost
+        better = _Saddle(trial, *windows).cost < saddle.cost
         shape = np.where(better[:, None], trial, shape)
-        saddle = _Saddle(shape, windows)
+        saddle = _Saddle(shape, *windows)
         damping = np.clip(np.where(better, damping / 5, damping * 10), 1e-9, 1e9)
     sigma = saddle.noise_sigma(picture.variance[where])
     misfit = np.sqrt(saddle.cost / np.maximum(saddle.weight.sum(-1) - 10, 1.0))
     xy = base + shape[:, :2]
-    near = np.linalg.norm(xy - start.xy, axis=1) < np.maximum(radius / 2, 3.0)
+    near = np.linalg.norm(xy - rough, axis=1) < np.maximum(radius / 2, 3.0)
     contrast = np.abs(saddle.linear[:, 3]) > rules.least_contrast * misfit
     good = inside & near & contrast & (sigma < rules.worst_corner_sigma_px) & np.isfinite(xy).all(axis=1)
-    return BoardCorners(start.ids[good], xy[good], sigma[good])
+    return BoardCorners(ids[good], xy[good], sigma[good])

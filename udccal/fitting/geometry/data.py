@@ -16,15 +16,13 @@ from jaxtyping import Bool, Float
 from udccal.arrangements import BoardSpec
 from udccal.fitting.engine.gaussian import Prior
 from udccal.fitting.geometry.bundle import GeometryRules, Intrinsics
-from udccal.fitting.geometry.corners import BoardCorners, Luminance, detect_corners, luminance, sites
+from udccal.fitting.geometry.corners import BoardCorners, detect_corners, luminance, sites
 from udccal.fitting.nominal import nominal_geometry
 from udccal.models.geometry import Geometry
 from udccal.models.noise import Noise, variance_e
 from udccal.rig import RigDescription
 from udccal.sessions.schema import BoardSubject, StoredCapture, StoredStep
 from udccal.sessions.store import Session
-
-_DARK, _FLAT = "wire/dark", "wire/flat"
 
 
 @final
@@ -126,11 +124,11 @@ def flat_field(
 
 def _read_flat_field(session: Session, noise: Noise, rules: GeometryRules) -> FlatField | None:
     """From the averages that the wire is fitted to; None where the session has none."""
-    if not {_DARK, _FLAT} <= {step.id for step in session.steps("wire")}:
+    if not {"wire/dark", "wire/flat"} <= {step.id for step in session.steps("wire")}:
         return None
-    capture = session.step(_FLAT).captures[0]
+    capture = session.step("wire/flat").captures[0]
     flat = session.average(capture).mean.astype(np.float64)
-    light = flat - session.average(session.step(_DARK).captures[0]).mean
+    light = flat - session.average(session.step("wire/dark").captures[0]).mean
     unclipped = flat < rules.clipped * float(np.asarray(noise.saturation_DN))
     return flat_field(light, _temporal_variance_DN2(noise, light, capture), unclipped, rules)
 
@@ -153,24 +151,15 @@ def _read_view(
     mean = session.frame(capture) if capture.kind == "frame" else session.average(capture).mean
     spec = BoardSpec(subject.columns, subject.rows, subject.square_mm, subject.marker_mm, subject.dictionary)
     light = mean.astype(np.float64) - float(np.asarray(noise.black_DN))
-    variance, area = _temporal_variance_DN2(noise, light, capture), capture.region
+    area, offsets_DN = capture.region, float(np.asarray(noise.K_DN_per_e)) * float(np.asarray(noise.DSNU1288_e))
+    variance = _temporal_variance_DN2(noise, light, capture) + offsets_DN**2
     part = np.s_[area.y : area.y + area.rows, area.x : area.x + area.columns]
-    crop = None if flat is None else FlatField(flat.response[part], flat.relative_variance[part])
-    corners = detect_corners(_evened(light, variance, noise, crop), spec, rules)
+    # As even pixels would see it; noise of pixels that stay unequal adds to the temporal noise.
+    response, unequal = np.ones_like(light), np.full_like(light, float(np.asarray(noise.PRNU1288)) ** 2)
+    if flat is not None:
+        response, unequal = flat.response[part], flat.relative_variance[part]
+    even = light / response
+    corners = detect_corners(luminance(even, variance / response**2 + unequal * even**2), spec, rules)
     moved = BoardCorners(corners.ids, corners.xy + np.array([area.x, area.y], dtype=np.float64), corners.sigma)
     clipped = float(np.mean(mean >= rules.clipped * float(np.asarray(noise.saturation_DN))))
     return BoardView(step.id, spec, subject.parallel_to_panel, moved, clipped)
-
-
-def _evened(
-    light: Float[np.ndarray, "rows columns"],
-    temporal: Float[np.ndarray, "rows columns"],
-    noise: Noise,
-    flat: FlatField | None,
-) -> Luminance:
-    """As even pixels would see it; noise of pixels that stay unequal adds to the temporal noise."""
-    offsets = (float(np.asarray(noise.K_DN_per_e)) * float(np.asarray(noise.DSNU1288_e))) ** 2
-    if flat is None:
-        return luminance(light, temporal + offsets + (float(np.asarray(noise.PRNU1288)) * light) ** 2)
-    even = light / flat.response
-    return luminance(even, (temporal + offsets) / flat.response**2 + flat.relative_variance * even**2)

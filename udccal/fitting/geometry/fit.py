@@ -7,9 +7,8 @@ unless a test says that the views differ (blur, light and distance do that): the
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import final
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -31,18 +30,14 @@ from udccal.fitting.geometry.bundle import (
     Solved,
     by_view,
     in_sigma,
-    residuals_px,
+    linearised,
     solve,
 )
 from udccal.fitting.geometry.calibrated import CalibratedViews, Evidence, weigh
-from udccal.fitting.geometry.start import Settled, costs, facing, gather, least_scale, settle
+from udccal.fitting.geometry.start import costs, facing, gather, least_scale, settle
 from udccal.models.geometry import Geometry
 from udccal.numerics import in_float64
 from udccal.result import FitStatus
-
-NO_PRIOR = Prior(np.zeros(LENS), np.zeros((0, LENS)))
-# A residual below this is rounding, not noise: orders that differ there only are equally good.
-_ROUNDING_PX = 1e-7
 
 
 @in_float64
@@ -81,7 +76,7 @@ def fit_geometry(
     """
     rules = rules or GeometryRules()
     gathered = gather(board_points, image_points, sigmas, rules)
-    least, known = (rules.least_views, NO_PRIOR) if prior is None else (1, prior)
+    least, known = (rules.least_views, Prior(np.zeros(LENS), np.zeros((0, LENS)))) if prior is None else (1, prior)
     given, left_out = gathered.points, gathered.outliers
     if len(given.names) < least:
         raise FitError(
@@ -89,35 +84,34 @@ def fit_geometry(
             f"views, {len(given.names)} of them usable. {' '.join(gathered.notes)} Capture more views of the board."
         )
     lens = None if start is None else Intrinsics.of_geometry(start)
-    settled = settle(given, image_size, lens, start_poses, known, rules)
-    strange = _strange_views(settled.points, given, rules)
+    settled, marked = settle(given, image_size, lens, start_poses, known, rules)
+    strange = _strange_views(marked, given, rules)
     if strange.any() and (~strange).sum() >= least:
         rule = f"of a view that scatters more than {rules.strange_view:g} times as much as the median view"
         left_out = (*left_out, *outliers(rule, (f"view {given.names[k]}" for k in np.flatnonzero(strange))))
         given = given.without(strange)
-        settled = settle(given, image_size, lens, start_poses, known, rules)
-    full, points, scales = _maximum_likelihood(settled, given, known, rules)
-    chosen, by_prior = _choose_order(full, points, known, rules)
-    final, points, dof = _rescaled(chosen.best.fit, points, known)
-    evidence, cov = weigh(final, points, chosen.best.fit.free, image_size, dof, rules)
-    status, advice = _judged(final, cov, image_size, rules)
+        settled, marked = settle(given, image_size, lens, start_poses, known, rules)
+    full, points, scales = _maximum_likelihood(settled, marked, given, known)
+    orders, by_prior = _choose_order(full, points, known, rules)
+    free = ORDERS[orders.best.name]
+    final, points, dof = _rescaled(orders.best.fit, points, free, known)
+    evidence, cov = weigh(final, points, free, image_size, dof, rules)
+    status, advice = _status(final, cov, image_size, rules)
     bundle = Bundle(final.place.intrinsics, facing(final.place.poses))
-    out = np.flatnonzero(~points.used)
     return CalibratedViews(
         intrinsics=Intrinsics.of(bundle.intrinsics),
         poses=bundle.poses,
         cov=cov,
         points=points,
-        residuals_px=residuals_px(bundle, points),
-        free=tuple(bool(one) for one in chosen.best.fit.free),
+        residuals_px=linearised(bundle, points)[0],
+        free=tuple(bool(one) for one in free),
         chi2_dof=1.0 if sigmas is None else float(((points.sigma / given.sigma)[points.used] ** 2).mean()),
-        candidates=chosen.candidates,
+        candidates=orders.candidates,
         evidence=evidence,
         status=status,
         notes=(*gathered.notes, *advice, *_remarks(points, scales, evidence, by_prior, rules)),
-        outliers=(*left_out, *rules.corners.listed(points.places(out))),
+        outliers=(*left_out, *rules.corners.listed(points.places(np.flatnonzero(~points.used)))),
         iterations=full.iterations,
-        starts_agreeing=settled.agreeing,
         image_size=image_size,
     )
 
@@ -129,12 +123,11 @@ def _strange_views(scattered: Points, given: Points, rules: GeometryRules) -> Bo
 
 
 def _maximum_likelihood(
-    settled: Settled, given: Points, prior: Prior, rules: GeometryRules
+    solved: Solved, points: Points, given: Points, prior: Prior
 ) -> tuple[Solved, Points, Float[np.ndarray, " views"]]:
     """Scales from residuals and their degrees of freedom, the points with them, and the solution weighted by them."""
-    solved, points = settled.solved, settled.points
     given, scales = replace(given, used=points.used), np.ones(len(given.names))
-    for _ in range(rules.rounds):
+    for _ in range(8):
         square, dof = costs(solved.place, given), 2 * given.sums(np.ones(len(given.view))) - _spent(solved, points)
         differ = _differ(square, dof)
         own = square / np.maximum(dof, 1.0) if differ else np.full(len(dof), square.sum() / max(dof.sum(), 1.0))
@@ -164,69 +157,58 @@ def _differ(square: Float[np.ndarray, " views"], dof: Float[np.ndarray, " views"
     return chi2_tail(ratio / correction, len(dof) - 1) < SIGNIFICANT
 
 
-@final
-@dataclass(frozen=True)
-class _Order:
-    """One order of the distortion, solved."""
+def _choose_order(full: Solved, points: Points, prior: Prior, rules: GeometryRules) -> tuple[Choice[Solved], bool]:
+    """Every order, each solved from the one above with its further coefficients at 0; and whether the prior chose.
 
-    solved: Solved
-    free: Bool[np.ndarray, "9"]
-
-
-def _choose_order(full: Solved, points: Points, prior: Prior, rules: GeometryRules) -> tuple[Choice[_Order], bool]:
-    """Every order, solved from the quadratic model of the one above; and whether the prior chose.
-
-    Where the prior brings a good part of what is known of focal length or centre, the data are too few to tell a
+    Where the prior brings a good part of what is known of focal length or centre, the data are too few to part a
     coefficient from a pose. All then stay free, each within its prior.
     """
-    tried: list[Attempt[_Order]] = []
+    tried: list[Attempt[Solved]] = []
+    solved = full
     for place, (name, free) in reversed(list(enumerate(ORDERS.items()))):
-        above = tried[0].fit if tried else _Order(full, EVERY)
-        solved = solve(_held(above, free), points, free, prior) if tried else full
+        if tried:
+            above = Bundle(np.where(free, solved.place.intrinsics, 0.0), solved.place.poses)
+            solved = solve(above, points, free, prior)
         parameters = int(free.sum()) + 6 * len(points.names)
         criterion = _criterion(solved, points, parameters) + 2 * place * np.log(rules.further_order)
-        tried.insert(0, Attempt(name, parameters, float(criterion), _Order(solved, free)))
-    known = np.diag(full.equations.cov())[:4] * np.diag(prior.precision)[:4]
-    by_prior = bool((known > rules.prior_share).any())
+        tried.insert(0, Attempt(name, parameters, float(criterion), solved))
+    known = Intrinsics.of(np.diag(full.equations.cov()) * np.diag(prior.precision))
+    by_prior = bool(max(*known.focal_px, *known.principal_point_px) > rules.prior_share)
     return (Choice(tried[-1], tuple(tried)) if by_prior else choose(tried)), by_prior
 
 
-def _held(above: _Order, free: Bool[np.ndarray, "9"]) -> Bundle:
-    """Where the minimum moves when coefficients are held at 0, by the quadratic model of the order above."""
-    place = above.solved.place
-    x, cov = np.concatenate([place.intrinsics, place.poses.ravel()]), above.solved.equations.joint_cov()
-    drop = np.flatnonzero(above.free & ~free)
-    moved = x - cov[:, drop] @ np.linalg.pinv(cov[np.ix_(drop, drop)], hermitian=True) @ x[drop]
-    return Bundle(np.where(free, moved[:LENS], 0.0), moved[LENS:].reshape(-1, 6))
-
-
 def _criterion(solved: Solved, points: Points, parameters: int) -> float:
-    """BIC with the scale of the noise estimated, too: n ln(chi2 / n) for chi2. Residuals of rounding are all equal."""
+    """BIC with the scale of the noise estimated, too: n ln(chi2 / n) for chi2.
+
+    A residual below 1e-7 px is rounding, not noise: orders that differ there only are equally good.
+    """
     samples = 2 * int(points.used.sum())
     chi2 = float(costs(solved.place, points).sum())
-    least = float((_ROUNDING_PX**2 / points.sigma[points.used] ** 2).sum())
+    least = float((1e-7**2 / points.sigma[points.used] ** 2).sum())
     return bic(samples * float(np.log(max(chi2, least) / samples)), float(parameters), samples)
 
 
-def _rescaled(order: _Order, points: Points, prior: Prior) -> tuple[Solved, Points, float]:
+def _rescaled(
+    solved: Solved, points: Points, free: Bool[np.ndarray, "9"], prior: Prior
+) -> tuple[Solved, Points, float]:
     """The chosen order with the scale of its own residuals, and the degrees of freedom behind that."""
-    dof = max(2 * float(points.used.sum()) - float(_spent(order.solved, points).sum()), 1.0)
-    factor = max(np.sqrt(float(costs(order.solved.place, points).sum()) / dof), least_scale(points))
+    dof = max(2 * float(points.used.sum()) - float(_spent(solved, points).sum()), 1.0)
+    factor = max(np.sqrt(float(costs(solved.place, points).sum()) / dof), least_scale(points))
     points = points.scaled(np.full(len(points.names), factor))
-    return solve(order.solved.place, points, order.free, prior), points, dof
+    return solve(solved.place, points, free, prior), points, dof
 
 
-def _judged(
+def _status(
     solved: Solved, cov: Float[np.ndarray, "n n"], image_size: tuple[int, int], rules: GeometryRules
 ) -> tuple[FitStatus, tuple[str, ...]]:
-    """Whether the views tell the lens; else what to capture."""
-    sigma = np.sqrt(np.diag(cov)[:4])
-    by_focal = float((sigma[:2] / np.abs(solved.place.intrinsics[:2])).max())
-    by_centre = float(sigma[2:].max() / image_size[0])
+    """Whether the views determine the lens; else what to capture."""
+    sigma, lens = Intrinsics.of(np.sqrt(np.diag(cov))), Intrinsics.of(solved.place.intrinsics)
+    by_focal = float(np.max(sigma.focal_px / np.abs(lens.focal_px)))
+    by_centre = float(np.max(sigma.principal_point_px)) / image_size[0]
     if max(by_focal, by_centre) > rules.most_uncertain:
         what = "focal length" if by_focal > by_centre else "centre of the picture"
         return FitStatus.TOO_FEW_DATA, (
-            f"The views do not tell the {what} (one sigma is {min(max(by_focal, by_centre), 99.0):.0%}). "
+            f"The views do not determine the {what} (one sigma is {min(max(by_focal, by_centre), 99.0):.0%}). "
             "Lean the board by 20 to 40 degrees, another way in each view, and let it fill the picture.",
         )
     if not solved.converged:
@@ -236,15 +218,14 @@ def _judged(
 
 def _remarks(
     points: Points, scales: Float[np.ndarray, " views"], evidence: Evidence, by_prior: bool, rules: GeometryRules
-) -> tuple[str, ...]:
-    notes = []
+) -> Iterator[str]:
     if by_prior:
-        notes.append(
-            "The views alone do not tell the whole lens: what is known beforehand stands for part of it, and every "
+        yield (
+            "The views alone do not determine the whole lens: what is known beforehand gives part of it, and every "
             "distortion coefficient stays free within that. Lean the board another way in each view to know more."
         )
     relative = scales / np.median(scales)
     loud = [f"{points.names[k]} ({relative[k]:.1f} x)" for k in np.flatnonzero(relative > rules.loud_view)]
     if loud:
-        notes.append(f"Views that scatter more than the median view, and count for less: {', '.join(loud)}.")
-    return (*notes, *evidence.notes)
+        yield f"Views that scatter more than the median view, and count for less: {', '.join(loud)}."
+    yield from evidence.notes

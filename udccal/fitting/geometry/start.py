@@ -14,6 +14,7 @@ from typing import final
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy.spatial.transform import Rotation
 
 from udccal.errors import FitError
 from udccal.fitting.engine.gaussian import Prior
@@ -26,24 +27,10 @@ from udccal.fitting.geometry.bundle import (
     Intrinsics,
     Points,
     Solved,
-    residuals_px,
+    linearised,
     solve,
 )
 from udccal.result import Outliers
-
-# Across to along: points closer to one line than this hold no pose, points closer to a plane are flat.
-_LINE, _FLAT = 1e-3, 1e-6
-# Of the picture's larger side: distortion bends straight lines by less, a corner read as its neighbour's by more.
-_OFF_HOMOGRAPHY = 0.005
-# The same of one board's part of the picture, which is smaller than the whole.
-_OFF_BOARD = 0.02
-# Focal lengths outside this range, in units of the larger side, are no lens that the model describes.
-_SHORTEST, _LONGEST = 0.15, 30.0
-# A view of few points may fit them all by its pose: its robust sigma is not taken below this part of all views'.
-_LEAST_OF_ALL = 0.5
-# Below this, sigma is rounding: exact points must not count as surer than arithmetic.
-_LEAST_SIGMA_PX = 1e-8
-_SAME_SCORE = 1e-6
 
 
 @final
@@ -60,58 +47,50 @@ def gather(
     board: Sequence[np.ndarray], image: Sequence[np.ndarray], sigmas: Sequence[np.ndarray] | None, rules: GeometryRules
 ) -> Gathered:
     """Every finite point of every view that holds a pose; arguments as for ``fit_geometry``."""
-    lost: list[str] = []
-    notes: list[str] = []
-    parts: list[tuple[np.ndarray, ...]] = []
-    names: list[int] = []
-    for number, (points, pixels, own) in enumerate(_views(board, image, sigmas, rules)):
-        good = np.isfinite(points).all(axis=1) & np.isfinite(pixels).all(axis=1) & np.isfinite(own) & (own > 0)
-        lost += [f"view {number}, point {k}" for k in np.flatnonzero(~good)]
-        part = (points[good], pixels[good], own[good], np.flatnonzero(good))
-        if complaint := _complaint(part, parts, rules):
-            notes.append(f"View {number} is left out: {complaint}")
-            continue
-        parts.append(part)
-        names.append(number)
-    empty = (np.zeros((0, 3)), np.zeros((0, 2)), np.zeros(0), np.zeros(0, dtype=np.int64))
-    points, pixels, own, index = (np.concatenate(same) for same in zip(empty, *parts, strict=True))
-    view = np.repeat(np.arange(len(parts)), [len(part[0]) for part in parts])
-    found = Points(points, pixels, own, view, index, np.ones(len(points), dtype=bool), tuple(names))
-    return Gathered(found, outliers("not a finite position with a positive sigma", lost), tuple(notes))
-
-
-def _views(
-    board: Sequence[np.ndarray], image: Sequence[np.ndarray], sigmas: Sequence[np.ndarray] | None, rules: GeometryRules
-) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Board points, pixels and sigma of each view in double precision, whatever the shape OpenCV gave them."""
     if len({len(board), len(image), len(image if sigmas is None else sigmas)}) > 1:
         raise FitError(
             f"Expected as many views on the board as in pictures (and of sigmas), found {len(board)} and {len(image)}. "
             "Give one array of each per view."
         )
-    found = []
-    for number, (points, pixels) in enumerate(zip(board, image, strict=True)):
-        there, here = np.asarray(points, dtype=np.float64), np.asarray(pixels, dtype=np.float64)
-        own = np.full(len(here), rules.default_sigma_px) if sigmas is None else np.asarray(sigmas[number], dtype=float)
-        n = len(here)
-        if there.shape not in ((n, 3), (n, 1, 3)) or here.shape not in ((n, 2), (n, 1, 2)) or own.shape != (n,):
-            raise FitError(
-                f"Expected board points (n, 3), image points (n, 2) and sigmas (n,) of equal n in view {number}, found "
-                f"{there.shape}, {here.shape} and {own.shape}. Give each seen corner its point on the board."
-            )
-        found.append((there.reshape(-1, 3), here.reshape(-1, 2), own))
-    return found
+    # Without sigmas any common one will do: its scale is estimated.
+    given = [np.full(len(pixels), 0.1) for pixels in image] if sigmas is None else sigmas
+    lost: list[str] = []
+    notes: list[str] = []
+    parts = {-1: (np.zeros((0, 3)), np.zeros((0, 2)), np.zeros(0), np.zeros(0, dtype=np.int64))}
+    for number, arrays in enumerate(zip(board, image, given, strict=True)):
+        points, pixels, own = _view(number, *(np.asarray(a, dtype=np.float64) for a in arrays))
+        good = np.isfinite(points).all(axis=1) & np.isfinite(pixels).all(axis=1) & np.isfinite(own) & (own > 0)
+        lost += [f"view {number}, point {k}" for k in np.flatnonzero(~good)]
+        part = (points[good], pixels[good], own[good], np.flatnonzero(good))
+        if complaint := _complaint(part[0], part[1], list(parts.values()), rules):
+            notes.append(f"View {number} is left out: {complaint}")
+        else:
+            parts[number] = part
+    points, pixels, own, index = (np.concatenate(same) for same in zip(*parts.values(), strict=True))
+    view = np.repeat(np.arange(len(parts)) - 1, [len(part[0]) for part in parts.values()])
+    found = Points(points, pixels, own, view, index, np.ones(len(points), dtype=bool), tuple(parts)[1:])
+    return Gathered(found, outliers("not a finite position with a positive sigma", lost), tuple(notes))
 
 
-def _complaint(part: tuple[np.ndarray, ...], before: list[tuple[np.ndarray, ...]], rules: GeometryRules) -> str:
+def _view(number: int, points: np.ndarray, pixels: np.ndarray, own: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Board points (n, 3), pixels (n, 2) and sigma (n,) of a view, whatever the shape OpenCV gave them."""
+    n = len(pixels)
+    if points.shape not in ((n, 3), (n, 1, 3)) or pixels.shape not in ((n, 2), (n, 1, 2)) or own.shape != (n,):
+        raise FitError(
+            f"Expected board points (n, 3), image points (n, 2) and sigmas (n,) of equal n in view {number}, found "
+            f"{points.shape}, {pixels.shape} and {own.shape}. Give each seen corner its point on the board."
+        )
+    return points.reshape(-1, 3), pixels.reshape(-1, 2), own
+
+
+def _complaint(board: np.ndarray, image: np.ndarray, before: list[tuple[np.ndarray, ...]], rules: GeometryRules) -> str:
     """Why a view cannot be used; empty when it can."""
-    board, image = part[:2]
     least = rules.least_corners
     if len(board) < least:
         return f"expected at least {least} points, found {len(board)}. Bring more of the board into the picture."
     for points, what in ((board, "on the board"), (image, "in the picture")):
         spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
-        if spread[1] <= _LINE * spread[0]:
+        if spread[1] <= 1e-3 * spread[0]:
             return f"its points lie on one line {what} and hold no pose. Show at least two rows of corners."
     if any(np.array_equal(image, other[1]) and np.array_equal(board, other[0]) for other in before):
         return "it repeats another view to the last digit, and so adds nothing. Capture every view anew."
@@ -122,12 +101,11 @@ def starts(
     points: Points, size: tuple[int, int], given: Intrinsics | None, poses: Float[np.ndarray, "views 6"] | None
 ) -> list[Bundle]:
     """Bundles to begin from: from what is given, from the views' vanishing points, else from a common lens."""
-    found = []
+    centred = Intrinsics(np.full(2, _focal_px(points, size)), (np.array(size) - 1) / 2, np.zeros(5)).vector
+    found = [Bundle(centred, best_poses(points, centred)[0])]
     if given is not None:
-        found.append(Bundle(given.vector, poses if poses is not None else best_poses(points, given.vector)[0]))
-    focal = _focal_px(points, size) or float(max(size))
-    centred = Intrinsics(np.full(2, focal), (np.array(size) - 1) / 2, np.zeros(5)).vector
-    return [*found, Bundle(centred, best_poses(points, centred)[0])]
+        found.insert(0, Bundle(given.vector, poses if poses is not None else best_poses(points, given.vector)[0]))
+    return found
 
 
 def best_poses(
@@ -143,13 +121,9 @@ def facing(poses: Float[np.ndarray, "views 6"]) -> Float[np.ndarray, "views 6"]:
 
     Behind the camera, a flat board turned by half a turn about its normal projects to the same points.
     """
-    turned = poses.copy()
-    for pose in turned:
-        matrix = cv2.Rodrigues(np.ascontiguousarray(pose[:3]))[0]
-        if pose[5] < 0:
-            matrix, pose[3:] = matrix @ np.diag([-1.0, -1.0, 1.0]), -pose[3:]
-        pose[:3] = cv2.Rodrigues(matrix)[0].ravel()
-    return turned
+    side = np.where(poses[:, 5:] < 0, -1.0, 1.0)
+    turn = Rotation.from_rotvec(poses[:, :3]) * Rotation.from_rotvec(np.pi * (side < 0) * np.array([0.0, 0.0, 1.0]))
+    return np.hstack([turn.as_rotvec(), side * poses[:, 3:]])
 
 
 def _pose_pair(points: Points, view: int, lens: Intrinsics) -> tuple[np.ndarray, np.ndarray]:
@@ -157,7 +131,7 @@ def _pose_pair(points: Points, view: int, lens: Intrinsics) -> tuple[np.ndarray,
     board, image = points.board[mine], points.image[mine]
     good = _consistent(board, image)
     flat = np.linalg.svd(board - board.mean(axis=0), compute_uv=False)
-    method = cv2.SOLVEPNP_IPPE if flat[2] <= _FLAT * flat[0] else cv2.SOLVEPNP_SQPNP
+    method = cv2.SOLVEPNP_IPPE if flat[2] <= 1e-6 * flat[0] else cv2.SOLVEPNP_SQPNP
     try:
         _, turns, shifts, _ = cv2.solvePnPGeneric(board[good], image[good], lens.matrix, lens.distortion, flags=method)
     except cv2.error:
@@ -176,42 +150,27 @@ def _ahead(board: np.ndarray, image: np.ndarray, lens: Intrinsics) -> np.ndarray
 
 
 def _consistent(board: np.ndarray, image: np.ndarray) -> Bool[np.ndarray, " n"]:
-    """Points that one homography puts near where they are; all, where there are too few to tell."""
+    """Points that one homography puts near where they are; all, where there are too few to tell.
+
+    Near is a part of the board's own size: distortion bends straight lines by less, a corner read as its neighbour's
+    is off by more.
+    """
     if len(board) >= 12:
-        limit = max(_OFF_BOARD * float(np.ptp(image, axis=0).max()), 1.0)
+        limit = max(0.02 * float(np.ptp(image, axis=0).max()), 1.0)
         _, inside = cv2.findHomography(board[:, :2], image, cv2.RANSAC, limit)
         if inside is not None and inside.sum() >= max(6, len(board) // 3):
             return inside.ravel().astype(bool)
     return np.ones(len(board), dtype=bool)
 
 
-def _focal_px(points: Points, size: tuple[int, int]) -> float | None:
-    """One focal length for both axes with the centre in the middle; None where the views do not tell it."""
-    unit, rows, right = float(max(size)), [], []
-    centred = (points.image - (np.array(size) - 1) / 2) / unit
-    for view in range(len(points.names)):
-        mine = points.view == view
-        matrix, _ = cv2.findHomography(points.board[mine, :2], centred[mine], cv2.RANSAC, _OFF_HOMOGRAPHY)
-        if matrix is None or not np.isfinite(matrix).all() or not matrix[:, :2].any(axis=0).all():
-            continue
-        first, second = matrix[:, :2].T / np.sqrt(np.prod(np.linalg.norm(matrix[:, :2], axis=0)))
-        # Both columns are images of orthogonal directions of equal length.
-        rows += [first[:2] @ second[:2], first[:2] @ first[:2] - second[:2] @ second[:2]]
-        right += [-first[2] * second[2], second[2] ** 2 - first[2] ** 2]
-    x, y = np.array(rows), np.array(right)
-    inverse = float(x @ y / (x @ x)) if len(x) and x @ x > 0 else 0.0
-    focal = 1 / np.sqrt(inverse) if inverse > 0 else 0.0
-    return float(focal * unit) if _SHORTEST <= focal <= _LONGEST else None
-
-
-@final
-@dataclass(frozen=True)
-class Settled:
-    """The robust minimum, the points with each view's own scatter and outliers marked, how many starts led there."""
-
-    solved: Solved
-    points: Points
-    agreeing: int
+def _focal_px(points: Points, size: tuple[int, int]) -> float:
+    """One focal length for both axes by the views' vanishing points; where they give none, that of a common lens."""
+    views = [points.view == k for k in range(len(points.names))]
+    board = [(points.board[mine] * np.array([1.0, 1.0, 0.0])).astype(np.float32) for mine in views]
+    image = [points.image[mine].astype(np.float32) for mine in views]
+    focal, usual = float(cv2.initCameraMatrix2D(board, image, size, 1.0)[0, 0]), float(max(size))
+    # Others are no lenses that the model describes.
+    return focal if 0.15 * usual <= focal <= 30.0 * usual else usual
 
 
 def settle(
@@ -221,14 +180,16 @@ def settle(
     poses: Float[np.ndarray, "views 6"] | None,
     prior: Prior,
     rules: GeometryRules,
-) -> Settled:
-    """The best minimum with all distortions free that any start leads to."""
+) -> tuple[Solved, Points]:
+    """The best minimum with all distortions free that any start leads to, and the points with outliers marked.
+
+    Their sigma has each view's own scatter. Starts, which may leave out different points, are compared by the robust
+    spread of all points.
+    """
     own = None if poses is None else np.asarray(poses, dtype=np.float64)[list(given.names)]
     found = [_descended(one, given, prior, rules) for one in starts(given, image_size, lens, own)]
-    scores = np.array([_score(solved.place, given) for solved, _ in found])
-    agreeing = int((scores <= scores.min() + _SAME_SCORE * max(abs(scores.min()), 1.0)).sum())
-    solved, points = found[int(scores.argmin())]
-    for _ in range(rules.rounds):  # Views whose mirrored pose fits better take it, and all is solved again.
+    solved, points = min(found, key=lambda one: float(np.log1p(_squares(one[0].place, given)).mean()))
+    for _ in range(8):  # Views whose mirrored pose fits better take it, and all is solved again.
         mirrored = Bundle(solved.place.intrinsics, best_poses(points, solved.place.intrinsics)[1])
         other = solve(mirrored, points, ~EVERY, prior).place
         better = costs(other, points) < 0.99 * costs(solved.place, points)
@@ -236,22 +197,16 @@ def settle(
             break
         swapped = np.where(better[:, None], facing(other.poses), solved.place.poses)
         solved, points = _without_outliers(Bundle(solved.place.intrinsics, swapped), given, prior, rules)
-    return Settled(solved, points, agreeing)
+    return solved, points
 
 
 def _descended(start: Bundle, given: Points, prior: Prior, rules: GeometryRules) -> tuple[Solved, Points]:
     """Robustly and with few coefficients first: from far off, five bend the picture into any minimum."""
     bundle = start
     for free in (ORDERS["k1"], EVERY):
-        scaled = given.scaled(_robust_scales(bundle, given))
-        bundle = solve(bundle, scaled, free, prior, rules.robust).place
+        bundle = solve(bundle, given.scaled(_robust_scales(bundle, given)), free, prior, rules.robust).place
         bundle = replace(bundle, poses=facing(bundle.poses))
     return _without_outliers(bundle, given, prior, rules)
-
-
-def _score(bundle: Bundle, given: Points) -> float:
-    """Robust spread of all points over the given sigma, comparable between starts that leave out different points."""
-    return float(np.log1p(_squares(bundle, given)).mean())
 
 
 def costs(bundle: Bundle, points: Points) -> Float[np.ndarray, " views"]:
@@ -261,20 +216,23 @@ def costs(bundle: Bundle, points: Points) -> Float[np.ndarray, " views"]:
 
 def _squares(bundle: Bundle, points: Points) -> Float[np.ndarray, " points"]:
     """Infinite where the lens bends a point out of reach."""
-    square = (residuals_px(bundle, points) ** 2).sum(axis=1) / points.sigma**2
+    square = (linearised(bundle, points)[0] ** 2).sum(axis=1) / points.sigma**2
     return np.where(np.isfinite(square), square, np.inf)
 
 
 def _robust_scales(bundle: Bundle, points: Points) -> Float[np.ndarray, " views"]:
-    """Scatter over sigma of each view, from medians."""
-    z = np.where(points.used[:, None], residuals_px(bundle, points) / points.sigma[:, None], np.nan)
+    """Scatter over sigma of each view, from medians.
+
+    A view of few points may fit them all by its pose: its scale is at least half of all views'.
+    """
+    z = np.where(points.used[:, None], linearised(bundle, points)[0] / points.sigma[:, None], np.nan)
     own = np.array([robust_sigma(z[points.view == k]) for k in range(len(points.names))])
-    return np.maximum(np.maximum(own, _LEAST_OF_ALL * robust_sigma(z)), least_scale(points))
+    return np.maximum(np.maximum(own, 0.5 * robust_sigma(z)), least_scale(points))
 
 
 def least_scale(points: Points) -> float:
-    """The least by which sigma may be scaled."""
-    return _LEAST_SIGMA_PX / float(np.median(points.sigma))
+    """The least by which sigma may be scaled: below 1e-8 px it is rounding."""
+    return 1e-8 / float(np.median(points.sigma))
 
 
 def _without_outliers(start: Bundle, given: Points, prior: Prior, rules: GeometryRules) -> tuple[Solved, Points]:
@@ -282,7 +240,7 @@ def _without_outliers(start: Bundle, given: Points, prior: Prior, rules: Geometr
     scales = _robust_scales(start, given)
     points = _marked(start, given.scaled(scales), rules)
     solved = solve(start, points, EVERY, prior)
-    for _ in range(rules.rounds):
+    for _ in range(8):
         before, used = scales, points.used
         scales = _robust_scales(solved.place, replace(given, used=used))
         points = _marked(solved.place, given.scaled(scales), rules)
@@ -294,6 +252,6 @@ def _without_outliers(start: Bundle, given: Points, prior: Prior, rules: Geometr
 
 def _marked(bundle: Bundle, points: Points, rules: GeometryRules) -> Points:
     """With outliers marked as not used, but where too little would be left of a view to hold its pose."""
-    off = rules.corners.off(residuals_px(bundle, points) / points.sigma[:, None]).any(axis=1)
+    off = rules.corners.off(linearised(bundle, points)[0] / points.sigma[:, None]).any(axis=1)
     kept = np.bincount(points.view[~off], minlength=len(points.names))
     return replace(points, used=~off | (kept < rules.least_corners)[points.view])

@@ -23,7 +23,7 @@ from udccal.models.arrays import Arrayish
 
 # Rounds that know the open samples only, then rounds with the clipped ones too. More move no pixel by 1 % of its sigma.
 _OPEN_ROUNDS, _ALL_ROUNDS = 1, 2
-# Below zero rate the variance goes on falling, so that the estimate stays unbiased in the dark, down to this share.
+# Below zero rate the variance goes on falling, so that the estimate stays unbiased in the dark, down to this part.
 _LEAST_VARIANCE = 0.25
 _TINY = 1e-30
 
@@ -90,7 +90,15 @@ def merge_block(
                 own = jnp.where(believed, slope * times[i] * ratio * (ratio - z), own)
             score, information = score + s, information + own
         rate = rate + score / jnp.maximum(information, _TINY)
-    worst, deviation2 = _worst(light, is_open, allowed, rate, information, times, sensor)
+    worst, deviation2 = jnp.zeros(rate.shape, jnp.int32), jnp.zeros_like(rate)
+    for i in range(count):
+        mean, variance = _expected(rate, times[i], sensor)
+        leverage = times[i] ** 2 / (variance * jnp.maximum(information, _TINY))
+        # Clipped although the others promise far less: how far, at least.
+        beyond = jnp.where(is_open[i], light[i] - mean, jnp.maximum(sensor.level_e - mean, 0.0))
+        own = beyond**2 / variance / jnp.where(is_open[i], jnp.maximum(1 - leverage, 1e-3), 1.0)
+        own = jnp.where(allowed[i], own, 0.0)
+        worst, deviation2 = jnp.where(own > deviation2, i, worst), jnp.maximum(own, deviation2)
     used = sum(o.astype(jnp.int32) for o in is_open)
     return BlockMerge(rate, jax.lax.rsqrt(jnp.maximum(information, _TINY)), used, worst, deviation2)
 
@@ -100,24 +108,3 @@ def _expected(
 ) -> tuple[Float[Array, " pixels"], Float[Array, " pixels"]]:
     mean = (rate + sensor.dark_e_per_s) * time
     return mean, jnp.maximum(mean + sensor.floor_e2, _LEAST_VARIANCE * sensor.floor_e2)
-
-
-def _worst(
-    light: list[Float[Array, " pixels"]],
-    is_open: list[Bool[Array, " pixels"]],
-    allowed: list[Bool[Array, " pixels"]],
-    rate: Float[Array, " pixels"],
-    information: Float[Array, " pixels"],
-    times: Float[Array, " n"],
-    sensor: SensorNumbers,
-) -> tuple[Int[Array, " pixels"], Float[Array, " pixels"]]:
-    worst, largest = jnp.zeros(rate.shape, jnp.int32), jnp.zeros_like(rate)
-    for i, x in enumerate(light):
-        mean, variance = _expected(rate, times[i], sensor)
-        share = times[i] ** 2 / (variance * jnp.maximum(information, _TINY))
-        # Clipped although the others promise far less: how far, at least.
-        beyond = jnp.where(is_open[i], x - mean, jnp.maximum(sensor.level_e - mean, 0.0))
-        own = beyond**2 / variance / jnp.where(is_open[i], jnp.maximum(1 - share, 1e-3), 1.0)
-        own = jnp.where(allowed[i], own, 0.0)
-        worst, largest = jnp.where(own > largest, i, worst), jnp.maximum(own, largest)
-    return worst, largest

@@ -19,9 +19,7 @@ from udccal.result import FitStatus, Outliers
 
 # What sigma says where no sample could be used: larger than any rate a sensor can tell, and finite.
 UNKNOWN_SIGMA = 1e12
-# Pixels of one compiled pass: large pictures, and crops.
-_BLOCKS = (1 << 16, 1 << 12)
-_THREADS = 2
+_BLOCKS = (1 << 16, 1 << 12)  # pixels of one compiled pass: large pictures, and crops
 
 
 @final
@@ -79,8 +77,7 @@ def merge_bracket(
 
     Solves the likelihood equation of ``hdr.likelihood`` for each pixel: shot, dark and quantisation noise at the
     merged rate (weights from single noisy samples would pull dark pixels down), samples within 6 sigma of saturation
-    as censored. In single precision, which moves no rate by a thousandth of its sigma; compiled once per number
-    of frames.
+    as censored. In single precision, which moves no rate by a thousandth of its sigma.
 
     Left out and listed are frames whose light is off by more than 2 % (a lamp that flickered, a dropped frame), and
     single samples more than 6 sigma from what the others of their pixel say (cosmic hits, blinking pixels); both need
@@ -116,8 +113,7 @@ def merge_bracket(
     for values in (merged.rate, merged.sigma):
         values /= np.float32(unit)
     unknown = merged.used <= 0
-    if unknown.any():
-        merged.rate[unknown], merged.sigma[unknown] = 0.0, UNKNOWN_SIGMA
+    merged.rate[unknown], merged.sigma[unknown] = 0.0, UNKNOWN_SIGMA
     note = f"{np.count_nonzero(unknown)} of {unknown.size} pixels have no sample that could be used."
     off = f"frames whose light is off by more than {100 * rules.frame_off:g} % and {rules.frame_sigma:g} sigma"
     hit = f"pixels with a sample more than {rules.believed_sigma:g} sigma from what its other samples say; that sample"
@@ -166,7 +162,7 @@ class _Bracket:
             own = None if left_out is None else left_out[:, part]
             _put(out, part, merge_block(codes[:, part], self.times, self.sensor, own, self.rules.believed_sigma))
 
-        with ThreadPoolExecutor(_THREADS) as pool:
+        with ThreadPoolExecutor(2) as pool:
             list(pool.map(run, [min(s, codes.shape[1] - size) for s in range(0, codes.shape[1], size)]))
         return BlockMerge(*(part[:pixels] for part in jax.tree.leaves(out)))
 
@@ -181,42 +177,31 @@ class _Bracket:
         signal = merged.rate[lit].astype(np.float64) * self.times[:, None]
         dark = float(sensor.dark_e_per_s) * self.times[:, None]
         sigma = np.sqrt(signal + dark + float(sensor.floor_e2))
-        # The open samples near the level are the low ones of their kind: stay clear of them.
-        clear = signal + dark + 5 * sigma < float(sensor.level_e)
-        score = [
-            self._off_in_sigma((x - d)[c] / s[c] - 1, (v / s)[c])
-            for x, d, s, v, c in zip(light, dark, signal, sigma, clear, strict=True)
-        ]
+        # The open samples near the level are the low ones of their kind: stay clear of them, and of the skew of a few
+        # electrons. A median: hits do not count as a lamp that flickers.
+        clear = (signal + dark + 5 * sigma < float(sensor.level_e)) & (sigma * rules.frame_snr < signal)
+        score = np.zeros(len(clear))
+        for i in np.flatnonzero(clear.sum(axis=1) >= rules.frame_least_pixels):
+            own = clear[i]
+            off = abs(float(np.median((light - dark)[i, own] / signal[i, own] - 1)))
+            # A median's standard error is 1.2533 times a mean's.
+            error = 1.2533 * float(np.median(sigma[i, own] / signal[i, own])) / math.sqrt(np.count_nonzero(own))
+            score[i] = off / error if off > rules.frame_off else 0.0
         worst = int(np.argmax(score))
         return worst if score[worst] > rules.frame_sigma else None
-
-    def _off_in_sigma(self, relative: Float[np.ndarray, " pixels"], sigma: Float[np.ndarray, " pixels"]) -> float:
-        """How many sigma the median of one frame's relative deviations is from 0; 0 where it is too small to matter.
-
-        A median of clear signals: hits do not count as a lamp that flickers, nor the skew of a few electrons.
-        """
-        clear = sigma < 1 / self.rules.frame_snr
-        if np.count_nonzero(clear) < self.rules.frame_least_pixels:
-            return 0.0
-        off = abs(float(np.median(relative[clear])))
-        # A median's standard error is 1.2533 times a mean's.
-        error = 1.2533 * float(np.median(sigma[clear])) / math.sqrt(np.count_nonzero(clear))
-        return off / error if off > self.rules.frame_off else 0.0
 
     def mend_hits(self, merged: BlockMerge) -> Int[np.ndarray, " hits"]:
         """Leave out the worst sample of a pixel while it is too far off; changes ``merged``, returns the pixels."""
         limit, least = self.rules.believed_sigma**2, self.rules.least_to_judge
-        touched: list[np.ndarray] = [np.zeros(0, dtype=np.int64)]
-        suspects = np.flatnonzero((merged.deviation2 > limit) & (len(self.times) >= least))
+        hits = suspects = np.flatnonzero((merged.deviation2 > limit) & (len(self.times) >= least))
         left_out = np.zeros((len(self.times), len(suspects)), dtype=bool)
         while len(suspects):
             left_out[merged.worst[suspects], np.arange(len(suspects))] = True
             again = replace(self, codes=np.ascontiguousarray(self.codes[:, suspects])).merged(left_out)
             _put(merged, suspects, again)
-            touched.append(suspects)
             more = (again.deviation2 > limit) & (len(self.times) - left_out.sum(axis=0) >= least)
             suspects, left_out = suspects[more], np.ascontiguousarray(left_out[:, more])
-        return np.unique(np.concatenate(touched))
+        return hits
 
 
 def _put(out: BlockMerge, where: slice | Int[np.ndarray, " some"], part: BlockMerge) -> None:

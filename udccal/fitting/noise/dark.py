@@ -1,82 +1,231 @@
-"""All that dark frames tell: black, dark current, read noise and its shape, row noise, DSNU; each if it is there."""
+"""Dark frames: black, dark current, read noise and its shape, row noise and DSNU; each if it is there.
+
+The likelihood is that of the two integer codes of a pixel, with the rounding inside it. Rounding is therefore exact
+where the noise is a fraction of a code, and not the usual 1/12; codes that stop at 0 or at the converter's end are
+censored: the signal lies beyond, and no more is known. Nothing is taken for normal that is not: few electrons of dark
+current are as skewed as Poisson says.
+"""
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass, replace
 from typing import final
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32
+from jaxtyping import Bool, Float
+from scipy.special import beta, xlogy
 
 from udccal.fitting.engine.gaussian import scaled_inverse
-from udccal.fitting.engine.orders import Attempt, bic, choose
-from udccal.fitting.engine.robust import MAD_TO_SIGMA
-from udccal.fitting.noise.codes import (
-    LEAST_VARIANCE,
-    NORMAL_SHAPE,
-    DarkFit,
-    Surroundings,
-    dark_levels,
-    excess_kurtosis,
-    fit_dark,
-)
-from udccal.fitting.noise.data import NoiseMoments
-from udccal.fitting.noise.rules import NoiseRules
-from udccal.result import Candidate
+from udccal.fitting.engine.least_squares import Blocks, SolverRules, Step, minimise
+from udccal.fitting.engine.orders import Quantity
+from udccal.fitting.noise.data import NoiseRules
+from udccal.fitting.noise.moments import DarkPair, NoiseMoments
+from udccal.fitting.noise.patterns import Pattern, dsnu, row_noise
+
+# The shape with the kurtosis of a normal distribution.
+NORMAL_SHAPE = 0.1349
+# Bounds of black [DN], dark current [DN/s], variance of single samples without row noise [DN^2], variance of the
+# pixels' offsets [DN^2], and Tukey-lambda shape: the order of ``Five``. Variances at the bound are those of none.
+_LOW = np.array([-np.inf, -np.inf, 1e-3, 1e-6, -0.1])
+_HIGH = np.array([np.inf, np.inf, np.inf, np.inf, 0.45])
+Five = Float[np.ndarray, "5"]
+
+
+def tukey_lambda_std(shape: float) -> float:
+    """Standard deviation of the Tukey-lambda distribution with quantile (p^l - (1-p)^l) / l."""
+    # The formula has no value at 0.
+    safe = shape if abs(shape) >= 1e-4 else 1e-4
+    return float(np.sqrt(2.0 / safe**2 * (1.0 / (1 + 2 * safe) - beta(safe + 1, safe + 1))))
+
+
+@functools.lru_cache(maxsize=64)
+def _standard_cdf(shape: float) -> tuple[Float[np.ndarray, " grid"], Float[np.ndarray, " grid"]]:
+    """Quantiles of the Tukey-lambda distribution of unit variance, and their probabilities."""
+    p, tail = (1.0 / (1.0 + np.exp(sign * np.linspace(-24.0, 24.0, 6001))) for sign in (-1, 1))
+    safe = shape if abs(shape) >= 1e-4 else 1e-4
+    return (p**safe - tail**safe) / safe / tukey_lambda_std(safe), p
+
+
+def excess_kurtosis(shape: float) -> float:
+    """Of the Tukey-lambda distribution: 1.2 for the logistic (0), 0 at 0.1349, negative above."""
+    x, p = _standard_cdf(shape)
+    return float(0.5 * (x[1:] ** 4 + x[:-1] ** 4) @ np.diff(p)) - 3.0
+
+
+@functools.lru_cache(maxsize=128)
+def _dark_cdf(
+    sigma_DN: float, shape: float, row_DN: float, dark_DN: float, K_DN_per_e: float
+) -> tuple[Float[np.ndarray, " grid"], Float[np.ndarray, " grid"]]:
+    """Places (DN from the mean) and the probability that a dark sample lies below them before rounding.
+
+    Tukey-lambda read noise, normal row noise and Poisson counts of ``dark_DN`` in all are independent: their
+    distribution is a convolution, made as a product of spectra.
+    """
+    reach = 14 * np.sqrt(sigma_DN**2 + row_DN**2 + K_DN_per_e * max(dark_DN, 0.0)) + 2 * K_DN_per_e * (dark_DN > 0)
+    # Peaks of single counts are as narrow as the read noise: three points to its sigma, down to 0.02 DN.
+    points = int(np.clip(2 ** np.ceil(np.log2(6 * reach / max(sigma_DN, 0.06))), 4096, 65536))
+    step = 2 * reach / points
+    edges = step * (np.arange(points + 1) - points // 2 - 0.5)
+    grid, cdf = _standard_cdf(shape)
+    mass = np.diff(np.interp(edges / max(sigma_DN, 1e-12), grid, cdf, left=0.0, right=1.0))
+    u = 2 * np.pi * np.fft.rfftfreq(points, step)
+    # Narrower than the grid it would ring: then it is widened to one step.
+    smear = step if sigma_DN < 2 * step else 0.0
+    log_phase = -0.5 * (row_DN**2 + smear**2) * u**2 + 0j
+    if dark_DN > 0 and K_DN_per_e > 0:
+        log_phase = log_phase + dark_DN / K_DN_per_e * (np.exp(-1j * u * K_DN_per_e) - 1 + 1j * u * K_DN_per_e)
+    mass = np.fft.irfft(np.fft.rfft(mass) * np.exp(log_phase), points)
+    return edges[1:], np.clip(np.maximum.accumulate(np.cumsum(mass)), 0.0, 1.0)
 
 
 @final
 @dataclass(frozen=True)
-class Quantity:
-    """A value with its variance; where ``there`` is False the data do not ask for it and the value is that without."""
+class Surroundings:
+    """What is known apart from the histograms; ``background`` is the fraction of samples of any code."""
 
-    value: float
-    variance: float
-    there: bool = True
-    candidates: tuple[Candidate, ...] = ()
+    K_DN_per_e: float
+    sigma_row_DN: float
+    background: float
 
-    @classmethod
-    def asked(
-        cls, name: str, value: float, variance: float, samples: int, gain: float | None = None, without: float = 0.0
-    ) -> Quantity:
-        """The value where the likelihood gains more by it (minus twice the logarithm) than BIC asks."""
-        own = value**2 / variance if value > 0 and variance > 0 else 0.0
-        choice = choose(
-            (
-                Attempt(f"without {name}", 0, own if gain is None else gain, without),
-                Attempt(f"with {name}", 1, bic(0.0, 1.0, samples), value),
-            )
-        )
-        return cls(choice.best.fit, variance, choice.best.parameters > 0, choice.candidates)
+
+def pair_probability(pair: DarkPair, values: Five, known: Surroundings) -> Float[np.ndarray, "codes codes"]:
+    """Of the two codes of a pixel in a pair of dark frames, in its groups of codes."""
+    black, per_s, variance, spread2, shape = (float(v) for v in values)
+    drift = per_s * pair.exposure_s
+    grid, cdf = _dark_cdf(np.sqrt(variance), shape, known.sigma_row_DN, drift, known.K_DN_per_e)
+    # Counts of dark current widen the distribution but leave its peaks as narrow as the read noise. Evenly spaced
+    # nodes are for a smooth integrand as good as any quadrature.
+    width, spread = max(np.sqrt(variance + known.sigma_row_DN**2), 1e-9), np.sqrt(spread2)
+    z = np.linspace(-5.5, 5.5, int(np.clip(np.ceil(17.6 * spread / width), 13, 1201)) | 1)
+    weights = np.exp(-0.5 * z**2)
+    below = np.interp(pair.edges_DN - (black + drift + spread * z)[:, None], grid, cdf, left=0.0, right=1.0)
+    single = np.diff(below, axis=1)
+    joint = (single * (weights / weights.sum())[:, None]).T @ single
+    return np.asarray((1 - known.background) * joint + known.background / joint.size)
 
 
 @final
 @dataclass(frozen=True)
-class Unevenness:
-    """A variance between pixels (may be negative by chance), its standard deviation, samples, and outliers left out.
+class DarkFit:
+    """Values in the order of the bounds, with their covariance; and what follows per pair.
 
-    ``mean`` is that of the samples left in, and ``mean_variance`` how much it differs from sensor to sensor by these
-    patterns alone; ``places`` are (row, column) of the first outliers.
+    ``edge_gains`` is d(mean code)/d(black): 1, and ``follows``, where rounding is white and no code is cut off.
+    ``means_DN`` is the mean signal with rounding and censoring undone, of variance ``variances_DN2``.
     """
 
-    variance: float
-    sigma: float
-    samples: int
-    outliers: int
-    mean: float
-    mean_variance: float
-    places: tuple[tuple[int, int], ...] = ()
+    values: Five
+    cov: Float[np.ndarray, "5 5"]
+    converged: bool
+    follows: bool
+    edge_gains: Float[np.ndarray, " pairs"]
+    means_DN: Float[np.ndarray, " pairs"]
+    variances_DN2: Float[np.ndarray, " pairs"]
+
+
+@final
+@dataclass(frozen=True)
+class _DarkCodes:
+    """The engine's problem: the deviance of all histograms from those expected, the shape's prior added."""
+
+    pairs: tuple[DarkPair, ...]
+    known: Surroundings
+    free: Bool[np.ndarray, "5"]
+    shape_sigma: float
+    name: str = "noise, dark codes"
+
+    def equations_at(self, place: Five) -> Blocks:
+        """Score and Fisher information; at a bound with the score pointing outwards the bound is the answer."""
+        off = (place[4] - NORMAL_SHAPE) / self.shape_sigma
+        cost, samples, shape = off**2, 0, self.free[4] * np.eye(5)[4] / self.shape_sigma
+        score, information = -off * shape, np.outer(shape, shape)
+        # For derivatives by differences: small beside the noise, large beside the arithmetic.
+        width2 = place[2] + 0.01
+        longest = max(max(pair.exposure_s for pair in self.pairs), 1e-9)
+        steps = 2e-3 * np.array([width2**0.5, width2**0.5 / longest, width2, max(0.5 * place[3], 1e-4 * width2), 1.0])
+        steps = np.where(place + steps <= _HIGH, steps, -steps)
+        for pair in self.pairs:
+            p, counts = pair_probability(pair, place, self.known).ravel(), pair.counts.ravel()
+            total = int(counts.sum())
+            # One-sided: the second order, which that leaves, sums to nothing in the score at the truth.
+            jacobian = np.zeros((5, p.size))
+            for i in np.flatnonzero(self.free):
+                moved = pair_probability(pair, place + steps[i] * np.eye(5)[i], self.known)
+                jacobian[i] = (moved.ravel() - p) / steps[i]
+            cost += 2 * float(np.sum(xlogy(counts, counts / (total * p))))
+            score += jacobian @ (counts / p)
+            information += total * (jacobian / p) @ jacobian.T
+            samples += total
+        held = ~self.free | ((place <= _LOW) & (score < 0)) | ((place >= _HIGH) & (score > 0))
+        return replace(Blocks.dense(cost, samples, information, score), held=held)
+
+    def moved(self, place: Five, step: Step) -> Five:
+        """Inside the bounds."""
+        return np.clip(place + step.shared, _LOW, _HIGH)
+
+
+def start_values(pairs: tuple[DarkPair, ...]) -> Five:
+    """Moments of the histograms: the covariance of the two codes is the variance of the offsets."""
+    found = []
+    for pair in pairs:
+        centres, part = pair.centres_DN, pair.counts / max(pair.counts.sum(), 1)
+        first, second = part.sum(axis=1), part.sum(axis=0)
+        spread = float((centres - first @ centres) @ part @ (centres - second @ centres))
+        total = float(first @ (centres - first @ centres) ** 2)
+        found.append((pair.exposure_s, 0.5 * (first + second) @ centres, total - spread, spread))
+    times, means, variances, spreads = np.array(found).T
+    centred = times - times.mean()
+    slope = centred @ means / max(centred @ centred, 1e-300)
+    least = max(variances.min() - 1.0 / 12.0, 0.05), max(spreads.min(), 0.003)
+    return np.array([means.mean() - slope * times.mean(), slope, *least, NORMAL_SHAPE])
+
+
+def fit_dark(
+    pairs: tuple[DarkPair, ...], known: Surroundings, rules: NoiseRules, start: Five | None = None, normal: bool = False
+) -> DarkFit:
+    """Fisher scoring on the likelihood of all pairs; ``normal`` holds the shape at that of normal noise.
+
+    The pairs have their pixels' offsets in common, so the information on DSNU does not add up over pairs: its sigma is
+    widened by the square root of their number. Row noise in ``known`` is that of these frames.
+    """
+    values = np.clip(start_values(pairs) if start is None else start, _LOW, _HIGH)
+    free = np.array([True, len({pair.exposure_s for pair in pairs}) > 1, True, True, not normal])
+    values = np.where(free, values, [0.0, 0.0, 0.0, 0.0, NORMAL_SHAPE])
+    # One-sided derivatives promise a little for ever.
+    solver = SolverRules(least_gain=1e-3, stalled_gain=1e-4, iterations=40)
+    found = minimise(_DarkCodes(pairs, known, free, rules.shape_sigma), values, solver)
+    values, information = found.place, found.equations.shared
+    # What rounding hides is no larger than rounding: that much is known of codes that are all the same. Noise and
+    # offsets within a code may be hidden by rounding, and else by nothing but chance.
+    step2, longest = pairs[0].step_DN ** 2 / 12.0, max(max(pair.exposure_s for pair in pairs), 1e-9)
+    least = np.array([1 / step2, longest**2 / step2, step2**-2, step2**-2, rules.shape_sigma**-2])
+    lost = free & bool(values[2] + values[3] < 12 * step2) & (np.diag(information) < least)
+    information = np.where(lost[:, None] | lost, np.diag(np.where(lost, least, 0.0)), information)
+    widen = np.sqrt(np.array([1.0, 1.0, 1.0, len(pairs), 1.0]))
+    cov = scaled_inverse(information) * np.outer(widen, widen)
+    levels = np.array([_level(pair, values, known) for pair in pairs]).T
+    return DarkFit(values, cov, found.converged, bool(np.abs(levels[0] - 1).max() < rules.white), *levels)
+
+
+def _level(pair: DarkPair, values: Five, known: Surroundings) -> tuple[float, float, float]:
+    """``DarkFit.edge_gains``, ``means_DN`` and ``variances_DN2`` of a pair, by one scoring step from the common fit."""
+    black = 0.01 * float(np.sqrt(values[2])) * np.eye(5)[0]
+    up, down = (pair_probability(pair, values + sign * black, known) for sign in (1, -1))
+    by_black, p, total = (up - down) / (2 * black[0]), 0.5 * (up + down), float(pair.counts.sum())
+    gain, information = float(by_black.sum(axis=1) @ pair.centres_DN), total * float(np.sum(by_black**2 / p))
+    mean, blind = float(values[0] + values[1] * pair.exposure_s), pair.step_DN**2 / 12.0
+    if information * blind < 1:
+        return gain, mean, blind  # Where all codes are one code, the level is known to rounding alone.
+    shift = float(np.sum(by_black * pair.counts / p)) / information
+    # The part of the offsets in the variance is the same in every pair and does not count here.
+    temporal = max(1 / information - float(values[3]) / total, 0.05 / information)
+    return gain, mean + shift, temporal + known.sigma_row_DN**2 / (2 * pair.rows)
 
 
 @final
 @dataclass(frozen=True)
 class DarkTerms:
-    """Dark quantities in DN.
-
-    ``K_DN_per_e`` is the gain that was taken for known; ``read_DN2`` is the variance of single samples without row
-    noise, and ``excess`` its excess kurtosis; ``levels_cov`` is the covariance of (black, dark current);
-    ``pixels_DN2`` the variance of the mean of this sensor's offsets.
-    """
+    """Dark quantities; ``levels_cov`` is that of (black, dark current); ``white``: no pixel's mean shows rounding."""
 
     K_DN_per_e: float
     black_DN: float
@@ -84,208 +233,63 @@ class DarkTerms:
     levels_cov: Float[np.ndarray, "2 2"]
     read_DN2: Quantity
     shape: Quantity
-    excess: float
     row_DN2: Quantity
     dsnu_DN2: Quantity
-    pixels_DN2: float
     white: bool
     fit: DarkFit
-    samples: int
-    defects: Unevenness
+    offsets: Pattern
 
 
-def fit_dark_terms(
-    data: NoiseMoments, K_DN_per_e: float, rules: NoiseRules, start: DarkTerms | None = None
-) -> DarkTerms:
-    """Fit everything dark; ``K_DN_per_e`` is used for the shot noise of the dark current alone.
-
-    ``start`` is a fit with another gain to begin from.
-    """
-    row, in_pairs = row_noise(data, rules, np.ones(len(data.darks)))
+def fit_dark_terms(data: NoiseMoments, K_DN_per_e: float, rules: NoiseRules, start: Five | None = None) -> DarkTerms:
+    """Fit everything dark; ``K_DN_per_e`` is used for the shot noise of the dark current alone."""
+    row, in_pairs = row_noise(data, np.ones(len(data.darks)))
     known = Surroundings(K_DN_per_e, in_pairs, rules.background)
-    tukey = fit_dark(data.darks, known, rules, start=None if start is None else start.fit.values)
-    if not _follows(tukey, rules):
-        row, in_pairs = row_noise(data, rules, tukey.edge_gains)
+    fit = fit_dark(data.darks, known, rules, start)
+    if not fit.follows:
+        row, in_pairs = row_noise(data, fit.edge_gains)
         known = replace(known, sigma_row_DN=in_pairs)
-        tukey = fit_dark(data.darks, known, rules, start=tukey.values)
-    # Temporal noise too small beside a code is not told from the pattern of rounding.
-    resolved = float(tukey.values[2]) + known.sigma_row_DN**2 >= (rules.resolved * data.q_DN) ** 2
-    row = row if resolved else row_noise(data, rules, np.zeros(len(data.darks)))[0]
-    samples = sum(int(pair.counts.sum()) for pair in data.darks)
-    told, variance = float(tukey.values[4]), float(tukey.cov[4, 4])
-    name = f"read noise of another shape than normal ({NORMAL_SHAPE:.2f})"
-    gain = (told - NORMAL_SHAPE) ** 2 / variance
-    shape = Quantity.asked(name, told, variance, samples, gain, without=NORMAL_SHAPE)
-    fit = tukey if shape.there else fit_dark(data.darks, known, rules, start=tukey.values, normal=True)
+        fit = fit_dark(data.darks, known, rules, fit.values)
+    # Temporal noise too small beside a code cannot be distinguished from the pattern of rounding.
+    resolved = float(fit.values[2]) + in_pairs**2 >= (rules.resolved * data.q_DN) ** 2
+    row = row if resolved else row_noise(data, np.zeros(len(data.darks)))[0]
+    value, variance = float(fit.values[4]), float(fit.cov[4, 4])
+    name, gain = f"read noise of another shape than normal ({NORMAL_SHAPE:.2f})", (value - NORMAL_SHAPE) ** 2 / variance
+    shape = Quantity.asked(name, value, variance, data.dark_samples, gain, without=NORMAL_SHAPE)
+    fit = fit if shape.there else fit_dark(data.darks, known, rules, fit.values, normal=True)
+    read, spread2 = float(fit.values[2]), float(fit.values[3])
+    # DSNU is that of the stack's average, unless rounding bends it: then that of the histograms.
+    stack, rounding = data.dark_stack, data.q_DN**2 / 12.0
+    single = read + K_DN_per_e * max(float(fit.values[1]), 0.0) * stack.exposure_s + rounding
+    offsets = dsnu(stack.mean_DN, single / stack.frames, in_pairs**2 / stack.frames, rules)
     # Offsets that differ smear the rounding of the mean over all pixels; that of one pixel, its own noise alone.
-    white = _follows(fit, rules) and 4 * np.pi**2 * float(fit.values[2]) >= rules.smeared * data.q_DN**2
-    uneven = _dsnu(data, fit, known, white, resolved, rules)
-    black, levels_cov, current = _levels(data, fit, known, _follows(fit, rules), uneven)
-    none = float(fit.values[2]) <= 1.001 * LEAST_VARIANCE
-    read_variance = max(float(fit.cov[2, 2]), LEAST_VARIANCE**2) if none else float(fit.cov[2, 2])
-    return DarkTerms(
-        K_DN_per_e=K_DN_per_e,
-        black_DN=black,
-        dark_DN_per_s=current,
-        levels_cov=levels_cov,
-        read_DN2=Quantity(0.0 if none else float(fit.values[2]), read_variance, not none),
-        shape=shape,
-        excess=excess_kurtosis(shape.value) if shape.there else 0.0,
-        row_DN2=row,
-        dsnu_DN2=Quantity.asked("DSNU", uneven.variance, uneven.sigma**2, uneven.samples),
-        pixels_DN2=uneven.mean_variance,
-        white=white,
-        fit=replace(fit, values=tukey.values),
-        samples=samples,
-        defects=uneven,
-    )
-
-
-def row_noise(data: NoiseMoments, rules: NoiseRules, edge_gains: Float[np.ndarray, " pairs"]) -> tuple[Quantity, float]:
-    """Variance by rows, and its root as it happened to be in the pairs alone: that is what widened their histograms.
-
-    Rounding and cut-off codes pass only the square of ``edge_gains`` of it, pair by pair.
-    """
-    seen = [(one.rows, float(gain)) for one, gain in zip(data.dark_moments, edge_gains, strict=True)]
-    samples = sum(int(pair.counts.sum()) for pair in data.darks)
-
-    def told() -> Quantity:
-        rows = [
-            ((of.variance_DN2 + of.sampling_DN2) / gain**2, of.sampling_DN2 / gain**2, of.dof)
-            for of, gain in seen
-            if gain >= rules.row_visible and of.variance_DN2 + of.sampling_DN2 > 0
-        ]
-        # Where rounding hides all of it, it may be as large as rounding itself.
-        found = excess_variance(*np.array(rows).T) if rows else (0.0, (data.q_DN**2 / 12.0) ** 2, 0.0)
-        return Quantity.asked("row noise", found[0], found[1], samples, found[2])
-
-    alone = told()
-    if data.dark_stack.temporal is not None:
-        nearest = int(np.argmin([abs(pair.exposure_s - data.dark_stack.exposure_s) for pair in data.darks]))
-        seen.append((data.dark_stack.temporal.rows, float(edge_gains[nearest])))
-    row = told()
-    return row, float(np.sqrt(alone.value)) if row.there else 0.0
-
-
-def excess_variance(
-    observed: Float[np.ndarray, " n"], known: Float[np.ndarray, " n"], dof: Float[np.ndarray, " n"]
-) -> tuple[float, float, float]:
-    """Variance that chi-squared estimates have beside what is known of them, by maximum likelihood; not below 0.
-
-    Args:
-        observed: estimates of a variance.
-        known: part of each that has another cause.
-        dof: degrees of freedom of each.
-
-    Returns:
-        the variance, its own variance, and what the likelihood gains by it (minus twice the logarithm).
-    """
-    known = known + 1e-12 * float(observed.max()) + 1e-300
-    found = float(np.average(observed, weights=dof))
-    for _ in range(50):
-        weight = dof / (found + known) ** 2
-        found = max(float(np.sum(weight * (observed - known)) / np.sum(weight)), 0.0)
-
-    def deviance(variance: float) -> float:
-        return float(np.sum(dof * (np.log(variance + known) + observed / (variance + known))))
-
-    return found, float(2 / np.sum(dof / (found + known) ** 2)), deviance(0.0) - deviance(found)
-
-
-def _follows(fit: DarkFit, rules: NoiseRules) -> bool:
-    """Mean codes follow the mean signal: nothing is cut off."""
-    return bool(np.abs(fit.edge_gains - 1).max() < rules.white)
-
-
-def _dsnu(
-    data: NoiseMoments, fit: DarkFit, known: Surroundings, white: bool, resolved: bool, rules: NoiseRules
-) -> Unevenness:
-    """From the stack's average, unless rounding bends it: then from the histograms."""
-    stack = data.dark_stack
-    shot = known.K_DN_per_e * max(float(fit.values[1]), 0.0) * stack.exposure_s
-    temporal = float(fit.values[2]) + shot + data.q_DN**2 / 12.0
-    found = dsnu(stack.mean_DN, temporal / stack.frames, known.sigma_row_DN**2 / stack.frames, rules)
-    if white:
-        return found
-    variance, pixels = float(fit.values[3]), stack.mean_DN.size
-    sigma = float(np.hypot(np.sqrt(fit.cov[3, 3]), 0.0 if resolved else data.q_DN**2 / 12.0))
-    return replace(found, variance=variance, sigma=sigma, samples=pixels, mean_variance=variance / pixels)
-
-
-def dsnu(
-    dark_DN: Float[np.ndarray, "rows columns"] | Float32[np.ndarray, "rows columns"],
-    temporal_DN2: float,
-    row_DN2: float,
-    rules: NoiseRules,
-) -> Unevenness:
-    """Variance of the pixels' offsets in an averaged dark frame (EMVA 1288, clause 8.2), row and column patterns in it.
-
-    Args:
-        dark_DN: the average.
-        temporal_DN2: temporal variance of one sample of the average, row noise left out.
-        row_DN2: row noise left in the average.
-        rules: which pixels are defects.
-    """
-    about = dark_DN.astype(np.float64)
-    bad = _far_off(about, rules.defect_sigma)
-    mean = float(about[~bad].mean()) if not bad.all() else 0.0
-    about -= mean
-    about[bad] = 0.0
-    rows, columns = about.shape
-    samples = int(about.size - bad.sum())
-    total = float(np.vdot(about, about)) / max(samples - 1, 1)
-    row_part, column_part = float(np.var(about.mean(axis=1))), float(np.var(about.mean(axis=0)))
-    pixel_part = max(total - row_part - column_part, 0.0)
-    # Each part is chi-squared with its own number of independent values.
-    sigma = np.sqrt(2 * pixel_part**2 / samples + 2 * row_part**2 / rows + 2 * column_part**2 / columns)
-    own_row, own_column = (max(part - pixel_part / n, 0.0) for part, n in ((row_part, columns), (column_part, rows)))
-    of_mean = max(pixel_part - temporal_DN2, 0.0) / samples + max(own_row - row_DN2, 0.0) / rows + own_column / columns
-    return Unevenness(
-        variance=total - temporal_DN2 - row_DN2,
-        sigma=float(sigma),
-        samples=samples,
-        outliers=int(bad.sum()),
-        mean=mean,
-        mean_variance=float(of_mean),
-        places=first_places(bad),
-    )
-
-
-def _far_off(values: Float[np.ndarray, "rows columns"], reach: float) -> Bool[np.ndarray, "rows columns"]:
-    """Samples more than ``reach`` robust sigma from the median."""
-    sample = values[:: max(1, values.shape[0] // 256)]
-    middle = float(np.median(sample))
-    spread = MAD_TO_SIGMA * float(np.median(np.abs(sample - middle)))
-    # Averages of few frames are coarse: a spread below their step is no measure of what is usual.
-    return np.abs(values - middle) > reach * max(spread, float(sample.std()) / reach, 1e-12)
-
-
-def first_places(bad: Bool[np.ndarray, "rows columns"]) -> tuple[tuple[int, int], ...]:
-    """Row and column of the first eight."""
-    rows, columns = np.unravel_index(np.flatnonzero(bad)[:8], bad.shape)
-    return tuple(zip(rows.tolist(), columns.tolist(), strict=True))
+    white = fit.follows and 4 * np.pi**2 * read >= rules.smeared * data.q_DN**2
+    if not white:
+        pixels, sigma = stack.mean_DN.size, float(np.hypot(fit.cov[3, 3] ** 0.5, 0.0 if resolved else rounding))
+        offsets = replace(offsets, variance=spread2, sigma=sigma, samples=pixels, mean_variance=spread2 / pixels)
+    black, levels_cov, current = _levels(data, fit, in_pairs**2, single, offsets)
+    none = read <= 1.001 * _LOW[2]
+    read_DN2 = Quantity(0.0 if none else read, max(float(fit.cov[2, 2]), _LOW[2] ** 2 if none else 0.0))
+    DSNU2 = Quantity.asked("DSNU", offsets.variance, offsets.sigma**2, offsets.samples)
+    return DarkTerms(K_DN_per_e, black, current, levels_cov, read_DN2, shape, row, DSNU2, white, fit, offsets)
 
 
 def _levels(
-    data: NoiseMoments, fit: DarkFit, known: Surroundings, follows: bool, uneven: Unevenness
+    data: NoiseMoments, fit: DarkFit, row_DN2: float, single_DN2: float, offsets: Pattern
 ) -> tuple[float, Float[np.ndarray, "2 2"], Quantity]:
     """Black and dark current from the mean of every dark exposure, with its own weight."""
-    means, variances = dark_levels(data.darks, fit, known)
-    times = np.array([pair.exposure_s for pair in data.darks])
+    means, variances, times = fit.means_DN, fit.variances_DN2, np.array([pair.exposure_s for pair in data.darks])
     stack, rounding = data.dark_stack, data.q_DN**2 / 12.0
-    if follows:
-        single = float(fit.values[2]) + known.K_DN_per_e * max(float(fit.values[1]), 0.0) * stack.exposure_s + rounding
-        rows = known.sigma_row_DN**2 / stack.mean_DN.shape[0]
-        means, times = np.append(means, uneven.mean), np.append(times, stack.exposure_s)
-        variances = np.append(variances, (single / stack.mean_DN.size + rows) / stack.frames)
+    if fit.follows:
+        means, times = np.append(means, offsets.mean), np.append(times, stack.exposure_s)
+        rows = row_DN2 / len(stack.mean_DN)
+        variances = np.append(variances, (single_DN2 / stack.mean_DN.size + rows) / stack.frames)
     design = np.column_stack([np.ones_like(times), times])
     cov = scaled_inverse(design.T @ (design / variances[:, None]))
     line = cov @ (design.T @ (means / variances))
-    samples = sum(int(pair.counts.sum()) for pair in data.darks)
-    current = Quantity.asked("dark current", float(line[1]), float(cov[1, 1]), samples)
+    current = Quantity.asked("dark current", float(line[1]), float(cov[1, 1]), data.dark_samples)
     # The offsets of this sensor's pixels are one draw: their mean is not that of all sensors alike.
-    cov[0, 0] += uneven.mean_variance
-    if not follows:
+    cov[0, 0] += offsets.mean_variance
+    if not fit.follows:
         # Black, spread and noise of coarse or cut-off codes err together, and alike in every pair.
         cov[0, 0] = max(float(cov[0, 0]), len(data.darks) * float(fit.cov[0, 0]))
     if (variances >= rounding).any():

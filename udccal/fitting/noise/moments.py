@@ -1,4 +1,4 @@
-"""Frames of one scene reduced to moments per bin: mean and temporal variance, row noise apart, hits left out.
+"""Frames reduced to what the fit needs: moments per bin of pairs and stacks, and joint histograms of dark codes.
 
 A bin is one site of the colour mosaic in one tile of the sensor. Frames come one by one; their differences to the first
 are summed, and the squares of these, so that float32 loses nothing.
@@ -7,98 +7,47 @@ are summed, and the squares of these, so that float32 loses nothing.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import final
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Float32, Int, UInt16
+from jaxtyping import Float, Float32, Int
 
-from udccal.fitting.noise.rules import NoiseRules
+from udccal.errors import FitError
+from udccal.fitting.noise.data import Averaged, Codes, ExposureLevel, Frame, NoiseData, NoiseRules, loaded
 
-Codes = UInt16[np.ndarray, "rows columns"]
 Grid = Float[np.ndarray, "groups_y groups_x"]
-# Samples of a strip, which stays in the processor's cache; and rows that tell the usual size of a difference.
-_STRIP, _SAMPLED_ROWS = 1 << 17, 128
-
-
-@final
-@dataclass(frozen=True)
-class Tiling:
-    """Sites and tiles of a sensor; groups are (tile, phase of the mosaic), the phase running fastest.
-
-    Attributes:
-        period: of the mosaic.
-        starts: per phase, where its tiles begin among the columns of that phase.
-        width: columns per group.
-        down: which rows belong to which group.
-        counts: samples per bin.
-    """
-
-    period: int
-    starts: Int[np.ndarray, "period tiles"]
-    width: Float[np.ndarray, " groups_x"]
-    down: Float[np.ndarray, "groups_y rows"]
-    counts: Grid
-
-    def across(self, values: Float32[np.ndarray, "rows columns"]) -> Float[np.ndarray, "rows groups_x"]:
-        """Sums over the columns of each group."""
-        sums = np.empty((values.shape[0], len(self.width)))
-        for phase, starts in enumerate(self.starts):
-            sums[:, phase :: self.period] = np.add.reduceat(values[:, phase :: self.period], starts, axis=1)
-        return sums
-
-    def means(self, values: Float32[np.ndarray, "rows columns"]) -> Grid:
-        """Means over the samples of each bin."""
-        return self.down @ self.across(values) / self.counts
 
 
 @functools.lru_cache(maxsize=8)
-def tiling(rows: int, columns: int, period: int, rules: NoiseRules) -> Tiling:
-    """Tiles of a sensor whose colour sites repeat every ``period`` samples (1: monochrome)."""
+def bins(
+    rows: int, columns: int, period: int, rules: NoiseRules
+) -> tuple[Float[np.ndarray, "groups_y rows"], Float32[np.ndarray, "columns groups_x"]]:
+    """Ones where a row and a column belong to a group of bins; colour sites repeat every ``period`` samples."""
     tiles = int(np.clip(np.sqrt(rows * columns / period**2 / rules.tile_samples), 1, rules.tiles))
 
-    def groups(length: int) -> Int[np.ndarray, " length"]:
+    def groups(length: int) -> Float[np.ndarray, "length groups"]:
         """Whole mosaic cells per tile; what is left over goes to the last one."""
         tile = np.minimum(np.arange(length) // period // max(length // period // tiles, 1), tiles - 1)
-        return tile * period + np.arange(length) % period
+        return np.eye(tiles * period)[tile * period + np.arange(length) % period]
 
-    starts = np.tile(np.arange(tiles) * max(columns // period // tiles, 1), (period, 1))
-    width = np.bincount(groups(columns), minlength=tiles * period).astype(np.float64)
-    down = np.eye(tiles * period)[groups(rows)].T.copy()
-    return Tiling(period, starts, width, down, np.outer(down.sum(axis=1), width))
-
-
-@final
-@dataclass(frozen=True)
-class RowMoments:
-    """Row noise of frames alike: sigma_row^2 (may be negative by chance), sampling variance beside it, and its rank."""
-
-    variance_DN2: float
-    sampling_DN2: float
-    dof: float
+    return groups(rows).T.copy(), groups(columns).astype(np.float32)
 
 
 @final
 @dataclass(frozen=True)
 class Moments:
-    """Two or more frames of the same scene.
+    """Two or more frames of the same scene; arrays are per bin.
 
-    Attributes:
-        exposure_s: of the frames.
-        light: relative exposure to light, in any unit common to all levels (photons per pixel, or seconds).
-        mean_DN: mean code per bin.
-        variance_DN2: temporal variance of one frame per bin, row noise and common changes of brightness removed.
-        dof: degrees of freedom of ``variance_DN2``.
-        samples: frames times pixels of each bin.
-        spread_DN: standard deviation over the samples of the bin, spatial and temporal.
-        shift_DN: mean of each frame in each bin, less that of all frames.
-        rows: row noise.
-        height: rows of a frame.
-        peak_DN: the largest code.
-        at_peak: share of the samples with that code.
-        outliers: samples that differ too much from the first frame's to be noise; left out.
+    ``light`` is the relative exposure to light, in any unit common to all levels (photons per pixel, or seconds).
+    ``variance_DN2`` is the temporal variance of one frame, row noise and common changes of brightness removed, and
+    ``dof`` its degrees of freedom; ``samples`` are frames times pixels; ``spread_DN`` is the standard deviation over
+    these, spatial and temporal; ``shift_DN`` is the mean of each frame less that of all. ``rows_DN2`` is the variance
+    of the rows' means, and ``sampling_DN2`` the part of it that is sampling; frames have ``height`` rows. ``at_peak``
+    is the fraction of the samples with the largest code. ``outliers`` were hits, and left out.
     """
 
     exposure_s: float
@@ -109,7 +58,8 @@ class Moments:
     samples: Float[np.ndarray, " bins"]
     spread_DN: Float[np.ndarray, " bins"]
     shift_DN: Float[np.ndarray, "frames bins"]
-    rows: RowMoments
+    rows_DN2: float
+    sampling_DN2: float
     height: int
     peak_DN: int
     at_peak: float
@@ -121,67 +71,60 @@ class Moments:
         return len(self.shift_DN)
 
 
-@final
-@dataclass(frozen=True)
-class Averaged:
-    """Mean of frames alike and, where the frames themselves were seen, their moments.
-
-    ``temporal`` is None for an average that was made elsewhere: its variance would hold the lamp's flicker.
-    """
-
-    exposure_s: float
-    mean_DN: Float32[np.ndarray, "rows columns"]
-    frames: int
-    temporal: Moments | None = None
-
-
 def reduce_frames(
-    frames: Iterable[Callable[[], Codes]], exposure_s: float, light: float | None, period: int, rules: NoiseRules
-) -> Averaged:
+    frames: Iterable[Codes], exposure_s: float, light: float | None, period: int, rules: NoiseRules
+) -> tuple[Averaged, Moments]:
     """Mean per pixel, and temporal moments about it per bin: common changes of brightness and row noise taken out.
 
     Args:
-        frames: functions that load one frame each, all of one shape; at least two.
+        frames: of one shape; at least two.
         exposure_s: of all frames, in seconds.
         light: relative exposure to light; the exposure time where not known.
         period: colour sites repeat after so many samples (1: monochrome).
         rules: size of the tiles, and what is a hit.
     """
     source = iter(frames)
-    first = next(source)()
-    tiles = tiling(*first.shape, period, rules)
-    total, squares = np.zeros((2, *first.shape), np.float32)
+    first = next(source)
+    down, right = bins(*first.shape, period, rules)
+    counts, total, outliers = np.outer(down.sum(axis=1), right.sum(axis=0)), np.zeros(first.shape, np.float32), 0
     # The first frame differs from itself by nothing.
-    by_row, peaks, outliers = [np.zeros((first.shape[0], len(tiles.width)))], [_peak(first)], 0
-    for load in source:
-        frame = load()
-        by_row.append(np.empty_like(by_row[0]))
+    by_row, peaks = [np.zeros((len(first), right.shape[1]))], [_peak(first)]
+    squares = np.zeros_like(by_row[0])
+    for frame in source:
+        difference = cv2.subtract(frame, first, dtype=cv2.CV_32F)
+        square = cv2.multiply(difference, difference)
+        # The usual difference is the median over some rows, which hits do not move; ten codes are never a hit.
+        usual = np.median(square[:: max(len(first) // 128, 1)] @ right, axis=0) / right.sum(axis=0)
+        hits = square > max(rules.hit_sigma**2 * float(usual.max()), 10.0**2)
+        difference[hits] = square[hits] = 0.0
+        outliers += int(np.count_nonzero(hits))
+        total += difference
+        squares += square @ right
+        by_row.append(np.asarray(difference @ right, dtype=np.float64))
         peaks.append(_peak(frame))
-        outliers += _add_difference(frame, first, tiles, rules, total, squares, by_row[-1])
-    number, middle = len(by_row), np.float32(np.median(first[:: max(len(first) // 64, 1)]))
+    number, middle, peak = len(by_row), float(np.median(first[:: max(len(first) // 64, 1)])), max(peaks)[0]
+    squares -= cv2.multiply(total, total, scale=1.0 / number) @ right
     mean = cv2.addWeighted(first, 1.0, total, 1.0 / number, 0.0, dtype=cv2.CV_32F)
-    within = tiles.across(cv2.subtract(squares, cv2.multiply(total, total, scale=1.0 / number)))
-    variance, dof, shift, rows = _temporal(tiles, np.stack(by_row), within, first.shape[1])
-    about = cv2.subtract(mean, float(middle))
-    level = tiles.means(about)
-    spatial = np.maximum(tiles.means(cv2.multiply(about, about)) - level**2, 0.0)
-    peak = max(code for code, _ in peaks)
-    moments = Moments(
+    variance, dof, shift, rows, sampling = _temporal(down, right, np.stack(by_row), squares)
+    about = cv2.subtract(mean, middle)
+    level, square = (down @ (of @ right) / counts for of in (about, cv2.multiply(about, about)))
+    spatial = np.maximum(square - level**2, 0.0)
+    return Averaged(exposure_s, mean, number), Moments(
         exposure_s=exposure_s,
         light=exposure_s if light is None else light,
         mean_DN=(level + middle).ravel(),
         variance_DN2=variance.ravel(),
         dof=dof.ravel(),
-        samples=number * tiles.counts.ravel(),
+        samples=number * counts.ravel(),
         spread_DN=np.sqrt(spatial + np.maximum(variance, 0.0) * (1 - 1 / number)).ravel(),
         shift_DN=shift.reshape(number, -1),
-        rows=rows,
-        height=first.shape[0],
+        rows_DN2=rows,
+        sampling_DN2=sampling,
+        height=len(first),
         peak_DN=peak,
         at_peak=sum(count for code, count in peaks if code == peak) / (number * first.size),
         outliers=outliers,
     )
-    return Averaged(exposure_s, mean, number, moments)
 
 
 def _peak(frame: Codes) -> tuple[int, int]:
@@ -190,56 +133,161 @@ def _peak(frame: Codes) -> tuple[int, int]:
     return int(top), int(np.count_nonzero(frame == top))
 
 
-def _add_difference(
-    frame: Codes,
-    first: Codes,
-    tiles: Tiling,
-    rules: NoiseRules,
-    total: Float32[np.ndarray, "rows columns"],
-    squares: Float32[np.ndarray, "rows columns"],
-    by_row: Float[np.ndarray, "rows groups_x"],
-) -> int:
-    """Adds ``frame - first`` and its square, and writes its sums by row; gives the number of hits left out."""
-    sample = np.s_[:: max(len(first) // _SAMPLED_ROWS, 1)]
-    difference = cv2.subtract(frame[sample], first[sample], dtype=cv2.CV_32F)
-    # The scale is the median over rows, which hits do not move.
-    usual = np.median(tiles.across(np.square(difference)), axis=0) / tiles.width
-    limit, outliers = np.float32(max(rules.hit_sigma**2 * float(usual.max()), rules.hit_DN**2)), 0
-    height = max(_STRIP // first.shape[1], 1)
-    for top in range(0, len(first), height):
-        rows = np.s_[top : top + height]
-        difference = cv2.subtract(frame[rows], first[rows], dtype=cv2.CV_32F)
-        square = cv2.multiply(difference, difference)
-        if float(square.max()) > limit:
-            wrong = square > limit
-            difference[wrong] = square[wrong] = 0.0
-            outliers += int(np.count_nonzero(wrong))
-        cv2.accumulate(difference, total[rows])
-        cv2.accumulate(square, squares[rows])
-        by_row[rows] = tiles.across(difference)
-    return outliers
-
-
 def _temporal(
-    tiles: Tiling,
+    down: Float[np.ndarray, "groups_y rows"],
+    right: Float32[np.ndarray, "columns groups_x"],
     by_row: Float[np.ndarray, "frames rows groups_x"],
     squares: Float[np.ndarray, "rows groups_x"],
-    columns: int,
-) -> tuple[Grid, Grid, Float[np.ndarray, "frames groups_y groups_x"], RowMoments]:
-    """Variances of bins, their degrees of freedom, the frames' shifts, and row noise."""
-    frames, height = by_row.shape[:2]
+) -> tuple[Grid, Grid, Float[np.ndarray, "frames groups_y groups_x"], float, float]:
+    """Variances of bins, their degrees of freedom, the frames' shifts, the rows' variance and the sampling in it."""
+    (frames, height), columns = by_row.shape[:2], len(right)
+    width = right.sum(axis=0, dtype=np.float64)
+    counts = np.outer(down.sum(axis=1), width)
     about = by_row - by_row.mean(axis=0)
     rows = about.sum(axis=2) / columns
-    within = squares - 2 * np.einsum("kr,krm->rm", rows, about) + np.square(rows).sum(axis=0)[:, None] * tiles.width
-    left = np.einsum("gr,krm->kgm", tiles.down, about - rows[:, :, None] * tiles.width)
-    dof = np.maximum((frames - 1) * (tiles.counts * (1 - 1 / columns) - 1), 1.0)
-    mixed = (tiles.down @ within - np.square(left).sum(axis=0) / tiles.counts) / dof
-    # The rows' means were taken from all of a row: a quiet bin beside noisy ones gains their share of the mean's
+    within = squares - 2 * np.einsum("kr,krm->rm", rows, about) + np.square(rows).sum(axis=0)[:, None] * width
+    left = down @ (about - rows[:, :, None] * width)
+    dof = np.maximum((frames - 1) * (counts * (1 - 1 / columns) - 1), 1.0)
+    mixed = (down @ within - np.square(left).sum(axis=0) / counts) / dof
+    # The rows' means were taken from all of a row: a quiet bin beside noisy ones gains their part of the mean's
     # variance, v' (1 - 1/n) = v (1 - 2/n) + row average / n.
-    average = (mixed @ tiles.width / tiles.width.sum())[:, None]
+    average = (mixed @ width / columns)[:, None]
     variance = (mixed * (1 - 1 / columns) - average / columns) / (1 - 2 / columns)
-    sampling = float(np.average(variance, weights=tiles.counts)) / columns
-    row_dof = (frames - 1) * max(height - 1, 1)
-    observed = float(np.sum((rows - rows.mean(axis=1, keepdims=True)) ** 2)) / row_dof
-    shift = np.einsum("gr,krm->kgm", tiles.down, about) / tiles.counts
-    return variance, dof, shift, RowMoments(observed - sampling, sampling, float(row_dof))
+    observed = float(np.sum((rows - rows.mean(axis=1, keepdims=True)) ** 2)) / ((frames - 1) * max(height - 1, 1))
+    return variance, dof, down @ about / counts, observed, float(np.average(variance, weights=counts)) / columns
+
+
+@final
+@dataclass(frozen=True)
+class DarkPair:
+    """A pair of dark frames reduced to the joint histogram of the two codes of each pixel, in groups of ``step_DN``.
+
+    The outermost edges are infinite where the codes stop there (at 0, or at the converter's end).
+    """
+
+    exposure_s: float
+    edges_DN: Float[np.ndarray, " codes_plus_1"]
+    step_DN: float
+    counts: Int[np.ndarray, "codes codes"]
+    rows: int
+
+    @property
+    def centres_DN(self) -> Float[np.ndarray, " codes"]:
+        """Middle of each group of codes; of a cut-off end, where its neighbours would put it."""
+        inner = self.edges_DN[1:-1]
+        edges = np.clip(self.edges_DN, inner[0] - self.step_DN, inner[-1] + self.step_DN)
+        return np.asarray(0.5 * (edges[1:] + edges[:-1]))
+
+
+def dark_pair(first: Codes, second: Codes, exposure_s: float, q_DN: int = 1, top_code: int = 65535) -> DarkPair:
+    """Joint histogram over a window of codes around the median; codes beyond it are left out."""
+    low, middle, high = np.percentile(first[:: max(1, first.size // 65536)], [2.0, 50.0, 98.0])
+    # 98th minus 2nd percentile is 4.1 sigma; 1.9 times that each side is about 7.8 sigma.
+    half = int(np.ceil(1.9 * (high - low) / q_DN)) + 4
+    # At most some 160 groups a side: a wide window loses nothing by coarser ones.
+    group = max(1, int(np.ceil((2 * half + 1) / 160)))
+    start = max(round(middle / q_DN) - half, 0)
+    codes = min((round(middle / q_DN) + half - start) // group, (top_code // q_DN - start) // group) + 1
+    # One more group takes all that lies outside the window.
+    side = codes + 1
+    group_of = (np.arange(65536) // q_DN - start) // group
+    group_of = np.where((group_of >= 0) & (group_of < codes), group_of, codes).astype(np.uint16)
+    both = group_of[first] * np.uint16(side) + group_of[second]
+    joint = cv2.calcHist([both], [0], None, [side**2], [0, side**2]).astype(np.int64)
+    counts = joint.reshape(side, side)[:codes, :codes]
+    edges = (start + group * np.arange(codes + 1) - 0.5) * q_DN
+    edges[0] = -np.inf if start == 0 else edges[0]
+    edges[-1] = np.inf if edges[-1] >= top_code else edges[-1]
+    return DarkPair(exposure_s, edges, float(group * q_DN), counts, len(first))
+
+
+def converter_step(frame: Codes) -> int:
+    """Smallest step between codes: greater than 1 where a converter's bits are shifted up in 16-bit samples."""
+    codes = np.flatnonzero(np.bincount(frame.ravel(), minlength=2))
+    return int(np.gcd.reduce(np.diff(codes))) if codes.size > 2 else 1
+
+
+def _converter_top(peak: int, declared: int | None, q_DN: int) -> int:
+    """Largest code there is; a FitError where a code that was seen is larger than the one declared."""
+    if declared is None:
+        return int(2 ** max(int(np.ceil(np.log2(peak + q_DN))), 8) - q_DN)
+    if peak > declared:
+        raise FitError(f"Expected codes up to {declared}, found {peak}. Give the converter's largest code as top_code.")
+    return declared
+
+
+@final
+@dataclass(frozen=True)
+class NoiseMoments:
+    """The frames, reduced.
+
+    ``dark_moments`` are of the pairs in ``darks``; both stacks are of about the same exposure; colour sites repeat
+    after ``period`` samples (1: monochrome). ``dark_seen`` and ``flat_seen`` are moments of the stacks' frames:
+    None for an average that was made elsewhere, whose variance would hold the lamp's flicker, and for frames of a pair,
+    which must not count twice.
+    """
+
+    darks: tuple[DarkPair, ...]
+    dark_moments: tuple[Moments, ...]
+    flats: tuple[Moments, ...]
+    dark_stack: Averaged
+    flat_stack: Averaged
+    q_DN: int
+    top_DN: float
+    period: int = 2
+    dark_seen: Moments | None = None
+    flat_seen: Moments | None = None
+
+    @property
+    def dark_samples(self) -> int:
+        """In all histograms."""
+        return sum(int(pair.counts.sum()) for pair in self.darks)
+
+
+def reduced(data: NoiseData, rules: NoiseRules) -> NoiseMoments | None:
+    """All frames as the moments and histograms that the fit needs; None without a dark and a bright pair.
+
+    Raises:
+        FitError: when a frame is not a picture of codes like the others, or an exposure is no time.
+    """
+    data.check()
+    darks, brights = [one for one in data.levels if one.dark], [one for one in data.levels if one.bright]
+    if not darks or not brights:
+        return None
+    stack, period = data.stack, 2 if data.bayer else 1
+    sample = loaded(brights[len(brights) // 2].bright[0])
+    q_DN = converter_step(sample)
+    metered = all(level.photons is not None for level in brights) and (stack is None or stack.photons is not None)
+
+    def moments(frames: Sequence[Frame], exposure_s: float, photons: float | None = None) -> tuple[Averaged, Moments]:
+        checked = (loaded(frame, sample.shape) for frame in frames)
+        return reduce_frames(checked, exposure_s, photons if metered else None, period, rules)
+
+    def dark(level: ExposureLevel) -> tuple[DarkPair, Moments]:
+        first, second = (loaded(frame, sample.shape) for frame in level.dark)
+        _converter_top(int(np.median(first[::64])), top, q_DN)
+        return dark_pair(first, second, level.exposure_s, q_DN, top), moments((first, second), level.exposure_s)[1]
+
+    def average(
+        frames: Sequence[Frame] | Averaged, exposure_s: float, photons: float | None
+    ) -> tuple[Averaged, Moments | None]:
+        return (frames, None) if isinstance(frames, Averaged) else moments(frames, exposure_s, photons)
+
+    with ThreadPoolExecutor(2) as pool:
+        # The stacks are the longest tasks: they go first.
+        tasks = [] if stack is None else [
+            pool.submit(average, frames, stack.exposure_s, stack.photons) for frames in (stack.dark, stack.bright)
+        ]  # fmt: skip
+        flats = tuple(pool.map(lambda level: moments(level.bright, level.exposure_s, level.photons)[1], brights))
+        top = _converter_top(max(flat.peak_DN for flat in flats), data.top_code, q_DN)
+        histograms, dark_moments = zip(*pool.map(dark, darks), strict=True)
+        stacks = [task.result() for task in tasks]
+    if not stacks:
+        means = np.array([flat.mean_DN.mean() for flat in flats])
+        middle = brights[int(np.argmin(np.abs(means - 0.5 * min(means.max(), top))))]
+        near = min(darks, key=lambda level: abs(level.exposure_s - middle.exposure_s))
+        stacks = [(moments(near.dark, near.exposure_s)[0], None), (moments(middle.bright, middle.exposure_s)[0], None)]
+    (dark_stack, dark_seen), (flat_stack, flat_seen) = stacks
+    return NoiseMoments(
+        histograms, dark_moments, flats, dark_stack, flat_stack, q_DN, float(top), period, dark_seen, flat_seen
+    )

@@ -11,21 +11,19 @@ data. Both relations bear on c; the first alone where the light is unsteady, whi
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import product
 from typing import final
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from udccal.fitting.engine.least_squares import Blocks, SolverRules, Step, minimise
+from udccal.fitting.engine.misfit import excess_variance
 from udccal.fitting.engine.orders import Attempt, Choice, bic, choose
 from udccal.fitting.engine.robust import OutlierRule
-from udccal.fitting.noise.dark import excess_variance
-from udccal.fitting.noise.rules import NoiseRules
+from udccal.fitting.noise.data import NoiseRules
 
-PARAMETERS = ("K_DN_per_e", "V0_DN2", "curvature_per_DN", "response_DN_per_light", "light_offset")
-_SOLVER = SolverRules(iterations=40)
-
-# Values in the order of ``PARAMETERS``.
+# K [DN/e], V0 [DN^2], curvature [1/DN], response [DN per light], offset of the light.
 Five = Float[np.ndarray, "5"]
 
 
@@ -40,8 +38,7 @@ class Levels:
         dof: of the variances.
         samples: per bin and level, frames times pixels: the mean's weight.
         usable: bins safely inside the range of the sensor.
-        light: relative exposure; nan where unknown.
-        steady: levels whose frames agree in brightness; the others tell nothing about the response.
+        light: relative exposure; nan where unknown, or where the lamp was not steady.
         dark_DN: dark signal in each level.
         row_variance_DN2: variance of each level's mean from row noise.
     """
@@ -52,14 +49,13 @@ class Levels:
     samples: Float[np.ndarray, "levels bins"]
     usable: Bool[np.ndarray, "levels bins"]
     light: Float[np.ndarray, " levels"]
-    steady: Bool[np.ndarray, " levels"]
     dark_DN: Float[np.ndarray, " levels"]
     row_variance_DN2: Float[np.ndarray, " levels"]
 
     @property
     def responding(self) -> Bool[np.ndarray, " levels"]:
-        """Levels whose brightness tells about the response."""
-        seen = self.usable.any(axis=1) & self.steady & np.isfinite(self.light)
+        """Levels whose brightness bears on the response."""
+        seen = self.usable.any(axis=1) & np.isfinite(self.light)
         known = self.light[seen]
         # Levels of one and the same exposure differ by the lamp's power, which nobody measured.
         return seen if known.size > 2 and float(np.ptp(known)) > 0 else np.zeros_like(seen)
@@ -76,7 +72,7 @@ class Levels:
 @final
 @dataclass(frozen=True)
 class DarkVariance:
-    """What dark frames tell about V0: each estimate (DN^2) with its standard deviation; and the rounding to add.
+    """V0 by dark frames: estimates (DN^2) with their standard deviations; and the rounding to add.
 
     The estimates hold for the gain ``K_DN_per_e``; with another one the shot noise of their dark signal ``drift_DN``
     changes, and they by as much.
@@ -109,21 +105,23 @@ class Order:
 @final
 @dataclass(frozen=True)
 class TransferFit:
-    """Values in the order of ``PARAMETERS`` with their covariance, and how well they describe the data.
+    """One order: values with their covariance, and residuals in units of sigma (nan where unused).
 
-    ``scatter`` is the relative standard deviation of the light from level to level; ``variance_z`` and ``level_z`` are
-    residuals in units of sigma, nan where unused.
+    ``scatter`` is the relative standard deviation of the light from level to level.
     """
 
     order: Order
     values: Five
     cov: Float[np.ndarray, "5 5"]
     scatter: float
-    deviance: float
-    chi2_dof: float
     converged: bool
     variance_z: Float[np.ndarray, "levels bins"]
     level_z: Float[np.ndarray, " levels"]
+
+    @property
+    def chi2_dof(self) -> float:
+        """Reduced chi-squared of the variances."""
+        return float(np.nansum(self.variance_z**2)) / max(int(np.isfinite(self.variance_z).sum()) - 1, 1)
 
 
 def linear_signal(mean_DN, curvature_per_DN, K_DN_per_e):  # type: ignore[no-untyped-def]
@@ -141,7 +139,10 @@ def temporal_variance(signal_DN, K_DN_per_e, V0_DN2, curvature_per_DN, rounding_
 @final
 @dataclass(frozen=True)
 class TransferProblem:
-    """The engine's problem: the deviance of variances, read noise and brightness from what is modelled of them."""
+    """The engine's problem: the deviance of variances, read noise and brightness from what is modelled of them.
+
+    ``bound`` is that of the curvature, and ``sizes`` are scales of the parameters, for derivatives by differences.
+    """
 
     levels: Levels
     dark: DarkVariance
@@ -149,12 +150,6 @@ class TransferProblem:
     bound: float
     sizes: Five
     name: str = "noise, photon transfer"
-
-    @property
-    def free(self) -> Bool[np.ndarray, "5"]:
-        """Parameters that the order leaves free, and the data tell."""
-        responds = bool(self.levels.responding.any())
-        return np.array([True, True, self.order.curved, responds, self.order.offset and responds])
 
     def modelled(
         self, x: Five
@@ -187,14 +182,16 @@ class TransferProblem:
         dof, ratio = levels.dof[use], np.maximum(levels.variance_DN2[use] / variance, 1e-12)
         off = np.concatenate([levels.variance_DN2[use] - variance, dark.V0_DN2 - floor, relative])
         weight = np.concatenate([0.5 * dof / variance**2, dark.sigma_DN2**-2, 1 / spread2])
-        jacobian = np.zeros((len(off), 5))
-        for i in np.flatnonzero(self.free):
+        # Parameters that the order leaves free, and on which the data bear.
+        responding, jacobian = bool(responds.any()), np.zeros((len(off), 5))
+        free = np.array([True, True, self.order.curved, responding, self.order.offset and responding])
+        for i in np.flatnonzero(free):
             step = 1e-4 * self.sizes[i] * np.eye(5)[i]
             jacobian[:, i] = (predicted(place + step) - predicted(place - step)) / (2 * step[i])
         cost = float(np.sum(dof * (ratio - 1 - np.log(ratio))) + np.sum(np.log(spread2)))
         cost += float(np.sum((weight * off**2)[len(dof) :]))
         score, information = jacobian.T @ (weight * off), jacobian.T @ (weight[:, None] * jacobian)
-        held = ~self.free
+        held = ~free
         held[2] |= abs(place[2]) >= self.bound and score[2] * place[2] > 0
         return replace(Blocks.dense(cost, len(off), information, score), held=held)
 
@@ -206,15 +203,12 @@ class TransferProblem:
 
 
 def _brightness(light_DN: Float[np.ndarray, "levels bins"], usable: np.ndarray) -> Float[np.ndarray, " levels"]:
-    """Mean light of each level as if every bin were usable in it: bins share one pattern through all levels."""
-    complete = np.flatnonzero(usable.all(axis=1))
-    if complete.size == np.count_nonzero(usable.any(axis=1)):
-        return light_DN.mean(axis=1)
+    """Mean light of each level as if every bin were usable in it: all levels have one pattern of bins."""
+    complete = np.asarray(usable.all(axis=1))
     # Alternating from the complete levels' pattern, the others add little; from none the first rounds would be rough.
-    pattern = light_DN[complete].sum(axis=0) if complete.size else np.ones(usable.shape[1])
-    pattern = pattern / max(float(pattern.mean()), 1e-9)
-    seen = np.where(usable, light_DN, 0.0)
-    for _ in range(6):
+    pattern = light_DN[complete].sum(axis=0) if complete.any() else np.ones(usable.shape[1])
+    seen, pattern = np.where(usable, light_DN, 0.0), pattern / max(float(pattern.mean()), 1e-9)
+    for _ in range(6 if usable[~complete].any() else 1):
         level = seen.sum(axis=1) / np.maximum(usable @ pattern, 1e-9)
         weight = level**2 @ usable
         pattern = np.where(weight > 0, level @ seen / np.maximum(weight, 1e-12), 1.0)
@@ -222,37 +216,25 @@ def _brightness(light_DN: Float[np.ndarray, "levels bins"], usable: np.ndarray) 
     return np.asarray(level)
 
 
-def _fit_transfer(
-    levels: Levels, dark: DarkVariance, full_DN: float, order: Order, start: np.ndarray, rules: NoiseRules
-) -> TransferFit:
-    """The fit of one order."""
-    known = levels.light[np.isfinite(levels.light)]
-    brightest = max(float(np.max(known, initial=0.0)), 1e-30)
+def _fit_order(
+    levels: Levels, dark: DarkVariance, full_DN: float, order: Order, start: Five, rules: NoiseRules
+) -> Attempt[TransferFit]:
+    brightest = max(float(np.nan_to_num(levels.light).max()), 1e-30)
     sizes = np.abs(start) + np.array([1e-9, dark.rounding_DN2 + 1e-3, 0.1 / full_DN, 1e-9, brightest])
     problem = TransferProblem(levels, dark, order, rules.most_bent / full_DN, sizes)
-    found = minimise(problem, np.where([True, True, order.curved, True, order.offset], start, 0.0), _SOLVER)
-    x, cov = found.place, found.equations.cov()
+    start = np.where([True, True, order.curved, True, order.offset], start, 0.0)
+    found = minimise(problem, start, SolverRules(iterations=40))
+    x, cov, cost = found.place, found.equations.cov(), found.equations.cost
     variance, _, relative = problem.modelled(x)
-    use, responds = levels.usable, levels.responding
-    scatter2 = problem.scatter2(relative[responds])
-    variance_z = np.where(use, (levels.variance_DN2 / variance - 1) * np.sqrt(levels.dof / 2), np.nan)
-    spread2 = np.where(responds, levels.brightness_variance + scatter2, np.inf)
-    level_z = np.where(responds, relative / np.sqrt(spread2), np.nan)
-    chi2_dof = float(np.nansum(variance_z**2)) / max(int(use.sum()) - 1, 1)
-    converged = bool(found.converged and np.isfinite(x).all() and np.isfinite(cov).all())
-    scatter, cost = float(np.sqrt(scatter2)), found.equations.cost
-    return TransferFit(order, x, cov, scatter, cost, chi2_dof, converged, variance_z, level_z)
-
-
-def _start(levels: Levels, dark: DarkVariance) -> Five:
-    """A straight line with rough weights, and the response through the origin."""
-    use = levels.usable
-    signal, variance = levels.mean_DN[use], levels.variance_DN2[use]
-    floor = float(np.average(dark.V0_DN2, weights=1 / dark.sigma_DN2**2))
-    K = float(np.median((variance - floor - dark.rounding_DN2) / np.maximum(signal, 1e-9)))
-    light = np.where(np.isfinite(levels.light), levels.light, 0.0)
-    gain = float(light @ _brightness(levels.mean_DN - levels.dark_DN[:, None], use)) / max(float(light @ light), 1e-30)
-    return np.array([K, floor, 0.0, gain if gain > 0 else 1.0, 0.0])
+    scatter2 = problem.scatter2(relative[levels.responding])
+    variance_z = np.where(levels.usable, (levels.variance_DN2 / variance - 1) * np.sqrt(levels.dof / 2), np.nan)
+    spread2 = np.where(levels.responding, levels.brightness_variance + scatter2, np.inf)
+    level_z = np.where(levels.responding, relative / np.sqrt(spread2), np.nan)
+    converged = bool(found.converged and np.isfinite(x).all() and np.isfinite(cov).all() and np.isfinite(cost))
+    parameters = order.curved + order.offset + order.unsteady
+    criterion = bic(cost, float(parameters), int(levels.dof[levels.usable].sum())) if converged else np.inf
+    fit = TransferFit(order, x, cov, float(np.sqrt(scatter2)), converged, variance_z, level_z)
+    return Attempt(order.name, parameters, criterion, fit)
 
 
 def choose_transfer(levels: Levels, dark: DarkVariance, full_DN: float, rules: NoiseRules) -> Choice[TransferFit]:
@@ -260,34 +242,39 @@ def choose_transfer(levels: Levels, dark: DarkVariance, full_DN: float, rules: N
 
     Args:
         levels: bright exposures; at least one usable bin.
-        dark: what dark frames tell about V0.
+        dark: V0 by dark frames.
         full_DN: saturation above black; sets the scale of the curvature.
         rules: how far the response may bend.
     """
-    start = _start(levels, dark)
+    # A straight line with rough weights, and the response through the origin.
+    use, light = levels.usable, np.nan_to_num(levels.light)
+    V0 = float(np.average(dark.V0_DN2, weights=1 / dark.sigma_DN2**2))
+    shot = levels.variance_DN2[use] - V0 - dark.rounding_DN2
+    K = float(np.median(shot / np.maximum(levels.mean_DN[use], 1e-9)))
+    gain = float(light @ _brightness(levels.mean_DN - levels.dark_DN[:, None], use)) / max(float(light @ light), 1e-30)
+    start = np.array([K, V0, 0.0, gain if gain > 0 else 1.0, 0.0])
     # A variance is set against the mean of the same bin: of Poisson counts the two err together, of read noise apart.
-    apart = start[0] ** 2 * max(start[1], 0.0) / levels.samples
-    measured = np.maximum(levels.variance_DN2, 1e-9) ** 2
-    weighed = replace(levels, dof=levels.dof / (1 + 0.5 * levels.dof * apart / measured))
-    orders = [Order(*(bool(n >> k & 1) for k in range(3))) for n in range(8)]
-    if not levels.responding.any():
-        orders = [Order(), Order(curved=True)]
-    samples = int(levels.dof[levels.usable].sum())
-    tried: list[Attempt[TransferFit]] = []
-    for order in orders:
-        fit = _fit_transfer(weighed, dark, full_DN, order, start, rules)
-        number = order.curved + order.offset + order.unsteady
-        criterion = bic(fit.deviance, float(number), samples) if fit.converged and np.isfinite(fit.deviance) else np.inf
-        tried.append(Attempt(order.name, number, criterion, fit))
-        # The simplest is where the others begin.
-        start = tried[0].fit.values if tried[0].fit.converged else start
-    return choose(tried)
+    apart = K**2 * max(V0, 0.0) / levels.samples / np.maximum(levels.variance_DN2, 1e-9) ** 2
+    levels = replace(levels, dof=levels.dof / (1 + 0.5 * levels.dof * apart))
+    orders = [Order(curved, offset, unsteady) for unsteady, offset, curved in product((False, True), repeat=3)]
+    first = _fit_order(levels, dark, full_DN, Order(), start, rules)
+    # The simplest is where the others begin.
+    start = first.fit.values if first.fit.converged else start
+    others = orders[1:] if levels.responding.any() else [Order(curved=True)]
+    return choose([first, *(_fit_order(levels, dark, full_DN, order, start, rules) for order in others)])
 
 
-def without_outliers(levels: Levels, fit: TransferFit, rules: NoiseRules) -> tuple[Levels, int, tuple[int, ...]]:
-    """Levels less what lies off the fit; how many bins, and which levels' brightness."""
-    bins = OutlierRule("bins of flats", rules.outlier_sigma).off(np.nan_to_num(fit.variance_z), levels.usable)
-    seen = np.isfinite(fit.level_z)
-    off = OutlierRule("levels", rules.outlier_sigma).off(np.nan_to_num(fit.level_z), seen)
-    cleaned = replace(levels, usable=levels.usable & ~bins, steady=levels.steady & ~off)
-    return cleaned, int(bins.sum()), tuple(int(i) for i in np.flatnonzero(off))
+def robust_transfer(
+    levels: Levels, dark: DarkVariance, full_DN: float, rules: NoiseRules
+) -> tuple[Choice[TransferFit], Levels]:
+    """The same, and the levels less what lies off it: bins are not usable, the light of whole levels not known."""
+    choice, rule = choose_transfer(levels, dark, full_DN, rules), OutlierRule("bins and levels", rules.outlier_sigma)
+    for _ in range(3):
+        fit = choice.best.fit
+        off = rule.off(np.nan_to_num(fit.variance_z), levels.usable)
+        unlike = rule.off(np.nan_to_num(fit.level_z), np.isfinite(fit.level_z))
+        if not (off.any() or unlike.any()) or not (levels.usable & ~off).any():
+            break
+        levels = replace(levels, usable=levels.usable & ~off, light=np.where(unlike, np.nan, levels.light))
+        choice = choose_transfer(levels, dark, full_DN, rules)
+    return choice, levels

@@ -1,50 +1,39 @@
 """The equations of a psf field in stamps: nodes by colour, banded, and a dense block of what stars and colours share.
 
 Nodes are eliminated colour by colour (Schur's complement); the dense block holds places and light of the stars, maps
-and lateral colour.
+and lateral colour. A cubic B-spline spans four rows, so that a row of nodes has entries with itself and the three that
+follow: a band is the upper half of a matrix, a row of nodes after the other. A factor lies where its matrix was.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.sparse
 from jaxtyping import Float, Int
 from scipy.linalg import cholesky, solve_triangular
+from scipy.linalg.blas import dtrsm
 
-from udccal.fitting.psf_stamps.banded import Band, band_of, factor, node_sums, stencil_of
-from udccal.fitting.psf_stamps.data import Scene
-from udccal.fitting.psf_stamps.field import TAPS, PlaneField, degrees, polynomials
-from udccal.fitting.psf_stamps.probability import OWN, State, Weighted, by_degree, expectation
+from udccal.fitting.engine.least_squares import Step
+from udccal.fitting.psf_stamps.data import Stamps
+from udccal.fitting.psf_stamps.field import TAPS, PsfField, degree_of, degrees, polynomials, taps
+from udccal.fitting.psf_stamps.probability import State, Weighted, expectation, laplacian
+
+# What a star may change by itself: relative light, centre (x, y), and the four numbers of its map, row by row.
+OWN = 7
 
 
 @dataclass(frozen=True)
-class Shared:
-    """How stars' own changes follow from the unknowns of the dense block that a colour depends on.
+class Colour:
+    """H x = g of one colour, whose part of the dense block is ``index``; nodes come node by node, not image by image.
 
-    Attributes:
-        index: of those unknowns in the dense block.
-        matrix: from these to the stars' own changes.
-        size: of the dense block.
+    Once nodes are eliminated, ``band`` is their factor U, ``cross`` and ``right_nodes`` are U^-T times theirs, and
+    ``dense`` and ``right_dense`` are what the colour adds to the dense block.
     """
 
     index: Int[np.ndarray, " own"]
-    matrix: scipy.sparse.csr_array
-    size: int
-
-
-@dataclass(frozen=True)
-class Normal:
-    """H x = g of one colour, without priors; nodes come node by node, the images of a node together.
-
-    Attributes:
-        sums: of nodes with their neighbours, as ``banded.node_sums`` gives them.
-        cross: block of nodes with the colour's part of the dense block.
-        dense: that part with itself.
-    """
-
-    sums: Float[np.ndarray, "rows 4 columns 7 terms terms"]
+    band: Float[np.ndarray, "rows n 4*n"]
     cross: Float[np.ndarray, "nodes own"]
     dense: Float[np.ndarray, "own own"]
     right_nodes: Float[np.ndarray, " nodes"]
@@ -52,208 +41,208 @@ class Normal:
 
 
 @dataclass(frozen=True)
-class Eliminated:
-    """One colour, its nodes eliminated.
+class Laplace:
+    """The Gaussian about the mode next to a state, and the evidence there by Laplace's method.
 
     Attributes:
-        factor: U of the nodes; ``cross`` and ``right`` are U^-T times theirs.
-        index: of the colour's part in the dense block.
-        schur, right_dense: what it adds to the dense block's matrix and right side.
-        diagonal: of the dense block by data, before the elimination.
-    """
-
-    factor: Band
-    cross: Float[np.ndarray, "nodes own"]
-    right: Float[np.ndarray, " nodes"]
-    index: Int[np.ndarray, " own"]
-    schur: Float[np.ndarray, "own own"]
-    right_dense: Float[np.ndarray, " own"]
-    diagonal: Float[np.ndarray, " own"]
-
-
-@dataclass(frozen=True)
-class Factors:
-    """The Gaussian about the mode next to a state, as factors.
-
-    Attributes:
-        colours: with their nodes eliminated.
+        cost: -2 log of the evidence, of an expansion about the state. samples: that tell something.
+        mode: relative to the state. gain: of the log posterior up to the mode.
         root: lower Cholesky factor of the dense block's precision.
-        mode: as changes of the state. gain: of the log posterior on the way there.
-        log_likelihood: at the state.
+        colours: with their nodes eliminated.
+        tuned: logarithm of what each precision changes by in a step.
     """
 
-    colours: tuple[Eliminated, ...]
-    root: Float[np.ndarray, "dense dense"]
+    cost: float
+    samples: int
     mode: Float[np.ndarray, " unknowns"]
     gain: float
-    log_likelihood: float
+    root: Float[np.ndarray, "dense dense"]
+    colours: tuple[Colour, ...]
+    tuned: Float[np.ndarray, " groups"]
 
     @property
-    def log_det(self) -> float:
-        """Of the precision."""
-        return sum(c.factor.log_det for c in self.colours) + float(2 * np.log(np.diag(self.root)).sum())
+    def evidence(self) -> float:
+        """Its logarithm, of an expansion about the mode."""
+        return self.gain - 0.5 * self.cost
+
+    def step(self, damping: float) -> Step:
+        """A part of the way: a raised diagonal would ask for the factors anew."""
+        part = 1.0 / (1.0 + damping)
+        return Step(part * self.mode, part * self.tuned[None], 2 * self.gain * part * (2 - part))
 
     def draws(self, rng: np.random.Generator, count: int) -> Float[np.ndarray, "unknowns draws"]:
         """Draws about the mode."""
         dense = solve_triangular(self.root, rng.standard_normal((len(self.root), count)), lower=True, trans=1)
-        nodes = [
-            c.factor.backward(rng.standard_normal((len(c.cross), count)) - c.cross @ dense[c.index])
-            for c in self.colours
-        ]
-        return np.concatenate([dense, *nodes])
+        own = [rng.standard_normal((len(c.cross), count)) - c.cross @ dense[c.index] for c in self.colours]
+        return np.concatenate([dense, *(divided(c.band, x, False) for c, x in zip(self.colours, own, strict=True))])
 
 
-def factors(scene: Scene, state: State) -> Factors:
-    """Of the equations at a state, priors included.
-
-    Raises:
-        numpy.linalg.LinAlgError: when the equations are singular.
-    """
-    colours, likelihood = [], 0.0
-    for plane, shared in enumerate(shared_by(state.fields, scene.unit)):
-        weighted, each = expectation(scene, state, plane)
-        likelihood += float(each.sum())
-        colours.append(_eliminated(scene, state, plane, weighted, shared))
-        del weighted
-    size = np.zeros(shared.size)
-    for c in colours:
-        size[c.index] += c.diagonal
+def laplace(stamps: Stamps, state: State) -> Laplace:
+    """From the equations at a state, priors included; LinAlgError when they are singular."""
+    seen, colours = expectation(stamps, state), []
+    size = np.zeros(state.maps_from + len(state.maps))
+    for plane in range(state.light_e.shape[1]):
+        colour = normal_equations(stamps, state.field, seen, plane)
+        size[colour.index] += colour.dense.diagonal()
+        colours.append(_eliminated(colour, state, plane))
     schur, right = _dense_prior(state, size)
     for c in colours:
-        schur[np.ix_(c.index, c.index)] += c.schur
+        schur[np.ix_(c.index, c.index)] += c.dense
         right[c.index] += c.right_dense
     root = cholesky(schur, lower=True)
     half = solve_triangular(root, right, lower=True)
     dense = solve_triangular(root, half, lower=True, trans=1)
-    nodes = [c.factor.backward((c.right - c.cross @ dense[c.index])[:, None])[:, 0] for c in colours]
-    gain = 0.5 * float(half @ half + sum(c.right @ c.right for c in colours))
-    return Factors(tuple(colours), root, np.concatenate([dense, *nodes]), gain, likelihood)
+    nodes = [divided(c.band, (c.right_nodes - c.cross @ dense[c.index])[:, None], False)[:, 0] for c in colours]
+    gain = 0.5 * float(half @ half + sum(c.right_nodes @ c.right_nodes for c in colours))
+    diagonals = [np.einsum("rii->ri", c.band[:, :, : c.band.shape[1]]).ravel() for c in colours]
+    log_det = 2 * np.log(np.concatenate([np.diag(root), *diagonals])).sum()
+    # Minus twice the log prior, but for constants that all orders share.
+    prior = float(state.precisions @ state.squares()) - state.volume()[0]
+    cost, mode = float(log_det - 2 * seen.log_likelihood + prior), np.concatenate([dense, *nodes])
+    return Laplace(cost, int(stamps.known.sum()), mode, gain, root, tuple(colours), np.zeros_like(state.precisions))
 
 
-def shared_by(fields: tuple[PlaneField, ...], unit: Float[np.ndarray, "stars 2"]) -> tuple[Shared, ...]:
-    """By colour."""
-    stars, planes = len(unit), len(fields)
-    star, start = OWN * np.arange(stars), stars * (2 + planes)
-    width = start + sum(np.size(f.warp) + np.size(f.lateral) for f in fields)
-    one, first = np.ones(stars), np.arange(stars) * (2 + planes)
-    out = []
-    for plane, field in enumerate(fields):
-        parts = [(star, first + 2 + plane, one), (star + 1, first, one), (star + 2, first + 1, one)]
-        for degree, numbers, own in ((field.warp_degree, 4, 3), (field.lateral_degree, 2, 1)):
-            for column in polynomials(unit, degree)[:, 1:].T:
-                parts += [(star + own + i, np.full(stars, start + i), column) for i in range(numbers)]
-                start += numbers
-        rows, columns, values = (np.concatenate(part) for part in zip(*parts, strict=True))
-        index, columns = np.unique(columns, return_inverse=True)
-        shape = (OWN * stars, len(index))
-        out.append(Shared(index, scipy.sparse.csr_array((values, (rows, columns)), shape=shape), width))
-    return tuple(out)
+def marginal_cov(root: Float[np.ndarray, "dense dense"], index: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n n"]:
+    """Covariance of some unknowns of the dense block, all others marginalised."""
+    half = solve_triangular(root, np.eye(len(root))[:, index], lower=True)
+    return half.T @ half
 
 
-def normal_equations(
-    field: PlaneField, unit: Float[np.ndarray, "stars 2"], seen: Weighted, shared: scipy.sparse.csr_array
-) -> Normal:
+def shared_by(
+    field: PsfField, unit: Float[np.ndarray, "stars 2"], plane: int
+) -> tuple[Int[np.ndarray, " own"], scipy.sparse.csr_array]:
+    """Unknowns of the dense block that a colour depends on, and the matrix from these to the stars' own changes."""
+    planes, stars, one = len(field.nodes), len(unit), np.eye(OWN)
+    place = (2 + planes) * np.arange(stars)[:, None] + np.array([0, 1, 2 + plane])
+    numbers = stars * (2 + planes) + np.arange(field.warp.size + field.lateral.size)
+    warp, lateral = np.split(numbers, [field.warp.size])
+    parts = [(place, np.eye(stars), one[:, [1, 2, 0]])]
+    parts += [(warp.reshape(field.warp.shape)[plane], polynomials(unit, field.degrees[0])[:, 1:], one[:, 3:])]
+    if plane != field.reference:
+        basis = polynomials(unit, degree_of(1 + field.lateral.shape[1]))[:, 1:]
+        parts += [(lateral.reshape(field.lateral.shape)[plane - (plane > field.reference)], basis, one[:, 1:3])]
+    matrix = scipy.sparse.hstack([scipy.sparse.kron(basis, own) for _, basis, own in parts], format="csr")
+    return np.concatenate([index.ravel() for index, _, _ in parts]), scipy.sparse.csr_array(matrix)
+
+
+def normal_equations(stamps: Stamps, field: PsfField, seen: Weighted, plane: int) -> Colour:
     """Of one colour, without priors."""
-    basis = polynomials(unit, field.image_degree)
-    rows, columns = field.nodes.shape[1:]
-    weighted = np.concatenate([seen.slopes, seen.residual[..., None]], axis=2) * seen.weight[..., None]
-    onto = _onto_nodes(seen, weighted, (rows, columns))
-    own = seen.slopes.transpose(0, 2, 1) @ weighted
-    return Normal(
-        sums=node_sums(basis, seen, (rows, columns)),
-        cross=_cross(basis, onto[..., :OWN], shared),
+    basis, grid = polynomials(stamps.unit, field.degrees[1]), field.nodes.shape[2:]
+    index, shared = shared_by(field, stamps.unit, plane)
+    weight = seen.weight * stamps.by_plane[plane]
+    weighted = np.concatenate([seen.seen.jacobian, seen.residual[..., None]], axis=2) * weight[..., None]
+    used = np.flatnonzero(weight)
+    onto = taps(seen.seen, used, grid).T @ weighted.reshape(-1, OWN + 1)[used]
+    onto = onto.reshape(len(stamps.unit), -1, OWN + 1).transpose(1, 0, 2)
+    cross = [(onto[..., :OWN] * part[:, None]).reshape(len(onto), -1) @ shared for part in basis.T]
+    own = seen.seen.jacobian.transpose(0, 2, 1) @ weighted
+    return Colour(
+        index=index,
+        band=node_sums(basis, seen, used, grid),
+        cross=np.stack(cross, axis=1).reshape(-1, len(index)),
         dense=(shared.T @ scipy.sparse.block_diag(list(own[..., :OWN]), format="csr") @ shared).toarray(),
         right_nodes=(onto[..., OWN] @ basis).ravel(),
         right_dense=shared.T @ own[..., OWN].ravel(),
     )
 
 
-def _eliminated(scene: Scene, state: State, plane: int, seen: Weighted, shared: Shared) -> Eliminated:
-    """A function of its own, so that one colour's equations are gone before the next one's are made."""
-    field, env, precisions = state.fields[plane], state.envelopes[plane], state.precisions[plane]
-    normal = normal_equations(field, scene.unit, seen, shared.matrix)
-    terms, rows, columns = field.nodes.shape
-    rough, size = stencil_of(env.roughness, (rows, columns)), env.size.ravel() ** -2.0
-    right = normal.right_nodes.reshape(-1, terms)
-    for term, (a, b) in enumerate(precisions.image[degrees(field.image_degree)]):
-        diagonal = normal.sums[..., term, term]
-        diagonal += b * rough
-        diagonal[:, 0, :, rough.shape[3] // 2] += a * size.reshape(rows, columns)
-        flat = np.ravel(field.nodes[term])
-        right[:, term] -= a * size * flat + b * (env.roughness @ flat)
-    found = factor(band_of(normal.sums))
-    half = found.forward(right.reshape(-1, 1).copy())[:, 0]
-    cross = found.forward(normal.cross)
-    schur, right_dense = normal.dense - cross.T @ cross, normal.right_dense - cross.T @ half
-    return Eliminated(found, cross, half, shared.index, schur, right_dense, normal.dense.diagonal())
+def node_sums(
+    basis: Float[np.ndarray, "stars terms"], seen: Weighted, used: Int[np.ndarray, " used"], grid: tuple[int, ...]
+) -> Float[np.ndarray, "rows n 4*n"]:
+    """Sums over samples of products of what two nodes bring, as a band."""
+    # Light of a star at position X enters the image t with the factor B_t(X), whatever the sample, and the weights of
+    # a sample's 4 x 4 nodes are products of four down and four across: so what samples of a cell of the grid bring is
+    # a product of pairs down, pairs across, and pairs of polynomials.
+    (rows, columns), terms, reach = grid, basis.shape[1], TAPS - 1
+    down, across = (part.reshape(-1, TAPS)[used] for part in (seen.seen.down, seen.seen.across))
+    (one, other), (t, u) = np.triu_indices(TAPS), np.triu_indices(terms)
+    both = (basis[:, t] * basis[:, u])[used // seen.weight.shape[1]] * seen.weight.ravel()[used, None]
+    right = ((down[:, one] * down[:, other])[:, :, None] * both[:, None]).reshape(len(used), -1)
+    index = seen.seen.first.ravel()[used, None] * len(one) + np.arange(len(one))
+    products = (across[:, one] * across[:, other]).ravel(), index.ravel(), np.arange(0, index.size + 1, len(one))
+    sums = scipy.sparse.csc_array(products, shape=(rows * columns * len(one), len(used))) @ right
+    sums = sums.reshape(rows, columns, len(one), len(one), -1)[:-reach, :-reach]
+    # Nodes that lie so many columns beside, for all pairs down; then these.
+    spread = np.zeros((rows - reach, columns, 2 * reach + 1, len(one), len(t)))
+    for pair, (j, k) in enumerate(zip(one, other, strict=True)):
+        for first, beside in {(j, k - j), (k, j - k)}:
+            spread[:, first : first + columns - reach, reach + beside] += sums[:, :, pair]
+    stencil = np.zeros((rows, TAPS, columns, 2 * reach + 1, len(t)))
+    for pair, (i, k) in enumerate(zip(one, other, strict=True)):
+        stencil[i : i + rows - reach, k - i] += spread[:, :, :, pair]
+    place = np.empty((terms, terms), dtype=int)
+    place[t, u] = place[u, t] = np.arange(len(t))
+    out = np.zeros((rows, columns, terms, TAPS, columns, terms))
+    for away in range(-reach, TAPS):
+        own, there = (slice(max(e, 0), columns + min(e, 0)) for e in (-away, away))
+        np.einsum("rctdcu->rdctu", out[:, own, :, :, there])[...] = stencil[:, :, own, reach + away][..., place]
+    return out.reshape(rows, columns * terms, -1)
+
+
+def factor(band: Float[np.ndarray, "rows n 4*n"]) -> Float[np.ndarray, "rows n 4*n"]:
+    """Cholesky's factor U of U^T U, in the place of the matrix; LinAlgError when that is not positive definite."""
+    rows, n = band.shape[:2]
+    for i, row in enumerate(band):
+        row[:, :n] = cholesky(row[:, :n], check_finite=False)
+        beyond = row[:, n:] = _divide(row[:, :n], row[:, n:], True)
+        for j in range(min(TAPS, rows - i) - 1):
+            band[i + 1 + j, :, : (TAPS - 1 - j) * n] -= beyond[:, j * n : (j + 1) * n].T @ beyond[:, j * n :]
+    return band
+
+
+def divided(
+    band: Float[np.ndarray, "rows n 4*n"], right: Float[np.ndarray, "size k"], transposed: bool
+) -> Float[np.ndarray, "size k"]:
+    """U^-1 right, or U^-T right, of a factor U; ``right`` is overwritten."""
+    rows, n = band.shape[:2]
+    out = right.reshape(rows, n, -1)
+    for i in range(rows) if transposed else reversed(range(rows)):
+        ahead = out[i + 1 : i + TAPS].reshape(-1, out.shape[2])
+        beyond = band[i, :, n : n + len(ahead)]
+        if not transposed:
+            out[i] -= beyond @ ahead
+        out[i] = _divide(band[i, :, :n], out[i], transposed)
+        if transposed:
+            ahead -= beyond.T @ out[i]
+    return right
+
+
+def _divide(upper: Float[np.ndarray, "n n"], right: Float[np.ndarray, "n k"], transposed: bool) -> np.ndarray:
+    """U^-1 right, or U^-T right; BLAS sees the transposes, whose columns are contiguous."""
+    return np.asarray(dtrsm(1.0, upper.T, right.T, side=1, lower=1, trans_a=int(transposed), overwrite_b=1)).T
+
+
+def _eliminated(colour: Colour, state: State, plane: int) -> Colour:
+    """With the prior of images, its nodes eliminated; what held them is overwritten."""
+    terms, rows, columns = state.field.nodes.shape[1:]
+    scale = scipy.sparse.diags_array(1.0 / state.size[plane].ravel())
+    rough = laplacian(rows, columns)[0] @ scale
+    rough, size = (rough.T @ rough).tocoo(), (scale @ scale).tocoo()
+    right, band = colour.right_nodes.reshape(-1, terms), colour.band.reshape(rows, columns, terms, TAPS, columns, terms)
+    for term, own in enumerate(state.of_images[plane][degrees(state.field.degrees[1])]):
+        nodes = state.field.nodes[plane, term].ravel()
+        for precision, prior in zip(own, (size, rough), strict=True):
+            right[:, term] -= precision * (prior @ nodes)
+            (r, c), (below, beside) = np.divmod(prior.row, columns), np.divmod(prior.col, columns)
+            half = below >= r
+            place = r[half], c[half], term, (below - r)[half], beside[half], term
+            band[place] += precision * prior.data[half]
+    factor(colour.band)
+    half = divided(colour.band, colour.right_nodes[:, None], True)[:, 0]
+    cross = divided(colour.band, colour.cross, True)
+    schur, left = colour.dense - cross.T @ cross, colour.right_dense - cross.T @ half
+    return replace(colour, cross=cross, right_nodes=half, dense=schur, right_dense=left)
 
 
 def _dense_prior(
     state: State, size: Float[np.ndarray, " dense"]
 ) -> tuple[Float[np.ndarray, "dense dense"], Float[np.ndarray, " dense"]]:
     """Precision of the dense block and its right side; what images could do as well (all light, all places) is held."""
-    stars, planes = state.flux_e.shape
-    own, values = np.zeros(len(size)), np.zeros(len(size))
-    own[state.maps_from :] = np.concatenate([precisions.of_maps for precisions in state.precisions])
-    values[state.maps_from :] = np.concatenate([np.ravel(part) for f in state.fields for part in (f.warp, f.lateral)])
-    held = np.zeros((2 + planes, len(size)))
-    for j in range(2 + planes):
-        index = j + (2 + planes) * np.arange(stars)
-        # Stars that are left out altogether stay where they are.
-        own[index] = np.where(size[index] > 0, 0.0, 1.0)
-        held[j, index] = np.sqrt(size[index].mean()) * (size[index] > 0)
-    return np.diag(own) + held.T @ held, -own * values
-
-
-def _cross(
-    basis: Float[np.ndarray, "stars terms"], onto: Float[np.ndarray, "grid stars own"], shared: scipy.sparse.csr_array
-) -> Float[np.ndarray, "nodes dense"]:
-    """Of nodes with the dense block, from sums over each star's samples."""
-    terms, width = basis.shape[1], shared.shape[1]
-    each = [shared.multiply(np.repeat(column, OWN)[:, None]).T for column in basis.T]
-    found = scipy.sparse.vstack(each, format="csr") @ np.ascontiguousarray(onto.reshape(len(onto), -1).T)
-    return np.ascontiguousarray(found.reshape(terms, width, -1).transpose(2, 0, 1)).reshape(-1, width)
-
-
-def _onto_nodes(
-    seen: Weighted, values: Float[np.ndarray, "stars samples k"], grid: tuple[int, int]
-) -> Float[np.ndarray, "nodes stars k"]:
-    """The stars' taps, transposed: from each star's samples to nodes."""
-    stars, samples, k = values.shape
-    nodes = grid[0] * grid[1]
-    step = (np.arange(TAPS)[:, None] * grid[1] + np.arange(TAPS)).ravel()
-    index = (seen.first[..., None] + step) * stars + np.arange(stars)[:, None, None]
-    weights = seen.down[..., :, None] * seen.across[..., None, :]
-    ends = np.arange(0, index.size + 1, TAPS**2)
-    taps = scipy.sparse.csr_array((weights.ravel(), index.ravel(), ends), shape=(stars * samples, nodes * stars))
-    return np.asarray(taps.T @ values.reshape(-1, k)).reshape(nodes, stars, k)
-
-
-def marginal_cov(root: Float[np.ndarray, "dense dense"], index: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n n"]:
-    """Covariance of some unknowns of the dense block, all others marginalised."""
-    columns = np.zeros((len(root), len(index)))
-    columns[index, np.arange(len(index))] = 1.0
-    half = solve_triangular(root, columns, lower=True)
-    return half.T @ half
-
-
-@dataclass(frozen=True)
-class MapCoefficients:
-    """Coefficients of maps above some degree: where in the dense block, of which degree and colour, and values."""
-
-    index: Int[np.ndarray, " n"]
-    degree: Int[np.ndarray, " n"]
-    colour: Int[np.ndarray, " n"]
-    value: Float[np.ndarray, " n"]
-    precision: Float[np.ndarray, " n"]
-
-    @classmethod
-    def above(cls, state: State, degree: int) -> MapCoefficients:
-        """Of all colours."""
-        start, columns = state.maps_from, []
-        for plane, (field, own) in enumerate(zip(state.fields, state.precisions, strict=True)):
-            group, flat = by_degree(own.warp, 4), np.ravel(field.warp)
-            parts = start + np.arange(len(flat)), 1 + group, np.full(len(flat), plane), flat, own.warp[group]
-            columns.append([part[1 + group > degree] for part in parts])
-            start += len(flat) + np.size(field.lateral)
-        return cls(*(np.concatenate(parts) for parts in zip(*columns, strict=True)))
+    seen = size[: state.maps_from].reshape(len(state.light_e), -1)
+    # Stars that are left out altogether stay where they are.
+    own = np.concatenate([np.where(seen > 0, 0.0, 1.0).ravel(), state.precisions[state.map_groups]])
+    values = np.concatenate([np.zeros(seen.size), state.maps])
+    held = (np.sqrt(seen.mean(axis=0)) * (seen > 0))[:, :, None] * np.eye(seen.shape[1])
+    matrix, held = np.diag(own), held.reshape(seen.size, -1)
+    matrix[: seen.size, : seen.size] += held @ held.T
+    return matrix, -own * values

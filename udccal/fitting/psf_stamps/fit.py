@@ -1,11 +1,10 @@
-"""Fit a psf field to stamps of point sources: orders, places and light found along with it, and true error bars.
-
-The data are arrays: stamps in electrons, each about one source, of a sensor without colours or of a raw mosaic.
-"""
+"""Fit a psf field to stamps of point sources: orders, places and light found along with it, and true error bars."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import NamedTuple, final
 
 import numpy as np
 from jaxtyping import Float
@@ -15,16 +14,166 @@ from udccal.errors import FitError
 from udccal.fitting.engine.gaussian import Posterior
 from udccal.fitting.engine.orders import Choice
 from udccal.fitting.engine.report import estimates, residual_sample
-from udccal.fitting.psf_stamps.data import Scene, Stamps, StampsRules, split
-from udccal.fitting.psf_stamps.equations import MapCoefficients, factors, marginal_cov
-from udccal.fitting.psf_stamps.orders import Found, Orders, reference, search
-from udccal.fitting.psf_stamps.probability import State, Weighted, expectation
-from udccal.fitting.psf_stamps.solve import left_out
-from udccal.fitting.psf_stamps.term import StampsPsf
+from udccal.fitting.engine.robust import OutlierRule, outliers
+from udccal.fitting.psf_stamps.data import Stamps, StampsRules, offsets, unusable
+from udccal.fitting.psf_stamps.equations import laplace, marginal_cov
+from udccal.fitting.psf_stamps.field import Changes, PsfField, degree_of, polynomials, see, taps
+from udccal.fitting.psf_stamps.probability import State, expectation
+from udccal.fitting.psf_stamps.search import WINDOW_PX, Found, Orders, search
 from udccal.numerics import in_float64
-from udccal.result import Diagnostic, Estimate, FitResult, FitStatus, ResidualSample
+from udccal.result import Diagnostic, FitResult, FitStatus, Outliers
 
-_WINDOW_PX = 1.5  # of centroids, before the kernel's size is known
+
+class Kernels(NamedTuple):
+    """Kernels, the model's centres beside theirs, light in the window; changes along the factor, of light relative."""
+
+    value: Float[np.ndarray, "n pixels"]
+    centre_px: Float[np.ndarray, "n 2"]
+    total: Float[np.ndarray, " n"]
+    change: Float[np.ndarray, "n pixels k"]
+    centre_change: Float[np.ndarray, "n 2 k"]
+    total_change: Float[np.ndarray, "n k"]
+    jacobian: Float[np.ndarray, "n pixels 2"]
+
+
+class Sources(NamedTuple):
+    """The stars of a fit in the term's convention: (x, y) from the middle sample, and light in the window by colour."""
+
+    place_px: Float[np.ndarray, "stars 2"]
+    place_sigma_px: Float[np.ndarray, "stars 2"]
+    light_e: Float[np.ndarray, "stars planes"]
+    light_sigma_e: Float[np.ndarray, "stars planes"]
+
+
+@final
+@dataclass(frozen=True)
+class StampsPsf:
+    """The psf field of stamps; every colour of a mosaic is a plane.
+
+    A kernel sums to 1 over its window. Its centre is where the centroid under a Gaussian of ``window_px`` vanishes, of
+    the field's reference plane; other planes keep their lateral colour beside it.
+
+    Attributes:
+        field: of all colours.
+        factor: of the covariance of all unknowns, in the order of ``Changes``: draws of the posterior over the root of
+            their number, so that sigmas are known to 5 %. It holds what the model leaves unexplained.
+        centre_px, half_px: positions scale as (p - centre) / half; beyond one half the field is extrapolated.
+        rows, columns: of kernels.
+        window_px: standard deviation of the Gaussian that weights centroids.
+        star_px, star_place_px, star_light_e: of the stars in the fit: middle samples on the sensor; the model's own
+            centres and light, of which ``sources`` are the convention's.
+    """
+
+    field: PsfField
+    factor: Float[np.ndarray, "unknowns k"]
+    centre_px: Float[np.ndarray, "2"]
+    half_px: Float[np.ndarray, "2"]
+    rows: int
+    columns: int
+    window_px: float
+    star_px: Float[np.ndarray, "stars 2"]
+    star_place_px: Float[np.ndarray, "stars 2"]
+    star_light_e: Float[np.ndarray, "stars planes"]
+
+    @in_float64
+    def predict(self, position_px: Float[np.ndarray, "n 2"], plane: int = 0) -> Float[np.ndarray, "n rows columns"]:
+        """Kernels of light centred on the middle sample, at positions (x, y) on the sensor in px."""
+        parts = [kernels.value for kernels in replace(self, factor=self.factor[:, :0])._kernels(position_px, plane)]
+        return np.concatenate(parts).reshape(-1, self.rows, self.columns)
+
+    @in_float64
+    def sigma(self, position_px: Float[np.ndarray, "n 2"], plane: int = 0) -> Float[np.ndarray, "n rows columns"]:
+        """One standard deviation of every pixel of ``predict``."""
+        parts = [np.linalg.norm(kernels.change, axis=2) for kernels in self._kernels(position_px, plane)]
+        return np.concatenate(parts).reshape(-1, self.rows, self.columns)
+
+    @in_float64
+    def relative_l2(self, position_px: Float[np.ndarray, "n 2"], plane: int = 0) -> Float[np.ndarray, "n 2"]:
+        """Error of ``predict`` that is to be expected, relative to the kernel's L2 norm: root mean square, and spread.
+
+        After the best amplitude and shift, which are a matter of convention.
+        """
+        each = []
+        for kernels in self._kernels(position_px, plane):
+            free, _ = np.linalg.qr(np.concatenate([kernels.value[..., None], kernels.jacobian], axis=2))
+            change = kernels.change - free @ (free.transpose(0, 2, 1) @ kernels.change)
+            each.append(np.linalg.norm(change, axis=1) / np.linalg.norm(kernels.value, axis=1)[:, None])
+        every = np.concatenate(each)
+        return np.stack([np.linalg.norm(every, axis=1), np.sqrt(every.shape[1]) * every.std(axis=1)], axis=1)
+
+    @in_float64
+    def sources(self) -> Sources:
+        """Places and light of the stars in the fit, with one standard deviation."""
+        own = Changes.of(self.field, len(self.star_px), self.factor).stars
+        light, relative = self.star_light_e.copy(), np.zeros_like(self.star_light_e)
+        for plane in range(light.shape[1]):
+            every = self._kernels(self.star_px, plane)
+            parts = zip(*((k.centre_px, k.total, k.centre_change, k.total_change) for k in every), strict=True)
+            centre, total, centre_change, total_change = (np.concatenate(part) for part in parts)
+            light[:, plane] *= total
+            relative[:, plane] = np.linalg.norm(own[:, 2 + plane] + total_change, axis=1)
+        # Kernels of all planes have the centre of the reference.
+        sigma_px = np.linalg.norm(own[:, :2] - centre_change, axis=2)
+        return Sources(self.star_place_px - centre, sigma_px, light, light * relative)
+
+    def changed(self, vector: Float[np.ndarray, " unknowns"]) -> StampsPsf:
+        """The term with changes of its unknowns, in the order of ``Changes``: what the posterior of a fit draws."""
+        changes = Changes.of(self.field, len(self.star_px), vector[:, None])
+        return replace(
+            self,
+            field=self.field.moved(changes),
+            star_place_px=self.star_place_px + changes.stars[:, :2, 0],
+            star_light_e=self.star_light_e * np.exp(changes.stars[:, 2:, 0]),
+        )
+
+    def _kernels(self, position_px: Float[np.ndarray, "n 2"], plane: int) -> Iterator[Kernels]:
+        """Kernels with their changes, eight positions at a time: numbers that need not be compiled anew."""
+        grid = offsets(self.rows, self.columns)
+        window = grid * np.exp(-0.5 * (grid**2).sum(axis=1) / self.window_px**2)[:, None]
+        for start in range(0, len(position_px), 8):
+            unit = (np.asarray(position_px[start : start + 8], dtype=np.float64) - self.centre_px) / self.half_px
+            centre = self._centres(unit, window)
+            _, own, by_centre = self._light(unit, centre, self.field.reference)
+            centre_change = -np.linalg.solve(window.T @ by_centre, window.T @ own)
+            light, change, jacobian = self._light(unit, centre, plane)
+            change = change + jacobian @ centre_change
+            total = light.sum(axis=1)
+            value, relative = light / total[:, None], change.sum(axis=1) / total[:, None]
+            shape = change / total[:, None, None] - value[..., None] * relative[:, None]
+            yield Kernels(value, centre, total, shape, centre_change, relative, jacobian)
+
+    def _centres(
+        self, unit: Float[np.ndarray, "n 2"], window: Float[np.ndarray, "pixels 2"]
+    ) -> Float[np.ndarray, "n 2"]:
+        """Where the model's centre must lie for the reference plane's centroid to vanish, by Newton's method."""
+        centre, grid = np.zeros_like(unit), offsets(self.rows, self.columns)
+        plane = np.full((len(unit), len(grid)), self.field.reference)
+        for _ in range(20):
+            seen = see(self.field, unit, centre, grid, plane)
+            off = window.T @ seen.value[..., None]
+            move = -np.linalg.solve(window.T @ seen.jacobian[..., 1:3], off)[..., 0]
+            centre = centre + np.clip(move, -0.5, 0.5)
+            if np.abs(move).max() < 1e-9:
+                break
+        return centre
+
+    def _light(
+        self, unit: Float[np.ndarray, "n 2"], centre: Float[np.ndarray, "n 2"], plane: int
+    ) -> tuple[Float[np.ndarray, "n pixels"], Float[np.ndarray, "n pixels k"], Float[np.ndarray, "n pixels 2"]]:
+        """The model's light, how it changes along the columns of the factor, and its derivatives by the centre."""
+        field, grid, k = self.field, offsets(self.rows, self.columns), self.factor.shape[1]
+        changes = Changes.of(field, len(self.star_px), self.factor)
+        seen = see(field, unit, centre, grid, np.full((len(unit), len(grid)), plane))
+        images = np.tensordot(polynomials(unit, field.degrees[1]), changes.nodes[plane], axes=1)
+        every = taps(seen, np.arange(seen.value.size), field.nodes.shape[2:])
+        change = (every @ images.reshape(every.shape[1], k)).reshape(*seen.value.shape, k)
+        maps, centres = np.split(changes.maps, [field.warp.size])
+        warp = maps.reshape(*field.warp.shape[:2], 4, k)
+        lateral = np.insert(centres.reshape(*field.lateral.shape, k), field.reference, 0.0, axis=0)
+        for own, by in ((lateral[plane], seen.jacobian[..., 1:3]), (warp[plane], seen.jacobian[..., 3:])):
+            basis = polynomials(unit, degree_of(1 + len(own)))[:, 1:]
+            change += by @ np.tensordot(basis, own, axes=1)
+        return seen.value, change, seen.jacobian[..., 1:3]
 
 
 @in_float64
@@ -47,132 +196,87 @@ def fit_psf_stamps(
         FitError: when there are fewer than four stamps.
     """
     rules = rules or StampsRules()
-    if len(stamps.values_e) < rules.fewest_stars:
-        raise FitError(
-            f"Expected at least {rules.fewest_stars} stamps, found {len(stamps.values_e)}. Cut more of them."
-        )
-    low, high = stamps.position_px.min(axis=0), stamps.position_px.max(axis=0)
-    middle, half = (low + high) / 2.0, np.maximum((high - low) / 2.0, 1.0)
-    _, *shape = stamps.values_e.shape
-    unit = (stamps.position_px - middle) / half
-    scene = Scene(split(stamps), unit, (shape[0], shape[1]), stamps.read_e, stamps.clip_e)
-    bad, lowest = _unusable(scene, rules), Orders(0, 0, rules.spacings_px[0])
+    if len(stamps.unit) < 4:
+        raise FitError(f"Expected at least 4 stamps, found {len(stamps.unit)}. Cut more of them.")
+    bad, lowest = unusable(stamps, rules), Orders(0, 0, rules.spacings_px[0])
     try:
-        chosen = search(scene, rules, orders if bad is None else lowest)
+        chosen = search(stamps, rules, orders if bad is None else lowest)
     except np.linalg.LinAlgError:
         bad = FitStatus.NOT_CONVERGED, "The equations were singular; what is given is one psf for all places."
-        chosen = search(scene, rules, lowest)
-    state = chosen.best.fit.place
-    term = StampsPsf(
-        fields=state.fields,
-        factor=np.zeros((0, 0)),
-        centre_px=middle,
-        half_px=half,
-        rows=shape[0],
-        columns=shape[1],
-        window_px=_WINDOW_PX,
-        reference=reference(len(scene.planes)),
-        star_px=stamps.position_px.astype(np.float64),
-        star_place_px=state.centre_px,
-        star_light_e=state.flux_e,
-    )
-    return _report(scene, chosen, term, np.random.default_rng(seed), rules, bad)
-
-
-def _unusable(scene: Scene, rules: StampsRules) -> tuple[FitStatus, str] | None:
-    """What stands in the way of a fit, if anything."""
-    for plane in scene.planes:
-        light = (plane.value_e * plane.usable).sum(axis=1)
-        noise = np.sqrt(np.maximum(light, 0.0) + plane.usable.sum(axis=1) * scene.read_e**2)
-        snr = float(np.median(light / np.maximum(noise, 1e-300)))
-        if snr < rules.least_snr:
-            needed = f"at least {rules.least_snr:.0f} are needed."
-            return FitStatus.TOO_DARK, f"Light over noise of a stamp is {snr:.1f} in the median; {needed}"
-        core = np.abs(plane.offset_px).max(axis=2) <= rules.core_px
-        clear = int((~(plane.clipped & core).any(axis=1) & (plane.usable & core).any(axis=1)).sum())
-        if clear < rules.fewest_unclipped:
-            needed = f"{rules.fewest_unclipped} are needed."
-            return FitStatus.SATURATED, f"{clear} stamps have a core that is not clipped or missing; {needed}"
-    return None
+        chosen = search(stamps, rules, lowest)
+    return _report(stamps, chosen, seed, rules, bad)
 
 
 def _report(
-    scene: Scene,
-    chosen: Choice[Found],
-    term: StampsPsf,
-    rng: np.random.Generator,
-    rules: StampsRules,
-    bad: tuple[FitStatus, str] | None,
+    stamps: Stamps, chosen: Choice[Found], seed: int, rules: StampsRules, bad: tuple[FitStatus, str] | None
 ) -> FitResult[StampsPsf]:
     found, state = chosen.best.fit, chosen.best.fit.place
-    posterior = factors(scene, state)
-    draws = posterior.draws(rng, rules.draws)
-    seen = [expectation(scene, state, plane)[0] for plane in range(len(scene.planes))]
-    samples = int(sum((own.weight > 0).sum() for own in seen))
+    posterior, seen = laplace(stamps, state), expectation(stamps, state)
+    draws, used = posterior.draws(np.random.default_rng(seed), rules.draws[1]), seen.weight > 0
+    z = (seen.residual * np.sqrt(seen.weight))[used]
     # All unknowns (but all light and all places together, which are held), less what the priors say of them.
-    held = float(np.concatenate([own.flat for own in state.precisions]) @ state.squares(draws))
-    effective = state.numbers + state.maps_from - 2 - len(scene.planes) - held
-    chi2_dof = float(sum((own.weight * own.residual**2).sum() for own in seen)) / max(samples - effective, 1.0)
+    held = float(state.precisions @ state.squares(draws))
+    effective = state.field.nodes.size + len(state.maps) + state.maps_from - 2 - state.light_e.shape[1] - held
+    chi2_dof = float(z @ z) / max(z.size - effective, 1.0)
     inflation = float(np.sqrt(chi2_dof)) if chi2_dof > rules.inflate_above else 1.0
-    # A Gaussian as wide as the kernel, by its noise-equivalent area of 4 pi sigma^2.
-    kernel = term.predict(term.centre_px[None], term.reference)
-    window_px = float(1 / np.sqrt(4 * np.pi * (kernel**2).sum()))
-    term = replace(term, factor=draws * (inflation / np.sqrt(rules.draws)), window_px=window_px)
-    maps = MapCoefficients.above(state, 0)
-    named, cov = _estimates(state, term, maps, inflation**2 * marginal_cov(posterior.root, maps.index))
-    status, note = bad or _verdict(found, chi2_dof, rules)
-    clipped = sum(int(plane.clipped.sum()) for plane in scene.planes)
-    used = sum(int((plane.usable & keep).sum()) for plane, keep in zip(scene.planes, state.keep, strict=True))
+    term = _term(stamps, state, draws * (inflation / np.sqrt(rules.draws[1])))
+    # The error to be expected, then the maps' coefficients, named by colour, element and degrees in x and y.
+    size, spread = np.sqrt((term.relative_l2(term.star_px, term.field.reference) ** 2).mean(axis=0))
+    warp = state.field.warp
+    cov = inflation**2 * marginal_cov(posterior.root, state.maps_from + np.arange(warp.size))
+    cov, names = block_diag(spread**2, cov), ["kernel_relative_l2", *_names(state)]
+    status, note = bad or (FitStatus.CONVERGED, "")
+    if not bad and chi2_dof > rules.poor_above:
+        status, note = FitStatus.POOR_FIT, "Check the noise given, and that each stamp holds one point source."
+    elif not bad and not found.converged:
+        left = f"It was left after {found.iterations} steps; use more or brighter stamps."
+        status, note = FitStatus.NOT_CONVERGED, left
     return FitResult(
         name="psf",
         term=term,
         status=status,
-        estimates=named,
+        estimates=estimates(names, ["1"] * len(names), np.concatenate([[size], warp.ravel()]), cov),
         cov=cov,
         chi2_dof=chi2_dof,
-        samples=samples,
+        samples=z.size,
         candidates=chosen.candidates,
         diagnostics=(
             Diagnostic("iterations", float(found.iterations), "1"),
             Diagnostic("effective_parameters", effective, "1"),
-            Diagnostic("log_evidence", found.equations.evidence, "1"),
-            Diagnostic("clipped_samples", float(clipped), "1"),
-            Diagnostic("samples_beyond_the_image", float(used - samples), "1"),
-            Diagnostic("centroid_window", window_px, "px"),
+            Diagnostic("clipped_samples", float(stamps.clipped.sum()), "1"),
+            Diagnostic("samples_beyond_the_image", float((stamps.known & state.keep).sum() - z.size), "1"),
             Diagnostic("sigma_inflation", inflation, "1"),
         ),
         notes=(note,) if note else (),
-        outliers=left_out(scene, state, rules),
-        residuals=_residuals(scene, term, seen),
+        outliers=_left_out(stamps, state, rules),
+        residuals=residual_sample((term.star_px[:, None] + stamps.offset_px)[used], z),
         posterior=Posterior(np.zeros(len(term.factor)), term.factor, term.changed),
     )
 
 
-def _verdict(found: Found, chi2_dof: float, rules: StampsRules) -> tuple[FitStatus, str]:
-    if chi2_dof > rules.poor_above:
-        return FitStatus.POOR_FIT, "Check the noise given, and that each stamp holds one point source."
-    if not found.converged:
-        return FitStatus.NOT_CONVERGED, f"It was left after {found.iterations} steps; use more or brighter stamps."
-    return FitStatus.CONVERGED, ""
+def _term(stamps: Stamps, state: State, factor: np.ndarray) -> StampsPsf:
+    stars = stamps.position_px.astype(np.float64), state.centre_px, state.light_e
+    (centre, half), (_, rows, columns) = stamps.frame_px, stamps.values_e.shape
+    term = StampsPsf(state.field, factor, centre, half, rows, columns, WINDOW_PX, *stars)
+    # A Gaussian as wide as the kernel, by its noise-equivalent area of 4 pi sigma^2.
+    kernel = term.predict(term.centre_px[None], state.field.reference)
+    return replace(term, window_px=float(1 / np.sqrt(4 * np.pi * (kernel**2).sum())))
 
 
-def _estimates(
-    state: State, term: StampsPsf, maps: MapCoefficients, cov: Float[np.ndarray, "n n"]
-) -> tuple[tuple[Estimate, ...], Float[np.ndarray, "m m"]]:
-    """The error to be expected, then the maps' coefficients, named by colour, element and degrees in x and y."""
-    error = term.relative_l2(term.star_px, term.reference)
-    size, spread = np.sqrt((error**2).mean(axis=0))
-    names = ["kernel_relative_l2"]
-    for plane, field in enumerate(state.fields):
-        powers = [(i, d - i) for d in range(1, field.warp_degree + 1) for i in range(d, -1, -1)]
-        prefix = "map" if len(state.fields) == 1 else f"map_{'rgb'[plane]}"
-        names += [f"{prefix}_{e}_{i}{j}" for i, j in powers for e in ("xx", "xy", "yx", "yy")]
-    whole = block_diag(spread**2, cov)
-    return estimates(names, ["1"] * len(names), np.concatenate([[size], maps.value]), whole), whole
+def _names(state: State) -> list[str]:
+    powers = [(i, d - i) for d in range(1, state.field.degrees[0] + 1) for i in range(d, -1, -1)]
+    prefixes = ["map_r", "map_g", "map_b"][: len(state.field.warp)] if len(state.field.warp) > 1 else ["map"]
+    return [f"{p}_{e}_{i}{j}" for p in prefixes for i, j in powers for e in ("xx", "xy", "yx", "yy")]
 
 
-def _residuals(scene: Scene, term: StampsPsf, seen: list[Weighted]) -> ResidualSample:
-    used = [own.weight > 0 for own in seen]
-    places = [(term.star_px[:, None] + plane.offset_px)[u] for plane, u in zip(scene.planes, used, strict=True)]
-    z = [(own.residual * np.sqrt(own.weight))[u] for own, u in zip(seen, used, strict=True)]
-    return residual_sample(np.concatenate(places), np.concatenate(z))
+def _left_out(stamps: Stamps, state: State, rules: StampsRules) -> tuple[Outliers, ...]:
+    stars = np.asarray(state.keep.any(axis=1))
+    left = np.argwhere(stamps.known & ~state.keep & stars[:, None])
+    samples = ((star, *stamps.offset_px[sample]) for star, sample in left)
+    places = (f"stamp {star}, {x:+.0f} px, {y:+.0f} px from its middle" for star, x, y in samples)
+    rule = (
+        f"stamps whose mean square is over {rules.star_ratio:g} times the median's, or that lose "
+        f"{100 * rules.star_lost:.0f} % of their samples"
+    )
+    named = OutlierRule("samples", rules.outlier_sigma).listed(places)
+    return named + outliers(rule, (f"stamp {star}" for star in np.flatnonzero(~stars)))

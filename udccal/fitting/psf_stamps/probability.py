@@ -12,151 +12,40 @@ method for smoothing parameter optimization", Biometrics 73, 2017).
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 import scipy.ndimage
 import scipy.sparse
 from jaxtyping import Bool, Float, Int
+from scipy.sparse.linalg import LaplacianNd
 from scipy.special import log_ndtr
 
-from udccal.fitting.psf_stamps.data import Plane, Scene
-from udccal.fitting.psf_stamps.field import Changes, PlaneField, degrees, see
-
-# What a star may change by itself: relative light, centre (x, y), and the four numbers of its map, row by row.
-OWN = 7
-_NEAR_PX, _FLOOR = 1.5, 2e-5
-# Precisions change by no more than this factor at a time, and end here: such a term is absent.
-_STEP, _MOST = 30.0, 1e14
-_WARP, _LATERAL = 4, 2  # numbers per polynomial
+from udccal.fitting.psf_stamps.data import Stamps, StampsRules
+from udccal.fitting.psf_stamps.field import Changes, PsfField, Seen, degree_of, degrees, see
+from udccal.models.fields import polynomial_terms
 
 
-@dataclass(frozen=True)
-class Precisions:
-    """Of the priors of one colour.
-
-    Attributes:
-        image: (a, b) of each degree of the images, from 0.
-        warp: of each degree of the map, from 1.
-        lateral: of each degree of the lateral colour, from 1; empty for the colour that others are compared with.
-    """
-
-    image: Float[np.ndarray, "image_degrees 2"]
-    warp: Float[np.ndarray, " warp_degrees"]
-    lateral: Float[np.ndarray, " lateral_degrees"]
-
-    @property
-    def flat(self) -> Float[np.ndarray, " groups"]:
-        """All of them."""
-        return np.concatenate([self.image.ravel(), self.warp, self.lateral])
-
-    def times(self, factors: Float[np.ndarray, " groups"]) -> Precisions:
-        """Each multiplied with a factor of its own."""
-        image, warp, lateral = np.split(self.flat * factors, np.cumsum([self.image.size, self.warp.size]))
-        return Precisions(image.reshape(-1, 2), warp, lateral)
-
-    @property
-    def of_maps(self) -> Float[np.ndarray, " coefficients"]:
-        """Of every coefficient of the map, then of the lateral colour."""
-        return np.concatenate([self.warp[by_degree(self.warp, _WARP)], self.lateral[by_degree(self.lateral, _LATERAL)]])
+def envelope(nodes: Float[np.ndarray, "*k rows columns"], spacing_px: float) -> Float[np.ndarray, "*k rows columns"]:
+    """The kernel's size E on the nodes of images of degree 0: their root mean square nearby."""
+    width = [0.0] * (nodes.ndim - 2) + [1.5 / spacing_px] * 2
+    peak = np.abs(nodes).max(axis=(-2, -1), keepdims=True)
+    return np.sqrt(scipy.ndimage.gaussian_filter(nodes**2, width, mode="nearest") + (2e-5 * peak) ** 2)
 
 
-@dataclass(frozen=True)
-class Envelope:
-    """The kernel's size E on the nodes, and how rough an image is beside it."""
-
-    size: Float[np.ndarray, "grid_rows grid_columns"]
-    roughness: scipy.sparse.csr_array
-    eigenvalues: Float[np.ndarray, " nodes"]
-
-    def scaled(self, images: Float[np.ndarray, "*n grid_rows grid_columns"]) -> Float[np.ndarray, "*n"]:
-        """Sum of squares of images / E."""
-        return np.asarray(((images / self.size) ** 2).sum(axis=(-2, -1)))
-
-    def rough(self, images: Float[np.ndarray, "*n grid_rows grid_columns"]) -> Float[np.ndarray, "*n"]:
-        """Sum of squares of the Laplacian of images / E."""
-        z = images / self.size
-        total = np.zeros_like(z)
-        down, across = np.diff(z, axis=-2), np.diff(z, axis=-1)
-        total[..., :-1, :] += down
-        total[..., 1:, :] -= down
-        total[..., :-1] += across
-        total[..., 1:] -= across
-        return np.asarray((total**2).sum(axis=(-2, -1)))
+def grid_size(shape: tuple[int, ...], spacing_px: float, reach: float) -> tuple[int, int]:
+    """Nodes that cover stamps ``reach`` times; by steps of 3, so that they do not move with every digit of a map."""
+    rows, columns = (3 * math.ceil(((size + 1) * reach / spacing_px + 3) / 3) for size in shape)
+    return rows, columns
 
 
-def envelope(image: Float[np.ndarray, "grid_rows grid_columns"], spacing_px: float) -> Envelope:
-    """Of an image's nodes: their root mean square nearby."""
-    near = scipy.ndimage.gaussian_filter(image**2, _NEAR_PX / spacing_px, mode="nearest")
-    size = np.sqrt(near + (_FLOOR * np.abs(image).max()) ** 2)
-    rows, columns = (_second_difference(n) for n in image.shape)
-    one = [scipy.sparse.eye_array(n) for n in image.shape]
-    laplacian = scipy.sparse.kron(rows, one[1]) + scipy.sparse.kron(one[0], columns)
-    weighted = scipy.sparse.csr_array(laplacian) @ scipy.sparse.diags_array(1.0 / size.ravel())
-    # The Laplacian's eigenvectors are those of the cosine transform.
-    y, x = (2 - 2 * np.cos(np.pi * np.arange(n) / n) for n in image.shape)
-    return Envelope(size, (weighted.T @ weighted).tocsr(), (y[:, None] + x).ravel() ** 2)
-
-
-def by_degree(numbers: Float[np.ndarray, " degrees"], each: int) -> Int[np.ndarray, " coefficients"]:
-    """For every coefficient of a polynomial without its constant: which of the numbers, one a degree, is its."""
-    return np.repeat(degrees(len(numbers))[1:] - 1, each)
-
-
-def squares(
-    env: Envelope,
-    precisions: Precisions,
-    images: Float[np.ndarray, "k terms grid_rows grid_columns"],
-    warp: Float[np.ndarray, "k warp"],
-    lateral: Float[np.ndarray, "k lateral"],
-) -> Float[np.ndarray, " groups"]:
-    """What each precision is multiplied with in minus twice the log prior, on average over ``k`` fields."""
-    degree = degrees(len(precisions.image) - 1)
-    image = [np.bincount(degree, of(images).mean(axis=0)) for of in (env.scaled, env.rough)]
-    maps = [
-        np.bincount(by_degree(own, each), (values**2).mean(axis=0), minlength=len(own))
-        for own, each, values in ((precisions.warp, _WARP, warp), (precisions.lateral, _LATERAL, lateral))
-    ]
-    return np.concatenate([np.stack(image, axis=1).ravel(), *maps])
-
-
-def expected_squares(env: Envelope, precisions: Precisions) -> Float[np.ndarray, " groups"]:
-    """The same, as the prior itself expects it."""
-    out = []
-    for degree, (a, b) in enumerate(precisions.image):
-        prior = a + b * env.eigenvalues
-        out += [(degree + 1) * (1.0 / prior).sum(), (degree + 1) * (env.eigenvalues / prior).sum()]
-    return np.concatenate([out, *(count / own for own, count in _map_counts(precisions))])
-
-
-def log_det(env: Envelope, precisions: Precisions) -> float:
-    """Of the prior's precision; constants that all orders share are left out."""
-    total = sum(float((count * np.log(own)).sum()) for own, count in _map_counts(precisions))
-    for degree, (a, b) in enumerate(precisions.image):
-        total += (degree + 1) * float(np.log(a + b * env.eigenvalues).sum() - 2 * np.log(env.size).sum())
-    return total
-
-
-def updated(
-    precision: Float[np.ndarray, " n"],
-    expected: Float[np.ndarray, " n"],
-    left: Float[np.ndarray, " n"],
-    found: Float[np.ndarray, " n"],
-) -> Float[np.ndarray, " n"]:
-    """Fellner and Schall's: squares that the prior expects, less those that the data leave open, over those found."""
-    ratio = np.maximum(expected - left, 1e-6 * expected) / np.maximum(found, 1e-300)
-    return np.minimum(precision * np.clip(ratio, 1 / _STEP, _STEP), _MOST)
-
-
-def _map_counts(precisions: Precisions) -> list[tuple[Float[np.ndarray, " _degrees"], Float[np.ndarray, " _degrees"]]]:
-    """Precisions of map and lateral colour, and how many coefficients share each."""
-    pairs = ((precisions.warp, _WARP), (precisions.lateral, _LATERAL))
-    return [(own, each * np.arange(2.0, len(own) + 2)) for own, each in pairs]
-
-
-def _second_difference(n: int) -> scipy.sparse.csr_array:
-    step = scipy.sparse.diags_array([-np.ones(n - 1), np.ones(n - 1)], offsets=[0, 1], shape=(n - 1, n))
-    return scipy.sparse.csr_array(-(step.T @ step))
+@lru_cache(maxsize=4)
+def laplacian(rows: int, columns: int) -> tuple[scipy.sparse.csr_array, Float[np.ndarray, " nodes"]]:
+    """Of a grid, and the eigenvalues of its square."""
+    grid = LaplacianNd((rows, columns), dtype=np.float64)
+    return scipy.sparse.csr_array(grid.tosparse()), grid.eigenvalues() ** 2
 
 
 @dataclass(frozen=True)
@@ -164,132 +53,155 @@ class State:
     """Where a fit has come to.
 
     Attributes:
-        fields: by colour.
         centre_px: of the stars, from their middle samples.
-        flux_e: by star and colour.
-        precisions, envelopes: of the priors, by colour.
-        keep: samples that are not outliers, by colour.
+        precisions: of the priors: (a, b) of images by colour and degree, from 0; of maps by colour and degree, from 1;
+            of lateral colour likewise, of all colours but the reference.
+        size: E of the priors, see ``envelope``.
+        keep: samples that are not outliers.
         model_error: relative error of the model that is allowed for beside the noise, while it is still coarse.
     """
 
-    fields: tuple[PlaneField, ...]
+    field: PsfField
     centre_px: Float[np.ndarray, "stars 2"]
-    flux_e: Float[np.ndarray, "stars planes"]
-    precisions: tuple[Precisions, ...]
-    envelopes: tuple[Envelope, ...]
-    keep: tuple[Bool[np.ndarray, "stars _samples"], ...]
+    light_e: Float[np.ndarray, "stars planes"]
+    precisions: Float[np.ndarray, " groups"]
+    size: Float[np.ndarray, "planes grid_rows grid_columns"]
+    keep: Bool[np.ndarray, "stars samples"]
     model_error: float = 0.0
 
     @property
     def maps_from(self) -> int:
-        """Index in the dense block of the first coefficient of a map: behind places and light of the stars."""
-        return self.centre_px.size + self.flux_e.size
+        """Index in the dense block of the first number of a map: behind places and light of the stars."""
+        return self.centre_px.size + self.light_e.size
 
     @property
-    def numbers(self) -> int:
-        """Parameters of the fields."""
-        return sum(np.size(f.nodes) + np.size(f.warp) + np.size(f.lateral) for f in self.fields)
+    def of_images(self) -> Float[np.ndarray, "planes image_degrees 2"]:
+        """Precisions of the images."""
+        planes, count = len(self.size), self.field.degrees[1] + 1
+        return self.precisions[: 2 * planes * count].reshape(planes, count, 2)
 
     @property
-    def out(self) -> Bool[np.ndarray, " stars"]:
-        """Stars that are left out altogether."""
-        return ~np.any([keep.any(axis=1) for keep in self.keep], axis=0)
+    def map_groups(self) -> Int[np.ndarray, " numbers"]:
+        """For every number of maps and lateral colour: which of the precisions is its."""
+        parts = (self.field.warp, 4), (self.field.lateral, 2)
+        sizes = [np.tile(k * np.arange(2, degree_of(1 + part.shape[1]) + 2), len(part)) for part, k in parts]
+        every = np.concatenate(sizes).astype(int)
+        return np.repeat(self.of_images.size + np.arange(len(every)), every)
+
+    @property
+    def maps(self) -> Float[np.ndarray, " numbers"]:
+        """Numbers of the maps, then of lateral colour."""
+        return np.concatenate([np.ravel(self.field.warp), np.ravel(self.field.lateral)])
 
     def shifted(self, vector: Float[np.ndarray, " unknowns"]) -> State:
         """The state with changes added, in the order of ``Changes``."""
-        changes = Changes.of(self.fields, len(self.flux_e), vector[:, None])
-        return replace(
-            self,
-            fields=changes.applied(self.fields),
-            centre_px=self.centre_px + changes.stars[:, :2, 0],
-            flux_e=self.flux_e * np.exp(changes.stars[:, 2:, 0]),
-        )
+        changes = Changes.of(self.field, len(self.light_e), vector[:, None])
+        centre, light = np.split(changes.stars[..., 0], [2], axis=1)
+        field, light = self.field.moved(changes), self.light_e * np.exp(light)
+        return replace(self, field=field, centre_px=self.centre_px + centre, light_e=light)
+
+    def with_degrees(self, warp: int, image: int, rules: StampsRules) -> State:
+        """The state with other degrees: what is new starts at zero, what is dropped is forgotten."""
+        (old_warp, old_image), planes = self.field.degrees, len(self.size)
+        nodes = _resized(self.field.nodes, polynomial_terms(image))
+        field = replace(self.field, nodes=nodes, warp=_resized(self.field.warp, polynomial_terms(warp) - 1))
+        _, warps, lateral = np.split(self.precisions, np.cumsum([self.of_images.size, planes * old_warp]))
+        images = _resized(self.of_images, image + 1)
+        for degree in range(old_image + 1, image + 1):
+            least = rules.new_image * images[:, degree - 1] if degree > 1 else 0.0
+            images[:, degree] = np.maximum(rules.first_image[1], least)
+        new = np.tile([rules.first_map] * 2 + [rules.new_map] * warp, (planes, 1))
+        warps = np.concatenate([warps.reshape(planes, old_warp), new[:, old_warp:]], axis=1)[:, :warp]
+        return replace(self, field=field, precisions=np.concatenate([images.ravel(), warps.ravel(), lateral]))
+
+    def with_spacing(self, stamps: Stamps, spacing_px: float) -> State:
+        """The state on other nodes, which give the same images and reach as far as maps look."""
+        reach = np.abs(np.linalg.inv(self.field.maps(stamps.unit))).sum(axis=3).max()
+        ratio = spacing_px / self.field.spacing_px
+        grid = grid_size(stamps.values_e.shape[1:], spacing_px, float(np.clip(reach, 1.0, 1.7)))
+        nodes = np.array([[_resampled(image, ratio, grid) for image in own] for own in self.field.nodes])
+        # A squared Laplacian is a difference of fourth order; there are more nodes for what is as rough.
+        precisions = self.precisions.copy()
+        precisions[: self.of_images.size] *= np.tile([ratio**2, ratio**-2], self.of_images.size // 2)
+        field = replace(self.field, nodes=nodes, spacing_px=spacing_px)
+        return replace(self, field=field, precisions=precisions, size=envelope(nodes[:, 0], spacing_px))
 
     def squares(self, vectors: Float[np.ndarray, "unknowns k"] | None = None) -> Float[np.ndarray, " groups"]:
-        """Of the fields, or on average of changes of them: what the precisions of all colours are multiplied with."""
-        if vectors is None:
-            parts = [(f.nodes[None], np.reshape(f.warp, (1, -1)), np.reshape(f.lateral, (1, -1))) for f in self.fields]
-        else:
-            c = Changes.of(self.fields, len(self.flux_e), vectors)
-            parts = [
-                (nodes.transpose(2, 0, 1).reshape(-1, *f.nodes.shape), warp.T, lateral.T)
-                for f, nodes, warp, lateral in zip(self.fields, c.nodes, c.warp, c.lateral, strict=True)
-            ]
-        return np.concatenate(
-            [squares(env, own, *part) for env, own, part in zip(self.envelopes, self.precisions, parts, strict=True)]
-        )
+        """What each precision is multiplied with in minus twice the log prior: of the field, or a mean over changes."""
+        nodes, maps = self.field.nodes[..., None], self.maps[:, None]
+        if vectors is not None:
+            _, maps, nodes = Changes.of(self.field, len(self.light_e), vectors)
+        planes, terms, rows, columns, k = nodes.shape
+        z = np.moveaxis(nodes / self.size[:, None, :, :, None], (2, 3), (0, 1)).reshape(rows * columns, -1)
+        both = np.stack([(z**2).sum(axis=0), ((laplacian(rows, columns)[0] @ z) ** 2).sum(axis=0)])
+        each = both.reshape(2, planes, terms, k).mean(axis=3)
+        first = np.flatnonzero(np.diff(degrees(self.field.degrees[1]), prepend=-1))
+        image = np.moveaxis(np.add.reduceat(each, first, axis=2), 0, 2).ravel()
+        return np.concatenate([image, np.bincount(self.map_groups, (maps**2).mean(axis=1))[image.size :]])
 
-    @property
-    def log_prior(self) -> float:
-        """Log prior; constants that all orders share are left out."""
-        volume = sum(log_det(env, own) for env, own in zip(self.envelopes, self.precisions, strict=True))
-        return 0.5 * (volume - float(np.concatenate([own.flat for own in self.precisions]) @ self.squares()))
+    def volume(self) -> tuple[float, Float[np.ndarray, " groups"]]:
+        """Log determinant of the priors' precision, and its derivatives: the squares that the priors expect."""
+        images, count = self.of_images.size, 1.0 + np.arange(self.of_images.shape[1])
+        maps, own = np.bincount(self.map_groups)[images:], self.precisions[images:]
+        a, b = np.moveaxis(self.of_images, 2, 0)[..., None]
+        eigenvalues = laplacian(*self.size.shape[1:])[1]
+        prior = a + b * eigenvalues
+        log_det = (
+            maps @ np.log(own) + (np.log(prior).sum(axis=2) @ count).sum() - 2 * count.sum() * np.log(self.size).sum()
+        )
+        squares = np.stack([(1 / prior).sum(axis=2), (eigenvalues / prior).sum(axis=2)], axis=2) * count[:, None]
+        return float(log_det), np.concatenate([squares.ravel(), maps / own])
+
+
+def _resized(values: Float[np.ndarray, "planes n *rest"], count: int) -> Float[np.ndarray, "planes count *rest"]:
+    """The first ``count`` of each colour, zeros where there were fewer."""
+    kept = values[:, :count]
+    return np.concatenate([kept, np.zeros((len(kept), count - kept.shape[1], *kept.shape[2:]))], axis=1)
+
+
+def _resampled(
+    image: Float[np.ndarray, "m n"], ratio: float, grid: tuple[int, int]
+) -> Float[np.ndarray, "rows columns"]:
+    """On nodes ``ratio`` as far from each other: coefficients to values at these, and values to coefficients."""
+    grids = [(np.arange(n) - (n - 1) / 2) * ratio + (size - 1) / 2 for n, size in zip(grid, image.shape, strict=True)]
+    places = np.stack(np.meshgrid(*grids, indexing="ij"))
+    values = scipy.ndimage.map_coordinates(image, places, order=3, mode="constant", prefilter=False)
+    return np.asarray(scipy.ndimage.spline_filter(values, order=3, mode="mirror"))
 
 
 @dataclass(frozen=True)
 class Weighted:
-    """One colour's samples under the present model.
+    """Samples under the model; ``seen`` has stars' light in ``down`` and ``jacobian``; unused ones weigh nothing."""
 
-    Attributes:
-        first: flat index of the first of a sample's 4 x 4 nodes.
-        down, across: weights of these nodes times the star's light, as a product.
-        slopes: to what a star may change by itself: relative light, centre (x, y), map (row by row).
-        residual: what is left, in electrons. weight: inverse variances, 0 where nothing is known.
-        mean: expected, in electrons.
-    """
-
-    first: Int[np.ndarray, "stars samples"]
-    down: Float[np.ndarray, "stars samples 4"]
-    across: Float[np.ndarray, "stars samples 4"]
-    slopes: Float[np.ndarray, "stars samples own"]
+    seen: Seen
     residual: Float[np.ndarray, "stars samples"]
     weight: Float[np.ndarray, "stars samples"]
-    mean: Float[np.ndarray, "stars samples"]
+    log_likelihood: float
 
 
-def expectation(scene: Scene, state: State, plane: int) -> tuple[Weighted, Float[np.ndarray, "stars samples"]]:
-    """One colour's samples under the model, and their log likelihood.
-
-    Shot noise and read noise r together are those of y + r^2 ~ Poisson(m + r^2) (Snyder et al., J. Opt. Soc. Am. A 10,
-    1993), whose score (y - m) / (m + r^2) asks for nothing but the variance.
-
-    Args:
-        scene: the samples.
-        state: the model.
-        plane: the colour.
-    """
-    data = scene.planes[plane]
-    seen = see(state.fields[plane], scene.unit, state.centre_px, data.offset_px)
-    value, slopes, first, down, across, inside = (np.asarray(part) for part in seen)
-    light = state.flux_e[:, plane, None]
-    mean = light * value
-    read = scene.read_e**2
-    variance = np.maximum(mean, 0.0) + read  # expected light below zero has no shot noise
-    likelihood = _unclipped(data, mean, variance, read)
-    if state.model_error:
-        variance = variance + (state.model_error * np.abs(mean)) ** 2
-    residual, weight = data.value_e - mean, 1.0 / variance
+def expectation(stamps: Stamps, state: State) -> Weighted:
+    """Samples under the model."""
+    # Shot noise and read noise r together are those of y + r^2 ~ Poisson(m + r^2) (Snyder et al., J. Opt. Soc. Am. A
+    # 10, 1993), whose score (y - m) / (m + r^2) asks for nothing but the variance.
+    seen = see(state.field, stamps.unit, state.centre_px, stamps.offset_px, stamps.plane)
+    light = np.take_along_axis(state.light_e, stamps.plane, axis=1)
+    mean, read = light * seen.value, stamps.read_e**2
+    # Expected light below zero has no shot noise.
+    variance = np.maximum(mean, 0.0) + read + (state.model_error * mean) ** 2
+    residual, weight = stamps.value_e - mean, 1.0 / variance
     if state.model_error:
         likelihood = -0.5 * (residual**2 * weight + np.log(variance / read))
-    cut = data.clipped
+    else:
+        below = np.where(mean < 0, mean * stamps.value_e - 0.5 * mean**2, 0.0) / read
+        likelihood = (stamps.value_e + read) * np.log(variance / read) - np.maximum(mean, 0.0) + below
+    cut = stamps.clipped
     sigma = np.sqrt(variance[cut])
-    z = (scene.clip_e - mean[cut]) / sigma
-    score, information = _clipped(z)
+    z = (stamps.clip_e - mean[cut]) / sigma
+    # Score and information of a unit normal's mean where it is known only to lie above z.
+    score = np.exp(-0.5 * z**2 - 0.5 * np.log(2 * np.pi) - log_ndtr(-z))
+    information = np.maximum(score * (score - z), 1e-12)
     residual[cut], weight[cut], likelihood[cut] = sigma * score / information, information / variance[cut], log_ndtr(-z)
-    known = data.usable & state.keep[plane] & inside
-    own = np.concatenate([mean[..., None], light[..., None] * slopes], axis=2)
-    residual, weight, likelihood = (np.where(known, part, 0.0) for part in (residual, weight, likelihood))
-    return Weighted(first, light[..., None] * down, across, own, residual, weight, mean), likelihood
-
-
-def _unclipped(
-    data: Plane, mean: Float[np.ndarray, "stars samples"], variance: Float[np.ndarray, "stars samples"], read: float
-) -> Float[np.ndarray, "stars samples"]:
-    below = np.where(mean < 0, mean * data.value_e - 0.5 * mean**2, 0.0) / read
-    return (data.value_e + read) * np.log(variance / read) - np.maximum(mean, 0.0) + below
-
-
-def _clipped(z: Float[np.ndarray, "*n"]) -> tuple[Float[np.ndarray, "*n"], Float[np.ndarray, "*n"]]:
-    """Score and information of a unit normal's mean where it is known only to lie above z."""
-    hazard = np.exp(-0.5 * z**2 - 0.5 * np.log(2 * np.pi) - log_ndtr(-z))
-    return hazard, np.maximum(hazard * (hazard - z), 1e-12)
+    used = stamps.known & state.keep & seen.inside
+    residual, weight = np.where(used, residual, 0.0), np.where(used, weight, 0.0)
+    seen = seen._replace(down=light[..., None] * seen.down, jacobian=light[..., None] * seen.jacobian)
+    return Weighted(seen, residual, weight, float(likelihood[used].sum()))

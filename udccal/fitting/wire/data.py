@@ -6,13 +6,14 @@ for more (or less) than its neighbours, and the map would be biased.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import final
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from typing import TypeVar, cast, final
 
 import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, Shaped
 from scipy.optimize import nnls
 
 from udccal.cfa import site_map
@@ -27,13 +28,8 @@ from udccal.sessions.store import Session
 
 # What is compiled is compiled for so many pixels.
 BLOCK = 2048
-_OFF = OutlierRule("pixels (row, column)")
-_LEAST_PRNU = 1e-5
-_BINS = 32
-# A sample variance beyond so many medians of its bin is a pixel that blinks, not noise.
-_BLINKING = 30.0
-# Weights go by signals of at least this part of the mean.
-_LEAST_SIGNAL = 0.01
+Result = TypeVar("Result")
+_OUTLIERS = OutlierRule("pixels (row, column)")
 
 
 @final
@@ -105,8 +101,9 @@ class FlatNoise:
 
     def variance(self, site: Int[np.ndarray, "*n"], signal: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
         """Of pixels of these sites at these relative signals."""
-        some = np.maximum(signal, _LEAST_SIGNAL)
-        unequal = max(self.PRNU1288, _LEAST_PRNU) * some
+        # What a model takes to be dark, or below, must not weigh without bounds.
+        some = np.maximum(signal, 0.01)
+        unequal = max(self.PRNU1288, 1e-5) * some
         return np.asarray(self.floor[site] + self.by_signal[site] * some + unequal**2)
 
 
@@ -123,16 +120,17 @@ def flat_noise(data: WireData, means: Float[np.ndarray, "4"]) -> FlatNoise:
 
 
 def _line(signal: Float[np.ndarray, " n"], variance: Float[np.ndarray, " n"]) -> Float[np.ndarray, "2"]:
-    """Constant and slope, neither negative, through the means of bins of equal counts."""
+    """Constant and slope, neither negative, through the means of 32 bins of equal counts."""
     good = np.isfinite(variance) & np.isfinite(signal) & (variance >= 0)
-    if not good.any():
-        return np.zeros(2)
     order = np.argsort(signal[good], kind="stable")
     bins = []
-    for x, y in zip(*(np.array_split(part[good][order], _BINS) for part in (signal, variance)), strict=True):
-        kept = y <= _BLINKING * np.median(y) if len(y) else np.zeros(0, dtype=bool)
+    for x, y in zip(*(np.array_split(part[good][order], 32) for part in (signal, variance)), strict=True):
+        # A sample variance beyond 30 medians of its bin is a pixel that blinks, not noise.
+        kept = y <= 30.0 * np.median(y) if len(y) else np.zeros(0, dtype=bool)
         if kept.any():
             bins.append((max(float(x[kept].mean()), 0.0), float(y[kept].mean())))
+    if not bins:
+        return np.zeros(2)
     at, mean = np.array(bins).T
     # Sample variances scatter in proportion to themselves.
     weight = 1.0 / np.maximum(mean, 1e-3 * mean.max() + 1e-300)
@@ -154,11 +152,6 @@ class Pixels(eqx.Module):
     weight: Float[np.ndarray, " n"]
     place: Int[np.ndarray, " n"]
 
-    def blocks(self) -> list[Pixels]:
-        """In pieces of one size; samples are padded to whole blocks when they are drawn."""
-        starts = range(0, len(self.value), BLOCK)
-        return [jax.tree.map(lambda a, s=s: a[s : s + BLOCK], self) for s in starts]
-
     def thinned(self, most: int) -> Pixels:
         """At most so many of them, evenly drawn, in whole blocks."""
         drawn = np.arange(0, len(self.value), -(-len(self.value) // most))
@@ -177,10 +170,10 @@ def sample_pixels(
     """About so many pixels in reading order, shifted along from row to row so that all CFA sites are visited.
 
     Args:
-        value: what is no number gets weight 0, others 1.
+        value: what is not finite gets weight 0, others 1.
         geometry: where the rays go.
         samples: as many or somewhat more; all where there are fewer.
-        other: a third as many that share no pixel with the sample drawn otherwise, where that is not all.
+        other: a third as many, of other pixels than the sample drawn otherwise, where that is not all.
     """
     rows, columns = value.shape
     step = odd_step(value.size, samples)
@@ -210,10 +203,23 @@ def odd_step(size: int, samples: int) -> int:
 
 def ideal_points(geometry: Geometry, positions_px: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
     """Undistorted image points of pixels (x, y), which are as many as fill whole blocks."""
-    return np.concatenate([np.asarray(_unproject(geometry, part)) for part in positions_px.reshape(-1, BLOCK, 2)])
+    return over_blocks(lambda part: _ideal_points(geometry, part), positions_px).T
 
 
-_unproject = jax.jit(unproject)
+@jax.jit
+def _ideal_points(geometry: Geometry, positions_px: Float[Array, "n 2"]) -> Float[Array, "2 n"]:
+    return unproject(geometry, positions_px).T
+
+
+def blocks(*arrays: Shaped[np.ndarray, "n ..."]) -> Iterator[tuple[Shaped[np.ndarray, "block ..."], ...]]:
+    """Arrays over pixels in pieces of one size, which they fill."""
+    return zip(*(part.reshape(-1, BLOCK, *part.shape[1:]) for part in arrays), strict=True)
+
+
+def over_blocks(function: Callable[..., Result], *arrays: Shaped[np.ndarray, "n ..."]) -> Result:
+    """A compiled function of arrays over pixels, block by block; what it gives has pixels last."""
+    found = [function(*part) for part in blocks(*arrays)]
+    return cast(Result, jax.tree.map(lambda *parts: np.concatenate(parts, axis=-1), *found))
 
 
 @final
@@ -237,19 +243,16 @@ class Weighed:
     def outliers(self, columns: int) -> tuple[Outliers, ...]:
         """What was left out, for a person to look at; the sensor has so many columns."""
         y, x = np.divmod(np.sort(self.pixels.place[self.outlying]), columns)
-        found = _OFF.listed(f"({row}, {column})" for row, column in zip(y, x, strict=True))
+        found = _OUTLIERS.listed(f"({row}, {column})" for row, column in zip(y, x, strict=True))
         clipped = (Outliers("so bright, by the fitted map, that single frames clip", self.clipped),)
         return (*found, *(clipped if self.clipped else ()))
 
 
 def weighed(pixels: Pixels, expected: Float[np.ndarray, " n"], noise: FlatNoise) -> Weighed:
-    """Weigh a sample by the signal that a model expects; leave out what clips and what no noise explains.
-
-    Outliers of an earlier model are looked at anew.
-    """
+    """Weigh a sample by the signal that a model expects; leave out what clips and what no noise explains."""
     variance = noise.variance(pixels.site, expected)
     real = (pixels.place >= 0) & np.isfinite(pixels.value)
     usable = real & (expected + 3 * np.sqrt(variance) < noise.clip[pixels.site])
-    outlying = _OFF.off((pixels.value - expected) / np.sqrt(variance), usable)
-    kept = eqx.tree_at(lambda p: p.weight, pixels, np.where(usable & ~outlying, 1.0 / variance, 0.0))
+    outlying = _OUTLIERS.off((pixels.value - expected) / np.sqrt(variance), usable)
+    kept = replace(pixels, weight=np.where(usable & ~outlying, 1.0 / variance, 0.0))
     return Weighed(kept, expected, int(np.count_nonzero(real & ~usable)), outlying)

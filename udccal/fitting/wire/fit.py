@@ -10,31 +10,32 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import final
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
 from udccal.cfa import SITES, site_map
-from udccal.fitting.engine.gaussian import Posterior, square_root
-from udccal.fitting.engine.least_squares import SolverRules, minimise
+from udccal.fitting.engine.gaussian import Posterior, scaled_inverse, square_root
+from udccal.fitting.engine.least_squares import minimise
 from udccal.fitting.engine.misfit import clustered_cov
-from udccal.fitting.wire.data import FlatNoise, Pixels, WireData, flat_noise, ideal_points, sample_pixels, weighed
-from udccal.fitting.wire.jacobian import BLOCK, WireProblem, block_jacobian, expected_of, values_at
-from udccal.fitting.wire.misfit import misfit, omitted, unseen
-from udccal.fitting.wire.orders import select
-from udccal.fitting.wire.parameters import Parameters, ideal_wire, parameters_of, possible_harmonics
-from udccal.fitting.wire.report import Joint, wire_result
-from udccal.fitting.wire.rules import WireRules
-from udccal.fitting.wire.search import Found, Search
+from udccal.fitting.wire.data import (
+    BLOCK,
+    FlatNoise,
+    Pixels,
+    WireData,
+    flat_noise,
+    ideal_points,
+    over_blocks,
+    sample_pixels,
+)
+from udccal.fitting.wire.jacobian import WireProblem, block_jacobian, values_at, weighed_at
+from udccal.fitting.wire.parameters import Kind, Parameters, parameters_of, select
+from udccal.fitting.wire.report import Joint, misfit, omitted, unseen, wire_result
+from udccal.fitting.wire.rules import WireRules, ideal_wire, possible_harmonics
+from udccal.fitting.wire.search import SOLVER, Found, Search
 from udccal.models.geometry import Geometry
 from udccal.models.wire import Wire, scaled_positions, wire_map
 from udccal.numerics import in_float64
 from udccal.result import FitResult, FitStatus
-
-# A step that is expected to gain less is taken without looking: it is a tenth of a sigma.
-_JOINT = SolverRules(least_gain=1e-2, stalled_gain=0.1)
-# Rows and columns of grids over the sensor, whole blocks, for the map's mean and its sigma.
-_MEAN_GRID, _SIGMA_GRID = (192, 256), (64, 64)
 
 
 @in_float64
@@ -49,36 +50,35 @@ def fit_wire(data: WireData, rules: WireRules | None = None) -> FitResult[Wire]:
         the wire, whose map has a mean of 1, and its posterior: ``result.sigma_of`` gives the error of the map at any
         pixels, what the model may be off included. A flat that cannot be used gives a status that says why.
     """
-    rules = rules or WireRules()
+    rules, shape = rules or WireRules(), data.signal.shape
     means = _site_means(data.signal, data.clip)
     refused = _unusable(data, means, rules)
     if refused:
         return FitResult.failed("wire", ideal_wire(data.geometry, data.start, np.zeros((0, 2)), rules), *refused)
-    noise, values = flat_noise(data, means), data.signal / means[site_map(*data.signal.shape)]
+    noise, values = flat_noise(data, means), data.signal / means[site_map(*shape)]
     few, coarse, every = (
         sample_pixels(values, data.geometry, max(int(part * rules.samples), 1))
-        for part in (rules.search_share, rules.shape_share, 1.0)
+        for part in (rules.search_part, rules.shape_part, 1.0)
     )
     found = Search(data.start, noise, rules).found(data.geometry, few, coarse)
     joint = _joint(found, every, data, noise, rules)
-    joint = replace(joint, x=mean_one(joint.parameters, joint.x, data.geometry, values.shape))
-    held_out = every.used < values.size / 2
-    jacobian = map_jacobian(joint.parameters, joint.x, data.geometry, values.shape)
-    judged = joint.seen
+    tested, held_out = joint.seen, every.used < values.size / 2
     if held_out:
         others = sample_pixels(values, data.geometry, rules.samples, other=True)
-        judged = weighed(others, expected_of(joint.wire, joint.parameters.gains(joint.x), others), noise)
-    off = misfit(judged, joint.wire if found.present else None, jacobian.sigma(joint.cov), held_out)
+        tested = weighed_at(joint.parameters, joint.x, others, noise)
+    joint = replace(joint, x=mean_one(joint.parameters, joint.x, data.geometry, shape))
+    jacobian, wire = map_jacobian(joint.parameters, joint.x, data.geometry, shape), joint.parameters.wire(joint.x)
+    off = misfit(tested, wire if joint.parameters.panel else None, jacobian.sigma(joint.cov), held_out)
     if off.test.found:
         joint = replace(joint, cov=clustered_cov(joint.cov, joint.by_tile))
-    if found.present:
-        missing = omitted(data.start, joint.wire, joint.seen, rules)
+    if joint.parameters.panel:
+        missing = omitted(data.start, wire, joint.seen, rules)
         left_out = missing.sigma if missing else 0.0
     else:
         left_out = unseen(possible_harmonics(data.start, rules.least_amplitude), found.searched, rules)
     model = float(np.hypot(off.sigma, left_out))
     posterior = _posterior(joint, jacobian, model)
-    return wire_result(joint, off, left_out, jacobian.sigma(joint.cov, model), posterior, values.shape, rules)
+    return wire_result(joint, off, left_out, jacobian.sigma(joint.cov, model), posterior, shape, rules)
 
 
 @in_float64
@@ -88,7 +88,7 @@ def sensor_map(wire: Wire, rows: int, columns: int) -> Float[np.ndarray, "rows c
 
 
 def _site_means(signal: Float[np.ndarray, "rows columns"], clip: float) -> Float[np.ndarray, "4"]:
-    """Of what is neither clipped nor not a number; not a number where nothing is left."""
+    """Of what is finite and not clipped; NaN where nothing is left."""
     sites = site_map(*signal.shape)
     good = [signal[(sites == k) & np.isfinite(signal) & (signal < clip)] for k in range(SITES)]
     return np.array([float(some.mean(dtype=np.float64)) if some.size else np.nan for some in good])
@@ -113,12 +113,12 @@ def _unusable(data: WireData, means: Float[np.ndarray, "4"], rules: WireRules) -
 
 def _joint(found: Found, every: Pixels, data: WireData, noise: FlatNoise, rules: WireRules) -> Joint:
     """Choose the columns that the data ask for, and fit them with the shape until nothing moves."""
-    wire, gains = found.descent.wire, found.descent.gains
-    bounds = possible_harmonics(data.start, rules.least_amplitude).bounds if found.present else np.zeros(0)
-    full = parameters_of(wire, rules, bounds, found.present)
+    wire, gains, panel = found.descent.wire, found.descent.gains, found.descent.problem.parameters.panel
+    bounds = possible_harmonics(data.start, rules.least_amplitude).bounds
+    full = parameters_of(wire, rules, bounds if panel else (), panel)
     prior, x = full.prior(data.start, rules), full.vector(wire, gains)
-    pixels = weighed(every, expected_of(wire, gains, every), noise).pixels
-    here = WireProblem("wire, orders", full, pixels, prior).equations_at(x).blocks
+    pixels = found.descent.weighs(every, noise)
+    here = WireProblem("wire, orders", full, pixels, prior).equations_at(x)
     # What is in the wire already counts as the column's own: the equations are moved to where there is none of it.
     already = np.where(full.groups >= 0, x - prior.mean, 0.0)
     right = here.right + here.shared @ already
@@ -127,18 +127,20 @@ def _joint(found: Found, every: Pixels, data: WireData, noise: FlatNoise, rules:
     chosen = orders.best.fit
     kept, x = full.kept(chosen.keep), (x - already + chosen.values)[chosen.keep]
     prior = kept.prior(data.start, rules)
-    pixels = weighed(every, expected_of(kept.wire(x), kept.gains(x), every), noise).pixels
-    solution = minimise(WireProblem("wire, joint", kept, pixels, prior), x, _JOINT)
-    equations = solution.equations
-    x = solution.place + (equations.step(0.0).shared if solution.converged else 0.0)
+    problem = WireProblem("wire, joint", kept, weighed_at(kept, x, every, noise).pixels, prior)
+    solution = minimise(problem, x, SOLVER)
+    # A step that is expected to gain less than the solver asks for is taken without looking.
+    x = solution.place + (solution.equations.step(0.0).shared if solution.converged else 0.0)
+    matrix, by_tile, chi2 = problem.sums(x)
+    variance = problem.variance(chi2)
     return Joint(
         parameters=kept,
         x=x,
-        cov=equations.blocks.cov(),
+        cov=scaled_inverse(matrix / variance + prior.precision),
         prior=prior,
-        variance=equations.variance,
-        by_tile=equations.by_tile,
-        seen=weighed(every, expected_of(kept.wire(x), kept.gains(x), every), noise),
+        variance=variance,
+        by_tile=by_tile / variance,
+        seen=weighed_at(kept, x, every, noise),
         orders=orders,
         converged=solution.converged and found.descent.solution.converged,
         iterations=found.descent.solution.iterations + solution.iterations,
@@ -159,7 +161,7 @@ def mean_one(
     parameters: Parameters, x: Float[np.ndarray, " n"], geometry: Geometry, shape: tuple[int, int]
 ) -> Float[np.ndarray, " n"]:
     """The parameters scaled to a map with a mean of one over a sensor of that shape, by the midpoint rule."""
-    whole, base = values_at(parameters.wire(x), *_grid(geometry, shape, _MEAN_GRID))
+    whole, base = values_at(parameters.wire(x), *_grid(geometry, shape, (192, 256)))
     scaled = x.copy()
     scaled[0] -= np.log(float(np.mean(whole * base)))
     return scaled
@@ -184,14 +186,12 @@ def map_jacobian(
     parameters: Parameters, x: Float[np.ndarray, " n"], geometry: Geometry, shape: tuple[int, int]
 ) -> MapJacobian:
     """Of the map that these parameters make on a sensor of that shape; its mean is 1 (``mean_one``)."""
-    site = np.zeros(BLOCK, dtype=np.int64)
-    ideal, scaled = (part.reshape(-1, BLOCK, 2) for part in _grid(geometry, shape, _SIGMA_GRID))
-    wire = parameters.wire(x)
-    parts = [block_jacobian(parameters, wire, i, s, site) for i, s in zip(ideal, scaled, strict=True)]
-    whole, base, rows = (np.concatenate(same, axis=-1) for same in zip(*parts, strict=True))
+    site, wire = np.zeros(BLOCK, dtype=np.int64), parameters.wire(x)
+    grid = _grid(geometry, shape, (64, 64))
+    whole, base, rows = over_blocks(lambda *at: block_jacobian(parameters, wire, at[0], at[1], site), *grid)
     value, rows = whole * base, rows * base
     # Site gains are not in the map.
-    rows[parameters.sites] = 0.0
+    rows[parameters.of(Kind.SITE)] = 0.0
     of_mean = rows.mean(axis=1)
     return MapJacobian(value, rows - of_mean[:, None] * value, of_mean)
 
@@ -207,11 +207,10 @@ def _posterior(joint: Joint, jacobian: MapJacobian, model: float) -> Posterior[W
         x, beside = values[:-2].copy(), values[-2:]
         x[0] -= jacobian.of_mean @ (x - joint.x)
         wire = joint.parameters.wire(x)
-        room = max(np.shape(wire.amplitudes), (1, 2, 1, 1))
-        amplitudes = np.zeros(room)
+        amplitudes = np.zeros(max(np.shape(wire.amplitudes), (1, 2, 1, 1)))
         amplitudes[: len(wire.amplitudes)] = wire.amplitudes
         amplitudes[0, :, 0, 0] += beside
-        return eqx.tree_at(lambda w: w.amplitudes, wire, amplitudes)
+        return replace(wire, amplitudes=amplitudes)
 
     size = len(joint.x)
     factor = np.zeros((size + 2, size + 2))

@@ -8,10 +8,10 @@ automatic derivatives of the whole model, in either mode.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import NamedTuple, final
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -20,8 +20,8 @@ from jaxtyping import Array, Float, Int
 from udccal.cfa import SITES
 from udccal.fitting.engine.gaussian import Prior
 from udccal.fitting.engine.least_squares import Blocks, Step
-from udccal.fitting.wire.data import BLOCK, Pixels
-from udccal.fitting.wire.parameters import Parameters, shape_vector, with_shape
+from udccal.fitting.wire.data import BLOCK, FlatNoise, Pixels, Weighed, blocks, over_blocks, weighed
+from udccal.fitting.wire.parameters import Kind, Parameters, shape_vector, with_shape
 from udccal.models.bessel import bessel_j0_j1
 from udccal.models.wire import (
     Wire,
@@ -35,9 +35,8 @@ from udccal.models.wire import (
     waves,
 )
 
-# Tiles of the sensor, down and across, whose residuals are looked at as a whole.
+# Tiles of the sensor, down and across, whose residuals are tested as a whole.
 TILES = (6, 8)
-_TILE_NUMBERS = np.arange(TILES[0] * TILES[1])[:, None]
 # Residual variance in units of what noise makes: less is none at all, and what is divided by it stays finite.
 LEAST_VARIANCE = 1e-12
 
@@ -51,7 +50,7 @@ class Rays(NamedTuple):
     periods: Float[Array, "2 n"]
     openings: Float[Array, "2 n"]
     ellipse: Float[Array, "3 n"]
-    log_pupil: Float[Array, ""]
+    log_pupil: Float[Array, "1 n"]
 
 
 class Derivatives(NamedTuple):
@@ -69,21 +68,19 @@ class Derivatives(NamedTuple):
     powers: Float[Array, "degrees harmonics n"]
 
 
+@jax.jit
 def _rays(wire: Wire, ideal: Float[Array, "n 2"]) -> Rays:
     slope, rotation = slopes(wire, ideal), panel_rotation(wire)
     right, down = (rotation[:2, i : i + 1] - slope * rotation[2, i] for i in (0, 1))
     ellipse = jnp.stack([right[i] * right[j] + down[i] * down[j] for i, j in ((0, 0), (0, 1), (1, 1))])
     periods = jnp.asarray(wire.offset_periods)[:, None] + wire.standoff_per_pitch * slope
-    return Rays(periods, openings(wire, slope), ellipse, jnp.log(jnp.asarray(wire.footprint_per_pitch)))
-
-
-_block_rays = jax.jit(_rays)
+    log_pupil = jnp.log(jnp.asarray(wire.footprint_per_pitch)) + jnp.zeros_like(slope[:1])
+    return Rays(periods, openings(wire, slope), ellipse, log_pupil)
 
 
 def rays_at(wire: Wire, ideal: Float[np.ndarray, "n 2"]) -> Rays:
     """Where rays of ideal image points, which fill whole blocks, meet the panel."""
-    found = [_block_rays(wire, part) for part in ideal.reshape(-1, BLOCK, 2)]
-    return jax.tree.map(lambda *parts: np.concatenate(parts, axis=-1) if np.ndim(parts[0]) else parts[0], *found)
+    return over_blocks(partial(_rays, wire), ideal)
 
 
 def with_harmonics(wire: Wire, harmonics: Float[np.ndarray, "harmonics 2"], ideal: Float[np.ndarray, "n 2"]) -> Wire:
@@ -96,11 +93,11 @@ def with_harmonics(wire: Wire, harmonics: Float[np.ndarray, "harmonics 2"], idea
     seen = np.sqrt(np.stack([n * n, 2 * n * m, m * m], axis=1) @ np.asarray(ellipse))
     low, high = (part.reshape(len(harmonics)) for part in (seen.min(axis=1), seen.max(axis=1)))
     frequency = np.stack([(low + high) / 2, np.maximum(0.51 * (high - low), 0.01)], axis=1)
-    return eqx.tree_at(lambda w: (w.harmonics, w.frequency, w.fields), wire, (harmonics, frequency, fields))
+    return replace(wire, harmonics=harmonics, frequency=frequency, fields=fields)
 
 
 @jax.jit
-def _block_values(
+def _values(
     wire: Wire, ideal: Float[Array, "n 2"], scaled: Float[Array, "n 2"]
 ) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
     slope = slopes(wire, ideal)
@@ -111,15 +108,18 @@ def values_at(
     wire: Wire, ideal: Float[np.ndarray, "n 2"], scaled: Float[np.ndarray, "n 2"]
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """1 + modulation and exp(B), whose product is the map, at points that fill whole blocks."""
-    blocks = (part.reshape(-1, BLOCK, 2) for part in (ideal, scaled))
-    whole, base = zip(*(_block_values(wire, *part) for part in zip(*blocks, strict=True)), strict=True)
-    return np.concatenate(whole), np.concatenate(base)
+    return over_blocks(partial(_values, wire), ideal, scaled)
 
 
 def expected_of(wire: Wire, gains: Float[np.ndarray, "4"], pixels: Pixels) -> Float[np.ndarray, " n"]:
     """The model's signal of a sample, in CFA-balanced units."""
     whole, base = values_at(wire, pixels.ideal, pixels.scaled)
     return whole * base * gains[pixels.site]
+
+
+def weighed_at(parameters: Parameters, x: Float[np.ndarray, " n"], pixels: Pixels, noise: FlatNoise) -> Weighed:
+    """A sample weighed by the wire and the gains of these parameters."""
+    return weighed(pixels, expected_of(parameters.wire(x), parameters.gains(x), pixels), noise)
 
 
 @jax.jit
@@ -147,12 +147,9 @@ def wire_derivatives(wire: Wire, ideal: Float[Array, "n 2"], scaled: Float[Array
     along = jnp.sum(free * wave, axis=0) * crossed
     by_open = jnp.stack([jnp.sum(along * slit_slope[i] * slit[1 - i], axis=0) for i in (0, 1)])
     by_ellipse, by_pupil = _by_footprint(wire, kappa, bessel, both, series, powers, wave)
-    shape = (
-        jnp.einsum("in,ink->kn", by_periods, by_shape.periods)
-        + jnp.einsum("in,ink->kn", by_open + whole / rays.openings, by_shape.openings)
-        + jnp.einsum("in,ink->kn", by_ellipse, by_shape.ellipse)
-        + by_pupil * by_shape.log_pupil[:, None]
-    )
+    by_rays = Rays(by_periods, by_open + whole / rays.openings, by_ellipse, by_pupil)
+    parts = [jnp.einsum("in,ink->kn", one, by) for one, by in zip(by_rays, by_shape, strict=True)]
+    shape = jnp.sum(jnp.stack(parts), axis=0)
     base = jnp.exp(log_baseline(wire, scaled, slopes(wire, ideal)))
     return Derivatives(whole, base, shape, wave, both * bessel[:2], powers)
 
@@ -190,7 +187,7 @@ def _beside(wire: Wire, scaled: Float[Array, "n 2"]) -> Float[Array, "2 harmonic
 
 def _by_footprint(
     wire: Wire, kappa: Array, bessel: Array, both: Array, series: Array, powers: Array, wave: Array
-) -> tuple[Float[Array, "3 n"], Float[Array, " n"]]:
+) -> tuple[Float[Array, "3 n"], Float[Array, "1 n"]]:
     """Derivatives of the modulation by the ellipse (xx, xy, yy) and by the logarithm of the pupil."""
     by_log_z = both * jnp.sum((bessel[1] * series[:, 0] + bessel[2] * series[:, 1]) * wave, axis=0)
     # The corrections to the pupil's transform are series in kappa themselves; P'_k = P'_(k-2) + (2 k - 1) P_(k-1).
@@ -200,7 +197,7 @@ def _by_footprint(
     curved = _series(wire, jnp.stack(bent[: len(powers)])) / jnp.asarray(wire.frequency)[:, 1:]
     by_kappa = by_log_z / kappa + both * jnp.sum((bessel[0] * curved[:, 0] + bessel[1] * curved[:, 1]) * wave, axis=0)
     n, m = jnp.asarray(wire.harmonics).T
-    return jnp.stack([n * n / 2, n * m, m * m / 2]) @ (by_kappa / kappa), jnp.sum(by_log_z, axis=0)
+    return jnp.stack([n * n / 2, n * m, m * m / 2]) @ (by_kappa / kappa), jnp.sum(by_log_z, axis=0, keepdims=True)
 
 
 def block_jacobian(
@@ -213,40 +210,17 @@ def block_jacobian(
     """1 + modulation, exp(B), and derivatives by the parameters relative to exp(B) and the gain, for one block."""
     found = jax.tree.map(np.asarray, wire_derivatives(wire, ideal, scaled))
     in_x, in_y = np.polynomial.legendre.legvander(scaled.T, np.shape(wire.baseline)[0] - 1).transpose(0, 2, 1)
-    sites = np.append(np.eye(SITES - 1), -np.ones((SITES - 1, 1)), axis=1)[:, site]
-    degree_y, degree_x = parameters.baseline.T
     # The baseline acts on everything: the change of exp(B) (1 + M), relative to exp(B), is (1 + M) dB.
-    rows = [in_y[degree_y] * in_x[degree_x] * found.whole, sites * found.whole]
-    harmonic, phase, degree_y, degree_x = parameters.amplitudes.T
+    _, _, degree_y, degree_x = parameters.indices(Kind.SHADING)
+    rows = [in_y[degree_y] * in_x[degree_x] * found.whole]
+    of_site = np.append(np.eye(SITES - 1), -np.ones((SITES - 1, 1)), axis=1)[:, site]
+    rows.append(of_site[parameters.indices(Kind.SITE)[0]] * found.whole)
+    harmonic, phase, degree_y, degree_x = parameters.indices(Kind.AMPLITUDE)
     rows.append(found.wave[phase, harmonic] * in_y[degree_y] * in_x[degree_x])
-    harmonic, phase, carrier, degree = parameters.fields.T
+    harmonic, phase, carrier, degree = parameters.indices(Kind.FIELD)
     rows.append(found.wave[phase, harmonic] * found.carrier[carrier, harmonic] * found.powers[degree, harmonic])
-    rows.append(found.shape[: 10 * parameters.panel])
+    rows.append(found.shape[parameters.indices(Kind.SHAPE)[0]])
     return found.whole, found.base, np.concatenate(rows)
-
-
-@final
-@dataclass(frozen=True)
-class WireEquations:
-    """Normal equations in units of the residual variance, and each tile's part of their right side by the data."""
-
-    blocks: Blocks
-    variance: float
-    by_tile: Float[np.ndarray, "tiles n"]
-
-    @property
-    def cost(self) -> float:
-        """Minus twice the log likelihood, and what the prior adds."""
-        return self.blocks.cost
-
-    @property
-    def samples(self) -> int:
-        """Pixels that count."""
-        return self.blocks.samples
-
-    def step(self, damping: float) -> Step:
-        """To the minimum of the quadratic model."""
-        return self.blocks.step(damping)
 
 
 @final
@@ -263,29 +237,31 @@ class WireProblem:
     pixels: Pixels
     prior: Prior
 
-    def equations_at(self, place: Float[np.ndarray, " n"]) -> WireEquations:
-        """Cost and normal equations."""
+    def equations_at(self, place: Float[np.ndarray, " n"]) -> Blocks:
+        """Cost and normal equations in units of the residual variance."""
         matrix, by_tile, chi2 = self.sums(place)
-        used = self.pixels.used
-        dof = max(used - len(place), 1)
-        variance = chi2 / dof + LEAST_VARIANCE
-        right = by_tile.sum(axis=0) / variance
-        blocks = Blocks.dense(dof * float(np.log(variance)), used, matrix / variance, right)
-        return WireEquations(blocks.with_prior(self.prior, place), variance, by_tile / variance)
+        used, variance = self.pixels.used, self.variance(chi2)
+        cost = max(used - len(place), 1) * float(np.log(variance))
+        by_data = Blocks.dense(cost, used, matrix / variance, by_tile.sum(axis=0) / variance)
+        return by_data.with_prior(self.prior, place)
+
+    def variance(self, chi2: float) -> float:
+        """Of the residuals, in units of what noise makes."""
+        return chi2 / max(self.pixels.used - len(self.prior.mean), 1) + LEAST_VARIANCE
 
     def sums(
         self, place: Float[np.ndarray, " n"]
     ) -> tuple[Float[np.ndarray, "n n"], Float[np.ndarray, "tiles n"], float]:
-        """Block by block: the information at the noise that the weights state, the right side by tile, chi-squared."""
+        """Information at the noise that the weights have, the right side by tile, chi-squared."""
         wire, gains, size = self.parameters.wire(place), self.parameters.gains(place), len(place)
-        matrix, by_tile, chi2 = np.zeros((size, size)), np.zeros((len(_TILE_NUMBERS), size)), 0.0
-        for part in self.pixels.blocks():
-            whole, base, rows = block_jacobian(self.parameters, wire, part.ideal, part.scaled, part.site)
-            level = base * gains[part.site]
-            root = np.sqrt(part.weight)
-            errors, rows = (part.value - whole * level) * root, rows * (root * level)
+        tiles = np.arange(TILES[0] * TILES[1])[:, None]
+        matrix, by_tile, chi2, p = np.zeros((size, size)), np.zeros((len(tiles), size)), 0.0, self.pixels
+        for ideal, scaled, site, value, weight in blocks(p.ideal, p.scaled, p.site, p.value, p.weight):
+            whole, base, rows = block_jacobian(self.parameters, wire, ideal, scaled, site)
+            level, root = base * gains[site], np.sqrt(weight)
+            errors, rows = (value - whole * level) * root, rows * (root * level)
             matrix += rows @ rows.T
-            by_tile += np.where(tile_numbers(part.scaled) == _TILE_NUMBERS, errors, 0.0) @ rows.T
+            by_tile += np.where(tile_numbers(scaled) == tiles, errors, 0.0) @ rows.T
             chi2 += float(errors @ errors)
         return matrix, by_tile, chi2
 

@@ -1,45 +1,160 @@
-"""A wire fit's numbers, gathered for a person to read."""
+"""What a wire fit found: patterns in its residuals, the harmonics that it leaves out, and the result for a person."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import final
 
-import equinox as eqx
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from udccal.fitting.engine.gaussian import Posterior, Prior
+from udccal.fitting.engine.misfit import NO_TEST, MisfitTest, chi2_test, excess_sigma, sharper
 from udccal.fitting.engine.orders import Choice
 from udccal.fitting.engine.report import estimates, residual_sample
-from udccal.fitting.wire.data import Weighed
-from udccal.fitting.wire.jacobian import values_at
-from udccal.fitting.wire.misfit import Misfit
+from udccal.fitting.wire.data import BLOCK, Pixels, Weighed
+from udccal.fitting.wire.jacobian import LEAST_VARIANCE, TILES, rays_at, tile_numbers, values_at, with_harmonics
 from udccal.fitting.wire.parameters import SHAPE_NAMES, SHAPE_UNITS, Parameters
-from udccal.fitting.wire.rules import WireRules
+from udccal.fitting.wire.rules import Harmonics, WireRules, WireStart, possible_harmonics
 from udccal.models.geometry import tilt_rad
 from udccal.models.wire import Wire, panel_rotation
 from udccal.result import Diagnostic, Estimate, FitResult, FitStatus
 
-_FEW = 16_384
+
+@final
+@dataclass(frozen=True)
+class Misfit:
+    """Relative sigma of the map, RMS over the sensor, that patterned residuals show, 0 where chance explains them."""
+
+    sigma: float
+    test: MisfitTest
+
+
+def misfit(tested: Weighed, wire: Wire | None, statistical: float, held_out: bool) -> Misfit:
+    """Means over bins of the rows' and the columns' period, tile by tile, against chance.
+
+    Noise is not patterned; a misfit is. ``wire`` gives where rays meet the period; without a panel bins lie by place.
+    Pixels that the fit has not seen (``held_out``) show its ``statistical`` errors as well: those are known, and are
+    taken off.
+    """
+    pixels, expected = tested.pixels, tested.expected
+    used = (pixels.weight > 0) & (expected > 0)
+    relative = np.where(used, pixels.value / np.where(used, expected, 1.0) - 1, 0.0)
+    weight = np.where(used, pixels.weight * expected**2, 0.0)
+    scale = max(float(np.sum(weight * relative**2)) / max(int(used.sum()), 1), LEAST_VARIANCE)
+    tests, sizes = [], []
+    # Of a period of the rows and of the columns, once finer in one, once in the other.
+    for down, across in ((12, 3), (3, 12)):
+        bins = _bins(pixels, wire, down, across)
+        full = np.bincount(bins, used) >= 4
+        total = np.bincount(bins, weight)[full]
+        mean = np.bincount(bins, weight * relative)[full] / total
+        noise = scale / total
+        noise = noise + statistical**2 if held_out else np.maximum(noise - statistical**2, 0.1 * noise)
+        tests.append(chi2_test(float(np.sum(mean**2 / noise)), float(len(mean))))
+        sizes.append(excess_sigma(mean**2, noise, np.ones(len(mean)), float(len(mean))))
+    test = sharper(*tests) if len(mean) else NO_TEST
+    return Misfit(sizes[int(np.argmin([one.p_value for one in tests]))] if test.found else 0.0, test)
+
+
+def _bins(pixels: Pixels, wire: Wire | None, down: int, across: int) -> Int[np.ndarray, " n"]:
+    """A bin in each pixel's tile: where its ray meets the period of rows and columns; without a panel, by place."""
+    by_place = 0.5 * (pixels.scaled.T + 1) * np.array([[TILES[1]], [TILES[0]]])
+    periods = rays_at(wire, pixels.ideal).periods if wire is not None else by_place
+    phase = periods - np.floor(periods)
+    x, y = (np.minimum((p * n).astype(np.int64), n - 1) for p, n in zip(phase, (across, down), strict=True))
+    return np.asarray((tile_numbers(pixels.scaled) * down + y) * across + x)
+
+
+@final
+@dataclass(frozen=True)
+class Omitted:
+    """The harmonics that a fit leaves out, hundreds, each too weak to be fitted.
+
+    A panel has them all, as its openings and a round pupil have it; a map that was made without has none. As a whole
+    they are one template, and how much of it is in the residuals is one number with an error.
+
+    Attributes:
+        rms: relative, over the sensor, if they are there.
+        part, part_sigma: of them, how much the residuals have, and its error.
+    """
+
+    rms: float
+    part: float
+    part_sigma: float
+
+    @property
+    def probability(self) -> float:
+        """That they are there, which beforehand is as likely as not.
+
+        By the likelihoods of the part found: 0 with its error, or 1 with that and the 0.3 by which real pupils differ.
+        """
+        wide = np.hypot(self.part_sigma, 0.3)
+        present = -0.5 * ((self.part - 1) / wide) ** 2 - np.log(wide)
+        absent = -0.5 * (self.part / self.part_sigma) ** 2 - np.log(self.part_sigma)
+        return float(1.0 / (1.0 + np.exp(np.clip(absent - present, -700.0, 700.0))))
+
+    @property
+    def sigma(self) -> float:
+        """What they are expected to add to the map's error, relative, RMS over the sensor."""
+        return self.rms * float(np.sqrt(self.probability))
+
+
+def omitted(start: WireStart, wire: Wire, seen: Weighed, rules: WireRules) -> Omitted | None:
+    """Look for them, at the fitted shape and with a round pupil; None where there are none to leave out.
+
+    The pixels may be those of the fit, as it takes up little of so many harmonics.
+    """
+    left_out = possible_harmonics(start, rules.least_counted, rules.least_amplitude)
+    if not len(left_out.bounds):
+        return None
+    pixels, expected = seen.pixels, seen.expected
+    # Only the strongest, with nine tenths of the power, are looked for: the others are not worth the seconds.
+    power = np.cumsum(left_out.bounds**2)
+    strongest = left_out.orders[: int(np.searchsorted(power, 0.9 * power[-1])) + 1]
+    template = harmonics_alone(wire, strongest, pixels)
+    weight = pixels.weight * np.where(expected > 0, expected, 0.0)
+    information = max(float(np.sum(weight * expected * template**2)), 1e-300)
+    part = float(np.sum(weight * (pixels.value - expected) * template)) / information
+    rms = float(np.std(harmonics_alone(wire, left_out.orders, pixels.thinned(BLOCK))))
+    return Omitted(rms, part, information**-0.5)
+
+
+def harmonics_alone(wire: Wire, orders: Float[np.ndarray, "any 2"], pixels: Pixels) -> Float[np.ndarray, " n"]:
+    """What these harmonics of a round pupil add to 1, at a wire's shape.
+
+    They go in chunks of as many as the wire has, so that what the fit compiled serves here; very few would take long.
+    """
+    size = max(len(wire.harmonics), 64)
+    plain = replace(wire, amplitudes=np.zeros_like(wire.amplitudes))
+    total = np.zeros(len(pixels.value))
+    for first in range(0, len(orders), size):
+        some = orders[first : first + size]
+        chunk = with_harmonics(plain, np.resize(some, (size, 2)), pixels.ideal)
+        fields = np.where(np.arange(size)[:, None, None, None] < len(some), chunk.fields, 0.0)
+        total += values_at(replace(chunk, fields=fields), pixels.ideal, pixels.scaled)[0] - 1
+    return total
+
+
+def unseen(harmonics: Harmonics, searched: Pixels, rules: WireRules) -> float:
+    """What a fit's harmonics may modulate by, relative RMS, though the pixels searched show none; else 0."""
+    power = float(np.sum(harmonics.bounds**2)) / 2
+    # Values are 1 but for shading, and a few that are far off must not count as light.
+    expected_gain = power * float(np.sum(searched.weight))
+    # Rows of half the amplitude that is expected would still have been noticed.
+    if expected_gain > 4.0 * rules.least_gain:
+        return 0.0
+    return float(np.sqrt(power * min(1.0, rules.least_gain / max(expected_gain, 1e-300))))
 
 
 @final
 @dataclass(frozen=True)
 class Joint:
-    """A fitted wire, and what tells how sure it is.
+    """A fitted wire: the parameters kept, their values and covariance, and how it was fitted.
 
-    Attributes:
-        parameters: those kept, of all orders of ``orders``.
-        x: their values; the map's mean is 1.
-        cov: theirs, misfit included where it was found.
-        prior: of the same.
-        variance: of the residuals, in units of what noise makes.
-        by_tile: each tile's part of the score.
-        seen: the pixels of the fit, weighed by the fitted wire.
-        converged, iterations: of the descents.
-        gain: chi-squared that the rows' first harmonic explained in the scan.
+    ``variance`` is that of the residuals in units of what noise makes, ``seen`` the pixels of the fit, weighed by it,
+    ``by_tile`` each tile's part of the score, ``gain`` the chi-squared that the rows explained in the scan.
     """
 
     parameters: Parameters
@@ -53,11 +168,6 @@ class Joint:
     converged: bool
     iterations: int
     gain: float
-
-    @property
-    def wire(self) -> Wire:
-        """As fitted."""
-        return self.parameters.wire(self.x)
 
     @property
     def impossible(self) -> bool:
@@ -75,23 +185,32 @@ def wire_result(
     shape: tuple[int, int],
     rules: WireRules,
 ) -> FitResult[Wire]:
-    """The result of a fit that came to its end.
+    """The result of a fit that came to its end, on a sensor of that shape.
 
-    Args:
-        joint: the fit.
-        found: whether the model describes the data.
-        left_out: of harmonics that were left out, or of rows that may be there unseen; relative, RMS over the sensor.
-        map_sigma: of the map, relative, RMS over the sensor.
-        posterior: of the wire.
-        shape: rows and columns of the sensor.
-        rules: what is doubted.
+    ``left_out`` is the part of harmonics that were left out, or of rows that may be there unseen, and ``map_sigma``
+    the whole of the map's sigma: both relative, RMS over the sensor.
     """
     panel, seen = joint.parameters.panel, joint.seen
-    term = trimmed(posterior.term_at(posterior.mean), panel)
+    term = _trimmed(posterior.term_at(posterior.mean), panel)
     outliers = seen.outliers(shape[1])
     drawn = np.flatnonzero(seen.pixels.weight > 0)
-    places = (seen.pixels.scaled[drawn] + 1) / 2 * [shape[1] - 1, shape[0] - 1]
+    few = seen.pixels.thinned(8 * BLOCK)
+    tilt = float(np.rad2deg(np.arcsin(np.clip(np.asarray(panel_rotation(term))[1, 2], -1.0, 1.0))))
     named, cov = _estimates(joint) if panel else ((), np.zeros((0, 0)))
+    diagnostics = (
+        ("wire_map_rms_sigma", 100 * map_sigma, "%"),
+        ("wire_map_model_sigma", 100 * float(np.hypot(found.sigma, left_out)), "%"),
+        ("harmonics_left_out", 100 * left_out, "%"),
+        ("residual_pattern_p_value", found.test.p_value, "1"),
+        ("modulation_peak_to_peak", 100 * float(np.ptp(values_at(term, few.ideal, few.scaled)[0])), "%"),
+        ("harmonics", float(len(term.harmonics)), "1"),
+        ("parameters", float(joint.parameters.linear), "1"),
+        ("pixels_left_out", float(sum(one.count for one in outliers)), "1"),
+        ("gain_in_chi2", joint.gain, "1"),
+        ("tilt_by_wire", tilt, "deg"),
+        ("tilt_by_wire_minus_geometry", tilt - float(np.rad2deg(tilt_rad(term.geometry))), "deg"),
+        ("iterations", float(joint.iterations), "1"),
+    )
     return FitResult(
         name="wire",
         term=term,
@@ -101,36 +220,21 @@ def wire_result(
         chi2_dof=joint.variance,
         samples=seen.pixels.used,
         candidates=joint.orders.candidates,
-        diagnostics=(
-            Diagnostic("wire_map_rms_sigma", 100 * map_sigma, "%"),
-            Diagnostic("wire_map_model_sigma", 100 * float(np.hypot(found.sigma, left_out)), "%"),
-            Diagnostic("harmonics_left_out", 100 * left_out, "%"),
-            Diagnostic("model_sigma_that_would_be_seen", 100 * found.resolution, "%"),
-            Diagnostic("residual_pattern_p_value", found.test.p_value, "1"),
-            Diagnostic("efficiency", seen.pixels.used / (shape[0] * shape[1]), "1"),
-            Diagnostic("residual_rms", 100 * found.residual_rms, "%"),
-            Diagnostic("modulation_peak_to_peak", 100 * _peak_to_peak(joint), "%"),
-            Diagnostic("harmonics", float(np.shape(term.harmonics)[0]), "1"),
-            Diagnostic("parameters", float(joint.parameters.linear), "1"),
-            Diagnostic("pixels_left_out", float(sum(one.count for one in outliers)), "1"),
-            Diagnostic("gain_in_chi2", joint.gain, "1"),
-            *_tilts(term),
-            Diagnostic("iterations", float(joint.iterations), "1"),
-        ),
+        diagnostics=tuple(Diagnostic(*one) for one in diagnostics),
         notes=tuple(_notes(joint, found, left_out, rules)),
         outliers=outliers,
-        residuals=residual_sample(places, seen.z[drawn]),
+        residuals=residual_sample((seen.pixels.scaled[drawn] + 1) / 2 * [shape[1] - 1, shape[0] - 1], seen.z[drawn]),
         posterior=posterior,
     )
 
 
-def trimmed(wire: Wire, panel: bool) -> Wire:
+def _trimmed(wire: Wire, panel: bool) -> Wire:
     """Without Legendre degrees that no harmonic uses, and without harmonics where no panel is: quicker to compute."""
     used = np.flatnonzero(np.any(np.asarray(wire.fields) != 0, axis=(0, 1, 2)))
     degrees, count = (int(used.max()) + 1 if used.size else 1), (None if panel else 0)
     beside = wire.amplitudes if np.any(wire.amplitudes) else np.zeros((0, 2, 1, 1))
-    leaves = (wire.harmonics[:count], wire.frequency[:count], wire.fields[:count, ..., :degrees], beside)
-    return eqx.tree_at(lambda w: (w.harmonics, w.frequency, w.fields, w.amplitudes), wire, leaves)
+    harmonics, frequency, fields = wire.harmonics[:count], wire.frequency[:count], wire.fields[:count, ..., :degrees]
+    return replace(wire, harmonics=harmonics, frequency=frequency, fields=fields, amplitudes=beside)
 
 
 def _status(joint: Joint, rules: WireRules) -> FitStatus:
@@ -147,18 +251,18 @@ def _notes(joint: Joint, found: Misfit, left_out: float, rules: WireRules) -> It
         off = (joint.prior.root @ (joint.x - joint.prior.mean))[joint.parameters.linear :]
         for name, sigmas in zip(SHAPE_NAMES, np.abs(off), strict=True):
             if sigmas > rules.doubted_sigma:
-                yield f"{name} is {sigmas * 2:.0f} tolerances away from the rig description; check it."
+                yield f"{name} is {sigmas * rules.widening:.0f} tolerances away from the rig description; check it."
     else:
         yield "No modulation by rows is visible; the map is the shading alone."
         if left_out > 0:
             yield (
                 f"These flats are too noisy to tell: rows may modulate by {100 * left_out:.2g} % unseen, which "
-                "the stated sigmas include. Average more frames, or expose longer."
+                "the sigmas include. Average more frames, or expose longer."
             )
     if found.test.found:
         yield (
             f"The residuals are patterned (p = {found.test.p_value:.1g}): the model may be {100 * found.sigma:.3f} % "
-            "off, which the stated sigmas include."
+            "off, which the sigmas include."
         )
     if joint.impossible:
         yield "An opening came out wider than its period: check panel, pitch and lens in the rig description."
@@ -166,17 +270,6 @@ def _notes(joint: Joint, found: Misfit, left_out: float, rules: WireRules) -> It
         yield "Look at the residual map for dust, glare or uneven light; check PRNU and the rig description."
     elif not joint.converged:
         yield "Capture more flats, or give the fit more pixels."
-
-
-def _peak_to_peak(joint: Joint) -> float:
-    few = joint.seen.pixels.thinned(_FEW)
-    return float(np.ptp(values_at(joint.wire, few.ideal, few.scaled)[0]))
-
-
-def _tilts(wire: Wire) -> tuple[Diagnostic, Diagnostic]:
-    tilt = float(np.rad2deg(np.arcsin(np.clip(np.asarray(panel_rotation(wire))[1, 2], -1.0, 1.0))))
-    apart = tilt - float(np.rad2deg(tilt_rad(wire.geometry)))
-    return Diagnostic("tilt_by_wire", tilt, "deg"), Diagnostic("tilt_by_wire_minus_geometry", apart, "deg")
 
 
 def _estimates(joint: Joint) -> tuple[tuple[Estimate, ...], Float[np.ndarray, "10 10"]]:

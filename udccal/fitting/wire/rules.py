@@ -1,10 +1,15 @@
-"""The constants of a wire fit, and the rig as built, where it starts."""
+"""What is known before a wire fit: its constants, the rig as built, and the harmonics its panel can show."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import final
 
+import numpy as np
+from jaxtyping import Float
+
+from udccal.models.geometry import Geometry
+from udccal.models.wire import HIGHEST_ORDER, Wire
 from udccal.rig import RigDescription
 
 
@@ -15,7 +20,7 @@ class WireRules:
 
     Attributes:
         samples: pixels of the joint fit; time grows with it, the map's sigma falls with its square root.
-        search_share, shape_share: of these, for the search of the shape and for its first full fit.
+        search_part, shape_part: of these, for the search of the shape and for its first full fit.
         search_harmonics: the strongest are enough for the search.
         least_samples: pixels that a flat must have.
         most_clipped: part of the flat's pixels that may be clipped.
@@ -25,24 +30,24 @@ class WireRules:
         amplitude_sigma, field_sigma: prior of amplitudes beside the pupil's, and of relative changes of its transform.
         least_amplitude: relative size from which harmonics are fitted; the others are part of the map's sigma.
         least_counted: relative size from which they count there.
-        strong, middle: relative sizes from which a harmonic may have many or few corrections to the round pupil.
-        smooth_degree: highest total degree of the shading; up to ``always_smooth`` it is not asked for.
+        strong: relative sizes from which a harmonic may have many or few corrections to the round pupil.
+        smooth_degrees: of the shading: those up to the first are always fitted, those up to the second on demand.
         scan_range: of stand-off and of pupil, relative to the rig description: two lengths that are divided, 20 % off.
-        scan_periods: step of the scan, in periods at the edge of the field.
-        scan_z: the same in radians of z, the argument of the pupil's transform.
+        scan_steps: of the stand-off in periods at the edge of the field, and of the pupil in radians of z, the
+            argument of its transform.
         places: most of the scan's places that are looked into.
         rival: minus twice the log posterior; places that differ by less may change their order with more pixels.
         unfinished: the same after the first steps only.
-        doubtful_variance: residual variance beyond which amplitudes that no pupil explains are tried, of
-            ``free_harmonics`` harmonics up to ``free_degree`` over the sensor.
+        doubtful_variance: residual variance beyond which amplitudes that no pupil explains are tried.
+        free: of how many harmonics, and up to which degree over the sensor.
         least_gain: chi-squared that rows must explain; chance does not reach a third of it in 300 trials.
         worst_variance: structure that the model lacks, as strong as shot noise and PRNU together.
         doubted_sigma: beyond so many prior sigmas the rig description is doubted.
     """
 
     samples: int = 300_000
-    search_share: float = 1 / 15
-    shape_share: float = 1 / 6
+    search_part: float = 1 / 15
+    shape_part: float = 1 / 6
     search_harmonics: int = 24
     least_samples: int = 4000
     most_clipped: float = 0.05
@@ -53,19 +58,15 @@ class WireRules:
     field_sigma: float = 0.5
     least_amplitude: float = 3e-5
     least_counted: float = 1e-6
-    strong: float = 2e-3
-    middle: float = 2e-4
-    smooth_degree: int = 8
-    always_smooth: int = 4
+    strong: tuple[float, float] = (2e-3, 2e-4)
+    smooth_degrees: tuple[int, int] = (4, 8)
     scan_range: tuple[float, float] = (0.64, 1.56)
-    scan_periods: float = 0.06
-    scan_z: float = 0.8
+    scan_steps: tuple[float, float] = (0.06, 0.8)
     places: int = 5
     rival: float = 60.0
     unfinished: float = 400.0
     doubtful_variance: float = 1.15
-    free_harmonics: int = 3
-    free_degree: int = 3
+    free: tuple[int, int] = (3, 3)
     least_gain: float = 100.0
     worst_variance: float = 2.0
     doubted_sigma: float = 3.0
@@ -106,4 +107,55 @@ def wire_start(rig: RigDescription) -> WireStart:
         column_tolerance=panel.column_open.tolerance,
         depth_per_pitch=depth.value / pitch,
         depth_tolerance=depth.tolerance / pitch,
+    )
+
+
+@final
+@dataclass(frozen=True)
+class Harmonics:
+    """Whole numbers (n, m), and the bound of each one's relative amplitude, largest first."""
+
+    orders: Float[np.ndarray, "harmonics 2"]
+    bounds: Float[np.ndarray, " harmonics"]
+
+
+def possible_harmonics(start: WireStart, least: float | None = None, below: float = np.inf) -> Harmonics:
+    """Harmonics whose bound is at least ``least`` (by default what is fitted) and less than ``below``.
+
+    The bound is the slits' times the envelope of 2 J1(z) / z, z = pi D kappa / pitch, for a round pupil.
+    """
+    least = WireRules().least_amplitude if least is None else least
+    orders = np.arange(HIGHEST_ORDER + 1.0)
+    m, n = (part.ravel() for part in np.meshgrid(orders, np.concatenate([-orders[:0:-1], orders]), indexing="ij"))
+    n, m = n[(m > 0) | (n > 0)], m[(m > 0) | (n > 0)]
+    z = np.pi * start.footprint_per_pitch * np.hypot(n, m)
+    size = np.where((n != 0) & (m != 0), 0.5, 1.0) * np.minimum(1.0, 2 * np.sqrt(2 / np.pi) / z**1.5)
+    for order, opening in ((m, start.row_open), (np.abs(n), start.column_open)):
+        slit = np.minimum(2.0 / (np.pi * np.maximum(order, 1) * opening), 2.0 * (1 - opening) / opening)
+        size = size * np.where(order == 0, 1.0, slit)
+    found = [i for i in np.argsort(-size, kind="stable") if least <= size[i] < below]
+    return Harmonics(np.stack([n[found], m[found]], axis=1), size[found])
+
+
+def ideal_wire(
+    geometry: Geometry, start: WireStart, harmonics: Float[np.ndarray, "harmonics 2"], rules: WireRules | None = None
+) -> Wire:
+    """The rig as built, with a round pupil and an even field; the harmonics' ranges of kappa are not set."""
+    degrees = (rules or WireRules()).smooth_degrees[1] + 1
+    fields = np.zeros((len(harmonics), 2, 2, 4))
+    fields[:, 0, 0, 0] = 1.0
+    return Wire(
+        geometry=geometry,
+        rotation_rad=np.zeros(3),
+        standoff_per_pitch=np.float64(start.standoff_per_pitch),
+        offset_periods=np.zeros(2),
+        footprint_per_pitch=np.float64(start.footprint_per_pitch),
+        row_open=np.float64(start.row_open),
+        column_open=np.float64(start.column_open),
+        depth_per_pitch=np.float64(start.depth_per_pitch),
+        harmonics=harmonics,
+        frequency=np.tile([0.0, 1.0], (len(harmonics), 1)),
+        fields=fields,
+        amplitudes=np.zeros((0, 2, 1, 1)),
+        baseline=np.zeros((degrees, degrees)),
     )

@@ -3,56 +3,52 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import final
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 from scipy.ndimage import maximum_filter
 from scipy.special import j1
 
-from udccal.fitting.engine.least_squares import Solution, SolverRules, minimise
+from udccal.fitting.engine.least_squares import Blocks, Solution, SolverRules, minimise
 from udccal.fitting.wire.data import FlatNoise, Pixels, weighed
-from udccal.fitting.wire.jacobian import WireEquations, WireProblem, expected_of, rays_at, values_at, with_harmonics
-from udccal.fitting.wire.parameters import Parameters, ideal_wire, parameters_of, possible_harmonics, shape_sigma
-from udccal.fitting.wire.rules import WireRules, WireStart
+from udccal.fitting.wire.jacobian import WireProblem, expected_of, rays_at, values_at, weighed_at, with_harmonics
+from udccal.fitting.wire.parameters import parameters_of, shape_sigma
+from udccal.fitting.wire.rules import WireRules, WireStart, ideal_wire, possible_harmonics
 from udccal.models.geometry import Geometry
 from udccal.models.wire import Wire
 
-_MOST_STANDOFFS, _MOST_PUPILS = 2500, 80
-# Other places are looked into that explain at least this part of what the best does.
-_PART = 0.3
 # What the data hardly show may creep on for ever: a tenth of a sigma, or what steps of a sigma no longer bring.
-_TO_THE_END = SolverRules(least_gain=1e-2, stalled_gain=0.1)
-_A_FEW_STEPS = SolverRules(least_gain=1e-2, iterations=3)
-# Amplitudes that no pupil explains must lower the residual variance to this part.
-_WORTH = 0.95
-_SHIFTS = np.arange(8) / 8
+SOLVER = SolverRules(least_gain=1e-2, stalled_gain=0.1)
 
 
 @final
 @dataclass(frozen=True)
 class Descent:
-    """A fit to a sample: its parameters, and where it ended."""
+    """A fit to a sample, and where it ended."""
 
-    parameters: Parameters
-    solution: Solution[Float[np.ndarray, " n"], WireEquations]
+    problem: WireProblem
+    solution: Solution[Float[np.ndarray, " n"], Blocks]
 
     @property
     def wire(self) -> Wire:
         """As fitted."""
-        return self.parameters.wire(self.solution.place)
+        return self.problem.parameters.wire(self.solution.place)
 
     @property
     def gains(self) -> Float[np.ndarray, "4"]:
         """Of the CFA sites."""
-        return self.parameters.gains(self.solution.place)
+        return self.problem.parameters.gains(self.solution.place)
 
     @property
     def variance(self) -> float:
         """Of the residuals, in units of what noise makes."""
-        return self.solution.equations.variance
+        return self.problem.variance(self.problem.sums(self.solution.place)[2])
+
+    def weighs(self, pixels: Pixels, noise: FlatNoise) -> Pixels:
+        """A sample weighed by what was fitted."""
+        return weighed_at(self.problem.parameters, self.solution.place, pixels, noise).pixels
 
 
 @final
@@ -62,16 +58,6 @@ class Found:
 
     descent: Descent
     searched: Pixels
-    gain: float
-    present: bool
-
-
-@final
-@dataclass(frozen=True)
-class Place:
-    """A wire as demodulation finds it, and the chi-squared that its first harmonic explains."""
-
-    wire: Wire
     gain: float
 
 
@@ -94,42 +80,37 @@ class Search:
         strongest = harmonics[: self.rules.search_harmonics]
         built = ideal_wire(geometry, self.start, strongest, self.rules)
         for sample in (few, many):
-            bare, sample = self._shading(with_harmonics(built, strongest, sample.ideal), sample)
-            places = scan_rows(bare.wire, bare.gains, self.start, sample, self.rules)
-            best = places[0].gain if places else 0.0
-            if best >= self.rules.least_gain:
+            bare = self._shading(with_harmonics(built, strongest, sample.ideal), sample)
+            sample = bare.weighs(sample, self.noise)
+            places, gain = scan_rows(bare.wire, bare.gains, self.start, sample, self.rules)
+            if gain >= self.rules.least_gain:
                 break
         else:
-            return Found(bare, sample, best, False)
+            return Found(bare, sample, gain)
         rivals = self._search(places, bare, strongest, sample)
-        weights = weighed(many, expected_of(rivals[0].wire, rivals[0].gains, many), self.noise).pixels
-        finished = [
-            self._descent(
-                with_harmonics(self._best_columns(one, weights), harmonics, few.ideal), one.gains, weights, _TO_THE_END
-            )
-            for one in rivals
-        ]
-        return Found(_rivals(finished, self.rules.rival)[0], sample, best, True)
+        weights, finished = rivals[0].weighs(many, self.noise), []
+        for one in rivals:
+            wire = with_harmonics(_best_columns(one, weights, self.start.column_open), harmonics, few.ideal)
+            finished.append(self._descent(wire, one.gains, weights, SOLVER))
+        return Found(_rivals(finished, self.rules.rival)[0], sample, gain)
 
-    def _shading(self, built: Wire, sample: Pixels) -> tuple[Descent, Pixels]:
-        """Without any panel: no waves, and nothing that narrows with obliquity; and the sample weighed by it."""
-        bare = eqx.tree_at(
-            lambda w: (w.fields, w.depth_per_pitch), built, (np.zeros_like(built.fields), np.float64(0.0))
-        )
+    def _shading(self, built: Wire, sample: Pixels) -> Descent:
+        """Without any panel: no waves, and nothing that narrows with obliquity."""
+        bare = replace(built, fields=np.zeros_like(built.fields), depth_per_pitch=np.float64(0.0))
         parameters = parameters_of(bare, self.rules, panel=False)
-        x, clip = parameters.vector(bare, np.ones(4)), self.noise.clip[sample.site]
+        prior, x = parameters.prior(self.start, self.rules), parameters.vector(bare, np.ones(4))
         x[0] = -np.log(float(bare.row_open) * float(bare.column_open))
         # To begin with, pixels that clip are left out by their own values; later, by the model's.
-        expected = np.where(sample.value < clip, 1.0, clip)
+        clip = self.noise.clip[sample.site]
+        pixels = weighed(sample, np.where(sample.value < clip, 1.0, clip), self.noise).pixels
         for _ in range(2):
-            pixels = weighed(sample, expected, self.noise).pixels
-            problem = WireProblem("wire, shading", parameters, pixels, parameters.prior(self.start, self.rules))
-            descent = Descent(parameters, minimise(problem, x, _TO_THE_END))
-            x, expected = descent.solution.place, expected_of(descent.wire, descent.gains, sample)
-        return descent, weighed(sample, expected, self.noise).pixels
+            problem = WireProblem("wire, shading", parameters, pixels, prior)
+            descent = Descent(problem, minimise(problem, x, SOLVER))
+            x, pixels = descent.solution.place, descent.weighs(sample, self.noise)
+        return descent
 
     def _search(
-        self, places: list[Place], bare: Descent, harmonics: Float[np.ndarray, "harmonics 2"], sample: Pixels
+        self, places: list[Wire], bare: Descent, harmonics: Float[np.ndarray, "harmonics 2"], sample: Pixels
     ) -> list[Descent]:
         """Descents from the places of a scan: a few steps from each, and to the end from the best.
 
@@ -138,43 +119,36 @@ class Search:
         """
         depth, tried = np.float64(self.start.depth_per_pitch), []
         for place in (places[0], *beside(places[0]), *places[1:]):
-            placed = scan_columns(place.wire, bare.gains, sample)
-            placed = eqx.tree_at(lambda w: w.depth_per_pitch, placed, depth)
+            placed = replace(scan_columns(place, bare.gains, sample), depth_per_pitch=depth)
             wire = with_harmonics(placed, harmonics, sample.ideal)
-            tried.append(self._descent(wire, bare.gains, sample, _A_FEW_STEPS))
-        ended = [
-            self._descent(one.wire, one.gains, sample, _TO_THE_END) for one in _rivals(tried, self.rules.unfinished)
-        ]
-        rivals = _rivals(ended, self.rules.rival)
-        best, degrees = rivals[0], self.rules.free_degree + 1
-        if best.variance <= self.rules.doubtful_variance:
+            tried.append(self._descent(wire, bare.gains, sample, SolverRules(least_gain=1e-2, iterations=3)))
+        unfinished = _rivals(tried, self.rules.unfinished)
+        rivals = [self._descent(one.wire, one.gains, sample, SOLVER) for one in unfinished]
+        rivals = _rivals(rivals, self.rules.rival)
+        best, (count, degree) = rivals[0], self.rules.free
+        if (variance := best.variance) <= self.rules.doubtful_variance:
             return rivals
-        room = np.zeros((min(self.rules.free_harmonics, len(harmonics)), 2, degrees, degrees))
-        free = eqx.tree_at(lambda w: w.amplitudes, best.wire, room)
-        other = self._descent(free, best.gains, sample, _TO_THE_END)
-        return [other] if other.variance < _WORTH * best.variance else rivals
+        room = np.zeros((min(count, len(harmonics)), 2, degree + 1, degree + 1))
+        other = self._descent(replace(best.wire, amplitudes=room), best.gains, sample, SOLVER)
+        # Chance, and noise that is somewhat larger than given, must not bring so many parameters in.
+        return [other] if other.variance < 0.95 * variance else rivals
 
     def _descent(self, wire: Wire, gains: Float[np.ndarray, "4"], pixels: Pixels, rules: SolverRules) -> Descent:
         """From a wire, whose origin becomes the prior's."""
         parameters = parameters_of(wire, self.rules)
         problem = WireProblem("wire, shape", parameters, pixels, parameters.prior(self.start, self.rules))
-        return Descent(parameters, minimise(problem, parameters.vector(wire, gains), rules))
+        return Descent(problem, minimise(problem, parameters.vector(wire, gains), rules))
 
-    def _best_columns(self, descent: Descent, pixels: Pixels) -> Wire:
-        """Origin along X, with the columns as wide as built.
 
-        In few pixels, faint columns may have been seen half a period off, with openings wider than their period.
-        """
-        at, built = np.asarray(descent.wire.offset_periods), np.float64(self.start.column_open)
-        shifted = [
-            eqx.tree_at(lambda w: (w.offset_periods, w.column_open), descent.wire, (at + np.array([shift, 0.0]), built))
-            for shift in _SHIFTS
-        ]
-        chi2 = [
-            float(np.sum((pixels.value - expected_of(wire, descent.gains, pixels)) ** 2 * pixels.weight))
-            for wire in shifted
-        ]
-        return shifted[int(np.argmin(chi2))]
+def _best_columns(descent: Descent, pixels: Pixels, column_open: float) -> Wire:
+    """Origin along X by eighths of a period, with the columns as wide as built.
+
+    In few pixels, faint columns may have been seen half a period off, with openings wider than their period.
+    """
+    wire = replace(descent.wire, column_open=np.float64(column_open))
+    shifted = [replace(wire, offset_periods=np.asarray(wire.offset_periods) + np.array([k / 8, 0.0])) for k in range(8)]
+    errors = (pixels.value - expected_of(one, descent.gains, pixels) for one in shifted)
+    return shifted[int(np.argmin([np.sum(error**2 * pixels.weight) for error in errors]))]
 
 
 def _rivals(tried: Sequence[Descent], margin: float) -> list[Descent]:
@@ -185,42 +159,37 @@ def _rivals(tried: Sequence[Descent], margin: float) -> list[Descent]:
 
 def scan_rows(
     wire: Wire, gains: Float[np.ndarray, "4"], start: WireStart, pixels: Pixels, rules: WireRules
-) -> list[Place]:
+) -> tuple[list[Wire], float]:
     """Stand-offs, pupils and origins along Y that put most of the signal into the rows' first harmonic, best first.
 
     There may be several: a pupil one period larger with the origin half a period on has nearly the same harmonic.
-
-    Args:
-        wire: without waves; at the start's stand-off and pupil.
-        gains: of the CFA sites.
-        start: the rig as built.
-        pixels: weighed by ``wire``.
-        rules: for the scan's range and steps.
+    ``wire`` has no waves, the start's stand-off and pupil, and it weighs the pixels. With them comes the chi-squared
+    that the best one's first harmonic explains, 0 where there is none.
     """
-    rays = rays_at(wire, pixels.ideal)
+    rays, sigma = rays_at(wire, pixels.ideal), shape_sigma(start, rules)
     half_field = max(float(np.ptp(rays.periods[1])) / 2, 1.0)
-    standoffs = start.standoff_per_pitch * _trials(rules.scan_range, rules.scan_periods / half_field, _MOST_STANDOFFS)
-    z = np.pi * start.footprint_per_pitch * float(np.sqrt(np.max(rays.ellipse[2])))
-    pupils = start.footprint_per_pitch * _trials(rules.scan_range, rules.scan_z / max(z, 1.0), _MOST_PUPILS)
+    z = max(np.pi * start.footprint_per_pitch * float(np.sqrt(np.max(rays.ellipse[2]))), 1.0)
+    step, step_z = rules.scan_steps
+    off = _trials(rules.scan_range, step / half_field, 2500), _trials(rules.scan_range, step_z / z, 80)
+    standoffs, pupils = start.standoff_per_pitch * np.exp(off[0]), start.footprint_per_pitch * np.exp(off[1])
     gain, angle = _demodulate(wire, gains, pixels, 1, standoffs, pupils)
-    sigma = shape_sigma(start, rules)
-    unlikely = (np.log(standoffs / start.standoff_per_pitch) / sigma[3])[:, None] ** 2
-    unlikely = unlikely + (np.log(pupils / start.footprint_per_pitch) / sigma[6]) ** 2
+    unlikely = (off[0] / sigma[3])[:, None] ** 2 + (off[1] / sigma[6]) ** 2
     score = np.where(gain > 0, gain - np.minimum(unlikely, 0.5 * gain), 0.0)
-    peaks = np.argwhere((maximum_filter(score, size=3, mode="nearest") == score) & (score >= _PART * score.max()))
+    # Of other places, those that explain a good part of what the best does.
+    peaks = np.argwhere((maximum_filter(score, size=3, mode="nearest") == score) & (score >= 0.3 * score.max()))
     order = np.argsort([-score[i, j] for i, j in peaks], kind="stable")[: rules.places]
-    return [Place(_placed(wire, standoffs[i], pupils[j], 1, angle[i, j]), float(gain[i, j])) for i, j in peaks[order]]
+    found = [_placed(wire, standoffs[i], pupils[j], 1, angle[i, j]) for i, j in peaks[order]]
+    return found, float(gain[tuple(peaks[order[0]])]) if found else 0.0
 
 
-def beside(place: Place) -> list[Place]:
+def beside(place: Wire) -> list[Wire]:
     """The places with a pupil one period larger or smaller: the first harmonic's sign changes, and with it the origin.
 
     In the pupil's transform a period of diameter is one zero more, or less, for a pupil of several periods.
     """
-    pupil, standoff = float(place.wire.footprint_per_pitch), float(place.wire.standoff_per_pitch)
-    angle = 2 * np.pi * (float(np.asarray(place.wire.offset_periods)[1]) + 0.5)
-    other = (pupil - 1.0, pupil + 1.0)
-    return [Place(_placed(place.wire, standoff, size, 1, angle), place.gain) for size in other if size > 1.0]
+    pupil, standoff = float(place.footprint_per_pitch), float(place.standoff_per_pitch)
+    angle = 2 * np.pi * (float(np.asarray(place.offset_periods)[1]) + 0.5)
+    return [_placed(place, standoff, size, 1, angle) for size in (pupil - 1.0, pupil + 1.0) if size > 1.0]
 
 
 def scan_columns(wire: Wire, gains: Float[np.ndarray, "4"], pixels: Pixels) -> Wire:
@@ -231,11 +200,11 @@ def scan_columns(wire: Wire, gains: Float[np.ndarray, "4"], pixels: Pixels) -> W
 
 
 def _trials(ends: tuple[float, float], step: float, most: int) -> Float[np.ndarray, " n"]:
+    """Logarithms of factors, one of which is 1: the rig description itself."""
     low, high = np.log(ends)
     count = int(np.clip(np.ceil((high - low) / step), 8, most))
-    # One of the steps is the rig description itself.
     below = max(round(count * -low / (high - low)), 1)
-    return np.exp(np.concatenate([np.linspace(low, 0, below + 1)[:-1], np.linspace(0, high, count - below + 1)]))
+    return np.concatenate([np.linspace(low, 0, below + 1)[:-1], np.linspace(0, high, count - below + 1)])
 
 
 def _demodulate(
@@ -266,5 +235,6 @@ def _demodulate(
 def _placed(wire: Wire, standoff: float, pupil: float, axis: int, angle: float) -> Wire:
     offset = np.array(wire.offset_periods, dtype=np.float64)
     offset[axis] = float(angle) / (2 * np.pi)
-    leaves = np.float64(standoff), np.float64(pupil), offset
-    return eqx.tree_at(lambda w: (w.standoff_per_pitch, w.footprint_per_pitch, w.offset_periods), wire, leaves)
+    return replace(
+        wire, standoff_per_pitch=np.float64(standoff), footprint_per_pitch=np.float64(pupil), offset_periods=offset
+    )

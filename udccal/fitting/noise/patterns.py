@@ -1,0 +1,278 @@
+"""Variances between rows and between pixels: row noise, DSNU of dark averages, and PRNU behind a panel.
+
+The response of pixels is white; light is not. Light that passed a panel is modulated, and the modulation's harmonics
+and their products sink slowly below the floor that the pixels' own response makes. What sinks below the floor is not
+seen in one coefficient of the spectrum, nor in a block of them, but the power of many blocks together still shows it:
+rectangles of all sizes are tested. Beyond what was seen the light goes on, unseen; so the spectrum is cut further out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import product
+from typing import final
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Float32
+from scipy.fft import dctn
+from scipy.special import ndtri
+
+from udccal.fitting.engine.misfit import excess_variance
+from udccal.fitting.engine.orders import Quantity
+from udccal.fitting.engine.robust import MAD_TO_SIGMA
+from udccal.fitting.noise.data import NoiseRules
+from udccal.fitting.noise.moments import Moments, NoiseMoments
+
+Picture = Float[np.ndarray, "rows columns"] | Float32[np.ndarray, "rows columns"]
+Mask = Bool[np.ndarray, "rows columns"]
+Grid = Float[np.ndarray, "down across"]
+
+
+def row_noise(data: NoiseMoments, edge_gains: Float[np.ndarray, " pairs"]) -> tuple[Quantity, float]:
+    """Variance by rows, and its root as it happened to be in the pairs alone: that is what widened their histograms.
+
+    Rounding and cut-off codes pass only the square of ``edge_gains`` of it, pair by pair.
+    """
+    nearest = int(np.argmin([abs(pair.exposure_s - data.dark_stack.exposure_s) for pair in data.darks]))
+    pairs = list(zip(data.dark_moments, edge_gains, strict=True))
+    stack = [] if data.dark_seen is None else [(data.dark_seen, edge_gains[nearest])]
+
+    def asked(seen: list[tuple[Moments, float]]) -> Quantity:
+        # Of row noise that follows black to less than a fifth nothing can be said.
+        rows = [
+            (of.rows_DN2 / gain**2, of.sampling_DN2 / gain**2, (of.frames - 1) * max(of.height - 1, 1))
+            for of, gain in seen
+            if gain >= 0.2 and of.rows_DN2 > 0
+        ]
+        # Where rounding hides all of it, it may be as large as rounding itself.
+        found = excess_variance(*np.array(rows).T) if rows else (0.0, (data.q_DN**2 / 12.0) ** 2, 0.0)
+        return Quantity.asked("row noise", found[0], found[1], data.dark_samples, found[2])
+
+    row = asked(pairs + stack)
+    return row, float(np.sqrt(asked(pairs).value)) if row.there else 0.0
+
+
+@final
+@dataclass(frozen=True)
+class Pattern:
+    """A variance between pixels (may be negative by chance), its standard deviation, samples, and outliers left out.
+
+    ``mean`` is that of the samples left in, and ``mean_variance`` how much it differs from sensor to sensor by these
+    patterns alone; ``places`` are (row, column) of the first outliers.
+    """
+
+    variance: float
+    sigma: float
+    samples: int
+    mean: float
+    mean_variance: float
+    outliers: int
+    places: tuple[tuple[int, int], ...]
+
+
+def dsnu(dark_DN: Picture, temporal_DN2: float, row_DN2: float, rules: NoiseRules) -> Pattern:
+    """Variance of the pixels' offsets in an averaged dark frame (EMVA 1288, clause 8.2), row and column patterns in it.
+
+    Args:
+        dark_DN: the average.
+        temporal_DN2: temporal variance of one sample of the average, row noise left out.
+        row_DN2: row noise left in the average.
+        rules: which pixels are defects.
+    """
+    about = dark_DN.astype(np.float64)
+    sample = about[:: max(1, len(about) // 256)]
+    middle = float(np.median(sample))
+    # Averages of few frames are coarse: a spread below their step is no measure of what is usual.
+    reach = rules.defect_sigma * MAD_TO_SIGMA * float(np.median(np.abs(sample - middle)))
+    bad = np.abs(about - middle) > max(reach, float(sample.std()), 1e-12)
+    mean = float(about[~bad].mean()) if not bad.all() else 0.0
+    about -= mean
+    about[bad] = 0.0
+    (rows, columns), samples = about.shape, int(about.size - bad.sum())
+    total = float(np.vdot(about, about)) / max(samples - 1, 1)
+    row_part, column_part = float(np.var(about.mean(axis=1))), float(np.var(about.mean(axis=0)))
+    pixel_part = max(total - row_part - column_part, 0.0)
+    # Each part is chi-squared with its own number of independent values.
+    sigma = np.sqrt(2 * pixel_part**2 / samples + 2 * row_part**2 / rows + 2 * column_part**2 / columns)
+    own_row, own_column = (max(part - pixel_part / n, 0.0) for part, n in ((row_part, columns), (column_part, rows)))
+    of_mean = max(pixel_part - temporal_DN2, 0.0) / samples + max(own_row - row_DN2, 0.0) / rows + own_column / columns
+    variance = total - temporal_DN2 - row_DN2
+    return Pattern(variance, float(sigma), samples, mean, float(of_mean), int(bad.sum()), _first_places(bad))
+
+
+def _first_places(bad: Mask) -> tuple[tuple[int, int], ...]:
+    """Row and column of the first eight."""
+    rows, columns = np.unravel_index(np.flatnonzero(bad)[:8], bad.shape)
+    return tuple(zip(rows.tolist(), columns.tolist(), strict=True))
+
+
+def rough_median(picture: Picture) -> float:
+    """Median over some 128 rows, an uneven number apart: of all rows of a mosaic alike."""
+    return float(np.median(picture[:: int(picture.shape[0] // 128) | 1]))
+
+
+@final
+@dataclass(frozen=True)
+class _Site:
+    """One colour: light and the inverse of its shading, both 0 where there is no measure; defects, and the spectrum."""
+
+    light: Float32[np.ndarray, "rows columns"]
+    inverse_DN: Float32[np.ndarray, "rows columns"]
+    defects: Mask
+    power: Float32[np.ndarray, "rows columns"]
+
+
+def prnu(signal_DN: Picture, temporal_DN2: float, shot_DN: float, period: int, rules: NoiseRules) -> Pattern:
+    """Variance of the photo response, relative (EMVA 1288, clause 8.3).
+
+    Per colour the picture is divided by its shading, and the floor of its spectrum (cosine transform) is taken where
+    ``white_coefficients`` finds no light. Where the light is modulated the pixels' patterns are so as well: the floor
+    is theirs times the mean square of the light.
+
+    Args:
+        signal_DN: average of flats minus average of darks.
+        temporal_DN2: temporal variance of one sample of it at no light.
+        shot_DN: what a DN of signal adds to that variance, in DN^2 per DN.
+        period: sites of the colour mosaic repeat after so many samples (1: monochrome).
+        rules: size of the shading's window, and what is light.
+    """
+    phases = [np.s_[row::period, column::period] for row, column in product(range(period), repeat=2)]
+    window = min(rules.shading, (min(signal_DN.shape) // period // 4) * 2 + 1)
+    sites = [_site(signal_DN[phase], window, rules.defect_sigma) for phase in phases]
+    # The window has taken its part of the lowest frequencies. Sites may differ by a line: the least is common to all.
+    rows, columns = (min(site.power.shape[axis] for site in sites) for axis in (0, 1))
+    taken = (3 * rows // window + 1, 3 * columns // window + 1)
+    white = white_coefficients([site.power[:rows, :columns] for site in sites], taken, rules)
+    variances, sigmas = np.array([_response(site, white, temporal_DN2, shot_DN) for site in sites]).T
+    weights = 1 / np.maximum(sigmas, 1e-30) ** 2
+    variance, samples = float(np.average(variances, weights=weights)), len(sites) * int(np.count_nonzero(white))
+    defects = np.zeros(signal_DN.shape, bool)
+    for phase, site in zip(phases, sites, strict=True):
+        defects[phase] = site.defects
+    outliers = signal_DN.size - sum(int(np.count_nonzero(site.inverse_DN)) for site in sites)
+    of_mean = max(variance, 0.0) / max(samples, 1)
+    return Pattern(variance, float(weights.sum() ** -0.5), samples, 0.0, of_mean, outliers, _first_places(defects))
+
+
+def _site(signal_DN: Picture, window: int, reach: float) -> _Site:
+    """Pixels ``reach`` robust sigma from the middle of their neighbours are defects, and named where they are lit.
+
+    Off along the row and along the column: at the crests of deep waves pixels are off across the wave alone.
+    """
+    site = np.ascontiguousarray(signal_DN, dtype=np.float32)
+    level = cv2.blur(site, (window, window), borderType=cv2.BORDER_REFLECT_101)
+    unlit = level <= 0
+    level[unlit] = 1.0
+    relative = site / level - np.float32(1)
+    second = np.array([[-0.5, 1.0, -0.5]], np.float32)
+    off = [np.abs(cv2.filter2D(relative, -1, kernel)) for kernel in (second, second.T)]
+    usual = MAD_TO_SIGMA * min(rough_median(one) for one in off)
+    bad = (np.minimum(*off) > np.float32(reach * max(usual, 1e-12))) | unlit
+    relative[bad] = cv2.medianBlur(relative, 5)[bad]
+    power = dctn(relative, norm="ortho", workers=2)
+    return _Site(np.where(bad, 0, 1 + relative), np.where(bad, 0, 1 / level), bad & ~unlit, np.square(power, out=power))
+
+
+def _response(site: _Site, white: Mask, temporal_DN2: float, shot_DN: float) -> tuple[float, float]:
+    """Variance of the response and its standard deviation."""
+    light, inverse = site.light, site.inverse_DN
+    kept, good = (max(int(np.count_nonzero(mask)), 1) for mask in (white, inverse))
+    power = site.power[: white.shape[0], : white.shape[1]]
+    floor = _mean_product(power, white.astype(np.float32), kept) * inverse.size / good
+    noise = temporal_DN2 * _mean_product(inverse, inverse, good) + shot_DN * _mean_product(light, inverse, good)
+    square = max(_mean_product(light, light, good) - floor, 0.1)
+    variance = (floor - noise) / square
+    # Pixels of unlike noise are worth fewer of like noise: one row in eight shows how unlike they are.
+    light, inverse = light[::8], inverse[::8]
+    own = max(variance, 0.0) * light**2 + inverse * (temporal_DN2 * inverse + shot_DN * light)
+    unlike = float(np.mean(own**2)) / max(float(np.mean(own)) ** 2, 1e-300)
+    return variance, floor / square * float(np.sqrt(2.0 * max(unlike, 1.0) / kept))
+
+
+def _mean_product(first: np.ndarray, second: np.ndarray, count: int) -> float:
+    """Mean over so many pixels, without a copy; sums by rows keep single precision exact enough."""
+    return float(np.einsum("ij,ij->i", first, second).sum(dtype=np.float64)) / count
+
+
+def white_coefficients(
+    powers: list[Float32[np.ndarray, "rows columns"]], taken: tuple[int, int], rules: NoiseRules
+) -> Mask:
+    """Coefficients of cosine transforms that hold white noise alone; all transforms are of the same light.
+
+    The first line and column hold what differs by rows and by columns: they are never among them.
+
+    Args:
+        powers: squared coefficients, one picture per colour site.
+        taken: so many of the lowest rows and columns were changed by taking off shading.
+        rules: what is light, and how far it reaches.
+    """
+    rows, columns = powers[0].shape
+    keep = np.ones((rows, columns), bool)
+    keep[0] = keep[:, 0] = keep[: taken[0], : taken[1]] = False
+    block = min(16, rows // 4, columns // 4)
+    if block < 2:
+        return keep
+    count = _by_block(keep, block)
+    totals = [_by_block(power * keep, block) for power in powers]
+    pooled = sum(total / max(_floor(count, total), 1e-300) for total in totals)
+    seen = _light(count * len(powers), np.asarray(pooled), rules.light_sigma)
+    wide = np.zeros_like(seen)
+    for row, column in np.argwhere(seen):
+        wide[: int(np.ceil(rules.light_reach * (row + 1))), : int(np.ceil(rules.light_reach * (column + 1)))] = True
+    # Where that leaves less than a tenth, what was not seen has to do.
+    left_out = wide if count[~wide].sum() >= 0.1 * keep.size else seen
+    white = np.zeros_like(keep)
+    blocks = np.repeat(np.repeat(~left_out, block, axis=0), block, axis=1)
+    white[: blocks.shape[0], : blocks.shape[1]] = blocks
+    return white & keep
+
+
+def _by_block(values: np.ndarray, block: int) -> Grid:
+    """Sums over blocks; coefficients that fill no block are left out."""
+    high, wide = (n // block * block for n in values.shape)
+    # Rows first: sums along contiguous memory are the slow part.
+    by_row = np.add.reduce(values[:high, :wide].reshape(high, wide // block, block), axis=2, dtype=np.float32)
+    return by_row.reshape(high // block, block, wide // block).sum(axis=1, dtype=np.float64)
+
+
+def _floor(count: Grid, total: Grid) -> float:
+    """Power of the floor from the lowest quarter of the blocks, put right for its being low."""
+    full = count >= count.max()
+    low = float(np.quantile(total[full] / count[full], 0.25))
+    return low / _mean_square(count.max(keepdims=True), float(ndtri(0.25))).item()
+
+
+def _mean_square(count: Float[np.ndarray, "*n"], z: float) -> Float[np.ndarray, "*n"]:
+    """The mean of so many squared normals that is ``z`` sigma high, by Wilson and Hilferty (PNAS 17, 1931)."""
+    spread = 2 / (9 * np.maximum(count, 1))
+    return np.asarray((1 - spread + z * np.sqrt(spread)) ** 3)
+
+
+def _light(count: Grid, total: Grid, sigma: float) -> Mask:
+    """Blocks with more power than the floor, alone or as part of a rectangle of them.
+
+    ``total`` is the power over the floor's of ``count`` coefficients.
+    """
+    light, floor = np.zeros(count.shape, bool), _floor(count, total)
+    # Small rectangles first: light in few blocks must not make large ones of it.
+    sides = [side for side in product((1, 4, 16), repeat=2) if side[0] <= len(count) and side[1] <= count.shape[1]]
+    for _ in range(8):
+        before = light.copy()
+        for down, across in sorted(sides, key=lambda side: side[0] * side[1]):
+            # Rectangles that begin at each block; those that reach over the end are cut there.
+            number, power = (
+                cv2.boxFilter(np.where(light, 0.0, part), -1, (across, down), anchor=(0, 0), normalize=False,
+                              borderType=cv2.BORDER_CONSTANT) for part in (count, total)
+            )  # fmt: skip
+            number = np.maximum(number, 0.0)
+            high = power / np.maximum(number, 1) > max(floor, 1e-300) * _mean_square(number, sigma)
+            # Those half a side apart are looked at.
+            marks, apart = np.zeros(high.shape, np.uint8), np.s_[:: max(down // 2, 1), :: max(across // 2, 1)]
+            marks[apart] = high[apart]
+            inside = cv2.dilate(marks, np.ones((down, across), np.uint8), anchor=(across - 1, down - 1)) > 0
+            light |= inside & (count > 0)
+        floor = float(total[~light].sum()) / max(float(count[~light].sum()), 1.0)
+        if np.array_equal(before, light):
+            break
+    return light
