@@ -116,7 +116,7 @@ class PanelWindow:
         self._settled = True
 
     def check(self) -> None:
-        """Check that the window has stayed on screen since ``show`` returned, not covered as far as the desktop reports.
+        """Check that the window has stayed on screen since ``show`` returned, uncovered as far as the desktop reports.
 
         Raises:
             DisplayError: when it has not; raised once, so that showing again can succeed, unless the window was closed.
