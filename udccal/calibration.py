@@ -1,4 +1,4 @@
-"""All five fits of a session, each with what the ones before it found, and the profile that they make."""
+"""All five fits of a session, each after those whose terms it needs, and the profile that they make."""
 
 from __future__ import annotations
 
@@ -49,13 +49,13 @@ ORDER: tuple[TermName, ...] = get_args(TermName)
 
 @dataclass(frozen=True)
 class FitEffort:
-    """What the fits may spend; less is quicker and less accurate.
+    """Effort of the fits; less effort is quicker and less accurate.
 
     Attributes:
-        wire_samples: pixels that the wire's fields are fitted to.
+        wire_samples: number of pixels that the wire's fields are fitted to.
         psf: see ``udccal.fitting.psf.data.PsfRules``.
-        backscatter_positions: sensor positions that the footprint is fitted at.
-        workers: with 2, psf and backscatter, which do not need each other, are fitted at once, in more memory.
+        backscatter_positions: number of sensor positions that the footprint is fitted at.
+        workers: 2 fits psf and backscatter, which are independent, at the same time and in more memory.
     """
 
     wire_samples: int = WireRules().samples
@@ -75,7 +75,7 @@ QUICK = FitEffort(
 
 @dataclass(frozen=True)
 class FitTime:
-    """How long one term's fit took."""
+    """Duration of one term's fit."""
 
     term: TermName
     seconds: float
@@ -83,12 +83,12 @@ class FitTime:
 
 @dataclass(frozen=True)
 class Foundation:
-    """The fits that psf and backscatter stand on.
+    """The fits that psf and backscatter need.
 
     Attributes:
-        times: how long these took.
-        wire_map: the fitted wire over the sensor, which takes long enough to be kept.
-        boards: what the geometry was fitted to.
+        times: durations of these fits.
+        wire_map: the fitted wire at every pixel; it is kept because evaluating it takes long.
+        boards: the board views that the geometry was fitted to.
     """
 
     noise: FitResult[Noise]
@@ -101,7 +101,7 @@ class Foundation:
 
 @dataclass(frozen=True)
 class Calibration:
-    """The five results of one session, and how long each took."""
+    """The five results of one session and their durations."""
 
     session: Session
     foundation: Foundation
@@ -111,7 +111,7 @@ class Calibration:
 
     @property
     def rig(self) -> RigDescription:
-        """As it was built to be."""
+        """The rig description: the rig as it was built to be."""
         return self.session.rig
 
     @property
@@ -131,32 +131,32 @@ class Calibration:
 
     @property
     def results(self) -> tuple[FitResult, FitResult, FitResult, FitResult, FitResult]:
-        """All five, in the order of ``TermName``."""
+        """All five results, in the order of ``TermName``."""
         return self.noise, self.geometry, self.wire, self.psf, self.backscatter
 
     def result(self, term: TermName) -> FitResult:
-        """The result of a term by its name."""
+        """Return the result of a term by its name."""
         return next(result for result in self.results if result.name == term)
 
     def or_raise(self) -> Calibration:
-        """Itself when every term can be used.
+        """Return itself when every term can be used.
 
         Raises:
-            FitError: with the advice of the first bad status otherwise.
+            FitError: when a term cannot be used, with the advice of its status.
         """
         for result in self.results:
             result.or_raise()
         return self
 
     def write(self, path: str | Path) -> Path:
-        """Write the profile as a folder, or as one file where ``path`` ends in ``.zip``; replaces one that is there.
+        """Write the profile as a folder, or as one file if ``path`` ends in ``.zip``; replace a profile at ``path``.
 
         Returns:
-            where it was written.
+            the path that was written.
 
         Raises:
             FitError: when a term cannot be used; nothing is written then.
-            ProfileError: when something that is not a profile stands at ``path``.
+            ProfileError: when ``path`` holds something that is not a profile.
         """
         provenance = provenance_now(self.session.path / MANIFEST_NAME, self.session.camera)
         write_profile(Path(path), build_profile(self.rig, provenance, *self.results, self.foundation.wire_map))
@@ -164,7 +164,7 @@ class Calibration:
 
 
 class _Fits:
-    """The fits of a session: each runs when it is first asked for, after those whose terms it needs."""
+    """The fits of a session: each runs when it is first read, after those whose terms it needs."""
 
     def __init__(
         self,
@@ -228,31 +228,32 @@ class _Fits:
         )
 
     def _run(self, term: TermName, fit: Callable[[], FitResult[Term]], absent: Callable[[], Term]) -> FitResult[Term]:
-        """The fit of a term, timed, or what stands for it where the session has no steps of it."""
+        """Run and time the fit of a term, or return its absent form where the session has no steps of it."""
         self._progress(term)
         start = time.perf_counter()
         if self._session.steps(term):
             result = fit()
         else:
-            note = f"The session has no {term} steps; the term stands at what the rig description says, or is absent."
+            note = f"The session has no {term} steps; the term has the rig description's nominal values, or is absent."
             result = FitResult.failed(term, absent(), FitStatus.ABSENT, note)
         self.times.append(FitTime(term, time.perf_counter() - start))
         return result
 
 
 def fit(session: Session, term: str, effort: FitEffort | None = None) -> FitResult:
-    """Fit one term of a session, and before it those whose terms it needs.
+    """Fit one term of a session, after those that it needs.
 
     Args:
-        session: what was captured.
+        session: the captured session.
         term: noise, geometry, wire, psf or backscatter.
-        effort: what the fits may spend.
+        effort: effort of the fits.
 
     Returns:
-        the term with its covariance; a term without steps comes back as ``calibrate`` has it.
+        the term with its covariance; a term without steps is the same as from ``calibrate``.
 
     Raises:
         SessionError: when a file of the session is missing or damaged.
+        UdccalError: when ``term`` is not the name of a term.
     """
     if term not in ORDER:
         raise UdccalError(f"Expected a term, one of {', '.join(ORDER)}, found '{term}'. Name one of these.")
@@ -262,9 +263,15 @@ def fit(session: Session, term: str, effort: FitEffort | None = None) -> FitResu
 def fit_foundation(
     session: Session, progress: Callable[[TermName], None] = lambda term: None, effort: FitEffort | None = None
 ) -> Foundation:
-    """Fit noise, geometry and wire; arguments and errors as for ``calibrate``.
+    """Fit noise, geometry and wire. This needs only their steps, so it can run while the others are captured.
 
-    This needs the steps of these terms only: it can go on while the others are captured.
+    Args:
+        session: the captured session.
+        progress: called with a term's name when its fit begins.
+        effort: effort of the fits.
+
+    Raises:
+        SessionError: when a file of the session is missing or damaged.
     """
     fits = _Fits(session, effort, progress)
     base = fits.noise, fits.geometry, fits.wire
@@ -280,10 +287,10 @@ def calibrate(
     """Fit every term of a session; a term without steps gets its nominal or absent form, a note and status ABSENT.
 
     Args:
-        session: what was captured.
+        session: the captured session.
         progress: called with a term's name when its fit begins.
-        effort: what the fits may spend.
-        foundation: what ``fit_foundation`` found in the same session, when it has been run already.
+        effort: effort of the fits.
+        foundation: result of ``fit_foundation`` for the same session, when it has already run.
 
     Raises:
         SessionError: when a file of the session is missing or damaged.
@@ -291,7 +298,7 @@ def calibrate(
     effort = effort or FitEffort()
     base = foundation or fit_foundation(session, progress, effort)
     fits = _Fits(session, effort, progress)
-    # A cached property that is set is not run.
+    # Setting a cached property keeps its fit from running.
     fits.noise, fits.geometry, fits.wire, fits.wire_map = base.noise, base.geometry, base.wire, base.wire_map
     with ThreadPoolExecutor(effort.workers) as pool:
         late = [pool.submit(getattr, fits, term) for term in ("psf", "backscatter")]

@@ -1,4 +1,4 @@
-"""The psf evaluated at field positions, in a way that compiles once for every use of the same kernel size."""
+"""The psf evaluated at field positions, compiled once for each kernel size."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from udccal.numerics import in_float64
 from udccal.rig import RigDescription
 
 KERNEL_ROWS, KERNEL_COLUMNS = 257, 65
-# So many diffraction orders of green light, down and across: far enough that what lies beyond is weaker than the noise
+# Diffraction orders of green light that a kernel spans, down and across. The light beyond them is weaker than the noise
 # of a well-exposed frame.
 _ORDERS_DOWN, _ORDERS_ACROSS = 170.0, 44.0
 _GREEN_MM = 550e-6
@@ -23,7 +23,12 @@ _GREEN_MM = 550e-6
 def kernel_size(
     rig: RigDescription, most_rows: int = KERNEL_ROWS, most_columns: int = KERNEL_COLUMNS
 ) -> tuple[int, int]:
-    """(rows, columns) of kernels for a rig, odd: what the orders cover, no more than given or half the sensor."""
+    """Return the odd (rows, columns) of kernels for a rig: the extent of its orders, at most half the sensor.
+
+    Args:
+        rig: the rig description.
+        most_rows: largest number of rows. most_columns: largest number of columns.
+    """
     order_px = _GREEN_MM / rig.panel.pitch_mm.value * rig.lens.focal_mm.value / (1e-3 * rig.camera.pitch_um)
     rows = min(most_rows, rig.camera.rows // 2, math.ceil(_ORDERS_DOWN * order_px))
     columns = min(most_columns, rig.camera.columns // 2, math.ceil(_ORDERS_ACROSS * order_px))
@@ -33,7 +38,13 @@ def kernel_size(
 def fitted_size(
     psf: PsfField, rig: RigDescription, most_rows: int = KERNEL_ROWS, most_columns: int = KERNEL_COLUMNS
 ) -> tuple[int, int]:
-    """As ``kernel_size``, and no more than the psf's support: where its pictures showed no light, none is undone."""
+    """Return ``kernel_size`` limited to the psf's support, beyond which the captured frames showed no light.
+
+    Args:
+        psf: the psf term.
+        rig: the rig description.
+        most_rows: largest number of rows. most_columns: largest number of columns.
+    """
     rows, columns = kernel_size(rig, most_rows, most_columns)
     across, down = (2 * int(half) + 1 for half in np.asarray(psf.support_px))
     return min(rows, down), min(columns, across)
@@ -42,8 +53,18 @@ def fitted_size(
 def kernels_at(
     psf: PsfField, positions_px: Float[np.ndarray, "n 2"], rows: int, columns: int, workers: int = 2
 ) -> Float32[np.ndarray, "n 3 rows columns"]:
-    """Kernels at positions, one call each: the same compiled function serves any number of them, on several threads."""
-    # A term just fitted and one read back hold the same numbers as different types: one compilation for both.
+    """Return kernels at positions, one call each, so that one compilation serves any number of them.
+
+    Args:
+        psf: the psf term.
+        positions_px: (x, y) of the sources on the sensor.
+        rows: odd number of rows. columns: odd number of columns.
+        workers: threads.
+
+    Returns:
+        kernels, of which each colour sums to 1.
+    """
+    # A fitted term and one read from a file hold the same numbers in different types: one compilation serves both.
     psf = jax.tree.map(lambda leaf: np.asarray(leaf, dtype=np.float64), psf)
 
     @in_float64

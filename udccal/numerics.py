@@ -1,4 +1,4 @@
-"""How fits compute: in double precision, without switching the importing program's JAX to it, each on one thread."""
+"""Run fits in double precision, without changing the importing program's JAX settings, and with BLAS on one thread."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ T = TypeVar("T")
 
 
 def in_float64(function: Callable[P, T]) -> Callable[P, T]:
-    """Run ``function`` with 64-bit JAX types enabled for the length of the call only, and BLAS on one thread.
+    """Wrap ``function`` so that 64-bit JAX types are enabled, and BLAS uses one thread, during each call only.
 
-    Return numpy arrays (not JAX arrays) from a function so wrapped: a 64-bit JAX array outside the context would be
-    narrowed by the next operation on it.
+    The function should return numpy arrays, not JAX arrays: outside the context the next operation would narrow a
+    64-bit JAX array.
     """
 
     @functools.wraps(function)
@@ -40,10 +40,10 @@ def _libraries() -> ThreadpoolController:
 
 @contextlib.contextmanager
 def _one_blas_thread() -> Iterator[None]:
-    """Keep BLAS from sharing out the small matrices of fits.
+    """Keep BLAS from splitting the small matrices of fits among threads.
 
-    Its threads wait for each other by turning in circles: where another program uses a core, a factorisation takes ten
-    times as long, and little is gained where none does.
+    Its threads spin while they wait for each other. A factorisation takes ten times as long when another program uses a
+    core, and gains little when none does.
     """
     if _ALREADY.get():
         yield

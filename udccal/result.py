@@ -1,4 +1,4 @@
-"""What a fit returns: the term, how sure it is, how it got there, and what to do when it failed."""
+"""What a fit returns: the term, its uncertainty, diagnostics, and advice when the fit failed."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _Term_co = TypeVar("_Term_co", covariant=True)
 
 
 class FitStatus(enum.Enum):
-    """How a fit ended; the value tells a person what to do next."""
+    """How a fit ended; the value says what to do next."""
 
     CONVERGED = "The fit converged."
     ABSENT = "The data show no sign of this term; it is left out and costs nothing later."
@@ -30,7 +30,7 @@ class FitStatus(enum.Enum):
 
 @dataclass(frozen=True)
 class Estimate:
-    """One named quantity with its unit and one standard deviation."""
+    """One named quantity with its unit and its standard deviation."""
 
     name: str
     value: float
@@ -40,7 +40,7 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Candidate:
-    """One order that was tried: a lower criterion is better."""
+    """One order that was tried; a lower criterion is better."""
 
     name: str
     parameters: int
@@ -50,7 +50,7 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Diagnostic:
-    """A number about the fit itself (residual RMS, rejected samples, iterations, ...)."""
+    """A number that describes the fit (residual RMS, rejected samples, iterations, ...)."""
 
     name: str
     value: float
@@ -59,12 +59,12 @@ class Diagnostic:
 
 @dataclass(frozen=True)
 class Outliers:
-    """Samples left out of a fit by a stated rule.
+    """Samples left out of a fit by a documented rule.
 
     Attributes:
-        rule: what made them outliers, such as "off by more than 5 robust sigma of their view".
-        count: how many.
-        places: the first of them by name or position, for a person to look at.
+        rule: the rule, such as "off by more than 5 robust sigma of their view".
+        count: number of samples left out.
+        places: names or positions of the first of them, for a person to inspect.
     """
 
     rule: str
@@ -74,7 +74,7 @@ class Outliers:
 
 @dataclass(frozen=True)
 class ResidualSample:
-    """Some of a fit's residuals, evenly drawn: where on the sensor they lie, and their size in units of their sigma."""
+    """An even sample of a fit's residuals: positions on the sensor, and residuals ``z`` in units of their sigma."""
 
     positions_px: Float[np.ndarray, "n 2"]
     z: Float[np.ndarray, " n"]
@@ -82,13 +82,13 @@ class ResidualSample:
 
 @runtime_checkable
 class TermPosterior(Protocol[_Term_co]):
-    """How sure a fit is of its whole term, field coefficients included."""
+    """Posterior distribution of a whole term, field coefficients included."""
 
     def sigma_of(self, f: Callable[[_Term_co], Float[np.ndarray, "*shape"]]) -> Float[np.ndarray, "*shape"]:
-        """One standard deviation of every number that ``f`` makes of the term."""
+        """Return one standard deviation of every element of ``f(term)``."""
 
     def draws(self, rng: np.random.Generator, count: int) -> tuple[_Term_co, ...]:
-        """Terms drawn from the posterior."""
+        """Draw ``count`` terms from the posterior."""
 
 
 @dataclass(frozen=True)
@@ -96,19 +96,19 @@ class FitResult(Generic[Term]):
     """A fitted term and the evidence for it.
 
     Attributes:
-        name: of the term: noise, geometry, wire, psf or backscatter.
-        term: as fitted, or as the rig description has it where the fit failed.
+        name: noise, geometry, wire, psf or backscatter.
+        term: the fitted term; the rig description's nominal term where the fit failed.
         status: how the fit ended.
-        estimates: named numbers of the term with one standard deviation each.
-        cov: covariance of the leading estimates, in their units; all of them unless a note says otherwise.
-        chi2_dof: reduced chi-squared, 1 where model and noise describe the data.
-        samples: how many took part.
+        estimates: named numbers of the term, each with its standard deviation.
+        cov: covariance of the leading estimates, in their units; of all estimates unless a note says otherwise.
+        chi2_dof: reduced chi-squared; about 1 where model and noise describe the data.
+        samples: number of samples used.
         candidates: the orders that were tried.
-        diagnostics: numbers about the fit.
+        diagnostics: numbers that describe the fit.
         notes: sentences for a person.
-        outliers: what was left out, by rule.
-        residuals: some of them, evenly drawn.
-        posterior: of the whole term; None where the fit failed, and in a profile that was read from a file.
+        outliers: samples left out, by rule.
+        residuals: an even sample of the residuals.
+        posterior: distribution of the whole term; None where the fit failed or the result was read from a profile.
     """
 
     name: str
@@ -136,14 +136,18 @@ class FitResult(Generic[Term]):
         return self.status in (FitStatus.CONVERGED, FitStatus.ABSENT)
 
     def estimate(self, name: str) -> Estimate:
-        """The estimate of that name; raises KeyError naming those there are."""
+        """Return an estimate by its name.
+
+        Raises:
+            KeyError: when there is none; the message lists the names.
+        """
         for item in self.estimates:
             if item.name == name:
                 return item
         raise KeyError(f"no estimate '{name}'; there are {', '.join(e.name for e in self.estimates)}")
 
     def sigma_of(self, f: Callable[[Term], Float[np.ndarray, "*shape"]]) -> Float[np.ndarray, "*shape"]:
-        """One standard deviation of any function of the term, such as its wire map, a kernel or a ray.
+        """Return one standard deviation of any function of the term, such as its wire map, a kernel or a ray.
 
         Args:
             f: pure function from a term to an array. It is called twice for every direction of the posterior.
@@ -157,15 +161,15 @@ class FitResult(Generic[Term]):
         if self.posterior is None:
             raise FitError(
                 f"Expected a {self.name} fit with a posterior, found none: the fit failed, or the result was read from "
-                "a profile, which keeps the covariance of the estimates alone. Fit the session again."
+                "a profile, which keeps only the covariance of the estimates. Fit the session again."
             )
         return self.posterior.sigma_of(f)
 
     def or_raise(self) -> FitResult[Term]:
-        """Itself when usable.
+        """Return itself when the term can be used.
 
         Raises:
-            FitError: with the advice of the status otherwise.
+            FitError: when it cannot, with the advice of the status.
         """
         if self.ok:
             return self

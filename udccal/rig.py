@@ -1,4 +1,4 @@
-"""The rig as built: nominal values with tolerances, all that a fit needs to start. Read from ``rig.toml``."""
+"""The rig as built, read from ``rig.toml``: nominal values with tolerances, from which fits start."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ class _Strict(BaseModel):
 
 
 class Nominal(_Strict):
-    """A value the rig was built to have, and how far off it may be (same unit)."""
+    """A value the rig was built to have, and its tolerance in the same unit."""
 
     value: float
     tolerance: Annotated[float, Field(ge=0, le=1e6)]
 
 
 def _within(low: float, high: float) -> AfterValidator:
-    """Bounds of a nominal value."""
+    """Return a validator that bounds a nominal value."""
 
     def check(nominal: Nominal) -> Nominal:
         if not low <= nominal.value <= high:
-            raise ValueError(f"a value of {nominal.value:g}, which should be from {low:g} to {high:g}")
+            raise ValueError(f"a value of {nominal.value:g}, which must be from {low:g} to {high:g}")
         return nominal
 
     return AfterValidator(check)
@@ -98,7 +98,7 @@ class Mounting(_Strict):
 
 
 class Captures(_Strict):
-    """How much a full calibration captures; each number trades time for accuracy."""
+    """Numbers of captures in a full calibration; each trades time for accuracy."""
 
     flats: Annotated[int, Field(ge=2)] = 300
     noise_levels: Annotated[int, Field(ge=4)] = 20
@@ -125,12 +125,12 @@ class View(_Strict):
     @model_validator(mode="after")
     def _holds_no_more_than_8k(self) -> View:
         if self.columns * self.rows > _MOST_VIEW_PX:
-            raise ValueError(f"{self.columns} x {self.rows} pixels, which should be {_MOST_VIEW_PX} together at most")
+            raise ValueError(f"{self.columns} x {self.rows} pixels, which must be at most {_MOST_VIEW_PX} in all")
         return self
 
 
 class RigDescription(_Strict):
-    """One rig as it was built to be. Older versions are read too, from files, sessions and profiles alike."""
+    """One rig as it was built to be. Older versions are read too, from files, sessions and profiles."""
 
     format: Literal["udccal-rig"]
     version: Literal[2]
@@ -159,23 +159,26 @@ class RigDescription(_Strict):
 
     @property
     def saturation_DN(self) -> int:
-        """Largest number the converter can deliver."""
+        """Largest number that the converter can deliver."""
         return int(2**self.camera.bits - 1)
 
 
 def user_rig_folder() -> Path:
-    """The folder in which a user's own rigs are looked up by name."""
+    """Return the folder in which a user's own rigs are looked up by name: ``UDCCAL_RIGS``, or a default."""
     default = Path.home() / ".local" / "share" / "udccal" / "rigs"
     return Path(os.environ.get("UDCCAL_RIGS", str(default)))
 
 
 def shipped_rig_folder() -> Path:
-    """The folder of the rigs that ship with udccal."""
+    """Return the folder of the rigs that ship with udccal."""
     return Path(str(resources.files("rig_profiles")))
 
 
 def find_rig(name_or_path: str | Path) -> Path:
-    """Folder of a rig given by path, or by name in the user's folder or among those shipped.
+    """Return the folder of a rig.
+
+    Args:
+        name_or_path: a path, or the name of a rig in the user's folder or among the shipped ones.
 
     Raises:
         RigError: when no folder with a ``rig.toml`` is found.
@@ -195,6 +198,9 @@ def find_rig(name_or_path: str | Path) -> Path:
 
 def load_rig(name_or_path: str | Path) -> RigDescription:
     """Read and check a rig description.
+
+    Args:
+        name_or_path: as for ``find_rig``.
 
     Raises:
         RigError: when it is missing, not TOML, or a value is missing, unknown or out of range.

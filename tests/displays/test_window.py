@@ -145,7 +145,7 @@ def test_two_screens_only_the_chosen_one_lights_up(monkeypatch: pytest.MonkeyPat
             assert differing(server.pixels(0), picture) == 0
             assert server.pixels(1).max() == 0
         # Screens of X, unlike monitors of one screen, begin at one place, and SDL cannot put a window on the second.
-        with pytest.raises(DisplayError, match="a place of its own"), WindowDisplay(1, large):
+        with pytest.raises(DisplayError, match="a position of its own"), WindowDisplay(1, large):
             pass
         assert server.pixels(1).max() == 0
 
@@ -210,7 +210,7 @@ def test_a_silent_window_is_an_error_in_bounded_time(screen: VirtualScreen, monk
     with WindowDisplay(0, SMALL, SETTLE_S) as display:
         assert display._link is not None
         os.kill(display._link._process.pid, signal.SIGSTOP)
-        with pytest.raises(DisplayError, match=r"answer within 0\.25 s, found it silent"):
+        with pytest.raises(DisplayError, match=r"answer within 0\.25 s, found no answer"):
             display.off()
         with pytest.raises(DisplayError, match="its process ended"):
             display.check()

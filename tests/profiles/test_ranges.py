@@ -133,7 +133,7 @@ def test_numbers_beyond_their_range_are_refused(toy_profile: Profile, name: str,
 TOGETHER = {
     "saturation below black": ("noise", "saturation_DN", np.float64(60.0), "above black_DN"),
     "half a harmonic": ("wire", "harmonics", np.array([[0.0, 1.5]]), "whole numbers"),
-    "a range of nothing": ("wire", "frequency", np.array([[3.0, 0.0]]), "more than nothing"),
+    "a range of nothing": ("wire", "frequency", np.array([[3.0, 0.0]]), "half ranges above 0"),
     "amplitudes of no harmonic": ("wire", "amplitudes", np.zeros((3, 2, 1, 1)), "at most the"),
     "a baseline of no degree": ("wire", "baseline", np.zeros((0, 1)), "1 to 64 degrees"),
     "one wavelength": ("psf.diffraction", "wavelengths_nm", np.array([500.0]), "2 to 64 wavelengths"),

@@ -52,5 +52,5 @@ def test_a_view_that_looks_beside_the_sensor_is_refused(toy_geometry: Geometry) 
     view = inscribed_view(toy_geometry, 128, 96, 96, 54)
     Rectification.within(toy_geometry, view, 128, 96)
     wider = VirtualView(96, 54, view.focal_px * 0.8, view.principal_point_px)
-    with pytest.raises(RestorationError, match="look beside it"):
+    with pytest.raises(RestorationError, match="look past it"):
         Rectification.within(toy_geometry, wider, 128, 96)

@@ -63,7 +63,7 @@ def test_a_session_is_resumed_not_overwritten(tmp_path: Path) -> None:
         assert writer.completed_ids == {"noise/dark_0"}
         assert (writer.number("noise/dark_0"), writer.number("noise/dark_1")) == (0, 1)
         writer.add_step("noise/dark_1", "noise", DarkSubject(), [frame()])
-        with pytest.raises(SessionError, match="captured already"):
+        with pytest.raises(SessionError, match="already captured"):
             writer.add_step("noise/dark_1", "noise", DarkSubject(), [frame()])
     assert [step.id for step in Session.open(tmp_path).steps("noise")] == ["noise/dark_0", "noise/dark_1"]
 

@@ -1,4 +1,4 @@
-"""What every display refuses before it shows anything."""
+"""The check that every display makes before it shows a picture."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from udccal.errors import DisplayError
 
 
 def check_picture(picture: np.ndarray, size: PanelSize) -> None:
-    """Return when ``picture`` is 8-bit RGB, (rows, columns, 3), of the panel's size: a display never resamples.
+    """Refuse a picture that is not 8-bit RGB, (rows, columns, 3), of the panel's size: a display never resamples.
 
     Raises:
-        DisplayError: when it is not.
+        DisplayError: when it is another.
     """
     if picture.dtype != np.uint8 or picture.ndim != 3 or picture.shape[2] != 3:
         raise DisplayError(

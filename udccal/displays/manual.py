@@ -1,4 +1,4 @@
-"""A display that a person works: told which file to show, asked whether it is on screen."""
+"""A display that a person operates: asked to show a file, and whether it is on screen."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ _BLACK = "black"
 
 @final
 class ManualDisplay:
-    """Implements ``udccal.displays.protocol.Display`` for panels that no cable of this computer leads to.
+    """Implements ``udccal.displays.protocol.Display`` for panels that are not connected to this computer.
 
-    A person may take as long as they like: nothing here times out, and Ctrl-C in ``confirm`` ends the wait.
+    There is no timeout: a person may take as long as they like. Ctrl-C in ``confirm`` ends the wait.
     """
 
     def __init__(
         self, folder: Path, size: PanelSize, tell: Callable[[str], None], confirm: Callable[[str], bool]
     ) -> None:
         """Args:
-        folder: for the pictures; made when it is not there. A picture's name follows from its pixels, so that no
-            two pictures share one and a stale one is never shown by mistake.
+        folder: folder for the pictures; made when it is missing. A picture's name is a hash of its pixels, so that
+            two pictures never have the same name and an old one is never shown by mistake.
         size: pixels of the panel.
         tell: says a sentence to the person.
-        confirm: asks the person a question and returns their answer, yes or no, once they gave it.
+        confirm: asks the person a question, waits, and returns whether the answer was yes.
         """
         self._folder = folder
         self._size = size
@@ -78,7 +78,7 @@ class ManualDisplay:
         )
 
     def off(self) -> None:
-        """Return once the person has switched the panel off or to black; asked only when it is not so already.
+        """Return once the person has switched the panel off or to black; ask only when it is not off already.
 
         Raises:
             DisplayError: when the person says no.
@@ -87,11 +87,11 @@ class ManualDisplay:
             self._ask(_BLACK, "Switch the panel off, or let it show black only.")
 
     def check(self) -> None:
-        """Nothing to find out: only the person sees the panel."""
+        """Do nothing: only the person sees the panel."""
 
     def _ask(self, shown: str, sentence: str) -> None:
         self._shown = None  # not known until the answer is there
         self._tell(sentence)
         if not self._confirm("Is it done?"):
-            raise DisplayError(f"Expected the answer yes to '{sentence}', found no. Run the same command to go on.")
+            raise DisplayError(f"Expected the answer yes to '{sentence}', found no. Run the same command to continue.")
         self._shown = shown

@@ -1,4 +1,4 @@
-"""The panel from its other side."""
+"""A display that mirrors pictures, for the panel seen from behind."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from udccal.displays.protocol import Display, PanelSize
 class MirroredDisplay:
     """Implements ``udccal.displays.protocol.Display``: shows every picture with left and right exchanged.
 
-    Pictures are given as the camera sees the panel, from behind (docs/conventions.md); a screen shows them to people in
-    front of it. What shall be at the camera's right has to be at those people's left.
+    Pictures are given as the camera sees the panel, from behind (docs/conventions.md). A screen shows them to people in
+    front of it. The camera's right is those people's left.
     """
 
     def __init__(self, display: Display) -> None:
@@ -45,5 +45,5 @@ class MirroredDisplay:
         self._display.off()
 
     def check(self) -> None:
-        """As the display itself."""
+        """Check the display behind this one."""
         self._display.check()

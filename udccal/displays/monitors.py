@@ -1,4 +1,4 @@
-"""The monitors of this computer, as SDL sees them. Runs in the process of the window only."""
+"""The monitors of this computer, as SDL sees them. This module runs only in the window's process."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _LEAST_BITS = 24
 
 
 def seen_monitors() -> tuple[Monitor, ...]:
-    """Every monitor; SDL's video must have been initialised."""
+    """Return every monitor; SDL's video must have been initialised."""
     sizes = pygame.display.get_desktop_sizes()
     rates = pygame.display.get_desktop_refresh_rates()
     return tuple(
@@ -26,7 +26,7 @@ def seen_monitors() -> tuple[Monitor, ...]:
 
 
 def _place(index: int, columns: int, rows: int) -> tuple[int, int]:
-    """Where a monitor begins: where a window of its size, never shown, is put when centred on it."""
+    """Return a monitor's top left corner: the position of a hidden window of its size that is centred on it."""
     hidden = pygame.Window("", (columns, rows), (CENTRED_ON | index, CENTRED_ON | index), hidden=True)
     try:
         x, y = hidden.position
@@ -36,10 +36,11 @@ def _place(index: int, columns: int, rows: int) -> tuple[int, int]:
 
 
 def choose_monitor(monitors: Sequence[Monitor], index: int, size: PanelSize) -> Monitor:
-    """The monitor of that number, when it runs at the panel's size, in full colour, at a place of its own.
+    """Return a monitor by its number, after checking that it can show the panel's pictures.
 
     Raises:
-        DisplayError: when it does not.
+        DisplayError: when there is none, or it does not run at the panel's size, in full colour, at a position of its
+            own on the desktop.
     """
     if not 0 <= index < len(monitors):
         raise DisplayError(f"Expected a monitor with number {index}, found {describe(monitors)}. Choose one of these.")
@@ -51,7 +52,7 @@ def choose_monitor(monitors: Sequence[Monitor], index: int, size: PanelSize) -> 
         )
     if any((other.x, other.y) == (chosen.x, chosen.y) for other in monitors[:index]):
         raise DisplayError(
-            f"Expected monitor {index} at a place of its own on the desktop, found {describe(monitors)}. "
+            f"Expected monitor {index} to have a position of its own on the desktop, found {describe(monitors)}. "
             "Set the monitors side by side, not mirrored."
         )
     bits = pygame.display.Info().bitsize
@@ -63,7 +64,7 @@ def choose_monitor(monitors: Sequence[Monitor], index: int, size: PanelSize) -> 
 
 
 def describe(monitors: Sequence[Monitor]) -> str:
-    """All monitors in one phrase."""
+    """Describe all monitors in one phrase."""
     return "; ".join(_phrase(monitor) for monitor in monitors) or "no monitor"
 
 

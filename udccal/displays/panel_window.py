@@ -1,4 +1,4 @@
-"""The full-screen window that shows pictures pixel for pixel. Runs in the process of the window only."""
+"""The full-screen window that shows pictures pixel for pixel. This module runs only in the window's process."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from udccal.displays.monitors import CENTRED_ON
 from udccal.displays.window_messages import Monitor
 from udccal.errors import DisplayError
 
-# After a picture was handed over: one refresh until a compositor takes it, one more that its graphics driver may hold
+# Refreshes after a picture is handed over: one until a compositor takes it, one that its graphics driver may hold it
 # back, and one until it has been scanned out to the last row.
 REFRESHES = 3
-_UNKNOWN_HZ = 24.0  # of a monitor that does not tell: the slowest in use
+_UNKNOWN_HZ = 24.0  # assumed for a monitor that does not report its rate: the slowest in use
 _OPENING_S = 5.0
-_SETTLING_S = 10.0  # at most, beyond what was asked for
+_SETTLING_S = 10.0  # longest wait beyond the requested time
 _TICK_MS = 10
 
 
@@ -27,20 +27,20 @@ _TICK_MS = 10
 class PanelWindow:
     """One window over one whole monitor, above all others, without a pointer.
 
-    All methods must be called from the thread that made it, the process's main thread; ``handle`` must be given every
-    event, so that the window answers the desktop and notices what happens to it.
+    All methods must be called from the thread that made it, the process's main thread. ``handle`` must be given every
+    event, so that the window responds to the desktop and notices when it is covered, moved or closed.
     """
 
     def __init__(self, monitor: Monitor, alone: bool) -> None:
         """Open the window, and return once it is on screen.
 
         Args:
-            monitor: where.
-            alone: it is the only monitor, so that a window which takes the keyboard lies on top of this one. With
-                several, a person may work on another one meanwhile.
+            monitor: the monitor to fill.
+            alone: whether it is the only monitor. Then a window that takes the keyboard covers this one; with several
+                monitors, a person may work on another one.
 
         Raises:
-            DisplayError: when it does not appear at the monitor's own resolution.
+            DisplayError: when the window does not appear at the monitor's own resolution.
         """
         self._monitor = monitor
         self._alone = alone
@@ -59,7 +59,7 @@ class PanelWindow:
             fullscreen_desktop=True,
             borderless=True,
             always_on_top=True,
-            allow_high_dpi=True,  # so that a desktop's scaling shows as a surface of another size, and is refused
+            allow_high_dpi=True,  # a scaled desktop then gives a surface of another size, which is refused
         )
         self._picture = pygame.Surface(size, depth=24)
         pygame.display.set_allow_screensaver(False)
@@ -75,7 +75,7 @@ class PanelWindow:
         self._window.destroy()
 
     def handle(self, event: pygame.event.Event) -> None:
-        """Note what an event means for the picture on screen."""
+        """Record what an event means for the picture on screen."""
         if event.type in (pygame.QUIT, pygame.WINDOWCLOSE):
             self._closed = True
             self._lose("it was closed")
@@ -93,12 +93,12 @@ class PanelWindow:
             self._uncovered()
 
     def show(self, picture: UInt8[np.ndarray, "rows columns 3"] | None, settle_s: float) -> None:
-        """Show a picture of the monitor's size, or black (None); return once it is seen on the panel.
+        """Show a picture of the monitor's size, or black (None); return once it is visible on the panel.
 
         Presents in step with the monitor's refresh, then waits ``REFRESHES`` refreshes and ``settle_s``.
 
         Raises:
-            DisplayError: as ``check`` for what was shown before, and when the window does not stay on screen.
+            DisplayError: as ``check`` for the picture shown before, and when the window does not stay on screen.
         """
         self.check()
         self._settled = False
@@ -108,18 +108,18 @@ class PanelWindow:
             pygame.surfarray.blit_array(self._picture, picture.swapaxes(0, 1))
         if self._alone and not self._window.focused:
             self._window.focus()
-            with contextlib.suppress(pygame.error):  # not possible while it is hidden, which is told below
-                self._window.focus(input_only=True)  # where no window manager heeds the first
+            with contextlib.suppress(pygame.error):  # fails while the window is hidden, which is reported below
+                self._window.focus(input_only=True)  # for desktops without a window manager
         self._present()
         self._settle(REFRESHES / (self._monitor.refresh_hz or _UNKNOWN_HZ) + settle_s)
         self._refuse_trouble()
         self._settled = True
 
     def check(self) -> None:
-        """Return when the window has been on screen, uncovered as far as can be known, since ``show`` returned.
+        """Check that the window has stayed on screen since ``show`` returned, uncovered as far as the desktop reports.
 
         Raises:
-            DisplayError: when it has not; said once, so that showing again may mend it, except for a closed window.
+            DisplayError: when it has not; raised once, so that showing again can succeed, unless the window was closed.
         """
         for event in pygame.event.get():
             self.handle(event)
@@ -133,12 +133,12 @@ class PanelWindow:
 
     def _present(self) -> None:
         self._window.get_surface().blit(self._picture, (0, 0))
-        pygame.mouse.set_visible(False)  # before the window is on screen, SDL does not heed it
+        pygame.mouse.set_visible(False)  # SDL ignores this before the window is on screen
         self._window.flip()
         self._presented = time.monotonic()
 
     def _uncovered(self) -> None:
-        """The desktop asks for pixels to be drawn anew. X does so only for those that another window covered."""
+        """Draw again when the desktop asks for it. X asks only for pixels that another window covered."""
         self._exposed = True
         if pygame.display.get_driver() == "x11":
             self._lose("another window covered it for a while")
@@ -155,12 +155,12 @@ class PanelWindow:
         self._refuse_trouble()
 
     def _settle(self, seconds: float) -> None:
-        """Handle events until the picture was drawn last that many seconds ago."""
+        """Handle events until this many seconds have passed since the picture was last drawn."""
         latest = self._presented + seconds + _SETTLING_S
         while time.monotonic() < self._presented + seconds and not self._closed:
             if time.monotonic() > latest:
                 raise DisplayError(
-                    f"Expected the picture to stay on screen, found it covered again and again for {_SETTLING_S:g} s. "
+                    f"Expected the picture to stay on screen, found it covered repeatedly for {_SETTLING_S:g} s. "
                     "Keep other windows and pop-ups off the panel's monitor."
                 )
             self._handle_next()
@@ -179,7 +179,7 @@ class PanelWindow:
             )
 
     def _trouble(self) -> str:
-        """What is wrong with the window now; empty when nothing is."""
+        """Return what is wrong with the window now; empty when nothing is wrong."""
         if self._closed:
             return "it was closed"
         if not (self._exposed and self._visible):

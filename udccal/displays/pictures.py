@@ -1,8 +1,8 @@
 """Face-like pictures for the panel: crowds of heads of all sizes, in front of a busy wall.
 
-A camera behind the panel sees some 30 x 30 panel pixels, out of focus. For pictures to tell what it sees there, they
-must differ in brightness, colour and shapes of that size: heads from a few pixels to a fifth of the panel are scattered
-all over, so that edges, eyes and hair cross any such place.
+A camera behind the panel sees about 30 x 30 panel pixels, out of focus. To identify that footprint, pictures must
+differ in brightness, colour and shapes of that size. Heads from a few pixels to a fifth of the panel are scattered all
+over, so that edges, eyes and hair cross any such place.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ Picture = UInt8[np.ndarray, "rows columns 3"]
 
 @dataclass(frozen=True)
 class _Head:
-    """Middle and height of a head in px, and how far it leans."""
+    """Centre and height of a head in px, and its lean."""
 
     x: float
     y: float
@@ -32,7 +32,12 @@ class _Head:
 
 
 def face_picture(seed: int, columns: int, rows: int) -> Picture:
-    """A crowd, in 8-bit RGB; another ``seed`` is another crowd in other colours and another light."""
+    """Draw a crowd in 8-bit RGB.
+
+    Args:
+        seed: each seed gives another crowd, in other colours and another light.
+        columns: columns of the panel. rows: rows of the panel.
+    """
     rng = np.random.default_rng([seed, 0xC20D])
     picture = _wall(rng, columns, rows)
     largest = max(0.2 * rows, 2 * _SMALLEST_HEAD_PX)
@@ -46,7 +51,7 @@ def face_picture(seed: int, columns: int, rows: int) -> Picture:
 
 
 def _wall(rng: np.random.Generator, columns: int, rows: int) -> Picture:
-    """Blocks of colour, as of shelves and windows, with a gradient of light."""
+    """Draw blocks of colour, like shelves and windows, with a gradient of light."""
     blocks = rng.integers(20, 256, (max(2, rows // 40), max(2, columns // 30), 3), dtype=np.uint8)
     wall = cv2.resize(blocks, (columns, rows), interpolation=cv2.INTER_NEAREST)
     fall = np.linspace(1.0, rng.uniform(0.4, 1.0), columns)[None, :, None]
@@ -54,7 +59,7 @@ def _wall(rng: np.random.Generator, columns: int, rows: int) -> Picture:
 
 
 def _draw_person(picture: Picture, rng: np.random.Generator, head: _Head) -> None:
-    """Head and shoulders."""
+    """Draw head and shoulders."""
     light = rng.uniform(0.6, 1.5)
     skin = light * np.array(_SKINS[rng.integers(len(_SKINS))], dtype=float)
     hair, coat = light * rng.uniform(5, 150, 3) * rng.uniform(0.2, 1.0), light * rng.uniform(0, 255, 3)
@@ -77,7 +82,7 @@ def _ellipse(
     half_axes: tuple[float, float],
     colour: Float[np.ndarray, "3"],
 ) -> None:
-    """One ellipse, measured in heads from the middle of the head."""
+    """Draw one ellipse, measured in heads from the centre of the head."""
     fine = 2**_SUBPIXEL_BITS
     centre = (round((head.x + middle[0] * head.size) * fine), round((head.y + middle[1] * head.size) * fine))
     axes = (max(1, round(half_axes[0] * head.size * fine)), max(1, round(half_axes[1] * head.size * fine)))

@@ -1,4 +1,4 @@
-"""The one protocol behind which every display stands."""
+"""The protocol that every display implements."""
 
 from __future__ import annotations
 
@@ -43,19 +43,19 @@ class Display(Protocol):
         ...
 
     def off(self) -> None:
-        """Show nothing: black, which is no light from a panel whose pixels shine by themselves.
+        """Show black, which is no light from a panel whose pixels emit their own.
 
         Raises:
-            DisplayError: when that cannot be done.
+            DisplayError: when black cannot be shown.
         """
         ...
 
     def check(self) -> None:
-        """Return when what was asked for last has been on screen ever since, as far as the display can know.
+        """Check that the last picture has stayed on screen since it was shown, as far as the display can know.
 
-        Called after a capture, so that frames of a picture that was covered meanwhile are not kept.
+        It is called after a capture, so that frames of a picture that was covered meanwhile are not kept.
 
         Raises:
-            DisplayError: when it has not.
+            DisplayError: when the picture has not stayed on screen.
         """
         ...

@@ -16,10 +16,10 @@ from udccal.simulation.world import SimulatedWorld
 
 @final
 class SimulatedDisplay:
-    """Implements ``udccal.displays.protocol.Display``: what it shows is the only light in a dark room.
+    """Implements ``udccal.displays.protocol.Display``: its picture is the only light in a dark room.
 
     Attributes:
-        picture: what is on screen now, None when off.
+        picture: the picture on screen; None when off.
     """
 
     def __init__(self, world: SimulatedWorld) -> None:
@@ -38,7 +38,7 @@ class SimulatedDisplay:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Nothing to let go of: the world keeps what is arranged in it."""
+        """Do nothing: the world keeps its arrangement."""
 
     def show(self, picture: UInt8[np.ndarray, "rows columns 3"]) -> None:
         """Show an 8-bit RGB picture at the panel's own resolution.
@@ -56,4 +56,4 @@ class SimulatedDisplay:
         self._world.arrange(Dark())
 
     def check(self) -> None:
-        """Always true: nothing covers a simulated panel."""
+        """Do nothing: nothing covers a simulated panel."""

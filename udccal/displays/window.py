@@ -16,13 +16,13 @@ from udccal.displays.window_link import START_S, WindowLink
 from udccal.displays.window_messages import Job, Monitor
 from udccal.errors import DisplayError
 
-# Televisions delay a picture by up to about 0.15 s with their picture processing on, and settle their brightness after.
+# Televisions with picture processing delay a picture by up to about 0.15 s; then their brightness has to settle.
 SETTLE_S = 0.5
 _ANSWER_S = 20.0
 
 
 def list_monitors() -> tuple[Monitor, ...]:
-    """The monitors that a window can be shown on.
+    """Return the monitors that a window can be shown on.
 
     Raises:
         DisplayError: when the optional package is missing, or no desktop can be reached.
@@ -38,15 +38,15 @@ def list_monitors() -> tuple[Monitor, ...]:
 class WindowDisplay:
     """Implements ``udccal.displays.protocol.Display`` with an SDL window in a process of its own.
 
-    The window answers the desktop all the time. That it was closed, minimised, moved or covered, as far as the desktop
-    tells, is said by the next call of ``show``, ``off`` or ``check``, whichever comes first.
+    The window responds to the desktop all the time. When it was closed, minimised, moved or covered, as far as the
+    desktop reports it, the next call of ``show``, ``off`` or ``check`` raises the error.
     """
 
     def __init__(self, monitor: int, size: PanelSize, settle_s: float = SETTLE_S) -> None:
         """Args:
         monitor: number of the monitor in ``list_monitors``; it must run at ``size``.
         size: pixels of the panel.
-        settle_s: wait after the monitor got a picture, for the panel's own delay.
+        settle_s: wait after the monitor received a picture, for the panel's own delay.
         """
         if not 0 <= settle_s <= 60:
             raise DisplayError(f"Expected to wait from 0 to 60 s for the panel to settle, found {settle_s:g} s.")
@@ -66,8 +66,8 @@ class WindowDisplay:
         """Open the window, black.
 
         Raises:
-            DisplayError: when the optional package is missing, no desktop can be reached, or the monitor is not there
-                or does not run at the panel's size.
+            DisplayError: when the optional package is missing, no desktop can be reached, or the monitor is missing or
+                does not run at the panel's size.
         """
         rows, columns = self._size.rows, self._size.columns
         self._folder = tempfile.TemporaryDirectory(prefix="udccal-panel-")
@@ -91,8 +91,8 @@ class WindowDisplay:
         """Show an 8-bit RGB picture at the panel's own resolution, and return once it is on screen.
 
         Raises:
-            DisplayError: when the picture is not 8-bit RGB of the panel's size, the window was not on screen since it
-                was asked last, or it cannot be shown now.
+            DisplayError: when the picture is not 8-bit RGB of the panel's size, the window has not stayed on screen
+                since the last call, or the picture cannot be shown now.
         """
         check_picture(picture, self._size)
         link = self._opened_anew()
@@ -105,7 +105,7 @@ class WindowDisplay:
         self._opened_anew().ask("black", self._settle_s + _ANSWER_S)
 
     def check(self) -> None:
-        """Return when the window has been on screen since it was asked last.
+        """Check that the window has stayed on screen since the last call.
 
         Raises:
             DisplayError: when it has not.
@@ -118,7 +118,7 @@ class WindowDisplay:
         return self._link
 
     def _opened_anew(self) -> WindowLink:
-        """The window; a new one where its process ended, which was said when it did."""
+        """Return the link; open a new window where the process ended, which an earlier call has reported."""
         if not self._opened().alive:
             self._close()
             self.__enter__()

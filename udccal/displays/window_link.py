@@ -1,4 +1,4 @@
-"""The asking end of the panel's window: starts its process, and waits for every answer a bounded time."""
+"""The client of the panel's window: it starts the window's process and waits a bounded time for every reply."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from udccal.errors import DisplayError
 START_S = 30.0
 _END_S = 3.0
 _LONGEST_LINE = 1 << 16
-# One surface pixel is one panel pixel, tearing-free, and the window stays when a person works on another monitor.
+# One surface pixel is one panel pixel, without tearing; the window stays when a person works on another monitor.
 _SDL = {
     "PYGAME_HIDE_SUPPORT_PROMPT": "1",
     "SDL_RENDER_VSYNC": "1",
@@ -36,10 +36,10 @@ _REPLY = TypeAdapter(Reply)
 
 @final
 class WindowLink:
-    """One process of ``udccal.displays.window_process``; close it when done."""
+    """One process of ``udccal.displays.window_process``, which must be closed."""
 
     def __init__(self, job: Job) -> None:
-        """Start the process; its first reply is to be fetched with ``reply``.
+        """Start the process; the caller must fetch its first reply with ``reply``.
 
         Raises:
             DisplayError: when the optional package is not installed.
@@ -72,19 +72,19 @@ class WindowLink:
         return self.reply(seconds)
 
     def reply(self, seconds: float) -> Reply:
-        """The next reply.
+        """Wait for the next reply, at most ``seconds``.
 
         Raises:
-            DisplayError: when the reply tells of a problem, or none comes in time, or the process is gone.
+            DisplayError: when the reply reports a problem, none comes in time, or the process has ended.
         """
         try:
             line = self._lines.get(timeout=seconds)
         except queue.Empty:
-            self._process.kill()  # its late answer must not be taken for that of the next request
+            self._process.kill()  # so that a late reply is not taken as the answer to the next request
             self._process.wait()
             raise DisplayError(
-                f"Expected the panel's window to answer within {seconds:g} s, found it silent. Check that the desktop "
-                "responds, then try again: it is opened anew."
+                f"Expected the panel's window to answer within {seconds:g} s, found no answer. Check that the desktop "
+                "responds, then try again: a new window is opened."
             ) from None
         if not line:
             self._lines.put(line)
@@ -98,10 +98,10 @@ class WindowLink:
         return reply
 
     def close(self) -> None:
-        """End the process, in order if it listens, else by force."""
+        """End the process, by force if it does not end by itself."""
         assert self._process.stdin is not None
         assert self._process.stdout is not None
-        with contextlib.suppress(OSError):  # the process is gone, and with it what was still to be written
+        with contextlib.suppress(OSError):  # the process has ended, and data still to be written is lost
             self._process.stdin.close()
         try:
             self._process.wait(_END_S)

@@ -1,11 +1,11 @@
-"""What the panel's window and the program that asks for pictures say to each other; needs no SDL."""
+"""Messages between the panel's window and the program that asks for pictures; this module needs no SDL."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import Literal, final
 
-# Requests, one per line: show the picture in the shared file, show black, say whether all is still well.
+# Requests, one per line: show the picture in the shared file, show black, check that the window stayed on screen.
 Request = Literal["show", "black", "check"]
 
 
@@ -15,7 +15,7 @@ class Monitor:
     """One monitor.
 
     Attributes:
-        index: SDL's number of it, from 0.
+        index: SDL's number of the monitor, from 0.
         x: desktop column of its first pixel.
         y: desktop row of its first pixel.
         refresh_hz: 0 when not known.
@@ -32,12 +32,14 @@ class Monitor:
 @final
 @dataclass(frozen=True)
 class Job:
-    """What a window's process is started for.
+    """Task of a window's process.
 
     Attributes:
-        monitor: its number; None only lists the monitors.
-        settle_s: wait after the picture was handed to the monitor.
-        picture: file of rows x columns x 3 bytes that both processes share.
+        monitor: number of the monitor; None only lists the monitors.
+        columns: columns of the panel.
+        rows: rows of the panel.
+        settle_s: wait after the monitor received the picture.
+        picture: path of the file of rows x columns x 3 bytes that both processes use.
     """
 
     monitor: int | None = None
@@ -50,7 +52,7 @@ class Job:
 @final
 @dataclass(frozen=True)
 class Reply:
-    """The answer to one request; ``problem`` is empty when it was done."""
+    """The answer to one request; ``problem`` is empty when the request succeeded."""
 
     problem: str = ""
     monitors: tuple[Monitor, ...] = ()

@@ -1,11 +1,12 @@
 """The process that owns the panel's window: ``python -m udccal.displays.window_process JOB``.
 
-SDL wants to be used from a process's main thread (on macOS there is no other way), and a window that answers the
-desktop needs a thread that never works on anything else. A process of its own has both, whatever thread of the program
-asks, and a fault in a graphics driver ends this process, not the capture.
+SDL should be used from a process's main thread (on macOS it must be), and a window that responds to the desktop needs a
+thread that does nothing else. A separate process has both, whichever thread of the program asks. A fault in a graphics
+driver then ends this process, not the capture.
 
-It reads requests on standard input and answers each with one ``Reply``, a line of JSON; the first reply says that the
-window is open. It ends when its input ends, which also happens when the asking program dies: no picture is left behind.
+The process reads requests on standard input and answers each with one ``Reply``, a line of JSON. The first reply says
+that the window is open. The process ends when its input ends, which also happens when the asking program dies, so that
+no picture stays on screen.
 """
 
 from __future__ import annotations
@@ -39,21 +40,21 @@ _IDLE_MS = 200
 
 def main() -> None:
     """Do the job in the first argument."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the program that asks; it ends this one in order
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the asking program, which then ends this one
     job = TypeAdapter(Job).validate_json(sys.argv[1])
     with _private_output() as output:
         _answer(output, partial(_do, job, output))
 
 
 def _private_output() -> TextIO:
-    """Standard output for replies alone; what libraries print goes to standard error."""
+    """Return standard output for replies only; redirect what libraries print to standard error."""
     private = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
     return private
 
 
 def _answer(output: TextIO, work: Callable[[], Reply | None]) -> None:
-    """Do something, and send its reply or the problem it ended in."""
+    """Do some work, and send its reply or its error."""
     try:
         reply = work()
     except DisplayError as error:
@@ -114,7 +115,7 @@ def _fulfil(request: str, window: PanelWindow, picture: np.memmap, settle_s: flo
 
 
 def _listen(requests: queue.SimpleQueue[str]) -> None:
-    """Hand on the lines of standard input, then an empty one when there will be no more."""
+    """Pass on the lines of standard input, then an empty one at its end."""
     for line in itertools.chain(sys.stdin, [""]):
         requests.put(line.strip())
         pygame.event.post(pygame.event.Event(_WAKE))

@@ -1,1 +1,1 @@
-"""Files on disk: EXR, PNG, checksums, and writes that are whole or absent."""
+"""Files on disk: EXR, PNG, checksums and atomic writes."""

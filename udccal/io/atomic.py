@@ -1,4 +1,4 @@
-"""Files that are there whole or not at all: written under a temporary name, flushed to disk, then renamed."""
+"""Atomic writes: a file is written under a temporary name, flushed to disk, then renamed."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from pathlib import Path
 
 @contextmanager
 def atomic_path(path: Path) -> Iterator[Path]:
-    """A temporary name beside ``path`` to write to; on leaving without an error it is flushed and becomes ``path``.
+    """Yield a temporary name next to ``path`` to write to; on leaving without an error the file becomes ``path``.
 
-    On an error nothing is left behind, and a file that was at ``path`` before stays as it was. A link at ``path`` is
-    replaced and not followed.
+    On an error nothing is left behind, and an earlier file at ``path`` stays as it was. A link at ``path`` is replaced,
+    not followed.
     """
     temporary = path.with_name(f".{path.stem}-{secrets.token_hex(6)}.partial{path.suffix}")
-    os.close(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666))  # O_EXCL opens no link, nor what is there
+    os.close(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666))  # O_EXCL refuses links and existing files
     try:
         yield temporary
         flush(temporary)
@@ -29,13 +29,17 @@ def atomic_path(path: Path) -> Iterator[Path]:
 
 
 def write_atomically(path: Path, content: bytes) -> None:
-    """Write ``content`` to ``path`` so that no reader, and no power cut, ever meets half of it."""
+    """Write ``content`` to ``path`` so that the file is never seen half-written, even after a power cut.
+
+    Raises:
+        OSError: when it cannot be written; an earlier file at ``path`` then stays as it was.
+    """
     with atomic_path(path) as temporary:
         temporary.write_bytes(content)
 
 
 def flush(path: Path) -> None:
-    """Have a file's bytes on disk."""
+    """Flush a file's bytes to disk."""
     descriptor = os.open(path, os.O_RDWR)
     try:
         os.fsync(descriptor)
@@ -44,8 +48,8 @@ def flush(path: Path) -> None:
 
 
 def flush_folder(folder: Path) -> None:
-    """Have a folder's names on disk."""
-    if os.name != "posix":  # elsewhere a folder cannot be opened; the rename itself is all there is
+    """Flush a folder's names to disk."""
+    if os.name != "posix":  # other systems cannot open a folder
         return
     descriptor = os.open(folder, os.O_RDONLY)
     try:

@@ -18,23 +18,25 @@ from udccal.io.limits import Shape, check_size
 # Measured on 2048 x 1536 x 2 channels of noisy averages: ZIPS 0.18 s and 25.0 MB, ZIP 0.29 s and 23.7 MB,
 # PIZ 0.61 s and 21.2 MB, none 0.05 s and 25.2 MB. ZIPS is quick and still shrinks maps that are smooth or empty.
 _COMPRESSION = OpenEXR.ZIPS_COMPRESSION
-# Of what udccal writes, whose shape is known; a rendered photograph may have more.
+# Limit for files that udccal writes, whose shape is known; a rendered photograph may have more channels.
 _MOST_CHANNELS = 3
 
 
 def read_exr(path: Path, shape: Shape | None = None) -> dict[str, Float32[np.ndarray, "rows columns"]]:
     """Read every channel of a single-part EXR as float32, by name.
 
-    Where a ``shape`` (rows, columns) is given, another one, and more than three channels, are refused undecoded.
+    Args:
+        path: the file.
+        shape: expected (rows, columns); files of another shape, or with more than three channels, are not decoded.
 
     Raises:
-        FileFormatError: when the file is missing, truncated, too large, of another shape, has subsampled channels, or
-            is not finite.
+        FileFormatError: when the file is missing, truncated, too large or of another shape, or has subsampled channels
+            or values that are not finite.
     """
     try:
         names = _checked_channel_names(path, shape)
         with OpenEXR.File(str(path), separate_channels=True) as file:
-            if not file.parts:  # the library warns and goes on when pixel data cannot be decoded
+            if not file.parts:  # the library only warns when pixel data cannot be decoded
                 raise FileFormatError(_unreadable(path, "pixel data cut short or damaged"))
             channels = {name: _plane(file.channels(0)[name].pixels) for name in names}
     except (RuntimeError, ValueError, KeyError, TypeError, OSError) as error:
@@ -48,7 +50,11 @@ def read_exr(path: Path, shape: Shape | None = None) -> dict[str, Float32[np.nda
 
 
 def write_exr(path: Path, channels: Mapping[str, Float[np.ndarray, "rows columns"]]) -> None:
-    """Write named channels of one size as 32-bit floats, atomically and without loss.
+    """Write channels as 32-bit floats, atomically and compressed without loss.
+
+    Args:
+        path: the file; an earlier one is replaced.
+        channels: arrays of one size, by name.
 
     Raises:
         OSError: when the disk is full or cannot be written to.
@@ -73,7 +79,7 @@ def write_exr(path: Path, channels: Mapping[str, Float[np.ndarray, "rows columns
 
 
 def read_rgb_exr(path: Path) -> Float32[np.ndarray, "rows columns 3"]:
-    """Read the channels R, G, B; other channels (alpha, depth) are left alone.
+    """Read the channels R, G, B; other channels (alpha, depth) are ignored.
 
     Raises:
         FileFormatError: as ``read_exr``, and when one of the three is absent.
@@ -88,18 +94,26 @@ def read_rgb_exr(path: Path) -> Float32[np.ndarray, "rows columns 3"]:
 
 
 def write_rgb_exr(path: Path, picture: Float[np.ndarray, "rows columns 3"]) -> None:
-    """Write a linear RGB picture; see ``write_exr``."""
+    """Write a linear RGB picture with the channels R, G, B.
+
+    Args:
+        path: the file; an earlier one is replaced.
+        picture: linear values.
+
+    Raises:
+        OSError, FileFormatError: as ``write_exr``.
+    """
     write_exr(path, {name: picture[..., index] for index, name in enumerate("RGB")})
 
 
 def _checked_channel_names(path: Path, shape: Shape | None) -> list[str]:
-    """Channel names from the header alone, after refusing what is too large to read."""
+    """Read the channel names from the header, and refuse a file that is too large to read."""
     if not path.is_file():
         raise FileFormatError(f"Expected an EXR file at {path}, found none. Check the path.")
     with OpenEXR.File(str(path), header_only=True) as file:
         if len(file.parts) != 1:
             raise FileFormatError(_unreadable(path, f"{len(file.parts)} parts"))
-        header = dict(file.header(0))  # the file empties its own when it closes
+        header = dict(file.header(0))  # a copy: the file's own is emptied when it closes
     (left, top), (right, bottom) = header["dataWindow"]
     described = header["channels"]
     check_size(path, int(bottom) - int(top) + 1, int(right) - int(left) + 1, len(described), shape)
@@ -111,7 +125,7 @@ def _checked_channel_names(path: Path, shape: Shape | None) -> list[str]:
 
 
 def _reason(error: RuntimeError) -> int:
-    """The library says in words only why a write failed."""
+    """Return the error number of a failed write, which the library reports only in words."""
     reasons = (errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EROFS)
     return next((reason for reason in reasons if os.strerror(reason) in str(error)), errno.EIO)
 

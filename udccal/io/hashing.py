@@ -7,6 +7,6 @@ from pathlib import Path
 
 
 def sha256_file(path: Path) -> str:
-    """SHA-256 of a file's bytes as 64 lower-case hexadecimal digits; memory does not grow with the file."""
+    """Return the SHA-256 of the file at ``path`` as 64 lower-case hexadecimal digits, in constant memory."""
     with path.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()

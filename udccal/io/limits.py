@@ -1,4 +1,4 @@
-"""How large a picture file may be before it is refused, checked on the header before memory is taken."""
+"""Largest sizes of picture files, checked on the header before memory is allocated."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from udccal.errors import FileFormatError
 
 MAX_SIDE = 16384
 MAX_PIXELS = 160_000_000  # the largest sensors sold have 151 million
-MAX_SAMPLES = 2 * MAX_PIXELS  # of an average: means and variances
+MAX_SAMPLES = 2 * MAX_PIXELS  # an average has means and variances
 
 Shape = tuple[int, int]
 
@@ -17,11 +17,13 @@ def check_size(path: Path, rows: int, columns: int, channels: int = 1, shape: Sh
     """Refuse a picture that is empty or larger than any sensor, panel or atlas udccal handles, or of another shape.
 
     Args:
-        path: for the sentence. rows, columns, channels: as the file's header says.
-        shape: rows and columns that it must have, where they are known.
+        path: the file, for the message.
+        rows, columns, channels: size from the file's header.
+        shape: rows and columns that the picture must have, where they are known.
 
     Raises:
-        FileFormatError: beyond 16384 samples per side, 160 million pixels or 320 million samples, or of another shape.
+        FileFormatError: when it has more than 16384 samples per side, 160 million pixels or 320 million samples, or
+            another shape.
     """
     if shape is not None and (rows, columns) != shape:
         raise FileFormatError(

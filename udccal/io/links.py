@@ -1,6 +1,6 @@
-"""Folders that somebody else may have filled: a link below one leads wherever its maker wants it to.
+"""Checks for links in folders that somebody else may have filled, where a link could lead anywhere.
 
-Nothing is read or written through such a link. The folder itself is the user's choice and may be one.
+Nothing is read or written through such a link. The folder itself is the user's choice and may be a link.
 """
 
 from __future__ import annotations
@@ -10,15 +10,19 @@ from pathlib import Path
 
 
 def is_plain_file(root: Path, file: Path) -> bool:
-    """Whether a file is there below ``root``, and neither it nor a folder on the way to it is a link."""
+    """Return whether ``file`` exists below ``root``, and neither it nor a folder between them is a link."""
     return file.is_file() and _first_link(root, file) is None
 
 
 def refuse_links(root: Path, path: Path) -> None:
-    """Refuse a place below ``root`` that is a link or lies behind one; nothing need be there.
+    """Refuse a path that is a link or lies behind one; the path need not exist.
+
+    Args:
+        root: the folder that is trusted.
+        path: a path below ``root``.
 
     Raises:
-        OSError: when it does.
+        OSError: when ``path``, or a folder between ``root`` and it, is a link.
     """
     link = _first_link(root, path)
     if link is not None:
@@ -26,10 +30,14 @@ def refuse_links(root: Path, path: Path) -> None:
 
 
 def make_folder(root: Path, folder: Path) -> None:
-    """Make a folder below ``root``, and those on the way to it, where they are not there yet.
+    """Make a folder and its missing parents.
+
+    Args:
+        root: the folder that is trusted.
+        folder: a path below ``root``.
 
     Raises:
-        OSError: when one cannot be made, or is a link.
+        OSError: when a folder cannot be made, or is a link.
     """
     refuse_links(root, folder)
     folder.mkdir(parents=True, exist_ok=True)

@@ -18,9 +18,14 @@ _MAX_BYTES = 256 * 1024 * 1024
 
 
 def read_photograph(path: Path, gamma: float = 2.2) -> Float[np.ndarray, "rows columns 3"]:
-    """Linear RGB of a photograph: OpenEXR and Radiance as they are, 8- and 16-bit pictures raised to ``gamma``.
+    """Read a photograph as linear RGB.
 
-    Values of integer formats lie between 0 and 1; negative values of float formats become 0.
+    Args:
+        path: an OpenEXR or Radiance picture, or an 8- or 16-bit PNG or JPEG.
+        gamma: exponent that makes 8- and 16-bit values linear; OpenEXR and Radiance values are linear already.
+
+    Returns:
+        values from 0 to 1 for integer formats; negative values of float formats become 0.
 
     Raises:
         FileFormatError: when the file is missing, too large, or not a colour picture.
@@ -41,7 +46,7 @@ def read_photograph(path: Path, gamma: float = 2.2) -> Float[np.ndarray, "rows c
 
 
 def _decoded(path: Path, content: bytes) -> np.ndarray:
-    """Blue, green and red, of a file whose header and frame were looked at first."""
+    """Decode blue, green and red, after checking the file's header and chunks."""
     size = picture_size(content)
     if size is None:
         raise FileFormatError(f"Expected {path} to be a PNG, JPEG, Radiance or OpenEXR picture, found another kind.")

@@ -1,4 +1,4 @@
-"""How many pixels a JPEG, PNG or Radiance picture claims to have, read before a decoder takes memory for them."""
+"""Number of pixels in the header of a JPEG, PNG or Radiance picture, read before a decoder allocates memory."""
 
 from __future__ import annotations
 
@@ -16,8 +16,10 @@ _RADIANCE_HEADER = 8192
 
 
 def picture_size(content: bytes) -> tuple[int, int] | None:
-    """(rows, columns) by the header of a PNG, JPEG or Radiance picture (the two may be exchanged where the picture
-    lies on its side); None for other kinds and broken headers."""
+    """Return (rows, columns) from the header of a PNG, JPEG or Radiance picture; None for others and broken headers.
+
+    The two are exchanged where the picture is stored on its side.
+    """
     if content.startswith(SIGNATURE):
         return _png_size(content)
     if content.startswith(_JPEG):

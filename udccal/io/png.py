@@ -16,14 +16,14 @@ from udccal.io.limits import Shape, check_size
 from udccal.io.png_chunks import SIGNATURE, png_fault
 
 _GREY, _RGB = 0, 2
-# Neighbours in a mosaic differ by colour and noise: neither filters nor a search for repeats shrink it, they only cost
-# two thirds of the time. Level 1 shrinks pictures nearly as far as higher levels do.
+# Neighbours in a mosaic differ by colour and noise. Filters and a search for repeats do not shrink it, and take two
+# thirds of the time. Level 1 shrinks pictures nearly as far as higher levels do.
 _MOSAIC = [
     *(cv2.IMWRITE_PNG_COMPRESSION, 1),
     *(cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_HUFFMAN_ONLY),
     *(cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_NONE),
 ]
-# No PNG is much larger than its samples; texts and profiles beside them fit into a megabyte.
+# A PNG is not much larger than its samples; its texts and profiles fit into a megabyte.
 _MOST_OVERHEAD, _MOST_EXTRA = 2, 1 << 20
 _PICTURE = [cv2.IMWRITE_PNG_COMPRESSION, 1]
 
@@ -36,7 +36,11 @@ class _Header(NamedTuple):
 
 
 def read_png16(path: Path, shape: Shape | None = None) -> UInt16[np.ndarray, "rows columns"]:
-    """Read a 16-bit one-channel mosaic; of another ``shape`` (rows, columns) than the one given, it is not decoded.
+    """Read a 16-bit mosaic in DN.
+
+    Args:
+        path: the file.
+        shape: expected (rows, columns); a file of another shape is not decoded.
 
     Raises:
         FileFormatError: when the file is missing, truncated, too large, of another shape, or not 16-bit greyscale.
@@ -45,12 +49,25 @@ def read_png16(path: Path, shape: Shape | None = None) -> UInt16[np.ndarray, "ro
 
 
 def write_png16(path: Path, mosaic: UInt16[np.ndarray, "rows columns"]) -> None:
-    """Write a mosaic as 16-bit greyscale PNG, atomically and without loss."""
+    """Write a mosaic as 16-bit greyscale PNG, atomically and without loss.
+
+    Args:
+        path: the file; an earlier one is replaced.
+        mosaic: samples in DN.
+
+    Raises:
+        OSError: when the disk is full or cannot be written to.
+        FileFormatError: when the size is out of bounds.
+    """
     _write(path, mosaic, _MOSAIC)
 
 
 def read_rgb8(path: Path, shape: Shape | None = None) -> UInt8[np.ndarray, "rows columns 3"]:
-    """Read an 8-bit RGB picture, in the order R, G, B; ``shape`` as ``read_png16``.
+    """Read an 8-bit RGB picture, in the order R, G, B.
+
+    Args:
+        path: the file.
+        shape: expected (rows, columns); a file of another shape is not decoded.
 
     Raises:
         FileFormatError: when the file is missing, truncated, too large, of another shape, or not 8-bit RGB.
@@ -59,7 +76,16 @@ def read_rgb8(path: Path, shape: Shape | None = None) -> UInt8[np.ndarray, "rows
 
 
 def write_rgb8(path: Path, picture: UInt8[np.ndarray, "rows columns 3"]) -> None:
-    """Write an 8-bit picture given in the order R, G, B, atomically."""
+    """Write an 8-bit RGB picture as PNG, atomically and without loss.
+
+    Args:
+        path: the file; an earlier one is replaced.
+        picture: values in the order R, G, B.
+
+    Raises:
+        OSError: when the disk is full or cannot be written to.
+        FileFormatError: when the size is out of bounds.
+    """
     _write(path, np.ascontiguousarray(picture[..., ::-1]), _PICTURE)
 
 
@@ -93,7 +119,7 @@ def _read(path: Path, bits: int, colour: int, expected: str, shape: Shape | None
 
 
 def _checked_header(path: Path, shape: Shape | None) -> _Header:
-    """The IHDR chunk, read and bounded before the rest of the file is."""
+    """Read and check the IHDR chunk before the rest of the file is read."""
     if not path.is_file():
         raise FileFormatError(f"Expected a PNG file at {path}, found none. Check the path.")
     with path.open("rb") as stream:

@@ -1,6 +1,6 @@
-"""Whether a PNG file is whole, found out before a decoder believes it.
+"""Check that a PNG file is whole before it is decoded.
 
-Decoders take memory for a chunk as its length says, four gigabytes if need be, and fill what is missing with zeros.
+Decoders allocate as much memory as a chunk's length says, up to four gigabytes, and fill missing data with zeros.
 
 Source: Portable Network Graphics (PNG) Specification, third edition, clause 5.
 """
@@ -16,7 +16,7 @@ _CRC = struct.Struct(">I")
 
 
 def png_fault(content: bytes) -> str | None:
-    """What is wrong with the frame of a PNG file: None, or some words for a sentence that begins with "found"."""
+    """Return what is wrong with the chunks of a PNG file, in words that follow "found"; None when it is whole."""
     if not content.startswith(SIGNATURE):
         return "other content"
     place = len(SIGNATURE)

@@ -1,7 +1,7 @@
-"""Folders that are replaced whole: whatever ends the process, and whenever, the old one or the new one stands.
+"""Folders that are replaced whole: however and whenever the process ends, the old one or the new one is there.
 
-Where the system lets two names change places at once, the name is never without a folder. Elsewhere it is for a moment;
-the old folder then lies beside it, under a name that ``standing`` finds.
+Where the system can exchange two names in one step, the name always has a folder. Elsewhere it has none for a moment;
+the old folder is then next to it, under a name that ``standing`` finds.
 """
 
 from __future__ import annotations
@@ -25,12 +25,13 @@ _NOT_HERE = (errno.EINVAL, errno.ENOSYS, errno.ENOTSUP)
 
 @contextmanager
 def folder_beside(path: Path) -> Iterator[Path]:
-    """An empty folder to make in it what ``replace_whole`` puts at ``path``; what is left in it afterwards is removed.
+    """Yield an empty folder next to ``path`` for files that ``replace_whole`` will move there; then remove it.
 
-    Processes that write beside one another wait for each other, so that what lies there is of dead ones and is removed.
+    Processes that write to the same parent folder wait for each other. Leftovers found there are therefore of processes
+    that ended, and are removed.
 
     Raises:
-        OSError: when it cannot be made.
+        OSError: when the folder cannot be made.
     """
     with _alone(path.parent) as alone:
         if alone:
@@ -44,10 +45,14 @@ def folder_beside(path: Path) -> Iterator[Path]:
 
 
 def replace_whole(new: Path, path: Path) -> None:
-    """Have a finished file, or folder of files, stand at ``path``; what stood there is gone or left at ``new``.
+    """Move a finished file or folder to ``path``, in place of what is there.
+
+    Args:
+        new: a file, or a folder of files, on the same disk; an earlier folder of ``path`` is left here.
+        path: where to put it.
 
     Raises:
-        OSError: when it cannot be done; ``path`` is then as it was.
+        OSError: when it cannot be moved; ``path`` is then as it was.
     """
     for file in new.iterdir() if new.is_dir() else (new,):
         flush(file)
@@ -61,7 +66,7 @@ def replace_whole(new: Path, path: Path) -> None:
 
 
 def standing(path: Path) -> Path:
-    """Where the folder of that name is to be read: there, or where a process that ended while replacing it left it."""
+    """Return where to read the folder ``path``: there, or where a process that ended while replacing it left it."""
     left = () if os.path.lexists(path) else _beside(path, "old")
     return next(iter(left), path)
 
@@ -80,7 +85,7 @@ def _swap(new: Path, path: Path) -> None:
 
 
 def _exchange(new: Path, path: Path) -> bool:
-    """Let two names change places at once; False where the system or the disk does not know how."""
+    """Exchange two names in one step; return False where the system or the disk cannot."""
     renameat2 = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None) if sys.platform == "linux" else None
     if renameat2 is None:
         return False
@@ -93,7 +98,7 @@ def _exchange(new: Path, path: Path) -> bool:
 
 
 def _tidy(path: Path) -> None:
-    """Put back and remove what dead processes left beside ``path``."""
+    """Put back or remove what processes that ended left next to ``path``."""
     place = standing(path)
     if place != path:
         os.replace(place, path)
@@ -115,7 +120,7 @@ def _remove(path: Path) -> None:
 
 @contextmanager
 def _alone(folder: Path) -> Iterator[bool]:
-    """Wait until no other process is here with the same folder; False at once where the disk knows no locks."""
+    """Wait until no other process holds the folder, and yield True; yield False at once where the disk has no locks."""
     if os.name != "posix":
         yield False
         return

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    # Shapes and types are checked at run time by jaxtyping; a union of all of them tells a static checker nothing.
+    # jaxtyping checks shapes and types at run time; a union of all types would not help a static checker.
     Arrayish = Any
 else:
     from jaxtyping import ArrayLike as Arrayish

@@ -1,14 +1,14 @@
-"""Backscatter: what the lit panel itself sends into the lens, as a function of the picture it shows.
+"""Backscatter: the light that the lit panel sends into the lens, as a function of the picture it shows.
 
 Every panel pixel carries one small emitter per primary. A sensor pixel collects the emitters inside the pupil's
-footprint on the panel: the pupil, projected along the pixel's ray, an ellipse a few panel pixels wide. The panel is far
-out of focus, so that the footprint hardly depends on where the lens is focused. A second, fainter copy comes by
-reflection at the front face of the glass, from a plane that appears deeper. With L = (picture / 255)^gamma,
+footprint on the panel. The footprint is the pupil projected along the pixel's ray: an ellipse a few panel pixels wide.
+The panel is far out of focus, so the footprint hardly depends on where the lens is focused. The front face of the
+glass reflects a second, fainter copy, which appears to come from a deeper plane. With L = (picture / 255)^gamma,
 
     b_c(q) = mask_c(q) sum_p C[c, p] S_p(q) / sum_p C[c, p] S_p(q; white),
-    S_p(q) = sum over panel pixels of (share of emitter p inside the footprint of q) L_p.
+    S_p(q) = sum over panel pixels of (fraction of emitter p inside the footprint of q) L_p.
 
-So ``mask`` is what an all-white panel gives, in e-/s, and the fraction is a low-pass of the panel's light mixed from
+``mask`` is the rate of an all-white panel in e-/s. The quotient is a low-pass of the panel's light, mixed from
 primaries to camera colours. b is defined before multiplication by the wire: y = (x * k + b) w.
 """
 
@@ -31,18 +31,18 @@ class Backscatter(eqx.Module):
     """Panel light in the lens.
 
     Attributes:
-        geometry: where rays go.
-        mask: e-/s that an all-white panel gives, by camera colour, at the grid of ``grid_positions``.
-        mix: camera colour from primary; rows sum to 1.
+        geometry: camera geometry, which gives each pixel's ray.
+        mask: rate of an all-white panel in e-/s, by camera colour, at the grid of ``grid_positions``.
+        mix: matrix from primaries to camera colours; rows sum to 1.
         gamma: exponent of the panel's transfer curve.
-        pitch_mm: panel pixels' distance.
+        pitch_mm: distance of panel pixels.
         pupil_diameter_mm: diameter of the entrance pupil as the footprint shows it.
-        standoff_mm: from the pupil to the plane of the emitters.
-        emitters_px: (x, y) of each primary's emitter from the centre of its panel pixel.
-        softness_px: width (one sigma) of the footprint's edge, the size of an emitter included.
-        reflection: light of the reflected copy relative to the direct one.
-        reflection_mm: how much deeper the reflected copy appears.
-        columns, rows, cfa: the sensor. step: spacing of the grid in px.
+        standoff_mm: distance from the pupil to the plane of the emitters.
+        emitters_px: (x, y) of each primary's emitter from the centre of its panel pixel, in panel pixels.
+        softness_px: one sigma of the footprint's soft edge in panel pixels; it includes the size of an emitter.
+        reflection: light of the reflected copy relative to the direct light.
+        reflection_mm: additional depth at which the reflected copy appears.
+        columns, rows, cfa: size and pattern of the sensor. step: spacing of the grid in sensor px.
         window: panel pixels across the square that holds the footprint.
     """
 
@@ -65,10 +65,13 @@ class Backscatter(eqx.Module):
 
 
 class PanelResponse(eqx.Module):
-    """A term worked out for one panel size: apply it to any number of pictures with ``response_rate``.
+    """A term evaluated for one panel size; ``response_rate`` applies it to any number of pictures.
 
-    ``shares`` holds, per grid position and primary, the share of each emitter in a window; ``pixels`` its place in the
-    row-major picture; ``white`` the term's mask over the mixed white response.
+    Attributes:
+        term: the term.
+        shares: fraction of each emitter that the footprint collects, per grid position, window pixel and primary.
+        pixels: index of each window pixel in the row-major picture.
+        gain: the term's mask divided by the mixed response to white, by camera colour.
     """
 
     term: Backscatter
@@ -88,12 +91,18 @@ def grid_positions(
 def footprints(
     term: Backscatter, rays: Float[Arrayish, "n 3"], standoff_mm: Float[Arrayish, ""]
 ) -> tuple[Float[Array, "n 2"], Float[Array, "n 2 2"]]:
-    """The pupil's footprint along ``rays`` (panel coordinates) on a plane at ``standoff_mm`` from the pupil.
+    """Project the pupil along rays onto a plane parallel to the panel.
+
+    A pupil point lies at R_panel_camera (r u, 0) from the pupil's centre. A ray of slope t = (s_x, s_y) / s_z through
+    it crosses the plane at P = pupil_xy + t standoff + (R_xy - t R_z) r u.
+
+    Args:
+        term: the backscatter term.
+        rays: directions in panel coordinates.
+        standoff_mm: distance of the plane from the pupil.
 
     Returns:
-        (centre, shape) in panel pixels: the ellipse ``centre + shape @ u`` over the unit disc of u. A pupil point lies
-        at R_panel_camera (r u, 0) from the pupil's centre; a ray of slope t = (s_x, s_y) / s_z through it meets the
-        plane at P = pupil_xy + t distance + (R_xy - t R_z) r u.
+        (centre, shape) in panel pixels: the ellipse ``centre + shape @ u`` over the unit disc of u.
     """
     rays = jnp.asarray(rays)
     slopes = rays[:, :2] / rays[:, 2:]
@@ -106,10 +115,15 @@ def footprints(
 def emitter_shares(
     term: Backscatter, rays: Float[Arrayish, "n 3"], corner: Int[Arrayish, "n 2"]
 ) -> Float[Array, "n window2 3"]:
-    """Share of each emitter in a window of panel pixels that is seen along rays, direct and reflected together.
+    """Return the fraction of each emitter that the footprint collects, direct and reflected light together.
 
-    ``corner`` is the (column, row) of the window's first panel pixel. Shares are per area of the footprint in panel
-    pixels, so that they sum to about 1.
+    Args:
+        term: the backscatter term.
+        rays: directions in panel coordinates.
+        corner: (column, row) of the first panel pixel of each ray's window.
+
+    Returns:
+        fractions divided by the footprint's area in panel pixels, so that they sum to about 1 for each primary.
     """
     span = jnp.arange(term.window)
     inner = jnp.stack(jnp.meshgrid(span, span), axis=-1).reshape(-1, 2)
@@ -125,7 +139,7 @@ def _inside(
     centre: Float[Array, "n 2"],
     shape: Float[Array, "n 2 2"],
 ) -> Float[Array, "n window2 3"]:
-    """Soft indicator of the ellipse: the normal distribution of the distance from its edge (to first order)."""
+    """Soft indicator of the ellipse: the cumulative normal distribution of the first-order distance from its edge."""
     determinant = shape[:, 0, 0] * shape[:, 1, 1] - shape[:, 0, 1] * shape[:, 1, 0]
     rows = [[shape[:, 1, 1], -shape[:, 0, 1]], [-shape[:, 1, 0], shape[:, 0, 0]]]
     inverse = jnp.moveaxis(jnp.array(rows), 2, 0) / determinant[:, None, None]
@@ -138,25 +152,30 @@ def _inside(
 
 
 def window_corners(term: Backscatter, rays: Float[Arrayish, "n 3"]) -> Int[Array, "n 2"]:
-    """(column, row) of the first panel pixel of the window around each ray's footprints."""
+    """Return (column, row) of the first panel pixel of the window around the footprints of ``rays`` (panel axes)."""
     centre, _ = footprints(term, rays, term.standoff_mm + term.reflection_mm * 0.5)
     middle = centre - jnp.asarray(term.emitters_px).mean(axis=0)
     return jnp.round(middle - (term.window - 1) / 2).astype(jnp.int32)
 
 
 def panel_light(term: Backscatter, picture: Num[Arrayish, "*n 3"]) -> Float[Array, "*n 3"]:
-    """Linear light of each primary, 0 to 1, of picture values 0 to 255."""
+    """Return the linear light of each primary, 0 to 1, for picture values from 0 to 255."""
     return (jnp.asarray(picture, dtype=float) / 255.0) ** term.gamma
 
 
 def mixed_colours(term: Backscatter, primaries: Float[Array, "*n 3"]) -> Float[Array, "*n 3"]:
-    """Camera colours from primaries, as a sum: jaxlib 0.10.2 miscompiles small matrix products over long arrays."""
+    """Mix primaries to camera colours, as a sum: jaxlib 0.10.2 miscompiles small matrix products over long arrays."""
     return (primaries[..., None, :] * jnp.asarray(term.mix)).sum(axis=-1)
 
 
 @functools.partial(jax.jit, static_argnums=(1, 2))
 def panel_response(term: Backscatter, panel_rows: int, panel_columns: int) -> PanelResponse:
-    """Work a term out for a panel of that many pixels; the panel is dark beyond its edges."""
+    """Evaluate a term for a panel that is dark beyond its edges.
+
+    Args:
+        term: the backscatter term.
+        panel_rows: rows of the panel. panel_columns: columns of the panel.
+    """
     x, y = grid_positions(term.columns, term.rows, term.step)
     pixels = jnp.stack(jnp.meshgrid(x, y), axis=-1)
 
@@ -180,7 +199,7 @@ def _on_panel(
     panel_rows: int,
     panel_columns: int,
 ) -> tuple[Float[Array, "n window2 3"], Int[Array, "n window2"]]:
-    """Shares with those beyond the panel's edges taken out, and each window place's index in a row-major picture."""
+    """Set shares beyond the panel's edges to 0, and return them with each pixel's index in a row-major picture."""
     span = jnp.arange(term.window)
     columns = corner[:, 0, None, None] + span[None, None, :]
     rows = corner[:, 1, None, None] + span[None, :, None]
@@ -204,7 +223,12 @@ def response_grid(
 def response_rate(
     response: PanelResponse, picture: Num[Arrayish, "panel_rows panel_columns 3"]
 ) -> Float[Array, "rows columns"]:
-    """Mosaic of backscatter in e-/s before the wire, while the panel shows ``picture`` (0 to 255)."""
+    """Return the mosaic of backscatter in e-/s, before the wire.
+
+    Args:
+        response: the term evaluated by ``panel_response``.
+        picture: what the panel shows, RGB values from 0 to 255.
+    """
     return mosaic_of_grid(response.term, response_grid(response, picture))
 
 
@@ -212,7 +236,12 @@ def response_rate(
 def backscatter_rate(
     term: Backscatter, picture: Num[Arrayish, "panel_rows panel_columns 3"]
 ) -> Float[Array, "rows columns"]:
-    """Mosaic of backscatter in e-/s before the wire; for several pictures keep one ``panel_response``."""
+    """Return the mosaic of backscatter in e-/s, before the wire; for several pictures keep one ``panel_response``.
+
+    Args:
+        term: the backscatter term.
+        picture: what the panel shows, RGB values from 0 to 255.
+    """
     panel_rows, panel_columns = jnp.shape(picture)[:2]
     return response_rate(panel_response(term, panel_rows, panel_columns), picture)
 
@@ -227,7 +256,7 @@ def typical_rate(term: Backscatter, level: Float[Arrayish, ""]) -> Float[Array, 
 def mosaic_of_grid(
     term: Backscatter, grid: Float[Arrayish, "3 grid_rows grid_columns"]
 ) -> Float[Array, "rows columns"]:
-    """Cubic interpolation from the grid to every sample of the mosaic, each of its own colour."""
+    """Interpolate from the grid to every sample of the mosaic, each in its own colour, by cubic convolution."""
     grid = jnp.asarray(grid)
     by_column = _cubic_weights(term.columns, term.step, grid.shape[2], grid.dtype)
     by_row = _cubic_weights(term.rows, term.step, grid.shape[1], grid.dtype)
@@ -239,7 +268,7 @@ def mosaic_of_grid(
 
 
 def _cubic_weights(count: int, step: int, nodes: int, dtype: jnp.dtype) -> Float[Array, "count nodes"]:
-    """Matrix of Keys' cubic convolution (a = -1/2) from block centres to pixels; linear beyond the outermost nodes."""
+    """Matrix of Keys' cubic convolution (1981, a = -1/2) from block centres to pixels; linear beyond the last nodes."""
     position = (jnp.arange(count, dtype=dtype) + 0.5) / step - 0.5
     padded = jnp.arange(-2, nodes + 2, dtype=dtype)
     distance = jnp.abs(position[:, None] - padded)

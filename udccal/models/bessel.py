@@ -1,6 +1,6 @@
 """Bessel functions J0 and J1 of a positive argument, which JAX lacks; absolute error under 1e-7.
 
-Rational approximations below 8 and asymptotic series above: J. F. Hart et al., Computer Approximations, Wiley 1968.
+Source: J. F. Hart et al., Computer Approximations, Wiley 1968; rational approximations below 8, asymptotic ones above.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def _polynomial(coefficients: tuple[float, ...], x: Array) -> Array:
 
 
 def bessel_j0_j1(x: Float[Arrayish, "*n"]) -> tuple[Float[Array, "*n"], Float[Array, "*n"]]:
-    """(J0(x), J1(x)) for x >= 0."""
+    """Return (J0(x), J1(x)) for x >= 0."""
     x = jnp.asarray(x)
     low, high = jnp.minimum(x, 8.0), jnp.maximum(x, 8.0)
     square = low * low

@@ -1,7 +1,7 @@
 """The five terms together: y = [(x * k) + b] w + n, as expected signal and variance of every sample of a mosaic.
 
-This is the plain form of the camera, written for checking and for fits that need it whole; restoration inverts a low
-rank of the same operator.
+This is the direct form of the camera model. Tests compare with it, and fits that need the whole model use it.
+Restoration inverts a low-rank form of the same operator.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ def space_varying_blur(
     kernels: Float[Arrayish, "n 3 kernel_rows kernel_columns"],
     weights: Float[Arrayish, "n rows columns"],
 ) -> Float[Array, "rows columns 3"]:
-    """y = sum_n k_n * (weights_n x): kernels belong to the source point; light beyond the edges is lost.
+    """Blur a scene: y = sum_n k_n * (weights_n x). Kernels belong to the source point; light beyond the edges is lost.
 
     Args:
         scene: linear light of each camera colour.
-        kernels: one per field position, odd sizes, origin in the middle.
-        weights: share of each kernel at each source pixel; they sum to 1 over n.
+        kernels: one per field position, of odd size, origin in the middle.
+        weights: weight of each kernel at each source pixel; they sum to 1 over n.
     """
     scene, kernels, weights = jnp.asarray(scene), jnp.asarray(kernels), jnp.asarray(weights)
     rows, columns = scene.shape[:2]
@@ -45,14 +45,22 @@ def space_varying_blur(
 def bilinear_weights(
     x_px: Float[Arrayish, " nx"], y_px: Float[Arrayish, " ny"], rows: int, columns: int
 ) -> Float[Array, "n rows columns"]:
-    """Weights that interpolate kernels of a grid of positions (row-major) bilinearly; constant beyond the grid."""
+    """Return weights that interpolate bilinearly between kernels at a grid of positions; constant beyond the grid.
+
+    Args:
+        x_px: x of the grid's columns. y_px: y of the grid's rows.
+        rows: rows of the sensor. columns: columns of the sensor.
+
+    Returns:
+        one map per position of the grid, in row-major order.
+    """
     down = _hats(jnp.asarray(y_px), jnp.arange(rows))
     across = _hats(jnp.asarray(x_px), jnp.arange(columns))
     return (down[:, None, :, None] * across[None, :, None, :]).reshape(-1, rows, columns)
 
 
 def _hats(nodes: Float[Array, " n"], at: Int[Array, " m"]) -> Float[Array, "n m"]:
-    """Each node's share at each place, piecewise linear."""
+    """Return each node's piecewise linear weight at each place."""
     identity = jnp.eye(nodes.shape[0], dtype=nodes.dtype)
     return jax.vmap(lambda row: jnp.interp(at.astype(nodes.dtype), nodes, row))(identity)
 
@@ -63,7 +71,14 @@ def mosaic_rate(
     wire: Float[Arrayish, "rows columns"],
     channels: Int[Arrayish, "rows columns"],
 ) -> Float[Array, "rows columns"]:
-    """[(x * k) + b] w in e-/s; ``channels`` is the colour (0 = R, 1 = G, 2 = B) of each sample."""
+    """Return [(x * k) + b] w at every sample of the mosaic, in e-/s.
+
+    Args:
+        blurred: x * k in e-/s by camera colour.
+        backscatter: b in e-/s.
+        wire: w, with mean 1.
+        channels: colour of each sample: 0 = R, 1 = G, 2 = B.
+    """
     index = jnp.asarray(channels)[..., None]
     sampled = jnp.take_along_axis(jnp.asarray(blurred), index, axis=-1)[..., 0]
     return (sampled + jnp.asarray(backscatter)) * jnp.asarray(wire)
@@ -72,7 +87,13 @@ def mosaic_rate(
 def expected_frame(
     noise: Noise, rate: Float[Arrayish, "rows columns"], exposure_s: Float[Arrayish, ""]
 ) -> tuple[Float[Array, "rows columns"], Float[Array, "rows columns"]]:
-    """Mean in DN and variance in DN^2 of a frame whose samples receive ``rate`` in e-/s; clipping left out."""
+    """Return the mean in DN and the variance in DN^2 of every sample of a frame, clipping left out (EMVA 1288).
+
+    Args:
+        noise: the noise term.
+        rate: photo-electrons in e-/s.
+        exposure_s: exposure time.
+    """
     signal = jnp.asarray(rate) * exposure_s
     mean = jnp.asarray(noise.black_DN) + noise.K_DN_per_e * (signal + noise.dark_current_e_per_s * exposure_s)
     return mean, jnp.asarray(noise.K_DN_per_e) ** 2 * variance_e(noise, signal, exposure_s)

@@ -4,12 +4,12 @@ The light sent from direction cosines l0 to l has the transfer function, f in cy
 
     O(f) = sum over wavelengths of w(lambda) R(lambda f),  R(s) = sum_gh cos(2 pi (g X + h Y)) A_g(s_x) A_h(s_y) H_gh(s)
 
-with R the autocorrelation of the open part of the pupil's footprint at a lag s on the panel. A_h are the Fourier
-coefficients of a row of slits times itself moved by the lag; H_gh that of the footprint times itself moved by the lag;
-(X, Y) is where the footprint's centre lies, in pitches (Goodman, Introduction to Fourier Optics, sections 3.10, 6.3).
-The term g = h = 0 is the average over X and Y, an incoherent sum of diffraction orders; the others are the
+R is the autocorrelation of the open part of the pupil's footprint at a lag s on the panel. A_h are the Fourier
+coefficients of a row of slits times itself moved by the lag. H_gh is that of the footprint times itself moved by the
+lag. (X, Y) is the footprint's centre in pitches (Goodman, Introduction to Fourier Optics, sections 3.10, 6.3).
+The term g = h = 0 is the average over X and Y, an incoherent sum of diffraction orders. The other terms are the
 interference between neighbouring orders, which changes as the footprint slides over the rows (see ``interference``).
-Direction cosines along the panel make this exact at any angle: stretch and conical bending come with the geometry.
+Direction cosines along the panel make this exact at any angle: the geometry adds stretch and conical bending.
 """
 
 from __future__ import annotations
@@ -29,18 +29,18 @@ PUPIL_NODES = 4
 
 
 class Diffraction(eqx.Module):
-    """The few numbers behind the whole field.
+    """Parameters of the diffraction over the whole field.
 
     Attributes:
         pitch_mm: pitch of rows and columns.
         openings: open part of the (columns, rows) for a ray along the panel's normal.
-        depth_mm: depth of the opaque structure; it narrows slits by thickness * |tangent of the obliquity|.
+        depth_mm: depth of the opaque structure; it narrows slits by depth * |tangent of the obliquity|.
         pupil_diameter_mm: diameter of the entrance pupil.
         offset_periods: centre (X, Y) of the footprint of a ray along the normal, in periods from the middle of an
             opening, modulo 1.
-        standoff_per_pitch: distance from the pupil to the openings, in pitches: the centre moves by this times slope.
-        visibility: 1, or 0 to leave interference between orders out (the footprint's place is then not known).
-        blur_px: standard deviation of a Gaussian that stands for what else blurs a little.
+        standoff_per_pitch: distance from the pupil to the openings in pitches; the centre moves by this times slope.
+        visibility: 1, or 0 to leave out the interference between orders, where the footprint's place is not known.
+        blur_px: standard deviation of a Gaussian that represents all other small blur.
         wavelengths_nm: nodes of the spectra, evenly spaced.
         spectrum: light per colour channel at the nodes, linear between them; each channel sums to 1.
     """
@@ -58,12 +58,12 @@ class Diffraction(eqx.Module):
 
 
 class LocalFrame(eqx.Module):
-    """Geometry about one source.
+    """Geometry around one source.
 
     Attributes:
         direction: (l_x, l_y, l_z) of the source in panel coordinates.
         jacobian: d(l_x, l_y) / d(pixel x, y).
-        footprint: takes the unit disc of the pupil (camera x, y) to the panel plane along the source's ray.
+        footprint: matrix that takes the unit disc of the pupil (camera x, y) to the panel plane along the source's ray.
     """
 
     direction: Float[Array, "3"]
@@ -72,7 +72,7 @@ class LocalFrame(eqx.Module):
 
 
 def local_frame(geometry: Geometry, position_px: Float[Arrayish, "2"]) -> LocalFrame:
-    """Direction, scale and footprint of the pupil at a sensor position."""
+    """Return direction, scale and pupil footprint of a source imaged at ``position_px`` (x, y) by ``geometry``."""
 
     def cosines(position: Float[Array, "2"]) -> Float[Array, "3"]:
         return panel_directions(geometry, position[None])[0]
@@ -86,7 +86,7 @@ def local_frame(geometry: Geometry, position_px: Float[Arrayish, "2"]) -> LocalF
 
 
 def node_scale(frame: LocalFrame) -> Float[Array, "2"]:
-    """Direction cosines (along x, along y) per pixel at the source: the unit of the lattice about it."""
+    """Return direction cosines per pixel (along x, along y) at the source: the unit of the lattice around it."""
     return jnp.abs(jnp.diagonal(frame.jacobian))
 
 
@@ -97,9 +97,14 @@ def average_transfer(
     spectra: Float[Array, "c nodes"],
     disc_px: Float[Arrayish, ""] = 0.0,
 ) -> Float[Array, "c rows half"]:
-    """Transfer functions averaged over the footprint's place, for light of the given spectra, pixel included.
+    """Return transfer functions averaged over the footprint's place: the term g = h = 0, pixel included.
 
-    The lattice is in panel directions about the source; ``disc_px`` is the diameter of a round source on the sensor.
+    Args:
+        model: the diffraction term.
+        frame: geometry around the source.
+        lattice: lattice in panel directions around the source.
+        spectra: light at the model's wavelength nodes, one row per result.
+        disc_px: diameter of a round source on the sensor; 0 for a point.
     """
     fx, fy = lattice_frequencies(frame, lattice)
     opened = open_fractions(model, frame)
@@ -109,7 +114,13 @@ def average_transfer(
 
 
 def pupil_overlaps(model: Diffraction, frame: LocalFrame, lattice: Lattice) -> Float[Array, "anchors rows half"]:
-    """Overlap of the pupil's footprint with itself moved, at the few wavelengths that it is computed for."""
+    """Return the overlap of the pupil's footprint with itself moved, at the wavelengths of ``pupil_anchors``.
+
+    Args:
+        model: the diffraction term.
+        frame: geometry around the source.
+        lattice: lattice whose frequencies give the lags.
+    """
     lag_x, lag_y = relative_lag(model, frame, *lattice_frequencies(frame, lattice))
     distance = jnp.sqrt(lag_x**2 + lag_y**2 + 1e-30)
     anchors, _ = pupil_anchors(model)
@@ -123,7 +134,14 @@ def average_of(
     share: Float[Array, "anchors nodes"],
     spectra: Float[Array, "c nodes"],
 ) -> Float[Array, "c rows half"]:
-    """Transfer functions without the sensor; linear in the slits, in the pupil's overlaps and in the spectra."""
+    """Return transfer functions without the sensor. They are linear in every argument.
+
+    Args:
+        columns: ``slit_tables`` of the columns, order 0. rows: those of the rows.
+        pupils: overlaps from ``pupil_overlaps``.
+        share: weights from ``pupil_anchors``.
+        spectra: light at the wavelength nodes.
+    """
 
     def add(
         total: Float[Array, "c rows half"], anchor: tuple[Array, Array]
@@ -131,25 +149,25 @@ def average_of(
         pupil, own = anchor
         return total + jnp.einsum("cj,yj,xj->cyx", spectra * own, rows, columns) * pupil, None
 
-    # As a loop, before which overlaps are worked out: the compiler would do so again for every channel.
+    # A loop over overlaps computed beforehand: without it the compiler computes them again for every channel.
     return jax.lax.scan(add, jnp.zeros((spectra.shape[0], rows.shape[0], columns.shape[0])), (pupils, share))[0]
 
 
 def through_sensor(
     transfer: Float[Array, "c rows half"], sensor: Float[Array, "rows half"]
 ) -> Float[Array, "c rows half"]:
-    """Transfer functions times that of the sensor, which a loop lets be worked out only once."""
+    """Multiply each ``transfer`` by ``sensor``, from ``sensor_transfer``; the loop has it computed only once."""
     return jax.lax.map(lambda one: one * sensor, transfer)
 
 
 def lattice_frequencies(frame: LocalFrame, lattice: Lattice) -> tuple[Float[Array, " half"], Float[Array, " rows"]]:
-    """(f_x, f_y) of a lattice's spectrum, in cycles per unit direction cosine."""
+    """Return (f_x, f_y) of ``lattice`` around the source of ``frame``, in cycles per unit direction cosine."""
     scale = node_scale(frame)
     return jnp.asarray(lattice.frequency_x) / scale[0], jnp.asarray(lattice.frequency_y) / scale[1]
 
 
 def open_fractions(model: Diffraction, frame: LocalFrame) -> Float[Array, "2"]:
-    """Open part of (columns, rows) along the source's ray."""
+    """Return the open part of (columns, rows) along the ray of ``frame``'s source, as ``model`` has it."""
     shadow = model.depth_mm / model.pitch_mm * jnp.abs(frame.direction[:2] / frame.direction[2])
     return jnp.clip(jnp.asarray(model.openings) - shadow, 0.02, 1.0)
 
@@ -157,14 +175,14 @@ def open_fractions(model: Diffraction, frame: LocalFrame) -> Float[Array, "2"]:
 def relative_lag(
     model: Diffraction, frame: LocalFrame, fx: Float[Array, " half"], fy: Float[Array, " rows"]
 ) -> tuple[Float[Array, "rows half"], Float[Array, "rows half"]]:
-    """Lag of a frequency per mm of wavelength, in diameters of the pupil and in its own axes."""
+    """Return each frequency's lag (x, y) per mm of wavelength, in diameters of the pupil and along its own axes."""
     (a, b), (c, d) = frame.footprint * model.pupil_diameter_mm
     fx, fy = fx / (a * d - b * c), fy[:, None] / (a * d - b * c)
     return d * fx - b * fy, a * fy - c * fx
 
 
 def disc_autocorrelation(relative_lag: Float[Arrayish, "*n"]) -> Float[Array, "*n"]:
-    """Overlap of a disc with itself moved by ``relative_lag`` diameters, as a fraction of its area."""
+    """Return the overlap of a disc with itself moved by ``relative_lag`` diameters, as a fraction of its area."""
     inside = relative_lag < 1.0
     x = jnp.where(inside, relative_lag, 0.5)
     return jnp.where(inside, (jnp.arccos(x) - x * jnp.sqrt(1.0 - x * x)) * (2.0 / jnp.pi), 0.0)
@@ -173,10 +191,10 @@ def disc_autocorrelation(relative_lag: Float[Arrayish, "*n"]) -> Float[Array, "*
 def slit_coefficients(
     relative_lag: Float[Arrayish, "*n"], opened: Float[Arrayish, ""], highest: int
 ) -> Float[Array, "orders *n"]:
-    """Fourier coefficients of a row of slits times itself moved by ``relative_lag`` pitches; 1 for order 0 at lag 0.
+    """Return Fourier coefficients, orders 0 to highest, of a row of slits times itself moved by the lag in pitches.
 
-    Where slits meet slits N pitches away, the common openings are ``opened`` - |lag - N| wide and lie half a pitch
-    further per N. The origin is the middle of an opening. Orders are 0 to ``highest``.
+    Slits overlap those N pitches away. The common openings are ``opened`` - |lag - N| wide and lie half a pitch further
+    per N. The origin is the middle of an opening. Order 0 is 1 at lag 0.
     """
     lag = jnp.asarray(relative_lag)
     whole = jnp.floor(lag)
@@ -197,10 +215,16 @@ def slit_coefficients(
 def slit_tables(
     model: Diffraction, opened: Float[Array, ""], frequency: Float[Array, " n"], highest: int
 ) -> Float[Array, "orders n nodes"]:
-    """Slit coefficients averaged over the light of each wavelength node, for lags lambda * frequency.
+    """Return slit coefficients averaged over the light of each wavelength node, for lags lambda * frequency.
 
-    A node's light is a triangle as wide as its distance to its neighbours, summed in steps of about a nanometre: so
-    orders far out smear into a continuum as they do in daylight, without a node for every nanometre.
+    A node's light is a triangle as wide as its distance to its neighbours, summed in steps of about a nanometre. High
+    orders therefore smear into a continuum, as they do in daylight, without a node for every nanometre.
+
+    Args:
+        model: the diffraction term.
+        opened: open part of a period along the source's ray.
+        frequency: cycles per unit direction cosine.
+        highest: highest Fourier order.
     """
     nodes = jnp.asarray(model.wavelengths_nm)
     step = nodes[1] - nodes[0]
@@ -217,14 +241,14 @@ def slit_tables(
 
 
 def _fine_count(model: Diffraction) -> int:
-    """Steps from one wavelength node to the next; nodes are taken as spread over about 300 nm."""
+    """Return the steps from one wavelength node to the next, for nodes that span about 300 nm."""
     return max(2, int(np.ceil(300.0 / (np.shape(model.wavelengths_nm)[0] - 1) / _FINE_NM)))
 
 
 def pupil_anchors(model: Diffraction) -> tuple[Float[Array, " a"], Float[Array, "a nodes"]]:
-    """A few wavelengths, and the weights that interpolate a smooth function from them to the nodes.
+    """Return a few Chebyshev wavelengths in nm, and the weights that interpolate from them to ``model``'s nodes.
 
-    The footprint's autocorrelation varies so smoothly with wavelength that it is computed for the few only.
+    The footprint's autocorrelation varies smoothly with wavelength, so it is computed for these few only.
     """
     nodes = jnp.asarray(model.wavelengths_nm)
     angle = np.pi * (np.arange(PUPIL_NODES) + 0.5) / PUPIL_NODES
@@ -242,7 +266,14 @@ def sensor_transfer(
     blur_px: Float[Arrayish, ""],
     disc_px: Float[Arrayish, ""],
 ) -> Float[Array, "rows half"]:
-    """Square pixel, small Gaussian and round source, all of them round or square on the sensor."""
+    """Return the transfer function of the square pixel, the small Gaussian blur and the round source together.
+
+    Args:
+        frame: geometry around the source.
+        fx: cycles per unit direction cosine along x. fy: the same along y.
+        blur_px: standard deviation of the Gaussian.
+        disc_px: diameter of the source on the sensor; 0 for a point.
+    """
     jacobian = frame.jacobian
     nu_x = jacobian[0, 0] * fx + jacobian[1, 0] * fy[:, None]
     nu_y = jacobian[0, 1] * fx + jacobian[1, 1] * fy[:, None]
@@ -252,7 +283,7 @@ def sensor_transfer(
 
 
 def _disc_transfer(z: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """2 J1(z) / z by Gauss-Chebyshev quadrature; exact to 1e-6 for z up to 8."""
+    """Return 2 J1(z) / z by Gauss-Chebyshev quadrature; accurate to 1e-6 for z up to 8."""
     count = 8
     angle = jnp.asarray(np.pi * np.arange(1, count + 1) / (count + 1))
     weights = 2.0 / (count + 1) * jnp.sin(angle) ** 2
@@ -261,5 +292,5 @@ def _disc_transfer(z: Float[Array, "*n"]) -> Float[Array, "*n"]:
         cosine, weight = node
         return total + weight * jnp.cos(z * cosine), None
 
-    # As a loop: written out, its cosines take longer to compile than all else.
+    # As a loop: unrolled, its cosines take longer to compile than everything else.
     return jax.lax.scan(add, jnp.zeros_like(z), (jnp.cos(angle), weights))[0]

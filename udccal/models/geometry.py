@@ -1,6 +1,6 @@
 """Geometry: pinhole with Brown-Conrady distortion, the pose of the camera behind the panel, and the virtual rotation.
 
-Pixel coordinates, frames and signs are those of docs/conventions.md. All functions are pure and differentiable.
+docs/conventions.md defines pixel coordinates, frames and signs. All functions are pure and differentiable.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from udccal.models.arrays import Arrayish
 
 
 class Geometry(eqx.Module):
-    """Where rays go.
+    """Intrinsics, distortion and pose of the camera, which give the ray of every pixel.
 
     Attributes:
         focal_px: (fx, fy). principal_point_px: (cx, cy).
@@ -40,7 +40,7 @@ class VirtualView(eqx.Module):
 
 
 def rotation_matrix(vector: Float[Arrayish, "3"]) -> Float[Array, "3 3"]:
-    """Rodrigues' formula, differentiable at zero."""
+    """Return the rotation matrix of a rotation vector in rad by Rodrigues' formula, differentiable at zero."""
     x, y, z = jnp.asarray(vector)
     angle2 = x * x + y * y + z * z
     small = angle2 < 1e-12
@@ -56,7 +56,7 @@ def rotation_matrix(vector: Float[Arrayish, "3"]) -> Float[Array, "3 3"]:
 def mounting_rotation(
     tilt_rad: Float[Arrayish, ""], roll_rad: Float[Arrayish, ""], yaw_rad: Float[Arrayish, ""]
 ) -> Float[Array, "3 3"]:
-    """``R_panel_camera`` = Ry(yaw) Rx(-tilt) Rz(roll)."""
+    """Return ``R_panel_camera`` = Ry(yaw) Rx(-tilt) Rz(roll)."""
     zero = jnp.zeros_like(jnp.asarray(tilt_rad, dtype=float))
     ry = rotation_matrix(jnp.stack([zero, jnp.asarray(yaw_rad), zero]))
     rx = rotation_matrix(jnp.stack([-jnp.asarray(tilt_rad), zero, zero]))
@@ -65,13 +65,13 @@ def mounting_rotation(
 
 
 def tilt_rad(geometry: Geometry) -> Float[Array, ""]:
-    """Angle by which the camera's axis points below the panel's normal, in rad."""
+    """Return the angle in rad by which the axis of a camera of this ``geometry`` points below the panel's normal."""
     axis = rotation_matrix(geometry.rotation_rad)[:, 2]
     return jnp.arcsin(jnp.clip(axis[1], -1.0, 1.0))
 
 
 def distort(geometry: Geometry, points: Float[Arrayish, "*n 2"]) -> Float[Array, "*n 2"]:
-    """Ideal normalised image points to distorted ones (OpenCV's five-coefficient model)."""
+    """Distort ideal normalised image points (Brown-Conrady, OpenCV's five coefficients)."""
     points = jnp.asarray(points)
     k1, k2, p1, p2, k3 = jnp.asarray(geometry.distortion)
     x, y = points[..., 0], points[..., 1]
@@ -87,13 +87,13 @@ def distort(geometry: Geometry, points: Float[Arrayish, "*n 2"]) -> Float[Array,
 
 
 def stretch(geometry: Geometry, points: Float[Arrayish, "*n 2"]) -> Float[Array, "*n"]:
-    """Area after ``distort`` over area before it, at ideal normalised image points: the determinant of its slopes."""
+    """Return the area after ``distort`` over the area before it: the determinant of its Jacobian at ideal points."""
     points = jnp.asarray(points)
     k1, k2, p1, p2, k3 = jnp.asarray(geometry.distortion)
     x, y = points[..., 0], points[..., 1]
     r2 = x * x + y * y
     radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    # d(radial)/dx is 2 x slope, d(radial)/dy is 2 y slope.
+    # d(radial)/dx = 2 x slope and d(radial)/dy = 2 y slope.
     slope = k1 + r2 * (2 * k2 + r2 * 3 * k3)
     x_by_x = radial + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x
     y_by_y = radial + 2 * y * y * slope + 6 * p1 * y + 2 * p2 * x
@@ -102,20 +102,34 @@ def stretch(geometry: Geometry, points: Float[Arrayish, "*n 2"]) -> Float[Array,
 
 
 def project(geometry: Geometry, points: Float[Arrayish, "*n 3"]) -> Float[Array, "*n 2"]:
-    """Points in camera coordinates (any unit, z > 0) to sensor pixels."""
+    """Project points onto the sensor.
+
+    Args:
+        geometry: camera geometry.
+        points: (x, y, z) in camera coordinates, in any unit, z > 0.
+
+    Returns:
+        (x, y) in sensor pixels.
+    """
     points = jnp.asarray(points)
     ideal = points[..., :2] / points[..., 2:]
     return distort(geometry, ideal) * jnp.asarray(geometry.focal_px) + jnp.asarray(geometry.principal_point_px)
 
 
 def unproject(geometry: Geometry, pixels: Float[Arrayish, "*n 2"], iterations: int = 12) -> Float[Array, "*n 2"]:
-    """Sensor pixels to ideal normalised image points (x/z, y/z).
+    """Undo distortion and intrinsics by fixed-point iteration.
 
-    Fixed-point inversion of the distortion; 12 rounds leave less than 1e-9 px for distortions up to 10 %.
+    Args:
+        geometry: camera geometry.
+        pixels: (x, y) in sensor pixels.
+        iterations: rounds; 12 leave less than 1e-9 px for distortions up to 10 %.
+
+    Returns:
+        ideal normalised image points (x/z, y/z).
     """
     measured = (jnp.asarray(pixels) - jnp.asarray(geometry.principal_point_px)) / jnp.asarray(geometry.focal_px)
 
-    # A loop of the compiler's: written out, it would take most of the time that compiling a fit takes.
+    # A compiled loop: unrolled, it would take most of the compilation time of a fit.
     def closer(_: Int[Array, ""], ideal: Float[Array, "*n 2"]) -> Float[Array, "*n 2"]:
         return ideal + measured - distort(geometry, ideal)
 
@@ -123,7 +137,15 @@ def unproject(geometry: Geometry, pixels: Float[Arrayish, "*n 2"], iterations: i
 
 
 def panel_directions(geometry: Geometry, pixels: Float[Arrayish, "*n 2"]) -> Float[Array, "*n 3"]:
-    """Unit vectors in panel coordinates of the rays through sensor pixels, pointing to the viewer's side."""
+    """Return the rays through sensor pixels.
+
+    Args:
+        geometry: camera geometry.
+        pixels: (x, y) in sensor pixels.
+
+    Returns:
+        unit vectors in panel coordinates that point to the viewer's side.
+    """
     ideal = unproject(geometry, pixels)
     rays = jnp.concatenate([ideal, jnp.ones_like(ideal[..., :1])], axis=-1)
     rays = rays @ rotation_matrix(geometry.rotation_rad).T
@@ -131,10 +153,10 @@ def panel_directions(geometry: Geometry, pixels: Float[Arrayish, "*n 2"]) -> Flo
 
 
 def area_of_pixels(geometry: Geometry, pixels: Float[Arrayish, "*n 2"]) -> Float[Array, "*n"]:
-    """Area in panel direction cosines (l_x, l_y) that a square pixel at each place covers.
+    """Return the area in panel direction cosines (l_x, l_y) that a square pixel covers at each of ``pixels``.
 
-    An ideal image point at radius r sees the solid angle (1 + r^2)^(-3/2) per unit area; l_z of it falls on the plane
-    of the cosines.
+    An ideal image point at radius r sees the solid angle (1 + r^2)^(-3/2) per unit area. Projection onto the plane of
+    the cosines multiplies it by l_z.
     """
     ideal = unproject(geometry, pixels)
     rays = jnp.concatenate([ideal, jnp.ones_like(ideal[..., :1])], axis=-1)
@@ -144,26 +166,51 @@ def area_of_pixels(geometry: Geometry, pixels: Float[Arrayish, "*n 2"]) -> Float
 
 
 def panel_points_mm(geometry: Geometry, pixels: Float[Arrayish, "*n 2"]) -> Float[Array, "*n 2"]:
-    """Where the rays through sensor pixels cross the panel plane, in panel coordinates in mm."""
+    """Return the points at which the rays through sensor pixels cross the panel plane.
+
+    Args:
+        geometry: camera geometry.
+        pixels: (x, y) in sensor pixels.
+
+    Returns:
+        (x, y) in panel coordinates in mm.
+    """
     rays = panel_directions(geometry, pixels)
     pupil = jnp.asarray(geometry.pupil_mm)
     return pupil[:2] - pupil[2] * rays[..., :2] / rays[..., 2:]
 
 
 def project_directions(geometry: Geometry, directions: Float[Arrayish, "*n 3"]) -> Float[Array, "*n 2"]:
-    """Directions in panel coordinates to sensor pixels; the inverse of ``panel_directions``."""
+    """Project directions onto the sensor; the inverse of ``panel_directions``.
+
+    Args:
+        geometry: camera geometry.
+        directions: vectors of any length in panel coordinates.
+
+    Returns:
+        (x, y) in sensor pixels.
+    """
     return project(geometry, jnp.asarray(directions) @ rotation_matrix(geometry.rotation_rad))
 
 
 def view_to_sensor(geometry: Geometry, view: VirtualView, view_pixels: Float[Arrayish, "*n 2"]) -> Float[Array, "*n 2"]:
-    """Sensor pixel that each pixel of the virtual view looks at: virtual rotation and distortion in one map."""
+    """Return the sensor pixel that each pixel of a virtual view looks at: virtual rotation and distortion in one map.
+
+    Args:
+        geometry: camera geometry.
+        view: the virtual view.
+        view_pixels: (x, y) in pixels of the view.
+
+    Returns:
+        (x, y) in sensor pixels.
+    """
     plane = (jnp.asarray(view_pixels) - jnp.asarray(view.principal_point_px)) / view.focal_px
     directions = jnp.concatenate([plane, jnp.ones_like(plane[..., :1])], axis=-1)
     return project_directions(geometry, directions)
 
 
 def virtual_rotation_homography(geometry: Geometry, view: VirtualView) -> Float[Array, "3 3"]:
-    """Homography from undistorted sensor pixels to pixels of the virtual view: K_view R_panel_camera K^-1."""
+    """Return the homography from undistorted sensor pixels to pixels of a view: K_view R_panel_camera K^-1."""
     fx, fy = jnp.asarray(geometry.focal_px)
     cx, cy = jnp.asarray(geometry.principal_point_px)
     vx, vy = jnp.asarray(view.principal_point_px)

@@ -1,7 +1,7 @@
-"""Interference between neighbouring diffraction orders: what of the kernel depends on where the pupil's footprint lies.
+"""Interference between neighbouring diffraction orders: the part of the kernel that depends on the footprint's place.
 
-These are the terms of ``models.diffraction`` with (g, h) other than (0, 0). They move about one percent of the light,
-but between the orders, where little light falls, they decide how much. Only the lowest matter.
+These are the terms of ``models.diffraction`` with (g, h) other than (0, 0). They move about one percent of the light.
+Between the orders, where little light falls, they dominate. Only the lowest terms matter.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from udccal.models.diffraction import (
 )
 from udccal.models.lattice import Lattice
 
-# (g, h): periods along columns and rows. The opposite of each is contained in it.
+# (g, h): periods along columns and rows. Each term includes its opposite (-g, -h).
 TERMS = ((0.0, 1.0), (0.0, 2.0), (1.0, 0.0), (2.0, 0.0), (1.0, 1.0), (1.0, -1.0))
 _COLUMN_OF, _ROW_OF = np.abs(np.array(TERMS, dtype=np.int32)).T
 HIGHEST_ORDER = int(max(_COLUMN_OF.max(), _ROW_OF.max()))
@@ -40,7 +40,16 @@ def interference_transfer(
     overlaps: Float[Arrayish, "nodes terms rows half"],
     disc_px: Float[Arrayish, ""] = 0.0,
 ) -> Float[Array, "c rows half"]:
-    """What to add to ``average_transfer``; ``overlaps`` come from ``node_overlaps``, and hardly change in a fit."""
+    """Return the transfer functions of the interference, to be added to ``average_transfer``.
+
+    Args:
+        model: the diffraction term.
+        frame: geometry around the source.
+        lattice: lattice in panel directions around the source.
+        spectra: light at the model's wavelength nodes, one row per result.
+        overlaps: from ``node_overlaps``; they hardly change during a fit.
+        disc_px: diameter of a round source on the sensor; 0 for a point.
+    """
     fx, fy = lattice_frequencies(frame, lattice)
     opened = open_fractions(model, frame)
     columns, rows = (slit_tables(model, opened[axis], f, HIGHEST_ORDER) for axis, f in enumerate((fx, fy)))
@@ -49,12 +58,17 @@ def interference_transfer(
 
 
 def footprint_place(model: Diffraction, frame: LocalFrame) -> Float[Array, "2"]:
-    """Where the footprint's centre lies on columns and rows, in pitches."""
+    """Return the footprint's centre on columns and rows in pitches, for the source of ``frame`` and this ``model``."""
     return jnp.asarray(model.offset_periods) + model.standoff_per_pitch * frame.direction[:2] / frame.direction[2]
 
 
 def strengths(model: Diffraction, place: Float[Arrayish, "2"]) -> Float[Array, " terms"]:
-    """How strongly, and with which sign, each term shows with the footprint at a place on columns and rows."""
+    """Return the signed strength of each term: 2 visibility cos(2 pi (g X + h Y)).
+
+    Args:
+        model: the diffraction term.
+        place: (X, Y), the footprint's centre on columns and rows in pitches.
+    """
     return model.visibility * 2.0 * jnp.cos(2.0 * jnp.pi * (jnp.array(TERMS) @ jnp.asarray(place)))
 
 
@@ -65,7 +79,14 @@ def interference_of(
     overlaps: Float[Arrayish, "nodes terms rows half"],
     spectra: Float[Array, "c nodes"],
 ) -> Float[Array, "c rows half"]:
-    """Transfer functions without the sensor; linear in strengths, slits, overlaps and spectra."""
+    """Return transfer functions without the sensor. They are linear in every argument.
+
+    Args:
+        strength: from ``strengths``.
+        columns: ``slit_tables`` of the columns up to ``HIGHEST_ORDER``. rows: those of the rows.
+        overlaps: from ``node_overlaps``.
+        spectra: light at the wavelength nodes.
+    """
 
     def add(
         total: Float[Array, "c rows half"], node: tuple[Array, Array, Array, Array]
@@ -81,7 +102,14 @@ def interference_of(
 def node_overlaps(
     model: Diffraction, frame: LocalFrame, lattice: Lattice, tables: Float[Array, "terms y x"]
 ) -> Float[Array, "nodes terms rows half"]:
-    """H_gh for the wavelength of every node at every frequency of a lattice; ``tables`` from ``overlap_tables``."""
+    """Return H_gh for the wavelength of every node at every frequency of a lattice.
+
+    Args:
+        model: the diffraction term.
+        frame: geometry around the source.
+        lattice: lattice in panel directions around the source.
+        tables: from ``overlap_tables``.
+    """
     lag_x, lag_y = relative_lag(model, frame, *lattice_frequencies(frame, lattice))
     lag_x, lag_y = lag_x.astype(tables.dtype), lag_y.astype(tables.dtype)
     scales = (jnp.asarray(model.wavelengths_nm) * 1e-6).astype(tables.dtype)
@@ -89,10 +117,11 @@ def node_overlaps(
 
 
 def disc_overlap_coefficient(lag: Float[Arrayish, "*n 2"], wave: Float[Arrayish, "2"]) -> Float[Array, "*n"]:
-    """Fourier coefficient of a disc of diameter 1 times itself moved by ``lag``, at ``wave`` cycles, per disc area.
+    """Return the Fourier coefficient, per disc area, of a disc of diameter 1 times itself moved by ``lag``.
 
-    The common part is a lens of half-thickness w(t) = sqrt(1/4 - t^2) - |lag| / 2 about its long axis t; the integral
-    across it is elementary, that along it is done by Gauss-Legendre quadrature in t = t_max sin(angle).
+    ``wave`` is in cycles per diameter. The common part is a lens of half-thickness w(t) = sqrt(1/4 - t^2) - |lag| / 2
+    around its long axis t. The integral across it is elementary. The integral along it uses Gauss-Legendre quadrature
+    in t = t_max sin(angle).
     """
     lag = jnp.asarray(lag)
     lag = lag + jnp.array([1e-6, 0.0], lag.dtype)
@@ -102,7 +131,7 @@ def disc_overlap_coefficient(lag: Float[Arrayish, "*n 2"], wave: Float[Arrayish,
     along = axis[..., 0] * jnp.asarray(wave)[1] - axis[..., 1] * jnp.asarray(wave)[0]
     half = jnp.sqrt(jnp.maximum(0.25 - distance**2 / 4.0, 0.0))
     nodes, weights = np.polynomial.legendre.leggauss(_QUADRATURE)
-    # The integrand is even: half of it, twice.
+    # The integrand is even: integrate one half and double it.
     angle = jnp.asarray((nodes + 1.0) * np.pi / 4, lag.dtype)
     weight = jnp.asarray(weights * np.pi / 2, lag.dtype)
     t = half[..., None] * jnp.sin(angle)
@@ -113,8 +142,16 @@ def disc_overlap_coefficient(lag: Float[Arrayish, "*n 2"], wave: Float[Arrayish,
 
 
 def overlap_tables(model: Diffraction, frame: LocalFrame) -> Float[Array, "terms y x"]:
-    """H_gh of every term on a grid of lags: x from 0 to 1, y from -1 to 1 diameters of the pupil."""
-    # Single precision: a millionth of what is a hundredth of the light. It takes half the time.
+    """Return H_gh of every term of ``model`` around a source, on a grid of lags.
+
+    Args:
+        model: the diffraction term.
+        frame: geometry around the source.
+
+    Returns:
+        tables over lags x from 0 to 1 and y from -1 to 1 diameters of the pupil.
+    """
+    # Single precision takes half the time. Its error is a millionth of these terms, which are a hundredth of the light.
     waves = (jnp.array(TERMS) @ frame.footprint * (model.pupil_diameter_mm / model.pitch_mm)).astype(jnp.float32)
     x, y = jnp.linspace(0.0, 1.0, _TABLE + 1), jnp.linspace(-1.0, 1.0, 2 * _TABLE + 1)
     grid = jnp.stack(jnp.meshgrid(x, y), axis=-1).astype(jnp.float32)
@@ -124,7 +161,7 @@ def overlap_tables(model: Diffraction, frame: LocalFrame) -> Float[Array, "terms
 def _look_up(
     tables: Float[Array, "t y x"], lag_x: Float[Array, "rows half"], lag_y: Float[Array, "rows half"]
 ) -> Float[Array, "t rows half"]:
-    """Bilinear interpolation; a lag and its opposite give the same; none overlap from one diameter on."""
+    """Interpolate bilinearly; a lag and its opposite give the same value; discs a diameter apart do not overlap."""
     flip = jnp.where(lag_x < 0, -1.0, 1.0)
     x, y = lag_x * flip * _TABLE, (lag_y * flip + 1.0) * _TABLE
     inside = lag_x**2 + lag_y**2 < 1.0

@@ -1,7 +1,7 @@
-"""A picture given by its transfer function, evaluated at arbitrary points: one FFT and a cubic B-spline.
+"""Evaluate a picture at arbitrary points from its transfer function, by one FFT and a cubic B-spline.
 
 Cubic B-spline coefficients are the picture divided, in frequency, by the spline's own transfer function (Unser 1999,
-"Splines: a perfect fit for signal and image processing"), so the prefilter costs nothing.
+"Splines: a perfect fit for signal and image processing"), so the prefilter costs no extra transform.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from udccal.models.arrays import Arrayish
 
 @dataclass(frozen=True)
 class Lattice:
-    """``rows`` x ``columns`` nodes (both even), so many to a pixel along each axis; node (0, 0) is the origin."""
+    """``rows`` x ``columns`` nodes, both even, ``per_px_y`` and ``per_px_x`` to a pixel; node (0, 0) is the origin."""
 
     rows: int
     columns: int
@@ -36,7 +36,12 @@ class Lattice:
 
 
 def lattice_for(rows_px: float, columns_px: float, per_px_y: int, per_px_x: int) -> Lattice:
-    """The smallest lattice with sizes that a fast Fourier transform likes, at least so many pixels high and wide."""
+    """Return the smallest lattice of at least the given size whose Fourier transform is fast.
+
+    Args:
+        rows_px: height in px. columns_px: width in px.
+        per_px_y: nodes per pixel along y. per_px_x: nodes per pixel along x.
+    """
     return Lattice(_fast_even(rows_px * per_px_y), _fast_even(columns_px * per_px_x), per_px_y, per_px_x)
 
 
@@ -55,13 +60,18 @@ def _largest_prime_factor(number: int) -> int:
 
 
 def low_pass(frequency: Float[Arrayish, " n"], start: float, stop: float) -> Float[Array, " n"]:
-    """1 below ``start``, 0 above ``stop``, a raised cosine between (cycles per pixel)."""
+    """Return 1 below ``start``, 0 above ``stop`` and a raised cosine between them, in the unit of ``frequency``."""
     along = jnp.clip((jnp.abs(jnp.asarray(frequency)) - start) / (stop - start), 0.0, 1.0)
     return 0.5 + 0.5 * jnp.cos(jnp.pi * along)
 
 
 def spline_coefficients(lattice: Lattice, transfer: Float[Array, "c rows half"]) -> Float[Array, "rows columns c"]:
-    """Spline coefficients of the pictures whose real transfer functions (value at 0: their sum) are given."""
+    """Return the cubic B-spline coefficients of pictures (Unser 1999).
+
+    Args:
+        lattice: the lattice of nodes.
+        transfer: real transfer functions of the pictures; the value at frequency 0 is the picture's sum.
+    """
 
     def prefilter(cycles_per_node: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
         return (2.0 + np.cos(2 * np.pi * cycles_per_node)) / 3.0
@@ -76,10 +86,18 @@ def spline_coefficients(lattice: Lattice, transfer: Float[Array, "c rows half"])
 def sample(
     lattice: Lattice, coefficients: Float[Array, "rows columns c"], points_px: Float[Array, "n 2"]
 ) -> Float[Array, "n c"]:
-    """Density per square pixel at points (x, y) in px from the origin; zero outside the lattice.
+    """Evaluate pictures at points.
 
     A lattice repeats itself. Pictures here fall as 1/x^2 along their series of diffraction orders, so their sum over
-    all repeats is 1/sinc^2 times too high; the product with sinc^2 takes that out to first order.
+    all repeats is 1/sinc^2 times too high. The product with sinc^2 corrects that to first order.
+
+    Args:
+        lattice: the lattice of nodes.
+        coefficients: from ``spline_coefficients``.
+        points_px: (x, y) in px from the origin.
+
+    Returns:
+        density per square pixel; zero outside the lattice.
     """
     size = jnp.array([lattice.columns, lattice.rows])
     nodes = points_px * jnp.array([lattice.per_px_x, lattice.per_px_y])
@@ -99,7 +117,7 @@ def sample(
 
 
 def _cubic_b_spline(t: Float[Array, " n"]) -> Float[Array, "n 4"]:
-    """Weights of nodes -1, 0, 1, 2 at a fraction ``t`` between nodes 0 and 1."""
+    """Return the weights of nodes -1, 0, 1, 2 at a fraction ``t`` between nodes 0 and 1."""
     u = 1.0 - t
     return jnp.stack(
         [u**3 / 6.0, (4.0 - 6.0 * t**2 + 3.0 * t**3) / 6.0, (4.0 - 6.0 * u**2 + 3.0 * u**3) / 6.0, t**3 / 6.0], axis=-1

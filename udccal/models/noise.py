@@ -10,9 +10,9 @@ from udccal.models.arrays import Arrayish
 
 
 class Noise(eqx.Module):
-    """The sensor's numbers, under their EMVA 1288 and ELD names.
+    """Noise parameters of the sensor under their EMVA 1288 and ELD names.
 
-    ``sigma_d_e`` is the temporal dark noise of one frame at zero exposure without quantisation, row noise included.
+    ``sigma_d_e`` is the temporal dark noise of one frame at zero exposure. It includes row noise but not quantisation.
     """
 
     K_DN_per_e: Float[Arrayish, ""]
@@ -28,14 +28,19 @@ class Noise(eqx.Module):
 
 
 def electrons(noise: Noise, signal_DN: Float[Arrayish, "*n"]) -> Float[Array, "*n"]:
-    """Linear signal in e-: (DN - black) / K."""
+    """Return the linear signal in e-: (DN - black) / K."""
     return (jnp.asarray(signal_DN) - noise.black_DN) / noise.K_DN_per_e
 
 
 def variance_e(noise: Noise, signal_e: Float[Arrayish, "*n"], exposure_s: Float[Arrayish, ""]) -> Float[Array, "*n"]:
-    """Temporal variance in e-^2 of one sample whose mean signal (dark signal excluded) is ``signal_e``.
+    """Return the temporal variance of samples in e-^2.
 
     EMVA 1288, equation of the photon transfer curve: shot + dark current + sigma_d^2 + quantisation.
+
+    Args:
+        noise: the noise term.
+        signal_e: mean signal in e-, dark signal excluded.
+        exposure_s: exposure time.
     """
     quantisation = (noise.q_DN / noise.K_DN_per_e) ** 2 / 12.0
     shot = jnp.maximum(jnp.asarray(signal_e), 0.0)

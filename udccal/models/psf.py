@@ -1,7 +1,8 @@
 """psf: the kernel of a point source, as a field over the sensor.
 
-Two parts add up: diffraction by the panel (few parameters, exact far from the source) and a residual, an image whose
-pixels are polynomials of the field position (for whatever else blurs). The kernel belongs to the source point.
+The kernel is the sum of two parts. Diffraction by the panel has few parameters and is exact far from the source. The
+residual describes all other blur: an image whose pixels are polynomials of the field position. The kernel belongs to
+the source point.
 """
 
 from __future__ import annotations
@@ -21,13 +22,13 @@ from udccal.models.geometry import Geometry, area_of_pixels, panel_directions
 from udccal.models.interference import interference_transfer, node_overlaps, overlap_tables
 from udccal.models.lattice import Lattice, lattice_for, low_pass, sample, spline_coefficients
 
-# A kernel is a cross: along each axis, detail finer than this band (cycles per pixel) matters near the axis only.
+# A kernel is a cross: detail finer than this band (cycles per pixel) along an axis matters only near the other axis.
 _BAND = (0.8, 1.3)
 _COARSE, _MARGIN = 3, 1.25
 _FINE_PX, _FINE_BLEND_PX = 28, (10.0, 14.0)
-# Interference between orders is followed over so many (rows, columns), and left out farther away, on one lattice.
+# Interference between orders is computed on one lattice over this many (rows, columns), and left out beyond them.
 _INTERFERENCE_PX, _INTERFERENCE_PER_PX = (144, 72), 4
-# Smaller kernels are cut from one of this size: little is saved below it, and compilers are slow with tiny transforms.
+# Smaller kernels are cut from one of this size: below it little time is saved, and tiny transforms compile slowly.
 _LEAST_PX = 32
 
 
@@ -35,15 +36,15 @@ class PsfField(eqx.Module):
     """The psf term.
 
     Attributes:
-        geometry: where pixels look.
+        geometry: camera geometry, which gives each pixel's direction.
         diffraction: the panel's diffraction.
-        diffraction_fraction: 1, or 0 when the residual carries the whole kernel.
+        diffraction_fraction: 1, or 0 when the residual is the whole kernel.
         residual: coefficients of the residual image; its terms are ``fields.polynomial_basis`` of ``degree``.
-        centre_px, half_px: positions scale as (p - centre) / half for the polynomials.
-        support_px: (across, down) to either side of the source, beyond which pictures showed none of the kernel's
-            light; the sensor's size where they showed no end of it.
-        degree: of the residual's polynomials; -1 for no residual.
-        fine: lattice nodes to a pixel where detail matters; see ``fine_oversample``.
+        centre_px, half_px: the polynomials take (p - centre) / half at position p.
+        support_px: distance (across, down) from the source beyond which the captured frames showed none of the
+            kernel's light; the sensor's size where they showed light everywhere.
+        degree: degree of the residual's polynomials; -1 for no residual.
+        fine: lattice nodes per pixel where detail matters; see ``fine_oversample``.
     """
 
     geometry: Geometry
@@ -61,9 +62,12 @@ class PsfField(eqx.Module):
 def psf_kernels(
     field: PsfField, positions_px: Float[Arrayish, "n 2"], rows: int, columns: int
 ) -> Float[Array, "n 3 rows columns"]:
-    """Kernels of point sources centred on a pixel at each position, integrated over pixels; each colour sums to 1.
+    """Return the kernels of point sources, integrated over pixels; each colour sums to 1.
 
-    ``rows`` and ``columns`` are odd; the origin is the middle sample.
+    Args:
+        field: the psf term.
+        positions_px: (x, y) of each source on the sensor, which is the centre of the kernel's middle sample.
+        rows: odd number of rows. columns: odd number of columns.
     """
 
     def one(position: Float[Array, "2"]) -> Float[Array, "3 rows columns"]:
@@ -76,7 +80,12 @@ def psf_kernels(
 
 
 def fine_oversample(pupil_diameter_mm: float, focal_px: float) -> int:
-    """Nodes to a pixel that hold nearly all detail a diffraction-limited lens delivers in blue, within reason."""
+    """Return the lattice nodes per pixel, from 6 to 14, that resolve nearly all detail of an ideal lens in blue light.
+
+    Args:
+        pupil_diameter_mm: diameter of the entrance pupil.
+        focal_px: focal length.
+    """
     cycles_per_px = pupil_diameter_mm / 480e-6 / focal_px
     return min(max(2 * round(0.95 * cycles_per_px), 6), 14)
 
@@ -84,7 +93,7 @@ def fine_oversample(pupil_diameter_mm: float, focal_px: float) -> int:
 def diffraction_kernel(
     model: Diffraction, geometry: Geometry, position_px: Float[Arrayish, "2"], rows: int, columns: int, fine: int = 8
 ) -> Float[Array, "3 rows columns"]:
-    """Diffraction alone, per unit of light that falls anywhere."""
+    """Return the kernel by diffraction alone, as a fraction of all the source's light."""
     frame = local_frame(geometry, position_px)
     spectra = jnp.asarray(model.spectrum)
     y, x = jnp.meshgrid(jnp.arange(rows) - rows // 2, jnp.arange(columns) - columns // 2, indexing="ij")
@@ -106,7 +115,7 @@ def _cross(
     size_px: tuple[int, int],
     fine: int,
 ) -> Float[Array, "n c"]:
-    """Values at points of what has a transfer function, in four bands: coarse or fine along each axis."""
+    """Evaluate a transfer function's picture at points, in four bands: coarse or fine along each axis."""
     rows, columns = size_px
     values: Array | float = 0.0
     for fine_y, fine_x in itertools.product((False, True), repeat=2):
@@ -128,8 +137,14 @@ def _cross(
 def lattice_points(
     geometry: Geometry, frame: LocalFrame, position_px: Float[Arrayish, "2"], offsets_px: Float[Array, "n 2"]
 ) -> tuple[Float[Array, "n 2"], Float[Array, " n"]]:
-    """Pixels in units of the lattice about a source, and the lattice area that each covers."""
+    """Return pixels in units of the lattice around a source, and the lattice area that each covers.
 
+    Args:
+        geometry: camera geometry.
+        frame: geometry around the source.
+        position_px: (x, y) of the source on the sensor.
+        offsets_px: (x, y) of the pixels' centres from the source.
+    """
     pixels = jnp.asarray(position_px) + offsets_px
     scale = node_scale(frame)
     points = (panel_directions(geometry, pixels)[:, :2] - frame.direction[:2]) / scale
@@ -139,7 +154,7 @@ def lattice_points(
 def residual_kernel(
     field: PsfField, position_px: Float[Array, "2"], rows: int, columns: int
 ) -> Float[Array, "3 rows columns"]:
-    """The residual image at a position, cut or padded with zeros to the size asked for."""
+    """Return the residual image at a position, cut or padded with zeros to ``rows`` x ``columns``."""
     residual = jnp.asarray(field.residual)
     unit = (position_px - jnp.asarray(field.centre_px)) / jnp.asarray(field.half_px)
     image = jnp.einsum("t,tcyx->cyx", polynomial_basis(unit[None], field.degree)[0], residual)

@@ -1,6 +1,6 @@
-"""Wire: the panel's out-of-focus rows and columns over the field of view, and the shading they ride on.
+"""Wire: modulation by the panel's out-of-focus rows and columns over the field of view, times the shading.
 
-The pupil's footprint on the panel is an ellipse whose centre moves with the pixel. An even field therefore comes out as
+The pupil's footprint on the panel is an ellipse whose centre moves with the pixel. An even field therefore becomes
 
     w(q) = exp(B(q)) [1 + sum_h a_h(q) cos(phase_h(q)) + b_h(q) sin(phase_h(q))],  phase_h = 2 pi (n X + m Y)
 
@@ -10,10 +10,10 @@ amplitude is the slits' Fourier coefficient times that of the footprint: for a r
     a_h = S_m(open_y) S_n(open_x) G(z),   z = pi (D / pitch) kappa,
     G(z) = 2 J1(z) / z,   S_m(f) = 2 sin(pi m f) / (pi m f),
 
-where kappa is the length of (n, m) seen through the footprint's shape and the openings narrow with the obliquity of the
-ray because the structure has some depth. What a real pupil does differently are short Legendre series in kappa: they
-scale G, and shift its argument (z G'), for cosine and sine. Where no pupil explains the amplitudes of the strongest
-harmonics, polynomials over the sensor are added to them.
+kappa is the length of (n, m) seen through the footprint's shape. The openings narrow with the obliquity of the ray
+because the structure has some depth. Short Legendre series in kappa describe how a real pupil differs from the ideal
+one: they scale G, and shift its argument (z G'), for cosine and sine. Where no pupil explains the amplitudes of the
+strongest harmonics, polynomials over the sensor are added to them.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from udccal.models.arrays import Arrayish
 from udccal.models.bessel import bessel_j0_j1
 from udccal.models.geometry import Geometry, rotation_matrix, unproject
 
-# Whole numbers up to this may stand in ``Wire.harmonics``.
+# Largest absolute value of a number in ``Wire.harmonics``.
 HIGHEST_ORDER = 24
 _LEAST_OPEN = 0.02
 
@@ -38,21 +38,21 @@ class Wire(eqx.Module):
     """Parameters of the wire map.
 
     Attributes:
-        geometry: as fitted on its own; the wire turns it by ``rotation``.
+        geometry: the geometry term; ``rotation_rad`` turns it for the wire.
         rotation_rad: rotation vector in rad, in panel coordinates, applied after the geometry's own.
         standoff_per_pitch: distance of the entrance pupil from the openings, in panel periods.
         offset_periods: panel coordinates (X, Y) of the pupil in periods, from the centre of an opening.
         footprint_per_pitch: diameter of the footprint in periods.
         row_open, column_open: open fraction of a period along Y and X for a ray along the normal.
         depth_per_pitch: depth of the opaque structure in periods; it narrows an opening by depth |slope|.
-        harmonics: whole numbers (n, m) per harmonic: periods along X (columns) and along Y (rows).
+        harmonics: integers (n, m) per harmonic: periods along X (columns) and along Y (rows).
         frequency: (middle, half range) of kappa over the sensor, per harmonic.
         fields: coefficients by harmonic; phase (cos, sin); carrier (G, z G'); Legendre degree in kappa. The ideal
             round pupil has 1 at (cos, G, degree 0) and 0 elsewhere.
-        amplitudes: of the first harmonics, Legendre coefficients over the sensor of what is added to their amplitude;
-            by harmonic, phase (cos, sin), degree in y and in x. Mostly of no harmonic: what the pupil does is enough.
-        baseline: Legendre coefficients by degree in y and in x, over the sensor scaled to [-1, 1], of the logarithm
-            of everything in B but the mean openings.
+        amplitudes: Legendre coefficients over the sensor that are added to the amplitudes of the first harmonics, by
+            harmonic, phase (cos, sin), degree in y and in x. It is usually empty: the pupil explains the amplitudes.
+        baseline: Legendre coefficients of B without the mean openings, by degree in y and in x, over the sensor scaled
+            to [-1, 1].
     """
 
     geometry: Geometry
@@ -71,7 +71,7 @@ class Wire(eqx.Module):
 
 
 def legendre(x: Float[Arrayish, "*n"], count: int) -> Float[Array, "count *n"]:
-    """The first ``count`` Legendre polynomials at ``x``."""
+    """Return the first ``count`` Legendre polynomials at ``x``, by Bonnet's recursion."""
     x = jnp.asarray(x)
     values = [jnp.ones_like(x), x]
     for k in range(1, count - 1):
@@ -80,25 +80,35 @@ def legendre(x: Float[Arrayish, "*n"], count: int) -> Float[Array, "count *n"]:
 
 
 def panel_rotation(wire: Wire) -> Float[Array, "3 3"]:
-    """``R_panel_camera`` as the wire sees it."""
+    """Return ``R_panel_camera`` of ``wire``: the geometry's rotation followed by the wire's own."""
     return rotation_matrix(wire.rotation_rad) @ rotation_matrix(wire.geometry.rotation_rad)
 
 
 def slopes(wire: Wire, ideal: Float[Arrayish, "n 2"]) -> Float[Array, "2 n"]:
-    """Slopes (dX/dz, dY/dz) in panel coordinates of rays given by ideal normalised image points."""
+    """Return the slopes (dX/dz, dY/dz) of rays in panel coordinates.
+
+    Args:
+        wire: the wire term.
+        ideal: ideal normalised image points (x/z, y/z).
+    """
     ideal = jnp.asarray(ideal)
     rays = panel_rotation(wire) @ jnp.stack([ideal[:, 0], ideal[:, 1], jnp.ones_like(ideal[:, 0])])
     return rays[:2] / rays[2]
 
 
 def openings(wire: Wire, slope: Float[Arrayish, "2 n"]) -> Float[Array, "2 n"]:
-    """Open fraction along X and along Y for rays of these slopes."""
+    """Return the open fraction along X and along Y for rays.
+
+    Args:
+        wire: the wire term.
+        slope: slopes of the rays, from ``slopes``.
+    """
     straight = jnp.stack([jnp.asarray(wire.column_open), jnp.asarray(wire.row_open)])
     return jnp.maximum(straight[:, None] - wire.depth_per_pitch * jnp.abs(jnp.asarray(slope)), _LEAST_OPEN)
 
 
 def kappa(wire: Wire, slope: Float[Arrayish, "2 n"]) -> Float[Array, "harmonics n"]:
-    """Length of each harmonic's (n, m) seen through the footprint's shape: a pupil square to the axis, projected."""
+    """Return the length of each harmonic's (n, m) through the footprint: a pupil square to the axis, projected."""
     rotation, slope = panel_rotation(wire), jnp.asarray(slope)
     harmonics = jnp.asarray(wire.harmonics)
     sides = [harmonics @ (rotation[:2, i : i + 1] - slope * rotation[2, i]) for i in (0, 1)]
@@ -108,7 +118,7 @@ def kappa(wire: Wire, slope: Float[Arrayish, "2 n"]) -> Float[Array, "harmonics 
 def carriers(
     wire: Wire, slope: Float[Arrayish, "2 n"], seen: Float[Arrayish, "harmonics n"]
 ) -> Float[Array, "2 harmonics n"]:
-    """G and z G' of each harmonic, times the slits' coefficients."""
+    """Return G and z G' of each harmonic times the slits' coefficients, for ``seen`` = ``kappa(wire, slope)``."""
     harmonics = jnp.asarray(wire.harmonics)[:, :, None]
     slit = jnp.where(harmonics == 0, 1.0, 2.0 * jnp.sinc(harmonics * openings(wire, slope)))
     # cos(nX) cos(mY) is half the sum over (n, m) and (-n, m).
@@ -120,9 +130,14 @@ def carriers(
 
 
 def waves(wire: Wire, slope: Float[Arrayish, "2 n"]) -> Float[Array, "2 harmonics n"]:
-    """cos and sin of each harmonic's phase 2 pi (n X + m Y)."""
+    """Return cos and sin of each harmonic's phase 2 pi (n X + m Y).
+
+    Args:
+        wire: the wire term.
+        slope: slopes of the rays, from ``slopes``.
+    """
     periods = jnp.asarray(wire.offset_periods)[:, None] + wire.standoff_per_pitch * jnp.asarray(slope)
-    # Whole periods leave before single precision would feel them.
+    # Subtract whole periods, which would cost digits in single precision.
     phase = 2 * jnp.pi * (periods - jnp.round(periods))
     order = jnp.asarray(wire.harmonics)
     (cosine_x, sine_x), (cosine_y, sine_y) = (_multiples(p, o) for p, o in zip(phase, order.T, strict=True))
@@ -130,7 +145,7 @@ def waves(wire: Wire, slope: Float[Arrayish, "2 n"]) -> Float[Array, "2 harmonic
 
 
 def _multiples(phase: Float[Array, " n"], order: Float[Array, " harmonics"]) -> tuple[Array, Array]:
-    """cos and sin of ``order`` times ``phase``, from one table for all harmonics."""
+    """Return cos and sin of ``order`` times ``phase``, from one table for all harmonics."""
     multiples = jnp.arange(HIGHEST_ORDER + 1.0, dtype=phase.dtype)
     # A product with a selection matrix: many times faster on a CPU than gathering rows.
     chosen = (jnp.round(jnp.abs(order))[:, None] == multiples).astype(phase.dtype)
@@ -140,19 +155,31 @@ def _multiples(phase: Float[Array, " n"], order: Float[Array, " harmonics"]) -> 
 
 
 def field_powers(wire: Wire, seen: Float[Arrayish, "harmonics n"], degrees: int) -> Float[Array, "degrees harmonics n"]:
-    """Legendre polynomials of each harmonic's kappa over its range."""
+    """Return Legendre polynomials of each harmonic's kappa, scaled to [-1, 1] over its range.
+
+    Args:
+        wire: the wire term.
+        seen: kappa of each harmonic at each ray.
+        degrees: number of polynomials, from degree 0.
+    """
     frequency = jnp.asarray(wire.frequency)
     return legendre((jnp.asarray(seen) - frequency[:, :1]) / frequency[:, 1:], degrees)
 
 
 def modulation(wire: Wire, slope: Float[Arrayish, "2 n"], scaled: Float[Arrayish, "n 2"]) -> Float[Array, " n"]:
-    """Sum of all harmonics, for rays of these slopes at sensor positions ``scaled`` to [-1, 1]."""
+    """Return the sum of all harmonics, relative to the baseline.
+
+    Args:
+        wire: the wire term.
+        slope: slopes of the rays, from ``slopes``.
+        scaled: sensor positions, from ``scaled_positions``.
+    """
     seen = kappa(wire, slope)
     fields = jnp.asarray(wire.fields)
     powers = field_powers(wire, seen, fields.shape[-1])
     carrier, wave = carriers(wire, slope, seen), waves(wire, slope)
     total = jnp.zeros_like(seen)
-    # Written out over the few phases, carriers and degrees: the compiler makes one fast loop of it.
+    # Unrolled over the few phases, carriers and degrees: the compiler fuses it into one fast loop.
     for p, c in ((0, 0), (0, 1), (1, 0), (1, 1)):
         series = sum(fields[:, p, c, d, None] * powers[d] for d in range(fields.shape[-1]))
         total = total + series * carrier[c] * wave[p]
@@ -162,7 +189,7 @@ def modulation(wire: Wire, slope: Float[Arrayish, "2 n"], scaled: Float[Arrayish
 def _beside_the_pupil(
     wire: Wire, wave: Float[Array, "2 harmonics n"], scaled: Float[Array, "n 2"]
 ) -> Float[Array, " n"] | float:
-    """The harmonics whose amplitudes have a part that is a polynomial over the sensor: that part."""
+    """Sum the polynomial parts of the strongest harmonics' amplitudes, which no pupil explains."""
     strongest, _, count_y, count_x = jnp.shape(wire.amplitudes)
     if strongest == 0:
         return 0.0
@@ -171,7 +198,13 @@ def _beside_the_pupil(
 
 
 def log_baseline(wire: Wire, scaled: Float[Arrayish, "n 2"], slope: Float[Arrayish, "2 n"]) -> Float[Array, " n"]:
-    """B at sensor positions ``scaled`` to [-1, 1]."""
+    """Return B, the logarithm of the baseline.
+
+    Args:
+        wire: the wire term.
+        scaled: sensor positions, from ``scaled_positions``.
+        slope: slopes of the rays, from ``slopes``.
+    """
     scaled = jnp.asarray(scaled)
     count_y, count_x = jnp.shape(wire.baseline)
     in_x, in_y = legendre(scaled[:, 0], count_x), legendre(scaled[:, 1], count_y)
@@ -180,12 +213,23 @@ def log_baseline(wire: Wire, scaled: Float[Arrayish, "n 2"], slope: Float[Arrayi
 
 
 def scaled_positions(pixels: Float[Arrayish, "n 2"], rows: int, columns: int) -> Float[Array, "n 2"]:
-    """Sensor pixels to [-1, 1] in both directions."""
+    """Scale sensor pixels to [-1, 1] in both directions.
+
+    Args:
+        pixels: (x, y) in px.
+        rows: rows of the sensor. columns: columns of the sensor.
+    """
     return 2 * jnp.asarray(pixels) / jnp.array([columns - 1.0, rows - 1.0]) - 1
 
 
 def wire_values(wire: Wire, pixels: Float[Arrayish, "n 2"], rows: int, columns: int) -> Float[Array, " n"]:
-    """The map at given pixels of a sensor of ``rows`` x ``columns``."""
+    """Return the wire w at pixels, with mean 1 over the sensor.
+
+    Args:
+        wire: the wire term.
+        pixels: (x, y) in px.
+        rows: rows of the sensor. columns: columns of the sensor.
+    """
     slope = slopes(wire, unproject(wire.geometry, pixels))
     scaled = scaled_positions(pixels, rows, columns)
     return jnp.exp(log_baseline(wire, scaled, slope)) * (1 + modulation(wire, slope, scaled))
@@ -193,10 +237,15 @@ def wire_values(wire: Wire, pixels: Float[Arrayish, "n 2"], rows: int, columns: 
 
 @functools.partial(jax.jit, static_argnames=("rows", "columns"))
 def wire_map(wire: Wire, rows: int, columns: int) -> Float[Array, "rows columns"]:
-    """The multiplicative map of the whole sensor, mean 1: lens shading, panel transmission and modulation together."""
+    """Return the map of the whole sensor, mean 1: lens shading, panel transmission and modulation together.
+
+    Args:
+        wire: the wire term.
+        rows: rows of the sensor. columns: columns of the sensor.
+    """
     x = jnp.arange(columns, dtype=float)
 
-    # Row by row: a hundred harmonics of one row stay in the processor's cache, and memory stays small.
+    # Row by row: a hundred harmonics of one row fit into the processor's cache, and memory stays small.
     def one_row(y: Float[Array, ""]) -> Float[Array, " columns"]:
         return wire_values(wire, jnp.stack([x, jnp.full_like(x, y)], axis=-1), rows, columns)
 

@@ -1,4 +1,4 @@
-"""A profile as one zip file: a flat list of files, refused before unpacking when it could do harm."""
+"""A profile as one zip file: a flat list of files, checked before unpacking."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ _ENTRY = re.compile(r"(profile\.json|[a-z][a-z0-9_]{0,95}\.exr)")
 _MAX_ENTRIES = 256
 _MAX_TOTAL_BYTES = 1024 * 1024 * 1024
 _CHUNK = 1024 * 1024
-# What a profile needs, and what zipfile unpacks in bounded pieces: of the other kinds it takes each piece whole.
+# The methods a profile needs. zipfile unpacks them in bounded pieces; other methods it may unpack whole.
 _KINDS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
-# Of the list of files at the archive's end, which zipfile reads whole (APPNOTE 6.3.10, sections 4.3.15 and 4.3.16).
+# Bound of the list of files at the archive's end, which zipfile reads whole (APPNOTE 6.3.10, 4.3.15 and 4.3.16).
 _MAX_LIST_BYTES = 1024 * 1024
 _END = struct.Struct("<4s8xI4x2s")
 _END_SIGNATURE, _LARGE_SIGNATURE, _NO_COMMENT = b"PK\5\6", b"PK\6\7", b"\0\0"
@@ -25,7 +25,7 @@ _LARGE_BYTES = 20
 
 
 def pack_archive(folder: Path, path: Path) -> None:
-    """Write the files of a profile's folder to one new zip file. EXR files are compressed already and only stored."""
+    """Write the files of a profile's folder to one new zip file. EXR files are already compressed and are stored."""
     files = sorted(folder.iterdir())
     with zipfile.ZipFile(path, "x") as archive:
         for file in files:
@@ -37,8 +37,8 @@ def unpack_archive(path: Path, folder: Path) -> None:
     """Unpack a profile's zip file into an empty folder.
 
     Raises:
-        ProfileError: when it is no zip file, damaged, holds a name that no profile has (folders, ``..``, absolute
-            paths, links), or would unpack to more than a profile can hold.
+        ProfileError: when the file is damaged or not a zip file, holds a name that no profile has (folders, ``..``,
+            absolute paths, links), or would unpack to more than a profile can hold.
     """
     try:
         _check_list(path)
@@ -59,37 +59,41 @@ def _check_list(path: Path) -> None:
     if signature != _END_SIGNATURE or comment != _NO_COMMENT:
         raise zipfile.BadZipFile("no list of files at its end")
     if size > _MAX_LIST_BYTES or tail.startswith(_LARGE_SIGNATURE):
-        raise ProfileError(f"Expected a short list of files in {path}, found a large one. It is not ours.")
+        raise ProfileError(f"Expected a short list of files in {path}, found a large one. It is not a profile.")
 
 
 def _check_entries(path: Path, entries: list[zipfile.ZipInfo]) -> None:
     if len(entries) > _MAX_ENTRIES:
-        raise ProfileError(f"Expected at most {_MAX_ENTRIES} files in {path}, found {len(entries)}. It is not ours.")
+        raise ProfileError(
+            f"Expected at most {_MAX_ENTRIES} files in {path}, found {len(entries)}. It is not a profile."
+        )
     names = [entry.filename for entry in entries]
     strange = [name for name in names if not _ENTRY.fullmatch(name)]
     if strange or len(set(names)) != len(names):
         found = f"'{strange[0]}'" if strange else "a name twice"
-        raise ProfileError(f"Expected only profile.json and EXR files in {path}, found {found}. It is not ours.")
+        raise ProfileError(f"Expected only profile.json and EXR files in {path}, found {found}. It is not a profile.")
     for entry in entries:
         most = MAX_JSON_BYTES if entry.filename == PROFILE_NAME else MAX_FILE_BYTES
         if entry.file_size > most or entry.compress_type not in _KINDS:
             raise ProfileError(
                 f"Expected '{entry.filename}' in {path} to unpack to at most {most} bytes, stored or deflated, found "
-                f"{entry.file_size} bytes coded by method {entry.compress_type}. It is not ours."
+                f"{entry.file_size} bytes coded by method {entry.compress_type}. It is not a profile."
             )
     total = sum(entry.file_size for entry in entries)
     if total > _MAX_TOTAL_BYTES:
         raise ProfileError(
-            f"Expected {path} to unpack to at most {_MAX_TOTAL_BYTES} bytes, found {total}. It is not ours."
+            f"Expected {path} to unpack to at most {_MAX_TOTAL_BYTES} bytes, found {total}. It is not a profile."
         )
 
 
 def _unpack_entry(path: Path, archive: zipfile.ZipFile, entry: zipfile.ZipInfo, target: Path) -> None:
-    """Unpack one file, never past the size it claims: the claim, not the content, has been checked."""
+    """Unpack one file, and refuse content beyond the size in its header, which is all that was checked before."""
     left = entry.file_size
     with archive.open(entry) as source, target.open("xb") as sink:
         while chunk := source.read(_CHUNK):
             left -= len(chunk)
             if left < 0:
-                raise ProfileError(f"Expected '{entry.filename}' in {path} to have the size it states. Copy it again.")
+                raise ProfileError(
+                    f"Expected '{entry.filename}' in {path} to have the size in its header, found more. Copy it again."
+                )
             sink.write(chunk)

@@ -1,4 +1,4 @@
-"""Arrays in EXR files: exact in float64, and to be looked at in any EXR viewer.
+"""Arrays in EXR files: exact in float64, and viewable in any EXR viewer.
 
 A float64 is written as up to three float32 channels that sum to it: 3 x 24 bits hold its 53. Magnitudes below about
 1e-22 keep an absolute accuracy of 1e-45 instead.
@@ -27,22 +27,22 @@ _DTYPES = {name: np.dtype(name) for name in get_args(DType)}
 
 
 def fits_inline(array: Shaped[np.ndarray, "..."]) -> bool:
-    """Whether an array is small enough to stand in profile.json (an empty one always does)."""
+    """Return whether an array is small enough for profile.json (an empty one always is)."""
     return array.size <= INLINE_VALUES
 
 
 def inline(name: str, array: Shaped[np.ndarray, "..."], unit: str, sigma: tuple[float, ...] | None) -> Numbers:
-    """A small array as JSON. Python writes a float with the digits that read back as the same float."""
+    """Return a small array as JSON. Python writes a float with enough digits to read back the same float."""
     _check_storable(name, array)
     values = tuple(float(v) for v in array.ravel())
     return Numbers(name=name, dtype=_dtype_name(array), shape=array.shape, value=values, unit=unit, sigma=sigma)
 
 
 def from_inline(stored: Numbers) -> Shaped[np.ndarray, "..."]:
-    """The array of ``inline``.
+    """Return the array that ``inline`` stored.
 
     Raises:
-        ProfileError: when shape and number of values disagree.
+        ProfileError: when the number of values does not fit the shape.
     """
     if math.prod(stored.shape) != len(stored.value):
         raise ProfileError(
@@ -70,7 +70,7 @@ def store(folder: Path, file: str, name: str, array: Shaped[np.ndarray, "..."], 
 
 
 def load(folder: Path, stored: StoredArray) -> Shaped[np.ndarray, "..."]:
-    """Read an array of ``store``.
+    """Read an array that ``store`` wrote.
 
     Raises:
         ProfileError: when the file is missing, altered, too large or of another shape.
@@ -93,17 +93,19 @@ def load(folder: Path, stored: StoredArray) -> Shaped[np.ndarray, "..."]:
 def read_checked(
     folder: Path, file: str, sha256: str, shape: Shape | None = None
 ) -> Mapping[str, Float[np.ndarray, "rows columns"]]:
-    """The channels of an EXR file of a profile, once its size, checksum and (rows, columns) are right.
+    """Read the channels of an EXR file of a profile after checking its size, checksum and (rows, columns).
 
     Raises:
-        ProfileError: when it is missing, a link, too large, altered, of another shape, or no EXR file.
+        ProfileError: when it is missing, a link, too large, altered, of another shape, or not an EXR file.
     """
     path = folder / file
     if not is_plain_file(folder, path):
         raise ProfileError(f"Expected the file {file} in {folder}, found none. Copy the whole profile again.")
     size = path.stat().st_size
     if size > MAX_FILE_BYTES:
-        raise ProfileError(f"Expected {path} to hold at most {MAX_FILE_BYTES} bytes, found {size}. It is not ours.")
+        raise ProfileError(
+            f"Expected {path} to hold at most {MAX_FILE_BYTES} bytes, found {size}. It does not belong to a profile."
+        )
     found = sha256_file(path)
     if found != sha256:
         raise ProfileError(
@@ -117,8 +119,8 @@ def read_checked(
 
 
 def _shaped(values: Float[np.ndarray, "..."], stored: Numbers | StoredArray) -> Shaped[np.ndarray, "..."]:
-    """Values in the stored shape and type, as far as both can hold them."""
-    # An empty array may name any sizes beside its zero; numpy takes them up to a point.
+    """Return values in the stored shape and type, after checking that both can hold them."""
+    # An empty array may have any other sizes next to its zero; numpy accepts them only up to a limit.
     sizes = math.prod(size for size in stored.shape if size)
     with np.errstate(invalid="ignore", over="ignore"):
         typed = values.astype(_DTYPES[stored.dtype])

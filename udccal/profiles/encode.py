@@ -1,4 +1,4 @@
-"""Between a profile in memory and its stored form in a folder."""
+"""Conversion between a profile in memory and its stored form in a folder."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ from udccal.result import FitResult
 from udccal.sessions.schema import TermName
 
 Channels = Mapping[str, Float[np.ndarray, "rows columns"]]
-# What maps can hold: the wire as a factor, backscatter in e-/s, kernels that sum to 1.
+# Ranges of the maps: the wire as a factor, backscatter in e-/s, kernels that sum to 1.
 _WIRE_RANGE, _RATE_RANGE, _KERNEL_RANGE = (1e-4, 1e4), (-1e10, 1e10), (-10.0, 10.0)
 
 
 def encode(profile: Profile, folder: Path) -> StoredProfile:
-    """Write a profile's arrays to ``folder`` and return what belongs into ``profile.json``."""
+    """Write a profile's arrays to ``folder`` and return the content of ``profile.json``."""
     shared = profile.geometry.term
     return StoredProfile(
         format=FORMAT,
@@ -54,10 +54,10 @@ def encode(profile: Profile, folder: Path) -> StoredProfile:
 
 
 def decode(stored: StoredProfile, folder: Path) -> Profile:
-    """The profile of a stored form and the arrays beside it.
+    """Build the profile from its stored form and the arrays in ``folder``.
 
     Raises:
-        ProfileError: when a file or a value is not in order.
+        ProfileError: when a file is missing or altered, or a value is invalid.
     """
     camera = stored.rig.camera
     geometry = _load_section(stored, "geometry", Geometry, folder, None)
@@ -119,7 +119,7 @@ def _store_pictures(profile: Profile, folder: Path) -> tuple[StoredPicture, ...]
             atlas,
             "1",
             f"Kernels at {ATLAS_COLUMNS} x {ATLAS_ROWS} field positions, from 5 % to 95 % of the sensor's width and "
-            "height, tiled as they lie on the sensor. Look at it with the exposure raised.",
+            "height, tiled as they lie on the sensor. Raise the exposure to view it.",
         ),
         _store_picture(
             folder,

@@ -1,4 +1,4 @@
-"""The evidence of a fit, to the profile and back."""
+"""Conversion of a fit's evidence to and from its stored form."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from udccal.result import Candidate, Diagnostic, Estimate, FitResult, FitStatus
 
 
 def store_fit(result: FitResult, section: str, folder: Path) -> StoredFit:
-    """A fit's evidence without its term.
+    """Return the stored form of a fit's evidence, without its term.
 
     Raises:
         ProfileError: when a number is not finite.
@@ -39,10 +39,10 @@ def store_fit(result: FitResult, section: str, folder: Path) -> StoredFit:
 
 
 def load_fit(name: str, stored: StoredFit, term: Any, folder: Path) -> FitResult:
-    """The fit result of a stored section.
+    """Return the fit result of a stored section.
 
     Raises:
-        ProfileError: when the status is unknown or the covariance's file is not in order.
+        ProfileError: when the status is unknown, or the covariance is missing, altered or not square.
     """
     if stored.status not in FitStatus.__members__:
         known = ", ".join(FitStatus.__members__)

@@ -1,8 +1,8 @@
-"""Terms to stored parameters and back, by the names of their fields.
+"""Conversion of terms to and from stored parameters, by the names of their fields.
 
-It works on any dataclass of arrays, numbers, orders, tuples and further dataclasses of ``udccal.models``; a term that
-gains a field needs no change here. Classes are looked up among those that the term's own module names: nothing in a
-file decides what code runs.
+It works on any dataclass of arrays, numbers, orders, tuples and further dataclasses of ``udccal.models``. A term that
+gains a field needs no change here. Classes are looked up among the names in the term's own module, so that nothing in a
+file decides which code runs.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from udccal.result import Estimate
 
 @dataclass(frozen=True)
 class Packed:
-    """A term as it is stored."""
+    """The stored form of a term."""
 
     parameters: tuple[Parameter, ...]
     arrays: tuple[StoredArray, ...]
@@ -35,8 +35,8 @@ class Packed:
 def pack(term: Any, section: str, estimates: tuple[Estimate, ...], folder: Path, geometry: Geometry | None) -> Packed:
     """Store a term; large arrays become files in ``folder`` whose names begin with ``section``.
 
-    A nested Geometry that equals ``geometry`` becomes a reference to the geometry section. Where an estimate carries a
-    field's name, the field carries its sigma.
+    A nested Geometry that equals ``geometry`` becomes a reference to the geometry section. A field with the name of an
+    estimate is stored with the estimate's sigma.
     """
     parameters: list[Parameter] = []
     files: list[StoredArray] = []
@@ -79,10 +79,10 @@ def pack(term: Any, section: str, estimates: tuple[Estimate, ...], folder: Path,
 
 
 def unpack(packed: Packed, kind: type, folder: Path, geometry: Geometry | None) -> Any:
-    """The term of class ``kind`` that ``pack`` stored.
+    """Return the term of class ``kind`` that ``pack`` stored.
 
     Raises:
-        ProfileError: when a field is missing, unknown, of the wrong sort, or an array's file is not in order.
+        ProfileError: when a field is missing, unknown or of the wrong type, or an array's file is missing or altered.
     """
     stored = {parameter.name: parameter for parameter in (*packed.parameters, *packed.arrays)}
     allowed = _classes_beside(kind)
@@ -118,8 +118,8 @@ def unpack(packed: Packed, kind: type, folder: Path, geometry: Geometry | None) 
     unknown = sorted(set(stored) - used)
     if unknown:
         raise ProfileError(
-            f"Expected only parameters that {kind.__name__} has, found also '{unknown[0]}'. Update udccal, or restore "
-            "the profile from a copy."
+            f"Expected only parameters of {kind.__name__}, found '{unknown[0]}' too. Update udccal, or restore the "
+            "profile from a copy."
         )
     return term
 
@@ -135,7 +135,7 @@ def _construct(cls: Callable[..., Any], fields: dict[str, Any]) -> Any:
 
 
 def _classes_beside(kind: type) -> dict[str, type]:
-    """Dataclasses of ``udccal.models`` (or of the term's own module) that the term's module names."""
+    """Return the dataclasses of ``udccal.models``, or of the term's own module, that the term's module names."""
     names = vars(sys.modules[kind.__module__])
     return {
         name: value
@@ -149,7 +149,7 @@ def _classes_beside(kind: type) -> dict[str, type]:
 def _shared(geometry: Geometry | None, name: str) -> Geometry:
     if geometry is None:
         raise ProfileError(
-            f"Expected '{name}' to stand on its own, found a reference. Restore the profile from a copy."
+            f"Expected '{name}' to be stored itself, found a reference. Restore the profile from a copy."
         )
     return geometry
 

@@ -1,4 +1,4 @@
-"""Maps evaluated from the terms: stored to be looked at, and so that restoration need not evaluate them again."""
+"""Maps evaluated from the terms. They are stored for viewing, and so that restoration need not evaluate them."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ _INSET = 0.05
 
 @in_float64
 def backscatter_mask(term: Backscatter, rig: RigDescription) -> Float32[np.ndarray, "half_rows half_columns 3"]:
-    """Backscatter of an all-white panel in e-/s before the wire, one sample per 2 x 2 cell and channel."""
+    """Return the backscatter of an all-white panel in e-/s before the wire, one sample per 2 x 2 cell and channel."""
     white = np.full((rig.panel.rows, rig.panel.columns, 3), 255, dtype=np.uint8)
     mosaic = np.asarray(backscatter_rate(term, white), dtype=np.float64)
     return cfa_named(rig.camera.cfa).cell_means(mosaic).astype(np.float32)
 
 
 def psf_atlas(term: PsfField, rig: RigDescription) -> Mapping[str, Float32[np.ndarray, "rows columns"]]:
-    """Kernels on a grid of field positions, tiled as the positions lie on the sensor; channels R, G, B."""
+    """Return kernels on a grid of field positions, tiled as the positions lie on the sensor; channels R, G, B."""
     x = np.linspace(_INSET, 1 - _INSET, ATLAS_COLUMNS) * (rig.camera.columns - 1)
     y = np.linspace(_INSET, 1 - _INSET, ATLAS_ROWS) * (rig.camera.rows - 1)
     rows, columns = fitted_size(term, rig)

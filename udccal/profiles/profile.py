@@ -1,4 +1,4 @@
-"""A profile in memory: what a rig was measured to be, with the evidence."""
+"""A profile in memory: the measured terms of a rig, with the evidence."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from udccal.result import FitResult
 from udccal.rig import RigDescription
 from udccal.sessions.schema import TermName
 
-# A person reads these in profile.json and in the report; each names something that happens to a rig.
+# Sentences in profile.json and in the report; each names a change of the rig.
 INVALIDATED_BY = (
     "The lens was refocused, its aperture changed, or it was exchanged: geometry, wire and psf are stale.",
-    "The camera moved against the panel, be it by a fraction of a millimetre: wire and backscatter are stale.",
+    "The camera moved against the panel, even by a fraction of a millimetre: wire and backscatter are stale.",
     "The camera was turned against the panel: geometry, wire, psf and backscatter are stale.",
     "The panel was exchanged: wire, psf and backscatter are stale.",
     "The panel's brightness, gamma or colour settings changed: backscatter is stale.",
@@ -34,12 +34,13 @@ class Profile:
     """One rig as measured.
 
     Attributes:
-        rig: what it was built to be.
-        provenance: where the numbers come from. parent: SHA-256 of the profile it was derived from, or None.
+        rig: the rig description: what it was built to be.
+        provenance: where the numbers come from.
+        parent: SHA-256 of the profile that this one was derived from, or None.
         noise, geometry, wire, psf, backscatter: the terms with their evidence.
         wire_map: the wire at every pixel of the sensor, mean 1. Restoration divides by it.
         backscatter_mask: backscatter of an all-white panel in e-/s, one sample per 2 x 2 cell and channel.
-        invalidated_by: what makes the profile stale, in sentences.
+        invalidated_by: sentences that say which changes make the profile stale.
     """
 
     rig: RigDescription
@@ -55,7 +56,7 @@ class Profile:
     invalidated_by: tuple[str, ...] = INVALIDATED_BY
 
     def result(self, term: TermName) -> FitResult:
-        """The fit of a term by its name."""
+        """Return the fit of a term by its name."""
         results: dict[TermName, FitResult] = {
             "noise": self.noise,
             "geometry": self.geometry,
@@ -77,10 +78,17 @@ def build_profile(
     wire_map: Float[np.ndarray, "rows columns"],
     parent: str | None = None,
 ) -> Profile:
-    """A profile from five fits and the fitted wire's map; evaluates the other maps that are stored with it.
+    """Make a profile from five fits, and evaluate the maps that are stored with it.
+
+    Args:
+        rig: the rig description.
+        provenance: where the numbers come from.
+        noise, geometry, wire, psf, backscatter: the fits.
+        wire_map: the fitted wire at every pixel of the sensor, mean 1.
+        parent: SHA-256 of the profile that this one is derived from, or None.
 
     Raises:
-        FitError: with the advice of the first fit that ended in a bad status.
+        FitError: when a fit cannot be used, with the advice of its status.
     """
     for result in (noise, geometry, wire, psf, backscatter):
         result.or_raise()

@@ -19,7 +19,12 @@ MAX_JSON_BYTES = 32 * 1024 * 1024
 
 
 def provenance_now(session_manifest: Path | None, camera: StoredCamera | None) -> Provenance:
-    """The provenance of a profile made by this process, now, from a session (or from none)."""
+    """Return the provenance of a profile that this process makes now.
+
+    Args:
+        session_manifest: ``session.json`` of the session, or None without a session.
+        camera: the camera that took the session, or None.
+    """
     return Provenance(
         created_at=datetime.now(UTC).isoformat(timespec="seconds"),
         udccal=__version__,
@@ -33,7 +38,7 @@ def provenance_now(session_manifest: Path | None, camera: StoredCamera | None) -
 
 
 def portable_command(arguments: list[str]) -> str:
-    """A command line in which absolute paths are cut down to their last name: it says nothing about the machine."""
+    """Return a command line with absolute paths cut to their last name, so that it says nothing about the machine."""
 
     def portable(argument: str) -> str:
         option, equals, value = argument.partition("=")
@@ -45,5 +50,5 @@ def portable_command(arguments: list[str]) -> str:
 
 
 def profile_sha256(folder: Path) -> str:
-    """The hash by which a derived profile names this one: of ``profile.json``, which holds all other checksums."""
+    """Return the SHA-256 of ``profile.json``, which holds all other checksums; a derived profile names it as parent."""
     return hashlib.sha256((folder / PROFILE_NAME).read_bytes()).hexdigest()

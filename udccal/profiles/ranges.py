@@ -1,7 +1,7 @@
-"""What the numbers of a term can be: by field, what a fit can choose and what is physically sensible, and no more.
+"""Ranges of the numbers of a term: every value that a fit can choose and that is physically sensible.
 
-A profile is a file like any other: its numbers size arrays, divide, and decide how long restoration works. All of them
-are looked at when a profile is read; beside each field's own range there are those that one number sets another.
+A profile is a file like any other. Its numbers set the sizes of arrays, occur in divisions, and determine how long
+restoration takes. All of them are checked when a profile is read: each against its own range, and some against others.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from udccal.models.wire import HIGHEST_ORDER, Wire
 from udccal.rig import RigDescription
 
 _ADVICE = "Restore the profile from a copy, or calibrate the rig again."
-# Shares of emitters that a term may hold: two gigabytes in double precision.
+# Largest number of fractions of emitters in a term: two gigabytes in double precision.
 _MOST_SHARES = 2**26
 
 
 @dataclass(frozen=True)
 class Real:
-    """Real numbers from ``low`` to ``high``; a name in ``shape`` is any size, the same throughout a term."""
+    """Real numbers from ``low`` to ``high``; a name in ``shape`` stands for one size throughout a term."""
 
     low: float
     high: float
@@ -46,7 +46,7 @@ class Whole:
 
 @dataclass(frozen=True)
 class Text:
-    """A word; which one, the rig decides."""
+    """A word, which is compared with the rig's."""
 
 
 Range = Real | Whole | Text | type
@@ -132,9 +132,9 @@ RANGES: Mapping[type, Mapping[str, Range]] = {
 
 
 def check_term(term: Any, name: str, rig: RigDescription) -> None:
-    """Refuse a term with a number that it cannot have, alone or beside its other numbers and those of its rig.
+    """Refuse a term whose numbers are out of range, or do not fit each other or the rig.
 
-    ``name`` is that of the section, to say where.
+    ``name`` is the section's name, for the message.
 
     Raises:
         ProfileError: with the field, what was expected and what was found.
@@ -183,7 +183,7 @@ def _require(holds: bool, where: str, expected: str, found: object) -> None:
 
 
 def _nothing(term: Any, name: str, rig: RigDescription) -> None:
-    """Fields that bound nothing but themselves."""
+    """Check nothing: this term's fields do not bound one another."""
 
 
 def _check_noise(term: Noise, name: str, rig: RigDescription) -> None:
@@ -193,9 +193,9 @@ def _check_noise(term: Noise, name: str, rig: RigDescription) -> None:
 
 def _check_wire(term: Wire, name: str, rig: RigDescription) -> None:
     orders, half_ranges = np.asarray(term.harmonics), np.asarray(term.frequency)[:, 1]
-    _require(bool(np.all(orders == np.round(orders))), f"{name}.harmonics", "whole numbers", "others")
+    _require(bool(np.all(orders == np.round(orders))), f"{name}.harmonics", "whole numbers", "fractions")
     least = float(half_ranges.min(initial=np.inf))
-    _require(least > 0, f"{name}.frequency", "ranges of more than nothing", least)
+    _require(least > 0, f"{name}.frequency", "half ranges above 0", least)
     strongest, most = len(np.asarray(term.amplitudes)), len(orders)
     _require(strongest <= most, f"{name}.amplitudes", f"of at most the {most} harmonics", strongest)
     for field in ("fields", "amplitudes", "baseline"):
@@ -241,7 +241,7 @@ def _check_backscatter(term: Backscatter, name: str, rig: RigDescription) -> Non
     found = np.shape(term.mask)[1:]
     _require(found == grid, f"{name}.mask", f"{grid[1]} x {grid[0]} values, one every {term.step} px", found[::-1])
     most = int((_MOST_SHARES / (grid[0] * grid[1])) ** 0.5)
-    _require(term.window <= max(most, 1), f"{name}.window", f"at most {most} for a grid so fine", term.window)
+    _require(term.window <= max(most, 1), f"{name}.window", f"at most {most} for a grid this fine", term.window)
     sums = np.asarray(term.mix, dtype=np.float64).sum(axis=1)
     off = sums[np.abs(sums - 1.0) > 1e-3]
     _require(not off.size, f"{name}.mix", "rows that sum to 1", off[0] if off.size else None)

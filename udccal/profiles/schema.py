@@ -1,4 +1,4 @@
-"""``profile.json``, format version 2. docs/profile.md says the same to people and to other programs."""
+"""``profile.json``, format version 2, which docs/profile.md describes."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from udccal.sessions.schema import Sha256, StoredCamera
 
 FORMAT: Final = "udccal-profile"
 VERSION: Final = 2
-# Arrays of at most so many values stand in profile.json, where a person can read and compare them.
+# Arrays of at most this many values are stored in profile.json, where a person can read and compare them.
 INLINE_VALUES = 512
 
 Name = Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]*(\.[A-Za-z0-9_]+)*$", max_length=120)]
@@ -51,7 +51,7 @@ class Numbers(_Strict):
 
 
 class Choice(_Strict):
-    """An order, a size, a name or a switch that belongs to the model's form and is not fitted; null is none."""
+    """An order, a size, a name or a switch that defines the model's form and is not fitted; null means none."""
 
     kind: Literal["choice"] = "choice"
     name: Name
@@ -75,7 +75,7 @@ class Sequence(_Strict):
 
 
 class Reference(_Strict):
-    """A parameter that is another section's term, stored once there."""
+    """A parameter that is the term of another section, where it is stored once."""
 
     kind: Literal["reference"] = "reference"
     name: Name
@@ -88,7 +88,7 @@ Parameter = Annotated[Number | Numbers | Choice | Group | Sequence | Reference, 
 class StoredArray(_Strict):
     """An array in an EXR file of the same folder, folded to two dimensions (all but the last; the last).
 
-    Its value is the sum of the channels ``value``, ``remainder`` and ``remainder2`` (those there are) in float64.
+    Its value is the sum in float64 of the channels ``value``, ``remainder`` and ``remainder2``, as far as present.
     """
 
     name: Name
@@ -100,7 +100,7 @@ class StoredArray(_Strict):
 
 
 class StoredPicture(_Strict):
-    """A map evaluated from the terms, to look at and to restore with."""
+    """A map evaluated from the terms, for viewing and for restoration."""
 
     name: Literal["wire_map", "psf_atlas", "backscatter_white"]
     file: FileName
@@ -130,7 +130,7 @@ class StoredCandidate(_Strict):
 
 
 class StoredDiagnostic(_Strict):
-    """A number about the fit itself."""
+    """A number that describes the fit."""
 
     name: Annotated[str, Field(max_length=120)]
     value: float
@@ -138,7 +138,7 @@ class StoredDiagnostic(_Strict):
 
 
 class StoredFit(_Strict):
-    """How a term's fit went. ``covariance`` names the array, or is null when no covariance was given."""
+    """Evidence of a term's fit. ``covariance`` is the array, or null when the fit gave no covariance."""
 
     status: Annotated[str, Field(pattern=r"^[A-Z_]{1,40}$")]
     chi2_dof: Annotated[float, Field(ge=0)]
@@ -151,7 +151,7 @@ class StoredFit(_Strict):
 
 
 class Section(_Strict):
-    """One term: what it is, its values, and the evidence for them."""
+    """One term: its model, its values, and the evidence for them."""
 
     model: Identifier
     version: Literal[1]
@@ -171,7 +171,7 @@ class Terms(_Strict):
 
 
 class Provenance(_Strict):
-    """Where the numbers come from. ``command`` carries file names without the folders they lay in."""
+    """Where the numbers come from. ``command`` has file names without their folders."""
 
     created_at: Annotated[str, Field(max_length=40)]
     udccal: Annotated[str, Field(max_length=40)]

@@ -1,4 +1,4 @@
-"""Reading and writing profiles: whole or not at all, checked before anything is believed."""
+"""Reading and writing profiles: whole or not at all, with every file and value checked."""
 
 from __future__ import annotations
 
@@ -20,15 +20,19 @@ from udccal.profiles.schema import StoredArray, StoredProfile
 from udccal.profiles.versions import migrated
 from udccal.rig import find_rig
 
-# In a rig's folder, beside its rig.toml.
+# Name of the profile in a rig's folder, next to rig.toml.
 RIG_PROFILE = "profile"
 
 
 def write_profile(path: Path, profile: Profile) -> None:
-    """Write a profile as a folder, or as one file where ``path`` ends in ``.zip``; replaces a profile that is there.
+    """Write a profile as a folder or as one zip file, whole or not at all.
+
+    Args:
+        path: where to write; one zip file if it ends in ``.zip``. A profile that is there is replaced.
+        profile: what to write.
 
     Raises:
-        ProfileError: when ``path`` is taken by something that is not a profile; nothing is changed then.
+        ProfileError: when ``path`` holds something that is not a profile; nothing is changed then.
     """
     check_replaceable(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -43,7 +47,10 @@ def write_profile(path: Path, profile: Profile) -> None:
 
 
 def read_profile(path: Path) -> Profile:
-    """Read a profile from a folder or a zip file; one that is replaced meanwhile is read anew.
+    """Read a profile.
+
+    Args:
+        path: a folder or a zip file; when it is replaced during reading, the new one is read.
 
     Raises:
         ProfileError: when it is missing, damaged, altered, too large, newer, or does not follow docs/profile.md.
@@ -58,7 +65,7 @@ def read_profile(path: Path) -> Profile:
 
 
 def _identity(path: Path) -> int | None:
-    """Another number when another profile stands there; None when none does."""
+    """Return a number that changes when the profile at ``path`` is replaced; None when there is no profile."""
     try:
         return standing(path).stat().st_ino
     except OSError:
@@ -74,14 +81,26 @@ def _read(path: Path) -> Profile:
 
 
 def load_profile(name_or_path: str | Path) -> Profile:
-    """Read a profile given by path, or by the name of a rig that has one; errors as for ``read_profile``."""
+    """Read a profile.
+
+    Args:
+        name_or_path: as for ``find_profile``.
+
+    Raises:
+        ProfileError: as ``read_profile``.
+    """
     return read_profile(find_profile(name_or_path))
 
 
 def find_profile(name_or_path: str | Path) -> Path:
-    """A profile given by path, or by the name of a rig whose folder holds one as ``profile``.
+    """Return the path of a profile.
 
-    What is there at the path goes first; a path at which nothing is comes back as it is, for a reader to complain of.
+    Args:
+        name_or_path: a path, or the name of a rig whose folder holds a profile as ``profile``. An existing path is
+            preferred.
+
+    Returns:
+        the path as given when nothing is found, so that reading it gives the error.
     """
     path = Path(name_or_path)
     if standing(path).exists():
@@ -94,7 +113,7 @@ def find_profile(name_or_path: str | Path) -> Path:
 
 
 def read_stored(folder: Path) -> StoredProfile:
-    """``profile.json`` of a folder, migrated to the present version and checked; the arrays are not read.
+    """Read ``profile.json`` of a folder, migrated to the present version and checked; the arrays are not read.
 
     Raises:
         ProfileError: as ``read_profile``.
@@ -106,7 +125,9 @@ def read_stored(folder: Path) -> StoredProfile:
         )
     size = file.stat().st_size
     if size > MAX_JSON_BYTES:
-        raise ProfileError(f"Expected {file} to hold at most {MAX_JSON_BYTES} bytes, found {size}. It is not ours.")
+        raise ProfileError(
+            f"Expected {file} to hold at most {MAX_JSON_BYTES} bytes, found {size}. It does not belong to a profile."
+        )
     try:
         found = json.loads(file.read_bytes())
     except (ValueError, RecursionError) as error:
@@ -125,10 +146,10 @@ def read_stored(folder: Path) -> StoredProfile:
 
 
 def check_replaceable(path: Path) -> None:
-    """Refuse a path at which a profile cannot be written; worth asking before the work that leads to one.
+    """Refuse a ``path`` that ``write_profile`` would refuse; call it before the work that leads to a profile.
 
     Raises:
-        ProfileError: when something other than a profile stands there.
+        ProfileError: when ``path`` holds something other than a profile.
     """
     if not path.exists() or (path.is_dir() and not any(path.iterdir())):
         return
@@ -148,13 +169,12 @@ def check_replaceable(path: Path) -> None:
     others = sorted(item.name for item in path.iterdir() if item.name not in ours)
     if others:
         raise ProfileError(
-            f"Expected {path} to hold only a profile's files, found also '{others[0]}'. Move it, or choose"
-            " another path."
+            f"Expected {path} to hold only a profile's files, found '{others[0]}' too. Move it, or choose another path."
         )
 
 
 def stored_files(stored: StoredProfile) -> set[str]:
-    """Names of the EXR files that a profile lists."""
+    """Return the names of the EXR files that a profile lists."""
     sections = (getattr(stored.terms, name) for name in type(stored.terms).model_fields)
     files = {picture.file for picture in stored.pictures}
     for section in sections:

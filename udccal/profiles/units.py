@@ -1,8 +1,8 @@
-"""Units of parameters from their names, which carry them (docs/conventions.md)."""
+"""Units of parameters, from the suffixes of their names (docs/conventions.md)."""
 
 from __future__ import annotations
 
-# Longest suffixes first: the first that fits decides.
+# Longest suffixes first: the first match decides.
 _SUFFIXES = (
     ("_periods", "period"),
     ("_e_per_s", "e-/s"),
@@ -22,7 +22,7 @@ _SUFFIXES = (
 
 
 def unit_of(name: str) -> str:
-    """Unit of a parameter by its (dotted) name; ``1`` where the name carries none."""
+    """Return the unit of a parameter by its (dotted) name; ``1`` where the name has no unit."""
     parts = [part for part in name.split(".") if not part.isdigit()]
     own = parts[-1] if parts else name
     return next((unit for suffix, unit in _SUFFIXES if own.endswith(suffix)), "1")

@@ -1,7 +1,7 @@
 """Format versions of ``profile.json``: older ones are migrated step by step, newer ones refused.
 
-To change the format: raise ``schema.VERSION``, and register here the function that takes the JSON object of the version
-before to the new one. Each function is kept for good, with a stored profile of its version among the tests.
+To change the format, raise ``schema.VERSION`` and register here the function that converts the JSON object from the
+previous version to the new one. Each function is kept for good, with a stored profile of its version among the tests.
 """
 
 from __future__ import annotations
@@ -12,11 +12,11 @@ from typing import Any
 from udccal.errors import ProfileError
 from udccal.profiles.schema import FORMAT, VERSION
 
-# JSON as it is before any schema of ours applies to it; the one place where a profile is an untyped object.
+# JSON before a schema applies to it: the only place where a profile is an untyped object.
 JsonObject = dict[str, Any]
 Migration = Callable[[JsonObject], JsonObject]
 
-# From version 1 to 2 one quantity has one name: by section, the parameters (the last part of their dotted names).
+# New names of parameters from version 1 to 2, by section and by the last part of their dotted names.
 _GEOMETRY = {"focal": "focal_px", "centre": "principal_point_px", "rotation": "rotation_rad", "pupil": "pupil_mm"}
 _PARAMETERS_OF_2: Mapping[str, Mapping[str, str]] = {
     "geometry": _GEOMETRY,
@@ -50,7 +50,7 @@ _ESTIMATES_OF_2: Mapping[str, Mapping[str, str]] = {
 
 
 def _first_to_second(found: JsonObject) -> JsonObject:
-    """Names change, numbers do not; the rig reads its own older versions (``udccal/rig_versions.py``)."""
+    """Rename parameters; numbers do not change. The rig migrates its own versions (``udccal/rig_versions.py``)."""
     terms = found.get("terms")
     if isinstance(terms, dict):
         terms = {name: _renamed_section(name, section) for name, section in terms.items()}
@@ -72,7 +72,7 @@ def _renamed_section(name: str, section: Any) -> Any:
 
 
 def _renamed(entries: Any, names: Mapping[str, str]) -> Any:
-    """Entries with their names replaced; whatever is no list of named objects is left for the schema to refuse."""
+    """Return entries with their names replaced; the schema refuses anything but a list of named objects later."""
     return [_renamed_entry(entry, names) for entry in entries] if isinstance(entries, list) else entries
 
 
@@ -85,17 +85,17 @@ def _renamed_entry(entry: Any, names: Mapping[str, str]) -> Any:
     return {**entry, "name": f"{group}{dot}{name}", **unit}
 
 
-# Keyed by the version a function starts from; it returns the next version.
+# By the version that a function starts from; it returns the next version.
 MIGRATIONS: Mapping[int, Migration] = {1: _first_to_second}
 
 
 def migrated(
     found: JsonObject, where: str, migrations: Mapping[int, Migration] = MIGRATIONS, target: int = VERSION
 ) -> JsonObject:
-    """The JSON object of a profile, taken to version ``target``.
+    """Migrate the JSON object of a profile to version ``target``.
 
     Raises:
-        ProfileError: when it is not a profile, newer than ``target``, or of a version that nothing migrates from.
+        ProfileError: when it is not a profile, newer than ``target``, or of a version without a migration.
     """
     if found.get("format") != FORMAT:
         raise ProfileError(f"Expected {where} to have the format '{FORMAT}', found another. Check the path.")
@@ -110,8 +110,8 @@ def migrated(
     while version < target:
         if version not in migrations:
             raise ProfileError(
-                f"Expected {where} to have a version that can be brought to {target}, found {version}, which this "
-                "udccal no longer reads. Bring it up to date with an older udccal first."
+                f"Expected {where} to have a version that can be migrated to {target}, found {version}, which this "
+                "udccal no longer reads. Migrate it with an older udccal first."
             )
         found = migrations[version](found)
         version += 1

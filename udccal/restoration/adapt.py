@@ -1,8 +1,8 @@
-"""As much smoothing as the local light calls for.
+"""Smoothing that adapts to the local brightness.
 
-One smoothness fits one brightness: where there is little light, noise is large against the contrasts that a scene can
-have there. The deblurred picture is therefore filtered to a few greater smoothnesses, each by the ratio of two Wiener
-filters of the mean kernel, and every pixel takes the one its own brightness calls for, interpolated between two.
+One smoothness suits one brightness: in the dark, noise is large relative to the contrasts of a scene. The deblurred
+picture is therefore filtered to a few greater smoothnesses, each by the ratio of two Wiener filters of the mean kernel.
+Every pixel interpolates between the two that suit its own brightness.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from jaxtyping import Float32
 from udccal.restoration.deblur import RIDGE, Deblurrer
 
 _STEP, _STEPS = 4.0, 7
-# Brightness is judged over so many pixels (one sigma).
+# One sigma of the Gaussian over which brightness is averaged.
 _LEVEL_SIGMA_PX = 3.0
 
 
@@ -25,12 +25,14 @@ def adapted(
     noise_floor_e2: float,
     contrast: float,
 ) -> Float32[np.ndarray, "rows columns"]:
-    """A deblurred channel with at least the smoothness it has, and more where it is dark.
+    """Smooth a deblurred channel further where it is dark.
 
     Args:
-        deblurrer: of this channel. picture: its solution in e-. smoothness: with which it was solved.
-        noise_floor_e2: variance of a dark sample. contrast: expected RMS difference of neighbours relative to the local
-            brightness.
+        deblurrer: the channel's deblurrer.
+        picture: its solution in e-.
+        smoothness: smoothness of that solution; no pixel gets less.
+        noise_floor_e2: variance of a dark sample in e-^2.
+        contrast: expected RMS difference of neighbours relative to the local brightness.
     """
     level = np.maximum(cv2.GaussianBlur(np.maximum(picture, 0.0), (0, 0), _LEVEL_SIGMA_PX), 1.0)
     wanted = (level + np.float32(noise_floor_e2)) / (np.float32(contrast) * level) ** 2
@@ -41,7 +43,7 @@ def adapted(
     present = deblurrer.mean_power + np.float32(smoothness) * deblurrer.difference_power + np.float32(RIDGE)
     result = picture * np.maximum(1.0 - steps, 0.0)
     for step in range(1, _STEPS):
-        # Each filtered picture counts where the wanted smoothness lies between its neighbours': a hat in steps.
+        # The weight of a filtered picture is a hat function of the step: 1 at its own, 0 at its neighbours.
         share = np.maximum(1.0 - np.abs(steps - np.float32(step)), 0.0)
         if not share.any():
             continue

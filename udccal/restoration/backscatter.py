@@ -1,4 +1,4 @@
-"""Subtracting the panel's own light: from the panel picture when it is known, from the mask alone when it is not."""
+"""Backscatter to subtract: from the panel picture when it is known, from the mask alone when it is not."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from udccal.models.backscatter import Backscatter, PanelResponse, panel_response
 from udccal.numerics import in_float64
 from udccal.rig import RigDescription
 
-# The level is read from blocks of so many samples: large enough to average noise, small enough to find dark places.
+# Side in samples of the blocks that give the level: large enough to average noise, small enough to find dark places.
 _BLOCK = 16
 _PERCENTILE = 1.0
 
 
 @in_float64
 def prepared_response(term: Backscatter, rig: RigDescription) -> PanelResponse:
-    """The term worked out for the rig's panel, in float32 numpy arrays.
+    """Evaluate the term for the rig's panel, as float32 numpy arrays.
 
     Raises:
-        RestorationError: when it is no number anywhere on the sensor.
+        RestorationError: when a value is not finite.
     """
     response = jax.tree.map(_single, panel_response(term, rig.panel.rows, rig.panel.columns))
     if not (np.all(np.isfinite(response.shares)) and np.all(np.isfinite(response.gain))):
@@ -36,7 +36,7 @@ def prepared_response(term: Backscatter, rig: RigDescription) -> PanelResponse:
 
 
 def _single(leaf: Any) -> np.ndarray:
-    """A leaf as numpy, in single precision if it is real; jitted functions take it outside the float64 context."""
+    """Return a leaf as numpy, in single precision if it is real: jitted functions use it outside float64."""
     array = np.asarray(leaf)
     return array.astype(np.float32) if np.issubdtype(array.dtype, np.floating) else array
 
@@ -44,14 +44,14 @@ def _single(leaf: Any) -> np.ndarray:
 def known_rate(
     response: PanelResponse, picture: UInt8[np.ndarray, "panel_rows panel_columns 3"]
 ) -> Float32[np.ndarray, "rows columns"]:
-    """Backscatter in e-/s at every sample of the mosaic while the panel shows ``picture``."""
+    """Return the backscatter in e-/s at every sample of the mosaic while the panel shows ``picture``."""
     return np.asarray(response_rate(response, picture), dtype=np.float32)
 
 
 def mask_mosaic(
     mask: Float32[np.ndarray, "half_rows half_columns 3"], cfa: str, rows: int, columns: int
 ) -> Float32[np.ndarray, "rows columns"]:
-    """The profile's mask (one value per cell of the pattern and channel) at every sample, each of its own colour."""
+    """Return the profile's mask, one value per cell and channel, at every sample of the mosaic in its own colour."""
     last_row, last_column = mask.shape[0] - 1, mask.shape[1] - 1
     pattern = cfa_named(cfa)
     cell_rows = np.minimum(np.arange(rows) // pattern.rows, last_row)[:, None]
@@ -62,11 +62,11 @@ def mask_mosaic(
 def estimated_rate(
     signal_rate: Float32[np.ndarray, "rows columns"], mask: Float32[np.ndarray, "rows columns"], cfa: str
 ) -> Float32[np.ndarray, "rows columns"]:
-    """Backscatter in e-/s when the panel picture is not known: the mask times one level per colour.
+    """Estimate the backscatter in e-/s when the panel picture is not known: the mask times one level per colour.
 
-    Light only adds, so the frame is nowhere darker than its backscatter: the level is what the darkest places (the 1st
-    percentile of 16 x 16 blocks) allow, between 0 and 1. A scene without dark places gets too much taken away, by at
-    most its own darkest percent.
+    Light only adds, so a frame is nowhere darker than its backscatter. The level, from 0 to 1, is the 1st percentile of
+    frame over mask in blocks of 16 x 16 samples. In a scene without dark places the estimate is too high, by at most
+    the scene's own darkest percent.
     """
     channels = cfa_named(cfa).channel_map(*signal_rate.shape)
     levels = np.array([_level(signal_rate, mask, channels == channel) for channel in range(3)], dtype=np.float32)

@@ -1,10 +1,10 @@
 """Space-varying deblurring of one channel: a regularised least-squares problem, solved by preconditioned conjugate
 gradients.
 
-Minimised over the canvas: |M (A x - y)|^2 + smoothness |D x|^2. A is the blur in low rank, M leaves out samples without
-a value (saturated ones, and all beyond the frame), D are the differences between neighbours: a 1/f^2 prior, as natural
-scenes follow. Noise grows with the signal, and so do the contrasts of a scene; their ratio, which is what the
-smoothness stands for, does not, hence equal weights. Clipped highlights are free to be as bright as their streaks say.
+The cost over the canvas is |M (A x - y)|^2 + smoothness |D x|^2. A is the blur in low rank. M leaves out samples
+without a value (saturated ones, and all beyond the frame). D takes the differences between neighbours, a 1/f^2 prior
+as natural scenes follow. All weights are equal: noise and the contrasts of a scene both grow with the signal, but the
+smoothness is their ratio, which does not. Clipped highlights may become as bright as their streaks require.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ RIDGE = 1e-5
 class Solution:
     """A deblurred channel over the frame, and how the solver ended.
 
-    ``residual`` is the preconditioned residual's norm relative to its start.
+    ``residual`` is the norm of the preconditioned residual relative to its initial value.
     """
 
     picture: Float32[np.ndarray, "rows columns"]
@@ -34,9 +34,9 @@ class Solution:
 
 @dataclass(frozen=True)
 class Deblurrer:
-    """What one channel needs, worked out once; ``solve`` is called per frame.
+    """The precomputed parts of one channel's problem; ``solve`` is called per frame.
 
-    ``mean_power`` is the power of the mean kernel by frequency, ``difference_power`` that of D.
+    ``mean_power`` is the power spectrum of the mean kernel, ``difference_power`` that of D.
     """
 
     blur: Blur
@@ -47,7 +47,7 @@ class Deblurrer:
 
     @classmethod
     def of(cls, blur: Blur, iterations: int, tolerance: float) -> Deblurrer:
-        """The two spectra of which every problem's preconditioner is made."""
+        """Compute the two spectra from which every preconditioner is made."""
         mean = blur.mean_spectrum()
         return cls(blur, mean.real**2 + mean.imag**2, _difference_power(blur.canvas), iterations, tolerance)
 
@@ -57,15 +57,16 @@ class Deblurrer:
         valid: Bool[np.ndarray, "rows columns"],
         smoothness: float,
     ) -> Solution:
-        """The scene behind a blurred channel.
+        """Estimate the scene behind a blurred channel.
 
         Args:
-            blurred: the channel over the frame. valid: samples that carry data; the others are explained by theirs.
+            blurred: the channel over the frame.
+            valid: samples that carry data; the scene at the others follows from these.
             smoothness: variance of the noise over the expected mean square of a neighbour difference.
         """
         canvas, blur = self.blur.canvas, self.blur
         penalty = np.float32(smoothness) * self.difference_power + np.float32(RIDGE)
-        # The inverse of the problem with the mean kernel everywhere and data everywhere.
+        # The exact inverse if every kernel were the mean kernel and every sample carried data.
         preconditioner = 1.0 / (self.mean_power + penalty)
         weight = np.zeros((canvas.rows, canvas.columns), dtype=np.float32)
         canvas.frame(weight)[:] = valid
@@ -101,10 +102,10 @@ class Deblurrer:
 
 
 def expected_smoothness(blurred: Float32[np.ndarray, "rows columns"], variance: float, contrast: float) -> float:
-    """Variance of the noise over the expected mean square of a neighbour difference.
+    """Return the variance of the noise over the expected mean square of a neighbour difference.
 
-    The difference is expected to be ``contrast`` times the channel's 97th percentile, and at least as large as the
-    noise's own sigma divided by ten, so that a frame without light stays finite.
+    The expected difference is ``contrast`` times the channel's 97th percentile. It is at least a tenth of the noise's
+    sigma, so that a frame without light gives a finite value.
     """
     level = contrast * float(np.percentile(blurred, 97.0))
     return variance / max(level, np.sqrt(variance) / 10.0) ** 2

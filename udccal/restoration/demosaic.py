@@ -1,7 +1,7 @@
 """Demosaicing by linear filters: Malvar, He and Cutler, "High-quality linear interpolation for demosaicing of
 Bayer-patterned color images", ICASSP 2004.
 
-Linear on purpose: noise stays what it was, negative values stay, and the deblurring that follows sees a linear camera.
+The filters are linear on purpose: they keep noise statistics and negative values, and deblurring needs a linear camera.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _FOOTPRINT = np.ones((5, 5), dtype=np.uint8)
 
 
 def demosaic(mosaic: Float32[np.ndarray, "rows columns"], cfa: str) -> Float32[np.ndarray, "rows columns 3"]:
-    """A colour at every sample. Borders continue by mirroring, which keeps the pattern."""
+    """Return three colours at every sample. Borders are mirrored, which keeps the pattern."""
     pattern = cfa_named(cfa)
     picture = np.empty((*mosaic.shape, 3), dtype=np.float32)
     green = _filtered(mosaic, _GREEN_AT_COLOUR)
@@ -51,10 +51,10 @@ def demosaic(mosaic: Float32[np.ndarray, "rows columns"], cfa: str) -> Float32[n
 def demosaic_clipped(
     mosaic: Float32[np.ndarray, "rows columns"], cfa: str, saturated: Bool[np.ndarray, "rows columns"]
 ) -> tuple[Float32[np.ndarray, "rows columns 3"], Bool[np.ndarray, "rows columns 3"]]:
-    """``demosaic``, and which of its values carry data although some samples are saturated.
+    """Demosaic a frame with saturated samples, and return which values carry data.
 
-    A saturated sample would spoil all three colours of the 5 x 5 pixels around it. There, each colour is interpolated
-    from its own samples alone, and carries data unless one of these is itself saturated.
+    A saturated sample would affect all three colours of the 5 x 5 pixels around it. There, each colour is interpolated
+    from its own samples alone. It carries data unless one of these is saturated.
     """
     picture = demosaic(mosaic, cfa)
     valid = np.ones(picture.shape, dtype=bool)

@@ -1,4 +1,4 @@
-"""From raw numbers to electrons, and which samples are not to be believed."""
+"""Convert raw numbers to electrons, and find samples that are saturated or defective."""
 
 from __future__ import annotations
 
@@ -9,22 +9,22 @@ from jaxtyping import ArrayLike, Bool, Float32, UInt16
 from udccal.cfa import cfa_named
 from udccal.models.noise import Noise, variance_e
 
-# A sample stands out when it differs from all its neighbours by so many sigma of temporal noise ...
+# A sample is an outlier when it differs from all its neighbours by this many sigma of temporal noise ...
 _OUTLIER_SIGMA = 8.0
-# ... and by so many times their own spread. A point of light seen through the panel stays below 4: its kernel is wide.
+# ... and by this many times their range. A point of light seen through the panel stays below 4: its kernel is wide.
 _OUTLIER_RATIO = 5.0
 _NEIGHBOURS = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], dtype=np.uint8)
 
 
 def scalar(value: ArrayLike) -> float:
-    """A term's parameter, be it a number or an array of no dimensions, as a float."""
+    """Return a term's parameter, a number or an array without dimensions, as a float."""
     return float(np.asarray(value))
 
 
 def to_electrons(
     mosaic: UInt16[np.ndarray, "rows columns"], noise: Noise, exposure_s: float
 ) -> Float32[np.ndarray, "rows columns"]:
-    """Signal in e-: (DN - black) / K minus the mean dark current. Negative values stay."""
+    """Return the signal in e-: (DN - black) / K minus the mean dark signal. Negative values stay."""
     scale = 1.0 / scalar(noise.K_DN_per_e)
     offset = scalar(noise.black_DN) * scale + scalar(noise.dark_current_e_per_s) * exposure_s
     return mosaic.astype(np.float32) * np.float32(scale) - np.float32(offset)
@@ -33,15 +33,15 @@ def to_electrons(
 def saturated(
     mosaic: UInt16[np.ndarray, "rows columns"], noise: Noise, margin: float
 ) -> Bool[np.ndarray, "rows columns"]:
-    """Samples within ``margin`` (a fraction of the range above black) of saturation: their value is only a bound."""
+    """Return the samples within ``margin`` (a fraction of the range above black) of saturation."""
     top, black = scalar(noise.saturation_DN), scalar(noise.black_DN)
     return mosaic >= top - margin * (top - black)
 
 
 def mean_variance_e2(mosaic: UInt16[np.ndarray, "rows columns"], noise: Noise, exposure_s: float) -> float:
-    """Temporal variance of a frame's samples in e-^2, averaged over the frame (EMVA 1288's linear model).
+    """Return the temporal variance in e-^2, averaged over a frame (EMVA 1288, linear camera model).
 
-    A dark current that was measured as slightly less than nothing makes no noise.
+    A measured dark current slightly below zero adds no noise.
     """
     mean_e = (float(mosaic.mean()) - scalar(noise.black_DN)) / scalar(noise.K_DN_per_e)
     dark_e = scalar(noise.dark_current_e_per_s) * exposure_s
@@ -52,10 +52,10 @@ def mean_variance_e2(mosaic: UInt16[np.ndarray, "rows columns"], noise: Noise, e
 def without_defects(
     signal_e: Float32[np.ndarray, "rows columns"], noise: Noise, cfa: str
 ) -> Float32[np.ndarray, "rows columns"]:
-    """Hot and dead samples replaced by the median of their 3 x 3 neighbourhood of the same colour.
+    """Replace hot and dead samples by the median of their 3 x 3 neighbourhood of the same colour.
 
-    A sample counts as defective when it lies outside the range of its eight neighbours of the same colour by more than
-    8 sigma of its temporal noise and by more than 5 times that range.
+    A sample is defective when it lies outside the range of its eight neighbours of the same colour by more than 8 sigma
+    of its temporal noise and by more than 5 times that range.
     """
     cleaned = signal_e.copy()
     floor = scalar(noise.sigma_d_e) ** 2

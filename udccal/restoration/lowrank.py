@@ -14,7 +14,7 @@ from scipy.interpolate import make_interp_spline
 
 @dataclass(frozen=True)
 class KernelGrid:
-    """Kernels of one picture on a regular grid of source positions; each channel of each kernel sums to 1."""
+    """Kernels on a regular grid of source positions; each channel of each kernel sums to 1."""
 
     x_px: Float[np.ndarray, " nx"]
     y_px: Float[np.ndarray, " ny"]
@@ -36,10 +36,10 @@ class LowRank:
 
 
 def decompose(grid: KernelGrid, channel: int, tolerance: float, max_rank: int) -> LowRank:
-    """The smallest rank whose relative L2 error, RMS over the positions, is at most ``tolerance``.
+    """Decompose one channel at the smallest rank whose relative L2 error, RMS over positions, is at most ``tolerance``.
 
-    The kernels' sums join the SVD as one more, heavily weighted sample, so that truncation does not print a slow
-    brightness pattern onto the picture: sum_r c_r sum(h_r) stays 1.
+    The SVD includes the kernels' sums as one more, heavily weighted sample. sum_r c_r sum(h_r) then stays 1, and
+    truncation adds no slow brightness pattern to the picture.
     """
     ny, nx, _, rows, columns = grid.kernels.shape
     samples = grid.kernels[:, :, channel].reshape(ny * nx, rows * columns).astype(np.float64)
@@ -68,7 +68,7 @@ def decompose(grid: KernelGrid, channel: int, tolerance: float, max_rank: int) -
 def coefficient_map(
     low_rank: LowRank, index: int, x_px: Float[np.ndarray, " columns"], y_px: Float[np.ndarray, " rows"]
 ) -> Float[np.ndarray, "rows columns"]:
-    """One coefficient at every pixel by bicubic interpolation of the grid; held constant outside the grid."""
+    """Interpolate one coefficient to every pixel, bicubic inside the grid and constant outside it."""
     values = low_rank.coefficients[index].astype(np.float64)
     along_y = _interpolation(low_rank.y_px, y_px)
     along_x = _interpolation(low_rank.x_px, x_px)
@@ -76,7 +76,7 @@ def coefficient_map(
 
 
 def _interpolation(nodes: Float[np.ndarray, " n"], at: Float[np.ndarray, " m"]) -> Float[np.ndarray, "m n"]:
-    """Matrix that takes values at the nodes to a spline's values (cubic where there are four nodes) at ``at``."""
+    """Matrix from values at the nodes to the values of a spline at ``at``; cubic when there are four nodes or more."""
     if len(nodes) == 1:
         return np.ones((len(at), 1))
     spline = make_interp_spline(nodes, np.eye(len(nodes)), k=min(3, len(nodes) - 1))

@@ -13,9 +13,9 @@ from udccal.restoration.lowrank import LowRank, coefficient_map
 
 @dataclass(frozen=True)
 class Canvas:
-    """A picture larger than the frame, so that light from just outside the frame has a place to come from.
+    """A picture larger than the frame, which holds the scene just outside the frame too.
 
-    The frame starts at (``top``, ``left``). The canvas is periodic: its far ends meet in the padding.
+    The frame starts at (``top``, ``left``). The canvas is periodic: opposite edges are neighbours.
     """
 
     rows: int
@@ -28,32 +28,32 @@ class Canvas:
 
     @classmethod
     def around(cls, frame_rows: int, frame_columns: int, pad_rows: int, pad_columns: int, workers: int) -> Canvas:
-        """The smallest canvas with at least this padding on each side whose FFT is fast."""
+        """Return the smallest canvas with at least this padding on each side whose FFT is fast."""
         rows = int(fft.next_fast_len(frame_rows + 2 * pad_rows, real=True))
         columns = int(fft.next_fast_len(frame_columns + 2 * pad_columns, real=True))
         top, left = (rows - frame_rows) // 2, (columns - frame_columns) // 2
         return cls(rows, columns, top, left, frame_rows, frame_columns, workers)
 
     def frame(self, picture: Float32[np.ndarray, "rows columns"]) -> Float32[np.ndarray, "frame_rows frame_columns"]:
-        """The part of a canvas-sized picture that the sensor sees (a view, not a copy)."""
+        """Return the part of a canvas-sized picture that the sensor sees (a view, not a copy)."""
         return picture[self.top : self.top + self.frame_rows, self.left : self.left + self.frame_columns]
 
     def extended(self, frame: Float32[np.ndarray, "frame_rows frame_columns"]) -> Float32[np.ndarray, "rows columns"]:
-        """A frame continued over the canvas by repeating its border."""
+        """Extend a frame over the canvas by repeating its border."""
         below = self.rows - self.frame_rows - self.top
         right = self.columns - self.frame_columns - self.left
         return np.pad(frame, ((self.top, below), (self.left, right)), mode="edge")
 
     def transform(self, picture: Float32[np.ndarray, "rows columns"]) -> Complex64[np.ndarray, "rows half"]:
-        """Real FFT."""
+        """Return the real FFT of a canvas-sized picture."""
         return fft.rfft2(picture, workers=self.workers)
 
     def inverse(self, spectrum: Complex64[np.ndarray, "rows half"]) -> Float32[np.ndarray, "rows columns"]:
-        """Inverse of ``transform``; may overwrite its argument."""
+        """Invert ``transform``; may overwrite its argument."""
         return fft.irfft2(spectrum, s=(self.rows, self.columns), workers=self.workers, overwrite_x=True)
 
     def kernel_spectrum(self, kernel: Float32[np.ndarray, "ky kx"]) -> Complex64[np.ndarray, "rows half"]:
-        """Spectrum of a kernel whose origin is its middle sample; what does not fit on the canvas wraps round."""
+        """Return the spectrum of a kernel whose origin is its middle sample; a larger kernel wraps around."""
         placed = np.zeros((self.rows, self.columns), dtype=np.float32)
         ky, kx = kernel.shape
         at_y = (np.arange(ky) - ky // 2) % self.rows
@@ -72,7 +72,7 @@ class Blur:
 
     @classmethod
     def of(cls, low_rank: LowRank, canvas: Canvas) -> Blur:
-        """Spectra and coefficient maps of a decomposed psf."""
+        """Compute the spectra and coefficient maps of a decomposed psf."""
         x_px = np.arange(canvas.columns, dtype=np.float64) - canvas.left
         y_px = np.arange(canvas.rows, dtype=np.float64) - canvas.top
         return cls(
@@ -82,14 +82,14 @@ class Blur:
         )
 
     def forward(self, x: Float32[np.ndarray, "rows columns"]) -> Float32[np.ndarray, "rows columns"]:
-        """Blur a canvas."""
+        """Blur a canvas-sized scene."""
         total = self.spectra[0] * self.canvas.transform(self.coefficients[0] * x)
         for spectrum, coefficient in zip(self.spectra[1:], self.coefficients[1:], strict=True):
             total += spectrum * self.canvas.transform(coefficient * x)
         return self.canvas.inverse(total)
 
     def adjoint(self, y: Float32[np.ndarray, "rows columns"]) -> Float32[np.ndarray, "rows columns"]:
-        """The transpose of ``forward``: sum_r c_r (h_r correlated with y)."""
+        """Apply the transpose of ``forward``: sum_r c_r (h_r correlated with y)."""
         transformed = np.conj(self.canvas.transform(y))
         total = np.zeros_like(y)
         for spectrum, coefficient in zip(self.spectra, self.coefficients, strict=True):
@@ -97,7 +97,7 @@ class Blur:
         return total
 
     def mean_spectrum(self) -> Complex64[np.ndarray, "rows half"]:
-        """Spectrum of the kernel averaged over the frame."""
+        """Return the spectrum of the kernel averaged over the frame."""
         total = np.zeros_like(self.spectra[0])
         for spectrum, coefficient in zip(self.spectra, self.coefficients, strict=True):
             total += spectrum * np.float32(self.canvas.frame(coefficient).mean())

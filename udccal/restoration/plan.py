@@ -1,4 +1,4 @@
-"""What restoration works out once per profile, and every choice that trades accuracy for time."""
+"""What restoration computes once per profile, and the options that trade accuracy for time."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from udccal.restoration.operator import Blur, Canvas
 from udccal.rig import RigDescription
 
 _CHANNELS = 3
-# A kernel sums to 1; one whose positive and negative values together reach so much is none.
+# A kernel sums to 1. If its absolute values sum to more than this, it is not a kernel.
 _MOST_LIGHT = 10.0
 
 
@@ -24,16 +24,16 @@ class PlanOptions:
     """Accuracy against time; the defaults were measured on full-size simulated scenes.
 
     Attributes:
-        kernel_rows, kernel_columns: largest size of the kernels in px, odd; a smaller sensor gets smaller ones, and so
-            does a psf of less support.
+        kernel_rows, kernel_columns: largest size of the kernels in px, odd. A smaller sensor, or a psf with less
+            support, gets smaller kernels.
         grid_rows, grid_columns: field positions at which the psf is evaluated.
-        rank_tolerance: RMS over the field of the kernels' relative L2 error, at which the rank is cut. 3 % costs less
+        rank_tolerance: relative L2 error of the kernels, RMS over the field, at which the rank is cut. 3 % costs less
             than 0.1 dB against full rank.
-        max_rank: components at most.
-        pad_rows, pad_columns: scene beyond the frame, in px, that may throw light into it.
+        max_rank: largest number of components.
+        pad_rows, pad_columns: width in px of the scene around the frame that may send light into it.
         contrast: expected RMS difference of neighbours, relative to a channel's 97th percentile.
-        local_contrast: the same relative to the local brightness, for the smoothing of dark places.
-        iterations: of conjugate gradients at most. tolerance: relative residual at which they stop.
+        local_contrast: the same, relative to the local brightness, for the smoothing of dark places.
+        iterations: largest number of conjugate-gradient iterations. tolerance: relative residual at which they stop.
         saturation_margin: fraction of the range below saturation that counts as saturated.
         workers: threads of the Fourier transforms.
     """
@@ -55,10 +55,10 @@ class PlanOptions:
 
 
 def kernel_grid(psf: PsfField, rig: RigDescription, options: PlanOptions) -> KernelGrid:
-    """The psf at a grid of positions that spans the sensor, border to border.
+    """Evaluate the psf at a grid of positions that spans the sensor from edge to edge.
 
     Raises:
-        RestorationError: when the psf gives no kernels there.
+        RestorationError: when the psf's values there are not kernels.
     """
     camera = rig.camera
     x = np.linspace(0.0, camera.columns - 1.0, options.grid_columns)
@@ -69,14 +69,14 @@ def kernel_grid(psf: PsfField, rig: RigDescription, options: PlanOptions) -> Ker
     light = np.abs(kernels).sum(axis=(2, 3))
     if not np.all(light <= _MOST_LIGHT):
         raise RestorationError(
-            f"Expected kernels that sum to 1 and are hardly negative, found one whose values sum to "
-            f"{light.max():g} without their signs. Check the psf and geometry terms, or calibrate the rig again."
+            f"Expected kernels that sum to 1 with hardly any negative values, found one whose absolute values sum to "
+            f"{light.max():g}. Check the psf and geometry terms, or calibrate the rig again."
         )
     return KernelGrid(x, y, kernels.reshape(len(y), len(x), _CHANNELS, rows, columns))
 
 
 def build_deblurrers(grid: KernelGrid, rig: RigDescription, options: PlanOptions) -> tuple[Deblurrer, ...]:
-    """One deblurrer per colour channel, on a canvas around the whole sensor."""
+    """Build one deblurrer per colour channel, on a canvas around the whole sensor."""
     camera = rig.camera
     canvas = Canvas.around(camera.rows, camera.columns, options.pad_rows, options.pad_columns, options.workers)
     return tuple(

@@ -16,7 +16,7 @@ from udccal.numerics import in_float64
 
 @dataclass(frozen=True)
 class Rectification:
-    """For every pixel of the view, the sensor pixel it looks at."""
+    """Maps from every pixel of the view to the sensor pixel (x, y) that it looks at."""
 
     map_x: Float32[np.ndarray, "rows columns"]
     map_y: Float32[np.ndarray, "rows columns"]
@@ -29,16 +29,16 @@ class Rectification:
 
     @classmethod
     def within(cls, geometry: Geometry, view: VirtualView, sensor_columns: int, sensor_rows: int) -> Rectification:
-        """As ``of``, of a view whose every pixel looks at the sensor.
+        """Evaluate the map as ``of`` does, and check that every pixel of the view looks at the sensor.
 
         Raises:
-            RestorationError: when one looks beside it, although the view's border does not: the distortion folds.
+            RestorationError: when a pixel inside the view looks past the sensor: the distortion folds.
         """
         found = cls.of(geometry, view)
         for places, size in ((found.map_x, sensor_columns), (found.map_y, sensor_rows)):
             if not np.all((places > -1) & (places < size)):
                 raise RestorationError(
-                    "Expected every pixel of the view to look at the sensor, found some that look beside it. Check the "
+                    "Expected every pixel of the view to look at the sensor, found some that look past it. Check the "
                     "geometry term's distortion, or calibrate the rig again."
                 )
         return found

@@ -1,7 +1,7 @@
-"""Restoration of frames with a profile: everything is worked out once, then reused for every frame.
+"""Restoration of frames with a profile: everything is computed once, then reused for every frame.
 
 Units: a restored picture is linear light in e-/s of each camera colour, on the scale of a pixel whose wire value is 1
-(the wire's mean over the sensor). It may be slightly negative where noise says so; encoding for a display clips that.
+(the wire's mean over the sensor). Noise may make it slightly negative; encoding for a display clips that.
 """
 
 from __future__ import annotations
@@ -35,14 +35,18 @@ Picture = Float32[np.ndarray, "rows columns 3"]
 
 @dataclass(frozen=True)
 class Restorer:
-    """A profile made ready to restore frames.
+    """A profile prepared to restore frames.
 
     Attributes:
-        rig: the rig. noise: its noise term. view: what is delivered.
-        wire: map to divide by; None when it is 1 everywhere. mask: backscatter of a white panel in e-/s.
-        response: the backscatter term for known panel pictures; None when the rig shows no backscatter.
-        deblurrers: one per channel; none when the rig shows no blur. rectification: sensor to view.
-        options: the choices made.
+        rig: the rig description.
+        noise: the noise term.
+        view: the view of restored pictures.
+        wire: map to divide by; None when it is 1 everywhere.
+        mask: backscatter of a white panel in e-/s.
+        response: the backscatter term for known panel pictures; None when the rig has no backscatter.
+        deblurrers: one per channel; empty when the rig has no blur.
+        rectification: map from sensor to view.
+        options: options of the restoration.
     """
 
     rig: RigDescription
@@ -57,20 +61,21 @@ class Restorer:
 
     @classmethod
     def load(cls, profile: str | Path, options: PlanOptions | None = None) -> Restorer:
-        """Read a profile, by path or by the name of a rig that has one, and make it ready.
+        """Read a profile, by path or by the name of a rig that has one, and prepare it.
 
         Raises:
             ProfileError: when it cannot be read.
-            RestorationError: when its geometry leaves no view through the panel.
+            RestorationError: as ``from_profile``.
         """
         return cls.from_profile(load_profile(profile), options)
 
     @classmethod
     def from_profile(cls, profile: Profile, options: PlanOptions | None = None) -> Restorer:
-        """Work everything out for a profile.
+        """Prepare a profile.
 
         Raises:
-            RestorationError: when the profile's geometry leaves no view through the panel, or a term gives no numbers.
+            RestorationError: when its geometry leaves no view through the panel, or a term gives values that are not
+                finite.
         """
         options = options or PlanOptions()
         rig, geometry = profile.rig, profile.geometry.term
@@ -97,11 +102,15 @@ class Restorer:
         exposure_s: float,
         panel_picture: UInt8[np.ndarray, "panel_rows panel_columns 3"] | None = None,
     ) -> Picture:
-        """A clean picture on the virtual view, linear, in e-/s.
+        """Restore a frame.
 
         Args:
-            mosaic: raw frame in DN. exposure_s: its exposure.
-            panel_picture: what the panel showed (a black picture when it was off); None when that is not known.
+            mosaic: raw frame in DN.
+            exposure_s: exposure time of the frame.
+            panel_picture: what the panel showed, 8-bit RGB (a black picture when it was off); None when not known.
+
+        Returns:
+            the clean picture on the virtual view: linear RGB in e-/s.
 
         Raises:
             RestorationError: when the frame, its exposure or the panel picture does not belong to this rig.
@@ -120,7 +129,7 @@ class Restorer:
         return self.rectification.apply(sharp) / np.float32(exposure_s)
 
     def before(self, mosaic: UInt16[np.ndarray, "frame_rows frame_columns"], exposure_s: float) -> Picture:
-        """The same frame without the cure: black level, demosaicing and geometry only."""
+        """Return the frame without restoration: black level, demosaicing and geometry only, linear RGB in e-/s."""
         check_frame(mosaic, exposure_s, self.rig)
         signal = to_electrons(mosaic, self.noise, exposure_s)
         return self.rectification.apply(demosaic(signal, self.rig.camera.cfa)) / np.float32(exposure_s)
@@ -129,7 +138,9 @@ class Restorer:
         """Deblur a demosaiced picture on the sensor.
 
         Args:
-            blurred: in e-. valid: which of its values carry data. variance_e2: of its noise, on average.
+            blurred: picture in e-.
+            valid: which of its values carry data.
+            variance_e2: mean variance of its noise in e-^2.
         """
         channels = []
         for channel, deblurrer in enumerate(self.deblurrers):
@@ -154,8 +165,13 @@ class Restorer:
 def check_frame(mosaic: np.ndarray, exposure_s: float, rig: RigDescription) -> None:
     """Refuse a frame that the rig cannot have taken.
 
+    Args:
+        mosaic: the frame; accepted are 16-bit samples of the camera's size and range.
+        exposure_s: exposure time; accepted is a positive number.
+        rig: the rig description.
+
     Raises:
-        RestorationError: for another type, size or range of samples, or an exposure that is not positive.
+        RestorationError: when the type, size or range of the samples is another, or the exposure is not positive.
     """
     camera = rig.camera
     if mosaic.dtype != np.uint16 or mosaic.ndim != 2:
@@ -174,14 +190,16 @@ def check_frame(mosaic: np.ndarray, exposure_s: float, rig: RigDescription) -> N
             "Give the frame as the camera delivered it, not scaled up."
         )
     if not (np.isfinite(exposure_s) and exposure_s > 0):
-        raise RestorationError(f"Expected a positive exposure in seconds, found {exposure_s}. Give the frame's own.")
+        raise RestorationError(
+            f"Expected a positive exposure in seconds, found {exposure_s}. Give the exposure of the frame."
+        )
 
 
 def check_panel_picture(picture: np.ndarray | None, rig: RigDescription) -> None:
-    """Refuse a panel picture that the rig's panel cannot have shown pixel for pixel.
+    """Refuse a panel picture that the rig's panel cannot have shown pixel for pixel; None is accepted.
 
     Raises:
-        RestorationError: for another size or type.
+        RestorationError: when it is not 8-bit RGB of the panel's size.
     """
     if picture is None:
         return

@@ -1,4 +1,4 @@
-"""Where restored pictures go: PNG to look at, EXR to work on."""
+"""Files of restored pictures: PNG for viewing, EXR for further work."""
 
 from __future__ import annotations
 
@@ -16,15 +16,16 @@ from udccal.restoration.tone import Tone, to_rgb8, to_rgb16
 
 
 def write_picture(path: Path, linear: Float[np.ndarray, "rows columns 3"], tone: Tone, bits: int = 8) -> None:
-    """Write a restored picture, atomically, in the form that the file's name asks for.
+    """Write a restored picture atomically, in the format of the file's name.
 
     Args:
-        path: ``*.exr`` keeps the linear values in e-/s; ``*.png`` gets the display-encoded ones.
-        linear: restored picture. tone: exposure and colour gains of the display-encoded form.
+        path: ``*.exr`` gets linear values in e-/s, ``*.png`` display-encoded ones.
+        linear: restored picture in e-/s.
+        tone: exposure and colour gains of the display-encoded picture.
         bits: 8 or 16, for PNG.
 
     Raises:
-        RestorationError: for another kind of file, or another number of bits.
+        RestorationError: when the name has another ending, or ``bits`` is another number.
     """
     if path.suffix == ".exr":
         write_rgb_exr(path, linear)

@@ -12,34 +12,34 @@ _PERCENTILE, _LEVEL = 97.0, 0.9
 
 @dataclass(frozen=True)
 class Tone:
-    """Display-encoded = sRGB(exposure * gains * linear). ``gains`` balance the colours (R, G, B)."""
+    """Display encoding sRGB(exposure * gains * linear); ``gains`` balance the colours (R, G, B)."""
 
     exposure: float
     gains: tuple[float, float, float] = (1.0, 1.0, 1.0)
 
     def apply(self, linear: Float[np.ndarray, "rows columns 3"]) -> Float32[np.ndarray, "rows columns 3"]:
-        """Display-encoded values from 0 to 1."""
+        """Return display-encoded values from 0 to 1."""
         return encode_srgb(linear * (np.float32(self.exposure) * np.asarray(self.gains, dtype=np.float32)))
 
 
 def encode_srgb(linear: Float[np.ndarray, "*shape"]) -> Float32[np.ndarray, "*shape"]:
-    """Linear light to display-encoded values, clipped to 0-1 (IEC 61966-2-1)."""
+    """Encode ``linear`` light, clipped to 0-1, by the sRGB transfer function (IEC 61966-2-1)."""
     clipped = np.clip(linear, 0.0, 1.0).astype(np.float32)
     root = np.power(np.maximum(clipped, 0.0031308), np.float32(1 / 2.4))
     return np.where(clipped <= 0.0031308, np.float32(12.92) * clipped, np.float32(1.055) * root - np.float32(0.055))
 
 
 def display_exposure(linear: Float[np.ndarray, "rows columns 3"]) -> float:
-    """Factor on linear light that brings its 97th percentile to the display-encoded value 0.9."""
+    """Return the factor on ``linear`` light that brings its 97th percentile to the display-encoded value 0.9."""
     level = float(np.percentile(linear, _PERCENTILE))
     return ((_LEVEL + 0.055) / 1.055) ** 2.4 / max(level, 1e-12)
 
 
 def to_rgb8(display: Float[np.ndarray, "rows columns 3"]) -> UInt8[np.ndarray, "rows columns 3"]:
-    """Display-encoded values to 8 bit."""
+    """Convert ``display``-encoded values, clipped to 0-1, to 8 bit."""
     return np.rint(np.clip(display, 0.0, 1.0) * 255.0).astype(np.uint8)
 
 
 def to_rgb16(display: Float[np.ndarray, "rows columns 3"]) -> UInt16[np.ndarray, "rows columns 3"]:
-    """Display-encoded values to 16 bit."""
+    """Convert ``display``-encoded values, clipped to 0-1, to 16 bit."""
     return np.rint(np.clip(display, 0.0, 1.0) * 65535.0).astype(np.uint16)

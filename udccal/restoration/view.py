@@ -22,13 +22,13 @@ _project, _directions = jax.jit(project_directions), jax.jit(panel_directions)
 def inscribed_view(
     geometry: Geometry, sensor_columns: int, sensor_rows: int, columns: int, rows: int, margin: float = 0.01
 ) -> VirtualView:
-    """The largest ``columns`` x ``rows`` view whose border projects inside the sensor.
+    """Return the largest ``columns`` x ``rows`` view whose border projects inside the sensor.
 
     Args:
-        geometry: where pixels look.
-        sensor_columns: size of the sensor. sensor_rows: size of the sensor.
-        columns: size of the view. rows: size of the view.
-        margin: kept free on each side, as a fraction of the sensor's size.
+        geometry: camera geometry.
+        sensor_columns: columns of the sensor. sensor_rows: rows of the sensor.
+        columns: columns of the view. rows: rows of the view.
+        margin: part of the sensor's size that is left free on each side.
 
     Raises:
         RestorationError: when no part of the sensor looks to the front of the panel.
@@ -63,7 +63,7 @@ def inscribed_view(
 
 
 def _largest(inside, centres: Float[np.ndarray, "n 2"], limit: float) -> Float[np.ndarray, " n"]:  # type: ignore[no-untyped-def]
-    """Largest half width at each centre, by bisection; 0 where not even a point fits."""
+    """Return the largest half width at each centre, by bisection; 0 where not even a point fits."""
     fits, fails = np.zeros(len(centres)), np.full(len(centres), limit)
     for _ in range(_BISECTIONS):
         middle = (fits + fails) / 2
@@ -73,7 +73,7 @@ def _largest(inside, centres: Float[np.ndarray, "n 2"], limit: float) -> Float[n
 
 
 def _unit_border() -> Float[np.ndarray, "points 2"]:
-    """Points along the border of the square from (-1, -1) to (1, 1)."""
+    """Return points along the border of the square from (-1, -1) to (1, 1)."""
     t = np.linspace(-1, 1, _BORDER_POINTS)
     one = np.ones_like(t)
     return np.concatenate([np.stack(side, axis=-1) for side in ((t, -one), (t, one), (-one, t), (one, t))])
@@ -82,7 +82,7 @@ def _unit_border() -> Float[np.ndarray, "points 2"]:
 def _slope_range(
     geometry: Geometry, last: Float[np.ndarray, "2"]
 ) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
-    """Smallest and largest slope (x/z, y/z) against the panel's normal among the sensor's border pixels."""
+    """Return the smallest and largest slope (x/z, y/z) to the panel's normal of the sensor's border pixels."""
     pixels = (_unit_border() + 1) / 2 * last
     rays = np.asarray(_directions(geometry, pixels))
     if np.any(rays[:, 2] <= 0):

@@ -1,4 +1,4 @@
-"""Averages of many frames in memory that does not grow with their number, with unusable frames replaced."""
+"""Averages of many frames in constant memory, with unusable frames replaced."""
 
 from __future__ import annotations
 
@@ -15,33 +15,33 @@ from udccal.sessions.captured import AveragedFrames
 from udccal.sessions.frame_checks import FrameChecks
 
 MAX_FRAMES = 40_000  # sums of 16-bit samples fit 32 bits, and (sum of samples)^2 fits 64
-_DELIVERIES = 8  # each asks only for what is still missing
-_ENOUGH_TO_TELL = 8  # frames of one delivery, all of them unusable
+_DELIVERIES = 8  # each requests only the frames that are still missing
+_ENOUGH_TO_TELL = 8  # frames of one delivery; if all of them are unusable, the rest will be too
 
 
 @final
 class RunningMoments:
-    """Exact sums of integers: mean and variance carry no rounding until they are asked for."""
+    """Exact sums of integers: mean and variance are rounded only when they are returned."""
 
     def __init__(self, rows: int, columns: int) -> None:
         """Start empty for frames of this size."""
         self._sum = np.zeros((rows, columns), np.uint32)
-        # Whole numbers below 2^53: floating point, for which OpenCV has a fast accumulator, holds them exactly.
+        # Integers below 2^53 are exact in floating point, for which OpenCV has a fast accumulator.
         self._squares = np.zeros((rows, columns), np.float64)
         self.frames = 0
 
     def add(self, data: UInt16[np.ndarray, "rows columns"]) -> None:
-        """Take one frame in."""
+        """Add one frame, in DN."""
         np.add(self._sum, data, out=self._sum)
         cv2.accumulateSquare(data, self._squares)
         self.frames += 1
 
     def mean(self) -> Float32[np.ndarray, "rows columns"]:
-        """Mean in DN."""
+        """Return the mean in DN."""
         return (self._sum / self.frames).astype(np.float32)
 
     def variance(self) -> Float32[np.ndarray, "rows columns"]:
-        """Unbiased sample variance in DN^2; needs two frames."""
+        """Return the unbiased sample variance in DN^2; at least two frames are needed."""
         count = self.frames
         exact = count * self._squares.astype(np.int64) - self._sum.astype(np.int64) ** 2
         return (exact / (count * (count - 1))).astype(np.float32)
@@ -51,12 +51,15 @@ def average_frames(deliver: Callable[[int], Iterator[Frame]], count: int, checks
     """Average ``count`` good frames; bad ones are counted with their reason and replaced.
 
     Args:
-        deliver: a configured camera's ``frames``.
-        count: how many frames to average.
-        checks: which frames are good.
+        deliver: method ``frames`` of a configured camera.
+        count: number of frames to average.
+        checks: checks that accept or reject a frame.
+
+    Returns:
+        mean in DN and variance in DN^2, with the settings and the rejected frames.
 
     Raises:
-        CaptureError: when too many frames had to be left out.
+        CaptureError: when ``count`` is out of range, or too many frames were left out.
         CameraError: from the camera.
     """
     if not 2 <= count <= MAX_FRAMES:
@@ -81,9 +84,9 @@ def average_frames(deliver: Callable[[int], Iterator[Frame]], count: int, checks
                 rejected=checks.rejections(),
             )
         if wanted >= _ENOUGH_TO_TELL and (moments.frames if moments is not None else 0) == before:
-            break  # what is wrong stays wrong: a lamp that changed for good, a scene that clips
+            break  # the cause will remain: a lamp that changed for good, or a scene that clips
     raise CaptureError(
-        f"Expected {count} usable frames, found that too many had to be left out "
+        f"Expected {count} usable frames, found that too many were left out "
         f"({checks.summary() or 'the camera delivered too few'}). "
         "Check the light, the exposure and the camera's cable, then repeat the step."
     )

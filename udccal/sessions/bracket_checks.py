@@ -1,4 +1,4 @@
-"""Whether the exposures of a bracket show one and the same light."""
+"""Check that the exposures of a bracket show the same light."""
 
 from __future__ import annotations
 
@@ -8,28 +8,28 @@ from jaxtyping import Float64, UInt16
 from udccal.cameras.protocol import Frame
 from udccal.sessions.frame_checks import FrameLimits
 
-_SIGNAL_DN = 40.0  # above black: below, an uncertain black level and noise say more than the light
+_SIGNAL_DN = 40.0  # above black; in weaker signals, noise and an uncertain black level dominate
 _BELOW_SATURATION = 0.95
 _FEWEST_SAMPLES = 8
 _BRIGHTNESS = 0.1  # relative
-_PATTERN = 0.15  # relative, in the root of the mean square
+_PATTERN = 0.15  # relative RMS
 _PATTERN_CHI2 = 6.0
-_DN_PER_e = 1.0  # a gain that no camera at 0 dB exceeds: the noise is not taken too low
+_DN_PER_e = 1.0  # no camera at 0 dB exceeds this gain, so the noise is not underestimated
 _READ_DN = 3.0
 
 
 def bracket_fault(shorter: Frame, longer: Frame, limits: FrameLimits) -> str | None:
-    """Compare two exposures of a small light, where the longer one does not clip and the shorter one shows something.
+    """Compare two exposures of a small light where the longer one does not clip and the shorter one has signal.
 
     Args:
-        shorter: a frame that was found good.
-        longer: the next one, of the same region.
+        shorter: a good frame.
+        longer: the next longer exposure, of the same region.
         limits: black and saturation level.
 
     Returns:
-        ``"motion"`` where the light's pattern changed by more than 15 % and 6 times the variance of noise;
-        ``"flicker"`` where its brightness, exposure divided out, did by more than 10 %; None where it is the same or
-        nothing can be said.
+        ``"motion"`` when the light's pattern changed by more than 15 % and 6 times the variance of noise;
+        ``"flicker"`` when its brightness per exposure changed by more than 10 %; None when both agree or too few
+        samples can be compared.
     """
     ratio = longer.settings.exposure_s / shorter.settings.exposure_s
     before, after = _light(shorter.data), _light(longer.data)
@@ -47,5 +47,5 @@ def bracket_fault(shorter: Frame, longer: Frame, limits: FrameLimits) -> str | N
 
 
 def _light(data: UInt16[np.ndarray, "rows columns"]) -> Float64[np.ndarray, "rows columns"]:
-    """Samples above the dark surroundings, which hold black level and dark current of this very frame."""
+    """Subtract the dark surroundings, which have the black level and dark current of this frame."""
     return data - float(np.median(data))

@@ -1,4 +1,4 @@
-"""What a step has captured, on its way to disk."""
+"""Captured data of a step before it is stored."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from udccal.sessions.schema import Rejection
 
 @dataclass(frozen=True)
 class SingleFrame:
-    """One frame exactly as the camera delivered it, and the frames left out before it."""
+    """One frame exactly as the camera delivered it, and the frames rejected before it."""
 
     frame: Frame
     rejected: tuple[Rejection, ...] = ()
@@ -21,7 +21,7 @@ class SingleFrame:
 
 @dataclass(frozen=True)
 class AveragedFrames:
-    """Mean and unbiased variance of single frames in DN and DN^2, with what is needed to store them."""
+    """Mean in DN and unbiased variance in DN^2 of single frames, with their settings and times."""
 
     mean: Float32[np.ndarray, "rows columns"]
     variance: Float32[np.ndarray, "rows columns"]

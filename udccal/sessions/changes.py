@@ -1,4 +1,4 @@
-"""Whether a session may go on with the camera and the rig at hand."""
+"""Check that a session may continue with the present camera and rig."""
 
 from __future__ import annotations
 
@@ -13,37 +13,44 @@ from udccal.sessions.schema import Manifest, StoredCamera, StoredChange
 
 
 class Exchanged(enum.StrEnum):
-    """What may be exchanged in the middle of a session when a person says so."""
+    """Parts that may be exchanged during a session when a person confirms it."""
 
     CAMERA = "camera"
     LENS = "lens"
 
 
 def stored_camera(camera: CameraIdentity) -> StoredCamera:
-    """A camera's identity as a manifest holds it."""
+    """Return a camera's identity in the form of the manifest."""
     return StoredCamera(vendor=camera.vendor, model=camera.model, serial=camera.serial, backend=camera.backend)
 
 
 def admit(
     path: Path, manifest: Manifest, rig: RigDescription, camera: CameraIdentity, accepted: Set[Exchanged]
 ) -> Manifest:
-    """The manifest with which the session goes on: as it was, or with the exchange that was accepted written into it.
+    """Return the manifest with which a session continues, with any accepted exchange added.
+
+    Args:
+        path: the session's folder, for messages.
+        manifest: the manifest so far.
+        rig: the present rig description.
+        camera: the present camera.
+        accepted: parts that a person exchanged on purpose.
 
     Raises:
-        SessionError: when the rig is another one, or camera or lens differ and that was not accepted.
+        SessionError: when the rig differs, or camera or lens differ and that was not accepted.
     """
     if rig.model_copy(update={"lens": manifest.rig.lens}) != manifest.rig:
         raise SessionError(
-            f"Expected the session {path} to be of the rig '{rig.name}' as described now, found another one "
-            f"('{manifest.rig.name}'). Begin a new session."
+            f"Expected the session {path} to be of the rig '{rig.name}' as it is described now, found another "
+            f"description ('{manifest.rig.name}'). Begin a new session."
         )
     changes = tuple(_changes(manifest, rig, camera))
     for change in changes:
         if Exchanged(change.what) not in accepted:
             raise SessionError(
                 f"Expected the session {path} to be of the {change.what} {change.after}, found {change.before}. Put "
-                f"that {change.what} back, begin a new session, or say that the {change.what} was exchanged "
-                f"(--exchanged {change.what}): what was captured before then belongs to another {change.what}."
+                f"that {change.what} back, begin a new session, or confirm that the {change.what} was exchanged "
+                f"(--exchanged {change.what}): earlier captures then belong to the earlier {change.what}."
             )
     if not changes:
         return manifest

@@ -1,4 +1,4 @@
-"""Which files of a session are no longer what was captured."""
+"""Find the files of a session that are missing or changed since they were captured."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ _LEFTOVER = re.compile(r"\..+-[0-9a-f]{12}\.partial\.(png|exr|json)")
 
 @dataclass(frozen=True)
 class Damage:
-    """A file that has to be captured again with its step."""
+    """A damaged file, whose step has to be captured again."""
 
     step_id: str
     file: str
     what: Literal["missing", "changed", "unreadable"]
 
     def __str__(self) -> str:
-        """As said to a person."""
+        """Describe the damage to a person."""
         return f"{self.file} of the step {self.step_id} is {self.what}"
 
 
@@ -41,7 +41,7 @@ def remove_leftovers(folder: Path) -> None:
 
 
 def is_leftover(path: Path) -> bool:
-    """Whether a killed process left this behind half-written."""
+    """Return whether a file is half-written and was left by a killed process."""
     return _LEFTOVER.fullmatch(path.name) is not None and path.is_file() and not path.is_symlink()
 
 

@@ -1,5 +1,8 @@
-"""Which frames of a steady scene are fit to be averaged: complete, of one setting, unclipped, dark where they must be
-dark, as bright as the others, and showing the same thing."""
+"""Select the frames of a steady scene that may be averaged.
+
+Such frames are complete, of one setting, not clipped, dark where they must be dark, as bright as the others, and show
+the same scene.
+"""
 
 from __future__ import annotations
 
@@ -16,28 +19,30 @@ from udccal.cameras.protocol import Frame, Settings
 from udccal.sessions.patches import brightest_patch_DN, patch_means
 from udccal.sessions.schema import Rejection
 
-_MEMORY = 31  # means remembered as the yardstick
-_WARM_UP = 8  # frames held back until there is a yardstick
-_FEWEST = 4  # below this a median says nothing
+_MEMORY = 31  # means kept as the reference
+_WARM_UP = 8  # frames held back until there is a reference
+_FEWEST = 4  # fewer means give no useful median
 _SIGMAS = 8.0
 _FLOOR_RELATIVE = 2e-3
 _FLOOR_DN = 0.3
-# Motion, in patches of the frame: 3072 of them at full size, of which the largest of pure noise lies at 4 sigmas.
+# Motion is found in patches of the frame: 3072 at full size, where the largest change by noise alone is 4 sigma.
 _FEWEST_PATCHES = 12
 _PATCH_SIGMAS = 10.0
 _PATCH_FLOOR_RELATIVE = 3e-3
 _PATCH_FLOOR_DN = 1.0
-# A camera may state for a frame what it rounded the settings to.
+# A camera may report rounded settings with a frame.
 _EXPOSURE_RELATIVE, _GAIN_DB = 0.01, 0.05
 
 
 @dataclass(frozen=True)
 class FrameLimits:
-    """What a good frame stays within, in DN.
+    """Limits of a good frame.
 
     Attributes:
-        max_saturated_fraction: of samples at ``saturation_DN`` or above; 1 where clipping is meant.
-        dark_DN: what no patch of a dark frame may exceed; None where light is meant.
+        black_DN: black level.
+        saturation_DN: level from which a sample counts as clipped.
+        max_saturated_fraction: largest fraction of clipped samples; 1 where clipping is intended.
+        dark_DN: largest median of a patch of a dark frame; None where light is intended.
     """
 
     black_DN: float
@@ -55,14 +60,14 @@ class _Seen:
 
 @final
 class FrameChecks:
-    """Judges the frames of one capture and remembers why any was left out.
+    """Checks the frames of one capture and counts the reasons for which frames are left out.
 
-    Flicker: a frame whose mean differs from the median of recent means by more than 8 robust sigmas (1.4826 MAD, not
-    taken below 0.2 % of the signal or 0.3 DN) is left out. Fast flicker that all frames share stays in the variance.
+    Flicker: a frame is left out when its mean differs from the median of recent means by more than 8 robust sigma
+    (1.4826 MAD), 0.2 % of the signal and 0.3 DN. Fast flicker that all frames have in common stays in the variance.
 
-    Motion: a frame some patch of which (32 x 32 px), brightness divided out, differs from the mean of the frames before
-    by more than 10 times the usual spread of patches, 0.3 % of the signal and 1 DN is left out: something moved, passed
-    by, or changed in one place. Fewer than 12 patches are not judged.
+    Motion: a frame is left out when a patch of 32 x 32 px, divided by the frame's brightness, differs from the median
+    of the frames before by more than 10 times the usual spread of patches, and by more than 0.3 % of the signal plus
+    1 DN. Then something moved, passed by, or changed in one place. Frames with fewer than 12 patches are not checked.
     """
 
     def __init__(self, limits: FrameLimits, settings: Settings) -> None:
@@ -77,18 +82,18 @@ class FrameChecks:
         self._dropped = 0
 
     def rejections(self) -> tuple[Rejection, ...]:
-        """Reasons with their counts, the commonest first."""
+        """Return the reasons with their counts, the most common first."""
         found = [Rejection(reason=reason, frames=frames) for reason, frames in self._reasons.most_common()]
         if self._dropped:
             found.append(Rejection(reason="dropped on the way from the camera", frames=self._dropped))
         return tuple(found)
 
     def summary(self) -> str:
-        """The same in words, for a sentence; empty when nothing was left out."""
+        """Return the rejections in words, for a sentence; empty when no frame was left out."""
         return ", ".join(f"{item.frames} {item.reason}" for item in self.rejections())
 
     def accepted(self, frames: Iterable[Frame], expected: int) -> Iterator[Frame]:
-        """The usable ones among frames of one delivery of ``expected``; at most eight are held at a time."""
+        """Yield the usable frames of one delivery of ``expected`` frames; at most eight are held at a time."""
         held: list[_Seen] = []
         warm_up = min(_WARM_UP, expected)
         for frame in self.sound(frames):
@@ -101,7 +106,7 @@ class FrameChecks:
         yield from self._steady(held)
 
     def sound(self, frames: Iterable[Frame]) -> Iterator[Frame]:
-        """The frames of one delivery in which nothing is wrong by itself, whatever the others show."""
+        """Yield the frames of one delivery that have no fault of their own, without comparing them with others."""
         last_id: int | None = None
         for frame in frames:
             reason = self._fault(frame, last_id)
@@ -112,11 +117,11 @@ class FrameChecks:
                 self._reasons[reason] += 1
 
     def reject(self, reason: str) -> None:
-        """Count a frame that the caller leaves out for a reason of its own."""
+        """Count a frame that the caller leaves out for another reason."""
         self._reasons[reason] += 1
 
     def _fault(self, frame: Frame, last_id: int | None) -> str | None:
-        # Ids may begin anew with each delivery; the same id at the same time is the same frame even so.
+        # Ids may restart with each delivery, but the same id at the same time is always the same frame.
         repeated = (frame.frame_id, frame.timestamp_s) == self._latest
         self._latest = (frame.frame_id, frame.timestamp_s)
         if repeated or (last_id is not None and frame.frame_id <= last_id):
@@ -136,17 +141,17 @@ class FrameChecks:
         return None
 
     def _steady(self, candidates: list[_Seen]) -> Iterator[Frame]:
-        """Frames in line with those before; the candidates themselves count towards the yardstick."""
+        """Yield frames that agree with earlier ones; the candidates themselves are part of the reference."""
         means = np.array([*self._recent, *(seen.mean for seen in candidates)])
         if means.size == 0:
             return
         middle = float(np.median(means))
         spread = 1.4826 * float(np.median(np.abs(means - middle)))
         limit = max(_SIGMAS * spread, _FLOOR_RELATIVE * (middle - self._limits.black_DN), _FLOOR_DN)
-        judged = means.size >= _FEWEST
-        moved = self._moved(candidates, middle) if judged else [False] * len(candidates)
+        comparable = means.size >= _FEWEST
+        moved = self._moved(candidates, middle) if comparable else [False] * len(candidates)
         for seen, has_moved in zip(candidates, moved, strict=True):
-            if judged and abs(seen.mean - middle) > limit:
+            if comparable and abs(seen.mean - middle) > limit:
                 self._reasons["flicker"] += 1
             elif has_moved:
                 self._reasons["motion"] += 1
@@ -156,14 +161,14 @@ class FrameChecks:
                 yield seen.frame
 
     def _moved(self, candidates: list[_Seen], mean_DN: float) -> list[bool]:
-        """Whether some patch of each candidate changed against the frames before by more than patches usually do."""
+        """Return whether a patch of each candidate changed by more than patches usually do."""
         reference = np.median([*self._patches, *(seen.patches for seen in candidates)], axis=0)
         if reference.size < _FEWEST_PATCHES:
             return [False] * len(candidates)
         black = self._limits.black_DN
         light = np.maximum(reference - black, 1.0)
         brightness = [max(seen.mean - black, 1.0) / max(mean_DN - black, 1.0) for seen in candidates]
-        # Shot noise grows with the root of the light; its scale is what most frames show.
+        # Shot noise grows with the root of the light; its scale is taken from most frames.
         changes = [
             (seen.patches - black - ratio * (reference - black)) / np.sqrt(light)
             for seen, ratio in zip(candidates, brightness, strict=True)
@@ -176,7 +181,13 @@ class FrameChecks:
 
 
 def frames_agree(frames: Iterable[Frame], black_DN: float, tolerance: float) -> bool:
-    """Whether the mean light of frames of one scene and setting agrees within ``tolerance`` (relative), or 0.5 DN."""
+    """Return whether the mean signals of frames of one scene and setting agree.
+
+    Args:
+        frames: the frames; at least one.
+        black_DN: black level.
+        tolerance: largest difference relative to the brightest frame; 0.5 DN is always accepted.
+    """
     means = [cv2.mean(frame.data)[0] - black_DN for frame in frames]
     return max(means) - min(means) <= max(tolerance * max(means), 0.5)
 

@@ -1,4 +1,4 @@
-"""One process at a time writes to a session."""
+"""A lock, so that one process at a time writes to a session."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ LOCK_NAME = ".session.lock"
 
 
 def lock_session(folder: Path) -> FileLock:
-    """Hold a session until the lock is released; the operating system releases it when the process ends in any way.
+    """Lock a session until the lock is released; the operating system releases it when the process ends in any way.
 
     Raises:
-        SessionError: when another process, or another writer in this one, holds it, or the disk knows no locks.
+        SessionError: when another process, or another writer in this one, holds it, or the disk has no locks.
     """
     lock = FileLock(folder / LOCK_NAME, timeout=0, thread_local=False)
     try:

@@ -1,4 +1,4 @@
-"""Reading and writing ``session.json``: strict, bounded, atomic, and refused with a sentence."""
+"""Reading and writing ``session.json``: strictly checked, of bounded size, and written atomically."""
 
 from __future__ import annotations
 
@@ -20,16 +20,20 @@ DAMAGED_NAME = "session.damaged.json"
 FORMAT = "udccal-session"
 VERSION = 1
 _MAX_BYTES = 64 * 1024 * 1024
-_BLANK = b"0" * 64  # stands for the manifest's own checksum while that is taken
+_BLANK = b"0" * 64  # placeholder for the manifest's own checksum while that is computed
 _SEAL = re.compile(rb'"manifest_sha256":\s*"([0-9a-f]{64})"')
 
 
 class NewerManifestError(SessionError):
-    """A manifest of a later version of udccal: whole, but not for this one."""
+    """A whole manifest of a later version of udccal, which this version cannot read."""
 
 
 def read_manifest(folder: Path, name: str = MANIFEST_NAME) -> Manifest:
     """Read and check the manifest of a session.
+
+    Args:
+        folder: the session's folder.
+        name: the file's name in it.
 
     Raises:
         SessionError: when it is missing, too large, not JSON, of a newer version, changed after it was written, or
@@ -45,7 +49,7 @@ def read_manifest(folder: Path, name: str = MANIFEST_NAME) -> Manifest:
 
 
 def write_manifest(folder: Path, manifest: Manifest) -> None:
-    """Replace the manifest whole: a reader meets the old one or the new one, never half of either."""
+    """Replace the manifest atomically: a reader sees the old one or the new one, never a part of either."""
     blank = manifest.model_copy(update={"manifest_sha256": _BLANK.decode()})
     content = blank.model_dump_json(indent=1).encode() + b"\n"
     seal = hashlib.sha256(content).hexdigest().encode()
@@ -53,7 +57,7 @@ def write_manifest(folder: Path, manifest: Manifest) -> None:
 
 
 def keep_previous(folder: Path) -> None:
-    """Copy the manifest as it stands, so that damage to the next one costs one step only."""
+    """Copy the present manifest, so that damage to the next one costs one step only."""
     write_atomically(folder / PREVIOUS_NAME, _content(folder, MANIFEST_NAME))
 
 
@@ -71,21 +75,21 @@ def _content(folder: Path, name: str) -> bytes:
 
 
 def _check_seal(file: Path, content: bytes) -> None:
-    """A manifest with a checksum of its own has the bytes that were written; another program may write none."""
+    """Compare a manifest with its own checksum, if it has one; other programs may write none."""
     seal = _SEAL.search(content)
     if seal is None:
         return
     start, end = seal.span(1)
     if hashlib.sha256(content[:start] + _BLANK + content[end:]).hexdigest() != seal[1].decode():
         raise SessionError(
-            f"Expected {file} to have the bytes that were written, found that its own checksum does not match: it was "
-            "changed or damaged. Capture again, which goes on from the copy kept before the last step; or, if you "
-            "edited it, remove the entry 'manifest_sha256'."
+            f"Expected {file} to match its own checksum, found that it was changed or damaged. Capture again, which "
+            "continues from the copy kept before the last step. If you edited the file, remove the entry "
+            "'manifest_sha256'."
         )
 
 
 def _check_version(file: Path, content: bytes) -> None:
-    """Refuse other formats and newer versions before the strict reading, which would only name an unknown entry."""
+    """Refuse other formats and newer versions before strict validation, which would only name an unknown entry."""
     try:
         found = json.loads(content)
     except (ValueError, RecursionError) as error:

@@ -1,4 +1,4 @@
-"""A frame looked at in patches of whole 2 x 2 cells, so that no colour of the pattern stands out."""
+"""Means and medians of a frame over patches of whole 2 x 2 cells, in which all colours of the pattern count equally."""
 
 from __future__ import annotations
 
@@ -11,8 +11,10 @@ _FEWEST_ACROSS = 8
 
 
 def patch_means(data: UInt16[np.ndarray, "rows columns"]) -> Float32[np.ndarray, "down across"]:
-    """Means over patches of 32 x 32, or smaller where there would be fewer than 8 of them to a side; what is left over
-    at the right and below is not looked at."""
+    """Return means over patches of 32 x 32 samples, or smaller ones where a side would have fewer than 8 patches.
+
+    Samples left over at the right and at the bottom are ignored.
+    """
     side = _side(data)
     down, across = data.shape[0] // side, data.shape[1] // side
     if min(down, across) < 1:
@@ -22,7 +24,7 @@ def patch_means(data: UInt16[np.ndarray, "rows columns"]) -> Float32[np.ndarray,
 
 
 def brightest_patch_DN(data: UInt16[np.ndarray, "rows columns"]) -> float:
-    """The highest median of any patch: light that falls on a part of the frame, and no hot pixel, raises it."""
+    """Return the highest median of a patch of ``data`` in DN; light on part of the frame raises it, hot pixels not."""
     return float(_patch_medians(data).max())
 
 

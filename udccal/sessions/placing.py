@@ -1,4 +1,4 @@
-"""Putting what was captured into a session's folder, one whole file each."""
+"""Writing captured data to a session's folder, one whole file each."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def place_capture(folder: Path, stem: str, capture: Capture) -> StoredCapture:
     """Write a frame or an average; a file of that name is replaced.
 
     Raises:
-        SessionError: when the stem is no step id.
+        SessionError: when the stem is not a valid step id.
         OSError: when the disk is full or cannot be written to.
     """
     match capture:

@@ -1,4 +1,4 @@
-"""The manifest of a session, ``session.json``, version 1. docs/session.md says the same to other programs."""
+"""The manifest of a session, ``session.json``, version 1, which docs/session.md describes."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class StoredRegion(_Strict):
 
 
 class Rejection(_Strict):
-    """Frames left out of a capture, with the reason a person can read."""
+    """Frames left out of a capture, with a reason for a person to read."""
 
     reason: Annotated[str, Field(max_length=200)]
     frames: Annotated[int, Field(ge=1)]
@@ -77,7 +77,7 @@ class FlatSubject(_Strict):
 
 
 class LedSubject(_Strict):
-    """A small LED; the position is where a person aimed for, the fit finds where it was."""
+    """A small LED; the position is where a person aimed, and the fit finds where it was."""
 
     kind: Literal["led"] = "led"
     x_px: float
@@ -87,7 +87,7 @@ class LedSubject(_Strict):
 
 
 class BoardSubject(_Strict):
-    """A ChArUco board somewhere in view, or (``parallel_to_panel``) on the jig that holds it parallel to the panel."""
+    """A ChArUco board in view, or, with ``parallel_to_panel``, on the jig that holds it parallel to the panel."""
 
     kind: Literal["board"] = "board"
     columns: Annotated[int, Field(ge=2, le=100)]
@@ -99,7 +99,7 @@ class BoardSubject(_Strict):
 
 
 class PanelSubject(_Strict):
-    """Blackout with the panel showing a picture, stored as 8-bit RGB PNG at the panel's resolution."""
+    """A dark room in which the panel shows a picture, stored as 8-bit RGB PNG at the panel's resolution."""
 
     kind: Literal["panel"] = "panel"
     picture: RelativePath
@@ -128,7 +128,7 @@ class StoredStep(_Strict):
 
 
 class StoredCamera(_Strict):
-    """Which camera took the session."""
+    """The camera that took the session."""
 
     vendor: Annotated[str, Field(max_length=100)]
     model: Annotated[str, Field(max_length=100)]
@@ -137,7 +137,7 @@ class StoredCamera(_Strict):
 
 
 class StoredChange(_Strict):
-    """The camera or the lens was exchanged, and a person said that the session shall go on all the same."""
+    """An exchange of the camera or the lens, after which a person continued the session."""
 
     what: Literal["camera", "lens"]
     before: Annotated[str, Field(max_length=300)]
@@ -164,5 +164,5 @@ class Manifest(_Strict):
         for step in self.steps:
             for region in (capture.region for capture in step.captures):
                 if region.x + region.columns > self.rig.camera.columns or region.y + region.rows > self.rig.camera.rows:
-                    raise ValueError(f"regions inside the sensor, not as in step '{step.id}'")
+                    raise ValueError(f"regions inside the sensor, unlike that of step '{step.id}'")
         return self

@@ -25,7 +25,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Average:
-    """Mean and unbiased variance of single frames in DN and DN^2, sample by sample of the mosaic."""
+    """Mean in DN and unbiased variance in DN^2 of single frames, for every sample of the mosaic."""
 
     mean: Float32[np.ndarray, "rows columns"]
     variance: Float32[np.ndarray, "rows columns"]
@@ -34,7 +34,7 @@ class Average:
 
 @final
 class Session:
-    """A captured session on disk, open for reading. Nothing is kept in memory but the manifest."""
+    """A captured session on disk, open for reading. Only the manifest is kept in memory."""
 
     def __init__(self, path: Path, manifest: Manifest) -> None:
         """Use ``Session.open``."""
@@ -63,11 +63,11 @@ class Session:
         return self.manifest.camera
 
     def steps(self, term: TermName) -> tuple[StoredStep, ...]:
-        """The completed steps of a term, in the order they were captured."""
+        """Return the completed steps of a term, in the order they were captured."""
         return tuple(step for step in self.manifest.steps if step.term == term)
 
     def step(self, step_id: str) -> StoredStep:
-        """The completed step of that id.
+        """Return a completed step by its id.
 
         Raises:
             SessionError: when it was not captured.
@@ -80,10 +80,10 @@ class Session:
         )
 
     def frame(self, capture: StoredCapture) -> UInt16[np.ndarray, "rows columns"]:
-        """The single frame of a capture in DN.
+        """Read the single frame of a capture, in DN.
 
         Raises:
-            SessionError: when it is an average, or the file is missing, changed, mis-shaped or out of range.
+            SessionError: when it is an average, or the file is missing, changed, of another shape or out of range.
         """
         if capture.kind != "frame":
             raise SessionError(f"Expected '{capture.file}' of {self.path} to be a single frame, found an average.")
@@ -92,10 +92,10 @@ class Session:
         return data
 
     def average(self, capture: StoredCapture) -> Average:
-        """The average of a capture.
+        """Read the average of a capture.
 
         Raises:
-            SessionError: when it is a single frame, or the file is missing, changed, mis-shaped or out of range.
+            SessionError: when it is a single frame, or the file is missing, changed, of another shape or out of range.
         """
         if capture.kind != "average":
             raise SessionError(f"Expected '{capture.file}' of {self.path} to be an average, found a single frame.")
@@ -112,7 +112,7 @@ class Session:
         return Average(mean, variance, capture.frames)
 
     def picture(self, subject: PanelSubject) -> UInt8[np.ndarray, "panel_rows panel_columns 3"]:
-        """The picture that the panel showed, 8-bit RGB at the panel's resolution.
+        """Read the picture that the panel showed, 8-bit RGB at the panel's resolution.
 
         Raises:
             SessionError: when the file is missing, changed or of another size.

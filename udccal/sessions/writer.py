@@ -1,4 +1,4 @@
-"""Writing a session: files first, each whole or absent, then the manifest that names them."""
+"""Writing a session: first the files, each whole or absent, then the manifest that names them."""
 
 from __future__ import annotations
 
@@ -39,20 +39,20 @@ Now = Callable[[], datetime]
 
 
 def utc_now() -> datetime:
-    """The time of day; a simulated rig has its own."""
+    """Return the time of day; a simulated rig has its own clock."""
     return datetime.now(UTC)
 
 
 @final
 class SessionWriter:
-    """Adds completed steps to a session on disk, alone; the manifest on disk is true after every call.
+    """Adds completed steps to a session on disk, as its only writer; the manifest on disk is correct after every call.
 
-    Whatever ends the process, and whenever, the session holds every step that ``add_step`` returned from, each once.
-    Use it as a context manager, or ``close`` it, to let others write to the session.
+    The session holds every step that ``add_step`` returned from, each once, however and whenever the process ends. Use
+    it as a context manager, or ``close`` it, to let others write to the session.
 
     Attributes:
         damage: files found missing or changed when the session was opened; their steps count as not captured.
-        recovered: the manifest itself was damaged, and the one before the last step was taken in its place.
+        recovered: whether the manifest was damaged and replaced by the one before the last step.
     """
 
     def __init__(
@@ -94,13 +94,13 @@ class SessionWriter:
 
     @classmethod
     def resume(cls, path: str | Path, now: Now = utc_now) -> SessionWriter:
-        """Go on with a session; steps that its manifest names and whose files are whole count as completed.
+        """Continue a session; steps that its manifest names and whose files are whole count as completed.
 
-        Every file is read and compared with its checksum. What a killed process left half-written is removed.
+        Every file is read and compared with its checksum. Half-written files of a killed process are removed.
 
         Raises:
-            SessionError: when there is none, another process writes to it, or its manifest does not follow
-                docs/session.md and no earlier one is left.
+            SessionError: when there is no session, another process writes to it, or its manifest does not follow
+                docs/session.md and there is no earlier one.
         """
         folder = Path(path)
         if not any((folder / name).is_file() for name in (MANIFEST_NAME, PREVIOUS_NAME)):
@@ -125,14 +125,14 @@ class SessionWriter:
         accepted: Set[Exchanged] = frozenset(),
         now: Now = utc_now,
     ) -> SessionWriter:
-        """Go on with the session in a folder if there is one of this rig and camera, else begin one.
+        """Continue the session in a folder if there is one of this rig and camera, else begin one.
 
         Args:
             path: the session's folder.
-            rig: as described now.
-            camera: the one at hand.
-            accepted: what a person exchanged on purpose since the session was begun.
-            now: the time of day.
+            rig: the present rig description.
+            camera: the present camera.
+            accepted: parts that a person exchanged on purpose since the session was begun.
+            now: function that returns the time of day.
 
         Raises:
             SessionError: when the folder holds something else, or a session of another rig, camera or lens.
@@ -167,11 +167,11 @@ class SessionWriter:
         return frozenset(step.id for step in self.manifest.steps) - self._invalid
 
     def step(self, step_id: str) -> StoredStep | None:
-        """A step that was captured (its files may be damaged), or None."""
+        """Return a step that was captured (its files may be damaged), or None."""
         return next((step for step in self.manifest.steps if step.id == step_id), None)
 
     def number(self, step_id: str) -> int:
-        """The place of a step in the session, counted from 0: the one it has, or the next that is free."""
+        """Return the index of a step in the session from 0: its own, or the next free one."""
         ids = [step.id for step in self.manifest.steps]
         return ids.index(step_id) if step_id in ids else len(ids)
 
@@ -181,7 +181,7 @@ class SessionWriter:
         picture: UInt8[np.ndarray, "panel_rows panel_columns 3"],
         role: Literal["white", "picture", "brightened"],
     ) -> PanelSubject:
-        """Store what the panel shows during a step, before the step is added with the subject returned.
+        """Store the picture that the panel shows during a step, and return the subject with which to add the step.
 
         Raises:
             SessionError: when the id does not fit docs/session.md, or the disk is full or cannot be written to.
@@ -190,14 +190,14 @@ class SessionWriter:
             return place_picture(self.path, step_id, picture, role)
 
     def add_step(self, step_id: str, term: TermName, subject: Subject, captures: Sequence[Capture]) -> StoredStep:
-        """Store a completed step's captures and name them in the manifest, in place of the step if it was damaged.
+        """Store a completed step's captures and name them in the manifest; a damaged step of this id is replaced.
 
         Raises:
-            SessionError: when the step is there already, does not fit docs/session.md, or the disk is full or cannot
-                be written to. The session stays as it was.
+            SessionError: when the step is already captured, does not follow docs/session.md, or the disk is full or
+                cannot be written to. The session stays as it was.
         """
         if step_id in self.completed_ids:
-            raise SessionError(f"Expected a new step in {self.path}, found '{step_id}' captured already. Skip it.")
+            raise SessionError(f"Expected a new step in {self.path}, found '{step_id}' already captured. Skip it.")
         try:
             with _sentences(f"the step '{step_id}'", self.path):
                 step = StoredStep(
@@ -239,12 +239,12 @@ def _check_new(folder: Path) -> None:
 
 
 def _may_be_there(item: Path) -> bool:
-    """What a process that was killed while it began a session leaves behind."""
+    """Return whether a process that was killed while it began a session may have left this."""
     return item.name == LOCK_NAME or is_leftover(item)
 
 
 def _read_or_recover(folder: Path) -> tuple[Manifest, bool]:
-    """The manifest, or if that is damaged the one before it, which then takes its place."""
+    """Read the manifest; if it is damaged, replace it by the one before the last step."""
     try:
         return read_manifest(folder), False
     except NewerManifestError:
@@ -257,7 +257,7 @@ def _read_or_recover(folder: Path) -> tuple[Manifest, bool]:
         if manifest is None:
             raise
     with _sentences("the manifest", folder):
-        with suppress(FileNotFoundError):  # a person may have edited it, and want that back; a link is moved as it is
+        with suppress(FileNotFoundError):  # keep it: a person may have edited it; a link is moved, not followed
             os.replace(folder / MANIFEST_NAME, folder / DAMAGED_NAME)
         write_manifest(folder, manifest)
     return manifest, True
@@ -265,7 +265,7 @@ def _read_or_recover(folder: Path) -> tuple[Manifest, bool]:
 
 @contextmanager
 def _sentences(what: str, folder: Path) -> Iterator[None]:
-    """Say what the operating system refused, and what to do."""
+    """Turn an error of the operating system into a sentence that says what to do."""
     try:
         yield
     except OSError as error:

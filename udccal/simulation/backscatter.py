@@ -1,8 +1,8 @@
-"""Backscatter: the panel's own light in the lens, straight from its emitters and by reflection in its glass.
+"""Backscatter: the panel's own light in the lens, directly from its emitters and by reflection in its glass.
 
-Three planes send light to the pupil, each out of focus: the emitters themselves, which leak backwards; their mirror
-image in the outer face of the front glass (air behind glass: Fresnel); and a fainter image after a second round, by way
-of the opaque rows. A face at depth t in glass of index n puts the image at 2 t / n.
+Three planes send light to the pupil, each out of focus. The first is that of the emitters, which leak backwards. The
+second is their mirror image in the outer face of the front glass (glass to air: Fresnel). The third is a fainter image
+after a second round trip, by way of the opaque rows. A face at depth t in glass of index n puts the image at 2 t / n.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _ROW_REFLECTANCE = 0.6
 
 @dataclass(frozen=True)
 class Backscatterer:
-    """The rig's answer to panel light, worked out once on a coarse grid of sensor positions (``x``, ``y`` in px)."""
+    """The rig's response to panel light, computed once on a coarse grid of sensor positions (``x``, ``y`` in px)."""
 
     truth: RigTruth
     x: Float[np.ndarray, "grid_columns"]
@@ -34,7 +34,7 @@ class Backscatterer:
     shares: tuple[sparse.csr_array, ...]
 
     def rate(self, picture: UInt8[np.ndarray, "panel_rows panel_columns 3"]) -> Float[np.ndarray, "rows columns"]:
-        """Mosaic of backscatter in e-/s while the panel shows ``picture``, before multiplication by the wire.
+        """Return the mosaic of backscatter in e-/s, before the wire, while the panel shows ``picture``.
 
         Raises:
             UdccalError: when the picture is not of the panel's size.
@@ -62,7 +62,7 @@ class Backscatterer:
 
 
 def backscatterer(truth: RigTruth) -> Backscatterer:
-    """Work out a rig's answer to panel light."""
+    """Compute a rig's response to panel light."""
     x, y = coarse_grid(truth)
     pixels = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
     directions = pixels_to_directions(truth.optics, pixels)
@@ -73,20 +73,20 @@ def backscatterer(truth: RigTruth) -> Backscatterer:
 def backscatter_rate(
     truth: RigTruth, picture: UInt8[np.ndarray, "panel_rows panel_columns 3"]
 ) -> Float[np.ndarray, "rows columns"]:
-    """Mosaic of backscatter in e-/s before the wire; for several pictures keep one ``backscatterer``."""
+    """Return the mosaic of backscatter in e-/s before the wire; for several pictures keep one ``backscatterer``."""
     return backscatterer(truth).rate(picture)
 
 
 def panel_light(
     truth: RigTruth, picture: UInt8[np.ndarray, "panel_rows panel_columns 3"]
 ) -> Float[np.ndarray, "pixels 3"]:
-    """Linear light of each primary, 0 to 1: the panel's transfer curve is a pure power."""
+    """Return the linear light of each primary, 0 to 1: the panel's transfer curve is a pure power."""
     curve = ((np.arange(256) / 255.0) ** truth.panel.gamma).astype(np.float32)
     return curve[picture.reshape(-1, 3)]
 
 
 def coarse_grid(truth: RigTruth) -> tuple[Float[np.ndarray, "grid_columns"], Float[np.ndarray, "grid_rows"]]:
-    """Sensor positions dense enough for the ripple that rows leave in the backscatter, and a little beyond the edge."""
+    """Return sensor positions dense enough for the rows' ripple in the backscatter, and a little past the edge."""
     camera, optics = truth.description.camera, truth.optics
     period = truth.panel.pitch_mm / abs(float(optics.pupil_mm[2])) * optics.fx_px
     step = max(1, int(period / _SAMPLES_PER_PERIOD))
@@ -98,7 +98,7 @@ def coarse_grid(truth: RigTruth) -> tuple[Float[np.ndarray, "grid_columns"], Flo
 
 
 def fresnel_reflectance(index: float, cosine: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
-    """Reflectance of a glass face for unpolarised light, by the cosine of its angle in air."""
+    """Return the reflectance of a glass face for unpolarised light, by the cosine of its angle in air (Fresnel)."""
     inside = np.sqrt(1 - (1 - cosine**2) / index**2)
     across = (cosine - index * inside) / (cosine + index * inside)
     parallel = (index * cosine - inside) / (index * cosine + inside)

@@ -1,7 +1,7 @@
-"""Space-variant blur of the simulated rig in low rank: y = sum_r h_r * (c_r x), the kernel belonging to the source.
+"""Space-variant blur of the simulated rig in low rank: y = sum_r h_r * (c_r x), where kernels belong to the source.
 
 Kernels on a grid of source positions are decomposed per colour by a singular value decomposition (Lauer, "Deconvolution
-with a spatially-variant PSF", 2002); between the grid's nodes the coefficients c_r follow a cubic spline.
+with a spatially-variant PSF", 2002). Between the grid's nodes the coefficients c_r follow a cubic spline.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class SpaceVariantBlur:
         components: kernels h_r by colour; odd sizes, origin in the middle.
         coefficients: c_r by colour at the grid's nodes.
         grid_x_px: x of the grid's columns on the sensor. grid_y_px: y of its rows.
-        relative_error: what the cut at this rank left out of the kernels, relative L2, worst colour.
+        relative_error: relative L2 error of the kernels at this rank, for the worst colour.
     """
 
     components: Float[np.ndarray, "3 rank rows columns"]
@@ -43,10 +43,10 @@ class SpaceVariantBlur:
         return self.components.shape[2] // 2, self.components.shape[3] // 2
 
     def apply(self, canvas: Float[np.ndarray, "canvas_rows canvas_columns 3"]) -> Float[np.ndarray, "rows columns 3"]:
-        """Blur a scene drawn on the sensor's pixels and ``margin`` around them; what the sensor holds is returned.
+        """Blur a scene drawn on the sensor's pixels and ``margin`` around them; return the sensor's pixels.
 
-        Pixel (margin columns, margin rows) of ``canvas`` is sensor pixel (0, 0). Light that leaves the canvas comes in
-        again at its other side, but reaches no further than the margin, which is cut off.
+        Pixel (margin columns, margin rows) of ``canvas`` is sensor pixel (0, 0). Light that leaves the canvas wraps
+        around to its other side, but reaches only the margin, which is cut off.
         """
         margin_rows, margin_columns = self.margin
         rows, columns = canvas.shape[0], canvas.shape[1]
@@ -61,7 +61,7 @@ class SpaceVariantBlur:
                 total += _transform(weighted, shape) * _transform(_origin_first(component, shape), shape)
             plane = scipy.fft.irfft2(total, s=shape, workers=_WORKERS)
             blurred[..., colour] = plane[margin_rows : rows - margin_rows, margin_columns : columns - margin_columns]
-        # Beside a light a million times brighter, the cut rank and single precision leave less than no light.
+        # Next to a light a million times brighter, the cut rank and single precision give negative values.
         return np.maximum(blurred, 0.0, out=blurred)
 
 
@@ -74,14 +74,14 @@ def build_blur(
     max_rank: int = 16,
     tolerance: float = 1e-3,
 ) -> SpaceVariantBlur:
-    """Blur from kernels of ``rows`` x ``columns`` pixels on a grid that spans the sensor.
+    """Build the blur from kernels of ``rows`` x ``columns`` pixels on a grid that spans the sensor.
 
     Args:
         truth: the simulated rig.
         grid_columns: source positions across. grid_rows: source positions down.
         rows: odd number of rows of a kernel. columns: odd number of columns.
-        max_rank: components kept at most.
-        tolerance: components are kept until the kernels on the grid are met with this relative error.
+        max_rank: largest number of components.
+        tolerance: relative error of the kernels on the grid at which the rank is cut.
     """
     camera = truth.description.camera
     grid_x = np.linspace(0.0, camera.columns - 1.0, grid_columns)
@@ -103,7 +103,7 @@ def build_blur(
 def low_rank(
     stack: Float[np.ndarray, "3 nodes samples"], max_rank: int, tolerance: float
 ) -> tuple[Float[np.ndarray, "3 rank samples"], Float[np.ndarray, "3 rank nodes"], float]:
-    """Components and coefficients such that ``stack[c, n]`` = sum over r of ``coefficients[c, r, n] components[c, r]``.
+    """Decompose ``stack[c, n]`` into the sum over r of ``coefficients[c, r, n] components[c, r]``.
 
     Returns:
         components, coefficients, and the relative error (L2, worst colour) of the common rank chosen.
@@ -126,7 +126,7 @@ def _each_kernel(
 
 
 def _spline_basis(nodes: Float[np.ndarray, "nodes"], positions: np.ndarray) -> Float[np.ndarray, "n nodes"]:
-    """Matrix from values at ``nodes`` to a cubic spline's values at ``positions``, constant outside the nodes."""
+    """Return the matrix from values at ``nodes`` to a cubic spline's at ``positions``, constant outside the nodes."""
     if nodes.size == 1:
         return np.ones((positions.size, 1))
     cardinal = make_interp_spline(nodes, np.eye(nodes.size), k=min(3, nodes.size - 1))

@@ -1,4 +1,4 @@
-"""A ChArUco board held in front of the panel, ray by ray."""
+"""A ChArUco board held in front of the panel, rendered ray by ray."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ _TEXELS_PER_SQUARE = (24, 400)
 def render_board_radiance(
     truth: RigTruth, board: Board, margin: tuple[int, int] = (0, 0)
 ) -> Float[np.ndarray, "rows columns 3"]:
-    """Radiance of a board in grey surroundings on the sensor's pixels and ``margin`` = (rows, columns) around them.
+    """Render a board in grey surroundings on the sensor's pixels and ``margin`` = (rows, columns) around them.
 
-    White paper has the radiance 1.
+    The result is a radiance; white paper has the radiance 1.
     """
     camera = truth.description.camera
     texture, texels_per_mm = _texture(truth, board)
@@ -34,7 +34,7 @@ def render_board_radiance(
 
     def one_sample(dx: float, dy: float) -> Float[np.ndarray, "rows columns"]:
         rays = cv2.transform(slope_grid(truth, x + dx, y + dy), projection)
-        # The face is seen by rays that run into the board; all others meet the surroundings.
+        # Rays that run into the board see its face; all others see the surroundings.
         texel = (rays[..., :2] / np.maximum(rays[..., 2:], 1e-9)).astype(np.float32)
         np.clip(texel, -10.0, max(texture.shape) + 10.0, out=texel)
         grey = cv2.remap(
@@ -51,19 +51,19 @@ def render_board_radiance(
 
 
 def board_corners_mm(spec: BoardSpec) -> Float[np.ndarray, "corners 3"]:
-    """Inner chessboard corners in board coordinates, in the order of their ChArUco numbers."""
+    """Return the inner chessboard corners in board coordinates, in the order of their ChArUco numbers."""
     x, y = np.meshgrid(np.arange(1, spec.columns), np.arange(1, spec.rows))
     return np.stack([x, y, np.zeros_like(x)], axis=-1).reshape(-1, 3) * spec.square_mm
 
 
 def opencv_board(spec: BoardSpec) -> cv2.aruco.CharucoBoard:
-    """The board as OpenCV knows it."""
+    """Return the board as OpenCV's object."""
     dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, spec.dictionary))
     return cv2.aruco.CharucoBoard((spec.columns, spec.rows), spec.square_mm, spec.marker_mm, dictionary)
 
 
 def _texture(truth: RigTruth, board: Board) -> tuple[Float32[np.ndarray, "texel_rows texel_columns"], float]:
-    """The printed board with texels a little coarser than samples on the sensor, and its texels per millimetre."""
+    """Return the printed board, with texels a little coarser than sensor samples, and its texels per millimetre."""
     spec = board.spec
     distance = max(board.translation_mm[2] - truth.optics.pupil_mm[2], spec.square_mm)
     samples = 0.7 * truth.optics.fx_px * spec.square_mm / distance * SUPERSAMPLING

@@ -1,11 +1,11 @@
 """Far-field diffraction by the part of the panel that the pupil looks through, independent of wavelength.
 
-The field over the panel plane is footprint x row mask x column mask. Its power spectrum as a function of the spatial
-frequency nu (cycles/mm) says how much light is sent from direction cosines l0 to l0 + lambda * nu, for every wavelength
-lambda alike (Goodman, Introduction to Fourier Optics, section 3.10; conical diffraction is contained, as l is exact).
+The field over the panel plane is footprint x row mask x column mask. Its power spectrum over the spatial frequency nu
+(cycles/mm) is the light sent from direction cosines l0 to l0 + lambda * nu, for every wavelength lambda alike (Goodman,
+Introduction to Fourier Optics, section 3.10). It includes conical diffraction, because direction cosines are exact.
 
-The periodic masks are built from their Fourier series cut off at the sampling limit. Sampling then causes no aliasing
-of the diffraction orders, whose strength falls too slowly for a mask drawn by area coverage.
+The periodic masks are built from their Fourier series cut off at the sampling limit, so that diffraction orders do not
+alias. The strength of the orders falls too slowly for a mask drawn by area coverage.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from jaxtyping import Float, Float32
 from udccal.simulation.panel import column_open_interval, pupil_footprint, row_open_interval
 from udccal.simulation.truth import RigTruth
 
-# The power spectrum is the transform of an autocorrelation, twice as wide as the footprint: sampled fully from 2 on,
-# and well enough for a cubic between samples from 3.
+# The power spectrum is the transform of an autocorrelation, twice as wide as the footprint: a padding of 2 samples it
+# fully, and 3 well enough for cubic interpolation between samples.
 _PADDING = 3.0
 _HEADROOM = 1.1
 _ROWS_BELOW_ZERO = 4
@@ -49,13 +49,13 @@ def power_spectrum(
     limit: tuple[float, float],
     shifts: tuple[tuple[float, float], ...] = ((0.0, 0.0),),
 ) -> PowerSpectrum:
-    """Power spectrum of the panel seen through the pupil along ``direction`` (unit vector in panel coordinates).
+    """Compute the power spectrum of the part of the panel that the pupil sees along a direction.
 
     Args:
         truth: the simulated rig.
-        direction: direction of the source.
-        limit: largest (nu_x, nu_y) wanted in cycles/mm.
-        shifts: the masks are moved by these fractions (of a column, of a row), and the powers averaged.
+        direction: unit vector to the source in panel coordinates.
+        limit: largest (nu_x, nu_y) needed, in cycles/mm.
+        shifts: shifts of the masks in fractions (of a column, of a row), over which the power is averaged.
     """
     centre, shape = pupil_footprint(truth, direction)
     half = np.linalg.norm(shape, axis=1)
@@ -88,11 +88,11 @@ def power_spectrum(
 
 
 def _cumulative(power: Float32[np.ndarray, "rows columns"]) -> Float[np.ndarray, "nodes_y nodes_x"]:
-    """Running sums along both axes, from a few rows below zero upwards and from the most negative column onwards."""
+    """Return running sums along both axes, from a few rows below zero and from the most negative column."""
     below = np.roll(power[_ROWS_BELOW_ZERO:0:-1, ::-1], 1, axis=1)
     centred = scipy.fft.fftshift(np.concatenate([below, power]), axes=1)
     total = np.zeros((centred.shape[0] + 1, centred.shape[1] + 1))
-    # Row by row: a running sum down the columns reads memory across the grain, and takes twenty times as long.
+    # Row by row: a running sum down the columns reads memory with large strides and takes twenty times as long.
     for before, row, after in zip(total[:-1, 1:], centred, total[1:, 1:], strict=True):
         np.add(before, row, out=after)
     np.cumsum(total[:, 1:], axis=1, out=total[:, 1:])
@@ -110,7 +110,7 @@ def _footprint(
     shape: Float[np.ndarray, "2 2"],
     step: Float[np.ndarray, "2"],
 ) -> Float32[np.ndarray, "rows columns"]:
-    """The ellipse ``shape @ u``, |u| <= 1, with its edge covering samples in proportion to area."""
+    """Draw the ellipse ``shape @ u``, |u| <= 1; samples on its edge have their covered fraction."""
     inverse = np.linalg.inv(shape).astype(np.float32)
     x, y = x.astype(np.float32), y.astype(np.float32)
     u = inverse[0, 0] * x + inverse[0, 1] * y[:, None]
@@ -129,7 +129,7 @@ def _open_mask(
     step_mm: float,
     pitch_mm: float,
 ) -> Float32[np.ndarray, "n"]:
-    """1 in the open part of each pitch, 0 elsewhere, as a Fourier series up to the sampling limit."""
+    """Return 1 in the open part of each pitch and 0 elsewhere, as a Fourier series up to the sampling limit."""
     start, width = float(interval[0][0]), float(interval[1][0])
     orders = np.arange(1, int(pitch_mm / (2 * step_mm)) + 1)
     phase = 2 * np.pi * (position_mm / pitch_mm - shift - start - width / 2)

@@ -1,4 +1,4 @@
-"""What goes wrong while a technician measures; each disturbance is off unless asked for."""
+"""Disturbances of a measurement; each is off by default."""
 
 from __future__ import annotations
 
@@ -14,10 +14,12 @@ class Disturbances:
     """Disturbances of a simulated session.
 
     Attributes:
-        flicker_fraction: amplitude of the flat light's flicker, relative. flicker_hz: its frequency.
-        leak_e_per_s: light that reaches the sensor past the panel, in every arrangement, the dark one too.
-        dropped_frame_every: every so many frames one is lost on the way; 0 for never.
-        knock_at_frame: from this frame on the camera stands elsewhere. knock_mm: by how much (panel axes).
+        flicker_fraction: relative amplitude of the flat light's flicker.
+        flicker_hz: frequency of the flicker.
+        leak_e_per_s: light that reaches the sensor past the panel in every arrangement, including darkness.
+        dropped_frame_every: number of frames of which one is lost; 0 for no loss.
+        knock_at_frame: first frame after the camera was knocked; None for no knock.
+        knock_mm: displacement of the camera by the knock, along panel axes.
     """
 
     flicker_fraction: float = 0.0
@@ -28,19 +30,19 @@ class Disturbances:
     knock_mm: tuple[float, float, float] = (0.0, 0.05, 0.0)
 
     def flicker(self, timestamp_s: float, exposure_s: float) -> float:
-        """Mean brightness of the flat light over one exposure that starts at ``timestamp_s``."""
+        """Return the mean relative brightness of the flat light over an exposure that starts at ``timestamp_s``."""
         phase = 2 * np.pi * self.flicker_hz * (timestamp_s + exposure_s / 2)
         return float(1 + self.flicker_fraction * np.cos(phase) * np.sinc(self.flicker_hz * exposure_s))
 
     def drops(self, frame_id: int) -> bool:
-        """Whether this frame never arrives."""
+        """Return whether this frame is lost."""
         return self.dropped_frame_every > 0 and frame_id % self.dropped_frame_every == self.dropped_frame_every - 1
 
     def knocked(self, frame_id: int) -> bool:
-        """Whether the camera has been knocked by the time of this frame."""
+        """Return whether the camera has been knocked by the time of this frame."""
         return self.knock_at_frame is not None and frame_id >= self.knock_at_frame
 
 
 def knock(truth: RigTruth, by_mm: tuple[float, float, float]) -> RigTruth:
-    """The same rig with its camera moved."""
+    """Return the same rig with its camera moved along panel axes."""
     return replace(truth, optics=replace(truth.optics, pupil_mm=truth.optics.pupil_mm + np.asarray(by_mm)))

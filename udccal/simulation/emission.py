@@ -1,8 +1,8 @@
-"""Which panel pixels the pupil collects light from, when it looks along given rays at the plane of the emitters.
+"""The fraction of each emitter's light that a sensor pixel collects, from the plane of the emitters.
 
-A panel pixel has one emitter per primary, side by side in the opaque strip below its opening. The share of an emitter's
-light that reaches a sensor pixel is the part of the emitter inside the pupil's (defocused) footprint. Shares depend on
-the rig alone, so that they are worked out once and applied to any number of pictures.
+A panel pixel has one emitter per primary, side by side in the opaque strip below its opening. The fraction of an
+emitter's light that reaches a sensor pixel is the part of the emitter inside the pupil's (defocused) footprint. The
+fractions depend on the rig alone, so they are computed once for any number of pictures.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ def emitter_shares(
     weight: Float[np.ndarray, "n"],
     primary: int,
 ) -> sparse.csr_array:
-    """Matrix that takes the light of one primary (panel pixels, row-major) to what the rays receive.
+    """Return the matrix from the light of one primary (panel pixels, row-major) to the light that rays receive.
 
     Args:
-        truth: the rig.
-        directions: rays in panel coordinates.
+        truth: the simulated rig.
+        directions: directions of the rays in panel coordinates.
         depth_mm: z of the plane in which the emitters (or their mirror image) appear.
         weight: factor per ray; an evenly lit panel gives ``weight`` to within the ripple of the rows.
         primary: index of the emitter.
@@ -64,7 +64,7 @@ def _disc_in_boxes(
     height: float,
     left: Float[np.ndarray, "n boxes"],
 ) -> Float[np.ndarray, "n boxes"]:
-    """Area of the unit disc over one row of boxes: chords along X, summed by Gauss's rule over the row's height."""
+    """Return the area of the unit disc over one row of boxes: chords along X, summed by Gauss's rule over the row."""
     half = np.linalg.norm(shape[:, 1], axis=-1)
     along = shape[:, 1] / half[:, None]
     slant = shape[:, 0, 0] * along[:, 0] + shape[:, 0, 1] * along[:, 1]
@@ -84,7 +84,7 @@ def _disc_in_boxes(
 
 
 def _flat_indices(truth: RigTruth, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
-    """Index of each panel pixel in a row-major picture, -1 outside the panel."""
+    """Return the index of each panel pixel in a row-major picture; -1 outside the panel."""
     panel = truth.description.panel
     inside = (rows >= 0) & (rows < panel.rows) & (columns >= 0) & (columns < panel.columns)
     return np.where(inside, rows * panel.columns + columns, -1)

@@ -1,9 +1,9 @@
-"""How much of the pupil's footprint on the panel is open: an exact area, not a sample of it.
+"""The open area of the pupil's footprint on the panel, computed exactly rather than sampled.
 
 The footprint is the ellipse ``centre + shape @ u`` over the unit disc of u. Its part over open rows is a sum of
-segments of the disc, in closed form. From it goes what lies behind opaque columns: these are thin strips, crossed by
-chords along Y; the open length of a chord is the difference of two values of the rows' antiderivative, and Gauss's rule
-takes the sum over chords. With x = sin(angle) the integrand is smooth up to the ends of the ellipse.
+segments of the disc, in closed form. The part behind opaque columns is subtracted. Columns are thin strips, crossed by
+chords along Y: the open length of a chord is the difference of two values of the rows' antiderivative, and Gauss's rule
+sums over chords. With x = sin(angle) the integrand is smooth up to the ends of the ellipse.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ _CHORDS_PER_COLUMN = 16
 def converging_footprint(
     truth: RigTruth, directions: Float[np.ndarray, "n 3"], depth_mm: float = 0.0
 ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2 2"]]:
-    """Where the beam that one pixel receives crosses a plane ``depth_mm`` in front of the panel (z = depth).
+    """Intersect the beam that a pixel receives with a plane ``depth_mm`` in front of the panel (z = depth).
 
-    The beam is as wide as the pupil at the pupil and converges to a point at the focus distance.
+    The beam is as wide as the pupil at the pupil, and converges to a point at the focus distance.
 
     Returns:
         (centre, shape) in mm: the ellipse ``centre + shape @ u`` over the unit disc of u.
@@ -34,7 +34,7 @@ def converging_footprint(
 
 
 def open_fraction(truth: RigTruth, directions: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
-    """Fraction of the pupil's area that rays along ``directions`` (panel coordinates) reach through the panel."""
+    """Return the fraction of the pupil's area that rays along ``directions`` (panel axes) reach through the panel."""
     pitch = truth.panel.pitch_mm
     centre, shape = converging_footprint(truth, directions)
     slopes = directions[:, :2] / directions[:, 2:]
@@ -51,7 +51,7 @@ def _disc_in_strips(
     half: Float[np.ndarray, "n"],
     strips: tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]],
 ) -> Float[np.ndarray, "n"]:
-    """Area of the unit disc over periodic strips; the disc spans ``centre`` +- ``half`` of their coordinate."""
+    """Return the area of the unit disc over periodic strips; it spans ``centre`` +- ``half`` of their coordinate."""
     start, width = strips
     first = np.floor(centre - half - start)
     area = np.zeros_like(centre)
@@ -62,7 +62,7 @@ def _disc_in_strips(
 
 
 def _segment(edge: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
-    """Area of the part of the unit disc below ``edge``, less pi / 2."""
+    """Return the area of the part of the unit disc below ``edge``, less pi / 2."""
     edge = np.clip(edge, -1.0, 1.0)
     return edge * np.sqrt(1 - edge * edge) + np.arcsin(edge)
 
@@ -73,7 +73,7 @@ def _disc_in_crossings(
     rows: tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]],
     columns: tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]],
 ) -> Float[np.ndarray, "n"]:
-    """Area of the unit disc over ``rows`` and ``columns`` together; ``columns`` are narrow."""
+    """Return the area of the unit disc over both ``rows`` and ``columns``; ``columns`` are narrow."""
     half = np.linalg.norm(shape[:, 0], axis=-1)
     along = shape[:, 0] / half[:, None]
     # On the chord sin(angle) of the disc: Y = centre + slant sin(angle) +- reach cos(angle).
@@ -100,7 +100,7 @@ def _disc_in_crossings(
 def _open_length(
     y: Float[np.ndarray, "n"], strips: tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]
 ) -> Float[np.ndarray, "n"]:
-    """Antiderivative of the periodic mask that is 1 on the strips."""
+    """Return the antiderivative of the periodic mask that is 1 on the strips."""
     start, width = strips
     position = y - start
     period = np.floor(position)

@@ -1,6 +1,6 @@
 """Light on one rig's sensor for each arrangement: y = [(x * k) + b] w, in e-/s behind the colour filters, no noise.
 
-What depends on the rig alone (wire map, blur, shares of the panel's light) is worked out when first needed, and kept.
+Wire map, blur and response to the panel's light depend on the rig alone. They are computed when first needed, and kept.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from udccal.simulation.spread import AngularSpread
 from udccal.simulation.truth import RigTruth
 from udccal.simulation.wire import wire_map
 
-# What the camera's red, green and blue make of the white LED light of the flat field and of the small LED.
+# Response of the camera's red, green and blue to the white LED light of the flat field and of the small LED.
 LED_WHITE = np.array([0.6, 1.0, 0.7])
 _FLAT_FILL, _FLAT_EXPOSURE_S = 0.65, 8e-3
 _LED_FILL, _LED_EXPOSURE_S = 0.8, 100e-6
 # A board is located by its corners: light scattered far from them does not matter.
 _BOARD_KERNEL = (129, 65)
-# Shifts of an LED about one place fall into no more than four cells; each pattern takes some 50 MB at full size.
+# Shifts of an LED around one place fall into at most four cells; each pattern takes about 50 MB at full size.
 _KEPT_SPREADS = 4
 
 
@@ -50,7 +50,7 @@ class RigLight:
 
     @cached_property
     def backscatterer(self) -> Backscatterer:
-        """The true answer to panel light."""
+        """The true response to panel light."""
         return backscatterer(self.truth)
 
     @cached_property
@@ -62,7 +62,7 @@ class RigLight:
 
     @cached_property
     def board_blur(self) -> SpaceVariantBlur:
-        """A lighter blur for boards."""
+        """The blur of boards, with smaller kernels and a lower rank."""
         captures = self.truth.description.captures
         rows, columns = (
             min(captures.psf_region_rows | 1, _BOARD_KERNEL[0]),
@@ -71,28 +71,28 @@ class RigLight:
         return build_blur(self.truth, 4, 3, rows, columns, max_rank=7, tolerance=1e-2)
 
     def flat(self) -> Float[np.ndarray, "rows columns"]:
-        """An even white field that fills the wells to about 65 % (green, mean) in 8 ms."""
+        """Return the light of an even white field that fills the wells to about 65 % (green, mean) in 8 ms."""
         camera = self.truth.description.camera
         rate = _FLAT_FILL * self.truth.sensor.full_well_e / _FLAT_EXPOSURE_S
         return rate * LED_WHITE[cfa_named(camera.cfa).channel_map(camera.rows, camera.columns)] * self.wire
 
     def board(self, board: Board) -> Float[np.ndarray, "rows columns"]:
-        """A board in even surroundings."""
+        """Return the light of a board in even surroundings."""
         return self._mosaic(render_board(self.truth, board, self.board_blur)) * self.wire
 
     def panel(self, picture: UInt8[np.ndarray, "panel_rows panel_columns 3"]) -> Float[np.ndarray, "rows columns"]:
-        """The panel's own light in a dark room."""
+        """Return the panel's own light in a dark room."""
         return self.backscatterer.rate(picture) * self.wire
 
     def photograph(self, photograph: Photograph) -> Float[np.ndarray, "rows columns"]:
-        """A scene through the panel, which may be lit."""
+        """Return the light of a scene through the panel, which may be lit."""
         scene = self._mosaic(render_photograph(self.truth, photograph, self.blur))
         if photograph.panel_picture is not None:
             scene = scene + self.backscatterer.rate(photograph.panel_picture)
         return scene * self.wire
 
     def led(self, led: Led, image_px: tuple[float, float], region: Region) -> Float[np.ndarray, "rows columns"]:
-        """A small LED whose image is centred at ``image_px``, as far as its light falls into ``region``."""
+        """Return the light in ``region`` of a small LED whose image is centred at ``image_px``."""
         disc_px = self.led_disc_px(led)
         rows, columns = region.rows | 1, region.columns | 1
         middle = np.array([region.x + columns // 2, region.y + rows // 2], dtype=float)
@@ -106,9 +106,10 @@ class RigLight:
         return self._led_flux(disc_px) * coloured * self.wire[down, across]
 
     def _spread_near(self, image_px: tuple[float, float], region: Region) -> AngularSpread:
-        """The diffraction pattern at the middle of the cell that the LED is in, for all pixels of the region.
+        """Return the diffraction pattern at the centre of the LED's cell, for all pixels of the region.
 
-        The cell, not the LED before, decides: a resumed session then sees the same light as an uninterrupted one.
+        The pattern depends on the cell, not on the previous LED, so that a resumed session sees the same light as an
+        uninterrupted one.
         """
         x, y = ((np.floor(v / SHARED_PX) + 0.5) * SHARED_PX for v in image_px)
         reach_x = max(x - region.x, region.x + region.columns - x) + SHARED_PX
@@ -116,12 +117,12 @@ class RigLight:
         return self._spread_at(float(x), float(y), float(reach_x), float(reach_y))
 
     def led_disc_px(self, led: Led) -> float:
-        """Diameter of the LED's image."""
+        """Return the diameter of the LED's image in px."""
         distance = led.distance_mm - float(self.truth.optics.pupil_mm[2])
         return led.diameter_mm / distance * self.truth.optics.fx_px
 
     def _led_flux(self, disc_px: float) -> float:
-        """Electrons per second in all: the brightest pixel anywhere reaches 80 % of the full well in 100 us."""
+        """Return the LED's total light in e-/s: its brightest pixel reaches 80 % of the full well in 100 us."""
         if disc_px not in self._peaks:
             camera = self.truth.description.camera
             middle = np.array([camera.columns // 2, camera.rows // 2], dtype=float)

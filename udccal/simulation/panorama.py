@@ -1,4 +1,4 @@
-"""A plane picture cut out of an equirectangular panorama."""
+"""A perspective picture from an equirectangular panorama."""
 
 from __future__ import annotations
 
@@ -15,12 +15,14 @@ def panorama_view(
     columns: int,
     rows: int,
 ) -> Float[np.ndarray, "rows columns 3"]:
-    """Linear picture that a pinhole camera takes of a panorama.
+    """Return the linear picture that a pinhole camera takes of a panorama.
 
     Args:
         equirect: linear colours; the middle column is straight ahead, the top row straight up.
-        yaw_deg: turn to the right. pitch_deg: turn upwards. hfov_deg: horizontal field of view, below 180.
-        columns: width of the picture. rows: its height.
+        yaw_deg: turn to the right.
+        pitch_deg: turn upwards.
+        hfov_deg: horizontal field of view, below 180.
+        columns: columns of the picture. rows: rows of the picture.
     """
     focal = columns / 2 / np.tan(np.deg2rad(hfov_deg) / 2)
     source = _shrunk(equirect, 2 * np.pi * focal)
@@ -45,7 +47,7 @@ def panorama_view(
 
 
 def _shrunk(equirect: Float[np.ndarray, "height width 3"], width_wanted: float) -> Float[np.ndarray, "h w 3"]:
-    """The panorama averaged down to the resolution of the view, if it is finer."""
+    """Average the panorama down to the resolution of the view, if it is finer."""
     height, width = equirect.shape[:2]
     factor = min(1.0, width_wanted / width)
     size = (max(4, round(width * factor)), max(4, round(height * factor)))

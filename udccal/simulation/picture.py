@@ -22,7 +22,7 @@ class PlanePicture:
     origin_mm: Float[np.ndarray, "2"]
 
     def at(self, points_mm: Float[np.ndarray, "rows columns 2"]) -> Float[np.ndarray, "rows columns 3"]:
-        """Colour at points of the plane; bicubic, never negative."""
+        """Return the colour at points of the plane, by bicubic interpolation, never negative."""
         texel = ((points_mm - self.origin_mm) / self.texel_mm).astype(np.float32)
         colours = cv2.remap(self.texels, texel[..., 0], texel[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
         return np.maximum(colours, 0.0).astype(np.float64)
@@ -34,9 +34,9 @@ def place_picture(
     centre_mm: Float[np.ndarray, "2"],
     sample_mm: float,
 ) -> PlanePicture:
-    """A picture ``width_mm`` wide, centred at ``centre_mm``, its texels no finer than ``sample_mm``.
+    """Place a picture ``width_mm`` wide, centred at ``centre_mm``, with texels no finer than ``sample_mm``.
 
-    Shrinking averages over area, which keeps out of the samples what they are too far apart to resolve.
+    Shrinking averages over area, so that detail too fine for the samples does not alias.
     """
     rows, columns = radiance.shape[:2]
     factor = min(1.0, width_mm / columns / sample_mm)
@@ -50,7 +50,7 @@ def place_picture(
 def supersample(
     render: Callable[[float, float], Float[np.ndarray, "rows columns *colours"]],
 ) -> Float[np.ndarray, "rows columns *colours"]:
-    """Mean of ``render(dx, dy)`` over sample points (dx, dy) spread evenly over a pixel."""
+    """Return the mean of ``render(dx, dy)`` over sample points (dx, dy) spread evenly over a pixel."""
     offsets = (np.arange(SUPERSAMPLING) + 0.5) / SUPERSAMPLING - 0.5
     total = render(float(offsets[0]), float(offsets[0]))
     for index in range(1, SUPERSAMPLING**2):

@@ -1,4 +1,4 @@
-"""The simulated point-spread function: diffraction by the panel, gathered by square pixels through a distorting lens.
+"""The simulated point-spread function: diffraction by the panel, integrated by square pixels through a distorting lens.
 
 A kernel belongs to its source. Sample [j, i] is the response of the pixel whose centre lies (i - columns // 2,
 j - rows // 2) pixels from ``position``; the source's image is at ``position`` + ``source_offset_px``.
@@ -22,9 +22,9 @@ _HALF_PERIODS = ((0.0, 0.0), (0.5, 0.5))
 
 @dataclass(frozen=True)
 class _Care:
-    """How finely a pixel is integrated: points over the source's disc, and steps along the pixel's slanted edges.
+    """Fineness of a pixel's integration: points over the source's disc, and steps along the pixel's slanted edges.
 
-    At least ``steps`` are taken, and as many as keep each narrower than ``step_px``.
+    There are at least ``steps`` steps, and enough to keep each narrower than ``step_px``.
     """
 
     disc_points: int
@@ -35,10 +35,10 @@ class _Care:
 # Nearly all light falls close to the source, most of the rest on two thin streaks across it.
 _CORE, _STREAKS, _ELSEWHERE = _Care(192, 4, 0.03), _Care(16, 2, 0.06), _Care(1, 1, 0.2)
 _STREAK_HALF_WIDTH_PX = 6.0
-# Corners times points of the source at once: their numbers stay in a processor's cache.
+# Corners times points of the source in one block, which fit into a processor's cache.
 _BLOCK = 8_000
 _WORKERS = 2
-# Sources no farther apart than this share one diffraction pattern.
+# One diffraction pattern serves sources no farther apart than this.
 SHARED_PX = 4.0
 
 
@@ -50,7 +50,7 @@ def kernels(
     source_offset_px: tuple[float, float] = (0.0, 0.0),
     source_disc_px: float = 0.0,
 ) -> Float[np.ndarray, "n 3 rows columns"]:
-    """Kernels of sources at ``positions_px`` + ``source_offset_px``, each colour summing to 1 over the array.
+    """Return kernels of sources at ``positions_px`` + ``source_offset_px``; each colour sums to 1.
 
     Args:
         truth: the simulated rig.
@@ -68,10 +68,10 @@ def kernels(
 def phase_averaged_kernels(
     truth: RigTruth, positions_px: Float[np.ndarray, "n 2"], rows: int, columns: int
 ) -> Float[np.ndarray, "n 3 rows columns"]:
-    """Kernels averaged over the mask and the mask moved by half a period.
+    """Return kernels averaged over the mask and the mask moved by half a period.
 
-    A kernel changes by about a percent as the footprint slides over one row, far quicker than a grid of positions can
-    follow; the average varies only as slowly as the geometry does.
+    A kernel changes by about a percent as the footprint slides over one row, which a grid of positions cannot follow.
+    The average varies as slowly as the geometry.
     """
     light = [captured_light(truth, position, rows, columns, shifts=_HALF_PERIODS) for position in positions_px]
     return np.stack([k / k.sum(axis=(1, 2), keepdims=True) for k in light])
@@ -87,10 +87,10 @@ def captured_light(
     shifts: tuple[tuple[float, float], ...] = ((0.0, 0.0),),
     spread: AngularSpread | None = None,
 ) -> Float[np.ndarray, "3 rows columns"]:
-    """One kernel before normalisation: fractions of all the light that passes the panel towards the lens.
+    """Return one kernel before normalisation: fractions of all the light that passes the panel towards the lens.
 
-    ``shifts`` moves the mask by fractions of (a column, a row) and averages over them. ``spread``, from ``spread_at`` a
-    source no more than ``SHARED_PX`` away, saves most of the work for one of several sources side by side.
+    ``shifts`` moves the mask by fractions of (a column, a row) and averages over them. ``spread`` is a result of
+    ``spread_at`` for a source at most ``SHARED_PX`` away; it saves most of the work for several sources side by side.
 
     Raises:
         UdccalError: when ``rows`` or ``columns`` is even.
@@ -115,17 +115,17 @@ def captured_light(
         ((everything, across), _STREAKS),
         ((down, across), _CORE),
     ):
-        # All points of the disc share one diffraction pattern: it moves, but does not change, over a pixel or two.
+        # One diffraction pattern serves all points of the disc: it moves, but does not change, over a pixel or two.
         disc = _disc(truth, source, source_disc_px, care.disc_points) - direction[:2]
         light[window] = _mean_over_disc(spread, offsets[_corners(window)], disc, care)
     return np.maximum(np.moveaxis(light, -1, 0), 0.0)
 
 
 def spread_at(truth: RigTruth, source_px: Float[np.ndarray, "2"], reach_px: tuple[float, float]) -> AngularSpread:
-    """Diffraction pattern of a source, out to ``reach_px`` (x, y) pixels to either side of it.
+    """Return the diffraction pattern of a source, out to ``reach_px`` (x, y) pixels to either side of it.
 
-    Over a pixel or two the pattern moves with the source but changes by no more than its numerical error: the wire's
-    phase turns by one part in thirty or so.
+    Over a pixel or two the pattern moves with the source but changes by no more than its numerical error: the phase of
+    the wire changes by about a thirtieth of a period.
     """
     around = source_px[:, None] + np.asarray(reach_px)[:, None] * np.array([-1.0, 0.0, 1.0])
     direction = pixels_to_directions(truth.optics, source_px)
@@ -143,7 +143,7 @@ def _spread_over(
 
 
 def _near(truth: RigTruth, offsets: Float[np.ndarray, "corner_rows corner_columns 2"]) -> tuple[slice, slice]:
-    """The rows and the columns that hold the two streaks through the source, bent as they are; none far from it."""
+    """Return the rows and columns that contain the two bent streaks through the source; none far from the source."""
     close = np.abs((offsets[:-1, :-1] + offsets[1:, 1:]) / 2) < _STREAK_HALF_WIDTH_PX / truth.optics.fx_px
     down, across = (np.flatnonzero(close[..., axis].any(axis=axis)) for axis in (1, 0))
     return (
@@ -153,7 +153,7 @@ def _near(truth: RigTruth, offsets: Float[np.ndarray, "corner_rows corner_column
 
 
 def _corners(window: tuple[slice, slice]) -> tuple[slice, slice]:
-    """The corners of a window's pixels."""
+    """Return the slices of the corners of a window's pixels."""
     down, across = (part if part.stop is None else slice(part.start, part.stop + 1) for part in window)
     return down, across
 
@@ -164,9 +164,9 @@ def _mean_over_disc(
     disc: Float[np.ndarray, "points 2"],
     care: _Care,
 ) -> Float[np.ndarray, "rows columns 3"]:
-    """Light inside each pixel of a window, averaged over the points of the source, a bounded number at once."""
+    """Return the light in each pixel of a window, averaged over the points of the source in blocks."""
     block = max(1, _BLOCK // corners[..., 0].size)
-    # The points of a disc meet the steps of a staircase at different places, so that its errors average out.
+    # The steps of a staircase fall at different places for each point of a disc, so that its errors average out.
     care = replace(care, step_px=care.step_px * len(disc) ** 0.5)
     blocks = [corners - disc[k : k + block, None, None] for k in range(0, len(disc), block)]
     with ThreadPoolExecutor(_WORKERS) as pool:
@@ -176,9 +176,9 @@ def _mean_over_disc(
 def _light_in_window(
     spread: AngularSpread, corners: Float[np.ndarray, "points corner_rows corner_columns 2"], care: _Care
 ) -> Float[np.ndarray, "points rows columns 3"]:
-    """Light inside every pixel of a window, a quadrilateral in direction cosines, by Green's theorem along its edges.
+    """Return the light in every pixel, a quadrilateral in direction cosines, by Green's theorem along its edges.
 
-    An edge between two pixels is worked out once.
+    An edge between two pixels is computed once.
     """
     if min(corners.shape[1:3]) < 2:
         return np.zeros((len(corners), max(corners.shape[1] - 1, 0), max(corners.shape[2] - 1, 0), 3))
@@ -189,7 +189,7 @@ def _light_in_window(
 
 
 def _steps(along: Float[np.ndarray, "*n 2"], down: Float[np.ndarray, "*n 2"], care: _Care) -> int:
-    """Steps of the staircases that stand for the pixels' edges along a row and down a column."""
+    """Return the number of steps of the staircases that replace pixel edges along a row and down a column."""
     along, down = (np.abs(edge).reshape(-1, 2).max(axis=0) for edge in (along, down))
     slant = max(float(along[1] / along[0]), float(down[0] / down[1]))
     return max(care.steps, int(np.ceil(slant / care.step_px)))
@@ -198,9 +198,9 @@ def _steps(along: Float[np.ndarray, "*n 2"], down: Float[np.ndarray, "*n 2"], ca
 def _light_along(
     spread: AngularSpread, start: Float[np.ndarray, "*n 2"], end: Float[np.ndarray, "*n 2"], steps: int
 ) -> Float[np.ndarray, "*n 3"]:
-    """What an edge adds to the light of the pixel that lies on its right; the pixel beyond it gets the opposite.
+    """Return an edge's contribution to the pixel on its right; the pixel on its left gets the opposite.
 
-    Each edge is replaced by a staircase. Neighbours share their edges: no light is lost or counted twice.
+    Each edge is replaced by a staircase. Neighbours have the same edge, so that no light is lost or counted twice.
     """
     light = np.zeros((*start.shape[:-1], 3))
     for index in range(steps):
@@ -213,7 +213,7 @@ def _light_along(
 def _disc(
     truth: RigTruth, source_px: Float[np.ndarray, "2"], diameter_px: float, count: int
 ) -> Float[np.ndarray, "points 2"]:
-    """Direction cosines of points spread evenly over the source's disc (Vogel's sunflower)."""
+    """Return direction cosines of points spread evenly over the source's disc (Vogel's sunflower spiral)."""
     if diameter_px == 0.0 or count == 1:
         return pixels_to_directions(truth.optics, source_px[None])[:, :2]
     index = np.arange(count)

@@ -1,4 +1,4 @@
-"""Rays of whole grids of sensor positions, quickly: exact at knots, a cubic spline between them."""
+"""Fast computation of the rays of grids of sensor positions: exact at knots, a cubic spline between them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _KNOT_STEP_PX = 16.0
 def slope_grid(
     truth: RigTruth, x_px: Float[np.ndarray, "columns"], y_px: Float[np.ndarray, "rows"]
 ) -> Float[np.ndarray, "rows columns 2"]:
-    """Slopes (s_x / s_z, s_y / s_z) in panel coordinates of the rays at sensor positions (x, y), both increasing."""
+    """Return slopes (s_x / s_z, s_y / s_z) in panel coordinates of rays at sensor positions (x, y), both increasing."""
     knots_x, knots_y = (np.linspace(v[0], v[-1], max(5, int((v[-1] - v[0]) / _KNOT_STEP_PX) + 2)) for v in (x_px, y_px))
     directions = pixels_to_directions(truth.optics, np.stack(np.meshgrid(knots_x, knots_y), axis=-1))
     slopes = directions[..., :2] / directions[..., 2:]
@@ -25,6 +25,6 @@ def slope_grid(
 def cosine_grid(
     truth: RigTruth, x_px: Float[np.ndarray, "columns"], y_px: Float[np.ndarray, "rows"]
 ) -> Float[np.ndarray, "rows columns 2"]:
-    """Direction cosines (s_x, s_y) of the same rays."""
+    """Return direction cosines (s_x, s_y) of the rays of ``slope_grid``."""
     slopes = slope_grid(truth, x_px, y_px)
     return slopes / np.sqrt(1.0 + (slopes**2).sum(axis=-1, keepdims=True))

@@ -1,4 +1,4 @@
-"""What stands in front of the panel, as light on the sensor before wire, backscatter, colour filters and noise.
+"""Scenes in front of the panel, as light on the sensor before wire, backscatter, colour filters and noise.
 
 Rates are electrons per second of each camera colour; a radiance of 1 gives ``WHITE_E_PER_S``. Radiance channels feed
 camera colours one to one. The fall-off of light towards the corners belongs to the wire term.
@@ -26,7 +26,7 @@ WHITE_E_PER_S = 1.4e6
 def render_photograph(
     truth: RigTruth, photograph: Photograph, blur: SpaceVariantBlur | None = None
 ) -> Float[np.ndarray, "rows columns 3"]:
-    """The photograph as the lens images it through the panel, in e-/s on every sensor pixel.
+    """Render a photograph as the lens images it through the panel, in e-/s on every sensor pixel.
 
     Its centre lies on the ray of the sensor's middle; x runs right and y down along the panel's axes.
     """
@@ -47,13 +47,14 @@ def ideal_view(
     columns: int,
     rows: int,
 ) -> Float[np.ndarray, "rows columns 3"]:
-    """The same photograph in e-/s as a pinhole at the pupil sees it, its image plane parallel to the panel, no panel.
+    """Render the same photograph in e-/s for a pinhole at the pupil without the panel.
 
     Args:
         truth: the simulated rig.
         photograph: the scene.
-        focal_px: focal length of the view. centre: (x, y) of the panel's normal in the view.
-        columns: width of the view. rows: its height.
+        focal_px: focal length of the view, whose image plane is parallel to the panel.
+        centre: (x, y) of the panel's normal in the view, in px.
+        columns: columns of the view. rows: rows of the view.
     """
     x, y = (np.arange(columns) - centre[0]) / focal_px, (np.arange(rows) - centre[1]) / focal_px
     picture = _placed(truth, photograph, focal_px)
@@ -68,19 +69,19 @@ def ideal_view(
 def render_board(
     truth: RigTruth, board: Board, blur: SpaceVariantBlur | None = None
 ) -> Float[np.ndarray, "rows columns 3"]:
-    """A board in even grey surroundings in e-/s on every sensor pixel; white paper has the radiance 1."""
+    """Render a board in even grey surroundings in e-/s on every sensor pixel; white paper has the radiance 1."""
     radiance = render_board_radiance(truth, board, blur.margin if blur else (0, 0))
     return WHITE_E_PER_S * (blur.apply(radiance) if blur else radiance)
 
 
 def _points_mm(truth: RigTruth, photograph: Photograph, slopes: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 2"]:
-    """Where rays from the pupil meet the photograph's plane, in panel coordinates."""
+    """Intersect rays from the pupil with the photograph's plane, in panel coordinates."""
     pupil = truth.optics.pupil_mm
     return pupil[:2] + (photograph.distance_mm - pupil[2]) * slopes
 
 
 def _placed(truth: RigTruth, photograph: Photograph, focal_px: float) -> PlanePicture:
-    """The photograph on its plane, resized for a camera of focal length ``focal_px``."""
+    """Place the photograph on its plane, resized for a camera of focal length ``focal_px``."""
     camera = truth.description.camera
     middle = slope_grid(
         truth, (camera.columns - 1) / 2 + np.linspace(-8.0, 8.0, 5), (camera.rows - 1) / 2 + np.linspace(-8.0, 8.0, 5)

@@ -1,4 +1,4 @@
-"""The sensor: light to electrons to numbers, with the noise of a real one (EMVA 1288, and ELD for the read noise).
+"""The sensor: from light to electrons to numbers, with realistic noise (EMVA 1288, and ELD for the read noise).
 
 Order of events: photo-response (PRNU), dark current, photon counting, full well, dark offset (DSNU) and read noise,
 gain, row noise, black level, rounding, and the range of the converter.
@@ -17,8 +17,8 @@ from udccal.simulation.truth import RigTruth, SensorTruth
 
 _ROWS_AT_ONCE = 64
 _TABLE = 65536
-# From here on photon counts are drawn from a normal distribution bent to Poisson's mean, variance and third moment.
-# They are left fractional: read noise of more than one electron makes whole numbers unobservable.
+# Above this, photon counts are drawn from a normal distribution corrected to Poisson's mean, variance and third moment.
+# They are not rounded: read noise of more than one electron makes whole numbers unobservable.
 _COUNTED_ONE_BY_ONE_BELOW_E = 50.0
 _HOT_CURRENT_E_PER_S = (300.0, 6000.0)
 
@@ -39,12 +39,12 @@ class Sensor:
 
     @property
     def sigma_d_e(self) -> float:
-        """Temporal dark noise of a short frame: read and row noise together, quantisation left out."""
+        """Temporal dark noise of a short frame: read and row noise, without quantisation."""
         return float(np.hypot(self.truth.sigma_read_e, self.truth.sigma_row_DN / self.truth.K_DN_per_e))
 
     @property
     def saturation_DN(self) -> float:
-        """Signal of a full pixel at 0 dB: the full well or the converter's end, whichever comes first."""
+        """Signal of a saturated pixel at 0 dB: the full well or the converter's maximum, whichever is lower."""
         full = self.truth.black_DN + self.truth.K_DN_per_e * self.truth.full_well_e
         return float(min(full, 2.0**self.truth.bits - 1))
 
@@ -56,7 +56,7 @@ class Sensor:
         rng: np.random.Generator,
         gain_dB: float = 0.0,
     ) -> UInt16[np.ndarray, "rows columns"]:
-        """One frame of ``region`` under the expected photo-electron rates of its pixels."""
+        """Return a frame of ``region`` in DN for the expected photo-electron rates of its pixels."""
         frame = np.empty((region.rows, region.columns), np.uint16)
         amplification = 10 ** (gain_dB / 20)
         row_DN = amplification * self.truth.sigma_row_DN * rng.standard_normal((region.rows, 1), np.float32)
@@ -81,7 +81,7 @@ class Sensor:
 
 
 def tukey_lambda_quantiles(shape: float, sigma: float) -> Float32[np.ndarray, "table"]:
-    """Equally likely values of Tukey's lambda distribution, scaled to the standard deviation ``sigma``.
+    """Return equally likely values of Tukey's lambda distribution, scaled to the standard deviation ``sigma``.
 
     Q(p) = (p^lambda - (1 - p)^lambda) / lambda; 0.14 is close to normal, smaller values have heavier tails (Wei et
     al., "A physics-based noise formation model for extreme low-light raw denoising", 2020).
@@ -94,7 +94,7 @@ def tukey_lambda_quantiles(shape: float, sigma: float) -> Float32[np.ndarray, "t
 def _counted(
     expected: Float32[np.ndarray, "rows columns"], rng: np.random.Generator
 ) -> Float32[np.ndarray, "rows columns"]:
-    """Poisson counts; large ones as m + sqrt(m - 1/18) z + (z^2 - 1) / 6 (Cornish and Fisher's expansion)."""
+    """Draw Poisson counts, large ones as m + sqrt(m - 1/18) z + (z^2 - 1) / 6 (Cornish-Fisher expansion)."""
     few = expected < _COUNTED_ONE_BY_ONE_BELOW_E
     if few.all():
         return rng.poisson(expected).astype(np.float32)

@@ -1,4 +1,4 @@
-"""What the camera's three colours see of white light, wavelength by wavelength."""
+"""Spectra of white light in the camera's three colours."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Spectrum:
 
 
 def camera_spectrum(truth: RigTruth) -> Spectrum:
-    """Colour responses of the simulated camera times a white LED, drawn once per rig.
+    """Return the colour responses of the simulated camera times the spectrum of a white LED, drawn once per rig.
 
     The responses are Gaussians of 35 to 45 nm standard deviation whose peaks differ by a few nanometres from rig to
     rig; the LED is a blue peak plus a broad phosphor.

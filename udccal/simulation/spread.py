@@ -1,4 +1,4 @@
-"""Where the light of one distant source goes after the panel, by colour, in direction cosines."""
+"""Distribution of the light of one distant source after the panel, by colour, in direction cosines."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from udccal.simulation.diffraction import power_spectrum
 from udccal.simulation.spectrum import camera_spectrum
 from udccal.simulation.truth import RigTruth
 
-# In sensor pixels: cells are this fine up to the reach from the source, and grow by a factor to the coarsest beyond.
+# In sensor pixels: cells have the finest size up to the reach from the source, then grow by a factor to the coarsest.
 _FINEST, _COARSEST, _FINE_REACH, _GROWTH = 1 / 32, 0.25, 3.0, 1.06
 
 
@@ -29,7 +29,7 @@ class AngularSpread:
     cumulative: Float[np.ndarray, "nodes_y nodes_x 3"]
 
     def below(self, x: Float[np.ndarray, "*n"], y: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n 3"]:
-        """Light at direction cosines less than both ``x`` and ``y``, relative to the source."""
+        """Return the light at direction cosines below both ``x`` and ``y``, relative to the source."""
         column, right = _bracket(self.edges_x, x)
         row, down = _bracket(self.edges_y, y)
         flat = self.cumulative.reshape(-1, 3)
@@ -45,14 +45,14 @@ def angular_spread(
     reach: tuple[float, float],
     shifts: tuple[tuple[float, float], ...] = ((0.0, 0.0),),
 ) -> AngularSpread:
-    """Spread of a source at ``direction``, out to direction cosines ``reach`` = (x, y) from it."""
+    """Compute the spread of a source at ``direction``, out to direction cosines ``reach`` = (x, y) from it."""
     spectrum = camera_spectrum(truth)
     shortest_mm = float(spectrum.wavelengths_nm[0]) * 1e-6
     power = power_spectrum(truth, direction, (reach[0] / shortest_mm, reach[1] / shortest_mm), shifts)
     unit = 1.0 / truth.optics.fx_px
     edges_x, edges_y = _edges(reach[0], unit), _edges(reach[1], unit)
     relative_step = spectrum.step_nm / spectrum.wavelengths_nm
-    # Power is even: cells with l_y >= 0 are computed, the others are their mirror image.
+    # Power is even: only cells with l_y >= 0 are computed; the others are their mirror image.
     half_y = edges_y[edges_y.size // 2 :]
     cells = np.zeros((3, half_y.size - 1, edges_x.size - 1))
     for wavelength_nm, weights, relative in zip(
@@ -68,7 +68,7 @@ def angular_spread(
 
 
 def _edges(reach: float, unit: float) -> Float[np.ndarray, "nodes"]:
-    """Cell edges, symmetric about zero, finest at zero."""
+    """Return cell edges, symmetric about zero and finest there."""
     fine = np.arange(0.0, _FINE_REACH, _FINEST)
     edges = list(fine * unit)
     step = _FINEST
@@ -82,10 +82,10 @@ def _edges(reach: float, unit: float) -> Float[np.ndarray, "nodes"]:
 def _cell_operator(
     edges: Float[np.ndarray, "nodes"], relative_step: float, cosine_per_row: float, origin: float, nodes: int
 ) -> scipy.sparse.csr_array:
-    """Sparse matrix from cumulative power to the light in each cell, for one wavelength.
+    """Return the sparse matrix from cumulative power to the light in each cell, for one wavelength.
 
-    The wavelength stands for a band, over which light at distance l moves by l * step / wavelength: each cell collects
-    from a window widened by that much (variances add), scaled back to the cell's width.
+    The wavelength represents a band, over which light at distance l moves by l * step / wavelength. Each cell collects
+    from a window widened by that amount (variances add), and is scaled back to the cell's width.
     """
     middle, width = (edges[1:] + edges[:-1]) / 2, np.diff(edges)
     window = np.hypot(width, middle * relative_step)
@@ -102,7 +102,7 @@ def _cell_operator(
 
 
 def _cubic_weights(position: Float[np.ndarray, "n"]) -> tuple[Float[np.ndarray, "n"], ...]:
-    """Lagrange's weights of the values at 0, 1, 2, 3 for the cubic through them."""
+    """Return Lagrange's weights of the values at 0, 1, 2, 3 for the cubic through them."""
     a, b, c, d = position, position - 1, position - 2, position - 3
     return -b * c * d / 6, a * c * d / 2, -a * b * d / 2, a * b * c / 6
 
@@ -116,7 +116,7 @@ def _cumulative(cells: Float[np.ndarray, "3 cells_y cells_x"]) -> Float[np.ndarr
 def _bracket(
     edges: Float[np.ndarray, "nodes"], value: Float[np.ndarray, "*n"]
 ) -> tuple[Int[np.ndarray, "*n"], Float[np.ndarray, "*n 1"]]:
-    """Node before each value, and how far the value is on the way to the next node."""
+    """Return the node before each value, and the value's fraction of the way to the next node."""
     position = np.interp(value, edges, np.arange(edges.size))
     index = np.minimum(position.astype(np.int64), edges.size - 2)
     return index, (position - index)[..., None]

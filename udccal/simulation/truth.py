@@ -1,6 +1,6 @@
 """The hidden true values of a simulated rig, drawn once from its description with a seed.
 
-Written in numpy, apart from ``udccal.models`` on purpose: agreement between the two is then evidence.
+This code uses numpy and is separate from ``udccal.models`` on purpose, so that agreement between the two is evidence.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class PanelTruth:
 
 @dataclass(frozen=True)
 class SensorTruth:
-    """True sensor; the names are EMVA 1288's and ELD's."""
+    """True sensor, under the names of EMVA 1288 and ELD."""
 
     K_DN_per_e: float
     black_DN: float
@@ -66,7 +66,7 @@ class SensorTruth:
 
 @dataclass(frozen=True)
 class RigTruth:
-    """Everything the rig's description leaves open, as it really is."""
+    """The true values of everything that the rig's description leaves open."""
 
     description: RigDescription
     seed: int
@@ -76,7 +76,7 @@ class RigTruth:
 
 
 def rotation_matrix(axis: int, angle_rad: float) -> Float[np.ndarray, "3 3"]:
-    """Right-handed rotation about a coordinate axis."""
+    """Return the right-handed rotation about a coordinate axis."""
     c, s = np.cos(angle_rad), np.sin(angle_rad)
     i, j = (axis + 1) % 3, (axis + 2) % 3
     matrix = np.eye(3)
@@ -86,7 +86,12 @@ def rotation_matrix(axis: int, angle_rad: float) -> Float[np.ndarray, "3 3"]:
 
 
 def draw_truth(description: RigDescription, seed: int = 0) -> RigTruth:
-    """True values of a rig: each nominal value moved by up to its tolerance, and what no data sheet says, drawn."""
+    """Draw the true values of a rig.
+
+    Args:
+        description: the rig description; each nominal value is moved by up to 0.8 of its tolerance.
+        seed: seed of all draws, including values that no data sheet gives.
+    """
     rng = np.random.default_rng([seed, 0x7AB1E])
 
     def drawn(nominal: Nominal) -> float:
@@ -156,7 +161,7 @@ def _draw_optics(description: RigDescription, drawn, rng: np.random.Generator) -
 
 
 def distort(optics: Optics, ideal: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 2"]:
-    """Brown-Conrady with five coefficients in OpenCV's order."""
+    """Distort ideal normalised image points (Brown-Conrady, five coefficients in OpenCV's order)."""
     k1, k2, p1, p2, k3 = optics.distortion
     x, y = ideal[..., 0], ideal[..., 1]
     r2 = x**2 + y**2
@@ -167,14 +172,22 @@ def distort(optics: Optics, ideal: Float[np.ndarray, "*n 2"]) -> Float[np.ndarra
 
 
 def directions_to_pixels(optics: Optics, directions: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 2"]:
-    """Directions in panel coordinates to sensor pixels."""
+    """Project directions in panel coordinates to sensor pixels."""
     rays = directions @ optics.R_panel_camera
     bent = distort(optics, rays[..., :2] / rays[..., 2:])
     return bent * np.array([optics.fx_px, optics.fy_px]) + np.array([optics.cx_px, optics.cy_px])
 
 
 def pixels_to_directions(optics: Optics, pixels: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 3"]:
-    """Unit vectors in panel coordinates of the rays through sensor pixels (Newton-like inversion to 1e-10)."""
+    """Return the rays through sensor pixels, by fixed-point inversion of the distortion to 1e-10.
+
+    Args:
+        optics: true camera geometry.
+        pixels: (x, y) in sensor pixels.
+
+    Returns:
+        unit vectors in panel coordinates.
+    """
     seen = (pixels - np.array([optics.cx_px, optics.cy_px])) / np.array([optics.fx_px, optics.fy_px])
     ideal = seen.copy()
     for _ in range(40):

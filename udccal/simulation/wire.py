@@ -1,7 +1,7 @@
-"""The wire: what the panel's out-of-focus rows and columns, and the lens's own shading, make of an even field.
+"""The wire: an even field seen through the panel's out-of-focus rows and columns and the lens's own shading.
 
-The true map is the open area of the pupil's footprint on the panel, pixel by pixel, times the lens's relative
-illumination. It is an area of shapes; no sinusoid is assumed anywhere.
+The true map is the open area of the pupil's footprint on the panel at each pixel, times the lens's relative
+illumination. The area follows from the shapes; no sinusoid is assumed.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ _ROWS_AT_ONCE = 16
 
 
 def relative_illumination(truth: RigTruth, directions: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
-    """Lens shading along ``directions`` (panel coordinates), 1 on the axis.
+    """Return the lens shading along ``directions`` (panel coordinates), 1 on the axis.
 
-    The natural cos^4 law of the field angle, times a mild polynomial for the rays that the lens barrel cuts off.
+    It is the cos^4 law of the field angle times a mild polynomial for vignetting by the lens barrel.
     """
     camera = truth.description.camera
     corner = np.hypot(camera.columns / truth.optics.fx_px, camera.rows / truth.optics.fy_px) / 2
@@ -29,7 +29,7 @@ def relative_illumination(truth: RigTruth, directions: Float[np.ndarray, "n 3"])
 
 
 def wire_map(truth: RigTruth) -> Float[np.ndarray, "rows columns"]:
-    """Relative sensitivity of every pixel to an even field, with mean 1 over the sensor."""
+    """Return the relative sensitivity of every pixel to an even field, with mean 1 over the sensor."""
     camera = truth.description.camera
     wire = np.empty((camera.rows, camera.columns))
     x = np.arange(camera.columns, dtype=float)

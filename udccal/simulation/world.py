@@ -1,4 +1,4 @@
-"""A simulated rig with something in front of it: what a simulated camera and display share."""
+"""A simulated rig with an arrangement in front of it, used by the simulated camera and display together."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from udccal.simulation.sensor import Sensor
 from udccal.simulation.truth import RigTruth
 
 _AIMING_ERROR_PX = 0.5
-# Each step of a session has a time and a stretch of noise of its own, so that the same steps give the same session
-# however often it was interrupted: no step takes an hour, nor a million frames.
+# Each step of a session has its own times and its own noise, so that the same steps give the same session however often
+# it was interrupted. A step takes less than an hour and less than a million frames.
 _STEP_S = 3600.0
 _STEP_FRAMES = 1_000_000
 _EPOCH = datetime(2000, 1, 1, tzinfo=UTC)
@@ -26,7 +26,7 @@ _EPOCH = datetime(2000, 1, 1, tzinfo=UTC)
 
 @dataclass(frozen=True)
 class LedTruth:
-    """Where an LED was asked for, and where its image really was (x, y in px)."""
+    """The position that was asked of an LED, and the true position of its image (x, y in px)."""
 
     asked_px: tuple[float, float]
     image_px: tuple[float, float]
@@ -43,18 +43,18 @@ class _Rendered:
 
 @final
 class SimulatedWorld:
-    """The rig, what is arranged in front of it, and the clock.
+    """The rig, the arrangement in front of it, and the clock.
 
     Args:
-        truth: the rig.
-        disturbances: what goes wrong.
-        seed: of noise and of aiming errors.
-        led_support: (rows, columns) on either side of an LED's image within which its light is followed; by default
-            the region that the psf procedure captures, which then is covered wherever in it the image lies.
+        truth: the simulated rig.
+        disturbances: disturbances of the measurement.
+        seed: seed of noise and of aiming errors.
+        led_support: (rows, columns) to either side of an LED's image within which its light is computed. The default
+            is the size of the region that the psf procedure captures, so that the light covers the whole region.
 
     Attributes:
         sensor: the rig's sensor.
-        truth_log: what tests may know and fits may not.
+        truth_log: true positions of LEDs, for tests but not for fits.
     """
 
     def __init__(
@@ -82,11 +82,11 @@ class SimulatedWorld:
 
     @property
     def truth(self) -> RigTruth:
-        """The rig as it stands now (after a knock: as the knock left it)."""
+        """The rig in its present state, which includes a knock that has happened."""
         return self.light.truth
 
     def arrange(self, arrangement: Arrangement, occasion: Occasion | None = None) -> None:
-        """Put something in front of the camera, in place of what was there; an occasion sets clock and noise."""
+        """Replace the arrangement in front of the camera; an occasion sets the clock and the noise."""
         if occasion is not None:
             self._clock_s = (1 + occasion.number) * _STEP_S
             self._noise_from = (1 + occasion.number) * _STEP_FRAMES - self._frames_begun
@@ -96,11 +96,11 @@ class SimulatedWorld:
             self.truth_log.append(self._led)
 
     def now(self) -> datetime:
-        """The simulated time of day."""
+        """Return the simulated time of day."""
         return _EPOCH + timedelta(seconds=self._clock_s)
 
     def expected_rate(self, region: Region) -> Float64[np.ndarray, "rows columns"]:
-        """Expected photo-electrons per second in ``region``, before noise and flicker; not to be written to."""
+        """Return expected photo-electrons per second in ``region``, before noise and flicker. Do not write to it."""
         if self._rendered is None or not _covers(self._rendered.region, region):
             self._rendered = self._render(region)
         x, y = region.x - self._rendered.region.x, region.y - self._rendered.region.y
@@ -108,7 +108,7 @@ class SimulatedWorld:
         return rate + self.disturbances.leak_e_per_s if self.disturbances.leak_e_per_s else rate
 
     def next_frame(self, period_s: float) -> tuple[int, float]:
-        """Start a frame: (frame number, time at which its exposure begins); frames that get lost are passed over."""
+        """Start a frame and return its number and the time at which its exposure begins; lost frames are skipped."""
         while self.disturbances.drops(self._frames_begun):
             self._tick(period_s)
         frame_id, timestamp_s = self._frames_begun, self._clock_s
@@ -118,7 +118,7 @@ class SimulatedWorld:
         return frame_id, timestamp_s
 
     def rate_during(self, settings: Settings, timestamp_s: float) -> Float64[np.ndarray, "rows columns"]:
-        """Expected rate of one frame, flicker included."""
+        """Return the expected rate of one frame in e-/s, flicker included."""
         rate = self.expected_rate(settings.region)
         if isinstance(self._arrangement, FlatLight) and self.disturbances.flicker_fraction:
             return rate * self.disturbances.flicker(timestamp_s, settings.exposure_s)
@@ -127,7 +127,7 @@ class SimulatedWorld:
     def develop(
         self, rate: Float[np.ndarray, "rows columns"], settings: Settings, frame_id: int
     ) -> UInt16[np.ndarray, "rows columns"]:
-        """What the sensor makes of the light; the frame's number seeds its noise, so that order does not matter."""
+        """Convert light to a frame in DN; the frame's number seeds its noise, so that order does not matter."""
         index = self._noise_from + frame_id
         rng = np.random.Generator(np.random.SFC64(np.random.SeedSequence([self.seed, 0xF2A3E, index])))
         return self.sensor.expose(rate, settings.exposure_s, settings.region, rng, settings.gain_dB)
@@ -142,7 +142,7 @@ class SimulatedWorld:
         self._rendered = None
 
     def _aim(self, led: Led) -> LedTruth:
-        """A person aims the LED; the error depends on the place alone, so that a resumed session finds it again."""
+        """Aim the LED as a person would; the error depends on the place alone, so that a resumed session repeats it."""
         place = [round(1e3 * v) & 0xFFFFFFFF for v in (led.x_px, led.y_px)]
         error = np.random.default_rng([self.seed, 0xA13, *place]).uniform(-_AIMING_ERROR_PX, _AIMING_ERROR_PX, 2)
         image = (led.x_px + float(error[0]), led.y_px + float(error[1]))
@@ -183,7 +183,7 @@ def _covers(outer: Region, inner: Region) -> bool:
 
 
 def _lit_part(region: Region, image_px: tuple[float, float], support: tuple[int, int]) -> Region | None:
-    """The part of ``region`` within ``support`` (rows, columns) of an image, on even coordinates; None when empty."""
+    """Return the part of ``region`` within ``support`` (rows, columns) of an image, on even coordinates, or None."""
     left, right = (max(region.x, 2 * int((image_px[0] - support[1]) // 2)), region.x + region.columns)
     top, bottom = (max(region.y, 2 * int((image_px[1] - support[0]) // 2)), region.y + region.rows)
     right = min(right, 2 * int((image_px[0] + support[1]) // 2 + 1))
