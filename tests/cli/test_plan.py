@@ -31,7 +31,7 @@ def test_a_plan_and_the_rig_it_writes(tmp_path: Path) -> None:
     assert geometry["floor"] > 0.001
     assert made["untouched"] == ["wire", "psf", "backscatter"]
     assert made["cost"]["frames"] > 300
-    assert "no amount of capture reaches 0.001 px" in done.stderr
+    assert "no number of captures reaches 0.001 px" in done.stderr
     assert "on the jig" in done.stderr
     planned, before = load_rig(out.parent).captures, load_rig("lg55-reduced").captures
     levels = next(one["planned"] for one in noise["settings"] if one["name"] == "noise_levels")

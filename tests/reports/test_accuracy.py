@@ -59,13 +59,13 @@ def test_the_sentence_names_what_helps_most() -> None:
         _forecast().curves[0], variable=DESIGN_VARIABLES["psf"][2], sigma=np.array([0.102, 0.101, 0.1, 0.099, 0.098])
     )
     said = forecast_sentence(replace(_forecast(), curves=(weak, _forecast().curves[0]), idle=("frames of a stack",)))
-    assert "more flats, 400 instead of 100, lower it most: 0.05 % instead of 0.1 %" in said
+    assert "More flats, 400 instead of 100, lower sigma most: 0.05 % instead of 0.1 %" in said
     assert "does not depend on frames of a stack" in said
 
 
 def test_where_nothing_helps_the_floor_is_explained() -> None:
     said = forecast_sentence(_forecast(floor=0.0995, gain=0.001))
-    assert "hardly lower it" in said
+    assert "hardly lower sigma" in said
     assert "More pixels would lower it." in said
     assert "More pixels" not in forecast_sentence(_forecast(floor=0.001))
 

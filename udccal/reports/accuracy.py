@@ -94,14 +94,14 @@ def accuracy_table(accuracy: Accuracy) -> Table:
 
 def forecast_sentence(ahead: Forecast) -> str:
     """Return a sentence about which captures to increase."""
-    said = "The sigma of the result against each number of captures, with the others unchanged. "
+    said = "The curves show sigma against each number of captures, with the others unchanged. "
     best = max(ahead.curves, key=lambda curve: curve.most_gain)
     if best.most_gain < _LEAST_GAIN:
-        said += "More captures would hardly lower it. "
+        said += "More captures would hardly lower sigma. "
     else:
         said += f"{_gain(ahead, best)} "
     if ahead.floor.sigma and best.most_gain * ahead.floor.sigma > ahead.sigma / 2:
-        said += ahead.floor.lowered_by
+        said += f"The floor is {ahead.floor.sigma:.3g} {ahead.quantity.unit}. {ahead.floor.lowered_by}"
     if ahead.idle:
         said += f" It does not depend on {' or '.join(ahead.idle)}."
     return said.strip()
@@ -110,7 +110,7 @@ def forecast_sentence(ahead: Forecast) -> str:
 def _gain(ahead: Forecast, best: Curve) -> str:
     unit = ahead.quantity.unit
     counted = f"{best.variable.counted}, {best.counts[-1]:.0f} instead of {best.now}"
-    return f"More {counted}, lower it most: {best.sigma[-1]:.3g} {unit} instead of {ahead.sigma:.3g} {unit}."
+    return f"More {counted}, lower sigma most: {best.sigma[-1]:.3g} {unit} instead of {ahead.sigma:.3g} {unit}."
 
 
 def _diagnostic(result: FitResult, name: str) -> float | None:

@@ -10,7 +10,7 @@ _NUMBERS = frozenset({1, 2})
 
 
 def estimates_table(title: str, result: FitResult) -> Table:
-    """Return a table of every estimate of a fit with its sigma and unit, under ``title``."""
+    """Return a table with ``title`` of every estimate in ``result`` with its sigma and unit."""
     rows = tuple((e.name, number(e.value, e.sigma), spread(e.sigma), e.unit) for e in result.estimates)
     return Table(title, ("quantity", "value", "sigma", "unit"), rows, frozenset({1, 2}))
 

@@ -54,7 +54,13 @@ def gather(
 
 
 def calibration_page(session: Session, evidence: Evidence, scene: PictureComparison | None) -> Page:
-    """Return the page of a calibration from its ``session``, its ``evidence`` and a restored ``scene``, if any."""
+    """Build the page of one calibration.
+
+    Args:
+        session: captured data.
+        evidence: numbers of the report, from ``gather``.
+        scene: a restored scene; None for none.
+    """
     calibration = evidence.calibration
     bad = [term for term in ORDER if not calibration.result(term).ok]
     good = "All five terms can be used."

@@ -77,7 +77,7 @@ def compare_with_truth(
 
 
 def truth_table(rows: tuple[TruthRow, ...]) -> Table:
-    """Return the rows as a table of text."""
+    """Return ``rows`` as a table of text."""
     text = tuple(
         (
             row.term,

@@ -23,7 +23,7 @@ class DoctorSummary:
 
 
 def report(output: Output, wanted: Wanted) -> bool:
-    """Examine this computer, print the findings, and return whether everything in ``wanted`` can work."""
+    """Examine this computer, print the findings to ``output``, and return whether everything in ``wanted`` can work."""
     with output.stage("looking"):
         findings = examine(wanted)
     rows = tuple((finding.topic, finding.status.value, finding.found) for finding in findings)
