@@ -1,8 +1,8 @@
-"""Calibrate a lens from arrays of points, and ask how sure it is where a ray lands.
+"""Calibrate a lens from arrays of points, and compute the sigma of where a ray lands.
 
     python examples/array_calibration.py
 
-The corners are made here, with known truth and 0.1 px of noise; put your own detector's in their place.
+The corners are made here, with known truth and 0.1 px of noise; replace them by your own detector's.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ NOISE_PX = 0.1
 
 
 def views(count: int, rng: np.random.Generator) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """A board of 9 x 6 corners, 30 mm apart, held in front of the camera; NaN where a corner is out of the picture."""
+    """Return corners of a board (9 x 6, 30 mm apart) in front of the camera; NaN for corners outside the picture."""
     x, y = np.meshgrid(np.arange(9), np.arange(6))
     board = 30.0 * np.stack([x.ravel() - 4.0, y.ravel() - 2.5, np.zeros(x.size)], axis=1)
     pictures = []
@@ -34,7 +34,7 @@ def views(count: int, rng: np.random.Generator) -> tuple[list[np.ndarray], list[
 
 
 def main() -> None:
-    """Fit, and print the lens, the evidence and the sigma of three rays."""
+    """Fit, and print the lens, the fit's residual and the sigma of three rays."""
     board, pictures = views(12, np.random.default_rng(0))
     found = fit_geometry(board, pictures, SIZE)
     sigma = np.sqrt(np.diag(found.cov))

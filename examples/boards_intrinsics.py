@@ -1,9 +1,9 @@
-"""Calibrate two real cameras from photographs of a chessboard, and put OpenCV's own calibration beside it.
+"""Calibrate two real cameras from photographs of a chessboard, and compare with OpenCV's own calibration.
 
     python examples/boards_intrinsics.py --data ../shared/data
 
 Each folder of photographs holds ``boards/left01.jpg`` ... and ``boards/right01.jpg`` ... of a board with 9 x 6 inner
-corners. The distances come out in squares: the size of a square changes no intrinsic number.
+corners. Distances are in squares: the size of a square changes no intrinsic parameter.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ DEFAULT_DATA = Path(__file__).resolve().parents[1] / ".." / "shared" / "data"
 
 
 def chessboard_corners(picture: np.ndarray) -> np.ndarray | None:
-    """Inner corners of a chessboard in px as OpenCV gives them, or None when there is none."""
+    """Return the inner corners of a chessboard in px from OpenCV, or None when there is none."""
     found, corners = cv2.findChessboardCorners(picture, INNER)
     if not found:
         return None
@@ -31,7 +31,7 @@ def chessboard_corners(picture: np.ndarray) -> np.ndarray | None:
 
 
 def calibrate(name: str, files: list[Path]) -> CalibratedViews | None:
-    """Calibrate one camera from its photographs and print what came out."""
+    """Calibrate one camera from its photographs and print the result."""
     pictures = [cv2.imread(str(file), cv2.IMREAD_GRAYSCALE) for file in files]
     found = [corners for corners in map(chessboard_corners, pictures) if corners is not None]
     if len(found) < 3:

@@ -1,4 +1,4 @@
-"""From a rig to a restored picture in Python: capture, fit, ask how sure, write a profile, restore.
+"""From a rig to a restored picture in Python: capture, fit, compute a sigma, write a profile, restore.
 
 python examples/fit_api.py                # a toy session of a simulated sensor: its noise
 python examples/fit_api.py SESSION OUT    # a whole session of your own, to a profile
@@ -15,7 +15,7 @@ from udccal.models.noise import electrons
 
 
 def toy_rig() -> udccal.RigDescription:
-    """A shipped rig with a quarter of its sensor and few captures."""
+    """Return a shipped rig with a quarter of its sensor and few captures."""
     rig = udccal.load_rig("lg55-reduced")
     camera = rig.camera.model_copy(update={"columns": 256, "rows": 192})
     captures = rig.captures.model_copy(update={"noise_levels": 8, "noise_stack": 4})
@@ -23,7 +23,7 @@ def toy_rig() -> udccal.RigDescription:
 
 
 def report(result: udccal.FitResult) -> None:
-    """What a fit found, and what to do where it failed."""
+    """Print what a fit found, and what to do where it failed."""
     print(f"{result.name}: {result.status.name}: {result.status.value}")
     for estimate in result.estimates:
         print(f"  {estimate.name:22} {estimate.value:12.5g} ± {estimate.sigma:.2g} {estimate.unit}")

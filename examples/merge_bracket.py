@@ -1,4 +1,4 @@
-"""Merge a bracket of exposures into one linear picture with error bars, and list what did not belong to it.
+"""Merge a bracket of exposures into one linear picture with error bars, and list the outliers.
 
     python examples/merge_bracket.py
 
@@ -38,7 +38,7 @@ def main() -> None:
     frames[9, 20, 30] = 3000
     merged = merge_bracket(frames, EXPOSURES_S, SENSOR)
     z = (merged.rate_e_per_s - rate) / merged.sigma_e_per_s
-    print(f"error in units of the stated sigma: mean {z.mean():+.3f}, standard deviation {z.std():.3f}")
+    print(f"error in units of its sigma: mean {z.mean():+.3f}, standard deviation {z.std():.3f}")
     for outlier in merged.outliers:
         print(f"left out: {outlier.count} ({', '.join(outlier.places)}): {outlier.rule}")
 

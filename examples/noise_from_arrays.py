@@ -1,4 +1,4 @@
-"""A sensor's noise from frames as arrays: pairs at several exposures, and stacks for the fixed pattern.
+"""Fit a sensor's noise to frames as arrays: pairs at several exposures, and stacks for the fixed pattern.
 
 python examples/noise_from_arrays.py                 # draws the frames of a toy sensor first
 python examples/noise_from_arrays.py FOLDER          # dark_0.npy, dark_1.npy, bright_0.npy, bright_1.npy in folders
@@ -36,7 +36,7 @@ def toy_levels() -> list[ExposureLevel]:
 
 
 def levels_of(folder: Path) -> list[ExposureLevel]:
-    """Frames are loaded one by one when their turn comes."""
+    """Return data that load their frames one by one when they are needed."""
 
     def pair(place: Path, kind: str) -> tuple[partial[np.ndarray], ...]:
         return tuple(partial(np.load, place / f"{kind}_{i}.npy") for i in (0, 1))

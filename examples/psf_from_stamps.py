@@ -1,4 +1,4 @@
-"""A psf field from stamps of point sources: fit, look at what was chosen, and predict kernels with their error bars.
+"""Fit a psf field to stamps of point sources, print the chosen order, and predict kernels with their error bars.
 
 python examples/psf_from_stamps.py
 """
@@ -14,7 +14,7 @@ COLUMNS, ROWS, SIZE, READ_E = 1000, 800, 15, 4.0
 
 
 def light(position_px: np.ndarray, shift_px: np.ndarray) -> np.ndarray:
-    """A round star that is wider towards the corners."""
+    """Return a round star that is wider towards the corners."""
     x, y = 2 * position_px / [COLUMNS, ROWS] - 1
     sigma = 1.3 * (1 + 0.15 * (x * x + y * y))
     v, u = np.mgrid[:SIZE, :SIZE] - SIZE // 2

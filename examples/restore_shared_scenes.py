@@ -38,17 +38,17 @@ FIELD_OF_VIEW_DEG = 75.0
 
 @dataclass(frozen=True)
 class Scene:
-    """A picture in linear light; its 97th percentile is 1."""
+    """Return a picture in linear light; its 97th percentile is 1."""
 
     name: str
     radiance: Float[np.ndarray, "rows columns 3"]
 
 
 def scenes(folder: Path, size: int, every: int) -> Iterator[Scene]:
-    """All of hdr/ and photos/, and two views into panoramas."""
+    """Yield all of hdr/ and photos/, and two views into panoramas."""
     files = [*sorted((folder / "hdr").glob("*.exr")), *sorted((folder / "photos").glob("*.png"))]
     for file in files[::every]:
-        # Which curve made an 8-bit photograph is not known: gamma differs from file to file.
+        # The tone curve of an 8-bit photograph is unknown: gamma differs from file to file.
         gamma = np.random.default_rng(zlib.crc32(file.name.encode())).uniform(1.8, 2.2)
         yield _scene(f"{file.parent.name}-{file.stem}", read_photograph(file, float(gamma)), size)
     for name, yaw, pitch in PANORAMAS[::every]:

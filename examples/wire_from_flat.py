@@ -1,8 +1,8 @@
-"""Fit the wire term to an averaged flat of your own, and ask how sure its map is anywhere.
+"""Fit the wire term to an averaged flat of your own, and compute the sigma of its map anywhere.
 
     python examples/wire_from_flat.py
 
-The flat is made here: the map of the profile that ships, lit evenly, with the noise of 100 averaged frames.
+The flat is made here: the map of the shipped profile, evenly lit, with the noise of 100 averaged frames.
 """
 
 from __future__ import annotations

@@ -1,1 +1,1 @@
-"""What a technician does to a rig: one module per term, each a list of steps."""
+"""Procedures: what a technician captures of a rig. One module per term, each a list of steps."""

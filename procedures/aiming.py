@@ -1,4 +1,4 @@
-"""Where to hold things, from the nominal mounting alone: the numbers a person is told, which no fit ever reads."""
+"""Computes where to hold things from the nominal mounting: numbers for a person, which no fit ever reads."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _PLASTIC = 1.32471795724474602596  # root of x^3 = x + 1
 
 
 def low_discrepancy(count: int, dimensions: int = 2) -> Float[np.ndarray, "count dimensions"]:
-    """Points that fill the unit cube evenly at any count: the R-sequence.
+    """Return points that fill the unit cube evenly at any count: the R-sequence.
 
     Source: M. Roberts, The unreasonable effectiveness of quasirandom sequences (2018).
     """
@@ -24,7 +24,7 @@ def low_discrepancy(count: int, dimensions: int = 2) -> Float[np.ndarray, "count
 
 
 def nominal_ray(rig: RigDescription, x_px: float, y_px: float) -> Float[np.ndarray, "3"]:
-    """Direction in panel coordinates in which a sensor pixel looks, of length 1 along the camera's axis."""
+    """Return the viewing direction of a sensor pixel in panel coordinates, of length 1 along the camera's axis."""
     camera = rig.camera
     across = (x_px - (camera.columns - 1) / 2) / rig.focal_px
     down = (y_px - (camera.rows - 1) / 2) / rig.focal_px
@@ -32,7 +32,7 @@ def nominal_ray(rig: RigDescription, x_px: float, y_px: float) -> Float[np.ndarr
 
 
 def nominal_pixels(rig: RigDescription, points_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
-    """Sensor pixels at which a perfect nominal camera sees points given in panel coordinates."""
+    """Return the sensor pixels at which a perfect nominal camera sees points in panel coordinates (mm)."""
     rays = (points_mm - nominal_pupil_mm(rig)) @ nominal_rotation(rig)
     centre = np.array([(rig.camera.columns - 1) / 2, (rig.camera.rows - 1) / 2])
     return rays[:, :2] / rays[:, 2:] * rig.focal_px + centre
@@ -45,13 +45,13 @@ def board_facing(
     distance_mm: float,
     lean_rad: tuple[float, float, float],
 ) -> Board:
-    """A board whose centre is seen at ``pixel``, leaning by rotations about x, y, then z from facing the camera."""
+    """Return a board whose centre is seen at ``pixel``, rotated about x, y, then z from facing the camera."""
     lean = Rotation.from_euler("xyz", lean_rad).as_matrix()
     return _placed(rig, spec, pixel, distance_mm, nominal_rotation(rig) @ lean, parallel=False)
 
 
 def board_parallel(rig: RigDescription, spec: BoardSpec, distance_mm: float) -> Board:
-    """A board parallel to the panel whose centre is seen in the middle of the sensor."""
+    """Return a board parallel to the panel whose centre is seen in the middle of the sensor."""
     middle = ((rig.camera.columns - 1) / 2, (rig.camera.rows - 1) / 2)
     return _placed(rig, spec, middle, distance_mm, np.eye(3), parallel=True)
 

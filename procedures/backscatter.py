@@ -1,4 +1,4 @@
-"""Backscatter: under blackout, what the lit panel itself sends into the lens, for white and for face-like pictures."""
+"""Backscatter: the light that the lit panel sends into the lens under blackout, for white and face-like pictures."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ from udccal.sessions.schema import TermName
 _WHITE = "backscatter/white"
 _LEVEL = 0.7  # of saturation, with the white picture
 _GAMMA, _GAIN, _LIFT = 2.2, 2.0, 0.3
-_BLACKOUT = "Keep all light out; the only light is our display, which shows the picture by itself."
+_BLACKOUT = "Keep all light out. The only light is our display, which shows the picture by itself."
 
 Picture = UInt8[np.ndarray, "panel_rows panel_columns 3"]
 
 
 @final
 class BackscatterProcedure(Procedure):
-    """The white picture gives the mask; the others, all at the white picture's exposure, how the light spreads."""
+    """The white picture determines the mask; the others, at the same exposure, determine how the light spreads."""
 
     term: ClassVar[TermName] = "backscatter"
 
     def steps(self, rig: RigDescription) -> Iterator[Step]:
-        """White, dark, then pictures; a third of them are brightened versions of others."""
+        """Yield white, dark, then pictures; a third of them are brightened versions of others."""
         panel, count = rig.panel, rig.captures.backscatter_pictures
         white = np.full((panel.rows, panel.columns, 3), 255, np.uint8)
         yield _shown(rig, _WHITE, white, "white", Metered(_LEVEL))
@@ -56,7 +56,7 @@ class BackscatterProcedure(Procedure):
 
 
 def brightened(picture: Picture) -> Picture:
-    """I' = (a I^gamma + b)^(1/gamma) on 0..1, clipped at white, with gamma = 2.2, a = 2, b = 0.3."""
+    """Brighten: I' = (a I^gamma + b)^(1/gamma) on 0..1, clipped at white, with gamma = 2.2, a = 2, b = 0.3."""
     values = (_GAIN * (np.arange(256) / 255.0) ** _GAMMA + _LIFT) ** (1 / _GAMMA)
     return np.rint(255 * np.minimum(values, 1.0)).astype(np.uint8)[picture]
 

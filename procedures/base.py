@@ -1,4 +1,4 @@
-"""Procedures, their steps, and the runner that carries them out on a bench, real or simulated."""
+"""Procedures, their steps, and the runner that carries them out on a real or simulated bench."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ PictureRole = Literal["white", "picture", "brightened"]
 
 @dataclass(frozen=True)
 class Step:
-    """One thing to set up, look at, and capture.
+    """One thing to set up, check and capture.
 
     Attributes:
         id: ``term/name``, unique in a session.
-        instruction: what a person is to do, as a sentence.
-        role: of the picture on the panel, for steps that show one.
+        instruction: what a person must do, as a sentence.
+        role: role of the picture on the panel, for steps that show one.
     """
 
     id: str
@@ -54,7 +54,7 @@ class Bench:
 
 @dataclass(frozen=True)
 class StepProgress:
-    """Said before a step begins, and once more (``step`` absent) when all are done."""
+    """Progress before each step, and once more (``step`` None) when all are done."""
 
     term: TermName
     done: int
@@ -66,19 +66,19 @@ Progress = Callable[[StepProgress], None]
 
 
 class Procedure(ABC):
-    """What a technician captures for one term."""
+    """The captures of one term."""
 
     term: ClassVar[TermName]
 
     @abstractmethod
     def steps(self, rig: RigDescription) -> Iterator[Step]:
-        """The steps in the order they are to be done; built one at a time."""
+        """Yield the steps in their order, one at a time."""
 
     @final
     def run(
         self, camera: Camera, display: Display, stage: Stage, writer: SessionWriter, progress: Progress | None = None
     ) -> None:
-        """Carry out the steps; what ``run_procedure`` does, for callers that know a procedure by entry point only."""
+        """Carry out the steps as ``run_procedure`` does, for callers that have a procedure by entry point only."""
         run_procedure(self, Bench(camera, display, stage), writer, progress)
 
 
@@ -104,7 +104,7 @@ def run_procedure(procedure: Procedure, bench: Bench, writer: SessionWriter, pro
 
 
 def _exposure_of(step_id: str | None, writer: SessionWriter) -> float | None:
-    """A step's exposure, a good guess for the next one; from the session, so that resuming changes nothing."""
+    """Return a step's exposure as a guess for the next; it comes from the session, so that resuming changes nothing."""
     step = writer.step(step_id) if step_id is not None else None
     return None if step is None else step.captures[0].exposure_s
 
@@ -132,7 +132,7 @@ def _expose(step: Step, camera: Camera, writer: SessionWriter, start_s: float | 
     rig = writer.manifest.rig
     match step.exposure:
         case Metered(signal="even") if (captured := writer.step(step.id)) is not None:
-            # Its files are damaged, its exposure is not: other steps were captured at that one.
+            # Its files are damaged but its exposure is known: other steps were captured at the same one.
             wanted = captured.captures[0].exposure_s
         case Metered():
             return meter(camera, step.region, step.exposure, rig, start_s)
@@ -175,12 +175,12 @@ def _check_camera(camera: Camera, rig: RigDescription) -> None:
     found = (camera.sensor.columns, camera.sensor.rows, camera.cfa, camera.bits)
     if found != expected:
         raise CaptureError(
-            f"Expected a camera of {expected[0]} x {expected[1]}, {expected[2]}, {expected[3]} bits as the rig "
-            f"'{rig.name}' says, found {found[0]} x {found[1]}, {found[2]}, {found[3]} bits. "
+            f"Expected a camera of {expected[0]} x {expected[1]}, {expected[2]}, {expected[3]} bits as in the rig "
+            f"'{rig.name}', found {found[0]} x {found[1]}, {found[2]}, {found[3]} bits. "
             "Connect the right camera, or correct rig.toml."
         )
 
 
 def whole_sensor(rig: RigDescription) -> Region:
-    """The whole sensor as a region."""
+    """Return the whole sensor as a region."""
     return Region(0, 0, rig.camera.columns, rig.camera.rows)

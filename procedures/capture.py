@@ -1,4 +1,4 @@
-"""Carrying out a capture plan at a known exposure; frames that are not fit are left out, counted and replaced."""
+"""Carries out a capture plan at a known exposure; rejected frames are left out, counted and replaced."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from udccal.sessions.captured import Capture, SingleFrame
 from udccal.sessions.frame_checks import FrameChecks, FrameLimits, frames_agree
 
 _TRIES = 4
-_AGREEMENT = 0.01  # relative, of the mean light of single frames of one scene
+_AGREEMENT = 0.01  # relative difference of the mean light of single frames of one scene
 
 
 def take(
     camera: Camera, region: Region, exposure_s: float, plan: Plan, limits: FrameLimits, longest_s: float
 ) -> tuple[Capture, ...]:
-    """What the plan asks for: single frames, or one average.
+    """Capture what the plan requires: single frames, or one average.
 
     Args:
-        camera: open.
-        region: of the sensor.
-        exposure_s: of the first frame.
-        plan: what to take.
-        limits: what each frame must stay within; single frames may clip, since that is what some are taken for.
-        longest_s: the longest exposure of a bracket.
+        camera: open camera.
+        region: region of the sensor.
+        exposure_s: exposure of the first frame.
+        plan: frames to take.
+        limits: limits of each frame; single frames may clip, since some are taken for that.
+        longest_s: longest exposure of a bracket.
 
     Raises:
         CaptureError: when the camera does not deliver enough usable frames.
@@ -45,7 +45,7 @@ def take(
 
 
 def _singles(camera: Camera, count: int, checks: FrameChecks, black_DN: float) -> tuple[SingleFrame, ...]:
-    """Frames of one scene and setting, whose light agrees; those left out are told with the first."""
+    """Return frames of one scene and setting whose light agrees; the first carries the rejected ones."""
     frames: list[Frame] = []
     for _ in range(_TRIES):
         frames += checks.sound(camera.frames(count - len(frames)))
@@ -53,7 +53,7 @@ def _singles(camera: Camera, count: int, checks: FrameChecks, black_DN: float) -
             continue
         if frames_agree(frames, black_DN, _AGREEMENT):
             return (SingleFrame(frames[0], checks.rejections()), *(SingleFrame(frame) for frame in frames[1:]))
-        for _ in frames:  # which of them is right cannot be told
+        for _ in frames:  # it is not known which of them is right
             checks.reject("flicker")
         frames = []
     raise CaptureError(_sentence("a steady light", checks))
@@ -62,7 +62,7 @@ def _singles(camera: Camera, count: int, checks: FrameChecks, black_DN: float) -
 def _exposures(
     camera: Camera, settings: Settings, exposures: Sequence[float], limits: FrameLimits
 ) -> tuple[SingleFrame, ...]:
-    """One frame at each exposure, all of the same light; fewer where the camera has no longer ones, as with files."""
+    """Return one frame per exposure, all of the same light; fewer where the camera has no longer one, as with files."""
     taken: list[SingleFrame] = []
     for exposure_s in exposures:
         accepted = camera.configure(replace(settings, exposure_s=exposure_s))
@@ -73,7 +73,7 @@ def _exposures(
 
 
 def _next_exposure(camera: Camera, checks: FrameChecks, taken: list[SingleFrame], limits: FrameLimits) -> SingleFrame:
-    """A frame that shows the light of the one taken before."""
+    """Return a frame with the same light as the one before."""
     for _ in range(_TRIES):
         for frame in checks.sound(camera.frames(1)):
             reason = bracket_fault(taken[-1].frame, frame, limits) if taken else None
@@ -86,6 +86,6 @@ def _next_exposure(camera: Camera, checks: FrameChecks, taken: list[SingleFrame]
 def _sentence(expected: str, checks: FrameChecks) -> str:
     found = checks.summary() or "no frame at all"
     return (
-        f"Expected {expected}, found frames that had to be left out one after the other ({found}). "
-        "Check the light, that nothing moves, and the camera's cable, then repeat the step."
+        f"Expected {expected}, found only frames that had to be rejected ({found}). "
+        "Check the light and the camera's cable, and that nothing moves, then repeat the step."
     )

@@ -1,4 +1,4 @@
-"""What the camera must see before a step is captured; each check speaks to the person at the rig."""
+"""Checks of what the camera sees before a step is captured; their errors are sentences for the person at the rig."""
 
 from __future__ import annotations
 
@@ -18,28 +18,28 @@ from udccal.sessions.patches import brightest_patch_DN
 
 Check = Callable[[Frame, RigDescription], None]
 
-_STRAY_E = 60.0  # electrons above the nominal black level that a dark frame may show, beside the tolerances
-_UNEVEN = 0.15  # of the brightest: the darkest patch an even light may leave, vignetting included
+_STRAY_E = 60.0  # electrons above the nominal black level that a dark frame may show, in addition to the tolerances
+_UNEVEN = 0.15  # darkest patch of an even light over the brightest, vignetting included
 _FEWEST_CORNERS, _ENOUGH_CORNERS = 6, 12  # a quarter of the board, within these bounds
-_AIM_PX = 10  # the fit looks a little further
+_AIM_PX = 10  # the fit searches a little further
 
 
 def dark_limit_DN(rig: RigDescription, exposure_s: float) -> float:
-    """What no patch of a dark frame exceeds: black level and dark current cannot make it brighter."""
+    """Return the level in DN that no patch of a dark frame exceeds through black level and dark current."""
     camera = rig.camera
-    # Half the sensor at 100 e-/s is more dark current than any camera within its specification shows.
+    # 100 e-/s over half the sensor is more dark current than any camera within its specification has.
     allowed_e = _STRAY_E + 100.0 * exposure_s
     return camera.black_DN.value + camera.black_DN.tolerance + allowed_e * camera.K_DN_per_e.value
 
 
 def frame_limits(rig: RigDescription, exposure_s: float, dark: bool) -> FrameLimits:
-    """What each frame of a step's captures must stay within."""
+    """Return the limits of each frame of a step's captures."""
     limits = FrameLimits(rig.camera.black_DN.value, lowest_saturation_DN(rig))
     return replace(limits, dark_DN=dark_limit_DN(rig, exposure_s)) if dark else limits
 
 
 def is_dark(frame: Frame, rig: RigDescription) -> None:
-    """No light reaches the sensor.
+    """Check that no light reaches the sensor.
 
     Raises:
         CaptureError: when the frame is brighter than black level and dark current can make it.
@@ -48,13 +48,13 @@ def is_dark(frame: Frame, rig: RigDescription) -> None:
     if brightest > dark_limit_DN(rig, frame.settings.exposure_s):
         above_DN = brightest - rig.camera.black_DN.value - rig.camera.black_DN.tolerance
         raise CaptureError(
-            f"Expected a dark frame, found it {above_DN:.0f} DN above the black level, in a part at least. "
+            f"Expected a dark frame, found at least a part {above_DN:.0f} DN above the black level. "
             "Cap the lens, switch the panel off and close the blackout, then repeat the step."
         )
 
 
 def is_even(frame: Frame, rig: RigDescription) -> None:
-    """An even light fills the view.
+    """Check that an even light fills the view.
 
     Raises:
         CaptureError: when a part of the view is much darker than the brightest.
@@ -64,12 +64,12 @@ def is_even(frame: Frame, rig: RigDescription) -> None:
     if darkest < _UNEVEN * brightest:
         raise CaptureError(
             f"Expected an even light over the whole view, found patches at {max(darkest, 0.0) / brightest:.0%} of the "
-            "brightest. Bring the LED panel closer and centre it, and take away what stands in front of it."
+            "brightest. Bring the LED panel closer and centre it, and remove what is in front of it."
         )
 
 
 def shows_led(x_px: float, y_px: float) -> Check:
-    """A check that one small light stands out of a dark room, its image where it was aimed at on the sensor."""
+    """A check that one small light shines in a dark room, with its image near the intended place on the sensor."""
 
     def check(frame: Frame, rig: RigDescription) -> None:
         """Find the LED.
@@ -117,11 +117,11 @@ def shows_board(spec: BoardSpec) -> Check:
 
 
 def sees_anything(frame: Frame, rig: RigDescription) -> None:
-    """No condition: dark pictures on the panel may leave nothing to see."""
+    """Accept every frame: dark pictures on the panel may show nothing."""
 
 
 def _patches(frame: Frame) -> np.ndarray:
-    """Means over about 16 x 16 patches of whole 2 x 2 cells: colour and noise average out."""
+    """Return means over about 16 x 16 patches of whole 2 x 2 cells: colour and noise average out."""
     height, width = (2 * max(1, side // 32) for side in frame.data.shape)
     down, across = frame.data.shape[0] // height, frame.data.shape[1] // width
     whole = frame.data[: down * height, : across * width]
@@ -132,7 +132,7 @@ def _corners_seen(frame: Frame, spec: BoardSpec) -> int:
     grey = cv2.blur(frame.data.astype(np.float32), (2, 2))  # every 2 x 2 holds each site of the pattern once
     low, high = np.percentile(grey, (0.5, 99.5))
     picture = np.clip((grey - low) / max(float(high - low), 1.0) * 255, 0, 255).astype(np.uint8)
-    if min(picture.shape) < 600:  # markers of few pixels are found more surely in a magnified picture
+    if min(picture.shape) < 600:  # markers of few pixels are found more reliably in a magnified picture
         picture = cv2.resize(picture, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC)
     dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, spec.dictionary))
     board = cv2.aruco.CharucoBoard((spec.columns, spec.rows), spec.square_mm, spec.marker_mm, dictionary)

@@ -1,4 +1,4 @@
-"""Geometry: views of a ChArUco board in varied poses, and one of it on a jig parallel to the panel for the tilt."""
+"""Geometry: views of a ChArUco board in varied poses, and one on a jig parallel to the panel for the tilt."""
 
 from __future__ import annotations
 
@@ -16,25 +16,25 @@ from udccal.rig import RigDescription
 from udccal.sessions.schema import TermName
 
 _MOST_SQUARES, _FEWEST_SQUARES, _SQUARE_PX = 12, 5, 40.0
-_MARKER = 0.75  # of the square
+_MARKER = 0.75  # marker side over square side
 _SPAN_AT_MM, _SPAN = 850.0, 0.6  # at this distance the board spans this part of the view's width
 _NEAREST_MM, _FARTHEST_MM = 570.0, 1250.0
 _JIG_MM = 700.0
 _LEVEL = 0.75
 _FRAMES = 8
 _MOST_LEAN_RAD, _MOST_TURN_RAD = np.deg2rad(40.0), np.deg2rad(20.0)
-# Middle of the board as a fraction of the sensor: centre, corners, edges, over and over.
+# Middle of the board as a fraction of the sensor: centre, corners, edges, repeatedly.
 _SPOTS = ((0.5, 0.5), (0.2, 0.2), (0.8, 0.8), (0.8, 0.2), (0.2, 0.8), (0.5, 0.2), (0.5, 0.8), (0.2, 0.5), (0.8, 0.5))
 
 
 @final
 class GeometryProcedure(Procedure):
-    """Poses are spread so that corners reach the edges of the field and the board leans every way."""
+    """Poses are spread so that corners reach the edges of the field and the board leans in every direction."""
 
     term: ClassVar[TermName] = "geometry"
 
     def steps(self, rig: RigDescription) -> Iterator[Step]:
-        """The view on the jig, then the views held by hand."""
+        """Yield the view on the jig, then the views held by hand."""
         spec = board_spec(rig)
         jig = board_parallel(rig, spec, _JIG_MM)
         yield _view(rig, "geometry/panel", jig, "Put the board on the jig that holds it parallel to the display.")
@@ -43,7 +43,7 @@ class GeometryProcedure(Procedure):
 
 
 def board_spec(rig: RigDescription) -> BoardSpec:
-    """A board of 12 x 9 squares (fewer where the camera has few pixels), in millimetres that suit its field of view."""
+    """Return a board of 12 x 9 squares (fewer for a camera with few pixels), sized in mm for the field of view."""
     columns = int(np.clip(_SPAN * rig.camera.columns / _SQUARE_PX, _FEWEST_SQUARES, _MOST_SQUARES))
     view_mm = _SPAN_AT_MM * rig.camera.columns / rig.focal_px
     square = float(round(_SPAN * view_mm / columns))
@@ -51,7 +51,7 @@ def board_spec(rig: RigDescription) -> BoardSpec:
 
 
 def board_poses(rig: RigDescription, spec: BoardSpec) -> Iterator[Board]:
-    """``captures.board_views`` poses."""
+    """Return ``captures.board_views`` poses."""
     camera, count = rig.camera, rig.captures.board_views
     for index, (near, lean_x, lean_y, turn) in enumerate(low_discrepancy(count, 4)):
         across, down = _SPOTS[index % len(_SPOTS)]

@@ -1,4 +1,4 @@
-"""Finding an exposure by a few test frames."""
+"""Finds an exposure by a few test frames."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ from udccal.errors import CaptureError
 from udccal.rig import RigDescription
 
 _MOST_TEST_FRAMES = 16
-_CLIPPED = 0.88  # of the range: within the tolerances of full well and gain the true level may be unknown
-_BURIED = 0.02  # of the range: the true level is too uncertain to scale by
-_CLOSE = 0.05  # relative distance from the target that is good enough
-_ENOUGH = 0.25  # of the target, at the longest exposure
+_CLIPPED = 0.88  # of the range: tolerances of full well and gain leave the true level uncertain
+_BURIED = 0.02  # of the range: below it the true level is too uncertain to scale by
+_CLOSE = 0.05  # accepted relative distance from the target
+_ENOUGH = 0.25  # least fraction of the target at the longest exposure
 
 Level = Callable[[UInt16[np.ndarray, "rows columns"], RigDescription], float]
 
 
 @dataclass(frozen=True)
 class Exposed:
-    """An exposure and the test frame that shows what it gives."""
+    """An exposure and its test frame."""
 
     exposure_s: float
     frame: Frame
 
 
 def trial_frame(camera: Camera, region: Region, exposure_s: float) -> Frame:
-    """One complete frame at an exposure.
+    """Return one complete frame at an exposure.
 
     Raises:
         CaptureError: when three in a row are incomplete.
@@ -48,14 +48,14 @@ def meter(camera: Camera, region: Region, plan: Metered, rig: RigDescription, st
     """Find the exposure at which the signal of what stands before the camera reaches the plan's target.
 
     Args:
-        camera: gives the test frames.
-        region: part of the sensor to look at.
-        plan: which signal, and how far up the range from black to saturation.
+        camera: takes the test frames.
+        region: part of the sensor to measure.
+        plan: signal to measure, and its target between black (0) and saturation (1).
         rig: black level, bits and the limits of the exposure.
-        start_s: a guess, e.g. what a step before this one used.
+        start_s: first guess, e.g. the exposure of an earlier step.
 
     Raises:
-        CaptureError: when the signal is clipped at the shortest exposure or buried at the longest.
+        CaptureError: when the signal is clipped at the shortest exposure or too weak at the longest.
     """
     shortest, longest = rig.camera.min_exposure_s, rig.camera.max_exposure_s
     level_of = even_level if plan.signal == "even" else spot_level
@@ -75,9 +75,7 @@ def meter(camera: Camera, region: Region, plan: Metered, rig: RigDescription, st
         if abs(bounded / exposure - 1) < _CLOSE and level <= _CLIPPED:
             _refuse_dark(level, plan, exposure)
             return Exposed(exposure, frame)
-        if (
-            exposure in tried and level <= _CLIPPED
-        ):  # asked for another, the camera has none nearer: files, coarse steps
+        if exposure in tried and level <= _CLIPPED:  # the camera has no nearer exposure: files, coarse steps
             _refuse_dark(level, plan, exposure)
             return Exposed(exposure, frame)
         if bounded == exposure or exposure in tried:
@@ -88,25 +86,25 @@ def meter(camera: Camera, region: Region, plan: Metered, rig: RigDescription, st
         tried.add(exposure)
         exposure = bounded
     raise CaptureError(
-        f"Expected a steady light, found that {_MOST_TEST_FRAMES} test frames did not settle on an exposure. "
+        f"Expected a steady light, found that {_MOST_TEST_FRAMES} test frames did not converge to an exposure. "
         "Check that the light does not flicker or move, then repeat the step."
     )
 
 
 def even_level(data: UInt16[np.ndarray, "rows columns"], rig: RigDescription) -> float:
-    """Level of the brightest channel of an even field, 0 at black and 1 at saturation: the 99.9th percentile."""
+    """Return the level of the brightest channel of an even field (99.9th percentile), 0 at black, 1 at saturation."""
     return _fraction(float(np.percentile(data, 99.9)), rig)
 
 
 def spot_level(data: UInt16[np.ndarray, "rows columns"], rig: RigDescription) -> float:
-    """Level of the brightest sample of a small light in a dark region, 0 at black and 1 at saturation."""
+    """Return the level of the brightest sample of a small light in a dark region, 0 at black, 1 at saturation."""
     return _fraction(float(np.median(data)) + float(spot_light(data).max()), rig)
 
 
 def spot_light(data: UInt16[np.ndarray, "rows columns"]) -> Float[np.ndarray, "rows columns"]:
-    """Samples above their surroundings in DN, hot pixels held down.
+    """Return samples above their surroundings in DN, with hot pixels limited.
 
-    A hot pixel stands alone while a light spreads: a sample counts at most ten times as much as its brightest
+    A hot pixel is isolated while a light spreads: a sample counts at most ten times as much as its brightest
     neighbour.
     """
     above = np.maximum(data - float(np.median(data)), 0.0)
@@ -128,13 +126,13 @@ def _refuse_dark(level: float, plan: Metered, exposure_s: float) -> None:
 
 
 def saturation_DN(rig: RigDescription) -> float:
-    """Nominal level at which a sample clips: the converter's end or the full well, whichever comes first."""
+    """Return the nominal level in DN at which a sample clips: the converter's end or the full well, if lower."""
     camera = rig.camera
     return min(float(rig.saturation_DN), camera.black_DN.value + camera.K_DN_per_e.value * camera.full_well_e.value)
 
 
 def lowest_saturation_DN(rig: RigDescription) -> float:
-    """The lowest level at which a sample may clip within the tolerances of the rig."""
+    """Return the lowest level in DN at which a sample may clip within the tolerances of the rig."""
     camera = rig.camera
     K, well = (nominal.value - nominal.tolerance for nominal in (camera.K_DN_per_e, camera.full_well_e))
     return min(float(rig.saturation_DN), camera.black_DN.value - camera.black_DN.tolerance + K * well)

@@ -15,8 +15,8 @@ from udccal.rig import RigDescription
 from udccal.sessions.schema import TermName
 
 _STACK = "noise/flat_stack"
-_LEVEL = 0.5  # of saturation, in the stack
-_TOP = 2.3  # times the stack's exposure: past saturation, so that the fit can find where it lies
+_LEVEL = 0.5  # level of the stack, of saturation
+_TOP = 2.3  # times the stack's exposure: beyond saturation, so that the fit can find it
 _BOTTOM = 0.02
 _LONG_DARKS_S = (0.25, 1.0, 4.0)
 
@@ -31,7 +31,7 @@ class NoiseProcedure(Procedure):
     term: ClassVar[TermName] = "noise"
 
     def steps(self, rig: RigDescription) -> Iterator[Step]:
-        """Flats first: the dark frames repeat their exposures, then go on to long ones for the dark current."""
+        """Yield flats, then dark frames at the same exposures and at long ones for the dark current."""
         stack = Stack(rig.captures.noise_stack)
         factors = np.linspace(_BOTTOM, _TOP, rig.captures.noise_levels)
         yield _lit(rig, _STACK, Metered(_LEVEL), stack)

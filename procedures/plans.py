@@ -1,4 +1,4 @@
-"""What a step captures, as small values that the runner in ``procedures.base`` carries out."""
+"""Capture plans of a step, which the runner in ``procedures.base`` carries out."""
 
 from __future__ import annotations
 
@@ -6,19 +6,18 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
-# What metering usually takes; a step whose exposure is known beforehand takes one frame to look at.
+# Usual number of metering frames; a step of known exposure takes one frame for its check.
 _METERING_FRAMES = 4
 
 
 @dataclass(frozen=True)
 class Planned:
-    """What is known of a step's exposure before anything is captured.
+    """A step's exposure as expected before anything is captured.
 
     Attributes:
-        exposure_s: of the first frame.
-        level: of the range from black to saturation, where that is what the exposure aims at (of what stands before
-            the camera in the step it was metered in); None where it is not.
-        test_frames: how many are taken to find and to check it.
+        exposure_s: exposure of the first frame.
+        level: target between black (0) and saturation (1) in the step where the exposure is metered; None without one.
+        test_frames: number of frames that find and check it.
     """
 
     exposure_s: float
@@ -30,7 +29,7 @@ class Planned:
 class Metered:
     """The exposure that brings the signal to ``target`` of the range from black to saturation, found by test frames.
 
-    ``signal``: ``even`` looks at the 99.9th percentile (the brightest channel of an even field), ``spot`` at the
+    ``signal`` ``even`` measures the 99.9th percentile (the brightest channel of an even field), ``spot`` the
     brightest sample of a small light.
     """
 
@@ -38,19 +37,19 @@ class Metered:
     signal: Literal["even", "spot"] = "even"
 
     def planned(self, metered_s: float, earlier: Mapping[str, Planned]) -> Planned:
-        """As metering will find it; ``metered_s`` is what the light there is expected to ask for."""
+        """Return the exposure that metering is expected to find: ``metered_s``."""
         return Planned(metered_s, self.target, _METERING_FRAMES)
 
 
 @dataclass(frozen=True)
 class TimesThatOf:
-    """``factor`` times the exposure of the first capture of an earlier step, so that resuming finds it again."""
+    """``factor`` times the exposure of an earlier step's first capture, so that a resumed session has the same."""
 
     step_id: str
     factor: float = 1.0
 
     def planned(self, metered_s: float, earlier: Mapping[str, Planned]) -> Planned:
-        """From that of the earlier step; raises KeyError when there is none of that name."""
+        """Return the expected exposure from the earlier step's; raise KeyError when there is no such step."""
         first = earlier[self.step_id]
         level = None if first.level is None else self.factor * first.level
         return Planned(self.factor * first.exposure_s, level, 1)
@@ -58,12 +57,12 @@ class TimesThatOf:
 
 @dataclass(frozen=True)
 class Fixed:
-    """An exposure known beforehand."""
+    """A fixed exposure."""
 
     exposure_s: float
 
     def planned(self, metered_s: float, earlier: Mapping[str, Planned]) -> Planned:
-        """As it is."""
+        """Return the fixed exposure."""
         return Planned(self.exposure_s, None, 1)
 
 
@@ -77,7 +76,7 @@ class Stack:
     frames: int
 
     def exposures_s(self, first_s: float, longest_s: float) -> tuple[float, ...]:
-        """Of every frame."""
+        """Return the exposure of every frame."""
         return self.frames * (first_s,)
 
 
@@ -88,7 +87,7 @@ class Singles:
     frames: int
 
     def exposures_s(self, first_s: float, longest_s: float) -> tuple[float, ...]:
-        """Of every frame."""
+        """Return the exposure of every frame."""
         return self.frames * (first_s,)
 
 
@@ -101,7 +100,7 @@ class Bracket:
     factor: float = 4.0
 
     def exposures_s(self, first_s: float, longest_s: float) -> tuple[float, ...]:
-        """Of every frame; the last is the camera's longest if the next step would pass it."""
+        """Return the exposure of every frame; the last is the camera's longest if the next step would exceed it."""
         exposures = [first_s]
         while len(exposures) < self.frames and exposures[-1] < longest_s:
             exposures.append(min(exposures[-1] * self.factor, longest_s))

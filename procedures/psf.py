@@ -24,13 +24,12 @@ _CELL_PX = 2.0  # a shift moves the LED within one cell of the Bayer pattern
 
 @final
 class PsfProcedure(Procedure):
-    """Each shift puts the LED elsewhere within a 2 x 2 cell, so that together they sample below the pixel in every
-    channel."""
+    """Each shift moves the LED within a 2 x 2 cell, so that together they sample every channel below its pitch."""
 
     term: ClassVar[TermName] = "psf"
 
     def steps(self, rig: RigDescription) -> Iterator[Step]:
-        """All shifts of one position, then the next position."""
+        """Yield all shifts of one position, then the next position."""
         captures = rig.captures
         shifts = _CELL_PX * low_discrepancy(captures.psf_shifts)
         for position, (x, y) in enumerate(led_positions_px(rig)):
@@ -52,14 +51,14 @@ class PsfProcedure(Procedure):
 
 
 def led_positions_px(rig: RigDescription) -> Float[np.ndarray, "positions 2"]:
-    """The first sample of the Bayer cell aimed at, on a grid over the sensor, row by row."""
+    """Return the first sample (x, y) of each position's Bayer cell, on a grid over the sensor, row by row."""
     sides = ((rig.camera.columns, rig.captures.psf_columns), (rig.camera.rows, rig.captures.psf_rows))
     across, down = (_even(_places(side, count)) for side, count in sides)
     return np.stack(np.meshgrid(across, down), axis=-1).reshape(-1, 2)
 
 
 def region_around(rig: RigDescription, x_px: float, y_px: float) -> Region:
-    """The region that holds the LED near its middle; at the sensor's border it is moved inwards and keeps its size."""
+    """Return the region with the LED near its middle; at the sensor's edge it is moved inwards and keeps its size."""
     captures, camera = rig.captures, rig.camera
     columns = min(captures.psf_region_columns, camera.columns) // 2 * 2
     rows = min(captures.psf_region_rows, camera.rows) // 2 * 2

@@ -18,12 +18,12 @@ _DARKS = 16
 
 @final
 class WireProcedure(Procedure):
-    """The modulation by the panel's rows is a few per cent: shot noise is averaged down below a thousandth."""
+    """The modulation by the panel's rows is a few per cent, so averaging reduces shot noise below a thousandth."""
 
     term: ClassVar[TermName] = "wire"
 
     def steps(self, rig: RigDescription) -> Iterator[Step]:
-        """The flat, then the dark at its exposure."""
+        """Yield the flat, then the dark at its exposure."""
         yield Step(
             id="wire/flat",
             term="wire",

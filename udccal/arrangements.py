@@ -1,4 +1,4 @@
-"""What must stand in front of the camera during a step: said once, to a person and to a simulated world alike.
+"""What must stand in front of the camera during a step, for a person and for a simulated world.
 
 Pixel positions follow docs/conventions.md: (0, 0) is the centre of the top-left sensor pixel, x right, y down.
 """
@@ -48,10 +48,10 @@ class BoardSpec:
 
 @dataclass(frozen=True)
 class Board:
-    """A board held in evenly lit surroundings. ``parallel_to_panel`` marks the one view on the alignment jig.
+    """A board held in even light. ``parallel_to_panel`` marks the one view on the alignment jig.
 
-    ``rotation_vector`` (radians) and ``translation_mm`` take board coordinates to *panel* coordinates. They say where
-    a person should hold it; a fit never reads them.
+    ``rotation_vector`` (radians) and ``translation_mm`` take board coordinates to *panel* coordinates. They describe
+    where a person should hold it; a fit never reads them.
     """
 
     spec: BoardSpec
@@ -85,9 +85,9 @@ Arrangement = Dark | FlatLight | Led | Board | PanelPicture | Photograph
 
 @dataclass(frozen=True)
 class Occasion:
-    """What an arrangement is for: told to a person with it; a simulated world takes its clock and its chance from it.
+    """The step that an arrangement belongs to; it seeds the clock and the noise of a simulated world.
 
-    ``number`` is the place of the step in the session, counted from 0.
+    ``instruction`` is the sentence for a person. ``number`` is the place of the step in the session, counted from 0.
     """
 
     step_id: str
@@ -100,5 +100,5 @@ class Stage(Protocol):
     """Puts things in front of the camera: a simulated world, or a person who follows an instruction."""
 
     def arrange(self, arrangement: Arrangement, occasion: Occasion) -> None:
-        """Return once the arrangement stands."""
+        """Set up the arrangement; return when it is in place."""
         ...

@@ -1,4 +1,4 @@
-"""The procedures that are installed, found by the name of their term through entry points."""
+"""Finds installed procedures by the name of their term through entry points."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ GROUP = "udccal.procedures"
 
 
 def find_procedure(term: str) -> type:
-    """Class of the procedure of a term; the one that another package brings goes before udccal's own.
+    """Return the class of the procedure of ``term``; that of another package comes before udccal's own.
 
     Raises:
-        UdccalError: when none is installed, two other packages bring one, or it cannot be imported.
+        UdccalError: when none is installed, two other packages provide one, or it cannot be imported.
     """
     found = entry_points(group=GROUP, name=term)
     others = [point for point in found if not _is_our_own(point)]
     if not found:
         raise UdccalError(
             f"Expected an installed procedure for the term '{term}', found none in the entry-point group '{GROUP}'. "
-            "Install udccal with pip, or install the package that brings the procedure."
+            "Install udccal with pip, or install the package that provides the procedure."
         )
     if len(others) > 1:
         values = " and ".join(point.value for point in others)

@@ -1,4 +1,4 @@
-"""Do stated error bars hold on rigs whose truth no model describes? Writes a table into docs/numerics.md.
+"""Checks error bars on rigs whose truth no model describes, and writes a table into docs/numerics.md.
 
     python -m tests.benchmarks.coverage [--out DIR] [--rigs N]
 
@@ -65,7 +65,7 @@ class Specimen:
 @final
 @dataclass(frozen=True)
 class Coverage:
-    """z-scores of one quantity over the rigs, and the share of them inside the stated 95 %."""
+    """z-scores of one quantity over the rigs, and the fraction of them inside the 95 % interval."""
 
     name: str
     by_rig: tuple[Float[np.ndarray, " n"], ...]
@@ -82,7 +82,7 @@ class Coverage:
 
     @property
     def z_rms(self) -> float:
-        """1 where errors are as large as stated."""
+        """RMS of z; 1 where errors are as large as their sigma."""
         return float(np.sqrt(np.mean([np.mean(z**2) for z in self.by_rig])))
 
     @property

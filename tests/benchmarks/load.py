@@ -50,7 +50,7 @@ class Load:
 
 
 def measure(rig: RigDescription, count: int) -> Load:
-    """Average ``count`` frames of a simulated camera; then time the averaging alone beside numpy's."""
+    """Average ``count`` frames of a simulated camera; then compare the time of the averaging alone with numpy's."""
     world = SimulatedWorld(draw_truth(rig, 0))
     world.arrange(FlatLight())
     memory: list[float] = []

@@ -1,10 +1,10 @@
-"""Planned against obtained: what ``udccal plan`` foretells at two designs of a reduced rig, and what fits then state.
+"""Compares the forecast of ``udccal plan`` at two designs of a reduced rig with the sigma of the fits.
 
     python -m tests.benchmarks.planning [--out DIR] [--term NAME ...] [--realisations N]
 
 Both designs are captured on the simulated rig and fitted. The fits of the first design are the profile at whose values
 both are predicted: at the first the prediction is of what was just measured, at the second it has to scale. Sigmas by
-noise are compared: how far a model is off is estimated anew by every fit, and a plan takes it from the profile. The psf
+noise are compared: every fit estimates its own model error, and a plan takes it from the profile. The psf
 is compared in small windows of a rig whose light is in the class of its fit, and with the errors found, too.
 Writes DIR/planning.json and DIR/planning.md, and the table in docs/planning.md when all terms were asked for; exits
 with 1 where a prediction is off by more than 15 %.
@@ -65,7 +65,7 @@ class Obtained:
     calibration: Calibration
 
     def sigma(self, term: TermName) -> float:
-        """What the fit states, in the unit of the term's target."""
+        """Return the fit's sigma, in the unit of the term's target."""
         match term:
             case "noise":
                 K = self.calibration.noise.estimate("K_DN_per_e")
@@ -123,7 +123,7 @@ def compared(term: TermName, designs: list[tuple[str, Captures, Obtained]]) -> l
 
 
 def psf_rows(made: Compared) -> list[Row]:
-    """One design's; errors found are compared where there are enough of them, within what these tell."""
+    """Return the rows of one design; compare errors where there are enough of them, within their standard error."""
     rows = [_row(f"psf, {made.name}", made.predicted, "stated", made.stated)]
     if made.realisations >= _ENOUGH:
         found = _row(f"psf, {made.name}", made.predicted, "found", made.obtained)

@@ -37,7 +37,7 @@ DESIGNS = ((3, 2, 2, 6), (4, 3, 3, 4))
 @final
 @dataclass(frozen=True)
 class Compared:
-    """One design: relative L2 of the kernel in per cent, as foretold, as stated by the fits, and as found.
+    """One design: relative L2 of the kernel in per cent, as forecast, as estimated by the fits, and as found.
 
     ``spread`` is the relative standard error of what was found in so many ``realisations``.
     """
@@ -111,7 +111,7 @@ def _inside(rig: RigDescription) -> Float[np.ndarray, "positions 2"]:
 
 @in_float64
 def _realisation(scene: Scene, prior: Prior, seed: int) -> tuple[float, float]:
-    """Squared relative L2 error of the kernel, mean over places and colours: found, and stated."""
+    """Squared relative L2 error of the kernel, mean over places and colours: found, and estimated by the fit."""
     rng, theta = np.random.default_rng([seed, 5]), prior.mean
     shots = shots_of(scene, pictures(scene, theta, rng), rng)
     rules = replace(FitEffort().psf, close_px=_HALF)

@@ -1,4 +1,4 @@
-"""Which residual the psf fit chooses beside diffraction on rigs where it is known.
+"""Which residual the psf fit chooses in addition to diffraction on rigs where it is known.
 
     python -m tests.benchmarks.psf_orders [--runs N]
 

@@ -1,10 +1,10 @@
-"""LED pictures by wave optics, whose kernel is in no class of the fit, and how far fits of them may be believed.
+"""Checks error bars of psf fits on LED pictures by wave optics, whose kernel is in no model class of the fit.
 
     python -m tests.benchmarks.psf_wave_optics [--rigs N]
 
 Draws N reduced rigs, fits each from brackets of an LED, and looks at the kernel where no LED was: what part of its
-samples lies within 1.96 sigma of the truth, and its relative L2 error as stated and as found. Exits with 1 where less
-than 90 % lies there.
+samples lies within 1.96 sigma of the truth, and its relative L2 error as estimated and as found. Exits with 1 where
+less than 90 % lies there.
 """
 
 from __future__ import annotations

@@ -117,7 +117,7 @@ BACKENDS = {
 
 
 def picture(rows: int, columns: int, seed: int = 0) -> UInt16[np.ndarray, "rows columns"]:
-    """Twelve bits of noise: every sample tells its place."""
+    """Twelve bits of noise: every sample identifies its place."""
     return np.random.default_rng(seed).integers(0, 4096, (rows, columns)).astype(np.uint16)
 
 

@@ -37,7 +37,7 @@ def camera(features: Path) -> Iterator[PylonCamera]:
 
 
 def opened(camera: PylonCamera) -> OpenDevice:
-    """The SDK's side of it, to which the emulator's faults are told."""
+    """The SDK's object, on which the emulator's faults are set."""
     assert camera._device is not None
     return camera._device
 

@@ -72,7 +72,7 @@ def test_files_must_say_their_exposure(tmp_path: Path) -> None:
     folder = tmp_path / "wire" / "flat"
     folder.mkdir(parents=True)
     write_png16(folder / "a.png", picture(12, 16))
-    with pytest.raises(CameraError, match=r"a frames\.csv beside it, found neither"):
+    with pytest.raises(CameraError, match=r"a frames\.csv in its folder, found neither"):
         StepFolders(tmp_path, bits=12)
     (folder / "frames.csv").write_text("file,exposure_s\na.png,0.25\n")
     with StepFolders(tmp_path, bits=12).camera as camera:

@@ -33,5 +33,5 @@ def test_the_demonstration_beats_the_panel(tmp_path: Path) -> None:
     for term in TERMS:
         assert f'alt="residuals of {term}"' in report
         assert f'alt="accuracy of {term} against captures"' in report
-    assert report.count("information left on the table") == len(TERMS)
+    assert report.count("unused part of the information") == len(TERMS)
     assert "http://" not in report

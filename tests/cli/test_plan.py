@@ -31,7 +31,7 @@ def test_a_plan_and_the_rig_it_writes(tmp_path: Path) -> None:
     assert geometry["floor"] > 0.001
     assert made["untouched"] == ["wire", "psf", "backscatter"]
     assert made["cost"]["frames"] > 300
-    assert "no amount of capture reaches 0.001 px" in done.stderr
+    assert "no number of captures reaches 0.001 px" in done.stderr
     assert "on the jig" in done.stderr
     planned, before = load_rig(out.parent).captures, load_rig("lg55-reduced").captures
     levels = next(one["planned"] for one in noise["settings"] if one["name"] == "noise_levels")
@@ -45,7 +45,7 @@ def test_a_plan_and_the_rig_it_writes(tmp_path: Path) -> None:
 def test_a_table_for_people() -> None:
     done = udccal("plan", "--rig", "lg55-reduced", "--target", "noise=1%")
     assert done.returncode == 0, done.stderr
-    for said in ("Planned captures", "noise_levels 5 (now 10)", "What one addition more would bring"):
+    for said in ("Planned captures", "noise_levels 5 (now 10)", "Effect of one further addition"):
         assert said in done.stdout
     assert "All 5 terms" in done.stderr
 

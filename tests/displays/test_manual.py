@@ -17,7 +17,7 @@ PICTURES = np.random.default_rng(5).integers(0, 256, (2, 9, 16, 3), dtype=np.uin
 
 @dataclass
 class Person:
-    """Answers yes until told otherwise."""
+    """Answers yes by default."""
 
     answer: bool = True
     heard: list[str] = field(default_factory=list)

@@ -68,7 +68,7 @@ def test_hanging_ends_in_bounded_time_with_all_that_was_started(tmp_path: Path) 
     ids=["crash", "status", "silent", "cut short", "other", "huge", "wrong kind"],
 )
 def test_breaking_down_is_a_failure(code: str, said: str) -> None:
-    assert child(code) == Failure(f"it broke down ({said})")
+    assert child(code) == Failure(f"it failed ({said})")
 
 
 def test_jax_answers_from_a_real_child() -> None:

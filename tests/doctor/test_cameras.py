@@ -19,7 +19,7 @@ def test_a_camera_that_can_be_opened_is_fine(asked: bool) -> None:
     finding = camera_finding("u3v", (GOOD, SLOW, HELD), asked)
     assert finding.topic == "cameras by u3v"
     assert finding.status is Status.OK
-    assert "Basler ace 1; Basler ace 2 (at a port or cable slower than it is made for)" in finding.found
+    assert "Basler ace 1; Basler ace 2 (at a port or cable that is slower than the camera)" in finding.found
     assert "Close that program" in finding.advice
 
 

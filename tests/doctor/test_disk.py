@@ -99,7 +99,7 @@ def test_without_a_rig_only_the_free_space_is_said(tmp_path: Path, monkeypatch: 
     monkeypatch.chdir(tmp_path)
     finding = disk_finding(None, None, lambda folder: 123_000_000_000)
     assert finding.status is Status.OK
-    assert finding.found.startswith(f"123.0 GB free in {tmp_path.resolve()}; --rig")
+    assert finding.found.startswith(f"123.0 GB free in {tmp_path.resolve()}; give --rig")
     assert free_bytes(tmp_path) == pytest.approx(shutil.disk_usage(tmp_path).free, rel=0.5)
 
 
@@ -122,4 +122,4 @@ def test_what_is_missing_is_what_was_not_captured(session: Path) -> None:
     assert missing == session_bytes(rig) - session_bytes(no_views)
     finding = disk_finding(session, no_views, lambda folder: 0)
     assert finding.status is Status.OK
-    assert finding.found.endswith("and is all there")
+    assert finding.found.endswith("and is complete")

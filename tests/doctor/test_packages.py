@@ -37,7 +37,11 @@ def test_versions_that_fit_are_fine_and_extras_are_left_out() -> None:
     [
         ({"jaxlib": "0.10.2", "numpy": "2.4"}, "jaxlib is 0.10.2", "wrongly"),
         ({"jaxlib": "0.10.2", "numpy": "2.4"}, "jaxlib is 0.10.2", "pip install 'jaxlib!=0.10.2,>=0.8'"),
-        ({"jaxlib": "0.7", "numpy": "1.26"}, "jaxlib is 0.7, needed is !=0.10.2,>=0.8; numpy is 1.26", "'numpy>=2.0'"),
+        (
+            {"jaxlib": "0.7", "numpy": "1.26"},
+            "jaxlib is 0.7, udccal needs !=0.10.2,>=0.8; numpy is 1.26",
+            "'numpy>=2.0'",
+        ),
         ({"jaxlib": "0.10.1"}, "numpy is not installed", "'numpy>=2.0'"),
         ({"jaxlib": "weird", "numpy": "2.4"}, "jaxlib is weird", "'jaxlib"),
     ],

@@ -122,7 +122,7 @@ def test_scripts_get_json(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Captur
     assert [finding["status"] for finding in summary["findings"]] == ["OK", "NOTE"]
     assert "No problem found" in err
     assert job.report(Output(as_json=True), Wanted(camera="sim"))
-    assert capsys.readouterr().err.strip().endswith("Ready for what was asked for.")
+    assert capsys.readouterr().err.strip().endswith("Ready for what you asked for.")
 
 
 def test_the_exit_status_says_whether_what_was_asked_for_can_work(tmp_path: Path) -> None:

@@ -68,7 +68,7 @@ class _Whole:
 
 
 def _rig() -> RigDescription:
-    """The size of the rig of the profiles' tests, so that both share what is compiled."""
+    """The size of the rig of the profiles' tests, so that both use the same compilations."""
     rig = load_rig("lg55-reduced")
     camera = rig.camera.model_copy(update={"columns": 96, "rows": 64, "pitch_um": 69.0})
     panel = rig.panel.model_copy(update={"columns": 32, "rows": 24})

@@ -1,4 +1,4 @@
-"""Predicted sigmas against those that fits of simulated captures state, at two designs each."""
+"""Forecast sigmas against those of fits of simulated captures, at two designs each."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def captured(rig: RigDescription, term: TermName, folder: Path) -> Session:
 
 
 def as_it_is(rig: RigDescription) -> RigState:
-    """The state of the simulated rig, as its profile would tell."""
+    """Return the state of the simulated rig, as its profile would give it."""
     truth = draw_truth(rig, 0)
     state = nominal_state(rig)
     noise = replace(state.noise, K_DN_per_e=truth.sensor.K_DN_per_e, PRNU1288=truth.sensor.PRNU1288)

@@ -21,7 +21,7 @@ def wire(floor: float = 0.0) -> Objective:
 
 
 def psf(dear: str) -> Objective:
-    """Positions and shifts tell alike; one of them takes ten times as long."""
+    """Positions and shifts give the same information; one of them takes ten times as long."""
 
     def cost(captures: Captures) -> Cost:
         positions, shifts = captures.psf_columns * captures.psf_rows, captures.psf_shifts

@@ -31,7 +31,7 @@ def test_dark_is_told_from_light() -> None:
     rng = np.random.default_rng(0)
     is_dark(frame(rng.normal(66, 3, (64, 64))), RIG)
     is_dark(frame(rng.normal(64 + 0.355 * 200, 8, (64, 64)), exposure_s=10.0), RIG)  # dark current
-    with pytest.raises(CaptureError, match=r"Expected a dark frame, found it .* Cap the lens"):
+    with pytest.raises(CaptureError, match=r"Expected a dark frame, found .* Cap the lens"):
         is_dark(frame(rng.normal(150, 8, (64, 64))), RIG)
 
 
@@ -64,7 +64,7 @@ def test_a_leak_in_a_part_of_a_dark_frame_is_told_and_hot_pixels_are_not() -> No
     dark[rng.integers(0, 192, 300), rng.integers(0, 256, 300)] = 4000
     is_dark(frame(dark), RIG)
     dark[:70, :90] += 60
-    with pytest.raises(CaptureError, match="in a part at least"):
+    with pytest.raises(CaptureError, match="at least a part"):
         is_dark(frame(dark), RIG)
 
 

@@ -59,26 +59,26 @@ def test_the_sentence_names_what_helps_most() -> None:
         _forecast().curves[0], variable=DESIGN_VARIABLES["psf"][2], sigma=np.array([0.102, 0.101, 0.1, 0.099, 0.098])
     )
     said = forecast_sentence(replace(_forecast(), curves=(weak, _forecast().curves[0]), idle=("frames of a stack",)))
-    assert "more flats, 400 for 100: 0.05 % for 0.1 %" in said
+    assert "More flats, 400 instead of 100, lower sigma most: 0.05 % instead of 0.1 %" in said
     assert "does not depend on frames of a stack" in said
 
 
 def test_where_nothing_helps_the_floor_is_explained() -> None:
     said = forecast_sentence(_forecast(floor=0.0995, gain=0.001))
-    assert "next to nothing" in said
+    assert "hardly lower sigma" in said
     assert "More pixels would lower it." in said
     assert "More pixels" not in forecast_sentence(_forecast(floor=0.001))
 
 
-def test_what_a_fit_wastes_is_left_on_the_table() -> None:
+def test_what_a_fit_wastes_is_the_unused_part() -> None:
     cells = _cells(Accuracy(_forecast(), None, 0.25))
-    assert cells["information left on the table"] == "75 %"
-    assert "stated by the fit" not in cells
+    assert cells["unused part of the information"] == "75 %"
+    assert "sigma of the fit" not in cells
     twice = _cells(Accuracy(_forecast(), 0.2, 1.0))
-    assert twice["stated by the fit"] == "0.2 %"
-    assert twice["information left on the table"] == "75 %"
-    # Stated surer than foretold is within what a prediction is good to, and no information from nowhere.
-    assert _cells(Accuracy(_forecast(), 0.09, 1.0))["information left on the table"] == "0 %"
+    assert twice["sigma of the fit"] == "0.2 %"
+    assert twice["unused part of the information"] == "75 %"
+    # A fit's sigma below the forecast is within the forecast's accuracy, and adds no information.
+    assert _cells(Accuracy(_forecast(), 0.09, 1.0))["unused part of the information"] == "0 %"
 
 
 def test_what_fits_state_is_in_the_unit_of_the_target() -> None:

@@ -1,4 +1,4 @@
-"""The page: one file, nothing beside it, everything escaped."""
+"""The page: one self-contained file, everything escaped."""
 
 from __future__ import annotations
 

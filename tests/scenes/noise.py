@@ -158,7 +158,7 @@ PLAIN = ToySensor(lambda_read=None, bend=0.0)
 
 
 def errors_in_sigma(result: FitResult[Noise], sensor: ToySensor) -> Float[np.ndarray, " n"]:
-    """Of every estimate that has a true value; one stated as certain must be right."""
+    """Return z of every estimate that has a true value; one with sigma 0 must be right."""
     z = []
     for name, value in truth(sensor).items():
         found = next((item for item in result.estimates if item.name == name), None)

@@ -53,7 +53,7 @@ _MIXED: Final = 0.12
 
 
 def chosen(degree: int, seed: int) -> int:
-    """Degree of the image that is chosen; -1 where diffraction keeps a share."""
+    """Degree of the image that is chosen; -1 where diffraction keeps a part."""
     rng = np.random.default_rng([seed, degree])
     mix = _MIXED * rng.choice([-1.0, 1.0], polynomial_terms(degree))
     return _select(_shots(mix, degree, rng))

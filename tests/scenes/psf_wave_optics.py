@@ -45,12 +45,12 @@ _RULES: Final = PsfRules(positions=9, shifts=2, half_px=_HALF, close_px=_HALF, i
 @final
 @dataclass(frozen=True)
 class Coverage:
-    """Of the kernel at places without an LED.
+    """Errors of the kernel at places without an LED.
 
     Attributes:
-        z: of its samples.
+        z: z-scores of its samples.
         stated, found: relative L2 error, root mean square over places and colours.
-        error_l2: what the fit says of positions that were held out; pattern_p of its residuals.
+        error_l2: the fit's error at held-out positions; pattern_p: p-value of its residuals' pattern.
     """
 
     stated: float

@@ -34,7 +34,7 @@ def session(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def home(tmp_path: Path) -> Path:
-    """What belongs to the person, beside the session."""
+    """A private file next to the session."""
     folder = tmp_path / "home"
     folder.mkdir()
     (folder / "key").write_bytes(PRIVATE)

@@ -84,7 +84,7 @@ def _present(serial: str) -> bool:
 
 
 def _folder(serial: str) -> Path | None:
-    """Where the kernel tells of the device with this serial number; None when it has found none."""
+    """Return the kernel's directory of the device with this serial number; None when it has found none."""
     for folder in _DEVICES.glob("*-*"):
         # Interfaces have no serial number, and devices may go while one looks.
         with contextlib.suppress(OSError):

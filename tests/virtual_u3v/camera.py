@@ -35,7 +35,7 @@ class VirtualCamera:
 
     Args:
         model: what kind of camera.
-        source: where its light comes from; by default a pattern in which every sample tells its place.
+        source: where its light comes from; by default a pattern in which every sample identifies its place.
         faults: what goes wrong from the start.
         speed: of the link: a SuperSpeed camera on a USB 2 port has Speed.HIGH.
         clock: simulated by default.

@@ -47,7 +47,7 @@ FrameSource = Callable[[Exposure], UInt16[np.ndarray, "rows columns"]]
 
 @final
 class PatternSource:
-    """A pattern in which every sample tells its place, and every frame (but each fourth) differs from the others.
+    """A pattern in which every sample identifies its place, and every frame (but each fourth) differs from the others.
 
     Frames are remembered and read-only, so that a camera that runs for long need not compute them again.
     """

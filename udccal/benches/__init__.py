@@ -1,1 +1,1 @@
-"""Benches: camera, display and stage of a rig, real or simulated; running the procedures on them."""
+"""Benches: camera, display and stage of a rig, real or simulated, and running the procedures on them."""

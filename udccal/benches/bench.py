@@ -1,4 +1,4 @@
-"""What a capture works with: a camera, a display, and whoever puts things in front of the camera."""
+"""Benches: a camera, a display, and the stage that puts things in front of the camera."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ class CaptureBench:
     """A rig with its camera open and its display on.
 
     Attributes:
-        rig: as it was built to be.
+        rig: the rig's description.
         camera, display: open.
-        stage: whoever puts things in front of the camera.
-        now: time of day there.
-        try_again: asked with the sentence of a refused step, whether to repeat the step.
+        stage: puts things in front of the camera.
+        now: returns the bench's time of day.
+        try_again: gets the sentence of a refused step and returns whether to repeat the step.
     """
 
     rig: RigDescription
@@ -38,22 +38,22 @@ class CaptureBench:
 
 
 def simulated_rig(rig: RigDescription, seed: int) -> SimulatedWorld:
-    """A simulated rig of that description; another seed is another specimen, and other noise."""
+    """Return a simulated rig with the description ``rig``; another ``seed`` gives another specimen and other noise."""
     return SimulatedWorld(draw_truth(rig, seed), seed=seed)
 
 
 @contextmanager
 def simulated_bench(world: SimulatedWorld) -> Iterator[CaptureBench]:
-    """Camera, display, stage and clock of a simulated world, where nothing gets better by trying again."""
+    """Open camera, display, stage and clock of ``world``; a refused step is not repeated."""
     with SimulatedCamera(world) as camera, SimulatedDisplay(world) as display:
         yield CaptureBench(world.truth.description, camera, display, world, world.now, lambda sentence: False)
 
 
 def simulate(rig: RigDescription, seed: int = 0) -> AbstractContextManager[CaptureBench]:
-    """A simulated rig to capture with: ``with simulate(rig) as bench``.
+    """Simulate a rig to capture with: ``with simulate(rig) as bench``.
 
     Args:
-        rig: as it was built to be; the simulated one differs from it within its tolerances.
-        seed: of the specimen and its noise.
+        rig: description; the simulated rig differs from it within its tolerances.
+        seed: chooses the specimen and its noise.
     """
     return simulated_bench(simulated_rig(rig, seed))

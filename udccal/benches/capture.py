@@ -1,4 +1,4 @@
-"""Capturing a session through the procedures that are installed."""
+"""Captures a session through the installed procedures."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ def capture(
     progress: Callable[[TermName, int, int | None], None] = lambda term, done, total: None,
     exchanged: Set[Exchanged] = frozenset(),
 ) -> Session:
-    """Capture the steps of the terms that the session does not hold yet, or no longer whole.
+    """Capture the steps of the terms that are missing or damaged in the session.
 
-    It may be stopped at any moment: called again with the same arguments it goes on.
+    It may be stopped at any moment; called again with the same arguments it continues.
 
     Args:
-        path: folder of the session; made where there is none.
-        bench: camera, display and stage, such as ``udccal.simulate`` gives.
-        terms: which to capture, in any order.
-        progress: called with the term, the steps done, and of how many.
-        exchanged: parts of the rig that were exchanged since the session began, and may be.
+        path: folder of the session; created if missing.
+        bench: camera, display and stage, such as ``udccal.simulate`` returns.
+        terms: terms to capture, in any order.
+        progress: gets the term, the number of steps done, and their total.
+        exchanged: parts of the rig that were exchanged on purpose since the session began.
 
     Raises:
         UdccalError: when a procedure is not installed.
@@ -51,7 +51,17 @@ def capture(
 def capture_term(
     writer: SessionWriter, bench: CaptureBench, term: TermName, progress: Callable[[int, int | None], None]
 ) -> None:
-    """Run one term's procedure, again where the bench says so; errors as for ``capture``."""
+    """Run one term's procedure; repeat a refused step while the bench says so.
+
+    Args:
+        writer: open session.
+        bench: camera, display and stage.
+        term: term to capture.
+        progress: gets the number of steps done, and their total or None.
+
+    Raises:
+        UdccalError: as ``capture`` does.
+    """
     procedure = find_procedure(term)()
 
     def report(at: Any) -> None:

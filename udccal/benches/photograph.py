@@ -1,4 +1,4 @@
-"""A photograph in front of a simulated rig: what the camera captures, and what it would see without the panel."""
+"""Puts a photograph in front of a simulated rig: the camera's frame, and the view without the panel."""
 
 from __future__ import annotations
 
@@ -36,7 +36,14 @@ def capture_photograph(
     view: VirtualView,
     panel_picture: UInt8[np.ndarray, "panel_rows panel_columns 3"] | None,
 ) -> CapturedScene:
-    """Hang a photograph so that it fills the view, show a picture on the panel, and take one well-exposed frame."""
+    """Hang a photograph so that it fills the view, show a picture on the panel, and take one well-exposed frame.
+
+    Args:
+        world: simulated rig.
+        radiance: photograph in linear light; 1 is white paper in a lit room.
+        view: virtual view that the photograph fills.
+        panel_picture: 8-bit RGB picture on the panel; None for a dark panel.
+    """
     depth_mm = DISTANCE_MM - float(world.truth.optics.pupil_mm[2])
     hung, width_px = _hung(world, radiance, view)
     photograph = Photograph(hung, width_px / float(view.focal_px) * depth_mm, DISTANCE_MM, panel_picture)
@@ -53,7 +60,7 @@ def capture_photograph(
 def _hung(
     world: SimulatedWorld, radiance: Float[np.ndarray, "rows columns 3"], view: VirtualView
 ) -> tuple[Float[np.ndarray, "hung_rows hung_columns 3"], float]:
-    """A photograph that just covers the view, and its width in px of the view.
+    """Return a photograph that just covers the view, and its width in px of the view.
 
     A photograph hangs with its middle on the ray of the sensor's middle; the view's middle lies elsewhere. Mirrored
     margins on the far sides, out of sight, bring the two together.
@@ -70,7 +77,7 @@ def _hung(
 
 
 def _exposure(camera: SimulatedCamera, world: SimulatedWorld) -> float:
-    """Exposure that puts the bright parts at 80 % of the range, from one trial frame, within the camera's limits."""
+    """Return the exposure in s that puts the bright parts at 80 % of the range, from one trial frame."""
     rig = world.truth.description
     exposure_s = _TRIAL_S
     for _ in range(3):

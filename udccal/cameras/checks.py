@@ -1,4 +1,4 @@
-"""What every backend refuses, in the same words: settings and modes that a camera cannot do, and use while closed."""
+"""Refusals that all backends share: settings and modes that a camera does not have, and use while closed."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ def check_settings(settings: Settings, features: Features, sensor: Region) -> No
     """Refuse an exposure, gain or region that a camera does not have; NaN is outside every range.
 
     Raises:
-        CameraError: which says the bounds.
+        CameraError: with the bounds.
     """
     _check_range("an exposure in s", settings.exposure_s, features.exposure_s)
     _check_range("a gain in dB", settings.gain_dB, features.gain_dB)
@@ -21,7 +21,7 @@ def check_region(region: Region, sensor: Region, steps: tuple[int, int, int, int
     """Refuse a region that is empty, reaches beyond the sensor, or is not on its steps (x, y, columns, rows).
 
     Raises:
-        CameraError: which says the sensor's size and the steps.
+        CameraError: with the sensor's size and the steps.
     """
     numbers = (region.x, region.y, region.columns, region.rows)
     across = region.x >= 0 and region.columns > 0 and region.x + region.columns <= sensor.columns
@@ -38,7 +38,7 @@ def check_mode(mode: Mode, features: Features) -> None:
     """Refuse a pixel format, frame rate or trigger that a camera does not have.
 
     Raises:
-        CameraError: which says what it has.
+        CameraError: with what it has.
     """
     if mode.pixel_format not in features.pixel_formats:
         raise CameraError(
@@ -55,14 +55,14 @@ def check_mode(mode: Mode, features: Features) -> None:
 
 
 def not_open() -> CameraError:
-    """The error of a camera that is used while closed."""
+    """Return the error of a camera that is used while closed."""
     return CameraError("Expected an open camera, found it closed. Use it in a 'with' statement.")
 
 
 def superseded() -> CameraError:
-    """The error of a stream that is read on after its camera was closed, or after another stream was begun."""
+    """Return the error of a stream that is read after its camera was closed or began another stream."""
     return CameraError(
-        "Expected frames of the camera's present stream, found that it was closed or began another one. "
+        "Expected frames of the camera's current stream, found that it was closed or began another one. "
         "Read one stream at a time, inside the 'with' statement."
     )
 

@@ -1,4 +1,4 @@
-"""The mode in which a camera serves a rig."""
+"""Chooses the camera's mode for a rig."""
 
 from __future__ import annotations
 
@@ -6,22 +6,22 @@ from udccal.cameras.pixel_formats import PIXEL_FORMATS, payload_bytes
 from udccal.cameras.protocol import Features, Mode, Region
 from udccal.errors import CameraError
 
-# Half of what USB 3 carries: a driver that reads one transfer after the other, on a computer that does other things,
-# keeps up with it. Faster cameras are held back to that; a calibration waits for light and hands, not for frames.
+# Half of the rate of USB 3: a driver that reads one transfer after the other, on a computer that does other things,
+# keeps up with it. Faster cameras are limited to it; a calibration waits for light and hands, not for frames.
 MOST_BYTES_PER_S = 200e6
 
 
 def mode_for(
     features: Features, sensor: Region, cfa: str, bits: int, most_bytes_per_s: float = MOST_BYTES_PER_S
 ) -> Mode:
-    """A free-running mode with the pattern and the bits that a rig's description asks for, packed if the camera can.
+    """Return a free-running mode with the pattern and the bits of a rig's description, packed if the camera can.
 
     Args:
-        features: of the camera.
-        sensor: of the camera, whole.
-        cfa: pattern that the rig says.
-        bits: per sample that the rig says.
-        most_bytes_per_s: of whole frames, that the way from the camera carries without loss.
+        features: what the camera can do.
+        sensor: whole sensor of the camera.
+        cfa: pattern in the rig's description.
+        bits: bits per sample in the rig's description.
+        most_bytes_per_s: highest rate of whole frames that the link carries without loss.
 
     Raises:
         CameraError: when the camera has no such format.
@@ -30,7 +30,7 @@ def mode_for(
     fitting = [each for each in known if (each.cfa, each.bits) == (cfa, bits)]
     if not fitting:
         raise CameraError(
-            f"Expected a camera with a pixel format of {bits} bits and the pattern {cfa}, as the rig says, found "
+            f"Expected a camera with a pixel format of {bits} bits and the pattern {cfa} of the rig, found "
             f"{', '.join(features.pixel_formats) or 'none'}. Connect the right camera, or correct rig.toml."
         )
     chosen = min(fitting, key=lambda each: each.bits_per_pixel)

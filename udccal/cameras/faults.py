@@ -1,4 +1,4 @@
-"""What goes wrong with a simulated camera; each fault is off unless asked for."""
+"""Faults of a simulated camera; each is off by default."""
 
 from __future__ import annotations
 
@@ -9,12 +9,11 @@ from typing import final
 @final
 @dataclass(frozen=True)
 class CameraFaults:
-    """Faults of a simulated camera. Frames are counted from 0 over the camera's whole life, openings included.
+    """Faults of a simulated camera. Frames are counted from 0 over the camera's whole life, across openings.
 
     Attributes:
-        incomplete_every: every so many frames one arrives without its lower half; 0 for never.
-        repeat_every: every so many frames the one before is delivered again, number and all, in place of the new one;
-            0 for never.
+        incomplete_every: period of frames that arrive without their lower half; 0 for never.
+        repeat_every: period of frames that are replaced by the one before, with its number; 0 for never.
         time_out_at_frame: this frame never comes; the next one does.
         unplug_at_frame: from this frame on the camera is gone, until it is opened again.
     """
@@ -29,7 +28,7 @@ class CameraFaults:
         return _is_last_of(frame, self.incomplete_every)
 
     def repeats(self, frame: int) -> bool:
-        """Whether the frame before is delivered in place of this one."""
+        """Whether the frame before replaces this one."""
         return frame > 0 and _is_last_of(frame, self.repeat_every)
 
 

@@ -27,7 +27,7 @@ _STEPS: Final = (2, 2, 2, 2)
 @final
 @dataclass(frozen=True)
 class _Shot:
-    """A file and how it was taken."""
+    """A file with its settings."""
 
     path: Path
     exposure_s: float
@@ -39,22 +39,22 @@ class _Shot:
 class FileCamera:
     """Implements ``udccal.cameras.protocol.Camera`` on files of one size, taken by one camera.
 
-    A file's exposure is what ``frames.csv`` beside it says, or what the file itself states. Its gain is relative to the
-    first file's: 20 log10 of the ratio of their ISO values, since no file says which ISO is the sensor's own.
+    A file's exposure comes from the ``frames.csv`` in its folder, else from the file itself. Its gain is relative to
+    the first file's: 20 log10 of the ratio of their ISO values, since no file gives the sensor's native ISO.
     ``configure`` chooses the files whose gain, then exposure, comes nearest, and begins with the first of these.
     """
 
     def __init__(self, source: Source, cfa: str = "RGGB", bits: int = 16, exposure_s: float | None = 1.0) -> None:
-        """Take a folder, or files in the order of the frames, and read the first one.
+        """List a folder, or files in the order of the frames, and read the first one.
 
         Args:
             source: a folder, with or without a ``frames.csv``, or a list of files.
-            cfa: pattern of PNG, TIFF and EXR files, ``mono`` for none; raw files say their own.
-            bits: of PNG, TIFF and EXR files.
-            exposure_s: of files that do not say theirs; None to refuse these.
+            cfa: pattern of PNG, TIFF and EXR files, ``mono`` for none; raw files contain their own.
+            bits: bits per sample of PNG, TIFF and EXR files.
+            exposure_s: exposure of files that do not contain it; None to refuse these.
 
         Raises:
-            CameraError: when there are no files, or one does not say its exposure and none is given.
+            CameraError: when there are no files, or one does not contain its exposure and ``exposure_s`` is None.
             FileFormatError: when a file cannot be read.
         """
         self._layout, self._exposure_s = _layout(cfa, bits), exposure_s
@@ -74,12 +74,12 @@ class FileCamera:
 
     @property
     def identity(self) -> CameraIdentity:
-        """What the first file says of the camera that took it."""
+        """Camera that took the first file."""
         return self._identity
 
     @property
     def sensor(self) -> Region:
-        """The first file's whole cells."""
+        """Whole CFA cells of the first file."""
         return self._sensor
 
     @property
@@ -94,7 +94,7 @@ class FileCamera:
 
     @property
     def features(self) -> Features:
-        """Exposures and gains are those of the files; files have no rate, and nothing triggers them."""
+        """Exposures and gains of the files; files have no rate and no trigger."""
         exposures = [shot.exposure_s for shot in self._shots]
         gains = [shot.gain_dB for shot in self._shots]
         return Features(
@@ -108,7 +108,7 @@ class FileCamera:
 
     @property
     def mode(self) -> Mode:
-        """The one there is."""
+        """The only mode."""
         return self._mode
 
     @property
@@ -130,11 +130,11 @@ class FileCamera:
         self._stream += 1
 
     def load(self, source: Source) -> None:
-        """Take other files of the same camera in place of those before, such as those of a session's next step.
+        """Replace the files by others of the same camera, such as those of a session's next step.
 
         Raises:
             CameraError: when there are none, or they are another camera's.
-            FileFormatError: when what one states cannot be read.
+            FileFormatError: when the fields of one cannot be read.
         """
         shots = tuple(self._shot(item) for item in _listed(source))
         self._shots = self._queue = shots
@@ -142,10 +142,10 @@ class FileCamera:
         self._stream += 1
 
     def set_mode(self, mode: Mode) -> Mode:
-        """Accept the one mode there is.
+        """Accept the only mode.
 
         Raises:
-            CameraError: when it is another, or the camera is closed.
+            CameraError: when it is another one, or the camera is closed.
         """
         self._check_open()
         check_mode(mode, self.features)
@@ -173,7 +173,7 @@ class FileCamera:
         return Settings(best.exposure_s, best.gain_dB, settings.region)
 
     def frames(self, count: int) -> Iterator[Frame]:
-        """The next files, one at a time.
+        """Deliver the next files, one at a time.
 
         Raises:
             CameraError: when the files are used up, one has another size or pattern than the first, or the camera is
@@ -209,7 +209,7 @@ class FileCamera:
             )
         region = self._region
         data = mosaic.data[region.y : region.y + region.rows, region.x : region.x + region.columns].copy()
-        self._taken_s = max(self._taken_s, shot.taken_s)  # copied files may carry times out of order
+        self._taken_s = max(self._taken_s, shot.taken_s)  # copied files may have times out of order
         number, self._counts = self._counts.delivered, Counts(self._counts.delivered + 1)
         return Frame(data, Settings(shot.exposure_s, shot.gain_dB, region), self._taken_s, number, True)
 
@@ -224,7 +224,7 @@ class FileCamera:
         exposure_s = next((s for s in (listed.exposure_s, facts.exposure_s, self._exposure_s) if s is not None), None)
         if exposure_s is None:
             raise CameraError(
-                f"Expected the exposure of {listed.path} in the file or in a frames.csv beside it, found neither. "
+                f"Expected the exposure of {listed.path} in the file or in a frames.csv in its folder, found neither. "
                 "Write a frames.csv."
             )
         ratio = facts.iso / first.iso if facts.iso and first.iso else 1.0
@@ -251,7 +251,7 @@ def _name(facts: Facts) -> str:
 
 
 def _identity(facts: Facts, path: Path) -> CameraIdentity:
-    """Files that say nothing all belong to one nameless camera, so that a session can go on with other files."""
+    """Return the camera of a file; all files without one share it, so that a session can continue with other files."""
     model = facts.model or path.suffix.lower().lstrip(".") or "unnamed"
     return CameraIdentity(facts.vendor or "files", model, facts.serial or "not stated", "files")
 

@@ -10,5 +10,5 @@ _BITS: Final = (8, 10, 12, 14, 16)
 
 
 def unpacked_format_name(cfa: str, bits: int) -> str:
-    """The name of unpacked samples of that pattern, at the next of the convention's sizes that holds the bits."""
+    """Return the name of unpacked samples of pattern ``cfa``, at the convention's smallest size for ``bits``."""
     return f"{cfa_named(cfa).family}{next(size for size in _BITS if size >= bits)}"

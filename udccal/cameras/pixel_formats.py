@@ -1,8 +1,8 @@
-"""Pixel formats after the GenICam Pixel Format Naming Convention (PFNC): names, codes, and bytes into samples.
+"""Pixel formats of the GenICam Pixel Format Naming Convention (PFNC): names, codes, and unpacking of samples.
 
-Known are Mono and Bayer with 8, 10, 12 and 16 bits in whole bytes, little-endian with the samples in the low bits; with
-10 and 12 bits packed from the lowest bit on (names ending in ``p``); and GigE Vision's older packing of 12 bits
-(``Packed``: high bits of the first sample, low bits of both, high bits of the second).
+This module knows Mono and Bayer in three layouts: 8, 10, 12 and 16 bits in whole bytes, little-endian with the samples
+in the low bits; 10 and 12 bits packed from the lowest bit on (names ending in ``p``); and GigE Vision's older packing
+of 12 bits (``Packed``: high bits of the first sample, low bits of both, high bits of the second).
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _WORD_BYTES: Final = 8
 
 @final
 class Packing(enum.Enum):
-    """How samples lie in memory; the values are the endings of PFNC's names."""
+    """Layout of samples in memory; the values are the endings of PFNC's names."""
 
     BYTES = ""
     LSB = "p"
@@ -38,10 +38,10 @@ class PixelFormat:
     """One pixel format.
 
     Attributes:
-        name: after PFNC, which is also the value of SFNC's feature ``PixelFormat``.
+        name: PFNC's name, which is also the value of SFNC's feature ``PixelFormat``.
         code: PFNC's 32-bit value; bits 16 to 23 hold the bits that a pixel takes in memory.
-        bits: that carry signal, per sample.
-        cfa: pattern of the top-left 2 x 2, e.g. ``RGGB``; ``mono`` without one.
+        bits: significant bits per sample.
+        cfa: pattern of the top-left 2 x 2, e.g. ``RGGB``; ``mono`` for none.
     """
 
     name: str
@@ -52,7 +52,7 @@ class PixelFormat:
 
     @property
     def bits_per_pixel(self) -> int:
-        """Bits that a pixel takes in memory."""
+        """Bits of a pixel in memory."""
         return (self.code >> 16) & 0xFF
 
     @property
@@ -113,10 +113,10 @@ _BY_CODE: Final = {format.code: format for format in PIXEL_FORMATS.values()}
 
 
 def pixel_format(name: str) -> PixelFormat:
-    """The format of that name.
+    """Return the format with the PFNC name ``name``.
 
     Raises:
-        CameraError: when it is not one that can be unpacked.
+        CameraError: when this module cannot unpack it.
     """
     if name not in PIXEL_FORMATS:
         raise CameraError(
@@ -127,10 +127,10 @@ def pixel_format(name: str) -> PixelFormat:
 
 
 def pixel_format_of(code: int) -> PixelFormat:
-    """The format of that 32-bit PFNC code.
+    """Return the format with the 32-bit PFNC code ``code``.
 
     Raises:
-        CameraError: when it is not one that can be unpacked.
+        CameraError: when this module cannot unpack it.
     """
     if code not in _BY_CODE:
         raise CameraError(
@@ -141,7 +141,7 @@ def pixel_format_of(code: int) -> PixelFormat:
 
 
 def payload_bytes(format: PixelFormat, rows: int, columns: int, padding_x: int = 0) -> int:
-    """Bytes that a picture takes; bit-packed samples run on from line to line unless lines are padded.
+    """Return the bytes of a picture; bit-packed samples continue from line to line unless lines are padded.
 
     Args:
         padding_x: bytes after the end of each line, after the leader of USB3 Vision and GigE Vision; padded lines start
@@ -159,10 +159,17 @@ def unpack(
     columns: int,
     padding_x: int = 0,
 ) -> UInt16[np.ndarray, "rows columns"]:
-    """The samples in a buffer, right-aligned in 16 bits, as a fresh array; bytes beyond the picture are ignored.
+    """Unpack the samples in a buffer into a new array, right-aligned in 16 bits, in DN.
+
+    Args:
+        buffer: bytes of the picture; bytes beyond it are ignored.
+        format: layout of the samples.
+        rows: rows of the picture.
+        columns: columns of the picture.
+        padding_x: bytes after the end of each line.
 
     Raises:
-        CameraError: when the picture is empty or the buffer shorter than it.
+        CameraError: when the picture is empty, or the buffer is shorter than it.
     """
     needed = payload_bytes(format, rows, columns, padding_x)
     data = np.frombuffer(buffer, np.uint8)
@@ -182,7 +189,7 @@ def _stride(format: PixelFormat, columns: int, padding_x: int) -> int:
 
 
 def _samples(lines: UInt8[np.ndarray, "lines bytes"], format: PixelFormat, count: int) -> UInt16[np.ndarray, "lines n"]:
-    """The first ``count`` samples of each line."""
+    """Return the first ``count`` samples of each line."""
     if format.packing is Packing.LSB:
         return _lsb_packed(lines, format.bits, count)
     if format.packing is Packing.GIGE:
@@ -193,9 +200,9 @@ def _samples(lines: UInt8[np.ndarray, "lines bytes"], format: PixelFormat, count
 
 
 def _lsb_packed(lines: UInt8[np.ndarray, "lines bytes"], bits: int, count: int) -> UInt16[np.ndarray, "lines n"]:
-    """Four samples at a time: each group of bytes is read as one 64-bit word and its samples moved 16 bits apart."""
+    """Unpack four samples at a time: read each group of bytes as one 64-bit word and move its samples 16 bits apart."""
     groups, size = -(-count // _GROUP), _GROUP * bits // 8
-    # A word reaches past its group, so that the last group of the last line needs room behind it.
+    # A word extends past its group, so the last group of the last line needs bytes after it.
     room = np.zeros((len(lines), max(groups * size, lines.shape[1]) + _WORD_BYTES), np.uint8)
     room[:, : lines.shape[1]] = lines
     words = np.ndarray((len(lines), groups), "<u8", room.data, strides=(room.strides[0], size)).astype(np.uint64)

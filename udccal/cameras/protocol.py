@@ -1,4 +1,4 @@
-"""The one protocol behind which every camera stands."""
+"""The protocol that every camera implements."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from jaxtyping import UInt16
 
 @dataclass(frozen=True)
 class CameraIdentity:
-    """Which camera this is; a session belongs to one."""
+    """Identity of a camera; a session belongs to one camera."""
 
     vendor: str
     model: str
@@ -36,7 +36,7 @@ class Trigger(enum.StrEnum):
     """What starts an exposure."""
 
     FREE_RUN = "free-run"  # the camera's own clock
-    SOFTWARE = "software"  # the driver, each time a frame is asked for: nothing is exposed before
+    SOFTWARE = "software"  # the driver, when a frame is requested: nothing is exposed before
     EXTERNAL = "external"  # a signal at the camera's trigger input
 
 
@@ -46,7 +46,7 @@ class Mode:
 
     Attributes:
         pixel_format: name after the GenICam Pixel Format Naming Convention, e.g. ``BayerRG12p``.
-        frame_rate_hz: of a free-running camera; None for the fastest that exposure and link allow.
+        frame_rate_hz: rate of a free-running camera; None for the fastest that exposure and link allow.
     """
 
     pixel_format: str
@@ -56,7 +56,7 @@ class Mode:
 
 @dataclass(frozen=True)
 class Settings:
-    """What a camera is asked to do for the next frames, or what it accepted."""
+    """Requested settings for the next frames, or those that the camera accepted."""
 
     exposure_s: float
     gain_dB: float
@@ -90,7 +90,7 @@ class Features:
 
 @dataclass(frozen=True)
 class Counts:
-    """Frames since the camera was opened: handed out (incomplete ones among them), incomplete, and never arrived."""
+    """Numbers of frames since the camera was opened: delivered (with incomplete ones), incomplete, and dropped."""
 
     delivered: int = 0
     incomplete: int = 0
@@ -99,7 +99,7 @@ class Counts:
 
 @dataclass(frozen=True)
 class Frame:
-    """One frame with the settings it was really taken with; ``data`` is the caller's own copy, in DN.
+    """One frame with its true settings; ``data`` is the caller's own copy, in DN.
 
     Attributes:
         timestamp_s: start of the exposure on the camera's clock.
@@ -116,7 +116,7 @@ class Frame:
 
 @runtime_checkable
 class Camera(Protocol):
-    """A source of raw mosaics, used as a context manager; everything but ``identity`` needs it open."""
+    """A source of raw mosaics, used as a context manager; everything but ``identity`` needs an open camera."""
 
     @property
     def identity(self) -> CameraIdentity: ...
@@ -128,27 +128,27 @@ class Camera(Protocol):
 
     @property
     def cfa(self) -> str:
-        """CFA pattern of the whole sensor's top-left 2 x 2, e.g. ``RGGB``; ``mono`` without one."""
+        """CFA pattern of the whole sensor's top-left 2 x 2, e.g. ``RGGB``; ``mono`` for none."""
         ...
 
     @property
     def bits(self) -> int:
-        """Bits per sample in the present mode."""
+        """Bits per sample in the current mode."""
         ...
 
     @property
     def features(self) -> Features:
-        """What the camera can do in the present mode."""
+        """What the camera can do in the current mode."""
         ...
 
     @property
     def mode(self) -> Mode:
-        """How it works now."""
+        """Current mode."""
         ...
 
     @property
     def counts(self) -> Counts:
-        """Frames since it was opened."""
+        """Frames since the camera was opened."""
         ...
 
     def __enter__(self) -> Camera: ...
@@ -158,15 +158,15 @@ class Camera(Protocol):
     ) -> None: ...
 
     def set_mode(self, mode: Mode) -> Mode:
-        """Ask for a mode; returns what the device accepted, read back. Raises CameraError when it refuses."""
+        """Request a mode; return what the device accepted, read back. Raise CameraError when it refuses."""
         ...
 
     def configure(self, settings: Settings) -> Settings:
-        """Ask for settings; returns what the device accepted, read back. Raises CameraError when it refuses."""
+        """Request settings; return what the device accepted, read back. Raise CameraError when it refuses."""
         ...
 
     def frames(self, count: int) -> Iterator[Frame]:
-        """Deliver ``count`` frames one at a time, incomplete ones among them and marked.
+        """Deliver ``count`` frames one at a time; incomplete ones are marked.
 
         Raises:
             CameraTimeout: when none comes within the exposure and the camera's time-out.

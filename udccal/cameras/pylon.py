@@ -36,10 +36,10 @@ _LONGEST_TIMEOUT_S: Final = 3600.0
 
 
 def list_cameras() -> tuple[CameraIdentity, ...]:
-    """The cameras that Basler's SDK sees.
+    """List the cameras that Basler's SDK sees.
 
     Raises:
-        CameraError: when the SDK is not installed, or cannot look.
+        CameraError: when the SDK is not installed, or cannot list cameras.
     """
     return tuple(identity_of(info) for info in device_infos(load_sdk()))
 
@@ -50,17 +50,17 @@ class PylonCamera:
 
     On opening, everything that changes raw samples is switched off (gamma, white balance, defect correction, binning,
     mirroring, automatic exposure and gain). Exposure, gain and timestamp of a frame are those of its chunk data where
-    the device sends them; otherwise the exposure and gain read back before the stream, and the SDK's timestamp, or for
-    a device without a clock the host's when the frame came, less its exposure.
+    the device sends them. Otherwise they are the exposure and gain read back before the stream, and the SDK's
+    timestamp; for a device without a clock it is the host's time of arrival less the exposure.
     """
 
     def __init__(self, serial: str | None = None, *, timeout_s: float = 2.0, feature_file: Path | None = None) -> None:
         """Find a camera without opening it.
 
         Args:
-            serial: of the camera; None for the only one.
+            serial: serial number of the camera; None for the only one.
             timeout_s: how long to wait for a frame beyond its exposure.
-            feature_file: saved by pylon Viewer, set on opening; e.g. which line triggers.
+            feature_file: file of pylon Viewer that is loaded on opening; may choose e.g. the trigger line.
 
         Raises:
             CameraError: when the SDK is not installed, or the camera is not there.
@@ -90,24 +90,24 @@ class PylonCamera:
 
     @property
     def cfa(self) -> str:
-        """Pattern of the present pixel format."""
+        """Pattern of the current pixel format."""
         return self._format().cfa
 
     @property
     def bits(self) -> int:
-        """Bits of the present pixel format."""
+        """Bits of the current pixel format."""
         return self._format().bits
 
     @property
     def features(self) -> Features:
-        """What the camera can do in the present mode."""
+        """What the camera can do in the current mode."""
         device = self._opened()
         with translated(device.sdk, device.camera, "to read the camera's features"):
             return controls.read_features(device.nodes)
 
     @property
     def mode(self) -> Mode:
-        """How it works now, read from the camera."""
+        """Current mode, read from the camera."""
         device = self._opened()
         with translated(device.sdk, device.camera, "to read the camera's mode"):
             return controls.read_mode(device.nodes)
@@ -146,7 +146,7 @@ class PylonCamera:
         device, self._device = self._device, None
         self._stream += 1
         if device is not None:
-            with suppress(CameraError) if error is not None else nullcontext():  # what came first is told
+            with suppress(CameraError) if error is not None else nullcontext():  # the first error is raised
                 close_device(device)
 
     def set_mode(self, mode: Mode) -> Mode:
@@ -157,7 +157,7 @@ class PylonCamera:
         """
         device = self._halted()
         check_mode(mode, self.features)
-        with translated(device.sdk, device.camera, f"the camera to take {mode.pixel_format} at the rate asked for"):
+        with translated(device.sdk, device.camera, f"the camera to take {mode.pixel_format} at the requested rate"):
             controls.write_mode(device.nodes, mode)
         return self.mode
 
@@ -174,7 +174,7 @@ class PylonCamera:
             return controls.read_settings(device.nodes)
 
     def frames(self, count: int) -> Iterator[Frame]:
-        """Deliver ``count`` frames; one whose grab failed is incomplete and all 0: which samples came is not told.
+        """Deliver ``count`` frames; one whose grab failed is incomplete and all 0.
 
         Raises:
             CameraTimeout: when none comes within the exposure, the frame period and the time-out.
@@ -201,7 +201,7 @@ class PylonCamera:
                     trigger(device, timeout_s)
                 yield self._frame(retrieve(device, timeout_s), settings, ticks_per_s)
         finally:
-            if self._stream == stream:  # otherwise it was ended already, and another may run
+            if self._stream == stream:  # otherwise it has ended, and another may run
                 stop(device)
 
     def _frame(self, grabbed: Grabbed, asked: Settings, ticks_per_s: float) -> Frame:
@@ -242,7 +242,7 @@ class PylonCamera:
         return self._device
 
     def _halted(self) -> OpenDevice:
-        """The open device, its stream ended: what is set holds for whole streams."""
+        """Return the open device with its stream ended, since settings hold for whole streams."""
         device = self._opened()
         self._stream += 1
         stop(device)

@@ -1,7 +1,6 @@
-"""The state in which a camera sends raw samples: linear in light, each by itself, at its place on the sensor.
+"""State of a camera that sends raw samples: linear in light, independent of each other, at their place on the sensor.
 
-The names are SFNC's, and where it has none those of makers. A camera that does not have a feature, or has it fixed, is
-left as it is.
+The names are SFNC's, or makers' where SFNC has none. A feature that a camera does not have, or has fixed, is skipped.
 """
 
 from __future__ import annotations
@@ -13,7 +12,7 @@ from typing import Final, final
 @final
 @dataclass(frozen=True)
 class Choice:
-    """An enumeration and what it is set to."""
+    """An enumeration and the value to set."""
 
     name: str
     symbol: str = "Off"
@@ -22,7 +21,7 @@ class Choice:
 @final
 @dataclass(frozen=True)
 class WholeNumber:
-    """An integer and what it is set to."""
+    """An integer and the value to set."""
 
     name: str
     value: int
@@ -64,13 +63,13 @@ WHOLE_NUMBERS: Final = (
     WholeNumber("DecimationVertical", 1),
 )
 
-# Numbers that are 1 where they change nothing.
+# Numbers whose neutral value is 1.
 GAMMA: Final = "Gamma"
 BALANCE_RATIO: Final = ("BalanceRatio", "BalanceRatioAbs")  # the second before SFNC 1.5
 BALANCE_SELECTOR: Final = "BalanceRatioSelector"
 BALANCE_COLOURS: Final = ("Red", "Green", "Blue")
 
-# Which of several gains is the one that is set, best first; a digital one beside it is 0 dB.
+# The gain to set among several, best first; an additional digital gain is set to 0 dB.
 GAIN_SELECTOR: Final = "GainSelector"
 GAINS: Final = ("All", "AnalogAll")
 DIGITAL_GAIN: Final = "DigitalAll"

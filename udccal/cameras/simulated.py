@@ -23,13 +23,13 @@ _GAIN_DB = Range(0.0, 24.0)
 _SLOWEST_HZ = 0.01
 _STEPS = (2, 2, 2, 2)
 _DEFAULT_EXPOSURE_S = 8e-3
-# Frames are developed ahead on as many threads; their noise is seeded per frame, so that this changes nothing.
+# Frames are computed ahead on this many threads; their noise is seeded per frame, so the number changes nothing.
 _THREADS = 2
 
 
 @final
 class SimulatedCamera:
-    """Implements ``udccal.cameras.protocol.Camera`` on a simulated world, whose clock its frames move on."""
+    """Implements ``udccal.cameras.protocol.Camera`` on a simulated world; each frame advances its clock."""
 
     def __init__(self, world: SimulatedWorld, faults: CameraFaults | None = None) -> None:
         camera = world.truth.description.camera
@@ -49,7 +49,7 @@ class SimulatedCamera:
 
     @property
     def identity(self) -> CameraIdentity:
-        """Which simulated camera this is."""
+        """Identity of the simulated camera."""
         return CameraIdentity("udccal", self._camera.model, f"simulated-{self._world.truth.seed}", "simulated")
 
     @property
@@ -82,12 +82,12 @@ class SimulatedCamera:
 
     @property
     def mode(self) -> Mode:
-        """How it works now."""
+        """Current mode."""
         return self._mode
 
     @property
     def counts(self) -> Counts:
-        """Frames since it was opened; dropped are those that the world's disturbances or a fault took."""
+        """Frames since the camera was opened; disturbances of the world and faults drop frames."""
         return self._counts
 
     def __enter__(self) -> SimulatedCamera:
@@ -102,7 +102,7 @@ class SimulatedCamera:
         self._stream += 1
 
     def set_mode(self, mode: Mode) -> Mode:
-        """Accept a mode as it is; the frame rate paces the simulated clock, not the wall's.
+        """Accept a mode as it is; the frame rate sets the pace of the simulated clock only.
 
         Raises:
             CameraError: when the camera does not have it, or is closed or gone.
@@ -124,13 +124,13 @@ class SimulatedCamera:
         return settings
 
     def frames(self, count: int) -> Iterator[Frame]:
-        """Deliver ``count`` frames with the present settings and whatever is arranged when each is exposed.
+        """Deliver ``count`` frames with the current settings and the arrangement at the time of each exposure.
 
-        Free-running, frames are exposed ahead of the one handed out; with the software trigger none is.
+        A free-running camera exposes frames ahead of the delivered one; with the software trigger it exposes none.
 
         Raises:
-            CameraError: when the camera is not open, or the stream is read on after it was closed.
-            CameraTimeout, CameraLost: as the faults say.
+            CameraError: when the camera is not open, or the stream was closed.
+            CameraTimeout, CameraLost: as the faults define.
         """
         self._check_open()
         self._stream += 1
@@ -170,7 +170,7 @@ class SimulatedCamera:
         return Frame(data, settings, timestamp_s, frame_id, complete=True)
 
     def _hand_out(self, developed: Future[Frame]) -> Frame:
-        """The frame as it comes over a link with faults."""
+        """Return the frame after the faults of the link."""
         number, self._handed_out = self._handed_out, self._handed_out + 1
         faults = self._faults
         if number == faults.unplug_at_frame:
@@ -196,7 +196,7 @@ class SimulatedCamera:
 
 
 def _cut(frame: Frame) -> Frame:
-    """The frame without its lower half."""
+    """Return the frame without its lower half."""
     data = frame.data.copy()
     data[len(data) // 2 :] = 0
     return replace(frame, data=data, complete=False)

@@ -1,4 +1,4 @@
-"""A rig that was photographed beforehand, or is while it is asked for: one folder of files per step of a session."""
+"""A rig whose pictures come from files: one folder per step of a session."""
 
 from __future__ import annotations
 
@@ -15,27 +15,27 @@ _MAX_FOLDERS: Final = 20_000
 
 @final
 class StepFolders:
-    """Files in ``root/<step id>/`` as a camera and its stage: an arrangement is the folder of the step that asks.
+    """Files in ``root/<step id>/`` as a camera and its stage: to arrange a step is to open its folder.
 
-    Files must state their exposure, or have it in a ``frames.csv`` beside them. A step whose folder has no pictures
-    stops the capture with a sentence that says which; the session goes on from there when they have been added.
+    Files must contain their exposure, or a ``frames.csv`` in their folder must. A step whose folder has no pictures
+    stops the capture with a sentence that names it; the session continues from there when they have been added.
 
     Attributes:
-        camera: to be opened by its user; it begins with the files of the first folder by name.
+        camera: its user opens it; it begins with the files of the first folder by name.
     """
 
     def __init__(self, root: str | Path, cfa: str = "RGGB", bits: int = 16) -> None:
-        """Find the folders; ``cfa`` and ``bits`` are those of files that do not say theirs.
+        """Find the folders; ``cfa`` and ``bits`` are those of files that do not contain theirs.
 
         Raises:
-            CameraError: when there are no pictures in any folder two levels down, or they do not state an exposure.
+            CameraError: when there are no pictures in any folder two levels down, or they do not contain an exposure.
             FileFormatError: when the first one cannot be read.
         """
         self._root = Path(root)
         self.camera = FileCamera(_first_with_pictures(self._root), cfa, bits, exposure_s=None)
 
     def arrange(self, arrangement: Arrangement, occasion: Occasion) -> None:
-        """Turn the camera to the files of a step.
+        """Give the camera the files of a step.
 
         Raises:
             CameraError: when there are none, or they are another camera's.

@@ -28,14 +28,14 @@ class CameraKind(enum.StrEnum):
 
 
 class DisplayKind(enum.StrEnum):
-    """What shows pictures on the panel of a real rig."""
+    """How pictures are shown on the panel of a real rig."""
 
     window = "window"
     manual = "manual"
 
 
 class ExchangedPart(enum.StrEnum):
-    """What a person exchanged in the middle of a session."""
+    """A part of the rig that a person exchanged during a session."""
 
     camera = "camera"
     lens = "lens"
@@ -52,7 +52,7 @@ class TermChoice(enum.StrEnum):
 
 
 _CAMERA_HELP = "sim: a simulated rig; u3v: any USB3 Vision camera; pylon: through Basler's SDK; files: see --files."
-_DISPLAY_HELP = "Of a real rig. window: full screen on --monitor; manual: you show the files you are told."
+_DISPLAY_HELP = "For a real rig. window: full screen on --monitor; manual: you show the named files."
 
 
 def calibrate(
@@ -61,20 +61,20 @@ def calibrate(
     session: SessionFolder,
     profile: ProfilePath,
     camera: Annotated[CameraKind, typer.Option("--camera", help=_CAMERA_HELP)] = CameraKind.sim,
-    serial: Annotated[str | None, typer.Option("--serial", help="Of the camera; needed if there are several.")] = None,
-    files: Annotated[Path | None, typer.Option("--files", help="Folder of one folder of pictures per step.")] = None,
+    serial: Annotated[str | None, typer.Option("--serial", help="Serial number; needed if there are several.")] = None,
+    files: Annotated[Path | None, typer.Option("--files", help="Folder with one folder of pictures per step.")] = None,
     display: Annotated[DisplayKind, typer.Option("--display", help=_DISPLAY_HELP)] = DisplayKind.manual,
-    monitor: Annotated[int, typer.Option("--monitor", help="Number of the panel among the monitors; see doctor.")] = 0,
+    monitor: Annotated[int, typer.Option("--monitor", help="Number of the monitor that is the panel; see doctor.")] = 0,
     seed: Seed = 0,
     term: Annotated[
         list[TermChoice] | None, typer.Option("--term", help="Capture this term only; may be given again.")
     ] = None,
     exchanged: Annotated[
-        list[ExchangedPart] | None, typer.Option("--exchanged", help="What was exchanged since the session began.")
+        list[ExchangedPart] | None, typer.Option("--exchanged", help="Part that was exchanged since the session began.")
     ] = None,
     log: IterationLog = None,
 ) -> None:
-    """Capture every calibration step of a rig, then fit them. An interrupted session goes on where it stopped."""
+    """Capture every calibration step of a rig, then fit them. An interrupted session continues where it stopped."""
     from udccal.cli.jobs.capture import capture_watched
     from udccal.cli.jobs.fit import fit_to_profile
     from udccal.profiles.store import check_replaceable

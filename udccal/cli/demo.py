@@ -1,4 +1,4 @@
-"""``udccal demo``: the whole way on a simulated rig, from captures to a restored photograph, against the truth."""
+"""``udccal demo``: captures, fits and restores on a simulated rig, and compares the results with the truth."""
 
 from __future__ import annotations
 

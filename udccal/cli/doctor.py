@@ -1,4 +1,4 @@
-"""``udccal doctor``: what this computer has and lacks for a calibration."""
+"""``udccal doctor``: checks this computer before a calibration."""
 
 from __future__ import annotations
 
@@ -9,22 +9,20 @@ import typer
 
 from udccal.cli.calibrate import CameraKind, DisplayKind
 
-_SESSION_HELP = "Folder that the session is to go to: is there room for it?"
+_SESSION_HELP = "Folder of the session: checks that its disk has room."
 
 
 def doctor(
     context: typer.Context,
     rig: Annotated[
-        str | None, typer.Option("--rig", help="The rig to be calibrated: its panel and its session.")
+        str | None, typer.Option("--rig", help="Rig to calibrate: checks its panel and the size of its session.")
     ] = None,
     session: Annotated[Path | None, typer.Option("--session", help=_SESSION_HELP)] = None,
-    camera: Annotated[CameraKind | None, typer.Option("--camera", help="The camera to be used must be ready.")] = None,
-    display: Annotated[
-        DisplayKind | None, typer.Option("--display", help="The display to be used must be ready.")
-    ] = None,
-    monitor: Annotated[int, typer.Option("--monitor", help="Number of the panel among the monitors.")] = 0,
+    camera: Annotated[CameraKind | None, typer.Option("--camera", help="Camera to use: it must be ready.")] = None,
+    display: Annotated[DisplayKind | None, typer.Option("--display", help="Display to use: it must be ready.")] = None,
+    monitor: Annotated[int, typer.Option("--monitor", help="Number of the monitor that is the panel.")] = 0,
 ) -> None:
-    """Say what this computer has and lacks. Leaves with status 1 when something that was asked for cannot work."""
+    """Check this computer before a capture. The exit status is 1 when something that you asked for cannot work."""
     from udccal.cli.jobs.doctor import report
     from udccal.doctor.examine import Wanted
     from udccal.rig import load_rig

@@ -1,4 +1,4 @@
-"""``udccal fit``: a captured session to a profile with its report."""
+"""``udccal fit``: fits a captured session and writes a profile with its report."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The command ``udccal``: its verbs, its global options, and what a person sees when something goes wrong."""
+"""The command ``udccal``: its verbs, its global options, and its error messages."""
 
 from __future__ import annotations
 
@@ -59,8 +59,8 @@ app.add_typer(profile_app, name="profile")
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run the command and leave with its exit status: 0, 1 for a known failure, 2 for wrong usage, 70 for a bug."""
-    # XLA's own log, before JAX is imported: what matters in it comes as an exception, too.
+    """Run the command and exit with its status: 0, 1 for a known failure, 2 for wrong usage, 70 for a bug."""
+    # Silences XLA's own log before JAX is imported: whatever matters in it also comes as an exception.
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     given = list(sys.argv[1:] if arguments is None else arguments)
     flags = [flag for flag in _GLOBAL_FLAGS if flag in given]
@@ -70,7 +70,7 @@ def main(arguments: list[str] | None = None) -> None:
     except UdccalError as error:
         _fail(str(error), 1, flags)
     except KeyboardInterrupt:
-        _fail("Stopped. Run the same command again to go on; completed steps of a session are kept.", 130, flags)
+        _fail("Stopped. Run the same command again to continue; completed steps of a session are kept.", 130, flags)
     except Exception as error:
         _fail(
             f"Something unexpected went wrong ({type(error).__name__}). "
@@ -81,7 +81,7 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def _fail(sentence: str, status: int, flags: list[str]) -> None:
-    """One sentence on standard error (the traceback before it with ``--debug``), and a non-zero exit status."""
+    """Print one sentence on standard error, with ``--debug`` the traceback before it; exit with a non-zero status."""
     if "--debug" in flags:
         traceback.print_exc()
     if "--json" in flags:

@@ -1,4 +1,4 @@
-"""Options that several verbs share, said once."""
+"""Options that several verbs share."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from typing import Annotated
 
 import typer
 
-RigName = Annotated[str, typer.Option("--rig", help="Name of a shipped rig, of one of your own, or a folder.")]
-SessionFolder = Annotated[Path, typer.Option("--session", help="Folder of the session; an unfinished one goes on.")]
-ProfilePath = Annotated[Path, typer.Option("--profile", help="Folder of the profile, or its zip file.")]
+RigName = Annotated[str, typer.Option("--rig", help="Name of a shipped rig or of your own, or a folder.")]
+SessionFolder = Annotated[Path, typer.Option("--session", help="Folder of the session; continues an unfinished one.")]
+ProfilePath = Annotated[Path, typer.Option("--profile", help="Folder of the profile, or a zip file.")]
 FoundProfile = Annotated[Path, typer.Option("--profile", help="A profile's folder or zip file, or a rig's name.")]
-OutFolder = Annotated[Path, typer.Option("--out", help="Folder for what is written.")]
-Seed = Annotated[int, typer.Option("--seed", help="Which rig of that description is simulated, and with which noise.")]
+OutFolder = Annotated[Path, typer.Option("--out", help="Folder for the results.")]
+Seed = Annotated[int, typer.Option("--seed", help="Chooses the specimen of the simulated rig, and its noise.")]
 IterationLog = Annotated[Path | None, typer.Option("--log", help="Write every iteration of every solver to this file.")]
 PanelPicturePath = Annotated[
     Path | None, typer.Option("--panel-picture", help="8-bit RGB PNG that the panel showed; omit if not known.")

@@ -1,4 +1,4 @@
-"""What every verb prints: tables or JSON on standard output, progress and errors on standard error."""
+"""Output of every verb: tables or JSON on standard output, progress and errors on standard error."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from rich.table import Table as RichTable
 from udccal.errors import UdccalError
 from udccal.reports.tables import Table
 
-# Of tables that go to a file or a pipe.
+# Width of tables that go to a file or a pipe.
 _FILE_WIDTH = 120
 
 
@@ -34,14 +34,14 @@ class StageTime:
 
 
 class Stage:
-    """A running stage with a progress bar; the total may become known on the way."""
+    """A running stage with a progress bar; the total may become known during the stage."""
 
     def __init__(self, bar: Progress, name: str) -> None:
         self._bar = bar
         self._task = bar.add_task(name, total=None)
 
     def update(self, done: int, total: int | None = None, text: str | None = None) -> None:
-        """Move the bar to ``done`` of ``total`` and say what is being done."""
+        """Move the bar to ``done`` of ``total`` and show what is being done."""
         self._bar.update(self._task, completed=done, total=total)
         if text is not None:
             self._bar.update(self._task, description=text)
@@ -49,7 +49,7 @@ class Stage:
 
 @dataclass
 class Output:
-    """Where a verb prints to, and how."""
+    """Where and how a verb prints."""
 
     as_json: bool = False
     debug: bool = False
@@ -61,14 +61,14 @@ class Output:
         self._standard = Console(width=None if sys.stdout.isatty() else _FILE_WIDTH)
 
     def say(self, sentence: str) -> None:
-        """A sentence for the person watching, on standard error."""
+        """Print a sentence for the user on standard error."""
         self._people.print(sentence, highlight=False, markup=False, soft_wrap=True)
 
     def ask(self, question: str) -> str:
-        """Ask the person watching and wait for a line, however long it takes; the progress bar rests meanwhile.
+        """Ask the user and wait for a line without a time limit; the progress bar pauses meanwhile.
 
         Raises:
-            UdccalError: when nobody can answer, since standard input is closed.
+            UdccalError: when standard input is closed, so that nobody can answer.
         """
         if self._bar is not None:
             self._bar.stop()
@@ -78,14 +78,14 @@ class Output:
         except EOFError as error:
             raise UdccalError(
                 f"Expected a person to answer '{question}', found that standard input is closed. Run the command in "
-                "a terminal; it goes on where it stopped."
+                "a terminal; it continues where it stopped."
             ) from error
         finally:
             if self._bar is not None:
                 self._bar.start()
 
     def table(self, table: Table) -> None:
-        """A table for people on standard output; nothing with ``--json``."""
+        """Print a table on standard output; print nothing with ``--json``."""
         if self.as_json:
             return
         shown = RichTable(title=table.title, title_justify="left", title_style="bold")
@@ -96,13 +96,13 @@ class Output:
         self._standard.print(shown, markup=False)
 
     def result(self, result: object) -> None:
-        """The machine-readable result (a dataclass), on standard output with ``--json`` only."""
+        """Print the result (a dataclass) as JSON on standard output; print nothing without ``--json``."""
         if self.as_json:
             print(json.dumps(plain(result), indent=2, allow_nan=False), flush=True)
 
     @contextmanager
     def stage(self, name: str) -> Iterator[Stage]:
-        """A stage that may take more than a second: shows a bar while it runs and notes how long it took."""
+        """Run a stage that may take more than a second: show a bar while it runs, and record how long it took."""
         start = time.perf_counter()
         columns = (
             SpinnerColumn(),
@@ -123,7 +123,7 @@ class Output:
 
 
 def plain(value: object) -> Any:
-    """A dataclass, path, enumeration, number or sequence as JSON's own types; numbers that are not finite become null.
+    """Convert a dataclass, path, enumeration, number or sequence to JSON's types; non-finite numbers become null.
 
     Raises:
         TypeError: for anything else.

@@ -1,4 +1,4 @@
-"""``udccal plan``: how much to capture for an accuracy, before anything is captured."""
+"""``udccal plan``: computes how much to capture for an accuracy, before anything is captured."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ import typer
 from udccal.cli.options import RigName
 
 _TARGET_HELP = (
-    "One standard deviation to be reached, such as wire=0.05%, psf=2%, noise=1%, geometry=0.1px, backscatter=1%; "
+    "One standard deviation to reach, such as wire=0.05%, psf=2%, noise=1%, geometry=0.1px, backscatter=1%; "
     "several may follow."
 )
-_PROFILE_HELP = "Plan at what this profile measured; without, at that in the rig's folder, or at the rig's own values."
+_PROFILE_HELP = "Profile with measured values. Default: that in the rig's folder, else the nominal values."
 
 
 def plan(
@@ -24,9 +24,9 @@ def plan(
     profile: Annotated[Path | None, typer.Option("--profile", help=_PROFILE_HELP)] = None,
     out: Annotated[Path | None, typer.Option("--out", help="Write the rig with the planned captures here.")] = None,
 ) -> None:
-    """Say how many flats, boards, LED positions and pictures an accuracy takes, and how long. Captures nothing.
+    """Compute how many flats, boards, LED positions and pictures an accuracy takes, and how long. Captures nothing.
 
-    Leaves with status 1 when a target is out of reach.
+    The exit status is 1 when a target is out of reach.
     """
     from udccal.cli.jobs.plan import plan_captures
 

@@ -1,4 +1,4 @@
-"""``udccal profile``: looks into profiles."""
+"""``udccal profile``: shows what a profile holds."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from typing import Annotated
 
 import typer
 
-profile_app = typer.Typer(help="Look into a profile.", no_args_is_help=True, pretty_exceptions_enable=False)
+profile_app = typer.Typer(help="Show what a profile holds.", no_args_is_help=True, pretty_exceptions_enable=False)
 
 
 @profile_app.callback()
 def profile() -> None:
-    """Look into a profile."""
+    """Show what a profile holds."""
 
 
 @profile_app.command(no_args_is_help=True)

@@ -1,4 +1,4 @@
-"""``udccal restore``: raw frames to clean pictures."""
+"""``udccal restore``: restores raw frames to clean pictures."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ def restore(
     out: OutFolder,
     panel_picture: PanelPicturePath = None,
     exposure_s: Annotated[
-        float | None, typer.Option("--exposure-s", min=1e-7, help="Exposure of the frames, where the file has none.")
+        float | None, typer.Option("--exposure-s", min=1e-7, help="Exposure of the frames, if not in the file.")
     ] = None,
     picture_format: Annotated[
-        PictureFormat, typer.Option("--format", help="png: for looking at. exr: linear light in e-/s.")
+        PictureFormat, typer.Option("--format", help="png: display-encoded, for viewing. exr: linear light in e-/s.")
     ] = PictureFormat.png,
 ) -> None:
     """Restore raw frames with a rig's profile."""

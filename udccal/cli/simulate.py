@@ -1,4 +1,4 @@
-"""``udccal simulate``: a photograph as a simulated rig would see it."""
+"""``udccal simulate``: shows a photograph as a simulated rig would see it."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""What this computer has and lacks for a calibration: one small check per file, all of them harmless to repeat."""
+"""Checks of this computer before a calibration: one small check per file, each harmless to repeat."""

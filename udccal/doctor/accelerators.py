@@ -1,4 +1,4 @@
-"""What computes: graphics processors and JAX's devices."""
+"""Finds graphics processors and JAX's devices."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from typing import Final
 from udccal.doctor.answers import Failure, JaxDevice
 from udccal.doctor.finding import Finding, Status
 
-ASK_JAX_S: Final = 120.0  # its first start on a slow disk takes a good part of that
+ASK_JAX_S: Final = 120.0  # its first start on a slow disk takes a large part of that
 _SMI_S: Final = 15.0
 _SMI: Final = ("nvidia-smi", "--query-gpu=name,memory.total,driver_version", "--format=csv,noheader")
 _NO_GPU: Final = "Everything runs on the processor; fits and restoration take longer."
 
 
 def gpu_finding(command: tuple[str, ...] = _SMI, seconds: float = _SMI_S) -> Finding:
-    """NVIDIA's graphics processors, as their driver lists them."""
+    """List NVIDIA's graphics processors, as their driver names them."""
     topic = "GPU"
     try:
         done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, timeout=seconds)
@@ -33,7 +33,7 @@ def gpu_finding(command: tuple[str, ...] = _SMI, seconds: float = _SMI_S) -> Fin
 
 
 def jax_finding(answer: tuple[JaxDevice, ...] | Failure, gpu: Finding) -> Finding:
-    """The devices that JAX computes on. Fits and restoration need it: without it there is always a problem."""
+    """List the devices that JAX computes on; without JAX it is a problem, since fits and restoration need it."""
     topic = "JAX devices"
     if isinstance(answer, Failure):
         advice = "Install udccal again: pip install --force-reinstall udccal"
@@ -41,6 +41,6 @@ def jax_finding(answer: tuple[JaxDevice, ...] | Failure, gpu: Finding) -> Findin
     counts = Counter((device.platform, device.kind) for device in answer)
     found = "; ".join(f"{number} x {platform} ({kind})" for (platform, kind), number in counts.items())
     if gpu.status is Status.OK and not any(device.platform in ("gpu", "cuda") for device in answer):
-        advice = "JAX does not use the GPU that is there. Give it the means to:\npip install 'jax[cuda13]'"
+        advice = "JAX does not use the GPU. Install its GPU support:\npip install 'jax[cuda13]'"
         return Finding(topic, Status.NOTE, found, advice)
     return Finding(topic, Status.OK, found)

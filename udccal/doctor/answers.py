@@ -1,4 +1,4 @@
-"""What a child process of the doctor may answer."""
+"""Answers of the doctor's child processes."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ class SeenCamera:
 
     Attributes:
         name: maker, model and serial.
-        too_slow: it is plugged into a slower port than it was made for, as far as the backend knows.
-        trouble: why it cannot be opened, as a sentence; empty when nothing is known against it.
+        too_slow: whether its port is slower than the camera supports, as far as the backend knows.
+        trouble: why it cannot be opened, as a sentence; empty when no reason is known.
     """
 
     name: str
@@ -36,11 +36,11 @@ class JaxDevice:
 @final
 @dataclass(frozen=True)
 class Failure:
-    """Why there is no answer.
+    """The reason for a missing answer.
 
     Attributes:
-        reason: in a phrase; or, when ``refused``, in a sentence that says what to do.
-        refused: udccal's own code found what is missing.
+        reason: a phrase; when ``refused``, a sentence that says what to do.
+        refused: whether udccal's own code found what is missing.
     """
 
     reason: str
@@ -48,10 +48,10 @@ class Failure:
 
 
 def read_cameras(content: bytes) -> tuple[SeenCamera, ...]:
-    """From JSON.
+    """Read cameras from JSON.
 
     Raises:
-        pydantic.ValidationError: when it is something else.
+        pydantic.ValidationError: when the JSON holds something else.
     """
     return TypeAdapter(tuple[SeenCamera, ...]).validate_json(content, strict=True)
 

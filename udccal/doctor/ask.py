@@ -1,4 +1,4 @@
-"""Asking a child process, so that software which hangs or crashes is a finding and not the end of the doctor."""
+"""Asks a child process, so that software which hangs or crashes is a finding and does not end the doctor."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ T = TypeVar("T")
 
 
 def ask(question: Question, read: Callable[[bytes], T], seconds: float) -> T | Failure:
-    """Ask one question: what ``read`` makes of the answer, or why there is none within that time."""
+    """Ask one question; return what ``read`` makes of the answer, or why there is none within that time."""
     return ask_command([sys.executable, "-m", "udccal.doctor.child", question.value], read, seconds)
 
 
 def ask_command(command: Sequence[str], read: Callable[[bytes], T], seconds: float) -> T | Failure:
-    """As ``ask``, of any command that answers as ``udccal.doctor.child`` does, into the file named last."""
+    """Do as ``ask`` with any command that answers as ``udccal.doctor.child`` does, into the file named last."""
     with tempfile.TemporaryDirectory(prefix="udccal-doctor-") as folder:
         file = Path(folder) / "answer.json"
         status = _run([*command, str(file)], seconds)
@@ -45,12 +45,12 @@ def ask_command(command: Sequence[str], read: Callable[[bytes], T], seconds: flo
                 failure = read_failure(content)
                 return dataclasses.replace(failure, reason=failure.reason[:_LONGEST_REASON])
         except (OSError, ValidationError):
-            pass  # it broke down before its answer was written
-        return Failure(f"it broke down ({_cause(status)})")
+            pass  # it failed before its answer was written
+        return Failure(f"it failed ({_cause(status)})")
 
 
 def _run(command: Sequence[str], seconds: float) -> int | None:
-    """Exit status, or None when time ran out. Whatever the process started ends with it."""
+    """Return the exit status, or None when time ran out; end whatever the process started."""
     quiet = subprocess.DEVNULL
     with subprocess.Popen(command, stdin=quiet, stdout=quiet, stderr=quiet, start_new_session=True) as process:
         try:
@@ -64,7 +64,7 @@ def _run(command: Sequence[str], seconds: float) -> int | None:
 def _end(process: subprocess.Popen) -> None:
     with contextlib.suppress(ProcessLookupError, PermissionError):
         if os.name == "posix":
-            os.killpg(process.pid, signal.SIGKILL)  # a session of its own is a group of its own
+            os.killpg(process.pid, signal.SIGKILL)  # its own session is its own process group
         else:
             process.kill()
 

@@ -1,4 +1,4 @@
-"""Which cameras are seen, and by which backend."""
+"""Finds the cameras that each backend sees."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from udccal.doctor.finding import Finding, Status
 
 ASK_S = 30.0
 _PLUG_IN = "Plug the camera in, power it, and run this again."
-_BROKEN = "Unplug the camera and run this again. If that changes nothing, install the backend's software again."
-_SLOW = " (at a port or cable slower than it is made for)"
+_BROKEN = "Unplug the camera and run this again. If that does not help, install the backend's software again."
+_SLOW = " (at a port or cable that is slower than the camera)"
 
 
 def camera_finding(backend: str, answer: tuple[SeenCamera, ...] | Failure, asked: bool) -> Finding:
-    """What a backend answered, in a row; a problem when the backend was asked for and has no camera to open."""
+    """Return a backend's answer; it is a problem when that backend is wanted and has no camera to open."""
     topic = f"cameras by {backend}"
     if isinstance(answer, Failure):
         found = "it cannot look for any" if answer.refused else answer.reason
@@ -29,10 +29,10 @@ def camera_finding(backend: str, answer: tuple[SeenCamera, ...] | Failure, asked
 
 
 def pylon_sdk_finding(asked: bool) -> Finding:
-    """Whether Basler's SDK is there, without loading it."""
+    """Check whether Basler's SDK is installed, without loading it."""
     topic = "pylon SDK"
     try:
         return Finding(topic, Status.OK, f"pypylon {version('pypylon')}")
     except PackageNotFoundError:
-        advice = "Only for Basler cameras through Basler's own SDK; u3v does without:\npip install 'udccal[pylon]'"
+        advice = "Needed only for Basler cameras through Basler's SDK, not for u3v:\npip install 'udccal[pylon]'"
         return Finding(topic, Status.NOTE, "not installed", advice).needed(asked)

@@ -1,7 +1,7 @@
 """The child process that answers one question: ``python -m udccal.doctor.child QUESTION FILE``.
 
-The answer goes to the file, as JSON, since what vendors' software prints is nobody's business; exit status 0 for an
-answer, ``FAILED`` for the reason why there is none, anything else when the process broke down.
+The answer goes to the file as JSON, apart from what vendors' software prints. The exit status is 0 for an answer,
+``FAILED`` for the reason why there is none, and anything else when the process failed.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ FAILED = 3
 
 
 def main() -> None:
-    """Answer the question in the first argument into the file in the second."""
+    """Answer the question in the first argument; write the answer to the file in the second."""
     status = _write(Question(sys.argv[1]), Path(sys.argv[2]))
-    os._exit(status)  # at once: libraries that look for hardware are known to hang or crash while they are unloaded
+    os._exit(status)  # exits at once: libraries that look for hardware may hang or crash while they are unloaded
 
 
 def _write(question: Question, file: Path) -> int:
@@ -30,7 +30,7 @@ def _write(question: Question, file: Path) -> int:
         answers = answer(question)
     except UdccalError as error:
         return _failed(file, Failure(str(error), refused=True))
-    except Exception as error:  # whatever foreign software raises is the answer to whether it works
+    except Exception as error:  # whatever foreign software raises is the answer
         return _failed(file, Failure(f"{type(error).__name__}: {error}"))
     file.write_text(json.dumps([dataclasses.asdict(each) for each in answers]), encoding="utf-8")
     return 0

@@ -1,4 +1,4 @@
-"""Whether a session fits on the disk that it is to go to."""
+"""Checks whether a session fits on its disk."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ _TOPIC = "disk"
 
 
 def free_bytes(folder: Path) -> int:
-    """What this user may still write there."""
+    """Return how many bytes this user may still write there."""
     return shutil.disk_usage(folder).free
 
 
 def disk_finding(session: Path | None, rig: RigDescription | None, free: Callable[[Path], int] = free_bytes) -> Finding:
-    """Whether there is room for a session, or for the rest of one, in a folder; the present one when none is given."""
+    """Check whether a folder has room for a session, or for the rest of one; default: the current folder."""
     place = session or Path()
     folder = _nearest_folder(place)
     if folder is None or not os.access(folder, os.W_OK):
@@ -37,7 +37,7 @@ def disk_finding(session: Path | None, rig: RigDescription | None, free: Callabl
     available = free(folder)
     found = f"{_size(available)} free in {folder.resolve()}"
     if described is None:
-        return Finding(_TOPIC, Status.OK, f"{found}; --rig and --session tell whether a session fits")
+        return Finding(_TOPIC, Status.OK, f"{found}; give --rig and --session to check whether a session fits")
     return _room(found, available, described, manifest)
 
 
@@ -46,7 +46,7 @@ def _room(found: str, available: int, rig: RigDescription, manifest: Manifest | 
     missing = whole if manifest is None else max(whole - captured_bytes(manifest), 0)
     found += f"; a session of {rig.name} takes at most {_size(whole)}"
     if manifest is not None:
-        found += f", of which at most {_size(missing)} are still to come" if missing else ", and is all there"
+        found += f", of which at most {_size(missing)} are still missing" if missing else ", and is complete"
     if available < missing:
         advice = f"Free {_size(missing - available)} more, or choose a folder on another disk with --session."
         return Finding(_TOPIC, Status.PROBLEM, found, advice)
@@ -54,7 +54,7 @@ def _room(found: str, available: int, rig: RigDescription, manifest: Manifest | 
 
 
 def _nearest_folder(path: Path) -> Path | None:
-    """The folder, or the one above it that is there; None when a file stands in the way."""
+    """Return the folder, or the nearest one above it that exists; None when a file is in the way."""
     while not path.exists() and path != path.parent:
         path = path.parent
     return path if path.is_dir() else None

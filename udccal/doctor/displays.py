@@ -1,4 +1,4 @@
-"""Which monitors a picture can be shown on."""
+"""Finds the monitors that can show a picture."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ _TOPIC = "monitors"
 def monitor_finding(
     size: PanelSize | None, monitor: int | None, look: Callable[[], tuple[Monitor, ...]] = list_monitors
 ) -> Finding:
-    """The monitors that a window can fill; compared with the panel's size where that is known.
+    """List the monitors that a window can fill, and compare them with the panel's size where that is known.
 
     Args:
-        size: of the panel, when a rig was named.
-        monitor: number of the one that was asked for; None when none was.
-        look: lists the monitors.
+        size: resolution of the panel; None without a rig.
+        monitor: number of the requested one; None for none.
+        look: returns the monitors.
     """
     try:
         monitors = look()
     except DisplayError as error:
-        why = "" if monitor is not None else " Needed only to show pictures in a window (--display window)."
-        return Finding(_TOPIC, Status.NOTE, "none to show a window on", f"{error}{why}").needed(monitor is not None)
+        why = "" if monitor is not None else " This is needed only to show pictures in a window (--display window)."
+        return Finding(_TOPIC, Status.NOTE, "none that can show a window", f"{error}{why}").needed(monitor is not None)
     found = "; ".join(_phrase(each) for each in monitors)
     if monitor is not None and monitor not in range(len(monitors)):
         return Finding(_TOPIC, Status.PROBLEM, found, f"There is no monitor {monitor}. Choose one with --monitor.")

@@ -1,4 +1,4 @@
-"""All checks, those that wait for others side by side."""
+"""Runs all checks; those that wait for other programs run in parallel."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ from udccal.rig import RigDescription
 @final
 @dataclass(frozen=True)
 class Wanted:
-    """What the person is about to do.
+    """What the user wants to do.
 
     Attributes:
-        camera: the backend they mean to use, ``u3v`` or ``pylon``; None when they did not say.
-        monitor: number of the monitor that a window shall fill; None for no window.
-        rig: the rig they mean to calibrate.
-        session: folder that the session shall go to.
+        camera: backend to use, ``u3v`` or ``pylon``; None when not given.
+        monitor: number of the monitor for a window; None for no window.
+        rig: rig to calibrate.
+        session: folder of the session.
     """
 
     camera: str | None = None
@@ -41,7 +41,7 @@ class Wanted:
 
 
 def examine(wanted: Wanted) -> tuple[Finding, ...]:
-    """Every finding, in the order that a person should read them."""
+    """Return every finding about this computer for what is ``wanted``, in the order of the table."""
     with ThreadPoolExecutor() as pool:
         u3v = pool.submit(ask, Question.U3V, read_cameras, cameras.ASK_S)
         jax = pool.submit(ask, Question.JAX, read_devices, accelerators.ASK_JAX_S)

@@ -1,4 +1,4 @@
-"""What a check found."""
+"""The result of a check."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from typing import final
 
 
 class Status(enum.StrEnum):
-    """How it stands with one topic."""
+    """State of one topic."""
 
     OK = "ok"
-    NOTE = "note"  # worth knowing; nothing that was asked for fails
-    PROBLEM = "PROBLEM"  # something that was asked for cannot work
+    NOTE = "note"  # worth knowing; nothing that the user asked for fails
+    PROBLEM = "PROBLEM"  # something that the user asked for cannot work
 
 
 @final
@@ -21,9 +21,9 @@ class Finding:
     """One row of the doctor's table.
 
     Attributes:
-        topic: what was looked at.
-        found: what is the case, in a phrase.
-        advice: what to do, with the commands on lines of their own; empty when there is nothing to do.
+        topic: what was checked.
+        found: the result, as a phrase.
+        advice: what to do, with commands on separate lines; empty when there is nothing to do.
     """
 
     topic: str
@@ -32,5 +32,5 @@ class Finding:
     advice: str = ""
 
     def needed(self, asked: bool) -> Finding:
-        """The same, and a problem instead of a note when it was asked for."""
+        """Return the finding with a note turned into a problem when the user asked for the topic."""
         return replace(self, status=Status.PROBLEM) if asked and self.status is Status.NOTE else self

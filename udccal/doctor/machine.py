@@ -1,4 +1,4 @@
-"""The computer under examination, in a form that tests can put another in the place of."""
+"""The computer under examination; tests replace it by another."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _LONGEST_VALUE = 4096
 
 
 def may_open(path: Path) -> bool:
-    """Whether this user may read and write a device; asks the system, so that access lists count."""
+    """Return whether this user may read and write a device; ask the system, so that access lists count."""
     return os.access(path, os.R_OK | os.W_OK)
 
 
@@ -24,9 +24,9 @@ class Machine:
     """Where to look.
 
     Attributes:
-        root: of the file system.
-        system: as ``sys.platform`` names it.
-        may_open: whether this user may read and write a device.
+        root: root of the file system.
+        system: name in ``sys.platform``.
+        may_open: returns whether this user may read and write a device.
     """
 
     root: Path = Path("/")
@@ -34,7 +34,7 @@ class Machine:
     may_open: Callable[[Path], bool] = may_open
 
     def value(self, path: Path) -> str | None:
-        """The text of a small file such as sysfs holds, without what cannot be printed; None when it cannot be read."""
+        """Return the printable text of a small file such as those of sysfs; None when it cannot be read."""
         try:
             with path.open("rb") as stream:
                 content = stream.read(_LONGEST_VALUE)

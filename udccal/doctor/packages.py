@@ -1,4 +1,4 @@
-"""Python and the packages that udccal needs, against the versions that its own metadata allows."""
+"""Compares Python and the packages that udccal needs with the versions that its own metadata allows."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from packaging.utils import canonicalize_name
 from udccal.doctor.finding import Finding, Status
 
 _DISTRIBUTION = "udccal"
-# Worth its own words: a version that installs and runs, and gives wrong numbers.
-_WHY = {"jaxlib": "It multiplies some matrices wrongly on CPUs.", "jax": "It goes with a jaxlib that computes wrongly."}
+# Explained separately: a version that installs and runs, and gives wrong numbers.
+_WHY = {"jaxlib": "It multiplies some matrices wrongly on CPUs.", "jax": "It requires a jaxlib that computes wrongly."}
 
 
 def python_finding() -> Finding:
-    """Which Python runs this."""
+    """Return the Python that runs this."""
     return Finding("Python", Status.OK, f"{platform.python_version()} on {platform.system()} {platform.machine()}")
 
 
 def packages_finding() -> Finding:
-    """Whether every package is there in a version that udccal can work with."""
+    """Check whether every package is installed in a version that udccal can work with."""
     try:
         lines = requires(_DISTRIBUTION) or []
     except PackageNotFoundError:
@@ -47,11 +47,11 @@ def _applies(requirement: Requirement) -> bool:
 
 
 def _mismatch(requirement: Requirement, installed: Callable[[str], str]) -> str:
-    """What is wrong with an installed package; empty when nothing is."""
+    """Return what is wrong with a package; empty when nothing is."""
     try:
         present = installed(requirement.name)
     except PackageNotFoundError:
         return f"{requirement.name} is not installed"
     if requirement.specifier.contains(present, prereleases=True):
         return ""
-    return f"{requirement.name} is {present}, needed is {requirement.specifier}"
+    return f"{requirement.name} is {present}, udccal needs {requirement.specifier}"

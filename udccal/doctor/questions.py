@@ -1,4 +1,4 @@
-"""The questions that are asked in a child process, since they load software that may hang or crash."""
+"""Questions for a child process, since they load software that may hang or crash."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from udccal.doctor.answers import JaxDevice, SeenCamera
 
 
 class Question(enum.StrEnum):
-    """What can be asked."""
+    """One question."""
 
     U3V = "u3v"
     PYLON = "pylon"
@@ -18,7 +18,7 @@ class Question(enum.StrEnum):
 
 
 def answer(question: Question) -> Sequence[SeenCamera] | Sequence[JaxDevice]:
-    """Load what is asked about, and look.
+    """Load the software that the question is about, and look.
 
     Raises:
         CameraError: when a camera backend cannot look.

@@ -1,7 +1,7 @@
-"""How many bytes a session takes at most, from what a rig's procedures capture (docs/session.md on what a term needs).
+"""Computes how many bytes a session takes at most, from the captures of a rig's procedures (docs/session.md).
 
-An upper bound: averages are noise to the last bit and do not shrink; single frames and pictures of the panel are
-counted as if they did not either, though frames of 12 bits shrink to three quarters or less of 16 bits per sample.
+This is an upper bound. Averages are noise to the last bit and do not compress. Single frames and pictures of the panel
+are counted the same way, though frames of 12 bits compress to three quarters or less of 16 bits per sample.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ class SessionFiles:
     """Files of a whole session of all five terms.
 
     Attributes:
-        averages: means and variances of the whole sensor.
-        frames: single frames of the whole sensor.
-        cut_frames: single frames of the psf's region.
-        pictures: what the panel showed.
+        averages: number of means and variances of the whole sensor.
+        frames: number of single frames of the whole sensor.
+        cut_frames: number of single frames of the psf's region.
+        pictures: number of pictures that the panel showed.
     """
 
     averages: int
@@ -41,7 +41,7 @@ class SessionFiles:
 
 
 def session_files(rig: RigDescription) -> SessionFiles:
-    """What the procedures that ship write for a rig."""
+    """Return the files that the shipped procedures write for a rig."""
     captures = rig.captures
     flats = 2 + 2  # wire and noise: a flat and a dark each
     views = captures.board_views + 1  # and the one on the jig
@@ -55,7 +55,7 @@ def session_files(rig: RigDescription) -> SessionFiles:
 
 
 def session_bytes(rig: RigDescription) -> int:
-    """The most that a whole session of a rig takes."""
+    """Return an upper bound of the bytes of a whole session of a rig."""
     files, captures, camera, panel = session_files(rig), rig.captures, rig.camera, rig.panel
     samples = camera.columns * camera.rows
     cut = min(captures.psf_region_columns, camera.columns) * min(captures.psf_region_rows, camera.rows)
@@ -68,7 +68,7 @@ def session_bytes(rig: RigDescription) -> int:
 
 
 def captured_bytes(manifest: Manifest) -> int:
-    """What a session holds already, counted as ``session_bytes`` counts, so that the difference is what is missing."""
+    """Return the bytes that a session holds, counted as in ``session_bytes``; the difference is what is missing."""
     panel = manifest.rig.panel
     pictures = sum(step.subject.kind == "panel" for step in manifest.steps)
     stored = sum(_most_of(capture) for step in manifest.steps for capture in step.captures)

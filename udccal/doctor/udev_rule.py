@@ -8,15 +8,15 @@ from typing import Final
 
 RULE_FILE: Final = Path("etc/udev/rules.d/70-udccal-cameras.rules")
 _BASLER: Final = 0x2676
-# USB3 Vision is told by the control interface (class EF, subclass 05, protocol 00), not by the device; of interfaces, a
-# rule for the device sees the list that udev's usb_id makes of them, each between colons.
+# The control interface (class EF, subclass 05, protocol 00) identifies USB3 Vision, not the device. A rule for the
+# device sees the list of its interfaces that udev's usb_id makes, each between colons.
 _ANY_MAKER: Final = (
     'SUBSYSTEM=="usb", ENV{DEVTYPE}=="usb_device", ENV{ID_USB_INTERFACES}=="*:ef0500:*", MODE="0666", TAG+="uaccess"'
 )
 
 
 def udev_rule(vendor_ids: Iterable[int] = ()) -> str:
-    """The rule's text: for every maker, then by name for Basler and the vendors given, should the first not match."""
+    """Return the rule: one line for every maker, then, should it not match, lines for Basler and the given vendors."""
     vendors = sorted({_BASLER, *vendor_ids})
     by_vendor = (
         f'SUBSYSTEM=="usb", ENV{{DEVTYPE}}=="usb_device", ATTR{{idVendor}}=="{vendor:04x}", MODE="0666", TAG+="uaccess"'
@@ -26,7 +26,7 @@ def udev_rule(vendor_ids: Iterable[int] = ()) -> str:
 
 
 def install_commands(vendor_ids: Iterable[int] = ()) -> str:
-    """What to paste into a terminal to install the rule and have it heeded."""
+    """Return the commands that install the rule and make the system apply it."""
     return (
         f"sudo tee /{RULE_FILE} <<'END'\n{udev_rule(vendor_ids)}END\n"
         "sudo udevadm control --reload-rules\n"

@@ -1,4 +1,4 @@
-"""Speed, permission and memory of USB."""
+"""Checks speed, permission and memory of USB."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ _LINUX_ONLY: Final = "linux"
 
 
 def usb_findings(machine: Machine) -> tuple[Finding, ...]:
-    """What the Linux kernel says of cameras on USB; nothing on other systems, which tell none of this."""
+    """Return what the Linux kernel reports about cameras on USB; nothing on other systems, which do not report it."""
     if not machine.system.startswith(_LINUX_ONLY):
         return ()
     if not has_usb(machine):
-        advice = "In a virtual machine or container, hand the USB controller through to it."
+        advice = "In a virtual machine or container, pass the USB controller through to it."
         return (Finding("USB", Status.NOTE, "this computer shows no USB", advice),)
     cameras = bus_cameras(machine)
     return (speed_finding(cameras), permission_finding(machine, cameras), memory_finding(machine))
 
 
 def speed_finding(cameras: Sequence[BusCamera]) -> Finding:
-    """Whether each camera runs at SuperSpeed, which every USB3 Vision camera is made for."""
+    """Check whether each camera runs at SuperSpeed, which every USB3 Vision camera supports."""
     topic = "USB speed"
     if not cameras:
         return Finding(topic, Status.NOTE, "no USB3 Vision camera is plugged in")
@@ -46,12 +46,12 @@ def speed_finding(cameras: Sequence[BusCamera]) -> Finding:
 
 
 def permission_finding(machine: Machine, cameras: Sequence[BusCamera]) -> Finding:
-    """Whether this user may open each camera; one that is plugged in is meant to be used, whether asked for or not."""
+    """Check whether this user may open each camera; every camera that is plugged in counts as asked for."""
     topic = "USB permission"
     refused = [camera for camera in cameras if not machine.may_open(camera.node)]
     if any(not camera.node.exists() for camera in refused):
         found = f"no device file for {_names(refused)}"
-        advice = "In a container, hand /dev/bus/usb through to it. Otherwise plug the camera in again."
+        advice = "In a container, pass /dev/bus/usb through to it. Otherwise plug the camera in again."
         return Finding(topic, Status.PROBLEM, found, advice)
     vendors = [camera.vendor_id for camera in cameras]
     install = f"Install this udev rule, then plug the camera in again:\n{install_commands(vendors)}"
@@ -65,7 +65,7 @@ def permission_finding(machine: Machine, cameras: Sequence[BusCamera]) -> Findin
 
 
 def memory_finding(machine: Machine) -> Finding:
-    """How much memory the kernel lends to USB transfers of programs."""
+    """Check how much memory the kernel allows for USB transfers of programs."""
     topic = "USB memory"
     text = machine.value(machine.root / _MEMORY) or ""
     if not re.fullmatch(r"[0-9]{1,9}", text):
@@ -75,7 +75,7 @@ def memory_finding(machine: Machine) -> Finding:
     if megabytes == 0 or megabytes >= _ADVISED_MB:
         return Finding(topic, Status.OK, f"{megabytes} MB" if megabytes else "without limit")
     advice = (
-        f"Enough for one slow camera. Advised are {_ADVISED_MB} MB, for now and for every start to come:\n"
+        f"This is enough for one slow camera. These commands set {_ADVISED_MB} MB, now and at every later start:\n"
         f"echo {_ADVISED_MB} | sudo tee /{_MEMORY}\n"
         f"echo 'w /{_MEMORY} - - - - {_ADVISED_MB}' | sudo tee /etc/tmpfiles.d/udccal.conf"
     )

@@ -1,4 +1,4 @@
-"""USB3 Vision cameras as the Linux kernel lists them, with no driver or library in between."""
+"""Lists USB3 Vision cameras from the Linux kernel, without a driver or library."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _NODES: Final = Path("dev/bus/usb")
 # Interface class, subclass and protocol of a control interface (USB3 Vision 1.1, 3.2).
 _CONTROL: Final = (0xEF, 0x05, 0x00)
 _MOST_ENTRIES: Final = 4096
-_MOST_NUMBER: Final = 999  # three digits are all that a device node's name has
+_MOST_NUMBER: Final = 999  # a device node's name has three digits
 
 
 @final
@@ -24,7 +24,7 @@ class BusCamera:
     """A camera at a port of this computer.
 
     Attributes:
-        name: maker, model and serial, as far as the camera tells.
+        name: maker, model and serial, as far as the camera gives them.
         vendor_id: USB's number of the maker.
         mbit_per_s: speed of the link; 0 when not known.
         node: the device file that a program opens.
@@ -37,18 +37,18 @@ class BusCamera:
 
 
 def has_usb(machine: Machine) -> bool:
-    """Whether the kernel knows of USB at all; virtual machines and containers often do not."""
+    """Return whether the kernel has USB at all; virtual machines and containers often do not."""
     return (machine.root / _DEVICES).is_dir()
 
 
 def bus_cameras(machine: Machine) -> tuple[BusCamera, ...]:
-    """Every device with a USB3 Vision control interface; entries that make no sense are passed over."""
+    """Return every device with a USB3 Vision control interface; skip invalid entries."""
     folder = machine.root / _DEVICES
     try:
         entries = sorted(entry.name for entry in itertools.islice(folder.iterdir(), _MOST_ENTRIES))
     except OSError:
         return ()
-    # Interfaces stand beside their device and are named after it: 2-1:1.0 belongs to 2-1.
+    # Interfaces are listed next to their device and named after it: 2-1:1.0 belongs to 2-1.
     devices = {name.partition(":")[0] for name in entries if ":" in name and _is_control(machine, folder / name)}
     cameras = (_camera(machine, folder / name) for name in sorted(devices))
     return tuple(camera for camera in cameras if camera is not None)
@@ -70,7 +70,7 @@ def _camera(machine: Machine, folder: Path) -> BusCamera | None:
 
 
 def _speed(machine: Machine, folder: Path) -> float:
-    """In Mbit/s, as the stable kernel interface ``/sys/bus/usb/devices/.../speed`` has it: 480, 5000 and so on."""
+    """Return the speed in Mbit/s from the stable kernel interface ``/sys/bus/usb/devices/.../speed``: 480, 5000, ..."""
     text = machine.value(folder / "speed") or ""
     return float(text) if re.fullmatch(r"[0-9]{1,6}(\.[0-9])?", text) else 0.0
 

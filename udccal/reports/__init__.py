@@ -1,1 +1,1 @@
-"""Numbers to figures to HTML."""
+"""Reports: collects numbers, draws figures, writes HTML."""

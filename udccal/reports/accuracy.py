@@ -1,4 +1,4 @@
-"""How accurate each term is, how much of what its frames tell was used, and what more captures would bring."""
+"""Accuracy of each term, the part of the frames' information that was used, and the effect of more captures."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from udccal.rig import RigDescription
 from udccal.sessions.schema import TermName
 
 _ACROSS = 17
-# A gain below this is none worth a sentence.
+# A smaller gain is not worth a sentence.
 _LEAST_GAIN = 1.02
 
 
 @dataclass(frozen=True)
 class Accuracy:
-    """One term's accuracy: as forecast for its captures, and as its fit states it (None where it states another).
+    """One term's accuracy: the forecast for its captures, and the fit's own sigma (None if of another quantity).
 
     Attributes:
-        used: share of the information in the frames that the fit spent, by the fit's own count where it has one.
+        used: fraction of the information in the frames that the fit used, from the fit's diagnostics where it has one.
     """
 
     forecast: Forecast
@@ -35,17 +35,17 @@ class Accuracy:
 
     @property
     def sigma(self) -> float:
-        """By the fit where it says so, else the forecast."""
+        """The fit's own sigma where it has one, else the forecast."""
         return self.forecast.sigma if self.stated is None else self.stated
 
     @property
     def efficiency(self) -> float:
-        """Cramér-Rao variance of all frames over the one stated; what the fit spent may be spent less than well."""
+        """Cramér-Rao variance of all frames over the fit's variance: ``used``, less the fit's own inefficiency."""
         return self.used * min((self.forecast.sigma / self.sigma) ** 2, 1.0)
 
 
 def accuracies(calibration: Calibration) -> tuple[Accuracy, ...]:
-    """Of the terms that were fitted; those whose procedure does not tell what it takes are left out."""
+    """Return the accuracy of each fitted term; leave out terms whose procedure does not describe its captures."""
     state = measured_state(calibration.rig, calibration)
     found = []
     for term in ORDER:
@@ -63,7 +63,7 @@ def accuracies(calibration: Calibration) -> tuple[Accuracy, ...]:
 
 
 def stated(term: TermName, result: FitResult, rig: RigDescription) -> float | None:
-    """The sigma of the term's quantity by its own fit, where the result holds it."""
+    """Return the fit's own sigma of the term's quantity, where the result holds it."""
     match term:
         case "noise":
             K = result.estimate("K_DN_per_e")
@@ -80,28 +80,28 @@ def stated(term: TermName, result: FitResult, rig: RigDescription) -> float | No
 
 
 def accuracy_table(accuracy: Accuracy) -> Table:
-    """The numbers beside the figure."""
+    """Return the numbers of the figure as a table."""
     ahead, unit = accuracy.forecast, accuracy.forecast.quantity.unit
-    rows = [("forecast for the frames captured (to 15 %)", f"{ahead.sigma:.3g} {unit}")]
+    rows = [("forecast for the captured frames (within 15 %)", f"{ahead.sigma:.3g} {unit}")]
     if accuracy.stated is not None:
-        rows.append(("stated by the fit", f"{accuracy.stated:.3g} {unit}"))
-    rows.append(("left, however much is captured", f"{ahead.floor.sigma:.3g} {unit}" if ahead.floor.sigma else "–"))
-    rows.append(("efficiency: information in the frames that is used", f"{100 * accuracy.efficiency:.0f} %"))
-    rows.append(("information left on the table", f"{100 * (1 - accuracy.efficiency):.0f} %"))
+        rows.append(("sigma of the fit", f"{accuracy.stated:.3g} {unit}"))
+    rows.append(("floor, however much is captured", f"{ahead.floor.sigma:.3g} {unit}" if ahead.floor.sigma else "–"))
+    rows.append(("efficiency: used part of the information in the frames", f"{100 * accuracy.efficiency:.0f} %"))
+    rows.append(("unused part of the information", f"{100 * (1 - accuracy.efficiency):.0f} %"))
     title = f"Accuracy: σ of {ahead.quantity.meaning}"
     return Table(title, ("", ""), tuple(rows), frozenset({1}))
 
 
 def forecast_sentence(ahead: Forecast) -> str:
-    """What to capture more of, in words."""
-    said = "How sure the result is against how much is captured, all else as it was. "
+    """Return a sentence about which captures to increase."""
+    said = "The curves show sigma against each number of captures, with the others unchanged. "
     best = max(ahead.curves, key=lambda curve: curve.most_gain)
     if best.most_gain < _LEAST_GAIN:
-        said += "More captures bring next to nothing. "
+        said += "More captures would hardly lower sigma. "
     else:
         said += f"{_gain(ahead, best)} "
     if ahead.floor.sigma and best.most_gain * ahead.floor.sigma > ahead.sigma / 2:
-        said += ahead.floor.lowered_by
+        said += f"The floor is {ahead.floor.sigma:.3g} {ahead.quantity.unit}. {ahead.floor.lowered_by}"
     if ahead.idle:
         said += f" It does not depend on {' or '.join(ahead.idle)}."
     return said.strip()
@@ -109,8 +109,8 @@ def forecast_sentence(ahead: Forecast) -> str:
 
 def _gain(ahead: Forecast, best: Curve) -> str:
     unit = ahead.quantity.unit
-    counted = f"{best.variable.counted}, {best.counts[-1]:.0f} for {best.now}"
-    return f"Most would come from more {counted}: {best.sigma[-1]:.3g} {unit} for {ahead.sigma:.3g} {unit}."
+    counted = f"{best.variable.counted}, {best.counts[-1]:.0f} instead of {best.now}"
+    return f"More {counted}, lower sigma most: {best.sigma[-1]:.3g} {unit} instead of {ahead.sigma:.3g} {unit}."
 
 
 def _diagnostic(result: FitResult, name: str) -> float | None:

@@ -1,4 +1,4 @@
-"""Corners of the boards in a session against the fitted geometry: numbers for the report's coverage picture."""
+"""Compares the board corners of a session with the fitted geometry: numbers for the report's coverage picture."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from udccal.models.geometry import Geometry
 
 @dataclass(frozen=True)
 class BoardEvidence:
-    """Every corner found, and how far it lies from where the fitted lens and the best pose of its board put it."""
+    """Every corner found, and its distance from the projection by the fitted lens and the best pose of its board."""
 
     corners_px: Float[np.ndarray, "n 2"]
     residuals_px: Float[np.ndarray, "n 2"]
@@ -25,7 +25,7 @@ class BoardEvidence:
 
 
 def board_evidence(boards: Sequence[BoardView], geometry: Geometry) -> BoardEvidence | None:
-    """Corners and residuals of all usable board views; None when there are none."""
+    """Return corners and residuals in px of all usable board views; None when there are none."""
     views = [view for view in boards if view.usable()]
     if not views:
         return None
@@ -34,7 +34,7 @@ def board_evidence(boards: Sequence[BoardView], geometry: Geometry) -> BoardEvid
 
 
 def _residuals(view: BoardView, geometry: Geometry) -> Float[np.ndarray, "n 2"]:
-    """Found minus projected, after the pose that fits this view best."""
+    """Return found minus projected corners in px, with the pose that fits this view best."""
     lens = Intrinsics.of_geometry(geometry)
     distortion = np.asarray(lens.distortion, dtype=np.float64)
     points_mm = board_points_mm(view.spec)[view.corners.ids]

@@ -1,4 +1,4 @@
-"""Numbers behind the report's pictures that a fit does not keep, taken from the session again."""
+"""Computes from the session the numbers of the report's pictures that a fit does not keep."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class PhotonTransfer:
 
 
 def photon_transfer(session: Session, noise: Noise) -> PhotonTransfer | None:
-    """The photon-transfer points of a session's pairs of flats and darks; None when it has none."""
+    """Return the photon-transfer points of a session's pairs of flats and darks; None when it has none."""
     flats, darks = _pairs(session, "noise/flat_"), _pairs(session, "noise/dark_")
     levels = sorted(set(flats) & set(darks))
     if not levels:
@@ -42,7 +42,7 @@ def photon_transfer(session: Session, noise: Noise) -> PhotonTransfer | None:
 
 
 def _pairs(session: Session, prefix: str) -> dict[str, StoredStep]:
-    """Steps of two single frames by what follows ``prefix`` in their id."""
+    """Return the steps of two single frames, by the rest of their id after ``prefix``."""
     return {s.id.removeprefix(prefix): s for s in session.steps("noise") if s.id.startswith(prefix) and _is_pair(s)}
 
 
@@ -51,7 +51,7 @@ def _is_pair(step: StoredStep) -> bool:
 
 
 def _pair(session: Session, step: StoredStep) -> Float[np.ndarray, "2 3"]:
-    """Mean and temporal variance per colour of two frames alike; EMVA 1288 equations 16 and 17."""
+    """Return mean and temporal variance per colour of a pair of frames; EMVA 1288 equations 16 and 17."""
     first, second = (session.frame(capture).astype(np.float64) for capture in step.captures)
     channels = cfa_named(session.rig.camera.cfa).channel_map(*first.shape)
     masks = [channels == c for c in range(_CHANNELS)]

@@ -1,4 +1,4 @@
-"""Numbers to figures, drawn with matplotlib's objects on an Agg canvas; nothing opens a window."""
+"""Draws figures with matplotlib's objects on an Agg canvas; nothing opens a window."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ _MOST_ROWS = 97
 
 
 def embedded_png(figure: Figure) -> str:
-    """A figure as a data URI that an HTML page can hold."""
+    """Return a figure as a data URI that an HTML page can hold."""
     buffer = io.BytesIO()
     FigureCanvasAgg(figure).print_png(buffer, metadata={"Software": ""})
     return _uri(buffer.getvalue())
 
 
 def embedded_picture(picture: UInt8[np.ndarray, "rows columns 3"]) -> str:
-    """An RGB picture as a data URI."""
+    """Return an RGB picture as a data URI."""
     done, encoded = cv2.imencode(".png", np.ascontiguousarray(picture[..., ::-1]))
     if not done:
         raise ValueError(f"expected a picture that encodes as PNG, found shape {picture.shape}")
@@ -43,13 +43,13 @@ def _uri(png: bytes) -> str:
 
 
 def row_of_axes(columns: int, width: float, height: float) -> tuple[Figure, list[Axes]]:
-    """A figure of ``columns`` panels side by side, in inches."""
+    """Return a figure of ``columns`` panels next to each other; sizes in inches."""
     figure = Figure(figsize=(width, height), dpi=_DPI, layout="constrained")
     return figure, [figure.add_subplot(1, columns, i + 1) for i in range(columns)]
 
 
 def photon_transfer_figure(points: PhotonTransfer) -> Figure:
-    """Photon transfer: the slope is the gain K."""
+    """Draw photon transfer: the slope is the gain K."""
     figure, (axes,) = row_of_axes(1, 6.0, 3.6)
     for channel, (name, colour) in enumerate(zip(_NAMES, _COLOURS, strict=True)):
         mean, variance = points.mean_DN[:, channel], points.variance_DN2[:, channel]
@@ -66,7 +66,7 @@ def photon_transfer_figure(points: PhotonTransfer) -> Figure:
 
 
 def board_figure(evidence: BoardEvidence, columns: int, rows: int) -> Figure:
-    """Where the boards' corners lay on the sensor, and what the fit leaves of them."""
+    """Draw the positions of the boards' corners on the sensor, and their residuals."""
     figure, (coverage, residuals) = row_of_axes(2, 6.8, 3.1)
     coverage.plot(evidence.corners_px[:, 0], evidence.corners_px[:, 1], ".", ms=3, color=_COLOURS[2])
     coverage.set(xlim=(0, columns), ylim=(rows, 0), xlabel="x [px]", ylabel="y [px]", aspect="equal")
@@ -81,7 +81,7 @@ def board_figure(evidence: BoardEvidence, columns: int, rows: int) -> Figure:
 
 
 def wire_figure(fitted: TermMaps, true: TermMaps | None) -> Figure:
-    """The ripple of the wire map in percent, beside the truth and the maps' difference when there is one."""
+    """Draw the ripple of the wire map in percent; with a truth, also the truth and the difference."""
     shown = [("fitted", 100.0 * ripple(fitted.wire))]
     if true is not None:
         shown += [("truth", 100.0 * ripple(true.wire)), ("fitted − truth", 100.0 * (fitted.wire / true.wire - 1.0))]
@@ -96,7 +96,7 @@ def wire_figure(fitted: TermMaps, true: TermMaps | None) -> Figure:
 
 
 def psf_figure(fitted: TermMaps, true: TermMaps | None) -> Figure:
-    """Kernels on a logarithmic scale over five decades, in the colours of the channels; fitted above, true below."""
+    """Draw kernels on a logarithmic scale over five decades, in the channels' colours; fitted above, true below."""
     rows = [("fitted", fitted.kernels)] + ([("truth", true.kernels)] if true is not None else [])
     places = fitted.kernels.shape[0]
     ky, kx = min(fitted.kernels.shape[2], _MOST_ROWS), fitted.kernels.shape[3]
@@ -122,7 +122,7 @@ def _log_colour(kernel: Float[np.ndarray, "3 ky kx"]) -> Float[np.ndarray, "ky k
 
 
 def backscatter_figure(fitted: TermMaps, true: TermMaps | None, cfa_step: int = 2) -> Figure:
-    """The picture on the panel, and the light it scatters back into the camera (one CFA site)."""
+    """Draw the picture on the panel, and the light that it scatters back into the camera (one CFA site)."""
     site = np.s_[1::cfa_step, ::cfa_step]
     shown = [("fitted", fitted.backscatter[site])]
     if true is not None:
@@ -143,7 +143,7 @@ def backscatter_figure(fitted: TermMaps, true: TermMaps | None, cfa_step: int = 
 
 
 def difference_figure(difference: Float[np.ndarray, "rows columns"], title: str) -> Figure:
-    """Absolute difference of display-encoded values, on a scale to 0.1."""
+    """Draw the absolute difference of display-encoded values, on a scale to 0.1."""
     figure, (axis,) = row_of_axes(1, 6.0, 3.5)
     image = axis.imshow(difference, cmap="inferno", vmin=0.0, vmax=0.1)
     bare(axis, title)
@@ -152,7 +152,7 @@ def difference_figure(difference: Float[np.ndarray, "rows columns"], title: str)
 
 
 def bare(axis: Axes, title: str) -> None:
-    """A picture's panel: a title, no ticks."""
+    """Give a picture's panel a title and no ticks."""
     axis.set_title(title, fontsize=9)
     axis.set_xticks([])
     axis.set_yticks([])

@@ -1,4 +1,4 @@
-"""Figures about how good a fit is: what it left over, and what more captures would bring."""
+"""Figures of the quality of a fit: its residuals, and the effect of more captures."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from udccal.reports.figures import bare, row_of_axes
 from udccal.reports.residuals import ResidualHistogram, ResidualMap
 
 _BLUE, _RED = "#2f6fb5", "#c0392b"
-# What is left is drawn where it is near enough to be seen; axes end this factor beyond the curves.
+# The floor is drawn where it is near enough to be seen; axes end this factor beyond the curves.
 _NEAR, _ROOM, _TICKS = 0.5, 1.08, 4
 
 
 def residual_figure(cells: ResidualMap, histogram: ResidualHistogram) -> Figure:
-    """Left: where on the sensor residuals are one-sided. Right: their distribution beside the normal one."""
+    """Draw the mean residuals over the sensor (left), and their distribution with the normal one (right)."""
     figure, (left, right) = row_of_axes(2, 6.8, 2.9)
     left.set_facecolor("0.85")
     image = left.imshow(cells.mean_sigma, cmap="RdBu_r", vmin=-4, vmax=4, aspect="auto", interpolation="nearest")
@@ -37,7 +37,7 @@ def residual_figure(cells: ResidualMap, histogram: ResidualHistogram) -> Figure:
 
 
 def forecast_figure(ahead: Forecast) -> Figure:
-    """One panel per number of the captures: sigma against it, with what was captured and what is left marked."""
+    """Draw sigma against each number of the captures, one panel each, with the captured number and the floor."""
     curves = ahead.curves
     # One panel alone is as large as two, so that its labels have room.
     figure, panels = row_of_axes(len(curves), max(3.0 * len(curves), 4.2), 2.7)
@@ -48,7 +48,7 @@ def forecast_figure(ahead: Forecast) -> Figure:
         axes.loglog(curve.counts, curve.sigma, "-", color=_BLUE, lw=1.8)
         axes.plot([curve.now], [ahead.sigma], "o", color=_RED, ms=6, label=f"captured: {curve.now}")
         if low <= ahead.floor.sigma:
-            axes.axhline(ahead.floor.sigma, color="0.4", ls="--", lw=1, label="left, however many")
+            axes.axhline(ahead.floor.sigma, color="0.4", ls="--", lw=1, label="floor")
         axes.set(xlabel=curve.variable.counted, ylim=(low / _ROOM, high * _ROOM))
         _plain_ticks(axes, curve)
         axes.legend(frameon=False, fontsize=7.5, loc="upper right")
@@ -58,7 +58,7 @@ def forecast_figure(ahead: Forecast) -> Figure:
 
 
 def _plain_ticks(axes: Axes, curve: Curve) -> None:
-    """Counts as the numbers that they are, and sigma without powers of ten."""
+    """Label counts as plain numbers, and sigma without powers of ten."""
     lowest, highest = float(curve.counts[0]), float(curve.counts[-1])
     places = np.unique(np.rint(np.geomspace(lowest, highest, _TICKS)).astype(int))
     axes.xaxis.set_major_locator(FixedLocator([float(place) for place in places]))

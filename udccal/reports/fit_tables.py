@@ -1,4 +1,4 @@
-"""The evidence of a fit as tables."""
+"""Turns the results of a fit into tables."""
 
 from __future__ import annotations
 
@@ -10,24 +10,23 @@ _NUMBERS = frozenset({1, 2})
 
 
 def estimates_table(title: str, result: FitResult) -> Table:
-    """Every estimate of a fit with its sigma."""
+    """Return a table with ``title`` of every estimate in ``result`` with its sigma and unit."""
     rows = tuple((e.name, number(e.value, e.sigma), spread(e.sigma), e.unit) for e in result.estimates)
     return Table(title, ("quantity", "value", "sigma", "unit"), rows, frozenset({1, 2}))
 
 
 def diagnostics_table(title: str, result: FitResult) -> Table:
-    """Numbers about the fit itself."""
+    """Return a table of the fit's diagnostics."""
     head = (("reduced χ²", number(result.chi2_dof), "1"), ("samples", str(result.samples), ""))
     rows = head + tuple((d.name, number(d.value), d.unit) for d in result.diagnostics)
     return Table(title, ("about the fit", "value", "unit"), rows, frozenset({1}))
 
 
 def orders_table(result: FitResult) -> Table:
-    """The orders that were tried, and which was chosen.
+    """Return a table of the orders that were tried, with the chosen one marked.
 
-    Where one choice was made: best first, the likeliest alone and how much worse than the best they are. Where several
-    were made, one after the other, each has its own criterion: all of them, in their order, or if these are many those
-    chosen.
+    After a single choice it lists the best orders first, with their difference from the best. Successive choices have
+    one criterion each: then it lists all orders as they were tried, or only the chosen ones if there are many.
     """
     if _choices(result) != 1 and more_orders(result):
         chosen = tuple((one.name, str(one.parameters)) for one in result.candidates if one.chosen)
@@ -44,7 +43,7 @@ def orders_table(result: FitResult) -> Table:
 
 
 def more_orders(result: FitResult) -> bool:
-    """Whether ``orders_table`` leaves some out."""
+    """Whether ``orders_table`` leaves out some orders."""
     return len(result.candidates) > (MOST_ORDERS if _choices(result) == 1 else MOST_CHOICES)
 
 
@@ -53,7 +52,7 @@ def _choices(result: FitResult) -> int:
 
 
 def candidates_table(title: str, result: FitResult) -> Table:
-    """All orders that were tried, the chosen one marked; lower is better."""
+    """Return a table of all orders that were tried, with the chosen one marked; lower is better."""
     rows = tuple(
         (c.name, str(c.parameters), f"{c.criterion:.6g}", "chosen" if c.chosen else "") for c in result.candidates
     )
@@ -61,6 +60,6 @@ def candidates_table(title: str, result: FitResult) -> Table:
 
 
 def outliers_table(title: str, result: FitResult) -> Table:
-    """What was left out, by which rule, and where the first of it lies."""
+    """Return a table of the outliers: their rule, their number, and the first places."""
     rows = tuple((o.rule, str(o.count), ", ".join(o.places)) for o in result.outliers)
     return Table(title, ("rule", "count", "first places"), rows, frozenset({1}))

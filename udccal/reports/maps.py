@@ -1,4 +1,4 @@
-"""The arrays that a report shows of the fitted terms, at the same places as those of a simulated truth."""
+"""Arrays of the fitted terms that a report shows, at the same places as those of a simulated truth."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from udccal.models.geometry import Geometry, panel_points_mm
 from udccal.numerics import in_float64
 from udccal.rig import RigDescription
 
-# Reach of the smoothing that stands for the shading, as a share of the picture's height.
+# Width of the smoothing that estimates the shading, as a fraction of the picture's height.
 _SHADING = 0.06
 _PLACES = ((0.5, 0.5), (0.17, 0.21), (0.81, 0.33), (0.37, 0.86))
 
 
 @dataclass(frozen=True)
 class TermMaps:
-    """What each map-like term looks like on the sensor.
+    """The terms as maps on the sensor.
 
     ``kernels`` are of point sources centred on ``positions_px``, which lie between those that a procedure captures.
     ``backscatter`` is a mosaic in e-/s for ``picture`` shown on the panel, before the wire; ``seen_px`` is the part of
@@ -39,18 +39,18 @@ class TermMaps:
 
 
 def ripple(wire: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray, "rows columns"]:
-    """What is left of a wire map when the smooth shading, far larger than the ripple, is divided out."""
+    """Divide a wire map by its smooth shading, which is far larger than the ripple."""
     return wire / gaussian_filter(wire, _SHADING * wire.shape[0], mode="nearest") - 1.0
 
 
 def report_positions(rig: RigDescription) -> Float[np.ndarray, "places 2"]:
-    """Whole-pixel places where the report shows the blur."""
+    """Return the whole-pixel places (x, y) at which the report shows the blur."""
     return np.floor(np.array(_PLACES) * [rig.camera.columns - 1, rig.camera.rows - 1])
 
 
 @in_float64
 def fitted_maps(calibration: Calibration, picture: UInt8[np.ndarray, "panel_rows panel_columns 3"]) -> TermMaps:
-    """Maps of the fitted terms."""
+    """Return the maps of the fitted terms."""
     rig = calibration.rig
     positions = report_positions(rig)
     return TermMaps(
@@ -67,7 +67,7 @@ _panel_points_mm = jax.jit(panel_points_mm)
 
 
 def _seen_px(geometry: Geometry, rig: RigDescription) -> tuple[int, int, int, int]:
-    """Panel pixels that the rays through the sensor's border cross, and the pupil's width around them."""
+    """Return the panel pixels that rays through the sensor's edge cross, widened by the pupil."""
     x, y = rig.camera.columns - 1.0, rig.camera.rows - 1.0
     corners = np.array([[0, 0], [x / 2, 0], [x, 0], [x, y / 2], [x, y], [x / 2, y], [0, y], [0, y / 2]])
     points = np.asarray(_panel_points_mm(geometry, corners)) / rig.panel.pitch_mm.value

@@ -1,4 +1,4 @@
-"""Figures and tables to one HTML file that needs nothing beside it."""
+"""Writes figures and tables to one self-contained HTML file."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from udccal.sessions.schema import TermName
 
 @dataclass(frozen=True)
 class Fact:
-    """One line of what the report is about."""
+    """One line of the report's head."""
 
     label: str
     value: str
@@ -23,7 +23,7 @@ class Fact:
 
 @dataclass(frozen=True)
 class Illustration:
-    """A figure as a data URI, with a sentence that says what to see in it."""
+    """A figure as a data URI, with a sentence that explains it."""
 
     uri: str
     caption: str
@@ -46,7 +46,7 @@ class TermSection:
 
     @property
     def mood(self) -> str:
-        """The style of the status: good, absent or bad."""
+        """CSS class of the status: good, absent or bad."""
         return {FitStatus.CONVERGED: "good", FitStatus.ABSENT: "absent"}.get(self.status, "bad")
 
 
@@ -64,7 +64,7 @@ class Page:
 
 
 def render(page: Page) -> str:
-    """The page as HTML text; all text is escaped."""
+    """Return the page as HTML; all text is escaped."""
     environment = Environment(
         loader=PackageLoader("udccal.reports"),
         autoescape=True,
@@ -76,6 +76,6 @@ def render(page: Page) -> str:
 
 
 def write_page(path: Path, page: Page) -> None:
-    """Render a page and write it atomically."""
+    """Render ``page`` and write it to ``path`` atomically."""
     path.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(path, render(page).encode("utf-8"))

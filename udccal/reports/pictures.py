@@ -1,4 +1,4 @@
-"""How good a picture is: display-encoded values against the truth, as PSNR and SSIM. Numbers only."""
+"""Compares display-encoded pictures with the truth by PSNR and SSIM. Numbers only."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from udccal.restoration.tone import display_exposure, encode_srgb
 
 @dataclass(frozen=True)
 class Score:
-    """One picture against the truth."""
+    """Scores of one picture against the truth."""
 
     psnr_dB: float
     ssim: float
@@ -22,7 +22,7 @@ class Score:
 
 @dataclass(frozen=True)
 class PictureComparison:
-    """A scene before and after restoration and as it is, all display-encoded (0 to 1), with both scores."""
+    """A scene before and after restoration and its truth, all display-encoded (0 to 1), with both scores."""
 
     name: str
     before: Float[np.ndarray, "rows columns 3"]
@@ -47,6 +47,12 @@ def compare_pictures(
 
     All three share the exposure that shows the truth well. ``before`` gets the least-squares gain per channel,
     ``after`` none: restoration has to get the level right.
+
+    Args:
+        name: of the scene.
+        before: without restoration, in e-/s.
+        after: restored, in e-/s.
+        truth: what a camera without a panel sees, in e-/s.
     """
     exposure = display_exposure(truth)
     blurred = encode_srgb(before * least_squares_gain(before, truth) * exposure)
@@ -61,5 +67,11 @@ def _score(picture: Float[np.ndarray, "rows columns 3"], truth: Float[np.ndarray
 def mosaic_preview(
     mosaic: UInt16[np.ndarray, "rows columns"], cfa: str, black_DN: float
 ) -> Float[np.ndarray, "half_rows half_columns 3"]:
-    """A linear picture of half the size, each 2 x 2 cell one pixel: quick, and free of interpolation."""
+    """Return a linear picture of half the size with one pixel per 2 x 2 cell, without interpolation.
+
+    Args:
+        mosaic: raw frame in DN.
+        cfa: pattern of its top-left 2 x 2, e.g. ``RGGB``.
+        black_DN: black level.
+    """
     return cfa_named(cfa).cell_means(np.maximum(mosaic.astype(np.float32) - np.float32(black_DN), 0.0))

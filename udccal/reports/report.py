@@ -27,7 +27,13 @@ def gather(
     picture: UInt8[np.ndarray, "panel_rows panel_columns 3"],
     light: RigLight | None,
 ) -> Evidence:
-    """Every number the report shows; ``light`` is the simulated rig's, None for a rig that is really there.
+    """Collect every number that the report shows.
+
+    Args:
+        session: captured data.
+        calibration: fits of that session.
+        picture: picture on the panel for which backscatter is shown; no calibration has captured it.
+        light: true light of a simulated rig; None for a real rig.
 
     Raises:
         SessionError: when a file of the session is damaged.
@@ -48,7 +54,13 @@ def gather(
 
 
 def calibration_page(session: Session, evidence: Evidence, scene: PictureComparison | None) -> Page:
-    """The page of one calibration, with a restored scene when there is one."""
+    """Build the page of one calibration.
+
+    Args:
+        session: captured data.
+        evidence: numbers of the report, from ``gather``.
+        scene: a restored scene; None for none.
+    """
     calibration = evidence.calibration
     bad = [term for term in ORDER if not calibration.result(term).ok]
     good = "All five terms can be used."
@@ -80,7 +92,7 @@ def calibration_page(session: Session, evidence: Evidence, scene: PictureCompari
 
 
 def scene_sentence(scene: PictureComparison) -> str:
-    """What restoration did to a scene, in numbers."""
+    """Return a sentence about a scene's scores before and after restoration."""
     before, after = scene.score_before, scene.score_after
     return (
         f"Restoration takes “{scene.name}” from {before.psnr_dB:.2f} dB to {after.psnr_dB:.2f} dB PSNR "
@@ -89,7 +101,7 @@ def scene_sentence(scene: PictureComparison) -> str:
 
 
 def scene_table(scene: PictureComparison) -> Table:
-    """Scores before and after as text."""
+    """Return the scores of ``scene`` before and after restoration as a table."""
     rows = tuple(
         (name, f"{score.psnr_dB:.2f}", f"{score.ssim:.4f}")
         for name, score in (("before", scene.score_before), ("after", scene.score_after))
@@ -98,7 +110,7 @@ def scene_table(scene: PictureComparison) -> Table:
 
 
 def scene_illustrations(scene: PictureComparison) -> tuple[Illustration, ...]:
-    """Before, after, truth and what is left."""
+    """Return pictures of a scene before, after, its truth and the remaining error."""
     difference = np.abs(scene.after - scene.truth).mean(axis=-1)
     return (
         Illustration(
@@ -110,7 +122,7 @@ def scene_illustrations(scene: PictureComparison) -> tuple[Illustration, ...]:
         Illustration(figures.embedded_picture(to_rgb8(scene.truth)), "Truth: the same view without a panel.", "truth"),
         Illustration(
             figures.embedded_png(figures.difference_figure(difference, "|after − truth|")),
-            "What is left, on a scale to a tenth of full.",
+            "Remaining error, on a scale to a tenth of full scale.",
             "difference",
         ),
     )

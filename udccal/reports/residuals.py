@@ -1,4 +1,4 @@
-"""What a fit left over, as a map over the sensor and as a histogram: numbers first."""
+"""Computes the residuals of a fit as a map over the sensor and as a histogram."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 
 from udccal.result import ResidualSample
 
-# Cells of the map need some residuals each to say anything; so many are wanted in the mean.
+# A cell of the map needs several residuals for a meaningful mean; this many on average.
 _WANTED = 12
 _MOST_CELLS = 32
 _REACH, _BINS = 5.0, 50
@@ -37,7 +37,7 @@ class ResidualHistogram:
 
 
 def residual_map(sample: ResidualSample, columns: int, rows: int) -> ResidualMap:
-    """Residuals averaged over cells of a sensor of ``rows`` x ``columns``."""
+    """Average residuals over cells of a sensor of ``rows`` x ``columns``."""
     cells = max(len(sample.z) / _WANTED, 1.0)
     across = int(np.clip(np.sqrt(cells * columns / rows), 1, _MOST_CELLS))
     down = int(np.clip(np.sqrt(cells * rows / columns), 1, _MOST_CELLS))
@@ -50,7 +50,7 @@ def residual_map(sample: ResidualSample, columns: int, rows: int) -> ResidualMap
 
 
 def residual_histogram(sample: ResidualSample) -> ResidualHistogram:
-    """Counts from -5 to 5 sigma."""
+    """Count residuals from -5 to 5 sigma."""
     counts, edges = np.histogram(sample.z, bins=_BINS, range=(-_REACH, _REACH))
     inside = int(counts.sum())
     return ResidualHistogram(edges, counts, float(sample.z.mean()), float(sample.z.std()), len(sample.z) - inside)

@@ -1,4 +1,4 @@
-"""The five chapters of a report: which figures and tables each term gets, and the sentences around them."""
+"""The five chapters of a report: each term's figures, tables and sentences."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _LONGEST_LIST = 14
 
 @dataclass(frozen=True)
 class Evidence:
-    """All numbers a report draws from; what is None is left out of the page."""
+    """All numbers of a report; the page leaves out what is None."""
 
     calibration: Calibration
     fitted: TermMaps
@@ -43,28 +43,28 @@ class Evidence:
     accuracies: tuple[Accuracy, ...]
 
     def accuracy(self, term: TermName) -> Accuracy | None:
-        """Of a term; None where nothing is known of it."""
+        """Return the accuracy of a term; None where it is not known."""
         return next((one for one in self.accuracies if one.forecast.term == term), None)
 
 
 _EXPLANATIONS: dict[TermName, str] = {
-    "noise": "How the sensor counts: gain, dark noise and the unevenness of its pixels, in the terms of EMVA 1288.",
-    "geometry": "Where each pixel looks: the lens with its distortion, and how the camera is tilted against the panel.",
+    "noise": "The sensor's response: gain, dark noise and non-uniformity, with the names of EMVA 1288.",
+    "geometry": "The direction of each pixel: the lens with its distortion, and the camera's rotation to the panel.",
     "wire": "The shadow of the panel's pixel rows, far out of focus: a ripple that multiplies the picture.",
-    "psf": "How the panel's rows spread a point of light by diffraction; it changes over the field and with colour.",
+    "psf": "Diffraction of a point of light by the panel's rows; it changes over the field and with colour.",
     "backscatter": "Light of the panel itself that scatters back into the lens; it depends on what the panel shows.",
 }
 
 
 def sections(evidence: Evidence) -> tuple[TermSection, ...]:
-    """One section per term in the order of the fits."""
+    """Return one section per term in the order of the fits."""
     return tuple(_section(term, evidence) for term in ORDER)
 
 
 def _section(term: TermName, evidence: Evidence) -> TermSection:
     result = evidence.calibration.result(term)
     shown = () if result.status is FitStatus.ABSENT else (*_illustrations(term, evidence), *_quality(term, evidence))
-    details = [diagnostics_table("The fit itself", result)]
+    details = [diagnostics_table("Diagnostics of the fit", result)]
     estimates = estimates_table("Fitted", result)
     shown_tables = _numbers(term, evidence)
     if len(estimates.rows) > _LONGEST_LIST:
@@ -74,7 +74,7 @@ def _section(term: TermName, evidence: Evidence) -> TermSection:
     if more_orders(result):
         details.append(candidates_table("All orders tried", result))
     if result.outliers:
-        details.append(outliers_table("Left out", result))
+        details.append(outliers_table("Outliers", result))
     return TermSection(
         term=term,
         heading=term.capitalize(),
@@ -89,14 +89,14 @@ def _section(term: TermName, evidence: Evidence) -> TermSection:
 
 
 def _numbers(term: TermName, evidence: Evidence) -> tuple[Table, ...]:
-    """Accuracy and orders."""
+    """Return the tables of accuracy and orders."""
     result, accuracy = evidence.calibration.result(term), evidence.accuracy(term)
     tables = () if accuracy is None else (accuracy_table(accuracy),)
     return (*tables, orders_table(result)) if result.candidates else tables
 
 
 def _finding(term: TermName, evidence: Evidence) -> str:
-    """The one number that says most: the distance from the truth when it is known, else how sure the term is."""
+    """Return the most important number: the error where the truth is known, else the sigma."""
     result, accuracy = evidence.calibration.result(term), evidence.accuracy(term)
     distances = [row for row in evidence.rows if row.term == term and row.fitted is None]
     if distances:
@@ -106,7 +106,7 @@ def _finding(term: TermName, evidence: Evidence) -> str:
         return "Nothing was fitted."
     if accuracy is not None and term != "noise":
         quantity = accuracy.forecast.quantity
-        return f"{quantity.meaning[0].upper()}{quantity.meaning[1:]}: known to {accuracy.sigma:.2g} {quantity.unit}."
+        return f"{quantity.meaning[0].upper()}{quantity.meaning[1:]}: sigma {accuracy.sigma:.2g} {quantity.unit}."
     first = result.estimates[0]
     unit = "" if first.unit == "1" else f" {first.unit}"
     return f"{first.name} = {number(first.value, first.sigma)} ± {spread(first.sigma)}{unit}."
@@ -118,14 +118,14 @@ def _illustrations(term: TermName, evidence: Evidence) -> tuple[Illustration, ..
 
 
 def _quality(term: TermName, evidence: Evidence) -> tuple[Illustration, ...]:
-    """What the fit left over, and what more captures would bring."""
+    """Return the pictures of the residuals and of the effect of more captures."""
     drawn: list[Illustration] = []
     camera, sample = evidence.calibration.rig.camera, evidence.calibration.result(term).residuals
     if sample is not None and len(sample.z):
         cells, histogram = residual_map(sample, camera.columns, camera.rows), residual_histogram(sample)
         caption = (
-            "What the fit left over. Left: a model that fits leaves no large patches of one colour (grey: no data). "
-            "Right: bars that follow the line are noise alone; wider ones are structure that the model lacks."
+            "Residuals of the fit. Left: a model that fits leaves no large patches of one colour (grey: no data). "
+            "Right: bars that follow the line are noise alone; a wider histogram shows a model error."
         )
         drawn += _illustration(fit_figures.residual_figure(cells, histogram), caption, f"residuals of {term}")
     accuracy = evidence.accuracy(term)
@@ -152,7 +152,7 @@ def _geometry(evidence: Evidence) -> tuple[Illustration, ...]:
     camera = evidence.calibration.rig.camera
     caption = (
         f"Left: corners of {evidence.boards.views} views; they should reach into every corner of the sensor. "
-        "Right: what is left after the fit; it should be round and centred."
+        "Right: their residuals; they should be round and centred."
     )
     figure = figures.board_figure(evidence.boards, camera.columns, camera.rows)
     return _illustration(figure, caption, "board coverage and residuals")
@@ -160,7 +160,7 @@ def _geometry(evidence: Evidence) -> tuple[Illustration, ...]:
 
 def _wire(evidence: Evidence) -> tuple[Illustration, ...]:
     caption = (
-        "The ripple in the map by which the picture is divided (the lens's shading is taken out here, to show it). "
+        "The ripple in the map by which the picture is divided (shown without the lens's shading). "
         "A difference from the truth should show no stripes and no trend."
     )
     return _illustration(figures.wire_figure(evidence.fitted, evidence.true), caption, "wire map")
@@ -173,7 +173,7 @@ def _psf(evidence: Evidence) -> tuple[Illustration, ...]:
 
 def _backscatter(evidence: Evidence) -> tuple[Illustration, ...]:
     caption = (
-        "The part of the panel in front of the lens, showing a picture that was not captured, and the light it sends "
+        "The part of the panel in front of the lens with a picture that was not captured, and the light that it sends "
         "back into the camera (one site of the pattern)."
     )
     return _illustration(figures.backscatter_figure(evidence.fitted, evidence.true), caption, "backscatter")

@@ -17,7 +17,7 @@ class Table:
 
 
 def number(value: float, sigma: float | None = None) -> str:
-    """A number with two digits of its sigma shown, or four significant digits when there is none."""
+    """Return a number to the second digit of its sigma, or with four significant digits without a sigma."""
     if not math.isfinite(value):
         return "not known"
     if sigma is None or not math.isfinite(sigma) or sigma <= 0:
@@ -30,5 +30,5 @@ def number(value: float, sigma: float | None = None) -> str:
 
 
 def spread(sigma: float | None) -> str:
-    """A sigma with two digits, or a dash where there is none."""
+    """Return a sigma with two digits, or a dash where there is none."""
     return "–" if sigma is None or not math.isfinite(sigma) or sigma <= 0 else f"{sigma:.2g}"

@@ -1,4 +1,4 @@
-"""The simulated rig's own values of the quantities that the fits estimate, under the names of the estimates."""
+"""True values of a simulated rig for the quantities that the fits estimate, under the names of the estimates."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from udccal.simulation.truth import RigTruth
 
 @dataclass(frozen=True)
 class TrueValue:
-    """A quantity as it really is; ``name`` and unit are those of the term's estimate."""
+    """A true quantity; ``name`` and unit are those of the term's estimate."""
 
     term: TermName
     name: str
@@ -22,7 +22,7 @@ class TrueValue:
 
 
 def true_values(truth: RigTruth) -> tuple[TrueValue, ...]:
-    """Every quantity that both a fit and the simulated rig can name."""
+    """Return every quantity that both a fit and the simulated rig have."""
     sensor, optics, panel = truth.sensor, truth.optics, truth.panel
     standoff_mm = -float(optics.pupil_mm[2])
     sigma_d = float(np.hypot(sensor.sigma_read_e, sensor.sigma_row_DN / sensor.K_DN_per_e))
@@ -40,7 +40,7 @@ def true_values(truth: RigTruth) -> tuple[TrueValue, ...]:
         TrueValue("geometry", "cx", optics.cx_px),
         TrueValue("geometry", "cy", optics.cy_px),
         TrueValue("geometry", "tilt_deg", optics.tilt_deg),
-        # An opening of some depth lets light through as a thin one half-way through it would.
+        # An opening of some depth transmits light as a thin one at half its depth.
         TrueValue("wire", "standoff_per_pitch", (standoff_mm + panel.depth_mm / 2) / panel.pitch_mm),
         TrueValue("wire", "row_open", panel.row_open),
         TrueValue("wire", "column_open", panel.column_open),
@@ -56,7 +56,7 @@ def true_values(truth: RigTruth) -> tuple[TrueValue, ...]:
 
 
 def true_geometry(truth: RigTruth) -> Geometry:
-    """The simulated rig's geometry as the term that a perfect fit would find."""
+    """Return the geometry term that a perfect fit of the simulated rig ``truth`` would find."""
     optics = truth.optics
     return Geometry(
         focal_px=np.array([optics.fx_px, optics.fy_px]),

@@ -1,4 +1,4 @@
-"""A calibration of a simulated rig against the truth it hides, as typed rows of numbers."""
+"""Compares a calibration of a simulated rig with its truth, as typed rows of numbers."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ _ROTATIONS = 3
 
 @dataclass(frozen=True)
 class TruthRow:
-    """One quantity of a term: what was fitted, what is true, and how far apart they are.
+    """One quantity of a term: its fitted value, its true value, and the error.
 
     ``fitted`` and ``truth`` are None for quantities that are a distance between two maps; ``sigma`` is None where the
-    fit states none.
+    fit has none.
     """
 
     term: TermName
@@ -43,7 +43,7 @@ class TruthRow:
 
 
 def true_maps(light: RigLight, like: TermMaps) -> TermMaps:
-    """The simulated truth at the same places and for the same panel picture as ``like``."""
+    """Return the simulated truth at the same places and for the same panel picture as ``like``."""
     return TermMaps(
         wire=light.wire,
         positions_px=like.positions_px,
@@ -57,7 +57,7 @@ def true_maps(light: RigLight, like: TermMaps) -> TermMaps:
 def compare_with_truth(
     calibration: Calibration, truth: RigTruth, fitted: TermMaps, true: TermMaps
 ) -> tuple[TruthRow, ...]:
-    """Every estimate that the simulated rig can name, and how far the maps of the terms are from the true ones."""
+    """Return every estimate whose truth the simulated rig has, and the errors of the terms' maps."""
     values = [
         TruthRow(value.term, estimate.name, estimate.unit, estimate.value, value.value, error, estimate.sigma)
         for value in true_values(truth)
@@ -77,7 +77,7 @@ def compare_with_truth(
 
 
 def truth_table(rows: tuple[TruthRow, ...]) -> Table:
-    """The rows as text."""
+    """Return ``rows`` as a table of text."""
     text = tuple(
         (
             row.term,
@@ -96,7 +96,7 @@ def truth_table(rows: tuple[TruthRow, ...]) -> Table:
 
 @in_float64
 def ray_error_px(geometry: Geometry, truth: RigTruth) -> float:
-    """95th percentile over the sensor of how far the fitted lens projects the true rays from their true pixels.
+    """Return the 95th percentile over the sensor of the fitted lens's projection errors of true rays, in px.
 
     Both lenses are compared in camera coordinates after the rotation that brings their rays closest (two descriptions
     of one lens may differ by a rotation that the pose absorbs; the tilt is compared on its own).
@@ -113,7 +113,7 @@ def ray_error_px(geometry: Geometry, truth: RigTruth) -> float:
 
 
 def _rotation_against(rays: Float[np.ndarray, "n 3"], errors: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "3 3"]:
-    """Small rotation of rays that takes the common part of errors in normalised image coordinates away."""
+    """Return the small rotation of rays that removes the common part of errors in normalised image coordinates."""
     u, v = rays[:, 0] / rays[:, 2], rays[:, 1] / rays[:, 2]
     # d(u, v) of a rotation by (a, b, c) about x, y, z
     by_u = np.stack([-u * v, 1 + u**2, -v], axis=-1)
@@ -131,7 +131,7 @@ def _wire_distance(result: FitResult, fitted: TermMaps, true: TermMaps) -> Truth
 
 
 def _psf_distances(fitted: TermMaps, true: TermMaps) -> tuple[TruthRow, ...]:
-    """Relative L2 per colour, mean over places that were not captured."""
+    """Return the relative L2 error per colour, mean over places that were not captured."""
     difference = np.sum((fitted.kernels - true.kernels) ** 2, axis=(2, 3))
     relative = 100.0 * np.sqrt(difference / np.sum(true.kernels**2, axis=(2, 3)))
     return tuple(

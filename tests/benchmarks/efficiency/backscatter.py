@@ -47,7 +47,7 @@ _PLACES = np.array([40, 95, 140, 190])
 
 @dataclass(frozen=True)
 class Ideal:
-    """What the pictures tell at best: truth and bounds, from shots without noise that are weighed as if they had it.
+    """Information in the pictures: truth and bounds, from shots without noise that have the weights of noisy ones.
 
     Attributes:
         posterior: the truth, with the Cramér–Rao bound on the parameters' covariance, the prior's information included.
@@ -80,7 +80,7 @@ def ideal_of(of: World, expected: BackscatterData, flat: np.ndarray, template: B
 
 @dataclass(frozen=True)
 class _One:
-    """One realisation: errors, stated sigmas and bounds of the parameters, and the same of predicted light."""
+    """One realisation: errors, sigmas and bounds of the parameters and of predicted light."""
 
     parameters: Float[np.ndarray, "3 18"]
     light: Float[np.ndarray, "3 n"]

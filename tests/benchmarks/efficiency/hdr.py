@@ -1,7 +1,7 @@
 """Merged brackets against the bound of one pixel's censored likelihood, decade by decade.
 
-A pixel of few electrons states its sigma at its own noisy rate, so that z-scores of single pixels are skewed, however
-good the merge; z is taken with the root mean square of the sigmas stated.
+A pixel of few electrons has its sigma at its own noisy rate, so that z-scores of single pixels are skewed even for a
+perfect merge. z uses the root mean square of the sigmas.
 """
 
 from __future__ import annotations

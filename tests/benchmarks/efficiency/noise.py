@@ -1,7 +1,7 @@
-"""The noise fit on many sensors of one kind, every frame drawn anew, against the bound of its own likelihood.
+"""The noise fit on many sensors of one kind, each with new frames, against the bound of its own likelihood.
 
-The sensor bends by two per cent, its read noise is heavy-tailed, and it has every other term of the model: so each of
-the figures is of a term that is there.
+The sensor bends by two per cent, its read noise is heavy-tailed, and it has every other term of the model: so
+each figure belongs to a term that is present.
 """
 
 from __future__ import annotations
@@ -102,10 +102,10 @@ def _statistics(sensor: ToySensor, x: Float[Array, "12"]) -> tuple[Float[Array, 
 
 
 def _histogram_information(sensor: ToySensor, x: Float[np.ndarray, "12"]) -> Float[np.ndarray, "3 3"]:
-    """On gain, read variance and shape, of the joint histograms that are expected of the dark pairs.
+    """Return the information on gain, read variance and shape in the expected joint histograms of the dark pairs.
 
-    The gain is in it by the counts of dark current. Row noise is that of these very frames, and so known to them;
-    black, dark current and offsets are left free: rows and pixels that pairs share tell less of them than it seems.
+    The counts of dark current carry information about the gain. Row noise is that of these frames, and so known. Black,
+    dark current and offsets are free: rows and pixels are common to both frames of a pair and so less informative.
     """
     rng = np.random.default_rng(0)
     fixed = patterns(sensor, rng)

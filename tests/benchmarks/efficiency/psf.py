@@ -1,7 +1,7 @@
 """psf: the numbers of diffraction, and the kernel at field points, against the Cramér–Rao bound.
 
 Truths are drawn from the fit's prior, pictures have shot and read noise, and all samples go into the fit. The pitch is
-held by the fit and stated with the rig's tolerance: there is nothing to be efficient about, and it is left out.
+held by the fit and has the rig's tolerance as its sigma, so it has no efficiency and is left out.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ _SAMPLES = ((8, 4), (8, 5), (7, 4), (5, 4), (2, 4))
 
 @dataclass(frozen=True)
 class _Outcome:
-    """Errors, stated sigmas and bounds of all numbers, then of all kernel samples relative to the peak."""
+    """Errors, sigmas and bounds of all parameters, then of all kernel samples relative to the peak."""
 
     error: Float[np.ndarray, " quantities"]
     sigma: Float[np.ndarray, " quantities"]
@@ -106,9 +106,9 @@ def _at_points(
 def _information(
     scene: Scene, prior: Prior, theta: Float[np.ndarray, " p"], made: list[Picture]
 ) -> Float[np.ndarray, "p p"]:
-    """Information on the global parameters, the prior's included, with every shot's own unknowns taken out.
+    """Return the information on the global parameters, with the prior's; each shot's own parameters are eliminated.
 
-    The light is Poisson's: its variance tells no more of the mean than the mean itself does.
+    The light is Poisson distributed: its variance adds no information about the mean.
     """
     shots = shots_of(scene, made, np.random.default_rng(0))
     true = np.stack([picture.source_px for picture in made])

@@ -1,4 +1,4 @@
-"""Many fits of one quantity against the truth: efficiency, and whether the stated sigma is true."""
+"""Many fits of one quantity against the truth: efficiency, and whether sigma is right."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ _UNNOTICED = 0.2
 
 @dataclass(frozen=True)
 class Trials:
-    """Realisations of one quantity, looked at in one or more places.
+    """Realisations of one quantity at one or more places.
 
     Attributes:
         name: term and quantity, such as ``noise/K``.
         error: estimate minus truth.
-        sigma: the standard deviation that the fit stated.
+        sigma: standard deviation from the fit.
         bound: the Cramér–Rao bound on the standard deviation, at the truth.
     """
 
@@ -59,7 +59,7 @@ def column(name: str, error: list[float], sigma: list[float], bound: float | lis
 
 
 def figure(trials: Trials) -> Figure:
-    """Judge the trials. Places of one realisation share its noise: standard errors come from whole realisations."""
+    """Evaluate the trials. Standard errors come from whole realisations, whose places have the same noise."""
     count = len(trials.error)
     ratio = ((trials.error / trials.bound) ** 2).mean(axis=1)
     over, over_error = float(ratio.mean()), float(ratio.std(ddof=1) / np.sqrt(count))

@@ -89,7 +89,7 @@ def bounds(truth: Wire, built: WireStart) -> tuple[Float[np.ndarray, "10"], Floa
 @final
 @dataclass(frozen=True)
 class Errors:
-    """Of one fit: shape and map, their stated sigmas and their bounds."""
+    """Errors of one fit: shape and map, with their sigmas and bounds."""
 
     shape: Float[np.ndarray, "3 10"]
     places: Float[np.ndarray, "3 places"]
@@ -98,7 +98,7 @@ class Errors:
 def errors(
     fit: FitResult[Wire], truth: Wire, bound: tuple[Float[np.ndarray, "10"], Float[np.ndarray, " places"]]
 ) -> Errors:
-    """Estimate minus truth, stated sigma, bound."""
+    """Estimate minus truth, sigma, bound."""
     result = fit.or_raise()
     found = np.array([e.value for e in result.estimates])
     off = found - shape_values(truth)

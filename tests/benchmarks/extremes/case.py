@@ -18,13 +18,13 @@ MOST_SINGLE = 0.1
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a fit made of an extreme input.
+    """Result of a fit of an extreme input.
 
     Attributes:
         status: how it ended.
         z: errors of its results in units of their sigma; empty where it gave none.
         finite: whether every number that it gave is finite.
-        advice: what it tells a person to do, beyond the status.
+        advice: what a person should do, in addition to the status.
     """
 
     status: FitStatus

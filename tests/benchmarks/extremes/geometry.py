@@ -89,7 +89,7 @@ def _truth(scene: Sight) -> dict[str, float]:
 
 
 def _drawn_from_prior(**options: float | int | bool) -> Sight:
-    """A lens as the prior has it: where the data do not tell it, only then are the error bars true."""
+    """Draw a lens from the prior: only then are the error bars right where the data do not determine the lens."""
     rng = np.random.default_rng(12)
     focal = 870.0 + _FOCAL_SIGMA_PX * rng.standard_normal(2)
     centre = np.array([511.5, 383.5]) + _CENTRE_SIGMA_PX * rng.standard_normal(2)

@@ -1,4 +1,4 @@
-"""Brackets at the ends: all too short, all clipped, seven decades, odd gains, no dark noise, few bits."""
+"""Brackets at the ends: all too short, all clipped, seven decades, extreme gains, no dark noise, few bits."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ def _sensor(K: float = 0.36, sigma_d: float = 4.0, bits: int = 12, black: float 
 
 
 def _merged(sensor: Noise, rates: tuple[float, float], times: np.ndarray = _TIMES) -> Outcome:
-    """Pixels of rates spread evenly in the logarithm, judged in groups of similar rate.
+    """Pixels of rates spread evenly in the logarithm, evaluated in groups of similar rate.
 
-    A pixel of few electrons states its sigma at its own noisy rate: a group's root mean square is judged.
+    A pixel of few electrons has its sigma at its own noisy rate, so a group's root mean square is evaluated.
     """
     rate = np.geomspace(*rates, _PIXELS)
     rng = np.random.default_rng(5)

@@ -1,4 +1,4 @@
-"""Sensors and captures at the ends: single electrons, odd gains, no dark noise, few bits, clipped, flickering."""
+"""Sensors and captures at the ends: single electrons, extreme gains, no dark noise, few bits, clipped, flickering."""
 
 from __future__ import annotations
 

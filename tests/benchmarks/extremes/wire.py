@@ -35,7 +35,7 @@ _FAR_FOCAL_PX, _STEEP_FOCAL_PX = 1500.0, 400.0
 
 
 def judged(fit: FitResult[Wire], flat: Flat) -> Outcome:
-    """The map's errors at places over the sensor, in its stated sigmas."""
+    """Return the map's errors at places over the sensor, in units of its sigma."""
     if not fit.ok:
         return outcome(fit)
     error = map_at(fit.term, places()) - map_at(flat.truth, places())

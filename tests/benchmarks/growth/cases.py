@@ -1,4 +1,4 @@
-"""What is measured as data double: per term and knob, its sizes and the work."""
+"""Cases of growing data: for each term and each growing quantity, its sizes and the work."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Case:
-    """One knob of one term; ``prepare(size)`` makes the data and returns the work on them."""
+    """One growing quantity of one term; ``prepare(size)`` makes the data and returns the work on them."""
 
     term: str
     knob: str

@@ -12,7 +12,7 @@ from udccal.compilation import compilation_clock
 
 
 def main() -> None:
-    """Arguments: term, knob, size."""
+    """Arguments: term, growing quantity, size."""
     term, knob, size = sys.argv[1:]
     cases = importlib.import_module(f"tests.benchmarks.growth.{term}").CASES
     (case,) = (c for c in cases if c.knob == knob)

@@ -3,8 +3,8 @@
     python -m tests.benchmarks.peers.ours_intrinsics --peers ../shared/peers --seeds 10 --starts 1000 --covered 200
 
 ``rot_rms`` is the pixel error over the field after the best common rotation, root mean square over the seeds, and
-``predicted_rms`` what the covariances say of it; ``projection_z_std`` compares the two place by place, over as many
-seeds as ``--covered`` says: the places of one seed share its noise, and ten seeds do not tell an error bar.
+``predicted_rms`` its prediction by the covariances; ``projection_z_std`` compares the two place by place, over as many
+seeds as ``--covered`` says: the places of one seed have the same noise, and ten seeds do not determine an error bar.
 ``seconds`` is the median of one calibration once compiled, ``first_run_s`` the very first with compilation.
 """
 
@@ -81,7 +81,7 @@ def aligned(works: ModuleType, intrinsics: np.ndarray) -> np.ndarray:
 
 
 def z_scores(works: ModuleType, result: CalibratedViews) -> np.ndarray:
-    """Errors after the best common rotation in units of the sigma stated for them, (81, 2)."""
+    """Errors after the best common rotation in units of their sigma, (81, 2)."""
     cov = result.projection_covariance(works.intr_grid(), Gauge.ALIGNED)
     return aligned(works, result.intrinsics.vector) / np.sqrt(np.einsum("nii->ni", cov))
 

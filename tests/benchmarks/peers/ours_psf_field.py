@@ -132,7 +132,7 @@ def best_fit(kernel: np.ndarray, truth: Callable[[float, float], np.ndarray]) ->
 def z_scores(
     term: StampsPsf, test: np.ndarray, plane: int, truth: Callable[[float, float, float, float], np.ndarray]
 ) -> np.ndarray:
-    """Errors of every pixel in units of the stated sigma; the truth in the term's own convention."""
+    """Errors of every pixel in units of sigma; the truth in the term's own convention."""
     errors = []
     for (x, y), kernel in zip(test, term.predict(test, plane), strict=True):
         errors.append(kernel - centred(term, lambda dx, dy, x=x, y=y: truth(x, y, dx, dy)))

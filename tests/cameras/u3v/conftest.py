@@ -1,4 +1,4 @@
-"""What the driver's tests share."""
+"""Fixtures of the driver's tests."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The virtual camera as a host without a driver sees it: what its own tests share."""
+"""The virtual camera as a host without a driver sees it, for its own tests."""
 
 from __future__ import annotations
 

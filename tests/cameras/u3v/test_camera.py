@@ -249,7 +249,7 @@ def test_frames_of_an_earlier_call_end_with_a_sentence(camera: U3vCamera) -> Non
         frames = camera.frames(5)
         next(frames)
         interrupt()
-        with pytest.raises(CameraError, match="anew"):
+        with pytest.raises(CameraError, match="Ask for frames again"):
             next(frames)
 
 
@@ -261,7 +261,7 @@ def test_the_device_is_left_stopped_and_free(device: VirtualCamera) -> None:
         assert device._acquisition.running
     assert not device._acquisition.running
     assert device._memory.uint(at.SI_CONTROL) == 0
-    with pytest.raises(CameraError, match="anew"):
+    with pytest.raises(CameraError, match="Ask for frames again"):
         next(frames)
     assert not backend._handles
 

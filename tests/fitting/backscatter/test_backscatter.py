@@ -157,7 +157,7 @@ def test_the_candidate_of_the_largest_evidence_is_chosen(fitted: FitResult[Backs
 
 
 def test_what_the_model_leaves_out_counts_as_noise(fitted: FitResult[Backscatter]) -> None:
-    """The simulator is not of the model's class: its chi2 is explained by an error that is stated."""
+    """The simulator is not of the model's class: a model error in the result explains its chi2."""
     share = next(d.value for d in fitted.diagnostics if d.name == "model_error_of_white")
     assert 1e-4 < share < 0.01
     assert fitted.chi2_dof == pytest.approx(1.0, abs=0.15)

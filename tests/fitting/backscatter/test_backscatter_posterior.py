@@ -22,7 +22,7 @@ _SHARE, _PLACE = 0.08, 2e-3
 
 
 def _errors_at(share: float, place: float):  # type: ignore[no-untyped-def]
-    """Pictures that tell the share of the light by way of the glass, and a mean of both planes' distances."""
+    """Pictures that determine the fraction of the light through the glass, and a mean of both planes' distances."""
 
     def errors_at(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         reflected = expit(x[REFLECTION])
@@ -89,7 +89,7 @@ def test_a_mixture_is_as_wide_as_its_parts_and_their_distance() -> None:
 
 
 def test_held_out_pictures_of_the_model_leave_nothing_undescribed() -> None:
-    """Few pictures tell 18 parameters: what the fit does not know of them is no error of the model."""
+    """Few pictures determine 18 parameters: their uncertainty is not a model error."""
     rng = np.random.default_rng([0, 0x4E1D])
     of = world(rng, small_rig())
     shots = shots_of(of, rng, panel_pictures(of.rig, 0, PICTURES))

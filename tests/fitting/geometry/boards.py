@@ -86,7 +86,7 @@ class Sight:
         return ((exact > 2) & (exact < np.array(self.size) - 3)).all(axis=-1)
 
     def views(self, rng: np.random.Generator, parallel: int = 1) -> list[BoardView]:
-        """With noise; corners outside the picture are not seen. ``sigma`` is without the scatter that all share."""
+        """With noise; corners outside the picture are not seen. ``sigma`` excludes the common scatter."""
         own = np.sqrt(np.maximum(self.sigma_px**2 - COMMON_PX**2, 0.0))
         found = []
         for k, (exact, inside) in enumerate(zip(self.corners_px(), self.seen(), strict=True)):

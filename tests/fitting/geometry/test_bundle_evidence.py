@@ -73,7 +73,7 @@ def test_views_of_different_lenses_disagree_and_widen_all(plain: CalibratedViews
 
 
 def test_error_bars_of_views_that_disagree_are_those_of_drawn_lenses() -> None:
-    """Boards bent by some mm, each its own way: noise alone would state a third of the scatter."""
+    """Boards bent by some mm, each differently: noise alone would give a third of the scatter."""
     scene = sight(views=12, sigma_px=0.06)
     flat = board_points_mm(scene.spec)
     u, v = ((flat - flat.mean(axis=0)) / np.ptp(flat[:, :2]))[:, :2].T

@@ -1,4 +1,4 @@
-"""Scatter beside noise: found at its size, and absent where there is none."""
+"""Scatter in addition to noise: found at its size, and absent where there is none."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ START = Geometry(np.full(2, 850.0), np.array([511.5, 383.5]), np.zeros(5), np.ze
 
 
 def fitted(sigma_scale: float) -> FitResult[Geometry]:
-    """Views whose corners say ``sigma_scale`` times the noise that they have beside the common scatter."""
+    """Views whose corners give ``sigma_scale`` times their noise as sigma, and have a common scatter in addition."""
     scene = sight(views=12, sigma_px=0.06)
     views = scene.views(np.random.default_rng(5))
     told = [

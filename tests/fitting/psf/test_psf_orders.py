@@ -1,4 +1,4 @@
-"""Which residual is chosen beside diffraction, and which image without it, where they are known."""
+"""Which residual is chosen in addition to diffraction, and which image without it, where they are known."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the psf fit goes by: noise at the expected light, a model error that the residuals tell, outliers, patterns."""
+"""Weights of the psf fit: noise at the expected light, a model error estimated from residuals, outliers, patterns."""
 
 from __future__ import annotations
 

@@ -28,7 +28,7 @@ def wire() -> Wire:
 
 
 def found(wire: Wire, share: float, seed: int, noise: float = NOISE) -> tuple[Omitted, float]:
-    """What is found of a flat that has a share of the harmonics left out, and their RMS."""
+    """Fit a flat that has a fraction of the omitted harmonics; return the result and their RMS."""
     with jax.enable_x64(True):
         pixels = even_pixels(wire, noise, seed)
         weak = possible_harmonics(START, RULES.least_counted, RULES.least_amplitude)

@@ -1,1 +1,1 @@
-"""Picture files as frames: raw files, 16-bit TIFF and PNG, EXR; what they say about themselves, and their order."""
+"""Picture files as frames: raw files, 16-bit TIFF and PNG, EXR; their fields and their order."""

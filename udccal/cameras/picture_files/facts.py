@@ -1,4 +1,4 @@
-"""What a picture file says about how it was taken, read without its samples (Exif 2.32, section 4.6; DNG 1.6)."""
+"""Reads how a picture was taken from its file, without its samples (Exif 2.32, section 4.6; DNG 1.6)."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _SAY_NOTHING: Final = (".png", ".exr")
 @final
 @dataclass(frozen=True)
 class Facts:
-    """What a file states; absent or empty where it does not.
+    """Fields of a file; None or empty where the file does not have them.
 
     Attributes:
         taken_s: seconds since 1970 by the camera's own clock and calendar.
@@ -38,9 +38,9 @@ class Facts:
 
 
 def read_facts(path: Path) -> Facts:
-    """What the file states.
+    """Read the fields of the file at ``path``.
 
-    LibRaw tells 1 s where a TIFF-like file leaves the exposure blank; it is asked only about files of other builds.
+    LibRaw returns 1 s where a TIFF-like file leaves the exposure blank, so it reads only files of other formats.
 
     Raises:
         FileFormatError: when the file is missing or damaged.
@@ -75,7 +75,7 @@ def _iso(places: tuple[Directory, ...]) -> float | None:
 
 
 def _positive(places: tuple[Directory, ...], tag: int) -> float | None:
-    """The first place's number that can be one: blank fields are written as 0."""
+    """Return the first usable number of several fields; blank fields are written as 0."""
     values = (place.number(tag) for place in places)
     return next((value for value in values if value is not None and 0 < value < math.inf), None)
 

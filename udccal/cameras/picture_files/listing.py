@@ -1,4 +1,4 @@
-"""Which files of a folder are its frames, in which order, and what is known of each beforehand."""
+"""Lists the files of a folder that are its frames, in order, with their known settings."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ MAX_FILES: Final = 40_000
 @final
 @dataclass(frozen=True)
 class ListedPicture:
-    """A file, and what its user says about it; absent where the file is to speak for itself."""
+    """A file, and the settings that its user gives; None where the file's own fields count."""
 
     path: Path
     exposure_s: float | None = None
@@ -26,7 +26,7 @@ class ListedPicture:
 
 
 def list_files(paths: Sequence[str | Path]) -> tuple[ListedPicture, ...]:
-    """Files in the order given.
+    """List the files of ``paths`` in their order.
 
     Raises:
         CameraError: when there is none, or more than a session ever needs.
@@ -37,7 +37,7 @@ def list_files(paths: Sequence[str | Path]) -> tuple[ListedPicture, ...]:
 
 
 def pictures_in(folder: Path) -> tuple[Path, ...]:
-    """The pictures of a folder by name, numbers in names by value (2 before 10); other files are not looked at.
+    """Return the pictures of ``folder`` by name, numbers in names by value (2 before 10); ignore other files.
 
     Raises:
         CameraError: when it is not a folder, or holds more files than a session ever needs.
@@ -54,7 +54,7 @@ def pictures_in(folder: Path) -> tuple[Path, ...]:
 
 
 def _natural(path: Path) -> tuple[tuple[tuple[int, str], ...], str]:
-    """Text and numbers in turn; digits are compared by length and then by letter, which is by value."""
+    """Split a name into text and numbers; digits are compared by length, then by letter, which is by value."""
     parts = re.split(r"([0-9]+)", path.name.lower())
     bare = (part.lstrip("0") if index % 2 else part for index, part in enumerate(parts))
     return tuple((len(part) if index % 2 else 0, part) for index, part in enumerate(bare)), path.name

@@ -1,4 +1,4 @@
-"""A mosaic out of a file."""
+"""A mosaic that was read from a file."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from jaxtyping import UInt16
 @final
 @dataclass(frozen=True)
 class Mosaic:
-    """One raw picture in DN, with the pattern and levels that its file states or its user did.
+    """One raw picture in DN, with the pattern and levels from its file or its user.
 
-    ``exposure_s`` is absent where it was not asked for or the file does not say.
+    ``exposure_s`` is None where it was not requested or the file does not contain it.
     """
 
     data: UInt16[np.ndarray, "rows columns"]

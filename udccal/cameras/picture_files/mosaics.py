@@ -1,4 +1,4 @@
-"""Files of every kind as mosaics."""
+"""Reads mosaics from files of every kind."""
 
 from __future__ import annotations
 
@@ -25,14 +25,18 @@ _MAX_DN: Final = 65535
 @final
 @dataclass(frozen=True)
 class Layout:
-    """What PNG, TIFF and EXR files do not say: the CFA pattern (``mono`` for none), and the bits per sample."""
+    """What PNG, TIFF and EXR files do not contain: the CFA pattern (``mono`` for none), and the bits per sample."""
 
     cfa: str
     bits: int
 
 
 def read_raw(path: Path, shape: Shape | None = None) -> Mosaic:
-    """Read a camera raw file with what it states; ``shape`` as ``raw_mosaic``.
+    """Read a camera raw file with its pattern, levels and exposure.
+
+    Args:
+        path: the file.
+        shape: expected (rows, columns), checked before decoding; None for any.
 
     Raises:
         FileFormatError: when it is missing, not a raw file, damaged, too large, or not a 2 x 2 Bayer mosaic.
@@ -41,7 +45,11 @@ def read_raw(path: Path, shape: Shape | None = None) -> Mosaic:
 
 
 def read_mosaic(path: Path, layout: Layout) -> Mosaic:
-    """Read the samples of any file that holds a mosaic; raw files know their own layout.
+    """Read the samples of any file that holds a mosaic.
+
+    Args:
+        path: the file.
+        layout: pattern and bits of PNG, TIFF and EXR files; raw files contain their own.
 
     Raises:
         FileFormatError: when it cannot be read, or has samples beyond the layout's bits.
@@ -64,7 +72,7 @@ def read_mosaic(path: Path, layout: Layout) -> Mosaic:
 
 
 def _single_plane(path: Path) -> UInt16[np.ndarray, "rows columns"]:
-    """An EXR of one channel that holds DN; fractions are rounded."""
+    """Read an EXR of one channel that holds DN; round fractions."""
     channels = list(read_exr(path).values())
     if len(channels) != 1 or channels[0].min() < 0 or channels[0].max() > _MAX_DN:
         raise FileFormatError(

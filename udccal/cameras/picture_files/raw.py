@@ -1,4 +1,4 @@
-"""Bayer mosaics of camera raw files by way of LibRaw. The only module that imports rawpy."""
+"""Reads Bayer mosaics of camera raw files through LibRaw. The only module that imports rawpy."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ RAW_SUFFIXES = (
     *(".dng", ".cr2", ".cr3", ".nef", ".nrw", ".arw", ".srf", ".sr2", ".raf", ".rw2", ".orf"),
     *(".pef", ".srw", ".3fr", ".fff", ".iiq", ".erf", ".mrw", ".kdc", ".dcr", ".mos", ".raw"),
 )
-# How files of these kinds begin (LibRaw 0.22, identify.cpp). A file that begins otherwise LibRaw takes for one of some
-# camera whose files have the same length.
+# How files of these kinds begin (LibRaw 0.22, identify.cpp). LibRaw takes any other file for one of a camera whose
+# files have the same length.
 _START: Final = re.compile(
     rb"II\*\0|MM\0\*|II(U\0|RO|RS)|MMOR|IIII.waR|MMMMRaw|FUJIFILM|\0MRM|.{4}ftypcrx |.{25}ARECOYK", re.DOTALL
 )
@@ -29,9 +29,9 @@ _START_BYTES: Final = 32
 
 
 def raw_mosaic(path: Path, shape: Shape | None = None) -> Mosaic:
-    """Read the visible part of a Bayer mosaic, unprocessed but for what the maker's coding needs.
+    """Read the visible part of a Bayer mosaic, with no processing but the decoding of the maker's format.
 
-    Of another ``shape`` (rows, columns) than the one given, it is not decoded.
+    A mosaic of another ``shape`` (rows, columns) than the given one is refused before it is decoded.
 
     Raises:
         FileFormatError: when it is missing, not a raw file, damaged, too large, of another shape, or not a 2 x 2
@@ -50,15 +50,15 @@ def raw_mosaic(path: Path, shape: Shape | None = None) -> Mosaic:
 
 
 def libraw_facts(path: Path) -> tuple[float | None, float | None, float | None]:
-    """Exposure in s, ISO and time in s since 1970 as LibRaw tells them; absent where the file says nothing.
+    """Return exposure in s, ISO and time in s since 1970 from LibRaw; None where the file does not contain them.
 
-    A file that states no ISO is taken to state no exposure either: LibRaw fills a blank one in with 1 s.
+    A file without an ISO counts as one without an exposure: LibRaw replaces a blank exposure by 1 s.
 
     Raises:
         FileFormatError: as ``raw_mosaic``.
     """
     with _opened(path) as raw:
-        other = getattr(raw, "other", None)  # older rawpy does not tell
+        other = getattr(raw, "other", None)  # older rawpy does not have it
         if other is None or not other.iso_speed > 0:
             return None, None, None
         exposure = float(other.shutter_speed)

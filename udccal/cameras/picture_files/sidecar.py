@@ -1,4 +1,4 @@
-"""``frames.csv``: a table beside pictures that do not say, or say wrongly, how they were taken."""
+"""``frames.csv``: a table for pictures that do not contain, or contain wrongly, how they were taken."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ _TIMES_S: Final = (-1e12, 1e12)
 
 
 def list_folder(folder: Path) -> tuple[ListedPicture, ...]:
-    """The frames of a folder: those of its ``frames.csv`` in that order, or all pictures by name.
+    """List the frames of ``folder``: those of its ``frames.csv`` in that order, else all pictures by name.
 
     Raises:
-        CameraError: when there are none, or the table names others than those that are there.
-        FileFormatError: when the table is not as docs/cameras.md says.
+        CameraError: when there are none, or the table names other files than the folder holds.
+        FileFormatError: when the table does not follow docs/cameras.md.
     """
     present = pictures_in(folder)
     table = folder / NAME
@@ -79,6 +79,6 @@ def _number(table: Path, number: int, text: str, bounds: tuple[float, float]) ->
     if not bounds[0] <= value <= bounds[1]:
         raise FileFormatError(
             f"Expected a number from {bounds[0]:g} to {bounds[1]:g} in line {number} of {table}, found '{text[:40]}'. "
-            "Correct it; numbers have a point, no comma."
+            "Correct it; use a decimal point, no comma."
         )
     return value

@@ -1,6 +1,6 @@
-"""Fields of TIFF directories, which DNG and most camera raw files are built of too (TIFF 6.0, section 2).
+"""Reads fields of TIFF directories, the base of DNG and most camera raw files (TIFF 6.0, section 2).
 
-Nothing is read before its size and place are checked against the file; fields nobody asks for are not read at all.
+The size and place of each field are checked against the file before it is read; fields not needed are not read.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class Field:
 
 
 def is_tiff(start: bytes) -> bool:
-    """Whether a file that begins so is built of TIFF directories with 32-bit offsets."""
+    """Return whether a file that begins this way consists of TIFF directories with 32-bit offsets."""
     return start[:4] in (_LITTLE, _BIG)
 
 
@@ -43,7 +43,7 @@ class Directory:
     """One directory of an open file.
 
     Attributes:
-        fields: in the order of the file.
+        fields: fields in the order of the file.
         following: offset of the next directory, 0 for none.
     """
 
@@ -63,7 +63,7 @@ class Directory:
 
     @staticmethod
     def first(stream: BinaryIO, path: Path) -> Directory:
-        """The directory that the header points to.
+        """Return the directory that the header points to.
 
         Raises:
             FileFormatError: when the file is not TIFF with 32-bit offsets, or damaged.
@@ -76,16 +76,16 @@ class Directory:
         return Directory(stream, path, order, struct.unpack(f"{order}I", header[4:])[0])
 
     def under(self, tag: int) -> Directory | None:
-        """The directory that a field points to, if it is there."""
+        """Return the directory that a field points to, if there is one."""
         offsets = self.integers(tag)
         return Directory(self._stream, self._path, self._order, offsets[0]) if offsets else None
 
     def integers(self, tag: int) -> tuple[int, ...]:
-        """Whole numbers of a field; empty when it is absent."""
+        """Return the whole numbers of a field; empty when it is absent."""
         return tuple(value for value in self._values(tag) if isinstance(value, int))
 
     def number(self, tag: int) -> float | None:
-        """The first number of a field, rationals as quotients; None when absent or divided by 0."""
+        """Return the first number of a field, rationals as quotients; None when absent or divided by 0."""
         field = self._find(tag)
         values = [value for value in self._values(tag) if isinstance(value, int | float)]
         if field is None or not values:
@@ -95,7 +95,7 @@ class Directory:
         return values[0] / values[1] if values[1] else None
 
     def text(self, tag: int) -> str:
-        """A text up to its first zero byte, printable ASCII only; empty when absent."""
+        """Return a text up to its first zero byte, printable ASCII only; empty when absent."""
         field = self._find(tag)
         if field is None or field.kind != _TEXT:
             return ""

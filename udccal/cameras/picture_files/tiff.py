@@ -1,4 +1,4 @@
-"""TIFF files as mosaics: one 16-bit picture of one channel, decoded by OpenCV after its directory has been checked."""
+"""Reads mosaics from TIFF files, 16-bit and of one channel; OpenCV decodes them after a check of the directory."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def read_tiff16(path: Path) -> UInt16[np.ndarray, "rows columns"]:
 
 
 def _checked(directory: Directory, path: Path) -> tuple[int, int]:
-    """Rows and columns, of a directory that describes what can be read."""
+    """Return rows and columns; refuse a directory that describes another kind of picture."""
     rows, columns = _one(directory, _ROWS, 0), _one(directory, _COLUMNS, 0)
     check_size(path, rows, columns)
     found = (
@@ -68,7 +68,7 @@ def _checked(directory: Directory, path: Path) -> tuple[int, int]:
 
 
 def _check_parts(directory: Directory, path: Path, rows: int, columns: int) -> None:
-    """Every strip or tile is there and lies in the file: decoders differ in what they put where one is missing."""
+    """Check that every strip or tile lies in the file: decoders differ in how they fill a missing one."""
     tiled = bool(directory.integers(_TILES))
     starts = directory.integers(_TILES if tiled else _STRIPS)
     lengths = directory.integers(_TILE_BYTES if tiled else _STRIP_BYTES)

@@ -1,1 +1,1 @@
-"""Basler's pylon SDK, through pypylon, behind small typed pieces; ``udccal.cameras.pylon`` puts them together."""
+"""Small typed wrappers of Basler's pylon SDK (pypylon), which ``udccal.cameras.pylon`` combines."""

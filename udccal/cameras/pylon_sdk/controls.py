@@ -1,5 +1,4 @@
-"""Modes and settings as GenICam features: SFNC's names, and where a device lacks these, the older ones that end in
-``Abs``."""
+"""Sets modes and settings through GenICam features, by SFNC's names or else by the older ones that end in ``Abs``."""
 
 from __future__ import annotations
 
@@ -21,14 +20,14 @@ _SOFTWARE: Final = "Software"
 
 
 def read_sensor(nodes: Nodes) -> Region:
-    """The largest region without binning, cut to whole 2 x 2 cells."""
+    """Return the largest region without binning, cropped to whole 2 x 2 cells."""
     sides = (nodes.number("WidthMax", "SensorWidth", "Width"), nodes.number("HeightMax", "SensorHeight", "Height"))
     columns, rows = (2 * (int(side or 0) // 2) for side in sides)
     return Region(0, 0, columns, rows)
 
 
 def read_features(nodes: Nodes) -> Features:
-    """What the device can do now."""
+    """Return what the device can do in its current mode."""
     exposure = nodes.bounds(*_EXPOSURE) or _NOTHING
     steps = tuple(math.lcm(2, nodes.step(name)) for name in ("OffsetX", "OffsetY", "Width", "Height"))
     return Features(
@@ -42,12 +41,12 @@ def read_features(nodes: Nodes) -> Features:
 
 
 def read_mode(nodes: Nodes) -> Mode:
-    """How the device works now."""
+    """Return the current mode."""
     return Mode(nodes.text("PixelFormat"), _paced_rate_hz(nodes), _trigger(nodes))
 
 
 def write_mode(nodes: Nodes, mode: Mode) -> None:
-    """Set a mode that was found among the features."""
+    """Set a mode that the features allow."""
     nodes.choose("PixelFormat", mode.pixel_format)
     can_be_free = nodes.set_flag(mode.frame_rate_hz is not None, *_RATE_ENABLE)
     fastest = nodes.bounds(*_RATE)
@@ -65,14 +64,14 @@ def write_mode(nodes: Nodes, mode: Mode) -> None:
 
 
 def read_settings(nodes: Nodes) -> Settings:
-    """What the device exposes with now; a device without a gain in dB is at 0 dB."""
+    """Return the current settings; a device without a gain in dB is at 0 dB."""
     numbers = [int(nodes.number(name) or 0) for name in ("OffsetX", "OffsetY", "Width", "Height")]
     exposure_s = (nodes.number(*_EXPOSURE) or 0.0) / _US_PER_S
     return Settings(exposure_s, nodes.number(*_GAIN) or 0.0, Region(*numbers))
 
 
 def write_settings(nodes: Nodes, settings: Settings) -> None:
-    """Set what was found within the features; a device without a gain in dB is set to the least it has."""
+    """Set settings that the features allow; a device without a gain in dB is set to its smallest gain."""
     nodes.set_number(settings.exposure_s * _US_PER_S, *_EXPOSURE)
     least = nodes.bounds("GainRaw")
     if not nodes.set_number(settings.gain_dB, *_GAIN) and least is not None:
@@ -88,23 +87,23 @@ def write_settings(nodes: Nodes, settings: Settings) -> None:
 
 
 def frame_period_s(nodes: Nodes) -> float:
-    """Time from one frame to the next of a paced camera; 0 when it runs as fast as it can."""
+    """Return the frame period in s of a paced camera; 0 when it runs as fast as it can."""
     rate_hz = _paced_rate_hz(nodes)
     return 1.0 / rate_hz if rate_hz else 0.0
 
 
 def _paced_rate_hz(nodes: Nodes) -> float | None:
-    """The rate that the camera is held to; a device without a switch for that always is."""
+    """Return the rate limit in Hz; a device without a switch for it always has one."""
     return nodes.number(*_RATE) if nodes.flag(*_RATE_ENABLE) in (True, None) else None
 
 
 def ticks_per_s(nodes: Nodes) -> float:
-    """Of the camera's clock: USB3 Vision counts in ns, GigE Vision says in what."""
+    """Return the tick of the camera's clock in s: USB3 Vision counts ns, GigE Vision gives its unit."""
     return nodes.number("GevTimestampTickFrequency") or 1e9
 
 
 def _formats(nodes: Nodes) -> tuple[str, ...]:
-    """Formats that hold raw samples; a colour sensor's Mono formats are mixed from its colours."""
+    """Return formats with raw samples; a colour sensor's Mono formats are mixed from its colours."""
     coloured = nodes.text("PixelColorFilter").startswith("Bayer")
     known = (name for name in nodes.choices("PixelFormat") if name in PIXEL_FORMATS)
     return tuple(name for name in known if not (coloured and PIXEL_FORMATS[name].cfa == "mono"))
@@ -126,6 +125,6 @@ def _trigger(nodes: Nodes) -> Trigger:
 
 
 def _line(nodes: Nodes) -> str:
-    """The trigger line chosen already, or the first."""
+    """Return the trigger line that is set already, or the first."""
     chosen = nodes.text("TriggerSource")
     return chosen if chosen.startswith("Line") else next(s for s in nodes.choices("TriggerSource") if "Line" in s)

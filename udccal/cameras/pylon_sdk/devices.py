@@ -1,4 +1,4 @@
-"""Which cameras the SDK sees, and opening one."""
+"""Lists the cameras that the SDK sees, and opens one."""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ class OpenDevice:
 
 
 def device_infos(sdk: Sdk) -> Sequence[Any]:
-    """What the SDK's transport layers find now.
+    """Return the cameras that the transport layers of ``sdk`` find, as its ``DeviceInfo`` objects.
 
     Raises:
-        CameraError: when they cannot look.
+        CameraError: when they cannot search.
     """
     try:
         return tuple(sdk.pylon.TlFactory.GetInstance().EnumerateDevices())
@@ -46,17 +46,17 @@ def device_infos(sdk: Sdk) -> Sequence[Any]:
 
 
 def identity_of(info: Any) -> CameraIdentity:
-    """Who a camera that was found is."""
+    """Return vendor, model and serial number of the SDK's device ``info``."""
     texts = (info.GetVendorName(), info.GetModelName(), info.GetSerialNumber())
     vendor, model, serial = (str(text)[:_MAX_NAME] or "not stated" for text in texts)
     return CameraIdentity(vendor, model, serial, "pylon")
 
 
 def choose_info(infos: Sequence[Any], serial: str | None) -> Any:
-    """The camera of that serial number, or the only one.
+    """Return the camera with that ``serial`` number among ``infos``, or for None the only one.
 
     Raises:
-        CameraError: when it is not there, or there are several to choose from.
+        CameraError: when there is none, or there are several and ``serial`` is None.
     """
     if serial is not None:
         infos = [info for info in infos if info.GetSerialNumber() == serial]
@@ -72,7 +72,7 @@ def choose_info(infos: Sequence[Any], serial: str | None) -> Any:
 
 
 def open_device(sdk: Sdk, info: Any) -> OpenDevice:
-    """Open a camera for control and streaming.
+    """Open the camera ``info`` through ``sdk`` for control and streaming.
 
     Raises:
         CameraBusy: when another program holds it, or this user may not open it.
@@ -85,7 +85,7 @@ def open_device(sdk: Sdk, info: Any) -> OpenDevice:
         accessible, why = factory.IsDeviceAccessibleInfo(info)
         if not accessible and why in held:
             raise CameraBusy(
-                f"Expected to open the camera {name}, found another program to hold it. Close other programs that use "
+                f"Expected to open the camera {name}, found it held by another program. Close other programs that use "
                 "it, such as pylon Viewer."
             )
         if not accessible:
@@ -104,7 +104,7 @@ def open_device(sdk: Sdk, info: Any) -> OpenDevice:
 
 
 def load_features(device: OpenDevice, path: Path) -> None:
-    """Set what a feature file of pylon Viewer says.
+    """Load the feature file of pylon Viewer at ``path`` into an open ``device``.
 
     Raises:
         CameraError: when it is not one, or the camera refuses a line of it.
@@ -121,7 +121,7 @@ def load_features(device: OpenDevice, path: Path) -> None:
 
 
 def close_device(device: OpenDevice) -> None:
-    """Close a camera; one that is gone already is let go of without an error.
+    """Close the camera ``device``; one that is gone already is released without an error.
 
     Raises:
         CameraError: when it does not close.

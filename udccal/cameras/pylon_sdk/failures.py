@@ -1,4 +1,4 @@
-"""The SDK's exceptions as this project's errors."""
+"""Turns the SDK's exceptions into this project's errors."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ _POLL_S: Final = 0.05
 
 @contextmanager
 def translated(sdk: Sdk, device: Any, expected: str, patience_s: float = 0.0) -> Iterator[None]:
-    """Turn what the SDK throws into a typed error.
+    """Turn an exception of the SDK into a typed error.
 
     Args:
         sdk: the SDK.
         device: the ``InstantCamera`` in use.
-        expected: what was wanted, as the middle of a sentence.
+        expected: what was expected, as the middle of a sentence.
         patience_s: how long to wait for the SDK to notice that the device is gone; it does so some time after the
-            first error that this causes.
+            first error.
 
     Raises:
         CameraTimeout: in place of ``TimeoutException``.
@@ -47,12 +47,12 @@ def translated(sdk: Sdk, device: Any, expected: str, patience_s: float = 0.0) ->
 
 
 def reason_of(error: Exception) -> str:
-    """The first part of the SDK's message, without the place in its source."""
+    """Return the SDK's message without the place in its source."""
     return " ".join(str(error).split(" : ")[0].split()).rstrip(".")[:_MAX_REASON] or type(error).__name__
 
 
 def removed_within(device: Any, patience_s: float) -> bool:
-    """Whether the SDK notices within that time that the device was taken away."""
+    """Return whether the SDK notices within that time that the device was removed."""
     deadline = time.monotonic() + patience_s
     while not device.IsCameraDeviceRemoved():
         if time.monotonic() >= deadline:

@@ -1,4 +1,4 @@
-"""Block ids of transport layers as one count that rises."""
+"""Turns block ids of transport layers into one rising count."""
 
 from __future__ import annotations
 
@@ -11,28 +11,28 @@ _HALF_TURN: Final = 32768
 
 @final
 class FrameIds:
-    """Numbers the frames of one opening; devices begin anew with each stream, these numbers go on.
+    """Numbers the frames of one opening; devices restart with each stream, these numbers continue.
 
     USB3 Vision counts from 0 in 64 bits. GigE Vision without extended ids counts from 1 to 65535 and begins at 1 again.
-    A device that does not count says 0, or all ones; then the SDK's own count of received images stands in.
+    A device that does not count sends 0 or all ones; then the SDK's own count of received images replaces it.
     """
 
     def __init__(self) -> None:
         """Start with no frames."""
         self._turns = 0
         self._last_block = 0
-        self._last: int | None = None  # as the device counts, 16-bit turns added
+        self._last: int | None = None  # as the device counts, with 16-bit overflows added
         self._last_number = -1
 
     def begin_stream(self) -> None:
-        """The next frame is the first of a stream."""
+        """Note that the next frame is the first of a stream."""
         self._turns, self._last_block, self._last = 0, 0, None
 
     def next(self, block_id: int, image_number: int) -> tuple[int, int]:
-        """Number of a frame, and how many before it never arrived.
+        """Return the number of a frame, and how many before it never arrived.
 
         Args:
-            block_id: what the device says.
+            block_id: the device's count.
             image_number: the SDK's count of this stream's images, from 1.
         """
         if block_id in (0, _INVALID):

@@ -1,4 +1,4 @@
-"""Grabbing: results of the SDK as samples of their own, with what their chunks say."""
+"""Grabs frames: copies the SDK's results with their chunk values."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ _US_PER_S: Final = 1e6
 @final
 @dataclass(frozen=True)
 class Grabbed:
-    """One result. ``data`` is absent when the grab failed; chunk values where the device sends none.
+    """One result. ``data`` is None when the grab failed; chunk values are None where the device sends none.
 
     Attributes:
-        ticks: of the camera's clock at the start of the exposure; 0 when it has no clock.
+        ticks: camera's clock at the start of the exposure; 0 when it has no clock.
     """
 
     data: UInt16[np.ndarray, "rows columns"] | None
@@ -37,7 +37,7 @@ class Grabbed:
 
 
 def start(device: OpenDevice, count: int) -> None:
-    """Begin an acquisition of ``count`` frames, of which up to 16 may wait to be retrieved.
+    """Begin an acquisition of ``count`` frames on an open ``device``; up to 16 may wait to be retrieved.
 
     Raises:
         CameraLost, CameraError: when the camera does not start.
@@ -49,7 +49,7 @@ def start(device: OpenDevice, count: int) -> None:
 
 
 def stop(device: OpenDevice) -> None:
-    """End the acquisition, if there is one.
+    """End the acquisition of ``device``, if there is one.
 
     Raises:
         CameraLost, CameraError: when the camera does not answer.
@@ -59,7 +59,7 @@ def stop(device: OpenDevice) -> None:
 
 
 def trigger(device: OpenDevice, timeout_s: float) -> None:
-    """Wait until the camera can expose, then have it do so.
+    """Wait at most ``timeout_s`` until ``device`` can expose, then trigger it.
 
     Raises:
         CameraTimeout: when it is not ready in time.
@@ -73,7 +73,7 @@ def trigger(device: OpenDevice, timeout_s: float) -> None:
 
 
 def retrieve(device: OpenDevice, timeout_s: float) -> Grabbed:
-    """The next result, its samples copied.
+    """Return the next result of ``device`` with a copy of its samples; wait at most ``timeout_s``.
 
     Raises:
         CameraTimeout: when none comes in time.

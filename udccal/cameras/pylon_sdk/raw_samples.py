@@ -1,6 +1,6 @@
-"""Switching off what a camera does to its samples, so that they are linear in light, each by itself.
+"""Switches off a camera's processing, so that samples are linear in light and independent of each other.
 
-Features that a camera does not have, or has fixed, are passed over.
+Features that a camera does not have, or has fixed, are skipped.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from udccal.cameras.pylon_sdk.nodes import Nodes
 
 
 def send_raw_samples(nodes: Nodes) -> None:
-    """Bring a camera into the state of ``raw_state``."""
+    """Bring the camera with the features ``nodes`` into the state of ``raw_state``."""
     for choice in raw_state.CHOICES:
         nodes.choose(choice.name, choice.symbol)
     for name in raw_state.SWITCHED_OFF:
@@ -25,7 +25,7 @@ def send_raw_samples(nodes: Nodes) -> None:
 
 
 def _select_gain(nodes: Nodes) -> None:
-    """Select the gain that is set from now on; a digital one beside it would multiply what it sends."""
+    """Select the gain that is set from now on; set an additional digital gain to 0 dB."""
     choices = nodes.choices(raw_state.GAIN_SELECTOR)
     selected = next((gain for gain in raw_state.GAINS if gain in choices), None)
     if selected is None:
@@ -36,7 +36,7 @@ def _select_gain(nodes: Nodes) -> None:
 
 
 def send_chunks(nodes: Nodes) -> None:
-    """Have each frame carry its own exposure, gain and timestamp, where the camera can."""
+    """Make the camera with the features ``nodes`` send exposure, gain and timestamp with each frame, where it can."""
     if not (nodes.has("ChunkSelector") and nodes.set_flag(True, "ChunkModeActive")):
         return
     for chunk in ("ExposureTime", "Gain", "Timestamp"):

@@ -1,4 +1,4 @@
-"""One run of a camera: started, its blocks read and made frames of, and stopped again whatever happens."""
+"""One run of a camera: starts it, reads its blocks, makes frames of them, and stops it whatever happens."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from udccal.errors import CameraError, CameraTimeout
 _READY_POLL_S: Final = 2e-3
 # After a trigger that may have arrived twice, a second frame would begin within this time.
 _TWICE_S: Final = 0.5
-# Whatever the camera says, frames are not waited for longer than an exposure of this length, and this much beyond it.
+# Limits of the wait for a frame, whatever the camera reports: the longest exposure, and the time beyond it.
 _MOST_EXPOSURE_S: Final = 3600.0
 _MOST_PERIOD_S: Final = 120.0
 
@@ -32,7 +32,7 @@ class Acquisition:
 
     Attributes:
         wait_s: longest wait for a frame.
-        timeout_s: for each transfer within a frame.
+        timeout_s: limit of each transfer within a frame.
     """
 
     device: Device
@@ -42,10 +42,10 @@ class Acquisition:
     timeout_s: float
 
     def frames(self, count: int, first_id: int) -> Iterator[tuple[Frame, int]]:
-        """Frames, each with how many were lost between the one before, or the start, and it.
+        """Yield frames, each with the number of frames lost since the one before or the start.
 
         Args:
-            first_id: of the first frame that the camera takes; block ids begin anew with each run.
+            first_id: id of the first frame; the camera's own block ids restart with each run.
 
         Raises:
             CameraTimeout, CameraLost, CameraProtocolError, CameraError: as for ``Camera.frames``.
@@ -54,7 +54,7 @@ class Acquisition:
         layout = self.device.registers.configure(self.device.link.stream_packet)
         receiver = Receiver(self.device.link, layout, self.timeout_s)
         blocks = self._blocks(receiver, count)
-        previous = -1  # ids count from 0 (USB3 Vision 1.0): what is missing before the first is lost as well
+        previous = -1  # ids count from 0 (USB3 Vision 1.0): frames missing before the first are lost as well
         try:
             self.device.start()
             for payload, block in blocks:
@@ -66,7 +66,7 @@ class Acquisition:
                 first_id += 1
         except BaseException:
             blocks.close()
-            with contextlib.suppress(CameraError):  # what happened first is told
+            with contextlib.suppress(CameraError):  # the first error is raised
                 self.device.stop()
             raise
         blocks.close()
@@ -78,7 +78,7 @@ class Acquisition:
         return ReadAhead(receiver, count, self.wait_s).blocks()
 
     def _triggered(self, receiver: Receiver, count: int) -> Blocks:
-        """A block for each trigger, which is given when the block is asked for."""
+        """Yield a block for each trigger, which is sent when the block is requested."""
         payload = memoryview(bytearray(receiver.room))
         for _ in range(count):
             self._await_ready()
@@ -88,14 +88,14 @@ class Acquisition:
             if block is None:
                 return
             if self.device.control.resent != resent:
-                # The frame of a second trigger would be taken for that of the next, exposed before it was asked for.
+                # The frame of a second trigger would be taken for that of the next, but exposed before its request.
                 with contextlib.suppress(CameraTimeout):
                     unwanted = memoryview(bytearray(receiver.room))
                     receiver.receive(unwanted, self.reader.settings.exposure_s + _TWICE_S, _never)
             yield payload, block
 
     def _await_ready(self) -> None:
-        """Wait until the camera takes a trigger, if it says so; one that comes too early is lost."""
+        """Wait until the camera accepts a trigger, if it reports this; an earlier trigger is lost."""
         nodes = self.device.nodes
         if not nodes.has("AcquisitionStatusSelector"):
             return
@@ -109,12 +109,12 @@ class Acquisition:
 
         if not comes_true(ready, self.wait_s, _READY_POLL_S):
             raise CameraTimeout(
-                "Expected the camera to take a trigger, found it busy. Shorten the exposure or try again."
+                "Expected the camera to accept a trigger, found it busy. Shorten the exposure or try again."
             )
 
 
 def frame_wait_s(settings: Settings, mode: Mode, timeout_s: float) -> float:
-    """Longest wait for a frame: its exposure, or the frame rate's period, and a time-out on top; s.
+    """Return the longest wait for a frame in s: its exposure, or the frame rate's period, plus a time-out.
 
     Args:
         mode: with a frame rate above 0 Hz, or none.

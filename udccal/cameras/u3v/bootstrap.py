@@ -1,4 +1,4 @@
-"""The registers that every camera has at the same places: who it is, where the rest stands, and what it can take."""
+"""Registers that every camera has at the same addresses: its identity, the other registers, and its limits."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _STRING_BYTES: Final = 64
 
 # Technology Specific Bootstrap Register Map, SBRM (USB3 Vision): offsets.
 _U3VCP_CAPABILITY: Final = 0x04
-_MAXIMUM_TRANSFER_LENGTHS: Final = 0x14  # of a command, then of an acknowledge
+_MAXIMUM_TRANSFER_LENGTHS: Final = 0x14  # lengths of a command, then of an acknowledge
 _SIRM_ADDRESS: Final = 0x20
 _SIRM_AVAILABLE: Final = 1
 
@@ -28,11 +28,11 @@ _SIRM_AVAILABLE: Final = 1
 @final
 @dataclass(frozen=True)
 class Bootstrap:
-    """What a camera says of itself before its description is read.
+    """A camera's bootstrap data, known before its description is read.
 
     Attributes:
-        manifest_address: of the table that says where its description is.
-        sirm_address: of the registers of its streaming interface.
+        manifest_address: address of the table that locates its description.
+        sirm_address: address of the registers of its streaming interface.
     """
 
     vendor: str
@@ -43,10 +43,10 @@ class Bootstrap:
 
 
 def read_bootstrap(control: ControlChannel) -> Bootstrap:
-    """Read the registers, and let the channel use the limits that stand in them.
+    """Read the registers, and apply their limits to the channel.
 
     Raises:
-        CameraProtocolError: when it has no streaming interface, or the registers make no sense.
+        CameraProtocolError: when it has no streaming interface, or the registers are invalid.
         CameraTimeout, CameraLost, CameraError: as for ``ControlChannel.read``.
     """
     vendor, model, serial = (_text(control, a) for a in (_MANUFACTURER_NAME, _MODEL_NAME, _SERIAL_NUMBER))
@@ -72,6 +72,6 @@ def _uint64(control: ControlChannel, address: int) -> int:
 
 
 def _text(control: ControlChannel, address: int) -> str:
-    """A string register: UTF-8 or ASCII, ended by a zero or by the register's end."""
+    """Return a string register: UTF-8 or ASCII, ended by a zero or by the register's end."""
     raw = control.read(address, _STRING_BYTES).split(b"\0")[0]
     return "".join(c for c in raw.decode("utf-8", "replace") if c.isprintable()).strip()

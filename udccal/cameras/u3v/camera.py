@@ -28,10 +28,10 @@ from udccal.errors import CameraError
 
 
 def list_cameras(backend: Any = None) -> tuple[CameraIdentity, ...]:
-    """Which USB3 Vision cameras are plugged in and can be named.
+    """List the USB3 Vision cameras that are plugged in and have a readable name.
 
     Args:
-        backend: pyusb's; None for libusb.
+        backend: pyusb's backend; None for libusb.
 
     Raises:
         CameraError: when there is no libusb.
@@ -43,13 +43,13 @@ def list_cameras(backend: Any = None) -> tuple[CameraIdentity, ...]:
 class U3vCamera:
     """Implements ``udccal.cameras.protocol.Camera`` on any USB3 Vision camera.
 
-    While it is open no other program can use the camera. Frame ids go on over the calls of ``frames``, though cameras
-    begin anew with each.
+    While it is open no other program can use the camera. Frame ids continue over the calls of ``frames``, although
+    cameras restart theirs with each.
 
     Args:
-        serial: which camera; None for the only one. Once opened, it stays the same camera.
-        backend: pyusb's; None for libusb.
-        timeout_s: for each answer and each part of a frame, and for a frame beyond its exposure.
+        serial: serial number; None for the only camera. Once opened, it stays the same camera.
+        backend: pyusb's backend; None for libusb.
+        timeout_s: limit for each answer and each part of a frame, and for a frame beyond its exposure.
     """
 
     def __init__(self, serial: str | None = None, *, backend: Any = None, timeout_s: float = 2.0) -> None:
@@ -65,7 +65,7 @@ class U3vCamera:
 
     @property
     def identity(self) -> CameraIdentity:
-        """Which camera this is; asked of its descriptors before it is opened for the first time."""
+        """Identity of the camera, read from its descriptors before it is opened for the first time."""
         if self._identity is None:
             self._identity = find_camera(self._serial, self._backend)[0].identity
         return self._identity
@@ -77,27 +77,27 @@ class U3vCamera:
 
     @property
     def cfa(self) -> str:
-        """CFA pattern of the sensor's top-left 2 x 2, which is that of every region on even coordinates."""
+        """CFA pattern of the sensor's top-left 2 x 2, and so of every region on even coordinates."""
         return read_format(self._opened().nodes).cfa
 
     @property
     def bits(self) -> int:
-        """Bits per sample in the present mode."""
+        """Bits per sample in the current mode."""
         return read_format(self._opened().nodes).bits
 
     @property
     def features(self) -> Features:
-        """What the camera can do in the present mode."""
+        """What the camera can do in the current mode."""
         return read_features(self._opened().nodes)
 
     @property
     def mode(self) -> Mode:
-        """How it works now."""
+        """Current mode."""
         return read_mode(self._opened().nodes)
 
     @property
     def counts(self) -> Counts:
-        """Frames since it was opened."""
+        """Frames since the camera was opened."""
         return self._counts
 
     def __enter__(self) -> U3vCamera:
@@ -123,7 +123,7 @@ class U3vCamera:
         if device is None:
             return
         try:
-            with contextlib.suppress(CameraError):  # what the caller meets counts, not how the end went
+            with contextlib.suppress(CameraError):  # the caller's own error counts, not one of the closing
                 if self._delivery is not None:
                     self._delivery.end()
         finally:
@@ -133,7 +133,7 @@ class U3vCamera:
                 device.link.close()
 
     def set_mode(self, mode: Mode) -> Mode:
-        """Ask for a mode; returns what the camera accepted, read back from it.
+        """Request a mode; return what the camera accepted, read back from it.
 
         Raises:
             CameraError: when it refuses.
@@ -143,7 +143,7 @@ class U3vCamera:
         return apply_mode(nodes, mode)
 
     def configure(self, settings: Settings) -> Settings:
-        """Ask for settings; returns what the camera accepted, read back from it.
+        """Request settings; return what the camera accepted, read back from it.
 
         Raises:
             CameraError: when it refuses.
@@ -153,15 +153,15 @@ class U3vCamera:
         return apply_settings(nodes, settings)
 
     def frames(self, count: int) -> Iterator[Frame]:
-        """Deliver ``count`` frames one at a time, incomplete ones among them and marked.
+        """Deliver ``count`` frames one at a time; incomplete ones are marked.
 
-        The camera runs from the first frame that is asked for until the last, or until the iterator is closed; frames
-        that come in between are read while the caller works, as long as memory for them is left.
+        The camera runs from the first requested frame until the last, or until the iterator is closed. Frames that
+        come while the caller works are read into buffers, as long as there are free ones.
 
         Raises:
-            CameraTimeout: when none comes within the exposure or the frame rate's period, and the time-out on top.
+            CameraTimeout: when none comes within the exposure or the frame rate's period, plus the time-out.
             CameraLost: when the camera is no longer there.
-            CameraProtocolError: when it sends what is no frame of the present settings.
+            CameraProtocolError: when it sends something else than a frame of the current settings.
             CameraError: when it is not open, or stops in another way.
         """
         self._idle()
@@ -197,7 +197,7 @@ class U3vCamera:
         return self._device
 
     def _idle(self) -> Device:
-        """The camera, with frames of an earlier call ended."""
+        """Return the camera after ending the frames of an earlier call."""
         device = self._opened()
         if self._delivery is not None:
             self._delivery.end()

@@ -1,4 +1,4 @@
-"""What a camera says of each frame in its chunk data: exposure, gain and time, by SFNC's Chunk Data Control."""
+"""Reads exposure, gain and time of each frame from its chunk data, by SFNC's Chunk Data Control."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _NS: Final = 1e-9
 @final
 @dataclass(frozen=True)
 class ChunkValues:
-    """What one frame's chunks say; None for what they do not."""
+    """Values in one frame's chunks; None for those that are missing."""
 
     exposure_s: float | None
     gain_dB: float | None
@@ -26,7 +26,7 @@ class ChunkValues:
 
 
 def enable_chunks(nodes: NodeMap) -> bool:
-    """Ask the camera to send exposure, gain and time with each frame; returns whether it sends any chunks."""
+    """Ask the camera to send exposure, gain and time with each frame; return whether it sends any chunks."""
     if not nodes.writable("ChunkModeActive"):
         return nodes.has("ChunkModeActive") and nodes.flag("ChunkModeActive")
     nodes.set_flag("ChunkModeActive", True)
@@ -41,7 +41,7 @@ def enable_chunks(nodes: NodeMap) -> bool:
 
 
 def tick_s(nodes: NodeMap) -> float:
-    """Length of a tick of ChunkTimestamp: USB3 Vision counts ns, older cameras may say otherwise."""
+    """Return the tick of ChunkTimestamp in s: USB3 Vision counts ns, older cameras may count other units."""
     if nodes.has("GevTimestampTickFrequency"):
         frequency_hz = nodes.number("GevTimestampTickFrequency")
         if frequency_hz > 0.0:
@@ -50,10 +50,10 @@ def tick_s(nodes: NodeMap) -> float:
 
 
 def read_chunks(nodes: NodeMap, data: bytes, tick: float) -> ChunkValues:
-    """The values in a sound sequence of chunks.
+    """Return the values in a valid sequence of chunks.
 
     Raises:
-        CameraProtocolError: when a chunk is too short for its value, or a value makes no sense.
+        CameraProtocolError: when a chunk is too short for its value, or a value is invalid.
         CameraLost, CameraTimeout: when the description asks the camera itself, which is gone or silent.
     """
     try:
@@ -65,7 +65,7 @@ def read_chunks(nodes: NodeMap, data: bytes, tick: float) -> ChunkValues:
         raise
     except CameraError as error:
         raise CameraProtocolError(
-            f"Expected chunks that the camera's description explains, found: {error} Update its firmware."
+            f"Expected chunks that fit the camera's description, found: {error} Update its firmware."
         ) from error
     if (exposure_us is not None and exposure_us <= 0.0) or (ticks is not None and ticks < 0.0):
         raise CameraProtocolError(

@@ -1,6 +1,6 @@
-"""Chunk data: what a payload holds besides the picture (USB3 Vision, chunk data).
+"""Chunk data: the parts of a payload after the picture (USB3 Vision, chunk data).
 
-Each chunk is its data, then its id and the length of its data, both 32 bits and little-endian: chunks are found from
+Each chunk is its data, then its id and the length of its data, both 32 bits and little-endian. So chunks are found from
 the payload's end. The picture is the first of them.
 """
 
@@ -19,7 +19,7 @@ _MOST_CHUNKS: Final = 256
 @final
 @dataclass(frozen=True)
 class Chunk:
-    """Where one chunk's data lies in a payload."""
+    """Place of one chunk's data in a payload."""
 
     id: int
     start: int
@@ -27,7 +27,7 @@ class Chunk:
 
 
 def parse_chunks(payload: memoryview) -> tuple[Chunk, ...]:
-    """The chunks of a payload in the order in which they lie.
+    """Return the chunks of a payload in their order.
 
     Raises:
         CameraProtocolError: when they do not fill it exactly, or there are more than any camera sends.
@@ -40,7 +40,7 @@ def parse_chunks(payload: memoryview) -> tuple[Chunk, ...]:
         if start < 0 or length > start or len(chunks) >= _MOST_CHUNKS:
             raise CameraProtocolError(
                 f"Expected chunks that fill {len(payload)} bytes of payload, found one of {length} bytes that ends at "
-                f"{start}, after {len(chunks)} others. Check the cable; if it stays, update the camera's firmware."
+                f"{start}, after {len(chunks)} others. Check the cable; if that fails, update the camera's firmware."
             )
         end = start - length
         chunks.append(Chunk(identifier, end, length))
@@ -48,13 +48,13 @@ def parse_chunks(payload: memoryview) -> tuple[Chunk, ...]:
 
 
 def behind_picture(payload: memoryview, picture_bytes: int) -> bytes:
-    """The chunks behind the picture, which are themselves a sound sequence of chunks.
+    """Return the part of a payload after the picture, itself a valid sequence of chunks.
 
     Args:
-        payload: of a frame with chunks, no longer than it is valid.
+        payload: valid bytes of a frame with chunks.
 
     Raises:
-        CameraProtocolError: when the chunks are unsound, or the first is too short for the picture.
+        CameraProtocolError: when the chunks are invalid, or the first is too short for the picture.
     """
     chunks = parse_chunks(payload)
     length = chunks[0].length if chunks else 0

@@ -1,4 +1,4 @@
-"""A camera's registers, read and written through GenCP with retries and bounded waits."""
+"""Reads and writes a camera's registers through GenCP, with retries and bounded waits."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from udccal.cameras.u3v.usb_errors import RECOVERABLE
 from udccal.errors import CameraError, CameraProtocolError, CameraTimeout
 
 _ATTEMPTS: Final = 3
-# Acknowledges that belong to no command of ours, or only ask for patience, in the time of one command.
+# Most acknowledges during one command that belong to another command or only ask for more time.
 _MOST_STALE: Final = 64
 _MOST_PENDING: Final = 100
 _LONGEST_PENDING_S: Final = 15.0
 _BUSY_PAUSE_S: Final = 0.02
-# Registers of bootstrap are read with this before the device has said what it takes; every device takes as much.
+# Bootstrap registers are read with this limit before the device has reported its own; every device supports it.
 _FIRST_TRANSFER_BYTES: Final = 128
 _MOST_TRANSFER_BYTES: Final = 1 << 16
 _FIRST_RESPONSE_S: Final = 0.5
@@ -25,7 +25,7 @@ _SHORTEST_RESPONSE_S: Final = 0.1
 
 @runtime_checkable
 class ControlLink(Protocol):
-    """What is needed of USB: two endpoints, with errors as ``transport`` raises them."""
+    """The control endpoints; methods raise the errors of ``transport``."""
 
     @property
     def control_packet(self) -> int:
@@ -47,13 +47,13 @@ class ControlLink(Protocol):
 
 @final
 class ControlChannel:
-    """Reads and writes a device's memory; long ranges in pieces that the device takes.
+    """Reads and writes a device's memory, long ranges in pieces that the device supports.
 
     A command whose acknowledge does not come is sent again with its old request id, so that a device that remembers
-    ids does not carry it out twice. Acknowledges of earlier commands are passed over.
+    ids does not execute it twice. Acknowledges of earlier commands are skipped.
 
     Args:
-        timeout_s: for the last attempt, and bound on what the device may claim to need for each.
+        timeout_s: limit of the last attempt, and bound on the time that the device may ask for each attempt.
     """
 
     def __init__(self, link: ControlLink, timeout_s: float) -> None:
@@ -66,11 +66,11 @@ class ControlChannel:
 
     @property
     def resent(self) -> int:
-        """Commands that were sent again, and that the device may have carried out twice."""
+        """Number of commands that were sent again, and that the device may have executed twice."""
         return self._resent
 
     def limit(self, response_s: float, command_bytes: int, acknowledge_bytes: int) -> None:
-        """Use what the device says of itself: its longest time to answer, and its longest messages.
+        """Apply the device's own limits: its longest time to answer, and its longest messages.
 
         Raises:
             CameraProtocolError: when its messages are too short for any register.
@@ -78,7 +78,7 @@ class ControlChannel:
         shortest = gencp.READ_COMMAND_BYTES + 8
         if min(command_bytes, acknowledge_bytes) < shortest:
             raise CameraProtocolError(
-                f"Expected a camera that takes messages of {shortest} bytes, found {command_bytes} and "
+                f"Expected a camera that supports messages of {shortest} bytes, found {command_bytes} and "
                 f"{acknowledge_bytes}. Update its firmware."
             )
         self._response_s = max(min(response_s, self._timeout_s), _SHORTEST_RESPONSE_S)
@@ -86,23 +86,23 @@ class ControlChannel:
         self._most_acknowledge = min(acknowledge_bytes, _MOST_TRANSFER_BYTES)
 
     def read(self, address: int, length: int) -> bytes:
-        """``length`` bytes from an address.
+        """Read ``length`` bytes from an address.
 
         Raises:
             CameraTimeout: when no acknowledge comes.
             CameraLost: when the device is gone.
-            CameraProtocolError: when what comes is no acknowledge.
+            CameraProtocolError: when the answer is not an acknowledge.
             CameraError: when the device refuses.
         """
         _check_address(address, length)
-        # Whole words, as devices may want their registers' alignment kept.
+        # Whole words, as devices may require aligned access.
         most = (self._most_acknowledge - gencp.HEADER_BYTES) // 8 * 8
         return b"".join(
             self._read_piece(address + start, min(most, length - start)) for start in range(0, length, most)
         )
 
     def write(self, address: int, data: bytes) -> None:
-        """Put ``data`` to an address.
+        """Write ``data`` to an address.
 
         Raises:
             CameraTimeout, CameraLost, CameraProtocolError, CameraError: as for ``read``.
@@ -134,7 +134,7 @@ class ControlChannel:
             )
 
     def _next_id(self) -> int:
-        self._request_id = self._request_id % 0xFFFF + 1  # 0 is kept for messages without an acknowledge
+        self._request_id = self._request_id % 0xFFFF + 1  # 0 is reserved for messages without an acknowledge
         return self._request_id
 
     def _execute(self, packet: bytes, request_id: int, expected: Command, what: str) -> Acknowledge:
@@ -160,7 +160,7 @@ class ControlChannel:
         raise trouble
 
     def _acknowledge(self, request_id: int, expected: Command, what: str, wait_s: float) -> Acknowledge:
-        """The acknowledge of a request, past those of others and those that ask for patience."""
+        """Return the acknowledge of a request; skip those of others and those that ask for more time."""
         pending = stale = 0
         latest = time.monotonic() + wait_s + _LONGEST_PENDING_S
         while pending <= _MOST_PENDING and stale <= _MOST_STALE and time.monotonic() < latest:
@@ -179,12 +179,12 @@ class ControlChannel:
             else:
                 return acknowledge
         raise CameraTimeout(
-            f"Expected an acknowledge of {what}, found {stale} of other commands and {pending} that ask for patience. "
+            f"Expected an acknowledge of {what}, found {stale} of other commands and {pending} that ask for more time. "
             "Unplug the camera and plug it in again."
         )
 
     def _room(self) -> int:
-        """Length of a read from the control endpoint: whole packets, so that no acknowledge is too long for it."""
+        """Return the length of a read from the control endpoint: whole packets, so that every acknowledge fits."""
         packet = max(1, self._link.control_packet)
         most = max(self._most_acknowledge, gencp.SHORT_ACKNOWLEDGE_BYTES)
         return -(-most // packet) * packet

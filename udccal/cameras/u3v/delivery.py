@@ -1,4 +1,4 @@
-"""Frames on their way to the caller."""
+"""Delivers frames to the caller."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from udccal.errors import CameraError
 
 @final
 class Delivery:
-    """An iterator over frames that, once ended from elsewhere, says so instead of being over early."""
+    """An iterator over frames that raises an error when it is ended from elsewhere."""
 
     def __init__(self, frames: Iterator[tuple[Frame, int]], deliver: Callable[[Frame, int], None]) -> None:
         self._frames = frames
@@ -24,8 +24,8 @@ class Delivery:
     def __next__(self) -> Frame:
         if self._ended:
             raise CameraError(
-                "Expected frames with the settings that they were asked for with, found that the camera was closed, "
-                "configured or asked again in between. Ask for frames anew."
+                "Expected frames with the requested settings, found that the camera was closed, "
+                "configured or asked again in between. Ask for frames again."
             )
         frame, lost = next(self._frames)
         self._deliver(frame, lost)

@@ -1,4 +1,4 @@
-"""A camera's own description: found through its manifest, checked, unzipped in memory, and refused when unsound."""
+"""Reads a camera's own description: finds it through its manifest, checks it and unzips it in memory."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from xml.parsers import expat
 
 from udccal.cameras.u3v.outline import check_outline, unsound
 
-# Files of real cameras have 0.1 to 4 MiB, unzipped.
+# Files of real cameras have 0.1 to 4 MiB unzipped.
 _MOST_FILE_BYTES: Final = 8 << 20
 _MOST_XML_BYTES: Final = 32 << 20
 _MOST_ENTRIES: Final = 32
@@ -51,7 +51,7 @@ class Memory(Protocol):
     """A device's memory."""
 
     def read(self, address: int, length: int) -> bytes:
-        """``length`` bytes from an address."""
+        """Read ``length`` bytes from an address."""
         ...
 
 
@@ -62,7 +62,7 @@ class ManifestEntry:
 
     Attributes:
         version: major, minor, subminor.
-        sha1: of the file as it is stored; None when the device does not say.
+        sha1: SHA-1 of the stored file; None when the device does not give it.
     """
 
     version: tuple[int, int, int]
@@ -74,7 +74,7 @@ class ManifestEntry:
 
 
 def read_description(memory: Memory, manifest_address: int) -> str:
-    """The newest description of a device, as XML that has been checked.
+    """Return the newest description of a device, as checked XML.
 
     Raises:
         CameraProtocolError: when there is none, or it is damaged, too long, or does not match its SHA-1.
@@ -88,7 +88,7 @@ def read_description(memory: Memory, manifest_address: int) -> str:
         raise unsound(f"a description of up to {_MOST_FILE_BYTES} bytes", f"{entry.size}")
     stored = memory.read(entry.address, entry.size)
     if entry.sha1 is not None and hashlib.sha1(stored, usedforsecurity=False).digest() != entry.sha1:
-        raise unsound("a description with the SHA-1 that the manifest says", "another")
+        raise unsound("a description with the SHA-1 of the manifest", "another")
     return checked_xml(unpacked(stored, entry.file_format))
 
 
@@ -100,7 +100,7 @@ def _read_manifest(memory: Memory, address: int) -> tuple[ManifestEntry, ...]:
 
 
 def parse_entry(data: bytes) -> ManifestEntry:
-    """A manifest entry out of its 64 bytes.
+    """Return the manifest entry in its 64 bytes.
 
     Raises:
         CameraProtocolError: when there are fewer or more.
@@ -119,10 +119,10 @@ def parse_entry(data: bytes) -> ManifestEntry:
 
 
 def unpacked(stored: bytes, file_format: int) -> bytes:
-    """The XML in a file: as it is, or the only XML in a zip.
+    """Return the XML in a file: the file itself, or the only XML in a zip.
 
     Raises:
-        CameraProtocolError: when the zip is damaged, holds none, or more than any description has.
+        CameraProtocolError: when the zip is damaged, has no XML, or is longer than any description.
     """
     if file_format == _UNCOMPRESSED:
         return stored
@@ -137,22 +137,22 @@ def unpacked(stored: bytes, file_format: int) -> bytes:
                 # Read no further than allowed, whatever size the zip claims.
                 xml = member.read(_MOST_XML_BYTES + 1)
     except _ZIP_ERRORS as error:
-        raise unsound("a zip that can be read", f"{type(error).__name__}: {str(error)[:80]}") from error
+        raise unsound("a readable zip", f"{type(error).__name__}: {str(error)[:80]}") from error
     if len(xml) > _MOST_XML_BYTES:
         raise unsound(f"a description of up to {_MOST_XML_BYTES} bytes", "a longer one")
     return xml
 
 
 def checked_xml(raw: bytes) -> str:
-    """XML text that is well-formed, and whose outline is one that GenApi can be given; it declares UTF-8, or nothing.
+    """Return well-formed XML whose outline is safe for GenApi; it declares UTF-8, or no encoding.
 
     Raises:
         CameraProtocolError: otherwise.
     """
     try:
-        # Some devices fill their file up with zeros.
+        # Some devices pad their file with zeros.
         text = _text(raw.rstrip(b"\0"))
-        # What is checked is the very text that GenApi is given.
+        # GenApi gets exactly the text that is checked here.
         check_outline(text)
     except UnicodeDecodeError as error:
         raise unsound(f"a description in {error.encoding.upper()}", "bytes that are not") from error
@@ -162,7 +162,7 @@ def checked_xml(raw: bytes) -> str:
 
 
 def _text(raw: bytes) -> str:
-    """Text out of the encoding that it declares, one of a few; else UTF-8, as behind that one's mark."""
+    """Decode text from the encoding that it declares, one of a few; else from UTF-8, as after UTF-8's mark."""
     unmarked = raw.removeprefix(codecs.BOM_UTF8)
     declared = _DECLARATION.match(unmarked)
     if declared is None:

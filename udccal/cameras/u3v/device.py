@@ -1,4 +1,4 @@
-"""An open camera's parts, and how its frames are started and stopped."""
+"""An open camera's parts; starts and stops its frames."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from udccal.cameras.u3v.nodes import NodeMap
 from udccal.cameras.u3v.transport import UsbLink
 from udccal.errors import CameraError
 
-# A camera may end the exposure in hand before it says that it has stopped.
+# A camera may finish the current exposure before it reports that it has stopped.
 _STOP_S: Final = 15.0
 
 
@@ -27,10 +27,10 @@ class Device:
     nodes: NodeMap
 
     def stop(self) -> None:
-        """Stop frames and stream; each step is taken, also where one before it fails.
+        """Stop frames and stream; take each step even if one before it fails.
 
         Raises:
-            CameraError: the first failure, once all was tried.
+            CameraError: the first failure, after all steps.
         """
         failures: list[CameraError] = []
         for step in (self._stop_acquisition, self.registers.disable, self.link.flush_stream, self._unlock):
@@ -42,13 +42,13 @@ class Device:
             raise failures[0]
 
     def leave_any_run(self) -> None:
-        """Stop what an earlier run, or another program that was killed, may have left going on."""
-        # A camera that does not run may refuse to be stopped; one that is gone will say so at the next command.
+        """Stop frames that an earlier run, or another program that was killed, may have left running."""
+        # A camera that does not run may refuse to be stopped; one that is gone fails at the next command.
         with contextlib.suppress(CameraError):
             self.stop()
 
     def start(self) -> None:
-        """Start the stream and frames; the stream's transfers must have been agreed on."""
+        """Start the stream and frames; the stream's transfers must be agreed on before."""
         self.registers.enable()
         if self.nodes.writable("TLParamsLocked"):
             self.nodes.set_number("TLParamsLocked", 1)

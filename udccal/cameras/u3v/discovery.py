@@ -1,4 +1,4 @@
-"""Which USB3 Vision cameras are plugged in, and what their descriptors say of them."""
+"""Finds USB3 Vision cameras that are plugged in, and reads their descriptors."""
 
 from __future__ import annotations
 
@@ -60,9 +60,9 @@ class FoundDevice:
     """A camera at a port, whether or not it can be opened.
 
     Attributes:
-        identity: vendor, model and serial from its descriptors; the serial is empty when it may not be read.
+        identity: vendor, model and serial from its descriptors; the serial is empty when it is not readable.
         vendor_id, product_id: USB's numbers, for a udev rule.
-        super_speed: whether it could run at SuperSpeed; with a slower ``speed`` it is at the wrong port or cable.
+        super_speed: whether it supports SuperSpeed; with a slower ``speed`` it is at the wrong port or cable.
         trouble: why it cannot be opened, as a sentence; None when it can.
     """
 
@@ -86,10 +86,10 @@ class UsbCamera:
 
 
 def found_devices(backend: Any = None) -> tuple[FoundDevice, ...]:
-    """Every USB3 Vision camera at this machine, also those that are held by others or may not be opened.
+    """List every USB3 Vision camera at this machine, also those that are held by others or may not be opened.
 
     Args:
-        backend: pyusb's; None for libusb from its wheel, else from the system.
+        backend: pyusb's backend; None for libusb from its wheel, else from the system.
 
     Raises:
         CameraError: when there is no libusb.
@@ -98,11 +98,11 @@ def found_devices(backend: Any = None) -> tuple[FoundDevice, ...]:
 
 
 def find_camera(serial: str | None, backend: Any = None) -> tuple[FoundDevice, UsbCamera]:
-    """The camera of that serial, or the only one.
+    """Return the camera with that serial, or the only one.
 
     Raises:
         CameraLost: when it is not plugged in.
-        CameraBusy: when there are cameras whose serial cannot be read for want of permission.
+        CameraBusy: when missing permission hides the serial of a camera.
         CameraError: when no serial is given and there are several, or there is no libusb.
     """
     found = [(_found(camera), camera) for camera in _usb_cameras(backend)]
@@ -111,7 +111,7 @@ def find_camera(serial: str | None, backend: Any = None) -> tuple[FoundDevice, U
         return chosen[0]
     seen = ", ".join(f"{device.identity.model} {device.identity.serial}" for device, _ in found) or "none"
     if chosen:
-        raise CameraError(f"Expected one USB3 Vision camera, found {seen}. Say which by its serial.")
+        raise CameraError(f"Expected one USB3 Vision camera, found {seen}. Give its serial.")
     trouble = next((device.trouble for device, _ in found if device.trouble and not device.identity.serial), None)
     if trouble is not None:
         raise CameraBusy(trouble)
@@ -120,15 +120,15 @@ def find_camera(serial: str | None, backend: Any = None) -> tuple[FoundDevice, U
 
 
 def configure(device: Any) -> None:
-    """Configure a pyusb device where the system has not; doing it again would disturb it.
+    """Configure a pyusb device if the system has not; a second configuration would disturb it.
 
     Raises:
-        usb.core.USBError: as USB has it.
+        usb.core.USBError: when USB fails.
     """
     try:
         device.get_active_configuration()
     except usb.core.USBError as error:
-        if (error.errno, error.backend_error_code) != (None, None):  # pyusb's own, of no configuration, has neither
+        if (error.errno, error.backend_error_code) != (None, None):  # pyusb's own error has neither
             raise
         device.set_configuration()
 
@@ -137,7 +137,7 @@ def _usb_cameras(backend: Any) -> Iterator[UsbCamera]:
     with usb_errors("looking for cameras"):
         devices = list(usb.core.find(find_all=True, backend=backend or _libusb()))
     for device in devices:
-        # A device may vanish between being listed and being asked.
+        # A device may vanish after it was listed.
         with contextlib.suppress(usb.core.USBError, NotImplementedError):
             interfaces = _interfaces_of(device)
             if interfaces is not None:
@@ -145,7 +145,7 @@ def _usb_cameras(backend: Any) -> Iterator[UsbCamera]:
 
 
 def _libusb() -> Any:
-    """libusb from its wheel, else from the system."""
+    """Return libusb from its wheel, else from the system."""
     backend = None
     with contextlib.suppress(ImportError):
         import libusb_package
@@ -195,7 +195,7 @@ def _found(camera: UsbCamera) -> FoundDevice:
     try:
         speed = UsbSpeed(device.speed or 0)
     except ValueError:
-        speed = UsbSpeed.SUPER_PLUS  # a libusb newer than this list knows faster ones
+        speed = UsbSpeed.SUPER_PLUS  # a libusb newer than this list has faster ones
     identity = CameraIdentity(*texts, BACKEND)
     numbers = (device.idVendor, device.idProduct, device.bus or 0, device.address or 0)
     return FoundDevice(identity, *numbers, speed, super_speed, trouble)
@@ -211,7 +211,7 @@ def _device_info(camera: UsbCamera) -> tuple[int, ...] | None:
 
 
 def _texts_and_trouble(camera: UsbCamera, indices: tuple[int, ...]) -> tuple[tuple[str, str, str], str | None]:
-    """The strings, as far as they can be read, and what stands in the way of opening the camera."""
+    """Return the readable strings, and the reason why the camera cannot be opened."""
     device, texts, trouble = camera.device, ["", "", ""], None
     control = camera.interfaces.numbers[0]
     try:
@@ -235,6 +235,6 @@ def _text(device: Any, index: int) -> str:
     try:
         text = usb.util.get_string(device, index) or ""
     except (ValueError, IndexError, UnicodeDecodeError):
-        # pyusb's word for a device that sends no, or no proper, string descriptors.
+        # pyusb's message for a device without valid string descriptors.
         raise CameraLost("Expected the camera's name, found no readable string. Plug it in again.") from None
     return "".join(c for c in text if c.isprintable()).strip()

@@ -1,4 +1,4 @@
-"""GenCP over USB3 Vision: commands into bytes, acknowledges out of bytes. Nothing here touches a device.
+"""GenCP over USB3 Vision: encodes commands and decodes acknowledges, without a device.
 
 A message is a prefix ``U3VC``, a header of flags or status, command, length of what follows and request id, and the
 command's own data; everything is little-endian (GenICam GenCP; prefix after USB3 Vision).
@@ -23,7 +23,7 @@ _TWO_WORDS: Final = struct.Struct("<HH")
 HEADER_BYTES: Final = _HEADER.size
 READ_COMMAND_BYTES: Final = _HEADER.size + _READ.size
 WRITE_COMMAND_BYTES: Final = _HEADER.size + _WRITE.size
-# Every other acknowledge than that of a read is this long at most.
+# Acknowledges of other commands than a read have at most this length.
 SHORT_ACKNOWLEDGE_BYTES: Final = _HEADER.size + _TWO_WORDS.size
 
 
@@ -40,7 +40,7 @@ class Command(enum.IntEnum):
 
 @final
 class Status(enum.IntEnum):
-    """What a device answers (GenCP, status codes; the 0xA000s are USB3 Vision's own)."""
+    """Status of an answer (GenCP, status codes; the 0xA000s are USB3 Vision's own)."""
 
     SUCCESS = 0x0000
     NOT_IMPLEMENTED = 0x8001
@@ -66,7 +66,7 @@ _ADVICE: Final = {
     Status.ACCESS_DENIED: "Another program may control the camera: close it.",
     Status.BUSY: "Wait a moment and try again.",
     Status.MSG_TIMEOUT: "Unplug the camera and plug it in again.",
-    Status.GENERIC_ERROR: "Unplug the camera and plug it in again; if it stays, update its firmware.",
+    Status.GENERIC_ERROR: "Unplug the camera and plug it in again; if that does not help, update its firmware.",
     Status.STREAM_ENDPOINT_HALTED: "Open the camera again.",
     Status.STREAM_INTERFACE_INCONSISTENT: "Open the camera again.",
 }
@@ -76,7 +76,7 @@ _OTHER_ADVICE: Final = "The camera does not support what was asked; update its f
 @final
 @dataclass(frozen=True)
 class Acknowledge:
-    """One acknowledge; ``status`` and ``command`` may be numbers that no standard knows."""
+    """One acknowledge; ``status`` and ``command`` may be numbers that no standard defines."""
 
     status: int
     command: int
@@ -85,22 +85,22 @@ class Acknowledge:
 
 
 def encode_read(request_id: int, address: int, length: int) -> bytes:
-    """READMEM: asks for ``length`` bytes, 65535 at most, from an address."""
+    """Encode READMEM, which asks for ``length`` bytes, 65535 at most, from an address."""
     header = _HEADER.pack(_PREFIX, _REQUEST_ACKNOWLEDGE, Command.READMEM, _READ.size, request_id)
     return header + _READ.pack(address, 0, length)
 
 
 def encode_write(request_id: int, address: int, data: bytes) -> bytes:
-    """WRITEMEM: puts ``data``, 65527 bytes at most, to an address."""
+    """Encode WRITEMEM, which writes ``data``, 65527 bytes at most, to an address."""
     header = _HEADER.pack(_PREFIX, _REQUEST_ACKNOWLEDGE, Command.WRITEMEM, _WRITE.size + len(data), request_id)
     return header + _WRITE.pack(address) + data
 
 
 def decode_acknowledge(packet: bytes) -> Acknowledge:
-    """What a packet from the control endpoint says.
+    """Decode a packet from the control endpoint.
 
     Raises:
-        CameraProtocolError: when it is no GenCP acknowledge, or not as long as it says.
+        CameraProtocolError: when it is not a GenCP acknowledge, or its length differs from its header.
     """
     if len(packet) < _HEADER.size or not packet.startswith(_PREFIX):
         raise CameraProtocolError(
@@ -117,10 +117,10 @@ def decode_acknowledge(packet: bytes) -> Acknowledge:
 
 
 def pending_s(acknowledge: Acknowledge) -> float:
-    """How long a PENDING_ACK asks to wait, s.
+    """Return how long a PENDING_ACK asks to wait, s.
 
     Raises:
-        CameraProtocolError: when it does not say.
+        CameraProtocolError: when it does not contain the time.
     """
     if len(acknowledge.data) != _TWO_WORDS.size:
         raise CameraProtocolError(
@@ -130,7 +130,7 @@ def pending_s(acknowledge: Acknowledge) -> float:
 
 
 def written_bytes(acknowledge: Acknowledge) -> int | None:
-    """How many bytes a WRITEMEM_ACK says were written; None when the device does not say.
+    """Return the number of bytes written according to a WRITEMEM_ACK; None when the device does not give it.
 
     Raises:
         CameraProtocolError: when its data is neither empty nor two words.
@@ -145,7 +145,7 @@ def written_bytes(acknowledge: Acknowledge) -> int | None:
 
 
 def refusal(status: int, what: str) -> CameraError:
-    """The error that says that a device refused ``what``, with the name of the status and what to do."""
+    """Return the error of a device that refused ``what``, with the status by name and what to do."""
     known = status in set(Status)
     name = Status(status).name if known else "unknown"
     advice = _ADVICE.get(Status(status), _OTHER_ADVICE) if known else _OTHER_ADVICE

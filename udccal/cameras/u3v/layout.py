@@ -1,4 +1,4 @@
-"""How a frame's payload is cut into USB transfers, agreed with the camera through its streaming registers."""
+"""Cuts a frame's payload into USB transfers, and agrees on them with the camera through its streaming registers."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from udccal.cameras.u3v.control import ControlChannel
 from udccal.cameras.u3v.stream import IMAGE_LEADER_BYTES, IMAGE_TRAILER_BYTES
 from udccal.errors import CameraProtocolError
 
-# Reads of about this size: usbfs takes no transfer above 16 MiB, and small ones cost time.
+# Reads of about this size: usbfs allows no transfer above 16 MiB, and small ones cost time.
 _TRANSFER_BYTES: Final = 1 << 20
 _MOST_PAYLOAD_BYTES: Final = 1 << 28
 _MOST_HEAD_BYTES: Final = 1 << 16
@@ -32,10 +32,10 @@ class StreamLayout:
     """Lengths of the transfers that carry one frame, bytes.
 
     Attributes:
-        leader, trailer: of the transfers before and behind.
-        payload: that a frame needs at most.
-        transfer, count: of the equal transfers that carry the payload's beginning.
-        final1, final2: of the transfers that carry the rest; 0 where there is none.
+        leader, trailer: lengths of the transfers before and after the payload.
+        payload: longest payload of a frame.
+        transfer, count: length and number of the equal transfers with the payload's beginning.
+        final1, final2: lengths of the transfers with the rest; 0 where there is none.
     """
 
     leader: int
@@ -56,7 +56,7 @@ def plan_layout(payload: int, leader: int, trailer: int, alignment: int) -> Stre
     """Cut a payload into transfers that are whole multiples of ``alignment``, a power of two.
 
     Raises:
-        CameraProtocolError: when a size is out of all reason.
+        CameraProtocolError: when a size is beyond any real camera's.
     """
     if not 0 < payload <= _MOST_PAYLOAD_BYTES or max(leader, trailer) > _MOST_HEAD_BYTES:
         raise CameraProtocolError(
@@ -85,13 +85,13 @@ class StreamRegisters:
         self._address = address
 
     def configure(self, packet_bytes: int) -> StreamLayout:
-        """Agree on transfers for the present settings, with the stream switched off.
+        """Agree on transfers for the current settings, with the stream switched off.
 
         Args:
-            packet_bytes: of a full USB packet; transfers are multiples of it too, so that no packet is cut.
+            packet_bytes: length of a full USB packet; transfers are multiples of it too, so that no packet is cut.
 
         Raises:
-            CameraProtocolError: when the camera's sizes are out of all reason.
+            CameraProtocolError: when the camera's sizes are beyond any real camera's.
             CameraError: when it refuses.
         """
         bits = self._read(_INFO, "<I")[0] >> 24
@@ -113,7 +113,7 @@ class StreamRegisters:
         self._write(_CONTROL, _ENABLE)
 
     def disable(self) -> None:
-        """Switch the stream off; the camera throws away what it has not sent."""
+        """Switch the stream off; the camera discards what it has not sent."""
         self._write(_CONTROL, 0)
 
     def _read(self, offset: int, form: str) -> tuple[int, ...]:

@@ -1,4 +1,4 @@
-"""Pixel format, frame rate and trigger by their SFNC names, and what a camera can do in all."""
+"""Sets pixel format, frame rate and trigger by their SFNC names, and reads all that a camera can do."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _LINE: Final = "Line"
 
 
 def read_features(nodes: NodeMap) -> Features:
-    """What the camera can do in its present mode."""
+    """Return what the camera can do in its current mode."""
     return Features(
         exposure_s=exposure_range(nodes),
         gain_dB=gain_range(nodes),
@@ -32,19 +32,19 @@ def read_features(nodes: NodeMap) -> Features:
 
 
 def read_format(nodes: NodeMap) -> PixelFormat:
-    """The pixel format that the camera has now.
+    """Return the current pixel format.
 
     Raises:
-        CameraError: when it is not one that can be unpacked.
+        CameraError: when udccal cannot unpack it.
     """
     return pixel_format(nodes.choice("PixelFormat"))
 
 
 def choose_known_format(nodes: NodeMap) -> None:
-    """Leave the pixel format if it holds raw samples; else take the one with most bits.
+    """Keep the pixel format if it holds raw samples; else set the one with most bits.
 
     Raises:
-        CameraError: when the camera has none that can be unpacked.
+        CameraError: when the camera has none that udccal can unpack.
     """
     names = _raw_formats(nodes)
     if nodes.choice("PixelFormat") in names:
@@ -60,10 +60,10 @@ def choose_known_format(nodes: NodeMap) -> None:
 
 
 def read_mode(nodes: NodeMap) -> Mode:
-    """How the camera works now.
+    """Return the current mode.
 
     Raises:
-        CameraProtocolError: when it says that it makes no frames in a second, or fewer.
+        CameraProtocolError: when its frame rate is 0 Hz or less.
     """
     enable, rate = nodes.first(*_RATE_ENABLE), nodes.first(*_RATE)
     limited = rate is not None and (enable is None or nodes.flag(enable))
@@ -76,10 +76,10 @@ def read_mode(nodes: NodeMap) -> Mode:
 
 
 def apply_mode(nodes: NodeMap, mode: Mode) -> Mode:
-    """Ask for a mode; returns what the camera has afterwards, read back from it.
+    """Request a mode; return the camera's mode afterwards, read back from it.
 
     Raises:
-        CameraError: when the camera or this program does not know a part of it.
+        CameraError: when the camera or udccal does not support a part of it.
     """
     _check_choice("a pixel format", mode.pixel_format, _raw_formats(nodes))
     _check_choice("a trigger", mode.trigger, _triggers(nodes))
@@ -97,7 +97,7 @@ def _check_choice(what: str, asked: str, allowed: tuple[str, ...]) -> None:
 
 
 def _raw_formats(nodes: NodeMap) -> tuple[str, ...]:
-    """Formats that can be unpacked; a colour sensor's Mono formats are mixed from its colours."""
+    """Return formats that udccal can unpack; a colour sensor's Mono formats are mixed from its colours."""
     known = tuple(name for name in nodes.choices("PixelFormat") if name in PIXEL_FORMATS)
     return tuple(name for name in known if PIXEL_FORMATS[name].cfa != "mono") or known
 
@@ -151,7 +151,7 @@ def _read_trigger(nodes: NodeMap) -> Trigger:
 
 
 def _set_trigger(nodes: NodeMap, trigger: Trigger) -> None:
-    """Every kind of trigger is switched off, and the one that starts a frame on again where it is wanted."""
+    """Switch every kind of trigger off, then the one that starts a frame on where it is wanted."""
     if not nodes.has("TriggerMode"):
         return
     for selector in nodes.choices("TriggerSelector") if nodes.writable("TriggerSelector") else ():
@@ -167,7 +167,7 @@ def _set_trigger(nodes: NodeMap, trigger: Trigger) -> None:
 
 
 def _source(nodes: NodeMap, trigger: Trigger) -> str:
-    """A camera's own choice of an input stays, so that it can be set beforehand with its maker's program."""
+    """Keep an input that is chosen already, so that it can be set before with the maker's program."""
     if trigger is Trigger.SOFTWARE:
         return _SOFTWARE
     present = nodes.choice("TriggerSource")

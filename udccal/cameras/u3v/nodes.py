@@ -1,4 +1,4 @@
-"""A camera's features by name, through EMVA's GenApi: its description says which registers a feature stands in."""
+"""Reads and sets a camera's features by name through EMVA's GenApi; its description maps them to registers."""
 
 from __future__ import annotations
 
@@ -22,27 +22,27 @@ class Registers(Protocol):
     """A device's memory."""
 
     def read(self, address: int, length: int) -> bytes:
-        """``length`` bytes from an address."""
+        """Read ``length`` bytes from an address."""
         ...
 
     def write(self, address: int, data: bytes) -> None:
-        """Put ``data`` to an address."""
+        """Write ``data`` to an address."""
         ...
 
 
 @final
 class NodeMap:
-    """The features that a description names, on a device's memory.
+    """The features that a description defines, on a device's memory.
 
-    Every method that asks for a feature raises CameraError when the camera has none of that name or refuses, and
-    whatever the memory raises.
+    Every method that asks for a feature raises CameraError when the camera does not have it or refuses, and the errors
+    of the memory.
 
     Args:
-        xml: a description that was checked; GenApi itself would follow its entities.
+        xml: a checked description; GenApi itself would follow its entities.
 
     Raises:
         CameraProtocolError: when the description has no port to the device.
-        CameraError: when GenApi is not installed, or cannot make sense of the description.
+        CameraError: when GenApi is not installed, or cannot interpret the description.
     """
 
     def __init__(self, xml: str, memory: Registers) -> None:
@@ -50,7 +50,7 @@ class NodeMap:
         self._map = self._genapi.NodeMap()
         with self._told("load its description"):
             self._map.load_xml_from_string(xml)
-            # GenApi takes any node of this name for a port, and would bring the process down with it.
+            # GenApi takes any node of this name for a port, and would crash the process.
             if not isinstance(self._map.get_node(_PORT), self._genapi.IPort):
                 raise CameraProtocolError(
                     f"Expected a description with a port {_PORT}, found none. Update the camera's firmware."
@@ -60,30 +60,30 @@ class NodeMap:
             self._chunks = self._genapi.ChunkAdapterU3V(self._map)
 
     def refresh(self) -> None:
-        """Forget every value that was read: GenApi keeps them, and cameras change some behind its back."""
-        # Invalidating one node would leave the registers below it as they were.
+        """Invalidate every value that was read: GenApi caches them, and cameras change some by themselves."""
+        # To invalidate one node would keep the registers below it.
         self._map._invalidate_nodes()
 
     def has(self, name: str) -> bool:
-        """Whether the camera has the feature, in its present state."""
+        """Return whether the camera has the feature in its current state."""
         return self._access(name) >= self._genapi.EAccessMode.WO
 
     def writable(self, name: str, kind: str | None = None) -> bool:
-        """Whether the feature may be set now.
+        """Return whether the feature may be set now.
 
         Args:
-            kind: GenApi's interface that it must have too, e.g. ``IFloat``.
+            kind: GenApi's interface that the feature must also have, e.g. ``IFloat``.
         """
         if self._access(name) not in (self._genapi.EAccessMode.WO, self._genapi.EAccessMode.RW):
             return False
         return kind is None or isinstance(self._map.get_node(name), getattr(self._genapi, kind))
 
     def first(self, *names: str) -> str | None:
-        """The first of several names for one thing that the camera has."""
+        """Return the first of several names that the camera has."""
         return next((name for name in names if self.has(name)), None)
 
     def number(self, name: str) -> float:
-        """A number, whether GenApi holds it as integer or as float."""
+        """Return a number, whether GenApi holds it as integer or as float."""
         with self._told(f"read {name}"):
             value = float(self._number(name).value)
         if not math.isfinite(value):
@@ -91,7 +91,7 @@ class NodeMap:
         return value
 
     def bounds(self, name: str) -> Range:
-        """Between which a number may be set now."""
+        """Return the bounds between which a number may be set now."""
         with self._told(f"read the limits of {name}"):
             node = self._number(name)
             bounds = Range(float(node.min), float(node.max))
@@ -102,7 +102,7 @@ class NodeMap:
         return bounds
 
     def step(self, name: str) -> int:
-        """By which an integer may be changed; 1 when the camera does not say."""
+        """Return the step of an integer; 1 when the camera does not give it."""
         with self._told(f"read the step of {name}"):
             return max(1, int(self._number(name).inc))
 
@@ -115,12 +115,12 @@ class NodeMap:
             node.value = round(value) if isinstance(node, self._genapi.IInteger) else float(value)
 
     def choice(self, name: str) -> str:
-        """Which of its choices an enumeration has."""
+        """Return the value of an enumeration."""
         with self._told(f"read {name}"):
             return str(self._node(name, "IEnumeration").value)
 
     def choices(self, name: str) -> tuple[str, ...]:
-        """What an enumeration may be set to now."""
+        """Return the values that an enumeration may be set to now."""
         with self._told(f"read the choices of {name}"):
             return tuple(str(symbol) for symbol in self._node(name, "IEnumeration").symbolics)
 
@@ -130,7 +130,7 @@ class NodeMap:
             self._node(name, "IEnumeration").value = symbol
 
     def flag(self, name: str) -> bool:
-        """A boolean."""
+        """Return a boolean."""
         with self._told(f"read {name}"):
             return bool(self._node(name, "IBoolean").value)
 
@@ -140,21 +140,21 @@ class NodeMap:
             self._node(name, "IBoolean").value = value
 
     def execute(self, name: str, wait_s: float = _COMMAND_S) -> None:
-        """Carry out a command, and wait until the camera has.
+        """Execute a command, and wait until the camera has finished.
 
         Raises:
-            CameraTimeout: when it is not done in that time.
+            CameraTimeout: when it has not finished in that time.
         """
         with self._told(f"execute {name}"):
             node = self._node(name, "ICommand")
             node.execute()
             if comes_true(node.is_done, wait_s, _COMMAND_POLL_S):
                 return
-        raise CameraTimeout(f"Expected {name} to be carried out, found it still going on. Open the camera again.")
+        raise CameraTimeout(f"Expected {name} to finish, found it still running. Open the camera again.")
 
     @contextmanager
     def chunks(self, data: bytes) -> Iterator[None]:
-        """Features that stand in chunk data can be read inside; ``data`` must be a sound sequence of chunks."""
+        """Make features in chunk data readable inside the context; ``data`` must be a valid sequence of chunks."""
         with self._told("lay out its chunk data"):
             self._chunks.attach_buffer(data, len(data))
         try:
@@ -163,8 +163,8 @@ class NodeMap:
             self._chunks.detach_buffer()
 
     def close(self) -> None:
-        """Let go of the memory, and of what was made of the description."""
-        # The adapter lives until the program ends, through a finalizer that holds it, and the node map with it.
+        """Release the memory and the node map."""
+        # A finalizer keeps the adapter until the program ends, and the node map with it.
         self._chunks.detach_node_map()
         self._map.disconnect()
 
@@ -180,7 +180,7 @@ class NodeMap:
         return self._node(name, "IFloat", "IInteger")
 
     def _node(self, name: str, *kinds: str) -> Any:
-        """A feature, if GenApi holds it as one of these kinds; a description may say anything."""
+        """Return a feature if GenApi holds it as one of these kinds; a description may define any kind."""
         node = self._map.get_node(name)
         found = "nothing of that name" if node is None else f"an {type(node).__name__}"
         if not any(isinstance(node, getattr(self._genapi, kind)) for kind in kinds):
@@ -191,11 +191,11 @@ class NodeMap:
 
     @contextmanager
     def _told(self, what: str) -> Iterator[None]:
-        """Turns GenApi's exceptions into sentences; those of the memory come through as they are."""
+        """Turn GenApi's exceptions into sentences; pass those of the memory on unchanged."""
         try:
             yield
         except (self._genapi.GenericException, RuntimeError, TypeError, ValueError, ArithmeticError) as error:
-            # Behind the first colon GenApi tells of its own source files.
+            # GenApi names its own source files after the first colon.
             reason = " ".join(str(error).split(" : ")[0].split())[:200] or type(error).__name__
             raise CameraError(
                 f"Expected the camera to {what}, found: {reason}. Ask for something that it can do."
@@ -211,7 +211,7 @@ def _import_genapi() -> Any:
 
 
 def _port(genapi: Any, memory: Registers) -> Any:
-    """GenApi's way to a device's memory; its base class is only there once GenApi is imported."""
+    """Return GenApi's port to a device's memory; its base class exists only once GenApi is imported."""
 
     @final
     class DevicePort(genapi.AbstractPort):

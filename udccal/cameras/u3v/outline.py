@@ -1,4 +1,4 @@
-"""What a description must look like before GenApi is given it, which trusts it more than a camera deserves."""
+"""Checks the outline of a description before GenApi gets it, since GenApi trusts its input."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from udccal.errors import CameraProtocolError
 _ROOT: Final = "RegisterDescription"
 _MOST_DEPTH: Final = 32
 _MOST_ELEMENTS: Final = 300_000
-# Elements that refer to a node are named so; GenApi follows them without asking what kind of node is at their end.
+# Elements that refer to a node have these endings; GenApi follows them without a check of the node's kind.
 _REFERENCE: Final = re.compile("p[A-Z]")
 _PORT_REFERENCE: Final = "pPort"
 _PORT: Final = "Port"
@@ -20,12 +20,12 @@ _PART_OF_REGISTER: Final = "StructEntry"  # becomes a node by itself
 
 
 def check_outline(text: str) -> None:
-    """Refuse a description of another root, with a document type (and so entities), too deep, or too long.
+    """Refuse a description with another root, with a document type (and so entities), too deep, or too long.
 
-    Refused are also references to a kind of node that cannot stand there, where GenApi would not notice.
+    Refuse also references to a kind of node that is not allowed there, which GenApi would not notice.
 
     Raises:
-        CameraProtocolError: as a sentence.
+        CameraProtocolError: when the description is refused.
         expat.ExpatError: when the text is not well-formed.
     """
     outline = _Outline()
@@ -40,16 +40,16 @@ def check_outline(text: str) -> None:
 
 
 def unsound(expected: str, found: str) -> CameraProtocolError:
-    """The error that says what is wrong with a description."""
+    """Return the error of an invalid description."""
     return CameraProtocolError(
         f"Expected {expected} in the camera, found {found}. Unplug it and plug it in again; "
-        "if it stays, update its firmware."
+        "if that does not help, update its firmware."
     )
 
 
 @final
 class _Outline:
-    """Elements, kinds of nodes and references between them, noted down while expat goes through a text."""
+    """Records elements, kinds of nodes and references between them while expat parses a text."""
 
     def __init__(self) -> None:
         self._path: list[str] = []
@@ -70,7 +70,7 @@ class _Outline:
                 f"a description of up to {_MOST_ELEMENTS} elements, {_MOST_DEPTH} deep",
                 f"{self._elements} elements, {len(self._path)} deep",
             )
-        # Names of entries, of variables and of constants are known within their node alone.
+        # Names of entries, variables and constants are local to their node.
         is_node = self._path[-2:-1] in _PLACES_OF_NODES or tag == _PART_OF_REGISTER
         if tag == _PORT and not is_node:
             raise unsound("a description with ports among its nodes", f"one inside {self._path[-2]}")
@@ -93,7 +93,7 @@ class _Outline:
         for reference, target in self._references:
             kind = self._kinds.get(target, "nothing")
             if (kind == _PORT) != (reference == _PORT_REFERENCE):
-                raise unsound(f"another kind of node behind {reference}", f"{kind} {target[:40]!r}")
+                raise unsound(f"another kind of node at the end of {reference}", f"{kind} {target[:40]!r}")
 
 
 def _local(name: str) -> str:

@@ -1,4 +1,4 @@
-"""A block of the stream as a frame: samples unpacked, settings and time from its chunks, what is missing made 0."""
+"""Turns a block of the stream into a frame: unpacks samples, reads its chunks, and sets missing samples to 0."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class PictureReader:
     """Makes frames of blocks taken with settings that the camera accepted.
 
     Attributes:
-        tick_s: of the time in chunks.
+        tick_s: unit of the time in chunks.
     """
 
     nodes: NodeMap
@@ -35,10 +35,10 @@ class PictureReader:
     tick_s: float
 
     def frame(self, payload: memoryview, block: Block, frame_id: int) -> Frame:
-        """The frame that a block holds; its payload is free for others afterwards.
+        """Return the frame in a block; its payload may be reused afterwards.
 
         Raises:
-            CameraProtocolError: when it is no picture of the settings.
+            CameraProtocolError: when the picture does not fit the settings.
         """
         image = self._image(block)
         rows, columns = self.settings.region.rows, self.settings.region.columns
@@ -59,7 +59,7 @@ class PictureReader:
             except CameraProtocolError:
                 complete = False
         if block.valid < needed:
-            # Samples fall on multiples of these bytes, counted from the start of a line or of the picture.
+            # Samples begin at multiples of these bytes, counted from the start of a line or of the picture.
             unit = needed // rows if image.padding_x else _WHOLE_SAMPLES_BYTES
             start = block.valid // unit * unit
             payload[start:needed] = bytes(needed - start)
@@ -70,7 +70,7 @@ class PictureReader:
         return Frame(data, self._taken_with(values), timestamp_s, frame_id, complete)
 
     def _image(self, block: Block) -> ImageInfo:
-        """The picture that the leader announces, if it is the one that was asked for."""
+        """Return the picture that the leader announces, if it fits the settings."""
         image = block.leader.image
         if image is None:
             raise CameraProtocolError("Expected a picture, found chunks alone. Switch ChunkEnable of Image on.")

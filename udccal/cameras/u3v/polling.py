@@ -1,4 +1,4 @@
-"""Asking a camera again and again, for so long and so often."""
+"""Polls a camera, with bounds on time and number."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from collections.abc import Callable
 def comes_true(asked: Callable[[], bool], wait_s: float, interval_s: float) -> bool:
     """Ask at least once, until the answer is yes or the time is over.
 
-    Bounded in time, since each answer may take long, and in number, since a camera's time may be simulated.
+    Polling is bounded in time, since each answer may take long, and in number, since a camera's time may be simulated.
 
     Args:
         interval_s: pause between two questions.

@@ -1,4 +1,4 @@
-"""Switching off, by GenApi, what a camera does to its samples."""
+"""Switches off a camera's processing of its samples through GenApi."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ _FLOAT: Final = "IFloat"
 
 
 def send_raw_samples(nodes: NodeMap) -> None:
-    """Bring a camera into the state of ``raw_state``; features that it lacks, or has fixed, are passed over.
+    """Bring a camera into the state of ``raw_state``; skip features that it lacks or has fixed.
 
-    Pixel formats and bounds of the region depend on it, so that they must be read afterwards.
+    Pixel formats and bounds of the region depend on that state, so read them afterwards.
 
     Raises:
         CameraError: when it refuses.
@@ -41,7 +41,7 @@ def send_raw_samples(nodes: NodeMap) -> None:
 
 
 def _choose(nodes: NodeMap, name: str, symbol: str) -> bool:
-    """Set an enumeration that has such an entry; False for all others."""
+    """Set an enumeration that has such an entry; return False for all others."""
     if not (nodes.writable(name, _CHOICE) and symbol in nodes.choices(name)):
         return False
     nodes.choose(name, symbol)
@@ -49,13 +49,13 @@ def _choose(nodes: NodeMap, name: str, symbol: str) -> bool:
 
 
 def _set_unity(nodes: NodeMap, name: str) -> None:
-    # An integer counts in the camera's own steps, of which 1 is seldom a factor of 1.
+    # An integer counts in the camera's own steps, so 1 is seldom a factor of 1.
     if nodes.writable(name, _FLOAT):
         nodes.set_number(name, 1.0)
 
 
 def _select_gain(nodes: NodeMap) -> None:
-    """Select the gain that is set from now on; a digital one beside it would multiply what it sends."""
+    """Select the gain that is set from now on; set an additional digital gain to 0 dB."""
     choices = nodes.choices(raw_state.GAIN_SELECTOR) if nodes.writable(raw_state.GAIN_SELECTOR, _CHOICE) else ()
     selected = next((gain for gain in raw_state.GAINS if gain in choices), None)
     if selected is None:

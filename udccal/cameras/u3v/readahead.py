@@ -1,4 +1,4 @@
-"""Frames read on a thread of their own, so that none is lost while the caller works on the one before."""
+"""Reads frames on a separate thread, so that none is lost while the caller works on the one before."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from udccal.cameras.u3v.receiver import Block
 from udccal.errors import CameraTimeout
 
 _POLL_S: Final = 0.05
-# Beyond this many bytes of waiting payloads the camera has to wait, and says so by ids that are missing.
+# Beyond this many bytes of waiting payloads the camera drops frames, whose ids are then missing.
 _MOST_BYTES: Final = 256 << 20
 _MOST_BUFFERS: Final = 32
 
 
 @runtime_checkable
 class Source(Protocol):
-    """Where blocks come from: a receiver."""
+    """A source of blocks: a receiver."""
 
     @property
     def room(self) -> int:
@@ -40,7 +40,7 @@ class _Filled:
 
 @final
 class ReadAhead:
-    """Reads up to ``count`` blocks into a few buffers that go round between a thread and the caller.
+    """Reads up to ``count`` blocks into a few buffers that circulate between a thread and the caller.
 
     Args:
         wait_s: longest wait for each block while the caller waits for it.
@@ -59,10 +59,10 @@ class ReadAhead:
         self._thread = threading.Thread(target=self._run, name="udccal-u3v-stream", daemon=True)
 
     def blocks(self) -> Generator[tuple[memoryview, Block], None, None]:
-        """The blocks with their payloads, each of which holds until the next one is asked for.
+        """Yield blocks with their payloads; each payload is valid until the next block is requested.
 
         Raises:
-            CameraError: what stopped the reading, once everything before it was handed out.
+            CameraError: the error that stopped the reading, after all blocks before it.
         """
         self._asked.set()
         self._thread.start()
@@ -88,11 +88,11 @@ class ReadAhead:
                     return
                 self._filled.put(_Filled(buffer, block))
         except Exception as error:
-            # Whatever it is, it belongs to the caller, who would wait for ever otherwise.
+            # Every error goes to the caller, who would wait for ever otherwise.
             self._filled.put(error)
 
     def _receive(self, buffer: bytearray) -> Block | None:
-        """The next block; that none comes is an error only to a caller who waits for it all the while."""
+        """Return the next block; raise a time-out only if the caller has been waiting for it the whole time."""
         while not self._stop.is_set():
             asked = self._asked.is_set()
             try:
@@ -103,7 +103,7 @@ class ReadAhead:
         return None
 
     def _empty_buffer(self) -> bytearray | None:
-        """A buffer that the caller has given back; None when stopped."""
+        """Return a buffer that the caller has returned; None when stopped."""
         while not self._stop.is_set():
             try:
                 return self._free.get(timeout=_POLL_S)

@@ -1,4 +1,4 @@
-"""Frames out of the stream endpoint: leader, payload and trailer, and back into step after anything else."""
+"""Reads frames from the stream endpoint: leader, payload and trailer; resynchronises after anything else."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from udccal.cameras.u3v.stream import Leader, Trailer, is_leader, is_trailer, pa
 from udccal.cameras.u3v.usb_errors import RECOVERABLE
 from udccal.errors import CameraProtocolError, CameraTimeout
 
-# Waiting for a leader is cut into pieces, so that it can be given up between them.
+# The wait for a leader is cut into pieces, so that it can be stopped between them.
 _SLICE_S: Final = 0.1
-# Times that one frame may be looked for anew after a halt, an overflow, a failed transfer or repeated ids.
+# How often the search for one frame may restart after a halt, an overflow, a failed transfer or repeated ids.
 _MOST_TROUBLES: Final = 32
 
 
 @runtime_checkable
 class StreamLink(Protocol):
-    """What is needed of USB: one endpoint, with errors as ``transport`` raises them."""
+    """The stream endpoint; methods raise the errors of ``transport``."""
 
     def read_stream(self, buffer: array[int], timeout_s: float) -> int:
-        """Fill a buffer, or as much of it as comes."""
+        """Fill a buffer with as many bytes as come."""
         ...
 
     def clear_stream_halt(self) -> None:
@@ -35,7 +35,7 @@ class StreamLink(Protocol):
 @final
 @dataclass(frozen=True)
 class Block:
-    """What came of one frame.
+    """The received parts of one frame.
 
     Attributes:
         trailer: None when none came.
@@ -48,12 +48,12 @@ class Block:
 
     @property
     def valid(self) -> int:
-        """Bytes of payload that came and mean something."""
+        """Bytes of payload that came and are valid."""
         return self.received if self.trailer is None else min(self.received, self.trailer.valid_bytes)
 
     @property
     def whole(self) -> bool:
-        """Whether the device says that it sent everything, and all of it came."""
+        """Whether the device reports that it sent everything, and all of it came."""
         trailer = self.trailer
         return (
             trailer is not None
@@ -65,10 +65,10 @@ class Block:
 
 @final
 class Receiver:
-    """Reads one block after the other, each id once; what belongs to none is thrown away.
+    """Reads one block after the other, each id once; discards data that belong to none.
 
     Args:
-        timeout_s: for each transfer within a frame.
+        timeout_s: limit of each transfer within a frame.
     """
 
     def __init__(self, link: StreamLink, layout: StreamLayout, timeout_s: float) -> None:
@@ -87,41 +87,41 @@ class Receiver:
         return sum(self._layout.transfers)
 
     def receive(self, payload: memoryview, wait_s: float, stopped: Callable[[], bool]) -> Block | None:
-        """The next block, whole or not; ``payload`` is filled from its beginning.
+        """Return the next block, complete or not; fill ``payload`` from its beginning.
 
         Args:
-            payload: of ``room`` bytes.
-            wait_s: longest wait for its leader.
-            stopped: asked now and then; None is returned once it says so.
+            payload: buffer of ``room`` bytes.
+            wait_s: longest wait for the leader.
+            stopped: polled during the wait; the method returns None once it is true.
 
         Raises:
             CameraTimeout: when no leader comes.
             CameraLost: when the camera is gone.
-            CameraProtocolError: when only data without leaders comes, or blocks with ids that were there before.
+            CameraProtocolError: when only data without leaders come, or only blocks with repeated ids.
         """
         for _ in range(_MOST_TROUBLES):
             leader = self._leader(wait_s, stopped)
             if leader is None:
                 return None
             block = self._block(leader, payload)
-            # A leader that another one follows at once was left over from an earlier run.
+            # A leader that is followed at once by another one was left over from an earlier run.
             left_over = not block.received and self._next_leader is not None
             if leader.block_id > self._last_id and not left_over:
                 self._last_id = leader.block_id
                 return block
         raise CameraProtocolError(
-            f"Expected a frame after frame {self._last_id}, found {_MOST_TROUBLES} that were there before. "
+            f"Expected a frame after frame {self._last_id}, found {_MOST_TROUBLES} with repeated ids. "
             "Open the camera again."
         )
 
     def _leader(self, wait_s: float, stopped: Callable[[], bool]) -> Leader | None:
-        """The next leader; None when stopped."""
+        """Return the next leader; None when stopped."""
         leader, self._next_leader = self._next_leader, None
         waited_s, foreign, troubles = 0.0, 0, 0
         latest = time.monotonic() + wait_s + self._timeout_s
         while leader is None and not stopped():
             try:
-                # Out of step, long reads take what is left of a broken frame; a leader ends one by its short packet.
+                # After an error, long reads skip the rest of a broken frame; a leader ends one by its short packet.
                 packet = self._read(self._layout.leader if self._in_step else self._layout.transfer, _SLICE_S)
                 leader = _leader_in(packet)
             except CameraTimeout as error:
@@ -142,7 +142,7 @@ class Receiver:
         return leader
 
     def _block(self, leader: Leader, payload: memoryview) -> Block:
-        """What follows a leader, as far as it is in order; out of order, the rest is left to be thrown away."""
+        """Read what follows a leader until an error; the rest is discarded later."""
         received = 0
         try:
             for size in self._layout.transfers:
@@ -151,10 +151,10 @@ class Receiver:
                     return self._ended(leader, received, data)
                 payload[received : received + len(data)] = data
                 received += len(data)
-                if len(data) < size:  # the device has no more to send, or the time was up in the middle
+                if len(data) < size:  # the device has no more to send, or the time ran out
                     break
             data = self._read(self._layout.trailer, self._timeout_s)
-            # Some devices end a payload that fills its transfers with an empty packet all the same.
+            # Some devices end a payload with an empty packet even if it fills its transfers.
             return self._ended(leader, received, data or self._read(self._layout.trailer, self._timeout_s))
         except CameraTimeout:
             self._in_step = False
@@ -163,18 +163,18 @@ class Receiver:
         return Block(leader, None, received)
 
     def _ended(self, leader: Leader, received: int, packet: memoryview) -> Block:
-        """The block, with what came behind its payload."""
+        """Return the block with what came after its payload."""
         try:
             if is_trailer(bytes(packet[:4])):
                 return Block(leader, parse_trailer(bytes(packet)), received)
         except CameraProtocolError:
-            pass  # a trailer cut short says nothing of the payload
+            pass  # an incomplete trailer has no information about the payload
         self._next_leader = _leader_in(packet)
         self._in_step = self._next_leader is not None
         return Block(leader, None, received)
 
     def _recover(self) -> None:
-        """After a halt, an overflow or a failed transfer: make the endpoint usable, and look for the next leader."""
+        """Make the endpoint usable after a halt, an overflow or a failed transfer, and search for the next leader."""
         self._link.clear_stream_halt()
         self._in_step = False
 
@@ -189,7 +189,7 @@ def _is_head(packet: memoryview) -> bool:
 
 
 def _leader_in(packet: memoryview) -> Leader | None:
-    """The leader that a packet is; None when it is another thing, or a leader that makes no sense."""
+    """Return the leader in a packet; None when it is something else, or an invalid leader."""
     try:
         return parse_leader(bytes(packet)) if is_leader(bytes(packet[:4])) else None
     except CameraProtocolError:

@@ -1,4 +1,4 @@
-"""Exposure, gain and region by their SFNC names (GenICam Standard Features Naming Convention)."""
+"""Sets exposure, gain and region by their SFNC names (GenICam Standard Features Naming Convention)."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from udccal.cameras.protocol import Range, Region, Settings
 from udccal.cameras.u3v.nodes import NodeMap
 from udccal.errors import CameraError
 
-_EXPOSURE: Final = ("ExposureTime", "ExposureTimeAbs")  # us; the second before SFNC 1.5
+_EXPOSURE: Final = ("ExposureTime", "ExposureTimeAbs")  # us; the second name is older than SFNC 1.5
 _GAIN: Final = "Gain"  # dB
 # Lowest and highest gain of a camera without one.
 _NO_GAIN: Final = Range(0.0, 0.0)
@@ -17,25 +17,25 @@ _US_PER_S: Final = 1e6
 
 
 def sensor_region(nodes: NodeMap) -> Region:
-    """The whole sensor, cut to even sizes; smaller than SensorWidth and SensorHeight while the camera bins."""
+    """Return the whole sensor, cropped to even sizes; smaller than SensorWidth, SensorHeight while the camera bins."""
     columns = _extent(nodes, "Width", "OffsetX", "SensorWidth")
     rows = _extent(nodes, "Height", "OffsetY", "SensorHeight")
     return Region(0, 0, columns // 2 * 2, rows // 2 * 2)
 
 
 def exposure_range(nodes: NodeMap) -> Range:
-    """Shortest and longest exposure now, s."""
+    """Return the shortest and longest exposure now, s."""
     bounds = nodes.bounds(_exposure_name(nodes))
     return Range(bounds.low / _US_PER_S, bounds.high / _US_PER_S)
 
 
 def gain_range(nodes: NodeMap) -> Range:
-    """Lowest and highest gain now, dB; both 0 for a camera without a gain in dB."""
+    """Return the lowest and highest gain now, dB; both 0 for a camera without a gain in dB."""
     return nodes.bounds(_GAIN) if nodes.has(_GAIN) else _NO_GAIN
 
 
 def region_steps(nodes: NodeMap) -> tuple[int, int, int, int]:
-    """Multiples of which x, y, columns and rows of a region are; even, so that the CFA pattern stays."""
+    """Return the steps of x, y, columns and rows of a region; even, so that the CFA pattern stays."""
     sensor = sensor_region(nodes)
     # Without an offset only 0 is possible, which is a multiple of the sensor's size as well.
     defaults = (sensor.columns, sensor.rows, sensor.columns, sensor.rows)
@@ -48,20 +48,20 @@ def region_steps(nodes: NodeMap) -> tuple[int, int, int, int]:
 
 
 def read_settings(nodes: NodeMap) -> Settings:
-    """What the camera has now."""
+    """Return the current settings."""
     gain_dB = nodes.number(_GAIN) if nodes.has(_GAIN) else 0.0
     return Settings(nodes.number(_exposure_name(nodes)) / _US_PER_S, gain_dB, read_region(nodes))
 
 
 def read_region(nodes: NodeMap) -> Region:
-    """The region that the camera has now."""
+    """Return the current region."""
     x, y = (round(nodes.number(name)) if nodes.has(name) else 0 for name in ("OffsetX", "OffsetY"))
     columns, rows = (round(nodes.number(name)) for name in ("Width", "Height"))
     return Region(x, y, columns, rows)
 
 
 def apply_settings(nodes: NodeMap, settings: Settings) -> Settings:
-    """Ask for settings; returns what the camera has afterwards, read back from it.
+    """Request settings; return the camera's settings afterwards, read back from it.
 
     Raises:
         CameraError: when one is outside what the camera can do now.
@@ -73,7 +73,7 @@ def apply_settings(nodes: NodeMap, settings: Settings) -> Settings:
     check_range("an exposure", "s", settings.exposure_s, exposure_range(nodes))
     check_range("a gain", "dB", settings.gain_dB, gain_range(nodes))
     bounds = nodes.bounds(_exposure_name(nodes))
-    # The way to s and back may end an ulp outside.
+    # Conversion to s and back may end an ulp outside.
     nodes.set_number(_exposure_name(nodes), min(max(settings.exposure_s * _US_PER_S, bounds.low), bounds.high))
     if nodes.has(_GAIN):
         nodes.set_number(_GAIN, settings.gain_dB)
@@ -82,10 +82,10 @@ def apply_settings(nodes: NodeMap, settings: Settings) -> Settings:
 
 
 def check_range(what: str, unit: str, value: float | int, allowed: Range) -> None:
-    """Refuse a value outside a range, or one that is no number.
+    """Refuse a value outside a range, or NaN.
 
     Raises:
-        CameraError: as a sentence.
+        CameraError: when the value is refused.
     """
     if not allowed.low <= value <= allowed.high:
         raise CameraError(
@@ -102,7 +102,7 @@ def _exposure_name(nodes: NodeMap) -> str:
 
 
 def _extent(nodes: NodeMap, size: str, offset: str, sensor: str) -> int:
-    """Largest size at offset 0, whatever the offset is now: cameras differ in whether WidthMax depends on it."""
+    """Return the largest size at offset 0 for any current offset: WidthMax depends on it in some cameras."""
     extent = nodes.bounds(size).high + (nodes.number(offset) if nodes.has(offset) else 0.0)
     return round(min(extent, nodes.number(sensor)) if nodes.has(sensor) else extent)
 
@@ -126,7 +126,7 @@ def _check_region(nodes: NodeMap, region: Region) -> None:
 
 
 def _set_region(nodes: NodeMap, region: Region) -> None:
-    """Offsets go to 0 first, since each size is bounded by its offset and the other way round."""
+    """Set offsets to 0 first, since size and offset bound each other."""
     if region == read_region(nodes):
         return
     offsets = (("OffsetX", region.x), ("OffsetY", region.y))

@@ -1,4 +1,4 @@
-"""What stands before and after a payload: leader and trailer, out of bytes (USB3 Vision, stream protocol)."""
+"""Decodes the leader and trailer of a payload (USB3 Vision, stream protocol)."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ IMAGE_TRAILER_BYTES: Final = _TRAILER_HEAD.size + _ROWS.size
 
 @final
 class PayloadType(enum.IntEnum):
-    """What the payload holds."""
+    """Kind of the payload."""
 
     IMAGE = 0x0001
     CHUNK = 0x4000
@@ -48,7 +48,7 @@ class ImageInfo:
 @final
 @dataclass(frozen=True)
 class Leader:
-    """Before a payload; ``image`` is None where the payload is chunks alone."""
+    """The packet before a payload; ``image`` is None where the payload is chunks alone."""
 
     block_id: int
     payload_type: PayloadType
@@ -59,12 +59,12 @@ class Leader:
 @final
 @dataclass(frozen=True)
 class Trailer:
-    """After a payload.
+    """The packet after a payload.
 
     Attributes:
-        status: 0 when the device sent everything; 0xA100 when it threw data away, 0xA101 when it ran over.
-        valid_bytes: of the payload; what came beyond is padding.
-        rows: that the picture really has; None where the payload is chunks alone.
+        status: 0 when the device sent everything; 0xA100 when it discarded data, 0xA101 after an overrun.
+        valid_bytes: valid bytes of the payload; the rest is padding.
+        rows: true number of rows of the picture; None where the payload is chunks alone.
     """
 
     block_id: int
@@ -74,20 +74,20 @@ class Trailer:
 
 
 def is_leader(packet: bytes) -> bool:
-    """Whether a packet starts as a leader does."""
+    """Return whether a packet starts as a leader does."""
     return packet.startswith(_LEADER)
 
 
 def is_trailer(packet: bytes) -> bool:
-    """Whether a packet starts as a trailer does."""
+    """Return whether a packet starts as a trailer does."""
     return packet.startswith(_TRAILER)
 
 
 def parse_leader(packet: bytes) -> Leader:
-    """A leader out of the bytes of one transfer.
+    """Decode a leader from the bytes of one transfer.
 
     Raises:
-        CameraProtocolError: when it is none, is cut short, or announces a payload of an unknown kind.
+        CameraProtocolError: when it is not a leader, is incomplete, or announces a payload of an unknown kind.
     """
     _check("leader", packet, is_leader(packet), _LEADER_HEAD.size)
     _, _, _, block_id, _, kind, timestamp_ns = _LEADER_HEAD.unpack_from(packet)
@@ -105,10 +105,10 @@ def parse_leader(packet: bytes) -> Leader:
 
 
 def parse_trailer(packet: bytes) -> Trailer:
-    """A trailer out of the bytes of one transfer.
+    """Decode a trailer from the bytes of one transfer.
 
     Raises:
-        CameraProtocolError: when it is none or is cut short.
+        CameraProtocolError: when it is not a trailer or is incomplete.
     """
     _check("trailer", packet, is_trailer(packet), _TRAILER_HEAD.size)
     _, _, _, block_id, status, _, valid_bytes = _TRAILER_HEAD.unpack_from(packet)
@@ -117,10 +117,10 @@ def parse_trailer(packet: bytes) -> Trailer:
 
 
 def _check(what: str, packet: bytes, starts: bool, needed: int) -> None:
-    """Refuse what does not start right, or holds less than it must or than it says."""
+    """Refuse a packet with a wrong start, or shorter than required or than its own size field."""
     said = struct.unpack_from("<H", packet, 6)[0] if len(packet) >= 8 else 0
     if not starts or len(packet) < max(needed, said) or said < needed:
         raise CameraProtocolError(
-            f"Expected a {what} of {needed} bytes, found {len(packet)} that start with {packet[:4]!r} and say {said}. "
-            "Check the cable; if it stays, update the camera's firmware."
+            f"Expected a {what} of {needed} bytes, found {len(packet)} starting with {packet[:4]!r}, declaring {said}. "
+            "Check the cable; if that does not help, update the camera's firmware."
         )

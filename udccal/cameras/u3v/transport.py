@@ -1,4 +1,4 @@
-"""The USB side of one open camera: its three endpoints, and every transfer bounded in time."""
+"""The USB side of one open camera: its three endpoints; every transfer has a time limit."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class UsbLink:
         """Send a message to the control endpoint.
 
         Raises:
-            CameraTimeout, CameraLost, CameraError: as USB has it; of the last kind, those that are RECOVERABLE.
+            CameraTimeout, CameraLost, CameraError: when USB fails; of the last kind, those that are RECOVERABLE.
         """
         with self._errors("sending a command"):
             sent = self._device.write(self._interfaces.control_out, command, _ms(timeout_s))
@@ -61,10 +61,10 @@ class UsbLink:
             raise CameraError(f"Expected {len(command)} bytes of a command to go out, found {sent}. Check the cable.")
 
     def receive(self, length: int, timeout_s: float) -> bytes:
-        """One message from the control endpoint, of ``length`` bytes at most.
+        """Return one message from the control endpoint, of ``length`` bytes at most.
 
         Raises:
-            CameraTimeout, CameraLost, CameraError: as USB has it; of the last kind, those that are RECOVERABLE.
+            CameraTimeout, CameraLost, CameraError: when USB fails; of the last kind, those that are RECOVERABLE.
         """
         with self._errors("waiting for an acknowledge"):
             data = self._device.read(self._interfaces.control_in, length, _ms(timeout_s))
@@ -74,10 +74,10 @@ class UsbLink:
         """Fill a buffer of bytes from the stream; a short packet ends the transfer early.
 
         Returns:
-            How many bytes came: fewer also when the time was up after some, which USB does not call an error.
+            How many bytes came; fewer also when the time ran out after some, which is no error in USB.
 
         Raises:
-            CameraTimeout, CameraLost, CameraError: as USB has it; of the last kind, those that are RECOVERABLE.
+            CameraTimeout, CameraLost, CameraError: when USB fails; of the last kind, those that are RECOVERABLE.
         """
         with self._errors("reading the stream"):
             return int(self._device.read(self._interfaces.stream_in, buffer, _ms(timeout_s)))
@@ -94,9 +94,9 @@ class UsbLink:
             self._device.clear_halt(self._interfaces.stream_in)
 
     def flush_stream(self) -> None:
-        """Halt the stream endpoint and clear it again, at which a device throws away what it has not sent."""
+        """Halt the stream endpoint and clear it again; a device then discards what it has not sent."""
         with self._errors("resetting the stream endpoint"):
-            # A device that cannot be halted by the host says so with a stall of this request alone.
+            # A device that the host cannot halt answers this request with a stall.
             with contextlib.suppress(usb.core.USBError):
                 usb.control.set_feature(self._device, usb.control.ENDPOINT_HALT, self._stream_in)
             self._device.clear_halt(self._interfaces.stream_in)
@@ -112,8 +112,8 @@ class UsbLink:
             with usb_errors(doing):
                 yield
         except TransferFailed as error:
-            # A cable that is pulled during a transfer shows as an error like any other, and for a moment the system
-            # still lists the camera: whether it is there it must be asked.
+            # A cable that is pulled during a transfer causes an error like any other, and for a moment the system
+            # still lists the camera. So the camera itself is asked.
             if self._answers():
                 raise
             raise CameraLost(
@@ -142,5 +142,5 @@ class UsbLink:
 
 
 def _ms(timeout_s: float) -> int:
-    """To pyusb's unit; its 0 would mean to wait without end."""
+    """Convert to pyusb's unit; its 0 would mean to wait without end."""
     return max(1, round(1e3 * timeout_s))

@@ -1,4 +1,4 @@
-"""What pyusb raises, as the errors of cameras."""
+"""Turns pyusb's exceptions into the errors of cameras."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ class EndpointHalted(CameraError):
 
 @final
 class TransferOverflow(CameraError):
-    """A device sent more than was asked for; what was received is worth nothing."""
+    """A device sent more than was requested; the received data are useless."""
 
 
 @final
 class TransferFailed(CameraError):
-    """The bus failed in the middle of a transfer, as a bad cable makes it; the next may go well."""
+    """The bus failed during a transfer, as with a bad cable; the next transfer may succeed."""
 
 
 # After any of these the endpoint is cleared and the transfer may be tried again.
 RECOVERABLE: Final = (EndpointHalted, TransferOverflow, TransferFailed)
 
-# libusb's own codes, for platforms where pyusb finds no errno to go with them (libusb.h, enum libusb_error).
+# libusb's own codes, for platforms where pyusb finds no errno for them (libusb.h, enum libusb_error).
 _ERRNO_OF_LIBUSB: Final = {
     -1: errno.EIO,
     -3: errno.EACCES,
@@ -46,12 +46,12 @@ _ERRNO_OF_LIBUSB: Final = {
 
 _LOST: Final = frozenset({errno.ENODEV, errno.ENXIO, errno.ESHUTDOWN, errno.ENOENT})
 _DENIED: Final = frozenset({errno.EACCES, errno.EPERM})
-# A system call that a signal cut short has sent nothing: to the caller it is a wait that ended without an answer.
+# A system call that a signal interrupted has sent nothing: for the caller, the wait ended without an answer.
 _TIMED_OUT: Final = frozenset({errno.ETIMEDOUT, errno.EINTR})
 
 
 def camera_error(error: usb.core.USBError, doing: str) -> CameraError:
-    """The camera's error for one of pyusb's, which differ in what they carry from backend to backend."""
+    """Return the camera's error for one of pyusb's, whose content differs from backend to backend."""
     number = error.errno if error.errno is not None else _ERRNO_OF_LIBUSB.get(error.backend_error_code)
     if isinstance(error, usb.core.USBTimeoutError) or number in _TIMED_OUT:
         return CameraTimeout(f"Expected the camera to answer in time while {doing}, found silence. Check the cable.")
@@ -60,7 +60,7 @@ def camera_error(error: usb.core.USBError, doing: str) -> CameraError:
     if number == errno.EPIPE:
         return EndpointHalted(f"Expected data while {doing}, found the endpoint halted. Open the camera again.")
     if number == errno.EOVERFLOW:
-        return TransferOverflow(f"Expected no more data than was asked for while {doing}, found more. Try again.")
+        return TransferOverflow(f"Expected no more data than requested while {doing}, found more. Try again.")
     if number == errno.EBUSY:
         return CameraBusy(
             f"Expected the camera to be free while {doing}, found it held by another program. Close that program."
@@ -72,7 +72,7 @@ def camera_error(error: usb.core.USBError, doing: str) -> CameraError:
         )
     if number == errno.EIO:
         return TransferFailed(
-            f"Expected a sound transfer while {doing}, found an error. Check the cable, port and hub."
+            f"Expected an intact transfer while {doing}, found an error. Check the cable, port and hub."
         )
     if number == errno.ENOMEM:
         return CameraError(
@@ -84,7 +84,7 @@ def camera_error(error: usb.core.USBError, doing: str) -> CameraError:
 
 @contextmanager
 def usb_errors(doing: str) -> Iterator[None]:
-    """Turns what pyusb raises inside into the errors of cameras; ``doing`` ends up in the sentence."""
+    """Turn pyusb's exceptions in the context into the errors of cameras; ``doing`` is part of their sentence."""
     try:
         yield
     except usb.core.USBError as error:

@@ -1,1 +1,1 @@
-"""What the verbs do once their words are understood; these modules import what is slow to load, the verbs do not."""
+"""The work of the verbs. These modules import what is slow to load; the verbs' own modules do not."""

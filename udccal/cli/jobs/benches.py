@@ -1,4 +1,4 @@
-"""Benches of this world: a camera, a display, and the person who puts things in front of the camera."""
+"""Real benches: a camera, a display, and the person who puts things in front of the camera."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ from udccal.sessions.writer import utc_now
 
 @contextmanager
 def real_bench(output: Output, rig: RigDescription, camera: Camera, display: Display) -> Iterator[CaptureBench]:
-    """A camera and a display of this world, and the person at the rig.
+    """Open a real camera and display, with the person at the rig as the stage.
 
     Raises:
-        CameraError: when the camera cannot be opened, or has no pixel format as the rig asks for.
+        CameraError: when the camera cannot be opened, or has no pixel format that fits the rig.
         DisplayError: when the display cannot be opened.
     """
     person = PersonStage(output)
@@ -35,11 +35,17 @@ def real_bench(output: Output, rig: RigDescription, camera: Camera, display: Dis
 
 @contextmanager
 def files_bench(output: Output, rig: RigDescription, root: Path, pictures: Path) -> Iterator[CaptureBench]:
-    """Pictures taken with any camera, in one folder per step; what the panel is to show is written to ``pictures``.
+    """Open a bench on pictures that any camera took, in one folder per step.
+
+    Args:
+        output: asks and informs the person at the rig.
+        rig: the rig's description.
+        root: holds one folder of pictures per step.
+        pictures: folder that receives the panel's pictures.
 
     Raises:
-        CameraError: when there are no pictures, or they do not state an exposure.
-        FileFormatError: when the first cannot be read.
+        CameraError: when there are no pictures, or they do not contain an exposure.
+        FileFormatError: when the first one cannot be read.
     """
     folders = StepFolders(root, rig.camera.cfa, rig.camera.bits)
     display = MirroredDisplay(ManualDisplay(pictures, panel_size(rig), output.say, lambda question: True))
@@ -48,33 +54,33 @@ def files_bench(output: Output, rig: RigDescription, root: Path, pictures: Path)
 
 
 def u3v_camera(serial: str | None) -> Camera:
-    """The USB3 Vision camera of that serial number, or the only one."""
+    """Return the USB3 Vision camera with that serial number, or the only one."""
     from udccal.cameras.u3v.camera import U3vCamera
 
     return U3vCamera(serial)
 
 
 def pylon_camera(serial: str | None) -> Camera:
-    """The camera of that serial number that Basler's SDK sees, or the only one."""
+    """Return the camera with that serial number among those that Basler's SDK sees, or the only one."""
     from udccal.cameras.pylon import PylonCamera
 
     return PylonCamera(serial)
 
 
 def panel_size(rig: RigDescription) -> PanelSize:
-    """Pixels of a rig's panel."""
+    """Return the resolution of a rig's panel."""
     return PanelSize(rig.panel.columns, rig.panel.rows)
 
 
 def window_display(rig: RigDescription, monitor: int) -> Display:
-    """A full-screen window on the monitor of that number."""
+    """Return a full-screen window on the monitor with that number."""
     from udccal.displays.window import WindowDisplay
 
     return WindowDisplay(monitor, panel_size(rig))
 
 
 def manual_display(output: Output, rig: RigDescription, folder: Path) -> Display:
-    """A panel that the person at the rig works, with the pictures in a folder."""
+    """Return a panel that the person at the rig operates, with its pictures in a folder."""
 
     def confirm(question: str) -> bool:
         return output.ask(f"{question} (Enter for yes, n for no)").strip().lower() not in ("n", "no")

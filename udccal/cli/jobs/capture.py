@@ -1,4 +1,4 @@
-"""Capturing a session with bars and sentences for the person watching."""
+"""Captures a session with progress bars and messages."""
 
 from __future__ import annotations
 
@@ -20,7 +20,18 @@ def capture_watched(
     terms: Sequence[TermName],
     exchanged: Set[Exchanged] = frozenset(),
 ) -> None:
-    """``udccal.benches.capture.capture`` with a stage per term; the same errors."""
+    """Capture a session with one stage per term.
+
+    Args:
+        output: shows stages and messages.
+        bench: camera, display and stage.
+        path: folder of the session.
+        terms: terms to capture.
+        exchanged: parts of the rig that were exchanged on purpose since the session began.
+
+    Raises:
+        UdccalError: as ``udccal.benches.capture.capture`` does.
+    """
     with SessionWriter.create_or_resume(path, bench.rig, bench.camera.identity, exchanged, bench.now) as writer:
         _say_damage(output, writer)
         for term in (name for name in TERMS if name in terms):
@@ -31,7 +42,7 @@ def capture_watched(
 def _say_damage(output: Output, writer: SessionWriter) -> None:
     if writer.recovered:
         output.say(
-            "The session's manifest was damaged; going on from the copy kept before the last step. The damaged one is "
+            "The session's manifest was damaged; the copy from before the last step replaces it. The damaged one is "
             "kept as session.damaged.json."
         )
     for damage in writer.damage:

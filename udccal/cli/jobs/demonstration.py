@@ -1,4 +1,4 @@
-"""The demonstration: capture, fit, profile and restoration on a simulated rig, each set against the truth."""
+"""The demonstration: captures, fits and restores on a simulated rig, and compares each result with the truth."""
 
 from __future__ import annotations
 
@@ -39,19 +39,19 @@ from udccal.sessions.schema import TermName
 from udccal.sessions.store import Session
 from udccal.simulation.world import SimulatedWorld
 
-# The terms that the fits of the others stand on.
+# The other fits need these terms.
 _EARLY: tuple[TermName, ...] = ("noise", "geometry", "wire")
-# Evening light in the room, where the panel's own light counts: as bad a start as the panel gives in practice.
+# Evening light in the room: the panel's own light is then as disturbing as it gets in practice.
 _ROOM_LIGHT = 0.25
-# A coarser grid of kernels than by default: quicker to work out.
+# A coarser grid of kernels than by default: quicker to compute.
 _PLAN = PlanOptions(grid_rows=4, grid_columns=6)
-# Of the shipped photograph: the part with the wide shape of the view that holds the head.
+# The part of the shipped photograph that holds the head and has the wide shape of the view.
 _CROP_TOP, _CROP_SHAPE = 18, 9 / 16
 
 
 @dataclass(frozen=True)
 class DemoSummary:
-    """What ``demo`` delivers."""
+    """Result of ``demo``."""
 
     rig: str
     seed: int
@@ -65,10 +65,16 @@ class DemoSummary:
 
 
 def demonstrate(output: Output, rig_name: str, out: Path, seed: int) -> None:
-    """Run the demonstration; session, profile, pictures and report stay in ``out``.
+    """Run the demonstration.
+
+    Args:
+        output: shows stages and the summary.
+        rig_name: name or folder of the rig.
+        out: folder that receives session, profile, pictures and report.
+        seed: chooses the specimen of the rig, and its noise.
 
     Raises:
-        UdccalError: as the parts do.
+        UdccalError: when capture, fit or restoration fails.
     """
     start = time.perf_counter()
     keep_compilations()
@@ -79,8 +85,8 @@ def demonstrate(output: Output, rig_name: str, out: Path, seed: int) -> None:
         world = simulated_rig(rig, seed)
     panel_picture = face_picture(UNSEEN_PICTURE, rig.panel.columns, rig.panel.rows)
     with ThreadPoolExecutor(1) as pool, simulated_bench(world) as bench:
-        # Beside the captures: first what only the simulated world needs, then the fits of what has been captured, at
-        # last the evidence of the report.
+        # In parallel with the captures: first what only the simulated world needs, then the fits of complete terms, at
+        # last the data of the report.
         pool.submit(lambda: (world.light.blur, world.light.backscatterer))
         capture_watched(output, bench, out / "session", _EARLY)
         foundation = pool.submit(fit_foundation, Session.open(out / "session"), effort=QUICK)
@@ -117,13 +123,13 @@ def demonstrate(output: Output, rig_name: str, out: Path, seed: int) -> None:
 
 
 def _prepare_kernels(rig: RigDescription, foundation: Foundation) -> None:
-    """Compile the psf's kernel while the fits leave a core to spare; profile, report and restorer wait for it."""
+    """Compile the psf's kernel while the fits leave a core free; profile, report and restorer need it."""
     start = nominal_psf(rig, foundation.geometry.term, foundation.wire.term)
     kernels_at(start, np.asarray(start.centre_px)[None], *kernel_size(rig))
 
 
 def portrait() -> Float[np.ndarray, "rows columns 3"]:
-    """The photograph that ships with udccal, cut to a wide shape, in linear light."""
+    """Return the photograph that ships with udccal, cropped to a wide shape, in linear light."""
     path = Path(str(resources.files("udccal") / "data" / "portrait.jpg"))
     photograph = read_photograph(path)
     height = int(photograph.shape[1] * _CROP_SHAPE)
@@ -133,7 +139,7 @@ def portrait() -> Float[np.ndarray, "rows columns 3"]:
 def _restore_portrait(
     output: Output, world: SimulatedWorld, panel_picture: UInt8[np.ndarray, "panel_rows panel_columns 3"], out: Path
 ) -> PictureComparison:
-    """Photograph, capture and restore, with what is stored on disk; writes the frames and pictures."""
+    """Capture the photograph and restore it with the stored profile; write the frames and pictures."""
     with output.stage("restorer"):
         restorer = Restorer.load(out / "profile", _PLAN)
     with output.stage("photograph through the rig"):
@@ -152,7 +158,7 @@ def _restore_portrait(
 
 
 def _times_table(times: list[StageTime], seconds: float, compilation_s: float) -> Table:
-    """With the compilation's part, which overlaps the stages and is less in the next run."""
+    """Print the times, with that of compilation, which overlaps the stages and is shorter in the next run."""
     totals = (("in all", f"{seconds:.1f}"), ("compilation, on all threads", f"{compilation_s:.1f}"))
     rows = (*((t.stage, f"{t.seconds:.1f}") for t in times), *totals)
     return Table("Where the time went", ("stage", "s"), rows, frozenset({1}))

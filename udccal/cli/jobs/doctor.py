@@ -1,4 +1,4 @@
-"""The doctor's findings, for people and for machines."""
+"""Prints the doctor's findings as a table or as JSON."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ _EXAMPLE = "udccal doctor --rig NAME --session FOLDER --camera u3v --display win
 @final
 @dataclass(frozen=True)
 class DoctorSummary:
-    """What ``doctor`` delivers; ``ready`` is false when something that was asked for cannot work."""
+    """Result of ``doctor``; ``ready`` is false when something that the user asked for cannot work."""
 
     ready: bool
     findings: tuple[Finding, ...]
 
 
 def report(output: Output, wanted: Wanted) -> bool:
-    """Examine this computer, print what was found, and return whether all that was asked for can work."""
+    """Examine this computer, print the findings to ``output``, and return whether everything in ``wanted`` can work."""
     with output.stage("looking"):
         findings = examine(wanted)
     rows = tuple((finding.topic, finding.status.value, finding.found) for finding in findings)
@@ -43,4 +43,4 @@ def _verdict(wanted: Wanted, problems: list[Finding]) -> str:
         return f"Not ready: {topics}. Follow the advice above, then run this again."
     if wanted == Wanted():
         return f"No problem found. Before a capture, ask for what it needs, for example: {_EXAMPLE}"
-    return "Ready for what was asked for."
+    return "Ready for what you asked for."

@@ -1,4 +1,4 @@
-"""From a captured session to a profile and its report."""
+"""Fits a captured session and writes a profile and its report."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class TermSummary:
 
 @dataclass(frozen=True)
 class FitSummary:
-    """What ``fit`` and ``calibrate`` deliver."""
+    """Result of ``fit`` and ``calibrate``."""
 
     session: Path
     profile: Path
@@ -50,12 +50,18 @@ class FitSummary:
 
 
 def fit_to_profile(output: Output, session_path: Path, profile_path: Path, log: Path | None = None) -> None:
-    """Fit a session, write the report and the profile, print the summary; the solvers' iterations go to ``log``.
+    """Fit a session, write the report and the profile, and print the summary.
+
+    Args:
+        output: shows stages and the summary.
+        session_path: folder of the session.
+        profile_path: folder or zip file to write; the report goes next to it.
+        log: file that receives the solvers' iterations; None for none.
 
     Raises:
         SessionError: when the session is missing or damaged.
-        FitError: when a term ended in a bad status; the report is written then, the profile is not.
-        ProfileError: when something else stands where the profile is to go.
+        FitError: when a term ended in a bad status; then the report is written and the profile is not.
+        ProfileError: when something else is at the profile's path.
     """
     check_replaceable(profile_path)
     keep_compilations()
@@ -64,7 +70,7 @@ def fit_to_profile(output: Output, session_path: Path, profile_path: Path, log: 
     for change in session.manifest.changes:
         output.say(
             f"Careful: the {change.what} was exchanged during this session, from {change.before} to {change.after}. "
-            "The fits take all steps for those of one."
+            "The fits treat all steps as captured with one."
         )
     with _iterations_to(log):
         calibration = run_fits(output, session)
@@ -80,7 +86,7 @@ def fit_to_profile(output: Output, session_path: Path, profile_path: Path, log: 
         store_profile(output, calibration, profile_path)
     except FitError as error:
         raise FitError(f"{error} No profile was written; the report {report} shows every term.") from error
-    output.say(f"Of all this, compilation (less in the next run): {clock.seconds:.1f} s")
+    output.say(f"Compilation took {clock.seconds:.1f} s of this (less in the next run)")
     output.say(f"Profile: {profile_path}\nReport: {report}")
     terms, times = summaries(calibration), tuple(output.times)
     output.result(FitSummary(session_path, profile_path, report, terms, times, clock.seconds))
@@ -114,7 +120,7 @@ def _iterations_to(path: Path | None) -> Iterator[None]:
 def run_fits(
     output: Output, session: Session, effort: FitEffort | None = None, foundation: Foundation | None = None
 ) -> Calibration:
-    """All five fits, with a bar; those of ``foundation`` are done."""
+    """Run all five fits with a bar; those in ``foundation`` are done already."""
     with output.stage("fits") as stage:
 
         def progress(term: TermName) -> None:
@@ -131,19 +137,19 @@ def store_profile(output: Output, calibration: Calibration, path: Path) -> None:
 
     Raises:
         FitError: when a term cannot be used.
-        ProfileError: when something else stands at ``path``.
+        ProfileError: when something else is at ``path``.
     """
     with output.stage("profile"):
         calibration.write(path)
 
 
 def summaries(calibration: Calibration) -> tuple[TermSummary, ...]:
-    """The end of each term's fit."""
+    """Return how each term's fit ended."""
     results = ((term, calibration.result(term)) for term in ORDER)
     return tuple(TermSummary(t, r.status.name, r.status.value, r.chi2_dof, r.notes) for t, r in results)
 
 
 def show_status(output: Output, calibration: Calibration) -> None:
-    """One line per term."""
+    """Return a table with one line per term."""
     rows = tuple((s.term, s.status, f"{s.chi2_dof:.3f}", s.advice) for s in summaries(calibration))
     output.table(Table("Fits", ("term", "status", "reduced χ²", "what it means"), rows, frozenset({2})))

@@ -1,4 +1,4 @@
-"""The picture that the panel showed, as a file given by a person."""
+"""Reads the file of the picture that the panel showed."""
 
 from __future__ import annotations
 

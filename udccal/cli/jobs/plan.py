@@ -1,4 +1,4 @@
-"""Planning a capture, for people and for machines."""
+"""Plans a capture and prints the plan as tables or as JSON."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Number:
 @final
 @dataclass(frozen=True)
 class PlanSummary:
-    """What ``plan`` delivers."""
+    """Result of ``plan``."""
 
     rig: str
     profile: Path | None
@@ -49,11 +49,18 @@ class PlanSummary:
 
 
 def plan_captures(output: Output, rig_name: str, words: Sequence[str], profile: Path | None, out: Path | None) -> bool:
-    """Plan, print, and write the rig with the planned captures; returns whether every target is reached.
+    """Plan, print, and write the rig with the planned captures; return whether every target is reached.
+
+    Args:
+        output: shows stages, tables and sentences.
+        rig_name: name or folder of the rig.
+        words: targets, each ``term=value`` with its unit, such as ``wire=0.05%``.
+        profile: profile whose measured values to use; None for that in the rig's folder, if there is one.
+        out: ``rig.toml`` to write; None to write none.
 
     Raises:
         UdccalError: when a target cannot be read, or a procedure is missing.
-        RigError: when the rig is not known, or something is at ``out`` already.
+        RigError: when the rig is not known, or ``out`` exists.
         ProfileError: when the profile cannot be read.
     """
     targets = parse_targets(words)
@@ -93,7 +100,7 @@ def plan_captures(output: Output, rig_name: str, words: Sequence[str], profile: 
 
 
 def _profile_path(rig_name: str, profile: Path | None) -> Path | None:
-    """The profile asked for, or the one in the rig's folder."""
+    """Return the requested profile, or the one in the rig's folder."""
     if profile is not None:
         return find_profile(profile)
     beside = find_rig(rig_name) / RIG_PROFILE
@@ -143,7 +150,7 @@ def _show(output: Output, made: CapturePlan) -> None:
     )
     if additions:
         columns = ("term", "most per", "addition", "sigma falls by", "camera", "set-ups")
-        output.table(Table("What one addition more would bring", columns, additions, frozenset({3, 4, 5})))
+        output.table(Table("Effect of one further addition", columns, additions, frozenset({3, 4, 5})))
     for sentence in _sentences(made):
         output.say(sentence)
 
@@ -151,17 +158,17 @@ def _show(output: Output, made: CapturePlan) -> None:
 def _sentences(made: CapturePlan) -> list[str]:
     said = [_out_of_reach(term) for term in made.terms if not term.reached]
     if made.untouched:
-        said.append(f"Without a target, as the rig has them: {', '.join(made.untouched)}.")
+        said.append(f"Terms without a target keep the rig's captures: {', '.join(made.untouched)}.")
     before, after = made.cost_before, made.cost
     said.append(
         f"All {len(get_args(TermName))} terms: {after.frames} frames in {_duration(after.seconds)} of the camera's "
-        f"time, {after.set_ups} things to set up (now {before.frames} frames, {_duration(before.seconds)}, "
+        f"time, {after.set_ups} set-ups (now {before.frames} frames, {_duration(before.seconds)}, "
         f"{before.set_ups})."
     )
     for what, one in (("second of capture", made.per_second), ("set-up", made.per_set_up)):
         if one is not None:
             said.append(
-                f"Most per {what}: {_addition(one)} lowers the sigma of {one.term} by {one.gain_percent:.2g} %."
+                f"Largest gain per {what}: {_addition(one)} lowers the sigma of {one.term} by {one.gain_percent:.2g} %."
             )
     return said
 
@@ -170,12 +177,12 @@ def _out_of_reach(term: TermPlan) -> str:
     target = _amount(term.target, term.unit)
     if term.floor >= term.target:
         return (
-            f"{term.term}: no amount of capture reaches {target}; {_amount(term.floor, term.unit)} is left. "
+            f"{term.term}: no number of captures reaches {target}; the floor is {_amount(term.floor, term.unit)}. "
             f"{term.lowered_by}"
         )
     left = "" if not term.lowered_by else f" {term.lowered_by}"
     return (
-        f"{term.term}: {target} lies so near what endless captures leave ({_amount(term.floor, term.unit)}) that no "
+        f"{term.term}: {target} is so near the floor ({_amount(term.floor, term.unit)}) that no "
         f"capture of a reasonable length reaches it.{left}"
     )
 
@@ -185,7 +192,7 @@ def _addition(one: Suggestion) -> str:
 
 
 def _amount(value: float, unit: str) -> str:
-    return f"{value:.3g} {unit}" if math.isfinite(value) else "not told"
+    return f"{value:.3g} {unit}" if math.isfinite(value) else "not known"
 
 
 def _duration(seconds: float) -> str:

@@ -1,4 +1,4 @@
-"""Restoring raw files one at a time."""
+"""Restores raw files one at a time."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class RestoredFile:
 
 @dataclass(frozen=True)
 class RestoreSummary:
-    """What ``restore`` delivers."""
+    """Result of ``restore``."""
 
     profile: Path
     pictures: tuple[RestoredFile, ...]
@@ -51,6 +51,15 @@ def restore_files(
 ) -> None:
     """Restore every image with a profile and write it under ``out``, one by one.
 
+    Args:
+        output: shows stages and results.
+        images: raw mosaics, PNG or camera raw.
+        profile_path: folder or zip file of the profile, or a rig's name.
+        out: folder of the restored pictures.
+        panel_picture: picture that the panel showed, 8-bit RGB PNG; None when it is not known.
+        exposure_s: exposure of the images; None to take that of each file.
+        picture_format: ``png``, display-encoded, or ``exr``, linear light in e-/s.
+
     Raises:
         ProfileError: when the profile cannot be read.
         FileFormatError: when an image or the panel's picture cannot be read.
@@ -60,7 +69,7 @@ def restore_files(
     profile = load_profile(profile_path)
     shown = None if panel_picture is None else read_panel_picture(panel_picture, profile.rig)
     targets = _targets(images, out, picture_format)
-    for image in images:  # so that a bad file is told before the long work begins
+    for image in images:  # so that a bad file is reported before the long work begins
         _checked_frame(image, exposure_s, profile.rig)
     restored: list[RestoredFile] = []
     with output.stage("restoring") as stage:
@@ -78,12 +87,12 @@ def restore_files(
 
 
 def _targets(images: list[Path], out: Path, picture_format: str) -> list[Path]:
-    """One file per image; refuses to let one overwrite another, or its own source."""
+    """Return one file per image; refuse to let one overwrite another, or its own source."""
     targets = [out / f"{image.stem}.{picture_format}" for image in images]
     for index, (image, target) in enumerate(zip(images, targets, strict=True)):
         if target in targets[:index] or target.resolve() == image.resolve():
             raise RestorationError(
-                f"Expected names that differ in {out}, found {target.name} to be taken when restoring {image}. "
+                f"Expected names that differ in {out}, found that {target.name} for {image} is taken. "
                 "Rename the image, or choose another folder."
             )
     return targets
@@ -92,7 +101,7 @@ def _targets(images: list[Path], out: Path, picture_format: str) -> list[Path]:
 def _checked_frame(
     image: Path, given_s: float | None, rig: RigDescription
 ) -> tuple[UInt16[np.ndarray, "rows columns"], float]:
-    """A frame that belongs to the rig, and its exposure: the one given goes before the file's own."""
+    """Return a frame that fits the rig, and its exposure in s: ``given_s``, else the file's own."""
     mosaic, in_file = _read_mosaic(image, (rig.camera.rows, rig.camera.columns))
     exposure = in_file if given_s is None else given_s
     if exposure is None:
@@ -107,7 +116,7 @@ def _checked_frame(
 
 
 def _read_mosaic(image: Path, shape: Shape) -> tuple[UInt16[np.ndarray, "rows columns"], float | None]:
-    """A mosaic and the exposure its file states, if any."""
+    """Return a mosaic and the exposure in its file, if any."""
     if image.suffix.lower() == ".png":
         return read_png16(image, shape), None
     raw = read_raw(image, shape)

@@ -1,4 +1,4 @@
-"""What a profile holds, for people and for machines."""
+"""Prints what a profile holds as tables or as JSON."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class ShownTerm:
 
 @dataclass(frozen=True)
 class ProfileSummary:
-    """What ``profile show`` delivers."""
+    """Result of ``profile show``."""
 
     profile: Path
     rig: str
@@ -46,6 +46,10 @@ class ProfileSummary:
 
 def show_profile(output: Output, path: Path) -> None:
     """Print every term's status and every quantity with its unit and sigma.
+
+    Args:
+        output: shows the tables.
+        path: folder or zip file of the profile, or a rig's name.
 
     Raises:
         ProfileError: when the profile cannot be read.

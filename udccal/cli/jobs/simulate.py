@@ -1,4 +1,4 @@
-"""Photographs as a simulated rig would see them."""
+"""Simulates how a rig would see photographs."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class SimulatedFile:
 
 @dataclass(frozen=True)
 class SimulateSummary:
-    """What ``simulate`` delivers."""
+    """Result of ``simulate``."""
 
     rig: str
     seed: int
@@ -46,6 +46,14 @@ def simulate_files(
     output: Output, images: list[Path], rig_name: str, out: Path, panel_picture: Path | None, seed: int
 ) -> None:
     """Write a raw mosaic, a preview and the ideal view of every photograph.
+
+    Args:
+        output: shows stages and results.
+        images: photographs.
+        rig_name: name or folder of the rig.
+        out: folder of the results.
+        panel_picture: picture on the panel, 8-bit RGB PNG; None for a dark panel.
+        seed: chooses the specimen of the rig, and its noise.
 
     Raises:
         RigError: when the rig is not known.
@@ -68,7 +76,7 @@ def simulate_files(
 
 
 def _normalised(radiance: Float[np.ndarray, "rows columns 3"]) -> Float[np.ndarray, "rows columns 3"]:
-    """Radiance scaled so that its 97th percentile is 1: as bright as white paper in a lit room."""
+    """Scale radiance so that its 97th percentile is 1: as bright as white paper in a lit room."""
     return radiance / max(float(np.percentile(radiance, 97.0)), 1e-9)
 
 
