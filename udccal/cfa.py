@@ -6,7 +6,6 @@ A pattern that a new camera needs is one more entry of ``PATTERNS``.
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final, final
 
@@ -97,7 +96,7 @@ class Cfa:
 
 
 _BAYER: Final = {"RGGB": "BayerRG", "GRBG": "BayerGR", "GBRG": "BayerGB", "BGGR": "BayerBG"}
-PATTERNS: Final[Mapping[str, Cfa]] = {
+PATTERNS: Final[dict[str, Cfa]] = {
     "mono": Cfa("mono", ("M",), "Mono"),
     **{name: Cfa(name, (name[:2], name[2:]), family) for name, family in _BAYER.items()},
 }
@@ -112,21 +111,3 @@ def cfa_named(name: str) -> Cfa:
     if name not in PATTERNS:
         raise ValueError(f"expected one of the CFA patterns {', '.join(PATTERNS)}, found '{name[:20]}'")
     return PATTERNS[name]
-
-
-SITES = 4
-
-
-def cell_channels(cfa: str) -> Int[np.ndarray, "2 2"]:
-    """Goes."""
-    return cfa_named(cfa).channels
-
-
-def channel_map(cfa: str, rows: int, columns: int) -> Int[np.ndarray, "rows columns"]:
-    """Goes."""
-    return cfa_named(cfa).channel_map(rows, columns)
-
-
-def site_map(rows: int, columns: int) -> Int[np.ndarray, "rows columns"]:
-    """Goes."""
-    return PATTERNS["RGGB"].site_map(rows, columns)

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy import sparse
 
-from udccal.cfa import cell_channels
+from udccal.cfa import cfa_named
 
 
 @final
@@ -38,27 +38,28 @@ class Bins:
 
     def _sum(self, mosaic: np.ndarray, row_power: int, column_power: int) -> Float[np.ndarray, "3 a b"]:
         sums = np.zeros((3, *(size // self.step for size in mosaic.shape)))
-        cells = np.asarray(cell_channels(self.cfa))
-        # A colour with two samples in a cell averages them.
-        factor = 1.0 / np.bincount(cells.ravel(), minlength=3) ** max(row_power, column_power)
-        for (j, i), channel in np.ndenumerate(cells):
-            part = mosaic[j::2, i::2].astype(np.float64)
+        pattern = cfa_named(self.cfa)
+        # A colour with several samples in a cell averages them.
+        factor = 1.0 / np.bincount(pattern.channels.ravel(), minlength=3).clip(1) ** max(row_power, column_power)
+        for site in pattern.sites:
+            part = mosaic[site.samples].astype(np.float64)
             by_row, by_column = (
-                sparse.csr_array(block_weights(samples, blocks, self.step, first) ** power)
-                for samples, blocks, first, power in zip(
-                    part.shape, sums.shape[1:], (j, i), (row_power, column_power), strict=True
+                sparse.csr_array(block_weights(size, along, blocks, self.step) ** power)
+                for size, along, blocks, power in zip(
+                    mosaic.shape, site.samples, sums.shape[1:], (row_power, column_power), strict=True
                 )
             )
-            sums[channel] += factor[channel] * (by_column @ (by_row @ part).T).T
+            sums[site.channel] += factor[site.channel] * (by_column @ (by_row @ part).T).T
         return sums
 
 
-def block_weights(samples: int, blocks: int, step: int, first: int) -> Float[np.ndarray, "blocks samples"]:
-    """Weights of the samples at ``first``, ``first`` + 2, ... px in the averages over blocks of ``step`` px.
+def block_weights(size: int, samples: slice, blocks: int, step: int) -> Float[np.ndarray, "blocks samples"]:
+    """Weights of the samples of one site in the averages over blocks of ``step`` px, along an axis of ``size`` px.
 
-    A sample covers one pixel to either side of it; what the sensor's edge cuts off, the others of the block take over.
+    A sample covers half the distance to its neighbours of the same site. Where the sensor's edge cuts some of a block
+    off, the block's other samples take over its weight.
     """
-    centre = first + 2.0 * np.arange(samples)
-    edge = step * np.arange(blocks)[:, None] - 0.5
-    weights = np.maximum(np.minimum(centre + 1, edge + step) - np.maximum(centre - 1, edge), 0.0)
+    centre = np.arange(size, dtype=np.float64)[samples]
+    edge, half = step * np.arange(blocks)[:, None] - 0.5, samples.step / 2
+    weights = np.maximum(np.minimum(centre + half, edge + step) - np.maximum(centre - half, edge), 0.0)
     return np.asarray(weights / weights.sum(axis=1, keepdims=True))

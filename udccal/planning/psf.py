@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from udccal.arrangements import Led
-from udccal.cfa import channel_map
+from udccal.cfa import cfa_named
 from udccal.fitting.engine.gaussian import Prior, scaled_inverse
 from udccal.fitting.psf.data import PsfRules, Shots, held_out_positions
 from udccal.fitting.psf.fit import start_model, start_prior
@@ -169,7 +169,7 @@ def _dark_shots(state: RigState, half: tuple[int, int]) -> Shots:
     aims = (middles[:, None] + _SHIFTS_PX).reshape(-1, 2)
     origins = np.round(aims).astype(np.int64)
     rows, columns = 2 * half[0] + 1, 2 * half[1] + 1
-    whole = channel_map(rig.camera.cfa, rows + 1, columns + 1)
+    whole = cfa_named(rig.camera.cfa).channel_map(rows + 1, columns + 1)
     first = (origins - np.array([half[1], half[0]])) % 2
     nothing = np.zeros((len(aims), rows, columns))
     disc = captures.psf_led_mm / (captures.psf_distance_mm + rig.mounting.standoff_mm.value) * rig.focal_px

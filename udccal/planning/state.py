@@ -12,7 +12,7 @@ from scipy.ndimage import map_coordinates
 
 from udccal.arrangements import Arrangement, Board, Dark, FlatLight, Led, PanelPicture, Photograph
 from udccal.calibration import Calibration
-from udccal.cfa import cell_channels
+from udccal.cfa import cfa_named
 from udccal.fitting.geometry.boards import BY_HAND, ON_JIG
 from udccal.fitting.nominal import nominal_geometry
 from udccal.models.backscatter import Backscatter
@@ -182,7 +182,7 @@ class EvenField:
     def __init__(self, state: RigState) -> None:
         camera, geometry, wire = state.rig.camera, state.geometry, state.wire
         self._size = np.array([camera.columns, camera.rows])
-        self._cell = np.asarray(cell_channels(camera.cfa), dtype=np.int64)
+        self._channels = cfa_named(camera.cfa).channel_map(camera.rows, camera.columns)
         y, x = (np.linspace(0, size - 1, count) for size, count in zip(self._size[::-1], _FIELD_GRID, strict=True))
         pixels = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
         if wire is None:
@@ -200,7 +200,7 @@ class EvenField:
     def signal(self, pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
         """What samples of a white field give, 1 for the brightest of all."""
         x, y = np.round(pixels).astype(np.int64).T
-        return np.asarray(self.at(pixels) * (np.array(WHITE) / max(WHITE))[self._cell[y % 2, x % 2]])
+        return np.asarray(self.at(pixels) * (np.array(WHITE) / max(WHITE))[self._channels[y, x]])
 
 
 @in_float64

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from udccal.arrangements import Dark, FlatLight
-from udccal.cfa import SITES
+from udccal.cfa import cfa_named
 from udccal.fitting.engine.gaussian import scaled_inverse
 from udccal.fitting.wire.data import Pixels, odd_step, sample_pixels
 from udccal.fitting.wire.fit import map_jacobian, mean_one
@@ -40,12 +40,12 @@ class WirePredictor:
     def __init__(self, state: RigState) -> None:
         self._state = state
         shape = (state.rig.camera.rows, state.rig.camera.columns)
-        self._pixels = sample_pixels(np.ones(shape), state.geometry, _PIXELS)
+        self._pixels = sample_pixels(np.ones(shape), state.geometry, _PIXELS, state.rig.camera.cfa)
         parameters, x = _expected(state, self._pixels)
         self._parameters, self._x = parameters, mean_one(parameters, x, state.geometry, shape)
         self._prior = parameters.prior(wire_start(state.rig), _RULES)
         self._jacobian = map_jacobian(parameters, self._x, state.geometry, shape)
-        self._value = expected_of(parameters.wire(self._x), np.ones(SITES), self._pixels)
+        self._value = expected_of(parameters.wire(self._x), np.ones(parameters.sites), self._pixels)
         y, x_px = np.divmod(np.maximum(self._pixels.place, 0), shape[1])
         self._signal_e = state.full_well_e * EvenField(state).signal(np.stack([x_px, y], axis=1).astype(float))
         # Each pixel looked at stands for so many of the sensor's, and of those that the fit spends.
@@ -107,8 +107,8 @@ def _expected(state: RigState, pixels: Pixels) -> tuple[Parameters, Float[np.nda
     possible = possible_harmonics(start)
     harmonics, bounds = possible.orders[:_HARMONICS], possible.bounds[:_HARMONICS]
     built = with_harmonics(ideal_wire(state.geometry, start, harmonics), harmonics, pixels.ideal)
-    parameters = parameters_of(built, _RULES, bounds)
-    gains = np.ones(SITES)
+    gains = np.ones(len(cfa_named(state.rig.camera.cfa).sites))
+    parameters = parameters_of(built, _RULES, gains.size, bounds)
     x = parameters.vector(built, gains)
     keep = parameters.groups < 0
     if state.wire is not None and len(np.asarray(state.wire.harmonics)):

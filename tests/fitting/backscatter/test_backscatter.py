@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from tests.simulation.toy import toy_rig, toy_truth
 from udccal.cameras.protocol import CameraIdentity, Region, Settings
-from udccal.cfa import cfa_named
+from udccal.cfa import PATTERNS, Cfa, cfa_named
 from udccal.displays.pictures import face_picture
 from udccal.fitting.backscatter.data import (
     BackscatterData,
@@ -223,15 +223,16 @@ def test_a_bin_is_clipped_from_the_fraction_of_saturation_that_the_rules_say(mos
     assert found.clipped.sum() == clipped
 
 
-@pytest.mark.parametrize("cfa", ["RGGB", "BGGR", "GRBG", "GBRG"])
-def test_every_colour_of_a_bin_is_of_its_centre(cfa: str) -> None:
+@pytest.mark.parametrize("cfa", ["RGGB", "BGGR", "GRBG", "GBRG", "quad"])
+def test_every_colour_of_a_bin_is_of_its_centre(cfa: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """A slanted plane: the mean of a block's own samples alone would be half a pixel off in red and blue."""
+    monkeypatch.setitem(PATTERNS, "quad", Cfa("quad", ("RRGG", "RRGG", "GGBB", "GGBB"), ""))
     y, x = np.mgrid[0:24, 0:32].astype(float)
     mean = Bins(cfa, 4).mean(2 * x + 3 * y)
     centres_x, centres_y = 4 * np.arange(8) + 1.5, 4 * np.arange(6) + 1.5
     wanted = 2 * centres_x + 3 * centres_y[:, None]
     np.testing.assert_allclose(mean[:, 1:-1, 1:-1], np.broadcast_to(wanted, (3, 6, 8))[:, 1:-1, 1:-1], atol=1e-9)
-    np.testing.assert_allclose(block_weights(12, 6, 4, 0).sum(axis=1), 1.0)
+    np.testing.assert_allclose(block_weights(24, slice(0, None, 2), 6, 4).sum(axis=1), 1.0)
 
 
 @pytest.mark.parametrize("name", ["lg55-aca2040", "lg55-reduced", "mk31-imx1600"])

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from tests.scenes import wire as drawn
+from udccal.cfa import cfa_named
 from udccal.fitting.engine.least_squares import minimise
 from udccal.fitting.wire.data import FlatNoise, Pixels, Weighed, WireData, flat_noise, sample_pixels, weighed
 from udccal.fitting.wire.jacobian import WireProblem, block_jacobian, expected_of, wire_derivatives
@@ -59,7 +60,7 @@ def uneven_wire(seed: int = 0) -> Wire:
 
 def even_pixels(wire: Wire, noise: float, seed: int) -> Pixels:
     """Pixels of the ideal map with white noise."""
-    blank = sample_pixels(np.ones((ROWS, COLUMNS)), GEOMETRY, ROWS * COLUMNS)
+    blank = sample_pixels(np.ones((ROWS, COLUMNS)), GEOMETRY, ROWS * COLUMNS, "RGGB")
     with jax.enable_x64(True):
         expected = expected_of(wire, np.ones(4), blank)
     value = expected + noise * np.random.default_rng(seed).standard_normal(len(expected))
@@ -73,7 +74,7 @@ def judge(wire: Wire, pixels: Pixels, noise: FlatNoise) -> Weighed:
 
 def test_slopes_are_those_of_the_model() -> None:
     wire = uneven_wire()
-    pixels = sample_pixels(np.ones((ROWS, COLUMNS)), GEOMETRY, 40)
+    pixels = sample_pixels(np.ones((ROWS, COLUMNS)), GEOMETRY, 40, "RGGB")
 
     @jax.jit
     @jax.jacfwd
@@ -92,9 +93,9 @@ def test_slopes_are_those_of_the_model() -> None:
 
 def test_columns_of_linear_coefficients_are_differences_of_the_map() -> None:
     wire = uneven_wire()
-    pixels = sample_pixels(np.ones((ROWS, COLUMNS)), GEOMETRY, 40)
+    pixels = sample_pixels(np.ones((ROWS, COLUMNS)), GEOMETRY, 40, "RGGB")
     with jax.enable_x64(True):
-        parameters = parameters_of(wire, RULES, np.full(len(HARMONICS), 1e-2))
+        parameters = parameters_of(wire, RULES, 4, np.full(len(HARMONICS), 1e-2))
         x = parameters.vector(wire, np.array([1.2, 0.9, 1.1, 1 / (1.2 * 0.9 * 1.1)]))
         base, design = block_jacobian(parameters, parameters.wire(x), pixels.ideal, pixels.scaled, pixels.site)[1:]
         level = base * parameters.gains(x)[pixels.site]
@@ -111,7 +112,7 @@ def test_a_vector_of_parameters_makes_the_wire_that_it_was_read_from() -> None:
     low = [np.add.outer(np.arange(n), np.arange(n)) < n for n in (9, 4)]
     wire = eqx.tree_at(lambda w: (w.baseline, w.amplitudes), wire, (wire.baseline * low[0], wire.amplitudes * low[1]))
     with jax.enable_x64(True):
-        parameters = parameters_of(wire, RULES, np.full(len(HARMONICS), 1e-2))
+        parameters = parameters_of(wire, RULES, 4, np.full(len(HARMONICS), 1e-2))
         x = parameters.vector(wire, np.ones(4))
         fewer = parameters.kept(parameters.groups < 0)
         back, bare = parameters.wire(x), fewer.wire(fewer.vector(wire, np.ones(4)))
@@ -130,9 +131,9 @@ def test_a_joint_fit_converges_from_afar() -> None:
     values = flat.signal / np.tile(drawn.ELECTRONS * drawn.SITES, (drawn.ROWS // 2, drawn.COLUMNS // 2))
     line = FlatNoise(np.zeros(4), 1 / (drawn.ELECTRONS * drawn.SITES.ravel()), drawn.PRNU, np.full(4, np.inf))
     with jax.enable_x64(True):
-        pixels = sample_pixels(values, lens, values.size)
+        pixels = sample_pixels(values, lens, values.size, "RGGB")
         pixels = weighed(pixels, expected_of(truth, np.ones(4), pixels), line).pixels
-        parameters = parameters_of(truth, RULES)
+        parameters = parameters_of(truth, RULES, 4)
         problem = WireProblem("afar", parameters, pixels, parameters.prior(built, RULES))
         near = minimise(problem, parameters.vector(truth, np.ones(4)))
         sigma = np.sqrt(np.diag(near.equations.cov()))
@@ -142,16 +143,18 @@ def test_a_joint_fit_converges_from_afar() -> None:
     assert np.abs((far.place - near.place) / sigma).max() < 0.05
 
 
-def test_variance_is_a_line_through_noisy_variances() -> None:
+@pytest.mark.parametrize("cfa", ["RGGB", "mono"])
+def test_variance_is_a_line_through_noisy_variances(cfa: str) -> None:
     rng = np.random.default_rng(1)
     values = rng.uniform(0.4, 1.6, (200, 300))
     true = 3.0 + 7.0 * 100 * values
     # Of four frames: three degrees of freedom; a few pixels blink.
     variance = true * rng.chisquare(3, values.shape) / 3
     variance[rng.random(values.shape) < 1e-3] *= 1e4
-    noise = flat_noise(WireData(100 * values, variance, GEOMETRY, START, 0.0), np.full(4, 100.0))
-    at = np.array([0.5, 1.0, 1.5, 1.0])
-    np.testing.assert_allclose(noise.variance(np.arange(4), at), (3.0 + 700 * at) / 100**2, rtol=0.05)
+    sites = len(cfa_named(cfa).sites)
+    noise = flat_noise(WireData(100 * values, variance, GEOMETRY, START, 0.0, cfa=cfa), np.full(sites, 100.0))
+    at = np.array([0.5, 1.0, 1.5, 1.0])[:sites]
+    np.testing.assert_allclose(noise.variance(np.arange(sites), at), (3.0 + 700 * at) / 100**2, rtol=0.05)
 
 
 def test_what_clips_by_the_model_and_what_is_off_are_left_out_and_listed() -> None:
@@ -176,7 +179,7 @@ def test_what_clips_by_the_model_and_what_is_off_are_left_out_and_listed() -> No
 def test_no_number_has_no_weight() -> None:
     values = np.ones((ROWS, COLUMNS))
     values[3, 4], values[5, 6] = np.nan, np.inf
-    pixels = sample_pixels(values, GEOMETRY, values.size)
+    pixels = sample_pixels(values, GEOMETRY, values.size, "RGGB")
     assert pixels.used == values.size - 2
     assert np.isfinite(pixels.value).all()
 
@@ -185,7 +188,7 @@ def test_the_prior_is_the_rig_description_widened() -> None:
     sigma = shape_sigma(START, RULES)
     assert sigma[3:] == pytest.approx([0.06, 1.0, 1.0, 0.08, 0.04, 0.02, 0.02])
     with jax.enable_x64(True):
-        parameters = parameters_of(ideal_wire(GEOMETRY, START, HARMONICS), RULES, np.full(len(HARMONICS), 1e-2))
+        parameters = parameters_of(ideal_wire(GEOMETRY, START, HARMONICS), RULES, 4, np.full(len(HARMONICS), 1e-2))
         prior = parameters.prior(START, RULES)
         built = parameters.vector(ideal_wire(GEOMETRY, START, HARMONICS), np.ones(4))
     assert prior.cost(built) == 0.0

@@ -10,7 +10,7 @@ import numpy as np
 import scipy.ndimage
 from jaxtyping import Float
 
-from udccal.cfa import channel_map
+from udccal.cfa import cfa_named
 from udccal.fitting.hdr.merge import HdrMerge, merge_bracket
 from udccal.fitting.psf.data import PsfData, PsfRules, Shots, joined
 from udccal.kernels import kernel_size
@@ -123,7 +123,10 @@ def cut_crop(
         return None
     x, y = middle = np.round(place).astype(np.int64)
     slope = np.zeros_like(rate) if noise_per_rate is None else noise_per_rate
-    parts = (np.pad(part, [2 * (h,) for h in half]) for part in (rate, weight, channel_map(cfa, *rate.shape), slope))
+    parts = (
+        np.pad(part, [2 * (h,) for h in half])
+        for part in (rate, weight, cfa_named(cfa).channel_map(*rate.shape), slope)
+    )
     windows = (part[None, y : y + 2 * half[0] + 1, x : x + 2 * half[1] + 1] for part in parts)
     where = (place + corner_px)[None], (middle + corner_px)[None], np.zeros(1, dtype=np.int64), np.array([disc_px])
     return Shots(*where, *windows)

@@ -9,7 +9,7 @@ from typing import final
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from udccal.cfa import channel_map
+from udccal.cfa import cfa_named
 from udccal.errors import FitError
 from udccal.result import FitStatus
 
@@ -154,7 +154,7 @@ def mosaic_channels(
     """Channels of stamps cut from a mosaic; for ``Stamps.channel``.
 
     Args:
-        cfa: the mosaic's first 2 x 2 cell, such as "RGGB".
+        cfa: pattern of the mosaic, such as "RGGB".
         position_px: of the stamps' middle samples on the sensor, (x, y).
         rows, columns: of a stamp.
 
@@ -162,12 +162,12 @@ def mosaic_channels(
         0, 1, 2 for R, G, B, of every sample.
 
     Raises:
-        ValueError: when ``cfa`` is not four letters of R, G, B.
+        ValueError: when there is no such pattern.
     """
-    cell = channel_map(cfa, 2, 2)
+    pattern = cfa_named(cfa)
     y = position_px[:, 1, None] - rows // 2 + np.arange(rows)
     x = position_px[:, 0, None] - columns // 2 + np.arange(columns)
-    return cell[y[:, :, None] % 2, x[:, None, :] % 2]
+    return pattern.channels[y[:, :, None] % pattern.rows, x[:, None, :] % pattern.columns]
 
 
 def centroids(stamps: Stamps, window_px: float) -> Float[np.ndarray, "stars 2"]:

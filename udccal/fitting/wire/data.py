@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Shaped
 from scipy.optimize import nnls
 
-from udccal.cfa import site_map
+from udccal.cfa import cfa_named
 from udccal.fitting.engine.robust import OutlierRule
 from udccal.fitting.wire.rules import WireRules, WireStart, wire_start
 from udccal.models.geometry import Geometry, unproject
@@ -46,6 +46,7 @@ class WireData:
         PRNU1288: relative response from pixel to pixel, added to the variance.
         clip: signal from which on single frames clip; pixels that the model puts there are left out.
         clipped: part of the flat's pixels whose average is clipped.
+        cfa: pattern of the sensor; each of its sites has a gain.
     """
 
     signal: Float[np.ndarray, "rows columns"]
@@ -55,6 +56,7 @@ class WireData:
     PRNU1288: float
     clip: float = np.inf
     clipped: float = 0.0
+    cfa: str = "RGGB"
 
 
 def read_wire(session: Session, noise: Noise, geometry: Geometry, rules: WireRules | None = None) -> WireData:
@@ -82,6 +84,7 @@ def read_wire(session: Session, noise: Noise, geometry: Geometry, rules: WireRul
         PRNU1288=float(np.asarray(noise.PRNU1288)),
         clip=headroom - rules.headroom_sigma * float(shot),
         clipped=float(np.mean(flat.mean >= 0.98 * saturation)),
+        cfa=session.rig.camera.cfa,
     )
 
 
@@ -94,10 +97,10 @@ class FlatNoise:
     on, single frames clip: such pixels are left out by what the model says of them.
     """
 
-    floor: Float[np.ndarray, "4"]
-    by_signal: Float[np.ndarray, "4"]
+    floor: Float[np.ndarray, " sites"]
+    by_signal: Float[np.ndarray, " sites"]
     PRNU1288: float
-    clip: Float[np.ndarray, "4"]
+    clip: Float[np.ndarray, " sites"]
 
     def variance(self, site: Int[np.ndarray, "*n"], signal: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
         """Of pixels of these sites at these relative signals."""
@@ -107,12 +110,12 @@ class FlatNoise:
         return np.asarray(self.floor[site] + self.by_signal[site] * some + unequal**2)
 
 
-def flat_noise(data: WireData, means: Float[np.ndarray, "4"]) -> FlatNoise:
+def flat_noise(data: WireData, means: Float[np.ndarray, " sites"]) -> FlatNoise:
     """Straight lines through variance against signal, site by site (EMVA 1288's photon transfer).
 
     The variance of few frames is itself too noisy to weigh single pixels with. ``means`` are the sites' mean signals.
     """
-    sites = site_map(*data.signal.shape)
+    sites = cfa_named(data.cfa).site_map(*data.signal.shape)
     lines = np.array(
         [_line(data.signal[sites == k] / m, data.variance[sites == k] / m**2) for k, m in enumerate(means)]
     )
@@ -165,7 +168,7 @@ class Pixels(eqx.Module):
 
 @in_float64
 def sample_pixels(
-    value: Float[np.ndarray, "rows columns"], geometry: Geometry, samples: int, other: bool = False
+    value: Float[np.ndarray, "rows columns"], geometry: Geometry, samples: int, cfa: str, other: bool = False
 ) -> Pixels:
     """About so many pixels in reading order, shifted along from row to row so that all CFA sites are visited.
 
@@ -173,6 +176,7 @@ def sample_pixels(
         value: what is not finite gets weight 0, others 1.
         geometry: where the rays go.
         samples: as many or somewhat more; all where there are fewer.
+        cfa: pattern of the sensor.
         other: a third as many, of other pixels than the sample drawn otherwise, where that is not all.
     """
     rows, columns = value.shape
@@ -188,7 +192,7 @@ def sample_pixels(
     return Pixels(
         ideal=ideal_points(geometry, positions),
         scaled=np.asarray(scaled_positions(positions, rows, columns)),
-        site=site_map(rows, columns)[y, x],
+        site=cfa_named(cfa).site_map(rows, columns)[y, x],
         value=np.where(real, seen, 0.0),
         weight=np.where(real, 1.0, 0.0),
         place=np.where(real, y * columns + x, -1),

@@ -13,7 +13,7 @@ from typing import final
 import numpy as np
 from jaxtyping import Float
 
-from udccal.cfa import SITES, site_map
+from udccal.cfa import cfa_named
 from udccal.fitting.engine.gaussian import Posterior, scaled_inverse, square_root
 from udccal.fitting.engine.least_squares import minimise
 from udccal.fitting.engine.misfit import clustered_cov
@@ -51,20 +51,20 @@ def fit_wire(data: WireData, rules: WireRules | None = None) -> FitResult[Wire]:
         pixels, what the model may be off included. A flat that cannot be used gives a status that says why.
     """
     rules, shape = rules or WireRules(), data.signal.shape
-    means = _site_means(data.signal, data.clip)
+    means = _site_means(data)
     refused = _unusable(data, means, rules)
     if refused:
         return FitResult.failed("wire", ideal_wire(data.geometry, data.start, np.zeros((0, 2)), rules), *refused)
-    noise, values = flat_noise(data, means), data.signal / means[site_map(*shape)]
+    noise, values = flat_noise(data, means), data.signal / means[cfa_named(data.cfa).site_map(*shape)]
     few, coarse, every = (
-        sample_pixels(values, data.geometry, max(int(part * rules.samples), 1))
+        sample_pixels(values, data.geometry, max(int(part * rules.samples), 1), data.cfa)
         for part in (rules.search_part, rules.shape_part, 1.0)
     )
     found = Search(data.start, noise, rules).found(data.geometry, few, coarse)
     joint = _joint(found, every, data, noise, rules)
     tested, held_out = joint.seen, every.used < values.size / 2
     if held_out:
-        others = sample_pixels(values, data.geometry, rules.samples, other=True)
+        others = sample_pixels(values, data.geometry, rules.samples, data.cfa, other=True)
         tested = weighed_at(joint.parameters, joint.x, others, noise)
     joint = replace(joint, x=mean_one(joint.parameters, joint.x, data.geometry, shape))
     jacobian, wire = map_jacobian(joint.parameters, joint.x, data.geometry, shape), joint.parameters.wire(joint.x)
@@ -87,14 +87,14 @@ def sensor_map(wire: Wire, rows: int, columns: int) -> Float[np.ndarray, "rows c
     return np.asarray(wire_map(wire, rows, columns), dtype=np.float64)
 
 
-def _site_means(signal: Float[np.ndarray, "rows columns"], clip: float) -> Float[np.ndarray, "4"]:
+def _site_means(data: WireData) -> Float[np.ndarray, " sites"]:
     """Of what is finite and not clipped; NaN where nothing is left."""
-    sites = site_map(*signal.shape)
-    good = [signal[(sites == k) & np.isfinite(signal) & (signal < clip)] for k in range(SITES)]
+    by_site = (data.signal[site.samples] for site in cfa_named(data.cfa).sites)
+    good = (some[np.isfinite(some) & (some < data.clip)] for some in by_site)
     return np.array([float(some.mean(dtype=np.float64)) if some.size else np.nan for some in good])
 
 
-def _unusable(data: WireData, means: Float[np.ndarray, "4"], rules: WireRules) -> tuple[FitStatus, str] | None:
+def _unusable(data: WireData, means: Float[np.ndarray, " sites"], rules: WireRules) -> tuple[FitStatus, str] | None:
     """Why a flat cannot be fitted."""
     if data.clipped > rules.most_clipped:
         return FitStatus.SATURATED, f"{100 * data.clipped:.1f} % of the flat is clipped."
@@ -104,7 +104,7 @@ def _unusable(data: WireData, means: Float[np.ndarray, "4"], rules: WireRules) -
         return FitStatus.TOO_DARK, "A CFA site has no light; check the lamp."
     if data.signal.size < rules.least_samples:
         return FitStatus.TOO_FEW_DATA, f"There are {data.signal.size} pixels; use a larger region of the sensor."
-    worst = float(np.sqrt(flat_noise(data, means).variance(np.arange(SITES), np.ones(SITES)).max()))
+    worst = float(np.sqrt(flat_noise(data, means).variance(np.arange(means.size), np.ones(means.size)).max()))
     if worst > 1.0:
         note = f"A pixel's noise is {worst:.2g} of its signal. Average more frames, or expose longer."
         return FitStatus.TOO_DARK, note
@@ -115,7 +115,7 @@ def _joint(found: Found, every: Pixels, data: WireData, noise: FlatNoise, rules:
     """Choose the columns that the data ask for, and fit them with the shape until nothing moves."""
     wire, gains, panel = found.descent.wire, found.descent.gains, found.descent.problem.parameters.panel
     bounds = possible_harmonics(data.start, rules.least_amplitude).bounds
-    full = parameters_of(wire, rules, bounds if panel else (), panel)
+    full = parameters_of(wire, rules, gains.size, bounds if panel else (), panel)
     prior, x = full.prior(data.start, rules), full.vector(wire, gains)
     pixels = found.descent.weighs(every, noise)
     here = WireProblem("wire, orders", full, pixels, prior).equations_at(x)

@@ -17,7 +17,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from udccal.cfa import SITES
 from udccal.fitting.engine.gaussian import Prior
 from udccal.fitting.engine.least_squares import Blocks, Step
 from udccal.fitting.wire.data import BLOCK, FlatNoise, Pixels, Weighed, blocks, over_blocks, weighed
@@ -111,7 +110,7 @@ def values_at(
     return over_blocks(partial(_values, wire), ideal, scaled)
 
 
-def expected_of(wire: Wire, gains: Float[np.ndarray, "4"], pixels: Pixels) -> Float[np.ndarray, " n"]:
+def expected_of(wire: Wire, gains: Float[np.ndarray, " sites"], pixels: Pixels) -> Float[np.ndarray, " n"]:
     """The model's signal of a sample, in CFA-balanced units."""
     whole, base = values_at(wire, pixels.ideal, pixels.scaled)
     return whole * base * gains[pixels.site]
@@ -213,7 +212,7 @@ def block_jacobian(
     # The baseline acts on everything: the change of exp(B) (1 + M), relative to exp(B), is (1 + M) dB.
     _, _, degree_y, degree_x = parameters.indices(Kind.SHADING)
     rows = [in_y[degree_y] * in_x[degree_x] * found.whole]
-    of_site = np.append(np.eye(SITES - 1), -np.ones((SITES - 1, 1)), axis=1)[:, site]
+    of_site = np.append(np.eye(parameters.sites - 1), -np.ones((parameters.sites - 1, 1)), axis=1)[:, site]
     rows.append(of_site[parameters.indices(Kind.SITE)[0]] * found.whole)
     harmonic, phase, degree_y, degree_x = parameters.indices(Kind.AMPLITUDE)
     rows.append(found.wave[phase, harmonic] * in_y[degree_y] * in_x[degree_x])

@@ -12,7 +12,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from udccal.cfa import SITES
 from udccal.fitting.engine.gaussian import Prior
 from udccal.fitting.engine.orders import Attempt, Choice, bic, choose
 from udccal.fitting.wire.rules import WireRules, WireStart, ideal_wire
@@ -111,6 +110,11 @@ class Parameters:
         return int(np.count_nonzero(~self.of(Kind.SHAPE)))
 
     @property
+    def sites(self) -> int:
+        """Sites of the CFA's cell; their gains have a mean logarithm of 0, and so one parameter less."""
+        return int(np.count_nonzero(self.of(Kind.SITE))) + 1
+
+    @property
     def panel(self) -> bool:
         """Whether there is one; without, there is no shape."""
         return self.linear < len(self.columns)
@@ -119,13 +123,13 @@ class Parameters:
         """Only the columns marked."""
         return Parameters(self.nothing, self.columns[keep], self.groups[keep])
 
-    def vector(self, wire: Wire, gains: Float[np.ndarray, "4"]) -> Float[np.ndarray, " n"]:
+    def vector(self, wire: Wire, gains: Float[np.ndarray, " sites"]) -> Float[np.ndarray, " n"]:
         """``x`` of a wire and the gains of the CFA sites."""
         return np.concatenate([leaf[self.indices(kind)] for kind, leaf in _leaves(wire, gains).items()])
 
     def wire(self, x: Float[np.ndarray, " n"]) -> Wire:
         """The wire of these parameters."""
-        leaves = _leaves(self.nothing, np.ones(SITES))
+        leaves = _leaves(self.nothing, np.ones(self.sites))
         for kind, leaf in leaves.items():
             leaf[self.indices(kind)] = x[self.of(kind)]
         baseline, amplitudes, fields = leaves[Kind.SHADING][0, 0], leaves[Kind.AMPLITUDE], leaves[Kind.FIELD]
@@ -133,7 +137,7 @@ class Parameters:
         wire = with_shape(wire, leaves[Kind.SHAPE].ravel()) if self.panel else wire
         return jax.tree.map(lambda leaf: np.asarray(leaf, dtype=np.float64), wire)
 
-    def gains(self, x: Float[np.ndarray, " n"]) -> Float[np.ndarray, "4"]:
+    def gains(self, x: Float[np.ndarray, " n"]) -> Float[np.ndarray, " sites"]:
         """Gains of the CFA sites."""
         logs = x[self.of(Kind.SITE)]
         return np.exp(np.append(logs, -logs.sum()))
@@ -143,14 +147,14 @@ class Parameters:
         built = replace(
             ideal_wire(self.nothing.geometry, start, np.zeros((0, 2))), offset_periods=self.nothing.offset_periods
         )
-        mean, shape = self.vector(self.nothing, np.ones(SITES)), self.indices(Kind.SHAPE)[0]
+        mean, shape = self.vector(self.nothing, np.ones(self.sites)), self.indices(Kind.SHAPE)[0]
         sigma = np.array([np.inf, np.inf, rules.amplitude_sigma, rules.field_sigma, np.nan])[self.columns[:, 0]]
         mean[self.linear :] = np.asarray(shape_vector(built))[shape]
         sigma[self.linear :] = shape_sigma(start, rules)[shape]
         return Prior.independent(mean, sigma)
 
 
-def _leaves(wire: Wire, gains: Float[np.ndarray, "4"]) -> dict[Kind, Float[np.ndarray, "_ _ _ _"]]:
+def _leaves(wire: Wire, gains: Float[np.ndarray, " sites"]) -> dict[Kind, Float[np.ndarray, "_ _ _ _"]]:
     """Copies of all that may be fitted, by the four indices of its kind."""
     parts = wire.baseline, np.log(gains), wire.amplitudes, wire.fields, shape_vector(wire)
     leaves = (np.array(part, dtype=np.float64) for part in parts)
@@ -158,19 +162,22 @@ def _leaves(wire: Wire, gains: Float[np.ndarray, "4"]) -> dict[Kind, Float[np.nd
     return {k: leaf.reshape(s) for k, leaf, s in zip(Kind, leaves, (*shapes, (-1, 1, 1, 1)), strict=True)}
 
 
-def parameters_of(wire: Wire, rules: WireRules, bounds: Iterable[float] = (), panel: bool = True) -> Parameters:
+def parameters_of(
+    wire: Wire, rules: WireRules, sites: int, bounds: Iterable[float] = (), panel: bool = True
+) -> Parameters:
     """Shading, site gains, the amplitudes that a wire has room for, and corrections to the round pupil.
 
     Args:
         wire: what no column has stays as it is here: its fields, and its shape where there is no panel.
         rules: for the degrees.
+        sites: of the CFA's cell.
         bounds: of the harmonics' relative amplitudes; stronger ones have more corrections.
         panel: whether there is one; without, there is no shape.
     """
     nothing = replace(wire, baseline=np.zeros_like(wire.baseline), amplitudes=np.zeros_like(wire.amplitudes))
     strongest, _, degrees, _ = np.shape(nothing.amplitudes)
     columns = [(Kind.SHADING, 0, 0, i, j) for i, j in _pairs(len(nothing.baseline))]
-    columns += [(Kind.SITE, site, 0, 0, 0) for site in range(SITES - 1)]
+    columns += [(Kind.SITE, site, 0, 0, 0) for site in range(sites - 1)]
     columns += [(Kind.AMPLITUDE, h, p, i, j) for h in range(strongest) for p in (0, 1) for i, j in _pairs(degrees)]
     for h, bound in enumerate(bounds):
         # What a real pupil changes of the weakest harmonics is too small to be seen.

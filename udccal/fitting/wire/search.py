@@ -37,7 +37,7 @@ class Descent:
         return self.problem.parameters.wire(self.solution.place)
 
     @property
-    def gains(self) -> Float[np.ndarray, "4"]:
+    def gains(self) -> Float[np.ndarray, " sites"]:
         """Of the CFA sites."""
         return self.problem.parameters.gains(self.solution.place)
 
@@ -97,8 +97,8 @@ class Search:
     def _shading(self, built: Wire, sample: Pixels) -> Descent:
         """Without any panel: no waves, and nothing that narrows with obliquity."""
         bare = replace(built, fields=np.zeros_like(built.fields), depth_per_pitch=np.float64(0.0))
-        parameters = parameters_of(bare, self.rules, panel=False)
-        prior, x = parameters.prior(self.start, self.rules), parameters.vector(bare, np.ones(4))
+        parameters = parameters_of(bare, self.rules, self.noise.floor.size, panel=False)
+        prior, x = parameters.prior(self.start, self.rules), parameters.vector(bare, np.ones(parameters.sites))
         x[0] = -np.log(float(bare.row_open) * float(bare.column_open))
         # To begin with, pixels that clip are left out by their own values; later, by the model's.
         clip = self.noise.clip[sample.site]
@@ -133,9 +133,9 @@ class Search:
         # Chance, and noise that is somewhat larger than given, must not bring so many parameters in.
         return [other] if other.variance < 0.95 * variance else rivals
 
-    def _descent(self, wire: Wire, gains: Float[np.ndarray, "4"], pixels: Pixels, rules: SolverRules) -> Descent:
+    def _descent(self, wire: Wire, gains: Float[np.ndarray, " sites"], pixels: Pixels, rules: SolverRules) -> Descent:
         """From a wire, whose origin becomes the prior's."""
-        parameters = parameters_of(wire, self.rules)
+        parameters = parameters_of(wire, self.rules, gains.size)
         problem = WireProblem("wire, shape", parameters, pixels, parameters.prior(self.start, self.rules))
         return Descent(problem, minimise(problem, parameters.vector(wire, gains), rules))
 
@@ -158,7 +158,7 @@ def _rivals(tried: Sequence[Descent], margin: float) -> list[Descent]:
 
 
 def scan_rows(
-    wire: Wire, gains: Float[np.ndarray, "4"], start: WireStart, pixels: Pixels, rules: WireRules
+    wire: Wire, gains: Float[np.ndarray, " sites"], start: WireStart, pixels: Pixels, rules: WireRules
 ) -> tuple[list[Wire], float]:
     """Stand-offs, pupils and origins along Y that put most of the signal into the rows' first harmonic, best first.
 
@@ -192,7 +192,7 @@ def beside(place: Wire) -> list[Wire]:
     return [_placed(place, standoff, size, 1, angle) for size in (pupil - 1.0, pupil + 1.0) if size > 1.0]
 
 
-def scan_columns(wire: Wire, gains: Float[np.ndarray, "4"], pixels: Pixels) -> Wire:
+def scan_columns(wire: Wire, gains: Float[np.ndarray, " sites"], pixels: Pixels) -> Wire:
     """The origin along X from the columns' first harmonic; the rest is known from the rows."""
     standoff, pupil = float(wire.standoff_per_pitch), float(wire.footprint_per_pitch)
     _gain, angle = _demodulate(wire, gains, pixels, 0, np.array([standoff]), np.array([pupil]))
@@ -209,7 +209,7 @@ def _trials(ends: tuple[float, float], step: float, most: int) -> Float[np.ndarr
 
 def _demodulate(
     wire: Wire,
-    gains: Float[np.ndarray, "4"],
+    gains: Float[np.ndarray, " sites"],
     pixels: Pixels,
     axis: int,
     standoffs: Float[np.ndarray, " s"],
