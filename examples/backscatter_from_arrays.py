@@ -28,12 +28,11 @@ def main() -> None:
     rest = np.full(light.shape, (READ_E / EXPOSURE_S) ** 2 / SAMPLES)
     rate = shot * rng.poisson(light / shot) + np.sqrt(rest) * rng.standard_normal(light.shape)
     one, crop = np.ones(len(light)), visible_crop(geometry, profile.rig)
-    shots, names = Binned(rate, shot, rest, light < 0, EXPOSURE_S * one, one), tuple(f"face {k}" for k in range(8))
-    data = BackscatterData(shots, np.stack([crop.of(picture) for picture in pictures]), crop, names)
+    shots = Binned(rate, shot, rest, light < 0, EXPOSURE_S * one, one)
+    data = BackscatterData(shots, np.stack([crop.of(picture) for picture in pictures]), crop, tuple("abcdefgh"))
     found = udccal.fit_backscatter(data, geometry, profile.rig).or_raise()
-    print(
-        found.status.name, *(f"{e.name:14} {e.value:9.5f} ± {e.sigma:.5f} {e.unit}" for e in found.estimates), sep="\n"
-    )
+    print(found.status.name)
+    print(*(f"{e.name:18} {e.value:9.5f} ± {e.sigma:.5f} {e.unit}" for e in found.estimates), sep="\n")
 
 
 if __name__ == "__main__":

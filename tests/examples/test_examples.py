@@ -96,6 +96,23 @@ def test_psf_from_stamps() -> None:
 
 
 @pytest.mark.slow
+def test_psf_from_leds() -> None:
+    said = run("examples/psf_from_leds.py")
+    assert said.startswith("CONVERGED")
+    opened = next(line.split() for line in said.splitlines() if line.startswith("row_open"))
+    truth = float(load_profile("lg55-reduced").psf.term.diffraction.openings[1])
+    assert abs(float(opened[1]) - truth) < 5 * float(opened[3])
+
+
+def test_every_term_has_an_array_example_of_under_40_lines() -> None:
+    names = "noise_from_arrays", "array_calibration", "wire_from_flat", "psf_from_leds", "backscatter_from_arrays"
+    for name in names:
+        lines = (ROOT / "examples" / f"{name}.py").read_text().splitlines()
+        assert len(lines) < 40, name
+        assert not any("udccal.cli" in line for line in lines), name
+
+
+@pytest.mark.slow
 def test_wire_from_flat() -> None:
     said = run("examples/wire_from_flat.py")
     assert "CONVERGED" in said

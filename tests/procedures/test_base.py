@@ -120,7 +120,7 @@ def test_a_light_leak_shows_in_the_long_dark_frames(tmp_path: Path) -> None:
     rig = small_rig()
     with simulated_bench(rig, Disturbances(leak_e_per_s=1000.0)) as bench:
         writer = new_writer(tmp_path, rig, bench)
-        with pytest.raises(CaptureError, match=r"Step noise/dark_4: Expected a dark frame, found it .* Cap the lens"):
+        with pytest.raises(CaptureError, match=r"Step noise/dark_4: Expected a dark frame, found .* Cap the lens"):
             run_procedure(NoiseProcedure(), bench, writer)
     assert "noise/flat_stack" in writer.completed_ids
 

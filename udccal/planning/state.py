@@ -182,7 +182,7 @@ class EvenField:
     def __init__(self, state: RigState) -> None:
         camera, geometry, wire = state.rig.camera, state.geometry, state.wire
         self._size = np.array([camera.columns, camera.rows])
-        self._channels = cfa_named(camera.cfa).channel_map(camera.rows, camera.columns)
+        self._cfa = cfa_named(camera.cfa)
         y, x = (np.linspace(0, size - 1, count) for size, count in zip(self._size[::-1], _FIELD_GRID, strict=True))
         pixels = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
         if wire is None:
@@ -200,7 +200,8 @@ class EvenField:
     def signal(self, pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
         """What samples of a white field give, 1 for the brightest of all."""
         x, y = np.round(pixels).astype(np.int64).T
-        return np.asarray(self.at(pixels) * (np.array(WHITE) / max(WHITE))[self._channels[y, x]])
+        channel = self._cfa.channels[y % self._cfa.rows, x % self._cfa.columns]
+        return np.asarray(self.at(pixels) * (np.array(WHITE) / max(WHITE))[channel])
 
 
 @in_float64

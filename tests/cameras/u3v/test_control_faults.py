@@ -68,7 +68,7 @@ def test_lasting_troubles_of_the_control_channel_are_told(
 
 def test_patience_has_an_end(camera: U3vCamera, device: VirtualCamera) -> None:
     device.inject(Faults(pending_acks=400))
-    with pytest.raises(CameraTimeout, match="patience"):
+    with pytest.raises(CameraTimeout, match="more time"):
         camera.configure(Settings(2e-3, 1.0, REGION))
 
 
