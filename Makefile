@@ -10,7 +10,7 @@ COVERAGE_OUT ?= coverage
 PEERS ?=
 USB ?=
 
-.PHONY: install demo test test-slow test-usb fuzz load lint types contracts check accuracy tables efficiency coverage extremes peers growth clean
+.PHONY: install demo test test-medium test-slow test-usb fuzz load lint types contracts check accuracy tables efficiency coverage extremes peers growth clean
 
 install: $(STAMP)
 
@@ -24,10 +24,14 @@ demo: $(STAMP)
 	$(BIN)/udccal demo --out $(DEMO_OUT)
 
 test: $(STAMP)
-	$(BIN)/python -m pytest -m "not slow" -n 2 --dist worksteal --durations=30
+	$(BIN)/python -m pytest -m "not slow and not medium" -n 2 --dist worksteal --durations=30
+
+# Single fits and compilations of some seconds; continuous integration runs them too.
+test-medium: $(STAMP)
+	$(BIN)/python -m pytest -m "medium and not slow" -n 2 --dist worksteal --durations=30
 
 test-slow: $(STAMP)
-	$(BIN)/python -m pytest -m slow -n 2 --dist worksteal --durations=30
+	$(BIN)/python -m pytest -m "slow or medium" -n 2 --dist worksteal --durations=30
 
 # The USB3 Vision driver through libusb and a real kernel's USB: boots one in qemu, with a virtual camera plugged in.
 # USB: arguments, such as --if-possible, which says so and goes on where qemu cannot be had.

@@ -36,6 +36,7 @@ def _kept(folder: Path) -> list[Path]:
     return [path for path in folder.rglob("*-cache") if path.is_file()]
 
 
+@pytest.mark.medium
 def test_the_second_run_reads_what_the_first_compiled(tmp_path: Path) -> None:
     first = _run(tmp_path)
     kept = {path: path.stat().st_size for path in _kept(tmp_path)}
@@ -45,6 +46,7 @@ def test_the_second_run_reads_what_the_first_compiled(tmp_path: Path) -> None:
     assert {path: path.stat().st_size for path in _kept(tmp_path)} == kept
 
 
+@pytest.mark.medium
 def test_a_folder_that_others_may_write_is_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(FOLDER_VARIABLE, str(tmp_path))
     folder = compilation_folder()

@@ -56,6 +56,7 @@ def test_help_is_quick_and_light(verb: list[str]) -> None:
     assert _times_the_bare_help(PROBE.format(heavy=HEAVY), verb) < WORTH_OF_BARE_HELP
 
 
+@pytest.mark.medium
 def test_a_slow_import_would_be_noticed() -> None:
     assert _times_the_bare_help("import jax\n" + PROBE.format(heavy=()), ["plan"]) > WORTH_OF_BARE_HELP
 

@@ -42,6 +42,7 @@ def test_a_plan_and_the_rig_it_writes(tmp_path: Path) -> None:
     assert "Expected nothing at" in json.loads(again.stdout)["error"]
 
 
+@pytest.mark.medium
 def test_a_table_for_people() -> None:
     done = udccal("plan", "--rig", "lg55-reduced", "--target", "noise=1%")
     assert done.returncode == 0, done.stderr
@@ -61,6 +62,7 @@ def test_a_table_for_people() -> None:
     ],
     ids=str,
 )
+@pytest.mark.medium
 def test_wrong_words_are_answered_with_a_sentence(words: list[str], said: str) -> None:
     done = udccal("plan", *words)
     assert done.returncode == 1

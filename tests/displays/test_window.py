@@ -112,6 +112,7 @@ def test_every_pixel_is_shown_and_off_is_black(size: PanelSize, monkeypatch: pyt
             assert server.pixels().max() == 0
 
 
+@pytest.mark.medium
 def test_waits_as_long_as_it_is_told(screen: VirtualScreen) -> None:
     seconds = []
     for settle_s in (0.0, 0.8):

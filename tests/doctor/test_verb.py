@@ -125,6 +125,7 @@ def test_scripts_get_json(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Captur
     assert capsys.readouterr().err.strip().endswith("Ready for what you asked for.")
 
 
+@pytest.mark.medium
 def test_the_exit_status_says_whether_what_was_asked_for_can_work(tmp_path: Path) -> None:
     done = udccal("--json", "--rig", "lg55-reduced", "--session", tmp_path / "session")
     summary = json.loads(done.stdout)

@@ -76,6 +76,7 @@ def test_restore_shared_scenes(toy_rig: Path, toy_data: Path, tmp_path: Path) ->
     assert len(list((tmp_path / "out").glob("*.png"))) == 4
 
 
+@pytest.mark.medium
 def test_merge_bracket_lists_the_flicker_and_the_hit() -> None:
     said = run("examples/merge_bracket.py")
     assert "frame 4" in said

@@ -35,7 +35,10 @@ def broken(draw: st.DrawFn, seeds: tuple[bytes, ...]) -> bytes:
     return bytes(data)
 
 
-@pytest.mark.parametrize("name", TARGETS)
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=pytest.mark.medium if target.one_in > 1 else ()) for name, target in TARGETS.items()],
+)
 def test_broken_inputs_are_refused_in_words(name: str) -> None:
     target = TARGETS[name]
     for seed in target.seeds():

@@ -92,6 +92,7 @@ def test_the_footprint_is_where_rays_from_the_pupil_meet_the_panel() -> None:
         np.testing.assert_allclose((middle + (ellipse @ rim).T) * 0.63, met[:, :2], atol=1e-9)
 
 
+@pytest.mark.medium
 def test_shares_add_up_to_the_footprint() -> None:
     pixels = np.random.default_rng(0).uniform([0, 0], [63, 47], (60, 2))
     with jax.enable_x64(True):
@@ -135,6 +136,7 @@ def test_beyond_the_panel_is_dark_and_finite() -> None:
     assert rate(moved, grey(255)).max() == 0.0
 
 
+@pytest.mark.medium
 def test_interpolation_from_the_grid_keeps_a_slanted_plane() -> None:
     x, y = np.meshgrid(4 * (np.arange(16) + 0.5) - 0.5, 4 * (np.arange(12) + 0.5) - 0.5)
     grid = np.stack([2 * x + 3 * y + 5] * 3)
@@ -144,6 +146,7 @@ def test_interpolation_from_the_grid_keeps_a_slanted_plane() -> None:
     np.testing.assert_allclose(mosaic, 2 * columns + 3 * rows + 5, atol=1e-9)
 
 
+@pytest.mark.medium
 def test_a_long_grid_compiled_is_the_same_as_step_by_step() -> None:
     """Some versions of jaxlib miscompile small matrix products over more than 16384 positions."""
     large = term(columns=512, rows=384, step=2)

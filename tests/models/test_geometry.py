@@ -61,6 +61,7 @@ def test_directions_come_back_to_their_pixels() -> None:
     np.testing.assert_allclose(back, pixels(), atol=1e-6)
 
 
+@pytest.mark.medium
 def test_area_of_pixels_is_the_determinant_of_the_directions_slopes() -> None:
     def cosines(pixel: jax.Array) -> jax.Array:
         return g.panel_directions(GEOMETRY, pixel[None])[0, :2]

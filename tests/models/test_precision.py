@@ -26,6 +26,7 @@ EVALUATED: dict[str, tuple[Callable[[Profile], np.ndarray], float]] = {
 @pytest.mark.parametrize(
     "term", [pytest.param(term, marks=pytest.mark.slow if term == "psf" else ()) for term in EVALUATED]
 )
+@pytest.mark.medium
 def test_single_precision_is_close_to_double(term: str) -> None:
     evaluate, limit = EVALUATED[term]
     profile = read_profile(find_profile("lg55-reduced"))

@@ -99,6 +99,7 @@ def test_overlap_of_discs_against_a_sum(lag: tuple[float, float], wave: tuple[fl
     assert area == pytest.approx(both.sum() * scale, abs=1e-3)
 
 
+@pytest.mark.medium
 def test_a_lattice_gives_back_what_its_transfer_says() -> None:
     def value(points: np.ndarray) -> jnp.ndarray:
         lattice = lattice_for(48.0, 40.0, 3, 4)
@@ -156,6 +157,7 @@ def test_the_residual_follows_its_polynomial_and_is_cut_or_padded(truth: RigTrut
     np.testing.assert_array_equal(images(3), wide[:, :, 2:5, 2:5])
 
 
+@pytest.mark.medium
 def test_the_footprint_grows_with_obliquity(truth: RigTruth) -> None:
     geometry = true_field(truth).geometry
 

@@ -115,6 +115,7 @@ def test_no_harmonics_leave_the_shading() -> None:
     assert not np.allclose(np.asarray(wire_map(wire, ROWS, COLUMNS)), 0.36, rtol=1e-3)
 
 
+@pytest.mark.medium
 def test_an_amplitude_beside_the_pupils_is_a_polynomial_over_the_sensor() -> None:
     wire = make_wire()
     beside = np.zeros((1, 2, 2, 2))

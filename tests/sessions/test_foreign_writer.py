@@ -28,6 +28,7 @@ def world() -> dict:
     return runpy.run_path(str(HERE / "foreign_world.py"))
 
 
+@pytest.mark.medium
 def test_every_file_of_it_is_accepted(session: Session) -> None:
     for step in session.manifest.steps:
         for capture in step.captures:
@@ -37,6 +38,7 @@ def test_every_file_of_it_is_accepted(session: Session) -> None:
     assert {step.term for step in session.manifest.steps} == {"noise", "geometry", "wire", "psf", "backscatter"}
 
 
+@pytest.mark.medium
 def test_its_numbers_mean_what_the_page_says(session: Session, world: dict) -> None:
     (flat,) = session.step("wire/flat").captures
     (dark,) = session.step("wire/dark").captures

@@ -46,6 +46,7 @@ def rejections(session: Session) -> Counter[str]:
     return sum((Counter({item.reason: item.frames}) for capture in captures for item in capture.rejected), Counter())
 
 
+@pytest.mark.medium
 def test_a_session_over_usb_fits_like_one_without(tmp_path: Path, rig: RigDescription) -> None:
     world = simulated_rig(rig, seed=2)
     with bench_over_usb(rig, world, VirtualCamera(model_of_rig(world), RigSource(world))) as bench:
@@ -76,6 +77,7 @@ def test_what_the_cable_spoils_is_replaced_and_counted(tmp_path: Path, rig: RigD
     assert session.step("wire/flat").captures[0].frames == rig.captures.flats
 
 
+@pytest.mark.medium
 def test_an_unplugged_camera_costs_the_step_in_hand(tmp_path: Path, rig: RigDescription) -> None:
     world = simulated_rig(rig, seed=2)
     device = VirtualCamera(model_of_rig(world), RigSource(world))

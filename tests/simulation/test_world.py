@@ -79,6 +79,7 @@ def test_led_light_ends_with_its_support() -> None:
     assert not world.expected_rate(Region(0, 0, 16, 16)).any()
 
 
+@pytest.mark.medium
 def test_lit_panel_adds_before_the_wire(world: SimulatedWorld) -> None:
     radiance = np.random.default_rng(0).random((20, 30, 3))
     rates = []
@@ -91,6 +92,7 @@ def test_lit_panel_adds_before_the_wire(world: SimulatedWorld) -> None:
     np.testing.assert_allclose(alone, world.light.backscatterer.rate(crowd()) * world.light.wire)
 
 
+@pytest.mark.medium
 def test_board_shows_black_and_white(world: SimulatedWorld) -> None:
     world.arrange(Board(BoardSpec(9, 7, 8.0, 6.0), (0.0, 0.0, 0.0), (570.0, 290.0, 400.0)))
     rate = world.expected_rate(WHOLE) / world.light.wire

@@ -199,6 +199,7 @@ def test_a_guest_that_fails_is_a_failure_also_where_it_need_not_be_had(
 
 
 @pytest.mark.parametrize(("promised", "status", "said"), [("", 0, "1 passed"), ("1", 5, "1 deselected")])
+@pytest.mark.medium
 def test_the_guests_command_runs_tests_and_there_those_that_need_its_kernel(
     promised: str, status: int, said: str
 ) -> None:

@@ -124,6 +124,7 @@ def error_of_peak(term: Backscatter, shown: np.ndarray, simulator) -> float:  # 
     return float(np.sqrt(np.mean((rate(term, shown) - truth) ** 2)) / truth.max())
 
 
+@pytest.mark.medium
 def test_pictures_not_in_the_fit_are_predicted(fitted: FitResult[Backscatter], simulator) -> None:  # type: ignore[no-untyped-def]
     assert fitted.status is FitStatus.CONVERGED
     for seed in (100, 101):
@@ -200,6 +201,7 @@ def test_pictures_in_the_wrong_order_are_a_poor_fit(data: BackscatterData) -> No
     assert not result.ok
 
 
+@pytest.mark.medium
 def test_bins_are_means_of_one_colour() -> None:
     rows, columns, step = 24, 32, 4
     channels = cfa_named("GBRG").channel_map(rows, columns)

@@ -104,11 +104,13 @@ def test_the_right_order_is_chosen_in_95_of_100_runs() -> None:
 @pytest.mark.parametrize(
     "order", [pytest.param(KERNELS[0], marks=pytest.mark.slow), TWO_PLANES], ids=lambda order: order.name
 )
+@pytest.mark.medium
 def test_the_order_of_a_rig_is_found(order: Order) -> None:
     of, shots = _made(4, order)
     assert _chosen(fit_backscatter(shots, of.term.geometry, RIG, RULES)) == order.name
 
 
+@pytest.mark.medium
 def test_a_glass_that_reflects_next_to_nothing_does_not_show() -> None:
     faint, pictures = prior_of(RIG).mean, panel_pictures(RIG, 0, PICTURES)
     faint[REFLECTION] = np.log(1e-5)

@@ -92,6 +92,7 @@ def test_nothing_comes_from_beyond_the_crop() -> None:
     np.testing.assert_array_equal(sums[0, :, 1], np.tile([4.0, 0.0], (3, 1)))
 
 
+@pytest.mark.medium
 def test_ratios_are_those_of_the_model() -> None:
     """The model's own pictures over its white, crosstalk included."""
     geometry, crop = nominal_geometry(RIG), visible_crop(nominal_geometry(RIG), RIG)

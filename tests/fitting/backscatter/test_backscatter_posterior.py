@@ -88,6 +88,7 @@ def test_a_mixture_is_as_wide_as_its_parts_and_their_distance() -> None:
     np.testing.assert_allclose(both.cov, np.eye(18) + 3.0)
 
 
+@pytest.mark.medium
 def test_held_out_pictures_of_the_model_leave_nothing_undescribed() -> None:
     """Few pictures determine 18 parameters: their uncertainty is not a model error."""
     rng = np.random.default_rng([0, 0x4E1D])

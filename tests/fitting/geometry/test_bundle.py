@@ -56,6 +56,7 @@ def test_the_lens_is_found_within_its_sigma(plain: CalibratedViews) -> None:
 
 
 @pytest.mark.parametrize("factor", [0.3, 0.8, 1.2, 4.0])
+@pytest.mark.medium
 def test_any_start_leads_to_the_same_lens(plain: CalibratedViews, factor: float) -> None:
     rng = np.random.default_rng(int(10 * factor))
     start = Geometry(SCENE.camera.focal_px * factor, np.array([300.0, 600.0]), np.zeros(5), np.zeros(3), np.zeros(3))
@@ -121,6 +122,7 @@ def test_views_of_another_scatter_get_their_own_scale() -> None:
     assert np.abs(errors(found)).max() < 4
 
 
+@pytest.mark.medium
 def test_boards_never_leaned_do_not_tell_the_focal_length() -> None:
     found = calibrate(sight(views=8, lean_rad=0.0, tilt_deg=0.0))
     assert found.status is FitStatus.TOO_FEW_DATA
@@ -157,6 +159,7 @@ def test_too_few_views_are_refused_with_the_reason() -> None:
     noise=st.floats(0.001, 2.0),
     lost=st.floats(0, 0.6),
 )
+@pytest.mark.medium
 def test_whatever_the_views_a_lens_or_advice(seed: int, tilt: float, lean: float, noise: float, lost: float) -> None:
     scene = sight(seed, 8, tilt, lean_rad=lean, sigma_px=noise)
     board, image, sigma = arrays(scene, seed)

@@ -72,6 +72,7 @@ def test_views_of_different_lenses_disagree_and_widen_all(plain: CalibratedViews
     assert any("disagree" in note for note in found.notes)
 
 
+@pytest.mark.medium
 def test_error_bars_of_views_that_disagree_are_those_of_drawn_lenses() -> None:
     """Boards bent by some mm, each differently: noise alone would give a third of the scatter."""
     scene = sight(views=12, sigma_px=0.06)

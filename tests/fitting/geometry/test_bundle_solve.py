@@ -40,6 +40,7 @@ def test_the_packing_is_one_and_goes_both_ways() -> None:
     assert [int(free.sum()) for free in ORDERS.values()] == [4, 5, 6, 8, 9]
 
 
+@pytest.mark.medium
 def test_places_and_slopes_are_those_of_the_model() -> None:
     """OpenCV's Jacobian against the term's own projection, traced by JAX, in all 15 directions."""
     residuals, slopes = linearised(TRUTH, POINTS)

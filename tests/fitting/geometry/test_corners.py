@@ -60,6 +60,7 @@ def test_corners_are_found_where_they_are(view: tuple[np.ndarray, np.ndarray]) -
     assert found.sigma.max() < 0.3
 
 
+@pytest.mark.medium
 def test_corners_scatter_by_noise_as_they_say(view: tuple[np.ndarray, np.ndarray]) -> None:
     """Thirty pictures of the same board: 1 within the error of so many."""
     runs = [detect_corners(grey_of(mosaic(view[0], 40.0, seed), 40.0), SPEC) for seed in range(30)]

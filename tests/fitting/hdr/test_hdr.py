@@ -46,6 +46,7 @@ def test_unbiased_and_honest_over_seven_decades(rate: float) -> None:
     assert merge.used.min() >= 1
 
 
+@pytest.mark.medium
 def test_repeats_lower_sigma_as_they_should() -> None:
     one = merge_bracket(bracket(1e3, EXPOSURES[-1:], 2), EXPOSURES[-1:], NOISE)
     repeated = np.repeat(EXPOSURES[-1:], 9)
@@ -88,6 +89,7 @@ def test_rules_decide_what_is_left_out() -> None:
     assert not merge_bracket(frames, EXPOSURES, NOISE, HdrRules(believed_sigma=1e4)).outliers
 
 
+@pytest.mark.medium
 def test_level_near_saturation_is_not_pulled_down() -> None:
     # The longest exposure lies right at the limit: half its samples are above.
     rate = (3960.0 - 64.3) / 0.355 / EXPOSURES[3] * 0.998

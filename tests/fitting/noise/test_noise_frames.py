@@ -73,6 +73,7 @@ def test_the_right_terms_in_95_of_100_runs() -> None:
     assert right >= 0.95 * count
 
 
+@pytest.mark.medium
 def test_loaders_and_arrays_and_bytes_give_the_same(tmp_path) -> None:  # type: ignore[no-untyped-def]
     sensor = replace(PLAIN, bits=8, K_DN_per_e=0.022, black_DN=8.0, row_DN=0.05)
     levels, stack = capture(sensor, 3)

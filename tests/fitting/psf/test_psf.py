@@ -100,6 +100,7 @@ def grating() -> Fitted:
     return Fitted(result, float(error.max()))
 
 
+@pytest.mark.medium
 def test_a_grating_is_predicted_where_it_was_not_captured(grating: Fitted) -> None:
     assert grating.result.status is FitStatus.CONVERGED
     assert grating.worst_l2 < 0.03
@@ -122,6 +123,7 @@ def test_a_grating_is_predicted_where_it_was_not_captured(grating: Fitted) -> No
     assert grating.result.chi2_dof == pytest.approx(1.0, abs=0.15)
 
 
+@pytest.mark.medium
 def test_the_posterior_knows_the_numbers_and_what_the_kernel_is_off_by(grating: Fitted) -> None:
     result = grating.result
     for estimate, of in (

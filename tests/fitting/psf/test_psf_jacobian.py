@@ -49,6 +49,7 @@ def shots(scene: Scene, prior: Prior) -> Shots:
 
 
 @pytest.mark.parametrize("interference", [pytest.param(True, marks=pytest.mark.slow), False])
+@pytest.mark.medium
 def test_slopes_of_the_kernel_are_those_of_differences(
     scene: Scene, prior: Prior, shots: Shots, interference: bool
 ) -> None:
@@ -83,6 +84,7 @@ def problem_of(scene: Scene, prior: Prior, shots: Shots, interference: bool) -> 
     return DiffractionProblem(made, evaluator, prior).with_overlaps(prior.mean)
 
 
+@pytest.mark.medium
 def test_slopes_by_pupil_and_pitch_follow_overlaps(scene: Scene, prior: Prior, shots: Shots) -> None:
     found, wanted = overlap_slopes(scene, prior, shots)
     for own, other in zip(found, wanted, strict=True):

@@ -127,6 +127,7 @@ def bracketed(light, exposure, noise, region, rng) -> SingleFrame:
 
 
 @pytest.mark.parametrize("ends_px", [23, 200])
+@pytest.mark.medium
 def test_whole_pictures_show_where_light_ends(tmp_path: Path, ends_px: int) -> None:
     made = captured(tmp_path / "session", ends_px)
     rig = made.session.rig

@@ -100,6 +100,7 @@ def test_the_table_has_one_choice_and_it_needs_the_map(fitted: FitResult[StampsP
     assert chosen[0].name.startswith("map degree 2, image degree 1")
 
 
+@pytest.mark.medium
 def test_sigma_of_any_function_is_that_of_kernels_and_stars_written_out(fitted: FitResult[StampsPsf]) -> None:
     place = test_positions()[:2]
     np.testing.assert_allclose(fitted.sigma_of(lambda t: t.predict(place)), fitted.term.sigma(place), rtol=0.01)
@@ -163,6 +164,7 @@ def test_clipping_that_is_not_told_is_seen() -> None:
     assert np.median(errors(fit_psf_stamps(told_nothing, ORDERS).term)[0]) > 0.01
 
 
+@pytest.mark.medium
 def test_mosaic_gives_a_field_per_colour() -> None:
     rng = np.random.default_rng(5)
     stamps, _ = make(5, count=40)

@@ -56,6 +56,7 @@ def fitted(order: tuple[int, int], degrees: tuple[int, int]) -> tuple[Stamps, Fo
     return stamps, improve(stamps, state.with_degrees(*degrees, RULES), RULES, 12)
 
 
+@pytest.mark.medium
 def test_a_field_that_does_not_change_needs_no_order() -> None:
     assert chosen((0, 0), 1) == (0, 0)
 

@@ -86,6 +86,7 @@ def fitted(bench: Bench) -> FitResult[Wire]:
     return fit_of(bench, *flat_of(bench.truth, 1))
 
 
+@pytest.mark.medium
 def test_map_is_better_than_the_average_it_came_from(bench: Bench, fitted: FitResult[Wire]) -> None:
     found = np.asarray(wire_map(fitted.or_raise().term, ROWS, COLUMNS))
     error = float(np.sqrt(np.mean((found - bench.truth) ** 2)))
@@ -95,6 +96,7 @@ def test_map_is_better_than_the_average_it_came_from(bench: Bench, fitted: FitRe
     assert np.ptp(bench.truth) > 0.3
 
 
+@pytest.mark.medium
 def test_shape_errors_are_as_large_as_claimed(bench: Bench, fitted: FitResult[Wire]) -> None:
     standoff = fitted.estimate("standoff_per_pitch")
     assert abs(standoff.value - bench.standoff_per_pitch) < 5 * standoff.sigma + 0.002
@@ -103,6 +105,7 @@ def test_shape_errors_are_as_large_as_claimed(bench: Bench, fitted: FitResult[Wi
     assert any(c.chosen for c in fitted.candidates)
 
 
+@pytest.mark.medium
 def test_hot_pixels_are_left_out_and_listed(bench: Bench, fitted: FitResult[Wire]) -> None:
     left_out = next(d.value for d in fitted.diagnostics if d.name == "pixels_left_out")
     signal, _ = flat_of(bench.truth, 1)
@@ -115,6 +118,7 @@ def test_hot_pixels_are_left_out_and_listed(bench: Bench, fitted: FitResult[Wire
     assert "robust sigma" in outliers.rule
 
 
+@pytest.mark.medium
 def test_the_maps_sigma_covers_the_truth(bench: Bench, fitted: FitResult[Wire]) -> None:
     found = sensor_map(fitted.term, ROWS, COLUMNS)
     y, x = np.divmod(np.random.default_rng(3).choice(found.size, 1000, replace=False), COLUMNS)
@@ -131,6 +135,7 @@ def test_the_maps_sigma_covers_the_truth(bench: Bench, fitted: FitResult[Wire]) 
     assert sigma.max() < 2e-3
 
 
+@pytest.mark.medium
 def test_no_panel_is_absent(bench: Bench) -> None:
     y, x = np.mgrid[:ROWS, :COLUMNS]
     shading = 1 - 0.2 * ((x / COLUMNS - 0.5) ** 2 + (y / ROWS - 0.5) ** 2)

@@ -71,6 +71,7 @@ def test_no_modulation_is_absent_and_costs_nothing() -> None:
 
 
 @pytest.mark.parametrize("electrons", [24.0, 100.0])
+@pytest.mark.medium
 def test_rows_that_noise_may_hide_are_in_the_error_bars(electrons: float) -> None:
     flat = noisy(drawn_truth(854, start(), geometry()), 854, electrons, 0.0)
     fit = fitted(flat, start(), geometry(), 0.0)
@@ -89,6 +90,7 @@ def test_saturated_flat_says_what_to_do() -> None:
     assert "shorter" in " ".join(result.notes)
 
 
+@pytest.mark.medium
 def test_clipped_light_is_no_misfit_of_the_pixels_held_out() -> None:
     """The mean of what is not clipped is not the map's, which is 1: residuals must not show the difference."""
     flat = noisy(drawn_truth(1, start(), geometry()), 1)
@@ -173,6 +175,7 @@ def test_absent_and_present_are_told_apart() -> None:
     assert told >= 190
 
 
+@pytest.mark.medium
 def test_a_flat_without_any_noise_or_ripple_is_absent() -> None:
     found = constant(1000.0)
     assert found.status is FitStatus.ABSENT

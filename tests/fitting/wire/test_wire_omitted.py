@@ -42,6 +42,7 @@ def found(wire: Wire, share: float, seed: int, noise: float = NOISE) -> tuple[Om
 
 
 @pytest.mark.parametrize("share", SHARES)
+@pytest.mark.medium
 def test_the_share_is_found_within_its_error(wire: Wire, share: float) -> None:
     errors = []
     for seed in range(4):

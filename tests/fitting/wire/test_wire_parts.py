@@ -72,6 +72,7 @@ def judge(wire: Wire, pixels: Pixels, noise: FlatNoise) -> Weighed:
         return weighed(pixels, expected_of(wire, np.ones(4), pixels), noise)
 
 
+@pytest.mark.medium
 def test_slopes_are_those_of_the_model() -> None:
     wire = uneven_wire()
     pixels = sample_pixels(np.ones((ROWS, COLUMNS)), GEOMETRY, 40, "RGGB")
