@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import TypeVar, get_args
@@ -13,6 +13,7 @@ from typing import TypeVar, get_args
 import numpy as np
 from jaxtyping import Float
 
+from udccal.effort import FitEffort
 from udccal.errors import UdccalError
 from udccal.fitting.absent import absent_backscatter, absent_psf, absent_wire
 from udccal.fitting.backscatter.data import read_backscatter
@@ -23,7 +24,6 @@ from udccal.fitting.geometry.data import BoardView, read_geometry
 from udccal.fitting.noise.data import read_noise
 from udccal.fitting.noise.fit import fit_noise, nominal_noise
 from udccal.fitting.nominal import nominal_geometry
-from udccal.fitting.psf.data import PsfRules
 from udccal.fitting.psf.fit import fit_psf
 from udccal.fitting.psf.read import read_psf
 from udccal.fitting.wire.data import read_wire
@@ -45,32 +45,6 @@ from udccal.sessions.store import Session
 
 Term = TypeVar("Term")
 ORDER: tuple[TermName, ...] = get_args(TermName)
-
-
-@dataclass(frozen=True)
-class FitEffort:
-    """Effort of the fits; less effort is quicker and less accurate.
-
-    Attributes:
-        wire_samples: number of pixels that the wire's fields are fitted to.
-        psf: see ``udccal.fitting.psf.data.PsfRules``.
-        backscatter_positions: number of sensor positions that the footprint is fitted at.
-        workers: 2 fits psf and backscatter, which are independent, at the same time and in more memory.
-    """
-
-    wire_samples: int = WireRules().samples
-    psf: PsfRules = field(default_factory=PsfRules)
-    backscatter_positions: int = 96
-    workers: int = 1
-
-
-# For a demonstration.
-QUICK = FitEffort(
-    wire_samples=60_000,
-    psf=PsfRules(positions=5, shifts=2, half_px=(36, 12), close_px=(32, 12), iterations=30),
-    backscatter_positions=32,
-    workers=2,
-)
 
 
 @dataclass(frozen=True)

@@ -26,9 +26,10 @@ from tests.scenes.backscatter import predicted_light
 from tests.scenes.psf_wave_optics import coverage as psf_coverage
 from udccal.benches.bench import simulated_bench
 from udccal.benches.capture import capture
-from udccal.calibration import FitEffort, Foundation, fit_foundation
+from udccal.calibration import Foundation, fit_foundation
 from udccal.compilation import keep_compilations
 from udccal.displays.pictures import face_picture
+from udccal.effort import FitEffort
 from udccal.fitting.backscatter.data import read_backscatter, sampled_rays
 from udccal.fitting.backscatter.fit import fit_backscatter
 from udccal.fitting.bins import Bins

@@ -15,7 +15,7 @@ from procedures.psf import led_positions_px
 from tests.benchmarks.psf_kernels import kernel_and_slopes
 from tests.scenes.psf import DISC_PX, Scene, pictures, shots_of, small_scene
 from udccal.arrangements import Led
-from udccal.calibration import FitEffort
+from udccal.effort import FitEffort
 from udccal.fitting.engine.gaussian import Prior
 from udccal.fitting.psf.diffraction import fit_diffraction
 from udccal.fitting.psf.fit import WAVELENGTHS_NM, some_shots, start_model, start_prior

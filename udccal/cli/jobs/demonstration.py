@@ -13,12 +13,13 @@ from jaxtyping import Float, UInt8
 
 from udccal.benches.bench import simulated_bench, simulated_rig
 from udccal.benches.photograph import capture_photograph
-from udccal.calibration import ORDER, QUICK, Foundation, fit_foundation
+from udccal.calibration import ORDER, Foundation, fit_foundation
 from udccal.cli.jobs.capture import capture_watched
 from udccal.cli.jobs.fit import UNSEEN_PICTURE, run_fits, show_status, store_profile
 from udccal.cli.output import Output, StageTime
 from udccal.compilation import compilation_clock, keep_compilations
 from udccal.displays.pictures import face_picture
+from udccal.effort import QUICK
 from udccal.fitting.psf.fit import nominal_psf
 from udccal.io.links import make_folder
 from udccal.io.photograph import read_photograph

@@ -8,10 +8,11 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from udccal.calibration import ORDER, Calibration, FitEffort, Foundation, calibrate
+from udccal.calibration import ORDER, Calibration, Foundation, calibrate
 from udccal.cli.output import Output, StageTime
 from udccal.compilation import compilation_clock, keep_compilations
 from udccal.displays.pictures import face_picture
+from udccal.effort import FitEffort
 from udccal.errors import FitError, UdccalError
 from udccal.fitting.engine.iteration_log import LOG
 from udccal.io.links import refuse_links
