@@ -53,6 +53,7 @@ def test_a_failure_is_one_sentence(case: str, tmp_path: Path) -> None:
     assert not (tmp_path / "o").exists()
 
 
+@pytest.mark.medium
 def test_with_json_the_failure_is_json_and_with_debug_there_is_a_traceback(tmp_path: Path) -> None:
     done = udccal("profile", "show", str(tmp_path), "--json", "--debug")
     assert done.returncode == 1

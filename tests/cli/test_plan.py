@@ -17,6 +17,7 @@ def udccal(*words: str | Path) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, text=True, timeout=280)
 
 
+@pytest.mark.medium
 def test_a_plan_and_the_rig_it_writes(tmp_path: Path) -> None:
     out = tmp_path / "planned" / "rig.toml"
     words = ["plan", "--rig", "lg55-reduced", "--target", "noise=0.06%", "geometry=0.001px", "--out", out, "--json"]

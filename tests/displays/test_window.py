@@ -136,6 +136,7 @@ def test_monitors_are_listed_and_the_chosen_one_must_run_at_the_panels_size(scre
     assert screen.pixels().max() == 0
 
 
+@pytest.mark.medium
 def test_two_screens_only_the_chosen_one_lights_up(monkeypatch: pytest.MonkeyPatch) -> None:
     large, picture = PanelSize(400, 300), noise(SMALL)
     with virtual_screen("320x200x24", "400x300x24") as server:
@@ -204,6 +205,7 @@ def test_a_dead_screen_is_an_error(screen: VirtualScreen) -> None:
             display.check()
 
 
+@pytest.mark.medium
 def test_a_silent_window_is_an_error_in_bounded_time(screen: VirtualScreen, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(window, "_ANSWER_S", 0.2)
     monkeypatch.setattr(window_link, "_END_S", 0.2)

@@ -36,6 +36,7 @@ def test_a_refusal_is_the_sentence_itself() -> None:
     assert len(answer.reason) == 500
 
 
+@pytest.mark.medium
 def test_hanging_ends_in_bounded_time_with_all_that_was_started(tmp_path: Path) -> None:
     note = tmp_path / "grandchild"
     code = (

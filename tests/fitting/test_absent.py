@@ -24,6 +24,7 @@ def test_the_wire_is_one(rig: RigDescription) -> None:
     assert np.abs(wire - 1.0).max() < 1e-12
 
 
+@pytest.mark.medium
 def test_the_panel_sends_nothing(rig: RigDescription) -> None:
     white = np.full((rig.panel.rows, rig.panel.columns, 3), 255, np.uint8)
     rate = in_float64(lambda: np.asarray(backscatter_rate(absent_backscatter(rig, nominal_geometry(rig)), white)))()

@@ -20,6 +20,7 @@ def _step_of_nothing() -> bytes:
     return target._CHANGE.pack(place, 6, 0, 0)
 
 
+@pytest.mark.medium
 def test_a_range_that_is_not_checked_is_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
     (profile,) = PROFILE_TARGETS
     assert not profile.try_out(_step_of_nothing())

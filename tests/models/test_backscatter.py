@@ -58,6 +58,7 @@ def typical(of: b.Backscatter, level: float) -> np.ndarray:
     return np.asarray(b.typical_rate(of, level))
 
 
+@pytest.mark.medium
 def test_white_gives_the_mask_black_gives_nothing() -> None:
     white = rate(term(), grey(255))
     np.testing.assert_allclose(white, typical(term(), 255.0), rtol=1e-9)
@@ -102,6 +103,7 @@ def test_shares_add_up_to_the_footprint() -> None:
     assert np.abs(shares - 1).max() < 0.12
 
 
+@pytest.mark.medium
 def test_a_window_too_small_loses_light() -> None:
     pixels = np.random.default_rng(0).uniform([0, 0], [63, 47], (60, 2))
     small = replace(term(), window=3)
@@ -111,6 +113,7 @@ def test_a_window_too_small_loses_light() -> None:
     assert shares.max() < 0.7
 
 
+@pytest.mark.medium
 def test_a_red_panel_reaches_all_colours_through_the_mix() -> None:
     red = grey(0)
     red[..., 0] = 255

@@ -17,6 +17,7 @@ def kernels() -> np.ndarray:
     return kernels / kernels.sum((2, 3), keepdims=True)
 
 
+@pytest.mark.medium
 def test_a_point_brings_its_own_kernel(kernels: np.ndarray) -> None:
     weights = np.asarray(bilinear_weights(np.array([0.0, 20.0]), np.array([0.0]), 15, 21))
     scene = np.zeros((15, 21, 3))

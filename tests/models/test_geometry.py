@@ -76,6 +76,7 @@ def test_area_of_pixels_is_the_determinant_of_the_directions_slopes() -> None:
     assert np.ptp(area) > 0.2 * area.mean()
 
 
+@pytest.mark.medium
 def test_rotation_is_that_of_opencv_and_has_a_derivative_at_zero() -> None:
     vector = np.array([0.3, -0.2, 0.5])
     with jax.enable_x64(True):

@@ -86,6 +86,7 @@ def test_slits_against_a_sum(lag: float, order: int) -> None:
 @pytest.mark.parametrize(
     ("lag", "wave"), [((0.0, 0.0), (0.3, 5.1)), ((0.2, 0.35), (0.4, 3.0)), ((-0.5, 0.1), (5.0, 5.0))]
 )
+@pytest.mark.medium
 def test_overlap_of_discs_against_a_sum(lag: tuple[float, float], wave: tuple[float, float]) -> None:
     axis = (np.arange(1500) + 0.5) / 1500 - 0.5
     x, y = np.meshgrid(axis, axis)
@@ -122,6 +123,7 @@ def test_polynomials_are_counted_and_start_with_one() -> None:
     assert polynomial_terms(-1) == 0
 
 
+@pytest.mark.medium
 def test_kernels_agree_with_wave_optics(truth: RigTruth) -> None:
     positions = np.array([[512.0, 384.0], [940.0, 715.0]])
     field = true_field(truth)

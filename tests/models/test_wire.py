@@ -88,6 +88,7 @@ def test_kappa_of_a_level_camera_is_the_order() -> None:
     assert np.allclose(seen, np.hypot(*np.asarray(wire.harmonics).T), rtol=1e-6)
 
 
+@pytest.mark.medium
 def test_map_agrees_with_pixels_in_both_precisions() -> None:
     wire = make_wire()
     single = np.asarray(wire_map(wire, ROWS, COLUMNS))
@@ -99,6 +100,7 @@ def test_map_agrees_with_pixels_in_both_precisions() -> None:
     assert np.abs(single / double - 1).max() < 2e-4
 
 
+@pytest.mark.medium
 def test_no_harmonics_leave_the_shading() -> None:
     wire = make_wire()
     bare = Wire(
@@ -132,6 +134,7 @@ def test_an_amplitude_beside_the_pupils_is_a_polynomial_over_the_sensor() -> Non
     assert np.abs(with_it - without).max() > 1e-3
 
 
+@pytest.mark.medium
 def test_differentiable_in_its_shape() -> None:
     wire = make_wire()
     pixels = jnp.array([[13.0, 30.0], [50.0, 3.0]])

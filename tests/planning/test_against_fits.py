@@ -46,6 +46,7 @@ def toy(tmp_path_factory: pytest.TempPathFactory) -> RigDescription:
     return load_rig(write_toy_rig(tmp_path_factory.mktemp("rig")))
 
 
+@pytest.mark.medium
 def test_the_gain_is_known_as_well_as_foretold(toy: RigDescription, tmp_path: Path) -> None:
     predictor, stated = NoisePredictor(as_it_is(toy)), []
     for levels in (6, 24):

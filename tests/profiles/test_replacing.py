@@ -88,6 +88,7 @@ def rounds(work: Callable[[], None], place: Path, prepare: Callable[[], None]) -
 
 
 @pytest.mark.parametrize("name", ["p", "p.zip"])
+@pytest.mark.medium
 def test_a_killed_writer_leaves_the_old_profile_or_the_new(
     tmp_path: Path, toy_profile: Profile, way: str, name: str
 ) -> None:

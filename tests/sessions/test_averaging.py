@@ -98,6 +98,7 @@ def test_a_camera_that_stops_is_refused() -> None:
         average_frames(Script([]).frames, 1, FrameChecks(LIMITS, SETTINGS))
 
 
+@pytest.mark.medium
 def test_memory_does_not_grow_with_the_number_of_frames() -> None:
     def peak(count: int) -> int:
         tracemalloc.start()

@@ -37,6 +37,7 @@ def bracket(rate: float, exposures: np.ndarray, seed: int, shape: tuple[int, int
 
 
 @pytest.mark.parametrize("rate", [0.0, 5.0, 100.0, 3e3, 1e5, 3e6, 5e7])
+@pytest.mark.medium
 def test_unbiased_and_honest_over_seven_decades(rate: float) -> None:
     merge = merge_bracket(bracket(rate, EXPOSURES, 1), EXPOSURES, NOISE)
     error = merge.rate_e_per_s - rate

@@ -142,6 +142,7 @@ def test_two_levels_are_too_few() -> None:
     assert result.status is FitStatus.TOO_FEW_DATA
 
 
+@pytest.mark.medium
 def test_a_lamp_of_changing_pattern_is_a_poor_fit() -> None:
     rig, sensor = toy("lg55-aca2040", 1)
     data = reduced(sensor, np.linspace(0.05, 0.6, 8), 1)

@@ -212,6 +212,7 @@ _ANY_SENSOR = given(
 )  # fmt: skip
 @_examples(3)
 @_ANY_SENSOR
+@pytest.mark.medium
 def test_any_sensor_gives_a_result_within_its_error_or_a_status(**numbers: Any) -> None:
     _within_its_error_or_a_status(**numbers)
 

@@ -59,6 +59,7 @@ def test_map_and_shape_are_within_their_errors_from_a_start_that_is_a_fifth_off(
     assert any("standoff_per_pitch" in note for note in result.notes)
 
 
+@pytest.mark.medium
 def test_no_modulation_is_absent_and_costs_nothing() -> None:
     flat = noisy(drawn_truth(2, start(), geometry(), modulated=False), 2)
     fit = fitted(flat, start(), geometry())
@@ -82,6 +83,7 @@ def test_rows_that_noise_may_hide_are_in_the_error_bars(electrons: float) -> Non
     assert np.std(z) > 0.2
 
 
+@pytest.mark.medium
 def test_saturated_flat_says_what_to_do() -> None:
     signal = np.full((ROWS, COLUMNS), 4095.0)
     flat = Flat(drawn_truth(0, start(), geometry()), signal, signal)

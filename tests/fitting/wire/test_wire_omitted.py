@@ -54,6 +54,7 @@ def test_the_share_is_found_within_its_error(wire: Wire, share: float) -> None:
     assert np.abs(errors).max() < 3.5
 
 
+@pytest.mark.medium
 def test_where_noise_hides_them_they_are_as_likely_as_not(wire: Wire) -> None:
     left, _ = found(wire, 1.0, 0, noise=0.5)
     assert left.part_sigma > 50

@@ -92,6 +92,7 @@ def test_slopes_are_those_of_the_model() -> None:
     assert np.all(np.abs(expected).max(axis=0) > 1e-3)
 
 
+@pytest.mark.medium
 def test_columns_of_linear_coefficients_are_differences_of_the_map() -> None:
     wire = uneven_wire()
     pixels = sample_pixels(np.ones((ROWS, COLUMNS)), GEOMETRY, 40, "RGGB")
