@@ -203,7 +203,11 @@ def binned(
 
 
 def grid_step(rig: RigDescription) -> int:
-    """Spacing of the grid in sensor px: even, near an eighth of the panel rows' period, and leaving little over."""
+    """Return the grid's spacing in sensor px: even, near an eighth of the panel rows' period, with a small remainder.
+
+    Args:
+        rig: gives pitch and stand-off in mm, the focal length in px, and the sensor's size.
+    """
     camera = rig.camera
     period = rig.panel.pitch_mm.value / rig.mounting.standoff_mm.value * rig.focal_px
     largest = max(4, int(period / 8))
@@ -213,10 +217,10 @@ def grid_step(rig: RigDescription) -> int:
 
 @in_float64
 def visible_crop(geometry: Geometry, rig: RigDescription) -> PanelCrop:
-    """The part of the panel that any sensor pixel may see, with room for the tolerances of the mounting.
+    """Return the part of the panel that any sensor pixel may see, with room for the tolerances of the mounting.
 
     Args:
-        geometry: where rays go.
+        geometry: gives the rays of pixels.
         rig: gives the panel's size and the nominal footprints.
     """
     camera, panel, room_px = rig.camera, rig.panel, 12
@@ -233,7 +237,17 @@ def visible_crop(geometry: Geometry, rig: RigDescription) -> PanelCrop:
 def sampled_rays(
     geometry: Geometry, rig: RigDescription, step: int, count: int
 ) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, " n"]]:
-    """About ``count`` grid positions spread evenly (the R2 sequence): their rays and flat grid indices."""
+    """Spread about ``count`` positions evenly over the grid (Roberts's R2 sequence, of the plastic number).
+
+    Args:
+        geometry: gives the rays of pixels.
+        rig: gives the sensor's size.
+        step: spacing of the grid in sensor px.
+        count: number of positions wanted; those that coincide are merged.
+
+    Returns:
+        rays in panel coordinates, and flat grid indices in rising order.
+    """
     shape = rig.camera.rows // step, rig.camera.columns // step
     plastic = 1.32471795724474602596
     sequence = (0.5 + np.arange(count)[:, None] / np.array([plastic, plastic**2])) % 1.0
@@ -246,6 +260,6 @@ def sampled_rays(
 def grid_rays(
     geometry: Geometry, shape: tuple[int, int], step: int, flat: Int[np.ndarray, " n"]
 ) -> Float[np.ndarray, "n 3"]:
-    """Rays of positions of a grid of that many rows and columns, by their flat indices, in panel coordinates."""
+    """Return the rays, in panel coordinates, of positions of a grid of ``shape`` (rows, columns), by flat index."""
     rows, columns = np.divmod(flat, shape[1])
     return directions(geometry, step * (np.stack([columns, rows], axis=1) + 0.5) - 0.5)

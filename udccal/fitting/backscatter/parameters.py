@@ -152,12 +152,15 @@ def footprint_per_pupil(rig: RigDescription) -> float:
 
 
 def prior_of(rig: RigDescription) -> Prior:
-    """What the rig's description says about every parameter, in the solver's coordinates.
+    """Return the prior that the rig's description gives every parameter, in the solver's coordinates.
 
-    The glass's light over that straight from the emitters: of what these send forwards, the outer face reflects 4 %
-    (Fresnel, index 1.5), and a fraction that no data sheet names leaks past their opaque backs. It is taken to be 4 %,
-    too, give or take a factor of e: from 1.5 to 11 % within one sigma. Two sigma hold a leak of half a per cent on one
-    side, and a coated face, which reflects a tenth as much, on the other.
+    ``reflection`` is the light by way of the glass over the light straight from the emitters. The outer face reflects
+    4 % of the light that emitters send forwards (Fresnel, index 1.5). A fraction that no data sheet gives leaks past
+    their opaque backs. The prior assumes 4 % for this leak, too, with a sigma of a factor of e: 1.5 to 11 %. Two sigma
+    include a leak of half a per cent on one side, and a coated face, which reflects a tenth as much, on the other.
+
+    Args:
+        rig: gives the values (mean) and their tolerances (sigma), in the units of ``UNITS``.
     """
     panel, lens, mounting = rig.panel, rig.lens, rig.mounting
     standoff, pitch = mounting.standoff_mm, panel.pitch_mm
@@ -176,7 +179,7 @@ def prior_of(rig: RigDescription) -> Prior:
 
 
 def values_of(x: Vector) -> Vector:
-    """The parameters in the units of ``UNITS``, lengths for the nominal pitch, the pupil as its footprint."""
+    """Return the parameters in the units of ``UNITS``: lengths at the nominal pitch, the footprint for the pupil."""
     with np.errstate(over="ignore"):
         return np.where(_LOGARITHMIC, np.where(x > _ABSENT, np.exp(x), 0.0), x)
 
@@ -209,7 +212,14 @@ class Moments:
 
 
 def linear_of(x: Vector) -> Vector:
-    """The parameters with the reflected fraction of all light, and crosstalk, for their logarithms: 0 where absent."""
+    """Return the parameters in coordinates in which light is close to linear.
+
+    ``reflection`` becomes the reflected fraction of all light, and crosstalk itself replaces its logarithm: both are 0
+    where absent. All others are as in ``x``.
+
+    Args:
+        x: the solver's coordinates, in the order of ``NAMES``; lengths (mm) and softness (panel px) are logarithms.
+    """
     theta, values = np.array(x, dtype=np.float64), values_of(x)
     theta[REFLECTION] = values[REFLECTION] / (1 + values[REFLECTION])
     theta[MIX] = values[MIX]
@@ -217,7 +227,11 @@ def linear_of(x: Vector) -> Vector:
 
 
 def linear_slope(x: Vector) -> Vector:
-    """Derivative of each of ``linear_of`` by the solver's coordinate."""
+    """Return the derivative of each number of ``linear_of`` by its own solver's coordinate.
+
+    Args:
+        x: the solver's coordinates, in the order of ``NAMES``.
+    """
     theta, slope = linear_of(x), np.ones(len(NAMES))
     slope[REFLECTION] = theta[REFLECTION] * (1 - theta[REFLECTION])
     slope[MIX] = theta[MIX]
@@ -225,7 +239,11 @@ def linear_slope(x: Vector) -> Vector:
 
 
 def vector_of(term: Backscatter) -> Vector:
-    """The solver's coordinates of a term, whose logarithms have 1e-6 for what is absent."""
+    """Return the solver's coordinates of a term, in the order of ``NAMES``; logarithms use 1e-6 for 0.
+
+    Args:
+        term: with lengths in mm, and places in panel px.
+    """
     emitters, mix = np.asarray(term.emitters_px), np.asarray(term.mix)
     lengths = (term.standoff_mm, term.pupil_diameter_mm, term.softness_px, term.reflection, term.reflection_mm)
     places = (emitters[1], emitters[0] - emitters[1], emitters[2] - emitters[1])
@@ -235,7 +253,7 @@ def vector_of(term: Backscatter) -> Vector:
 
 
 def with_linear(term: Backscatter, theta: Float[Array, "18"]) -> Backscatter:
-    """The term with parameters of ``linear_of``."""
+    """Return the term with parameters of ``linear_of``."""
     offset = theta[OFFSET]
     distance, pupil, softness, _, depth = jnp.exp(theta[1:6])
     reflected = jnp.minimum(theta[REFLECTION], 1 - 1e-9)
