@@ -158,7 +158,7 @@ def wide_support(wide: Shots, sources: Sources, term: PsfField, rig: RigDescript
 def with_support(term: PsfField, support: Support, rig: RigDescription) -> PsfField:
     """Return the term with this support of its kernel.
 
-    Diffraction reaches over the whole sensor where the pictures show no end of it; an image ends with its window.
+    Diffraction reaches over the whole sensor where the pictures show no end of it; an image ends at the support.
     """
     size = (rig.camera.rows, rig.camera.columns)
     onward = (seen and bool(term.diffraction_fraction) for seen in support.open_ended)

@@ -213,7 +213,7 @@ def solve_image(
         return jax.linear_transpose(forward, start)(weight * (light - by_own(own_of(light))))[0]
 
     if moves is not None:
-        # The model is linear and the prior is about the whole change: start from no change.
+        # The prior is about the whole change, and the model is linear: the data become those before any change.
         data = data + by_own(jnp.asarray(moves.changed))
     iterations, tolerance = (150, 1e-5) if free else (60, 1e-4)
     added, _ = jax.scipy.sparse.linalg.cg(
