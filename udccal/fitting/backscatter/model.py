@@ -24,7 +24,7 @@ from udccal.models.backscatter import Backscatter, emitter_shares, footprints, w
 from udccal.models.geometry import Geometry, panel_directions
 from udccal.numerics import in_float64
 
-# By shot, colour and position; by bin: colour and position; by parameter, too; in panel coordinates.
+# Axes: shot, colour, position; bin: colour, position; Moves add the parameter. Rays are in panel coordinates.
 PerShot = Float[np.ndarray, "shots 3 n"]
 PerBin = Float[np.ndarray, "3 n"]
 Usable = Bool[np.ndarray, "shots 3 n"]

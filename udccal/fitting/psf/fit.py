@@ -227,7 +227,7 @@ def start_prior(rig: RigDescription, start: Diffraction, rules: PsfRules | None 
     Args:
         rig: its tolerances are taken for standard deviations.
         start: the mean; its ``visibility`` says whether the wire has measured the panel's numbers.
-        rules: how much tighter, and the sigmas of parameters that the rig does not describe.
+        rules: factor of the tolerances after the wire's fit, and sigmas of parameters that the rig does not describe.
     """
     panel, theta, rules = rig.panel, pack(start), rules or PsfRules()
     tighter = rules.wire_tolerance if start.visibility else 1.0

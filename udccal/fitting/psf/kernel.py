@@ -42,8 +42,8 @@ from udccal.models.interference import (
 )
 from udccal.models.lattice import Lattice, lattice_for, spline_coefficients
 
-# Of the parameters: how many precede the spectra; the panel's pitch in mm, the pupil's diameter in mm, the logarithm of
-# the blur in px, and where the footprint's centre lies on columns and rows, with its stand-off, in pitches.
+# HEAD parameters precede the spectra. The others are indices among these: the panel's pitch in mm, the pupil's diameter
+# in mm, the logarithm of the blur in px, and the footprint's place on columns and rows with its stand-off, in pitches.
 HEAD: Final = 9
 PITCH, PUPIL, BLUR, FOOTPRINT = 0, 4, 5, slice(6, 9)
 

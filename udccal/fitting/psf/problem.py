@@ -108,7 +108,7 @@ class DiffractionProblem:
         return Place(stepped(place.theta, step.shared), moved_own(place.own, step.own.reshape(place.own.shape)))
 
     def light_at(self, place: Place) -> Lights:
-        """What samples hold under the model, in e-/s, without background."""
+        """Return the samples' light under the model, in e-/s, without background."""
         return np.asarray(light_of(self.evaluator, place.theta, self.samples, place.own))
 
     def errors(self, place: Place, light: Lights) -> Lights:
@@ -164,7 +164,7 @@ def _coefficients(evaluator: Evaluator, theta: Theta, one: Samples) -> Float[Arr
 
 @eqx.filter_jit
 def light_of(evaluator: Evaluator, theta: Theta, samples: Samples, own: Owns) -> Lights:
-    """What samples hold under the model, in e-/s, without background."""
+    """Return the samples' light under the model, in e-/s, without background."""
     theta = jnp.asarray(theta)
 
     def one(pair: tuple[Samples, Array]) -> Light:

@@ -40,7 +40,7 @@ class Samples(eqx.Module):
         points, density: samples on the lattice about the mean place; see ``models.psf.lattice_points``.
         slope: lattice units per pixel, to move a source.
         begun_px: (x, y) of the shots from the mean place, as first assumed.
-        colour: which of three colours a sample has (one-hot).
+        colour: each sample's colour (one-hot).
         known: inverse variance of a sample as measured, 0 where there is no sample.
         noise_per_rate: derivative of that variance by the light, in (e-/s)^2 per e-/s.
         weight: inverse variance that the fit uses.
@@ -107,7 +107,7 @@ def stands_for(shots: Shots, rules: PsfRules) -> Float[np.ndarray, "shots n"]:
 def _on_lattice(
     geometry: Geometry, places: Float[Arrayish, "positions 2"], offsets_px: Float[Arrayish, "positions m 2"]
 ) -> tuple[LocalFrame, Float[Array, "positions m 2"], Float[Array, "positions m"]]:
-    """Frames of places, and where pixels beside them lie on their lattices."""
+    """Return the frames of places, and the positions of pixels near them on their lattices."""
 
     def one(at: tuple[Array, Array]) -> tuple[LocalFrame, Array, Array]:
         frame = local_frame(geometry, at[0])

@@ -171,7 +171,7 @@ def mosaic_channels(
 
 
 def centroids(stamps: Stamps, window_px: float) -> Float[np.ndarray, "stars 2"]:
-    """Return centroids, (x, y) in px, under a Gaussian that follows them; colours have equal weight per sample."""
+    """Return each star's centroid, (x, y) in px, under a Gaussian that follows it, from all colours together."""
     centre = np.zeros((len(stamps.unit), 2))
     for _ in range(15):
         off = stamps.offset_px - centre[:, None]

@@ -77,7 +77,7 @@ def without_outliers(stamps: Stamps, state: State, rules: StampsRules) -> State:
         # Otherwise a star that was left out would be compared at its place and light of a coarse field.
         everything = _placed(stamps, everything, out)
     seen = expectation(stamps, everything)
-    # Clipped samples have large errors in one direction only.
+    # Clipped samples are not tested: their errors have a bound on one side.
     used = (seen.weight > 0) & ~stamps.clipped
     z = np.where(used, seen.residual * np.sqrt(seen.weight), 0.0)
     keep = ~OutlierRule("samples", rules.outlier_sigma).off(z, used)
