@@ -1,4 +1,4 @@
-"""Terms that do nothing: what stands where a session has no steps for a term."""
+"""Terms that do nothing: a calibration uses them where a session has no steps for a term."""
 
 from __future__ import annotations
 
@@ -17,13 +17,23 @@ from udccal.rig import RigDescription
 
 
 def absent_wire(rig: RigDescription, geometry: Geometry) -> Wire:
-    """A wire map that is 1 everywhere: a panel that is open all over."""
+    """Return a wire map that is 1 everywhere: a panel that is open all over.
+
+    Args:
+        rig: gives the panel's numbers and the pitch.
+        geometry: says where each pixel's ray meets the panel.
+    """
     ideal = ideal_wire(geometry, wire_start(rig), np.zeros((0, 2)))
     return replace(ideal, row_open=np.float64(1.0), column_open=np.float64(1.0), depth_per_pitch=np.float64(0.0))
 
 
 def absent_psf(rig: RigDescription, geometry: Geometry) -> PsfField:
-    """A kernel that is a single pixel everywhere; its diffraction is the rig's nominal one and has no share in it."""
+    """Return a field whose kernel is a single pixel everywhere; its diffraction is nominal and has the fraction 0.
+
+    Args:
+        rig: gives the panel, the pupil, the stand-off, and the sensor's size.
+        geometry: becomes part of the term.
+    """
     panel, camera = rig.panel, rig.camera
     half = np.array([camera.columns - 1, camera.rows - 1]) / 2.0
     wavelengths_nm = np.linspace(400.0, 700.0, 4)
@@ -51,7 +61,12 @@ def absent_psf(rig: RigDescription, geometry: Geometry) -> PsfField:
 
 
 def absent_backscatter(rig: RigDescription, geometry: Geometry) -> Backscatter:
-    """A panel that sends no light back, with the rig's nominal measures."""
+    """Return a panel that sends no light back, with the rig's nominal dimensions.
+
+    Args:
+        rig: gives the dimensions and the sensor's size.
+        geometry: becomes part of the term.
+    """
     camera = rig.camera
     step = min(camera.columns, camera.rows) // 2
     mask = np.zeros((3, camera.rows // step, camera.columns // step))

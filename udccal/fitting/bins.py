@@ -17,23 +17,23 @@ from udccal.cfa import cfa_named
 class Bins:
     """Averages of a mosaic over blocks of ``step`` x ``step`` (even) pixels, colour by colour.
 
-    A sample of a colour represents the 2 x 2 pixels around it and counts by the part of them inside the block: then
-    every colour's average is of the block's centre, though its samples are not.
+    A sample of a colour represents the 2 x 2 pixels around it. Its weight is the part of them inside the block, so that
+    every colour's average belongs to the block's centre, although its samples are not centred there.
     """
 
     cfa: str
     step: int
 
     def mean(self, mosaic: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray, "3 grid_rows grid_columns"]:
-        """Averages of the samples."""
+        """Return the averages of the samples, in the samples' unit."""
         return self._sum(mosaic, 1, 1)
 
     def variance(self, mosaic: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray, "3 grid_rows grid_columns"]:
-        """Variances of the averages from those of the samples, each by itself."""
+        """Return the variances of the averages from those of the samples, where samples are independent."""
         return self._sum(mosaic, 2, 2)
 
     def row_variance(self, mosaic: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray, "3 grid_rows grid_columns"]:
-        """The same where the samples of a row go up and down together."""
+        """Return the same where the noise of a row is common to all its samples."""
         return self._sum(mosaic, 2, 1)
 
     def _sum(self, mosaic: np.ndarray, row_power: int, column_power: int) -> Float[np.ndarray, "3 a b"]:
@@ -54,10 +54,10 @@ class Bins:
 
 
 def block_weights(size: int, samples: slice, blocks: int, step: int) -> Float[np.ndarray, "blocks samples"]:
-    """Weights of the samples of one site in the averages over blocks of ``step`` px, along an axis of ``size`` px.
+    """Return the weights of one site's samples in averages over blocks of ``step`` px, along an axis of ``size`` px.
 
-    A sample covers half the distance to its neighbours of the same site. Where the sensor's edge cuts some of a block
-    off, the block's other samples take over its weight.
+    A sample covers half the distance to its neighbours of the same site. Where the sensor's edge cuts off a part of a
+    block, the block's other samples take over its weight.
     """
     centre = np.arange(size, dtype=np.float64)[samples]
     edge, half = step * np.arange(blocks)[:, None] - 0.5, samples.step / 2

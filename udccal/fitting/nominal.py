@@ -1,4 +1,4 @@
-"""Terms as the rig was built to have them: where fits start."""
+"""Terms with the values of the rig's description: fits start from them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,11 @@ from udccal.rig import RigDescription
 
 
 def nominal_geometry(rig: RigDescription) -> Geometry:
-    """Distortion-free geometry of a rig description: focal length of the lens, centred, at its nominal mounting."""
+    """Return the geometry that a rig's description gives: no distortion, centred, at the nominal mounting.
+
+    Args:
+        rig: gives the focal length in px, the sensor's size, and the mounting (angles in degrees, lengths in mm).
+    """
     camera = rig.camera
     return Geometry(
         focal_px=np.array([rig.focal_px, rig.focal_px]),
@@ -27,7 +31,15 @@ def nominal_geometry(rig: RigDescription) -> Geometry:
 def nominal_backscatter(
     geometry: Geometry, rig: RigDescription, mask: Float[np.ndarray, "3 a b"], step: int, window: int
 ) -> Backscatter:
-    """A term with the rig's nominal measures and the mask given: where the fit starts."""
+    """Return a backscatter term with the rig's nominal dimensions; the fit starts from it.
+
+    Args:
+        geometry: gives the rays of the sensor's pixels.
+        rig: gives the panel, the mounting, the pupil (all in mm) and the sensor.
+        mask: rate of white on the grid of bins in e-/s, by camera colour.
+        step: spacing of that grid in sensor px.
+        window: number of panel pixels across the window that holds the footprints (odd).
+    """
     panel = rig.panel
     return Backscatter(
         geometry=geometry,

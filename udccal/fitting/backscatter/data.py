@@ -1,4 +1,4 @@
-"""What the backscatter fit looks at: the panel's light as rates in bins, colour by colour, and what was shown."""
+"""Data of the backscatter fit: the panel's light as rates in bins, colour by colour, and the pictures shown."""
 
 from __future__ import annotations
 
@@ -38,11 +38,11 @@ class Binned:
 
     Attributes:
         rate: e-/s above the black level, the dark signal included.
-        shot: variance per rate, (e-/s)^2 per e-/s: what one electron in a bin amounts to.
-        rest: variance that a rate of 0 has, (e-/s)^2: read and row noise, quantisation, dark current.
-        clipped: bins in which a sample is clipped.
+        shot: variance per rate, (e-/s)^2 per e-/s: the rate of one electron in a bin.
+        rest: variance at a rate of 0, (e-/s)^2: read and row noise, quantisation, dark current.
+        clipped: True for bins with a clipped sample.
         exposure_s: of each shot.
-        scatter: variance between the frames of a shot over what the noise model says; NaN where not known.
+        scatter: variance between the frames of a shot over the noise model's; NaN where not known.
     """
 
     rate: Float[np.ndarray, "shots 3 *grid"]
@@ -54,15 +54,15 @@ class Binned:
 
     @classmethod
     def joined(cls, parts: Sequence[Binned]) -> Binned:
-        """Shots one after the other."""
+        """Join shots in their order."""
         return cls(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(cls)))
 
     def part(self, which: slice | Shaped[np.ndarray, " n"]) -> Binned:
-        """Some of the shots."""
+        """Return some of the shots."""
         return Binned(*(getattr(self, f.name)[which] for f in fields(self)))
 
     def at(self, flat: Int[np.ndarray, " n"]) -> Binned:
-        """All shots at some bins, by their flat indices."""
+        """Return all shots at some bins, by their flat indices."""
         rate, shot, rest, clipped = (
             part.reshape(*part.shape[:2], -1)[:, :, flat] for part in (self.rate, self.shot, self.rest, self.clipped)
         )
@@ -70,49 +70,49 @@ class Binned:
 
     @property
     def usable(self) -> Bool[np.ndarray, "shots 3 *grid"]:
-        """False where samples are clipped."""
+        """False for bins with clipped samples; the dark frame's are all True."""
         usable = ~self.clipped
         usable[-1] = True
         return usable
 
     @property
     def excess(self) -> Float[np.ndarray, "shots 3 *grid"]:
-        """Light above that of the dark frame, as measured."""
+        """Measured light less that of the dark frame, in e-/s."""
         return self.rate - np.multiply.outer(self.exposure_s[-1] / self.exposure_s, self.rate[-1])
 
     def variance(self, rate: Float[np.ndarray, "shots 3 *grid"]) -> Float[np.ndarray, "shots 3 *grid"]:
-        """Of every bin by noise, at this light."""
-        # Never below rounding's: a black picture in a camera without read noise.
+        """Return every bin's variance by noise, in (e-/s)^2, at this light."""
+        # A black picture in a camera without read noise still has rounding's variance.
         return np.maximum(self.shot * np.maximum(rate, 0.0) + self.rest, self.shot**2 / 12)
 
     def weights(self, rate: PerShot, mask: PerBin, model_error: float, usable: Usable) -> PerShot:
-        """1 / sigma of every bin, 0 where not usable, at this light of this mask."""
+        """Return 1 / sigma of every bin, 0 where not usable, at this light and mask."""
         variance = self.variance(rate)
-        # White is the mask by definition, dark has no light: the model's error is in neither.
+        # White is the mask by definition, and dark has no light: neither has a model error.
         variance[1:-1] += (model_error * mask) ** 2
         return np.where(usable, 1 / np.sqrt(variance), 0.0)
 
     def first_weights(self) -> PerShot:
-        """Weights by what was measured, one electron on the safe side."""
+        """Return weights at the measured light plus one electron, for safety."""
         rate = np.maximum(self.excess, 0.0) + self.shot
         rate[-1] = 0.0
         return self.weights(rate, np.zeros(rate.shape[1:]), 0.0, self.usable)
 
     def profile(self, ratio: PerShot, weight: PerShot) -> Profile:
-        """Mask and dark signal at their best."""
+        """Return the most probable mask and dark signal."""
         return Profile.of(ratio, self.rate, self.exposure_s[-1] / self.exposure_s, weight)
 
 
 @final
 @dataclass(frozen=True)
 class BackscatterData:
-    """What the camera saw of the panel, and what the panel showed.
+    """The camera's shots of the panel, and the pictures that the panel showed.
 
     Attributes:
         shots: white, then the pictures, and the dark frame last; none at all where white or dark are missing.
         shown: the pictures, values 0 to 255, in the crop.
         crop: the part of the panel that the camera can see (``visible_crop``).
-        names: of the pictures.
+        names: names of the pictures.
     """
 
     shots: Binned
@@ -122,11 +122,11 @@ class BackscatterData:
 
     @functools.cached_property
     def pictures(self) -> Pictures:
-        """What the panel showed during every shot."""
+        """The panel's picture during every shot."""
         return Pictures.of(self.shown, self.crop)
 
     def only(self, keep: Bool[np.ndarray, " pictures"]) -> BackscatterData:
-        """White, dark, and some of the pictures."""
+        """Return white, dark, and some of the pictures."""
         names = tuple(name for name, kept in zip(self.names, keep, strict=True) if kept)
         shots = self.shots.part(np.concatenate([[True], keep, [True]]))
         return BackscatterData(shots, self.shown[keep], self.crop, names)
@@ -144,9 +144,9 @@ def read_backscatter(
     Args:
         session: holds ``backscatter/white``, ``backscatter/dark`` and other pictures, as averages.
         noise: gives K, black level and saturation, and the variance of samples.
-        geometry: where rays go.
-        shading: the wire's map of the sensor (``fitting.wire.sensor_map``), divided out of what was measured.
-        rules: say what is clipped.
+        geometry: the rays of pixels.
+        shading: the wire's map of the sensor (``fitting.wire.sensor_map``), which divides the rates.
+        rules: give the fraction of saturation from which a mean is clipped.
 
     Returns:
         rates in e-/s by bin and colour; without shots where white or dark were not captured.
@@ -181,12 +181,12 @@ def binned(
     bins: Bins,
     most: float,
 ) -> Binned:
-    """One shot in bins, from its average in DN; from the fraction ``most`` of saturation on, means count as clipped."""
+    """Bin one shot from its average in DN; means above the fraction ``most`` of saturation count as clipped."""
     gain = float(np.asarray(noise.K_DN_per_e))
     to_rate = 1.0 / (exposure_s * shading)
     signal_e = (average.mean - float(np.asarray(noise.black_DN))) / gain
     clipped = average.mean >= most * float(np.asarray(noise.saturation_DN))
-    # Variance in the dark, e-^2: that of a row's offset, and that of each sample by itself.
+    # Variance in the dark, e-^2: of a row's offset, and of each sample independently.
     row_e2 = float(np.asarray(noise.sigma_row_DN / noise.K_DN_per_e)) ** 2
     rest_e2 = max(float(np.asarray(variance_e(noise, np.zeros(()), np.float64(exposure_s)))) - row_e2, 0.0)
     per_frame = to_rate**2 / average.frames
@@ -203,7 +203,11 @@ def binned(
 
 
 def grid_step(rig: RigDescription) -> int:
-    """Spacing of the grid in sensor px: even, near an eighth of the panel rows' period, and leaving little over."""
+    """Return the grid's spacing in sensor px: even, near an eighth of the panel rows' period, with a small remainder.
+
+    Args:
+        rig: gives pitch and stand-off in mm, the focal length in px, and the sensor's size.
+    """
     camera = rig.camera
     period = rig.panel.pitch_mm.value / rig.mounting.standoff_mm.value * rig.focal_px
     largest = max(4, int(period / 8))
@@ -213,10 +217,10 @@ def grid_step(rig: RigDescription) -> int:
 
 @in_float64
 def visible_crop(geometry: Geometry, rig: RigDescription) -> PanelCrop:
-    """The part of the panel that any sensor pixel may see, with room for the tolerances of the mounting.
+    """Return the part of the panel that any sensor pixel may see, with room for the tolerances of the mounting.
 
     Args:
-        geometry: where rays go.
+        geometry: gives the rays of pixels.
         rig: gives the panel's size and the nominal footprints.
     """
     camera, panel, room_px = rig.camera, rig.panel, 12
@@ -233,7 +237,17 @@ def visible_crop(geometry: Geometry, rig: RigDescription) -> PanelCrop:
 def sampled_rays(
     geometry: Geometry, rig: RigDescription, step: int, count: int
 ) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, " n"]]:
-    """About ``count`` grid positions spread evenly (the R2 sequence): their rays and flat grid indices."""
+    """Spread about ``count`` positions evenly over the grid (Roberts's R2 sequence, of the plastic number).
+
+    Args:
+        geometry: gives the rays of pixels.
+        rig: gives the sensor's size.
+        step: spacing of the grid in sensor px.
+        count: number of positions wanted; those that coincide are merged.
+
+    Returns:
+        rays in panel coordinates, and flat grid indices in rising order.
+    """
     shape = rig.camera.rows // step, rig.camera.columns // step
     plastic = 1.32471795724474602596
     sequence = (0.5 + np.arange(count)[:, None] / np.array([plastic, plastic**2])) % 1.0
@@ -246,6 +260,6 @@ def sampled_rays(
 def grid_rays(
     geometry: Geometry, shape: tuple[int, int], step: int, flat: Int[np.ndarray, " n"]
 ) -> Float[np.ndarray, "n 3"]:
-    """Rays of positions of a grid of that many rows and columns, by their flat indices, in panel coordinates."""
+    """Return the rays, in panel coordinates, of positions of a grid of ``shape`` (rows, columns), by flat index."""
     rows, columns = np.divmod(flat, shape[1])
     return directions(geometry, step * (np.stack([columns, rows], axis=1) + 0.5) - 0.5)

@@ -1,4 +1,4 @@
-"""Backscatter fit: averages of the panel's pictures under blackout -> how the panel's light gets into the lens."""
+"""Backscatter fit: from averages of the panel's pictures under blackout to the panel's light on the sensor."""
 
 from __future__ import annotations
 
@@ -41,17 +41,18 @@ def fit_backscatter(
 ) -> FitResult[Backscatter]:
     """Fit the backscatter term to binned rates.
 
-    The term has the most probable parameters. Estimates are means over what is possible, so that their errors are as
-    often to either side as sigma says; the two differ where a parameter is known to some tens of per cent only.
+    The term has the most probable parameters. Estimates are posterior means, whose errors are to either side as often
+    as sigma says. The two differ where a parameter is known only to some tens of per cent.
 
     Args:
-        data: white, dark and at least 6 other pictures (``read_backscatter``).
-        geometry: where rays go.
+        data: rates in e-/s of white, dark and at least 6 other pictures (``read_backscatter``).
+        geometry: the rays of pixels.
         rig: gives the start and its tolerances, which are the prior.
         rules: see ``BackscatterRules``.
 
     Returns:
-        the term, its estimates in the units of their names, and how sure it is; the status says what to do next.
+        The term, its estimates in the units of their names, and its posterior. Data that cannot be fitted give a status
+        and a note instead of an exception.
     """
     rules = rules or BackscatterRules()
     keep = data.shots.clipped.mean(axis=(1, 2, 3))[1:-1] <= rules.most_clipped
@@ -66,7 +67,7 @@ def fit_backscatter(
 def _usable(
     data: BackscatterData, keep: Bool[np.ndarray, " pictures"], rules: BackscatterRules
 ) -> tuple[FitStatus, str]:
-    """Whether a fit can begin with white, dark and the pictures to keep, and else why not."""
+    """Return whether a fit can start with white, dark and the pictures to keep, and a note if it cannot."""
     shots = data.shots
     if len(shots.rate) < 2:
         note = "Expected the steps backscatter/white and backscatter/dark, found that they were not captured."
@@ -84,11 +85,11 @@ def _usable(
 
 
 def result_of(found: Found, data: BackscatterData, rig: RigDescription, clipped: list[str]) -> FitResult[Backscatter]:
-    """The fit as a result; ``clipped`` names the pictures that were left out before it."""
+    """Return the fit as a result; ``clipped`` names the pictures that were left out before it."""
     fitted, template, used = found.fitted, found.problem.template, found.fitted.used
     rest = residual_pattern(found)
     values = value_moments(found, rest.inflation)
-    # By how much lengths move with one sigma of the pitch: pictures give lengths in panel pixels only.
+    # Change of lengths with one sigma of the pitch: pictures give lengths in panel pixels only.
     moved, lengths = np.zeros(len(NAMES)), [DISTANCE, PUPIL, DEPTH]
     moved[lengths] = values.mean[lengths] * rig.panel.pitch_mm.tolerance / rig.panel.pitch_mm.value
     scale = np.ones(len(NAMES))
@@ -99,10 +100,10 @@ def result_of(found: Found, data: BackscatterData, rig: RigDescription, clipped:
     window = window_for(template, linear_of(fitted.found.x), rays, slack=0.5)
     posterior = term_posterior(replace(template, window=window), data, found, rest.inflation)
     status, advice = _status(found)
-    # Between the frames of a shot, over what the noise model says, as the median of all shots; 0: unknown.
+    # Variance between the frames of a shot over the noise model's, as the median of all shots; 0: unknown.
     known = data.shots.scatter[:-1][np.isfinite(data.shots.scatter[:-1])]
     scatter = float(np.median(known)) if known.size else 0.0
-    # What the profiled mask took from the residuals' variance is given back.
+    # The eliminated mask reduces the residuals' variance; this corrects for it.
     z = fitted.z[used] * np.sqrt(used.sum() / found.dof)
     return FitResult(
         name="backscatter",
@@ -129,7 +130,7 @@ def result_of(found: Found, data: BackscatterData, rig: RigDescription, clipped:
 
 
 def residual_pattern(found: Found) -> MisfitTest:
-    """Whether residuals of a shot and colour have the same sign over parts of the sensor or over all of it."""
+    """Test whether residuals of a shot and colour have the same sign over parts of the sensor or all of it."""
     fitted, cells, places, used = found.fitted, found.problem.rules.cells, _places(found), found.fitted.used
     low, high = places.min(axis=0), places.max(axis=0)
     column, row = np.minimum((places - low) / np.maximum(high - low, 1e-9) * cells, cells - 1).astype(int).T
@@ -143,14 +144,14 @@ def residual_pattern(found: Found) -> MisfitTest:
 
 
 def _places(found: Found) -> Float[np.ndarray, "n 2"]:
-    """Grid columns and rows of the positions."""
+    """Return grid columns and rows of the positions."""
     template = found.problem.template
     rows, columns = np.divmod(found.problem.flat, template.columns // template.step)
     return np.stack([columns, rows], axis=1).astype(np.float64)
 
 
 def _status(found: Found) -> tuple[FitStatus, tuple[str, ...]]:
-    """How the fit ended, and what to do about it beyond what the status says."""
+    """Return the fit's status, and notes on what to do in addition to the status's own advice."""
     solved, problem, rules = found.fitted.found, found.problem, found.problem.rules
     if not solved.converged:
         return FitStatus.NOT_CONVERGED, ("Check panel and mounting in the rig's description.",)
@@ -202,7 +203,7 @@ def _notes(found: Found, rest: MisfitTest, scatter: float, clipped: list[str]) -
 
 
 def _outliers(found: Found, data: BackscatterData, clipped: list[str]) -> tuple[Outliers, ...]:
-    """What was left out, by rule."""
+    """Return the samples and pictures that were left out, by rule."""
     names, usable, bad = ("white", *data.names), found.problem.seen.usable[:-1], found.bad_shots[:-1]
     places = _places(found).astype(int)
 
@@ -221,15 +222,15 @@ def _outliers(found: Found, data: BackscatterData, clipped: list[str]) -> tuple[
 def term_posterior(
     template: Backscatter, data: BackscatterData, found: Found, inflation: float
 ) -> Posterior[Backscatter]:
-    """Of the whole term: its parameters, the mask that follows them, the mask's own noise, and other orders.
+    """Return the whole term's posterior: its parameters, the mask that follows them, its noise, and other orders.
 
-    What the model leaves undescribed of a picture (``model_error_of_white``) is no error of the term and comes on top.
+    The model error of a picture (``model_error_of_white``) is not an error of the term and adds to it.
 
     Args:
         template: gives the window.
         data: all shots.
         found: the chosen order's fit, and the others.
-        inflation: of the parameters' variance.
+        inflation: factor of the parameters' variance.
     """
     theta, orders, parts = linear_of(found.fitted.found.x), found.orders, []
     for one in orders.tried:

@@ -1,9 +1,8 @@
 """Light of pictures over that of white at sensor positions, and its derivatives by the parameters.
 
-Only the emitters' shares depend on where the footprints lie, and only the light of the panel on gamma. The shares and
-their derivatives come from the model by automatic differentiation, compiled once for a block of positions; the sums
-over panel pixels are products of sparse matrices. ``theta`` is of ``parameters.linear_of``. White is the first of the
-shots, the dark frame the last.
+Only the emitters' shares depend on the places of the footprints, and only the panel's light depends on gamma. Automatic
+differentiation of the model gives the derivatives of the shares, compiled once for a block of positions. Sums over
+panel pixels are products of sparse matrices. White is the first shot, the dark frame the last.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ from udccal.models.backscatter import Backscatter, emitter_shares, footprints, w
 from udccal.models.geometry import Geometry, panel_directions
 from udccal.numerics import in_float64
 
-# By shot, colour and position; by bin: colour and position; by parameter, too; in panel coordinates.
+# Axes: shot, colour, position; bin: colour, position; Moves add the parameter. Rays are in panel coordinates.
 PerShot = Float[np.ndarray, "shots 3 n"]
 PerBin = Float[np.ndarray, "3 n"]
 Usable = Bool[np.ndarray, "shots 3 n"]
@@ -38,7 +37,7 @@ _LEAST_WHITE = 1e-9
 def in_blocks(
     function: Callable[..., tuple[Array, ...]], *columns: Shaped[np.ndarray, "n ..."]
 ) -> tuple[Shaped[np.ndarray, "n ..."], ...]:
-    """``function`` of arrays with one row per position, ``BLOCK`` rows at a time: it is compiled once."""
+    """Apply a function to arrays with one row per position, ``BLOCK`` rows at a time: it is compiled once."""
     count = len(columns[0])
     found = []
     for first in range(0, count, BLOCK):
@@ -53,23 +52,23 @@ _directions = jax.jit(panel_directions)
 
 @in_float64
 def directions(geometry: Geometry, pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 3"]:
-    """Rays of sensor pixels in panel coordinates."""
+    """Return the rays of sensor pixels in panel coordinates."""
     return in_blocks(lambda part: (_directions(geometry, part),), np.asarray(pixels, dtype=np.float64))[0]
 
 
 def corners_of(template: Backscatter, theta: Vector, rays: Rays) -> Int[np.ndarray, "n 2"]:
-    """(column, row) of the first panel pixel of each position's window."""
+    """Return (column, row) of the first panel pixel of each position's window."""
     return _middle_and_reach(template, theta, rays)[0] - (template.window - 1) // 2
 
 
 def window_for(template: Backscatter, theta: Vector, rays: Rays, slack: float) -> int:
-    """Odd number of panel pixels across a window that holds both footprints at every position.
+    """Return the odd number of panel pixels across a window that holds both footprints at every position.
 
     Args:
         template: gives the geometry.
         theta: of ``parameters.linear_of``.
         rays: in panel coordinates.
-        slack: panel pixels by which the footprints may move.
+        slack: distance that the footprints may move, in panel px.
     """
     reach_px = _middle_and_reach(template, theta, rays)[1]
     emitters = np.insert(theta[EMITTERS].reshape(2, 2), 1, 0.0, axis=0)
@@ -81,8 +80,8 @@ def window_for(template: Backscatter, theta: Vector, rays: Rays, slack: float) -
 def _middle_and_reach(
     template: Backscatter, theta: Vector, rays: Rays
 ) -> tuple[Int[np.ndarray, "n 2"], Float[np.ndarray, " n"]]:
-    """Middle panel pixel of each position's window, and how far the footprints reach from it."""
-    # For a window of one pixel: windows of any size then use one compilation.
+    """Return the middle panel pixel of each position's window, and the footprints' reach from it in panel px."""
+    # With a window of one pixel, windows of any size use one compilation.
     single = replace(template, window=1)
     middle, reach = in_blocks(lambda part: _middle_and_reach_of_block(single, theta, part), rays)
     return middle.astype(np.int64), reach
@@ -110,16 +109,16 @@ class PanelCrop:
     rows: int
 
     def of(self, picture: UInt8[np.ndarray, "panel_rows panel_columns 3"]) -> UInt8[np.ndarray, "rows columns 3"]:
-        """That part of a picture."""
+        """Return that part of a picture."""
         return picture[self.row : self.row + self.rows, self.column : self.column + self.columns].copy()
 
 
 @final
 @dataclass(frozen=True)
 class Pictures:
-    """What the panel showed in the part that the camera sees: white first, and black last.
+    """The pictures in the part of the panel that the camera sees: white first, and black last.
 
-    Values 0 to 255 by primary; the pixels of the crop row by row, and then a black one in place of all beyond it.
+    Values are 0 to 255 by primary. Pixels of the crop are row by row; a black one follows for all beyond the crop.
     """
 
     values: UInt8[np.ndarray, "3 pixels shots"]
@@ -127,13 +126,13 @@ class Pictures:
 
     @classmethod
     def of(cls, shown: UInt8[np.ndarray, "pictures crop_rows crop_columns 3"], crop: PanelCrop) -> Pictures:
-        """From pictures in the crop, values 0 to 255; white and black are added."""
+        """Add white and black to pictures in the crop with values 0 to 255."""
         values = shown.reshape(len(shown), crop.rows * crop.columns, 3).transpose(2, 1, 0)
         white = np.full((3, values.shape[1], 1), 255, np.uint8)
         return cls(np.pad(np.concatenate([white, values], axis=2), ((0, 0), (0, 1), (0, 1))), crop)
 
     def light(self, gamma: float) -> Float[np.ndarray, "2 3 pixels shots"]:
-        """Light of the panel's primaries, 1 at most, and its derivative by gamma."""
+        """Return the light of the panel's primaries, 1 at most, and its derivative by gamma."""
         log = np.log(np.maximum(np.arange(256), 1) / 255)
         light = np.where(np.arange(256) > 0, np.exp(gamma * log), 0.0)
         return np.stack([light, light * log])[:, self.values]
@@ -156,7 +155,7 @@ class Windows:
 
     @classmethod
     def around(cls, template: Backscatter, theta: Vector, rays: Rays, crop: PanelCrop) -> Windows:
-        """As wide as the template says, around the footprints of these parameters."""
+        """Return windows of the template's width around the footprints of these parameters."""
         corner, span = corners_of(template, theta, rays), np.arange(template.window)
         columns = corner[:, 0, None, None] - crop.column + span[None, None, :]
         rows = corner[:, 1, None, None] - crop.row + span[None, :, None]
@@ -167,7 +166,7 @@ class Windows:
     def sums(
         self, shares: Float[np.ndarray, "n 3 k window2"], panel: Float[np.ndarray, "3 pixels shots"]
     ) -> Float[np.ndarray, "k 3 shots n"]:
-        """Each primary's light from the panel; nothing comes from beyond the crop."""
+        """Sum each primary's light over the windows; panel pixels beyond the crop are black."""
         pixels = panel.shape[1]
         places = self.places[:, None, None] + pixels * np.arange(3)[:, None, None]
         columns = np.broadcast_to(places, shares.shape).ravel()
@@ -181,7 +180,7 @@ class Windows:
 def _shares_at(
     template: Backscatter, theta: Vector, at: Windows, derivatives: bool
 ) -> Float[np.ndarray, "n 3 k window2"]:
-    """Share of every emitter in the windows, and on request its derivatives by ``PLACES``."""
+    """Return the share of every emitter in the windows, and on request its derivatives by ``PLACES``."""
     of_block = functools.partial(_shares, template, theta, derivatives=derivatives)
     (shares,) = in_blocks(lambda rays, corner: (of_block(rays, corner),), at.rays, at.corner)
     return shares
@@ -207,14 +206,19 @@ def _shares(
 
 
 def ratios(template: Backscatter, theta: Vector, at: Windows, shown: Pictures) -> PerShot:
-    """Light of pictures over that of white."""
+    """Return the light of pictures over that of white, by shot, colour and position."""
     shares = _shares_at(template, theta, at, derivatives=False)
     light = _mixed(theta, at.sums(shares, shown.light(float(theta[0]))[0]))[0]
     return light / np.maximum(light[0], _LEAST_WHITE)
 
 
 def ratios_and_jacobian(template: Backscatter, theta: Vector, at: Windows, shown: Pictures) -> tuple[PerShot, Moves]:
-    """Light of pictures over that of white, and its derivatives by ``theta``."""
+    """Return ``ratios``, by shot, colour and position, and their derivatives by each of ``theta``.
+
+    Args:
+        template, theta: geometry and window; parameters of ``parameters.linear_of``.
+        at, shown: the panel pixels around the footprints; what the panel showed.
+    """
     shares = _shares_at(template, theta, at, derivatives=True)
     panel, by_gamma = shown.light(float(theta[0]))
     primaries = at.sums(shares, panel)
@@ -231,7 +235,7 @@ def ratios_and_jacobian(template: Backscatter, theta: Vector, at: Windows, shown
 
 
 def _mixed(theta: Vector, primaries: Float[np.ndarray, "k 3 shots n"]) -> Moves:
-    """Camera colours from primaries, but for a factor of each colour, on which ratios do not depend."""
+    """Mix primaries into camera colours, except for a factor per colour, which cancels in ratios."""
     mix = np.eye(3)
     mix[OFF_DIAGONAL] = theta[MIX]
     return np.einsum("cp,kpsn->kscn", mix, primaries)
@@ -240,13 +244,13 @@ def _mixed(theta: Vector, primaries: Float[np.ndarray, "k 3 shots n"]) -> Moves:
 @final
 @dataclass(frozen=True)
 class Profile:
-    """Mask and dark signal at their best for given ratios, bin by bin.
+    """The most probable mask and dark signal for given ratios, bin by bin.
 
     Attributes:
         mask, dark: e-/s.
         errors: measured less modelled rates; ``weight`` is 1 / sigma of each.
-        information: on the mask, the dark signal not being known.
-        by_mask, by_dark: directions of the whitened errors that mask and dark take up, at right angles, of length 1.
+        information: on the mask, with the dark signal eliminated.
+        by_mask, by_dark: orthonormal directions of the whitened errors that mask and dark remove.
     """
 
     mask: PerBin
@@ -259,12 +263,12 @@ class Profile:
 
     @property
     def chi2(self) -> float:
-        """The prior left out."""
+        """Chi-squared without the prior."""
         return float(((self.errors * self.weight) ** 2).sum())
 
     @classmethod
     def of(cls, ratio: PerShot, light: PerShot, exposure: Float[np.ndarray, " shots"], weight: PerShot) -> Profile:
-        """For the ratios of all shots, their light, and the dark frame's exposure over theirs."""
+        """Solve for mask and dark from all shots' ratios and light; ``exposure`` is the dark frame's over theirs."""
         apart = exposure[:, None, None] * weight
         length = np.sqrt((apart**2).sum(axis=0))
         by_dark = apart / length
@@ -278,19 +282,19 @@ class Profile:
         return cls(mask, dark, errors, weight, information, by_mask, by_dark)
 
     def jacobian(self, of_ratio: Moves) -> Moves:
-        """Of the whitened errors, off what mask and dark can take up (Kaufman, BIT 15, 1975)."""
+        """Return the whitened errors' Jacobian without the parts that mask and dark remove (Kaufman, BIT 15, 1975)."""
         jacobian = -(self.mask * self.weight) * of_ratio
         for way in (self.by_dark, self.by_mask):
             jacobian -= way * np.einsum("scn,kscn->kcn", way, jacobian)[:, None]
         return jacobian
 
     def mask_jacobian(self, of_ratio: Moves) -> Float[np.ndarray, "k 3 n"]:
-        """How the mask follows the ratios, for the light that is expected; what noise adds is of second order."""
+        """Return the mask's derivatives for the expected light; the contribution of noise is of second order."""
         along = np.einsum("scn,kscn->kcn", self.by_mask * self.weight, of_ratio)
         return -self.mask * along / np.sqrt(np.where(self.information > 0, self.information, 1.0))
 
     def light_variance(self, ratio: PerShot, of_ratio: Moves, cov: Float[np.ndarray, "k k"]) -> PerShot:
-        """Of predicted light: the parameters' covariance with the mask that follows them, and the mask's noise."""
+        """Return predicted light's variance: from the parameters and their effect on the mask, and from its noise."""
         moves = self.mask * of_ratio + ratio * self.mask_jacobian(of_ratio)[:, None]
         by_parameters = np.einsum("kicn,kl,licn->icn", moves, cov, moves, optimize=True)
         return np.asarray(by_parameters + ratio**2 / np.maximum(self.information, 1e-30))

@@ -1,8 +1,8 @@
-"""The search for the backscatter's order and its most probable parameters, and how sure these are.
+"""The search for the backscatter's order, its most probable parameters, and their covariance.
 
-White, dark and pictures have one likelihood (``solve``). A scan over whole panel pixels gives the start, one plane of
-emitters the next, and two planes what is compared with simpler orders by its evidence. What the chosen order leaves
-undescribed is estimated, from all pictures and from those held out of a fit of its own, and counts as noise.
+White, dark and pictures have one likelihood (``solve``). A scan over whole panel pixels gives the start for one plane
+of emitters, which gives the start for two planes. The evidence compares two planes with simpler orders. The chosen
+order's model error is estimated from all pictures, and from those held out of another fit. It counts as noise.
 """
 
 from __future__ import annotations
@@ -48,14 +48,14 @@ BAD_BINS = OutlierRule("bins")
 @final
 @dataclass(frozen=True)
 class Found:
-    """The order that was chosen and its fit.
+    """The chosen order and its fit.
 
     Attributes:
         usable: samples that are neither clipped nor outliers.
-        model_error: what the model leaves undescribed of a ratio, as one sigma.
-        orders: all that were compared.
-        bad_shots: left out whole (white first, dark last).
-        held_out: rms of errors of pictures that took no part over their peaks, noise taken out.
+        model_error: one sigma of the model's deviation from the truth, as a ratio to white.
+        orders: all candidates and their evidence.
+        bad_shots: True for shots that are left out whole (white first, dark last).
+        held_out: rms error of held-out pictures over their peaks, without noise.
     """
 
     problem: Problem
@@ -73,13 +73,13 @@ class Found:
 
 
 def search(problem: Problem, kernels: tuple[Order, ...] = KERNELS) -> Found:
-    """Fit the orders and take the one of the largest evidence; ``kernels`` holds one where the order is known."""
+    """Fit the orders and choose the one of largest evidence; ``kernels`` has one item if the order is known."""
     noise, rules = problem.seen.first_weights(), problem.rules
     simple = _from_afar(problem, ONE_PLANE, problem.start, noise, rules.first_error)
     bad = _bad_shots(simple.weighed(noise), rules)
     problem = problem.with_room(simple.found.x)
     rich = _two_planes(problem, simple, np.where(bad[:, None, None], 0.0, noise))
-    # Judged anew: one plane describes some good pictures badly.
+    # Evaluate again: one plane describes some good pictures badly.
     bad = _bad_shots(rich.weighed(noise), rules)
     rich = rich.weighed(np.where(bad[:, None, None], 0.0, noise))
     usable = _without_outliers(problem, rich, ~bad)
@@ -90,17 +90,17 @@ def search(problem: Problem, kernels: tuple[Order, ...] = KERNELS) -> Found:
     best = problem.solved(best.order, best.found.x, rich.best.weight)
     fitted, error = refit(problem, best, usable)
     held, new = held_out(problem, fitted)
-    # Pictures that took no part say what is to be expected of new ones.
+    # Held-out pictures show the error to expect of new ones.
     return Found(problem, fitted, usable, max(error, new), orders, bad, held)
 
 
 def refit(problem: Problem, fitted: Fitted, usable: Usable) -> tuple[Fitted, float]:
-    """With weights of the model, and with what it leaves undescribed, which comes back too, until both stay."""
+    """Fit again with weights by the model and its model error; return the fit and that error."""
     error = 0.0
     for _ in range(2):
         used, mask = fitted.best.weight > 0, fitted.best.mask
         unit = np.broadcast_to(mask**2, used.shape).copy()
-        # White and dark have no part in the model's error.
+        # White and dark have no model error.
         unit[[0, -1]] = 0.0
         noise = problem.seen.variance(fitted.light)
         error = excess_sigma(fitted.best.errors[used] ** 2, noise[used], unit[used], fitted.dof(problem.prior))
@@ -110,7 +110,7 @@ def refit(problem: Problem, fitted: Fitted, usable: Usable) -> tuple[Fitted, flo
 
 
 def _from_afar(problem: Problem, order: Order, x: Vector, noise: PerShot, error: float) -> Fitted:
-    """A fit whose start has this model error, which counts as noise: against noise alone, no prior would count."""
+    """Fit with this model error of the start as noise: with noise alone, the prior would have no effect."""
     light, used = np.maximum(problem.seen.excess[0], 0.0), noise > 0
     for _ in range(4):
         variance = 1 / np.where(used, noise, 1.0) ** 2
@@ -123,7 +123,7 @@ def _from_afar(problem: Problem, order: Order, x: Vector, noise: PerShot, error:
 
 
 def typical_error(fitted: Fitted, seen: Binned) -> float:
-    """Model error relative to white that half of the pictures' samples have: bad pictures do not count."""
+    """Return a robust model error relative to white, on which bad pictures have little effect."""
     used, noise = fitted.used, seen.variance(fitted.light)
     used[0] = False
     unit = np.broadcast_to(fitted.best.mask**2, used.shape)
@@ -131,9 +131,9 @@ def typical_error(fitted: Fitted, seen: Binned) -> float:
 
 
 def _two_planes(problem: Problem, simple: Fitted, noise: PerShot) -> Fitted:
-    """The best of some fits, with reflections brighter and fainter than the emitters themselves to begin with."""
+    """Return the best of several fits, which start with reflections brighter and fainter than the emitters."""
     prior, seen = problem.prior, problem.seen
-    # No more than one plane leaves: against much more, all starts would end at the prior's mean.
+    # Not above one plane's model error: with a much larger one, all starts would end at the prior's mean.
     error = typical_error(simple, seen)
     starts = [split_plane(simple.found.x, prior, reflection) for reflection in problem.rules.reflections]
     fits = [_from_afar(problem, TWO_PLANES, x, noise, error) for x in starts]
@@ -141,11 +141,11 @@ def _two_planes(problem: Problem, simple: Fitted, noise: PerShot) -> Fitted:
 
 
 def _bad_shots(fitted: Fitted, rules: BackscatterRules) -> Bool[np.ndarray, " shots"]:
-    """Shots that dropped, flickered or were of another picture: by brightness and by how badly they are described."""
+    """Find shots that dropped, flickered or show another picture, by brightness and by size of residuals."""
     z, used, weight = fitted.z, fitted.used, fitted.best.weight
     typical = np.array([np.median(np.abs(one[kept])) if kept.any() else 0.0 for one, kept in zip(z, used, strict=True)])
     bad = typical > rules.worse_pictures * max(float(np.median(typical[:-1])), ndtri(0.75))
-    # By how much each is brighter than modelled, relative to its light, in units of noise or of all shots' scatter.
+    # Excess brightness over the model, relative to its light, in units of noise or of all shots' scatter.
     model = np.where(used, fitted.light * weight, 0.0)[:-1]
     information = np.maximum((model**2).sum(axis=(1, 2)), 1e-12)
     off = (z[:-1] * model).sum(axis=(1, 2)) / information
@@ -156,7 +156,7 @@ def _bad_shots(fitted: Fitted, rules: BackscatterRules) -> Bool[np.ndarray, " sh
 
 
 def _without_outliers(problem: Problem, fitted: Fitted, good: Bool[np.ndarray, " shots"]) -> Usable:
-    """Samples that stay: the worst of a bin goes, which may have pulled the others off, and its mask is fitted anew."""
+    """Remove the worst sample of a bin, which may have biased the others, and fit the bin's mask again."""
     seen = problem.seen
     usable = seen.usable & good[:, None, None]
     for _ in range(4):
@@ -169,7 +169,7 @@ def _without_outliers(problem: Problem, fitted: Fitted, good: Bool[np.ndarray, "
 
 
 def _compared(problem: Problem, rich: Fitted, simple: Vector, kernels: tuple[Order, ...]) -> Choice[Fitted]:
-    """All orders at the same weights."""
+    """Compare all orders at the same weights."""
     prior, weight = problem.prior, rich.best.weight
 
     def attempt(fitted: Fitted, more: float = 0.0) -> Attempt[Fitted]:
@@ -182,8 +182,8 @@ def _compared(problem: Problem, rich: Fitted, simple: Vector, kernels: tuple[Ord
         start = rich.found.x if order.free[REFLECTION] else simple
         tried.append(attempt(rich if order is TWO_PLANES else problem.solved(order, start, weight)))
     best = choose(tried).best.fit
-    # By how much chi-squared would rise without crosstalk, to second order (Wald). Where that is a lot, a fit without
-    # it would wander far for nothing.
+    # Rise of chi-squared without crosstalk, to second order (Wald's test). If it is large, a fit without crosstalk
+    # would take many steps to no purpose.
     crosstalk, plain = values_of(best.found.x)[MIX], best.order.without_crosstalk()
     cov = best.found.cov[MIX, MIX] * np.outer(crosstalk, crosstalk)
     rise = float(crosstalk @ np.linalg.pinv(cov, hermitian=True) @ crosstalk)
@@ -193,9 +193,9 @@ def _compared(problem: Problem, rich: Fitted, simple: Vector, kernels: tuple[Ord
 
 
 def held_out(problem: Problem, full: Fitted) -> tuple[float, float]:
-    """How badly pictures left out of a fit are predicted: relative to their peaks, and as a model error of ratios.
+    """Return the errors of pictures left out of a fit: relative to their peaks, and as a model error of ratios.
 
-    Noise is taken out of both; the model error is 0 where it is not significant. ``full`` is the fit with them.
+    Both are without noise; the model error is 0 where it is not significant. ``full`` is the fit with these pictures.
     """
     every, seen = problem.rules.held_out, problem.seen
     weight = full.best.weight.copy()
@@ -209,7 +209,7 @@ def held_out(problem: Problem, full: Fitted) -> tuple[float, float]:
     excess = fitted.best.errors**2 - noise
     peak = np.maximum(np.where(used, fitted.light, 0.0).max(axis=(1, 2), keepdims=True), 1e-12)
     of_peak = float((excess / peak**2)[used].mean())
-    # By how much pictures that come in raise chi-squared is their own chi-squared by the prediction's whole covariance.
+    # The rise of chi-squared by added pictures equals their chi-squared by the prediction's whole covariance.
     found = chi2_test(full.found.cost - fitted.found.cost, float(used.sum())).found
     unit = np.broadcast_to(fitted.best.mask**2, used.shape)[used].sum()
     of_white = float(excess[used].sum() / max(float(unit), 1e-30))
@@ -217,15 +217,15 @@ def held_out(problem: Problem, full: Fitted) -> tuple[float, float]:
 
 
 def value_moments(found: Found, inflation: float) -> Moments:
-    """Of the values by the chosen order; the covariance holds the others by their probability (``Choice``).
+    """Return the values' moments by the chosen order; other orders widen the covariance by their probability.
 
-    ``inflation`` is of the noise's variance, where residuals have a pattern.
+    ``inflation`` is a factor of the noise's variance, above 1 where residuals have a pattern.
     """
     problem, fitted = found.problem, found.fitted
     free, solved, weight = fitted.order.free, fitted.found, fitted.best.weight / np.sqrt(inflation)
     errors_at = problem.errors_at(weight, fitted.at)
     if inflation > 1:
-        # The prior is as sure as before: only the pictures say less.
+        # The prior stays the same: only the pictures hold less information.
         solved = most_probable(errors_at, solved.x, free, problem.prior, problem.rules.solver)
     own = moments_along_reflection(errors_at, solved, free, problem.prior, problem.rules)
     parts = [
@@ -238,21 +238,21 @@ def value_moments(found: Found, inflation: float) -> Moments:
 def moments_along_reflection(
     errors_at: ErrorsAt, solved: MostProbable, free: Bool[np.ndarray, "18"], prior: Prior, rules: BackscatterRules
 ) -> Moments:
-    """Mean and covariance of the values around the most probable parameters.
+    """Return mean and covariance of the values around the most probable parameters.
 
-    The likelihood is close to a parabola in the solver's coordinates but for one of them: once nearly all light comes
-    by way of the glass, or nearly none does, more of the same changes nothing, and the logarithm of the reflection runs
-    away. Along it the posterior is worked out at equal steps, at each of which all other parameters are normal:
-    integrated over by Laplace's method (Tierney and Kadane, Journal of the American Statistical Association 81, 1986).
+    The log likelihood is close to a parabola in all of the solver's coordinates except the logarithm of the reflection.
+    That has no bound once nearly all light, or nearly none, comes by way of the glass. Along it the posterior is
+    computed at equal steps. At each step all other parameters are normal and are integrated out by Laplace's method
+    (Tierney and Kadane, Journal of the American Statistical Association 81, 1986).
     """
     step = float(np.sqrt(max(solved.cov[REFLECTION, REFLECTION], 0.0)))
-    # So narrow a posterior is normal: the mean is off by a twentieth of a sigma at most.
+    # A posterior this narrow is normal: its mean is off by a twentieth of a sigma at most.
     if not free[REFLECTION] or step < 0.1 or not solved.converged:
         return Moments.log_normal(solved.x, solved.cov)
     others = free & (np.arange(len(free)) != REFLECTION)
 
     def node(start: Vector) -> tuple[MostProbable, float]:
-        """The others at this reflection, and the posterior's logarithm there."""
+        """Return the others at this reflection, and the posterior's logarithm there."""
         held = most_probable(errors_at, start, others, prior, rules.solver)
         off = float((start - prior.mean)[REFLECTION] / prior.sigma[REFLECTION])
         return held, -0.5 * evidence(held.cost + off**2, held.cov[np.ix_(others, others)], prior.sigma[others])
@@ -263,10 +263,10 @@ def moments_along_reflection(
         for _ in range(12):
             nodes.append(node(x + way))
             x, way = nodes[-1][0].x, nodes[-1][0].x - x
-            # In squares of the value, to which its variance goes, values further up weigh more.
+            # The variance grows with the square of the value, so that larger values have more weight.
             ahead = 2 * max(float(x[REFLECTION] - nodes[0][0].x[REFLECTION]), 0.0)
             if not nodes[-1][1] - nodes[0][1] + ahead > -6.0:
                 break
-    # Equal steps: sums are integrals, to many digits for what falls off this smoothly.
+    # With equal steps, sums approximate integrals of such smooth functions to many digits.
     weights = np.exp([log - max(log for _, log in nodes) for _, log in nodes])
     return Moments.mixture([Moments.log_normal(one.x, one.cov) for one, _ in nodes], weights / weights.sum())

@@ -2,7 +2,7 @@
 
 Lengths, softness, reflection and crosstalk cannot be negative: the solver works on their logarithms. The prior is
 normal in the solver's coordinates: nominal values with the tolerances of the rig, and wide where no data sheet helps.
-Light is close to linear in other coordinates (``linear_of``), in which orders with and without a part can be mixed.
+Light is close to linear in other coordinates (``linear_of``), in which orders with and without a part can be combined.
 """
 
 from __future__ import annotations
@@ -28,44 +28,44 @@ NAMES = (
 )  # fmt: skip
 UNITS = ("1", "mm", "mm", "px", "1", "mm", *["px"] * 6, *["1"] * 6)
 DISTANCE, PUPIL, SOFTNESS, REFLECTION, DEPTH = range(1, 6)
-# Of the green emitters from the centres of their pixels, and of red and blue from green; crosstalk. PLACES are the
-# parameters that say where footprints lie and how they look.
+# Offset of the green emitters from the centres of their pixels, and of red and blue from green; crosstalk. PLACES are
+# the parameters that determine the footprints' places and shapes.
 OFFSET, EMITTERS, MIX, PLACES = slice(6, 8), slice(8, 12), slice(12, 18), slice(1, 12)
 # Rows and columns of the crosstalk in the mix.
 OFF_DIAGONAL = np.nonzero(~np.eye(3, dtype=bool))
 _LOGARITHMIC = np.isin(np.arange(18), np.r_[1:6, 12:18])
-# In place of the logarithm of 0.
+# Replaces the logarithm of 0.
 _ABSENT = -40.0
 
 
 @final
 @dataclass(frozen=True)
 class BackscatterRules:
-    """What a backscatter fit looks at, what it leaves out, and when it is content.
+    """Constants of a backscatter fit: its samples, its outliers, and its criteria.
 
     Attributes:
-        positions: places on the sensor that the footprint is fitted at.
-        fewest_pictures: beside white and dark.
+        positions: number of places on the sensor at which the footprint is fitted.
+        fewest_pictures: in addition to white and dark.
         clipped: fraction of saturation from which a mean counts as clipped.
-        most_clipped: a shot with a larger fraction of clipped bins is left out whole; of others, the clipped bins are.
-        visible_sigma, present_sigma: white that is below this many sigma of a bin at the 90th percentile of bins, or of
-            all bins together, is no light.
-        slack_px: room that a window of panel pixels leaves for the footprint to move during a fit.
+        most_clipped: fraction of clipped bins above which a shot is left out whole; others lose their clipped bins.
+        visible_sigma, present_sigma: white counts as dark below this many sigma of a bin at the 90th percentile of
+            bins, or of all bins together.
+        slack_px: distance in panel px that a window leaves for the footprint to move during a fit.
         most_wider: a fit whose footprints need a window this many times as wide has gone astray.
-        first_error: model error, as a fraction of white, that a fit from far away is taken to have.
-        settled: such a fit goes on while its model error shrinks by more than this factor.
-        reflections: light of the second plane over that of the first, where fits of two planes start. Where the farther
-            one is the brighter, a fit that begins with the nearer one brighter may end at its mirror image.
-        worse_pictures: a picture described so many times worse than the others does not belong.
+        first_error: assumed model error of a fit from far away, as a fraction of white.
+        settled: such a fit continues while its model error falls below this factor of the one before.
+        reflections: light of the second plane over that of the first, where fits of two planes start. If the farther
+            plane is brighter, a fit that starts with a brighter nearer plane may end at its mirror image.
+        worse_pictures: a picture whose residuals are this many times those of the others is an outlier.
         nothing_fits: model error, as a fraction of white, from which orders are not compared.
-        held_out: every so-manyth picture is predicted by a fit without it.
-        cells: residuals are averaged over so many parts of the sensor, across and down, in search of a pattern.
-        worst_error: of held-out pictures, noise apart, as a fraction of their peak.
-        undetermined: sigma of where footprints lie, over that of the prior, from which pictures say too little, ...
-        known: ... unless it is as well known as this: ln of distance and pupil, offsets in panel pixels.
+        held_out: the n in "every n-th picture is predicted by a fit without it".
+        cells: number of parts of the sensor, across and down, over which residuals are averaged to find a pattern.
+        worst_error: the most for held-out pictures, without noise, as a fraction of their peak.
+        undetermined: sigma of the footprints' places over the prior's, from which pictures hold too little information,
+        known: unless sigma is below this: ln of distance and pupil, offsets in panel px.
         steady: variance between frames of a picture, over noise, from which the panel may flicker.
-        most_outliers: fraction of the pictures.
-        solver: of every descent.
+        most_outliers: the largest fraction of pictures that may be outliers.
+        solver: rules of every descent.
     """
 
     positions: int = 96
@@ -94,40 +94,40 @@ class BackscatterRules:
 @final
 @dataclass(frozen=True)
 class Order:
-    """What a candidate leaves free: the others are held."""
+    """A candidate: its free parameters; the others are held."""
 
     name: str
     free: Bool[np.ndarray, "18"]
 
     @property
     def parameters(self) -> int:
-        """How many are fitted."""
+        """Number of fitted parameters."""
         return int(self.free.sum())
 
     @property
     def against(self) -> float:
-        """-2 ln of how likely this order is beforehand, against one that leaves everything free.
+        """-2 ln of this order's prior probability over that of an order with all parameters free.
 
-        Panels have a cover glass, their primaries lie side by side and cameras' colours overlap: an order that does
-        without one of these has to be twice as good.
+        Panels have a cover glass, their primaries lie side by side and cameras' colours overlap: an order without one
+        of these must be twice as probable by the data.
         """
         return float((~self.free[[REFLECTION, EMITTERS.start, MIX.start]]).sum() * 2 * np.log(2.0))
 
     def start(self, x: Vector, prior: Prior) -> Vector:
-        """``x`` with the held parameters at where this order has them."""
+        """Return ``x`` with the held parameters at this order's values."""
         held = prior.mean.copy()
         held[EMITTERS], held[REFLECTION], held[MIX] = 0.0, _ABSENT, _ABSENT
         return np.where(self.free, np.where(x <= _ABSENT, prior.mean, x), held)
 
     def without(self, name: str, *held: int | slice) -> Order:
-        """The same with more parameters held."""
+        """Return an order in which more parameters are held."""
         free = self.free.copy()
         for one in held:
             free[one] = False
         return Order(name, free)
 
     def without_crosstalk(self) -> Order:
-        """The same where every camera colour sees its own primary only."""
+        """Return an order in which every camera colour sees only its own primary."""
         return self.without(f"{self.name}, no crosstalk", MIX)
 
 
@@ -138,7 +138,7 @@ KERNELS = (ONE_PLANE.without("one plane, primaries in one place", EMITTERS), ONE
 
 
 def split_plane(x: Vector, prior: Prior, reflection: float) -> Vector:
-    """One plane's parameters with a reflection added: the two planes' light comes from where the one's came from."""
+    """Add a reflection to one plane's parameters, so that the mean distance of the light stays the same."""
     split = x.copy()
     split[REFLECTION], split[DEPTH] = np.log(reflection), prior.mean[DEPTH]
     between = np.exp(x[DISTANCE]) - np.exp(split[DEPTH]) * reflection / (1 + reflection)
@@ -147,17 +147,20 @@ def split_plane(x: Vector, prior: Prior, reflection: float) -> Vector:
 
 
 def footprint_per_pupil(rig: RigDescription) -> float:
-    """Diameter of the pupil's footprint on the panel over that of the pupil: rays converge towards the focus."""
+    """Return the diameter of the footprint on the panel over the pupil's: rays converge towards the focus."""
     return 1.0 - rig.mounting.standoff_mm.value / rig.lens.focus_mm
 
 
 def prior_of(rig: RigDescription) -> Prior:
-    """What the rig's description says about every parameter, in the solver's coordinates.
+    """Return the prior that the rig's description gives every parameter, in the solver's coordinates.
 
-    The glass's light over that straight from the emitters: of what these send forwards, the outer face reflects 4 %
-    (Fresnel, index 1.5), and a fraction that no data sheet names leaks past their opaque backs. It is taken to be 4 %,
-    too, give or take a factor of e: from 1.5 to 11 % within one sigma. Two sigma hold a leak of half a per cent on one
-    side, and a coated face, which reflects a tenth as much, on the other.
+    ``reflection`` is the light by way of the glass over the light straight from the emitters. The outer face reflects
+    4 % of the light that emitters send forwards (Fresnel, index 1.5). A fraction that no data sheet gives leaks past
+    their opaque backs. The prior assumes 4 % for this leak, too, with a sigma of a factor of e: 1.5 to 11 %. Two sigma
+    include a leak of half a per cent on one side, and a coated face, which reflects a tenth as much, on the other.
+
+    Args:
+        rig: gives the values (mean) and their tolerances (sigma), in the units of ``UNITS``.
     """
     panel, lens, mounting = rig.panel, rig.lens, rig.mounting
     standoff, pitch = mounting.standoff_mm, panel.pitch_mm
@@ -167,7 +170,7 @@ def prior_of(rig: RigDescription) -> Prior:
     pupil = lens.focal_mm.tolerance / lens.focal_mm.value + lens.f_number.tolerance / lens.f_number.value + 0.02
     mean = np.concatenate([[panel.gamma.value], np.log(lengths), np.zeros(6), np.full(6, np.log(crosstalk))])
     scales = [panel.gamma.tolerance + 0.02, (standoff.tolerance + 0.1) / standoff.value, pupil, 0.7, 1.0, 0.3]
-    # How far the pupil may be from its nominal panel pixel: the mounting's tolerance, and pitches that add up.
+    # Sigma of the pupil's panel pixel: the mounting's tolerance, and the accumulated tolerance of the pitch.
     offset = [
         place.tolerance + place.value * pitch.tolerance / pitch.value + 0.5
         for place in (mounting.panel_x_px, mounting.panel_y_px)
@@ -176,7 +179,7 @@ def prior_of(rig: RigDescription) -> Prior:
 
 
 def values_of(x: Vector) -> Vector:
-    """The parameters in the units of ``UNITS``, lengths for the nominal pitch, the pupil as its footprint."""
+    """Return the parameters in the units of ``UNITS``: lengths at the nominal pitch, the footprint for the pupil."""
     with np.errstate(over="ignore"):
         return np.where(_LOGARITHMIC, np.where(x > _ABSENT, np.exp(x), 0.0), x)
 
@@ -191,7 +194,7 @@ class Moments:
 
     @classmethod
     def log_normal(cls, x: Vector, cov: Float[np.ndarray, "18 18"]) -> Moments:
-        """Of the values where the solver's coordinates are normal."""
+        """Return the moments of the values if the solver's coordinates are normal."""
         mean = values_of(x) * np.where(_LOGARITHMIC, np.exp(0.5 * np.diag(cov)), 1.0)
         scale = np.where(_LOGARITHMIC, mean, 1.0)
         both = np.outer(_LOGARITHMIC, _LOGARITHMIC)
@@ -201,7 +204,7 @@ class Moments:
     def mixture(
         cls, parts: Sequence[Moments], weights: Float[np.ndarray, " parts"], mean: Vector | None = None
     ) -> Moments:
-        """The covariance of each part, and how far it is from ``mean``, by default from the mean of all."""
+        """Combine each part's covariance and its distance from ``mean``, by default from the mean of all."""
         means = np.stack([one.mean for one in parts])
         off = means - (mean := weights @ means if mean is None else mean)
         within = np.einsum("p,pkl->kl", weights, np.stack([one.cov for one in parts]))
@@ -209,7 +212,14 @@ class Moments:
 
 
 def linear_of(x: Vector) -> Vector:
-    """The parameters with the reflected fraction of all light, and crosstalk, for their logarithms: 0 where absent."""
+    """Return the parameters in coordinates in which light is close to linear.
+
+    ``reflection`` becomes the reflected fraction of all light, and crosstalk itself replaces its logarithm: both are 0
+    where absent. All others are as in ``x``.
+
+    Args:
+        x: the solver's coordinates, in the order of ``NAMES``; lengths (mm) and softness (panel px) are logarithms.
+    """
     theta, values = np.array(x, dtype=np.float64), values_of(x)
     theta[REFLECTION] = values[REFLECTION] / (1 + values[REFLECTION])
     theta[MIX] = values[MIX]
@@ -217,7 +227,11 @@ def linear_of(x: Vector) -> Vector:
 
 
 def linear_slope(x: Vector) -> Vector:
-    """Derivative of each of ``linear_of`` by the solver's coordinate."""
+    """Return the derivative of each number of ``linear_of`` by its own solver's coordinate.
+
+    Args:
+        x: the solver's coordinates, in the order of ``NAMES``.
+    """
     theta, slope = linear_of(x), np.ones(len(NAMES))
     slope[REFLECTION] = theta[REFLECTION] * (1 - theta[REFLECTION])
     slope[MIX] = theta[MIX]
@@ -225,7 +239,11 @@ def linear_slope(x: Vector) -> Vector:
 
 
 def vector_of(term: Backscatter) -> Vector:
-    """The solver's coordinates of a term, whose logarithms have 1e-6 for what is absent."""
+    """Return the solver's coordinates of a term, in the order of ``NAMES``; logarithms use 1e-6 for 0.
+
+    Args:
+        term: with lengths in mm, and places in panel px.
+    """
     emitters, mix = np.asarray(term.emitters_px), np.asarray(term.mix)
     lengths = (term.standoff_mm, term.pupil_diameter_mm, term.softness_px, term.reflection, term.reflection_mm)
     places = (emitters[1], emitters[0] - emitters[1], emitters[2] - emitters[1])
@@ -235,7 +253,7 @@ def vector_of(term: Backscatter) -> Vector:
 
 
 def with_linear(term: Backscatter, theta: Float[Array, "18"]) -> Backscatter:
-    """The term with parameters of ``linear_of``."""
+    """Return the term with parameters of ``linear_of``."""
     offset = theta[OFFSET]
     distance, pupil, softness, _, depth = jnp.exp(theta[1:6])
     reflected = jnp.minimum(theta[REFLECTION], 1 - 1e-9)

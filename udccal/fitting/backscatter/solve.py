@@ -1,10 +1,10 @@
 """Likelihood of the backscatter term, and the most probable parameters of an order.
 
-Light of shot i at a position and colour is  y_i = m r_i + u_i d + noise: r_i is the picture's light over that of white
+Light of shot i at a position and colour is  y_i = m r_i + u_i d + noise. r_i is the picture's light over that of white
 (1 for white itself, 0 for the dark frame), m the mask and d the dark signal there, u_i the dark frame's exposure over
-the shot's. m and d have no prior and enter linearly: they are profiled out exactly, bin by bin, so that the noise of
-white and dark, which all pictures of a bin depend on, is weighed as it should be. Variances are of the model: shot
-noise, what is left in the dark, and (e m)^2 for what the model leaves undescribed, e the model error relative to white.
+the shot's. m and d have no prior and enter linearly: they are eliminated exactly, bin by bin, so that the noise of
+white and dark, which is common to all pictures of a bin, has its right weight. The model gives the variances: shot
+noise, noise in the dark, and (e m)^2 for the model error e, which is relative to white.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ from udccal.models.geometry import Geometry
 from udccal.numerics import in_float64
 from udccal.rig import RigDescription
 
-# Bins so far apart are never interpolated between.
+# Interpolation never combines bins at this distance.
 _TILE = 4
 _with_linear = jax.jit(with_linear)
 # Parameters in the solver's coordinates to whitened errors and their Jacobian.
@@ -59,7 +59,7 @@ ErrorsAt = Callable[[Vector], tuple[Float[np.ndarray, " m"], Float[np.ndarray, "
 @final
 @dataclass(frozen=True)
 class MostProbable:
-    """The most probable parameters; ``cov`` is 0 for those that are held, ``cost`` holds what the prior adds."""
+    """The most probable parameters; ``cov`` is 0 for those that are held, ``cost`` includes the prior's part."""
 
     x: Vector
     cov: Float[np.ndarray, "18 18"]
@@ -91,7 +91,7 @@ class _Free:
 def most_probable(
     errors_at: ErrorsAt, start: Vector, free: Bool[np.ndarray, "18"], prior: Prior, rules: SolverRules | None = None
 ) -> MostProbable:
-    """Where errors and prior together are least, over the free parameters."""
+    """Minimise the cost of errors and prior over the free parameters."""
     problem = _Free(errors_at, free, Prior(prior.mean[free], prior.root[:, free]))
     found, cov = minimise(problem, start, rules), np.zeros((len(free), len(free)))
     if np.isfinite(found.equations.cost):
@@ -102,7 +102,7 @@ def most_probable(
 @final
 @dataclass(frozen=True)
 class Fitted:
-    """An order's parameters, and what they make of the samples with mask and dark at their best."""
+    """An order's parameters, its ratios of all samples, and the most probable mask and dark signal."""
 
     order: Order
     found: MostProbable
@@ -112,28 +112,28 @@ class Fitted:
 
     @property
     def light(self) -> PerShot:
-        """Modelled light, the dark signal left out."""
+        """Modelled light without the dark signal, in e-/s."""
         return self.best.mask * self.ratio
 
     @property
     def z(self) -> PerShot:
-        """Errors in units of their sigma, 0 where not used."""
+        """Errors in units of their sigma, 0 for unused samples."""
         return self.best.errors * self.best.weight
 
     @property
     def used(self) -> Usable:
-        """Samples that count, dark left out."""
+        """Samples with a weight, without the dark frame's."""
         used = self.best.weight > 0
         used[-1] = False
         return used
 
     def weighed(self, weight: PerShot) -> Fitted:
-        """The same, mask and dark too, looked at with other weights."""
+        """Return the same parameters, mask and dark signal with other weights."""
         return replace(self, best=replace(self.best, weight=weight))
 
     def dof(self, prior: Prior) -> float:
-        """Samples less one mask per bin (the dark signal has a sample of its own) less parameters."""
-        # A parameter that its prior holds takes less than one.
+        """Return samples less one mask per bin (the dark signal has a sample of its own) less parameters."""
+        # A parameter that its prior determines counts less than one.
         narrowed = np.where(self.order.free, np.diag(self.found.cov) / prior.sigma**2, 1.0)
         used = self.used
         return max(float(used.sum() - used.any(axis=0).sum() - np.maximum(1.0 - narrowed, 0.0).sum()), 1.0)
@@ -142,7 +142,7 @@ class Fitted:
 @final
 @dataclass(frozen=True)
 class Problem:
-    """What all orders have in common; ``flat`` are the grid indices of the positions, ``rays`` in panel coordinates."""
+    """The common part of all orders; ``flat`` are the positions' grid indices, ``rays`` are in panel coordinates."""
 
     template: Backscatter
     seen: Binned
@@ -157,10 +157,10 @@ class Problem:
     def of(
         cls, data: BackscatterData, geometry: Geometry, rig: RigDescription, rules: BackscatterRules | None = None
     ) -> Problem:
-        """Samples at positions spread over the sensor; the start is at the best offset of whole panel pixels."""
+        """Take samples at positions spread over the sensor, and start at the best offset of whole panel pixels."""
         rules, step, prior = rules or BackscatterRules(), grid_step(rig), prior_of(rig)
         rays, flat = sampled_rays(geometry, rig, step, rules.positions)
-        # The mask comes out of the likelihood; the template's is of no size.
+        # The likelihood gives the mask; the template's has a single bin.
         template = nominal_backscatter(geometry, rig, np.zeros((3, 1, 1)), step, window=1)
         template = replace(template, window=window_for(template, linear_of(prior.mean), rays, rules.slack_px))
         seen, shown, start = data.shots.at(flat), data.pictures, prior.mean.copy()
@@ -176,7 +176,7 @@ class Problem:
         return cls(template, seen, shown, rays, flat, prior, start, rules)
 
     def solved(self, order: Order, x: Vector, weight: PerShot) -> Fitted:
-        """The most probable parameters of an order at given weights, from ``x`` on."""
+        """Solve for the most probable parameters of an order at given weights, from ``x`` on."""
         start = order.start(x, self.prior)
         at = Windows.around(self.template, linear_of(start), self.rays, self.shown.crop)
         found = most_probable(self.errors_at(weight, at), start, order.free, self.prior, self.rules.solver)
@@ -184,12 +184,12 @@ class Problem:
         return Fitted(order, found, at, ratio, self.seen.profile(ratio, weight))
 
     def ratios(self, x: Vector, at: Windows) -> tuple[PerShot, Moves]:
-        """Light over that of white, and its derivatives by the solver's coordinates."""
+        """Return light over that of white, and its derivatives by the solver's coordinates."""
         ratio, jacobian = ratios_and_jacobian(self.template, linear_of(x), at, self.shown)
         return ratio, jacobian * linear_slope(x)[:, None, None, None]
 
     def errors_at(self, weight: PerShot, at: Windows) -> ErrorsAt:
-        """Whitened errors, mask and dark at their best, and their Jacobian; windows stay where they are."""
+        """Return a function for whitened errors, with the best mask and dark, and their Jacobian; windows stay."""
 
         def of(x: Vector) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m 18"]]:
             ratio, of_ratio = self.ratios(x, at)
@@ -199,7 +199,7 @@ class Problem:
         return of
 
     def with_room(self, x: Vector) -> Problem:
-        """With windows that let the footprints of these parameters move, unless the fit has gone far astray."""
+        """Return the problem with windows wide enough for these parameters, unless the fit has gone far astray."""
         theta, rules, template = linear_of(x), self.rules, self.template
         if not template.window < window_for(template, theta, self.rays, 0.0) <= rules.most_wider * template.window:
             return self
@@ -212,9 +212,9 @@ class Problem:
 class TermAt:
     """The term as a function of its parameters (``linear_of``), and of ``_TILE`` squared numbers of the mask's noise.
 
-    The mask is the best one for all shots, which know it better than white alone. It follows the parameters linearly.
-    Bins with the same number are so far from each other that nothing interpolated depends on two of them, and go up
-    and down by chance, so that sums over the sensor are right on average.
+    The mask is the most probable one for all shots, which determine it better than white alone. It follows the
+    parameters linearly. Bins with the same number are so far from each other that no interpolated value depends on two
+    of them. Their signs are random, so that sums over the sensor are right on average.
     """
 
     template: Backscatter
@@ -225,7 +225,7 @@ class TermAt:
 
     @in_float64
     def __call__(self, parameters: Float[np.ndarray, " n"]) -> Backscatter:
-        """The term, its mask never below 0."""
+        """Return the term; its mask is never below 0."""
         theta, noise = parameters[: len(self.theta)], parameters[len(self.theta) :].reshape(_TILE, _TILE)
         mask, sigma = self._mask
         rows, columns = mask.shape[1:]
@@ -238,7 +238,7 @@ class TermAt:
 
     @functools.cached_property
     def _mask(self) -> tuple[Float[np.ndarray, "3 a b"], Float[np.ndarray, "3 a b"]]:
-        """Light of white over the whole grid, and one sigma of it, whose sign is drawn."""
+        """Light of white over the whole grid, and its sigma with a random sign, in e-/s."""
         found = [self._best(flat)[1] for flat in self._parts(4096)]
         mask = np.concatenate([one.mask for one in found], axis=1)
         sigma = np.concatenate([np.maximum(one.information, 1e-30) for one in found], axis=1) ** -0.5
@@ -248,7 +248,7 @@ class TermAt:
 
     @functools.cached_property
     def _mask_jacobian(self) -> Float[np.ndarray, "18 3 a b"]:
-        """How the mask follows the parameters: worked out for those who ask how sure the term is."""
+        """Derivatives of the mask by the parameters, computed only when the posterior is used."""
         parts = []
         for flat in self._parts(256):
             at, best = self._best(flat)
@@ -257,12 +257,12 @@ class TermAt:
         return np.concatenate(parts, axis=2).reshape(-1, *self.data.shots.rate.shape[1:])
 
     def _parts(self, size: int) -> list[Int[np.ndarray, " n"]]:
-        """As many grid positions as are held in memory at a time."""
+        """Split the grid positions into parts of ``size``, which fit into memory."""
         flat = np.arange(self.data.shots.rate[0, 0].size)
         return np.split(flat, flat[size::size])
 
     def _best(self, flat: Int[np.ndarray, " n"]) -> tuple[Windows, Profile]:
-        """Windows, and mask and dark signal, once by weights of what was measured, then by those of the model."""
+        """Return windows, mask and dark signal: first with the data's weights, then with the model's."""
         rays = grid_rays(self.template.geometry, self.data.shots.rate.shape[2:], self.template.step, flat)
         at = Windows.around(self.template, self.theta, rays, self.data.crop)
         seen = self.data.shots.at(flat)
@@ -274,7 +274,7 @@ class TermAt:
         return at, best
 
     def posterior(self, cov: Float[np.ndarray, "18 18"]) -> Posterior[Backscatter]:
-        """With this covariance of the parameters, and the mask's noise."""
+        """Return the posterior with this covariance of the parameters, and with the mask's noise."""
         count, noise = len(cov), _TILE**2
         factor = np.eye(count + noise)
         factor[:count, :count] = square_root(cov)

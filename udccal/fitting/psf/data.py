@@ -1,8 +1,8 @@
-"""What the psf fit works on: its rules, crops of merged LED pictures, and the variance of their samples.
+"""The psf fit's rules and data: crops of merged LED pictures, and the variance of their samples.
 
-What a model leaves out matters the more, relatively, the fainter a sample is: its standard deviation is taken as the
-model error times light^(3/4) peak^(1/4), e.g. at 10^-4 of the peak ten times the model error. The model error is that
-of greatest likelihood of the residuals, and none where that is no better by BIC.
+The model's deviation from the truth is relatively larger in fainter samples. Its standard deviation is taken as the
+model error times light^(3/4) peak^(1/4): at 10^-4 of the peak it is ten times the model error, relative to the light.
+The model error is the one of greatest likelihood for the residuals, or 0 where BIC does not prefer it.
 """
 
 from __future__ import annotations
@@ -25,42 +25,42 @@ Crops = Float[np.ndarray, "shots rows columns"]
 @final
 @dataclass(frozen=True)
 class PsfRules:
-    """What the fit may spend, and its constants. More positions, shifts and samples are slower and more accurate.
+    """Effort and constants of the psf fit. More positions, shifts and samples make it slower and more accurate.
 
     Attributes:
         positions, shifts: the most field positions, and pictures of each, in the fit of diffraction.
         least_positions: the fewest field positions that are fitted.
         half_px: largest window (rows, columns) to either side of the LED; the captured regions may bound it further.
-        close_px: the same for the fit of diffraction, whose time grows with it.
+        close_px: the same for the fit of diffraction, which takes longer in a larger window.
         peak_half_px: all samples this close (rows, columns) to the LED go into the fit of diffraction.
-        far_fraction: of the samples farther away, this fraction does.
-        iterations: at most, of the fit of diffraction.
+        far_fraction: fraction of the samples farther away that go into it.
+        iterations: the most, in the fit of diffraction.
         first_model_error: of diffraction, before residuals give it; it also keeps a fit that is still far off from
             trusting the brightest samples alone.
-        spectrum_bend, spectrum_sigma: prior standard deviations of the logarithm of a spectrum: of its bend from node
-            to node, and about its start.
-        blur_px, blur_log_sigma: prior of the blur beside pixel and disc: its value, and the sigma of its logarithm.
+        spectrum_bend, spectrum_sigma: prior standard deviations of the logarithm of a spectrum: of its second
+            difference along the nodes, and about its start.
+        blur_px, blur_log_sigma: prior of the blur in addition to pixel and disc: value, and sigma of its logarithm.
         wire_tolerance: part of the rig's tolerances that is left after the wire's fit.
         pitch_tolerance: part of the pitch's tolerance that the fit may use; see ``start_prior``.
-        pitch_well_known: a pitch of larger relative tolerance takes more wavelengths to make up for it than daylight
-            has.
-        pitch_least_known: with a larger tolerance nothing is known of the pitch, and no fit is tried.
+        pitch_well_known: where the pitch's relative tolerance is larger, the nodes cover more wavelengths than
+            daylight has, to compensate for an error of the pitch.
+        pitch_least_known: relative tolerance above which the pitch counts as unknown, and no fit is tried.
         footprint_periods: prior sigma of the footprint's place on the rows, after the wire's fit.
         picture_times: pictures whose mean squared residual is this many times the median picture's are outliers.
-        residual_sizes: prior sizes of a residual beside diffraction, as fractions of the kernel nearby.
+        residual_sizes: prior sizes of a residual added to diffraction, as fractions of the kernel nearby.
         highest_degree: of the residual's polynomials.
         reaches: parts of the window that may be enough for a residual, the narrowest first.
-        worth: a higher order must lower the held-out loss of a sample by this (what is left of the samples then
-            narrows by an eighth) to be worth its ten thousand coefficients: every restoration pays for them. Pictures
-            held out have errors in common with the others: on a full-size rig of wave optics a residual gained 0.17,
-            and made the kernel at new places a fifth worse.
-        worth_of_room: the same for a wider residual, which costs less: no component more, only a larger one.
-        doubtful: beyond this relative L2 error of diffraction alone, an image without diffraction is tried too.
+        worth: decrease of the held-out loss per sample that a higher order must reach (residuals then narrow by an
+            eighth): every restoration computes its ten thousand coefficients. Pictures held out have errors in common
+            with the others: on a full-size rig of wave optics a residual gained 0.17, but its kernel at new places
+            was a fifth worse.
+        worth_of_room: the same for a wider residual, which costs less: it adds no component, but enlarges one.
+        doubtful: relative L2 error of diffraction alone from which an image without diffraction is tried too.
         free_model_error: of such an image, before positions held out give it.
-        own_sigma: prior standard deviations of a shot's place, in px, and relative light, beside such an image:
-            centroids and sums of a crop's light are this good.
+        own_sigma: prior standard deviations of a shot's place, in px, and relative light, along with such an image:
+            centroids and sums of a crop's light have this accuracy.
         error_knee, error_power: priors of the kernel error's knee and power; the knee's sigma is of its logarithm.
-        poor: beyond this relative L2 error at positions held out the fit is poor.
+        poor: relative L2 error at positions held out from which the fit is poor.
     """
 
     positions: int = 10
@@ -95,7 +95,7 @@ class PsfRules:
     poor: float = 0.2
 
     def close(self, half: tuple[int, int]) -> tuple[int, int]:
-        """(rows, columns) to either side of the LED that diffraction is fitted to, of windows of this size."""
+        """Return (rows, columns) to either side of the LED that diffraction is fitted to, for windows of this size."""
         return min(half[0], self.close_px[0]), min(half[1], self.close_px[1])
 
 
@@ -105,13 +105,13 @@ class Shots:
     """Crops of one size, one per picture of the LED, on Bayer sites, with their uncertainty.
 
     Attributes:
-        centre_px: (x, y) on the sensor of the LED's image, as known so far.
+        centre_px: (x, y) on the sensor of the LED's image, by the current estimate.
         origin_px: (x, y) on the sensor of the crop's middle sample.
         position: index of the field position that the shot belongs to.
         disc_px: diameter of the LED's image.
         rate: e-/s; weight: 1 / sigma^2 in (e-/s)^-2, 0 where nothing is known; channel: 0, 1, 2 for R, G, B.
-        noise_per_rate: how fast sigma^2 grows with the rate, in e-/s: the sigma of a sample that noise has made
-            darker is too small, and a fit that went by it would come out too dark.
+        noise_per_rate: derivative of sigma^2 by the rate, in e-/s. A sample that noise has made darker has too small
+            a measured sigma, and a fit with that sigma would be too dark.
     """
 
     centre_px: Float[np.ndarray, "shots 2"]
@@ -140,7 +140,7 @@ class Shots:
 
     @property
     def colour(self) -> Float[np.ndarray, "shots rows columns 3"]:
-        """Which of three colours a sample has (one-hot)."""
+        """The colour of each sample (one-hot)."""
         return np.eye(3)[self.channel]
 
     def offsets(self) -> Int[np.ndarray, "rows columns 2"]:
@@ -171,13 +171,13 @@ def about_middle(images: np.ndarray, largest: tuple[int, int]) -> np.ndarray:
 
 
 def joined(crops: Sequence[Shots], aims_px: Float[np.ndarray, "shots 2"]) -> Shots:
-    """Crops of one size together, grouped into field positions by where they were aimed."""
+    """Join crops of one size, and group them into field positions by their aims."""
     together = Shots(*(np.concatenate([getattr(crop, field.name) for crop in crops]) for field in fields(Shots)))
     return replace(together, position=group(aims_px))
 
 
 def group(aims_px: Float[np.ndarray, "shots 2"]) -> Int[np.ndarray, " shots"]:
-    """Index of the field position of each shot: aims within 4 px of a position's first are shifts of it."""
+    """Return the index of each shot's field position: aims within 4 px of a position's first belong to it."""
     firsts: list[Float[np.ndarray, "2"]] = []
     index = np.zeros(len(aims_px), dtype=np.int64)
     for i, aim in enumerate(aims_px):
@@ -189,19 +189,23 @@ def group(aims_px: Float[np.ndarray, "shots 2"]) -> Int[np.ndarray, " shots"]:
 
 
 def held_out_positions(count: int) -> Bool[np.ndarray, " positions"]:
-    """Every fourth position, the second first, is left out while orders are compared; with three, one of them."""
+    """Return which positions are held out while orders are compared: every fourth from the second on, at least one.
+
+    Args:
+        count: number of field positions.
+    """
     return np.arange(count) % 4 == 1
 
 
 @final
 @dataclass(frozen=True)
 class PsfData:
-    """What there is to fit.
+    """The data of a psf fit.
 
     Attributes:
-        shots: crops, which may be wider than the fit's windows: how far light reaches is seen in the whole of them.
-            None where no picture can be used.
-        taken, dark, clipped: pictures captured, and of these such without an LED, and such that are clipped.
+        shots: crops, which may be wider than the fit's windows: the support of the kernel needs all of them. None
+            where no picture can be used.
+        taken, dark, clipped: numbers of pictures captured, of those without an LED, and of those that are clipped.
     """
 
     shots: Shots | None
@@ -211,7 +215,7 @@ class PsfData:
 
 
 def left_out(light: Float[np.ndarray, "*shots n"], model_error: float) -> Float[np.ndarray, "*shots n"]:
-    """Standard deviation of what the model leaves out of samples that it expects to be this bright."""
+    """Return the standard deviation of the model's deviation in samples of this expected ``light``."""
     size = np.maximum(light, 0.0)
     return model_error * size**0.75 * size.max(axis=-1, keepdims=True) ** 0.25
 
@@ -222,7 +226,7 @@ def noise_at(
     measured: Float[np.ndarray, "*n"],
     noise_per_rate: Float[np.ndarray, "*n"],
 ) -> Float[np.ndarray, "*n"]:
-    """Variance of samples whose true rate is ``level``, if it was ``measured`` to be that of the ``rate`` found."""
+    """Return the variance of samples of true rate ``level``; it was ``measured`` at the observed ``rate``."""
     change = noise_per_rate * (np.maximum(level, 0.0) - np.maximum(rate, 0.0))
     # A sensor without read noise has no variance at all where no light is expected.
     return np.maximum(measured + change, 1e-2 * measured)
@@ -234,10 +238,10 @@ def estimate_model_error(
     unit: Float[np.ndarray, " samples"],
     parameters: int,
 ) -> float:
-    """Model error of greatest likelihood; 0 where the noise alone explains the residuals as well, by BIC.
+    """Return the model error of greatest likelihood, or 0 where BIC prefers noise alone.
 
-    ``unit`` is the standard deviation that a model error of 1 adds to a sample. The residuals of a fit of so many
-    ``parameters`` are smaller than the errors; that is made up for. ``variance`` is of the sensor's noise.
+    ``unit`` is the standard deviation that a model error of 1 adds to a sample. Residuals are smaller than errors by
+    the number of fitted ``parameters``, which is corrected for. ``variance`` is the sensor noise's.
     """
     raised = residual**2 * (residual.size / max(residual.size - parameters, 1))
 

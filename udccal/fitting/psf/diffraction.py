@@ -1,6 +1,6 @@
 """Fit of diffraction to LED pictures: maximum likelihood with the sensor's noise and a model error from the residuals.
 
-Rounds of a descent with fixed weights; between them the weights follow the model, and outliers go.
+Each round is a descent with fixed weights. Between rounds the weights follow the model, and outliers are left out.
 """
 
 from __future__ import annotations
@@ -38,17 +38,17 @@ from udccal.result import Outliers
 @final
 @dataclass(frozen=True)
 class DiffractionFit:
-    """What was found.
+    """The result of a fit of diffraction.
 
     Attributes:
-        problem, solution: the equations, and where they ended.
-        shots: what was fitted, at the places that the samples are about.
+        problem, solution: the equations, and the end of the descent.
+        shots: the data, at the places that the samples are about.
         model_error: as a fraction of the peak, see ``data.left_out``; 0 where the residuals are noise.
-        outliers: what was left out.
-        iterations: of all descents together.
-        phase: with the wire's phase or averaged over it, by BIC; the fits are its strength in the kernel (1 where the
-            footprint lies where the wire has it, 0 where the kernel shows nothing of it) and its sigma. None where no
-            wire was seen.
+        outliers: pictures and samples that were left out.
+        iterations: sum over all descents.
+        phase: comparison by BIC of a kernel with the wire's phase to one averaged over it. The fits are the phase's
+            strength in the kernel (1 where it agrees with the wire, 0 where the kernel does not show it) and its sigma.
+            None where no wire was seen.
     """
 
     problem: DiffractionProblem
@@ -61,23 +61,23 @@ class DiffractionFit:
 
     @property
     def theta(self) -> Float[np.ndarray, " p"]:
-        """The shared parameters."""
+        """The shared parameters, in the order of ``kernel.pack``."""
         return self.solution.place.theta
 
     @property
     def converged(self) -> bool:
-        """Whether a minimum was reached."""
+        """True if a minimum was reached."""
         return self.solution.converged and bool(np.isfinite(self.theta).all() and np.isfinite(self.noise_cov).all())
 
     @property
     def noise_cov(self) -> Float[np.ndarray, "p p"]:
-        """Covariance of the shared parameters, the model error taken as independent from sample to sample."""
+        """Covariance of the shared parameters if the model error is independent from sample to sample."""
         return self.solution.equations.cov()
 
     def cov(self) -> Float[np.ndarray, "p p"]:
         """Covariance of the shared parameters.
 
-        What the model leaves out is alike in all samples of a position, so that it averages out over positions only.
+        The model's deviation is common to the samples of a position, so that it averages out over positions only.
         """
         if self.model_error == 0.0:
             return self.noise_cov
@@ -86,7 +86,7 @@ class DiffractionFit:
 
     @property
     def chi2_dof(self) -> float:
-        """Reduced chi-squared, with that model error."""
+        """Reduced chi-squared, with the model error in the weights."""
         dof = max(self.problem.used - self.problem.unknowns, 1)
         return (self.solution.equations.cost - self.problem.prior.cost(self.theta)) / dof
 
@@ -98,15 +98,15 @@ class DiffractionFit:
 def fit_diffraction(
     shots: Shots, geometry: Geometry, start: Diffraction, prior: Prior, rules: PsfRules
 ) -> DiffractionFit:
-    """Fit the numbers of diffraction: near the minimum, then to it at the places found there.
+    """Fit the parameters of diffraction: first to near the minimum, then to the minimum at the places found there.
 
     Args:
-        shots: what to fit, positions numbered without gaps.
-        geometry: where pixels look.
-        start: its nodes of the spectra are kept; where it has a ``visibility``, the footprint's place on the rows is
-            known, and it is tested whether the data show it.
+        shots: the data in e-/s, positions numbered without gaps.
+        geometry: the rays of pixels.
+        start: gives the nodes of the spectra. With a ``visibility``, the footprint's place on the rows is known, and
+            ``phase`` says whether the data show it.
         prior: of the parameters of ``kernel.pack``; its mean is the start.
-        rules: see there.
+        rules: windows, effort and constants.
     """
     chosen = choose_samples(shots, rules)
     evaluator = Evaluator(
@@ -130,7 +130,7 @@ def fit_diffraction(
 
 
 def _approach(problem: DiffractionProblem, rules: PsfRules) -> Solution[Place, Blocks]:
-    """From the prior's mean to about the minimum, where a step gains a thousandth of the cost; weights by the data."""
+    """Go from the prior's mean until a step gains a thousandth of the cost; weights are by the data."""
     theta, problem = problem.prior.mean, replace(problem, samples=weighed(problem.samples, rules.first_model_error))
     coefficients = coefficients_of(problem.evaluator, theta, problem.samples)
     own = start_own(problem.evaluator, problem.samples, coefficients)
@@ -140,10 +140,10 @@ def _approach(problem: DiffractionProblem, rules: PsfRules) -> Solution[Place, B
 def _refine(
     problem: DiffractionProblem, shots: Shots, place: Place, rules: PsfRules, iterations: int
 ) -> DiffractionFit:
-    """From about the minimum to the maximum of the likelihood.
+    """Go from near the minimum to the maximum of the likelihood.
 
-    The last round is the one that moves no parameter by a tenth of a sigma; descents go to a hundredth of chi-squared
-    once weights hardly change anything.
+    The last round moves no parameter by a tenth of a sigma. Descents go to a hundredth of chi-squared once a change of
+    weights has little effect.
     """
     whole, enough = None, 1.0
     for _ in range(5):
@@ -154,7 +154,7 @@ def _refine(
         moved = float(np.sqrt(change @ solution.equations.marginal()[0] @ change))
         LOG.debug("psf: model error %.3g, moved by %.3g sigma", model_error, moved)
         fit = DiffractionFit(problem, solution, shots, model_error, found, iterations)
-        # Out of iterations: the round before, whose weights are those of a model not quite this one, has an end.
+        # Without iterations left, the round before counts: it has ended, with weights of a slightly different model.
         if not solution.converged:
             return whole or fit
         whole, place, last = fit, solution.place, enough < 1.0 and moved < 0.1
@@ -166,14 +166,14 @@ def _refine(
 
 
 def _solver(enough: float, iterations: int) -> SolverRules:
-    # Derivatives that are themselves sums over a lattice promise a little for ever.
+    # Derivatives are sums over a lattice, whose errors predict a small gain without end.
     return SolverRules(enough, stalled_gain=0.05, iterations=iterations, first_damping=1e-2, most_damping=1e6)
 
 
 def _reweighed(
     problem: DiffractionProblem, place: Place, rules: PsfRules
 ) -> tuple[DiffractionProblem, float, tuple[Outliers, ...]]:
-    """Weights at the model's light, with the model error of the residuals, and without outliers."""
+    """Set weights at the model's light, with the model error of the residuals, and leave outliers out."""
     samples, light, background = problem.samples, problem.light_at(place), place.own[..., 5:]
     seen, level = np.asarray(samples.known) > 0, light + background
     of_samples = (np.asarray(samples.rate) - level, sensor_variance(samples, level), left_out(light * seen, 1.0))
@@ -185,14 +185,14 @@ def _reweighed(
 
 
 def without_outliers(samples: Samples, z: Lights, rules: PsfRules) -> tuple[Samples, tuple[Outliers, ...]]:
-    """Samples in which outliers have no weight, and what was left out: pictures first, then samples of the others.
+    """Return samples in which outliers have no weight, and a list of these: pictures, then samples of the others.
 
-    ``z`` is data less expectation in units of sigma. A picture that fits so much worse than the others shows that
-    something moved, flickered or was in the way: that needs a rule of its own beside the engine's of single samples.
+    ``z`` is data less expectation in units of sigma. In a picture that fits much worse than the others something moved,
+    flickered or was in the way. It needs its own rule in addition to the engine's rule of single samples.
     """
     weight, index = np.asarray(samples.weight), np.asarray(samples.index)
     used, real = weight > 0, index >= 0
-    # Residuals are bounded, so that one cosmic hit does not condemn its picture.
+    # Residuals are bounded, so that one cosmic hit does not make its picture an outlier.
     square = (np.minimum(z**2, HUBER.sigma**2) * used).sum(axis=-1) / np.maximum(used.sum(axis=-1), 1)
     worst = rules.picture_times * max(float(np.median(square[real])), 1.0)
     moved = real & (square > worst) & (real.sum() >= 4)
@@ -208,19 +208,19 @@ def without_outliers(samples: Samples, z: Lights, rules: PsfRules) -> tuple[Samp
 
 
 def phase_evidence(fit: DiffractionFit) -> Choice[tuple[float, float]]:
-    """Compare a fit with interference to the same without, to second order about the fit."""
+    """Compare a fit with interference to the same fit without it, to second order about the fit."""
     problem, place, here = fit.problem, fit.solution.place, fit.solution.equations
     none = {n: np.zeros_like(getattr(problem.samples, n)) for n in ("correction", "by_overlaps", "overlaps")}
     light = problem.light_at(place)
     change = light - replace(problem, samples=replace(problem.samples, **none)).light_at(place)
     in_sigma = change * np.sqrt(np.asarray(problem.samples.weight))
     score, alone = float((in_sigma * problem.errors(place, light)).sum()), float((in_sigma**2).sum())
-    # Residuals are moved by a part of the phase's light too small to change which of them are outliers.
+    # Residuals change by so small a part of the phase's light that their outliers stay the same.
     part = 1e-3
     moved = replace(problem.samples, rate=np.asarray(problem.samples.rate) + part * change)
     there = replace(problem, samples=moved).equations_at(place)
     shared, own = (there.right - here.right) / part, (there.own_right - here.own_right) / part
-    # What the other parameters can make up for is no information on the strength.
+    # Residuals that the other parameters can compensate hold no information on the strength.
     information = max(alone - replace(here, right=shared, own_right=own).step(0.0).gain, 1e-12)
     found, unknowns = (1.0 + score / information, information**-0.5), problem.unknowns
     fewer, worse = unknowns - (FOOTPRINT.stop - FOOTPRINT.start), here.cost + information * (2.0 * found[0] - 1.0)
@@ -231,10 +231,10 @@ def phase_evidence(fit: DiffractionFit) -> Choice[tuple[float, float]]:
 
 
 def efficiency(fit: DiffractionFit, rules: PsfRules, available: int, reported: int) -> float:
-    """Variance that all samples of all pictures would leave over the variance of the fit, mean of its first numbers.
+    """Return the variance by all samples of all pictures over the fit's variance, as a mean over parameters.
 
-    The samples drawn away from the peak stand for all of them there, and the fit's pictures for all that there are
-    ``available``. The first ``reported`` numbers are looked at.
+    Samples drawn away from the peak represent all samples there; the fit's pictures represent all that are
+    ``available``. The mean is over the first ``reported`` parameters.
     """
     samples, count = fit.problem.samples, stands_for(fit.shots, rules)[np.asarray(fit.problem.samples.index)]
     weighed_up = replace(samples, weight=np.asarray(samples.weight) * count)
@@ -245,9 +245,9 @@ def efficiency(fit: DiffractionFit, rules: PsfRules, available: int, reported: i
 
 
 def kernel_sigma(fit: DiffractionFit, cov: Float[np.ndarray, "p p"]) -> float:
-    """Relative L2 sigma of the kernel at the first position, in all colours.
+    """Return the relative L2 sigma of the kernel at the first position, in all colours.
 
-    At weights that make every sample of the kernel count alike, the equations hold the sum of its squared derivatives.
+    With equal weights for all samples of the kernel, the equations' matrix is the sum of its squared derivatives.
     """
     samples = fit.problem.samples.at(slice(1))
     even = np.asarray(samples.colour) / np.maximum(np.asarray(samples.colour).sum(axis=2, keepdims=True), 1)

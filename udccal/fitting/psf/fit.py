@@ -1,8 +1,8 @@
 """psf fit: from brackets of an LED at field positions to the kernel of a point source anywhere on the sensor.
 
-First the few numbers of diffraction by the panel are fitted to some of the shots; then it is tried on the others how
-much an image of smooth coefficients, on top of diffraction or instead of it, improves the prediction at positions that
-were left out, and how far from the LED these show the kernel's light.
+The fit first solves for the few parameters of diffraction by the panel, from some of the shots. An image with smooth
+coefficients may then be added to diffraction or replace it. Positions that were held out decide whether it improves the
+prediction, and how far from the LED the kernel reaches.
 """
 
 from __future__ import annotations
@@ -41,15 +41,16 @@ def fit_psf(
     """Fit the psf term to crops about the LED.
 
     Args:
-        data: what was captured; see ``read_psf``.
+        data: crops in e-/s; see ``read_psf``.
         rig: the panel and the lens as built, for the start and the prior.
-        geometry: where pixels look.
+        geometry: the rays of pixels.
         wire: a start for the panel's numbers.
-        rules: what the fit may spend, and its constants.
+        rules: effort and constants of the fit.
 
     Returns:
-        the result. Its posterior is that of the numbers of diffraction, of the pitch that all lengths are measured in,
-        and of what positions held out show the kernel to be off by beside noise.
+        The result. Its posterior covers the parameters of diffraction, the pitch, which scales all lengths, and the
+        error of the kernel that positions held out show in addition to noise. Data that cannot be fitted give a status
+        and a note instead of an exception.
     """
     rules = rules or PsfRules()
     start = start_model(rig, geometry, wire, rules)
@@ -73,7 +74,7 @@ def fit_psf(
         half_px=size,
         degree=max(order.degree, 0),
     )
-    # An image that carries the kernel ends with the crops.
+    # An image without diffraction ends with the crops.
     if not order.free and data.shots.half != shots.half:
         held_out = np.flatnonzero(held_out_positions(shots.positions))
         # Two whole pictures of each of these positions are enough.
@@ -83,18 +84,18 @@ def fit_psf(
 
 
 def nominal_psf(rig: RigDescription, geometry: Geometry, wire: Wire) -> PsfField:
-    """What the fit starts from: diffraction by the panel as the rig's description and the wire have it.
+    """Return the term that the fit starts from: diffraction by the panel of the rig's description and of the wire.
 
     Args:
         rig: the panel and the lens as described.
-        geometry: where pixels look.
-        wire: where it shows, its numbers replace the rig's.
+        geometry: the rays of pixels.
+        wire: its numbers replace the rig's if the wire fit saw the rows.
     """
     return _field(start_model(rig, geometry, wire), geometry)
 
 
 def some_shots(shots: Shots, rules: PsfRules) -> Bool[np.ndarray, " shots"]:
-    """Shots for the fit of diffraction: evenly spread over the positions not held out, and over their shifts."""
+    """Choose shots for the fit of diffraction, evenly over the positions not held out and over their shifts."""
 
     def spread(items: np.ndarray, most: int) -> np.ndarray:
         return items[np.unique(np.linspace(0, len(items) - 1, most).round().astype(int))]
@@ -106,7 +107,7 @@ def some_shots(shots: Shots, rules: PsfRules) -> Bool[np.ndarray, " shots"]:
 
 
 def _unfit(data: PsfData, rig: RigDescription, rules: PsfRules) -> tuple[FitStatus, str] | None:
-    """Why there can be no fit."""
+    """Return why there can be no fit, or None."""
     most = 0.5 * max(data.taken, 1)
     if data.clipped > most:
         return FitStatus.SATURATED, f"{data.clipped} of {data.taken} pictures are clipped."
@@ -123,7 +124,7 @@ def _unfit(data: PsfData, rig: RigDescription, rules: PsfRules) -> tuple[FitStat
 
 
 def _field(model: Diffraction, geometry: Geometry) -> PsfField:
-    """Without a residual."""
+    """Return a term of diffraction without a residual."""
     half = np.maximum(np.asarray(geometry.principal_point_px, dtype=np.float64), 1.0)
     return PsfField(
         geometry=geometry,
@@ -139,8 +140,8 @@ def _field(model: Diffraction, geometry: Geometry) -> PsfField:
 
 
 def wide_support(wide: Shots, sources: Sources, term: PsfField, rig: RigDescription) -> Support:
-    """The support from whole pictures of positions held out, whose places and light are ``sources``."""
-    # Of the size that a profile holds: compiled but once.
+    """Choose the support from whole pictures of positions held out, whose places and light are ``sources``."""
+    # The size that a profile holds needs no second compilation.
     rows, columns = kernel_size(rig)
     wide = wide.within((rows // 2, columns // 2))
     kernels = about_middle(kernels_at(term, wide.positions_px(), rows, columns).astype(np.float64), wide.half)
@@ -149,15 +150,15 @@ def wide_support(wide: Shots, sources: Sources, term: PsfField, rig: RigDescript
     light = np.asarray(predict(windows, kernels))
     windows = make_windows(wide, sources.with_light_of_peak(wide, light), light, at_position, 0.0)
     found = compare(wide, windows, light * np.asarray(windows.flux), np.arange(wide.count))
-    # About the source, whole pixels are too coarse for a kernel that is moved by fractions of one; all windows hold it.
+    # Near the source, whole pixels are too coarse for a kernel that moves by fractions of one; all windows hold it.
     core = (np.abs(wide.offsets()) <= 4).all(axis=-1)
     return choose_support(replace(found, known=found.known & ~core))
 
 
 def with_support(term: PsfField, support: Support, rig: RigDescription) -> PsfField:
-    """The term with how far its kernel was seen.
+    """Return the term with this support of its kernel.
 
-    Where no end of diffraction was seen, it goes on over the whole sensor; an image ends where it ends.
+    Diffraction reaches over the whole sensor where the pictures show no end of it; an image ends at the support.
     """
     size = (rig.camera.rows, rig.camera.columns)
     onward = (seen and bool(term.diffraction_fraction) for seen in support.open_ended)
@@ -166,13 +167,13 @@ def with_support(term: PsfField, support: Support, rig: RigDescription) -> PsfFi
 
 
 def start_model(rig: RigDescription, geometry: Geometry, wire: Wire, rules: PsfRules | None = None) -> Diffraction:
-    """The rig's nominal panel and pupil, or the wire's where the wire shows; the spectra of common colour filters.
+    """Return the start of diffraction: the wire's panel and pupil, or the rig's if no wire was seen.
 
     Args:
-        rig: the panel and the lens as described.
-        geometry: has the pupil's place, in mm.
+        rig: the panel and the lens as described; lengths in mm.
+        geometry: has the pupil's position, in mm.
         wire: its numbers are in pitches of the panel.
-        rules: the blur, and which pitches are well known.
+        rules: the blur, and which pitches are well known. Spectra start as those of common colour filters.
     """
     panel, pitch, rules = rig.panel, rig.panel.pitch_mm.value, rules or PsfRules()
     nodes = wavelengths_nm(rig, rules)
@@ -199,12 +200,12 @@ def start_model(rig: RigDescription, geometry: Geometry, wire: Wire, rules: PsfR
 
 
 def wire_shows(wire: Wire) -> bool:
-    """Whether the wire fit saw the rows: only then is it known where the pupil's footprint lies on them."""
+    """Return whether the wire fit saw the rows: only then the place of the pupil's footprint on them is known."""
     return np.shape(wire.harmonics)[0] > 0
 
 
 def wavelengths_nm(rig: RigDescription, rules: PsfRules) -> Float[np.ndarray, " nodes"]:
-    """Nodes of the spectra: daylight's, or what it looks like behind a panel whose pitch is off by its tolerance."""
+    """Return the spectra's nodes in nm: those of daylight, wider by the pitch's tolerance where that is large."""
     relative = min(pitch_tolerance(rig), rules.pitch_least_known)
     if relative <= rules.pitch_well_known:
         return WAVELENGTHS_NM
@@ -213,20 +214,20 @@ def wavelengths_nm(rig: RigDescription, rules: PsfRules) -> Float[np.ndarray, " 
 
 
 def pitch_tolerance(rig: RigDescription) -> float:
-    """Of the pitch, relatively: the psf measures all lengths in pitches."""
+    """Return the relative tolerance of the pitch, in which the psf measures all lengths."""
     return rig.panel.pitch_mm.tolerance / rig.panel.pitch_mm.value
 
 
 def start_prior(rig: RigDescription, start: Diffraction, rules: PsfRules | None = None) -> Prior:
-    """Tolerances of the rig on the panel's numbers, tighter where the wire has measured them; smooth spectra.
+    """Return the prior: the rig's tolerances, tighter for what the wire has measured, and smooth spectra.
 
-    Diffraction shows wavelength / pitch only. The pitch is therefore held where the rig has it, and the spectra are
-    free to move: a pitch that is off by its tolerance then comes out as wavelengths that are.
+    Diffraction depends on wavelength / pitch only. The pitch is therefore held at the rig's value, and the spectra are
+    free to move: an error of the pitch then appears as an error of the wavelengths.
 
     Args:
         rig: its tolerances are taken for standard deviations.
         start: the mean; its ``visibility`` says whether the wire has measured the panel's numbers.
-        rules: how much tighter, and the sigmas of what the rig does not describe.
+        rules: factor of the tolerances after the wire's fit, and sigmas of parameters that the rig does not describe.
     """
     panel, theta, rules = rig.panel, pack(start), rules or PsfRules()
     tighter = rules.wire_tolerance if start.visibility else 1.0

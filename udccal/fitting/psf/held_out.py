@@ -1,6 +1,6 @@
-"""What positions that were held out say of a kernel: how likely they are, how far it is off there, how far it reaches.
+"""Tests of a kernel at positions that were held out: their likelihood, the kernel's error, and its support.
 
-Whatever is wrong there counts: what the model leaves out, and what its numbers are off by because of that.
+The kernel's error includes the model's deviation from the truth, and the errors of its parameters that follow from it.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from udccal.result import Candidate
 @final
 @dataclass(frozen=True)
 class Compared:
-    """Samples that a solution has not seen, next to what it expects of them.
+    """Samples that a solution has not used, and its expectation of them.
 
     Attributes:
         residual, light: in e-/s.
-        measured, variance: of the sensor's noise, as it was measured and at the light expected.
-        left_out: what a model error of 1 would add to the standard deviation.
-        known: which samples there are.
-        model_error: the one under which the residuals are most likely.
+        measured, variance: variance of the sensor's noise, as measured, and at the expected light.
+        left_out: standard deviation that a model error of 1 would add.
+        known: True for samples that were measured.
+        model_error: the one of greatest likelihood for the residuals.
     """
 
     residual: Crops
@@ -41,24 +41,24 @@ class Compared:
 
     @property
     def total(self) -> Crops:
-        """Variance with the model error."""
+        """Variance of samples, with the model error."""
         return self.variance + (self.model_error * self.left_out) ** 2
 
     def errors(self) -> Float[np.ndarray, " samples"]:
-        """Of all samples, in units of their sigma."""
+        """Errors of all samples, in units of their sigma."""
         return (self.residual / np.sqrt(self.total))[self.known]
 
     def relative_l2(self, channel: Int[np.ndarray, "shots rows columns"]) -> Float[np.ndarray, "3"]:
-        """Error of the expectation by colour, the data's own noise included."""
+        """Return the expectation's error by colour, which includes the data's own noise."""
         error, light = (
             np.bincount(channel[self.known], (part**2)[self.known], 3) for part in (self.residual, self.light)
         )
         return np.sqrt(error / np.maximum(light, 1e-30))
 
     def loss(self, position: Int[np.ndarray, " shots"]) -> Float[np.ndarray, " places"]:
-        """Minus twice the logarithm of the likelihood per sample, but for a constant, by position.
+        """Return minus twice the log likelihood per sample, up to a constant, by position.
 
-        What the model leaves out is common to the pictures of a position. Of a single position, it is by picture.
+        The model's deviation is common to the pictures of a position. For a single position, the loss is by picture.
         """
         each = (np.log(self.total / self.measured) + HUBER.loss(self.residual / np.sqrt(self.total))) * self.known
         by_shot = each.sum(axis=(1, 2)) / np.maximum(self.known.sum(axis=(1, 2)), 1)
@@ -67,13 +67,13 @@ class Compared:
 
 
 def compare(shots: Shots, windows: Windows, light: Crops, pick: np.ndarray) -> Compared:
-    """The data of the shots picked, and the ``light`` (e-/s) that is expected of all."""
+    """Compare the data of the picked shots with the ``light`` (e-/s) that is expected of all shots."""
     parts = (windows.rate, shots.weight, shots.noise_per_rate, windows.left_out, light)
     rate, weight, slope, one, light = (np.asarray(part)[pick] for part in parts)
     known = weight > 0
     measured = 1.0 / np.where(known, weight, 1.0)
     variance = noise_at(light, rate, measured, slope)
-    # What is left out is the same for all orders, and not nothing where one of them expects no light.
+    # All orders have the same deviation here; it is above 0 where one of them expects no light.
     model_error = estimate_model_error((rate - light)[known], variance[known], one[known], 0)
     return Compared(rate - light, light, measured, variance, one, known, model_error)
 
@@ -83,8 +83,8 @@ def compare(shots: Shots, windows: Windows, light: Crops, pick: np.ndarray) -> C
 class KernelError:
     """Standard deviation of a kernel's samples, where 1 is the kernel's peak: size (s / (1 + s / knee))^power at s.
 
-    A power of the kernel's size that flattens off above a knee: near the peak each picture's own place and light take
-    up part of what is wrong. A ``size`` of 0 says that nothing was found beside noise.
+    This power of the kernel's value becomes flat above a knee: near the peak, each picture's own place and light absorb
+    part of the error. A ``size`` of 0 means that nothing was found in addition to noise.
     """
 
     size: float
@@ -92,17 +92,17 @@ class KernelError:
     power: float = 1.0
 
     def of_peak(self, brightness: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
-        """Of samples that have this part of their peak's light."""
+        """Return the sigma of samples with this part of their peak's light."""
         part = np.maximum(brightness, 0.0)
         return self.size * (part / (1.0 + part / self.knee)) ** self.power
 
     def of_kernels(self, kernels: Float[np.ndarray, "*n rows columns"]) -> Float[np.ndarray, "*n rows columns"]:
-        """In the kernels' own unit."""
+        """Return the sigma of every sample of the kernels, in their own unit."""
         peak = np.maximum(kernels.max(axis=(-2, -1), keepdims=True), 1e-300)
         return self.of_peak(kernels / peak) * peak
 
     def relative_l2(self, kernels: Float[np.ndarray, "*n rows columns"]) -> Float[np.ndarray, "*n"]:
-        """What that makes of a whole kernel."""
+        """Return the relative L2 error of whole kernels."""
         error, light = ((part**2).sum(axis=(-2, -1)) for part in (self.of_kernels(kernels), kernels))
         return np.asarray(np.sqrt(error / np.maximum(light, 1e-300)))
 
@@ -113,10 +113,10 @@ def estimate_kernel_error(
     brightness: Float[np.ndarray, " samples"],
     rules: PsfRules,
 ) -> KernelError:
-    """The error of greatest posterior; a size of 0 where noise alone explains the residuals as well, by BIC.
+    """Return the most probable error, or a size of 0 where BIC prefers noise alone.
 
-    All are parts of the peak's light: data less expectation at positions held out, the variance of the sensor's noise,
-    and the expected light.
+    All arrays are relative to the peak's light: data less expectation at positions held out, the variance of the
+    sensor's noise, and the expected light.
     """
     seen = brightness > 1e-7
     residual, variance, brightness = residual[seen], variance[seen], brightness[seen]
@@ -129,7 +129,7 @@ def estimate_kernel_error(
         return KernelError(float(np.exp(values[0])), float(np.exp(values[1])), float(values[2]))
 
     def misfit(total: Float[np.ndarray, " samples"]) -> float:
-        # Beyond 5 sigma the loss grows with the logarithm alone: of a hit, but where the model is far off counts.
+        # Beyond 5 sigma the loss grows as a logarithm: a cosmic hit counts little, a large model error still counts.
         square = residual**2 / (total * 25.0)
         return float(np.sum(np.log(total) + 25.0 * np.where(square < 1, square, 1 + np.log(np.maximum(square, 1)))))
 
@@ -147,10 +147,10 @@ def estimate_kernel_error(
 def kernel_error(
     found: Compared, channel: Int[np.ndarray, "shots rows columns"], sources: Sources, rules: PsfRules
 ) -> KernelError:
-    """How far the kernel is off beside noise, from samples that it has not seen."""
+    """Estimate the kernel's error without noise, from samples that it has not used."""
     flux = np.take_along_axis(np.abs(sources.flux), channel.reshape(len(channel), -1), axis=1).reshape(channel.shape)
     unit = found.light / np.maximum(flux, 1e-300) * found.known
-    # Pictures see the peak at different fractions of a pixel: the highest of all is nearest to it.
+    # Pictures sample the peak at different fractions of a pixel: the largest sample is nearest to it.
     full = flux * np.array([unit[channel == colour].max(initial=1e-300) for colour in range(3)])[channel]
     seen = found.known & (full > 0)
     full = full[seen]
@@ -162,11 +162,11 @@ def kernel_error(
 @final
 @dataclass(frozen=True)
 class Support:
-    """How far the kernel reaches.
+    """Support of the kernel.
 
     Attributes:
         half_px: (rows, columns) to either side of the source.
-        seen_px: (rows, columns) to either side that the pictures held.
+        seen_px: (rows, columns) to either side that the pictures hold.
         candidates: every window tried, both axes.
     """
 
@@ -176,17 +176,17 @@ class Support:
 
     @property
     def open_ended(self) -> tuple[bool, bool]:
-        """Along (rows, columns), whether light was seen up to the end of what the pictures held."""
+        """Along (rows, columns), True if light reaches the end of the pictures' windows."""
         rows, columns = (chosen >= seen for chosen, seen in zip(self.half_px, self.seen_px, strict=True))
         return rows, columns
 
 
 def choose_support(found: Compared) -> Support:
-    """The smallest window outside of which samples that the model has not seen show none of the kernel's light.
+    """Choose the smallest window outside of which samples that the model has not used show none of the kernel's light.
 
-    Along rows and along columns by itself, since a kernel of pixel rows is a cross. Inside it the kernel is the
-    model's, outside there is none but an even background. Its criterion is BIC, one parameter for every larger window
-    that is tried: light that is there pays for it many times, light that only the model sees does not.
+    Rows and columns have a window each, since a kernel of pixel rows is a cross. The candidate is the model's kernel
+    inside the window, and an even background outside. The criterion is BIC, with one more parameter for every larger
+    window: real light lowers chi-squared by many times that, and light that only the model has does not.
     """
     rows, columns = (size // 2 for size in found.residual.shape[1:])
     y, x = np.mgrid[-rows : rows + 1, -columns : columns + 1]
@@ -195,14 +195,14 @@ def choose_support(found: Compared) -> Support:
 
 
 def windows_to_try(largest_px: int) -> tuple[int, ...]:
-    """Sizes to either side from 4 px: each half as large again as the one before the last, up to the largest."""
+    """Return sizes to either side from 4 px up to the largest, each about sqrt(2) times the one before."""
     count = int(np.ceil(2.0 * np.log2(max(largest_px / 4.0, 1.0))))
     steps = np.round(4.0 * 2.0 ** (np.arange(count) / 2.0)).astype(int)
     return (*(int(step) for step in steps if step < largest_px), largest_px)
 
 
 def _along(found: Compared, name: str, distance: Int[np.ndarray, "rows columns"]) -> Choice[int]:
-    """With the kernel's light within each window alone, and each picture's background found anew."""
+    """Compare the windows along one axis; each picture's background is fitted again for each window."""
     weight, samples = np.where(found.known, 1.0 / found.total, 0.0), int(found.known.sum())
     tried = []
     for step, half in enumerate(windows_to_try(int(distance.max()))):

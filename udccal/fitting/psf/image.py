@@ -1,16 +1,16 @@
 """The part of the kernel that diffraction does not explain: an image whose nodes are polynomials of the position.
 
-All shots of all positions are solved together on Bayer sites: ridge regression by conjugate gradients, never forming
-the matrix. A shot's expectation is the image at its position, moved by a fraction of a pixel and smeared by the LED's
-disc. Along rows and along columns that is one small matrix each (for a disc of a pixel or two, which pixels cannot tell
+All shots of all positions are solved together on Bayer sites: ridge regression by conjugate gradients, without forming
+the matrix. A shot's expectation is the image at its position, shifted by a fraction of a pixel and smeared by the LED's
+disc. Along rows and along columns this is one small matrix each (pixels cannot distinguish a disc of a pixel or two
 from the product of its shadows).
 
-Beside diffraction one node to a pixel is enough. A free image carries the whole kernel, whose core about as narrow as a
-pixel is not determined by its values on whole pixels; undoing the LED's disc makes more of what is wrong. It has two
-nodes to a pixel: no shot sees all of these, but all shots at their places do together, and it is smooth over about one.
-Where its LEDs are and how bright is estimated along: in every round the model is linear in both, and each shot's own
-parameters are eliminated exactly (Golub and Pereyra, "The differentiation of pseudo-inverses and nonlinear least
-squares problems whose variables separate", 1973).
+One node to a pixel is enough in addition to diffraction. A free image carries the whole kernel. Values on whole pixels
+do not determine its core, which is about as narrow as a pixel, and removing the LED's disc amplifies errors. It
+therefore has two nodes to a pixel, and is smooth over about one: all shots at their places determine it together. The
+LEDs' places and light are estimated with it: in every round the model is linear in both, and each shot's own parameters
+are eliminated exactly (Golub and Pereyra, "The differentiation of pseudo-inverses and nonlinear least squares problems
+whose variables separate", 1973).
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ Image = Float[Arrayish, "terms 3 node_rows node_columns"]
 @final
 @dataclass(frozen=True)
 class Sources:
-    """Where each shot's LED is and how bright: (x, y) on the sensor in px, e-/s per colour, background in e-/s."""
+    """Place and light of each shot's LED: (x, y) on the sensor in px, e-/s per colour, background in e-/s."""
 
     place_px: Float[np.ndarray, "shots 2"]
     flux: Float[np.ndarray, "shots 3"]
@@ -47,7 +47,7 @@ class Sources:
         return Sources(self.place_px[keep], self.flux[keep], self.background[keep])
 
     def with_light_of_peak(self, shots: Shots, explained: Crops) -> Sources:
-        """Light from unweighted least squares: set by the peak, where relative weights listen to the wings."""
+        """Return light from unweighted least squares: the peak determines it, not the wings as with weights."""
         colour = shots.colour * (shots.weight > 0)[..., None]
         rate = shots.rate - self.background[:, None, None]
         top, bottom = (np.einsum("syx,syx,syxc->sc", part, explained, colour) for part in (rate, explained))
@@ -63,10 +63,10 @@ class Windows(eqx.Module):
         down, across: from nodes to samples, along columns and along rows: shift and disc.
         flux: light of each sample's own colour, 0 where nothing is known.
         colour: one-hot.
-        explained: per unit of light, what diffraction brings to each sample.
+        explained: light of each sample by diffraction, per unit of the LED's light.
         rate: e-/s without background.
-        left_out: what a model error of 1 would add to the rate's standard deviation; see ``data.left_out``.
-        weight: inverse variance of the rate that solutions go by, 0 where nothing is known.
+        left_out: standard deviation of the rate that a model error of 1 would add; see ``data.left_out``.
+        weight: inverse variance of the rate that solutions use, 0 where nothing is known.
     """
 
     basis: Float[Arrayish, "shots terms"]
@@ -80,11 +80,11 @@ class Windows(eqx.Module):
     weight: Float[Arrayish, "shots rows columns"]
 
     def only(self, keep: Bool[np.ndarray, " shots"]) -> Windows:
-        """With no weight on the other shots: of one shape whichever are kept, compiled but once."""
+        """Set the weights of the other shots to 0; the shape stays, so that nothing is compiled again."""
         return replace(self, weight=self.weight * keep[:, None, None])
 
     def expected(self, free: bool, image: Image) -> Crops:
-        """What an image brings to each sample, and diffraction unless it is ``free``, in e-/s."""
+        """Return each sample's light in e-/s, by an image, and by diffraction unless the image is ``free``."""
         unit = np.asarray(predict(self, image)) + (0.0 if free else np.asarray(self.explained))
         return unit * np.asarray(self.flux)
 
@@ -97,11 +97,11 @@ def make_windows(
     model_error: float,
     per_px: int = 1,
 ) -> Windows:
-    """What images are solved from.
+    """Return the equations' data from which images are solved.
 
-    ``explained`` is what diffraction brings to each sample per unit of light; ``model_error``, relative to the peak, is
-    allowed for beside the data's noise. The image has ``per_px`` nodes to a pixel, the first and last on the first and
-    last pixels.
+    ``explained`` is each sample's light by diffraction per unit of the LED's; ``model_error``, relative to the peak,
+    adds to the data's noise. The image has ``per_px`` nodes to a pixel, the first and last on the first and last
+    pixels.
     """
     colour, known = shots.colour, shots.weight > 0
     rate = shots.rate - sources.background[:, None, None]
@@ -127,13 +127,13 @@ def make_windows(
 def shifts(
     offset_px: Float[np.ndarray, " shots"], disc_px: Float[np.ndarray, " shots"], samples: int, per_px: int = 1
 ) -> Float[np.ndarray, "shots samples nodes"]:
-    """Matrices along one axis that move an image by an offset and average it over a disc's shadow.
+    """Return matrices along one axis that shift an image by an offset and average it over a disc's shadow.
 
-    Lanczos's interpolation over six nodes; a disc's shadow is summed by Gauss and Chebyshev's rule at eight points.
+    Interpolation is Lanczos's over six nodes; Gauss and Chebyshev's rule at eight points sums a disc's shadow.
     """
     angle, reach = np.pi * np.arange(1, 9) / 9, 3
     shots, nodes = len(offset_px), per_px * (samples - 1) + 1
-    matrix = np.zeros((shots, samples, nodes + 2 * reach))  # what falls beside the nodes is cut off at the end
+    matrix = np.zeros((shots, samples, nodes + 2 * reach))  # the end cuts off what falls outside the nodes
     index = np.ogrid[:shots, :samples]
     for part, weight in zip(np.cos(angle) / 2, 2 / 9 * np.sin(angle) ** 2, strict=True):
         place = per_px * (np.arange(samples) - (offset_px + part * disc_px)[:, None])
@@ -148,7 +148,7 @@ def shifts(
 def prior_sigma(
     magnitude: Float[np.ndarray, "3 rows columns"], relative: float, per_px: int = 1
 ) -> Float[np.ndarray, "3 node_rows node_columns"]:
-    """Prior standard deviation of every coefficient: a fraction of the kernel's own size near that node."""
+    """Return the prior sigma of every coefficient: a fraction of the kernel's own size near that node."""
     near = scipy.ndimage.maximum_filter(scipy.ndimage.gaussian_filter(np.abs(magnitude), (0, 0.7, 0.7)), (1, 3, 3))
     near = near + 1e-5 * near.max(axis=(1, 2), keepdims=True)
     nodes = [1.0, *((per_px * (size - 1) + 1) / size for size in near.shape[1:])]
@@ -157,7 +157,7 @@ def prior_sigma(
 
 @eqx.filter_jit
 def predict(windows: Windows, image: Image) -> Float[Array, "shots rows columns"]:
-    """What an image brings to each sample per unit of light."""
+    """Return each sample's light by an image, per unit of the LED's light."""
 
     def one(shot: tuple[Array, Array, Array, Array]) -> Float[Array, "rows columns"]:
         basis, down, across, colour = shot
@@ -170,11 +170,11 @@ def predict(windows: Windows, image: Image) -> Float[Array, "shots rows columns"
 
 @final
 class Moves(eqx.Module):
-    """What shots may change by themselves along with a free image: place in px (x, y), and relative light (R, G, B).
+    """Changes of each shot along with a free image: place in px (x, y), and relative light (R, G, B).
 
     Attributes:
-        design: what a change brings to each sample, in e-/s.
-        changed: by how much they have been changed.
+        design: derivative of each sample by a change, in e-/s.
+        changed: sum of the changes so far.
         sigma: prior standard deviations of the whole changes.
     """
 
@@ -187,11 +187,11 @@ class Moves(eqx.Module):
 def solve_image(
     windows: Windows, sigma: Image, free: bool, start: Image, moves: Moves | None = None
 ) -> tuple[Image, Float[Array, "shots 5"]]:
-    """Ridge estimate of an image, beside diffraction or ``free`` of it, and by how much own parameters are changed now.
+    """Return the ridge estimate of an image, with diffraction or ``free`` of it, and the changes of own parameters.
 
     The image, like its ``start``, is in units of ``sigma``, its prior standard deviations; see ``image_of``. The prior
-    is about what is added: about the whole, it would trade a smaller image for brighter LEDs. Where there are
-    ``moves``, places and light of the shots are estimated along.
+    is about the addition to the start: a prior about the whole would prefer a smaller image and brighter LEDs. With
+    ``moves``, places and light of the shots are estimated too.
     """
     sigma, start, flux, weight = (jnp.asarray(part) for part in (sigma, start, windows.flux, windows.weight))
     data = jnp.asarray(windows.rate) - (0.0 if free else flux * jnp.asarray(windows.explained))
@@ -213,7 +213,7 @@ def solve_image(
         return jax.linear_transpose(forward, start)(weight * (light - by_own(own_of(light))))[0]
 
     if moves is not None:
-        # As if nothing had been changed yet: the model is linear, and the prior is about the whole change.
+        # The prior is about the whole change, and the model is linear: the data become those before any change.
         data = data + by_own(jnp.asarray(moves.changed))
     iterations, tolerance = (150, 1e-5) if free else (60, 1e-4)
     added, _ = jax.scipy.sparse.linalg.cg(
@@ -226,7 +226,7 @@ def solve_image(
 
 
 def image_of(scaled: Image, sigma: Image, free: bool) -> Image:
-    """The image: what has the prior's standard deviations, smoothed by a Gaussian of one node where it is free."""
+    """Return the image from its scaled values; a Gaussian of one node smooths it where it is free."""
     image = jnp.asarray(scaled) * jnp.asarray(sigma)
     if not free:
         return image
@@ -242,9 +242,9 @@ def free_sources(
     magnitude: Float[np.ndarray, "3 rows columns"],
     rules: PsfRules,
 ) -> Sources:
-    """Places and light when diffraction explains nothing: from the crops themselves, then along with a free image.
+    """Estimate places and light without diffraction: from the crops themselves, then along with a free image.
 
-    The image has the first ``terms`` of the ``basis``; ``magnitude`` is how large the kernel is on average.
+    The image has the first ``terms`` of the ``basis``; ``magnitude`` is the kernel's average size.
     """
     colour = shots.colour * (shots.weight > 0)[..., None]
     light, covered = (np.einsum("syx,syxc->sc", shots.rate, colour), np.einsum("cyx,syxc->sc", magnitude, colour))
@@ -258,9 +258,9 @@ def free_sources(
     for _ in range(2):
         moves = _moves(shots, sources, windows, np.asarray(image_of(scaled, sigma, True)), changed, rules)
         scaled, found = solve_image(windows, sigma, True, scaled, moves)
-        # What is common to the shots of a position, a change of the image there does as well.
+        # A change of the image has the same effect as a change common to the shots of a position.
         mean = np.stack([np.asarray(found)[shots.position == g].mean(axis=0) for g in range(shots.positions)])
-        # Places and light change by less than this (px; relatively).
+        # Places and light change by less than this (px; relative).
         changed = np.clip(np.asarray(found) - mean[shots.position], -0.7, 0.7)
         sources = replace(start, place_px=start.place_px + changed[:, :2], flux=start.flux * (1.0 + changed[:, 2:]))
         windows = make_windows(shots, sources, nothing, basis, rules.free_model_error, FREE_PER_PX)
@@ -275,7 +275,7 @@ def _moves(
     changed: Float[np.ndarray, "shots 5"],
     rules: PsfRules,
 ) -> Moves:
-    """About ``sources``, at which places and light have been ``changed`` by so much."""
+    """Linearise about ``sources``, whose places and light have already changed by ``changed``."""
     x, y = (sources.place_px - shots.origin_px).T
 
     def at(right: float, below: float) -> Crops:

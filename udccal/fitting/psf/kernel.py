@@ -1,9 +1,9 @@
 """The kernel about a field position, on its lattice, and its Jacobian by the parameters of diffraction.
 
 A transfer function is a sum of products of slits along columns, slits along rows, overlaps of the pupil and strengths
-of the interference terms: it is linear in each, so that its derivatives are products, too, with one factor replaced by
-its derivative. Only the factors are differentiated. It is linear in the spectra, so that one evaluation for every
-wavelength node serves all colours and all their derivatives.
+of the interference terms. It is linear in each factor: a derivative is the same product with one factor replaced by its
+derivative, and only factors are differentiated. It is also linear in the spectra: one evaluation per wavelength node
+serves all colours and all their derivatives.
 """
 
 from __future__ import annotations
@@ -42,16 +42,16 @@ from udccal.models.interference import (
 )
 from udccal.models.lattice import Lattice, lattice_for, spline_coefficients
 
-# Of the parameters: how many precede the spectra; the panel's pitch in mm, the pupil's diameter in mm, the logarithm of
-# the blur in px, and where the footprint's centre lies on columns and rows, with its stand-off, in pitches.
+# HEAD parameters precede the spectra. The others are indices among these: the panel's pitch in mm, the pupil's diameter
+# in mm, the logarithm of the blur in px, and the footprint's place on columns and rows with its stand-off, in pitches.
 HEAD: Final = 9
 PITCH, PUPIL, BLUR, FOOTPRINT = 0, 4, 5, slice(6, 9)
 
 
 def pack(model: Diffraction) -> Float[np.ndarray, " p"]:
-    """Parameters as one vector: pitch, open fractions, thickness, pupil, log blur, footprint, log spectra.
+    """Return the parameters as one vector: pitch, open fractions, depth, pupil, log blur, footprint, log spectra.
 
-    The kernel depends on the square of the blur: about none at all it would have no derivative, and two signs.
+    The kernel depends on the square of the blur. The logarithm avoids its two signs and its zero derivative at 0.
     """
     logs = np.log(np.maximum(np.asarray(model.spectrum), 1e-6))
     head = [model.pitch_mm, *np.asarray(model.openings), model.depth_mm, model.pupil_diameter_mm, np.log(model.blur_px)]
@@ -61,12 +61,12 @@ def pack(model: Diffraction) -> Float[np.ndarray, " p"]:
 
 @final
 class Evaluator(eqx.Module):
-    """What stays the same from call to call.
+    """The constants of a fit that every call uses.
 
     Attributes:
         wavelengths_nm: nodes of the spectra.
         lattice: for the transfer functions.
-        interference: whether the footprint's place on the rows is known.
+        interference: true where the footprint's place on the rows is known.
     """
 
     wavelengths_nm: Float[Arrayish, " nodes"]
@@ -74,7 +74,7 @@ class Evaluator(eqx.Module):
     interference: bool = eqx.field(static=True)
 
     def model(self, theta: Float[Arrayish, " p"]) -> Diffraction:
-        """The model of a vector of parameters; see ``pack``."""
+        """Return the model of a vector of parameters; see ``pack``."""
         theta = jnp.asarray(theta)
         return Diffraction(
             pitch_mm=theta[PITCH],
@@ -91,9 +91,10 @@ class Evaluator(eqx.Module):
 
 
 def fit_lattice(half: tuple[int, int]) -> Lattice:
-    """Lattice that holds windows of ``half`` (rows, columns) to either side, sources off the middle included.
+    """Return the lattice of a fit: four nodes to a pixel, a quarter wider than the window, for sources off the middle.
 
-    It has four nodes to a pixel, and a quarter more room than the window.
+    Args:
+        half: (rows, columns) of the window to either side of the LED, in px.
     """
     rows, columns = (2 * h + 9 for h in half)
     return lattice_for(rows * 1.25, columns * 1.25, 4, 4)
@@ -103,7 +104,7 @@ def fit_lattice(half: tuple[int, int]) -> Lattice:
 def overlaps_of(
     evaluator: Evaluator, theta: Float[Arrayish, " p"], frame: LocalFrame
 ) -> Float[Array, "nodes terms rows half"]:
-    """The slow part of interference, in single precision: it hardly changes in the course of a fit."""
+    """Return the slow part of interference, in single precision: it hardly changes during a fit."""
     model, lattice = evaluator.model(theta), evaluator.lattice
     if not evaluator.interference:
         return jnp.zeros((len(evaluator.wavelengths_nm), 0, lattice.rows, lattice.columns // 2 + 1), jnp.float32)
@@ -118,7 +119,7 @@ def kernel_coefficients(
     disc_px: Float[Arrayish, ""],
     overlaps: Float[Arrayish, "nodes terms rows half"],
 ) -> Float[Array, "lattice_rows lattice_columns 3"]:
-    """Spline coefficients of the three colours' kernel of a source whose image is ``disc_px`` wide."""
+    """Return spline coefficients of the three colours' kernels, for a source whose image is ``disc_px`` wide."""
     model, lattice = evaluator.model(theta), evaluator.lattice
     spectra = jnp.asarray(model.spectrum)
     transfer = average_transfer(model, frame, lattice, spectra, disc_px)
@@ -130,7 +131,7 @@ def kernel_coefficients(
 def interference_coefficients(
     evaluator: Evaluator, model: Diffraction, frame: LocalFrame, disc_px: Float[Arrayish, ""]
 ) -> Callable[[Float[Array, " terms"], Float[Array, "nodes terms rows half"]], Float[Array, "y x 3"]]:
-    """Part of ``kernel_coefficients`` that interference brings, as a function of its strengths and overlaps."""
+    """Return interference's part of ``kernel_coefficients``, as a function of its strengths and overlaps."""
     lattice, spectra = evaluator.lattice, jnp.asarray(model.spectrum)
     opened, (fx, fy) = open_fractions(model, frame), lattice_frequencies(frame, lattice)
     columns, rows = (slit_tables(model, opened[axis], f, HIGHEST_ORDER) for axis, f in enumerate((fx, fy)))
@@ -150,10 +151,10 @@ def kernel_jacobian(
     disc_px: Float[Arrayish, ""],
     overlaps: Float[Arrayish, "nodes terms rows half"],
 ) -> tuple[Float[Array, "y x nodes"], Float[Array, "y x factors 3"]]:
-    """Spline coefficients of the kernel in the light of every wavelength node, and derivatives in all colours.
+    """Return spline coefficients of the kernel at every wavelength node, and derivatives in all colours.
 
-    Derivatives are by the factors of ``factor_jacobian``, the ``overlaps`` of interference held. The average over the
-    footprint's place is one more term of interference, (0, 0), of strength 1.
+    Derivatives are by the factors of ``factor_jacobian``, with the ``overlaps`` of interference held. The average over
+    the footprint's place is one more term of interference, (0, 0), of strength 1.
     """
     lattice, spectra = evaluator.lattice, jnp.asarray(model.spectrum)
     fx, fy = lattice_frequencies(frame, lattice)
@@ -197,7 +198,7 @@ def kernel_jacobian(
 def factor_jacobian(
     evaluator: Evaluator, theta: Float[Arrayish, " p"], frame: LocalFrame
 ) -> Float[Array, "factors head"]:
-    """Derivatives of the factors of ``kernel_jacobian`` by the parameters before the spectra, in their order.
+    """Return derivatives of the factors of ``kernel_jacobian`` by the parameters before the spectra, in order.
 
     Factors: open part of columns and of rows along the ray, the pitch where it scales lags, the pupil, the footprint's
     place (x, y), and the logarithm of the blur.
@@ -214,7 +215,7 @@ def factor_jacobian(
 def _slits(
     model: Diffraction, frame: LocalFrame, axis: int, frequency: Float[Array, " n"]
 ) -> Float[Array, "nodes 3 orders n"]:
-    """Slits along an axis, and derivatives by the open part of a ray and by the pitch, each with the other held."""
+    """Return slits along an axis, and derivatives by a ray's open part and by the pitch, with the other held."""
 
     def table(opened: Float[Array, ""], pitch_mm: Float[Array, ""]) -> Float[Array, "orders n nodes"]:
         return slit_tables(eqx.tree_at(lambda m: m.pitch_mm, model, pitch_mm), opened, frequency, HIGHEST_ORDER)

@@ -1,4 +1,4 @@
-"""Which residual the kernel needs beside diffraction or without it, and how wide: by positions that were left out."""
+"""Choice of the kernel's residual and its width, with or without diffraction, by positions that were held out."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ from udccal.result import Candidate
 @final
 @dataclass(frozen=True)
 class Order:
-    """What residual there may be.
+    """A candidate for the residual.
 
     Attributes:
         degree: of its polynomials, -1 for none.
-        free: whether it carries the whole kernel, without diffraction.
-        size: its standard deviation beforehand, as a fraction of the kernel nearby.
-        model_error: what solutions allow for, see ``data.left_out``.
-        reach: of the window, so large a part has a residual, about the source.
+        free: True if it is the whole kernel, without diffraction.
+        size: its prior standard deviation, as a fraction of the kernel nearby.
+        model_error: included in the weights of solutions, see ``data.left_out``.
+        reach: part of the window, about the source, that has a residual.
     """
 
     degree: int
@@ -48,12 +48,12 @@ class Order:
 
     @property
     def per_px(self) -> int:
-        """Nodes of the image to a pixel."""
+        """Number of the image's nodes per pixel."""
         return FREE_PER_PX if self.free else 1
 
     @property
     def name(self) -> str:
-        """For the table of candidates."""
+        """Name in the table of candidates."""
         if self.degree < 0:
             return "diffraction"
         if self.free:
@@ -62,11 +62,11 @@ class Order:
         return f"diffraction, residual degree {self.degree} of {100 * self.size:g} %{within}"
 
     def half_px(self, half: tuple[int, int]) -> tuple[int, int]:
-        """(rows, columns) to either side of the source that have a residual, in windows of this size."""
+        """Return (rows, columns) to either side of the source that have a residual, in windows of this size."""
         return round(self.reach * half[0]), round(self.reach * half[1])
 
     def coefficients(self, half: tuple[int, int]) -> int:
-        """Of the image for windows of this size."""
+        """Return the number of the image's coefficients for windows of this size."""
         rows, columns = (2 * self.per_px * size + 1 for size in self.half_px(half))
         return 3 * rows * columns * polynomial_terms(self.degree)
 
@@ -85,14 +85,14 @@ class Trial:
 @final
 @dataclass(frozen=True)
 class Selection:
-    """The residual chosen, and how well it predicts.
+    """The residual that was chosen, and its errors.
 
     Attributes:
-        trial: chosen, and ``candidates`` tried.
-        image: the residual on pixels, as wide as it is needed; a single zero for none.
-        held_out: relative L2 error by colour at positions that were left out, noise included.
-        error: of the kernel there, beside noise. relative_l2: what that makes of the kernel, mean over colours.
-        support: how far these positions show its light.
+        trial: the chosen one of the ``candidates``.
+        image: the residual on pixels, only as wide as needed; a single zero for none.
+        held_out: relative L2 error by colour at positions that were held out, noise included.
+        error: of the kernel there, without noise. relative_l2: that error of a whole kernel, mean over colours.
+        support: of the kernel's light at these positions.
     """
 
     trial: Trial
@@ -107,7 +107,7 @@ class Selection:
 @final
 @dataclass(frozen=True)
 class _Orders:
-    """All shots with what diffraction ``explained`` of them per unit of light; ``magnitude`` of the mean kernel."""
+    """All shots, their light by diffraction (``explained``, per unit of light), and the mean kernel's size."""
 
     shots: Shots
     explained: Crops
@@ -125,7 +125,7 @@ class _Orders:
         return Attempt(order.name, order.coefficients(self.shots.half), float(trial.loss.mean()), trial)
 
     def image(self, trial: Trial, support: Support) -> Float[np.ndarray, "terms 3 rows columns"]:
-        """The residual from all shots: beside diffraction as wide as it is needed, alone as far as light was seen."""
+        """Solve for the residual from all shots: as wide as its order, or a free one as wide as the support."""
         order = trial.order
         if order.degree < 0:
             return np.zeros((1, 3, 1, 1))
@@ -136,9 +136,9 @@ class _Orders:
     def rising(
         self, sources: Sources, free: bool, sizes: Sequence[float], allowed: float, first: tuple[Attempt[Trial], ...]
     ) -> tuple[Attempt[Trial], ...]:
-        """Rising degrees while they help, each of the size that predicts best; see ``engine.orders.rising``.
+        """Try rising degrees while they help, each with its best size; see ``engine.orders.rising``.
 
-        There are never more terms than positions to fit them to. What one degree leaves out the next allows for.
+        There are never more terms than fitted positions. A degree's residuals give the next one's model error.
         """
         positions = len(np.unique(self.shots.position[~self.test]))
         allowances = [allowed]
@@ -154,11 +154,11 @@ class _Orders:
         return rising([*tried, *(partial(attempt, degree) for degree in degrees)], self.beats)
 
     def beats(self, one: Attempt[Trial], other: Attempt[Trial]) -> bool:
-        """Whether it predicts what was held out better, by more than it costs."""
+        """Return whether ``one`` lowers the held-out loss by more than it costs."""
         return held_out_beats(one.fit.loss, other.fit.loss, self.rules.worth)
 
     def narrowed(self, best: Attempt[Trial]) -> tuple[Attempt[Trial], ...]:
-        """Narrower residuals, up to the first that the whole window does not improve on; the last is the choice."""
+        """Try narrower residuals, up to the first that the whole window does not improve on; the last is chosen."""
         tried: list[Attempt[Trial]] = []
         for reach in self.rules.reaches:
             tried.append(self.attempt(best.fit.sources, replace(best.fit.order, reach=reach)))
@@ -170,7 +170,7 @@ class _Orders:
         return make_windows(self.shots, sources, self.explained, self.basis, order.model_error, order.per_px)
 
     def _solve(self, windows: Windows, order: Order) -> Float[np.ndarray, "terms 3 node_rows node_columns"]:
-        """The residual's image. Terms of higher degrees are there, too, without room: all orders compile to one."""
+        """Solve for the residual's image; higher degrees are held at 0, so that all orders share one compilation."""
         sigma = prior_sigma(self.magnitude, order.size, order.per_px)
         y, x = (np.abs(np.arange(nodes) - nodes // 2) for nodes in sigma.shape[1:])
         rows, columns = (order.per_px * half for half in order.half_px(self.shots.half))
@@ -193,8 +193,8 @@ def select_field(
 ) -> Selection:
     """Try no residual, then residuals of rising degree while they help; if diffraction fails, do without it.
 
-    ``sources``, ``explained`` (light per unit) and ``model_error`` are those of diffraction; ``unit_positions`` is
-    where the field positions lie, scaled to about [-1, 1].
+    ``sources``, ``explained`` (light per unit) and ``model_error`` are those of diffraction; ``unit_positions`` are the
+    field positions, scaled to about [-1, 1].
     """
     magnitude = _mean_kernel(shots, sources)
     test = held_out_positions(shots.positions)[shots.position]
@@ -227,7 +227,7 @@ def select_field(
 
 
 def _mean_kernel(shots: Shots, sources: Sources) -> Float[np.ndarray, "3 rows columns"]:
-    """How large the kernel is on average, by colour, on samples that any picture has."""
+    """Return the kernel's average size by colour, on samples that any picture has."""
     colour = shots.colour * (shots.weight > 0)[..., None]
     rate = np.abs(shots.rate - sources.background[:, None, None])
     seen = np.maximum(colour.sum(axis=0), 1.0).transpose(2, 0, 1)

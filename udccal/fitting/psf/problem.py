@@ -1,6 +1,6 @@
 """The light that diffraction brings to samples, its normal equations, and both as a problem for the engine's solver.
 
-Own parameters of a shot are (x, y) in px from the place first assumed, light per colour and background in e-/s.
+Own parameters of a shot are (x, y) in px from the first assumed place, light per colour and background in e-/s.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ _IN_OVERLAPS: Final = np.array([PITCH, PUPIL])
 @final
 @dataclass(frozen=True)
 class Place:
-    """Where a descent is: the shared parameters of diffraction, and those of every shot."""
+    """A descent's current parameters: those of diffraction, which are shared, and those of every shot."""
 
     theta: Float[np.ndarray, " p"]
     own: Owns
@@ -69,8 +69,8 @@ class Place:
 class DiffractionProblem:
     """Diffraction for the engine's solver; the groups of its equations are the shots, position after position.
 
-    Interference changes with where the pupil's footprint lies and with its overlaps, which are slow to follow: it is
-    set up about one place, with what it needs to be right around it.
+    Interference depends on the place of the pupil's footprint and on its overlaps, which take long to compute. It is
+    therefore set up about one place, with its changes around that place to first order.
     """
 
     samples: Samples
@@ -80,23 +80,23 @@ class DiffractionProblem:
 
     @property
     def used(self) -> int:
-        """How many samples count."""
+        """Number of samples that are used."""
         return int((np.asarray(self.samples.weight) > 0).sum())
 
     @property
     def unknowns(self) -> int:
-        """How many numbers are estimated, those of each shot included."""
+        """Number of parameters, those of each shot included."""
         return self.prior.mean.size + OWN * int((np.asarray(self.samples.index) >= 0).sum())
 
     def by_position(self, place: Place) -> list[Blocks]:
-        """Each position's part of the equations, without the prior."""
+        """Return each position's part of the equations, without the prior."""
         made = normal_equations(self.evaluator, place.theta, self.samples, place.own)
         cost, *parts = (np.asarray(part) for part in made)
         counts = (np.asarray(self.samples.weight) > 0).sum(axis=(1, 2))
         return [Blocks(float(cost[i]), int(n), *(part[i] for part in parts)) for i, n in enumerate(counts)]
 
     def equations_at(self, place: Place) -> Blocks:
-        """Cost and normal equations, the prior's included."""
+        """Return cost and normal equations, with the prior's."""
         made = self.by_position(place)
         own = (np.concatenate([getattr(one, part) for one in made]) for part in ("own", "own_right", "cross"))
         shared, right = np.sum([one.shared for one in made], axis=0), np.sum([one.right for one in made], axis=0)
@@ -104,32 +104,32 @@ class DiffractionProblem:
         return whole.with_prior(self.prior, place.theta)
 
     def moved(self, place: Place, step: Step) -> Place:
-        """The place after a step."""
+        """Return the place after a step."""
         return Place(stepped(place.theta, step.shared), moved_own(place.own, step.own.reshape(place.own.shape)))
 
     def light_at(self, place: Place) -> Lights:
-        """What samples hold under the model, in e-/s, without background."""
+        """Return the samples' light under the model, in e-/s, without background."""
         return np.asarray(light_of(self.evaluator, place.theta, self.samples, place.own))
 
     def errors(self, place: Place, light: Lights) -> Lights:
-        """Data less expectation in units of sigma, 0 where no sample counts; ``light`` of that place."""
+        """Return data less expectation in units of sigma, 0 for unused samples; ``light`` is of that place."""
         samples = self.samples
         return np.asarray((samples.rate - light - place.own[..., 5:]) * np.sqrt(np.asarray(samples.weight)))
 
     def with_overlaps(self, theta: Float[np.ndarray, " p"]) -> DiffractionProblem:
-        """With the overlaps of ``theta``: what interference depends on hardly changes in a descent."""
+        """Set the overlaps to those of ``theta``: they hardly change in a descent."""
         overlaps = np.asarray(overlaps_by_position(self.evaluator, theta, self.samples))
         return replace(self, samples=replace(self.samples, overlaps=overlaps))
 
     def about(self, place: Place) -> DiffractionProblem:
-        """With interference set up about a place."""
+        """Set interference up about a place."""
         if not self.evaluator.interference:
             return self.with_overlaps(place.theta)
         return replace(self, samples=with_interference(self.evaluator, place.theta, self.samples, place.own[..., :2]))
 
 
 def stepped(theta: Float[np.ndarray, " p"], step: Float[np.ndarray, " p"]) -> Float[np.ndarray, " p"]:
-    """Parameters after a step; light grows by what the step says, not by that number's exponential."""
+    """Return parameters after a step; spectra grow by the step itself, not by its exponential."""
     spectra = softmax(theta[HEAD:].reshape(3, -1), axis=1)
     logs = step[HEAD:].reshape(3, -1)
     mean = np.sum(spectra * logs, axis=1, keepdims=True)
@@ -139,7 +139,7 @@ def stepped(theta: Float[np.ndarray, " p"], step: Float[np.ndarray, " p"]) -> Fl
 
 
 def moved_own(own: Float[np.ndarray, "*k l"], step: Float[np.ndarray, "*k l"]) -> Float[np.ndarray, "*k l"]:
-    """Places of LEDs move by no more than half a pixel in a step."""
+    """Return own parameters after a step; places of LEDs move by half a pixel at most."""
     return own + np.concatenate([np.clip(step[..., :2], -0.5, 0.5), step[..., 2:]], axis=-1)
 
 
@@ -147,13 +147,13 @@ def moved_own(own: Float[np.ndarray, "*k l"], step: Float[np.ndarray, "*k l"]) -
 def overlaps_by_position(
     evaluator: Evaluator, theta: Theta, samples: Samples
 ) -> Float[Array, "positions nodes terms rows half"]:
-    """See ``kernel.overlaps_of``."""
+    """Return overlaps at every position; see ``kernel.overlaps_of``."""
     return jax.lax.map(lambda frame: overlaps_of(evaluator, theta, frame), samples.frame)
 
 
 @eqx.filter_jit
 def coefficients_of(evaluator: Evaluator, theta: Theta, samples: Samples) -> Float[Array, "positions y x 3"]:
-    """Of the kernel at every position."""
+    """Return the kernel's spline coefficients at every position."""
     return jax.lax.map(lambda one: _coefficients(evaluator, jnp.asarray(theta), one), samples)
 
 
@@ -164,7 +164,7 @@ def _coefficients(evaluator: Evaluator, theta: Theta, one: Samples) -> Float[Arr
 
 @eqx.filter_jit
 def light_of(evaluator: Evaluator, theta: Theta, samples: Samples, own: Owns) -> Lights:
-    """What samples hold under the model, in e-/s, without background."""
+    """Return the samples' light under the model, in e-/s, without background."""
     theta = jnp.asarray(theta)
 
     def one(pair: tuple[Samples, Array]) -> Light:
@@ -176,7 +176,7 @@ def light_of(evaluator: Evaluator, theta: Theta, samples: Samples, own: Owns) ->
 
 
 def _corrected(one: Samples, theta: Theta, unit: Light) -> Light:
-    """Light per unit with what the lattice's kernel at the mean place, and with fixed overlaps, does not have."""
+    """Add to the light per unit the changes by a shot's own place and by overlaps, to first order."""
     return unit + one.correction + one.by_overlaps @ (theta[_IN_OVERLAPS] - one.overlaps_at)
 
 
@@ -184,7 +184,7 @@ def _corrected(one: Samples, theta: Theta, unit: Light) -> Light:
 def with_interference(
     evaluator: Evaluator, theta: Theta, samples: Samples, offset_px: Float[Arrayish, "positions shots 2"]
 ) -> Samples:
-    """With overlaps of ``theta``, how they change with it, and each shot's own place on the rows."""
+    """Return samples with overlaps of ``theta``, their derivatives, and corrections for each shot's own place."""
     theta = jnp.asarray(theta)
 
     def one(pair: tuple[Samples, Array]) -> tuple[Array, Array, Array]:
@@ -196,8 +196,8 @@ def with_interference(
         def light(strength: Float[Array, " terms"], own: Float[Array, "nodes terms rows half"]) -> Float[Array, "s n"]:
             return unit_light(evaluator, here, offset, coefficients(strength, own))
 
-        # Overlaps are in single precision: by such steps, in mm, their difference is not. Over steps ten times as long
-        # derivatives bend by some percent.
+        # Overlaps are in single precision: steps of this length (mm) keep their difference precise. Steps ten times as
+        # long change derivatives by some per cent.
         strength, steps_mm = strengths(model, place), jnp.array([0.0002, 0.001])
         larger = theta + steps_mm[:, None] * jnp.eye(theta.size)[_IN_OVERLAPS]
         by_overlaps = (
@@ -221,9 +221,9 @@ def with_interference(
 
 @eqx.filter_jit
 def normal_equations(evaluator: Evaluator, theta: Theta, samples: Samples, own: Owns) -> tuple[Array, ...]:
-    """Each position's part of the Gauss-Newton equations, with Huber's weights.
+    """Return each position's part of the Gauss-Newton equations, with Huber's weights.
 
-    In the order of ``engine.least_squares.Blocks``, the number of samples left out.
+    The order is that of ``engine.least_squares.Blocks``, without the number of samples.
     """
     theta = jnp.asarray(theta)
     return jax.lax.map(lambda pair: _normal_equations(evaluator, theta, *pair), (samples, jnp.asarray(own)))
@@ -258,7 +258,7 @@ def _normal_equations(evaluator: Evaluator, theta: Theta, one: Samples, own: Own
 def explain(
     problem: DiffractionProblem, theta: Float[np.ndarray, " p"], shots: Shots, geometry: Geometry, model_error: float
 ) -> tuple[Float[np.ndarray, "shots l"], Crops]:
-    """What a fit's diffraction brings to whole crops: own parameters, with (x, y) on the sensor, and light per unit."""
+    """Apply a fit's diffraction to whole crops: return own parameters, (x, y) on the sensor, and light per unit."""
     evaluator = replace(problem.evaluator, lattice=fit_lattice(shots.half))
     samples = weighed(gather(shots, geometry, np.ones(shots.rate.shape, dtype=bool)), model_error)
     coefficients = coefficients_of(evaluator, theta, samples)

@@ -19,20 +19,23 @@ from udccal.models.wire import Wire, wire_values
 from udccal.sessions.schema import LedSubject, StoredStep
 from udccal.sessions.store import Session
 
-# How far from its aim an LED is looked for.
+# The search for an LED reaches this far from its aim.
 _SEARCH_PX: Final = 16
 
 _wire_values = eqx.filter_jit(wire_values)
 
 
 def read_psf(session: Session, noise: Noise, wire: Wire, rules: PsfRules | None = None) -> PsfData:
-    """The LED pictures of the steps ``psf/...`` of a session, in windows as wide as a profile's kernel or the fit's.
+    """Read the LED pictures of a session's steps ``psf/...``, in windows as wide as a profile's kernel or the fit's.
 
     Args:
         session: brackets of an LED at field positions, each at some sub-pixel shifts.
-        noise: for merging brackets.
-        wire: divided out.
-        rules: how large windows may be.
+        noise: gives K, black level, saturation and variances for merging brackets.
+        wire: its map divides the rates.
+        rules: the largest windows in px.
+
+    Returns:
+        Crops in e-/s about each LED, and the numbers of dark and clipped pictures.
 
     Raises:
         SessionError: when a file of the session is missing or damaged.
@@ -57,14 +60,14 @@ def read_psf(session: Session, noise: Noise, wire: Wire, rules: PsfRules | None 
 
 
 def window_half(session: Session, largest: tuple[int, int]) -> tuple[int, int]:
-    """(rows, columns) to either side of the LED that the regions captured can fill."""
+    """Return (rows, columns) to either side of the LED that the captured regions can fill."""
     regions = [c.region for step in session.steps("psf") for c in step.captures]
     rows, columns = (min((getattr(r, name) for r in regions), default=0) for name in ("rows", "columns"))
     return max(4, min(largest[0], rows // 2 - 4)), max(4, min(largest[1], columns // 2 - 4))
 
 
 def _without_wire(shots: Shots, wire: Wire, rows: int, columns: int) -> Shots:
-    """Rates divided by the wire's map of a sensor of ``rows`` x ``columns``."""
+    """Divide rates by the wire's map of a sensor of ``rows`` x ``columns``."""
     pixels = shots.offsets()[None] + shots.origin_px[:, None, None]
     gains = np.stack([np.asarray(_wire_values(wire, p.reshape(-1, 2) * 1.0, rows, columns)) for p in pixels])
     gain = gains.reshape(shots.rate.shape)
@@ -76,7 +79,7 @@ def _without_wire(shots: Shots, wire: Wire, rows: int, columns: int) -> Shots:
 def _read_shot(
     session: Session, step: StoredStep, subject: LedSubject, noise: Noise, half: tuple[int, int]
 ) -> tuple[Shots | None, bool]:
-    """The crop, and whether the LED is clipped in all exposures. Only the part about the aim is merged."""
+    """Return the crop, and True if the LED is clipped in all exposures; only the part near the aim is merged."""
     region, aim = step.captures[0].region, (subject.x_px, subject.y_px)
     down = _part(aim[1] - region.y, half[0] + _SEARCH_PX + 2, region.rows)
     across = _part(aim[0] - region.x, half[1] + _SEARCH_PX + 2, region.columns)
@@ -84,9 +87,9 @@ def _read_shot(
     frames = np.stack([session.frame(c)[down, across] for c in captures])
     exposures_s = np.array([c.exposure_s for c in captures])
     merged, corner = merge_bracket(frames, exposures_s, noise), (region.x + across.start, region.y + down.start)
-    # Without its brightest sample neither an LED's light nor its place is known.
+    # An LED without its brightest sample has no known light or place.
     clipped = (merged.used == 0) & (frames[int(np.argmin(exposures_s))] >= 0.98 * float(noise.saturation_DN))
-    # A hot pixel elsewhere is not the LED's.
+    # A hot pixel elsewhere does not belong to the LED.
     if clipped[tuple(_part(aim[i] - corner[i], _SEARCH_PX, clipped.shape[1 - i]) for i in (1, 0))].any():
         return None, True
     # The pupil is a few mm behind the panel: less than a percent of any useful distance.
@@ -96,7 +99,7 @@ def _read_shot(
 
 
 def _part(aim: float, reach: int, size: int) -> slice:
-    """Even start, so that the pattern of the mosaic stays the sensor's."""
+    """Return a slice with an even start, so that the pattern of the mosaic stays the sensor's."""
     start = int(np.clip(np.floor(aim) - reach, 0, max(size - 2, 0))) // 2 * 2
     return slice(start, int(np.clip(np.ceil(aim) + reach + 1, start + 2, size)))
 
@@ -110,11 +113,11 @@ def cut_crop(
     disc_px: float,
     noise_per_rate: Float[np.ndarray, "rows columns"] | None = None,
 ) -> Shots | None:
-    """One shot about the LED, ``half`` (rows, columns) to either side; None when no light stands out near the aim.
+    """Cut a shot about the LED, ``half`` (rows, columns) to either side; return None without a visible LED at the aim.
 
-    ``merged`` is the bracket of a region whose first sample is ``corner_px`` (x, y; even); beside it samples have no
+    ``merged`` is the bracket of a region whose first sample is ``corner_px`` (x, y; even); samples outside it have no
     weight. The aim is on the sensor; ``disc_px`` is the diameter of the LED's image. Without ``noise_per_rate`` (see
-    ``shot_noise``) the merged sigma is taken as it is.
+    ``shot_noise``) the merged sigma stays unchanged.
     """
     rate = merged.rate_e_per_s
     weight = np.where(merged.used > 0, 1.0 / merged.sigma_e_per_s.astype(np.float64) ** 2, 0.0)
@@ -135,9 +138,9 @@ def cut_crop(
 def _brightest(
     rate: Float[np.ndarray, "rows columns"], weight: Float[np.ndarray, "rows columns"], aim: Float[np.ndarray, "2"]
 ) -> Float[np.ndarray, "2"] | None:
-    """(x, y) of the LED: centroid about the brightest 2 x 2 cell near the aim, or None when it is not there.
+    """Return (x, y) of the LED, the centroid about the brightest 2 x 2 cell near the aim, or None without an LED.
 
-    A cell holds every colour, so that the mosaic does not steer the search; hot pixels are too narrow to win it.
+    A cell holds every colour, so that the mosaic does not bias the search; a hot pixel is too narrow to be found.
     """
     known = np.where(weight > 0, rate, 0.0)
     cells = scipy.ndimage.uniform_filter(scipy.ndimage.median_filter(known, size=3) + 0.02 * known, size=3)
@@ -149,17 +152,17 @@ def _brightest(
     about = (np.abs(x - column) <= 2) & (np.abs(y - row) <= 2)
     signal = np.maximum(known[about], 0.0)
     noise = np.sqrt((1.0 / np.maximum(weight[about], 1e-300)).clip(max=1e24))
-    # An LED stands out of the noise by 8 sigma.
+    # An LED exceeds the noise by 8 sigma.
     if signal.max(initial=0.0) < 8.0 * np.median(noise) or signal.sum() <= 0:
         return None
     return np.array([np.average(x[about], weights=signal), np.average(y[about], weights=signal)])
 
 
 def shot_noise(merged: HdrMerge, noise: Noise) -> Float[np.ndarray, "rows columns"]:
-    """How fast a merged sample's variance grows with its rate, in (e-/s)^2 per e-/s.
+    """Return the derivative of a merged sample's variance by its rate, in (e-/s)^2 per e-/s.
 
-    Variance (r + d) u + f u^2 is that of one exposure of 1/u seconds, f being what a dark sample has; a bracket is
-    taken for the single exposure that has its variance.
+    One exposure of 1/u seconds has the variance (r + d) u + f u^2, where f is a dark sample's. A bracket is treated as
+    the single exposure that has its variance.
     """
     K, dark = float(np.asarray(noise.K_DN_per_e)), float(np.asarray(noise.dark_current_e_per_s))
     floor = float(np.asarray(noise.sigma_d_e)) ** 2 + (float(np.asarray(noise.q_DN)) / K) ** 2 / 12.0

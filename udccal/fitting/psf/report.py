@@ -1,4 +1,4 @@
-"""The psf fit's result: estimates with sigma, how sure the whole kernel is, how well it predicts, notes."""
+"""The psf fit's result: estimates with sigma, the sigma of the whole kernel, its held-out error, and notes."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from udccal.models.psf import PsfField
 from udccal.result import Diagnostic, Estimate, FitResult, FitStatus
 from udccal.rig import RigDescription
 
-# The first parameters: name, unit, and whether it is a length on the panel, which is measured in pitches.
+# The first parameters: name, unit, and true for a length on the panel, which is measured in pitches.
 _NUMBERS: Final = (
     ("pitch_mm", "mm", True),
     ("column_open", "1", False),
@@ -40,7 +40,7 @@ _NUMBERS: Final = (
 def report(
     data: PsfData, fit: DiffractionFit, selection: Selection, term: PsfField, rig: RigDescription, rules: PsfRules
 ) -> FitResult[PsfField]:
-    """Everything together; the support of the ``selection`` is the one chosen, of crops or of whole pictures."""
+    """Put the result together; the support of the ``selection`` is the final one, by crops or by whole pictures."""
     diffracts, samples = not selection.trial.order.free, fit.problem.samples
     worst = float(np.sqrt((selection.held_out**2).mean()))
     status = FitStatus.CONVERGED
@@ -95,11 +95,11 @@ def _posterior(
     cov: Float[np.ndarray, "p p"],
     pitch_tolerance: float,
 ) -> Posterior[PsfField]:
-    """Of the parameters of diffraction, of the pitch, and of what the kernel is off by beside noise.
+    """Return the posterior of the parameters of diffraction, of the pitch, and of the kernel's error without noise.
 
-    All lengths are measured in pitches, and wavelengths with them: the pitch's tolerance scales them together, which
-    leaves the kernel as it is. What positions held out show the kernel to be off by is a residual on every pixel of a
-    kernel, of a size that follows the kernel there, with signs of sixteen drawn patterns.
+    All lengths and wavelengths are measured in pitches: the pitch's tolerance scales them together, which does not
+    change the kernel. Positions held out show the kernel's error. It becomes a residual on every pixel of a kernel,
+    whose size follows the kernel there, with the signs of sixteen drawn patterns.
     """
     error, count, evaluator = selection.error, fit.theta.size, fit.problem.evaluator
     patterns = 16 if error.size else 0
@@ -108,7 +108,7 @@ def _posterior(
         factor[:count, :count] = square_root(cov)
         factor[count, count] = pitch_tolerance
     factor[count + 1 :, count + 1 :] = np.eye(patterns) / np.sqrt(max(patterns, 1))
-    # No more is held than is needed: a result lives long, and what was fitted is large.
+    # A result lives long and the data are large: the function below keeps only what it needs.
     size_and_signs = cache(lambda: _error_patterns(term, error, rig, patterns))
 
     def term_at(x: Float[np.ndarray, " n"]) -> PsfField:
@@ -131,7 +131,7 @@ def _posterior(
 def _error_patterns(
     term: PsfField, error: KernelError, rig: RigDescription, patterns: int
 ) -> tuple[int, Float[np.ndarray, "terms 3 rows columns"], Float[np.ndarray, "patterns 3 rows columns"]]:
-    """Size of the kernel's error as a residual whose pixels are polynomials of some degree of the position, and signs.
+    """Return a degree, the size of the kernel's error as polynomials of that degree of the position, and signs.
 
     Four places along each axis determine cubic polynomials.
     """
@@ -145,17 +145,17 @@ def _error_patterns(
 
 
 def as_numpy(model: Diffraction) -> Diffraction:
-    """The model with numpy leaves."""
+    """Return the model with numpy leaves."""
     return Diffraction(*(np.asarray(getattr(model, name), np.float64) for name in Diffraction.__dataclass_fields__))
 
 
 def pattern_p_value(samples: Samples, z: Lights) -> float:
-    """Probability of residuals at least as alike in different pictures of a position, were they noise.
+    """Return the probability that noise alone makes residuals of a position's pictures at least as similar.
 
-    Each picture has its own noise, and each samples the kernel at its own fraction of a pixel. Residuals of samples of
-    one colour that see the same place of the kernel in two pictures, within a pixel, are therefore uncorrelated unless
-    the model is wrong there; the mean of their products, in units of its standard error, is normal. Means of groups
-    (``engine.misfit``) hold squares besides, which are no evidence and hide what two pictures have in common.
+    Each picture has its own noise, and samples the kernel at its own fraction of a pixel. Residuals of one colour at
+    the same place of the kernel, within a pixel, are uncorrelated between two pictures unless the model is wrong there.
+    The mean of their products, in units of its standard error, is normal. Means of groups (``engine.misfit``) also hold
+    squares, which are no evidence and hide the common part of two pictures.
     ``z`` is data less expectation, in units of sigma.
     """
     z = np.clip(z, -HUBER.sigma, HUBER.sigma)
@@ -168,13 +168,13 @@ def pattern_p_value(samples: Samples, z: Lights) -> float:
     sums, squares = (np.zeros((int(number.max()) + 1, z.shape[1])) for _ in range(2))
     np.add.at(sums, (number.reshape(-1), shot), z.ravel())
     np.add.at(squares, (number.reshape(-1), shot), z.ravel() ** 2)
-    # Of pairs of different pictures alone.
+    # Only pairs of different pictures count.
     total, variance = (float((part.sum(axis=1) ** 2 - (part**2).sum(axis=1)).sum()) / 2.0 for part in (sums, squares))
     return float(ndtr(-total / np.sqrt(variance))) if variance > 0 else 1.0
 
 
 def support_notes(term: PsfField, support: Support) -> tuple[str, ...]:
-    """What is to be said where no end of the kernel's light was seen."""
+    """Return the notes for axes along which no end of the kernel's light was seen."""
     along = [name for name, on in zip(("columns", "rows"), support.open_ended, strict=True) if on]
     if not along or not term.diffraction_fraction:
         return ()

@@ -1,6 +1,6 @@
-"""The samples of all field positions: what they count for, the light of a kernel, and each shot's own parameters.
+"""The samples of all field positions: their weights, the light of a kernel, and each shot's own parameters.
 
-Own parameters of a shot are (x, y) in px from the place first assumed, light per colour and background in e-/s.
+Own parameters of a shot are (x, y) in px from the first assumed place, light per colour and background in e-/s.
 """
 
 from __future__ import annotations
@@ -34,24 +34,22 @@ Lights = Float[Arrayish, "positions shots n"]
 
 @final
 class Samples(eqx.Module):
-    """The chosen samples of all shots, by field position; positions with fewer shots are padded with weights of 0.
-
-    Of one position alone it has no axis of positions.
+    """The chosen samples of all shots, by field position (no such axis for one position); padding has weights of 0.
 
     Attributes:
         points, density: samples on the lattice about the mean place; see ``models.psf.lattice_points``.
         slope: lattice units per pixel, to move a source.
         begun_px: (x, y) of the shots from the mean place, as first assumed.
-        colour: which of three colours a sample has (one-hot).
-        known: inverse variance of a sample as it was measured, 0 where there is none.
-        noise_per_rate: by how much that variance grows with the light, in (e-/s)^2 per e-/s.
-        weight: inverse variance that the fit goes by.
-        correction: per unit of light of a sample's colour, what a shot has more because the pupil's footprint lies
-            elsewhere on the rows than at the mean place.
-        by_overlaps: by how much interference changes with the pitch and with the pupil because overlaps do, per mm and
-            unit of light. overlaps_at: those (mm) that ``overlaps``, of ``kernel.overlaps_of``, are of.
-        overlaps: without any, those of the parameters at hand are worked out.
-        index: which shots these are, -1 for padding.
+        colour: each sample's colour (one-hot).
+        known: inverse variance of a sample as measured, 0 where there is no sample.
+        noise_per_rate: derivative of that variance by the light, in (e-/s)^2 per e-/s.
+        weight: inverse variance that the fit uses.
+        correction: light that a shot has in addition because the pupil's footprint lies elsewhere on the rows than at
+            the mean place, per unit of light of a sample's colour.
+        by_overlaps: derivative of interference by the pitch and by the pupil through overlaps, per mm and unit of
+            light. overlaps_at: pitch and pupil (mm) at which ``overlaps`` were computed.
+        overlaps: of ``kernel.overlaps_of``; if empty, they are computed from the current parameters.
+        index: of the shots, -1 for padding.
     """
 
     frame: LocalFrame
@@ -72,12 +70,17 @@ class Samples(eqx.Module):
     index: Int[Arrayish, "*positions shots"]
 
     def at(self, which: int | slice) -> Samples:
-        """Those of one position, or of some."""
+        """Return the samples of one position, or of several."""
         return jax.tree.map(lambda part: part[which], self)
 
 
 def choose_samples(shots: Shots, rules: PsfRules) -> Bool[np.ndarray, "shots rows columns"]:
-    """All samples about the peak and a seeded draw of the others in the window of the fit, as many in every shot."""
+    """Return which samples are fitted: all near the peak and a seeded draw of the others, as many in every shot.
+
+    Args:
+        shots: crops about the LED.
+        rules: the windows in px, and the fraction that is drawn away from the peak.
+    """
     rng = np.random.default_rng(2)
     x, y = np.moveaxis(np.abs(shots.offsets()), -1, 0)
     inside = (x <= rules.close_px[1]) & (y <= rules.close_px[0])
@@ -90,7 +93,12 @@ def choose_samples(shots: Shots, rules: PsfRules) -> Bool[np.ndarray, "shots row
 
 
 def stands_for(shots: Shots, rules: PsfRules) -> Float[np.ndarray, "shots n"]:
-    """How many samples of its picture each chosen one stands for: those away from the peak were drawn."""
+    """Return how many samples of its picture each chosen sample represents: 1 near the peak, more where it was drawn.
+
+    Args:
+        shots: crops about the LED.
+        rules: those of ``choose_samples``.
+    """
     chosen, near = choose_samples(shots, rules), choose_samples(shots, replace(rules, far_fraction=0.0))
     return np.where(near[chosen].reshape(shots.count, -1), 1.0, 1.0 / rules.far_fraction)
 
@@ -99,7 +107,7 @@ def stands_for(shots: Shots, rules: PsfRules) -> Float[np.ndarray, "shots n"]:
 def _on_lattice(
     geometry: Geometry, places: Float[Arrayish, "positions 2"], offsets_px: Float[Arrayish, "positions m 2"]
 ) -> tuple[LocalFrame, Float[Array, "positions m 2"], Float[Array, "positions m"]]:
-    """Frames of places, and where pixels beside them lie on their lattices."""
+    """Return the frames of places, and the positions of pixels near them on their lattices."""
 
     def one(at: tuple[Array, Array]) -> tuple[LocalFrame, Array, Array]:
         frame = local_frame(geometry, at[0])
@@ -109,12 +117,12 @@ def _on_lattice(
 
 
 def gather(shots: Shots, geometry: Geometry, chosen: Bool[np.ndarray, "shots rows columns"]) -> Samples:
-    """Chosen samples by field position, without overlaps.
+    """Arrange the chosen samples by field position, without overlaps.
 
     Args:
         shots: the data, positions numbered without gaps.
-        geometry: where pixels look.
-        chosen: as many samples in every shot.
+        geometry: the rays of pixels.
+        chosen: as many samples in every shot; see ``choose_samples``.
     """
     groups = [np.flatnonzero(shots.position == g) for g in range(shots.positions)]
     most, places = max(len(group) for group in groups), shots.positions_px()
@@ -153,7 +161,7 @@ def gather(shots: Shots, geometry: Geometry, chosen: Bool[np.ndarray, "shots row
 
 
 def sensor_variance(samples: Samples, level: Float[np.ndarray, "*k n"]) -> Float[np.ndarray, "*k n"]:
-    """Variance of the samples' noise if their true rate is ``level``; 1 where there is no sample."""
+    """Return the variance of the samples' noise if their true rate is ``level``; 1 where there is no sample."""
     known, rate = np.asarray(samples.known), np.asarray(samples.rate)
     measured = 1.0 / np.where(known > 0, known, 1.0)
     return noise_at(level, rate, measured, np.asarray(samples.noise_per_rate) * (known > 0))
@@ -162,13 +170,13 @@ def sensor_variance(samples: Samples, level: Float[np.ndarray, "*k n"]) -> Float
 def weighed(
     samples: Samples, model_error: float, light: np.ndarray | None = None, background: np.ndarray | float = 0.0
 ) -> Samples:
-    """With weights at the ``light`` and ``background`` that a model expects, in e-/s; before there is one, at the data.
+    """Return the samples with weights at the expected ``light`` and ``background``, or at the data without them.
 
     Args:
         samples: the data.
         model_error: relative to the peak of each picture; see ``left_out``.
-        light: of each sample.
-        background: broadcast to samples.
+        light: that a model expects of each sample, in e-/s.
+        background: in e-/s, broadcast to samples.
     """
     seen = np.asarray(samples.known) > 0
     light = np.asarray(samples.rate) if light is None else light
@@ -180,20 +188,20 @@ def weighed(
 def unit_light(
     evaluator: Evaluator, one: Samples, offset_px: Float[Arrayish, "shots 2"], coefficients: Float[Arrayish, "y x 3"]
 ) -> Light:
-    """What one unit of light of its own colour brings to every sample of one position, corrections left out."""
+    """Return each sample's light per unit of light of its own colour, at one position and without corrections."""
     values = sampled(evaluator, one, jnp.asarray(coefficients), jnp.asarray(offset_px))
     return jnp.sum(values * one.colour, axis=-1)
 
 
 def flux_of(one: Samples, own: Own) -> Light:
-    """Light of each sample's own colour, in e-/s."""
+    """Return the LED's light in each sample's own colour, in e-/s."""
     return jnp.einsum("snc,sc->sn", one.colour, own[:, 2:5])
 
 
 def sampled(
     evaluator: Evaluator, one: Samples, coefficients: Float[Array, "y x c"], offset_px: Float[Array, "shots 2"]
 ) -> Float[Array, "shots n c"]:
-    """What one unit of light brings to every sample."""
+    """Return each sample's light per unit of the LED's light, for every kernel of the coefficients."""
     points = one.points - (offset_px @ one.slope.T)[:, None]
     values = sample(evaluator.lattice, coefficients, points.reshape(-1, 2)).reshape(*points.shape[:2], -1)
     return values * one.density[..., None]
@@ -203,7 +211,7 @@ def sampled(
 def own_equations(
     evaluator: Evaluator, samples: Samples, own: Owns, coefficients: Float[Arrayish, "positions y x 3"]
 ) -> tuple[Float[Array, "positions shots l l"], Float[Array, "positions shots l"], Lights]:
-    """Normal matrix and right side of every shot's own parameters for given kernels, and light per unit."""
+    """Return normal matrix and right side of every shot's own parameters for given kernels, and light per unit."""
 
     def one(group: tuple[Samples, Array, Array]) -> tuple[Array, Array, Array]:
         here, mine, kernel = group
@@ -229,10 +237,10 @@ def own_jacobian(
 
 
 def start_own(evaluator: Evaluator, samples: Samples, coefficients: Float[Arrayish, "positions y x 3"]) -> Owns:
-    """Start of every shot's own parameters: the best of a grid of places, light and background by least squares.
+    """Start every shot's own parameters at the best of a grid of places, with light and background by least squares.
 
-    A centroid will not do: neighbouring diffraction orders are half as bright as the middle one, and the mosaic samples
-    each colour unevenly, so it can be off by a pixel; a descent from there ends on a neighbouring order.
+    A centroid is not accurate enough. Neighbouring diffraction orders are half as bright as the middle one, and the
+    mosaic samples each colour unevenly: it can be off by a pixel, and a descent then ends on a neighbouring order.
     """
     # Places are compared on the samples about the brightest spot; 117 of them are enough.
     core = np.argsort((np.asarray(samples.points) ** 2).sum(axis=-1), axis=-1, kind="stable")[..., :117]
@@ -279,9 +287,9 @@ def _unit_lights(
 def _linear(
     samples: Samples, units: Float[np.ndarray, "positions moves shots n"]
 ) -> tuple[Float[np.ndarray, "positions moves shots 4"], Float[np.ndarray, "positions moves shots"]]:
-    """Light per colour and background of the shots for each of several expectations, and the cost that remains."""
+    """Fit light per colour and background of the shots for each of several expectations; return them and the cost."""
     rate, weight, colour = (np.asarray(part)[:, None] for part in (samples.rate, samples.weight, samples.colour))
-    # Far from the solution the model is no better than a tenth of the signal.
+    # Far from the solution, the model error is a tenth of the signal or more.
     variance = 1.0 / np.where(weight > 0, weight, 1.0) + (0.1 * np.maximum(rate, 0.0)) ** 2
     root = np.where(weight > 0, 1.0 / np.sqrt(variance), 0.0)
     design = np.concatenate([units[..., None] * colour, np.ones((*units.shape, 1))], axis=-1) * root[..., None]

@@ -1,1 +1,1 @@
-"""A smooth psf field from stamps of point sources, of mosaics too."""
+"""A smooth psf field from stamps of point sources; mosaics are allowed."""

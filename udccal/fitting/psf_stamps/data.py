@@ -17,14 +17,14 @@ from udccal.result import FitStatus
 @final
 @dataclass(frozen=True)
 class Stamps:
-    """What a fit is given: each stamp is cut about one point source; what else shines has been subtracted.
+    """Data of a fit: each stamp is cut about one point source; other light has been subtracted.
 
     Attributes:
         values_e: samples in electrons; NaN where nothing is known.
         position_px: of each stamp's middle sample (``rows // 2, columns // 2``) on the sensor, (x, y).
         read_e: standard deviation of a sample's noise without light, in electrons, quantisation included.
-        clip_e: samples at or above it tell only that they are so.
-        channel: of each sample (0 = R, 1 = G, 2 = B) of raw mosaics; ``None`` where all samples are of one kind.
+        clip_e: level in electrons; a sample at or above it counts only as "at least that bright".
+        channel: of each sample (0 = R, 1 = G, 2 = B) of raw mosaics; ``None`` for one plane.
     """
 
     values_e: Float[np.ndarray, "stars rows columns"]
@@ -55,17 +55,17 @@ class Stamps:
 
     @cached_property
     def known(self) -> Bool[np.ndarray, "stars samples"]:
-        """Which samples of each stamp, row by row, tell something."""
+        """True for samples with a value; each stamp is row by row."""
         return np.isfinite(self.values_e).reshape(len(self.values_e), -1)
 
     @cached_property
     def value_e(self) -> Float[np.ndarray, "stars samples"]:
-        """The samples, zero where nothing is known."""
+        """The samples in electrons, zero where nothing is known."""
         return np.where(self.known, self.values_e.reshape(self.known.shape), 0.0)
 
     @cached_property
     def clipped(self) -> Bool[np.ndarray, "stars samples"]:
-        """Which samples tell only that they are at or above the clipping level."""
+        """True for samples at or above the clipping level."""
         return self.known & (self.value_e >= self.clip_e)
 
     @cached_property
@@ -101,28 +101,28 @@ class StampsRules:
     """The constants of a fit of stamps.
 
     Attributes:
-        least_snr: light over noise of the median stamp, at least.
-        fewest_unclipped: stamps, at least, whose core (1.5 px about the middle) is neither clipped nor missing.
+        least_snr: least light over noise of the median stamp.
+        fewest_unclipped: least number of stamps whose core (1.5 px about the middle) is neither clipped nor missing.
         outlier_sigma: samples further off, in robust sigma, are left out.
-        star_ratio, star_lost: stamps are left out whose mean square is over so many times the median's, or that lose
-            more than such a part of their samples.
-        coarse: degrees of map and images, and the relative model error that is allowed for, of the fits that lead from
-            a round star to a field.
-        spacings_px: of nodes, the coarsest first.
-        worth_finer: nodes are made denser again where the criterion may still fall by so much.
-        highest: degrees of map and images.
-        steps_to_compare, steps_to_end: of one fit at most: of orders that are compared, and of those that are chosen.
-        evidence: converged when the last step brought less log evidence, and the next promises half of it in log
-            posterior. Near the maximum precisions and unknowns go on to trade places by hundredths.
+        star_ratio, star_lost: a stamp is left out if its mean square exceeds the median's by the first factor, or if it
+            loses more than the second fraction of its samples.
+        coarse: degrees of map and images, and the assumed relative model error, of the fits that lead from a round
+            star to a field.
+        spacings_px: spacings of nodes, the coarsest first.
+        worth_finer: expected decrease of the criterion from which denser nodes are tried.
+        highest: largest degrees of map and images.
+        steps_to_compare, steps_to_end: most steps of one fit, for orders that are compared, and for the chosen one.
+        evidence: a fit has converged when the last step gained less log evidence than this, and the next predicts less
+            than half of it in log posterior. Near the maximum, steps still gain hundredths.
         beyond_doubt: log posterior; maps of lower degrees that are expected to lose more are not fitted.
         first_image: precisions before the data: of images of degree 0 (size, roughness) and of higher ones.
-        first_map, first_lateral: of maps of degrees 1 and 2, and of lateral colour.
-        new_image, new_map: of higher degrees, relative to the degree below, and as it is: nearly absent. Where the data
-            ask for them, one update makes them appear.
-        draws: of the posterior: for updates of precisions, and for error bars (5 % of a sigma).
-        inflate_above: reduced chi-squared above which every sigma grows with its root. Counts are skewed: theirs
-            scatters more than that of normal samples.
-        poor_above: reduced chi-squared beyond which this is no psf field.
+        first_map, first_lateral: the same of maps of degrees 1 and 2, and of lateral colour.
+        new_image, new_map: the same of new degrees, relative to the degree below, and absolute. They start nearly
+            absent; one update makes them appear where the data support them.
+        draws: numbers of posterior draws: for updates of precisions, and for error bars (5 % of a sigma).
+        inflate_above: reduced chi-squared above which every sigma grows with its root. Counts are skewed, so that
+            their chi-squared scatters more than that of normal samples.
+        poor_above: reduced chi-squared above which the fit is poor.
     """
 
     least_snr: float = 10.0
@@ -151,7 +151,7 @@ class StampsRules:
 def mosaic_channels(
     cfa: str, position_px: Int[np.ndarray, "stars 2"], rows: int, columns: int
 ) -> Int[np.ndarray, "stars rows columns"]:
-    """Channels of stamps cut from a mosaic; for ``Stamps.channel``.
+    """Return the channels of stamps cut from a mosaic, for ``Stamps.channel``.
 
     Args:
         cfa: pattern of the mosaic, such as "RGGB".
@@ -159,7 +159,7 @@ def mosaic_channels(
         rows, columns: of a stamp.
 
     Returns:
-        0, 1, 2 for R, G, B, of every sample.
+        0, 1, 2 for R, G, B at every sample.
 
     Raises:
         ValueError: when there is no such pattern.
@@ -171,13 +171,13 @@ def mosaic_channels(
 
 
 def centroids(stamps: Stamps, window_px: float) -> Float[np.ndarray, "stars 2"]:
-    """Under a Gaussian that follows, all colours alike: of light per sample, each colour by its own number of them."""
+    """Return each star's centroid, (x, y) in px, under a Gaussian that follows it, from all colours together."""
     centre = np.zeros((len(stamps.unit), 2))
     for _ in range(15):
         off = stamps.offset_px - centre[:, None]
         weight = stamps.by_plane * np.exp(-0.5 * (off**2).sum(axis=2) / window_px**2)
         light = weight * np.maximum(stamps.value_e, 0.0)
-        # The mean under the weight alone is taken off: samples of a mosaic do not lie evenly about the centre.
+        # Subtract the mean under the weight alone: samples of a mosaic do not lie evenly about the centre.
         mean = np.einsum("pks,ksi->pki", weight, off) / np.maximum(weight.sum(axis=2), 1e-300)[..., None]
         top = np.einsum("pks,ksi->ki", light, off) - (light.sum(axis=2)[..., None] * mean).sum(axis=0)
         move = 2 * top / np.maximum(light.sum(axis=(0, 2)), 1e-300)[:, None]
@@ -186,14 +186,14 @@ def centroids(stamps: Stamps, window_px: float) -> Float[np.ndarray, "stars 2"]:
 
 
 def light_of(stamps: Stamps) -> Float[np.ndarray, "stars planes"]:
-    """Sums, scaled up for samples that are missing; in light per pixel of all colours."""
+    """Return each star's light by colour: sums, scaled up for missing samples, as light per pixel of all colours."""
     known = np.maximum(stamps.by_plane.sum(axis=2), 1)
     total = (stamps.value_e * stamps.by_plane).sum(axis=2) * stamps.value_e.shape[1] / known
     return np.maximum(total, 10 * stamps.read_e).T
 
 
 def unusable(stamps: Stamps, rules: StampsRules) -> tuple[FitStatus, str] | None:
-    """What makes a fit impossible, if anything."""
+    """Return a status and a note if a fit is impossible, or None."""
     core = stamps.by_plane & (np.abs(stamps.offset_px).max(axis=1) <= 1.5)
     light = (stamps.value_e * stamps.by_plane).sum(axis=2)
     noise = np.sqrt(np.maximum(light, 0.0) + stamps.by_plane.sum(axis=2) * stamps.read_e**2)
@@ -209,6 +209,6 @@ def unusable(stamps: Stamps, rules: StampsRules) -> tuple[FitStatus, str] | None
 
 
 def offsets(rows: int, columns: int) -> Float[np.ndarray, "samples 2"]:
-    """(x, y) of every sample of a stamp from its middle one, row by row."""
+    """Return (x, y) in px of every sample of a stamp from its middle one, row by row."""
     y, x = np.mgrid[:rows, :columns].reshape(2, -1)
     return np.stack([x - columns // 2, y - rows // 2], axis=1).astype(np.float64)

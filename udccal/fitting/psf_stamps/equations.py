@@ -1,4 +1,4 @@
-"""The equations of a psf field in stamps: nodes by colour, banded, and a dense block of what stars and colours share.
+"""The equations of a psf field in stamps: banded blocks of nodes by colour, and a dense block that colours share.
 
 Nodes are eliminated colour by colour (Schur's complement); the dense block holds places and light of the stars, maps
 and lateral colour. A cubic B-spline spans four rows, so that a row of nodes has entries with itself and the three that
@@ -20,16 +20,16 @@ from udccal.fitting.psf_stamps.data import Stamps
 from udccal.fitting.psf_stamps.field import TAPS, PsfField, degree_of, degrees, polynomials, taps
 from udccal.fitting.psf_stamps.probability import State, Weighted, expectation, laplacian
 
-# What a star may change by itself: relative light, centre (x, y), and the four numbers of its map, row by row.
+# Parameters of one star: relative light, centre (x, y), and the four numbers of its map, row by row.
 OWN = 7
 
 
 @dataclass(frozen=True)
 class Colour:
-    """H x = g of one colour, whose part of the dense block is ``index``; nodes come node by node, not image by image.
+    """H x = g of one colour, whose part of the dense block is ``index``; nodes are ordered node by node, then by image.
 
-    Once nodes are eliminated, ``band`` is their factor U, ``cross`` and ``right_nodes`` are U^-T times theirs, and
-    ``dense`` and ``right_dense`` are what the colour adds to the dense block.
+    After nodes are eliminated, ``band`` is their factor U, and ``cross`` and ``right_nodes`` are U^-T times their own.
+    ``dense`` and ``right_dense`` are the colour's contribution to the dense block.
     """
 
     index: Int[np.ndarray, " own"]
@@ -45,11 +45,11 @@ class Laplace:
     """The Gaussian about the mode next to a state, and the evidence there by Laplace's method.
 
     Attributes:
-        cost: -2 log of the evidence, of an expansion about the state. samples: that tell something.
-        mode: relative to the state. gain: of the log posterior up to the mode.
+        cost: -2 log of the evidence, expanded about the state. samples: number of samples with a value.
+        mode: relative to the state. gain: increase of the log posterior up to the mode.
         root: lower Cholesky factor of the dense block's precision.
-        colours: with their nodes eliminated.
-        tuned: logarithm of what each precision changes by in a step.
+        colours: equations with their nodes eliminated.
+        tuned: logarithm of each precision's factor of change in a step.
     """
 
     cost: float
@@ -62,23 +62,23 @@ class Laplace:
 
     @property
     def evidence(self) -> float:
-        """Its logarithm, of an expansion about the mode."""
+        """Log evidence, expanded about the mode."""
         return self.gain - 0.5 * self.cost
 
     def step(self, damping: float) -> Step:
-        """A part of the way: a raised diagonal would ask for the factors anew."""
+        """Return a part of the way to the mode: a raised diagonal would need new factors."""
         part = 1.0 / (1.0 + damping)
         return Step(part * self.mode, part * self.tuned[None], 2 * self.gain * part * (2 - part))
 
     def draws(self, rng: np.random.Generator, count: int) -> Float[np.ndarray, "unknowns draws"]:
-        """Draws about the mode."""
+        """Draw from the Gaussian about the mode."""
         dense = solve_triangular(self.root, rng.standard_normal((len(self.root), count)), lower=True, trans=1)
         own = [rng.standard_normal((len(c.cross), count)) - c.cross @ dense[c.index] for c in self.colours]
         return np.concatenate([dense, *(divided(c.band, x, False) for c, x in zip(self.colours, own, strict=True))])
 
 
 def laplace(stamps: Stamps, state: State) -> Laplace:
-    """From the equations at a state, priors included; LinAlgError when they are singular."""
+    """Build and solve the equations at a state with priors; raise LinAlgError when they are singular."""
     seen, colours = expectation(stamps, state), []
     size = np.zeros(state.maps_from + len(state.maps))
     for plane in range(state.light_e.shape[1]):
@@ -96,14 +96,14 @@ def laplace(stamps: Stamps, state: State) -> Laplace:
     gain = 0.5 * float(half @ half + sum(c.right_nodes @ c.right_nodes for c in colours))
     diagonals = [np.einsum("rii->ri", c.band[:, :, : c.band.shape[1]]).ravel() for c in colours]
     log_det = 2 * np.log(np.concatenate([np.diag(root), *diagonals])).sum()
-    # Minus twice the log prior, but for constants that all orders share.
+    # Minus twice the log prior, up to constants that all orders have in common.
     prior = float(state.precisions @ state.squares()) - state.volume()[0]
     cost, mode = float(log_det - 2 * seen.log_likelihood + prior), np.concatenate([dense, *nodes])
     return Laplace(cost, int(stamps.known.sum()), mode, gain, root, tuple(colours), np.zeros_like(state.precisions))
 
 
 def marginal_cov(root: Float[np.ndarray, "dense dense"], index: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n n"]:
-    """Covariance of some unknowns of the dense block, all others marginalised."""
+    """Return the covariance of some unknowns of the dense block, with all others marginalised."""
     half = solve_triangular(root, np.eye(len(root))[:, index], lower=True)
     return half.T @ half
 
@@ -111,7 +111,7 @@ def marginal_cov(root: Float[np.ndarray, "dense dense"], index: Int[np.ndarray, 
 def shared_by(
     field: PsfField, unit: Float[np.ndarray, "stars 2"], plane: int
 ) -> tuple[Int[np.ndarray, " own"], scipy.sparse.csr_array]:
-    """Unknowns of the dense block that a colour depends on, and the matrix from these to the stars' own changes."""
+    """Return the dense block's unknowns that a colour depends on, and the matrix to the stars' own changes."""
     planes, stars, one = len(field.nodes), len(unit), np.eye(OWN)
     place = (2 + planes) * np.arange(stars)[:, None] + np.array([0, 1, 2 + plane])
     numbers = stars * (2 + planes) + np.arange(field.warp.size + field.lateral.size)
@@ -126,7 +126,7 @@ def shared_by(
 
 
 def normal_equations(stamps: Stamps, field: PsfField, seen: Weighted, plane: int) -> Colour:
-    """Of one colour, without priors."""
+    """Return the equations of one colour, without priors."""
     basis, grid = polynomials(stamps.unit, field.degrees[1]), field.nodes.shape[2:]
     index, shared = shared_by(field, stamps.unit, plane)
     weight = seen.weight * stamps.by_plane[plane]
@@ -149,10 +149,10 @@ def normal_equations(stamps: Stamps, field: PsfField, seen: Weighted, plane: int
 def node_sums(
     basis: Float[np.ndarray, "stars terms"], seen: Weighted, used: Int[np.ndarray, " used"], grid: tuple[int, ...]
 ) -> Float[np.ndarray, "rows n 4*n"]:
-    """Sums over samples of products of what two nodes bring, as a band."""
-    # Light of a star at position X enters the image t with the factor B_t(X), whatever the sample, and the weights of
-    # a sample's 4 x 4 nodes are products of four down and four across: so what samples of a cell of the grid bring is
-    # a product of pairs down, pairs across, and pairs of polynomials.
+    """Sum products of two nodes' contributions over samples, as a band."""
+    # Light of a star at position X enters the image t with the factor B_t(X), for every sample, and the weights of
+    # a sample's 4 x 4 nodes are products of four down and four across. The contribution of a grid cell's samples is
+    # therefore a product of pairs down, pairs across, and pairs of polynomials.
     (rows, columns), terms, reach = grid, basis.shape[1], TAPS - 1
     down, across = (part.reshape(-1, TAPS)[used] for part in (seen.seen.down, seen.seen.across))
     (one, other), (t, u) = np.triu_indices(TAPS), np.triu_indices(terms)
@@ -162,7 +162,7 @@ def node_sums(
     products = (across[:, one] * across[:, other]).ravel(), index.ravel(), np.arange(0, index.size + 1, len(one))
     sums = scipy.sparse.csc_array(products, shape=(rows * columns * len(one), len(used))) @ right
     sums = sums.reshape(rows, columns, len(one), len(one), -1)[:-reach, :-reach]
-    # Nodes that lie so many columns beside, for all pairs down; then these.
+    # Nodes at each distance in columns, for all pairs down; then these.
     spread = np.zeros((rows - reach, columns, 2 * reach + 1, len(one), len(t)))
     for pair, (j, k) in enumerate(zip(one, other, strict=True)):
         for first, beside in {(j, k - j), (k, j - k)}:
@@ -180,7 +180,7 @@ def node_sums(
 
 
 def factor(band: Float[np.ndarray, "rows n 4*n"]) -> Float[np.ndarray, "rows n 4*n"]:
-    """Cholesky's factor U of U^T U, in the place of the matrix; LinAlgError when that is not positive definite."""
+    """Replace the matrix by Cholesky's factor U of U^T U; raise LinAlgError if it is not positive definite."""
     rows, n = band.shape[:2]
     for i, row in enumerate(band):
         row[:, :n] = cholesky(row[:, :n], check_finite=False)
@@ -193,7 +193,7 @@ def factor(band: Float[np.ndarray, "rows n 4*n"]) -> Float[np.ndarray, "rows n 4
 def divided(
     band: Float[np.ndarray, "rows n 4*n"], right: Float[np.ndarray, "size k"], transposed: bool
 ) -> Float[np.ndarray, "size k"]:
-    """U^-1 right, or U^-T right, of a factor U; ``right`` is overwritten."""
+    """Return U^-1 right, or U^-T right, of a factor U; ``right`` is overwritten."""
     rows, n = band.shape[:2]
     out = right.reshape(rows, n, -1)
     for i in range(rows) if transposed else reversed(range(rows)):
@@ -208,12 +208,12 @@ def divided(
 
 
 def _divide(upper: Float[np.ndarray, "n n"], right: Float[np.ndarray, "n k"], transposed: bool) -> np.ndarray:
-    """U^-1 right, or U^-T right; BLAS sees the transposes, whose columns are contiguous."""
+    """Return U^-1 right, or U^-T right; BLAS gets the transposes, whose columns are contiguous."""
     return np.asarray(dtrsm(1.0, upper.T, right.T, side=1, lower=1, trans_a=int(transposed), overwrite_b=1)).T
 
 
 def _eliminated(colour: Colour, state: State, plane: int) -> Colour:
-    """With the prior of images, its nodes eliminated; what held them is overwritten."""
+    """Add the prior of images and eliminate the nodes; their arrays are overwritten."""
     terms, rows, columns = state.field.nodes.shape[1:]
     scale = scipy.sparse.diags_array(1.0 / state.size[plane].ravel())
     rough = laplacian(rows, columns)[0] @ scale
@@ -237,9 +237,9 @@ def _eliminated(colour: Colour, state: State, plane: int) -> Colour:
 def _dense_prior(
     state: State, size: Float[np.ndarray, " dense"]
 ) -> tuple[Float[np.ndarray, "dense dense"], Float[np.ndarray, " dense"]]:
-    """Precision of the dense block and its right side; what images could do as well (all light, all places) is held."""
+    """Return the dense block's prior precision and right side; it holds changes that images can make as well."""
     seen = size[: state.maps_from].reshape(len(state.light_e), -1)
-    # Stars that are left out altogether stay where they are.
+    # Stars that are left out completely keep their places and light.
     own = np.concatenate([np.where(seen > 0, 0.0, 1.0).ravel(), state.precisions[state.map_groups]])
     values = np.concatenate([np.zeros(seen.size), state.maps])
     held = (np.sqrt(seen.mean(axis=0)) * (seen > 0))[:, :, None] * np.eye(seen.shape[1])

@@ -1,12 +1,12 @@
-"""A psf field seen in stamps: an image whose nodes are polynomials of the position, behind a map that is one as well.
+"""A psf field in stamps: an image whose nodes are polynomials of the position, with a map of polynomials as well.
 
 With w the distance to the centre of the light, X the position and B_t(X) polynomials,
 
     psf(w; X) = 1 / |M(X)|  sum_t B_t(X) P_t(M(X)^-1 (w - L(X))),    M(X) = 1 + sum_t>0 B_t(X) M_t.
 
-The map M says how an image is stretched, sheared and turned over the field, which takes few numbers; images P_t, cubic
-B-splines on a square grid of nodes, carry the rest. L, polynomials too, is how far a colour lies beside the centre
-that all colours of a stamp share.
+The map M stretches, shears and turns an image over the field, with few numbers. Images P_t are cubic B-splines on a
+square grid of nodes and describe the rest. L, of polynomials too, is the distance of a colour's centre from the centre
+that all colours of a stamp have in common.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ class PsfField(eqx.Module):
     Attributes:
         nodes: B-spline coefficients of the images, in light per pixel.
         warp: the map's polynomials without the constant, which is 1.
-        lateral: lateral colour's, in px (x, y), without the constant, which the images carry; of all planes but the
-            reference, beside which they lie.
+        lateral: polynomials of lateral colour, in px (x, y), without the constant, which the images contain; of all
+            planes except the reference, from which it is measured.
         spacing_px: between nodes.
     """
 
@@ -46,36 +46,36 @@ class PsfField(eqx.Module):
 
     @property
     def reference(self) -> int:
-        """The plane that places are of: green, where there are three."""
+        """The plane whose places are the stars': green, where there are three."""
         return 1 if len(self.nodes) == 3 else 0
 
     @property
     def degrees(self) -> tuple[int, int]:
-        """Of the map and of the images."""
+        """Degrees of the map and of the images."""
         return degree_of(1 + self.warp.shape[1]), degree_of(self.nodes.shape[1])
 
     def maps(self, unit: Float[np.ndarray, "stars 2"]) -> Float[np.ndarray, "stars planes 2 2"]:
-        """M at positions scaled to about [-1, 1]."""
+        """Return M at positions scaled to about [-1, 1]."""
         return np.eye(2) + np.einsum("sm,pmij->spij", polynomials(unit, self.degrees[0])[:, 1:], self.warp)
 
     def centres(self, unit: Float[np.ndarray, "stars 2"]) -> Float[np.ndarray, "stars planes 2"]:
-        """L at positions scaled to about [-1, 1], in px."""
+        """Return L in px at positions scaled to about [-1, 1]."""
         every = np.insert(np.asarray(self.lateral), self.reference, 0.0, axis=0)
         return np.einsum("sm,pmi->spi", polynomials(unit, degree_of(1 + every.shape[1]))[:, 1:], every)
 
     def moved(self, changes: Changes) -> PsfField:
-        """The field after the first of some changes."""
+        """Return the field after the first of these changes."""
         maps = np.split(changes.maps[:, 0], [np.size(self.warp)])
         warp, lateral = (old + own.reshape(old.shape) for old, own in zip((self.warp, self.lateral), maps, strict=True))
         return replace(self, nodes=self.nodes + changes.nodes[..., 0], warp=warp, lateral=lateral)
 
 
 class Changes(NamedTuple):
-    """Changes of all that is unknown, ``k`` of them at a time: parts of one vector, in this order.
+    """Changes of all unknowns, ``k`` at a time: parts of one vector, in this order.
 
     Attributes:
         stars: (x, y) in px, then relative light by colour.
-        maps: the map's numbers, then the lateral colour's. With ``stars`` they make the dense block of the equations.
+        maps: the map's numbers, then the lateral colour's. With ``stars`` they form the dense block of the equations.
         nodes: in the vector colour by colour and node by node, the images of a node together.
     """
 
@@ -85,7 +85,7 @@ class Changes(NamedTuple):
 
     @classmethod
     def of(cls, field: PsfField, stars: int, vector: Float[np.ndarray, "unknowns k"]) -> Changes:
-        """The parts of a vector."""
+        """Split a vector into its parts."""
         planes, terms, *grid = field.nodes.shape
         ends = np.cumsum([stars * (2 + planes), np.size(field.warp) + np.size(field.lateral)])
         own, maps, nodes = np.split(vector, ends)
@@ -93,13 +93,13 @@ class Changes(NamedTuple):
 
 
 class Seen(NamedTuple):
-    """What a field brings to samples of stamps, per unit of light.
+    """A field's light in samples of stamps, per unit of a star's light.
 
     Attributes:
-        jacobian: by what a star may change by itself: relative light, centre (x, y), map (row by row).
+        jacobian: derivatives by a star's own parameters: relative light, centre (x, y), map (row by row).
         first: flat index of the first of 4 x 4 nodes.
         down, across: weights of these nodes times 1 / |M|, as a product.
-        inside: whether the sample lies on the grid.
+        inside: True for samples on the grid.
     """
 
     value: Float[Arrayish, "stars samples"]
@@ -111,17 +111,17 @@ class Seen(NamedTuple):
 
 
 def degree_of(terms: int) -> int:
-    """The highest degree of so many polynomials, (d + 1) (d + 2) / 2."""
+    """Return the highest degree d of ``terms`` = (d + 1) (d + 2) / 2 polynomials."""
     return math.isqrt(2 * terms) - 1
 
 
 def degrees(highest: int) -> Int[np.ndarray, " terms"]:
-    """Of every polynomial up to a degree, in their order."""
+    """Return the degree of every polynomial up to the highest, in their order."""
     return np.repeat(np.arange(highest + 1), np.arange(1, highest + 2))
 
 
 def polynomials(unit: Float[np.ndarray, "stars 2"], degree: int) -> Float[np.ndarray, "stars terms"]:
-    """All B_t up to a degree at positions scaled to about [-1, 1]; lower degrees are the first columns of higher."""
+    """Return all B_t up to a degree at positions scaled to about [-1, 1]; lower degrees are the first columns."""
     x, y = (legvander(part, degree) for part in unit.T)
     columns = [x[:, i] * y[:, total - i] for total in range(degree + 1) for i in range(total + 1)]
     return np.stack(columns, axis=1)
@@ -134,10 +134,10 @@ def see(
     offset_px: Float[np.ndarray, "samples 2"],
     plane: Int[np.ndarray, "stars samples"],
 ) -> Seen:
-    """Values and derivatives at samples of colours ``plane``; centres and samples are (x, y) from the middle ones."""
+    """Return values and derivatives at samples of colours ``plane``; centres and samples are (x, y) in px."""
     planes, terms, rows, columns = field.nodes.shape
     images = polynomials(unit, field.degrees[1]) @ np.asarray(field.nodes).reshape(planes, terms, -1)
-    # Compiled once for all orders, and for numbers of nodes and stars up to multiples of these.
+    # One compilation serves all orders, and numbers of nodes and stars up to multiples of these.
     filled = _filled(np.moveaxis(images, 0, 1), (0, 8), (2, 4096))
     by_star = (field.maps(unit), centre_px[:, None] + field.centres(unit), plane.astype(np.int32))
     grid = np.int32(rows), np.int32(columns), np.float64(field.spacing_px)
@@ -146,7 +146,7 @@ def see(
 
 
 def taps(seen: Seen, used: Int[np.ndarray, " used"], grid: tuple[int, ...]) -> scipy.sparse.csr_array:
-    """From the nodes of each star's image to the samples ``used`` (flat, in order)."""
+    """Return the matrix from the nodes of each star's image to the samples ``used`` (flat, in order)."""
     stars, samples = seen.first.shape
     step = (np.arange(TAPS)[:, None] * grid[1] + np.arange(TAPS)).ravel()
     index = seen.first.ravel()[used, None] + step + grid[0] * grid[1] * (used // samples)[:, None]
@@ -156,7 +156,7 @@ def taps(seen: Seen, used: Int[np.ndarray, " used"], grid: tuple[int, ...]) -> s
 
 
 def _filled(values: Shaped[np.ndarray, "..."], *multiples: tuple[int, int]) -> Shaped[np.ndarray, "..."]:
-    """Repeats what is last along some axes up to a multiple."""
+    """Repeat the last entry along some axes up to a multiple."""
     widths = [(0, 0)] * values.ndim
     for axis, multiple in multiples:
         widths[axis] = (0, -values.shape[axis] % multiple)
@@ -174,10 +174,10 @@ def response(
     columns: Int[Arrayish, ""],
     spacing_px: Float[Arrayish, ""],
 ) -> Seen:
-    """``see`` of images, maps and centres at each star; nodes beyond ``rows * columns`` only fill up."""
+    """Compute ``see`` from images, maps and centres at each star; nodes beyond ``rows * columns`` are padding."""
 
     def star(image: Array, warp: Array, centre: Array, own: Array) -> Seen:
-        # By hand: a decomposition, even of 2 x 2, takes long to compile.
+        # The explicit inverse: a decomposition, even of 2 x 2, takes long to compile.
         thinner = 1.0 / (warp[:, 0, 0] * warp[:, 1, 1] - warp[:, 0, 1] * warp[:, 1, 0])
         turned = jnp.stack([warp[:, 1, 1], -warp[:, 0, 1], -warp[:, 1, 0], warp[:, 0, 0]], axis=1)
         inverse, scale = (thinner[:, None] * turned).reshape(-1, 2, 2)[own], thinner[own]
@@ -201,7 +201,7 @@ def response(
 def _weights(
     place: Float[Array, " samples"], nodes: Int[Arrayish, ""]
 ) -> tuple[Int[Array, " samples"], Float[Array, "samples 4"], Float[Array, "samples 4"], Bool[Array, " samples"]]:
-    """First node, weights and their derivatives, and whether all four nodes exist (else the weights are zero)."""
+    """Return first node, weights, derivatives, and True where all four nodes exist (else the weights are zero)."""
     cell = jnp.floor(place)
     f = (place - cell)[:, None]
     first = cell.astype(jnp.int32) - 1

@@ -1,4 +1,4 @@
-"""Fit a psf field to stamps of point sources: orders, places and light found along with it, and true error bars."""
+"""Fit a psf field to stamps of point sources, with orders, places and light, and calibrated error bars."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from udccal.result import Diagnostic, FitResult, FitStatus, Outliers
 
 
 class Kernels(NamedTuple):
-    """Kernels, the model's centres beside theirs, light in the window; changes along the factor, of light relative."""
+    """Kernels, model centres relative to theirs, light in the window; changes along the factor (relative for light)."""
 
     value: Float[np.ndarray, "n pixels"]
     centre_px: Float[np.ndarray, "n 2"]
@@ -37,7 +37,7 @@ class Kernels(NamedTuple):
 
 
 class Sources(NamedTuple):
-    """The stars of a fit in the term's convention: (x, y) from the middle sample, and light in the window by colour."""
+    """A fit's stars in the term's convention: (x, y) from the middle sample, and light in the window by colour."""
 
     place_px: Float[np.ndarray, "stars 2"]
     place_sigma_px: Float[np.ndarray, "stars 2"]
@@ -50,18 +50,18 @@ class Sources(NamedTuple):
 class StampsPsf:
     """The psf field of stamps; every colour of a mosaic is a plane.
 
-    A kernel sums to 1 over its window. Its centre is where the centroid under a Gaussian of ``window_px`` vanishes, of
-    the field's reference plane; other planes keep their lateral colour beside it.
+    A kernel sums to 1 over its window. The centroid of the field's reference plane, under a Gaussian of ``window_px``,
+    is the kernel's centre; other planes keep their lateral colour relative to it.
 
     Attributes:
         field: of all colours.
         factor: of the covariance of all unknowns, in the order of ``Changes``: draws of the posterior over the root of
-            their number, so that sigmas are known to 5 %. It holds what the model leaves unexplained.
+            their number, so that sigmas are known to 5 %. It includes the inflation by the misfit.
         centre_px, half_px: positions scale as (p - centre) / half; beyond one half the field is extrapolated.
         rows, columns: of kernels.
         window_px: standard deviation of the Gaussian that weights centroids.
         star_px, star_place_px, star_light_e: of the stars in the fit: middle samples on the sensor; the model's own
-            centres and light, of which ``sources`` are the convention's.
+            centres and light, which ``sources`` converts to the convention.
     """
 
     field: PsfField
@@ -77,21 +77,21 @@ class StampsPsf:
 
     @in_float64
     def predict(self, position_px: Float[np.ndarray, "n 2"], plane: int = 0) -> Float[np.ndarray, "n rows columns"]:
-        """Kernels of light centred on the middle sample, at positions (x, y) on the sensor in px."""
+        """Return kernels centred on the middle sample, at positions (x, y) on the sensor in px."""
         parts = [kernels.value for kernels in replace(self, factor=self.factor[:, :0])._kernels(position_px, plane)]
         return np.concatenate(parts).reshape(-1, self.rows, self.columns)
 
     @in_float64
     def sigma(self, position_px: Float[np.ndarray, "n 2"], plane: int = 0) -> Float[np.ndarray, "n rows columns"]:
-        """One standard deviation of every pixel of ``predict``."""
+        """Return one standard deviation of every pixel of ``predict``."""
         parts = [np.linalg.norm(kernels.change, axis=2) for kernels in self._kernels(position_px, plane)]
         return np.concatenate(parts).reshape(-1, self.rows, self.columns)
 
     @in_float64
     def relative_l2(self, position_px: Float[np.ndarray, "n 2"], plane: int = 0) -> Float[np.ndarray, "n 2"]:
-        """Error of ``predict`` that is to be expected, relative to the kernel's L2 norm: root mean square, and spread.
+        """Return the expected error of ``predict`` relative to the kernel's L2 norm: root mean square, and spread.
 
-        After the best amplitude and shift, which are a matter of convention.
+        The error is the one after the best amplitude and shift, which are a matter of convention.
         """
         each = []
         for kernels in self._kernels(position_px, plane):
@@ -103,7 +103,7 @@ class StampsPsf:
 
     @in_float64
     def sources(self) -> Sources:
-        """Places and light of the stars in the fit, with one standard deviation."""
+        """Return places and light of the stars in the fit, with one standard deviation."""
         own = Changes.of(self.field, len(self.star_px), self.factor).stars
         light, relative = self.star_light_e.copy(), np.zeros_like(self.star_light_e)
         for plane in range(light.shape[1]):
@@ -117,7 +117,7 @@ class StampsPsf:
         return Sources(self.star_place_px - centre, sigma_px, light, light * relative)
 
     def changed(self, vector: Float[np.ndarray, " unknowns"]) -> StampsPsf:
-        """The term with changes of its unknowns, in the order of ``Changes``: what the posterior of a fit draws."""
+        """Return the term with changes of its unknowns, in the order of ``Changes``; a fit's posterior draws these."""
         changes = Changes.of(self.field, len(self.star_px), vector[:, None])
         return replace(
             self,
@@ -127,7 +127,7 @@ class StampsPsf:
         )
 
     def _kernels(self, position_px: Float[np.ndarray, "n 2"], plane: int) -> Iterator[Kernels]:
-        """Kernels with their changes, eight positions at a time: numbers that need not be compiled anew."""
+        """Yield kernels with their changes, eight positions at a time: this size needs one compilation."""
         grid = offsets(self.rows, self.columns)
         window = grid * np.exp(-0.5 * (grid**2).sum(axis=1) / self.window_px**2)[:, None]
         for start in range(0, len(position_px), 8):
@@ -145,7 +145,7 @@ class StampsPsf:
     def _centres(
         self, unit: Float[np.ndarray, "n 2"], window: Float[np.ndarray, "pixels 2"]
     ) -> Float[np.ndarray, "n 2"]:
-        """Where the model's centre must lie for the reference plane's centroid to vanish, by Newton's method."""
+        """Find the model's centre for which the reference plane's centroid is 0, by Newton's method."""
         centre, grid = np.zeros_like(unit), offsets(self.rows, self.columns)
         plane = np.full((len(unit), len(grid)), self.field.reference)
         for _ in range(20):
@@ -160,7 +160,7 @@ class StampsPsf:
     def _light(
         self, unit: Float[np.ndarray, "n 2"], centre: Float[np.ndarray, "n 2"], plane: int
     ) -> tuple[Float[np.ndarray, "n pixels"], Float[np.ndarray, "n pixels k"], Float[np.ndarray, "n pixels 2"]]:
-        """The model's light, how it changes along the columns of the factor, and its derivatives by the centre."""
+        """Return the model's light, its changes along the columns of the factor, and its derivatives by the centre."""
         field, grid, k = self.field, offsets(self.rows, self.columns), self.factor.shape[1]
         changes = Changes.of(field, len(self.star_px), self.factor)
         seen = see(field, unit, centre, grid, np.full((len(unit), len(grid)), plane))
@@ -180,17 +180,17 @@ class StampsPsf:
 def fit_psf_stamps(
     stamps: Stamps, orders: Orders | None = None, seed: int = 0, rules: StampsRules | None = None
 ) -> FitResult[StampsPsf]:
-    """The psf field of stamps.
+    """Fit the psf field of stamps.
 
     Args:
-        stamps: of at least four point sources; checked when they were made.
-        orders: degrees and spacing of nodes; found by the data when left out.
-        seed: of the draws that stand for the posterior.
+        stamps: of at least four point sources, in electrons; checked when they were made.
+        orders: degrees and spacing of nodes; None to choose them by the evidence.
+        seed: of the draws that represent the posterior.
         rules: see ``StampsRules``.
 
     Returns:
-        A result whose term predicts kernels and their sigma anywhere in the field. Its estimates are the relative L2
-        error to be expected at the stamps' positions, and the coefficients of the map.
+        A result whose term predicts kernels and their sigma anywhere in the field. Its estimates are the expected
+        relative L2 error at the stamps' positions, and the coefficients of the map.
 
     Raises:
         FitError: when there are fewer than four stamps.
@@ -214,13 +214,13 @@ def _report(
     posterior, seen = laplace(stamps, state), expectation(stamps, state)
     draws, used = posterior.draws(np.random.default_rng(seed), rules.draws[1]), seen.weight > 0
     z = (seen.residual * np.sqrt(seen.weight))[used]
-    # All unknowns (but all light and all places together, which are held), less what the priors say of them.
+    # All unknowns (except total light and common shift, which are held), less the part that the priors determine.
     held = float(state.precisions @ state.squares(draws))
     effective = state.field.nodes.size + len(state.maps) + state.maps_from - 2 - state.light_e.shape[1] - held
     chi2_dof = float(z @ z) / max(z.size - effective, 1.0)
     inflation = float(np.sqrt(chi2_dof)) if chi2_dof > rules.inflate_above else 1.0
     term = _term(stamps, state, draws * (inflation / np.sqrt(rules.draws[1])))
-    # The error to be expected, then the maps' coefficients, named by colour, element and degrees in x and y.
+    # The expected error, then the maps' coefficients, named by colour, element and degrees in x and y.
     size, spread = np.sqrt((term.relative_l2(term.star_px, term.field.reference) ** 2).mean(axis=0))
     warp = state.field.warp
     cov = inflation**2 * marginal_cov(posterior.root, state.maps_from + np.arange(warp.size))
@@ -258,7 +258,7 @@ def _term(stamps: Stamps, state: State, factor: np.ndarray) -> StampsPsf:
     stars = stamps.position_px.astype(np.float64), state.centre_px, state.light_e
     (centre, half), (_, rows, columns) = stamps.frame_px, stamps.values_e.shape
     term = StampsPsf(state.field, factor, centre, half, rows, columns, WINDOW_PX, *stars)
-    # A Gaussian as wide as the kernel, by its noise-equivalent area of 4 pi sigma^2.
+    # A Gaussian of the kernel's width, by its noise-equivalent area of 4 pi sigma^2.
     kernel = term.predict(term.centre_px[None], state.field.reference)
     return replace(term, window_px=float(1 / np.sqrt(4 * np.pi * (kernel**2).sum())))
 

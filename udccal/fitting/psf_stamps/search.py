@@ -1,4 +1,4 @@
-"""Which orders a psf field needs: tried from a middle one, a degree at a time, by how likely each makes the data.
+"""The search for the orders of a psf field: from a middle one, a degree at a time, by evidence.
 
 The criterion is -2 log of the evidence (fields, places and light integrated out by Laplace's method), plus the
 logarithm of the number of samples for each precision that was tuned (Schwarz, "Estimating the dimension of a model",
@@ -31,36 +31,36 @@ Found = Solution[State, Laplace]
 @final
 @dataclass(frozen=True)
 class Evidence:
-    """The engine's problem: a step goes to the likeliest state, and sets the precisions by empirical Bayes."""
+    """The engine's problem: a step goes to the most probable state, and sets the precisions by empirical Bayes."""
 
     stamps: Stamps
     rules: StampsRules
     name: str = "psf field of stamps"
 
     def equations_at(self, place: State) -> Laplace:
-        """Of infinite cost where the equations are singular."""
+        """Return the equations, of infinite cost where they are singular."""
         try:
             found = laplace(self.stamps, place)
         except np.linalg.LinAlgError:
             return Laplace(np.inf, 1, np.zeros(0), np.inf, np.zeros((0, 0)), (), np.zeros(0))
-        # The same draws every time, so that a descent comes to an end.
+        # The draws are the same every time, so that a descent ends.
         left = place.squares(found.draws(np.random.default_rng(0), self.rules.draws[0]))
         (_, expected), there = place.volume(), place.shifted(found.mode).squares()
         # Fellner and Schall: squares that the prior expects, less those that the data leave open, over those found;
         # no more than 30 times as much at once, and no more than 1e14, where a term is absent.
         ratio = np.clip(np.maximum(expected - left, 1e-6 * expected) / np.maximum(there, 1e-300), 1 / 30, 30.0)
         tuned = np.minimum(np.log(ratio), np.log(1e14 / place.precisions))
-        # Without the factors, the largest arrays of a fit: never are there two of them.
+        # Drop the factors, the largest arrays of a fit, so that memory never holds two of them.
         return replace(found, tuned=tuned, colours=())
 
     def moved(self, place: State, step: Step) -> State:
-        """Along all unknowns, and along the logarithms of the precisions."""
+        """Return the state after a step of all unknowns, and of the logarithms of the precisions."""
         return replace(place.shifted(step.shared), precisions=place.precisions * np.exp(step.own[0]))
 
 
 def improve(stamps: Stamps, state: State, rules: StampsRules, steps: int) -> Found:
-    """The likeliest state nearby, or where so many steps, and one more, lead to; LinAlgError when singular at first."""
-    # The last step tells more than the next one's promise: that knows nothing of the precisions.
+    """Go to the most probable state nearby, in ``steps`` and one more at most; LinAlgError if singular at first."""
+    # The last step's gain is more reliable than the next one's prediction, which ignores the precisions.
     ends = dict(least_gain=0.0, stalled_gain=2 * rules.evidence, small_gain=rules.evidence)
     solver = SolverRules(iterations=steps, first_damping=0.03, most_damping=10.0, **ends)
     problem = Evidence(stamps, rules)
@@ -71,13 +71,13 @@ def improve(stamps: Stamps, state: State, rules: StampsRules, steps: int) -> Fou
 
 
 def without_outliers(stamps: Stamps, state: State, rules: StampsRules) -> State:
-    """The state without samples, and stars, that the model does not explain; those it does explain come back."""
+    """Leave out samples and stars that the model does not explain, and take back those that it does explain."""
     everything, out = replace(state, keep=np.ones_like(state.keep)), np.asarray(~state.keep.any(axis=1))
     if out.any():
-        # Left alone, a star that was out would be compared at the place and light it had when the field was coarse.
+        # Otherwise a star that was left out would be compared at its place and light of a coarse field.
         everything = _placed(stamps, everything, out)
     seen = expectation(stamps, everything)
-    # Clipped samples cannot be far off in one direction.
+    # Clipped samples are not tested: their errors have a bound on one side.
     used = (seen.weight > 0) & ~stamps.clipped
     z = np.where(used, seen.residual * np.sqrt(seen.weight), 0.0)
     keep = ~OutlierRule("samples", rules.outlier_sigma).off(z, used)
@@ -89,7 +89,7 @@ def without_outliers(stamps: Stamps, state: State, rules: StampsRules) -> State:
 
 
 def _placed(stamps: Stamps, state: State, stars: Bool[np.ndarray, " stars"]) -> State:
-    """Some stars' places and light fitted anew, the field being as it is."""
+    """Fit some stars' places and light again, with the field held."""
     for _ in range(4):
         seen = expectation(stamps, state)
         by_light = seen.seen.jacobian[..., :1] * np.moveaxis(stamps.by_plane, 0, 2)
@@ -104,7 +104,7 @@ def _placed(stamps: Stamps, state: State, stars: Bool[np.ndarray, " stars"]) -> 
 @final
 @dataclass(frozen=True)
 class Orders:
-    """Degrees of the map and of the images over the field, and how many px lie between nodes."""
+    """Degrees of the map and of the images over the field, and spacing of nodes in px."""
 
     warp: int
     image: int
@@ -112,17 +112,17 @@ class Orders:
 
     @classmethod
     def of(cls, state: State) -> Orders:
-        """Of a state."""
+        """Return the orders of a state."""
         return cls(*state.field.degrees, state.field.spacing_px)
 
     @property
     def name(self) -> str:
-        """For the table of candidates."""
+        """Name in the table of candidates."""
         return f"map degree {self.warp}, image degree {self.image}, nodes every {self.spacing_px:g} px"
 
 
 def start(stamps: Stamps, rules: StampsRules) -> State:
-    """A state of the lowest orders: a round image of the stamps' size."""
+    """Return a state of the lowest orders: a round image of the stamps' size."""
     planes, spacing_px = len(stamps.by_plane), rules.spacings_px[0]
     y, x = (np.arange(n) - (n - 1) / 2 for n in grid_size(stamps.values_e.shape[1:], spacing_px, 1.1))
     image = np.exp(-0.5 * (y[:, None] ** 2 + x**2) * (spacing_px / WINDOW_PX) ** 2) + 1e-3
@@ -135,7 +135,7 @@ def start(stamps: Stamps, rules: StampsRules) -> State:
 
 
 def coarse(stamps: Stamps, rules: StampsRules, most: Orders) -> State:
-    """Places, light and a first field; what the model cannot follow yet is allowed for as an error of its own."""
+    """Fit places, light and a first field, with a model error for the parts that the model cannot describe yet."""
     state = start(stamps, rules)
     for warp, image, allowed in rules.coarse:
         state = replace(state.with_degrees(min(warp, most.warp), min(image, most.image), rules), model_error=allowed)
@@ -147,8 +147,8 @@ def coarse(stamps: Stamps, rules: StampsRules, most: Orders) -> State:
 
 
 def search(stamps: Stamps, rules: StampsRules, orders: Orders | None) -> Choice[Found]:
-    """The orders, found unless they are given, and their fit; LinAlgError when equations are singular."""
-    # No more polynomials than half the stars.
+    """Search for the orders, unless they are given, and fit; raise LinAlgError when equations are singular."""
+    # Degrees have at most half as many polynomials as there are stars.
     limit = max(d for d in range(9) if d == 0 or 2 * polynomial_terms(d) <= len(stamps.unit))
     warp, image = (min(limit, highest) for highest in rules.highest)
     most = orders or Orders(warp, image, rules.spacings_px[0])
@@ -167,14 +167,14 @@ def search(stamps: Stamps, rules: StampsRules, orders: Orders | None) -> Choice[
 
 
 def attempt(stamps: Stamps, found: Found, more: float = 0.0) -> Attempt[Found]:
-    """With its criterion; ``more`` log evidence than the equations have."""
+    """Return a fit with its criterion; ``more`` adds to the equations' log evidence."""
     state = found.place
     criterion = np.log(stamps.known.sum()) * len(state.precisions) - 2 * (found.equations.evidence + more)
     return Attempt(Orders.of(state).name, state.field.nodes.size + len(state.maps), float(criterion), found)
 
 
 def _degrees(stamps: Stamps, state: State, rules: StampsRules, most: Orders) -> list[Attempt[Found]]:
-    """All that were tried, going from neighbour to neighbour until none is better."""
+    """Return all fits of a search that goes from neighbour to neighbour until none is better."""
     best = attempt(stamps, improve(stamps, state, rules, rules.steps_to_compare + 1))
     tried, known = [best], {Orders.of(state)}
     while True:
@@ -190,7 +190,7 @@ def _degrees(stamps: Stamps, state: State, rules: StampsRules, most: Orders) -> 
 
 
 def _judged(stamps: Stamps, best: Attempt[Found], orders: Orders, rules: StampsRules) -> Attempt[Found]:
-    """A fit of these degrees, or what the curvature says of it, where a map that matters is left out beyond doubt."""
+    """Fit these degrees, or predict the fit by curvature if a map that matters beyond doubt is left out."""
     place, warp = best.fit.place, best.fit.place.field.warp
     dropped = np.arange(warp.size).reshape(warp.shape)[:, polynomial_terms(orders.warp) - 1 :].ravel()
     value, cov = place.maps[dropped], marginal_cov(best.fit.equations.root, place.maps_from + dropped)
@@ -202,7 +202,7 @@ def _judged(stamps: Stamps, best: Attempt[Found], orders: Orders, rules: StampsR
 
 
 def _spacings(stamps: Stamps, tried: list[Attempt[Found]], rules: StampsRules) -> list[Attempt[Found]]:
-    """With the best degrees on denser nodes, as long as the last gain lets expect another that is worth it."""
+    """Try the best degrees on denser nodes, while the last gain predicts another that is large enough."""
     gain, first, *finer = np.inf, *rules.spacings_px
     for spacing in finer:
         best = choose(tried).best
