@@ -19,7 +19,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 def run(*words: str | Path) -> str:
-    done = subprocess.run([sys.executable, *map(str, words)], capture_output=True, text=True, timeout=280, cwd=ROOT)
+    done = subprocess.run([sys.executable, *map(str, words)], capture_output=True, text=True, timeout=1000, cwd=ROOT)
     assert done.returncode == 0, done.stderr
     return done.stdout
 
