@@ -69,7 +69,7 @@ def mean_response(result: FitResult[Noise], light: Float[np.ndarray, " n"]) -> F
     """Mean signal above black in DN that the fitted response predicts, saturation at most.
 
     Args:
-        result: of the noise fit (EMVA 1288, clause 6.7, judges the response).
+        result: of the noise fit (EMVA 1288, clause 6.7, evaluates the response).
         light: in the unit of the fitted levels (photons per pixel, or seconds).
     """
     numbers = {item.name: item.value for item in result.diagnostics}

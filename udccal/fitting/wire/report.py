@@ -103,7 +103,7 @@ class Omitted:
 def omitted(start: WireStart, wire: Wire, seen: Weighed, rules: WireRules) -> Omitted | None:
     """Look for the omitted harmonics at the fitted shape, with a round pupil; None where the fit omits none.
 
-    The pixels may be those of the fit, since it absorbs little of so many harmonics.
+    The pixels may be those of the fit, since it absorbs little of hundreds of harmonics.
     """
     left_out = possible_harmonics(start, rules.least_counted, rules.least_amplitude)
     if not len(left_out.bounds):

@@ -130,7 +130,7 @@ class Search:
             return rivals
         room = np.zeros((min(count, len(harmonics)), 2, degree + 1, degree + 1))
         other = self._descent(replace(best.wire, amplitudes=room), best.gains, sample, SOLVER)
-        # Chance, or noise somewhat larger than given, must not add so many parameters.
+        # Chance, or noise somewhat larger than given, must not add that many parameters.
         return [other] if other.variance < 0.95 * variance else rivals
 
     def _descent(self, wire: Wire, gains: Float[np.ndarray, " sites"], pixels: Pixels, rules: SolverRules) -> Descent:
