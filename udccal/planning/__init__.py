@@ -1,1 +1,1 @@
-"""How much to capture: what planned frames will tell, by their Fisher information, before any is taken."""
+"""How much to capture: the sigma that planned frames will give, predicted from their Fisher information."""

@@ -1,6 +1,6 @@
 """Prediction for backscatter: the fit's likelihood at its own positions, for pictures as the procedure shows them.
 
-Some pictures are drawn as the procedure draws them and represent all. Others, which it does not show, are to be
+A few pictures, drawn as the procedure draws them, represent all. Others, which the procedure does not show, are to be
 predicted: they are samples without weight.
 """
 
@@ -26,9 +26,9 @@ from udccal.planning.state import WHITE, EvenField, RigState, sample_variance_e
 from udccal.planning.steps import PlannedStep, planned_steps, without_pictures
 from udccal.rig import Captures
 
-# So many pictures of the procedure represent all, since drawing them takes long: more are more of the same kind.
+# Number of the procedure's pictures that represent all: drawing takes long, and further ones are of the same kind.
 _DRAWN: Final = 6
-# Of pictures that no calibration shows, whose light is to be predicted.
+# Pictures that no calibration shows, whose light is to be predicted.
 _NEW_SEEDS: Final = (9001, 9002, 9003)
 _SHOWN: Final = slice(1, -1 - len(_NEW_SEEDS))
 _NEW: Final = slice(_SHOWN.stop, -1)
@@ -48,14 +48,14 @@ class BackscatterPredictor:
         theta = linear_of(self._x)
         template = nominal_backscatter(state.geometry, rig, np.zeros((3, 1, 1)), step_px, window=1)
         template = replace(template, window=window_for(template, theta, rays, _RULES.slack_px))
-        # Where in the field the light falls: what leaves the panel evenly is shaded like everything else.
+        # Shading of the scattered light: light that leaves the panel evenly is shaded as all light is.
         grid = rig.camera.rows // step_px, rig.camera.columns // step_px
         rows, columns = np.divmod(flat, grid[1])
         self._shading = EvenField(state).at(step_px * (np.stack([columns, rows], axis=1) + 0.5) - 0.5)
         self._mask = _white_light(state, flat, self._shading)
         # The fit looks at some of the sensor's bins.
         self._every = grid[0] * grid[1] / len(flat)
-        # What a sample's variance, and that of a row's offset, come to in a bin's average.
+        # Factors from a sample's variance, and from that of a row's offset, to the variance of a bin's average.
         bins, one = Bins(rig.camera.cfa, step_px), np.ones((rig.camera.rows, rig.camera.columns))
         self._by_sample = bins.variance(one).reshape(3, -1)[:, flat]
         self._by_row = bins.row_variance(one).reshape(3, -1)[:, flat]
@@ -65,17 +65,17 @@ class BackscatterPredictor:
         self._jacobian = jacobian * linear_slope(self._x)[:, None, None, None]
 
     def sigma(self, captures: Captures) -> float:
-        """Root mean square over sensor, colours and pictures, of these' peaks; see ``Predictor``."""
+        """Root mean square over sensor, colours and pictures, relative to the pictures' peaks; see ``Predictor``."""
         planned = self._planned(captures)
         return float("inf") if planned is None else self._light_sigma(*planned)
 
     def used(self, captures: Captures) -> float:
-        """Of all bins, a part tells the kernel; see ``Predictor``."""
+        """Less than 1, since the fit uses only some of the sensor's bins; see ``Predictor``."""
         planned = self._planned(captures)
         return 1.0 if planned is None else (self._light_sigma(*planned, self._every) / self._light_sigma(*planned)) ** 2
 
     def floor(self) -> Floor:
-        """What a profile's fit found its model to leave out, of a new picture's peak; nothing where there is none."""
+        """The model error that a profile's fit found, of a new picture's peak; 0 without a profile."""
         almost_none = np.full(self._mask.shape, 1e-15)
         endless = self._binned(almost_none, almost_none, almost_none)
         return Floor(
@@ -84,7 +84,7 @@ class BackscatterPredictor:
         )
 
     def _light_sigma(self, seen: Binned, pictures: int, count: float = 1.0) -> float:
-        """Bins represent ``count`` of them each where the parameters are concerned."""
+        """Sigma of new pictures' light in per cent of their peak; bins count ``count`` times for the parameters."""
         error = self._state.model_errors.backscatter
         weight = seen.weights(seen.rate, self._mask, error, seen.usable)
         weight[_SHOWN] *= np.sqrt(pictures / len(weight[_SHOWN]))
@@ -98,7 +98,7 @@ class BackscatterPredictor:
         return 100.0 * float(np.sqrt(variance.mean() / (peak**2).mean()))
 
     def _planned(self, captures: Captures) -> tuple[Binned, int] | None:
-        """Shots of the pictures drawn, and how many pictures there are; None where these are too few."""
+        """Shots of the pictures drawn, and the number of pictures in all; None where these are too few."""
         steps = list(planned_steps("backscatter", without_pictures(self._state.with_captures(captures))))
         shown = [step for step in steps if isinstance(step.arrangement, PanelPicture)]
         darks = [step for step in steps if isinstance(step.arrangement, Dark)]
@@ -108,7 +108,7 @@ class BackscatterPredictor:
         return self._binned(shot, rest, dark), len(shown) - 1
 
     def _binned(self, shot: PerBin, rest: PerBin, dark: PerBin) -> Binned:
-        """Shots with these variances, in units in which white, shaded, is 1 where it is brightest."""
+        """Shots with these variances, in units of the brightest light of a shaded white picture."""
         light = self._mask * self._ratio
         by_shot = np.broadcast_to(rest, light.shape).copy()
         by_shot[-1] = dark
@@ -136,7 +136,7 @@ def _white_light(state: RigState, flat: Int[np.ndarray, " n"], shading: Float[np
 
 
 def _pictures(state: RigState) -> Pictures:
-    """As the procedure shows them, and last those for the prediction."""
+    """Pictures as the procedure shows them, followed by those for the prediction."""
     panel, crop = state.rig.panel, visible_crop(state.geometry, state.rig)
     few = state.with_captures(state.rig.captures.model_copy(update={"backscatter_pictures": _DRAWN}))
     shown = [

@@ -1,6 +1,7 @@
 """Design variables of a capture, and the cheapest design that reaches a sigma.
 
-The design of the best gain per second is added to until the sigma is reached, then pruned. No chance in it.
+The search starts from the least captures and repeats the addition with the best gain per second until the sigma is
+reached. Then it prunes the design. It uses no random numbers.
 """
 
 from __future__ import annotations
@@ -15,17 +16,17 @@ from udccal.planning.steps import Cost
 from udccal.rig import Captures
 from udccal.sessions.schema import TermName
 
-# One step up adds this share of what there is, and one at least.
+# One step up adds this part of the present number, and one at least.
 _SHARE: Final = 0.25
 _MOST_ADDITIONS: Final = 200
-# An addition that lowers the logarithm of sigma by less than this is none.
+# An addition that lowers the logarithm of sigma by less than this does not count.
 _LEAST_GAIN: Final = 1e-6
 
 
 @final
 @dataclass(frozen=True)
 class DesignVariable:
-    """One number of ``Captures``, with the least that the term's fit can judge itself by, and the most to be asked.
+    """One number of ``Captures``, between the least with which the term's fit can test itself and the most allowed.
 
     ``counted`` says in words what the number counts.
     """
@@ -46,7 +47,7 @@ class DesignVariable:
 
 DESIGN_VARIABLES: Final = MappingProxyType[TermName, tuple[DesignVariable, ...]](
     {
-        # PRNU and DSNU live on the stack, K on the levels: below these, noise's other numbers would suffer.
+        # PRNU and DSNU depend on the stack, K on the levels: with fewer, the other noise quantities would suffer.
         "noise": (
             DesignVariable("noise_levels", 5, 400, "levels of light"),
             DesignVariable("noise_stack", 8, 1000, "frames of a stack"),
@@ -70,7 +71,7 @@ DESIGN_VARIABLES: Final = MappingProxyType[TermName, tuple[DesignVariable, ...]]
 @final
 @dataclass(frozen=True)
 class Objective:
-    """What captures of one term would give, and what they take."""
+    """Sigma and cost of one term's captures, as functions of the captures."""
 
     term: TermName
     sigma: Callable[[Captures], float]
@@ -80,7 +81,7 @@ class Objective:
 @final
 @dataclass(frozen=True)
 class Addition:
-    """One design variable one step up: by how much the logarithm of sigma falls, and what it takes."""
+    """One design variable one step up: the fall of the logarithm of sigma, and the cost."""
 
     variable: DesignVariable
     captures: Captures
@@ -107,7 +108,7 @@ def worthwhile(objective: Objective, design: Captures) -> list[Addition]:
     found = []
     for variable, more in one_step_up(objective.term, design):
         after = objective.sigma(more)
-        # From what cannot be told at all, anything that can is a gain.
+        # From an infinite sigma, any finite one is a gain.
         gain = math.log(before / after) if math.isfinite(before) else 100.0 if math.isfinite(after) else 1.0
         if gain > _LEAST_GAIN:
             found.append(Addition(variable, more, gain, objective.cost(more) - spent))
@@ -115,7 +116,7 @@ def worthwhile(objective: Objective, design: Captures) -> list[Addition]:
 
 
 def cheapest(objective: Objective, captures: Captures, target: float) -> Captures | None:
-    """The captures with the term's design variables such that sigma is at most ``target``; None where none are."""
+    """The cheapest captures found whose sigma is at most ``target``; None where no captures reach it."""
     design = least_captures(objective.term, captures)
     for _ in range(_MOST_ADDITIONS):
         if objective.sigma(design) <= target:
@@ -128,7 +129,7 @@ def cheapest(objective: Objective, captures: Captures, target: float) -> Capture
 
 
 def _pruned(objective: Objective, design: Captures, target: float) -> Captures:
-    """Every variable at its least that still reaches the target, the one that saves most time first."""
+    """Lower every variable as far as the target allows, beginning with the one that saves most time."""
     while True:
         lower = [_lowered(objective, design, target, variable) for variable in DESIGN_VARIABLES[objective.term]]
         best = min(lower, key=lambda one: objective.cost(one).seconds)
@@ -138,7 +139,7 @@ def _pruned(objective: Objective, design: Captures, target: float) -> Captures:
 
 
 def _lowered(objective: Objective, design: Captures, target: float, variable: DesignVariable) -> Captures:
-    """Halving the interval: more captures never tell less."""
+    """Lower one variable by halving an interval, since more captures never raise sigma."""
     low, high = variable.least - 1, variable.of(design)
     while high - low > 1:
         middle = (low + high) // 2

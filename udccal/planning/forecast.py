@@ -1,7 +1,7 @@
-"""The sigma expected of a term's captures: as planned, of endless ones, and against the number of each.
+"""The sigma expected of a term's captures: as planned, in the limit of endless ones, and against the number of each.
 
-Every term has a predictor: expected data at the planned exposures, through the equations of the term's own fit, give
-its information and with it the sigma of one quantity, in which people speak of the term.
+Every term has a predictor. It puts expected data at the planned exposures through the equations of the term's own fit.
+Their information gives the sigma of one quantity, which stands for the term.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from udccal.planning.wire import WirePredictor
 from udccal.rig import Captures
 from udccal.sessions.schema import TermName
 
-# From a quarter of what was captured to four times as much.
+# Curves reach from a quarter of what was captured to four times as much.
 _REACH: Final = 4.0
 _POINTS: Final = 9
 # Design variables that change sigma by less than this part of it do not matter to the quantity.
@@ -44,14 +44,14 @@ _PREDICTORS: Final = MappingProxyType[TermName, Callable[[RigState], Predictor]]
 
 
 def predictor_for(term: TermName, state: RigState) -> Predictor:
-    """What predicts a term of a rig."""
+    """The predictor of a term, for one rig."""
     return _PREDICTORS[term](state)
 
 
 @final
 @dataclass(frozen=True)
 class Curve:
-    """Sigma against one design variable, all others as they were; ``now`` is what was captured."""
+    """Sigma against one design variable, the others unchanged; ``now`` is the number that was captured."""
 
     variable: DesignVariable
     now: int
@@ -60,7 +60,7 @@ class Curve:
 
     @property
     def most_gain(self) -> float:
-        """By which factor sigma falls from what was captured to the most that is looked at."""
+        """Factor by which sigma falls from ``now`` to the largest of ``counts``."""
         at = float(np.exp(np.interp(np.log(self.now), np.log(self.counts), np.log(self.sigma))))
         return at / float(self.sigma[-1])
 
@@ -68,15 +68,15 @@ class Curve:
 @final
 @dataclass(frozen=True)
 class Forecast:
-    """What a term's captures bring, and what more or fewer of them would.
+    """The sigma that a term's captures give, and that more or fewer of them would give.
 
     Attributes:
-        quantity: what ``sigma`` is of, and its unit.
-        sigma: predicted at what was captured.
-        floor: what no captures get below.
-        used: part of the frames' information on the quantity that the fit, at its default effort, spends; 1 is all.
-        curves: one per design variable that matters.
-        idle: what the variables count that do not matter to the quantity.
+        quantity: name of the quantity that ``sigma`` belongs to, and its unit.
+        sigma: predicted for the present captures.
+        floor: the sigma that no captures can lower.
+        used: part of the frames' information on the quantity that the fit, at its default effort, uses; 1 is all.
+        curves: one per design variable on which sigma depends.
+        idle: names of the other design variables, in words.
     """
 
     term: TermName
@@ -89,10 +89,18 @@ class Forecast:
 
 
 def forecast(term: TermName, state: RigState) -> Forecast | None:
-    """Of one term at a state's captures; None where these do not suffice for a fit.
+    """Forecast the sigma of one term.
+
+    Args:
+        term: of which term.
+        state: the rig with its present captures, and the terms as expected.
+
+    Returns:
+        sigma, its floor and its curves, in the unit of ``QUANTITIES``; None where the captures do not suffice for a
+        fit.
 
     Raises:
-        UdccalError: when no procedure is installed, or the one that is does not tell what it will take.
+        UdccalError: when no procedure is installed, or a step of it does not state its frames and exposure.
     """
     predictor, captures = predictor_for(term, state), state.rig.captures
     sigma = predictor.sigma(captures)

@@ -1,7 +1,7 @@
-"""Prediction for geometry: the bundle of the boards that the procedure asks for, and how sure rays are for the panel.
+"""Prediction for geometry: the bundle of the boards that the procedure asks for, and the sigma of rays to the panel.
 
-A planned view holds the corners that it would show and their scatter; the fit's own equations give the covariance of
-intrinsics and poses, of which the board on the jig has the panel's rotation.
+A planned view holds the corners that it would show, with their scatter. The fit's own equations give the covariance of
+intrinsics and poses. The pose of the board on the jig gives the panel's rotation.
 """
 
 from __future__ import annotations
@@ -42,14 +42,14 @@ from udccal.rig import Captures
 _ACROSS = 17
 # Stands for endless views.
 _MANY = 1e6
-# What a saddle leaves out of a corner, by axis, where no profile has measured it. Edges of the board on the jig run
-# along the sensor's rows: samples meet them at few phases, and corners scatter more than on boards that lean.
+# Scatter of corners by axis in addition to noise, where no profile has measured it. Edges of the board on the jig run
+# along the sensor's rows: samples see them at few phases, and corners scatter more than on boards that lean.
 _ON_JIG_PX, _BY_HAND_PX = 0.0085, 0.006
 # White paper reflects so much more than black ink that half the difference is this part of white.
 _HALF_CONTRAST = 0.47
 # Edges after lens, pixel and the filter that makes a grey picture of a mosaic (one sigma).
 _EDGE_PX = 1.0
-# Radius of a saddle's window in squares: markers stand beyond it.
+# Radius of a saddle's window in squares: markers lie outside it.
 _WINDOW_SQUARES = 0.16
 _RULES = GeometryRules()
 _places, _directions = jax.jit(project_directions), jax.jit(panel_directions)
@@ -58,7 +58,7 @@ _places, _directions = jax.jit(project_directions), jax.jit(panel_directions)
 @final
 @dataclass(frozen=True)
 class _View:
-    """Corners that a planned view would show, on the board, in px and with their scatter; its pose, board to camera."""
+    """Corners that a planned view would show (on the board, in px, with scatter), and its pose, board to camera."""
 
     board: Float[np.ndarray, "n 3"]
     image: Float[np.ndarray, "n 2"]
@@ -83,7 +83,7 @@ class GeometryPredictor:
         return self._ray_sigma(self._views(captures), 1.0)
 
     def floor(self) -> Floor:
-        """Where endless views have told all of the lens."""
+        """The sigma when endless views held by hand have determined the lens."""
         return Floor(
             self._ray_sigma(self._views(self._state.rig.captures), _MANY),
             "The panel's rotation rests on the one view of the board on the jig: a larger or nearer board there, or "
@@ -91,7 +91,7 @@ class GeometryPredictor:
         )
 
     def used(self, captures: Captures) -> float:
-        """All corners; see ``Predictor``."""
+        """1, since the fit uses all corners; see ``Predictor``."""
         return 1.0
 
     def _views(self, captures: Captures) -> list[_View]:
@@ -105,7 +105,7 @@ class GeometryPredictor:
 
     @in_float64
     def _ray_sigma(self, views: list[_View], count: float) -> float:
-        """Views held by hand stand for ``count`` of them each."""
+        """Sigma in px of rays, by axis, where each view held by hand counts ``count`` times."""
         parallel = [k for k, view in enumerate(views) if view.parallel]
         if not parallel:
             return float("inf")
@@ -129,7 +129,7 @@ class GeometryPredictor:
         return float(np.sqrt((sigma**2).mean()))
 
     def _order(self, points: Points, bundle: Bundle) -> Bool[np.ndarray, "9"]:
-        """The distortions that the data are expected to ask for, by the fit's own criterion, n ln(chi2) + k ln(n)."""
+        """The order of the distortion that the fit is expected to choose, by its own BIC, n ln(chi2) + k ln(n)."""
         equations = BundleProblem(points, EVERY, self._prior).equations_at(bundle)
         cov, samples = equations.cov(), equations.samples
         freedom = max(samples - EVERY.sum() - bundle.poses.size, 1)
@@ -154,7 +154,7 @@ def _planned_view(state: RigState, field: EvenField, step: PlannedStep, board: B
     square_px = board.spec.square_mm / depth * Intrinsics.of(intrinsics).focal_px[0]
     radius = float(np.clip(_WINDOW_SQUARES * square_px, *_RULES.window_px))
     whole = _inside(state, marks, 1.0).reshape(-1, 4).all(axis=1)
-    # Corners both of whose markers are in the picture: without them the detector does not know their numbers.
+    # Only corners with both markers in the picture count: without these the detector does not know their numbers.
     near = np.linalg.norm(corners[:, None] - markers.reshape(-1, 4, 3).mean(axis=1), axis=2) < board.spec.square_mm
     good = _inside(state, image, np.ceil(radius) + 1) & ~(near & ~whole).any(axis=1)
     if depth <= 0 or good.sum() < _RULES.least_corners:
@@ -172,7 +172,7 @@ def _planned_view(state: RigState, field: EvenField, step: PlannedStep, board: B
 def _noise_px(
     state: RigState, field: EvenField, step: PlannedStep, pixels: Float[np.ndarray, "n 2"], radius: float
 ) -> Float[np.ndarray, " n"]:
-    """Scatter of saddles by temporal noise of the board's frames; boards are divided by far more frames of the flat."""
+    """Scatter of saddles by temporal noise of the board's frames; that of the flat field, of far more, is left out."""
     white = (step.level or 0.0) * state.full_well_e * field.at(pixels)
     signal = white[:, None] * np.array(WHITE)[[0, 1, 1, 2]] / max(WHITE)
     temporal = sample_variance_e(state, 0.5 * signal, step.exposures_s[0]) / len(step.exposures_s)
@@ -187,7 +187,7 @@ def _saddle_scatter(radius_px: float) -> float:
     weight = np.clip(1 - (x**2 + y**2) * (_EDGE_PX / radius_px) ** 2, 0.0, None).ravel()
     across = np.sqrt(2 / np.pi) / _EDGE_PX * np.exp(-0.5 * x**2) * erf(y / np.sqrt(2))
     design = np.stack([across.ravel(), y.ravel()], axis=1)
-    # Windows weigh samples unlike their noise: the covariance is a sandwich.
+    # The window's weights are not those of the noise: the covariance is a sandwich.
     solved = np.linalg.solve(design.T @ (design * weight[:, None]), (design * weight[:, None]).T)
     return float(np.linalg.norm(solved[0]))
 

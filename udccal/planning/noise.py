@@ -26,7 +26,7 @@ class NoisePredictor:
     def __init__(self, state: RigState) -> None:
         self._state = state
         pixels = sensor_samples(state.rig, _SAMPLES_ACROSS)
-        # Neighbours in both directions: every site of the CFA has its share.
+        # Samples are neighbours in both directions, so that every site of the CFA is among them.
         sites = np.concatenate([pixels + shift for shift in np.mgrid[0:2, 0:2].reshape(2, -1).T])
         self._light = EvenField(state).signal(sites)
         noise = state.noise
@@ -37,7 +37,7 @@ class NoisePredictor:
         self._V0, self._rounding = max((self._K * sigma_d) ** 2 - row_DN**2, 1e-4), q_DN**2 / 12
 
     def sigma(self, captures: Captures) -> float:
-        """Of K, in per cent; see ``Predictor``."""
+        """Sigma of K in per cent of K; see ``Predictor``."""
         steps = list(planned_steps("noise", self._state.with_captures(captures)))
         pairs = [step for step in steps if len(step.exposures_s) == 2]
         flats = [step for step in pairs if isinstance(step.arrangement, FlatLight)]
@@ -54,15 +54,15 @@ class NoisePredictor:
         return 100.0 * float(np.sqrt(cov[0, 0])) / self._K
 
     def floor(self) -> Floor:
-        """None: every further pair tells more."""
+        """0, since every further pair lowers sigma."""
         return Floor(0.0, "")
 
     def used(self, captures: Captures) -> float:
-        """All pairs; see ``Predictor``."""
+        """1, since the fit uses all pairs; see ``Predictor``."""
         return 1.0
 
     def _levels(self, level: Float[np.ndarray, " levels"], exposure_s: Float[np.ndarray, " levels"]) -> Levels:
-        """Pairs of flats, of which every place looked at is a bin; their light is not known."""
+        """Pairs of flats as the transfer fit takes them: each sampled place is a bin, and the light is unknown."""
         full_DN = self._K * self._state.full_well_e
         dark_DN = self._K * self._dark_e_per_s * exposure_s
         light_DN = full_DN * level[:, None] * self._light
@@ -80,7 +80,7 @@ class NoisePredictor:
         )
 
     def _dark(self, exposure_s: Float[np.ndarray, " pairs"]) -> DarkVariance:
-        """Pairs of dark frames."""
+        """Dark variance as the pairs of dark frames would give it."""
         dark_DN = self._K * self._dark_e_per_s * exposure_s
         variance = temporal_variance(dark_DN, self._K, self._V0, 0.0, self._rounding)
         sigma = variance * np.sqrt(2 / (self._state.rig.camera.rows * self._state.rig.camera.columns))

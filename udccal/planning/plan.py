@@ -1,4 +1,4 @@
-"""A capture plan: for every term with a target the cheapest captures that reach it, what they take, what helps next."""
+"""A capture plan: the cheapest captures that reach every term's target, their cost, and the most useful additions."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from udccal.planning.steps import NOTHING, Cost, cost_of
 from udccal.rig import Captures
 from udccal.sessions.schema import TermName
 
-# A target this much above the floor takes captures without end.
+# A target closer to the floor than this factor needs endless captures.
 _NEAR_FLOOR: Final = 1.001
 _FORM: Final = re.compile(r"(?P<term>[^=\s]+)=(?P<value>[-+.0-9]*(?:[eE][-+]?[0-9]+)?)(?P<unit>%|[a-zA-Z]*)")
 _EXAMPLE: Final = "Write, for example, wire=0.05% or geometry=0.1px."
@@ -27,7 +27,7 @@ _EXAMPLE: Final = "Write, for example, wire=0.05% or geometry=0.1px."
 @final
 @dataclass(frozen=True)
 class Target:
-    """One standard deviation that a term is to reach, in the unit of ``QUANTITIES``."""
+    """The sigma that a term is to reach, in the unit of ``QUANTITIES``."""
 
     term: TermName
     sigma: float
@@ -46,7 +46,7 @@ class Setting:
 @final
 @dataclass(frozen=True)
 class Suggestion:
-    """One design variable one step up: by how much sigma falls in per cent of itself, and what that takes."""
+    """One design variable one step up: the fall of sigma in per cent of itself, and the cost."""
 
     term: TermName
     setting: Setting
@@ -60,10 +60,10 @@ class TermPlan:
     """The plan of one term.
 
     Attributes:
-        target, sigma, floor: in ``unit``; ``sigma`` is that of the planned captures, ``floor`` of endless ones.
-        reached: whether the planned captures reach the target; where they do not, they are the rig's own.
-        lowered_by: what would lower the floor; empty where there is none.
-        per_second, per_set_up: the single additions that help most; None where none helps.
+        target, sigma, floor: in ``unit``; ``sigma`` is that of the planned captures, ``floor`` that of endless ones.
+        reached: whether the planned captures reach the target; where no captures do, they are the rig's own.
+        lowered_by: change that would lower the floor; empty where there is no floor.
+        per_second, per_set_up: the additions that lower sigma most per second and per set-up; None where none does.
     """
 
     term: TermName
@@ -85,7 +85,7 @@ class TermPlan:
 @final
 @dataclass(frozen=True)
 class CapturePlan:
-    """The whole plan: captures of all terms, and what they take, those without a target as the rig has them."""
+    """The whole plan: captures and cost of all terms; terms without a target keep the rig's captures."""
 
     captures: Captures
     terms: tuple[TermPlan, ...]
@@ -97,15 +97,21 @@ class CapturePlan:
 
     @property
     def reached(self) -> bool:
-        """Whether every target is."""
+        """Whether the plan reaches every target."""
         return all(term.reached for term in self.terms)
 
 
 def parse_targets(words: Sequence[str]) -> tuple[Target, ...]:
-    """Targets such as ``wire=0.05%``, in the order of the terms.
+    """Read targets such as ``wire=0.05%``.
+
+    Args:
+        words: one target each: a term, "=", and a sigma with the term's unit of ``QUANTITIES``.
+
+    Returns:
+        the targets in the order of the terms.
 
     Raises:
-        UdccalError: when a word is no target, names no term or another unit, or the terms repeat.
+        UdccalError: when a word is no target, names no term or a wrong unit, or a term has two targets.
     """
     targets = [_target(word) for word in words]
     terms = [target.term for target in targets]
@@ -146,8 +152,11 @@ def make_plan(
         targets: one per term at most.
         progress: called with a term's name when its plan begins.
 
+    Returns:
+        captures and cost of every term, with the additions that would help most.
+
     Raises:
-        UdccalError: when a procedure is not installed, or does not tell what it takes.
+        UdccalError: when a procedure is not installed, or a step of it does not state its frames and exposure.
     """
     captures, plans = state.rig.captures, []
     for target in targets:
@@ -207,6 +216,6 @@ def _most_per_second(suggestions: Iterable[Suggestion | None]) -> Suggestion | N
 
 
 def _most_per_set_up(suggestions: Iterable[Suggestion | None]) -> Suggestion | None:
-    """What takes no set-up goes first."""
+    """The suggestion that lowers sigma most per set-up; suggestions without a set-up go first."""
     made = filter(None, suggestions)
     return max(made, key=lambda one: (one.cost.set_ups <= 0, one.gain_percent / max(one.cost.set_ups, 1)), default=None)

@@ -1,4 +1,4 @@
-"""What a term's predictor is: the sigma of one quantity, in which people speak of the term, and its floor."""
+"""The interface of a term's predictor: the sigma of one quantity, which stands for the term, and its floor."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from udccal.sessions.schema import TermName
 @final
 @dataclass(frozen=True)
 class Quantity:
-    """What the sigma of a term is of, and its unit."""
+    """The quantity whose sigma stands for a term: its unit and its meaning."""
 
     unit: str
     meaning: str
@@ -33,7 +33,7 @@ QUANTITIES: Final = MappingProxyType[TermName, Quantity](
 @final
 @dataclass(frozen=True)
 class Floor:
-    """The sigma that is left however much is captured, in the quantity's unit, and what would lower it."""
+    """The sigma that no number of captures lowers, in the quantity's unit, and a change that would lower it."""
 
     sigma: float
     lowered_by: str
@@ -41,13 +41,13 @@ class Floor:
 
 @runtime_checkable
 class Predictor(Protocol):
-    """Predicts one term of one rig; remembers what does not change with the captures."""
+    """Predicts one term of one rig; it keeps the results that do not depend on the captures."""
 
     def sigma(self, captures: Captures) -> float:
-        """Of the term's quantity; infinite where the captures do not suffice for a fit."""
+        """Sigma of the term's quantity; infinite where the captures do not suffice for a fit."""
 
     def floor(self) -> Floor:
-        """In the limit of endless captures."""
+        """Sigma in the limit of endless captures."""
 
     def used(self, captures: Captures) -> float:
-        """Part of the captures' information on the quantity that the fit, at its default effort, spends; 1 is all."""
+        """Part of the captures' information on the quantity that the fit, at its default effort, uses; 1 is all."""

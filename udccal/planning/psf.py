@@ -1,8 +1,8 @@
 """Prediction for the psf: the equations of the diffraction fit, for LEDs as they are expected to be seen.
 
-A few places stand for all; each shot's own parameters (place, light per colour, background) are estimated along. A
-sample has what its bracket tells of its rate, and PRNU. The fit looks at no more positions and shifts than its rules
-say, so that more of them bring nothing.
+A few places represent all. Each shot's nuisance parameters (place, light per colour, background) are eliminated. The
+variance of a sample is that of its bracket's rate, and PRNU. The fit uses no more positions and shifts than its rules
+state, so that further ones do not lower sigma.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ from udccal.planning.state import WHITE, RigState, built_wire, sample_variance_e
 from udccal.planning.steps import PlannedStep, planned_steps
 from udccal.rig import Captures
 
-# Steps of one term are alike but for their place: a design of so few shows how each is exposed.
+# Steps of the term differ only in their place: a design of this few shows how each is exposed.
 _SAMPLE: Final = {"psf_columns": 1, "psf_rows": 1, "psf_shifts": 1}
 _EXPOSURES: Final = next(one for one in DESIGN_VARIABLES["psf"] if one.name == "psf_exposures")
-# Places in fractions of the sensor, and shifts in px, that stand for all: of the field, and of the procedure's grid,
-# which reaches nearly to the border.
+# Places in fractions of the sensor and shifts in px that represent all, for the field and for the procedure's grid.
+# The grid reaches nearly to the border.
 _FIELD: Final = ((0.45, 0.55), (0.15, 0.2), (0.85, 0.7))
 _CAPTURED: Final = ((0.05, 0.06), (0.5, 0.94), (0.9, 0.5))
 _SHIFTS_PX: Final = np.array([[0.4, 1.3], [1.7, 0.2]])
@@ -55,7 +55,7 @@ class PsfPredictor:
         problem, place = _expected(state, shots, evaluator, self._prior)
         field, field_place = _part(problem, place, slice(len(_FIELD)))
         self._captured, self._place = _part(problem, place, slice(len(_FIELD), None))
-        # At weights that make every colour's kernel count 1, the equations hold its squared derivatives.
+        # With weights that give every colour's kernel the norm 1, the equations hold its squared derivatives.
         relative = replace(field, samples=_relative(field.samples, shots))
         self._of_kernel = _per_shot([one.shared for one in relative.by_position(field_place)])
         self._known: dict[tuple[float, ...], Float[np.ndarray, "p p"]] = {}
@@ -66,13 +66,13 @@ class PsfPredictor:
         return self._kernel_sigma(captures, shots) if shots else float("inf")
 
     def used(self, captures: Captures) -> float:
-        """Of all positions and shifts, a part; see ``Predictor``."""
+        """Less than 1 where there are more positions and shifts than the fit uses; see ``Predictor``."""
         shots = self._shots_used(captures)
         every = captures.psf_columns * captures.psf_rows * captures.psf_shifts
         return self._of_noise(captures, every) / self._of_noise(captures, shots) if shots else 1.0
 
     def floor(self) -> Floor:
-        """All that the fit looks at, endlessly bright."""
+        """The sigma of all positions and shifts that the fit uses, at endless light."""
         most, shots = _EXPOSURES.set(self._state.rig.captures, _EXPOSURES.most), _RULES.positions * _RULES.shifts
         if self._state.model_errors.psf_kernel**2 > self._of_noise(most, shots):
             why = "That much of the kernel the fit of the present profile could not describe; no capture changes it."
@@ -84,7 +84,7 @@ class PsfPredictor:
         return Floor(self._kernel_sigma(most, shots), why)
 
     def _shots_used(self, captures: Captures) -> int:
-        """Pictures that the fit of diffraction looks at; 0 where there are too few positions."""
+        """Number of pictures that the diffraction fit uses; 0 where there are too few positions."""
         positions = captures.psf_columns * captures.psf_rows
         fitted = int((~held_out_positions(positions)).sum())
         used = min(fitted, _RULES.positions) * min(captures.psf_shifts, _RULES.shifts)
@@ -94,7 +94,7 @@ class PsfPredictor:
         return 100.0 * float(np.sqrt(self._of_noise(captures, shots) + self._state.model_errors.psf_kernel**2))
 
     def _of_noise(self, captures: Captures, shots: int) -> float:
-        """Squared relative L2 error of the kernel by noise, mean over places and colours."""
+        """Squared relative L2 error of the kernel by noise, averaged over places and colours."""
         few = self._state.with_captures(captures.model_copy(update=_SAMPLE))
         step = next(step for step in planned_steps("psf", few) if isinstance(step.arrangement, Led))
         if step.exposures_s not in self._known:
@@ -104,7 +104,7 @@ class PsfPredictor:
 
     @in_float64
     def _information(self, step: PlannedStep) -> Float[np.ndarray, "p p"]:
-        """Of one shot on the parameters of diffraction, mean over the places that stand for all."""
+        """Information of one shot on the diffraction parameters, averaged over the places that represent all."""
         merged = replace(self._captured, samples=_merged(self._state, self._captured.samples, step))
         return _per_shot([one.marginal()[0] for one in merged.by_position(self._place)])
 
@@ -114,9 +114,9 @@ def _per_shot(matrices: list[Float[np.ndarray, "p p"]]) -> Float[np.ndarray, "p 
 
 
 def _merged(state: RigState, samples: Samples, step: PlannedStep) -> Samples:
-    """The samples with what its bracket tells of every sample, PRNU, and what a profile's fit has left out.
+    """The samples weighted by their brackets' noise, PRNU, and the model error that a profile's fit found.
 
-    Exposures that would fill a sample's well tell nothing of it.
+    Exposures that would fill a sample's well do not count for it.
     """
     full_e, light = (step.level or 0.0) * state.full_well_e, np.maximum(np.asarray(samples.rate), 0.0)
     known = np.zeros_like(light)
@@ -130,7 +130,7 @@ def _merged(state: RigState, samples: Samples, step: PlannedStep) -> Samples:
 
 
 def _relative(samples: Samples, shots: Shots) -> Samples:
-    """At weights by which squared errors of light sum up to the squared relative L2 error, mean over colours."""
+    """The samples with weights under which squared errors sum to the squared relative L2 error, mean over colours."""
     count, light, colour = (
         stands_for(shots, _RULES)[samples.index],
         np.asarray(samples.rate),
@@ -141,7 +141,7 @@ def _relative(samples: Samples, shots: Shots) -> Samples:
 
 
 def _expected(state: RigState, shots: Shots, evaluator: Evaluator, prior: Prior) -> tuple[DiffractionProblem, Place]:
-    """What the diffraction fit would be given of each place; light is that of its start, 1 for the brightest sample."""
+    """The diffraction fit's problem at each place; the light is that of its start, 1 for the brightest sample."""
     made = gather(shots, state.geometry, choose_samples(shots, _RULES))
     problem = DiffractionProblem(made, evaluator, prior).with_overlaps(prior.mean)
     own = np.tile([0.0, 0.0, *WHITE, 0.0], (shots.positions, len(_SHIFTS_PX), 1))
@@ -156,14 +156,14 @@ def _part(problem: DiffractionProblem, place: Place, which: slice) -> tuple[Diff
 
 
 def _half(captures: Captures) -> tuple[int, int]:
-    """(rows, columns) to either side of the LED that a region fills, as the fit has it."""
+    """(rows, columns) of the fit's region to either side of the LED."""
     sides = (captures.psf_region_rows, captures.psf_region_columns)
     rows, columns = (max(4, min(most, side // 2 - 4)) for most, side in zip(_RULES.half_px, sides, strict=True))
     return rows, columns
 
 
 def _dark_shots(state: RigState, half: tuple[int, int]) -> Shots:
-    """Where the shots are and what colour their samples have; their light is yet to come."""
+    """Shots with the places and colours of their samples, still without light."""
     rig, captures = state.rig, state.rig.captures
     middles = np.floor(np.array([*_FIELD, *_CAPTURED]) * [rig.camera.columns, rig.camera.rows] / 2) * 2
     aims = (middles[:, None] + _SHIFTS_PX).reshape(-1, 2)

@@ -1,4 +1,4 @@
-"""A rig description with planned captures, as a new file: everything else stays as it was written, comments too."""
+"""Write a rig description with planned captures to a new file; everything else stays as written, comments too."""
 
 from __future__ import annotations
 
@@ -18,10 +18,13 @@ _SECTION: Final = re.compile(r"^\[captures\][^\n]*\n(?:(?!\[)[^\n]*(?:\n|\Z))*",
 
 
 def check_absent(path: Path) -> None:
-    """Nothing may be at a path that is to be written.
+    """Check that nothing exists at a path that is to be written.
+
+    Args:
+        path: of the new file.
 
     Raises:
-        RigError: when something is.
+        RigError: when something exists there.
     """
     if path.exists() or path.is_symlink():
         raise RigError(f"Expected nothing at {path}, found that it exists. Move it away, or choose another name.")
@@ -30,8 +33,13 @@ def check_absent(path: Path) -> None:
 def write_planned_rig(rig_name: str | Path, captures: Captures, path: Path) -> None:
     """Write the description of a rig with other captures to a new file.
 
+    Args:
+        rig_name: name of a known rig, or the folder of its description.
+        captures: replace the description's own.
+        path: of the new file; missing folders are made.
+
     Raises:
-        RigError: when something is at ``path`` already, it cannot be written, or the description cannot be taken over.
+        RigError: when ``path`` exists or cannot be written, or when the captures of the description cannot be replaced.
     """
     check_absent(path)
     source = find_rig(rig_name) / "rig.toml"
@@ -48,7 +56,7 @@ def write_planned_rig(rig_name: str | Path, captures: Captures, path: Path) -> N
 
 
 def with_captures(text: str, captures: Captures) -> str:
-    """The description's text with another block of captures; one at its end where there was none."""
+    """The description's text with another block of captures, added at its end where there was none."""
     lines = [f"{name} = {value!r}" for name, value in captures.model_dump().items()]
     block = "\n".join(["[captures]", *lines]) + "\n"
     found = _SECTION.search(text)
@@ -59,7 +67,7 @@ def with_captures(text: str, captures: Captures) -> str:
 
 
 def _check(before: str, after: str, captures: Captures, source: Path) -> None:
-    """The new text must say what the old one says, but for the captures."""
+    """Check that the new text differs from the old one in the captures alone."""
     try:
         wanted = RigDescription.model_validate({**tomllib.loads(before), "captures": captures.model_dump()})
         found = RigDescription.model_validate(tomllib.loads(after))

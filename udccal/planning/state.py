@@ -1,4 +1,4 @@
-"""What a plan takes for true: the rig's nominal values or those that fits have measured, and light in an even field."""
+"""The assumptions of a plan: the rig's nominal values or those that fits have measured, and light in an even field."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ from udccal.profiles.profile import Profile
 from udccal.result import FitResult, FitStatus
 from udccal.rig import Captures, RigDescription
 
-# What no data sheet of an industrial camera says: EMVA 1288 numbers as its reports commonly show them.
+# Numbers that data sheets of industrial cameras leave out, as EMVA 1288 reports commonly show them.
 _SIGMA_D_E, _LAMBDA, _SIGMA_ROW_E = 5.0, 0.14, 0.6
 _DARK_E_PER_S, _DSNU_E, _PRNU = 15.0, 2.0, 0.0055
 # White light of LEDs as red, green and blue photodiodes see it.
 WHITE = (0.6, 1.0, 0.7)
-# Lenses of a short focal length bend about so much (k1, k2).
+# Distortion (k1, k2) that is usual for lenses of a short focal length.
 _DISTORTION = (-0.07, 0.035, 0.0, 0.0, -0.005)
-# Shading is smooth; the ripple of rows on top of it hardly matters to how many electrons there are.
+# Shading is smooth; the modulation by the rows hardly changes the number of electrons.
 _FIELD_GRID = (49, 65)
-# How long things take to fill the wells: flats and boards are lit so that they do within a frame.
+# Exposures that fill the wells. Flats and boards are lit so that they fill them within a frame.
 _LED_FULL_S, _PANEL_FULL_S = 125e-6, 0.1
 _wire_values = jax.jit(wire_values, static_argnums=(2, 3))
 
@@ -41,14 +41,14 @@ _wire_values = jax.jit(wire_values, static_argnums=(2, 3))
 @final
 @dataclass(frozen=True)
 class ModelErrors:
-    """What the models leave undescribed, beside noise, as a profile's fits have found it.
+    """Model errors of the terms, in addition to noise, as a profile's fits have found them.
 
     Attributes:
-        on_jig_px, by_hand_px: scatter of a board's corners by axis beside noise; None where not known.
-        wire, psf: relative error of the model; the psf's is what its fit allows for, see ``fitting.psf.data.left_out``.
-        psf_kernel: relative L2 error of the kernel beside noise where it was not captured.
-        backscatter: error of a ratio to white.
-        inflation: of the variances of the backscatter's parameters, whose residuals hang together.
+        on_jig_px, by_hand_px: scatter of a board's corners by axis in addition to noise; None where not known.
+        wire, psf: relative model error; the psf's is that which its fit allows for, see ``fitting.psf.data.left_out``.
+        psf_kernel: relative L2 error of the kernel, in addition to noise, where it was not captured.
+        backscatter: error of the ratio to white.
+        inflation: factor on the variances of the backscatter's parameters, since its residuals are correlated.
     """
 
     on_jig_px: float | None = None
@@ -63,13 +63,13 @@ class ModelErrors:
 @final
 @dataclass(frozen=True)
 class RigState:
-    """A rig, and the terms as they are expected to come out.
+    """A rig, and the terms that its calibration is expected to give.
 
     Attributes:
-        rig: with the captures that are looked at.
-        noise, geometry: as expected.
-        wire, backscatter: as a profile has measured them; None: as built.
-        model_errors: errors beside noise.
+        rig: with the captures that are evaluated.
+        noise, geometry: expected terms.
+        wire, backscatter: terms that a profile has measured; None stands for the rig as built.
+        model_errors: errors in addition to noise.
     """
 
     rig: RigDescription
@@ -91,7 +91,14 @@ class RigState:
 
 
 def nominal_state(rig: RigDescription) -> RigState:
-    """From the rig's description alone."""
+    """The state of a rig that was never calibrated.
+
+    Args:
+        rig: its description, with the captures that are evaluated.
+
+    Returns:
+        terms at the description's nominal values, with usual noise and distortion, and no model errors.
+    """
     camera = rig.camera
     K, black = camera.K_DN_per_e.value, camera.black_DN.value
     noise = Noise(
@@ -110,7 +117,15 @@ def nominal_state(rig: RigDescription) -> RigState:
 
 
 def measured_state(rig: RigDescription, fits: Calibration | Profile) -> RigState:
-    """A rig at the values of its fits; terms that these hold as absent, or could not tell, stand as built."""
+    """The state of a rig that was calibrated.
+
+    Args:
+        rig: its description, with the captures that are evaluated.
+        fits: of that rig.
+
+    Returns:
+        terms and model errors as fitted; a term whose fit did not converge is that of the rig as built.
+    """
     nominal = nominal_state(rig)
     geometry_seen = _converged(fits.geometry)
     return RigState(
@@ -136,19 +151,19 @@ def _converged(result: FitResult[Any]) -> bool:
 
 
 def _corners_px(geometry: FitResult[Geometry], name: str) -> float | None:
-    """Scatter of corners beside noise, disagreement of views included; None where the fit does not tell."""
+    """Scatter of corners in addition to noise, disagreement of views included; None where the fit lacks the number."""
     if all(item.name != name for item in geometry.diagnostics):
         return None
     return _diagnostic(geometry, name) * float(np.sqrt(max(_diagnostic(geometry, "variance_factor"), 1.0)))
 
 
 def _diagnostic(result: FitResult[Any], name: str) -> float:
-    """0 where the fit does not tell."""
+    """A diagnostic of a fit by its name; 0 where the fit has none of that name."""
     return next((item.value for item in result.diagnostics if item.name == name), 0.0)
 
 
 def full_s(arrangement: Arrangement, state: RigState) -> float:
-    """Exposure at which the brightest sample of what stands before the camera would fill its well."""
+    """Exposure in seconds at which the brightest sample of an arrangement would fill its well."""
     match arrangement:
         case Led():
             return _LED_FULL_S
@@ -161,7 +176,15 @@ def full_s(arrangement: Arrangement, state: RigState) -> float:
 
 
 def sensor_samples(rig: RigDescription, across: int) -> Float[np.ndarray, "n 2"]:
-    """About ``across`` x ``across`` pixels spread evenly over the sensor."""
+    """Pixels spread evenly over the sensor.
+
+    Args:
+        rig: for the size of the sensor.
+        across: number of pixels along x and along y.
+
+    Returns:
+        (x, y) in px, ``across`` squared of them, not rounded to whole pixels.
+    """
     x, y = ((np.arange(across) + 0.5) / across * size - 0.5 for size in (rig.camera.columns, rig.camera.rows))
     return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
 
@@ -176,7 +199,7 @@ def built_wire(state: RigState) -> Wire:
 
 @final
 class EvenField:
-    """An even white field as one rig sees it, 1 at its brightest: as the wire measured it, or the cos^4 law."""
+    """An even white field as one rig sees it, 1 at its brightest: the wire's measured shading, or the cos^4 law."""
 
     @in_float64
     def __init__(self, state: RigState) -> None:
@@ -198,7 +221,7 @@ class EvenField:
         return np.asarray(map_coordinates(self._grid, places, order=1, mode="nearest"))
 
     def signal(self, pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
-        """What samples of a white field give, 1 for the brightest of all."""
+        """Signal of samples of a white field, 1 for the brightest of all."""
         x, y = np.round(pixels).astype(np.int64).T
         channel = self._cfa.channels[y % self._cfa.rows, x % self._cfa.columns]
         return np.asarray(self.at(pixels) * (np.array(WHITE) / max(WHITE))[channel])

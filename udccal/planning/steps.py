@@ -1,4 +1,4 @@
-"""The steps that the procedures would do for a rig, how long their frames take, and what a person sets up."""
+"""The steps that the procedures would take for a rig, the time of their frames, and the set-ups by a person."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from udccal.plugins import find_procedure
 from udccal.rig import RigDescription
 from udccal.sessions.schema import TermName
 
-# How long a capture takes does not depend on what the panel shows: pictures are drawn this small for counting.
+# The time of a capture does not depend on the panel's picture: pictures are drawn this small for counting.
 _COUNTING_PX = 8
 
 
@@ -23,10 +23,10 @@ class PlannedStep:
     """One step as it will be carried out.
 
     Attributes:
-        exposures_s: of every frame that is kept.
+        exposures_s: exposure of every frame that is kept.
         level: of the range from black to saturation that the brightest sample of the first frame reaches in the light
             that the exposure was metered in; None where the exposure does not aim at a level.
-        test_frames: taken at the first exposure, to find it and to look at what stands before the camera.
+        test_frames: frames at the first exposure, taken to find it and to check the scene.
     """
 
     id: str
@@ -40,7 +40,7 @@ class PlannedStep:
 @final
 @dataclass(frozen=True)
 class Cost:
-    """What a capture takes: frames of the camera, the camera's time for them, and what a person sets up."""
+    """Cost of a capture: frames of the camera, the camera's time for them in seconds, and set-ups by a person."""
 
     frames: int
     seconds: float
@@ -57,10 +57,10 @@ NOTHING = Cost(0, 0.0, 0)
 
 
 def planned_steps(term: TermName, state: RigState) -> Iterator[PlannedStep]:
-    """The steps of a term's procedure, one at a time, at the exposures that are to be expected.
+    """The steps of a term's procedure, one at a time, at the expected exposures.
 
     Raises:
-        UdccalError: when no procedure is installed, or the one that is does not tell what it will take.
+        UdccalError: when no procedure is installed, or a step of it does not state its frames and exposure.
     """
     steps: Any = find_procedure(term)().steps(state.rig)
     longest_s = state.rig.camera.max_exposure_s
@@ -79,7 +79,7 @@ def planned_steps(term: TermName, state: RigState) -> Iterator[PlannedStep]:
 
 
 def cost_of(term: TermName, state: RigState) -> Cost:
-    """Frames, seconds and set-ups of a term's procedure; errors as ``planned_steps``."""
+    """Frames, seconds and set-ups of a term's procedure; it raises the errors of ``planned_steps``."""
     total, standing = NOTHING, ""
     for step in planned_steps(term, without_pictures(state)):
         period_s = 1.0 / state.rig.camera.frame_rate_hz
@@ -92,7 +92,7 @@ def cost_of(term: TermName, state: RigState) -> Cost:
 
 
 def _metered_s(step: Any, state: RigState) -> float:
-    """What metering will find; 0 where nothing is metered."""
+    """Exposure in seconds that metering is expected to find; 0 where nothing is metered."""
     target = getattr(step.exposure, "target", 0.0)
     return _within(target * full_s(step.arrangement, state), state.rig)
 
@@ -102,6 +102,6 @@ def _within(exposure_s: float, rig: RigDescription) -> float:
 
 
 def without_pictures(state: RigState) -> RigState:
-    """The same with a panel of next to no size: frames and exposures of its steps do not depend on it."""
+    """The same state with a tiny panel, on which the frames and exposures of its steps do not depend."""
     small = state.rig.panel.model_copy(update={"columns": _COUNTING_PX, "rows": _COUNTING_PX})
     return replace(state, rig=state.rig.model_copy(update={"panel": small}))

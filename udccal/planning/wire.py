@@ -1,7 +1,7 @@
-"""Prediction for the wire: the equations of the joint fit, on a part of the pixels that it spends.
+"""Prediction for the wire: the equations of the joint fit, on a part of the pixels that the fit uses.
 
-The map's sigma follows from the covariance of shape, shading and site gains together, with the prior that the fit has.
-A pixel's variance is shot and dark noise over the frames, and PRNU, which no number of frames averages down.
+The map's sigma follows from the joint covariance of shape, shading and site gains, with the prior of the fit. A
+pixel's variance is shot and dark noise over the frames, and PRNU, which no number of frames averages down.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from udccal.planning.steps import planned_steps
 from udccal.rig import Captures
 
 _PIXELS = 8_000
-# The strongest tell all of the shape that matters.
+# The strongest harmonics determine the shape.
 _HARMONICS = 24
 _RULES = WireRules()
 
@@ -48,7 +48,7 @@ class WirePredictor:
         self._value = expected_of(parameters.wire(self._x), np.ones(parameters.sites), self._pixels)
         y, x_px = np.divmod(np.maximum(self._pixels.place, 0), shape[1])
         self._signal_e = state.full_well_e * EvenField(state).signal(np.stack([x_px, y], axis=1).astype(float))
-        # Each pixel looked at stands for so many of the sensor's, and of those that the fit spends.
+        # Each sampled pixel represents this many of the sensor's pixels, and of those that the fit uses.
         self._every = shape[0] * shape[1] / self._pixels.used
         self._spent = self._every / odd_step(shape[0] * shape[1], _RULES.samples)
 
@@ -58,7 +58,7 @@ class WirePredictor:
         return float("inf") if relative is None else self._map_sigma(relative, self._spent)
 
     def used(self, captures: Captures) -> float:
-        """Of all pixels, a part; see ``Predictor``."""
+        """Less than 1 where the sensor has more pixels than the fit uses; see ``Predictor``."""
         relative = self._relative_variance(captures)
         if relative is None:
             return 1.0
@@ -66,7 +66,7 @@ class WirePredictor:
         return min((by_all / by_part) ** 2, 1.0)
 
     def floor(self) -> Floor:
-        """That of PRNU."""
+        """The sigma that PRNU and the model error leave."""
         PRNU1288 = float(np.asarray(self._state.noise.PRNU1288))
         more = "a fit to more of the sensor's pixels (FitEffort's wire_samples)"
         return Floor(
@@ -76,7 +76,7 @@ class WirePredictor:
         )
 
     def _relative_variance(self, captures: Captures) -> Float[np.ndarray, " n"] | None:
-        """Of flat less dark at each pixel, over the signal squared; None without flats or darks."""
+        """Variance of flat minus dark at each pixel over the signal squared; None without flats or darks."""
         state = self._state
         steps = list(planned_steps("wire", state.with_captures(captures)))
         flat = next((step for step in steps if isinstance(step.arrangement, FlatLight)), None)
@@ -90,7 +90,7 @@ class WirePredictor:
 
     @in_float64
     def _map_sigma(self, relative: Float[np.ndarray, " n"], count: float, model: float | None = None) -> float:
-        """At this relative variance of each pixel, which stands for ``count`` of them."""
+        """Sigma in per cent at this relative variance of the pixels, each of which represents ``count`` of them."""
         weight = np.where(self._pixels.place >= 0, count / np.maximum(relative * self._value**2, 1e-12), 0.0)
         pixels = eqx.tree_at(lambda p: p.weight, self._pixels, weight)
         information, _, _ = WireProblem("wire, planned", self._parameters, pixels, self._prior).sums(self._x)
@@ -101,7 +101,7 @@ class WirePredictor:
 def _expected(state: RigState, pixels: Pixels) -> tuple[Parameters, Float[np.ndarray, " n"]]:
     """The wire as built, and the parameters that a fit of it is expected to keep.
 
-    What a profile's wire has of shading and of departures from a round pupil is what the data asked for.
+    A profile's wire contributes the shading and the corrections to a round pupil that its data supported.
     """
     start = wire_start(state.rig)
     possible = possible_harmonics(start)
@@ -119,7 +119,7 @@ def _expected(state: RigState, pixels: Pixels) -> tuple[Parameters, Float[np.nda
 
 
 def _over(values: object, others: object) -> Float[np.ndarray, "..."]:
-    """Values with others in their place as far as these go."""
+    """Values, replaced by the others as far as these reach."""
     made, put = np.array(values), np.asarray(others)
     both = tuple(slice(min(sizes)) for sizes in zip(made.shape, put.shape, strict=True))
     made[both] = put[both]

@@ -1,1 +1,1 @@
-"""What all fits share and what knows no term: Gaussians, the solver, robust rules, choice of orders, tests, reports."""
+"""Code that all fits share, independent of the term: Gaussians, solver, robust rules, choice of orders, tests."""

@@ -13,18 +13,18 @@ from udccal.numerics import in_float64
 
 Term = TypeVar("Term")
 
-# Slopes are taken over this part of a sigma: there a function is straight, and its rounding does not show.
+# Derivatives are taken over this part of a sigma: a function is straight over it, and its rounding does not show.
 _STEP_SIGMA = 0.05
 
 
 @final
 @dataclass(frozen=True)
 class Prior:
-    """A normal distribution of ``n`` parameters before the data: |root (x - mean)|^2 is what it adds to chi-squared.
+    """A normal distribution of ``n`` parameters before the data; it adds |root (x - mean)|^2 to chi-squared.
 
     Attributes:
         mean: in the parameters' units.
-        root: a root of the inverse covariance. Parameters that nothing is known of have zeros in their column.
+        root: a root of the inverse covariance. The column of a parameter is zero where nothing is known of it.
     """
 
     mean: Float[np.ndarray, " n"]
@@ -47,12 +47,12 @@ class Prior:
             return np.asarray(1.0 / np.linalg.norm(self.root, axis=0))
 
     def cost(self, x: Float[np.ndarray, " n"]) -> float:
-        """What the prior adds to chi-squared at ``x``."""
+        """The chi-squared that the prior adds at ``x``."""
         off = self.root @ (x - self.mean)
         return float(off @ off)
 
     def right(self, x: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-        """What the prior adds to the right side of normal equations set up at ``x``."""
+        """The prior's part of the right side of normal equations set up at ``x``."""
         return np.asarray(-self.root.T @ (self.root @ (x - self.mean)))
 
 
@@ -79,7 +79,7 @@ class Posterior(Generic[Term]):
         cov: Float[np.ndarray, "n n"],
         term_at: Callable[[Float[np.ndarray, " n"]], Term],
     ) -> Posterior[Term]:
-        """From a covariance, whose directions of rounding below zero are taken for zero."""
+        """Make a posterior from a covariance; eigenvalues that rounding put below zero count as zero."""
         return cls(np.asarray(mean, dtype=np.float64), square_root(cov), term_at)
 
     @property
@@ -96,8 +96,8 @@ class Posterior(Generic[Term]):
     def sigma_of(self, f: Callable[[Term], Float[np.ndarray, "*shape"]]) -> Float[np.ndarray, "*shape"]:
         """One standard deviation of every number that ``f`` makes of the term, to first order.
 
-        The slopes of ``f`` are taken along the columns of ``factor`` by central differences (the delta method), so that
-        ``f`` may be any pure function, traced by JAX or not. Memory is that of a few outputs of ``f``.
+        The derivatives of ``f`` are central differences along the columns of ``factor`` (the delta method). ``f`` may
+        therefore be any pure function, traced by JAX or not. Memory is that of a few outputs of ``f``.
 
         Args:
             f: from a term to an array; called twice per column of ``factor``.
@@ -123,7 +123,16 @@ class Posterior(Generic[Term]):
 
 
 def square_root(cov: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
-    """A matrix whose product with its transpose is ``cov``; parameters of very unlike size keep their digits."""
+    """A matrix whose product with its transpose is ``cov``.
+
+    It is scaled to a unit diagonal first, so that parameters of very different sizes keep their digits.
+
+    Args:
+        cov: positive semi-definite, n x n, in products of the parameters' units; negative eigenvalues count as zero.
+
+    Returns:
+        n x n, one row per parameter, in that parameter's unit.
+    """
     size = np.sqrt(np.maximum(np.diag(cov), 0.0))
     unit = np.where(size > 0, size, 1.0)
     values, vectors = np.linalg.eigh((cov + cov.T) / (2 * np.outer(unit, unit)))
@@ -131,11 +140,14 @@ def square_root(cov: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
 
 
 def scaled_inverse(matrix: Float[np.ndarray, "*k n n"], rcond: float = 1e-12) -> Float[np.ndarray, "*k n n"]:
-    """Inverse of symmetric matrices of very unlike scales; what they do not determine comes back as zero.
+    """Pseudo-inverse of symmetric matrices whose parameters have very different scales.
 
     Args:
-        matrix: positive semi-definite.
-        rcond: eigenvalues of the matrix with a unit diagonal below this part of the largest count as none.
+        matrix: positive semi-definite, one n x n matrix or a stack of them.
+        rcond: the matrix is scaled to a unit diagonal; eigenvalues below this part of the largest count as zero.
+
+    Returns:
+        matrices of the same shape; directions that a matrix does not determine are zero.
     """
     size = np.sqrt(np.maximum(np.einsum("...ii->...i", matrix), 0.0))
     unit = np.where(size > 1e-150, size, np.inf)

@@ -1,8 +1,8 @@
-"""What data can tell at best: Fisher information of Gaussian, possibly clipped samples, and the Cramér–Rao bound.
+"""Fisher information of Gaussian, possibly clipped samples, and the Cramér–Rao bound that follows from it.
 
-The model is given as one pure JAX function from parameters to the mean and variance of every sample; its slopes come
-from automatic differentiation, so that a bound and a fit share one likelihood. With mean m, variance v and samples
-clipped at c, one sample brings
+The model is given as one pure JAX function from parameters to the mean and variance of every sample. Its derivatives
+come from automatic differentiation, so that a bound and a fit share one likelihood. With mean m, variance v and samples
+clipped at c, the information of one sample is
 
     I = m' m'^T / v  w_m(z) + v' v'^T / (2 v^2) w_v(z) + cross terms,   z = (c - m) / sqrt(v),
 
@@ -33,12 +33,16 @@ Predict = Callable[..., tuple[Float[Array, " samples"], Float[Array, " samples"]
 def fisher_information(
     predict: Predict, x: Float[np.ndarray, " n"], *args: Any, clip: float = np.inf
 ) -> Float[np.ndarray, "n n"]:
-    """Information on ``x`` in independent samples, expected over the noise.
+    """Fisher information on ``x`` in independent samples, expected over the noise; the module has the formula.
 
     Args:
         predict: pure JAX function at module scope; ``predict(x, *args)`` gives mean and variance of each sample.
-        x: parameters.
-        clip: samples at or above this value tell only that they are so.
+        x: the n parameters.
+        args: further arguments of ``predict``.
+        clip: samples at or above this value are known only to lie there; in the unit of the means.
+
+    Returns:
+        n x n, in the inverse products of the parameters' units.
     """
     (mean, variance), (mean_slope, variance_slope) = (
         tuple(np.asarray(part, dtype=np.float64) for part in pair) for pair in _linearised(predict)(x, args)
@@ -54,9 +58,16 @@ def fisher_information(
 def cramer_rao(
     information: Float[np.ndarray, "n n"], slopes: Float[np.ndarray, "quantities n"] | None = None
 ) -> Float[np.ndarray, " quantities"]:
-    """Smallest standard deviation of unbiased estimates: of the parameters, or of quantities with these slopes.
+    """Smallest standard deviation of unbiased estimates of the parameters or of functions of them (Cramér–Rao bound).
 
-    Parameters of very different size are scaled before the inversion. What the data cannot tell at all is infinite.
+    Parameters of very different size are scaled before the inversion.
+
+    Args:
+        information: of the n parameters; see ``fisher_information``.
+        slopes: derivatives of each quantity by the parameters; without them the parameters are the quantities.
+
+    Returns:
+        one sigma per quantity, in its unit; infinite where the data do not determine it.
     """
     root = np.sqrt(np.diag(information))
     seen = root > 0
@@ -85,7 +96,7 @@ def _linearised(predict: Predict) -> Callable[..., tuple[tuple[Array, Array], tu
 def _clipped_moments(
     z: Float[np.ndarray, " samples"],
 ) -> tuple[Float[np.ndarray, " samples"], Float[np.ndarray, " samples"], Float[np.ndarray, " samples"]]:
-    """Of a unit normal clipped at ``z``: information (mean, mean), (mean, sigma) and (sigma, sigma)."""
+    """Information (mean, mean), (mean, sigma) and (sigma, sigma) of a unit normal clipped at ``z``."""
     z = np.clip(z, -30.0, 40.0)
     density = np.exp(-0.5 * z**2) / np.sqrt(2 * np.pi)
     below = ndtr(z)

@@ -1,4 +1,4 @@
-"""Where every solver logs its iterations, at level DEBUG: `udccal fit --log`, or logging's own settings."""
+"""The logger to which every solver writes its iterations at level DEBUG: `udccal fit --log` shows them."""
 
 from __future__ import annotations
 

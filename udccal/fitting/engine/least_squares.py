@@ -1,12 +1,12 @@
-"""Levenberg-Marquardt on normal equations by blocks: shared parameters, and small groups that belong to one datum each.
+"""Levenberg-Marquardt on normal equations by blocks: shared parameters, and nuisance parameters of one datum each.
 
 The equations of one step are
 
     [ A    B ] [shared]     [a]        A: p x p,  B_k: p x l,  C_k: l x l, one block per view, shot or star,
     [ B^T  C ] [ own  ]  =  [c],
 
-with C block diagonal, so that the groups' own parameters are eliminated one by one (Schur's complement: Triggs et al.,
-Bundle Adjustment - A Modern Synthesis, 2000, section 6.1). The damping follows Nielsen (IMM-REP-1999-05, 1999).
+with C block diagonal. The nuisance parameters are therefore eliminated group by group (Schur's complement: Triggs et
+al., Bundle Adjustment - A Modern Synthesis, 2000, section 6.1). The damping follows Nielsen (IMM-REP-1999-05, 1999).
 """
 
 from __future__ import annotations
@@ -34,12 +34,12 @@ class SolverRules:
     Attributes:
         least_gain: converged when one more step is expected to lower the cost by less than this, in units of the
             reduced chi-squared where that is above 1. 1e-4 is a hundredth of a sigma.
-        stalled_gain: converged, too, when less than ``small_gain`` is expected and the last step brought less than
-            this: slopes that are themselves sums may promise a little for ever. 0 asks for the promise alone.
-        small_gain: see ``stalled_gain``; also what may be left where rounding lets no step lower the cost.
+        stalled_gain: also converged when the expected gain is below ``small_gain`` and the last step lowered the cost
+            by less than this: inexact derivatives may predict a small gain for ever. 0 turns this rule off.
+        small_gain: see ``stalled_gain``; also the expected gain that is accepted where rounding hides any progress.
         iterations: at most.
         first_damping: relative to the diagonal of the equations.
-        most_damping: no step, however small, lowers the cost.
+        most_damping: the descent ends beyond it, since no step, however small, lowers the cost.
     """
 
     least_gain: float = 1e-4
@@ -53,7 +53,7 @@ class SolverRules:
 @final
 @dataclass(frozen=True)
 class Step:
-    """A step of the shared parameters and of the groups' own, and by how much it is expected to lower the cost."""
+    """A step of the shared and of the nuisance parameters, and ``gain``, the expected fall of the cost."""
 
     shared: Float[np.ndarray, " p"]
     own: Float[np.ndarray, "k l"]
@@ -62,11 +62,11 @@ class Step:
 
 @runtime_checkable
 class Equations(Protocol):
-    """What the solver asks of a problem's equations at a place; ``Blocks`` has it, and so may others."""
+    """The properties of a problem's equations that the solver uses; ``Blocks`` has them, and other classes may."""
 
     @property
     def cost(self) -> float:
-        """Chi-squared and what the prior adds."""
+        """Chi-squared with the prior's part."""
 
     @property
     def samples(self) -> int:
@@ -82,14 +82,14 @@ _Equations_co = TypeVar("_Equations_co", bound=Equations, covariant=True)
 
 @runtime_checkable
 class Problem(Protocol[Place, _Equations_co]):
-    """What an adapter gives: equations at a place, and the place after a step."""
+    """An adapter between a fit and the solver: it gives equations at a place, and the place after a step."""
 
     @property
     def name(self) -> str:
         """For the iteration log."""
 
     def equations_at(self, place: Place) -> _Equations_co:
-        """Cost and normal equations, the prior's included."""
+        """Cost and normal equations at a place, with the prior's part."""
 
     def moved(self, place: Place, step: Step) -> Place:
         """The place after a step."""
@@ -98,15 +98,15 @@ class Problem(Protocol[Place, _Equations_co]):
 @final
 @dataclass(frozen=True)
 class Blocks:
-    """Normal equations by blocks; ``k`` groups of ``l`` own parameters each, none where ``k`` is 0.
+    """Normal equations by blocks; ``k`` groups of ``l`` nuisance parameters each, none where ``k`` is 0.
 
     Attributes:
-        cost: chi-squared, and what priors add.
+        cost: chi-squared with the priors' part.
         samples: data that count.
-        shared, right: of the shared parameters: half the Hessian and minus half the gradient of the cost.
-        own, own_right: of the groups' own.
-        cross: shared by own.
-        held: shared parameters that make no step, such as those at a bound that the data would have them pass; their
+        shared, right: half the Hessian and minus half the gradient of the cost by the shared parameters.
+        own, own_right: the same by the nuisance parameters of each group.
+        cross: half the Hessian, shared by own.
+        held: shared parameters that make no step, such as those at a bound that the data push against; their
             covariance is that without the bound.
     """
 
@@ -129,16 +129,16 @@ class Blocks:
 
     @classmethod
     def of_errors(cls, errors: Float[np.ndarray, " m"], slopes: Float[np.ndarray, "m p"]) -> Blocks:
-        """Without groups, from errors in units of their sigma and their slopes by the parameters."""
+        """Without groups, from errors in units of their sigma and their Jacobian."""
         return cls.dense(float(errors @ errors), len(errors), slopes.T @ slopes, -slopes.T @ errors)
 
     def with_prior(self, prior: Prior, x: Float[np.ndarray, " p"]) -> Blocks:
-        """With what is known of the shared parameters beforehand, which are ``x``."""
+        """The same with a prior on the shared parameters, whose values are ``x``."""
         cost, matrix = self.cost + prior.cost(x), self.shared + prior.precision
         return replace(self, cost=cost, shared=matrix, right=self.right + prior.right(x))
 
     def marginal(self, damping: float = 0.0) -> tuple[Float[np.ndarray, "p p"], Float[np.ndarray, " p"]]:
-        """Matrix and right side of the shared parameters once the groups' own are eliminated."""
+        """Matrix and right side of the shared parameters once the nuisance parameters are eliminated."""
         return self._marginal(damping, self._own_inverse(damping))
 
     def _marginal(
@@ -161,11 +161,11 @@ class Blocks:
         return Step(shared, own, float(self.right @ shared + (self.own_right * own).sum()))
 
     def cov(self) -> Float[np.ndarray, "p p"]:
-        """Covariance of the shared parameters with the groups' own marginalised; 0 in what the data do not tell."""
+        """Covariance of the shared parameters, nuisance parameters marginalised; 0 where they are not determined."""
         return scaled_inverse(self.marginal()[0])
 
     def joint_cov(self) -> Float[np.ndarray, "n n"]:
-        """Covariance of the shared parameters and then of every group's own; ``n`` is p + k l."""
+        """Covariance of the shared, then of the nuisance parameters group by group; ``n`` is p + k l."""
         shared, inverse = self.cov(), self._own_inverse(0.0)
         carried = -(inverse @ np.swapaxes(self.cross, 1, 2)).reshape(-1, len(self.right))
         cov = np.block([[shared, shared @ carried.T], [carried @ shared, carried @ shared @ carried.T]])
@@ -176,7 +176,7 @@ class Blocks:
         return cov
 
     def _own_inverse(self, damping: float) -> Float[np.ndarray, "k l l"]:
-        """A group that only fills up a block has nothing on its diagonal, and stays where it is."""
+        """Inverse of each group's block; a group that only fills up the array has zeros there, and does not move."""
         return scaled_inverse(_damped(self.own, damping), 1e-14)
 
 
@@ -188,7 +188,15 @@ def _damped(matrix: Float[np.ndarray, "*k n n"], damping: float) -> Float[np.nda
 
 
 def solve(matrix: Float[np.ndarray, "p p"], right: Float[np.ndarray, " p"]) -> Float[np.ndarray, " p"]:
-    """Solution of symmetric positive equations of very unlike scales; no step in what they do not tell."""
+    """Solution of symmetric positive semi-definite equations, scaled to a unit diagonal.
+
+    Args:
+        matrix: p x p, such as half a Hessian.
+        right: p numbers.
+
+    Returns:
+        the p parameters; directions that the matrix does not determine are zero.
+    """
     unit = 1 / np.sqrt(np.maximum(np.diag(matrix), _TINY))
     try:
         root = np.linalg.cholesky(matrix * np.outer(unit, unit))
@@ -204,10 +212,10 @@ class Solution(Generic[Place, _Equations]):
     """Where a descent ended.
 
     Attributes:
-        place: of the lowest cost.
-        equations: there.
-        gain: by how much one more step is expected to lower the cost.
-        converged: whether that is no more than the rules ask for.
+        place: where the cost is lowest.
+        equations: at ``place``.
+        gain: expected fall of the cost by one more step.
+        converged: whether ``gain`` satisfies the rules.
         history: the cost at the start and after each iteration that lowered it.
         iterations: steps that were tried.
     """
@@ -223,15 +231,18 @@ class Solution(Generic[Place, _Equations]):
 def minimise(
     problem: Problem[Place, _Equations], start: Place, rules: SolverRules | None = None
 ) -> Solution[Place, _Equations]:
-    """The minimum of the cost next to ``start``.
+    """The minimum of the cost next to ``start``, by Levenberg-Marquardt steps.
 
-    The one rule of convergence: another step is expected to lower the cost by less than ``rules.least_gain``. Where the
-    cost is not finite at the start, the start comes back, not converged.
+    The descent has converged when another step is expected to lower the cost by less than ``rules.least_gain``. Where
+    the cost is not finite at the start, the start comes back, not converged.
 
     Args:
-        problem: gives equations and moves.
+        problem: gives equations at a place, and the place after a step.
         start: where to begin.
         rules: see ``SolverRules``.
+
+    Returns:
+        the place of the lowest cost with its equations, and whether the descent converged.
     """
     rules = rules or SolverRules()
     place, here = start, problem.equations_at(start)

@@ -1,9 +1,9 @@
-"""What a model leaves undescribed: whether residuals have a pattern, how large it is, and what that adds to error bars.
+"""Misfit: whether residuals have a pattern, how large it is, and how much it adds to error bars.
 
-One policy for all terms. Noise is independent from sample to sample; a misfit is not. Residuals are gathered in groups
-that a misfit shares (views, positions, tiles of the sensor, pictures) and tested against chance: beyond one in a
-thousand the misfit counts as found. Then (1) a note says so, with its size; (2) the parameters' covariance is that of
-groups that differ by more than their noise; (3) what is predicted carries the misfit's size besides.
+All terms follow one policy. Noise is independent from sample to sample; a misfit is not. Residuals are gathered in
+groups that a misfit has in common (views, positions, tiles of the sensor, pictures) and tested against chance. The
+misfit counts as found when chance makes it less than once in a thousand fits. Then (1) a note gives its size; (2) the
+parameters' covariance is that of groups that differ by more than their noise; (3) predictions include its size.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class MisfitTest:
 
     @property
     def inflation(self) -> float:
-        """What a variance is multiplied with: 1 unless a misfit was found."""
+        """Factor by which a variance is multiplied: 1 unless a misfit was found."""
         return max(self.ratio, 1.0) if self.found else 1.0
 
 
@@ -46,14 +46,30 @@ NO_TEST = MisfitTest(1.0, 1.0)
 
 
 def chi2_test(statistic: float, dof: float) -> MisfitTest:
-    """Of a sum of squares of independent unit normals; no test where there are no degrees of freedom."""
+    """Chi-squared test of a sum of squares of independent unit normals.
+
+    Args:
+        statistic: the sum.
+        dof: its degrees of freedom; where there are none the result is ``NO_TEST``.
+
+    Returns:
+        the reduced chi-squared and its p-value.
+    """
     return MisfitTest(statistic / dof, chi2_tail(statistic, dof)) if dof > 0 and np.isfinite(statistic) else NO_TEST
 
 
 def f_test(statistic: float, rank: int, dof: float) -> MisfitTest:
-    """The same where the scale of the noise is estimated from ``dof`` degrees of freedom that hold those of the test.
+    """F-test of a sum of squares whose scale was estimated from residuals that include it.
 
-    The numerator is part of the residuals behind the scale, so that it is taken out of the denominator.
+    The sum is part of the residuals behind the scale; it is therefore taken out of the denominator.
+
+    Args:
+        statistic: the sum, in units of the estimated variance.
+        rank: its degrees of freedom.
+        dof: degrees of freedom of all residuals behind the scale, those of ``rank`` included.
+
+    Returns:
+        F and its p-value; ``NO_TEST`` where either has no degrees of freedom.
     """
     rest = dof - rank
     if rank < 1 or rest < 1 or not np.isfinite(statistic):
@@ -63,7 +79,7 @@ def f_test(statistic: float, rank: int, dof: float) -> MisfitTest:
 
 
 def sharper(*tests: MisfitTest) -> MisfitTest:
-    """The test of the lowest p-value; that it was chosen from several is paid for (Bonferroni)."""
+    """The test of the lowest p-value, which is multiplied by the number of tests (Bonferroni's correction)."""
     best = min(tests, key=lambda t: t.p_value)
     return MisfitTest(best.ratio, min(1.0, len(tests) * best.p_value))
 
@@ -71,13 +87,16 @@ def sharper(*tests: MisfitTest) -> MisfitTest:
 def group_means_test(
     z: Float[np.ndarray, " n"], group: Int[np.ndarray, " n"], used: Bool[np.ndarray, " n"], scale: float = 1.0
 ) -> MisfitTest:
-    """Whether means of groups scatter as those of independent residuals do.
+    """Test whether means of groups scatter as those of independent residuals do.
 
     Args:
-        z: residuals in units of their sigma, freed of what the fit took up.
+        z: residuals of the fit in units of their sigma.
         group: number of each sample's group.
         used: samples that count.
         scale: variance of ``z`` where the model holds.
+
+    Returns:
+        the chi-squared test of the groups' means, one degree of freedom per group.
     """
     count = np.bincount(group[used])
     total = np.bincount(group[used], z[used])
@@ -92,16 +111,19 @@ def excess_sigma(
     dof: float,
     chance: float = SIGNIFICANT,
 ) -> float:
-    """Size of an error beside noise that brings chi-squared to its degrees of freedom; 0 unless it is significant.
+    """Size of an error in addition to noise that brings chi-squared to its degrees of freedom; 0 if not significant.
 
-    The estimate of Paule and Mandel (J. Res. NBS 87, 1982).
+    The estimate is that of Paule and Mandel (J. Res. NBS 87, 1982).
 
     Args:
-        square: of residuals.
-        noise: variance of each.
-        unit: variance that an error of size 1 adds to each.
+        square: squared residuals.
+        noise: variance of each residual by noise, in the same unit.
+        unit: variance that an error of size 1 adds to each residual.
         dof: degrees of freedom.
         chance: how often chance may find an error where there is none; 0.5 gives an estimate wherever one is above 0.
+
+    Returns:
+        the size, one sigma, in units such that size^2 times ``unit`` is a variance.
     """
     if not unit.any() or chi2_tail(float((square / noise).sum()), dof) > chance:
         return 0.0
@@ -111,9 +133,15 @@ def excess_sigma(
 def robust_excess_sigma(
     square: Float[np.ndarray, " n"], noise: Float[np.ndarray, " n"], unit: Float[np.ndarray, " n"]
 ) -> float:
-    """The same, significant or not, by half of the residuals being below their probable error: outliers do not count.
+    """The same by the median, significant or not: half of the residuals lie below their probable error.
 
-    Arguments as for ``excess_sigma``.
+    Args:
+        square: squared residuals; outliers have little weight.
+        noise: variance of each residual by noise, in the same unit.
+        unit: variance that an error of size 1 adds to each residual.
+
+    Returns:
+        the size, as in ``excess_sigma``.
     """
     probable = MAD_TO_SIGMA**-2
     return _halved(square, unit, lambda size: float(np.median(square / (noise + size**2 * unit))) > probable)
@@ -122,7 +150,7 @@ def robust_excess_sigma(
 def excess_variance(
     observed: Float[np.ndarray, " n"], known: Float[np.ndarray, " n"], dof: Float[np.ndarray, " n"]
 ) -> tuple[float, float, float]:
-    """Variance that chi-squared estimates have beside a known part, by maximum likelihood; not below 0.
+    """Maximum-likelihood variance of chi-squared estimates in addition to a known part; not below 0.
 
     Args:
         observed: estimates of a variance.
@@ -144,7 +172,7 @@ def excess_variance(
 def _halved(
     square: Float[np.ndarray, " n"], unit: Float[np.ndarray, " n"], too_small: Callable[[float], bool]
 ) -> float:
-    """The size from which an error is no more too small."""
+    """The smallest size that is not too small, by halving an interval."""
     if not unit.any():
         return 0.0
     low, high = 0.0, float(np.sqrt(square.max() / unit[unit > 0].min()))
@@ -161,13 +189,16 @@ def clustered_cov(
 ) -> Float[np.ndarray, "n n"]:
     """Covariance of parameters whose groups of data differ by more than their noise, never below ``cov``.
 
-    Each group is left out in one Newton step (jackknife: Efron, CBMS 38, 1982); without the groups' own information the
-    step is that of the whole (sandwich: Huber, Proc. 5th Berkeley Symposium, 1967).
+    Each group is left out in one Newton step (jackknife: Efron, CBMS 38, 1982). Without the groups' information the
+    step uses ``cov`` alone (sandwich: Huber, Proc. 5th Berkeley Symposium, 1967).
 
     Args:
-        cov: of the fit, by noise alone, other parameters marginalised.
+        cov: covariance of the fit by noise alone, other parameters marginalised.
         scores: minus half the gradient of each group's chi-squared at the minimum.
-        information: half its Hessian.
+        information: half the Hessian of each group's chi-squared.
+
+    Returns:
+        n x n, in the units of ``cov``.
     """
     groups = len(scores)
     if groups < 2:

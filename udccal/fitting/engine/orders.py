@@ -1,8 +1,8 @@
-"""Which order of a model the data ask for: the candidates, their evidence, and how probable each is.
+"""Choice of a model's order by the data: the candidates, their evidence, and how probable each is.
 
-One criterion for all terms: -2 ln of the probability of the data, parameters integrated out. Where parameters have a
-proper prior that is Laplace's approximation; where they have none, each parameter is priced at ln(samples), which is
-what the approximation comes to for a prior as wide as one sample's information (Schwarz, Annals of Statistics 6, 1978).
+All terms use one criterion: -2 ln of the probability of the data, parameters integrated out. Where parameters have a
+proper prior, Laplace's approximation gives it. Where they have none, each parameter costs ln(samples): the
+approximation for a prior as wide as one sample's information (BIC: Schwarz, Annals of Statistics 6, 1978).
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class Attempt(Generic[Fit]):
         name: of the order, for a person.
         parameters: how many it has.
         criterion: lower is better; infinite where the fit failed.
-        fit: whatever the adapter needs of it.
+        fit: the result of the fit, of a type that the adapter chooses.
     """
 
     name: str
@@ -59,7 +59,14 @@ class Choice(Generic[Fit]):
 
 
 def choose(tried: Iterable[Attempt[Fit]]) -> Choice[Fit]:
-    """The order with the lowest criterion; of equals, the first."""
+    """Choose the order with the lowest criterion; of equal ones, the first.
+
+    Args:
+        tried: at least one attempt.
+
+    Returns:
+        the best attempt, with all of them.
+    """
     found = tuple(tried)
     return Choice(min(found, key=lambda t: t.criterion), found)
 
@@ -69,9 +76,15 @@ def rising(
     beats: Callable[[Attempt[Fit], Attempt[Fit]], bool],
     patience: int = 2,
 ) -> tuple[Attempt[Fit], ...]:
-    """Attempts of rising order, until ``patience`` of them in a row do not beat the best before them.
+    """Try rising orders until ``patience`` of them in a row do not beat the best one before them.
 
-    More than one, since what grows from one side of the field to the other has no mean.
+    Args:
+        orders: functions that fit one order each, simplest first.
+        beats: whether its first argument, the later attempt, is better than the second.
+        patience: more than 1, since an effect that is odd over the field needs a further order to show.
+
+    Returns:
+        all attempts that were made.
     """
     tried: list[Attempt[Fit]] = []
     best, in_vain = None, 0
@@ -85,7 +98,16 @@ def rising(
 
 
 def bic(cost: float, parameters: float, samples: int) -> float:
-    """Criterion of an order whose parameters have no prior."""
+    """Bayesian information criterion of an order whose parameters have no prior (Schwarz, Ann. Stat. 6, 1978).
+
+    Args:
+        cost: minus twice the log likelihood at its maximum, such as chi-squared.
+        parameters: how many the order has.
+        samples: how many data the fit uses.
+
+    Returns:
+        the criterion; lower is better.
+    """
     return cost + parameters * float(np.log(max(samples, 2)))
 
 
@@ -94,13 +116,16 @@ def evidence(
 ) -> float:
     """Criterion of an order whose parameters have independent priors: -2 ln of the evidence by Laplace's method.
 
-    A parameter that the data cannot tell costs nothing and stays, with its true error bar.
+    A parameter that the data do not determine costs nothing and stays, with its true error bar.
 
     Args:
-        cost: chi-squared at the minimum, what the prior adds included.
-        cov: of the free parameters, after the data.
-        prior_sigma: of the same.
+        cost: chi-squared at the minimum, the prior's part included.
+        cov: covariance of the n free parameters after the data.
+        prior_sigma: sigma of the same parameters before the data.
         against: -2 ln of how probable the order is beforehand.
+
+    Returns:
+        the criterion; lower is better.
     """
     narrowed = cov / np.outer(prior_sigma, prior_sigma)
     return cost - float(np.linalg.slogdet(narrowed)[1]) + against
@@ -109,12 +134,12 @@ def evidence(
 def held_out_beats(
     losses: Float[np.ndarray, " groups"], before: Float[np.ndarray, " groups"], worth: float = 0.0
 ) -> bool:
-    """Whether data held out are predicted better, by more than ``worth`` and than what their groups leave in doubt.
+    """Whether an order predicts held-out data better, by more than ``worth`` and than the scatter of the groups.
 
     Args:
         losses: minus twice the log likelihood per sample, by independent group (position, view).
         before: the same of the order to beat.
-        worth: the least gain that counts.
+        worth: the least gain that counts, in the unit of the losses.
     """
     gain = before - losses
     doubt = float(gain.std(ddof=1) / np.sqrt(gain.size)) if gain.size > 1 else np.inf
@@ -124,7 +149,7 @@ def held_out_beats(
 @final
 @dataclass(frozen=True)
 class Quantity:
-    """A value with its variance; where ``there`` is False the data do not ask for it and the value is that without."""
+    """A value with its variance; where ``there`` is False the data do not support it, and the value is the default."""
 
     value: float
     variance: float
@@ -135,14 +160,14 @@ class Quantity:
     def asked(
         cls, name: str, value: float, variance: float, samples: int, gain: float | None = None, without: float = 0.0
     ) -> Quantity:
-        """The value where the likelihood gains more by it (minus twice the logarithm) than BIC asks.
+        """The value if it raises the likelihood (minus twice the logarithm) by more than BIC requires.
 
         Args:
             name: for the table of candidates.
-            value, variance: as the data have them; the variance is kept where the value is not.
-            samples: data that bear on it.
-            gain: of the likelihood; by default that of a normal estimate, which is none below 0.
-            without: the value where the data do not ask for it.
+            value, variance: the estimate; its variance is kept where the value is not.
+            samples: number of data that determine it.
+            gain: of the likelihood; by default that of a normal estimate, 0 for a value below 0.
+            without: the value where the data do not support it.
         """
         own = value**2 / variance if value > 0 and variance > 0 else 0.0
         simple = Attempt(f"without {name}", 0, own if gain is None else gain, without)
@@ -150,9 +175,9 @@ class Quantity:
         return cls(choice.best.fit, variance, choice.best.parameters > 0, choice.candidates)
 
     def root(self) -> tuple[float, float]:
-        """Where the value is a variance: the standard deviation, and its derivative by the variance.
+        """The standard deviation, and its derivative by the variance, where the value is a variance.
 
-        Where the value is lost in its error the root is that far from zero at most, not to first order.
+        To first order a variance below its own sigma s would give the root far too large a sigma; there it is sqrt(s).
         """
         value, error = float(np.sqrt(max(self.value, 0.0))), float(np.sqrt(self.variance))
         return value, 0.5 / value if value**2 > error else float(1 / np.sqrt(max(error, 1e-300)))

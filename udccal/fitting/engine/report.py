@@ -1,4 +1,4 @@
-"""A fit's numbers, gathered for a person: estimates in their units, residuals evenly drawn."""
+"""A fit's numbers for a report: estimates in their units, and a sample of the residuals."""
 
 from __future__ import annotations
 
@@ -18,7 +18,14 @@ def estimates(
     values: Float[np.ndarray, " n"],
     cov: Float[np.ndarray, "n n"],
 ) -> tuple[Estimate, ...]:
-    """Named quantities with one standard deviation each; ``cov`` may have more rows than there are names."""
+    """Named quantities with one standard deviation each.
+
+    Args:
+        names: of the quantities.
+        units: one per name.
+        values: one per name, in its unit.
+        cov: covariance, in the order of the names; further rows are ignored.
+    """
     sigma = np.sqrt(np.maximum(np.diag(cov), 0.0))
     return tuple(
         Estimate(name, float(value), float(one), unit)
@@ -27,6 +34,11 @@ def estimates(
 
 
 def residual_sample(positions_px: Float[np.ndarray, "n 2"], z: Float[np.ndarray, " n"]) -> ResidualSample:
-    """At most some thousand of the residuals, evenly drawn in the order given."""
+    """A few thousand of the residuals at most, drawn evenly in the order given.
+
+    Args:
+        positions_px: (x, y) of each residual on the sensor.
+        z: residuals in units of their sigma.
+    """
     drawn = np.s_[:: max(1, -(-len(z) // _MOST_RESIDUALS))]
     return ResidualSample(np.asarray(positions_px[drawn], dtype=np.float64), np.asarray(z[drawn], dtype=np.float64))

@@ -1,8 +1,8 @@
-"""Samples that no noise explains: what they count for in a fit, and by which rule they are left out.
+"""Outliers: how much they count in a fit, and by which rule they are left out.
 
-One contract for all terms: an ``OutlierRule`` compares residuals in units of their sigma with the residuals' own robust
-scatter, so that noise larger than expected makes no outliers of all. Five robust sigma leave out one of two million
-normal samples.
+All terms follow one contract. An ``OutlierRule`` compares residuals in units of their sigma with the residuals' own
+robust scatter, so that noise larger than expected does not turn all samples into outliers. Five robust sigma leave out
+one of two million normal samples.
 """
 
 from __future__ import annotations
@@ -23,7 +23,14 @@ _NAMED = 8
 
 
 def robust_sigma(z: Float[np.ndarray, "*n"]) -> float:
-    """Standard deviation of the finite residuals about 0, by their median size; 0 where there are none."""
+    """Standard deviation about 0 by the median of the absolute values, which outliers hardly change.
+
+    Args:
+        z: residuals in any unit and shape; those that are not finite are ignored.
+
+    Returns:
+        one sigma in the unit of ``z``; 0 where no residual is finite.
+    """
     seen = np.abs(z[np.isfinite(z)])
     return MAD_TO_SIGMA * float(np.median(seen)) if seen.size else 0.0
 
@@ -31,11 +38,11 @@ def robust_sigma(z: Float[np.ndarray, "*n"]) -> float:
 @final
 @dataclass(frozen=True)
 class OutlierRule:
-    """Samples further off than ``sigma`` robust standard deviations are left out.
+    """Leave out samples whose residual is larger than ``sigma`` robust standard deviations.
 
     Attributes:
-        what: of which things, in the plural, for the sentence that names the rule.
-        sigma: how far; see the module for the default.
+        what: name of the samples, in the plural, for the sentence that states the rule.
+        sigma: limit in robust standard deviations; the module explains the default.
     """
 
     what: str
@@ -48,12 +55,20 @@ class OutlierRule:
         return np.asarray(off if used is None else off & used)
 
     def listed(self, places: Iterable[str]) -> tuple[Outliers, ...]:
-        """What was left out, the first of them named; nothing where there are none."""
+        """The samples left out at ``places``, the first of them by name; empty where there are none."""
         return outliers(f"{self.what} further than {self.sigma:g} robust sigma from the model", places)
 
 
 def outliers(rule: str, places: Iterable[str]) -> tuple[Outliers, ...]:
-    """What a rule left out: how many, and the first of them; nothing where there are none."""
+    """The samples that a rule left out: how many, and the first of them.
+
+    Args:
+        rule: sentence that states the rule.
+        places: where each sample is, for a person.
+
+    Returns:
+        one entry; empty where no sample was left out.
+    """
     named = iter(places)
     first = tuple(islice(named, _NAMED))
     return (Outliers(rule, len(first) + sum(1 for _ in named), first),) if first else ()
@@ -80,9 +95,9 @@ class Cauchy:
     sigma: float = 2.5
 
     def loss(self, z: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
-        """What each residual adds to chi-squared."""
+        """The part of chi-squared that each residual adds."""
         return np.asarray(self.sigma**2 * np.log1p((z / self.sigma) ** 2))
 
     def weight(self, z: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
-        """What each squared residual counts for in a step: the derivative of ``loss`` by the square."""
+        """Weight of each squared residual in a step: the derivative of ``loss`` by the square."""
         return np.asarray(1 / (1 + (z / self.sigma) ** 2))

@@ -1,1 +1,1 @@
-"""Lens, panel and board poses: ``fit_geometry`` takes arrays of corners, ``fit_boards`` the boards of a session."""
+"""Lens, panel pose and board poses: ``fit_geometry`` fits arrays of corners, ``fit_boards`` a session's boards."""

@@ -1,7 +1,7 @@
 """A rig's geometry from its boards: intrinsics, distortion, and how the camera is mounted behind the panel.
 
 One view shows the board parallel to the panel. Its axes are then the panel's, so that the inverse of its pose is
-``R_panel_camera``. Stand-off and panel position stay nominal here: a far board does not show them; the wire fit does.
+``R_panel_camera``. Stand-off and panel position stay nominal here: a far board does not determine them. The wire does.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ from udccal.models.geometry import Geometry, panel_directions, project_direction
 from udccal.numerics import in_float64
 from udccal.result import Diagnostic, FitResult, FitStatus, Outliers
 
-# Scatter beside noise of the board on the jig, and of the median view of others: a plan reads them.
+# Scatter in addition to noise of the board on the jig, and of the median other view: a plan reads them.
 ON_JIG, BY_HAND = "corner_scatter_on_jig", "corner_scatter_by_hand"
 
 
 def fit_boards(data: GeometryData, rules: GeometryRules | None = None) -> FitResult[Geometry]:
     """Fit the geometry term to boards, with ``fit_geometry``.
 
-    Every corner has its noise and a scatter that all have beside it (paper that is not flat, blur that a saddle does
-    not describe), which is estimated with the rest.
+    Every corner has its own noise and a scatter common to all (paper that is not flat, blur that a saddle does not
+    describe). The fit estimates that scatter.
 
     Args:
         data: boards, one of them parallel to the panel; at least 3 usable ones, or any number with a prior.
@@ -63,9 +63,14 @@ def fit_boards(data: GeometryData, rules: GeometryRules | None = None) -> FitRes
 
 
 def projection_sigma_px(result: FitResult[Geometry], pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
-    """One sigma in px (x, y) of where directions fixed in panel coordinates appear, at the sensor pixels given.
+    """Sigma of the places at which directions fixed in panel coordinates appear; it includes the model error found.
 
-    What the residuals show of the model's own error is part of it.
+    Args:
+        result: of ``fit_boards``, with its posterior.
+        pixels: (x, y) in px, where the directions appear.
+
+    Returns:
+        one sigma in px along x and along y, per pixel.
 
     Raises:
         FitError: when the fit failed, or was read from a profile.
@@ -83,7 +88,7 @@ def _directions(term: Geometry, pixels: Float[np.ndarray, "n 2"]) -> Float[np.nd
 def _calibrated(
     views: Sequence[BoardView], data: GeometryData, rules: GeometryRules
 ) -> tuple[CalibratedViews, Float[np.ndarray, " n"]]:
-    """The bundle, and the scatter beside noise in px by axis: of all views together, then of each in use."""
+    """The bundle, and the scatter in addition to noise in px by axis: of all views together, then of each in use."""
     points = [board_points_mm(view.spec)[view.corners.ids] for view in views]
     seen, scatter_px = [view.corners.xy for view in views], np.full(1, rules.start_scatter_px)
     for _ in range(8):
@@ -97,13 +102,13 @@ def _calibrated(
 
 
 def _scatter_px(bundle: CalibratedViews, views: Sequence[BoardView]) -> Float[np.ndarray, " n"]:
-    """The scatter at which residuals have the size that they should; not gated, as plans need the estimate itself."""
+    """The scatter that gives residuals their expected size, significant or not: plans need the estimate itself."""
     points = bundle.points
     noise = [views[points.names[v]].corners.sigma[k] for v, k in zip(points.view, points.index, strict=True)]
     variance = np.maximum(np.array(noise), 1e-3) ** 2
     square = (bundle.residuals_px**2).sum(axis=1)
     spent = (sum(bundle.free) + 6 * len(points.names)) / (2 * points.used.sum())
-    # A floor keeps fits that spend nearly all of their data from having no degrees of freedom.
+    # A floor keeps fits with nearly as many parameters as data from having no degrees of freedom.
     left = max(1 - spent, 0.05)
     groups = [points.used, *(points.used & (points.view == view) for view in range(len(points.names)))]
     return np.array(
@@ -128,14 +133,14 @@ def _result(
     notes: tuple[str, ...],
     rules: GeometryRules,
 ) -> FitResult[Geometry]:
-    """``views`` are those that the bundle uses."""
+    """The result of a bundle, which uses ``views``."""
     notes = (*notes, *bundle.notes)
     parallel = [k for k, view in enumerate(views) if view.parallel]
     if bundle.status is FitStatus.TOO_FEW_DATA or not parallel:
         lost = () if parallel else ("No usable view shows the board parallel to the panel; capture that view again.",)
         return FitResult.failed("geometry", nominal, FitStatus.TOO_FEW_DATA, *notes, *lost)
     x, cov = with_angles(bundle.intrinsics.vector, bundle.poses, bundle.cov, parallel)
-    # A pattern in the residuals moves every place by its size, as a centre does that is off by as much.
+    # A pattern in the residuals is modelled as an error of the principal point, which moves every place by its size.
     pattern = bundle.evidence.pattern_px * np.asarray(Intrinsics.of(np.eye(LENS, len(x))).principal_point_px).T
     pupil = np.asarray(nominal.pupil_mm, dtype=np.float64)
     posterior = Posterior(x, np.hstack([square_root(cov), pattern]), partial(term_at, pupil=pupil))
@@ -172,12 +177,12 @@ def with_angles(
 
     Args:
         intrinsics: in the order of ``INTRINSIC_NAMES``.
-        poses: board to camera, as ``bundle.Bundle`` has them.
+        poses: board to camera: rotation vector in rad, then translation, as in ``bundle.Bundle``.
         cov: of intrinsics and all poses one after another.
         parallel: which views show the board parallel to the panel.
 
     Returns:
-        what ``term_at`` takes; angles in degrees.
+        the argument of ``term_at``, and its covariance; angles in degrees.
     """
     rotation = np.asarray(Rotation.from_rotvec(-poses[parallel, :3]).mean().as_rotvec())
     steps = 1e-5 * np.eye(3)
@@ -196,7 +201,12 @@ def _angles_deg(rotation: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
 
 
 def term_at(x: Float[np.ndarray, "12"], pupil: Float[np.ndarray, "3"]) -> Geometry:
-    """The term of intrinsics and angles."""
+    """The term of intrinsics and angles.
+
+    Args:
+        x: intrinsics in the order of ``INTRINSIC_NAMES``, then tilt, roll and yaw in degrees.
+        pupil: position of the entrance pupil in panel coordinates, in mm.
+    """
     lens, (tilt, roll, yaw) = Intrinsics.of(x[:LENS]), x[LENS:]
     rotation = Rotation.from_euler("YXZ", [yaw, -tilt, roll], degrees=True).as_rotvec()
     return Geometry(lens.focal_px, lens.principal_point_px, lens.distortion, np.asarray(rotation), pupil)

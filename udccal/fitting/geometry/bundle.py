@@ -1,7 +1,7 @@
-"""Bundle adjustment of flat boards: nine intrinsics seen by all views, six numbers of a pose by one view each.
+"""Bundle adjustment of flat boards: nine intrinsics are common to all views, and each view has a pose of six numbers.
 
-Places and their Jacobian are OpenCV's (``cv2.projectPoints``): the five-coefficient model of Brown and Conrady that
-``udccal.models.geometry`` has, in one compiled call for all points.
+``cv2.projectPoints`` gives places and their Jacobian in one compiled call for all points. Its five-coefficient model
+(Brown and Conrady) is that of ``udccal.models.geometry``.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from udccal.models.geometry import Geometry
 INTRINSIC_NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
 INTRINSIC_UNITS = ("px", "px", "px", "px", "1", "1", "1", "1", "1")
 LENS = len(INTRINSIC_NAMES)
-# Orders of the distortion, simplest first: which intrinsics are free. Each has the coefficients of the one before it.
+# Orders of the distortion, simplest first: which intrinsics are free. Each includes the coefficients of the one before.
 ORDERS = {
     name: np.arange(LENS) < count
     for name, count in (("no distortion", 4), ("k1", 5), ("k1 k2", 6), ("k1 k2 p1 p2", 8), ("k1 k2 p1 p2 k3", 9))
@@ -34,32 +34,32 @@ EVERY = np.ones(LENS, dtype=bool)
 @final
 @dataclass(frozen=True)
 class GeometryRules:
-    """What the fit of lens and boards goes by.
+    """The constants of the fit of lens and boards.
 
     Attributes:
         least_views: usable views that may determine a lens; with a prior, one determines at least its pose.
-        least_corners: of a usable view. Four hold a homography; two more tell whether it is the right one.
+        least_corners: of a usable view. Four determine a homography; two more test it.
         most_clipped: part of a board's samples at saturation. Beyond it edges have bloomed.
         clipped: samples from this part of saturation on count as clipped.
         least_response: samples with less than this part of the flat field are dead, or behind an opaque row.
-        centre_sigma: lenses sit on their sensors' middles to about this part of the width.
-        distortion_sigma: of (k1, k2, p1, p2, k3) of lenses that the model describes.
-        robust: how residuals count on the way from a start that may be far off.
-        corners: which corners are left out, compared with their view's own scatter.
+        centre_sigma: prior sigma of the principal point about the sensor's middle, as part of the width.
+        distortion_sigma: prior sigma of (k1, k2, p1, p2, k3).
+        robust: loss of the residuals in descents from a start that may be far off.
+        corners: which corners are left out, by their view's own scatter.
         strange_view: a view is left out whole when it scatters this many times as much as the median view.
         loud_view: a view is mentioned when it scatters this many times as much.
-        further_order: odds before any data against each further order of the distortion: a coefficient that is not
-            there costs the others much of their certainty.
+        further_order: prior odds against each further order of the distortion: a coefficient that is not needed raises
+            the sigma of the others.
         prior_share: beyond this part of the information on focal length or centre, the prior chooses the order.
         most_uncertain: sigma of focal length (of itself) and centre (of the width) beyond which the views do not
             determine the lens; the model is not linear over such a sigma.
         worst_rms_px, worst_chi2_dof: beyond both, the fit is poor.
-        pattern_cells: on a side of the grid that residuals are averaged over.
-        start_scatter_px: of corners beside their noise, before it is estimated.
+        pattern_cells: cells along a side of the grid over which residuals are averaged.
+        start_scatter_px: scatter of corners in addition to noise, before it is estimated.
         marker_margin, window_squares: radius of a corner's window, of the distance to the markers and of a square.
         window_px: least and largest radius.
-        least_contrast: half the step at a corner over what the saddle leaves of the samples.
-        worst_corner_sigma_px: of a corner by noise.
+        least_contrast: half the step at a corner over the saddle's residuals.
+        worst_corner_sigma_px: largest sigma of a corner by noise.
     """
 
     least_views: int = 3
@@ -90,9 +90,9 @@ class GeometryRules:
 @final
 @dataclass(frozen=True)
 class Intrinsics:
-    """A lens, or something else (a sigma, a row of a matrix) of each of its nine numbers.
+    """The nine numbers of a lens, or a number for each of them (a sigma, a row of a matrix).
 
-    ``of`` and ``vector`` alone know where each is in a vector, whose order is ``INTRINSIC_NAMES``.
+    ``of`` and ``vector`` convert from and to a vector in the order of ``INTRINSIC_NAMES``.
 
     Attributes:
         focal_px: (fx, fy). principal_point_px: (cx, cy).
@@ -105,7 +105,7 @@ class Intrinsics:
 
     @classmethod
     def of(cls, vector: Float[Arrayish, "n ..."]) -> Intrinsics:
-        """From the vector, or rows of a matrix that begin with it, traced by JAX or not."""
+        """From the vector, or from a matrix whose first rows are the intrinsics; numpy or JAX arrays."""
         return cls(vector[:2], vector[2:4], vector[4:LENS])
 
     @classmethod
@@ -147,7 +147,7 @@ class Points:
 
     Attributes:
         board: on the board, any unit of length. image: in px. sigma: of each coordinate in px.
-        view: whose point it is, counted over the usable views. index: its place in its view as given.
+        view: number of the point's view among the usable ones. index: its place in its view as given.
         used: whether it takes part in the fit.
         names: the usable views by their place in what was given.
     """
@@ -173,7 +173,7 @@ class Points:
         return Points(*parts, self.index[stay], self.used[stay], names)
 
     def sums(self, values: Float[np.ndarray, " points"]) -> Float[np.ndarray, " views"]:
-        """Of a number of each point in use, by view."""
+        """Sums over each view's points in use."""
         return np.bincount(self.view[self.used], values[self.used], len(self.names))
 
     def places(self, points: Int[np.ndarray, " some"]) -> tuple[str, ...]:
@@ -184,10 +184,14 @@ class Points:
 def projected(
     intrinsics: Float[np.ndarray, "9"], camera: Float[np.ndarray, "n 3"]
 ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2 15"]]:
-    """Where points in camera coordinates appear, in px.
+    """Project points in camera coordinates (``cv2.projectPoints``).
+
+    Args:
+        intrinsics: in the order of ``INTRINSIC_NAMES``.
+        camera: points in camera coordinates, in any unit of length.
 
     Returns:
-        the places, and their derivatives by the intrinsics, a small turn of the points, and a shift of the points.
+        the places in px, and their derivatives by the 9 intrinsics, a small turn (rad) and a shift of the points.
     """
     lens = Intrinsics.of(intrinsics)
     places, slopes = cv2.projectPoints(camera, np.zeros(3), np.zeros(3), lens.matrix, lens.distortion)
@@ -230,13 +234,13 @@ def by_view(
 @final
 @dataclass(frozen=True)
 class BundleProblem:
-    """What the solver asks of a bundle.
+    """A bundle as the solver's problem.
 
     Attributes:
-        points: those in use count, by their sigma.
+        points: those in use are weighted by their sigma.
         free: which of the intrinsics are fitted; the others stay where they start.
         prior: on the intrinsics.
-        robust: how residuals count; None for their squares.
+        robust: loss of the residuals; None for their squares.
     """
 
     points: Points
@@ -254,7 +258,7 @@ class BundleProblem:
         return Bundle(place.intrinsics + step.shared, place.poses + step.own)
 
     def equations_at(self, place: Bundle) -> Blocks:
-        """Shared are the intrinsics, with zeros for those held; a group is a view."""
+        """Intrinsics are the shared parameters, with zeros for those held; a group is a view."""
         with np.errstate(all="ignore"):  # A step too far may lead to points behind the camera; the cost refuses it.
             z, jacobian = in_sigma(place, self.points)
             size = np.sqrt((z**2).sum(axis=1))
@@ -265,8 +269,8 @@ class BundleProblem:
                 z, jacobian = z * root[:, None], jacobian * root[:, None, None]
             matrix, right = by_view(z, jacobian, self.points)
         shared = matrix[:, :LENS, :LENS].sum(axis=0) + self.prior.precision
-        # Each intrinsic gets this part of the information that known poses would bring: what views do not tell at all
-        # has then a very large variance, not none. It is above rounding, and moves no sigma of what they do tell.
+        # Each intrinsic gets this part of the information that known poses would bring: an intrinsic that views do not
+        # determine has then a very large variance, not none. It is above rounding, and changes no other sigma.
         shared = (shared + 1e-11 * np.diag(np.diag(shared))) * np.outer(self.free, self.free)
         shared_right = (right[:, :LENS].sum(axis=0) + self.prior.right(place.intrinsics)) * self.free
         cross = matrix[:, :LENS, LENS:] * self.free[:, None]
@@ -281,7 +285,7 @@ def solve(
     start: Bundle, points: Points, free: Bool[np.ndarray, "9"], prior: Prior, robust: Cauchy | None = None
 ) -> Solved:
     """The minimum next to ``start``, roughly if robust or of poses alone; arguments as for ``BundleProblem``."""
-    # A descent ends a thousandth of a sigma from the minimum, one that another follows a tenth.
+    # A descent ends a thousandth of a sigma from the minimum; if another one follows, a tenth is enough.
     rough = robust is not None or not free.any()
     rules = SolverRules(least_gain=1e-2 if rough else 1e-6, iterations=60)
     return minimise(BundleProblem(points, free, prior, robust), start, rules)

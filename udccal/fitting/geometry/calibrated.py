@@ -1,9 +1,9 @@
-"""What a bundle of views gives: lens, poses, whether the model holds, and how sure it is where a ray lands.
+"""The result of a bundle: lens, poses, tests of the model, and the covariance of the place where a ray lands.
 
-Two ways to be wrong are told apart from chance. Views that disagree: each view alone would have the intrinsics a little
-elsewhere, further than its noise explains (Cochran's Q, as in meta-analysis). A pattern over the picture: residuals of
-neighbouring places in the sensor, over all views, have a common direction. Both statistics are exact for a linear model
-with normal noise.
+Two model errors are tested against chance. Views may disagree: each view alone would put the intrinsics elsewhere,
+further than its noise explains (Cochran's Q, as in meta-analysis). Residuals may have a pattern over the picture: those
+of neighbouring places on the sensor, over all views, have a common direction. Both statistics are exact for a linear
+model with normal noise.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from udccal.result import Candidate, FitStatus, Outliers
 
 
 class Gauge(enum.Enum):
-    """What a ray stays fixed to while the calibration varies.
+    """The frame to which a ray stays fixed while the calibration varies.
 
     A lens whose centre is a pixel off and a camera that is turned by as much see nearly the same. Compare Kogan,
     "Projection uncertainty" in the documentation of mrcal, whose choice is ``BOARDS``.
@@ -39,11 +39,11 @@ class Gauge(enum.Enum):
 @final
 @dataclass(frozen=True)
 class Evidence:
-    """What the residuals say about the model.
+    """Tests of the model by its residuals.
 
     Attributes:
-        pattern: residuals averaged over the cells of a grid on the sensor, against independence.
-        views: the intrinsics that each view prefers, against one set for all.
+        pattern: test of residuals averaged over the cells of a grid on the sensor against independence.
+        views: test of the intrinsics that each view prefers against one set for all.
         pattern_px: size of the pattern per axis beyond noise; 0 unless found.
     """
 
@@ -53,7 +53,7 @@ class Evidence:
 
     @property
     def notes(self) -> Iterator[str]:
-        """What was found, for a person."""
+        """Sentences for a person about the model errors found."""
         if self.views.found:
             yield (
                 f"The views disagree on the lens beyond their noise (ratio {self.views.ratio:.1f}, "
@@ -75,14 +75,14 @@ class CalibratedViews:
         intrinsics: the lens; distortion coefficients that the data do not ask for are 0.
         poses: of the views in use, board to camera: rotation vector (rad), then translation (board's unit).
         cov: of the intrinsics as a vector, then 6 per view in use. The scale of the noise is estimated; where the views
-            disagree beyond it, what they disagree by is added.
-        points: the finite points of all views in use, with their sigma as estimated: that given times its scatter.
+            disagree beyond it, the variance of their disagreement is added.
+        points: the finite points of all views in use; their sigma is the given one times the estimated scatter.
         residuals_px: projected minus seen, of these points.
         free: which intrinsics were fitted.
-        chi2_dof: scatter over the sigma given, squared; 1 where none was given.
+        chi2_dof: scatter over the given sigma, squared; 1 where none was given.
         candidates: the orders of the distortion, by BIC.
         evidence: tests of the model.
-        status: ``CONVERGED``, or why not to use this; ``notes`` say what to do.
+        status: ``CONVERGED``, or the reason not to use this; ``notes`` say what to do.
         outliers: points left out.
         iterations: of the last solve with all distortions free.
         image_size: (columns, rows).
@@ -110,15 +110,19 @@ class CalibratedViews:
 
     @property
     def rms_px(self) -> float:
-        """Root of the mean squared distance between seen and projected points, as OpenCV's calibrateCamera counts."""
+        """Root mean square distance of seen from projected points in px, as OpenCV's calibrateCamera returns it."""
         return float(np.sqrt((self.residuals_px[self.points.used] ** 2).sum(axis=1).mean()))
 
     def projection_covariance(
         self, pixels: Float[np.ndarray, "rays 2"], gauge: Gauge = Gauge.BOARDS
     ) -> Float[np.ndarray, "rays 2 2"]:
-        """Covariance in px^2 of where the rays that the fit puts at these pixels land.
+        """Covariance in px^2 of the places where rays land.
 
-        A pattern that the residuals show beyond chance is an error of the model; its size is added.
+        A pattern that the residuals show beyond chance is a model error; its size is added.
+
+        Args:
+            pixels: (x, y) in px, where the fit puts the rays.
+            gauge: the frame to which the rays are fixed.
 
         Raises:
             FitError: when the fitted distortion folds before a pixel, so that no ray lands there.
@@ -129,7 +133,7 @@ class CalibratedViews:
         return np.einsum("nai,ij,nbj->nab", slope, self.cov, slope) + self.evidence.pattern_px**2 * np.eye(2)
 
     def turn(self, gauge: Gauge) -> Float[np.ndarray, "3 n"]:
-        """How the rays turn, in camera coordinates, with the intrinsics and poses."""
+        """Derivatives of the rays' rotation, in camera coordinates, by the intrinsics and poses."""
         turn = np.zeros((3, len(self.cov)))
         if gauge is Gauge.BOARDS:
             for view, pose in enumerate(self.poses):
@@ -142,7 +146,7 @@ class CalibratedViews:
     def _ray_slopes(
         self, pixels: Float[np.ndarray, "rays 2"]
     ) -> tuple[Float[np.ndarray, "rays 2 9"], Float[np.ndarray, "rays 2 3"]]:
-        """Of where fixed rays land: by the intrinsics, and by a small rotation of the rays in camera coordinates."""
+        """Derivatives of the places where rays land, by the intrinsics and by a small rotation of the rays."""
         lens = self.intrinsics
         rays = np.hstack([(pixels - lens.principal_point_px) / lens.focal_px, np.ones((len(pixels), 1))])
         with np.errstate(all="ignore"):  # Rays that do not come near are found below.
@@ -171,7 +175,7 @@ def field_grid(image_size: tuple[int, int]) -> Float[np.ndarray, "81 2"]:
 
 
 def _turn_by_vector(vector: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
-    """Small rotation that a change of a rotation vector adds after it (the left Jacobian of SO(3))."""
+    """The left Jacobian of SO(3): a change of the rotation vector to the small rotation that follows the old one."""
     matrix, by = cv2.Rodrigues(np.ascontiguousarray(vector))
     small = by.reshape(3, 3, 3) @ matrix.T
     return np.array([small[:, 2, 1], small[:, 0, 2], small[:, 1, 0]])
@@ -194,7 +198,7 @@ def weigh(
     matrix, right = by_view(z, jacobian, points)
     own = scaled_inverse(matrix[:, LENS:, LENS:], 1e-14)
     carried = -own @ matrix[:, LENS:, :LENS]
-    # Of each view on the free intrinsics once its pose is eliminated; all views together have the size 1.
+    # Each view's information on the free intrinsics, its pose eliminated; all views together have the size 1.
     information = (matrix[:, :LENS, :LENS] + matrix[:, :LENS, LENS:] @ carried)[:, free][:, :, free]
     score = (right[:, :LENS] + np.einsum("kji,kj->ki", carried, right[:, LENS:]))[:, free]
     unit = 1 / np.sqrt(np.maximum(np.einsum("kii->i", information), 1e-300))
@@ -215,10 +219,11 @@ def _widened(
     carried: Float[np.ndarray, "views 6 9"],
     own: Float[np.ndarray, "views 6 6"],
 ) -> Float[np.ndarray, "n n"]:
-    """With the lens's spread, carried to the poses, and what is added to each pose's own part.
+    """The covariance with the spread of the lens, carried to the poses, and an addition to each pose's own part.
 
-    The lens has the scatter of what it is without one view after another: its 95 % intervals hold 93 to 98 % where
-    boards are bent or lenses move, those of one factor for all (Birge, 1932) 83 to 99 %. No other view tells a pose.
+    The spread is that of the lens when one view after another is left out. Its 95 % intervals hold 93 to 98 % where
+    boards are bent or lenses move; with one factor for all (Birge, 1932) they hold 83 to 99 %. Only its own view
+    determines a pose.
     """
     along = np.vstack([np.eye(LENS), carried.reshape(-1, LENS)])
     wide = cov + along @ spread @ along.T
@@ -229,7 +234,7 @@ def _widened(
 
 
 def _disagreement(information: np.ndarray, score: np.ndarray, dof: float) -> MisfitTest:
-    """Q = sum over views of score' information^+ score: how far the views' own minima lie from the common one."""
+    """Cochran's Q: sum over views of score' information^+ score, the distances of the views' minima from the common."""
     values, vectors = np.linalg.eigh(information)
     seen = values > 1e-9 * np.maximum(values[:, -1:], 1e-9)
     along = np.einsum("kij,ki->kj", vectors, score)
@@ -246,10 +251,10 @@ def _pattern(
     dof: float,
     cells: int,
 ) -> tuple[MisfitTest, float]:
-    """Sums over the cells of a grid, against their covariance under the model, and the pattern's size in px.
+    """Test sums over the cells of a grid by their covariance under the model; give the pattern's size in px as well.
 
-    Not ``group_means_test``: the fit takes up most of what is smooth over the picture, so that means of cells scatter
-    far less than those of independent residuals; their covariance accounts for that.
+    ``group_means_test`` does not serve here: the fit absorbs most of a smooth pattern, so that means of cells scatter
+    far less than those of independent residuals. The covariance of the sums accounts for that.
     """
     place = np.clip(points.image / np.array(image_size) * cells, 0, cells - 1).astype(np.int64)
     cell = np.where(points.used, place[:, 1] * cells + place[:, 0], -1)
@@ -264,6 +269,6 @@ def _pattern(
     values, vectors = np.linalg.eigh(expected)
     seen = values > 1e-6 * count.max()
     found = f_test(float(((vectors[:, seen].T @ sums) ** 2 / values[seen]).sum()), int(seen.sum()), dof)
-    # Mean over the points of the squared mean of their cell, less what noise makes of it.
+    # Mean over the points of the squared mean of their cell, less the part that noise has in it.
     excess = float(((sums**2 - np.diag(expected)) / count).sum() / count.sum())
     return found, float(np.sqrt(max(excess, 0.0) * np.mean(points.sigma[points.used] ** 2)))

@@ -1,12 +1,12 @@
 """Inner corners of a ChArUco board in a raw mosaic, to a few hundredths of a pixel.
 
-OpenCV's detector names the corners. Each is then placed by a blurred saddle, fitted to the samples around it:
+OpenCV's detector numbers the corners. A blurred saddle, fitted to the samples around each, then gives its place:
 
     I(u) = b + g . u + A erf(n1 . u / (sqrt(2) s1)) erf(n2 . u / (sqrt(2) s2)),
 
 with u the offset from the corner and n1, n2 the unit normals of the two edges. Each edge has its own width, so that
-blur along one direction (diffraction streaks) fits. Model and window are even about the corner: blur that the model
-does not describe, but which is symmetric, moves nothing.
+blur along one direction (diffraction streaks) fits. Model and window are even about the corner: symmetric blur that
+the model does not describe moves no corner.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ class Luminance:
     """Grey picture of a black-and-white subject.
 
     Attributes:
-        grey: filtered.
-        variance: of the samples before the filter, brought to one mean as they were.
+        grey: filtered picture.
+        variance: of the samples before the filter, scaled as the samples are.
     """
 
     grey: Float[np.ndarray, "rows columns"]
@@ -42,11 +42,12 @@ class Luminance:
 def luminance(mosaic: Float[np.ndarray, "rows columns"], variance: Float[np.ndarray, "rows columns"]) -> Luminance:
     """Grey picture on the mosaic's own pixels.
 
-    The four sites of the pattern are brought to one mean and averaged with the filter (1 2 1) x (1 2 1) / 16: nothing
-    moves, and no pattern is left.
+    The four sites of the pattern are scaled to one mean and averaged with the filter (1 2 1) x (1 2 1) / 16. That
+    moves no edge and removes the pattern.
 
     Args:
-        mosaic: free of black, in any linear unit. variance: of its samples, in that unit squared.
+        mosaic: black level subtracted, in any linear unit.
+        variance: of its samples, in that unit squared.
     """
     grey, spread = np.asarray(mosaic, dtype=np.float64).copy(), np.asarray(variance, dtype=np.float64).copy()
     total = max(float(grey.mean()), 1e-12)
@@ -71,9 +72,9 @@ def _filtered(picture: Float[np.ndarray, "*stack rows columns"]) -> Float[np.nda
 @final
 @dataclass(frozen=True)
 class BoardCorners:
-    """Corners found: their numbers on the board, where they are in sensor pixels, and one sigma in px of that by noise.
+    """Corners found: their numbers on the board, their places in sensor pixels, and one sigma of these in px by noise.
 
-    What a board's print and the picture's blur add to it, the bundle tells from how corners scatter.
+    The bundle estimates how much the board's print and the picture's blur add to the sigma.
     """
 
     ids: Int[np.ndarray, " n"]
@@ -82,7 +83,10 @@ class BoardCorners:
 
 
 def charuco_board(spec: BoardSpec) -> cv2.aruco.CharucoBoard:
-    """OpenCV's board of that description.
+    """OpenCV's board of a description.
+
+    Args:
+        spec: squares, sizes in mm and the dictionary's name.
 
     Raises:
         FitError: when OpenCV has no dictionary of that name.
@@ -97,12 +101,27 @@ def charuco_board(spec: BoardSpec) -> cv2.aruco.CharucoBoard:
 
 
 def board_points_mm(spec: BoardSpec) -> Float[np.ndarray, "corners 3"]:
-    """Inner corners in board coordinates, in the order of their numbers."""
+    """Inner corners of a board in the order of their numbers.
+
+    Args:
+        spec: squares, sizes in mm and the dictionary's name.
+
+    Returns:
+        (x, y, 0) in mm in board coordinates.
+
+    Raises:
+        FitError: when OpenCV has no dictionary of that name.
+    """
     return np.asarray(charuco_board(spec).getChessboardCorners(), dtype=np.float64).reshape(-1, 3)
 
 
 def detect_corners(picture: Luminance, spec: BoardSpec, rules: GeometryRules | None = None) -> BoardCorners:
-    """Find a board's inner corners in a grey picture; none found gives empty arrays.
+    """Find a board's inner corners in a grey picture; where there are none the arrays are empty.
+
+    Args:
+        picture: see ``luminance``.
+        spec: of the board.
+        rules: see ``GeometryRules``.
 
     Raises:
         FitError: when the board's dictionary is unknown.
@@ -121,7 +140,7 @@ def detect_corners(picture: Luminance, spec: BoardSpec, rules: GeometryRules | N
 def _detect(
     grey: Float[np.ndarray, "rows columns"], spec: BoardSpec
 ) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, "n 2"]]:
-    """OpenCV's detection, on the picture and, for strong blur, on one of half its size; the richer answer."""
+    """OpenCV's detection on the picture and, for strong blur, on one of half its size; the one with more corners."""
     low, high = np.percentile(grey, [0.5, 99.5])
     scaled = np.clip((grey - low) / max(high - low, 1e-12), 0.0, 1.0)
     picture = np.round(255.0 * scaled).astype(np.uint8)
@@ -141,7 +160,7 @@ def _detect(
 def _edges_px(
     board: Float[np.ndarray, "n 2"], image: Float[np.ndarray, "n 2"], square_mm: float
 ) -> Float[np.ndarray, "n 2 2"]:
-    """How one square's side to the right and one side down look in the picture at each corner."""
+    """The sides of a square to the right and down at each corner, as vectors in px."""
     homography, _ = cv2.findHomography(board, image, cv2.RANSAC, 5.0)
     if homography is None:
         homography = np.eye(3)
@@ -155,9 +174,9 @@ def _edges_px(
 
 @final
 class _Saddle:
-    """The model at a shape (px, py, angle1, angle2, log s1, log s2), its linear part (b, gx, gy, A) at its best.
+    """The model at a shape (px, py, angle1, angle2, log s1, log s2), with its best linear part (b, gx, gy, A).
 
-    Samples lie in squares around whole pixels near corners, at ``offsets``; the round part within ``radius`` counts.
+    Samples lie in squares around whole pixels near corners, at ``offsets``; those within ``radius`` count.
     """
 
     def __init__(
@@ -182,7 +201,7 @@ class _Saddle:
         self.cost = (self.weight * self.residual**2).sum(-1)
 
     def jacobian(self) -> Float[np.ndarray, "n m 10"]:
-        """By the shape and the linear part."""
+        """Derivatives by the shape and the linear part."""
         bell = np.sqrt(2 / np.pi) * np.exp(-(self.across**2) / 2)
         common = self.linear[:, 3, None, None] * bell * self.profile[:, ::-1]
         by_width = common / self.width[..., None]
@@ -201,7 +220,7 @@ class _Saddle:
         return np.linalg.solve(normal + raised[:, :, None] * np.eye(10), right[..., None])[:, :6, 0]
 
     def noise_sigma(self, variance: Float[np.ndarray, "n m"]) -> Float[np.ndarray, " n"]:
-        """One sigma by axis in px that the samples' noise gives, through the filter and the window's weights.
+        """One sigma by axis in px of the corners, from the samples' noise, the filter and the window's weights.
 
         Weighted least squares moves a corner by G = (J' W J)^-1 J' W per filtered sample: the covariance is a sandwich.
         """

@@ -1,8 +1,8 @@
 """A session's boards: corners in the first capture of each step ``geometry/*``, behind the flat field if there is one.
 
-A gradient of the picture's brightness beside a corner moves it. Rows of the panel out of focus make such gradients: on
-a rig whose wire modulates by 3 % corners scatter half as much once they are divided out (EMVA 1288's flat-field
-correction, with the panel as part of the camera). Unequal pixels go with it.
+A gradient of the picture's brightness at a corner moves it. Out-of-focus rows of the panel make such gradients. On a
+rig whose wire modulates by 3 %, corners scatter half as much once the flat field is divided out (EMVA 1288's flat-field
+correction, with the panel as part of the camera). That corrects unequal pixels as well.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class BoardView:
     """The corners of one step's board.
 
     Attributes:
-        step_id: for a person. spec: of the board. corners: found.
+        step_id: name of the step, for a person. spec: of the board. corners: those found.
         parallel: whether the board stands parallel to the panel, its axes the panel's.
         clipped: part of the picture's samples at saturation.
     """
@@ -51,7 +51,7 @@ class BoardView:
 @final
 @dataclass(frozen=True)
 class GeometryData:
-    """What a rig's geometry is fitted to.
+    """The data of a rig's geometry fit.
 
     Attributes:
         views: of boards, at least one of them parallel to the panel.
@@ -67,10 +67,15 @@ class GeometryData:
 
 
 def read_geometry(session: Session, noise: Noise, rules: GeometryRules | None = None) -> GeometryData:
-    """The boards of all steps ``geometry/*``, and what the rig's description says of the lens.
+    """Read the boards of all steps ``geometry/*``, and the prior on the lens from the rig's description.
 
     Args:
-        session: where they were captured. noise: gives the black level, the saturation and the corners' sigma.
+        session: with the boards' captures.
+        noise: for the black level, the saturation and the corners' sigma.
+        rules: see ``GeometryRules``.
+
+    Returns:
+        the data of ``fit_boards``.
 
     Raises:
         SessionError: when a file is missing or damaged.
@@ -84,7 +89,15 @@ def read_geometry(session: Session, noise: Noise, rules: GeometryRules | None = 
 
 
 def rig_prior(rig: RigDescription, rules: GeometryRules | None = None) -> Prior:
-    """What a rig's description says of its lens: the focal length by its tolerance, the rest as lenses commonly are."""
+    """Prior on the intrinsics from a rig's description.
+
+    Args:
+        rig: for the focal length, whose tolerance is its sigma, and the size of the sensor.
+        rules: for the sigma of principal point and distortion.
+
+    Returns:
+        independent normal distributions in the order of ``Intrinsics``, in px and without a unit.
+    """
     rules = rules or GeometryRules()
     focal = rig.focal_px * max(rig.lens.focal_mm.tolerance / rig.lens.focal_mm.value, 1e-4)
     centre = rules.centre_sigma * rig.camera.columns
@@ -95,7 +108,7 @@ def rig_prior(rig: RigDescription, rules: GeometryRules | None = None) -> Prior:
 @final
 @dataclass(frozen=True)
 class FlatField:
-    """Response of every sample over the mean of its site of the pattern, and the relative variance of that by noise."""
+    """Response of every sample over the mean of its CFA site, and the relative variance of that by noise."""
 
     response: Float[np.ndarray, "rows columns"]
     relative_variance: Float[np.ndarray, "rows columns"]
@@ -107,10 +120,13 @@ def flat_field(
     unclipped: Bool[np.ndarray, "rows columns"],
     rules: GeometryRules | None = None,
 ) -> FlatField:
-    """Response of a sensor to an even field; clipped, dead and covered samples are left as they are.
+    """Response of a sensor to an even field; clipped, dead and covered samples have a response of 1.
 
     Args:
-        light: free of black, in any linear unit. variance: of that, in the unit squared. unclipped: which samples are.
+        light: black level subtracted, in any linear unit.
+        variance: of ``light``, in its unit squared.
+        unclipped: which samples are below saturation.
+        rules: for the least response.
     """
     least = (rules or GeometryRules()).least_response
     response, relative = np.ones_like(light), np.zeros_like(light)
@@ -123,7 +139,7 @@ def flat_field(
 
 
 def _read_flat_field(session: Session, noise: Noise, rules: GeometryRules) -> FlatField | None:
-    """From the averages that the wire is fitted to; None where the session has none."""
+    """The flat field by the averages of the wire fit; None where the session has none."""
     if not {"wire/dark", "wire/flat"} <= {step.id for step in session.steps("wire")}:
         return None
     capture = session.step("wire/flat").captures[0]
@@ -136,7 +152,7 @@ def _read_flat_field(session: Session, noise: Noise, rules: GeometryRules) -> Fl
 def _temporal_variance_DN2(
     noise: Noise, light_DN: Float[np.ndarray, "rows columns"], capture: StoredCapture
 ) -> Float[np.ndarray, "rows columns"]:
-    """Of a capture's mean (EMVA 1288's photon transfer)."""
+    """Temporal variance of a capture's mean in DN^2 (EMVA 1288's photon transfer)."""
     gain, exposure_s = float(np.asarray(noise.K_DN_per_e)), np.float64(capture.exposure_s)
     return gain**2 * np.asarray(variance_e(noise, light_DN / gain, exposure_s), dtype=np.float64) / capture.frames
 
@@ -154,7 +170,7 @@ def _read_view(
     area, offsets_DN = capture.region, float(np.asarray(noise.K_DN_per_e)) * float(np.asarray(noise.DSNU1288_e))
     variance = _temporal_variance_DN2(noise, light, capture) + offsets_DN**2
     part = np.s_[area.y : area.y + area.rows, area.x : area.x + area.columns]
-    # As even pixels would see it; noise of pixels that stay unequal adds to the temporal noise.
+    # The picture as equal pixels would see it; the remaining inequality adds to the temporal noise.
     response, unequal = np.ones_like(light), np.full_like(light, float(np.asarray(noise.PRNU1288)) ** 2)
     if flat is not None:
         response, unequal = flat.response[part], flat.relative_variance[part]

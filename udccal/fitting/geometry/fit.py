@@ -1,8 +1,8 @@
 """Lens and poses from arrays of corners, of a ChArUco board through a panel and of a chessboard in a photograph alike.
 
-The robust minimum of the best start, without outliers; then scatter by likelihood; then the order of the distortion.
-The sigma that comes with a point tells how it compares with others; its scale is estimated. One scale serves all views
-unless a test says that the views differ (blur, light and distance do that): then each has its own.
+The fit takes the robust minimum of the best start, without outliers. It then estimates the scatter by maximum
+likelihood, and chooses the order of the distortion. The sigma of a point counts relative to that of others; its scale
+is estimated. All views have one scale unless a test finds that they differ (by blur, light or distance).
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ def fit_geometry(
         start: intrinsics to start from. The views' vanishing points (Zhang, 2000) give another start in any case; the
             lower minimum wins.
         sigmas: per view, one sigma in px of each point, up to a common factor; without it all points count alike.
-        prior: what is known of the intrinsics beforehand, in the order of ``Intrinsics``; with it a single view may do.
+        prior: on the intrinsics, in the order of ``Intrinsics``; with it a single view may be enough.
         start_poses: per view, a pose to start from, with ``start``.
         rules: see ``GeometryRules``.
 
@@ -117,7 +117,7 @@ def fit_geometry(
 
 
 def _strange_views(scattered: Points, given: Points, rules: GeometryRules) -> Bool[np.ndarray, " views"]:
-    """Views that are better left out: read in another order, another board, moved while captured."""
+    """Views to leave out: their points are in another order, the board is another one, or it moved."""
     ratio = np.array([np.median((scattered.sigma / given.sigma)[given.view == k]) for k in range(len(given.names))])
     return np.asarray(ratio > rules.strange_view * np.median(ratio))
 
@@ -125,7 +125,7 @@ def _strange_views(scattered: Points, given: Points, rules: GeometryRules) -> Bo
 def _maximum_likelihood(
     solved: Solved, points: Points, given: Points, prior: Prior
 ) -> tuple[Solved, Points, Float[np.ndarray, " views"]]:
-    """Scales from residuals and their degrees of freedom, the points with them, and the solution weighted by them."""
+    """Scales by residuals and their degrees of freedom, points with scaled sigma, and the solution with these."""
     given, scales = replace(given, used=points.used), np.ones(len(given.names))
     for _ in range(8):
         square, dof = costs(solved.place, given), 2 * given.sums(np.ones(len(given.view))) - _spent(solved, points)
@@ -140,7 +140,7 @@ def _maximum_likelihood(
 
 
 def _spent(solved: Solved, points: Points) -> Float[np.ndarray, " views"]:
-    """Degrees of freedom that the fit takes up of each view: the trace of information times covariance."""
+    """Degrees of freedom that the fit uses of each view: the trace of information times covariance."""
     information, _ = by_view(*in_sigma(solved.place, points), points)
     views = np.arange(len(points.names))[:, None]
     mine = np.hstack([np.arange(LENS) + 0 * views, LENS + 6 * views + np.arange(6)])
@@ -149,7 +149,7 @@ def _spent(solved: Solved, points: Points) -> Float[np.ndarray, " views"]:
 
 
 def _differ(square: Float[np.ndarray, " views"], dof: Float[np.ndarray, " views"]) -> bool:
-    """Bartlett's test of equal variances (1937), over views that have at least four degrees of freedom."""
+    """Bartlett's test of equal variances (1937), over views with at least four degrees of freedom."""
     if len(dof) < 2 or not ((dof >= 4) & (square > 0)).all():
         return False
     ratio = float((dof * np.log(square.sum() / dof.sum() / (square / dof))).sum())
@@ -160,8 +160,8 @@ def _differ(square: Float[np.ndarray, " views"], dof: Float[np.ndarray, " views"
 def _choose_order(full: Solved, points: Points, prior: Prior, rules: GeometryRules) -> tuple[Choice[Solved], bool]:
     """Every order, each solved from the one above with its further coefficients at 0; and whether the prior chose.
 
-    Where the prior brings a good part of what is known of focal length or centre, the data are too few to part a
-    coefficient from a pose. All then stay free, each within its prior.
+    Where a large part of the information on focal length or centre is the prior's, the data are too few to separate a
+    coefficient from a pose. All coefficients then stay free, each within its prior.
     """
     tried: list[Attempt[Solved]] = []
     solved = full
@@ -178,9 +178,9 @@ def _choose_order(full: Solved, points: Points, prior: Prior, rules: GeometryRul
 
 
 def _criterion(solved: Solved, points: Points, parameters: int) -> float:
-    """BIC with the scale of the noise estimated, too: n ln(chi2 / n) for chi2.
+    """BIC with an estimated scale of the noise: n ln(chi2 / n) replaces chi2.
 
-    A residual below 1e-7 px is rounding, not noise: orders that differ there only are equally good.
+    A residual below 1e-7 px is rounding, not noise: orders that differ only there are equally good.
     """
     samples = 2 * int(points.used.sum())
     chi2 = float(costs(solved.place, points).sum())
@@ -191,7 +191,7 @@ def _criterion(solved: Solved, points: Points, parameters: int) -> float:
 def _rescaled(
     solved: Solved, points: Points, free: Bool[np.ndarray, "9"], prior: Prior
 ) -> tuple[Solved, Points, float]:
-    """The chosen order with the scale of its own residuals, and the degrees of freedom behind that."""
+    """The chosen order with the scale of its own residuals, and the degrees of freedom of that scale."""
     dof = max(2 * float(points.used.sum()) - float(_spent(solved, points).sum()), 1.0)
     factor = max(np.sqrt(float(costs(solved.place, points).sum()) / dof), least_scale(points))
     points = points.scaled(np.full(len(points.names), factor))

@@ -1,6 +1,6 @@
 """From arrays to the robust minimum of a bundle: views checked, starts, outliers left out.
 
-Focal length starts from homographies (Zhang, IEEE PAMI 22, 2000), poses from flat boards (Collins and Bartoli, IJCV
+The focal length starts from homographies (Zhang, IEEE PAMI 22, 2000), poses from flat boards (Collins and Bartoli, IJCV
 109, 2014). A flat board seen from afar looks almost the same in two poses, mirrored at the line of sight. Both are
 kept: the second is tried again once the lens is known.
 """
@@ -36,7 +36,7 @@ from udccal.result import Outliers
 @final
 @dataclass(frozen=True)
 class Gathered:
-    """Points of the usable views, what was left out of them, and sentences about that."""
+    """Points of the usable views, the points left out, and sentences about these."""
 
     points: Points
     outliers: tuple[Outliers, ...]
@@ -46,13 +46,13 @@ class Gathered:
 def gather(
     board: Sequence[np.ndarray], image: Sequence[np.ndarray], sigmas: Sequence[np.ndarray] | None, rules: GeometryRules
 ) -> Gathered:
-    """Every finite point of every view that holds a pose; arguments as for ``fit_geometry``."""
+    """Every finite point of every view that determines a pose; arguments as for ``fit_geometry``."""
     if len({len(board), len(image), len(image if sigmas is None else sigmas)}) > 1:
         raise FitError(
             f"Expected as many views on the board as in pictures (and of sigmas), found {len(board)} and {len(image)}. "
             "Give one array of each per view."
         )
-    # Without sigmas any common one will do: its scale is estimated.
+    # Without sigmas any common value serves: its scale is estimated.
     given = [np.full(len(pixels), 0.1) for pixels in image] if sigmas is None else sigmas
     lost: list[str] = []
     notes: list[str] = []
@@ -100,7 +100,7 @@ def _complaint(board: np.ndarray, image: np.ndarray, before: list[tuple[np.ndarr
 def starts(
     points: Points, size: tuple[int, int], given: Intrinsics | None, poses: Float[np.ndarray, "views 6"] | None
 ) -> list[Bundle]:
-    """Bundles to begin from: from what is given, from the views' vanishing points, else from a common lens."""
+    """Starts: from the given intrinsics, and from the views' vanishing points or else a common lens."""
     centred = Intrinsics(np.full(2, _focal_px(points, size)), (np.array(size) - 1) / 2, np.zeros(5)).vector
     found = [Bundle(centred, best_poses(points, centred)[0])]
     if given is not None:
@@ -111,7 +111,7 @@ def starts(
 def best_poses(
     points: Points, intrinsics: Float[np.ndarray, "9"]
 ) -> tuple[Float[np.ndarray, "views 6"], Float[np.ndarray, "views 6"]]:
-    """The pose of each view that suits these intrinsics, and the one mirrored at the line of sight."""
+    """The best pose of each view at these intrinsics, and the one mirrored at the line of sight."""
     pairs = [_pose_pair(points, view, Intrinsics.of(intrinsics)) for view in range(len(points.names))]
     return np.array([first for first, _ in pairs]), np.array([second for _, second in pairs])
 
@@ -142,7 +142,7 @@ def _pose_pair(points: Points, view: int, lens: Intrinsics) -> tuple[np.ndarray,
 
 
 def _ahead(board: np.ndarray, image: np.ndarray, lens: Intrinsics) -> np.ndarray:
-    """Facing the camera, at the distance and place that the points' spread says."""
+    """A pose that faces the camera, at the distance and place by the points' spread."""
     (across, down), middle = image.mean(axis=0), board.mean(axis=0)
     seen = max(float(np.linalg.norm(image - image.mean(axis=0))), 1e-9)
     distance = lens.matrix[0, 0] * float(np.linalg.norm(board - middle)) / seen
@@ -150,10 +150,10 @@ def _ahead(board: np.ndarray, image: np.ndarray, lens: Intrinsics) -> np.ndarray
 
 
 def _consistent(board: np.ndarray, image: np.ndarray) -> Bool[np.ndarray, " n"]:
-    """Points that one homography puts near where they are; all, where there are too few to tell.
+    """Points that one homography puts near their places; all points where there are too few for it.
 
-    Near is a part of the board's own size: distortion bends straight lines by less, a corner read as its neighbour's
-    is off by more.
+    The limit is a part of the board's size: distortion bends straight lines by less, and a corner with its neighbour's
+    number is off by more.
     """
     if len(board) >= 12:
         limit = max(0.02 * float(np.ptp(image, axis=0).max()), 1.0)
@@ -164,12 +164,12 @@ def _consistent(board: np.ndarray, image: np.ndarray) -> Bool[np.ndarray, " n"]:
 
 
 def _focal_px(points: Points, size: tuple[int, int]) -> float:
-    """One focal length for both axes by the views' vanishing points; where they give none, that of a common lens."""
+    """One focal length for both axes by the views' vanishing points; that of a common lens where they give none."""
     views = [points.view == k for k in range(len(points.names))]
     board = [(points.board[mine] * np.array([1.0, 1.0, 0.0])).astype(np.float32) for mine in views]
     image = [points.image[mine].astype(np.float32) for mine in views]
     focal, usual = float(cv2.initCameraMatrix2D(board, image, size, 1.0)[0, 0]), float(max(size))
-    # Others are no lenses that the model describes.
+    # The model does not describe lenses outside this range.
     return focal if 0.15 * usual <= focal <= 30.0 * usual else usual
 
 
@@ -181,10 +181,10 @@ def settle(
     prior: Prior,
     rules: GeometryRules,
 ) -> tuple[Solved, Points]:
-    """The best minimum with all distortions free that any start leads to, and the points with outliers marked.
+    """The best minimum of all starts with every distortion free, and the points with outliers marked.
 
-    Their sigma has each view's own scatter. Starts, which may leave out different points, are compared by the robust
-    spread of all points.
+    The points' sigma has each view's own scatter. Starts may leave out different points; the robust spread of all
+    points compares them.
     """
     own = None if poses is None else np.asarray(poses, dtype=np.float64)[list(given.names)]
     found = [_descended(one, given, prior, rules) for one in starts(given, image_size, lens, own)]
@@ -201,7 +201,7 @@ def settle(
 
 
 def _descended(start: Bundle, given: Points, prior: Prior, rules: GeometryRules) -> tuple[Solved, Points]:
-    """Robustly and with few coefficients first: from far off, five bend the picture into any minimum."""
+    """Descend robustly and with few coefficients first: from far off, all five may lead to a wrong minimum."""
     bundle = start
     for free in (ORDERS["k1"], EVERY):
         bundle = solve(bundle, given.scaled(_robust_scales(bundle, given)), free, prior, rules.robust).place
@@ -215,7 +215,7 @@ def costs(bundle: Bundle, points: Points) -> Float[np.ndarray, " views"]:
 
 
 def _squares(bundle: Bundle, points: Points) -> Float[np.ndarray, " points"]:
-    """Infinite where the lens bends a point out of reach."""
+    """Squared residuals in units of sigma; infinite where a point's projection is not finite."""
     square = (linearised(bundle, points)[0] ** 2).sum(axis=1) / points.sigma**2
     return np.where(np.isfinite(square), square, np.inf)
 
@@ -223,7 +223,7 @@ def _squares(bundle: Bundle, points: Points) -> Float[np.ndarray, " points"]:
 def _robust_scales(bundle: Bundle, points: Points) -> Float[np.ndarray, " views"]:
     """Scatter over sigma of each view, from medians.
 
-    A view of few points may fit them all by its pose: its scale is at least half of all views'.
+    The pose of a view with few points may fit them all: its scale is at least half of all views'.
     """
     z = np.where(points.used[:, None], linearised(bundle, points)[0] / points.sigma[:, None], np.nan)
     own = np.array([robust_sigma(z[points.view == k]) for k in range(len(points.names))])
@@ -231,12 +231,12 @@ def _robust_scales(bundle: Bundle, points: Points) -> Float[np.ndarray, " views"
 
 
 def least_scale(points: Points) -> float:
-    """The least by which sigma may be scaled: below 1e-8 px it is rounding."""
+    """The least factor on sigma: a sigma below 1e-8 px is rounding."""
     return 1e-8 / float(np.median(points.sigma))
 
 
 def _without_outliers(start: Bundle, given: Points, prior: Prior, rules: GeometryRules) -> tuple[Solved, Points]:
-    """Leave out what is too far off and solve again, until nothing changes; what fits again comes back."""
+    """Leave out points that are too far off and solve again, until nothing changes; points that fit again return."""
     scales = _robust_scales(start, given)
     points = _marked(start, given.scaled(scales), rules)
     solved = solve(start, points, EVERY, prior)
@@ -251,7 +251,7 @@ def _without_outliers(start: Bundle, given: Points, prior: Prior, rules: Geometr
 
 
 def _marked(bundle: Bundle, points: Points, rules: GeometryRules) -> Points:
-    """With outliers marked as not used, but where too little would be left of a view to hold its pose."""
+    """Points with outliers marked as not used, except where too few would be left to determine a view's pose."""
     off = rules.corners.off(linearised(bundle, points)[0] / points.sigma[:, None]).any(axis=1)
     kept = np.bincount(points.view[~off], minlength=len(points.names))
     return replace(points, used=~off | (kept < rules.least_corners)[points.view])

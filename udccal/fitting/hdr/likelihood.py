@@ -1,8 +1,8 @@
 """The likelihood of one pixel's bracket, for a block of pixels in one compiled pass.
 
-Samples below the clipping level are normal with the noise model's variance at the *merged* rate; samples at or above
-it tell only that they are so (censored). The score in the rate r of a sample of exposure t, mean m = (r + dark) t and
-variance v is therefore
+Samples below the clipping level are normal with the noise model's variance at the *merged* rate. Samples at or above
+it are censored: only that is known of them. The score in the rate r of a sample of exposure t, mean m = (r + dark) t
+and variance v is therefore
 
     t (x - m) / v            below the level,
     t h(z) / sqrt(v)         at or above it,   z = (level - m) / sqrt(v),
@@ -21,7 +21,7 @@ from jaxtyping import Array, Bool, Float, Int, UInt16
 
 from udccal.models.arrays import Arrayish
 
-# Rounds that know the open samples only, then rounds with the clipped ones too. More move no pixel by 1 % of its sigma.
+# Rounds with the unclipped samples only, then with the clipped ones too. More move no pixel by 1 % of its sigma.
 _OPEN_ROUNDS, _ALL_ROUNDS = 1, 2
 # Below zero rate the variance goes on falling, so that the estimate stays unbiased in the dark, down to this part.
 _LEAST_VARIANCE = 0.25
@@ -29,7 +29,7 @@ _TINY = 1e-30
 
 
 class SensorNumbers(eqx.Module):
-    """What the likelihood needs of the noise model, in electrons; single precision."""
+    """The numbers of the noise model that the likelihood uses, in electrons; single precision."""
 
     black_DN: Float[Arrayish, ""]
     e_per_DN: Float[Arrayish, ""]
@@ -39,9 +39,9 @@ class SensorNumbers(eqx.Module):
 
 
 class BlockMerge(eqx.Module):
-    """Of every pixel: rate and sigma in e-/s, open samples, and the worst sample with its squared deviation in sigma.
+    """Rate and sigma of every pixel in e-/s, its number of unclipped samples, and its worst sample.
 
-    The deviation is that from the rate that the other samples give (leave one out).
+    ``deviation2`` is that sample's squared deviation, in sigma, from the rate that the others give (leave one out).
     """
 
     rate: Float[Arrayish, " pixels"]
@@ -67,7 +67,7 @@ def merge_block(
     left_out: Bool[Array, "n pixels"] | None,
     believed_sigma: float,
 ) -> BlockMerge:
-    """Maximum-likelihood rates. Loops over samples are written out: a pixel stays in the processor's registers."""
+    """Maximum-likelihood rates. Loops over samples are unrolled: a pixel stays in the processor's registers."""
     count = len(frames)
     light = [(frames[i].astype(jnp.float32) - sensor.black_DN) * sensor.e_per_DN for i in range(count)]
     everywhere = jnp.ones(frames.shape[1:], bool)
@@ -94,7 +94,7 @@ def merge_block(
     for i in range(count):
         mean, variance = _expected(rate, times[i], sensor)
         leverage = times[i] ** 2 / (variance * jnp.maximum(information, _TINY))
-        # Clipped although the others promise far less: how far, at least.
+        # The least deviation of a sample that is clipped although the others give a far lower rate.
         beyond = jnp.where(is_open[i], light[i] - mean, jnp.maximum(sensor.level_e - mean, 0.0))
         own = beyond**2 / variance / jnp.where(is_open[i], jnp.maximum(1 - leverage, 1e-3), 1.0)
         own = jnp.where(allowed[i], own, 0.0)

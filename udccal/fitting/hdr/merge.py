@@ -17,7 +17,7 @@ from udccal.fitting.hdr.likelihood import BlockMerge, SensorNumbers, merge_block
 from udccal.models.noise import Noise
 from udccal.result import FitStatus, Outliers
 
-# What sigma says where no sample could be used: larger than any rate a sensor can tell, and finite.
+# Sigma where no sample could be used: finite, and larger than any rate that a sensor can measure.
 UNKNOWN_SIGMA = 1e12
 _BLOCKS = (1 << 16, 1 << 12)  # pixels of one compiled pass: large pictures, and crops
 
@@ -28,12 +28,12 @@ class HdrRules:
     """The constants of a merge.
 
     Attributes:
-        believed_sigma: a sample that the others of its pixel put farther off is a hit, no light, be it clipped or not.
-        margin_sigma: a full well holds its charge before the dark noise is added: so far below it, no sample is full.
-        frame_off, frame_sigma: a frame whose light is off by more than both is left out.
-        frame_pixels: that a frame is judged by, at most.
-        frame_least_pixels, frame_snr: and at least, of so much light over noise each.
-        least_to_judge: samples of a pixel that hits and frames are judged by.
+        believed_sigma: a sample farther than this from the other samples of its pixel is a hit, clipped or not.
+        margin_sigma: samples count as clipped from this many sigma of dark noise below saturation on.
+        frame_off, frame_sigma: a frame is left out when its light is off by more than both (relative, and in sigma).
+        frame_pixels: the most pixels by which a frame is tested.
+        frame_least_pixels, frame_snr: the fewest pixels for that test, and the least signal over noise of each.
+        least_to_judge: the fewest samples of a pixel for finding hits and testing frames.
     """
 
     believed_sigma: float = 6.0
@@ -53,7 +53,7 @@ class HdrMerge:
 
     Attributes:
         rate_e_per_s, sigma_e_per_s: light of every pixel, with one standard deviation.
-        used: samples that each pixel rests on; where there are none the rate is 0 and sigma ``UNKNOWN_SIGMA``.
+        used: number of samples used for each pixel; where it is 0 the rate is 0 and sigma ``UNKNOWN_SIGMA``.
         outliers: frames and samples that were left out.
         status: SATURATED where no pixel has a sample that could be used.
         notes: sentences for a person.
@@ -75,19 +75,22 @@ def merge_bracket(
 ) -> HdrMerge:
     """Merge frames of one still scene at several exposures (repeats allowed).
 
-    Solves the likelihood equation of ``hdr.likelihood`` for each pixel: shot, dark and quantisation noise at the
-    merged rate (weights from single noisy samples would pull dark pixels down), samples within 6 sigma of saturation
-    as censored. In single precision, which moves no rate by a thousandth of its sigma.
+    It solves the likelihood equation of ``hdr.likelihood`` for each pixel. Shot, dark and quantisation noise are those
+    at the merged rate: weights from single noisy samples would pull dark pixels down. Samples within 6 sigma of
+    saturation are censored. Single precision moves no rate by a thousandth of its sigma.
 
-    Left out and listed are frames whose light is off by more than 2 % (a lamp that flickered, a dropped frame), and
-    single samples more than 6 sigma from what the others of their pixel say (cosmic hits, blinking pixels); both need
-    3 samples to judge by. These figures are those of the default ``rules``.
+    Two kinds of outliers are left out and listed: frames whose light is off by more than 2 % (a lamp that flickered, a
+    dropped frame), and samples more than 6 sigma from the other samples of their pixel (cosmic hits, blinking pixels).
+    Both tests need 3 samples of a pixel. These figures are those of the default ``rules``.
 
     Args:
-        frames: codes in DN.
-        exposures_s: of the frames.
-        noise: of the sensor.
+        frames: codes in DN, one frame or mosaic per exposure, all of one shape.
+        exposures_s: exposure of each frame.
+        noise: noise model of the sensor.
         rules: see ``HdrRules``.
+
+    Returns:
+        rate and sigma in e-/s of every pixel, and the outliers; status ``SATURATED`` where no sample could be used.
 
     Raises:
         FitError: when exposures are not positive, or not as many as frames.
@@ -130,7 +133,7 @@ def merge_bracket(
 
 
 def sensor_numbers(noise: Noise, unit_s: float, rules: HdrRules) -> SensorNumbers:
-    """What the likelihood needs of a noise model, times in units of ``unit_s``."""
+    """The numbers of a noise model that the likelihood uses, times in units of ``unit_s``."""
     K, black = float(np.asarray(noise.K_DN_per_e)), float(np.asarray(noise.black_DN))
     floor = float(np.asarray(noise.sigma_d_e)) ** 2 + (float(np.asarray(noise.q_DN)) / K) ** 2 / 12.0
     # A sensor without any dark noise still has a least variance: the likelihood of its dark pixels stays finite.
@@ -148,7 +151,7 @@ class _Bracket:
     rules: HdrRules
 
     def merged(self, left_out: Bool[np.ndarray, "n pixels"] | None = None) -> BlockMerge:
-        """In numpy; in blocks of one size, on two threads; the last block overlaps the one before it."""
+        """Merge in blocks of one size on two threads, to numpy; the last block overlaps the one before it."""
         codes, pixels = self.codes, self.codes.shape[1]
         size = next((b for b in _BLOCKS if b <= pixels), _BLOCKS[-1])
         if (short := size - pixels) > 0:
@@ -177,8 +180,8 @@ class _Bracket:
         signal = merged.rate[lit].astype(np.float64) * self.times[:, None]
         dark = float(sensor.dark_e_per_s) * self.times[:, None]
         sigma = np.sqrt(signal + dark + float(sensor.floor_e2))
-        # The open samples near the level are the low ones of their kind: stay clear of them, and of the skew of a few
-        # electrons. A median: hits do not count as a lamp that flickers.
+        # Unclipped samples near the level are the low ones of their kind; samples of few electrons are skewed. Both are
+        # left out here. The median keeps hits from counting as a lamp that flickers.
         clear = (signal + dark + 5 * sigma < float(sensor.level_e)) & (sigma * rules.frame_snr < signal)
         score = np.zeros(len(clear))
         for i in np.flatnonzero(clear.sum(axis=1) >= rules.frame_least_pixels):

@@ -1,1 +1,1 @@
-"""Noise after EMVA 1288: what dark frames and flats show of the sensor. ``fit.py`` has the entry."""
+"""The noise fit after EMVA 1288, from dark frames and flats; ``fit.py`` has the entry."""

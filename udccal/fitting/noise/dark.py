@@ -1,9 +1,9 @@
-"""Dark frames: black, dark current, read noise and its shape, row noise and DSNU; each if it is there.
+"""Dark frames: black, dark current, read noise and its shape, row noise and DSNU; each if the data support it.
 
 The likelihood is that of the two integer codes of a pixel, with the rounding inside it. Rounding is therefore exact
-where the noise is a fraction of a code, and not the usual 1/12; codes that stop at 0 or at the converter's end are
-censored: the signal lies beyond, and no more is known. Nothing is taken for normal that is not: few electrons of dark
-current are as skewed as Poisson says.
+where the noise is a fraction of a code, instead of the usual 1/12. Codes at 0 or at the converter's end are censored:
+the signal lies at or beyond them. Distributions are not assumed to be normal: dark current of few electrons is as
+skewed as Poisson's distribution.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from udccal.fitting.noise.patterns import Pattern, dsnu, row_noise
 # The shape with the kurtosis of a normal distribution.
 NORMAL_SHAPE = 0.1349
 # Bounds of black [DN], dark current [DN/s], variance of single samples without row noise [DN^2], variance of the
-# pixels' offsets [DN^2], and Tukey-lambda shape: the order of ``Five``. Variances at the bound are those of none.
+# pixels' offsets [DN^2], and Tukey-lambda shape: the order of ``Five``. A variance at its lower bound counts as 0.
 _LOW = np.array([-np.inf, -np.inf, 1e-3, 1e-6, -0.1])
 _HIGH = np.array([np.inf, np.inf, np.inf, np.inf, 0.45])
 Five = Float[np.ndarray, "5"]
@@ -48,7 +48,7 @@ def _standard_cdf(shape: float) -> tuple[Float[np.ndarray, " grid"], Float[np.nd
 
 
 def excess_kurtosis(shape: float) -> float:
-    """Of the Tukey-lambda distribution: 1.2 for the logistic (0), 0 at 0.1349, negative above."""
+    """Excess kurtosis of the Tukey-lambda distribution: 1.2 for the logistic (0), 0 at 0.1349, negative above."""
     x, p = _standard_cdf(shape)
     return float(0.5 * (x[1:] ** 4 + x[:-1] ** 4) @ np.diff(p)) - 3.0
 
@@ -59,18 +59,18 @@ def _dark_cdf(
 ) -> tuple[Float[np.ndarray, " grid"], Float[np.ndarray, " grid"]]:
     """Places (DN from the mean) and the probability that a dark sample lies below them before rounding.
 
-    Tukey-lambda read noise, normal row noise and Poisson counts of ``dark_DN`` in all are independent: their
-    distribution is a convolution, made as a product of spectra.
+    Tukey-lambda read noise, normal row noise and Poisson counts with the mean ``dark_DN`` are independent: their
+    distribution is a convolution, computed as a product of spectra.
     """
     reach = 14 * np.sqrt(sigma_DN**2 + row_DN**2 + K_DN_per_e * max(dark_DN, 0.0)) + 2 * K_DN_per_e * (dark_DN > 0)
-    # Peaks of single counts are as narrow as the read noise: three points to its sigma, down to 0.02 DN.
+    # Peaks of single counts are as narrow as the read noise: three points per sigma of it, down to 0.02 DN.
     points = int(np.clip(2 ** np.ceil(np.log2(6 * reach / max(sigma_DN, 0.06))), 4096, 65536))
     step = 2 * reach / points
     edges = step * (np.arange(points + 1) - points // 2 - 0.5)
     grid, cdf = _standard_cdf(shape)
     mass = np.diff(np.interp(edges / max(sigma_DN, 1e-12), grid, cdf, left=0.0, right=1.0))
     u = 2 * np.pi * np.fft.rfftfreq(points, step)
-    # Narrower than the grid it would ring: then it is widened to one step.
+    # A distribution narrower than the grid would ring: it is widened to one step.
     smear = step if sigma_DN < 2 * step else 0.0
     log_phase = -0.5 * (row_DN**2 + smear**2) * u**2 + 0j
     if dark_DN > 0 and K_DN_per_e > 0:
@@ -82,7 +82,7 @@ def _dark_cdf(
 @final
 @dataclass(frozen=True)
 class Surroundings:
-    """What is known apart from the histograms; ``background`` is the fraction of samples of any code."""
+    """Known numbers apart from the histograms; ``background`` is the fraction of samples that may have any code."""
 
     K_DN_per_e: float
     sigma_row_DN: float
@@ -90,12 +90,12 @@ class Surroundings:
 
 
 def pair_probability(pair: DarkPair, values: Five, known: Surroundings) -> Float[np.ndarray, "codes codes"]:
-    """Of the two codes of a pixel in a pair of dark frames, in its groups of codes."""
+    """Probability of the two codes of a pixel in a pair of dark frames, by groups of codes."""
     black, per_s, variance, spread2, shape = (float(v) for v in values)
     drift = per_s * pair.exposure_s
     grid, cdf = _dark_cdf(np.sqrt(variance), shape, known.sigma_row_DN, drift, known.K_DN_per_e)
-    # Counts of dark current widen the distribution but leave its peaks as narrow as the read noise. Evenly spaced
-    # nodes are for a smooth integrand as good as any quadrature.
+    # Counts of dark current widen the distribution but leave its peaks as narrow as the read noise. For a smooth
+    # integrand, evenly spaced nodes are as good as any quadrature.
     width, spread = max(np.sqrt(variance + known.sigma_row_DN**2), 1e-9), np.sqrt(spread2)
     z = np.linspace(-5.5, 5.5, int(np.clip(np.ceil(17.6 * spread / width), 13, 1201)) | 1)
     weights = np.exp(-0.5 * z**2)
@@ -108,7 +108,7 @@ def pair_probability(pair: DarkPair, values: Five, known: Surroundings) -> Float
 @final
 @dataclass(frozen=True)
 class DarkFit:
-    """Values in the order of the bounds, with their covariance; and what follows per pair.
+    """Values in the order of the bounds, with their covariance, and numbers of each pair.
 
     ``edge_gains`` is d(mean code)/d(black): 1, and ``follows``, where rounding is white and no code is cut off.
     ``means_DN`` is the mean signal with rounding and censoring undone, of variance ``variances_DN2``.
@@ -126,7 +126,7 @@ class DarkFit:
 @final
 @dataclass(frozen=True)
 class _DarkCodes:
-    """The engine's problem: the deviance of all histograms from those expected, the shape's prior added."""
+    """The solver's problem: the deviance of all histograms from those expected, and the shape's prior."""
 
     pairs: tuple[DarkPair, ...]
     known: Surroundings
@@ -135,11 +135,11 @@ class _DarkCodes:
     name: str = "noise, dark codes"
 
     def equations_at(self, place: Five) -> Blocks:
-        """Score and Fisher information; at a bound with the score pointing outwards the bound is the answer."""
+        """Score and Fisher information; a parameter at a bound stays there while its score points outwards."""
         off = (place[4] - NORMAL_SHAPE) / self.shape_sigma
         cost, samples, shape = off**2, 0, self.free[4] * np.eye(5)[4] / self.shape_sigma
         score, information = -off * shape, np.outer(shape, shape)
-        # For derivatives by differences: small beside the noise, large beside the arithmetic.
+        # Steps of differences: small compared with the noise, large compared with rounding errors.
         width2 = place[2] + 0.01
         longest = max(max(pair.exposure_s for pair in self.pairs), 1e-9)
         steps = 2e-3 * np.array([width2**0.5, width2**0.5 / longest, width2, max(0.5 * place[3], 1e-4 * width2), 1.0])
@@ -147,7 +147,7 @@ class _DarkCodes:
         for pair in self.pairs:
             p, counts = pair_probability(pair, place, self.known).ravel(), pair.counts.ravel()
             total = int(counts.sum())
-            # One-sided: the second order, which that leaves, sums to nothing in the score at the truth.
+            # One-sided: the second order, which remains, sums to zero in the score at the truth.
             jacobian = np.zeros((5, p.size))
             for i in np.flatnonzero(self.free):
                 moved = pair_probability(pair, place + steps[i] * np.eye(5)[i], self.known)
@@ -160,12 +160,12 @@ class _DarkCodes:
         return replace(Blocks.dense(cost, samples, information, score), held=held)
 
     def moved(self, place: Five, step: Step) -> Five:
-        """Inside the bounds."""
+        """The place after a step, inside the bounds."""
         return np.clip(place + step.shared, _LOW, _HIGH)
 
 
 def start_values(pairs: tuple[DarkPair, ...]) -> Five:
-    """Moments of the histograms: the covariance of the two codes is the variance of the offsets."""
+    """Start values from moments of the histograms: the covariance of the two codes is the offsets' variance."""
     found = []
     for pair in pairs:
         centres, part = pair.centres_DN, pair.counts / max(pair.counts.sum(), 1)
@@ -191,12 +191,12 @@ def fit_dark(
     values = np.clip(start_values(pairs) if start is None else start, _LOW, _HIGH)
     free = np.array([True, len({pair.exposure_s for pair in pairs}) > 1, True, True, not normal])
     values = np.where(free, values, [0.0, 0.0, 0.0, 0.0, NORMAL_SHAPE])
-    # One-sided derivatives promise a little for ever.
+    # One-sided derivatives predict a small gain for ever.
     solver = SolverRules(least_gain=1e-3, stalled_gain=1e-4, iterations=40)
     found = minimise(_DarkCodes(pairs, known, free, rules.shape_sigma), values, solver)
     values, information = found.place, found.equations.shared
-    # What rounding hides is no larger than rounding: that much is known of codes that are all the same. Noise and
-    # offsets within a code may be hidden by rounding, and else by nothing but chance.
+    # Rounding hides no more than its own size: codes that are all the same give this bound. Noise and offsets within a
+    # code may be hidden by rounding, and otherwise only by chance.
     step2, longest = pairs[0].step_DN ** 2 / 12.0, max(max(pair.exposure_s for pair in pairs), 1e-9)
     least = np.array([1 / step2, longest**2 / step2, step2**-2, step2**-2, rules.shape_sigma**-2])
     lost = free & bool(values[2] + values[3] < 12 * step2) & (np.diag(information) < least)
@@ -215,9 +215,9 @@ def _level(pair: DarkPair, values: Five, known: Surroundings) -> tuple[float, fl
     gain, information = float(by_black.sum(axis=1) @ pair.centres_DN), total * float(np.sum(by_black**2 / p))
     mean, blind = float(values[0] + values[1] * pair.exposure_s), pair.step_DN**2 / 12.0
     if information * blind < 1:
-        return gain, mean, blind  # Where all codes are one code, the level is known to rounding alone.
+        return gain, mean, blind  # Where all samples have one code, the level is known to within rounding.
     shift = float(np.sum(by_black * pair.counts / p)) / information
-    # The part of the offsets in the variance is the same in every pair and does not count here.
+    # The offsets' part of the variance is the same in every pair and does not count here.
     temporal = max(1 / information - float(values[3]) / total, 0.05 / information)
     return gain, mean + shift, temporal + known.sigma_row_DN**2 / (2 * pair.rows)
 
@@ -241,7 +241,7 @@ class DarkTerms:
 
 
 def fit_dark_terms(data: NoiseMoments, K_DN_per_e: float, rules: NoiseRules, start: Five | None = None) -> DarkTerms:
-    """Fit everything dark; ``K_DN_per_e`` is used for the shot noise of the dark current alone."""
+    """Fit all dark quantities; only the shot noise of the dark current depends on ``K_DN_per_e``."""
     row, in_pairs = row_noise(data, np.ones(len(data.darks)))
     known = Surroundings(K_DN_per_e, in_pairs, rules.background)
     fit = fit_dark(data.darks, known, rules, start)
@@ -249,7 +249,7 @@ def fit_dark_terms(data: NoiseMoments, K_DN_per_e: float, rules: NoiseRules, sta
         row, in_pairs = row_noise(data, fit.edge_gains)
         known = replace(known, sigma_row_DN=in_pairs)
         fit = fit_dark(data.darks, known, rules, fit.values)
-    # Temporal noise too small beside a code cannot be distinguished from the pattern of rounding.
+    # Temporal noise much smaller than a code cannot be distinguished from the pattern of rounding.
     resolved = float(fit.values[2]) + in_pairs**2 >= (rules.resolved * data.q_DN) ** 2
     row = row if resolved else row_noise(data, np.zeros(len(data.darks)))[0]
     value, variance = float(fit.values[4]), float(fit.cov[4, 4])
@@ -257,11 +257,11 @@ def fit_dark_terms(data: NoiseMoments, K_DN_per_e: float, rules: NoiseRules, sta
     shape = Quantity.asked(name, value, variance, data.dark_samples, gain, without=NORMAL_SHAPE)
     fit = fit if shape.there else fit_dark(data.darks, known, rules, fit.values, normal=True)
     read, spread2 = float(fit.values[2]), float(fit.values[3])
-    # DSNU is that of the stack's average, unless rounding bends it: then that of the histograms.
+    # DSNU comes from the stack's average, or from the histograms where rounding biases the average.
     stack, rounding = data.dark_stack, data.q_DN**2 / 12.0
     single = read + K_DN_per_e * max(float(fit.values[1]), 0.0) * stack.exposure_s + rounding
     offsets = dsnu(stack.mean_DN, single / stack.frames, in_pairs**2 / stack.frames, rules)
-    # Offsets that differ smear the rounding of the mean over all pixels; that of one pixel, its own noise alone.
+    # Different offsets smear the rounding in the mean over all pixels; only a pixel's own noise smears its rounding.
     white = fit.follows and 4 * np.pi**2 * read >= rules.smeared * data.q_DN**2
     if not white:
         pixels, sigma = stack.mean_DN.size, float(np.hypot(fit.cov[3, 3] ** 0.5, 0.0 if resolved else rounding))
@@ -290,10 +290,10 @@ def _levels(
     # The offsets of this sensor's pixels are one draw: their mean is not that of all sensors alike.
     cov[0, 0] += offsets.mean_variance
     if not fit.follows:
-        # Black, spread and noise of coarse or cut-off codes err together, and alike in every pair.
+        # With coarse or cut-off codes, the errors of black, spread and noise are common to all pairs.
         cov[0, 0] = max(float(cov[0, 0]), len(data.darks) * float(fit.cov[0, 0]))
     if (variances >= rounding).any():
-        # What rounding hides is hidden alike in every exposure.
+        # Rounding hides the same in every exposure.
         cov[0, 0] += rounding
-    # Black stays that of the line: a dark current too weak to be chosen must not pull it.
+    # Black stays that of the line: a dark current too weak to be chosen must not shift it.
     return float(line[0]), cov, current

@@ -1,6 +1,6 @@
-"""What the noise fit is given: frames in the dark and under even light, from a session or as arrays; and its rules.
+"""The data of the noise fit, frames in the dark and under even light from a session or as arrays; and its rules.
 
-Frames may be arrays, memory maps, or functions that load one; each is loaded when its turn comes and dropped again, so
+Frames may be arrays, memory maps, or functions that load one. The fit loads one after another and drops it again, so
 that memory does not grow with their number.
 """
 
@@ -18,7 +18,7 @@ from udccal.errors import FitError
 from udccal.sessions.store import Session
 
 Codes = UInt16[np.ndarray, "rows columns"]
-# A level may hold frames of unlike size, until they are loaded: the sizes are not compared here.
+# Frames of a level may have different sizes until they are loaded: the types do not compare the sizes.
 Frame = UInt16[np.ndarray, "_rows _columns"] | UInt8[np.ndarray, "_rows _columns"] | Callable[[], np.ndarray]
 
 _LEAST_SIDE, _MOST_SIDE, _MOST_FRAMES = 16, 65536, 4096
@@ -30,28 +30,28 @@ class NoiseRules:
     """The documented constants of the noise fit.
 
     Attributes:
-        tiles, tile_samples: at most so many tiles a side, each of at least so many samples of one colour: they keep
-            shading and the slow flicker of a lamp out of the variance.
+        tiles, tile_samples: most tiles a side, and fewest samples of one colour in each: tiles keep shading and the
+            slow flicker of a lamp out of the variance.
         hit_sigma: codes of one pixel that differ by more are a hit or a blinking pixel.
-        outlier_sigma: bins and levels so many robust sigma off the curve are left out.
-        defect_sigma: pixels so many robust sigma off the rest are defects: of millions, five would take good ones.
-        background: fraction of dark samples that may have any code; keeps one outlier from deciding.
-        shape_sigma: prior sigma of the read noise's shape; decides only where rounding hides the shape.
-        white: the mean code follows black to this fraction where rounding is white and nothing is cut off.
+        outlier_sigma: bins and levels farther off the curve, in robust sigma, are left out.
+        defect_sigma: pixels farther off the rest, in robust sigma, are defects; of millions, 5 would reject good ones.
+        background: fraction of dark samples that may have any code; it limits the weight of an outlier.
+        shape_sigma: prior sigma of the read noise's shape; it matters only where rounding hides the shape.
+        white: rounding counts as white, and no code as cut off, where the mean code follows black to this fraction.
         smeared: rounding does not show where its first harmonic is down by this, as a natural logarithm.
         resolved: temporal noise, in codes, below which rounding decides which samples differ.
         fit_up_to, narrow_up_to: fraction of saturation that the fit reaches; the second (EMVA 1288) where it
             describes the data far better.
-        margin_sigma, uneven_sigma: so many sigma of its noise, and of its shading, a bin stays inside the range.
-        white_spread, white_temporal: in steps and steps^2; samples must spread so far for rounding to be white.
-        most_bent: fraction of the signal missing at full scale above which the quadratic is no description.
-        collapsed: a bin is full where its variance is under this part of what the others predict.
-        full_sigma: every pixel of a bin is full where its variance is within so many sigma of the dark noise.
+        margin_sigma, uneven_sigma: distance of a bin from the range's ends, in sigma of its noise and of its shading.
+        white_spread, white_temporal: least spread of samples for white rounding, in steps and steps^2.
+        most_bent: fraction of the signal missing at full scale above which a quadratic does not describe the response.
+        collapsed: a bin is full where its variance is below this part of the variance that the others predict.
+        full_sigma: every pixel of a bin is full where its variance is within this many sigma of the dark noise.
         shading: side of the window that follows shading, in samples of one colour.
-        light_sigma: power of a spectrum that is so many sigma above the floor is light.
+        light_sigma: power of a spectrum counts as light from this many sigma above the floor.
         light_reach: light is expected up to this many times the frequencies at which it was seen.
         levels: fewest exposures of a photon transfer curve.
-        gain_sigma: fewest sigma of the gain; what is divided by a gain known worse has no symmetric error.
+        gain_sigma: least gain in units of its sigma; quotients by a less certain gain have no symmetric error.
         worst_chi2: reduced chi-squared above which the sensor is not what the model says.
     """
 
@@ -85,7 +85,7 @@ class NoiseRules:
 @final
 @dataclass(frozen=True)
 class Averaged:
-    """Mean of frames alike."""
+    """Mean of frames of one scene and exposure."""
 
     exposure_s: float
     mean_DN: Float32[np.ndarray, "rows columns"]
@@ -113,7 +113,7 @@ class ExposureLevel:
 @final
 @dataclass(frozen=True)
 class SpatialStack:
-    """Many frames alike, or their average, for the fixed pattern: dark and bright (EMVA 1288, clause 8)."""
+    """Many dark and many bright frames, or their averages, for the fixed pattern (EMVA 1288, clause 8)."""
 
     exposure_s: float
     dark: Sequence[Frame] | Averaged
@@ -129,8 +129,8 @@ class NoiseData:
     Attributes:
         levels: exposures; at least two with dark and three with bright pairs are needed.
         stack: for DSNU and PRNU; without it the pair nearest to half of saturation serves.
-        bayer: the sensor carries a mosaic of 2 x 2 colours.
-        top_code: the converter's largest code; the smallest 2^n - 1 that holds all codes where not given.
+        bayer: whether the sensor has a mosaic of 2 x 2 colours.
+        top_code: the converter's largest code; where not given, the smallest 2^n - 1 not below any code.
     """
 
     levels: Sequence[ExposureLevel]
@@ -139,10 +139,10 @@ class NoiseData:
     top_code: int | None = None
 
     def check(self) -> None:
-        """Refuse numbers of frames, exposures and photons that are none.
+        """Check numbers of frames, exposures and photons.
 
         Raises:
-            FitError: says which level or stack.
+            FitError: when one is not possible; it names the level or stack.
         """
         stack = self.stack
         stacks = [] if stack is None else [s for s in (stack.dark, stack.bright) if isinstance(s, Sequence)]
@@ -161,7 +161,7 @@ class NoiseData:
 
 
 def loaded(frame: Frame, shape: tuple[int, ...] | None = None) -> Codes:
-    """A frame as codes; one that is none, or is not of the shape of the others, is refused by a FitError."""
+    """A frame as codes; a FitError where it is not a picture of codes, or differs from ``shape``."""
     array = frame() if callable(frame) else frame
     if not isinstance(array, np.ndarray) or array.dtype not in (np.uint8, np.uint16) or array.ndim != 2:
         found = f"{array.dtype} of shape {array.shape}" if isinstance(array, np.ndarray) else type(array).__name__
@@ -174,11 +174,14 @@ def loaded(frame: Frame, shape: tuple[int, ...] | None = None) -> Codes:
 
 
 def read_noise(session: Session) -> NoiseData:
-    """The steps ``noise/*`` of a session; frames are read when the fit comes to them.
+    """The steps ``noise/*`` of a session; frames are read when the fit uses them.
 
     Args:
         session: holds ``noise/dark_{i}`` and ``noise/flat_{i}`` (two frames each), ``noise/dark_stack`` and
             ``noise/flat_stack`` (averages).
+
+    Returns:
+        the data of ``fit_noise``.
 
     Raises:
         SessionError: when the file of an average is missing or damaged; of a frame, when it is read.

@@ -28,12 +28,12 @@ UNITS = ("DN/e", "DN", "DN", "e", "1", "DN", "DN", "e/s", "e", "1", "1")
 
 
 def nominal_noise(rig: RigDescription) -> Noise:
-    """Noise from the rig description alone: what a failed fit returns."""
+    """Noise from the rig description alone, the term of a failed fit; ``rig`` gives K, black and saturation."""
     return _assumed(rig.camera.K_DN_per_e.value, rig.camera.black_DN.value, float(rig.saturation_DN))
 
 
 def _assumed(K_DN_per_e: float, black_DN: float, saturation_DN: float) -> Noise:
-    """What is taken for granted of a sensor of which only these are known."""
+    """The noise assumed for a sensor of which only these numbers are known."""
     return Noise(K_DN_per_e, black_DN, saturation_DN, 5.0, 0.14, 0.0, 1.0, 0.0, 0.0, 0.0)
 
 
@@ -41,11 +41,11 @@ def _assumed(K_DN_per_e: float, black_DN: float, saturation_DN: float) -> Noise:
 def fit_noise(data: NoiseData, nominal: Noise | None = None, rules: NoiseRules | None = None) -> FitResult[Noise]:
     """Fit the noise term: K, black, saturation, dark noise and its shape, row noise, dark current, DSNU, PRNU.
 
-    A curved response is found by itself: the result then has the estimate ``nonlinearity``, the fraction of the
-    signal that is missing at full scale, and K is that of small signals.
+    The fit detects a curved response. The result then has the estimate ``nonlinearity``, the fraction of the signal
+    that is missing at full scale, and K is that of small signals.
 
     Args:
-        data: frames as arrays, or as ``read_noise`` has them of a session.
+        data: frames as arrays, or from a session by ``read_noise``.
         nominal: returned as the term where no fit is possible.
         rules: see ``NoiseRules``.
 
@@ -53,7 +53,7 @@ def fit_noise(data: NoiseData, nominal: Noise | None = None, rules: NoiseRules |
         the term with its status; a fit that is not possible says why in its notes.
 
     Raises:
-        FitError: when a frame is not a picture of codes like the others, or an exposure is no time.
+        FitError: when a frame is not a picture of codes like the others, or an exposure is not a time.
         SessionError: when a file of the session is missing or damaged.
     """
     rules = rules or NoiseRules()
@@ -66,10 +66,10 @@ def fit_noise(data: NoiseData, nominal: Noise | None = None, rules: NoiseRules |
 
 
 def mean_response(result: FitResult[Noise], light: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    """Mean signal above black in DN that the fitted response predicts; where it would pass saturation, saturation.
+    """Mean signal above black in DN that the fitted response predicts, saturation at most.
 
     Args:
-        result: of the noise fit (EMVA 1288, clause 6.7, judges the response).
+        result: of the noise fit (EMVA 1288, clause 6.7, evaluates the response).
         light: in the unit of the fitted levels (photons per pixel, or seconds).
     """
     numbers = {item.name: item.value for item in result.diagnostics}
@@ -86,8 +86,8 @@ def fit_moments(data: NoiseMoments, nominal: Noise, rules: NoiseRules) -> FitRes
     dark = fit_dark_terms(data, rough_gain(data, float(start[0]), float(start[2])), rules, start)
     curve = fit_curve(data, dark, rules)
     longest = max(pair.exposure_s for pair in data.darks)
-    # The dark fit wants the gain, the gain the dark fit. To first order the curve moves the read noise with the gain by
-    # itself; another round is for a gain that moves dark current's shot noise by half of the read noise's sigma.
+    # The dark fit needs the gain, and the gain the dark fit. To first order the curve corrects the read noise for the
+    # gain; a second round is for a gain that moves dark current's shot noise by half of the read noise's sigma.
     for _ in range(5):
         K = float(curve.fit.values[0]) if curve.choice else 0.0
         moved = abs(K - dark.K_DN_per_e) * dark.dark_DN_per_s.value * longest
@@ -101,7 +101,7 @@ def fit_moments(data: NoiseMoments, nominal: Noise, rules: NoiseRules) -> FitRes
 
 
 def _too_little(data: NoiseMoments, rules: NoiseRules) -> tuple[FitStatus, str] | None:
-    """What can be refused at sight."""
+    """The status and sentence of data that cannot be fitted; None where the fit may begin."""
     if len(data.darks) < 2 or len(data.flats) < rules.levels:
         wanted, found = f"2 dark and {rules.levels} flat", f"{len(data.darks)} and {len(data.flats)}"
         return FitStatus.TOO_FEW_DATA, f"Expected at least {wanted} exposures, found {found}."
@@ -117,8 +117,8 @@ def _too_little(data: NoiseMoments, rules: NoiseRules) -> tuple[FitStatus, str] 
 
 
 def _no_gain(data: NoiseMoments, dark: DarkTerms, curve: Curve, rules: NoiseRules) -> tuple[FitStatus, str] | None:
-    """Darks that do not show black; flats that are copies, too few, too dark, or clipped."""
-    # Codes cut off at 0, and offsets of pixels far larger than their noise: no code shows where black is.
+    """Status and sentence where darks do not show black, or flats are copies, too few, too dark, or clipped."""
+    # With codes cut off at 0 and offsets of pixels far larger than their noise, no code shows black.
     cut = any(pair.edges_DN[0] == -np.inf and pair.counts[0].sum() > 0.01 * pair.counts.sum() for pair in data.darks)
     quiet = max(dark.read_DN2.value + dark.row_DN2.value, 1e-9)
     if cut and not dark.white and dark.dsnu_DN2.value > 30.0**2 * quiet:
@@ -138,7 +138,7 @@ def _no_gain(data: NoiseMoments, dark: DarkTerms, curve: Curve, rules: NoiseRule
             f"Expected at least {rules.levels} flat exposures between the dark noise and 90 % of saturation, found "
             f"{curve.usable_levels}."
         )
-    # Shot noise of the light in all bins together, in sigma of their variances.
+    # Shot noise of the light in all bins, in sigma of their variances.
     shot = K * (levels.mean_DN - levels.dark_DN[:, None]) / np.maximum(levels.variance_DN2, 1e-9)
     significance = float(np.sqrt(np.sum((levels.dof / 2 * shot**2)[levels.usable])))
     sigma = float(np.sqrt(curve.fit.cov[0, 0]))
@@ -154,7 +154,7 @@ def _no_gain(data: NoiseMoments, dark: DarkTerms, curve: Curve, rules: NoiseRule
 
 
 def _photo_response(data: NoiseMoments, dark: DarkTerms, curve: Curve, rules: NoiseRules) -> Pattern:
-    """PRNU from the stacks; the temporal variance that averaging left comes from the photon transfer curve."""
+    """PRNU from the stacks; the photon transfer curve gives the temporal variance of the averages."""
     K, V0, c = (float(v) for v in curve.fit.values[:3])
     bright, stack, rate = data.flat_stack, data.dark_stack, dark.dark_DN_per_s.value
     quiet = max(V0, 0.0) + data.q_DN**2 / 12.0
@@ -163,7 +163,7 @@ def _photo_response(data: NoiseMoments, dark: DarkTerms, curve: Curve, rules: No
         signal = bright.mean_DN.astype(np.float32) - stack.mean_DN.astype(np.float32)
         at_no_light += (quiet + K * rate * stack.exposure_s) / stack.frames
     else:
-        # Dark codes that are cut off or coarse do not show the offsets: their variance is taken off instead.
+        # Dark codes that are cut off or coarse do not show the offsets: the offsets' variance is subtracted instead.
         signal = bright.mean_DN.astype(np.float32) - np.float32(dark.black_DN + rate * bright.exposure_s)
         at_no_light += dark.dsnu_DN2.value
     level = max(rough_median(signal), 1e-6)
@@ -177,7 +177,7 @@ def _photo_response(data: NoiseMoments, dark: DarkTerms, curve: Curve, rules: No
 
 
 def _assembled(data: NoiseMoments, dark: DarkTerms, curve: Curve, rules: NoiseRules) -> FitResult[Noise]:
-    """The result of a fit that went through."""
+    """The result of a finished fit."""
     fit, response = curve.fit, curve.choice
     assert response is not None, "a fit that went through has a curve"
     saturation, uneven = find_saturation(data, dark, curve, rules), _photo_response(data, dark, curve, rules)
@@ -230,7 +230,7 @@ def _term(values: Float[np.ndarray, "10"]) -> Noise:
 def _values(
     data: NoiseMoments, dark: DarkTerms, curve: Curve, saturation: tuple[float, float], PRNU2: Quantity
 ) -> tuple[Float[np.ndarray, "11"], Float[np.ndarray, "11 11"]]:
-    """The estimates and their covariance, from that of what was fitted."""
+    """The estimates, and their covariance from that of the fitted quantities."""
     (K, V0, c), transfer = (float(v) for v in curve.fit.values[:3]), curve.fit.cov[:3, :3]
     total = Quantity(V0 + dark.row_DN2.value, float(transfer[1, 1]) + dark.row_DN2.variance)
     roots = [one.root() for one in (total, dark.row_DN2, dark.dsnu_DN2, PRNU2)]
@@ -261,7 +261,7 @@ def _outliers(
         stack = len(data.flats)
         return tuple("flat stack" if i >= stack else f"flat {i} ({data.flats[i].exposure_s:.4g} s)" for i in levels)[:8]
 
-    # Among clipped samples those that are not stick out; that is no defect.
+    # Unclipped samples stand out among clipped ones; that is no defect.
     ceiling = saturation_DN - 0.1 * (curve.ceiling_DN - dark.black_DN)
     seen = (*(flat for flat in data.flats if float(flat.mean_DN.max()) < ceiling), *data.dark_moments)
     hits, sigma = sum(moments.outliers for moments in seen), f"{rules.outlier_sigma:g} robust sigma"

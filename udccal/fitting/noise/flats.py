@@ -1,4 +1,4 @@
-"""What flats show: which of their bins lie inside the sensor's range, the photon transfer curve, and saturation."""
+"""Flats: which of their bins lie inside the sensor's range, the photon transfer curve, and saturation."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Curve:
 
     @property
     def fit(self) -> TransferFit:
-        """Of the best order."""
+        """The fit of the best order."""
         assert self.choice is not None, "asked for where there are usable levels"
         return self.choice.best.fit
 
@@ -49,7 +49,7 @@ class Curve:
 
 
 def fit_curve(data: NoiseMoments, dark: DarkTerms, rules: NoiseRules) -> Curve:
-    """The curve up to 90 % of saturation, or up to 70 % where that is described far better."""
+    """The curve up to 90 % of saturation, or up to 70 % where the model describes that far better."""
     full, flickering = _saturated(data, dark, rules), _flickering(data.flats, dark, rules)
     # Upper median of the saturated bins, or the converter's largest code where there is none.
     ceiling = float(np.quantile(stacked(data.flats, "mean_DN")[full], 0.75)) if full.any() else data.top_DN
@@ -72,7 +72,7 @@ def fit_curve(data: NoiseMoments, dark: DarkTerms, rules: NoiseRules) -> Curve:
 
 
 def stacked(flats: tuple[Moments, ...], name: str) -> Float[np.ndarray, "levels bins"]:
-    """A number of every flat and bin."""
+    """The field ``name`` of every flat and bin."""
     return np.stack([getattr(flat, name) for flat in flats])
 
 
@@ -81,7 +81,7 @@ def _inside(data: NoiseMoments, dark: DarkTerms, up_to_DN: float, ceiling_DN: fl
     flats = data.flats if data.flat_seen is None else (*data.flats, data.flat_seen)
     mean, variance, spread = (stacked(flats, name) for name in ("mean_DN", "variance_DN2", "spread_DN"))
     above, K, q = mean - dark.black_DN, dark.K_DN_per_e, data.q_DN
-    # What frames of unlike brightness differ by beside noise: the pattern of the bin (shading, PRNU) times that.
+    # Frames of different brightness differ, in addition to noise, by the bin's pattern (shading, PRNU) times that.
     shift2 = np.stack([np.var(flat.shift_DN, axis=0, ddof=1) for flat in flats])
     pattern2 = np.maximum(spread**2 - variance, 0.0) / np.where(above > 0, above, np.inf) ** 2
     variance = np.maximum(variance - shift2 * pattern2, 0.0)
@@ -89,8 +89,8 @@ def _inside(data: NoiseMoments, dark: DarkTerms, up_to_DN: float, ceiling_DN: fl
     uneven = rules.uneven_sigma * np.sqrt(np.maximum(spread**2 - variance, 0.0))
     usable = (above > 0) & (above <= up_to_DN) & (mean + temporal + uneven < ceiling_DN) & (mean > temporal)
     usable &= (spread >= rules.white_spread * q) & (variance >= rules.white_temporal * q**2)
-    # Of few counts the distribution keeps its steps: rounding is white once they are smeared over a code. Beside a
-    # variance of thirty codes they do not matter.
+    # The distribution of few counts has steps: rounding is white once noise smears them over a code. With a variance
+    # of thirty codes they do not matter.
     smeared = 2 * above / max(K, 1e-9) * (1 - np.cos(2 * np.pi * K / q))
     smeared += 4 * np.pi**2 * (dark.read_DN2.value + dark.row_DN2.value) / q**2
     usable &= (smeared >= rules.smeared) | (variance >= 30 * q**2)
@@ -110,25 +110,25 @@ def _dark_variance(data: NoiseMoments, dark: DarkTerms) -> DarkVariance:
     """V0 from the histograms, and from the temporal variance of the dark stack where its frames were seen."""
     rounding, K, rate, read = data.q_DN**2 / 12.0, dark.K_DN_per_e, dark.dark_DN_per_s.value, dark.read_DN2
     drift = rate * np.array([pair.exposure_s for pair in data.darks])
-    # Dark signal in the pairs as their read noise depends on it: long exposures, being noisier, count less.
+    # Dark signal in the pairs as their read noise depends on it: long exposures are noisier and count less.
     total = read.value + dark.row_DN2.value + rounding + K * drift
     points = [(read.value, read.variance**0.5, float(np.average(drift, weights=1 / total**2)))]
     seen = data.dark_seen
     if seen is not None and dark.white:
         observed = float(np.average(seen.variance_DN2, weights=seen.dof))
-        # The read noise's tails, among rounding and counts of dark current, which have none to speak of.
+        # The tails are the read noise's: rounding and counts of dark current have hardly any.
         excess = excess_kurtosis(dark.shape.value) if dark.shape.there else 0.0
         tails = excess * min(read.value, observed) ** 2 * (1 - 1 / seen.frames)
         sigma = float(np.sqrt((2 * observed**2 + tails) / float(seen.dof.sum())))
         points.append((observed - rounding - K * rate * seen.exposure_s, sigma, rate * seen.exposure_s))
     values, sigmas, drifts = np.array(points).T
-    # Black off by so much acts on the curve as read noise off by K times that.
+    # An error of black acts on the curve as an error of V0 that is K times as large.
     shifted = K * np.sqrt(max(float(dark.levels_cov[0, 0]) - dark.offsets.mean_variance, 0.0))
     return DarkVariance(values, np.hypot(np.maximum(sigmas, 1e-9), shifted), rounding, K, drifts)
 
 
 def _flickering(flats: tuple[Moments, ...], dark: DarkTerms, rules: NoiseRules) -> tuple[int, ...]:
-    """Flats whose frames differ in mean by more than such differences usually do, and than noise makes them."""
+    """Flats whose frames differ in mean by more than noise explains, and by more than the frames of other flats."""
     signal = np.array([flat.mean_DN.mean() for flat in flats]) - dark.black_DN
     lit = np.flatnonzero(signal > 0)
     if len(lit) < 4:
@@ -141,7 +141,7 @@ def _flickering(flats: tuple[Moments, ...], dark: DarkTerms, rules: NoiseRules) 
 
 
 def rough_gain(data: NoiseMoments, black_DN: float, dark_DN2: float) -> float:
-    """Conversion gain from moments alone: what the dark frames' fit starts from."""
+    """Conversion gain in DN per electron from moments alone, for the first fit of the dark frames."""
     mean, variance = (
         stacked(data.flats, "mean_DN") - black_DN,
         stacked(data.flats, "variance_DN2") - data.q_DN**2 / 12.0,
@@ -152,9 +152,9 @@ def rough_gain(data: NoiseMoments, black_DN: float, dark_DN2: float) -> float:
 
 
 def _saturated(data: NoiseMoments, dark: DarkTerms, rules: NoiseRules) -> Bins:
-    """Bins that are saturated: variance far under what the rest predicts for their mean, and as bright as any.
+    """Saturated bins: as bright as any, with a variance far below the one that the rest predicts for their mean.
 
-    Where all flats are saturated there is no rest: then those are that show no more variance than the dark frames.
+    Where all flats are saturated there is no rest: bins with no more variance than the dark frames are then saturated.
     """
     mean, variance = stacked(data.flats, "mean_DN") - dark.black_DN, stacked(data.flats, "variance_DN2")
     bright = mean > 0.05 * (data.top_DN - dark.black_DN)
@@ -172,21 +172,21 @@ def _saturated(data: NoiseMoments, dark: DarkTerms, rules: NoiseRules) -> Bins:
 def find_saturation(data: NoiseMoments, dark: DarkTerms, curve: Curve, rules: NoiseRules) -> tuple[float, float]:
     """Level in DN at which the signal stops, with its sigma (patterns of the offsets not counted).
 
-    Where the full well lies below the converter's end, the mean of the bins in which every pixel is full; where codes
-    end first, that code; between, from the fraction of samples at the end.
+    Where the full well lies below the converter's end, it is the mean of the bins in which every pixel is full. Where
+    codes end first, it is the last code. In between, it follows from the fraction of samples at the end.
     """
     full = [(flat, bins) for flat, bins in zip(data.flats, curve.full, strict=True) if bins.any()]
     if not full:
-        # Somewhere from the brightest code seen to the largest there is.
+        # The level lies between the brightest code seen and the largest possible one.
         seen = max(flat.peak_DN for flat in data.flats)
         return data.top_DN, max(data.top_DN - seen, 0.0) / float(np.sqrt(3.0))
     peak = max(flat.peak_DN for flat, _ in full)
     if max(flat.at_peak for flat, _ in full) >= 0.5:
-        # Of codes at the converter's end nothing is uncertain; a level between them is known to rounding.
+        # A level at the converter's end is certain; a level below it is known to within rounding.
         return float(peak), float(1 / np.sqrt(12.0)) if peak < data.top_DN else 0.0
     V0 = max(float(curve.fit.values[1]), 0.0) if curve.choice else 0.0
     found = np.array([_level(flat, bins, data, dark, V0, peak, rules) for flat, bins in full])
-    # A hit among full pixels is one that is not full.
+    # An outlier among full pixels is a pixel that is not full.
     clean = (found[:, 2] > 0) & np.array([of.frames * of.outliers <= 1e-5 * of.samples.sum() for of, _ in full])
     values, variances, _ = (found[clean] if clean.any() else found).T
     weight = 1 / np.maximum(variances, 1e-12)
@@ -197,7 +197,7 @@ def _level(
     flat: Moments, full: Bool[np.ndarray, " bins"], data: NoiseMoments, dark: DarkTerms, V0: float, peak: int,
     rules: NoiseRules,
 ) -> tuple[float, float, bool]:  # fmt: skip
-    """Saturation by one flat, the variance of it, and whether its pixels are all full."""
+    """Saturation in DN by one flat, its variance, and whether all pixels of a bin are full."""
     temporal = V0 + data.q_DN**2 / 12.0
     excess = flat.variance_DN2 - temporal
     sure = full & (excess < rules.full_sigma * temporal * np.sqrt(2 / flat.dof))
@@ -211,10 +211,10 @@ def _level(
         own = spread2 * flat.at_peak * (1 - flat.at_peak) / density2 / samples
         return peak - 0.5 * data.q_DN + float(np.sqrt(spread2)) * z, own + rows, bool(sure.any())
     # Rounding adds sum over k of (-1)^k q sin(2 pi k x / q) exp(-2 (pi k s / q)^2) / (pi k) to the mean of normal noise
-    # of sigma s (Widrow and Kollar, Quantization Noise, chapter 5): by so much it is uncertain.
+    # of sigma s (Widrow and Kollar, Quantization Noise, chapter 5): this is its uncertainty.
     k = np.arange(1, 8)
     rounding = float(np.sum(np.exp(-4 * (np.pi * k / data.q_DN) ** 2 * spread2) / (2 * (np.pi * k / data.q_DN) ** 2)))
-    # Where some pixels are not full, so it is by as much as the mean may lie low.
+    # Where some pixels are not full, the possible shift of the mean adds to it.
     low = 0.0 if sure.any() else 0.5 * max(float(excess[chosen].mean()), 0.0)
     mean = float(np.average(flat.mean_DN[chosen], weights=flat.samples[chosen]))
     return mean, temporal / samples + rounding + low + rows, bool(sure.any())

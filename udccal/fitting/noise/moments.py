@@ -1,7 +1,7 @@
-"""Frames reduced to what the fit needs: moments per bin of pairs and stacks, and joint histograms of dark codes.
+"""Frames reduced to the data of the fit: moments per bin of pairs and stacks, and joint histograms of dark codes.
 
-A bin is one site of the colour mosaic in one tile of the sensor. Frames come one by one; their differences to the first
-are summed, and the squares of these, so that float32 loses nothing.
+A bin is one site of the colour mosaic in one tile of the sensor. Frames come one by one. Their differences from the
+first frame are summed, and the squares of these, so that float32 loses no digits that matter.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ def bins(
     tiles = int(np.clip(np.sqrt(rows * columns / period**2 / rules.tile_samples), 1, rules.tiles))
 
     def groups(length: int) -> Float[np.ndarray, "length groups"]:
-        """Whole mosaic cells per tile; what is left over goes to the last one."""
+        """Whole mosaic cells per tile; the last tile has the remaining ones."""
         tile = np.minimum(np.arange(length) // period // max(length // period // tiles, 1), tiles - 1)
         return np.eye(tiles * period)[tile * period + np.arange(length) % period]
 
@@ -67,27 +67,27 @@ class Moments:
 
     @property
     def frames(self) -> int:
-        """How many."""
+        """Number of frames."""
         return len(self.shift_DN)
 
 
 def reduce_frames(
     frames: Iterable[Codes], exposure_s: float, light: float | None, period: int, rules: NoiseRules
 ) -> tuple[Averaged, Moments]:
-    """Mean per pixel, and temporal moments about it per bin: common changes of brightness and row noise taken out.
+    """Mean per pixel, and temporal moments per bin without common changes of brightness and row noise.
 
     Args:
         frames: of one shape; at least two.
         exposure_s: of all frames, in seconds.
         light: relative exposure to light; the exposure time where not known.
-        period: colour sites repeat after so many samples (1: monochrome).
-        rules: size of the tiles, and what is a hit.
+        period: colour sites repeat after this many samples (1: monochrome).
+        rules: for the size of the tiles, and the limit of a hit.
     """
     source = iter(frames)
     first = next(source)
     down, right = bins(*first.shape, period, rules)
     counts, total, outliers = np.outer(down.sum(axis=1), right.sum(axis=0)), np.zeros(first.shape, np.float32), 0
-    # The first frame differs from itself by nothing.
+    # The first frame's difference from itself is zero.
     by_row, peaks = [np.zeros((len(first), right.shape[1]))], [_peak(first)]
     squares = np.zeros_like(by_row[0])
     for frame in source:
@@ -128,7 +128,7 @@ def reduce_frames(
 
 
 def _peak(frame: Codes) -> tuple[int, int]:
-    """The largest code, and how many samples have it."""
+    """The largest code, and the number of samples with it."""
     top = frame.max()
     return int(top), int(np.count_nonzero(frame == top))
 
@@ -139,7 +139,7 @@ def _temporal(
     by_row: Float[np.ndarray, "frames rows groups_x"],
     squares: Float[np.ndarray, "rows groups_x"],
 ) -> tuple[Grid, Grid, Float[np.ndarray, "frames groups_y groups_x"], float, float]:
-    """Variances of bins, their degrees of freedom, the frames' shifts, the rows' variance and the sampling in it."""
+    """Variances of bins, their degrees of freedom, the frames' shifts, the rows' variance and its sampling part."""
     (frames, height), columns = by_row.shape[:2], len(right)
     width = right.sum(axis=0, dtype=np.float64)
     counts = np.outer(down.sum(axis=1), width)
@@ -173,7 +173,7 @@ class DarkPair:
 
     @property
     def centres_DN(self) -> Float[np.ndarray, " codes"]:
-        """Middle of each group of codes; of a cut-off end, where its neighbours would put it."""
+        """Middle of each group of codes; that of a cut-off end is extrapolated from its neighbours."""
         inner = self.edges_DN[1:-1]
         edges = np.clip(self.edges_DN, inner[0] - self.step_DN, inner[-1] + self.step_DN)
         return np.asarray(0.5 * (edges[1:] + edges[:-1]))
@@ -184,7 +184,7 @@ def dark_pair(first: Codes, second: Codes, exposure_s: float, q_DN: int = 1, top
     low, middle, high = np.percentile(first[:: max(1, first.size // 65536)], [2.0, 50.0, 98.0])
     # 98th minus 2nd percentile is 4.1 sigma; 1.9 times that each side is about 7.8 sigma.
     half = int(np.ceil(1.9 * (high - low) / q_DN)) + 4
-    # At most some 160 groups a side: a wide window loses nothing by coarser ones.
+    # At most about 160 groups a side: a wide window loses nothing by coarser ones.
     group = max(1, int(np.ceil((2 * half + 1) / 160)))
     start = max(round(middle / q_DN) - half, 0)
     codes = min((round(middle / q_DN) + half - start) // group, (top_code // q_DN - start) // group) + 1
@@ -208,7 +208,7 @@ def converter_step(frame: Codes) -> int:
 
 
 def _converter_top(peak: int, declared: int | None, q_DN: int) -> int:
-    """Largest code there is; a FitError where a code that was seen is larger than the one declared."""
+    """Largest possible code; a FitError where a code in the frames is larger than the declared one."""
     if declared is None:
         return int(2 ** max(int(np.ceil(np.log2(peak + q_DN))), 8) - q_DN)
     if peak > declared:
@@ -221,10 +221,10 @@ def _converter_top(peak: int, declared: int | None, q_DN: int) -> int:
 class NoiseMoments:
     """The frames, reduced.
 
-    ``dark_moments`` are of the pairs in ``darks``; both stacks are of about the same exposure; colour sites repeat
-    after ``period`` samples (1: monochrome). ``dark_seen`` and ``flat_seen`` are moments of the stacks' frames:
-    None for an average that was made elsewhere, whose variance would hold the lamp's flicker, and for frames of a pair,
-    which must not count twice.
+    ``dark_moments`` are those of the pairs in ``darks``; both stacks have about the same exposure; colour sites repeat
+    after ``period`` samples (1: monochrome). ``dark_seen`` and ``flat_seen`` are moments of the stacks' frames. They
+    are None for an average that was made elsewhere, whose variance would include the lamp's flicker, and for frames of
+    a pair, which must not count twice.
     """
 
     darks: tuple[DarkPair, ...]
@@ -240,15 +240,15 @@ class NoiseMoments:
 
     @property
     def dark_samples(self) -> int:
-        """In all histograms."""
+        """Number of samples in all histograms."""
         return sum(int(pair.counts.sum()) for pair in self.darks)
 
 
 def reduced(data: NoiseData, rules: NoiseRules) -> NoiseMoments | None:
-    """All frames as the moments and histograms that the fit needs; None without a dark and a bright pair.
+    """All frames as moments and histograms for the fit; None without a dark and a bright pair.
 
     Raises:
-        FitError: when a frame is not a picture of codes like the others, or an exposure is no time.
+        FitError: when a frame is not a picture of codes like the others, or an exposure is not a time.
     """
     data.check()
     darks, brights = [one for one in data.levels if one.dark], [one for one in data.levels if one.bright]

@@ -1,9 +1,9 @@
 """Variances between rows and between pixels: row noise, DSNU of dark averages, and PRNU behind a panel.
 
-The response of pixels is white; light is not. Light that passed a panel is modulated, and the modulation's harmonics
-and their products sink slowly below the floor that the pixels' own response makes. What sinks below the floor is not
-seen in one coefficient of the spectrum, nor in a block of them, but the power of many blocks together still shows it:
-rectangles of all sizes are tested. Beyond what was seen the light goes on, unseen; so the spectrum is cut further out.
+The response of pixels is white; light is not. Light that passed a panel is modulated. The modulation's harmonics and
+their products fall slowly below the floor of the pixels' own response. One coefficient of the spectrum, or a block of
+them, does not show light below the floor, but the power of many blocks does: rectangles of all sizes are tested. Light
+that is too weak to show continues to higher frequencies, so that the spectrum is cut further out.
 """
 
 from __future__ import annotations
@@ -30,22 +30,22 @@ Grid = Float[np.ndarray, "down across"]
 
 
 def row_noise(data: NoiseMoments, edge_gains: Float[np.ndarray, " pairs"]) -> tuple[Quantity, float]:
-    """Variance by rows, and its root as it happened to be in the pairs alone: that is what widened their histograms.
+    """Variance by rows, and its root in the pairs alone, which is the one that widened their histograms.
 
-    Rounding and cut-off codes pass only the square of ``edge_gains`` of it, pair by pair.
+    Rounding and cut-off codes reduce the variance of a pair by the square of its ``edge_gains``.
     """
     nearest = int(np.argmin([abs(pair.exposure_s - data.dark_stack.exposure_s) for pair in data.darks]))
     pairs = list(zip(data.dark_moments, edge_gains, strict=True))
     stack = [] if data.dark_seen is None else [(data.dark_seen, edge_gains[nearest])]
 
     def asked(seen: list[tuple[Moments, float]]) -> Quantity:
-        # Of row noise that follows black to less than a fifth nothing can be said.
+        # Pairs whose mean code follows black to less than a fifth do not determine row noise.
         rows = [
             (of.rows_DN2 / gain**2, of.sampling_DN2 / gain**2, (of.frames - 1) * max(of.height - 1, 1))
             for of, gain in seen
             if gain >= 0.2 and of.rows_DN2 > 0
         ]
-        # Where rounding hides all of it, it may be as large as rounding itself.
+        # Row noise that rounding hides completely may be as large as rounding itself.
         found = excess_variance(*np.array(rows).T) if rows else (0.0, (data.q_DN**2 / 12.0) ** 2, 0.0)
         return Quantity.asked("row noise", found[0], found[1], data.dark_samples, found[2])
 
@@ -58,8 +58,8 @@ def row_noise(data: NoiseMoments, edge_gains: Float[np.ndarray, " pairs"]) -> tu
 class Pattern:
     """A variance between pixels (may be negative by chance), its standard deviation, samples, and outliers left out.
 
-    ``mean`` is that of the samples left in, and ``mean_variance`` how much it differs from sensor to sensor by these
-    patterns alone; ``places`` are (row, column) of the first outliers.
+    ``mean`` is that of the samples left in, and ``mean_variance`` its variance from sensor to sensor by these patterns
+    alone; ``places`` are (row, column) of the first outliers.
     """
 
     variance: float
@@ -72,18 +72,18 @@ class Pattern:
 
 
 def dsnu(dark_DN: Picture, temporal_DN2: float, row_DN2: float, rules: NoiseRules) -> Pattern:
-    """Variance of the pixels' offsets in an averaged dark frame (EMVA 1288, clause 8.2), row and column patterns in it.
+    """Variance of the pixels' offsets in an averaged dark frame (EMVA 1288, clause 8.2), with row and column patterns.
 
     Args:
         dark_DN: the average.
-        temporal_DN2: temporal variance of one sample of the average, row noise left out.
-        row_DN2: row noise left in the average.
-        rules: which pixels are defects.
+        temporal_DN2: temporal variance of one sample of the average, without row noise.
+        row_DN2: variance of row noise in the average.
+        rules: for the limit of a defect.
     """
     about = dark_DN.astype(np.float64)
     sample = about[:: max(1, len(about) // 256)]
     middle = float(np.median(sample))
-    # Averages of few frames are coarse: a spread below their step is no measure of what is usual.
+    # Averages of few frames are coarse: a spread below their step does not measure the usual scatter.
     reach = rules.defect_sigma * MAD_TO_SIGMA * float(np.median(np.abs(sample - middle)))
     bad = np.abs(about - middle) > max(reach, float(sample.std()), 1e-12)
     mean = float(about[~bad].mean()) if not bad.all() else 0.0
@@ -102,20 +102,20 @@ def dsnu(dark_DN: Picture, temporal_DN2: float, row_DN2: float, rules: NoiseRule
 
 
 def _first_places(bad: Mask) -> tuple[tuple[int, int], ...]:
-    """Row and column of the first eight."""
+    """Row and column of the first eight marked pixels."""
     rows, columns = np.unravel_index(np.flatnonzero(bad)[:8], bad.shape)
     return tuple(zip(rows.tolist(), columns.tolist(), strict=True))
 
 
 def rough_median(picture: Picture) -> float:
-    """Median over some 128 rows, an uneven number apart: of all rows of a mosaic alike."""
+    """Median over about 128 rows, an odd number apart, so that both kinds of a mosaic's rows count."""
     return float(np.median(picture[:: int(picture.shape[0] // 128) | 1]))
 
 
 @final
 @dataclass(frozen=True)
 class _Site:
-    """One colour: light and the inverse of its shading, both 0 where there is no measure; defects, and the spectrum."""
+    """One colour: light and the inverse of its shading, both 0 where undefined; defects, and the spectrum's power."""
 
     light: Float32[np.ndarray, "rows columns"]
     inverse_DN: Float32[np.ndarray, "rows columns"]
@@ -126,21 +126,21 @@ class _Site:
 def prnu(signal_DN: Picture, temporal_DN2: float, shot_DN: float, period: int, rules: NoiseRules) -> Pattern:
     """Variance of the photo response, relative (EMVA 1288, clause 8.3).
 
-    Per colour the picture is divided by its shading, and the floor of its spectrum (cosine transform) is taken where
-    ``white_coefficients`` finds no light. Where the light is modulated the pixels' patterns are so as well: the floor
-    is theirs times the mean square of the light.
+    The picture of each colour is divided by its shading. The floor of its spectrum (cosine transform) is measured where
+    ``white_coefficients`` finds no light. Modulated light modulates the pixels' patterns as well: the floor is theirs
+    times the mean square of the light.
 
     Args:
         signal_DN: average of flats minus average of darks.
         temporal_DN2: temporal variance of one sample of it at no light.
-        shot_DN: what a DN of signal adds to that variance, in DN^2 per DN.
-        period: sites of the colour mosaic repeat after so many samples (1: monochrome).
-        rules: size of the shading's window, and what is light.
+        shot_DN: increase of that variance with the signal, in DN^2 per DN.
+        period: sites of the colour mosaic repeat after this many samples (1: monochrome).
+        rules: for the size of the shading's window, and the limit of light.
     """
     phases = [np.s_[row::period, column::period] for row, column in product(range(period), repeat=2)]
     window = min(rules.shading, (min(signal_DN.shape) // period // 4) * 2 + 1)
     sites = [_site(signal_DN[phase], window, rules.defect_sigma) for phase in phases]
-    # The window has taken its part of the lowest frequencies. Sites may differ by a line: the least is common to all.
+    # The window has removed its part of the lowest frequencies. Sites may differ by a line: the least is common to all.
     rows, columns = (min(site.power.shape[axis] for site in sites) for axis in (0, 1))
     taken = (3 * rows // window + 1, 3 * columns // window + 1)
     white = white_coefficients([site.power[:rows, :columns] for site in sites], taken, rules)
@@ -156,9 +156,9 @@ def prnu(signal_DN: Picture, temporal_DN2: float, shot_DN: float, period: int, r
 
 
 def _site(signal_DN: Picture, window: int, reach: float) -> _Site:
-    """Pixels ``reach`` robust sigma from the middle of their neighbours are defects, and named where they are lit.
+    """One colour with its defects: lit pixels more than ``reach`` robust sigma from the middle of their neighbours.
 
-    Off along the row and along the column: at the crests of deep waves pixels are off across the wave alone.
+    A defect is off along the row and along the column: pixels at the crests of deep waves are off in one direction.
     """
     site = np.ascontiguousarray(signal_DN, dtype=np.float32)
     level = cv2.blur(site, (window, window), borderType=cv2.BORDER_REFLECT_101)
@@ -183,7 +183,7 @@ def _response(site: _Site, white: Mask, temporal_DN2: float, shot_DN: float) -> 
     noise = temporal_DN2 * _mean_product(inverse, inverse, good) + shot_DN * _mean_product(light, inverse, good)
     square = max(_mean_product(light, light, good) - floor, 0.1)
     variance = (floor - noise) / square
-    # Pixels of unlike noise are worth fewer of like noise: one row in eight shows how unlike they are.
+    # Pixels of different noise count as fewer pixels of equal noise: one row in eight gives the ratio.
     light, inverse = light[::8], inverse[::8]
     own = max(variance, 0.0) * light**2 + inverse * (temporal_DN2 * inverse + shot_DN * light)
     unlike = float(np.mean(own**2)) / max(float(np.mean(own)) ** 2, 1e-300)
@@ -191,7 +191,7 @@ def _response(site: _Site, white: Mask, temporal_DN2: float, shot_DN: float) -> 
 
 
 def _mean_product(first: np.ndarray, second: np.ndarray, count: int) -> float:
-    """Mean over so many pixels, without a copy; sums by rows keep single precision exact enough."""
+    """Mean product over ``count`` pixels, without a copy; sums by rows keep single precision exact enough."""
     return float(np.einsum("ij,ij->i", first, second).sum(dtype=np.float64)) / count
 
 
@@ -200,12 +200,12 @@ def white_coefficients(
 ) -> Mask:
     """Coefficients of cosine transforms that hold white noise alone; all transforms are of the same light.
 
-    The first line and column hold what differs by rows and by columns: they are never among them.
+    The first row and column hold differences between columns and between rows: they are never among them.
 
     Args:
         powers: squared coefficients, one picture per colour site.
-        taken: so many of the lowest rows and columns were changed by taking off shading.
-        rules: what is light, and how far it reaches.
+        taken: number of the lowest rows and columns that the correction of shading has changed.
+        rules: for the limit of light, and how far it reaches.
     """
     rows, columns = powers[0].shape
     keep = np.ones((rows, columns), bool)
@@ -220,7 +220,7 @@ def white_coefficients(
     wide = np.zeros_like(seen)
     for row, column in np.argwhere(seen):
         wide[: int(np.ceil(rules.light_reach * (row + 1))), : int(np.ceil(rules.light_reach * (column + 1)))] = True
-    # Where that leaves less than a tenth, what was not seen has to do.
+    # Where that leaves less than a tenth, all coefficients without visible light are used.
     left_out = wide if count[~wide].sum() >= 0.1 * keep.size else seen
     white = np.zeros_like(keep)
     blocks = np.repeat(np.repeat(~left_out, block, axis=0), block, axis=1)
@@ -237,14 +237,14 @@ def _by_block(values: np.ndarray, block: int) -> Grid:
 
 
 def _floor(count: Grid, total: Grid) -> float:
-    """Power of the floor from the lowest quarter of the blocks, put right for its being low."""
+    """Power of the floor from the lowest quartile of the blocks, corrected for the bias of a quartile."""
     full = count >= count.max()
     low = float(np.quantile(total[full] / count[full], 0.25))
     return low / _mean_square(count.max(keepdims=True), float(ndtri(0.25))).item()
 
 
 def _mean_square(count: Float[np.ndarray, "*n"], z: float) -> Float[np.ndarray, "*n"]:
-    """The mean of so many squared normals that is ``z`` sigma high, by Wilson and Hilferty (PNAS 17, 1931)."""
+    """The mean of ``count`` squared normals at ``z`` sigma of its distribution (Wilson, Hilferty, PNAS 17, 1931)."""
     spread = 2 / (9 * np.maximum(count, 1))
     return np.asarray((1 - spread + z * np.sqrt(spread)) ** 3)
 
@@ -260,14 +260,14 @@ def _light(count: Grid, total: Grid, sigma: float) -> Mask:
     for _ in range(8):
         before = light.copy()
         for down, across in sorted(sides, key=lambda side: side[0] * side[1]):
-            # Rectangles that begin at each block; those that reach over the end are cut there.
+            # Rectangles that begin at each block; those beyond the end are cut there.
             number, power = (
                 cv2.boxFilter(np.where(light, 0.0, part), -1, (across, down), anchor=(0, 0), normalize=False,
                               borderType=cv2.BORDER_CONSTANT) for part in (count, total)
             )  # fmt: skip
             number = np.maximum(number, 0.0)
             high = power / np.maximum(number, 1) > max(floor, 1e-300) * _mean_square(number, sigma)
-            # Those half a side apart are looked at.
+            # Rectangles half a side apart are tested.
             marks, apart = np.zeros(high.shape, np.uint8), np.s_[:: max(down // 2, 1), :: max(across // 2, 1)]
             marks[apart] = high[apart]
             inside = cv2.dilate(marks, np.ones((down, across), np.uint8), anchor=(across - 1, down - 1)) > 0

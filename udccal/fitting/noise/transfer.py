@@ -5,7 +5,7 @@ The sensor turns a linear signal z (DN above black) into y = z - c (z^2 + K z): 
     temporal variance = K z (1 - 2 c z)^2 + V0 + q^2/12,     light part of z = A (u + u0),
 
 with u the relative exposure to light. Sample variances are chi-squared: their weights come from the model, not from the
-data. Both relations bear on c; the first alone where the light is unsteady, which is one of the orders.
+data. Both relations determine c; where the light is unsteady, which is one of the orders, only the first does.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class Levels:
         dof: of the variances.
         samples: per bin and level, frames times pixels: the mean's weight.
         usable: bins safely inside the range of the sensor.
-        light: relative exposure; nan where unknown, or where the lamp was not steady.
+        light: relative exposure to light; nan where unknown, or where the lamp was not steady.
         dark_DN: dark signal in each level.
         row_variance_DN2: variance of each level's mean from row noise.
     """
@@ -54,10 +54,10 @@ class Levels:
 
     @property
     def responding(self) -> Bool[np.ndarray, " levels"]:
-        """Levels whose brightness bears on the response."""
+        """Levels whose brightness counts for the response."""
         seen = self.usable.any(axis=1) & np.isfinite(self.light)
         known = self.light[seen]
-        # Levels of one and the same exposure differ by the lamp's power, which nobody measured.
+        # Levels of one exposure differ by the lamp's power, which was not measured.
         return seen if known.size > 2 and float(np.ptp(known)) > 0 else np.zeros_like(seen)
 
     @property
@@ -74,8 +74,8 @@ class Levels:
 class DarkVariance:
     """V0 by dark frames: estimates (DN^2) with their standard deviations; and the rounding to add.
 
-    The estimates hold for the gain ``K_DN_per_e``; with another one the shot noise of their dark signal ``drift_DN``
-    changes, and they by as much.
+    The estimates hold for the gain ``K_DN_per_e``. With another gain they change by as much as the shot noise of their
+    dark signal ``drift_DN``.
     """
 
     V0_DN2: Float[np.ndarray, " points"]
@@ -132,14 +132,25 @@ def linear_signal(mean_DN, curvature_per_DN, K_DN_per_e):  # type: ignore[no-unt
 
 
 def temporal_variance(signal_DN, K_DN_per_e, V0_DN2, curvature_per_DN, rounding_DN2):  # type: ignore[no-untyped-def]
-    """Temporal variance in DN^2 at the linear signal z; works on numpy and JAX arrays alike."""
+    """Temporal variance K z (1 - 2 c z)^2 + V0 + rounding (EMVA 1288, clause 6); for numpy and JAX arrays.
+
+    Args:
+        signal_DN: linear signal z above black.
+        K_DN_per_e: conversion gain K.
+        V0_DN2: variance in the dark, without rounding.
+        curvature_per_DN: c of the response, 0 for a linear one.
+        rounding_DN2: variance of rounding, such as q^2 / 12.
+
+    Returns:
+        the variance in DN^2, in the shape of the signal.
+    """
     return K_DN_per_e * signal_DN * (1 - 2 * curvature_per_DN * signal_DN) ** 2 + V0_DN2 + rounding_DN2
 
 
 @final
 @dataclass(frozen=True)
 class TransferProblem:
-    """The engine's problem: the deviance of variances, read noise and brightness from what is modelled of them.
+    """The solver's problem: the deviance of variances, read noise and brightness from the model.
 
     ``bound`` is that of the curvature, and ``sizes`` are scales of the parameters, for derivatives by differences.
     """
@@ -154,7 +165,7 @@ class TransferProblem:
     def modelled(
         self, x: Five
     ) -> tuple[Float[np.ndarray, "levels bins"], Float[np.ndarray, " points"], Float[np.ndarray, " levels"]]:
-        """Variances; estimates of V0; and how far the levels' brightness, relative, is above that modelled."""
+        """Modelled variances and estimates of V0, and the relative excess of the levels' brightness over the model."""
         K, V0, c, gain, offset = x
         levels, dark = self.levels, self.dark
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -164,12 +175,12 @@ class TransferProblem:
         return variance, V0 + (K - dark.K_DN_per_e) * dark.drift_DN, bright - 1
 
     def scatter2(self, relative: Float[np.ndarray, " levels"]) -> float:
-        """Maximum-likelihood variance of the light from level to level, beyond what noise explains."""
+        """Maximum-likelihood variance of the light from level to level, in addition to noise."""
         known = self.levels.brightness_variance[self.levels.responding]
         return excess_variance(relative**2, known, np.ones(len(known)))[0] if self.order.unsteady else 0.0
 
     def equations_at(self, place: Five) -> Blocks:
-        """Score and Fisher information; the scatter of the light is that of the greatest likelihood there."""
+        """Score and Fisher information; the scatter of the light is the maximum-likelihood one at this place."""
         levels, dark, use, responds = self.levels, self.dark, self.levels.usable, self.levels.responding
 
         def predicted(at: Five) -> Float[np.ndarray, " data"]:
@@ -182,7 +193,7 @@ class TransferProblem:
         dof, ratio = levels.dof[use], np.maximum(levels.variance_DN2[use] / variance, 1e-12)
         off = np.concatenate([levels.variance_DN2[use] - variance, dark.V0_DN2 - floor, relative])
         weight = np.concatenate([0.5 * dof / variance**2, dark.sigma_DN2**-2, 1 / spread2])
-        # Parameters that the order leaves free, and on which the data bear.
+        # Free parameters are those of the order that the data determine.
         responding, jacobian = bool(responds.any()), np.zeros((len(off), 5))
         free = np.array([True, True, self.order.curved, responding, self.order.offset and responding])
         for i in np.flatnonzero(free):
@@ -196,7 +207,7 @@ class TransferProblem:
         return replace(Blocks.dense(cost, len(off), information, score), held=held)
 
     def moved(self, place: Five, step: Step) -> Five:
-        """With the curvature inside its bound."""
+        """The place after a step, with the curvature inside its bound."""
         x = place + step.shared
         x[2] = np.clip(x[2], -self.bound, self.bound)
         return x
@@ -205,7 +216,7 @@ class TransferProblem:
 def _brightness(light_DN: Float[np.ndarray, "levels bins"], usable: np.ndarray) -> Float[np.ndarray, " levels"]:
     """Mean light of each level as if every bin were usable in it: all levels have one pattern of bins."""
     complete = np.asarray(usable.all(axis=1))
-    # Alternating from the complete levels' pattern, the others add little; from none the first rounds would be rough.
+    # The alternation starts from the pattern of the complete levels; without them its first rounds would be rough.
     pattern = light_DN[complete].sum(axis=0) if complete.any() else np.ones(usable.shape[1])
     seen, pattern = np.where(usable, light_DN, 0.0), pattern / max(float(pattern.mean()), 1e-9)
     for _ in range(6 if usable[~complete].any() else 1):
@@ -253,12 +264,12 @@ def choose_transfer(levels: Levels, dark: DarkVariance, full_DN: float, rules: N
     K = float(np.median(shot / np.maximum(levels.mean_DN[use], 1e-9)))
     gain = float(light @ _brightness(levels.mean_DN - levels.dark_DN[:, None], use)) / max(float(light @ light), 1e-30)
     start = np.array([K, V0, 0.0, gain if gain > 0 else 1.0, 0.0])
-    # A variance is set against the mean of the same bin: of Poisson counts the two err together, of read noise apart.
+    # A variance and the mean of its bin have correlated errors for Poisson counts, and independent ones for read noise.
     apart = K**2 * max(V0, 0.0) / levels.samples / np.maximum(levels.variance_DN2, 1e-9) ** 2
     levels = replace(levels, dof=levels.dof / (1 + 0.5 * levels.dof * apart))
     orders = [Order(curved, offset, unsteady) for unsteady, offset, curved in product((False, True), repeat=3)]
     first = _fit_order(levels, dark, full_DN, Order(), start, rules)
-    # The simplest is where the others begin.
+    # The other orders start from the simplest one.
     start = first.fit.values if first.fit.converged else start
     others = orders[1:] if levels.responding.any() else [Order(curved=True)]
     return choose([first, *(_fit_order(levels, dark, full_DN, order, start, rules) for order in others)])
@@ -267,7 +278,7 @@ def choose_transfer(levels: Levels, dark: DarkVariance, full_DN: float, rules: N
 def robust_transfer(
     levels: Levels, dark: DarkVariance, full_DN: float, rules: NoiseRules
 ) -> tuple[Choice[TransferFit], Levels]:
-    """The same, and the levels less what lies off it: bins are not usable, the light of whole levels not known."""
+    """The same without outliers: bins off the curve are marked as not usable, the light of whole levels as unknown."""
     choice, rule = choose_transfer(levels, dark, full_DN, rules), OutlierRule("bins and levels", rules.outlier_sigma)
     for _ in range(3):
         fit = choice.best.fit

@@ -1,1 +1,1 @@
-"""The modulation by the pixel rows and the shading it rides on: shape and fields in one fit."""
+"""The modulation by the pixel rows and the shading under it: shape and fields in one fit."""

@@ -1,7 +1,7 @@
 """From averaged flats to weighted pixels: shot and read noise by the expected signal, PRNU, clipping, outliers.
 
-Weights come from the model's signal, not from the sample's own: a pixel that happens to be high would otherwise count
-for more (or less) than its neighbours, and the map would be biased.
+Weights come from the model's signal, not from the sample's own. Otherwise a pixel that is high by chance would count
+more (or less) than its neighbours, and the map would be biased.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from udccal.numerics import in_float64
 from udccal.result import Outliers
 from udccal.sessions.store import Session
 
-# What is compiled is compiled for so many pixels.
+# Functions are compiled for blocks of this many pixels.
 BLOCK = 2048
 Result = TypeVar("Result")
 _OUTLIERS = OutlierRule("pixels (row, column)")
@@ -35,16 +35,16 @@ _OUTLIERS = OutlierRule("pixels (row, column)")
 @final
 @dataclass(frozen=True)
 class WireData:
-    """An averaged flat, and what is known of the rig.
+    """An averaged flat, and the rig's description.
 
     Attributes:
         signal: flat minus dark, in any linear unit; colours need not be balanced.
-        variance: of ``signal`` itself (after averaging), in its unit squared; PRNU not included. It is smoothed to a
-            straight line against the signal before it weighs anything.
-        geometry: where the rays go.
+        variance: of ``signal`` itself (after averaging), in its unit squared; PRNU not included. The fit uses a
+            straight line through it against the signal.
+        geometry: gives the rays.
         start: the rig as built; its tolerances are the prior.
-        PRNU1288: relative response from pixel to pixel, added to the variance.
-        clip: signal from which on single frames clip; pixels that the model puts there are left out.
+        PRNU1288: relative sigma of the pixels' response; its square is added to the relative variance.
+        clip: signal at which single frames begin to clip; pixels are left out where the model expects more.
         clipped: part of the flat's pixels whose average is clipped.
         cfa: pattern of the sensor; each of its sites has a gain.
     """
@@ -60,13 +60,16 @@ class WireData:
 
 
 def read_wire(session: Session, noise: Noise, geometry: Geometry, rules: WireRules | None = None) -> WireData:
-    """What the steps ``wire/dark`` and ``wire/flat`` of a session hold.
+    """Read the steps ``wire/dark`` and ``wire/flat`` of a session.
 
     Args:
-        session: both averages are at one exposure.
+        session: with both averages, at one exposure.
         noise: for saturation and PRNU.
-        geometry: where the rays go.
-        rules: for the distance that single frames keep from saturation.
+        geometry: gives the rays.
+        rules: for the distance of single frames from saturation.
+
+    Returns:
+        the data of ``fit_wire``, in DN.
 
     Raises:
         SessionError: when a file of the session is missing or damaged.
@@ -93,8 +96,8 @@ def read_wire(session: Session, noise: Noise, geometry: Geometry, rules: WireRul
 class FlatNoise:
     """Variance of an averaged flat whose CFA sites have been divided by their means.
 
-    At a relative signal s of a site: ``floor + by_signal s + (PRNU1288 s)^2``. From the site's relative signal ``clip``
-    on, single frames clip: such pixels are left out by what the model says of them.
+    At a site's relative signal s it is ``floor + by_signal s + (PRNU1288 s)^2``. Single frames clip from the relative
+    signal ``clip`` on: pixels are left out where the model expects more.
     """
 
     floor: Float[np.ndarray, " sites"]
@@ -103,8 +106,8 @@ class FlatNoise:
     clip: Float[np.ndarray, " sites"]
 
     def variance(self, site: Int[np.ndarray, "*n"], signal: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
-        """Of pixels of these sites at these relative signals."""
-        # What a model takes to be dark, or below, must not weigh without bounds.
+        """Variance of pixels of these sites at these relative signals."""
+        # The weight must stay bounded where a model expects no light, or less than none.
         some = np.maximum(signal, 0.01)
         unequal = max(self.PRNU1288, 1e-5) * some
         return np.asarray(self.floor[site] + self.by_signal[site] * some + unequal**2)
@@ -113,7 +116,8 @@ class FlatNoise:
 def flat_noise(data: WireData, means: Float[np.ndarray, " sites"]) -> FlatNoise:
     """Straight lines through variance against signal, site by site (EMVA 1288's photon transfer).
 
-    The variance of few frames is itself too noisy to weigh single pixels with. ``means`` are the sites' mean signals.
+    The variance of few frames is itself too noisy for the weight of single pixels. ``means`` are the sites' mean
+    signals, in the unit of ``data.signal``.
     """
     sites = cfa_named(data.cfa).site_map(*data.signal.shape)
     lines = np.array(
@@ -143,9 +147,9 @@ def _line(signal: Float[np.ndarray, " n"], variance: Float[np.ndarray, " n"]) ->
 
 @final
 class Pixels(eqx.Module):
-    """A sample of the sensor with what does not change during the fit; ``weight`` 0 leaves a pixel out.
+    """A sample of the sensor's pixels; ``weight`` 0 leaves a pixel out.
 
-    ``place`` is the index in reading order; padding and what is no number have -1.
+    ``place`` is the index in reading order; it is -1 for padding and for values that are not finite.
     """
 
     ideal: Float[np.ndarray, "n 2"]
@@ -156,13 +160,13 @@ class Pixels(eqx.Module):
     place: Int[np.ndarray, " n"]
 
     def thinned(self, most: int) -> Pixels:
-        """At most so many of them, evenly drawn, in whole blocks."""
+        """About ``most`` of the pixels at most, evenly drawn, in whole blocks."""
         drawn = np.arange(0, len(self.value), -(-len(self.value) // most))
         return jax.tree.map(lambda a: a[np.resize(drawn, -(-len(drawn) // BLOCK) * BLOCK)], self)
 
     @property
     def used(self) -> int:
-        """How many have a weight."""
+        """Number of pixels with a weight."""
         return int(np.count_nonzero(self.weight))
 
 
@@ -170,14 +174,17 @@ class Pixels(eqx.Module):
 def sample_pixels(
     value: Float[np.ndarray, "rows columns"], geometry: Geometry, samples: int, cfa: str, other: bool = False
 ) -> Pixels:
-    """About so many pixels in reading order, shifted along from row to row so that all CFA sites are visited.
+    """Draw pixels in reading order, shifted from row to row so that all CFA sites are among them.
 
     Args:
-        value: what is not finite gets weight 0, others 1.
-        geometry: where the rays go.
-        samples: as many or somewhat more; all where there are fewer.
+        value: CFA-balanced signal; pixels that are not finite have weight 0, the others 1.
+        geometry: gives the rays.
+        samples: number of pixels; the sample has somewhat more, or all where there are fewer.
         cfa: pattern of the sensor.
-        other: a third as many, of other pixels than the sample drawn otherwise, where that is not all.
+        other: draw a third as many, from the pixels that the sample without ``other`` leaves out if there are any.
+
+    Returns:
+        the sample, padded to whole blocks.
     """
     rows, columns = value.shape
     step = odd_step(value.size, samples)
@@ -200,13 +207,21 @@ def sample_pixels(
 
 
 def odd_step(size: int, samples: int) -> int:
-    """From pixel to pixel of a sample of ``size`` pixels; odd steps visit all CFA sites."""
+    """Step from pixel to pixel of a sample in reading order; an odd step visits all CFA sites.
+
+    Args:
+        size: number of pixels of the sensor.
+        samples: number of pixels wanted.
+
+    Returns:
+        the step in pixels, at least 1.
+    """
     step = max(1, size // max(samples, 1))
     return step + 1 - step % 2
 
 
 def ideal_points(geometry: Geometry, positions_px: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
-    """Undistorted image points of pixels (x, y), which are as many as fill whole blocks."""
+    """Undistorted image points of pixels (x, y), whose number fills whole blocks."""
     return over_blocks(lambda part: _ideal_points(geometry, part), positions_px).T
 
 
@@ -221,7 +236,7 @@ def blocks(*arrays: Shaped[np.ndarray, "n ..."]) -> Iterator[tuple[Shaped[np.nda
 
 
 def over_blocks(function: Callable[..., Result], *arrays: Shaped[np.ndarray, "n ..."]) -> Result:
-    """A compiled function of arrays over pixels, block by block; what it gives has pixels last."""
+    """Apply a compiled function to arrays over pixels, block by block; the results have pixels last."""
     found = [function(*part) for part in blocks(*arrays)]
     return cast(Result, jax.tree.map(lambda *parts: np.concatenate(parts, axis=-1), *found))
 
@@ -229,7 +244,7 @@ def over_blocks(function: Callable[..., Result], *arrays: Shaped[np.ndarray, "n 
 @final
 @dataclass(frozen=True)
 class Weighed:
-    """A sample weighed by a model, with what was left out: by the model's clipping, and as outliers.
+    """A sample weighted by a model; ``clipped`` counts and ``outlying`` marks the pixels left out.
 
     ``expected`` is the model's signal in CFA-balanced units.
     """
@@ -241,11 +256,11 @@ class Weighed:
 
     @property
     def z(self) -> Float[np.ndarray, " n"]:
-        """Residuals in units of their expected sigma; 0 of what is left out."""
+        """Residuals in units of their expected sigma; 0 for pixels left out."""
         return np.asarray((self.pixels.value - self.expected) * np.sqrt(self.pixels.weight))
 
     def outliers(self, columns: int) -> tuple[Outliers, ...]:
-        """What was left out, for a person to look at; the sensor has so many columns."""
+        """The pixels left out, for a person; ``columns`` is the width of the sensor."""
         y, x = np.divmod(np.sort(self.pixels.place[self.outlying]), columns)
         found = _OUTLIERS.listed(f"({row}, {column})" for row, column in zip(y, x, strict=True))
         clipped = (Outliers("so bright, by the fitted map, that single frames clip", self.clipped),)
@@ -253,7 +268,7 @@ class Weighed:
 
 
 def weighed(pixels: Pixels, expected: Float[np.ndarray, " n"], noise: FlatNoise) -> Weighed:
-    """Weigh a sample by the signal that a model expects; leave out what clips and what no noise explains."""
+    """Weight a sample by the signal that a model expects; leave out clipped pixels and outliers."""
     variance = noise.variance(pixels.site, expected)
     real = (pixels.place >= 0) & np.isfinite(pixels.value)
     usable = real & (expected + 3 * np.sqrt(variance) < noise.clip[pixels.site])

@@ -1,8 +1,8 @@
 """Wire fit: from the average of flats to a smooth, noise-free map of the panel's modulation and the shading.
 
-Maximum a posteriori with the rig description as prior: every pixel weighs by the variance that its expected signal
-brings (shot, read and quantisation noise over the frames, PRNU), pixels that clip by the model are left out, outliers
-are listed. A search on few pixels is followed by one joint fit of shape and fields on many.
+The fit takes the maximum a posteriori, with the rig description as prior. The weight of a pixel follows from the
+variance at its expected signal (shot, read and quantisation noise over the frames, PRNU). Pixels that the model expects
+to clip are left out; outliers are listed. A search on few pixels precedes one joint fit of shape and fields on many.
 """
 
 from __future__ import annotations
@@ -47,8 +47,8 @@ def fit_wire(data: WireData, rules: WireRules | None = None) -> FitResult[Wire]:
         rules: constants of the fit.
 
     Returns:
-        the wire, whose map has a mean of 1, and its posterior: ``result.sigma_of`` gives the error of the map at any
-        pixels, what the model may be off included. A flat that cannot be used gives a status that says why.
+        the wire, whose map has a mean of 1, and its posterior: ``result.sigma_of`` gives the sigma of the map at any
+        pixels, model error included. The status of a flat that cannot be used says why.
     """
     rules, shape = rules or WireRules(), data.signal.shape
     means = _site_means(data)
@@ -83,12 +83,21 @@ def fit_wire(data: WireData, rules: WireRules | None = None) -> FitResult[Wire]:
 
 @in_float64
 def sensor_map(wire: Wire, rows: int, columns: int) -> Float[np.ndarray, "rows columns"]:
-    """The wire at every pixel of the sensor. It takes seconds: keep it."""
+    """The wire at every pixel of the sensor; the computation takes seconds.
+
+    Args:
+        wire: the fitted term.
+        rows: of the sensor.
+        columns: of the sensor.
+
+    Returns:
+        modulation times shading, whose mean is 1 for a fitted wire.
+    """
     return np.asarray(wire_map(wire, rows, columns), dtype=np.float64)
 
 
 def _site_means(data: WireData) -> Float[np.ndarray, " sites"]:
-    """Of what is finite and not clipped; NaN where nothing is left."""
+    """Mean signal of each site's finite, unclipped pixels; NaN where there are none."""
     by_site = (data.signal[site.samples] for site in cfa_named(data.cfa).sites)
     good = (some[np.isfinite(some) & (some < data.clip)] for some in by_site)
     return np.array([float(some.mean(dtype=np.float64)) if some.size else np.nan for some in good])
@@ -112,14 +121,14 @@ def _unusable(data: WireData, means: Float[np.ndarray, " sites"], rules: WireRul
 
 
 def _joint(found: Found, every: Pixels, data: WireData, noise: FlatNoise, rules: WireRules) -> Joint:
-    """Choose the columns that the data ask for, and fit them with the shape until nothing moves."""
+    """Choose the columns that the data support, and fit them with the shape until the solver converges."""
     wire, gains, panel = found.descent.wire, found.descent.gains, found.descent.problem.parameters.panel
     bounds = possible_harmonics(data.start, rules.least_amplitude).bounds
     full = parameters_of(wire, rules, gains.size, bounds if panel else (), panel)
     prior, x = full.prior(data.start, rules), full.vector(wire, gains)
     pixels = found.descent.weighs(every, noise)
     here = WireProblem("wire, orders", full, pixels, prior).equations_at(x)
-    # What is in the wire already counts as the column's own: the equations are moved to where there is none of it.
+    # The equations are moved to where the columns are 0, so that the present coefficients count as the columns' own.
     already = np.where(full.groups >= 0, x - prior.mean, 0.0)
     right = here.right + here.shared @ already
     power = here.samples - len(x) + prior.cost(x) + float((here.right + right) @ already)
@@ -129,7 +138,7 @@ def _joint(found: Found, every: Pixels, data: WireData, noise: FlatNoise, rules:
     prior = kept.prior(data.start, rules)
     problem = WireProblem("wire, joint", kept, weighed_at(kept, x, every, noise).pixels, prior)
     solution = minimise(problem, x, SOLVER)
-    # A step that is expected to gain less than the solver asks for is taken without looking.
+    # A last step whose expected gain is below the solver's limit is taken without a check of the cost.
     x = solution.place + (solution.equations.step(0.0).shared if solution.converged else 0.0)
     matrix, by_tile, chi2 = problem.sums(x)
     variance = problem.variance(chi2)
@@ -151,7 +160,7 @@ def _joint(found: Found, every: Pixels, data: WireData, noise: FlatNoise, rules:
 def _grid(
     geometry: Geometry, shape: tuple[int, int], parts: tuple[int, int]
 ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"]]:
-    """Ideal and scaled points of the middles of so many parts of a sensor of that shape, down and across."""
+    """Ideal and scaled points of the middles of ``parts`` (down, across) of a sensor of that shape."""
     y, x = ((np.arange(n) + 0.5) / n * size - 0.5 for n, size in zip(parts, shape, strict=True))
     pixels = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
     return ideal_points(geometry, pixels), np.asarray(scaled_positions(pixels, *shape))
@@ -160,7 +169,17 @@ def _grid(
 def mean_one(
     parameters: Parameters, x: Float[np.ndarray, " n"], geometry: Geometry, shape: tuple[int, int]
 ) -> Float[np.ndarray, " n"]:
-    """The parameters scaled to a map with a mean of one over a sensor of that shape, by the midpoint rule."""
+    """Scale the parameters to a map with a mean of 1 over the sensor, by the midpoint rule.
+
+    Args:
+        parameters: what ``x`` consists of.
+        x: in the units of the fit.
+        geometry: gives the rays.
+        shape: (rows, columns) of the sensor.
+
+    Returns:
+        ``x`` with another first coefficient of the shading.
+    """
     whole, base = values_at(parameters.wire(x), *_grid(geometry, shape, (192, 256)))
     scaled = x.copy()
     scaled[0] -= np.log(float(np.mean(whole * base)))
@@ -170,14 +189,17 @@ def mean_one(
 @final
 @dataclass(frozen=True)
 class MapJacobian:
-    """Derivatives of the map, its mean kept at 1, on a grid over the sensor; of its mean, were that not kept."""
+    """Values of the map and their derivatives ``rows`` at a fixed mean of 1, on a grid over the sensor.
+
+    ``of_mean`` are the derivatives of the mean where it is not fixed.
+    """
 
     value: Float[np.ndarray, " places"]
     rows: Float[np.ndarray, "n places"]
     of_mean: Float[np.ndarray, " n"]
 
     def sigma(self, cov: Float[np.ndarray, "n n"], model: float = 0.0) -> float:
-        """Relative, RMS over the sensor; ``model`` is what the model itself may be off."""
+        """Relative sigma of the map, RMS over the sensor; ``model`` is the relative model error."""
         variance = np.einsum("ip,ij,jp->p", self.rows, cov, self.rows, optimize=True)
         return float(np.sqrt(np.mean(variance + (model * self.value) ** 2)))
 
@@ -185,7 +207,17 @@ class MapJacobian:
 def map_jacobian(
     parameters: Parameters, x: Float[np.ndarray, " n"], geometry: Geometry, shape: tuple[int, int]
 ) -> MapJacobian:
-    """Of the map that these parameters make on a sensor of that shape; its mean is 1 (``mean_one``)."""
+    """Jacobian of the map by the parameters.
+
+    Args:
+        parameters: what ``x`` consists of.
+        x: scaled to a map with a mean of 1, see ``mean_one``.
+        geometry: gives the rays.
+        shape: (rows, columns) of the sensor.
+
+    Returns:
+        the map and its derivatives on a grid of 64 x 64 places.
+    """
     site, wire = np.zeros(BLOCK, dtype=np.int64), parameters.wire(x)
     grid = _grid(geometry, shape, (64, 64))
     whole, base, rows = over_blocks(lambda *at: block_jacobian(parameters, wire, at[0], at[1], site), *grid)
@@ -197,10 +229,10 @@ def map_jacobian(
 
 
 def _posterior(joint: Joint, jacobian: MapJacobian, model: float) -> Posterior[Wire]:
-    """Of all that was fitted, and of what the model may be off.
+    """Posterior of the fitted parameters and of the model error.
 
-    That is a modulation of unknown phase beside the pupil's: its cosine and sine are two further parameters, so that
-    the map's variance is the same everywhere. To first order, the map's mean stays 1.
+    The model error is a further modulation of unknown phase. Its cosine and sine are two more parameters, so that it
+    adds the same variance everywhere. To first order, the map's mean stays 1.
     """
 
     def term_at(values: Float[np.ndarray, " n_2"]) -> Wire:

@@ -1,9 +1,9 @@
-"""The wire's values and their derivatives, pixel by pixel, written out and summed up to normal equations.
+"""The wire's values and their derivatives, pixel by pixel, in closed form and summed up to normal equations.
 
-The modulation depends on the ten shape parameters through few numbers per pixel: where its ray meets the panel (X, Y),
-the two openings, the three of the footprint's ellipse, and the pupil. Sums over the harmonics are made once per such
-number; what turns it into the shape parameters knows nothing of harmonics. That is several times quicker than
-automatic derivatives of the whole model, in either mode.
+The modulation depends on the ten shape parameters through few numbers per pixel: the point where its ray meets the
+panel (X, Y), two openings, three numbers of the footprint's ellipse, and the pupil. Sums over the harmonics are made
+once per such number. Its derivatives by the shape parameters do not depend on the harmonics. That is several times
+faster than automatic derivatives of the whole model, in either mode.
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ from udccal.models.wire import (
 
 # Tiles of the sensor, down and across, whose residuals are tested as a whole.
 TILES = (6, 8)
-# Residual variance in units of what noise makes: less is none at all, and what is divided by it stays finite.
+# Least residual variance in units of the noise's, so that quotients by it stay finite.
 LEAST_VARIANCE = 1e-12
 
 
 class Rays(NamedTuple):
-    """What the modulation and the baseline depend on the shape through.
+    """The numbers per pixel through which modulation and baseline depend on the shape.
 
-    Panel coordinates in periods and openings are (X, Y); ``ellipse`` (xx, xy, yy) makes kappa of a harmonic.
+    Panel coordinates in periods and openings are (X, Y); ``ellipse`` (xx, xy, yy) gives kappa of a harmonic.
     """
 
     periods: Float[Array, "2 n"]
@@ -83,10 +83,19 @@ def rays_at(wire: Wire, ideal: Float[np.ndarray, "n 2"]) -> Rays:
 
 
 def with_harmonics(wire: Wire, harmonics: Float[np.ndarray, "harmonics 2"], ideal: Float[np.ndarray, "n 2"]) -> Wire:
-    """The same shape with other harmonics of a round pupil, and their ranges of kappa over a sample of the sensor."""
+    """The same shape with other harmonics of a round pupil.
+
+    Args:
+        wire: gives the shape.
+        harmonics: orders (n, m) along X and Y.
+        ideal: undistorted image points of a sample of the sensor, which fill whole blocks.
+
+    Returns:
+        the wire with these harmonics and their ranges of kappa over the sample.
+    """
     fields = np.zeros((len(harmonics), *np.shape(wire.fields)[1:]))
     fields[:, 0, 0, 0] = 1.0
-    # Of harmonics, the wire's rays know nothing.
+    # The wire's rays do not depend on its harmonics.
     ellipse = rays_at(wire, ideal[:: len(ideal) // BLOCK][:BLOCK]).ellipse
     n, m = harmonics.T
     seen = np.sqrt(np.stack([n * n, 2 * n * m, m * m], axis=1) @ np.asarray(ellipse))
@@ -111,13 +120,22 @@ def values_at(
 
 
 def expected_of(wire: Wire, gains: Float[np.ndarray, " sites"], pixels: Pixels) -> Float[np.ndarray, " n"]:
-    """The model's signal of a sample, in CFA-balanced units."""
+    """The signal of a sample by the model.
+
+    Args:
+        wire: modulation and shading.
+        gains: of the CFA sites.
+        pixels: the sample.
+
+    Returns:
+        one signal per pixel, in CFA-balanced units.
+    """
     whole, base = values_at(wire, pixels.ideal, pixels.scaled)
     return whole * base * gains[pixels.site]
 
 
 def weighed_at(parameters: Parameters, x: Float[np.ndarray, " n"], pixels: Pixels, noise: FlatNoise) -> Weighed:
-    """A sample weighed by the wire and the gains of these parameters."""
+    """A sample weighted by the wire and the gains of these parameters."""
     return weighed(pixels, expected_of(parameters.wire(x), parameters.gains(x), pixels), noise)
 
 
@@ -171,7 +189,7 @@ def _factors(wire: Wire, rays: Rays) -> tuple[Array, Array, Array, Array, Array]
 
 
 def _series(wire: Wire, powers: Float[Array, "degrees harmonics n"]) -> Float[Array, "2 2 harmonics n"]:
-    """What the field coefficients make of the two carriers, by phase and carrier."""
+    """Sums of the field coefficients times the Legendre powers, by phase and carrier."""
     fields = jnp.moveaxis(jnp.asarray(wire.fields), 0, -1)[..., None]
     return sum((fields[:, :, d] * powers[d] for d in range(1, len(powers))), start=fields[:, :, 0] * powers[0])
 
@@ -189,7 +207,7 @@ def _by_footprint(
 ) -> tuple[Float[Array, "3 n"], Float[Array, "1 n"]]:
     """Derivatives of the modulation by the ellipse (xx, xy, yy) and by the logarithm of the pupil."""
     by_log_z = both * jnp.sum((bessel[1] * series[:, 0] + bessel[2] * series[:, 1]) * wave, axis=0)
-    # The corrections to the pupil's transform are series in kappa themselves; P'_k = P'_(k-2) + (2 k - 1) P_(k-1).
+    # The corrections to the pupil's transform are themselves series in kappa; P'_k = P'_(k-2) + (2 k - 1) P_(k-1).
     bent = [jnp.zeros_like(powers[0]), jnp.ones_like(powers[0])]
     for k in range(2, len(powers)):
         bent.append(bent[k - 2] + (2 * k - 1) * powers[k - 1])
@@ -225,10 +243,10 @@ def block_jacobian(
 @final
 @dataclass(frozen=True)
 class WireProblem:
-    """The parameters' likelihood by a sample of weighted pixels.
+    """The likelihood of the parameters by a sample of weighted pixels.
 
-    The scale of the noise is estimated along with them, so that what the prior weighs against PRNU does not depend on
-    how well that is known: with it profiled out, minus twice the log likelihood is dof ln(chi-squared / dof).
+    The scale of the noise is estimated with them, so that the prior's weight does not depend on how well PRNU is
+    known. With the scale profiled out, minus twice the log likelihood is dof ln(chi-squared / dof).
     """
 
     name: str
@@ -245,13 +263,13 @@ class WireProblem:
         return by_data.with_prior(self.prior, place)
 
     def variance(self, chi2: float) -> float:
-        """Of the residuals, in units of what noise makes."""
+        """Variance of the residuals in units of the noise's."""
         return chi2 / max(self.pixels.used - len(self.prior.mean), 1) + LEAST_VARIANCE
 
     def sums(
         self, place: Float[np.ndarray, " n"]
     ) -> tuple[Float[np.ndarray, "n n"], Float[np.ndarray, "tiles n"], float]:
-        """Information at the noise that the weights have, the right side by tile, chi-squared."""
+        """Information by the pixels' weights, the right side by tile, and chi-squared."""
         wire, gains, size = self.parameters.wire(place), self.parameters.gains(place), len(place)
         tiles = np.arange(TILES[0] * TILES[1])[:, None]
         matrix, by_tile, chi2, p = np.zeros((size, size)), np.zeros((len(tiles), size)), 0.0, self.pixels
@@ -270,6 +288,6 @@ class WireProblem:
 
 
 def tile_numbers(scaled: Float[np.ndarray, "n 2"]) -> Int[np.ndarray, " n"]:
-    """Which tile of the sensor each position lies in."""
+    """Number of the sensor's tile in which each position lies."""
     x, y = (np.clip((0.5 * (scaled[:, i] + 1) * n).astype(np.int64), 0, n - 1) for i, n in enumerate(TILES[::-1]))
     return np.asarray(y * TILES[1] + x)

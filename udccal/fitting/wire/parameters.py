@@ -1,4 +1,4 @@
-"""What a wire fit solves for: which numbers of a wire, and which of these the data support."""
+"""The parameters of a wire fit: which numbers of a wire they are, and which of these the data support."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def with_shape(wire: Wire, shape: Float[np.ndarray, "10"] | Float[Array, "10"]) 
 
 
 def shape_sigma(start: WireStart, rules: WireRules) -> Float[np.ndarray, "10"]:
-    """One standard deviation of the shape parameters by the rig description; the origin is anywhere in a period."""
+    """Sigma of the shape parameters by the rig description; the origin may be anywhere in a period."""
     openings = start.row_tolerance, start.column_tolerance, start.depth_tolerance
     tolerances = rules.widening * np.array([start.standoff_tolerance, start.pupil_tolerance, *openings])
     turned = [rules.rotation_sigma_rad] * 3
@@ -67,7 +67,7 @@ def shape_sigma(start: WireStart, rules: WireRules) -> Float[np.ndarray, "10"]:
 
 
 class Kind(enum.IntEnum):
-    """Of a parameter, and what its four indices are.
+    """Kind of a parameter, and the meaning of its four indices.
 
     Shading: 0, 0, Legendre degree in y and in x. Site: logarithm of the gain of one of three CFA sites, as the sum over
     all four is 0. Amplitude: harmonic, phase, degree in y and in x. Field: harmonic, phase, carrier, degree. Shape: one
@@ -84,12 +84,12 @@ class Kind(enum.IntEnum):
 @final
 @dataclass(frozen=True)
 class Parameters:
-    """Which numbers of a wire are fitted: they make the vector ``x``.
+    """The numbers of a wire that are fitted; they form the vector ``x``.
 
     Attributes:
-        nothing: the wire where all linear coefficients are nothing; what is not fitted stays as it is here.
+        nothing: the wire where all linear coefficients are 0; numbers that are not fitted keep their values here.
         columns: (kind, four indices) of each parameter, kind by kind.
-        groups: numbers columns that are kept or dropped together; -1 is always kept.
+        groups: group of each column; a group is kept or dropped as a whole, and -1 is always kept.
     """
 
     nothing: Wire
@@ -97,26 +97,26 @@ class Parameters:
     groups: Int[np.ndarray, " n"]
 
     def of(self, kind: Kind) -> Bool[np.ndarray, " n"]:
-        """Which are of this kind."""
+        """Mask of the parameters of this kind."""
         return np.asarray(self.columns[:, 0] == kind)
 
     def indices(self, kind: Kind) -> tuple[Int[np.ndarray, " some"], ...]:
-        """Of those of this kind, the four indices."""
+        """The four indices of the parameters of this kind."""
         return tuple(self.columns[self.of(kind), 1:].T)
 
     @property
     def linear(self) -> int:
-        """How many there are but the shape, which comes last."""
+        """Number of parameters without the shape, which comes last."""
         return int(np.count_nonzero(~self.of(Kind.SHAPE)))
 
     @property
     def sites(self) -> int:
-        """Sites of the CFA's cell; their gains have a mean logarithm of 0, and so one parameter less."""
+        """Sites of the CFA's cell; the logarithms of their gains sum to 0, so that there is one parameter less."""
         return int(np.count_nonzero(self.of(Kind.SITE))) + 1
 
     @property
     def panel(self) -> bool:
-        """Whether there is one; without, there is no shape."""
+        """Whether there is a panel; without one there is no shape."""
         return self.linear < len(self.columns)
 
     def kept(self, keep: Bool[np.ndarray, " n"]) -> Parameters:
@@ -143,7 +143,7 @@ class Parameters:
         return np.exp(np.append(logs, -logs.sum()))
 
     def prior(self, start: WireStart, rules: WireRules) -> Prior:
-        """From the rig description, widened; of the origin no more is known than where ``nothing`` has it."""
+        """Prior by the rig description, widened; the origin is that of ``nothing``, within a period."""
         built = replace(
             ideal_wire(self.nothing.geometry, start, np.zeros((0, 2))), offset_periods=self.nothing.offset_periods
         )
@@ -155,7 +155,7 @@ class Parameters:
 
 
 def _leaves(wire: Wire, gains: Float[np.ndarray, " sites"]) -> dict[Kind, Float[np.ndarray, "_ _ _ _"]]:
-    """Copies of all that may be fitted, by the four indices of its kind."""
+    """Copies of all arrays that may be fitted, by kind, with that kind's four indices."""
     parts = wire.baseline, np.log(gains), wire.amplitudes, wire.fields, shape_vector(wire)
     leaves = (np.array(part, dtype=np.float64) for part in parts)
     shapes = (1, 1, *np.shape(wire.baseline)), (-1, 1, 1, 1), np.shape(wire.amplitudes), np.shape(wire.fields)
@@ -165,14 +165,17 @@ def _leaves(wire: Wire, gains: Float[np.ndarray, " sites"]) -> dict[Kind, Float[
 def parameters_of(
     wire: Wire, rules: WireRules, sites: int, bounds: Iterable[float] = (), panel: bool = True
 ) -> Parameters:
-    """Shading, site gains, the amplitudes that a wire has room for, and corrections to the round pupil.
+    """Parameters for shading, site gains, the wire's amplitudes, corrections to the round pupil, and the shape.
 
     Args:
-        wire: what no column has stays as it is here: its fields, and its shape where there is no panel.
+        wire: its arrays set the number of amplitudes and fields; numbers without a column keep their values.
         rules: for the degrees.
-        sites: of the CFA's cell.
+        sites: number of sites of the CFA's cell.
         bounds: of the harmonics' relative amplitudes; stronger ones have more corrections.
-        panel: whether there is one; without, there is no shape.
+        panel: whether there is one; without it there is no shape.
+
+    Returns:
+        all columns; ``select`` chooses among their groups.
     """
     nothing = replace(wire, baseline=np.zeros_like(wire.baseline), amplitudes=np.zeros_like(wire.amplitudes))
     strongest, _, degrees, _ = np.shape(nothing.amplitudes)
@@ -180,12 +183,12 @@ def parameters_of(
     columns += [(Kind.SITE, site, 0, 0, 0) for site in range(sites - 1)]
     columns += [(Kind.AMPLITUDE, h, p, i, j) for h in range(strongest) for p in (0, 1) for i, j in _pairs(degrees)]
     for h, bound in enumerate(bounds):
-        # What a real pupil changes of the weakest harmonics is too small to be seen.
+        # A real pupil's changes of the weakest harmonics are too small to be seen.
         counts = (4, 3) if bound > rules.strong[0] else (2, 1) if bound > rules.strong[1] else (0, 0)
         columns += [(Kind.FIELD, h, p, c, degree) for p in (0, 1) for degree in range(counts[p]) for c in (0, 1)]
     columns += [(Kind.SHAPE, k, 0, 0, 0) for k in range(10 * panel)]
     table = np.array(columns, dtype=np.int64)
-    # Kept or dropped together are shading and amplitudes of one total degree, and both carriers of a degree.
+    # The shading's terms of one total degree form a group, as do an amplitude's, and both carriers of a field's degree.
     kind, harmonic, phase, i, degree = table.T
     degree = np.where(kind == Kind.FIELD, degree, i + degree)
     optional = (kind == Kind.AMPLITUDE) | (kind == Kind.FIELD)
@@ -216,18 +219,18 @@ def select(
 ) -> Choice[Selected]:
     """Drop groups of columns, the weakest first, while that lowers BIC.
 
-    A group of k columns pays for itself when leaving it out raises chi-squared, in units of the residual variance of
-    the full model (so that PRNU counts as noise), by more than k ln(samples). The full choice and the last steps to the
-    best one come back.
+    A group of k columns is kept when leaving it out raises chi-squared, in units of the residual variance of the full
+    model (so that PRNU counts as noise), by more than k ln(samples). The result holds the full choice and the last
+    steps to the best one.
 
     Args:
         matrix, right: normal equations of all columns.
         power: weighted sum of the squared data.
-        samples: how many.
-        groups: of the columns; -1 stays.
+        samples: number of data.
+        groups: group of each column; -1 is always kept.
     """
     unit = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
-    # The tiny ridge only decides between columns that the data cannot tell apart.
+    # The tiny ridge only decides between columns that the data cannot distinguish.
     cov = np.linalg.inv(matrix / np.outer(unit, unit) + 1e-10 * np.eye(len(unit))) / np.outer(unit, unit)
     values, keep, total = cov @ right, np.ones(len(right), dtype=bool), len(np.unique(groups[groups >= 0]))
     variance = max((power - float(right @ values)) / max(samples - len(right), 1), 1e-300)
@@ -237,7 +240,7 @@ def select(
         criterion = bic((power - float(right @ values)) / variance, float(keep.sum()), samples)
         selected = Selected(keep, values)
         tried.append(Attempt(f"{len(optional)} of {total} terms", int(keep.sum()), criterion, selected))
-        # Exact rise of chi-squared when a group alone is left out, by column.
+        # The exact rise of chi-squared when one group is left out, by column.
         inside = [np.flatnonzero(groups == group) for group in optional]
         rises = [values[g] @ np.linalg.solve(cov[np.ix_(g, g)], values[g]) / len(g) / variance for g in inside]
         if not rises or min(rises) >= np.log(samples):

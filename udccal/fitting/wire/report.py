@@ -1,4 +1,4 @@
-"""What a wire fit found: patterns in its residuals, the harmonics that it leaves out, and the result for a person."""
+"""The result of a wire fit: patterns in its residuals, the harmonics that it leaves out, and numbers for a person."""
 
 from __future__ import annotations
 
@@ -25,18 +25,17 @@ from udccal.result import Diagnostic, Estimate, FitResult, FitStatus
 @final
 @dataclass(frozen=True)
 class Misfit:
-    """Relative sigma of the map, RMS over the sensor, that patterned residuals show, 0 where chance explains them."""
+    """Relative model error of the map by patterned residuals, RMS over the sensor; 0 where chance explains them."""
 
     sigma: float
     test: MisfitTest
 
 
 def misfit(tested: Weighed, wire: Wire | None, statistical: float, held_out: bool) -> Misfit:
-    """Means over bins of the rows' and the columns' period, tile by tile, against chance.
+    """Test means over bins of the rows' and the columns' period, tile by tile, against chance.
 
-    Noise is not patterned; a misfit is. ``wire`` gives where rays meet the period; without a panel bins lie by place.
-    Pixels that the fit has not seen (``held_out``) show its ``statistical`` errors as well: those are known, and are
-    taken off.
+    Noise has no pattern; a misfit has. ``wire`` gives the phase of each ray in the period; without a panel, bins are
+    parts of a tile. ``held_out`` pixels show the fit's ``statistical`` errors as well; these are accounted for.
     """
     pixels, expected = tested.pixels, tested.expected
     used = (pixels.weight > 0) & (expected > 0)
@@ -44,7 +43,7 @@ def misfit(tested: Weighed, wire: Wire | None, statistical: float, held_out: boo
     weight = np.where(used, pixels.weight * expected**2, 0.0)
     scale = max(float(np.sum(weight * relative**2)) / max(int(used.sum()), 1), LEAST_VARIANCE)
     tests, sizes = [], []
-    # Of a period of the rows and of the columns, once finer in one, once in the other.
+    # Bins of a period of the rows and of the columns, once finer in the one, once in the other.
     for down, across in ((12, 3), (3, 12)):
         bins = _bins(pixels, wire, down, across)
         full = np.bincount(bins, used) >= 4
@@ -59,7 +58,7 @@ def misfit(tested: Weighed, wire: Wire | None, statistical: float, held_out: boo
 
 
 def _bins(pixels: Pixels, wire: Wire | None, down: int, across: int) -> Int[np.ndarray, " n"]:
-    """A bin in each pixel's tile: where its ray meets the period of rows and columns; without a panel, by place."""
+    """Number of each pixel's bin in its tile: by its ray's phase in rows and columns, or by place without a panel."""
     by_place = 0.5 * (pixels.scaled.T + 1) * np.array([[TILES[1]], [TILES[0]]])
     periods = rays_at(wire, pixels.ideal).periods if wire is not None else by_place
     phase = periods - np.floor(periods)
@@ -70,14 +69,14 @@ def _bins(pixels: Pixels, wire: Wire | None, down: int, across: int) -> Int[np.n
 @final
 @dataclass(frozen=True)
 class Omitted:
-    """The harmonics that a fit leaves out, hundreds, each too weak to be fitted.
+    """The harmonics that a fit leaves out: hundreds, each too weak to be fitted.
 
-    A panel has them all, as its openings and a round pupil have it; a map that was made without has none. As a whole
-    they are one template, and how much of it is in the residuals is one number with an error.
+    A panel has all of them, by its openings and a round pupil; a synthetic map without them has none. Together they
+    are one template, whose amplitude in the residuals is one number with a sigma.
 
     Attributes:
-        rms: relative, over the sensor, if they are there.
-        part, part_sigma: of them, how much the residuals have, and its error.
+        rms: their relative RMS over the sensor, if they are there.
+        part, part_sigma: amplitude of the template in the residuals, 1 where all are there, and its sigma.
     """
 
     rms: float
@@ -86,9 +85,9 @@ class Omitted:
 
     @property
     def probability(self) -> float:
-        """That they are there, which beforehand is as likely as not.
+        """Probability that they are there, from 1/2 before the data.
 
-        By the likelihoods of the part found: 0 with its error, or 1 with that and the 0.3 by which real pupils differ.
+        The expected part is 0 or 1 within the part's sigma; around 1, real pupils differ by a further 0.3.
         """
         wide = np.hypot(self.part_sigma, 0.3)
         present = -0.5 * ((self.part - 1) / wide) ** 2 - np.log(wide)
@@ -97,20 +96,20 @@ class Omitted:
 
     @property
     def sigma(self) -> float:
-        """What they are expected to add to the map's error, relative, RMS over the sensor."""
+        """Their expected part of the map's relative sigma, RMS over the sensor."""
         return self.rms * float(np.sqrt(self.probability))
 
 
 def omitted(start: WireStart, wire: Wire, seen: Weighed, rules: WireRules) -> Omitted | None:
-    """Look for them, at the fitted shape and with a round pupil; None where there are none to leave out.
+    """Look for the omitted harmonics at the fitted shape, with a round pupil; None where the fit omits none.
 
-    The pixels may be those of the fit, as it takes up little of so many harmonics.
+    The pixels may be those of the fit, since it absorbs little of hundreds of harmonics.
     """
     left_out = possible_harmonics(start, rules.least_counted, rules.least_amplitude)
     if not len(left_out.bounds):
         return None
     pixels, expected = seen.pixels, seen.expected
-    # Only the strongest, with nine tenths of the power, are looked for: the others are not worth the seconds.
+    # The search is for the strongest, with nine tenths of the power: the others are not worth the time.
     power = np.cumsum(left_out.bounds**2)
     strongest = left_out.orders[: int(np.searchsorted(power, 0.9 * power[-1])) + 1]
     template = harmonics_alone(wire, strongest, pixels)
@@ -122,9 +121,9 @@ def omitted(start: WireStart, wire: Wire, seen: Weighed, rules: WireRules) -> Om
 
 
 def harmonics_alone(wire: Wire, orders: Float[np.ndarray, "any 2"], pixels: Pixels) -> Float[np.ndarray, " n"]:
-    """What these harmonics of a round pupil add to 1, at a wire's shape.
+    """The modulation by these harmonics of a round pupil, at a wire's shape.
 
-    They go in chunks of as many as the wire has, so that what the fit compiled serves here; very few would take long.
+    Chunks have as many harmonics as the wire, so that the fit's compiled functions serve here; tiny chunks are slow.
     """
     size = max(len(wire.harmonics), 64)
     plain = replace(wire, amplitudes=np.zeros_like(wire.amplitudes))
@@ -138,11 +137,11 @@ def harmonics_alone(wire: Wire, orders: Float[np.ndarray, "any 2"], pixels: Pixe
 
 
 def unseen(harmonics: Harmonics, searched: Pixels, rules: WireRules) -> float:
-    """What a fit's harmonics may modulate by, relative RMS, though the pixels searched show none; else 0."""
+    """Relative RMS modulation that the harmonics may have though the searched pixels show none; else 0."""
     power = float(np.sum(harmonics.bounds**2)) / 2
-    # Values are 1 but for shading, and a few that are far off must not count as light.
+    # The mean value is 1 apart from shading; a few outliers must not count as light.
     expected_gain = power * float(np.sum(searched.weight))
-    # Rows of half the amplitude that is expected would still have been noticed.
+    # Rows of half the expected amplitude would still have been found.
     if expected_gain > 4.0 * rules.least_gain:
         return 0.0
     return float(np.sqrt(power * min(1.0, rules.least_gain / max(expected_gain, 1e-300))))
@@ -151,9 +150,9 @@ def unseen(harmonics: Harmonics, searched: Pixels, rules: WireRules) -> float:
 @final
 @dataclass(frozen=True)
 class Joint:
-    """A fitted wire: the parameters kept, their values and covariance, and how it was fitted.
+    """A fitted wire: the parameters kept, their values and covariance, and facts about the fit.
 
-    ``variance`` is that of the residuals in units of what noise makes, ``seen`` the pixels of the fit, weighed by it,
+    ``variance`` is that of the residuals in units of the noise's, ``seen`` the pixels of the fit with their weights,
     ``by_tile`` each tile's part of the score, ``gain`` the chi-squared that the rows explained in the scan.
     """
 
@@ -171,7 +170,7 @@ class Joint:
 
     @property
     def impossible(self) -> bool:
-        """Whether an opening is surely wider than its period."""
+        """Whether an opening is wider than its period by more than three sigma."""
         wide = self.x[self.parameters.linear :][7:9] - 1
         return bool(np.any(wide > 3 * np.sqrt(np.diag(self.cov)[self.parameters.linear :][7:9])))
 
@@ -185,10 +184,10 @@ def wire_result(
     shape: tuple[int, int],
     rules: WireRules,
 ) -> FitResult[Wire]:
-    """The result of a fit that came to its end, on a sensor of that shape.
+    """The result of a finished fit, on a sensor of that shape.
 
-    ``left_out`` is the part of harmonics that were left out, or of rows that may be there unseen, and ``map_sigma``
-    the whole of the map's sigma: both relative, RMS over the sensor.
+    ``map_sigma`` is the whole sigma of the map. ``left_out`` is the part by omitted harmonics, or by rows that may be
+    there unseen. Both are relative, RMS over the sensor.
     """
     panel, seen = joint.parameters.panel, joint.seen
     term = _trimmed(posterior.term_at(posterior.mean), panel)
@@ -229,7 +228,7 @@ def wire_result(
 
 
 def _trimmed(wire: Wire, panel: bool) -> Wire:
-    """Without Legendre degrees that no harmonic uses, and without harmonics where no panel is: quicker to compute."""
+    """The wire without unused Legendre degrees, and without harmonics where there is no panel: it is faster."""
     used = np.flatnonzero(np.any(np.asarray(wire.fields) != 0, axis=(0, 1, 2)))
     degrees, count = (int(used.max()) + 1 if used.size else 1), (None if panel else 0)
     beside = wire.amplitudes if np.any(wire.amplitudes) else np.zeros((0, 2, 1, 1))

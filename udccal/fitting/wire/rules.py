@@ -1,4 +1,4 @@
-"""What is known before a wire fit: its constants, the rig as built, and the harmonics its panel can show."""
+"""The inputs of a wire fit: its constants, the rig as built, and the harmonics that its panel can show."""
 
 from __future__ import annotations
 
@@ -20,29 +20,29 @@ class WireRules:
 
     Attributes:
         samples: pixels of the joint fit; time grows with it, the map's sigma falls with its square root.
-        search_part, shape_part: of these, for the search of the shape and for its first full fit.
-        search_harmonics: the strongest are enough for the search.
-        least_samples: pixels that a flat must have.
+        search_part, shape_part: parts of ``samples`` for the search of the shape and for its first full fit.
+        search_harmonics: number of the strongest harmonics, which are enough for the search.
+        least_samples: fewest pixels of a flat.
         most_clipped: part of the flat's pixels that may be clipped.
-        headroom_sigma: single frames must stay so far below saturation, or their average is bent.
-        rotation_sigma_rad: how far the geometry's own rotation may be off.
-        widening: the rig's tolerances are bounds on a careful build; the prior's sigma is so many of them.
-        amplitude_sigma, field_sigma: prior of amplitudes beside the pupil's, and of relative changes of its transform.
+        headroom_sigma: distance of single frames from saturation; with less, their average is not linear.
+        rotation_sigma_rad: prior sigma of the rotation about the geometry's own.
+        widening: the prior's sigma in units of the rig's tolerances, which are bounds of a careful build.
+        amplitude_sigma, field_sigma: prior sigma of free amplitudes, and of relative changes of the pupil's transform.
         least_amplitude: relative size from which harmonics are fitted; the others are part of the map's sigma.
-        least_counted: relative size from which they count there.
+        least_counted: relative size from which the others count there.
         strong: relative sizes from which a harmonic may have many or few corrections to the round pupil.
-        smooth_degrees: of the shading: those up to the first are always fitted, those up to the second on demand.
-        scan_range: of stand-off and of pupil, relative to the rig description: two lengths that are divided, 20 % off.
+        smooth_degrees: of the shading: those up to the first are always fitted, those up to the second if supported.
+        scan_range: of stand-off and of pupil, relative to the rig description: a quotient of lengths, each 20 % off.
         scan_steps: of the stand-off in periods at the edge of the field, and of the pupil in radians of z, the
             argument of its transform.
-        places: most of the scan's places that are looked into.
-        rival: minus twice the log posterior; places that differ by less may change their order with more pixels.
-        unfinished: the same after the first steps only.
-        doubtful_variance: residual variance beyond which amplitudes that no pupil explains are tried.
-        free: of how many harmonics, and up to which degree over the sensor.
+        places: most places of the scan from which descents start.
+        rival: difference in minus twice the log posterior below which places may change their order with more pixels.
+        unfinished: the same difference after the first steps.
+        doubtful_variance: residual variance beyond which free amplitudes, which no pupil explains, are tried.
+        free: number of harmonics with free amplitudes, and their degree over the sensor.
         least_gain: chi-squared that rows must explain; chance does not reach a third of it in 300 trials.
-        worst_variance: structure that the model lacks, as strong as shot noise and PRNU together.
-        doubted_sigma: beyond so many prior sigmas the rig description is doubted.
+        worst_variance: residual variance beyond which the fit is poor: model error as strong as shot noise and PRNU.
+        doubted_sigma: deviation in prior sigmas beyond which the rig description is doubted.
     """
 
     samples: int = 300_000
@@ -75,7 +75,7 @@ class WireRules:
 @final
 @dataclass(frozen=True)
 class WireStart:
-    """The rig as built, lengths in panel periods. Tolerances are absolute but those of stand-off and pupil."""
+    """The rig as built, lengths in panel periods. Tolerances of stand-off and pupil are relative, others absolute."""
 
     standoff_per_pitch: float
     standoff_tolerance: float
@@ -90,7 +90,14 @@ class WireStart:
 
 
 def wire_start(rig: RigDescription) -> WireStart:
-    """Start values of a rig description."""
+    """The start values of a wire fit by a rig description.
+
+    Args:
+        rig: its panel, lens and stand-off.
+
+    Returns:
+        lengths in panel periods, with their tolerances.
+    """
     panel, lens, standoff = rig.panel, rig.lens, rig.mounting.standoff_mm
     pitch, depth = panel.pitch_mm.value, panel.depth_mm
     pitch_tolerance = panel.pitch_mm.tolerance / pitch
@@ -120,9 +127,17 @@ class Harmonics:
 
 
 def possible_harmonics(start: WireStart, least: float | None = None, below: float = np.inf) -> Harmonics:
-    """Harmonics whose bound is at least ``least`` (by default what is fitted) and less than ``below``.
+    """Harmonics whose relative amplitude has a bound from ``least`` to ``below``.
 
     The bound is the slits' times the envelope of 2 J1(z) / z, z = pi D kappa / pitch, for a round pupil.
+
+    Args:
+        start: the rig as built.
+        least: smallest bound; by default that of the fitted harmonics.
+        below: bounds are smaller than this.
+
+    Returns:
+        orders (n, m) with their bounds, largest first.
     """
     least = WireRules().least_amplitude if least is None else least
     orders = np.arange(HIGHEST_ORDER + 1.0)
@@ -140,7 +155,17 @@ def possible_harmonics(start: WireStart, least: float | None = None, below: floa
 def ideal_wire(
     geometry: Geometry, start: WireStart, harmonics: Float[np.ndarray, "harmonics 2"], rules: WireRules | None = None
 ) -> Wire:
-    """The rig as built, with a round pupil and an even field; the harmonics' ranges of kappa are not set."""
+    """The wire of the rig as built, with a round pupil and an even field.
+
+    Args:
+        geometry: gives the rays.
+        start: the rig as built.
+        harmonics: orders (n, m) along X and Y.
+        rules: for the degrees of the shading.
+
+    Returns:
+        the wire; the ranges of kappa of its harmonics are not set.
+    """
     degrees = (rules or WireRules()).smooth_degrees[1] + 1
     fields = np.zeros((len(harmonics), 2, 2, 4))
     fields[:, 0, 0, 0] = 1.0

@@ -1,4 +1,4 @@
-"""Where the wire is, far around the rig description: a scan by demodulation, and descents from the places it finds."""
+"""The search for the wire far around the rig description: a scan by demodulation, and descents from its places."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from udccal.fitting.wire.rules import WireRules, WireStart, ideal_wire, possible
 from udccal.models.geometry import Geometry
 from udccal.models.wire import Wire
 
-# What the data hardly show may creep on for ever: a tenth of a sigma, or what steps of a sigma no longer bring.
+# Weakly determined parameters may creep on for ever: the descent ends at a tenth of a sigma, or when steps stall.
 SOLVER = SolverRules(least_gain=1e-2, stalled_gain=0.1)
 
 
@@ -33,28 +33,28 @@ class Descent:
 
     @property
     def wire(self) -> Wire:
-        """As fitted."""
+        """The fitted wire."""
         return self.problem.parameters.wire(self.solution.place)
 
     @property
     def gains(self) -> Float[np.ndarray, " sites"]:
-        """Of the CFA sites."""
+        """Gains of the CFA sites."""
         return self.problem.parameters.gains(self.solution.place)
 
     @property
     def variance(self) -> float:
-        """Of the residuals, in units of what noise makes."""
+        """Variance of the residuals in units of the noise's."""
         return self.problem.variance(self.problem.sums(self.solution.place)[2])
 
     def weighs(self, pixels: Pixels, noise: FlatNoise) -> Pixels:
-        """A sample weighed by what was fitted."""
+        """A sample weighted by the fitted model."""
         return weighed_at(self.problem.parameters, self.solution.place, pixels, noise).pixels
 
 
 @final
 @dataclass(frozen=True)
 class Found:
-    """A fit whose shape is nearly final, where it was searched, and what the rows' first harmonic explains there."""
+    """A fit whose shape is nearly final, the pixels searched, and the chi-squared that the rows explain in them."""
 
     descent: Descent
     searched: Pixels
@@ -64,17 +64,17 @@ class Found:
 @final
 @dataclass(frozen=True)
 class Search:
-    """What a search goes by: the rig as built, the noise, the rules."""
+    """A search by the rig as built, the noise and the rules."""
 
     start: WireStart
     noise: FlatNoise
     rules: WireRules
 
     def found(self, geometry: Geometry, few: Pixels, many: Pixels) -> Found:
-        """The shading alone; stand-off and origin by demodulation of the first harmonics; then all of it together.
+        """Fit the shading alone, then stand-off and origin by demodulation of the first harmonics, then all together.
 
-        Searches on ``few`` pixels with the strongest harmonics, and finishes on ``many`` with all of them. Rows that
-        ``few`` do not show are looked for in ``many``.
+        The search uses ``few`` pixels and the strongest harmonics; the last fit uses ``many`` pixels and all harmonics.
+        Rows that ``few`` do not show are searched in ``many``.
         """
         harmonics = possible_harmonics(self.start, self.rules.least_amplitude).orders
         strongest = harmonics[: self.rules.search_harmonics]
@@ -95,12 +95,12 @@ class Search:
         return Found(_rivals(finished, self.rules.rival)[0], sample, gain)
 
     def _shading(self, built: Wire, sample: Pixels) -> Descent:
-        """Without any panel: no waves, and nothing that narrows with obliquity."""
+        """Fit the shading without any panel: no modulation, and no openings that narrow with obliquity."""
         bare = replace(built, fields=np.zeros_like(built.fields), depth_per_pitch=np.float64(0.0))
         parameters = parameters_of(bare, self.rules, self.noise.floor.size, panel=False)
         prior, x = parameters.prior(self.start, self.rules), parameters.vector(bare, np.ones(parameters.sites))
         x[0] = -np.log(float(bare.row_open) * float(bare.column_open))
-        # To begin with, pixels that clip are left out by their own values; later, by the model's.
+        # At first, clipped pixels are left out by their own values; later, by the model's.
         clip = self.noise.clip[sample.site]
         pixels = weighed(sample, np.where(sample.value < clip, 1.0, clip), self.noise).pixels
         for _ in range(2):
@@ -112,10 +112,10 @@ class Search:
     def _search(
         self, places: list[Wire], bare: Descent, harmonics: Float[np.ndarray, "harmonics 2"], sample: Pixels
     ) -> list[Descent]:
-        """Descents from the places of a scan: a few steps from each, and to the end from the best.
+        """Descend from the places of a scan: a few steps from each, and to the end from the best.
 
-        A pupil one period larger, with the origin half a period on, has nearly the same first harmonic: where few
-        pixels cannot tell, all such rivals come back, best first.
+        A pupil one period larger, with the origin half a period on, has nearly the same first harmonic. Where few
+        pixels cannot distinguish such rivals, all of them come back, best first.
         """
         depth, tried = np.float64(self.start.depth_per_pitch), []
         for place in (places[0], *beside(places[0]), *places[1:]):
@@ -130,20 +130,20 @@ class Search:
             return rivals
         room = np.zeros((min(count, len(harmonics)), 2, degree + 1, degree + 1))
         other = self._descent(replace(best.wire, amplitudes=room), best.gains, sample, SOLVER)
-        # Chance, and noise that is somewhat larger than given, must not bring so many parameters in.
+        # Chance, or noise somewhat larger than given, must not add that many parameters.
         return [other] if other.variance < 0.95 * variance else rivals
 
     def _descent(self, wire: Wire, gains: Float[np.ndarray, " sites"], pixels: Pixels, rules: SolverRules) -> Descent:
-        """From a wire, whose origin becomes the prior's."""
+        """Descend from a wire, whose origin becomes the prior's."""
         parameters = parameters_of(wire, self.rules, gains.size)
         problem = WireProblem("wire, shape", parameters, pixels, parameters.prior(self.start, self.rules))
         return Descent(problem, minimise(problem, parameters.vector(wire, gains), rules))
 
 
 def _best_columns(descent: Descent, pixels: Pixels, column_open: float) -> Wire:
-    """Origin along X by eighths of a period, with the columns as wide as built.
+    """The best origin along X of eight in a period, with the columns' openings as built.
 
-    In few pixels, faint columns may have been seen half a period off, with openings wider than their period.
+    A fit to few pixels may put faint columns half a period off, with openings wider than their period.
     """
     wire = replace(descent.wire, column_open=np.float64(column_open))
     shifted = [replace(wire, offset_periods=np.asarray(wire.offset_periods) + np.array([k / 8, 0.0])) for k in range(8)]
@@ -152,7 +152,7 @@ def _best_columns(descent: Descent, pixels: Pixels, column_open: float) -> Wire:
 
 
 def _rivals(tried: Sequence[Descent], margin: float) -> list[Descent]:
-    """Those that the data seen so far cannot tell from the best, best first."""
+    """The descents that the data so far cannot distinguish from the best one, best first."""
     ordered = sorted(tried, key=lambda one: one.solution.equations.cost)
     return [one for one in ordered if one.solution.equations.cost < ordered[0].solution.equations.cost + margin]
 
@@ -160,11 +160,11 @@ def _rivals(tried: Sequence[Descent], margin: float) -> list[Descent]:
 def scan_rows(
     wire: Wire, gains: Float[np.ndarray, " sites"], start: WireStart, pixels: Pixels, rules: WireRules
 ) -> tuple[list[Wire], float]:
-    """Stand-offs, pupils and origins along Y that put most of the signal into the rows' first harmonic, best first.
+    """Wires whose stand-off, pupil and origin along Y put most signal into the rows' first harmonic, best first.
 
     There may be several: a pupil one period larger with the origin half a period on has nearly the same harmonic.
-    ``wire`` has no waves, the start's stand-off and pupil, and it weighs the pixels. With them comes the chi-squared
-    that the best one's first harmonic explains, 0 where there is none.
+    ``wire`` has no modulation and the start's stand-off and pupil; ``pixels`` have its weights. The second result is
+    the chi-squared that the best one's first harmonic explains, 0 where there is none.
     """
     rays, sigma = rays_at(wire, pixels.ideal), shape_sigma(start, rules)
     half_field = max(float(np.ptp(rays.periods[1])) / 2, 1.0)
@@ -175,7 +175,7 @@ def scan_rows(
     gain, angle = _demodulate(wire, gains, pixels, 1, standoffs, pupils)
     unlikely = (off[0] / sigma[3])[:, None] ** 2 + (off[1] / sigma[6]) ** 2
     score = np.where(gain > 0, gain - np.minimum(unlikely, 0.5 * gain), 0.0)
-    # Of other places, those that explain a good part of what the best does.
+    # Other places count if they explain a good part of the best one's chi-squared.
     peaks = np.argwhere((maximum_filter(score, size=3, mode="nearest") == score) & (score >= 0.3 * score.max()))
     order = np.argsort([-score[i, j] for i, j in peaks], kind="stable")[: rules.places]
     found = [_placed(wire, standoffs[i], pupils[j], 1, angle[i, j]) for i, j in peaks[order]]
@@ -183,9 +183,9 @@ def scan_rows(
 
 
 def beside(place: Wire) -> list[Wire]:
-    """The places with a pupil one period larger or smaller: the first harmonic's sign changes, and with it the origin.
+    """The places with a pupil one period larger or smaller, where the first harmonic's sign and the origin change.
 
-    In the pupil's transform a period of diameter is one zero more, or less, for a pupil of several periods.
+    For a pupil of several periods, a period of diameter is one zero more, or less, in the pupil's transform.
     """
     pupil, standoff = float(place.footprint_per_pitch), float(place.standoff_per_pitch)
     angle = 2 * np.pi * (float(np.asarray(place.offset_periods)[1]) + 0.5)
@@ -193,14 +193,14 @@ def beside(place: Wire) -> list[Wire]:
 
 
 def scan_columns(wire: Wire, gains: Float[np.ndarray, " sites"], pixels: Pixels) -> Wire:
-    """The origin along X from the columns' first harmonic; the rest is known from the rows."""
+    """The wire with the origin along X from the columns' first harmonic; the rows have given the rest."""
     standoff, pupil = float(wire.standoff_per_pitch), float(wire.footprint_per_pitch)
     _gain, angle = _demodulate(wire, gains, pixels, 0, np.array([standoff]), np.array([pupil]))
     return _placed(wire, standoff, pupil, 0, angle[0, 0])
 
 
 def _trials(ends: tuple[float, float], step: float, most: int) -> Float[np.ndarray, " n"]:
-    """Logarithms of factors, one of which is 1: the rig description itself."""
+    """Logarithms of the factors to try; one factor is 1, the rig description itself."""
     low, high = np.log(ends)
     count = int(np.clip(np.ceil((high - low) / step), 8, most))
     below = max(round(count * -low / (high - low)), 1)
@@ -215,7 +215,7 @@ def _demodulate(
     standoffs: Float[np.ndarray, " s"],
     pupils: Float[np.ndarray, " p"],
 ) -> tuple[Float[np.ndarray, "s p"], Float[np.ndarray, "s p"]]:
-    """Of what ``wire`` leaves: chi-squared by an axis' first harmonic, in residual variances, and its phase."""
+    """Demodulate the residuals of ``wire``: chi-squared by an axis' first harmonic, in residual variances; phase."""
     whole, base = values_at(wire, pixels.ideal, pixels.scaled)
     level = base * gains[pixels.site]
     root = np.sqrt(pixels.weight) * level
