@@ -15,10 +15,10 @@ from udccal.cfa import cfa_named
 @final
 @dataclass(frozen=True)
 class Bins:
-    """Averages of a mosaic over blocks of ``step`` x ``step`` (even) pixels, colour by colour.
+    """Averages of a mosaic over blocks of ``step`` x ``step`` pixels (whole cells of the pattern), colour by colour.
 
-    A sample of a colour represents the 2 x 2 pixels around it. Its weight is the part of them inside the block, so that
-    every colour's average belongs to the block's centre, although its samples are not centred there.
+    A sample represents the area around it up to half the distance to its neighbours of the same site. Its weight is the
+    part of that area inside the block, so that every colour's average belongs to the block's centre.
     """
 
     cfa: str
