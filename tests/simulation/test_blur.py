@@ -95,6 +95,14 @@ def test_built_blur_meets_the_kernels_on_its_grid():
     assert np.abs(found - expected[:, :17, :9]).max() < 5e-3 * expected.max()
 
 
+def test_a_smaller_blur_keeps_the_middle_of_the_first_components():
+    blur = toy_blur(np.ones((3, 4, 2, 2)))
+    small = blur.smaller(2, 3, 9)
+    assert small.components.shape == (3, 2, 3, COLUMNS)
+    np.testing.assert_array_equal(small.components, blur.components[:, :2, 2:5])
+    np.testing.assert_array_equal(small.coefficients, blur.coefficients[:, :2])
+
+
 def test_even_light_stays_even():
     blur = build_blur(toy_truth(), 2, 2, 33, 17)
     even = blur.apply(np.ones((96 + 32, 128 + 16, 3)))

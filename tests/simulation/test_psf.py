@@ -8,7 +8,7 @@ import pytest
 from tests.simulation.toy import toy_truth
 from udccal.errors import UdccalError
 from udccal.rig import load_rig
-from udccal.simulation.psf import captured_light, kernels, phase_averaged_kernels
+from udccal.simulation.psf import captured_light, kernels, phase_averaged_kernels, spread_at
 from udccal.simulation.spectrum import camera_spectrum
 from udccal.simulation.truth import RigTruth, draw_truth, pixels_to_directions
 
@@ -105,19 +105,26 @@ def test_whole_pixel_offset_shifts_the_samples(truth: RigTruth):
     assert np.abs(shifted[:, 1:, 2:] - plain[:, :-1, :-2]).max() < 1e-3 * plain.max()
 
 
-@pytest.mark.slow
 def test_disc_averages_points_and_keeps_the_light(truth: RigTruth):
-    point, disc = captured_light(truth, MIDDLE, 65, 33), captured_light(truth, MIDDLE, 65, 33, source_disc_px=1.6)
+    spread = spread_at(truth, MIDDLE, (20.0, 36.0))
+
+    def light(rows: int, columns: int, offset: tuple[float, float], disc_px: float) -> np.ndarray:
+        return captured_light(truth, MIDDLE, rows, columns, offset, disc_px, spread=spread)
+
+    point, disc = light(65, 33, (0.3, -0.2), 0.0), light(65, 33, (0.3, -0.2), 1.6)
     assert np.allclose(disc.sum(axis=(1, 2)), point.sum(axis=(1, 2)), rtol=2e-3)
-    assert (disc.max(axis=(1, 2)) < point.max(axis=(1, 2))).all()
-    side = 9
-    grid = (np.arange(side) + 0.5) / side - 0.5
-    inside = [(1.6 * x, 1.6 * y) for x in grid for y in grid if x * x + y * y < 0.25]
-    brute = np.mean([captured_light(truth, MIDDLE, 7, 5, offset) for offset in inside], axis=0)
-    error = np.linalg.norm(disc[:, 29:36, 14:19] - brute, axis=(1, 2)) / np.linalg.norm(brute, axis=(1, 2))
-    assert (error < 0.08).all()
-    against_point = np.linalg.norm(point[:, 29:36, 14:19] - brute, axis=(1, 2)) / np.linalg.norm(brute, axis=(1, 2))
-    assert (against_point > 0.4).all()
+    # Points spread evenly over the disc (Vogel's sunflower spiral).
+    index = np.arange(250)
+    radius, angle = 0.8 * np.sqrt((index + 0.5) / index.size), index * np.pi * (3 - np.sqrt(5))
+    moves = np.stack([0.3 + radius * np.cos(angle), -0.2 + radius * np.sin(angle)], axis=-1)
+    brute = np.mean([light(7, 5, (float(x), float(y)), 0.0) for x, y in moves], axis=0)
+
+    def error(kernel: np.ndarray) -> np.ndarray:
+        return np.linalg.norm(kernel[:, 29:36, 14:19] - brute, axis=(1, 2)) / np.linalg.norm(brute, axis=(1, 2))
+
+    assert (error(disc) < 0.008).all()
+    assert (error(point) > 0.4).all()
+    assert (error(light(65, 33, (0.3, -0.2), 1.7)) > 0.01).all()
 
 
 def test_thicker_structure_changes_the_kernel(truth: RigTruth):

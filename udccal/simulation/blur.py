@@ -7,14 +7,14 @@ with a spatially-variant PSF", 2002). Between the grid's nodes the coefficients 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.fft
 from jaxtyping import Float
-from scipy.interpolate import make_interp_spline
 
 from udccal.simulation.psf import phase_averaged_kernels
+from udccal.simulation.rays import spline_basis
 from udccal.simulation.truth import RigTruth
 
 _WORKERS = 2
@@ -28,7 +28,7 @@ class SpaceVariantBlur:
         components: kernels h_r by colour; odd sizes, origin in the middle.
         coefficients: c_r by colour at the grid's nodes.
         grid_x_px: x of the grid's columns on the sensor. grid_y_px: y of its rows.
-        relative_error: relative L2 error of the kernels at this rank, for the worst colour.
+        relative_error: relative L2 error of the kernels on the grid, before any cut, for the worst colour.
     """
 
     components: Float[np.ndarray, "3 rank rows columns"]
@@ -42,6 +42,13 @@ class SpaceVariantBlur:
         """(rows, columns) of scene that must surround the sensor on every side."""
         return self.components.shape[2] // 2, self.components.shape[3] // 2
 
+    def smaller(self, rank: int, rows: int, columns: int) -> SpaceVariantBlur:
+        """Return the blur at a lower ``rank``, with the middle ``rows`` x ``columns`` pixels of its kernels at most."""
+        (down, across), most = self.margin, (rows // 2, columns // 2)
+        cut_rows, cut_columns = max(0, down - most[0]), max(0, across - most[1])
+        inner = slice(cut_rows, 2 * down + 1 - cut_rows), slice(cut_columns, 2 * across + 1 - cut_columns)
+        return replace(self, components=self.components[:, :rank, *inner], coefficients=self.coefficients[:, :rank])
+
     def apply(self, canvas: Float[np.ndarray, "canvas_rows canvas_columns 3"]) -> Float[np.ndarray, "rows columns 3"]:
         """Blur a scene drawn on the sensor's pixels and ``margin`` around them; return the sensor's pixels.
 
@@ -50,17 +57,19 @@ class SpaceVariantBlur:
         """
         margin_rows, margin_columns = self.margin
         rows, columns = canvas.shape[0], canvas.shape[1]
-        basis_y = _spline_basis(self.grid_y_px, np.arange(rows) - margin_rows)
-        basis_x = _spline_basis(self.grid_x_px, np.arange(columns) - margin_columns)
+        basis_y = spline_basis(self.grid_y_px, np.arange(rows, dtype=float) - margin_rows)
+        basis_x = spline_basis(self.grid_x_px, np.arange(columns, dtype=float) - margin_columns).T
         shape = (scipy.fft.next_fast_len(rows, real=True), scipy.fft.next_fast_len(columns, real=True))
+        # Kernels keep their middle away from the origin, which moves the result by their margin.
+        down, across = slice(2 * margin_rows, rows), slice(2 * margin_columns, columns)
         blurred = np.empty((rows - 2 * margin_rows, columns - 2 * margin_columns, 3))
         for colour in range(3):
+            plane = canvas[..., colour].astype(np.float32)
             total = np.zeros((shape[0], shape[1] // 2 + 1), np.complex64)
             for component, coefficients in zip(self.components[colour], self.coefficients[colour], strict=True):
-                weighted = canvas[..., colour] * (basis_y @ coefficients @ basis_x.T)
-                total += _transform(weighted, shape) * _transform(_origin_first(component, shape), shape)
-            plane = scipy.fft.irfft2(total, s=shape, workers=_WORKERS)
-            blurred[..., colour] = plane[margin_rows : rows - margin_rows, margin_columns : columns - margin_columns]
+                strength = (basis_y @ coefficients).astype(np.float32) @ basis_x.astype(np.float32)
+                total += scipy.fft.rfft2(plane * strength, s=shape, workers=_WORKERS) * _transfer(component, shape)
+            blurred[..., colour] = scipy.fft.irfft2(total, s=shape, workers=_WORKERS)[down, across]
         # Next to a light a million times brighter, the cut rank and single precision give negative values.
         return np.maximum(blurred, 0.0, out=blurred)
 
@@ -125,21 +134,7 @@ def _each_kernel(
         yield phase_averaged_kernels(truth, node[None], rows, columns)[0]
 
 
-def _spline_basis(nodes: Float[np.ndarray, "nodes"], positions: np.ndarray) -> Float[np.ndarray, "n nodes"]:
-    """Return the matrix from values at ``nodes`` to a cubic spline's at ``positions``, constant outside the nodes."""
-    if nodes.size == 1:
-        return np.ones((positions.size, 1))
-    cardinal = make_interp_spline(nodes, np.eye(nodes.size), k=min(3, nodes.size - 1))
-    return cardinal(np.clip(positions, nodes[0], nodes[-1]))
-
-
-def _origin_first(
-    kernel: Float[np.ndarray, "rows columns"], shape: tuple[int, int]
-) -> Float[np.ndarray, "padded_rows padded_columns"]:
-    padded = np.zeros(shape, np.float32)
-    padded[: kernel.shape[0], : kernel.shape[1]] = kernel
-    return np.roll(padded, (-(kernel.shape[0] // 2), -(kernel.shape[1] // 2)), axis=(0, 1))
-
-
-def _transform(plane: Float[np.ndarray, "rows columns"], shape: tuple[int, int]) -> np.ndarray:
-    return scipy.fft.rfft2(plane.astype(np.float32), s=shape, workers=_WORKERS)
+def _transfer(component: Float[np.ndarray, "rows columns"], shape: tuple[int, int]) -> np.ndarray:
+    """Transform a kernel that is much smaller than ``shape``: its rows first, for which padding adds no rows."""
+    rows = scipy.fft.rfft(component, n=shape[1], axis=1, workers=_WORKERS)
+    return scipy.fft.fft(rows, n=shape[0], axis=0, workers=_WORKERS, overwrite_x=True)

@@ -62,7 +62,7 @@ def power_spectrum(
     step = 0.5 / (_HEADROOM * np.asarray(limit))
     count_x, count_y = (scipy.fft.next_fast_len(int(n)) for n in np.ceil(_PADDING * 2 * half / step))
     x, y = (_samples(float(centre[i]), float(half[i]), float(step[i])) for i in range(2))
-    footprint = _footprint(x - centre[0], y - centre[1], shape, step)
+    footprint = ellipse_cover(x - centre[0], y - centre[1], shape, step)
     slopes = direction[:2] / direction[2]
     open_x, open_y = column_open_interval(truth, slopes[:1]), row_open_interval(truth, slopes[1:])
     power = np.zeros((count_y // 2 + 1, count_x), np.float32)
@@ -104,7 +104,7 @@ def _samples(centre: float, half: float, step: float) -> Float[np.ndarray, "n"]:
     return centre + step * np.arange(-reach, reach + 1)
 
 
-def _footprint(
+def ellipse_cover(
     x: Float[np.ndarray, "columns"],
     y: Float[np.ndarray, "rows"],
     shape: Float[np.ndarray, "2 2"],

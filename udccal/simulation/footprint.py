@@ -14,7 +14,7 @@ from jaxtyping import Float
 from udccal.simulation.panel import column_open_interval, pupil_footprint, row_open_interval
 from udccal.simulation.truth import RigTruth
 
-_CHORDS_PER_COLUMN = 16
+_CHORDS_PER_COLUMN = 8
 
 
 def converging_footprint(

@@ -26,8 +26,8 @@ from udccal.simulation.wire import wire_map
 LED_WHITE = np.array([0.6, 1.0, 0.7])
 _FLAT_FILL, _FLAT_EXPOSURE_S = 0.65, 8e-3
 _LED_FILL, _LED_EXPOSURE_S = 0.8, 100e-6
-# A board is located by its corners: light scattered far from them does not matter.
-_BOARD_KERNEL = (129, 65)
+# A board is located by its corners: light scattered far from them, or a percent of the kernel, does not matter.
+_BOARD_BLUR = (7, 129, 65)  # rank, rows, columns
 # Shifts of an LED around one place fall into at most four cells; each pattern takes about 50 MB at full size.
 _KEPT_SPREADS = 4
 
@@ -63,12 +63,7 @@ class RigLight:
     @cached_property
     def board_blur(self) -> SpaceVariantBlur:
         """The blur of boards, with smaller kernels and a lower rank."""
-        captures = self.truth.description.captures
-        rows, columns = (
-            min(captures.psf_region_rows | 1, _BOARD_KERNEL[0]),
-            min(captures.psf_region_columns | 1, _BOARD_KERNEL[1]),
-        )
-        return build_blur(self.truth, 4, 3, rows, columns, max_rank=7, tolerance=1e-2)
+        return self.blur.smaller(*_BOARD_BLUR)
 
     def flat(self) -> Float[np.ndarray, "rows columns"]:
         """Return the light of an even white field that fills the wells to about 65 % (green, mean) in 8 ms."""

@@ -6,15 +6,14 @@ j - rows // 2) pixels from ``position``; the source's image is at ``position`` +
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
 
 from udccal.errors import UdccalError
 from udccal.simulation.rays import cosine_grid
-from udccal.simulation.spread import AngularSpread, angular_spread
+from udccal.simulation.spread import AngularSpread, angular_spread, averaged_over
 from udccal.simulation.truth import RigTruth, pixels_to_directions
 
 _HALF_PERIODS = ((0.0, 0.0), (0.5, 0.5))
@@ -22,22 +21,22 @@ _HALF_PERIODS = ((0.0, 0.0), (0.5, 0.5))
 
 @dataclass(frozen=True)
 class _Care:
-    """Fineness of a pixel's integration: points over the source's disc, and steps along the pixel's slanted edges.
+    """Fineness of a pixel's integration.
 
-    There are at least ``steps`` steps, and enough to keep each narrower than ``step_px``.
+    Attributes:
+        grid_px: (x, y) steps of the grid on which the light of a wide source is averaged over it.
+        steps: least number of steps along the pixel's slanted edges. step_px: largest width of a step.
     """
 
-    disc_points: int
+    grid_px: tuple[float, float]
     steps: int
     step_px: float
 
 
 # Nearly all light falls close to the source, most of the rest on two thin streaks across it.
-_CORE, _STREAKS, _ELSEWHERE = _Care(192, 4, 0.03), _Care(16, 2, 0.06), _Care(1, 1, 0.2)
+_CORE, _ELSEWHERE = _Care((1 / 32, 1 / 32), 4, 0.03), _Care((1 / 4, 1 / 4), 1, 0.2)
+_ROW_STREAK, _COLUMN_STREAK = _Care((1 / 8, 1 / 32), 2, 0.06), _Care((1 / 32, 1 / 8), 2, 0.06)
 _STREAK_HALF_WIDTH_PX = 6.0
-# Corners times points of the source in one block, which fit into a processor's cache.
-_BLOCK = 8_000
-_WORKERS = 2
 # One diffraction pattern serves sources no farther apart than this.
 SHARED_PX = 4.0
 
@@ -111,13 +110,14 @@ def captured_light(
     everything = slice(None)
     for window, care in (
         ((everything, everything), _ELSEWHERE),
-        ((down, everything), _STREAKS),
-        ((everything, across), _STREAKS),
+        ((down, everything), _ROW_STREAK),
+        ((everything, across), _COLUMN_STREAK),
         ((down, across), _CORE),
     ):
-        # One diffraction pattern serves all points of the disc: it moves, but does not change, over a pixel or two.
-        disc = _disc(truth, source, source_disc_px, care.disc_points) - direction[:2]
-        light[window] = _mean_over_disc(spread, offsets[_corners(window)], disc, care)
+        corners = offsets[_corners(window)]
+        if min(corners.shape[:2]) > 1:
+            seen = _of_disc(truth, spread, corners, source, source_disc_px, care) if source_disc_px else spread
+            light[window] = _light_in_window(seen, corners, care)
     return np.maximum(np.moveaxis(light, -1, 0), 0.0)
 
 
@@ -158,34 +158,36 @@ def _corners(window: tuple[slice, slice]) -> tuple[slice, slice]:
     return down, across
 
 
-def _mean_over_disc(
+def _of_disc(
+    truth: RigTruth,
     spread: AngularSpread,
     corners: Float[np.ndarray, "corner_rows corner_columns 2"],
-    disc: Float[np.ndarray, "points 2"],
+    source_px: Float[np.ndarray, "2"],
+    diameter_px: float,
     care: _Care,
-) -> Float[np.ndarray, "rows columns 3"]:
-    """Return the light in each pixel of a window, averaged over the points of the source in blocks."""
-    block = max(1, _BLOCK // corners[..., 0].size)
-    # The steps of a staircase fall at different places for each point of a disc, so that its errors average out.
-    care = replace(care, step_px=care.step_px * len(disc) ** 0.5)
-    blocks = [corners - disc[k : k + block, None, None] for k in range(0, len(disc), block)]
-    with ThreadPoolExecutor(_WORKERS) as pool:
-        return sum(pool.map(lambda moved: _light_in_window(spread, moved, care).sum(axis=0), blocks)) / len(disc)
+) -> AngularSpread:
+    """Return the spread averaged over the source's disc, where the corners lie.
+
+    One diffraction pattern serves all points of the disc: it moves, but does not change, over a pixel or two.
+    """
+    ends = source_px + diameter_px / 4 * np.array([[[1.0, 0.0], [0.0, 1.0]], [[-1.0, 0.0], [0.0, -1.0]]])
+    ahead, behind = pixels_to_directions(truth.optics, ends)[..., :2]
+    flat = corners.reshape(-1, 2)
+    step = np.asarray(care.grid_px) / truth.optics.fx_px
+    return averaged_over(spread, (ahead - behind).T, flat.min(axis=0), flat.max(axis=0), step)
 
 
 def _light_in_window(
-    spread: AngularSpread, corners: Float[np.ndarray, "points corner_rows corner_columns 2"], care: _Care
-) -> Float[np.ndarray, "points rows columns 3"]:
+    spread: AngularSpread, corners: Float[np.ndarray, "corner_rows corner_columns 2"], care: _Care
+) -> Float[np.ndarray, "rows columns 3"]:
     """Return the light in every pixel, a quadrilateral in direction cosines, by Green's theorem along its edges.
 
     An edge between two pixels is computed once.
     """
-    if min(corners.shape[1:3]) < 2:
-        return np.zeros((len(corners), max(corners.shape[1] - 1, 0), max(corners.shape[2] - 1, 0), 3))
-    steps = _steps(corners[:, :-1, 1:] - corners[:, :-1, :-1], corners[:, 1:, 1:] - corners[:, :-1, 1:], care)
-    along = _light_along(spread, corners[:, :, :-1], corners[:, :, 1:], steps)
-    down = _light_along(spread, corners[:, :-1], corners[:, 1:], steps)
-    return along[:, :-1] + down[:, :, 1:] - along[:, 1:] - down[:, :, :-1]
+    steps = _steps(corners[:-1, 1:] - corners[:-1, :-1], corners[1:, 1:] - corners[:-1, 1:], care)
+    along = _light_along(spread, corners[:, :-1], corners[:, 1:], steps)
+    down = _light_along(spread, corners[:-1], corners[1:], steps)
+    return along[:-1] + down[:, 1:] - along[1:] - down[:, :-1]
 
 
 def _steps(along: Float[np.ndarray, "*n 2"], down: Float[np.ndarray, "*n 2"], care: _Care) -> int:
@@ -208,16 +210,3 @@ def _light_along(
         x = (low[..., 0] + high[..., 0]) / 2
         light += spread.below(x, high[..., 1]) - spread.below(x, low[..., 1])
     return light
-
-
-def _disc(
-    truth: RigTruth, source_px: Float[np.ndarray, "2"], diameter_px: float, count: int
-) -> Float[np.ndarray, "points 2"]:
-    """Return direction cosines of points spread evenly over the source's disc (Vogel's sunflower spiral)."""
-    if diameter_px == 0.0 or count == 1:
-        return pixels_to_directions(truth.optics, source_px[None])[:, :2]
-    index = np.arange(count)
-    radius = np.sqrt((index + 0.5) / count) * diameter_px / 2
-    angle = index * np.pi * (3 - np.sqrt(5))
-    points = source_px + np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=-1)
-    return pixels_to_directions(truth.optics, points)[:, :2]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Float
-from scipy.interpolate import RectBivariateSpline
+from scipy.interpolate import make_interp_spline
 
 from udccal.simulation.truth import RigTruth, pixels_to_directions
 
@@ -19,7 +19,16 @@ def slope_grid(
     knots_x, knots_y = (np.linspace(v[0], v[-1], max(5, int((v[-1] - v[0]) / _KNOT_STEP_PX) + 2)) for v in (x_px, y_px))
     directions = pixels_to_directions(truth.optics, np.stack(np.meshgrid(knots_x, knots_y), axis=-1))
     slopes = directions[..., :2] / directions[..., 2:]
-    return np.stack([RectBivariateSpline(knots_y, knots_x, slopes[..., i])(y_px, x_px) for i in range(2)], axis=-1)
+    basis_x, basis_y = spline_basis(knots_x, x_px), spline_basis(knots_y, y_px)
+    return np.stack([basis_y @ slopes[..., i] @ basis_x.T for i in range(2)], axis=-1)
+
+
+def spline_basis(nodes: Float[np.ndarray, "nodes"], positions: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n nodes"]:
+    """Return the matrix from values at ``nodes`` to a cubic spline's at ``positions``, constant outside the nodes."""
+    if nodes.size == 1:
+        return np.ones((positions.size, 1))
+    cardinal = make_interp_spline(nodes, np.eye(nodes.size), k=min(3, nodes.size - 1))
+    return cardinal(np.clip(positions, nodes[0], nodes[-1]))
 
 
 def cosine_grid(

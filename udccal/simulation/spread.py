@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 import scipy.sparse
 from jaxtyping import Float, Int
 
-from udccal.simulation.diffraction import power_spectrum
+from udccal.simulation.diffraction import ellipse_cover, power_spectrum
 from udccal.simulation.spectrum import camera_spectrum
 from udccal.simulation.truth import RigTruth
 
@@ -65,6 +66,44 @@ def angular_spread(
         light = (pick_x @ np.ascontiguousarray((pick_y @ power.cumulative).T)).T
         cells += weights[:, None, None] * light
     return AngularSpread(edges_x, edges_y, _cumulative(np.concatenate([cells[:, ::-1, ::-1], cells], axis=1)))
+
+
+def averaged_over(
+    spread: AngularSpread,
+    shape: Float[np.ndarray, "2 2"],
+    low: Float[np.ndarray, "2"],
+    high: Float[np.ndarray, "2"],
+    step: Float[np.ndarray, "2"],
+) -> AngularSpread:
+    """Return the spread of an even source, the ellipse ``shape @ u`` over the unit disc of u, about the same direction.
+
+    Args:
+        spread: of a point.
+        shape: of the source, in direction cosines.
+        low, high: (x, y) between which the result is needed.
+        step: (x, y) of the even grid of the result.
+    """
+    reach = (np.ceil(np.linalg.norm(shape, axis=1) / step) + 1).astype(np.int64)
+    # Multiples of the step, so that the result does not depend on the window.
+    first, last = np.floor(low / step).astype(np.int64) - reach, np.ceil(high / step).astype(np.int64) + reach
+    x, y = (step[i] * np.arange(first[i], last[i] + 1) for i in range(2))
+    pick_x, pick_y = _linear_operator(spread.edges_x, x), _linear_operator(spread.edges_y, y)
+    rows = (pick_y @ spread.cumulative.reshape(spread.edges_y.size, -1)).reshape(y.size, -1, 3)
+    table = np.stack([(pick_x @ np.ascontiguousarray(rows[..., c].T)).T for c in range(3)], axis=-1)
+    taps_x, taps_y = (step[i] * np.arange(-reach[i], reach[i] + 1) for i in range(2))
+    source = ellipse_cover(taps_x, taps_y, shape, step).astype(np.float64)
+    # A correlation, but the source is the same either way round; the rim that lacks neighbours is cut off.
+    inner_x, inner_y = slice(reach[0], -reach[0]), slice(reach[1], -reach[1])
+    even = cv2.filter2D(table, -1, source / source.sum())[inner_y, inner_x]
+    return AngularSpread(x[inner_x], y[inner_y], np.ascontiguousarray(even))
+
+
+def _linear_operator(edges: Float[np.ndarray, "nodes"], values: Float[np.ndarray, "n"]) -> scipy.sparse.csr_array:
+    """Return the sparse matrix that interpolates from the edges to the values, constant outside."""
+    index, part = _bracket(edges, values)
+    rows = np.arange(values.size)
+    entries = np.concatenate([1.0 - part[:, 0], part[:, 0]]), (np.tile(rows, 2), np.concatenate([index, index + 1]))
+    return scipy.sparse.csr_array(entries, shape=(values.size, edges.size))
 
 
 def _edges(reach: float, unit: float) -> Float[np.ndarray, "nodes"]:

@@ -191,6 +191,9 @@ def pixels_to_directions(optics: Optics, pixels: Float[np.ndarray, "*n 2"]) -> F
     seen = (pixels - np.array([optics.cx_px, optics.cy_px])) / np.array([optics.fx_px, optics.fy_px])
     ideal = seen.copy()
     for _ in range(40):
-        ideal = ideal + (seen - distort(optics, ideal))
+        missing = seen - distort(optics, ideal)
+        ideal += missing
+        if np.abs(missing).max(initial=0.0) < 1e-14:
+            break
     rays = np.concatenate([ideal, np.ones_like(ideal[..., :1])], axis=-1) @ optics.R_panel_camera.T
     return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
