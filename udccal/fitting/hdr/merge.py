@@ -113,8 +113,8 @@ def merge_bracket(
     listed = outliers(off, (f"frame {i}" for i in np.flatnonzero(dropped)))
     listed += outliers(f"{hit} is left out", places)
     status = FitStatus.SATURATED if unknown.size and unknown.all() else FitStatus.CONVERGED
-    pictures = (part.reshape(shape) for part in (merged.rate, merged.sigma, merged.used))
-    return HdrMerge(*pictures, listed, status, (note,) if unknown.any() else ())
+    rate, sigma, used = (part.reshape(shape) for part in (merged.rate, merged.sigma, merged.used))
+    return HdrMerge(rate, sigma, used, listed, status, (note,) if unknown.any() else ())
 
 
 def sensor_numbers(noise: Noise, unit_s: float, rules: HdrRules) -> SensorNumbers:
