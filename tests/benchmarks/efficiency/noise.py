@@ -16,8 +16,7 @@ from jaxtyping import Array, Float
 from tests.benchmarks.efficiency.trials import Trials, column
 from tests.scenes.noise import ToySensor, expose, measure, patterns, truth
 from udccal.fitting.engine.information import cramer_rao, fisher_information
-from udccal.fitting.noise import dark
-from udccal.fitting.noise.dark import excess_kurtosis
+from udccal.fitting.noise.dark import excess_kurtosis, pair_probability
 from udccal.fitting.noise.data import NoiseRules
 from udccal.fitting.noise.moments import DarkPair, dark_pair
 from udccal.fitting.noise.transfer import temporal_variance
@@ -119,8 +118,8 @@ def _histogram_information(sensor: ToySensor, x: Float[np.ndarray, "12"]) -> Flo
 
         def probability(at: Float[np.ndarray, "6"], pair: DarkPair = pair) -> Float[np.ndarray, " cells"]:
             K, V0, shape, black, rate, spread2 = at
-            known = dark.Surroundings(K, sensor.row_DN, NoiseRules().background)
-            return dark.pair_probability(pair, np.array([black, rate, V0, spread2, shape]), known).ravel()
+            values = np.array([black, rate, V0, spread2, shape])
+            return pair_probability(pair, values, K, sensor.row_DN, NoiseRules().background).ravel()
 
         p = probability(x[places])
         slopes = [(probability(x[places] + d) - probability(x[places] - d)) / (2 * d.sum()) for d in steps]

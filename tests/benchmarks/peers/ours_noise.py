@@ -16,7 +16,7 @@ import numpy as np
 
 from tests.benchmarks.peers.works_module import arguments, load
 from udccal.fitting.noise.data import ExposureLevel, NoiseData, SpatialStack
-from udccal.fitting.noise.fit import fit_noise, mean_response
+from udccal.fitting.noise.fit import fit_noise
 from udccal.models.noise import Noise
 from udccal.result import FitResult
 
@@ -48,7 +48,10 @@ def metrics(works: ModuleType, data: dict[str, Any], result: FitResult[Noise]) -
     term = {name: float(np.asarray(getattr(result.term, name))) for name in result.term.__dataclass_fields__}
     K = term["K_DN_per_e"]
     full_DN = term["saturation_DN"] - term["black_DN"]
-    mean_DN = mean_response(result, np.asarray(data["u_p"]))
+    # The fitted response, z - c (z^2 + K z) of the linear signal z (EMVA 1288, clause 6.7).
+    numbers = {item.name: item.value for item in result.diagnostics}
+    linear = numbers["response_DN_per_light"] * (np.asarray(data["u_p"]) + numbers["light_offset"])
+    mean_DN = np.minimum(linear - numbers["curvature"] * (linear**2 + K * linear), full_DN)
     inside = np.flatnonzero((mean_DN >= _LEAST * full_DN * (1 - 1e-2)) & (mean_DN <= _MOST * full_DN))
     low, high = int(inside[0]), int(inside[-1])
     return works.noise_metrics(

@@ -143,9 +143,19 @@ def test_single_precision_moves_no_rate_by_a_hundredth_of_its_sigma() -> None:
     frames = np.concatenate([bracket(rate, EXPOSURES, 11, (20, 20)) for rate in (0.0, 30.0, 1e3, 1e5, 1e7)], axis=1)
     merge = merge_bracket(frames, EXPOSURES, NOISE)
     numbers = jax.tree.map(lambda n: np.float64(n), sensor_numbers(NOISE, float(EXPOSURES.max()), HdrRules()))
-    with jax.enable_x64(True):
-        double = jax.tree.map(
-            np.asarray, merge_block(frames.reshape(7, -1), EXPOSURES / EXPOSURES.max(), numbers, None, 6.0)
-        )
+    codes = frames.reshape(7, -1)
+    double = merge_block(codes, EXPOSURES / EXPOSURES.max(), numbers, np.zeros(codes.shape, bool), 6.0)
+    assert double.rate.dtype == np.float64
     off = merge.rate_e_per_s.ravel() - double.rate / EXPOSURES.max()
     assert np.abs(off / merge.sigma_e_per_s.ravel()).max() < 0.01
+
+
+def test_large_pictures_are_merged_like_small_ones() -> None:
+    # The compiled pass takes large pictures in blocks; the last block overlaps the one before it.
+    frames = bracket(1e4, EXPOSURES, 13, (300, 250))
+    frames[6, 3, 5] = frames[6, 299, 249] = 100
+    whole, part = merge_bracket(frames, EXPOSURES, NOISE), merge_bracket(frames[:, 200:], EXPOSURES, NOISE)
+    off = (whole.rate_e_per_s[200:] - part.rate_e_per_s) / part.sigma_e_per_s
+    assert np.abs(off).max() < 0.01
+    np.testing.assert_array_equal(whole.used[200:], part.used)
+    assert set(whole.outliers[0].places) == {"(3, 5)", "(299, 249)"}

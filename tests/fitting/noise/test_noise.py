@@ -170,7 +170,7 @@ def test_rounding_coarser_than_the_noise(fraction: float) -> None:
     offset = 24 + fraction + spread * rng.standard_normal((400, 400))
     frames = [np.rint(offset + sigma * rng.standard_normal((400, 400))).astype(np.uint16) for _ in range(2)]
     pair = dark_pair(frames[0], frames[1], 0.01)
-    fit = dark.fit_dark((pair, replace(pair, exposure_s=0.02)), dark.Surroundings(0.06, 0.0, 1e-5), RULES)
+    fit = dark.fit_dark((pair, replace(pair, exposure_s=0.02)), 0.06, 0.0, RULES)
     assert np.sqrt(fit.values[2]) == pytest.approx(sigma, rel=0.03)
     # What the textbook's white quantisation makes of the same frames is worse than what is asked for.
     naive = 0.5 * np.var(frames[0].astype(float) - frames[1]) - 1 / 12
@@ -186,7 +186,7 @@ def test_codes_cut_off_at_zero_are_censored() -> None:
         dark_pair(frames[i].astype(np.uint16), frames[i + 1].astype(np.uint16), 0.01 * (i + 1)) for i in (0, 2)
     )
     assert pairs[0].edges_DN[0] == -np.inf
-    fit = dark.fit_dark(pairs, dark.Surroundings(0.3, 0.0, 1e-5), RULES, normal=True)
+    fit = dark.fit_dark(pairs, 0.3, 0.0, RULES, normal=True)
     assert fit.values[0] == pytest.approx(black, abs=0.05)
     assert np.sqrt(fit.values[2]) == pytest.approx(sigma, rel=0.02)
     # Moments of the cut-off codes are far away.
@@ -206,9 +206,9 @@ def test_a_wide_window_of_codes_is_grouped_and_loses_nothing() -> None:
 def test_hot_pixels_do_not_carry_the_prnu() -> None:
     rng = np.random.default_rng(2)
     signal = 1000 * (1 + 0.005 * rng.standard_normal((200, 300)))
-    clean = prnu(signal, 0.0, 0.0, 2, RULES)
+    clean = prnu(signal, 0.0, 0.0, 2, RULES.defect_sigma)
     signal[rng.random(signal.shape) < 1e-3] *= 3
-    hot = prnu(signal, 0.0, 0.0, 2, RULES)
+    hot = prnu(signal, 0.0, 0.0, 2, RULES.defect_sigma)
     assert np.sqrt(clean.variance) == pytest.approx(0.005, rel=0.03)
     assert np.sqrt(hot.variance) == pytest.approx(0.005, rel=0.03)
     assert hot.outliers > clean.outliers
@@ -220,7 +220,7 @@ def test_shading_and_waves_do_not_carry_the_prnu() -> None:
     y, x = np.mgrid[:240, :320]
     light = (1 - 0.3 * ((x / 320 - 0.5) ** 2 + (y / 240 - 0.5) ** 2)) * (1 + 0.02 * np.cos(2 * np.pi * y / 40))
     signal = 1000 * light * (1 + 0.005 * rng.standard_normal(light.shape))
-    found = prnu(signal, 0.0, 0.0, 2, RULES)
+    found = prnu(signal, 0.0, 0.0, 2, RULES.defect_sigma)
     assert np.sqrt(found.variance) == pytest.approx(0.005, rel=0.02)
     assert np.std(signal) / 1000 > 0.02
 
@@ -229,7 +229,7 @@ def test_counts_hot_pixels_and_converter_steps() -> None:
     rng = np.random.default_rng(2)
     dark = 64 + 0.3 * rng.standard_normal((100, 100))
     dark[3, 4] = dark[50, 60] = 90.0
-    assert dsnu(dark, 0.09, 0.0, RULES).places == ((3, 4), (50, 60))
+    assert dsnu(dark, 0.09, 0.0, RULES.defect_sigma).places == ((3, 4), (50, 60))
     frame = rng.integers(100, 200, (50, 50)).astype(np.uint16)
     assert converter_step(frame) == 1
     assert converter_step(frame * np.uint16(16)) == 16

@@ -24,7 +24,7 @@ from tests.scenes.noise import (
 )
 from udccal.errors import FitError
 from udccal.fitting.noise.data import ExposureLevel, Frame, NoiseData, NoiseRules, SpatialStack
-from udccal.fitting.noise.fit import fit_noise, mean_response
+from udccal.fitting.noise.fit import fit_noise
 from udccal.fitting.noise.moments import reduced
 from udccal.result import FitStatus
 
@@ -49,14 +49,12 @@ def test_a_bent_sensor_is_found_bent_and_every_number_within_its_error() -> None
     assert float(np.asarray(result.term.K_DN_per_e)) == pytest.approx(sensor.K_DN_per_e, rel=0.015)
 
 
-def test_the_response_follows_the_bend_and_stops_at_saturation() -> None:
+def test_the_response_and_its_bend_are_among_the_diagnostics() -> None:
     sensor = ToySensor()
-    result = measure(sensor, 5)
-    electrons = sensor.flux_e_per_s * np.array([0.02, 0.1, 0.19])
-    expected = sensor.K_DN_per_e * electrons * (1 - sensor.bend * electrons / sensor.full_well_e)
-    assert mean_response(result, electrons / sensor.flux_e_per_s) == pytest.approx(expected, rel=2e-3)
-    full_DN = float(np.asarray(result.term.saturation_DN)) - float(np.asarray(result.term.black_DN))
-    assert mean_response(result, np.array([5.0]))[0] == full_DN
+    numbers = {item.name: item.value for item in measure(sensor, 5).diagnostics}
+    full_DN = sensor.K_DN_per_e * sensor.full_well_e
+    assert numbers["response_DN_per_light"] == pytest.approx(sensor.K_DN_per_e * sensor.flux_e_per_s, rel=2e-3)
+    assert numbers["curvature"] == pytest.approx(sensor.bend / full_DN, rel=0.05)
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -6,12 +6,10 @@ import numpy as np
 import pytest
 from jaxtyping import Float
 
-from udccal.fitting.noise.data import NoiseRules
 from udccal.fitting.noise.patterns import prnu, white_coefficients
 
 ROWS, COLUMNS = 512, 768
 PRNU, SHOT = 0.006, 3e-5
-RULES = NoiseRules()
 
 
 def panel_light(depth: float, second: float, third: float) -> Float[np.ndarray, "rows columns"]:
@@ -29,7 +27,7 @@ def z_score(light: Float[np.ndarray, "rows columns"], seed: int) -> float:
     response = 1 + PRNU * rng.standard_normal(light.shape)
     signal = 1000 * light
     noisy = signal * response + np.sqrt(SHOT * 1000 * signal) * rng.standard_normal(light.shape)
-    found = prnu(noisy, 0.0, SHOT * 1000, 2, RULES)
+    found = prnu(noisy, 0.0, SHOT * 1000, 2, 6.0)
     return (found.variance - PRNU**2) / found.sigma
 
 
@@ -49,7 +47,7 @@ def test_light_of_a_wide_band_below_the_floor_is_seen() -> None:
     power = rng.standard_normal((256, 384)) ** 2
     # 25 % above the floor: no single block of 16 x 16 tells this from chance.
     power[32:96, 16:144] *= 1.25
-    white = white_coefficients([power.astype(np.float32)], (1, 1), RULES)
+    white = white_coefficients([power.astype(np.float32)], (1, 1))
     assert white[32:96, 16:144].mean() < 0.05
     assert 0.3 < white.mean() < 0.8
 
@@ -58,7 +56,7 @@ def test_white_noise_is_used_all_but_the_first_lines() -> None:
     kept = []
     for seed in range(20):
         power = np.random.default_rng(seed).standard_normal((256, 384)) ** 2
-        white = white_coefficients([power.astype(np.float32)], (2, 3), RULES)
+        white = white_coefficients([power.astype(np.float32)], (2, 3))
         assert not white[0].any()
         assert not white[:, 0].any()
         assert not white[:2, :3].any()
@@ -69,30 +67,30 @@ def test_white_noise_is_used_all_but_the_first_lines() -> None:
 def test_a_spectrum_full_of_light_leaves_what_was_not_seen() -> None:
     power = np.random.default_rng(2).standard_normal((256, 384)) ** 2
     power[-32:-16, -32:-16] *= 30.0
-    white = white_coefficients([power.astype(np.float32)], (1, 1), RULES)
+    white = white_coefficients([power.astype(np.float32)], (1, 1))
     assert not white[-32:-16, -32:-16].any()
     assert white.mean() > 0.9
 
 
 def test_a_picture_too_small_for_blocks_still_has_a_floor() -> None:
     power = np.ones((6, 7), np.float32)
-    assert white_coefficients([power], (1, 1), RULES).sum() == 5 * 6
+    assert white_coefficients([power], (1, 1)).sum() == 5 * 6
 
 
 def test_defects_are_named_amid_deep_waves_and_the_crests_are_none() -> None:
     rng = np.random.default_rng(4)
     light = panel_light(0.3, 0.01, 0.001)
     signal = 1000 * light * (1 + PRNU * rng.standard_normal(light.shape))
-    clean = prnu(signal, 0.0, 0.0, 2, RULES)
+    clean = prnu(signal, 0.0, 0.0, 2, 6.0)
     assert clean.outliers < 20
     rows, columns = rng.integers(10, ROWS - 10, 30), rng.integers(10, COLUMNS - 10, 30)
     signal[rows, columns] *= 2
-    hot = prnu(signal, 0.0, 0.0, 2, RULES)
+    hot = prnu(signal, 0.0, 0.0, 2, 6.0)
     assert hot.outliers >= clean.outliers + 25
     assert hot.variance == pytest.approx(clean.variance, abs=2 * clean.sigma)
 
 
 def test_a_picture_without_light_has_no_prnu_and_no_nan() -> None:
-    found = prnu(np.zeros((64, 96)), 1.0, 0.3, 2, RULES)
+    found = prnu(np.zeros((64, 96)), 1.0, 0.3, 2, 6.0)
     assert np.isfinite([found.variance, found.sigma]).all()
     assert found.outliers == 64 * 96

@@ -1,4 +1,4 @@
-"""The likelihood of one pixel's bracket, for a block of pixels in one compiled pass.
+"""The likelihood of one pixel's bracket, for a block of pixels at once, in NumPy or compiled.
 
 Samples below the clipping level are normal with the noise model's variance at the *merged* rate. Samples at or above
 it are censored: only that is known of them. The score in the rate r of a sample of exposure t, mean m = (r + dark) t
@@ -12,17 +12,15 @@ with h the inverse Mills ratio of the normal distribution.
 
 from __future__ import annotations
 
-import functools
+from types import ModuleType
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, UInt16
+import numpy as np
+from jaxtyping import Bool, Float, Int, UInt16
 
 from udccal.models.arrays import Arrayish
 
-# Rounds with the unclipped samples only, then with the clipped ones too. More move no pixel by 1 % of its sigma.
-_OPEN_ROUNDS, _ALL_ROUNDS = 1, 2
 # Below zero rate the variance goes on falling, so that the estimate stays unbiased in the dark, down to this part.
 _LEAST_VARIANCE = 0.25
 _TINY = 1e-30
@@ -39,10 +37,7 @@ class SensorNumbers(eqx.Module):
 
 
 class BlockMerge(eqx.Module):
-    """Rate and sigma of every pixel in e-/s, its number of unclipped samples, and its worst sample.
-
-    ``deviation2`` is that sample's squared deviation, in sigma, from the rate that the others give (leave one out).
-    """
+    """Rate and sigma in e-/s, number of unclipped samples, worst sample, and the square of its deviation in sigma."""
 
     rate: Float[Arrayish, " pixels"]
     sigma: Float[Arrayish, " pixels"]
@@ -51,60 +46,52 @@ class BlockMerge(eqx.Module):
     deviation2: Float[Arrayish, " pixels"]
 
 
-def _mills(z: Float[Array, " pixels"]) -> Float[Array, " pixels"]:
+def _mills(z: Float[Arrayish, "n pixels"], xp: ModuleType) -> Float[Arrayish, "n pixels"]:
     """Density over upper tail of the normal distribution; Abramowitz and Stegun 7.1.26 for the tail, 1e-3 up to 5."""
-    t = 1 / (1 + 0.23164189 * jnp.abs(z))
+    t = 1 / (1 + 0.23164189 * abs(z))
     tail = t * (0.254829592 + t * (-0.284496736 + t * (1.421413741 + t * (-1.453152027 + t * 1.061405429))))
-    bell = jnp.exp(-0.5 * z * z)
-    return jnp.where(z >= 0, 0.79788456 / tail, 0.39894228 * bell / (1 - 0.5 * tail * bell))
+    bell = xp.exp(-0.5 * z * z)
+    return xp.where(z >= 0, 0.79788456 / tail, 0.39894228 * bell / (1 - 0.5 * tail * bell))
 
 
-@functools.partial(jax.jit, static_argnames="believed_sigma")
 def merge_block(
-    frames: UInt16[Array, "n pixels"],
-    times: Float[Array, " n"],
+    frames: UInt16[Arrayish, "n pixels"],
+    times: Float[Arrayish, " n"],
     sensor: SensorNumbers,
-    left_out: Bool[Array, "n pixels"] | None,
+    left_out: Bool[Arrayish, "n pixels"],
     believed_sigma: float,
+    xp: ModuleType = np,
 ) -> BlockMerge:
-    """Maximum-likelihood rates. Loops over samples are unrolled: a pixel stays in the processor's registers."""
-    count = len(frames)
-    light = [(frames[i].astype(jnp.float32) - sensor.black_DN) * sensor.e_per_DN for i in range(count)]
-    everywhere = jnp.ones(frames.shape[1:], bool)
-    allowed = [everywhere if left_out is None else ~left_out[i] for i in range(count)]
-    is_open = [(x < sensor.level_e) & a for x, a in zip(light, allowed, strict=True)]
-    time_open = sum(jnp.where(o, times[i], 0.0) for i, o in enumerate(is_open))
-    total = sum(jnp.where(o, light[i] - sensor.dark_e_per_s * times[i], 0.0) for i, o in enumerate(is_open))
-    rate = total / jnp.maximum(time_open, _TINY)
-    for k in range(_OPEN_ROUNDS + _ALL_ROUNDS):
-        score, information = jnp.zeros_like(rate), jnp.zeros_like(rate)
-        for i in range(count):
-            mean, variance = _expected(rate, times[i], sensor)
-            slope = times[i] / variance
-            s, own = jnp.where(is_open[i], slope * (light[i] - mean), 0.0), jnp.where(is_open[i], slope * times[i], 0.0)
-            if k >= _OPEN_ROUNDS:
-                z = (sensor.level_e - mean) * jax.lax.rsqrt(variance)
-                believed = allowed[i] & ~is_open[i] & (z < believed_sigma)
-                ratio = _mills(z)
-                s = jnp.where(believed, times[i] * jax.lax.rsqrt(variance) * ratio, s)
-                own = jnp.where(believed, slope * times[i] * ratio * (ratio - z), own)
-            score, information = score + s, information + own
-        rate = rate + score / jnp.maximum(information, _TINY)
-    worst, deviation2 = jnp.zeros(rate.shape, jnp.int32), jnp.zeros_like(rate)
-    for i in range(count):
-        mean, variance = _expected(rate, times[i], sensor)
-        leverage = times[i] ** 2 / (variance * jnp.maximum(information, _TINY))
-        # The least deviation of a sample that is clipped although the others give a far lower rate.
-        beyond = jnp.where(is_open[i], light[i] - mean, jnp.maximum(sensor.level_e - mean, 0.0))
-        own = beyond**2 / variance / jnp.where(is_open[i], jnp.maximum(1 - leverage, 1e-3), 1.0)
-        own = jnp.where(allowed[i], own, 0.0)
-        worst, deviation2 = jnp.where(own > deviation2, i, worst), jnp.maximum(own, deviation2)
-    used = sum(o.astype(jnp.int32) for o in is_open)
-    return BlockMerge(rate, jax.lax.rsqrt(jnp.maximum(information, _TINY)), used, worst, deviation2)
+    """Maximum-likelihood rates, computed by the functions of ``xp``, numpy or jax.numpy."""
+    time = times[:, None]
+
+    def expected(rate: Float[Arrayish, " pixels"]) -> tuple[Float[Arrayish, "n pixels"], Float[Arrayish, "n pixels"]]:
+        mean = (rate + sensor.dark_e_per_s) * time
+        return mean, xp.maximum(mean + sensor.floor_e2, _LEAST_VARIANCE * sensor.floor_e2)
+
+    light = (frames.astype(np.float32) - sensor.black_DN) * sensor.e_per_DN
+    is_open, is_clipped = (light < sensor.level_e) & ~left_out, (light >= sensor.level_e) & ~left_out
+    electrons = xp.where(is_open, light - sensor.dark_e_per_s * time, 0).sum(axis=0)
+    rate = electrons / xp.maximum(xp.where(is_open, time, 0).sum(axis=0), _TINY)
+    # One round with the unclipped samples only, two with the clipped ones too: more move no pixel by 1 % of its sigma.
+    for with_clipped in (False, True, True):
+        mean, variance = expected(rate)
+        slope = time / variance
+        score, information = xp.where(is_open, slope * (light - mean), 0), xp.where(is_open, slope * time, 0)
+        if with_clipped:
+            z = (sensor.level_e - mean) / xp.sqrt(variance)
+            believed, ratio = is_clipped & (z < believed_sigma), _mills(z, xp)
+            score = xp.where(believed, time / xp.sqrt(variance) * ratio, score)
+            information = xp.where(believed, slope * time * ratio * (ratio - z), information)
+        total = xp.maximum(information.sum(axis=0), _TINY)
+        rate = rate + score.sum(axis=0) / total
+    mean, variance = expected(rate)
+    leverage = time**2 / (variance * total)
+    # The least deviation of a sample that is clipped although the others give a far lower rate.
+    beyond = xp.where(is_open, light - mean, xp.maximum(sensor.level_e - mean, 0))
+    own = xp.where(left_out, 0, beyond**2 / variance / xp.where(is_open, xp.maximum(1 - leverage, 1e-3), 1))
+    worst, used = own.argmax(axis=0), is_open.sum(axis=0, dtype=np.int32)
+    return BlockMerge(rate, 1 / xp.sqrt(total), used, worst, own.max(axis=0))
 
 
-def _expected(
-    rate: Float[Array, " pixels"], time: Float[Array, ""], sensor: SensorNumbers
-) -> tuple[Float[Array, " pixels"], Float[Array, " pixels"]]:
-    mean = (rate + sensor.dark_e_per_s) * time
-    return mean, jnp.maximum(mean + sensor.floor_e2, _LEAST_VARIANCE * sensor.floor_e2)
+compiled_merge_block = jax.jit(merge_block, static_argnames=("believed_sigma", "xp"))

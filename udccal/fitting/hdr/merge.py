@@ -8,18 +8,20 @@ from dataclasses import dataclass, replace
 from typing import final
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt16
 
 from udccal.errors import FitError
 from udccal.fitting.engine.robust import outliers
-from udccal.fitting.hdr.likelihood import BlockMerge, SensorNumbers, merge_block
+from udccal.fitting.hdr.likelihood import BlockMerge, SensorNumbers, compiled_merge_block, merge_block
 from udccal.models.noise import Noise
 from udccal.result import FitStatus, Outliers
 
 # Sigma where no sample could be used: finite, and larger than any rate that a sensor can measure.
 UNKNOWN_SIGMA = 1e12
-_BLOCKS = (1 << 16, 1 << 12)  # pixels of one compiled pass: large pictures, and crops
+# Pixels of a picture that is worth compiling for, and of one compiled pass, which stays in the processor's cache.
+_LEAST_COMPILED, _BLOCK = 1 << 16, 1 << 14
 
 
 @final
@@ -31,8 +33,6 @@ class HdrRules:
         believed_sigma: a sample farther than this from the other samples of its pixel is a hit, clipped or not.
         margin_sigma: samples count as clipped from this many sigma of dark noise below saturation on.
         frame_off, frame_sigma: a frame is left out when its light is off by more than both (relative, and in sigma).
-        frame_pixels: the most pixels by which a frame is tested.
-        frame_least_pixels, frame_snr: the fewest pixels for that test, and the least signal over noise of each.
         least_to_judge: the fewest samples of a pixel for finding hits and testing frames.
     """
 
@@ -40,9 +40,6 @@ class HdrRules:
     margin_sigma: float = 6.0
     frame_off: float = 0.02
     frame_sigma: float = 5.0
-    frame_pixels: int = 20_000
-    frame_least_pixels: int = 8
-    frame_snr: float = 10.0
     least_to_judge: int = 3
 
 
@@ -55,8 +52,7 @@ class HdrMerge:
         rate_e_per_s, sigma_e_per_s: light of every pixel, with one standard deviation.
         used: number of samples used for each pixel; where it is 0 the rate is 0 and sigma ``UNKNOWN_SIGMA``.
         outliers: frames and samples that were left out.
-        status: SATURATED where no pixel has a sample that could be used.
-        notes: sentences for a person.
+        status, notes: SATURATED where no pixel has a sample that could be used; sentences for a person.
     """
 
     rate_e_per_s: Float[np.ndarray, "*picture"]
@@ -75,13 +71,9 @@ def merge_bracket(
 ) -> HdrMerge:
     """Merge frames of one still scene at several exposures (repeats allowed).
 
-    It solves the likelihood equation of ``hdr.likelihood`` for each pixel. Shot, dark and quantisation noise are those
-    at the merged rate: weights from single noisy samples would pull dark pixels down. Samples within 6 sigma of
-    saturation are censored. Single precision moves no rate by a thousandth of its sigma.
-
-    Two kinds of outliers are left out and listed: frames whose light is off by more than 2 % (a lamp that flickered, a
-    dropped frame), and samples more than 6 sigma from the other samples of their pixel (cosmic hits, blinking pixels).
-    Both tests need 3 samples of a pixel. These figures are those of the default ``rules``.
+    It solves the likelihood equation of ``hdr.likelihood`` for each pixel: weights from single noisy samples would pull
+    dark pixels down. Frames of other light (a lamp that flickered, a dropped frame) and samples far from the others of
+    their pixel (cosmic hits, blinking pixels) are left out and listed.
 
     Args:
         frames: codes in DN, one frame or mosaic per exposure, all of one shape.
@@ -90,7 +82,7 @@ def merge_bracket(
         rules: see ``HdrRules``.
 
     Returns:
-        rate and sigma in e-/s of every pixel, and the outliers; status ``SATURATED`` where no sample could be used.
+        rate and sigma in e-/s of every pixel, and the outliers.
 
     Raises:
         FitError: when exposures are not positive, or not as many as frames.
@@ -98,48 +90,41 @@ def merge_bracket(
     rules = rules or HdrRules()
     times = np.asarray(exposures_s, dtype=np.float64)
     if len(frames) != len(times) or not len(times) or not np.all((times > 0) & np.isfinite(times)):
-        raise FitError(
-            f"Expected a positive exposure for each of the {len(frames)} frames of a bracket, found {times.tolist()}. "
-            "Give the exposures in seconds."
-        )
+        expected = f"Expected a positive exposure for each of the {len(frames)} frames of a bracket"
+        raise FitError(f"{expected}, found {times.tolist()}. Give the exposures in seconds.")
     # Times in units of the longest: sums of their squares stay in single precision's range.
-    unit, shape, kept = float(times.max()), frames.shape[1:], np.arange(len(frames))
+    unit, shape, dropped = float(times.max()), frames.shape[1:], np.zeros((len(frames), 1), bool)
     codes = np.ascontiguousarray(frames).reshape(len(frames), -1)
     bracket = _Bracket(codes, (times / unit).astype(np.float32), sensor_numbers(noise, unit, rules), rules)
-    merged = bracket.merged()
-    while (bad := bracket.frame_off(merged)) is not None:
-        kept = np.delete(kept, bad)
-        bracket = replace(bracket, codes=np.delete(bracket.codes, bad, 0), times=np.delete(bracket.times, bad))
-        merged = bracket.merged()
-    hits = bracket.mend_hits(merged)
+    merged = bracket.merged(dropped)
+    while (bad := bracket.frame_off(merged, dropped)) is not None:
+        dropped[bad] = True
+        merged = bracket.merged(dropped)
+    hits = bracket.mend_hits(merged, dropped)
     # In place: copies of a full frame would cost as much as a third of the merging.
     for values in (merged.rate, merged.sigma):
         values /= np.float32(unit)
     unknown = merged.used <= 0
     merged.rate[unknown], merged.sigma[unknown] = 0.0, UNKNOWN_SIGMA
-    note = f"{np.count_nonzero(unknown)} of {unknown.size} pixels have no sample that could be used."
+    note = f"{unknown.sum()} of {unknown.size} pixels have no sample that could be used."
     off = f"frames whose light is off by more than {100 * rules.frame_off:g} % and {rules.frame_sigma:g} sigma"
     hit = f"pixels with a sample more than {rules.believed_sigma:g} sigma from what its other samples say; that sample"
-    dropped = (f"frame {i}" for i in np.setdiff1d(np.arange(len(frames)), kept))
     places = (str(tuple(int(k) for k in np.unravel_index(pixel, shape))) for pixel in hits)
-    return HdrMerge(
-        merged.rate.reshape(shape),
-        merged.sigma.reshape(shape),
-        merged.used.reshape(shape),
-        outliers(off, dropped) + outliers(f"{hit} is left out", places),
-        FitStatus.SATURATED if unknown.size and unknown.all() else FitStatus.CONVERGED,
-        (note,) if unknown.any() else (),
-    )
+    listed = outliers(off, (f"frame {i}" for i in np.flatnonzero(dropped)))
+    listed += outliers(f"{hit} is left out", places)
+    status = FitStatus.SATURATED if unknown.size and unknown.all() else FitStatus.CONVERGED
+    rate, sigma, used = (part.reshape(shape) for part in (merged.rate, merged.sigma, merged.used))
+    return HdrMerge(rate, sigma, used, listed, status, (note,) if unknown.any() else ())
 
 
 def sensor_numbers(noise: Noise, unit_s: float, rules: HdrRules) -> SensorNumbers:
     """The numbers of a noise model that the likelihood uses, times in units of ``unit_s``."""
-    K, black = float(np.asarray(noise.K_DN_per_e)), float(np.asarray(noise.black_DN))
-    floor = float(np.asarray(noise.sigma_d_e)) ** 2 + (float(np.asarray(noise.q_DN)) / K) ** 2 / 12.0
+    parts = noise.K_DN_per_e, noise.black_DN, noise.saturation_DN, noise.sigma_d_e, noise.q_DN
+    K, black, saturation, sigma_d, q = (float(np.asarray(part)) for part in parts)
     # A sensor without any dark noise still has a least variance: the likelihood of its dark pixels stays finite.
-    floor = max(floor, 1e-4)
-    level = (float(np.asarray(noise.saturation_DN)) - black) / K - rules.margin_sigma * math.sqrt(floor)
-    numbers = (black, 1 / K, float(np.asarray(noise.dark_current_e_per_s)) * unit_s, floor, level)
+    floor = max(sigma_d**2 + (q / K) ** 2 / 12.0, 1e-4)
+    level = (saturation - black) / K - rules.margin_sigma * math.sqrt(floor)
+    numbers = black, 1 / K, float(np.asarray(noise.dark_current_e_per_s)) * unit_s, floor, level
     return SensorNumbers(*(np.float32(n) for n in numbers))
 
 
@@ -150,59 +135,54 @@ class _Bracket:
     sensor: SensorNumbers
     rules: HdrRules
 
-    def merged(self, left_out: Bool[np.ndarray, "n pixels"] | None = None) -> BlockMerge:
-        """Merge in blocks of one size on two threads, to numpy; the last block overlaps the one before it."""
-        codes, pixels = self.codes, self.codes.shape[1]
-        size = next((b for b in _BLOCKS if b <= pixels), _BLOCKS[-1])
-        if (short := size - pixels) > 0:
-            codes = np.pad(codes, ((0, 0), (0, short)))
-            left_out = None if left_out is None else np.pad(left_out, ((0, 0), (0, short)))
-        kinds = (np.float32, np.float32, np.int32, np.int32, np.float32)
-        out = BlockMerge(*(np.empty(codes.shape[1], kind) for kind in kinds))
+    def merged(self, left_out: Bool[np.ndarray, "n #pixels"]) -> BlockMerge:
+        """All pixels, without the samples that are left out."""
+        codes, pixels, left_out = self.codes, self.codes.shape[1], np.broadcast_to(left_out, self.codes.shape)
+        if pixels < _LEAST_COMPILED:
+            return merge_block(codes, self.times, self.sensor, left_out, self.rules.believed_sigma)
+        out = BlockMerge(*(np.empty(pixels, kind) for kind in ("f4", "f4", "i4", "i4", "f4")))
 
         def run(start: int) -> None:
-            part = np.s_[start : start + size]
-            own = None if left_out is None else left_out[:, part]
-            _put(out, part, merge_block(codes[:, part], self.times, self.sensor, own, self.rules.believed_sigma))
+            part = np.s_[start : start + _BLOCK]
+            numbers = codes[:, part], self.times, self.sensor, left_out[:, part], self.rules.believed_sigma
+            _put(out, part, compiled_merge_block(*numbers, jnp))
 
         with ThreadPoolExecutor(2) as pool:
-            list(pool.map(run, [min(s, codes.shape[1] - size) for s in range(0, codes.shape[1], size)]))
-        return BlockMerge(*(part[:pixels] for part in jax.tree.leaves(out)))
+            # The last block overlaps the one before it, so that all have one size.
+            list(pool.map(run, (min(start, pixels - _BLOCK) for start in range(0, pixels, _BLOCK))))
+        return out
 
-    def frame_off(self, merged: BlockMerge) -> int | None:
+    def frame_off(self, merged: BlockMerge, dropped: Bool[np.ndarray, "n 1"]) -> int | None:
         """The frame whose light differs most from the others', when that is too much."""
         rules, sensor = self.rules, self.sensor
-        if len(self.times) < rules.least_to_judge:
-            return None
         lit = np.flatnonzero((merged.used >= rules.least_to_judge) & (merged.rate > 0))
-        lit = lit[:: max(1, len(lit) // rules.frame_pixels)]
+        lit, times = lit[:: max(1, len(lit) // 20_000)], self.times[:, None]
         light = (self.codes[:, lit].astype(np.float64) - float(sensor.black_DN)) * float(sensor.e_per_DN)
-        signal = merged.rate[lit].astype(np.float64) * self.times[:, None]
-        dark = float(sensor.dark_e_per_s) * self.times[:, None]
+        signal, dark = merged.rate[lit].astype(np.float64) * times, float(sensor.dark_e_per_s) * times
         sigma = np.sqrt(signal + dark + float(sensor.floor_e2))
         # Unclipped samples near the level are the low ones of their kind; samples of few electrons are skewed. Both are
         # left out here. The median keeps hits from counting as a lamp that flickers.
-        clear = (signal + dark + 5 * sigma < float(sensor.level_e)) & (sigma * rules.frame_snr < signal)
+        clear = ~dropped & (signal + dark + 5 * sigma < float(sensor.level_e)) & (10 * sigma < signal)
         score = np.zeros(len(clear))
-        for i in np.flatnonzero(clear.sum(axis=1) >= rules.frame_least_pixels):
-            own = clear[i]
-            off = abs(float(np.median((light - dark)[i, own] / signal[i, own] - 1)))
+        for i in np.flatnonzero(clear.sum(axis=1) >= 8):
+            part = np.s_[i, clear[i]]
+            off = abs(float(np.median((light - dark)[part] / signal[part] - 1)))
             # A median's standard error is 1.2533 times a mean's.
-            error = 1.2533 * float(np.median(sigma[i, own] / signal[i, own])) / math.sqrt(np.count_nonzero(own))
+            error = 1.2533 * float(np.median(sigma[part] / signal[part])) / math.sqrt(clear[i].sum())
             score[i] = off / error if off > rules.frame_off else 0.0
         worst = int(np.argmax(score))
         return worst if score[worst] > rules.frame_sigma else None
 
-    def mend_hits(self, merged: BlockMerge) -> Int[np.ndarray, " hits"]:
+    def mend_hits(self, merged: BlockMerge, dropped: Bool[np.ndarray, "n 1"]) -> Int[np.ndarray, " hits"]:
         """Leave out the worst sample of a pixel while it is too far off; changes ``merged``, returns the pixels."""
-        limit, least = self.rules.believed_sigma**2, self.rules.least_to_judge
-        hits = suspects = np.flatnonzero((merged.deviation2 > limit) & (len(self.times) >= least))
-        left_out = np.zeros((len(self.times), len(suspects)), dtype=bool)
+        limit, most = self.rules.believed_sigma**2, len(self.times) - self.rules.least_to_judge
+        hits = suspects = np.flatnonzero((merged.deviation2 > limit) & (dropped.sum() <= most))
+        left_out = np.repeat(dropped, len(suspects), axis=1)
         while len(suspects):
             left_out[merged.worst[suspects], np.arange(len(suspects))] = True
             again = replace(self, codes=np.ascontiguousarray(self.codes[:, suspects])).merged(left_out)
             _put(merged, suspects, again)
-            more = (again.deviation2 > limit) & (len(self.times) - left_out.sum(axis=0) >= least)
+            more = (again.deviation2 > limit) & (left_out.sum(axis=0) <= most)
             suspects, left_out = suspects[more], np.ascontiguousarray(left_out[:, more])
         return hits
 

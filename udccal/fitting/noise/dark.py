@@ -1,14 +1,14 @@
 """Dark frames: black, dark current, read noise and its shape, row noise and DSNU; each if the data support it.
 
-The likelihood is that of the two integer codes of a pixel, with the rounding inside it. Rounding is therefore exact
-where the noise is a fraction of a code, instead of the usual 1/12. Codes at 0 or at the converter's end are censored:
-the signal lies at or beyond them. Distributions are not assumed to be normal: dark current of few electrons is as
-skewed as Poisson's distribution.
+The likelihood is that of the two integer codes of a pixel: rounding is exact where the noise is a fraction of a code,
+instead of the usual 1/12. Codes at 0 or at the converter's end are censored: the signal lies at or beyond them. Few
+electrons of dark current are as skewed as Poisson's distribution.
 """
 
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import final
 
@@ -30,21 +30,21 @@ NORMAL_SHAPE = 0.1349
 _LOW = np.array([-np.inf, -np.inf, 1e-3, 1e-6, -0.1])
 _HIGH = np.array([np.inf, np.inf, np.inf, np.inf, 0.45])
 Five = Float[np.ndarray, "5"]
+Grid = Float[np.ndarray, " grid"]
+Expected = Callable[[DarkPair, Five], Float[np.ndarray, "codes codes"]]
 
 
 def tukey_lambda_std(shape: float) -> float:
-    """Standard deviation of the Tukey-lambda distribution with quantile (p^l - (1-p)^l) / l."""
-    # The formula has no value at 0.
-    safe = shape if abs(shape) >= 1e-4 else 1e-4
-    return float(np.sqrt(2.0 / safe**2 * (1.0 / (1 + 2 * safe) - beta(safe + 1, safe + 1))))
+    """Standard deviation of the Tukey-lambda distribution with quantile (p^l - (1-p)^l) / l; l is not 0."""
+    return float(np.sqrt(2.0 / shape**2 * (1.0 / (1 + 2 * shape) - beta(shape + 1, shape + 1))))
 
 
 @functools.lru_cache(maxsize=64)
-def _standard_cdf(shape: float) -> tuple[Float[np.ndarray, " grid"], Float[np.ndarray, " grid"]]:
+def _standard_cdf(shape: float) -> tuple[Grid, Grid]:
     """Quantiles of the Tukey-lambda distribution of unit variance, and their probabilities."""
     p, tail = (1.0 / (1.0 + np.exp(sign * np.linspace(-24.0, 24.0, 6001))) for sign in (-1, 1))
-    safe = shape if abs(shape) >= 1e-4 else 1e-4
-    return (p**safe - tail**safe) / safe / tukey_lambda_std(safe), p
+    shape = shape if abs(shape) >= 1e-4 else 1e-4
+    return (p**shape - tail**shape) / shape / tukey_lambda_std(shape), p
 
 
 def excess_kurtosis(shape: float) -> float:
@@ -54,9 +54,7 @@ def excess_kurtosis(shape: float) -> float:
 
 
 @functools.lru_cache(maxsize=128)
-def _dark_cdf(
-    sigma_DN: float, shape: float, row_DN: float, dark_DN: float, K_DN_per_e: float
-) -> tuple[Float[np.ndarray, " grid"], Float[np.ndarray, " grid"]]:
+def _dark_cdf(sigma_DN: float, shape: float, row_DN: float, dark_DN: float, K_DN_per_e: float) -> tuple[Grid, Grid]:
     """Places (DN from the mean) and the probability that a dark sample lies below them before rounding.
 
     Tukey-lambda read noise, normal row noise and Poisson counts with the mean ``dark_DN`` are independent: their
@@ -79,30 +77,22 @@ def _dark_cdf(
     return edges[1:], np.clip(np.maximum.accumulate(np.cumsum(mass)), 0.0, 1.0)
 
 
-@final
-@dataclass(frozen=True)
-class Surroundings:
-    """Known numbers apart from the histograms; ``background`` is the fraction of samples that may have any code."""
-
-    K_DN_per_e: float
-    sigma_row_DN: float
-    background: float
-
-
-def pair_probability(pair: DarkPair, values: Five, known: Surroundings) -> Float[np.ndarray, "codes codes"]:
-    """Probability of the two codes of a pixel in a pair of dark frames, by groups of codes."""
+def pair_probability(
+    pair: DarkPair, values: Five, K_DN_per_e: float, sigma_row_DN: float, background: float
+) -> Float[np.ndarray, "codes codes"]:
+    """Probability of the two codes of a pixel by groups of codes; ``background`` is NoiseRules'."""
     black, per_s, variance, spread2, shape = (float(v) for v in values)
     drift = per_s * pair.exposure_s
-    grid, cdf = _dark_cdf(np.sqrt(variance), shape, known.sigma_row_DN, drift, known.K_DN_per_e)
+    grid, cdf = _dark_cdf(np.sqrt(variance), shape, sigma_row_DN, drift, K_DN_per_e)
     # Counts of dark current widen the distribution but leave its peaks as narrow as the read noise. For a smooth
     # integrand, evenly spaced nodes are as good as any quadrature.
-    width, spread = max(np.sqrt(variance + known.sigma_row_DN**2), 1e-9), np.sqrt(spread2)
+    width, spread = max(np.sqrt(variance + sigma_row_DN**2), 1e-9), np.sqrt(spread2)
     z = np.linspace(-5.5, 5.5, int(np.clip(np.ceil(17.6 * spread / width), 13, 1201)) | 1)
     weights = np.exp(-0.5 * z**2)
     below = np.interp(pair.edges_DN - (black + drift + spread * z)[:, None], grid, cdf, left=0.0, right=1.0)
     single = np.diff(below, axis=1)
     joint = (single * (weights / weights.sum())[:, None]).T @ single
-    return np.asarray((1 - known.background) * joint + known.background / joint.size)
+    return np.asarray((1 - background) * joint + background / joint.size)
 
 
 @final
@@ -129,7 +119,7 @@ class _DarkCodes:
     """The solver's problem: the deviance of all histograms from those expected, and the shape's prior."""
 
     pairs: tuple[DarkPair, ...]
-    known: Surroundings
+    expected: Expected
     free: Bool[np.ndarray, "5"]
     shape_sigma: float
     name: str = "noise, dark codes"
@@ -145,12 +135,12 @@ class _DarkCodes:
         steps = 2e-3 * np.array([width2**0.5, width2**0.5 / longest, width2, max(0.5 * place[3], 1e-4 * width2), 1.0])
         steps = np.where(place + steps <= _HIGH, steps, -steps)
         for pair in self.pairs:
-            p, counts = pair_probability(pair, place, self.known).ravel(), pair.counts.ravel()
+            p, counts = self.expected(pair, place).ravel(), pair.counts.ravel()
             total = int(counts.sum())
             # One-sided: the second order, which remains, sums to zero in the score at the truth.
             jacobian = np.zeros((5, p.size))
             for i in np.flatnonzero(self.free):
-                moved = pair_probability(pair, place + steps[i] * np.eye(5)[i], self.known)
+                moved = self.expected(pair, place + steps[i] * np.eye(5)[i])
                 jacobian[i] = (moved.ravel() - p) / steps[i]
             cost += 2 * float(np.sum(xlogy(counts, counts / (total * p))))
             score += jacobian @ (counts / p)
@@ -181,19 +171,24 @@ def start_values(pairs: tuple[DarkPair, ...]) -> Five:
 
 
 def fit_dark(
-    pairs: tuple[DarkPair, ...], known: Surroundings, rules: NoiseRules, start: Five | None = None, normal: bool = False
-) -> DarkFit:
+    pairs: tuple[DarkPair, ...], K_DN_per_e: float, sigma_row_DN: float, rules: NoiseRules, start: Five | None = None,
+    normal: bool = False,
+) -> DarkFit:  # fmt: skip
     """Fisher scoring on the likelihood of all pairs; ``normal`` holds the shape at that of normal noise.
 
     The pairs have their pixels' offsets in common, so the information on DSNU does not add up over pairs: its sigma is
-    widened by the square root of their number. Row noise in ``known`` is that of these frames.
+    widened by the square root of their number. Row noise is that of these frames.
     """
     values = np.clip(start_values(pairs) if start is None else start, _LOW, _HIGH)
     free = np.array([True, len({pair.exposure_s for pair in pairs}) > 1, True, True, not normal])
     values = np.where(free, values, [0.0, 0.0, 0.0, 0.0, NORMAL_SHAPE])
     # One-sided derivatives predict a small gain for ever.
     solver = SolverRules(least_gain=1e-3, stalled_gain=1e-4, iterations=40)
-    found = minimise(_DarkCodes(pairs, known, free, rules.shape_sigma), values, solver)
+
+    def expected(pair: DarkPair, at: Five) -> Float[np.ndarray, "codes codes"]:
+        return pair_probability(pair, at, K_DN_per_e, sigma_row_DN, rules.background)
+
+    found = minimise(_DarkCodes(pairs, expected, free, rules.shape_sigma), values, solver)
     values, information = found.place, found.equations.shared
     # Rounding hides no more than its own size: codes that are all the same give this bound. Noise and offsets within a
     # code may be hidden by rounding, and otherwise only by chance.
@@ -203,14 +198,14 @@ def fit_dark(
     information = np.where(lost[:, None] | lost, np.diag(np.where(lost, least, 0.0)), information)
     widen = np.sqrt(np.array([1.0, 1.0, 1.0, len(pairs), 1.0]))
     cov = scaled_inverse(information) * np.outer(widen, widen)
-    levels = np.array([_level(pair, values, known) for pair in pairs]).T
+    levels = np.array([_level(pair, values, expected, sigma_row_DN) for pair in pairs]).T
     return DarkFit(values, cov, found.converged, bool(np.abs(levels[0] - 1).max() < rules.white), *levels)
 
 
-def _level(pair: DarkPair, values: Five, known: Surroundings) -> tuple[float, float, float]:
+def _level(pair: DarkPair, values: Five, expected: Expected, sigma_row_DN: float) -> tuple[float, float, float]:
     """``DarkFit.edge_gains``, ``means_DN`` and ``variances_DN2`` of a pair, by one scoring step from the common fit."""
     black = 0.01 * float(np.sqrt(values[2])) * np.eye(5)[0]
-    up, down = (pair_probability(pair, values + sign * black, known) for sign in (1, -1))
+    up, down = (expected(pair, values + sign * black) for sign in (1, -1))
     by_black, p, total = (up - down) / (2 * black[0]), 0.5 * (up + down), float(pair.counts.sum())
     gain, information = float(by_black.sum(axis=1) @ pair.centres_DN), total * float(np.sum(by_black**2 / p))
     mean, blind = float(values[0] + values[1] * pair.exposure_s), pair.step_DN**2 / 12.0
@@ -219,7 +214,7 @@ def _level(pair: DarkPair, values: Five, known: Surroundings) -> tuple[float, fl
     shift = float(np.sum(by_black * pair.counts / p)) / information
     # The offsets' part of the variance is the same in every pair and does not count here.
     temporal = max(1 / information - float(values[3]) / total, 0.05 / information)
-    return gain, mean + shift, temporal + known.sigma_row_DN**2 / (2 * pair.rows)
+    return gain, mean + shift, temporal + sigma_row_DN**2 / (2 * pair.rows)
 
 
 @final
@@ -243,32 +238,30 @@ class DarkTerms:
 def fit_dark_terms(data: NoiseMoments, K_DN_per_e: float, rules: NoiseRules, start: Five | None = None) -> DarkTerms:
     """Fit all dark quantities; only the shot noise of the dark current depends on ``K_DN_per_e``."""
     row, in_pairs = row_noise(data, np.ones(len(data.darks)))
-    known = Surroundings(K_DN_per_e, in_pairs, rules.background)
-    fit = fit_dark(data.darks, known, rules, start)
+    fit = fit_dark(data.darks, K_DN_per_e, in_pairs, rules, start)
     if not fit.follows:
         row, in_pairs = row_noise(data, fit.edge_gains)
-        known = replace(known, sigma_row_DN=in_pairs)
-        fit = fit_dark(data.darks, known, rules, fit.values)
-    # Temporal noise much smaller than a code cannot be distinguished from the pattern of rounding.
-    resolved = float(fit.values[2]) + in_pairs**2 >= (rules.resolved * data.q_DN) ** 2
+        fit = fit_dark(data.darks, K_DN_per_e, in_pairs, rules, fit.values)
+    # Temporal noise below 0.15 of a code cannot be distinguished from the pattern of rounding.
+    resolved = float(fit.values[2]) + in_pairs**2 >= (0.15 * data.q_DN) ** 2
     row = row if resolved else row_noise(data, np.zeros(len(data.darks)))[0]
     value, variance = float(fit.values[4]), float(fit.cov[4, 4])
     name, gain = f"read noise of another shape than normal ({NORMAL_SHAPE:.2f})", (value - NORMAL_SHAPE) ** 2 / variance
     shape = Quantity.asked(name, value, variance, data.dark_samples, gain, without=NORMAL_SHAPE)
-    fit = fit if shape.there else fit_dark(data.darks, known, rules, fit.values, normal=True)
+    fit = fit if shape.there else fit_dark(data.darks, K_DN_per_e, in_pairs, rules, fit.values, True)
     read, spread2 = float(fit.values[2]), float(fit.values[3])
     # DSNU comes from the stack's average, or from the histograms where rounding biases the average.
     stack, rounding = data.dark_stack, data.q_DN**2 / 12.0
     single = read + K_DN_per_e * max(float(fit.values[1]), 0.0) * stack.exposure_s + rounding
-    offsets = dsnu(stack.mean_DN, single / stack.frames, in_pairs**2 / stack.frames, rules)
+    offsets = dsnu(stack.mean_DN, single / stack.frames, in_pairs**2 / stack.frames, rules.defect_sigma)
     # Different offsets smear the rounding in the mean over all pixels; only a pixel's own noise smears its rounding.
     white = fit.follows and 4 * np.pi**2 * read >= rules.smeared * data.q_DN**2
     if not white:
         pixels, sigma = stack.mean_DN.size, float(np.hypot(fit.cov[3, 3] ** 0.5, 0.0 if resolved else rounding))
         offsets = replace(offsets, variance=spread2, sigma=sigma, samples=pixels, mean_variance=spread2 / pixels)
     black, levels_cov, current = _levels(data, fit, in_pairs**2, single, offsets)
-    none = read <= 1.001 * _LOW[2]
-    read_DN2 = Quantity(0.0 if none else read, max(float(fit.cov[2, 2]), _LOW[2] ** 2 if none else 0.0))
+    variance = float(fit.cov[2, 2])
+    read_DN2 = Quantity(read, variance) if read > 1.001 * _LOW[2] else Quantity(0.0, max(variance, _LOW[2] ** 2))
     DSNU2 = Quantity.asked("DSNU", offsets.variance, offsets.sigma**2, offsets.samples)
     return DarkTerms(K_DN_per_e, black, current, levels_cov, read_DN2, shape, row, DSNU2, white, fit, offsets)
 

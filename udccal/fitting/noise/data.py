@@ -1,7 +1,6 @@
-"""The data of the noise fit, frames in the dark and under even light from a session or as arrays; and its rules.
+"""Frames in the dark and under even light, from a session or as arrays; and the rules of the noise fit.
 
-Frames may be arrays, memory maps, or functions that load one. The fit loads one after another and drops it again, so
-that memory does not grow with their number.
+The fit loads one frame after another and drops it again, so that memory does not grow with their number.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ from udccal.errors import FitError
 from udccal.sessions.store import Session
 
 Codes = UInt16[np.ndarray, "rows columns"]
-# Frames of a level may have different sizes until they are loaded: the types do not compare the sizes.
+# An array, memory map, or function that loads one. Their sizes may differ until they are loaded: types compare none.
 Frame = UInt16[np.ndarray, "_rows _columns"] | UInt8[np.ndarray, "_rows _columns"] | Callable[[], np.ndarray]
 
 _LEAST_SIDE, _MOST_SIDE, _MOST_FRAMES = 16, 65536, 4096
@@ -30,8 +29,6 @@ class NoiseRules:
     """The documented constants of the noise fit.
 
     Attributes:
-        tiles, tile_samples: most tiles a side, and fewest samples of one colour in each: tiles keep shading and the
-            slow flicker of a lamp out of the variance.
         hit_sigma: codes of one pixel that differ by more are a hit or a blinking pixel.
         outlier_sigma: bins and levels farther off the curve, in robust sigma, are left out.
         defect_sigma: pixels farther off the rest, in robust sigma, are defects; of millions, 5 would reject good ones.
@@ -39,24 +36,14 @@ class NoiseRules:
         shape_sigma: prior sigma of the read noise's shape; it matters only where rounding hides the shape.
         white: rounding counts as white, and no code as cut off, where the mean code follows black to this fraction.
         smeared: rounding does not show where its first harmonic is down by this, as a natural logarithm.
-        resolved: temporal noise, in codes, below which rounding decides which samples differ.
         fit_up_to, narrow_up_to: fraction of saturation that the fit reaches; the second (EMVA 1288) where it
             describes the data far better.
-        margin_sigma, uneven_sigma: distance of a bin from the range's ends, in sigma of its noise and of its shading.
-        white_spread, white_temporal: least spread of samples for white rounding, in steps and steps^2.
         most_bent: fraction of the signal missing at full scale above which a quadratic does not describe the response.
-        collapsed: a bin is full where its variance is below this part of the variance that the others predict.
-        full_sigma: every pixel of a bin is full where its variance is within this many sigma of the dark noise.
-        shading: side of the window that follows shading, in samples of one colour.
-        light_sigma: power of a spectrum counts as light from this many sigma above the floor.
-        light_reach: light is expected up to this many times the frequencies at which it was seen.
         levels: fewest exposures of a photon transfer curve.
         gain_sigma: least gain in units of its sigma; quotients by a less certain gain have no symmetric error.
         worst_chi2: reduced chi-squared above which the sensor is not what the model says.
     """
 
-    tiles: int = 8
-    tile_samples: int = 4096
     hit_sigma: float = 8.0
     outlier_sigma: float = 5.0
     defect_sigma: float = 6.0
@@ -64,19 +51,9 @@ class NoiseRules:
     shape_sigma: float = 0.3
     white: float = 0.005
     smeared: float = 6.0
-    resolved: float = 0.15
     fit_up_to: float = 0.9
     narrow_up_to: float = 0.7
-    margin_sigma: float = 5.0
-    uneven_sigma: float = 2.5
-    white_spread: float = 0.7
-    white_temporal: float = 0.2
     most_bent: float = 0.24
-    collapsed: float = 0.3
-    full_sigma: float = 3.0
-    shading: int = 63
-    light_sigma: float = 5.0
-    light_reach: float = 2.0
     levels: int = 3
     gain_sigma: float = 10.0
     worst_chi2: float = 6.0
@@ -99,9 +76,8 @@ class ExposureLevel:
 
     Attributes:
         exposure_s: exposure time.
-        dark: pair of frames without light; empty where not taken.
-        bright: pair of frames under even light; empty where not taken.
-        photons: mean number of photons per pixel, where known; exposure times take its place where a level has none.
+        dark, bright: pairs of frames without light and under even light; empty where not taken.
+        photons: mean number per pixel, where known; exposure times take its place where a level has none.
     """
 
     exposure_s: float
@@ -139,11 +115,7 @@ class NoiseData:
     top_code: int | None = None
 
     def check(self) -> None:
-        """Check numbers of frames, exposures and photons.
-
-        Raises:
-            FitError: when one is not possible; it names the level or stack.
-        """
+        """Check numbers of frames, exposures and photons; a FitError names the level or stack that is not possible."""
         stack = self.stack
         stacks = [] if stack is None else [s for s in (stack.dark, stack.bright) if isinstance(s, Sequence)]
         if max([len(self.levels), *map(len, stacks)]) > _MOST_FRAMES:
@@ -179,9 +151,6 @@ def read_noise(session: Session) -> NoiseData:
     Args:
         session: holds ``noise/dark_{i}`` and ``noise/flat_{i}`` (two frames each), ``noise/dark_stack`` and
             ``noise/flat_stack`` (averages).
-
-    Returns:
-        the data of ``fit_noise``.
 
     Raises:
         SessionError: when the file of an average is missing or damaged; of a frame, when it is read.

@@ -65,19 +65,6 @@ def fit_noise(data: NoiseData, nominal: Noise | None = None, rules: NoiseRules |
     return FitResult.failed("noise", nominal, FitStatus.TOO_FEW_DATA, note)
 
 
-def mean_response(result: FitResult[Noise], light: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    """Mean signal above black in DN that the fitted response predicts, saturation at most.
-
-    Args:
-        result: of the noise fit (EMVA 1288, clause 6.7, evaluates the response).
-        light: in the unit of the fitted levels (photons per pixel, or seconds).
-    """
-    numbers = {item.name: item.value for item in result.diagnostics}
-    K, black_DN, top_DN = (float(np.asarray(getattr(result.term, name))) for name in NAMES[:3])
-    linear = numbers["response_DN_per_light"] * (np.asarray(light) + numbers["light_offset"])
-    return np.asarray(np.minimum(linear - numbers["curvature"] * (linear**2 + K * linear), top_DN - black_DN))
-
-
 def fit_moments(data: NoiseMoments, nominal: Noise, rules: NoiseRules) -> FitResult[Noise]:
     """Fit the noise term to frames that are reduced; ``nominal`` is returned as the term where no fit is possible."""
     if refused := _too_little(data, rules):
@@ -103,8 +90,8 @@ def fit_moments(data: NoiseMoments, nominal: Noise, rules: NoiseRules) -> FitRes
 def _too_little(data: NoiseMoments, rules: NoiseRules) -> tuple[FitStatus, str] | None:
     """The status and sentence of data that cannot be fitted; None where the fit may begin."""
     if len(data.darks) < 2 or len(data.flats) < rules.levels:
-        wanted, found = f"2 dark and {rules.levels} flat", f"{len(data.darks)} and {len(data.flats)}"
-        return FitStatus.TOO_FEW_DATA, f"Expected at least {wanted} exposures, found {found}."
+        found = f"{len(data.darks)} and {len(data.flats)}"
+        return FitStatus.TOO_FEW_DATA, f"Expected at least 2 dark and {rules.levels} flat exposures, found {found}."
     if any(pair.counts.sum() < 100 for pair in data.darks):
         return FitStatus.TOO_FEW_DATA, "A dark pair holds fewer than 100 samples of like codes."
     start = start_values(data.darks)
@@ -169,7 +156,7 @@ def _photo_response(data: NoiseMoments, dark: DarkTerms, curve: Curve, rules: No
     level = max(rough_median(signal), 1e-6)
     z = float(linear_signal(np.array(level), c, K))
     steep = 1 - 2 * c * z
-    found = prnu(signal, at_no_light, K * z * steep**2 / level / bright.frames, data.period, rules)
+    found = prnu(signal, at_no_light, K * z * steep**2 / level / bright.frames, data.period, rules.defect_sigma)
     # Where the response bends, a relative change of light is a smaller relative change of signal.
     scale = (level / (z * steep)) ** 2
     offsets = 0.0 if dark.white else float(np.sqrt(dark.dsnu_DN2.variance)) / level**2
@@ -180,7 +167,7 @@ def _assembled(data: NoiseMoments, dark: DarkTerms, curve: Curve, rules: NoiseRu
     """The result of a finished fit."""
     fit, response = curve.fit, curve.choice
     assert response is not None, "a fit that went through has a curve"
-    saturation, uneven = find_saturation(data, dark, curve, rules), _photo_response(data, dark, curve, rules)
+    saturation, uneven = find_saturation(data, dark, curve), _photo_response(data, dark, curve, rules)
     PRNU2 = Quantity.asked("PRNU", uneven.variance, uneven.sigma**2, uneven.samples)
     values, cov = _values(data, dark, curve, saturation, PRNU2)
     bent_too_far = abs(float(fit.values[2])) * max(curve.ceiling_DN - dark.black_DN, 1.0) >= 0.999 * rules.most_bent
@@ -192,7 +179,7 @@ def _assembled(data: NoiseMoments, dark: DarkTerms, curve: Curve, rules: NoiseRu
     candidates = [*(one for term in terms for one in term.candidates), *response.candidates]
     outside = len(data.darks) * data.flat_stack.mean_DN.size - data.dark_samples
     height, width = data.flat_stack.mean_DN.shape
-    (down, right), used = bins(height, width, data.period, rules), np.isfinite(fit.variance_z)
+    (down, right), used = bins(height, width, data.period), np.isfinite(fit.variance_z)
     x, y = np.arange(width) @ right / right.sum(axis=0), down @ np.arange(height) / down.sum(axis=1)
     places = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
     return FitResult(

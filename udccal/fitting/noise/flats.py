@@ -50,7 +50,7 @@ class Curve:
 
 def fit_curve(data: NoiseMoments, dark: DarkTerms, rules: NoiseRules) -> Curve:
     """The curve up to 90 % of saturation, or up to 70 % where the model describes that far better."""
-    full, flickering = _saturated(data, dark, rules), _flickering(data.flats, dark, rules)
+    full, flickering = _saturated(data, dark), _flickering(data.flats, dark, rules)
     # Upper median of the saturated bins, or the converter's largest code where there is none.
     ceiling = float(np.quantile(stacked(data.flats, "mean_DN")[full], 0.75)) if full.any() else data.top_DN
 
@@ -85,10 +85,11 @@ def _inside(data: NoiseMoments, dark: DarkTerms, up_to_DN: float, ceiling_DN: fl
     shift2 = np.stack([np.var(flat.shift_DN, axis=0, ddof=1) for flat in flats])
     pattern2 = np.maximum(spread**2 - variance, 0.0) / np.where(above > 0, above, np.inf) ** 2
     variance = np.maximum(variance - shift2 * pattern2, 0.0)
-    temporal = rules.margin_sigma * np.sqrt(variance)
-    uneven = rules.uneven_sigma * np.sqrt(np.maximum(spread**2 - variance, 0.0))
+    # Bins keep 5 sigma of their noise and 2.5 of their shading away from the range's ends.
+    temporal, uneven = 5.0 * np.sqrt(variance), 2.5 * np.sqrt(np.maximum(spread**2 - variance, 0.0))
     usable = (above > 0) & (above <= up_to_DN) & (mean + temporal + uneven < ceiling_DN) & (mean > temporal)
-    usable &= (spread >= rules.white_spread * q) & (variance >= rules.white_temporal * q**2)
+    # Rounding is white over this spread of samples and this noise.
+    usable &= (spread >= 0.7 * q) & (variance >= 0.2 * q**2)
     # The distribution of few counts has steps: rounding is white once noise smears them over a code. With a variance
     # of thirty codes they do not matter.
     smeared = 2 * above / max(K, 1e-9) * (1 - np.cos(2 * np.pi * K / q))
@@ -142,16 +143,14 @@ def _flickering(flats: tuple[Moments, ...], dark: DarkTerms, rules: NoiseRules) 
 
 def rough_gain(data: NoiseMoments, black_DN: float, dark_DN2: float) -> float:
     """Conversion gain in DN per electron from moments alone, for the first fit of the dark frames."""
-    mean, variance = (
-        stacked(data.flats, "mean_DN") - black_DN,
-        stacked(data.flats, "variance_DN2") - data.q_DN**2 / 12.0,
-    )
+    mean = stacked(data.flats, "mean_DN") - black_DN
+    variance = stacked(data.flats, "variance_DN2") - data.q_DN**2 / 12.0
     lit = mean > max(0.05 * mean.max(), 0.0)
     # Clipping lowers the ratio and nothing raises it.
     return max(float(np.quantile((variance[lit] - dark_DN2) / mean[lit], 0.75)), 1e-6) if lit.any() else 1.0
 
 
-def _saturated(data: NoiseMoments, dark: DarkTerms, rules: NoiseRules) -> Bins:
+def _saturated(data: NoiseMoments, dark: DarkTerms) -> Bins:
     """Saturated bins: as bright as any, with a variance far below the one that the rest predicts for their mean.
 
     Where all flats are saturated there is no rest: bins with no more variance than the dark frames are then saturated.
@@ -164,16 +163,16 @@ def _saturated(data: NoiseMoments, dark: DarkTerms, rules: NoiseRules) -> Bins:
     highest = bright & (mean >= 0.9 * mean.max())
     # Below saturation variance over mean is K plus a small positive part; clipping only lowers it.
     slope = variance / np.maximum(mean, 1e-9)
-    collapsed: Bins = highest & (slope < rules.collapsed * float(np.quantile(slope[bright], 0.75)))
+    collapsed: Bins = highest & (slope < 0.3 * float(np.quantile(slope[bright], 0.75)))
     quiet: Bins = highest & (variance <= 1.3 * (dark.read_DN2.value + data.q_DN**2 / 12.0 + dark.row_DN2.value))
     return quiet if not collapsed.any() and quiet[bright].mean() > 0.5 else collapsed
 
 
-def find_saturation(data: NoiseMoments, dark: DarkTerms, curve: Curve, rules: NoiseRules) -> tuple[float, float]:
+def find_saturation(data: NoiseMoments, dark: DarkTerms, curve: Curve) -> tuple[float, float]:
     """Level in DN at which the signal stops, with its sigma (patterns of the offsets not counted).
 
-    Where the full well lies below the converter's end, it is the mean of the bins in which every pixel is full. Where
-    codes end first, it is the last code. In between, it follows from the fraction of samples at the end.
+    It is the mean of the bins in which every pixel is full, or the last code where codes end before the full well. In
+    between, it follows from the fraction of samples at the end.
     """
     full = [(flat, bins) for flat, bins in zip(data.flats, curve.full, strict=True) if bins.any()]
     if not full:
@@ -185,7 +184,7 @@ def find_saturation(data: NoiseMoments, dark: DarkTerms, curve: Curve, rules: No
         # A level at the converter's end is certain; a level below it is known to within rounding.
         return float(peak), float(1 / np.sqrt(12.0)) if peak < data.top_DN else 0.0
     V0 = max(float(curve.fit.values[1]), 0.0) if curve.choice else 0.0
-    found = np.array([_level(flat, bins, data, dark, V0, peak, rules) for flat, bins in full])
+    found = np.array([_level(flat, bins, data, dark, V0, peak) for flat, bins in full])
     # An outlier among full pixels is a pixel that is not full.
     clean = (found[:, 2] > 0) & np.array([of.frames * of.outliers <= 1e-5 * of.samples.sum() for of, _ in full])
     values, variances, _ = (found[clean] if clean.any() else found).T
@@ -194,13 +193,12 @@ def find_saturation(data: NoiseMoments, dark: DarkTerms, curve: Curve, rules: No
 
 
 def _level(
-    flat: Moments, full: Bool[np.ndarray, " bins"], data: NoiseMoments, dark: DarkTerms, V0: float, peak: int,
-    rules: NoiseRules,
-) -> tuple[float, float, bool]:  # fmt: skip
+    flat: Moments, full: Bool[np.ndarray, " bins"], data: NoiseMoments, dark: DarkTerms, V0: float, peak: int
+) -> tuple[float, float, bool]:
     """Saturation in DN by one flat, its variance, and whether all pixels of a bin are full."""
     temporal = V0 + data.q_DN**2 / 12.0
     excess = flat.variance_DN2 - temporal
-    sure = full & (excess < rules.full_sigma * temporal * np.sqrt(2 / flat.dof))
+    sure = full & (excess < 3.0 * temporal * np.sqrt(2 / flat.dof))
     chosen = sure if sure.any() else full
     samples = float(flat.samples[chosen].sum())
     rows = dark.row_DN2.value / (flat.frames * flat.height) * (full.size / float(chosen.sum()))

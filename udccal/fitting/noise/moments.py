@@ -1,6 +1,6 @@
 """Frames reduced to the data of the fit: moments per bin of pairs and stacks, and joint histograms of dark codes.
 
-A bin is one site of the colour mosaic in one tile of the sensor. Frames come one by one. Their differences from the
+A bin is one site of the colour mosaic in one tile of the sensor. Frames come one by one: their differences from the
 first frame are summed, and the squares of these, so that float32 loses no digits that matter.
 """
 
@@ -17,20 +17,21 @@ import numpy as np
 from jaxtyping import Float, Float32, Int
 
 from udccal.errors import FitError
-from udccal.fitting.noise.data import Averaged, Codes, ExposureLevel, Frame, NoiseData, NoiseRules, loaded
+from udccal.fitting.noise.data import Averaged, Codes, ExposureLevel, Frame, NoiseData, NoiseRules, SpatialStack, loaded
 
 Grid = Float[np.ndarray, "groups_y groups_x"]
 
 
 @functools.lru_cache(maxsize=8)
 def bins(
-    rows: int, columns: int, period: int, rules: NoiseRules
+    rows: int, columns: int, period: int
 ) -> tuple[Float[np.ndarray, "groups_y rows"], Float32[np.ndarray, "columns groups_x"]]:
     """Ones where a row and a column belong to a group of bins; colour sites repeat every ``period`` samples."""
-    tiles = int(np.clip(np.sqrt(rows * columns / period**2 / rules.tile_samples), 1, rules.tiles))
+    # Tiles keep shading and a lamp's slow flicker out of the variance: at most 8 a side, each of 4096 samples a colour.
+    tiles = int(np.clip(np.sqrt(rows * columns / period**2 / 4096), 1, 8))
 
     def groups(length: int) -> Float[np.ndarray, "length groups"]:
-        """Whole mosaic cells per tile; the last tile has the remaining ones."""
+        # Whole mosaic cells per tile; the last tile has the remaining ones.
         tile = np.minimum(np.arange(length) // period // max(length // period // tiles, 1), tiles - 1)
         return np.eye(tiles * period)[tile * period + np.arange(length) % period]
 
@@ -67,25 +68,17 @@ class Moments:
 
     @property
     def frames(self) -> int:
-        """Number of frames."""
+        """How many."""
         return len(self.shift_DN)
 
 
 def reduce_frames(
     frames: Iterable[Codes], exposure_s: float, light: float | None, period: int, rules: NoiseRules
 ) -> tuple[Averaged, Moments]:
-    """Mean per pixel, and temporal moments per bin without common changes of brightness and row noise.
-
-    Args:
-        frames: of one shape; at least two.
-        exposure_s: of all frames, in seconds.
-        light: relative exposure to light; the exposure time where not known.
-        period: colour sites repeat after this many samples (1: monochrome).
-        rules: for the size of the tiles, and the limit of a hit.
-    """
+    """Mean per pixel, and temporal moments per bin without common changes of brightness and row noise."""
     source = iter(frames)
     first = next(source)
-    down, right = bins(*first.shape, period, rules)
+    down, right = bins(*first.shape, period)
     counts, total, outliers = np.outer(down.sum(axis=1), right.sum(axis=0)), np.zeros(first.shape, np.float32), 0
     # The first frame's difference from itself is zero.
     by_row, peaks = [np.zeros((len(first), right.shape[1]))], [_peak(first)]
@@ -96,8 +89,9 @@ def reduce_frames(
         # The usual difference is the median over some rows, which hits do not move; ten codes are never a hit.
         usual = np.median(square[:: max(len(first) // 128, 1)] @ right, axis=0) / right.sum(axis=0)
         hits = square > max(rules.hit_sigma**2 * float(usual.max()), 10.0**2)
-        difference[hits] = square[hits] = 0.0
-        outliers += int(np.count_nonzero(hits))
+        if count := int(np.count_nonzero(hits)):
+            difference[hits] = square[hits] = 0.0
+            outliers += count
         total += difference
         squares += square @ right
         by_row.append(np.asarray(difference @ right, dtype=np.float64))
@@ -140,8 +134,7 @@ def _temporal(
     squares: Float[np.ndarray, "rows groups_x"],
 ) -> tuple[Grid, Grid, Float[np.ndarray, "frames groups_y groups_x"], float, float]:
     """Variances of bins, their degrees of freedom, the frames' shifts, the rows' variance and its sampling part."""
-    (frames, height), columns = by_row.shape[:2], len(right)
-    width = right.sum(axis=0, dtype=np.float64)
+    (frames, height, _), columns, width = by_row.shape, len(right), right.sum(axis=0, dtype=np.float64)
     counts = np.outer(down.sum(axis=1), width)
     about = by_row - by_row.mean(axis=0)
     rows = about.sum(axis=2) / columns
@@ -245,11 +238,7 @@ class NoiseMoments:
 
 
 def reduced(data: NoiseData, rules: NoiseRules) -> NoiseMoments | None:
-    """All frames as moments and histograms for the fit; None without a dark and a bright pair.
-
-    Raises:
-        FitError: when a frame is not a picture of codes like the others, or an exposure is not a time.
-    """
+    """All frames as moments and histograms for the fit; None without a dark and a bright pair."""
     data.check()
     darks, brights = [one for one in data.levels if one.dark], [one for one in data.levels if one.bright]
     if not darks or not brights:
@@ -268,16 +257,12 @@ def reduced(data: NoiseData, rules: NoiseRules) -> NoiseMoments | None:
         _converter_top(int(np.median(first[::64])), top, q_DN)
         return dark_pair(first, second, level.exposure_s, q_DN, top), moments((first, second), level.exposure_s)[1]
 
-    def average(
-        frames: Sequence[Frame] | Averaged, exposure_s: float, photons: float | None
-    ) -> tuple[Averaged, Moments | None]:
-        return (frames, None) if isinstance(frames, Averaged) else moments(frames, exposure_s, photons)
+    def average(frames: Sequence[Frame] | Averaged, stack: SpatialStack) -> tuple[Averaged, Moments | None]:
+        return (frames, None) if isinstance(frames, Averaged) else moments(frames, stack.exposure_s, stack.photons)
 
     with ThreadPoolExecutor(2) as pool:
         # The stacks are the longest tasks: they go first.
-        tasks = [] if stack is None else [
-            pool.submit(average, frames, stack.exposure_s, stack.photons) for frames in (stack.dark, stack.bright)
-        ]  # fmt: skip
+        tasks = [pool.submit(average, frames, stack) for frames in (stack.dark, stack.bright)] if stack else []
         flats = tuple(pool.map(lambda level: moments(level.bright, level.exposure_s, level.photons)[1], brights))
         top = _converter_top(max(flat.peak_DN for flat in flats), data.top_code, q_DN)
         histograms, dark_moments = zip(*pool.map(dark, darks), strict=True)
@@ -288,6 +273,5 @@ def reduced(data: NoiseData, rules: NoiseRules) -> NoiseMoments | None:
         near = min(darks, key=lambda level: abs(level.exposure_s - middle.exposure_s))
         stacks = [(moments(near.dark, near.exposure_s)[0], None), (moments(middle.bright, middle.exposure_s)[0], None)]
     (dark_stack, dark_seen), (flat_stack, flat_seen) = stacks
-    return NoiseMoments(
-        histograms, dark_moments, flats, dark_stack, flat_stack, q_DN, float(top), period, dark_seen, flat_seen
-    )
+    pairs = histograms, dark_moments, flats
+    return NoiseMoments(*pairs, dark_stack, flat_stack, q_DN, float(top), period, dark_seen, flat_seen)

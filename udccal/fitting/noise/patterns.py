@@ -21,7 +21,6 @@ from scipy.special import ndtri
 from udccal.fitting.engine.misfit import excess_variance
 from udccal.fitting.engine.orders import Quantity
 from udccal.fitting.engine.robust import MAD_TO_SIGMA
-from udccal.fitting.noise.data import NoiseRules
 from udccal.fitting.noise.moments import Moments, NoiseMoments
 
 Picture = Float[np.ndarray, "rows columns"] | Float32[np.ndarray, "rows columns"]
@@ -71,20 +70,16 @@ class Pattern:
     places: tuple[tuple[int, int], ...]
 
 
-def dsnu(dark_DN: Picture, temporal_DN2: float, row_DN2: float, rules: NoiseRules) -> Pattern:
+def dsnu(dark_DN: Picture, temporal_DN2: float, row_DN2: float, defect_sigma: float) -> Pattern:
     """Variance of the pixels' offsets in an averaged dark frame (EMVA 1288, clause 8.2), with row and column patterns.
 
-    Args:
-        dark_DN: the average.
-        temporal_DN2: temporal variance of one sample of the average, without row noise.
-        row_DN2: variance of row noise in the average.
-        rules: for the limit of a defect.
+    The average has the temporal variance ``temporal_DN2`` without row noise, which adds ``row_DN2``.
     """
     about = dark_DN.astype(np.float64)
     sample = about[:: max(1, len(about) // 256)]
     middle = float(np.median(sample))
     # Averages of few frames are coarse: a spread below their step does not measure the usual scatter.
-    reach = rules.defect_sigma * MAD_TO_SIGMA * float(np.median(np.abs(sample - middle)))
+    reach = defect_sigma * MAD_TO_SIGMA * float(np.median(np.abs(sample - middle)))
     bad = np.abs(about - middle) > max(reach, float(sample.std()), 1e-12)
     mean = float(about[~bad].mean()) if not bad.all() else 0.0
     about -= mean
@@ -123,27 +118,22 @@ class _Site:
     power: Float32[np.ndarray, "rows columns"]
 
 
-def prnu(signal_DN: Picture, temporal_DN2: float, shot_DN: float, period: int, rules: NoiseRules) -> Pattern:
+def prnu(signal_DN: Picture, temporal_DN2: float, shot_DN: float, period: int, defect_sigma: float) -> Pattern:
     """Variance of the photo response, relative (EMVA 1288, clause 8.3).
 
     The picture of each colour is divided by its shading. The floor of its spectrum (cosine transform) is measured where
     ``white_coefficients`` finds no light. Modulated light modulates the pixels' patterns as well: the floor is theirs
-    times the mean square of the light.
-
-    Args:
-        signal_DN: average of flats minus average of darks.
-        temporal_DN2: temporal variance of one sample of it at no light.
-        shot_DN: increase of that variance with the signal, in DN^2 per DN.
-        period: sites of the colour mosaic repeat after this many samples (1: monochrome).
-        rules: for the size of the shading's window, and the limit of light.
+    times the mean square of the light. ``signal_DN`` is the average of flats minus that of darks; its temporal variance
+    is ``temporal_DN2`` at no light, and rises with the signal by ``shot_DN``.
     """
     phases = [np.s_[row::period, column::period] for row, column in product(range(period), repeat=2)]
-    window = min(rules.shading, (min(signal_DN.shape) // period // 4) * 2 + 1)
-    sites = [_site(signal_DN[phase], window, rules.defect_sigma) for phase in phases]
+    # Shading varies over more than 63 samples of one colour.
+    window = min(63, (min(signal_DN.shape) // period // 4) * 2 + 1)
+    sites = [_site(signal_DN[phase], window, defect_sigma) for phase in phases]
     # The window has removed its part of the lowest frequencies. Sites may differ by a line: the least is common to all.
     rows, columns = (min(site.power.shape[axis] for site in sites) for axis in (0, 1))
     taken = (3 * rows // window + 1, 3 * columns // window + 1)
-    white = white_coefficients([site.power[:rows, :columns] for site in sites], taken, rules)
+    white = white_coefficients([site.power[:rows, :columns] for site in sites], taken)
     variances, sigmas = np.array([_response(site, white, temporal_DN2, shot_DN) for site in sites]).T
     weights = 1 / np.maximum(sigmas, 1e-30) ** 2
     variance, samples = float(np.average(variances, weights=weights)), len(sites) * int(np.count_nonzero(white))
@@ -195,17 +185,11 @@ def _mean_product(first: np.ndarray, second: np.ndarray, count: int) -> float:
     return float(np.einsum("ij,ij->i", first, second).sum(dtype=np.float64)) / count
 
 
-def white_coefficients(
-    powers: list[Float32[np.ndarray, "rows columns"]], taken: tuple[int, int], rules: NoiseRules
-) -> Mask:
+def white_coefficients(powers: list[Float32[np.ndarray, "rows columns"]], taken: tuple[int, int]) -> Mask:
     """Coefficients of cosine transforms that hold white noise alone; all transforms are of the same light.
 
-    The first row and column hold differences between columns and between rows: they are never among them.
-
-    Args:
-        powers: squared coefficients, one picture per colour site.
-        taken: number of the lowest rows and columns that the correction of shading has changed.
-        rules: for the limit of light, and how far it reaches.
+    The first row and column hold differences between columns and between rows: they are never among them, nor are the
+    ``taken`` lowest rows and columns, which the correction of shading has changed.
     """
     rows, columns = powers[0].shape
     keep = np.ones((rows, columns), bool)
@@ -216,10 +200,11 @@ def white_coefficients(
     count = _by_block(keep, block)
     totals = [_by_block(power * keep, block) for power in powers]
     pooled = sum(total / max(_floor(count, total), 1e-300) for total in totals)
-    seen = _light(count * len(powers), np.asarray(pooled), rules.light_sigma)
+    seen = _light(count * len(powers), np.asarray(pooled))
     wide = np.zeros_like(seen)
     for row, column in np.argwhere(seen):
-        wide[: int(np.ceil(rules.light_reach * (row + 1))), : int(np.ceil(rules.light_reach * (column + 1)))] = True
+        # Light too weak to be seen is expected up to twice the frequencies at which it was seen.
+        wide[: 2 * (row + 1), : 2 * (column + 1)] = True
     # Where that leaves less than a tenth, all coefficients without visible light are used.
     left_out = wide if count[~wide].sum() >= 0.1 * keep.size else seen
     white = np.zeros_like(keep)
@@ -249,11 +234,8 @@ def _mean_square(count: Float[np.ndarray, "*n"], z: float) -> Float[np.ndarray, 
     return np.asarray((1 - spread + z * np.sqrt(spread)) ** 3)
 
 
-def _light(count: Grid, total: Grid, sigma: float) -> Mask:
-    """Blocks with more power than the floor, alone or as part of a rectangle of them.
-
-    ``total`` is the power over the floor's of ``count`` coefficients.
-    """
+def _light(count: Grid, total: Grid) -> Mask:
+    """Blocks with a ``total`` power, of ``count`` coefficients, 5 sigma above the floor, alone or in a rectangle."""
     light, floor = np.zeros(count.shape, bool), _floor(count, total)
     # Small rectangles first: light in few blocks must not make large ones of it.
     sides = [side for side in product((1, 4, 16), repeat=2) if side[0] <= len(count) and side[1] <= count.shape[1]]
@@ -266,7 +248,7 @@ def _light(count: Grid, total: Grid, sigma: float) -> Mask:
                               borderType=cv2.BORDER_CONSTANT) for part in (count, total)
             )  # fmt: skip
             number = np.maximum(number, 0.0)
-            high = power / np.maximum(number, 1) > max(floor, 1e-300) * _mean_square(number, sigma)
+            high = power / np.maximum(number, 1) > max(floor, 1e-300) * _mean_square(number, 5.0)
             # Rectangles half a side apart are tested.
             marks, apart = np.zeros(high.shape, np.uint8), np.s_[:: max(down // 2, 1), :: max(across // 2, 1)]
             marks[apart] = high[apart]

@@ -23,6 +23,8 @@ from udccal.fitting.engine.orders import Attempt, Choice, bic, choose
 from udccal.fitting.engine.robust import OutlierRule
 from udccal.fitting.noise.data import NoiseRules
 
+Grid = Float[np.ndarray, "levels bins"]
+PerLevel = Float[np.ndarray, " levels"]
 # K [DN/e], V0 [DN^2], curvature [1/DN], response [DN per light], offset of the light.
 Five = Float[np.ndarray, "5"]
 
@@ -32,36 +34,29 @@ Five = Float[np.ndarray, "5"]
 class Levels:
     """Bright exposures, already reduced: one row per level, one column per bin (CFA site x tile).
 
-    Attributes:
-        mean_DN: above black.
-        variance_DN2: temporal.
-        dof: of the variances.
-        samples: per bin and level, frames times pixels: the mean's weight.
-        usable: bins safely inside the range of the sensor.
-        light: relative exposure to light; nan where unknown, or where the lamp was not steady.
-        dark_DN: dark signal in each level.
-        row_variance_DN2: variance of each level's mean from row noise.
+    ``mean_DN`` is above black, ``variance_DN2`` temporal with ``dof``, ``samples`` are frames times pixels, ``usable``
+    are bins safely inside the range of the sensor, and ``light`` is the relative exposure to light, nan where unknown.
+    ``dark_DN`` is each level's dark signal, and ``row_variance_DN2`` the variance of its mean by row noise.
     """
 
-    mean_DN: Float[np.ndarray, "levels bins"]
-    variance_DN2: Float[np.ndarray, "levels bins"]
-    dof: Float[np.ndarray, "levels bins"]
-    samples: Float[np.ndarray, "levels bins"]
+    mean_DN: Grid
+    variance_DN2: Grid
+    dof: Grid
+    samples: Grid
     usable: Bool[np.ndarray, "levels bins"]
-    light: Float[np.ndarray, " levels"]
-    dark_DN: Float[np.ndarray, " levels"]
-    row_variance_DN2: Float[np.ndarray, " levels"]
+    light: PerLevel
+    dark_DN: PerLevel
+    row_variance_DN2: PerLevel
 
     @property
     def responding(self) -> Bool[np.ndarray, " levels"]:
         """Levels whose brightness counts for the response."""
         seen = self.usable.any(axis=1) & np.isfinite(self.light)
-        known = self.light[seen]
         # Levels of one exposure differ by the lamp's power, which was not measured.
-        return seen if known.size > 2 and float(np.ptp(known)) > 0 else np.zeros_like(seen)
+        return np.asarray(seen & bool(seen.sum() > 2 and np.ptp(self.light[seen]) > 0))
 
     @property
-    def brightness_variance(self) -> Float[np.ndarray, " levels"]:
+    def brightness_variance(self) -> PerLevel:
         """Relative variance of each level's brightness by shot, read and row noise."""
         count = np.maximum(self.usable.sum(axis=1), 1)
         mean = np.where(self.usable, self.mean_DN, 0.0).sum(axis=1) / count
@@ -72,10 +67,9 @@ class Levels:
 @final
 @dataclass(frozen=True)
 class DarkVariance:
-    """V0 by dark frames: estimates (DN^2) with their standard deviations; and the rounding to add.
+    """V0 by dark frames: estimates with their standard deviations; and the rounding to add.
 
-    The estimates hold for the gain ``K_DN_per_e``. With another gain they change by as much as the shot noise of their
-    dark signal ``drift_DN``.
+    They hold for the gain ``K_DN_per_e``, and change with it by the shot noise of their dark signal ``drift_DN``.
     """
 
     V0_DN2: Float[np.ndarray, " points"]
@@ -97,26 +91,22 @@ class Order:
     @property
     def name(self) -> str:
         """For the table of candidates."""
-        parts = ["curved" if self.curved else "linear"]
-        parts += ["exposure offset"] * self.offset + ["unsteady light"] * self.unsteady
-        return "response: " + ", ".join(parts)
+        offset, unsteady = ", exposure offset" * self.offset, ", unsteady light" * self.unsteady
+        return f"response: {'curved' if self.curved else 'linear'}{offset}{unsteady}"
 
 
 @final
 @dataclass(frozen=True)
 class TransferFit:
-    """One order: values with their covariance, and residuals in units of sigma (nan where unused).
-
-    ``scatter`` is the relative standard deviation of the light from level to level.
-    """
+    """One order: values, covariance, relative scatter of the light by level, and residuals in sigma (nan: unused)."""
 
     order: Order
     values: Five
     cov: Float[np.ndarray, "5 5"]
     scatter: float
     converged: bool
-    variance_z: Float[np.ndarray, "levels bins"]
-    level_z: Float[np.ndarray, " levels"]
+    variance_z: Grid
+    level_z: PerLevel
 
     @property
     def chi2_dof(self) -> float:
@@ -132,17 +122,9 @@ def linear_signal(mean_DN, curvature_per_DN, K_DN_per_e):  # type: ignore[no-unt
 
 
 def temporal_variance(signal_DN, K_DN_per_e, V0_DN2, curvature_per_DN, rounding_DN2):  # type: ignore[no-untyped-def]
-    """Temporal variance K z (1 - 2 c z)^2 + V0 + rounding (EMVA 1288, clause 6); for numpy and JAX arrays.
+    """K z (1 - 2 c z)^2 + V0 + rounding in DN^2 (EMVA 1288, clause 6), for a linear signal z above black.
 
-    Args:
-        signal_DN: linear signal z above black.
-        K_DN_per_e: conversion gain K.
-        V0_DN2: variance in the dark, without rounding.
-        curvature_per_DN: c of the response, 0 for a linear one.
-        rounding_DN2: variance of rounding, such as q^2 / 12.
-
-    Returns:
-        the variance in DN^2, in the shape of the signal.
+    Arguments and result are numpy or JAX arrays; the curvature c is 0 for a linear response, the rounding q^2 / 12.
     """
     return K_DN_per_e * signal_DN * (1 - 2 * curvature_per_DN * signal_DN) ** 2 + V0_DN2 + rounding_DN2
 
@@ -150,10 +132,7 @@ def temporal_variance(signal_DN, K_DN_per_e, V0_DN2, curvature_per_DN, rounding_
 @final
 @dataclass(frozen=True)
 class TransferProblem:
-    """The solver's problem: the deviance of variances, read noise and brightness from the model.
-
-    ``bound`` is that of the curvature, and ``sizes`` are scales of the parameters, for derivatives by differences.
-    """
+    """The solver's problem: deviance from the model; the curvature's bound, and scales of the parameters for steps."""
 
     levels: Levels
     dark: DarkVariance
@@ -162,10 +141,8 @@ class TransferProblem:
     sizes: Five
     name: str = "noise, photon transfer"
 
-    def modelled(
-        self, x: Five
-    ) -> tuple[Float[np.ndarray, "levels bins"], Float[np.ndarray, " points"], Float[np.ndarray, " levels"]]:
-        """Modelled variances and estimates of V0, and the relative excess of the levels' brightness over the model."""
+    def modelled(self, x: Five) -> tuple[Grid, Float[np.ndarray, " points"], PerLevel]:
+        """Variances and estimates of V0 by the model, and the relative excess of the levels' brightness over it."""
         K, V0, c, gain, offset = x
         levels, dark = self.levels, self.dark
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -174,7 +151,7 @@ class TransferProblem:
             bright = _brightness(signal - levels.dark_DN[:, None], levels.usable) / (gain * (levels.light + offset))
         return variance, V0 + (K - dark.K_DN_per_e) * dark.drift_DN, bright - 1
 
-    def scatter2(self, relative: Float[np.ndarray, " levels"]) -> float:
+    def scatter2(self, relative: PerLevel) -> float:
         """Maximum-likelihood variance of the light from level to level, in addition to noise."""
         known = self.levels.brightness_variance[self.levels.responding]
         return excess_variance(relative**2, known, np.ones(len(known)))[0] if self.order.unsteady else 0.0
@@ -194,8 +171,8 @@ class TransferProblem:
         off = np.concatenate([levels.variance_DN2[use] - variance, dark.V0_DN2 - floor, relative])
         weight = np.concatenate([0.5 * dof / variance**2, dark.sigma_DN2**-2, 1 / spread2])
         # Free parameters are those of the order that the data determine.
-        responding, jacobian = bool(responds.any()), np.zeros((len(off), 5))
-        free = np.array([True, True, self.order.curved, responding, self.order.offset and responding])
+        free, jacobian = np.array([True, True, self.order.curved, True, self.order.offset]), np.zeros((len(off), 5))
+        free[3:] &= responds.any()
         for i in np.flatnonzero(free):
             step = 1e-4 * self.sizes[i] * np.eye(5)[i]
             jacobian[:, i] = (predicted(place + step) - predicted(place - step)) / (2 * step[i])
@@ -213,7 +190,7 @@ class TransferProblem:
         return x
 
 
-def _brightness(light_DN: Float[np.ndarray, "levels bins"], usable: np.ndarray) -> Float[np.ndarray, " levels"]:
+def _brightness(light_DN: Grid, usable: np.ndarray) -> PerLevel:
     """Mean light of each level as if every bin were usable in it: all levels have one pattern of bins."""
     complete = np.asarray(usable.all(axis=1))
     # The alternation starts from the pattern of the complete levels; without them its first rounds would be rough.
@@ -227,12 +204,8 @@ def _brightness(light_DN: Float[np.ndarray, "levels bins"], usable: np.ndarray) 
     return np.asarray(level)
 
 
-def _fit_order(
-    levels: Levels, dark: DarkVariance, full_DN: float, order: Order, start: Five, rules: NoiseRules
-) -> Attempt[TransferFit]:
-    brightest = max(float(np.nan_to_num(levels.light).max()), 1e-30)
-    sizes = np.abs(start) + np.array([1e-9, dark.rounding_DN2 + 1e-3, 0.1 / full_DN, 1e-9, brightest])
-    problem = TransferProblem(levels, dark, order, rules.most_bent / full_DN, sizes)
+def _fitted(problem: TransferProblem, start: Five) -> Attempt[TransferFit]:
+    order, levels = problem.order, problem.levels
     start = np.where([True, True, order.curved, True, order.offset], start, 0.0)
     found = minimise(problem, start, SolverRules(iterations=40))
     x, cov, cost = found.place, found.equations.cov(), found.equations.cost
@@ -249,14 +222,7 @@ def _fit_order(
 
 
 def choose_transfer(levels: Levels, dark: DarkVariance, full_DN: float, rules: NoiseRules) -> Choice[TransferFit]:
-    """The order with the least BIC, its fit, and the criterion of every order.
-
-    Args:
-        levels: bright exposures; at least one usable bin.
-        dark: V0 by dark frames.
-        full_DN: saturation above black; sets the scale of the curvature.
-        rules: how far the response may bend.
-    """
+    """The order with the least BIC, its fit, and the criterion of every order; at least one bin is usable."""
     # A straight line with rough weights, and the response through the origin.
     use, light = levels.usable, np.nan_to_num(levels.light)
     V0 = float(np.average(dark.V0_DN2, weights=1 / dark.sigma_DN2**2))
@@ -267,19 +233,21 @@ def choose_transfer(levels: Levels, dark: DarkVariance, full_DN: float, rules: N
     # A variance and the mean of its bin have correlated errors for Poisson counts, and independent ones for read noise.
     apart = K**2 * max(V0, 0.0) / levels.samples / np.maximum(levels.variance_DN2, 1e-9) ** 2
     levels = replace(levels, dof=levels.dof / (1 + 0.5 * levels.dof * apart))
-    orders = [Order(curved, offset, unsteady) for unsteady, offset, curved in product((False, True), repeat=3)]
-    first = _fit_order(levels, dark, full_DN, Order(), start, rules)
+    sizes = np.abs(start) + np.array([1e-9, dark.rounding_DN2 + 1e-3, 0.1 / full_DN, 1e-9, max(light.max(), 1e-30)])
+    simplest = TransferProblem(levels, dark, Order(), rules.most_bent / full_DN, sizes)
+    first = _fitted(simplest, start)
     # The other orders start from the simplest one.
     start = first.fit.values if first.fit.converged else start
-    others = orders[1:] if levels.responding.any() else [Order(curved=True)]
-    return choose([first, *(_fit_order(levels, dark, full_DN, order, start, rules) for order in others)])
+    others = [Order(curved, offset, unsteady) for unsteady, offset, curved in product((False, True), repeat=3)][1:]
+    others = others if levels.responding.any() else [Order(curved=True)]
+    return choose([first, *(_fitted(replace(simplest, order=order), start) for order in others)])
 
 
 def robust_transfer(
     levels: Levels, dark: DarkVariance, full_DN: float, rules: NoiseRules
 ) -> tuple[Choice[TransferFit], Levels]:
     """The same without outliers: bins off the curve are marked as not usable, the light of whole levels as unknown."""
-    choice, rule = choose_transfer(levels, dark, full_DN, rules), OutlierRule("bins and levels", rules.outlier_sigma)
+    choice, rule = choose_transfer(levels, dark, full_DN, rules), OutlierRule("bins", rules.outlier_sigma)
     for _ in range(3):
         fit = choice.best.fit
         off = rule.off(np.nan_to_num(fit.variance_z), levels.usable)
