@@ -2,22 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 from jaxtyping import Float, UInt16
 
-from udccal.fitting.noise.dark import NORMAL_SHAPE, tukey_lambda_std
 from udccal.fitting.noise.data import ExposureLevel, NoiseData, SpatialStack
 from udccal.fitting.noise.fit import fit_noise
+from udccal.fitting.noise.read_noise import NORMAL_SHAPE, tukey_lambda_std
 from udccal.models.noise import Noise
 from udccal.result import FitResult
 
 
 @dataclass(frozen=True)
 class ToySensor:
-    """A sensor and how it is measured; noise is drawn in electrons, then K, row noise, rounding and clipping."""
+    """A sensor and how it is measured; noise is drawn in electrons, then K, row noise, rounding and clipping.
+
+    ``other_noise`` draws read noise of unit variance in place of Tukey's lambda; a fraction ``telegraph`` of the pixels
+    has three times the read noise.
+    """
 
     rows: int = 96
     columns: int = 128
@@ -26,6 +31,8 @@ class ToySensor:
     full_well_e: float = 10_000.0
     read_e: float = 4.0
     lambda_read: float | None = 0.05
+    other_noise: Callable[[np.random.Generator, tuple[int, ...]], np.ndarray] | None = None
+    telegraph: float = 0.0
     row_DN: float = 0.4
     dark_e_per_s: float = 40.0
     DSNU_e: float = 3.0
@@ -56,12 +63,15 @@ class Patterns:
 
     response: Float[np.ndarray, "rows columns"]
     offset_e: Float[np.ndarray, "rows columns"]
+    read_e: Float[np.ndarray, "rows columns"]
 
 
 def patterns(sensor: ToySensor, rng: np.random.Generator) -> Patterns:
     """Fixed patterns of one sensor of this kind."""
     shape = (sensor.rows, sensor.columns)
-    return Patterns(1 + sensor.PRNU * rng.standard_normal(shape), sensor.DSNU_e * rng.standard_normal(shape))
+    response, offset = 1 + sensor.PRNU * rng.standard_normal(shape), sensor.DSNU_e * rng.standard_normal(shape)
+    noisy = rng.random(shape) < sensor.telegraph if sensor.telegraph else np.zeros(shape, bool)
+    return Patterns(response, offset, np.where(noisy, 3.0, 1.0) * sensor.read_e)
 
 
 def expose(
@@ -73,7 +83,9 @@ def expose(
     mean = exposure_s * (np.maximum(light * fixed.response, 0.0) + sensor.dark_e_per_s)
     counts = rng.poisson(mean).astype(np.float64)
     bent = np.minimum(counts * (1 - sensor.bend * counts / sensor.full_well_e), sensor.full_well_e)
-    signal = bent + fixed.offset_e + sensor.read_e * _read_noise(sensor.lambda_read, shape, rng)
+    draw = sensor.other_noise
+    noise = draw(rng, shape) if draw else _read_noise(sensor.lambda_read, shape, rng)
+    signal = bent + fixed.offset_e + fixed.read_e * noise
     codes = sensor.black_DN + sensor.K_DN_per_e * signal + sensor.row_DN * rng.standard_normal((shape[0], 1))
     return np.clip(np.rint(codes), 0, 2**sensor.bits - 1).astype(np.uint16)
 

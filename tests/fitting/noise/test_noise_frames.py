@@ -169,7 +169,7 @@ FRAME = np.full((32, 32), 100, np.uint16)
         ([ExposureLevel(0.1, (FRAME[:4], FRAME[:4]), (FRAME, FRAME))], None, "samples a side"),
         ([ExposureLevel(0.1, (FRAME, FRAME), (FRAME, FRAME))], SpatialStack(0.1, [FRAME], [FRAME]), "stack"),
         ([ExposureLevel(0.1, (FRAME, FRAME), (FRAME + np.uint16(60000),) * 2)], None, "top_code"),
-        ([ExposureLevel(0.1, (FRAME + np.uint16(60000),) * 2, (FRAME, FRAME))], None, "top_code"),
+        ([ExposureLevel(0.1, (FRAME + np.uint16(60000),) * 2, (FRAME, FRAME))], None, "exchanged"),
     ],
 )
 def test_what_is_no_frame_is_refused(levels: list[ExposureLevel], stack: SpatialStack | None, sentence: str) -> None:

@@ -14,7 +14,7 @@ from typing import final
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.special import beta, xlogy
+from scipy.special import xlogy
 
 from udccal.fitting.engine.gaussian import scaled_inverse
 from udccal.fitting.engine.least_squares import Blocks, SolverRules, Step, minimise
@@ -22,9 +22,8 @@ from udccal.fitting.engine.orders import Quantity
 from udccal.fitting.noise.data import NoiseRules
 from udccal.fitting.noise.moments import DarkPair, NoiseMoments
 from udccal.fitting.noise.patterns import Pattern, dsnu, row_noise
+from udccal.fitting.noise.read_noise import NORMAL_SHAPE, measured_variance, standard_cdf
 
-# The shape with the kurtosis of a normal distribution.
-NORMAL_SHAPE = 0.1349
 # Bounds of black [DN], dark current [DN/s], variance of single samples without row noise [DN^2], variance of the
 # pixels' offsets [DN^2], and Tukey-lambda shape: the order of ``Five``. A variance at its lower bound counts as 0.
 _LOW = np.array([-np.inf, -np.inf, 1e-3, 1e-6, -0.1])
@@ -32,25 +31,6 @@ _HIGH = np.array([np.inf, np.inf, np.inf, np.inf, 0.45])
 Five = Float[np.ndarray, "5"]
 Grid = Float[np.ndarray, " grid"]
 Expected = Callable[[DarkPair, Five], Float[np.ndarray, "codes codes"]]
-
-
-def tukey_lambda_std(shape: float) -> float:
-    """Standard deviation of the Tukey-lambda distribution with quantile (p^l - (1-p)^l) / l; l is not 0."""
-    return float(np.sqrt(2.0 / shape**2 * (1.0 / (1 + 2 * shape) - beta(shape + 1, shape + 1))))
-
-
-@functools.lru_cache(maxsize=64)
-def _standard_cdf(shape: float) -> tuple[Grid, Grid]:
-    """Quantiles of the Tukey-lambda distribution of unit variance, and their probabilities."""
-    p, tail = (1.0 / (1.0 + np.exp(sign * np.linspace(-24.0, 24.0, 6001))) for sign in (-1, 1))
-    shape = shape if abs(shape) >= 1e-4 else 1e-4
-    return (p**shape - tail**shape) / shape / tukey_lambda_std(shape), p
-
-
-def excess_kurtosis(shape: float) -> float:
-    """Excess kurtosis of the Tukey-lambda distribution: 1.2 for the logistic (0), 0 at 0.1349, negative above."""
-    x, p = _standard_cdf(shape)
-    return float(0.5 * (x[1:] ** 4 + x[:-1] ** 4) @ np.diff(p)) - 3.0
 
 
 @functools.lru_cache(maxsize=128)
@@ -65,7 +45,7 @@ def _dark_cdf(sigma_DN: float, shape: float, row_DN: float, dark_DN: float, K_DN
     points = int(np.clip(2 ** np.ceil(np.log2(6 * reach / max(sigma_DN, 0.06))), 4096, 65536))
     step = 2 * reach / points
     edges = step * (np.arange(points + 1) - points // 2 - 0.5)
-    grid, cdf = _standard_cdf(shape)
+    grid, cdf = standard_cdf(shape)
     mass = np.diff(np.interp(edges / max(sigma_DN, 1e-12), grid, cdf, left=0.0, right=1.0))
     u = 2 * np.pi * np.fft.rfftfreq(points, step)
     # A distribution narrower than the grid would ring: it is widened to one step.
@@ -165,7 +145,7 @@ def start_values(pairs: tuple[DarkPair, ...]) -> Five:
         found.append((pair.exposure_s, 0.5 * (first + second) @ centres, total - spread, spread))
     times, means, variances, spreads = np.array(found).T
     centred = times - times.mean()
-    slope = centred @ means / max(centred @ centred, 1e-300)
+    slope = centred @ means / (centred @ centred) if np.ptp(times) > 0 else 0.0
     least = max(variances.min() - 1.0 / 12.0, 0.05), max(spreads.min(), 0.003)
     return np.array([means.mean() - slope * times.mean(), slope, *least, NORMAL_SHAPE])
 
@@ -220,7 +200,10 @@ def _level(pair: DarkPair, values: Five, expected: Expected, sigma_row_DN: float
 @final
 @dataclass(frozen=True)
 class DarkTerms:
-    """Dark quantities; ``levels_cov`` is that of (black, dark current); ``white``: no pixel's mean shows rounding."""
+    """Dark quantities; ``levels_cov`` is that of (black, dark current); ``white``: no pixel's mean shows rounding.
+
+    ``foreign``: no distribution of the family describes the read noise; its variance is that of the codes.
+    """
 
     K_DN_per_e: float
     black_DN: float
@@ -231,6 +214,7 @@ class DarkTerms:
     row_DN2: Quantity
     dsnu_DN2: Quantity
     white: bool
+    foreign: bool
     fit: DarkFit
     offsets: Pattern
 
@@ -249,21 +233,28 @@ def fit_dark_terms(data: NoiseMoments, K_DN_per_e: float, rules: NoiseRules, sta
     name, gain = f"read noise of another shape than normal ({NORMAL_SHAPE:.2f})", (value - NORMAL_SHAPE) ** 2 / variance
     shape = Quantity.asked(name, value, variance, data.dark_samples, gain, without=NORMAL_SHAPE)
     fit = fit if shape.there else fit_dark(data.darks, K_DN_per_e, in_pairs, rules, fit.values, True)
-    read, spread2 = float(fit.values[2]), float(fit.values[3])
-    # DSNU comes from the stack's average, or from the histograms where rounding biases the average.
-    stack, rounding = data.dark_stack, data.q_DN**2 / 12.0
-    single = read + K_DN_per_e * max(float(fit.values[1]), 0.0) * stack.exposure_s + rounding
-    offsets = dsnu(stack.mean_DN, single / stack.frames, in_pairs**2 / stack.frames, rules.defect_sigma)
+    spread2, variance = float(fit.values[3]), float(fit.cov[2, 2])
+    read_DN2 = Quantity(float(fit.values[2]), variance)
     # Different offsets smear the rounding in the mean over all pixels; only a pixel's own noise smears its rounding.
-    white = fit.follows and 4 * np.pi**2 * read >= rules.smeared * data.q_DN**2
+    white = fit.follows and 4 * np.pi**2 * read_DN2.value >= rules.smeared * data.q_DN**2
+    rate, rounding, stack = max(float(fit.values[1]), 0.0), data.q_DN**2 / 12.0, data.dark_stack
+    measured = measured_variance(data, K_DN_per_e * rate, rounding, rules.most_hits)
+    foreign = white and abs(measured.value - read_DN2.value) > rules.foreign_sigma * measured.variance**0.5
+    if foreign:
+        read_DN2 = measured
+    elif read_DN2.value <= 1.001 * _LOW[2]:
+        read_DN2 = Quantity(0.0, max(variance, _LOW[2] ** 2))
+    # DSNU comes from the stack's average, or from the histograms where rounding biases the average.
+    single = read_DN2.value + K_DN_per_e * rate * stack.exposure_s + rounding
+    if foreign and data.dark_seen is not None:
+        single = float(np.average(data.dark_seen.variance_DN2, weights=data.dark_seen.dof))
+    offsets = dsnu(stack.mean_DN, single / stack.frames, in_pairs**2 / stack.frames, rules.defect_sigma)
     if not white:
         pixels, sigma = stack.mean_DN.size, float(np.hypot(fit.cov[3, 3] ** 0.5, 0.0 if resolved else rounding))
         offsets = replace(offsets, variance=spread2, sigma=sigma, samples=pixels, mean_variance=spread2 / pixels)
     black, levels_cov, current = _levels(data, fit, in_pairs**2, single, offsets)
-    variance = float(fit.cov[2, 2])
-    read_DN2 = Quantity(read, variance) if read > 1.001 * _LOW[2] else Quantity(0.0, max(variance, _LOW[2] ** 2))
     DSNU2 = Quantity.asked("DSNU", offsets.variance, offsets.sigma**2, offsets.samples)
-    return DarkTerms(K_DN_per_e, black, current, levels_cov, read_DN2, shape, row, DSNU2, white, fit, offsets)
+    return DarkTerms(K_DN_per_e, black, current, levels_cov, read_DN2, shape, row, DSNU2, white, foreign, fit, offsets)
 
 
 def _levels(
@@ -276,9 +267,12 @@ def _levels(
         means, times = np.append(means, offsets.mean), np.append(times, stack.exposure_s)
         rows = row_DN2 / len(stack.mean_DN)
         variances = np.append(variances, (single_DN2 / stack.mean_DN.size + rows) / stack.frames)
-    design = np.column_stack([np.ones_like(times), times])
+    # One exposure time does not tell dark current from black: all is black, and all of it may be dark current.
+    apart = bool(np.ptp(times) > 0)
+    design = np.column_stack([np.ones_like(times), times * apart])
     cov = scaled_inverse(design.T @ (design / variances[:, None]))
     line = cov @ (design.T @ (means / variances))
+    cov[1, 1] = cov[1, 1] if apart else (line[0] / max(float(times[0]), 1e-6)) ** 2
     current = Quantity.asked("dark current", float(line[1]), float(cov[1, 1]), data.dark_samples)
     # The offsets of this sensor's pixels are one draw: their mean is not that of all sensors alike.
     cov[0, 0] += offsets.mean_variance

@@ -41,6 +41,9 @@ class NoiseRules:
         most_bent: fraction of the signal missing at full scale above which a quadratic does not describe the response.
         levels: fewest exposures of a photon transfer curve.
         gain_sigma: least gain in units of its sigma; quotients by a less certain gain have no symmetric error.
+        foreign_sigma: read noise whose measured variance is farther from the fitted distribution's, in sigma, has
+            none of the family's distributions.
+        most_hits: fraction of pixels that radiation hits at most in a dark pair.
         worst_chi2: reduced chi-squared above which the sensor is not what the model says.
     """
 
@@ -56,6 +59,8 @@ class NoiseRules:
     most_bent: float = 0.24
     levels: int = 3
     gain_sigma: float = 10.0
+    foreign_sigma: float = 3.0
+    most_hits: float = 1e-4
     worst_chi2: float = 6.0
 
 
@@ -135,7 +140,11 @@ class NoiseData:
 def loaded(frame: Frame, shape: tuple[int, ...] | None = None) -> Codes:
     """A frame as codes; a FitError where it is not a picture of codes, or differs from ``shape``."""
     array = frame() if callable(frame) else frame
-    if not isinstance(array, np.ndarray) or array.dtype not in (np.uint8, np.uint16) or array.ndim != 2:
+    if (
+        not isinstance(array, np.ndarray)
+        or array.dtype.newbyteorder("=") not in (np.uint8, np.uint16)
+        or array.ndim != 2
+    ):
         found = f"{array.dtype} of shape {array.shape}" if isinstance(array, np.ndarray) else type(array).__name__
         raise FitError(f"Expected a frame as uint8 or uint16 array of rows x columns, found {found}. Pass raw codes.")
     if min(array.shape) < _LEAST_SIDE or max(array.shape) > _MOST_SIDE:

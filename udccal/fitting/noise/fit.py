@@ -171,7 +171,8 @@ def _assembled(data: NoiseMoments, dark: DarkTerms, curve: Curve, rules: NoiseRu
     PRNU2 = Quantity.asked("PRNU", uneven.variance, uneven.sigma**2, uneven.samples)
     values, cov = _values(data, dark, curve, saturation, PRNU2)
     bent_too_far = abs(float(fit.values[2])) * max(curve.ceiling_DN - dark.black_DN, 1.0) >= 0.999 * rules.most_bent
-    status = FitStatus.CONVERGED if dark.fit.converged and fit.converged else FitStatus.NOT_CONVERGED
+    converged = fit.converged and (dark.fit.converged or dark.foreign)
+    status = FitStatus.CONVERGED if converged else FitStatus.NOT_CONVERGED
     if fit.chi2_dof > rules.worst_chi2 or bent_too_far:
         status = FitStatus.POOR_FIT
     shown = len(NAMES) - (not fit.order.curved)
@@ -203,7 +204,7 @@ def _assembled(data: NoiseMoments, dark: DarkTerms, curve: Curve, rules: NoiseRu
             Diagnostic("dark_samples_outside_histogram", float(outside), "1"),
             Diagnostic("edge_gain", float(np.sqrt(np.mean(dark.fit.edge_gains**2))), "1"),
         ),
-        notes=tuple(_notes(dark, curve, values, bent_too_far)),
+        notes=tuple(_notes(data, dark, curve, values, bent_too_far)),
         outliers=tuple(one for one in _outliers(data, dark, curve, float(values[2]), uneven, rules) if one.count),
         residuals=residual_sample(places[np.nonzero(used)[1]], fit.variance_z[used]),
         posterior=Posterior.from_cov(values[:-1], cov[:-1, :-1], _term),
@@ -265,11 +266,20 @@ def _outliers(
         yield Outliers(rule, found.outliers, places)
 
 
-def _notes(dark: DarkTerms, curve: Curve, values: Float[np.ndarray, "11"], bent_too_far: bool) -> Iterable[str]:
+def _notes(
+    data: NoiseMoments, dark: DarkTerms, curve: Curve, values: Float[np.ndarray, "11"], bent_too_far: bool
+) -> Iterable[str]:
     if not curve.full.any():
         yield f"No flat reached saturation; the converter's largest code, {values[2]:.0f} DN, is taken for it."
     if not dark.white:
         yield "Rounding or cut-off codes bend the dark codes; black and DSNU come from the histograms."
+    if len({pair.exposure_s for pair in data.darks}) < 2:
+        yield "Dark frames of one exposure time do not tell dark current from black: black holds both."
+    if dark.foreign:
+        yield (
+            "Read noise has another distribution than those of the model (heavy tails, or some pixels far noisier than "
+            "others): sigma_d is the root mean square of all pixels, and lambda_read only the nearest shape."
+        )
     if curve.fit.order.curved:
         yield f"The response bends: {100 * values[-1]:.2g} % of the signal is missing at full scale."
     if bent_too_far:

@@ -11,9 +11,10 @@ from scipy.special import ndtri
 
 from udccal.fitting.engine.orders import Choice
 from udccal.fitting.engine.robust import OutlierRule, robust_sigma
-from udccal.fitting.noise.dark import DarkTerms, excess_kurtosis
+from udccal.fitting.noise.dark import DarkTerms
 from udccal.fitting.noise.data import NoiseRules
 from udccal.fitting.noise.moments import Moments, NoiseMoments
+from udccal.fitting.noise.read_noise import excess_kurtosis
 from udccal.fitting.noise.transfer import DarkVariance, Levels, TransferFit, robust_transfer
 
 Bins = Bool[np.ndarray, "flats bins"]
@@ -115,7 +116,8 @@ def _dark_variance(data: NoiseMoments, dark: DarkTerms) -> DarkVariance:
     total = read.value + dark.row_DN2.value + rounding + K * drift
     points = [(read.value, read.variance**0.5, float(np.average(drift, weights=1 / total**2)))]
     seen = data.dark_seen
-    if seen is not None and dark.white:
+    # Hits were left out of the stack: where tails of the noise were taken for hits, it shows too little.
+    if seen is not None and dark.white and not dark.foreign:
         observed = float(np.average(seen.variance_DN2, weights=seen.dof))
         # The tails are the read noise's: rounding and counts of dark current have hardly any.
         excess = excess_kurtosis(dark.shape.value) if dark.shape.there else 0.0

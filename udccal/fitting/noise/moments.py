@@ -48,7 +48,8 @@ class Moments:
     ``dof`` its degrees of freedom; ``samples`` are frames times pixels; ``spread_DN`` is the standard deviation over
     these, spatial and temporal; ``shift_DN`` is the mean of each frame less that of all. ``rows_DN2`` is the variance
     of the rows' means, and ``sampling_DN2`` the part of it that is sampling; frames have ``height`` rows. ``at_peak``
-    is the fraction of the samples with the largest code. ``outliers`` were hits, and left out.
+    is the fraction of the samples with the largest code. ``outliers`` were hits, and left out; ``outlier_powers`` are
+    the sums of the second and fourth powers of their differences from the first frame.
     """
 
     exposure_s: float
@@ -65,6 +66,7 @@ class Moments:
     peak_DN: int
     at_peak: float
     outliers: int
+    outlier_powers: tuple[float, float]
 
     @property
     def frames(self) -> int:
@@ -79,7 +81,8 @@ def reduce_frames(
     source = iter(frames)
     first = next(source)
     down, right = bins(*first.shape, period)
-    counts, total, outliers = np.outer(down.sum(axis=1), right.sum(axis=0)), np.zeros(first.shape, np.float32), 0
+    counts, total = np.outer(down.sum(axis=1), right.sum(axis=0)), np.zeros(first.shape, np.float32)
+    outliers, powers = 0, np.zeros(2)
     # The first frame's difference from itself is zero.
     by_row, peaks = [np.zeros((len(first), right.shape[1]))], [_peak(first)]
     squares = np.zeros_like(by_row[0])
@@ -90,8 +93,9 @@ def reduce_frames(
         usual = np.median(square[:: max(len(first) // 128, 1)] @ right, axis=0) / right.sum(axis=0)
         hits = square > max(rules.hit_sigma**2 * float(usual.max()), 10.0**2)
         if count := int(np.count_nonzero(hits)):
+            large = square[hits].astype(np.float64)
+            outliers, powers = outliers + count, powers + np.array([large.sum(), np.square(large).sum()])
             difference[hits] = square[hits] = 0.0
-            outliers += count
         total += difference
         squares += square @ right
         by_row.append(np.asarray(difference @ right, dtype=np.float64))
@@ -118,6 +122,7 @@ def reduce_frames(
         peak_DN=peak,
         at_peak=sum(count for code, count in peaks if code == peak) / (number * first.size),
         outliers=outliers,
+        outlier_powers=(float(powers[0]), float(powers[1])),
     )
 
 
@@ -209,6 +214,16 @@ def _converter_top(peak: int, declared: int | None, q_DN: int) -> int:
     return declared
 
 
+def _check_levels(flats: Sequence[Moments], darks: Sequence[Moments]) -> None:
+    """A FitError where levels hold the same frames: moments of different frames never agree in all digits."""
+    for name, levels in (("bright", flats), ("dark", darks)):
+        # Frames of one code throughout, as in saturation, may agree.
+        varied = [of.mean_DN.tobytes() + of.variance_DN2.tobytes() for of in levels if of.variance_DN2.any()]
+        if len(set(varied)) < len(varied):
+            expected = f"Expected other {name} frames in each level, found the same frames in several"
+            raise FitError(f"{expected}. Each would count as a new measurement. Give each pair once.")
+
+
 @final
 @dataclass(frozen=True)
 class NoiseMoments:
@@ -254,7 +269,9 @@ def reduced(data: NoiseData, rules: NoiseRules) -> NoiseMoments | None:
 
     def dark(level: ExposureLevel) -> tuple[DarkPair, Moments]:
         first, second = (loaded(frame, sample.shape) for frame in level.dark)
-        _converter_top(int(np.median(first[::64])), top, q_DN)
+        if (middle := float(np.median(first[::64]))) > brightest:
+            found = f"dark frames of {middle:.4g} DN and bright ones of at most {brightest:.4g} DN"
+            raise FitError(f"Expected dark frames darker than bright ones, found {found}. They may be exchanged.")
         return dark_pair(first, second, level.exposure_s, q_DN, top), moments((first, second), level.exposure_s)[1]
 
     def average(frames: Sequence[Frame] | Averaged, stack: SpatialStack) -> tuple[Averaged, Moments | None]:
@@ -265,8 +282,10 @@ def reduced(data: NoiseData, rules: NoiseRules) -> NoiseMoments | None:
         tasks = [pool.submit(average, frames, stack) for frames in (stack.dark, stack.bright)] if stack else []
         flats = tuple(pool.map(lambda level: moments(level.bright, level.exposure_s, level.photons)[1], brights))
         top = _converter_top(max(flat.peak_DN for flat in flats), data.top_code, q_DN)
+        brightest = max(float(flat.mean_DN.mean()) for flat in flats)
         histograms, dark_moments = zip(*pool.map(dark, darks), strict=True)
         stacks = [task.result() for task in tasks]
+    _check_levels(flats, dark_moments)
     if not stacks:
         means = np.array([flat.mean_DN.mean() for flat in flats])
         middle = brights[int(np.argmin(np.abs(means - 0.5 * min(means.max(), top))))]

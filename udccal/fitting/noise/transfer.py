@@ -213,7 +213,7 @@ def _fitted(problem: TransferProblem, start: Five) -> Attempt[TransferFit]:
     scatter2 = problem.scatter2(relative[levels.responding])
     variance_z = np.where(levels.usable, (levels.variance_DN2 / variance - 1) * np.sqrt(levels.dof / 2), np.nan)
     spread2 = np.where(levels.responding, levels.brightness_variance + scatter2, np.inf)
-    level_z = np.where(levels.responding, relative / np.sqrt(spread2), np.nan)
+    level_z = np.where(levels.responding, np.nan_to_num(relative) / np.sqrt(spread2), np.nan)
     converged = bool(found.converged and np.isfinite(x).all() and np.isfinite(cov).all() and np.isfinite(cost))
     parameters = order.curved + order.offset + order.unsteady
     criterion = bic(cost, float(parameters), int(levels.dof[levels.usable].sum())) if converged else np.inf

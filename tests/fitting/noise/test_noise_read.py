@@ -1,0 +1,102 @@
+"""Read noise that none of the fitted distributions describes, and frames given in other ways than meant."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.scenes.noise import ToySensor, measure
+from udccal.errors import FitError
+from udccal.fitting.noise.data import ExposureLevel, NoiseData, NoiseRules
+from udccal.fitting.noise.fit import fit_noise
+from udccal.fitting.noise.moments import reduced
+from udccal.fitting.noise.read_noise import measured_variance
+from udccal.result import FitResult, FitStatus
+
+SENSOR = ToySensor(rows=192, columns=256, lambda_read=None, row_DN=0.0, bend=0.0, DSNU_e=1.0)
+NOISES = {
+    "normal": (SENSOR, 4.0),
+    "Student t, 4": (replace(SENSOR, other_noise=lambda rng, size: rng.standard_t(4, size) / np.sqrt(2)), 4.0),
+    "Student t, 8": (replace(SENSOR, other_noise=lambda rng, size: rng.standard_t(8, size) / np.sqrt(8 / 6)), 4.0),
+    "Laplace": (replace(SENSOR, other_noise=lambda rng, size: rng.laplace(size=size) / np.sqrt(2)), 4.0),
+    "even": (replace(SENSOR, other_noise=lambda rng, size: rng.uniform(-(3**0.5), 3**0.5, size)), 4.0),
+    "telegraph": (replace(SENSOR, telegraph=0.05), 4.0 * (1 + 0.05 * 8) ** 0.5),
+}
+
+
+def estimate(result: FitResult, name: str) -> tuple[float, float]:
+    return next((one.value, one.sigma) for one in result.estimates if one.name == name)
+
+
+@pytest.mark.parametrize("name", NOISES)
+def test_any_read_noise_has_its_variance_within_sigma_or_a_note(name: str) -> None:
+    sensor, truth = NOISES[name]
+    for seed in range(2):
+        result = measure(sensor, seed)
+        assert result.status is FitStatus.CONVERGED
+        value, sigma = estimate(result, "sigma_d_e")
+        # The fraction of telegraph pixels is itself drawn.
+        drawn = truth * 0.5 * 8 * (0.05 * 0.95 / (192 * 256)) ** 0.5 / 1.4 if name == "telegraph" else 0.0
+        assert abs(value - truth) < 4.5 * np.hypot(sigma, drawn)
+        assert sigma < 0.012 * truth
+        dsnu, dsnu_sigma = estimate(result, "DSNU1288_e")
+        assert abs(dsnu - sensor.DSNU_e) < 4.5 * dsnu_sigma + 0.02
+        assert abs(estimate(result, "K_DN_per_e")[0] / 0.36 - 1) < 0.01
+        noted = any("another distribution" in note for note in result.notes)
+        assert noted == (name in ("Student t, 4", "telegraph")) or name in ("Student t, 8", "Laplace", "even")
+
+
+def pair(rng: np.random.Generator, electrons: float, kind: str = "<u2") -> tuple[np.ndarray, np.ndarray]:
+    counts = rng.poisson(electrons, (2, 96, 128))
+    first, second = np.rint(64 + 0.36 * (counts + 4 * rng.standard_normal(counts.shape))).astype(kind)
+    return first, second
+
+
+def levels(exposures_s: np.ndarray, kind: str = "<u2", seed: int = 0) -> list[ExposureLevel]:
+    rng = np.random.default_rng(seed)
+    return [ExposureLevel(float(t), pair(rng, 0.0, kind), pair(rng, 1e5 * t, kind)) for t in exposures_s]
+
+
+def test_bytes_may_lie_either_way_round() -> None:
+    times = np.linspace(0.005, 0.05, 6)
+    results = [fit_noise(NoiseData(levels(times, kind), top_code=4095)) for kind in ("<u2", ">u2")]
+    assert estimate(results[0], "K_DN_per_e") == estimate(results[1], "K_DN_per_e")
+
+
+def test_dark_and_bright_frames_exchanged_are_named() -> None:
+    swapped = [ExposureLevel(one.exposure_s, one.bright, one.dark) for one in levels(np.linspace(0.005, 0.05, 6))]
+    with pytest.raises(FitError, match="exchanged"):
+        fit_noise(NoiseData(swapped))
+
+
+def test_a_pair_given_twice_is_refused() -> None:
+    once = levels(np.linspace(0.005, 0.05, 6))
+    with pytest.raises(FitError, match="same frames"):
+        fit_noise(NoiseData([*once, once[2]]))
+
+
+def test_one_exposure_time_does_not_tell_dark_current_from_black() -> None:
+    for exposure_s in (0.0, 0.02):
+        rng = np.random.default_rng(3)
+        same = [ExposureLevel(exposure_s, pair(rng, 0.0), pair(rng, e)) for e in (500, 1000, 2000, 4000, 8000)]
+        result = fit_noise(NoiseData(same, top_code=4095))
+        assert any("dark current" in note for note in result.notes)
+        for name, truth in (("K_DN_per_e", 0.36), ("sigma_d_e", 4.0), ("black_DN", 64.0)):
+            value, sigma = estimate(result, name)
+            assert abs(value - truth) < 4.5 * sigma
+            assert sigma < 0.02 * truth
+
+
+def test_measured_variance_leaves_out_hits_of_radiation() -> None:
+    data = levels(np.linspace(0.005, 0.05, 6))
+    clean = reduced(NoiseData(data, top_code=4095), NoiseRules())
+    for level in data:
+        level.dark[0][7, 9] = 4000
+    hit = reduced(NoiseData(data, top_code=4095), NoiseRules())
+    assert clean is not None
+    assert hit is not None
+    few, many = (measured_variance(hit, 0.0, 1 / 12, most) for most in (1e-3, 1e-5))
+    assert few.value == pytest.approx(measured_variance(clean, 0.0, 1 / 12, 1e-3).value, rel=1e-3)
+    assert many.value > 2 * few.value
