@@ -60,7 +60,7 @@ class BackscatterPredictor:
         self._by_sample = bins.variance(one).reshape(3, -1)[:, flat]
         self._by_row = bins.row_variance(one).reshape(3, -1)[:, flat]
         shown = _pictures(state)
-        at = Windows.around(template, theta, rays, shown.crop)
+        at = Windows.around(template, theta, rays)
         self._ratio, jacobian = ratios_and_jacobian(template, theta, at, shown)
         self._jacobian = jacobian * linear_slope(self._x)[:, None, None, None]
 

@@ -67,7 +67,7 @@ def ideal_of(of: World, expected: BackscatterData, flat: np.ndarray, template: B
     seen = expected.shots.at(flat)
     weight = seen.weights(seen.rate, seen.rate[0], 0.0, seen.usable)
     problem = Problem(template, seen, expected.pictures, rays, flat, prior, of.x, RULES)
-    errors_at = problem.errors_at(weight, Windows.around(template, theta, rays, expected.crop))
+    errors_at = problem.errors_at(weight, Windows.around(template, theta, rays))
     jacobian = errors_at(of.x)[1] / linear_slope(of.x)
     cov = np.linalg.inv(jacobian.T @ jacobian + np.diag((prior.sigma * linear_slope(of.x)) ** -2.0))
     used = np.ones(len(seen.rate), dtype=bool)

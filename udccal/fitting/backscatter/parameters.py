@@ -11,9 +11,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import final
 
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float
 
 from udccal.fitting.engine.gaussian import Prior
 from udccal.fitting.engine.least_squares import SolverRules
@@ -252,12 +251,16 @@ def vector_of(term: Backscatter) -> Vector:
     return np.where(_LOGARITHMIC, np.log(np.maximum(x, 1e-6)), x)
 
 
-def with_linear(term: Backscatter, theta: Float[Array, "18"]) -> Backscatter:
+def emitters_of(theta: Vector) -> Float[np.ndarray, "3 2"]:
+    """Return the place of each primary's emitter from the centre of its pixel, in panel px."""
+    return theta[OFFSET] + np.insert(theta[EMITTERS].reshape(2, 2), 1, 0.0, axis=0)
+
+
+def with_linear(term: Backscatter, theta: Vector) -> Backscatter:
     """Return the term with parameters of ``linear_of``."""
-    offset = theta[OFFSET]
-    distance, pupil, softness, _, depth = jnp.exp(theta[1:6])
-    reflected = jnp.minimum(theta[REFLECTION], 1 - 1e-9)
-    mix = jnp.eye(3, dtype=theta.dtype).at[OFF_DIAGONAL].set(theta[MIX])
+    distance, pupil, softness, _, depth = np.exp(theta[1:6])
+    reflected, mix = np.minimum(theta[REFLECTION], 1 - 1e-9), np.eye(3)
+    mix[OFF_DIAGONAL] = theta[MIX]
     return replace(
         term,
         gamma=theta[0],
@@ -266,6 +269,6 @@ def with_linear(term: Backscatter, theta: Float[Array, "18"]) -> Backscatter:
         softness_px=softness,
         reflection=reflected / (1 - reflected),
         reflection_mm=depth,
-        emitters_px=jnp.stack([offset + theta[8:10], offset, offset + theta[10:12]]),
+        emitters_px=emitters_of(theta),
         mix=mix / mix.sum(axis=1, keepdims=True),
     )

@@ -14,7 +14,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import final
 
-import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
@@ -25,10 +24,12 @@ from udccal.fitting.backscatter.model import (
     Pictures,
     Profile,
     Rays,
+    Shares,
     Usable,
     Windows,
     ratios,
     ratios_and_jacobian,
+    ratios_of,
     window_for,
 )
 from udccal.fitting.backscatter.parameters import (
@@ -51,7 +52,6 @@ from udccal.rig import RigDescription
 
 # Interpolation never combines bins at this distance.
 _TILE = 4
-_with_linear = jax.jit(with_linear)
 # Parameters in the solver's coordinates to whitened errors and their Jacobian.
 ErrorsAt = Callable[[Vector], tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m 18"]]]
 
@@ -166,10 +166,14 @@ class Problem:
         seen, shown, start = data.shots.at(flat), data.pictures, prior.mean.copy()
         weight = seen.first_weights()
 
+        theta = linear_of(start)
+        at = Windows.around(template, theta, rays)
+        shares, panel = Shares.of(template, theta, at), shown.light(float(theta[0]))[0]
+
         def cost(offset: tuple[int, int]) -> float:
-            start[OFFSET] = offset
-            at = Windows.around(template, linear_of(start), rays, shown.crop)
-            return seen.profile(ratios(template, linear_of(start), at, shown), weight).chi2
+            # An offset of whole pixels leaves the shares as they are.
+            moved = replace(shares, panel_px=shares.panel_px - offset)
+            return seen.profile(ratios_of(theta, moved.light(shown, panel)), weight).chi2
 
         across, down = (range(-int(np.ceil(reach)), int(np.ceil(reach)) + 1) for reach in prior.sigma[OFFSET])
         start[OFFSET] = min(((x, y) for y in down for x in across), key=cost)
@@ -178,7 +182,7 @@ class Problem:
     def solved(self, order: Order, x: Vector, weight: PerShot) -> Fitted:
         """Solve for the most probable parameters of an order at given weights, from ``x`` on."""
         start = order.start(x, self.prior)
-        at = Windows.around(self.template, linear_of(start), self.rays, self.shown.crop)
+        at = Windows.around(self.template, linear_of(start), self.rays)
         found = most_probable(self.errors_at(weight, at), start, order.free, self.prior, self.rules.solver)
         ratio = ratios(self.template, linear_of(found.x), at, self.shown)
         return Fitted(order, found, at, ratio, self.seen.profile(ratio, weight))
@@ -232,14 +236,12 @@ class TermAt:
         mask = mask + sigma * np.tile(noise, (-(-rows // _TILE), -(-columns // _TILE)))[:rows, :columns]
         if (moved := theta - self.theta).any():
             mask = mask + np.einsum("k,kcij->cij", moved, self._mask_jacobian)
-        with_parameters = _with_linear(self.template, theta)
-        term = jax.tree.map(lambda leaf: np.asarray(leaf, dtype=np.float64), with_parameters)
-        return replace(term, geometry=self.template.geometry, mask=np.maximum(mask, 0.0))
+        return replace(with_linear(self.template, theta), mask=np.maximum(mask, 0.0))
 
     @functools.cached_property
     def _mask(self) -> tuple[Float[np.ndarray, "3 a b"], Float[np.ndarray, "3 a b"]]:
         """Light of white over the whole grid, and its sigma with a random sign, in e-/s."""
-        found = [self._best(flat)[1] for flat in self._parts(4096)]
+        found = [self._best(flat)[1] for flat in self._parts(512)]
         mask = np.concatenate([one.mask for one in found], axis=1)
         sigma = np.concatenate([np.maximum(one.information, 1e-30) for one in found], axis=1) ** -0.5
         sign = np.random.default_rng(0).choice([-1.0, 1.0], mask.shape)
@@ -264,7 +266,7 @@ class TermAt:
     def _best(self, flat: Int[np.ndarray, " n"]) -> tuple[Windows, Profile]:
         """Return windows, mask and dark signal: first with the data's weights, then with the model's."""
         rays = grid_rays(self.template.geometry, self.data.shots.rate.shape[2:], self.template.step, flat)
-        at = Windows.around(self.template, self.theta, rays, self.data.crop)
+        at = Windows.around(self.template, self.theta, rays)
         seen = self.data.shots.at(flat)
         usable = seen.usable & self.used[:, None, None]
         ratio = ratios(self.template, self.theta, at, self.data.pictures)
