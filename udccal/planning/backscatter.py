@@ -17,6 +17,7 @@ from udccal.displays.pictures import face_picture
 from udccal.fitting.backscatter.data import Binned, grid_step, sampled_rays, visible_crop
 from udccal.fitting.backscatter.model import PerBin, Pictures, Windows, ratios_and_jacobian, window_for
 from udccal.fitting.backscatter.parameters import BackscatterRules, linear_of, linear_slope, prior_of, vector_of
+from udccal.fitting.backscatter.solve import Profile
 from udccal.fitting.bins import Bins
 from udccal.fitting.engine.least_squares import Blocks
 from udccal.fitting.nominal import nominal_backscatter
@@ -89,7 +90,7 @@ class BackscatterPredictor:
         weight = seen.weights(seen.rate, self._mask, error, seen.usable)
         weight[_SHOWN] *= np.sqrt(pictures / len(weight[_SHOWN]))
         weight[_NEW] = 0.0
-        profile = seen.profile(self._ratio, weight)
+        profile = Profile.of(seen, self._ratio, weight)
         jacobian = np.sqrt(count) * profile.jacobian(self._jacobian).reshape(len(self._x), -1).T
         equations = Blocks.of_errors(np.zeros(len(jacobian)), jacobian).with_prior(self._prior, self._x)
         cov = equations.cov() * self._state.model_errors.inflation

@@ -25,7 +25,7 @@ from tests.scenes.backscatter import (
     world,
 )
 from udccal.fitting.backscatter.data import BackscatterData, grid_rays
-from udccal.fitting.backscatter.fit import result_of
+from udccal.fitting.backscatter.fit import TermAt, result_of
 from udccal.fitting.backscatter.model import Windows
 from udccal.fitting.backscatter.orders import moments_along_reflection, search
 from udccal.fitting.backscatter.parameters import (
@@ -36,7 +36,7 @@ from udccal.fitting.backscatter.parameters import (
     linear_slope,
     prior_of,
 )
-from udccal.fitting.backscatter.solve import Problem, TermAt, most_probable
+from udccal.fitting.backscatter.solve import Problem, most_probable
 from udccal.fitting.engine.gaussian import Posterior
 from udccal.models.backscatter import Backscatter
 from udccal.numerics import in_float64

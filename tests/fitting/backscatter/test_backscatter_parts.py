@@ -31,7 +31,7 @@ from udccal.fitting.backscatter.parameters import (
     vector_of,
     with_linear,
 )
-from udccal.fitting.backscatter.solve import Fitted, MostProbable, Problem
+from udccal.fitting.backscatter.solve import Fitted, MostProbable, Problem, Profile
 from udccal.fitting.nominal import nominal_backscatter, nominal_geometry
 from udccal.models.backscatter import emitter_shares, panel_response, response_grid, window_corners
 from udccal.models.geometry import panel_directions
@@ -151,7 +151,7 @@ def test_a_term_has_the_parameters_that_made_it() -> None:
 def test_mask_and_dark_are_those_of_least_squares() -> None:
     ratio, seen = _seen()
     weight = _weights(seen)
-    best = seen.profile(ratio, weight)
+    best = Profile.of(seen, ratio, weight)
     for c, n in np.ndindex(best.mask.shape):
         rows = np.stack([ratio[:, c, n], 1 / seen.exposure_s], axis=1) * weight[:, c, n, None]
         found, *_ = np.linalg.lstsq(rows, seen.rate[:, c, n] * weight[:, c, n], rcond=None)
@@ -162,19 +162,19 @@ def test_mask_and_dark_are_those_of_least_squares() -> None:
 def test_the_mask_follows_ratios_as_said() -> None:
     ratio, seen = _seen()
     weight = _weights(seen)
-    best = seen.profile(ratio, weight)
+    best = Profile.of(seen, ratio, weight)
     expected = replace(seen, rate=best.mask * ratio)
     way = np.random.default_rng(1).normal(size=(2, *ratio.shape))
     found = best.mask_jacobian(way)
     for k in range(2):
-        up, down = (expected.profile(ratio + sign * 1e-6 * way[k], weight).mask for sign in (1, -1))
+        up, down = (Profile.of(expected, ratio + sign * 1e-6 * way[k], weight).mask for sign in (1, -1))
         np.testing.assert_allclose(found[k], (up - down) / 2e-6, rtol=1e-4, atol=1e-3)
 
 
 def test_whitened_errors_are_at_right_angles_to_mask_and_dark() -> None:
     ratio, seen = _seen()
     weight = _weights(seen)
-    best = seen.profile(ratio, weight)
+    best = Profile.of(seen, ratio, weight)
     errors = best.errors * weight
     jacobian = best.jacobian(np.random.default_rng(1).normal(size=(2, *ratio.shape)))
     for way in (ratio * weight, (1 / seen.exposure_s)[:, None, None] * weight):
@@ -192,7 +192,7 @@ def test_a_typical_error_is_that_of_most_pictures() -> None:
 
     def error_of(ratios_of: np.ndarray) -> float:
         at = Windows(np.zeros((60, 3)), np.zeros((60, 2), dtype=np.int64))
-        best = seen.profile(ratios_of, _weights(seen))
+        best = Profile.of(seen, ratios_of, _weights(seen))
         return typical_error(Fitted(TWO_PLANES, nothing, at, ratios_of, best), seen)
 
     assert error_of(ratio) < 0.004

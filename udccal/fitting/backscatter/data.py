@@ -18,7 +18,6 @@ from udccal.fitting.backscatter.model import (
     PerBin,
     PerShot,
     Pictures,
-    Profile,
     Rays,
     Usable,
     Windows,
@@ -102,10 +101,6 @@ class Binned:
         rate = np.maximum(self.excess, 0.0) + self.shot
         rate[-1] = 0.0
         return self.weights(rate, np.zeros(rate.shape[1:]), 0.0, self.usable)
-
-    def profile(self, ratio: PerShot, weight: PerShot) -> Profile:
-        """Return the most probable mask and dark signal."""
-        return Profile.of(ratio, self.rate, self.exposure_s[-1] / self.exposure_s, weight)
 
 
 @final

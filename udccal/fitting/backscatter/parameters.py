@@ -27,9 +27,8 @@ NAMES = (
 )  # fmt: skip
 UNITS = ("1", "mm", "mm", "px", "1", "mm", *["px"] * 6, *["1"] * 6)
 DISTANCE, PUPIL, SOFTNESS, REFLECTION, DEPTH = range(1, 6)
-# Offset of the green emitters from the centres of their pixels, and of red and blue from green; crosstalk. PLACES are
-# the parameters that determine the footprints' places and shapes.
-OFFSET, EMITTERS, MIX, PLACES = slice(6, 8), slice(8, 12), slice(12, 18), slice(1, 12)
+# Offset of the green emitters from the centres of their pixels, and of red and blue from green; crosstalk.
+OFFSET, EMITTERS, MIX = slice(6, 8), slice(8, 12), slice(12, 18)
 # Rows and columns of the crosstalk in the mix.
 OFF_DIAGONAL = np.nonzero(~np.eye(3, dtype=bool))
 _LOGARITHMIC = np.isin(np.arange(18), np.r_[1:6, 12:18])
@@ -211,13 +210,10 @@ class Moments:
 
 
 def linear_of(x: Vector) -> Vector:
-    """Return the parameters in coordinates in which light is close to linear.
+    """Return the parameters in coordinates in which light is close to linear, from the solver's.
 
     ``reflection`` becomes the reflected fraction of all light, and crosstalk itself replaces its logarithm: both are 0
-    where absent. All others are as in ``x``.
-
-    Args:
-        x: the solver's coordinates, in the order of ``NAMES``; lengths (mm) and softness (panel px) are logarithms.
+    where absent. All others are as in ``x``: lengths (mm) and softness (panel px) are logarithms.
     """
     theta, values = np.array(x, dtype=np.float64), values_of(x)
     theta[REFLECTION] = values[REFLECTION] / (1 + values[REFLECTION])
@@ -226,11 +222,7 @@ def linear_of(x: Vector) -> Vector:
 
 
 def linear_slope(x: Vector) -> Vector:
-    """Return the derivative of each number of ``linear_of`` by its own solver's coordinate.
-
-    Args:
-        x: the solver's coordinates, in the order of ``NAMES``.
-    """
+    """Return the derivative of each number of ``linear_of`` by its own solver's coordinate."""
     theta, slope = linear_of(x), np.ones(len(NAMES))
     slope[REFLECTION] = theta[REFLECTION] * (1 - theta[REFLECTION])
     slope[MIX] = theta[MIX]
@@ -238,11 +230,7 @@ def linear_slope(x: Vector) -> Vector:
 
 
 def vector_of(term: Backscatter) -> Vector:
-    """Return the solver's coordinates of a term, in the order of ``NAMES``; logarithms use 1e-6 for 0.
-
-    Args:
-        term: with lengths in mm, and places in panel px.
-    """
+    """Return the solver's coordinates of a term (mm, panel px), in the order of ``NAMES``; 1e-6 has the place of 0."""
     emitters, mix = np.asarray(term.emitters_px), np.asarray(term.mix)
     lengths = (term.standoff_mm, term.pupil_diameter_mm, term.softness_px, term.reflection, term.reflection_mm)
     places = (emitters[1], emitters[0] - emitters[1], emitters[2] - emitters[1])
