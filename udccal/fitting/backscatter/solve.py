@@ -19,6 +19,7 @@ from jaxtyping import Bool, Float, Int
 from udccal.fitting.backscatter.data import BackscatterData, Binned, grid_step, sampled_rays
 from udccal.fitting.backscatter.model import (
     Moves,
+    PerBin,
     PerShot,
     Pictures,
     Rays,
