@@ -22,7 +22,7 @@ from udccal.fitting.bins import Bins
 from udccal.fitting.engine.least_squares import Blocks
 from udccal.fitting.nominal import nominal_backscatter
 from udccal.numerics import in_float64
-from udccal.planning.predictor import Floor
+from udccal.planning.design import Floor
 from udccal.planning.state import WHITE, EvenField, RigState, sample_variance_e
 from udccal.planning.steps import PlannedStep, planned_steps, without_pictures
 from udccal.rig import Captures
