@@ -20,7 +20,7 @@ from udccal.fitting.backscatter.model import (
     Pictures,
     Rays,
     Usable,
-    Windows,
+    corners_of,
 )
 from udccal.fitting.backscatter.parameters import BackscatterRules, linear_of, prior_of
 from udccal.fitting.bins import Bins
@@ -236,7 +236,7 @@ def visible_crop(geometry: Geometry, rig: RigDescription) -> PanelCrop:
     edge_x, edge_y = np.linspace(0, camera.columns - 1, 9), np.linspace(0, camera.rows - 1, 9)
     pixels = np.stack(np.meshgrid(edge_x, edge_y), axis=-1).reshape(-1, 2)
     template = nominal_backscatter(geometry, rig, np.zeros((3, 1, 1)), grid_step(rig), window=1)
-    middle = Windows.around(template, linear_of(prior_of(rig).mean), directions(geometry, pixels)).corner
+    middle = corners_of(template, linear_of(prior_of(rig).mean), directions(geometry, pixels))
     first = np.clip(middle.min(axis=0) - room_px, 0, [panel.columns - 8, panel.rows - 8])
     last = np.clip(middle.max(axis=0) + room_px + 1, first + 8, [panel.columns, panel.rows])
     return PanelCrop(int(first[0]), int(first[1]), int(last[0] - first[0]), int(last[1] - first[1]))

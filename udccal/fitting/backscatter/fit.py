@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 
 from udccal.fitting.absent import absent_backscatter
 from udccal.fitting.backscatter.data import BackscatterData, Binned, grid_rays
-from udccal.fitting.backscatter.model import Usable, Windows, ratios, ratios_and_jacobian, window_for
+from udccal.fitting.backscatter.model import Rays, Usable, ratios, ratios_and_jacobian, window_for
 from udccal.fitting.backscatter.orders import BAD_BINS, BAD_PICTURES, Found, residual_pattern, search, value_moments
 from udccal.fitting.backscatter.parameters import (
     DEPTH,
@@ -100,10 +100,7 @@ def result_of(found: Found, data: BackscatterData, rig: RigDescription, clipped:
     moved = np.where(np.isin(np.arange(len(NAMES)), [DISTANCE, PUPIL, DEPTH]), values.mean, 0.0)
     scale[PUPIL] = 1 / footprint_per_pupil(rig)
     cov = (values.cov + (pitch.tolerance / pitch.value) ** 2 * np.outer(moved, moved)) * np.outer(scale, scale)
-    shape = data.shots.rate.shape[2:]
-    rays = grid_rays(template.geometry, shape, template.step, np.arange(shape[0] * shape[1]))
-    window = window_for(template, linear_of(fitted.found.x), rays, slack=0.5)
-    posterior = term_posterior(replace(template, window=window), data, found, rest.inflation)
+    posterior = term_posterior(data, found, rest.inflation)
     status, advice = _status(found)
     # Variance between the frames of a shot over the noise model's, as the median of all shots; 0: unknown.
     known = data.shots.scatter[:-1][np.isfinite(data.shots.scatter[:-1])]
@@ -244,8 +241,8 @@ class TermAt:
         """Derivatives of the mask by the parameters, computed only when the posterior is used."""
         parts = []
         for flat in self._parts(256):
-            at, best = self._best(flat)
-            of_ratio = ratios_and_jacobian(self.template, self.theta, at, self.data.pictures)[1]
+            rays, best = self._best(flat)
+            of_ratio = ratios_and_jacobian(self.template, self.theta, rays, self.data.pictures)[1]
             parts.append(best.mask_jacobian(of_ratio))
         return np.concatenate(parts, axis=2).reshape(-1, *self.data.shots.rate.shape[1:])
 
@@ -254,17 +251,16 @@ class TermAt:
         flat = np.arange(self.data.shots.rate[0, 0].size)
         return np.split(flat, flat[size::size])
 
-    def _best(self, flat: Int[np.ndarray, " n"]) -> tuple[Windows, Profile]:
-        """Return windows, mask and dark signal: first with the data's weights, then with the model's."""
+    def _best(self, flat: Int[np.ndarray, " n"]) -> tuple[Rays, Profile]:
+        """Return rays, mask and dark signal: first with the data's weights, then with the model's."""
         shots, template = self.data.shots, self.template
         rays, seen = grid_rays(template.geometry, shots.rate.shape[2:], template.step, flat), shots.at(flat)
-        at = Windows.around(template, self.theta, rays)
         usable = seen.usable & self.used[:, None, None]
-        ratio = ratios(template, self.theta, at, self.data.pictures)
+        ratio = ratios(template, self.theta, rays, self.data.pictures)
         best = Profile.of(seen, ratio, np.where(usable, seen.first_weights(), 0.0))
         for _ in range(2):
             best = Profile.of(seen, ratio, seen.weights(best.mask * ratio, best.mask, self.model_error, usable))
-        return at, best
+        return rays, best
 
     def posterior(self, cov: Float[np.ndarray, "18 18"]) -> Posterior[Backscatter]:
         """Return the posterior with this covariance of the parameters, and with the mask's noise."""
@@ -275,18 +271,19 @@ class TermAt:
 
 
 @in_float64
-def term_posterior(
-    template: Backscatter, data: BackscatterData, found: Found, inflation: float
-) -> Posterior[Backscatter]:
+def term_posterior(data: BackscatterData, found: Found, inflation: float) -> Posterior[Backscatter]:
     """Return the whole term's posterior: its parameters, the mask that follows them, its noise, and other orders.
 
     The model error of a picture (``model_error_of_white``) is not an error of the term and adds to it.
 
     Args:
-        template, data, found: gives the window; all shots; the chosen order's fit, and the others.
+        data, found: all shots; the chosen order's fit, and the others.
         inflation: factor of the parameters' variance.
     """
     theta, orders, parts = linear_of(found.fitted.found.x), found.orders, []
+    template, shape = found.problem.template, data.shots.rate.shape[2:]
+    rays = grid_rays(template.geometry, shape, template.step, np.arange(shape[0] * shape[1]))
+    template = replace(template, window=window_for(template, theta, rays, slack=0.5))
     for one in orders.tried:
         fit, factor = (found.fitted.found, inflation) if one is orders.best else (one.fit.found, 1.0)
         slope = linear_slope(fit.x)

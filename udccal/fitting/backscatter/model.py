@@ -59,19 +59,6 @@ def _footprints(template: Backscatter, theta: Vector, rays: Rays) -> _Footprints
     return _Footprints(slope / pitch, centre / pitch, (across[:2] - slope[:, :, None] * across[2]) / pitch)
 
 
-class Windows(NamedTuple):
-    """Rays of positions, and (column, row) of the first panel pixel of the window around each one's footprints."""
-
-    rays: Rays
-    corner: Int[np.ndarray, "n 2"]
-
-    @classmethod
-    def around(cls, template: Backscatter, theta: Vector, rays: Rays) -> Windows:
-        """Return windows of the template's width around the footprints of these parameters (``linear_of``)."""
-        middle = _footprints(template, theta, rays).centre.mean(axis=1) - emitters_of(theta).mean(axis=0)
-        return cls(rays, np.round(middle - (template.window - 1) / 2).astype(np.int64))
-
-
 def window_for(template: Backscatter, theta: Vector, rays: Rays, slack: float) -> int:
     """Return the odd number of panel pixels across a window that holds both footprints at every position.
 
@@ -79,12 +66,25 @@ def window_for(template: Backscatter, theta: Vector, rays: Rays, slack: float) -
         template: gives the geometry.
         theta: of ``parameters.linear_of``.
         rays: in panel coordinates.
-        slack: distance that the footprints may move, in panel px.
+        slack: distance between footprints and the window's edge in panel px.
     """
-    at, emitters = _footprints(template, theta, rays), emitters_of(theta)
+    return _window(_footprints(template, theta, rays), theta, 4 * float(np.exp(theta[SOFTNESS])) + slack)
+
+
+def _window(at: _Footprints, theta: Vector, edge_px: Float[np.ndarray, "*n"] | float) -> int:
     reach_px = np.linalg.norm(at.shape, axis=2).max(axis=1) + np.abs(at.centre[:, 1] - at.centre[:, 0]).max(axis=1) / 2
-    spread = np.abs(emitters - emitters.mean(axis=0)).max()
-    return 2 * int(np.ceil(reach_px.max() + spread + 4 * float(np.exp(theta[SOFTNESS])) + slack)) + 1
+    spread = np.abs(emitters_of(theta) - emitters_of(theta).mean(axis=0)).max()
+    return 2 * int(np.ceil((reach_px + edge_px).max() + spread)) + 1
+
+
+def corners_of(template: Backscatter, theta: Vector, rays: Rays) -> Int[np.ndarray, "n 2"]:
+    """Return (column, row) of the first panel pixel of the window around each position's footprints."""
+    return _corners(_footprints(template, theta, rays), theta, template.window)
+
+
+def _corners(at: _Footprints, theta: Vector, window: int) -> Int[np.ndarray, "n 2"]:
+    middle = at.centre.mean(axis=1) - emitters_of(theta).mean(axis=0)
+    return np.round(middle - (window - 1) / 2).astype(np.int64)
 
 
 @final
@@ -156,12 +156,20 @@ class Shares:
     slopes: Float[np.ndarray, "d e"]
 
     @classmethod
-    def of(cls, template: Backscatter, theta: Vector, at: Windows, derivatives: bool = False) -> Shares:
-        """Return ``models.backscatter.emitter_shares`` of each plane; without derivatives ``slopes`` has no rows."""
-        feet, softness, window = _footprints(template, theta, at.rays), float(np.exp(theta[SOFTNESS])), template.window
+    def of(cls, template: Backscatter, theta: Vector, rays: Rays, derivatives: bool = False) -> Shares:
+        """Return ``models.backscatter.emitter_shares`` of each plane; without derivatives ``slopes`` has no rows.
+
+        A window wider than the template's, as only a fit that goes astray needs it, is cut to that.
+        """
+        feet, softness = _footprints(template, theta, rays), float(np.exp(theta[SOFTNESS]))
         inverse, area = np.linalg.inv(feet.shape), np.pi * np.abs(np.linalg.det(feet.shape))
+        # Half width of the soft edge where the ellipse is narrowest, in units of the ellipse.
+        reach = _EDGE_SIGMAS * softness / np.linalg.svd(feet.shape, compute_uv=False)[:, 1]
+        needed = _window(feet, theta, reach * np.linalg.norm(feet.shape, axis=2).max(axis=1) + 0.5)
+        window = min(needed, template.window)
+        corner = _corners(feet, theta, window)
         # The emitter of each window's first pixel, seen from the footprint's centre, in units of the ellipse.
-        first = at.corner[:, None, None] + emitters_of(theta) - feet.centre[:, :, None]
+        first = corner[:, None, None] + emitters_of(theta) - feet.centre[:, :, None]
         first, step = np.einsum("nij,npcj->inpc", inverse, first)[..., None, None], np.arange(window)
         x, y = (
             (first[i] + (inverse[:, i, 1, None] * step)[:, None, None, :, None])
@@ -169,17 +177,15 @@ class Shares:
             for i in (0, 1)
         )
         square = x * x + y * y + 1e-6
-        # Half width of the soft edge where the ellipse is narrowest.
-        reach = (_EDGE_SIGMAS * softness / np.linalg.svd(feet.shape, compute_uv=False)[:, 1])[:, None, None, None, None]
-        inside = np.flatnonzero(square < (1 + reach) ** 2)
+        inside = np.flatnonzero(square < ((1 + reach) ** 2)[:, None, None, None, None])
         row, pixel = np.divmod(inside, window**2)
-        panel_px = at.corner[row // 6] + np.stack([pixel % window, pixel // window], axis=1)
+        panel_px = corner[row // 6] + np.stack([pixel % window, pixel // window], axis=1)
         value, square = (1 / area)[row // 6], square.ravel()[inside]
-        edge = square > (np.maximum(1 - reach, 0.0) ** 2).ravel()[row // 6]
+        edge = square > (np.maximum(1 - reach, 0.0) ** 2)[row // 6]
         n, inside, square = row[edge] // 6, inside[edge], square[edge]
         share, *slopes = _soft_edge(x.ravel()[inside], y.ravel()[inside], square, inverse[n], softness, derivatives)
         value[edge] *= share
-        return cls(len(area), row, panel_px, value, edge, np.reshape(slopes, (-1, len(n))) / area[n])
+        return cls(len(area), row, panel_px, value, edge, np.reshape(slopes, (len(slopes), len(n))) / area[n])
 
     def light(
         self, shown: Pictures, panel: Float[np.ndarray, "3 pixels shots"]
@@ -235,9 +241,9 @@ def _soft_edge(
     return share, by_x, by_y, -distance * density, by_pupil
 
 
-def ratios(template: Backscatter, theta: Vector, at: Windows, shown: Pictures) -> PerShot:
+def ratios(template: Backscatter, theta: Vector, rays: Rays, shown: Pictures) -> PerShot:
     """Return the light of pictures over that of white, by shot, colour and position."""
-    return ratios_of(theta, Shares.of(template, theta, at).light(shown, shown.light(float(theta[0]))[0]))
+    return ratios_of(theta, Shares.of(template, theta, rays).light(shown, shown.light(float(theta[0]))[0]))
 
 
 def ratios_of(theta: Vector, light: Float[np.ndarray, "n 2 3 shots"]) -> PerShot:
@@ -246,16 +252,16 @@ def ratios_of(theta: Vector, light: Float[np.ndarray, "n 2 3 shots"]) -> PerShot
     return mixed / np.maximum(mixed[0], _LEAST_WHITE)
 
 
-def ratios_and_jacobian(template: Backscatter, theta: Vector, at: Windows, shown: Pictures) -> tuple[PerShot, Moves]:
+def ratios_and_jacobian(template: Backscatter, theta: Vector, rays: Rays, shown: Pictures) -> tuple[PerShot, Moves]:
     """Return ``ratios``, by shot, colour and position, and their derivatives by each of ``theta``.
 
     Args:
         template, theta: geometry and window; parameters of ``parameters.linear_of``.
-        at, shown: the windows around the footprints; what the panel showed.
+        rays, shown: in panel coordinates; what the panel showed.
     """
-    shares, (panel, by_gamma) = Shares.of(template, theta, at, derivatives=True), shown.light(float(theta[0]))
+    shares, (panel, by_gamma) = Shares.of(template, theta, rays, derivatives=True), shown.light(float(theta[0]))
     light, slopes = shares.light(shown, panel), shares.light_slopes(shown, panel)
-    slope, whole = _footprints(template, theta, at.rays).slope.T[:, :, None, None], _joined(theta, light)
+    slope, whole = _footprints(template, theta, rays).slope.T[:, :, None, None], _joined(theta, light)
     by_x, by_y, by_softness, by_pupil = _joined(theta, slopes)
     moves = np.zeros((len(theta), *whole.shape))
     moves[0] = _joined(theta, shares.light(shown, by_gamma))

@@ -85,14 +85,12 @@ def search(problem: Problem, kernels: tuple[Order, ...] = KERNELS) -> Found:
     noise, rules = problem.seen.first_weights(), problem.rules
     simple = _from_afar(problem, ONE_PLANE, problem.start, noise, rules.first_error)
     bad = _bad_shots(simple.weighed(noise), rules)
-    problem = problem.with_room(simple.found.x)
     rich = _two_planes(problem, simple, np.where(bad[:, None, None], 0.0, noise))
     # Evaluate again: one plane describes some good pictures badly.
     bad = _bad_shots(rich.weighed(noise), rules)
     rich = rich.weighed(np.where(bad[:, None, None], 0.0, noise))
     usable = _without_outliers(problem, rich, ~bad)
     rich, error = refit(problem, rich, usable)
-    problem = problem.with_room(rich.found.x)
     orders = _compared(problem, rich, simple.found.x, kernels if error <= rules.nothing_fits else (TWO_PLANES,))
     best = orders.best.fit
     best = problem.solved(best.order, best.found.x, rich.best.weight)
@@ -212,7 +210,7 @@ def held_out(problem: Problem, full: Fitted) -> tuple[float, float]:
     used = full.used & (weight == 0)
     if not used.any():
         return 0.0, 0.0
-    ratio, of_ratio = problem.ratios(fitted.found.x, fitted.at)
+    ratio, of_ratio = problem.ratios(fitted.found.x)
     noise = seen.variance(fitted.light) + fitted.best.light_variance(ratio, of_ratio, fitted.found.cov)
     excess = fitted.best.errors**2 - noise
     peak = np.maximum(np.where(used, fitted.light, 0.0).max(axis=(1, 2), keepdims=True), 1e-12)
@@ -245,7 +243,7 @@ def value_moments(found: Found, inflation: float) -> Moments:
     """
     problem, fitted = found.problem, found.fitted
     free, solved, weight = fitted.order.free, fitted.found, fitted.best.weight / np.sqrt(inflation)
-    errors_at = problem.errors_at(weight, fitted.at)
+    errors_at = problem.errors_at(weight)
     if inflation > 1:
         # The prior stays the same: only the pictures hold less information.
         solved = most_probable(errors_at, solved.x, free, problem.prior, problem.rules.solver)

@@ -48,8 +48,7 @@ class BackscatterRules:
         most_clipped: fraction of clipped bins above which a shot is left out whole; others lose their clipped bins.
         visible_sigma, present_sigma: white counts as dark below this many sigma of a bin at the 90th percentile of
             bins, or of all bins together.
-        slack_px: distance in panel px that a window leaves for the footprint to move during a fit.
-        most_wider: a fit whose footprints need a window this many times as wide has gone astray.
+        most_wider: a fit whose footprints are this many times as wide as nominal ones has gone astray.
         first_error: assumed model error of a fit from far away, as a fraction of white.
         settled: such a fit continues while its model error falls below this factor of the one before.
         reflections: light of the second plane over that of the first, where fits of two planes start. If the farther
@@ -72,7 +71,6 @@ class BackscatterRules:
     most_clipped: float = 0.02
     visible_sigma: float = 2.0
     present_sigma: float = 5.0
-    slack_px: float = 0.7
     most_wider: float = 3.0
     first_error: float = 0.3
     settled: float = 0.7

@@ -25,7 +25,6 @@ from udccal.fitting.backscatter.model import (
     Rays,
     Shares,
     Usable,
-    Windows,
     ratios,
     ratios_and_jacobian,
     ratios_of,
@@ -161,7 +160,6 @@ class Fitted:
 
     order: Order
     found: MostProbable
-    at: Windows
     ratio: PerShot
     best: Profile
 
@@ -217,13 +215,14 @@ class Problem:
         rays, flat = sampled_rays(geometry, rig, step, rules.positions)
         # The likelihood gives the mask; the template's has a single bin.
         template = nominal_backscatter(geometry, rig, np.zeros((3, 1, 1)), step, window=1)
-        template = replace(template, window=window_for(template, linear_of(prior.mean), rays, rules.slack_px))
+        # Beyond this width a fit has gone astray.
+        most = int(rules.most_wider * window_for(template, linear_of(prior.mean), rays, 0.5))
+        template = replace(template, window=most)
         seen, shown, start = data.shots.at(flat), data.pictures, prior.mean.copy()
         weight = seen.first_weights()
 
         theta = linear_of(start)
-        at = Windows.around(template, theta, rays)
-        shares, panel = Shares.of(template, theta, at), shown.light(float(theta[0]))[0]
+        shares, panel = Shares.of(template, theta, rays), shown.light(float(theta[0]))[0]
 
         def cost(offset: tuple[int, int]) -> float:
             # An offset of whole pixels leaves the shares as they are.
@@ -237,30 +236,21 @@ class Problem:
     def solved(self, order: Order, x: Vector, weight: PerShot) -> Fitted:
         """Solve for the most probable parameters of an order at given weights, from ``x`` on."""
         start = order.start(x, self.prior)
-        at = Windows.around(self.template, linear_of(start), self.rays)
-        found = most_probable(self.errors_at(weight, at), start, order.free, self.prior, self.rules.solver)
-        ratio = ratios(self.template, linear_of(found.x), at, self.shown)
-        return Fitted(order, found, at, ratio, Profile.of(self.seen, ratio, weight))
+        found = most_probable(self.errors_at(weight), start, order.free, self.prior, self.rules.solver)
+        ratio = ratios(self.template, linear_of(found.x), self.rays, self.shown)
+        return Fitted(order, found, ratio, Profile.of(self.seen, ratio, weight))
 
-    def ratios(self, x: Vector, at: Windows) -> tuple[PerShot, Moves]:
+    def ratios(self, x: Vector) -> tuple[PerShot, Moves]:
         """Return light over that of white, and its derivatives by the solver's coordinates."""
-        ratio, jacobian = ratios_and_jacobian(self.template, linear_of(x), at, self.shown)
+        ratio, jacobian = ratios_and_jacobian(self.template, linear_of(x), self.rays, self.shown)
         return ratio, jacobian * linear_slope(x)[:, None, None, None]
 
-    def errors_at(self, weight: PerShot, at: Windows) -> ErrorsAt:
-        """Return a function for whitened errors, with the best mask and dark, and their Jacobian; windows stay."""
+    def errors_at(self, weight: PerShot) -> ErrorsAt:
+        """Return a function for whitened errors, with the best mask and dark, and their Jacobian."""
 
         def of(x: Vector) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m 18"]]:
-            ratio, of_ratio = self.ratios(x, at)
+            ratio, of_ratio = self.ratios(x)
             best = Profile.of(self.seen, ratio, weight)
             return (best.errors * weight).ravel(), best.jacobian(of_ratio).reshape(len(x), -1).T
 
         return of
-
-    def with_room(self, x: Vector) -> Problem:
-        """Return the problem with windows wide enough for these parameters, unless the fit has gone far astray."""
-        theta, rules, template = linear_of(x), self.rules, self.template
-        if not template.window < window_for(template, theta, self.rays, 0.0) <= rules.most_wider * template.window:
-            return self
-        window = window_for(template, theta, self.rays, rules.slack_px)
-        return replace(self, template=replace(template, window=window))
