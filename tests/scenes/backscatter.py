@@ -93,7 +93,7 @@ def world_at(x: Float[np.ndarray, "18"], rig: RigDescription, white: Float[np.nd
     mask = white * (1 - 0.3 * (u**2 + v**2) / 2)
     template = nominal_backscatter(nominal_geometry(rig), rig, mask, step, window=1)
     rays, theta = grid_rays(template.geometry, (rows, columns), step, np.arange(rows * columns)), linear_of(x)
-    term = with_linear(replace(template, window=window_for(template, theta, rays, 1.0)), jax.numpy.asarray(theta))
+    term = with_linear(replace(template, window=window_for(template, theta, rays, 1.0)), theta)
     return World(rig, jax.tree.map(np.asarray, term), x)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 from typing import final
 
@@ -42,15 +43,19 @@ class Bins:
         # A colour with several samples in a cell averages them.
         factor = 1.0 / np.bincount(pattern.channels.ravel(), minlength=3).clip(1) ** max(row_power, column_power)
         for site in pattern.sites:
-            part = mosaic[site.samples].astype(np.float64)
             by_row, by_column = (
-                sparse.csr_array(block_weights(size, along, blocks, self.step) ** power)
-                for size, along, blocks, power in zip(
-                    mosaic.shape, site.samples, sums.shape[1:], (row_power, column_power), strict=True
-                )
+                _sparse_weights(size, along.start, along.step, self.step) ** power
+                for size, along, power in zip(mosaic.shape, site.samples, (row_power, column_power), strict=True)
             )
+            part = mosaic[site.samples].astype(np.float64)
             sums[site.channel] += factor[site.channel] * (by_column @ (by_row @ part).T).T
         return sums
+
+
+# The mosaics of a session have one size.
+@functools.lru_cache(maxsize=64)
+def _sparse_weights(size: int, first: int, apart: int, step: int) -> sparse.csr_array:
+    return sparse.csr_array(block_weights(size, slice(first, None, apart), size // step, step))
 
 
 def block_weights(size: int, samples: slice, blocks: int, step: int) -> Float[np.ndarray, "blocks samples"]:

@@ -15,13 +15,14 @@ from jaxtyping import Float, Int
 from udccal.arrangements import Dark, PanelPicture
 from udccal.displays.pictures import face_picture
 from udccal.fitting.backscatter.data import Binned, grid_step, sampled_rays, visible_crop
-from udccal.fitting.backscatter.model import PerBin, Pictures, Windows, ratios_and_jacobian, window_for
+from udccal.fitting.backscatter.model import PerBin, Pictures, ratios_and_jacobian, window_for
 from udccal.fitting.backscatter.parameters import BackscatterRules, linear_of, linear_slope, prior_of, vector_of
+from udccal.fitting.backscatter.solve import Profile
 from udccal.fitting.bins import Bins
 from udccal.fitting.engine.least_squares import Blocks
 from udccal.fitting.nominal import nominal_backscatter
 from udccal.numerics import in_float64
-from udccal.planning.predictor import Floor
+from udccal.planning.design import Floor
 from udccal.planning.state import WHITE, EvenField, RigState, sample_variance_e
 from udccal.planning.steps import PlannedStep, planned_steps, without_pictures
 from udccal.rig import Captures
@@ -47,7 +48,7 @@ class BackscatterPredictor:
         self._x = self._prior.mean if state.backscatter is None else vector_of(state.backscatter)
         theta = linear_of(self._x)
         template = nominal_backscatter(state.geometry, rig, np.zeros((3, 1, 1)), step_px, window=1)
-        template = replace(template, window=window_for(template, theta, rays, _RULES.slack_px))
+        template = replace(template, window=window_for(template, theta, rays, slack=1.0))
         # Shading of the scattered light: light that leaves the panel evenly is shaded as all light is.
         grid = rig.camera.rows // step_px, rig.camera.columns // step_px
         rows, columns = np.divmod(flat, grid[1])
@@ -60,8 +61,7 @@ class BackscatterPredictor:
         self._by_sample = bins.variance(one).reshape(3, -1)[:, flat]
         self._by_row = bins.row_variance(one).reshape(3, -1)[:, flat]
         shown = _pictures(state)
-        at = Windows.around(template, theta, rays, shown.crop)
-        self._ratio, jacobian = ratios_and_jacobian(template, theta, at, shown)
+        self._ratio, jacobian = ratios_and_jacobian(template, theta, rays, shown)
         self._jacobian = jacobian * linear_slope(self._x)[:, None, None, None]
 
     def sigma(self, captures: Captures) -> float:
@@ -89,7 +89,7 @@ class BackscatterPredictor:
         weight = seen.weights(seen.rate, self._mask, error, seen.usable)
         weight[_SHOWN] *= np.sqrt(pictures / len(weight[_SHOWN]))
         weight[_NEW] = 0.0
-        profile = seen.profile(self._ratio, weight)
+        profile = Profile.of(seen, self._ratio, weight)
         jacobian = np.sqrt(count) * profile.jacobian(self._jacobian).reshape(len(self._x), -1).T
         equations = Blocks.of_errors(np.zeros(len(jacobian)), jacobian).with_prior(self._prior, self._x)
         cov = equations.cov() * self._state.model_errors.inflation

@@ -1,4 +1,4 @@
-"""Design variables of a capture, and the cheapest design that reaches a sigma.
+"""Quantities that stand for the terms, design variables of a capture, and the cheapest design that reaches a sigma.
 
 The search starts from the least captures and repeats the addition with the best gain per second until the sigma is
 reached. Then it prunes the design. It uses no random numbers.
@@ -10,7 +10,7 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Final, final
+from typing import Final, Protocol, final, runtime_checkable
 
 from udccal.planning.steps import Cost
 from udccal.rig import Captures
@@ -21,6 +21,49 @@ _SHARE: Final = 0.25
 _MOST_ADDITIONS: Final = 200
 # An addition that lowers the logarithm of sigma by less than this does not count.
 _LEAST_GAIN: Final = 1e-6
+
+
+@final
+@dataclass(frozen=True)
+class Quantity:
+    """The quantity whose sigma stands for a term: its unit and its meaning."""
+
+    unit: str
+    meaning: str
+
+
+QUANTITIES: Final = MappingProxyType[TermName, Quantity](
+    {
+        "noise": Quantity("%", "conversion gain K, relative"),
+        "geometry": Quantity("px", "where a ray lands, root mean square over the sensor"),
+        "wire": Quantity("%", "wire map, root mean square over the sensor"),
+        "psf": Quantity("%", "kernel, relative L2"),
+        "backscatter": Quantity("%", "predicted light, root mean square, of its peak"),
+    }
+)
+
+
+@final
+@dataclass(frozen=True)
+class Floor:
+    """The sigma that no number of captures lowers, in the quantity's unit, and a change that would lower it."""
+
+    sigma: float
+    lowered_by: str
+
+
+@runtime_checkable
+class Predictor(Protocol):
+    """Predicts one term of one rig; it keeps the results that do not depend on the captures."""
+
+    def sigma(self, captures: Captures) -> float:
+        """Sigma of the term's quantity; infinite where the captures do not suffice for a fit."""
+
+    def floor(self) -> Floor:
+        """Sigma in the limit of endless captures."""
+
+    def used(self, captures: Captures) -> float:
+        """Part of the captures' information on the quantity that the fit, at its default effort, uses; 1 is all."""
 
 
 @final

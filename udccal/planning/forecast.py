@@ -15,10 +15,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from udccal.planning.backscatter import BackscatterPredictor
-from udccal.planning.design import DESIGN_VARIABLES, DesignVariable
+from udccal.planning.design import DESIGN_VARIABLES, QUANTITIES, DesignVariable, Floor, Predictor, Quantity
 from udccal.planning.geometry import GeometryPredictor
 from udccal.planning.noise import NoisePredictor
-from udccal.planning.predictor import QUANTITIES, Floor, Predictor, Quantity
 from udccal.planning.psf import PsfPredictor
 from udccal.planning.state import RigState
 from udccal.planning.wire import WirePredictor

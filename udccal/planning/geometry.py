@@ -34,7 +34,7 @@ from udccal.fitting.geometry.corners import board_points_mm, charuco_board
 from udccal.fitting.geometry.data import rig_prior
 from udccal.models.geometry import panel_directions, project_directions
 from udccal.numerics import in_float64
-from udccal.planning.predictor import Floor
+from udccal.planning.design import Floor
 from udccal.planning.state import WHITE, EvenField, RigState, sample_variance_e, sensor_samples
 from udccal.planning.steps import PlannedStep, planned_steps
 from udccal.rig import Captures

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from udccal.arrangements import Dark, FlatLight
 from udccal.fitting.noise.data import NoiseRules
 from udccal.fitting.noise.transfer import DarkVariance, Levels, Order, TransferProblem, temporal_variance
-from udccal.planning.predictor import Floor
+from udccal.planning.design import Floor
 from udccal.planning.state import EvenField, RigState, sensor_samples
 from udccal.planning.steps import planned_steps
 from udccal.rig import Captures

@@ -10,9 +10,8 @@ from dataclasses import dataclass
 from typing import Final, final, get_args
 
 from udccal.errors import UdccalError
-from udccal.planning.design import DESIGN_VARIABLES, Addition, Objective, cheapest, worthwhile
+from udccal.planning.design import DESIGN_VARIABLES, QUANTITIES, Addition, Objective, cheapest, worthwhile
 from udccal.planning.forecast import predictor_for
-from udccal.planning.predictor import QUANTITIES
 from udccal.planning.state import RigState
 from udccal.planning.steps import NOTHING, Cost, cost_of
 from udccal.rig import Captures

@@ -22,8 +22,7 @@ from udccal.fitting.psf.kernel import Evaluator, fit_lattice
 from udccal.fitting.psf.problem import DiffractionProblem, Place
 from udccal.fitting.psf.samples import Samples, choose_samples, gather, stands_for, weighed
 from udccal.numerics import in_float64
-from udccal.planning.design import DESIGN_VARIABLES
-from udccal.planning.predictor import Floor
+from udccal.planning.design import DESIGN_VARIABLES, Floor
 from udccal.planning.state import WHITE, RigState, built_wire, sample_variance_e
 from udccal.planning.steps import PlannedStep, planned_steps
 from udccal.rig import Captures

@@ -21,7 +21,7 @@ from udccal.fitting.wire.jacobian import WireProblem, expected_of, with_harmonic
 from udccal.fitting.wire.parameters import Parameters, parameters_of
 from udccal.fitting.wire.rules import WireRules, ideal_wire, possible_harmonics, wire_start
 from udccal.numerics import in_float64
-from udccal.planning.predictor import Floor
+from udccal.planning.design import Floor
 from udccal.planning.state import EvenField, RigState, sample_variance_e
 from udccal.planning.steps import planned_steps
 from udccal.rig import Captures

@@ -25,8 +25,7 @@ from tests.scenes.backscatter import (
     world,
 )
 from udccal.fitting.backscatter.data import BackscatterData, grid_rays
-from udccal.fitting.backscatter.fit import result_of
-from udccal.fitting.backscatter.model import Windows
+from udccal.fitting.backscatter.fit import TermAt, result_of
 from udccal.fitting.backscatter.orders import moments_along_reflection, search
 from udccal.fitting.backscatter.parameters import (
     NAMES,
@@ -36,7 +35,7 @@ from udccal.fitting.backscatter.parameters import (
     linear_slope,
     prior_of,
 )
-from udccal.fitting.backscatter.solve import Problem, TermAt, most_probable
+from udccal.fitting.backscatter.solve import Problem, most_probable
 from udccal.fitting.engine.gaussian import Posterior
 from udccal.models.backscatter import Backscatter
 from udccal.numerics import in_float64
@@ -67,7 +66,7 @@ def ideal_of(of: World, expected: BackscatterData, flat: np.ndarray, template: B
     seen = expected.shots.at(flat)
     weight = seen.weights(seen.rate, seen.rate[0], 0.0, seen.usable)
     problem = Problem(template, seen, expected.pictures, rays, flat, prior, of.x, RULES)
-    errors_at = problem.errors_at(weight, Windows.around(template, theta, rays, expected.crop))
+    errors_at = problem.errors_at(weight)
     jacobian = errors_at(of.x)[1] / linear_slope(of.x)
     cov = np.linalg.inv(jacobian.T @ jacobian + np.diag((prior.sigma * linear_slope(of.x)) ** -2.0))
     used = np.ones(len(seen.rate), dtype=bool)
@@ -98,7 +97,7 @@ def realisation(seed: int) -> _One:
     result = result_of(found, data, of.rig, [])
     values = np.array([[e.value, e.sigma] for e in result.estimates]).T
     expected = noise_free(data, of, pictures)
-    ideal = ideal_of(of, expected, found.problem.flat, found.problem.template)
+    ideal = ideal_of(of, expected, found.problem.flat, of.term)
     model_error = found.model_error
     predicted = predicted_light(result.term, result, model_error, of.rig, new, _PLACES)
     limit = predicted_light(of.term, ideal.posterior, 0.0, of.rig, new, _PLACES)

@@ -15,7 +15,7 @@ from udccal.displays.pictures import face_picture
 from udccal.fitting.backscatter.data import (
     BackscatterData,
     Binned,
-    binned,
+    Binning,
     grid_step,
     read_backscatter,
     visible_crop,
@@ -221,7 +221,7 @@ def test_a_bin_is_clipped_from_the_fraction_of_saturation_that_the_rules_say(mos
     mean = np.full((8, 8), float(noise.black_DN), np.float32)
     mean[0, 0], mean[0, 4] = 0.99 * float(noise.saturation_DN), 0.7 * float(noise.saturation_DN)
     average = Average(mean, np.ones_like(mean), FRAMES)
-    found = binned(average, EXPOSURE_S, noise, np.ones(mean.shape), Bins("RGGB", 4), most)
+    found = Binning(noise, np.ones(mean.shape), Bins("RGGB", 4), most).of(average, EXPOSURE_S)
     assert found.clipped.sum() == clipped
 
 

@@ -54,7 +54,6 @@ def _made(seed: int, order: Order) -> tuple[World, BackscatterData]:
 def _shows(of: World, order: Order, expected: BackscatterData) -> bool:
     """Whether pictures without noise are described so much worse without any one part of the order."""
     problem = replace(Problem.of(expected, of.term.geometry, RIG, RULES), start=of.x)
-    problem = replace(problem, template=replace(problem.template, window=of.term.window))
     seen = problem.seen
     weight = seen.weights(seen.rate, seen.rate[0], 0.0, seen.usable)
     crosstalk = bool(order.free[MIX].any())
@@ -133,7 +132,7 @@ def test_predicted_light_is_as_unsure_as_its_order() -> None:
 
     def predicted(*tried: Attempt[Fitted]) -> tuple[Posterior[Backscatter], Light]:
         known = replace(found, orders=Choice(tried[0], tried))
-        posterior = term_posterior(found.problem.template, shots, known, 1.0)
+        posterior = term_posterior(shots, known, 1.0)
         term = posterior.term_at(posterior.mean)
         return posterior, predicted_light(term, posterior, 0.0, RIG, new, place)
 

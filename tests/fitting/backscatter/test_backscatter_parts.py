@@ -5,17 +5,14 @@ from __future__ import annotations
 from dataclasses import replace
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from udccal.fitting.backscatter.data import Binned, grid_step, sampled_rays, visible_crop
+from udccal.fitting.backscatter.data import Binned, directions, grid_step, sampled_rays, visible_crop
 from udccal.fitting.backscatter.model import (
-    BLOCK,
     PanelCrop,
     Pictures,
-    Windows,
-    in_blocks,
+    Shares,
     ratios,
     ratios_and_jacobian,
     window_for,
@@ -23,17 +20,20 @@ from udccal.fitting.backscatter.model import (
 from udccal.fitting.backscatter.orders import typical_error
 from udccal.fitting.backscatter.parameters import (
     KERNELS,
+    PUPIL,
+    REFLECTION,
+    SOFTNESS,
     TWO_PLANES,
-    BackscatterRules,
     linear_of,
     linear_slope,
     prior_of,
     vector_of,
     with_linear,
 )
-from udccal.fitting.backscatter.solve import Fitted, MostProbable, Problem
+from udccal.fitting.backscatter.solve import Fitted, MostProbable, Profile
 from udccal.fitting.nominal import nominal_backscatter, nominal_geometry
-from udccal.models.backscatter import panel_response, response_grid
+from udccal.models.backscatter import emitter_shares, panel_response, response_grid, window_corners
+from udccal.models.geometry import panel_directions
 from udccal.rig import load_rig
 
 RIG = load_rig("lg55-reduced")
@@ -70,26 +70,51 @@ def test_derivatives_of_ratios_are_those_of_differences() -> None:
     pictures = Pictures.of(shown, crop)
     template = nominal_backscatter(geometry, RIG, np.zeros((3, 1, 1)), grid_step(RIG), window=1)
     template = replace(template, window=window_for(template, THETA, rays, 1.0))
-    at = Windows.around(template, THETA, rays, crop)
-    ratio, jacobian = ratios_and_jacobian(template, THETA, at, pictures)
+    ratio, jacobian = ratios_and_jacobian(template, THETA, rays, pictures)
     np.testing.assert_allclose(ratio[0], 1.0, rtol=1e-12)
     np.testing.assert_array_equal(ratio[-1], 0.0)
-    np.testing.assert_allclose(ratio, ratios(template, THETA, at, pictures), rtol=1e-12)
+    np.testing.assert_allclose(ratio, ratios(template, THETA, rays, pictures), rtol=1e-12)
     for k in range(18):
         step = 1e-5 * np.eye(18)[k]
-        up, down = (ratios(template, THETA + sign * step, at, pictures) for sign in (1, -1))
+        up, down = (ratios(template, THETA + sign * step, rays, pictures) for sign in (1, -1))
         np.testing.assert_allclose(jacobian[k], (up - down) / 2e-5, atol=1e-6)
 
 
+@pytest.mark.parametrize(("softness", "window"), [(0.1, 41), (0.3, 41), (2.0, 5)])
+def test_shares_are_those_of_the_model(softness: float, window: int) -> None:
+    """In all of a wide window, and in one that is cut to less than the footprints."""
+    geometry = replace(nominal_geometry(RIG), distortion=np.array([-0.1, 0.05, 0.001, -0.002, 0.01]))
+    rays, _ = sampled_rays(geometry, RIG, grid_step(RIG), 7)
+    template = nominal_backscatter(geometry, RIG, np.zeros((3, 1, 1)), grid_step(RIG), window=window)
+    theta = np.where(np.arange(18) == SOFTNESS, np.log(softness), THETA)
+    with jax.enable_x64(True):
+        term = with_linear(template, theta)
+        corner = np.asarray(window_corners(term, rays))
+        wanted = np.moveaxis(np.asarray(emitter_shares(term, rays, corner)), 1, 2)
+    shares, found = Shares.of(template, theta, rays), np.zeros((len(rays) * 6, window**2))
+    column, row = (shares.panel_px - corner[shares.row // 6]).T
+    found[shares.row, row * window + column] = shares.value
+    direct, reflected = np.moveaxis(found.reshape(len(rays), 2, 3, -1), 1, 0)
+    whole = (1 - theta[REFLECTION]) * direct + theta[REFLECTION] * reflected
+    np.testing.assert_allclose(whole, wanted, atol=1e-12)
+
+
+def test_rays_are_those_of_the_model() -> None:
+    geometry = replace(nominal_geometry(RIG), distortion=np.array([-0.1, 0.05, 0.001, -0.002, 0.01]))
+    pixels = np.random.default_rng(0).uniform(0, 700, (50, 2))
+    with jax.enable_x64(True):
+        wanted = np.asarray(panel_directions(geometry, pixels))
+    np.testing.assert_allclose(directions(geometry, pixels), wanted, atol=1e-12)
+
+
 def test_nothing_comes_from_beyond_the_crop() -> None:
-    template = nominal_backscatter(nominal_geometry(RIG), RIG, np.zeros((3, 1, 1)), grid_step(RIG), window=3)
-    rays = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 1.0]])
-    column, row = Windows.around(template, THETA, rays, PanelCrop(0, 0, 1, 1)).corner[0]
-    pictures = Pictures.of(np.full((1, 2, 3, 3), 255, np.uint8), PanelCrop(int(column) + 1, int(row) + 1, 3, 2))
-    at = Windows.around(template, THETA, rays, pictures.crop)
-    assert (at.places < 6).sum(axis=1).tolist() == [4, 0]
-    sums = at.sums(np.ones((2, 3, 1, 9)), pictures.light(2.2)[0])
-    np.testing.assert_array_equal(sums[0, :, 1], np.tile([4.0, 0.0], (3, 1)))
+    pictures = Pictures.of(np.full((1, 2, 3, 3), 255, np.uint8), PanelCrop(1, 1, 3, 2))
+    column, row = np.divmod(np.arange(9), 3)
+    panel_px = np.stack([column, row], axis=1)
+    shares = Shares(2, np.zeros(9, int), panel_px, np.ones(9), np.zeros(9, dtype=bool), np.zeros((0, 0)))
+    sums = shares.light(pictures, pictures.light(2.2)[0])
+    np.testing.assert_array_equal(sums[0, 0, 0], [4.0, 4.0, 0.0])
+    assert not sums[1].any()
 
 
 @pytest.mark.medium
@@ -102,11 +127,9 @@ def test_ratios_are_those_of_the_model() -> None:
     template = replace(template, window=window_for(template, THETA, rays, 1.0))
     shown = np.random.default_rng(0).integers(0, 256, (RIG.panel.rows, RIG.panel.columns, 3)).astype(np.uint8)
     with jax.enable_x64(True):
-        response = panel_response(with_linear(template, jnp.asarray(THETA)), RIG.panel.rows, RIG.panel.columns)
+        response = panel_response(with_linear(template, THETA), RIG.panel.rows, RIG.panel.columns)
         wanted = np.asarray(response_grid(response, shown)).reshape(3, -1)[:, flat]
-    found = ratios(
-        template, THETA, Windows.around(template, THETA, rays, crop), Pictures.of(crop.of(shown)[None], crop)
-    )
+    found = ratios(template, THETA, rays, Pictures.of(crop.of(shown)[None], crop))
     np.testing.assert_allclose(found[1], wanted, rtol=1e-9)
 
 
@@ -118,15 +141,13 @@ def test_linear_parameters_have_the_slopes_of_differences() -> None:
 
 def test_a_term_has_the_parameters_that_made_it() -> None:
     template = nominal_backscatter(nominal_geometry(RIG), RIG, np.zeros((3, 1, 1)), 8, window=5)
-    with jax.enable_x64(True):
-        term = with_linear(template, jnp.asarray(THETA))
-        np.testing.assert_allclose(vector_of(term), X, rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(vector_of(with_linear(template, THETA)), X, rtol=1e-12, atol=1e-12)
 
 
 def test_mask_and_dark_are_those_of_least_squares() -> None:
     ratio, seen = _seen()
     weight = _weights(seen)
-    best = seen.profile(ratio, weight)
+    best = Profile.of(seen, ratio, weight)
     for c, n in np.ndindex(best.mask.shape):
         rows = np.stack([ratio[:, c, n], 1 / seen.exposure_s], axis=1) * weight[:, c, n, None]
         found, *_ = np.linalg.lstsq(rows, seen.rate[:, c, n] * weight[:, c, n], rcond=None)
@@ -137,19 +158,19 @@ def test_mask_and_dark_are_those_of_least_squares() -> None:
 def test_the_mask_follows_ratios_as_said() -> None:
     ratio, seen = _seen()
     weight = _weights(seen)
-    best = seen.profile(ratio, weight)
+    best = Profile.of(seen, ratio, weight)
     expected = replace(seen, rate=best.mask * ratio)
     way = np.random.default_rng(1).normal(size=(2, *ratio.shape))
     found = best.mask_jacobian(way)
     for k in range(2):
-        up, down = (expected.profile(ratio + sign * 1e-6 * way[k], weight).mask for sign in (1, -1))
+        up, down = (Profile.of(expected, ratio + sign * 1e-6 * way[k], weight).mask for sign in (1, -1))
         np.testing.assert_allclose(found[k], (up - down) / 2e-6, rtol=1e-4, atol=1e-3)
 
 
 def test_whitened_errors_are_at_right_angles_to_mask_and_dark() -> None:
     ratio, seen = _seen()
     weight = _weights(seen)
-    best = seen.profile(ratio, weight)
+    best = Profile.of(seen, ratio, weight)
     errors = best.errors * weight
     jacobian = best.jacobian(np.random.default_rng(1).normal(size=(2, *ratio.shape)))
     for way in (ratio * weight, (1 / seen.exposure_s)[:, None, None] * weight):
@@ -166,10 +187,8 @@ def test_a_typical_error_is_that_of_most_pictures() -> None:
     nothing = MostProbable(np.zeros(18), np.zeros((18, 18)), 0.0, True)
 
     def error_of(ratios_of: np.ndarray) -> float:
-        nowhere = np.zeros((60, 2), dtype=np.int64)
-        at = Windows(np.zeros((60, 3)), nowhere, nowhere)
-        best = seen.profile(ratios_of, _weights(seen))
-        return typical_error(Fitted(TWO_PLANES, nothing, at, ratios_of, best), seen)
+        best = Profile.of(seen, ratios_of, _weights(seen))
+        return typical_error(Fitted(TWO_PLANES, nothing, ratios_of, best), seen)
 
     assert error_of(ratio) < 0.004
     assert error_of(off) == pytest.approx(0.03, rel=0.15)
@@ -184,29 +203,11 @@ def test_an_order_without_something_has_to_be_better_for_it() -> None:
 
 
 def test_a_window_does_not_follow_a_fit_gone_astray() -> None:
-    geometry = nominal_geometry(RIG)
+    geometry, most = nominal_geometry(RIG), 31
     rays, _ = sampled_rays(geometry, RIG, grid_step(RIG), 7)
-    template = nominal_backscatter(geometry, RIG, np.zeros((3, 1, 1)), grid_step(RIG), window=1)
-    template = replace(template, window=window_for(template, linear_of(PRIOR.mean), rays, 1.0))
-    wider, astray = PRIOR.mean.copy(), PRIOR.mean.copy()
-    wider[2] += np.log(2.2)
-    astray[2] += np.log(50.0)
-    shown = Pictures.of(np.zeros((5, 1, 1, 3), np.uint8), PanelCrop(0, 0, 1, 1))
-    seen, flat = _seen(n=len(rays))[1], np.arange(len(rays))
-    problem = Problem(template, seen, shown, rays, flat, PRIOR, PRIOR.mean, BackscatterRules())
-    assert problem.with_room(wider).template.window > template.window
-    assert problem.with_room(astray) is problem
-
-
-def test_blocks_give_what_the_whole_gives() -> None:
-    numbers = np.arange(2.0 * BLOCK + 5)
-    shapes = []
-
-    def function(part: np.ndarray) -> tuple[np.ndarray, ...]:
-        shapes.append(part.shape)
-        return (jnp.asarray(part) ** 2, jnp.asarray(part) + 1)
-
-    square, more = in_blocks(function, numbers)
-    np.testing.assert_array_equal(square, numbers**2)
-    np.testing.assert_array_equal(more, numbers + 1)
-    assert set(shapes) == {(BLOCK,)}
+    template = nominal_backscatter(geometry, RIG, np.zeros((3, 1, 1)), grid_step(RIG), window=most)
+    widths = []
+    for pupils in (1.0, 2.2, 50.0):
+        shares = Shares.of(template, linear_of(PRIOR.mean + np.log(pupils) * np.eye(18)[PUPIL]), rays)
+        widths.append(np.ptp(shares.panel_px[shares.row < 6], axis=0).max() + 1)
+    assert widths[0] < widths[1] < widths[2] == most

@@ -7,28 +7,32 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import final
 
+import cv2
+import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped, UInt8
+from scipy.spatial.transform import Rotation
 
 from udccal.fitting.backscatter.model import (
     PanelCrop,
     PerBin,
     PerShot,
     Pictures,
-    Profile,
+    Rays,
     Usable,
     corners_of,
-    directions,
 )
 from udccal.fitting.backscatter.parameters import BackscatterRules, linear_of, prior_of
 from udccal.fitting.bins import Bins
 from udccal.fitting.nominal import nominal_backscatter
 from udccal.models.geometry import Geometry
 from udccal.models.noise import Noise, variance_e
-from udccal.numerics import in_float64
 from udccal.rig import RigDescription
 from udccal.sessions.schema import DarkSubject, PanelSubject
 from udccal.sessions.store import Average, Session
+
+# One compilation instead of one per operation.
+_variance_e = jax.jit(variance_e)
 
 
 @final
@@ -98,10 +102,6 @@ class Binned:
         rate[-1] = 0.0
         return self.weights(rate, np.zeros(rate.shape[1:]), 0.0, self.usable)
 
-    def profile(self, ratio: PerShot, weight: PerShot) -> Profile:
-        """Return the most probable mask and dark signal."""
-        return Profile.of(ratio, self.rate, self.exposure_s[-1] / self.exposure_s, weight)
-
 
 @final
 @dataclass(frozen=True)
@@ -155,7 +155,7 @@ def read_backscatter(
         SessionError: when a file is missing or damaged.
     """
     crop, bins = visible_crop(geometry, session.rig), Bins(session.rig.camera.cfa, grid_step(session.rig))
-    clipped = (rules or BackscatterRules()).clipped
+    binning = Binning(noise, shading, bins, (rules or BackscatterRules()).clipped)
     steps = session.steps("backscatter")
     panels = [(step, step.subject) for step in steps if isinstance(step.subject, PanelSubject)]
     white = [step for step, subject in panels if subject.role == "white"]
@@ -166,40 +166,50 @@ def read_backscatter(
         nothing, none = np.zeros((0, 3, 1, 1)), np.zeros(0)
         return BackscatterData(Binned(nothing, nothing, nothing, nothing > 0, none, none), shown, crop, ())
     shots = [
-        binned(session.average(step.captures[0]), step.captures[0].exposure_s, noise, shading, bins, clipped)
+        binning.of(session.average(step.captures[0]), step.captures[0].exposure_s)
         for step in (white[0], *(step for step, _ in others), dark[0])
     ]
     shown = np.concatenate([shown, *(crop.of(session.picture(subject))[None] for _, subject in others)])
     return BackscatterData(Binned.joined(shots), shown, crop, tuple(step.id for step, _ in others))
 
 
-def binned(
-    average: Average,
-    exposure_s: float,
-    noise: Noise,
-    shading: Float[np.ndarray, "rows columns"],
-    bins: Bins,
-    most: float,
-) -> Binned:
-    """Bin one shot from its average in DN; means above the fraction ``most`` of saturation count as clipped."""
-    gain = float(np.asarray(noise.K_DN_per_e))
-    to_rate = 1.0 / (exposure_s * shading)
-    signal_e = (average.mean - float(np.asarray(noise.black_DN))) / gain
-    clipped = average.mean >= most * float(np.asarray(noise.saturation_DN))
-    # Variance in the dark, e-^2: of a row's offset, and of each sample independently.
-    row_e2 = float(np.asarray(noise.sigma_row_DN / noise.K_DN_per_e)) ** 2
-    rest_e2 = max(float(np.asarray(variance_e(noise, np.zeros(()), np.float64(exposure_s)))) - row_e2, 0.0)
-    per_frame = to_rate**2 / average.frames
-    expected = np.maximum(signal_e, 0.0) + rest_e2
-    scatter = average.variance.mean(dtype=np.float64) / gain**2 / expected.mean()
-    return Binned(
-        rate=bins.mean(signal_e * to_rate)[None],
-        shot=bins.variance(to_rate / average.frames)[None],
-        rest=(rest_e2 * bins.variance(per_frame) + row_e2 * bins.row_variance(per_frame))[None],
-        clipped=(bins.mean(clipped.astype(np.float64)) > 0)[None],
-        exposure_s=np.array([exposure_s]),
-        scatter=np.array([scatter], dtype=np.float64),
-    )
+@final
+@dataclass(frozen=True)
+class Binning:
+    """Bins shots from their averages; means above the fraction ``most`` of saturation count as clipped."""
+
+    noise: Noise
+    shading: Float[np.ndarray, "rows columns"]
+    bins: Bins
+    most: float
+
+    @functools.cached_property
+    def _variances(self) -> tuple[Float[np.ndarray, "3 a b"], ...]:
+        """Variance of bins if that of a sample over its shading is 1 / shading, or 1: by sample, or by row."""
+        each = 1 / self.shading
+        return self.bins.variance(each), self.bins.variance(each**2), self.bins.row_variance(each**2)
+
+    def of(self, average: Average, exposure_s: float) -> Binned:
+        """Bin one shot from its average in DN."""
+        gain, black_DN, row_DN, saturation_DN = (
+            float(np.asarray(getattr(self.noise, name)))
+            for name in ("K_DN_per_e", "black_DN", "sigma_row_DN", "saturation_DN")
+        )
+        signal_e, clipped = (average.mean - black_DN) / gain, average.mean >= self.most * saturation_DN
+        # Variance in the dark, e-^2: of a row's offset, and of each sample independently.
+        row_e2 = (row_DN / gain) ** 2
+        rest_e2 = max(float(np.asarray(_variance_e(self.noise, np.zeros(()), np.float64(exposure_s)))) - row_e2, 0.0)
+        expected = np.maximum(signal_e, 0.0) + rest_e2
+        scatter = average.variance.mean(dtype=np.float64) / gain**2 / expected.mean()
+        shot, each, rows = self._variances
+        return Binned(
+            rate=self.bins.mean(signal_e / self.shading)[None] / exposure_s,
+            shot=shot[None] / (exposure_s * average.frames),
+            rest=(rest_e2 * each + row_e2 * rows)[None] / (exposure_s**2 * average.frames),
+            clipped=(self.bins.mean(clipped.astype(np.float32)) > 0)[None],
+            exposure_s=np.array([exposure_s]),
+            scatter=np.array([scatter], dtype=np.float64),
+        )
 
 
 def grid_step(rig: RigDescription) -> int:
@@ -215,7 +225,6 @@ def grid_step(rig: RigDescription) -> int:
     return min(choices, key=lambda step: camera.columns % step + camera.rows % step)
 
 
-@in_float64
 def visible_crop(geometry: Geometry, rig: RigDescription) -> PanelCrop:
     """Return the part of the panel that any sensor pixel may see, with room for the tolerances of the mounting.
 
@@ -233,7 +242,6 @@ def visible_crop(geometry: Geometry, rig: RigDescription) -> PanelCrop:
     return PanelCrop(int(first[0]), int(first[1]), int(last[0] - first[0]), int(last[1] - first[1]))
 
 
-@in_float64
 def sampled_rays(
     geometry: Geometry, rig: RigDescription, step: int, count: int
 ) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, " n"]]:
@@ -256,10 +264,20 @@ def sampled_rays(
     return grid_rays(geometry, shape, step, flat), flat
 
 
-@in_float64
 def grid_rays(
     geometry: Geometry, shape: tuple[int, int], step: int, flat: Int[np.ndarray, " n"]
 ) -> Float[np.ndarray, "n 3"]:
     """Return the rays, in panel coordinates, of positions of a grid of ``shape`` (rows, columns), by flat index."""
     rows, columns = np.divmod(flat, shape[1])
     return directions(geometry, step * (np.stack([columns, rows], axis=1) + 0.5) - 0.5)
+
+
+def directions(geometry: Geometry, pixels: Float[np.ndarray, "n 2"]) -> Rays:
+    """Return the rays of sensor pixels in panel coordinates, as ``models.geometry.panel_directions`` does."""
+    matrix = np.eye(3)
+    matrix[[0, 1], [0, 1]], matrix[:2, 2] = np.asarray(geometry.focal_px), np.asarray(geometry.principal_point_px)
+    until = cv2.TERM_CRITERIA_MAX_ITER + cv2.TERM_CRITERIA_EPS, 60, 1e-14
+    lens = matrix, np.asarray(geometry.distortion, dtype=np.float64)
+    ideal = cv2.undistortPoints(pixels[:, None], *lens, R=np.eye(3), P=np.eye(3), criteria=until)[:, 0]
+    rays = np.insert(ideal, 2, 1.0, axis=1) @ Rotation.from_rotvec(np.asarray(geometry.rotation_rad)).as_matrix().T
+    return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))

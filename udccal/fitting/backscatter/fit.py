@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+import functools
+from dataclasses import dataclass, replace
+from typing import final
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from udccal.fitting.absent import absent_backscatter
-from udccal.fitting.backscatter.data import BackscatterData, grid_rays
-from udccal.fitting.backscatter.model import Usable, window_for
-from udccal.fitting.backscatter.orders import BAD_BINS, BAD_PICTURES, Found, search, value_moments
+from udccal.fitting.backscatter.data import BackscatterData, Binned, grid_rays
+from udccal.fitting.backscatter.model import Rays, Usable, ratios, ratios_and_jacobian, window_for
+from udccal.fitting.backscatter.orders import BAD_BINS, BAD_PICTURES, Found, residual_pattern, search, value_moments
 from udccal.fitting.backscatter.parameters import (
     DEPTH,
     DISTANCE,
@@ -20,13 +22,15 @@ from udccal.fitting.backscatter.parameters import (
     UNITS,
     BackscatterRules,
     Moments,
+    Vector,
     footprint_per_pupil,
     linear_of,
     linear_slope,
+    with_linear,
 )
-from udccal.fitting.backscatter.solve import Problem, TermAt
-from udccal.fitting.engine.gaussian import Posterior
-from udccal.fitting.engine.misfit import MisfitTest, group_means_test, sharper
+from udccal.fitting.backscatter.solve import Problem, Profile
+from udccal.fitting.engine.gaussian import Posterior, square_root
+from udccal.fitting.engine.misfit import MisfitTest
 from udccal.fitting.engine.report import estimates, residual_sample
 from udccal.fitting.engine.robust import outliers
 from udccal.models.backscatter import Backscatter
@@ -35,7 +39,11 @@ from udccal.numerics import in_float64
 from udccal.result import Diagnostic, FitResult, FitStatus, Outliers
 from udccal.rig import RigDescription
 
+# Interpolation never combines bins at this distance.
+_TILE = 4
 
+
+@in_float64
 def fit_backscatter(
     data: BackscatterData, geometry: Geometry, rig: RigDescription, rules: BackscatterRules | None = None
 ) -> FitResult[Backscatter]:
@@ -56,19 +64,17 @@ def fit_backscatter(
     """
     rules = rules or BackscatterRules()
     keep = data.shots.clipped.mean(axis=(1, 2, 3))[1:-1] <= rules.most_clipped
-    status, note = _usable(data, keep, rules)
-    if status is not FitStatus.CONVERGED:
-        return FitResult.failed("backscatter", absent_backscatter(rig, geometry), status, note)
+    if (unusable := _unusable(data.shots, keep, rules)) is not None:
+        return FitResult.failed("backscatter", absent_backscatter(rig, geometry), *unusable)
     clipped = [name for name, kept in zip(data.names, keep, strict=True) if not kept]
     used = data.only(keep)
     return result_of(search(Problem.of(used, geometry, rig, rules)), used, rig, clipped)
 
 
-def _usable(
-    data: BackscatterData, keep: Bool[np.ndarray, " pictures"], rules: BackscatterRules
-) -> tuple[FitStatus, str]:
-    """Return whether a fit can start with white, dark and the pictures to keep, and a note if it cannot."""
-    shots = data.shots
+def _unusable(
+    shots: Binned, keep: Bool[np.ndarray, " pictures"], rules: BackscatterRules
+) -> tuple[FitStatus, str] | None:
+    """Return a status and a note if white, dark and the pictures to keep allow no fit."""
     if len(shots.rate) < 2:
         note = "Expected the steps backscatter/white and backscatter/dark, found that they were not captured."
         return FitStatus.TOO_FEW_DATA, note
@@ -81,7 +87,7 @@ def _usable(
     found = f"found {keep.sum()} ({(~keep).sum()} clipped)"
     if keep.sum() < rules.fewest_pictures:
         return FitStatus.TOO_FEW_DATA, f"Expected at least {rules.fewest_pictures} unclipped pictures, {found}."
-    return FitStatus.CONVERGED, ""
+    return None
 
 
 def result_of(found: Found, data: BackscatterData, rig: RigDescription, clipped: list[str]) -> FitResult[Backscatter]:
@@ -89,22 +95,16 @@ def result_of(found: Found, data: BackscatterData, rig: RigDescription, clipped:
     fitted, template, used = found.fitted, found.problem.template, found.fitted.used
     rest = residual_pattern(found)
     values = value_moments(found, rest.inflation)
-    # Change of lengths with one sigma of the pitch: pictures give lengths in panel pixels only.
-    moved, lengths = np.zeros(len(NAMES)), [DISTANCE, PUPIL, DEPTH]
-    moved[lengths] = values.mean[lengths] * rig.panel.pitch_mm.tolerance / rig.panel.pitch_mm.value
-    scale = np.ones(len(NAMES))
+    # Pictures give lengths in panel pixels only: lengths change with the pitch.
+    pitch, scale = rig.panel.pitch_mm, np.ones(len(NAMES))
+    moved = np.where(np.isin(np.arange(len(NAMES)), [DISTANCE, PUPIL, DEPTH]), values.mean, 0.0)
     scale[PUPIL] = 1 / footprint_per_pupil(rig)
-    cov = (values.cov + np.outer(moved, moved)) * np.outer(scale, scale)
-    shape = data.shots.rate.shape[2:]
-    rays = grid_rays(template.geometry, shape, template.step, np.arange(shape[0] * shape[1]))
-    window = window_for(template, linear_of(fitted.found.x), rays, slack=0.5)
-    posterior = term_posterior(replace(template, window=window), data, found, rest.inflation)
+    cov = (values.cov + (pitch.tolerance / pitch.value) ** 2 * np.outer(moved, moved)) * np.outer(scale, scale)
+    posterior = term_posterior(data, found, rest.inflation)
     status, advice = _status(found)
     # Variance between the frames of a shot over the noise model's, as the median of all shots; 0: unknown.
     known = data.shots.scatter[:-1][np.isfinite(data.shots.scatter[:-1])]
     scatter = float(np.median(known)) if known.size else 0.0
-    # The eliminated mask reduces the residuals' variance; this corrects for it.
-    z = fitted.z[used] * np.sqrt(used.sum() / found.dof)
     return FitResult(
         name="backscatter",
         term=posterior.term_at(posterior.mean),
@@ -124,30 +124,12 @@ def result_of(found: Found, data: BackscatterData, rig: RigDescription, clipped:
         ),
         notes=(*advice, *_notes(found, rest, scatter, clipped)),
         outliers=_outliers(found, data, clipped),
-        residuals=residual_sample(_places(found)[np.nonzero(used)[2]] * template.step, z),
+        # The eliminated mask reduces the residuals' variance; the factor corrects for it.
+        residuals=residual_sample(
+            found.places[np.nonzero(used)[2]] * template.step, fitted.z[used] * np.sqrt(used.sum() / found.dof)
+        ),
         posterior=posterior,
     )
-
-
-def residual_pattern(found: Found) -> MisfitTest:
-    """Test whether residuals of a shot and colour have the same sign over parts of the sensor or all of it."""
-    fitted, cells, places, used = found.fitted, found.problem.rules.cells, _places(found), found.fitted.used
-    low, high = places.min(axis=0), places.max(axis=0)
-    column, row = np.minimum((places - low) / np.maximum(high - low, 1e-9) * cells, cells - 1).astype(int).T
-    groups = np.arange(used[..., 0].size).reshape(*used.shape[:2], 1)
-    scale = max(fitted.best.chi2 / found.dof, 1.0) * found.dof / max(used.sum(), 1)
-    tests = [
-        group_means_test(fitted.z.ravel(), (groups * cells**2 + cell).ravel(), used.ravel(), scale)
-        for cell in (row * cells + column, np.zeros(len(places), dtype=int))
-    ]
-    return sharper(*tests)
-
-
-def _places(found: Found) -> Float[np.ndarray, "n 2"]:
-    """Return grid columns and rows of the positions."""
-    template = found.problem.template
-    rows, columns = np.divmod(found.problem.flat, template.columns // template.step)
-    return np.stack([columns, rows], axis=1).astype(np.float64)
 
 
 def _status(found: Found) -> tuple[FitStatus, tuple[str, ...]]:
@@ -205,7 +187,7 @@ def _notes(found: Found, rest: MisfitTest, scatter: float, clipped: list[str]) -
 def _outliers(found: Found, data: BackscatterData, clipped: list[str]) -> tuple[Outliers, ...]:
     """Return the samples and pictures that were left out, by rule."""
     names, usable, bad = ("white", *data.names), found.problem.seen.usable[:-1], found.bad_shots[:-1]
-    places = _places(found).astype(int)
+    places = found.places.astype(int)
 
     def named(which: Usable) -> list[str]:
         return [f"{names[i]} {'RGB'[c]} bin ({places[n, 0]}, {places[n, 1]})" for i, c, n in np.argwhere(which)]
@@ -218,21 +200,90 @@ def _outliers(found: Found, data: BackscatterData, clipped: list[str]) -> tuple[
     )
 
 
+@final
+@dataclass(frozen=True)
+class TermAt:
+    """The term as a function of its parameters (``linear_of``), and of ``_TILE`` squared numbers of the mask's noise.
+
+    The mask is the most probable one for all shots and follows the parameters linearly. Bins with the same number are
+    so far from each other that no interpolated value depends on two of them. Their signs are random, so that sums over
+    the sensor are right on average.
+    """
+
+    template: Backscatter
+    data: BackscatterData
+    used: Bool[np.ndarray, " shots"]
+    model_error: float
+    theta: Vector
+
+    @in_float64
+    def __call__(self, parameters: Float[np.ndarray, " n"]) -> Backscatter:
+        """Return the term; its mask is never below 0."""
+        theta, noise = parameters[: len(self.theta)], parameters[len(self.theta) :].reshape(_TILE, _TILE)
+        mask, sigma = self._mask
+        rows, columns = mask.shape[1:]
+        mask = mask + sigma * np.tile(noise, (-(-rows // _TILE), -(-columns // _TILE)))[:rows, :columns]
+        if (moved := theta - self.theta).any():
+            mask = mask + np.einsum("k,kcij->cij", moved, self._mask_jacobian)
+        return replace(with_linear(self.template, theta), mask=np.maximum(mask, 0.0))
+
+    @functools.cached_property
+    def _mask(self) -> tuple[Float[np.ndarray, "3 a b"], Float[np.ndarray, "3 a b"]]:
+        """Light of white over the whole grid, and its sigma with a random sign, in e-/s."""
+        found, shape = [self._best(flat)[1] for flat in self._parts(512)], self.data.shots.rate.shape[1:]
+        mask = np.concatenate([np.maximum(one.mask, 0.0) for one in found], axis=1)
+        sigma = np.concatenate([np.maximum(one.information, 1e-30) for one in found], axis=1) ** -0.5
+        sign = np.random.default_rng(0).choice([-1.0, 1.0], mask.shape)
+        return mask.reshape(shape), (sign * sigma).reshape(shape)
+
+    @functools.cached_property
+    def _mask_jacobian(self) -> Float[np.ndarray, "18 3 a b"]:
+        """Derivatives of the mask by the parameters, computed only when the posterior is used."""
+        parts = []
+        for flat in self._parts(256):
+            rays, best = self._best(flat)
+            of_ratio = ratios_and_jacobian(self.template, self.theta, rays, self.data.pictures)[1]
+            parts.append(best.mask_jacobian(of_ratio))
+        return np.concatenate(parts, axis=2).reshape(-1, *self.data.shots.rate.shape[1:])
+
+    def _parts(self, size: int) -> list[Int[np.ndarray, " n"]]:
+        """Split the grid positions into parts of ``size``, which fit into memory."""
+        flat = np.arange(self.data.shots.rate[0, 0].size)
+        return np.split(flat, flat[size::size])
+
+    def _best(self, flat: Int[np.ndarray, " n"]) -> tuple[Rays, Profile]:
+        """Return rays, mask and dark signal: first with the data's weights, then with the model's."""
+        shots, template = self.data.shots, self.template
+        rays, seen = grid_rays(template.geometry, shots.rate.shape[2:], template.step, flat), shots.at(flat)
+        usable = seen.usable & self.used[:, None, None]
+        ratio = ratios(template, self.theta, rays, self.data.pictures)
+        best = Profile.of(seen, ratio, np.where(usable, seen.first_weights(), 0.0))
+        for _ in range(2):
+            best = Profile.of(seen, ratio, seen.weights(best.mask * ratio, best.mask, self.model_error, usable))
+        return rays, best
+
+    def posterior(self, cov: Float[np.ndarray, "18 18"]) -> Posterior[Backscatter]:
+        """Return the posterior with this covariance of the parameters, and with the mask's noise."""
+        count, noise = len(cov), _TILE**2
+        factor = np.eye(count + noise)
+        factor[:count, :count] = square_root(cov)
+        return Posterior(np.concatenate([self.theta, np.zeros(noise)]), factor, self)
+
+
 @in_float64
-def term_posterior(
-    template: Backscatter, data: BackscatterData, found: Found, inflation: float
-) -> Posterior[Backscatter]:
+def term_posterior(data: BackscatterData, found: Found, inflation: float) -> Posterior[Backscatter]:
     """Return the whole term's posterior: its parameters, the mask that follows them, its noise, and other orders.
 
     The model error of a picture (``model_error_of_white``) is not an error of the term and adds to it.
 
     Args:
-        template: gives the window.
-        data: all shots.
-        found: the chosen order's fit, and the others.
+        data, found: all shots; the chosen order's fit, and the others.
         inflation: factor of the parameters' variance.
     """
     theta, orders, parts = linear_of(found.fitted.found.x), found.orders, []
+    template, shape = found.problem.template, data.shots.rate.shape[2:]
+    rays = grid_rays(template.geometry, shape, template.step, np.arange(shape[0] * shape[1]))
+    template = replace(template, window=window_for(template, theta, rays, slack=0.5))
     for one in orders.tried:
         fit, factor = (found.fitted.found, inflation) if one is orders.best else (one.fit.found, 1.0)
         slope = linear_slope(fit.x)

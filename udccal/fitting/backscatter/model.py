@@ -1,28 +1,34 @@
 """Light of pictures over that of white at sensor positions, and its derivatives by the parameters.
 
-Only the emitters' shares depend on the places of the footprints, and only the panel's light depends on gamma. Automatic
-differentiation of the model gives the derivatives of the shares, compiled once for a block of positions. Sums over
-panel pixels are products of sparse matrices. White is the first shot, the dark frame the last.
+This is ``udccal.models.backscatter`` in numpy: a fit needs it at few positions and for many parameters, for which
+compiling takes longer than computing. White is the first shot, the dark frame the last.
 """
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import final
+from dataclasses import dataclass
+from typing import NamedTuple, final
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, Shaped, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from scipy import sparse
+from scipy.spatial.transform import Rotation
+from scipy.special import erf
 
-from udccal.fitting.backscatter.parameters import EMITTERS, MIX, OFF_DIAGONAL, PLACES, SOFTNESS, Vector, with_linear
-from udccal.models.arrays import Arrayish
-from udccal.models.backscatter import Backscatter, emitter_shares, footprints, window_corners
-from udccal.models.geometry import Geometry, panel_directions
-from udccal.numerics import in_float64
+from udccal.fitting.backscatter.parameters import (
+    DEPTH,
+    DISTANCE,
+    EMITTERS,
+    MIX,
+    OFF_DIAGONAL,
+    OFFSET,
+    PUPIL,
+    REFLECTION,
+    SOFTNESS,
+    Vector,
+    emitters_of,
+)
+from udccal.models.backscatter import Backscatter
 
 # Axes: shot, colour, position; bin: colour, position; Moves add the parameter. Rays are in panel coordinates.
 PerShot = Float[np.ndarray, "shots 3 n"]
@@ -30,35 +36,27 @@ PerBin = Float[np.ndarray, "3 n"]
 Usable = Bool[np.ndarray, "shots 3 n"]
 Rays = Float[np.ndarray, "n 3"]
 Moves = Float[np.ndarray, "k shots 3 n"]
-BLOCK = 32
 _LEAST_WHITE = 1e-9
+# The soft edge differs from 0 or 1 by 1e-12 at this many of its sigmas.
+_EDGE_SIGMAS = 7.0
 
 
-def in_blocks(
-    function: Callable[..., tuple[Array, ...]], *columns: Shaped[np.ndarray, "n ..."]
-) -> tuple[Shaped[np.ndarray, "n ..."], ...]:
-    """Apply a function to arrays with one row per position, ``BLOCK`` rows at a time: it is compiled once."""
-    count = len(columns[0])
-    found = []
-    for first in range(0, count, BLOCK):
-        # The last block repeats the last row.
-        rows = np.minimum(np.arange(first, first + BLOCK), count - 1)
-        found.append([np.asarray(part) for part in function(*(column[rows] for column in columns))])
-    return tuple(np.concatenate(parts)[:count] for parts in zip(*found, strict=True))
+class _Footprints(NamedTuple):
+    """Ellipses in panel px: slopes of rays, centres on the emitters' and the reflection's plane, shapes of the disc."""
+
+    slope: Float[np.ndarray, "n 2"]
+    centre: Float[np.ndarray, "n 2 2"]
+    shape: Float[np.ndarray, "n 2 2"]
 
 
-_directions = jax.jit(panel_directions)
-
-
-@in_float64
-def directions(geometry: Geometry, pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 3"]:
-    """Return the rays of sensor pixels in panel coordinates."""
-    return in_blocks(lambda part: (_directions(geometry, part),), np.asarray(pixels, dtype=np.float64))[0]
-
-
-def corners_of(template: Backscatter, theta: Vector, rays: Rays) -> Int[np.ndarray, "n 2"]:
-    """Return (column, row) of the first panel pixel of each position's window."""
-    return _middle_and_reach(template, theta, rays)[0] - (template.window - 1) // 2
+def _footprints(template: Backscatter, theta: Vector, rays: Rays) -> _Footprints:
+    """Return ``models.backscatter.footprints`` of both planes."""
+    geometry, pitch = template.geometry, float(np.asarray(template.pitch_mm))
+    slope = rays[:, :2] / rays[:, 2:]
+    across = Rotation.from_rotvec(np.asarray(geometry.rotation_rad)).as_matrix()[:, :2] * np.exp(theta[PUPIL]) / 2
+    planes = np.exp(theta[DISTANCE]) + np.array([0.0, np.exp(theta[DEPTH])])
+    centre = np.asarray(geometry.pupil_mm)[:2] + planes[:, None] * slope[:, None]
+    return _Footprints(slope / pitch, centre / pitch, (across[:2] - slope[:, :, None] * across[2]) / pitch)
 
 
 def window_for(template: Backscatter, theta: Vector, rays: Rays, slack: float) -> int:
@@ -68,34 +66,25 @@ def window_for(template: Backscatter, theta: Vector, rays: Rays, slack: float) -
         template: gives the geometry.
         theta: of ``parameters.linear_of``.
         rays: in panel coordinates.
-        slack: distance that the footprints may move, in panel px.
+        slack: distance between footprints and the window's edge in panel px.
     """
-    reach_px = _middle_and_reach(template, theta, rays)[1]
-    emitters = np.insert(theta[EMITTERS].reshape(2, 2), 1, 0.0, axis=0)
-    spread = np.abs(emitters - emitters.mean(axis=0)).max()
-    return 2 * int(np.ceil(reach_px.max() + spread + 4 * float(np.exp(theta[SOFTNESS])) + slack)) + 1
+    return _window(_footprints(template, theta, rays), theta, 4 * float(np.exp(theta[SOFTNESS])) + slack)
 
 
-@in_float64
-def _middle_and_reach(
-    template: Backscatter, theta: Vector, rays: Rays
-) -> tuple[Int[np.ndarray, "n 2"], Float[np.ndarray, " n"]]:
-    """Return the middle panel pixel of each position's window, and the footprints' reach from it in panel px."""
-    # With a window of one pixel, windows of any size use one compilation.
-    single = replace(template, window=1)
-    middle, reach = in_blocks(lambda part: _middle_and_reach_of_block(single, theta, part), rays)
-    return middle.astype(np.int64), reach
+def _window(at: _Footprints, theta: Vector, edge_px: Float[np.ndarray, "*n"] | float) -> int:
+    reach_px = np.linalg.norm(at.shape, axis=2).max(axis=1) + np.abs(at.centre[:, 1] - at.centre[:, 0]).max(axis=1) / 2
+    spread = np.abs(emitters_of(theta) - emitters_of(theta).mean(axis=0)).max()
+    return 2 * int(np.ceil((reach_px + edge_px).max() + spread)) + 1
 
 
-@jax.jit
-def _middle_and_reach_of_block(
-    template: Backscatter, theta: Float[Arrayish, "18"], rays: Float[Arrayish, "b 3"]
-) -> tuple[Int[Array, "b 2"], Float[Array, " b"]]:
-    term = with_linear(template, jnp.asarray(theta))
-    near, shape = footprints(term, rays, term.standoff_mm)
-    far, far_shape = footprints(term, rays, term.standoff_mm + term.reflection_mm)
-    extent = jnp.maximum(jnp.linalg.norm(shape, axis=2), jnp.linalg.norm(far_shape, axis=2)).max(axis=1)
-    return window_corners(term, rays), extent + jnp.abs(far - near).max(axis=1) / 2
+def corners_of(template: Backscatter, theta: Vector, rays: Rays) -> Int[np.ndarray, "n 2"]:
+    """Return (column, row) of the first panel pixel of the window around each position's footprints."""
+    return _corners(_footprints(template, theta, rays), theta, template.window)
+
+
+def _corners(at: _Footprints, theta: Vector, window: int) -> Int[np.ndarray, "n 2"]:
+    middle = at.centre.mean(axis=1) - emitters_of(theta).mean(axis=0)
+    return np.round(middle - (window - 1) / 2).astype(np.int64)
 
 
 @final
@@ -137,164 +126,170 @@ class Pictures:
         light = np.where(np.arange(256) > 0, np.exp(gamma * log), 0.0)
         return np.stack([light, light * log])[:, self.values]
 
+    def index(self, panel_px: Int[np.ndarray, "k 2"]) -> Int[np.ndarray, " k"]:
+        """Return the indices of panel pixels (column, row) among those of ``light``."""
+        crop = self.crop
+        column, row = panel_px[:, 0] - crop.column, panel_px[:, 1] - crop.row
+        inside = (column >= 0) & (column < crop.columns) & (row >= 0) & (row < crop.rows)
+        return np.where(inside, row * crop.columns + column, crop.rows * crop.columns)
+
 
 @final
 @dataclass(frozen=True)
-class Windows:
-    """The panel pixels around each position's footprints.
+class Shares:
+    """Shares of emitters that are not 0, in rows of one position, plane (direct, reflected) and primary.
 
     Attributes:
-        rays: of the positions, in panel coordinates.
-        corner: (column, row) of each window's first panel pixel.
-        places: indices of a window's pixels among those of ``Pictures``.
+        positions: number of positions.
+        row, panel_px: of each share; (column, row) of its panel pixel.
+        value: the share.
+        edge: which of them are at their footprint's edge.
+        slopes: derivatives of these by the emitter's place (x, y), and by the logarithms of softness and of the pupil,
+            whose area is constant here.
     """
 
-    rays: Rays
-    corner: Int[np.ndarray, "n 2"]
-    places: Int[np.ndarray, "n window2"]
+    positions: int
+    row: Int[np.ndarray, " k"]
+    panel_px: Int[np.ndarray, "k 2"]
+    value: Float[np.ndarray, " k"]
+    edge: Bool[np.ndarray, " k"]
+    slopes: Float[np.ndarray, "d e"]
 
     @classmethod
-    def around(cls, template: Backscatter, theta: Vector, rays: Rays, crop: PanelCrop) -> Windows:
-        """Return windows of the template's width around the footprints of these parameters."""
-        corner, span = corners_of(template, theta, rays), np.arange(template.window)
-        columns = corner[:, 0, None, None] - crop.column + span[None, None, :]
-        rows = corner[:, 1, None, None] - crop.row + span[None, :, None]
-        inside = (columns >= 0) & (columns < crop.columns) & (rows >= 0) & (rows < crop.rows)
-        places = np.where(inside, rows * crop.columns + columns, crop.rows * crop.columns)
-        return cls(rays, corner, places.reshape(len(corner), -1))
+    def of(cls, template: Backscatter, theta: Vector, rays: Rays, derivatives: bool = False) -> Shares:
+        """Return ``models.backscatter.emitter_shares`` of each plane; without derivatives ``slopes`` has no rows.
 
-    def sums(
-        self, shares: Float[np.ndarray, "n 3 k window2"], panel: Float[np.ndarray, "3 pixels shots"]
-    ) -> Float[np.ndarray, "k 3 shots n"]:
-        """Sum each primary's light over the windows; panel pixels beyond the crop are black."""
-        pixels = panel.shape[1]
-        places = self.places[:, None, None] + pixels * np.arange(3)[:, None, None]
-        columns = np.broadcast_to(places, shares.shape).ravel()
-        ends = np.arange(0, shares.size + 1, shares.shape[3])
-        collect = sparse.csr_array((shares.ravel(), columns, ends), shape=(len(ends) - 1, 3 * pixels))
-        light = (collect @ panel.reshape(3 * pixels, -1)).reshape(*shares.shape[:3], -1)
-        return light.transpose(2, 1, 3, 0)
+        A window wider than the template's, as only a fit that goes astray needs it, is cut to that.
+        """
+        feet, softness = _footprints(template, theta, rays), float(np.exp(theta[SOFTNESS]))
+        inverse, area = np.linalg.inv(feet.shape), np.pi * np.abs(np.linalg.det(feet.shape))
+        # Half width of the soft edge where the ellipse is narrowest, in units of the ellipse.
+        reach = _EDGE_SIGMAS * softness / np.linalg.svd(feet.shape, compute_uv=False)[:, 1]
+        needed = _window(feet, theta, reach * np.linalg.norm(feet.shape, axis=2).max(axis=1) + 0.5)
+        window = min(needed, template.window)
+        corner = _corners(feet, theta, window)
+        # The emitter of each window's first pixel, seen from the footprint's centre, in units of the ellipse.
+        first = corner[:, None, None] + emitters_of(theta) - feet.centre[:, :, None]
+        first, step = np.einsum("nij,npcj->inpc", inverse, first)[..., None, None], np.arange(window)
+        x, y = (
+            (first[i] + (inverse[:, i, 1, None] * step)[:, None, None, :, None])
+            + (inverse[:, i, 0, None] * step)[:, None, None, None, :]
+            for i in (0, 1)
+        )
+        square = x * x + y * y + 1e-6
+        inside = np.flatnonzero(square < ((1 + reach) ** 2)[:, None, None, None, None])
+        row, pixel = np.divmod(inside, window**2)
+        panel_px = corner[row // 6] + np.stack([pixel % window, pixel // window], axis=1)
+        value, square = (1 / area)[row // 6], square.ravel()[inside]
+        edge = square > (np.maximum(1 - reach, 0.0) ** 2)[row // 6]
+        n, inside, square = row[edge] // 6, inside[edge], square[edge]
+        share, *slopes = _soft_edge(x.ravel()[inside], y.ravel()[inside], square, inverse[n], softness, derivatives)
+        value[edge] *= share
+        return cls(len(area), row, panel_px, value, edge, np.reshape(slopes, (len(slopes), len(n))) / area[n])
+
+    def light(
+        self, shown: Pictures, panel: Float[np.ndarray, "3 pixels shots"]
+    ) -> Float[np.ndarray, "positions 2 3 shots"]:
+        """Sum the light ``panel`` of each primary over the footprints."""
+        return self._sums(np.ones_like(self.edge), self.value[None], shown, panel)[0]
+
+    def light_slopes(
+        self, shown: Pictures, panel: Float[np.ndarray, "3 pixels shots"]
+    ) -> Float[np.ndarray, "d positions 2 3 shots"]:
+        """Return the derivatives of ``light`` in the order of ``slopes``."""
+        return self._sums(self.edge, self.slopes, shown, panel)
+
+    def _sums(
+        self, which: np.ndarray, values: np.ndarray, shown: Pictures, panel: np.ndarray
+    ) -> Float[np.ndarray, "d positions 2 3 shots"]:
+        row, rows, (_, pixels, shots) = self.row[which], 6 * self.positions, panel.shape
+        columns, ends = row % 3 * pixels + shown.index(self.panel_px[which]), np.searchsorted(row, np.arange(rows + 1))
+        matrices = [sparse.csr_array((one, columns, ends), shape=(rows, 3 * pixels)) for one in values]
+        return np.stack([one @ panel.reshape(-1, shots) for one in matrices]).reshape(-1, self.positions, 2, 3, shots)
 
 
-@in_float64
-def _shares_at(
-    template: Backscatter, theta: Vector, at: Windows, derivatives: bool
-) -> Float[np.ndarray, "n 3 k window2"]:
-    """Return the share of every emitter in the windows, and on request its derivatives by ``PLACES``."""
-    of_block = functools.partial(_shares, template, theta, derivatives=derivatives)
-    (shares,) = in_blocks(lambda rays, corner: (of_block(rays, corner),), at.rays, at.corner)
-    return shares
-
-
-@functools.partial(jax.jit, static_argnames="derivatives")
-def _shares(
-    template: Backscatter,
-    theta: Float[Arrayish, "18"],
-    rays: Float[Arrayish, "b 3"],
-    corner: Int[Arrayish, "b 2"],
+def _soft_edge(
+    x: Float[np.ndarray, " e"],
+    y: Float[np.ndarray, " e"],
+    square: Float[np.ndarray, " e"],
+    inverse: Float[np.ndarray, "e 2 2"],
+    softness: float,
     derivatives: bool,
-) -> Float[Array, "b 3 k window2"]:
-    whole = jnp.asarray(theta)
+) -> tuple[Float[np.ndarray, " e"], ...]:
+    """Return the part of emitters inside, and on request the derivatives of ``Shares.slopes``.
 
-    def shares_of(part: Array) -> Array:
-        return emitter_shares(with_linear(template, whole.at[PLACES].set(part)), rays, corner)
+    At u = inverse @ place, r^2 = |u|^2 + 1e-6, the distance from the edge is d = (1 - r) / |g|, g = inverse^T u / r.
+    """
+    (a, b), (c, d) = inverse.transpose(1, 2, 0)
+    radius = np.sqrt(square)
+    g_x, g_y = (a * x + c * y) / radius, (b * x + d * y) / radius
+    steep = g_x * g_x + g_y * g_y
+    length = np.sqrt(steep + 1e-12)
+    distance = (1 - radius) / length
+    share = 0.5 + 0.5 * erf(distance / (np.sqrt(2.0) * softness))
+    if not derivatives:
+        return (share,)
+    density = np.exp(-0.5 * (distance / softness) ** 2) / (np.sqrt(2 * np.pi) * softness)
+    # The change of |g| with the place, times r: (inverse^T inverse - |g|^2) g.
+    along = a * g_x + b * g_y, c * g_x + d * g_y
+    bent = distance / (radius * length)
+    by_x = -density / length * (g_x + bent * (a * along[0] + c * along[1] - steep * g_x))
+    by_y = -density / length * (g_y + bent * (b * along[0] + d * along[1] - steep * g_y))
+    # A larger pupil makes u shorter.
+    shorter = 1 - 1e-6 / square
+    by_pupil = density * (radius * shorter / length + distance * steep / length**2 * (2 - shorter))
+    return share, by_x, by_y, -distance * density, by_pupil
 
-    found = shares_of(whole[PLACES])[..., None]
-    if derivatives:
-        found = jnp.concatenate([found, jax.jacfwd(shares_of)(whole[PLACES])], axis=-1)
-    return jnp.transpose(found, (0, 2, 3, 1))
 
-
-def ratios(template: Backscatter, theta: Vector, at: Windows, shown: Pictures) -> PerShot:
+def ratios(template: Backscatter, theta: Vector, rays: Rays, shown: Pictures) -> PerShot:
     """Return the light of pictures over that of white, by shot, colour and position."""
-    shares = _shares_at(template, theta, at, derivatives=False)
-    light = _mixed(theta, at.sums(shares, shown.light(float(theta[0]))[0]))[0]
-    return light / np.maximum(light[0], _LEAST_WHITE)
+    return ratios_of(theta, Shares.of(template, theta, rays).light(shown, shown.light(float(theta[0]))[0]))
 
 
-def ratios_and_jacobian(template: Backscatter, theta: Vector, at: Windows, shown: Pictures) -> tuple[PerShot, Moves]:
+def ratios_of(theta: Vector, light: Float[np.ndarray, "n 2 3 shots"]) -> PerShot:
+    """Return ratios from the light of both planes."""
+    mixed = _mixed(theta, _joined(theta, light)[None])[0]
+    return mixed / np.maximum(mixed[0], _LEAST_WHITE)
+
+
+def ratios_and_jacobian(template: Backscatter, theta: Vector, rays: Rays, shown: Pictures) -> tuple[PerShot, Moves]:
     """Return ``ratios``, by shot, colour and position, and their derivatives by each of ``theta``.
 
     Args:
         template, theta: geometry and window; parameters of ``parameters.linear_of``.
-        at, shown: the panel pixels around the footprints; what the panel showed.
+        rays, shown: in panel coordinates; what the panel showed.
     """
-    shares = _shares_at(template, theta, at, derivatives=True)
-    panel, by_gamma = shown.light(float(theta[0]))
-    primaries = at.sums(shares, panel)
-    light = _mixed(theta, primaries)
-    white = np.maximum(light[0, 0], _LEAST_WHITE)
-    ratio = light[0] / white
-    jacobian = np.zeros((len(theta), *ratio.shape))
-    jacobian[0] = _mixed(theta, at.sums(shares[:, :, :1], by_gamma))[0] / white
-    jacobian[PLACES] = (light[1:] - ratio * light[1:, :1]) / white
-    for k, (colour, primary) in enumerate(zip(*OFF_DIAGONAL, strict=True), MIX.start):
-        one = primaries[0, primary]
-        jacobian[k, :, colour] = (one - ratio[:, colour] * one[0]) / white[colour]
-    return ratio, jacobian
+    shares, (panel, by_gamma) = Shares.of(template, theta, rays, derivatives=True), shown.light(float(theta[0]))
+    light, slopes = shares.light(shown, panel), shares.light_slopes(shown, panel)
+    slope, whole = _footprints(template, theta, rays).slope.T[:, :, None, None], _joined(theta, light)
+    by_x, by_y, by_softness, by_pupil = _joined(theta, slopes)
+    moves = np.zeros((len(theta), *whole.shape))
+    moves[0] = _joined(theta, shares.light(shown, by_gamma))
+    moves[DISTANCE] = -np.exp(theta[DISTANCE]) * (slope[0] * by_x + slope[1] * by_y)
+    moves[PUPIL] = by_pupil - 2 * whole
+    moves[SOFTNESS] = by_softness
+    moves[REFLECTION] = light[:, 1] - light[:, 0]
+    deeper = slope[0] * slopes[0, :, 1] + slope[1] * slopes[1, :, 1]
+    moves[DEPTH] = -np.exp(theta[DEPTH]) * theta[REFLECTION] * deeper
+    moves[OFFSET] = by_x, by_y
+    # The emitters of red, and of blue.
+    moves[EMITTERS][:2, :, 0] = by_x[:, 0], by_y[:, 0]
+    moves[EMITTERS][2:, :, 2] = by_x[:, 2], by_y[:, 2]
+    mixed = _mixed(theta, np.concatenate([whole[None], moves]))
+    for k, (colour, primary) in enumerate(zip(*OFF_DIAGONAL, strict=True), MIX.start + 1):
+        mixed[k, :, colour] = whole[:, primary].T
+    white = np.maximum(mixed[0, 0], _LEAST_WHITE)
+    ratio = mixed[0] / white
+    return ratio, (mixed[1:] - ratio * mixed[1:, :1]) / white
 
 
-def _mixed(theta: Vector, primaries: Float[np.ndarray, "k 3 shots n"]) -> Moves:
+def _joined(theta: Vector, light: Float[np.ndarray, "*k n 2 3 shots"]) -> Float[np.ndarray, "*k n 3 shots"]:
+    """Return the light of both planes together."""
+    return (1 - theta[REFLECTION]) * light[..., 0, :, :] + theta[REFLECTION] * light[..., 1, :, :]
+
+
+def _mixed(theta: Vector, primaries: Float[np.ndarray, "k n 3 shots"]) -> Moves:
     """Mix primaries into camera colours, except for a factor per colour, which cancels in ratios."""
     mix = np.eye(3)
     mix[OFF_DIAGONAL] = theta[MIX]
-    return np.einsum("cp,kpsn->kscn", mix, primaries)
-
-
-@final
-@dataclass(frozen=True)
-class Profile:
-    """The most probable mask and dark signal for given ratios, bin by bin.
-
-    Attributes:
-        mask, dark: e-/s.
-        errors: measured less modelled rates; ``weight`` is 1 / sigma of each.
-        information: on the mask, with the dark signal eliminated.
-        by_mask, by_dark: orthonormal directions of the whitened errors that mask and dark remove.
-    """
-
-    mask: PerBin
-    dark: PerBin
-    errors: PerShot
-    weight: PerShot
-    information: PerBin
-    by_mask: PerShot
-    by_dark: PerShot
-
-    @property
-    def chi2(self) -> float:
-        """Chi-squared without the prior."""
-        return float(((self.errors * self.weight) ** 2).sum())
-
-    @classmethod
-    def of(cls, ratio: PerShot, light: PerShot, exposure: Float[np.ndarray, " shots"], weight: PerShot) -> Profile:
-        """Solve for mask and dark from all shots' ratios and light; ``exposure`` is the dark frame's over theirs."""
-        apart = exposure[:, None, None] * weight
-        length = np.sqrt((apart**2).sum(axis=0))
-        by_dark = apart / length
-        across = ratio * weight - by_dark * (by_dark * ratio * weight).sum(axis=0)
-        information = (across**2).sum(axis=0)
-        root = np.sqrt(np.where(information > 0, information, 1.0))
-        by_mask = across / root
-        mask = (by_mask * light * weight).sum(axis=0) / root
-        dark = (by_dark * (light - mask * ratio) * weight).sum(axis=0) / length
-        errors = light - mask * ratio - exposure[:, None, None] * dark
-        return cls(mask, dark, errors, weight, information, by_mask, by_dark)
-
-    def jacobian(self, of_ratio: Moves) -> Moves:
-        """Return the whitened errors' Jacobian without the parts that mask and dark remove (Kaufman, BIT 15, 1975)."""
-        jacobian = -(self.mask * self.weight) * of_ratio
-        for way in (self.by_dark, self.by_mask):
-            jacobian -= way * np.einsum("scn,kscn->kcn", way, jacobian)[:, None]
-        return jacobian
-
-    def mask_jacobian(self, of_ratio: Moves) -> Float[np.ndarray, "k 3 n"]:
-        """Return the mask's derivatives for the expected light; the contribution of noise is of second order."""
-        along = np.einsum("scn,kscn->kcn", self.by_mask * self.weight, of_ratio)
-        return -self.mask * along / np.sqrt(np.where(self.information > 0, self.information, 1.0))
-
-    def light_variance(self, ratio: PerShot, of_ratio: Moves, cov: Float[np.ndarray, "k k"]) -> PerShot:
-        """Return predicted light's variance: from the parameters and their effect on the mask, and from its noise."""
-        moves = self.mask * of_ratio + ratio * self.mask_jacobian(of_ratio)[:, None]
-        by_parameters = np.einsum("kicn,kl,licn->icn", moves, cov, moves, optimize=True)
-        return np.asarray(by_parameters + ratio**2 / np.maximum(self.information, 1e-30))
+    return np.einsum("cp,knps->kscn", mix, primaries)

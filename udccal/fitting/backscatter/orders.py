@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from typing import final
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from scipy.special import ndtri
 
 from udccal.fitting.backscatter.data import Binned
@@ -29,15 +29,16 @@ from udccal.fitting.backscatter.parameters import (
     split_plane,
     values_of,
 )
-from udccal.fitting.backscatter.solve import (
-    ErrorsAt,
-    Fitted,
-    MostProbable,
-    Problem,
-    most_probable,
-)
+from udccal.fitting.backscatter.solve import ErrorsAt, Fitted, MostProbable, Problem, Profile, most_probable
 from udccal.fitting.engine.gaussian import Prior
-from udccal.fitting.engine.misfit import chi2_test, excess_sigma, robust_excess_sigma
+from udccal.fitting.engine.misfit import (
+    MisfitTest,
+    chi2_test,
+    excess_sigma,
+    group_means_test,
+    robust_excess_sigma,
+    sharper,
+)
 from udccal.fitting.engine.orders import Attempt, Choice, choose, evidence
 from udccal.fitting.engine.robust import MAD_TO_SIGMA, OutlierRule
 
@@ -71,20 +72,25 @@ class Found:
         """Degrees of freedom of chi-squared without the prior's part."""
         return self.fitted.dof(self.problem.prior)
 
+    @property
+    def places(self) -> Float[np.ndarray, "n 2"]:
+        """Grid columns and rows of the positions."""
+        template = self.problem.template
+        rows, columns = np.divmod(self.problem.flat, template.columns // template.step)
+        return np.stack([columns, rows], axis=1).astype(np.float64)
+
 
 def search(problem: Problem, kernels: tuple[Order, ...] = KERNELS) -> Found:
     """Fit the orders and choose the one of largest evidence; ``kernels`` has one item if the order is known."""
     noise, rules = problem.seen.first_weights(), problem.rules
     simple = _from_afar(problem, ONE_PLANE, problem.start, noise, rules.first_error)
     bad = _bad_shots(simple.weighed(noise), rules)
-    problem = problem.with_room(simple.found.x)
     rich = _two_planes(problem, simple, np.where(bad[:, None, None], 0.0, noise))
     # Evaluate again: one plane describes some good pictures badly.
     bad = _bad_shots(rich.weighed(noise), rules)
     rich = rich.weighed(np.where(bad[:, None, None], 0.0, noise))
     usable = _without_outliers(problem, rich, ~bad)
     rich, error = refit(problem, rich, usable)
-    problem = problem.with_room(rich.found.x)
     orders = _compared(problem, rich, simple.found.x, kernels if error <= rules.nothing_fits else (TWO_PLANES,))
     best = orders.best.fit
     best = problem.solved(best.order, best.found.x, rich.best.weight)
@@ -137,7 +143,7 @@ def _two_planes(problem: Problem, simple: Fitted, noise: PerShot) -> Fitted:
     error = typical_error(simple, seen)
     starts = [split_plane(simple.found.x, prior, reflection) for reflection in problem.rules.reflections]
     fits = [_from_afar(problem, TWO_PLANES, x, noise, error) for x in starts]
-    return min(fits, key=lambda one: seen.profile(one.ratio, noise).chi2 + prior.cost(one.found.x))
+    return min(fits, key=lambda one: Profile.of(seen, one.ratio, noise).chi2 + prior.cost(one.found.x))
 
 
 def _bad_shots(fitted: Fitted, rules: BackscatterRules) -> Bool[np.ndarray, " shots"]:
@@ -160,7 +166,7 @@ def _without_outliers(problem: Problem, fitted: Fitted, good: Bool[np.ndarray, "
     seen = problem.seen
     usable = seen.usable & good[:, None, None]
     for _ in range(4):
-        best = seen.profile(fitted.ratio, np.where(usable, fitted.best.weight, 0.0))
+        best = Profile.of(seen, fitted.ratio, np.where(usable, fitted.best.weight, 0.0))
         used = best.weight > 0
         used[-1] = False
         z = np.where(used, np.abs(best.errors * best.weight), 0.0)
@@ -195,7 +201,7 @@ def _compared(problem: Problem, rich: Fitted, simple: Vector, kernels: tuple[Ord
 def held_out(problem: Problem, full: Fitted) -> tuple[float, float]:
     """Return the errors of pictures left out of a fit: relative to their peaks, and as a model error of ratios.
 
-    Both are without noise; the model error is 0 where it is not significant. ``full`` is the fit with these pictures.
+    Both are without noise; the model error is 0 where it is not significant. ``full`` includes these pictures.
     """
     every, seen = problem.rules.held_out, problem.seen
     weight = full.best.weight.copy()
@@ -204,7 +210,7 @@ def held_out(problem: Problem, full: Fitted) -> tuple[float, float]:
     used = full.used & (weight == 0)
     if not used.any():
         return 0.0, 0.0
-    ratio, of_ratio = problem.ratios(fitted.found.x, fitted.at)
+    ratio, of_ratio = problem.ratios(fitted.found.x)
     noise = seen.variance(fitted.light) + fitted.best.light_variance(ratio, of_ratio, fitted.found.cov)
     excess = fitted.best.errors**2 - noise
     peak = np.maximum(np.where(used, fitted.light, 0.0).max(axis=(1, 2), keepdims=True), 1e-12)
@@ -216,6 +222,20 @@ def held_out(problem: Problem, full: Fitted) -> tuple[float, float]:
     return float(np.sqrt(max(of_peak, 0.0))), float(np.sqrt(max(of_white, 0.0)) * found)
 
 
+def residual_pattern(found: Found) -> MisfitTest:
+    """Test whether residuals of a shot and colour have the same sign over parts of the sensor or all of it."""
+    fitted, cells, places, used = found.fitted, found.problem.rules.cells, found.places, found.fitted.used
+    low, high = places.min(axis=0), places.max(axis=0)
+    column, row = np.minimum((places - low) / np.maximum(high - low, 1e-9) * cells, cells - 1).astype(int).T
+    groups = np.arange(used[..., 0].size).reshape(*used.shape[:2], 1)
+    scale = max(fitted.best.chi2 / found.dof, 1.0) * found.dof / max(used.sum(), 1)
+    tests = [
+        group_means_test(fitted.z.ravel(), (groups * cells**2 + cell).ravel(), used.ravel(), scale)
+        for cell in (row * cells + column, np.zeros(len(places), dtype=int))
+    ]
+    return sharper(*tests)
+
+
 def value_moments(found: Found, inflation: float) -> Moments:
     """Return the values' moments by the chosen order; other orders widen the covariance by their probability.
 
@@ -223,7 +243,7 @@ def value_moments(found: Found, inflation: float) -> Moments:
     """
     problem, fitted = found.problem, found.fitted
     free, solved, weight = fitted.order.free, fitted.found, fitted.best.weight / np.sqrt(inflation)
-    errors_at = problem.errors_at(weight, fitted.at)
+    errors_at = problem.errors_at(weight)
     if inflation > 1:
         # The prior stays the same: only the pictures hold less information.
         solved = most_probable(errors_at, solved.x, free, problem.prior, problem.rules.solver)

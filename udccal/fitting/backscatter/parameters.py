@@ -11,9 +11,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import final
 
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float
 
 from udccal.fitting.engine.gaussian import Prior
 from udccal.fitting.engine.least_squares import SolverRules
@@ -28,9 +27,8 @@ NAMES = (
 )  # fmt: skip
 UNITS = ("1", "mm", "mm", "px", "1", "mm", *["px"] * 6, *["1"] * 6)
 DISTANCE, PUPIL, SOFTNESS, REFLECTION, DEPTH = range(1, 6)
-# Offset of the green emitters from the centres of their pixels, and of red and blue from green; crosstalk. PLACES are
-# the parameters that determine the footprints' places and shapes.
-OFFSET, EMITTERS, MIX, PLACES = slice(6, 8), slice(8, 12), slice(12, 18), slice(1, 12)
+# Offset of the green emitters from the centres of their pixels, and of red and blue from green; crosstalk.
+OFFSET, EMITTERS, MIX = slice(6, 8), slice(8, 12), slice(12, 18)
 # Rows and columns of the crosstalk in the mix.
 OFF_DIAGONAL = np.nonzero(~np.eye(3, dtype=bool))
 _LOGARITHMIC = np.isin(np.arange(18), np.r_[1:6, 12:18])
@@ -50,8 +48,7 @@ class BackscatterRules:
         most_clipped: fraction of clipped bins above which a shot is left out whole; others lose their clipped bins.
         visible_sigma, present_sigma: white counts as dark below this many sigma of a bin at the 90th percentile of
             bins, or of all bins together.
-        slack_px: distance in panel px that a window leaves for the footprint to move during a fit.
-        most_wider: a fit whose footprints need a window this many times as wide has gone astray.
+        most_wider: a fit whose footprints are this many times as wide as nominal ones has gone astray.
         first_error: assumed model error of a fit from far away, as a fraction of white.
         settled: such a fit continues while its model error falls below this factor of the one before.
         reflections: light of the second plane over that of the first, where fits of two planes start. If the farther
@@ -74,7 +71,6 @@ class BackscatterRules:
     most_clipped: float = 0.02
     visible_sigma: float = 2.0
     present_sigma: float = 5.0
-    slack_px: float = 0.7
     most_wider: float = 3.0
     first_error: float = 0.3
     settled: float = 0.7
@@ -212,13 +208,10 @@ class Moments:
 
 
 def linear_of(x: Vector) -> Vector:
-    """Return the parameters in coordinates in which light is close to linear.
+    """Return the parameters in coordinates in which light is close to linear, from the solver's.
 
     ``reflection`` becomes the reflected fraction of all light, and crosstalk itself replaces its logarithm: both are 0
-    where absent. All others are as in ``x``.
-
-    Args:
-        x: the solver's coordinates, in the order of ``NAMES``; lengths (mm) and softness (panel px) are logarithms.
+    where absent. All others are as in ``x``: lengths (mm) and softness (panel px) are logarithms.
     """
     theta, values = np.array(x, dtype=np.float64), values_of(x)
     theta[REFLECTION] = values[REFLECTION] / (1 + values[REFLECTION])
@@ -227,11 +220,7 @@ def linear_of(x: Vector) -> Vector:
 
 
 def linear_slope(x: Vector) -> Vector:
-    """Return the derivative of each number of ``linear_of`` by its own solver's coordinate.
-
-    Args:
-        x: the solver's coordinates, in the order of ``NAMES``.
-    """
+    """Return the derivative of each number of ``linear_of`` by its own solver's coordinate."""
     theta, slope = linear_of(x), np.ones(len(NAMES))
     slope[REFLECTION] = theta[REFLECTION] * (1 - theta[REFLECTION])
     slope[MIX] = theta[MIX]
@@ -239,11 +228,7 @@ def linear_slope(x: Vector) -> Vector:
 
 
 def vector_of(term: Backscatter) -> Vector:
-    """Return the solver's coordinates of a term, in the order of ``NAMES``; logarithms use 1e-6 for 0.
-
-    Args:
-        term: with lengths in mm, and places in panel px.
-    """
+    """Return the solver's coordinates of a term (mm, panel px), in the order of ``NAMES``; 1e-6 has the place of 0."""
     emitters, mix = np.asarray(term.emitters_px), np.asarray(term.mix)
     lengths = (term.standoff_mm, term.pupil_diameter_mm, term.softness_px, term.reflection, term.reflection_mm)
     places = (emitters[1], emitters[0] - emitters[1], emitters[2] - emitters[1])
@@ -252,12 +237,16 @@ def vector_of(term: Backscatter) -> Vector:
     return np.where(_LOGARITHMIC, np.log(np.maximum(x, 1e-6)), x)
 
 
-def with_linear(term: Backscatter, theta: Float[Array, "18"]) -> Backscatter:
+def emitters_of(theta: Vector) -> Float[np.ndarray, "3 2"]:
+    """Return the place of each primary's emitter from the centre of its pixel, in panel px."""
+    return theta[OFFSET] + np.insert(theta[EMITTERS].reshape(2, 2), 1, 0.0, axis=0)
+
+
+def with_linear(term: Backscatter, theta: Vector) -> Backscatter:
     """Return the term with parameters of ``linear_of``."""
-    offset = theta[OFFSET]
-    distance, pupil, softness, _, depth = jnp.exp(theta[1:6])
-    reflected = jnp.minimum(theta[REFLECTION], 1 - 1e-9)
-    mix = jnp.eye(3, dtype=theta.dtype).at[OFF_DIAGONAL].set(theta[MIX])
+    distance, pupil, softness, _, depth = np.exp(theta[1:6])
+    reflected, mix = np.minimum(theta[REFLECTION], 1 - 1e-9), np.eye(3)
+    mix[OFF_DIAGONAL] = theta[MIX]
     return replace(
         term,
         gamma=theta[0],
@@ -266,6 +255,6 @@ def with_linear(term: Backscatter, theta: Float[Array, "18"]) -> Backscatter:
         softness_px=softness,
         reflection=reflected / (1 - reflected),
         reflection_mm=depth,
-        emitters_px=jnp.stack([offset + theta[8:10], offset, offset + theta[10:12]]),
+        emitters_px=emitters_of(theta),
         mix=mix / mix.sum(axis=1, keepdims=True),
     )

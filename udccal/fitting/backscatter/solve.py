@@ -9,26 +9,25 @@ noise, noise in the dark, and (e m)^2 for the model error e, which is relative t
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import final
 
-import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from udccal.fitting.backscatter.data import BackscatterData, Binned, grid_rays, grid_step, sampled_rays
+from udccal.fitting.backscatter.data import BackscatterData, Binned, grid_step, sampled_rays
 from udccal.fitting.backscatter.model import (
     Moves,
+    PerBin,
     PerShot,
     Pictures,
-    Profile,
     Rays,
+    Shares,
     Usable,
-    Windows,
     ratios,
     ratios_and_jacobian,
+    ratios_of,
     window_for,
 )
 from udccal.fitting.backscatter.parameters import (
@@ -39,9 +38,8 @@ from udccal.fitting.backscatter.parameters import (
     linear_of,
     linear_slope,
     prior_of,
-    with_linear,
 )
-from udccal.fitting.engine.gaussian import Posterior, Prior, square_root
+from udccal.fitting.engine.gaussian import Prior
 from udccal.fitting.engine.least_squares import Blocks, SolverRules, Step, minimise
 from udccal.fitting.nominal import nominal_backscatter
 from udccal.models.backscatter import Backscatter
@@ -49,9 +47,6 @@ from udccal.models.geometry import Geometry
 from udccal.numerics import in_float64
 from udccal.rig import RigDescription
 
-# Interpolation never combines bins at this distance.
-_TILE = 4
-_with_linear = jax.jit(with_linear)
 # Parameters in the solver's coordinates to whitened errors and their Jacobian.
 ErrorsAt = Callable[[Vector], tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m 18"]]]
 
@@ -101,12 +96,70 @@ def most_probable(
 
 @final
 @dataclass(frozen=True)
+class Profile:
+    """The most probable mask and dark signal for given ratios, bin by bin.
+
+    Attributes:
+        mask, dark: e-/s.
+        errors: measured less modelled rates; ``weight`` is 1 / sigma of each.
+        information: on the mask, with the dark signal eliminated.
+        by_mask, by_dark: orthonormal directions of the whitened errors that mask and dark remove.
+    """
+
+    mask: PerBin
+    dark: PerBin
+    errors: PerShot
+    weight: PerShot
+    information: PerBin
+    by_mask: PerShot
+    by_dark: PerShot
+
+    @property
+    def chi2(self) -> float:
+        """Chi-squared without the prior."""
+        return float(((self.errors * self.weight) ** 2).sum())
+
+    @classmethod
+    def of(cls, seen: Binned, ratio: PerShot, weight: PerShot) -> Profile:
+        """Solve for mask and dark signal from the ratios of all shots."""
+        light, exposure = seen.rate, (seen.exposure_s[-1] / seen.exposure_s)[:, None, None]
+        apart = exposure * weight
+        length = np.sqrt((apart**2).sum(axis=0))
+        by_dark = apart / length
+        across = ratio * weight - by_dark * (by_dark * ratio * weight).sum(axis=0)
+        information = (across**2).sum(axis=0)
+        root = np.sqrt(np.where(information > 0, information, 1.0))
+        by_mask = across / root
+        mask = (by_mask * light * weight).sum(axis=0) / root
+        dark = (by_dark * (light - mask * ratio) * weight).sum(axis=0) / length
+        return cls(mask, dark, light - mask * ratio - exposure * dark, weight, information, by_mask, by_dark)
+
+    def jacobian(self, of_ratio: Moves) -> Moves:
+        """Return the whitened errors' Jacobian without the parts that mask and dark remove (Kaufman, BIT 15, 1975)."""
+        jacobian = -(self.mask * self.weight) * of_ratio
+        for way in (self.by_dark, self.by_mask):
+            jacobian -= way * np.einsum("scn,kscn->kcn", way, jacobian)[:, None]
+        return jacobian
+
+    def mask_jacobian(self, of_ratio: Moves) -> Float[np.ndarray, "k 3 n"]:
+        """Return the mask's derivatives for the expected light; the contribution of noise is of second order."""
+        along = np.einsum("scn,kscn->kcn", self.by_mask * self.weight, of_ratio)
+        return -self.mask * along / np.sqrt(np.where(self.information > 0, self.information, 1.0))
+
+    def light_variance(self, ratio: PerShot, of_ratio: Moves, cov: Float[np.ndarray, "k k"]) -> PerShot:
+        """Return predicted light's variance: from the parameters and their effect on the mask, and from its noise."""
+        moves = self.mask * of_ratio + ratio * self.mask_jacobian(of_ratio)[:, None]
+        by_parameters = np.einsum("kicn,kl,licn->icn", moves, cov, moves, optimize=True)
+        return np.asarray(by_parameters + ratio**2 / np.maximum(self.information, 1e-30))
+
+
+@final
+@dataclass(frozen=True)
 class Fitted:
     """An order's parameters, its ratios of all samples, and the most probable mask and dark signal."""
 
     order: Order
     found: MostProbable
-    at: Windows
     ratio: PerShot
     best: Profile
 
@@ -162,14 +215,19 @@ class Problem:
         rays, flat = sampled_rays(geometry, rig, step, rules.positions)
         # The likelihood gives the mask; the template's has a single bin.
         template = nominal_backscatter(geometry, rig, np.zeros((3, 1, 1)), step, window=1)
-        template = replace(template, window=window_for(template, linear_of(prior.mean), rays, rules.slack_px))
+        # Beyond this width a fit has gone astray.
+        most = int(rules.most_wider * window_for(template, linear_of(prior.mean), rays, 0.5))
+        template = replace(template, window=most)
         seen, shown, start = data.shots.at(flat), data.pictures, prior.mean.copy()
         weight = seen.first_weights()
 
+        theta = linear_of(start)
+        shares, panel = Shares.of(template, theta, rays), shown.light(float(theta[0]))[0]
+
         def cost(offset: tuple[int, int]) -> float:
-            start[OFFSET] = offset
-            at = Windows.around(template, linear_of(start), rays, shown.crop)
-            return seen.profile(ratios(template, linear_of(start), at, shown), weight).chi2
+            # An offset of whole pixels leaves the shares as they are.
+            moved = replace(shares, panel_px=shares.panel_px - offset)
+            return Profile.of(seen, ratios_of(theta, moved.light(shown, panel)), weight).chi2
 
         across, down = (range(-int(np.ceil(reach)), int(np.ceil(reach)) + 1) for reach in prior.sigma[OFFSET])
         start[OFFSET] = min(((x, y) for y in down for x in across), key=cost)
@@ -178,104 +236,21 @@ class Problem:
     def solved(self, order: Order, x: Vector, weight: PerShot) -> Fitted:
         """Solve for the most probable parameters of an order at given weights, from ``x`` on."""
         start = order.start(x, self.prior)
-        at = Windows.around(self.template, linear_of(start), self.rays, self.shown.crop)
-        found = most_probable(self.errors_at(weight, at), start, order.free, self.prior, self.rules.solver)
-        ratio = ratios(self.template, linear_of(found.x), at, self.shown)
-        return Fitted(order, found, at, ratio, self.seen.profile(ratio, weight))
+        found = most_probable(self.errors_at(weight), start, order.free, self.prior, self.rules.solver)
+        ratio = ratios(self.template, linear_of(found.x), self.rays, self.shown)
+        return Fitted(order, found, ratio, Profile.of(self.seen, ratio, weight))
 
-    def ratios(self, x: Vector, at: Windows) -> tuple[PerShot, Moves]:
+    def ratios(self, x: Vector) -> tuple[PerShot, Moves]:
         """Return light over that of white, and its derivatives by the solver's coordinates."""
-        ratio, jacobian = ratios_and_jacobian(self.template, linear_of(x), at, self.shown)
+        ratio, jacobian = ratios_and_jacobian(self.template, linear_of(x), self.rays, self.shown)
         return ratio, jacobian * linear_slope(x)[:, None, None, None]
 
-    def errors_at(self, weight: PerShot, at: Windows) -> ErrorsAt:
-        """Return a function for whitened errors, with the best mask and dark, and their Jacobian; windows stay."""
+    def errors_at(self, weight: PerShot) -> ErrorsAt:
+        """Return a function for whitened errors, with the best mask and dark, and their Jacobian."""
 
         def of(x: Vector) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m 18"]]:
-            ratio, of_ratio = self.ratios(x, at)
-            best = self.seen.profile(ratio, weight)
+            ratio, of_ratio = self.ratios(x)
+            best = Profile.of(self.seen, ratio, weight)
             return (best.errors * weight).ravel(), best.jacobian(of_ratio).reshape(len(x), -1).T
 
         return of
-
-    def with_room(self, x: Vector) -> Problem:
-        """Return the problem with windows wide enough for these parameters, unless the fit has gone far astray."""
-        theta, rules, template = linear_of(x), self.rules, self.template
-        if not template.window < window_for(template, theta, self.rays, 0.0) <= rules.most_wider * template.window:
-            return self
-        window = window_for(template, theta, self.rays, rules.slack_px)
-        return replace(self, template=replace(template, window=window))
-
-
-@final
-@dataclass(frozen=True)
-class TermAt:
-    """The term as a function of its parameters (``linear_of``), and of ``_TILE`` squared numbers of the mask's noise.
-
-    The mask is the most probable one for all shots, which determine it better than white alone. It follows the
-    parameters linearly. Bins with the same number are so far from each other that no interpolated value depends on two
-    of them. Their signs are random, so that sums over the sensor are right on average.
-    """
-
-    template: Backscatter
-    data: BackscatterData
-    used: Bool[np.ndarray, " shots"]
-    model_error: float
-    theta: Vector
-
-    @in_float64
-    def __call__(self, parameters: Float[np.ndarray, " n"]) -> Backscatter:
-        """Return the term; its mask is never below 0."""
-        theta, noise = parameters[: len(self.theta)], parameters[len(self.theta) :].reshape(_TILE, _TILE)
-        mask, sigma = self._mask
-        rows, columns = mask.shape[1:]
-        mask = mask + sigma * np.tile(noise, (-(-rows // _TILE), -(-columns // _TILE)))[:rows, :columns]
-        if (moved := theta - self.theta).any():
-            mask = mask + np.einsum("k,kcij->cij", moved, self._mask_jacobian)
-        with_parameters = _with_linear(self.template, theta)
-        term = jax.tree.map(lambda leaf: np.asarray(leaf, dtype=np.float64), with_parameters)
-        return replace(term, geometry=self.template.geometry, mask=np.maximum(mask, 0.0))
-
-    @functools.cached_property
-    def _mask(self) -> tuple[Float[np.ndarray, "3 a b"], Float[np.ndarray, "3 a b"]]:
-        """Light of white over the whole grid, and its sigma with a random sign, in e-/s."""
-        found = [self._best(flat)[1] for flat in self._parts(4096)]
-        mask = np.concatenate([one.mask for one in found], axis=1)
-        sigma = np.concatenate([np.maximum(one.information, 1e-30) for one in found], axis=1) ** -0.5
-        sign = np.random.default_rng(0).choice([-1.0, 1.0], mask.shape)
-        shape = self.data.shots.rate.shape[1:]
-        return np.maximum(mask, 0.0).reshape(shape), (sign * sigma).reshape(shape)
-
-    @functools.cached_property
-    def _mask_jacobian(self) -> Float[np.ndarray, "18 3 a b"]:
-        """Derivatives of the mask by the parameters, computed only when the posterior is used."""
-        parts = []
-        for flat in self._parts(256):
-            at, best = self._best(flat)
-            of_ratio = ratios_and_jacobian(self.template, self.theta, at, self.data.pictures)[1]
-            parts.append(best.mask_jacobian(of_ratio))
-        return np.concatenate(parts, axis=2).reshape(-1, *self.data.shots.rate.shape[1:])
-
-    def _parts(self, size: int) -> list[Int[np.ndarray, " n"]]:
-        """Split the grid positions into parts of ``size``, which fit into memory."""
-        flat = np.arange(self.data.shots.rate[0, 0].size)
-        return np.split(flat, flat[size::size])
-
-    def _best(self, flat: Int[np.ndarray, " n"]) -> tuple[Windows, Profile]:
-        """Return windows, mask and dark signal: first with the data's weights, then with the model's."""
-        rays = grid_rays(self.template.geometry, self.data.shots.rate.shape[2:], self.template.step, flat)
-        at = Windows.around(self.template, self.theta, rays, self.data.crop)
-        seen = self.data.shots.at(flat)
-        usable = seen.usable & self.used[:, None, None]
-        ratio = ratios(self.template, self.theta, at, self.data.pictures)
-        best = seen.profile(ratio, np.where(usable, seen.first_weights(), 0.0))
-        for _ in range(2):
-            best = seen.profile(ratio, seen.weights(best.mask * ratio, best.mask, self.model_error, usable))
-        return at, best
-
-    def posterior(self, cov: Float[np.ndarray, "18 18"]) -> Posterior[Backscatter]:
-        """Return the posterior with this covariance of the parameters, and with the mask's noise."""
-        count, noise = len(cov), _TILE**2
-        factor = np.eye(count + noise)
-        factor[:count, :count] = square_root(cov)
-        return Posterior(np.concatenate([self.theta, np.zeros(noise)]), factor, self)
