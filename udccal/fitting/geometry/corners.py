@@ -96,7 +96,10 @@ def charuco_board(spec: BoardSpec) -> cv2.aruco.CharucoBoard:
             f"Expected the name of a dictionary of OpenCV such as DICT_5X5_1000, found '{spec.dictionary}'. "
             "Correct the board's description."
         )
-    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, spec.dictionary))
+    whole = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, spec.dictionary))
+    # Only the board's own markers, every second square: a search among all thousand takes ten times as long.
+    own = whole.bytesList[: spec.columns * spec.rows // 2]
+    dictionary = cv2.aruco.Dictionary(own, whole.markerSize, whole.maxCorrectionBits)
     return cv2.aruco.CharucoBoard((spec.columns, spec.rows), spec.square_mm, spec.marker_mm, dictionary)
 
 
@@ -142,8 +145,7 @@ def _detect(
 ) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, "n 2"]]:
     """OpenCV's detection on the picture and, for strong blur, on one of half its size; the one with more corners."""
     low, high = np.percentile(grey, [0.5, 99.5])
-    scaled = np.clip((grey - low) / max(high - low, 1e-12), 0.0, 1.0)
-    picture = np.round(255.0 * scaled).astype(np.uint8)
+    picture = np.round(255.0 * np.clip((grey - low) / max(high - low, 1e-12), 0.0, 1.0)).astype(np.uint8)
     detector = cv2.aruco.CharucoDetector(charuco_board(spec))
     best = (np.zeros(0, dtype=np.int64), np.zeros((0, 2)))
     for shrink in (1, 2):
@@ -190,33 +192,37 @@ class _Saddle:
         self.weight = np.clip(1 - (self.u**2).sum(-1) / radius[:, None] ** 2, 0.0, None)
         self.normals = np.stack([np.cos(shape[:, 2:4]), np.sin(shape[:, 2:4])], axis=-1)
         self.width = np.exp(shape[:, 4:6])
-        self.across = np.einsum("nmi,nki->nkm", self.u, self.normals) / self.width[..., None]
+        self.across = self.normals @ np.swapaxes(self.u, 1, 2) / self.width[..., None]
         self.profile = erf(self.across / np.sqrt(2.0))
         product = self.profile[:, 0] * self.profile[:, 1]
         self.design = np.stack([np.ones_like(samples), self.u[..., 0], self.u[..., 1], product], axis=-1)
-        normal = np.einsum("nmi,nm,nmj->nij", self.design, self.weight, self.design) + 1e-9 * np.eye(4)
-        right = np.einsum("nmi,nm,nm->ni", self.design, self.weight, samples)
-        self.linear = np.linalg.solve(normal, right[..., None])[..., 0]
-        self.residual = samples - np.einsum("nmi,ni->nm", self.design, self.linear)
+        normal, right = self.equations(self.design, samples)
+        self.linear = np.linalg.solve(normal + 1e-9 * np.eye(4), right[..., None])[..., 0]
+        self.residual = samples - (self.design @ self.linear[..., None])[..., 0]
         self.cost = (self.weight * self.residual**2).sum(-1)
+
+    def equations(
+        self, slopes: Float[np.ndarray, "n m p"], values: Float[np.ndarray, "n m"]
+    ) -> tuple[Float[np.ndarray, "n p p"], Float[np.ndarray, "n p"]]:
+        """Weighted normal equations of each corner."""
+        weighted = np.swapaxes(slopes * self.weight[..., None], 1, 2)
+        return weighted @ slopes, (weighted @ values[..., None])[..., 0]
 
     def jacobian(self) -> Float[np.ndarray, "n m 10"]:
         """Derivatives by the shape and the linear part."""
         bell = np.sqrt(2 / np.pi) * np.exp(-(self.across**2) / 2)
         common = self.linear[:, 3, None, None] * bell * self.profile[:, ::-1]
         by_width = common / self.width[..., None]
-        position = -np.einsum("nkm,nki->nmi", by_width, self.normals) - self.linear[:, None, 1:3]
+        position = -np.swapaxes(by_width, 1, 2) @ self.normals - self.linear[:, None, 1:3]
         tangents = np.stack([-self.normals[..., 1], self.normals[..., 0]], axis=-1)
-        turn, grow = by_width * np.einsum("nmi,nki->nkm", self.u, tangents), -common * self.across
+        turn, grow = by_width * (tangents @ np.swapaxes(self.u, 1, 2)), -common * self.across
         return np.concatenate([position, np.moveaxis(turn, 1, 2), np.moveaxis(grow, 1, 2), self.design], axis=-1)
 
     def step(self, damping: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 6"]:
         """Damped Gauss-Newton step of the shape; the linear part follows by itself."""
-        jacobian = self.jacobian()
-        normal = np.einsum("nmi,nm,nmj->nij", jacobian, self.weight, jacobian)
+        normal, right = self.equations(self.jacobian(), self.residual)
         diagonal = np.einsum("nii->ni", normal)
         raised = damping[:, None] * diagonal + 1e-12 * diagonal.max(1, keepdims=True) + 1e-30
-        right = np.einsum("nmi,nm,nm->ni", jacobian, self.weight, self.residual)
         return np.linalg.solve(normal + raised[:, :, None] * np.eye(10), right[..., None])[:, :6, 0]
 
     def noise_sigma(self, variance: Float[np.ndarray, "n m"]) -> Float[np.ndarray, " n"]:
@@ -225,12 +231,11 @@ class _Saddle:
         Weighted least squares moves a corner by G = (J' W J)^-1 J' W per filtered sample: the covariance is a sandwich.
         """
         jacobian = self.jacobian()
-        normal = np.einsum("nmi,nm,nmj->nij", jacobian, self.weight, jacobian)
-        inverse = np.linalg.pinv(normal, hermitian=True)[:, :2]
-        moves = np.einsum("nip,nmp,nm->nim", inverse, jacobian, self.weight)
+        inverse = np.linalg.pinv(self.equations(jacobian, self.residual)[0], hermitian=True)[:, :2]
+        moves = inverse @ np.swapaxes(jacobian * self.weight[..., None], 1, 2)
         side = int(np.sqrt(moves.shape[2]))
         by_sample = _filtered(moves.reshape(*moves.shape[:2], side, side)).reshape(moves.shape)
-        return np.sqrt(np.einsum("nim,nm->n", by_sample**2, variance) / 2)
+        return np.sqrt((by_sample**2 * variance[:, None]).sum(axis=(1, 2)) / 2)
 
 
 def _saddles(
@@ -256,9 +261,13 @@ def _saddles(
     for _ in range(12):
         trial = shape + np.clip(saddle.step(damping), -1.0, 1.0)
         trial[:, 4:] = np.clip(trial[:, 4:], np.log(0.3), np.log(20.0))
-        better = _Saddle(trial, *windows).cost < saddle.cost
+        tried = _Saddle(trial, *windows)
+        better = tried.cost < saddle.cost
+        step = np.abs(trial - shape).max()
         shape = np.where(better[:, None], trial, shape)
-        saddle = _Saddle(shape, *windows)
+        saddle = tried if better.all() else _Saddle(shape, *windows)
+        if step < 1e-4:  # The next one would be its square.
+            break
         damping = np.clip(np.where(better, damping / 5, damping * 10), 1e-9, 1e9)
     sigma = saddle.noise_sigma(picture.variance[where])
     misfit = np.sqrt(saddle.cost / np.maximum(saddle.weight.sum(-1) - 10, 1.0))

@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import final
 
+import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
@@ -23,6 +24,8 @@ from udccal.models.noise import Noise, variance_e
 from udccal.rig import RigDescription
 from udccal.sessions.schema import BoardSubject, StoredCapture, StoredStep
 from udccal.sessions.store import Session
+
+_variance_e = jax.jit(variance_e)
 
 
 @final
@@ -154,7 +157,7 @@ def _temporal_variance_DN2(
 ) -> Float[np.ndarray, "rows columns"]:
     """Temporal variance of a capture's mean in DN^2 (EMVA 1288's photon transfer)."""
     gain, exposure_s = float(np.asarray(noise.K_DN_per_e)), np.float64(capture.exposure_s)
-    return gain**2 * np.asarray(variance_e(noise, light_DN / gain, exposure_s), dtype=np.float64) / capture.frames
+    return gain**2 * np.asarray(_variance_e(noise, light_DN / gain, exposure_s), dtype=np.float64) / capture.frames
 
 
 def _read_view(
