@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from typing import final
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
@@ -31,27 +30,21 @@ SHAPE_NAMES = (
 SHAPE_UNITS = ("deg", "deg", "deg", "1", "period", "period", "1", "1", "1", "1")
 
 
-def shape_vector(wire: Wire) -> Float[Array, "10"]:
+def shape_vector(wire: Wire) -> Float[np.ndarray, "10"]:
     """Rotation (3, rad), log stand-off, offset (2), log pupil, row and column openings, depth."""
-    lengths = wire.row_open, wire.column_open, wire.depth_per_pitch
-    parts = (
-        wire.rotation_rad,
-        jnp.log(wire.standoff_per_pitch),
-        wire.offset_periods,
-        jnp.log(wire.footprint_per_pitch),
-        *lengths,
-    )
-    return jnp.concatenate([jnp.atleast_1d(jnp.asarray(part)) for part in parts])
+    logs = [[np.log(float(length))] for length in (wire.standoff_per_pitch, wire.footprint_per_pitch)]
+    rest = [[float(length)] for length in (wire.row_open, wire.column_open, wire.depth_per_pitch)]
+    return np.concatenate([wire.rotation_rad, logs[0], wire.offset_periods, logs[1], *rest])
 
 
 def with_shape(wire: Wire, shape: Float[np.ndarray, "10"] | Float[Array, "10"]) -> Wire:
-    """The wire with other shape parameters, in the order of ``shape_vector``."""
+    """The wire with other shape parameters, in the order of ``shape_vector``; numbers may be traced by JAX."""
     return replace(
         wire,
         rotation_rad=shape[:3],
-        standoff_per_pitch=jnp.exp(shape[3]),
+        standoff_per_pitch=np.e ** shape[3],
         offset_periods=shape[4:6],
-        footprint_per_pitch=jnp.exp(shape[6]),
+        footprint_per_pitch=np.e ** shape[6],
         row_open=shape[7],
         column_open=shape[8],
         depth_per_pitch=shape[9],
@@ -149,7 +142,7 @@ class Parameters:
         )
         mean, shape = self.vector(self.nothing, np.ones(self.sites)), self.indices(Kind.SHAPE)[0]
         sigma = np.array([np.inf, np.inf, rules.amplitude_sigma, rules.field_sigma, np.nan])[self.columns[:, 0]]
-        mean[self.linear :] = np.asarray(shape_vector(built))[shape]
+        mean[self.linear :] = shape_vector(built)[shape]
         sigma[self.linear :] = shape_sigma(start, rules)[shape]
         return Prior.independent(mean, sigma)
 
