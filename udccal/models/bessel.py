@@ -1,4 +1,4 @@
-"""Bessel functions J0 and J1 of a positive argument, which JAX lacks, absolute error under 1e-7; a quick sine and cosine.
+"""Bessel functions J0 and J1 of a positive argument, which JAX lacks, to 1e-7, and a quick sine and cosine.
 
 Source: J. F. Hart et al., Computer Approximations, Wiley 1968; rational approximations below 8, asymptotic ones above.
 """

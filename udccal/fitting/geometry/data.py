@@ -7,6 +7,7 @@ correction, with the panel as part of the camera). That corrects unequal pixels 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import final
 
@@ -15,12 +16,15 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from udccal.arrangements import BoardSpec
+from udccal.errors import FitError
 from udccal.fitting.engine.gaussian import Prior
-from udccal.fitting.geometry.bundle import GeometryRules, Intrinsics
+from udccal.fitting.engine.robust import outliers
+from udccal.fitting.geometry.bundle import GeometryRules, Intrinsics, Points
 from udccal.fitting.geometry.corners import BoardCorners, detect_corners, luminance, sites
 from udccal.fitting.nominal import nominal_geometry
 from udccal.models.geometry import Geometry
 from udccal.models.noise import Noise, variance_e
+from udccal.result import Outliers
 from udccal.rig import RigDescription
 from udccal.sessions.schema import BoardSubject, StoredCapture, StoredStep
 from udccal.sessions.store import Session
@@ -182,3 +186,77 @@ def _read_view(
     moved = BoardCorners(corners.ids, corners.xy + np.array([area.x, area.y], dtype=np.float64), corners.sigma)
     clipped = float(np.mean(mean >= rules.clipped * float(np.asarray(noise.saturation_DN))))
     return BoardView(step.id, spec, subject.parallel_to_panel, moved, clipped)
+
+
+@final
+@dataclass(frozen=True)
+class Gathered:
+    """Points of the usable views, what was left out, and sentences about it.
+
+    ``views`` were given; ``weighted`` says whether with sigmas.
+    """
+
+    points: Points
+    outliers: tuple[Outliers, ...]
+    notes: tuple[str, ...]
+    views: int
+    weighted: bool
+
+
+def gather(
+    board: Sequence[np.ndarray],
+    image: Sequence[np.ndarray],
+    sigmas: Sequence[np.ndarray] | None = None,
+    rules: GeometryRules | None = None,
+) -> Gathered:
+    """Every finite point of every view that determines a pose; arguments and errors as for ``fit_geometry``."""
+    rules = rules or GeometryRules()
+    if len({len(board), len(image), len(image if sigmas is None else sigmas)}) > 1:
+        raise FitError(
+            f"Expected as many views on the board as in pictures (and of sigmas), found {len(board)} and {len(image)}. "
+            "Give one array of each per view."
+        )
+    # Without sigmas any common value serves: its scale is estimated.
+    given = [np.full(len(pixels), 0.1) for pixels in image] if sigmas is None else sigmas
+    lost: list[str] = []
+    notes: list[str] = []
+    parts = {-1: (np.zeros((0, 3)), np.zeros((0, 2)), np.zeros(0), np.zeros(0, dtype=np.int64))}
+    for number, arrays in enumerate(zip(board, image, given, strict=True)):
+        points, pixels, own = _view(number, *(np.asarray(a, dtype=np.float64) for a in arrays))
+        good = np.isfinite(points).all(axis=1) & np.isfinite(pixels).all(axis=1) & np.isfinite(own) & (own > 0)
+        lost += [f"view {number}, point {k}" for k in np.flatnonzero(~good)]
+        part = (points[good], pixels[good], own[good], np.flatnonzero(good))
+        if complaint := _complaint(part[0], part[1], list(parts.values()), rules):
+            notes.append(f"View {number} is left out: {complaint}")
+        else:
+            parts[number] = part
+    points, pixels, own, index = (np.concatenate(same) for same in zip(*parts.values(), strict=True))
+    view = np.repeat(np.arange(len(parts)) - 1, [len(part[0]) for part in parts.values()])
+    found = Points(points, pixels, own, view, index, np.ones(len(points), dtype=bool), tuple(parts)[1:])
+    left_out = outliers("not a finite position with a positive sigma", lost)
+    return Gathered(found, left_out, tuple(notes), len(board), sigmas is not None)
+
+
+def _view(number: int, points: np.ndarray, pixels: np.ndarray, own: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Board points (n, 3), pixels (n, 2) and sigma (n,) of a view, whatever the shape OpenCV gave them."""
+    n = len(pixels)
+    if points.shape not in ((n, 3), (n, 1, 3)) or pixels.shape not in ((n, 2), (n, 1, 2)) or own.shape != (n,):
+        raise FitError(
+            f"Expected board points (n, 3), image points (n, 2) and sigmas (n,) of equal n in view {number}, found "
+            f"{points.shape}, {pixels.shape} and {own.shape}. Give each seen corner its point on the board."
+        )
+    return points.reshape(-1, 3), pixels.reshape(-1, 2), own
+
+
+def _complaint(board: np.ndarray, image: np.ndarray, before: list[tuple[np.ndarray, ...]], rules: GeometryRules) -> str:
+    """Why a view cannot be used; empty when it can."""
+    least = rules.least_corners
+    if len(board) < least:
+        return f"expected at least {least} points, found {len(board)}. Bring more of the board into the picture."
+    for points, what in ((board, "on the board"), (image, "in the picture")):
+        spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+        if spread[1] <= 1e-3 * spread[0]:
+            return f"its points lie on one line {what} and hold no pose. Show at least two rows of corners."
+    if any(np.array_equal(image, other[1]) and np.array_equal(board, other[0]) for other in before):
+        return "it repeats another view to the last digit, and so adds nothing. Capture every view anew."
+    return ""

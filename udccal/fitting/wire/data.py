@@ -21,7 +21,6 @@ from udccal.fitting.engine.robust import OutlierRule
 from udccal.fitting.wire.rules import WireRules, WireStart, wire_start
 from udccal.models.geometry import Geometry, unproject
 from udccal.models.noise import Noise
-from udccal.models.wire import scaled_positions
 from udccal.numerics import in_float64
 from udccal.result import Outliers
 from udccal.sessions.store import Session
@@ -198,12 +197,17 @@ def sample_pixels(
     real = (np.arange(padded) < count) & np.isfinite(seen)
     return Pixels(
         ideal=ideal_points(geometry, positions),
-        scaled=np.asarray(scaled_positions(positions, rows, columns)),
+        scaled=scaled_places(positions, value.shape),
         site=cfa_named(cfa).site_map(rows, columns)[y, x],
         value=np.where(real, seen, 0.0),
         weight=np.where(real, 1.0, 0.0),
         place=np.where(real, y * columns + x, -1),
     )
+
+
+def scaled_places(pixels: Float[np.ndarray, "n 2"], shape: tuple[int, int]) -> Float[np.ndarray, "n 2"]:
+    """Pixels (x, y) in px, scaled to [-1, 1] over a sensor of that shape (rows, columns)."""
+    return 2 * pixels / (np.array(shape[::-1]) - 1.0) - 1
 
 
 def odd_step(size: int, samples: int) -> int:

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import NamedTuple, final
 
 import cv2
@@ -69,6 +68,11 @@ def _rotations(wire: Wire) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, 
         cv2.Rodrigues(np.asarray(one, dtype=np.float64)) for one in (wire.rotation_rad, wire.geometry.rotation_rad)
     )
     return own @ mounted, by_own.reshape(3, 3, 3) @ mounted
+
+
+def tilt_deg(wire: Wire) -> float:
+    """Angle by which the camera's axis points below the panel's normal."""
+    return float(np.rad2deg(np.arcsin(np.clip(_rotations(wire)[0][1, 2], -1.0, 1.0))))
 
 
 def _plane(ideal: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "3 n"]:
@@ -184,7 +188,9 @@ def wire_derivatives(wire: Wire, ideal: Float[np.ndarray, "n 2"], scaled: Float[
     )
     sums[0] += 1.0
     sums[3:5] += sums[0] / rays.openings
-    return Derivatives(sums[0], _base(wire, scaled, rays), _by_shape(wire, ideal, rays, sums[1:]), wave, carrier, powers)
+    return Derivatives(
+        sums[0], _base(wire, scaled, rays), _by_shape(wire, ideal, rays, sums[1:]), wave, carrier, powers
+    )
 
 
 def _by_shape(
@@ -333,14 +339,16 @@ class WireProblem:
     ) -> tuple[Float[np.ndarray, "n n"], Float[np.ndarray, "tiles n"], float]:
         """Information by the pixels' weights, the right side by tile, and chi-squared."""
         wire, gains, size = self.parameters.wire(place), self.parameters.gains(place), len(place)
-        tiles = np.arange(TILES[0] * TILES[1])[:, None]
-        matrix, by_tile, chi2, p = np.zeros((size, size)), np.zeros((len(tiles), size)), 0.0, self.pixels
+        matrix, by_tile, chi2, p = np.zeros((size, size)), np.zeros((TILES[0] * TILES[1], size)), 0.0, self.pixels
         for ideal, scaled, site, value, weight in blocks(p.ideal, p.scaled, p.site, p.value, p.weight):
             whole, base, rows = block_jacobian(self.parameters, wire, ideal, scaled, site)
             level, root = base * gains[site], np.sqrt(weight)
             errors, rows = (value - whole * level) * root, rows * (root * level)
             matrix += rows @ rows.T
-            by_tile += np.where(tile_numbers(scaled) == tiles, errors, 0.0) @ rows.T
+            # A block is some rows of the sensor, which cross few of the tiles.
+            tile = tile_numbers(scaled)
+            crossed = np.unique(tile)
+            by_tile[crossed] += np.where(tile == crossed[:, None], errors, 0.0) @ rows.T
             chi2 += float(errors @ errors)
         return matrix, by_tile, chi2
 
