@@ -42,7 +42,7 @@ def sine_cosine(x: Float[Array, "*n"]) -> tuple[Float[Array, "*n"], Float[Array,
     Quarter turns are taken off in three exact parts (Cody and Waite, 1980); Taylor's series serve for the rest.
     """
     quarters = jnp.round(x * 0.6366197723675814)
-    r = ((x - quarters * 1.5703125) - quarters * 4.837512969970703125e-4) - quarters * 7.549789948768648e-8
+    r = ((x - quarters * 1.5703125) - quarters * 4.837512969970703125e-4) - quarters * 7.549789954891882e-08
     square = r * r
     sine, cosine = r * _polynomial(_SINE, square), _polynomial(_COSINE, square)
     turn = quarters - 4.0 * jnp.floor(quarters / 4.0)

@@ -28,26 +28,17 @@ from udccal.fitting.geometry.bundle import GeometryRules
 @final
 @dataclass(frozen=True)
 class Luminance:
-    """Grey picture of a black-and-white subject.
-
-    Attributes:
-        grey: filtered picture.
-        variance: of the samples before the filter, scaled as the samples are.
-    """
+    """Grey picture of a black-and-white subject; ``variance`` is that of its samples before they were filtered."""
 
     grey: Float[np.ndarray, "rows columns"]
     variance: Float[np.ndarray, "rows columns"]
 
 
 def luminance(mosaic: Float[np.ndarray, "rows columns"], variance: Float[np.ndarray, "rows columns"]) -> Luminance:
-    """Grey picture on the mosaic's own pixels.
+    """Grey picture on the mosaic's own pixels, whose black level is subtracted; ``variance`` is of single samples.
 
     The four sites of the pattern are scaled to one mean and averaged with the filter (1 2 1) x (1 2 1) / 16. That
     moves no edge and removes the pattern.
-
-    Args:
-        mosaic: black level subtracted, in any linear unit.
-        variance: of its samples, in that unit squared.
     """
     grey, spread = np.asarray(mosaic, dtype=np.float64).copy(), np.asarray(variance, dtype=np.float64).copy()
     total = max(float(grey.mean()), 1e-12)
@@ -72,10 +63,7 @@ def _filtered(picture: Float[np.ndarray, "*stack rows columns"]) -> Float[np.nda
 @final
 @dataclass(frozen=True)
 class BoardCorners:
-    """Corners found: their numbers on the board, their places in sensor pixels, and one sigma of these in px by noise.
-
-    The bundle estimates how much the board's print and the picture's blur add to the sigma.
-    """
+    """Corners found: their numbers on the board, their places in the picture, and one sigma of these in px by noise."""
 
     ids: Int[np.ndarray, " n"]
     xy: Float[np.ndarray, "n 2"]
@@ -83,14 +71,7 @@ class BoardCorners:
 
 
 def charuco_board(spec: BoardSpec) -> cv2.aruco.CharucoBoard:
-    """OpenCV's board of a description.
-
-    Args:
-        spec: squares, sizes in mm and the dictionary's name.
-
-    Raises:
-        FitError: when OpenCV has no dictionary of that name.
-    """
+    """OpenCV's board of a description; a dictionary that OpenCV lacks is a ``FitError``."""
     if not (spec.dictionary.startswith("DICT_") and hasattr(cv2.aruco, spec.dictionary)):
         raise FitError(
             f"Expected the name of a dictionary of OpenCV such as DICT_5X5_1000, found '{spec.dictionary}'. "
@@ -104,30 +85,20 @@ def charuco_board(spec: BoardSpec) -> cv2.aruco.CharucoBoard:
 
 
 def board_points_mm(spec: BoardSpec) -> Float[np.ndarray, "corners 3"]:
-    """Inner corners of a board in the order of their numbers.
-
-    Args:
-        spec: squares, sizes in mm and the dictionary's name.
-
-    Returns:
-        (x, y, 0) in mm in board coordinates.
-
-    Raises:
-        FitError: when OpenCV has no dictionary of that name.
-    """
+    """Inner corners (x, y, 0) of a board in mm, in the order of their numbers; errors as for ``charuco_board``."""
     return np.asarray(charuco_board(spec).getChessboardCorners(), dtype=np.float64).reshape(-1, 3)
 
 
 def detect_corners(picture: Luminance, spec: BoardSpec, rules: GeometryRules | None = None) -> BoardCorners:
-    """Find a board's inner corners in a grey picture; where there are none the arrays are empty.
+    """Find a board's inner corners in a grey picture; errors as for ``charuco_board``.
 
     Args:
-        picture: see ``luminance``.
+        picture: from ``luminance``.
         spec: of the board.
         rules: see ``GeometryRules``.
 
-    Raises:
-        FitError: when the board's dictionary is unknown.
+    Returns:
+        the corners; the arrays are empty where there are none.
     """
     rules = rules or GeometryRules()
     ids, rough = _detect(picture.grey, spec)
@@ -166,12 +137,9 @@ def _edges_px(
     homography, _ = cv2.findHomography(board, image, cv2.RANSAC, 5.0)
     if homography is None:
         homography = np.eye(3)
-
-    def seen(points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
-        return np.asarray(cv2.perspectiveTransform(points.reshape(-1, 1, 2), homography).reshape(-1, 2))
-
-    half = square_mm / 2 * np.eye(2)
-    return np.stack([seen(board + step) - seen(board - step) for step in half], axis=1)
+    ends = board[:, None] + square_mm / 2 * np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
+    seen = cv2.perspectiveTransform(ends.reshape(-1, 1, 2), homography).reshape(-1, 4, 2)
+    return np.asarray(seen[:, :2] - seen[:, 2:])
 
 
 @final

@@ -7,9 +7,8 @@ One view of a rig shows the board parallel to the panel. Its axes are then the p
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
-from typing import final
 
 import jax
 import numpy as np
@@ -31,6 +30,7 @@ from udccal.result import Diagnostic, FitResult, FitStatus, Outliers
 
 # Scatter in addition to noise of the board on the jig, and of the median other view: a plan reads them.
 ON_JIG, BY_HAND = "corner_scatter_on_jig", "corner_scatter_by_hand"
+_NAMES, _UNITS = (*INTRINSIC_NAMES, "tilt_deg", "roll_deg", "yaw_deg"), (*INTRINSIC_UNITS, "deg", "deg", "deg")
 
 
 def fit_geometry(
@@ -43,11 +43,10 @@ def fit_geometry(
     prior: Prior | None = None,
     rules: GeometryRules | None = None,
 ) -> FitResult[Geometry]:
-    """Fit the lens to views of flat boards, given as arrays.
+    """Fit the lens to views of flat boards, given as arrays; ``views.calibrate_views`` gives their poses as well.
 
-    The axes of the term are the camera's at the fitted lens, and fixed to the boards: ``result.sigma_of`` and
-    ``projection_sigma_px`` give the sigma of rays for which the boards hold still. ``views.calibrate_views`` gives
-    poses as well, and the covariance of rays fixed to other things.
+    The term's axes are the camera's, and its posterior holds the boards still: ``projection_sigma_px`` gives the sigma
+    of rays fixed to the boards.
 
     Args:
         board_points: per view, points on the board (z = 0) in any unit of length, (n, 3) or (n, 1, 3).
@@ -71,34 +70,28 @@ def fit_geometry(
     try:
         views = calibrate_views(gathered, image_size, start, prior, rules=rules)
     except FitError as error:
-        lens = np.zeros(LENS) if start is None else Intrinsics.of_geometry(start).vector
-        return FitResult.failed("geometry", Intrinsics.of(lens).camera(), FitStatus.TOO_FEW_DATA, str(error))
+        usual = Intrinsics(np.full(2, float(max(image_size))), (np.array(image_size) - 1) / 2, np.zeros(5))
+        return FitResult.failed("geometry", start or usual.camera(), FitStatus.TOO_FEW_DATA, str(error))
     picks = np.vstack([np.eye(LENS, len(views.cov)), -views.turn(Gauge.BOARDS)])
-    x = np.append(views.intrinsics.vector, np.zeros(3))
-    fitted = _Fitted(x, picks @ views.cov @ picks.T, _lens_at, INTRINSIC_NAMES, INTRINSIC_UNITS)
-    notes = (*views.notes, *_held(views))
-    return _result(views, fitted, views.outliers, _common_diagnostics(views), notes, views.status)
+    return _result(views, np.append(views.intrinsics.vector, np.zeros(3)), picks @ views.cov @ picks.T, _lens_at, LENS)
 
 
 def fit_boards(data: GeometryData, rules: GeometryRules | None = None) -> FitResult[Geometry]:
     """Fit lens and mounting to a session's boards.
 
     Every corner has its own noise and a scatter common to all (paper that is not flat, blur that a saddle does not
-    describe). The fit estimates that scatter.
+    describe), which the fit estimates.
 
     Args:
         data: boards, one of them parallel to the panel; at least 3 usable ones, or any number with a prior.
-        rules: see ``GeometryRules``.
 
     Returns:
-        the term, with estimates of the intrinsics and of tilt, roll and yaw. Status ``TOO_FEW_DATA``, ``SATURATED`` or
-        ``POOR_FIT`` says what to capture.
+        the term, with estimates of the intrinsics and of tilt, roll and yaw; the status says what to capture.
     """
     rules = rules or GeometryRules()
     usable = [view for view in data.views if view.usable(rules)]
     notes = tuple(_lost(data.views, rules))
-    least = rules.least_views if data.prior is None else 1
-    parallel = sum(view.parallel for view in usable)
+    least, parallel = 1 if data.prior else rules.least_views, sum(view.parallel for view in usable)
     if len(usable) < least or not parallel:
         clipped = sum(view.clipped > rules.most_clipped for view in data.views)
         status = FitStatus.SATURATED if clipped > len(data.views) / 2 else FitStatus.TOO_FEW_DATA
@@ -111,33 +104,25 @@ def fit_boards(data: GeometryData, rules: GeometryRules | None = None) -> FitRes
     return _mounted(bundle, scatter_px, [usable[k] for k in bundle.points.names], data.nominal, notes, rules)
 
 
+@in_float64
 def projection_sigma_px(result: FitResult[Geometry], pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
     """Sigma of the places at which directions fixed in panel coordinates appear; it includes the model error found.
 
     Args:
-        result: of ``fit_boards``, with its posterior.
+        result: of ``fit_boards`` or ``fit_geometry``, with its posterior.
         pixels: (x, y) in px, where the directions appear.
 
     Returns:
-        one sigma in px along x and along y, per pixel.
-
-    Raises:
-        FitError: when the fit failed, or was read from a profile.
+        one sigma in px along x and along y, per pixel; errors as for ``FitResult.sigma_of``.
     """
-    directions = _directions(result.term, pixels)
-    places = jax.jit(project_directions)
+    directions, places = jax.jit(panel_directions)(result.term, pixels), jax.jit(project_directions)
     return result.sigma_of(lambda term: np.asarray(places(term, directions)))
-
-
-@in_float64
-def _directions(term: Geometry, pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 3"]:
-    return np.asarray(jax.jit(panel_directions)(term, pixels))
 
 
 def _calibrated(
     views: Sequence[BoardView], data: GeometryData, rules: GeometryRules
 ) -> tuple[CalibratedViews, Float[np.ndarray, " n"]]:
-    """The bundle, and the scatter in addition to noise in px by axis: of all views together, then of each in use."""
+    """The bundle, and the scatter in addition to noise in px by axis: of all views, then of each in use."""
     points = [board_points_mm(view.spec)[view.corners.ids] for view in views]
     seen, scatter_px = [view.corners.xy for view in views], np.full(1, rules.start_scatter_px)
     for _ in range(8):
@@ -180,66 +165,59 @@ def _mounted(
     scatter_px: Float[np.ndarray, " n"],
     views: list[BoardView],
     nominal: Geometry,
-    notes: tuple[str, ...],
+    lost: tuple[str, ...],
     rules: GeometryRules,
 ) -> FitResult[Geometry]:
     """The result of a bundle, which uses ``views``, with the rotation of the board that is parallel to the panel."""
-    notes = (*notes, *bundle.notes)
     parallel = [k for k, view in enumerate(views) if view.parallel]
     if bundle.status is FitStatus.TOO_FEW_DATA or not parallel:
-        lost = () if parallel else ("No usable view shows the board parallel to the panel; capture that view again.",)
-        return FitResult.failed("geometry", nominal, FitStatus.TOO_FEW_DATA, *notes, *lost)
+        tilt = () if parallel else ("No usable view shows the board parallel to the panel; capture that view again.",)
+        return FitResult.failed("geometry", nominal, FitStatus.TOO_FEW_DATA, *lost, *bundle.notes, *tilt)
     x, cov = with_angles(bundle.intrinsics.vector, bundle.poses, bundle.cov, parallel)
     pupil = np.asarray(nominal.pupil_mm, dtype=np.float64)
-    names, units = (*INTRINSIC_NAMES, "tilt_deg", "roll_deg", "yaw_deg"), (*INTRINSIC_UNITS, "deg", "deg", "deg")
-    fitted = _Fitted(x, cov, partial(term_at, pupil=pupil), names, units)
-    poor = bundle.rms_px > rules.worst_rms_px and bundle.chi2_dof > rules.worst_chi2_dof
-    status = FitStatus.POOR_FIT if poor else bundle.status
+    result = _result(bundle, x, cov, partial(term_at, pupil=pupil), len(_NAMES))
     left_out, sentences = _outliers(bundle, views, rules)
-    diagnostics = _diagnostics(bundle, scatter_px, views)
+    poor = bundle.rms_px > rules.worst_rms_px and bundle.chi2_dof > rules.worst_chi2_dof
     mounting = "Stand-off and panel position are the rig's nominal ones; the wire fit refines them."
-    return _result(bundle, fitted, left_out, diagnostics, (*notes, *sentences, *_held(bundle), mounting), status)
-
-
-@final
-@dataclass(frozen=True)
-class _Fitted:
-    """Parameters with their covariance, the term that they make, and names and units of those that are estimates."""
-
-    x: Float[np.ndarray, " n"]
-    cov: Float[np.ndarray, "n n"]
-    term_at: Callable[[Float[np.ndarray, " n"]], Geometry]
-    names: tuple[str, ...]
-    units: tuple[str, ...]
+    return replace(
+        result,
+        status=FitStatus.POOR_FIT if poor else result.status,
+        diagnostics=(*result.diagnostics, *_scatter_diagnostics(scatter_px, views)),
+        notes=(*lost, *result.notes, *sentences, mounting),
+        outliers=left_out,
+    )
 
 
 def _result(
     bundle: CalibratedViews,
-    fitted: _Fitted,
-    left_out: tuple[Outliers, ...],
-    diagnostics: tuple[Diagnostic, ...],
-    notes: tuple[str, ...],
-    status: FitStatus,
+    x: Float[np.ndarray, "12"],
+    cov: Float[np.ndarray, "12 12"],
+    lens_at: Callable[[Float[np.ndarray, "12"]], Geometry],
+    count: int,
 ) -> FitResult[Geometry]:
-    """The result of a bundle; its posterior includes the pattern that the residuals have."""
-    x, cov, count = fitted.x, fitted.cov, len(fitted.names)
-    # A pattern in the residuals is modelled as an error of the principal point, which moves every place by its size.
+    """The result of a bundle, whose first ``count`` parameters are estimates.
+
+    A pattern in the residuals is modelled as an error of the principal point, which moves every place by its size.
+    """
     pattern = bundle.evidence.pattern_px * np.asarray(Intrinsics.of(np.eye(LENS, len(x))).principal_point_px).T
-    posterior = Posterior(x, np.hstack([square_root(cov), pattern]), fitted.term_at)
+    posterior = Posterior(x, np.hstack([square_root(cov), pattern]), lens_at)
     points, use = bundle.points, bundle.points.used
     z = bundle.residuals_px[use] / points.sigma[use, None]
+    held = [name for name, free in zip(INTRINSIC_NAMES, bundle.free, strict=True) if not free]
     return FitResult(
         name="geometry",
         term=posterior.term_at(x),
-        status=status,
-        estimates=estimates(fitted.names, fitted.units, x[:count], cov[:count, :count]),
+        status=bundle.status,
+        estimates=estimates(_NAMES[:count], _UNITS[:count], x[:count], cov[:count, :count]),
         cov=cov[:count, :count],
         chi2_dof=bundle.chi2_dof,
         samples=2 * int(use.sum()),
         candidates=bundle.candidates,
-        diagnostics=diagnostics,
-        notes=notes,
-        outliers=left_out,
+        diagnostics=_diagnostics(bundle),
+        notes=(*bundle.notes, f"Held at 0, as the data do not ask for it: {', '.join(held)}.")
+        if held
+        else bundle.notes,
+        outliers=bundle.outliers,
         residuals=residual_sample(np.repeat(points.image[use], 2, axis=0), z.ravel()),
         posterior=posterior,
     )
@@ -251,16 +229,11 @@ def with_angles(
     cov: Float[np.ndarray, "n n"],
     parallel: Sequence[int],
 ) -> tuple[Float[np.ndarray, "12"], Float[np.ndarray, "12 12"]]:
-    """Values and covariance of intrinsics and angles; several parallel views count as their mean.
+    """The argument of ``term_at``, and its covariance; several parallel views count as their mean.
 
     Args:
-        intrinsics: in the order of ``INTRINSIC_NAMES``.
-        poses: board to camera: rotation vector in rad, then translation, as in ``bundle.Bundle``.
-        cov: of intrinsics and all poses one after another.
+        intrinsics, poses: as in ``bundle.Bundle``. cov: of intrinsics and all poses one after another.
         parallel: which views show the board parallel to the panel.
-
-    Returns:
-        the argument of ``term_at``, and its covariance; angles in degrees.
     """
     rotation = np.asarray(Rotation.from_rotvec(-poses[parallel, :3]).mean().as_rotvec())
     steps = 1e-5 * np.eye(3)
@@ -279,36 +252,17 @@ def _angles_deg(rotation: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
 
 
 def term_at(x: Float[np.ndarray, "12"], pupil: Float[np.ndarray, "3"]) -> Geometry:
-    """The term of intrinsics and angles.
-
-    Args:
-        x: intrinsics in the order of ``INTRINSIC_NAMES``, then tilt, roll and yaw in degrees.
-        pupil: position of the entrance pupil in panel coordinates, in mm.
-    """
+    """The term of ``x``: intrinsics, tilt, roll and yaw in degrees; ``pupil`` in mm in panel coordinates."""
     lens, (tilt, roll, yaw) = Intrinsics.of(x[:LENS]), x[LENS:]
     rotation = Rotation.from_euler("YXZ", [yaw, -tilt, roll], degrees=True).as_rotvec()
     return Geometry(lens.focal_px, lens.principal_point_px, lens.distortion, np.asarray(rotation), pupil)
 
 
 def _lens_at(x: Float[np.ndarray, "12"]) -> Geometry:
-    """The lens of intrinsics and a rotation vector in rad, and no pupil."""
     return replace(Intrinsics.of(x).camera(), rotation_rad=x[LENS:])
 
 
-def _diagnostics(
-    bundle: CalibratedViews, scatter_px: Float[np.ndarray, " n"], views: list[BoardView]
-) -> tuple[Diagnostic, ...]:
-    on_jig = [one for one, view in zip(scatter_px[1:], views, strict=True) if view.parallel]
-    by_hand = [one for one, view in zip(scatter_px[1:], views, strict=True) if not view.parallel]
-    return (
-        *_common_diagnostics(bundle),
-        Diagnostic("corner_scatter_beside_noise", float(scatter_px[0]), "px"),
-        Diagnostic(ON_JIG, float(np.median(on_jig)), "px"),
-        Diagnostic(BY_HAND, float(np.median(by_hand or on_jig)), "px"),
-    )
-
-
-def _common_diagnostics(bundle: CalibratedViews) -> tuple[Diagnostic, ...]:
+def _diagnostics(bundle: CalibratedViews) -> tuple[Diagnostic, ...]:
     evidence, used = bundle.evidence, bundle.points.used
     return (
         Diagnostic("rms_reprojection", bundle.rms_px, "px"),
@@ -321,6 +275,14 @@ def _common_diagnostics(bundle: CalibratedViews) -> tuple[Diagnostic, ...]:
         Diagnostic("residual_pattern_p", evidence.pattern.p_value, "1"),
         Diagnostic("residual_pattern", evidence.pattern_px, "px"),
     )
+
+
+def _scatter_diagnostics(scatter_px: Float[np.ndarray, " n"], views: list[BoardView]) -> Iterator[Diagnostic]:
+    parallel = np.array([view.parallel for view in views])
+    on_jig, by_hand = scatter_px[1:][parallel], scatter_px[1:][~parallel]
+    yield Diagnostic("corner_scatter_beside_noise", float(scatter_px[0]), "px")
+    yield Diagnostic(ON_JIG, float(np.median(on_jig)), "px")
+    yield Diagnostic(BY_HAND, float(np.median(by_hand if len(by_hand) else on_jig)), "px")
 
 
 def _outliers(
@@ -336,9 +298,3 @@ def _outliers(
             sentences.append(f"{view.step_id}: corners {', '.join(map(str, ids))} left out, {far}.")
     found = rules.corners.listed(places)
     return (*(other for other in bundle.outliers if all(other.rule != f.rule for f in found)), *found), tuple(sentences)
-
-
-def _held(bundle: CalibratedViews) -> Iterator[str]:
-    held = [name for name, free in zip(INTRINSIC_NAMES, bundle.free, strict=True) if not free]
-    if held:
-        yield f"Held at 0, as the data do not ask for it: {', '.join(held)}."

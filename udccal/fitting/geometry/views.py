@@ -1,23 +1,17 @@
 """Lens and poses from arrays of corners, of a ChArUco board through a panel and of a chessboard in a photograph alike.
 
-The fit takes the robust minimum of the best start, without outliers. The focal length starts from homographies (Zhang,
-IEEE PAMI 22, 2000), poses from flat boards (Collins and Bartoli, IJCV 109, 2014). A flat board seen from afar looks
-almost the same in two poses, mirrored at the line of sight: the second is tried again once the lens is known.
-
-The fit then estimates the scatter by maximum likelihood, and chooses the order of the distortion. The sigma of a point
-counts relative to that of others; its scale is estimated. All views have one scale unless a test finds that they differ
-(by blur, light or distance).
+The fit takes the robust minimum of the best start, without outliers. It then estimates the scatter by maximum
+likelihood, and chooses the order of the distortion. The sigma of a point counts relative to that of others; its scale
+is estimated. All views have one scale unless a test finds that they differ (by blur, light or distance).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.spatial.transform import Rotation
 
 from udccal.errors import FitError
 from udccal.fitting.engine.gaussian import Prior
@@ -39,11 +33,10 @@ from udccal.fitting.geometry.bundle import (
     linearised,
     solve,
 )
-from udccal.fitting.geometry.calibrated import CalibratedViews, Evidence, weigh
-from udccal.fitting.geometry.data import Gathered
+from udccal.fitting.geometry.calibrated import CalibratedViews, remarks, status_of, weigh
+from udccal.fitting.geometry.data import Gathered, best_poses, facing
 from udccal.models.geometry import Geometry
 from udccal.numerics import in_float64
-from udccal.result import FitStatus
 
 
 @in_float64
@@ -55,16 +48,13 @@ def calibrate_views(
     start_poses: Float[np.ndarray, "views 6"] | None = None,
     rules: GeometryRules | None = None,
 ) -> CalibratedViews:
-    """Lens, poses and the tests of the model, of which ``fit_geometry`` makes the term.
+    """Lens and poses with their covariance, and the evidence for them; ``fit_geometry`` makes the term of these.
 
     Args:
         gathered: the points, from ``gather``.
         image_size: (columns, rows).
         start, prior, rules: as for ``fit_geometry``.
         start_poses: per view, a pose to start from, with ``start``; see ``bundle.Bundle``.
-
-    Returns:
-        lens and poses with their covariance, and the evidence for them.
 
     Raises:
         FitError: with fewer than 3 usable views (1 with a prior).
@@ -90,7 +80,7 @@ def calibrate_views(
     free = ORDERS[orders.best.name]
     final, points, dof = _rescaled(orders.best.fit, points, free, known)
     evidence, cov = weigh(final, points, free, image_size, dof, rules)
-    status, advice = _status(final, cov, image_size, rules)
+    status, advice = status_of(final, cov, image_size, rules)
     bundle = Bundle(final.place.intrinsics, facing(final.place.poses))
     return CalibratedViews(
         intrinsics=Intrinsics.of(bundle.intrinsics),
@@ -103,7 +93,7 @@ def calibrate_views(
         candidates=orders.candidates,
         evidence=evidence,
         status=status,
-        notes=(*gathered.notes, *advice, *_remarks(points, scales, evidence, by_prior, rules)),
+        notes=(*gathered.notes, *advice, *remarks(points, scales, evidence, by_prior, rules)),
         outliers=(*left_out, *rules.corners.listed(points.places(np.flatnonzero(~points.used)))),
         iterations=full.iterations,
         image_size=image_size,
@@ -119,61 +109,6 @@ def starts(
     if given is not None:
         found.insert(0, Bundle(given.vector, poses if poses is not None else best_poses(points, given.vector)[0]))
     return found
-
-
-def best_poses(
-    points: Points, intrinsics: Float[np.ndarray, "9"]
-) -> tuple[Float[np.ndarray, "views 6"], Float[np.ndarray, "views 6"]]:
-    """The best pose of each view at these intrinsics, and the one mirrored at the line of sight."""
-    pairs = [_pose_pair(points, view, Intrinsics.of(intrinsics)) for view in range(len(points.names))]
-    return np.array([first for first, _ in pairs]), np.array([second for _, second in pairs])
-
-
-def facing(poses: Float[np.ndarray, "views 6"]) -> Float[np.ndarray, "views 6"]:
-    """The same pictures with every board in front of the camera, and rotations of at most half a turn.
-
-    Behind the camera, a flat board turned by half a turn about its normal projects to the same points.
-    """
-    side = np.where(poses[:, 5:] < 0, -1.0, 1.0)
-    turn = Rotation.from_rotvec(poses[:, :3]) * Rotation.from_rotvec(np.pi * (side < 0) * np.array([0.0, 0.0, 1.0]))
-    return np.hstack([turn.as_rotvec(), side * poses[:, 3:]])
-
-
-def _pose_pair(points: Points, view: int, lens: Intrinsics) -> tuple[np.ndarray, np.ndarray]:
-    mine = (points.view == view) & points.used
-    board, image = points.board[mine], points.image[mine]
-    good = _consistent(board, image)
-    flat = np.linalg.svd(board - board.mean(axis=0), compute_uv=False)
-    method = cv2.SOLVEPNP_IPPE if flat[2] <= 1e-6 * flat[0] else cv2.SOLVEPNP_SQPNP
-    try:
-        _, turns, shifts, _ = cv2.solvePnPGeneric(board[good], image[good], lens.matrix, lens.distortion, flags=method)
-    except cv2.error:
-        turns, shifts = (), ()
-    found = [np.concatenate([t.ravel(), s.ravel()]) for t, s in zip(turns, shifts, strict=True)]
-    found = [pose for pose in found if np.isfinite(pose).all()] or [_ahead(board, image, lens)]
-    return found[0], found[-1]
-
-
-def _ahead(board: np.ndarray, image: np.ndarray, lens: Intrinsics) -> np.ndarray:
-    """A pose that faces the camera, at the distance and place by the points' spread."""
-    (across, down), middle = image.mean(axis=0), board.mean(axis=0)
-    seen = max(float(np.linalg.norm(image - image.mean(axis=0))), 1e-9)
-    distance = lens.matrix[0, 0] * float(np.linalg.norm(board - middle)) / seen
-    return np.concatenate([np.zeros(3), np.linalg.solve(lens.matrix, [across, down, 1.0]) * distance - middle])
-
-
-def _consistent(board: np.ndarray, image: np.ndarray) -> Bool[np.ndarray, " n"]:
-    """Points that one homography puts near their places; all points where there are too few for it.
-
-    The limit is a part of the board's size: distortion bends straight lines by less, and a corner with its neighbour's
-    number is off by more.
-    """
-    if len(board) >= 12:
-        limit = max(0.02 * float(np.ptp(image, axis=0).max()), 1.0)
-        _, inside = cv2.findHomography(board[:, :2], image, cv2.RANSAC, limit)
-        if inside is not None and inside.sum() >= max(6, len(board) // 3):
-            return inside.ravel().astype(bool)
-    return np.ones(len(board), dtype=bool)
 
 
 def _focal_px(points: Points, size: tuple[int, int]) -> float:
@@ -350,36 +285,3 @@ def _rescaled(
     factor = max(np.sqrt(float(costs(solved.place, points).sum()) / dof), least_scale(points))
     points = points.scaled(np.full(len(points.names), factor))
     return solve(solved.place, points, free, prior), points, dof
-
-
-def _status(
-    solved: Solved, cov: Float[np.ndarray, "n n"], image_size: tuple[int, int], rules: GeometryRules
-) -> tuple[FitStatus, tuple[str, ...]]:
-    """Whether the views determine the lens; else what to capture."""
-    sigma, lens = Intrinsics.of(np.sqrt(np.diag(cov))), Intrinsics.of(solved.place.intrinsics)
-    by_focal = float(np.max(sigma.focal_px / np.abs(lens.focal_px)))
-    by_centre = float(np.max(sigma.principal_point_px)) / image_size[0]
-    if max(by_focal, by_centre) > rules.most_uncertain:
-        what = "focal length" if by_focal > by_centre else "centre of the picture"
-        return FitStatus.TOO_FEW_DATA, (
-            f"The views do not determine the {what} (one sigma is {min(max(by_focal, by_centre), 99.0):.0%}). "
-            "Lean the board by 20 to 40 degrees, another way in each view, and let it fill the picture.",
-        )
-    if not solved.converged:
-        return FitStatus.NOT_CONVERGED, ("Check that the points of each view are in the order of the board's.",)
-    return FitStatus.CONVERGED, ()
-
-
-def _remarks(
-    points: Points, scales: Float[np.ndarray, " views"], evidence: Evidence, by_prior: bool, rules: GeometryRules
-) -> Iterator[str]:
-    if by_prior:
-        yield (
-            "The views alone do not determine the whole lens: what is known beforehand gives part of it, and every "
-            "distortion coefficient stays free within that. Lean the board another way in each view to know more."
-        )
-    relative = scales / np.median(scales)
-    loud = [f"{points.names[k]} ({relative[k]:.1f} x)" for k in np.flatnonzero(relative > rules.loud_view)]
-    if loud:
-        yield f"Views that scatter more than the median view, and count for less: {', '.join(loud)}."
-    yield from evidence.notes

@@ -59,16 +59,9 @@ class WireData:
 
 
 def read_wire(session: Session, noise: Noise, geometry: Geometry, rules: WireRules | None = None) -> WireData:
-    """Read the steps ``wire/dark`` and ``wire/flat`` of a session.
+    """Read the steps ``wire/dark`` and ``wire/flat`` of a session, at one exposure, in DN.
 
-    Args:
-        session: with both averages, at one exposure.
-        noise: for saturation and PRNU.
-        geometry: gives the rays.
-        rules: for the distance of single frames from saturation.
-
-    Returns:
-        the data of ``fit_wire``, in DN.
+    The noise term gives saturation and PRNU, ``rules`` the distance of single frames from saturation.
 
     Raises:
         SessionError: when a file of the session is missing or damaged.
@@ -173,7 +166,7 @@ class Pixels(eqx.Module):
 def sample_pixels(
     value: Float[np.ndarray, "rows columns"], geometry: Geometry, samples: int, cfa: str, other: bool = False
 ) -> Pixels:
-    """Draw pixels in reading order, shifted from row to row so that all CFA sites are among them.
+    """Draw pixels in reading order, shifted from row to row so that all CFA sites are among them, in whole blocks.
 
     Args:
         value: CFA-balanced signal; pixels that are not finite have weight 0, the others 1.
@@ -181,9 +174,6 @@ def sample_pixels(
         samples: number of pixels; the sample has somewhat more, or all where there are fewer.
         cfa: pattern of the sensor.
         other: draw a third as many, from the pixels that the sample without ``other`` leaves out if there are any.
-
-    Returns:
-        the sample, padded to whole blocks.
     """
     rows, columns = value.shape
     step = odd_step(value.size, samples)
@@ -211,15 +201,7 @@ def scaled_places(pixels: Float[np.ndarray, "n 2"], shape: tuple[int, int]) -> F
 
 
 def odd_step(size: int, samples: int) -> int:
-    """Step from pixel to pixel of a sample in reading order; an odd step visits all CFA sites.
-
-    Args:
-        size: number of pixels of the sensor.
-        samples: number of pixels wanted.
-
-    Returns:
-        the step in pixels, at least 1.
-    """
+    """Step from pixel to pixel for so many ``samples`` of ``size`` pixels; an odd step visits all CFA sites."""
     step = max(1, size // max(samples, 1))
     return step + 1 - step % 2
 

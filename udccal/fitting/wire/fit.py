@@ -28,11 +28,11 @@ from udccal.fitting.wire.data import (
     sample_pixels,
     scaled_places,
 )
-from udccal.fitting.wire.jacobian import WireProblem, block_jacobian, values_at, weighed_at
+from udccal.fitting.wire.jacobian import block_jacobian, values_at, weighed_at
 from udccal.fitting.wire.parameters import Kind, Parameters, parameters_of, select
 from udccal.fitting.wire.report import Joint, misfit, omitted, unseen, wire_result
 from udccal.fitting.wire.rules import WireRules, ideal_wire, possible_harmonics
-from udccal.fitting.wire.search import SOLVER, Found, Search
+from udccal.fitting.wire.search import SOLVER, Found, Search, WireProblem
 from udccal.models.geometry import Geometry
 from udccal.models.wire import Wire, wire_map
 from udccal.numerics import in_float64
@@ -84,16 +84,7 @@ def fit_wire(data: WireData, rules: WireRules | None = None) -> FitResult[Wire]:
 
 @in_float64
 def sensor_map(wire: Wire, rows: int, columns: int) -> Float[np.ndarray, "rows columns"]:
-    """The wire at every pixel of the sensor; the computation takes seconds.
-
-    Args:
-        wire: the fitted term.
-        rows: of the sensor.
-        columns: of the sensor.
-
-    Returns:
-        modulation times shading, whose mean is 1 for a fitted wire.
-    """
+    """The wire at every pixel of the sensor: modulation times shading. The computation takes seconds."""
     return np.asarray(wire_map(wire, rows, columns), dtype=np.float64)
 
 
@@ -166,16 +157,9 @@ def _grid(
 def mean_one(
     parameters: Parameters, x: Float[np.ndarray, " n"], geometry: Geometry, shape: tuple[int, int]
 ) -> Float[np.ndarray, " n"]:
-    """Scale the parameters to a map with a mean of 1 over the sensor, by the midpoint rule.
+    """``x`` with the first coefficient of the shading that gives the map a mean of 1, by the midpoint rule.
 
-    Args:
-        parameters: what ``x`` consists of.
-        x: in the units of the fit.
-        geometry: gives the rays.
-        shape: (rows, columns) of the sensor.
-
-    Returns:
-        ``x`` with another first coefficient of the shading.
+    ``shape`` is the sensor's (rows, columns).
     """
     whole, base = values_at(parameters.wire(x), *_grid(geometry, shape, (192, 256)))
     scaled = x.copy()
@@ -204,17 +188,7 @@ class MapJacobian:
 def map_jacobian(
     parameters: Parameters, x: Float[np.ndarray, " n"], geometry: Geometry, shape: tuple[int, int]
 ) -> MapJacobian:
-    """Jacobian of the map by the parameters.
-
-    Args:
-        parameters: what ``x`` consists of.
-        x: scaled to a map with a mean of 1, see ``mean_one``.
-        geometry: gives the rays.
-        shape: (rows, columns) of the sensor.
-
-    Returns:
-        the map and its derivatives on a grid of 64 x 64 places.
-    """
+    """Jacobian of the map at ``x``, whose mean is 1, on a grid of 64 x 64 places of a sensor (rows, columns)."""
     site, wire = np.zeros(BLOCK, dtype=np.int64), parameters.wire(x)
     grid = _grid(geometry, shape, (64, 64))
     whole, base, rows = over_blocks(lambda *at: block_jacobian(parameters, wire, at[0], at[1], site), *grid)

@@ -10,8 +10,8 @@ that each function is compiled once.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
-from typing import NamedTuple, final
+from dataclasses import replace
+from typing import NamedTuple
 
 import cv2
 import jax
@@ -19,17 +19,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from udccal.fitting.engine.gaussian import Prior
-from udccal.fitting.engine.least_squares import Blocks, Step
-from udccal.fitting.wire.data import BLOCK, FlatNoise, Pixels, Weighed, blocks, over_blocks, weighed
+from udccal.fitting.wire.data import BLOCK, FlatNoise, Pixels, Weighed, over_blocks, weighed
 from udccal.fitting.wire.parameters import Kind, Parameters
 from udccal.models.bessel import bessel_j0_j1
 from udccal.models.wire import LEAST_OPEN, Wire, field_powers, legendre, modulation, slits, waves
 
-# Tiles of the sensor, down and across, whose residuals are tested as a whole.
-TILES = (6, 8)
-# Least residual variance in units of the noise's, so that quotients by it stay finite.
-LEAST_VARIANCE = 1e-12
 # Harmonics that are summed at once.
 _GROUP = 50
 
@@ -98,16 +92,7 @@ def _axes(rotation: Float[np.ndarray, "3 3"], slope: Float[np.ndarray, "2 n"]) -
 
 
 def with_harmonics(wire: Wire, harmonics: Float[np.ndarray, "harmonics 2"], ideal: Float[np.ndarray, "n 2"]) -> Wire:
-    """The same shape with other harmonics of a round pupil.
-
-    Args:
-        wire: gives the shape.
-        harmonics: orders (n, m) along X and Y.
-        ideal: undistorted image points of a sample of the sensor.
-
-    Returns:
-        the wire with these harmonics and their ranges of kappa over the sample.
-    """
+    """The same shape with other harmonics (n, m) of a round pupil, and their ranges of kappa over a sample's points."""
     fields = np.zeros((len(harmonics), *np.shape(wire.fields)[1:]))
     fields[:, 0, 0, 0] = 1.0
     # The wire's rays do not depend on its harmonics.
@@ -158,16 +143,7 @@ def _base(wire: Wire, scaled: Float[np.ndarray, "n 2"], rays: Rays) -> Float[np.
 
 
 def expected_of(wire: Wire, gains: Float[np.ndarray, " sites"], pixels: Pixels) -> Float[np.ndarray, " n"]:
-    """The signal of a sample by the model.
-
-    Args:
-        wire: modulation and shading.
-        gains: of the CFA sites.
-        pixels: the sample.
-
-    Returns:
-        one signal per pixel, in CFA-balanced units.
-    """
+    """The signal of a sample by the model, in CFA-balanced units."""
     whole, base = values_at(wire, pixels.ideal, pixels.scaled)
     return whole * base * gains[pixels.site]
 
@@ -306,58 +282,3 @@ def block_jacobian(
     rows.append(found.wave[phase, harmonic] * found.carrier[carrier, harmonic] * found.powers[degree, harmonic])
     rows.append(found.shape[parameters.indices(Kind.SHAPE)[0]])
     return found.whole, found.base, np.concatenate(rows)
-
-
-@final
-@dataclass(frozen=True)
-class WireProblem:
-    """The likelihood of the parameters by a sample of weighted pixels.
-
-    The scale of the noise is estimated with them, so that the prior's weight does not depend on how well PRNU is
-    known. With the scale profiled out, minus twice the log likelihood is dof ln(chi-squared / dof).
-    """
-
-    name: str
-    parameters: Parameters
-    pixels: Pixels
-    prior: Prior
-
-    def equations_at(self, place: Float[np.ndarray, " n"]) -> Blocks:
-        """Cost and normal equations in units of the residual variance."""
-        matrix, by_tile, chi2 = self.sums(place)
-        used, variance = self.pixels.used, self.variance(chi2)
-        cost = max(used - len(place), 1) * float(np.log(variance))
-        by_data = Blocks.dense(cost, used, matrix / variance, by_tile.sum(axis=0) / variance)
-        return by_data.with_prior(self.prior, place)
-
-    def variance(self, chi2: float) -> float:
-        """Variance of the residuals in units of the noise's."""
-        return chi2 / max(self.pixels.used - len(self.prior.mean), 1) + LEAST_VARIANCE
-
-    def sums(
-        self, place: Float[np.ndarray, " n"]
-    ) -> tuple[Float[np.ndarray, "n n"], Float[np.ndarray, "tiles n"], float]:
-        """Information by the pixels' weights, the right side by tile, and chi-squared."""
-        wire, gains, size = self.parameters.wire(place), self.parameters.gains(place), len(place)
-        matrix, by_tile, chi2, p = np.zeros((size, size)), np.zeros((TILES[0] * TILES[1], size)), 0.0, self.pixels
-        for ideal, scaled, site, value, weight in blocks(p.ideal, p.scaled, p.site, p.value, p.weight):
-            whole, base, rows = block_jacobian(self.parameters, wire, ideal, scaled, site)
-            level, root = base * gains[site], np.sqrt(weight)
-            errors, rows = (value - whole * level) * root, rows * (root * level)
-            matrix += rows @ rows.T
-            # A block is some rows of the sensor, which cross few of the tiles.
-            tile = tile_numbers(scaled)
-            crossed = np.unique(tile)
-            by_tile[crossed] += np.where(tile == crossed[:, None], errors, 0.0) @ rows.T
-            chi2 += float(errors @ errors)
-        return matrix, by_tile, chi2
-
-    def moved(self, place: Float[np.ndarray, " n"], step: Step) -> Float[np.ndarray, " n"]:
-        """The place after a step."""
-        return place + step.shared
-
-
-def tile_numbers(scaled: Float[np.ndarray, "n 2"]) -> Int[np.ndarray, " n"]:
-    """Number of the sensor's tile in which each position lies."""
-    x, y = (np.clip((0.5 * (scaled[:, i] + 1) * n).astype(np.int64), 0, n - 1) for i, n in enumerate(TILES[::-1]))
-    return np.asarray(y * TILES[1] + x)

@@ -16,17 +16,9 @@ from udccal.fitting.engine.orders import Attempt, Choice, bic, choose
 from udccal.fitting.wire.rules import WireRules, WireStart, ideal_wire
 from udccal.models.wire import Wire
 
-SHAPE_NAMES = (
-    *(
-        "rotation_x_deg",
-        "rotation_y_deg",
-        "rotation_z_deg",
-        "standoff_per_pitch",
-        "offset_x_periods",
-        "offset_y_periods",
-    ),
-    *("footprint_per_pitch", "row_open", "column_open", "depth_per_pitch"),
-)
+_POSE = "rotation_x_deg", "rotation_y_deg", "rotation_z_deg", "standoff_per_pitch"
+_PUPIL = "offset_x_periods", "offset_y_periods", "footprint_per_pitch"
+SHAPE_NAMES = (*_POSE, *_PUPIL, "row_open", "column_open", "depth_per_pitch")
 SHAPE_UNITS = ("deg", "deg", "deg", "1", "period", "period", "1", "1", "1", "1")
 
 
@@ -158,7 +150,7 @@ def _leaves(wire: Wire, gains: Float[np.ndarray, " sites"]) -> dict[Kind, Float[
 def parameters_of(
     wire: Wire, rules: WireRules, sites: int, bounds: Iterable[float] = (), panel: bool = True
 ) -> Parameters:
-    """Parameters for shading, site gains, the wire's amplitudes, corrections to the round pupil, and the shape.
+    """All columns, for shading, site gains, the wire's amplitudes, corrections to the round pupil, and the shape.
 
     Args:
         wire: its arrays set the number of amplitudes and fields; numbers without a column keep their values.
@@ -166,9 +158,6 @@ def parameters_of(
         sites: number of sites of the CFA's cell.
         bounds: of the harmonics' relative amplitudes; stronger ones have more corrections.
         panel: whether there is one; without it there is no shape.
-
-    Returns:
-        all columns; ``select`` chooses among their groups.
     """
     nothing = replace(wire, baseline=np.zeros_like(wire.baseline), amplitudes=np.zeros_like(wire.amplitudes))
     strongest, _, degrees, _ = np.shape(nothing.amplitudes)

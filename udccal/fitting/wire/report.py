@@ -14,18 +14,10 @@ from udccal.fitting.engine.misfit import NO_TEST, MisfitTest, chi2_test, excess_
 from udccal.fitting.engine.orders import Choice
 from udccal.fitting.engine.report import estimates, residual_sample
 from udccal.fitting.wire.data import BLOCK, Pixels, Weighed
-from udccal.fitting.wire.jacobian import (
-    LEAST_VARIANCE,
-    TILES,
-    WireProblem,
-    rays_at,
-    tile_numbers,
-    tilt_deg,
-    values_at,
-    with_harmonics,
-)
+from udccal.fitting.wire.jacobian import rays_at, tilt_deg, values_at, with_harmonics
 from udccal.fitting.wire.parameters import SHAPE_NAMES, SHAPE_UNITS, Parameters
 from udccal.fitting.wire.rules import Harmonics, WireRules, WireStart, possible_harmonics
+from udccal.fitting.wire.search import LEAST_VARIANCE, TILES, WireProblem, tile_numbers
 from udccal.models.wire import Wire
 from udccal.result import Diagnostic, Estimate, FitResult, FitStatus
 
