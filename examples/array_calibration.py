@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 import udccal
+from udccal.fitting.geometry.fit import projection_sigma_px
 
 SIZE, DISTORTION, NOISE_PX = (1280, 960), np.array([-0.12, 0.08, 0.0, 0.0, 0.0]), 0.1
 MATRIX = np.array([[1100.0, 0.0, 652.0], [0.0, 1100.0, 470.0], [0.0, 0.0, 1.0]])
@@ -27,12 +28,11 @@ def main() -> None:
         views.append(np.where(((seen >= 0) & (seen < SIZE)).all(axis=1)[:, None], seen, np.nan))
     found = udccal.fit_geometry([board] * len(views), views, SIZE)
     order = next(c.name for c in found.candidates if c.chosen)
-    print(f"{found.status.name}: rms {found.rms_px:.3f} px, distortion: {order}")
-    sigma = np.sqrt(np.diag(found.cov))
-    for i, name in enumerate(("fx", "fy", "cx", "cy")):
-        print(f"  {name} {found.intrinsics.vector[i]:9.2f} ± {sigma[i]:.2f} px")
-    covariance = found.projection_covariance(np.array([[640.0, 480.0], [100.0, 80.0], [1200.0, 900.0]]))
-    print("  rays: sigma " + ", ".join(f"{np.trace(one) ** 0.5:.3f}" for one in covariance) + " px")
+    print(f"{found.status.name}: rms {found.diagnostics[0].value:.3f} px, distortion: {order}")
+    for one in found.estimates[:4]:
+        print(f"  {one.name} {one.value:9.2f} ± {one.sigma:.2f} {one.unit}")
+    sigma = projection_sigma_px(found, np.array([[640.0, 480.0], [100.0, 80.0], [1200.0, 900.0]]))
+    print("  rays: sigma " + ", ".join(f"{np.linalg.norm(one):.3f}" for one in sigma) + " px")
 
 
 if __name__ == "__main__":

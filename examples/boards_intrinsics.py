@@ -14,8 +14,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from udccal.fitting.geometry.calibrated import CalibratedViews
-from udccal.fitting.geometry.fit import fit_geometry
+from udccal import FitResult, fit_geometry
+from udccal.models.geometry import Geometry
 
 INNER = (9, 6)
 DEFAULT_DATA = Path(__file__).resolve().parents[1] / ".." / "shared" / "data"
@@ -30,7 +30,7 @@ def chessboard_corners(picture: np.ndarray) -> np.ndarray | None:
     return cv2.cornerSubPix(picture, corners, (5, 5), (-1, -1), stop)
 
 
-def calibrate(name: str, files: list[Path]) -> CalibratedViews | None:
+def calibrate(name: str, files: list[Path]) -> FitResult[Geometry] | None:
     """Calibrate one camera from its photographs and print the result."""
     pictures = [cv2.imread(str(file), cv2.IMREAD_GRAYSCALE) for file in files]
     found = [corners for corners in map(chessboard_corners, pictures) if corners is not None]
@@ -44,13 +44,13 @@ def calibrate(name: str, files: list[Path]) -> CalibratedViews | None:
     theirs, matrix, distortion, _, _ = cv2.calibrateCamera(
         [board.astype(np.float32)] * len(found), [c.astype(np.float32) for c in found], (columns, rows), None, None
     )
-    lens = ours.intrinsics
+    lens, numbers = ours.term, {d.name: d.value for d in ours.diagnostics}
     order = next(c.name for c in ours.candidates if c.chosen)
-    lost = int((~ours.points.used).sum())
+    lost = int(numbers["corners_rejected"])
     print(f"{name}: board found in {len(found)} of {len(files)} pictures, {lost} corners left out")
     (fx, fy), (cx, cy) = lens.focal_px, lens.principal_point_px
     print(
-        f"  udccal  rms {ours.rms_px:.3f} px   fx {fx:.2f} fy {fy:.2f} cx {cx:.2f} cy {cy:.2f}   "
+        f"  udccal  rms {numbers['rms_reprojection']:.3f} px   fx {fx:.2f} fy {fy:.2f} cx {cx:.2f} cy {cy:.2f}   "
         f"distortion: {order} {np.round(lens.distortion, 4)}"
     )
     print(

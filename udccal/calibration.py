@@ -19,8 +19,8 @@ from udccal.fitting.absent import absent_backscatter, absent_psf, absent_wire
 from udccal.fitting.backscatter.data import read_backscatter
 from udccal.fitting.backscatter.fit import fit_backscatter
 from udccal.fitting.backscatter.parameters import BackscatterRules
-from udccal.fitting.geometry.boards import fit_boards
 from udccal.fitting.geometry.data import BoardView, read_geometry
+from udccal.fitting.geometry.fit import fit_boards
 from udccal.fitting.noise.data import read_noise
 from udccal.fitting.noise.fit import fit_noise, nominal_noise
 from udccal.fitting.nominal import nominal_geometry

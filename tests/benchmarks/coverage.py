@@ -33,7 +33,7 @@ from udccal.effort import FitEffort
 from udccal.fitting.backscatter.data import read_backscatter, sampled_rays
 from udccal.fitting.backscatter.fit import fit_backscatter
 from udccal.fitting.bins import Bins
-from udccal.fitting.geometry.boards import projection_sigma_px
+from udccal.fitting.geometry.fit import projection_sigma_px
 from udccal.models.geometry import project_directions
 from udccal.models.wire import wire_values
 from udccal.numerics import in_float64

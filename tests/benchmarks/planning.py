@@ -33,7 +33,7 @@ from udccal.fitting.backscatter.data import read_backscatter
 from udccal.fitting.backscatter.fit import term_posterior
 from udccal.fitting.backscatter.orders import search
 from udccal.fitting.backscatter.solve import Problem
-from udccal.fitting.geometry.boards import projection_sigma_px
+from udccal.fitting.geometry.fit import projection_sigma_px
 from udccal.planning.forecast import predictor_for
 from udccal.planning.state import ModelErrors, measured_state, sensor_samples
 from udccal.rig import Captures, RigDescription, load_rig

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.special import j0, j1
 
-from udccal.models.bessel import bessel_j0_j1
+from udccal.models.bessel import bessel_j0_j1, sine_cosine
 from udccal.models.geometry import Geometry, panel_points_mm, unproject
 from udccal.models.wire import Wire, kappa, modulation, panel_rotation, slopes, waves, wire_map, wire_values
 
@@ -147,3 +147,13 @@ def test_differentiable_in_its_shape() -> None:
         slope = float(jax.jit(jax.grad(total))(jnp.asarray(22.0)))
         numeric = float((total(jnp.asarray(22.0 + 1e-5)) - total(jnp.asarray(22.0 - 1e-5))) / 2e-5)
     assert slope == pytest.approx(numeric, rel=1e-4)
+
+
+@pytest.mark.parametrize(("precision", "off"), [(np.float64, 4e-16), (np.float32, 2e-7)])
+def test_the_quick_sine_and_cosine_are_exact_to_rounding(precision: type, off: float) -> None:
+    x: np.ndarray = np.append(np.linspace(-400, 400, 100_001), np.arange(-40, 41) * np.pi / 4).astype(precision)
+    with jax.enable_x64(True):
+        found = [np.asarray(part) for part in jax.jit(sine_cosine)(x)]
+    assert all(part.dtype == precision for part in found)
+    for part, exact in zip(found, (np.sin(x.astype(np.float64)), np.cos(x.astype(np.float64))), strict=True):
+        assert np.abs(part - exact).max() < off

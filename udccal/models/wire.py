@@ -26,12 +26,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from udccal.models.arrays import Arrayish
-from udccal.models.bessel import bessel_j0_j1
+from udccal.models.bessel import bessel_j0_j1, sine_cosine
 from udccal.models.geometry import Geometry, rotation_matrix, unproject
 
 # Largest absolute value of a number in ``Wire.harmonics``.
 HIGHEST_ORDER = 24
-_LEAST_OPEN = 0.02
+# Narrowest opening, as a part of the period.
+LEAST_OPEN = 0.02
 
 
 class Wire(eqx.Module):
@@ -104,7 +105,7 @@ def openings(wire: Wire, slope: Float[Arrayish, "2 n"]) -> Float[Array, "2 n"]:
         slope: slopes of the rays, from ``slopes``.
     """
     straight = jnp.stack([jnp.asarray(wire.column_open), jnp.asarray(wire.row_open)])
-    return jnp.maximum(straight[:, None] - wire.depth_per_pitch * jnp.abs(jnp.asarray(slope)), _LEAST_OPEN)
+    return jnp.maximum(straight[:, None] - wire.depth_per_pitch * jnp.abs(jnp.asarray(slope)), LEAST_OPEN)
 
 
 def kappa(wire: Wire, slope: Float[Arrayish, "2 n"]) -> Float[Array, "harmonics n"]:
@@ -120,13 +121,30 @@ def carriers(
 ) -> Float[Array, "2 harmonics n"]:
     """Return G and z G' of each harmonic times the slits' coefficients, for ``seen`` = ``kappa(wire, slope)``."""
     harmonics = jnp.asarray(wire.harmonics)[:, :, None]
-    slit = jnp.where(harmonics == 0, 1.0, 2.0 * jnp.sinc(harmonics * openings(wire, slope)))
+    slit, _ = slits(wire, openings(wire, slope))
     # cos(nX) cos(mY) is half the sum over (n, m) and (-n, m).
     crossed = jnp.where(jnp.all(harmonics != 0, axis=1), 0.5, 1.0)
     z = jnp.pi * wire.footprint_per_pitch * jnp.asarray(seen)
     j0, j1 = bessel_j0_j1(z)
     g = 2.0 * j1 / z
-    return crossed * slit[:, 0] * slit[:, 1] * jnp.stack([g, 2.0 * (j0 - g)])
+    return crossed * slit[0] * slit[1] * jnp.stack([g, 2.0 * (j0 - g)])
+
+
+def slits(
+    wire: Wire, width: Float[Array, "2 n"]
+) -> tuple[Float[Array, "2 harmonics n"], Float[Array, "2 harmonics n"]]:
+    """Return the slits' coefficients 2 sin(pi m f) / (pi m f), 1 where m is 0, and their derivatives by f.
+
+    Args:
+        wire: the wire term.
+        width: openings f along X and Y, from ``openings``.
+    """
+    order = jnp.abs(jnp.asarray(wire.harmonics)).T[..., None]
+    waved = [_multiples(jnp.pi * f, m[:, 0]) for f, m in zip(width, order, strict=True)]
+    cosine, sine = (jnp.stack(part) for part in zip(*waved, strict=True))
+    sinc = sine / (jnp.pi * jnp.maximum(order, 1.0) * width[:, None])
+    slope = 2.0 * (cosine - sinc) / width[:, None]
+    return jnp.where(order == 0, 1.0, 2.0 * sinc), jnp.where(order == 0, 0.0, slope)
 
 
 def waves(wire: Wire, slope: Float[Arrayish, "2 n"]) -> Float[Array, "2 harmonics n"]:
@@ -149,8 +167,7 @@ def _multiples(phase: Float[Array, " n"], order: Float[Array, " harmonics"]) -> 
     multiples = jnp.arange(HIGHEST_ORDER + 1.0, dtype=phase.dtype)
     # A product with a selection matrix: many times faster on a CPU than gathering rows.
     chosen = (jnp.round(jnp.abs(order))[:, None] == multiples).astype(phase.dtype)
-    table = multiples[:, None] * phase
-    cosine, sine = (jnp.matmul(chosen, part, precision="highest") for part in (jnp.cos(table), jnp.sin(table)))
+    sine, cosine = (jnp.matmul(chosen, part, precision="highest") for part in sine_cosine(multiples[:, None] * phase))
     return cosine, jnp.sign(order)[:, None] * sine
 
 

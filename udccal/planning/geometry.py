@@ -19,7 +19,6 @@ from scipy.special import erf
 from udccal.arrangements import Board
 from udccal.fitting.engine.gaussian import Posterior, scaled_inverse
 from udccal.fitting.engine.orders import bic
-from udccal.fitting.geometry.boards import term_at, with_angles
 from udccal.fitting.geometry.bundle import (
     EVERY,
     ORDERS,
@@ -32,6 +31,7 @@ from udccal.fitting.geometry.bundle import (
 )
 from udccal.fitting.geometry.corners import board_points_mm, charuco_board
 from udccal.fitting.geometry.data import rig_prior
+from udccal.fitting.geometry.fit import term_at, with_angles
 from udccal.models.geometry import panel_directions, project_directions
 from udccal.numerics import in_float64
 from udccal.planning.design import Floor

@@ -13,7 +13,7 @@ from scipy.ndimage import map_coordinates
 from udccal.arrangements import Arrangement, Board, Dark, FlatLight, Led, PanelPicture, Photograph
 from udccal.calibration import Calibration
 from udccal.cfa import cfa_named
-from udccal.fitting.geometry.boards import BY_HAND, ON_JIG
+from udccal.fitting.geometry.fit import BY_HAND, ON_JIG
 from udccal.fitting.nominal import nominal_geometry
 from udccal.models.backscatter import Backscatter
 from udccal.models.geometry import Geometry

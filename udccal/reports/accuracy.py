@@ -8,7 +8,7 @@ import numpy as np
 
 from udccal.calibration import ORDER, Calibration
 from udccal.errors import UdccalError
-from udccal.fitting.geometry.boards import projection_sigma_px
+from udccal.fitting.geometry.fit import projection_sigma_px
 from udccal.planning.forecast import Curve, Forecast, forecast
 from udccal.planning.state import measured_state, sensor_samples
 from udccal.reports.tables import Table

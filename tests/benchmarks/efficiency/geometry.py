@@ -13,13 +13,12 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from tests.benchmarks.efficiency.trials import Trials
-from tests.fitting.geometry.boards import Sight, sight
+from tests.fitting.geometry.boards import Sight, calibrated, sight
 from udccal.fitting.engine.information import cramer_rao, fisher_information
-from udccal.fitting.geometry.boards import fit_boards, projection_sigma_px
 from udccal.fitting.geometry.calibrated import CalibratedViews, Gauge, field_grid
 from udccal.fitting.geometry.corners import board_points_mm
 from udccal.fitting.geometry.data import GeometryData
-from udccal.fitting.geometry.fit import fit_geometry
+from udccal.fitting.geometry.fit import fit_boards, projection_sigma_px
 from udccal.models.geometry import Geometry, project, rotation_matrix
 from udccal.numerics import in_float64
 from udccal.result import FitResult
@@ -94,7 +93,7 @@ def trials(share: float = 1.0) -> list[Trials]:
         result = fit_boards(GeometryData(tuple(views), _START, scene.size)).or_raise()
         ids = [view.corners.ids for view in views]
         sigmas = [scene.sigma_px[k, seen] for k, seen in enumerate(ids)]
-        bundle = fit_geometry([board[i] for i in ids], [v.corners.xy for v in views], scene.size, None, sigmas)
+        bundle = calibrated([board[i] for i in ids], [v.corners.xy for v in views], scene.size, None, sigmas)
         parts = (
             *_parameters(result, values),
             *_panel_rays(result, turned, pixels),

@@ -10,9 +10,9 @@ import numpy as np
 from tests.benchmarks.extremes.case import Case, Outcome, outcome
 from tests.fitting.geometry.boards import MOUNTED_DEG, Sight, sight
 from udccal.fitting.engine.gaussian import Prior
-from udccal.fitting.geometry.boards import fit_boards
 from udccal.fitting.geometry.corners import BoardCorners
 from udccal.fitting.geometry.data import BoardView, GeometryData
+from udccal.fitting.geometry.fit import fit_boards
 from udccal.models.geometry import Geometry
 
 _FOCAL_SIGMA_PX, _CENTRE_SIGMA_PX = 15.0, 8.0

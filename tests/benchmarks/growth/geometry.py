@@ -10,9 +10,9 @@ import numpy as np
 from tests.benchmarks.growth.cases import Case
 from tests.fitting.geometry.boards import sight
 from udccal.arrangements import BoardSpec
-from udccal.fitting.geometry.boards import fit_boards
 from udccal.fitting.geometry.corners import board_points_mm
 from udccal.fitting.geometry.data import GeometryData
+from udccal.fitting.geometry.fit import fit_boards
 from udccal.models.geometry import Geometry
 from udccal.numerics import in_float64
 

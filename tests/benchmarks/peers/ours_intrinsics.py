@@ -1,4 +1,4 @@
-"""The work ``intrinsics`` of the peers' folder, through ``fit_geometry``. Prints one JSON line as the peers do.
+"""The work ``intrinsics`` of the peers' folder, through ``calibrate_views``. Prints one JSON line as the peers do.
 
     python -m tests.benchmarks.peers.ours_intrinsics --peers ../shared/peers --seeds 10 --starts 1000 --covered 200
 
@@ -21,7 +21,8 @@ import numpy as np
 
 from udccal import __version__
 from udccal.fitting.geometry.calibrated import CalibratedViews, Gauge
-from udccal.fitting.geometry.fit import fit_geometry
+from udccal.fitting.geometry.data import gather
+from udccal.fitting.geometry.views import calibrate_views
 from udccal.models.geometry import Geometry
 
 Boards = tuple[list[np.ndarray], list[np.ndarray]]
@@ -62,7 +63,7 @@ def converged(works: ModuleType, data: list[Boards], references: list[Calibrated
     for k in range(starts):
         board, image = data[k % len(data)]
         start, poses = random_start(works, len(board), rng)
-        found = fit_geometry(board, image, (works.W, works.H), start, start_poses=poses)
+        found = calibrate_views(gather(board, image), (works.W, works.H), start, start_poses=poses)
         count += found.converged and same(found, references[k % len(data)])
     return count
 
@@ -90,7 +91,7 @@ def spread(works: ModuleType, seeds: int) -> tuple[float, float]:
     """Root mean square of the z-scores over so many seeds, and its standard error."""
     size = (works.W, works.H)
     square = np.array(
-        [(z_scores(works, fit_geometry(*boards(works, seed), size)) ** 2).mean() for seed in range(seeds)]
+        [(z_scores(works, calibrate_views(gather(*boards(works, seed)), size)) ** 2).mean() for seed in range(seeds)]
     )
     rms = float(np.sqrt(square.mean()))
     return rms, float(square.std(ddof=1) / np.sqrt(seeds) / (2 * rms))
@@ -109,12 +110,12 @@ def main() -> None:
     size = (works.W, works.H)
     data = [boards(works, seed) for seed in range(options.seeds)]
     begun = time.perf_counter()
-    fit_geometry(*data[0], size)
+    calibrate_views(gather(*data[0]), size)
     first = time.perf_counter() - begun
     results, seconds, sigmas = [], [], []
     for views in data:
-        fit_geometry(*views, size)  # other numbers of corners may be another padded size
-        result, taken, _ = works.timed(lambda views=views: fit_geometry(*views, size))
+        calibrate_views(gather(*views), size)  # other numbers of corners may be another padded size
+        result, taken, _ = works.timed(lambda views=views: calibrate_views(gather(*views), size))
         results.append(result)
         seconds.append(taken)
         cov = result.projection_covariance(works.intr_grid(), Gauge.ALIGNED)

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import jax
 import numpy as np
 
 from udccal.arrangements import BoardSpec
+from udccal.fitting.geometry.calibrated import CalibratedViews
 from udccal.fitting.geometry.corners import BoardCorners, board_points_mm, charuco_board
-from udccal.fitting.geometry.data import BoardView
+from udccal.fitting.geometry.data import BoardView, gather
+from udccal.fitting.geometry.views import calibrate_views
 from udccal.models.geometry import Geometry, mounting_rotation, project, unproject
 
 SPEC = BoardSpec(columns=7, rows=5, square_mm=40.0, marker_mm=30.0)
@@ -147,3 +151,15 @@ def sight(
 
 def _matrix(pose: np.ndarray) -> np.ndarray:
     return np.asarray(cv2.Rodrigues(np.ascontiguousarray(pose[:3]))[0])
+
+
+def calibrated(
+    board: Sequence[np.ndarray],
+    image: Sequence[np.ndarray],
+    size: tuple[int, int],
+    start: Geometry | None = None,
+    sigmas: Sequence[np.ndarray] | None = None,
+    **options: Any,
+) -> CalibratedViews:
+    """Lens and poses of arrays."""
+    return calibrate_views(gather(board, image, sigmas), size, start, **options)

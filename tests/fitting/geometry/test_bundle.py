@@ -7,12 +7,12 @@ import pytest
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
-from tests.fitting.geometry.boards import VISIBLE_BEND, Sight, sight
+from tests.fitting.geometry.boards import VISIBLE_BEND, Sight, calibrated, sight
 from udccal.errors import FitError
 from udccal.fitting.engine.gaussian import Prior
 from udccal.fitting.geometry.calibrated import CalibratedViews
 from udccal.fitting.geometry.corners import board_points_mm
-from udccal.fitting.geometry.fit import fit_geometry
+from udccal.fitting.geometry.fit import fit_geometry, projection_sigma_px
 from udccal.models.geometry import Geometry
 from udccal.result import FitStatus
 
@@ -31,7 +31,7 @@ def arrays(scene: Sight = SCENE, seed: int = 1) -> tuple[list[np.ndarray], list[
 
 def calibrate(scene: Sight = SCENE, **options: object) -> CalibratedViews:
     board, image, sigma = arrays(scene)
-    return fit_geometry(board, image, scene.size, sigmas=sigma, **options)
+    return calibrated(board, image, scene.size, sigmas=sigma, **options)
 
 
 def errors(found: CalibratedViews, scene: Sight = SCENE) -> np.ndarray:
@@ -78,7 +78,7 @@ def test_points_that_are_no_numbers_are_listed_and_left_out(plain: CalibratedVie
 def test_a_corner_in_glare_is_left_out_by_name() -> None:
     board, image, sigma = arrays()
     image[2][20] += [2.0, -1.0]
-    found = fit_geometry(board, image, SCENE.size, sigmas=sigma)
+    found = calibrated(board, image, SCENE.size, sigmas=sigma)
     assert "view 2, point 20" in found.outliers[-1].places
     assert found.outliers[-1].count <= 3
     assert np.abs(errors(found)).max() < 4
@@ -87,7 +87,7 @@ def test_a_corner_in_glare_is_left_out_by_name() -> None:
 def test_a_view_in_the_wrong_order_is_left_out_whole() -> None:
     board, image, sigma = arrays()
     image[3] = np.random.default_rng(2).permutation(image[3])
-    found = fit_geometry(board, image, SCENE.size, sigmas=sigma)
+    found = calibrated(board, image, SCENE.size, sigmas=sigma)
     assert 3 not in found.points.names
     assert any(one.places == ("view 3",) and "median view" in one.rule for one in found.outliers)
     assert np.abs(errors(found)).max() < 4
@@ -95,7 +95,7 @@ def test_a_view_in_the_wrong_order_is_left_out_whole() -> None:
 
 def test_a_view_twice_counts_once(plain: CalibratedViews) -> None:
     board, image, sigma = arrays()
-    found = fit_geometry(board + board[:2], image + image[:2], SCENE.size, sigmas=sigma + sigma[:2])
+    found = calibrated(board + board[:2], image + image[:2], SCENE.size, sigmas=sigma + sigma[:2])
     assert found.points.names == plain.points.names
     assert "repeats" in found.notes[0]
     np.testing.assert_allclose(found.cov, plain.cov, rtol=1e-6, atol=1e-12)
@@ -105,7 +105,7 @@ def test_points_on_one_line_hold_no_pose() -> None:
     board, image, sigma = arrays()
     row = slice(0, SCENE.spec.columns - 1)
     board[4], image[4], sigma[4] = board[4][row], image[4][row], sigma[4][row]
-    found = fit_geometry(board, image, SCENE.size, sigmas=sigma)
+    found = calibrated(board, image, SCENE.size, sigmas=sigma)
     assert 4 not in found.points.names
     assert "one line" in found.notes[0]
 
@@ -114,7 +114,7 @@ def test_views_of_another_scatter_get_their_own_scale() -> None:
     board, image, sigma = arrays()
     rng = np.random.default_rng(3)
     image[1] = image[1] + 0.8 * rng.standard_normal(image[1].shape)
-    found = fit_geometry(board, image, SCENE.size, sigmas=sigma)
+    found = calibrated(board, image, SCENE.size, sigmas=sigma)
     view, sigma_px = found.points.view, found.points.sigma
     ratio = [np.median(sigma_px[view == k] / sigma_px[view == 0].mean()) for k in (1, 2)]
     assert ratio[0] > 4
@@ -144,7 +144,7 @@ def test_too_few_views_are_refused_with_the_reason() -> None:
     board, image, _ = arrays()
     image[1] = np.full_like(image[1], np.nan)
     with pytest.raises(FitError, match="View 1 is left out: expected at least 6 points, found 0"):
-        fit_geometry(board[:3], image[:3], SCENE.size)
+        calibrated(board[:3], image[:3], SCENE.size)
 
 
 @settings(
@@ -166,7 +166,7 @@ def test_whatever_the_views_a_lens_or_advice(seed: int, tilt: float, lean: float
     rng = np.random.default_rng(seed)
     image = [np.where(rng.uniform(size=(len(view), 1)) < lost, np.nan, view) for view in image]
     try:
-        found = fit_geometry(board, image, scene.size, sigmas=sigma)
+        found = calibrated(board, image, scene.size, sigmas=sigma)
     except FitError:
         # Only where too little was left to begin with.
         assert sum((np.isfinite(view[:, 0]).sum() >= 6) for view in image) < 8
@@ -178,3 +178,25 @@ def test_whatever_the_views_a_lens_or_advice(seed: int, tilt: float, lean: float
         assert np.abs(errors(found, scene)[:2]).max() < 5
     else:
         assert found.notes
+
+
+def test_the_term_of_arrays_has_the_lens_and_the_sigma_of_its_rays(plain: CalibratedViews) -> None:
+    board, image, sigma = arrays()
+    found = fit_geometry(board, image, SCENE.size, sigmas=sigma)
+    assert found.or_raise() is found
+    np.testing.assert_allclose(found.term.distortion, plain.intrinsics.distortion)
+    assert [e.name for e in found.estimates] == list(NAMES)
+    np.testing.assert_allclose([e.sigma for e in found.estimates], np.sqrt(np.diag(plain.cov)[:9]))
+    pixels = np.array([[511.0, 383.0], [40.0, 60.0], [980.0, 700.0]])
+    expected = np.sqrt(np.einsum("nii->ni", plain.projection_covariance(pixels)))
+    np.testing.assert_allclose(projection_sigma_px(found, pixels), expected, rtol=1e-3)
+    assert sum(one.count for one in found.outliers) == sum(one.count for one in plain.outliers)
+
+
+def test_too_few_arrays_have_a_status_and_arrays_of_other_numbers_an_error() -> None:
+    board, image, _ = arrays()
+    found = fit_geometry(board[:2], image[:2], SCENE.size)
+    assert found.status is FitStatus.TOO_FEW_DATA
+    assert "3 views" in found.notes[0]
+    with pytest.raises(FitError, match="as many views"):
+        fit_geometry(board[:2], image, SCENE.size)

@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from tests.fitting.geometry.boards import sight
+from tests.fitting.geometry.boards import calibrated, sight
 from tests.fitting.geometry.test_bundle import SCENE, arrays
 from udccal.errors import FitError
 from udccal.fitting.geometry.bundle import ORDERS, Intrinsics, projected
 from udccal.fitting.geometry.calibrated import CalibratedViews, Gauge, field_grid
 from udccal.fitting.geometry.corners import board_points_mm
-from udccal.fitting.geometry.fit import fit_geometry
 
 PIXELS = np.array([[511.0, 383.0], [40.0, 60.0], [980.0, 700.0]])
 
@@ -22,7 +21,7 @@ PIXELS = np.array([[511.0, 383.0], [40.0, 60.0], [980.0, 700.0]])
 @pytest.fixture(scope="module")
 def plain() -> CalibratedViews:
     board, image, sigma = arrays()
-    return fit_geometry(board, image, SCENE.size, sigmas=sigma)
+    return calibrated(board, image, SCENE.size, sigmas=sigma)
 
 
 def trace(found: CalibratedViews, gauge: Gauge) -> np.ndarray:
@@ -54,7 +53,7 @@ def test_a_pattern_in_the_residuals_is_flagged_and_widens_the_rays(plain: Calibr
     """A ripple over the sensor that no lens of the model bends."""
     board, image, sigma = arrays()
     bent = [view + 0.3 * np.sin(view[:, ::-1] / 40.0) for view in image]
-    found = fit_geometry(board, bent, SCENE.size, sigmas=sigma)
+    found = calibrated(board, bent, SCENE.size, sigmas=sigma)
     assert found.evidence.pattern.p_value < 1e-3 < plain.evidence.pattern.p_value
     assert 0.03 < found.evidence.pattern_px < 0.4
     assert any("pattern over the picture" in note for note in found.notes)
@@ -65,7 +64,7 @@ def test_views_of_different_lenses_disagree_and_widen_all(plain: CalibratedViews
     """Half of the views through a lens that squeezes, as when something was moved in between."""
     board, image, sigma = arrays()
     squeezed = [view + np.array([1.0, -1.0]) * 0.002 * (k % 2) * (view - 400) for k, view in enumerate(image)]
-    found = fit_geometry(board, squeezed, SCENE.size, sigmas=sigma)
+    found = calibrated(board, squeezed, SCENE.size, sigmas=sigma)
     assert found.evidence.views.found
     assert not plain.evidence.views.found
     assert found.cov[0, 0] > 4 * plain.cov[0, 0]
@@ -79,7 +78,7 @@ def test_error_bars_of_views_that_disagree_are_those_of_drawn_lenses() -> None:
     flat = board_points_mm(scene.spec)
     u, v = ((flat - flat.mean(axis=0)) / np.ptp(flat[:, :2]))[:, :2].T
     truth = Intrinsics.of_geometry(scene.camera).vector
-    plain = fit_geometry([flat] * 12, arrays(scene)[1], scene.size)
+    plain = calibrated([flat] * 12, arrays(scene)[1], scene.size)
     z, noise_z = [], []
     for seed in range(30):
         rng, pictures = np.random.default_rng(seed), []
@@ -88,7 +87,7 @@ def test_error_bars_of_views_that_disagree_are_those_of_drawn_lenses() -> None:
             there = Rotation.from_rotvec(pose[:3]).apply(bent) + pose[3:]
             exact = projected(truth, there)[0]
             pictures.append(np.where(seen[:, None], exact + sigma[:, None] * rng.standard_normal(exact.shape), np.nan))
-        found = fit_geometry([flat] * 12, pictures, scene.size)
+        found = calibrated([flat] * 12, pictures, scene.size)
         assert found.evidence.views.found
         free = np.array(found.free)
         z.append(((found.intrinsics.vector - truth) / np.sqrt(np.diag(found.cov)[:9] + ~free))[:4])
@@ -128,7 +127,7 @@ def test_the_right_order_is_chosen_in_95_of_100(order: str) -> None:
     scene, right = sight(views=8, distortion=np.array(VISIBLE[order]), sigma_px=0.06), 0
     for seed in range(100):
         board, image, sigma = arrays(scene, seed)
-        found = fit_geometry(board, image, scene.size, sigmas=sigma)
+        found = calibrated(board, image, scene.size, sigmas=sigma)
         right += next(c.name for c in found.candidates if c.chosen) == order
     assert right >= 95
     assert order in ORDERS

@@ -19,7 +19,8 @@ from udccal.fitting.geometry.bundle import (
     linearised,
     solve,
 )
-from udccal.fitting.geometry.start import best_poses, facing, gather, starts
+from udccal.fitting.geometry.data import best_poses, facing, gather
+from udccal.fitting.geometry.views import starts
 from udccal.models.geometry import project, rotation_matrix
 
 POINTS = gather(*arrays(), GeometryRules()).points

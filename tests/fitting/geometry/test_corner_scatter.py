@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from tests.fitting.geometry.boards import COMMON_PX, sight
-from udccal.fitting.geometry.boards import fit_boards
 from udccal.fitting.geometry.corners import BoardCorners
 from udccal.fitting.geometry.data import GeometryData
+from udccal.fitting.geometry.fit import fit_boards
 from udccal.models.geometry import Geometry
 from udccal.result import FitResult, FitStatus
 

@@ -7,15 +7,14 @@ import jax
 import numpy as np
 import pytest
 
-from tests.fitting.geometry.boards import CAMERA, SIZE, SPEC, draw, pose, true_corners
+from tests.fitting.geometry.boards import CAMERA, SIZE, SPEC, calibrated, draw, pose, true_corners
 from udccal.cameras.protocol import CameraIdentity, Region, Settings
 from udccal.errors import FitError
 from udccal.fitting.engine.gaussian import Prior
-from udccal.fitting.geometry.boards import fit_boards, projection_sigma_px
 from udccal.fitting.geometry.calibrated import CalibratedViews
 from udccal.fitting.geometry.corners import BoardCorners, board_points_mm
 from udccal.fitting.geometry.data import BoardView, GeometryData, read_geometry, rig_prior
-from udccal.fitting.geometry.fit import fit_geometry
+from udccal.fitting.geometry.fit import fit_boards, projection_sigma_px
 from udccal.fitting.noise.fit import nominal_noise
 from udccal.fitting.nominal import nominal_geometry
 from udccal.models.geometry import Geometry, mounting_rotation, project_directions, rotation_matrix
@@ -181,7 +180,7 @@ def test_clipped_boards_are_saturated() -> None:
 
 def test_too_few_views_are_refused() -> None:
     with pytest.raises(FitError, match="3 views"):
-        fit_geometry([board_points_mm(SPEC)] * 2, [v.corners.xy for v in views()[:2]], SIZE)
+        calibrated([board_points_mm(SPEC)] * 2, [v.corners.xy for v in views()[:2]], SIZE)
 
 
 @pytest.mark.slow
@@ -189,14 +188,14 @@ def test_a_bent_board_is_a_poor_fit() -> None:
     """A board that is not as described: no camera sees it so."""
     bent = np.outer(np.arange(24) % 5, [0.0, 0.0, 8.0])
     points = board_points_mm(SPEC) * np.array([1.0, 1.1, 1.0]) + bent
-    bundle = fit_geometry([points] * 9, [v.corners.xy for v in views()], SIZE, START)
+    bundle = calibrated([points] * 9, [v.corners.xy for v in views()], SIZE, START)
     assert bundle.rms_px > 1.0
 
 
 @pytest.mark.slow
 def test_a_plain_camera_needs_no_start() -> None:
     found = views()
-    bundle: CalibratedViews = fit_geometry([board_points_mm(SPEC)] * 9, [v.corners.xy for v in found], SIZE)
+    bundle: CalibratedViews = calibrated([board_points_mm(SPEC)] * 9, [v.corners.xy for v in found], SIZE)
     assert bundle.converged
     np.testing.assert_allclose(bundle.intrinsics.focal_px, CAMERA.focal_px, atol=0.5)
     assert bundle.rms_px < 2 * NOISE_PX * np.sqrt(2)

@@ -14,7 +14,7 @@ from tests.scenes import wire as drawn
 from udccal.cfa import cfa_named
 from udccal.fitting.engine.least_squares import minimise
 from udccal.fitting.wire.data import FlatNoise, Pixels, Weighed, WireData, flat_noise, sample_pixels, weighed
-from udccal.fitting.wire.jacobian import WireProblem, block_jacobian, expected_of, wire_derivatives
+from udccal.fitting.wire.jacobian import block_jacobian, expected_of, wire_derivatives
 from udccal.fitting.wire.parameters import (
     Kind,
     parameters_of,
@@ -25,7 +25,7 @@ from udccal.fitting.wire.parameters import (
 )
 from udccal.fitting.wire.report import misfit
 from udccal.fitting.wire.rules import WireRules, WireStart, ideal_wire, possible_harmonics
-from udccal.fitting.wire.search import scan_rows
+from udccal.fitting.wire.search import WireProblem, scan_rows
 from udccal.models.geometry import Geometry
 from udccal.models.wire import Wire, log_baseline, modulation, slopes
 

@@ -10,7 +10,6 @@ from dataclasses import dataclass, field, replace
 from typing import final
 
 import cv2
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
@@ -90,13 +89,9 @@ class GeometryRules:
 @final
 @dataclass(frozen=True)
 class Intrinsics:
-    """The nine numbers of a lens, or a number for each of them (a sigma, a row of a matrix).
+    """The nine numbers of a lens, or a number for each of them (a sigma, a row of a matrix); see ``Geometry``.
 
     ``of`` and ``vector`` convert from and to a vector in the order of ``INTRINSIC_NAMES``.
-
-    Attributes:
-        focal_px: (fx, fy). principal_point_px: (cx, cy).
-        distortion: (k1, k2, p1, p2, k3), OpenCV's order and signs.
     """
 
     focal_px: Float[Arrayish, "2 ..."]
@@ -105,7 +100,7 @@ class Intrinsics:
 
     @classmethod
     def of(cls, vector: Float[Arrayish, "n ..."]) -> Intrinsics:
-        """From the vector, or from a matrix whose first rows are the intrinsics; numpy or JAX arrays."""
+        """From a vector, or a matrix whose first rows are the intrinsics; numpy or JAX arrays."""
         return cls(vector[:2], vector[2:4], vector[4:LENS])
 
     @classmethod
@@ -128,7 +123,7 @@ class Intrinsics:
 
     def camera(self) -> Geometry:
         """The term with the lens alone: camera coordinates are the panel's."""
-        return Geometry(self.focal_px, self.principal_point_px, self.distortion, jnp.zeros(3), jnp.zeros(3))
+        return Geometry(self.focal_px, self.principal_point_px, self.distortion, np.zeros(3), np.zeros(3))
 
 
 @final
@@ -143,10 +138,9 @@ class Bundle:
 @final
 @dataclass(frozen=True)
 class Points:
-    """Points of all usable views one after another.
+    """Points of all usable views one after another: on the board in any unit of length, and in px with their sigma.
 
     Attributes:
-        board: on the board, any unit of length. image: in px. sigma: of each coordinate in px.
         view: number of the point's view among the usable ones. index: its place in its view as given.
         used: whether it takes part in the fit.
         names: the usable views by their place in what was given.
@@ -184,14 +178,9 @@ class Points:
 def projected(
     intrinsics: Float[np.ndarray, "9"], camera: Float[np.ndarray, "n 3"]
 ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2 15"]]:
-    """Project points in camera coordinates (``cv2.projectPoints``).
+    """Places of points in camera coordinates (any unit), in px (``cv2.projectPoints``).
 
-    Args:
-        intrinsics: in the order of ``INTRINSIC_NAMES``.
-        camera: points in camera coordinates, in any unit of length.
-
-    Returns:
-        the places in px, and their derivatives by the 9 intrinsics, a small turn (rad) and a shift of the points.
+    The second result has their derivatives by the 9 intrinsics, a small turn (rad) and a shift of the points.
     """
     lens = Intrinsics.of(intrinsics)
     places, slopes = cv2.projectPoints(camera, np.zeros(3), np.zeros(3), lens.matrix, lens.distortion)
@@ -234,13 +223,9 @@ def by_view(
 @final
 @dataclass(frozen=True)
 class BundleProblem:
-    """A bundle as the solver's problem.
+    """A bundle as the solver's problem, with a prior on the intrinsics; those that are not ``free`` stay.
 
-    Attributes:
-        points: those in use are weighted by their sigma.
-        free: which of the intrinsics are fitted; the others stay where they start.
-        prior: on the intrinsics.
-        robust: loss of the residuals; None for their squares.
+    ``robust`` is the loss of residuals; None stands for their squares.
     """
 
     points: Points

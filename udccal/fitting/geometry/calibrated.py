@@ -39,12 +39,9 @@ class Gauge(enum.Enum):
 @final
 @dataclass(frozen=True)
 class Evidence:
-    """Tests of the model by its residuals.
+    """Tests of residuals averaged over cells of the sensor, and of the intrinsics that each view prefers.
 
-    Attributes:
-        pattern: test of residuals averaged over the cells of a grid on the sensor against independence.
-        views: test of the intrinsics that each view prefers against one set for all.
-        pattern_px: size of the pattern per axis beyond noise; 0 unless found.
+    ``pattern_px`` is the size of the pattern per axis beyond noise; 0 unless found.
     """
 
     pattern: MisfitTest
@@ -72,18 +69,15 @@ class CalibratedViews:
     """Intrinsics and poses with their uncertainty, and the evidence for them.
 
     Attributes:
-        intrinsics: the lens; distortion coefficients that the data do not ask for are 0.
+        intrinsics: the lens; distortion coefficients that the data do not ask for are 0, and not ``free``.
         poses: of the views in use, board to camera: rotation vector (rad), then translation (board's unit).
         cov: of the intrinsics as a vector, then 6 per view in use. The scale of the noise is estimated; where the views
             disagree beyond it, the variance of their disagreement is added.
         points: the finite points of all views in use; their sigma is the given one times the estimated scatter.
         residuals_px: projected minus seen, of these points.
-        free: which intrinsics were fitted.
         chi2_dof: scatter over the given sigma, squared; 1 where none was given.
         candidates: the orders of the distortion, by BIC.
-        evidence: tests of the model.
         status: ``CONVERGED``, or the reason not to use this; ``notes`` say what to do.
-        outliers: points left out.
         iterations: of the last solve with all distortions free.
         image_size: (columns, rows).
     """
@@ -116,13 +110,9 @@ class CalibratedViews:
     def projection_covariance(
         self, pixels: Float[np.ndarray, "rays 2"], gauge: Gauge = Gauge.BOARDS
     ) -> Float[np.ndarray, "rays 2 2"]:
-        """Covariance in px^2 of the places where rays land.
+        """Covariance in px^2 of the places where rays land, which the fit puts at ``pixels`` (x, y).
 
-        A pattern that the residuals show beyond chance is a model error; its size is added.
-
-        Args:
-            pixels: (x, y) in px, where the fit puts the rays.
-            gauge: the frame to which the rays are fixed.
+        The pattern that the residuals show beyond chance is a model error, and is added.
 
         Raises:
             FitError: when the fitted distortion folds before a pixel, so that no ray lands there.
@@ -189,10 +179,7 @@ def weigh(
     dof: float,
     rules: GeometryRules,
 ) -> tuple[Evidence, Float[np.ndarray, "n n"]]:
-    """Test a solution whose points carry their scaled sigma, and give its covariance, widened where the views disagree.
-
-    ``dof`` are the degrees of freedom behind the scale of sigma.
-    """
+    """Tests of a solution, and its covariance, widened where the views disagree; ``dof`` are those behind sigma."""
     z, jacobian = in_sigma(solved.place, points)
     jacobian = jacobian * np.concatenate([free, np.ones(6)])
     matrix, right = by_view(z, jacobian, points)
@@ -251,7 +238,7 @@ def _pattern(
     dof: float,
     cells: int,
 ) -> tuple[MisfitTest, float]:
-    """Test sums over the cells of a grid by their covariance under the model; give the pattern's size in px as well.
+    """Test of sums over the cells of a grid by their covariance under the model, and the pattern's size in px.
 
     ``group_means_test`` does not serve here: the fit absorbs most of a smooth pattern, so that means of cells scatter
     far less than those of independent residuals. The covariance of the sums accounts for that.
@@ -272,3 +259,37 @@ def _pattern(
     # Mean over the points of the squared mean of their cell, less the part that noise has in it.
     excess = float(((sums**2 - np.diag(expected)) / count).sum() / count.sum())
     return found, float(np.sqrt(max(excess, 0.0) * np.mean(points.sigma[points.used] ** 2)))
+
+
+def status_of(
+    solved: Solved, cov: Float[np.ndarray, "n n"], image_size: tuple[int, int], rules: GeometryRules
+) -> tuple[FitStatus, tuple[str, ...]]:
+    """Whether the views determine the lens; else what to capture."""
+    sigma, lens = Intrinsics.of(np.sqrt(np.diag(cov))), Intrinsics.of(solved.place.intrinsics)
+    by_focal = float(np.max(sigma.focal_px / np.abs(lens.focal_px)))
+    by_centre = float(np.max(sigma.principal_point_px)) / image_size[0]
+    if max(by_focal, by_centre) > rules.most_uncertain:
+        what = "focal length" if by_focal > by_centre else "centre of the picture"
+        return FitStatus.TOO_FEW_DATA, (
+            f"The views do not determine the {what} (one sigma is {min(max(by_focal, by_centre), 99.0):.0%}). "
+            "Lean the board by 20 to 40 degrees, another way in each view, and let it fill the picture.",
+        )
+    if not solved.converged:
+        return FitStatus.NOT_CONVERGED, ("Check that the points of each view are in the order of the board's.",)
+    return FitStatus.CONVERGED, ()
+
+
+def remarks(
+    points: Points, scales: Float[np.ndarray, " views"], evidence: Evidence, by_prior: bool, rules: GeometryRules
+) -> Iterator[str]:
+    """What a person should know of a fit that can be used; ``scales`` are the views' scatter."""
+    if by_prior:
+        yield (
+            "The views alone do not determine the whole lens: what is known beforehand gives part of it, and every "
+            "distortion coefficient stays free within that. Lean the board another way in each view to know more."
+        )
+    relative = scales / np.median(scales)
+    loud = [f"{points.names[k]} ({relative[k]:.1f} x)" for k in np.flatnonzero(relative > rules.loud_view)]
+    if loud:
+        yield f"Views that scatter more than the median view, and count for less: {', '.join(loud)}."
+    yield from evidence.notes

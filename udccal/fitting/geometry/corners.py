@@ -28,26 +28,17 @@ from udccal.fitting.geometry.bundle import GeometryRules
 @final
 @dataclass(frozen=True)
 class Luminance:
-    """Grey picture of a black-and-white subject.
-
-    Attributes:
-        grey: filtered picture.
-        variance: of the samples before the filter, scaled as the samples are.
-    """
+    """Grey picture of a black-and-white subject; ``variance`` is that of its samples before they were filtered."""
 
     grey: Float[np.ndarray, "rows columns"]
     variance: Float[np.ndarray, "rows columns"]
 
 
 def luminance(mosaic: Float[np.ndarray, "rows columns"], variance: Float[np.ndarray, "rows columns"]) -> Luminance:
-    """Grey picture on the mosaic's own pixels.
+    """Grey picture on the mosaic's own pixels, whose black level is subtracted; ``variance`` is of single samples.
 
     The four sites of the pattern are scaled to one mean and averaged with the filter (1 2 1) x (1 2 1) / 16. That
     moves no edge and removes the pattern.
-
-    Args:
-        mosaic: black level subtracted, in any linear unit.
-        variance: of its samples, in that unit squared.
     """
     grey, spread = np.asarray(mosaic, dtype=np.float64).copy(), np.asarray(variance, dtype=np.float64).copy()
     total = max(float(grey.mean()), 1e-12)
@@ -72,10 +63,7 @@ def _filtered(picture: Float[np.ndarray, "*stack rows columns"]) -> Float[np.nda
 @final
 @dataclass(frozen=True)
 class BoardCorners:
-    """Corners found: their numbers on the board, their places in sensor pixels, and one sigma of these in px by noise.
-
-    The bundle estimates how much the board's print and the picture's blur add to the sigma.
-    """
+    """Corners found: their numbers on the board, their places in the picture, and one sigma of these in px by noise."""
 
     ids: Int[np.ndarray, " n"]
     xy: Float[np.ndarray, "n 2"]
@@ -83,48 +71,34 @@ class BoardCorners:
 
 
 def charuco_board(spec: BoardSpec) -> cv2.aruco.CharucoBoard:
-    """OpenCV's board of a description.
-
-    Args:
-        spec: squares, sizes in mm and the dictionary's name.
-
-    Raises:
-        FitError: when OpenCV has no dictionary of that name.
-    """
+    """OpenCV's board of a description; a dictionary that OpenCV lacks is a ``FitError``."""
     if not (spec.dictionary.startswith("DICT_") and hasattr(cv2.aruco, spec.dictionary)):
         raise FitError(
             f"Expected the name of a dictionary of OpenCV such as DICT_5X5_1000, found '{spec.dictionary}'. "
             "Correct the board's description."
         )
-    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, spec.dictionary))
+    whole = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, spec.dictionary))
+    # Only the board's own markers, every second square: a search among all thousand takes ten times as long.
+    own = whole.bytesList[: spec.columns * spec.rows // 2]
+    dictionary = cv2.aruco.Dictionary(own, whole.markerSize, whole.maxCorrectionBits)
     return cv2.aruco.CharucoBoard((spec.columns, spec.rows), spec.square_mm, spec.marker_mm, dictionary)
 
 
 def board_points_mm(spec: BoardSpec) -> Float[np.ndarray, "corners 3"]:
-    """Inner corners of a board in the order of their numbers.
-
-    Args:
-        spec: squares, sizes in mm and the dictionary's name.
-
-    Returns:
-        (x, y, 0) in mm in board coordinates.
-
-    Raises:
-        FitError: when OpenCV has no dictionary of that name.
-    """
+    """Inner corners (x, y, 0) of a board in mm, in the order of their numbers; errors as for ``charuco_board``."""
     return np.asarray(charuco_board(spec).getChessboardCorners(), dtype=np.float64).reshape(-1, 3)
 
 
 def detect_corners(picture: Luminance, spec: BoardSpec, rules: GeometryRules | None = None) -> BoardCorners:
-    """Find a board's inner corners in a grey picture; where there are none the arrays are empty.
+    """Find a board's inner corners in a grey picture; errors as for ``charuco_board``.
 
     Args:
-        picture: see ``luminance``.
+        picture: from ``luminance``.
         spec: of the board.
         rules: see ``GeometryRules``.
 
-    Raises:
-        FitError: when the board's dictionary is unknown.
+    Returns:
+        the corners; the arrays are empty where there are none.
     """
     rules = rules or GeometryRules()
     ids, rough = _detect(picture.grey, spec)
@@ -142,8 +116,7 @@ def _detect(
 ) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, "n 2"]]:
     """OpenCV's detection on the picture and, for strong blur, on one of half its size; the one with more corners."""
     low, high = np.percentile(grey, [0.5, 99.5])
-    scaled = np.clip((grey - low) / max(high - low, 1e-12), 0.0, 1.0)
-    picture = np.round(255.0 * scaled).astype(np.uint8)
+    picture = np.round(255.0 * np.clip((grey - low) / max(high - low, 1e-12), 0.0, 1.0)).astype(np.uint8)
     detector = cv2.aruco.CharucoDetector(charuco_board(spec))
     best = (np.zeros(0, dtype=np.int64), np.zeros((0, 2)))
     for shrink in (1, 2):
@@ -164,12 +137,9 @@ def _edges_px(
     homography, _ = cv2.findHomography(board, image, cv2.RANSAC, 5.0)
     if homography is None:
         homography = np.eye(3)
-
-    def seen(points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
-        return np.asarray(cv2.perspectiveTransform(points.reshape(-1, 1, 2), homography).reshape(-1, 2))
-
-    half = square_mm / 2 * np.eye(2)
-    return np.stack([seen(board + step) - seen(board - step) for step in half], axis=1)
+    ends = board[:, None] + square_mm / 2 * np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
+    seen = cv2.perspectiveTransform(ends.reshape(-1, 1, 2), homography).reshape(-1, 4, 2)
+    return np.asarray(seen[:, :2] - seen[:, 2:])
 
 
 @final
@@ -190,33 +160,37 @@ class _Saddle:
         self.weight = np.clip(1 - (self.u**2).sum(-1) / radius[:, None] ** 2, 0.0, None)
         self.normals = np.stack([np.cos(shape[:, 2:4]), np.sin(shape[:, 2:4])], axis=-1)
         self.width = np.exp(shape[:, 4:6])
-        self.across = np.einsum("nmi,nki->nkm", self.u, self.normals) / self.width[..., None]
+        self.across = self.normals @ np.swapaxes(self.u, 1, 2) / self.width[..., None]
         self.profile = erf(self.across / np.sqrt(2.0))
         product = self.profile[:, 0] * self.profile[:, 1]
         self.design = np.stack([np.ones_like(samples), self.u[..., 0], self.u[..., 1], product], axis=-1)
-        normal = np.einsum("nmi,nm,nmj->nij", self.design, self.weight, self.design) + 1e-9 * np.eye(4)
-        right = np.einsum("nmi,nm,nm->ni", self.design, self.weight, samples)
-        self.linear = np.linalg.solve(normal, right[..., None])[..., 0]
-        self.residual = samples - np.einsum("nmi,ni->nm", self.design, self.linear)
+        normal, right = self.equations(self.design, samples)
+        self.linear = np.linalg.solve(normal + 1e-9 * np.eye(4), right[..., None])[..., 0]
+        self.residual = samples - (self.design @ self.linear[..., None])[..., 0]
         self.cost = (self.weight * self.residual**2).sum(-1)
+
+    def equations(
+        self, slopes: Float[np.ndarray, "n m p"], values: Float[np.ndarray, "n m"]
+    ) -> tuple[Float[np.ndarray, "n p p"], Float[np.ndarray, "n p"]]:
+        """Weighted normal equations of each corner."""
+        weighted = np.swapaxes(slopes * self.weight[..., None], 1, 2)
+        return weighted @ slopes, (weighted @ values[..., None])[..., 0]
 
     def jacobian(self) -> Float[np.ndarray, "n m 10"]:
         """Derivatives by the shape and the linear part."""
         bell = np.sqrt(2 / np.pi) * np.exp(-(self.across**2) / 2)
         common = self.linear[:, 3, None, None] * bell * self.profile[:, ::-1]
         by_width = common / self.width[..., None]
-        position = -np.einsum("nkm,nki->nmi", by_width, self.normals) - self.linear[:, None, 1:3]
+        position = -np.swapaxes(by_width, 1, 2) @ self.normals - self.linear[:, None, 1:3]
         tangents = np.stack([-self.normals[..., 1], self.normals[..., 0]], axis=-1)
-        turn, grow = by_width * np.einsum("nmi,nki->nkm", self.u, tangents), -common * self.across
+        turn, grow = by_width * (tangents @ np.swapaxes(self.u, 1, 2)), -common * self.across
         return np.concatenate([position, np.moveaxis(turn, 1, 2), np.moveaxis(grow, 1, 2), self.design], axis=-1)
 
     def step(self, damping: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 6"]:
         """Damped Gauss-Newton step of the shape; the linear part follows by itself."""
-        jacobian = self.jacobian()
-        normal = np.einsum("nmi,nm,nmj->nij", jacobian, self.weight, jacobian)
+        normal, right = self.equations(self.jacobian(), self.residual)
         diagonal = np.einsum("nii->ni", normal)
         raised = damping[:, None] * diagonal + 1e-12 * diagonal.max(1, keepdims=True) + 1e-30
-        right = np.einsum("nmi,nm,nm->ni", jacobian, self.weight, self.residual)
         return np.linalg.solve(normal + raised[:, :, None] * np.eye(10), right[..., None])[:, :6, 0]
 
     def noise_sigma(self, variance: Float[np.ndarray, "n m"]) -> Float[np.ndarray, " n"]:
@@ -225,12 +199,11 @@ class _Saddle:
         Weighted least squares moves a corner by G = (J' W J)^-1 J' W per filtered sample: the covariance is a sandwich.
         """
         jacobian = self.jacobian()
-        normal = np.einsum("nmi,nm,nmj->nij", jacobian, self.weight, jacobian)
-        inverse = np.linalg.pinv(normal, hermitian=True)[:, :2]
-        moves = np.einsum("nip,nmp,nm->nim", inverse, jacobian, self.weight)
+        inverse = np.linalg.pinv(self.equations(jacobian, self.residual)[0], hermitian=True)[:, :2]
+        moves = inverse @ np.swapaxes(jacobian * self.weight[..., None], 1, 2)
         side = int(np.sqrt(moves.shape[2]))
         by_sample = _filtered(moves.reshape(*moves.shape[:2], side, side)).reshape(moves.shape)
-        return np.sqrt(np.einsum("nim,nm->n", by_sample**2, variance) / 2)
+        return np.sqrt((by_sample**2 * variance[:, None]).sum(axis=(1, 2)) / 2)
 
 
 def _saddles(
@@ -256,9 +229,13 @@ def _saddles(
     for _ in range(12):
         trial = shape + np.clip(saddle.step(damping), -1.0, 1.0)
         trial[:, 4:] = np.clip(trial[:, 4:], np.log(0.3), np.log(20.0))
-        better = _Saddle(trial, *windows).cost < saddle.cost
+        tried = _Saddle(trial, *windows)
+        better = tried.cost < saddle.cost
+        step = np.abs(trial - shape).max()
         shape = np.where(better[:, None], trial, shape)
-        saddle = _Saddle(shape, *windows)
+        saddle = tried if better.all() else _Saddle(shape, *windows)
+        if step < 1e-4:  # The next one would be its square.
+            break
         damping = np.clip(np.where(better, damping / 5, damping * 10), 1e-9, 1e9)
     sigma = saddle.noise_sigma(picture.variance[where])
     misfit = np.sqrt(saddle.cost / np.maximum(saddle.weight.sum(-1) - 10, 1.0))

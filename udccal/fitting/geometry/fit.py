@@ -1,46 +1,38 @@
-"""Lens and poses from arrays of corners, of a ChArUco board through a panel and of a chessboard in a photograph alike.
+"""The geometry term: intrinsics and distortion from arrays, or from a rig's boards with the camera's mounting.
 
-The fit takes the robust minimum of the best start, without outliers. It then estimates the scatter by maximum
-likelihood, and chooses the order of the distortion. The sigma of a point counts relative to that of others; its scale
-is estimated. All views have one scale unless a test finds that they differ (by blur, light or distance).
+One view of a rig shows the board parallel to the panel. Its axes are then the panel's: the inverse of its pose is
+``R_panel_camera``. Stand-off and panel position stay nominal here: a far board does not determine them. The wire does.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 
+import jax
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 
 from udccal.errors import FitError
-from udccal.fitting.engine.gaussian import Prior
-from udccal.fitting.engine.misfit import SIGNIFICANT
-from udccal.fitting.engine.orders import Attempt, Choice, bic, choose
-from udccal.fitting.engine.robust import outliers
-from udccal.fitting.engine.tails import chi2_tail
-from udccal.fitting.geometry.bundle import (
-    EVERY,
-    LENS,
-    ORDERS,
-    Bundle,
-    GeometryRules,
-    Intrinsics,
-    Points,
-    Solved,
-    by_view,
-    in_sigma,
-    linearised,
-    solve,
-)
-from udccal.fitting.geometry.calibrated import CalibratedViews, Evidence, weigh
-from udccal.fitting.geometry.start import costs, facing, gather, least_scale, settle
-from udccal.models.geometry import Geometry
+from udccal.fitting.engine.gaussian import Posterior, Prior, square_root
+from udccal.fitting.engine.misfit import excess_sigma
+from udccal.fitting.engine.report import estimates, residual_sample
+from udccal.fitting.geometry.bundle import INTRINSIC_NAMES, INTRINSIC_UNITS, LENS, GeometryRules, Intrinsics
+from udccal.fitting.geometry.calibrated import CalibratedViews, Gauge
+from udccal.fitting.geometry.corners import board_points_mm
+from udccal.fitting.geometry.data import BoardView, GeometryData, gather
+from udccal.fitting.geometry.views import calibrate_views
+from udccal.models.geometry import Geometry, panel_directions, project_directions
 from udccal.numerics import in_float64
-from udccal.result import FitStatus
+from udccal.result import Diagnostic, FitResult, FitStatus, Outliers
+
+# Scatter in addition to noise of the board on the jig, and of the median other view: a plan reads them.
+ON_JIG, BY_HAND = "corner_scatter_on_jig", "corner_scatter_by_hand"
+_NAMES, _UNITS = (*INTRINSIC_NAMES, "tilt_deg", "roll_deg", "yaw_deg"), (*INTRINSIC_UNITS, "deg", "deg", "deg")
 
 
-@in_float64
 def fit_geometry(
     board_points: Sequence[Float[np.ndarray, "..."]],
     image_points: Sequence[Float[np.ndarray, "..."]],
@@ -49,10 +41,12 @@ def fit_geometry(
     sigmas: Sequence[Float[np.ndarray, " _"]] | None = None,
     *,
     prior: Prior | None = None,
-    start_poses: Float[np.ndarray, "views 6"] | None = None,
     rules: GeometryRules | None = None,
-) -> CalibratedViews:
-    """Calibrate a camera from views of flat boards.
+) -> FitResult[Geometry]:
+    """Fit the lens to views of flat boards, given as arrays; ``views.calibrate_views`` gives their poses as well.
+
+    The term's axes are the camera's, and its posterior holds the boards still: ``projection_sigma_px`` gives the sigma
+    of rays fixed to the boards.
 
     Args:
         board_points: per view, points on the board (z = 0) in any unit of length, (n, 3) or (n, 1, 3).
@@ -63,169 +57,244 @@ def fit_geometry(
             lower minimum wins.
         sigmas: per view, one sigma in px of each point, up to a common factor; without it all points count alike.
         prior: on the intrinsics, in the order of ``Intrinsics``; with it a single view may be enough.
-        start_poses: per view, a pose to start from, with ``start``.
         rules: see ``GeometryRules``.
 
     Returns:
-        lens and poses with their covariance, and the evidence for them. The order of the distortion is the one with the
-        lowest BIC (Schwarz, 1978) on the points that remain after outliers are left out.
+        the term, without rotation and pupil, with estimates of the intrinsics. The order of the distortion is the one
+        with the lowest BIC (Schwarz, 1978). Status ``TOO_FEW_DATA`` says what to capture.
 
     Raises:
-        FitError: with fewer than 3 usable views (1 with a prior), each of 6 finite points that are not on one line; or
-            when the arrays do not belong together.
+        FitError: when the arrays do not belong together.
+    """
+    rules, gathered = rules or GeometryRules(), gather(board_points, image_points, sigmas, rules)
+    try:
+        views = calibrate_views(gathered, image_size, start, prior, rules=rules)
+    except FitError as error:
+        usual = Intrinsics(np.full(2, float(max(image_size))), (np.array(image_size) - 1) / 2, np.zeros(5))
+        return FitResult.failed("geometry", start or usual.camera(), FitStatus.TOO_FEW_DATA, str(error))
+    picks = np.vstack([np.eye(LENS, len(views.cov)), -views.turn(Gauge.BOARDS)])
+    return _result(views, np.append(views.intrinsics.vector, np.zeros(3)), picks @ views.cov @ picks.T, _lens_at, LENS)
+
+
+def fit_boards(data: GeometryData, rules: GeometryRules | None = None) -> FitResult[Geometry]:
+    """Fit lens and mounting to a session's boards.
+
+    Every corner has its own noise and a scatter common to all (paper that is not flat, blur that a saddle does not
+    describe), which the fit estimates.
+
+    Args:
+        data: boards, one of them parallel to the panel; at least 3 usable ones, or any number with a prior.
+
+    Returns:
+        the term, with estimates of the intrinsics and of tilt, roll and yaw; the status says what to capture.
     """
     rules = rules or GeometryRules()
-    gathered = gather(board_points, image_points, sigmas, rules)
-    least, known = (rules.least_views, Prior(np.zeros(LENS), np.zeros((0, LENS)))) if prior is None else (1, prior)
-    given, left_out = gathered.points, gathered.outliers
-    if len(given.names) < least:
-        raise FitError(
-            f"Expected at least {least} views of at least {rules.least_corners} points each, found {len(board_points)} "
-            f"views, {len(given.names)} of them usable. {' '.join(gathered.notes)} Capture more views of the board."
-        )
-    lens = None if start is None else Intrinsics.of_geometry(start)
-    settled, marked = settle(given, image_size, lens, start_poses, known, rules)
-    strange = _strange_views(marked, given, rules)
-    if strange.any() and (~strange).sum() >= least:
-        rule = f"of a view that scatters more than {rules.strange_view:g} times as much as the median view"
-        left_out = (*left_out, *outliers(rule, (f"view {given.names[k]}" for k in np.flatnonzero(strange))))
-        given = given.without(strange)
-        settled, marked = settle(given, image_size, lens, start_poses, known, rules)
-    full, points, scales = _maximum_likelihood(settled, marked, given, known)
-    orders, by_prior = _choose_order(full, points, known, rules)
-    free = ORDERS[orders.best.name]
-    final, points, dof = _rescaled(orders.best.fit, points, free, known)
-    evidence, cov = weigh(final, points, free, image_size, dof, rules)
-    status, advice = _status(final, cov, image_size, rules)
-    bundle = Bundle(final.place.intrinsics, facing(final.place.poses))
-    return CalibratedViews(
-        intrinsics=Intrinsics.of(bundle.intrinsics),
-        poses=bundle.poses,
-        cov=cov,
-        points=points,
-        residuals_px=linearised(bundle, points)[0],
-        free=tuple(bool(one) for one in free),
-        chi2_dof=1.0 if sigmas is None else float(((points.sigma / given.sigma)[points.used] ** 2).mean()),
-        candidates=orders.candidates,
-        evidence=evidence,
-        status=status,
-        notes=(*gathered.notes, *advice, *_remarks(points, scales, evidence, by_prior, rules)),
-        outliers=(*left_out, *rules.corners.listed(points.places(np.flatnonzero(~points.used)))),
-        iterations=full.iterations,
-        image_size=image_size,
+    usable = [view for view in data.views if view.usable(rules)]
+    notes = tuple(_lost(data.views, rules))
+    least, parallel = 1 if data.prior else rules.least_views, sum(view.parallel for view in usable)
+    if len(usable) < least or not parallel:
+        clipped = sum(view.clipped > rules.most_clipped for view in data.views)
+        status = FitStatus.SATURATED if clipped > len(data.views) / 2 else FitStatus.TOO_FEW_DATA
+        found = f"Expected {least} views with a board and one of them parallel to the panel, found {len(usable)} "
+        return FitResult.failed("geometry", data.nominal, status, *notes, f"{found}and {parallel}.")
+    try:
+        bundle, scatter_px = _calibrated(usable, data, rules)
+    except FitError as error:
+        return FitResult.failed("geometry", data.nominal, FitStatus.TOO_FEW_DATA, *notes, str(error))
+    return _mounted(bundle, scatter_px, [usable[k] for k in bundle.points.names], data.nominal, notes, rules)
+
+
+@in_float64
+def projection_sigma_px(result: FitResult[Geometry], pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
+    """Sigma of the places at which directions fixed in panel coordinates appear; it includes the model error found.
+
+    Args:
+        result: of ``fit_boards`` or ``fit_geometry``, with its posterior.
+        pixels: (x, y) in px, where the directions appear.
+
+    Returns:
+        one sigma in px along x and along y, per pixel; errors as for ``FitResult.sigma_of``.
+    """
+    directions, places = jax.jit(panel_directions)(result.term, pixels), jax.jit(project_directions)
+    return result.sigma_of(lambda term: np.asarray(places(term, directions)))
+
+
+def _calibrated(
+    views: Sequence[BoardView], data: GeometryData, rules: GeometryRules
+) -> tuple[CalibratedViews, Float[np.ndarray, " n"]]:
+    """The bundle, and the scatter in addition to noise in px by axis: of all views, then of each in use."""
+    points = [board_points_mm(view.spec)[view.corners.ids] for view in views]
+    seen, scatter_px = [view.corners.xy for view in views], np.full(1, rules.start_scatter_px)
+    for _ in range(8):
+        # No lens follows its model more closely than a thousandth of a pixel.
+        sigmas = [np.maximum(np.hypot(view.corners.sigma, scatter_px[0]), 1e-3) for view in views]
+        gathered = gather(points, seen, sigmas, rules)
+        bundle = calibrate_views(gathered, data.image_size, data.nominal, data.prior, rules=rules)
+        before, scatter_px = scatter_px, _scatter_px(bundle, views)
+        if abs(scatter_px[0] - before[0]) <= 0.05 * before[0]:
+            break
+    return bundle, scatter_px
+
+
+def _scatter_px(bundle: CalibratedViews, views: Sequence[BoardView]) -> Float[np.ndarray, " n"]:
+    """The scatter that gives residuals their expected size, significant or not: plans need the estimate itself."""
+    points = bundle.points
+    noise = [views[points.names[v]].corners.sigma[k] for v, k in zip(points.view, points.index, strict=True)]
+    variance = np.maximum(np.array(noise), 1e-3) ** 2
+    square = (bundle.residuals_px**2).sum(axis=1)
+    spent = (sum(bundle.free) + 6 * len(points.names)) / (2 * points.used.sum())
+    # A floor keeps fits with nearly as many parameters as data from having no degrees of freedom.
+    left = max(1 - spent, 0.05)
+    groups = [points.used, *(points.used & (points.view == view) for view in range(len(points.names)))]
+    return np.array(
+        [excess_sigma(square[g], variance[g], np.ones(g.sum()), 2 * left * g.sum(), chance=0.5) for g in groups]
     )
 
 
-def _strange_views(scattered: Points, given: Points, rules: GeometryRules) -> Bool[np.ndarray, " views"]:
-    """Views to leave out: their points are in another order, the board is another one, or it moved."""
-    ratio = np.array([np.median((scattered.sigma / given.sigma)[given.view == k]) for k in range(len(given.names))])
-    return np.asarray(ratio > rules.strange_view * np.median(ratio))
+def _lost(views: Sequence[BoardView], rules: GeometryRules) -> Iterator[str]:
+    lost = [view.step_id for view in views if len(view.corners.ids) < rules.least_corners]
+    clipped = [view.step_id for view in views if view.clipped > rules.most_clipped]
+    if lost:
+        yield f"No board (fewer than {rules.least_corners} corners) in {', '.join(lost)}."
+    if clipped:
+        yield f"More than {rules.most_clipped:.0%} of the samples clipped in {', '.join(clipped)}."
 
 
-def _maximum_likelihood(
-    solved: Solved, points: Points, given: Points, prior: Prior
-) -> tuple[Solved, Points, Float[np.ndarray, " views"]]:
-    """Scales by residuals and their degrees of freedom, points with scaled sigma, and the solution with these."""
-    given, scales = replace(given, used=points.used), np.ones(len(given.names))
-    for _ in range(8):
-        square, dof = costs(solved.place, given), 2 * given.sums(np.ones(len(given.view))) - _spent(solved, points)
-        differ = _differ(square, dof)
-        own = square / np.maximum(dof, 1.0) if differ else np.full(len(dof), square.sum() / max(dof.sum(), 1.0))
-        before, scales = scales, np.maximum(np.sqrt(own), least_scale(given))
-        points = given.scaled(scales)
-        solved = solve(solved.place, points, EVERY, prior)
-        if not differ or np.allclose(scales, before, rtol=1e-3):
-            break
-    return solved, points, scales
+def _mounted(
+    bundle: CalibratedViews,
+    scatter_px: Float[np.ndarray, " n"],
+    views: list[BoardView],
+    nominal: Geometry,
+    lost: tuple[str, ...],
+    rules: GeometryRules,
+) -> FitResult[Geometry]:
+    """The result of a bundle, which uses ``views``, with the rotation of the board that is parallel to the panel."""
+    parallel = [k for k, view in enumerate(views) if view.parallel]
+    if bundle.status is FitStatus.TOO_FEW_DATA or not parallel:
+        tilt = () if parallel else ("No usable view shows the board parallel to the panel; capture that view again.",)
+        return FitResult.failed("geometry", nominal, FitStatus.TOO_FEW_DATA, *lost, *bundle.notes, *tilt)
+    x, cov = with_angles(bundle.intrinsics.vector, bundle.poses, bundle.cov, parallel)
+    pupil = np.asarray(nominal.pupil_mm, dtype=np.float64)
+    result = _result(bundle, x, cov, partial(term_at, pupil=pupil), len(_NAMES))
+    left_out, sentences = _outliers(bundle, views, rules)
+    poor = bundle.rms_px > rules.worst_rms_px and bundle.chi2_dof > rules.worst_chi2_dof
+    mounting = "Stand-off and panel position are the rig's nominal ones; the wire fit refines them."
+    return replace(
+        result,
+        status=FitStatus.POOR_FIT if poor else result.status,
+        diagnostics=(*result.diagnostics, *_scatter_diagnostics(scatter_px, views)),
+        notes=(*lost, *result.notes, *sentences, mounting),
+        outliers=left_out,
+    )
 
 
-def _spent(solved: Solved, points: Points) -> Float[np.ndarray, " views"]:
-    """Degrees of freedom that the fit uses of each view: the trace of information times covariance."""
-    information, _ = by_view(*in_sigma(solved.place, points), points)
-    views = np.arange(len(points.names))[:, None]
-    mine = np.hstack([np.arange(LENS) + 0 * views, LENS + 6 * views + np.arange(6)])
-    cov = solved.equations.joint_cov()[mine[:, :, None], mine[:, None, :]]
-    return np.einsum("kij,kji->k", information, cov)
+def _result(
+    bundle: CalibratedViews,
+    x: Float[np.ndarray, "12"],
+    cov: Float[np.ndarray, "12 12"],
+    lens_at: Callable[[Float[np.ndarray, "12"]], Geometry],
+    count: int,
+) -> FitResult[Geometry]:
+    """The result of a bundle, whose first ``count`` parameters are estimates.
 
-
-def _differ(square: Float[np.ndarray, " views"], dof: Float[np.ndarray, " views"]) -> bool:
-    """Bartlett's test of equal variances (1937), over views with at least four degrees of freedom."""
-    if len(dof) < 2 or not ((dof >= 4) & (square > 0)).all():
-        return False
-    ratio = float((dof * np.log(square.sum() / dof.sum() / (square / dof))).sum())
-    correction = 1 + ((1 / dof).sum() - 1 / dof.sum()) / (3 * (len(dof) - 1))
-    return chi2_tail(ratio / correction, len(dof) - 1) < SIGNIFICANT
-
-
-def _choose_order(full: Solved, points: Points, prior: Prior, rules: GeometryRules) -> tuple[Choice[Solved], bool]:
-    """Every order, each solved from the one above with its further coefficients at 0; and whether the prior chose.
-
-    Where a large part of the information on focal length or centre is the prior's, the data are too few to separate a
-    coefficient from a pose. All coefficients then stay free, each within its prior.
+    A pattern in the residuals is modelled as an error of the principal point, which moves every place by its size.
     """
-    tried: list[Attempt[Solved]] = []
-    solved = full
-    for place, (name, free) in reversed(list(enumerate(ORDERS.items()))):
-        if tried:
-            above = Bundle(np.where(free, solved.place.intrinsics, 0.0), solved.place.poses)
-            solved = solve(above, points, free, prior)
-        parameters = int(free.sum()) + 6 * len(points.names)
-        criterion = _criterion(solved, points, parameters) + 2 * place * np.log(rules.further_order)
-        tried.insert(0, Attempt(name, parameters, float(criterion), solved))
-    known = Intrinsics.of(np.diag(full.equations.cov()) * np.diag(prior.precision))
-    by_prior = bool(max(*known.focal_px, *known.principal_point_px) > rules.prior_share)
-    return (Choice(tried[-1], tuple(tried)) if by_prior else choose(tried)), by_prior
+    pattern = bundle.evidence.pattern_px * np.asarray(Intrinsics.of(np.eye(LENS, len(x))).principal_point_px).T
+    posterior = Posterior(x, np.hstack([square_root(cov), pattern]), lens_at)
+    points, use = bundle.points, bundle.points.used
+    z = bundle.residuals_px[use] / points.sigma[use, None]
+    held = [name for name, free in zip(INTRINSIC_NAMES, bundle.free, strict=True) if not free]
+    return FitResult(
+        name="geometry",
+        term=posterior.term_at(x),
+        status=bundle.status,
+        estimates=estimates(_NAMES[:count], _UNITS[:count], x[:count], cov[:count, :count]),
+        cov=cov[:count, :count],
+        chi2_dof=bundle.chi2_dof,
+        samples=2 * int(use.sum()),
+        candidates=bundle.candidates,
+        diagnostics=_diagnostics(bundle),
+        notes=(*bundle.notes, f"Held at 0, as the data do not ask for it: {', '.join(held)}.")
+        if held
+        else bundle.notes,
+        outliers=bundle.outliers,
+        residuals=residual_sample(np.repeat(points.image[use], 2, axis=0), z.ravel()),
+        posterior=posterior,
+    )
 
 
-def _criterion(solved: Solved, points: Points, parameters: int) -> float:
-    """BIC with an estimated scale of the noise: n ln(chi2 / n) replaces chi2.
+def with_angles(
+    intrinsics: Float[np.ndarray, "9"],
+    poses: Float[np.ndarray, "views 6"],
+    cov: Float[np.ndarray, "n n"],
+    parallel: Sequence[int],
+) -> tuple[Float[np.ndarray, "12"], Float[np.ndarray, "12 12"]]:
+    """The argument of ``term_at``, and its covariance; several parallel views count as their mean.
 
-    A residual below 1e-7 px is rounding, not noise: orders that differ only there are equally good.
+    Args:
+        intrinsics, poses: as in ``bundle.Bundle``. cov: of intrinsics and all poses one after another.
+        parallel: which views show the board parallel to the panel.
     """
-    samples = 2 * int(points.used.sum())
-    chi2 = float(costs(solved.place, points).sum())
-    least = float((1e-7**2 / points.sigma[points.used] ** 2).sum())
-    return bic(samples * float(np.log(max(chi2, least) / samples)), float(parameters), samples)
+    rotation = np.asarray(Rotation.from_rotvec(-poses[parallel, :3]).mean().as_rotvec())
+    steps = 1e-5 * np.eye(3)
+    slope = np.array([_angles_deg(rotation + step) - _angles_deg(rotation - step) for step in steps]).T / 2e-5
+    picks = np.zeros((LENS + 3, len(cov)))
+    picks[:LENS, :LENS] = np.eye(LENS)
+    for view in parallel:
+        picks[LENS:, LENS + 6 * view : LENS + 6 * view + 3] = -slope / len(parallel)
+    return np.concatenate([intrinsics, _angles_deg(rotation)]), picks @ cov @ picks.T
 
 
-def _rescaled(
-    solved: Solved, points: Points, free: Bool[np.ndarray, "9"], prior: Prior
-) -> tuple[Solved, Points, float]:
-    """The chosen order with the scale of its own residuals, and the degrees of freedom of that scale."""
-    dof = max(2 * float(points.used.sum()) - float(_spent(solved, points).sum()), 1.0)
-    factor = max(np.sqrt(float(costs(solved.place, points).sum()) / dof), least_scale(points))
-    points = points.scaled(np.full(len(points.names), factor))
-    return solve(solved.place, points, free, prior), points, dof
+def _angles_deg(rotation: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
+    """(tilt, roll, yaw) of R_panel_camera = Ry(yaw) Rx(-tilt) Rz(roll)."""
+    yaw, tilt, roll = Rotation.from_rotvec(rotation).as_euler("YXZ", degrees=True)
+    return np.array([-tilt, roll, yaw])
 
 
-def _status(
-    solved: Solved, cov: Float[np.ndarray, "n n"], image_size: tuple[int, int], rules: GeometryRules
-) -> tuple[FitStatus, tuple[str, ...]]:
-    """Whether the views determine the lens; else what to capture."""
-    sigma, lens = Intrinsics.of(np.sqrt(np.diag(cov))), Intrinsics.of(solved.place.intrinsics)
-    by_focal = float(np.max(sigma.focal_px / np.abs(lens.focal_px)))
-    by_centre = float(np.max(sigma.principal_point_px)) / image_size[0]
-    if max(by_focal, by_centre) > rules.most_uncertain:
-        what = "focal length" if by_focal > by_centre else "centre of the picture"
-        return FitStatus.TOO_FEW_DATA, (
-            f"The views do not determine the {what} (one sigma is {min(max(by_focal, by_centre), 99.0):.0%}). "
-            "Lean the board by 20 to 40 degrees, another way in each view, and let it fill the picture.",
-        )
-    if not solved.converged:
-        return FitStatus.NOT_CONVERGED, ("Check that the points of each view are in the order of the board's.",)
-    return FitStatus.CONVERGED, ()
+def term_at(x: Float[np.ndarray, "12"], pupil: Float[np.ndarray, "3"]) -> Geometry:
+    """The term of ``x``: intrinsics, tilt, roll and yaw in degrees; ``pupil`` in mm in panel coordinates."""
+    lens, (tilt, roll, yaw) = Intrinsics.of(x[:LENS]), x[LENS:]
+    rotation = Rotation.from_euler("YXZ", [yaw, -tilt, roll], degrees=True).as_rotvec()
+    return Geometry(lens.focal_px, lens.principal_point_px, lens.distortion, np.asarray(rotation), pupil)
 
 
-def _remarks(
-    points: Points, scales: Float[np.ndarray, " views"], evidence: Evidence, by_prior: bool, rules: GeometryRules
-) -> Iterator[str]:
-    if by_prior:
-        yield (
-            "The views alone do not determine the whole lens: what is known beforehand gives part of it, and every "
-            "distortion coefficient stays free within that. Lean the board another way in each view to know more."
-        )
-    relative = scales / np.median(scales)
-    loud = [f"{points.names[k]} ({relative[k]:.1f} x)" for k in np.flatnonzero(relative > rules.loud_view)]
-    if loud:
-        yield f"Views that scatter more than the median view, and count for less: {', '.join(loud)}."
-    yield from evidence.notes
+def _lens_at(x: Float[np.ndarray, "12"]) -> Geometry:
+    return replace(Intrinsics.of(x).camera(), rotation_rad=x[LENS:])
+
+
+def _diagnostics(bundle: CalibratedViews) -> tuple[Diagnostic, ...]:
+    evidence, used = bundle.evidence, bundle.points.used
+    return (
+        Diagnostic("rms_reprojection", bundle.rms_px, "px"),
+        Diagnostic("views", float(len(bundle.points.names)), "1"),
+        Diagnostic("corners_used", float(used.sum()), "1"),
+        Diagnostic("corners_rejected", float((~used).sum()), "1"),
+        Diagnostic("iterations", float(bundle.iterations), "1"),
+        Diagnostic("views_disagree_p", evidence.views.p_value, "1"),
+        Diagnostic("variance_factor", evidence.views.inflation, "1"),
+        Diagnostic("residual_pattern_p", evidence.pattern.p_value, "1"),
+        Diagnostic("residual_pattern", evidence.pattern_px, "px"),
+    )
+
+
+def _scatter_diagnostics(scatter_px: Float[np.ndarray, " n"], views: list[BoardView]) -> Iterator[Diagnostic]:
+    parallel = np.array([view.parallel for view in views])
+    on_jig, by_hand = scatter_px[1:][parallel], scatter_px[1:][~parallel]
+    yield Diagnostic("corner_scatter_beside_noise", float(scatter_px[0]), "px")
+    yield Diagnostic(ON_JIG, float(np.median(on_jig)), "px")
+    yield Diagnostic(BY_HAND, float(np.median(by_hand if len(by_hand) else on_jig)), "px")
+
+
+def _outliers(
+    bundle: CalibratedViews, views: list[BoardView], rules: GeometryRules
+) -> tuple[tuple[Outliers, ...], tuple[str, ...]]:
+    """What was left out, corners by step and number, and one sentence per view that lost corners."""
+    points, places, sentences = bundle.points, [], []
+    for k, view in enumerate(views):
+        ids = view.corners.ids[points.index[(points.view == k) & ~points.used]]
+        places += [f"{view.step_id} corner {corner}" for corner in ids]
+        if len(ids):
+            far = f"further than {rules.corners.sigma:g} robust sigma of their view from the model"
+            sentences.append(f"{view.step_id}: corners {', '.join(map(str, ids))} left out, {far}.")
+    found = rules.corners.listed(places)
+    return (*(other for other in bundle.outliers if all(other.rule != f.rule for f in found)), *found), tuple(sentences)

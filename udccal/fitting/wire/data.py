@@ -21,7 +21,6 @@ from udccal.fitting.engine.robust import OutlierRule
 from udccal.fitting.wire.rules import WireRules, WireStart, wire_start
 from udccal.models.geometry import Geometry, unproject
 from udccal.models.noise import Noise
-from udccal.models.wire import scaled_positions
 from udccal.numerics import in_float64
 from udccal.result import Outliers
 from udccal.sessions.store import Session
@@ -60,16 +59,9 @@ class WireData:
 
 
 def read_wire(session: Session, noise: Noise, geometry: Geometry, rules: WireRules | None = None) -> WireData:
-    """Read the steps ``wire/dark`` and ``wire/flat`` of a session.
+    """Read the steps ``wire/dark`` and ``wire/flat`` of a session, at one exposure, in DN.
 
-    Args:
-        session: with both averages, at one exposure.
-        noise: for saturation and PRNU.
-        geometry: gives the rays.
-        rules: for the distance of single frames from saturation.
-
-    Returns:
-        the data of ``fit_wire``, in DN.
+    The noise term gives saturation and PRNU, ``rules`` the distance of single frames from saturation.
 
     Raises:
         SessionError: when a file of the session is missing or damaged.
@@ -174,7 +166,7 @@ class Pixels(eqx.Module):
 def sample_pixels(
     value: Float[np.ndarray, "rows columns"], geometry: Geometry, samples: int, cfa: str, other: bool = False
 ) -> Pixels:
-    """Draw pixels in reading order, shifted from row to row so that all CFA sites are among them.
+    """Draw pixels in reading order, shifted from row to row so that all CFA sites are among them, in whole blocks.
 
     Args:
         value: CFA-balanced signal; pixels that are not finite have weight 0, the others 1.
@@ -182,9 +174,6 @@ def sample_pixels(
         samples: number of pixels; the sample has somewhat more, or all where there are fewer.
         cfa: pattern of the sensor.
         other: draw a third as many, from the pixels that the sample without ``other`` leaves out if there are any.
-
-    Returns:
-        the sample, padded to whole blocks.
     """
     rows, columns = value.shape
     step = odd_step(value.size, samples)
@@ -198,7 +187,7 @@ def sample_pixels(
     real = (np.arange(padded) < count) & np.isfinite(seen)
     return Pixels(
         ideal=ideal_points(geometry, positions),
-        scaled=np.asarray(scaled_positions(positions, rows, columns)),
+        scaled=scaled_places(positions, value.shape),
         site=cfa_named(cfa).site_map(rows, columns)[y, x],
         value=np.where(real, seen, 0.0),
         weight=np.where(real, 1.0, 0.0),
@@ -206,16 +195,13 @@ def sample_pixels(
     )
 
 
+def scaled_places(pixels: Float[np.ndarray, "n 2"], shape: tuple[int, int]) -> Float[np.ndarray, "n 2"]:
+    """Pixels (x, y) in px, scaled to [-1, 1] over a sensor of that shape (rows, columns)."""
+    return 2 * pixels / (np.array(shape[::-1]) - 1.0) - 1
+
+
 def odd_step(size: int, samples: int) -> int:
-    """Step from pixel to pixel of a sample in reading order; an odd step visits all CFA sites.
-
-    Args:
-        size: number of pixels of the sensor.
-        samples: number of pixels wanted.
-
-    Returns:
-        the step in pixels, at least 1.
-    """
+    """Step from pixel to pixel for so many ``samples`` of ``size`` pixels; an odd step visits all CFA sites."""
     step = max(1, size // max(samples, 1))
     return step + 1 - step % 2
 

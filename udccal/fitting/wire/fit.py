@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from udccal.cfa import cfa_named
-from udccal.fitting.engine.gaussian import Posterior, scaled_inverse, square_root
+from udccal.fitting.engine.gaussian import Posterior, square_root
 from udccal.fitting.engine.least_squares import minimise
 from udccal.fitting.engine.misfit import clustered_cov
 from udccal.fitting.wire.data import (
@@ -26,14 +26,15 @@ from udccal.fitting.wire.data import (
     ideal_points,
     over_blocks,
     sample_pixels,
+    scaled_places,
 )
-from udccal.fitting.wire.jacobian import WireProblem, block_jacobian, values_at, weighed_at
+from udccal.fitting.wire.jacobian import block_jacobian, values_at, weighed_at
 from udccal.fitting.wire.parameters import Kind, Parameters, parameters_of, select
 from udccal.fitting.wire.report import Joint, misfit, omitted, unseen, wire_result
 from udccal.fitting.wire.rules import WireRules, ideal_wire, possible_harmonics
-from udccal.fitting.wire.search import SOLVER, Found, Search
+from udccal.fitting.wire.search import SOLVER, Found, Search, WireProblem
 from udccal.models.geometry import Geometry
-from udccal.models.wire import Wire, scaled_positions, wire_map
+from udccal.models.wire import Wire, wire_map
 from udccal.numerics import in_float64
 from udccal.result import FitResult, FitStatus
 
@@ -70,7 +71,7 @@ def fit_wire(data: WireData, rules: WireRules | None = None) -> FitResult[Wire]:
     jacobian, wire = map_jacobian(joint.parameters, joint.x, data.geometry, shape), joint.parameters.wire(joint.x)
     off = misfit(tested, wire if joint.parameters.panel else None, jacobian.sigma(joint.cov), held_out)
     if off.test.found:
-        joint = replace(joint, cov=clustered_cov(joint.cov, joint.by_tile))
+        joint = replace(joint, cov=clustered_cov(joint.cov, joint.problem.sums(joint.x)[1] / joint.variance))
     if joint.parameters.panel:
         missing = omitted(data.start, wire, joint.seen, rules)
         left_out = missing.sigma if missing else 0.0
@@ -83,16 +84,7 @@ def fit_wire(data: WireData, rules: WireRules | None = None) -> FitResult[Wire]:
 
 @in_float64
 def sensor_map(wire: Wire, rows: int, columns: int) -> Float[np.ndarray, "rows columns"]:
-    """The wire at every pixel of the sensor; the computation takes seconds.
-
-    Args:
-        wire: the fitted term.
-        rows: of the sensor.
-        columns: of the sensor.
-
-    Returns:
-        modulation times shading, whose mean is 1 for a fitted wire.
-    """
+    """The wire at every pixel of the sensor: modulation times shading. The computation takes seconds."""
     return np.asarray(wire_map(wire, rows, columns), dtype=np.float64)
 
 
@@ -122,12 +114,11 @@ def _unusable(data: WireData, means: Float[np.ndarray, " sites"], rules: WireRul
 
 def _joint(found: Found, every: Pixels, data: WireData, noise: FlatNoise, rules: WireRules) -> Joint:
     """Choose the columns that the data support, and fit them with the shape until the solver converges."""
-    wire, gains, panel = found.descent.wire, found.descent.gains, found.descent.problem.parameters.panel
+    descent, panel = found.descent, found.descent.problem.parameters.panel
     bounds = possible_harmonics(data.start, rules.least_amplitude).bounds
-    full = parameters_of(wire, rules, gains.size, bounds if panel else (), panel)
-    prior, x = full.prior(data.start, rules), full.vector(wire, gains)
-    pixels = found.descent.weighs(every, noise)
-    here = WireProblem("wire, orders", full, pixels, prior).equations_at(x)
+    full = parameters_of(descent.wire, rules, descent.gains.size, bounds if panel else (), panel)
+    prior, x = full.prior(data.start, rules), full.vector(descent.wire, descent.gains)
+    here = WireProblem("wire, orders", full, descent.weighs(every, noise), prior).equations_at(x)
     # The equations are moved to where the columns are 0, so that the present coefficients count as the columns' own.
     already = np.where(full.groups >= 0, x - prior.mean, 0.0)
     right = here.right + here.shared @ already
@@ -135,24 +126,21 @@ def _joint(found: Found, every: Pixels, data: WireData, noise: FlatNoise, rules:
     orders = select(here.shared, right, power, here.samples, full.groups)
     chosen = orders.best.fit
     kept, x = full.kept(chosen.keep), (x - already + chosen.values)[chosen.keep]
-    prior = kept.prior(data.start, rules)
-    problem = WireProblem("wire, joint", kept, weighed_at(kept, x, every, noise).pixels, prior)
+    pixels = weighed_at(kept, x, every, noise).pixels
+    problem = WireProblem("wire, joint", kept, pixels, kept.prior(data.start, rules))
     solution = minimise(problem, x, SOLVER)
     # A last step whose expected gain is below the solver's limit is taken without a check of the cost.
     x = solution.place + (solution.equations.step(0.0).shared if solution.converged else 0.0)
-    matrix, by_tile, chi2 = problem.sums(x)
-    variance = problem.variance(chi2)
+    seen = weighed_at(kept, x, every, noise)
     return Joint(
-        parameters=kept,
+        problem=problem,
         x=x,
-        cov=scaled_inverse(matrix / variance + prior.precision),
-        prior=prior,
-        variance=variance,
-        by_tile=by_tile / variance,
-        seen=weighed_at(kept, x, every, noise),
+        cov=solution.equations.cov(),
+        variance=problem.variance(float(seen.z @ seen.z)),
+        seen=seen,
         orders=orders,
-        converged=solution.converged and found.descent.solution.converged,
-        iterations=found.descent.solution.iterations + solution.iterations,
+        converged=solution.converged and descent.solution.converged,
+        iterations=descent.solution.iterations + solution.iterations,
         gain=found.gain,
     )
 
@@ -163,22 +151,15 @@ def _grid(
     """Ideal and scaled points of the middles of ``parts`` (down, across) of a sensor of that shape."""
     y, x = ((np.arange(n) + 0.5) / n * size - 0.5 for n, size in zip(parts, shape, strict=True))
     pixels = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-    return ideal_points(geometry, pixels), np.asarray(scaled_positions(pixels, *shape))
+    return ideal_points(geometry, pixels), scaled_places(pixels, shape)
 
 
 def mean_one(
     parameters: Parameters, x: Float[np.ndarray, " n"], geometry: Geometry, shape: tuple[int, int]
 ) -> Float[np.ndarray, " n"]:
-    """Scale the parameters to a map with a mean of 1 over the sensor, by the midpoint rule.
+    """``x`` with the first coefficient of the shading that gives the map a mean of 1, by the midpoint rule.
 
-    Args:
-        parameters: what ``x`` consists of.
-        x: in the units of the fit.
-        geometry: gives the rays.
-        shape: (rows, columns) of the sensor.
-
-    Returns:
-        ``x`` with another first coefficient of the shading.
+    ``shape`` is the sensor's (rows, columns).
     """
     whole, base = values_at(parameters.wire(x), *_grid(geometry, shape, (192, 256)))
     scaled = x.copy()
@@ -207,17 +188,7 @@ class MapJacobian:
 def map_jacobian(
     parameters: Parameters, x: Float[np.ndarray, " n"], geometry: Geometry, shape: tuple[int, int]
 ) -> MapJacobian:
-    """Jacobian of the map by the parameters.
-
-    Args:
-        parameters: what ``x`` consists of.
-        x: scaled to a map with a mean of 1, see ``mean_one``.
-        geometry: gives the rays.
-        shape: (rows, columns) of the sensor.
-
-    Returns:
-        the map and its derivatives on a grid of 64 x 64 places.
-    """
+    """Jacobian of the map at ``x``, whose mean is 1, on a grid of 64 x 64 places of a sensor (rows, columns)."""
     site, wire = np.zeros(BLOCK, dtype=np.int64), parameters.wire(x)
     grid = _grid(geometry, shape, (64, 64))
     whole, base, rows = over_blocks(lambda *at: block_jacobian(parameters, wire, at[0], at[1], site), *grid)

@@ -1,55 +1,44 @@
-"""The wire's values and their derivatives, pixel by pixel, in closed form and summed up to normal equations.
+"""The wire's values and their derivatives, pixel by pixel, in closed form.
 
 The modulation depends on the ten shape parameters through few numbers per pixel: the point where its ray meets the
 panel (X, Y), two openings, three numbers of the footprint's ellipse, and the pupil. Sums over the harmonics are made
 once per such number. Its derivatives by the shape parameters do not depend on the harmonics. That is several times
-faster than automatic derivatives of the whole model, in either mode.
+faster than automatic derivatives of the whole model, in either mode. Harmonics are summed in groups of one size, so
+that each function is compiled once.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from functools import partial
-from typing import NamedTuple, final
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import NamedTuple
 
+import cv2
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from udccal.fitting.engine.gaussian import Prior
-from udccal.fitting.engine.least_squares import Blocks, Step
-from udccal.fitting.wire.data import BLOCK, FlatNoise, Pixels, Weighed, blocks, over_blocks, weighed
-from udccal.fitting.wire.parameters import Kind, Parameters, shape_vector, with_shape
+from udccal.fitting.wire.data import BLOCK, FlatNoise, Pixels, Weighed, over_blocks, weighed
+from udccal.fitting.wire.parameters import Kind, Parameters
 from udccal.models.bessel import bessel_j0_j1
-from udccal.models.wire import (
-    Wire,
-    field_powers,
-    legendre,
-    log_baseline,
-    modulation,
-    openings,
-    panel_rotation,
-    slopes,
-    waves,
-)
+from udccal.models.wire import LEAST_OPEN, Wire, field_powers, legendre, modulation, slits, waves
 
-# Tiles of the sensor, down and across, whose residuals are tested as a whole.
-TILES = (6, 8)
-# Least residual variance in units of the noise's, so that quotients by it stay finite.
-LEAST_VARIANCE = 1e-12
+# Harmonics that are summed at once.
+_GROUP = 50
 
 
 class Rays(NamedTuple):
     """The numbers per pixel through which modulation and baseline depend on the shape.
 
-    Panel coordinates in periods and openings are (X, Y); ``ellipse`` (xx, xy, yy) gives kappa of a harmonic.
+    ``slope`` is (dX/dz, dY/dz). Panel coordinates in periods and openings are (X, Y); ``ellipse`` (xx, xy, yy) gives
+    kappa of a harmonic.
     """
 
-    periods: Float[Array, "2 n"]
-    openings: Float[Array, "2 n"]
-    ellipse: Float[Array, "3 n"]
-    log_pupil: Float[Array, "1 n"]
+    slope: Float[np.ndarray, "2 n"]
+    periods: Float[np.ndarray, "2 n"]
+    openings: Float[np.ndarray, "2 n"]
+    ellipse: Float[np.ndarray, "3 n"]
 
 
 class Derivatives(NamedTuple):
@@ -59,77 +48,102 @@ class Derivatives(NamedTuple):
     ``powers`` are the factors of the linear field coefficients.
     """
 
-    whole: Float[Array, " n"]
-    base: Float[Array, " n"]
-    shape: Float[Array, "10 n"]
-    wave: Float[Array, "2 harmonics n"]
-    carrier: Float[Array, "2 harmonics n"]
-    powers: Float[Array, "degrees harmonics n"]
+    whole: Float[np.ndarray, " n"]
+    base: Float[np.ndarray, " n"]
+    shape: Float[np.ndarray, "10 n"]
+    wave: Float[np.ndarray, "2 harmonics n"]
+    carrier: Float[np.ndarray, "2 harmonics n"]
+    powers: Float[np.ndarray, "degrees harmonics n"]
 
 
-@jax.jit
-def _rays(wire: Wire, ideal: Float[Array, "n 2"]) -> Rays:
-    slope, rotation = slopes(wire, ideal), panel_rotation(wire)
-    right, down = (rotation[:2, i : i + 1] - slope * rotation[2, i] for i in (0, 1))
-    ellipse = jnp.stack([right[i] * right[j] + down[i] * down[j] for i, j in ((0, 0), (0, 1), (1, 1))])
-    periods = jnp.asarray(wire.offset_periods)[:, None] + wire.standoff_per_pitch * slope
-    log_pupil = jnp.log(jnp.asarray(wire.footprint_per_pitch)) + jnp.zeros_like(slope[:1])
-    return Rays(periods, openings(wire, slope), ellipse, log_pupil)
+def _rotations(wire: Wire) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3 3 3"]]:
+    """``R_panel_camera``, and its derivatives by the wire's own rotation vector."""
+    (own, by_own), (mounted, _) = (
+        cv2.Rodrigues(np.asarray(one, dtype=np.float64)) for one in (wire.rotation_rad, wire.geometry.rotation_rad)
+    )
+    return own @ mounted, by_own.reshape(3, 3, 3) @ mounted
+
+
+def tilt_deg(wire: Wire) -> float:
+    """Angle by which the camera's axis points below the panel's normal."""
+    return float(np.rad2deg(np.arcsin(np.clip(_rotations(wire)[0][1, 2], -1.0, 1.0))))
+
+
+def _plane(ideal: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "3 n"]:
+    return np.stack([ideal[:, 0], ideal[:, 1], np.ones(len(ideal))])
 
 
 def rays_at(wire: Wire, ideal: Float[np.ndarray, "n 2"]) -> Rays:
-    """Where rays of ideal image points, which fill whole blocks, meet the panel."""
-    return over_blocks(partial(_rays, wire), ideal)
+    """Where rays of ideal image points meet the panel."""
+    rotation = _rotations(wire)[0]
+    rays = rotation @ _plane(ideal)
+    slope = rays[:2] / rays[2]
+    straight = np.array([[wire.column_open], [wire.row_open]])
+    width = np.maximum(straight - wire.depth_per_pitch * np.abs(slope), LEAST_OPEN)
+    x, y = np.moveaxis(_axes(rotation, slope), 1, 0)
+    ellipse = np.stack([(x * x).sum(axis=0), (x * y).sum(axis=0), (y * y).sum(axis=0)])
+    periods = np.asarray(wire.offset_periods)[:, None] + wire.standoff_per_pitch * slope
+    return Rays(slope, periods, width, ellipse)
+
+
+def _axes(rotation: Float[np.ndarray, "3 3"], slope: Float[np.ndarray, "2 n"]) -> Float[np.ndarray, "2 2 n"]:
+    """The pupil's x and y axes, seen along each ray on the panel (X, Y)."""
+    return rotation[:2, :2].T[:, :, None] - slope * rotation[2, :2, None, None]
 
 
 def with_harmonics(wire: Wire, harmonics: Float[np.ndarray, "harmonics 2"], ideal: Float[np.ndarray, "n 2"]) -> Wire:
-    """The same shape with other harmonics of a round pupil.
-
-    Args:
-        wire: gives the shape.
-        harmonics: orders (n, m) along X and Y.
-        ideal: undistorted image points of a sample of the sensor, which fill whole blocks.
-
-    Returns:
-        the wire with these harmonics and their ranges of kappa over the sample.
-    """
+    """The same shape with other harmonics (n, m) of a round pupil, and their ranges of kappa over a sample's points."""
     fields = np.zeros((len(harmonics), *np.shape(wire.fields)[1:]))
     fields[:, 0, 0, 0] = 1.0
     # The wire's rays do not depend on its harmonics.
-    ellipse = rays_at(wire, ideal[:: len(ideal) // BLOCK][:BLOCK]).ellipse
+    ellipse = rays_at(wire, ideal[:: max(len(ideal) // BLOCK, 1)][:BLOCK]).ellipse
     n, m = harmonics.T
-    seen = np.sqrt(np.stack([n * n, 2 * n * m, m * m], axis=1) @ np.asarray(ellipse))
+    seen = np.sqrt(np.stack([n * n, 2 * n * m, m * m], axis=1) @ ellipse)
     low, high = (part.reshape(len(harmonics)) for part in (seen.min(axis=1), seen.max(axis=1)))
     frequency = np.stack([(low + high) / 2, np.maximum(0.51 * (high - low), 0.01)], axis=1)
     return replace(wire, harmonics=harmonics, frequency=frequency, fields=fields)
 
 
-@jax.jit
-def _values(
-    wire: Wire, ideal: Float[Array, "n 2"], scaled: Float[Array, "n 2"]
-) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
-    slope = slopes(wire, ideal)
-    return 1 + modulation(wire, slope, scaled), jnp.exp(log_baseline(wire, scaled, slope))
+def _groups(wire: Wire) -> Iterator[Wire]:
+    """The wire's harmonics in groups of one size, the last filled up with harmonics of no amplitude.
+
+    Amplitudes that no pupil explains are those of the first harmonics: only the first group has them.
+    """
+    free = wire.amplitudes if len(wire.amplitudes) else np.zeros((1, 2, 1, 1))
+    for first in range(0, len(wire.harmonics), _GROUP):
+        some = np.s_[first : first + _GROUP]
+        fill = np.maximum(_GROUP - len(wire.harmonics[some]), 0)
+        parts = (
+            np.concatenate([np.asarray(part)[some], np.full((fill, *np.shape(part)[1:]), value)])
+            for part, value in ((wire.harmonics, 1.0), (wire.frequency, 1.0), (wire.fields, 0.0))
+        )
+        harmonics, frequency, fields = parts
+        amplitudes = free if first == 0 else np.zeros_like(free)
+        yield replace(wire, harmonics=harmonics, frequency=frequency, fields=fields, amplitudes=amplitudes)
+
+
+_modulation = jax.jit(modulation)
 
 
 def values_at(
     wire: Wire, ideal: Float[np.ndarray, "n 2"], scaled: Float[np.ndarray, "n 2"]
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """1 + modulation and exp(B), whose product is the map, at points that fill whole blocks."""
-    return over_blocks(partial(_values, wire), ideal, scaled)
+    rays = rays_at(wire, ideal)
+    whole = np.ones(len(ideal))
+    for some in _groups(wire):
+        whole += over_blocks(lambda slope, at, some=some: _modulation(some, slope.T, at), rays.slope.T, scaled)
+    return whole, _base(wire, scaled, rays)
+
+
+def _base(wire: Wire, scaled: Float[np.ndarray, "n 2"], rays: Rays) -> Float[np.ndarray, " n"]:
+    """exp(B): the shading times the openings."""
+    in_x, in_y = np.polynomial.legendre.legvander(scaled.T, len(wire.baseline) - 1)
+    return np.exp(((in_y @ wire.baseline) * in_x).sum(axis=1)) * rays.openings.prod(axis=0)
 
 
 def expected_of(wire: Wire, gains: Float[np.ndarray, " sites"], pixels: Pixels) -> Float[np.ndarray, " n"]:
-    """The signal of a sample by the model.
-
-    Args:
-        wire: modulation and shading.
-        gains: of the CFA sites.
-        pixels: the sample.
-
-    Returns:
-        one signal per pixel, in CFA-balanced units.
-    """
+    """The signal of a sample by the model, in CFA-balanced units."""
     whole, base = values_at(wire, pixels.ideal, pixels.scaled)
     return whole * base * gains[pixels.site]
 
@@ -139,52 +153,82 @@ def weighed_at(parameters: Parameters, x: Float[np.ndarray, " n"], pixels: Pixel
     return weighed(pixels, expected_of(parameters.wire(x), parameters.gains(x), pixels), noise)
 
 
+def wire_derivatives(wire: Wire, ideal: Float[np.ndarray, "n 2"], scaled: Float[np.ndarray, "n 2"]) -> Derivatives:
+    """Values and derivatives at ideal image points of one block, which lie at ``scaled`` positions of the sensor."""
+    rays = rays_at(wire, ideal)
+    found = [jax.tree.map(np.asarray, _group_derivatives(some, rays, scaled)) for some in _groups(wire)]
+    sums = sum((one[0] for one in found), start=np.zeros((9, len(ideal))))
+    count = len(wire.harmonics)
+    wave, carrier, powers = (
+        np.concatenate(parts, axis=1)[:, :count] for parts in zip(*(one[1:] for one in found), strict=True)
+    )
+    sums[0] += 1.0
+    sums[3:5] += sums[0] / rays.openings
+    return Derivatives(
+        sums[0], _base(wire, scaled, rays), _by_shape(wire, ideal, rays, sums[1:]), wave, carrier, powers
+    )
+
+
+def _by_shape(
+    wire: Wire, ideal: Float[np.ndarray, "n 2"], rays: Rays, by: Float[np.ndarray, "8 n"]
+) -> Float[np.ndarray, "10 n"]:
+    """Derivatives by the shape, from those ``by`` periods (2), openings (2), ellipse (3) and logarithm of the pupil."""
+    rotation, turns = _rotations(wire)
+    plane, slope = _plane(ideal), rays.slope
+    by_periods, by_open, (xx, xy, yy) = by[:2], by[2:4], by[4:7]
+    # An opening at its least size does not change.
+    by_open = np.where(rays.openings > LEAST_OPEN, by_open, 0.0)
+    x, y = np.moveaxis(_axes(rotation, slope), 1, 0)
+    by_axes = np.stack([2 * xx * x + xy * y, 2 * yy * y + xy * x], axis=1)
+    by_slope = wire.standoff_per_pitch * by_periods - wire.depth_per_pitch * np.sign(slope) * by_open
+    by_slope = by_slope - np.tensordot(rotation[2, :2], by_axes, 1)
+    away = (rotation @ plane)[2]
+    rows = []
+    for turn in turns:
+        moved = turn @ plane
+        along = ((moved[:2] - slope * moved[2]) / away * by_slope).sum(axis=0)
+        rows.append(along + (_axes(turn, slope) * by_axes).sum(axis=(0, 1)))
+    rows += [wire.standoff_per_pitch * (by_periods * slope).sum(axis=0), *by_periods, by[7]]
+    return np.stack([*rows, by_open[1], by_open[0], -(by_open * np.abs(slope)).sum(axis=0)])
+
+
 @jax.jit
-def wire_derivatives(wire: Wire, ideal: Float[Array, "n 2"], scaled: Float[Array, "n 2"]) -> Derivatives:
-    """Values and derivatives at ideal image points, which lie at ``scaled`` positions of the sensor."""
-
-    def rays_after(step: Float[Array, "10"]) -> Rays:
-        return _rays(with_shape(wire, shape_vector(wire) + step), ideal)
-
-    nothing = jnp.zeros(10)
-    rays, by_shape = rays_after(nothing), jax.jacfwd(rays_after)(nothing)
-    wave = waves(wire, slopes(wire, ideal))
+def _group_derivatives(
+    wire: Wire, rays: Rays, scaled: Float[Array, "n 2"]
+) -> tuple[Float[Array, "9 n"], Float[Array, "2 group n"], Float[Array, "2 group n"], Float[Array, "degrees group n"]]:
+    """Modulation and its derivatives by periods, openings, ellipse and log pupil; waves, carriers and powers."""
+    harmonics = jnp.asarray(wire.harmonics)
+    wave = waves(wire, rays.slope)
     kappa, bessel, slit, slit_slope, powers = _factors(wire, rays)
     series = _series(wire, powers)
     # Without the barrier the compiler computes the Bessel functions anew for every sum below.
     wave, bessel, slit, slit_slope, powers, series = jax.lax.optimization_barrier(
         (wave, bessel, slit, slit_slope, powers, series)
     )
-    crossed = jnp.where(jnp.all(jnp.asarray(wire.harmonics) != 0, axis=1), 0.5, 1.0)[:, None]
+    crossed = jnp.where(jnp.all(harmonics != 0, axis=1), 0.5, 1.0)[:, None]
     both = crossed * slit[0] * slit[1]
     free = bessel[0] * series[:, 0] + bessel[1] * series[:, 1]
     size = both * free + _beside(wire, scaled)
-    whole = 1 + jnp.sum(size * wave, axis=(0, 1))
-    by_periods = 2 * jnp.pi * jnp.asarray(wire.harmonics).T @ (size[1] * wave[0] - size[0] * wave[1])
+    by_periods = 2 * jnp.pi * harmonics.T @ (size[1] * wave[0] - size[0] * wave[1])
     along = jnp.sum(free * wave, axis=0) * crossed
     by_open = jnp.stack([jnp.sum(along * slit_slope[i] * slit[1 - i], axis=0) for i in (0, 1)])
     by_ellipse, by_pupil = _by_footprint(wire, kappa, bessel, both, series, powers, wave)
-    by_rays = Rays(by_periods, by_open + whole / rays.openings, by_ellipse, by_pupil)
-    parts = [jnp.einsum("in,ink->kn", one, by) for one, by in zip(by_rays, by_shape, strict=True)]
-    shape = jnp.sum(jnp.stack(parts), axis=0)
-    base = jnp.exp(log_baseline(wire, scaled, slopes(wire, ideal)))
-    return Derivatives(whole, base, shape, wave, both * bessel[:2], powers)
+    modulated = jnp.sum(size * wave, axis=(0, 1))[None]
+    sums = jnp.concatenate([modulated, by_periods, by_open, by_ellipse, by_pupil])
+    return sums, wave, both * bessel[:2], powers
 
 
 def _factors(wire: Wire, rays: Rays) -> tuple[Array, Array, Array, Array, Array]:
     """kappa; G, z G' and z (z G')'; the slits' coefficients along X and Y; their slopes; Legendre powers."""
     n, m = (jnp.asarray(wire.harmonics)[:, i, None] for i in (0, 1))
-    xx, xy, yy = rays.ellipse
+    xx, xy, yy = jnp.asarray(rays.ellipse)
     kappa = jnp.sqrt(n * n * xx + 2 * n * m * xy + m * m * yy)
-    z = jnp.pi * jnp.exp(rays.log_pupil) * kappa
+    z = jnp.pi * wire.footprint_per_pitch * kappa
     j0, j1 = bessel_j0_j1(z)
     g = 2.0 * j1 / z
     second = 2.0 * (j0 - g)
     bessel = jnp.stack([g, second, -z * z * g - 2.0 * second])
-    order, width = jnp.stack([n, m]), rays.openings[:, None]
-    sinc = jnp.sinc(order * width)
-    slit = jnp.where(order == 0, 1.0, 2.0 * sinc)
-    slit_slope = jnp.where(order == 0, 0.0, 2.0 * (jnp.cos(jnp.pi * order * width) - sinc) / width)
+    slit, slit_slope = slits(wire, jnp.asarray(rays.openings))
     return kappa, bessel, slit, slit_slope, field_powers(wire, kappa, jnp.shape(wire.fields)[-1])
 
 
@@ -225,7 +269,7 @@ def block_jacobian(
     site: Int[np.ndarray, " n"],
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.ndarray, "parameters n"]]:
     """1 + modulation, exp(B), and derivatives by the parameters relative to exp(B) and the gain, for one block."""
-    found = jax.tree.map(np.asarray, wire_derivatives(wire, ideal, scaled))
+    found = wire_derivatives(wire, ideal, scaled)
     in_x, in_y = np.polynomial.legendre.legvander(scaled.T, np.shape(wire.baseline)[0] - 1).transpose(0, 2, 1)
     # The baseline acts on everything: the change of exp(B) (1 + M), relative to exp(B), is (1 + M) dB.
     _, _, degree_y, degree_x = parameters.indices(Kind.SHADING)
@@ -238,56 +282,3 @@ def block_jacobian(
     rows.append(found.wave[phase, harmonic] * found.carrier[carrier, harmonic] * found.powers[degree, harmonic])
     rows.append(found.shape[parameters.indices(Kind.SHAPE)[0]])
     return found.whole, found.base, np.concatenate(rows)
-
-
-@final
-@dataclass(frozen=True)
-class WireProblem:
-    """The likelihood of the parameters by a sample of weighted pixels.
-
-    The scale of the noise is estimated with them, so that the prior's weight does not depend on how well PRNU is
-    known. With the scale profiled out, minus twice the log likelihood is dof ln(chi-squared / dof).
-    """
-
-    name: str
-    parameters: Parameters
-    pixels: Pixels
-    prior: Prior
-
-    def equations_at(self, place: Float[np.ndarray, " n"]) -> Blocks:
-        """Cost and normal equations in units of the residual variance."""
-        matrix, by_tile, chi2 = self.sums(place)
-        used, variance = self.pixels.used, self.variance(chi2)
-        cost = max(used - len(place), 1) * float(np.log(variance))
-        by_data = Blocks.dense(cost, used, matrix / variance, by_tile.sum(axis=0) / variance)
-        return by_data.with_prior(self.prior, place)
-
-    def variance(self, chi2: float) -> float:
-        """Variance of the residuals in units of the noise's."""
-        return chi2 / max(self.pixels.used - len(self.prior.mean), 1) + LEAST_VARIANCE
-
-    def sums(
-        self, place: Float[np.ndarray, " n"]
-    ) -> tuple[Float[np.ndarray, "n n"], Float[np.ndarray, "tiles n"], float]:
-        """Information by the pixels' weights, the right side by tile, and chi-squared."""
-        wire, gains, size = self.parameters.wire(place), self.parameters.gains(place), len(place)
-        tiles = np.arange(TILES[0] * TILES[1])[:, None]
-        matrix, by_tile, chi2, p = np.zeros((size, size)), np.zeros((len(tiles), size)), 0.0, self.pixels
-        for ideal, scaled, site, value, weight in blocks(p.ideal, p.scaled, p.site, p.value, p.weight):
-            whole, base, rows = block_jacobian(self.parameters, wire, ideal, scaled, site)
-            level, root = base * gains[site], np.sqrt(weight)
-            errors, rows = (value - whole * level) * root, rows * (root * level)
-            matrix += rows @ rows.T
-            by_tile += np.where(tile_numbers(scaled) == tiles, errors, 0.0) @ rows.T
-            chi2 += float(errors @ errors)
-        return matrix, by_tile, chi2
-
-    def moved(self, place: Float[np.ndarray, " n"], step: Step) -> Float[np.ndarray, " n"]:
-        """The place after a step."""
-        return place + step.shared
-
-
-def tile_numbers(scaled: Float[np.ndarray, "n 2"]) -> Int[np.ndarray, " n"]:
-    """Number of the sensor's tile in which each position lies."""
-    x, y = (np.clip((0.5 * (scaled[:, i] + 1) * n).astype(np.int64), 0, n - 1) for i, n in enumerate(TILES[::-1]))
-    return np.asarray(y * TILES[1] + x)

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from typing import final
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
@@ -17,41 +16,27 @@ from udccal.fitting.engine.orders import Attempt, Choice, bic, choose
 from udccal.fitting.wire.rules import WireRules, WireStart, ideal_wire
 from udccal.models.wire import Wire
 
-SHAPE_NAMES = (
-    *(
-        "rotation_x_deg",
-        "rotation_y_deg",
-        "rotation_z_deg",
-        "standoff_per_pitch",
-        "offset_x_periods",
-        "offset_y_periods",
-    ),
-    *("footprint_per_pitch", "row_open", "column_open", "depth_per_pitch"),
-)
+_POSE = "rotation_x_deg", "rotation_y_deg", "rotation_z_deg", "standoff_per_pitch"
+_PUPIL = "offset_x_periods", "offset_y_periods", "footprint_per_pitch"
+SHAPE_NAMES = (*_POSE, *_PUPIL, "row_open", "column_open", "depth_per_pitch")
 SHAPE_UNITS = ("deg", "deg", "deg", "1", "period", "period", "1", "1", "1", "1")
 
 
-def shape_vector(wire: Wire) -> Float[Array, "10"]:
+def shape_vector(wire: Wire) -> Float[np.ndarray, "10"]:
     """Rotation (3, rad), log stand-off, offset (2), log pupil, row and column openings, depth."""
-    lengths = wire.row_open, wire.column_open, wire.depth_per_pitch
-    parts = (
-        wire.rotation_rad,
-        jnp.log(wire.standoff_per_pitch),
-        wire.offset_periods,
-        jnp.log(wire.footprint_per_pitch),
-        *lengths,
-    )
-    return jnp.concatenate([jnp.atleast_1d(jnp.asarray(part)) for part in parts])
+    logs = [[np.log(float(length))] for length in (wire.standoff_per_pitch, wire.footprint_per_pitch)]
+    rest = [[float(length)] for length in (wire.row_open, wire.column_open, wire.depth_per_pitch)]
+    return np.concatenate([wire.rotation_rad, logs[0], wire.offset_periods, logs[1], *rest])
 
 
 def with_shape(wire: Wire, shape: Float[np.ndarray, "10"] | Float[Array, "10"]) -> Wire:
-    """The wire with other shape parameters, in the order of ``shape_vector``."""
+    """The wire with other shape parameters, in the order of ``shape_vector``; numbers may be traced by JAX."""
     return replace(
         wire,
         rotation_rad=shape[:3],
-        standoff_per_pitch=jnp.exp(shape[3]),
+        standoff_per_pitch=np.e ** shape[3],
         offset_periods=shape[4:6],
-        footprint_per_pitch=jnp.exp(shape[6]),
+        footprint_per_pitch=np.e ** shape[6],
         row_open=shape[7],
         column_open=shape[8],
         depth_per_pitch=shape[9],
@@ -149,7 +134,7 @@ class Parameters:
         )
         mean, shape = self.vector(self.nothing, np.ones(self.sites)), self.indices(Kind.SHAPE)[0]
         sigma = np.array([np.inf, np.inf, rules.amplitude_sigma, rules.field_sigma, np.nan])[self.columns[:, 0]]
-        mean[self.linear :] = np.asarray(shape_vector(built))[shape]
+        mean[self.linear :] = shape_vector(built)[shape]
         sigma[self.linear :] = shape_sigma(start, rules)[shape]
         return Prior.independent(mean, sigma)
 
@@ -165,7 +150,7 @@ def _leaves(wire: Wire, gains: Float[np.ndarray, " sites"]) -> dict[Kind, Float[
 def parameters_of(
     wire: Wire, rules: WireRules, sites: int, bounds: Iterable[float] = (), panel: bool = True
 ) -> Parameters:
-    """Parameters for shading, site gains, the wire's amplitudes, corrections to the round pupil, and the shape.
+    """All columns, for shading, site gains, the wire's amplitudes, corrections to the round pupil, and the shape.
 
     Args:
         wire: its arrays set the number of amplitudes and fields; numbers without a column keep their values.
@@ -173,9 +158,6 @@ def parameters_of(
         sites: number of sites of the CFA's cell.
         bounds: of the harmonics' relative amplitudes; stronger ones have more corrections.
         panel: whether there is one; without it there is no shape.
-
-    Returns:
-        all columns; ``select`` chooses among their groups.
     """
     nothing = replace(wire, baseline=np.zeros_like(wire.baseline), amplitudes=np.zeros_like(wire.amplitudes))
     strongest, _, degrees, _ = np.shape(nothing.amplitudes)

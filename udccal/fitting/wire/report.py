@@ -9,16 +9,16 @@ from typing import final
 import numpy as np
 from jaxtyping import Float, Int
 
-from udccal.fitting.engine.gaussian import Posterior, Prior
+from udccal.fitting.engine.gaussian import Posterior
 from udccal.fitting.engine.misfit import NO_TEST, MisfitTest, chi2_test, excess_sigma, sharper
 from udccal.fitting.engine.orders import Choice
 from udccal.fitting.engine.report import estimates, residual_sample
 from udccal.fitting.wire.data import BLOCK, Pixels, Weighed
-from udccal.fitting.wire.jacobian import LEAST_VARIANCE, TILES, rays_at, tile_numbers, values_at, with_harmonics
+from udccal.fitting.wire.jacobian import rays_at, tilt_deg, values_at, with_harmonics
 from udccal.fitting.wire.parameters import SHAPE_NAMES, SHAPE_UNITS, Parameters
 from udccal.fitting.wire.rules import Harmonics, WireRules, WireStart, possible_harmonics
-from udccal.models.geometry import tilt_rad
-from udccal.models.wire import Wire, panel_rotation
+from udccal.fitting.wire.search import LEAST_VARIANCE, TILES, WireProblem, tile_numbers
+from udccal.models.wire import Wire
 from udccal.result import Diagnostic, Estimate, FitResult, FitStatus
 
 
@@ -150,23 +150,26 @@ def unseen(harmonics: Harmonics, searched: Pixels, rules: WireRules) -> float:
 @final
 @dataclass(frozen=True)
 class Joint:
-    """A fitted wire: the parameters kept, their values and covariance, and facts about the fit.
+    """A fitted wire: the problem that was solved, the parameters' values and covariance, and facts about the fit.
 
     ``variance`` is that of the residuals in units of the noise's, ``seen`` the pixels of the fit with their weights,
-    ``by_tile`` each tile's part of the score, ``gain`` the chi-squared that the rows explained in the scan.
+    ``gain`` the chi-squared that the rows explained in the scan.
     """
 
-    parameters: Parameters
+    problem: WireProblem
     x: Float[np.ndarray, " n"]
     cov: Float[np.ndarray, "n n"]
-    prior: Prior
     variance: float
     seen: Weighed
-    by_tile: Float[np.ndarray, "tiles n"]
     orders: Choice
     converged: bool
     iterations: int
     gain: float
+
+    @property
+    def parameters(self) -> Parameters:
+        """The parameters kept."""
+        return self.problem.parameters
 
     @property
     def impossible(self) -> bool:
@@ -194,7 +197,7 @@ def wire_result(
     outliers = seen.outliers(shape[1])
     drawn = np.flatnonzero(seen.pixels.weight > 0)
     few = seen.pixels.thinned(8 * BLOCK)
-    tilt = float(np.rad2deg(np.arcsin(np.clip(np.asarray(panel_rotation(term))[1, 2], -1.0, 1.0))))
+    tilt, nominal = (tilt_deg(one) for one in (term, replace(term, rotation_rad=np.zeros(3))))
     named, cov = _estimates(joint) if panel else ((), np.zeros((0, 0)))
     diagnostics = (
         ("wire_map_rms_sigma", 100 * map_sigma, "%"),
@@ -207,7 +210,7 @@ def wire_result(
         ("pixels_left_out", float(sum(one.count for one in outliers)), "1"),
         ("gain_in_chi2", joint.gain, "1"),
         ("tilt_by_wire", tilt, "deg"),
-        ("tilt_by_wire_minus_geometry", tilt - float(np.rad2deg(tilt_rad(term.geometry))), "deg"),
+        ("tilt_by_wire_minus_geometry", tilt - nominal, "deg"),
         ("iterations", float(joint.iterations), "1"),
     )
     return FitResult(
@@ -247,7 +250,8 @@ def _status(joint: Joint, rules: WireRules) -> FitStatus:
 def _notes(joint: Joint, found: Misfit, left_out: float, rules: WireRules) -> Iterator[str]:
     if joint.parameters.panel:
         yield "cov covers the shape parameters, as fitted together with all coefficients of the fields."
-        off = (joint.prior.root @ (joint.x - joint.prior.mean))[joint.parameters.linear :]
+        prior = joint.problem.prior
+        off = (prior.root @ (joint.x - prior.mean))[joint.parameters.linear :]
         for name, sigmas in zip(SHAPE_NAMES, np.abs(off), strict=True):
             if sigmas > rules.doubted_sigma:
                 yield f"{name} is {sigmas * rules.widening:.0f} tolerances away from the rig description; check it."

@@ -90,14 +90,7 @@ class WireStart:
 
 
 def wire_start(rig: RigDescription) -> WireStart:
-    """The start values of a wire fit by a rig description.
-
-    Args:
-        rig: its panel, lens and stand-off.
-
-    Returns:
-        lengths in panel periods, with their tolerances.
-    """
+    """The start values of a wire fit by a rig's panel, lens and stand-off."""
     panel, lens, standoff = rig.panel, rig.lens, rig.mounting.standoff_mm
     pitch, depth = panel.pitch_mm.value, panel.depth_mm
     pitch_tolerance = panel.pitch_mm.tolerance / pitch
@@ -127,17 +120,9 @@ class Harmonics:
 
 
 def possible_harmonics(start: WireStart, least: float | None = None, below: float = np.inf) -> Harmonics:
-    """Harmonics whose relative amplitude has a bound from ``least`` to ``below``.
+    """Harmonics whose relative amplitude has a bound from ``least`` (by default the fitted ones') to ``below``.
 
     The bound is the slits' times the envelope of 2 J1(z) / z, z = pi D kappa / pitch, for a round pupil.
-
-    Args:
-        start: the rig as built.
-        least: smallest bound; by default that of the fitted harmonics.
-        below: bounds are smaller than this.
-
-    Returns:
-        orders (n, m) with their bounds, largest first.
     """
     least = WireRules().least_amplitude if least is None else least
     orders = np.arange(HIGHEST_ORDER + 1.0)
@@ -155,16 +140,13 @@ def possible_harmonics(start: WireStart, least: float | None = None, below: floa
 def ideal_wire(
     geometry: Geometry, start: WireStart, harmonics: Float[np.ndarray, "harmonics 2"], rules: WireRules | None = None
 ) -> Wire:
-    """The wire of the rig as built, with a round pupil and an even field.
+    """The wire of the rig as built, with a round pupil and an even field; ranges of kappa are not set.
 
     Args:
         geometry: gives the rays.
         start: the rig as built.
         harmonics: orders (n, m) along X and Y.
         rules: for the degrees of the shading.
-
-    Returns:
-        the wire; the ranges of kappa of its harmonics are not set.
     """
     degrees = (rules or WireRules()).smooth_degrees[1] + 1
     fields = np.zeros((len(harmonics), 2, 2, 4))

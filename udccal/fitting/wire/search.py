@@ -7,20 +7,80 @@ from dataclasses import dataclass, replace
 from typing import final
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.ndimage import maximum_filter
 from scipy.special import j1
 
-from udccal.fitting.engine.least_squares import Blocks, Solution, SolverRules, minimise
-from udccal.fitting.wire.data import FlatNoise, Pixels, weighed
-from udccal.fitting.wire.jacobian import WireProblem, expected_of, rays_at, values_at, weighed_at, with_harmonics
-from udccal.fitting.wire.parameters import parameters_of, shape_sigma
+from udccal.fitting.engine.gaussian import Prior
+from udccal.fitting.engine.least_squares import Blocks, Solution, SolverRules, Step, minimise
+from udccal.fitting.wire.data import FlatNoise, Pixels, blocks, weighed
+from udccal.fitting.wire.jacobian import block_jacobian, expected_of, rays_at, values_at, weighed_at, with_harmonics
+from udccal.fitting.wire.parameters import Parameters, parameters_of, shape_sigma
 from udccal.fitting.wire.rules import WireRules, WireStart, ideal_wire, possible_harmonics
 from udccal.models.geometry import Geometry
 from udccal.models.wire import Wire
 
+# Tiles of the sensor, down and across, whose residuals are tested as a whole.
+TILES = (6, 8)
+# Least residual variance in units of the noise's, so that quotients by it stay finite.
+LEAST_VARIANCE = 1e-12
 # Weakly determined parameters may creep on for ever: the descent ends at a tenth of a sigma, or when steps stall.
 SOLVER = SolverRules(least_gain=1e-2, stalled_gain=0.1)
+
+
+@final
+@dataclass(frozen=True)
+class WireProblem:
+    """The likelihood of the parameters by a sample of weighted pixels.
+
+    The scale of the noise is estimated with them, so that the prior's weight does not depend on how well PRNU is
+    known. With the scale profiled out, minus twice the log likelihood is dof ln(chi-squared / dof).
+    """
+
+    name: str
+    parameters: Parameters
+    pixels: Pixels
+    prior: Prior
+
+    def equations_at(self, place: Float[np.ndarray, " n"]) -> Blocks:
+        """Cost and normal equations in units of the residual variance."""
+        matrix, by_tile, chi2 = self.sums(place)
+        used, variance = self.pixels.used, self.variance(chi2)
+        cost = max(used - len(place), 1) * float(np.log(variance))
+        by_data = Blocks.dense(cost, used, matrix / variance, by_tile.sum(axis=0) / variance)
+        return by_data.with_prior(self.prior, place)
+
+    def variance(self, chi2: float) -> float:
+        """Variance of the residuals in units of the noise's."""
+        return chi2 / max(self.pixels.used - len(self.prior.mean), 1) + LEAST_VARIANCE
+
+    def sums(
+        self, place: Float[np.ndarray, " n"]
+    ) -> tuple[Float[np.ndarray, "n n"], Float[np.ndarray, "tiles n"], float]:
+        """Information by the pixels' weights, the right side by tile, and chi-squared."""
+        wire, gains, size = self.parameters.wire(place), self.parameters.gains(place), len(place)
+        matrix, by_tile, chi2, p = np.zeros((size, size)), np.zeros((TILES[0] * TILES[1], size)), 0.0, self.pixels
+        for ideal, scaled, site, value, weight in blocks(p.ideal, p.scaled, p.site, p.value, p.weight):
+            whole, base, rows = block_jacobian(self.parameters, wire, ideal, scaled, site)
+            level, root = base * gains[site], np.sqrt(weight)
+            errors, rows = (value - whole * level) * root, rows * (root * level)
+            matrix += rows @ rows.T
+            # A block is some rows of the sensor, which cross few of the tiles.
+            tile = tile_numbers(scaled)
+            crossed = np.unique(tile)
+            by_tile[crossed] += np.where(tile == crossed[:, None], errors, 0.0) @ rows.T
+            chi2 += float(errors @ errors)
+        return matrix, by_tile, chi2
+
+    def moved(self, place: Float[np.ndarray, " n"], step: Step) -> Float[np.ndarray, " n"]:
+        """The place after a step."""
+        return place + step.shared
+
+
+def tile_numbers(scaled: Float[np.ndarray, "n 2"]) -> Int[np.ndarray, " n"]:
+    """Number of the sensor's tile in which each position lies."""
+    x, y = (np.clip((0.5 * (scaled[:, i] + 1) * n).astype(np.int64), 0, n - 1) for i, n in enumerate(TILES[::-1]))
+    return np.asarray(y * TILES[1] + x)
 
 
 @final
