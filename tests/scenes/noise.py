@@ -21,7 +21,7 @@ class ToySensor:
     """A sensor and how it is measured; noise is drawn in electrons, then K, row noise, rounding and clipping.
 
     ``other_noise`` draws read noise of unit variance in place of Tukey's lambda; a fraction ``telegraph`` of the pixels
-    has three times the read noise.
+    has three times the read noise. ``pattern`` is a relative response in addition to the white one.
     """
 
     rows: int = 96
@@ -33,6 +33,7 @@ class ToySensor:
     lambda_read: float | None = 0.05
     other_noise: Callable[[np.random.Generator, tuple[int, ...]], np.ndarray] | None = None
     telegraph: float = 0.0
+    pattern: Float[np.ndarray, "rows columns"] | None = None
     row_DN: float = 0.4
     dark_e_per_s: float = 40.0
     DSNU_e: float = 3.0
@@ -70,6 +71,7 @@ def patterns(sensor: ToySensor, rng: np.random.Generator) -> Patterns:
     """Fixed patterns of one sensor of this kind."""
     shape = (sensor.rows, sensor.columns)
     response, offset = 1 + sensor.PRNU * rng.standard_normal(shape), sensor.DSNU_e * rng.standard_normal(shape)
+    response = response if sensor.pattern is None else response + sensor.pattern
     noisy = rng.random(shape) < sensor.telegraph if sensor.telegraph else np.zeros(shape, bool)
     return Patterns(response, offset, np.where(noisy, 3.0, 1.0) * sensor.read_e)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -44,8 +45,20 @@ def test_any_read_noise_has_its_variance_within_sigma_or_a_note(name: str) -> No
         dsnu, dsnu_sigma = estimate(result, "DSNU1288_e")
         assert abs(dsnu - sensor.DSNU_e) < 4.5 * dsnu_sigma + 0.02
         assert abs(estimate(result, "K_DN_per_e")[0] / 0.36 - 1) < 0.01
-        noted = any("another distribution" in note for note in result.notes)
+        noted = any("tails" in note for note in result.notes)
         assert noted == (name in ("Student t, 4", "telegraph")) or name in ("Student t, 8", "Laplace", "even")
+
+
+def test_what_is_not_white_in_flats_is_told() -> None:
+    base = replace(SENSOR, PRNU=0.0)
+    columns = np.random.default_rng(8).standard_normal(256)
+    blotches = cv2.GaussianBlur(np.random.default_rng(9).standard_normal((192, 256)), (0, 0), 3.0)
+    for unevenness in (np.tile(columns / columns.std(), (192, 1)), blotches / blotches.std()):
+        sensor = replace(base, pattern=0.006 * unevenness)
+        (note,) = [one for one in measure(sensor, 0).notes if "white" in one]
+        assert float(note.split("vary by ")[1].split(" %")[0]) == pytest.approx(0.6, abs=0.03)
+        assert estimate(measure(sensor, 0), "PRNU1288")[0] < 0.001
+    assert not [one for one in measure(SENSOR, 0).notes if "white" in one]
 
 
 def pair(rng: np.random.Generator, electrons: float, kind: str = "<u2") -> tuple[np.ndarray, np.ndarray]:

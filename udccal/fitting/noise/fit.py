@@ -201,10 +201,11 @@ def _assembled(data: NoiseMoments, dark: DarkTerms, curve: Curve, rules: NoiseRu
             Diagnostic("response_DN_per_light", float(fit.values[3]), "DN"),
             Diagnostic("light_offset", float(fit.values[4]), "light"),
             Diagnostic("light_scatter", fit.scatter, "1"),
+            Diagnostic("flat_structure", uneven.structure2**0.5, "1"),
             Diagnostic("dark_samples_outside_histogram", float(outside), "1"),
             Diagnostic("edge_gain", float(np.sqrt(np.mean(dark.fit.edge_gains**2))), "1"),
         ),
-        notes=tuple(_notes(data, dark, curve, values, bent_too_far)),
+        notes=tuple(_notes(data, dark, curve, uneven, values, bent_too_far)),
         outliers=tuple(one for one in _outliers(data, dark, curve, float(values[2]), uneven, rules) if one.count),
         residuals=residual_sample(places[np.nonzero(used)[1]], fit.variance_z[used]),
         posterior=Posterior.from_cov(values[:-1], cov[:-1, :-1], _term),
@@ -267,7 +268,12 @@ def _outliers(
 
 
 def _notes(
-    data: NoiseMoments, dark: DarkTerms, curve: Curve, values: Float[np.ndarray, "11"], bent_too_far: bool
+    data: NoiseMoments,
+    dark: DarkTerms,
+    curve: Curve,
+    uneven: Pattern,
+    values: Float[np.ndarray, "11"],
+    bent_too_far: bool,
 ) -> Iterable[str]:
     if not curve.full.any():
         yield f"No flat reached saturation; the converter's largest code, {values[2]:.0f} DN, is taken for it."
@@ -275,11 +281,11 @@ def _notes(
         yield "Rounding or cut-off codes bend the dark codes; black and DSNU come from the histograms."
     if len({pair.exposure_s for pair in data.darks}) < 2:
         yield "Dark frames of one exposure time do not tell dark current from black: black holds both."
+    if uneven.structure2 > 0:
+        found = f"Flats vary by {100 * uneven.structure2**0.5:.2g} % between pixels, but not as white noise does."
+        yield f"{found} That counts as light, as a panel's; columns or blotches of the sensor are not in PRNU1288."
     if dark.foreign:
-        yield (
-            "Read noise has another distribution than those of the model (heavy tails, or some pixels far noisier than "
-            "others): sigma_d is the root mean square of all pixels, and lambda_read only the nearest shape."
-        )
+        yield "Read noise has heavier or lighter tails than the model's: sigma_d is the root mean square of all pixels."
     if curve.fit.order.curved:
         yield f"The response bends: {100 * values[-1]:.2g} % of the signal is missing at full scale."
     if bent_too_far:

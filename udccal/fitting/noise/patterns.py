@@ -58,7 +58,8 @@ class Pattern:
     """A variance between pixels (may be negative by chance), its standard deviation, samples, and outliers left out.
 
     ``mean`` is that of the samples left in, and ``mean_variance`` its variance from sensor to sensor by these patterns
-    alone; ``places`` are (row, column) of the first outliers.
+    alone; ``places`` are (row, column) of the first outliers. ``structure2`` is a variance between pixels that is not
+    white, so that it was taken for the light's; 0 where it cannot be seen.
     """
 
     variance: float
@@ -68,6 +69,7 @@ class Pattern:
     mean_variance: float
     outliers: int
     places: tuple[tuple[int, int], ...]
+    structure2: float = 0.0
 
 
 def dsnu(dark_DN: Picture, temporal_DN2: float, row_DN2: float, defect_sigma: float) -> Pattern:
@@ -134,7 +136,7 @@ def prnu(signal_DN: Picture, temporal_DN2: float, shot_DN: float, period: int, d
     rows, columns = (min(site.power.shape[axis] for site in sites) for axis in (0, 1))
     taken = (3 * rows // window + 1, 3 * columns // window + 1)
     white = white_coefficients([site.power[:rows, :columns] for site in sites], taken)
-    variances, sigmas = np.array([_response(site, white, temporal_DN2, shot_DN) for site in sites]).T
+    variances, sigmas, structures = np.array([_response(site, white, temporal_DN2, shot_DN) for site in sites]).T
     weights = 1 / np.maximum(sigmas, 1e-30) ** 2
     variance, samples = float(np.average(variances, weights=weights)), len(sites) * int(np.count_nonzero(white))
     defects = np.zeros(signal_DN.shape, bool)
@@ -142,7 +144,8 @@ def prnu(signal_DN: Picture, temporal_DN2: float, shot_DN: float, period: int, d
         defects[phase] = site.defects
     outliers = signal_DN.size - sum(int(np.count_nonzero(site.inverse_DN)) for site in sites)
     of_mean = max(variance, 0.0) / max(samples, 1)
-    return Pattern(variance, float(weights.sum() ** -0.5), samples, 0.0, of_mean, outliers, _first_places(defects))
+    places, sigma, structure2 = _first_places(defects), float(weights.sum() ** -0.5), float(structures.mean())
+    return Pattern(variance, sigma, samples, 0.0, of_mean, outliers, places, structure2)
 
 
 def _site(signal_DN: Picture, window: int, reach: float) -> _Site:
@@ -164,20 +167,23 @@ def _site(signal_DN: Picture, window: int, reach: float) -> _Site:
     return _Site(np.where(bad, 0, 1 + relative), np.where(bad, 0, 1 / level), bad & ~unlit, np.square(power, out=power))
 
 
-def _response(site: _Site, white: Mask, temporal_DN2: float, shot_DN: float) -> tuple[float, float]:
-    """Variance of the response and its standard deviation."""
+def _response(site: _Site, white: Mask, temporal_DN2: float, shot_DN: float) -> tuple[float, float, float]:
+    """Variance of the response and its standard deviation, and the variance of what is not white."""
     light, inverse = site.light, site.inverse_DN
     kept, good = (max(int(np.count_nonzero(mask)), 1) for mask in (white, inverse))
     power = site.power[: white.shape[0], : white.shape[1]]
     floor = _mean_product(power, white.astype(np.float32), kept) * inverse.size / good
     noise = temporal_DN2 * _mean_product(inverse, inverse, good) + shot_DN * _mean_product(light, inverse, good)
-    square = max(_mean_product(light, light, good) - floor, 0.1)
+    mean_square = _mean_product(light, light, good)
+    square = max(mean_square - floor, 0.1)
+    structure2 = mean_square - (float(light.sum(dtype=np.float64)) / good) ** 2 - floor
+    seen = structure2 > 5 * floor * float(np.sqrt(2.0 / good + 2.0 / kept))
     variance = (floor - noise) / square
     # Pixels of different noise count as fewer pixels of equal noise: one row in eight gives the ratio.
     light, inverse = light[::8], inverse[::8]
     own = max(variance, 0.0) * light**2 + inverse * (temporal_DN2 * inverse + shot_DN * light)
     unlike = float(np.mean(own**2)) / max(float(np.mean(own)) ** 2, 1e-300)
-    return variance, floor / square * float(np.sqrt(2.0 * max(unlike, 1.0) / kept))
+    return variance, floor / square * float(np.sqrt(2.0 * max(unlike, 1.0) / kept)), structure2 * seen
 
 
 def _mean_product(first: np.ndarray, second: np.ndarray, count: int) -> float:
