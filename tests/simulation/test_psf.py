@@ -105,6 +105,7 @@ def test_whole_pixel_offset_shifts_the_samples(truth: RigTruth):
     assert np.abs(shifted[:, 1:, 2:] - plain[:, :-1, :-2]).max() < 1e-3 * plain.max()
 
 
+@pytest.mark.medium
 def test_disc_averages_points_and_keeps_the_light(truth: RigTruth):
     spread = spread_at(truth, MIDDLE, (20.0, 36.0))
 
