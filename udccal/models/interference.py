@@ -92,7 +92,8 @@ def interference_of(
         total: Float[Array, "c rows half"], node: tuple[Array, Array, Array, Array]
     ) -> tuple[Float[Array, "c rows half"], None]:
         column, row, overlap, share = node
-        here = jnp.einsum("t,ty,tx,tyx->yx", strength, row[_ROW_OF], column[_COLUMN_OF], overlap)
+        down = strength[:, None] * row[_ROW_OF]
+        here = jnp.sum(down[:, :, None] * column[_COLUMN_OF][:, None, :] * overlap, axis=0)
         return total + share[:, None, None] * here, None
 
     nodes = (jnp.moveaxis(columns, -1, 0), jnp.moveaxis(rows, -1, 0), jnp.asarray(overlaps), spectra.T)

@@ -15,7 +15,6 @@ from udccal.fitting.psf.kernel import (
     PITCH,
     PUPIL,
     Evaluator,
-    factor_jacobian,
     fit_lattice,
     kernel_coefficients,
     kernel_jacobian,
@@ -64,9 +63,9 @@ def test_slopes_of_the_kernel_are_those_of_differences(
 def slopes_both_ways(scene: Scene, prior: Prior, shots: Shots, interference: bool) -> tuple[np.ndarray, np.ndarray]:
     problem = problem_of(scene, prior, shots, interference)
     one, theta, evaluator = problem.samples.at(0), prior.mean, problem.evaluator
-    _, by_factor = kernel_jacobian(evaluator, evaluator.model(theta), one.frame, one.disc_px, one.overlaps)
-    chain = np.asarray(factor_jacobian(evaluator, theta, one.frame))
-    found = np.einsum("yxfc,fp->pyxc", np.asarray(by_factor), chain)
+    made, chain = (np.asarray(p) for p in kernel_jacobian(evaluator, theta, one.frame, one.disc_px, one.overlaps))
+    by_factor = made[..., len(WAVELENGTHS_NM) :].reshape(*made.shape[:2], -1, 3)
+    found = np.einsum("yxfc,fp->pyxc", by_factor, chain)
     wanted = []
     for step in np.eye(HEAD, theta.size) * _STEPS[:, None]:
         more, less = (
@@ -106,7 +105,7 @@ def overlap_slopes(scene: Scene, prior: Prior, shots: Shots) -> tuple[np.ndarray
             other[number] += move
             # The kernel of the same numbers: what changes is the overlaps.
             overlaps = overlaps_of(problem.evaluator, other, one.frame)
-            kernel = kernel_coefficients(problem.evaluator, theta, one.frame, one.disc_px, overlaps)
+            kernel = np.asarray(kernel_coefficients(problem.evaluator, theta, one.frame, one.disc_px, overlaps))
             lit.append(np.asarray(unit_light(problem.evaluator, one, own[0, :, :2], kernel)))
         wanted.append((lit[0] - lit[1]) / (2 * step_mm))
     return np.moveaxis(np.asarray(one.by_overlaps), -1, 0), np.stack(wanted)

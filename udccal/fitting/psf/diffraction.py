@@ -147,7 +147,9 @@ def _refine(
     """
     whole, enough = None, 1.0
     for _ in range(5):
-        problem, model_error, found = _reweighed(problem.about(place), place, rules)
+        # A change of less than a sigma is small enough for the interference set up before.
+        problem = problem.about(place) if enough == 1.0 else problem
+        problem, model_error, found = _reweighed(problem, place, rules)
         solution = minimise(problem, place, _solver(enough, rules.iterations - iterations))
         iterations += solution.iterations
         change = solution.place.theta - place.theta
@@ -210,9 +212,8 @@ def without_outliers(samples: Samples, z: Lights, rules: PsfRules) -> tuple[Samp
 def phase_evidence(fit: DiffractionFit) -> Choice[tuple[float, float]]:
     """Compare a fit with interference to the same fit without it, to second order about the fit."""
     problem, place, here = fit.problem, fit.solution.place, fit.solution.equations
-    none = {n: np.zeros_like(getattr(problem.samples, n)) for n in ("correction", "by_overlaps", "overlaps")}
     light = problem.light_at(place)
-    change = light - replace(problem, samples=replace(problem.samples, **none)).light_at(place)
+    change = light - problem.light_of_average(place)
     in_sigma = change * np.sqrt(np.asarray(problem.samples.weight))
     score, alone = float((in_sigma * problem.errors(place, light)).sum()), float((in_sigma**2).sum())
     # Residuals change by so small a part of the phase's light that their outliers stay the same.
@@ -252,7 +253,8 @@ def kernel_sigma(fit: DiffractionFit, cov: Float[np.ndarray, "p p"]) -> float:
     samples = fit.problem.samples.at(slice(1))
     even = np.asarray(samples.colour) / np.maximum(np.asarray(samples.colour).sum(axis=2, keepdims=True), 1)
     own = np.concatenate([fit.solution.place.own[:1, :, :2], np.tile([1.0, 1.0, 1.0, 0.0], (1, even.shape[1], 1))], -1)
-    place, one = Place(fit.theta, own), replace(fit.problem, samples=replace(samples, weight=even.sum(axis=-1)))
+    place, weighed_evenly = Place(fit.theta, own), replace(samples, weight=even.sum(axis=-1))
+    one = DiffractionProblem(weighed_evenly, fit.problem.evaluator, fit.problem.prior)
     light = one.light_at(place)
     (sums,) = replace(one, samples=replace(one.samples, rate=light)).by_position(place)
     return float(np.sqrt(max(float((sums.shared * cov).sum()), 0.0) / float((even.sum(axis=-1) * light**2).sum())))

@@ -34,7 +34,6 @@ from udccal.models.interference import (
     HIGHEST_ORDER,
     TERMS,
     footprint_place,
-    interference_of,
     interference_transfer,
     node_overlaps,
     overlap_tables,
@@ -128,35 +127,23 @@ def kernel_coefficients(
     return spline_coefficients(lattice, transfer)
 
 
-def interference_coefficients(
-    evaluator: Evaluator, model: Diffraction, frame: LocalFrame, disc_px: Float[Arrayish, ""]
-) -> Callable[[Float[Array, " terms"], Float[Array, "nodes terms rows half"]], Float[Array, "y x 3"]]:
-    """Return interference's part of ``kernel_coefficients``, as a function of its strengths and overlaps."""
-    lattice, spectra = evaluator.lattice, jnp.asarray(model.spectrum)
-    opened, (fx, fy) = open_fractions(model, frame), lattice_frequencies(frame, lattice)
-    columns, rows = (slit_tables(model, opened[axis], f, HIGHEST_ORDER) for axis, f in enumerate((fx, fy)))
-    sensor = sensor_transfer(frame, fx, fy, model.blur_px, disc_px)
-
-    def of(strength: Float[Array, " terms"], overlaps: Float[Array, "nodes terms rows half"]) -> Float[Array, "y x 3"]:
-        total = interference_of(strength, columns, rows, overlaps, spectra)
-        return spline_coefficients(lattice, through_sensor(total, sensor))
-
-    return of
-
-
+@eqx.filter_jit
 def kernel_jacobian(
     evaluator: Evaluator,
-    model: Diffraction,
+    theta: Float[Arrayish, " p"],
     frame: LocalFrame,
     disc_px: Float[Arrayish, ""],
     overlaps: Float[Arrayish, "nodes terms rows half"],
-) -> tuple[Float[Array, "y x nodes"], Float[Array, "y x factors 3"]]:
-    """Return spline coefficients of the kernel at every wavelength node, and derivatives in all colours.
+) -> tuple[Float[Array, "y x channels"], Float[Array, "factors head"]]:
+    """Return spline coefficients of the kernel at every wavelength node, and of its derivatives by factors and colours.
 
-    Derivatives are by the factors of ``factor_jacobian``, with the ``overlaps`` of interference held. The average over
-    the footprint's place is one more term of interference, (0, 0), of strength 1.
+    Factors: open part of columns and of rows along the ray, the pitch where it scales lags, the pupil, the footprint's
+    place (x, y), and the logarithm of the blur, with the ``overlaps`` of interference held. The second result has their
+    derivatives by the parameters before the spectra. The average over the footprint's place is one more term of
+    interference, (0, 0), of strength 1.
     """
-    lattice, spectra = evaluator.lattice, jnp.asarray(model.spectrum)
+    model, lattice = evaluator.model(theta), evaluator.lattice
+    spectra = jnp.asarray(model.spectrum)
     fx, fy = lattice_frequencies(frame, lattice)
     slits = (_slits(model, frame, axis, f) for axis, f in enumerate((fx, fy)))
     pupils, by_pupil = _with_derivative(
@@ -191,25 +178,13 @@ def kernel_jacobian(
     mixed = jnp.einsum("cj,jfyx->fcyx", spectra, every)
     channels = jnp.concatenate([every[:, 0], mixed[1:].reshape(-1, *sensor.shape)])
     seen = jnp.concatenate([through_sensor(channels, sensor), through_sensor(mixed[0], by_blur)])
-    flat, count = spline_coefficients(lattice, seen), spectra.shape[1]
-    return flat[..., :count], flat[..., count:].reshape(*flat.shape[:2], -1, 3)
-
-
-def factor_jacobian(
-    evaluator: Evaluator, theta: Float[Arrayish, " p"], frame: LocalFrame
-) -> Float[Array, "factors head"]:
-    """Return derivatives of the factors of ``kernel_jacobian`` by the parameters before the spectra, in order.
-
-    Factors: open part of columns and of rows along the ray, the pitch where it scales lags, the pupil, the footprint's
-    place (x, y), and the logarithm of the blur.
-    """
 
     def factors(head: Float[Array, " head"]) -> Float[Array, " factors"]:
         model = evaluator.model(jnp.concatenate([head, jnp.asarray(theta)[HEAD:]]))
         opened, place = open_fractions(model, frame), footprint_place(model, frame)
         return jnp.stack([*opened, head[PITCH], head[PUPIL], *place, head[BLUR]])
 
-    return jax.jacfwd(factors)(jnp.asarray(theta)[:HEAD])
+    return spline_coefficients(lattice, seen), jax.jacfwd(factors)(jnp.asarray(theta)[:HEAD])
 
 
 def _slits(

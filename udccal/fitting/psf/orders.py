@@ -129,7 +129,7 @@ class _Orders:
         order = trial.order
         if order.degree < 0:
             return np.zeros((1, 3, 1, 1))
-        image = self._solve(self._windows(trial.sources, order), order)[: polynomial_terms(order.degree)]
+        image = self._solve(self._windows(trial.sources, order), order)
         half = support.half_px if order.free else order.half_px(self.shots.half)
         return about_middle(image[..., :: order.per_px, :: order.per_px], half)
 
@@ -170,17 +170,15 @@ class _Orders:
         return make_windows(self.shots, sources, self.explained, self.basis, order.model_error, order.per_px)
 
     def _solve(self, windows: Windows, order: Order) -> Float[np.ndarray, "terms 3 node_rows node_columns"]:
-        """Solve for the residual's image; higher degrees are held at 0, so that all orders share one compilation."""
+        """Solve for the residual's image, which is 0 beyond its reach."""
         sigma = prior_sigma(self.magnitude, order.size, order.per_px)
         y, x = (np.abs(np.arange(nodes) - nodes // 2) for nodes in sigma.shape[1:])
         rows, columns = (order.per_px * half for half in order.half_px(self.shots.half))
-        terms = np.arange(self.basis.shape[1]) < polynomial_terms(order.degree)
-        sigmas = terms[:, None, None, None] * (sigma * ((y <= rows)[:, None] & (x <= columns)))
+        within = sigma * ((y <= rows)[:, None] & (x <= columns))
+        sigmas = np.tile(within, (polynomial_terms(order.degree), 1, 1, 1))
         if order.degree < 0:
-            return np.zeros_like(sigmas)
-        return np.asarray(
-            image_of(solve_image(windows, sigmas, order.free, np.zeros_like(sigmas))[0], sigmas, order.free)
-        )
+            return sigmas
+        return image_of(solve_image(windows, sigmas, order.free, np.zeros_like(sigmas))[0], sigmas, order.free)
 
 
 def select_field(
