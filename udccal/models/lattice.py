@@ -7,7 +7,7 @@ Cubic B-spline coefficients are the picture divided, in frequency, by the spline
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +15,37 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from udccal.models.arrays import Arrayish
+
+
+@runtime_checkable
+class Frequencies(Protocol):
+    """The frequencies of a half-plane spectrum, in cycles per pixel."""
+
+    @property
+    def frequency_y(self) -> Float[np.ndarray, " rows"]:
+        """Of each row."""
+
+    @property
+    def frequency_x(self) -> Float[np.ndarray, " half"]:
+        """Of each column."""
+
+
+@dataclass(frozen=True)
+class Joined:
+    """Frequencies of two lattices, one after the other: they make one transfer function of four parts."""
+
+    first: Lattice
+    second: Lattice
+
+    @property
+    def frequency_y(self) -> Float[np.ndarray, " rows"]:
+        """Of each row, in cycles per pixel."""
+        return np.concatenate([self.first.frequency_y, self.second.frequency_y])
+
+    @property
+    def frequency_x(self) -> Float[np.ndarray, " half"]:
+        """Of each column, in cycles per pixel."""
+        return np.concatenate([self.first.frequency_x, self.second.frequency_x])
 
 
 @dataclass(frozen=True)

@@ -21,20 +21,20 @@ from udccal.models.arrays import Arrayish
 from udccal.models.diffraction import (
     Diffraction,
     LocalFrame,
-    average_transfer,
+    average_of,
     lattice_frequencies,
     open_fractions,
     pupil_anchors,
     pupil_overlaps,
     sensor_transfer,
-    slit_tables,
+    slits_of,
     through_sensor,
 )
 from udccal.models.interference import (
     HIGHEST_ORDER,
     TERMS,
     footprint_place,
-    interference_transfer,
+    interference_of,
     node_overlaps,
     overlap_tables,
     strengths,
@@ -120,11 +120,17 @@ def kernel_coefficients(
 ) -> Float[Array, "lattice_rows lattice_columns 3"]:
     """Return spline coefficients of the three colours' kernels, for a source whose image is ``disc_px`` wide."""
     model, lattice = evaluator.model(theta), evaluator.lattice
-    spectra = jnp.asarray(model.spectrum)
-    transfer = average_transfer(model, frame, lattice, spectra, disc_px)
+    spectra, (fx, fy) = jnp.asarray(model.spectrum), lattice_frequencies(frame, lattice)
+    columns, rows = slits_of(
+        model, open_fractions(model, frame), fx, fy, HIGHEST_ORDER if evaluator.interference else 0
+    )
+    pupils, (_, parts) = pupil_overlaps(model, frame, lattice), pupil_anchors(model)
+    transfer = average_of(columns[0], rows[0], pupils, parts, spectra)
     if evaluator.interference:
-        transfer = transfer + interference_transfer(model, frame, lattice, spectra, overlaps, disc_px)
-    return spline_coefficients(lattice, transfer)
+        strength = strengths(model, footprint_place(model, frame))
+        transfer = transfer + interference_of(strength, columns, rows, overlaps, spectra)
+    sensor = sensor_transfer(frame, fx, fy, model.blur_px, disc_px)
+    return spline_coefficients(lattice, through_sensor(transfer, sensor))
 
 
 @eqx.filter_jit
@@ -145,7 +151,7 @@ def kernel_jacobian(
     model, lattice = evaluator.model(theta), evaluator.lattice
     spectra = jnp.asarray(model.spectrum)
     fx, fy = lattice_frequencies(frame, lattice)
-    slits = (_slits(model, frame, axis, f) for axis, f in enumerate((fx, fy)))
+    slits = _slits(model, frame, fx, fy)
     pupils, by_pupil = _with_derivative(
         lambda mm: pupil_overlaps(eqx.tree_at(lambda m: m.pupil_diameter_mm, model, mm), frame, lattice),
         model.pupil_diameter_mm,
@@ -188,16 +194,20 @@ def kernel_jacobian(
 
 
 def _slits(
-    model: Diffraction, frame: LocalFrame, axis: int, frequency: Float[Array, " n"]
-) -> Float[Array, "nodes 3 orders n"]:
-    """Return slits along an axis, and derivatives by a ray's open part and by the pitch, with the other held."""
+    model: Diffraction, frame: LocalFrame, fx: Float[Array, " half"], fy: Float[Array, " rows"]
+) -> tuple[Float[Array, "nodes 3 orders half"], Float[Array, "nodes 3 orders rows"]]:
+    """Return slits of both axes, and derivatives by a ray's open part and by the pitch, with the other held."""
 
-    def table(opened: Float[Array, ""], pitch_mm: Float[Array, ""]) -> Float[Array, "orders n nodes"]:
-        return slit_tables(eqx.tree_at(lambda m: m.pitch_mm, model, pitch_mm), opened, frequency, HIGHEST_ORDER)
+    def tables(opened: Float[Array, "2"], pitch_mm: Float[Array, ""]) -> tuple[Array, Array]:
+        return slits_of(eqx.tree_at(lambda m: m.pitch_mm, model, pitch_mm), opened, fx, fy, HIGHEST_ORDER)
 
-    at = (open_fractions(model, frame)[axis], jnp.asarray(model.pitch_mm))
-    value, derivatives = jax.vmap(lambda way: jax.jvp(table, at, (way[0], way[1])), out_axes=(None, 0))(jnp.eye(2))
-    return jnp.moveaxis(jnp.concatenate([value[None], derivatives]), -1, 0)
+    at = (open_fractions(model, frame), jnp.asarray(model.pitch_mm))
+    ways = (jnp.array([[1.0, 1.0], [0.0, 0.0]]), jnp.array([0.0, 1.0]))
+    value, derivatives = jax.vmap(lambda *way: jax.jvp(tables, at, way), out_axes=(None, 0))(*ways)
+    columns, rows = (
+        jnp.moveaxis(jnp.concatenate([own[None], by]), -1, 0) for own, by in zip(value, derivatives, strict=True)
+    )
+    return columns, rows
 
 
 def _with_derivative(of: Callable[[Array], Array], at: Float[Arrayish, ""]) -> tuple[Array, Array]:

@@ -24,7 +24,9 @@ from udccal.models.lattice import sample
 from udccal.models.psf import lattice_points
 
 OWN: Final = 6
-_PER_SAMPLE: Final = "points density colour rate known noise_per_rate weight correction by_overlaps".split()
+_PER_SAMPLE: Final = (
+    *("points", "density", "colour", "rate", "known", "noise_per_rate", "weight", "correction", "by_overlaps"),
+)
 # Pixels that are put on a lattice together.
 _BLOCK: Final = 2048
 # Parameters of diffraction; own parameters and light of the shots of one position, and of all positions.
