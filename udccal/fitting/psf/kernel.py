@@ -181,9 +181,10 @@ def kernel_jacobian(
         return jnp.stack([light(y, x), light(y, by_open_x), light(by_open_y, x), by_pitch, pupil, *moved])
 
     every = jax.lax.map(at_node, (*slits, jnp.asarray(overlaps), pupil_anchors(model)[1].T))
-    mixed = jnp.einsum("cj,jfyx->fcyx", spectra, every)
-    channels = jnp.concatenate([every[:, 0], mixed[1:].reshape(-1, *sensor.shape)])
-    seen = jnp.concatenate([through_sensor(channels, sensor), through_sensor(mixed[0], by_blur)])
+    # As one product of matrices: an einsum over the nodes takes five times as long.
+    mixed = (spectra @ every.reshape(len(every), -1)).reshape(len(spectra), *every.shape[1:])
+    channels = jnp.concatenate([every[:, 0], jnp.swapaxes(mixed[:, 1:], 0, 1).reshape(-1, *sensor.shape)])
+    seen = jnp.concatenate([through_sensor(channels, sensor), through_sensor(mixed[:, 0], by_blur)])
 
     def factors(head: Float[Array, " head"]) -> Float[Array, " factors"]:
         model = evaluator.model(jnp.concatenate([head, jnp.asarray(theta)[HEAD:]]))

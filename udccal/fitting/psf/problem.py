@@ -53,10 +53,18 @@ _IN_OVERLAPS: Final = np.array([PITCH, PUPIL])
 @final
 @dataclass(frozen=True)
 class Place:
-    """A descent's current parameters: those of diffraction, which are shared, and those of every shot."""
+    """A descent's current parameters: those of diffraction, which are shared, and those of every shot.
+
+    ``near`` is a place less than a sigma away whose derivatives serve here too; by default it is this place.
+    """
 
     theta: Float[np.ndarray, " p"]
     own: Owns
+    near: Place | None = None
+
+    def same(self, other: Place) -> bool:
+        """Whether all parameters are equal."""
+        return np.array_equal(self.theta, other.theta) and np.array_equal(self.own, other.own)
 
 
 @final
@@ -70,11 +78,9 @@ class _Slopes:
     by_theta: Float[np.ndarray, "positions shots n p"]
     by_own: Float[np.ndarray, "positions shots n l"]
 
-    def of(self, samples: Samples, place: Place) -> bool:
-        """Whether these are the light and the derivatives of the samples at this place; weights do not matter."""
-        optics = all(getattr(self.samples, n) is getattr(samples, n) for n in ("points", "overlaps", "correction"))
-        own, theta = self.place.own, self.place.theta
-        return optics and np.array_equal(theta, place.theta) and np.array_equal(own, place.own)
+    def of(self, samples: Samples) -> bool:
+        """Whether these are of the samples; their weights and rates do not matter."""
+        return all(getattr(self.samples, n) is getattr(samples, n) for n in ("points", "overlaps", "correction"))
 
 
 @final
@@ -128,7 +134,9 @@ class DiffractionProblem:
 
     def moved(self, place: Place, step: Step) -> Place:
         """Return the place after a step."""
-        return Place(stepped(place.theta, step.shared), moved_own(place.own, step.own.reshape(place.own.shape)))
+        theta, own = stepped(place.theta, step.shared), moved_own(place.own, step.own.reshape(place.own.shape))
+        # The gain is the square of the step's length in sigmas.
+        return Place(theta, own, (place.near or place) if step.gain < 1.0 else None)
 
     def light_at(self, place: Place) -> Lights:
         """Return the samples' light under the model, in e-/s, without background."""
@@ -136,13 +144,9 @@ class DiffractionProblem:
 
     def light_of_average(self, place: Place) -> Lights:
         """Return the same averaged over the footprint's place, without interference."""
-        none = replace(self.samples, overlaps=np.zeros_like(self.samples.overlaps))
-        kernels = coefficients_of(self.evaluator, place.theta, none)
-        units = [
-            unit_light(self.evaluator, one, own[:, :2], kernel)
-            for one, own, kernel in zip(none.each(), place.own, kernels, strict=True)
-        ]
-        return np.stack(units) * flux_of(self.samples, place.own)
+        samples = self.samples
+        none = {name: np.zeros_like(getattr(samples, name)) for name in ("overlaps", "correction", "by_overlaps")}
+        return replace(self, samples=replace(samples, **none))._light(place)
 
     def errors(self, place: Place, light: Lights) -> Lights:
         """Return data less expectation in units of sigma, 0 for unused samples; ``light`` is of that place."""
@@ -167,14 +171,33 @@ class DiffractionProblem:
         return replace(self, samples=made)
 
     def _slopes_at(self, place: Place) -> _Slopes:
-        if not self._last or not self._last[0].of(self.samples, place):
+        last = self._last[0] if self._last and self._last[0].of(self.samples) else None
+        if last and last.place.same(place):
+            return last
+        if last and place.near and (last.place.near or last.place).same(place.near):
+            found = _Slopes(self.samples, place, self._light(place), last.by_theta, last.by_own)
+        else:
+            place = replace(place, near=None)
             made = (
-                _slopes(self.evaluator, place.theta, one, own)
-                for one, own in zip(self.samples.each(), place.own, strict=True)
+                _slopes(self.evaluator, place.theta, *one) for one in zip(self.samples.each(), place.own, strict=True)
             )
-            parts = (np.stack(part) for part in zip(*made, strict=True))
-            self._last[:] = [_Slopes(self.samples, place, *parts)]
-        return self._last[0]
+            found = _Slopes(self.samples, place, *(np.stack(part) for part in zip(*made, strict=True)))
+        self._last[:] = [found]
+        return found
+
+    def _light(self, place: Place) -> Lights:
+        kernels = coefficients_of(self.evaluator, place.theta, self.samples)
+        parts = zip(self.samples.each(), place.own, kernels, strict=True)
+        units = [
+            unit_light(self.evaluator, one, own[:, :2], kernel) + _changed(one, place.theta)
+            for one, own, kernel in parts
+        ]
+        return np.stack(units) * flux_of(self.samples, place.own)
+
+
+def _changed(one: Samples, theta: Theta) -> Light:
+    """Return changes of the light per unit by a shot's own place and by overlaps, to first order."""
+    return one.correction + one.by_overlaps @ (theta[_IN_OVERLAPS] - one.overlaps_at)
 
 
 def stepped(theta: Float[np.ndarray, " p"], step: Float[np.ndarray, " p"]) -> Float[np.ndarray, " p"]:
@@ -250,8 +273,7 @@ def _slopes(
     by_logs = one.colour[..., None] * (of_colour * (nodes - unit[..., None]))[..., None, :]
     flux = flux_of(one, own)
     by_theta = np.concatenate([by_head, by_logs.reshape(*unit.shape, -1)], axis=-1) * flux[..., None]
-    # Changes by a shot's own place and by overlaps, to first order.
-    unit = unit + one.correction + one.by_overlaps @ (theta[_IN_OVERLAPS] - one.overlaps_at)
+    unit = unit + _changed(one, theta)
     kernel = coefficients[..., :count] @ spectra.T
     return unit * flux, by_theta, own_slopes(evaluator, one, own, unit, kernel)
 
