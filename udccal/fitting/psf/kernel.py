@@ -17,6 +17,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from udccal.fitting.engine.gaussian import Prior
+from udccal.fitting.psf.data import PsfRules
 from udccal.models.arrays import Arrayish
 from udccal.models.diffraction import (
     Diffraction,
@@ -30,6 +32,7 @@ from udccal.models.diffraction import (
     slits_of,
     through_sensor,
 )
+from udccal.models.geometry import Geometry
 from udccal.models.interference import (
     HIGHEST_ORDER,
     TERMS,
@@ -40,6 +43,10 @@ from udccal.models.interference import (
     strengths,
 )
 from udccal.models.lattice import Lattice, lattice_for, spline_coefficients
+from udccal.models.wire import Wire
+from udccal.rig import RigDescription
+
+WAVELENGTHS_NM: Final = np.linspace(400.0, 700.0, 13)
 
 # HEAD parameters precede the spectra. The others are indices among these: the panel's pitch in mm, the pupil's diameter
 # in mm, the logarithm of the blur in px, and the footprint's place on columns and rows with its stand-off, in pitches.
@@ -60,13 +67,7 @@ def pack(model: Diffraction) -> Float[np.ndarray, " p"]:
 
 @final
 class Evaluator(eqx.Module):
-    """The constants of a fit that every call uses.
-
-    Attributes:
-        wavelengths_nm: nodes of the spectra.
-        lattice: for the transfer functions.
-        interference: true where the footprint's place on the rows is known.
-    """
+    """The constants of a fit that every call uses; ``interference`` where the footprint's place on rows is known."""
 
     wavelengths_nm: Float[Arrayish, " nodes"]
     lattice: Lattice = eqx.field(static=True)
@@ -90,11 +91,7 @@ class Evaluator(eqx.Module):
 
 
 def fit_lattice(half: tuple[int, int]) -> Lattice:
-    """Return the lattice of a fit: four nodes to a pixel, a quarter wider than the window, for sources off the middle.
-
-    Args:
-        half: (rows, columns) of the window to either side of the LED, in px.
-    """
+    """Return a fit's lattice: four nodes to a pixel, a quarter wider than the window, for sources off the middle."""
     rows, columns = (2 * h + 9 for h in half)
     return lattice_for(rows * 1.25, columns * 1.25, 4, 4)
 
@@ -215,3 +212,89 @@ def _with_derivative(of: Callable[[Array], Array], at: Float[Arrayish, ""]) -> t
     number = jnp.asarray(at)
     value, derivative = jax.jvp(of, (number,), (jnp.ones_like(number),))
     return value, derivative
+
+
+def as_numpy(model: Diffraction) -> Diffraction:
+    """Return the model with numpy leaves."""
+    return Diffraction(*(np.asarray(getattr(model, name), np.float64) for name in Diffraction.__dataclass_fields__))
+
+
+def start_model(rig: RigDescription, geometry: Geometry, wire: Wire, rules: PsfRules | None = None) -> Diffraction:
+    """Return the start of diffraction: the wire's panel and pupil, or the rig's if no wire was seen.
+
+    Args:
+        rig: the panel and the lens as described; lengths in mm.
+        geometry: has the pupil's position, in mm.
+        wire: its numbers are in pitches of the panel.
+        rules: the blur, and which pitches are well known.
+    """
+    panel, pitch, rules = rig.panel, rig.panel.pitch_mm.value, rules or PsfRules()
+    nodes = wavelengths_nm(rig, rules)
+    # Those of common colour filters.
+    responses = np.exp(-0.5 * ((nodes - np.array([[600.0], [535.0], [460.0]])) / 45.0) ** 2) + 1e-3
+    pupil = np.asarray(geometry.pupil_mm, dtype=np.float64)
+    if seen := wire_shows(wire):
+        opened, offset = (wire.column_open, wire.row_open), wire.offset_periods
+        lengths = (wire.depth_per_pitch, wire.footprint_per_pitch, wire.standoff_per_pitch)
+    else:
+        opened, offset = (panel.column_open.value, panel.row_open.value), pupil[:2] / pitch
+        lengths = (panel.depth_mm.value / pitch, rig.pupil_diameter_mm / pitch, -pupil[2] / pitch)
+    return Diffraction(
+        pitch_mm=np.float64(pitch),
+        openings=np.array([float(part) for part in opened]),
+        depth_mm=np.float64(float(lengths[0]) * pitch),
+        pupil_diameter_mm=np.float64(float(lengths[1]) * pitch),
+        blur_px=np.float64(rules.blur_px),
+        offset_periods=np.asarray(offset, dtype=np.float64),
+        standoff_per_pitch=np.float64(float(lengths[2])),
+        visibility=np.float64(seen),
+        wavelengths_nm=nodes,
+        spectrum=responses / responses.sum(axis=1, keepdims=True),
+    )
+
+
+def wire_shows(wire: Wire) -> bool:
+    """Return whether the wire fit saw the rows: only then the place of the pupil's footprint on them is known."""
+    return np.shape(wire.harmonics)[0] > 0
+
+
+def wavelengths_nm(rig: RigDescription, rules: PsfRules) -> Float[np.ndarray, " nodes"]:
+    """Return the spectra's nodes in nm: those of daylight, wider by the pitch's tolerance where that is large."""
+    relative = min(pitch_tolerance(rig), rules.pitch_least_known)
+    if relative <= rules.pitch_well_known:
+        return WAVELENGTHS_NM
+    first, last = WAVELENGTHS_NM[0] * (1 - relative), WAVELENGTHS_NM[-1] * (1 + relative)
+    return np.linspace(first, last, round((last - first) / (WAVELENGTHS_NM[1] - WAVELENGTHS_NM[0])) + 1)
+
+
+def pitch_tolerance(rig: RigDescription) -> float:
+    """Return the relative tolerance of the pitch, in which the psf measures all lengths."""
+    return rig.panel.pitch_mm.tolerance / rig.panel.pitch_mm.value
+
+
+def start_prior(rig: RigDescription, start: Diffraction, rules: PsfRules | None = None) -> Prior:
+    """Return the prior: the rig's tolerances, tighter for what the wire has measured, and smooth spectra.
+
+    Diffraction depends on wavelength / pitch only. The pitch is therefore held at the rig's value, and the spectra are
+    free to move: an error of the pitch then appears as an error of the wavelengths.
+
+    Args:
+        rig: its tolerances (mm, or fractions) are taken for standard deviations.
+        start: the mean; its ``visibility`` says whether the wire has measured the panel's numbers.
+        rules: sigmas of the other parameters.
+    """
+    panel, theta, rules = rig.panel, pack(start), rules or PsfRules()
+    tighter = rules.wire_tolerance if start.visibility else 1.0
+    sigma = [
+        rules.pitch_tolerance * min(panel.pitch_mm.tolerance, rules.pitch_well_known * panel.pitch_mm.value),
+        tighter * panel.column_open.tolerance,
+        tighter * panel.row_open.tolerance,
+        tighter * panel.depth_mm.tolerance,
+        tighter * 2.0 * rig.pupil_diameter_mm * rig.lens.f_number.tolerance / rig.lens.f_number.value,
+        rules.blur_log_sigma,
+        *(3 * (rules.footprint_periods,)),
+    ]
+    roots = [np.eye(HEAD, theta.size) / np.maximum(np.array(sigma), 1e-6)[:, None]]
+    for pick in np.eye(theta.size)[HEAD:].reshape(3, -1, theta.size):
+        roots += [np.diff(pick, 2, axis=0) / rules.spectrum_bend, pick / rules.spectrum_sigma]
+    return Prior(theta.copy(), np.concatenate(roots))

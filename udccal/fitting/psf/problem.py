@@ -55,7 +55,7 @@ _IN_OVERLAPS: Final = np.array([PITCH, PUPIL])
 class Place:
     """A descent's current parameters: those of diffraction, which are shared, and those of every shot.
 
-    ``near`` is a place less than a sigma away whose derivatives serve here too; by default it is this place.
+    ``near`` is a place a few sigmas away at most, whose derivatives serve here too; by default it is this place.
     """
 
     theta: Float[np.ndarray, " p"]
@@ -135,8 +135,8 @@ class DiffractionProblem:
     def moved(self, place: Place, step: Step) -> Place:
         """Return the place after a step."""
         theta, own = stepped(place.theta, step.shared), moved_own(place.own, step.own.reshape(place.own.shape))
-        # The gain is the square of the step's length in sigmas.
-        return Place(theta, own, (place.near or place) if step.gain < 1.0 else None)
+        # The gain is the square of the step's length in sigmas: derivatives hardly change over five of them.
+        return Place(theta, own, (place.near or place) if step.gain < 25.0 else None)
 
     def light_at(self, place: Place) -> Lights:
         """Return the samples' light under the model, in e-/s, without background."""

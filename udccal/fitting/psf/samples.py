@@ -6,13 +6,13 @@ Own parameters of a shot are (x, y) in px from the first assumed place, light pe
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Final, final
+from typing import Any, Final, final
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
 
 from udccal.fitting.engine.gaussian import scaled_inverse
 from udccal.fitting.psf.data import HUBER, PsfRules, Shots, left_out, noise_at
@@ -27,14 +27,12 @@ OWN: Final = 6
 _PER_SAMPLE: Final = (
     *("points", "density", "colour", "rate", "known", "noise_per_rate", "weight", "correction", "by_overlaps"),
 )
-# Pixels that are put on a lattice together.
-_BLOCK: Final = 2048
 # Parameters of diffraction; own parameters and light of the shots of one position, and of all positions.
-Theta = Float[Arrayish, " p"]
-Own = Float[Arrayish, "shots l"]
-Light = Float[Arrayish, "shots n"]
-Owns = Float[Arrayish, "positions shots l"]
-Lights = Float[Arrayish, "positions shots n"]
+Theta = Float[np.ndarray, " p"]
+Own = Float[np.ndarray, "shots l"]
+Light = Float[np.ndarray, "shots n"]
+Owns = Float[np.ndarray, "positions shots l"]
+Lights = Float[np.ndarray, "positions shots n"]
 
 
 @final
@@ -58,21 +56,21 @@ class Samples(eqx.Module):
     """
 
     frame: LocalFrame
-    points: Float[Arrayish, "*positions shots n 2"]
-    density: Float[Arrayish, "*positions shots n"]
-    slope: Float[Arrayish, "*positions 2 2"]
-    begun_px: Float[Arrayish, "*positions shots 2"]
-    colour: Float[Arrayish, "*positions shots n 3"]
-    rate: Float[Arrayish, "*positions shots n"]
-    known: Float[Arrayish, "*positions shots n"]
-    noise_per_rate: Float[Arrayish, "*positions shots n"]
-    weight: Float[Arrayish, "*positions shots n"]
-    correction: Float[Arrayish, "*positions shots n"]
-    by_overlaps: Float[Arrayish, "*positions shots n 2"]
-    overlaps_at: Float[Arrayish, "*positions 2"]
-    overlaps: Float[Arrayish, "*positions nodes terms rows half"]
+    points: Float[np.ndarray, "*positions shots n 2"]
+    density: Float[np.ndarray, "*positions shots n"]
+    slope: Float[np.ndarray, "*positions 2 2"]
+    begun_px: Float[np.ndarray, "*positions shots 2"]
+    colour: Float[np.ndarray, "*positions shots n 3"]
+    rate: Float[np.ndarray, "*positions shots n"]
+    known: Float[np.ndarray, "*positions shots n"]
+    noise_per_rate: Float[np.ndarray, "*positions shots n"]
+    weight: Float[np.ndarray, "*positions shots n"]
+    correction: Float[np.ndarray, "*positions shots n"]
+    by_overlaps: Float[np.ndarray, "*positions shots n 2"]
+    overlaps_at: Float[np.ndarray, "*positions 2"]
+    overlaps: Float[np.ndarray, "*positions nodes terms rows half"]
     disc_px: Float[Arrayish, "*positions"]
-    index: Int[Arrayish, "*positions shots"]
+    index: Int[np.ndarray, "*positions shots"]
 
     def at(self, which: int | slice) -> Samples:
         """Return the samples of one position, or of several."""
@@ -84,12 +82,7 @@ class Samples(eqx.Module):
 
 
 def choose_samples(shots: Shots, rules: PsfRules) -> Bool[np.ndarray, "shots rows columns"]:
-    """Return which samples are fitted: all near the peak and a seeded draw of the others, as many in every shot.
-
-    Args:
-        shots: crops about the LED.
-        rules: the windows in px, and the fraction that is drawn away from the peak.
-    """
+    """Return which samples are fitted: all near the peak and a seeded draw of the others, as many in every shot."""
     rng = np.random.default_rng(2)
     x, y = np.moveaxis(np.abs(shots.offsets()), -1, 0)
     inside = (x <= rules.close_px[1]) & (y <= rules.close_px[0])
@@ -102,20 +95,13 @@ def choose_samples(shots: Shots, rules: PsfRules) -> Bool[np.ndarray, "shots row
 
 
 def stands_for(shots: Shots, rules: PsfRules) -> Float[np.ndarray, "shots n"]:
-    """Return how many samples of its picture each chosen sample represents: 1 near the peak, more where it was drawn.
-
-    Args:
-        shots: crops about the LED.
-        rules: those of ``choose_samples``.
-    """
+    """Return how many samples of a picture each chosen one represents: 1 near the peak, more where it was drawn."""
     chosen, near = choose_samples(shots, rules), choose_samples(shots, replace(rules, far_fraction=0.0))
     return np.where(near[chosen].reshape(shots.count, -1), 1.0, 1.0 / rules.far_fraction)
 
 
 @eqx.filter_jit
-def _block_on_lattice(
-    geometry: Geometry, place: Float[Arrayish, "2"], offsets_px: Float[Arrayish, "m 2"]
-) -> tuple[LocalFrame, Float[Array, "m 2"], Float[Array, " m"]]:
+def _block(geometry: Geometry, place: Float[Arrayish, "2"], offsets_px: Float[Arrayish, "m 2"]) -> tuple[Any, ...]:
     frame = local_frame(geometry, place)
     return frame, *lattice_points(geometry, frame, place, jnp.asarray(offsets_px))
 
@@ -124,21 +110,15 @@ def _on_lattice(
     geometry: Geometry, place: Float[np.ndarray, "2"], offsets_px: Float[np.ndarray, "m 2"]
 ) -> tuple[LocalFrame, Float[np.ndarray, "m 2"], Float[np.ndarray, " m"]]:
     """Return a place's frame and pixels near it on its lattice, in blocks of one size that share a compilation."""
-    count = len(offsets_px)
-    blocks = np.pad(offsets_px, ((0, -count % _BLOCK), (0, 0))).reshape(-1, _BLOCK, 2)
-    made = [jax.tree.map(np.asarray, _block_on_lattice(geometry, place, block)) for block in blocks]
+    count, size = len(offsets_px), 2048
+    blocks = np.pad(offsets_px, ((0, -count % size), (0, 0))).reshape(-1, size, 2)
+    made = [jax.tree.map(np.asarray, _block(geometry, place, block)) for block in blocks]
     points, density = (np.concatenate([one[part] for one in made])[:count] for part in (1, 2))
     return made[0][0], points, density
 
 
 def gather(shots: Shots, geometry: Geometry, chosen: Bool[np.ndarray, "shots rows columns"]) -> Samples:
-    """Arrange the chosen samples by field position, without overlaps.
-
-    Args:
-        shots: the data, positions numbered without gaps.
-        geometry: the rays of pixels.
-        chosen: as many samples in every shot; see ``choose_samples``.
-    """
+    """Arrange the chosen samples by field position, without overlaps; there are as many in every shot."""
     groups = [np.flatnonzero(shots.position == g) for g in range(shots.positions)]
     most, places = max(len(group) for group in groups), shots.positions_px()
     index = np.stack([np.pad(group, (0, most - len(group)), constant_values=-1) for group in groups])
@@ -178,24 +158,16 @@ def gather(shots: Shots, geometry: Geometry, chosen: Bool[np.ndarray, "shots row
 
 def sensor_variance(samples: Samples, level: Float[np.ndarray, "*k n"]) -> Float[np.ndarray, "*k n"]:
     """Return the variance of the samples' noise if their true rate is ``level``; 1 where there is no sample."""
-    known, rate = np.asarray(samples.known), np.asarray(samples.rate)
-    measured = 1.0 / np.where(known > 0, known, 1.0)
-    return noise_at(level, rate, measured, np.asarray(samples.noise_per_rate) * (known > 0))
+    measured = 1.0 / np.where(samples.known > 0, samples.known, 1.0)
+    return noise_at(level, samples.rate, measured, samples.noise_per_rate * (samples.known > 0))
 
 
 def weighed(
     samples: Samples, model_error: float, light: np.ndarray | None = None, background: np.ndarray | float = 0.0
 ) -> Samples:
-    """Return the samples with weights at the expected ``light`` and ``background``, or at the data without them.
-
-    Args:
-        samples: the data.
-        model_error: relative to the peak of each picture; see ``left_out``.
-        light: that a model expects of each sample, in e-/s.
-        background: in e-/s, broadcast to samples.
-    """
-    seen = np.asarray(samples.known) > 0
-    light = np.asarray(samples.rate) if light is None else light
+    """Return the samples with weights at the expected ``light`` and ``background`` (e-/s), or at the data."""
+    seen = samples.known > 0
+    light = samples.rate if light is None else light
     variance = sensor_variance(samples, light + background) + left_out(light * seen, model_error) ** 2
     return replace(samples, weight=np.where(seen, 1.0 / variance, 0.0))
 
