@@ -283,19 +283,15 @@ def _posterior(
 
 
 def _notes(data: PsfData, diffracts: bool, misfit: str, support: tuple[str, ...]) -> tuple[str, ...]:
+    notes = [
+        "The blur is not that of a panel's grating: an image carries the kernel; no number of diffraction is known.",
+        "chi2_dof is of that image at positions held out, and allows for their model error.",
+    ]
     if diffracts:
         notes = [
             "cov covers the numbers of diffraction; field coefficients of the residual and spectra are left out of it.",
             "chi2_dof is of the fit of diffraction and allows for the model error of its residuals.",
             *([misfit] if misfit else []),
         ]
-    else:
-        notes = [
-            "The blur is not that of a panel's grating: an image carries the kernel; no number of diffraction is "
-            "known.",
-            "chi2_dof is of that image at positions held out, and allows for their model error.",
-        ]
-    if data.dark + data.clipped:
-        why = f"{data.dark} without an LED, {data.clipped} clipped."
-        return (*notes, *support, f"{data.dark + data.clipped} pictures were left out: {why}")
-    return (*notes, *support)
+    left_out, why = data.dark + data.clipped, f"{data.dark} without an LED, {data.clipped} clipped."
+    return (*notes, *support, *([f"{left_out} pictures were left out: {why}"] if left_out else []))

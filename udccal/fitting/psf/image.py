@@ -95,11 +95,10 @@ def make_windows(
     model_error: float,
     per_px: int = 1,
 ) -> Windows:
-    """Return the equations' data from which images are solved.
+    """Return the data from which images are solved; see ``Windows``.
 
-    ``explained`` is each sample's light by diffraction per unit of the LED's; ``model_error``, relative to the peak,
-    adds to the data's noise. The image has ``per_px`` nodes to a pixel, the first and last on the first and last
-    pixels.
+    ``model_error``, relative to the peak, adds to the data's noise. The image has ``per_px`` nodes to a pixel, the
+    first and last on the first and last pixels.
     """
     colour, known = shots.colour, shots.weight > 0
     rate = shots.rate - sources.background[:, None, None]
@@ -172,10 +171,8 @@ def _gathered(windows: Windows, light: Crops, terms: int) -> Image:
 class Moves:
     """Changes of each shot along with a free image: place in px (x, y), and relative light (R, G, B).
 
-    Attributes:
-        design: derivative of each sample by a change, in e-/s.
-        changed: sum of the changes so far.
-        sigma: prior standard deviations of the whole changes.
+    ``design`` has the derivatives of samples, in e-/s; ``changed`` is the sum of the changes so far, and ``sigma`` the
+    prior standard deviations of the whole changes.
     """
 
     design: Float[np.ndarray, "shots 5 rows columns"]

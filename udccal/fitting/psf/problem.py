@@ -217,12 +217,11 @@ def moved_own(own: Float[np.ndarray, "*k l"], step: Float[np.ndarray, "*k l"]) -
 
 def coefficients_of(evaluator: Evaluator, theta: Theta, samples: Samples) -> Float[np.ndarray, "positions y x 3"]:
     """Return the kernel's spline coefficients at every position."""
-    return np.stack([_coefficients(evaluator, theta, one) for one in samples.each()])
-
-
-def _coefficients(evaluator: Evaluator, theta: Theta, one: Samples) -> Float[np.ndarray, "y x 3"]:
-    overlaps = one.overlaps if np.shape(one.overlaps)[-1] else overlaps_of(evaluator, theta, one.frame)
-    return np.asarray(kernel_coefficients(evaluator, theta, one.frame, one.disc_px, overlaps))
+    kernels = []
+    for one in samples.each():
+        overlaps = one.overlaps if one.overlaps.shape[-1] else overlaps_of(evaluator, theta, one.frame)
+        kernels.append(np.asarray(kernel_coefficients(evaluator, theta, one.frame, one.disc_px, overlaps)))
+    return np.stack(kernels)
 
 
 def _about(
@@ -244,9 +243,8 @@ def _about(
     steps = zip(_IN_OVERLAPS, (2e-4, 1e-3), strict=True)
     moved = [(step, theta + step * np.eye(theta.size)[i]) for i, step in steps]
     by_overlaps = [(light(theta, overlaps_of(evaluator, there, one.frame)) - here) / step for step, there in moved]
-    direction = one.frame.direction
-    slope = direction[:2] / direction[2]
-    tangent = (np.eye(2) + np.outer(slope, slope)) / direction[2]
+    slope = one.frame.direction[:2] / one.frame.direction[2]
+    tangent = (np.eye(2) + np.outer(slope, slope)) / one.frame.direction[2]
     along = theta[FOOTPRINT][2] * (one.begun_px + offset_px) @ (tangent @ one.frame.jacobian).T
     correction = np.zeros_like(here)
     for shot, move in enumerate(along):
