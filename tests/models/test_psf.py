@@ -114,6 +114,15 @@ def test_a_lattice_gives_back_what_its_transfer_says() -> None:
     np.testing.assert_array_equal(as_numpy(value)(np.array([[30.0, 0.0]])), 0.0)
 
 
+def test_numpy_evaluates_a_lattice_as_jax_does() -> None:
+    rng, lattice = np.random.default_rng(0), lattice_for(20.0, 12.0, 3, 4)
+    coefficients = rng.normal(size=(lattice.rows, lattice.columns, 2))
+    points = rng.uniform(-11, 11, (300, 2))
+    compiled = as_numpy(lambda at: sample(lattice, jnp.asarray(coefficients), at))(points)
+    np.testing.assert_allclose(sample(lattice, coefficients, points), compiled, rtol=1e-9, atol=1e-12)
+    assert np.abs(sample(lattice, coefficients, points + 0.1) - compiled).max() > 0.1
+
+
 def test_polynomials_are_counted_and_start_with_one() -> None:
     unit = np.array([[0.2, -0.4], [1.0, 1.0]])
     basis = as_numpy(lambda u: polynomial_basis(u, 2))(unit)

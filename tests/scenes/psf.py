@@ -13,8 +13,7 @@ from udccal.cfa import cfa_named
 from udccal.fitting.hdr.merge import merge_bracket
 from udccal.fitting.nominal import nominal_geometry
 from udccal.fitting.psf.data import Shots, joined
-from udccal.fitting.psf.fit import WAVELENGTHS_NM
-from udccal.fitting.psf.kernel import Evaluator, fit_lattice
+from udccal.fitting.psf.kernel import WAVELENGTHS_NM, Evaluator, fit_lattice
 from udccal.fitting.psf.read import cut_crop
 from udccal.models.diffraction import Diffraction, average_transfer, local_frame
 from udccal.models.geometry import Geometry

@@ -11,8 +11,8 @@ from jaxtyping import Float
 from tests.scenes.psf import DISC_PX, Picture, Scene, pictures, shots_of, small_scene
 from udccal.cfa import cfa_named
 from udccal.fitting.psf.data import PsfRules, Shots
-from udccal.fitting.psf.fit import start_model, start_prior
 from udccal.fitting.psf.image import Sources, prior_sigma, shifts
+from udccal.fitting.psf.kernel import start_model, start_prior
 from udccal.fitting.psf.orders import select_field
 from udccal.models.fields import polynomial_basis, polynomial_terms
 from udccal.numerics import in_float64

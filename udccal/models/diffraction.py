@@ -22,7 +22,7 @@ from jaxtyping import Array, Float
 
 from udccal.models.arrays import Arrayish
 from udccal.models.geometry import Geometry, panel_directions, rotation_matrix
-from udccal.models.lattice import Lattice
+from udccal.models.lattice import Frequencies
 
 _FINE_NM = 1.0
 PUPIL_NODES = 4
@@ -93,7 +93,7 @@ def node_scale(frame: LocalFrame) -> Float[Array, "2"]:
 def average_transfer(
     model: Diffraction,
     frame: LocalFrame,
-    lattice: Lattice,
+    lattice: Frequencies,
     spectra: Float[Array, "c nodes"],
     disc_px: Float[Arrayish, ""] = 0.0,
 ) -> Float[Array, "c rows half"]:
@@ -107,13 +107,12 @@ def average_transfer(
         disc_px: diameter of a round source on the sensor; 0 for a point.
     """
     fx, fy = lattice_frequencies(frame, lattice)
-    opened = open_fractions(model, frame)
-    columns, rows = slit_tables(model, opened[0], fx, 0)[0], slit_tables(model, opened[1], fy, 0)[0]
+    columns, rows = (table[0] for table in slits_of(model, open_fractions(model, frame), fx, fy, 0))
     total = average_of(columns, rows, pupil_overlaps(model, frame, lattice), pupil_anchors(model)[1], spectra)
     return through_sensor(total, sensor_transfer(frame, fx, fy, model.blur_px, disc_px))
 
 
-def pupil_overlaps(model: Diffraction, frame: LocalFrame, lattice: Lattice) -> Float[Array, "anchors rows half"]:
+def pupil_overlaps(model: Diffraction, frame: LocalFrame, lattice: Frequencies) -> Float[Array, "anchors rows half"]:
     """Return the overlap of the pupil's footprint with itself moved, at the wavelengths of ``pupil_anchors``.
 
     Args:
@@ -137,7 +136,7 @@ def average_of(
     """Return transfer functions without the sensor. They are linear in every argument.
 
     Args:
-        columns: ``slit_tables`` of the columns, order 0. rows: those of the rows.
+        columns: ``slits_of`` the columns, order 0. rows: those of the rows.
         pupils: overlaps from ``pupil_overlaps``.
         share: weights from ``pupil_anchors``.
         spectra: light at the wavelength nodes.
@@ -160,7 +159,7 @@ def through_sensor(
     return jax.lax.map(lambda one: one * sensor, transfer)
 
 
-def lattice_frequencies(frame: LocalFrame, lattice: Lattice) -> tuple[Float[Array, " half"], Float[Array, " rows"]]:
+def lattice_frequencies(frame: LocalFrame, lattice: Frequencies) -> tuple[Float[Array, " half"], Float[Array, " rows"]]:
     """Return (f_x, f_y) of ``lattice`` around the source of ``frame``, in cycles per unit direction cosine."""
     scale = node_scale(frame)
     return jnp.asarray(lattice.frequency_x) / scale[0], jnp.asarray(lattice.frequency_y) / scale[1]
@@ -189,7 +188,7 @@ def disc_autocorrelation(relative_lag: Float[Arrayish, "*n"]) -> Float[Array, "*
 
 
 def slit_coefficients(
-    relative_lag: Float[Arrayish, "*n"], opened: Float[Arrayish, ""], highest: int
+    relative_lag: Float[Arrayish, "*n"], opened: Float[Arrayish, "*#n"], highest: int
 ) -> Float[Array, "orders *n"]:
     """Return Fourier coefficients, orders 0 to highest, of a row of slits times itself moved by the lag in pitches.
 
@@ -212,18 +211,18 @@ def slit_coefficients(
     return jnp.stack(made)
 
 
-def slit_tables(
-    model: Diffraction, opened: Float[Array, ""], frequency: Float[Array, " n"], highest: int
-) -> Float[Array, "orders n nodes"]:
-    """Return slit coefficients averaged over the light of each wavelength node, for lags lambda * frequency.
+def slits_of(
+    model: Diffraction, opened: Float[Array, "2"], fx: Float[Array, " half"], fy: Float[Array, " rows"], highest: int
+) -> tuple[Float[Array, "orders half nodes"], Float[Array, "orders rows nodes"]]:
+    """Return slit coefficients of columns and of rows, averaged over the light of each wavelength node.
 
     A node's light is a triangle as wide as its distance to its neighbours, summed in steps of about a nanometre. High
     orders therefore smear into a continuum, as they do in daylight, without a node for every nanometre.
 
     Args:
         model: the diffraction term.
-        opened: open part of a period along the source's ray.
-        frequency: cycles per unit direction cosine.
+        opened: open part of (columns, rows) along the source's ray.
+        fx: cycles per unit direction cosine along x, for the columns. fy: along y, for the rows.
         highest: highest Fourier order.
     """
     nodes = jnp.asarray(model.wavelengths_nm)
@@ -232,12 +231,16 @@ def slit_tables(
     offset = jnp.arange(-count + 1, count) / count
     triangle = (1.0 - jnp.abs(offset)) / count
     fine = nodes[:, None] + offset * step
+    # One loop for both axes: it compiles once.
+    frequency, count = jnp.concatenate([fx, fy])[:, None], fx.shape[0]
+    open_part = jnp.where(jnp.arange(frequency.shape[0]) < count, opened[0], opened[1])[:, None]
 
     def averaged(wavelengths_nm: Float[Array, " k"]) -> Float[Array, "orders n"]:
-        lag = frequency[:, None] * (wavelengths_nm * 1e-6 / model.pitch_mm)
-        return slit_coefficients(lag, opened, highest) @ triangle
+        lag = frequency * (wavelengths_nm * 1e-6 / model.pitch_mm)
+        return slit_coefficients(lag, open_part, highest) @ triangle
 
-    return jnp.moveaxis(jax.lax.map(averaged, fine), 0, -1)
+    table = jnp.moveaxis(jax.lax.map(averaged, fine), 0, -1)
+    return table[:, :count], table[:, count:]
 
 
 def _fine_count(model: Diffraction) -> int:

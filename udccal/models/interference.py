@@ -19,7 +19,7 @@ from udccal.models.diffraction import (
     open_fractions,
     relative_lag,
     sensor_transfer,
-    slit_tables,
+    slits_of,
     through_sensor,
 )
 from udccal.models.lattice import Lattice
@@ -51,8 +51,7 @@ def interference_transfer(
         disc_px: diameter of a round source on the sensor; 0 for a point.
     """
     fx, fy = lattice_frequencies(frame, lattice)
-    opened = open_fractions(model, frame)
-    columns, rows = (slit_tables(model, opened[axis], f, HIGHEST_ORDER) for axis, f in enumerate((fx, fy)))
+    columns, rows = slits_of(model, open_fractions(model, frame), fx, fy, HIGHEST_ORDER)
     total = interference_of(strengths(model, footprint_place(model, frame)), columns, rows, overlaps, spectra)
     return through_sensor(total, sensor_transfer(frame, fx, fy, model.blur_px, disc_px))
 
@@ -83,7 +82,7 @@ def interference_of(
 
     Args:
         strength: from ``strengths``.
-        columns: ``slit_tables`` of the columns up to ``HIGHEST_ORDER``. rows: those of the rows.
+        columns: ``slits_of`` the columns up to ``HIGHEST_ORDER``. rows: those of the rows.
         overlaps: from ``node_overlaps``.
         spectra: light at the wavelength nodes.
     """
@@ -92,7 +91,8 @@ def interference_of(
         total: Float[Array, "c rows half"], node: tuple[Array, Array, Array, Array]
     ) -> tuple[Float[Array, "c rows half"], None]:
         column, row, overlap, share = node
-        here = jnp.einsum("t,ty,tx,tyx->yx", strength, row[_ROW_OF], column[_COLUMN_OF], overlap)
+        down = strength[:, None] * row[_ROW_OF]
+        here = jnp.sum(down[:, :, None] * column[_COLUMN_OF][:, None, :] * overlap, axis=0)
         return total + share[:, None, None] * here, None
 
     nodes = (jnp.moveaxis(columns, -1, 0), jnp.moveaxis(rows, -1, 0), jnp.asarray(overlaps), spectra.T)

@@ -7,12 +7,45 @@ Cubic B-spline coefficients are the picture divided, in frequency, by the spline
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any, Protocol, runtime_checkable
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from udccal.models.arrays import Arrayish
+
+
+@runtime_checkable
+class Frequencies(Protocol):
+    """The frequencies of a half-plane spectrum, in cycles per pixel."""
+
+    @property
+    def frequency_y(self) -> Float[np.ndarray, " rows"]:
+        """Of each row."""
+
+    @property
+    def frequency_x(self) -> Float[np.ndarray, " half"]:
+        """Of each column."""
+
+
+@dataclass(frozen=True)
+class Joined:
+    """Frequencies of two lattices, one after the other: they make one transfer function of four parts."""
+
+    first: Lattice
+    second: Lattice
+
+    @property
+    def frequency_y(self) -> Float[np.ndarray, " rows"]:
+        """Of each row, in cycles per pixel."""
+        return np.concatenate([self.first.frequency_y, self.second.frequency_y])
+
+    @property
+    def frequency_x(self) -> Float[np.ndarray, " half"]:
+        """Of each column, in cycles per pixel."""
+        return np.concatenate([self.first.frequency_x, self.second.frequency_x])
 
 
 @dataclass(frozen=True)
@@ -84,8 +117,8 @@ def spline_coefficients(lattice: Lattice, transfer: Float[Array, "c rows half"])
 
 
 def sample(
-    lattice: Lattice, coefficients: Float[Array, "rows columns c"], points_px: Float[Array, "n 2"]
-) -> Float[Array, "n c"]:
+    lattice: Lattice, coefficients: Float[Arrayish, "rows columns c"], points_px: Float[Arrayish, "n 2"]
+) -> Float[Arrayish, "n c"]:
     """Evaluate pictures at points.
 
     A lattice repeats itself. Pictures here fall as 1/x^2 along their series of diffraction orders, so their sum over
@@ -93,32 +126,29 @@ def sample(
 
     Args:
         lattice: the lattice of nodes.
-        coefficients: from ``spline_coefficients``.
+        coefficients: from ``spline_coefficients``; of numpy, they are evaluated by numpy, without compiling.
         points_px: (x, y) in px from the origin.
 
     Returns:
         density per square pixel; zero outside the lattice.
     """
-    size = jnp.array([lattice.columns, lattice.rows])
-    nodes = points_px * jnp.array([lattice.per_px_x, lattice.per_px_y])
-    along = nodes / size
-    inside = jnp.all(jnp.abs(along) < 0.5, axis=-1)
-    base = jnp.floor(nodes)
-    weights_x, weights_y = (_cubic_b_spline(nodes[:, i] - base[:, i]) for i in (0, 1))
-    first = base.astype(jnp.int32) - 1
-    taps = jnp.arange(4)
+    xp: Any = jnp if isinstance(coefficients, jax.Array) else np
+    nodes = points_px * xp.array([lattice.per_px_x, lattice.per_px_y])
+    along = nodes / xp.array([lattice.columns, lattice.rows])
+    inside = xp.all(xp.abs(along) < 0.5, axis=-1)
+    base = xp.floor(nodes)
+    weights_x, weights_y = (xp.stack(_cubic_b_spline(nodes[:, i] - base[:, i]), axis=-1) for i in (0, 1))
+    first, taps = base.astype(xp.int32) - 1, xp.arange(4)
     columns = (first[:, 0, None] + taps) % lattice.columns
     rows = (first[:, 1, None] + taps) % lattice.rows
     flat = coefficients.reshape(lattice.rows * lattice.columns, -1)
-    near = flat[(rows[:, :, None] * lattice.columns + columns[:, None, :])]
-    value = jnp.einsum("nyxc,ny,nx->nc", near, weights_y, weights_x)
-    unfold = jnp.prod(jnp.sinc(along) ** 2, axis=-1)
-    return value * jnp.where(inside, unfold, 0.0)[:, None]
+    near = flat[(rows[:, :, None] * lattice.columns + columns[:, None, :]).reshape(-1, 16)]
+    weights = (weights_y[:, :, None] * weights_x[:, None, :]).reshape(-1, 16)
+    unfold = xp.prod(xp.sinc(along) ** 2, axis=-1)
+    return xp.einsum("ntc,nt->nc", near, weights) * xp.where(inside, unfold, 0.0)[:, None]
 
 
-def _cubic_b_spline(t: Float[Array, " n"]) -> Float[Array, "n 4"]:
+def _cubic_b_spline(t: Float[Arrayish, " n"]) -> tuple[Float[Arrayish, " n"], ...]:
     """Return the weights of nodes -1, 0, 1, 2 at a fraction ``t`` between nodes 0 and 1."""
     u = 1.0 - t
-    return jnp.stack(
-        [u**3 / 6.0, (4.0 - 6.0 * t**2 + 3.0 * t**3) / 6.0, (4.0 - 6.0 * u**2 + 3.0 * u**3) / 6.0, t**3 / 6.0], axis=-1
-    )
+    return u**3 / 6.0, (4.0 - 6.0 * t**2 + 3.0 * t**3) / 6.0, (4.0 - 6.0 * u**2 + 3.0 * u**3) / 6.0, t**3 / 6.0

@@ -20,7 +20,7 @@ from udccal.models.diffraction import Diffraction, LocalFrame, average_transfer,
 from udccal.models.fields import polynomial_basis
 from udccal.models.geometry import Geometry, area_of_pixels, panel_directions
 from udccal.models.interference import interference_transfer, node_overlaps, overlap_tables
-from udccal.models.lattice import Lattice, lattice_for, low_pass, sample, spline_coefficients
+from udccal.models.lattice import Joined, Lattice, lattice_for, low_pass, sample, spline_coefficients
 
 # A kernel is a cross: detail finer than this band (cycles per pixel) along an axis matters only near the other axis.
 _BAND = (0.8, 1.3)
@@ -110,23 +110,24 @@ def diffraction_kernel(
 
 
 def _cross(
-    transfer: Callable[[Lattice], Float[Array, "c rows half"]],
+    transfer: Callable[[Joined], Float[Array, "c rows half"]],
     points: Float[Array, "n 2"],
     size_px: tuple[int, int],
     fine: int,
 ) -> Float[Array, "n c"]:
     """Evaluate a transfer function's picture at points, in four bands: coarse or fine along each axis."""
     rows, columns = size_px
+    coarse = lattice_for(rows * _MARGIN, columns * _MARGIN, _COARSE, _COARSE)
+    dense = lattice_for(_FINE_PX * _MARGIN, _FINE_PX * _MARGIN, fine, fine)
+    whole, start, half = transfer(Joined(coarse, dense)), coarse.rows, coarse.frequency_x.size
     values: Array | float = 0.0
     for fine_y, fine_x in itertools.product((False, True), repeat=2):
-        grid = lattice_for(
-            (_FINE_PX if fine_y else rows) * _MARGIN,
-            (_FINE_PX if fine_x else columns) * _MARGIN,
-            fine if fine_y else _COARSE,
-            fine if fine_x else _COARSE,
-        )
+        down, across = (dense if fine_y else coarse), (dense if fine_x else coarse)
+        grid = Lattice(down.rows, across.columns, down.per_px_y, across.per_px_x)
+        part = whole[:, slice(start, None) if fine_y else slice(start)]
+        part = part[:, :, slice(half, None) if fine_x else slice(half)]
         band = _band(grid.frequency_y, fine_y)[:, None] * _band(grid.frequency_x, fine_x)
-        coefficients = spline_coefficients(grid, transfer(grid) * band)
+        coefficients = spline_coefficients(grid, part * band)
         near = jnp.ones(points.shape[0])
         near = near * low_pass(points[:, 0], *_FINE_BLEND_PX) if fine_x else near
         near = near * low_pass(points[:, 1], *_FINE_BLEND_PX) if fine_y else near

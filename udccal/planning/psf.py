@@ -17,8 +17,7 @@ from udccal.arrangements import Led
 from udccal.cfa import cfa_named
 from udccal.fitting.engine.gaussian import Prior, scaled_inverse
 from udccal.fitting.psf.data import PsfRules, Shots, held_out_positions
-from udccal.fitting.psf.fit import start_model, start_prior
-from udccal.fitting.psf.kernel import Evaluator, fit_lattice
+from udccal.fitting.psf.kernel import Evaluator, fit_lattice, start_model, start_prior
 from udccal.fitting.psf.problem import DiffractionProblem, Place
 from udccal.fitting.psf.samples import Samples, choose_samples, gather, stands_for, weighed
 from udccal.numerics import in_float64

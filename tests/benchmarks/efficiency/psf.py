@@ -18,8 +18,7 @@ from udccal.fitting.engine.gaussian import Prior, scaled_inverse
 from udccal.fitting.engine.information import cramer_rao
 from udccal.fitting.psf.data import PsfRules
 from udccal.fitting.psf.diffraction import fit_diffraction
-from udccal.fitting.psf.fit import WAVELENGTHS_NM, start_model, start_prior
-from udccal.fitting.psf.kernel import Evaluator, fit_lattice
+from udccal.fitting.psf.kernel import WAVELENGTHS_NM, Evaluator, fit_lattice, start_model, start_prior
 from udccal.fitting.psf.problem import DiffractionProblem, coefficients_of
 from udccal.fitting.psf.samples import Samples, gather, sensor_variance, unit_light
 from udccal.numerics import in_float64

@@ -9,8 +9,8 @@ import numpy as np
 from tests.benchmarks.extremes.case import Case, Outcome, outcome
 from tests.scenes.psf import Scene, pictures, shots_of, small_scene
 from udccal.fitting.psf.data import PsfData, PsfRules
-from udccal.fitting.psf.fit import fit_psf, start_model, start_prior
-from udccal.fitting.psf.kernel import BLUR
+from udccal.fitting.psf.fit import fit_psf
+from udccal.fitting.psf.kernel import BLUR, start_model, start_prior
 from udccal.models.psf import PsfField
 from udccal.result import FitResult
 

@@ -17,8 +17,9 @@ from udccal.fitting.hdr.merge import HdrMerge
 from udccal.fitting.noise.fit import nominal_noise
 from udccal.fitting.nominal import nominal_geometry
 from udccal.fitting.psf.data import PsfData, PsfRules, Shots, group, joined
-from udccal.fitting.psf.fit import fit_psf, start_model, wire_shows
+from udccal.fitting.psf.fit import fit_psf
 from udccal.fitting.psf.image import shifts
+from udccal.fitting.psf.kernel import start_model, wire_shows
 from udccal.fitting.psf.read import cut_crop, read_psf, window_half
 from udccal.models.psf import PsfField, psf_kernels
 from udccal.numerics import in_float64

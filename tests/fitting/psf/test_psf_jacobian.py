@@ -9,17 +9,20 @@ from scipy.special import softmax
 from tests.scenes.psf import Scene, pictures, shots_of, small_scene
 from udccal.fitting.engine.gaussian import Prior
 from udccal.fitting.psf.data import PsfData, PsfRules, Shots
-from udccal.fitting.psf.fit import WAVELENGTHS_NM, fit_psf, start_model, start_prior, wavelengths_nm
+from udccal.fitting.psf.fit import fit_psf
 from udccal.fitting.psf.kernel import (
     HEAD,
     PITCH,
     PUPIL,
+    WAVELENGTHS_NM,
     Evaluator,
-    factor_jacobian,
     fit_lattice,
     kernel_coefficients,
     kernel_jacobian,
     overlaps_of,
+    start_model,
+    start_prior,
+    wavelengths_nm,
 )
 from udccal.fitting.psf.problem import DiffractionProblem, Place, stepped
 from udccal.fitting.psf.samples import gather, unit_light
@@ -64,9 +67,9 @@ def test_slopes_of_the_kernel_are_those_of_differences(
 def slopes_both_ways(scene: Scene, prior: Prior, shots: Shots, interference: bool) -> tuple[np.ndarray, np.ndarray]:
     problem = problem_of(scene, prior, shots, interference)
     one, theta, evaluator = problem.samples.at(0), prior.mean, problem.evaluator
-    _, by_factor = kernel_jacobian(evaluator, evaluator.model(theta), one.frame, one.disc_px, one.overlaps)
-    chain = np.asarray(factor_jacobian(evaluator, theta, one.frame))
-    found = np.einsum("yxfc,fp->pyxc", np.asarray(by_factor), chain)
+    made, chain = (np.asarray(p) for p in kernel_jacobian(evaluator, theta, one.frame, one.disc_px, one.overlaps))
+    by_factor = made[..., len(WAVELENGTHS_NM) :].reshape(*made.shape[:2], -1, 3)
+    found = np.einsum("yxfc,fp->pyxc", by_factor, chain)
     wanted = []
     for step in np.eye(HEAD, theta.size) * _STEPS[:, None]:
         more, less = (
@@ -106,10 +109,39 @@ def overlap_slopes(scene: Scene, prior: Prior, shots: Shots) -> tuple[np.ndarray
             other[number] += move
             # The kernel of the same numbers: what changes is the overlaps.
             overlaps = overlaps_of(problem.evaluator, other, one.frame)
-            kernel = kernel_coefficients(problem.evaluator, theta, one.frame, one.disc_px, overlaps)
+            kernel = np.asarray(kernel_coefficients(problem.evaluator, theta, one.frame, one.disc_px, overlaps))
             lit.append(np.asarray(unit_light(problem.evaluator, one, own[0, :, :2], kernel)))
         wanted.append((lit[0] - lit[1]) / (2 * step_mm))
     return np.moveaxis(np.asarray(one.by_overlaps), -1, 0), np.stack(wanted)
+
+
+@pytest.mark.medium
+def test_derivatives_of_a_place_nearby_serve_with_the_light_of_the_place_itself(
+    scene: Scene, prior: Prior, shots: Shots
+) -> None:
+    (cost, right), (near_cost, near_right), (far_cost, far_right) = equations_near(scene, prior, shots)
+    assert near_cost == pytest.approx(cost, rel=1e-9)
+    assert far_cost == pytest.approx(cost, rel=1e-9)
+    assert np.linalg.norm(near_right - right) < 1e-4 * np.linalg.norm(right)
+    assert np.linalg.norm(far_right - right) > 1e-3 * np.linalg.norm(right)  # that the comparison can fail
+
+
+@in_float64
+def equations_near(scene: Scene, prior: Prior, shots: Shots) -> list[tuple[float, np.ndarray]]:
+    """Cost and right side at one place: with its own derivatives, with those of a place nearby, and of one far off."""
+    problem, theta = problem_of(scene, prior, shots, False), prior.mean
+    own = np.zeros((1, shots.position.tolist().count(0), 6))
+    own[..., 2:5] = shots.rate.max()
+    here = Place(theta, own)
+    alone, found = problem.equations_at(here), []
+    for off in (1e-4, 0.1):
+        other = theta.copy()
+        other[PUPIL] *= 1.0 + off
+        base = Place(other, own)
+        problem.equations_at(base)
+        made = problem.equations_at(Place(theta, own, base))
+        found.append((made.cost, made.right))
+    return [(alone.cost, alone.right), *found]
 
 
 def test_a_step_makes_spectra_grow_by_what_it_says() -> None:

@@ -16,11 +16,18 @@ from udccal.cfa import cfa_named
 from udccal.fitting.absent import absent_wire
 from udccal.fitting.noise.fit import nominal_noise
 from udccal.fitting.nominal import nominal_geometry
-from udccal.fitting.psf.fit import nominal_psf, wide_support, with_support
-from udccal.fitting.psf.held_out import Compared, Support, choose_support, windows_to_try
+from udccal.fitting.psf.fit import nominal_psf
+from udccal.fitting.psf.held_out import (
+    Support,
+    choose_support,
+    support_notes,
+    wide_support,
+    windows_to_try,
+    with_support,
+)
 from udccal.fitting.psf.image import Sources
+from udccal.fitting.psf.orders import Compared
 from udccal.fitting.psf.read import read_psf
-from udccal.fitting.psf.report import support_notes
 from udccal.kernels import fitted_size, kernel_size, kernels_at
 from udccal.models.psf import PsfField
 from udccal.rig import load_rig

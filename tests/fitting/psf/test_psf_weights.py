@@ -14,9 +14,8 @@ from hypothesis import strategies as st
 from tests.scenes.psf import frames_of, small_scene
 from udccal.fitting.hdr.merge import HdrMerge
 from udccal.fitting.psf.data import PsfRules, Shots, estimate_model_error, left_out
-from udccal.fitting.psf.diffraction import without_outliers
+from udccal.fitting.psf.diffraction import pattern_p_value, without_outliers
 from udccal.fitting.psf.read import shot_noise
-from udccal.fitting.psf.report import pattern_p_value
 from udccal.fitting.psf.samples import Samples, choose_samples, sensor_variance, stands_for, weighed
 from udccal.models.diffraction import LocalFrame
 

@@ -189,23 +189,17 @@ def group(aims_px: Float[np.ndarray, "shots 2"]) -> Int[np.ndarray, " shots"]:
 
 
 def held_out_positions(count: int) -> Bool[np.ndarray, " positions"]:
-    """Return which positions are held out while orders are compared: every fourth from the second on, at least one.
-
-    Args:
-        count: number of field positions.
-    """
+    """Return which of ``count`` positions are held out while orders are compared: every fourth from the second on."""
     return np.arange(count) % 4 == 1
 
 
 @final
 @dataclass(frozen=True)
 class PsfData:
-    """The data of a psf fit.
+    """The data of a psf fit: crops, and numbers of pictures captured, of those without an LED, and of clipped ones.
 
-    Attributes:
-        shots: crops, which may be wider than the fit's windows: the support of the kernel needs all of them. None
-            where no picture can be used.
-        taken, dark, clipped: numbers of pictures captured, of those without an LED, and of those that are clipped.
+    Crops may be wider than the fit's windows: the kernel's support needs all of them. There are none where no picture
+    can be used.
     """
 
     shots: Shots | None
@@ -238,10 +232,10 @@ def estimate_model_error(
     unit: Float[np.ndarray, " samples"],
     parameters: int,
 ) -> float:
-    """Return the model error of greatest likelihood, or 0 where BIC prefers noise alone.
+    """Return the model error of greatest likelihood, or 0 where BIC prefers noise alone (``variance``).
 
     ``unit`` is the standard deviation that a model error of 1 adds to a sample. Residuals are smaller than errors by
-    the number of fitted ``parameters``, which is corrected for. ``variance`` is the sensor noise's.
+    the number of fitted ``parameters``, which is corrected for.
     """
     raised = residual**2 * (residual.size / max(residual.size - parameters, 1))
 

@@ -10,6 +10,7 @@ from typing import final
 
 import numpy as np
 from jaxtyping import Float
+from scipy.special import ndtr
 
 from udccal.fitting.engine.gaussian import Prior, scaled_inverse
 from udccal.fitting.engine.iteration_log import LOG
@@ -41,14 +42,12 @@ class DiffractionFit:
     """The result of a fit of diffraction.
 
     Attributes:
-        problem, solution: the equations, and the end of the descent.
         shots: the data, at the places that the samples are about.
         model_error: as a fraction of the peak, see ``data.left_out``; 0 where the residuals are noise.
-        outliers: pictures and samples that were left out.
         iterations: sum over all descents.
-        phase: comparison by BIC of a kernel with the wire's phase to one averaged over it. The fits are the phase's
-            strength in the kernel (1 where it agrees with the wire, 0 where the kernel does not show it) and its sigma.
-            None where no wire was seen.
+        phase: comparison by BIC of a kernel with the wire's phase to one averaged over it; None where no wire was
+            seen. The fits are the phase's strength in the kernel (1 where it agrees with the wire, 0 where the kernel
+            does not show it) and its sigma.
     """
 
     problem: DiffractionProblem
@@ -100,13 +99,8 @@ def fit_diffraction(
 ) -> DiffractionFit:
     """Fit the parameters of diffraction: first to near the minimum, then to the minimum at the places found there.
 
-    Args:
-        shots: the data in e-/s, positions numbered without gaps.
-        geometry: the rays of pixels.
-        start: gives the nodes of the spectra. With a ``visibility``, the footprint's place on the rows is known, and
-            ``phase`` says whether the data show it.
-        prior: of the parameters of ``kernel.pack``; its mean is the start.
-        rules: windows, effort and constants.
+    ``start`` gives the nodes of the spectra. With a ``visibility``, the footprint's place on the rows is known, and
+    ``phase`` says whether the data show it. The mean of the ``prior`` is the start.
     """
     chosen = choose_samples(shots, rules)
     evaluator = Evaluator(
@@ -114,7 +108,7 @@ def fit_diffraction(
     )
     problem = DiffractionProblem(gather(shots, geometry, chosen), evaluator, prior).with_overlaps(prior.mean)
     near = _approach(problem, rules)
-    own, index, places = near.place.own.copy(), np.asarray(problem.samples.index), shots.centre_px.copy()
+    own, index, places = near.place.own.copy(), problem.samples.index, shots.centre_px.copy()
     places[index[index >= 0]] += own[index >= 0][:, :2]
     own[..., :2] = 0.0
     shots = replace(shots, centre_px=places)
@@ -124,7 +118,8 @@ def fit_diffraction(
         return fit
     phase = phase_evidence(fit)
     if phase.best is not phase.tried[0]:
-        averaged = replace(problem, evaluator=Evaluator(evaluator.wavelengths_nm, evaluator.lattice, False))
+        alone = Evaluator(evaluator.wavelengths_nm, evaluator.lattice, False)
+        averaged = DiffractionProblem(problem.samples, alone, prior)
         fit = _refine(averaged, shots, fit.solution.place, rules, 0)
     return replace(fit, phase=phase)
 
@@ -147,7 +142,9 @@ def _refine(
     """
     whole, enough = None, 1.0
     for _ in range(5):
-        problem, model_error, found = _reweighed(problem.about(place), place, rules)
+        # A change of less than a sigma is small enough for the interference set up before.
+        problem = problem.about(place) if enough == 1.0 else problem
+        problem, model_error, found = _reweighed(problem, place, rules)
         solution = minimise(problem, place, _solver(enough, rules.iterations - iterations))
         iterations += solution.iterations
         change = solution.place.theta - place.theta
@@ -175,8 +172,8 @@ def _reweighed(
 ) -> tuple[DiffractionProblem, float, tuple[Outliers, ...]]:
     """Set weights at the model's light, with the model error of the residuals, and leave outliers out."""
     samples, light, background = problem.samples, problem.light_at(place), place.own[..., 5:]
-    seen, level = np.asarray(samples.known) > 0, light + background
-    of_samples = (np.asarray(samples.rate) - level, sensor_variance(samples, level), left_out(light * seen, 1.0))
+    seen, level = samples.known > 0, light + background
+    of_samples = (samples.rate - level, sensor_variance(samples, level), left_out(light * seen, 1.0))
     residual, variance, unit = (part[seen] for part in of_samples)
     model_error = estimate_model_error(residual, variance, unit, problem.unknowns)
     problem = replace(problem, samples=weighed(samples, model_error, light, background))
@@ -187,10 +184,10 @@ def _reweighed(
 def without_outliers(samples: Samples, z: Lights, rules: PsfRules) -> tuple[Samples, tuple[Outliers, ...]]:
     """Return samples in which outliers have no weight, and a list of these: pictures, then samples of the others.
 
-    ``z`` is data less expectation in units of sigma. In a picture that fits much worse than the others something moved,
-    flickered or was in the way. It needs its own rule in addition to the engine's rule of single samples.
+    In a picture that fits much worse than the others something moved, flickered or was in the way. It needs its own
+    rule in addition to the engine's rule of single samples. ``z`` is data less expectation in units of sigma.
     """
-    weight, index = np.asarray(samples.weight), np.asarray(samples.index)
+    weight, index = samples.weight, samples.index
     used, real = weight > 0, index >= 0
     # Residuals are bounded, so that one cosmic hit does not make its picture an outlier.
     square = (np.minimum(z**2, HUBER.sigma**2) * used).sum(axis=-1) / np.maximum(used.sum(axis=-1), 1)
@@ -210,14 +207,13 @@ def without_outliers(samples: Samples, z: Lights, rules: PsfRules) -> tuple[Samp
 def phase_evidence(fit: DiffractionFit) -> Choice[tuple[float, float]]:
     """Compare a fit with interference to the same fit without it, to second order about the fit."""
     problem, place, here = fit.problem, fit.solution.place, fit.solution.equations
-    none = {n: np.zeros_like(getattr(problem.samples, n)) for n in ("correction", "by_overlaps", "overlaps")}
     light = problem.light_at(place)
-    change = light - replace(problem, samples=replace(problem.samples, **none)).light_at(place)
-    in_sigma = change * np.sqrt(np.asarray(problem.samples.weight))
+    change = light - problem.light_of_average(place)
+    in_sigma = change * np.sqrt(problem.samples.weight)
     score, alone = float((in_sigma * problem.errors(place, light)).sum()), float((in_sigma**2).sum())
     # Residuals change by so small a part of the phase's light that their outliers stay the same.
     part = 1e-3
-    moved = replace(problem.samples, rate=np.asarray(problem.samples.rate) + part * change)
+    moved = replace(problem.samples, rate=problem.samples.rate + part * change)
     there = replace(problem, samples=moved).equations_at(place)
     shared, own = (there.right - here.right) / part, (there.own_right - here.own_right) / part
     # Residuals that the other parameters can compensate hold no information on the strength.
@@ -236,8 +232,8 @@ def efficiency(fit: DiffractionFit, rules: PsfRules, available: int, reported: i
     Samples drawn away from the peak represent all samples there; the fit's pictures represent all that are
     ``available``. The mean is over the first ``reported`` parameters.
     """
-    samples, count = fit.problem.samples, stands_for(fit.shots, rules)[np.asarray(fit.problem.samples.index)]
-    weighed_up = replace(samples, weight=np.asarray(samples.weight) * count)
+    samples, count = fit.problem.samples, stands_for(fit.shots, rules)[fit.problem.samples.index]
+    weighed_up = replace(samples, weight=samples.weight * count)
     positions = replace(fit.problem, samples=weighed_up).by_position(fit.solution.place)
     information = sum(position.marginal()[0] for position in positions) * available / fit.shots.count
     best = scaled_inverse(fit.problem.prior.precision + information)
@@ -250,9 +246,34 @@ def kernel_sigma(fit: DiffractionFit, cov: Float[np.ndarray, "p p"]) -> float:
     With equal weights for all samples of the kernel, the equations' matrix is the sum of its squared derivatives.
     """
     samples = fit.problem.samples.at(slice(1))
-    even = np.asarray(samples.colour) / np.maximum(np.asarray(samples.colour).sum(axis=2, keepdims=True), 1)
+    even = samples.colour / np.maximum(samples.colour.sum(axis=2, keepdims=True), 1)
     own = np.concatenate([fit.solution.place.own[:1, :, :2], np.tile([1.0, 1.0, 1.0, 0.0], (1, even.shape[1], 1))], -1)
-    place, one = Place(fit.theta, own), replace(fit.problem, samples=replace(samples, weight=even.sum(axis=-1)))
+    place, weighed_evenly = Place(fit.theta, own), replace(samples, weight=even.sum(axis=-1))
+    one = DiffractionProblem(weighed_evenly, fit.problem.evaluator, fit.problem.prior)
     light = one.light_at(place)
     (sums,) = replace(one, samples=replace(one.samples, rate=light)).by_position(place)
     return float(np.sqrt(max(float((sums.shared * cov).sum()), 0.0) / float((even.sum(axis=-1) * light**2).sum())))
+
+
+def pattern_p_value(samples: Samples, z: Lights) -> float:
+    """Return the probability that noise alone makes residuals of a position's pictures at least as similar.
+
+    Each picture has its own noise, and samples the kernel at its own fraction of a pixel. Residuals of one colour at
+    the same place of the kernel, within a pixel, are uncorrelated between two pictures unless the model is wrong there.
+    The mean of their products, in units of its standard error, is normal. Means of groups (``engine.misfit``) also hold
+    squares, which are no evidence and hide the common part of two pictures.
+    ``z`` is data less expectation, in units of sigma.
+    """
+    z = np.clip(z, -HUBER.sigma, HUBER.sigma)
+    cell = np.concatenate([np.floor(samples.points), samples.colour.argmax(axis=-1)[..., None]], axis=-1).astype(
+        np.int64
+    )
+    position = np.broadcast_to(np.arange(len(z))[:, None, None, None], (*z.shape, 1))
+    number = np.unique(np.concatenate([position, cell], axis=-1).reshape(-1, 4), axis=0, return_inverse=True)[1]
+    shot = np.broadcast_to(np.arange(z.shape[1])[:, None], z.shape).ravel()
+    sums, squares = (np.zeros((int(number.max()) + 1, z.shape[1])) for _ in range(2))
+    np.add.at(sums, (number.reshape(-1), shot), z.ravel())
+    np.add.at(squares, (number.reshape(-1), shot), z.ravel() ** 2)
+    # Only pairs of different pictures count.
+    total, variance = (float((part.sum(axis=1) ** 2 - (part**2).sum(axis=1)).sum()) / 2.0 for part in (sums, squares))
+    return float(ndtr(-total / np.sqrt(variance))) if variance > 0 else 1.0

@@ -8,30 +8,48 @@ prediction, and how far from the LED the kernel reaches.
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 from typing import Final
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-from udccal.fitting.engine.gaussian import Prior
+from udccal.fitting.engine.gaussian import Posterior, square_root
+from udccal.fitting.engine.misfit import SIGNIFICANT
+from udccal.fitting.engine.report import estimates, residual_sample
 from udccal.fitting.psf.data import PsfData, PsfRules, Shots, about_middle, held_out_positions
-from udccal.fitting.psf.diffraction import fit_diffraction
-from udccal.fitting.psf.held_out import Support, choose_support, compare
-from udccal.fitting.psf.image import Sources, make_windows, predict
-from udccal.fitting.psf.kernel import HEAD, pack
-from udccal.fitting.psf.orders import select_field
+from udccal.fitting.psf.diffraction import DiffractionFit, efficiency, fit_diffraction, kernel_sigma, pattern_p_value
+from udccal.fitting.psf.held_out import (
+    KernelError,
+    Support,
+    choose_support,
+    error_patterns,
+    kernel_error,
+    support_notes,
+    wide_support,
+    with_support,
+)
+from udccal.fitting.psf.image import Sources
+from udccal.fitting.psf.kernel import BLUR, as_numpy, pitch_tolerance, start_model, start_prior
+from udccal.fitting.psf.orders import Selection, select_field
 from udccal.fitting.psf.problem import explain
-from udccal.fitting.psf.report import as_numpy, report
-from udccal.kernels import kernel_size, kernels_at
 from udccal.models.diffraction import Diffraction
 from udccal.models.geometry import Geometry
 from udccal.models.psf import PsfField, fine_oversample
 from udccal.models.wire import Wire
 from udccal.numerics import in_float64
-from udccal.result import FitResult, FitStatus
+from udccal.result import Diagnostic, Estimate, FitResult, FitStatus
 from udccal.rig import RigDescription
 
-WAVELENGTHS_NM: Final = np.linspace(400.0, 700.0, 13)
+# The first parameters: name, unit, and true for a length on the panel, which is measured in pitches.
+_NUMBERS: Final = (
+    ("pitch_mm", "mm", True),
+    ("column_open", "1", False),
+    ("row_open", "1", False),
+    ("depth_mm", "mm", True),
+    ("pupil_diameter_mm", "mm", True),
+    ("blur_px", "px", False),
+)
 
 
 @in_float64
@@ -60,16 +78,15 @@ def fit_psf(
         return FitResult.failed("psf", _field(start, geometry), status, note)
     shots = data.shots.within(rules.half_px)
     fit = fit_diffraction(shots.pick(some_shots(shots, rules)), geometry, start, start_prior(rig, start, rules), rules)
-    allowed = max(fit.model_error, rules.first_model_error)
-    own, explained = explain(fit.problem, fit.theta, shots, geometry, allowed)
+    own, explained = explain(fit.problem, fit.theta, shots, geometry, max(fit.model_error, rules.first_model_error))
     sources = Sources(own[:, :2], own[:, 2:5], own[:, 5]).with_light_of_peak(shots, explained)
     size = np.array([rig.camera.columns - 1, rig.camera.rows - 1]) / 2.0
     selection = select_field(shots, sources, explained, (shots.positions_px() - size) / size, fit.model_error, rules)
-    order, support = selection.trial.order, selection.support
+    order, support = selection.trial.order, choose_support(selection.trial.compared)
     term = replace(
         _field(as_numpy(fit.problem.evaluator.model(fit.theta)), geometry),
         diffraction_fraction=np.float64(not order.free),
-        residual=selection.image,
+        residual=about_middle(selection.image, support.half_px) if order.free else selection.image,
         centre_px=size,
         half_px=size,
         degree=max(order.degree, 0),
@@ -80,7 +97,7 @@ def fit_psf(
         # Two whole pictures of each of these positions are enough.
         looked_at = np.concatenate([np.flatnonzero(shots.position == p)[:2] for p in held_out])
         support = wide_support(data.shots.pick(looked_at), selection.trial.sources.pick(looked_at), term, rig)
-    return report(data, fit, replace(selection, support=support), with_support(term, support, rig), rig, rules)
+    return _report(data, shots, fit, selection, support, with_support(term, support, rig), rig, rules)
 
 
 def nominal_psf(rig: RigDescription, geometry: Geometry, wire: Wire) -> PsfField:
@@ -139,108 +156,142 @@ def _field(model: Diffraction, geometry: Geometry) -> PsfField:
     )
 
 
-def wide_support(wide: Shots, sources: Sources, term: PsfField, rig: RigDescription) -> Support:
-    """Choose the support from whole pictures of positions held out, whose places and light are ``sources``."""
-    # The size that a profile holds needs no second compilation.
-    rows, columns = kernel_size(rig)
-    wide = wide.within((rows // 2, columns // 2))
-    kernels = about_middle(kernels_at(term, wide.positions_px(), rows, columns).astype(np.float64), wide.half)
-    at_position = np.eye(wide.positions)[wide.position]
-    windows = make_windows(wide, sources, np.zeros_like(wide.rate), at_position, 0.0)
-    light = np.asarray(predict(windows, kernels))
-    windows = make_windows(wide, sources.with_light_of_peak(wide, light), light, at_position, 0.0)
-    found = compare(wide, windows, light * np.asarray(windows.flux), np.arange(wide.count))
-    # Near the source, whole pixels are too coarse for a kernel that moves by fractions of one; all windows hold it.
-    core = (np.abs(wide.offsets()) <= 4).all(axis=-1)
-    return choose_support(replace(found, known=found.known & ~core))
-
-
-def with_support(term: PsfField, support: Support, rig: RigDescription) -> PsfField:
-    """Return the term with this support of its kernel.
-
-    Diffraction reaches over the whole sensor where the pictures show no end of it; an image ends at the support.
-    """
-    size = (rig.camera.rows, rig.camera.columns)
-    onward = (seen and bool(term.diffraction_fraction) for seen in support.open_ended)
-    down, across = (most if on else half for half, on, most in zip(support.half_px, onward, size, strict=True))
-    return replace(term, support_px=np.array([across, down], dtype=np.float64))
-
-
-def start_model(rig: RigDescription, geometry: Geometry, wire: Wire, rules: PsfRules | None = None) -> Diffraction:
-    """Return the start of diffraction: the wire's panel and pupil, or the rig's if no wire was seen.
-
-    Args:
-        rig: the panel and the lens as described; lengths in mm.
-        geometry: has the pupil's position, in mm.
-        wire: its numbers are in pitches of the panel.
-        rules: the blur, and which pitches are well known. Spectra start as those of common colour filters.
-    """
-    panel, pitch, rules = rig.panel, rig.panel.pitch_mm.value, rules or PsfRules()
-    nodes = wavelengths_nm(rig, rules)
-    responses = np.exp(-0.5 * ((nodes - np.array([[600.0], [535.0], [460.0]])) / 45.0) ** 2) + 1e-3
-    pupil = np.asarray(geometry.pupil_mm, dtype=np.float64)
-    if seen := wire_shows(wire):
-        opened, offset = (wire.column_open, wire.row_open), wire.offset_periods
-        lengths = (wire.depth_per_pitch, wire.footprint_per_pitch, wire.standoff_per_pitch)
-    else:
-        opened, offset = (panel.column_open.value, panel.row_open.value), pupil[:2] / pitch
-        lengths = (panel.depth_mm.value / pitch, rig.pupil_diameter_mm / pitch, -pupil[2] / pitch)
-    return Diffraction(
-        pitch_mm=np.float64(pitch),
-        openings=np.array([float(part) for part in opened]),
-        depth_mm=np.float64(float(lengths[0]) * pitch),
-        pupil_diameter_mm=np.float64(float(lengths[1]) * pitch),
-        blur_px=np.float64(rules.blur_px),
-        offset_periods=np.asarray(offset, dtype=np.float64),
-        standoff_per_pitch=np.float64(float(lengths[2])),
-        visibility=np.float64(seen),
-        wavelengths_nm=nodes,
-        spectrum=responses / responses.sum(axis=1, keepdims=True),
+def _report(
+    data: PsfData,
+    shots: Shots,
+    fit: DiffractionFit,
+    selection: Selection,
+    support: Support,
+    term: PsfField,
+    rig: RigDescription,
+    rules: PsfRules,
+) -> FitResult[PsfField]:
+    trial, diffracts = selection.trial, not selection.trial.order.free
+    channel = shots.channel[selection.test]
+    held_out_l2, held_out = trial.compared.relative_l2(channel), trial.compared.errors()
+    error = kernel_error(trial.compared, channel, trial.sources.pick(selection.test), rules)
+    worst, status = float(np.sqrt((held_out_l2**2).mean())), FitStatus.CONVERGED
+    if not np.isfinite(worst) or worst > rules.poor:
+        status = FitStatus.POOR_FIT
+    elif diffracts and not fit.converged:
+        status = FitStatus.NOT_CONVERGED
+    cov, tolerance, samples = fit.cov(), pitch_tolerance(rig), fit.problem.samples
+    numbers, cov_of_numbers = _estimates(fit, diffracts, held_out_l2, cov, tolerance)
+    errors, used = fit.errors(), samples.weight > 0
+    pattern_p, error_l2 = pattern_p_value(samples, errors), float(error.relative_l2(selection.magnitude).mean())
+    places = fit.shots.centre_px[np.broadcast_to(samples.index[..., None], used.shape)[used]]
+    names = (f"held_out_l2_{name}" for name in ("red", "green", "blue"))
+    figures = dict(zip(names, held_out_l2, strict=True)) | {
+        "field_positions": shots.positions,
+        "pictures": shots.count,
+        "samples_left_out": int((shots.weight <= 0).sum()),
+        "iterations": fit.iterations,
+        "kernel_error_l2": error_l2,
+        "residual_degree": trial.order.degree,
+        "diffraction_fraction": diffracts,
+        "model_error": fit.model_error,
+        "efficiency": efficiency(fit, rules, shots.count, len(_NUMBERS)),
+        "residual_pattern_p": pattern_p,
+    }
+    if fit.phase:
+        figures["wire_phase_strength"], figures["wire_phase_strength_sigma"] = fit.phase.best.fit
+    lengths = zip(("support_rows", "support_columns"), support.half_px, strict=True)
+    misfit = ""
+    if pattern_p <= SIGNIFICANT:
+        off = f" The kernel is off by {100 * error_l2:.2g} % where it was not captured; sigmas include that."
+        misfit = f"Residuals of diffraction have a pattern (p = {pattern_p:.1g}).{off if error.size else ''}"
+    return FitResult(
+        name="psf",
+        term=term,
+        status=status,
+        estimates=numbers,
+        cov=cov_of_numbers,
+        chi2_dof=fit.chi2_dof if diffracts else float(np.mean(held_out**2)),
+        samples=fit.problem.used if diffracts else len(held_out),
+        candidates=(*(fit.phase.candidates if fit.phase else ()), *selection.candidates, *support.candidates),
+        diagnostics=(
+            *(Diagnostic(name, float(value), "1") for name, value in figures.items()),
+            *(Diagnostic(name, float(value), "px") for name, value in lengths),
+        ),
+        notes=_notes(data, diffracts, misfit, support_notes(term, support)),
+        outliers=fit.outliers,
+        residuals=residual_sample(places, errors[used]) if diffracts else None,
+        posterior=_posterior(fit, diffracts, error, term, rig, cov, tolerance),
     )
 
 
-def wire_shows(wire: Wire) -> bool:
-    """Return whether the wire fit saw the rows: only then the place of the pupil's footprint on them is known."""
-    return np.shape(wire.harmonics)[0] > 0
+def _estimates(
+    fit: DiffractionFit,
+    diffracts: bool,
+    held_out_l2: Float[np.ndarray, "3"],
+    whole: Float[np.ndarray, "p p"],
+    tolerance: float,
+) -> tuple[tuple[Estimate, ...], Float[np.ndarray, "n n"]]:
+    count, error = len(_NUMBERS), float(held_out_l2.mean())
+    spread = float(held_out_l2.std(ddof=1) / np.sqrt(held_out_l2.size))
+    if not diffracts:
+        return (Estimate("kernel_relative_l2", error, spread, "1"),), np.array([[spread**2]])
+    kernel = Estimate("kernel_relative_l2", error, float(np.hypot(kernel_sigma(fit, whole), spread)), "1")
+    names, units, lengths = zip(*_NUMBERS, strict=True)
+    # The fit's own parameter is the logarithm of the blur.
+    values, unit = fit.theta[:count].copy(), np.ones(count)
+    values[BLUR] = unit[BLUR] = np.exp(fit.theta[BLUR])
+    by_pitch = np.where(lengths, values, 0.0) * tolerance
+    cov = whole[:count, :count] * np.outer(unit, unit) + np.outer(by_pitch, by_pitch)
+    return (*estimates(names, units, values, cov), kernel), cov
 
 
-def wavelengths_nm(rig: RigDescription, rules: PsfRules) -> Float[np.ndarray, " nodes"]:
-    """Return the spectra's nodes in nm: those of daylight, wider by the pitch's tolerance where that is large."""
-    relative = min(pitch_tolerance(rig), rules.pitch_least_known)
-    if relative <= rules.pitch_well_known:
-        return WAVELENGTHS_NM
-    first, last = WAVELENGTHS_NM[0] * (1 - relative), WAVELENGTHS_NM[-1] * (1 + relative)
-    return np.linspace(first, last, round((last - first) / (WAVELENGTHS_NM[1] - WAVELENGTHS_NM[0])) + 1)
+def _posterior(
+    fit: DiffractionFit,
+    diffracts: bool,
+    error: KernelError,
+    term: PsfField,
+    rig: RigDescription,
+    cov: Float[np.ndarray, "p p"],
+    tolerance: float,
+) -> Posterior[PsfField]:
+    """Return the posterior of the parameters of diffraction, of the pitch, and of the kernel's error without noise.
 
-
-def pitch_tolerance(rig: RigDescription) -> float:
-    """Return the relative tolerance of the pitch, in which the psf measures all lengths."""
-    return rig.panel.pitch_mm.tolerance / rig.panel.pitch_mm.value
-
-
-def start_prior(rig: RigDescription, start: Diffraction, rules: PsfRules | None = None) -> Prior:
-    """Return the prior: the rig's tolerances, tighter for what the wire has measured, and smooth spectra.
-
-    Diffraction depends on wavelength / pitch only. The pitch is therefore held at the rig's value, and the spectra are
-    free to move: an error of the pitch then appears as an error of the wavelengths.
-
-    Args:
-        rig: its tolerances are taken for standard deviations.
-        start: the mean; its ``visibility`` says whether the wire has measured the panel's numbers.
-        rules: factor of the tolerances after the wire's fit, and sigmas of parameters that the rig does not describe.
+    All lengths and wavelengths are measured in pitches: the pitch's tolerance scales them together, which does not
+    change the kernel. The kernel's error becomes a residual on every pixel of a kernel, whose size follows the kernel
+    there, with the signs of sixteen drawn patterns.
     """
-    panel, theta, rules = rig.panel, pack(start), rules or PsfRules()
-    tighter = rules.wire_tolerance if start.visibility else 1.0
-    sigma = [
-        rules.pitch_tolerance * min(panel.pitch_mm.tolerance, rules.pitch_well_known * panel.pitch_mm.value),
-        tighter * panel.column_open.tolerance,
-        tighter * panel.row_open.tolerance,
-        tighter * panel.depth_mm.tolerance,
-        tighter * 2.0 * rig.pupil_diameter_mm * rig.lens.f_number.tolerance / rig.lens.f_number.value,
-        rules.blur_log_sigma,
-        *(3 * (rules.footprint_periods,)),
+    count, evaluator, patterns = fit.theta.size, fit.problem.evaluator, 16 if error.size else 0
+    factor = np.zeros((count + 1 + patterns, count + 1 + patterns))
+    if diffracts:
+        factor[:count, :count] = square_root(cov)
+        factor[count, count] = tolerance
+    factor[count + 1 :, count + 1 :] = np.eye(patterns) / np.sqrt(max(patterns, 1))
+    # A result lives long and the data are large: the function below keeps only what it needs.
+    size_and_signs = cache(lambda: error_patterns(term, error, rig, patterns))
+
+    def term_at(x: Float[np.ndarray, " n"]) -> PsfField:
+        longer = 1.0 + x[count]
+        model = as_numpy(evaluator.model(x[:count]))
+        scaled = {name: getattr(model, name) * longer for name in ("pitch_mm", "depth_mm", "pupil_diameter_mm")}
+        model = replace(model, wavelengths_nm=model.wavelengths_nm * longer, **scaled)
+        if not patterns:
+            return replace(term, diffraction=model)
+        degree, size, signs = size_and_signs()
+        residual = size * np.tensordot(x[count + 1 :], signs, axes=1)
+        terms, _, rows, columns = term.residual.shape
+        down, across = ((n - m) // 2 for n, m in zip(residual.shape[2:], (rows, columns), strict=True))
+        residual[:terms, :, down : down + rows, across : across + columns] += term.residual
+        return replace(term, diffraction=model, residual=residual, degree=degree)
+
+    return Posterior(np.concatenate([fit.theta, np.zeros(1 + patterns)]), factor, term_at)
+
+
+def _notes(data: PsfData, diffracts: bool, misfit: str, support: tuple[str, ...]) -> tuple[str, ...]:
+    notes = [
+        "The blur is not that of a panel's grating: an image carries the kernel; no number of diffraction is known.",
+        "chi2_dof is of that image at positions held out, and allows for their model error.",
     ]
-    roots = [np.eye(HEAD, theta.size) / np.maximum(np.array(sigma), 1e-6)[:, None]]
-    for pick in np.eye(theta.size)[HEAD:].reshape(3, -1, theta.size):
-        roots += [np.diff(pick, 2, axis=0) / rules.spectrum_bend, pick / rules.spectrum_sigma]
-    return Prior(theta.copy(), np.concatenate(roots))
+    if diffracts:
+        notes = [
+            "cov covers the numbers of diffraction; field coefficients of the residual and spectra are left out of it.",
+            "chi2_dof is of the fit of diffraction and allows for the model error of its residuals.",
+            *([misfit] if misfit else []),
+        ]
+    left_out, why = data.dark + data.clipped, f"{data.dark} without an LED, {data.clipped} clipped."
+    return (*notes, *support, *([f"{left_out} pictures were left out: {why}"] if left_out else []))

@@ -1,81 +1,26 @@
-"""Tests of a kernel at positions that were held out: their likelihood, the kernel's error, and its support.
+"""What positions that were held out show of a kernel: its error, and how far its light reaches.
 
 The kernel's error includes the model's deviation from the truth, and the errors of its parameters that follow from it.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import final
 
 import numpy as np
 import scipy.optimize
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from udccal.fitting.engine.orders import Attempt, Choice, bic, choose
-from udccal.fitting.psf.data import HUBER, Crops, PsfRules, Shots, estimate_model_error, noise_at
-from udccal.fitting.psf.image import Sources, Windows
+from udccal.fitting.psf.data import HUBER, PsfRules, Shots, about_middle
+from udccal.fitting.psf.image import Sources, make_windows, predict
+from udccal.fitting.psf.orders import Compared, compare
+from udccal.kernels import kernel_size, kernels_at
+from udccal.models.fields import polynomial_basis
+from udccal.models.psf import PsfField
 from udccal.result import Candidate
-
-
-@final
-@dataclass(frozen=True)
-class Compared:
-    """Samples that a solution has not used, and its expectation of them.
-
-    Attributes:
-        residual, light: in e-/s.
-        measured, variance: variance of the sensor's noise, as measured, and at the expected light.
-        left_out: standard deviation that a model error of 1 would add.
-        known: True for samples that were measured.
-        model_error: the one of greatest likelihood for the residuals.
-    """
-
-    residual: Crops
-    light: Crops
-    measured: Crops
-    variance: Crops
-    left_out: Crops
-    known: Bool[np.ndarray, "shots rows columns"]
-    model_error: float
-
-    @property
-    def total(self) -> Crops:
-        """Variance of samples, with the model error."""
-        return self.variance + (self.model_error * self.left_out) ** 2
-
-    def errors(self) -> Float[np.ndarray, " samples"]:
-        """Errors of all samples, in units of their sigma."""
-        return (self.residual / np.sqrt(self.total))[self.known]
-
-    def relative_l2(self, channel: Int[np.ndarray, "shots rows columns"]) -> Float[np.ndarray, "3"]:
-        """Return the expectation's error by colour, which includes the data's own noise."""
-        error, light = (
-            np.bincount(channel[self.known], (part**2)[self.known], 3) for part in (self.residual, self.light)
-        )
-        return np.sqrt(error / np.maximum(light, 1e-30))
-
-    def loss(self, position: Int[np.ndarray, " shots"]) -> Float[np.ndarray, " places"]:
-        """Return minus twice the log likelihood per sample, up to a constant, by position.
-
-        The model's deviation is common to the pictures of a position. For a single position, the loss is by picture.
-        """
-        each = (np.log(self.total / self.measured) + HUBER.loss(self.residual / np.sqrt(self.total))) * self.known
-        by_shot = each.sum(axis=(1, 2)) / np.maximum(self.known.sum(axis=(1, 2)), 1)
-        places = np.unique(position)
-        return np.array([by_shot[position == place].mean() for place in places]) if len(places) > 1 else by_shot
-
-
-def compare(shots: Shots, windows: Windows, light: Crops, pick: np.ndarray) -> Compared:
-    """Compare the data of the picked shots with the ``light`` (e-/s) that is expected of all shots."""
-    parts = (windows.rate, shots.weight, shots.noise_per_rate, windows.left_out, light)
-    rate, weight, slope, one, light = (np.asarray(part)[pick] for part in parts)
-    known = weight > 0
-    measured = 1.0 / np.where(known, weight, 1.0)
-    variance = noise_at(light, rate, measured, slope)
-    # All orders have the same deviation here; it is above 0 where one of them expects no light.
-    model_error = estimate_model_error((rate - light)[known], variance[known], one[known], 0)
-    return Compared(rate - light, light, measured, variance, one, known, model_error)
+from udccal.rig import RigDescription
 
 
 @final
@@ -115,8 +60,7 @@ def estimate_kernel_error(
 ) -> KernelError:
     """Return the most probable error, or a size of 0 where BIC prefers noise alone.
 
-    All arrays are relative to the peak's light: data less expectation at positions held out, the variance of the
-    sensor's noise, and the expected light.
+    All arrays are relative to the peak's light: data less expectation, noise's variance, and expected light.
     """
     seen = brightness > 1e-7
     residual, variance, brightness = residual[seen], variance[seen], brightness[seen]
@@ -159,16 +103,26 @@ def kernel_error(
     )
 
 
+def error_patterns(
+    term: PsfField, error: KernelError, rig: RigDescription, patterns: int
+) -> tuple[int, Float[np.ndarray, "terms 3 rows columns"], Float[np.ndarray, "patterns 3 rows columns"]]:
+    """Return a degree, the size of the kernel's error as polynomials of that degree of the position, and signs.
+
+    Four places along each axis determine cubic polynomials.
+    """
+    along = np.stack(np.meshgrid(*2 * (np.linspace(-0.9, 0.9, 4),)), axis=-1).reshape(-1, 2)
+    places, degree = np.asarray(term.centre_px) + along * np.asarray(term.half_px), max(3, term.degree)
+    rows, columns = (max(pair) for pair in zip(kernel_size(rig), term.residual.shape[2:], strict=True))
+    sizes = error.of_kernels(kernels_at(term, places, rows, columns).astype(np.float64))
+    basis = np.asarray(polynomial_basis(along, degree), dtype=np.float64)
+    signs = np.random.default_rng(0).choice([-1.0, 1.0], (patterns, *sizes.shape[1:]))
+    return degree, np.tensordot(np.linalg.pinv(basis), sizes, axes=1), signs
+
+
 @final
 @dataclass(frozen=True)
 class Support:
-    """Support of the kernel.
-
-    Attributes:
-        half_px: (rows, columns) to either side of the source.
-        seen_px: (rows, columns) to either side that the pictures hold.
-        candidates: every window tried, both axes.
-    """
+    """Support of the kernel: (rows, columns) to either side of the source, those that pictures hold, and all tried."""
 
     half_px: tuple[int, int]
     seen_px: tuple[int, int]
@@ -211,3 +165,39 @@ def _along(found: Compared, name: str, distance: Int[np.ndarray, "rows columns"]
         loss = float(HUBER.loss((error - background[:, None, None]) * np.sqrt(weight)).sum())
         tried.append(Attempt(f"{name}: light within {half} px", step, bic(loss, float(step), samples), half))
     return choose(tried)
+
+
+def wide_support(wide: Shots, sources: Sources, term: PsfField, rig: RigDescription) -> Support:
+    """Choose the support from whole pictures of positions held out, whose places and light are ``sources``."""
+    # The size that a profile holds needs no second compilation.
+    rows, columns = kernel_size(rig)
+    wide = wide.within((rows // 2, columns // 2))
+    kernels = about_middle(kernels_at(term, wide.positions_px(), rows, columns).astype(np.float64), wide.half)
+    at_position = np.eye(wide.positions)[wide.position]
+    windows = make_windows(wide, sources, np.zeros_like(wide.rate), at_position, 0.0)
+    light = predict(windows, kernels)
+    windows = make_windows(wide, sources.with_light_of_peak(wide, light), light, at_position, 0.0)
+    found = compare(wide, windows, light * windows.flux, np.arange(wide.count))
+    # Near the source, whole pixels are too coarse for a kernel that moves by fractions of one; all windows hold it.
+    core = (np.abs(wide.offsets()) <= 4).all(axis=-1)
+    return choose_support(replace(found, known=found.known & ~core))
+
+
+def with_support(term: PsfField, support: Support, rig: RigDescription) -> PsfField:
+    """Return the term with this support of its kernel.
+
+    Diffraction reaches over the whole sensor where the pictures show no end of it; an image ends at the support.
+    """
+    size = (rig.camera.rows, rig.camera.columns)
+    onward = (seen and bool(term.diffraction_fraction) for seen in support.open_ended)
+    down, across = (most if on else half for half, on, most in zip(support.half_px, onward, size, strict=True))
+    return replace(term, support_px=np.array([across, down], dtype=np.float64))
+
+
+def support_notes(term: PsfField, support: Support) -> tuple[str, ...]:
+    """Return the notes for axes along which no end of the kernel's light was seen."""
+    along = [name for name, on in zip(("columns", "rows"), support.open_ended, strict=True) if on]
+    if not along or not term.diffraction_fraction:
+        return ()
+    seen = "light was seen as far as was looked; beyond, the kernel is diffraction as fitted."
+    return (f"Along {' and '.join(along)} {seen}",)

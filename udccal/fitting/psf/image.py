@@ -18,19 +18,16 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Final, final
 
-import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
 import scipy.ndimage
-from jaxtyping import Array, Bool, Float
+import scipy.sparse.linalg
+from jaxtyping import Bool, Float
 
 from udccal.fitting.psf.data import Crops, PsfRules, Shots, left_out, noise_at
-from udccal.models.arrays import Arrayish
 
 FREE_PER_PX: Final = 2
-Image = Float[Arrayish, "terms 3 node_rows node_columns"]
+Image = Float[np.ndarray, "terms 3 node_rows node_columns"]
 
 
 @final
@@ -55,7 +52,8 @@ class Sources:
 
 
 @final
-class Windows(eqx.Module):
+@dataclass(frozen=True)
+class Windows:
     """All shots about their LED.
 
     Attributes:
@@ -69,24 +67,24 @@ class Windows(eqx.Module):
         weight: inverse variance of the rate that solutions use, 0 where nothing is known.
     """
 
-    basis: Float[Arrayish, "shots terms"]
-    down: Float[Arrayish, "shots rows node_rows"]
-    across: Float[Arrayish, "shots columns node_columns"]
-    flux: Float[Arrayish, "shots rows columns"]
-    colour: Float[Arrayish, "shots rows columns 3"]
-    explained: Float[Arrayish, "shots rows columns"]
-    rate: Float[Arrayish, "shots rows columns"]
-    left_out: Float[Arrayish, "shots rows columns"]
-    weight: Float[Arrayish, "shots rows columns"]
+    basis: Float[np.ndarray, "shots terms"]
+    down: Float[np.ndarray, "shots rows node_rows"]
+    across: Float[np.ndarray, "shots columns node_columns"]
+    flux: Float[np.ndarray, "shots rows columns"]
+    colour: Float[np.ndarray, "shots rows columns 3"]
+    explained: Float[np.ndarray, "shots rows columns"]
+    rate: Float[np.ndarray, "shots rows columns"]
+    left_out: Float[np.ndarray, "shots rows columns"]
+    weight: Float[np.ndarray, "shots rows columns"]
 
     def only(self, keep: Bool[np.ndarray, " shots"]) -> Windows:
-        """Set the weights of the other shots to 0; the shape stays, so that nothing is compiled again."""
+        """Set the weights of the other shots to 0."""
         return replace(self, weight=self.weight * keep[:, None, None])
 
     def expected(self, free: bool, image: Image) -> Crops:
         """Return each sample's light in e-/s, by an image, and by diffraction unless the image is ``free``."""
-        unit = np.asarray(predict(self, image)) + (0.0 if free else np.asarray(self.explained))
-        return unit * np.asarray(self.flux)
+        unit = predict(self, image) + (0.0 if free else self.explained)
+        return unit * self.flux
 
 
 def make_windows(
@@ -97,11 +95,10 @@ def make_windows(
     model_error: float,
     per_px: int = 1,
 ) -> Windows:
-    """Return the equations' data from which images are solved.
+    """Return the data from which images are solved; see ``Windows``.
 
-    ``explained`` is each sample's light by diffraction per unit of the LED's; ``model_error``, relative to the peak,
-    adds to the data's noise. The image has ``per_px`` nodes to a pixel, the first and last on the first and last
-    pixels.
+    ``model_error``, relative to the peak, adds to the data's noise. The image has ``per_px`` nodes to a pixel, the
+    first and last on the first and last pixels.
     """
     colour, known = shots.colour, shots.weight > 0
     rate = shots.rate - sources.background[:, None, None]
@@ -155,79 +152,84 @@ def prior_sigma(
     return np.asarray(relative * scipy.ndimage.zoom(near, nodes, order=1))
 
 
-@eqx.filter_jit
-def predict(windows: Windows, image: Image) -> Float[Array, "shots rows columns"]:
+def predict(windows: Windows, image: Image) -> Crops:
     """Return each sample's light by an image, per unit of the LED's light."""
+    of_shots = np.tensordot(windows.basis[:, : len(image)], image, 1)
+    moved = windows.down[:, None] @ of_shots @ np.swapaxes(windows.across, 1, 2)[:, None]
+    return np.einsum("scyx,syxc->syx", moved, windows.colour)
 
-    def one(shot: tuple[Array, Array, Array, Array]) -> Float[Array, "rows columns"]:
-        basis, down, across, colour = shot
-        moved = down @ jnp.einsum("t,tcyx->cyx", basis, jnp.asarray(image)) @ across.T
-        return jnp.einsum("cyx,yxc->yx", moved, colour)
 
-    parts = (windows.basis, windows.down, windows.across, windows.colour)
-    return jax.lax.map(one, tuple(jnp.asarray(part) for part in parts))
+def _gathered(windows: Windows, light: Crops, terms: int) -> Image:
+    """Return the transpose of ``predict``."""
+    by_colour = np.moveaxis(light[..., None] * windows.colour, -1, 1)
+    moved = np.swapaxes(windows.down, 1, 2)[:, None] @ by_colour @ windows.across[:, None]
+    return np.tensordot(windows.basis[:, :terms].T, moved, 1)
 
 
 @final
-class Moves(eqx.Module):
+@dataclass(frozen=True)
+class Moves:
     """Changes of each shot along with a free image: place in px (x, y), and relative light (R, G, B).
 
-    Attributes:
-        design: derivative of each sample by a change, in e-/s.
-        changed: sum of the changes so far.
-        sigma: prior standard deviations of the whole changes.
+    ``design`` has the derivatives of samples, in e-/s; ``changed`` is the sum of the changes so far, and ``sigma`` the
+    prior standard deviations of the whole changes.
     """
 
-    design: Float[Arrayish, "shots 5 rows columns"]
-    changed: Float[Arrayish, "shots 5"]
-    sigma: Float[Arrayish, "5"]
+    design: Float[np.ndarray, "shots 5 rows columns"]
+    changed: Float[np.ndarray, "shots 5"]
+    sigma: Float[np.ndarray, "5"]
+
+    def light(self, own: Float[np.ndarray, "shots 5"]) -> Crops:
+        """Return the light that changes add, in e-/s."""
+        return np.einsum("spyx,sp->syx", self.design, own)
+
+    def fitted(self, light: Crops, weight: Crops) -> Float[np.ndarray, "shots 5"]:
+        """Return the changes that this light is most likely to come from."""
+        weighted = (self.design * weight[:, None]).reshape(*self.design.shape[:2], -1)
+        flat = self.design.reshape(weighted.shape)
+        normal = weighted @ np.swapaxes(flat, 1, 2) + np.diag(self.sigma**-2.0)
+        return np.linalg.solve(normal, weighted @ light.reshape(len(light), -1, 1))[..., 0]
 
 
-@eqx.filter_jit
 def solve_image(
     windows: Windows, sigma: Image, free: bool, start: Image, moves: Moves | None = None
-) -> tuple[Image, Float[Array, "shots 5"]]:
+) -> tuple[Image, Float[np.ndarray, "shots 5"]]:
     """Return the ridge estimate of an image, with diffraction or ``free`` of it, and the changes of own parameters.
 
     The image, like its ``start``, is in units of ``sigma``, its prior standard deviations; see ``image_of``. The prior
     is about the addition to the start: a prior about the whole would prefer a smaller image and brighter LEDs. With
     ``moves``, places and light of the shots are estimated too.
     """
-    sigma, start, flux, weight = (jnp.asarray(part) for part in (sigma, start, windows.flux, windows.weight))
-    data = jnp.asarray(windows.rate) - (0.0 if free else flux * jnp.asarray(windows.explained))
+    flux, weight, changes = windows.flux, windows.weight, np.zeros((len(windows.flux), 5))
+    data = windows.rate - (0.0 if free else flux * windows.explained)
+    # The prior is about the whole change, and the model is linear: the data become those before any change.
+    data = data if moves is None else data + moves.light(moves.changed)
 
-    def own_of(light: Float[Array, "shots rows columns"]) -> Float[Array, "shots 5"]:
-        if moves is None:
-            return jnp.zeros((len(light), 5))
-        normal = jnp.einsum("spyx,sqyx,syx->spq", moves.design, moves.design, weight)
-        inverse = jnp.linalg.inv(normal + jnp.diag(jnp.asarray(moves.sigma) ** -2.0))
-        return jnp.einsum("spq,sqyx,syx->sp", inverse, moves.design, weight * light)
-
-    def by_own(own: Float[Array, "shots 5"]) -> Float[Array, "shots rows columns"] | float:
-        return 0.0 if moves is None else jnp.einsum("spyx,sp->syx", moves.design, own)
-
-    def forward(scaled: Image) -> Float[Array, "shots rows columns"]:
+    def forward(scaled: Image) -> Crops:
         return flux * predict(windows, image_of(scaled, sigma, free))
 
-    def backward(light: Float[Array, "shots rows columns"]) -> Image:
-        return jax.linear_transpose(forward, start)(weight * (light - by_own(own_of(light))))[0]
+    def backward(light: Crops) -> Image:
+        left = light if moves is None else light - moves.light(moves.fitted(light, weight))
+        return sigma * smoothed(_gathered(windows, flux * weight * left, len(sigma)), free)
 
-    if moves is not None:
-        # The prior is about the whole change, and the model is linear: the data become those before any change.
-        data = data + by_own(jnp.asarray(moves.changed))
+    def normal(flat: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+        return flat + backward(forward(flat.reshape(sigma.shape))).ravel()
+
     iterations, tolerance = (150, 1e-5) if free else (60, 1e-4)
-    added, _ = jax.scipy.sparse.linalg.cg(
-        lambda image: image + backward(forward(image)),
-        backward(data - forward(start)),
-        tol=tolerance,
-        maxiter=iterations,
-    )
-    return start + added, own_of(data - forward(start + added))
+    operator = scipy.sparse.linalg.LinearOperator((sigma.size, sigma.size), matvec=normal, dtype=np.float64)
+    right = backward(data - forward(start)).ravel()
+    added, _ = scipy.sparse.linalg.cg(operator, right, rtol=tolerance, maxiter=iterations)
+    image = start + added.reshape(sigma.shape)
+    return image, changes if moves is None else moves.fitted(data - forward(image), weight)
 
 
 def image_of(scaled: Image, sigma: Image, free: bool) -> Image:
-    """Return the image from its scaled values; a Gaussian of one node smooths it where it is free."""
-    image = jnp.asarray(scaled) * jnp.asarray(sigma)
+    """Return the image from its scaled values."""
+    return smoothed(scaled * sigma, free)
+
+
+def smoothed(image: Image, free: bool) -> Image:
+    """Smooth an image by a Gaussian of one node where it is free."""
     if not free:
         return image
     taps = [np.where(np.arange(n) <= 4, np.exp(-0.5 * np.arange(n) ** 2.0), 0.0) for n in image.shape[-2:]]
@@ -250,18 +252,17 @@ def free_sources(
     light, covered = (np.einsum("syx,syxc->sc", shots.rate, colour), np.einsum("cyx,syxc->sc", magnitude, colour))
     start = Sources(shots.centre_px, light / np.maximum(covered, 1e-6), np.zeros(shots.count))
     nothing = np.zeros_like(shots.rate)
-    room = (np.arange(basis.shape[1]) < terms)[:, None, None, None]
-    sigma = room * prior_sigma(magnitude, 1.0, FREE_PER_PX)
+    sigma = np.tile(prior_sigma(magnitude, 1.0, FREE_PER_PX), (terms, 1, 1, 1))
     sources, changed = start, np.zeros((shots.count, 5))
     windows = make_windows(shots, sources, nothing, basis, rules.free_model_error, FREE_PER_PX)
     scaled, _ = solve_image(windows, sigma, True, np.zeros_like(sigma))
     for _ in range(2):
-        moves = _moves(shots, sources, windows, np.asarray(image_of(scaled, sigma, True)), changed, rules)
+        moves = _moves(shots, sources, windows, image_of(scaled, sigma, True), changed, rules)
         scaled, found = solve_image(windows, sigma, True, scaled, moves)
         # A change of the image has the same effect as a change common to the shots of a position.
-        mean = np.stack([np.asarray(found)[shots.position == g].mean(axis=0) for g in range(shots.positions)])
+        mean = np.stack([found[shots.position == g].mean(axis=0) for g in range(shots.positions)])
         # Places and light change by less than this (px; relative).
-        changed = np.clip(np.asarray(found) - mean[shots.position], -0.7, 0.7)
+        changed = np.clip(found - mean[shots.position], -0.7, 0.7)
         sources = replace(start, place_px=start.place_px + changed[:, :2], flux=start.flux * (1.0 + changed[:, 2:]))
         windows = make_windows(shots, sources, nothing, basis, rules.free_model_error, FREE_PER_PX)
     return sources
@@ -281,10 +282,10 @@ def _moves(
     def at(right: float, below: float) -> Crops:
         down = shifts(y + below, shots.disc_px, shots.rate.shape[1], FREE_PER_PX)
         across = shifts(x + right, shots.disc_px, shots.rate.shape[2], FREE_PER_PX)
-        return np.asarray(predict(replace(windows, down=down, across=across), image))
+        return predict(replace(windows, down=down, across=across), image)
 
     h = 0.05
     by_place = [(at(h, 0.0) - at(-h, 0.0)) / (2 * h), (at(0.0, h) - at(0.0, -h)) / (2 * h)]
-    light = np.moveaxis(at(0.0, 0.0)[..., None] * np.asarray(windows.colour), -1, 1)
-    design = np.concatenate([np.stack(by_place, 1), light], 1) * np.asarray(windows.flux)[:, None]
+    light = np.moveaxis(at(0.0, 0.0)[..., None] * windows.colour, -1, 1)
+    design = np.concatenate([np.stack(by_place, 1), light], 1) * windows.flux[:, None]
     return Moves(design, changed, np.repeat(rules.own_sigma, (2, 3)))

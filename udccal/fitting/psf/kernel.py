@@ -17,30 +17,36 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from udccal.fitting.engine.gaussian import Prior
+from udccal.fitting.psf.data import PsfRules
 from udccal.models.arrays import Arrayish
 from udccal.models.diffraction import (
     Diffraction,
     LocalFrame,
-    average_transfer,
+    average_of,
     lattice_frequencies,
     open_fractions,
     pupil_anchors,
     pupil_overlaps,
     sensor_transfer,
-    slit_tables,
+    slits_of,
     through_sensor,
 )
+from udccal.models.geometry import Geometry
 from udccal.models.interference import (
     HIGHEST_ORDER,
     TERMS,
     footprint_place,
     interference_of,
-    interference_transfer,
     node_overlaps,
     overlap_tables,
     strengths,
 )
 from udccal.models.lattice import Lattice, lattice_for, spline_coefficients
+from udccal.models.wire import Wire
+from udccal.rig import RigDescription
+
+WAVELENGTHS_NM: Final = np.linspace(400.0, 700.0, 13)
 
 # HEAD parameters precede the spectra. The others are indices among these: the panel's pitch in mm, the pupil's diameter
 # in mm, the logarithm of the blur in px, and the footprint's place on columns and rows with its stand-off, in pitches.
@@ -61,13 +67,7 @@ def pack(model: Diffraction) -> Float[np.ndarray, " p"]:
 
 @final
 class Evaluator(eqx.Module):
-    """The constants of a fit that every call uses.
-
-    Attributes:
-        wavelengths_nm: nodes of the spectra.
-        lattice: for the transfer functions.
-        interference: true where the footprint's place on the rows is known.
-    """
+    """The constants of a fit that every call uses; ``interference`` where the footprint's place on rows is known."""
 
     wavelengths_nm: Float[Arrayish, " nodes"]
     lattice: Lattice = eqx.field(static=True)
@@ -91,11 +91,7 @@ class Evaluator(eqx.Module):
 
 
 def fit_lattice(half: tuple[int, int]) -> Lattice:
-    """Return the lattice of a fit: four nodes to a pixel, a quarter wider than the window, for sources off the middle.
-
-    Args:
-        half: (rows, columns) of the window to either side of the LED, in px.
-    """
+    """Return a fit's lattice: four nodes to a pixel, a quarter wider than the window, for sources off the middle."""
     rows, columns = (2 * h + 9 for h in half)
     return lattice_for(rows * 1.25, columns * 1.25, 4, 4)
 
@@ -121,44 +117,38 @@ def kernel_coefficients(
 ) -> Float[Array, "lattice_rows lattice_columns 3"]:
     """Return spline coefficients of the three colours' kernels, for a source whose image is ``disc_px`` wide."""
     model, lattice = evaluator.model(theta), evaluator.lattice
-    spectra = jnp.asarray(model.spectrum)
-    transfer = average_transfer(model, frame, lattice, spectra, disc_px)
+    spectra, (fx, fy) = jnp.asarray(model.spectrum), lattice_frequencies(frame, lattice)
+    columns, rows = slits_of(
+        model, open_fractions(model, frame), fx, fy, HIGHEST_ORDER if evaluator.interference else 0
+    )
+    pupils, (_, parts) = pupil_overlaps(model, frame, lattice), pupil_anchors(model)
+    transfer = average_of(columns[0], rows[0], pupils, parts, spectra)
     if evaluator.interference:
-        transfer = transfer + interference_transfer(model, frame, lattice, spectra, overlaps, disc_px)
-    return spline_coefficients(lattice, transfer)
-
-
-def interference_coefficients(
-    evaluator: Evaluator, model: Diffraction, frame: LocalFrame, disc_px: Float[Arrayish, ""]
-) -> Callable[[Float[Array, " terms"], Float[Array, "nodes terms rows half"]], Float[Array, "y x 3"]]:
-    """Return interference's part of ``kernel_coefficients``, as a function of its strengths and overlaps."""
-    lattice, spectra = evaluator.lattice, jnp.asarray(model.spectrum)
-    opened, (fx, fy) = open_fractions(model, frame), lattice_frequencies(frame, lattice)
-    columns, rows = (slit_tables(model, opened[axis], f, HIGHEST_ORDER) for axis, f in enumerate((fx, fy)))
+        strength = strengths(model, footprint_place(model, frame))
+        transfer = transfer + interference_of(strength, columns, rows, overlaps, spectra)
     sensor = sensor_transfer(frame, fx, fy, model.blur_px, disc_px)
-
-    def of(strength: Float[Array, " terms"], overlaps: Float[Array, "nodes terms rows half"]) -> Float[Array, "y x 3"]:
-        total = interference_of(strength, columns, rows, overlaps, spectra)
-        return spline_coefficients(lattice, through_sensor(total, sensor))
-
-    return of
+    return spline_coefficients(lattice, through_sensor(transfer, sensor))
 
 
+@eqx.filter_jit
 def kernel_jacobian(
     evaluator: Evaluator,
-    model: Diffraction,
+    theta: Float[Arrayish, " p"],
     frame: LocalFrame,
     disc_px: Float[Arrayish, ""],
     overlaps: Float[Arrayish, "nodes terms rows half"],
-) -> tuple[Float[Array, "y x nodes"], Float[Array, "y x factors 3"]]:
-    """Return spline coefficients of the kernel at every wavelength node, and derivatives in all colours.
+) -> tuple[Float[Array, "y x channels"], Float[Array, "factors head"]]:
+    """Return spline coefficients of the kernel at every wavelength node, and of its derivatives by factors and colours.
 
-    Derivatives are by the factors of ``factor_jacobian``, with the ``overlaps`` of interference held. The average over
-    the footprint's place is one more term of interference, (0, 0), of strength 1.
+    Factors: open part of columns and of rows along the ray, the pitch where it scales lags, the pupil, the footprint's
+    place (x, y), and the logarithm of the blur, with the ``overlaps`` of interference held. The second result has their
+    derivatives by the parameters before the spectra. The average over the footprint's place is one more term of
+    interference, (0, 0), of strength 1.
     """
-    lattice, spectra = evaluator.lattice, jnp.asarray(model.spectrum)
+    model, lattice = evaluator.model(theta), evaluator.lattice
+    spectra = jnp.asarray(model.spectrum)
     fx, fy = lattice_frequencies(frame, lattice)
-    slits = (_slits(model, frame, axis, f) for axis, f in enumerate((fx, fy)))
+    slits = _slits(model, frame, fx, fy)
     pupils, by_pupil = _with_derivative(
         lambda mm: pupil_overlaps(eqx.tree_at(lambda m: m.pupil_diameter_mm, model, mm), frame, lattice),
         model.pupil_diameter_mm,
@@ -188,44 +178,123 @@ def kernel_jacobian(
         return jnp.stack([light(y, x), light(y, by_open_x), light(by_open_y, x), by_pitch, pupil, *moved])
 
     every = jax.lax.map(at_node, (*slits, jnp.asarray(overlaps), pupil_anchors(model)[1].T))
-    mixed = jnp.einsum("cj,jfyx->fcyx", spectra, every)
-    channels = jnp.concatenate([every[:, 0], mixed[1:].reshape(-1, *sensor.shape)])
-    seen = jnp.concatenate([through_sensor(channels, sensor), through_sensor(mixed[0], by_blur)])
-    flat, count = spline_coefficients(lattice, seen), spectra.shape[1]
-    return flat[..., :count], flat[..., count:].reshape(*flat.shape[:2], -1, 3)
-
-
-def factor_jacobian(
-    evaluator: Evaluator, theta: Float[Arrayish, " p"], frame: LocalFrame
-) -> Float[Array, "factors head"]:
-    """Return derivatives of the factors of ``kernel_jacobian`` by the parameters before the spectra, in order.
-
-    Factors: open part of columns and of rows along the ray, the pitch where it scales lags, the pupil, the footprint's
-    place (x, y), and the logarithm of the blur.
-    """
+    # As one product of matrices: an einsum over the nodes takes five times as long.
+    mixed = (spectra @ every.reshape(len(every), -1)).reshape(len(spectra), *every.shape[1:])
+    channels = jnp.concatenate([every[:, 0], jnp.swapaxes(mixed[:, 1:], 0, 1).reshape(-1, *sensor.shape)])
+    seen = jnp.concatenate([through_sensor(channels, sensor), through_sensor(mixed[:, 0], by_blur)])
 
     def factors(head: Float[Array, " head"]) -> Float[Array, " factors"]:
         model = evaluator.model(jnp.concatenate([head, jnp.asarray(theta)[HEAD:]]))
         opened, place = open_fractions(model, frame), footprint_place(model, frame)
         return jnp.stack([*opened, head[PITCH], head[PUPIL], *place, head[BLUR]])
 
-    return jax.jacfwd(factors)(jnp.asarray(theta)[:HEAD])
+    return spline_coefficients(lattice, seen), jax.jacfwd(factors)(jnp.asarray(theta)[:HEAD])
 
 
 def _slits(
-    model: Diffraction, frame: LocalFrame, axis: int, frequency: Float[Array, " n"]
-) -> Float[Array, "nodes 3 orders n"]:
-    """Return slits along an axis, and derivatives by a ray's open part and by the pitch, with the other held."""
+    model: Diffraction, frame: LocalFrame, fx: Float[Array, " half"], fy: Float[Array, " rows"]
+) -> tuple[Float[Array, "nodes 3 orders half"], Float[Array, "nodes 3 orders rows"]]:
+    """Return slits of both axes, and derivatives by a ray's open part and by the pitch, with the other held."""
 
-    def table(opened: Float[Array, ""], pitch_mm: Float[Array, ""]) -> Float[Array, "orders n nodes"]:
-        return slit_tables(eqx.tree_at(lambda m: m.pitch_mm, model, pitch_mm), opened, frequency, HIGHEST_ORDER)
+    def tables(opened: Float[Array, "2"], pitch_mm: Float[Array, ""]) -> tuple[Array, Array]:
+        return slits_of(eqx.tree_at(lambda m: m.pitch_mm, model, pitch_mm), opened, fx, fy, HIGHEST_ORDER)
 
-    at = (open_fractions(model, frame)[axis], jnp.asarray(model.pitch_mm))
-    value, derivatives = jax.vmap(lambda way: jax.jvp(table, at, (way[0], way[1])), out_axes=(None, 0))(jnp.eye(2))
-    return jnp.moveaxis(jnp.concatenate([value[None], derivatives]), -1, 0)
+    at = (open_fractions(model, frame), jnp.asarray(model.pitch_mm))
+    ways = (jnp.array([[1.0, 1.0], [0.0, 0.0]]), jnp.array([0.0, 1.0]))
+    value, derivatives = jax.vmap(lambda *way: jax.jvp(tables, at, way), out_axes=(None, 0))(*ways)
+    columns, rows = (
+        jnp.moveaxis(jnp.concatenate([own[None], by]), -1, 0) for own, by in zip(value, derivatives, strict=True)
+    )
+    return columns, rows
 
 
 def _with_derivative(of: Callable[[Array], Array], at: Float[Arrayish, ""]) -> tuple[Array, Array]:
     number = jnp.asarray(at)
     value, derivative = jax.jvp(of, (number,), (jnp.ones_like(number),))
     return value, derivative
+
+
+def as_numpy(model: Diffraction) -> Diffraction:
+    """Return the model with numpy leaves."""
+    return Diffraction(*(np.asarray(getattr(model, name), np.float64) for name in Diffraction.__dataclass_fields__))
+
+
+def start_model(rig: RigDescription, geometry: Geometry, wire: Wire, rules: PsfRules | None = None) -> Diffraction:
+    """Return the start of diffraction: the wire's panel and pupil, or the rig's if no wire was seen.
+
+    Args:
+        rig: the panel and the lens as described; lengths in mm.
+        geometry: has the pupil's position, in mm.
+        wire: its numbers are in pitches of the panel.
+        rules: the blur, and which pitches are well known.
+    """
+    panel, pitch, rules = rig.panel, rig.panel.pitch_mm.value, rules or PsfRules()
+    nodes = wavelengths_nm(rig, rules)
+    # Those of common colour filters.
+    responses = np.exp(-0.5 * ((nodes - np.array([[600.0], [535.0], [460.0]])) / 45.0) ** 2) + 1e-3
+    pupil = np.asarray(geometry.pupil_mm, dtype=np.float64)
+    if seen := wire_shows(wire):
+        opened, offset = (wire.column_open, wire.row_open), wire.offset_periods
+        lengths = (wire.depth_per_pitch, wire.footprint_per_pitch, wire.standoff_per_pitch)
+    else:
+        opened, offset = (panel.column_open.value, panel.row_open.value), pupil[:2] / pitch
+        lengths = (panel.depth_mm.value / pitch, rig.pupil_diameter_mm / pitch, -pupil[2] / pitch)
+    return Diffraction(
+        pitch_mm=np.float64(pitch),
+        openings=np.array([float(part) for part in opened]),
+        depth_mm=np.float64(float(lengths[0]) * pitch),
+        pupil_diameter_mm=np.float64(float(lengths[1]) * pitch),
+        blur_px=np.float64(rules.blur_px),
+        offset_periods=np.asarray(offset, dtype=np.float64),
+        standoff_per_pitch=np.float64(float(lengths[2])),
+        visibility=np.float64(seen),
+        wavelengths_nm=nodes,
+        spectrum=responses / responses.sum(axis=1, keepdims=True),
+    )
+
+
+def wire_shows(wire: Wire) -> bool:
+    """Return whether the wire fit saw the rows: only then the place of the pupil's footprint on them is known."""
+    return np.shape(wire.harmonics)[0] > 0
+
+
+def wavelengths_nm(rig: RigDescription, rules: PsfRules) -> Float[np.ndarray, " nodes"]:
+    """Return the spectra's nodes in nm: those of daylight, wider by the pitch's tolerance where that is large."""
+    relative = min(pitch_tolerance(rig), rules.pitch_least_known)
+    if relative <= rules.pitch_well_known:
+        return WAVELENGTHS_NM
+    first, last = WAVELENGTHS_NM[0] * (1 - relative), WAVELENGTHS_NM[-1] * (1 + relative)
+    return np.linspace(first, last, round((last - first) / (WAVELENGTHS_NM[1] - WAVELENGTHS_NM[0])) + 1)
+
+
+def pitch_tolerance(rig: RigDescription) -> float:
+    """Return the relative tolerance of the pitch, in which the psf measures all lengths."""
+    return rig.panel.pitch_mm.tolerance / rig.panel.pitch_mm.value
+
+
+def start_prior(rig: RigDescription, start: Diffraction, rules: PsfRules | None = None) -> Prior:
+    """Return the prior: the rig's tolerances, tighter for what the wire has measured, and smooth spectra.
+
+    Diffraction depends on wavelength / pitch only. The pitch is therefore held at the rig's value, and the spectra are
+    free to move: an error of the pitch then appears as an error of the wavelengths.
+
+    Args:
+        rig: its tolerances (mm, or fractions) are taken for standard deviations.
+        start: the mean; its ``visibility`` says whether the wire has measured the panel's numbers.
+        rules: sigmas of the other parameters.
+    """
+    panel, theta, rules = rig.panel, pack(start), rules or PsfRules()
+    tighter = rules.wire_tolerance if start.visibility else 1.0
+    sigma = [
+        rules.pitch_tolerance * min(panel.pitch_mm.tolerance, rules.pitch_well_known * panel.pitch_mm.value),
+        tighter * panel.column_open.tolerance,
+        tighter * panel.row_open.tolerance,
+        tighter * panel.depth_mm.tolerance,
+        tighter * 2.0 * rig.pupil_diameter_mm * rig.lens.f_number.tolerance / rig.lens.f_number.value,
+        rules.blur_log_sigma,
+        *(3 * (rules.footprint_periods,)),
+    ]
+    roots = [np.eye(HEAD, theta.size) / np.maximum(np.array(sigma), 1e-6)[:, None]]
+    for pick in np.eye(theta.size)[HEAD:].reshape(3, -1, theta.size):
+        roots += [np.diff(pick, 2, axis=0) / rules.spectrum_bend, pick / rules.spectrum_sigma]
+    return Prior(theta.copy(), np.concatenate(roots))

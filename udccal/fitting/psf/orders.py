@@ -8,13 +8,22 @@ from functools import partial
 from typing import final
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from udccal.fitting.engine.orders import Attempt, Choice, choose, held_out_beats, rising
-from udccal.fitting.psf.data import Crops, PsfRules, Shots, about_middle, held_out_positions
-from udccal.fitting.psf.held_out import Compared, KernelError, Support, choose_support, compare, kernel_error
+from udccal.fitting.psf.data import (
+    HUBER,
+    Crops,
+    PsfRules,
+    Shots,
+    about_middle,
+    estimate_model_error,
+    held_out_positions,
+    noise_at,
+)
 from udccal.fitting.psf.image import (
     FREE_PER_PX,
+    Image,
     Sources,
     Windows,
     free_sources,
@@ -25,6 +34,65 @@ from udccal.fitting.psf.image import (
 )
 from udccal.models.fields import polynomial_basis, polynomial_terms
 from udccal.result import Candidate
+
+
+@final
+@dataclass(frozen=True)
+class Compared:
+    """Samples that a solution has not used, and its expectation of them.
+
+    Attributes:
+        residual, light: in e-/s.
+        measured, variance: variance of the sensor's noise, as measured, and at the expected light.
+        left_out: standard deviation that a model error of 1 would add.
+        known: True for samples that were measured.
+        model_error: the one of greatest likelihood for the residuals.
+    """
+
+    residual: Crops
+    light: Crops
+    measured: Crops
+    variance: Crops
+    left_out: Crops
+    known: Bool[np.ndarray, "shots rows columns"]
+    model_error: float
+
+    @property
+    def total(self) -> Crops:
+        """Variance of samples, with the model error."""
+        return self.variance + (self.model_error * self.left_out) ** 2
+
+    def errors(self) -> Float[np.ndarray, " samples"]:
+        """Errors of all samples, in units of their sigma."""
+        return (self.residual / np.sqrt(self.total))[self.known]
+
+    def relative_l2(self, channel: Int[np.ndarray, "shots rows columns"]) -> Float[np.ndarray, "3"]:
+        """Return the expectation's error by colour, which includes the data's own noise."""
+        squares = ((part**2)[self.known] for part in (self.residual, self.light))
+        error, light = (np.bincount(channel[self.known], square, 3) for square in squares)
+        return np.sqrt(error / np.maximum(light, 1e-30))
+
+    def loss(self, position: Int[np.ndarray, " shots"]) -> Float[np.ndarray, " places"]:
+        """Return minus twice the log likelihood per sample, up to a constant, by position.
+
+        The model's deviation is common to the pictures of a position. For a single position, the loss is by picture.
+        """
+        each = (np.log(self.total / self.measured) + HUBER.loss(self.residual / np.sqrt(self.total))) * self.known
+        by_shot = each.sum(axis=(1, 2)) / np.maximum(self.known.sum(axis=(1, 2)), 1)
+        places = np.unique(position)
+        return np.array([by_shot[position == place].mean() for place in places]) if len(places) > 1 else by_shot
+
+
+def compare(shots: Shots, windows: Windows, light: Crops, pick: np.ndarray) -> Compared:
+    """Compare the data of the picked shots with the ``light`` (e-/s) that is expected of all shots."""
+    parts = (windows.rate, shots.weight, shots.noise_per_rate, windows.left_out, light)
+    rate, weight, slope, one, light = (part[pick] for part in parts)
+    known = weight > 0
+    measured = 1.0 / np.where(known, weight, 1.0)
+    variance = noise_at(light, rate, measured, slope)
+    # All orders have the same deviation here; it is above 0 where one of them expects no light.
+    model_error = estimate_model_error((rate - light)[known], variance[known], one[known], 0)
+    return Compared(rate - light, light, measured, variance, one, known, model_error)
 
 
 @final
@@ -85,23 +153,20 @@ class Trial:
 @final
 @dataclass(frozen=True)
 class Selection:
-    """The residual that was chosen, and its errors.
+    """The residual that was chosen.
 
     Attributes:
         trial: the chosen one of the ``candidates``.
-        image: the residual on pixels, only as wide as needed; a single zero for none.
-        held_out: relative L2 error by colour at positions that were held out, noise included.
-        error: of the kernel there, without noise. relative_l2: that error of a whole kernel, mean over colours.
-        support: of the kernel's light at these positions.
+        image: the residual on pixels, as wide as its order; a single zero for none.
+        magnitude: the kernel's average size.
+        test: which shots were held out.
     """
 
     trial: Trial
     candidates: tuple[Candidate, ...]
     image: Float[np.ndarray, "terms 3 rows columns"]
-    held_out: Float[np.ndarray, "3"]
-    error: KernelError
-    relative_l2: float
-    support: Support
+    magnitude: Float[np.ndarray, "3 rows columns"]
+    test: Bool[np.ndarray, " shots"]
 
 
 @final
@@ -124,14 +189,13 @@ class _Orders:
         trial = Trial(order, sources, found, found.loss(self.shots.position[self.test]))
         return Attempt(order.name, order.coefficients(self.shots.half), float(trial.loss.mean()), trial)
 
-    def image(self, trial: Trial, support: Support) -> Float[np.ndarray, "terms 3 rows columns"]:
-        """Solve for the residual from all shots: as wide as its order, or a free one as wide as the support."""
+    def image(self, trial: Trial) -> Float[np.ndarray, "terms 3 rows columns"]:
+        """Solve for the residual from all shots."""
         order = trial.order
         if order.degree < 0:
             return np.zeros((1, 3, 1, 1))
-        image = self._solve(self._windows(trial.sources, order), order)[: polynomial_terms(order.degree)]
-        half = support.half_px if order.free else order.half_px(self.shots.half)
-        return about_middle(image[..., :: order.per_px, :: order.per_px], half)
+        image = self._solve(self._windows(trial.sources, order), order)[..., :: order.per_px, :: order.per_px]
+        return about_middle(image, order.half_px(self.shots.half))
 
     def rising(
         self, sources: Sources, free: bool, sizes: Sequence[float], allowed: float, first: tuple[Attempt[Trial], ...]
@@ -169,18 +233,16 @@ class _Orders:
     def _windows(self, sources: Sources, order: Order) -> Windows:
         return make_windows(self.shots, sources, self.explained, self.basis, order.model_error, order.per_px)
 
-    def _solve(self, windows: Windows, order: Order) -> Float[np.ndarray, "terms 3 node_rows node_columns"]:
-        """Solve for the residual's image; higher degrees are held at 0, so that all orders share one compilation."""
+    def _solve(self, windows: Windows, order: Order) -> Image:
+        """Solve for the residual's image, which is 0 beyond its reach."""
         sigma = prior_sigma(self.magnitude, order.size, order.per_px)
         y, x = (np.abs(np.arange(nodes) - nodes // 2) for nodes in sigma.shape[1:])
         rows, columns = (order.per_px * half for half in order.half_px(self.shots.half))
-        terms = np.arange(self.basis.shape[1]) < polynomial_terms(order.degree)
-        sigmas = terms[:, None, None, None] * (sigma * ((y <= rows)[:, None] & (x <= columns)))
+        within = sigma * ((y <= rows)[:, None] & (x <= columns))
+        sigmas = np.tile(within, (polynomial_terms(order.degree), 1, 1, 1))
         if order.degree < 0:
-            return np.zeros_like(sigmas)
-        return np.asarray(
-            image_of(solve_image(windows, sigmas, order.free, np.zeros_like(sigmas))[0], sigmas, order.free)
-        )
+            return sigmas
+        return image_of(solve_image(windows, sigmas, order.free, np.zeros_like(sigmas))[0], sigmas, order.free)
 
 
 def select_field(
@@ -200,10 +262,9 @@ def select_field(
     test = held_out_positions(shots.positions)[shots.position]
     basis = np.asarray(polynomial_basis(unit_positions, rules.highest_degree))[shots.position]
     orders = _Orders(shots, explained, basis, magnitude, test, rules)
-    channel = shots.channel[test]
     plain = orders.attempt(sources, Order(-1, False, 0.0, model_error))
     tried = orders.rising(sources, False, rules.residual_sizes, plain.fit.compared.model_error, (plain,))
-    if np.sqrt((plain.fit.compared.relative_l2(channel) ** 2).mean()) > rules.doubtful:
+    if np.sqrt((plain.fit.compared.relative_l2(shots.channel[test]) ** 2).mean()) > rules.doubtful:
         linear = polynomial_terms(1) if polynomial_terms(1) <= shots.positions else 1
         free = free_sources(shots, basis, linear, magnitude, rules)
         tried += orders.rising(free, True, (1.0,), rules.free_model_error, ())
@@ -213,17 +274,7 @@ def select_field(
     if best.fit.order.degree >= 0 and not best.fit.order.free:
         narrower = orders.narrowed(best)
         tried, best = (*tried, *(one for one in narrower if one is not best)), narrower[-1]
-    compared = best.fit.compared
-    support, error = choose_support(compared), kernel_error(compared, channel, best.fit.sources.pick(test), rules)
-    return Selection(
-        trial=best.fit,
-        candidates=Choice(best, tried).candidates,
-        image=orders.image(best.fit, support),
-        held_out=compared.relative_l2(channel),
-        error=error,
-        relative_l2=float(error.relative_l2(magnitude).mean()),
-        support=support,
-    )
+    return Selection(best.fit, Choice(best, tried).candidates, orders.image(best.fit), magnitude, test)
 
 
 def _mean_kernel(shots: Shots, sources: Sources) -> Float[np.ndarray, "3 rows columns"]:

@@ -5,27 +5,23 @@ Own parameters of a shot are (x, y) in px from the first assumed place, light pe
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Final, final
 
-import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 from scipy.special import softmax
 
 from udccal.fitting.engine.gaussian import Prior, scaled_inverse
 from udccal.fitting.engine.least_squares import Blocks, Step
 from udccal.fitting.psf.data import HUBER, Crops, Shots
 from udccal.fitting.psf.kernel import (
+    FOOTPRINT,
     HEAD,
     PITCH,
     PUPIL,
     Evaluator,
-    factor_jacobian,
     fit_lattice,
-    interference_coefficients,
     kernel_coefficients,
     kernel_jacobian,
     overlaps_of,
@@ -40,8 +36,8 @@ from udccal.fitting.psf.samples import (
     Theta,
     flux_of,
     gather,
-    own_equations,
-    own_jacobian,
+    huber_weight,
+    own_slopes,
     sampled,
     start_own,
     unit_light,
@@ -49,7 +45,6 @@ from udccal.fitting.psf.samples import (
 )
 from udccal.models.arrays import Arrayish
 from udccal.models.geometry import Geometry
-from udccal.models.interference import footprint_place, strengths
 
 # Overlaps of the pupil's footprint change with these parameters.
 _IN_OVERLAPS: Final = np.array([PITCH, PUPIL])
@@ -58,10 +53,34 @@ _IN_OVERLAPS: Final = np.array([PITCH, PUPIL])
 @final
 @dataclass(frozen=True)
 class Place:
-    """A descent's current parameters: those of diffraction, which are shared, and those of every shot."""
+    """A descent's current parameters: those of diffraction, which are shared, and those of every shot.
+
+    ``near`` is a place a few sigmas away at most, whose derivatives serve here too; by default it is this place.
+    """
 
     theta: Float[np.ndarray, " p"]
     own: Owns
+    near: Place | None = None
+
+    def same(self, other: Place) -> bool:
+        """Whether all parameters are equal."""
+        return np.array_equal(self.theta, other.theta) and np.array_equal(self.own, other.own)
+
+
+@final
+@dataclass(frozen=True)
+class _Slopes:
+    """The light of all samples at a ``place``, in e-/s, and its derivatives."""
+
+    samples: Samples
+    place: Place
+    light: Lights
+    by_theta: Float[np.ndarray, "positions shots n p"]
+    by_own: Float[np.ndarray, "positions shots n l"]
+
+    def of(self, samples: Samples) -> bool:
+        """Whether these are of the samples; their weights and rates do not matter."""
+        return all(getattr(self.samples, n) is getattr(samples, n) for n in ("points", "overlaps", "correction"))
 
 
 @final
@@ -77,23 +96,33 @@ class DiffractionProblem:
     evaluator: Evaluator
     prior: Prior
     name: str = "psf"
+    # The last derivatives, for problems that differ in the weights or the rates only.
+    _last: list[_Slopes] = field(default_factory=list, repr=False)
 
     @property
     def used(self) -> int:
         """Number of samples that are used."""
-        return int((np.asarray(self.samples.weight) > 0).sum())
+        return int((self.samples.weight > 0).sum())
 
     @property
     def unknowns(self) -> int:
         """Number of parameters, those of each shot included."""
-        return self.prior.mean.size + OWN * int((np.asarray(self.samples.index) >= 0).sum())
+        return self.prior.mean.size + OWN * int((self.samples.index >= 0).sum())
 
     def by_position(self, place: Place) -> list[Blocks]:
-        """Return each position's part of the equations, without the prior."""
-        made = normal_equations(self.evaluator, place.theta, self.samples, place.own)
-        cost, *parts = (np.asarray(part) for part in made)
-        counts = (np.asarray(self.samples.weight) > 0).sum(axis=(1, 2))
-        return [Blocks(float(cost[i]), int(n), *(part[i] for part in parts)) for i, n in enumerate(counts)]
+        """Return each position's part of the Gauss-Newton equations with Huber's weights, without the prior."""
+        slopes, weight = self._slopes_at(place), self.samples.weight
+        residual = self.samples.rate - slopes.light - place.own[..., 5:]
+        losses = HUBER.loss(residual * np.sqrt(weight))
+        huber, made = huber_weight(residual, weight), []
+        for i, (by_theta, by_own) in enumerate(zip(slopes.by_theta, slopes.by_own, strict=True)):
+            weighted, across = by_theta * huber[i, ..., None], np.swapaxes(by_own * huber[i, ..., None], 1, 2)
+            flat = by_theta.reshape(-1, by_theta.shape[-1])
+            shared, right = weighted.reshape(flat.shape).T @ flat, np.tensordot(residual[i], weighted, 2)
+            own_right, cross = (across @ residual[i, ..., None])[..., 0], np.swapaxes(across @ by_theta, 1, 2)
+            count = int((weight[i] > 0).sum())
+            made.append(Blocks(float(losses[i].sum()), count, shared, right, across @ by_own, own_right, cross))
+        return made
 
     def equations_at(self, place: Place) -> Blocks:
         """Return cost and normal equations, with the prior's."""
@@ -105,27 +134,70 @@ class DiffractionProblem:
 
     def moved(self, place: Place, step: Step) -> Place:
         """Return the place after a step."""
-        return Place(stepped(place.theta, step.shared), moved_own(place.own, step.own.reshape(place.own.shape)))
+        theta, own = stepped(place.theta, step.shared), moved_own(place.own, step.own.reshape(place.own.shape))
+        # The gain is the square of the step's length in sigmas: derivatives hardly change over five of them.
+        return Place(theta, own, (place.near or place) if step.gain < 25.0 else None)
 
     def light_at(self, place: Place) -> Lights:
         """Return the samples' light under the model, in e-/s, without background."""
-        return np.asarray(light_of(self.evaluator, place.theta, self.samples, place.own))
+        return self._slopes_at(place).light
+
+    def light_of_average(self, place: Place) -> Lights:
+        """Return the same averaged over the footprint's place, without interference."""
+        samples = self.samples
+        none = {name: np.zeros_like(getattr(samples, name)) for name in ("overlaps", "correction", "by_overlaps")}
+        return replace(self, samples=replace(samples, **none))._light(place)
 
     def errors(self, place: Place, light: Lights) -> Lights:
         """Return data less expectation in units of sigma, 0 for unused samples; ``light`` is of that place."""
-        samples = self.samples
-        return np.asarray((samples.rate - light - place.own[..., 5:]) * np.sqrt(np.asarray(samples.weight)))
+        return (self.samples.rate - light - place.own[..., 5:]) * np.sqrt(self.samples.weight)
 
     def with_overlaps(self, theta: Float[np.ndarray, " p"]) -> DiffractionProblem:
         """Set the overlaps to those of ``theta``: they hardly change in a descent."""
-        overlaps = np.asarray(overlaps_by_position(self.evaluator, theta, self.samples))
-        return replace(self, samples=replace(self.samples, overlaps=overlaps))
+        overlaps = [overlaps_of(self.evaluator, theta, one.frame) for one in self.samples.each()]
+        return replace(self, samples=replace(self.samples, overlaps=np.stack(overlaps)))
 
     def about(self, place: Place) -> DiffractionProblem:
         """Set interference up about a place."""
         if not self.evaluator.interference:
             return self.with_overlaps(place.theta)
-        return replace(self, samples=with_interference(self.evaluator, place.theta, self.samples, place.own[..., :2]))
+        found = [
+            _about(self.evaluator, place.theta, one, own[:, :2])
+            for one, own in zip(self.samples.each(), place.own, strict=True)
+        ]
+        overlaps, correction, by_overlaps = (np.stack(part) for part in zip(*found, strict=True))
+        at = np.tile(place.theta[_IN_OVERLAPS], (len(found), 1))
+        made = replace(self.samples, overlaps=overlaps, correction=correction, by_overlaps=by_overlaps, overlaps_at=at)
+        return replace(self, samples=made)
+
+    def _slopes_at(self, place: Place) -> _Slopes:
+        last = self._last[0] if self._last and self._last[0].of(self.samples) else None
+        if last and last.place.same(place):
+            return last
+        if last and place.near and (last.place.near or last.place).same(place.near):
+            found = _Slopes(self.samples, place, self._light(place), last.by_theta, last.by_own)
+        else:
+            place = replace(place, near=None)
+            made = (
+                _slopes(self.evaluator, place.theta, *one) for one in zip(self.samples.each(), place.own, strict=True)
+            )
+            found = _Slopes(self.samples, place, *(np.stack(part) for part in zip(*made, strict=True)))
+        self._last[:] = [found]
+        return found
+
+    def _light(self, place: Place) -> Lights:
+        kernels = coefficients_of(self.evaluator, place.theta, self.samples)
+        parts = zip(self.samples.each(), place.own, kernels, strict=True)
+        units = [
+            unit_light(self.evaluator, one, own[:, :2], kernel) + _changed(one, place.theta)
+            for one, own, kernel in parts
+        ]
+        return np.stack(units) * flux_of(self.samples, place.own)
+
+
+def _changed(one: Samples, theta: Theta) -> Light:
+    """Return changes of the light per unit by a shot's own place and by overlaps, to first order."""
+    return one.correction + one.by_overlaps @ (theta[_IN_OVERLAPS] - one.overlaps_at)
 
 
 def stepped(theta: Float[np.ndarray, " p"], step: Float[np.ndarray, " p"]) -> Float[np.ndarray, " p"]:
@@ -143,116 +215,65 @@ def moved_own(own: Float[np.ndarray, "*k l"], step: Float[np.ndarray, "*k l"]) -
     return own + np.concatenate([np.clip(step[..., :2], -0.5, 0.5), step[..., 2:]], axis=-1)
 
 
-@eqx.filter_jit
-def overlaps_by_position(
-    evaluator: Evaluator, theta: Theta, samples: Samples
-) -> Float[Array, "positions nodes terms rows half"]:
-    """Return overlaps at every position; see ``kernel.overlaps_of``."""
-    return jax.lax.map(lambda frame: overlaps_of(evaluator, theta, frame), samples.frame)
-
-
-@eqx.filter_jit
-def coefficients_of(evaluator: Evaluator, theta: Theta, samples: Samples) -> Float[Array, "positions y x 3"]:
+def coefficients_of(evaluator: Evaluator, theta: Theta, samples: Samples) -> Float[np.ndarray, "positions y x 3"]:
     """Return the kernel's spline coefficients at every position."""
-    return jax.lax.map(lambda one: _coefficients(evaluator, jnp.asarray(theta), one), samples)
+    kernels = []
+    for one in samples.each():
+        overlaps = one.overlaps if one.overlaps.shape[-1] else overlaps_of(evaluator, theta, one.frame)
+        kernels.append(np.asarray(kernel_coefficients(evaluator, theta, one.frame, one.disc_px, overlaps)))
+    return np.stack(kernels)
 
 
-def _coefficients(evaluator: Evaluator, theta: Theta, one: Samples) -> Float[Array, "y x 3"]:
-    overlaps = one.overlaps if np.shape(one.overlaps)[-1] else overlaps_of(evaluator, theta, one.frame)
-    return kernel_coefficients(evaluator, theta, one.frame, one.disc_px, overlaps)
+def _about(
+    evaluator: Evaluator, theta: Theta, one: Samples, offset_px: Float[np.ndarray, "shots 2"]
+) -> tuple[Float[np.ndarray, "nodes terms rows half"], Light, Float[np.ndarray, "shots n 2"]]:
+    """Return one position's overlaps at ``theta``, and corrections of the light per unit.
 
-
-@eqx.filter_jit
-def light_of(evaluator: Evaluator, theta: Theta, samples: Samples, own: Owns) -> Lights:
-    """Return the samples' light under the model, in e-/s, without background."""
-    theta = jnp.asarray(theta)
-
-    def one(pair: tuple[Samples, Array]) -> Light:
-        here, mine = pair
-        unit = unit_light(evaluator, here, mine[:, :2], _coefficients(evaluator, theta, here))
-        return _corrected(here, theta, unit) * flux_of(here, mine)
-
-    return jax.lax.map(one, (samples, jnp.asarray(own)))
-
-
-def _corrected(one: Samples, theta: Theta, unit: Light) -> Light:
-    """Add to the light per unit the changes by a shot's own place and by overlaps, to first order."""
-    return unit + one.correction + one.by_overlaps @ (theta[_IN_OVERLAPS] - one.overlaps_at)
-
-
-@eqx.filter_jit
-def with_interference(
-    evaluator: Evaluator, theta: Theta, samples: Samples, offset_px: Float[Arrayish, "positions shots 2"]
-) -> Samples:
-    """Return samples with overlaps of ``theta``, their derivatives, and corrections for each shot's own place."""
-    theta = jnp.asarray(theta)
-
-    def one(pair: tuple[Samples, Array]) -> tuple[Array, Array, Array]:
-        here, offset = pair
-        frame, model = here.frame, evaluator.model(theta)
-        overlaps, place = overlaps_of(evaluator, theta, frame), footprint_place(model, frame)
-        coefficients = interference_coefficients(evaluator, model, frame, here.disc_px)
-
-        def light(strength: Float[Array, " terms"], own: Float[Array, "nodes terms rows half"]) -> Float[Array, "s n"]:
-            return unit_light(evaluator, here, offset, coefficients(strength, own))
-
-        # Overlaps are in single precision: steps of this length (mm) keep their difference precise. Steps ten times as
-        # long change derivatives by some per cent.
-        strength, steps_mm = strengths(model, place), jnp.array([0.0002, 0.001])
-        larger = theta + steps_mm[:, None] * jnp.eye(theta.size)[_IN_OVERLAPS]
-        by_overlaps = (
-            jax.lax.map(lambda at: light(strength, overlaps_of(evaluator, at, frame) - overlaps), larger)
-            / steps_mm[:, None, None]
-        )
-        slope = frame.direction[:2] / frame.direction[2]
-        tangent = (jnp.eye(2) + jnp.outer(slope, slope)) / frame.direction[2]
-        along = model.standoff_per_pitch * (here.begun_px + offset) @ (tangent @ frame.jacobian).T
-
-        def elsewhere(move: Float[Array, "2"]) -> Light:
-            return light(strengths(model, place + move) - strength, overlaps)
-
-        of_shots = jnp.diagonal(jax.lax.map(elsewhere, along), axis1=0, axis2=1).T
-        return overlaps, of_shots, jnp.moveaxis(by_overlaps, 0, -1)
-
-    overlaps, correction, by_overlaps = jax.lax.map(one, (samples, jnp.asarray(offset_px)))
-    at = jnp.tile(theta[_IN_OVERLAPS], (len(overlaps), 1))
-    return replace(samples, overlaps=overlaps, correction=correction, by_overlaps=by_overlaps, overlaps_at=at)
-
-
-@eqx.filter_jit
-def normal_equations(evaluator: Evaluator, theta: Theta, samples: Samples, own: Owns) -> tuple[Array, ...]:
-    """Return each position's part of the Gauss-Newton equations, with Huber's weights.
-
-    The order is that of ``engine.least_squares.Blocks``, without the number of samples.
+    The first is for each shot's own place, the second a derivative, by what the overlaps depend on.
     """
-    theta = jnp.asarray(theta)
-    return jax.lax.map(lambda pair: _normal_equations(evaluator, theta, *pair), (samples, jnp.asarray(own)))
+    overlaps = np.asarray(overlaps_of(evaluator, theta, one.frame))
+
+    def light(theta: Theta, overlaps: Float[Arrayish, "nodes terms rows half"]) -> Light:
+        kernel = np.asarray(kernel_coefficients(evaluator, theta, one.frame, one.disc_px, overlaps))
+        return unit_light(evaluator, one, offset_px, kernel)
+
+    here = light(theta, overlaps)
+    # Overlaps are in single precision: steps of this length (mm) keep their difference precise. Steps ten times as
+    # long change derivatives by some per cent.
+    steps = zip(_IN_OVERLAPS, (2e-4, 1e-3), strict=True)
+    moved = [(step, theta + step * np.eye(theta.size)[i]) for i, step in steps]
+    by_overlaps = [(light(theta, overlaps_of(evaluator, there, one.frame)) - here) / step for step, there in moved]
+    slope = one.frame.direction[:2] / one.frame.direction[2]
+    tangent = (np.eye(2) + np.outer(slope, slope)) / one.frame.direction[2]
+    along = theta[FOOTPRINT][2] * (one.begun_px + offset_px) @ (tangent @ one.frame.jacobian).T
+    correction = np.zeros_like(here)
+    for shot, move in enumerate(along):
+        elsewhere = theta.copy()
+        elsewhere[FOOTPRINT][:2] += move
+        correction[shot] = (light(elsewhere, overlaps) - here)[shot]
+    return overlaps, correction, np.stack(by_overlaps, axis=-1)
 
 
-def _normal_equations(evaluator: Evaluator, theta: Theta, one: Samples, own: Own) -> tuple[Array, ...]:
-    model, colour = evaluator.model(theta), one.colour
-    spectra = jnp.asarray(model.spectrum)
-    coefficients, by_factor = kernel_jacobian(evaluator, model, one.frame, one.disc_px, one.overlaps)
+def _slopes(
+    evaluator: Evaluator, theta: Theta, one: Samples, own: Own
+) -> tuple[Light, Float[np.ndarray, "shots n p"], Float[np.ndarray, "shots n l"]]:
+    """Return the light of one position's samples, and its derivatives by shared and by own parameters."""
+    spectra = softmax(theta[HEAD:].reshape(3, -1), axis=1)
+    made = kernel_jacobian(evaluator, theta, one.frame, one.disc_px, one.overlaps)
+    coefficients, chain = (np.asarray(part) for part in made)
     count = spectra.shape[1]
-    parts = jnp.concatenate([coefficients, by_factor.reshape(*coefficients.shape[:2], -1)], axis=-1)
-    values = sampled(evaluator, one, parts, own[:, :2])
+    values = sampled(evaluator, one, coefficients, own[:, :2])
     nodes, by_colour = values[..., :count], values[..., count:].reshape(*values.shape[:2], -1, 3)
-    unit = jnp.einsum("snj,cj,snc->sn", nodes, spectra, colour)
-    by_head = jnp.einsum("snfc,snc->snf", by_colour, colour) @ factor_jacobian(evaluator, theta, one.frame)
-    by_head = by_head.at[..., _IN_OVERLAPS].add(one.by_overlaps)
-    by_logs = jnp.einsum("snc,cj,snj->sncj", colour, spectra, nodes - unit[..., None])
-    by_theta = jnp.concatenate([by_head, by_logs.reshape(*unit.shape, -1)], axis=-1) * flux_of(one, own)[..., None]
-    unit = _corrected(one, theta, unit)
-    by_own, residual, huber = own_jacobian(evaluator, one, own, unit, coefficients @ spectra.T)
-    size = jnp.abs(residual) * jnp.sqrt(one.weight)
-    return (
-        jnp.sum(jnp.where(size < HUBER.sigma, size**2, 2.0 * HUBER.sigma * size - HUBER.sigma**2)),
-        jnp.einsum("snp,sn,snq->pq", by_theta, huber, by_theta),
-        jnp.einsum("snp,sn->p", by_theta, huber * residual),
-        jnp.einsum("snk,sn,snl->skl", by_own, huber, by_own),
-        jnp.einsum("snl,sn->sl", by_own, huber * residual),
-        jnp.einsum("snp,sn,snl->spl", by_theta, huber, by_own),
-    )
+    of_colour = one.colour @ spectra
+    unit = np.einsum("snj,snj->sn", nodes, of_colour)
+    by_head = np.einsum("snfc,snc->snf", by_colour, one.colour) @ chain
+    by_head[..., _IN_OVERLAPS] += one.by_overlaps
+    by_logs = one.colour[..., None] * (of_colour * (nodes - unit[..., None]))[..., None, :]
+    flux = flux_of(one, own)
+    by_theta = np.concatenate([by_head, by_logs.reshape(*unit.shape, -1)], axis=-1) * flux[..., None]
+    unit = unit + _changed(one, theta)
+    kernel = coefficients[..., :count] @ spectra.T
+    return unit * flux, by_theta, own_slopes(evaluator, one, own, unit, kernel)
 
 
 def explain(
@@ -261,15 +282,18 @@ def explain(
     """Apply a fit's diffraction to whole crops: return own parameters, (x, y) on the sensor, and light per unit."""
     evaluator = replace(problem.evaluator, lattice=fit_lattice(shots.half))
     samples = weighed(gather(shots, geometry, np.ones(shots.rate.shape, dtype=bool)), model_error)
-    coefficients = coefficients_of(evaluator, theta, samples)
-    own = start_own(evaluator, samples, coefficients)
-    for _ in range(3):
-        matrix, right, _ = (np.asarray(part) for part in own_equations(evaluator, samples, own, coefficients))
-        own = moved_own(own, np.einsum("pslm,psm->psl", scaled_inverse(matrix, 1e-14), right))
-    unit = np.asarray(own_equations(evaluator, samples, own, coefficients)[2])
-    index = np.asarray(samples.index)
+    kernels = coefficients_of(evaluator, theta, samples)
     found, explained = np.zeros((shots.count, OWN)), np.zeros(shots.rate.shape)
-    found[index[index >= 0]] = own[index >= 0]
-    explained[index[index >= 0]] = unit[index >= 0].reshape(-1, *shots.rate.shape[1:])
+    for one, own, kernel in zip(samples.each(), start_own(evaluator, samples, kernels), kernels, strict=True):
+        for _ in range(3):
+            unit = unit_light(evaluator, one, own[:, :2], kernel)
+            slopes = own_slopes(evaluator, one, own, unit, kernel)
+            residual = one.rate - unit * flux_of(one, own) - own[:, 5:]
+            across = np.swapaxes(slopes * huber_weight(residual, one.weight)[..., None], 1, 2)
+            step = scaled_inverse(across @ slopes, 1e-14) @ (across @ residual[..., None])
+            own = moved_own(own, step[..., 0])
+        real = one.index >= 0
+        unit = unit_light(evaluator, one, own[:, :2], kernel)
+        found[one.index[real]], explained[one.index[real]] = own[real], unit[real].reshape(-1, *shots.rate.shape[1:])
     found[:, :2] += shots.centre_px
     return found, explained

@@ -6,13 +6,13 @@ Own parameters of a shot are (x, y) in px from the first assumed place, light pe
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Final, final
+from typing import Any, Final, final
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
 
 from udccal.fitting.engine.gaussian import scaled_inverse
 from udccal.fitting.psf.data import HUBER, PsfRules, Shots, left_out, noise_at
@@ -24,12 +24,15 @@ from udccal.models.lattice import sample
 from udccal.models.psf import lattice_points
 
 OWN: Final = 6
+_PER_SAMPLE: Final = (
+    *("points", "density", "colour", "rate", "known", "noise_per_rate", "weight", "correction", "by_overlaps"),
+)
 # Parameters of diffraction; own parameters and light of the shots of one position, and of all positions.
-Theta = Float[Arrayish, " p"]
-Own = Float[Arrayish, "shots l"]
-Light = Float[Arrayish, "shots n"]
-Owns = Float[Arrayish, "positions shots l"]
-Lights = Float[Arrayish, "positions shots n"]
+Theta = Float[np.ndarray, " p"]
+Own = Float[np.ndarray, "shots l"]
+Light = Float[np.ndarray, "shots n"]
+Owns = Float[np.ndarray, "positions shots l"]
+Lights = Float[np.ndarray, "positions shots n"]
 
 
 @final
@@ -53,34 +56,33 @@ class Samples(eqx.Module):
     """
 
     frame: LocalFrame
-    points: Float[Arrayish, "*positions shots n 2"]
-    density: Float[Arrayish, "*positions shots n"]
-    slope: Float[Arrayish, "*positions 2 2"]
-    begun_px: Float[Arrayish, "*positions shots 2"]
-    colour: Float[Arrayish, "*positions shots n 3"]
-    rate: Float[Arrayish, "*positions shots n"]
-    known: Float[Arrayish, "*positions shots n"]
-    noise_per_rate: Float[Arrayish, "*positions shots n"]
-    weight: Float[Arrayish, "*positions shots n"]
-    correction: Float[Arrayish, "*positions shots n"]
-    by_overlaps: Float[Arrayish, "*positions shots n 2"]
-    overlaps_at: Float[Arrayish, "*positions 2"]
-    overlaps: Float[Arrayish, "*positions nodes terms rows half"]
+    points: Float[np.ndarray, "*positions shots n 2"]
+    density: Float[np.ndarray, "*positions shots n"]
+    slope: Float[np.ndarray, "*positions 2 2"]
+    begun_px: Float[np.ndarray, "*positions shots 2"]
+    colour: Float[np.ndarray, "*positions shots n 3"]
+    rate: Float[np.ndarray, "*positions shots n"]
+    known: Float[np.ndarray, "*positions shots n"]
+    noise_per_rate: Float[np.ndarray, "*positions shots n"]
+    weight: Float[np.ndarray, "*positions shots n"]
+    correction: Float[np.ndarray, "*positions shots n"]
+    by_overlaps: Float[np.ndarray, "*positions shots n 2"]
+    overlaps_at: Float[np.ndarray, "*positions 2"]
+    overlaps: Float[np.ndarray, "*positions nodes terms rows half"]
     disc_px: Float[Arrayish, "*positions"]
-    index: Int[Arrayish, "*positions shots"]
+    index: Int[np.ndarray, "*positions shots"]
 
     def at(self, which: int | slice) -> Samples:
         """Return the samples of one position, or of several."""
         return jax.tree.map(lambda part: part[which], self)
 
+    def each(self) -> list[Samples]:
+        """Return the samples of every position."""
+        return [self.at(position) for position in range(len(self.index))]
+
 
 def choose_samples(shots: Shots, rules: PsfRules) -> Bool[np.ndarray, "shots rows columns"]:
-    """Return which samples are fitted: all near the peak and a seeded draw of the others, as many in every shot.
-
-    Args:
-        shots: crops about the LED.
-        rules: the windows in px, and the fraction that is drawn away from the peak.
-    """
+    """Return which samples are fitted: all near the peak and a seeded draw of the others, as many in every shot."""
     rng = np.random.default_rng(2)
     x, y = np.moveaxis(np.abs(shots.offsets()), -1, 0)
     inside = (x <= rules.close_px[1]) & (y <= rules.close_px[0])
@@ -93,37 +95,30 @@ def choose_samples(shots: Shots, rules: PsfRules) -> Bool[np.ndarray, "shots row
 
 
 def stands_for(shots: Shots, rules: PsfRules) -> Float[np.ndarray, "shots n"]:
-    """Return how many samples of its picture each chosen sample represents: 1 near the peak, more where it was drawn.
-
-    Args:
-        shots: crops about the LED.
-        rules: those of ``choose_samples``.
-    """
+    """Return how many samples of a picture each chosen one represents: 1 near the peak, more where it was drawn."""
     chosen, near = choose_samples(shots, rules), choose_samples(shots, replace(rules, far_fraction=0.0))
     return np.where(near[chosen].reshape(shots.count, -1), 1.0, 1.0 / rules.far_fraction)
 
 
 @eqx.filter_jit
+def _block(geometry: Geometry, place: Float[Arrayish, "2"], offsets_px: Float[Arrayish, "m 2"]) -> tuple[Any, ...]:
+    frame = local_frame(geometry, place)
+    return frame, *lattice_points(geometry, frame, place, jnp.asarray(offsets_px))
+
+
 def _on_lattice(
-    geometry: Geometry, places: Float[Arrayish, "positions 2"], offsets_px: Float[Arrayish, "positions m 2"]
-) -> tuple[LocalFrame, Float[Array, "positions m 2"], Float[Array, "positions m"]]:
-    """Return the frames of places, and the positions of pixels near them on their lattices."""
-
-    def one(at: tuple[Array, Array]) -> tuple[LocalFrame, Array, Array]:
-        frame = local_frame(geometry, at[0])
-        return frame, *lattice_points(geometry, frame, *at)
-
-    return jax.lax.map(one, (jnp.asarray(places), jnp.asarray(offsets_px)))
+    geometry: Geometry, place: Float[np.ndarray, "2"], offsets_px: Float[np.ndarray, "m 2"]
+) -> tuple[LocalFrame, Float[np.ndarray, "m 2"], Float[np.ndarray, " m"]]:
+    """Return a place's frame and pixels near it on its lattice, in blocks of one size that share a compilation."""
+    count, size = len(offsets_px), 2048
+    blocks = np.pad(offsets_px, ((0, -count % size), (0, 0))).reshape(-1, size, 2)
+    made = [jax.tree.map(np.asarray, _block(geometry, place, block)) for block in blocks]
+    points, density = (np.concatenate([one[part] for one in made])[:count] for part in (1, 2))
+    return made[0][0], points, density
 
 
 def gather(shots: Shots, geometry: Geometry, chosen: Bool[np.ndarray, "shots rows columns"]) -> Samples:
-    """Arrange the chosen samples by field position, without overlaps.
-
-    Args:
-        shots: the data, positions numbered without gaps.
-        geometry: the rays of pixels.
-        chosen: as many samples in every shot; see ``choose_samples``.
-    """
+    """Arrange the chosen samples by field position, without overlaps; there are as many in every shot."""
     groups = [np.flatnonzero(shots.position == g) for g in range(shots.positions)]
     most, places = max(len(group) for group in groups), shots.positions_px()
     index = np.stack([np.pad(group, (0, most - len(group)), constant_values=-1) for group in groups])
@@ -137,7 +132,8 @@ def gather(shots: Shots, geometry: Geometry, chosen: Bool[np.ndarray, "shots row
     away = taken(offsets) + (shots.origin_px[group] - places[:, None])[:, :, None]
     begun = shots.centre_px[group] - places[:, None]
     together = np.concatenate([away.reshape(len(groups), -1, 2), begun], axis=1)
-    frame, points, density = jax.tree.map(np.asarray, _on_lattice(geometry, places, together))
+    made = [_on_lattice(geometry, place, offset) for place, offset in zip(places, together, strict=True)]
+    frame, points, density = jax.tree.map(lambda *parts: np.stack(parts), *made)
     size, weight = away.shape[:3], taken(shots.weight) * (index >= 0)[..., None]
     scale = np.abs(np.diagonal(frame.jacobian, axis1=1, axis2=2))
     return Samples(
@@ -147,7 +143,7 @@ def gather(shots: Shots, geometry: Geometry, chosen: Bool[np.ndarray, "shots row
         slope=frame.jacobian / scale[..., None],
         begun_px=begun,
         colour=taken(shots.colour) * (index >= 0)[..., None, None],
-        rate=taken(shots.rate),
+        rate=taken(shots.rate).astype(np.float64),
         known=weight,
         noise_per_rate=taken(shots.noise_per_rate),
         weight=weight,
@@ -162,133 +158,93 @@ def gather(shots: Shots, geometry: Geometry, chosen: Bool[np.ndarray, "shots row
 
 def sensor_variance(samples: Samples, level: Float[np.ndarray, "*k n"]) -> Float[np.ndarray, "*k n"]:
     """Return the variance of the samples' noise if their true rate is ``level``; 1 where there is no sample."""
-    known, rate = np.asarray(samples.known), np.asarray(samples.rate)
-    measured = 1.0 / np.where(known > 0, known, 1.0)
-    return noise_at(level, rate, measured, np.asarray(samples.noise_per_rate) * (known > 0))
+    measured = 1.0 / np.where(samples.known > 0, samples.known, 1.0)
+    return noise_at(level, samples.rate, measured, samples.noise_per_rate * (samples.known > 0))
 
 
 def weighed(
     samples: Samples, model_error: float, light: np.ndarray | None = None, background: np.ndarray | float = 0.0
 ) -> Samples:
-    """Return the samples with weights at the expected ``light`` and ``background``, or at the data without them.
-
-    Args:
-        samples: the data.
-        model_error: relative to the peak of each picture; see ``left_out``.
-        light: that a model expects of each sample, in e-/s.
-        background: in e-/s, broadcast to samples.
-    """
-    seen = np.asarray(samples.known) > 0
-    light = np.asarray(samples.rate) if light is None else light
+    """Return the samples with weights at the expected ``light`` and ``background`` (e-/s), or at the data."""
+    seen = samples.known > 0
+    light = samples.rate if light is None else light
     variance = sensor_variance(samples, light + background) + left_out(light * seen, model_error) ** 2
     return replace(samples, weight=np.where(seen, 1.0 / variance, 0.0))
 
 
-@eqx.filter_jit
-def unit_light(
-    evaluator: Evaluator, one: Samples, offset_px: Float[Arrayish, "shots 2"], coefficients: Float[Arrayish, "y x 3"]
-) -> Light:
-    """Return each sample's light per unit of light of its own colour, at one position and without corrections."""
-    values = sampled(evaluator, one, jnp.asarray(coefficients), jnp.asarray(offset_px))
-    return jnp.sum(values * one.colour, axis=-1)
-
-
-def flux_of(one: Samples, own: Own) -> Light:
-    """Return the LED's light in each sample's own colour, in e-/s."""
-    return jnp.einsum("snc,sc->sn", one.colour, own[:, 2:5])
-
-
 def sampled(
-    evaluator: Evaluator, one: Samples, coefficients: Float[Array, "y x c"], offset_px: Float[Array, "shots 2"]
-) -> Float[Array, "shots n c"]:
-    """Return each sample's light per unit of the LED's light, for every kernel of the coefficients."""
+    evaluator: Evaluator, one: Samples, coefficients: Float[np.ndarray, "y x c"], offset_px: Float[np.ndarray, "k 2"]
+) -> Float[np.ndarray, "shots n c"]:
+    """Return each sample's light per unit of the LED's light at one position, for every kernel of the coefficients."""
     points = one.points - (offset_px @ one.slope.T)[:, None]
     values = sample(evaluator.lattice, coefficients, points.reshape(-1, 2)).reshape(*points.shape[:2], -1)
-    return values * one.density[..., None]
+    return np.asarray(values * one.density[..., None])
 
 
-@eqx.filter_jit
-def own_equations(
-    evaluator: Evaluator, samples: Samples, own: Owns, coefficients: Float[Arrayish, "positions y x 3"]
-) -> tuple[Float[Array, "positions shots l l"], Float[Array, "positions shots l"], Lights]:
-    """Return normal matrix and right side of every shot's own parameters for given kernels, and light per unit."""
-
-    def one(group: tuple[Samples, Array, Array]) -> tuple[Array, Array, Array]:
-        here, mine, kernel = group
-        unit = unit_light(evaluator, here, mine[:, :2], kernel)
-        by_own, residual, huber = own_jacobian(evaluator, here, mine, unit, kernel)
-        matrix = jnp.einsum("snk,sn,snl->skl", by_own, huber, by_own)
-        return matrix, jnp.einsum("snl,sn->sl", by_own, huber * residual), unit
-
-    return jax.lax.map(one, (samples, jnp.asarray(own), jnp.asarray(coefficients)))
+def unit_light(
+    evaluator: Evaluator,
+    one: Samples,
+    offset_px: Float[np.ndarray, "shots 2"],
+    coefficients: Float[np.ndarray, "y x 3"],
+) -> Light:
+    """Return each sample's light per unit of light of its own colour, at one position and without corrections."""
+    return np.einsum("snc,snc->sn", sampled(evaluator, one, coefficients, offset_px), one.colour)
 
 
-def own_jacobian(
-    evaluator: Evaluator, one: Samples, own: Own, unit: Light, coefficients: Float[Array, "y x 3"]
-) -> tuple[Float[Array, "shots n l"], Light, Light]:
-    """Derivatives of the light by each shot's own parameters, data less expectation, and Huber's weights."""
-    by_move = jax.jacfwd(lambda move: unit_light(evaluator, one, own[:, :2] + move, coefficients))(jnp.zeros(2))
-    flux = flux_of(one, own)
-    by_own = [flux[..., None] * by_move, unit[..., None] * one.colour, jnp.ones_like(unit)[..., None]]
-    residual = one.rate - unit * flux - own[:, 5:]
-    size = jnp.abs(residual) * jnp.sqrt(one.weight)
-    huber = one.weight * jnp.minimum(1.0, HUBER.sigma / jnp.maximum(size, 1e-12))
-    return jnp.concatenate(by_own, axis=-1), residual, huber
+def flux_of(samples: Samples, own: Float[np.ndarray, "*k l"]) -> Float[np.ndarray, "*k n"]:
+    """Return the LED's light in each sample's own colour, in e-/s."""
+    return np.einsum("...snc,...sc->...sn", samples.colour, own[..., 2:5])
 
 
-def start_own(evaluator: Evaluator, samples: Samples, coefficients: Float[Arrayish, "positions y x 3"]) -> Owns:
+def own_slopes(
+    evaluator: Evaluator, one: Samples, own: Own, unit: Light, coefficients: Float[np.ndarray, "y x 3"]
+) -> Float[np.ndarray, "shots n l"]:
+    """Derivatives of one position's light by each shot's own parameters; ``unit`` is the light per unit."""
+    # Differences over a 250th of the lattice's spacing: a cubic spline has no more detail.
+    moves = 1e-3 * np.eye(2)
+    ahead, behind = (
+        [unit_light(evaluator, one, own[:, :2] + sign * move, coefficients) for move in moves] for sign in (1, -1)
+    )
+    by_move = np.stack([(a - b) / 2e-3 for a, b in zip(ahead, behind, strict=True)], axis=-1)
+    flux = flux_of(one, own)[..., None]
+    return np.concatenate([flux * by_move, unit[..., None] * one.colour, np.ones_like(flux)], axis=-1)
+
+
+def huber_weight(residual: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """Return weights of squared residuals in a step, those of Huber's loss."""
+    return np.asarray(weight * np.minimum(1.0, HUBER.sigma / np.maximum(np.abs(residual) * np.sqrt(weight), 1e-12)))
+
+
+def start_own(evaluator: Evaluator, samples: Samples, coefficients: Float[np.ndarray, "positions y x 3"]) -> Owns:
     """Start every shot's own parameters at the best of a grid of places, with light and background by least squares.
 
     A centroid is not accurate enough. Neighbouring diffraction orders are half as bright as the middle one, and the
     mosaic samples each colour unevenly: it can be off by a pixel, and a descent then ends on a neighbouring order.
     """
-    # Places are compared on the samples about the brightest spot; 117 of them are enough.
-    core = np.argsort((np.asarray(samples.points) ** 2).sum(axis=-1), axis=-1, kind="stable")[..., :117]
-    by_sample = (
-        "points",
-        "density",
-        "colour",
-        "rate",
-        "known",
-        "noise_per_rate",
-        "weight",
-        "correction",
-        "by_overlaps",
-    )
-    near = replace(samples, **{name: _taken(np.asarray(getattr(samples, name)), core) for name in by_sample})
     moves = np.stack(np.meshgrid(*2 * (np.linspace(-1.25, 1.25, 11),)), axis=-1).reshape(-1, 2)
-    every = np.broadcast_to(moves[None, :, None], (len(core), len(moves), core.shape[1], 2))
-    _, cost = _linear(near, np.asarray(_unit_lights(evaluator, near, every, coefficients)))
-    offset = moves[cost.argmin(axis=1)]
-    linear, _ = _linear(samples, np.asarray(_unit_lights(evaluator, samples, offset[:, None], coefficients)))
-    return np.concatenate([offset, linear[:, 0]], axis=-1)
+    # Places are compared on the samples about the brightest spot; 117 of them are enough.
+    core = np.argsort((samples.points**2).sum(axis=-1), axis=-1, kind="stable")[..., :117]
+    near = replace(samples, **{name: _taken(getattr(samples, name), core) for name in _PER_SAMPLE})
+    owns = []
+    for position, kernel in enumerate(coefficients):
+        core_of, all_of = near.at(position), samples.at(position)
+        shots = len(core_of.rate)
+        units = np.stack([unit_light(evaluator, core_of, np.tile(move, (shots, 1)), kernel) for move in moves])
+        offset = moves[_linear(core_of, units)[1].argmin(axis=0)]
+        light, _ = _linear(all_of, unit_light(evaluator, all_of, offset, kernel)[None])
+        owns.append(np.concatenate([offset, light[0]], axis=-1))
+    return np.stack(owns)
 
 
 def _taken(values: np.ndarray, core: Int[np.ndarray, "positions shots few"]) -> np.ndarray:
     return np.take_along_axis(values, core.reshape(*core.shape, *(1,) * (values.ndim - core.ndim)), axis=2)
 
 
-@eqx.filter_jit
-def _unit_lights(
-    evaluator: Evaluator,
-    samples: Samples,
-    offsets_px: Float[Arrayish, "positions moves shots 2"],
-    coefficients: Float[Arrayish, "positions y x 3"],
-) -> Float[Array, "positions moves shots n"]:
-    """``unit_light`` for each of several moves of all shots."""
-
-    def one(group: tuple[Samples, Array, Array]) -> Float[Array, "moves shots n"]:
-        here, offsets, kernel = group
-        return jax.lax.map(lambda offset: unit_light(evaluator, here, offset, kernel), offsets)
-
-    return jax.lax.map(one, (samples, jnp.asarray(offsets_px), jnp.asarray(coefficients)))
-
-
 def _linear(
-    samples: Samples, units: Float[np.ndarray, "positions moves shots n"]
-) -> tuple[Float[np.ndarray, "positions moves shots 4"], Float[np.ndarray, "positions moves shots"]]:
+    one: Samples, units: Float[np.ndarray, "moves shots n"]
+) -> tuple[Float[np.ndarray, "moves shots 4"], Float[np.ndarray, "moves shots"]]:
     """Fit light per colour and background of the shots for each of several expectations; return them and the cost."""
-    rate, weight, colour = (np.asarray(part)[:, None] for part in (samples.rate, samples.weight, samples.colour))
+    rate, weight, colour = one.rate, one.weight, one.colour
     # Far from the solution, the model error is a tenth of the signal or more.
     variance = 1.0 / np.where(weight > 0, weight, 1.0) + (0.1 * np.maximum(rate, 0.0)) ** 2
     root = np.where(weight > 0, 1.0 / np.sqrt(variance), 0.0)
