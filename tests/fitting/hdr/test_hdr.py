@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import jax
 import numpy as np
 import pytest
@@ -159,3 +161,36 @@ def test_large_pictures_are_merged_like_small_ones() -> None:
     assert np.abs(off).max() < 0.01
     np.testing.assert_array_equal(whole.used[200:], part.used)
     assert set(whole.outliers[0].places) == {"(3, 5)", "(299, 249)"}
+
+
+def test_a_wrong_noise_model_is_told_by_the_scatter() -> None:
+    rng = np.random.default_rng(5)
+    for rate in (1e4, 1e5, 1e6):
+        frames = bracket(rate, EXPOSURES, int(rng.integers(1000)))
+        assert merge_bracket(frames, EXPOSURES, NOISE).status is FitStatus.CONVERGED
+        for K in (0.8, 1.2):
+            wrong = merge_bracket(frames, EXPOSURES, replace(NOISE, K_DN_per_e=K * 0.355))
+            assert wrong.status is FitStatus.POOR_FIT
+            assert "Check K" in wrong.notes[-1]
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"K_DN_per_e": 0.0}, {"K_DN_per_e": np.nan}, {"sigma_d_e": -1.0}, {"saturation_DN": 60.0}, {"q_DN": np.inf}],
+)
+def test_a_noise_model_that_cannot_be_is_refused(wrong: dict[str, float]) -> None:
+    with pytest.raises(FitError, match="gain above 0"):
+        merge_bracket(bracket(1e4, EXPOSURES, 0, (8, 8)), EXPOSURES, replace(NOISE, **wrong))
+
+
+def test_few_electrons_are_no_hits() -> None:
+    """A quiet sensor with a coarse gain, in the dim: counts of one or two electrons are no hits."""
+    noise = replace(NOISE, K_DN_per_e=2.0, sigma_d_e=1.0, dark_current_e_per_s=0.0, black_DN=64.0)
+    rng = np.random.default_rng(6)
+    rate = np.exp(rng.uniform(np.log(1e2), np.log(1e4), (300, 400)))
+    electrons = [rng.poisson(rate * t) + rng.standard_normal(rate.shape) for t in EXPOSURES]
+    frames = np.clip(np.rint(64 + 2.0 * np.array(electrons)), 0, 4095).astype(np.uint16)
+    assert not merge_bracket(frames, EXPOSURES, noise).outliers
+    frames[4, 7, 9] += 400
+    (found,) = merge_bracket(frames, EXPOSURES, noise).outliers
+    assert found.places == ("(7, 9)",)

@@ -86,12 +86,20 @@ def merge_block(
         total = xp.maximum(information.sum(axis=0), _TINY)
         rate = rate + score.sum(axis=0) / total
     mean, variance = expected(rate)
-    leverage = time**2 / (variance * total)
+    left = xp.where(is_open, xp.maximum(1 - time**2 / (variance * total), 1e-3), 1)
     # The least deviation of a sample that is clipped although the others give a far lower rate.
-    beyond = xp.where(is_open, light - mean, xp.maximum(sensor.level_e - mean, 0))
-    own = xp.where(left_out, 0, beyond**2 / variance / xp.where(is_open, xp.maximum(1 - leverage, 1e-3), 1))
+    beyond = xp.where(is_open, light - mean, xp.maximum(sensor.level_e - mean, 0)) / xp.sqrt(left)
+    # One sample alone may have made the rate so low that it seems to be known well: the others may give a higher one.
+    mean = xp.maximum(mean, mean - (1 - left) / xp.sqrt(left) * beyond)
+    variance = xp.maximum(variance, mean + sensor.floor_e2)
+    own = xp.where(left_out, 0, beyond**2 / variance)
     worst, used = own.argmax(axis=0), is_open.sum(axis=0, dtype=np.int32)
-    return BlockMerge(rate, 1 / xp.sqrt(total), used, worst, own.max(axis=0))
+    # Few electrons scatter more upwards than downwards: the deviance of scaled counts of this variance and skewness.
+    scale = xp.maximum(mean / variance, 0.03)
+    relative = xp.maximum(beyond * scale / variance, 0)
+    upwards = 2 * variance / scale**2 * ((1 + relative) * xp.log1p(relative) - relative)
+    deviation2 = xp.take_along_axis(xp.where(beyond > 0, xp.minimum(own, upwards), own), worst[None], axis=0)[0]
+    return BlockMerge(rate, 1 / xp.sqrt(total), used, worst, deviation2)
 
 
 compiled_merge_block = jax.jit(merge_block, static_argnames=("believed_sigma", "xp"))

@@ -34,6 +34,7 @@ class HdrRules:
         margin_sigma: samples count as clipped from this many sigma of dark noise below saturation on.
         frame_off, frame_sigma: a frame is left out when its light is off by more than both (relative, and in sigma).
         least_to_judge: the fewest samples of a pixel for finding hits and testing frames.
+        scatter_off: scatter of samples about their light, relative to the noise model's variance, that is too much.
     """
 
     believed_sigma: float = 6.0
@@ -41,6 +42,7 @@ class HdrRules:
     frame_off: float = 0.02
     frame_sigma: float = 5.0
     least_to_judge: int = 3
+    scatter_off: float = 0.05
 
 
 @final
@@ -52,7 +54,8 @@ class HdrMerge:
         rate_e_per_s, sigma_e_per_s: light of every pixel, with one standard deviation.
         used: number of samples used for each pixel; where it is 0 the rate is 0 and sigma ``UNKNOWN_SIGMA``.
         outliers: frames and samples that were left out.
-        status, notes: SATURATED where no pixel has a sample that could be used; sentences for a person.
+        status, notes: SATURATED where no pixel has a sample that could be used, POOR_FIT where samples of a pixel
+            scatter unlike the noise model says, so that rate and sigma are not to be trusted; sentences for a person.
     """
 
     rate_e_per_s: Float[np.ndarray, "*picture"]
@@ -85,7 +88,7 @@ def merge_bracket(
         rate and sigma in e-/s of every pixel, and the outliers.
 
     Raises:
-        FitError: when exposures are not positive, or not as many as frames.
+        FitError: when exposures are not positive, or not as many as frames, or a number of the noise is impossible.
     """
     rules = rules or HdrRules()
     times = np.asarray(exposures_s, dtype=np.float64)
@@ -100,27 +103,36 @@ def merge_bracket(
     while (bad := bracket.frame_off(merged, dropped)) is not None:
         dropped[bad] = True
         merged = bracket.merged(dropped)
-    hits = bracket.mend_hits(merged, dropped)
+    hits, scatter = bracket.mend_hits(merged, dropped), bracket.scatter(merged, dropped)
     # In place: copies of a full frame would cost as much as a third of the merging.
     for values in (merged.rate, merged.sigma):
         values /= np.float32(unit)
     unknown = merged.used <= 0
     merged.rate[unknown], merged.sigma[unknown] = 0.0, UNKNOWN_SIGMA
-    note = f"{unknown.sum()} of {unknown.size} pixels have no sample that could be used."
+    notes = [f"{unknown.sum()} of {unknown.size} pixels have no sample that could be used."] if unknown.any() else []
+    if scatter != 1:
+        notes.append(
+            f"Samples scatter about a pixel's light with {scatter:.2f} times the variance of the noise model. Check K, "
+            "black level and exposure times; rate and sigma are not to be trusted."
+        )
     off = f"frames whose light is off by more than {100 * rules.frame_off:g} % and {rules.frame_sigma:g} sigma"
     hit = f"pixels with a sample more than {rules.believed_sigma:g} sigma from what its other samples say; that sample"
     places = (str(tuple(int(k) for k in np.unravel_index(pixel, shape))) for pixel in hits)
     listed = outliers(off, (f"frame {i}" for i in np.flatnonzero(dropped)))
     listed += outliers(f"{hit} is left out", places)
-    status = FitStatus.SATURATED if unknown.size and unknown.all() else FitStatus.CONVERGED
+    status = FitStatus.CONVERGED if scatter == 1 else FitStatus.POOR_FIT
+    status = FitStatus.SATURATED if unknown.size and unknown.all() else status
     rate, sigma, used = (part.reshape(shape) for part in (merged.rate, merged.sigma, merged.used))
-    return HdrMerge(rate, sigma, used, listed, status, (note,) if unknown.any() else ())
+    return HdrMerge(rate, sigma, used, listed, status, tuple(notes))
 
 
 def sensor_numbers(noise: Noise, unit_s: float, rules: HdrRules) -> SensorNumbers:
     """The numbers of a noise model that the likelihood uses, times in units of ``unit_s``."""
     parts = noise.K_DN_per_e, noise.black_DN, noise.saturation_DN, noise.sigma_d_e, noise.q_DN
     K, black, saturation, sigma_d, q = (float(np.asarray(part)) for part in parts)
+    if not (np.isfinite([K, black, saturation, sigma_d, q]).all() and K > 0 and sigma_d >= 0 and saturation > black):
+        found = f"K {K:g} DN/e, black {black:g} DN, saturation {saturation:g} DN, sigma_d {sigma_d:g} e"
+        raise FitError(f"Expected a noise model with a gain above 0 and saturation above black, found {found}. Fit it.")
     # A sensor without any dark noise still has a least variance: the likelihood of its dark pixels stays finite.
     floor = max(sigma_d**2 + (q / K) ** 2 / 12.0, 1e-4)
     level = (saturation - black) / K - rules.margin_sigma * math.sqrt(floor)
@@ -172,6 +184,20 @@ class _Bracket:
             score[i] = off / error if off > rules.frame_off else 0.0
         worst = int(np.argmax(score))
         return worst if score[worst] > rules.frame_sigma else None
+
+    def scatter(self, merged: BlockMerge, dropped: Bool[np.ndarray, "n 1"]) -> float:
+        """Variance of bright samples about their pixel's light over the model's; 1 where that is what chance gives."""
+        sensor, lit = self.sensor, np.flatnonzero((merged.used >= 2) & (merged.rate > 0))
+        lit, times = lit[:: max(1, len(lit) // 20_000)], self.times[:, None].astype(np.float64)
+        light = (self.codes[:, lit].astype(np.float64) - float(sensor.black_DN)) * float(sensor.e_per_DN)
+        mean = (merged.rate[lit].astype(np.float64) + float(sensor.dark_e_per_s)) * times
+        variance = mean + float(sensor.floor_e2)
+        # Samples of many electrons, clear of clipping: that a sample is clipped or skewed changes nothing then.
+        clear = ~dropped & (mean > 100) & (mean + 5 * np.sqrt(variance) < float(sensor.level_e))
+        chi2 = np.minimum((light - mean) ** 2 / variance, self.rules.believed_sigma**2)
+        dof = float(np.sum((1 - np.minimum((times * merged.sigma[lit]) ** 2 / variance, 1))[clear]))
+        found = float(np.sum(chi2[clear])) / max(dof, 1e-9)
+        return found if abs(found - 1) > max(self.rules.scatter_off, 6 * math.sqrt(2 / max(dof, 1e-9))) else 1.0
 
     def mend_hits(self, merged: BlockMerge, dropped: Bool[np.ndarray, "n 1"]) -> Int[np.ndarray, " hits"]:
         """Leave out the worst sample of a pixel while it is too far off; changes ``merged``, returns the pixels."""
