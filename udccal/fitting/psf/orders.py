@@ -165,7 +165,7 @@ class Selection:
     trial: Trial
     candidates: tuple[Candidate, ...]
     image: Float[np.ndarray, "terms 3 rows columns"]
-    magnitude: Float[np.ndarray, "3 rows columns"]
+    magnitude: Float[np.ndarray, "3 window_rows window_columns"]
     test: Bool[np.ndarray, " shots"]
 
 
