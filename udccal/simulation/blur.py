@@ -18,6 +18,7 @@ from udccal.simulation.rays import spline_basis
 from udccal.simulation.truth import RigTruth
 
 _WORKERS = 2
+_MOST_COMPONENTS = 16
 
 
 @dataclass(frozen=True)
@@ -80,7 +81,6 @@ def build_blur(
     grid_rows: int,
     rows: int,
     columns: int,
-    max_rank: int = 16,
     tolerance: float = 1e-3,
 ) -> SpaceVariantBlur:
     """Build the blur from kernels of ``rows`` x ``columns`` pixels on a grid that spans the sensor.
@@ -89,7 +89,6 @@ def build_blur(
         truth: the simulated rig.
         grid_columns: source positions across. grid_rows: source positions down.
         rows: odd number of rows of a kernel. columns: odd number of columns.
-        max_rank: largest number of components.
         tolerance: relative error of the kernels on the grid at which the rank is cut.
     """
     camera = truth.description.camera
@@ -99,7 +98,7 @@ def build_blur(
     stack = np.empty((3, len(nodes), rows * columns), np.float32)
     for index, kernel in enumerate(_each_kernel(truth, nodes, rows, columns)):
         stack[:, index] = kernel.reshape(3, -1)
-    components, coefficients, error = low_rank(stack, max_rank, tolerance)
+    components, coefficients, error = low_rank(stack, _MOST_COMPONENTS, tolerance)
     return SpaceVariantBlur(
         components=components.reshape(3, -1, rows, columns),
         coefficients=coefficients.reshape(3, -1, grid_rows, grid_columns),

@@ -167,14 +167,12 @@ class _Bracket:
     def frame_off(self, merged: BlockMerge, dropped: Bool[np.ndarray, "n 1"]) -> int | None:
         """The frame whose light differs most from the others', when that is too much."""
         rules, sensor = self.rules, self.sensor
-        lit = np.flatnonzero((merged.used >= rules.least_to_judge) & (merged.rate > 0))
-        lit, times = lit[:: max(1, len(lit) // 20_000)], self.times[:, None]
-        light = (self.codes[:, lit].astype(np.float64) - float(sensor.black_DN)) * float(sensor.e_per_DN)
-        signal, dark = merged.rate[lit].astype(np.float64) * times, float(sensor.dark_e_per_s) * times
-        sigma = np.sqrt(signal + dark + float(sensor.floor_e2))
+        _, light, mean, variance = self._lit(merged, rules.least_to_judge)
+        dark, sigma = float(sensor.dark_e_per_s) * self.times[:, None].astype(np.float64), np.sqrt(variance)
+        signal = mean - dark
         # Unclipped samples near the level are the low ones of their kind; samples of few electrons are skewed. Both are
         # left out here. The median keeps hits from counting as a lamp that flickers.
-        clear = ~dropped & (signal + dark + 5 * sigma < float(sensor.level_e)) & (10 * sigma < signal)
+        clear = ~dropped & (mean + 5 * sigma < float(sensor.level_e)) & (10 * sigma < signal)
         score = np.zeros(len(clear))
         for i in np.flatnonzero(clear.sum(axis=1) >= 8):
             part = np.s_[i, clear[i]]
@@ -185,15 +183,24 @@ class _Bracket:
         worst = int(np.argmax(score))
         return worst if score[worst] > rules.frame_sigma else None
 
+    def _lit(
+        self, merged: BlockMerge, least: int
+    ) -> tuple[
+        Int[np.ndarray, " lit"], Float[np.ndarray, "n lit"], Float[np.ndarray, "n lit"], Float[np.ndarray, "n lit"]
+    ]:
+        """Some lit pixels with at least so many samples; their samples, and those' mean and variance, in electrons."""
+        sensor, lit = self.sensor, np.flatnonzero((merged.used >= least) & (merged.rate > 0))
+        lit = lit[:: max(1, len(lit) // 20_000)]
+        light = (self.codes[:, lit].astype(np.float64) - float(sensor.black_DN)) * float(sensor.e_per_DN)
+        mean = (merged.rate[lit].astype(np.float64) + float(sensor.dark_e_per_s)) * self.times[:, None]
+        return lit, light, mean, mean + float(sensor.floor_e2)
+
     def scatter(self, merged: BlockMerge, dropped: Bool[np.ndarray, "n 1"]) -> float:
         """Variance of bright samples about their pixel's light over the model's; 1 where that is what chance gives."""
-        sensor, lit = self.sensor, np.flatnonzero((merged.used >= 2) & (merged.rate > 0))
-        lit, times = lit[:: max(1, len(lit) // 20_000)], self.times[:, None].astype(np.float64)
-        light = (self.codes[:, lit].astype(np.float64) - float(sensor.black_DN)) * float(sensor.e_per_DN)
-        mean = (merged.rate[lit].astype(np.float64) + float(sensor.dark_e_per_s)) * times
-        variance = mean + float(sensor.floor_e2)
+        lit, light, mean, variance = self._lit(merged, 2)
+        times, level_e = self.times[:, None].astype(np.float64), float(self.sensor.level_e)
         # Samples of many electrons, clear of clipping: that a sample is clipped or skewed changes nothing then.
-        clear = ~dropped & (mean > 100) & (mean + 5 * np.sqrt(variance) < float(sensor.level_e))
+        clear = ~dropped & (mean > 100) & (mean + 5 * np.sqrt(variance) < level_e)
         chi2 = np.minimum((light - mean) ** 2 / variance, self.rules.believed_sigma**2)
         dof = float(np.sum((1 - np.minimum((times * merged.sigma[lit]) ** 2 / variance, 1))[clear]))
         found = float(np.sum(chi2[clear])) / max(dof, 1e-9)
