@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import ArrayLike, Bool, Float32, UInt16
 
 from udccal.cfa import cfa_named
-from udccal.models.noise import Noise, variance_e
+from udccal.models.noise import Noise
 
 # A sample is an outlier when it differs from all its neighbours by this many sigma of temporal noise ...
 _OUTLIER_SIGMA = 8.0
@@ -38,15 +38,22 @@ def saturated(
     return mosaic >= top - margin * (top - black)
 
 
-def mean_variance_e2(mosaic: UInt16[np.ndarray, "rows columns"], noise: Noise, exposure_s: float) -> float:
-    """Return the temporal variance in e-^2, averaged over a frame (EMVA 1288, linear camera model).
+def variance_e2(
+    signal_e: Float32[np.ndarray, "rows columns"], noise: Noise, exposure_s: float
+) -> Float32[np.ndarray, "rows columns"]:
+    """Return the temporal variance of every sample in e-^2 (EMVA 1288, linear camera model).
 
     A measured dark current slightly below zero adds no noise.
+
+    Args:
+        signal_e: signal in e-, dark signal excluded, backscatter included.
+        noise: the noise term.
+        exposure_s: exposure time.
     """
-    mean_e = (float(mosaic.mean()) - scalar(noise.black_DN)) / scalar(noise.K_DN_per_e)
     dark_e = scalar(noise.dark_current_e_per_s) * exposure_s
-    signal_e = max(mean_e - dark_e, 0.0)
-    return float(variance_e(noise, signal_e, exposure_s)) + max(-dark_e, 0.0)
+    quantisation = (scalar(noise.q_DN) / scalar(noise.K_DN_per_e)) ** 2 / 12.0
+    floor = max(dark_e, 0.0) + scalar(noise.sigma_d_e) ** 2 + quantisation
+    return np.maximum(signal_e, np.float32(0)) + np.float32(floor)
 
 
 def without_defects(

@@ -31,9 +31,11 @@ class PlanOptions:
             than 0.1 dB against full rank.
         max_rank: largest number of components.
         pad_rows, pad_columns: width in px of the scene around the frame that may send light into it.
-        contrast: expected RMS difference of neighbours, relative to a channel's 97th percentile.
-        local_contrast: the same, relative to the local brightness, for the smoothing of dark places.
-        iterations: largest number of conjugate-gradient iterations. tolerance: relative residual at which they stop.
+        tile_rows, tile_columns: size in px of the tiles, each of which has one kernel and one prior.
+        contrast: of clipped light's solver, expected RMS difference of neighbours, relative to a channel's 97th
+            percentile.
+        iterations: its largest number of conjugate-gradient iterations. tolerance: relative residual at which they
+            stop.
         saturation_margin: fraction of the range below saturation that counts as saturated.
         workers: threads of the Fourier transforms.
     """
@@ -46,8 +48,9 @@ class PlanOptions:
     max_rank: int = 10
     pad_rows: int = 64
     pad_columns: int = 24
+    tile_rows: int = 256
+    tile_columns: int = 256
     contrast: float = 0.03
-    local_contrast: float = 0.17
     iterations: int = 12
     tolerance: float = 0.005
     saturation_margin: float = 0.015

@@ -43,6 +43,12 @@ class Rectification:
                 )
         return found
 
+    @property
+    def rows(self) -> tuple[int, int]:
+        """First row of the sensor that resampling reads, and the row after the last one; they may lie outside it."""
+        reach = 4
+        return int(np.floor(self.map_y.min())) - reach, int(np.ceil(self.map_y.max())) + reach + 1
+
     def apply(self, picture: Float32[np.ndarray, "rows columns 3"]) -> Float32[np.ndarray, "view_rows view_columns 3"]:
         """Resample a sensor picture onto the view (Lanczos over 8 x 8 pixels)."""
         return cv2.remap(picture, self.map_x, self.map_y, cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REFLECT_101)

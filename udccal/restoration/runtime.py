@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float32, UInt8, UInt16
+from jaxtyping import Float32, UInt8, UInt16
 
 from udccal.errors import RestorationError
 from udccal.models.backscatter import PanelResponse
@@ -18,13 +18,13 @@ from udccal.models.geometry import VirtualView
 from udccal.models.noise import Noise
 from udccal.profiles.profile import Profile
 from udccal.profiles.store import load_profile
-from udccal.restoration.adapt import adapted
 from udccal.restoration.backscatter import estimated_rate, known_rate, mask_mosaic, prepared_response
-from udccal.restoration.deblur import Deblurrer, expected_smoothness
-from udccal.restoration.demosaic import demosaic, demosaic_clipped
-from udccal.restoration.linear import mean_variance_e2, saturated, scalar, to_electrons, without_defects
-from udccal.restoration.plan import PlanOptions, build_deblurrers, kernel_grid
+from udccal.restoration.demosaic import demosaic
+from udccal.restoration.linear import saturated, to_electrons, variance_e2, without_defects
+from udccal.restoration.plan import PlanOptions, kernel_grid
 from udccal.restoration.rectify import Rectification
+from udccal.restoration.sharpen import Sharpener
+from udccal.restoration.tiers import Tier
 from udccal.restoration.view import inscribed_view
 from udccal.result import FitStatus
 from udccal.rig import RigDescription
@@ -35,43 +35,55 @@ Picture = Float32[np.ndarray, "rows columns 3"]
 
 @dataclass(frozen=True)
 class Restorer:
-    """A profile prepared to restore frames.
+    """A profile prepared to restore frames at one tier.
 
     Attributes:
+        tier: how much is done to a frame.
         rig: the rig description.
         noise: the noise term.
         view: the view of restored pictures.
         wire: map to divide by; None when it is 1 everywhere.
-        mask: backscatter of a white panel in e-/s.
-        response: the backscatter term for known panel pictures; None when the rig has no backscatter.
-        deblurrers: one per channel; empty when the rig has no blur.
+        mask: backscatter of a white panel in e-/s; None when the rig has none.
+        response: the backscatter term for known panel pictures; None when the rig has no backscatter, or the tier does
+            not ask for the picture.
+        sharpener: demosaics and deblurs; None when the rig has no blur, or the tier leaves it.
         rectification: map from sensor to view.
         options: options of the restoration.
     """
 
+    tier: Tier
     rig: RigDescription
     noise: Noise
     view: VirtualView
     wire: Mosaic | None
-    mask: Mosaic
+    mask: Mosaic | None
     response: PanelResponse | None
-    deblurrers: tuple[Deblurrer, ...]
+    sharpener: Sharpener | None
     rectification: Rectification
     options: PlanOptions
 
     @classmethod
-    def load(cls, profile: str | Path, options: PlanOptions | None = None) -> Restorer:
+    def load(
+        cls, profile: str | Path, tier: Tier = Tier.balanced, options: PlanOptions | None = None
+    ) -> Restorer:
         """Read a profile, by path or by the name of a rig that has one, and prepare it.
 
         Raises:
             ProfileError: when it cannot be read.
             RestorationError: as ``from_profile``.
         """
-        return cls.from_profile(load_profile(profile), options)
+        return cls.from_profile(load_profile(profile), tier, options)
 
     @classmethod
-    def from_profile(cls, profile: Profile, options: PlanOptions | None = None) -> Restorer:
+    def from_profile(
+        cls, profile: Profile, tier: Tier = Tier.balanced, options: PlanOptions | None = None
+    ) -> Restorer:
         """Prepare a profile.
+
+        Args:
+            profile: the rig as measured.
+            tier: how much is done to a frame.
+            options: accuracy against time within the tier.
 
         Raises:
             RestorationError: when its geometry leaves no view through the panel, or a term gives values that are not
@@ -81,18 +93,25 @@ class Restorer:
         rig, geometry = profile.rig, profile.geometry.term
         camera = rig.camera
         view = inscribed_view(geometry, camera.columns, camera.rows, rig.view.columns, rig.view.rows)
+        rectification = Rectification.within(geometry, view, camera.columns, camera.rows)
+        quick = tier is Tier.preview
         unscattered = profile.backscatter.status is FitStatus.ABSENT
-        unblurred = profile.psf.status is FitStatus.ABSENT
+        unblurred = quick or profile.psf.status is FitStatus.ABSENT
         even = profile.wire.status is FitStatus.ABSENT and bool(np.all(profile.wire_map == 1.0))
         return cls(
+            tier=tier,
             rig=rig,
             noise=profile.noise.term,
             view=view,
             wire=None if even else profile.wire_map,
-            mask=mask_mosaic(profile.backscatter_mask, camera.cfa, camera.rows, camera.columns),
-            response=None if unscattered else prepared_response(profile.backscatter.term, rig),
-            deblurrers=() if unblurred else build_deblurrers(kernel_grid(profile.psf.term, rig, options), rig, options),
-            rectification=Rectification.within(geometry, view, camera.columns, camera.rows),
+            mask=None
+            if unscattered
+            else mask_mosaic(profile.backscatter_mask, camera.cfa, camera.rows, camera.columns),
+            response=None if quick or unscattered else prepared_response(profile.backscatter.term, rig),
+            sharpener=None
+            if unblurred
+            else Sharpener.of(kernel_grid(profile.psf.term, rig, options), rig, rectification.rows, tier, options),
+            rectification=rectification,
             options=options,
         )
 
@@ -117,15 +136,19 @@ class Restorer:
         """
         check_frame(mosaic, exposure_s, self.rig)
         check_panel_picture(panel_picture, self.rig)
-        signal = without_defects(to_electrons(mosaic, self.noise, exposure_s), self.noise, self.rig.camera.cfa)
+        raw = to_electrons(mosaic, self.noise, exposure_s)
+        signal = without_defects(raw, self.noise, self.rig.camera.cfa)
+        clipped = saturated(mosaic, self.noise, self.options.saturation_margin) & (signal == raw)
+        variance = variance_e2(signal, self.noise, exposure_s)
         if self.wire is not None:
             signal /= self.wire
-        if self.response is not None:
+            variance /= self.wire**2
+        if self.mask is not None:
             signal -= np.float32(exposure_s) * self._backscatter_rate(signal, exposure_s, panel_picture)
-        clipped = saturated(mosaic, self.noise, self.options.saturation_margin)
-        sharp, valid = demosaic_clipped(signal, self.rig.camera.cfa, clipped)
-        if self.deblurrers:
-            sharp = self.deblur(sharp, valid, mean_variance_e2(mosaic, self.noise, exposure_s))
+        if self.sharpener is None:
+            sharp = demosaic(signal, self.rig.camera.cfa)
+        else:
+            sharp = self.sharpener.apply(signal, variance, clipped)
         return self.rectification.apply(sharp) / np.float32(exposure_s)
 
     def before(self, mosaic: UInt16[np.ndarray, "frame_rows frame_columns"], exposure_s: float) -> Picture:
@@ -133,23 +156,6 @@ class Restorer:
         check_frame(mosaic, exposure_s, self.rig)
         signal = to_electrons(mosaic, self.noise, exposure_s)
         return self.rectification.apply(demosaic(signal, self.rig.camera.cfa)) / np.float32(exposure_s)
-
-    def deblur(self, blurred: Picture, valid: Bool[np.ndarray, "rows columns 3"], variance_e2: float) -> Picture:
-        """Deblur a demosaiced picture on the sensor.
-
-        Args:
-            blurred: picture in e-.
-            valid: which of its values carry data.
-            variance_e2: mean variance of its noise in e-^2.
-        """
-        channels = []
-        for channel, deblurrer in enumerate(self.deblurrers):
-            plane, known = np.ascontiguousarray(blurred[..., channel]), np.ascontiguousarray(valid[..., channel])
-            smoothness = expected_smoothness(plane, variance_e2, self.options.contrast)
-            sharp = deblurrer.solve(plane, known, smoothness).picture
-            floor_e2 = scalar(self.noise.sigma_d_e) ** 2
-            channels.append(adapted(deblurrer, sharp, smoothness, floor_e2, self.options.local_contrast))
-        return np.stack(channels, axis=-1)
 
     def _backscatter_rate(
         self,

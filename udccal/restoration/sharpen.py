@@ -1,0 +1,130 @@
+"""From a mosaic without backscatter to a sharp picture on the sensor, in tiles."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+from typing import final
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float32
+
+from udccal.cfa import Cfa, cfa_named
+from udccal.restoration.highlights import Highlights
+from udccal.restoration.lowrank import KernelGrid
+from udccal.restoration.mosaic_filter import FilterTables, filter_tables, filtered
+from udccal.restoration.plan import PlanOptions
+from udccal.restoration.shrink import BandNoise, measured_noise, shrunk
+from udccal.restoration.tiers import Tier
+from udccal.restoration.tiles import TileLayout, layout_for
+from udccal.rig import RigDescription
+
+Mosaic = Float32[np.ndarray, "rows columns"]
+Picture = Float32[np.ndarray, "rows columns 3"]
+
+# Every n-th cell of a tile gives the mean noise of its samples.
+_SPARSE = 4
+# Width in px over which the noise's variance is averaged to tell bright places of a tile from dark ones.
+_LOCAL_PX = 16
+
+
+@final
+@dataclass(frozen=True)
+class Sharpener:
+    """Everything that depends on kernels alone.
+
+    Attributes:
+        grid: kernels over the sensor.
+        rig: the rig description.
+        layout: the tiles.
+        tables: of the tiles' filters.
+        noise: what the filters leave of noise; None for the tier that does not take it out.
+        options: options of the restoration.
+    """
+
+    grid: KernelGrid
+    rig: RigDescription
+    layout: TileLayout
+    tables: FilterTables
+    noise: BandNoise | None
+    options: PlanOptions
+
+    @classmethod
+    def of(
+        cls, grid: KernelGrid, rig: RigDescription, rows: tuple[int, int], tier: Tier, options: PlanOptions
+    ) -> Sharpener:
+        """Prepare the filters of a tier.
+
+        Args:
+            grid: kernels over the sensor.
+            rig: the rig description.
+            rows: first row of the sensor that the view needs, and the row after the last one.
+            tier: fast or balanced.
+            options: options of the restoration.
+        """
+        camera, cfa = rig.camera, cfa_named(rig.camera.cfa)
+        size = options.tile_rows, options.tile_columns
+        layout = layout_for(camera.rows, camera.columns, (cfa.rows, cfa.columns), size, rows)
+        tables = filter_tables(grid, layout, cfa, options.workers)
+        noise = measured_noise(tables, layout, cfa, options.workers) if tier is Tier.balanced else None
+        return cls(grid, rig, layout, tables, noise, options)
+
+    @property
+    def cfa(self) -> Cfa:
+        """The camera's colour pattern."""
+        return cfa_named(self.rig.camera.cfa)
+
+    @functools.cached_property
+    def highlights(self) -> Highlights:
+        """The solver for clipped light, made for the first frame that needs it."""
+        return Highlights.of(self.grid, self.rig, self.options)
+
+    def apply(self, signal_e: Mosaic, variance_e2: Mosaic, clipped: Bool[np.ndarray, "rows columns"]) -> Picture:
+        """Demosaic and deblur.
+
+        Args:
+            signal_e: signal in e-, divided by the wire, without backscatter.
+            variance_e2: variance of its noise in e-^2.
+            clipped: samples that are saturated.
+
+        Returns:
+            the picture in e-; rows that the view does not need are 0.
+        """
+        bright = None
+        if self.noise is not None and clipped.any():
+            signal_e, bright = self.highlights.taken_out(signal_e, clipped, float(variance_e2.mean()))
+        tile_noise = self._tile_noise(variance_e2)
+        tiles = self.layout.cut(signal_e)
+        pictures, strengths = filtered(tiles, tile_noise, self.tables, self.layout, self.cfa, self.options.workers)
+        picture = self.layout.join(pictures)
+        if self.noise is not None:
+            bands = self.noise.of_tiles(strengths)
+            picture = shrunk(
+                picture, tile_noise, _local(variance_e2), bands, self.layout, self.options.workers
+            )
+        return picture if bright is None else picture + bright
+
+    def _tile_noise(self, variance_e2: Mosaic) -> Float32[np.ndarray, "tiles 3"]:
+        """Return the sigma of a sample of each colour in each tile."""
+        sites = {channel: [s for s in self.cfa.sites if s.channel == channel] for channel in range(3)}
+        rows, columns = variance_e2.shape
+        found = np.empty((self.layout.count, 3), dtype=np.float32)
+        for index, (x, y) in enumerate(self.layout.centres_px):
+            down = _within(y, self.layout.rows, rows)
+            across = _within(x, self.layout.columns, columns)
+            part = variance_e2[down, across]
+            for channel in range(3):
+                planes = [part[site.samples] for site in sites[channel] or self.cfa.sites]
+                found[index, channel] = np.mean([plane[::_SPARSE, ::_SPARSE].mean() for plane in planes])
+        return np.sqrt(np.maximum(found, np.float32(1e-6)))
+
+
+def _within(centre: float, size: int, most: int) -> slice:
+    """Return the part of a tile on the frame along one axis, from an even sample on."""
+    start = int(np.clip(centre - (size - 1) / 2, 0, max(most - size, 0))) // 4 * 4
+    return slice(start, start + size)
+
+
+def _local(variance_e2: Mosaic) -> Mosaic:
+    return cv2.blur(variance_e2, (_LOCAL_PX, _LOCAL_PX), borderType=cv2.BORDER_REFLECT_101)
