@@ -113,23 +113,31 @@ class Calibration:
         return next(result for result in self.results if result.name == term)
 
     def or_raise(self) -> Calibration:
-        """Return itself when every term can be used.
+        """Return itself when every fit ended well.
 
         Raises:
-            FitError: when a term cannot be used, with the advice of its status.
+            FitError: when a fit did not, with the advice of its status.
         """
         for result in self.results:
             result.or_raise()
         return self
 
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """A sentence for each term that is usable though its fit did not end well."""
+        return tuple(result.warning for result in self.results if result.warning)
+
     def write(self, path: str | Path) -> Path:
         """Write the profile as a folder, or as one file if ``path`` ends in ``.zip``; replace a profile at ``path``.
+
+        A term whose fit stopped early or fits poorly is written with its status, as its error bars include that. Call
+        ``or_raise`` before to refuse such terms.
 
         Returns:
             the path that was written.
 
         Raises:
-            FitError: when a term cannot be used; nothing is written then.
+            FitError: when a term has no error bars (``FitResult.usable``); nothing is written then.
             ProfileError: when ``path`` holds something that is not a profile.
         """
         provenance = provenance_now(self.session.path / MANIFEST_NAME, self.session.camera)

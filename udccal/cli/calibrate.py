@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from udccal.cli.options import IterationLog, ProfilePath, RigName, Seed, SessionFolder
+from udccal.cli.options import DOUBTFUL, IterationLog, ProfilePath, RigName, Seed, SessionFolder
 from udccal.cli.output import Output
 from udccal.errors import CameraError
 
@@ -95,7 +95,8 @@ def calibrate(
     with opened as bench:
         parts = {Exchanged(part.value) for part in exchanged or ()}
         capture_watched(output, bench, session, [t.value for t in term or TermChoice], parts)
-    fit_to_profile(output, session, profile, log)
+    if not fit_to_profile(output, session, profile, log):
+        raise typer.Exit(DOUBTFUL)
 
 
 def _simulated(rig: RigDescription, seed: int) -> AbstractContextManager[CaptureBench]:

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from udccal.cli.options import IterationLog, ProfilePath
+from udccal.cli.options import DOUBTFUL, IterationLog, ProfilePath
 
 
 def fit(
@@ -19,4 +19,5 @@ def fit(
     """Fit all five terms of a captured session and write a profile with its report."""
     from udccal.cli.jobs.fit import fit_to_profile
 
-    fit_to_profile(context.obj, session, profile, log)
+    if not fit_to_profile(context.obj, session, profile, log):
+        raise typer.Exit(DOUBTFUL)

@@ -7,6 +7,9 @@ from typing import Annotated
 
 import typer
 
+# Exit status of a fit whose profile was written with a warning.
+DOUBTFUL = 3
+
 RigName = Annotated[str, typer.Option("--rig", help="Name of a shipped rig or of your own, or a folder.")]
 SessionFolder = Annotated[Path, typer.Option("--session", help="Folder of the session; continues an unfinished one.")]
 ProfilePath = Annotated[Path, typer.Option("--profile", help="Folder of the profile, or a zip file.")]

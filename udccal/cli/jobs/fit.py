@@ -40,18 +40,19 @@ class TermSummary:
 
 @dataclass(frozen=True)
 class FitSummary:
-    """Result of ``fit`` and ``calibrate``."""
+    """Result of ``fit`` and ``calibrate``; ``warnings`` are of terms in the profile whose fit did not end well."""
 
     session: Path
     profile: Path
     report: Path
     terms: tuple[TermSummary, ...]
+    warnings: tuple[str, ...]
     times: tuple[StageTime, ...]
     compilation_s: float
 
 
-def fit_to_profile(output: Output, session_path: Path, profile_path: Path, log: Path | None = None) -> None:
-    """Fit a session, write the report and the profile, and print the summary.
+def fit_to_profile(output: Output, session_path: Path, profile_path: Path, log: Path | None = None) -> bool:
+    """Fit a session, write the report and the profile, and print the summary; return whether every fit ended well.
 
     Args:
         output: shows stages and the summary.
@@ -61,7 +62,7 @@ def fit_to_profile(output: Output, session_path: Path, profile_path: Path, log: 
 
     Raises:
         SessionError: when the session is missing or damaged.
-        FitError: when a term ended in a bad status; then the report is written and the profile is not.
+        FitError: when a term has no error bars; then the report is written and the profile is not.
         ProfileError: when something else is at the profile's path.
     """
     check_replaceable(profile_path)
@@ -89,8 +90,11 @@ def fit_to_profile(output: Output, session_path: Path, profile_path: Path, log: 
         raise FitError(f"{error} No profile was written; the report {report} shows every term.") from error
     output.say(f"Compilation took {clock.seconds:.1f} s of this (less in the next run)")
     output.say(f"Profile: {profile_path}\nReport: {report}")
+    for warning in calibration.warnings:
+        output.say(warning)
     terms, times = summaries(calibration), tuple(output.times)
-    output.result(FitSummary(session_path, profile_path, report, terms, times, clock.seconds))
+    output.result(FitSummary(session_path, profile_path, report, terms, calibration.warnings, times, clock.seconds))
+    return not calibration.warnings
 
 
 @contextmanager
@@ -137,7 +141,7 @@ def store_profile(output: Output, calibration: Calibration, path: Path) -> None:
     """Write the profile of a calibration.
 
     Raises:
-        FitError: when a term cannot be used.
+        FitError: when a term has no error bars.
         ProfileError: when something else is at ``path``.
     """
     with output.stage("profile"):

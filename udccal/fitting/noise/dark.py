@@ -163,7 +163,7 @@ def fit_dark(
     free = np.array([True, len({pair.exposure_s for pair in pairs}) > 1, True, True, not normal])
     values = np.where(free, values, [0.0, 0.0, 0.0, 0.0, NORMAL_SHAPE])
     # One-sided derivatives predict a small gain for ever.
-    solver = SolverRules(least_gain=1e-3, stalled_gain=1e-4, iterations=40)
+    solver = SolverRules(least_gain=1e-3, stalled_gain=1e-4)
 
     def expected(pair: DarkPair, at: Five) -> Float[np.ndarray, "codes codes"]:
         return pair_probability(pair, at, K_DN_per_e, sigma_row_DN, rules.background)
@@ -177,7 +177,7 @@ def fit_dark(
     lost = free & bool(values[2] + values[3] < 12 * step2) & (np.diag(information) < least)
     information = np.where(lost[:, None] | lost, np.diag(np.where(lost, least, 0.0)), information)
     widen = np.sqrt(np.array([1.0, 1.0, 1.0, len(pairs), 1.0]))
-    cov = scaled_inverse(information) * np.outer(widen, widen)
+    cov = found.with_rest(scaled_inverse(information) * np.outer(widen, widen), found.equations.step(0.0).shared)
     levels = np.array([_level(pair, values, expected, sigma_row_DN) for pair in pairs]).T
     return DarkFit(values, cov, found.converged, bool(np.abs(levels[0] - 1).max() < rules.white), *levels)
 

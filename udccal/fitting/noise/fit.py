@@ -220,7 +220,8 @@ def _values(
     data: NoiseMoments, dark: DarkTerms, curve: Curve, saturation: tuple[float, float], PRNU2: Quantity
 ) -> tuple[Float[np.ndarray, "11"], Float[np.ndarray, "11 11"]]:
     """The estimates, and their covariance from that of the fitted quantities."""
-    (K, V0, c), transfer = (float(v) for v in curve.fit.values[:3]), curve.fit.cov[:3, :3]
+    K, V0, c = (float(v) for v in curve.fit.values[:3])
+    transfer = curve.fit.cov[:3, :3] * curve.fit.misfit.inflation
     total = Quantity(V0 + dark.row_DN2.value, float(transfer[1, 1]) + dark.row_DN2.variance)
     roots = [one.root() for one in (total, dark.row_DN2, dark.dsnu_DN2, PRNU2)]
     (sigma_d, by_total), (row, by_row), (spread, by_spread), (response, by_response) = roots
@@ -286,6 +287,9 @@ def _notes(
         yield f"{found} That counts as light, as a panel's; columns or blotches of the sensor are not in PRNU1288."
     if dark.foreign:
         yield "Read noise has heavier or lighter tails than the model's: sigma_d is the root mean square of all pixels."
+    if (test := curve.fit.misfit).found:
+        found = f"Variances scatter {test.ratio:.2g} times as much about the photon transfer curve as noise does"
+        yield f"{found} (p = {test.p_value:.1g}); the sigmas of K, sigma_d, dark current and DSNU include that."
     if curve.fit.order.curved:
         yield f"The response bends: {100 * values[-1]:.2g} % of the signal is missing at full scale."
     if bent_too_far:

@@ -182,7 +182,8 @@ def find_saturation(data: NoiseMoments, dark: DarkTerms, curve: Curve) -> tuple[
         seen = max(flat.peak_DN for flat in data.flats)
         return data.top_DN, max(data.top_DN - seen, 0.0) / float(np.sqrt(3.0))
     peak = max(flat.peak_DN for flat, _ in full)
-    if max(flat.at_peak for flat, _ in full) >= 0.5:
+    # Bins in which most samples have the last code; of a whole frame, colours that are not full hide them.
+    if max(float(flat.at_peak[bins].max()) for flat, bins in full if flat.peak_DN == peak) >= 0.5:
         # A level at the converter's end is certain; a level below it is known to within rounding.
         return float(peak), float(1 / np.sqrt(12.0)) if peak < data.top_DN else 0.0
     V0 = max(float(curve.fit.values[1]), 0.0) if curve.choice else 0.0
@@ -205,10 +206,11 @@ def _level(
     samples = float(flat.samples[chosen].sum())
     rows = dark.row_DN2.value / (flat.frames * flat.height) * (full.size / float(chosen.sum()))
     spread2 = V0 + dark.dsnu_DN2.value + dark.row_DN2.value
-    if peak >= data.top_DN and flat.at_peak > 1e-3:
-        z = float(ndtri(flat.at_peak))
+    part = float(np.average(flat.at_peak[chosen], weights=flat.samples[chosen]))
+    if flat.peak_DN >= data.top_DN and part > 1e-3:
+        z = float(ndtri(part))
         density2 = float(np.exp(-(z**2)) / (2 * np.pi))
-        own = spread2 * flat.at_peak * (1 - flat.at_peak) / density2 / samples
+        own = spread2 * part * (1 - part) / density2 / samples
         return peak - 0.5 * data.q_DN + float(np.sqrt(spread2)) * z, own + rows, bool(sure.any())
     # Rounding adds sum over k of (-1)^k q sin(2 pi k x / q) exp(-2 (pi k s / q)^2) / (pi k) to the mean of normal noise
     # of sigma s (Widrow and Kollar, Quantization Noise, chapter 5): this is its uncertainty.

@@ -71,7 +71,8 @@ class DiffractionFit:
     @property
     def noise_cov(self) -> Float[np.ndarray, "p p"]:
         """Covariance of the shared parameters if the model error is independent from sample to sample."""
-        return self.solution.equations.cov()
+        equations = self.solution.equations
+        return self.solution.with_rest(equations.cov(), equations.step(0.0).shared)
 
     def cov(self) -> Float[np.ndarray, "p p"]:
         """Covariance of the shared parameters.

@@ -129,17 +129,18 @@ def _joint(found: Found, every: Pixels, data: WireData, noise: FlatNoise, rules:
     pixels = weighed_at(kept, x, every, noise).pixels
     problem = WireProblem("wire, joint", kept, pixels, kept.prior(data.start, rules))
     solution = minimise(problem, x, SOLVER)
+    ahead = solution.equations.step(0.0).shared
     # A last step whose expected gain is below the solver's limit is taken without a check of the cost.
-    x = solution.place + (solution.equations.step(0.0).shared if solution.converged else 0.0)
+    x = solution.place + (ahead if solution.converged else 0.0)
     seen = weighed_at(kept, x, every, noise)
     return Joint(
         problem=problem,
         x=x,
-        cov=solution.equations.cov(),
+        cov=solution.with_rest(solution.equations.cov(), ahead),
         variance=problem.variance(float(seen.z @ seen.z)),
         seen=seen,
         orders=orders,
-        converged=solution.converged and descent.solution.converged,
+        converged=solution.converged,
         iterations=descent.solution.iterations + solution.iterations,
         gain=found.gain,
     )
