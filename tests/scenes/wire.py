@@ -79,11 +79,14 @@ class Flat:
 
 
 @in_float64
-def drawn_truth(seed: int, built: WireStart, lens: Geometry, modulated: bool = True) -> Wire:
-    """A wire drawn from the fit's prior, with shading."""
+def drawn_truth(seed: int, built: WireStart, lens: Geometry, modulated: bool = True, sharpness: float = 1.0) -> Wire:
+    """A wire drawn from the fit's prior, with shading; ``sharpness`` below 1 gives the openings' edges a blur."""
     rng = np.random.default_rng([seed, 1])
     harmonics = possible_harmonics(built).orders
     wire = ideal_wire(lens, built, harmonics if modulated else harmonics[:0])
+    fields = np.array(wire.fields)
+    fields[:, 0, 0, 0] = sharpness ** np.maximum((np.asarray(wire.harmonics) ** 2).sum(axis=1) - 1, 0)
+    wire = eqx.tree_at(lambda w: w.fields, wire, fields)
     steps = shape_sigma(built, WireRules()) * np.clip(rng.standard_normal(10), -2.5, 2.5)
     steps[4:6] = rng.uniform(-0.5, 0.5, 2)
     # Beyond a degree the geometry fit would be to blame.

@@ -84,6 +84,15 @@ class DiffractionFit:
         alone = [position.marginal() for position in self.problem.by_position(self.solution.place)]
         return clustered_cov(self.noise_cov, np.stack([a[1] for a in alone]), np.stack([a[0] for a in alone]))
 
+    def refuted_cov(self) -> Float[np.ndarray, "p p"]:
+        """The same where residuals refute the model: its deviation may be common to all positions.
+
+        Then it does not average out over positions as it does in ``cov``.
+        """
+        weight = self.problem.samples.weight
+        positions = int((weight.reshape(len(weight), -1) > 0).any(axis=1).sum())
+        return self.noise_cov + max(positions, 1) * (self.cov() - self.noise_cov)
+
     @property
     def chi2_dof(self) -> float:
         """Reduced chi-squared, with the model error in the weights."""
