@@ -118,7 +118,7 @@ def refit(problem: Problem, fitted: Fitted, usable: Usable) -> tuple[Fitted, flo
 def _from_afar(problem: Problem, order: Order, x: Vector, noise: PerShot, error: float) -> Fitted:
     """Fit with this model error of the start as noise: with noise alone, the prior would have no effect."""
     light, used = np.maximum(problem.seen.excess[0], 0.0), noise > 0
-    for _ in range(4):
+    for _ in range(30):
         variance = 1 / np.where(used, noise, 1.0) ** 2
         variance[1:-1] += (error * light) ** 2
         fitted = problem.solved(order, x, np.where(used, 1 / np.sqrt(variance), 0.0))

@@ -75,7 +75,7 @@ def fit_moments(data: NoiseMoments, nominal: Noise, rules: NoiseRules) -> FitRes
     longest = max(pair.exposure_s for pair in data.darks)
     # The dark fit needs the gain, and the gain the dark fit. To first order the curve corrects the read noise for the
     # gain; a second round is for a gain that moves dark current's shot noise by half of the read noise's sigma.
-    for _ in range(5):
+    for _ in range(30):
         K = float(curve.fit.values[0]) if curve.choice else 0.0
         moved = abs(K - dark.K_DN_per_e) * dark.dark_DN_per_s.value * longest
         if curve.usable_levels < rules.levels or K <= 0 or moved <= 0.5 * dark.read_DN2.variance**0.5:

@@ -151,7 +151,7 @@ def _refine(
     weights has little effect.
     """
     whole, enough = None, 1.0
-    for _ in range(5):
+    for _ in range(15):
         # A change of less than a sigma is small enough for the interference set up before.
         problem = problem.about(place) if enough == 1.0 else problem
         problem, model_error, found = _reweighed(problem, place, rules)
@@ -164,12 +164,11 @@ def _refine(
         # Without iterations left, the round before counts: it has ended, with weights of a slightly different model.
         if not solution.converged:
             return whole or fit
-        whole, place, last = fit, solution.place, enough < 1.0 and moved < 0.1
-        if last:
-            break
-        enough = 1e-2 if moved < 1.0 else 1.0
-    assert whole is not None  # there is a first round
-    return whole
+        if enough < 1.0 and moved < 0.1:
+            return fit
+        whole, place, enough = fit, solution.place, 1e-2 if moved < 1.0 else 1.0
+    # Weights that go on to change the parameters give no minimum.
+    return replace(fit, solution=replace(fit.solution, converged=False))
 
 
 def _solver(enough: float, iterations: int) -> SolverRules:

@@ -64,7 +64,7 @@ class WireRules:
     scan_range: tuple[float, float] = (0.64, 1.56)
     scan_steps: tuple[float, float] = (0.06, 0.8)
     places: int = 5
-    sharpness: tuple[float, ...] = (1.0, 0.0)
+    sharpness: tuple[float, ...] = (1.0, 0.5, 0.0)
     rival: float = 60.0
     unfinished: float = 400.0
     doubtful_variance: float = 1.15
