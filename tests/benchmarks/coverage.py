@@ -21,7 +21,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from tests.benchmarks.readme_tables import between
+from tests.benchmarks.readme_tables import put_table
 from tests.scenes.backscatter import predicted_light
 from tests.scenes.psf_wave_optics import coverage as psf_coverage
 from udccal.benches.bench import simulated_bench
@@ -195,7 +195,7 @@ def main() -> int:
             print(f"rig {seed}, {name}: {np.mean(np.abs(part[-1]) < _INSIDE):.1%} inside", flush=True)
     found = [Coverage(name, tuple(part)) for (name, _), part in zip(QUANTITIES, scores, strict=True)]
     print(table(found))
-    _PAGE.write_text(between(_PAGE.read_text(encoding="utf-8"), "coverage", table(found)), encoding="utf-8")
+    put_table(_PAGE, "coverage", table(found))
     return 0 if all(one.ok for one in found) else 1
 
 

@@ -21,7 +21,7 @@ from typing import final, get_args
 import numpy as np
 
 from tests.benchmarks.planning_psf import Compared, compared_psf
-from tests.benchmarks.readme_tables import between
+from tests.benchmarks.readme_tables import put_table
 from tests.benchmarks.rows import Row, table, write_json
 from tests.scenes.backscatter import predicted_light
 from udccal.benches.bench import simulated_bench, simulated_rig
@@ -172,7 +172,7 @@ def main() -> int:
     write_json(rows, options.out / "planning.json")
     (options.out / "planning.md").write_text(table(rows) + "\n", encoding="utf-8")
     if set(terms) == set(get_args(TermName)):
-        _PAGE.write_text(between(_PAGE.read_text(encoding="utf-8"), "planning", table(rows)), encoding="utf-8")
+        put_table(_PAGE, "planning", table(rows))
     return 0 if all(row.ok for row in rows) else 1
 
 

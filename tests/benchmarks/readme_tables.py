@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import argparse
 import json
+from collections.abc import Iterable
 from pathlib import Path
 
+from tests.benchmarks.commit import stamped
 from tests.benchmarks.rows import Row, table
 
 _README = Path(__file__).resolve().parents[2] / "README.md"
@@ -22,6 +24,12 @@ def between(text: str, marker: str, content: str) -> str:
     if start < 0 or end < start:
         raise ValueError(f"Expected the markers {first} and {last} in the page, found them missing. Put them back.")
     return f"{text[: start + len(first)]}\n{content.strip()}\n{text[end:]}"
+
+
+def put_table(page: Path, marker: str, table: str, commits: Iterable[str] | None = None) -> None:
+    """Put a table into a page between its markers, with the commit that it was measured at (``stamped``)."""
+    text = between(page.read_text(encoding="utf-8"), marker, stamped(table, commits))
+    page.write_text(text, encoding="utf-8")
 
 
 def main() -> None:
