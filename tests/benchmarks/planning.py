@@ -102,7 +102,7 @@ def _backscatter_percent(made: Obtained) -> float:
     found = search(Problem.of(data, geometry, rig))
     # By noise alone.
     found = replace(found, model_error=0.0)
-    posterior = term_posterior(data, found, 1.0)
+    posterior = term_posterior(data, found, np.ones(len(found.fitted.found.x)))
     light = predicted_light(posterior.term_at(posterior.mean), posterior, 0.0, rig, new, found.problem.flat)
     peak = light.rate.max(axis=(1, 2))
     return 100 * float(np.sqrt((light.sigma**2).mean() / (peak**2).mean()))

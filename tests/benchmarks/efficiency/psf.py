@@ -33,12 +33,12 @@ _NUMBERS = {
     "pupil_diameter_mm": 4,
     "log_blur": 5,
 }
-_POINTS_PX = np.array([[350.0, 260.0], [700.0, 480.0]])
-_WINDOW = (17, 9)
+POINTS_PX = np.array([[350.0, 260.0], [700.0, 480.0]])
+WINDOW = (17, 9)
 # For differences, forward and backward.
 _MOVE_PX = 1e-3
 # (row, column) of the green kernel: peak, beside it, and on the series of orders.
-_SAMPLES = ((8, 4), (8, 5), (7, 4), (5, 4), (2, 4))
+SAMPLES = ((8, 4), (8, 5), (7, 4), (5, 4), (2, 4))
 
 
 @dataclass(frozen=True)
@@ -92,10 +92,10 @@ def _at_points(
 ) -> tuple[Float[np.ndarray, " samples"], Float[np.ndarray, "samples p"]]:
     """Samples of the green kernel relative to its peak, at all field points, and their slopes."""
     values, slopes = [], []
-    for point in _POINTS_PX:
-        kernel, by = (np.asarray(part) for part in kernel_and_slopes(evaluator, theta, scene.geometry, point, *_WINDOW))
+    for point in POINTS_PX:
+        kernel, by = (np.asarray(part) for part in kernel_and_slopes(evaluator, theta, scene.geometry, point, *WINDOW))
         peak, peak_slope = kernel[1, 8, 4], by[:, 1, 8, 4]
-        for row, column in _SAMPLES[1:]:
+        for row, column in SAMPLES[1:]:
             ratio = kernel[1, row, column] / peak
             values.append(ratio)
             slopes.append((by[:, 1, row, column] - ratio * peak_slope) / peak)
