@@ -49,24 +49,26 @@ _CAMERA = load_rig("lg55-aca2040").camera
 SHARE = FitEffort().wire_samples / (_CAMERA.rows * _CAMERA.columns)
 
 
-def predict(x: Float[Array, " n"], truth: Wire, pixels: Array, site: Array, prnu: Array) -> tuple[Array, Array]:
-    """Mean and variance of every pixel in electrons; ``x``: shape, baseline, three site gains."""
-    wire = _moved(truth, x)
+def predict(
+    x: Float[Array, " n"], truth: Wire, shape: Float[Array, "10"], pixels: Array, site: Array, prnu: Array
+) -> tuple[Array, Array]:
+    """Mean and variance of every pixel in electrons; ``x``: changes of shape and baseline, three site gains."""
+    wire = _moved(truth, shape, x)
     gains = jnp.exp(jnp.append(x[-3:], -jnp.sum(x[-3:])))
     mean = ELECTRONS * jnp.asarray(SITES.ravel())[site] * gains[site] * wire_values(wire, pixels, ROWS, COLUMNS)
     return mean, mean + (prnu * mean) ** 2
 
 
-def normalised(x: Float[Array, " n"], truth: Wire, pixels: Array, grid: Array) -> Array:
+def normalised(x: Float[Array, " n"], truth: Wire, shape: Float[Array, "10"], pixels: Array, grid: Array) -> Array:
     """The map at ``pixels``, its mean over ``grid`` 1."""
-    wire = _moved(truth, x)
+    wire = _moved(truth, shape, x)
     whole = wire_values(wire, jnp.concatenate([pixels, grid]), ROWS, COLUMNS)
     return whole[: len(pixels)] / jnp.mean(whole[len(pixels) :])
 
 
-def _moved(truth: Wire, x: Array) -> Wire:
+def _moved(truth: Wire, shape: Array, x: Array) -> Wire:
     baseline = jnp.asarray(truth.baseline).at[tuple(PAIRS.T)].add(x[10 : 10 + len(PAIRS)])
-    return eqx.tree_at(lambda w: w.baseline, with_shape(truth, shape_vector(truth) + x[:10]), baseline)
+    return eqx.tree_at(lambda w: w.baseline, with_shape(truth, shape + x[:10]), baseline)
 
 
 _map_slopes = jax.jit(jax.jacfwd(normalised))
@@ -92,11 +94,13 @@ def bounds(truth: Wire, built: WireStart, step: int) -> Bounds:
     at = np.zeros(10 + len(PAIRS) + 3)
     information = np.diag(np.append(shape_sigma(built, WireRules()) ** -2.0, np.zeros(len(at) - 10)))
     for part in np.array_split(np.arange(len(pixels)), 4):
-        information += fisher_information(predict, at, truth, pixels[part], site[part], np.float64(PRNU))
+        information += fisher_information(
+            predict, at, truth, shape_vector(truth), pixels[part], site[part], np.float64(PRNU)
+        )
     unit = np.ones(10)
     unit[:3] = 180 / np.pi
     unit[3], unit[6] = float(truth.standoff_per_pitch), float(truth.footprint_per_pitch)
-    slopes = np.asarray(_map_slopes(at, truth, places(), _grid(48, 64)))
+    slopes = np.asarray(_map_slopes(at, truth, shape_vector(truth), places(), _grid(48, 64)))
     return cramer_rao(information)[:10] * unit, cramer_rao(information, slopes)
 
 

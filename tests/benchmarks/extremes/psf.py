@@ -1,7 +1,7 @@
 """psf at its ends: dynamic range, exposure, few captures, wide kernels, the pupil near and far, wrong starts.
 
 Every case draws its truth from the prior of the rig's description. Judged are the numbers of the panel and the pupil,
-and what a case is named for: the kernel at field points, and the pitch where the description of it is wrong. The
+and what a case is named for: the kernel at a field point, and the pitch where the description of it is wrong. The
 stand-off is the wire's number; here, only the kernel can be right or wrong by it.
 """
 
@@ -17,7 +17,6 @@ from jaxtyping import Float
 
 from tests.benchmarks.efficiency.psf import POINTS_PX, SAMPLES, WINDOW
 from tests.benchmarks.extremes.case import Case, Outcome, outcome
-from tests.benchmarks.psf_kernels import kernel_and_slopes
 from tests.scenes.psf import Scene, pictures, shots_of, small_scene
 from udccal.fitting.psf.data import PsfData, PsfRules
 from udccal.fitting.psf.fit import fit_psf
@@ -69,7 +68,7 @@ def fit_from(off: Off, seed: int = 1) -> Outcome:
 
 @in_float64
 def _errors(result: FitResult[PsfField], scene: Scene, true: Float[np.ndarray, " p"]) -> Float[np.ndarray, " n"]:
-    """Of the numbers, where the fit gives them, and of the kernel at field points."""
+    """Of the numbers, where the fit gives them, and of the kernel at a field point, by the term's own evaluation."""
     found = {estimate.name: estimate for estimate in result.estimates}
     numbers = [
         (found[name].value - value) / found[name].sigma
@@ -78,19 +77,15 @@ def _errors(result: FitResult[PsfField], scene: Scene, true: Float[np.ndarray, "
     ]
 
     def fitted(term: PsfField) -> Float[np.ndarray, " samples"]:
-        return _relative(np.asarray(psf_kernels(term, POINTS_PX, *WINDOW)))
+        """Samples of the green kernel relative to its peak."""
+        (peak_row, peak_column), *others = SAMPLES
+        green = np.asarray(psf_kernels(term, POINTS_PX[:1], *WINDOW))[0, 1]
+        return np.array([green[row, column] / green[peak_row, peak_column] for row, column in others])
 
-    evaluator = Evaluator(WAVELENGTHS_NM, fit_lattice(scene.half), True)
-    kernels = [kernel_and_slopes(evaluator, true, scene.geometry, point, *WINDOW)[0] for point in POINTS_PX]
-    kernel = (fitted(result.term) - _relative(np.asarray(kernels))) / result.sigma_of(fitted)
-    return np.concatenate([numbers, kernel])
-
-
-def _relative(kernels: Float[np.ndarray, "points 3 rows columns"]) -> Float[np.ndarray, " samples"]:
-    """Samples of the green kernels relative to their peaks."""
-    (peak_row, peak_column), *others = SAMPLES
-    green = kernels[:, 1]
-    return np.concatenate([green[:, row, column] / green[:, peak_row, peak_column] for row, column in others])
+    model = Evaluator(WAVELENGTHS_NM, fit_lattice(scene.half), True).model(true)
+    plain = {"diffraction_fraction": np.float64(1.0), "residual": np.zeros_like(result.term.residual)}
+    kernel = fitted(result.term) - fitted(replace(result.term, diffraction=model, **plain))
+    return np.concatenate([numbers, kernel / result.sigma_of(fitted)])
 
 
 def _with(**changes: object) -> Scene:
