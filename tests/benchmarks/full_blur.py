@@ -28,7 +28,8 @@ _HARMONICS, _PHASES = 3, 7
 _CORE = (97, 49)
 _COLUMN_SHIFTS = (0.0, 0.5)
 # Of the kernel and of its ripple, relative L2; the ripple is a hundredth of the kernel.
-_TOLERANCE, _RIPPLE_TOLERANCE, _MOST_COMPONENTS = 1e-3, 5e-2, 16
+_TOLERANCE, _MOST_COMPONENTS = 1e-3, 16
+_RIPPLE_TOLERANCE, _MOST_OF_RIPPLE = 0.1, 8
 
 
 @dataclass(frozen=True)
@@ -85,16 +86,17 @@ def build_full_blur(truth: RigTruth, grid_columns: int, grid_rows: int, rows: in
     for index, node in enumerate(nodes):
         mean[:, index], series[:, :, :, index] = _kernel_series(truth, node, (rows, columns), core)
 
-    def decomposed(stack: Float[np.ndarray, "3 nodes rows columns"], tolerance: float) -> SpaceVariantBlur:
+    def decomposed(stack: Float[np.ndarray, "3 nodes rows columns"], most: int, tolerance: float) -> SpaceVariantBlur:
         size = stack.shape[2:]
-        components, coefficients, error = low_rank(stack.reshape(3, len(nodes), -1), _MOST_COMPONENTS, tolerance)
+        components, coefficients, error = low_rank(stack.reshape(3, len(nodes), -1), most, tolerance)
         shaped = components.reshape(3, -1, *size), coefficients.reshape(3, -1, grid_rows, grid_columns)
         return SpaceVariantBlur(*shaped, grid_x_px=grid_x, grid_y_px=grid_y, relative_error=error)
 
     ripples = tuple(
-        (decomposed(cosine, _RIPPLE_TOLERANCE), decomposed(sine, _RIPPLE_TOLERANCE)) for cosine, sine in series
+        (decomposed(cosine, _MOST_OF_RIPPLE, _RIPPLE_TOLERANCE), decomposed(sine, _MOST_OF_RIPPLE, _RIPPLE_TOLERANCE))
+        for cosine, sine in series
     )
-    return FullBlur(truth, decomposed(mean, _TOLERANCE), ripples)
+    return FullBlur(truth, decomposed(mean, _MOST_COMPONENTS, _TOLERANCE), ripples)
 
 
 def _kernel_series(

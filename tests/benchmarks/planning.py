@@ -41,6 +41,8 @@ from udccal.sessions.schema import TermName
 from udccal.sessions.store import Session
 
 MOST_OFF = 0.15
+# Errors found in fewer fits than these tell nothing: their standard error widens the limit.
+_ENOUGH = 12
 _PAGE = Path(__file__).resolve().parents[2] / "docs" / "planning.md"
 _OF_SESSIONS: tuple[TermName, ...] = ("noise", "geometry", "wire", "backscatter")
 _RIG = "lg55-reduced"
@@ -157,8 +159,10 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("planning"), help="folder for sessions and results")
     parser.add_argument("--term", action="append", choices=get_args(TermName), help="this term only; may be repeated")
-    parser.add_argument("--realisations", type=int, default=16, help="fits of each of the psf's designs")
+    parser.add_argument("--realisations", type=int, default=32, help="fits of each of the psf's designs")
     options = parser.parse_args()
+    if options.realisations < _ENOUGH:
+        parser.error(f"expected at least {_ENOUGH} realisations, found {options.realisations}")
     options.out.mkdir(parents=True, exist_ok=True)
     keep_compilations()
     terms: list[TermName] = options.term or list(get_args(TermName))
