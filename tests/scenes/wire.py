@@ -121,10 +121,17 @@ def noisy(truth: Wire, seed: int, electrons: float = ELECTRONS, prnu: float = PR
     return Flat(truth, signal, level)
 
 
-def fitted(flat: Flat, built: WireStart, lens: Geometry, prnu: float = PRNU, clip: float = np.inf) -> FitResult[Wire]:
-    """The fit with all pixels."""
+def fitted(
+    flat: Flat,
+    built: WireStart,
+    lens: Geometry,
+    prnu: float = PRNU,
+    clip: float = np.inf,
+    samples: int = ROWS * COLUMNS,
+) -> FitResult[Wire]:
+    """The fit with so many pixels, by default with all."""
     data = WireData(flat.signal, flat.variance, lens, built, prnu, clip)
-    return fit_wire(data, WireRules(samples=flat.signal.size))
+    return fit_wire(data, WireRules(samples=samples))
 
 
 def map_sigma(result: FitResult[Wire], pixels: Float[np.ndarray, "places 2"]) -> Float[np.ndarray, " places"]:
