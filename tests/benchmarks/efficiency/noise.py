@@ -110,7 +110,8 @@ def _histogram_information(sensor: ToySensor, x: Float[np.ndarray, "12"]) -> Flo
     rng = np.random.default_rng(0)
     fixed = patterns(sensor, rng)
     places = [_K, _V0, _SHAPE, _BLACK, _RATE, _SPREAD]
-    steps = np.diag([4e-3, 2e-3, 2e-3, 2e-3, 2e-3, 4e-3])
+    K, V0 = x[_K], x[_V0]
+    steps = np.diag([0.01 * K, 1e-3 * V0, 2e-3, 1e-3 * V0**0.5, 1e-4 * x[_RATE], 3e-3 * x[_SPREAD]])
     information = np.zeros((6, 6))
     for t in sensor.dark_times_s:
         first, second = (expose(sensor, fixed, t, False, rng) for _ in range(2))
