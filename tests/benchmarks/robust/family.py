@@ -143,7 +143,11 @@ def _judged(answer: Answer) -> tuple[Kind, float, str]:
     if not answer.finite:
         return Kind.NOT_FINITE, math.inf, "; ".join(answer.notes)
     if not answer.usable:
-        return (Kind.REFUSED, 0.0, answer.notes[0]) if answer.notes else (Kind.SILENT, math.inf, "a status, no advice")
+        return (
+            (Kind.REFUSED, 0.0, " ".join(answer.notes))
+            if answer.notes
+            else (Kind.SILENT, math.inf, "a status, no advice")
+        )
     off = [number for number in answer.numbers if number.z > WORST_Z]
     silent = [number for number in answer.numbers if not (number.z > WORST_Z and number.told_by(answer.notes))]
     worst = max(silent, key=lambda number: number.z, default=None)
