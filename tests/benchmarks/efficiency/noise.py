@@ -90,11 +90,12 @@ def _statistics(sensor: ToySensor, x: Float[Array, "12"]) -> tuple[Float[Array, 
             parts.append((v, (2 + tails * (1 - 1 / count)) * v**2 / (pixels * (count - 1))))
     parts.append((offset, spread2 / pixels))
     averaged = spread2 + (V0 + 1 / 12 + K * rate * stack_s + row2) / frames
-    parts.append((averaged, 2 * averaged**2 / pixels))
+    # The sensor at hand has these patterns; only what is temporal scatters.
+    parts.append((averaged, 2 * (averaged**2 - spread2**2) / pixels))
     z = (gain + rate) * stack_s
     quiet = V0 + 1 / 12 + K * rate * stack_s
     uneven = uneven2 + (temporal_variance(z, K, V0, c, 1 / 12) + quiet) / frames / (gain * stack_s) ** 2
-    parts.append((uneven, 2 * uneven**2 / pixels))
+    parts.append((uneven, 2 * (uneven**2 - uneven2**2) / pixels))
     parts.append((black + full + offset, ((V0 + 1 / 12) / pixels + row2 / sensor.rows) / 2))
     # Nothing here tells of the shape.
     mean, variance = (jnp.stack(part) for part in zip(*parts, strict=True))

@@ -17,7 +17,14 @@ from tests.scenes.noise import ToySensor, measure, patterns, truth
 Draw = Callable[[np.random.Generator, tuple[int, ...]], np.ndarray]
 _ROWS, _COLUMNS = 144, 192
 # Notes that say of a number that it may be off.
-_WORDS = {"PRNU1288": ("PRNU1288",), "dark_current_e_per_s": ("dark current",)}
+_CODED = ("of the model's kind",)
+_WORDS = {
+    "PRNU1288": ("PRNU1288",),
+    "dark_current_e_per_s": ("dark current of", *_CODED),
+    "black_DN": _CODED,
+    "sigma_d_e": _CODED,
+    "DSNU1288_e": _CODED,
+}
 
 
 def draw(seed: int) -> Case:

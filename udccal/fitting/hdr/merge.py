@@ -143,7 +143,7 @@ def _doubts(scatter: float, black_DN: float, unlike: list[int]) -> list[str]:
         )
     if black_DN:
         doubts.append(
-            f"Dark samples of all exposures lie {black_DN:+.2g} DN off the black level. Fit the noise again with frames "
+            f"Dark samples of all exposures lie {black_DN:+.2g} DN off the black level. Fit the noise with frames "
             "of this gain and temperature; the light of dark pixels is not to be trusted."
         )
     if unlike:
