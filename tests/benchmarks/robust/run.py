@@ -32,6 +32,7 @@ def main() -> None:
     parser.add_argument("--sets", type=int, default=200, help="data sets of each family")
     parser.add_argument("--seed", type=int, default=0, help="the first seed")
     parser.add_argument("--only-worst", action="store_true", help="print only what was missed")
+    parser.add_argument("--page", action="store_true", help="put the tables of fewer than 200 sets into the page, too")
     parser.add_argument("--again", metavar="FAMILY/SEED", help="one data set again, with all its numbers")
     options = parser.parse_args()
     if options.again:
@@ -47,9 +48,9 @@ def main() -> None:
         print(f"{table(found)}\n", flush=True)
         rows += found
         write_json(rows, options.out / "robust.json")
-    if options.family is None and options.sets >= 200:
-        made = f"Made by `make robust` at commit {commit()}, {options.sets} data sets of each family.\n\n{table(rows)}"
-        _PAGE.write_text(between(_PAGE.read_text(encoding="utf-8"), "robust", made), encoding="utf-8")
+        if options.sets >= 200 or options.page:
+            made = f"Commit {commit()}, seeds {seeds[0]} to {seeds[-1]}.\n\n{table(found)}"
+            _PAGE.write_text(between(_PAGE.read_text(encoding="utf-8"), f"robust {name}", made), encoding="utf-8")
     sys.exit(0 if all(row.ok for row in rows) else 1)
 
 

@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, Int, UInt16
 
 from udccal.errors import FitError
 from udccal.fitting.engine.robust import outliers
+from udccal.fitting.hdr.doubts import checked, doubts, rounding_e
 from udccal.fitting.hdr.likelihood import BlockMerge, SensorNumbers, compiled_merge_block, merge_block
 from udccal.models.noise import Noise
 from udccal.result import FitStatus, Outliers
@@ -92,18 +93,16 @@ def merge_bracket(
         rate and sigma in e-/s of every pixel, and the outliers.
 
     Raises:
-        FitError: when exposures are not positive, or not as many as frames, or a number of the noise is impossible.
+        FitError: when frames are not codes, exposures are not positive or not as many as frames, or a number of the
+            noise is impossible.
     """
     rules = rules or HdrRules()
-    times = np.asarray(exposures_s, dtype=np.float64)
-    if len(frames) != len(times) or not len(times) or not np.all((times > 0) & np.isfinite(times)):
-        expected = f"Expected a positive exposure for each of the {len(frames)} frames of a bracket"
-        raise FitError(f"{expected}, found {times.tolist()}. Give the exposures in seconds.")
+    times = checked(frames, exposures_s)
     # Times in units of the longest: sums of their squares stay in single precision's range.
     unit, shape, dropped = float(times.max()), frames.shape[1:], np.zeros((len(frames), 1), bool)
     codes = np.ascontiguousarray(frames).reshape(len(frames), -1)
-    sensor, rounding_e = sensor_numbers(noise, unit, rules), _rounding_e(noise)
-    bracket = _Bracket(codes, (times / unit).astype(np.float32), sensor, rules, rounding_e)
+    sensor, rounded_e = sensor_numbers(noise, unit, rules), rounding_e(noise)
+    bracket = _Bracket(codes, (times / unit).astype(np.float32), sensor, rules, rounded_e)
     merged = bracket.merged(dropped)
     unlike: list[int] = []
     while (bad := bracket.frames_off(merged, dropped)).size:
@@ -118,48 +117,19 @@ def merge_bracket(
     unknown = merged.used <= 0
     merged.rate[unknown], merged.sigma[unknown] = 0.0, UNKNOWN_SIGMA
     notes = [f"{unknown.sum()} of {unknown.size} pixels have no sample that could be used."] if unknown.any() else []
-    doubts = _doubts(scatter, black_e * float(np.asarray(noise.K_DN_per_e)), unlike)
-    notes += doubts
-    if rounding_e > rules.black_off * math.sqrt(sensor.floor_e2):
+    doubted = doubts(scatter, black_e * float(np.asarray(noise.K_DN_per_e)), unlike)
+    notes += doubted
+    if rounded_e > rules.black_off * math.sqrt(sensor.floor_e2):
         notes.append("Dark noise is far below a code: rounding moves dark pixels by up to half a code. Raise the gain.")
     off = f"frames whose light is off by more than {100 * rules.frame_off:g} % and {rules.frame_sigma:g} sigma"
     hit = f"pixels with a sample more than {rules.believed_sigma:g} sigma from what its other samples say; that sample"
     places = (str(tuple(int(k) for k in np.unravel_index(pixel, shape))) for pixel in hits)
     listed = outliers(off, (f"frame {i}" for i in np.flatnonzero(dropped)))
     listed += outliers(f"{hit} is left out", places)
-    status = FitStatus.POOR_FIT if doubts else FitStatus.CONVERGED
+    status = FitStatus.POOR_FIT if doubted else FitStatus.CONVERGED
     status = FitStatus.SATURATED if unknown.size and unknown.all() else status
     rate, sigma, used = (part.reshape(shape) for part in (merged.rate, merged.sigma, merged.used))
     return HdrMerge(rate, sigma, used, listed, status, tuple(notes))
-
-
-def _doubts(scatter: float, black_DN: float, unlike: list[int]) -> list[str]:
-    """Sentences for samples that contradict the noise model, or one another."""
-    doubts = []
-    if scatter != 1:
-        doubts.append(
-            f"Samples scatter about a pixel's light with {scatter:.2f} times the variance of the noise model. Check K, "
-            "black level and exposure times; rate and sigma are not to be trusted."
-        )
-    if black_DN:
-        doubts.append(
-            f"Dark samples of all exposures lie {black_DN:+.2g} DN off the black level. Fit the noise with frames "
-            "of this gain and temperature; the light of dark pixels is not to be trusted."
-        )
-    if unlike:
-        frames = " and ".join(map(str, unlike))
-        doubts.append(
-            f"The light of frames {frames} differs, and no other frame tells which one is right: frame {unlike[0]} is "
-            "left out. Check their exposure times, or take exposures that lie closer together."
-        )
-    return doubts
-
-
-def _rounding_e(noise: Noise) -> float:
-    """Largest shift of the mean of dark samples by rounding: the first harmonic of what noise does not smear."""
-    codes = float(np.asarray(noise.sigma_d_e)) * float(np.asarray(noise.K_DN_per_e)) / float(np.asarray(noise.q_DN))
-    step_e = float(np.asarray(noise.q_DN)) / float(np.asarray(noise.K_DN_per_e))
-    return step_e / math.pi * math.exp(-2 * (math.pi * codes) ** 2)
 
 
 def sensor_numbers(noise: Noise, unit_s: float, rules: HdrRules) -> SensorNumbers:
@@ -271,11 +241,12 @@ class _Bracket:
         _, light, mean, variance = self._lit(merged, 2, -np.inf)
         times, floor = self.times[:, None].astype(np.float64), float(self.sensor.floor_e2)
         weight = np.where(~dropped & (mean < 3 * floor), 1 / variance, 0.0)
-        weight = np.where((light - mean) ** 2 < self.rules.believed_sigma**2 * variance, weight, 0.0)
         light_taken = times * (weight * times).sum(axis=0) / np.maximum((weight * times**2).sum(axis=0), 1e-30)
         slope = 1 - light_taken
         information = max(float(np.sum(weight * slope)), 1e-30)
-        found = float(np.sum(weight * slope * (light - mean))) / information
+        # Hits count as samples at the limit.
+        most = self.rules.believed_sigma * np.sqrt(variance)
+        found = float(np.sum(weight * slope * np.clip(light - mean, -most, most))) / information
         limit = max(self.rules.black_off * math.sqrt(floor), 6 / math.sqrt(information), self.rounding_e)
         return found if abs(found) > limit else 0.0
 

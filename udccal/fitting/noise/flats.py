@@ -107,7 +107,8 @@ def _inside(data: NoiseMoments, dark: DarkTerms, up_to_DN: float, ceiling_DN: fl
         dof=stacked(flats, "dof"),
         samples=stacked(flats, "samples"),
         usable=usable,
-        light=np.array([flat.light for flat in flats]),
+        # Frames that are lit have an exposure: 0 says that it is not known.
+        light=np.array([flat.light or np.nan for flat in flats]),
         dark_DN=dark.dark_DN_per_s.value * np.array([flat.exposure_s for flat in flats]),
         row_variance_DN2=np.array([dark.row_DN2.value / (flat.frames * flat.height) for flat in flats]),
     )
