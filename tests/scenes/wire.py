@@ -79,10 +79,11 @@ class Flat:
 
 
 @in_float64
-def drawn_truth(seed: int, built: WireStart, lens: Geometry, modulated: bool = True) -> Wire:
-    """A wire drawn from the fit's prior, with shading."""
+def drawn_truth(seed: int, built: WireStart, lens: Geometry, modulated: bool = True, highest: float = np.inf) -> Wire:
+    """A wire drawn from the fit's prior, with shading; smooth openings have harmonics up to the ``highest`` alone."""
     rng = np.random.default_rng([seed, 1])
     harmonics = possible_harmonics(built).orders
+    harmonics = harmonics[np.abs(harmonics).sum(axis=1) <= highest]
     wire = ideal_wire(lens, built, harmonics if modulated else harmonics[:0])
     steps = shape_sigma(built, WireRules()) * np.clip(rng.standard_normal(10), -2.5, 2.5)
     steps[4:6] = rng.uniform(-0.5, 0.5, 2)
