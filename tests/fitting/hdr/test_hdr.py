@@ -11,6 +11,8 @@ import pytest
 from udccal.errors import FitError
 from udccal.fitting.hdr.likelihood import merge_block
 from udccal.fitting.hdr.merge import UNKNOWN_SIGMA, HdrRules, merge_bracket, sensor_numbers
+from udccal.fitting.psf.data import PsfData
+from udccal.fitting.psf.fit import _notes as psf_notes
 from udccal.models.noise import Noise
 from udccal.result import FitStatus
 
@@ -211,6 +213,12 @@ def test_a_wrong_black_level_is_told_by_dark_samples() -> None:
     wrong = merge_bracket(frames, EXPOSURES[:5], replace(NOISE, black_DN=63.7))
     assert wrong.status is FitStatus.POOR_FIT
     assert "+0.6 DN off the black level" in wrong.notes[-1]
+
+
+def test_a_psf_of_doubted_brackets_says_so() -> None:
+    told = psf_notes(PsfData(None, 3, doubted=("psf/1: Check K.",)), True, "", ())
+    assert "1 of 3 brackets are in doubt. psf/1: Check K." in told
+    assert not any("doubt" in note for note in psf_notes(PsfData(None, 3), True, "", ()))
 
 
 def test_two_frames_that_differ_are_told_where_no_third_decides() -> None:
