@@ -79,10 +79,21 @@ class Flat:
 
 
 @in_float64
-def drawn_truth(seed: int, built: WireStart, lens: Geometry, modulated: bool = True, sharpness: float = 1.0) -> Wire:
-    """A wire drawn from the fit's prior, with shading; ``sharpness`` below 1 gives the openings' edges a blur."""
+def drawn_truth(
+    seed: int,
+    built: WireStart,
+    lens: Geometry,
+    modulated: bool = True,
+    sharpness: float = 1.0,
+    highest: float = np.inf,
+) -> Wire:
+    """A wire drawn from the fit's prior, with shading.
+
+    ``sharpness`` below 1 gives the openings' edges a blur; smooth openings have harmonics up to the ``highest`` alone.
+    """
     rng = np.random.default_rng([seed, 1])
     harmonics = possible_harmonics(built).orders
+    harmonics = harmonics[np.abs(harmonics).sum(axis=1) <= highest]
     wire = ideal_wire(lens, built, harmonics if modulated else harmonics[:0])
     fields = np.array(wire.fields)
     fields[:, 0, 0, 0] = sharpness ** np.maximum((np.asarray(wire.harmonics) ** 2).sum(axis=1) - 1, 0)

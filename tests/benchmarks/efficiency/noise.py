@@ -91,11 +91,12 @@ def _statistics(sensor: ToySensor, x: Float[Array, "12"]) -> tuple[Float[Array, 
             parts.append((v, (2 + tails * (1 - 1 / count)) * v**2 / (pixels * (count - 1))))
     parts.append((offset, spread2 / pixels))
     averaged = spread2 + (V0 + 1 / 12 + K * rate * stack_s + row2) / frames
-    parts.append((averaged, 2 * averaged**2 / pixels))
+    # The sensor at hand has these patterns; only what is temporal scatters.
+    parts.append((averaged, 2 * (averaged**2 - spread2**2) / pixels))
     z = (gain + rate) * stack_s
     quiet = V0 + 1 / 12 + K * rate * stack_s
     uneven = uneven2 + (temporal_variance(z, K, V0, c, 1 / 12) + quiet) / frames / (gain * stack_s) ** 2
-    parts.append((uneven, 2 * uneven**2 / pixels))
+    parts.append((uneven, 2 * (uneven**2 - uneven2**2) / pixels))
     parts.append((black + full + offset, ((V0 + 1 / 12) / pixels + row2 / sensor.rows) / 2))
     # Nothing here tells of the shape.
     mean, variance = (jnp.stack(part) for part in zip(*parts, strict=True))
@@ -111,7 +112,8 @@ def _histogram_information(sensor: ToySensor, x: Float[np.ndarray, "12"]) -> Flo
     rng = np.random.default_rng(0)
     fixed = patterns(sensor, rng)
     places = [_K, _V0, _SHAPE, _BLACK, _RATE, _SPREAD]
-    steps = np.diag([4e-3, 2e-3, 2e-3, 2e-3, 2e-3, 4e-3])
+    K, V0 = x[_K], x[_V0]
+    steps = np.diag([0.01 * K, 1e-3 * V0, 2e-3, 1e-3 * V0**0.5, 1e-4 * x[_RATE], 3e-3 * x[_SPREAD]])
     information = np.zeros((6, 6))
     for t in sensor.dark_times_s:
         first, second = (expose(sensor, fixed, t, False, rng) for _ in range(2))

@@ -199,13 +199,14 @@ class PsfData:
     """The data of a psf fit: crops, and numbers of pictures captured, of those without an LED, and of clipped ones.
 
     Crops may be wider than the fit's windows: the kernel's support needs all of them. There are none where no picture
-    can be used.
+    can be used. ``doubted`` has a sentence for each picture whose bracket contradicts the noise model.
     """
 
     shots: Shots | None
     taken: int = 0
     dark: int = 0
     clipped: int = 0
+    doubted: tuple[str, ...] = ()
 
 
 def left_out(light: Float[np.ndarray, "*shots n"], model_error: float) -> Float[np.ndarray, "*shots n"]:

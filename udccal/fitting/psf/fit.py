@@ -296,5 +296,7 @@ def _notes(data: PsfData, diffracts: bool, misfit: str, support: tuple[str, ...]
             "chi2_dof is of the fit of diffraction and allows for the model error of its residuals.",
             *([misfit] if misfit else []),
         ]
+    if data.doubted:
+        notes.append(f"{len(data.doubted)} of {data.taken} brackets are in doubt. {data.doubted[0]}")
     left_out, why = data.dark + data.clipped, f"{data.dark} without an LED, {data.clipped} clipped."
     return (*notes, *support, *([f"{left_out} pictures were left out: {why}"] if left_out else []))
