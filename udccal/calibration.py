@@ -2,33 +2,18 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
-from typing import TypeVar, get_args
+from typing import get_args
 
 import numpy as np
 from jaxtyping import Float
 
 from udccal.effort import FitEffort
 from udccal.errors import UdccalError
-from udccal.fitting.absent import absent_backscatter, absent_psf, absent_wire
-from udccal.fitting.backscatter.data import read_backscatter
-from udccal.fitting.backscatter.fit import fit_backscatter
-from udccal.fitting.backscatter.parameters import BackscatterRules
-from udccal.fitting.geometry.data import BoardView, read_geometry
-from udccal.fitting.geometry.fit import fit_boards
-from udccal.fitting.noise.data import read_noise
-from udccal.fitting.noise.fit import fit_noise, nominal_noise
-from udccal.fitting.nominal import nominal_geometry
-from udccal.fitting.psf.fit import fit_psf
-from udccal.fitting.psf.read import read_psf
-from udccal.fitting.wire.data import read_wire
-from udccal.fitting.wire.fit import fit_wire, sensor_map
-from udccal.fitting.wire.rules import WireRules
+from udccal.fitting.geometry.data import BoardView
 from udccal.models.backscatter import Backscatter
 from udccal.models.geometry import Geometry
 from udccal.models.noise import Noise
@@ -37,22 +22,14 @@ from udccal.models.wire import Wire
 from udccal.profiles.profile import build_profile
 from udccal.profiles.provenance import provenance_now
 from udccal.profiles.store import write_profile
-from udccal.result import FitResult, FitStatus
+from udccal.result import FitResult
 from udccal.rig import RigDescription
 from udccal.sessions.manifest import MANIFEST_NAME
 from udccal.sessions.schema import TermName
 from udccal.sessions.store import Session
+from udccal.term_fits import FitTime, TermFits
 
-Term = TypeVar("Term")
 ORDER: tuple[TermName, ...] = get_args(TermName)
-
-
-@dataclass(frozen=True)
-class FitTime:
-    """Duration of one term's fit."""
-
-    term: TermName
-    seconds: float
 
 
 @dataclass(frozen=True)
@@ -113,105 +90,36 @@ class Calibration:
         return next(result for result in self.results if result.name == term)
 
     def or_raise(self) -> Calibration:
-        """Return itself when every term can be used.
+        """Return itself when every fit ended well.
 
         Raises:
-            FitError: when a term cannot be used, with the advice of its status.
+            FitError: when a fit did not, with the advice of its status.
         """
         for result in self.results:
             result.or_raise()
         return self
 
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """A sentence for each term that is usable though its fit did not end well."""
+        return tuple(result.warning for result in self.results if result.warning)
+
     def write(self, path: str | Path) -> Path:
         """Write the profile as a folder, or as one file if ``path`` ends in ``.zip``; replace a profile at ``path``.
+
+        A term whose fit stopped early or fits poorly is written with its status, as its error bars include that. Call
+        ``or_raise`` before to refuse such terms.
 
         Returns:
             the path that was written.
 
         Raises:
-            FitError: when a term cannot be used; nothing is written then.
+            FitError: when a term has no error bars (``FitResult.usable``); nothing is written then.
             ProfileError: when ``path`` holds something that is not a profile.
         """
         provenance = provenance_now(self.session.path / MANIFEST_NAME, self.session.camera)
         write_profile(Path(path), build_profile(self.rig, provenance, *self.results, self.foundation.wire_map))
         return Path(path)
-
-
-class _Fits:
-    """The fits of a session: each runs when it is first read, after those whose terms it needs."""
-
-    def __init__(
-        self,
-        session: Session,
-        effort: FitEffort | None,
-        progress: Callable[[TermName], None] = lambda term: None,
-    ) -> None:
-        self._session, self._progress, self._effort = session, progress, effort or FitEffort()
-        self.boards: tuple[BoardView, ...] = ()
-        self.times: list[FitTime] = []
-
-    @cached_property
-    def noise(self) -> FitResult[Noise]:
-        nominal = nominal_noise(self._session.rig)
-        return self._run("noise", lambda: fit_noise(read_noise(self._session), nominal), lambda: nominal)
-
-    @cached_property
-    def geometry(self) -> FitResult[Geometry]:
-        rig, noise = self._session.rig, self.noise.term
-
-        def fit() -> FitResult[Geometry]:
-            data = read_geometry(self._session, noise)
-            self.boards = data.views
-            return fit_boards(data)
-
-        return self._run("geometry", fit, lambda: nominal_geometry(rig))
-
-    @cached_property
-    def wire(self) -> FitResult[Wire]:
-        noise, geometry = self.noise.term, self.geometry.term
-        rules = WireRules(samples=self._effort.wire_samples)
-        return self._run(
-            "wire",
-            lambda: fit_wire(read_wire(self._session, noise, geometry, rules), rules),
-            lambda: absent_wire(self._session.rig, geometry),
-        )
-
-    @cached_property
-    def wire_map(self) -> Float[np.ndarray, "rows columns"]:
-        camera = self._session.rig.camera
-        return sensor_map(self.wire.term, camera.rows, camera.columns)
-
-    @cached_property
-    def psf(self) -> FitResult[PsfField]:
-        noise, geometry, wire = self.noise.term, self.geometry.term, self.wire.term
-        rig, rules = self._session.rig, self._effort.psf
-        return self._run(
-            "psf",
-            lambda: fit_psf(read_psf(self._session, noise, wire, rules), rig, geometry, wire, rules),
-            lambda: absent_psf(rig, geometry),
-        )
-
-    @cached_property
-    def backscatter(self) -> FitResult[Backscatter]:
-        noise, geometry, wire_map = self.noise.term, self.geometry.term, self.wire_map
-        rig, rules = self._session.rig, BackscatterRules(positions=self._effort.backscatter_positions)
-        return self._run(
-            "backscatter",
-            lambda: fit_backscatter(read_backscatter(self._session, noise, geometry, wire_map), geometry, rig, rules),
-            lambda: absent_backscatter(rig, geometry),
-        )
-
-    def _run(self, term: TermName, fit: Callable[[], FitResult[Term]], absent: Callable[[], Term]) -> FitResult[Term]:
-        """Run and time the fit of a term, or return its absent form where the session has no steps of it."""
-        self._progress(term)
-        start = time.perf_counter()
-        if self._session.steps(term):
-            result = fit()
-        else:
-            note = f"The session has no {term} steps; the term has the rig description's nominal values, or is absent."
-            result = FitResult.failed(term, absent(), FitStatus.ABSENT, note)
-        self.times.append(FitTime(term, time.perf_counter() - start))
-        return result
 
 
 def fit(session: Session, term: str, effort: FitEffort | None = None) -> FitResult:
@@ -231,7 +139,7 @@ def fit(session: Session, term: str, effort: FitEffort | None = None) -> FitResu
     """
     if term not in ORDER:
         raise UdccalError(f"Expected a term, one of {', '.join(ORDER)}, found '{term}'. Name one of these.")
-    return getattr(_Fits(session, effort), term)
+    return getattr(TermFits(session, effort), term)
 
 
 def fit_foundation(
@@ -247,7 +155,7 @@ def fit_foundation(
     Raises:
         SessionError: when a file of the session is missing or damaged.
     """
-    fits = _Fits(session, effort, progress)
+    fits = TermFits(session, effort, progress)
     base = fits.noise, fits.geometry, fits.wire
     return Foundation(*base, tuple(fits.times), fits.wire_map, fits.boards)
 
@@ -271,7 +179,7 @@ def calibrate(
     """
     effort = effort or FitEffort()
     base = foundation or fit_foundation(session, progress, effort)
-    fits = _Fits(session, effort, progress)
+    fits = TermFits(session, effort, progress)
     # Setting a cached property keeps its fit from running.
     fits.noise, fits.geometry, fits.wire, fits.wire_map = base.noise, base.geometry, base.wire, base.wire_map
     with ThreadPoolExecutor(effort.workers) as pool:

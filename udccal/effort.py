@@ -28,7 +28,7 @@ class FitEffort:
 # For a demonstration.
 QUICK = FitEffort(
     wire_samples=60_000,
-    psf=PsfRules(positions=5, shifts=2, half_px=(36, 12), close_px=(32, 12), iterations=30),
+    psf=PsfRules(positions=5, shifts=2, half_px=(36, 12), close_px=(32, 12)),
     backscatter_positions=32,
     workers=2,
 )

@@ -132,8 +132,28 @@ class FitResult(Generic[Term]):
 
     @property
     def ok(self) -> bool:
-        """Whether the term can be used."""
+        """Whether the fit ended well."""
         return self.status in (FitStatus.CONVERGED, FitStatus.ABSENT)
+
+    @property
+    def usable(self) -> bool:
+        """Whether the term may go into a profile: the fit ended well, or its error bars can be stated all the same.
+
+        A fit that stopped early has the way that was left in its covariance, a poor one has its misfit there.
+        """
+        numbers = [number for e in self.estimates for number in (e.value, e.sigma)]
+        stated = bool(self.estimates) and self.cov.size > 0 and np.isfinite(self.chi2_dof)
+        return self.ok or bool(stated and np.isfinite(numbers).all() and np.isfinite(self.cov).all())
+
+    @property
+    def warning(self) -> str:
+        """A sentence for a term that is usable though its fit did not end well; empty for others."""
+        if self.ok or not self.usable:
+            return ""
+        return (
+            f"Careful: the {self.name} fit ended as {self.status.name}. {self.status.value} Its error bars include "
+            "this; check them before you rely on the term."
+        )
 
     def estimate(self, name: str) -> Estimate:
         """Return an estimate by its name.
@@ -166,12 +186,16 @@ class FitResult(Generic[Term]):
         return self.posterior.sigma_of(f)
 
     def or_raise(self) -> FitResult[Term]:
-        """Return itself when the term can be used.
+        """Return itself when the fit ended well.
 
         Raises:
-            FitError: when it cannot, with the advice of the status.
+            FitError: when it did not, with the advice of the status.
         """
         if self.ok:
             return self
+        raise self.error()
+
+    def error(self) -> FitError:
+        """The error of a fit that did not end well, with the advice of its status."""
         detail = f" {' '.join(self.notes)}" if self.notes else ""
-        raise FitError(f"The {self.name} fit ended as {self.status.name}: {self.status.value}{detail}")
+        return FitError(f"The {self.name} fit ended as {self.status.name}: {self.status.value}{detail}")

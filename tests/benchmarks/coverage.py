@@ -15,15 +15,15 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import final
+from typing import final, get_args
 
 import jax
 import numpy as np
 from jaxtyping import Float
 
-from tests.benchmarks.readme_tables import between
+from tests.benchmarks.readme_tables import put_table
 from tests.scenes.backscatter import predicted_light
-from tests.scenes.psf_wave_optics import coverage as psf_coverage
+from tests.scenes.psf_wave_optics import held_out_positions
 from udccal.benches.bench import simulated_bench
 from udccal.benches.capture import capture
 from udccal.calibration import Foundation, fit_foundation
@@ -34,14 +34,19 @@ from udccal.fitting.backscatter.data import read_backscatter, sampled_rays
 from udccal.fitting.backscatter.fit import fit_backscatter
 from udccal.fitting.bins import Bins
 from udccal.fitting.geometry.fit import projection_sigma_px
+from udccal.fitting.psf.fit import fit_psf
+from udccal.fitting.psf.read import read_psf
 from udccal.models.geometry import project_directions
+from udccal.models.psf import PsfField, psf_kernels
 from udccal.models.wire import wire_values
 from udccal.numerics import in_float64
 from udccal.planning.state import sensor_samples
 from udccal.reports.true_values import true_values
 from udccal.rig import load_rig
+from udccal.sessions.schema import TermName
 from udccal.sessions.store import Session
 from udccal.simulation import backscatter, wire
+from udccal.simulation.psf import kernels
 from udccal.simulation.sensor import Sensor
 from udccal.simulation.truth import RigTruth, draw_truth, pixels_to_directions
 from udccal.simulation.world import SimulatedWorld
@@ -49,6 +54,8 @@ from udccal.simulation.world import SimulatedWorld
 _RIG = "lg55-reduced"
 _INSIDE, _LEAST = 1.96, 0.90
 _RAYS, _PIXELS = 17, 2000
+# Rows and columns of the kernel about its source.
+_WINDOW = (33, 17)
 _PICTURES = (9101, 9102, 9103)
 _PAGE = Path(__file__).resolve().parents[2] / "docs" / "numerics.md"
 
@@ -93,10 +100,10 @@ class Coverage:
 
 
 def sensor_numbers(rig: Specimen) -> Float[np.ndarray, " n"]:
-    """K, dark noise, black level, dark current and the rest."""
-    found = {estimate.name: estimate for estimate in rig.base.noise.estimates}
+    """K, dark noise, black level, dark current and the rest; a number without an interval does not count as inside."""
+    found = {estimate.name: estimate for estimate in rig.base.noise.estimates if estimate.sigma > 0}
     true = [one for one in true_values(rig.truth) if one.term == "noise" and one.name in found]
-    return np.array([(found[one.name].value - one.value) / max(found[one.name].sigma, 1e-30) for one in true])
+    return np.array([one.error_of(found[one.name].value) / found[one.name].sigma for one in true])
 
 
 @in_float64
@@ -141,9 +148,20 @@ def new_pictures(rig: Specimen) -> Float[np.ndarray, " n"]:
     return ((light.rate - true) / light.sigma).ravel()
 
 
+@in_float64
 def kernel_samples(rig: Specimen) -> Float[np.ndarray, " n"]:
-    """The psf where no LED was, from LEDs of its own (``psf_wave_optics``)."""
-    return psf_coverage(rig.truth.seed).z
+    """The psf where no LED was, fitted from the session as a calibration does; a sample of known value has no sigma."""
+    session, base, rules = rig.session, rig.base, FitEffort().psf
+    geometry, wire_term = base.geometry.term, base.wire.term
+    data = read_psf(session, base.noise.term, wire_term, rules)
+    fit = fit_psf(data, session.rig, geometry, wire_term, rules).or_raise()
+    places = held_out_positions(rig.truth)
+
+    def kernels_of(term: PsfField) -> Float[np.ndarray, "n 3 rows columns"]:
+        return np.asarray(psf_kernels(term, places, *_WINDOW))
+
+    error, sigma = kernels_of(fit.term) - kernels(rig.truth, places, *_WINDOW), fit.sigma_of(kernels_of)
+    return (error[sigma > 0] / sigma[sigma > 0]).ravel()
 
 
 QUANTITIES: tuple[tuple[str, Callable[[Specimen], Float[np.ndarray, " n"]]], ...] = (
@@ -160,7 +178,7 @@ def specimen(seed: int, folder: Path) -> Specimen:
     rig = load_rig(_RIG)
     truth = draw_truth(rig, seed)
     with simulated_bench(SimulatedWorld(truth, seed=seed)) as bench:
-        capture(folder, bench, ("noise", "geometry", "wire", "backscatter"))
+        capture(folder, bench, get_args(TermName))
     session = Session.open(folder)
     return Specimen(truth, session, fit_foundation(session))
 
@@ -195,7 +213,7 @@ def main() -> int:
             print(f"rig {seed}, {name}: {np.mean(np.abs(part[-1]) < _INSIDE):.1%} inside", flush=True)
     found = [Coverage(name, tuple(part)) for (name, _), part in zip(QUANTITIES, scores, strict=True)]
     print(table(found))
-    _PAGE.write_text(between(_PAGE.read_text(encoding="utf-8"), "coverage", table(found)), encoding="utf-8")
+    put_table(_PAGE, "coverage", table(found))
     return 0 if all(one.ok for one in found) else 1
 
 

@@ -1,12 +1,14 @@
 """Scenes seen through a simulated rig, restored with its profile, and compared with what a perfect camera sees.
 
-What counts for "before" is the ratio of panel light to room light. The panel stays at the brightness it was calibrated
-at; the room's light is set, once for all scenes, so that the mean PSNR of "before" is the paper's 21.5 dB.
+What counts for "before" is the ratio of panel light to room light, so the PSNR of "before" is a dial. The panel stays
+at the brightness it was calibrated at; the room's light is set, once for all scenes, so that the mean PSNR of "before"
+is the paper's 21.5 dB. ``CONDITIONS`` are that light, and others beside it.
 """
 
 from __future__ import annotations
 
 import time
+import zlib
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -32,6 +34,32 @@ _BEFORE_DB, _WITHIN_DB, _TRIES = 21.5, 0.1, 12
 _FILL = 0.85
 # Panel pictures that no calibration has shown.
 _PICTURE_SEEDS = (9001, 9002, 9003, 9004)
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """What a frame is taken and restored under.
+
+    Attributes:
+        name: for a table.
+        light: of the room, in units of the light that is set.
+        known: whether ``restore`` is given the picture that the panel shows.
+        lit: whether the panel shows one; else it is black, and ``restore`` knows that.
+    """
+
+    name: str
+    light: float = 1.0
+    known: bool = True
+    lit: bool = True
+
+
+CONDITIONS = (
+    Conditions("light set for 21.5 dB before, exact panel picture given"),
+    Conditions("room light x 0.3", light=0.3),
+    Conditions("room light x 3", light=3.0),
+    Conditions("panel picture unknown", known=False),
+    Conditions("panel black", lit=False),
+)
 
 Rgb = Float32[np.ndarray, "rows columns 3"]
 
@@ -77,6 +105,7 @@ class PictureBench:
         self._panel_rates = [
             (backscatter_rate(truth, picture) * self._wire).astype(np.float32) for picture in self.pictures
         ]
+        self._black = np.zeros_like(self.pictures[0])
 
     def shots(self, scenes: Iterable[Scene]) -> list[Shot]:
         """Every scene at its own display exposure."""
@@ -94,22 +123,29 @@ class PictureBench:
             scene.name, mosaic.astype(np.float32), (ideal * gain).astype(np.float32), index % len(self.pictures)
         )
 
-    def exposure_s(self, shot: Shot, room_light: float) -> float:
+    def _panel_rate(self, shot: Shot, lit: bool) -> Float32[np.ndarray, "sensor_rows sensor_columns"]:
+        """A black panel sends no light."""
+        rate = self._panel_rates[shot.picture]
+        return rate if lit else np.zeros_like(rate)
+
+    def exposure_s(self, shot: Shot, room_light: float, lit: bool = True) -> float:
         """Exposure at which display white and the panel's light together fill most of the well."""
         white = room_light * WHITE_E_PER_S * float(self._wire.max())
-        panel = float(np.percentile(self._panel_rates[shot.picture], 99))
+        panel = float(np.percentile(self._panel_rate(shot, lit), 99))
         return _FILL * self._truth.sensor.full_well_e / (white + panel)
 
-    def frame(self, shot: Shot, room_light: float) -> UInt16[np.ndarray, "sensor_rows sensor_columns"]:
+    def frame(
+        self, shot: Shot, room_light: float, lit: bool = True
+    ) -> UInt16[np.ndarray, "sensor_rows sensor_columns"]:
         """The raw frame."""
-        rate = room_light * shot.scene_rate + self._panel_rates[shot.picture]
-        seed = np.random.default_rng([self._truth.seed, 0x5CE7E, shot.picture, len(shot.name)])
-        exposure_s = self.exposure_s(shot, room_light)
+        rate = room_light * shot.scene_rate + self._panel_rate(shot, lit)
+        seed = np.random.default_rng([self._truth.seed, 0x5CE7E, zlib.crc32(shot.name.encode())])
+        exposure_s = self.exposure_s(shot, room_light, lit)
         return self._sensor.expose(rate.astype(np.float64), exposure_s, self._region, seed)
 
-    def before(self, shot: Shot, room_light: float) -> Rgb:
+    def before(self, shot: Shot, room_light: float, lit: bool = True) -> Rgb:
         """Everything but the cure, display-encoded."""
-        linear = self._restorer.before(self.frame(shot, room_light), self.exposure_s(shot, room_light))
+        linear = self._restorer.before(self.frame(shot, room_light, lit), self.exposure_s(shot, room_light, lit))
         return _displayed(linear, shot, room_light)
 
     def matched_room_light(self, shots: list[Shot]) -> float:
@@ -123,13 +159,14 @@ class PictureBench:
             low, high = (middle, high) if mean < _BEFORE_DB else (low, middle)
         return 2.0**middle
 
-    def score(self, shot: Shot, room_light: float) -> Score:
+    def score(self, shot: Shot, matched_light: float, conditions: Conditions = CONDITIONS[0]) -> Score:
         """Before and after against the truth; both get the least-squares gain per channel."""
-        truth = encode_srgb(shot.ideal)
-        before = self.before(shot, room_light)
-        frame, exposure_s = self.frame(shot, room_light), self.exposure_s(shot, room_light)
+        truth, room_light, lit = encode_srgb(shot.ideal), conditions.light * matched_light, conditions.lit
+        before = self.before(shot, room_light, lit)
+        frame, exposure_s = self.frame(shot, room_light, lit), self.exposure_s(shot, room_light, lit)
+        shown = self.pictures[shot.picture] if lit else self._black
         start = time.perf_counter()
-        linear = self._restorer.restore(frame, exposure_s, self.pictures[shot.picture])
+        linear = self._restorer.restore(frame, exposure_s, shown if conditions.known else None)
         seconds = time.perf_counter() - start
         after = _displayed(linear, shot, room_light)
         return Score(

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import json
+from collections.abc import Iterable
 from pathlib import Path
 
-from tests.benchmarks.rows import Row, table
+from tests.benchmarks.accuracy import finished, summaries, table
+from tests.benchmarks.commit import stamped
 
 _README = Path(__file__).resolve().parents[2] / "README.md"
 
@@ -24,16 +25,27 @@ def between(text: str, marker: str, content: str) -> str:
     return f"{text[: start + len(first)]}\n{content.strip()}\n{text[end:]}"
 
 
+def put_table(page: Path, marker: str, table: str, commits: Iterable[str] | None = None) -> None:
+    """Put a table into a page between its markers, with the commit that it was measured at (``stamped``)."""
+    text = between(page.read_text(encoding="utf-8"), marker, stamped(table, commits))
+    page.write_text(text, encoding="utf-8")
+
+
+def write_tables(folder: Path, page: Path) -> None:
+    """Put the finished parts of ``make accuracy`` into a page, with the commits of the measurement, not of this."""
+    parts = finished(folder)
+    commits = [part.commit for part in parts]
+    put_table(page, "accuracy", table(summaries(parts)), commits)
+    files = sorted(folder.glob("*/scenes.md"))
+    scenes = "\n\n".join(f"{file.parent.name}:\n\n{file.read_text(encoding='utf-8').strip()}" for file in files)
+    put_table(page, "scenes", scenes or "Not measured yet.", commits)
+
+
 def main() -> None:
     """Read the results and rewrite README.md."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--accuracy", type=Path, default=Path("accuracy"), help="folder that `make accuracy` wrote")
-    folder: Path = parser.parse_args().accuracy
-    rows = [Row(**row) for row in json.loads((folder / "accuracy.json").read_text(encoding="utf-8"))]
-    files = sorted(folder.glob("*/scenes.md"))
-    scenes = "\n\n".join(f"{file.parent.name}:\n\n{file.read_text(encoding='utf-8').strip()}" for file in files)
-    text = between(_README.read_text(encoding="utf-8"), "accuracy", table(rows))
-    _README.write_text(between(text, "scenes", scenes or "Not measured yet."), encoding="utf-8")
+    write_tables(parser.parse_args().accuracy, _README)
 
 
 if __name__ == "__main__":

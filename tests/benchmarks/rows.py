@@ -6,6 +6,9 @@ import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+# How names end whose limit is a lower one.
+AT_LEAST = "(at least)"
+
 
 @dataclass(frozen=True)
 class Row:
@@ -25,7 +28,7 @@ def at_most(name: str, value: float, limit: float, unit: str) -> Row:
 
 def at_least(name: str, value: float, limit: float, unit: str) -> Row:
     """A number that must reach its limit."""
-    return Row(f"{name} (at least)", float(value), limit, unit, bool(value >= limit))
+    return Row(f"{name} {AT_LEAST}", float(value), limit, unit, bool(value >= limit))
 
 
 def table(rows: list[Row]) -> str:

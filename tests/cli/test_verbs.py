@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -86,6 +87,25 @@ def test_profile_show_lists_what_was_measured(folder: Path) -> None:
     shown = json.loads(done.stdout)
     assert shown["rig"] == "toy"
     assert "K_DN_per_e" in {estimate["name"] for estimate in shown["estimates"]}
+
+
+def test_one_term_is_fitted_again_and_the_others_are_kept(folder: Path) -> None:
+    before = json.loads((folder / "profile" / "profile.json").read_text())
+    done = udccal("fit", folder / "session", "--profile", folder / "profile", "--term", "wire", "--term", "psf")
+    assert done.returncode == 0, done.stderr
+    terms = {term["term"]: term for term in json.loads(done.stdout)["terms"]}
+    assert terms["noise"]["status"] == "CONVERGED"
+    assert "Fitted with an earlier wire term." in terms["backscatter"]["notes"]
+    after = json.loads((folder / "profile" / "profile.json").read_text())
+    assert after["terms"]["noise"] == before["terms"]["noise"]
+    strange = json.loads((folder / "session" / "session.json").read_text())
+    other = Path(shutil.copytree(folder / "session", folder / "other"))
+    del strange["manifest_sha256"]
+    (other / "session.json").write_text(json.dumps(strange))
+    refused = udccal("fit", other, "--profile", folder / "profile", "--term", "wire")
+    assert refused.returncode == 1
+    assert "another session" in json.loads(refused.stdout)["error"]
+    assert json.loads((folder / "profile" / "profile.json").read_text()) == after
 
 
 def test_a_damaged_session_leaves_the_profile_as_it_was(folder: Path) -> None:

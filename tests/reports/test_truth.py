@@ -10,7 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from udccal.models.geometry import panel_directions
 from udccal.numerics import in_float64
-from udccal.reports.true_values import true_geometry, true_values
+from udccal.profiles.store import load_profile
+from udccal.reports.true_values import TrueValue, true_geometry, true_values
 from udccal.reports.truth import TruthRow, ray_error_px, truth_table
 from udccal.rig import load_rig
 from udccal.simulation.truth import RigTruth, draw_truth, pixels_to_directions
@@ -52,6 +53,28 @@ def test_a_wrong_focal_length_shows(truth: RigTruth) -> None:
 def test_names_of_true_values_are_unique_in_their_term(truth: RigTruth) -> None:
     names = [(value.term, value.name) for value in true_values(truth)]
     assert len(names) == len(set(names))
+
+
+def test_every_estimate_of_the_shipped_profile_has_its_truth_but_those_of_the_model_alone() -> None:
+    profile = load_profile("lg55-reduced")
+    known = {(one.term, one.name) for one in true_values(draw_truth(load_rig("lg55-reduced"), 0))}
+    of_the_model = {
+        ("psf", "blur_px"),
+        ("psf", "kernel_relative_l2"),
+        ("backscatter", "softness_px"),
+        ("backscatter", "reflection"),
+    }
+    sections = {term: getattr(profile, term) for term in ("noise", "geometry", "wire", "psf", "backscatter")}
+    given = {(term, one.name) for term, section in sections.items() for one in section.estimates}
+    assert given - known == of_the_model
+    assert known <= given
+
+
+def test_whole_periods_are_no_error() -> None:
+    offset = TrueValue("wire", "offset_x_periods", 961.02, 1.0)
+    assert offset.error_of(0.03) == pytest.approx(0.01)
+    assert offset.error_of(0.99) == pytest.approx(-0.03)
+    assert TrueValue("wire", "row_open", 0.4).error_of(1.4) == pytest.approx(1.0)
 
 
 def test_a_table_shows_dashes_where_nothing_is_known() -> None:

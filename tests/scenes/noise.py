@@ -70,7 +70,10 @@ class Patterns:
 def patterns(sensor: ToySensor, rng: np.random.Generator) -> Patterns:
     """Fixed patterns of one sensor of this kind."""
     shape = (sensor.rows, sensor.columns)
-    response, offset = 1 + sensor.PRNU * rng.standard_normal(shape), sensor.DSNU_e * rng.standard_normal(shape)
+    # Of exactly these deviations, as EMVA 1288's numbers are those of the sensor at hand.
+    drawn = (rng.standard_normal(shape) for _ in range(2))
+    white, uneven = ((one - one.mean()) / one.std() for one in drawn)
+    response, offset = 1 + sensor.PRNU * white, sensor.DSNU_e * uneven
     response = response if sensor.pattern is None else response + sensor.pattern
     noisy = rng.random(shape) < sensor.telegraph if sensor.telegraph else np.zeros(shape, bool)
     return Patterns(response, offset, np.where(noisy, 3.0, 1.0) * sensor.read_e)

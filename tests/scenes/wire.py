@@ -79,11 +79,25 @@ class Flat:
 
 
 @in_float64
-def drawn_truth(seed: int, built: WireStart, lens: Geometry, modulated: bool = True) -> Wire:
-    """A wire drawn from the fit's prior, with shading."""
+def drawn_truth(
+    seed: int,
+    built: WireStart,
+    lens: Geometry,
+    modulated: bool = True,
+    sharpness: float = 1.0,
+    highest: float = np.inf,
+) -> Wire:
+    """A wire drawn from the fit's prior, with shading.
+
+    ``sharpness`` below 1 gives the openings' edges a blur; smooth openings have harmonics up to the ``highest`` alone.
+    """
     rng = np.random.default_rng([seed, 1])
     harmonics = possible_harmonics(built).orders
+    harmonics = harmonics[np.abs(harmonics).sum(axis=1) <= highest]
     wire = ideal_wire(lens, built, harmonics if modulated else harmonics[:0])
+    fields = np.array(wire.fields)
+    fields[:, 0, 0, 0] = sharpness ** np.maximum((np.asarray(wire.harmonics) ** 2).sum(axis=1) - 1, 0)
+    wire = eqx.tree_at(lambda w: w.fields, wire, fields)
     steps = shape_sigma(built, WireRules()) * np.clip(rng.standard_normal(10), -2.5, 2.5)
     steps[4:6] = rng.uniform(-0.5, 0.5, 2)
     # Beyond a degree the geometry fit would be to blame.
@@ -118,10 +132,17 @@ def noisy(truth: Wire, seed: int, electrons: float = ELECTRONS, prnu: float = PR
     return Flat(truth, signal, level)
 
 
-def fitted(flat: Flat, built: WireStart, lens: Geometry, prnu: float = PRNU, clip: float = np.inf) -> FitResult[Wire]:
-    """The fit with all pixels."""
+def fitted(
+    flat: Flat,
+    built: WireStart,
+    lens: Geometry,
+    prnu: float = PRNU,
+    clip: float = np.inf,
+    samples: int = ROWS * COLUMNS,
+) -> FitResult[Wire]:
+    """The fit with so many pixels, by default with all."""
     data = WireData(flat.signal, flat.variance, lens, built, prnu, clip)
-    return fit_wire(data, WireRules(samples=flat.signal.size))
+    return fit_wire(data, WireRules(samples=samples))
 
 
 def map_sigma(result: FitResult[Wire], pixels: Float[np.ndarray, "places 2"]) -> Float[np.ndarray, " places"]:

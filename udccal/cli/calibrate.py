@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from udccal.cli.options import IterationLog, ProfilePath, RigName, Seed, SessionFolder
+from udccal.cli.options import DOUBTFUL, IterationLog, ProfilePath, RigName, Seed, SessionFolder, TermChoice
 from udccal.cli.output import Output
 from udccal.errors import CameraError
 
@@ -39,16 +39,6 @@ class ExchangedPart(enum.StrEnum):
 
     camera = "camera"
     lens = "lens"
-
-
-class TermChoice(enum.StrEnum):
-    """A term that can be captured on its own."""
-
-    noise = "noise"
-    geometry = "geometry"
-    wire = "wire"
-    psf = "psf"
-    backscatter = "backscatter"
 
 
 _CAMERA_HELP = "sim: a simulated rig; u3v: any USB3 Vision camera; pylon: through Basler's SDK; files: see --files."
@@ -95,7 +85,8 @@ def calibrate(
     with opened as bench:
         parts = {Exchanged(part.value) for part in exchanged or ()}
         capture_watched(output, bench, session, [t.value for t in term or TermChoice], parts)
-    fit_to_profile(output, session, profile, log)
+    if not fit_to_profile(output, session, profile, log):
+        raise typer.Exit(DOUBTFUL)
 
 
 def _simulated(rig: RigDescription, seed: int) -> AbstractContextManager[CaptureBench]:

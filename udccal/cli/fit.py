@@ -7,16 +7,21 @@ from typing import Annotated
 
 import typer
 
-from udccal.cli.options import IterationLog, ProfilePath
+from udccal.cli.options import DOUBTFUL, IterationLog, ProfilePath, TermChoice
 
 
 def fit(
     context: typer.Context,
     session: Annotated[Path, typer.Argument(help="Folder of a captured session.")],
     profile: ProfilePath,
+    term: Annotated[
+        list[TermChoice] | None,
+        typer.Option("--term", help="Fit this term only, and keep the profile's others; may be given again."),
+    ] = None,
     log: IterationLog = None,
 ) -> None:
-    """Fit all five terms of a captured session and write a profile with its report."""
+    """Fit all five terms of a captured session, or some of them again, and write a profile with its report."""
     from udccal.cli.jobs.fit import fit_to_profile
 
-    fit_to_profile(context.obj, session, profile, log)
+    if not fit_to_profile(context.obj, session, profile, log, [one.value for one in term or ()]):
+        raise typer.Exit(DOUBTFUL)

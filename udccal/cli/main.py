@@ -59,7 +59,7 @@ app.add_typer(profile_app, name="profile")
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run the command and exit with its status: 0, 1 for a known failure, 2 for wrong usage, 70 for a bug."""
+    """Run the command and exit with its status, which docs/cli.md explains: 0, 1, 2, 3, 70 or 130."""
     # Silences XLA's own log before JAX is imported: whatever matters in it also comes as an exception.
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     given = list(sys.argv[1:] if arguments is None else arguments)

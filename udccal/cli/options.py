@@ -2,10 +2,25 @@
 
 from __future__ import annotations
 
+import enum
 from pathlib import Path
 from typing import Annotated
 
 import typer
+
+
+class TermChoice(enum.StrEnum):
+    """A term that can be captured or fitted on its own."""
+
+    noise = "noise"
+    geometry = "geometry"
+    wire = "wire"
+    psf = "psf"
+    backscatter = "backscatter"
+
+
+# Exit status of a fit whose profile was written with a warning.
+DOUBTFUL = 3
 
 RigName = Annotated[str, typer.Option("--rig", help="Name of a shipped rig or of your own, or a folder.")]
 SessionFolder = Annotated[Path, typer.Option("--session", help="Folder of the session; continues an unfinished one.")]

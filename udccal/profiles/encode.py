@@ -33,8 +33,14 @@ _WIRE_RANGE, _RATE_RANGE, _KERNEL_RANGE = (1e-4, 1e4), (-1e10, 1e10), (-10.0, 10
 
 
 def encode(profile: Profile, folder: Path) -> StoredProfile:
-    """Write a profile's arrays to ``folder`` and return the content of ``profile.json``."""
+    """Write a profile's arrays to ``folder`` and return the content of ``profile.json``.
+
+    Raises:
+        ProfileError: when a number is not finite or out of range, so that the profile could not be read again.
+    """
     shared = profile.geometry.term
+    for result in profile.results:
+        check_term(result.term, result.name, profile.rig)
     return StoredProfile(
         format=FORMAT,
         version=VERSION,

@@ -55,16 +55,19 @@ class Profile:
     backscatter_mask: Float32[np.ndarray, "half_rows half_columns 3"]
     invalidated_by: tuple[str, ...] = INVALIDATED_BY
 
+    @property
+    def results(self) -> tuple[FitResult, FitResult, FitResult, FitResult, FitResult]:
+        """All five results, in the order of ``TermName``."""
+        return self.noise, self.geometry, self.wire, self.psf, self.backscatter
+
     def result(self, term: TermName) -> FitResult:
         """Return the fit of a term by its name."""
-        results: dict[TermName, FitResult] = {
-            "noise": self.noise,
-            "geometry": self.geometry,
-            "wire": self.wire,
-            "psf": self.psf,
-            "backscatter": self.backscatter,
-        }
-        return results[term]
+        return next(result for result in self.results if result.name == term)
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """A sentence for each term whose fit did not end well."""
+        return tuple(result.warning for result in self.results if result.warning)
 
 
 def build_profile(
@@ -88,10 +91,11 @@ def build_profile(
         parent: SHA-256 of the profile that this one is derived from, or None.
 
     Raises:
-        FitError: when a fit cannot be used, with the advice of its status.
+        FitError: when a fit has no term with error bars (``FitResult.usable``), with the advice of its status.
     """
     for result in (noise, geometry, wire, psf, backscatter):
-        result.or_raise()
+        if not result.usable:
+            raise result.error()
     return Profile(
         rig=rig,
         provenance=provenance,

@@ -78,8 +78,9 @@ RANGES: Mapping[type, Mapping[str, Range]] = {
         "standoff_per_pitch": Real(1e-3, 1e6),
         "offset_periods": Real(-1e6, 1e6, (2,)),
         "footprint_per_pitch": Real(1e-3, 1e6),
-        "row_open": _FRACTION,
-        "column_open": _FRACTION,
+        # Noise may take an opening somewhat beyond its period.
+        "row_open": Real(0.0, 2.0),
+        "column_open": Real(0.0, 2.0),
         "depth_per_pitch": Real(-100.0, 100.0),
         "harmonics": Real(-float(HIGHEST_ORDER), float(HIGHEST_ORDER), ("harmonics", 2)),
         "frequency": Real(-1e3, 1e3, ("harmonics", 2)),

@@ -69,7 +69,7 @@ def stated(term: TermName, result: FitResult, rig: RigDescription) -> float | No
             K = result.estimate("K_DN_per_e")
             return 100 * K.sigma / K.value
         case "geometry":
-            if not len(result.cov):
+            if not len(result.cov) or result.posterior is None:
                 return None
             sigma = projection_sigma_px(result, sensor_samples(rig, _ACROSS))
             return float(np.sqrt(np.mean(sigma**2)))

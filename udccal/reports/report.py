@@ -62,9 +62,13 @@ def calibration_page(session: Session, evidence: Evidence, scene: PictureCompari
         scene: a restored scene; None for none.
     """
     calibration = evidence.calibration
-    bad = [term for term in ORDER if not calibration.result(term).ok]
-    good = "All five terms can be used."
-    verdict = f"Not usable: {', '.join(bad)}. Each section says what to do." if bad else good
+    bad = [term for term in ORDER if not calibration.result(term).usable]
+    doubtful = [term for term in ORDER if calibration.result(term).warning]
+    verdict = "All five terms can be used."
+    if bad:
+        verdict = f"Not usable: {', '.join(bad)}. Each section says what to do."
+    elif doubtful:
+        verdict = f"Usable with care: {', '.join(doubtful)}. Each section says why; the error bars include it."
     camera, sensor = session.camera, calibration.rig.camera
     facts = (
         Fact("rig", calibration.rig.name),

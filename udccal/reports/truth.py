@@ -59,11 +59,11 @@ def compare_with_truth(
 ) -> tuple[TruthRow, ...]:
     """Return every estimate whose truth the simulated rig has, and the errors of the terms' maps."""
     values = [
-        TruthRow(value.term, estimate.name, estimate.unit, estimate.value, value.value, error, estimate.sigma)
-        for value in true_values(truth)
-        for estimate in calibration.result(value.term).estimates
-        if estimate.name == value.name
-        for error in (estimate.value - value.value,)
+        TruthRow(true.term, one.name, one.unit, one.value, one.value - error, error, one.sigma or None)
+        for true in true_values(truth)
+        for one in calibration.result(true.term).estimates
+        if one.name == true.name
+        for error in (true.error_of(one.value),)
     ]
     ray = ray_error_px(calibration.geometry.term, truth)
     distances = (

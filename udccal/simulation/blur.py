@@ -56,6 +56,13 @@ class SpaceVariantBlur:
         Pixel (margin columns, margin rows) of ``canvas`` is sensor pixel (0, 0). Light that leaves the canvas wraps
         around to its other side, but reaches only the margin, which is cut off.
         """
+        # Next to a light a million times brighter, the cut rank and single precision give negative values.
+        return np.maximum(self.convolve(canvas), 0.0)
+
+    def convolve(
+        self, canvas: Float[np.ndarray, "canvas_rows canvas_columns 3"]
+    ) -> Float[np.ndarray, "rows columns 3"]:
+        """Like ``apply``, for kernels that may be negative, such as a difference of two."""
         margin_rows, margin_columns = self.margin
         rows, columns = canvas.shape[0], canvas.shape[1]
         basis_y = spline_basis(self.grid_y_px, np.arange(rows, dtype=float) - margin_rows)
@@ -71,8 +78,7 @@ class SpaceVariantBlur:
                 strength = (basis_y @ coefficients).astype(np.float32) @ basis_x.astype(np.float32)
                 total += scipy.fft.rfft2(plane * strength, s=shape, workers=_WORKERS) * _transfer(component, shape)
             blurred[..., colour] = scipy.fft.irfft2(total, s=shape, workers=_WORKERS)[down, across]
-        # Next to a light a million times brighter, the cut rank and single precision give negative values.
-        return np.maximum(blurred, 0.0, out=blurred)
+        return blurred
 
 
 def build_blur(

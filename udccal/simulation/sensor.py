@@ -114,7 +114,9 @@ def _counted(
 def _pattern(
     rng: np.random.Generator, shape: tuple[int, int], mean: float, sigma: float
 ) -> Float32[np.ndarray, "rows columns"]:
-    return np.float32(mean) + np.float32(sigma) * rng.standard_normal(shape, np.float32)
+    # Of exactly this mean and deviation: EMVA 1288's PRNU and DSNU are those of the sensor at hand.
+    drawn = rng.standard_normal(shape, np.float32)
+    return np.float32(mean) + np.float32(sigma) * (drawn - drawn.mean()) / drawn.std()
 
 
 def _dark_current(

@@ -85,17 +85,19 @@ def rotation_matrix(axis: int, angle_rad: float) -> Float[np.ndarray, "3 3"]:
     return matrix
 
 
-def draw_truth(description: RigDescription, seed: int = 0) -> RigTruth:
+def draw_truth(description: RigDescription, seed: int = 0, at_ends: bool = False) -> RigTruth:
     """Draw the true values of a rig.
 
     Args:
         description: the rig description; each nominal value is moved by up to 0.8 of its tolerance.
         seed: seed of all draws, including values that no data sheet gives.
+        at_ends: move each nominal value by its whole tolerance instead, up or down.
     """
     rng = np.random.default_rng([seed, 0x7AB1E])
 
     def drawn(nominal: Nominal) -> float:
-        return nominal.value + nominal.tolerance * float(rng.uniform(-0.8, 0.8))
+        part = float(rng.uniform(-0.8, 0.8))
+        return nominal.value + nominal.tolerance * (float(np.sign(part)) if at_ends else part)
 
     optics = _draw_optics(description, drawn, rng)
     mix = np.array([[1.0, 0.09, 0.02], [0.12, 1.0, 0.10], [0.03, 0.14, 1.0]])

@@ -1,4 +1,4 @@
-"""Geometry from a session-like set of boards, over realisations of the corners' noise.
+"""Geometry from a session-like set of boards, over drawn lenses and mountings, and realisations of the corners' noise.
 
 Eleven views of 48 corners, one of them parallel to the panel, a lens with four distortion coefficients of visible size
 and corners whose sigma differ by a factor of three. Two kinds of rays are followed: fixed to the panel, as restoration
@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from tests.benchmarks.efficiency.trials import Trials
-from tests.fitting.geometry.boards import Sight, calibrated, sight
+from tests.fitting.geometry.boards import VISIBLE_BEND, Sight, calibrated, sight
 from udccal.fitting.engine.information import cramer_rao, fisher_information
 from udccal.fitting.geometry.calibrated import CalibratedViews, Gauge, field_grid
 from udccal.fitting.geometry.corners import board_points_mm
@@ -23,7 +23,7 @@ from udccal.models.geometry import Geometry, project, rotation_matrix
 from udccal.numerics import in_float64
 from udccal.result import FitResult
 
-_REALISATIONS = 400
+_LENSES, _REALISATIONS = 40, 10
 _NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "tilt_deg", "roll_deg", "yaw_deg")
 # Fractions of the picture's width and height.
 _FIELD = np.array([[0.5, 0.5], [0.05, 0.05], [0.95, 0.1], [0.1, 0.9], [0.75, 0.7]])
@@ -66,10 +66,41 @@ def _lens_alone(x: Float[Array, " n"], rays: Float[Array, "rays 3"]) -> Float[Ar
     return project(_camera(x), rays).ravel()
 
 
-@in_float64
 def trials(share: float = 1.0) -> list[Trials]:
-    """Realisations of the intrinsics, the mounting and where rays land."""
-    scene, count = sight(views=11), max(int(_REALISATIONS * share), 20)
+    """Realisations of the intrinsics, the mounting and where rays land, of lenses that are drawn."""
+    count = max(2, round(_LENSES * share))
+    lenses = [_of_lens(seed) for seed in range(count)]
+    number = np.repeat(np.arange(count), _REALISATIONS)
+    numbers, by_panel, aligned = (np.concatenate([lens[part] for lens in lenses], axis=1) for part in range(3))
+    return [
+        *(Trials(f"geometry/{name}", *numbers[:, :, [k]], truth=number) for k, name in enumerate(_NAMES)),
+        Trials("geometry/ray of the panel", *by_panel, truth=number),
+        Trials("geometry/ray of the lens", *aligned, truth=number),
+    ]
+
+
+def _drawn(seed: int) -> Sight:
+    """Another lens, mounting, boards and corners' noise; every coefficient is of a size that the fit sees.
+
+    Where one is too small for that, the fit leaves it out, and its error bars are those of the smaller lens.
+    """
+    rng = np.random.default_rng([seed, 0x6E])
+    focal, aspect = rng.uniform(800.0, 950.0), rng.normal(1.0, 2e-4)
+    bend = VISIBLE_BEND * rng.uniform(0.8, 1.2, 5)
+    return sight(
+        seed=seed,
+        views=11,
+        tilt_deg=rng.uniform(5.0, 30.0),
+        distortion=bend,
+        focal_px=(focal, focal * aspect),
+        centre_px=(rng.uniform(505.0, 518.0), rng.uniform(378.0, 389.0)),
+    )
+
+
+@in_float64
+def _of_lens(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(error, sigma, bound) by realisation: of the numbers, of rays of the panel, and of rays of the lens."""
+    scene = _drawn(seed)
     truth = np.concatenate(
         [scene.camera.focal_px, scene.camera.principal_point_px, scene.camera.distortion[:4], scene.poses.ravel()]
     )
@@ -80,35 +111,30 @@ def trials(share: float = 1.0) -> list[Trials]:
     rays = _rays(scene, pixels)
     turned = rays @ np.asarray(rotation_matrix(scene.poses[0, :3]))
     slopes = np.vstack([np.eye(len(truth))[:8], jax.jacfwd(_angles_deg)(truth)])
-    bound = cramer_rao(information, slopes)
-    by_panel = cramer_rao(information, np.asarray(jax.jacfwd(_landed)(truth, turned)))
     grid = field_grid(scene.size)
     grid_rays = _rays(scene, grid)
-    aligned = cramer_rao(information, _without_turn(np.asarray(jax.jacfwd(_lens_alone)(truth, grid_rays)), scene, grid))
+    bounds = (
+        cramer_rao(information, slopes),
+        cramer_rao(information, np.asarray(jax.jacfwd(_landed)(truth, turned))),
+        cramer_rao(information, _without_turn(np.asarray(jax.jacfwd(_lens_alone)(truth, grid_rays)), scene, grid)),
+    )
     values = np.concatenate([truth[:8], np.asarray(_angles_deg(truth))])
-    found: list[list[np.ndarray]] = [[], [], [], [], [], []]
-    rng = np.random.default_rng(4)
-    for _ in range(count):
+    found: list[list[tuple[np.ndarray, np.ndarray]]] = [[], [], []]
+    rng = np.random.default_rng([seed, 4])
+    for _ in range(_REALISATIONS):
         views = scene.views(rng)
         result = fit_boards(GeometryData(tuple(views), _START, scene.size)).or_raise()
         ids = [view.corners.ids for view in views]
         sigmas = [scene.sigma_px[k, seen] for k, seen in enumerate(ids)]
         bundle = calibrated([board[i] for i in ids], [v.corners.xy for v in views], scene.size, None, sigmas)
-        parts = (
-            *_parameters(result, values),
-            *_panel_rays(result, turned, pixels),
-            *_lens_rays(bundle, grid_rays, grid),
-        )
-        for kept, part in zip(found, parts, strict=True):
-            kept.append(part)
-    error, sigma, ray_error, ray_sigma, lens_error, lens_sigma = (np.array(part) for part in found)
-    wide = np.broadcast_to(bound, error.shape)
-    named = [Trials(f"geometry/{name}", error[:, [k]], sigma[:, [k]], wide[:, [k]]) for k, name in enumerate(_NAMES)]
-    return [
-        *named,
-        Trials("geometry/ray of the panel", ray_error, ray_sigma, np.broadcast_to(by_panel, ray_error.shape)),
-        Trials("geometry/ray of the lens", lens_error, lens_sigma, np.broadcast_to(aligned, lens_error.shape)),
-    ]
+        found[0].append(_parameters(result, values))
+        found[1].append(_panel_rays(result, turned, pixels))
+        found[2].append(_lens_rays(bundle, grid_rays, grid))
+    parts = []
+    for bound, pairs in zip(bounds, found, strict=True):
+        error, sigma = (np.array([pair[k] for pair in pairs]) for k in range(2))
+        parts.append(np.stack([error, sigma, np.broadcast_to(bound, error.shape)]))
+    return parts[0], parts[1], parts[2]
 
 
 def _rays(scene: Sight, pixels: Float[np.ndarray, "rays 2"]) -> Float[np.ndarray, "rays 3"]:

@@ -1,7 +1,7 @@
 """Merged brackets against the bound of one pixel's censored likelihood, decade by decade.
 
 A pixel of few electrons has its sigma at its own noisy rate, so that z-scores of single pixels are skewed even for a
-perfect merge. z uses the root mean square of the sigmas.
+perfect merge. z uses the root mean square of the sigmas of one rate.
 """
 
 from __future__ import annotations
@@ -17,7 +17,8 @@ from udccal.models.noise import Noise
 _K, _BLACK, _TOP, _SIGMA = 0.36, 64.0, 4095.0, 4.0
 _TIMES = 2.0 ** np.arange(10)
 _DECADES = np.geomspace(8e-3, 8e3, 7)
-_REALISATIONS = 20_000
+# Of each decade: rates drawn within it, and pixels of one rate.
+_RATES, _PIXELS = 100, 200
 
 
 def sensor() -> Noise:
@@ -35,14 +36,19 @@ def bracket(rates: Float[np.ndarray, " pixels"], seed: int) -> Float[np.ndarray,
 
 def trials(share: float) -> list[Trials]:
     """One figure per decade of light, from a millionth of the brightest up."""
-    count = max(400, int(share * _REALISATIONS))
-    found = []
-    for seed, rate in enumerate(_DECADES):
-        merged = merge_bracket(bracket(np.full(count, rate), seed).astype(np.uint16), _TIMES, sensor())
-        information = fisher_information(_samples, np.array([rate]), _TIMES, clip=_TOP - 0.5)
-        error = merged.rate_e_per_s.ravel() - rate
-        sigma = np.full(count, np.sqrt(np.mean(merged.sigma_e_per_s**2)))
-        found.append(column(f"hdr/{rate:.0e} e-/s", error.tolist(), sigma.tolist(), float(cramer_rao(information)[0])))
+    # Half a decade up, the brightest light would clip in every exposure.
+    count, found = max(10, round(share * _RATES)), []
+    for seed, middle in enumerate(_DECADES):
+        drawn = middle * 10 ** np.random.default_rng([seed, 0xD]).uniform(-0.5, 0.1, count)
+        rates = np.repeat(drawn, _PIXELS)
+        merged = merge_bracket(bracket(rates, seed).astype(np.uint16), _TIMES, sensor())
+        informations = [fisher_information(_samples, np.array([rate]), _TIMES, clip=_TOP - 0.5) for rate in drawn]
+        bound = np.repeat([float(cramer_rao(one)[0]) for one in informations], _PIXELS)
+        pooled = np.sqrt((merged.sigma_e_per_s.reshape(count, _PIXELS) ** 2).mean(axis=1))
+        error, sigma = merged.rate_e_per_s.ravel() - rates, np.repeat(pooled, _PIXELS)
+        number = np.repeat(np.arange(count), _PIXELS)
+        name = f"hdr/{middle:.0e} e-/s"
+        found.append(column(name, error.tolist(), sigma.tolist(), bound.tolist(), number))
     return found
 
 

@@ -1,4 +1,4 @@
-"""The noise fit on many sensors of one kind, each with new frames, against the bound of its own likelihood.
+"""The noise fit on drawn sensors, each with new frames, against the bound of its own likelihood.
 
 The sensor bends by two per cent, its read noise is heavy-tailed, and it has every other term of the model: so
 each figure belongs to a term that is present.
@@ -22,7 +22,8 @@ from udccal.fitting.noise.moments import DarkPair, dark_pair
 from udccal.fitting.noise.read_noise import excess_kurtosis
 from udccal.fitting.noise.transfer import temporal_variance
 
-_REALISATIONS = 1000
+# Every sensor has so many realisations: its bound takes longer than they do.
+_SENSORS, _REALISATIONS = 50, 20
 
 
 # Parameters of the bound: K, V0, c, A, sigma_row^2, black, dark current, DSNU, PRNU, well (all DN), this sensor's mean
@@ -90,11 +91,12 @@ def _statistics(sensor: ToySensor, x: Float[Array, "12"]) -> tuple[Float[Array, 
             parts.append((v, (2 + tails * (1 - 1 / count)) * v**2 / (pixels * (count - 1))))
     parts.append((offset, spread2 / pixels))
     averaged = spread2 + (V0 + 1 / 12 + K * rate * stack_s + row2) / frames
-    parts.append((averaged, 2 * averaged**2 / pixels))
+    # The sensor at hand has these patterns; only what is temporal scatters.
+    parts.append((averaged, 2 * (averaged**2 - spread2**2) / pixels))
     z = (gain + rate) * stack_s
     quiet = V0 + 1 / 12 + K * rate * stack_s
     uneven = uneven2 + (temporal_variance(z, K, V0, c, 1 / 12) + quiet) / frames / (gain * stack_s) ** 2
-    parts.append((uneven, 2 * uneven**2 / pixels))
+    parts.append((uneven, 2 * (uneven**2 - uneven2**2) / pixels))
     parts.append((black + full + offset, ((V0 + 1 / 12) / pixels + row2 / sensor.rows) / 2))
     # Nothing here tells of the shape.
     mean, variance = (jnp.stack(part) for part in zip(*parts, strict=True))
@@ -110,7 +112,8 @@ def _histogram_information(sensor: ToySensor, x: Float[np.ndarray, "12"]) -> Flo
     rng = np.random.default_rng(0)
     fixed = patterns(sensor, rng)
     places = [_K, _V0, _SHAPE, _BLACK, _RATE, _SPREAD]
-    steps = np.diag([4e-3, 2e-3, 2e-3, 2e-3, 2e-3, 4e-3])
+    K, V0 = x[_K], x[_V0]
+    steps = np.diag([0.01 * K, 1e-3 * V0, 2e-3, 1e-3 * V0**0.5, 1e-4 * x[_RATE], 3e-3 * x[_SPREAD]])
     information = np.zeros((6, 6))
     for t in sensor.dark_times_s:
         first, second = (expose(sensor, fixed, t, False, rng) for _ in range(2))
@@ -130,13 +133,33 @@ def _histogram_information(sensor: ToySensor, x: Float[np.ndarray, "12"]) -> Flo
 
 def trials(share: float) -> list[Trials]:
     """A figure for each of the estimates."""
-    sensor = ToySensor()
-    count = max(40, int(share * _REALISATIONS))
-    true, bound = truth(sensor), bounds(sensor)
-    results = [measure(sensor, seed).or_raise() for seed in range(count)]
+    sensors = [drawn_sensor(seed) for seed in range(max(2, round(share * _SENSORS)))]
+    number = np.repeat(np.arange(len(sensors)), _REALISATIONS)
+    true, bound = [truth(sensor) for sensor in sensors], [bounds(sensor) for sensor in sensors]
+    results = [measure(sensors[k], seed).or_raise() for seed, k in enumerate(number)]
     found = []
-    for name, value in true.items():
+    for name in true[0]:
         estimates = [result.estimate(name) for result in results]
-        errors, sigmas = [e.value - value for e in estimates], [e.sigma for e in estimates]
-        found.append(column(f"noise/{name}", errors, sigmas, bound[name]))
+        errors = [e.value - true[k][name] for k, e in zip(number, estimates, strict=True)]
+        sigmas, limits = [e.sigma for e in estimates], [bound[k][name] for k in number]
+        found.append(column(f"noise/{name}", errors, sigmas, limits, number))
     return found
+
+
+def drawn_sensor(seed: int) -> ToySensor:
+    """A sensor on which every term of the model shows; exposures fill its well as they fill the plain one's."""
+    rng = np.random.default_rng([seed, 0x5E])
+    well_e = float(rng.uniform(8_000.0, 12_000.0))
+    return ToySensor(
+        K_DN_per_e=float(rng.uniform(0.28, 0.32)),
+        black_DN=float(rng.uniform(50.0, 80.0)),
+        full_well_e=well_e,
+        read_e=float(rng.uniform(3.0, 6.0)),
+        lambda_read=float(rng.uniform(0.03, 0.1)),
+        row_DN=float(rng.uniform(0.25, 0.5)),
+        dark_e_per_s=float(rng.uniform(20.0, 60.0)),
+        DSNU_e=float(rng.uniform(2.0, 4.0)),
+        PRNU=float(rng.uniform(0.005, 0.01)),
+        bend=float(rng.uniform(0.01, 0.03)),
+        flux_e_per_s=5 * well_e,
+    )

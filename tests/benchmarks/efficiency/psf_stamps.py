@@ -25,7 +25,7 @@ from udccal.models.fields import polynomial_basis
 from udccal.numerics import in_float64
 
 STARS, SIZE, NODES, READ_E, ORDERS = 20, 11, 18, 4.0, Orders(2, 1, 1.0)
-TRUTHS, PER_TRUTH = 6, 20
+TRUTHS, PER_TRUTH = 40, 3
 # Prior precisions: (a, b) of the images by degree, and of the map by degree.
 IMAGE = np.array([[0.05, 0.5], [300.0, 300.0]])
 MAP = np.array([1e3, 300.0])
@@ -53,14 +53,14 @@ class Truth:
 
 
 def trials(share: float) -> list[Trials]:
-    """120 realisations at share 1."""
+    """So many fits of each truth; standard errors are of truths."""
     rng = np.random.default_rng(41)
-    per_truth = max(round(share * PER_TRUTH), 1)
     errors, sigmas, bounds = [], [], []
-    for _ in range(TRUTHS):
+    count = max(2, round(share * TRUTHS))
+    for _ in range(count):
         truth = make_truth(rng)
         quantities, bound = at_best(truth)
-        for _ in range(per_truth):
+        for _ in range(PER_TRUTH):
             error, sigma = realisation(truth, quantities, rng)
             errors.append(error)
             sigmas.append(sigma)
@@ -68,7 +68,8 @@ def trials(share: float) -> list[Trials]:
     e, s, b = (np.array(part) for part in (errors, sigmas, bounds))
     pixels = len(POINTS) * SIZE**2
     cuts = {"psf": np.s_[:pixels], "place": np.s_[pixels : pixels + 2 * STARS], "light": np.s_[pixels + 2 * STARS :]}
-    return [Trials(f"psf_stamps/{name}", e[:, cut], s[:, cut], b[:, cut]) for name, cut in cuts.items()]
+    number = np.repeat(np.arange(count), PER_TRUTH)
+    return [Trials(f"psf_stamps/{name}", e[:, cut], s[:, cut], b[:, cut], number) for name, cut in cuts.items()]
 
 
 @in_float64

@@ -10,7 +10,7 @@ import time
 from pathlib import Path
 
 from tests.benchmarks.efficiency.trials import Figure, figure, table, write_json
-from tests.benchmarks.readme_tables import between
+from tests.benchmarks.readme_tables import put_table
 
 # Each module has ``trials(share) -> list[Trials]``; with share 1 it makes as many realisations as its figures need.
 _PAGE = Path(__file__).resolve().parents[3] / "docs" / "numerics.md"
@@ -36,8 +36,7 @@ def main() -> None:
         # Term by term: nothing is lost where a later one is stopped. Figures of terms that are not run stay.
         write_json([*_others(options.out / _FILE, term), *own], options.out / _FILE)
         if options.share == 1.0:
-            text = _PAGE.read_text(encoding="utf-8")
-            _PAGE.write_text(between(text, f"efficiency {term}", table(own)), encoding="utf-8")
+            put_table(_PAGE, f"efficiency {term}", table(own))
     sys.exit(0 if all(f.ok for f in found) else 1)
 
 

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -46,11 +47,35 @@ def test_places_that_share_their_noise_do_not_count_as_many() -> None:
     assert alone.efficiency_error > 5 * apart.efficiency_error
 
 
+def test_realisations_that_share_a_truth_do_not_count_as_many() -> None:
+    rng = np.random.default_rng(3)
+    truth = np.repeat(np.arange(20), 100)
+    error = (rng.standard_normal(20)[truth] + 0.1 * rng.standard_normal(2000))[:, None]
+    alike = Trials("a", error, np.ones_like(error), np.ones_like(error))
+    counted, apart = figure(replace(alike, truth=truth)), figure(alike)
+    assert (counted.truths, apart.truths) == (20, 2000)
+    assert counted.efficiency_error > 5 * apart.efficiency_error
+    with pytest.raises(ValueError, match="several truths"):
+        figure(replace(alike, truth=np.zeros(2000, dtype=int)))
+
+
+def test_what_users_get_is_of_all_data() -> None:
+    """A fit of every tenth sample is efficient for these, and has a tenth of all information."""
+    tenth = _draw()
+    found = figure(replace(tenth, bound_of_all=tenth.bound / np.sqrt(10)))
+    assert found.ok
+    assert found.of_all == pytest.approx(found.efficiency / 10)
+    assert figure(tenth).of_all == figure(tenth).efficiency
+    unknown = figure(replace(tenth, bound_of_all=np.full_like(tenth.bound, np.nan)))
+    assert unknown.of_all is None
+    assert "| – |" in table([unknown])
+
+
 def test_table_and_file_show_what_was_missed(tmp_path: Path) -> None:
     figures = [figure(_draw()), figure(column("b", [5.0, 6.0, 5.0], [1.0, 1.0, 1.0], 1.0))]
     assert table(figures).count("**missed**") == 1
     write_json(figures, tmp_path / "efficiency.json")
     kept = json.loads((tmp_path / "efficiency.json").read_text())
-    names = ["efficiency", "efficiency_error", "name", "ok", "realisations", "z_mean", "z_std"]
+    names = ["efficiency", "efficiency_error", "name", "of_all", "ok", "truths", "z_mean", "z_std"]
     assert [sorted(one) for one in kept] == [names] * 2
     assert [one["ok"] for one in kept] == [True, False]

@@ -22,7 +22,7 @@ class Outcome:
 
     Attributes:
         status: how it ended.
-        z: errors of its results in units of their sigma; empty where it gave none.
+        z: errors of the numbers that the case is about, in units of their sigma; empty where the fit gave none.
         finite: whether every number that it gave is finite.
         advice: what a person should do, in addition to the status.
     """
@@ -34,12 +34,12 @@ class Outcome:
 
     @property
     def ok(self) -> bool:
-        """A result within its error bars, or a named status that says what to do."""
+        """A result within its error bars, or a named status that says what to do; a result that none judged is not."""
         if not self.finite:
             return False
-        if self.status in (FitStatus.CONVERGED, FitStatus.ABSENT):
-            return not self.z.size or float(np.abs(self.z).max()) <= WORST_Z
-        return bool(self.advice)
+        if self.z.size and self.status in (FitStatus.CONVERGED, FitStatus.ABSENT):
+            return float(np.abs(self.z).max()) <= WORST_Z
+        return bool(self.advice) and self.status is not FitStatus.CONVERGED
 
 
 @dataclass(frozen=True)

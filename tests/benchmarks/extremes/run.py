@@ -10,7 +10,7 @@ from pathlib import Path
 
 from tests.benchmarks.extremes import basin as basins
 from tests.benchmarks.extremes.case import Case, Outcome, table
-from tests.benchmarks.readme_tables import between
+from tests.benchmarks.readme_tables import put_table
 
 # Each module has ``CASES``.
 MODULES = ("noise", "hdr", "geometry", "wire", "psf", "backscatter")
@@ -35,7 +35,7 @@ def _extremes(term: str) -> bool:
         found = case.run()
         rows.append((case, found, time.perf_counter() - start))
         print(f"{term}: {case.name}: {found.status.name} {'ok' if found.ok else 'MISSED'}", flush=True)
-    _put(f"extremes {term}", table(rows))
+    put_table(_PAGE, f"extremes {term}", table(rows))
     return all(found.ok for _, found, _ in rows)
 
 
@@ -44,12 +44,8 @@ def _basins() -> bool:
     for start in basins.STARTS:
         rows.append(basins.basin(start))
         print(f"{start.term}: {start.what}: {rows[-1].least:g} to {rows[-1].most:g}", flush=True)
-    _put(_BASIN, basins.table(rows))
+    put_table(_PAGE, _BASIN, basins.table(rows))
     return all(row.ok for row in rows)
-
-
-def _put(marker: str, content: str) -> None:
-    _PAGE.write_text(between(_PAGE.read_text(encoding="utf-8"), marker, content), encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from tests.benchmarks.growth.cases import Case
-from tests.benchmarks.readme_tables import between
+from tests.benchmarks.readme_tables import put_table
 
 _ROOT = Path(__file__).resolve().parents[3]
 _PAGE = _ROOT / "docs" / "numerics.md"
@@ -68,8 +68,7 @@ def main() -> None:
             for size in case.sizes:
                 rows.append(measure(case, size))
                 print(table(rows[-1:]).splitlines()[-1], flush=True)
-        text = _PAGE.read_text(encoding="utf-8")
-        _PAGE.write_text(between(text, f"growth {term}", table(rows)), encoding="utf-8")
+        put_table(_PAGE, f"growth {term}", table(rows))
 
 
 if __name__ == "__main__":

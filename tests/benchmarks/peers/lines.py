@@ -29,6 +29,15 @@ class Line:
         """Of a script that printed nothing."""
         return cls(work, peer, {"work": work, "peer": peer, "failed": reason})
 
+    def measured_at(self, commit: str) -> Line:
+        """The same line, with the commit of udccal that it was measured beside."""
+        return Line(self.work, self.peer, {**self.fields, "commit": commit})
+
+    @property
+    def commit(self) -> str:
+        """See ``measured_at``; lines of earlier versions do not say it."""
+        return str(self.fields.get("commit", "unknown"))
+
     def text(self) -> str:
         """As a line of JSON."""
         return json.dumps(self.fields)
@@ -59,8 +68,8 @@ def _name(line: Line) -> str:
 
 
 def _decades(line: Line) -> str:
-    """Ratio to the bound per decade, darkest first; over many pictures where the script measured them."""
-    ratios = line.fields.get("ratio_many_pictures") or line.fields.get("full", {}).get("ratio") or []
+    """Ratio to the bound per decade of the one picture that every script merges, darkest first."""
+    ratios = line.fields.get("full", {}).get("ratio") or []
     return ", ".join(f"{r:.3g}" for r in ratios) or _NONE
 
 

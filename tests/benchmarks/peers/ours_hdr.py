@@ -9,11 +9,9 @@ from tests.benchmarks.peers.works_module import arguments, load, timed
 from udccal.fitting.hdr.merge import merge_bracket
 from udccal.models.noise import Noise
 
-_PICTURES = 24
-
 
 def main() -> None:
-    """Print one line of JSON: both kinds of the work, and the ratios to the bound over many pictures."""
+    """Print one line of JSON with both kinds of the work, of the same single picture that the peers merge."""
     parser = arguments(__doc__)
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
@@ -38,24 +36,7 @@ def main() -> None:
         run = timed(lambda stack=stack, exposures=exposures: merge_bracket(stack, exposures, sensor))
         metrics = works.hdr_metrics(run.result.rate_e_per_s, phi, fit_scale=False)
         found[kind] = dict(seconds=run.seconds, first_run_s=run.first_s, **metrics)
-    # The brightest decade of one picture is some thirty pixels: many pictures tell its ratio.
-    many = np.array([_ratios(works, sensor, options.seed + 1 + k) for k in range(_PICTURES)])
-    ratios = np.sqrt(np.mean(many**2, axis=0))
-    works.emit(
-        "hdr", "udccal", udccal.__version__, found["full"]["seconds"], **found, ratio_many_pictures=ratios.tolist()
-    )
-
-
-def _ratios(works, sensor: Noise, seed: int) -> list[float]:  # type: ignore[no-untyped-def]
-    _, times, phi = works.hdr_data("psf256")
-    rng = np.random.default_rng([77, seed])
-    electrons = rng.poisson(phi * times[:, None, None, None]) + works.HDR["read"] * rng.standard_normal(
-        (len(times), *phi.shape)
-    )
-    codes = np.rint(works.HDR["K"] * electrons + works.HDR["offset"])
-    stack = np.clip(codes, 0, works.HDR["clip"]).astype(np.uint16)
-    merged = merge_bracket(stack, np.asarray(times, dtype=np.float64), sensor)
-    return works.hdr_metrics(merged.rate_e_per_s, phi, fit_scale=False)["ratio"]
+    works.emit("hdr", "udccal", udccal.__version__, found["full"]["seconds"], **found)
 
 
 if __name__ == "__main__":

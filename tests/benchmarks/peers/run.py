@@ -15,8 +15,9 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
+from tests.benchmarks.commit import this_commit
 from tests.benchmarks.peers.lines import Line, tables
-from tests.benchmarks.readme_tables import between
+from tests.benchmarks.readme_tables import put_table
 
 _ROOT = Path(__file__).resolve().parents[3]
 _PAGE = _ROOT / "docs" / "peers.md"
@@ -50,7 +51,7 @@ PEERS = (
     Peer("intrinsics", None, "intrinsics_mrcal.py"),
 )
 OURS = {
-    "noise": ("ours_noise --small 20", "ours_noise --variant nonlin"),
+    "noise": ("ours_noise --small 20", "ours_noise --variant nonlin --seeds 0"),
     "hdr": ("ours_hdr",),
     "psf_field": ("ours_psf_field",),
     "intrinsics": ("ours_intrinsics --starts 1000 --covered 200",),
@@ -88,8 +89,7 @@ def main() -> None:
                 kept += _run(work, peer.script, [python, *peer.script.split()], options.peers, environment)
         results.write_text("".join(line.text() + "\n" for line in kept), encoding="utf-8")
     stamp = f"Measured {datetime.now(UTC):%Y-%m-%d}, all in one run." if not options.ours_only else ""
-    page = between(_PAGE.read_text(encoding="utf-8"), "peers", f"{stamp}\n\n{tables(kept)}")
-    _PAGE.write_text(page, encoding="utf-8")
+    put_table(_PAGE, "peers", f"{stamp}\n\n{tables(kept)}", {line.commit for line in kept})
 
 
 def _set_up(peers: Path, environment: dict[str, str]) -> None:
@@ -133,14 +133,14 @@ def _run(work: str, name: str, command: list[str], folder: Path, environment: di
             command, cwd=folder, env=environment, capture_output=True, text=True, timeout=_LIMIT_S, check=False
         )
     except (OSError, subprocess.TimeoutExpired) as error:
-        return [Line.failure(work, name, str(error))]
-    lines = [Line.read(text) for text in done.stdout.splitlines() if text.startswith("{")]
+        return [Line.failure(work, name, str(error)).measured_at(this_commit())]
+    lines = [Line.read(text).measured_at(this_commit()) for text in done.stdout.splitlines() if text.startswith("{")]
     if lines:
         print("\n".join(line.text() for line in lines), flush=True)
         return lines
     reason = (done.stderr.strip().splitlines() or ["no output"])[-1]
     print(f"{name}: {reason}", flush=True)
-    return [Line.failure(work, name, reason[:160])]
+    return [Line.failure(work, name, reason[:160]).measured_at(this_commit())]
 
 
 if __name__ == "__main__":

@@ -33,6 +33,19 @@ def test_lines_survive_being_written() -> None:
     assert [Line.read(line.text()) for line in _LINES] == _LINES
 
 
+def test_one_picture_is_compared_with_one() -> None:
+    many = Line.read('{"work": "hdr", "peer": "u", "ratio_many_pictures": [7.0], "full": {"ratio": [1.5]}}')
+    assert "| 1.5 |" in tables([many])
+    assert "7" not in tables([many])
+
+
+def test_lines_say_the_commit_that_they_were_measured_beside() -> None:
+    measured = [line.measured_at("abc1234") for line in _LINES]
+    assert {line.commit for line in measured} == {"abc1234"}
+    assert Line.read(measured[0].text()) == measured[0]
+    assert _LINES[0].commit == "unknown"
+
+
 def test_a_line_without_a_work_is_refused() -> None:
     with pytest.raises(KeyError):
         Line.read('{"peer": "a"}')

@@ -132,7 +132,7 @@ def test_predicted_light_is_as_unsure_as_its_order() -> None:
 
     def predicted(*tried: Attempt[Fitted]) -> tuple[Posterior[Backscatter], Light]:
         known = replace(found, orders=Choice(tried[0], tried))
-        posterior = term_posterior(shots, known, 1.0)
+        posterior = term_posterior(shots, known, np.ones(18))
         term = posterior.term_at(posterior.mean)
         return posterior, predicted_light(term, posterior, 0.0, RIG, new, place)
 

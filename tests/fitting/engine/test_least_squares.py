@@ -174,3 +174,37 @@ def test_held_parameters_stay_and_the_others_step_as_if_they_were_known() -> Non
     assert np.concatenate([step.shared[[0, 2]], step.own.ravel()[:-2]]) == pytest.approx(expected, rel=1e-8)
     assert step.gain == pytest.approx(whole[used, -1] @ expected, rel=1e-9)
     assert step.gain < blocks.step(0.0).gain
+
+
+def test_equations_that_are_not_finite_are_taken_back_like_costs() -> None:
+    @dataclass(frozen=True)
+    class Broken:
+        name: str = "broken"
+
+        def equations_at(self, place: Float[np.ndarray, " p"]) -> Blocks:
+            slope = np.nan if 2.5 < place[0] < 10 else -10.0
+            return Blocks.of_errors(10 * (3.0 - place), np.array([[slope]]))
+
+        def moved(self, place: Float[np.ndarray, " p"], step: Step) -> Float[np.ndarray, " p"]:
+            return place + step.shared
+
+    found = minimise(Broken(), np.zeros(1))
+    assert not found.converged
+    assert np.isfinite(found.gain)
+    assert 2.0 < found.place[0] <= 2.5
+    lost = minimise(Broken(), np.array([5.0]))
+    assert not lost.converged
+    assert lost.gain == np.inf
+
+
+@pytest.mark.parametrize("steps", [1, 3, 8])
+def test_a_descent_that_was_stopped_has_the_way_left_in_its_error_bars(steps: int) -> None:
+    stopped = minimise(Curve(rosenbrock), np.array([-1.2, 1.0]), SolverRules(iterations=steps))
+    assert not stopped.converged
+    known = 1e-6 * np.eye(2)
+    cov = stopped.with_rest(known, stopped.equations.step(0.0).shared)
+    off = stopped.place - 1.0
+    assert off @ np.linalg.solve(known, off) > 4.5**2
+    assert np.all(np.abs(off) < 4.5 * np.sqrt(np.diag(cov)))
+    ended = minimise(Curve(rosenbrock), np.array([-1.2, 1.0]), SolverRules(least_gain=1e-12))
+    assert ended.with_rest(known, ended.equations.step(0.0).shared) == pytest.approx(known, abs=1e-6)

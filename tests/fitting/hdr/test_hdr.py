@@ -11,6 +11,8 @@ import pytest
 from udccal.errors import FitError
 from udccal.fitting.hdr.likelihood import merge_block
 from udccal.fitting.hdr.merge import UNKNOWN_SIGMA, HdrRules, merge_bracket, sensor_numbers
+from udccal.fitting.psf.data import PsfData
+from udccal.fitting.psf.fit import _notes as psf_notes
 from udccal.models.noise import Noise
 from udccal.result import FitStatus
 
@@ -194,3 +196,35 @@ def test_few_electrons_are_no_hits() -> None:
     frames[4, 7, 9] += 400
     (found,) = merge_bracket(frames, EXPOSURES, noise).outliers
     assert found.places == ("(7, 9)",)
+
+
+def test_light_that_every_exposure_clips_is_no_hit() -> None:
+    rate = np.full((8, 8), 3e4)
+    rate[2, 3] = 1e9
+    frames = bracket(rate, EXPOSURES, 4, (8, 8))
+    merged = merge_bracket(frames, EXPOSURES, NOISE)
+    assert not merged.outliers
+    assert merged.used[2, 3] == 0
+
+
+def test_a_wrong_black_level_is_told_by_dark_samples() -> None:
+    frames = bracket(200.0, EXPOSURES[:5], 8)
+    assert merge_bracket(frames, EXPOSURES[:5], NOISE).status is FitStatus.CONVERGED
+    wrong = merge_bracket(frames, EXPOSURES[:5], replace(NOISE, black_DN=63.7))
+    assert wrong.status is FitStatus.POOR_FIT
+    assert "+0.6 DN off the black level" in wrong.notes[-1]
+
+
+def test_a_psf_of_doubted_brackets_says_so() -> None:
+    told = psf_notes(PsfData(None, 3, doubted=("psf/1: Check K.",)), True, "", ())
+    assert "1 of 3 brackets are in doubt. psf/1: Check K." in told
+    assert not any("doubt" in note for note in psf_notes(PsfData(None, 3), True, "", ()))
+
+
+def test_two_frames_that_differ_are_told_where_no_third_decides() -> None:
+    frames = bracket(3e4, EXPOSURES[3:5], 9)
+    exposures = EXPOSURES[3:5] * np.array([1.0, 1.2])
+    three = np.concatenate([frames, bracket(3e4, EXPOSURES[4:5], 10)])
+    decided = merge_bracket(three, np.append(exposures, EXPOSURES[4]), NOISE)
+    assert [o.places for o in decided.outliers] == [("frame 1",)]
+    assert decided.status is FitStatus.CONVERGED

@@ -131,6 +131,18 @@ def test_rounding_is_in_the_sigma_of_a_saturation_between_codes(read_e: float) -
     assert found.sigma < 0.35
 
 
+@pytest.mark.parametrize("brightest", [0.5, 0.7])
+def test_codes_that_end_in_one_colour_only_are_the_saturation(brightest: float) -> None:
+    # Red and blue get half of green's light: less than half of the frame's samples have the converter's last code.
+    colours = np.tile([[-0.5, 0.0], [0.0, -0.4]], (48, 64))
+    sensor = replace(PLAIN, bits=10, K_DN_per_e=0.1, full_well_e=20_000.0, read_e=15.0, DSNU_e=5.0, pattern=colours)
+    sensor = replace(sensor, flux_e_per_s=1e5, levels=(*np.linspace(0.04, 0.4, 9).tolist(), brightest), stack_level=0.2)
+    levels, stack = capture(sensor, 1)
+    saturation = fit_noise(NoiseData(levels, stack, bayer=True, top_code=1023)).estimate("saturation_DN")
+    assert abs(saturation.value - 1023) <= saturation.sigma
+    assert saturation.sigma < 0.35
+
+
 def test_hot_pixels_are_named() -> None:
     levels, stack = capture(PLAIN, 6)
     for frame in stack.dark:

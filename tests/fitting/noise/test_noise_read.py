@@ -13,7 +13,7 @@ from udccal.errors import FitError
 from udccal.fitting.noise.data import ExposureLevel, NoiseData, NoiseRules
 from udccal.fitting.noise.fit import fit_noise
 from udccal.fitting.noise.moments import reduced
-from udccal.fitting.noise.read_noise import measured_variance
+from udccal.fitting.noise.read_noise import unexplained_variance
 from udccal.result import FitResult, FitStatus
 
 SENSOR = ToySensor(rows=192, columns=256, lambda_read=None, row_DN=0.0, bend=0.0, DSNU_e=1.0)
@@ -103,7 +103,7 @@ def test_one_exposure_time_does_not_tell_dark_current_from_black() -> None:
             assert sigma < 0.02 * truth
 
 
-def test_measured_variance_leaves_out_hits_of_radiation() -> None:
+def test_variance_leaves_out_hits_of_radiation() -> None:
     data = levels(np.linspace(0.005, 0.05, 6))
     clean = reduced(NoiseData(data, top_code=4095), NoiseRules())
     for level in data:
@@ -111,6 +111,22 @@ def test_measured_variance_leaves_out_hits_of_radiation() -> None:
     hit = reduced(NoiseData(data, top_code=4095), NoiseRules())
     assert clean is not None
     assert hit is not None
-    few, many = (measured_variance(hit, 0.0, 1 / 12, most) for most in (1e-3, 1e-5))
-    assert few.value == pytest.approx(measured_variance(clean, 0.0, 1 / 12, 1e-3).value, rel=1e-3)
+    few, many = (unexplained_variance(hit, [0.0] * 6, most) for most in (1e-3, 1e-5))
+    assert few.value == pytest.approx(unexplained_variance(clean, [0.0] * 6, 1e-3).value, rel=1e-3)
     assert many.value > 2 * few.value
+
+
+def test_coarse_codes_state_sigmas_that_hold_for_other_noise_than_the_models() -> None:
+    coarse = replace(SENSOR, K_DN_per_e=0.0202, bits=8, full_well_e=12_000.0, read_e=9.9, telegraph=0.03)
+    result = measure(coarse, 0)
+    value, sigma = estimate(result, "sigma_d_e")
+    assert abs(value - 9.9 * (1 + 0.03 * 8) ** 0.5) < 4.5 * sigma
+    assert any("of the model's kind" in note for note in result.notes)
+
+
+def test_dark_current_bends_as_light_does() -> None:
+    bent = replace(SENSOR, bend=0.12, dark_e_per_s=600.0, full_well_e=3000.0, K_DN_per_e=1.2, flux_e_per_s=15_000.0)
+    result = measure(bent, 0)
+    for name, truth in (("black_DN", 64.0), ("dark_current_e_per_s", 600.0)):
+        value, sigma = estimate(result, name)
+        assert abs(value - truth) < 4.5 * sigma

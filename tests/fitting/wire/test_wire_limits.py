@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import replace
 
 import equinox as eqx
@@ -26,6 +27,7 @@ from tests.scenes.wire import (
     shape_values,
     start,
 )
+from udccal.fitting.engine.iteration_log import LOG
 from udccal.fitting.wire.data import WireData
 from udccal.fitting.wire.fit import fit_wire
 from udccal.fitting.wire.rules import WireRules
@@ -57,6 +59,40 @@ def test_map_and_shape_are_within_their_errors_from_a_start_that_is_a_fifth_off(
     assert columns_kept(result) == _PLAIN
     # A start so far beyond its tolerance is doubted in words.
     assert any("standoff_per_pitch" in note for note in result.notes)
+
+
+@pytest.mark.medium
+@pytest.mark.parametrize(("seed", "sharpness"), [(22, 0.0), (21, 1.0)])
+def test_openings_without_sharp_edges_are_found_and_told(seed: int, sharpness: float) -> None:
+    truth = drawn_truth(seed, start(), geometry(), sharpness=sharpness)
+    result = fitted(noisy(truth, seed), start(), geometry())
+    assert result.status is FitStatus.CONVERGED
+    sigmas = np.array([e.sigma for e in result.estimates])
+    begun = shape_values(drawn_truth(seed, start(), geometry(), sharpness=sharpness))[3] - start().standoff_per_pitch
+    assert abs(begun) > 10 * sigmas[3]
+    off = np.array([e.value for e in result.estimates]) - shape_values(truth)
+    off[4:6] -= np.round(off[4:6])
+    assert np.all(np.abs(off) < 4.5 * sigmas)
+    error = map_at(result.term, places()) - map_at(truth, places())
+    assert np.all(np.abs(error) < 4.5 * map_sigma(result, places()))
+    assert any("row_open and column_open" in note for note in result.notes) == (sharpness == 0.0)
+
+
+@pytest.mark.medium
+def test_a_fit_goes_on_from_an_earlier_wire_without_a_search(caplog: pytest.LogCaptureFixture) -> None:
+    flat = noisy(drawn_truth(1, start(), geometry()), 1)
+    data = WireData(flat.signal, flat.variance, geometry(), start(), PRNU)
+    rules = WireRules(samples=flat.signal.size)
+    first = fit_wire(data, rules)
+    with caplog.at_level(logging.DEBUG, logger=LOG.name):
+        again = fit_wire(data, rules, first.term)
+    assert {line.split(":")[0] for line in caplog.messages} == {"wire, resumed", "wire, joint"}
+    assert again.status is FitStatus.CONVERGED
+    moved = map_at(again.term, places()) - map_at(first.term, places())
+    assert np.all(np.abs(moved) < 0.2 * map_sigma(first, places()))
+    # A wire of another rig is no start: the search begins anew.
+    other = replace(first.term, harmonics=np.asarray(first.term.harmonics)[::-1])
+    assert fit_wire(data, rules, other).status is FitStatus.CONVERGED
 
 
 @pytest.mark.medium

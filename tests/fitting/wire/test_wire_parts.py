@@ -25,7 +25,8 @@ from udccal.fitting.wire.parameters import (
 )
 from udccal.fitting.wire.report import misfit
 from udccal.fitting.wire.rules import WireRules, WireStart, ideal_wire, possible_harmonics
-from udccal.fitting.wire.search import WireProblem, scan_rows
+from udccal.fitting.wire.scan import scan_rows
+from udccal.fitting.wire.search import WireProblem
 from udccal.models.geometry import Geometry
 from udccal.models.wire import Wire, log_baseline, modulation, slopes
 

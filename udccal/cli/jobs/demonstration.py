@@ -103,6 +103,8 @@ def demonstrate(output: Output, rig_name: str, out: Path, seed: int) -> None:
         evidence = gathered.result()
         report = out / "report.html"
         write_page(report, calibration_page(session, evidence, scene))
+    for warning in calibration.warnings:
+        output.say(warning)
     output.table(truth_table(evidence.rows))
     output.table(scene_table(scene))
     seconds = time.perf_counter() - start

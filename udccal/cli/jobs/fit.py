@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +16,9 @@ from udccal.effort import FitEffort
 from udccal.errors import FitError, UdccalError
 from udccal.fitting.engine.iteration_log import LOG
 from udccal.io.links import refuse_links
-from udccal.profiles.store import check_replaceable
+from udccal.profiles.profile import Profile
+from udccal.profiles.store import check_replaceable, read_profile
+from udccal.refit import refit
 from udccal.reports.page import write_page
 from udccal.reports.report import calibration_page, gather
 from udccal.reports.tables import Table
@@ -40,31 +42,36 @@ class TermSummary:
 
 @dataclass(frozen=True)
 class FitSummary:
-    """Result of ``fit`` and ``calibrate``."""
+    """Result of ``fit`` and ``calibrate``; ``warnings`` are of terms in the profile whose fit did not end well."""
 
     session: Path
     profile: Path
     report: Path
     terms: tuple[TermSummary, ...]
+    warnings: tuple[str, ...]
     times: tuple[StageTime, ...]
     compilation_s: float
 
 
-def fit_to_profile(output: Output, session_path: Path, profile_path: Path, log: Path | None = None) -> None:
-    """Fit a session, write the report and the profile, and print the summary.
+def fit_to_profile(
+    output: Output, session_path: Path, profile_path: Path, log: Path | None = None, terms: Sequence[TermName] = ()
+) -> bool:
+    """Fit a session, write the report and the profile, and print the summary; return whether every fit ended well.
 
     Args:
         output: shows stages and the summary.
         session_path: folder of the session.
         profile_path: folder or zip file to write; the report goes next to it.
         log: file that receives the solvers' iterations; None for none.
+        terms: those to fit; the profile's others are kept. All where there are none.
 
     Raises:
         SessionError: when the session is missing or damaged.
-        FitError: when a term ended in a bad status; then the report is written and the profile is not.
-        ProfileError: when something else is at the profile's path.
+        FitError: when a term has no error bars; then the report is written and the profile is not.
+        ProfileError: when something else is at the profile's path, or a profile whose terms cannot be kept.
     """
     check_replaceable(profile_path)
+    before = read_profile(profile_path) if terms else None
     keep_compilations()
     clock = compilation_clock()
     session = Session.open(session_path)
@@ -74,7 +81,7 @@ def fit_to_profile(output: Output, session_path: Path, profile_path: Path, log: 
             "The fits treat all steps as captured with one."
         )
     with _iterations_to(log):
-        calibration = run_fits(output, session)
+        calibration = run_fits(output, session) if before is None else run_some(output, session, before, terms)
     profile_path = profile_path.resolve()
     report = profile_path.with_name(f"{profile_path.name.removesuffix('.zip')}-report.html")
     with output.stage("report"):
@@ -89,8 +96,11 @@ def fit_to_profile(output: Output, session_path: Path, profile_path: Path, log: 
         raise FitError(f"{error} No profile was written; the report {report} shows every term.") from error
     output.say(f"Compilation took {clock.seconds:.1f} s of this (less in the next run)")
     output.say(f"Profile: {profile_path}\nReport: {report}")
-    terms, times = summaries(calibration), tuple(output.times)
-    output.result(FitSummary(session_path, profile_path, report, terms, times, clock.seconds))
+    for warning in calibration.warnings:
+        output.say(warning)
+    ended, times = summaries(calibration), tuple(output.times)
+    output.result(FitSummary(session_path, profile_path, report, ended, calibration.warnings, times, clock.seconds))
+    return not calibration.warnings
 
 
 @contextmanager
@@ -133,11 +143,20 @@ def run_fits(
     return calibration
 
 
+def run_some(output: Output, session: Session, before: Profile, terms: Sequence[TermName]) -> Calibration:
+    """Run the fits of some terms with a bar; the others are those of the session's profile ``before``."""
+    with output.stage("fits") as stage:
+        calibration = refit(session, before, terms, lambda term: stage.update(0, None, f"fitting {term}"))
+    for time in calibration.times:
+        output.say(f"  {time.term}: {time.seconds:.1f} s")
+    return calibration
+
+
 def store_profile(output: Output, calibration: Calibration, path: Path) -> None:
     """Write the profile of a calibration.
 
     Raises:
-        FitError: when a term cannot be used.
+        FitError: when a term has no error bars.
         ProfileError: when something else is at ``path``.
     """
     with output.stage("profile"):

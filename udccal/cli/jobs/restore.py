@@ -67,6 +67,8 @@ def restore_files(
     """
     keep_compilations()
     profile = load_profile(profile_path)
+    for warning in profile.warnings:
+        output.say(warning)
     shown = None if panel_picture is None else read_panel_picture(panel_picture, profile.rig)
     targets = _targets(images, out, picture_format)
     for image in images:  # so that a bad file is reported before the long work begins

@@ -30,6 +30,7 @@ class ShownTerm:
     term: str
     status: str
     chi2_dof: float
+    notes: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -41,11 +42,12 @@ class ProfileSummary:
     created_at: str
     terms: tuple[ShownTerm, ...]
     estimates: tuple[ShownEstimate, ...]
+    warnings: tuple[str, ...]
     invalidated_by: tuple[str, ...]
 
 
 def show_profile(output: Output, path: Path) -> None:
-    """Print every term's status and every quantity with its unit and sigma.
+    """Print every term's status, every quantity with its unit and sigma, and what is said of them.
 
     Args:
         output: shows the tables.
@@ -59,15 +61,18 @@ def show_profile(output: Output, path: Path) -> None:
     output.say(f"Profile of {profile.rig.name}, made {profile.provenance.created_at}")
     for term, result in results:
         output.table(estimates_table(f"{term}: {result.status.name.lower().replace('_', ' ')}", result))
+        for sentence in (*result.notes, *filter(None, [result.warning])):
+            output.say(sentence)
     output.result(
         ProfileSummary(
             profile=path,
             rig=profile.rig.name,
             created_at=profile.provenance.created_at,
-            terms=tuple(ShownTerm(term, r.status.name, r.chi2_dof) for term, r in results),
+            terms=tuple(ShownTerm(term, r.status.name, r.chi2_dof, r.notes) for term, r in results),
             estimates=tuple(
                 ShownEstimate(term, e.name, e.value, e.sigma, e.unit) for term, r in results for e in r.estimates
             ),
+            warnings=profile.warnings,
             invalidated_by=profile.invalidated_by,
         )
     )

@@ -12,7 +12,15 @@ from jaxtyping import Bool, Float, Int
 from udccal.fitting.absent import absent_backscatter
 from udccal.fitting.backscatter.data import BackscatterData, Binned, grid_rays
 from udccal.fitting.backscatter.model import Rays, Usable, ratios, ratios_and_jacobian, window_for
-from udccal.fitting.backscatter.orders import BAD_BINS, BAD_PICTURES, Found, residual_pattern, search, value_moments
+from udccal.fitting.backscatter.orders import (
+    BAD_BINS,
+    BAD_PICTURES,
+    Found,
+    disagreement,
+    residual_pattern,
+    search,
+    value_moments,
+)
 from udccal.fitting.backscatter.parameters import (
     DEPTH,
     DISTANCE,
@@ -94,13 +102,17 @@ def result_of(found: Found, data: BackscatterData, rig: RigDescription, clipped:
     """Return the fit as a result; ``clipped`` names the pictures that were left out before it."""
     fitted, template, used = found.fitted, found.problem.template, found.fitted.used
     rest = residual_pattern(found)
+    wider = disagreement(found)
     values = value_moments(found, rest.inflation)
+    # A pattern has widened all parameters already.
+    scale = np.sqrt(np.maximum(wider / rest.inflation, 1.0))
+    values = replace(values, cov=values.cov * np.outer(scale, scale))
     # Pictures give lengths in panel pixels only: lengths change with the pitch.
     pitch, scale = rig.panel.pitch_mm, np.ones(len(NAMES))
     moved = np.where(np.isin(np.arange(len(NAMES)), [DISTANCE, PUPIL, DEPTH]), values.mean, 0.0)
     scale[PUPIL] = 1 / footprint_per_pupil(rig)
     cov = (values.cov + (pitch.tolerance / pitch.value) ** 2 * np.outer(moved, moved)) * np.outer(scale, scale)
-    posterior = term_posterior(data, found, rest.inflation)
+    posterior = term_posterior(data, found, np.maximum(wider, rest.inflation))
     status, advice = _status(found)
     # Variance between the frames of a shot over the noise model's, as the median of all shots; 0: unknown.
     known = data.shots.scatter[:-1][np.isfinite(data.shots.scatter[:-1])]
@@ -122,7 +134,7 @@ def result_of(found: Found, data: BackscatterData, rig: RigDescription, clipped:
             Diagnostic("frame_scatter_over_noise", scatter, "1"),
             Diagnostic("pictures", float((~found.bad_shots[1:-1]).sum()), "1"),
         ),
-        notes=(*advice, *_notes(found, rest, scatter, clipped)),
+        notes=(*advice, *_notes(found, rest, wider, scatter, clipped)),
         outliers=_outliers(found, data, clipped),
         # The eliminated mask reduces the residuals' variance; the factor corrects for it.
         residuals=residual_sample(
@@ -164,7 +176,7 @@ def _status(found: Found) -> tuple[FitStatus, tuple[str, ...]]:
     return FitStatus.CONVERGED, ()
 
 
-def _notes(found: Found, rest: MisfitTest, scatter: float, clipped: list[str]) -> tuple[str, ...]:
+def _notes(found: Found, rest: MisfitTest, wider: Vector, scatter: float, clipped: list[str]) -> tuple[str, ...]:
     notes = [f"{len(clipped)} clipped pictures left out."] if clipped else []
     if found.model_error > 0:
         notes.append(f"Ratios to white are modelled to {found.model_error:.2%} only; that counts as noise.")
@@ -172,6 +184,11 @@ def _notes(found: Found, rest: MisfitTest, scatter: float, clipped: list[str]) -
         notes.append(
             f"Residuals have a pattern (p = {rest.p_value:.1g}); all sigmas are {np.sqrt(rest.inflation):.1f} times "
             "those of independent ones."
+        )
+    if (most := float(np.sqrt(wider.max()))) > 1:
+        notes.append(
+            "Parts of the sensor ask for different kernels: the model is not true there. Sigmas are up to "
+            f"{most:.1f} times those of a true model ({NAMES[int(wider.argmax())]})."
         )
     if scatter > found.problem.rules.steady:
         notes.append(
@@ -271,22 +288,22 @@ class TermAt:
 
 
 @in_float64
-def term_posterior(data: BackscatterData, found: Found, inflation: float) -> Posterior[Backscatter]:
+def term_posterior(data: BackscatterData, found: Found, inflation: Vector) -> Posterior[Backscatter]:
     """Return the whole term's posterior: its parameters, the mask that follows them, its noise, and other orders.
 
     The model error of a picture (``model_error_of_white``) is not an error of the term and adds to it.
 
     Args:
         data, found: all shots; the chosen order's fit, and the others.
-        inflation: factor of the parameters' variance.
+        inflation: factors of the parameters' variances.
     """
     theta, orders, parts = linear_of(found.fitted.found.x), found.orders, []
     template, shape = found.problem.template, data.shots.rate.shape[2:]
     rays = grid_rays(template.geometry, shape, template.step, np.arange(shape[0] * shape[1]))
     template = replace(template, window=window_for(template, theta, rays, slack=0.5))
     for one in orders.tried:
-        fit, factor = (found.fitted.found, inflation) if one is orders.best else (one.fit.found, 1.0)
-        slope = linear_slope(fit.x)
-        parts.append(Moments(linear_of(fit.x), factor * fit.cov * np.outer(slope, slope)))
+        fit, factor = (found.fitted.found, inflation) if one is orders.best else (one.fit.found, np.ones(len(theta)))
+        slope = linear_slope(fit.x) * np.sqrt(factor)
+        parts.append(Moments(linear_of(fit.x), fit.cov * np.outer(slope, slope)))
     cov = Moments.mixture(parts, orders.probabilities, theta).cov
     return TermAt(template, data, ~found.bad_shots, found.model_error, theta).posterior(cov)

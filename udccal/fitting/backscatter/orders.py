@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from typing import final
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy.special import ndtri
 
 from udccal.fitting.backscatter.data import Binned
@@ -32,6 +32,7 @@ from udccal.fitting.backscatter.parameters import (
 from udccal.fitting.backscatter.solve import ErrorsAt, Fitted, MostProbable, Problem, Profile, most_probable
 from udccal.fitting.engine.gaussian import Prior
 from udccal.fitting.engine.misfit import (
+    NO_TEST,
     MisfitTest,
     chi2_test,
     excess_sigma,
@@ -118,7 +119,7 @@ def refit(problem: Problem, fitted: Fitted, usable: Usable) -> tuple[Fitted, flo
 def _from_afar(problem: Problem, order: Order, x: Vector, noise: PerShot, error: float) -> Fitted:
     """Fit with this model error of the start as noise: with noise alone, the prior would have no effect."""
     light, used = np.maximum(problem.seen.excess[0], 0.0), noise > 0
-    for _ in range(4):
+    for _ in range(30):
         variance = 1 / np.where(used, noise, 1.0) ** 2
         variance[1:-1] += (error * light) ** 2
         fitted = problem.solved(order, x, np.where(used, 1 / np.sqrt(variance), 0.0))
@@ -225,8 +226,7 @@ def held_out(problem: Problem, full: Fitted) -> tuple[float, float]:
 def residual_pattern(found: Found) -> MisfitTest:
     """Test whether residuals of a shot and colour have the same sign over parts of the sensor or all of it."""
     fitted, cells, places, used = found.fitted, found.problem.rules.cells, found.places, found.fitted.used
-    low, high = places.min(axis=0), places.max(axis=0)
-    column, row = np.minimum((places - low) / np.maximum(high - low, 1e-9) * cells, cells - 1).astype(int).T
+    column, row = _cells(places, cells)
     groups = np.arange(used[..., 0].size).reshape(*used.shape[:2], 1)
     scale = max(fitted.best.chi2 / found.dof, 1.0) * found.dof / max(used.sum(), 1)
     tests = [
@@ -234,6 +234,40 @@ def residual_pattern(found: Found) -> MisfitTest:
         for cell in (row * cells + column, np.zeros(len(places), dtype=int))
     ]
     return sharper(*tests)
+
+
+def _cells(places: Float[np.ndarray, "n 2"], across: int) -> Int[np.ndarray, "2 n"]:
+    """(column, row) of the part of the sensor in which each place lies; there are so many ``across`` and down."""
+    low, high = places.min(axis=0), places.max(axis=0)
+    return np.minimum((places - low) / np.maximum(high - low, 1e-9) * across, across - 1).astype(int).T
+
+
+def disagreement(found: Found) -> Vector:
+    """Factors of the parameters' variances, above 1 where parts of the sensor ask for different values.
+
+    A kernel that is wrong by an amount that changes slowly over the field hardly shows in residuals, which have the
+    signs of the pictures' edges. But it moves a parameter by different amounts in different places, and then by more
+    than independent residuals do. Each part moves the parameters by its score (``clustered_cov``). Parts are cells, and
+    bands of rows and of columns. Where chance is no explanation for the scatter of any parameter, the model is refuted,
+    and the scatter of every parameter is the measure of its sigma.
+    """
+    fitted, solved, across = found.fitted, found.fitted.found, found.problem.rules.cells
+    free = np.flatnonzero(fitted.order.free)
+    errors, jacobian = found.problem.errors_at(fitted.best.weight)(solved.x)
+    shifts = (jacobian @ solved.cov) * errors[:, None], (jacobian @ solved.cov) ** 2
+    column, row = _cells(found.places, across)
+    factors, tests = np.ones(len(solved.x)), [NO_TEST]
+    for parts in (row * across + column, row, column):
+        part = np.broadcast_to(parts, fitted.z.shape).ravel()
+        moved, expected = np.zeros((2, parts.max() + 1, len(solved.x)))
+        np.add.at(moved, part, shifts[0])
+        np.add.at(expected, part, shifts[1])
+        for k in free:
+            seen = expected[:, k] > 0
+            square, most = moved[seen, k] ** 2, expected[seen, k]
+            tests.append(chi2_test(float((square / most).sum()), float(seen.sum() - 1)))
+            factors[k] = max(factors[k], float(square.sum() / most.sum()))
+    return factors if sharper(*tests).found else np.ones(len(solved.x))
 
 
 def value_moments(found: Found, inflation: float) -> Moments:

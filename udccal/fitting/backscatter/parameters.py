@@ -84,7 +84,7 @@ class BackscatterRules:
     known: tuple[float, float, float, float] = (0.1, 0.1, 0.5, 0.5)
     steady: float = 1.3
     most_outliers: float = 0.25
-    solver: SolverRules = field(default_factory=lambda: SolverRules(iterations=60))
+    solver: SolverRules = field(default_factory=SolverRules)
 
 
 @final

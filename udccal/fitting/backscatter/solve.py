@@ -90,7 +90,7 @@ def most_probable(
     problem = _Free(errors_at, free, Prior(prior.mean[free], prior.root[:, free]))
     found, cov = minimise(problem, start, rules), np.zeros((len(free), len(free)))
     if np.isfinite(found.equations.cost):
-        cov[np.ix_(free, free)] = found.equations.cov()
+        cov[np.ix_(free, free)] = found.with_rest(found.equations.cov(), found.equations.step(0.0).shared)
     return MostProbable(found.place, cov, found.equations.cost, found.converged)
 
 

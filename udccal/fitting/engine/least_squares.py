@@ -6,7 +6,8 @@ The equations of one step are
     [ B^T  C ] [ own  ]  =  [c],
 
 with C block diagonal. The nuisance parameters are therefore eliminated group by group (Schur's complement: Triggs et
-al., Bundle Adjustment - A Modern Synthesis, 2000, section 6.1). The damping follows Nielsen (IMM-REP-1999-05, 1999).
+al., Bundle Adjustment - A Modern Synthesis, 2000, section 6.1). The damping, which is the multiplier of a trust region
+scaled by the diagonal (More, Lecture Notes in Mathematics 630, 1978), follows Nielsen (IMM-REP-1999-05, 1999).
 """
 
 from __future__ import annotations
@@ -24,6 +25,8 @@ Place = TypeVar("Place")
 _Place_contra = TypeVar("_Place_contra", contravariant=True)
 
 _TINY = 1e-300
+# Steps that shrink more slowly than this tell little of the way that is left.
+_SLOWEST = 0.9
 
 
 @final
@@ -32,12 +35,12 @@ class SolverRules:
     """When a descent ends, and how carefully it steps.
 
     Attributes:
-        least_gain: converged when one more step is expected to lower the cost by less than this, in units of the
-            reduced chi-squared where that is above 1. 1e-4 is a hundredth of a sigma.
+        least_gain: converged when one more step is expected to gain less, in units of the reduced chi-squared where
+            that is above 1. 1e-4 is a hundredth of a sigma.
         stalled_gain: also converged when the expected gain is below ``small_gain`` and the last step lowered the cost
             by less than this: inexact derivatives may predict a small gain for ever. 0 turns this rule off.
         small_gain: see ``stalled_gain``; also the expected gain that is accepted where rounding hides any progress.
-        iterations: at most.
+        iterations: at most; far more than data take, so that it only bounds the time of a descent without an end.
         first_damping: relative to the diagonal of the equations.
         most_damping: the descent ends beyond it, since no step, however small, lowers the cost.
     """
@@ -214,10 +217,11 @@ class Solution(Generic[Place, _Equations]):
     Attributes:
         place: where the cost is lowest.
         equations: at ``place``.
-        gain: expected fall of the cost by one more step.
+        gain: expected fall of the cost by one more step; infinite where the equations are not finite.
         converged: whether ``gain`` satisfies the rules.
         history: the cost at the start and after each iteration that lowered it.
         iterations: steps that were tried.
+        ahead: length of the way left, in next steps, if steps go on to shrink as the last two did.
     """
 
     place: Place
@@ -226,6 +230,14 @@ class Solution(Generic[Place, _Equations]):
     converged: bool
     history: tuple[float, ...]
     iterations: int
+    ahead: float = 1.0
+
+    def with_rest(self, cov: Float[np.ndarray, "n n"], step: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n n"]:
+        """A covariance of parameters whose next step, undamped, is ``step``; the way left is one more error in it."""
+        if not np.isfinite(self.gain):
+            return cov
+        rest = step if self.converged else self.ahead * step
+        return np.asarray(cov + np.outer(rest, rest))
 
 
 def minimise(
@@ -246,27 +258,42 @@ def minimise(
     """
     rules = rules or SolverRules()
     place, here = start, problem.equations_at(start)
+    gain, ahead = _gain(here), 1.0
     history, damping, raise_by, lowered, iteration = [here.cost], rules.first_damping, 2.0, np.inf, 0
     while True:
-        gain = here.step(0.0).gain if np.isfinite(here.cost) else np.inf
         LOG.debug("%s: iteration %d, cost %.9g, to gain %.3g", problem.name, iteration, here.cost, gain)
         enough = rules.least_gain * max(here.cost / max(here.samples, 1), 1.0)
         stalled = damping > rules.most_damping or lowered < rules.stalled_gain
         converged = bool(gain < enough or (stalled and gain < rules.small_gain))
-        if converged or iteration >= rules.iterations or damping > rules.most_damping or not np.isfinite(here.cost):
-            return Solution(place, here, float(gain), converged, tuple(history), iteration)
+        if converged or iteration >= rules.iterations or damping > rules.most_damping or not np.isfinite(gain):
+            return Solution(place, here, gain, converged, tuple(history), iteration, ahead)
         following = None
         while following is None and iteration < rules.iterations and damping <= rules.most_damping:
             iteration += 1
             step = here.step(damping)
             tried = problem.moved(place, step)
             there = problem.equations_at(tried)
-            if np.isfinite(there.cost) and there.cost < here.cost:
+            next_gain = _gain(there) if there.cost < here.cost else np.inf
+            if np.isfinite(next_gain):
                 lowered, following = here.cost - there.cost, (tried, there)
                 kept = lowered / max(step.gain, _TINY)
                 damping, raise_by = damping * float(np.clip(1.0 - (2.0 * kept - 1.0) ** 3, 0.1, 2.0)), 2.0
             else:
                 damping, raise_by = damping * raise_by, 2.0 * raise_by
         if following is not None:
+            # The gain falls with the square of the step.
+            shrunk = float(np.sqrt(max(next_gain, 0.0) / max(gain, _TINY)))
+            ahead, gain = 1 / (1 - min(shrunk, _SLOWEST)), next_gain
             place, here = following
             history.append(here.cost)
+
+
+def _gain(equations: Equations) -> float:
+    """Expected fall of the cost by one undamped step; infinite where cost or equations are not finite."""
+    if not np.isfinite(equations.cost):
+        return np.inf
+    try:
+        gain = float(equations.step(0.0).gain)
+    except np.linalg.LinAlgError:
+        return np.inf
+    return gain if np.isfinite(gain) else np.inf

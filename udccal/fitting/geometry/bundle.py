@@ -272,5 +272,5 @@ def solve(
     """The minimum next to ``start``, roughly if robust or of poses alone; arguments as for ``BundleProblem``."""
     # A descent ends a thousandth of a sigma from the minimum; if another one follows, a tenth is enough.
     rough = robust is not None or not free.any()
-    rules = SolverRules(least_gain=1e-2 if rough else 1e-6, iterations=60)
+    rules = SolverRules(least_gain=1e-2 if rough else 1e-6)
     return minimise(BundleProblem(points, free, prior, robust), start, rules)

@@ -233,6 +233,8 @@ def _complaint(board: np.ndarray, image: np.ndarray, before: list[tuple[np.ndarr
         return f"expected at least {least} points, found {len(board)}. Bring more of the board into the picture."
     for points, what in ((board, "on the board"), (image, "in the picture")):
         spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+        if not 1e-9 < spread[0] < 1e9:
+            return f"its points span {spread[0]:.2g} {what}. Give the board in mm or m, and the picture in px."
         if spread[1] <= 1e-3 * spread[0]:
             return f"its points lie on one line {what} and hold no pose. Show at least two rows of corners."
     if any(np.array_equal(image, other[1]) and np.array_equal(board, other[0]) for other in before):

@@ -214,7 +214,10 @@ def _result(
         samples=2 * int(use.sum()),
         candidates=bundle.candidates,
         diagnostics=_diagnostics(bundle),
-        notes=(*bundle.notes, f"Held at 0, as the data do not ask for it: {', '.join(held)}.")
+        notes=(
+            *bundle.notes,
+            f"Held at 0, as the data do not ask for it: {', '.join(held)}. The sigmas are those of a lens without it.",
+        )
         if held
         else bundle.notes,
         outliers=bundle.outliers,

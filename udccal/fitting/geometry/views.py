@@ -116,7 +116,12 @@ def _focal_px(points: Points, size: tuple[int, int]) -> float:
     views = [points.view == k for k in range(len(points.names))]
     board = [(points.board[mine] * np.array([1.0, 1.0, 0.0])).astype(np.float32) for mine in views]
     image = [points.image[mine].astype(np.float32) for mine in views]
-    focal, usual = float(cv2.initCameraMatrix2D(board, image, size, 1.0)[0, 0]), float(max(size))
+    usual = float(max(size))
+    try:
+        focal = float(cv2.initCameraMatrix2D(board, image, size, 1.0)[0, 0])
+    except cv2.error:
+        # Points of a size beyond single precision.
+        return usual
     # The model does not describe lenses outside this range.
     return focal if 0.15 * usual <= focal <= 30.0 * usual else usual
 

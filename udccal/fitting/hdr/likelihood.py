@@ -47,11 +47,13 @@ class BlockMerge(eqx.Module):
 
 
 def _mills(z: Float[Arrayish, "n pixels"], xp: ModuleType) -> Float[Arrayish, "n pixels"]:
-    """Density over upper tail of the normal distribution; Abramowitz and Stegun 7.1.26 for the tail, 1e-3 up to 5."""
+    """Density over upper tail of the normal distribution to 1e-3: Abramowitz and Stegun 7.1.26, from 5 on 26.2.12."""
+    far = xp.maximum(z, 5.0)
     t = 1 / (1 + 0.23164189 * abs(z))
     tail = t * (0.254829592 + t * (-0.284496736 + t * (1.421413741 + t * (-1.453152027 + t * 1.061405429))))
     bell = xp.exp(-0.5 * z * z)
-    return xp.where(z >= 0, 0.79788456 / tail, 0.39894228 * bell / (1 - 0.5 * tail * bell))
+    near = xp.where(z >= 0, 0.79788456 / tail, 0.39894228 * bell / (1 - 0.5 * tail * bell))
+    return xp.where(z > 5, far + (1 - 2 / far**2) / far, near)
 
 
 def merge_block(
@@ -80,13 +82,21 @@ def merge_block(
         score, information = xp.where(is_open, slope * (light - mean), 0), xp.where(is_open, slope * time, 0)
         if with_clipped:
             z = (sensor.level_e - mean) / xp.sqrt(variance)
-            believed, ratio = is_clipped & (z < believed_sigma), _mills(z, xp)
+            # The rate that the unclipped samples give has its own error.
+            known = information.sum(axis=0)
+            apart = xp.sqrt(1 + xp.where(known > 0, slope * time / xp.maximum(known, _TINY), 0))
+            believed, ratio = is_clipped & (z < believed_sigma * apart), _mills(z, xp)
             score = xp.where(believed, time / xp.sqrt(variance) * ratio, score)
             information = xp.where(believed, slope * time * ratio * (ratio - z), information)
         total = xp.maximum(information.sum(axis=0), _TINY)
         rate = rate + score.sum(axis=0) / total
     mean, variance = expected(rate)
-    left = xp.where(is_open, xp.maximum(1 - time**2 / (variance * total), 1e-3), 1)
+    # Below zero rate the rounds may not have settled: a sample's deviation is that from the rate of these weights.
+    slope = xp.where(is_open, time / variance, 0)
+    now = xp.maximum((slope * time).sum(axis=0), _TINY)
+    settled, share = (slope * (light - mean)).sum(axis=0) / now, time**2 / (variance * xp.maximum(total, now))
+    left = xp.where(is_open, xp.maximum(1 - share, 1e-3), 1 + share)
+    mean = mean + xp.where(is_clipped.any(axis=0), 0, settled) * time
     # The least deviation of a sample that is clipped although the others give a far lower rate.
     beyond = xp.where(is_open, light - mean, xp.maximum(sensor.level_e - mean, 0)) / xp.sqrt(left)
     # One sample alone may have made the rate so low that it seems to be known well: the others may give a higher one.

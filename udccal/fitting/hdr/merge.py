@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, Int, UInt16
 
 from udccal.errors import FitError
 from udccal.fitting.engine.robust import outliers
+from udccal.fitting.hdr.doubts import checked, doubts, rounding_e
 from udccal.fitting.hdr.likelihood import BlockMerge, SensorNumbers, compiled_merge_block, merge_block
 from udccal.models.noise import Noise
 from udccal.result import FitStatus, Outliers
@@ -35,6 +36,8 @@ class HdrRules:
         frame_off, frame_sigma: a frame is left out when its light is off by more than both (relative, and in sigma).
         least_to_judge: the fewest samples of a pixel for finding hits and testing frames.
         scatter_off: scatter of samples about their light, relative to the noise model's variance, that is too much.
+        sure_electrons: electrons that a pixel's light is worth before the scatter about it is judged.
+        black_off: error of the black level, in sigma of dark noise, that is too much.
     """
 
     believed_sigma: float = 6.0
@@ -43,6 +46,8 @@ class HdrRules:
     frame_sigma: float = 5.0
     least_to_judge: int = 3
     scatter_off: float = 0.05
+    sure_electrons: float = 100.0
+    black_off: float = 0.1
 
 
 @final
@@ -88,39 +93,40 @@ def merge_bracket(
         rate and sigma in e-/s of every pixel, and the outliers.
 
     Raises:
-        FitError: when exposures are not positive, or not as many as frames, or a number of the noise is impossible.
+        FitError: when frames are not codes, exposures are not positive or not as many as frames, or a number of the
+            noise is impossible.
     """
     rules = rules or HdrRules()
-    times = np.asarray(exposures_s, dtype=np.float64)
-    if len(frames) != len(times) or not len(times) or not np.all((times > 0) & np.isfinite(times)):
-        expected = f"Expected a positive exposure for each of the {len(frames)} frames of a bracket"
-        raise FitError(f"{expected}, found {times.tolist()}. Give the exposures in seconds.")
+    times = checked(frames, exposures_s)
     # Times in units of the longest: sums of their squares stay in single precision's range.
     unit, shape, dropped = float(times.max()), frames.shape[1:], np.zeros((len(frames), 1), bool)
     codes = np.ascontiguousarray(frames).reshape(len(frames), -1)
-    bracket = _Bracket(codes, (times / unit).astype(np.float32), sensor_numbers(noise, unit, rules), rules)
+    sensor, rounded_e = sensor_numbers(noise, unit, rules), rounding_e(noise)
+    bracket = _Bracket(codes, (times / unit).astype(np.float32), sensor, rules, rounded_e)
     merged = bracket.merged(dropped)
-    while (bad := bracket.frame_off(merged, dropped)) is not None:
-        dropped[bad] = True
+    unlike: list[int] = []
+    while (bad := bracket.frames_off(merged, dropped)).size:
+        dropped[bad[0]] = True
+        unlike = bad.tolist() if len(bad) > 1 else unlike
         merged = bracket.merged(dropped)
-    hits, scatter = bracket.mend_hits(merged, dropped), bracket.scatter(merged, dropped)
+    hits, black_e = bracket.mend_hits(merged, dropped), bracket.black_off(merged, dropped)
+    scatter = bracket.scatter(merged, dropped)
     # In place: copies of a full frame would cost as much as a third of the merging.
     for values in (merged.rate, merged.sigma):
         values /= np.float32(unit)
     unknown = merged.used <= 0
     merged.rate[unknown], merged.sigma[unknown] = 0.0, UNKNOWN_SIGMA
     notes = [f"{unknown.sum()} of {unknown.size} pixels have no sample that could be used."] if unknown.any() else []
-    if scatter != 1:
-        notes.append(
-            f"Samples scatter about a pixel's light with {scatter:.2f} times the variance of the noise model. Check K, "
-            "black level and exposure times; rate and sigma are not to be trusted."
-        )
+    doubted = doubts(scatter, black_e * float(np.asarray(noise.K_DN_per_e)), unlike)
+    notes += doubted
+    if rounded_e > rules.black_off * math.sqrt(sensor.floor_e2):
+        notes.append("Dark noise is far below a code: rounding moves dark pixels by up to half a code. Raise the gain.")
     off = f"frames whose light is off by more than {100 * rules.frame_off:g} % and {rules.frame_sigma:g} sigma"
     hit = f"pixels with a sample more than {rules.believed_sigma:g} sigma from what its other samples say; that sample"
     places = (str(tuple(int(k) for k in np.unravel_index(pixel, shape))) for pixel in hits)
     listed = outliers(off, (f"frame {i}" for i in np.flatnonzero(dropped)))
     listed += outliers(f"{hit} is left out", places)
-    status = FitStatus.CONVERGED if scatter == 1 else FitStatus.POOR_FIT
+    status = FitStatus.POOR_FIT if doubted else FitStatus.CONVERGED
     status = FitStatus.SATURATED if unknown.size and unknown.all() else status
     rate, sigma, used = (part.reshape(shape) for part in (merged.rate, merged.sigma, merged.used))
     return HdrMerge(rate, sigma, used, listed, status, tuple(notes))
@@ -146,6 +152,7 @@ class _Bracket:
     times: Float[np.ndarray, " n"]
     sensor: SensorNumbers
     rules: HdrRules
+    rounding_e: float
 
     def merged(self, left_out: Bool[np.ndarray, "n #pixels"]) -> BlockMerge:
         """All pixels, without the samples that are left out."""
@@ -164,10 +171,28 @@ class _Bracket:
             list(pool.map(run, (min(start, pixels - _BLOCK) for start in range(0, pixels, _BLOCK))))
         return out
 
-    def frame_off(self, merged: BlockMerge, dropped: Bool[np.ndarray, "n 1"]) -> int | None:
-        """The frame whose light differs most from the others', when that is too much."""
+    def frames_off(self, merged: BlockMerge, dropped: Bool[np.ndarray, "n 1"]) -> Int[np.ndarray, " off"]:
+        """Frames without any one of which the others agree, the best first; none where all agree."""
+        if not self._frame_scores(merged, dropped, self.rules.least_to_judge).max() > self.rules.frame_sigma:
+            return np.zeros(0, int)
+        # The frame of most light sets the merged light: where it is wrong, the others are off. Each is left out once.
+        part = replace(self, codes=np.ascontiguousarray(self.codes[:, :: max(1, self.codes.shape[1] // 20_000)]))
+        left = np.full(len(dropped), np.inf)
+        for i in np.flatnonzero(~dropped):
+            without = dropped | (np.arange(len(dropped)) == i)[:, None]
+            left[i] = part._frame_scores(part.merged(without), without, self.rules.least_to_judge - 1).max()
+        order = np.argsort(left)
+        return order[: max(1, int(np.sum(left <= self.rules.frame_sigma)))]
+
+    def _frame_scores(
+        self, merged: BlockMerge, dropped: Bool[np.ndarray, "n 1"], least: int
+    ) -> Float[np.ndarray, " n"]:
+        """How far each frame's light is off that of all, in sigma, in pixels of at least so many samples.
+
+        It is 0 where that is little or unknown.
+        """
         rules, sensor = self.rules, self.sensor
-        _, light, mean, variance = self._lit(merged, rules.least_to_judge)
+        _, light, mean, variance = self._lit(merged, least)
         dark, sigma = float(sensor.dark_e_per_s) * self.times[:, None].astype(np.float64), np.sqrt(variance)
         signal = mean - dark
         # Unclipped samples near the level are the low ones of their kind; samples of few electrons are skewed. Both are
@@ -180,36 +205,56 @@ class _Bracket:
             # A median's standard error is 1.2533 times a mean's.
             error = 1.2533 * float(np.median(sigma[part] / signal[part])) / math.sqrt(clear[i].sum())
             score[i] = off / error if off > rules.frame_off else 0.0
-        worst = int(np.argmax(score))
-        return worst if score[worst] > rules.frame_sigma else None
+        return score
 
     def _lit(
-        self, merged: BlockMerge, least: int
+        self, merged: BlockMerge, least: int, least_rate: float = 0.0
     ) -> tuple[
         Int[np.ndarray, " lit"], Float[np.ndarray, "n lit"], Float[np.ndarray, "n lit"], Float[np.ndarray, "n lit"]
     ]:
         """Some lit pixels with at least so many samples; their samples, and those' mean and variance, in electrons."""
-        sensor, lit = self.sensor, np.flatnonzero((merged.used >= least) & (merged.rate > 0))
+        sensor, lit = self.sensor, np.flatnonzero((merged.used >= least) & (merged.rate > least_rate))
         lit = lit[:: max(1, len(lit) // 20_000)]
         light = (self.codes[:, lit].astype(np.float64) - float(sensor.black_DN)) * float(sensor.e_per_DN)
         mean = (merged.rate[lit].astype(np.float64) + float(sensor.dark_e_per_s)) * self.times[:, None]
-        return lit, light, mean, mean + float(sensor.floor_e2)
+        return lit, light, mean, np.maximum(mean, 0.0) + float(sensor.floor_e2)
 
     def scatter(self, merged: BlockMerge, dropped: Bool[np.ndarray, "n 1"]) -> float:
-        """Variance of bright samples about their pixel's light over the model's; 1 where that is what chance gives."""
+        """Variance of samples about their pixel's light over the model's; 1 where that is what chance gives."""
         lit, light, mean, variance = self._lit(merged, 2)
         times, level_e = self.times[:, None].astype(np.float64), float(self.sensor.level_e)
-        # Samples of many electrons, clear of clipping: that a sample is clipped or skewed changes nothing then.
-        clear = ~dropped & (mean > 100) & (mean + 5 * np.sqrt(variance) < level_e)
-        chi2 = np.minimum((light - mean) ** 2 / variance, self.rules.believed_sigma**2)
+        # Clear of clipping, and of pixels whose light is known well: that the variance is that of the light as merged,
+        # and not as it is, changes nothing then.
+        sure = merged.rate[lit] > self.rules.sure_electrons**0.5 * merged.sigma[lit]
+        clear = ~dropped & sure & (mean + 5 * np.sqrt(variance) < level_e)
+        # Hits in pixels of two samples are not found: a few of them must not count much.
+        chi2 = np.minimum((light - mean) ** 2 / variance, 4.0**2)
         dof = float(np.sum((1 - np.minimum((times * merged.sigma[lit]) ** 2 / variance, 1))[clear]))
         found = float(np.sum(chi2[clear])) / max(dof, 1e-9)
         return found if abs(found - 1) > max(self.rules.scatter_off, 6 * math.sqrt(2 / max(dof, 1e-9))) else 1.0
 
+    def black_off(self, merged: BlockMerge, dropped: Bool[np.ndarray, "n 1"]) -> float:
+        """The error of the black level that dark samples show, in electrons; 0 where it is not too much.
+
+        A wrong black level is the same in all exposures, and light is not: this is its weighted mean, light taken out.
+        """
+        _, light, mean, variance = self._lit(merged, 2, -np.inf)
+        times, floor = self.times[:, None].astype(np.float64), float(self.sensor.floor_e2)
+        weight = np.where(~dropped & (mean < 3 * floor), 1 / variance, 0.0)
+        light_taken = times * (weight * times).sum(axis=0) / np.maximum((weight * times**2).sum(axis=0), 1e-30)
+        slope = 1 - light_taken
+        information = max(float(np.sum(weight * slope)), 1e-30)
+        # Hits count as samples at the limit.
+        most = self.rules.believed_sigma * np.sqrt(variance)
+        found = float(np.sum(weight * slope * np.clip(light - mean, -most, most))) / information
+        limit = max(self.rules.black_off * math.sqrt(floor), 6 / math.sqrt(information), self.rounding_e)
+        return found if abs(found) > limit else 0.0
+
     def mend_hits(self, merged: BlockMerge, dropped: Bool[np.ndarray, "n 1"]) -> Int[np.ndarray, " hits"]:
         """Leave out the worst sample of a pixel while it is too far off; changes ``merged``, returns the pixels."""
         limit, most = self.rules.believed_sigma**2, len(self.times) - self.rules.least_to_judge
-        hits = suspects = np.flatnonzero((merged.deviation2 > limit) & (dropped.sum() <= most))
+        # Samples that are all clipped do not contradict one another.
+        hits = suspects = np.flatnonzero((merged.deviation2 > limit) & (merged.used > 0) & (dropped.sum() <= most))
         left_out = np.repeat(dropped, len(suspects), axis=1)
         while len(suspects):
             left_out[merged.worst[suspects], np.arange(len(suspects))] = True

@@ -22,7 +22,7 @@ from udccal.fitting.engine.orders import Quantity
 from udccal.fitting.noise.data import NoiseRules
 from udccal.fitting.noise.moments import DarkPair, NoiseMoments
 from udccal.fitting.noise.patterns import Pattern, dsnu, row_noise
-from udccal.fitting.noise.read_noise import NORMAL_SHAPE, measured_variance, standard_cdf
+from udccal.fitting.noise.read_noise import NORMAL_SHAPE, standard_cdf, unexplained_variance
 
 # Bounds of black [DN], dark current [DN/s], variance of single samples without row noise [DN^2], variance of the
 # pixels' offsets [DN^2], and Tukey-lambda shape: the order of ``Five``. A variance at its lower bound counts as 0.
@@ -163,7 +163,7 @@ def fit_dark(
     free = np.array([True, len({pair.exposure_s for pair in pairs}) > 1, True, True, not normal])
     values = np.where(free, values, [0.0, 0.0, 0.0, 0.0, NORMAL_SHAPE])
     # One-sided derivatives predict a small gain for ever.
-    solver = SolverRules(least_gain=1e-3, stalled_gain=1e-4, iterations=40)
+    solver = SolverRules(least_gain=1e-3, stalled_gain=1e-4)
 
     def expected(pair: DarkPair, at: Five) -> Float[np.ndarray, "codes codes"]:
         return pair_probability(pair, at, K_DN_per_e, sigma_row_DN, rules.background)
@@ -177,7 +177,7 @@ def fit_dark(
     lost = free & bool(values[2] + values[3] < 12 * step2) & (np.diag(information) < least)
     information = np.where(lost[:, None] | lost, np.diag(np.where(lost, least, 0.0)), information)
     widen = np.sqrt(np.array([1.0, 1.0, 1.0, len(pairs), 1.0]))
-    cov = scaled_inverse(information) * np.outer(widen, widen)
+    cov = found.with_rest(scaled_inverse(information) * np.outer(widen, widen), found.equations.step(0.0).shared)
     levels = np.array([_level(pair, values, expected, sigma_row_DN) for pair in pairs]).T
     return DarkFit(values, cov, found.converged, bool(np.abs(levels[0] - 1).max() < rules.white), *levels)
 
@@ -219,8 +219,13 @@ class DarkTerms:
     offsets: Pattern
 
 
-def fit_dark_terms(data: NoiseMoments, K_DN_per_e: float, rules: NoiseRules, start: Five | None = None) -> DarkTerms:
-    """Fit all dark quantities; only the shot noise of the dark current depends on ``K_DN_per_e``."""
+def fit_dark_terms(
+    data: NoiseMoments, K_DN_per_e: float, rules: NoiseRules, start: Five | None = None, curvature: float = 0.0
+) -> DarkTerms:
+    """Fit all dark quantities; only the dark current's shot noise depends on ``K_DN_per_e``.
+
+    ``curvature`` is the response's in 1/DN: dark signal bends as light does.
+    """
     row, in_pairs = row_noise(data, np.ones(len(data.darks)))
     fit = fit_dark(data.darks, K_DN_per_e, in_pairs, rules, start)
     if not fit.follows:
@@ -232,16 +237,28 @@ def fit_dark_terms(data: NoiseMoments, K_DN_per_e: float, rules: NoiseRules, sta
     value, variance = float(fit.values[4]), float(fit.cov[4, 4])
     name, gain = f"read noise of another shape than normal ({NORMAL_SHAPE:.2f})", (value - NORMAL_SHAPE) ** 2 / variance
     shape = Quantity.asked(name, value, variance, data.dark_samples, gain, without=NORMAL_SHAPE)
-    fit = fit if shape.there else fit_dark(data.darks, K_DN_per_e, in_pairs, rules, fit.values, True)
+    free, normal = fit, fit_dark(data.darks, K_DN_per_e, in_pairs, rules, fit.values, True)
+    fit = free if shape.there else normal
+    # Different offsets smear the rounding in the mean over all pixels; only a pixel's own noise smears its rounding.
+    white = fit.follows and 4 * np.pi**2 * float(fit.values[2]) >= rules.smeared * data.q_DN**2
+    if not white:
+        # Coarse codes hardly show the distribution, and all that they tell depends on it.
+        depends = (free.values - normal.values) * np.array([1.0, 1.0, 1.0, 1.0, 0.0])
+        fit = replace(fit, cov=fit.cov + np.outer(depends, depends))
+        row = replace(row, variance=row.variance + (0.5 * row.value) ** 2)
     spread2, variance = float(fit.values[3]), float(fit.cov[2, 2])
     read_DN2 = Quantity(float(fit.values[2]), variance)
-    # Different offsets smear the rounding in the mean over all pixels; only a pixel's own noise smears its rounding.
-    white = fit.follows and 4 * np.pi**2 * read_DN2.value >= rules.smeared * data.q_DN**2
     rate, rounding, stack = max(float(fit.values[1]), 0.0), data.q_DN**2 / 12.0, data.dark_stack
-    measured = measured_variance(data, K_DN_per_e * rate, rounding, rules.most_hits)
-    foreign = white and abs(measured.value - read_DN2.value) > rules.foreign_sigma * measured.variance**0.5
+    if white:
+        expected = [read_DN2.value + rounding + K_DN_per_e * rate * pair.exposure_s for pair in data.darks]
+    else:
+        expected = _coded_variances(data.darks, fit, K_DN_per_e, in_pairs)
+    more = unexplained_variance(data, expected, rules.most_hits)
+    foreign = abs(more.value) > rules.foreign_sigma * more.variance**0.5
     if foreign:
-        read_DN2 = measured
+        # Where rounding hides the distribution, half of what was not expected may be an effect of it.
+        value = max(read_DN2.value + more.value, 0.0)
+        read_DN2 = Quantity(value, more.variance + (0.0 if white else 0.25 * more.value**2))
     elif read_DN2.value <= 1.001 * _LOW[2]:
         read_DN2 = Quantity(0.0, max(variance, _LOW[2] ** 2))
     # DSNU comes from the stack's average, or from the histograms where rounding biases the average.
@@ -252,13 +269,23 @@ def fit_dark_terms(data: NoiseMoments, K_DN_per_e: float, rules: NoiseRules, sta
     if not white:
         pixels, sigma = stack.mean_DN.size, float(np.hypot(fit.cov[3, 3] ** 0.5, 0.0 if resolved else rounding))
         offsets = replace(offsets, variance=spread2, sigma=sigma, samples=pixels, mean_variance=spread2 / pixels)
-    black, levels_cov, current = _levels(data, fit, in_pairs**2, single, offsets)
+    black, levels_cov, current = _levels(data, fit, in_pairs**2, single, offsets, curvature)
     DSNU2 = Quantity.asked("DSNU", offsets.variance, offsets.sigma**2, offsets.samples)
     return DarkTerms(K_DN_per_e, black, current, levels_cov, read_DN2, shape, row, DSNU2, white, foreign, fit, offsets)
 
 
+def _coded_variances(pairs: tuple[DarkPair, ...], fit: DarkFit, K_DN_per_e: float, row_DN: float) -> list[float]:
+    """Temporal variance without row noise that the fitted distribution has in each pair's codes."""
+    found = []
+    for pair, gain in zip(pairs, fit.edge_gains, strict=True):
+        p = pair_probability(pair, fit.values, K_DN_per_e, row_DN, 0.0)
+        square = (pair.centres_DN[:, None] - pair.centres_DN) ** 2
+        found.append(float(np.sum(p * square)) / (2 * float(p.sum())) - (float(gain) * row_DN) ** 2)
+    return found
+
+
 def _levels(
-    data: NoiseMoments, fit: DarkFit, row_DN2: float, single_DN2: float, offsets: Pattern
+    data: NoiseMoments, fit: DarkFit, row_DN2: float, single_DN2: float, offsets: Pattern, curvature: float
 ) -> tuple[float, Float[np.ndarray, "2 2"], Quantity]:
     """Black and dark current from the mean of every dark exposure, with its own weight."""
     means, variances, times = fit.means_DN, fit.variances_DN2, np.array([pair.exposure_s for pair in data.darks])
@@ -267,6 +294,8 @@ def _levels(
         means, times = np.append(means, offsets.mean), np.append(times, stack.exposure_s)
         rows = row_DN2 / len(stack.mean_DN)
         variances = np.append(variances, (single_DN2 / stack.mean_DN.size + rows) / stack.frames)
+    above = np.maximum(means - float(fit.values[0]), 0.0)
+    means = means + curvature * above**2
     # One exposure time does not tell dark current from black: all is black, and all of it may be dark current.
     apart = bool(np.ptp(times) > 0)
     design = np.column_stack([np.ones_like(times), times * apart])
@@ -279,7 +308,8 @@ def _levels(
     if not fit.follows:
         # With coarse or cut-off codes, the errors of black, spread and noise are common to all pairs.
         cov[0, 0] = max(float(cov[0, 0]), len(data.darks) * float(fit.cov[0, 0]))
-    if (variances >= rounding).any():
+        cov[1, 1] = max(float(cov[1, 1]), float(fit.cov[1, 1]))
+    if any(own == pair.step_DN**2 / 12.0 for own, pair in zip(fit.variances_DN2, data.darks, strict=True)):
         # Rounding hides the same in every exposure.
         cov[0, 0] += rounding
     # Black stays that of the line: a dark current too weak to be chosen must not shift it.

@@ -122,7 +122,10 @@ class NoiseData:
     def check(self) -> None:
         """Check numbers of frames, exposures and photons; a FitError names the level or stack that is not possible."""
         stack = self.stack
-        stacks = [] if stack is None else [s for s in (stack.dark, stack.bright) if isinstance(s, Sequence)]
+        given = () if stack is None else (stack.dark, stack.bright)
+        if wrong := [type(one).__name__ for one in given if not isinstance(one, Sequence | np.ndarray | Averaged)]:
+            raise FitError(f"Expected the stack's frames as a sequence or an average, found {wrong[0]}. Leave it out.")
+        stacks = [one for one in given if not isinstance(one, Averaged)]
         if max([len(self.levels), *map(len, stacks)]) > _MOST_FRAMES:
             raise FitError(f"Expected at most {_MOST_FRAMES} levels and frames of a stack. Average some first.")
         if stacks and min(map(len, stacks)) < 2:

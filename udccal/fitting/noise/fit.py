@@ -72,15 +72,18 @@ def fit_moments(data: NoiseMoments, nominal: Noise, rules: NoiseRules) -> FitRes
     start = start_values(data.darks)
     dark = fit_dark_terms(data, rough_gain(data, float(start[0]), float(start[2])), rules, start)
     curve = fit_curve(data, dark, rules)
-    longest = max(pair.exposure_s for pair in data.darks)
+    longest, curvature = max(pair.exposure_s for pair in data.darks), 0.0
     # The dark fit needs the gain, and the gain the dark fit. To first order the curve corrects the read noise for the
-    # gain; a second round is for a gain that moves dark current's shot noise by half of the read noise's sigma.
-    for _ in range(5):
+    # gain; a second round is for a gain that moves dark current's shot noise by half of the read noise's sigma, or
+    # for a curvature that moves black by half of its own.
+    for _ in range(30):
         K = float(curve.fit.values[0]) if curve.choice else 0.0
-        moved = abs(K - dark.K_DN_per_e) * dark.dark_DN_per_s.value * longest
-        if curve.usable_levels < rules.levels or K <= 0 or moved <= 0.5 * dark.read_DN2.variance**0.5:
+        c, signal = (float(curve.fit.values[2]) if curve.choice else 0.0), dark.dark_DN_per_s.value * longest
+        moved = abs(K - dark.K_DN_per_e) * signal > 0.5 * dark.read_DN2.variance**0.5
+        moved |= abs(c - curvature) * signal**2 > 0.5 * float(dark.levels_cov[0, 0]) ** 0.5
+        if curve.usable_levels < rules.levels or K <= 0 or not moved:
             break
-        dark = fit_dark_terms(data, K, rules, dark.fit.values)
+        dark, curvature = fit_dark_terms(data, K, rules, dark.fit.values, c), c
         curve = fit_curve(data, dark, rules)
     if refused := _no_gain(data, dark, curve, rules):
         return FitResult.failed("noise", nominal, *refused)
@@ -220,7 +223,8 @@ def _values(
     data: NoiseMoments, dark: DarkTerms, curve: Curve, saturation: tuple[float, float], PRNU2: Quantity
 ) -> tuple[Float[np.ndarray, "11"], Float[np.ndarray, "11 11"]]:
     """The estimates, and their covariance from that of the fitted quantities."""
-    (K, V0, c), transfer = (float(v) for v in curve.fit.values[:3]), curve.fit.cov[:3, :3]
+    K, V0, c = (float(v) for v in curve.fit.values[:3])
+    transfer = curve.fit.cov[:3, :3] * curve.fit.misfit.inflation
     total = Quantity(V0 + dark.row_DN2.value, float(transfer[1, 1]) + dark.row_DN2.variance)
     roots = [one.root() for one in (total, dark.row_DN2, dark.dsnu_DN2, PRNU2)]
     (sigma_d, by_total), (row, by_row), (spread, by_spread), (response, by_response) = roots
@@ -278,7 +282,10 @@ def _notes(
     if not curve.full.any():
         yield f"No flat reached saturation; the converter's largest code, {values[2]:.0f} DN, is taken for it."
     if not dark.white:
-        yield "Rounding or cut-off codes bend the dark codes; black and DSNU come from the histograms."
+        yield (
+            "Rounding or cut-off codes bend the dark codes: black, dark noise, dark current and DSNU come from "
+            "histograms, and hold for read noise of the model's kind (Tukey's lambda)."
+        )
     if len({pair.exposure_s for pair in data.darks}) < 2:
         yield "Dark frames of one exposure time do not tell dark current from black: black holds both."
     if uneven.structure2 > 0:
@@ -286,6 +293,9 @@ def _notes(
         yield f"{found} That counts as light, as a panel's; columns or blotches of the sensor are not in PRNU1288."
     if dark.foreign:
         yield "Read noise has heavier or lighter tails than the model's: sigma_d is the root mean square of all pixels."
+    if (test := curve.fit.misfit).found:
+        found = f"Variances scatter {test.ratio:.2g} times as much about the photon transfer curve as noise does"
+        yield f"{found} (p = {test.p_value:.1g}); the sigmas of K, sigma_d, dark current and DSNU include that."
     if curve.fit.order.curved:
         yield f"The response bends: {100 * values[-1]:.2g} % of the signal is missing at full scale."
     if bent_too_far:

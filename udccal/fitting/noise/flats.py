@@ -81,6 +81,11 @@ def _inside(data: NoiseMoments, dark: DarkTerms, up_to_DN: float, ceiling_DN: fl
     """The flats as the transfer fit takes them, with the bins that lie safely inside the sensor's range."""
     flats = data.flats if data.flat_seen is None else (*data.flats, data.flat_seen)
     mean, variance, spread = (stacked(flats, name) for name in ("mean_DN", "variance_DN2", "spread_DN"))
+    if dark.foreign:
+        # What was taken for hits were tails of the noise.
+        pixels = [2 * (of.frames - 1) * float(of.samples.sum()) / of.frames for of in flats]
+        tails = np.array([of.outlier_powers[0] / n for of, n in zip(flats, pixels, strict=True)])
+        variance = variance + tails[:, None]
     above, K, q = mean - dark.black_DN, dark.K_DN_per_e, data.q_DN
     # Frames of different brightness differ, in addition to noise, by the bin's pattern (shading, PRNU) times that.
     shift2 = np.stack([np.var(flat.shift_DN, axis=0, ddof=1) for flat in flats])
@@ -102,7 +107,8 @@ def _inside(data: NoiseMoments, dark: DarkTerms, up_to_DN: float, ceiling_DN: fl
         dof=stacked(flats, "dof"),
         samples=stacked(flats, "samples"),
         usable=usable,
-        light=np.array([flat.light for flat in flats]),
+        # Frames that are lit have an exposure: 0 says that it is not known.
+        light=np.array([flat.light or np.nan for flat in flats]),
         dark_DN=dark.dark_DN_per_s.value * np.array([flat.exposure_s for flat in flats]),
         row_variance_DN2=np.array([dark.row_DN2.value / (flat.frames * flat.height) for flat in flats]),
     )
@@ -182,7 +188,8 @@ def find_saturation(data: NoiseMoments, dark: DarkTerms, curve: Curve) -> tuple[
         seen = max(flat.peak_DN for flat in data.flats)
         return data.top_DN, max(data.top_DN - seen, 0.0) / float(np.sqrt(3.0))
     peak = max(flat.peak_DN for flat, _ in full)
-    if max(flat.at_peak for flat, _ in full) >= 0.5:
+    # Bins in which most samples have the last code; of a whole frame, colours that are not full hide them.
+    if max(float(flat.at_peak[bins].max()) for flat, bins in full if flat.peak_DN == peak) >= 0.5:
         # A level at the converter's end is certain; a level below it is known to within rounding.
         return float(peak), float(1 / np.sqrt(12.0)) if peak < data.top_DN else 0.0
     V0 = max(float(curve.fit.values[1]), 0.0) if curve.choice else 0.0
@@ -205,10 +212,13 @@ def _level(
     samples = float(flat.samples[chosen].sum())
     rows = dark.row_DN2.value / (flat.frames * flat.height) * (full.size / float(chosen.sum()))
     spread2 = V0 + dark.dsnu_DN2.value + dark.row_DN2.value
-    if peak >= data.top_DN and flat.at_peak > 1e-3:
-        z = float(ndtri(flat.at_peak))
+    part = float(np.average(flat.at_peak[chosen], weights=flat.samples[chosen]))
+    if flat.peak_DN >= data.top_DN and part > 1e-3:
+        z = float(ndtri(part))
         density2 = float(np.exp(-(z**2)) / (2 * np.pi))
-        own = spread2 * flat.at_peak * (1 - flat.at_peak) / density2 / samples
+        own = spread2 * part * (1 - part) / density2 / samples
+        # The fraction gives the level by the shape of the noise, which is then another one.
+        own += 0.2**2 * spread2 if dark.foreign else 0.0
         return peak - 0.5 * data.q_DN + float(np.sqrt(spread2)) * z, own + rows, bool(sure.any())
     # Rounding adds sum over k of (-1)^k q sin(2 pi k x / q) exp(-2 (pi k s / q)^2) / (pi k) to the mean of normal noise
     # of sigma s (Widrow and Kollar, Quantization Noise, chapter 5): this is its uncertainty.

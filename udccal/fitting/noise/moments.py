@@ -64,7 +64,7 @@ class Moments:
     sampling_DN2: float
     height: int
     peak_DN: int
-    at_peak: float
+    at_peak: Float[np.ndarray, " bins"]
     outliers: int
     outlier_powers: tuple[float, float]
 
@@ -84,7 +84,7 @@ def reduce_frames(
     counts, total = np.outer(down.sum(axis=1), right.sum(axis=0)), np.zeros(first.shape, np.float32)
     outliers, powers = 0, np.zeros(2)
     # The first frame's difference from itself is zero.
-    by_row, peaks = [np.zeros((len(first), right.shape[1]))], [_peak(first)]
+    by_row, peaks = [np.zeros((len(first), right.shape[1]))], [_peak(first, down, right)]
     squares = np.zeros_like(by_row[0])
     for frame in source:
         difference = cv2.subtract(frame, first, dtype=cv2.CV_32F)
@@ -99,8 +99,10 @@ def reduce_frames(
         total += difference
         squares += square @ right
         by_row.append(np.asarray(difference @ right, dtype=np.float64))
-        peaks.append(_peak(frame))
-    number, middle, peak = len(by_row), float(np.median(first[:: max(len(first) // 64, 1)])), max(peaks)[0]
+        peaks.append(_peak(frame, down, right))
+    number, middle = len(by_row), float(np.median(first[:: max(len(first) // 64, 1)]))
+    peak = max(code for code, _ in peaks)
+    at_peak = sum((count for code, count in peaks if code == peak), start=np.zeros_like(counts))
     squares -= cv2.multiply(total, total, scale=1.0 / number) @ right
     mean = cv2.addWeighted(first, 1.0, total, 1.0 / number, 0.0, dtype=cv2.CV_32F)
     variance, dof, shift, rows, sampling = _temporal(down, right, np.stack(by_row), squares)
@@ -120,16 +122,16 @@ def reduce_frames(
         sampling_DN2=sampling,
         height=len(first),
         peak_DN=peak,
-        at_peak=sum(count for code, count in peaks if code == peak) / (number * first.size),
+        at_peak=(at_peak / (number * counts)).ravel(),
         outliers=outliers,
         outlier_powers=(float(powers[0]), float(powers[1])),
     )
 
 
-def _peak(frame: Codes) -> tuple[int, int]:
-    """The largest code, and the number of samples with it."""
+def _peak(frame: Codes, down: Float[np.ndarray, "_ _"], right: Float32[np.ndarray, "_ _"]) -> tuple[int, Grid]:
+    """The largest code, and the number of samples with it by bin."""
     top = frame.max()
-    return int(top), int(np.count_nonzero(frame == top))
+    return int(top), down @ ((frame == top).astype(np.float32) @ right)
 
 
 def _temporal(

@@ -57,6 +57,8 @@ def row_noise(data: NoiseMoments, edge_gains: Float[np.ndarray, " pairs"]) -> tu
 class Pattern:
     """A variance between pixels (may be negative by chance), its standard deviation, samples, and outliers left out.
 
+    It is that of the pixels at hand (EMVA 1288), not of all sensors of the kind: the draw of these is no part of sigma.
+
     ``mean`` is that of the samples left in, and ``mean_variance`` its variance from sensor to sensor by these patterns
     alone; ``places`` are (row, column) of the first outliers. ``structure2`` is a variance between pixels that is not
     white, so that it was taken for the light's; 0 where it cannot be seen.
@@ -90,10 +92,12 @@ def dsnu(dark_DN: Picture, temporal_DN2: float, row_DN2: float, defect_sigma: fl
     total = float(np.vdot(about, about)) / max(samples - 1, 1)
     row_part, column_part = float(np.var(about.mean(axis=1))), float(np.var(about.mean(axis=0)))
     pixel_part = max(total - row_part - column_part, 0.0)
-    # Each part is chi-squared with its own number of independent values.
-    sigma = np.sqrt(2 * pixel_part**2 / samples + 2 * row_part**2 / rows + 2 * column_part**2 / columns)
     own_row, own_column = (max(part - pixel_part / n, 0.0) for part, n in ((row_part, columns), (column_part, rows)))
-    of_mean = max(pixel_part - temporal_DN2, 0.0) / samples + max(own_row - row_DN2, 0.0) / rows + own_column / columns
+    own_pixel, own_row = max(pixel_part - temporal_DN2, 0.0), max(own_row - row_DN2, 0.0)
+    # Each part is chi-squared with its own number of values; this sensor's own pattern is what is asked for.
+    parts = ((pixel_part, own_pixel, samples), (row_part, own_row, rows), (column_part, own_column, columns))
+    sigma = np.sqrt(sum(2 * max(part**2 - own**2, 0.0) / n for part, own, n in parts))
+    of_mean = own_pixel / samples + own_row / rows + own_column / columns
     variance = total - temporal_DN2 - row_DN2
     return Pattern(variance, float(sigma), samples, mean, float(of_mean), int(bad.sum()), _first_places(bad))
 
@@ -177,13 +181,15 @@ def _response(site: _Site, white: Mask, temporal_DN2: float, shot_DN: float) -> 
     mean_square = _mean_product(light, light, good)
     square = max(mean_square - floor, 0.1)
     structure2 = mean_square - (float(light.sum(dtype=np.float64)) / good) ** 2 - floor
-    seen = structure2 > 5 * floor * float(np.sqrt(2.0 / good + 2.0 / kept))
+    seen = structure2 > 3 * floor * float(np.sqrt(2.0 / good + 2.0 / kept))
     variance = (floor - noise) / square
     # Pixels of different noise count as fewer pixels of equal noise: one row in eight gives the ratio.
     light, inverse = light[::8], inverse[::8]
     own = max(variance, 0.0) * light**2 + inverse * (temporal_DN2 * inverse + shot_DN * light)
     unlike = float(np.mean(own**2)) / max(float(np.mean(own)) ** 2, 1e-300)
-    return variance, floor / square * float(np.sqrt(2.0 * max(unlike, 1.0) / kept)), structure2 * seen
+    # The pattern of all pixels is what is asked for; the coefficients that are left out have a part of it.
+    sigma2 = 2.0 * max(unlike, 1.0) / kept * (floor / square) ** 2 - 2.0 * max(variance, 0.0) ** 2 / good
+    return variance, float(np.sqrt(max(sigma2, 0.0))), structure2 * seen
 
 
 def _mean_product(first: np.ndarray, second: np.ndarray, count: int) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
@@ -36,23 +37,23 @@ def excess_kurtosis(shape: float) -> float:
     return float(0.5 * (x[1:] ** 4 + x[:-1] ** 4) @ np.diff(p)) - 3.0
 
 
-def measured_variance(data: NoiseMoments, shot_DN2_per_s: float, rounding_DN2: float, most_hits: float) -> Quantity:
-    """Variance of dark samples less that of dark current and rounding, from the differences of each pair's codes.
+def unexplained_variance(data: NoiseMoments, expected_DN2: Sequence[float], most_hits: float) -> Quantity:
+    """Temporal variance of dark samples, without row noise, less that expected in each pair.
 
-    Its sigma follows from the fourth moment of the differences. Differences taken for hits count where they are more
-    than ``most_hits`` of all: radiation does not hit so often, so that they are tails of the noise, or pixels with
-    random telegraph noise (EMVA 1288, clause 6.3, averages the variance over all pixels).
+    It comes from the differences of the codes, and its sigma from their fourth moment. Differences taken for hits count
+    where they are more than ``most_hits`` of all: radiation does not hit so often, so that they are tails of the noise,
+    or pixels with random telegraph noise (EMVA 1288, clause 6.3, averages the variance over all pixels).
     """
     hits = sum(of.outliers for of in data.dark_moments)
     tails = hits > most_hits * sum(of.samples.sum() / of.frames for of in data.dark_moments)
     values, variances = [], []
-    for pair, of in zip(data.darks, data.dark_moments, strict=True):
+    for pair, of, expected in zip(data.darks, data.dark_moments, expected_DN2, strict=True):
         pixels = float(of.samples.sum()) / of.frames
         second, fourth = of.outlier_powers if tails else (0.0, 0.0)
         value = float(np.average(of.variance_DN2, weights=of.dof)) + second / (2 * pixels)
         difference = pair.centres_DN[:, None] - pair.centres_DN
         fourth_moment = float(np.sum(pair.counts * difference**4) + fourth) / pixels
-        values.append(value - shot_DN2_per_s * pair.exposure_s - rounding_DN2)
+        values.append(value - expected)
         variances.append(max(fourth_moment / 4 - value**2, value**2) / pixels)
     weights = 1.0 / np.maximum(variances, 1e-30)
     return Quantity(float(np.average(values, weights=weights)), float(1.0 / weights.sum()))

@@ -17,8 +17,8 @@ from typing import final
 import numpy as np
 from jaxtyping import Bool, Float
 
-from udccal.fitting.engine.least_squares import Blocks, SolverRules, Step, minimise
-from udccal.fitting.engine.misfit import excess_variance
+from udccal.fitting.engine.least_squares import Blocks, Step, minimise
+from udccal.fitting.engine.misfit import MisfitTest, chi2_test, excess_variance
 from udccal.fitting.engine.orders import Attempt, Choice, bic, choose
 from udccal.fitting.engine.robust import OutlierRule
 from udccal.fitting.noise.data import NoiseRules
@@ -111,7 +111,16 @@ class TransferFit:
     @property
     def chi2_dof(self) -> float:
         """Reduced chi-squared of the variances."""
-        return float(np.nansum(self.variance_z**2)) / max(int(np.isfinite(self.variance_z).sum()) - 1, 1)
+        return float(np.nansum(self.variance_z**2)) / self._dof
+
+    @property
+    def misfit(self) -> MisfitTest:
+        """Whether the variances scatter by more than noise."""
+        return chi2_test(float(np.nansum(self.variance_z**2)), self._dof)
+
+    @property
+    def _dof(self) -> float:
+        return float(max(int(np.isfinite(self.variance_z).sum()) - 1, 1))
 
 
 def linear_signal(mean_DN, curvature_per_DN, K_DN_per_e):  # type: ignore[no-untyped-def]
@@ -207,8 +216,9 @@ def _brightness(light_DN: Grid, usable: np.ndarray) -> PerLevel:
 def _fitted(problem: TransferProblem, start: Five) -> Attempt[TransferFit]:
     order, levels = problem.order, problem.levels
     start = np.where([True, True, order.curved, True, order.offset], start, 0.0)
-    found = minimise(problem, start, SolverRules(iterations=40))
-    x, cov, cost = found.place, found.equations.cov(), found.equations.cost
+    found = minimise(problem, start)
+    x, cost = found.place, found.equations.cost
+    cov = found.with_rest(found.equations.cov(), found.equations.step(0.0).shared)
     variance, _, relative = problem.modelled(x)
     scatter2 = problem.scatter2(relative[levels.responding])
     variance_z = np.where(levels.usable, (levels.variance_DN2 / variance - 1) * np.sqrt(levels.dof / 2), np.nan)

@@ -34,7 +34,7 @@ class PsfRules:
         close_px: the same for the fit of diffraction, which takes longer in a larger window.
         peak_half_px: all samples this close (rows, columns) to the LED go into the fit of diffraction.
         far_fraction: fraction of the samples farther away that go into it.
-        iterations: the most, in the fit of diffraction.
+        iterations: the most, in the fit of diffraction; far more than data take.
         first_model_error: of diffraction, before residuals give it; it also keeps a fit that is still far off from
             trusting the brightest samples alone.
         spectrum_bend, spectrum_sigma: prior standard deviations of the logarithm of a spectrum: of its second
@@ -70,7 +70,7 @@ class PsfRules:
     close_px: tuple[int, int] = (40, 14)
     peak_half_px: tuple[int, int] = (12, 6)
     far_fraction: float = 1 / 6
-    iterations: int = 30
+    iterations: int = 100
     first_model_error: float = 0.015
     spectrum_bend: float = 1.0
     spectrum_sigma: float = 5.0
@@ -199,13 +199,14 @@ class PsfData:
     """The data of a psf fit: crops, and numbers of pictures captured, of those without an LED, and of clipped ones.
 
     Crops may be wider than the fit's windows: the kernel's support needs all of them. There are none where no picture
-    can be used.
+    can be used. ``doubted`` has a sentence for each picture whose bracket contradicts the noise model.
     """
 
     shots: Shots | None
     taken: int = 0
     dark: int = 0
     clipped: int = 0
+    doubted: tuple[str, ...] = ()
 
 
 def left_out(light: Float[np.ndarray, "*shots n"], model_error: float) -> Float[np.ndarray, "*shots n"]:

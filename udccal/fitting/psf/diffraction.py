@@ -71,7 +71,8 @@ class DiffractionFit:
     @property
     def noise_cov(self) -> Float[np.ndarray, "p p"]:
         """Covariance of the shared parameters if the model error is independent from sample to sample."""
-        return self.solution.equations.cov()
+        equations = self.solution.equations
+        return self.solution.with_rest(equations.cov(), equations.step(0.0).shared)
 
     def cov(self) -> Float[np.ndarray, "p p"]:
         """Covariance of the shared parameters.
@@ -82,6 +83,15 @@ class DiffractionFit:
             return self.noise_cov
         alone = [position.marginal() for position in self.problem.by_position(self.solution.place)]
         return clustered_cov(self.noise_cov, np.stack([a[1] for a in alone]), np.stack([a[0] for a in alone]))
+
+    def refuted_cov(self) -> Float[np.ndarray, "p p"]:
+        """The same where residuals refute the model: its deviation may be common to all positions.
+
+        Then it does not average out over positions as it does in ``cov``.
+        """
+        weight = self.problem.samples.weight
+        positions = int((weight.reshape(len(weight), -1) > 0).any(axis=1).sum())
+        return self.noise_cov + max(positions, 1) * (self.cov() - self.noise_cov)
 
     @property
     def chi2_dof(self) -> float:
@@ -141,7 +151,7 @@ def _refine(
     weights has little effect.
     """
     whole, enough = None, 1.0
-    for _ in range(5):
+    for _ in range(15):
         # A change of less than a sigma is small enough for the interference set up before.
         problem = problem.about(place) if enough == 1.0 else problem
         problem, model_error, found = _reweighed(problem, place, rules)
@@ -154,12 +164,11 @@ def _refine(
         # Without iterations left, the round before counts: it has ended, with weights of a slightly different model.
         if not solution.converged:
             return whole or fit
-        whole, place, last = fit, solution.place, enough < 1.0 and moved < 0.1
-        if last:
-            break
-        enough = 1e-2 if moved < 1.0 else 1.0
-    assert whole is not None  # there is a first round
-    return whole
+        if enough < 1.0 and moved < 0.1:
+            return fit
+        whole, place, enough = fit, solution.place, 1e-2 if moved < 1.0 else 1.0
+    # Weights that go on to change the parameters give no minimum.
+    return replace(fit, solution=replace(fit.solution, converged=False))
 
 
 def _solver(enough: float, iterations: int) -> SolverRules:

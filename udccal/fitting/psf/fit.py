@@ -1,8 +1,7 @@
 """psf fit: from brackets of an LED at field positions to the kernel of a point source anywhere on the sensor.
 
 The fit first solves for the few parameters of diffraction by the panel, from some of the shots. An image with smooth
-coefficients may then be added to diffraction or replace it. Positions that were held out decide whether it improves the
-prediction, and how far from the LED the kernel reaches.
+coefficients may be added to it or replace it. Positions held out decide whether that helps, and how far light reaches.
 """
 
 from __future__ import annotations
@@ -175,10 +174,11 @@ def _report(
         status = FitStatus.POOR_FIT
     elif diffracts and not fit.converged:
         status = FitStatus.NOT_CONVERGED
-    cov, tolerance, samples = fit.cov(), pitch_tolerance(rig), fit.problem.samples
-    numbers, cov_of_numbers = _estimates(fit, diffracts, held_out_l2, cov, tolerance)
+    tolerance, samples = pitch_tolerance(rig), fit.problem.samples
     errors, used = fit.errors(), samples.weight > 0
     pattern_p, error_l2 = pattern_p_value(samples, errors), float(error.relative_l2(selection.magnitude).mean())
+    cov = fit.refuted_cov() if pattern_p <= SIGNIFICANT else fit.cov()
+    numbers, cov_of_numbers = _estimates(fit, diffracts, held_out_l2, cov, tolerance)
     places = fit.shots.centre_px[np.broadcast_to(samples.index[..., None], used.shape)[used]]
     names = (f"held_out_l2_{name}" for name in ("red", "green", "blue"))
     figures = dict(zip(names, held_out_l2, strict=True)) | {
@@ -199,7 +199,10 @@ def _report(
     misfit = ""
     if pattern_p <= SIGNIFICANT:
         off = f" The kernel is off by {100 * error_l2:.2g} % where it was not captured; sigmas include that."
-        misfit = f"Residuals of diffraction have a pattern (p = {pattern_p:.1g}).{off if error.size else ''}"
+        numbered = f"{', '.join(name for name, *_ in _NUMBERS)} are numbers of a model that they refute"
+        misfit = (
+            f"Residuals of diffraction have a pattern (p = {pattern_p:.1g}): {numbered}.{off if error.size else ''}"
+        )
     return FitResult(
         name="psf",
         term=term,
@@ -293,5 +296,7 @@ def _notes(data: PsfData, diffracts: bool, misfit: str, support: tuple[str, ...]
             "chi2_dof is of the fit of diffraction and allows for the model error of its residuals.",
             *([misfit] if misfit else []),
         ]
+    if data.doubted:
+        notes.append(f"{len(data.doubted)} of {data.taken} brackets are in doubt. {data.doubted[0]}")
     left_out, why = data.dark + data.clipped, f"{data.dark} without an LED, {data.clipped} clipped."
     return (*notes, *support, *([f"{left_out} pictures were left out: {why}"] if left_out else []))

@@ -16,6 +16,7 @@ from udccal.fitting.psf.data import PsfData, PsfRules, Shots, joined
 from udccal.kernels import kernel_size
 from udccal.models.noise import Noise
 from udccal.models.wire import Wire, wire_values
+from udccal.result import FitStatus
 from udccal.sessions.schema import LedSubject, StoredStep
 from udccal.sessions.store import Session
 
@@ -42,13 +43,14 @@ def read_psf(session: Session, noise: Noise, wire: Wire, rules: PsfRules | None 
     """
     kernel, least = kernel_size(session.rig), (rules or PsfRules()).half_px
     half = window_half(session, (max(kernel[0] // 2, least[0]), max(kernel[1] // 2, least[1])))
-    crops, aims, dark, clipped = [], [], 0, 0
+    crops, aims, dark, clipped, doubted = [], [], 0, 0, list[str]()
     steps = session.steps("psf")
     for step in steps:
         subject = step.subject
         if not isinstance(subject, LedSubject):
             continue
-        crop, full = _read_shot(session, step, subject, noise, half)
+        crop, full, doubts = _read_shot(session, step, subject, noise, half)
+        doubted += doubts
         clipped += full
         dark += crop is None and not full
         if crop is not None:
@@ -56,7 +58,7 @@ def read_psf(session: Session, noise: Noise, wire: Wire, rules: PsfRules | None 
             aims.append((subject.x_px, subject.y_px))
     camera = session.rig.camera
     shots = _without_wire(joined(crops, np.array(aims)), wire, camera.rows, camera.columns) if crops else None
-    return PsfData(shots, len(steps), dark, clipped)
+    return PsfData(shots, len(steps), dark, clipped, tuple(doubted))
 
 
 def window_half(session: Session, largest: tuple[int, int]) -> tuple[int, int]:
@@ -78,8 +80,11 @@ def _without_wire(shots: Shots, wire: Wire, rows: int, columns: int) -> Shots:
 
 def _read_shot(
     session: Session, step: StoredStep, subject: LedSubject, noise: Noise, half: tuple[int, int]
-) -> tuple[Shots | None, bool]:
-    """Return the crop, and True if the LED is clipped in all exposures; only the part near the aim is merged."""
+) -> tuple[Shots | None, bool, list[str]]:
+    """Return the crop, True if the LED is clipped in all exposures, and what the merge says against the noise model.
+
+    Only the part near the aim is merged.
+    """
     region, aim = step.captures[0].region, (subject.x_px, subject.y_px)
     down = _part(aim[1] - region.y, half[0] + _SEARCH_PX + 2, region.rows)
     across = _part(aim[0] - region.x, half[1] + _SEARCH_PX + 2, region.columns)
@@ -91,11 +96,13 @@ def _read_shot(
     clipped = (merged.used == 0) & (frames[int(np.argmin(exposures_s))] >= 0.98 * float(noise.saturation_DN))
     # A hot pixel elsewhere does not belong to the LED.
     if clipped[tuple(_part(aim[i] - corner[i], _SEARCH_PX, clipped.shape[1 - i]) for i in (1, 0))].any():
-        return None, True
+        return None, True, []
     # The pupil is a few mm behind the panel: less than a percent of any useful distance.
     away_mm = subject.distance_mm + session.rig.mounting.standoff_mm.value
     disc_px = subject.diameter_mm / away_mm * session.rig.focal_px
-    return cut_crop(merged, corner, aim, session.rig.camera.cfa, half, disc_px, shot_noise(merged, noise)), False
+    doubts = [f"{step.id}: {' '.join(merged.notes)}"] if merged.status is FitStatus.POOR_FIT else []
+    crop = cut_crop(merged, corner, aim, session.rig.camera.cfa, half, disc_px, shot_noise(merged, noise))
+    return crop, False, doubts
 
 
 def _part(aim: float, reach: int, size: int) -> slice:

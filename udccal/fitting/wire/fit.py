@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from udccal.cfa import cfa_named
 from udccal.fitting.engine.gaussian import Posterior, square_root
-from udccal.fitting.engine.least_squares import minimise
+from udccal.fitting.engine.least_squares import SolverRules, minimise
 from udccal.fitting.engine.misfit import clustered_cov
 from udccal.fitting.wire.data import (
     BLOCK,
@@ -27,12 +27,13 @@ from udccal.fitting.wire.data import (
     over_blocks,
     sample_pixels,
     scaled_places,
+    weighed,
 )
-from udccal.fitting.wire.jacobian import block_jacobian, values_at, weighed_at
-from udccal.fitting.wire.parameters import Kind, Parameters, parameters_of, select
+from udccal.fitting.wire.jacobian import block_jacobian, values_at, weighed_at, with_harmonics
+from udccal.fitting.wire.parameters import Kind, Parameters, parameters_of, select, shape_vector, with_shape
 from udccal.fitting.wire.report import Joint, misfit, omitted, unseen, wire_result
 from udccal.fitting.wire.rules import WireRules, ideal_wire, possible_harmonics
-from udccal.fitting.wire.search import SOLVER, Found, Search, WireProblem
+from udccal.fitting.wire.search import SOLVER, Descent, Found, Search, WireProblem
 from udccal.models.geometry import Geometry
 from udccal.models.wire import Wire, wire_map
 from udccal.numerics import in_float64
@@ -40,12 +41,13 @@ from udccal.result import FitResult, FitStatus
 
 
 @in_float64
-def fit_wire(data: WireData, rules: WireRules | None = None) -> FitResult[Wire]:
+def fit_wire(data: WireData, rules: WireRules | None = None, start: Wire | None = None) -> FitResult[Wire]:
     """Fit the wire to an averaged flat.
 
     Args:
         data: see ``WireData``.
         rules: constants of the fit.
+        start: a wire of an earlier fit to go on from, instead of a search about the rig as built.
 
     Returns:
         the wire, whose map has a mean of 1, and its posterior: ``result.sigma_of`` gives the sigma of the map at any
@@ -61,7 +63,11 @@ def fit_wire(data: WireData, rules: WireRules | None = None) -> FitResult[Wire]:
         sample_pixels(values, data.geometry, max(int(part * rules.samples), 1), data.cfa)
         for part in (rules.search_part, rules.shape_part, 1.0)
     )
-    found = Search(data.start, noise, rules).found(data.geometry, few, coarse)
+    harmonics = possible_harmonics(data.start, rules.least_amplitude).orders
+    if start is not None and np.array_equal(start.harmonics, harmonics):
+        found = _resumed(start, coarse, data, noise, rules)
+    else:
+        found = Search(data.start, noise, rules).found(data.geometry, few, coarse)
     joint = _joint(found, every, data, noise, rules)
     tested, held_out = joint.seen, every.used < values.size / 2
     if held_out:
@@ -80,6 +86,23 @@ def fit_wire(data: WireData, rules: WireRules | None = None) -> FitResult[Wire]:
     model = float(np.hypot(off.sigma, left_out))
     posterior = _posterior(joint, jacobian, model)
     return wire_result(joint, off, left_out, jacobian.sigma(joint.cov, model), posterior, shape, rules)
+
+
+def _resumed(wire: Wire, many: Pixels, data: WireData, noise: FlatNoise, rules: WireRules) -> Found:
+    """The shape and the shading of an earlier fit as they are; its corrections of the pupil are chosen anew."""
+    ideal, gains = ideal_wire(data.geometry, data.start, wire.harmonics, rules), np.ones(noise.floor.size)
+    shaped = replace(with_shape(ideal, shape_vector(wire)), baseline=wire.baseline, amplitudes=wire.amplitudes)
+    whole, base = values_at(wire, many.ideal, many.scaled)
+    # The weights are those of the earlier fit's own map.
+    pixels, found = weighed(many, whole * base, noise).pixels, []
+    without, with_rows = (np.sum((many.value - of) ** 2 * pixels.weight) for of in (base, whole * base))
+    for sharpness in rules.sharpness:
+        one = with_harmonics(shaped, wire.harmonics, many.ideal, sharpness)
+        parameters = parameters_of(one, rules, gains.size)
+        problem = WireProblem("wire, resumed", parameters, pixels, parameters.prior(data.start, rules))
+        descent = Descent(problem, minimise(problem, parameters.vector(one, gains), SolverRules(iterations=0)))
+        found.append(Found(descent, pixels, float(without - with_rows) / descent.variance, sharpness))
+    return min(found, key=lambda one: one.descent.criterion)
 
 
 @in_float64
@@ -129,19 +152,21 @@ def _joint(found: Found, every: Pixels, data: WireData, noise: FlatNoise, rules:
     pixels = weighed_at(kept, x, every, noise).pixels
     problem = WireProblem("wire, joint", kept, pixels, kept.prior(data.start, rules))
     solution = minimise(problem, x, SOLVER)
+    ahead = solution.equations.step(0.0).shared
     # A last step whose expected gain is below the solver's limit is taken without a check of the cost.
-    x = solution.place + (solution.equations.step(0.0).shared if solution.converged else 0.0)
+    x = solution.place + (ahead if solution.converged else 0.0)
     seen = weighed_at(kept, x, every, noise)
     return Joint(
         problem=problem,
         x=x,
-        cov=solution.equations.cov(),
+        cov=solution.with_rest(solution.equations.cov(), ahead),
         variance=problem.variance(float(seen.z @ seen.z)),
         seen=seen,
         orders=orders,
-        converged=solution.converged and descent.solution.converged,
+        converged=solution.converged,
         iterations=descent.solution.iterations + solution.iterations,
         gain=found.gain,
+        sharpness=found.sharpness,
     )
 
 

@@ -91,10 +91,16 @@ def _axes(rotation: Float[np.ndarray, "3 3"], slope: Float[np.ndarray, "2 n"]) -
     return rotation[:2, :2].T[:, :, None] - slope * rotation[2, :2, None, None]
 
 
-def with_harmonics(wire: Wire, harmonics: Float[np.ndarray, "harmonics 2"], ideal: Float[np.ndarray, "n 2"]) -> Wire:
-    """The same shape with other harmonics (n, m) of a round pupil, and their ranges of kappa over a sample's points."""
+def with_harmonics(
+    wire: Wire, harmonics: Float[np.ndarray, "harmonics 2"], ideal: Float[np.ndarray, "n 2"], sharpness: float = 1.0
+) -> Wire:
+    """The same shape with other harmonics (n, m) of a round pupil, and their ranges of kappa over a sample's points.
+
+    ``sharpness`` is of the openings' edges: 1 for rectangular openings, 0 where only the first harmonics are left.
+    """
     fields = np.zeros((len(harmonics), *np.shape(wire.fields)[1:]))
-    fields[:, 0, 0, 0] = 1.0
+    # Normal blur of the edges multiplies harmonics by the exponential of -(n^2 + m^2).
+    fields[:, 0, 0, 0] = sharpness ** np.maximum((harmonics**2).sum(axis=1) - 1, 0)
     # The wire's rays do not depend on its harmonics.
     ellipse = rays_at(wire, ideal[:: max(len(ideal) // BLOCK, 1)][:BLOCK]).ellipse
     n, m = harmonics.T

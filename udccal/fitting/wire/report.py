@@ -153,7 +153,7 @@ class Joint:
     """A fitted wire: the problem that was solved, the parameters' values and covariance, and facts about the fit.
 
     ``variance`` is that of the residuals in units of the noise's, ``seen`` the pixels of the fit with their weights,
-    ``gain`` the chi-squared that the rows explained in the scan.
+    ``gain`` the chi-squared that the rows explained in the scan, ``sharpness`` that of the openings' edges.
     """
 
     problem: WireProblem
@@ -165,6 +165,7 @@ class Joint:
     converged: bool
     iterations: int
     gain: float
+    sharpness: float
 
     @property
     def parameters(self) -> Parameters:
@@ -252,6 +253,11 @@ def _notes(joint: Joint, found: Misfit, left_out: float, rules: WireRules) -> It
         yield "cov covers the shape parameters, as fitted together with all coefficients of the fields."
         prior = joint.problem.prior
         off = (prior.root @ (joint.x - prior.mean))[joint.parameters.linear :]
+        if joint.sharpness < 1:
+            yield (
+                "The rows lack the higher harmonics of rectangular openings: row_open and column_open describe the "
+                "strength of the first harmonics, not edges that a microscope would show."
+            )
         for name, sigmas in zip(SHAPE_NAMES, np.abs(off), strict=True):
             if sigmas > rules.doubted_sigma:
                 yield f"{name} is {sigmas * rules.widening:.0f} tolerances away from the rig description; check it."

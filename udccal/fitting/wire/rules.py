@@ -36,6 +36,7 @@ class WireRules:
         scan_steps: of the stand-off in periods at the edge of the field, and of the pupil in radians of z, the
             argument of its transform.
         places: most places of the scan from which descents start.
+        sharpness: of the openings' edges, to try; see ``with_harmonics``.
         rival: difference in minus twice the log posterior below which places may change their order with more pixels.
         unfinished: the same difference after the first steps.
         doubtful_variance: residual variance beyond which free amplitudes, which no pupil explains, are tried.
@@ -63,6 +64,7 @@ class WireRules:
     scan_range: tuple[float, float] = (0.64, 1.56)
     scan_steps: tuple[float, float] = (0.06, 0.8)
     places: int = 5
+    sharpness: tuple[float, ...] = (1.0, 0.5, 0.0)
     rival: float = 60.0
     unfinished: float = 400.0
     doubtful_variance: float = 1.15
