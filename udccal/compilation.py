@@ -52,17 +52,20 @@ def keep_compilations() -> None:
     if jax.config.values["jax_compilation_cache_dir"]:
         return
     folder = compilation_folder()
-    try:
-        # For its owner alone: what is read from it is run.
-        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        owner_only = folder.stat().st_mode & 0o022 == 0 and os.access(folder, os.W_OK)
-    except OSError:
-        return
-    if owner_only:
+    if private_folder(folder):
         jax.config.update("jax_compilation_cache_dir", str(folder))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", _LEAST_S)
         jax.config.update("jax_compilation_cache_max_size", _MOST_BYTES)
         jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
+
+
+def private_folder(folder: Path) -> bool:
+    """Make a folder, and return whether its owner alone may write to it: what is read from it is run, or trusted."""
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        return folder.stat().st_mode & 0o022 == 0 and os.access(folder, os.W_OK)
+    except OSError:
+        return False
 
 
 @final

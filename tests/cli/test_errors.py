@@ -28,6 +28,7 @@ FAILURES = {
     "no session": lambda tmp: (["fit", str(tmp / "absent"), "--profile", str(tmp / "p")], "Expected"),
     "broken session": lambda tmp: (["fit", str(broken_session(tmp / "s")), "--profile", str(tmp / "p")], "session"),
     "no profile": lambda tmp: (["profile", "show", str(tmp / "absent")], "profile.json"),
+    "nothing to prepare": lambda tmp: (["profile", "prepare", str(tmp / "absent")], "profile.json"),
     "no rig": lambda tmp: (
         ["calibrate", "--rig", "no-such-rig", "--session", str(tmp / "s"), "--profile", str(tmp / "p")],
         "lg55-reduced",

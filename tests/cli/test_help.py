@@ -23,6 +23,7 @@ VERBS = (
     ["simulate"],
     ["profile"],
     ["profile", "show"],
+    ["profile", "prepare"],
 )
 # typer itself loads pydantic, which is quick
 HEAVY = ("jax", "numpy", "cv2", "matplotlib", "scipy", "equinox", "rawpy", "OpenEXR")

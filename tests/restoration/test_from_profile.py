@@ -9,49 +9,11 @@ import numpy as np
 import pytest
 
 from udccal.errors import RestorationError
-from udccal.fitting.absent import absent_backscatter, absent_psf, absent_wire
-from udccal.fitting.nominal import nominal_geometry
-from udccal.fitting.wire.fit import sensor_map
-from udccal.models.noise import Noise
-from udccal.profiles.profile import Profile, build_profile
-from udccal.profiles.provenance import provenance_now
+from udccal.profiles.profile import Profile
 from udccal.profiles.store import read_profile, write_profile
 from udccal.restoration.plan import PlanOptions
 from udccal.restoration.runtime import Restorer
 from udccal.result import FitResult, FitStatus
-from udccal.rig import RigDescription
-
-
-@pytest.fixture(scope="module")
-def small_rig(toy_rig: RigDescription) -> RigDescription:
-    """As small as the rig of the profiles' tests, so that the terms are compiled once for both."""
-    camera = toy_rig.camera.model_copy(update={"columns": 96, "rows": 64, "pitch_um": 69.0})
-    panel = toy_rig.panel.model_copy(update={"columns": 32, "rows": 24})
-    return toy_rig.model_copy(update={"camera": camera, "panel": panel})
-
-
-@pytest.fixture(scope="module")
-def profile(small_rig: RigDescription, toy_noise: Noise) -> Profile:
-    geometry = nominal_geometry(small_rig)
-    point = absent_psf(small_rig, geometry)
-    residual = np.pad(np.asarray(point.residual), ((0, 0), (0, 0), (7, 7), (7, 7)))
-    dark = absent_backscatter(small_rig, geometry)
-    lit = type(dark)(**{**vars(dark), "mask": np.full(np.shape(dark.mask), 2.0e4), "window": 24})
-
-    def fitted(term: object) -> FitResult:
-        return FitResult("test", term, FitStatus.CONVERGED, (), np.zeros((0, 0)), 1.0, 100)
-
-    wire = absent_wire(small_rig, geometry)
-    return build_profile(
-        small_rig,
-        provenance_now(None, None),
-        noise=fitted(toy_noise),
-        geometry=fitted(geometry),
-        wire=fitted(wire),
-        psf=fitted(type(point)(**{**vars(point), "residual": residual})),
-        backscatter=fitted(lit),
-        wire_map=sensor_map(wire, small_rig.camera.rows, small_rig.camera.columns),
-    )
 
 
 def test_a_stored_profile_restores_a_frame(profile: Profile, tmp_path: Path) -> None:

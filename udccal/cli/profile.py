@@ -1,4 +1,4 @@
-"""``udccal profile``: shows what a profile holds."""
+"""``udccal profile``: shows what a profile holds, and prepares restoration with it."""
 
 from __future__ import annotations
 
@@ -7,20 +7,34 @@ from typing import Annotated
 
 import typer
 
-profile_app = typer.Typer(help="Show what a profile holds.", no_args_is_help=True, pretty_exceptions_enable=False)
+from udccal.restoration.tiers import Tier
 
-
-@profile_app.callback()
-def profile() -> None:
-    """Show what a profile holds."""
+profile_app = typer.Typer(
+    help="Show what a profile holds, or prepare it.", no_args_is_help=True, pretty_exceptions_enable=False
+)
+ProfileArgument = Annotated[
+    Path, typer.Argument(metavar="PROFILE", help="The profile's folder or zip file, or a rig's name.")
+]
 
 
 @profile_app.command(no_args_is_help=True)
 def show(
     context: typer.Context,
-    path: Annotated[Path, typer.Argument(metavar="PROFILE", help="The profile's folder or zip file, or a rig's name.")],
+    path: ProfileArgument,
 ) -> None:
     """Show what a profile holds: every term's status, and every quantity with its unit and sigma."""
     from udccal.cli.jobs.show import show_profile
 
     show_profile(context.obj, path)
+
+
+@profile_app.command(no_args_is_help=True)
+def prepare(
+    context: typer.Context,
+    path: ProfileArgument,
+    tier: Annotated[Tier, typer.Option("--tier", help="How much restoration does to a frame.")] = Tier.balanced,
+) -> None:
+    """Compute what restoration needs of a profile and keep it, so that the next ``udccal restore`` starts quickly."""
+    from udccal.cli.jobs.prepare import prepare_profile
+
+    prepare_profile(context.obj, path, tier)

@@ -75,9 +75,9 @@ class PanelResponse(eqx.Module):
     """
 
     term: Backscatter
-    shares: Float[Array, "positions window2 3"]
-    pixels: Int[Array, "positions window2"]
-    gain: Float[Array, "3 positions"]
+    shares: Float[Arrayish, "positions window2 3"]
+    pixels: Int[Arrayish, "positions window2"]
+    gain: Float[Arrayish, "3 positions"]
 
 
 def grid_positions(

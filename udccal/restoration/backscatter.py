@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, final
 
 import jax
 import numpy as np
-from jaxtyping import Float, Float32, UInt8
+from jaxtyping import Float, Float32, Int, UInt8
 
 from udccal.cfa import cfa_named
 from udccal.errors import RestorationError
 from udccal.models.backscatter import Backscatter, PanelResponse, panel_response, response_rate
 from udccal.numerics import in_float64
+from udccal.restoration.prepared import kept
 from udccal.rig import RigDescription
 
 # Side in samples of the blocks that give the level: large enough to average noise, small enough to find dark places.
@@ -19,20 +22,41 @@ _BLOCK = 16
 _PERCENTILE = 1.0
 
 
+@final
+@dataclass(frozen=True)
+class _Evaluated:
+    """The arrays of a ``PanelResponse`` beside its term."""
+
+    shares: Float32[np.ndarray, "positions window2 3"]
+    pixels: Int[np.ndarray, "positions window2"]
+    gain: Float32[np.ndarray, "3 positions"]
+
+
 @in_float64
-def prepared_response(term: Backscatter, rig: RigDescription) -> PanelResponse:
+def prepared_response(term: Backscatter, rig: RigDescription, keep: Path | None = None) -> PanelResponse:
     """Evaluate the term for the rig's panel, as float32 numpy arrays.
+
+    Args:
+        term: the backscatter term.
+        rig: the rig description.
+        keep: folder that keeps the result between starts; None to keep nothing.
 
     Raises:
         RestorationError: when a value is not finite.
     """
-    response = jax.tree.map(_single, panel_response(term, rig.panel.rows, rig.panel.columns))
-    if not (np.all(np.isfinite(response.shares)) and np.all(np.isfinite(response.gain))):
+    found = kept(keep, _Evaluated, (term, rig), lambda: _evaluated(term, rig))
+    return PanelResponse(jax.tree.map(_single, term), found.shares, found.pixels, found.gain)
+
+
+def _evaluated(term: Backscatter, rig: RigDescription) -> _Evaluated:
+    response = panel_response(term, rig.panel.rows, rig.panel.columns)
+    found = _Evaluated(_single(response.shares), _single(response.pixels), _single(response.gain))
+    if not (np.all(np.isfinite(found.shares)) and np.all(np.isfinite(found.gain))):
         raise RestorationError(
             "Expected a footprint of the pupil on the panel for every pixel, found places without one. Check the "
             "backscatter and geometry terms, or calibrate the rig again."
         )
-    return response
+    return found
 
 
 def _single(leaf: Any) -> np.ndarray:

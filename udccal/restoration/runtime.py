@@ -6,7 +6,7 @@ Units: a restored picture is linear light in e-/s of each camera colour, on the 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -16,12 +16,15 @@ from udccal.errors import RestorationError
 from udccal.models.backscatter import PanelResponse
 from udccal.models.geometry import VirtualView
 from udccal.models.noise import Noise
+from udccal.models.psf import PsfField
 from udccal.profiles.profile import Profile
 from udccal.profiles.store import load_profile
 from udccal.restoration.backscatter import estimated_rate, known_rate, mask_mosaic, prepared_response
 from udccal.restoration.demosaic import demosaic
 from udccal.restoration.linear import saturated, to_electrons, variance_e2, without_defects
+from udccal.restoration.lowrank import KernelGrid
 from udccal.restoration.plan import PlanOptions, kernel_grid
+from udccal.restoration.prepared import kept
 from udccal.restoration.rectify import Rectification
 from udccal.restoration.sharpen import Sharpener
 from udccal.restoration.tiers import Tier
@@ -64,19 +67,27 @@ class Restorer:
 
     @classmethod
     def load(
-        cls, profile: str | Path, tier: Tier = Tier.balanced, options: PlanOptions | None = None
+        cls,
+        profile: str | Path,
+        tier: Tier = Tier.balanced,
+        options: PlanOptions | None = None,
+        keep: Path | None = None,
     ) -> Restorer:
-        """Read a profile, by path or by the name of a rig that has one, and prepare it.
+        """Read a profile, by path or by the name of a rig that has one, and prepare it as ``from_profile`` does.
 
         Raises:
             ProfileError: when it cannot be read.
             RestorationError: as ``from_profile``.
         """
-        return cls.from_profile(load_profile(profile), tier, options)
+        return cls.from_profile(load_profile(profile), tier, options, keep)
 
     @classmethod
     def from_profile(
-        cls, profile: Profile, tier: Tier = Tier.balanced, options: PlanOptions | None = None
+        cls,
+        profile: Profile,
+        tier: Tier = Tier.balanced,
+        options: PlanOptions | None = None,
+        keep: Path | None = None,
     ) -> Restorer:
         """Prepare a profile.
 
@@ -84,6 +95,8 @@ class Restorer:
             profile: the rig as measured.
             tier: how much is done to a frame.
             options: accuracy against time within the tier.
+            keep: folder that keeps what is computed, so that the next start of a program reads it instead; None to
+                keep nothing. ``prepared_folder()`` is the one of the ``udccal`` command.
 
         Raises:
             RestorationError: when its geometry leaves no view through the panel, or a term gives values that are not
@@ -107,10 +120,12 @@ class Restorer:
             mask=None
             if unscattered
             else mask_mosaic(profile.backscatter_mask, camera.cfa, camera.rows, camera.columns),
-            response=None if quick or unscattered else prepared_response(profile.backscatter.term, rig),
+            response=None if quick or unscattered else prepared_response(profile.backscatter.term, rig, keep),
             sharpener=None
             if unblurred
-            else Sharpener.of(kernel_grid(profile.psf.term, rig, options), rig, rectification.rows, tier, options),
+            else Sharpener.of(
+                _kept_grid(profile.psf.term, rig, options, keep), rig, rectification.rows, tier, options, keep
+            ),
             rectification=rectification,
             options=options,
         )
@@ -166,6 +181,11 @@ class Restorer:
         if panel_picture is None or self.response is None:
             return estimated_rate(signal / np.float32(exposure_s), self.mask, self.rig.camera.cfa)
         return known_rate(self.response, panel_picture)
+
+
+def _kept_grid(psf: PsfField, rig: RigDescription, options: PlanOptions, keep: Path | None) -> KernelGrid:
+    """Return ``kernel_grid``; the number of threads does not matter to what is kept."""
+    return kept(keep, KernelGrid, (psf, rig, replace(options, workers=1)), lambda: kernel_grid(psf, rig, options))
 
 
 def check_frame(mosaic: np.ndarray, exposure_s: float, rig: RigDescription) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass
+from pathlib import Path
 from typing import final
 
 import cv2
@@ -15,6 +16,7 @@ from udccal.restoration.highlights import Highlights
 from udccal.restoration.lowrank import KernelGrid
 from udccal.restoration.mosaic_filter import FilterTables, filter_tables, filtered
 from udccal.restoration.plan import PlanOptions
+from udccal.restoration.prepared import kept
 from udccal.restoration.shrink import BandNoise, measured_noise, shrunk
 from udccal.restoration.tiers import Tier
 from udccal.restoration.tiles import TileLayout, layout_for
@@ -52,7 +54,13 @@ class Sharpener:
 
     @classmethod
     def of(
-        cls, grid: KernelGrid, rig: RigDescription, rows: tuple[int, int], tier: Tier, options: PlanOptions
+        cls,
+        grid: KernelGrid,
+        rig: RigDescription,
+        rows: tuple[int, int],
+        tier: Tier,
+        options: PlanOptions,
+        keep: Path | None = None,
     ) -> Sharpener:
         """Prepare the filters of a tier.
 
@@ -62,12 +70,16 @@ class Sharpener:
             rows: first row of the sensor that the view needs, and the row after the last one.
             tier: fast or balanced.
             options: options of the restoration.
+            keep: folder that keeps tables and noise between starts; None to keep nothing.
         """
         camera, cfa = rig.camera, cfa_named(rig.camera.cfa)
         size = options.tile_rows, options.tile_columns
         layout = layout_for(camera.rows, camera.columns, (cfa.rows, cfa.columns), size, rows)
-        tables = filter_tables(grid, layout, cfa, options.workers)
-        noise = measured_noise(tables, layout, cfa, options.workers) if tier is Tier.balanced else None
+        source = grid, layout, cfa
+        tables = kept(keep, FilterTables, source, lambda: filter_tables(*source, options.workers))
+        noise = None
+        if tier is Tier.balanced:
+            noise = kept(keep, BandNoise, source, lambda: measured_noise(tables, layout, cfa, options.workers))
         return cls(grid, rig, layout, tables, noise, options)
 
     @property

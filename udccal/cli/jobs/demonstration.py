@@ -32,6 +32,7 @@ from udccal.reports.report import calibration_page, gather, scene_table
 from udccal.reports.tables import Table
 from udccal.reports.truth import TruthRow, truth_table
 from udccal.restoration.plan import PlanOptions
+from udccal.restoration.prepared import prepared_folder
 from udccal.restoration.runtime import Restorer
 from udccal.restoration.sinks import write_picture
 from udccal.restoration.tone import Tone, display_exposure
@@ -144,7 +145,7 @@ def _restore_portrait(
 ) -> PictureComparison:
     """Capture the photograph and restore it with the stored profile; write the frames and pictures."""
     with output.stage("restorer"):
-        restorer = Restorer.load(out / "profile", _PLAN)
+        restorer = Restorer.load(out / "profile", options=_PLAN, keep=prepared_folder())
     with output.stage("photograph through the rig"):
         scene = capture_photograph(world, _ROOM_LIGHT * portrait(), restorer.view, panel_picture)
     with output.stage("restoration"):

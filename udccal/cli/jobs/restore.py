@@ -17,6 +17,7 @@ from udccal.errors import RestorationError
 from udccal.io.limits import Shape
 from udccal.io.png import read_png16
 from udccal.profiles.store import load_profile
+from udccal.restoration.prepared import prepared_folder
 from udccal.restoration.runtime import Restorer, check_frame
 from udccal.restoration.sinks import write_picture
 from udccal.restoration.tone import Tone, display_exposure
@@ -75,7 +76,7 @@ def restore_files(
         _checked_frame(image, exposure_s, profile.rig)
     restored: list[RestoredFile] = []
     with output.stage("restoring") as stage:
-        restorer = Restorer.from_profile(profile)
+        restorer = Restorer.from_profile(profile, keep=prepared_folder())
         for index, (image, target) in enumerate(zip(images, targets, strict=True)):
             stage.update(index, len(images), f"restoring {image.name}")
             mosaic, exposure = _checked_frame(image, exposure_s, profile.rig)

@@ -1,0 +1,332 @@
+"""What is kept between starts is read again, and is made anew whenever it may not be right."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import os
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from jaxtyping import Float32, Int
+
+from udccal.profiles.profile import Profile
+from udccal.restoration import backscatter, prepared, runtime, sharpen
+from udccal.restoration.backscatter import known_rate, prepared_response
+from udccal.restoration.plan import PlanOptions
+from udccal.restoration.prepared import kept, prepared_bytes, prepared_folder
+from udccal.restoration.runtime import Restorer
+from udccal.restoration.sharpen import Sharpener
+from udccal.restoration.tiers import Tier
+
+_OPTIONS = PlanOptions(grid_rows=2, grid_columns=2, pad_rows=8, pad_columns=8, tile_rows=128, tile_columns=128)
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Some arrays."""
+
+    values: Float32[np.ndarray, "n 2"]
+    places: Int[np.ndarray, " n"]
+
+
+def pair(value: float) -> Pair:
+    return Pair(np.full((500, 2), value, np.float32), np.arange(500))
+
+
+class Maker:
+    """Makes pairs, and counts them."""
+
+    def __init__(self) -> None:
+        self.made = 0
+
+    def __call__(self) -> Pair:
+        self.made += 1
+        return pair(float(self.made))
+
+
+def entry(folder: Path) -> Path:
+    (path,) = folder.iterdir()
+    return path
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    return tmp_path / "kept"
+
+
+# ---- entries
+
+
+def test_an_entry_is_read_again(folder: Path) -> None:
+    make = Maker()
+    first = kept(folder, Pair, (1, "a"), make)
+    again = kept(folder, Pair, (1, "a"), make)
+    assert make.made == 1
+    assert np.array_equal(first.values, again.values)
+    assert np.array_equal(first.places, again.places)
+    assert folder.stat().st_mode & 0o077 == 0
+    assert prepared_bytes(folder) == entry(folder).stat().st_size > first.values.nbytes + first.places.nbytes
+
+
+def test_without_a_folder_nothing_is_kept() -> None:
+    make = Maker()
+    kept(None, Pair, (1,), make)
+    kept(None, Pair, (1,), make)
+    assert make.made == 2
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        (1, "a", np.zeros(3), _OPTIONS),
+        (1.0, "a", np.zeros(2), _OPTIONS),
+        (1, "b", np.zeros(2), _OPTIONS),
+        (1, "a", np.zeros((2, 1)), _OPTIONS),
+        (1, "a", np.full(2, 1e-30), _OPTIONS),
+        (1, "a", np.zeros(2), replace(_OPTIONS, grid_rows=3)),
+        (1, ("a", np.zeros(2)), _OPTIONS),
+    ],
+)
+def test_whatever_differs_is_made_anew(folder: Path, other: tuple[object, ...]) -> None:
+    make = Maker()
+    kept(folder, Pair, (1, "a", np.zeros(2), _OPTIONS), make)
+    kept(folder, Pair, other, make)
+    assert make.made == 2
+
+
+def test_other_code_makes_anew(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    make = Maker()
+    kept(folder, Pair, (1,), make)
+    monkeypatch.setattr(prepared, "_code", lambda: "changed")
+    kept(folder, Pair, (1,), make)
+    assert make.made == 2
+
+
+def test_the_precision_of_equal_numbers_does_not_matter(folder: Path) -> None:
+    make = Maker()
+    kept(folder, Pair, (np.float32([0.5, 2.0]),), make)
+    kept(folder, Pair, (np.float64([0.5, 2.0]),), make)
+    assert make.made == 1
+
+
+def test_what_has_no_bytes_of_its_own_is_refused(folder: Path) -> None:
+    with pytest.raises(TypeError, match="expected a number"):
+        kept(folder, Pair, (object(),), Maker())
+
+
+def forged(*arrays: np.ndarray) -> Callable[[bytes], bytes]:
+    """An entry with a right checksum."""
+    stream = io.BytesIO()
+    for array in arrays:
+        np.save(stream, array)
+    content = hashlib.sha256(stream.getvalue()).digest() + stream.getvalue()
+    return lambda _: content
+
+
+GOOD = pair(9.0)
+DAMAGES: dict[str, Callable[[bytes], bytes]] = {
+    "empty": lambda _: b"",
+    "cut": lambda found: found[: len(found) // 2],
+    "cut in the checksum": lambda found: found[:10],
+    "one bit": lambda found: found[:1000] + bytes([found[1000] ^ 1]) + found[1001:],
+    "one bit of a header": lambda found: found[:80] + bytes([found[80] ^ 4]) + found[81:],
+    "foreign": lambda _: b"PK\x03\x04 something else entirely" * 100,
+    "an array too few": forged(GOOD.values),
+    "another type": forged(GOOD.values.astype(np.float64), GOOD.places),
+    "another number of axes": forged(GOOD.values[0], GOOD.places),
+    "another size": forged(GOOD.values[:, :1], GOOD.places),
+    "sizes that disagree": forged(GOOD.values, GOOD.places[:-1]),
+    "not a number": forged(GOOD.values * np.float32(np.nan), GOOD.places),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGES.values(), ids=DAMAGES)
+def test_a_damaged_entry_is_made_anew(folder: Path, damage: Callable[[bytes], bytes]) -> None:
+    make = Maker()
+    kept(folder, Pair, (1,), make)
+    path = entry(folder)
+    path.write_bytes(damage(path.read_bytes()))
+    assert kept(folder, Pair, (1,), make).values[0, 0] == 2.0
+    assert kept(folder, Pair, (1,), make).values[0, 0] == 2.0
+    assert make.made == 2
+
+
+def test_an_entry_that_runs_code_is_not_run(folder: Path) -> None:
+    kept(folder, Pair, (1,), Maker())
+    stream, ran = io.BytesIO(), folder / "ran"
+
+    class Trap:
+        def __reduce__(self) -> tuple[object, tuple[str]]:
+            return os.mkdir, (str(ran),)
+
+    np.save(stream, np.array([Trap()], dtype=object), allow_pickle=True)
+    entry(folder).write_bytes(hashlib.sha256(stream.getvalue()).digest() + stream.getvalue())
+    make = Maker()
+    kept(folder, Pair, (1,), make)
+    assert make.made == 1
+    assert not ran.exists()
+
+
+def test_a_forged_entry_of_right_arrays_would_be_read(folder: Path) -> None:
+    """So the refusals above are of what they name."""
+    kept(folder, Pair, (1,), Maker())
+    entry(folder).write_bytes(forged(GOOD.values, GOOD.places)(b""))
+    assert kept(folder, Pair, (1,), Maker()).values[0, 0] == 9.0
+
+
+def test_the_oldest_use_goes_first(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    kept(folder, Pair, (0,), Maker())
+    size = prepared_bytes(folder)
+    monkeypatch.setattr(prepared, "_MOST_BYTES", 3 * size)
+    kept(folder, Pair, (1,), Maker())
+    (folder / ".left-by-a-killed-program.partial.prepared").write_bytes(bytes(size))
+    for index, path in enumerate(sorted(folder.iterdir(), key=lambda path: (path.name.startswith("Pair"), path.name))):
+        os.utime(path, (index, index))
+    oldest, youngest = sorted(folder.glob("Pair*"), key=lambda path: path.stat().st_mtime)
+    first = (0,) if str(prepared._key(Pair, (0,))) in oldest.name else (1,)
+    kept(folder, Pair, first, Maker())  # is used, and so is the youngest now
+    kept(folder, Pair, (2,), Maker())
+    assert prepared_bytes(folder) == 3 * size
+    kept(folder, Pair, (3,), Maker())
+    left = {path.name for path in folder.iterdir()}
+    assert len(left) == 3
+    assert oldest.name in left
+    assert youngest.name not in left
+
+
+def test_what_alone_is_too_large_is_not_kept(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(prepared, "_MOST_BYTES", 1000)
+    assert kept(folder, Pair, (1,), Maker()).values[0, 0] == 1.0
+    assert prepared_bytes(folder) == 0
+
+
+def test_a_folder_that_cannot_be_made_costs_time_only(tmp_path: Path) -> None:
+    (tmp_path / "file").write_bytes(b"")
+    assert kept(tmp_path / "file" / "kept", Pair, (1,), Maker()).values[0, 0] == 1.0
+    assert prepared_bytes(tmp_path / "absent") == 0
+
+
+def test_a_full_disk_costs_time_only(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object, **__: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(np, "save", full)
+    assert kept(folder, Pair, (1,), Maker()).values[0, 0] == 1.0
+    assert list(folder.iterdir()) == []
+
+
+def test_a_folder_that_others_may_write_is_not_read(folder: Path) -> None:
+    make = Maker()
+    kept(folder, Pair, (1,), make)
+    folder.chmod(0o777)
+    kept(folder, Pair, (1,), make)
+    assert make.made == 2
+
+
+def test_the_folder_is_beside_the_compilations(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("UDCCAL_COMPILATIONS", str(tmp_path))
+    assert prepared_folder() == tmp_path / "prepared"
+
+
+# ---- profiles
+
+
+def _refuse(monkeypatch: pytest.MonkeyPatch, *names: str) -> None:
+    """Let these computations fail."""
+    for module, name in (
+        (runtime, "kernel_grid"),
+        (sharpen, "filter_tables"),
+        (sharpen, "measured_noise"),
+        (backscatter, "panel_response"),
+    ):
+        if name in names:
+            monkeypatch.setattr(module, name, lambda *_, name=name: pytest.fail(f"computed {name}"))
+
+
+def _changed_psf(profile: Profile) -> Profile:
+    psf = profile.psf.term
+    changed = replace(psf, residual=np.asarray(psf.residual) + 1e-4)
+    return replace(profile, psf=replace(profile.psf, term=changed))
+
+
+@pytest.fixture(scope="module")
+def filled(profile: Profile, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Restorer]:
+    """A folder in which everything is kept, and the restorer that computed it."""
+    folder = tmp_path_factory.mktemp("kept", numbered=True)
+    return folder, Restorer.from_profile(profile, Tier.balanced, _OPTIONS, folder)
+
+
+def test_the_second_start_computes_nothing(
+    profile: Profile, filled: tuple[Path, Restorer], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder, first = filled
+    _refuse(monkeypatch, "kernel_grid", "filter_tables", "measured_noise", "panel_response")
+    second = Restorer.from_profile(profile, Tier.balanced, replace(_OPTIONS, workers=1), folder)
+    assert isinstance(first.sharpener, Sharpener)
+    assert isinstance(second.sharpener, Sharpener)
+    for part in ("grid", "tables", "noise"):
+        one, other = vars(getattr(first.sharpener, part)), vars(getattr(second.sharpener, part))
+        assert all(np.array_equal(one[name], other[name]) for name in one)
+    assert second.response is not None
+
+
+def test_a_kept_response_gives_the_terms_light(profile: Profile, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    rig = profile.rig
+    pitch_mm, term = rig.panel.pitch_mm.value, profile.backscatter.term
+    before_panel = replace(term.geometry, pupil_mm=np.array([16 * pitch_mm, 12 * pitch_mm, -14.0]))
+    term = replace(term, geometry=before_panel)
+    shown = np.random.default_rng(5).integers(0, 256, (rig.panel.rows, rig.panel.columns, 3)).astype(np.uint8)
+    expected = known_rate(prepared_response(term, rig), shown)
+    assert expected.mean() > 100
+    prepared_response(term, rig, folder)
+    _refuse(monkeypatch, "panel_response")
+    assert np.array_equal(known_rate(prepared_response(term, rig, folder), shown), expected)
+
+
+def test_tiers_share_what_both_need(
+    profile: Profile, filled: tuple[Path, Restorer], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _refuse(monkeypatch, "kernel_grid", "filter_tables", "panel_response")
+    Restorer.from_profile(profile, Tier.fast, _OPTIONS, filled[0])
+
+
+def test_a_changed_psf_computes_its_kernels_anew(
+    profile: Profile, filled: tuple[Path, Restorer], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _refuse(monkeypatch, "kernel_grid", "panel_response")
+    with pytest.raises(pytest.fail.Exception, match="kernel_grid"):
+        Restorer.from_profile(_changed_psf(profile), Tier.fast, _OPTIONS, filled[0])
+
+
+def test_changed_kernels_compute_their_tables_anew(
+    profile: Profile, filled: tuple[Path, Restorer], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder, restorer = filled
+    _refuse(monkeypatch, "filter_tables")
+    assert restorer.sharpener is not None
+    grid, rows = restorer.sharpener.grid, restorer.rectification.rows
+    Sharpener.of(grid, profile.rig, rows, Tier.fast, _OPTIONS, folder)
+    changed = replace(grid, kernels=grid.kernels * np.float32(1.001))
+    with pytest.raises(pytest.fail.Exception, match="filter_tables"):
+        Sharpener.of(changed, profile.rig, rows, Tier.fast, _OPTIONS, folder)
+
+
+def test_other_options_compute_anew(
+    profile: Profile, filled: tuple[Path, Restorer], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _refuse(monkeypatch, "kernel_grid")
+    with pytest.raises(pytest.fail.Exception, match="kernel_grid"):
+        Restorer.from_profile(profile, Tier.fast, replace(_OPTIONS, grid_columns=3), filled[0])
+
+
+def test_libraries_keep_nothing_unasked(
+    profile: Profile, filled: tuple[Path, Restorer], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("UDCCAL_COMPILATIONS", str(filled[0].parent))
+    _refuse(monkeypatch, "kernel_grid")
+    with pytest.raises(pytest.fail.Exception, match="kernel_grid"):
+        Restorer.from_profile(profile, Tier.fast, _OPTIONS)
