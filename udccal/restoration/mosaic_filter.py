@@ -107,7 +107,9 @@ def _tables_of(
     )
 
 
-def _transfer(kernels: Float[np.ndarray, "3 ky kx"], rows: int, columns: int) -> Complex128[np.ndarray, "3 rows columns"]:
+def _transfer(
+    kernels: Float[np.ndarray, "3 ky kx"], rows: int, columns: int
+) -> Complex128[np.ndarray, "3 rows columns"]:
     """Return the Fourier transform of kernels whose origin is their middle; a larger kernel wraps around."""
     placed = np.zeros((_CHANNELS, rows, columns))
     ky, kx = kernels.shape[1:]
@@ -208,7 +210,9 @@ def _solve(
     whole = _whole_plane(weighted, rows, columns, cfa)
     phases = [jnp.conj(jnp.asarray(p[:, : columns // 2 + 1], matched.dtype)) for p in _phases(rows, columns, cfa)]
     at_site = [whole[index] * phase for index, phase in enumerate(phases)]
-    per_colour = [sum(a for a, c in zip(at_site, channels, strict=True) if c == channel) for channel in range(_CHANNELS)]
+    per_colour = [
+        sum(a for a, c in zip(at_site, channels, strict=True) if c == channel) for channel in range(_CHANNELS)
+    ]
     by_colour = jnp.stack([matched[c] * part for c, part in enumerate(per_colour)])
     grey = by_colour.sum(axis=0) * (1 - _COLOURFUL / _CHANNELS)
     picture = jnp.fft.irfft2(_COLOURFUL * by_colour + grey, s=(rows, columns))

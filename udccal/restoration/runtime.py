@@ -24,10 +24,10 @@ from udccal.restoration.linear import saturated, to_electrons, variance_e2, with
 from udccal.restoration.plan import PlanOptions, kernel_grid
 from udccal.restoration.rectify import Rectification
 from udccal.restoration.sharpen import Sharpener
-from udccal.restoration.tiers import Tier
 from udccal.restoration.view import inscribed_view
 from udccal.result import FitStatus
 from udccal.rig import RigDescription
+from udccal.tiers import Tier
 
 Mosaic = Float32[np.ndarray, "rows columns"]
 Picture = Float32[np.ndarray, "rows columns 3"]
@@ -63,9 +63,7 @@ class Restorer:
     options: PlanOptions
 
     @classmethod
-    def load(
-        cls, profile: str | Path, tier: Tier = Tier.balanced, options: PlanOptions | None = None
-    ) -> Restorer:
+    def load(cls, profile: str | Path, tier: Tier = Tier.balanced, options: PlanOptions | None = None) -> Restorer:
         """Read a profile, by path or by the name of a rig that has one, and prepare it.
 
         Raises:
@@ -75,9 +73,7 @@ class Restorer:
         return cls.from_profile(load_profile(profile), tier, options)
 
     @classmethod
-    def from_profile(
-        cls, profile: Profile, tier: Tier = Tier.balanced, options: PlanOptions | None = None
-    ) -> Restorer:
+    def from_profile(cls, profile: Profile, tier: Tier = Tier.balanced, options: PlanOptions | None = None) -> Restorer:
         """Prepare a profile.
 
         Args:

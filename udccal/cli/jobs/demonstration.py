@@ -144,7 +144,7 @@ def _restore_portrait(
 ) -> PictureComparison:
     """Capture the photograph and restore it with the stored profile; write the frames and pictures."""
     with output.stage("restorer"):
-        restorer = Restorer.load(out / "profile", _PLAN)
+        restorer = Restorer.load(out / "profile", options=_PLAN)
     with output.stage("photograph through the rig"):
         scene = capture_photograph(world, _ROOM_LIGHT * portrait(), restorer.view, panel_picture)
     with output.stage("restoration"):
