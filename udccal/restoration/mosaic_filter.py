@@ -114,7 +114,8 @@ def _transfer(
     placed = np.zeros((_CHANNELS, rows, columns))
     ky, kx = kernels.shape[1:]
     at_y, at_x = (np.arange(ky) - ky // 2) % rows, (np.arange(kx) - kx // 2) % columns
-    np.add.at(placed, (slice(None), at_y[:, None], at_x), kernels)
+    for plane, kernel in zip(placed, kernels, strict=True):
+        np.add.at(plane, (at_y[:, None], at_x), kernel)
     return fft.fft2(placed)
 
 
@@ -183,7 +184,8 @@ def _solve_chunk(
     taper: Float32[Array, "rows columns"],
     cfa: Cfa,
 ) -> tuple[Float32[Array, "tiles 3 rows columns"], Float32[Array, " tiles"]]:
-    return jax.vmap(lambda *tile: _solve(*tile, taper, cfa))(tiles, noise_e, choices, matched, vectors, values)
+    every = (0, 0, 0, 0, 0, 0, None)
+    return jax.vmap(partial(_solve, cfa=cfa), in_axes=every)(tiles, noise_e, choices, matched, vectors, values, taper)
 
 
 def _solve(

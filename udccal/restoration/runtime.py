@@ -140,7 +140,7 @@ class Restorer:
             signal /= self.wire
             variance /= self.wire**2
         if self.mask is not None:
-            signal -= np.float32(exposure_s) * self._backscatter_rate(signal, exposure_s, panel_picture)
+            signal -= np.float32(exposure_s) * self._backscatter_rate(signal, self.mask, exposure_s, panel_picture)
         if self.sharpener is None:
             sharp = demosaic(signal, self.rig.camera.cfa)
         else:
@@ -156,11 +156,12 @@ class Restorer:
     def _backscatter_rate(
         self,
         signal: Mosaic,
+        mask: Mosaic,
         exposure_s: float,
         panel_picture: UInt8[np.ndarray, "panel_rows panel_columns 3"] | None,
     ) -> Mosaic:
         if panel_picture is None or self.response is None:
-            return estimated_rate(signal / np.float32(exposure_s), self.mask, self.rig.camera.cfa)
+            return estimated_rate(signal / np.float32(exposure_s), mask, self.rig.camera.cfa)
         return known_rate(self.response, panel_picture)
 
 
