@@ -11,7 +11,7 @@ from udccal.cli.jobs.prepare import prepare_profile
 from udccal.cli.output import Output
 from udccal.errors import RestorationError
 from udccal.restoration.runtime import Restorer
-from udccal.restoration.tiers import Tier
+from udccal.tiers import Tier
 
 
 @pytest.fixture(autouse=True)

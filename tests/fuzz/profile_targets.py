@@ -46,7 +46,7 @@ T = TypeVar("T")
 
 _CHANGE = struct.Struct("<HHHH")
 # One field position and little beyond the frame: what is tried here is numbers, not accuracy.
-_OPTIONS = PlanOptions(grid_rows=1, grid_columns=1, pad_rows=8, pad_columns=8, workers=1)
+_OPTIONS = PlanOptions(grid_rows=1, grid_columns=1, pad_rows=8, pad_columns=8, tile_rows=64, tile_columns=64, workers=1)
 _EXPOSURE_S = 0.02
 _BURIED, _DEPTH = "buried", 20_000
 _INTERESTING: tuple[Any, ...] = (
@@ -211,7 +211,7 @@ def _restore(data: bytes) -> None:
         show_profile(Output(as_json=False, debug=False), folder)
     kernels, view = _remembered(_kernels), _remembered(inscribed_view)
     with mock.patch.multiple(runtime, kernel_grid=kernels, inscribed_view=view):
-        restorer = runtime.Restorer.from_profile(profile, _OPTIONS)
+        restorer = runtime.Restorer.from_profile(profile, options=_OPTIONS)
     camera, panel = profile.rig.camera, profile.rig.panel
     frame = np.random.default_rng(2).integers(60, 250, (camera.rows, camera.columns)).astype(np.uint16)
     frame[5:8, 5:8] = 2**camera.bits - 1

@@ -14,18 +14,22 @@ from udccal.profiles.store import read_profile, write_profile
 from udccal.restoration.plan import PlanOptions
 from udccal.restoration.runtime import Restorer
 from udccal.result import FitResult, FitStatus
+from udccal.tiers import Tier
 
 
-def test_a_stored_profile_restores_a_frame(profile: Profile, tmp_path: Path) -> None:
+@pytest.mark.parametrize("tier", list(Tier))
+def test_a_stored_profile_restores_a_frame(profile: Profile, tmp_path: Path, tier: Tier) -> None:
     write_profile(tmp_path / "p", profile)
-    options = PlanOptions(grid_rows=2, grid_columns=2, pad_rows=8, pad_columns=8)
-    restorer = Restorer.from_profile(read_profile(tmp_path / "p"), options)
+    options = PlanOptions(grid_rows=2, grid_columns=2, tile_rows=96, tile_columns=128)
+    restorer = Restorer.from_profile(read_profile(tmp_path / "p"), tier, options)
     rig, exposure_s = profile.rig, 0.02
     picture = np.full((rig.panel.rows, rig.panel.columns, 3), 255, np.uint8)
     scene_e = 2000.0
+    assert restorer.mask is not None
     backscatter_e = exposure_s * restorer.mask
     frame = np.rint(64 + 0.355 * (scene_e + backscatter_e + 20 * exposure_s)).astype(np.uint16)
-    for shown in (picture, np.zeros_like(picture)):
+    # The preview does not ask what the panel shows.
+    for shown in (picture,) if tier is Tier.preview else (picture, np.zeros_like(picture)):
         expected = scene_e + (0.0 if shown.any() else backscatter_e.mean())
         restored = restorer.restore(frame, exposure_s, shown)
         np.testing.assert_allclose(restored * exposure_s, expected, rtol=0.02)
@@ -41,9 +45,9 @@ def test_absent_terms_cost_nothing(profile: Profile) -> None:
     without = replace(
         profile, wire=absent(profile.wire), psf=absent(profile.psf), backscatter=absent(profile.backscatter)
     )
-    restorer = Restorer.from_profile(without, PlanOptions(grid_rows=2, grid_columns=2))
+    restorer = Restorer.from_profile(without)
     assert restorer.wire is None
-    assert restorer.deblurrers == ()
+    assert restorer.sharpener is None
     assert restorer.response is None
     frame = np.full((profile.rig.camera.rows, profile.rig.camera.columns), 64 + round(0.355 * 2000), np.uint16)
     np.testing.assert_allclose(restorer.restore(frame, 0.02) * 0.02, 2000.0, rtol=0.01)
@@ -55,7 +59,7 @@ def test_the_shading_of_a_wire_that_is_not_there_stays(profile: Profile) -> None
         wire=replace(profile.wire, status=FitStatus.ABSENT),
         wire_map=profile.wire_map * np.linspace(0.8, 1.2, profile.rig.camera.columns, dtype=np.float32),
     )
-    assert Restorer.from_profile(shaded, PlanOptions(grid_rows=2, grid_columns=2)).wire is not None
+    assert Restorer.from_profile(shaded, Tier.preview).wire is not None
 
 
 def test_terms_that_give_no_numbers_are_refused_when_made_ready(profile: Profile) -> None:
@@ -63,7 +67,7 @@ def test_terms_that_give_no_numbers_are_refused_when_made_ready(profile: Profile
     psf, backscatter = profile.psf.term, profile.backscatter.term
     dark = replace(psf, residual=np.zeros(np.shape(psf.residual)))
     with pytest.raises(RestorationError, match="Expected kernels that sum to 1"):
-        Restorer.from_profile(replace(profile, psf=replace(profile.psf, term=dark)), options)
+        Restorer.from_profile(replace(profile, psf=replace(profile.psf, term=dark)), options=options)
     nowhere = replace(backscatter, geometry=replace(backscatter.geometry, principal_point_px=np.array([np.nan, 0.0])))
     with pytest.raises(RestorationError, match="Expected a footprint"):
-        Restorer.from_profile(replace(profile, backscatter=replace(profile.backscatter, term=nowhere)), options)
+        Restorer.from_profile(replace(profile, backscatter=replace(profile.backscatter, term=nowhere)), options=options)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from udccal.models.noise import Noise
-from udccal.restoration.linear import mean_variance_e2, saturated, to_electrons, without_defects
+from udccal.restoration.linear import saturated, to_electrons, variance_e2, without_defects
 
 
 def test_black_level_gain_and_dark_current(toy_noise: Noise) -> None:
@@ -17,15 +17,14 @@ def test_saturation_is_a_margin_below_the_full_well(toy_noise: Noise) -> None:
     assert saturated(np.array([[3800, 3960, 3969]], np.uint16), toy_noise, 0.015).tolist() == [[False, True, True]]
 
 
-def test_variance_of_a_frame(toy_noise: Noise) -> None:
-    mosaic = np.full((4, 4), 64 + 355, np.uint16)
-    assert abs(mean_variance_e2(mosaic, toy_noise, 0.0) - (1000 + 25 + (1 / 0.355) ** 2 / 12)) < 0.1
+def test_variance_of_a_sample(toy_noise: Noise) -> None:
+    signal = np.full((4, 4), 1000.0, np.float32)
+    np.testing.assert_allclose(variance_e2(signal, toy_noise, 0.0), 1000 + 25 + (1 / 0.355) ** 2 / 12, rtol=1e-6)
 
 
-def test_less_than_no_dark_current_makes_no_noise(toy_noise: Noise) -> None:
-    mosaic = np.full((4, 4), 64, np.uint16)
-    negative = replace(toy_noise, dark_current_e_per_s=-1e4)
-    assert mean_variance_e2(mosaic, negative, 1.0) > mean_variance_e2(mosaic, toy_noise, 0.0) > 0
+def test_less_than_no_light_or_dark_current_makes_no_noise(toy_noise: Noise) -> None:
+    dark, negative = np.full((4, 4), -50.0, np.float32), replace(toy_noise, dark_current_e_per_s=-1e4)
+    np.testing.assert_array_equal(variance_e2(dark, negative, 1.0), variance_e2(dark * 0, toy_noise, 0.0))
 
 
 def test_hot_and_dead_samples_are_replaced(toy_noise: Noise) -> None:

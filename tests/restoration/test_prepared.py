@@ -6,6 +6,7 @@ import hashlib
 import io
 import os
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -20,9 +21,9 @@ from udccal.restoration.plan import PlanOptions
 from udccal.restoration.prepared import kept, prepared_bytes, prepared_folder
 from udccal.restoration.runtime import Restorer
 from udccal.restoration.sharpen import Sharpener
-from udccal.restoration.tiers import Tier
+from udccal.tiers import Tier
 
-_OPTIONS = PlanOptions(grid_rows=2, grid_columns=2, pad_rows=8, pad_columns=8, tile_rows=128, tile_columns=128)
+_OPTIONS = PlanOptions(grid_rows=2, grid_columns=2, tile_rows=96, tile_columns=128)
 
 
 @dataclass(frozen=True)
@@ -196,6 +197,19 @@ def test_the_oldest_use_goes_first(folder: Path, monkeypatch: pytest.MonkeyPatch
     assert len(left) == 3
     assert oldest.name in left
     assert youngest.name not in left
+
+
+def test_many_at_once_find_whole_entries(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    kept(folder, Pair, (0,), lambda: pair(0.0))
+    monkeypatch.setattr(prepared, "_MOST_BYTES", 3 * prepared_bytes(folder))
+
+    def one(turn: int) -> bool:
+        value = turn % 5
+        return float(kept(folder, Pair, (value,), lambda: pair(float(value))).values[7, 1]) == value
+
+    with ThreadPoolExecutor(8) as pool:
+        assert all(pool.map(one, range(200)))
+    assert len(list(folder.iterdir())) <= 3
 
 
 def test_what_alone_is_too_large_is_not_kept(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

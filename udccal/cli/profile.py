@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from udccal.restoration.tiers import Tier
+from udccal.tiers import Tier
 
 profile_app = typer.Typer(
     help="Show what a profile holds, or prepare it.", no_args_is_help=True, pretty_exceptions_enable=False

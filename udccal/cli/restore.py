@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from udccal.cli.options import FoundProfile, OutFolder, PanelPicturePath
+from udccal.tiers import Tier
 
 
 class PictureFormat(enum.StrEnum):
@@ -27,6 +28,13 @@ def restore(
     exposure_s: Annotated[
         float | None, typer.Option("--exposure-s", min=1e-7, help="Exposure of the frames, if not in the file.")
     ] = None,
+    tier: Annotated[
+        Tier,
+        typer.Option(
+            "--tier",
+            help="preview: no deblurring. fast: one linear filter per tile. balanced: noise and clipped light as well.",
+        ),
+    ] = Tier.balanced,
     picture_format: Annotated[
         PictureFormat, typer.Option("--format", help="png: display-encoded, for viewing. exr: linear light in e-/s.")
     ] = PictureFormat.png,
@@ -34,4 +42,4 @@ def restore(
     """Restore raw frames with a rig's profile."""
     from udccal.cli.jobs.restore import restore_files
 
-    restore_files(context.obj, images, profile, out, panel_picture, exposure_s, picture_format.value)
+    restore_files(context.obj, images, profile, out, panel_picture, exposure_s, picture_format.value, tier)

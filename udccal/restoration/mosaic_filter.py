@@ -107,12 +107,15 @@ def _tables_of(
     )
 
 
-def _transfer(kernels: Float[np.ndarray, "3 ky kx"], rows: int, columns: int) -> Complex128[np.ndarray, "3 rows columns"]:
+def _transfer(
+    kernels: Float[np.ndarray, "3 ky kx"], rows: int, columns: int
+) -> Complex128[np.ndarray, "3 rows columns"]:
     """Return the Fourier transform of kernels whose origin is their middle; a larger kernel wraps around."""
     placed = np.zeros((_CHANNELS, rows, columns))
     ky, kx = kernels.shape[1:]
     at_y, at_x = (np.arange(ky) - ky // 2) % rows, (np.arange(kx) - kx // 2) % columns
-    np.add.at(placed, (slice(None), at_y[:, None], at_x), kernels)
+    for plane, kernel in zip(placed, kernels, strict=True):
+        np.add.at(plane, (at_y[:, None], at_x), kernel)
     return fft.fft2(placed)
 
 
@@ -181,7 +184,8 @@ def _solve_chunk(
     taper: Float32[Array, "rows columns"],
     cfa: Cfa,
 ) -> tuple[Float32[Array, "tiles 3 rows columns"], Float32[Array, " tiles"]]:
-    return jax.vmap(lambda *tile: _solve(*tile, taper, cfa))(tiles, noise_e, choices, matched, vectors, values)
+    every = (0, 0, 0, 0, 0, 0, None)
+    return jax.vmap(partial(_solve, cfa=cfa), in_axes=every)(tiles, noise_e, choices, matched, vectors, values, taper)
 
 
 def _solve(
@@ -208,7 +212,9 @@ def _solve(
     whole = _whole_plane(weighted, rows, columns, cfa)
     phases = [jnp.conj(jnp.asarray(p[:, : columns // 2 + 1], matched.dtype)) for p in _phases(rows, columns, cfa)]
     at_site = [whole[index] * phase for index, phase in enumerate(phases)]
-    per_colour = [sum(a for a, c in zip(at_site, channels, strict=True) if c == channel) for channel in range(_CHANNELS)]
+    per_colour = [
+        sum(a for a, c in zip(at_site, channels, strict=True) if c == channel) for channel in range(_CHANNELS)
+    ]
     by_colour = jnp.stack([matched[c] * part for c, part in enumerate(per_colour)])
     grey = by_colour.sum(axis=0) * (1 - _COLOURFUL / _CHANNELS)
     picture = jnp.fft.irfft2(_COLOURFUL * by_colour + grey, s=(rows, columns))

@@ -12,6 +12,7 @@ import contextlib
 import dataclasses
 import functools
 import hashlib
+import os
 import typing
 from collections.abc import Callable
 from pathlib import Path
@@ -82,9 +83,10 @@ def _read(path: Path, kind: type[T]) -> T | None:
                 return None
             stream.seek(_CHECKSUM_BYTES)
             arrays = [np.load(stream, allow_pickle=False) for _ in dataclasses.fields(kind)]
-        path.touch()
     except (OSError, ValueError, EOFError):
         return None
+    with contextlib.suppress(OSError):  # Another program may have removed it.
+        os.utime(path)
     build: Callable[..., T] = kind
     return build(*arrays) if _as_declared(arrays, kind) else None
 

@@ -27,10 +27,10 @@ from udccal.restoration.plan import PlanOptions, kernel_grid
 from udccal.restoration.prepared import kept
 from udccal.restoration.rectify import Rectification
 from udccal.restoration.sharpen import Sharpener
-from udccal.restoration.tiers import Tier
 from udccal.restoration.view import inscribed_view
 from udccal.result import FitStatus
 from udccal.rig import RigDescription
+from udccal.tiers import Tier
 
 Mosaic = Float32[np.ndarray, "rows columns"]
 Picture = Float32[np.ndarray, "rows columns 3"]
@@ -159,7 +159,7 @@ class Restorer:
             signal /= self.wire
             variance /= self.wire**2
         if self.mask is not None:
-            signal -= np.float32(exposure_s) * self._backscatter_rate(signal, exposure_s, panel_picture)
+            signal -= np.float32(exposure_s) * self._backscatter_rate(signal, self.mask, exposure_s, panel_picture)
         if self.sharpener is None:
             sharp = demosaic(signal, self.rig.camera.cfa)
         else:
@@ -175,11 +175,12 @@ class Restorer:
     def _backscatter_rate(
         self,
         signal: Mosaic,
+        mask: Mosaic,
         exposure_s: float,
         panel_picture: UInt8[np.ndarray, "panel_rows panel_columns 3"] | None,
     ) -> Mosaic:
         if panel_picture is None or self.response is None:
-            return estimated_rate(signal / np.float32(exposure_s), self.mask, self.rig.camera.cfa)
+            return estimated_rate(signal / np.float32(exposure_s), mask, self.rig.camera.cfa)
         return known_rate(self.response, panel_picture)
 
 

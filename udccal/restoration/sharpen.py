@@ -18,9 +18,9 @@ from udccal.restoration.mosaic_filter import FilterTables, filter_tables, filter
 from udccal.restoration.plan import PlanOptions
 from udccal.restoration.prepared import kept
 from udccal.restoration.shrink import BandNoise, measured_noise, shrunk
-from udccal.restoration.tiers import Tier
 from udccal.restoration.tiles import TileLayout, layout_for
 from udccal.rig import RigDescription
+from udccal.tiers import Tier
 
 Mosaic = Float32[np.ndarray, "rows columns"]
 Picture = Float32[np.ndarray, "rows columns 3"]
@@ -112,9 +112,7 @@ class Sharpener:
         picture = self.layout.join(pictures)
         if self.noise is not None:
             bands = self.noise.of_tiles(strengths)
-            picture = shrunk(
-                picture, tile_noise, _local(variance_e2), bands, self.layout, self.options.workers
-            )
+            picture = shrunk(picture, tile_noise, _local(variance_e2), bands, self.layout, self.options.workers)
         return picture if bright is None else picture + bright
 
     def _tile_noise(self, variance_e2: Mosaic) -> Float32[np.ndarray, "tiles 3"]:
@@ -122,7 +120,7 @@ class Sharpener:
         sites = {channel: [s for s in self.cfa.sites if s.channel == channel] for channel in range(3)}
         rows, columns = variance_e2.shape
         found = np.empty((self.layout.count, 3), dtype=np.float32)
-        for index, (x, y) in enumerate(self.layout.centres_px):
+        for index, (x, y) in enumerate(self.layout.centres_px.tolist()):
             down = _within(y, self.layout.rows, rows)
             across = _within(x, self.layout.columns, columns)
             part = variance_e2[down, across]

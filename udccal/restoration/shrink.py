@@ -8,6 +8,7 @@ Processing 52, 2004). The filter's noise in each band is measured once per profi
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -113,19 +114,16 @@ def shrunk(
         layout: the tiles.
         workers: threads.
     """
-    rows, columns = picture.shape[:2]
-    place = _placed(layout, rows, columns)
-    scale = np.stack([place(small, 1.0) for small in layout.spread(noise_e)], axis=-1)
+    scale = np.stack([_smooth(layout, small, picture.shape[:2]) for small in layout.spread(noise_e)], axis=-1)
     opponent = (picture / scale) @ _OPPONENT.T
     # Within a tile, bright places are noisier than dark ones.
     brightness = local_variance_e2 / (scale * scale).mean(axis=-1)
 
     def one(colour: int) -> Plane:
-        def noise(level: int, band: int, like: Plane) -> Plane:
+        def noise(level: int, band: int, shape: tuple[int, ...]) -> Plane:
             small = next(layout.spread(variance[:, colour, level, band][:, None]))
-            factor = 0.5**level
-            ratio = cv2.resize(brightness, like.shape[::-1], interpolation=cv2.INTER_AREA if level else cv2.INTER_NEAREST)
-            return place(small, factor, like.shape) * ratio
+            local = cv2.resize(brightness, shape[::-1], interpolation=cv2.INTER_AREA) if level else brightness
+            return _stepped(layout, small, shape, 0.5**level) * local
 
         return _shrink_level(np.ascontiguousarray(opponent[..., colour]), 0, noise)
 
@@ -134,13 +132,13 @@ def shrunk(
     return (calm @ _OPPONENT) * scale
 
 
-def _shrink_level(plane: Plane, level: int, noise: Callable[[int, int, Plane], Plane]) -> Plane:
+def _shrink_level(plane: Plane, level: int, noise: Callable[[int, int, tuple[int, ...]], Plane]) -> Plane:
     """Shrink a plane's bands at this level, and at coarser ones by what they change."""
     bands, smooth = _split(plane)
     result = smooth.copy()
     for index, band in enumerate(bands):
         energy = cv2.blur(band * band, _WINDOW)
-        keep = 1 - np.float32(_MARGIN) * noise(level, index, plane) / np.maximum(energy, np.float32(1e-20))
+        keep = 1 - np.float32(_MARGIN) * noise(level, index, plane.shape) / np.maximum(energy, np.float32(1e-20))
         result += band * np.maximum(keep, np.float32(0))
     if level + 1 < _LEVELS and min(plane.shape) > 2 * len(_SMOOTH):
         half = cv2.resize(smooth, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_NEAREST)
@@ -158,22 +156,40 @@ def _split(plane: Plane) -> tuple[tuple[Plane, Plane, Plane], Plane]:
     return (down - smooth, across - smooth, plane - down - across + smooth), smooth
 
 
-def _placed(layout: TileLayout, rows: int, columns: int) -> Callable[..., Plane]:
-    """Return a function that interpolates one value per tile to the frame, or to a smaller copy of it."""
-    step_y = layout.tops[1] - layout.tops[0] if len(layout.tops) > 1 else 1
-    step_x = layout.lefts[1] - layout.lefts[0] if len(layout.lefts) > 1 else 1
-    first_y, first_x = layout.tops[0] + (layout.rows - 1) / 2, layout.lefts[0] + (layout.columns - 1) / 2
+def _stepped(
+    layout: TileLayout, small: Float32[np.ndarray, "down across"], shape: tuple[int, ...], factor: float
+) -> Plane:
+    """Return each tile's value where the frame, or a smaller copy, comes from it; in blends, the largest."""
+    result = np.zeros(shape, dtype=np.float32)
+    for side_y, side_x in itertools.product((-0.5, 0.5), repeat=2):
+        down = _tile_coordinate(layout, 0, shape[0], factor, side_y * BLEND_PX)
+        across = _tile_coordinate(layout, 1, shape[1], factor, side_x * BLEND_PX)
+        y, x = (
+            np.clip(np.rint(at), 0, most - 1).astype(int) for at, most in zip((down, across), small.shape, strict=True)
+        )
+        np.maximum(result, small[y[:, None], x], out=result)
+    return result
 
-    def place(small: Plane, factor: float, shape: tuple[int, ...] | None = None) -> Plane:
-        height, width = shape or (rows, columns)
-        y = (np.arange(height, dtype=np.float32) / np.float32(factor) - np.float32(first_y)) / np.float32(step_y)
-        x = (np.arange(width, dtype=np.float32) / np.float32(factor) - np.float32(first_x)) / np.float32(step_x)
-        return _interpolated(_interpolated(small, y).T, x).T
 
-    return place
+def _smooth(layout: TileLayout, small: Float32[np.ndarray, "down across"], shape: tuple[int, ...]) -> Plane:
+    """Interpolate one value per tile linearly to the frame, constant beyond the outer tiles' centres."""
+    down, across = (_tile_coordinate(layout, axis, shape[axis], 1.0, 0.0) for axis in (0, 1))
+    return _interpolated(_interpolated(small, down).T, across).T
 
 
-def _interpolated(values: Plane, at: Float32[np.ndarray, " n"]) -> Float32[np.ndarray, "n columns"]:
+def _tile_coordinate(
+    layout: TileLayout, axis: int, count: int, factor: float, offset_px: float
+) -> Float32[np.ndarray, " count"]:
+    """Return where samples of the frame, or of a copy smaller by ``factor``, lie in units of tiles."""
+    starts, size = ((layout.tops, layout.rows), (layout.lefts, layout.columns))[axis]
+    step = starts[1] - starts[0] if len(starts) > 1 else 1
+    px = np.arange(count, dtype=np.float32) / np.float32(factor) + np.float32(offset_px)
+    return (px - np.float32(starts[0] + (size - 1) / 2)) / np.float32(step)
+
+
+def _interpolated(
+    values: Float32[np.ndarray, "tiles columns"], at: Float32[np.ndarray, " n"]
+) -> Float32[np.ndarray, "n columns"]:
     """Interpolate rows linearly, constant beyond the first and the last."""
     at = np.clip(at, 0, len(values) - 1)
     low = np.minimum(at.astype(int), max(len(values) - 2, 0))

@@ -57,7 +57,9 @@ class TileLayout:
     @property
     def centres_px(self) -> Float32[np.ndarray, "tiles 2"]:
         """(x, y) of the tiles' centres on the sensor."""
-        y, x = (np.array(starts) + (size - 1) / 2 for starts, size in ((self.tops, self.rows), (self.lefts, self.columns)))
+        y, x = (
+            np.array(starts) + (size - 1) / 2 for starts, size in ((self.tops, self.rows), (self.lefts, self.columns))
+        )
         return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2).astype(np.float32)
 
     @functools.cached_property
@@ -91,7 +93,9 @@ class TileLayout:
             frame[:, *at] += picture[:, y, x] * weight
         return np.ascontiguousarray(np.moveaxis(frame, 0, -1))
 
-    def spread(self, values: Float32[np.ndarray, "tiles k"]) -> Iterator[Float32[np.ndarray, "tiles_down tiles_across"]]:
+    def spread(
+        self, values: Float32[np.ndarray, "tiles k"]
+    ) -> Iterator[Float32[np.ndarray, "tiles_down tiles_across"]]:
         """Return each of the tiles' ``k`` values as a small picture with one pixel per tile."""
         for value in values.T:
             yield value.reshape(len(self.tops), len(self.lefts))

@@ -11,7 +11,7 @@ from udccal.compilation import FOLDER_VARIABLE, keep_compilations, private_folde
 from udccal.errors import RestorationError
 from udccal.restoration.prepared import prepared_bytes, prepared_folder
 from udccal.restoration.runtime import Restorer
-from udccal.restoration.tiers import Tier
+from udccal.tiers import Tier
 
 
 @dataclass(frozen=True)

@@ -22,6 +22,7 @@ from udccal.restoration.runtime import Restorer, check_frame
 from udccal.restoration.sinks import write_picture
 from udccal.restoration.tone import Tone, display_exposure
 from udccal.rig import RigDescription
+from udccal.tiers import Tier
 
 
 @dataclass(frozen=True)
@@ -49,6 +50,7 @@ def restore_files(
     panel_picture: Path | None,
     exposure_s: float | None,
     picture_format: Literal["png", "exr"],
+    tier: Tier,
 ) -> None:
     """Restore every image with a profile and write it under ``out``, one by one.
 
@@ -60,6 +62,7 @@ def restore_files(
         panel_picture: picture that the panel showed, 8-bit RGB PNG; None when it is not known.
         exposure_s: exposure of the images; None to take that of each file.
         picture_format: ``png``, display-encoded, or ``exr``, linear light in e-/s.
+        tier: how much is done to each frame.
 
     Raises:
         ProfileError: when the profile cannot be read.
@@ -76,7 +79,7 @@ def restore_files(
         _checked_frame(image, exposure_s, profile.rig)
     restored: list[RestoredFile] = []
     with output.stage("restoring") as stage:
-        restorer = Restorer.from_profile(profile, keep=prepared_folder())
+        restorer = Restorer.from_profile(profile, tier, keep=prepared_folder())
         for index, (image, target) in enumerate(zip(images, targets, strict=True)):
             stage.update(index, len(images), f"restoring {image.name}")
             mosaic, exposure = _checked_frame(image, exposure_s, profile.rig)

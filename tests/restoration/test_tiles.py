@@ -1,0 +1,43 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from udccal.cfa import PATTERNS
+from udccal.restoration.tiles import layout_for
+
+
+@pytest.mark.parametrize("name", ["RGGB", "BGGR", "mono"])
+@pytest.mark.parametrize(
+    ("frame", "size", "rows"),
+    [((300, 410), (128, 160), (0, 300)), ((301, 411), (96, 96), (77, 250)), ((40, 30), (128, 128), (-5, 60))],
+)
+def test_what_is_cut_and_joined_is_the_frame(
+    name: str, frame: tuple[int, int], size: tuple[int, int], rows: tuple[int, int]
+) -> None:
+    cfa = PATTERNS[name]
+    layout = layout_for(*frame, (cfa.rows, cfa.columns), size, rows)
+    mosaic = np.random.default_rng(0).random(frame, dtype=np.float32)
+    joined = layout.join(layout.cut(mosaic)[:, None])[..., 0]
+    covered = slice(max(rows[0], 0), min(rows[1], frame[0]))
+    np.testing.assert_allclose(joined[covered], mosaic[covered], atol=1e-6)
+
+
+def test_every_tile_begins_with_the_same_colour_inside_and_outside_the_frame() -> None:
+    cfa = PATTERNS["GRBG"]
+    channels = cfa.channel_map(100, 131).astype(np.float32)
+    layout = layout_for(100, 131, (2, 2), (96, 96), (0, 100))
+    tiles = layout.cut(channels)
+    # The last column of an odd frame is half a cell, which a mirrored cell cannot begin with.
+    whole = np.array(layout.lefts)[None, :].repeat(len(layout.tops), axis=0).ravel() + 96 <= 130
+    assert whole.any()
+    for tile in tiles[whole]:
+        np.testing.assert_array_equal(tile, cfa.channel_map(96, 96))
+
+
+def test_tiles_whose_values_differ_are_blended_without_a_step() -> None:
+    layout = layout_for(200, 600, (2, 2), (128, 128), (0, 200))
+    values = np.repeat(np.arange(layout.count, dtype=np.float32), 128 * 128).reshape(-1, 1, 128, 128)
+    joined = layout.join(values)[..., 0]
+    steps = np.abs(np.diff(joined[:, layout.lefts[1] :], axis=1))
+    assert steps.max() < 0.15
