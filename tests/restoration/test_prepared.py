@@ -286,6 +286,10 @@ def test_the_second_start_computes_nothing(
         one, other = vars(getattr(first.sharpener, part)), vars(getattr(second.sharpener, part))
         assert all(np.array_equal(one[name], other[name]) for name in one)
     assert second.response is not None
+    frame = np.full((profile.rig.camera.rows, profile.rig.camera.columns), 900, np.uint16)
+    frame[20:30, 40:60] = 3000
+    shown = np.full((profile.rig.panel.rows, profile.rig.panel.columns, 3), 200, np.uint8)
+    assert np.array_equal(first.restore(frame, 0.02, shown), second.restore(frame, 0.02, shown))
 
 
 def test_a_kept_response_gives_the_terms_light(profile: Profile, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

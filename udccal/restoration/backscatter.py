@@ -8,7 +8,7 @@ from typing import Any, final
 
 import jax
 import numpy as np
-from jaxtyping import Float, Float32, Int, UInt8
+from jaxtyping import Float, Float32, Int32, UInt8
 
 from udccal.cfa import cfa_named
 from udccal.errors import RestorationError
@@ -24,11 +24,11 @@ _PERCENTILE = 1.0
 
 @final
 @dataclass(frozen=True)
-class _Evaluated:
+class _ResponseArrays:
     """The arrays of a ``PanelResponse`` beside its term."""
 
     shares: Float32[np.ndarray, "positions window2 3"]
-    pixels: Int[np.ndarray, "positions window2"]
+    pixels: Int32[np.ndarray, "positions window2"]
     gain: Float32[np.ndarray, "3 positions"]
 
 
@@ -44,13 +44,13 @@ def prepared_response(term: Backscatter, rig: RigDescription, keep: Path | None 
     Raises:
         RestorationError: when a value is not finite.
     """
-    found = kept(keep, _Evaluated, (term, rig), lambda: _evaluated(term, rig))
+    found = kept(keep, _ResponseArrays, (term, rig), lambda: _evaluated(term, rig))
     return PanelResponse(jax.tree.map(_single, term), found.shares, found.pixels, found.gain)
 
 
-def _evaluated(term: Backscatter, rig: RigDescription) -> _Evaluated:
+def _evaluated(term: Backscatter, rig: RigDescription) -> _ResponseArrays:
     response = panel_response(term, rig.panel.rows, rig.panel.columns)
-    found = _Evaluated(_single(response.shares), _single(response.pixels), _single(response.gain))
+    found = _ResponseArrays(_single(response.shares), np.asarray(response.pixels, np.int32), _single(response.gain))
     if not (np.all(np.isfinite(found.shares)) and np.all(np.isfinite(found.gain))):
         raise RestorationError(
             "Expected a footprint of the pupil on the panel for every pixel, found places without one. Check the "
