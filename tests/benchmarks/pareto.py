@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import csv
+import itertools
 import statistics
 import sys
 import time
@@ -102,7 +103,7 @@ def _measured(
 def judged(results: list[TierResult]) -> list[Row]:
     """Each tier is better on average than the one before, and on no scene worse than the preview."""
     rows = []
-    for quicker, slower in zip(results, results[1:], strict=False):
+    for quicker, slower in itertools.pairwise(results):
         gain = slower.mean("after_dB") - quicker.mean("after_dB")
         rows.append(at_least(f"{slower.tier}: mean dB - {quicker.tier}'s", gain, 0.0, "dB"))
     for result in results[1:]:
