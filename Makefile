@@ -7,13 +7,14 @@ DEMO_OUT ?= udccal-demo
 ACCURACY_OUT ?= accuracy
 ACCURACY_SEEDS ?= 8
 EFFICIENCY_OUT ?= efficiency
+PARETO_OUT ?= pareto
 COVERAGE_OUT ?= coverage
 ROBUST_OUT ?= robust
 ROBUST ?=
 PEERS ?=
 USB ?=
 
-.PHONY: install demo test test-medium test-slow test-usb fuzz load lint types contracts check accuracy tables efficiency coverage extremes robust peers growth clean
+.PHONY: install demo test test-medium test-slow test-usb fuzz load lint types contracts check accuracy tables efficiency coverage extremes pareto robust peers growth clean
 
 install: $(STAMP)
 
@@ -94,9 +95,14 @@ peers: $(STAMP)
 growth: $(STAMP)
 	$(BIN)/python -m tests.benchmarks.growth.run
 
+# Every tier of restoration on the shared scenes. Writes pareto.json, pareto.csv and the table of docs/restoration.md;
+# non-zero exit where a tier misses a limit.
+pareto: $(STAMP)
+	$(BIN)/python -m tests.benchmarks.pareto --out $(PARETO_OUT)
+
 # Puts the measured tables into README.md.
 tables: $(STAMP)
 	$(BIN)/python -m tests.benchmarks.readme_tables --accuracy $(ACCURACY_OUT)
 
 clean:
-	rm -rf $(VENV) $(DEMO_OUT) $(ACCURACY_OUT) $(EFFICIENCY_OUT) $(ROBUST_OUT) peers build dist *.egg-info
+	rm -rf $(VENV) $(DEMO_OUT) $(ACCURACY_OUT) $(EFFICIENCY_OUT) $(ROBUST_OUT) $(PARETO_OUT) peers build dist *.egg-info

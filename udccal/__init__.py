@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from udccal.rig import RigDescription as RigDescription
     from udccal.rig import load_rig as load_rig
     from udccal.sessions.store import Session as Session
+    from udccal.tiers import Tier as Tier
 
 __version__ = "0.1.0"
 
@@ -46,6 +47,7 @@ _HOMES = {
     "Restorer": "udccal.restoration.runtime",
     "RigDescription": "udccal.rig",
     "Session": "udccal.sessions.store",
+    "Tier": "udccal.tiers",
     "UdccalError": "udccal.errors",
     "calibrate": "udccal.calibration",
     "capture": "udccal.benches.capture",
