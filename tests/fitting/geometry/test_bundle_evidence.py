@@ -135,6 +135,7 @@ def test_the_right_order_is_chosen_in_95_of_100(order: str) -> None:
 
 
 # Steps of a descent that leads nowhere may overflow; the solver takes them back.
+@pytest.mark.medium
 @pytest.mark.filterwarnings("ignore:overflow encountered")
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("weighted", [False, True])
