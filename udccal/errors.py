@@ -55,3 +55,9 @@ class FitError(UdccalError):
 
 class RestorationError(UdccalError):
     """A frame cannot be restored with the profile chosen."""
+
+
+def found_instead(value: object) -> str:
+    """What an argument is that should have been an array, for a message: type and shape."""
+    kind, shape = getattr(value, "dtype", None), getattr(value, "shape", None)
+    return type(value).__name__ if kind is None else f"{kind} of shape {shape}"

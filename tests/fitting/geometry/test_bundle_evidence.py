@@ -14,6 +14,7 @@ from udccal.errors import FitError
 from udccal.fitting.geometry.bundle import ORDERS, Intrinsics, projected
 from udccal.fitting.geometry.calibrated import CalibratedViews, Gauge, field_grid
 from udccal.fitting.geometry.corners import board_points_mm
+from udccal.result import FitStatus
 
 PIXELS = np.array([[511.0, 383.0], [40.0, 60.0], [980.0, 700.0]])
 
@@ -131,3 +132,28 @@ def test_the_right_order_is_chosen_in_95_of_100(order: str) -> None:
         right += next(c.name for c in found.candidates if c.chosen) == order
     assert right >= 95
     assert order in ORDERS
+
+
+# Steps of a descent that leads nowhere may overflow; the solver takes them back.
+@pytest.mark.medium
+@pytest.mark.filterwarnings("ignore:overflow encountered")
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("weighted", [False, True])
+def test_random_corners_are_a_poor_fit(seed: int, weighted: bool) -> None:
+    """Without sigmas only the residuals' size in px can tell; with sigmas the status is the same."""
+    rng, scene = np.random.default_rng([seed, 31]), sight(views=8)
+    board = [board_points_mm(scene.spec)] * 8
+    image = [rng.uniform((0, 0), scene.size, (len(board[0]), 2)) for _ in board]
+    sigmas = [np.full(len(board[0]), 0.1) for _ in board] if weighted else None
+    found = calibrated(board, image, scene.size, sigmas=sigmas)
+    assert found.status is FitStatus.POOR_FIT
+    assert "order of the board" in " ".join(found.notes)
+
+
+def test_coarse_corners_of_a_real_board_are_no_poor_fit() -> None:
+    """Corners to 2 px, as of a quick detector on a large picture, still calibrate."""
+    scene = sight(views=8, sigma_px=2.0)
+    views = scene.views(np.random.default_rng(3))
+    points = board_points_mm(scene.spec)
+    found = calibrated([points[v.corners.ids] for v in views], [v.corners.xy for v in views], scene.size)
+    assert found.status is FitStatus.CONVERGED

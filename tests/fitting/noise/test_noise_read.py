@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.scenes.noise import ToySensor, measure
+from tests.scenes.noise import PLAIN, ToySensor, errors_in_sigma, measure
 from udccal.errors import FitError
 from udccal.fitting.noise.data import ExposureLevel, NoiseData, NoiseRules
 from udccal.fitting.noise.fit import fit_noise
@@ -83,6 +83,27 @@ def test_dark_and_bright_frames_exchanged_are_named() -> None:
     swapped = [ExposureLevel(one.exposure_s, one.bright, one.dark) for one in levels(np.linspace(0.005, 0.05, 6))]
     with pytest.raises(FitError, match="exchanged"):
         fit_noise(NoiseData(swapped))
+
+
+@pytest.mark.parametrize("times_s", [(0.005, 0.05), (0.05, 0.5), (0.005, 0.5)])
+def test_exchanged_frames_of_any_times_are_named(times_s: tuple[float, float]) -> None:
+    """Bright frames of these times as dark ones, beside dark ones of 5 to 50 ms as bright ones."""
+    rng, dark_s = np.random.default_rng(1), np.linspace(0.005, 0.05, 6)
+    swapped = [ExposureLevel(float(t), bright=pair(rng, 300 * t)) for t in dark_s]
+    swapped += [ExposureLevel(float(t), dark=pair(rng, 300 * t + 1e4 * t)) for t in np.linspace(*times_s, 6)]
+    with pytest.raises(FitError, match="exchanged"):
+        fit_noise(NoiseData(swapped))
+
+
+def test_long_darks_may_be_brighter_than_dim_flats() -> None:
+    """300 e- of dark current in the longest dark, beside at most 60 e- of light in the flats."""
+    sensor = replace(
+        PLAIN, rows=64, columns=64, full_well_e=20_000.0, dark_e_per_s=300.0, flux_e_per_s=20_000.0,
+        levels=tuple(3e-3 * np.linspace(0.05, 1, 7)), stack_level=1.5e-3, stack_frames=4,
+    )  # fmt: skip
+    result = measure(sensor, 0)
+    assert result.status is FitStatus.CONVERGED
+    assert np.abs(errors_in_sigma(result, sensor)).max() < 5.5
 
 
 def test_a_pair_given_twice_is_refused() -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -202,6 +204,14 @@ def test_wrong_noise_is_a_poor_fit() -> None:
     assert fit_psf_stamps(replace(stamps, values_e=rough), ORDERS).status is FitStatus.POOR_FIT
 
 
+def checked_with(original: Stamps, change: dict[str, Any]) -> None:
+    """Run the checks of a changed copy, past the tests' own check of types, which programs do not have."""
+    changed = copy.copy(original)
+    for name, value in change.items():
+        object.__setattr__(changed, name, value)
+    changed.__post_init__()
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [
@@ -211,11 +221,35 @@ def test_wrong_noise_is_a_poor_fit() -> None:
         ({"channel": np.full((30, 15, 15), 2)}, "channels 0, 1 and 2"),
         ({"channel": np.zeros((30, 15, 14), dtype=np.int64)}, "a channel for every sample"),
         ({"values_e": np.zeros((30, 3, 15))}, "7 to 255 samples"),
+        ({"values_e": [[[0.0]]]}, "found list"),
+        ({"values_e": None}, "found NoneType"),
+        ({"values_e": np.zeros((30, 15, 15), dtype=complex)}, "found complex128"),
+        ({"values_e": np.zeros(30)}, r"of shape \(30,\)"),
+        ({"position_px": np.zeros((30, 2)).astype(str)}, "real numbers, stars x 2"),
+        ({"position_px": np.zeros((30, 2), dtype=bool)}, "found bool"),
+        ({"position_px": np.zeros((30, 3), dtype=np.int64)}, "found 3 columns"),
+        ({"position_px": np.full((30, 2), np.nan)}, "found 2 columns from nan"),
+        ({"position_px": np.full((30, 2), 1e30)}, "at most 1048576 px"),
     ],
 )
 def test_bad_stamps_are_refused(change: dict, words: str) -> None:
     with pytest.raises(FitError, match=words):
-        replace(make(1)[0], **change)
+        checked_with(make(1)[0], change)
+
+
+@pytest.mark.parametrize("value_e", [np.nan, 0.0, -100.0])
+def test_stamps_without_light_are_refused(value_e: float) -> None:
+    stamps, _ = make(1)
+    with pytest.raises(FitError, match="light above the noise"):
+        fit_psf_stamps(replace(stamps, values_e=np.full_like(stamps.values_e, value_e)))
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+def test_stamps_that_no_psf_describes_are_refused() -> None:
+    stamps, _ = make(1)
+    wild = np.where(np.random.default_rng(2).random(stamps.values_e.shape) < 0.1, 1e30, stamps.values_e)
+    with pytest.raises(FitError, match="a psf can describe"):
+        fit_psf_stamps(replace(stamps, values_e=wild, clip_e=1e9))
 
 
 def test_three_stamps_are_too_few() -> None:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 import logging
 from dataclasses import replace
+from typing import Any
 
 import equinox as eqx
 import numpy as np
@@ -27,6 +29,7 @@ from tests.scenes.wire import (
     shape_values,
     start,
 )
+from udccal.errors import FitError
 from udccal.fitting.engine.iteration_log import LOG
 from udccal.fitting.wire.data import WireData
 from udccal.fitting.wire.fit import fit_wire
@@ -117,6 +120,39 @@ def test_rows_that_noise_may_hide_are_in_the_error_bars(electrons: float) -> Non
     z = (map_at(fit.term, places()) - map_at(flat.truth, places())) / map_sigma(fit, places())
     assert np.abs(z).max() < 3.5
     assert np.std(z) > 0.2
+
+
+def checked_with(original: WireData, change: dict[str, Any]) -> None:
+    """Run the checks of a changed copy, past the tests' own check of types, which programs do not have."""
+    changed = copy.copy(original)
+    for name, value in change.items():
+        object.__setattr__(changed, name, value)
+    changed.__post_init__()
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"signal": [[1.0]]}, "the signal as an array .* found list"),
+        ({"signal": None}, "found NoneType"),
+        ({"signal": np.ones(100)}, r"of shape \(100,\)"),
+        ({"variance": np.ones((1, ROWS, COLUMNS))}, "the variance as an array"),
+        ({"variance": np.ones((ROWS, COLUMNS)).astype(str)}, "real numbers"),
+        ({"variance": np.ones((COLUMNS, ROWS))}, "of one shape"),
+        ({"signal": np.ones((ROWS - 1, COLUMNS))}, "of one shape"),
+        ({"variance": np.full((ROWS, COLUMNS), np.nan)}, "variances of 0 or more"),
+        ({"variance": np.full((ROWS, COLUMNS), -1.0)}, "variances of 0 or more"),
+        ({"PRNU1288": np.nan}, "PRNU1288 from 0 to 1, found nan"),
+        ({"PRNU1288": -0.1}, "PRNU1288 from 0 to 1"),
+        ({"clipped": np.inf}, "part of clipped pixels"),
+        ({"clip": np.nan}, "found NaN"),
+        ({"cfa": "WXYZ"}, "found 'WXYZ'"),
+    ],
+)
+def test_what_is_no_flat_is_refused(change: dict[str, Any], words: str) -> None:
+    plain = np.ones((ROWS, COLUMNS))
+    with pytest.raises(FitError, match=words):
+        checked_with(WireData(plain, plain, geometry(), start(), PRNU), change)
 
 
 @pytest.mark.medium

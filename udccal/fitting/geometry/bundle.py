@@ -53,6 +53,7 @@ class GeometryRules:
         most_uncertain: sigma of focal length (of itself) and centre (of the width) beyond which the views do not
             determine the lens; the model is not linear over such a sigma.
         worst_rms_px, worst_chi2_dof: beyond both, the fit is poor.
+        no_corners_px: RMS residual beyond which the fit is poor whatever the sigmas: any corner detector comes closer.
         pattern_cells: cells along a side of the grid over which residuals are averaged.
         start_scatter_px: scatter of corners in addition to noise, before it is estimated.
         marker_margin, window_squares: radius of a corner's window, of the distance to the markers and of a square.
@@ -77,6 +78,7 @@ class GeometryRules:
     most_uncertain: float = 0.05
     worst_rms_px: float = 1.0
     worst_chi2_dof: float = 9.0
+    no_corners_px: float = 5.0
     pattern_cells: int = 6
     start_scatter_px: float = 0.02
     marker_margin: float = 0.9

@@ -105,7 +105,7 @@ class CalibratedViews:
     @property
     def rms_px(self) -> float:
         """Root mean square distance of seen from projected points in px, as OpenCV's calibrateCamera returns it."""
-        return float(np.sqrt((self.residuals_px[self.points.used] ** 2).sum(axis=1).mean()))
+        return rms_px(self.residuals_px, self.points)
 
     def projection_covariance(
         self, pixels: Float[np.ndarray, "rays 2"], gauge: Gauge = Gauge.BOARDS
@@ -155,6 +155,11 @@ class CalibratedViews:
                 "fitted distortion folds. Ask within the corners that were seen, or capture boards at the edges."
             )
         return by[:, :, :LENS], by[:, :, LENS : LENS + 3]
+
+
+def rms_px(residuals_px: Float[np.ndarray, "points 2"], points: Points) -> float:
+    """Root mean square distance of the points in use."""
+    return float(np.sqrt((residuals_px[points.used] ** 2).sum(axis=1).mean()))
 
 
 def field_grid(image_size: tuple[int, int]) -> Float[np.ndarray, "81 2"]:
@@ -262,9 +267,14 @@ def _pattern(
 
 
 def status_of(
-    solved: Solved, cov: Float[np.ndarray, "n n"], image_size: tuple[int, int], rules: GeometryRules
+    solved: Solved, cov: Float[np.ndarray, "n n"], off_px: float, image_size: tuple[int, int], rules: GeometryRules
 ) -> tuple[FitStatus, tuple[str, ...]]:
-    """Whether the views determine the lens; else what to capture."""
+    """Whether the views determine the lens, with residuals of RMS ``off_px``; else what to capture."""
+    if off_px > rules.no_corners_px:
+        return FitStatus.POOR_FIT, (
+            f"Expected corners within {rules.no_corners_px:g} px of the fitted lens, found {off_px:.3g} px (RMS): no "
+            "lens puts these board points there. Check that the points of each view are in the order of the board's.",
+        )
     sigma, lens = Intrinsics.of(np.sqrt(np.diag(cov))), Intrinsics.of(solved.place.intrinsics)
     by_focal = float(np.max(sigma.focal_px / np.abs(lens.focal_px)))
     by_centre = float(np.max(sigma.principal_point_px)) / image_size[0]

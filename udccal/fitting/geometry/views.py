@@ -33,7 +33,7 @@ from udccal.fitting.geometry.bundle import (
     linearised,
     solve,
 )
-from udccal.fitting.geometry.calibrated import CalibratedViews, remarks, status_of, weigh
+from udccal.fitting.geometry.calibrated import CalibratedViews, remarks, rms_px, status_of, weigh
 from udccal.fitting.geometry.data import Gathered, best_poses, facing
 from udccal.models.geometry import Geometry
 from udccal.numerics import in_float64
@@ -80,14 +80,15 @@ def calibrate_views(
     free = ORDERS[orders.best.name]
     final, points, dof = _rescaled(orders.best.fit, points, free, known)
     evidence, cov = weigh(final, points, free, image_size, dof, rules)
-    status, advice = status_of(final, cov, image_size, rules)
     bundle = Bundle(final.place.intrinsics, facing(final.place.poses))
+    residuals_px = linearised(bundle, points)[0]
+    status, advice = status_of(final, cov, rms_px(residuals_px, points), image_size, rules)
     return CalibratedViews(
         intrinsics=Intrinsics.of(bundle.intrinsics),
         poses=bundle.poses,
         cov=cov,
         points=points,
-        residuals_px=linearised(bundle, points)[0],
+        residuals_px=residuals_px,
         free=tuple(bool(one) for one in free),
         chi2_dof=float(((points.sigma / given.sigma)[points.used] ** 2).mean()) if gathered.weighted else 1.0,
         candidates=orders.candidates,

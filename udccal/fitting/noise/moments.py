@@ -226,6 +226,21 @@ def _check_levels(flats: Sequence[Moments], darks: Sequence[Moments]) -> None:
             raise FitError(f"{expected}. Each would count as a new measurement. Give each pair once.")
 
 
+def _check_darker(dark: Codes, exposure_s: float, flats: Sequence[Moments]) -> None:
+    """A FitError where a dark frame is brighter than every flat that is exposed at least as long.
+
+    A flat collects as much dark current in that time. In a longer time, a dark frame may well collect more than the
+    light of dim flats. Three quarters of the samples must be brighter: noise and rounding move a median.
+    """
+    brightest = max((float(of.mean_DN.mean()) for of in flats if of.exposure_s >= exposure_s), default=np.inf)
+    if float(np.percentile(dark[::64], 25.0)) > brightest:
+        found = f"dark frames of {np.median(dark[::64]):.4g} DN and bright ones of at most {brightest:.4g} DN"
+        raise FitError(
+            f"Expected dark frames darker than bright ones of at least their {exposure_s:.4g} s, found {found}. "
+            "They may be exchanged."
+        )
+
+
 @final
 @dataclass(frozen=True)
 class NoiseMoments:
@@ -271,9 +286,7 @@ def reduced(data: NoiseData, rules: NoiseRules) -> NoiseMoments | None:
 
     def dark(level: ExposureLevel) -> tuple[DarkPair, Moments]:
         first, second = (loaded(frame, sample.shape) for frame in level.dark)
-        if (middle := float(np.median(first[::64]))) > brightest:
-            found = f"dark frames of {middle:.4g} DN and bright ones of at most {brightest:.4g} DN"
-            raise FitError(f"Expected dark frames darker than bright ones, found {found}. They may be exchanged.")
+        _check_darker(first, level.exposure_s, flats)
         return dark_pair(first, second, level.exposure_s, q_DN, top), moments((first, second), level.exposure_s)[1]
 
     def average(frames: Sequence[Frame] | Averaged, stack: SpatialStack) -> tuple[Averaged, Moments | None]:
@@ -284,7 +297,6 @@ def reduced(data: NoiseData, rules: NoiseRules) -> NoiseMoments | None:
         tasks = [pool.submit(average, frames, stack) for frames in (stack.dark, stack.bright)] if stack else []
         flats = tuple(pool.map(lambda level: moments(level.bright, level.exposure_s, level.photons)[1], brights))
         top = _converter_top(max(flat.peak_DN for flat in flats), data.top_code, q_DN)
-        brightest = max(float(flat.mean_DN.mean()) for flat in flats)
         histograms, dark_moments = zip(*pool.map(dark, darks), strict=True)
         stacks = [task.result() for task in tasks]
     _check_levels(flats, dark_moments)

@@ -10,8 +10,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from udccal.cfa import cfa_named
-from udccal.errors import FitError
+from udccal.errors import FitError, found_instead
 from udccal.result import FitStatus
+
+_FARTHEST_PX = 2**20
 
 
 @final
@@ -34,6 +36,11 @@ class Stamps:
     channel: Int[np.ndarray, "*channels"] | None = None
 
     def __post_init__(self) -> None:
+        for name, array, axes in (("stamps", self.values_e, 3), ("positions", self.position_px, 2)):
+            if not isinstance(array, np.ndarray) or array.ndim != axes or array.dtype.kind not in "fiu":
+                shape = "stars x rows x columns" if axes == 3 else "stars x 2"
+                expected = f"Expected {name} as an array of real numbers, {shape}"
+                raise FitError(f"{expected}, found {found_instead(array)}. Cut one stamp about each star.")
         count, *sides = self.values_e.shape
         if min(sides) < 7 or max(sides) > 255:
             raise FitError(f"Expected stamps of 7 to 255 samples a side, found {sides[0]} x {sides[1]}. Cut them anew.")
@@ -41,6 +48,10 @@ class Stamps:
             raise FitError(f"Expected at most {2**26} samples, found {self.values_e.size}. Use fewer stamps.")
         if len(self.position_px) != count:
             raise FitError(f"Expected a position for each of {count} stamps, found {len(self.position_px)}.")
+        if self.position_px.shape[1] != 2 or not (np.abs(self.position_px) <= _FARTHEST_PX).all():
+            span = f"{self.position_px.shape[1]} columns from {self.position_px.min():g} to {self.position_px.max():g}"
+            expected = f"Expected positions (x, y) on the sensor, of at most {_FARTHEST_PX} px"
+            raise FitError(f"{expected}, found {span}. Give each stamp's middle sample.")
         if not (np.isfinite(self.read_e) and self.read_e > 0):
             raise FitError(f"Expected a read noise above 0 e-, found {self.read_e}. Count the quantisation into it.")
         if not self.clip_e > 0:

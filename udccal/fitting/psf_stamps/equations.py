@@ -149,10 +149,12 @@ def normal_equations(stamps: Stamps, field: PsfField, seen: Weighted, plane: int
 def node_sums(
     basis: Float[np.ndarray, "stars terms"], seen: Weighted, used: Int[np.ndarray, " used"], grid: tuple[int, ...]
 ) -> Float[np.ndarray, "rows n 4*n"]:
-    """Sum products of two nodes' contributions over samples, as a band."""
+    """Sum products of two nodes' contributions over samples, as a band; raise LinAlgError without samples."""
     # Light of a star at position X enters the image t with the factor B_t(X), for every sample, and the weights of
     # a sample's 4 x 4 nodes are products of four down and four across. The contribution of a grid cell's samples is
     # therefore a product of pairs down, pairs across, and pairs of polynomials.
+    if not used.size:
+        raise np.linalg.LinAlgError("no sample is in use")
     (rows, columns), terms, reach = grid, basis.shape[1], TAPS - 1
     down, across = (part.reshape(-1, TAPS)[used] for part in (seen.seen.down, seen.seen.across))
     (one, other), (t, u) = np.triu_indices(TAPS), np.triu_indices(terms)

@@ -193,18 +193,31 @@ def fit_psf_stamps(
         relative L2 error at the stamps' positions, and the coefficients of the map.
 
     Raises:
-        FitError: when there are fewer than four stamps.
+        FitError: when there are fewer than four stamps with light, or no psf describes any of them.
     """
     rules = rules or StampsRules()
     if len(stamps.unit) < 4:
         raise FitError(f"Expected at least 4 stamps, found {len(stamps.unit)}. Cut more of them.")
+    if (lit := int((stamps.value_e > stamps.read_e).any(axis=1).sum())) < 4:
+        raise FitError(f"Expected light above the noise in at least 4 stamps, found it in {lit}. Check what was cut.")
     bad, lowest = unusable(stamps, rules), Orders(0, 0, rules.spacings_px[0])
     try:
         chosen = search(stamps, rules, orders if bad is None else lowest)
     except np.linalg.LinAlgError:
         bad = FitStatus.NOT_CONVERGED, "The equations were singular; what is given is one psf for all places."
-        chosen = search(stamps, rules, lowest)
+        chosen = _one_for_all(stamps, rules, lowest)
     return _report(stamps, chosen, seed, rules, bad)
+
+
+def _one_for_all(stamps: Stamps, rules: StampsRules, lowest: Orders) -> Choice[Found]:
+    """The fit of the lowest orders; a FitError where there is none."""
+    try:
+        return search(stamps, rules, lowest)
+    except np.linalg.LinAlgError:
+        raise FitError(
+            f"Expected stamps that a psf can describe, found {int(stamps.known.sum())} samples with a value and no "
+            "solution. Check units, noise and clipping level, and that each stamp holds one point source."
+        ) from None
 
 
 def _report(

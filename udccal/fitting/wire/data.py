@@ -16,7 +16,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Shaped
 from scipy.optimize import nnls
 
-from udccal.cfa import cfa_named
+from udccal.cfa import PATTERNS, cfa_named
+from udccal.errors import FitError, found_instead
 from udccal.fitting.engine.robust import OutlierRule
 from udccal.fitting.wire.rules import WireRules, WireStart, wire_start
 from udccal.models.geometry import Geometry, unproject
@@ -46,6 +47,9 @@ class WireData:
         clip: signal at which single frames begin to clip; pixels are left out where the model expects more.
         clipped: part of the flat's pixels whose average is clipped.
         cfa: pattern of the sensor; each of its sites has a gain.
+
+    Raises:
+        FitError: when the arrays are not pictures of one size, no variance is usable, or a number is impossible.
     """
 
     signal: Float[np.ndarray, "rows columns"]
@@ -56,6 +60,26 @@ class WireData:
     clip: float = np.inf
     clipped: float = 0.0
     cfa: str = "RGGB"
+
+    def __post_init__(self) -> None:
+        for name, array in (("signal", self.signal), ("variance", self.variance)):
+            if not isinstance(array, np.ndarray) or array.ndim != 2 or array.dtype.kind not in "fiu":
+                expected = f"Expected the {name} as an array of real numbers, rows x columns"
+                raise FitError(f"{expected}, found {found_instead(array)}. Pass the average of one mosaic.")
+        if self.signal.shape != self.variance.shape:
+            found = f"{self.signal.shape} and {self.variance.shape}"
+            raise FitError(f"Expected signal and variance of one shape, found {found}. Give each pixel its variance.")
+        if self.variance.size and not (np.isfinite(self.variance) & (self.variance >= 0)).any():
+            raise FitError("Expected variances of 0 or more, found none. Take them from the frames that were averaged.")
+        for name, number in (("PRNU1288", self.PRNU1288), ("part of clipped pixels", self.clipped)):
+            if not (np.ndim(number) == 0 and 0 <= number <= 1):
+                raise FitError(f"Expected a {name} from 0 to 1, found {number}. Take it from the noise fit.")
+        if np.isnan(self.clip):
+            raise FitError("Expected a signal from which frames clip, found NaN. Leave it out if nothing clips.")
+        if self.cfa not in PATTERNS:
+            raise FitError(
+                f"Expected one of the patterns {', '.join(PATTERNS)}, found '{self.cfa}'. Name the sensor's."
+            )
 
 
 def read_wire(session: Session, noise: Noise, geometry: Geometry, rules: WireRules | None = None) -> WireData:
