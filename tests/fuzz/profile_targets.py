@@ -46,7 +46,7 @@ T = TypeVar("T")
 
 _CHANGE = struct.Struct("<HHHH")
 # One field position and little beyond the frame: what is tried here is numbers, not accuracy.
-_OPTIONS = PlanOptions(grid_rows=1, grid_columns=1, pad_rows=8, pad_columns=8, tile_rows=64, tile_columns=64, workers=1)
+_OPTIONS = PlanOptions(grid_rows=1, grid_columns=1, pad_rows=8, pad_columns=8, tile_rows=96, tile_columns=96, workers=1)
 _EXPOSURE_S = 0.02
 _BURIED, _DEPTH = "buried", 20_000
 _INTERESTING: tuple[Any, ...] = (

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from udccal.cfa import PATTERNS
+from udccal.errors import RestorationError
 from udccal.restoration.tiles import layout_for
 
 
@@ -21,6 +22,11 @@ def test_what_is_cut_and_joined_is_the_frame(
     joined = layout.join(layout.cut(mosaic)[:, None])[..., 0]
     covered = slice(max(rows[0], 0), min(rows[1], frame[0]))
     np.testing.assert_allclose(joined[covered], mosaic[covered], atol=1e-6)
+
+
+def test_tiles_too_small_to_be_blended_are_refused() -> None:
+    with pytest.raises(RestorationError, match="at least 80 x 80 px, found 128 x 64"):
+        layout_for(300, 300, (2, 2), (64, 128), (0, 300))
 
 
 def test_every_tile_begins_with_the_same_colour_inside_and_outside_the_frame() -> None:

@@ -15,6 +15,8 @@ from typing import final
 import numpy as np
 from jaxtyping import Float32, Int
 
+from udccal.errors import RestorationError
+
 TAPER_PX, BLEND_PX = 24, 16
 
 
@@ -111,7 +113,15 @@ def layout_for(
         cell: (rows, columns) of the colour pattern.
         size: (rows, columns) of a tile, rounded up to whole cells.
         rows: first row to be covered, and the row after the last one.
+
+    Raises:
+        RestorationError: when a tile is too small to have a part that is neither tapered nor blended.
     """
+    least = 2 * (TAPER_PX + BLEND_PX)
+    if min(size) < least:
+        raise RestorationError(
+            f"Expected tiles of at least {least} x {least} px, found {size[1]} x {size[0]}. Give larger ones."
+        )
     height, width = (-(-most // unit) * unit for most, unit in zip(size, cell, strict=True))
     return TileLayout(height, width, max(rows[0], 0), min(rows[1], frame_rows), frame_rows, frame_columns, *cell)
 

@@ -156,10 +156,16 @@ class Search:
                 break
         else:
             return Found(bare, sample, gain)
-        finished, weights = [], None
-        for sharpness in self.rules.sharpness:
-            rivals = self._search(places, bare, strongest, sample, sharpness)
-            weights = weights or rivals[0].weighs(many, self.noise)
+        first, *others = self.rules.sharpness
+        sharp = self._search(places, bare, strongest, sample, first)
+        weights, tried = sharp[0].weighs(many, self.noise), [(first, sharp)]
+        for sharpness in others:
+            # From where sharp edges led; only edges that these pixels prefer are finished.
+            placed = (with_harmonics(one.wire, strongest, sample.ideal, sharpness) for one in sharp)
+            soft = [self._descent(wire, sharp[0].gains, sample, SOLVER) for wire in placed]
+            tried.append((sharpness, [one for one in soft if one.criterion < sharp[0].criterion]))
+        finished = []
+        for sharpness, rivals in tried:
             for one in rivals:
                 columns = _best_columns(one, weights, self.start.column_open)
                 wire = with_harmonics(columns, harmonics, few.ideal, sharpness)
