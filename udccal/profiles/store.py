@@ -8,7 +8,7 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
-from udccal.errors import ProfileError, RigError
+from udccal.errors import FileFormatError, ProfileError, RigError
 from udccal.io.atomic import write_atomically
 from udccal.io.links import is_plain_file
 from udccal.io.whole_folder import folder_beside, replace_whole, standing
@@ -59,7 +59,7 @@ def read_profile(path: Path) -> Profile:
         place, before = standing(path), _identity(path)
         try:
             return _read(place)
-        except (ProfileError, OSError):
+        except (ProfileError, FileFormatError, OSError):
             if _identity(path) == before:
                 raise
 
