@@ -11,7 +11,7 @@ class Tier(enum.StrEnum):
     ``preview``: black level, wire, backscatter of the panel's mean, demosaicing, geometry; no deblurring.
     ``fast``: backscatter of the panel's picture; demosaicing and deblurring in one linear filter per tile, each with
     the prior that its samples make likeliest.
-    ``balanced``: also takes out noise band by band, and solves for clipped light.
+    ``balanced``: also takes out noise band by band.
     """
 
     preview = "preview"

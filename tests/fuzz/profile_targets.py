@@ -36,7 +36,7 @@ from udccal.profiles.profile import Profile, build_profile
 from udccal.profiles.provenance import PROFILE_NAME, provenance_now
 from udccal.profiles.store import read_profile, write_profile
 from udccal.restoration import runtime
-from udccal.restoration.lowrank import KernelGrid
+from udccal.restoration.kernel_grid import KernelGrid
 from udccal.restoration.plan import PlanOptions, kernel_grid
 from udccal.restoration.view import inscribed_view
 from udccal.result import Estimate, FitResult, FitStatus
@@ -46,7 +46,7 @@ T = TypeVar("T")
 
 _CHANGE = struct.Struct("<HHHH")
 # One field position and little beyond the frame: what is tried here is numbers, not accuracy.
-_OPTIONS = PlanOptions(grid_rows=1, grid_columns=1, pad_rows=8, pad_columns=8, tile_rows=96, tile_columns=96, workers=1)
+_OPTIONS = PlanOptions(grid_rows=1, grid_columns=1, tile_rows=96, tile_columns=96, workers=1)
 _EXPOSURE_S = 0.02
 _BURIED, _DEPTH = "buried", 20_000
 _INTERESTING: tuple[Any, ...] = (

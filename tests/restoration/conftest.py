@@ -12,7 +12,7 @@ from udccal.models.geometry import Geometry
 from udccal.models.noise import Noise
 from udccal.profiles.profile import Profile, build_profile
 from udccal.profiles.provenance import provenance_now
-from udccal.restoration.lowrank import KernelGrid
+from udccal.restoration.kernel_grid import KernelGrid
 from udccal.result import FitResult, FitStatus
 from udccal.rig import RigDescription, load_rig
 

@@ -1,38 +1,90 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from udccal.cfa import cfa_named
-from udccal.restoration.backscatter import estimated_rate, mask_mosaic
+from udccal.models.backscatter import Backscatter, backscatter_rate
+from udccal.numerics import in_float64
+from udccal.profiles.profile import Profile
+from udccal.restoration.backscatter import PanelLight, PanelMask, mask_mosaic
 
 ROWS, COLUMNS = 96, 128
-CHANNELS = cfa_named("RGGB").channel_map(ROWS, COLUMNS)
+CFA = cfa_named("RGGB")
+CHANNELS = CFA.channel_map(ROWS, COLUMNS)
 
 
 @pytest.fixture
-def mask() -> np.ndarray:
+def mask() -> PanelMask:
     y, x = np.mgrid[: ROWS // 2, : COLUMNS // 2]
     cells = 1000.0 * (1 + y[..., None] / ROWS) * np.array([1.0, 2.0, 3.0]) + x[..., None]
-    return mask_mosaic(cells.astype(np.float32), "RGGB", ROWS, COLUMNS)
+    return PanelMask(mask_mosaic(cells.astype(np.float32), CFA, ROWS, COLUMNS), CFA)
 
 
-def test_each_sample_gets_its_own_colour(mask: np.ndarray) -> None:
-    np.testing.assert_allclose(mask[:2, :2], [[1000, 2000], [2000, 3000]])
-    assert mask_mosaic(np.ones((4, 4, 3), np.float32), "GBRG", 9, 9).shape == (9, 9)
+def test_each_sample_gets_its_own_colour(mask: PanelMask) -> None:
+    np.testing.assert_allclose(mask.white[:2, :2], [[1000, 2000], [2000, 3000]])
+    assert mask_mosaic(np.ones((4, 4, 3), np.float32), cfa_named("GBRG"), 9, 9).shape == (9, 9)
 
 
-def test_the_level_is_what_dark_places_allow(mask: np.ndarray) -> None:
+def test_the_level_is_what_dark_places_allow(mask: PanelMask) -> None:
     rng = np.random.default_rng(0)
-    scene = rng.uniform(500, 5000, mask.shape).astype(np.float32)
+    scene = rng.uniform(500, 5000, (ROWS, COLUMNS)).astype(np.float32)
     scene[32:64, 32:80] = 0.0
-    levels = np.array([0.3, 0.5, 0.2], np.float32)[CHANNELS]
-    found = estimated_rate(scene + mask * levels, mask, "RGGB")
-    np.testing.assert_allclose(found, mask * levels, rtol=0.05)
+    levels = np.array([0.3, 0.5, 0.2], np.float32)
+    found = mask.levels(0.01 * (scene + mask.white * levels[CHANNELS]), 0.01)
+    np.testing.assert_allclose(found, levels, rtol=0.05)
+    np.testing.assert_allclose(mask.rate(found), mask.white * found[CHANNELS])
 
 
-def test_a_dark_panel_takes_nothing_and_a_bright_scene_at_most_the_mask(mask: np.ndarray) -> None:
-    dark = np.zeros(mask.shape, np.float32)
-    assert not estimated_rate(dark - 3.0, mask, "RGGB").any()
-    assert (estimated_rate(dark + 1e6, mask, "RGGB") <= mask).all()
-    assert not estimated_rate(dark + 1e3, dark, "RGGB").any()
+def test_a_dark_panel_takes_nothing_and_a_bright_scene_at_most_the_mask(mask: PanelMask) -> None:
+    dark = np.zeros((ROWS, COLUMNS), np.float32)
+    assert not mask.levels(dark - 3.0, 1.0).any()
+    assert (mask.levels(dark + 1e6, 1.0) == 1).all()
+    assert not PanelMask(dark, CFA).levels(dark + 1e3, 1.0).any()
+
+
+@pytest.mark.parametrize("name", ["mono", "RGGB"])
+def test_frames_smaller_than_a_block_have_a_level(name: str) -> None:
+    cfa = cfa_named(name)
+    white = np.full((10, 12), 100.0, np.float32)
+    found = PanelMask(white, cfa).levels(0.25 * white, 1.0)
+    np.testing.assert_allclose(found, [0, 0.25, 0] if name == "mono" else 0.25, rtol=1e-5)
+
+
+@pytest.fixture(scope="module")
+def lit(profile: Profile) -> Backscatter:
+    """A panel before the whole camera, whose footprints are some pixels wide."""
+    term, pitch_mm = profile.backscatter.term, profile.rig.panel.pitch_mm.value
+    before_panel = replace(term.geometry, pupil_mm=np.array([16 * pitch_mm, 12 * pitch_mm, -14.0]))
+    return replace(term, geometry=before_panel)
+
+
+def test_sums_over_pixels_are_the_term(profile: Profile, lit: Backscatter) -> None:
+    rig = profile.rig
+    picture = np.random.default_rng(5).integers(0, 256, (rig.panel.rows, rig.panel.columns, 3)).astype(np.uint8)
+    expected = np.asarray(in_float64(backscatter_rate)(lit, picture))
+    assert expected.max() > 100
+    found = PanelLight.of(lit, rig, 1).rate(picture)
+    np.testing.assert_allclose(found, expected, atol=1e-4 * expected.max())
+    # A wrong picture is told from the right one.
+    assert np.abs(PanelLight.of(lit, rig, 1).rate(picture[::-1].copy()) - expected).max() > 0.05 * expected.max()
+
+
+def test_blocks_of_pixels_cost_little_accuracy_and_none_on_even_pictures(profile: Profile, lit: Backscatter) -> None:
+    rig = profile.rig
+    y, x = np.mgrid[: rig.panel.rows, : rig.panel.columns]
+    waves = np.stack([127 + 120 * np.sin(x / (3 + c) + y / 5) for c in range(3)], axis=-1).astype(np.uint8)
+    exact, blocks = PanelLight.of(lit, rig, 1), PanelLight.of(lit, rig, 2)
+    even = np.full_like(waves, 200)
+    np.testing.assert_allclose(blocks.rate(even), exact.rate(even), rtol=1e-4)
+    expected = exact.rate(waves)
+    assert 0 < np.sqrt(np.mean((blocks.rate(waves) - expected) ** 2)) < 0.02 * expected.max()
+
+
+def test_a_panel_whose_last_blocks_are_not_whole_is_as_bright(profile: Profile, lit: Backscatter) -> None:
+    odd = profile.rig.model_copy(update={"panel": profile.rig.panel.model_copy(update={"rows": 23, "columns": 31})})
+    white = np.full((23, 31, 3), 255, np.uint8)
+    exact, blocks = (PanelLight.of(lit, odd, block).rate(white) for block in (1, 2))
+    np.testing.assert_allclose(blocks, exact, rtol=1e-4, atol=1e-4 * exact.max())

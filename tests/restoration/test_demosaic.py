@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from udccal.cfa import cfa_named
-from udccal.restoration.demosaic import demosaic, demosaic_clipped
+from udccal.restoration.demosaic import demosaic
 
 
 @pytest.mark.parametrize("cfa", ["RGGB", "BGGR", "GRBG", "GBRG"])
@@ -24,23 +24,3 @@ def test_a_wrong_pattern_shows() -> None:
     mosaic = np.take_along_axis(picture, cfa_named("RGGB").channel_map(12, 12)[..., None], 2)[..., 0]
     np.testing.assert_allclose(demosaic(mosaic, "RGGB"), picture, atol=1e-5)
     assert np.abs(demosaic(mosaic, "GRBG") - picture).max() > 1.0
-
-
-def test_a_saturated_colour_does_not_spoil_the_others() -> None:
-    channels = cfa_named("RGGB").channel_map(16, 16)
-    mosaic = np.choose(channels, [100.0, 20.0, 30.0]).astype(np.float32)
-    saturated = np.zeros((16, 16), bool)
-    saturated[8, 8] = True
-    mosaic[8, 8] = 60.0  # a red sample that was clipped
-    picture, valid = demosaic_clipped(mosaic, "RGGB", saturated)
-    np.testing.assert_allclose(picture[..., 1:], np.broadcast_to([20.0, 30.0], (16, 16, 2)), atol=1e-4)
-    assert valid[..., 1:].all()
-    assert not valid[7:10, 7:10, 0].any()
-    np.testing.assert_allclose(picture[valid[..., 0]][:, 0], 100.0, atol=1e-3)
-
-
-def test_without_saturation_nothing_changes() -> None:
-    mosaic = np.random.default_rng(0).random((16, 16)).astype(np.float32)
-    picture, valid = demosaic_clipped(mosaic, "BGGR", np.zeros((16, 16), bool))
-    np.testing.assert_array_equal(picture, demosaic(mosaic, "BGGR"))
-    assert valid.all()

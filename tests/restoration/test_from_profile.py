@@ -26,7 +26,7 @@ def test_a_stored_profile_restores_a_frame(profile: Profile, tmp_path: Path, tie
     picture = np.full((rig.panel.rows, rig.panel.columns, 3), 255, np.uint8)
     scene_e = 2000.0
     assert restorer.mask is not None
-    backscatter_e = exposure_s * restorer.mask
+    backscatter_e = exposure_s * restorer.mask.white
     frame = np.rint(64 + 0.355 * (scene_e + backscatter_e + 20 * exposure_s)).astype(np.uint16)
     # The preview does not ask what the panel shows.
     for shown in (picture,) if tier is Tier.preview else (picture, np.zeros_like(picture)):
@@ -48,7 +48,7 @@ def test_absent_terms_cost_nothing(profile: Profile) -> None:
     restorer = Restorer.from_profile(without)
     assert restorer.wire is None
     assert restorer.sharpener is None
-    assert restorer.response is None
+    assert restorer.panel is None
     frame = np.full((profile.rig.camera.rows, profile.rig.camera.columns), 64 + round(0.355 * 2000), np.uint16)
     np.testing.assert_allclose(restorer.restore(frame, 0.02) * 0.02, 2000.0, rtol=0.01)
 

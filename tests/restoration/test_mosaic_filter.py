@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from udccal.cfa import PATTERNS, Cfa
-from udccal.restoration.lowrank import KernelGrid
+from udccal.restoration.kernel_grid import KernelGrid
 from udccal.restoration.mosaic_filter import (
+    _COLOURS,
     STRENGTHS,
-    _agreement,
+    FilterTables,
     _solve_chunk,
     _tables_of,
     filter_tables,
@@ -43,7 +44,7 @@ def dense_solution(tile: np.ndarray, kernel: np.ndarray, cfa: Cfa, strength: flo
     blurs = [circulant(np.fft.fft2(p)) for p in placed]
     channels = cfa.channel_map(SIZE, SIZE).ravel()
     seen = np.zeros((SIZE * SIZE, SIZE * SIZE))
-    mixed = np.array([[_agreement(i, j) for j in range(3)] for i in range(3)])
+    mixed = _COLOURS
     across = [np.zeros((SIZE * SIZE, SIZE * SIZE)) for _ in range(3)]
     for i in range(3):
         for j in range(3):
@@ -64,12 +65,10 @@ def test_the_filter_is_the_posteriors_mean(name: str) -> None:
         own = cfa.channel_map(SIZE, SIZE) == channel
         if own.any():
             tile[own] -= tile[own].mean()
-    tables = _tables_of(kernel, prior_density(SIZE, SIZE), cfa)
     choices = np.full((1, len(STRENGTHS)), strength, np.float32)
     whole = np.ones((SIZE, SIZE), np.float32)
-    found, chosen = _solve_chunk(
-        tile[None], np.ones((1, 3), np.float32), choices, *(t[None] for t in tables), whole, cfa=cfa
-    )
+    tables = FilterTables(*(table[None] for table in _tables_of(kernel, prior_density(SIZE, SIZE), cfa)))
+    found, chosen = _solve_chunk(tile[None], np.ones((1, 3), np.float32), choices, tables, whole, cfa=cfa)
     expected = dense_solution(tile.astype(float), kernel, cfa, strength)
     assert float(chosen[0]) == strength
     # In sigma of a sample's noise: single precision costs most at the tile's mean, where the prior is widest.
@@ -90,13 +89,14 @@ def test_scenes_drawn_from_the_prior_choose_their_own_strength(strength: float) 
     point = np.zeros((1, 1, 3, 3, 3), np.float32)
     point[..., 1, 1] = 1.0
     layout = layout_for(128, 128, (2, 2), (128, 128), (40, 80))
+    shape = layout.rows, layout.columns
     tables = filter_tables(KernelGrid(np.zeros(1), np.zeros(1), point), layout, cfa, 1)
-    amplitude = np.sqrt(strength * prior_density(128, 128))
-    grey = np.linalg.cholesky([[_agreement(i, j) for j in range(3)] for i in range(3)])
-    white = np.fft.fft2(rng.normal(size=(layout.count, 3, 128, 128)))
+    amplitude = np.sqrt(strength * prior_density(*shape))
+    grey = np.linalg.cholesky(_COLOURS)
+    white = np.fft.fft2(rng.normal(size=(layout.count, 3, *shape)))
     scene = np.einsum("ij,njyx->niyx", grey, np.fft.ifft2(white * amplitude).real)
-    own = cfa.channel_map(128, 128)
-    mosaics = np.take_along_axis(scene, own[None, None], axis=1)[:, 0] + rng.normal(size=(layout.count, 128, 128))
+    own = cfa.channel_map(*shape)
+    mosaics = np.take_along_axis(scene, own[None, None], axis=1)[:, 0] + rng.normal(size=(layout.count, *shape))
     noise = np.ones((layout.count, 3), np.float32)
     _, chosen = filtered(mosaics.astype(np.float32), noise, tables, layout, cfa, 1)
     assert np.all(np.abs(np.log2(chosen / strength)) <= 1.01)

@@ -16,7 +16,7 @@ from jaxtyping import Float32, Int
 
 from udccal.profiles.profile import Profile
 from udccal.restoration import backscatter, prepared, runtime, sharpen
-from udccal.restoration.backscatter import known_rate, prepared_response
+from udccal.restoration.backscatter import PanelLight
 from udccal.restoration.plan import PlanOptions
 from udccal.restoration.prepared import kept, prepared_bytes, prepared_folder
 from udccal.restoration.runtime import Restorer
@@ -285,24 +285,24 @@ def test_the_second_start_computes_nothing(
     for part in ("grid", "tables", "noise"):
         one, other = vars(getattr(first.sharpener, part)), vars(getattr(second.sharpener, part))
         assert all(np.array_equal(one[name], other[name]) for name in one)
-    assert second.response is not None
+    assert second.panel is not None
     frame = np.full((profile.rig.camera.rows, profile.rig.camera.columns), 900, np.uint16)
     frame[20:30, 40:60] = 3000
     shown = np.full((profile.rig.panel.rows, profile.rig.panel.columns, 3), 200, np.uint8)
     assert np.array_equal(first.restore(frame, 0.02, shown), second.restore(frame, 0.02, shown))
 
 
-def test_a_kept_response_gives_the_terms_light(profile: Profile, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_kept_sums_give_the_terms_light(profile: Profile, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     rig = profile.rig
     pitch_mm, term = rig.panel.pitch_mm.value, profile.backscatter.term
     before_panel = replace(term.geometry, pupil_mm=np.array([16 * pitch_mm, 12 * pitch_mm, -14.0]))
     term = replace(term, geometry=before_panel)
     shown = np.random.default_rng(5).integers(0, 256, (rig.panel.rows, rig.panel.columns, 3)).astype(np.uint8)
-    expected = known_rate(prepared_response(term, rig), shown)
+    expected = PanelLight.of(term, rig, 2).rate(shown)
     assert expected.mean() > 100
-    prepared_response(term, rig, folder)
+    PanelLight.of(term, rig, 2, folder)
     _refuse(monkeypatch, "panel_response")
-    assert np.array_equal(known_rate(prepared_response(term, rig, folder), shown), expected)
+    assert np.array_equal(PanelLight.of(term, rig, 2, folder).rate(shown), expected)
 
 
 def test_tiers_share_what_both_need(

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from udccal.cfa import PATTERNS
-from udccal.restoration.lowrank import KernelGrid
+from udccal.restoration.kernel_grid import KernelGrid
 from udccal.restoration.mosaic_filter import STRENGTHS, FilterTables, filter_tables, filtered
 from udccal.restoration.shrink import BandNoise, _split, measured_noise, shrunk
 from udccal.restoration.tiles import TileLayout, layout_for

@@ -19,9 +19,16 @@ def test_what_is_cut_and_joined_is_the_frame(
     cfa = PATTERNS[name]
     layout = layout_for(*frame, (cfa.rows, cfa.columns), size, rows)
     mosaic = np.random.default_rng(0).random(frame, dtype=np.float32)
-    joined = layout.join(layout.cut(mosaic)[:, None])[..., 0]
-    covered = slice(max(rows[0], 0), min(rows[1], frame[0]))
-    np.testing.assert_allclose(joined[covered], mosaic[covered], atol=1e-6)
+    joined = layout.join(layout.cut(mosaic)[:, None] * np.array([1, 2, 3], np.float32)[:, None, None])
+    covered = mosaic[max(rows[0], 0) : rows[1], :, None]
+    np.testing.assert_allclose(joined, covered * np.array([1, 2, 3]), atol=2e-6)
+
+
+def test_tiles_are_no_larger_than_what_they_cover_asks_for() -> None:
+    layout = layout_for(1536, 2048, (2, 2), (256, 256), (300, 1240))
+    assert (layout.rows, layout.columns, layout.count) == (256, 256, 55)
+    small = layout_for(1536, 2048, (2, 2), (256, 256), (0, 200))
+    assert small.rows < 256 == layout_for(1536, 2048, (2, 2), (255, 255), (0, 300)).columns
 
 
 def test_tiles_too_small_to_be_blended_are_refused() -> None:
@@ -35,15 +42,16 @@ def test_every_tile_begins_with_the_same_colour_inside_and_outside_the_frame() -
     layout = layout_for(100, 131, (2, 2), (96, 96), (0, 100))
     tiles = layout.cut(channels)
     # The last column of an odd frame is half a cell, which a mirrored cell cannot begin with.
-    whole = np.array(layout.lefts)[None, :].repeat(len(layout.tops), axis=0).ravel() + 96 <= 130
+    whole = np.array(layout.lefts)[None, :].repeat(len(layout.tops), axis=0).ravel() + layout.columns <= 130
     assert whole.any()
     for tile in tiles[whole]:
-        np.testing.assert_array_equal(tile, cfa.channel_map(96, 96))
+        np.testing.assert_array_equal(tile, cfa.channel_map(layout.rows, layout.columns))
 
 
 def test_tiles_whose_values_differ_are_blended_without_a_step() -> None:
     layout = layout_for(200, 600, (2, 2), (128, 128), (0, 200))
-    values = np.repeat(np.arange(layout.count, dtype=np.float32), 128 * 128).reshape(-1, 1, 128, 128)
+    values = np.arange(layout.count, dtype=np.float32).repeat(3 * layout.rows * layout.columns)
+    values = values.reshape(-1, 3, layout.rows, layout.columns)
     joined = layout.join(values)[..., 0]
     steps = np.abs(np.diff(joined[:, layout.lefts[1] :], axis=1))
     assert steps.max() < 0.15

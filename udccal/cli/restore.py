@@ -32,7 +32,7 @@ def restore(
         Tier,
         typer.Option(
             "--tier",
-            help="preview: no deblurring. fast: one linear filter per tile. balanced: noise and clipped light as well.",
+            help="preview: no deblurring. fast: one linear filter per tile. balanced: takes out noise as well.",
         ),
     ] = Tier.balanced,
     picture_format: Annotated[

@@ -258,8 +258,8 @@ def mosaic_of_grid(
 ) -> Float[Array, "rows columns"]:
     """Interpolate from the grid to every sample of the mosaic, each in its own colour, by cubic convolution."""
     grid = jnp.asarray(grid)
-    by_column = _cubic_weights(term.columns, term.step, grid.shape[2], grid.dtype)
-    by_row = _cubic_weights(term.rows, term.step, grid.shape[1], grid.dtype)
+    by_column = cubic_weights(term.columns, term.step, grid.shape[2], grid.dtype)
+    by_row = cubic_weights(term.rows, term.step, grid.shape[1], grid.dtype)
     mosaic = jnp.zeros((term.rows, term.columns), grid.dtype)
     for site in cfa_named(term.cfa).sites:
         down, across = site.samples
@@ -267,8 +267,11 @@ def mosaic_of_grid(
     return mosaic
 
 
-def _cubic_weights(count: int, step: int, nodes: int, dtype: jnp.dtype) -> Float[Array, "count nodes"]:
-    """Matrix of Keys' cubic convolution (1981, a = -1/2) from block centres to pixels; linear beyond the last nodes."""
+def cubic_weights(count: int, step: int, nodes: int, dtype: jnp.dtype) -> Float[Array, "count nodes"]:
+    """Return the matrix of Keys' cubic convolution (1981, a = -1/2) from block centres to pixels.
+
+    Beyond the last nodes it is linear.
+    """
     position = (jnp.arange(count, dtype=dtype) + 0.5) / step - 0.5
     padded = jnp.arange(-2, nodes + 2, dtype=dtype)
     distance = jnp.abs(position[:, None] - padded)

@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, final
+from typing import final
 
-import jax
+import cv2
 import numpy as np
-from jaxtyping import Float, Float32, Int32, UInt8
+from jaxtyping import Float32, Int32, UInt8
+from scipy import sparse
 
-from udccal.cfa import cfa_named
+from udccal.cfa import Cfa, cfa_named
 from udccal.errors import RestorationError
-from udccal.models.backscatter import Backscatter, PanelResponse, panel_response, response_rate
+from udccal.models.backscatter import Backscatter, cubic_weights, panel_light, panel_response
 from udccal.numerics import in_float64
 from udccal.restoration.prepared import kept
 from udccal.rig import RigDescription
 
+# Shares below this fraction of all light are left out.
+_LEAST_SHARE = 1e-6
 # Side in samples of the blocks that give the level: large enough to average noise, small enough to find dark places.
 _BLOCK = 16
 _PERCENTILE = 1.0
@@ -24,90 +28,190 @@ _PERCENTILE = 1.0
 
 @final
 @dataclass(frozen=True)
-class _ResponseArrays:
-    """The arrays of a ``PanelResponse`` beside its term."""
+class PanelSums:
+    """Backscatter as sums over blocks of panel pixels: for each place of the term's grid, a row of a sparse matrix.
 
-    shares: Float32[np.ndarray, "positions window2 3"]
-    pixels: Int32[np.ndarray, "positions window2"]
-    gain: Float32[np.ndarray, "3 positions"]
+    Attributes:
+        shares: fraction of each primary's light that the footprint collects.
+        blocks: index of the row-major block that it comes from.
+        starts: first share of each place, and the number of shares.
+        gain: e-/s of each camera colour per mixed light, by place.
+        mix: matrix from primaries to camera colours.
+        light: linear light of the 8-bit values of a picture.
+        down, across: weights from the grid to the rows and columns of the mosaic.
+    """
+
+    shares: Float32[np.ndarray, "3 shares"]
+    blocks: Int32[np.ndarray, " shares"]
+    starts: Int32[np.ndarray, " places_and_end"]
+    gain: Float32[np.ndarray, "3 places"]
+    mix: Float32[np.ndarray, "3 3"]
+    light: Float32[np.ndarray, " 256"]
+    down: Float32[np.ndarray, "rows grid_rows"]
+    across: Float32[np.ndarray, "columns grid_columns"]
+
+
+@final
+@dataclass(frozen=True)
+class PanelLight:
+    """The backscatter of any picture on the rig's panel, quickly.
+
+    The footprint of the pupil covers some dozen panel pixels, so that blocks of 2 x 2 of them tell nearly as much.
+
+    Attributes:
+        sums: the term, evaluated.
+        cfa: the camera's colour pattern.
+        panel_rows, panel_columns: pixels of the panel. block: pixels across a block.
+    """
+
+    sums: PanelSums
+    cfa: Cfa
+    panel_rows: int
+    panel_columns: int
+    block: int
+
+    @classmethod
+    def of(cls, term: Backscatter, rig: RigDescription, block: int, keep: Path | None = None) -> PanelLight:
+        """Evaluate the term for the rig's panel.
+
+        Args:
+            term: the backscatter term.
+            rig: the rig description.
+            block: pixels across a block; 1 sums over pixels.
+            keep: folder that keeps the sums between starts; None to keep nothing.
+
+        Raises:
+            RestorationError: when a value is not finite.
+        """
+        sums = kept(keep, PanelSums, (term, rig, block), lambda: _panel_sums(term, rig, block))
+        return cls(sums, cfa_named(rig.camera.cfa), rig.panel.rows, rig.panel.columns, block)
+
+    def rate(self, picture: UInt8[np.ndarray, "panel_rows panel_columns 3"]) -> Float32[np.ndarray, "rows columns"]:
+        """Return the backscatter in e-/s at every sample of the mosaic while the panel shows ``picture``."""
+        light = self._blocks(cv2.LUT(picture, self.sums.light))
+        collected = np.stack([sums @ plane.ravel() for sums, plane in zip(self._matrices, light, strict=True)])
+        nodes = len(self.sums.down[0]), len(self.sums.across[0])
+        grid = (self.sums.gain * (self.sums.mix @ collected)).reshape(3, *nodes)
+        rate = np.empty((len(self.sums.down), len(self.sums.across)), dtype=np.float32)
+        for site, (down, across) in zip(self.cfa.sites, self._interpolations, strict=True):
+            rate[site.samples] = down @ np.ascontiguousarray((across @ np.ascontiguousarray(grid[site.channel].T)).T)
+        return rate
+
+    def _blocks(self, light: Float32[np.ndarray, "rows columns 3"]) -> list[Float32[np.ndarray, "down across"]]:
+        """Return the mean light of each primary in blocks; at the panel's edge, of what there is of them."""
+        down, across = (-(-most // self.block) for most in (self.panel_rows, self.panel_columns))
+        below, right = down * self.block - self.panel_rows, across * self.block - self.panel_columns
+        if below or right:
+            light = cv2.copyMakeBorder(light, 0, below, 0, right, cv2.BORDER_REFLECT)
+        return list(cv2.split(cv2.resize(light, (across, down), interpolation=cv2.INTER_AREA)))
+
+    @functools.cached_property
+    def _matrices(self) -> list[sparse.csr_array]:
+        shape = (len(self.sums.starts) - 1, -(-self.panel_rows // self.block) * -(-self.panel_columns // self.block))
+        pattern = self.sums.blocks, self.sums.starts
+        return [sparse.csr_array((shares, *pattern), shape) for shares in self.sums.shares]
+
+    @functools.cached_property
+    def _interpolations(self) -> list[tuple[sparse.csr_array, sparse.csr_array]]:
+        both = self.sums.down, self.sums.across
+        return [
+            (sparse.csr_array(both[0][site.samples[0]]), sparse.csr_array(both[1][site.samples[1]]))
+            for site in self.cfa.sites
+        ]
 
 
 @in_float64
-def prepared_response(term: Backscatter, rig: RigDescription, keep: Path | None = None) -> PanelResponse:
-    """Evaluate the term for the rig's panel, as float32 numpy arrays.
-
-    Args:
-        term: the backscatter term.
-        rig: the rig description.
-        keep: folder that keeps the result between starts; None to keep nothing.
-
-    Raises:
-        RestorationError: when a value is not finite.
-    """
-    found = kept(keep, _ResponseArrays, (term, rig), lambda: _evaluated(term, rig))
-    return PanelResponse(jax.tree.map(_single, term), found.shares, found.pixels, found.gain)
-
-
-def _evaluated(term: Backscatter, rig: RigDescription) -> _ResponseArrays:
+def _panel_sums(term: Backscatter, rig: RigDescription, block: int) -> PanelSums:
     response = panel_response(term, rig.panel.rows, rig.panel.columns)
-    found = _ResponseArrays(_single(response.shares), np.asarray(response.pixels, np.int32), _single(response.gain))
-    if not (np.all(np.isfinite(found.shares)) and np.all(np.isfinite(found.gain))):
+    shares, pixels, gain = (np.asarray(part) for part in (response.shares, response.pixels, response.gain))
+    if not (np.all(np.isfinite(shares)) and np.all(np.isfinite(gain))):
         raise RestorationError(
             "Expected a footprint of the pupil on the panel for every pixel, found places without one. Check the "
             "backscatter and geometry terms, or calibrate the rig again."
         )
-    return found
-
-
-def _single(leaf: Any) -> np.ndarray:
-    """Return a leaf as numpy, in single precision if it is real: jitted functions use it outside float64."""
-    array = np.asarray(leaf)
-    return array.astype(np.float32) if np.issubdtype(array.dtype, np.floating) else array
-
-
-def known_rate(
-    response: PanelResponse, picture: UInt8[np.ndarray, "panel_rows panel_columns 3"]
-) -> Float32[np.ndarray, "rows columns"]:
-    """Return the backscatter in e-/s at every sample of the mosaic while the panel shows ``picture``."""
-    return np.asarray(response_rate(response, picture), dtype=np.float32)
+    across = -(-rig.panel.columns // block)
+    blocks = pixels // rig.panel.columns // block * across + pixels % rig.panel.columns // block
+    shape = len(pixels), -(-rig.panel.rows // block) * across
+    starts = np.arange(len(pixels) + 1) * pixels.shape[1]
+    # Shares are a fraction of about 1; what is left out of one is far below its own error.
+    significant = [np.where(shares[..., p] > _LEAST_SHARE, shares[..., p], 0.0).ravel() for p in range(3)]
+    wide = [sparse.csr_array((own, blocks.ravel(), starts), shape, copy=True) for own in significant]
+    for matrix in wide:
+        matrix.sum_duplicates()
+    used = wide[0].data + wide[1].data + wide[2].data > 0
+    starts = np.concatenate([[0], np.cumsum(used)])[wide[0].indptr]
+    mask = np.shape(term.mask)
+    return PanelSums(
+        np.stack([matrix.data[used] for matrix in wide]).astype(np.float32),
+        wide[0].indices[used].astype(np.int32),
+        starts.astype(np.int32),
+        gain.astype(np.float32),
+        np.asarray(term.mix, dtype=np.float32),
+        np.asarray(panel_light(term, np.arange(256)[:, None].repeat(3, axis=1)), dtype=np.float32)[:, 0],
+        np.asarray(cubic_weights(term.rows, term.step, mask[1], np.dtype(float)), dtype=np.float32),
+        np.asarray(cubic_weights(term.columns, term.step, mask[2], np.dtype(float)), dtype=np.float32),
+    )
 
 
 def mask_mosaic(
-    mask: Float32[np.ndarray, "half_rows half_columns 3"], cfa: str, rows: int, columns: int
+    mask: Float32[np.ndarray, "half_rows half_columns 3"], cfa: Cfa, rows: int, columns: int
 ) -> Float32[np.ndarray, "rows columns"]:
     """Return the profile's mask, one value per cell and channel, at every sample of the mosaic in its own colour."""
     last_row, last_column = mask.shape[0] - 1, mask.shape[1] - 1
-    pattern = cfa_named(cfa)
-    cell_rows = np.minimum(np.arange(rows) // pattern.rows, last_row)[:, None]
-    cell_columns = np.minimum(np.arange(columns) // pattern.columns, last_column)[None, :]
-    return mask[cell_rows, cell_columns, pattern.channel_map(rows, columns)]
+    cell_rows = np.minimum(np.arange(rows) // cfa.rows, last_row)[:, None]
+    cell_columns = np.minimum(np.arange(columns) // cfa.columns, last_column)[None, :]
+    return mask[cell_rows, cell_columns, cfa.channel_map(rows, columns)]
 
 
-def estimated_rate(
-    signal_rate: Float32[np.ndarray, "rows columns"], mask: Float32[np.ndarray, "rows columns"], cfa: str
-) -> Float32[np.ndarray, "rows columns"]:
-    """Estimate the backscatter in e-/s when the panel picture is not known: the mask times one level per colour.
+@final
+@dataclass(frozen=True)
+class PanelMask:
+    """Backscatter of a panel whose picture is not known: that of a white one times a level per colour.
 
-    Light only adds, so a frame is nowhere darker than its backscatter. The level, from 0 to 1, is the 1st percentile of
-    frame over mask in blocks of 16 x 16 samples. In a scene without dark places the estimate is too high, by at most
-    the scene's own darkest percent.
+    Attributes:
+        white: backscatter of a white panel in e-/s.
+        cfa: the camera's colour pattern.
     """
-    channels = cfa_named(cfa).channel_map(*signal_rate.shape)
-    levels = np.array([_level(signal_rate, mask, channels == channel) for channel in range(3)], dtype=np.float32)
-    return mask * levels[channels]
+
+    white: Float32[np.ndarray, "rows columns"]
+    cfa: Cfa
+
+    @functools.cached_property
+    def _possible(self) -> list[Float32[np.ndarray, "down across"]]:
+        return _block_means(self.white, self.cfa)
+
+    def levels(self, signal_e: Float32[np.ndarray, "rows columns"], exposure_s: float) -> Float32[np.ndarray, "3"]:
+        """Estimate each colour's level, from 0 to 1; 0 for a colour without samples.
+
+        Light only adds, so a frame is nowhere darker than its backscatter. The level is the 1st percentile of frame
+        over white panel in blocks of 16 x 16 samples. In a scene without dark places it is too high, by at most the
+        scene's own darkest percent.
+        """
+        light = _block_means(signal_e, self.cfa)
+        levels = np.zeros(3, dtype=np.float32)
+        for channel in {site.channel for site in self.cfa.sites}:
+            same = [index for index, site in enumerate(self.cfa.sites) if site.channel == channel]
+            seen, possible = (np.sum([planes[index] for index in same], axis=0) for planes in (light, self._possible))
+            usable = possible > 0
+            if usable.any():
+                ratio = np.percentile(seen[usable] / possible[usable], _PERCENTILE)
+                levels[channel] = np.clip(ratio / exposure_s, 0.0, 1.0)
+        return levels
+
+    def rate(self, levels: Float32[np.ndarray, "3"]) -> Float32[np.ndarray, "rows columns"]:
+        """Return the backscatter in e-/s at these levels."""
+        rate = np.empty_like(self.white)
+        for site in self.cfa.sites:
+            rate[site.samples] = levels[site.channel] * self.white[site.samples]
+        return rate
 
 
-def _level(
-    signal_rate: Float[np.ndarray, "rows columns"], mask: Float[np.ndarray, "rows columns"], own: np.ndarray
-) -> float:
-    light, possible = _block_sums(np.where(own, signal_rate, 0.0)), _block_sums(np.where(own, mask, 0.0))
-    usable = possible > 0
-    if not usable.any():
-        return 0.0
-    return float(np.clip(np.percentile(light[usable] / possible[usable], _PERCENTILE), 0.0, 1.0))
-
-
-def _block_sums(samples: np.ndarray) -> Float[np.ndarray, "block_rows block_columns"]:
-    rows, columns = (max(size // _BLOCK, 1) for size in samples.shape)
-    cut = samples[: rows * _BLOCK, : columns * _BLOCK]
-    return cut.reshape(rows, cut.shape[0] // rows, columns, cut.shape[1] // columns).sum(axis=(1, 3))
+def _block_means(mosaic: Float32[np.ndarray, "rows columns"], cfa: Cfa) -> list[Float32[np.ndarray, "down across"]]:
+    """Return each site's mean in blocks."""
+    down, across = (max(size // _BLOCK, 1) for size in mosaic.shape)
+    columns = (across * _BLOCK if mosaic.shape[1] >= _BLOCK else mosaic.shape[1]) // cfa.columns * cfa.columns
+    cut = mosaic[: down * _BLOCK, :columns]
+    # A line of the sites of one row is a line of pixels with as many channels: no site has to be picked out.
+    lines = [cut[row :: cfa.rows].reshape(-1, columns // cfa.columns, cfa.columns) for row in range(cfa.rows)]
+    blocks = [cv2.resize(line, (across, down), interpolation=cv2.INTER_AREA) for line in lines]
+    return [block.reshape(down, across, -1)[..., column] for block in blocks for column in range(cfa.columns)]

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32
+from jaxtyping import Float32
 
 from udccal.cfa import BLUE, GREEN, RED, cfa_named
 
@@ -24,8 +24,6 @@ _COLOUR_ACROSS = np.array(
     [[0, 0, -1.5, 0, 0], [0, 2, 0, 2, 0], [-1.5, 0, 6, 0, -1.5], [0, 2, 0, 2, 0], [0, 0, -1.5, 0, 0]],
     dtype=np.float32,
 ) / np.float32(8)
-_BILINEAR = np.array([[1, 2, 1], [2, 4, 2], [1, 2, 1]], dtype=np.float32)
-_FOOTPRINT = np.ones((5, 5), dtype=np.uint8)
 
 
 def demosaic(mosaic: Float32[np.ndarray, "rows columns"], cfa: str) -> Float32[np.ndarray, "rows columns 3"]:
@@ -46,28 +44,6 @@ def demosaic(mosaic: Float32[np.ndarray, "rows columns"], cfa: str) -> Float32[n
             picture[(*at, GREEN)] = green[at]
             picture[(*at, RED + BLUE - own)] = across[at]
     return picture
-
-
-def demosaic_clipped(
-    mosaic: Float32[np.ndarray, "rows columns"], cfa: str, saturated: Bool[np.ndarray, "rows columns"]
-) -> tuple[Float32[np.ndarray, "rows columns 3"], Bool[np.ndarray, "rows columns 3"]]:
-    """Demosaic a frame with saturated samples, and return which values carry data.
-
-    A saturated sample would affect all three colours of the 5 x 5 pixels around it. There, each colour is interpolated
-    from its own samples alone. It carries data unless one of these is saturated.
-    """
-    picture = demosaic(mosaic, cfa)
-    valid = np.ones(picture.shape, dtype=bool)
-    if not saturated.any():
-        return picture, valid
-    spoilt = cv2.dilate(saturated.astype(np.uint8), _FOOTPRINT).astype(bool)
-    channels = cfa_named(cfa).channel_map(*mosaic.shape)
-    for channel in range(3):
-        own = (channels == channel).astype(np.float32)
-        alone = _filtered(mosaic * own, _BILINEAR) / _filtered(own, _BILINEAR)
-        picture[..., channel] = np.where(spoilt, alone, picture[..., channel])
-        valid[..., channel] = _filtered(own * saturated, _BILINEAR) == 0
-    return picture, valid
 
 
 def _filtered(

@@ -1,4 +1,4 @@
-"""Convert raw numbers to electrons, and find samples that are saturated or defective."""
+"""Convert raw numbers to electrons, and replace samples that are defective."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from udccal.models.noise import Noise
 _OUTLIER_SIGMA = 8.0
 # ... and by this many times their range. A point of light seen through the panel stays below 4: its kernel is wide.
 _OUTLIER_RATIO = 5.0
-_NEIGHBOURS = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], dtype=np.uint8)
+_NEIGHBOURS = tuple((down, across) for down in (-1, 0, 1) for across in (-1, 0, 1) if down or across)
 
 
 def scalar(value: ArrayLike) -> float:
@@ -21,21 +21,16 @@ def scalar(value: ArrayLike) -> float:
     return float(np.asarray(value))
 
 
+def dark_DN(noise: Noise, exposure_s: float) -> float:
+    """Return what a sample reads without light: black level and mean dark signal."""
+    return scalar(noise.black_DN) + scalar(noise.K_DN_per_e) * scalar(noise.dark_current_e_per_s) * exposure_s
+
+
 def to_electrons(
     mosaic: UInt16[np.ndarray, "rows columns"], noise: Noise, exposure_s: float
 ) -> Float32[np.ndarray, "rows columns"]:
-    """Return the signal in e-: (DN - black) / K minus the mean dark signal. Negative values stay."""
-    scale = 1.0 / scalar(noise.K_DN_per_e)
-    offset = scalar(noise.black_DN) * scale + scalar(noise.dark_current_e_per_s) * exposure_s
-    return mosaic.astype(np.float32) * np.float32(scale) - np.float32(offset)
-
-
-def saturated(
-    mosaic: UInt16[np.ndarray, "rows columns"], noise: Noise, margin: float
-) -> Bool[np.ndarray, "rows columns"]:
-    """Return the samples within ``margin`` (a fraction of the range above black) of saturation."""
-    top, black = scalar(noise.saturation_DN), scalar(noise.black_DN)
-    return mosaic >= top - margin * (top - black)
+    """Return the signal in e-: DN above dark over K. Negative values stay."""
+    return (mosaic.astype(np.float32) - np.float32(dark_DN(noise, exposure_s))) / np.float32(scalar(noise.K_DN_per_e))
 
 
 def variance_e2(
@@ -65,12 +60,31 @@ def without_defects(
     of its temporal noise and by more than 5 times that range.
     """
     cleaned = signal_e.copy()
-    floor = scalar(noise.sigma_d_e) ** 2
+    floor = np.float32(scalar(noise.sigma_d_e) ** 2)
     for site in cfa_named(cfa).sites:
         plane = np.ascontiguousarray(signal_e[site.samples])
-        high, low = cv2.dilate(plane, _NEIGHBOURS), cv2.erode(plane, _NEIGHBOURS)
-        sigma = np.sqrt(np.maximum(high, 0.0) + floor)
-        allowed = np.maximum(_OUTLIER_SIGMA * sigma, _OUTLIER_RATIO * (high - low))
-        defective = (plane > high + allowed) | (plane < low - allowed)
-        cleaned[site.samples] = np.where(defective, cv2.medianBlur(plane, 3), plane)
+        median = cv2.medianBlur(plane, 3)
+        # Few samples are this far from their median, and no defective one is nearer.
+        away = plane - median
+        least = np.maximum(median, np.float32(0)) + floor
+        places = np.nonzero(away * away > np.float32(_OUTLIER_SIGMA**2) * least)
+        at = tuple(index[_is_defective(plane, places, floor)] for index in places)
+        plane[at] = median[at]
+        cleaned[site.samples] = plane
     return cleaned
+
+
+def _is_defective(
+    plane: Float32[np.ndarray, "rows columns"], places: tuple[np.ndarray, ...], floor_e2: np.float32
+) -> Bool[np.ndarray, " places"]:
+    neighbours = np.stack([plane[_mirrored(places, plane.shape, step)] for step in _NEIGHBOURS])
+    high, low = neighbours.max(axis=0), neighbours.min(axis=0)
+    sigma = np.sqrt(np.maximum(high, 0.0) + floor_e2)
+    allowed = np.maximum(_OUTLIER_SIGMA * sigma, _OUTLIER_RATIO * (high - low))
+    return (plane[places] > high + allowed) | (plane[places] < low - allowed)
+
+
+def _mirrored(places: tuple[np.ndarray, ...], shape: tuple[int, ...], step: tuple[int, int]) -> tuple[np.ndarray, ...]:
+    """Return the indices of neighbours; beyond the border, those mirrored at it."""
+    steps = zip(places, step, shape, strict=True)
+    return tuple(np.abs((most - 1) - np.abs((most - 1) - (at + by))) % most for at, by, most in steps)

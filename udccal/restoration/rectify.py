@@ -2,16 +2,26 @@
 
 from __future__ import annotations
 
+import enum
+import functools
 from dataclasses import dataclass
 
 import cv2
 import jax
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Float, Float32, Int16, Real, UInt16
 
 from udccal.errors import RestorationError
 from udccal.models.geometry import Geometry, VirtualView, view_to_sensor
 from udccal.numerics import in_float64
+
+
+class Interpolation(enum.IntEnum):
+    """How a picture is resampled: over 2 x 2, 4 x 4 or 8 x 8 pixels."""
+
+    LINEAR = cv2.INTER_LINEAR
+    CUBIC = cv2.INTER_CUBIC
+    LANCZOS = cv2.INTER_LANCZOS4
 
 
 @dataclass(frozen=True)
@@ -49,9 +59,20 @@ class Rectification:
         reach = 4
         return int(np.floor(self.map_y.min())) - reach, int(np.ceil(self.map_y.max())) + reach + 1
 
-    def apply(self, picture: Float32[np.ndarray, "rows columns 3"]) -> Float32[np.ndarray, "view_rows view_columns 3"]:
-        """Resample a sensor picture onto the view (Lanczos over 8 x 8 pixels)."""
-        return cv2.remap(picture, self.map_x, self.map_y, cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REFLECT_101)
+    def from_row(self, first: int) -> Rectification:
+        """Return the maps for pictures that begin at a row of the sensor."""
+        return Rectification(self.map_x, self.map_y - np.float32(first))
+
+    @functools.cached_property
+    def _fixed(self) -> tuple[Int16[np.ndarray, "rows columns 2"], UInt16[np.ndarray, "rows columns"]]:
+        """Both maps as OpenCV uses them: whole pixels, and 1024 steps of 1/32 px."""
+        return cv2.convertMaps(self.map_x, self.map_y, cv2.CV_16SC2)
+
+    def apply(
+        self, picture: Real[np.ndarray, "rows columns 3"], interpolation: Interpolation = Interpolation.LANCZOS
+    ) -> Real[np.ndarray, "view_rows view_columns 3"]:
+        """Resample a sensor picture onto the view; its type, float32 or 8 bits, is kept."""
+        return cv2.remap(picture, *self._fixed, interpolation, borderMode=cv2.BORDER_REFLECT_101)
 
 
 _sensor_places = jax.jit(view_to_sensor)

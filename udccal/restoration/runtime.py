@@ -6,27 +6,30 @@ Units: a restored picture is linear light in e-/s of each camera colour, on the 
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float32, UInt8, UInt16
 
+from udccal.cfa import cfa_named
 from udccal.errors import RestorationError
-from udccal.models.backscatter import PanelResponse
 from udccal.models.geometry import VirtualView
 from udccal.models.noise import Noise
 from udccal.models.psf import PsfField
 from udccal.profiles.profile import Profile
 from udccal.profiles.store import load_profile
-from udccal.restoration.backscatter import estimated_rate, known_rate, mask_mosaic, prepared_response
+from udccal.restoration.backscatter import PanelLight, PanelMask, mask_mosaic
 from udccal.restoration.demosaic import demosaic
-from udccal.restoration.linear import saturated, to_electrons, variance_e2, without_defects
-from udccal.restoration.lowrank import KernelGrid
+from udccal.restoration.kernel_grid import KernelGrid
+from udccal.restoration.linear import to_electrons, variance_e2, without_defects
 from udccal.restoration.plan import PlanOptions, kernel_grid
 from udccal.restoration.prepared import kept
+from udccal.restoration.preview import Preview
 from udccal.restoration.rectify import Rectification
 from udccal.restoration.sharpen import Sharpener
+from udccal.restoration.tone import Tone
 from udccal.restoration.view import inscribed_view
 from udccal.result import FitStatus
 from udccal.rig import RigDescription
@@ -46,9 +49,9 @@ class Restorer:
         noise: the noise term.
         view: the view of restored pictures.
         wire: map to divide by; None when it is 1 everywhere.
-        mask: backscatter of a white panel in e-/s; None when the rig has none.
-        response: the backscatter term for known panel pictures; None when the rig has no backscatter, or the tier does
-            not ask for the picture.
+        mask: backscatter of pictures that are not known; None when the rig has none.
+        panel: backscatter of known panel pictures; None when the rig has none, or the tier does not ask for the
+            picture.
         sharpener: demosaics and deblurs; None when the rig has no blur, or the tier leaves it.
         rectification: map from sensor to view.
         options: options of the restoration.
@@ -59,8 +62,8 @@ class Restorer:
     noise: Noise
     view: VirtualView
     wire: Mosaic | None
-    mask: Mosaic | None
-    response: PanelResponse | None
+    mask: PanelMask | None
+    panel: PanelLight | None
     sharpener: Sharpener | None
     rectification: Rectification
     options: PlanOptions
@@ -104,7 +107,7 @@ class Restorer:
         """
         options = options or PlanOptions()
         rig, geometry = profile.rig, profile.geometry.term
-        camera = rig.camera
+        camera, cfa = rig.camera, cfa_named(rig.camera.cfa)
         view = inscribed_view(geometry, camera.columns, camera.rows, rig.view.columns, rig.view.rows)
         rectification = Rectification.within(geometry, view, camera.columns, camera.rows)
         quick = tier is Tier.preview
@@ -119,8 +122,10 @@ class Restorer:
             wire=None if even else profile.wire_map,
             mask=None
             if unscattered
-            else mask_mosaic(profile.backscatter_mask, camera.cfa, camera.rows, camera.columns),
-            response=None if quick or unscattered else prepared_response(profile.backscatter.term, rig, keep),
+            else PanelMask(mask_mosaic(profile.backscatter_mask, cfa, camera.rows, camera.columns), cfa),
+            panel=None
+            if quick or unscattered
+            else PanelLight.of(profile.backscatter.term, rig, options.panel_block, keep),
             sharpener=None
             if unblurred
             else Sharpener.of(
@@ -151,37 +156,77 @@ class Restorer:
         """
         check_frame(mosaic, exposure_s, self.rig)
         check_panel_picture(panel_picture, self.rig)
-        raw = to_electrons(mosaic, self.noise, exposure_s)
-        signal = without_defects(raw, self.noise, self.rig.camera.cfa)
-        clipped = saturated(mosaic, self.noise, self.options.saturation_margin) & (signal == raw)
+        signal = without_defects(to_electrons(mosaic, self.noise, exposure_s), self.noise, self.rig.camera.cfa)
         variance = variance_e2(signal, self.noise, exposure_s)
         if self.wire is not None:
             signal /= self.wire
             variance /= self.wire**2
-        if self.mask is not None:
-            signal -= np.float32(exposure_s) * self._backscatter_rate(signal, self.mask, exposure_s, panel_picture)
+        signal -= self._backscatter_e(signal, exposure_s, panel_picture)
         if self.sharpener is None:
-            sharp = demosaic(signal, self.rig.camera.cfa)
-        else:
-            sharp = self.sharpener.apply(signal, variance, clipped)
-        return self.rectification.apply(sharp) / np.float32(exposure_s)
+            return self._on_view(demosaic(signal, self.rig.camera.cfa), exposure_s)
+        sharp = self.sharpener.apply(signal, variance)
+        linear = self._strip_rectification.apply(sharp, self.options.interpolation)
+        linear /= np.float32(exposure_s)
+        return linear
+
+    def display(
+        self,
+        mosaic: UInt16[np.ndarray, "frame_rows frame_columns"],
+        exposure_s: float,
+        tone: Tone,
+        panel_picture: UInt8[np.ndarray, "panel_rows panel_columns 3"] | None = None,
+    ) -> UInt8[np.ndarray, "view_rows view_columns 3"]:
+        """Restore a frame for a display: 8-bit sRGB on the virtual view.
+
+        The tier ``preview`` has a path of its own for this, many times quicker than ``restore``.
+
+        Args:
+            mosaic: raw frame in DN.
+            exposure_s: exposure time of the frame.
+            tone: exposure and colour gains, such as ``Tone(display_exposure(picture))`` of an earlier picture.
+            panel_picture: as for ``restore``.
+
+        Raises:
+            RestorationError: as ``restore``.
+        """
+        if self.tier is not Tier.preview:
+            return tone.rgb8(self.restore(mosaic, exposure_s, panel_picture))
+        check_frame(mosaic, exposure_s, self.rig)
+        check_panel_picture(panel_picture, self.rig)
+        return self._preview.rgb8(mosaic, exposure_s, tone)
 
     def before(self, mosaic: UInt16[np.ndarray, "frame_rows frame_columns"], exposure_s: float) -> Picture:
         """Return the frame without restoration: black level, demosaicing and geometry only, linear RGB in e-/s."""
         check_frame(mosaic, exposure_s, self.rig)
-        signal = to_electrons(mosaic, self.noise, exposure_s)
-        return self.rectification.apply(demosaic(signal, self.rig.camera.cfa)) / np.float32(exposure_s)
+        return self._on_view(demosaic(to_electrons(mosaic, self.noise, exposure_s), self.rig.camera.cfa), exposure_s)
 
-    def _backscatter_rate(
+    def _on_view(self, sensor_e: Float32[np.ndarray, "sensor_rows sensor_columns 3"], exposure_s: float) -> Picture:
+        return self.rectification.apply(sensor_e) / np.float32(exposure_s)
+
+    def _backscatter_e(
         self,
         signal: Mosaic,
-        mask: Mosaic,
         exposure_s: float,
         panel_picture: UInt8[np.ndarray, "panel_rows panel_columns 3"] | None,
-    ) -> Mosaic:
-        if panel_picture is None or self.response is None:
-            return estimated_rate(signal / np.float32(exposure_s), mask, self.rig.camera.cfa)
-        return known_rate(self.response, panel_picture)
+    ) -> Mosaic | np.float32:
+        exposure = np.float32(exposure_s)
+        if self.mask is None:
+            return np.float32(0)
+        if panel_picture is None or self.panel is None:
+            return exposure * self.mask.rate(self.mask.levels(signal, exposure_s))
+        return exposure * self.panel.rate(panel_picture)
+
+    @functools.cached_property
+    def _strip_rectification(self) -> Rectification:
+        assert self.sharpener is not None
+        return self.rectification.from_row(self.sharpener.rows.start)
+
+    @functools.cached_property
+    def _preview(self) -> Preview:
+        camera = self.rig.camera
+        cfa = cfa_named(camera.cfa)
+        sensor = camera.rows, camera.columns
+        return Preview.of(self.noise, self.wire, self.mask, cfa, self.rectification, sensor)
 
 
 def _kept_grid(psf: PsfField, rig: RigDescription, options: PlanOptions, keep: Path | None) -> KernelGrid:

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import functools
 from dataclasses import dataclass
 from pathlib import Path
 from typing import final
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32
+from jaxtyping import Float32
 
 from udccal.cfa import Cfa, cfa_named
-from udccal.restoration.highlights import Highlights
-from udccal.restoration.lowrank import KernelGrid
+from udccal.restoration.kernel_grid import KernelGrid
 from udccal.restoration.mosaic_filter import FilterTables, filter_tables, filtered
 from udccal.restoration.plan import PlanOptions
 from udccal.restoration.prepared import kept
@@ -23,7 +21,7 @@ from udccal.rig import RigDescription
 from udccal.tiers import Tier
 
 Mosaic = Float32[np.ndarray, "rows columns"]
-Picture = Float32[np.ndarray, "rows columns 3"]
+Strip = Float32[np.ndarray, "covered_rows columns 3"]
 
 # Every n-th cell of a tile gives the mean noise of its samples.
 _SPARSE = 4
@@ -87,33 +85,30 @@ class Sharpener:
         """The camera's colour pattern."""
         return cfa_named(self.rig.camera.cfa)
 
-    @functools.cached_property
-    def highlights(self) -> Highlights:
-        """The solver for clipped light, made for the first frame that needs it."""
-        return Highlights.of(self.grid, self.rig, self.options)
+    @property
+    def rows(self) -> slice:
+        """Rows of the sensor that ``apply`` returns."""
+        return slice(self.layout.first_row, self.layout.last_row)
 
-    def apply(self, signal_e: Mosaic, variance_e2: Mosaic, clipped: Bool[np.ndarray, "rows columns"]) -> Picture:
+    def apply(self, signal_e: Mosaic, variance_e2: Mosaic) -> Strip:
         """Demosaic and deblur.
 
         Args:
             signal_e: signal in e-, divided by the wire, without backscatter.
             variance_e2: variance of its noise in e-^2.
-            clipped: samples that are saturated.
 
         Returns:
-            the picture in e-; rows that the view does not need are 0.
+            the picture in e-, of the rows that the layout covers.
         """
-        bright = None
-        if self.noise is not None and clipped.any():
-            signal_e, bright = self.highlights.taken_out(signal_e, clipped, float(variance_e2.mean()))
         tile_noise = self._tile_noise(variance_e2)
         tiles = self.layout.cut(signal_e)
         pictures, strengths = filtered(tiles, tile_noise, self.tables, self.layout, self.cfa, self.options.workers)
         picture = self.layout.join(pictures)
         if self.noise is not None:
             bands = self.noise.of_tiles(strengths)
-            picture = shrunk(picture, tile_noise, _local(variance_e2), bands, self.layout, self.options.workers)
-        return picture if bright is None else picture + bright
+            local = cv2.blur(variance_e2, (_LOCAL_PX, _LOCAL_PX), borderType=cv2.BORDER_REFLECT_101)
+            picture = shrunk(picture, tile_noise, local[self.rows], bands, self.layout, self.options.workers)
+        return picture
 
     def _tile_noise(self, variance_e2: Mosaic) -> Float32[np.ndarray, "tiles 3"]:
         """Return the sigma of a sample of each colour in each tile."""
@@ -134,7 +129,3 @@ def _within(centre: float, size: int, most: int) -> slice:
     """Return the part of a tile on the frame along one axis, from an even sample on."""
     start = int(np.clip(centre - (size - 1) / 2, 0, max(most - size, 0))) // 4 * 4
     return slice(start, start + size)
-
-
-def _local(variance_e2: Mosaic) -> Mosaic:
-    return cv2.blur(variance_e2, (_LOCAL_PX, _LOCAL_PX), borderType=cv2.BORDER_REFLECT_101)

@@ -8,19 +8,18 @@ Processing 52, 2004). The filter's noise in each band is measured once per profi
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import final
+from typing import TypeAlias, final
 
 import cv2
+import jax
 import numpy as np
-from jaxtyping import Float32, Int
+from jaxtyping import Float, Float32, Int
 
 from udccal.cfa import Cfa
 from udccal.restoration.mosaic_filter import STRENGTHS, FilterTables, filtered
-from udccal.restoration.tiles import BLEND_PX, TAPER_PX, TileLayout
+from udccal.restoration.tiles import BLEND_PX, TAPER_PX, Strip, TileLayout
 
 _LEVELS, _BANDS = 4, 3
 # A sample keeps 1 - margin * noise / energy: the energy of noise alone scatters about its mean.
@@ -34,7 +33,10 @@ _OPPONENT /= np.linalg.norm(_OPPONENT, axis=1, keepdims=True)
 # Tiles whose noise is measured, down and across the frame; the others are like the nearest of them.
 _PROBES = 3
 
-Plane = Float32[np.ndarray, "rows columns"]
+# A row that takes the mean of three colours.
+_MEAN = np.full((1, 3), 1 / 3, dtype=np.float32)
+
+Plane: TypeAlias = Float32[np.ndarray, "rows columns"]
 
 
 @final
@@ -72,7 +74,7 @@ def measured_noise(tables: FilterTables, layout: TileLayout, cfa: Cfa, workers: 
     repeated = np.repeat(chosen, len(STRENGTHS))
     noise = np.random.default_rng(0x5EED).standard_normal((len(chosen), layout.rows, layout.columns), dtype=np.float32)
     tiles = np.repeat(noise, len(STRENGTHS), axis=0)
-    picked = FilterTables(tables.matched[repeated], tables.vectors[repeated], tables.values[repeated])
+    picked = jax.tree.map(lambda table: table[repeated], tables)
     unit = np.ones((len(tiles), 3), dtype=np.float32)
     pictures, _ = filtered(tiles, unit, picked, layout, cfa, workers, np.tile(STRENGTHS, len(chosen)))
     inner = slice(TAPER_PX + BLEND_PX, -TAPER_PX - BLEND_PX)
@@ -92,7 +94,7 @@ def _band_variances(picture: Float32[np.ndarray, "3 rows columns"]) -> Float32[n
         for level in range(_LEVELS):
             bands, smooth = _split(rest)
             found[colour, level] = [float(np.mean(band**2)) for band in bands]
-            rest = cv2.resize(smooth, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_NEAREST)
+            rest = np.ascontiguousarray(smooth[::2, ::2])
     return found
 
 
@@ -107,42 +109,55 @@ def shrunk(
     """Take noise out of a filtered picture.
 
     Args:
-        picture: in e-, covered by the layout.
+        picture: in e-, the rows that the layout covers.
         noise_e: sigma of a sample of each colour, by tile.
         local_variance_e2: variance of a sample in e-^2, averaged over some px.
         variance: of unit noise in each band, by tile.
         layout: the tiles.
         workers: threads.
     """
-    scale = np.stack([_smooth(layout, small, picture.shape[:2]) for small in layout.spread(noise_e)], axis=-1)
-    opponent = (picture / scale) @ _OPPONENT.T
+    scale = _smooth(layout, layout.by_place(noise_e))
+    opponent = cv2.transform(picture / scale, _OPPONENT)
     # Within a tile, bright places are noisier than dark ones.
-    brightness = local_variance_e2 / (scale * scale).mean(axis=-1)
+    brightness = [local_variance_e2 / (cv2.transform(scale * scale, _MEAN))]
+    for _ in range(1, _LEVELS):
+        rows, columns = brightness[-1].shape
+        brightness.append(cv2.resize(brightness[-1], (-(-columns // 2), -(-rows // 2)), interpolation=cv2.INTER_AREA))
+    by_place = np.float32(_MARGIN) * layout.by_place(variance)
 
     def one(colour: int) -> Plane:
-        def noise(level: int, band: int, shape: tuple[int, ...]) -> Plane:
-            small = next(layout.spread(variance[:, colour, level, band][:, None]))
-            local = cv2.resize(brightness, shape[::-1], interpolation=cv2.INTER_AREA) if level else brightness
-            return _stepped(layout, small, shape, 0.5**level) * local
-
-        return _shrink_level(np.ascontiguousarray(opponent[..., colour]), 0, noise)
+        return _shrink_level(np.ascontiguousarray(opponent[..., colour]), by_place[:, :, colour], layout, brightness)
 
     with ThreadPoolExecutor(workers) as pool:
-        calm = np.stack(list(pool.map(one, range(3))), axis=-1)
-    return (calm @ _OPPONENT) * scale
+        calm = cv2.merge(list(pool.map(one, range(3))))
+    return cv2.transform(calm, np.ascontiguousarray(_OPPONENT.T)) * scale
 
 
-def _shrink_level(plane: Plane, level: int, noise: Callable[[int, int, tuple[int, ...]], Plane]) -> Plane:
+def _shrink_level(
+    plane: Plane,
+    noise: Float32[np.ndarray, "tiles_down tiles_across levels bands"],
+    layout: TileLayout,
+    brightness: list[np.ndarray],
+    level: int = 0,
+) -> Plane:
     """Shrink a plane's bands at this level, and at coarser ones by what they change."""
     bands, smooth = _split(plane)
     result = smooth.copy()
+    down, across = (_Runs.of(s, count, 0.5**level) for s, count in zip(layout.strips, plane.shape, strict=True))
     for index, band in enumerate(bands):
         energy = cv2.blur(band * band, _WINDOW)
-        keep = 1 - np.float32(_MARGIN) * noise(level, index, plane.shape) / np.maximum(energy, np.float32(1e-20))
-        result += band * np.maximum(keep, np.float32(0))
+        energy += np.float32(1e-20)
+        # 1 - noise / energy, in place: these are the passes over memory that cost most.
+        keep = _largest(noise[:, :, level, index], down, across)
+        keep *= brightness[level]
+        keep /= energy
+        np.subtract(np.float32(1), keep, out=keep)
+        np.maximum(keep, np.float32(0), out=keep)
+        keep *= band
+        result += keep
     if level + 1 < _LEVELS and min(plane.shape) > 2 * len(_SMOOTH):
-        half = cv2.resize(smooth, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_NEAREST)
-        change = _shrink_level(half, level + 1, noise) - half
+        half = np.ascontiguousarray(smooth[::2, ::2])
+        change = _shrink_level(half, noise, layout, brightness, level + 1) - half
         result += cv2.resize(change, plane.shape[::-1], interpolation=cv2.INTER_LINEAR)
     return result
 
@@ -153,45 +168,55 @@ def _split(plane: Plane) -> tuple[tuple[Plane, Plane, Plane], Plane]:
     down = cv2.sepFilter2D(plane, cv2.CV_32F, _ONE, _SMOOTH, borderType=border)
     across = cv2.sepFilter2D(plane, cv2.CV_32F, _SMOOTH, _ONE, borderType=border)
     smooth = cv2.sepFilter2D(down, cv2.CV_32F, _SMOOTH, _ONE, borderType=border)
-    return (down - smooth, across - smooth, plane - down - across + smooth), smooth
+    diagonal = plane - down
+    diagonal -= across
+    diagonal += smooth
+    down -= smooth
+    across -= smooth
+    return (down, across, diagonal), smooth
 
 
-def _stepped(
-    layout: TileLayout, small: Float32[np.ndarray, "down across"], shape: tuple[int, ...], factor: float
-) -> Plane:
-    """Return each tile's value where the frame, or a smaller copy, comes from it; in blends, the largest."""
-    result = np.zeros(shape, dtype=np.float32)
-    for side_y, side_x in itertools.product((-0.5, 0.5), repeat=2):
-        down = _tile_coordinate(layout, 0, shape[0], factor, side_y * BLEND_PX)
-        across = _tile_coordinate(layout, 1, shape[1], factor, side_x * BLEND_PX)
-        y, x = (
-            np.clip(np.rint(at), 0, most - 1).astype(int) for at, most in zip((down, across), small.shape, strict=True)
-        )
-        np.maximum(result, small[y[:, None], x], out=result)
-    return result
+@final
+@dataclass(frozen=True)
+class _Runs:
+    """Runs of samples along one axis of the picture, or of a smaller copy, that come from the same tiles.
+
+    Attributes:
+        first, last: tiles; two of them where they are blended.
+        samples: length of each run.
+    """
+
+    first: Int[np.ndarray, " runs"]
+    last: Int[np.ndarray, " runs"]
+    samples: Int[np.ndarray, " runs"]
+
+    @classmethod
+    def of(cls, strips: list[Strip], count: int, factor: float) -> _Runs:
+        at = (np.arange(count) + 0.5) / factor
+        first = np.searchsorted([strip.at.stop for strip in strips], at, side="right").clip(max=len(strips) - 1)
+        last = np.searchsorted([strip.at.start for strip in strips], at, side="right") - 1
+        begins = np.flatnonzero(np.diff(first, prepend=-1) | np.diff(last, prepend=-1))
+        return cls(first[begins], last[begins], np.diff(begins, append=count))
 
 
-def _smooth(layout: TileLayout, small: Float32[np.ndarray, "down across"], shape: tuple[int, ...]) -> Plane:
-    """Interpolate one value per tile linearly to the frame, constant beyond the outer tiles' centres."""
-    down, across = (_tile_coordinate(layout, axis, shape[axis], 1.0, 0.0) for axis in (0, 1))
-    return _interpolated(_interpolated(small, down).T, across).T
+def _largest(values: Float32[np.ndarray, "tiles_down tiles_across"], down: _Runs, across: _Runs) -> Plane:
+    """Return the value of each sample's tile; of two tiles, the larger one."""
+    rows = np.maximum(values[down.first], values[down.last])
+    blocks = np.maximum(rows[:, across.first], rows[:, across.last])
+    return np.repeat(np.repeat(blocks, across.samples, axis=1), down.samples, axis=0)
 
 
-def _tile_coordinate(
-    layout: TileLayout, axis: int, count: int, factor: float, offset_px: float
-) -> Float32[np.ndarray, " count"]:
-    """Return where samples of the frame, or of a copy smaller by ``factor``, lie in units of tiles."""
-    starts, size = ((layout.tops, layout.rows), (layout.lefts, layout.columns))[axis]
-    step = starts[1] - starts[0] if len(starts) > 1 else 1
-    px = np.arange(count, dtype=np.float32) / np.float32(factor) + np.float32(offset_px)
-    return (px - np.float32(starts[0] + (size - 1) / 2)) / np.float32(step)
+def _smooth(
+    layout: TileLayout, values: Float32[np.ndarray, "tiles_down tiles_across 3"]
+) -> Float32[np.ndarray, "rows columns 3"]:
+    """Interpolate values linearly between the tiles' centres, constant beyond the outer ones."""
+    down, across = (
+        _hats(np.array([strip.middle for strip in strips]), count)
+        for strips, count in zip(layout.strips, layout.covered, strict=True)
+    )
+    return cv2.merge([down @ plane @ across.T for plane in np.moveaxis(values, -1, 0)])
 
 
-def _interpolated(
-    values: Float32[np.ndarray, "tiles columns"], at: Float32[np.ndarray, " n"]
-) -> Float32[np.ndarray, "n columns"]:
-    """Interpolate rows linearly, constant beyond the first and the last."""
-    at = np.clip(at, 0, len(values) - 1)
-    low = np.minimum(at.astype(int), max(len(values) - 2, 0))
-    part = (at - low)[:, None].astype(np.float32)
-    return values[low] * (1 - part) + values[np.minimum(low + 1, len(values) - 1)] * part
+def _hats(nodes: Float[np.ndarray, " nodes"], count: int) -> Float32[np.ndarray, "count nodes"]:
+    """Return the matrix of linear interpolation from ``nodes`` to 0 ... count - 1, constant beyond the outer ones."""
+    return np.stack([np.interp(np.arange(count), nodes, one) for one in np.eye(len(nodes))], axis=1).astype(np.float32)

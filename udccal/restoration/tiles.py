@@ -8,16 +8,37 @@ from __future__ import annotations
 
 import functools
 import itertools
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import final
 
+import cv2
 import numpy as np
 from jaxtyping import Float32, Int
+from scipy import fft
 
 from udccal.errors import RestorationError
 
 TAPER_PX, BLEND_PX = 24, 16
+# From a tile's edge to the middle of its blend.
+_OUTSIDE = TAPER_PX + BLEND_PX // 2
+
+
+@final
+@dataclass(frozen=True)
+class Strip:
+    """One tile along one axis.
+
+    Attributes:
+        part: of the tile, what is used.
+        at: where it lies in the joined picture.
+        weights: of its samples in the blend; those of all tiles sum to 1.
+        middle: of the whole tile in the joined picture, in px.
+    """
+
+    part: slice
+    at: slice
+    weights: Float32[np.ndarray, " part"]
+    middle: float
 
 
 @final
@@ -81,56 +102,71 @@ class TileLayout:
         return tiles
 
     def join(
-        self, pictures: Float32[np.ndarray, "tiles channels rows columns"]
-    ) -> Float32[np.ndarray, "frame_rows frame_columns channels"]:
-        """Blend the tiles' pictures into one of the frame; rows that no tile covers are 0."""
-        frame = np.zeros((pictures.shape[1], self.frame_rows, self.frame_columns), dtype=np.float32)
-        down, across = _ramped(self.rows, TAPER_PX, BLEND_PX), _ramped(self.columns, TAPER_PX, BLEND_PX)
-        covered_y = _covered(down, self.tops, self.frame_rows)
-        covered_x = _covered(across, self.lefts, self.frame_columns)
-        for picture, (top, left) in zip(pictures, itertools.product(self.tops, self.lefts), strict=True):
-            y, x = _inside(top, self.rows, self.frame_rows), _inside(left, self.columns, self.frame_columns)
-            at = slice(top + y.start, top + y.stop), slice(left + x.start, left + x.stop)
-            weight = (down[y] / covered_y[at[0]])[:, None] * (across[x] / covered_x[at[1]])
-            frame[:, *at] += picture[:, y, x] * weight
-        return np.ascontiguousarray(np.moveaxis(frame, 0, -1))
+        self, pictures: Float32[np.ndarray, "tiles 3 rows columns"]
+    ) -> Float32[np.ndarray, "covered_rows frame_columns 3"]:
+        """Blend the tiles' pictures into one of the rows that are covered."""
+        joined = np.zeros((*self.covered, 3), dtype=np.float32)
+        for picture, (down, across) in zip(pictures, itertools.product(*self.strips), strict=True):
+            weight = down.weights[:, None] * across.weights
+            joined[down.at, across.at] += cv2.merge(list(picture[:, down.part, across.part] * weight))
+        return joined
 
-    def spread(
-        self, values: Float32[np.ndarray, "tiles k"]
-    ) -> Iterator[Float32[np.ndarray, "tiles_down tiles_across"]]:
-        """Return each of the tiles' ``k`` values as a small picture with one pixel per tile."""
-        for value in values.T:
-            yield value.reshape(len(self.tops), len(self.lefts))
+    @property
+    def covered(self) -> tuple[int, int]:
+        """Rows and columns of the joined picture."""
+        return self.last_row - self.first_row, self.frame_columns
+
+    @functools.cached_property
+    def strips(self) -> tuple[list[Strip], list[Strip]]:
+        """The tiles along both axes of the joined picture."""
+        return (
+            _blended(self.tops, self.rows, self.first_row, self.last_row),
+            _blended(self.lefts, self.columns, 0, self.frame_columns),
+        )
+
+    def by_place(self, values: Float32[np.ndarray, "tiles *k"]) -> Float32[np.ndarray, "tiles_down tiles_across *k"]:
+        """Return the tiles' values by row and column of tiles."""
+        return values.reshape(len(self.tops), len(self.lefts), *values.shape[1:])
 
 
 def layout_for(
-    frame_rows: int, frame_columns: int, cell: tuple[int, int], size: tuple[int, int], rows: tuple[int, int]
+    frame_rows: int, frame_columns: int, cell: tuple[int, int], largest: tuple[int, int], rows: tuple[int, int]
 ) -> TileLayout:
-    """Return the tiles that cover the ``rows`` (first, past the last) of a frame.
+    """Return the tiles that cover the ``rows`` (first, past the last) of a frame: as few as possible, then as small.
 
     Args:
         frame_rows: rows of the frame. frame_columns: columns of the frame.
         cell: (rows, columns) of the colour pattern.
-        size: (rows, columns) of a tile, rounded up to whole cells.
+        largest: (rows, columns) of a tile at most, rounded up to whole cells.
         rows: first row to be covered, and the row after the last one.
 
     Raises:
         RestorationError: when a tile is too small to have a part that is neither tapered nor blended.
     """
     least = 2 * (TAPER_PX + BLEND_PX)
-    if min(size) < least:
+    if min(largest) < least:
         raise RestorationError(
-            f"Expected tiles of at least {least} x {least} px, found {size[1]} x {size[0]}. Give larger ones."
+            f"Expected tiles of at least {least} x {least} px, found {largest[1]} x {largest[0]}. Give larger ones."
         )
-    height, width = (-(-most // unit) * unit for most, unit in zip(size, cell, strict=True))
-    return TileLayout(height, width, max(rows[0], 0), min(rows[1], frame_rows), frame_rows, frame_columns, *cell)
+    first, last = max(rows[0], 0), min(rows[1], frame_rows)
+    height = _fitted(last - first, largest[0], cell[0])
+    return TileLayout(
+        height, _fitted(frame_columns, largest[1], cell[1]), first, last, frame_rows, frame_columns, *cell
+    )
+
+
+def _fitted(span: int, largest: int, cell: int) -> int:
+    """Return the smallest size of tiles, of whole cells and with a fast transform, that needs no more tiles."""
+    most = -(-largest // cell) * cell
+    count = -(-(span + cell) // (most - 2 * _OUTSIDE))
+    needed = -(-(span + cell) // count) + 2 * _OUTSIDE
+    return min(most, cell * int(fft.next_fast_len(-(-needed // cell), real=True)))
 
 
 def _starts(first: int, last: int, size: int, cell: int) -> tuple[int, ...]:
     """Return where tiles start so that their inner parts cover [first, last), a constant step apart."""
-    outside = TAPER_PX + BLEND_PX // 2
-    step = (size - 2 * outside) // cell * cell
-    start = -(-(first - outside - cell + 1) // cell) * cell
+    step = (size - 2 * _OUTSIDE) // cell * cell
+    start = -(-(first - _OUTSIDE - cell + 1) // cell) * cell
     count = max(1, -(-(last - first + cell) // step))
     return tuple(start + step * index for index in range(count))
 
@@ -150,18 +186,19 @@ def _run(index: Int[np.ndarray, " n"]) -> slice | Int[np.ndarray, " n"]:
     return slice(index[0], index[-1] + 1) if np.all(np.diff(index) == 1) else index
 
 
-def _covered(weights: Float32[np.ndarray, " size"], starts: tuple[int, ...], most: int) -> Float32[np.ndarray, " most"]:
-    """Return the sum of the tiles' weights along one axis of the frame; 1 where no tile is."""
-    total = np.zeros(most, dtype=np.float32)
+def _blended(starts: tuple[int, ...], size: int, first: int, last: int) -> list[Strip]:
+    """Return the strips of [first, last) along one axis."""
+    ramp, total = _ramped(size, TAPER_PX, BLEND_PX), np.zeros(last - first, dtype=np.float32)
+    places = []
     for start in starts:
-        part = _inside(start, len(weights), most)
-        total[start + part.start : start + part.stop] += weights[part]
-    return np.where(total > 0, total, np.float32(1))
-
-
-def _inside(start: int, size: int, most: int) -> slice:
-    """Return the part of a tile along one axis that lies on the frame and is not tapered."""
-    return slice(max(TAPER_PX, -start), max(min(size - TAPER_PX, most - start), TAPER_PX))
+        part = slice(max(TAPER_PX, first - start), max(min(size - TAPER_PX, last - start), TAPER_PX))
+        at = slice(start + part.start - first, start + part.stop - first)
+        total[at] += ramp[part]
+        places.append((part, at))
+    return [
+        Strip(part, at, ramp[part] / total[at], start - first + (size - 1) / 2)
+        for start, (part, at) in zip(starts, places, strict=True)
+    ]
 
 
 def _ramped(size: int, zeros: int, ramp: int) -> Float32[np.ndarray, " size"]:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Float32, UInt8, UInt16
+from jaxtyping import Array, Float, Float32, UInt8, UInt16
 
 _PERCENTILE, _LEVEL = 97.0, 0.9
 
@@ -17,9 +19,17 @@ class Tone:
     exposure: float
     gains: tuple[float, float, float] = (1.0, 1.0, 1.0)
 
+    def scale(self) -> Float32[np.ndarray, "3"]:
+        """Return the factor of each colour from linear light to the display's range."""
+        return np.float32(self.exposure) * np.asarray(self.gains, dtype=np.float32)
+
+    def rgb8(self, linear: Float32[np.ndarray, "rows columns 3"]) -> UInt8[np.ndarray, "rows columns 3"]:
+        """Return what a display shows, in 8 bits: ``to_rgb8(apply(linear))`` by a table, within 1 of 255."""
+        return np.asarray(table_codes(linear, self.scale(), CODES))
+
     def apply(self, linear: Float[np.ndarray, "rows columns 3"]) -> Float32[np.ndarray, "rows columns 3"]:
         """Return display-encoded values from 0 to 1."""
-        return encode_srgb(linear * (np.float32(self.exposure) * np.asarray(self.gains, dtype=np.float32)))
+        return encode_srgb(linear * self.scale())
 
 
 def encode_srgb(linear: Float[np.ndarray, "*shape"]) -> Float32[np.ndarray, "*shape"]:
@@ -43,3 +53,17 @@ def to_rgb8(display: Float[np.ndarray, "rows columns 3"]) -> UInt8[np.ndarray, "
 def to_rgb16(display: Float[np.ndarray, "rows columns 3"]) -> UInt16[np.ndarray, "rows columns 3"]:
     """Convert ``display``-encoded values, clipped to 0-1, to 16 bit."""
     return np.rint(np.clip(display, 0.0, 1.0) * 65535.0).astype(np.uint16)
+
+
+# 8-bit sRGB codes of 65536 even steps of linear light from 0 to 1.
+CODES = to_rgb8(encode_srgb(np.linspace(0.0, 1.0, 1 << 16)[:, None, None].repeat(3, axis=2)))[:, 0, 0]
+
+
+@jax.jit
+def table_codes(
+    light: Float32[Array, "*shape"], scale: Float32[Array, "*any"], codes: UInt8[Array, " steps"]
+) -> UInt8[Array, "*shape"]:
+    """Return codes of ``light * scale``, from 0 to 1, rounded to the nearest step."""
+    last = len(codes) - 1
+    step = jnp.clip(light * scale * last + 0.5, 0.0, last + 0.5).astype(jnp.int32)
+    return codes[step]
