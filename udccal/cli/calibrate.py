@@ -67,6 +67,7 @@ def calibrate(
     """Capture every calibration step of a rig, then fit them. An interrupted session continues where it stopped."""
     from udccal.cli.jobs.capture import capture_watched
     from udccal.cli.jobs.fit import fit_to_profile
+    from udccal.io.out_folder import check_writable
     from udccal.profiles.store import check_replaceable
     from udccal.rig import load_rig
     from udccal.sessions.changes import Exchanged
@@ -74,6 +75,7 @@ def calibrate(
     output: Output = context.obj
     description = load_rig(rig)
     check_replaceable(profile)
+    check_writable(profile.parent)
     pictures = session.resolve().with_name(f"{session.resolve().name}-pictures")
     match camera:
         case CameraKind.sim:

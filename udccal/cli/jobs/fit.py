@@ -16,6 +16,7 @@ from udccal.effort import FitEffort
 from udccal.errors import FitError, UdccalError
 from udccal.fitting.engine.iteration_log import LOG
 from udccal.io.links import refuse_links
+from udccal.io.out_folder import check_writable, storing_in
 from udccal.profiles.profile import Profile
 from udccal.profiles.store import check_replaceable, read_profile
 from udccal.refit import refit
@@ -69,8 +70,10 @@ def fit_to_profile(
         SessionError: when the session is missing or damaged.
         FitError: when a term has no error bars; then the report is written and the profile is not.
         ProfileError: when something else is at the profile's path, or a profile whose terms cannot be kept.
+        UdccalError: when the profile's folder cannot be written to; this is found before any work.
     """
     check_replaceable(profile_path)
+    check_writable(profile_path.parent)
     before = read_profile(profile_path) if terms else None
     keep_compilations()
     clock = compilation_clock()
@@ -88,7 +91,8 @@ def fit_to_profile(
         panel = session.rig.panel
         unseen = face_picture(UNSEEN_PICTURE, panel.columns, panel.rows)
         evidence = gather(session, calibration, unseen, None)
-        write_page(report, calibration_page(session, evidence, None))
+        with storing_in(report.parent):
+            write_page(report, calibration_page(session, evidence, None))
     show_status(output, calibration)
     try:
         store_profile(output, calibration, profile_path)
@@ -158,8 +162,9 @@ def store_profile(output: Output, calibration: Calibration, path: Path) -> None:
     Raises:
         FitError: when a term has no error bars.
         ProfileError: when something else is at ``path``.
+        UdccalError: when it cannot be written.
     """
-    with output.stage("profile"):
+    with output.stage("profile"), storing_in(path.parent):
         calibration.write(path)
 
 
