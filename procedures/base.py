@@ -14,7 +14,7 @@ from procedures.plans import Exposure, Fixed, Metered, Plan, TimesThatOf
 from udccal.arrangements import Arrangement, Board, Dark, FlatLight, Led, Occasion, PanelPicture, Stage
 from udccal.cameras.protocol import Camera, Region
 from udccal.displays.protocol import Display
-from udccal.errors import CaptureError
+from udccal.errors import CameraError, CaptureError, SessionError, UdccalError
 from udccal.rig import RigDescription
 from udccal.sessions.schema import BoardSubject, DarkSubject, FlatSubject, LedSubject, Subject, TermName
 from udccal.sessions.writer import SessionWriter
@@ -86,8 +86,9 @@ def run_procedure(procedure: Procedure, bench: Bench, writer: SessionWriter, pro
     """Carry out every step that the session does not hold yet, on a bench whose camera is open.
 
     Raises:
-        CaptureError: when the camera does not fit the rig, or does not see what a step needs.
-        CameraError, SessionError: from the camera and the writer. Steps completed before stay in the session.
+        CaptureError: when the camera does not see what a step needs: a person at the rig can mend that and repeat it.
+        CameraError: when the camera does not fit the rig; also from the camera itself.
+        SessionError: from the writer. Steps completed before stay in the session.
     """
     rig = writer.manifest.rig
     _check_camera(bench.camera, rig)
@@ -141,7 +142,7 @@ def _expose(step: Step, camera: Camera, writer: SessionWriter, start_s: float | 
         case TimesThatOf(step_id, factor):
             earlier = writer.step(step_id)
             if earlier is None:
-                raise CaptureError(f"Expected the step '{step_id}' before this one, found it not captured. Capture it.")
+                raise SessionError(f"Expected the step '{step_id}' before this one, found it not captured. Capture it.")
             wanted = factor * earlier.captures[0].exposure_s
     bounded = min(max(wanted, rig.camera.min_exposure_s), rig.camera.max_exposure_s)
     frame = trial_frame(camera, step.region, bounded)
@@ -167,14 +168,14 @@ def _subject(step: Step, writer: SessionWriter) -> Subject:
             )
         case PanelPicture(picture):
             return writer.store_picture(step.id, picture, step.role)
-    raise CaptureError(f"Expected an arrangement that calibrates a term, found another for the step '{step.id}'.")
+    raise UdccalError(f"Expected an arrangement that calibrates a term, found another for the step '{step.id}'.")
 
 
 def _check_camera(camera: Camera, rig: RigDescription) -> None:
     expected = (rig.camera.columns, rig.camera.rows, rig.camera.cfa, rig.camera.bits)
     found = (camera.sensor.columns, camera.sensor.rows, camera.cfa, camera.bits)
     if found != expected:
-        raise CaptureError(
+        raise CameraError(
             f"Expected a camera of {expected[0]} x {expected[1]}, {expected[2]}, {expected[3]} bits as in the rig "
             f"'{rig.name}', found {found[0]} x {found[1]}, {found[2]}, {found[3]} bits. "
             "Connect the right camera, or correct rig.toml."
