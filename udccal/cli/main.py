@@ -19,6 +19,7 @@ from udccal.cli.output import Output
 from udccal.cli.plan import plan
 from udccal.cli.profile import profile_app
 from udccal.cli.restore import restore
+from udccal.cli.rig import rig_app
 from udccal.cli.simulate import simulate
 from udccal.errors import UdccalError
 
@@ -58,6 +59,7 @@ def globals_(
 for _verb in (demo, doctor, plan, calibrate, fit, restore, simulate):
     app.command(no_args_is_help=_verb not in (demo, doctor))(_verb)
 app.add_typer(profile_app, name="profile")
+app.add_typer(rig_app, name="rig")
 
 
 def main(arguments: list[str] | None = None) -> None:
