@@ -8,37 +8,20 @@ from pathlib import Path
 
 import pytest
 
-from tests.toy_rigs import write_toy_rig
-from udccal.cameras.pylon_sdk.loading import load_sdk
-from udccal.errors import CameraError
+from tests.toy_rigs import write_emulated_rig, write_toy_rig
 
 pytestmark = pytest.mark.medium
 
 
 @pytest.fixture(autouse=True)
-def _emulator(monkeypatch: pytest.MonkeyPatch) -> None:
-    try:
-        load_sdk()
-    except CameraError as error:
-        pytest.skip(str(error))
-    monkeypatch.setenv("PYLON_CAMEMU", "1")
+def _emulator(emulated_camera: None) -> None:
+    """Every test has the emulated camera."""
 
 
 def calibrate(folder: Path, rig: Path, typed: str) -> subprocess.CompletedProcess[str]:
     words = ["calibrate", "--rig", rig, "--camera", "pylon", "--session", folder / "s", "--profile", folder / "p"]
     command = [sys.executable, "-m", "udccal.cli.main", *map(str, words), "--term", "noise"]
     return subprocess.run(command, input=typed, capture_output=True, text=True, timeout=280)
-
-
-def rig_of_the_emulator(folder: Path) -> Path:
-    """The toy rig with a sensor of the emulated camera's size."""
-    rig = write_toy_rig(folder)
-    text = (rig / "rig.toml").read_text(encoding="utf-8")
-    for old, new in (("columns = 128", "columns = 4096"), ("rows = 96", "rows = 4096"), ("= 55.2", "= 1.725")):
-        assert old in text
-        text = text.replace(old, new, 1)
-    (rig / "rig.toml").write_text(text, encoding="utf-8")
-    return rig
 
 
 def test_what_no_person_can_mend_is_not_asked_again(tmp_path: Path) -> None:
@@ -50,7 +33,7 @@ def test_what_no_person_can_mend_is_not_asked_again(tmp_path: Path) -> None:
 
 
 def test_a_word_that_is_not_offered_is_never_yes(tmp_path: Path) -> None:
-    done = calibrate(tmp_path, rig_of_the_emulator(tmp_path), "skip\n\nskip\n\nq\n")
+    done = calibrate(tmp_path, write_emulated_rig(tmp_path), "skip\n\nskip\n\nq\n")
     assert done.returncode == 1
     asked = done.stderr
     panel = asked.index("Is it done? (Enter for yes, n for no) 'skip' is none of the answers. Is it done?")
@@ -63,7 +46,7 @@ def test_a_word_that_is_not_offered_is_never_yes(tmp_path: Path) -> None:
 
 
 def test_no_is_no(tmp_path: Path) -> None:
-    done = calibrate(tmp_path, rig_of_the_emulator(tmp_path), "n\nno\nq\n")
+    done = calibrate(tmp_path, write_emulated_rig(tmp_path), "n\nno\nq\n")
     assert done.returncode == 1
     assert "'no' is none of the answers." in done.stderr
     assert "Press Enter when it is done" not in done.stderr
