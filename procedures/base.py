@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import ClassVar, Literal, final
 
 from procedures.capture import take
-from procedures.checks import Check, frame_limits
+from procedures.checks import Check, frame_limits, refuse_far_exposure
 from procedures.metering import Exposed, meter, trial_frame
 from procedures.plans import Exposure, Fixed, Metered, Plan, TimesThatOf
 from udccal.arrangements import Arrangement, Board, Dark, FlatLight, Led, Occasion, PanelPicture, Stage
@@ -146,6 +146,7 @@ def _expose(step: Step, camera: Camera, writer: SessionWriter, start_s: float | 
             wanted = factor * earlier.captures[0].exposure_s
     bounded = min(max(wanted, rig.camera.min_exposure_s), rig.camera.max_exposure_s)
     frame = trial_frame(camera, step.region, bounded)
+    refuse_far_exposure(frame.settings.exposure_s, bounded)
     return Exposed(frame.settings.exposure_s, frame)
 
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import json
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -74,6 +77,30 @@ def test_pictures_of_any_camera_make_a_session(tmp_path: Path, rig: RigDescripti
     result = fit_noise(read_noise(session))
     truth = simulated_rig(rig, seed=2).truth.sensor
     assert float(result.term.K_DN_per_e) == pytest.approx(truth.K_DN_per_e, rel=0.02)
+
+
+@pytest.mark.medium
+def test_milliseconds_for_seconds_are_refused_at_their_step(tmp_path: Path, rig: RigDescription) -> None:
+    root = tmp_path / "pictures"
+    photograph_steps(rig, root)
+    table = root / "noise" / "flat_2" / "frames.csv"
+    right = table.read_text()
+    head, *lines = right.splitlines()
+    in_ms = [f"{name},{1000 * float(exposure_s)!r}" for name, exposure_s in (line.split(",") for line in lines)]
+    table.write_text("\n".join((head, *in_ms)) + "\n")
+    words = ["calibrate", "--rig", tmp_path / "toy", "--camera", "files", "--files", root, "--term", "noise", "--json"]
+    words += ["--session", tmp_path / "session", "--profile", tmp_path / "profile"]
+    command = [sys.executable, "-m", "udccal.cli.main", *map(str, words)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=280)
+    assert done.returncode == 1, done.stderr
+    sentence = json.loads(done.stdout)["error"]
+    assert sentence.startswith("Step noise/flat_2: Expected an exposure near 0.0051 s")
+    assert "found 5.1 s: 1000 times too long" in sentence
+    assert "milliseconds (ms)" in sentence
+    assert [step.id for step in Session.open(tmp_path / "session").manifest.steps][-1] == "noise/flat_1"
+    table.write_text(right)
+    with files_bench(Output(), rig, root, tmp_path / "shown") as bench:
+        capture(tmp_path / "session", bench, ("noise",))
 
 
 @pytest.fixture

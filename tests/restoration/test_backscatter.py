@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from udccal.cfa import cfa_named
-from udccal.restoration.backscatter import estimated_rate, mask_mosaic
+from udccal.errors import RestorationError
+from udccal.restoration.backscatter import estimated_rate, mask_mosaic, refuse_excess
 
 ROWS, COLUMNS = 96, 128
 CHANNELS = cfa_named("RGGB").channel_map(ROWS, COLUMNS)
@@ -36,3 +37,13 @@ def test_a_dark_panel_takes_nothing_and_a_bright_scene_at_most_the_mask(mask: np
     assert not estimated_rate(dark - 3.0, mask, "RGGB").any()
     assert (estimated_rate(dark + 1e6, mask, "RGGB") <= mask).all()
     assert not estimated_rate(dark + 1e3, dark, "RGGB").any()
+
+
+def test_a_frame_is_no_darker_than_the_panels_light(mask: np.ndarray) -> None:
+    none, frame = np.zeros(mask.shape, bool), 0.02 * mask
+    refuse_excess(frame, frame, none)  # a dark room
+    refuse_excess(-frame, 0 * frame, none)  # a black panel, and noise
+    refuse_excess(frame, 1.1 * frame, none)  # a panel that has aged
+    refuse_excess(0 * frame, frame, ~none)  # clipped samples say nothing
+    with pytest.raises(RestorationError, match=r"8 ms are 0\.008"):
+        refuse_excess(frame, 1000 * frame, none)

@@ -19,7 +19,7 @@ from udccal.models.noise import Noise
 from udccal.models.psf import PsfField
 from udccal.profiles.profile import Profile
 from udccal.profiles.store import load_profile
-from udccal.restoration.backscatter import estimated_rate, known_rate, mask_mosaic, prepared_response
+from udccal.restoration.backscatter import estimated_rate, known_rate, mask_mosaic, prepared_response, refuse_excess
 from udccal.restoration.demosaic import demosaic
 from udccal.restoration.linear import saturated, to_electrons, variance_e2, without_defects
 from udccal.restoration.lowrank import KernelGrid
@@ -147,7 +147,8 @@ class Restorer:
             the clean picture on the virtual view: linear RGB in e-/s.
 
         Raises:
-            RestorationError: when the frame, its exposure or the panel picture does not belong to this rig.
+            RestorationError: when the frame, its exposure or the panel picture does not belong to this rig, or the
+                panel's picture alone would give more light than the frame has: the exposure is wrong, or the picture.
         """
         check_frame(mosaic, exposure_s, self.rig)
         check_panel_picture(panel_picture, self.rig)
@@ -159,7 +160,9 @@ class Restorer:
             signal /= self.wire
             variance /= self.wire**2
         if self.mask is not None:
-            signal -= np.float32(exposure_s) * self._backscatter_rate(signal, self.mask, exposure_s, panel_picture)
+            panel_light = np.float32(exposure_s) * self._backscatter_rate(signal, self.mask, exposure_s, panel_picture)
+            refuse_excess(signal, panel_light, clipped)
+            signal -= panel_light
         if self.sharpener is None:
             sharp = demosaic(signal, self.rig.camera.cfa)
         else:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -86,7 +88,8 @@ def restore_files(
         for index, (image, target) in enumerate(zip(images, targets, strict=True)):
             stage.update(index, len(images), f"restoring {image.name}")
             mosaic, exposure = _checked_frame(image, exposure_s, profile.rig)
-            picture = restorer.restore(mosaic, exposure, shown)
+            with _naming(image):
+                picture = restorer.restore(mosaic, exposure, shown)
             with storing_in(out):
                 out.mkdir(parents=True, exist_ok=True)
                 write_picture(target, picture, Tone(display_exposure(picture)))
@@ -118,11 +121,18 @@ def _checked_frame(
         raise RestorationError(
             f"Expected the exposure of {image} in the file or from --exposure-s, found neither. Add --exposure-s."
         )
-    try:
+    with _naming(image):
         check_frame(mosaic, exposure, rig)
+    return mosaic, exposure
+
+
+@contextmanager
+def _naming(image: Path) -> Iterator[None]:
+    """Add the image's name to what is wrong with it."""
+    try:
+        yield
     except RestorationError as error:
         raise RestorationError(f"{image}: {error}") from error
-    return mosaic, exposure
 
 
 def _read_mosaic(image: Path, shape: Shape) -> tuple[UInt16[np.ndarray, "rows columns"], float | None]:
