@@ -28,7 +28,6 @@ from udccal.restoration.prepared import kept
 from udccal.restoration.rectify import Rectification
 from udccal.restoration.sharpen import Sharpener
 from udccal.restoration.view import inscribed_view
-from udccal.result import FitStatus
 from udccal.rig import RigDescription
 from udccal.tiers import Tier
 
@@ -108,9 +107,9 @@ class Restorer:
         view = inscribed_view(geometry, camera.columns, camera.rows, rig.view.columns, rig.view.rows)
         rectification = Rectification.within(geometry, view, camera.columns, camera.rows)
         quick = tier is Tier.preview
-        unscattered = profile.backscatter.status is FitStatus.ABSENT
-        unblurred = quick or profile.psf.status is FitStatus.ABSENT
-        even = profile.wire.status is FitStatus.ABSENT and bool(np.all(profile.wire_map == 1.0))
+        unscattered = profile.backscatter.unfitted
+        unblurred = quick or profile.psf.unfitted
+        even = profile.wire.unfitted and bool(np.all(profile.wire_map == 1.0))
         return cls(
             tier=tier,
             rig=rig,
