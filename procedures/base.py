@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from typing import ClassVar, Literal, final
 
 from procedures.capture import take
@@ -19,6 +20,8 @@ from udccal.rig import RigDescription
 from udccal.sessions.schema import BoardSubject, DarkSubject, FlatSubject, LedSubject, Subject, TermName
 from udccal.sessions.writer import SessionWriter
 
+# Relative difference of two exposures of which one was to be the other's.
+_SAME_EXPOSURE = 0.01
 PictureRole = Literal["white", "picture", "brightened"]
 
 
@@ -98,7 +101,7 @@ def run_procedure(procedure: Procedure, bench: Bench, writer: SessionWriter, pro
         if progress is not None:
             progress(StepProgress(procedure.term, done, total, step))
         if step.id not in writer.completed_ids:
-            _run_step(step, bench, writer, _exposure_of(before, writer))
+            _run_step(step, bench, writer, _exposure_of(before, writer), partial(procedure.steps, rig))
         before = step.id
     if progress is not None:
         progress(StepProgress(procedure.term, total, total, None))
@@ -110,7 +113,9 @@ def _exposure_of(step_id: str | None, writer: SessionWriter) -> float | None:
     return None if step is None else step.captures[0].exposure_s
 
 
-def _run_step(step: Step, bench: Bench, writer: SessionWriter, start_s: float | None) -> None:
+def _run_step(
+    step: Step, bench: Bench, writer: SessionWriter, start_s: float | None, steps: Callable[[], Iterator[Step]]
+) -> None:
     rig = writer.manifest.rig
     arrangement = step.arrangement
     if isinstance(arrangement, PanelPicture):
@@ -126,12 +131,27 @@ def _run_step(step: Step, bench: Bench, writer: SessionWriter, start_s: float | 
         bench.display.check()
     except CaptureError as error:
         raise CaptureError(f"Step {step.id}: {error}") from error
-    writer.add_step(step.id, step.term, _subject(step, writer), captures)
+    stale = _stale(step.id, exposed.exposure_s, writer, steps)
+    writer.add_step(step.id, step.term, _subject(step, writer), captures, stale)
+
+
+def _stale(
+    step_id: str, exposure_s: float, writer: SessionWriter, steps: Callable[[], Iterator[Step]]
+) -> tuple[str, ...]:
+    """Return the steps that were captured at an exposure which followed from this one's, and no longer does."""
+    before = _exposure_of(step_id, writer)
+    if before is None or abs(exposure_s / before - 1) < _SAME_EXPOSURE:
+        return ()
+    return tuple(
+        step.id for step in steps() if isinstance(step.exposure, TimesThatOf) and step.exposure.step_id == step_id
+    )
 
 
 def _expose(step: Step, camera: Camera, writer: SessionWriter, start_s: float | None) -> Exposed:
     rig = writer.manifest.rig
     match step.exposure:
+        case Metered() if step.id in writer.again:
+            return meter(camera, step.region, step.exposure, rig, _exposure_of(step.id, writer))
         case Metered(signal="even") if (captured := writer.step(step.id)) is not None:
             # Its files are damaged but its exposure is known: other steps were captured at the same one.
             wanted = captured.captures[0].exposure_s

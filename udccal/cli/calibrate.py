@@ -62,6 +62,10 @@ def calibrate(
     exchanged: Annotated[
         list[ExchangedPart] | None, typer.Option("--exchanged", help="Part that was exchanged since the session began.")
     ] = None,
+    again: Annotated[
+        list[str] | None,
+        typer.Option("--again", metavar="STEP", help="Capture this captured step once more; may be given again."),
+    ] = None,
     log: IterationLog = None,
 ) -> None:
     """Capture every calibration step of a rig, then fit them. An interrupted session continues where it stopped."""
@@ -86,7 +90,7 @@ def calibrate(
             opened = _real(output, description, camera, serial, display, monitor, pictures)
     with opened as bench:
         parts = {Exchanged(part.value) for part in exchanged or ()}
-        capture_watched(output, bench, session, [t.value for t in term or TermChoice], parts)
+        capture_watched(output, bench, session, [t.value for t in term or TermChoice], parts, again or ())
     if not fit_to_profile(output, session, profile, log):
         raise typer.Exit(DOUBTFUL)
 
