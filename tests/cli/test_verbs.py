@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.reports.widths import layouts
 from tests.toy_rigs import write_toy_rig
 from udccal.io.exr import read_rgb_exr
 from udccal.io.png import read_png16, read_rgb8, write_png16
@@ -58,6 +59,12 @@ def mosaic(folder: Path) -> tuple[Path, float]:
     assert read_rgb8(Path(made["ideal"])).shape == (68, 120, 3)
     assert read_rgb8(Path(made["preview"])).shape == (48, 64, 3)
     return Path(made["mosaic"]), made["exposure_s"]
+
+
+def test_the_reports_tables_stay_in_their_cards(folder: Path, tmp_path: Path) -> None:
+    for layout in layouts((folder / "profile-report.html").read_text(encoding="utf-8"), tmp_path):
+        assert not layout.sideways
+        assert layout.outside == ()
 
 
 def test_restore_writes_display_and_linear_pictures(folder: Path, mosaic: tuple[Path, float]) -> None:
