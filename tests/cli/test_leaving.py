@@ -67,6 +67,7 @@ def test_a_seed_that_is_none_is_a_wrong_word(seed: str, tmp_path: Path) -> None:
     assert not (tmp_path / "o").exists()
 
 
+@pytest.mark.medium
 def test_results_without_a_place_are_refused_before_any_work(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     mosaic = tmp_path / "frame.png"

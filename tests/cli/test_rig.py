@@ -12,6 +12,8 @@ import pytest
 from udccal.errors import RigError
 from udccal.rig import load_rig
 
+pytestmark = pytest.mark.medium
+
 
 @pytest.fixture
 def rigs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:

@@ -91,8 +91,9 @@ def fit_to_profile(
         panel = session.rig.panel
         unseen = face_picture(UNSEEN_PICTURE, panel.columns, panel.rows)
         evidence = gather(session, calibration, unseen, None)
+        page = calibration_page(session, evidence, None)
         with storing_in(report.parent):
-            write_page(report, calibration_page(session, evidence, None))
+            write_page(report, page)
     show_status(output, calibration)
     try:
         store_profile(output, calibration, profile_path)
