@@ -5,20 +5,23 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from typing import ClassVar, Literal, final
 
 from procedures.capture import take
-from procedures.checks import Check, frame_limits
+from procedures.checks import Check, frame_limits, refuse_far_exposure
 from procedures.metering import Exposed, meter, trial_frame
 from procedures.plans import Exposure, Fixed, Metered, Plan, TimesThatOf
 from udccal.arrangements import Arrangement, Board, Dark, FlatLight, Led, Occasion, PanelPicture, Stage
 from udccal.cameras.protocol import Camera, Region
 from udccal.displays.protocol import Display
-from udccal.errors import CaptureError
+from udccal.errors import CameraError, CaptureError, SessionError, UdccalError
 from udccal.rig import RigDescription
 from udccal.sessions.schema import BoardSubject, DarkSubject, FlatSubject, LedSubject, Subject, TermName
 from udccal.sessions.writer import SessionWriter
 
+# Relative difference of two exposures of which one was to be the other's.
+_SAME_EXPOSURE = 0.01
 PictureRole = Literal["white", "picture", "brightened"]
 
 
@@ -86,8 +89,9 @@ def run_procedure(procedure: Procedure, bench: Bench, writer: SessionWriter, pro
     """Carry out every step that the session does not hold yet, on a bench whose camera is open.
 
     Raises:
-        CaptureError: when the camera does not fit the rig, or does not see what a step needs.
-        CameraError, SessionError: from the camera and the writer. Steps completed before stay in the session.
+        CaptureError: when the camera does not see what a step needs: a person at the rig can mend that and repeat it.
+        CameraError: when the camera does not fit the rig; also from the camera itself.
+        SessionError: from the writer. Steps completed before stay in the session.
     """
     rig = writer.manifest.rig
     _check_camera(bench.camera, rig)
@@ -97,7 +101,7 @@ def run_procedure(procedure: Procedure, bench: Bench, writer: SessionWriter, pro
         if progress is not None:
             progress(StepProgress(procedure.term, done, total, step))
         if step.id not in writer.completed_ids:
-            _run_step(step, bench, writer, _exposure_of(before, writer))
+            _run_step(step, bench, writer, _exposure_of(before, writer), partial(procedure.steps, rig))
         before = step.id
     if progress is not None:
         progress(StepProgress(procedure.term, total, total, None))
@@ -109,7 +113,9 @@ def _exposure_of(step_id: str | None, writer: SessionWriter) -> float | None:
     return None if step is None else step.captures[0].exposure_s
 
 
-def _run_step(step: Step, bench: Bench, writer: SessionWriter, start_s: float | None) -> None:
+def _run_step(
+    step: Step, bench: Bench, writer: SessionWriter, start_s: float | None, steps: Callable[[], Iterator[Step]]
+) -> None:
     rig = writer.manifest.rig
     arrangement = step.arrangement
     if isinstance(arrangement, PanelPicture):
@@ -125,12 +131,27 @@ def _run_step(step: Step, bench: Bench, writer: SessionWriter, start_s: float | 
         bench.display.check()
     except CaptureError as error:
         raise CaptureError(f"Step {step.id}: {error}") from error
-    writer.add_step(step.id, step.term, _subject(step, writer), captures)
+    stale = _stale(step.id, exposed.exposure_s, writer, steps)
+    writer.add_step(step.id, step.term, _subject(step, writer), captures, stale)
+
+
+def _stale(
+    step_id: str, exposure_s: float, writer: SessionWriter, steps: Callable[[], Iterator[Step]]
+) -> tuple[str, ...]:
+    """Return the steps that were captured at an exposure which followed from this one's, and no longer does."""
+    before = _exposure_of(step_id, writer)
+    if before is None or abs(exposure_s / before - 1) < _SAME_EXPOSURE:
+        return ()
+    return tuple(
+        step.id for step in steps() if isinstance(step.exposure, TimesThatOf) and step.exposure.step_id == step_id
+    )
 
 
 def _expose(step: Step, camera: Camera, writer: SessionWriter, start_s: float | None) -> Exposed:
     rig = writer.manifest.rig
     match step.exposure:
+        case Metered() if step.id in writer.again:
+            return meter(camera, step.region, step.exposure, rig, _exposure_of(step.id, writer))
         case Metered(signal="even") if (captured := writer.step(step.id)) is not None:
             # Its files are damaged but its exposure is known: other steps were captured at the same one.
             wanted = captured.captures[0].exposure_s
@@ -141,10 +162,11 @@ def _expose(step: Step, camera: Camera, writer: SessionWriter, start_s: float | 
         case TimesThatOf(step_id, factor):
             earlier = writer.step(step_id)
             if earlier is None:
-                raise CaptureError(f"Expected the step '{step_id}' before this one, found it not captured. Capture it.")
+                raise SessionError(f"Expected the step '{step_id}' before this one, found it not captured. Capture it.")
             wanted = factor * earlier.captures[0].exposure_s
     bounded = min(max(wanted, rig.camera.min_exposure_s), rig.camera.max_exposure_s)
     frame = trial_frame(camera, step.region, bounded)
+    refuse_far_exposure(frame.settings.exposure_s, bounded)
     return Exposed(frame.settings.exposure_s, frame)
 
 
@@ -167,14 +189,14 @@ def _subject(step: Step, writer: SessionWriter) -> Subject:
             )
         case PanelPicture(picture):
             return writer.store_picture(step.id, picture, step.role)
-    raise CaptureError(f"Expected an arrangement that calibrates a term, found another for the step '{step.id}'.")
+    raise UdccalError(f"Expected an arrangement that calibrates a term, found another for the step '{step.id}'.")
 
 
 def _check_camera(camera: Camera, rig: RigDescription) -> None:
     expected = (rig.camera.columns, rig.camera.rows, rig.camera.cfa, rig.camera.bits)
     found = (camera.sensor.columns, camera.sensor.rows, camera.cfa, camera.bits)
     if found != expected:
-        raise CaptureError(
+        raise CameraError(
             f"Expected a camera of {expected[0]} x {expected[1]}, {expected[2]}, {expected[3]} bits as in the rig "
             f"'{rig.name}', found {found[0]} x {found[1]}, {found[2]}, {found[3]} bits. "
             "Connect the right camera, or correct rig.toml."

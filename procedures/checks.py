@@ -21,6 +21,7 @@ Check = Callable[[Frame, RigDescription], None]
 _STRAY_E = 60.0  # electrons above the nominal black level that a dark frame may show, in addition to the tolerances
 _UNEVEN = 0.15  # darkest patch of an even light over the brightest, vignetting included
 _FEWEST_CORNERS, _ENOUGH_CORNERS = 6, 12  # a quarter of the board, within these bounds
+_FAR = 100.0  # times: a camera without the exposure may lend its nearest; milliseconds for seconds are 1000 times off
 _AIM_PX = 10  # the fit searches a little further
 
 
@@ -36,6 +37,22 @@ def frame_limits(rig: RigDescription, exposure_s: float, dark: bool) -> FrameLim
     """Return the limits of each frame of a step's captures."""
     limits = FrameLimits(rig.camera.black_DN.value, lowest_saturation_DN(rig))
     return replace(limits, dark_DN=dark_limit_DN(rig, exposure_s)) if dark else limits
+
+
+def refuse_far_exposure(found_s: float, wanted_s: float) -> None:
+    """Refuse an exposure that is far off the one that a step is captured at: pictures of files have what they have.
+
+    Raises:
+        CaptureError: when it is more than 100 times longer or shorter.
+    """
+    if not 1 / _FAR <= found_s / wanted_s <= _FAR:
+        factor = max(found_s / wanted_s, wanted_s / found_s)
+        raise CaptureError(
+            f"Expected an exposure near {wanted_s:.3g} s, as follows from the rig and the earlier steps, found "
+            f"{found_s:.3g} s: {factor:.0f} times too {'long' if found_s > wanted_s else 'short'}. Exposures are in "
+            "seconds (s): correct a frames.csv that has milliseconds (ms), here or in an earlier step, or take the "
+            "pictures again."
+        )
 
 
 def is_dark(frame: Frame, rig: RigDescription) -> None:

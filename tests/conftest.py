@@ -37,6 +37,19 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker(pytest.mark.timeout(SLOW_TEST_TIMEOUT_S))
 
 
+@pytest.fixture
+def emulated_camera(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Programs that the test starts see the camera that Basler's SDK emulates: 4096 x 4096 pixels."""
+    from udccal.cameras.pylon_sdk.loading import load_sdk
+    from udccal.errors import CameraError
+
+    try:
+        load_sdk()
+    except CameraError as error:
+        pytest.skip(str(error))
+    monkeypatch.setenv("PYLON_CAMEMU", "1")
+
+
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
     """Folder of the shared photographs; tests that need it skip with this reason when it is absent."""

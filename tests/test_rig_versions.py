@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 from udccal.errors import RigError
-from udccal.rig import RigDescription, find_rig, load_rig
+from udccal.rig import RigDescription, load_rig
+from udccal.rig_folders import find_rig
 from udccal.rig_versions import present_rig
 
 OLD_WORDS = {

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 RIGS = Path(__file__).resolve().parents[1] / "rig_profiles"
@@ -16,6 +17,27 @@ _CHANGES = {
     "psf_region_rows = 144": "psf_region_rows = 32",
     "[view]\ncolumns = 960\nrows = 540": "[view]\ncolumns = 120\nrows = 68",
 }
+
+
+# The emulated camera of Basler's SDK has this many pixels across and down.
+_EMULATED = {"columns = 128": "columns = 4096", "rows = 96": "rows = 4096", "pitch_um = 55.2": "pitch_um = 1.725"}
+
+
+def write_emulated_rig(folder: Path) -> Path:
+    """The toy rig with the sensor of the camera that Basler's SDK emulates; returns the rig's folder."""
+    rig = write_toy_rig(folder)
+    change_rig(rig, _EMULATED)
+    return rig
+
+
+def change_rig(rig: Path, changes: Mapping[str, str]) -> None:
+    """Replace parts of a rig's description that it has exactly once."""
+    text = (rig / "rig.toml").read_text(encoding="utf-8")
+    for old, new in changes.items():
+        if text.count(old) != 1:
+            raise ValueError(f"expected '{old}' once in the rig's description, found it {text.count(old)} times")
+        text = text.replace(old, new)
+    (rig / "rig.toml").write_text(text, encoding="utf-8")
 
 
 def write_toy_rig(folder: Path) -> Path:

@@ -22,7 +22,7 @@ from udccal.models.wire import Wire
 from udccal.profiles.profile import build_profile
 from udccal.profiles.provenance import provenance_now
 from udccal.profiles.store import write_profile
-from udccal.result import FitResult
+from udccal.result import FitResult, FitStatus
 from udccal.rig import RigDescription
 from udccal.sessions.manifest import MANIFEST_NAME
 from udccal.sessions.schema import TermName
@@ -100,6 +100,11 @@ class Calibration:
         return self
 
     @property
+    def not_captured(self) -> tuple[TermName, ...]:
+        """The terms that the session has no captures of."""
+        return tuple(term for term in ORDER if self.result(term).status is FitStatus.NOT_CAPTURED)
+
+    @property
     def warnings(self) -> tuple[str, ...]:
         """A sentence for each term that is usable though its fit did not end well."""
         return tuple(result.warning for result in self.results if result.warning)
@@ -166,7 +171,7 @@ def calibrate(
     effort: FitEffort | None = None,
     foundation: Foundation | None = None,
 ) -> Calibration:
-    """Fit every term of a session; a term without steps gets its nominal or absent form, a note and status ABSENT.
+    """Fit every term of a session; a term without steps gets its nominal or absent form, and status NOT_CAPTURED.
 
     Args:
         session: the captured session.

@@ -21,6 +21,10 @@ class FitStatus(enum.Enum):
 
     CONVERGED = "The fit converged."
     ABSENT = "The data show no sign of this term; it is left out and costs nothing later."
+    NOT_CAPTURED = (
+        "Nobody looked: the session has no captures of this term. It keeps the rig description's nominal values, or is "
+        "left out. Capture it to measure it."
+    )
     NOT_CONVERGED = "The solver stopped before it converged. Check the residual map, or allow more iterations."
     TOO_FEW_DATA = "There are fewer usable samples than parameters. Capture more positions, exposures or views."
     SATURATED = "Too much of the data is clipped. Capture again with a shorter exposure or less light."
@@ -98,7 +102,7 @@ class FitResult(Generic[Term]):
     Attributes:
         name: noise, geometry, wire, psf or backscatter.
         term: the fitted term; the rig description's nominal term where the fit failed.
-        status: how the fit ended.
+        status: how the fit ended; NOT_CAPTURED where the session has no captures of the term.
         estimates: named numbers of the term, each with its standard deviation.
         cov: covariance of the leading estimates, in their units; of all estimates unless a note says otherwise.
         chi2_dof: reduced chi-squared; about 1 where model and noise describe the data.
@@ -132,8 +136,13 @@ class FitResult(Generic[Term]):
 
     @property
     def ok(self) -> bool:
-        """Whether the fit ended well."""
-        return self.status in (FitStatus.CONVERGED, FitStatus.ABSENT)
+        """Whether nothing went wrong: the fit ended well, or there was nothing to fit."""
+        return self.status is FitStatus.CONVERGED or self.unfitted
+
+    @property
+    def unfitted(self) -> bool:
+        """Whether the term was not fitted: the data show no sign of it, or there are none."""
+        return self.status in (FitStatus.ABSENT, FitStatus.NOT_CAPTURED)
 
     @property
     def usable(self) -> bool:

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-import os
 import tomllib
-from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from udccal.errors import RigError
+from udccal.rig_folders import RIG_FILE, find_rig
 from udccal.rig_versions import present_rig
 
 CfaPattern = Literal["RGGB", "BGGR", "GRBG", "GBRG"]
 _MAX_TOML_BYTES = 64 * 1024
+RIG_NAME = r"^[a-z0-9][a-z0-9._-]{0,63}$"
+# Further mistakes that one message names.
+_MOST_MISTAKES = 20
 # 8K UHD and a little more.
 _MOST_VIEW_PX = 2**25
 
@@ -71,6 +73,12 @@ class Camera(_Strict):
     frame_rate_hz: Annotated[float, Field(gt=0, le=1e6)]
     min_exposure_s: Annotated[float, Field(gt=0, le=1e6)]
     max_exposure_s: Annotated[float, Field(gt=0, le=1e6)]
+
+    @model_validator(mode="after")
+    def _exposures_in_order(self) -> Camera:
+        if self.min_exposure_s > self.max_exposure_s:
+            raise ValueError(f"a shortest exposure of {self.min_exposure_s:g} s, longer than the longest")
+        return self
 
 
 class Lens(_Strict):
@@ -134,7 +142,7 @@ class RigDescription(_Strict):
 
     format: Literal["udccal-rig"]
     version: Literal[2]
-    name: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9._-]{0,63}$")]
+    name: Annotated[str, Field(pattern=RIG_NAME)]
     panel: Panel
     camera: Camera
     lens: Lens
@@ -163,39 +171,6 @@ class RigDescription(_Strict):
         return int(2**self.camera.bits - 1)
 
 
-def user_rig_folder() -> Path:
-    """Return the folder in which a user's own rigs are looked up by name: ``UDCCAL_RIGS``, or a default."""
-    default = Path.home() / ".local" / "share" / "udccal" / "rigs"
-    return Path(os.environ.get("UDCCAL_RIGS", str(default)))
-
-
-def shipped_rig_folder() -> Path:
-    """Return the folder of the rigs that ship with udccal."""
-    return Path(str(resources.files("rig_profiles")))
-
-
-def find_rig(name_or_path: str | Path) -> Path:
-    """Return the folder of a rig.
-
-    Args:
-        name_or_path: a path, or the name of a rig in the user's folder or among the shipped ones.
-
-    Raises:
-        RigError: when no folder with a ``rig.toml`` is found.
-    """
-    path = Path(name_or_path)
-    by_name = [] if path.parts[1:] or path.is_absolute() else [user_rig_folder() / path, shipped_rig_folder() / path]
-    places = [*by_name, path]
-    for place in places:
-        if (place / "rig.toml").is_file():
-            return place
-    shipped = sorted(p.parent.name for p in shipped_rig_folder().glob("*/rig.toml"))
-    raise RigError(
-        f"Expected a rig folder with a rig.toml, found none for '{name_or_path}'. "
-        f"Give a path, or one of the shipped rigs: {', '.join(shipped)}."
-    )
-
-
 def load_rig(name_or_path: str | Path) -> RigDescription:
     """Read and check a rig description.
 
@@ -205,7 +180,7 @@ def load_rig(name_or_path: str | Path) -> RigDescription:
     Raises:
         RigError: when it is missing, not TOML, or a value is missing, unknown or out of range.
     """
-    file = find_rig(name_or_path) / "rig.toml"
+    file = find_rig(name_or_path) / RIG_FILE
     raw = file.read_bytes()
     if len(raw) > _MAX_TOML_BYTES:
         raise RigError(f"Expected {file} to hold at most {_MAX_TOML_BYTES} bytes, found {len(raw)}. Shorten it.")
@@ -214,6 +189,12 @@ def load_rig(name_or_path: str | Path) -> RigDescription:
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise RigError(f"Expected {file} to be TOML, found: {error}. Correct that line.") from error
     except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"])
-        raise RigError(f"Expected a valid '{where}' in {file}, found: {first['msg']}. Correct that value.") from error
+        first, *others = error.errors()
+        more = f", and {', '.join(_place(other['loc']) for other in others[:_MOST_MISTAKES])}" if others else ""
+        raise RigError(
+            f"Expected a valid '{_place(first['loc'])}' in {file}, found: {first['msg']}. Correct that value{more}."
+        ) from error
+
+
+def _place(location: tuple[int | str, ...]) -> str:
+    return ".".join(str(part) for part in location)

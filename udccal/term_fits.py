@@ -126,10 +126,7 @@ class TermFits:
         """Run and time the fit of a term, or return its absent form where the session has no steps of it."""
         self._progress(term)
         start = time.perf_counter()
-        if self._session.steps(term):
-            result = fit()
-        else:
-            note = f"The session has no {term} steps; the term has the rig description's nominal values, or is absent."
-            result = FitResult.failed(term, absent(), FitStatus.ABSENT, note)
+        captured = self._session.steps(term)
+        result = fit() if captured else FitResult.failed(term, absent(), FitStatus.NOT_CAPTURED)
         self.times.append(FitTime(term, time.perf_counter() - start))
         return result

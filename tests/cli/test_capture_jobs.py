@@ -7,20 +7,17 @@ from pathlib import Path
 import pytest
 
 from procedures.noise import NoiseProcedure
-from procedures.plans import Fixed, Metered, Stack
+from tests.cli.step_pictures import photograph_steps
 from tests.toy_rigs import write_toy_rig
 from udccal.arrangements import Dark, FlatLight, Occasion
 from udccal.benches.bench import CaptureBench, simulated_bench, simulated_rig
 from udccal.benches.capture import capture
-from udccal.cameras.protocol import Settings
-from udccal.cameras.simulated import SimulatedCamera
 from udccal.cli.jobs.benches import files_bench
 from udccal.cli.jobs.person import PersonStage
 from udccal.cli.output import Output
 from udccal.errors import CameraError, CaptureError, UdccalError
 from udccal.fitting.noise.data import read_noise
 from udccal.fitting.noise.fit import fit_noise
-from udccal.io.png import write_png16
 from udccal.rig import RigDescription, load_rig
 from udccal.sessions.store import Session
 
@@ -28,32 +25,6 @@ from udccal.sessions.store import Session
 @pytest.fixture
 def rig(tmp_path: Path) -> RigDescription:
     return load_rig(write_toy_rig(tmp_path))
-
-
-def photograph_steps(rig: RigDescription, root: Path) -> None:
-    """What a person with another camera does: pictures of every step of the noise term, in a folder each."""
-    world = simulated_rig(rig, seed=2)
-    stack_s = 4.4e-3
-    with SimulatedCamera(world) as camera:
-        for number, step in enumerate(NoiseProcedure().steps(rig)):
-            world.arrange(step.arrangement, Occasion(step.id, number, step.instruction))
-            match step.exposure:
-                case Metered():
-                    exposure_s = stack_s
-                case Fixed(exposure_s):
-                    pass
-                case other:
-                    exposure_s = other.factor * stack_s
-            camera.configure(Settings(max(exposure_s, rig.camera.min_exposure_s), 0.0, camera.sensor))
-            folder = root / step.id
-            folder.mkdir(parents=True)
-            lines = ["file,exposure_s"]
-            frames = step.plan.frames + (2 if isinstance(step.plan, Stack) else 1)
-            for frame in camera.frames(frames):
-                name = f"{frame.frame_id:06d}.png"
-                write_png16(folder / name, frame.data)
-                lines.append(f"{name},{frame.settings.exposure_s!r}")
-            (folder / "frames.csv").write_text("\n".join(lines) + "\n")
 
 
 def test_pictures_of_any_camera_make_a_session(tmp_path: Path, rig: RigDescription) -> None:

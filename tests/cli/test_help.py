@@ -24,6 +24,10 @@ VERBS = (
     ["profile"],
     ["profile", "show"],
     ["profile", "prepare"],
+    ["rig"],
+    ["rig", "list"],
+    ["rig", "new"],
+    ["rig", "check"],
 )
 # typer itself loads pydantic, which is quick
 HEAVY = ("jax", "numpy", "cv2", "matplotlib", "scipy", "equinox", "rawpy", "OpenEXR")

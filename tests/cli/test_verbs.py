@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.reports.widths import layouts
 from tests.toy_rigs import write_toy_rig
 from udccal.io.exr import read_rgb_exr
 from udccal.io.png import read_png16, read_rgb8, write_png16
@@ -24,6 +25,10 @@ def udccal(*words: str | Path) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, text=True, timeout=800)
 
 
+def headline(report: str) -> str:
+    return report.partition('<p class="verdict">')[2].partition("</p>")[0]
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a toy rig, its session and its profile."""
@@ -35,8 +40,13 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     assert done.returncode == 0, done.stderr
     status = {term["term"]: term["status"] for term in json.loads(done.stdout)["terms"]}
     assert status.pop("noise") == "CONVERGED"
-    assert set(status.values()) == {"ABSENT"}
-    assert (folder / "profile-report.html").is_file()
+    assert set(status.values()) == {"NOT_CAPTURED"}
+    report = (folder / "profile-report.html").read_text(encoding="utf-8")
+    counted = "1 of 5 terms measured, and can be used: noise. Not captured: geometry, wire, psf, backscatter."
+    assert headline(report) == counted
+    assert counted in done.stderr
+    assert "no sign of this term" not in report
+    assert report.count("Nobody looked") == 4
     return folder
 
 
@@ -49,6 +59,12 @@ def mosaic(folder: Path) -> tuple[Path, float]:
     assert read_rgb8(Path(made["ideal"])).shape == (68, 120, 3)
     assert read_rgb8(Path(made["preview"])).shape == (48, 64, 3)
     return Path(made["mosaic"]), made["exposure_s"]
+
+
+def test_the_reports_tables_stay_in_their_cards(folder: Path, tmp_path: Path) -> None:
+    for layout in layouts((folder / "profile-report.html").read_text(encoding="utf-8"), tmp_path):
+        assert not layout.sideways
+        assert layout.outside == ()
 
 
 def test_restore_writes_display_and_linear_pictures(folder: Path, mosaic: tuple[Path, float]) -> None:
@@ -87,6 +103,27 @@ def test_profile_show_lists_what_was_measured(folder: Path) -> None:
     shown = json.loads(done.stdout)
     assert shown["rig"] == "toy"
     assert "K_DN_per_e" in {estimate["name"] for estimate in shown["estimates"]}
+    assert [term["status"] for term in shown["terms"]] == ["CONVERGED", *(4 * ["NOT_CAPTURED"])]
+    assert done.stderr.count(": Nobody looked: the session has no captures of this term.") == 4
+
+
+def test_a_profile_from_before_that_status_is_read_as_what_it_says(folder: Path) -> None:
+    """A term without captures was called ABSENT, with a note that says why; a term that was looked for stays absent."""
+    old = Path(shutil.copytree(folder / "profile", folder / "old"))
+    stored = json.loads((old / "profile.json").read_text())
+    for name in ("wire", "psf"):
+        stored["terms"][name]["fit"]["status"] = "ABSENT"
+    stored["terms"]["wire"]["fit"]["notes"] = ["The session has no wire steps; the term has the rig's nominal values."]
+    stored["terms"]["psf"]["fit"]["notes"] = ["No modulation by rows is visible."]
+    (old / "profile.json").write_text(json.dumps(stored))
+    shown = {term["term"]: term["status"] for term in json.loads(udccal("profile", "show", old).stdout)["terms"]}
+    assert shown["wire"] == "NOT_CAPTURED"
+    assert shown["psf"] == "ABSENT"
+    stored["terms"]["wire"]["fit"]["status"] = "NOBODY_CAME"
+    (old / "profile.json").write_text(json.dumps(stored))
+    refused = udccal("profile", "show", old)
+    assert refused.returncode == 1
+    assert "found 'NOBODY_CAME'" in json.loads(refused.stdout)["error"]
 
 
 def test_one_term_is_fitted_again_and_the_others_are_kept(folder: Path) -> None:

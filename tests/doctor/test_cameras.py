@@ -1,13 +1,15 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from importlib.metadata import PackageNotFoundError
 
 import pytest
 
 from udccal.doctor import cameras
-from udccal.doctor.answers import Failure, SeenCamera
-from udccal.doctor.cameras import camera_finding, pylon_sdk_finding
+from udccal.doctor.answers import Failure, OpenedCamera, SeenCamera
+from udccal.doctor.cameras import camera_finding, pylon_sdk_finding, rig_finding
 from udccal.doctor.finding import Finding, Status
+from udccal.rig import load_rig
 
 GOOD = SeenCamera("Basler ace 1")
 SLOW = SeenCamera("Basler ace 2", too_slow=True)
@@ -53,6 +55,31 @@ def test_the_sdk_is_a_note_when_missing_and_a_problem_when_asked_for(monkeypatch
     assert "pip install 'udccal[pylon]'" in pylon_sdk_finding(False).advice
     monkeypatch.setattr(cameras, "version", lambda name: "1.2")
     assert pylon_sdk_finding(True) == Finding("pylon SDK", Status.OK, "pypylon 1.2")
+
+
+FITS = OpenedCamera(1024, 768, 120.0, 2e-5, 10.0)
+
+
+@pytest.mark.parametrize(
+    ("answer", "status", "advice"),
+    [
+        (FITS, Status.OK, ""),
+        (replace(FITS, columns=4096, rows=4096), Status.PROBLEM, "1024 x 768 as in the rig 'lg55-reduced', found 4096"),
+        (replace(FITS, rows=766), Status.PROBLEM, "found 1024 x 766"),
+        (replace(FITS, refusal="Expected RGGB, found mono."), Status.PROBLEM, "Expected RGGB, found mono."),
+        (replace(FITS, longest_s=1.0), Status.PROBLEM, "Expected exposures of 2e-05 to 10 s"),
+        (replace(FITS, shortest_s=1e-3), Status.PROBLEM, "found 0.001 to 10 s"),
+        (replace(FITS, rate_hz=60.0), Status.NOTE, "The rig says 120 Hz"),
+        (Failure("Expected it free, found it held.", refused=True), Status.PROBLEM, "found it held"),
+        (Failure("no answer within 30 s"), Status.PROBLEM, "Unplug the camera"),
+    ],
+    ids=["fits", "size", "rows", "pattern", "longest", "shortest", "rate", "held", "hung"],
+)
+def test_the_camera_is_compared_with_the_rig(answer: OpenedCamera | Failure, status: Status, advice: str) -> None:
+    finding = rig_finding(load_rig("lg55-reduced"), answer)
+    assert finding.topic == "camera against rig"
+    assert finding.status is status
+    assert advice in finding.advice
 
 
 def test_only_notes_become_problems() -> None:

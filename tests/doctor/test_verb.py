@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from tests.doctor.trees import BASLER, CONTROL, add_device, set_usb_memory
+from tests.toy_rigs import change_rig, write_emulated_rig
 from udccal.cli.jobs import doctor as job
 from udccal.cli.output import Output
 from udccal.displays.window_messages import Monitor
@@ -51,7 +52,7 @@ def udccal(*words: str | Path) -> subprocess.CompletedProcess[str]:
 
 def fake_ask(u3v: tuple[SeenCamera, ...] | Failure) -> Callable:
     answers = {Question.U3V: u3v, Question.PYLON: (), Question.JAX: (JaxDevice("cpu", "cpu"),)}
-    return lambda question, read, seconds: answers[question]
+    return lambda question, read, seconds, words=(): answers[question]
 
 
 @pytest.fixture
@@ -140,6 +141,33 @@ def test_the_exit_status_says_whether_what_was_asked_for_can_work(tmp_path: Path
     assert refused.returncode == 1
     assert json.loads(refused.stdout)["ready"] is False  # one object, and the only one
     assert "Not ready: " in refused.stderr
+
+
+@pytest.mark.medium
+@pytest.mark.parametrize(
+    ("changes", "serial", "status", "said"),
+    [
+        ({}, "0815-0000", "OK", ""),
+        ({"columns = 4096": "columns = 128"}, "", "PROBLEM", "Expected a camera of 128 x 4096"),
+        ({"bits = 12": "bits = 14"}, "", "PROBLEM", "a pixel format of 14 bits and the pattern RGGB"),
+        ({"frame_rate_hz = 120.0": "frame_rate_hz = 9000.0"}, "", "NOTE", "The rig says 9000 Hz"),
+        ({}, "4711", "PROBLEM", "serial number 4711"),
+    ],
+    ids=["fits", "size", "bits", "rate", "serial"],
+)
+def test_the_camera_is_opened_and_compared_with_the_rig(
+    changes: dict[str, str], serial: str, status: str, said: str, tmp_path: Path, emulated_camera: None
+) -> None:
+    rig = write_emulated_rig(tmp_path)
+    change_rig(rig, changes)
+    words = ["--serial", serial] if serial else []
+    done = udccal("--json", "--rig", rig, "--camera", "pylon", *words)
+    summary = json.loads(done.stdout)
+    (finding,) = [one for one in summary["findings"] if one["topic"] == "camera against rig"]
+    assert finding["status"] == status, finding
+    assert said in finding["advice"]
+    assert summary["ready"] is (status != "PROBLEM")
+    assert done.returncode == (1 if status == "PROBLEM" else 0)
 
 
 def test_an_unknown_rig_is_one_sentence() -> None:

@@ -15,7 +15,7 @@ from procedures.psf import PsfProcedure
 from procedures.wire import WireProcedure
 from tests.procedures.benches import new_writer, simulated_bench, small_rig
 from udccal.arrangements import Arrangement, Dark, Occasion
-from udccal.errors import CaptureError
+from udccal.errors import CameraError, CaptureError, SessionError
 from udccal.sessions.store import Session
 from udccal.sessions.writer import SessionWriter
 from udccal.simulation.disturbances import Disturbances
@@ -139,7 +139,7 @@ def test_another_camera_than_the_rigs_is_refused(tmp_path: Path) -> None:
     other = rig.model_copy(update={"camera": rig.camera.model_copy(update={"cfa": "BGGR"})})
     with simulated_bench(rig) as bench:
         writer = new_writer(tmp_path, other, bench)
-        with pytest.raises(CaptureError, match="Expected a camera of 128 x 96, BGGR, 12 bits"):
+        with pytest.raises(CameraError, match="Expected a camera of 128 x 96, BGGR, 12 bits"):
             run_procedure(WireProcedure(), bench, writer)
 
 
@@ -153,5 +153,5 @@ def test_a_step_that_leans_on_a_missing_one_is_refused(tmp_path: Path) -> None:
             (step,) = (step for step in WireProcedure().steps(rig) if isinstance(step.exposure, TimesThatOf))
             yield step
 
-    with simulated_bench(rig) as bench, pytest.raises(CaptureError, match="Expected the step 'wire/flat' before"):
+    with simulated_bench(rig) as bench, pytest.raises(SessionError, match="Expected the step 'wire/flat' before"):
         run_procedure(OnlyDark(), bench, new_writer(tmp_path, rig, bench))

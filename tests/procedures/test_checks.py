@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from procedures.checks import is_dark, is_even, shows_board, shows_led
+from procedures.checks import is_dark, is_even, refuse_far_exposure, shows_board, shows_led
 from udccal.arrangements import BoardSpec
 from udccal.cameras.protocol import Frame, Region, Settings
 from udccal.errors import CaptureError
@@ -80,3 +80,11 @@ def test_a_board_is_found_and_its_absence_told() -> None:
     check(frame(board_picture()), RIG)
     with pytest.raises(CaptureError, match=r"at least 6 corners of the 7 x 5 ChArUco board, found 0"):
         check(frame(np.full((480, 640), 500.0)), RIG)
+
+
+@pytest.mark.parametrize(("found_s", "way"), [(8.0, "1000 times too long"), (8e-6, "1000 times too short")])
+def test_an_exposure_that_is_far_off_is_refused(found_s: float, way: str) -> None:
+    for near_s in (8e-3, 0.5, 1e-4):
+        refuse_far_exposure(near_s, 8e-3)
+    with pytest.raises(CaptureError, match=rf"Expected an exposure near 0.008 s.* {way}\. .*milliseconds"):
+        refuse_far_exposure(found_s, 8e-3)

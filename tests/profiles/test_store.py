@@ -16,7 +16,8 @@ from udccal.profiles.profile import Profile, build_profile
 from udccal.profiles.provenance import PROFILE_NAME, profile_sha256
 from udccal.profiles.store import RIG_PROFILE, find_profile, read_profile, read_stored, write_profile
 from udccal.result import FitStatus
-from udccal.rig import load_rig, shipped_rig_folder
+from udccal.rig import load_rig
+from udccal.rig_folders import shipped_rig_folder
 
 TERMS = ("noise", "geometry", "wire", "psf", "backscatter")
 

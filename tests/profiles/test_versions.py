@@ -13,7 +13,7 @@ from udccal.errors import ProfileError
 from udccal.profiles.schema import VERSION
 from udccal.profiles.store import load_profile, read_profile, write_profile
 from udccal.profiles.versions import JsonObject, migrated
-from udccal.rig import shipped_rig_folder
+from udccal.rig_folders import shipped_rig_folder
 
 
 def first_to_second(found: JsonObject) -> JsonObject:

@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
+import base64
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
+import cv2
+import numpy as np
+import pytest
+
+from tests.reports.widths import layouts
 from udccal.reports.page import Fact, Illustration, Page, TermSection, render, write_page
 from udccal.reports.tables import Table
 from udccal.result import FitStatus
@@ -82,3 +89,48 @@ def test_text_is_escaped() -> None:
     text = render(page(section(finding="<script>alert(1)</script>")))
     assert "<script>" not in text
     assert "&lt;script&gt;" in text
+
+
+def wide_page() -> str:
+    """A page with tables of many columns, a large picture and a word without a break."""
+    picture = base64.b64encode(_png(900, 300)).decode()
+    row = tuple(f"{1 / (3 + k):.9f}" for k in range(9))
+    wide = Table(
+        "Fitted, in many columns", tuple(f"quantity_{k}" for k in range(9)), (row, row), frozenset(range(1, 9))
+    )
+    one = replace(
+        section(finding="a" * 200),
+        illustrations=(Illustration(f"data:image/png;base64,{picture}", "What to see. " * 20, "wide"),),
+        tables=(wide,),
+        details=(wide, wide),
+        notes=("b" * 200,),
+    )
+    return render(replace(page(one), tables=(wide,), facts=(Fact("camera", "c" * 200),)))
+
+
+def _png(columns: int, rows: int) -> bytes:
+    return bytes(cv2.imencode(".png", np.zeros((rows, columns, 3), np.uint8))[1])
+
+
+@pytest.mark.medium
+def test_only_tables_scroll_sideways_however_narrow_the_window(tmp_path: Path) -> None:
+    for layout in layouts(wide_page(), tmp_path):
+        assert not layout.sideways, layout
+        assert layout.outside == (), layout
+        assert layout.scrolling == (4 if layout.width < 500 else layout.scrolling), layout
+
+
+@pytest.mark.medium
+def test_a_table_that_leaves_its_card_would_be_noticed(tmp_path: Path) -> None:
+    text = wide_page()
+    for rule, broken in (("overflow-x: auto;", ""), ("min-width: 0;", "min-width: max-content;")):
+        assert rule in text
+        (layout,) = layouts(text.replace(rule, broken), tmp_path, (390,))
+        assert layout.sideways or layout.outside
+
+
+def test_the_rules_that_keep_tables_in_their_cards_are_there() -> None:
+    text = wide_page()
+    assert text.count("<table>") == text.count('<div class="table"') == 4
+    for rule in (".table { overflow-x: auto; ", ".columns > div { min-width: 0; }", "minmax(min(360px, 100%), 1fr)"):
+        assert rule in text

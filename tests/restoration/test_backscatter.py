@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from udccal.cfa import cfa_named
+from udccal.errors import RestorationError
 from udccal.models.backscatter import Backscatter, backscatter_rate
 from udccal.numerics import in_float64
 from udccal.profiles.profile import Profile
-from udccal.restoration.backscatter import PanelLight, PanelMask, mask_mosaic
+from udccal.restoration.backscatter import PanelLight, PanelMask, mask_mosaic, refuse_excess
 
 ROWS, COLUMNS = 96, 128
 CFA = cfa_named("RGGB")
@@ -88,3 +89,13 @@ def test_a_panel_whose_last_blocks_are_not_whole_is_as_bright(profile: Profile, 
     white = np.full((23, 31, 3), 255, np.uint8)
     exact, blocks = (PanelLight.of(lit, odd, block).rate(white) for block in (1, 2))
     np.testing.assert_allclose(blocks, exact, rtol=1e-4, atol=1e-4 * exact.max())
+
+
+def test_a_frame_is_no_darker_than_the_panels_light(mask: PanelMask) -> None:
+    none, frame = np.zeros(mask.white.shape, bool), 0.02 * mask.white
+    refuse_excess(frame, frame, none)  # a dark room
+    refuse_excess(-frame, 0 * frame, none)  # a black panel, and noise
+    refuse_excess(frame, 1.1 * frame, none)  # a panel that has aged
+    refuse_excess(0 * frame, frame, ~none)  # clipped samples say nothing
+    with pytest.raises(RestorationError, match=r"8 ms are 0\.008"):
+        refuse_excess(frame, 1000 * frame, none)

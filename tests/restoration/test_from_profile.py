@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import json
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,11 +12,13 @@ import numpy as np
 import pytest
 
 from udccal.errors import RestorationError
-from udccal.profiles.profile import Profile
+from udccal.io.png import write_png16, write_rgb8
+from udccal.profiles.profile import Profile, build_profile
 from udccal.profiles.store import read_profile, write_profile
 from udccal.restoration.plan import PlanOptions
 from udccal.restoration.runtime import Restorer
 from udccal.result import FitResult, FitStatus
+from udccal.rig import load_rig
 from udccal.tiers import Tier
 
 
@@ -36,6 +41,27 @@ def test_a_stored_profile_restores_a_frame(profile: Profile, tmp_path: Path, tie
     # Without the picture, an even frame might be all backscatter: no more than the mask is taken away.
     unknown = restorer.restore(frame, exposure_s)
     np.testing.assert_allclose(unknown * exposure_s, scene_e, rtol=0.02)
+
+
+@pytest.mark.slow
+def test_a_frame_darker_than_the_panels_light_is_refused(profile: Profile, tmp_path: Path) -> None:
+    """Milliseconds given as seconds to the command, and the same frame with its own exposure."""
+    rig = profile.rig.model_copy(update={"panel": load_rig("lg55-reduced").panel})
+    whole_panel = build_profile(rig, profile.provenance, *profile.results, profile.wire_map)
+    write_profile(tmp_path / "p", whole_panel)
+    write_rgb8(tmp_path / "shown.png", np.full((rig.panel.rows, rig.panel.columns, 3), 255, np.uint8))
+    mask = Restorer.from_profile(whole_panel, Tier.preview).mask
+    assert mask is not None
+    exposure_s = 6.0 / mask.mean()  # the panel gives 6 e- per pixel then, the scene 2000
+    write_png16(tmp_path / "frame.png", np.rint(64 + 0.355 * (2000.0 + exposure_s * mask)).astype(np.uint16))
+    words = ["restore", "frame.png", "--profile", "p", "--panel-picture", "shown.png", "--tier", "fast", "--out", "out"]
+    for given_s, status in ((1000 * exposure_s, 1), (exposure_s, 0)):
+        command = [sys.executable, "-m", "udccal.cli.main", *words, "--exposure-s", str(given_s), "--json"]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=280, cwd=tmp_path)
+        assert done.returncode == status, done.stderr
+        assert (tmp_path / "out").exists() is (status == 0)
+        if status:
+            assert "Expected a frame at least as bright as the panel's own light" in json.loads(done.stdout)["error"]
 
 
 def test_absent_terms_cost_nothing(profile: Profile) -> None:

@@ -5,12 +5,16 @@ from dataclasses import replace
 import numpy as np
 
 from udccal.models.noise import Noise
-from udccal.restoration.linear import to_electrons, variance_e2, without_defects
+from udccal.restoration.linear import saturated, to_electrons, variance_e2, without_defects
 
 
 def test_black_level_gain_and_dark_current(toy_noise: Noise) -> None:
     mosaic = np.array([[64, 64 + 355]], np.uint16)
     np.testing.assert_allclose(to_electrons(mosaic, toy_noise, 0.5), [[-10.0, 990.0]], atol=1e-3)
+
+
+def test_saturation_is_a_margin_below_the_full_well(toy_noise: Noise) -> None:
+    assert saturated(np.array([[3800, 3960, 3969]], np.uint16), toy_noise).tolist() == [[False, True, True]]
 
 
 def test_variance_of_a_sample(toy_noise: Noise) -> None:

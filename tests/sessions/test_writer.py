@@ -18,7 +18,7 @@ from udccal.io.hashing import sha256_file
 from udccal.rig import RigDescription, load_rig
 from udccal.sessions.captured import AveragedFrames, SingleFrame
 from udccal.sessions.changes import Exchanged
-from udccal.sessions.schema import DarkSubject, FlatSubject
+from udccal.sessions.schema import DarkSubject, FlatSubject, Manifest
 from udccal.sessions.store import Session
 from udccal.sessions.writer import SessionWriter
 
@@ -137,6 +137,53 @@ def test_another_rig_camera_or_lens_does_not_go_on_unless_told(tmp_path: Path) -
     by_another_backend = replace(OTHER_CAMERA, backend="other", vendor="MAKER")
     SessionWriter.create_or_resume(tmp_path, with_other_lens(), by_another_backend).close()
     SessionWriter.create_or_resume(tmp_path, with_other_lens(), OTHER_CAMERA).close()
+
+
+def test_a_step_stays_until_the_one_that_replaces_it_is_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    three_steps(tmp_path)
+    before = Session.open(tmp_path)
+    old = before.step("noise/dark_1")
+    with SessionWriter.resume(tmp_path) as writer:
+        writer.capture_again(["noise/dark_1"])
+        assert writer.completed_ids == {"noise/dark_0", "noise/dark_2"}
+        with monkeypatch.context() as patch:  # the process ends between the files and the manifest
+            patch.setattr("udccal.sessions.writer.write_manifest", _killed)
+            with pytest.raises(KeyboardInterrupt):
+                writer.add_step("noise/dark_1", "noise", DarkSubject(), [frame(level=5), frame(level=6)])
+    for level, capture in zip((1, 9), old.captures, strict=True):
+        assert int(before.frame(capture).max()) == level
+    for level in (7, 8):  # twice, so that the names are free again
+        with SessionWriter.resume(tmp_path) as writer:
+            assert writer.damage == ()
+            writer.capture_again(["noise/dark_1"])
+            writer.add_step("noise/dark_1", "noise", DarkSubject(), [frame(level=level), frame(level=9)])
+        after = Session.open(tmp_path)
+        assert [step.id for step in after.manifest.steps] == [f"noise/dark_{index}" for index in range(3)]
+        assert int(after.frame(after.step("noise/dark_1").captures[0]).max()) == level
+        named = {capture.file for step in after.manifest.steps for capture in step.captures}
+        assert {f"noise/{path.name}" for path in (tmp_path / "noise").iterdir()} == named
+    assert after.step("noise/dark_1").captures[0].file == old.captures[0].file
+
+
+def _killed(folder: Path, manifest: Manifest) -> None:
+    raise KeyboardInterrupt
+
+
+def test_a_step_captured_again_leaves_out_those_that_do_not_go_with_it(tmp_path: Path) -> None:
+    three_steps(tmp_path)
+    with SessionWriter.resume(tmp_path) as writer:
+        with pytest.raises(SessionError, match="'noise/dark_7' was not captured"):
+            writer.capture_again(["noise/dark_0", "noise/dark_7"])
+        assert len(writer.completed_ids) == 3
+        writer.capture_again(["noise/dark_0"])
+        shown = writer.store_picture(
+            "noise/dark_0", np.zeros((RIG.panel.rows, RIG.panel.columns, 3), np.uint8), "white"
+        )
+        assert shown.picture == "noise/dark_0-2_shown.png"
+        writer.add_step("noise/dark_0", "noise", DarkSubject(), [frame()], without=["noise/dark_2"])
+        assert writer.completed_ids == {"noise/dark_0", "noise/dark_1"}
+    assert not (tmp_path / "noise" / "dark_2_0.png").exists()
+    assert SessionWriter.resume(tmp_path).damage == ()
 
 
 @pytest.mark.parametrize("harm", ["flip", "truncate", "remove"])

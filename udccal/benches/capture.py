@@ -38,6 +38,7 @@ def capture(
 
     Raises:
         UdccalError: when a procedure is not installed.
+        CameraError: when the camera does not fit the rig.
         CaptureError: when the camera does not see what a step needs.
         SessionError: when the folder holds another rig's or camera's session, or another process writes to it.
     """

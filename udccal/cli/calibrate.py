@@ -62,11 +62,16 @@ def calibrate(
     exchanged: Annotated[
         list[ExchangedPart] | None, typer.Option("--exchanged", help="Part that was exchanged since the session began.")
     ] = None,
+    again: Annotated[
+        list[str] | None,
+        typer.Option("--again", metavar="STEP", help="Capture this captured step once more; may be given again."),
+    ] = None,
     log: IterationLog = None,
 ) -> None:
     """Capture every calibration step of a rig, then fit them. An interrupted session continues where it stopped."""
     from udccal.cli.jobs.capture import capture_watched
     from udccal.cli.jobs.fit import fit_to_profile
+    from udccal.io.out_folder import check_writable
     from udccal.profiles.store import check_replaceable
     from udccal.rig import load_rig
     from udccal.sessions.changes import Exchanged
@@ -74,6 +79,7 @@ def calibrate(
     output: Output = context.obj
     description = load_rig(rig)
     check_replaceable(profile)
+    check_writable(profile.parent)
     pictures = session.resolve().with_name(f"{session.resolve().name}-pictures")
     match camera:
         case CameraKind.sim:
@@ -84,7 +90,7 @@ def calibrate(
             opened = _real(output, description, camera, serial, display, monitor, pictures)
     with opened as bench:
         parts = {Exchanged(part.value) for part in exchanged or ()}
-        capture_watched(output, bench, session, [t.value for t in term or TermChoice], parts)
+        capture_watched(output, bench, session, [t.value for t in term or TermChoice], parts, again or ())
     if not fit_to_profile(output, session, profile, log):
         raise typer.Exit(DOUBTFUL)
 

@@ -18,7 +18,10 @@ def doctor(
         str | None, typer.Option("--rig", help="Rig to calibrate: checks its panel and the size of its session.")
     ] = None,
     session: Annotated[Path | None, typer.Option("--session", help=_SESSION_HELP)] = None,
-    camera: Annotated[CameraKind | None, typer.Option("--camera", help="Camera to use: it must be ready.")] = None,
+    camera: Annotated[
+        CameraKind | None, typer.Option("--camera", help="Camera to use: it must be ready, and fit --rig.")
+    ] = None,
+    serial: Annotated[str | None, typer.Option("--serial", help="Serial number; needed if there are several.")] = None,
     display: Annotated[DisplayKind | None, typer.Option("--display", help="Display to use: it must be ready.")] = None,
     monitor: Annotated[int, typer.Option("--monitor", help="Number of the monitor that is the panel.")] = 0,
 ) -> None:
@@ -29,6 +32,7 @@ def doctor(
 
     wanted = Wanted(
         camera=None if camera is None else camera.value,
+        serial=serial,
         monitor=monitor if display is DisplayKind.window else None,
         rig=None if rig is None else load_rig(rig),
         session=session,

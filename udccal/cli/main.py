@@ -19,10 +19,13 @@ from udccal.cli.output import Output
 from udccal.cli.plan import plan
 from udccal.cli.profile import profile_app
 from udccal.cli.restore import restore
+from udccal.cli.rig import rig_app
 from udccal.cli.simulate import simulate
 from udccal.errors import UdccalError
 
 _GLOBAL_FLAGS = ("--json", "--debug")
+# The statuses that a shell gives to a program which ended by SIGINT, and by SIGPIPE.
+_STOPPED, _PIPE_CLOSED = 130, 141
 
 app = typer.Typer(
     name="udccal",
@@ -56,10 +59,11 @@ def globals_(
 for _verb in (demo, doctor, plan, calibrate, fit, restore, simulate):
     app.command(no_args_is_help=_verb not in (demo, doctor))(_verb)
 app.add_typer(profile_app, name="profile")
+app.add_typer(rig_app, name="rig")
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run the command and exit with its status, which docs/cli.md explains: 0, 1, 2, 3, 70 or 130."""
+    """Run the command and exit with its status, which docs/cli.md explains: 0, 1, 2, 3, 70, 130 or 141."""
     # Silences XLA's own log before JAX is imported: whatever matters in it also comes as an exception.
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     given = list(sys.argv[1:] if arguments is None else arguments)
@@ -69,8 +73,15 @@ def main(arguments: list[str] | None = None) -> None:
         app(args=[*flags, *rest], prog_name="udccal")
     except UdccalError as error:
         _fail(str(error), 1, flags)
-    except KeyboardInterrupt:
-        _fail("Stopped. Run the same command again to continue; completed steps of a session are kept.", 130, flags)
+    except SystemExit as left:  # typer and rich turn Ctrl-C and a closed pipe into this, without a word
+        if left.code == _STOPPED:
+            sentence = "Stopped. Run the same command again to continue; completed steps of a session are kept."
+            _fail(sentence, _STOPPED, flags)
+        if isinstance(left.__context__, BrokenPipeError):
+            # What is still buffered goes nowhere; else Python would complain when it ends.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            sys.exit(_PIPE_CLOSED)
+        raise
     except Exception as error:
         _fail(
             f"Something unexpected went wrong ({type(error).__name__}). "

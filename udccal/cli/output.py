@@ -8,7 +8,7 @@ import json
 import math
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import PurePath
@@ -83,6 +83,17 @@ class Output:
         finally:
             if self._bar is not None:
                 self._bar.start()
+
+    def choose(self, question: str, offered: Collection[str]) -> str:
+        """Ask until the answer is one of the words that the question offers; Enter alone is the empty word.
+
+        Raises:
+            UdccalError: as ``ask`` does.
+        """
+        answer = self.ask(question).strip().lower()
+        while answer not in offered:
+            answer = self.ask(f"'{answer[:40]}' is none of the answers. {question.strip()}").strip().lower()
+        return answer
 
     def table(self, table: Table) -> None:
         """Print a table on standard output; print nothing with ``--json``."""

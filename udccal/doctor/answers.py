@@ -26,6 +26,26 @@ class SeenCamera:
 
 @final
 @dataclass(frozen=True)
+class OpenedCamera:
+    """A camera that was opened for a rig.
+
+    Attributes:
+        columns, rows: its whole sensor.
+        rate_hz: highest frame rate.
+        shortest_s, longest_s: exposures.
+        refusal: why it has no mode with the rig's pattern and bits, as a sentence; empty when it has.
+    """
+
+    columns: int
+    rows: int
+    rate_hz: float
+    shortest_s: float
+    longest_s: float
+    refusal: str = ""
+
+
+@final
+@dataclass(frozen=True)
 class JaxDevice:
     """A device that JAX computes on: its platform (cpu, gpu, tpu) and kind."""
 
@@ -54,6 +74,11 @@ def read_cameras(content: bytes) -> tuple[SeenCamera, ...]:
         pydantic.ValidationError: when the JSON holds something else.
     """
     return TypeAdapter(tuple[SeenCamera, ...]).validate_json(content, strict=True)
+
+
+def read_opened(content: bytes) -> tuple[OpenedCamera]:
+    """From JSON; errors as ``read_cameras``."""
+    return TypeAdapter(tuple[OpenedCamera]).validate_json(content, strict=True)
 
 
 def read_devices(content: bytes) -> tuple[JaxDevice, ...]:

@@ -24,9 +24,12 @@ _LONGEST_REASON = 500
 T = TypeVar("T")
 
 
-def ask(question: Question, read: Callable[[bytes], T], seconds: float) -> T | Failure:
-    """Ask one question; return what ``read`` makes of the answer, or why there is none within that time."""
-    return ask_command([sys.executable, "-m", "udccal.doctor.child", question.value], read, seconds)
+def ask(question: Question, read: Callable[[bytes], T], seconds: float, words: Sequence[str] = ()) -> T | Failure:
+    """Ask one question; return what ``read`` makes of the answer, or why there is none within that time.
+
+    ``words`` are those that the question needs (``udccal.doctor.questions.answer``).
+    """
+    return ask_command([sys.executable, "-m", "udccal.doctor.child", question.value, *words], read, seconds)
 
 
 def ask_command(command: Sequence[str], read: Callable[[bytes], T], seconds: float) -> T | Failure:

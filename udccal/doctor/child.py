@@ -1,4 +1,4 @@
-"""The child process that answers one question: ``python -m udccal.doctor.child QUESTION FILE``.
+"""The child process that answers one question: ``python -m udccal.doctor.child QUESTION [WORD ...] FILE``.
 
 The answer goes to the file as JSON, apart from what vendors' software prints. The exit status is 0 for an answer,
 ``FAILED`` for the reason why there is none, and anything else when the process failed.
@@ -10,6 +10,7 @@ import dataclasses
 import json
 import os
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 from udccal.doctor.answers import Failure
@@ -20,14 +21,14 @@ FAILED = 3
 
 
 def main() -> None:
-    """Answer the question in the first argument; write the answer to the file in the second."""
-    status = _write(Question(sys.argv[1]), Path(sys.argv[2]))
+    """Answer the question in the first argument, with the words after it; write the answer to the file in the last."""
+    status = _write(Question(sys.argv[1]), sys.argv[2:-1], Path(sys.argv[-1]))
     os._exit(status)  # exits at once: libraries that look for hardware may hang or crash while they are unloaded
 
 
-def _write(question: Question, file: Path) -> int:
+def _write(question: Question, words: Sequence[str], file: Path) -> int:
     try:
-        answers = answer(question)
+        answers = answer(question, words)
     except UdccalError as error:
         return _failed(file, Failure(str(error), refused=True))
     except Exception as error:  # whatever foreign software raises is the answer

@@ -11,7 +11,8 @@ from pydantic import ValidationError
 
 from udccal.errors import RigError
 from udccal.io.atomic import write_atomically
-from udccal.rig import Captures, RigDescription, find_rig
+from udccal.rig import Captures, RigDescription
+from udccal.rig_folders import find_rig
 
 # The section from its heading to the next, or to the end.
 _SECTION: Final = re.compile(r"^\[captures\][^\n]*\n(?:(?!\[)[^\n]*(?:\n|\Z))*", re.MULTILINE)

@@ -47,10 +47,13 @@ def load_fit(name: str, stored: StoredFit, term: Any, folder: Path) -> FitResult
     if stored.status not in FitStatus.__members__:
         known = ", ".join(FitStatus.__members__)
         raise ProfileError(f"Expected one of the statuses {known}, found '{stored.status}'. Update udccal to read it.")
+    status = FitStatus[stored.status]
+    if status is FitStatus.ABSENT and any(note.startswith(f"The session has no {name} steps") for note in stored.notes):
+        status = FitStatus.NOT_CAPTURED  # earlier versions had no status of its own for it
     return FitResult(
         name=name,
         term=term,
-        status=FitStatus[stored.status],
+        status=status,
         estimates=tuple(Estimate(e.name, e.value, e.sigma, e.unit) for e in stored.estimates),
         cov=_load_covariance(stored.covariance, folder),
         chi2_dof=stored.chi2_dof,

@@ -18,7 +18,7 @@ from udccal.profiles.profile import Profile
 from udccal.profiles.provenance import MAX_JSON_BYTES, PROFILE_NAME
 from udccal.profiles.schema import StoredArray, StoredProfile
 from udccal.profiles.versions import migrated
-from udccal.rig import find_rig
+from udccal.rig_folders import find_rig
 
 # Name of the profile in a rig's folder, next to rig.toml.
 RIG_PROFILE = "profile"

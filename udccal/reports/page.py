@@ -47,7 +47,8 @@ class TermSection:
     @property
     def mood(self) -> str:
         """CSS class of the status: good, absent or bad."""
-        return {FitStatus.CONVERGED: "good", FitStatus.ABSENT: "absent"}.get(self.status, "bad")
+        moods = {FitStatus.CONVERGED: "good", FitStatus.ABSENT: "absent", FitStatus.NOT_CAPTURED: "absent"}
+        return moods.get(self.status, "bad")
 
 
 @dataclass(frozen=True)

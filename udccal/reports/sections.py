@@ -24,7 +24,6 @@ from udccal.reports.page import Illustration, TermSection
 from udccal.reports.residuals import residual_histogram, residual_map
 from udccal.reports.tables import Table, number, spread
 from udccal.reports.truth import TruthRow
-from udccal.result import FitStatus
 from udccal.sessions.schema import TermName
 
 _LONGEST_LIST = 14
@@ -63,7 +62,7 @@ def sections(evidence: Evidence) -> tuple[TermSection, ...]:
 
 def _section(term: TermName, evidence: Evidence) -> TermSection:
     result = evidence.calibration.result(term)
-    shown = () if result.status is FitStatus.ABSENT else (*_illustrations(term, evidence), *_quality(term, evidence))
+    shown = () if result.unfitted else (*_illustrations(term, evidence), *_quality(term, evidence))
     details = [diagnostics_table("Diagnostics of the fit", result)]
     estimates = estimates_table("Fitted", result)
     shown_tables = _numbers(term, evidence)

@@ -9,7 +9,7 @@ from typing import final
 
 import cv2
 import numpy as np
-from jaxtyping import Float32, Int32, UInt8
+from jaxtyping import Bool, Float32, Int32, UInt8
 from scipy import sparse
 
 from udccal.cfa import Cfa, cfa_named
@@ -24,6 +24,10 @@ _LEAST_SHARE = 1e-6
 # Side in samples of the blocks that give the level: large enough to average noise, small enough to find dark places.
 _BLOCK = 16
 _PERCENTILE = 1.0
+# A frame is darker than its panel's light where this is more than so many times the frame, and more than so few e-.
+_MORE, _NEGLIGIBLE_E = 1.2, 1.0
+# Samples of which the sums are taken: few, and by an odd step, so that every colour is among them.
+_SPARSE = np.s_[::5, ::5]
 
 
 @final
@@ -151,6 +155,32 @@ def _panel_sums(term: Backscatter, rig: RigDescription, block: int) -> PanelSums
         np.asarray(cubic_weights(term.rows, term.step, mask[1], np.dtype(float)), dtype=np.float32),
         np.asarray(cubic_weights(term.columns, term.step, mask[2], np.dtype(float)), dtype=np.float32),
     )
+
+
+def refuse_excess(
+    signal: Float32[np.ndarray, "rows columns"],
+    panel_light: Float32[np.ndarray, "rows columns"],
+    clipped: Bool[np.ndarray, "rows columns"],
+) -> None:
+    """Refuse a frame that is darker than the panel's light alone: light only adds.
+
+    Args:
+        signal: the frame in e-, divided by the wire.
+        panel_light: backscatter in e- expected of the panel's picture at the frame's exposure.
+        clipped: samples of the frame that say less than the light was; they are left out.
+
+    Raises:
+        RestorationError: when the panel's light is more than the frame's by a fifth, far beyond the mask's errors.
+    """
+    use = ~clipped[_SPARSE]
+    seen, expected = (float(np.sum(light[_SPARSE], where=use, dtype=np.float64)) for light in (signal, panel_light))
+    samples = int(np.count_nonzero(use))
+    if expected > _MORE * max(seen, 0.0) + samples * _NEGLIGIBLE_E:
+        raise RestorationError(
+            f"Expected a frame at least as bright as the panel's own light, found {seen / samples:.3g} e- per pixel "
+            f"where the panel picture alone gives {expected / samples:.3g} e- at this exposure. Check that the "
+            "exposure is in seconds (8 ms are 0.008), and that the panel showed that picture; or leave the picture out."
+        )
 
 
 def mask_mosaic(

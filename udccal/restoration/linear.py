@@ -9,6 +9,8 @@ from jaxtyping import ArrayLike, Bool, Float32, UInt16
 from udccal.cfa import cfa_named
 from udccal.models.noise import Noise
 
+# Part of the range above black: where a sample says less than its light was.
+_SATURATION_MARGIN = 0.015
 # A sample is an outlier when it differs from all its neighbours by this many sigma of temporal noise ...
 _OUTLIER_SIGMA = 8.0
 # ... and by this many times their range. A point of light seen through the panel stays below 4: its kernel is wide.
@@ -31,6 +33,12 @@ def to_electrons(
 ) -> Float32[np.ndarray, "rows columns"]:
     """Return the signal in e-: DN above dark over K. Negative values stay."""
     return (mosaic.astype(np.float32) - np.float32(dark_DN(noise, exposure_s))) / np.float32(scalar(noise.K_DN_per_e))
+
+
+def saturated(mosaic: UInt16[np.ndarray, "rows columns"], noise: Noise) -> Bool[np.ndarray, "rows columns"]:
+    """Return the samples within 1.5 % of the range above black of saturation."""
+    top, black = scalar(noise.saturation_DN), scalar(noise.black_DN)
+    return mosaic >= top - _SATURATION_MARGIN * (top - black)
 
 
 def variance_e2(

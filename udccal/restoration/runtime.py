@@ -20,10 +20,10 @@ from udccal.models.noise import Noise
 from udccal.models.psf import PsfField
 from udccal.profiles.profile import Profile
 from udccal.profiles.store import load_profile
-from udccal.restoration.backscatter import PanelLight, PanelMask, mask_mosaic
+from udccal.restoration.backscatter import PanelLight, PanelMask, mask_mosaic, refuse_excess
 from udccal.restoration.demosaic import demosaic
 from udccal.restoration.kernel_grid import KernelGrid
-from udccal.restoration.linear import to_electrons, variance_e2, without_defects
+from udccal.restoration.linear import saturated, to_electrons, variance_e2, without_defects
 from udccal.restoration.plan import PlanOptions, kernel_grid
 from udccal.restoration.prepared import kept
 from udccal.restoration.preview import Preview
@@ -31,7 +31,6 @@ from udccal.restoration.rectify import Rectification
 from udccal.restoration.sharpen import Sharpener
 from udccal.restoration.tone import Tone
 from udccal.restoration.view import inscribed_view
-from udccal.result import FitStatus
 from udccal.rig import RigDescription
 from udccal.tiers import Tier
 
@@ -111,9 +110,9 @@ class Restorer:
         view = inscribed_view(geometry, camera.columns, camera.rows, rig.view.columns, rig.view.rows)
         rectification = Rectification.within(geometry, view, camera.columns, camera.rows)
         quick = tier is Tier.preview
-        unscattered = profile.backscatter.status is FitStatus.ABSENT
-        unblurred = quick or profile.psf.status is FitStatus.ABSENT
-        even = profile.wire.status is FitStatus.ABSENT and bool(np.all(profile.wire_map == 1.0))
+        unscattered = profile.backscatter.unfitted
+        unblurred = quick or profile.psf.unfitted
+        even = profile.wire.unfitted and bool(np.all(profile.wire_map == 1.0))
         return cls(
             tier=tier,
             rig=rig,
@@ -152,7 +151,8 @@ class Restorer:
             the clean picture on the virtual view: linear RGB in e-/s.
 
         Raises:
-            RestorationError: when the frame, its exposure or the panel picture does not belong to this rig.
+            RestorationError: when the frame, its exposure or the panel picture does not belong to this rig, or the
+                panel's picture alone would give more light than the frame has: the exposure is wrong, or the picture.
         """
         check_frame(mosaic, exposure_s, self.rig)
         check_panel_picture(panel_picture, self.rig)
@@ -161,7 +161,10 @@ class Restorer:
         if self.wire is not None:
             signal /= self.wire
             variance /= self.wire**2
-        signal -= self._backscatter_e(signal, exposure_s, panel_picture)
+        panel_e = self._panel_light_e(signal, exposure_s, panel_picture)
+        if panel_picture is not None:
+            refuse_excess(signal, panel_e, saturated(mosaic, self.noise))
+        signal -= panel_e
         if self.sharpener is None:
             return self._on_view(demosaic(signal, self.rig.camera.cfa), exposure_s)
         sharp = self.sharpener.apply(signal, variance)
@@ -203,15 +206,15 @@ class Restorer:
     def _on_view(self, sensor_e: Float32[np.ndarray, "sensor_rows sensor_columns 3"], exposure_s: float) -> Picture:
         return self.rectification.apply(sensor_e) / np.float32(exposure_s)
 
-    def _backscatter_e(
+    def _panel_light_e(
         self,
         signal: Mosaic,
         exposure_s: float,
         panel_picture: UInt8[np.ndarray, "panel_rows panel_columns 3"] | None,
-    ) -> Mosaic | np.float32:
+    ) -> Mosaic:
         exposure = np.float32(exposure_s)
         if self.mask is None:
-            return np.float32(0)
+            return np.zeros_like(signal)
         if panel_picture is None or self.panel is None:
             return exposure * self.mask.rate(self.mask.levels(signal, exposure_s))
         return exposure * self.panel.rate(panel_picture)

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float32, UInt16
 
 from udccal.cameras.protocol import Frame
-from udccal.errors import CaptureError
+from udccal.errors import CaptureError, UdccalError
 from udccal.sessions.captured import AveragedFrames
 from udccal.sessions.frame_checks import FrameChecks
 
@@ -59,11 +59,12 @@ def average_frames(deliver: Callable[[int], Iterator[Frame]], count: int, checks
         mean in DN and variance in DN^2, with the settings and the rejected frames.
 
     Raises:
-        CaptureError: when ``count`` is out of range, or too many frames were left out.
+        UdccalError: when ``count`` is out of range.
+        CaptureError: when too many frames were left out.
         CameraError: from the camera.
     """
     if not 2 <= count <= MAX_FRAMES:
-        raise CaptureError(f"Expected between 2 and {MAX_FRAMES} frames to average, found {count}. Change the plan.")
+        raise UdccalError(f"Expected between 2 and {MAX_FRAMES} frames to average, found {count}. Change the plan.")
     moments: RunningMoments | None = None
     ends: list[Frame] = []
     for _ in range(_DELIVERIES):

@@ -46,7 +46,7 @@ def is_leftover(path: Path) -> bool:
 
 
 def _damage(folder: Path, step: StoredStep) -> Iterator[Damage]:
-    for name, expected in _named_files(step):
+    for name, expected in named_files(step):
         file = folder / name
         if not is_plain_file(folder, file):
             yield Damage(step.id, name, "missing")
@@ -60,7 +60,8 @@ def _damage(folder: Path, step: StoredStep) -> Iterator[Damage]:
             yield Damage(step.id, name, "changed")
 
 
-def _named_files(step: StoredStep) -> Iterator[tuple[str, str]]:
+def named_files(step: StoredStep) -> Iterator[tuple[str, str]]:
+    """Yield the files of a step, relative to the session's folder, each with its checksum."""
     for capture in step.captures:
         yield capture.file, capture.sha256
     if isinstance(step.subject, PanelSubject):

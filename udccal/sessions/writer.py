@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import errno
-import os
-from collections.abc import Callable, Iterator, Sequence, Set
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Collection, Sequence, Set
+from contextlib import suppress
 from datetime import UTC, datetime
+from itertools import chain, count
 from pathlib import Path
 from types import TracebackType
 from typing import Literal, final
@@ -21,17 +20,10 @@ from udccal.errors import SessionError
 from udccal.rig import RigDescription
 from udccal.sessions.captured import Capture
 from udccal.sessions.changes import Exchanged, admit, stored_camera
-from udccal.sessions.damage import Damage, find_damage, is_leftover, remove_leftovers
-from udccal.sessions.lock import LOCK_NAME, lock_session
-from udccal.sessions.manifest import (
-    DAMAGED_NAME,
-    MANIFEST_NAME,
-    PREVIOUS_NAME,
-    NewerManifestError,
-    keep_previous,
-    read_manifest,
-    write_manifest,
-)
+from udccal.sessions.damage import Damage, find_damage, named_files, remove_leftovers
+from udccal.sessions.lock import lock_session
+from udccal.sessions.manifest import MANIFEST_NAME, PREVIOUS_NAME, keep_previous, write_manifest
+from udccal.sessions.opening import check_new, read_or_recover, sentences
 from udccal.sessions.placing import place_capture, place_picture
 from udccal.sessions.schema import Manifest, PanelSubject, StoredStep, Subject, TermName
 
@@ -53,6 +45,7 @@ class SessionWriter:
     Attributes:
         damage: files found missing or changed when the session was opened; their steps count as not captured.
         recovered: whether the manifest was damaged and replaced by the one before the last step.
+        again: captured steps to capture once more; each stays until its new captures are whole.
     """
 
     def __init__(
@@ -65,6 +58,7 @@ class SessionWriter:
         self.recovered = recovered
         self._lock = lock
         self._now = now
+        self.again: frozenset[str] = frozenset()
         self._invalid = {item.step_id for item in damage}
 
     @classmethod
@@ -75,17 +69,17 @@ class SessionWriter:
             SessionError: when the folder holds anything, cannot be written to, or another process begins one there.
         """
         folder = Path(path)
-        _check_new(folder)
-        with _sentences("a session", folder):
+        check_new(folder)
+        with sentences("a session", folder):
             folder.mkdir(parents=True, exist_ok=True)
             lock = lock_session(folder)
         try:
-            _check_new(folder)
+            check_new(folder)
             remove_leftovers(folder)
             manifest = Manifest(
                 format="udccal-session", version=1, created_at=_time(now), rig=rig, camera=stored_camera(camera)
             )
-            with _sentences("a session", folder):
+            with sentences("a session", folder):
                 write_manifest(folder, manifest)
         except BaseException:
             lock.release()
@@ -107,8 +101,8 @@ class SessionWriter:
             raise SessionError(f"Expected a session at {folder}, found none. Check the path, or begin one.")
         lock = lock_session(folder)
         try:
-            manifest, recovered = _read_or_recover(folder)
-            with _sentences("a session", folder):
+            manifest, recovered = read_or_recover(folder)
+            with sentences("a session", folder):
                 remove_leftovers(folder)
                 damage = find_damage(folder, manifest)
         except BaseException:
@@ -164,7 +158,21 @@ class SessionWriter:
     @property
     def completed_ids(self) -> frozenset[str]:
         """Ids of the steps that need not be captured again."""
-        return frozenset(step.id for step in self.manifest.steps) - self._invalid
+        return frozenset(step.id for step in self.manifest.steps) - self._invalid - self.again
+
+    def capture_again(self, step_ids: Collection[str]) -> None:
+        """Have captured steps captured once more.
+
+        Raises:
+            SessionError: when one of them was not captured.
+        """
+        for step_id in step_ids:
+            if self.step(step_id) is None:
+                raise SessionError(
+                    f"Expected captured steps of {self.path} to capture again, found that '{step_id}' was not "
+                    "captured. Leave it out: missing steps are captured anyway."
+                )
+        self.again = self.again.union(step_ids)
 
     def step(self, step_id: str) -> StoredStep | None:
         """Return a step that was captured (its files may be damaged), or None."""
@@ -186,11 +194,27 @@ class SessionWriter:
         Raises:
             SessionError: when the id does not fit docs/session.md, or the disk is full or cannot be written to.
         """
-        with _sentences(f"the picture of the step '{step_id}'", self.path):
-            return place_picture(self.path, step_id, picture, role)
+        with sentences(f"the picture of the step '{step_id}'", self.path):
+            return place_picture(self.path, self._stem(step_id), picture, role)
 
-    def add_step(self, step_id: str, term: TermName, subject: Subject, captures: Sequence[Capture]) -> StoredStep:
-        """Store a completed step's captures and name them in the manifest; a damaged step of this id is replaced.
+    def add_step(
+        self,
+        step_id: str,
+        term: TermName,
+        subject: Subject,
+        captures: Sequence[Capture],
+        without: Collection[str] = (),
+    ) -> StoredStep:
+        """Store a completed step's captures and name them in the manifest.
+
+        A step of this id that is damaged, or to be captured again, is replaced.
+
+        Args:
+            step_id: id of the step.
+            term: its term.
+            subject: what stood before the camera.
+            captures: its frames and averages.
+            without: steps that are left out from now on, since they do not go with the new one.
 
         Raises:
             SessionError: when the step is already captured, does not follow docs/session.md, or the disk is full or
@@ -199,7 +223,7 @@ class SessionWriter:
         if step_id in self.completed_ids:
             raise SessionError(f"Expected a new step in {self.path}, found '{step_id}' already captured. Skip it.")
         try:
-            with _sentences(f"the step '{step_id}'", self.path):
+            with sentences(f"the step '{step_id}'", self.path):
                 step = StoredStep(
                     id=step_id,
                     term=term,
@@ -207,74 +231,44 @@ class SessionWriter:
                     completed_at=_time(self._now),
                     after_changes=len(self.manifest.changes),
                     captures=tuple(
-                        place_capture(self.path, f"{step_id}_{index}", capture)
+                        place_capture(self.path, f"{self._stem(step_id)}_{index}", capture)
                         for index, capture in enumerate(captures)
                     ),
                 )
-            manifest = Manifest.model_validate(dict(self.manifest) | {"steps": self._steps_with(step)})
+            steps = tuple(each for each in self._steps_with(step) if each.id not in without)
+            manifest = Manifest.model_validate(dict(self.manifest) | {"steps": steps})
         except ValidationError as error:
             raise SessionError(f"Expected the step '{step_id}' to fit docs/session.md, found: {error}") from error
+        before = self.manifest
         self._write(manifest)
         self._invalid.discard(step_id)
+        self.again -= {step_id, *without}
+        for name in _files(before) - _files(manifest):
+            with suppress(OSError):  # a file that stays does no harm
+                (self.path / name).unlink()
         return step
+
+    def _stem(self, step_id: str) -> str:
+        """Return how the names of a step's files begin: not as those of a whole step that is to be replaced."""
+        if step_id not in self.again or step_id in self._invalid:
+            return step_id
+        used = _files(self.manifest)
+        stems = chain((step_id,), (f"{step_id}-{number}" for number in count(2)))
+        return next(stem for stem in stems if not any(name.startswith(f"{stem}_") for name in used))
 
     def _steps_with(self, step: StoredStep) -> tuple[StoredStep, ...]:
         steps, number = self.manifest.steps, self.number(step.id)
         return (*steps[:number], step, *steps[number + 1 :])
 
     def _write(self, manifest: Manifest) -> None:
-        with _sentences("the manifest", self.path):
+        with sentences("the manifest", self.path):
             keep_previous(self.path)
             write_manifest(self.path, manifest)
         self.manifest = manifest
 
 
-def _check_new(folder: Path) -> None:
-    if (folder / MANIFEST_NAME).exists():
-        raise SessionError(f"Expected no session at {folder}, found one. Resume it, or choose another folder.")
-    if folder.exists() and (not folder.is_dir() or not all(_may_be_there(item) for item in folder.iterdir())):
-        raise SessionError(
-            f"Expected {folder} to be a new or empty folder, found other content. Choose another folder."
-        )
-
-
-def _may_be_there(item: Path) -> bool:
-    """Return whether a process that was killed while it began a session may have left this."""
-    return item.name == LOCK_NAME or is_leftover(item)
-
-
-def _read_or_recover(folder: Path) -> tuple[Manifest, bool]:
-    """Read the manifest; if it is damaged, replace it by the one before the last step."""
-    try:
-        return read_manifest(folder), False
-    except NewerManifestError:
-        raise
-    except SessionError:
-        try:
-            manifest = read_manifest(folder, PREVIOUS_NAME)
-        except SessionError:
-            manifest = None
-        if manifest is None:
-            raise
-    with _sentences("the manifest", folder):
-        with suppress(FileNotFoundError):  # keep it: a person may have edited it; a link is moved, not followed
-            os.replace(folder / MANIFEST_NAME, folder / DAMAGED_NAME)
-        write_manifest(folder, manifest)
-    return manifest, True
-
-
-@contextmanager
-def _sentences(what: str, folder: Path) -> Iterator[None]:
-    """Turn an error of the operating system into a sentence that says what to do."""
-    try:
-        yield
-    except OSError as error:
-        full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-        advice = "Free some space there" if full else "Check the disk, the folder and its permissions"
-        raise SessionError(
-            f"Expected to store {what} in {folder}, found: {error.strerror or error}. {advice}, then run the same "
-            "command again: completed steps are kept."
-        ) from error
+def _files(manifest: Manifest) -> frozenset[str]:
+    return frozenset(name for step in manifest.steps for name, _ in named_files(step))
 
 
 def _time(now: Now) -> str:

@@ -83,6 +83,6 @@ def manual_display(output: Output, rig: RigDescription, folder: Path) -> Display
     """Return a panel that the person at the rig operates, with its pictures in a folder."""
 
     def confirm(question: str) -> bool:
-        return output.ask(f"{question} (Enter for yes, n for no)").strip().lower() not in ("n", "no")
+        return output.choose(f"{question} (Enter for yes, n for no)", ("", "n")) != "n"
 
     return ManualDisplay(folder, panel_size(rig), output.say, confirm)

@@ -16,11 +16,12 @@ from udccal.effort import FitEffort
 from udccal.errors import FitError, UdccalError
 from udccal.fitting.engine.iteration_log import LOG
 from udccal.io.links import refuse_links
+from udccal.io.out_folder import check_writable, storing_in
 from udccal.profiles.profile import Profile
 from udccal.profiles.store import check_replaceable, read_profile
 from udccal.refit import refit
 from udccal.reports.page import write_page
-from udccal.reports.report import calibration_page, gather
+from udccal.reports.report import calibration_page, gather, verdict
 from udccal.reports.tables import Table
 from udccal.sessions.schema import TermName
 from udccal.sessions.store import Session
@@ -69,8 +70,10 @@ def fit_to_profile(
         SessionError: when the session is missing or damaged.
         FitError: when a term has no error bars; then the report is written and the profile is not.
         ProfileError: when something else is at the profile's path, or a profile whose terms cannot be kept.
+        UdccalError: when the profile's folder cannot be written to; this is found before any work.
     """
     check_replaceable(profile_path)
+    check_writable(profile_path.parent)
     before = read_profile(profile_path) if terms else None
     keep_compilations()
     clock = compilation_clock()
@@ -88,14 +91,16 @@ def fit_to_profile(
         panel = session.rig.panel
         unseen = face_picture(UNSEEN_PICTURE, panel.columns, panel.rows)
         evidence = gather(session, calibration, unseen, None)
-        write_page(report, calibration_page(session, evidence, None))
+        page = calibration_page(session, evidence, None)
+        with storing_in(report.parent):
+            write_page(report, page)
     show_status(output, calibration)
     try:
         store_profile(output, calibration, profile_path)
     except FitError as error:
         raise FitError(f"{error} No profile was written; the report {report} shows every term.") from error
     output.say(f"Compilation took {clock.seconds:.1f} s of this (less in the next run)")
-    output.say(f"Profile: {profile_path}\nReport: {report}")
+    output.say(f"Profile: {profile_path}\nReport: {report}\n{verdict(calibration)}")
     for warning in calibration.warnings:
         output.say(warning)
     ended, times = summaries(calibration), tuple(output.times)
@@ -158,8 +163,9 @@ def store_profile(output: Output, calibration: Calibration, path: Path) -> None:
     Raises:
         FitError: when a term has no error bars.
         ProfileError: when something else is at ``path``.
+        UdccalError: when it cannot be written.
     """
-    with output.stage("profile"):
+    with output.stage("profile"), storing_in(path.parent):
         calibration.write(path)
 
 

@@ -22,11 +22,12 @@ class PersonStage:
         """Print the instruction and wait; do not ask again for what the step before has set up."""
         if occasion.instruction == self._standing:
             return
-        self._output.ask(f"\n{occasion.step_id}: {occasion.instruction}\nPress Enter when it is done.")
+        question = f"\n{occasion.step_id}: {occasion.instruction}\nPress Enter when it is done, or Ctrl-C to stop."
+        self._output.choose(question, ("",))
         self._standing = occasion.instruction
 
     def try_again(self, sentence: str) -> bool:
         """Print what was wrong and ask whether to repeat the step; return False to stop for now."""
         self._standing = None
-        answer = self._output.ask(f"\n{sentence}\nPress Enter to repeat the step, or {_GIVE_UP} and Enter to stop.")
-        return answer.strip().lower() != _GIVE_UP
+        question = f"\n{sentence}\nPress Enter to repeat the step, or {_GIVE_UP} and Enter to stop."
+        return self._output.choose(question, ("", _GIVE_UP)) != _GIVE_UP

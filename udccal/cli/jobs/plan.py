@@ -17,7 +17,8 @@ from udccal.planning.state import RigState, measured_state, nominal_state
 from udccal.planning.steps import Cost
 from udccal.profiles.store import RIG_PROFILE, find_profile, read_profile
 from udccal.reports.tables import Table
-from udccal.rig import RigDescription, find_rig, load_rig
+from udccal.rig import RigDescription, load_rig
+from udccal.rig_folders import find_rig
 from udccal.sessions.schema import TermName
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -15,6 +17,7 @@ from udccal.cli.output import Output
 from udccal.compilation import keep_compilations
 from udccal.errors import RestorationError
 from udccal.io.limits import Shape
+from udccal.io.out_folder import check_writable, storing_in
 from udccal.io.png import read_png16
 from udccal.profiles.store import load_profile
 from udccal.restoration.prepared import prepared_folder
@@ -68,7 +71,9 @@ def restore_files(
         ProfileError: when the profile cannot be read.
         FileFormatError: when an image or the panel's picture cannot be read.
         RestorationError: when an image does not fit the profile's rig, or its exposure is not known.
+        UdccalError: when ``out`` cannot be written to; this is found before any work.
     """
+    check_writable(out)
     keep_compilations()
     profile = load_profile(profile_path)
     for warning in profile.warnings:
@@ -83,9 +88,11 @@ def restore_files(
         for index, (image, target) in enumerate(zip(images, targets, strict=True)):
             stage.update(index, len(images), f"restoring {image.name}")
             mosaic, exposure = _checked_frame(image, exposure_s, profile.rig)
-            picture = restorer.restore(mosaic, exposure, shown)
-            target.parent.mkdir(parents=True, exist_ok=True)
-            write_picture(target, picture, Tone(display_exposure(picture)))
+            with _naming(image):
+                picture = restorer.restore(mosaic, exposure, shown)
+            with storing_in(out):
+                out.mkdir(parents=True, exist_ok=True)
+                write_picture(target, picture, Tone(display_exposure(picture)))
             restored.append(RestoredFile(image, target, exposure))
     for item in restored:
         output.say(f"{item.source} -> {item.picture}")
@@ -96,7 +103,7 @@ def _targets(images: list[Path], out: Path, picture_format: str) -> list[Path]:
     """Return one file per image; refuse to let one overwrite another, or its own source."""
     targets = [out / f"{image.stem}.{picture_format}" for image in images]
     for index, (image, target) in enumerate(zip(images, targets, strict=True)):
-        if target in targets[:index] or target.resolve() == image.resolve():
+        if target in targets[:index] or target.resolve() == image.resolve() or target.is_dir():
             raise RestorationError(
                 f"Expected names that differ in {out}, found that {target.name} for {image} is taken. "
                 "Rename the image, or choose another folder."
@@ -114,11 +121,18 @@ def _checked_frame(
         raise RestorationError(
             f"Expected the exposure of {image} in the file or from --exposure-s, found neither. Add --exposure-s."
         )
-    try:
+    with _naming(image):
         check_frame(mosaic, exposure, rig)
+    return mosaic, exposure
+
+
+@contextmanager
+def _naming(image: Path) -> Iterator[None]:
+    """Add the image's name to what is wrong with it."""
+    try:
+        yield
     except RestorationError as error:
         raise RestorationError(f"{image}: {error}") from error
-    return mosaic, exposure
 
 
 def _read_mosaic(image: Path, shape: Shape) -> tuple[UInt16[np.ndarray, "rows columns"], float | None]:

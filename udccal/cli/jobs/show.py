@@ -61,6 +61,8 @@ def show_profile(output: Output, path: Path) -> None:
     output.say(f"Profile of {profile.rig.name}, made {profile.provenance.created_at}")
     for term, result in results:
         output.table(estimates_table(f"{term}: {result.status.name.lower().replace('_', ' ')}", result))
+        if result.unfitted:
+            output.say(f"{term}: {result.status.value}")
         for sentence in (*result.notes, *filter(None, [result.warning])):
             output.say(sentence)
     output.result(

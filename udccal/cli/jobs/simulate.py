@@ -12,6 +12,7 @@ from udccal.benches.bench import simulated_rig
 from udccal.benches.photograph import CapturedScene, capture_photograph
 from udccal.cli.jobs.panel_picture import read_panel_picture
 from udccal.cli.output import Output
+from udccal.io.out_folder import check_writable, storing_in
 from udccal.io.photograph import read_photograph
 from udccal.io.png import write_png16
 from udccal.reports.pictures import mosaic_preview
@@ -58,7 +59,9 @@ def simulate_files(
     Raises:
         RigError: when the rig is not known.
         FileFormatError: when a photograph or the panel's picture cannot be read.
+        UdccalError: when ``out`` cannot be written to; this is found before any work.
     """
+    check_writable(out)
     rig = load_rig(rig_name)
     shown = None if panel_picture is None else read_panel_picture(panel_picture, rig)
     files: list[SimulatedFile] = []
@@ -69,7 +72,8 @@ def simulate_files(
         for index, image in enumerate(images):
             stage.update(index, len(images), f"simulating {image.name}")
             scene = capture_photograph(world, _normalised(read_photograph(image)), view, shown)
-            files.append(_write(out, image, scene, rig))
+            with storing_in(out):
+                files.append(_write(out, image, scene, rig))
     for item in files:
         output.say(f"{item.source} -> {item.mosaic} (exposure {item.exposure_s:.6f} s)")
     output.result(SimulateSummary(rig.name, seed, tuple(files)))

@@ -1,0 +1,93 @@
+"""How the command leaves when it is stopped, when nobody reads on, and when its results have no place."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.toy_rigs import write_toy_rig
+from udccal.errors import UdccalError
+from udccal.io.out_folder import check_writable
+from udccal.io.png import write_png16
+
+COMMAND = [sys.executable, "-m", "udccal.cli.main"]
+PORTRAIT = Path(__file__).resolve().parents[2] / "udccal" / "data" / "portrait.jpg"
+
+
+def udccal(*words: str | Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([*COMMAND, *map(str, words)], capture_output=True, text=True, timeout=280)
+
+
+@pytest.mark.medium
+@pytest.mark.parametrize("flags", [[], ["--json"]], ids=str)
+def test_ctrl_c_leaves_with_130_and_a_sentence(flags: list[str], tmp_path: Path) -> None:
+    words = ["calibrate", "--rig", write_toy_rig(tmp_path), "--session", tmp_path / "s", "--profile", tmp_path / "p"]
+    with subprocess.Popen(
+        [*COMMAND, *map(str, words), *flags], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        while not (tmp_path / "s" / "session.json").exists():
+            assert process.poll() is None
+            time.sleep(0.02)
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate(timeout=200)
+    assert process.returncode == 130
+    assert err.strip().splitlines()[-1].startswith("udccal: Stopped. Run the same command again to continue")
+    assert "Traceback" not in err
+    if flags:
+        assert json.loads(out)["error"].startswith("Stopped.")
+    else:
+        assert out == ""
+
+
+@pytest.mark.parametrize(
+    "words", [["profile", "show", "lg55-reduced"], ["profile", "show", "lg55-reduced", "--json"], ["--help"]], ids=str
+)
+def test_a_closed_pipe_leaves_quietly(words: list[str]) -> None:
+    reader, writer = os.pipe()
+    os.close(reader)
+    done = subprocess.run([*COMMAND, *words], stdout=writer, stderr=subprocess.PIPE, text=True, timeout=280)
+    os.close(writer)
+    assert done.returncode == 141
+    assert not any(word in done.stderr for word in ("udccal:", "Traceback", "Exception", "Error"))
+
+
+@pytest.mark.parametrize("seed", ["-1", "half"])
+def test_a_seed_that_is_none_is_a_wrong_word(seed: str, tmp_path: Path) -> None:
+    done = udccal("simulate", PORTRAIT, "--rig", "lg55-reduced", "--out", tmp_path / "o", "--seed", seed)
+    assert done.returncode == 2
+    assert "--seed" in done.stderr
+    assert not (tmp_path / "o").exists()
+
+
+@pytest.mark.medium
+def test_results_without_a_place_are_refused_before_any_work(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    mosaic = tmp_path / "frame.png"
+    write_png16(mosaic, np.zeros((768, 1024), np.uint16))
+    restore = ["restore", mosaic, "--profile", "lg55-reduced", "--exposure-s", "0.01"]
+    for words in (restore, ["simulate", PORTRAIT, "--rig", "lg55-reduced"]):
+        done = udccal(*words, "--out", tmp_path / "file" / "out")
+        assert done.returncode == 1, done.stderr
+        (sentence,) = done.stderr.strip().splitlines()  # and no stage has run
+        assert sentence.startswith("udccal: Expected to write the results to")
+        assert "Not a directory" in sentence
+    (tmp_path / "out" / "frame.png").mkdir(parents=True)
+    done = udccal(*restore, "--out", tmp_path / "out")
+    assert done.returncode == 1
+    assert "is taken" in done.stderr
+
+
+def test_a_folder_that_can_be_written_to_is_left_as_it_was(tmp_path: Path) -> None:
+    check_writable(tmp_path / "a" / "b")
+    assert not list(tmp_path.iterdir())
+    (tmp_path / "round").symlink_to(tmp_path / "round")
+    with pytest.raises(UdccalError, match="Expected to write the results"):
+        check_writable(tmp_path / "round" / "out")

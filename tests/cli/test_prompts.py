@@ -1,0 +1,53 @@
+"""What a person at the rig is asked, with the camera that Basler's SDK emulates: 4096 x 4096 pixels."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.toy_rigs import write_emulated_rig, write_toy_rig
+
+pytestmark = pytest.mark.medium
+
+
+@pytest.fixture(autouse=True)
+def _emulator(emulated_camera: None) -> None:
+    """Every test has the emulated camera."""
+
+
+def calibrate(folder: Path, rig: Path, typed: str) -> subprocess.CompletedProcess[str]:
+    words = ["calibrate", "--rig", rig, "--camera", "pylon", "--session", folder / "s", "--profile", folder / "p"]
+    command = [sys.executable, "-m", "udccal.cli.main", *map(str, words), "--term", "noise"]
+    return subprocess.run(command, input=typed, capture_output=True, text=True, timeout=280)
+
+
+def test_what_no_person_can_mend_is_not_asked_again(tmp_path: Path) -> None:
+    done = calibrate(tmp_path, write_toy_rig(tmp_path), "\n\n\n\n")
+    assert done.returncode == 1
+    assert "Expected a camera of 128 x 96, RGGB, 12 bits as in the rig 'toy', found 4096 x 4096" in done.stderr
+    assert "Press Enter" not in done.stderr
+    assert "(Enter for yes" not in done.stderr
+
+
+def test_a_word_that_is_not_offered_is_never_yes(tmp_path: Path) -> None:
+    done = calibrate(tmp_path, write_emulated_rig(tmp_path), "skip\n\nskip\n\nq\n")
+    assert done.returncode == 1
+    asked = done.stderr
+    panel = asked.index("Is it done? (Enter for yes, n for no) 'skip' is none of the answers. Is it done?")
+    light = asked.index(
+        "Press Enter when it is done, or Ctrl-C to stop. 'skip' is none of the answers. noise/flat_stack"
+    )
+    refused = asked.index("Press Enter to repeat the step, or q and Enter to stop.")
+    assert panel < light < refused
+    assert "udccal: Step noise/flat_stack: Expected" in asked.strip().splitlines()[-1]
+
+
+def test_no_is_no(tmp_path: Path) -> None:
+    done = calibrate(tmp_path, write_emulated_rig(tmp_path), "n\nno\nq\n")
+    assert done.returncode == 1
+    assert "'no' is none of the answers." in done.stderr
+    assert "Press Enter when it is done" not in done.stderr
+    assert "found no. Run the same command to continue." in done.stderr.strip().splitlines()[-1]

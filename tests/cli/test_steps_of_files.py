@@ -1,0 +1,133 @@
+"""Steps whose pictures lie in folders: those that cannot be right are refused, and captured steps captured once more.
+
+The last step has no pictures, so that the command ends before it fits.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.cli.step_pictures import photograph_steps
+from tests.toy_rigs import write_toy_rig
+from udccal.rig import load_rig
+from udccal.sessions.schema import StoredStep
+from udccal.sessions.store import Session
+
+LAST = "noise/dark_7"
+pytestmark = pytest.mark.medium
+
+
+@pytest.fixture(scope="module")
+def photographed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A toy rig, and the pictures of its noise term but for the last step."""
+    folder = tmp_path_factory.mktemp("photographed")
+    photograph_steps(load_rig(write_toy_rig(folder)), folder / "pictures")
+    shutil.rmtree(folder / "pictures" / LAST)
+    return folder
+
+
+@pytest.fixture
+def folder(photographed: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(photographed, tmp_path / "rig and pictures"))
+
+
+def refused(folder: Path, *words: str, term: str = "noise") -> str:
+    """Run the command, which fails at the last step at the latest, and return its sentence."""
+    command = [
+        "calibrate",
+        "--rig",
+        folder / "toy",
+        "--camera",
+        "files",
+        "--files",
+        folder / "pictures",
+        "--term",
+        term,
+    ]
+    command += ["--session", folder / "session", "--profile", folder / "profile", "--json", *words]
+    done = subprocess.run(
+        [sys.executable, "-m", "udccal.cli.main", *map(str, command)], capture_output=True, text=True, timeout=280
+    )
+    assert done.returncode == 1, done.stderr
+    return json.loads(done.stdout)["error"]
+
+
+def steps(folder: Path) -> dict[str, StoredStep]:
+    return {step.id: step for step in Session.open(folder / "session").manifest.steps}
+
+
+def times(table: Path, factor: float) -> None:
+    """Multiply the exposures in a ``frames.csv``."""
+    head, *lines = table.read_text().splitlines()
+    changed = [f"{name},{factor * float(exposure_s)!r}" for name, exposure_s in (line.split(",") for line in lines)]
+    table.write_text("\n".join((head, *changed)) + "\n")
+
+
+def test_milliseconds_for_seconds_are_refused_at_their_step(folder: Path) -> None:
+    table = folder / "pictures" / "noise" / "flat_2" / "frames.csv"
+    times(table, 1000.0)
+    sentence = refused(folder)
+    assert sentence.startswith("Step noise/flat_2: Expected an exposure near 0.0051 s")
+    assert "found 5.1 s: 1000 times too long" in sentence
+    assert "milliseconds (ms)" in sentence
+    assert list(steps(folder)) == ["noise/flat_stack", "noise/flat_0", "noise/flat_1"]
+    times(table, 1e-3)
+    assert f"the step {LAST}" in refused(folder)
+
+
+def test_a_first_step_in_milliseconds_is_captured_again_with_what_followed_from_it(folder: Path) -> None:
+    table = folder / "pictures" / "noise" / "flat_stack" / "frames.csv"
+    times(table, 1000.0)
+    assert "Step noise/flat_0: Expected an exposure near 0.088 s" in refused(folder)
+    times(table, 1e-3)
+    assert f"the step {LAST}" in refused(folder, "--again", "noise/flat_stack")
+    assert steps(folder)["noise/flat_stack"].captures[0].exposure_s == pytest.approx(4.4e-3)
+    # Of another exposure than before, so that the steps at multiples of it are captured anew.
+    before = steps(folder)
+    for name in (
+        "flat_stack",
+        *(f"flat_{index}" for index in range(5)),
+        "dark_stack",
+        *(f"dark_{i}" for i in range(5)),
+    ):
+        times(folder / "pictures" / "noise" / name / "frames.csv", 1.5)
+    assert f"the step {LAST}" in refused(folder, "--again", "noise/flat_stack")
+    after = steps(folder)
+    assert set(after) == set(before)
+    changed = {name for name in after if after[name].captures[0].exposure_s != before[name].captures[0].exposure_s}
+    assert changed == {name for name in after if name not in ("noise/dark_5", "noise/dark_6")}
+
+
+def test_a_captured_step_is_captured_again_alone(folder: Path) -> None:
+    assert f"the step {LAST}" in refused(folder)
+    before, pictures = steps(folder), folder / "pictures" / "noise"
+    first, second, *_ = sorted((pictures / "flat_3").glob("*.png"))
+    shutil.copy(second, first)
+    assert f"the step {LAST}" in refused(folder, "--again", "noise/flat_3")
+    after = steps(folder)
+    assert list(after) == list(before)
+    assert [name for name in after if after[name] != before[name]] == ["noise/flat_3"]
+    named = {capture.file for step in after.values() for capture in step.captures}
+    assert {str(p.relative_to(folder / "session")) for p in (folder / "session" / "noise").iterdir()} == named
+    assert f"the step {LAST}" in refused(folder)  # whole, and not asked for once more
+    assert steps(folder) == after
+
+
+def test_steps_that_cannot_be_captured_again_are_refused_and_change_nothing(folder: Path) -> None:
+    assert "Expected a session" in refused(folder, "--again", "noise/flat_3")
+    assert not (folder / "session").exists()
+    refused(folder)
+    before = (folder / "session" / "session.json").read_bytes()
+    for step in (LAST, "../x"):
+        assert f"Expected the step '{step}'" in refused(folder, "--again", step)
+    assert "Add --term noise" in refused(folder, "--again", "noise/flat_3", term="wire")
+    assert (folder / "session" / "session.json").read_bytes() == before
+    shutil.rmtree(folder / "pictures" / "noise" / "flat_3")
+    assert "pictures of the step noise/flat_3" in refused(folder, "--again", "noise/flat_3")
+    assert (folder / "session" / "session.json").read_bytes() == before
