@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -17,8 +18,13 @@ import pytest
 
 from examples.read_live import frames
 from tests.live.conftest import COLUMNS, ROWS
-from udccal.cli.main import main
+from udccal.cli.jobs.live import LiveRun, run_live
+from udccal.cli.jobs.live_cameras import LiveCamera
+from udccal.cli.output import Output
+from udccal.errors import CameraError, UdccalError
 from udccal.io.png import read_rgb8, write_png16
+from udccal.live.pipeline import Limits
+from udccal.tiers import Tier
 
 ROOT = Path(__file__).resolve().parents[2]
 pytestmark = pytest.mark.medium
@@ -93,23 +99,30 @@ def test_a_sink_that_is_not_here_is_refused(profile_folder: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("words", "message"),
+    ("changes", "message"),
     [
-        (["--sink", "paper:x"], "sink 'paper'"),
-        (["--sink", "shm:ok", "--camera", "files"], "--files"),
-        (["--sink", "shm:ok", "--hook", "none:at_all"], "--hook"),
-        (["--sink", "shm:ok", "--log", "/none/log"], "--log"),
-        (["--sink", "shm:ok", "--frames", "0"], "--frames"),
+        ({"sink": "paper:x"}, "sink 'paper'"),
+        ({"hook": "none:at_all"}, "--hook"),
+        ({"log": Path("/none/log")}, "--log"),
+        ({}, "no-such-profile"),
     ],
 )
 def test_what_cannot_begin_is_refused_before_the_profile_is_read(
-    words: list[str], message: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    changes: dict[str, object], message: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("udccal.cli.jobs.live.keep_compilations", lambda: None)
-    with pytest.raises(SystemExit) as end:
-        main(["run", "--profile", "no-such-profile", *words])
-    assert end.value.code in (1, 2)
-    assert message in capsys.readouterr().err
+    camera = LiveCamera("sim", None, None, None, 30.0, 0)
+    wanted = LiveRun(
+        Path("no-such-profile"), Tier.preview, camera, "shm:not-made", None, None, 1.0, Limits(frames=1), None
+    )
+    with pytest.raises(UdccalError, match=message):
+        run_live(Output(), replace(wanted, **changes))
+
+
+def test_files_and_their_folder_go_together() -> None:
+    for kind, files in (("files", None), ("sim", Path("folder"))):
+        with pytest.raises(CameraError, match="--files"):
+            LiveCamera(kind, None, files, None, 30.0, 0)
 
 
 def test_frames_of_another_camera_end_it_with_a_sentence(profile_folder: Path, tmp_path: Path) -> None:
