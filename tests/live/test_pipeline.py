@@ -137,6 +137,20 @@ def test_an_error_of_any_stage_ends_all_with_its_sentence() -> None:
         assert isinstance(found.value, UdccalError)
 
 
+def test_a_stage_that_does_not_end_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("udccal.live.pipeline._END_WITHIN_S", 0.2)
+    go_on = threading.Event()
+
+    def hanging() -> Iterator[Frame]:
+        yield raw_frame(0)
+        go_on.wait()
+
+    pipeline = Pipeline(hanging(), restore, SHAPE, ListSink(), None, Limits(frames=1), threading.Event())
+    with pytest.raises(LiveError, match=r"within 0.2 s, found acquisition still at work"):
+        pipeline.run(lambda figures: None)
+    go_on.set()
+
+
 def test_a_late_hook_lets_frames_out_unaltered_and_is_counted() -> None:
     never = threading.Event()
 

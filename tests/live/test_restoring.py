@@ -62,7 +62,7 @@ def test_frames_of_another_camera_are_refused(restoring: Restoring) -> None:
 
 def test_a_profile_of_another_view_is_refused(restoring: Restoring, live_rig: RigDescription) -> None:
     larger = live_rig.model_copy(update={"view": live_rig.view.model_copy(update={"columns": 32, "rows": 18})})
-    with pytest.raises(LiveError, match="Start another run"):
+    with pytest.raises(LiveError, match=r"view of 64 x 36.* found .* 32 x 18. Start another run"):
         restoring.replace(Restorer.from_profile(profile_of(larger), Tier.preview))
 
 
@@ -78,10 +78,14 @@ def test_a_changed_profile_is_taken_up_between_two_frames(
         said.append(sentence)
         told.set()
 
-    def take() -> None:
-        restoring.replace(Restorer.load(profile_folder, Tier.preview))
-
     levels: list[float] = []
+    written_meanwhile: list[int] = []
+
+    def take() -> None:
+        before = len(levels)
+        restorer = Restorer.load(profile_folder, Tier.preview)
+        written_meanwhile.append(len(levels) - before)
+        restoring.replace(restorer)
 
     class LevelSink(ListSink):
         def open(self, shape: tuple[int, int]) -> None:
@@ -108,3 +112,4 @@ def test_a_changed_profile_is_taken_up_between_two_frames(
     assert not running.is_alive()
     assert set(levels) == {64.0, 70.0}
     assert levels == sorted(levels)
+    assert written_meanwhile[0] > 3

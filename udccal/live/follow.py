@@ -7,7 +7,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import final
 
-from udccal.errors import UdccalError
 from udccal.io.whole_folder import standing
 from udccal.profiles.provenance import PROFILE_NAME
 
@@ -47,7 +46,7 @@ class ProfileFollower:
     def _try(self) -> None:
         try:
             self._take()
-        except (UdccalError, OSError) as error:
+        except Exception as error:
             self._say(f"The profile {self._path} has changed and cannot be used; the earlier one is kept. {error}")
         else:
             self._say(f"The profile {self._path} has changed; frames are restored with the new one from now on.")

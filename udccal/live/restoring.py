@@ -11,6 +11,7 @@ from udccal.cameras.protocol import Frame
 from udccal.errors import LiveError
 from udccal.live.display import Display
 from udccal.restoration.runtime import Restorer
+from udccal.rig import RigDescription
 
 
 @final
@@ -38,13 +39,13 @@ class Restoring:
         """Use ``restorer`` from the next frame on.
 
         Raises:
-            LiveError: when its camera or its view has another size or pattern, as the stream has begun.
+            LiveError: when its camera or its view has another size or pattern, as the sink is open for these.
         """
-        before, after = self._restorer.rig, restorer.rig
-        if (before.camera, before.view) != (after.camera, after.view):
+        before, after = _sizes(self._restorer.rig), _sizes(restorer.rig)
+        if before != after:
             raise LiveError(
-                f"Expected the changed profile to have the camera and the view of '{before.name}', with which this run "
-                f"began, found those of '{after.name}' to differ. Start another run for it."
+                f"Expected a changed profile of {before}, with which this run began, found one of {after}. "
+                "Start another run for it."
             )
         self._restorer = restorer
 
@@ -56,3 +57,8 @@ class Restoring:
         """
         linear = self._restorer.restore(frame.data, frame.settings.exposure_s, self._panel_picture)
         return self._display.encode(linear)
+
+
+def _sizes(rig: RigDescription) -> str:
+    camera, view = rig.camera, rig.view
+    return f"{camera.columns} x {camera.rows} {camera.cfa} samples and a view of {view.columns} x {view.rows}"

@@ -30,7 +30,7 @@ from udccal.restoration.prepared import prepared_folder
 from udccal.restoration.runtime import Restorer
 from udccal.tiers import Tier
 
-_SIGNALS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+_ENDING: Final = ("SIGINT", "SIGTERM", "SIGHUP")  # the last one is not on every system
 
 
 @final
@@ -95,7 +95,8 @@ def _ended_by_signals(stop: threading.Event) -> Iterator[None]:
         stop.set()
         signal.signal(number, before[signal.Signals(number)])
 
-    before = {number: signal.signal(number, end) for number in _SIGNALS}
+    numbers = [signal.Signals[name] for name in _ENDING if hasattr(signal, name)]
+    before = {number: signal.signal(number, end) for number in numbers}
     try:
         yield
     finally:

@@ -6,7 +6,6 @@ writer that died, and the next run removes it.
 
 from __future__ import annotations
 
-import fcntl
 import mmap
 import os
 import re
@@ -74,7 +73,7 @@ def _unnamed(size: int) -> int:
     """Return the descriptor of a locked file without a name, with all its memory reserved."""
     descriptor = os.open(_FOLDER, os.O_TMPFILE | os.O_RDWR, 0o600)
     try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX)
+        _lock(descriptor)
         os.posix_fallocate(descriptor, 0, size)
     except OSError as error:
         os.close(descriptor)
@@ -99,13 +98,20 @@ def _remove_stale(path: Path) -> None:
     try:
         if os.read(descriptor, len(MAGIC)) != MAGIC:
             raise _taken(path, "another program's memory")
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        _lock(descriptor)
         if _is_at(descriptor, path):
             path.unlink()
     except BlockingIOError as error:
         raise _taken(path, "a run that still writes to it") from error
     finally:
         os.close(descriptor)
+
+
+def _lock(descriptor: int) -> None:
+    """Lock a file for as long as it is open here; raise BlockingIOError where another process has locked it."""
+    import fcntl  # not on every system
+
+    fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
 
 def _is_at(descriptor: int, path: Path) -> bool:
