@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from typing import Final, final
 
+import cv2
 import numpy as np
 from jaxtyping import Float32, UInt8
 
 from udccal.restoration.tone import display_exposure, encode_srgb
 
-# Levels of linear light in the table: the darkest differ by a fifth of an 8-bit step after encoding.
-_LEVELS: Final = 1 << 14
+# Every 16-bit level of linear light has its place in the table.
+_LEVELS: Final = 1 << 16
 _TABLE: Final = np.rint(255.0 * encode_srgb(np.linspace(0.0, 1.0, _LEVELS))).astype(np.uint8)
 # Every so many pixels are looked at to choose the exposure.
 _STEP: Final = 8
@@ -30,6 +31,8 @@ class Display:
         wanted = display_exposure(linear[::_STEP, ::_STEP])
         before = wanted if self._exposure is None else self._exposure
         self._exposure = before * (wanted / before) ** _PART
-        levels = linear * np.float32(self._exposure * (_LEVELS - 1))
-        np.clip(levels, 0.0, _LEVELS - 1.0, out=levels)
-        return np.take(_TABLE, levels.astype(np.uint16), mode="clip")
+        scale = self._exposure * (_LEVELS - 1)
+        levels = cv2.multiply(
+            linear, (scale, scale, scale, scale), dtype=cv2.CV_16U
+        )  # rounded, and clipped at the ends
+        return cv2.LUT(levels, _TABLE)
