@@ -113,3 +113,12 @@ def test_a_changed_profile_is_taken_up_between_two_frames(
     assert set(levels) == {64.0, 70.0}
     assert levels == sorted(levels)
     assert written_meanwhile[0] > 3
+
+
+def test_a_change_before_the_run_begins_is_taken_up(profile_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("udccal.live.follow._EVERY_S", 0.01)
+    taken = threading.Event()
+    follower = ProfileFollower(profile_folder, taken.set, lambda sentence: None)
+    (profile_folder / "profile.json").touch()
+    with follower:
+        assert taken.wait(30)

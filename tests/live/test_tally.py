@@ -45,5 +45,5 @@ def test_seconds_begin_anew_and_the_whole_goes_on() -> None:
         )
         assert figures.latency_ms.p50 == pytest.approx(30, rel=0.01)
     whole = tally.whole()
-    assert (whole.captured, whole.written, whole.dropped_percent) == (8, 2, 75.0)
+    assert (whole.captured, whole.written, whole.dropped) == (8, 2, 6)
     assert tally.second().restoration_ms == Spread(None, None, None)

@@ -15,7 +15,7 @@ _EVERY_S = 1.0
 
 @final
 class ProfileFollower:
-    """Looks at a profile once a second; a context manager.
+    """Looks at a profile once a second while it is entered; a change since it was made counts, too.
 
     Args:
         path: folder or zip file of the profile.

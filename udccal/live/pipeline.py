@@ -77,15 +77,8 @@ class Pipeline:
         Raises:
             UdccalError: the first error of any thread; all threads have ended then.
         """
-        stages = {
-            Stage.ACQUISITION: self._acquire,
-            Stage.RESTORATION: self._restore,
-            Stage.OUTPUT: self._output,
-        }
-        threads = [
-            threading.Thread(target=self._guarded, args=(stage, work), name=stage, daemon=True)
-            for stage, work in stages.items()
-        ]
+        works = (Stage.ACQUISITION, self._acquire), (Stage.RESTORATION, self._restore), (Stage.OUTPUT, self._output)
+        threads = [threading.Thread(target=self._guarded, args=each, name=each[0], daemon=True) for each in works]
         for thread in threads:
             thread.start()
         try:

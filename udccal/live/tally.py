@@ -53,10 +53,9 @@ class Figures:
     latency_ms: Spread
 
     @property
-    def dropped_percent(self) -> float:
-        """Frames lost anywhere, in percent of those captured."""
-        dropped = self.dropped_by_camera + self.dropped_before_restoration + self.dropped_before_output
-        return 100.0 * dropped / max(self.captured, 1)
+    def dropped(self) -> int:
+        """Frames lost anywhere."""
+        return self.dropped_by_camera + self.dropped_before_restoration + self.dropped_before_output
 
 
 @final

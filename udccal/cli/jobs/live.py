@@ -49,7 +49,7 @@ class LiveRun:
     log: Path | None
 
 
-def run_live(output: Output, wanted: LiveRun) -> Figures:
+def run_live(output: Output, wanted: LiveRun) -> None:
     """Run until the limits, the end of the files, or a signal; then show the figures of the whole run.
 
     Raises:
@@ -63,6 +63,7 @@ def run_live(output: Output, wanted: LiveRun) -> Figures:
     def load() -> Restorer:
         return Restorer.load(path, wanted.tier, keep=prepared_folder())
 
+    follower = ProfileFollower(path, lambda: restoring.replace(load()), output.say)
     with contextlib.ExitStack() as open_:
         write = open_.enter_context(_log(wanted.log))
         with output.stage("preparing"):
@@ -71,7 +72,7 @@ def run_live(output: Output, wanted: LiveRun) -> Figures:
             restoring = Restoring(restorer, shown)
             frames = open_.enter_context(wanted.camera.open(restorer, shown))
         open_.enter_context(_ended_by_signals(stop))
-        open_.enter_context(ProfileFollower(path, lambda: restoring.replace(load()), output.say))
+        open_.enter_context(follower)
         output.say("Running; Ctrl-C ends it.")
         with output.stage("running") as stage:
 
@@ -84,7 +85,6 @@ def run_live(output: Output, wanted: LiveRun) -> Figures:
         write(whole)
     output.table(_table(whole))
     output.result(whole)
-    return whole
 
 
 @contextlib.contextmanager
@@ -119,16 +119,17 @@ def _log(path: Path | None) -> Iterator[Callable[[Figures], None]]:
 
 
 def _line(figures: Figures) -> str:
-    dropped = figures.dropped_by_camera, figures.dropped_before_restoration, figures.dropped_before_output
+    """Return one second in one line, what matters most first: a narrow terminal cuts its end."""
     return (
-        f"{figures.captured} frames in, {figures.written} out, {'+'.join(map(str, dropped))} dropped, "
+        f"{figures.captured} in, {figures.written} out, {figures.dropped} dropped; latency {_ms(figures.latency_ms)}, "
         f"restoration {_ms(figures.restoration_ms)}, output {_ms(figures.output_ms)}, "
-        f"latency {_ms(figures.latency_ms)}"
+        f"acquisition {_ms(figures.acquisition_ms)}"
     )
 
 
 def _ms(spread: Spread) -> str:
-    return "–" if spread.p50 is None else f"{spread.p50:.0f} ({spread.p95:.0f}, {spread.p99:.0f}) ms"
+    """Return the 50th, 95th and 99th percentile."""
+    return "–" if spread.p50 is None else f"{spread.p50:.0f}/{spread.p95:.0f}/{spread.p99:.0f} ms"
 
 
 def _table(figures: Figures) -> Table:
@@ -142,11 +143,12 @@ def _table(figures: Figures) -> Table:
         ("hooks that were late", figures.late_hooks),
     )
     times = (
-        ("acquisition: median (95 %, 99 %)", figures.acquisition_ms),
+        ("acquisition: 50th/95th/99th percentile", figures.acquisition_ms),
         ("restoration", figures.restoration_ms),
         ("output", figures.output_ms),
         ("latency", figures.latency_ms),
     )
     rows = [(name, str(count)) for name, count in counts] + [(name, _ms(spread)) for name, spread in times]
-    title = f"{figures.elapsed_s:.1f} s, {figures.dropped_percent:.1f} % dropped"
+    percent = 100.0 * figures.dropped / max(figures.captured, 1)
+    title = f"{figures.elapsed_s:.1f} s, {percent:.1f} % dropped"
     return Table(title, ("", ""), tuple(rows), frozenset({1}))
