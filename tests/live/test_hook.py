@@ -27,6 +27,12 @@ def test_a_hook_alters_a_copy() -> None:
     assert np.all(PICTURE == 100)
 
 
+def test_a_view_that_is_turned_is_laid_out_anew() -> None:
+    altered = TimedHook(lambda picture, frame_id: picture[:, ::-1, ::-1], 10.0).apply(PICTURE, 0)
+    assert altered is not None
+    assert altered.flags.c_contiguous
+
+
 def test_a_late_hook_is_passed_by_until_it_has_ended() -> None:
     go_on, calls = threading.Event(), list[int]()
 

@@ -88,7 +88,7 @@ class TimedHook:
                 f"Expected the hook to return 8-bit RGB of shape {picture.shape}, found {found_instead(answer)}. "
                 "Return the picture that it was given, altered."
             )
-        return answer
+        return np.ascontiguousarray(answer)  # sinks take no turned or cut views
 
     def _work(self) -> None:
         while True:
