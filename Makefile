@@ -8,13 +8,14 @@ ACCURACY_OUT ?= accuracy
 ACCURACY_SEEDS ?= 8
 EFFICIENCY_OUT ?= efficiency
 PARETO_OUT ?= pareto
+LIVE_OUT ?= live.json
 COVERAGE_OUT ?= coverage
 ROBUST_OUT ?= robust
 ROBUST ?=
 PEERS ?=
 USB ?=
 
-.PHONY: install demo test test-medium test-slow test-usb fuzz load lint types contracts check accuracy tables efficiency coverage extremes pareto robust peers growth clean
+.PHONY: install demo test test-medium test-slow test-usb fuzz load lint types contracts check accuracy tables efficiency coverage extremes pareto live robust peers growth clean
 
 install: $(STAMP)
 
@@ -100,9 +101,14 @@ growth: $(STAMP)
 pareto: $(STAMP)
 	$(BIN)/python -m tests.benchmarks.pareto --out $(PARETO_OUT)
 
+# Ten minutes of `udccal run` with the simulated camera at 30 Hz. Writes live.json; non-zero exit where frames dropped,
+# latency or memory miss their limits. Nothing else should run meanwhile.
+live: $(STAMP)
+	$(BIN)/python -m tests.benchmarks.live --out $(LIVE_OUT)
+
 # Puts the measured tables into README.md.
 tables: $(STAMP)
 	$(BIN)/python -m tests.benchmarks.readme_tables --accuracy $(ACCURACY_OUT)
 
 clean:
-	rm -rf $(VENV) $(DEMO_OUT) $(ACCURACY_OUT) $(EFFICIENCY_OUT) $(ROBUST_OUT) $(PARETO_OUT) peers build dist *.egg-info
+	rm -rf $(VENV) $(DEMO_OUT) $(ACCURACY_OUT) $(EFFICIENCY_OUT) $(ROBUST_OUT) $(PARETO_OUT) $(LIVE_OUT) peers build dist *.egg-info

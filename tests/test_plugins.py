@@ -14,7 +14,7 @@ OWN = ("wire", "procedures.wire:WireProcedure")
 
 
 def install(monkeypatch: pytest.MonkeyPatch, *points: tuple[str, str]) -> None:
-    found = EntryPoints(EntryPoint(name, value, plugins.GROUP) for name, value in points)
+    found = EntryPoints(EntryPoint(name, value, plugins.PROCEDURES) for name, value in points)
     monkeypatch.setattr(plugins, "entry_points", lambda **chosen: found.select(**chosen))
 
 
@@ -23,6 +23,11 @@ def test_the_five_procedures_are_installed(term: str) -> None:
     found = plugins.find_procedure(term)
     assert issubclass(found, Procedure)
     assert found.term == term
+
+
+@pytest.mark.parametrize("name", ["images", "shm", "v4l2", "video", "window"])
+def test_the_five_sinks_are_installed(name: str) -> None:
+    assert plugins.find_sink(name).__module__.startswith("udccal.live.sinks.")
 
 
 def test_another_packages_procedure_goes_first(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -36,9 +41,10 @@ def test_another_packages_procedure_goes_first(monkeypatch: pytest.MonkeyPatch) 
 @pytest.mark.parametrize(
     ("points", "message"),
     [
-        ([], "found none in the entry-point group"),
+        ([], "found none in the entry-point group 'udccal.procedures', which has nothing"),
+        ([("psf", "other:Psf")], "which has psf"),
         ([OWN, ("wire", "other:Wire"), ("wire", "third:Wire")], "one procedure for the term 'wire', found other:Wire"),
-        ([("wire", "no_such_package:Wire")], "Expected the procedure 'wire' at no_such_package:Wire, found: No module"),
+        ([("wire", "no_such_package:Wire")], "procedure for the term 'wire' at no_such_package:Wire, found: No module"),
         ([("wire", "procedures.wire:Nothing")], "Reinstall the package"),
         ([("wire", "procedures.wire:_DARKS")], "to be a class, found 16"),
     ],

@@ -57,6 +57,10 @@ class RestorationError(UdccalError):
     """A frame cannot be restored with the profile chosen."""
 
 
+class LiveError(UdccalError):
+    """A live run cannot begin or go on: its sink, its hook, or a stage of it."""
+
+
 def found_instead(value: object) -> str:
     """What an argument is that should have been an array, for a message: type and shape."""
     kind, shape = getattr(value, "dtype", None), getattr(value, "shape", None)

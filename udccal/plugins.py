@@ -1,4 +1,4 @@
-"""Finds installed procedures by the name of their term through entry points."""
+"""Finds installed procedures and sinks by their names through entry points."""
 
 from __future__ import annotations
 
@@ -6,7 +6,8 @@ from importlib.metadata import EntryPoint, entry_points
 
 from udccal.errors import UdccalError
 
-GROUP = "udccal.procedures"
+PROCEDURES = "udccal.procedures"
+SINKS = "udccal.sinks"
 
 
 def find_procedure(term: str) -> type:
@@ -15,32 +16,44 @@ def find_procedure(term: str) -> type:
     Raises:
         UdccalError: when none is installed, two other packages provide one, or it cannot be imported.
     """
-    found = entry_points(group=GROUP, name=term)
+    return _find(PROCEDURES, term, f"procedure for the term '{term}'")
+
+
+def find_sink(name: str) -> type:
+    """Return the class of the sink ``name`` of a live run; that of another package comes before udccal's own.
+
+    Raises:
+        UdccalError: as ``find_procedure``.
+    """
+    return _find(SINKS, name, f"sink '{name}'")
+
+
+def _find(group: str, name: str, what: str) -> type:
+    found = entry_points(group=group, name=name)
     others = [point for point in found if not _is_our_own(point)]
     if not found:
+        present = ", ".join(sorted({point.name for point in entry_points(group=group)})) or "nothing"
         raise UdccalError(
-            f"Expected an installed procedure for the term '{term}', found none in the entry-point group '{GROUP}'. "
-            "Install udccal with pip, or install the package that provides the procedure."
+            f"Expected an installed {what}, found none in the entry-point group '{group}', which has {present}. "
+            "Choose one of these, install udccal with pip, or install the package that provides it."
         )
     if len(others) > 1:
         values = " and ".join(point.value for point in others)
-        raise UdccalError(
-            f"Expected one procedure for the term '{term}', found {values}. Uninstall the package you do not want."
-        )
-    return _load(next(iter(others or found)))
+        raise UdccalError(f"Expected one {what}, found {values}. Uninstall the package you do not want.")
+    return _load(next(iter(others or found)), what)
 
 
 def _is_our_own(point: EntryPoint) -> bool:
-    return point.value.startswith("procedures.")
+    return point.value.startswith(("procedures.", "udccal."))
 
 
-def _load(point: EntryPoint) -> type:
+def _load(point: EntryPoint, what: str) -> type:
     try:
         loaded = point.load()
     except (ImportError, AttributeError) as error:
         raise UdccalError(
-            f"Expected the procedure '{point.name}' at {point.value}, found: {error}. Reinstall the package it is from."
+            f"Expected the {what} at {point.value}, found: {error}. Reinstall the package it is from."
         ) from error
     if not isinstance(loaded, type):
-        raise UdccalError(f"Expected the procedure '{point.name}' at {point.value} to be a class, found {loaded!r}.")
+        raise UdccalError(f"Expected the {what} at {point.value} to be a class, found {loaded!r}.")
     return loaded

@@ -20,6 +20,7 @@ VERBS = (
     ["fit"],
     ["plan"],
     ["restore"],
+    ["run"],
     ["simulate"],
     ["profile"],
     ["profile", "show"],

@@ -20,6 +20,7 @@ from udccal.cli.plan import plan
 from udccal.cli.profile import profile_app
 from udccal.cli.restore import restore
 from udccal.cli.rig import rig_app
+from udccal.cli.run import run
 from udccal.cli.simulate import simulate
 from udccal.errors import UdccalError
 
@@ -56,7 +57,7 @@ def globals_(
     context.obj = Output(as_json=as_json, debug=debug)
 
 
-for _verb in (demo, doctor, plan, calibrate, fit, restore, simulate):
+for _verb in (demo, doctor, plan, calibrate, fit, restore, run, simulate):
     app.command(no_args_is_help=_verb not in (demo, doctor))(_verb)
 app.add_typer(profile_app, name="profile")
 app.add_typer(rig_app, name="rig")

@@ -1,0 +1,148 @@
+"""``udccal run`` as a person starts it, with a tiny profile."""
+
+from __future__ import annotations
+
+import json
+import os
+import secrets
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from examples.read_live import frames
+from tests.live.conftest import COLUMNS, ROWS
+from udccal.cli.jobs.live import LiveRun, run_live
+from udccal.cli.jobs.live_cameras import LiveCamera
+from udccal.cli.output import Output
+from udccal.errors import CameraError, UdccalError
+from udccal.io.png import read_rgb8, write_png16
+from udccal.live.pipeline import Limits
+from udccal.tiers import Tier
+
+ROOT = Path(__file__).resolve().parents[2]
+pytestmark = pytest.mark.medium
+
+
+def command(*words: str | Path) -> list[str]:
+    return [sys.executable, "-m", "udccal.cli.main", "run", *map(str, words), "--json"]
+
+
+def udccal_run(*words: str | Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(command(*words), capture_output=True, text=True, timeout=1000, cwd=ROOT)
+
+
+def write_raw_files(folder: Path, count: int) -> Path:
+    folder.mkdir()
+    rng = np.random.default_rng(5)
+    for number in range(count):
+        write_png16(folder / f"{number}.png", rng.integers(500, 3000, (64, 96)).astype(np.uint16))
+    return folder
+
+
+def test_files_become_images(profile_folder: Path, tmp_path: Path) -> None:
+    raw_files = write_raw_files(tmp_path / "raw", 6)
+    (tmp_path / "my_hook.py").write_text("def mark(p, n):\n    p[0, 0] = n\n    return p\n")
+    log, out = tmp_path / "log.jsonl", tmp_path / "out"
+    source = ["--camera", "files", "--files", raw_files, "--exposure-s", "0.001", "--fps", "2"]
+    hook = ["--hook", "my_hook:mark", "--hook-ms", "2000"]
+    words = command("--profile", profile_folder, "--sink", f"images:{out}", "--log", log, *source, *hook)
+    path = os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])
+    done = subprocess.run(
+        words, capture_output=True, text=True, timeout=250, cwd=tmp_path, env={**os.environ, "PYTHONPATH": path}
+    )
+    assert done.returncode == 0, done.stderr
+    shown = json.loads(done.stdout)
+    assert (shown["captured"], shown["written"], shown["late_hooks"]) == (6, 6, 0)
+    files = sorted(out.iterdir())
+    assert [file.name for file in files] == [f"frame-{number:08d}.png" for number in range(6)]
+    picture = read_rgb8(files[5])
+    assert picture.shape == (ROWS, COLUMNS, 3)
+    assert np.all(picture[0, 0] == 5)
+    *seconds, whole = [json.loads(line) for line in log.read_text().splitlines()]
+    assert whole == {**shown, "elapsed_s": whole["elapsed_s"]}
+    assert len(seconds) >= 2
+    assert {line["span"] for line in seconds} == {"second"}
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_it_and_removes_the_shared_memory(
+    profile_folder: Path, tmp_path: Path, number: signal.Signals
+) -> None:
+    name = f"udccal-test-{secrets.token_hex(6)}"
+    raw_files = write_raw_files(tmp_path / "raw", 300)
+    source = ["--camera", "files", "--files", raw_files, "--exposure-s", "0.001", "--fps", "5"]
+    words = command("--profile", profile_folder, "--sink", f"shm:{name}", *source)
+    with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT) as running:
+        deadline = time.monotonic() + 200
+        while not Path("/dev/shm", name).exists() and running.poll() is None and time.monotonic() < deadline:
+            time.sleep(0.05)
+        seen = [frame_id for (frame_id, _), _ in zip(frames(name), range(3), strict=False)]
+        running.send_signal(number)
+        said, complained = running.communicate(timeout=60)
+    assert running.returncode == 0, complained
+    assert seen == sorted(set(seen))
+    assert json.loads(said)["written"] >= 3
+    assert not Path("/dev/shm", name).exists()
+
+
+def test_a_sink_that_is_not_here_is_refused(profile_folder: Path) -> None:
+    done = udccal_run("--profile", profile_folder, "--sink", "window:")
+    assert done.returncode == 1
+    assert "headless build" in json.loads(done.stdout)["error"]
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"sink": "paper:x"}, "sink 'paper'"),
+        ({"hook": "none:at_all"}, "--hook"),
+        ({"log": Path("/none/log")}, "--log"),
+        ({}, "no-such-profile"),
+    ],
+)
+def test_what_cannot_begin_is_refused_before_the_profile_is_read(
+    changes: dict[str, object], message: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("udccal.cli.jobs.live.keep_compilations", lambda: None)
+    camera = LiveCamera("sim", None, None, None, 30.0, 0)
+    wanted = LiveRun(
+        Path("no-such-profile"), Tier.preview, camera, "shm:not-made", None, None, 1.0, Limits(frames=1), None
+    )
+    with pytest.raises(UdccalError, match=message):
+        run_live(Output(), replace(wanted, **changes))
+
+
+def test_files_and_their_folder_go_together() -> None:
+    for kind, files in (("files", None), ("sim", Path("folder"))):
+        with pytest.raises(CameraError, match="--files"):
+            LiveCamera(kind, None, files, None, 30.0, 0)
+
+
+def test_frames_of_another_camera_end_it_with_a_sentence(profile_folder: Path, tmp_path: Path) -> None:
+    write_png16(tmp_path / "small.png", np.full((32, 48), 900, np.uint16))
+    words = ["--camera", "files", "--files", tmp_path, "--exposure-s", "0.001", "--sink", f"images:{tmp_path / 'out'}"]
+    done = udccal_run("--profile", profile_folder, *words)
+    assert done.returncode == 1
+    assert "96 x 64" in json.loads(done.stdout)["error"]
+
+
+@pytest.mark.slow
+def test_the_simulated_camera_becomes_a_video(tmp_path: Path) -> None:
+    path = tmp_path / "a.mp4"
+    done = udccal_run("--profile", "lg55-reduced", "--sink", f"video:{path}", "--frames", "5")
+    assert done.returncode == 0, done.stderr
+    shown = json.loads(done.stdout)
+    assert shown["written"] == 5
+    assert shown["latency_ms"]["p50"] > 0
+    video = cv2.VideoCapture(str(path))
+    assert int(video.get(cv2.CAP_PROP_FRAME_COUNT)) >= 5
+    picture = video.read()[1]
+    assert picture.shape == (540, 960, 3)
+    assert picture.std() > 10

@@ -1,0 +1,79 @@
+"""A real camera's driver under a live run: the virtual USB3 Vision camera."""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+
+import pytest
+
+from tests.live.test_pipeline import SHAPE, ListSink, restore
+from tests.virtual_u3v.backend import VirtualBackend
+from tests.virtual_u3v.camera import VirtualCamera
+from tests.virtual_u3v.faults import Faults
+from tests.virtual_u3v.model import CameraModel
+from udccal.cameras.u3v.camera import U3vCamera
+from udccal.cli.jobs.live_cameras import LiveCamera
+from udccal.errors import CameraError
+from udccal.live.pipeline import Limits, Pipeline
+from udccal.live.tally import Figures
+from udccal.profiles.profile import Profile
+from udccal.restoration.runtime import Restorer
+from udccal.rig import RigDescription
+from udccal.tiers import Tier
+
+
+@pytest.fixture
+def plugged(live_rig: RigDescription, monkeypatch: pytest.MonkeyPatch) -> U3vCamera:
+    camera = live_rig.camera
+    model = CameraModel(columns=camera.columns, rows=camera.rows, cfa=camera.cfa, bits=camera.bits)
+    return plug(model, Faults(), monkeypatch)
+
+
+def plug(model: CameraModel, faults: Faults, monkeypatch: pytest.MonkeyPatch) -> U3vCamera:
+    found = U3vCamera(backend=VirtualBackend([VirtualCamera(model, faults=faults)]), timeout_s=0.5)
+    monkeypatch.setattr("udccal.cli.jobs.live_cameras.u3v_camera", lambda serial: found)
+    return found
+
+
+def run(profile: Profile) -> Figures:
+    camera = LiveCamera("u3v", None, None, 2e-3, 25.0, 0)
+    with camera.open(Restorer.from_profile(profile, Tier.preview), None) as frames:
+        pipeline = Pipeline(frames, restore, SHAPE, ListSink(), None, Limits(frames=5), threading.Event())
+        return pipeline.run(lambda figures: None)
+
+
+def test_it_is_set_and_streams_until_the_run_ends(live_profile: Profile, plugged: U3vCamera) -> None:
+    asked: list[float] = []
+    configure = plugged.configure
+    plugged.configure = lambda settings: asked.append(settings.exposure_s) or configure(settings)
+    assert run(live_profile).written == 5
+    assert asked == [2e-3]
+    with plugged:  # it can be opened again
+        assert plugged.mode.frame_rate_hz == pytest.approx(25.0)
+
+
+def test_one_that_falls_silent_ends_the_run(
+    live_profile: Profile, live_rig: RigDescription, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    camera = live_rig.camera
+    model = CameraModel(columns=camera.columns, rows=camera.rows, cfa=camera.cfa, bits=camera.bits)
+    plug(model, Faults(hang_at_frame=2), monkeypatch)
+    with pytest.raises(CameraError, match="Expected"):
+        run(live_profile)
+
+
+def test_one_of_another_pattern_is_refused(live_profile: Profile, monkeypatch: pytest.MonkeyPatch) -> None:
+    plug(CameraModel(columns=96, rows=64, cfa="GBRG"), Faults(), monkeypatch)
+    with pytest.raises(CameraError, match="the pattern RGGB of the rig"):
+        run(live_profile)
+
+
+def test_files_play_once(tmp_path: Path, live_profile: Profile) -> None:
+    with (
+        pytest.raises(CameraError, match="Expected pictures"),
+        LiveCamera("files", None, tmp_path, 1e-3, 30.0, 0).open(
+            Restorer.from_profile(live_profile, Tier.preview), None
+        ),
+    ):
+        pass

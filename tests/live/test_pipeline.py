@@ -1,0 +1,169 @@
+"""The three threads, with a restoration and a sink of the tests."""
+
+from __future__ import annotations
+
+import itertools
+import threading
+import time
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from tests.live.conftest import raw_frame
+from udccal.cameras.protocol import Frame
+from udccal.errors import CameraLost, LiveError, UdccalError
+from udccal.live.hook import Picture, TimedHook
+from udccal.live.pacing import looped
+from udccal.live.pipeline import Limits, Pipeline
+from udccal.live.sinks.protocol import RestoredFrame
+from udccal.live.tally import Figures
+
+SHAPE = (4, 6)
+
+
+class ListSink:
+    """Keeps the frames; fails at the one it is told to."""
+
+    def __init__(self, target: str = "", rate_hz: float = 30.0) -> None:
+        self.fails_at = int(target or -1)
+        self.frames: list[RestoredFrame] = []
+        self.calls: list[str] = []
+
+    def open(self, shape: tuple[int, int]) -> None:
+        self.calls.append("open")
+        assert shape == SHAPE
+
+    def write(self, frame: RestoredFrame) -> None:
+        if len(self.frames) == self.fails_at:
+            raise OSError(28, "No space left on device")
+        self.frames.append(frame)
+
+    def close(self) -> None:
+        self.calls.append("close")
+
+
+def restore(frame: Frame) -> Picture:
+    return np.full((*SHAPE, 3), frame.frame_id % 251, np.uint8)
+
+
+def run(
+    frames: Iterator[Frame],
+    sink: ListSink,
+    limits: Limits = Limits(seconds=20.0),  # noqa: B008
+    hook: TimedHook | None = None,
+    restore: object = restore,
+    stop: threading.Event | None = None,
+) -> Figures:
+    before = threading.active_count()
+    try:
+        return Pipeline(frames, restore, SHAPE, sink, hook, limits, stop or threading.Event()).run(lambda figures: None)
+    finally:
+        assert sink.calls == ["open", "close"]
+        assert threading.active_count() <= before
+
+
+def endless(rate_hz: float = 200.0) -> Iterator[Frame]:
+    return looped([raw_frame(0)], rate_hz)
+
+
+def test_it_ends_after_so_many_frames() -> None:
+    sink = ListSink()
+    figures = run(endless(), sink, Limits(frames=5))
+    assert figures.written == len(sink.frames) == 5
+    ids = [frame.frame_id for frame in sink.frames]
+    assert ids == sorted(set(ids))
+    assert all(np.all(frame.picture == frame.frame_id % 251) for frame in sink.frames)
+    assert figures.latency_ms.p99 is not None
+
+
+def test_it_ends_after_so_many_seconds() -> None:
+    start = time.monotonic()
+    figures = run(endless(), ListSink(), Limits(seconds=0.3))
+    assert 0.3 <= time.monotonic() - start < 10
+    assert figures.written > 0
+
+
+def test_it_ends_where_the_frames_end_and_the_last_one_is_written() -> None:
+    sink = ListSink()
+    run(iter([raw_frame(number) for number in range(50)]), sink)
+    assert sink.frames[-1].frame_id == 49
+
+
+def test_it_ends_when_it_is_told_to() -> None:
+    stop = threading.Event()
+    threading.Timer(0.1, stop.set).start()
+    run(endless(), ListSink(), stop=stop)
+
+
+def test_every_frame_is_written_or_counted_as_dropped() -> None:
+    def slow(frame: Frame) -> Picture:
+        time.sleep(0.03)
+        return restore(frame)
+
+    sink = ListSink()
+    figures = run(itertools.islice(endless(), 60), sink, restore=slow)
+    assert figures.dropped_before_restoration > 10
+    assert figures.captured == figures.written + figures.dropped
+    assert figures.restoration_ms.p50 >= 30
+
+
+def test_frames_that_the_camera_lost_or_broke_are_counted() -> None:
+    def frames() -> Iterator[Frame]:
+        for number in (0, 1, 5, 6):
+            yield raw_frame(number, complete=number != 6)
+            time.sleep(0.05)
+
+    figures = run(frames(), ListSink())
+    assert (figures.captured, figures.dropped_by_camera, figures.written) == (7, 4, 3)
+
+
+def test_an_error_of_any_stage_ends_all_with_its_sentence() -> None:
+    def unplugged() -> Iterator[Frame]:
+        yield raw_frame(0)
+        raise CameraLost("Expected the camera, found it unplugged. Plug it in.")
+
+    def broken(frame: Frame) -> Picture:
+        raise ZeroDivisionError("division by zero")
+
+    for frames, sink, how, error, message in (
+        (unplugged(), ListSink(), restore, CameraLost, "unplugged"),
+        (endless(), ListSink(), broken, LiveError, "the restoration to go on, found ZeroDivisionError: division"),
+        (endless(), ListSink("3"), restore, LiveError, "the output to go on, found OSError: .*No space left"),
+    ):
+        with pytest.raises(error, match=message) as found:
+            run(frames, sink, restore=how)
+        assert isinstance(found.value, UdccalError)
+
+
+def test_a_stage_that_does_not_end_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("udccal.live.pipeline._END_WITHIN_S", 0.2)
+    go_on = threading.Event()
+
+    def hanging() -> Iterator[Frame]:
+        yield raw_frame(0)
+        go_on.wait()
+
+    pipeline = Pipeline(hanging(), restore, SHAPE, ListSink(), None, Limits(frames=1), threading.Event())
+    with pytest.raises(LiveError, match=r"within 0.2 s, found acquisition still at work"):
+        pipeline.run(lambda figures: None)
+    go_on.set()
+
+
+def test_a_late_hook_lets_frames_out_unaltered_and_is_counted() -> None:
+    never = threading.Event()
+
+    def stuck(picture: Picture, frame_id: int) -> Picture:
+        never.wait()
+        return 255 - picture
+
+    sink = ListSink()
+    hook = TimedHook(stuck, 0.01)
+    figures = run(endless(), sink, Limits(frames=4), hook)
+    assert figures.late_hooks == 4
+    assert all(np.all(frame.picture == frame.frame_id % 251) for frame in sink.frames)
+    sink = ListSink()
+    prompt = TimedHook(lambda picture, frame_id: 255 - picture, 10.0)
+    assert run(endless(), sink, Limits(frames=4), prompt).late_hooks == 0
+    assert all(np.all(frame.picture == 255 - frame.frame_id % 251) for frame in sink.frames)
+    never.set()

@@ -1,0 +1,148 @@
+from __future__ import annotations
+
+import os
+import secrets
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from examples.read_live import frames
+from tests.live.conftest import COLUMNS, ROWS, restored_frame
+from udccal.errors import LiveError
+from udccal.live.sinks.shared_memory import SharedMemorySink
+
+ROOT = Path(__file__).resolve().parents[2]
+FOLDER = Path("/dev/shm")
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="shared memory of Linux")
+
+WRITER = """
+import sys, time
+from tests.live.conftest import restored_frame
+from udccal.live.sinks.shared_memory import SharedMemorySink
+sink = SharedMemorySink(sys.argv[1], 30.0)
+sink.open((36, 64))
+sink.write(restored_frame(7))
+print("written", flush=True)
+time.sleep(600)
+"""
+
+
+@pytest.fixture
+def name() -> Iterator[str]:
+    name = f"udccal-test-{secrets.token_hex(6)}"
+    yield name
+    (FOLDER / name).unlink(missing_ok=True)
+
+
+def open_sink(name: str) -> SharedMemorySink:
+    sink = SharedMemorySink(name, 30.0)
+    sink.open((ROWS, COLUMNS))
+    return sink
+
+
+def test_a_segment_goes_with_its_writer(name: str) -> None:
+    sink = open_sink(name)
+    assert (FOLDER / name).stat().st_mode & 0o777 == 0o600
+    reader = frames(name)
+    sink.write(restored_frame(3))
+    frame_id, picture = next(reader)
+    assert (frame_id, picture is not None and int(picture.max())) == (3, 3)
+    sink.close()
+    assert not (FOLDER / name).exists()
+    assert list(reader) == []
+    sink.close()
+
+
+def test_a_living_writer_is_left_alone_and_a_dead_ones_segment_is_replaced(name: str) -> None:
+    writer = subprocess.Popen([sys.executable, "-c", WRITER, name], stdout=subprocess.PIPE, text=True, cwd=ROOT)
+    try:
+        assert writer.stdout is not None
+        assert writer.stdout.readline() == "written\n"
+        second = SharedMemorySink(name, 30.0)
+        with pytest.raises(LiveError, match="a run that still writes to it"):
+            second.open((ROWS, COLUMNS))
+        second.close()
+        assert next(frames(name))[0] == 7
+    finally:
+        writer.send_signal(signal.SIGKILL)
+        writer.wait(30)
+    assert (FOLDER / name).exists()
+    sink = open_sink(name)
+    sink.write(restored_frame(1))
+    assert next(frames(name))[0] == 1
+    sink.close()
+    assert not (FOLDER / name).exists()
+
+
+@pytest.mark.parametrize("content", [b"", b"another program's data"])
+def test_other_programs_memory_is_not_touched(name: str, content: bytes) -> None:
+    (FOLDER / name).write_bytes(content)
+    sink = SharedMemorySink(name, 30.0)
+    with pytest.raises(LiveError, match="another program's memory"):
+        sink.open((ROWS, COLUMNS))
+    sink.close()
+    assert (FOLDER / name).read_bytes() == content
+
+
+def test_a_link_is_not_followed(name: str, tmp_path: Path) -> None:
+    (FOLDER / name).symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(LiveError, match="to be free"):
+        open_sink(name)
+    assert not (tmp_path / "elsewhere").exists()
+
+
+@pytest.mark.parametrize("wrong", ["", "a/b", "../x", ".hidden", "x" * 101])
+def test_names_that_are_none_are_refused(wrong: str) -> None:
+    with pytest.raises(LiveError, match="shm:NAME"):
+        SharedMemorySink(wrong, 30.0)
+
+
+def test_memory_that_is_not_there_is_refused_and_nothing_is_left(name: str) -> None:
+    sink = SharedMemorySink(name, 30.0)
+    with pytest.raises(LiveError, match="bytes of shared memory"):
+        sink.open((1 << 22, 1 << 22))
+    sink.close()
+    assert not (FOLDER / name).exists()
+
+
+def test_a_stalled_reader_slows_nobody(name: str) -> None:
+    sink = open_sink(name)
+    sink.write(restored_frame(0))
+    reader = frames(name)
+    next(reader)  # and never again, until the end
+    slowest = 0.0
+    for number in range(1, 200):
+        start = time.perf_counter()
+        sink.write(restored_frame(number))
+        slowest = max(slowest, time.perf_counter() - start)
+    assert slowest < 1.0
+    assert next(reader)[0] == 199
+    sink.close()
+
+
+@pytest.mark.skipif(shutil.which("cc") is None, reason="needs a C compiler")
+def test_the_reader_in_c(name: str, tmp_path: Path) -> None:
+    program = tmp_path / "read_live"
+    compiler = ["cc", "-O2", "-Wall", "-Wextra", "-Werror", "-o", program, ROOT / "examples" / "read_live.c"]
+    subprocess.run(compiler, check=True, timeout=120)
+    sink = open_sink(name)
+    sink.write(restored_frame(5))
+    with subprocess.Popen([program, name], stdout=subprocess.PIPE, text=True) as reader:
+        assert reader.stdout is not None
+        assert reader.stdout.readline() == "frame 5: mean 5.00\n"
+        # As if the third slot's frame had been written while a later one was begun in it.
+        slot_bytes = (-(-ROWS * COLUMNS * 3 // 64) + 2) * 64
+        tear = os.open(FOLDER / name, os.O_RDWR)
+        for place, value in ((128 + 3 * slot_bytes - 64, 3), (128 + 2 * slot_bytes, 7), (56, 3)):
+            os.pwrite(tear, value.to_bytes(8, "little"), place)
+        assert reader.stdout.readline() == "frame 0: torn\n"
+        os.close(tear)
+        sink.close()
+        assert reader.wait(30) == 0
+    assert subprocess.run([program, name], capture_output=True, timeout=30).returncode == 1

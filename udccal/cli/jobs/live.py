@@ -1,0 +1,154 @@
+"""Runs the live pipeline for a person at a terminal."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from types import FrameType
+from typing import Final, final
+
+from udccal.cli.jobs.live_cameras import LiveCamera
+from udccal.cli.jobs.panel_picture import read_panel_picture
+from udccal.cli.output import Output
+from udccal.compilation import keep_compilations
+from udccal.errors import LiveError
+from udccal.live.durations import Spread
+from udccal.live.follow import ProfileFollower
+from udccal.live.hook import TimedHook, load_hook
+from udccal.live.pipeline import Limits, Pipeline
+from udccal.live.restoring import Restoring
+from udccal.live.sinks.choice import make_sink
+from udccal.live.tally import Figures
+from udccal.profiles.store import find_profile
+from udccal.reports.tables import Table
+from udccal.restoration.prepared import prepared_folder
+from udccal.restoration.runtime import Restorer
+from udccal.tiers import Tier
+
+_ENDING: Final = ("SIGINT", "SIGTERM", "SIGHUP")  # the last one is not on every system
+
+
+@final
+@dataclass(frozen=True)
+class LiveRun:
+    """What a person asked for; see ``udccal.cli.run``."""
+
+    profile: Path
+    tier: Tier
+    camera: LiveCamera
+    sink: str
+    panel_picture: Path | None
+    hook: str | None
+    hook_s: float
+    limits: Limits
+    log: Path | None
+
+
+def run_live(output: Output, wanted: LiveRun) -> None:
+    """Run until the limits, the end of the files, or a signal; then show the figures of the whole run.
+
+    Raises:
+        UdccalError: when the run cannot begin, or a part of it fails.
+    """
+    keep_compilations()
+    sink = make_sink(wanted.sink, wanted.camera.rate_hz)
+    hook = None if wanted.hook is None else TimedHook(load_hook(wanted.hook), wanted.hook_s)
+    path, stop = find_profile(wanted.profile), threading.Event()
+
+    def load() -> Restorer:
+        return Restorer.load(path, wanted.tier, keep=prepared_folder())
+
+    follower = ProfileFollower(path, lambda: restoring.replace(load()), output.say)
+    with contextlib.ExitStack() as open_:
+        write = open_.enter_context(_log(wanted.log))
+        with output.stage("preparing"):
+            restorer = load()
+            shown = None if wanted.panel_picture is None else read_panel_picture(wanted.panel_picture, restorer.rig)
+            restoring = Restoring(restorer, shown)
+            frames = open_.enter_context(wanted.camera.open(restorer, shown))
+        open_.enter_context(_ended_by_signals(stop))
+        open_.enter_context(follower)
+        output.say("Running; Ctrl-C ends it.")
+        with output.stage("running") as stage:
+
+            def show(figures: Figures) -> None:
+                stage.update(round(figures.elapsed_s), text=_line(figures))
+                write(figures)
+
+            run = Pipeline(frames, restoring.restore, restoring.shape, sink, hook, wanted.limits, stop)
+            whole = run.run(show)
+        write(whole)
+    output.table(_table(whole))
+    output.result(whole)
+
+
+@contextlib.contextmanager
+def _ended_by_signals(stop: threading.Event) -> Iterator[None]:
+    """Set ``stop`` at Ctrl-C and whatever else asks this process to end; a second time, Ctrl-C is itself again."""
+
+    def end(number: int, _: FrameType | None) -> None:
+        stop.set()
+        signal.signal(number, before[signal.Signals(number)])
+
+    numbers = [signal.Signals[name] for name in _ENDING if hasattr(signal, name)]
+    before = {number: signal.signal(number, end) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextlib.contextmanager
+def _log(path: Path | None) -> Iterator[Callable[[Figures], None]]:
+    """Yield what writes figures to a file, a line of JSON each."""
+    if path is None:
+        yield lambda figures: None
+        return
+    try:
+        stream = path.open("w", encoding="utf-8", buffering=1)
+    except OSError as error:
+        raise LiveError(f"Expected --log to name a file that can be written, found: {error}. Name another.") from error
+    with stream:
+        yield lambda figures: print(json.dumps(asdict(figures)), file=stream)
+
+
+def _line(figures: Figures) -> str:
+    """Return one second in one line, what matters most first: a narrow terminal cuts its end."""
+    return (
+        f"{figures.captured} in, {figures.written} out, {figures.dropped} dropped; latency {_ms(figures.latency_ms)}, "
+        f"restoration {_ms(figures.restoration_ms)}, output {_ms(figures.output_ms)}, "
+        f"acquisition {_ms(figures.acquisition_ms)}"
+    )
+
+
+def _ms(spread: Spread) -> str:
+    """Return the 50th, 95th and 99th percentile."""
+    return "–" if spread.p50 is None else f"{spread.p50:.0f}/{spread.p95:.0f}/{spread.p99:.0f} ms"
+
+
+def _table(figures: Figures) -> Table:
+    """Return the summary of a run."""
+    counts = (
+        ("frames from the camera", figures.captured),
+        ("written", figures.written),
+        ("dropped by the camera", figures.dropped_by_camera),
+        ("dropped before restoration", figures.dropped_before_restoration),
+        ("dropped before output", figures.dropped_before_output),
+        ("hooks that were late", figures.late_hooks),
+    )
+    times = (
+        ("acquisition: 50th/95th/99th percentile", figures.acquisition_ms),
+        ("restoration", figures.restoration_ms),
+        ("output", figures.output_ms),
+        ("latency", figures.latency_ms),
+    )
+    rows = [(name, str(count)) for name, count in counts] + [(name, _ms(spread)) for name, spread in times]
+    percent = 100.0 * figures.dropped / max(figures.captured, 1)
+    title = f"{figures.elapsed_s:.1f} s, {percent:.1f} % dropped"
+    return Table(title, ("", ""), tuple(rows), frozenset({1}))

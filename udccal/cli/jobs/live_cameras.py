@@ -1,0 +1,95 @@
+"""Frames for a live run: of a simulated rig, of files, or of a real camera."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final, Literal, final
+
+import numpy as np
+from jaxtyping import UInt8
+
+from udccal.benches.bench import simulated_rig
+from udccal.benches.photograph import capture_photograph
+from udccal.cameras.choice import mode_for
+from udccal.cameras.files import FileCamera
+from udccal.cameras.picture_files.sidecar import list_folder
+from udccal.cameras.protocol import Camera, Frame, Range, Settings
+from udccal.cameras.simulated import SimulatedCamera
+from udccal.cli.jobs.benches import pylon_camera, u3v_camera
+from udccal.cli.jobs.demonstration import portrait
+from udccal.errors import CameraError
+from udccal.live.pacing import looped, paced, streamed
+from udccal.restoration.runtime import Restorer
+from udccal.rig import RigDescription
+
+# Frames of the simulated loop. They differ in their noise.
+_LOOP: Final = 8
+_DEFAULT_EXPOSURE_S: Final = 8e-3
+
+PanelPicture = UInt8[np.ndarray, "panel_rows panel_columns 3"]
+
+
+@final
+@dataclass(frozen=True)
+class LiveCamera:
+    """Which camera, and how it is set.
+
+    Attributes:
+        kind: the backend.
+        serial: serial number of a real camera; None for the only one.
+        files: folder of raw frames; None for other cameras.
+        exposure_s: exposure; None for 8 ms, for the files' own, or for what suits the simulated scene.
+        rate_hz: frames per second.
+        seed: specimen of the simulated rig.
+    """
+
+    kind: Literal["sim", "u3v", "pylon", "files"]
+    serial: str | None
+    files: Path | None
+    exposure_s: float | None
+    rate_hz: float
+    seed: int
+
+    def __post_init__(self) -> None:
+        if (self.kind == "files") != (self.files is not None):
+            raise CameraError("Expected --files with --camera files, and only there, found one of them. Give both.")
+
+    @contextlib.contextmanager
+    def open(self, restorer: Restorer, panel_picture: PanelPicture | None) -> Iterator[Iterator[Frame]]:
+        """Open the camera and yield its frames.
+
+        Raises:
+            CameraError: when it cannot be opened or does not fit the rig.
+        """
+        rig = restorer.rig
+        if self.kind == "sim":
+            yield looped(self._rendered(restorer, panel_picture), self.rate_hz)
+        elif self.files is not None:
+            with FileCamera(self.files, rig.camera.cfa, rig.camera.bits, self.exposure_s) as camera:
+                yield paced(camera.frames(len(list_folder(self.files))), self.rate_hz)
+        else:
+            with u3v_camera(self.serial) if self.kind == "u3v" else pylon_camera(self.serial) as camera:
+                self._set(camera, rig)
+                yield streamed(camera)
+
+    def _rendered(self, restorer: Restorer, panel_picture: PanelPicture | None) -> tuple[Frame, ...]:
+        """Return a few frames of a photograph before the simulated rig, so that simulation takes no time later."""
+        world = simulated_rig(restorer.rig, self.seed)
+        scene = capture_photograph(world, portrait(), restorer.view, panel_picture)
+        with SimulatedCamera(world) as camera:
+            camera.configure(Settings(self.exposure_s or scene.exposure_s, 0.0, camera.sensor))
+            return tuple(camera.frames(_LOOP))
+
+    def _set(self, camera: Camera, rig: RigDescription) -> None:
+        mode = mode_for(camera.features, camera.sensor, rig.camera.cfa, rig.camera.bits)
+        rate_hz = _within(min(self.rate_hz, mode.frame_rate_hz or self.rate_hz), camera.features.frame_rate_hz)
+        camera.set_mode(replace(mode, frame_rate_hz=rate_hz))
+        exposure_s = self.exposure_s or _within(_DEFAULT_EXPOSURE_S, camera.features.exposure_s)
+        camera.configure(Settings(exposure_s, _within(0.0, camera.features.gain_dB), camera.sensor))
+
+
+def _within(value: float, bounds: Range) -> float:
+    return min(max(value, bounds.low), bounds.high)

@@ -1,0 +1,1 @@
+"""Live restoration: a camera's frames, restored as they come, to a sink."""

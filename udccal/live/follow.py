@@ -1,0 +1,61 @@
+"""Follows a profile on disk: one that has been replaced is loaded in the background and then used."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import final
+
+from udccal.io.whole_folder import standing
+from udccal.profiles.provenance import PROFILE_NAME
+
+_EVERY_S = 1.0
+
+
+@final
+class ProfileFollower:
+    """Looks at a profile once a second while it is entered; a change since it was made counts, too.
+
+    Args:
+        path: folder or zip file of the profile.
+        take: loads the profile and uses it from then on.
+        say: gets a sentence when the profile was taken up, or could not be.
+    """
+
+    def __init__(self, path: Path, take: Callable[[], None], say: Callable[[str], None]) -> None:
+        self._path, self._take, self._say = path, take, say
+        self._known = self._state()
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._follow, name="profile", daemon=True)
+
+    def __enter__(self) -> ProfileFollower:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._ended.set()
+
+    def _follow(self) -> None:
+        while not self._ended.wait(_EVERY_S):
+            state = self._state()
+            if state is not None and state != self._known:
+                self._known = state
+                self._try()
+
+    def _try(self) -> None:
+        try:
+            self._take()
+        except Exception as error:
+            self._say(f"The profile {self._path} has changed and cannot be used; the earlier one is kept. {error}")
+        else:
+            self._say(f"The profile {self._path} has changed; frames are restored with the new one from now on.")
+
+    def _state(self) -> tuple[int, int] | None:
+        """Return what changes with the profile; None where there is none at the moment."""
+        place = standing(self._path)
+        try:
+            found = (place / PROFILE_NAME if place.is_dir() else place).stat()
+        except OSError:
+            return None
+        return found.st_ino, found.st_mtime_ns

@@ -1,0 +1,1 @@
+"""Where restored frames go: one small protocol, and the sinks behind it."""

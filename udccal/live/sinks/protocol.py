@@ -1,0 +1,48 @@
+"""The protocol that every sink implements."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol, final, runtime_checkable
+
+import numpy as np
+from jaxtyping import UInt8
+
+
+@final
+@dataclass(frozen=True)
+class RestoredFrame:
+    """A restored frame on its way out.
+
+    Attributes:
+        picture: display-encoded RGB. The sink may keep it, but must not write to it.
+        frame_id: the camera's count.
+        captured_ns: when the frame arrived from the camera, on the clock of ``time.monotonic_ns``.
+    """
+
+    picture: UInt8[np.ndarray, "rows columns 3"]
+    frame_id: int
+    captured_ns: int
+
+
+@runtime_checkable
+class Sink(Protocol):
+    """Takes restored frames, all of one size; one thread calls ``open``, ``write`` and ``close`` in this order.
+
+    A sink is made from what follows its name on the command line and from the rate of the frames in Hz. Making one
+    touches nothing, and refuses what it can know to be wrong.
+    """
+
+    def __init__(self, target: str, rate_hz: float) -> None: ...
+
+    def open(self, shape: tuple[int, int]) -> None:
+        """Begin, for pictures of ``shape`` (rows, columns). Raise LiveError where that cannot be."""
+        ...
+
+    def write(self, frame: RestoredFrame) -> None:
+        """Take a frame. Raise LiveError or OSError where that cannot be."""
+        ...
+
+    def close(self) -> None:
+        """End; what was written is whole afterwards. Called after an error in ``open`` or ``write``, too."""
+        ...
