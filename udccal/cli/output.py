@@ -84,6 +84,11 @@ class Output:
             if self._bar is not None:
                 self._bar.start()
 
+    def answer(self, sentence: str) -> None:
+        """Print a sentence that is part of the result on standard output; print nothing with ``--json``."""
+        if not self.as_json:
+            self._standard.print(sentence, highlight=False, markup=False, soft_wrap=True)
+
     def table(self, table: Table) -> None:
         """Print a table on standard output; print nothing with ``--json``."""
         if self.as_json:
