@@ -23,6 +23,7 @@ VERBS = (
     ["simulate"],
     ["profile"],
     ["profile", "show"],
+    ["profile", "diff"],
     ["profile", "prepare"],
 )
 # typer itself loads pydantic, which is quick

@@ -6,8 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, final, get_args
 
-import numpy as np
-
 from udccal.comparison.advice import advice
 from udccal.comparison.comparable import check_comparable
 from udccal.comparison.effects import Effect, effects_of
@@ -16,8 +14,7 @@ from udccal.comparison.held import held_estimates
 from udccal.comparison.limits import DiffLimits
 from udccal.comparison.maps import DifferenceMaps, difference_maps
 from udccal.comparison.movement import Movement, movement
-from udccal.comparison.picture import PictureLoss, picture_loss
-from udccal.errors import ProfileError
+from udccal.comparison.picture import picture_loss
 from udccal.fitting.engine.tails import chi2_tail
 from udccal.profiles.profile import Profile
 from udccal.result import FitStatus
@@ -113,30 +110,26 @@ def diff(a: Profile, b: Profile, limits: DiffLimits | None = None) -> ProfileDif
         limits: thresholds of the verdicts.
 
     Raises:
-        ProfileError: when they are of different rigs or cameras, or hold a covariance that cannot be one.
+        ProfileError: when they are of different rigs or cameras, hold a covariance that cannot be one, or terms that
+            give no finite numbers.
     """
-    return diff_by(a, b, maps_of(a, b), limits or DiffLimits())
+    return compare(a, b, limits or DiffLimits())[0]
 
 
-def maps_of(a: Profile, b: Profile) -> DifferenceMaps:
-    """Return the maps that ``diff_by`` needs; errors as for ``diff``."""
+def compare(a: Profile, b: Profile, limits: DiffLimits) -> tuple[ProfileDiff, DifferenceMaps]:
+    """Compare two profiles, and keep the maps for figures; see ``diff``."""
     check_comparable(a, b)
-    return difference_maps(a, b)
-
-
-def diff_by(a: Profile, b: Profile, maps: DifferenceMaps, limits: DiffLimits) -> ProfileDiff:
-    """Compare two profiles by their maps; see ``diff``."""
     found = difference(held_estimates(a), held_estimates(b))
+    maps = difference_maps(a, b)
     loss = picture_loss(a, b, maps)
     effects = effects_of(a, b, maps, loss, limits)
-    _check_finite([e.value for some in effects.values() for e in some], loss)
     terms = tuple(_term(a, b, term, found.of(term), effects[term], limits) for term in ORDER)
     moved = movement(found, a.rig.panel.pitch_mm.value, limits)
     verdict = max((one.verdict for one in terms), key=VERDICTS.index)
     changed = [(one.term, one.worst) for one in terms if one.verdict == "changed"]
     harmless = [one.term for one in terms if one.verdict == "changed, harmless"]
     newer = "A" if a.provenance.created_at > b.provenance.created_at else "B"
-    return ProfileDiff(
+    answer = ProfileDiff(
         format=FORMAT,
         version=VERSION,
         rig=a.rig.name,
@@ -149,6 +142,7 @@ def diff_by(a: Profile, b: Profile, maps: DifferenceMaps, limits: DiffLimits) ->
         movement=moved,
         limits=limits,
     )
+    return answer, maps
 
 
 def verdict_of(chi2: float, dof: int, effects: Sequence[Effect], limits: DiffLimits) -> Verdict:
@@ -194,11 +188,3 @@ def _term(
 
 def _compared(profile: Profile) -> Compared:
     return Compared(profile.provenance.created_at, profile.provenance.session_sha256)
-
-
-def _check_finite(values: list[float], loss: PictureLoss) -> None:
-    if not np.isfinite([*values, loss.together]).all():
-        raise ProfileError(
-            "Expected terms that give finite rays, kernels and light, found numbers that do not. Restore both profiles "
-            "from copies, or calibrate the rig again."
-        )

@@ -16,7 +16,6 @@ from udccal.profiles.profile import Profile
 from udccal.result import FitResult
 from udccal.sessions.schema import TermName
 
-
 _LOSS = "loss of a restored picture"
 
 
@@ -56,7 +55,7 @@ def effects_of(
                 100 * _rms(maps.wire),
                 "%",
                 limits.wire_percent,
-                _stated(a.wire, b.wire, "wire_map_rms_sigma", 1),
+                _stated(a.wire, b.wire, "wire_map_rms_sigma", 1.0),
             ),
             Effect(_LOSS, loss.wire, "dB", limits.picture_dB),
         ),
@@ -66,7 +65,7 @@ def effects_of(
                 _kernels(maps),
                 "%",
                 limits.kernel_percent,
-                _stated(a.psf, b.psf, "kernel_relative_l2", 100),
+                _stated(a.psf, b.psf, "kernel_relative_l2", 100.0),
             ),
             Effect(_LOSS, loss.psf, "dB", limits.picture_dB),
         ),
@@ -76,7 +75,7 @@ def effects_of(
                 _light(maps),
                 "%",
                 limits.backscatter_percent,
-                _stated(a.backscatter, b.backscatter, "held_out_without_noise_of_peak", 100),
+                _stated(a.backscatter, b.backscatter, "held_out_without_noise_of_peak", 100.0),
             ),
             Effect(_LOSS, loss.backscatter, "dB", limits.picture_dB),
         ),

@@ -14,6 +14,7 @@ from scipy.ndimage import map_coordinates
 
 from udccal.comparison.grid import kernel_places, light_step, sensor_grid
 from udccal.comparison.held import STEPS
+from udccal.errors import ProfileError
 from udccal.fitting.geometry.fit import angles_deg, term_at
 from udccal.kernels import fitted_size, kernels_at
 from udccal.models.backscatter import Backscatter, PanelResponse, grid_positions, panel_response, response_grid
@@ -53,20 +54,33 @@ class DifferenceMaps:
 
 
 def difference_maps(a: Profile, b: Profile) -> DifferenceMaps:
-    """Return the maps of two comparable profiles. The psf's kernels take most of the time."""
+    """Return the maps of two comparable profiles. The psf's kernels take most of the time.
+
+    Raises:
+        ProfileError: when the terms give numbers that are not finite.
+    """
     rays, lens, sigma = _rays(a, b)
     kernels_a, kernels_b = _kernels(a, b)
     pictures = panel_pictures(a.rig)
-    return DifferenceMaps(
+    with np.errstate(divide="ignore", invalid="ignore"):
+        wire = np.log(b.wire_map.astype(np.float64) / a.wire_map)
+    maps = DifferenceMaps(
         rays_px=rays,
         lens_px=lens,
         rays_sigma_px=sigma,
-        wire=np.log(b.wire_map.astype(np.float64) / a.wire_map),
+        wire=wire,
         kernels_a=kernels_a,
         kernels_b=kernels_b,
         light_a=_light(a, pictures),
         light_b=_light(b, pictures),
     )
+    seen = (maps.rays_px, maps.wire, maps.kernels_a, maps.kernels_b, maps.light_a, maps.light_b)
+    if not all(np.isfinite(one).all() for one in seen):
+        raise ProfileError(
+            "Expected terms that give finite rays, kernels and light, found others. Restore both profiles from copies, "
+            "or calibrate the rig again."
+        )
+    return maps
 
 
 @in_float64

@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 
 from udccal.cli.output import Output, plain
-from udccal.comparison.diff import ProfileDiff, diff_by, maps_of
+from udccal.comparison.diff import ProfileDiff, compare
 from udccal.comparison.limits import DiffLimits
 from udccal.comparison.maps import DifferenceMaps
 from udccal.compilation import keep_compilations
@@ -35,8 +35,7 @@ def diff_profiles(output: Output, a: Path, b: Path, out: Path | None) -> bool:
         check_writable(out)
     one, other = load_profile(a), load_profile(b)
     with output.stage("comparing"):
-        maps = maps_of(one, other)
-        found = diff_by(one, other, maps, DiffLimits())
+        found, maps = compare(one, other, DiffLimits())
     output.answer(found.advice)
     output.table(terms_table(found))
     output.table(movement_table(found.movement))
