@@ -147,10 +147,12 @@ def test_what_changed_is_named_and_mirrored(toy: Profile) -> None:
 
 @pytest.mark.medium
 def test_a_term_without_error_bars_is_told(toy: Profile) -> None:
-    absent = with_result(toy, "psf", status=FitStatus.ABSENT)
-    doubtful = with_result(absent, "noise", status=FitStatus.POOR_FIT)
+    silent = with_result(toy, "geometry", estimates=(), cov=np.zeros((0, 0)))
+    doubtful = with_result(silent, "noise", status=FitStatus.POOR_FIT)
     found = udccal.diff(toy, doubtful)
-    assert found.terms[3].notes[0].startswith("B: this term was not found or not captured")
+    assert found.terms[1].notes == ("B: no number of this term was measured; what restoration uses is compared.",)
+    assert found.terms[1].effects[0].error is None
+    assert found.terms[3].notes[0].startswith("A and B: no number")
     assert found.terms[0].notes[0].startswith("B: Careful: the noise fit ended as POOR_FIT.")
     document = json.loads(json.dumps(plain(found), allow_nan=False))
     assert (document["format"], document["version"]) == ("udccal-diff", 1)
@@ -160,7 +162,7 @@ def test_a_term_without_error_bars_is_told(toy: Profile) -> None:
 @pytest.mark.medium
 def test_terms_that_give_no_finite_numbers_are_refused(toy: Profile) -> None:
     dark = replace(toy.psf.term, residual=np.zeros_like(toy.psf.term.residual))
-    with pytest.raises(ProfileError, match="finite rays, kernels and light"):
+    with pytest.raises(ProfileError, match="finite numbers"):
         udccal.diff(toy, with_result(toy, "psf", term=dark))
 
 

@@ -1,8 +1,11 @@
-"""Which profiles may be compared: those of one rig with one sensor."""
+"""Which profiles may be compared: those of one rig with one sensor, with finite numbers."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+
+import numpy as np
+from jaxtyping import Float
 
 from udccal.errors import ProfileError
 from udccal.profiles.profile import Profile
@@ -20,6 +23,19 @@ def check_comparable(a: Profile, b: Profile) -> None:
                 f"Expected two profiles of one rig, found another {what}: {first} in A, {second} in B. "
                 "Compare profiles of the same rig and camera."
             )
+
+
+def check_finite(*numbers: Float[np.ndarray, "..."]) -> None:
+    """Refuse numbers that were computed of a profile and cannot be compared.
+
+    Raises:
+        ProfileError: when one is not finite.
+    """
+    if not all(np.isfinite(some).all() for some in numbers):
+        raise ProfileError(
+            "Expected terms and error bars that give finite numbers, found others. Restore both profiles from copies, "
+            "or calibrate the rig again."
+        )
 
 
 def _identity(profile: Profile) -> Iterator[tuple[str, object]]:

@@ -17,7 +17,6 @@ from udccal.comparison.movement import Movement, movement
 from udccal.comparison.picture import picture_loss
 from udccal.fitting.engine.tails import chi2_tail
 from udccal.profiles.profile import Profile
-from udccal.result import FitStatus
 from udccal.sessions.schema import TermName
 
 Verdict = Literal["same", "changed, harmless", "changed"]
@@ -166,10 +165,10 @@ def _term(
     results = a.result(term), b.result(term)
     chi2, dof = found.chi2()
     columns = zip(found.names, found.units, found.a, found.b, found.values, found.sigma, strict=True)
-    absent = [name for name, result in zip("AB", results, strict=True) if result.status is FitStatus.ABSENT]
+    silent = [name for name, result in zip("AB", results, strict=True) if not result.estimates]
     notes = (
-        [f"{' and '.join(absent)}: this term was not found or not captured; its nominal form is compared."]
-        if absent
+        [f"{' and '.join(silent)}: no number of this term was measured; what restoration uses is compared."]
+        if silent
         else []
     )
     notes += [f"{name}: {result.warning}" for name, result in zip("AB", results, strict=True) if result.warning]

@@ -8,7 +8,7 @@ from typing import final, get_args
 import numpy as np
 from jaxtyping import Bool, Float
 
-from udccal.errors import ProfileError
+from udccal.comparison.comparable import check_finite
 from udccal.result import FitResult
 from udccal.sessions.schema import TermName
 
@@ -92,11 +92,7 @@ def difference(a: Estimates, b: Estimates) -> Difference:
         cov = a.cov[np.ix_(at, at)] + b.cov[np.ix_(to, to)]
         found = Difference(both, units, a.values[at], b.values[to], wrapped, cov)
         found = found.only(np.diag(cov) > 0)
-        if not np.isfinite(found.chi2()[0]):
-            raise ProfileError(
-                "Expected estimates whose differences can be divided by their sigmas, found numbers too large for "
-                "that. Restore both profiles from copies."
-            )
+        check_finite(np.array(found.chi2()[0]))
     return found
 
 

@@ -13,6 +13,7 @@ from jaxtyping import Float
 from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
+from udccal.comparison.comparable import check_finite
 from udccal.comparison.estimates import ANGLES, ORDER, Estimates, Name
 from udccal.comparison.grid import sensor_grid
 from udccal.errors import ProfileError
@@ -67,33 +68,41 @@ def _checked(result: FitResult) -> Float[np.ndarray, "n n"]:
 def _with_whole_rotation(found: Estimates, profile: Profile) -> Estimates:
     """The angles of the wire's whole rotation from camera to panel, and the lens's share of the pose's covariance."""
     at = np.array([found.names.index(("wire", name)) for name in _POSE])
-    base = Rotation.from_rotvec(np.asarray(profile.wire.term.geometry.rotation_rad, dtype=np.float64))
-
-    def whole_deg(turn_deg: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
-        return angles_deg((Rotation.from_rotvec(turn_deg, degrees=True) * base).as_rotvec())
-
-    turn, steps = found.values[at[:3]], _POSE_STEP * np.eye(3)
     values, change = found.values.copy(), np.eye(len(found.names))
-    values[at[:3]] = whole_deg(turn)
-    slopes = [(whole_deg(turn + e) - whole_deg(turn - e)) / (2 * _POSE_STEP) for e in steps]
-    change[np.ix_(at[:3], at[:3])] = np.transpose(slopes)
+    turn, steps = values[at[:3]], _POSE_STEP * np.eye(3)
     lens = [i for i, (term, name) in enumerate(found.names) if term == "geometry" and name in INTRINSIC_NAMES]
     if len(lens) == LENS:
-        change[np.ix_(at, np.array(lens))] = _by_lens(profile, values[lens], values[at])
+        change[np.ix_(at, np.array(lens))] = _by_lens(profile)
+    with np.errstate(all="ignore"):
+        values[at[:3]] = _whole_deg(profile, turn)
+        slopes = [(_whole_deg(profile, turn + e) - _whole_deg(profile, turn - e)) / (2 * _POSE_STEP) for e in steps]
+        change[np.ix_(at[:3], at[:3])] = np.transpose(slopes)
+        cov = change @ found.cov @ change.T
+    check_finite(values, cov)
     names, units = list(found.names), list(found.units)
     for i, name in zip(at, ANGLES, strict=False):
         names[i], units[i] = ("wire", name), "deg"
-    return Estimates(tuple(names), tuple(units), values, change @ found.cov @ change.T)
+    return Estimates(tuple(names), tuple(units), values, cov)
+
+
+def _whole_deg(profile: Profile, turn_deg: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
+    """(tilt, roll, yaw) of the geometry's rotation followed by ``turn_deg``, a rotation vector."""
+    base = Rotation.from_rotvec(np.asarray(profile.wire.term.geometry.rotation_rad, dtype=np.float64))
+    return angles_deg((Rotation.from_rotvec(turn_deg, degrees=True) * base).as_rotvec())
 
 
 @in_float64
-def _by_lens(profile: Profile, lens: Float[np.ndarray, "9"], pose: Float[np.ndarray, "6"]) -> Float[np.ndarray, "6 9"]:
+def _by_lens(profile: Profile) -> Float[np.ndarray, "6 9"]:
     """Derivatives of the wire's pose by the lens that its fit held.
 
     A flat shows the phase of rows and columns at every pixel. Where the lens is off, the pose makes up for it as far as
     it can: by least squares over the sensor, rows and columns alike.
     """
-    pixels, ideal = sensor_grid(profile.rig), jax.jit(unproject)
+    wire, pixels, ideal = profile.wire.term, sensor_grid(profile.rig), jax.jit(unproject)
+    of = wire.geometry
+    lens = np.concatenate([of.focal_px, of.principal_point_px, of.distortion])
+    turn = _whole_deg(profile, np.rad2deg(np.asarray(wire.rotation_rad)))
+    pose = np.concatenate([turn, [float(wire.standoff_per_pitch)], wire.offset_periods])
 
     def phases(lens: Float[np.ndarray, "9"], pose: Float[np.ndarray, "6"]) -> Float[np.ndarray, " phases"]:
         term = term_at(np.concatenate([lens, pose[:3]]), np.zeros(3))
@@ -101,6 +110,8 @@ def _by_lens(profile: Profile, lens: Float[np.ndarray, "9"], pose: Float[np.ndar
         rays = Rotation.from_rotvec(np.asarray(term.rotation_rad)).apply(rays)
         return (pose[4:] + pose[3] * rays[:, :2] / rays[:, 2:]).ravel()
 
-    by_lens = [(phases(lens + e, pose) - phases(lens - e, pose)) / e.max() for e in np.diag(STEPS[:LENS])]
-    by_pose = [(phases(lens, pose + e) - phases(lens, pose - e)) / _POSE_STEP for e in _POSE_STEP * np.eye(6)]
+    with np.errstate(all="ignore"):
+        by_lens = [(phases(lens + e, pose) - phases(lens - e, pose)) / e.max() for e in np.diag(STEPS[:LENS])]
+        by_pose = [(phases(lens, pose + e) - phases(lens, pose - e)) / _POSE_STEP for e in _POSE_STEP * np.eye(6)]
+    check_finite(np.array(by_lens), np.array(by_pose))
     return -np.linalg.lstsq(np.transpose(by_pose), np.transpose(by_lens), rcond=None)[0]

@@ -12,9 +12,9 @@ import numpy as np
 from jaxtyping import Array, Float, UInt8
 from scipy.ndimage import map_coordinates
 
+from udccal.comparison.comparable import check_finite
 from udccal.comparison.grid import kernel_places, light_step, sensor_grid
 from udccal.comparison.held import STEPS
-from udccal.errors import ProfileError
 from udccal.fitting.geometry.fit import angles_deg, term_at
 from udccal.kernels import fitted_size, kernels_at
 from udccal.models.backscatter import Backscatter, PanelResponse, grid_positions, panel_response, response_grid
@@ -74,12 +74,7 @@ def difference_maps(a: Profile, b: Profile) -> DifferenceMaps:
         light_a=_light(a, pictures),
         light_b=_light(b, pictures),
     )
-    seen = (maps.rays_px, maps.wire, maps.kernels_a, maps.kernels_b, maps.light_a, maps.light_b)
-    if not all(np.isfinite(one).all() for one in seen):
-        raise ProfileError(
-            "Expected terms that give finite rays, kernels and light, found others. Restore both profiles from copies, "
-            "or calibrate the rig again."
-        )
+    check_finite(maps.rays_px, maps.wire, maps.kernels_a, maps.kernels_b, maps.light_a, maps.light_b)
     return maps
 
 
