@@ -153,6 +153,10 @@ def test_a_term_without_error_bars_is_told(toy: Profile) -> None:
     assert found.terms[1].notes == ("B: no number of this term was measured; what restoration uses is compared.",)
     assert found.terms[1].effects[0].error is None
     assert found.terms[3].notes[0].startswith("A and B: no number")
+    wide = with_result(changed(toy), "geometry", estimates=toy.geometry.estimates, cov=1e12 * toy.geometry.cov)
+    told = udccal.diff(toy, wide).terms[1]
+    assert told.verdict == "same"
+    assert told.notes[-1].endswith("Capture more.")
     assert found.terms[0].notes[0].startswith("B: Careful: the noise fit ended as POOR_FIT.")
     document = json.loads(json.dumps(plain(found), allow_nan=False))
     assert (document["format"], document["version"]) == ("udccal-diff", 1)
@@ -166,11 +170,14 @@ def test_terms_that_give_no_finite_numbers_are_refused(toy: Profile) -> None:
         udccal.diff(toy, with_result(toy, "psf", term=dark))
 
 
-@pytest.mark.slow
+def with_wire_map(profile: Profile) -> Profile:
+    camera = profile.rig.camera
+    return replace(profile, wire_map=sensor_map(profile.wire.term, camera.rows, camera.columns).astype(np.float32))
+
+
+@pytest.mark.medium
 def test_a_knock_of_a_measured_rig_is_found(measured: Profile) -> None:
-    other = moved(measured, (0.0, 0.05, 0.0), (0.0, 0.0, 0.0))
-    camera = measured.rig.camera
-    other = replace(other, wire_map=sensor_map(other.wire.term, camera.rows, camera.columns).astype(np.float32))
+    other = with_wire_map(moved(measured, (0.0, 0.05, 0.0), (0.0, 0.0, 0.0)))
     found = udccal.diff(measured, other)
     verdicts = {one.term: one.verdict for one in found.terms}
     assert verdicts["wire"] == verdicts["backscatter"] == found.verdict == "changed"
@@ -180,3 +187,13 @@ def test_a_knock_of_a_measured_rig_is_found(measured: Profile) -> None:
     assert found.advice.startswith("Use B, the newer profile: the other one no longer describes wire (")
     assert "the camera moved by 0.0500 ± 0.000" in found.advice
     assert found.terms[2].effects[0].value == pytest.approx(0.98, rel=0.05)  # % of the wire map
+
+
+@pytest.mark.medium
+def test_five_micrometres_are_significant_and_harmless(measured: Profile) -> None:
+    found = udccal.diff(measured, with_wire_map(moved(measured, (0.0, 0.005, 0.0), (0.0, 0.0, 0.0))))
+    assert found.terms[2].verdict == found.verdict == "changed, harmless"
+    assert found.terms[2].effects[0].value == pytest.approx(0.099, rel=0.05)
+    assert found.movement.p_value < 1e-6
+    assert found.picture_dB_lost < 0.05
+    assert found.advice.startswith("Go on with either profile: wire changed, too little to matter; the camera moved by")

@@ -9,7 +9,7 @@ from udccal.comparison.movement import Moved, Movement
 
 
 def advice(
-    changed: Sequence[tuple[str, Effect | None]], harmless: Sequence[str], moved: Movement, newer: str, chance: float
+    changed: Sequence[tuple[str, Effect]], harmless: Sequence[str], moved: Movement, newer: str, chance: float
 ) -> str:
     """Return one sentence.
 
@@ -21,7 +21,7 @@ def advice(
         chance: probability below which the movement is significant.
     """
     if changed:
-        reasons = ", ".join(term if effect is None else f"{term} ({_said(effect)})" for term, effect in changed)
+        reasons = ", ".join(f"{term} ({_said(effect)})" for term, effect in changed)
         return f"Use {newer}, the newer profile: the other one no longer describes {reasons}{_movement(moved, chance)}."
     if harmless:
         terms = " and ".join(harmless)
@@ -36,16 +36,12 @@ def _said(effect: Effect) -> str:
 def _movement(moved: Movement, chance: float) -> str:
     if moved.p_value >= chance:
         return ""
-    found = [
-        f"{verb} by {length(of)}" for verb, of in (("moved", moved.distance), ("turned", moved.angle)) if _told(of)
-    ]
+    found = [*_said_of("moved", moved.distance), *_said_of("turned", moved.angle)]
     return f"; the camera {' and '.join(found)}" if found else ""
 
 
-def _told(of: Moved) -> bool:
-    return of.value is not None and of.sigma is not None and of.value > 3 * of.sigma
-
-
-def length(of: Moved) -> str:
-    """Return a length or angle with its sigma and unit; a dash where no term tells it."""
-    return "–" if of.value is None or of.sigma is None else f"{of.value:.4f} ± {of.sigma:.4f} {of.unit}"
+def _said_of(verb: str, of: Moved) -> list[str]:
+    """A length or angle with its sigma, where it is larger than that."""
+    if of.value is None or of.sigma is None or of.value <= 3 * of.sigma:
+        return []
+    return [f"{verb} by {of.value:.4f} ± {of.sigma:.4f} {of.unit}"]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal, final, get_args
 
@@ -17,6 +17,7 @@ from udccal.comparison.movement import Movement, movement
 from udccal.comparison.picture import picture_loss
 from udccal.fitting.engine.tails import chi2_tail
 from udccal.profiles.profile import Profile
+from udccal.result import FitResult
 from udccal.sessions.schema import TermName
 
 Verdict = Literal["same", "changed, harmless", "changed"]
@@ -164,25 +165,30 @@ def _term(
 ) -> TermDiff:
     results = a.result(term), b.result(term)
     chi2, dof = found.chi2()
+    verdict = verdict_of(chi2, dof, effects, limits)
     columns = zip(found.names, found.units, found.a, found.b, found.values, found.sigma, strict=True)
-    silent = [name for name, result in zip("AB", results, strict=True) if not result.estimates]
-    notes = (
-        [f"{' and '.join(silent)}: no number of this term was measured; what restoration uses is compared."]
-        if silent
-        else []
-    )
-    notes += [f"{name}: {result.warning}" for name, result in zip("AB", results, strict=True) if result.warning]
     return TermDiff(
         term=term,
-        verdict=verdict_of(chi2, dof, effects, limits),
+        verdict=verdict,
         chi2=chi2,
         dof=dof,
         p_value=chi2_tail(chi2, dof),
         effects=effects,
         estimates=tuple(EstimateDiff(name, unit, *map(float, rest)) for (_, name), unit, *rest in columns),
         not_covered=not_covered(*results),
-        notes=tuple(notes),
+        notes=tuple(_notes(results, verdict, effects)),
     )
+
+
+def _notes(results: tuple[FitResult, FitResult], verdict: Verdict, effects: Sequence[Effect]) -> Iterator[str]:
+    silent = [name for name, result in zip("AB", results, strict=True) if not result.estimates]
+    if silent:
+        yield f"{' and '.join(silent)}: no number of this term was measured; what restoration uses is compared."
+    for name, result in zip("AB", results, strict=True):
+        if result.warning:
+            yield f"{name}: {result.warning}"
+    if verdict == "same" and any(effect.harmful for effect in effects):
+        yield "An effect is beyond its limit, but the error bars are too wide to tell it from chance. Capture more."
 
 
 def _compared(profile: Profile) -> Compared:

@@ -83,7 +83,7 @@ def movement(found: Difference, pitch_mm: float, limits: DiffLimits) -> Movement
     solved = cov @ design.T @ weight @ seen.values
     chi2, dof = chi2_of(solved, cov)
     left, size = seen.values - design @ solved, chi2_of(seen.values, seen.cov)[1]
-    off = float(left @ weight @ left)
+    off = max(float(left @ weight @ left), 0.0)
     values, whole = np.full(6, np.nan), np.full((6, 6), np.nan)
     values[told], whole[np.ix_(told, told)] = solved, cov
     return Movement(
