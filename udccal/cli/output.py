@@ -84,11 +84,6 @@ class Output:
             if self._bar is not None:
                 self._bar.start()
 
-    def answer(self, sentence: str) -> None:
-        """Print a sentence that is part of the result on standard output; print nothing with ``--json``."""
-        if not self.as_json:
-            self._standard.print(sentence, highlight=False, markup=False, soft_wrap=True)
-
     def table(self, table: Table) -> None:
         """Print a table on standard output; print nothing with ``--json``."""
         if self.as_json:
@@ -99,6 +94,11 @@ class Output:
         for row in table.rows:
             shown.add_row(*row)
         self._standard.print(shown, markup=False)
+
+    def answer(self, sentence: str) -> None:
+        """Print a sentence that is part of the result on standard output; print nothing with ``--json``."""
+        if not self.as_json:
+            self._standard.print(sentence, highlight=False, markup=False, soft_wrap=True)
 
     def result(self, result: object) -> None:
         """Print the result (a dataclass) as JSON on standard output; print nothing without ``--json``."""
