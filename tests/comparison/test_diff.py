@@ -166,8 +166,10 @@ def test_a_term_without_error_bars_is_told(toy: Profile) -> None:
 @pytest.mark.medium
 def test_terms_that_give_no_finite_numbers_are_refused(toy: Profile) -> None:
     dark = replace(toy.psf.term, residual=np.zeros_like(toy.psf.term.residual))
-    with pytest.raises(ProfileError, match="finite numbers"):
-        udccal.diff(toy, with_result(toy, "psf", term=dark))
+    bent = replace(toy.geometry.term, distortion=np.full(5, 1e6))
+    for other in (with_result(toy, "psf", term=dark), with_result(toy, "geometry", term=bent)):
+        with pytest.raises(ProfileError, match="finite numbers"):
+            udccal.diff(toy, other)
 
 
 def with_wire_map(profile: Profile) -> Profile:

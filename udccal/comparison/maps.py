@@ -74,7 +74,7 @@ def difference_maps(a: Profile, b: Profile) -> DifferenceMaps:
         light_a=_light(a, pictures),
         light_b=_light(b, pictures),
     )
-    check_finite(maps.rays_px, maps.wire, maps.kernels_a, maps.kernels_b, maps.light_a, maps.light_b)
+    check_finite(maps.wire, maps.kernels_a, maps.kernels_b, maps.light_a, maps.light_b)
     return maps
 
 
@@ -89,6 +89,7 @@ def _rays(
     rays = 0.5 * (np.asarray(image(other, seen_a)) - np.asarray(image(one, seen_b)))
     slopes = [_slopes(term, seen, image) for term, seen in ((one, seen_a), (other, seen_b))]
     turns = (0.5 * (slopes[0] + slopes[1]))[:, :, -3:].reshape(-1, 3)
+    check_finite(rays, turns)
     lens = rays - (turns @ np.linalg.lstsq(turns, rays.ravel(), rcond=None)[0]).reshape(-1, 2)
     if not (_of_lens_and_pose(a.geometry) and _of_lens_and_pose(b.geometry)):
         return rays, lens, None
