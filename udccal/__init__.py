@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from udccal.calibration import Calibration as Calibration
     from udccal.calibration import calibrate as calibrate
     from udccal.calibration import fit as fit
+    from udccal.comparison.diff import ProfileDiff as ProfileDiff
+    from udccal.comparison.diff import diff as diff
     from udccal.errors import UdccalError as UdccalError
     from udccal.fitting.backscatter.fit import fit_backscatter as fit_backscatter
     from udccal.fitting.geometry.fit import fit_geometry as fit_geometry
@@ -44,6 +46,7 @@ _HOMES = {
     "FitResult": "udccal.result",
     "FitStatus": "udccal.result",
     "Profile": "udccal.profiles.profile",
+    "ProfileDiff": "udccal.comparison.diff",
     "Restorer": "udccal.restoration.runtime",
     "RigDescription": "udccal.rig",
     "Session": "udccal.sessions.store",
@@ -51,6 +54,7 @@ _HOMES = {
     "UdccalError": "udccal.errors",
     "calibrate": "udccal.calibration",
     "capture": "udccal.benches.capture",
+    "diff": "udccal.comparison.diff",
     "fit": "udccal.calibration",
     "fit_backscatter": "udccal.fitting.backscatter.fit",
     "fit_geometry": "udccal.fitting.geometry.fit",

@@ -24,6 +24,7 @@ VERBS = (
     ["simulate"],
     ["profile"],
     ["profile", "show"],
+    ["profile", "diff"],
     ["profile", "prepare"],
     ["rig"],
     ["rig", "list"],

@@ -21,6 +21,8 @@ class TermChoice(enum.StrEnum):
 
 # Exit status of a fit whose profile was written with a warning.
 DOUBTFUL = 3
+# Exit status of a comparison of profiles that have changed by more than is harmless.
+CHANGED = 3
 
 RigName = Annotated[str, typer.Option("--rig", help="Name of a shipped rig or of your own, or a folder.")]
 SessionFolder = Annotated[Path, typer.Option("--session", help="Folder of the session; continues an unfinished one.")]

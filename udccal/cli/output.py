@@ -106,6 +106,11 @@ class Output:
             shown.add_row(*row)
         self._standard.print(shown, markup=False)
 
+    def answer(self, sentence: str) -> None:
+        """Print a sentence that is part of the result on standard output; print nothing with ``--json``."""
+        if not self.as_json:
+            self._standard.print(sentence, highlight=False, markup=False, soft_wrap=True)
+
     def result(self, result: object) -> None:
         """Print the result (a dataclass) as JSON on standard output; print nothing without ``--json``."""
         if self.as_json:

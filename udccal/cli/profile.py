@@ -1,4 +1,4 @@
-"""``udccal profile``: shows what a profile holds, and prepares restoration with it."""
+"""``udccal profile``: shows what a profile holds, compares two, and prepares restoration with one."""
 
 from __future__ import annotations
 
@@ -7,10 +7,11 @@ from typing import Annotated
 
 import typer
 
+from udccal.cli.options import CHANGED
 from udccal.tiers import Tier
 
 profile_app = typer.Typer(
-    help="Show what a profile holds, or prepare it.", no_args_is_help=True, pretty_exceptions_enable=False
+    help="Show what a profile holds, compare two, or prepare one.", no_args_is_help=True, pretty_exceptions_enable=False
 )
 ProfileArgument = Annotated[
     Path, typer.Argument(metavar="PROFILE", help="The profile's folder or zip file, or a rig's name.")
@@ -38,3 +39,17 @@ def prepare(
     from udccal.cli.jobs.prepare import prepare_profile
 
     prepare_profile(context.obj, path, tier)
+
+
+@profile_app.command(no_args_is_help=True)
+def diff(
+    context: typer.Context,
+    a: Annotated[Path, typer.Argument(metavar="A", help="A profile's folder or zip file, or a rig's name.")],
+    b: Annotated[Path, typer.Argument(metavar="B", help="Another profile of the same rig.")],
+    out: Annotated[Path | None, typer.Option("--out", help="Write diff.json and diff.html to this folder.")] = None,
+) -> None:
+    """Say whether two profiles of one rig differ, by how much, whether it matters, and how the camera moved."""
+    from udccal.cli.jobs.diff import diff_profiles
+
+    if not diff_profiles(context.obj, a, b, out):
+        raise typer.Exit(CHANGED)

@@ -9,7 +9,7 @@ from jaxtyping import UInt8
 
 from udccal.cameras.protocol import Frame
 from udccal.errors import LiveError
-from udccal.live.display import Display
+from udccal.live.exposure import AutoExposure
 from udccal.restoration.runtime import Restorer
 from udccal.rig import RigDescription
 
@@ -28,7 +28,7 @@ class Restoring:
     ) -> None:
         self._restorer = restorer
         self._panel_picture = panel_picture
-        self._display = Display()
+        self._exposure: AutoExposure | None = None
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -55,8 +55,12 @@ class Restoring:
         Raises:
             RestorationError: when the frame is not of the profile's camera.
         """
-        linear = self._restorer.restore(frame.data, frame.settings.exposure_s, self._panel_picture)
-        return self._display.encode(linear)
+        restorer, exposure_s, shown = self._restorer, frame.settings.exposure_s, self._panel_picture
+        if self._exposure is None:
+            self._exposure = AutoExposure(restorer.restore(frame.data, exposure_s, shown))
+        picture = restorer.display(frame.data, exposure_s, self._exposure.tone, shown)
+        self._exposure.follow(picture)
+        return picture
 
 
 def _sizes(rig: RigDescription) -> str:

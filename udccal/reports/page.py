@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
@@ -55,6 +56,8 @@ class TermSection:
 class Page:
     """A whole report."""
 
+    template: ClassVar[str] = "report.html.j2"
+
     title: str
     verdict: str
     facts: tuple[Fact, ...]
@@ -64,7 +67,39 @@ class Page:
     sections: tuple[TermSection, ...]
 
 
-def render(page: Page) -> str:
+@dataclass(frozen=True)
+class DiffSection:
+    """One term's chapter."""
+
+    term: str
+    verdict: str
+    finding: str
+    effects: Table
+    illustrations: tuple[Illustration, ...]
+    estimates: Table
+    notes: tuple[str, ...]
+
+    @property
+    def mood(self) -> str:
+        """CSS class of the verdict."""
+        return self.verdict.split()[-1]
+
+
+@dataclass(frozen=True)
+class DiffPage:
+    """A comparison of two profiles."""
+
+    template: ClassVar[str] = "diff.html.j2"
+
+    title: str
+    verdict: str
+    facts: tuple[Fact, ...]
+    movement_sentence: str
+    movement: Table
+    sections: tuple[DiffSection, ...]
+
+
+def render(page: Page | DiffPage) -> str:
     """Return the page as HTML; all text is escaped."""
     environment = Environment(
         loader=PackageLoader("udccal.reports"),
@@ -73,10 +108,10 @@ def render(page: Page) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    return environment.get_template("report.html.j2").render(page=page)
+    return environment.get_template(page.template).render(page=page)
 
 
-def write_page(path: Path, page: Page) -> None:
+def write_page(path: Path, page: Page | DiffPage) -> None:
     """Render ``page`` and write it to ``path`` atomically."""
     path.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(path, render(page).encode("utf-8"))

@@ -11,6 +11,7 @@ from typing import final
 
 import cv2
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float32, UInt8, UInt16
 
@@ -19,7 +20,7 @@ from udccal.models.noise import Noise
 from udccal.restoration.backscatter import PanelMask
 from udccal.restoration.linear import dark_DN, scalar
 from udccal.restoration.rectify import Interpolation, Rectification
-from udccal.restoration.tone import CODES, Tone, table_codes
+from udccal.restoration.tone import CODES, Tone
 
 # OpenCV names a pattern by its second row from the second column on.
 _DEMOSAIC = {
@@ -120,4 +121,6 @@ def _codes(
 ) -> UInt8[Array, "rows columns"]:
     """Return display codes of the signal without backscatter, which is ``light`` times that of a white panel."""
     clean = signal_e if white is None else signal_e - light[channels] * white
-    return table_codes(clean, scale[channels], CODES)
+    last = len(CODES) - 1
+    step = jnp.clip(clean * scale[channels] * last + 0.5, 0.0, last + 0.5).astype(jnp.int32)
+    return jnp.asarray(CODES)[step]

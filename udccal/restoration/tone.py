@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import jax
-import jax.numpy as jnp
+import cv2
 import numpy as np
-from jaxtyping import Array, Float, Float32, UInt8, UInt16
+from jaxtyping import Float, Float32, UInt8, UInt16
 
 _PERCENTILE, _LEVEL = 97.0, 0.9
 
@@ -25,7 +24,9 @@ class Tone:
 
     def rgb8(self, linear: Float32[np.ndarray, "rows columns 3"]) -> UInt8[np.ndarray, "rows columns 3"]:
         """Return what a display shows, in 8 bits: ``to_rgb8(apply(linear))`` by a table, within 1 of 255."""
-        return np.asarray(table_codes(linear, self.scale(), CODES))
+        # Rounded, and clipped at both ends.
+        steps = cv2.multiply(linear, (*(self.scale() * (len(CODES) - 1)).tolist(), 0.0), dtype=cv2.CV_16U)
+        return cv2.LUT(steps, CODES)
 
     def apply(self, linear: Float[np.ndarray, "rows columns 3"]) -> Float32[np.ndarray, "rows columns 3"]:
         """Return display-encoded values from 0 to 1."""
@@ -57,13 +58,3 @@ def to_rgb16(display: Float[np.ndarray, "rows columns 3"]) -> UInt16[np.ndarray,
 
 # 8-bit sRGB codes of 65536 even steps of linear light from 0 to 1.
 CODES = to_rgb8(encode_srgb(np.linspace(0.0, 1.0, 1 << 16)[:, None, None].repeat(3, axis=2)))[:, 0, 0]
-
-
-@jax.jit
-def table_codes(
-    light: Float32[Array, "*shape"], scale: Float32[Array, "*any"], codes: UInt8[Array, " steps"]
-) -> UInt8[Array, "*shape"]:
-    """Return codes of ``light * scale``, from 0 to 1, rounded to the nearest step."""
-    last = len(codes) - 1
-    step = jnp.clip(light * scale * last + 0.5, 0.0, last + 0.5).astype(jnp.int32)
-    return codes[step]

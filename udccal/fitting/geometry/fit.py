@@ -240,15 +240,15 @@ def with_angles(
     """
     rotation = np.asarray(Rotation.from_rotvec(-poses[parallel, :3]).mean().as_rotvec())
     steps = 1e-5 * np.eye(3)
-    slope = np.array([_angles_deg(rotation + step) - _angles_deg(rotation - step) for step in steps]).T / 2e-5
+    slope = np.array([angles_deg(rotation + step) - angles_deg(rotation - step) for step in steps]).T / 2e-5
     picks = np.zeros((LENS + 3, len(cov)))
     picks[:LENS, :LENS] = np.eye(LENS)
     for view in parallel:
         picks[LENS:, LENS + 6 * view : LENS + 6 * view + 3] = -slope / len(parallel)
-    return np.concatenate([intrinsics, _angles_deg(rotation)]), picks @ cov @ picks.T
+    return np.concatenate([intrinsics, angles_deg(rotation)]), picks @ cov @ picks.T
 
 
-def _angles_deg(rotation: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
+def angles_deg(rotation: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
     """(tilt, roll, yaw) of R_panel_camera = Ry(yaw) Rx(-tilt) Rz(roll)."""
     yaw, tilt, roll = Rotation.from_rotvec(rotation).as_euler("YXZ", degrees=True)
     return np.array([-tilt, roll, yaw])

@@ -1,0 +1,61 @@
+"""The shipped profile, and a toy one whose maps are quick to make."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.profiles.conftest import fitted
+from udccal.fitting.absent import absent_backscatter, absent_psf, absent_wire
+from udccal.fitting.geometry.bundle import INTRINSIC_NAMES
+from udccal.fitting.geometry.fit import angles_deg
+from udccal.fitting.nominal import nominal_geometry
+from udccal.models.noise import Noise
+from udccal.profiles.profile import Profile, build_profile
+from udccal.profiles.provenance import provenance_now
+from udccal.profiles.store import load_profile
+from udccal.result import Estimate
+from udccal.rig import load_rig
+from udccal.sessions.schema import StoredCamera
+
+_GEOMETRY_SIGMA = [0.03] * 4 + [1e-4, 7e-4, 1e-5, 1e-5, 1e-3] + [2e-3] * 3
+
+
+@pytest.fixture(scope="session")
+def measured() -> Profile:
+    """A whole rig as measured."""
+    return load_profile("lg55-reduced")
+
+
+@pytest.fixture(scope="session")
+def toy() -> Profile:
+    """A tiny sensor with estimates of noise and geometry; its other terms have none."""
+    rig = load_rig("lg55-reduced")
+    rig = rig.model_copy(
+        update={
+            "camera": rig.camera.model_copy(update={"columns": 96, "rows": 64, "pitch_um": 69.0}),
+            "view": rig.view.model_copy(update={"columns": 64, "rows": 36}),
+        }
+    )
+    geometry = nominal_geometry(rig)
+    lens = np.concatenate([geometry.focal_px, geometry.principal_point_px, geometry.distortion])
+    numbers = np.concatenate([lens, angles_deg(geometry.rotation_rad)])
+    names = (*INTRINSIC_NAMES, "tilt_deg", "roll_deg", "yaw_deg")
+    units = ["px"] * 4 + ["1"] * 5 + ["deg"] * 3
+    noise = Noise(*(np.float64(v) for v in (0.355, 64.1, 3969.0, 4.7, 0.08, 0.2, 1.0, 12.0, 2.0, 0.005)))
+    light, wire = absent_backscatter(rig, geometry), absent_wire(rig, geometry)
+    x = np.arange(rig.camera.columns)
+    return build_profile(
+        rig,
+        provenance_now(None, StoredCamera(vendor="Basler", model="acA2040", serial="1", backend="simulated")),
+        noise=fitted(
+            "noise", noise, (Estimate("K_DN_per_e", 0.355, 1e-3, "DN/e"), Estimate("black_DN", 64.1, 0.1, "DN"))
+        ),
+        geometry=fitted("geometry", geometry, tuple(map(Estimate, names, numbers, _GEOMETRY_SIGMA, units))),
+        wire=fitted("wire", wire),
+        psf=fitted("psf", absent_psf(rig, geometry)),
+        backscatter=fitted("backscatter", replace(light, mask=np.full(np.shape(light.mask), 2e4), window=5)),
+        wire_map=np.tile(1 + 0.01 * np.sin(x), (rig.camera.rows, 1)),
+    )

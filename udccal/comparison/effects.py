@@ -1,0 +1,132 @@
+"""What a difference of two profiles does to what is seen, term by term, in the units of the accuracy tables."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import final
+
+import numpy as np
+from jaxtyping import Float
+
+from udccal.comparison.limits import DiffLimits
+from udccal.comparison.maps import DifferenceMaps
+from udccal.comparison.picture import PictureLoss
+from udccal.profiles.profile import Profile
+from udccal.result import FitResult
+from udccal.sessions.schema import TermName
+
+_LOSS = "loss of a restored picture"
+
+
+@final
+@dataclass(frozen=True)
+class Effect:
+    """One effect of a term's difference.
+
+    Attributes:
+        name: what differs. value: by how much, in ``unit``; it is the same when the profiles change places.
+        limit: up to which it is harmless; None where it only explains.
+        error: one standard deviation by the errors that both profiles state of it; None where one states none.
+    """
+
+    name: str
+    value: float
+    unit: str
+    limit: float | None
+    error: float | None = None
+
+    @property
+    def harmful(self) -> bool:
+        """Whether it is beyond its limit."""
+        return self.limit is not None and self.value > self.limit
+
+
+def effects_of(
+    a: Profile, b: Profile, maps: DifferenceMaps, loss: PictureLoss, limits: DiffLimits
+) -> Mapping[TermName, tuple[Effect, ...]]:
+    """Return the effects of each term's difference, the first with what the accuracy tables measure."""
+    return {
+        "noise": _noise(a, b, limits),
+        "geometry": _geometry(maps, limits),
+        "wire": (
+            Effect(
+                "wire map, RMS",
+                100 * _rms(maps.wire),
+                "%",
+                limits.wire_percent,
+                _stated(a.wire, b.wire, "wire_map_rms_sigma", 1.0),
+            ),
+            Effect(_LOSS, loss.wire, "dB", limits.picture_dB),
+        ),
+        "psf": (
+            Effect(
+                "kernels, L2",
+                _kernels(maps),
+                "%",
+                limits.kernel_percent,
+                _stated(a.psf, b.psf, "kernel_relative_l2", 100.0),
+            ),
+            Effect(_LOSS, loss.psf, "dB", limits.picture_dB),
+        ),
+        "backscatter": (
+            Effect(
+                "panel's light, RMS, of its peak",
+                _light(maps),
+                "%",
+                limits.backscatter_percent,
+                _stated(a.backscatter, b.backscatter, "held_out_without_noise_of_peak", 100.0),
+            ),
+            Effect(_LOSS, loss.backscatter, "dB", limits.picture_dB),
+        ),
+    }
+
+
+def _noise(a: Profile, b: Profile, limits: DiffLimits) -> tuple[Effect, ...]:
+    shares = (
+        ("K", "K_DN_per_e", limits.K_percent),
+        ("σ_d", "sigma_d_e", limits.sigma_d_percent),
+        ("PRNU", "PRNU1288", limits.PRNU_percent),
+    )
+    found = []
+    for name, field, limit in shares:
+        one, other = (float(np.asarray(getattr(p.noise.term, field))) for p in (a, b))
+        middle = abs(one + other) / 2 or 1.0
+        found.append(Effect(name, 100 * abs(other - one) / middle, "%", limit))
+    one, other = a.noise.term, b.noise.term
+    dark_DN = float(one.K_DN_per_e * one.sigma_d_e + other.K_DN_per_e * other.sigma_d_e) / 2 or 1.0
+    off = abs(float(other.black_DN - one.black_DN)) / dark_DN
+    return (*found, Effect("black level, in dark noise of one sample", off, "σ_d", limits.black_sigma_d))
+
+
+def _geometry(maps: DifferenceMaps, limits: DiffLimits) -> tuple[Effect, ...]:
+    error = None if maps.rays_sigma_px is None else float(np.percentile(maps.rays_sigma_px, 95))
+    rays, lens = (float(np.percentile(np.hypot(*some.T), 95)) for some in (maps.rays_px, maps.lens_px))
+    return (
+        Effect("rays in the panel's frame, 95th percentile", rays, "px", limits.rays_px, error),
+        Effect("of these, the lens alone", lens, "px", None),
+    )
+
+
+def _kernels(maps: DifferenceMaps) -> float:
+    a, b = maps.kernels_a, maps.kernels_b
+    square, size = np.sum((a - b) ** 2, axis=(2, 3)), np.sqrt(np.sum(a**2, axis=(2, 3)) * np.sum(b**2, axis=(2, 3)))
+    return 100 * float(np.sqrt(square / size).mean(axis=0).max())
+
+
+def _light(maps: DifferenceMaps) -> float:
+    shares = []
+    for a, b in zip(maps.light_a, maps.light_b, strict=True):
+        peak = max(float(np.abs(a).max()), float(np.abs(b).max()))
+        shares.append(_rms(a - b) / peak if peak > 0 else 0.0)
+    return 100 * max(shares)
+
+
+def _rms(values: Float[np.ndarray, "..."]) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def _stated(a: FitResult, b: FitResult, name: str, unit: float) -> float | None:
+    """Error that both profiles state of themselves under this name, as an estimate or a diagnostic."""
+    stated = [{**{d.name: d.value for d in r.diagnostics}, **{e.name: e.value for e in r.estimates}} for r in (a, b)]
+    return unit * float(np.hypot(stated[0][name], stated[1][name])) if all(name in one for one in stated) else None

@@ -1,0 +1,51 @@
+"""Exposure of the shown pictures: it follows the light without flicker, by what was shown last."""
+
+from __future__ import annotations
+
+from typing import Final, final
+
+import numpy as np
+from jaxtyping import Float, Float32, UInt8
+
+from udccal.restoration.tone import Tone, display_exposure
+
+# Every so many pixels are looked at.
+_STEP: Final = 8
+_PERCENTILE, _WANTED, _WHITE = 97.0, 0.9 * 255, 255
+# Part of the way to the wanted exposure that one frame goes, in logarithms: a third of a second at 30 Hz.
+_PART: Final = 0.1
+
+
+@final
+class AutoExposure:
+    """The exposure at which the next picture is shown.
+
+    Args:
+        linear: a first picture in e-/s.
+    """
+
+    def __init__(self, linear: Float32[np.ndarray, "rows columns 3"]) -> None:
+        self.tone = Tone(display_exposure(linear[::_STEP, ::_STEP]))
+
+    def follow(self, shown: UInt8[np.ndarray, "rows columns 3"]) -> None:
+        """Move towards the exposure at which ``shown`` would be as bright as a still picture.
+
+        A black picture says nothing. A white one says only that the exposure is too long: it is halved.
+        """
+        codes = shown[::_STEP, ::_STEP]
+        level = float(np.percentile(codes, _PERCENTILE))
+        if level == 0:
+            return
+        if np.median(codes) == _WHITE:
+            factor = 0.5
+        elif level == _WHITE:
+            factor = 0.5**_PART
+        else:
+            factor = float(_linear(_WANTED) / _linear(level)) ** _PART
+        self.tone = Tone(self.tone.exposure * factor, self.tone.gains)
+
+
+def _linear(code: float) -> Float[np.ndarray, ""]:
+    """Return the linear light of an 8-bit sRGB code (IEC 61966-2-1)."""
+    value = code / 255
+    return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
