@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from udccal.fitting.wire.fit import fit_wire as fit_wire
     from udccal.profiles.profile import Profile as Profile
     from udccal.profiles.store import load_profile as load_profile
+    from udccal.restoration.deblur import deblur as deblur
     from udccal.restoration.runtime import Restorer as Restorer
     from udccal.result import FitResult as FitResult
     from udccal.result import FitStatus as FitStatus
@@ -54,6 +55,7 @@ _HOMES = {
     "UdccalError": "udccal.errors",
     "calibrate": "udccal.calibration",
     "capture": "udccal.benches.capture",
+    "deblur": "udccal.restoration.deblur",
     "diff": "udccal.comparison.diff",
     "fit": "udccal.calibration",
     "fit_backscatter": "udccal.fitting.backscatter.fit",

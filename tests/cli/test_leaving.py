@@ -31,7 +31,12 @@ def udccal(*words: str | Path) -> subprocess.CompletedProcess[str]:
 def test_ctrl_c_leaves_with_130_and_a_sentence(flags: list[str], tmp_path: Path) -> None:
     words = ["calibrate", "--rig", write_toy_rig(tmp_path), "--session", tmp_path / "s", "--profile", tmp_path / "p"]
     with subprocess.Popen(
-        [*COMMAND, *map(str, words), *flags], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        [*COMMAND, *map(str, words), *flags],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        # A shell that runs these tests in the background has them ignore it.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
     ) as process:
         while not (tmp_path / "s" / "session.json").exists():
             assert process.poll() is None

@@ -18,9 +18,10 @@ Samples come in units of their noise. Then one table serves every brightness, ex
 from __future__ import annotations
 
 import functools
+import itertools
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
-from typing import final
+from typing import Protocol, final, runtime_checkable
 
 import equinox as eqx
 import jax
@@ -29,7 +30,7 @@ import numpy as np
 from jaxtyping import Array, Complex64, Complex128, Float, Float32, Float64
 from scipy import fft
 
-from udccal.cfa import Cfa
+from udccal.cfa import Site
 from udccal.restoration.kernel_grid import KernelGrid, interpolated_kernels
 from udccal.restoration.tiles import TileLayout
 
@@ -45,35 +46,52 @@ _SPARSE = 3
 _CHUNK = 6
 
 
+@runtime_checkable
+class Pattern(Protocol):
+    """What the filter needs of a colour pattern: a ``Cfa``, or pictures with several colours at one place."""
+
+    @property
+    def sites(self) -> tuple[Site, ...]:
+        """Samples of a cell."""
+
+    @property
+    def rows(self) -> int:
+        """Rows of the cell."""
+
+    @property
+    def columns(self) -> int:
+        """Columns of the cell."""
+
+
 @final
 class FilterTables(eqx.Module):
     """What the filter needs of each tile's kernels. Within jitted functions, its arrays are JAX's.
 
     Attributes:
-        matched: transfer from each site plane of the mosaic (second axis) to each of the picture (first axis): prior
+        matched: transfer from each site plane of the mosaic to the picture's plane at each place of the cell: prior
             power times the conjugate transfer of the site's colour.
         vectors: V, orthonormal, by eigenvalue and site, at the site planes' frequencies.
         values: lambda, in units of the noise.
     """
 
-    matched: Complex64[np.ndarray, "tiles sites sites site_rows site_half"]
+    matched: Complex64[np.ndarray, "tiles places sites site_rows site_half"]
     vectors: Complex64[np.ndarray, "tiles sites sites site_rows site_half"]
     values: Float32[np.ndarray, "tiles sites site_rows site_half"]
 
 
-def filter_tables(grid: KernelGrid, layout: TileLayout, cfa: Cfa, workers: int) -> FilterTables:
+def filter_tables(grid: KernelGrid, layout: TileLayout, pattern: Pattern, workers: int) -> FilterTables:
     """Compute the tables of every tile.
 
     Args:
         grid: kernels over the sensor.
         layout: the tiles.
-        cfa: the colour pattern, whose cell divides the tiles.
+        pattern: the colour pattern, whose cell divides the tiles.
         workers: threads.
     """
     kernels = interpolated_kernels(grid, layout.centres_px)
     density = prior_density(layout.rows, layout.columns)
     with ThreadPoolExecutor(workers) as pool:
-        parts = list(pool.map(lambda kernel: _tables_of(kernel, density, cfa), kernels))
+        parts = list(pool.map(lambda kernel: _tables_of(kernel, density, pattern), kernels))
     return FilterTables(*(np.stack(column) for column in zip(*parts, strict=True)))
 
 
@@ -86,22 +104,25 @@ def prior_density(rows: int, columns: int) -> Float64[np.ndarray, "rows columns"
 
 
 def _tables_of(
-    kernels: Float[np.ndarray, "3 ky kx"], density: Float64[np.ndarray, "rows columns"], cfa: Cfa
+    kernels: Float[np.ndarray, "3 ky kx"], density: Float64[np.ndarray, "rows columns"], pattern: Pattern
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     rows, columns = density.shape
     transfer = fft.fft2(np.stack([_centred(kernel, rows, columns) for kernel in kernels]))
-    half, count = columns // cfa.columns // 2 + 1, len(cfa.sites)
-    seen = [phase * transfer[site.channel] for site, phase in zip(cfa.sites, _phases(rows, columns, cfa), strict=True)]
-    matrix = np.empty((rows // cfa.rows, half, count, count), dtype=np.complex128)
-    for i, own in enumerate(cfa.sites):
-        for j, other in enumerate(cfa.sites[: i + 1]):
+    half, count, aliases = columns // pattern.columns // 2 + 1, len(pattern.sites), pattern.rows * pattern.columns
+    seen = [
+        phase * transfer[site.channel]
+        for site, phase in zip(pattern.sites, _phases(rows, columns, pattern), strict=True)
+    ]
+    matrix = np.empty((rows // pattern.rows, half, count, count), dtype=np.complex128)
+    for i, own in enumerate(pattern.sites):
+        for j, other in enumerate(pattern.sites[: i + 1]):
             product = density * seen[i] * np.conj(seen[j])
-            folded = product.reshape(cfa.rows, rows // cfa.rows, cfa.columns, -1).sum(axis=(0, 2))[:, :half]
-            matrix[..., i, j] = folded * (_COLOURS[own.channel, other.channel] / count)
+            folded = product.reshape(pattern.rows, rows // pattern.rows, pattern.columns, -1).sum(axis=(0, 2))[:, :half]
+            matrix[..., i, j] = folded * (_COLOURS[own.channel, other.channel] / aliases)
             matrix[..., j, i] = np.conj(matrix[..., i, j])
     values, vectors = np.linalg.eigh(matrix)
     return (
-        _polyphase(fft.ifft2(density * np.conj(transfer)).real, cfa).astype(np.complex64),
+        _polyphase(fft.ifft2(density * np.conj(transfer)).real, pattern).astype(np.complex64),
         np.conj(np.moveaxis(vectors, (3, 2), (0, 1))).astype(np.complex64),
         np.moveaxis(np.maximum(values, 0.0), 2, 0).astype(np.float32),
     )
@@ -116,37 +137,38 @@ def _centred(kernel: Float[np.ndarray, "ky kx"], rows: int, columns: int) -> Flo
     return placed
 
 
-def _phases(rows: int, columns: int, cfa: Cfa) -> list[Complex128[np.ndarray, "rows columns"]]:
+def _phases(rows: int, columns: int, pattern: Pattern) -> list[Complex128[np.ndarray, "rows columns"]]:
     """Return exp(2 pi i f.p) for the place p of every site."""
     y, x = np.arange(rows)[:, None] / rows, np.arange(columns) / columns
-    return [np.exp(2j * np.pi * (y * site.row + x * site.column)) for site in cfa.sites]
+    return [np.exp(2j * np.pi * (y * site.row + x * site.column)) for site in pattern.sites]
 
 
 def _polyphase(
-    filters: Float64[np.ndarray, "3 rows columns"], cfa: Cfa
-) -> Complex128[np.ndarray, "sites sites site_rows site_half"]:
+    filters: Float64[np.ndarray, "3 rows columns"], pattern: Pattern
+) -> Complex128[np.ndarray, "places sites site_rows site_half"]:
     """Return the transfer from each site plane to each plane of a picture, for one periodic filter per colour."""
-    moved = [np.roll(filters[site.channel], (site.row, site.column), axis=(0, 1)) for site in cfa.sites]
-    return fft.rfft2(np.array([[each[plane.samples] for each in moved] for plane in cfa.sites]))
+    moved = [np.roll(filters[site.channel], (site.row, site.column), axis=(0, 1)) for site in pattern.sites]
+    places = itertools.product(range(pattern.rows), range(pattern.columns))
+    return fft.rfft2(np.array([[each[y :: pattern.rows, x :: pattern.columns] for each in moved] for y, x in places]))
 
 
 def filtered(
-    tiles: Float32[np.ndarray, "tiles rows columns"],
+    tiles: Float32[np.ndarray, "tiles *colours rows columns"],
     noise_e: Float32[np.ndarray, "tiles 3"],
     tables: FilterTables,
     layout: TileLayout,
-    cfa: Cfa,
+    pattern: Pattern,
     workers: int,
     strengths: Float32[np.ndarray, "tiles"] | None = None,
 ) -> tuple[Float32[np.ndarray, "tiles 3 rows columns"], Float32[np.ndarray, " tiles"]]:
     """Demosaic and deblur tiles.
 
     Args:
-        tiles: signal in e-, backscatter subtracted.
+        tiles: signal in e-, backscatter subtracted; with an axis of colours where the pattern's sites share a place.
         noise_e: sigma of a sample of each colour in e-.
         tables: of the same tiles.
         layout: of the same tiles.
-        cfa: the colour pattern.
+        pattern: the colour pattern.
         workers: threads.
         strengths: of each tile's prior; None to choose the likeliest.
 
@@ -164,7 +186,7 @@ def filtered(
         at = np.minimum(np.arange(start, start + _CHUNK), len(tiles) - 1)
         count = min(_CHUNK, len(tiles) - start)
         part = jax.tree.map(lambda array: array[start : start + count] if count == _CHUNK else array[at], inputs)
-        pictures, chosen = _solve_chunk(*part, layout.taper, cfa=cfa)
+        pictures, chosen = _solve_chunk(*part, layout.taper, pattern=pattern)
         return np.asarray(pictures)[:count], np.asarray(chosen)[:count]
 
     chunks = range(0, len(tiles), _CHUNK)
@@ -173,29 +195,31 @@ def filtered(
     return np.concatenate([p for p, _ in parts]), np.concatenate([s for _, s in parts])
 
 
-@partial(jax.jit, static_argnames="cfa")
+@partial(jax.jit, static_argnames="pattern")
 def _solve_chunk(
-    tiles: Float32[Array, "tiles rows columns"],
+    tiles: Float32[Array, "tiles *colours rows columns"],
     noise_e: Float32[Array, "tiles 3"],
     choices: Float32[Array, "tiles choices"],
     tables: FilterTables,
     taper: Float32[Array, "rows columns"],
-    cfa: Cfa,
+    pattern: Pattern,
 ) -> tuple[Float32[Array, "tiles 3 rows columns"], Float32[Array, " tiles"]]:
-    return jax.vmap(partial(_solve, taper=taper, cfa=cfa))(tiles, noise_e, choices, tables)
+    return jax.vmap(partial(_solve, taper=taper, pattern=pattern))(tiles, noise_e, choices, tables)
 
 
 def _solve(
-    tile: Float32[Array, "rows columns"],
+    tile: Float32[Array, "*colours rows columns"],
     noise_e: Float32[Array, "3"],
     choices: Float32[Array, " choices"],
     tables: FilterTables,
     taper: Float32[Array, "rows columns"],
-    cfa: Cfa,
+    pattern: Pattern,
 ) -> tuple[Float32[Array, "3 rows columns"], Float32[Array, ""]]:
     """Solve one tile; its tables have no axis of tiles."""
-    planes, windows = (jnp.stack([whole[site.samples] for site in cfa.sites]) for whole in (tile, taper))
-    channels = np.array([site.channel for site in cfa.sites])
+    of_site = [tile] * len(pattern.sites) if tile.ndim == 2 else list(tile)
+    planes = jnp.stack([whole[site.samples] for whole, site in zip(of_site, pattern.sites, strict=True)])
+    windows = jnp.stack([taper[site.samples] for site in pattern.sites])
+    channels = np.array([site.channel for site in pattern.sites])
     own = np.array([channels == colour for colour in range(_COLOURS.shape[0])], dtype=np.float32)
     # A colour without sites is like the mean of all.
     of_all = np.where(own.any(axis=1, keepdims=True), own, 1)
@@ -208,16 +232,16 @@ def _solve(
     by_site = tables.matched * (jnp.conj(tables.vectors) * weighted[:, None]).sum(axis=0)
     by_colour = [[w * by_site[:, site] for site, w in enumerate(row)] for row in _COLOURS[:, channels].tolist()]
     mixed = jnp.stack([functools.reduce(jnp.add, parts) for parts in by_colour])
-    picture = _interleaved(jnp.fft.irfft2(mixed, s=planes.shape[1:]), cfa)
+    picture = _interleaved(jnp.fft.irfft2(mixed, s=planes.shape[1:]), pattern)
     return picture * noise_e[:, None, None] + level[:, None, None], strength
 
 
 def _interleaved(
-    planes: Float32[Array, "3 sites site_rows site_columns"], cfa: Cfa
+    planes: Float32[Array, "3 places site_rows site_columns"], pattern: Pattern
 ) -> Float32[Array, "3 rows columns"]:
     colours, _, rows, columns = planes.shape
-    by_place = planes.reshape(colours, cfa.rows, cfa.columns, rows, columns)
-    return by_place.transpose(0, 3, 1, 4, 2).reshape(colours, rows * cfa.rows, columns * cfa.columns)
+    by_place = planes.reshape(colours, pattern.rows, pattern.columns, rows, columns)
+    return by_place.transpose(0, 3, 1, 4, 2).reshape(colours, rows * pattern.rows, columns * pattern.columns)
 
 
 def _likeliest(

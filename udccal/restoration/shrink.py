@@ -17,8 +17,7 @@ import jax
 import numpy as np
 from jaxtyping import Float, Float32, Int
 
-from udccal.cfa import Cfa
-from udccal.restoration.mosaic_filter import STRENGTHS, FilterTables, filtered
+from udccal.restoration.mosaic_filter import STRENGTHS, FilterTables, Pattern, filtered
 from udccal.restoration.tiles import BLEND_PX, TAPER_PX, Strip, TileLayout
 
 _LEVELS, _BANDS = 4, 3
@@ -57,13 +56,13 @@ class BandNoise:
         return self.variance[self.probe, np.searchsorted(STRENGTHS, strengths)]
 
 
-def measured_noise(tables: FilterTables, layout: TileLayout, cfa: Cfa, workers: int) -> BandNoise:
+def measured_noise(tables: FilterTables, layout: TileLayout, pattern: Pattern, workers: int) -> BandNoise:
     """Filter noise at every strength of the prior, and measure what is left of it in each band.
 
     Args:
         tables: of the tiles.
         layout: of the tiles.
-        cfa: the colour pattern.
+        pattern: the colour pattern.
         workers: threads.
     """
     down, across = len(layout.tops), len(layout.lefts)
@@ -72,11 +71,14 @@ def measured_noise(tables: FilterTables, layout: TileLayout, cfa: Cfa, workers: 
     nearest_column = columns[np.abs(np.arange(across)[:, None] - columns).argmin(axis=1)]
     chosen, probe = np.unique(nearest_row[:, None] * across + nearest_column, return_inverse=True)
     repeated = np.repeat(chosen, len(STRENGTHS))
-    noise = np.random.default_rng(0x5EED).standard_normal((len(chosen), layout.rows, layout.columns), dtype=np.float32)
+    # Sites that share a place have samples of their own.
+    colours = len(pattern.sites) // (pattern.rows * pattern.columns)
+    shape = (len(chosen), *(() if colours == 1 else (colours,)), layout.rows, layout.columns)
+    noise = np.random.default_rng(0x5EED).standard_normal(shape, dtype=np.float32)
     tiles = np.repeat(noise, len(STRENGTHS), axis=0)
     picked = jax.tree.map(lambda table: table[repeated], tables)
     unit = np.ones((len(tiles), 3), dtype=np.float32)
-    pictures, _ = filtered(tiles, unit, picked, layout, cfa, workers, np.tile(STRENGTHS, len(chosen)))
+    pictures, _ = filtered(tiles, unit, picked, layout, pattern, workers, np.tile(STRENGTHS, len(chosen)))
     inner = slice(TAPER_PX + BLEND_PX, -TAPER_PX - BLEND_PX)
     with ThreadPoolExecutor(workers) as pool:
         parts = list(pool.map(lambda picture: _band_variances(picture[:, inner, inner]), pictures))

@@ -112,6 +112,10 @@ _COLUMNS: dict[str, tuple[tuple[str, Cell], ...]] = {
         ("95th percentile, %", _number("err_p95", factor=100)),
         ("z std", _number("z_std")),
     ),
+    "deconv": (
+        ("PSNR, dB", _number("psnr", digits=4)),
+        ("SSIM", _number("ssim")),
+    ),
     "intrinsics": (
         ("error after rotation, px", _number("rot_rms")),
         ("largest, px", _number("rot_max")),

@@ -47,6 +47,12 @@ PEERS = (
     Peer("psf_field", "piff", "psf_field_piff.py 4"),
     Peer("psf_field", "regpsf", "psf_field_regularizepsf.py 128"),
     Peer("psf_field", "jaxstar", "psf_field_starred.py"),
+    Peer("deconv", "classic", "deconv_tiles.py wiener"),
+    Peer("deconv", "classic", "deconv_tiles.py skwiener"),
+    Peer("deconv", "classic", "deconv_tiles.py skrl"),
+    Peer("deconv", "regpsf", "deconv_regularizepsf.py"),
+    Peer("deconv", "scico", "deconv_scico.py sv"),
+    Peer("deconv", "torch", "deconv_deepinv.py"),
     Peer("intrinsics", "classic", "intrinsics_opencv.py"),
     Peer("intrinsics", None, "intrinsics_mrcal.py"),
 )
@@ -54,6 +60,7 @@ OURS = {
     "noise": ("ours_noise --small 20", "ours_noise --variant nonlin --seeds 0"),
     "hdr": ("ours_hdr",),
     "psf_field": ("ours_psf_field",),
+    "deconv": ("ours_deconv",),
     "intrinsics": ("ours_intrinsics --starts 1000 --covered 200",),
 }
 

@@ -1,0 +1,90 @@
+"""Pictures deblurred by given kernels: nothing but the picture says how noisy it is."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import udccal
+from tests.restoration.blur import blurred
+from udccal.errors import RestorationError
+from udccal.restoration.deblur import _noise_line
+from udccal.restoration.kernel_grid import KernelGrid
+
+TILE = 96
+
+
+@pytest.fixture(scope="module")
+def sharp(toy_scene: np.ndarray) -> np.ndarray:
+    return toy_scene / 6000.0
+
+
+@pytest.fixture(scope="module")
+def soft(toy_grid: KernelGrid, sharp: np.ndarray) -> np.ndarray:
+    return np.stack([blurred(toy_grid, channel, sharp[..., channel]) for channel in range(3)], axis=-1)
+
+
+def rms(a: np.ndarray, b: np.ndarray) -> float:
+    return float(np.sqrt(np.mean((a - b)[8:-8, 8:-8] ** 2)))
+
+
+def noisy(soft: np.ndarray, electrons: float, seed: int = 0) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    return (rng.poisson(np.maximum(soft, 0) * electrons) + rng.normal(0, 3, soft.shape)) / electrons
+
+
+def deblurred(picture: np.ndarray, grid: KernelGrid) -> np.ndarray:
+    return udccal.deblur(picture, grid.kernels, grid.x_px, grid.y_px, tile_px=TILE, workers=1)
+
+
+@pytest.mark.parametrize("electrons", [300.0, 3e4])
+def test_a_blurred_picture_becomes_sharper_whatever_its_noise(
+    toy_grid: KernelGrid, sharp: np.ndarray, soft: np.ndarray, electrons: float
+) -> None:
+    picture = noisy(soft, electrons)
+    error = rms(deblurred(picture, toy_grid), sharp)
+    assert error < {300.0: 0.9, 3e4: 0.55}[electrons] * rms(picture, sharp)
+
+
+def test_units_do_not_matter(toy_grid: KernelGrid, soft: np.ndarray) -> None:
+    picture = noisy(soft, 3e3)
+    np.testing.assert_allclose(
+        deblurred(1e5 * picture, toy_grid), 1e5 * deblurred(picture, toy_grid), rtol=1e-3, atol=5
+    )
+
+
+def test_kernels_of_another_place_do_worse(toy_grid: KernelGrid, sharp: np.ndarray, soft: np.ndarray) -> None:
+    wrong = KernelGrid(toy_grid.x_px, toy_grid.y_px, np.ascontiguousarray(toy_grid.kernels[::-1]))
+    picture = noisy(soft, 3e4)
+    assert rms(deblurred(picture, wrong), sharp) > 1.3 * rms(deblurred(picture, toy_grid), sharp)
+
+
+def test_noise_is_a_line_over_light() -> None:
+    rng = np.random.default_rng(4)
+    light = rng.uniform(0.0, 1.0, (20, 3, 1, 1)) * np.ones((1, 1, 96, 96))
+    tiles = (light + rng.normal(size=light.shape) * np.sqrt(1e-4 + 2e-4 * light)).astype(np.float32)
+    np.testing.assert_allclose(_noise_line(tiles), (1e-4, 2e-4), rtol=0.1)
+
+
+@pytest.mark.parametrize("level", [0.0, 1.0])
+def test_a_picture_without_noise_or_light_stays_finite(toy_grid: KernelGrid, level: float) -> None:
+    even = np.full((96, 128, 3), level, np.float32)
+    np.testing.assert_allclose(deblurred(even, toy_grid), even, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        ({"picture": np.zeros((96, 128), np.float32)}, "Give three colours of both"),
+        ({"picture": np.full((96, 128, 3), np.nan, np.float32)}, "found NaN or infinity"),
+        ({"x_px": np.arange(3.0)}, "Give the picture's px at which each kernel lies"),
+        ({"y_px": np.array([3.0, 2.0, 1.0, 0.0])}, "Expected ascending places"),
+        ({"scale": 2.0}, "Divide each by its sum"),
+        ({"tile_px": 40}, "Expected tiles of at least 80"),
+    ],
+)
+def test_what_does_not_fit_is_refused(toy_grid: KernelGrid, change: dict, sentence: str) -> None:
+    given = {"picture": np.zeros((96, 128, 3), np.float32), "x_px": toy_grid.x_px, "y_px": toy_grid.y_px, **change}
+    kernels = toy_grid.kernels * given.pop("scale", 1.0)
+    with pytest.raises(RestorationError, match=sentence):
+        udccal.deblur(kernels=kernels, **given)

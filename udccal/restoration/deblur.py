@@ -1,0 +1,127 @@
+"""Deblurring of colour pictures by kernels that vary over the field, with nothing else known.
+
+The same filter as for mosaics, for pictures that have all three colours at every pixel; then the same shrinkage of
+noise. The picture itself tells how noisy it is. The variance is a straight line over its light,
+
+    variance = read + light / gain,
+
+fitted to the finest diagonal detail of the tiles, where a blurred picture has next to nothing but noise.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final, final
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Float32
+from scipy.optimize import nnls
+
+from udccal.cfa import BLUE, GREEN, RED, Site
+from udccal.errors import RestorationError
+from udccal.restoration.kernel_grid import KernelGrid
+from udccal.restoration.mosaic_filter import filter_tables, filtered
+from udccal.restoration.shrink import measured_noise, shrunk
+from udccal.restoration.tiles import layout_for
+
+_EVERY = (slice(None), slice(None))
+# The finest diagonal detail: second differences along both axes.
+_DIAGONAL = np.outer([1.0, -2.0, 1.0], [1.0, -2.0, 1.0]).astype(np.float32)
+# Median of |x| of a normal distribution with sigma 1.
+_MEDIAN = 0.6745
+_REWEIGHTINGS = 3
+
+
+@final
+@dataclass(frozen=True)
+class _ThreeColours:
+    """The pattern of pictures that have all colours at every pixel."""
+
+    sites: tuple[Site, ...] = tuple(Site(0, 0, channel, _EVERY) for channel in (RED, GREEN, BLUE))
+    rows: int = 1
+    columns: int = 1
+
+    def __hash__(self) -> int:
+        return hash(type(self))
+
+
+_PATTERN: Final = _ThreeColours()
+
+
+def deblur(
+    picture: Float[np.ndarray, "..."],
+    kernels: Float[np.ndarray, "..."],
+    x_px: Float[np.ndarray, "..."],
+    y_px: Float[np.ndarray, "..."],
+    tile_px: int = 256,
+    workers: int = 2,
+) -> Float32[np.ndarray, "rows columns 3"]:
+    """Deblur a picture.
+
+    Args:
+        picture: (rows, columns, 3), linear light of three colours in any unit.
+        kernels: (grid rows, grid columns, 3, kernel rows, kernel columns), by place of the source and colour. Their
+            middle sample is the source's place. Each sums to 1.
+        x_px: columns of the picture at which the kernels lie, ascending. y_px: rows.
+        tile_px: rows and columns of a tile at most; a tile has one kernel and one prior. At least 80.
+        workers: threads.
+
+    Returns:
+        the picture as it was before the blur, in its unit. Where there is noise alone, values scatter about 0.
+
+    Raises:
+        RestorationError: when a number is not finite, the kernels do not sum to 1, or shapes do not agree.
+    """
+    grid = _checked(picture, kernels, x_px, y_px)
+    light = np.ascontiguousarray(picture, dtype=np.float32)
+    rows, columns = light.shape[:2]
+    layout = layout_for(rows, columns, (1, 1), (tile_px, tile_px), (0, rows))
+    tiles = np.stack([layout.cut(plane) for plane in cv2.split(light)], axis=1)
+    read, slope = _noise_line(tiles)
+    noise = np.sqrt(np.maximum(read + slope * tiles.mean(axis=(2, 3)), np.finfo(np.float32).tiny)).astype(np.float32)
+    tables = filter_tables(grid, layout, _PATTERN, workers)
+    pictures, strengths = filtered(tiles, noise, tables, layout, _PATTERN, workers)
+    bands = measured_noise(tables, layout, _PATTERN, workers).of_tiles(strengths)
+    local = (read + slope * np.maximum(cv2.blur(light.mean(axis=2), (16, 16)), 0)).astype(np.float32)
+    return shrunk(layout.join(pictures), noise, local, bands, layout, workers)
+
+
+def _noise_line(tiles: Float32[np.ndarray, "tiles 3 rows columns"]) -> tuple[float, float]:
+    """Return the variance of the noise without light, and how it grows with light."""
+    gain = float(np.sum(_DIAGONAL**2))
+    planes = tiles.reshape(-1, *tiles.shape[2:])
+    detail = np.array([np.median(np.abs(cv2.filter2D(plane, cv2.CV_32F, _DIAGONAL))) for plane in planes])
+    variance = (detail.astype(np.float64) / _MEDIAN) ** 2 / gain
+    light = np.maximum(planes.mean(axis=(1, 2)), 0).astype(np.float64)
+    design = np.stack([np.ones_like(light), light], axis=1)
+    # Detail adds to noise, so that the lower ones of what was found are the noise.
+    weight = np.ones_like(light)
+    read, slope = 0.0, 0.0
+    for _ in range(_REWEIGHTINGS):
+        (read, slope), _ = nnls(design * weight[:, None], variance * weight)
+        expected = np.maximum(read + slope * light, np.finfo(np.float64).tiny)
+        weight = np.where(variance > 1.5 * expected, 0.1, 1.0) / expected
+        weight /= weight.max()
+    return float(read), float(slope)
+
+
+def _checked(picture: np.ndarray, kernels: np.ndarray, x_px: np.ndarray, y_px: np.ndarray) -> KernelGrid:
+    if picture.ndim != 3 or picture.shape[2] != 3 or kernels.ndim != 5 or kernels.shape[2] != 3:
+        raise RestorationError(
+            "Expected a picture of rows x columns x 3 and kernels of grid rows x grid columns x 3 x rows x columns, "
+            f"found {picture.shape} and {kernels.shape}. Give three colours of both."
+        )
+    if kernels.shape[:2] != (len(y_px), len(x_px)) or np.any(np.diff(x_px) <= 0) or np.any(np.diff(y_px) <= 0):
+        raise RestorationError(
+            f"Expected ascending places of {kernels.shape[1]} columns and {kernels.shape[0]} rows of kernels, found "
+            f"{len(x_px)} and {len(y_px)}. Give the picture's px at which each kernel lies."
+        )
+    if not (np.all(np.isfinite(picture)) and np.all(np.isfinite(kernels))):
+        raise RestorationError("Expected finite numbers, found NaN or infinity. Replace such pixels first.")
+    sums = kernels.sum(axis=(3, 4))
+    if not np.allclose(sums, 1.0, atol=0.02):
+        raise RestorationError(
+            f"Expected kernels that sum to 1, found sums from {sums.min():g} to {sums.max():g}. Divide each by its sum."
+        )
+    return KernelGrid(np.asarray(x_px, float), np.asarray(y_px, float), kernels)
