@@ -46,7 +46,7 @@ def test_a_movement_is_found(measured: Profile, by_mm, angles) -> None:  # type:
     assert found.whole_pitches == tuple(np.round((np.array(by_mm[:2])) / PITCH_MM))
     assert found.agreement_p_value > 0.9
     assert found.p_value < 1e-6
-    assert found.told_by == ("geometry", "wire", "backscatter")
+    assert found.terms == ("geometry", "wire", "backscatter")
 
 
 def test_there_and_back_are_opposite(measured: Profile) -> None:
@@ -104,4 +104,4 @@ def test_nothing_tells_nothing(measured: Profile) -> None:
         silent = with_result(silent, term, estimates=(), cov=np.zeros((0, 0)))  # type: ignore[arg-type]
     found = movement_of(silent, measured)
     assert values(found) == [None] * 6
-    assert (found.told_by, found.p_value) == ((), 1.0)
+    assert (found.terms, found.p_value) == ((), 1.0)

@@ -72,9 +72,9 @@ def chi2_of(values: Float[np.ndarray, " n"], cov: Float[np.ndarray, "n n"]) -> t
         return 0.0, 0
     sigma = np.sqrt(np.diag(cov))
     size, axes = np.linalg.eigh(cov / np.outer(sigma, sigma))
-    told = size > _LEAST * size.max()
-    z = (axes.T @ (values / sigma))[told] / np.sqrt(size[told])
-    return float(z @ z), int(told.sum())
+    known = size > _LEAST * size.max()
+    z = (axes.T @ (values / sigma))[known] / np.sqrt(size[known])
+    return float(z @ z), int(known.sum())
 
 
 def difference(a: Estimates, b: Estimates) -> Difference:

@@ -30,7 +30,7 @@ _PARTS = ("x", "y", "z", "tilt", "roll", "yaw")
 @final
 @dataclass(frozen=True)
 class Moved:
-    """One part of a movement. ``value`` and ``sigma`` are None where no term tells it."""
+    """One part of a movement. ``value`` and ``sigma`` are None where no term determines it."""
 
     name: str
     value: float | None
@@ -49,7 +49,7 @@ class Movement:
         whole_pitches: pitches of the panel in x and y that the movement holds; None where backscatter does not tell.
         chi2, dof, p_value: of no movement at all.
         agreement_chi2, agreement_dof, agreement_p_value: of the terms' agreement on this movement.
-        told_by: the terms that tell it.
+        terms: those from which it was solved.
     """
 
     parts: tuple[Moved, ...]
@@ -62,7 +62,7 @@ class Movement:
     agreement_chi2: float
     agreement_dof: int
     agreement_p_value: float
-    told_by: tuple[str, ...]
+    terms: tuple[str, ...]
 
 
 def movement(found: Difference, pitch_mm: float, limits: DiffLimits) -> Movement:
@@ -77,15 +77,15 @@ def movement(found: Difference, pitch_mm: float, limits: DiffLimits) -> Movement
     seen = found.only(np.array([name in rows for name in found.names], dtype=bool))
     seen, pitches = _with_whole_pitches(seen, limits)
     design = np.array([rows[name] for name in seen.names], dtype=np.float64).reshape(-1, 6)
-    told = np.any(design != 0, axis=0)
-    design, weight = design[:, told], scaled_inverse(seen.cov)
+    known = np.any(design != 0, axis=0)
+    design, weight = design[:, known], scaled_inverse(seen.cov)
     cov = scaled_inverse(design.T @ weight @ design)
     solved = cov @ design.T @ weight @ seen.values
     chi2, dof = chi2_of(solved, cov)
     left, size = seen.values - design @ solved, chi2_of(seen.values, seen.cov)[1]
     off = max(float(left @ weight @ left), 0.0)
     values, whole = np.full(6, np.nan), np.full((6, 6), np.nan)
-    values[told], whole[np.ix_(told, told)] = solved, cov
+    values[known], whole[np.ix_(known, known)] = solved, cov
     return Movement(
         parts=tuple(_moved(*one) for one in zip(_PARTS, values, np.sqrt(np.diag(whole)), _UNITS, strict=True)),
         distance=_length("distance", values[:3], whole[:3, :3], "mm"),
@@ -97,7 +97,7 @@ def movement(found: Difference, pitch_mm: float, limits: DiffLimits) -> Movement
         agreement_chi2=off,
         agreement_dof=size - dof,
         agreement_p_value=chi2_tail(off, size - dof),
-        told_by=tuple(dict.fromkeys(term for term, _ in seen.names)),
+        terms=tuple(dict.fromkeys(term for term, _ in seen.names)),
     )
 
 
@@ -142,5 +142,5 @@ def _length(name: str, values: Float[np.ndarray, "3"], cov: Float[np.ndarray, "3
 
 
 def _moved(name: str, value: float, sigma: float, unit: str) -> Moved:
-    told = bool(np.isfinite(value) and np.isfinite(sigma))
-    return Moved(name, float(value) if told else None, float(sigma) if told else None, unit)
+    known = bool(np.isfinite(value) and np.isfinite(sigma))
+    return Moved(name, float(value) if known else None, float(sigma) if known else None, unit)

@@ -59,17 +59,17 @@ _PLAIN = {
 def movement_sentence(found: ProfileDiff) -> str:
     """Return who tells the movement, whether it is significant, and whether the terms agree on it."""
     moved = found.movement
-    if not moved.told_by:
+    if not moved.terms:
         return "No term of both profiles tells where the camera was."
     said = "No movement is seen" if moved.p_value >= found.limits.chance else "The camera moved"
-    said += f" (χ² {moved.chi2:.4g} of {moved.dof}; from {_listed(moved.told_by)})."
+    said += f" (χ² {moved.chi2:.4g} of {moved.dof}; from {_listed(moved.terms)})."
     if moved.agreement_dof:
         agree = moved.agreement_p_value >= found.limits.chance
         said += f" These terms {'agree' if agree else 'do not agree'} on it"
         said += f" (χ² {moved.agreement_chi2:.4g} of {moved.agreement_dof})."
         said += "" if agree else " Something else changed, too."
     if moved.whole_pitches is None:
-        said += " Whole pitches of the panel are not told: backscatter does not see its place well enough."
+        said += " Whole pitches of the panel are not known: backscatter does not see its place well enough."
     return said
 
 
