@@ -22,7 +22,7 @@ from udccal.models.wire import Wire
 from udccal.profiles.profile import build_profile
 from udccal.profiles.provenance import provenance_now
 from udccal.profiles.store import write_profile
-from udccal.result import FitResult, FitStatus
+from udccal.result import FitResult, FitStatus, TermResults
 from udccal.rig import RigDescription
 from udccal.sessions.manifest import MANIFEST_NAME
 from udccal.sessions.schema import TermName
@@ -51,7 +51,7 @@ class Foundation:
 
 
 @dataclass(frozen=True)
-class Calibration:
+class Calibration(TermResults):
     """The five results of one session and their durations."""
 
     session: Session
@@ -85,10 +85,6 @@ class Calibration:
         """All five results, in the order of ``TermName``."""
         return self.noise, self.geometry, self.wire, self.psf, self.backscatter
 
-    def result(self, term: TermName) -> FitResult:
-        """Return the result of a term by its name."""
-        return next(result for result in self.results if result.name == term)
-
     def or_raise(self) -> Calibration:
         """Return itself when every fit ended well.
 
@@ -103,11 +99,6 @@ class Calibration:
     def not_captured(self) -> tuple[TermName, ...]:
         """The terms that the session has no captures of."""
         return tuple(term for term in ORDER if self.result(term).status is FitStatus.NOT_CAPTURED)
-
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """A sentence for each term that is usable though its fit did not end well."""
-        return tuple(result.warning for result in self.results if result.warning)
 
     def write(self, path: str | Path) -> Path:
         """Write the profile as a folder, or as one file if ``path`` ends in ``.zip``; replace a profile at ``path``.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import abc
 import enum
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -208,3 +209,21 @@ class FitResult(Generic[Term]):
         """The error of a fit that did not end well, with the advice of its status."""
         detail = f" {' '.join(self.notes)}" if self.notes else ""
         return FitError(f"The {self.name} fit ended as {self.status.name}: {self.status.value}{detail}")
+
+
+class TermResults(abc.ABC):
+    """The results of all five terms: of a calibration, or as a profile keeps them."""
+
+    @property
+    @abc.abstractmethod
+    def results(self) -> tuple[FitResult, FitResult, FitResult, FitResult, FitResult]:
+        """All five results, in the order of ``TermName``."""
+
+    def result(self, term: str) -> FitResult:
+        """Return the result of a term by its name."""
+        return next(result for result in self.results if result.name == term)
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """A sentence for each term that is usable though its fit did not end well."""
+        return tuple(result.warning for result in self.results if result.warning)

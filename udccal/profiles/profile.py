@@ -14,9 +14,8 @@ from udccal.models.psf import PsfField
 from udccal.models.wire import Wire
 from udccal.profiles.pictures import backscatter_mask
 from udccal.profiles.schema import Provenance
-from udccal.result import FitResult
+from udccal.result import FitResult, TermResults
 from udccal.rig import RigDescription
-from udccal.sessions.schema import TermName
 
 # Sentences in profile.json and in the report; each names a change of the rig.
 INVALIDATED_BY = (
@@ -30,7 +29,7 @@ INVALIDATED_BY = (
 
 
 @dataclass(frozen=True)
-class Profile:
+class Profile(TermResults):
     """One rig as measured.
 
     Attributes:
@@ -59,15 +58,6 @@ class Profile:
     def results(self) -> tuple[FitResult, FitResult, FitResult, FitResult, FitResult]:
         """All five results, in the order of ``TermName``."""
         return self.noise, self.geometry, self.wire, self.psf, self.backscatter
-
-    def result(self, term: TermName) -> FitResult:
-        """Return the fit of a term by its name."""
-        return next(result for result in self.results if result.name == term)
-
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """A sentence for each term whose fit did not end well."""
-        return tuple(result.warning for result in self.results if result.warning)
 
 
 def build_profile(

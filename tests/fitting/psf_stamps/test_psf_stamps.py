@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import copy
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
 
+from tests.scenes.unchecked import checked_with
 from udccal.errors import FitError
 from udccal.fitting.psf_stamps.data import Stamps, mosaic_channels
 from udccal.fitting.psf_stamps.fit import StampsPsf, fit_psf_stamps
@@ -202,14 +201,6 @@ def test_wrong_noise_is_a_poor_fit() -> None:
     stamps, _ = make(8)
     rough = stamps.values_e + np.random.default_rng(1).normal(0, 40.0, stamps.values_e.shape)
     assert fit_psf_stamps(replace(stamps, values_e=rough), ORDERS).status is FitStatus.POOR_FIT
-
-
-def checked_with(original: Stamps, change: dict[str, Any]) -> None:
-    """Run the checks of a changed copy, past the tests' own check of types, which programs do not have."""
-    changed = copy.copy(original)
-    for name, value in change.items():
-        object.__setattr__(changed, name, value)
-    changed.__post_init__()
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import logging
 from dataclasses import replace
 from typing import Any
@@ -13,6 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.scenes.unchecked import checked_with
 from tests.scenes.wire import (
     COLUMNS,
     PRNU,
@@ -120,14 +120,6 @@ def test_rows_that_noise_may_hide_are_in_the_error_bars(electrons: float) -> Non
     z = (map_at(fit.term, places()) - map_at(flat.truth, places())) / map_sigma(fit, places())
     assert np.abs(z).max() < 3.5
     assert np.std(z) > 0.2
-
-
-def checked_with(original: WireData, change: dict[str, Any]) -> None:
-    """Run the checks of a changed copy, past the tests' own check of types, which programs do not have."""
-    changed = copy.copy(original)
-    for name, value in change.items():
-        object.__setattr__(changed, name, value)
-    changed.__post_init__()
 
 
 @pytest.mark.parametrize(
