@@ -99,3 +99,14 @@ def test_a_frame_is_no_darker_than_the_panels_light(mask: PanelMask) -> None:
     refuse_excess(0 * frame, frame, ~none)  # clipped samples say nothing
     with pytest.raises(RestorationError, match=r"8 ms are 0\.008"):
         refuse_excess(frame, 1000 * frame, none)
+
+
+def test_a_panel_that_stands_still_is_summed_once(profile: Profile, lit: Backscatter) -> None:
+    rig = profile.rig
+    panel = PanelLight.of(lit, rig, 1)
+    picture = np.full((rig.panel.rows, rig.panel.columns, 3), 200, np.uint8)
+    first = panel.rate(picture)
+    assert panel.rate(picture.copy()) is first
+    picture[:] = 100  # the same array, with another picture in it
+    assert not np.array_equal(panel.rate(picture), first)
+    np.testing.assert_array_equal(panel.rate(picture), PanelLight.of(lit, rig, 1).rate(picture))

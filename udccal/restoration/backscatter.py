@@ -56,6 +56,15 @@ class PanelSums:
 
 
 @final
+class _Latest:
+    """The latest picture of a panel, and its backscatter."""
+
+    def __init__(self) -> None:
+        self.picture: UInt8[np.ndarray, "panel_rows panel_columns 3"] | None = None
+        self.rate: Float32[np.ndarray, "rows columns"] = np.empty((0, 0), dtype=np.float32)
+
+
+@final
 @dataclass(frozen=True)
 class PanelLight:
     """The backscatter of any picture on the rig's panel, quickly.
@@ -91,7 +100,19 @@ class PanelLight:
         return cls(sums, cfa_named(rig.camera.cfa), rig.panel.rows, rig.panel.columns, block)
 
     def rate(self, picture: UInt8[np.ndarray, "panel_rows panel_columns 3"]) -> Float32[np.ndarray, "rows columns"]:
-        """Return the backscatter in e-/s at every sample of the mosaic while the panel shows ``picture``."""
+        """Return the backscatter in e-/s at every sample of the mosaic while the panel shows ``picture``.
+
+        The latest picture's is kept: a panel that stands still costs a comparison.
+        """
+        latest = self._latest
+        if latest.picture is None or not np.array_equal(latest.picture, picture):
+            latest.picture, latest.rate = picture.copy(), self._summed(picture)
+            latest.rate.setflags(write=False)
+        return latest.rate
+
+    def _summed(
+        self, picture: UInt8[np.ndarray, "rows columns 3"]
+    ) -> Float32[np.ndarray, "sensor_rows sensor_columns"]:
         light = self._blocks(cv2.LUT(picture, self.sums.light))
         collected = np.stack([sums @ plane.ravel() for sums, plane in zip(self._matrices, light, strict=True)])
         nodes = len(self.sums.down[0]), len(self.sums.across[0])
@@ -108,6 +129,10 @@ class PanelLight:
         if below or right:
             light = cv2.copyMakeBorder(light, 0, below, 0, right, cv2.BORDER_REFLECT)
         return list(cv2.split(cv2.resize(light, (across, down), interpolation=cv2.INTER_AREA)))
+
+    @functools.cached_property
+    def _latest(self) -> _Latest:
+        return _Latest()
 
     @functools.cached_property
     def _matrices(self) -> list[sparse.csr_array]:
