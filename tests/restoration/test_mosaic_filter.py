@@ -68,7 +68,7 @@ def test_the_filter_is_the_posteriors_mean(name: str) -> None:
     choices = np.full((1, len(STRENGTHS)), strength, np.float32)
     whole = np.ones((SIZE, SIZE), np.float32)
     tables = FilterTables(*(table[None] for table in _tables_of(kernel, prior_density(SIZE, SIZE), cfa)))
-    found, chosen = _solve_chunk(tile[None], np.ones((1, 3), np.float32), choices, tables, whole, cfa=cfa)
+    found, chosen = _solve_chunk(tile[None], np.ones((1, 3), np.float32), choices, tables, whole, pattern=cfa)
     expected = dense_solution(tile.astype(float), kernel, cfa, strength)
     assert float(chosen[0]) == strength
     # In sigma of a sample's noise: single precision costs most at the tile's mean, where the prior is widest.
