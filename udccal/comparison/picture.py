@@ -18,6 +18,7 @@ from scipy.ndimage import map_coordinates
 from udccal.comparison.grid import kernel_places, light_step
 from udccal.comparison.maps import DifferenceMaps
 from udccal.profiles.profile import Profile
+from udccal.restoration.kernel_grid import centred
 from udccal.restoration.metrics import encode_srgb
 
 # Side of a tile in px; the scene's mean, spread and darkest place; its power spectrum falls as frequency to this power.
@@ -125,12 +126,9 @@ def _seen(
     for (x, y), kernel in zip(kernel_places(profile.rig), kernels, strict=True):
         down, across = (np.clip(int(p) + span, 0, n - 1) for p, n in zip((y, x), profile.wire_map.shape, strict=True))
         at = np.meshgrid((down + 0.5) / step - 0.5, (across + 0.5) / step - 0.5, indexing="ij")
-        ky, kx = kernel.shape[1:]
-        whole = np.zeros((3, _TILE, _TILE))
-        whole[:, :ky, :kx] = kernel
         found.append(
             _Seen(
-                psf=np.fft.rfft2(np.roll(whole, (-(ky // 2), -(kx // 2)), axis=(1, 2))),
+                psf=np.fft.rfft2(np.stack([centred(one, _TILE, _TILE) for one in kernel])),
                 backscatter=np.stack([map_coordinates(one, at, order=1, mode="nearest") for one in light]),
                 wire=profile.wire_map[np.ix_(down, across)].astype(np.float64),
             )

@@ -69,7 +69,7 @@ class _Latest:
 class PanelLight:
     """The backscatter of any picture on the rig's panel, quickly.
 
-    The footprint of the pupil covers some dozen panel pixels, so that blocks of 2 x 2 of them tell nearly as much.
+    The footprint of the pupil covers some dozen panel pixels. Sums over blocks of them are quicker and less accurate.
 
     Attributes:
         sums: the term, evaluated.

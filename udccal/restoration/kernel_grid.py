@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Float64
 from scipy.interpolate import make_interp_spline
 
 
@@ -32,6 +32,15 @@ def interpolated_kernels(
     weights = (along_y[:, :, None] * along_x[:, None, :]).reshape(len(positions_px), -1)
     flat = grid.kernels.reshape(weights.shape[1], -1)
     return (weights.astype(np.float32) @ flat.astype(np.float32)).reshape(-1, *grid.kernels.shape[2:])
+
+
+def centred(kernel: Float[np.ndarray, "ky kx"], rows: int, columns: int) -> Float64[np.ndarray, "rows columns"]:
+    """Return a periodic picture of a kernel with its middle sample at (0, 0); a larger kernel wraps around."""
+    placed = np.zeros((rows, columns))
+    ky, kx = kernel.shape
+    at_y, at_x = (np.arange(ky) - ky // 2) % rows, (np.arange(kx) - kx // 2) % columns
+    np.add.at(placed, (at_y[:, None], at_x), kernel)
+    return placed
 
 
 def _interpolation(nodes: Float[np.ndarray, " n"], at: Float[np.ndarray, " m"]) -> Float[np.ndarray, "m n"]:

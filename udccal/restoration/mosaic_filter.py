@@ -31,7 +31,7 @@ from jaxtyping import Array, Complex64, Complex128, Float, Float32, Float64
 from scipy import fft
 
 from udccal.cfa import Site
-from udccal.restoration.kernel_grid import KernelGrid, interpolated_kernels
+from udccal.restoration.kernel_grid import KernelGrid, centred, interpolated_kernels
 from udccal.restoration.tiles import TileLayout
 
 # Of the prior, fitted on photographs of two magnifications: the exponent of its power spectrum, the frequency in
@@ -107,7 +107,7 @@ def _tables_of(
     kernels: Float[np.ndarray, "3 ky kx"], density: Float64[np.ndarray, "rows columns"], pattern: Pattern
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     rows, columns = density.shape
-    transfer = fft.fft2(np.stack([_centred(kernel, rows, columns) for kernel in kernels]))
+    transfer = fft.fft2(np.stack([centred(kernel, rows, columns) for kernel in kernels]))
     half, count, aliases = columns // pattern.columns // 2 + 1, len(pattern.sites), pattern.rows * pattern.columns
     seen = [
         phase * transfer[site.channel]
@@ -126,15 +126,6 @@ def _tables_of(
         np.conj(np.moveaxis(vectors, (3, 2), (0, 1))).astype(np.complex64),
         np.moveaxis(np.maximum(values, 0.0), 2, 0).astype(np.float32),
     )
-
-
-def _centred(kernel: Float[np.ndarray, "ky kx"], rows: int, columns: int) -> Float64[np.ndarray, "rows columns"]:
-    """Return a periodic picture of a kernel with its middle sample at (0, 0); a larger kernel wraps around."""
-    placed = np.zeros((rows, columns))
-    ky, kx = kernel.shape
-    at_y, at_x = (np.arange(ky) - ky // 2) % rows, (np.arange(kx) - kx // 2) % columns
-    np.add.at(placed, (at_y[:, None], at_x), kernel)
-    return placed
 
 
 def _phases(rows: int, columns: int, pattern: Pattern) -> list[Complex128[np.ndarray, "rows columns"]]:

@@ -161,10 +161,11 @@ class Restorer:
         if self.wire is not None:
             signal /= self.wire
             variance /= self.wire**2
-        panel_e = self._panel_light_e(signal, exposure_s, panel_picture)
-        if panel_picture is not None:
-            refuse_excess(signal, panel_e, saturated(mosaic, self.noise))
-        signal -= panel_e
+        if self.mask is not None:
+            panel_e = self._panel_light_e(signal, self.mask, exposure_s, panel_picture)
+            if panel_picture is not None:
+                refuse_excess(signal, panel_e, saturated(mosaic, self.noise))
+            signal -= panel_e
         if self.sharpener is None:
             return self._on_view(demosaic(signal, self.rig.camera.cfa), exposure_s)
         sharp = self.sharpener.apply(signal, variance)
@@ -209,14 +210,13 @@ class Restorer:
     def _panel_light_e(
         self,
         signal: Mosaic,
+        mask: PanelMask,
         exposure_s: float,
         panel_picture: UInt8[np.ndarray, "panel_rows panel_columns 3"] | None,
     ) -> Mosaic:
         exposure = np.float32(exposure_s)
-        if self.mask is None:
-            return np.zeros_like(signal)
         if panel_picture is None or self.panel is None:
-            return exposure * self.mask.rate(self.mask.levels(signal, exposure_s))
+            return exposure * mask.rate(mask.levels(signal, exposure_s))
         return exposure * self.panel.rate(panel_picture)
 
     @functools.cached_property
