@@ -50,7 +50,7 @@ def test_files_become_images(profile_folder: Path, tmp_path: Path) -> None:
     raw_files = write_raw_files(tmp_path / "raw", 6)
     (tmp_path / "my_hook.py").write_text("def mark(p, n):\n    p[0, 0] = n\n    return p\n")
     log, out = tmp_path / "log.jsonl", tmp_path / "out"
-    source = ["--camera", "files", "--files", raw_files, "--exposure-s", "0.001", "--fps", "2"]
+    source = ["--camera", "files", "--files", raw_files, "--exposure-s", "0.001", "--fps", "1"]
     hook = ["--hook", "my_hook:mark", "--hook-ms", "2000"]
     words = command("--profile", profile_folder, "--sink", f"images:{out}", "--log", log, *source, *hook)
     path = os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])

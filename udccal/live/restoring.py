@@ -11,6 +11,7 @@ from udccal.cameras.protocol import Frame
 from udccal.errors import LiveError
 from udccal.live.exposure import AutoExposure
 from udccal.restoration.runtime import Restorer
+from udccal.restoration.tone import Tone
 from udccal.rig import RigDescription
 
 
@@ -26,9 +27,9 @@ class Restoring:
     def __init__(
         self, restorer: Restorer, panel_picture: UInt8[np.ndarray, "panel_rows panel_columns 3"] | None = None
     ) -> None:
-        self._restorer = restorer
         self._panel_picture = panel_picture
         self._exposure: AutoExposure | None = None
+        self._restorer = self._warm(restorer)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -47,7 +48,7 @@ class Restoring:
                 f"Expected a changed profile of {before}, with which this run began, found one of {after}. "
                 "Start another run for it."
             )
-        self._restorer = restorer
+        self._restorer = self._warm(restorer)
 
     def restore(self, frame: Frame) -> UInt8[np.ndarray, "rows columns 3"]:
         """Return a frame as display-encoded RGB.
@@ -61,6 +62,14 @@ class Restoring:
         picture = restorer.display(frame.data, exposure_s, self._exposure.tone, shown)
         self._exposure.follow(picture)
         return picture
+
+    def _warm(self, restorer: Restorer) -> Restorer:
+        """Restore a grey frame: the first takes longer than others, and the camera's next ones would be dropped."""
+        camera = restorer.rig.camera
+        grey = np.full((camera.rows, camera.columns), 1 << (camera.bits - 1), np.uint16)
+        restorer.restore(grey, camera.min_exposure_s, self._panel_picture)
+        restorer.display(grey, camera.min_exposure_s, Tone(1.0), self._panel_picture)
+        return restorer
 
 
 def _sizes(rig: RigDescription) -> str:
