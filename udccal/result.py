@@ -135,6 +135,10 @@ class FitResult(Generic[Term]):
         """A result without estimates: the fit could not begin, or the session has no data for it."""
         return cls(name, term, status, (), np.zeros((0, 0)), 0.0, 0, notes=notes)
 
+    def diagnostic(self, name: str) -> float | None:
+        """The diagnostic of this name; None where the fit has none."""
+        return next((item.value for item in self.diagnostics if item.name == name), None)
+
     @property
     def ok(self) -> bool:
         """Whether nothing went wrong: the fit ended well, or there was nothing to fit."""
