@@ -84,8 +84,9 @@ def load_fit(name: str, stored: StoredFit, term: Any, folder: Path) -> FitResult
         term=term,
         status=status,
         estimates=tuple(
-            Estimate(e.name, e.value, e.sigma, e.unit, e.prior and EstimatePrior(e.prior.value, e.prior.sigma))
+            Estimate(e.name, e.value, e.sigma, e.unit, None if p is None else EstimatePrior(p.value, p.sigma))
             for e in stored.estimates
+            for p in (e.prior,)
         ),
         cov=_load_covariance(stored.covariance, folder),
         chi2_dof=stored.chi2_dof,
