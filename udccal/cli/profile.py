@@ -1,4 +1,4 @@
-"""``udccal profile``: shows what a profile holds, compares two, and prepares restoration with one."""
+"""``udccal profile``: what can be done with a profile."""
 
 from __future__ import annotations
 
@@ -11,7 +11,9 @@ from udccal.cli.options import CHANGED
 from udccal.tiers import Tier
 
 profile_app = typer.Typer(
-    help="Show what a profile holds, compare two, or prepare one.", no_args_is_help=True, pretty_exceptions_enable=False
+    help="Show, compare, copy or prepare profiles, and exchange them with other programs.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
 )
 ProfileArgument = Annotated[
     Path, typer.Argument(metavar="PROFILE", help="The profile's folder or zip file, or a rig's name.")
@@ -53,3 +55,50 @@ def diff(
 
     if not diff_profiles(context.obj, a, b, out):
         raise typer.Exit(CHANGED)
+
+
+@profile_app.command(no_args_is_help=True)
+def log(
+    context: typer.Context,
+    path: ProfileArgument,
+) -> None:
+    """Tell a profile's past: when, with what and from which session it was made, and what it was derived from."""
+    from udccal.cli.jobs.log import log_profile
+
+    log_profile(context.obj, path)
+
+
+@profile_app.command(no_args_is_help=True)
+def pack(
+    context: typer.Context,
+    path: ProfileArgument,
+    file: Annotated[Path, typer.Argument(metavar="FILE.zip", help="The zip file to write.")],
+) -> None:
+    """Write a profile as one zip file, byte for byte."""
+    from udccal.cli.jobs import copies
+
+    copies.pack(context.obj, path, file)
+
+
+@profile_app.command(no_args_is_help=True)
+def unpack(
+    context: typer.Context,
+    file: Annotated[Path, typer.Argument(metavar="FILE.zip", help="A profile's zip file.")],
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="The folder to write.")],
+) -> None:
+    """Write the profile of a zip file as a folder, byte for byte."""
+    from udccal.cli.jobs import copies
+
+    copies.unpack(context.obj, file, folder)
+
+
+@profile_app.command(no_args_is_help=True)
+def migrate(
+    context: typer.Context,
+    path: ProfileArgument,
+    out: Annotated[Path, typer.Option("--out", help="Folder to write, or a zip file.")],
+) -> None:
+    """Write a profile of an older format version anew in the present one; the old one becomes its parent."""
+    from udccal.cli.jobs import copies
+
+    copies.migrate(context.obj, path, out)
