@@ -70,7 +70,7 @@ def test_names_that_say_something_else_are_refused(folder: Path) -> None:
     with pytest.raises(ProfileError, match="name of a folder"):
         unpack_profile(folder.with_name("p.zip"), folder.with_name("q.zip"))
     for missing in (folder, folder.with_name("none.zip")):
-        with pytest.raises(ProfileError, match="zip file at .* found none"):
+        with pytest.raises(ProfileError, match=r"zip file at .* found none"):
             unpack_profile(missing, folder.with_name("q"))
 
 
@@ -114,6 +114,7 @@ def test_half_a_profile_is_not_packed(folder: Path, fault: str) -> None:
     assert sorted(folder.parent.iterdir()) == before
 
 
+@pytest.mark.medium
 def test_an_old_version_is_written_anew_with_the_old_one_as_its_parent(tmp_path: Path) -> None:
     old, new = stored_in_version_1(tmp_path / "old"), tmp_path / "new.zip"
     migrate_profile(old, new)

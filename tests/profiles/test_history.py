@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import shutil
 from pathlib import Path
 
 import pytest
@@ -17,9 +18,10 @@ from udccal.profiles.store import write_profile
 MISSING = "ab" * 32
 
 
-@pytest.fixture
-def lineage(tmp_path: Path, toy_profile: Profile) -> Path:
+@pytest.fixture(scope="module")
+def original(tmp_path_factory: pytest.TempPathFactory, toy_profile: Profile) -> Path:
     """Three profiles, each derived from the one before; the first one's parent is not there."""
+    tmp_path = tmp_path_factory.mktemp("lineage")
     write_profile(tmp_path / "first.zip", dataclasses.replace(toy_profile, parent=MISSING))
     noted = dataclasses.replace(toy_profile.psf, notes=("Fitted with an earlier noise term.",))
     other = dataclasses.replace(toy_profile.noise.term, K_DN_per_e=0.356)
@@ -37,6 +39,11 @@ def lineage(tmp_path: Path, toy_profile: Profile) -> Path:
     (tmp_path / "not mine").mkdir()
     (tmp_path / "not mine" / PROFILE_NAME).symlink_to("/dev/zero")
     return tmp_path
+
+
+@pytest.fixture
+def lineage(tmp_path: Path, original: Path) -> Path:
+    return Path(shutil.copytree(original, tmp_path / "lineage", symlinks=True))
 
 
 def test_a_lineage_is_told_from_the_newest_to_the_oldest_at_hand(lineage: Path) -> None:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import enum
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from udccal.cli.options import CHANGED
+from udccal.cli.options import CHANGED, RigName
 from udccal.tiers import Tier
 
 profile_app = typer.Typer(
@@ -15,6 +16,26 @@ profile_app = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_enable=False,
 )
+
+
+class ExportTo(enum.StrEnum):
+    """A format that profiles are exported to."""
+
+    opencv_yaml = "opencv-yaml"
+    ros_camera_info = "ros-camera-info"
+    mrcal = "mrcal"
+    npz = "npz"
+    csv = "csv"
+
+
+class ImportFrom(enum.StrEnum):
+    """A format that lenses are imported from."""
+
+    opencv_yaml = "opencv-yaml"
+    ros_camera_info = "ros-camera-info"
+    mrcal = "mrcal"
+
+
 ProfileArgument = Annotated[
     Path, typer.Argument(metavar="PROFILE", help="The profile's folder or zip file, or a rig's name.")
 ]
@@ -102,3 +123,30 @@ def migrate(
     from udccal.cli.jobs import copies
 
     copies.migrate(context.obj, path, out)
+
+
+@profile_app.command(no_args_is_help=True)
+def export(
+    context: typer.Context,
+    path: ProfileArgument,
+    to: Annotated[ExportTo, typer.Option("--to", help="The format; the covariance goes into a .json beside the file.")],
+    out: Annotated[Path, typer.Option("--out", help="The new file.")],
+) -> None:
+    """Write a profile's numbers for another program, and say what its format cannot hold."""
+    from udccal.cli.jobs.exchange import export
+
+    export(context.obj, path, to.value, out)
+
+
+@profile_app.command("import", no_args_is_help=True)
+def import_(
+    context: typer.Context,
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="Another program's calibration of the camera.")],
+    of: Annotated[ImportFrom, typer.Option("--from", help="The format of the file.")],
+    rig: RigName,
+    out: Annotated[Path, typer.Option("--out", help="Folder of the profile to write, or a zip file.")],
+) -> None:
+    """Make a profile with the lens of another program's calibration; the other terms stay nominal."""
+    from udccal.cli.jobs.exchange import import_
+
+    import_(context.obj, of.value, file, rig, out)

@@ -10,6 +10,7 @@ from pydantic import ValidationError
 from udccal.errors import FileFormatError, ProfileError, RigError
 from udccal.io.atomic import write_atomically
 from udccal.io.links import is_plain_file
+from udccal.io.out_folder import storing_in
 from udccal.io.whole_folder import folder_beside, replace_whole, standing
 from udccal.profiles.archive import pack_archive, unpacked
 from udccal.profiles.encode import decode, encode
@@ -39,6 +40,26 @@ def write_profile(path: Path, profile: Profile) -> None:
         stored = encode(profile, folder)
         write_atomically(folder / PROFILE_NAME, stored.model_dump_json(indent=1).encode() + b"\n")
         put(folder, path)
+
+
+def save_profile(profile: Profile, path: str | Path) -> Path:
+    """Write a profile as a folder, or as one file if ``path`` ends in ``.zip``, whole or not at all.
+
+    Args:
+        profile: what to write.
+        path: where to; a profile that is there is replaced, anything else is left alone.
+
+    Returns:
+        the path that was written.
+
+    Raises:
+        ProfileError: as ``write_profile``.
+        UdccalError: when it cannot be written.
+    """
+    target = Path(path)
+    with storing_in(target.parent):
+        write_profile(target, profile)
+    return target
 
 
 def put(folder: Path, path: Path) -> None:
