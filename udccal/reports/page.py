@@ -48,8 +48,9 @@ class TermSection:
     @property
     def mood(self) -> str:
         """CSS class of the status: good, absent or bad."""
-        moods = {FitStatus.CONVERGED: "good", FitStatus.ABSENT: "absent", FitStatus.NOT_CAPTURED: "absent"}
-        return moods.get(self.status, "bad")
+        if self.status is FitStatus.CONVERGED:
+            return "good"
+        return "absent" if self.status in (FitStatus.ABSENT, FitStatus.NOT_CAPTURED, FitStatus.IMPORTED) else "bad"
 
 
 @dataclass(frozen=True)
