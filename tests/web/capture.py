@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import final
 
@@ -65,6 +66,7 @@ STEPS = (
 )
 
 
+@functools.lru_cache(maxsize=64)
 def frame(columns: int = 1024, rows: int = 768, spot: tuple[float, float] | None = None, seed: int = 0) -> Frame:
     """Return a mosaic with a bright spot at a place, clipped in its middle; without a spot it is dark."""
     rng = np.random.default_rng(seed)
@@ -89,6 +91,7 @@ class PlayedCapture:
     Attributes:
         answered: every answer with the step that it was given in, in order.
         looked: frames shown so far.
+        stop: ends the play at the next question.
         frames: of a step.
     """
 
@@ -98,6 +101,7 @@ class PlayedCapture:
     answered: list[tuple[str, Answer]] = field(default_factory=list)
     looked: int = 0
     beat_s: float = 0.05
+    stop: bool = False
 
     def run(self) -> None:
         place, captured = 0, 0
@@ -135,29 +139,20 @@ class PlayedCapture:
                 Reading("exposure", 0.01, None, None, "s"),
             )
             self.person.tell(ReadingsEvent(step.id, readings, sentence))
-            answer = self.person.answer(READY, self.beat_s)
-            if answer is not None:
-                return self._note(step, answer)
+            if (answer := self._answer(step, READY)) is not None:
+                return answer
         raise AssertionError
 
     def _take(self, step: Step) -> Answer:
         for count in range(1, self.frames + 1):
             self._look(step, 0.0)
             self.person.tell(ProgressEvent(step.id, count, self.frames))
-        first = not any(one == step.id and answer is Answer.again for one, answer in self.answered)
-        wrong = step.id == "psf/led-3" and first
+        wrong = step.id == "psf/led-3" and (step.id, Answer.again) not in self.answered
         sentence = "The LED moved by 3 px during a bracket. Rest it on something." if wrong else "The step is captured."
         self.person.tell(VerdictEvent(step.id, not wrong, sentence, VERDICT))
-        for answer in self._until_answered(step):
-            return self._note(step, answer)
-        raise AssertionError
-
-    def _until_answered(self, step: Step) -> Iterator[Answer]:
-        while True:
+        while (answer := self._answer(step, VERDICT)) is None:
             self._look(step, 0.0)
-            answer = self.person.answer(VERDICT, self.beat_s)
-            if answer is not None:
-                yield answer
+        return answer
 
     def _look(self, step: Step, off_px: float) -> None:
         seen = moved(step.wanted, off_px)
@@ -166,6 +161,8 @@ class PlayedCapture:
         self.person.look(frame(spot=middle, seed=self.looked % 4), outlines)
         self.looked += 1
 
-    def _note(self, step: Step, answer: Answer) -> Answer:
-        self.answered.append((step.id, answer))
+    def _answer(self, step: Step, offered: tuple[Answer, ...]) -> Answer | None:
+        answer = Answer.quit if self.stop else self.person.answer(offered, self.beat_s)
+        if answer is not None:
+            self.answered.append((step.id, answer))
         return answer

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import enum
+import math
 import threading
 import time
 from dataclasses import dataclass, replace
@@ -17,6 +18,7 @@ from udccal.web.view import LiveView, View
 
 # How often a waiting window looks for a newer picture: frames come without a signal, so that ``look`` costs nothing.
 _TICK_S = 0.05
+_LATELY_S = 2.0
 
 
 class Reception(enum.StrEnum):
@@ -54,6 +56,12 @@ class WebPerson:
         self._version = 1
         self._questions = 0
         self._given: Answer | None = None
+        self._asked_s = -math.inf
+
+    @property
+    def watched(self) -> bool:
+        """Whether a window asked for news lately."""
+        return time.monotonic() - self._asked_s < _LATELY_S
 
     def tell(self, event: Event) -> None:
         """Show an event."""
@@ -90,6 +98,7 @@ class WebPerson:
             newer = self._view.newer(view)
             with self._changed:
                 self._lead.heard(window)
+                self._asked_s = time.monotonic()
                 if newer is not None or self._version != version or time.monotonic() >= end_s:
                     return News(self._version, self._lead.allows(window), self._shown, newer)
                 self._changed.wait_for(lambda: self._version != version, _TICK_S)

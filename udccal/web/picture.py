@@ -19,8 +19,8 @@ BINS: Final = 64
 _GAMMA = 2.2
 _JPEG_QUALITY = 80
 _STRIPE_PX = 8
-# BGR. Red and black alternate, so that a clipped sample shows on white and among coloured ones.
-_STRIPES: Final = ((40, 40, 255), (0, 0, 0))
+# Blue, green, red. Both are red, so that a lone clipped sample shows whichever it meets.
+_STRIPES: Final = ((50, 50, 255), (0, 0, 140))
 
 
 @final
@@ -82,13 +82,14 @@ def half_size(mosaic: UInt16[np.ndarray, "rows columns"], cfa: Cfa) -> UInt16[np
 def paint_zebra(
     picture: UInt8[np.ndarray, "rows columns 3"], clipped: Bool[np.ndarray, "frame_rows frame_columns"]
 ) -> None:
-    """Paint slanted stripes, in place, wherever a pixel holds a clipped sample."""
+    """Paint slanted stripes, in place, on every pixel that holds a clipped sample, and on its neighbours."""
     if not clipped.any():
         return
     # Two means, of which the first is of whole cells and quick. A lone sample is more than nothing after both.
     cells = clipped.shape[1] // 2, clipped.shape[0] // 2
     some = cv2.resize(clipped.view(np.uint8) * np.uint8(255), cells, interpolation=cv2.INTER_AREA)
     some = cv2.resize(some, picture.shape[1::-1], interpolation=cv2.INTER_AREA)
+    some = cv2.dilate(some, np.ones((3, 3), np.uint8))  # a single pixel would not be seen
     cv2.copyTo(_zebra(*some.shape), some, picture)
 
 

@@ -99,7 +99,8 @@ def serve(person: WebPerson, port: int) -> Iterator[str]:
         thread.start()
         try:
             yield server.address
-            time.sleep(_FAREWELL_S)
+            if person.watched:
+                time.sleep(_FAREWELL_S)
         finally:
             server.shutdown()
             thread.join()

@@ -30,7 +30,7 @@ class Shown:
     question: Question | None = None
 
     def after(self, event: Event) -> Shown:
-        """The same after one more event. A step, a verdict and the end close the open question."""
+        """The same after one more event. A step, a verdict and the end close the question, and end the readings."""
         match event:
             case StepEvent():
                 return Shown(step=event)
@@ -39,9 +39,9 @@ class Shown:
             case ProgressEvent():
                 return replace(self, progress=event)
             case VerdictEvent():
-                return replace(self, verdict=event, question=None)
+                return replace(self, verdict=event, readings=None, question=None)
             case DoneEvent():
-                return replace(self, done=event, question=None)
+                return Shown(step=self.step, done=event)
 
     def answered(self) -> Shown:
         """The same after an answer: the question and the verdict that led to it are past."""
