@@ -128,7 +128,7 @@ class PlayedCapture:
     def _aim(self, step: Step) -> Answer:
         """Show frames in which the light comes nearer to where it is wanted, until the person says how to go on."""
         for beat in itertools.count():
-            off_px = step.off_px * max(1.0 - beat / 15.0, 0.0)
+            off_px = step.off_px * max(1.0 - beat / 60.0, 0.0)
             self._look(step, off_px)
             sentence = f"Move it {off_px:.0f} px to the left." if off_px > 20.0 else ""
             readings = (
