@@ -19,7 +19,11 @@ import pytest
 
 CHROMIUM: Final = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 PATIENCE_S = 60.0
-_FLAGS = ("--headless", "--no-sandbox", "--disable-gpu", "--disable-background-networking", "--no-first-run")
+_FLAGS = (
+    *("--headless", "--no-sandbox", "--disable-gpu", "--disable-background-networking", "--no-first-run"),
+    # A window behind another one works as if it were in front.
+    *("--disable-renderer-backgrounding", "--disable-backgrounding-occluded-windows"),
+)
 
 
 @final
@@ -131,7 +135,7 @@ class Browser:
 
     def open(self, address: str, width: int, height: int = 900) -> Page:
         """Open a page in a window of its own; one that is less than 1000 px wide is a phone's or a tablet's."""
-        target = self.pipe.call("Target.createTarget", url="about:blank")["targetId"]
+        target = self.pipe.call("Target.createTarget", url="about:blank", newWindow=True)["targetId"]
         session = self.pipe.call("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
         page = self.pipe.pages[session] = Page(self.pipe, session)
         for domain in ("Page", "Runtime", "Log", "Network"):
