@@ -39,6 +39,8 @@ if TYPE_CHECKING:
     from udccal.rig import load_rig as load_rig
     from udccal.sessions.store import Session as Session
     from udccal.tiers import Tier as Tier
+    from udccal.validation.validate import Validation as Validation
+    from udccal.validation.validate import validate as validate
 
 __version__ = "0.1.0"
 
@@ -53,6 +55,7 @@ _HOMES = {
     "Session": "udccal.sessions.store",
     "Tier": "udccal.tiers",
     "UdccalError": "udccal.errors",
+    "Validation": "udccal.validation.validate",
     "calibrate": "udccal.calibration",
     "capture": "udccal.benches.capture",
     "deblur": "udccal.restoration.deblur",
@@ -66,6 +69,7 @@ _HOMES = {
     "load_profile": "udccal.profiles.store",
     "load_rig": "udccal.rig",
     "simulate": "udccal.benches.bench",
+    "validate": "udccal.validation.validate",
 }
 
 __all__ = list(_HOMES)

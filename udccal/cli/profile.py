@@ -1,4 +1,4 @@
-"""``udccal profile``: shows what a profile holds, compares two, and prepares restoration with one."""
+"""``udccal profile``: shows what a profile holds, compares two, validates one, and prepares restoration with one."""
 
 from __future__ import annotations
 
@@ -11,7 +11,9 @@ from udccal.cli.options import CHANGED
 from udccal.tiers import Tier
 
 profile_app = typer.Typer(
-    help="Show what a profile holds, compare two, or prepare one.", no_args_is_help=True, pretty_exceptions_enable=False
+    help="Show what a profile holds, compare two, validate one, or prepare one.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
 )
 ProfileArgument = Annotated[
     Path, typer.Argument(metavar="PROFILE", help="The profile's folder or zip file, or a rig's name.")
@@ -52,4 +54,20 @@ def diff(
     from udccal.cli.jobs.diff import diff_profiles
 
     if not diff_profiles(context.obj, a, b, out):
+        raise typer.Exit(CHANGED)
+
+
+@profile_app.command(no_args_is_help=True)
+def validate(
+    context: typer.Context,
+    path: ProfileArgument,
+    session: Annotated[Path, typer.Option("--session", help="Folder of a session of the same rig, best a later one.")],
+    out: Annotated[
+        Path | None, typer.Option("--out", help="Write validation.json and validation.html to this folder.")
+    ] = None,
+) -> None:
+    """Say whether a profile predicts a session that it was not fitted to, with a map for each term."""
+    from udccal.cli.jobs.validate import validate_profile
+
+    if not validate_profile(context.obj, path, session, out):
         raise typer.Exit(CHANGED)

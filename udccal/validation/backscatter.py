@@ -1,4 +1,4 @@
-"""Backscatter: a session's panel pictures in the dark, as a profile's backscatter term predicts them. Nothing is free."""
+"""Backscatter: a session's panel pictures in the dark, as a profile's term predicts them; nothing is solved for."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from udccal.fitting.backscatter.parameters import linear_of, vector_of
 from udccal.models.backscatter import Backscatter
 from udccal.numerics import in_float64
 from udccal.profiles.profile import Profile
+from udccal.result import FitResult
 from udccal.sessions.store import Session
 from udccal.validation.checks import Check, Judged, ZMap, at_most, chi2_check, unusable
 from udccal.validation.limits import ValidationLimits
@@ -21,15 +22,21 @@ from udccal.validation.limits import ValidationLimits
 _EVERY = 4
 
 
-@in_float64
 def validate_backscatter(profile: Profile, session: Session, limits: ValidationLimits) -> Judged:
-    """Judge the panel's brightness, the light of its pictures, and the scatter of the bins.
+    """Judge a session's panel pictures; see ``judge_backscatter``.
 
     Raises:
         SessionError: when a file of the session is missing or damaged.
     """
-    result, shading = profile.backscatter, profile.wire_map.astype(np.float64)
-    data = read_backscatter(session, profile.noise.term, result.term.geometry, shading)
+    geometry, shading = profile.backscatter.term.geometry, profile.wire_map.astype(np.float64)
+    return judge_backscatter(
+        read_backscatter(session, profile.noise.term, geometry, shading), profile.backscatter, limits
+    )
+
+
+@in_float64
+def judge_backscatter(data: BackscatterData, result: FitResult[Backscatter], limits: ValidationLimits) -> Judged:
+    """Judge the panel's brightness, the light of its pictures, and the scatter of the bins."""
     if not len(data.shots.rate):
         return unusable("backscatter", "The white picture or the dark frame is missing. Capture the backscatter steps.")
     if data.shots.rate.shape[1:] != np.shape(result.term.mask):
@@ -136,6 +143,5 @@ def _light_check(seen: _Seen, limits: ValidationLimits) -> Check:
         worst,
         limits.backscatter_percent,
         "%",
-        f"The light of {len(seen.off)} pictures is up to {worst:.2f} % of its peak from the predicted one (RMS, without "
-        "noise).",
+        f"The light of {len(seen.off)} pictures is off by up to {worst:.2f} % of its peak (RMS, without noise).",
     )

@@ -37,7 +37,7 @@ class Check:
 @final
 @dataclass(frozen=True)
 class ZMap:
-    """Errors of a prediction over an area, in units of their sigma; ``across`` and ``down`` name the axes."""
+    """Errors of a prediction in units of their sigma, NaN where nothing was seen; ``across`` and ``down`` name axes."""
 
     z: Float[np.ndarray, "rows columns"]
     across: str
@@ -60,7 +60,7 @@ def at_most(term: TermName, name: str, value: float, limit: float, unit: str, wh
 
 
 def chi2_check(
-    term: TermName, value: float, dof: float, own: float, factor: float, limits: ValidationLimits, data: str
+    term: TermName, value: float, dof: int, own: float, factor: float, limits: ValidationLimits, data: str
 ) -> Check:
     """Return the check of a reduced chi-squared.
 

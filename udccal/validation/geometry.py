@@ -37,41 +37,50 @@ _NOTHING_KNOWN = Prior(np.zeros(LENS), np.zeros((0, LENS)))
 
 
 def validate_geometry(profile: Profile, session: Session, limits: ValidationLimits) -> Judged:
-    """Judge corners with free poses, patterns in them, and the camera's turn by the board on its jig.
+    """Judge a session's boards; see ``judge_geometry``.
 
     Raises:
         SessionError: when a file of the session is missing or damaged.
         FitError: when a board's dictionary is unknown.
     """
-    rules, result = GeometryRules(), profile.geometry
-    views = [view for view in read_geometry(session, profile.noise.term, rules).views if view.usable(rules)]
+    data = read_geometry(session, profile.noise.term)
+    return judge_geometry(data.views, profile.geometry, data.image_size, limits)
+
+
+def judge_geometry(
+    views: Sequence[BoardView], result: FitResult[Geometry], image_size: tuple[int, int], limits: ValidationLimits
+) -> Judged:
+    """Judge corners with free poses, patterns in them, and the camera's turn by the board on its jig."""
+    rules = GeometryRules()
+    views = [view for view in views if view.usable(rules)]
     if not views:
         return unusable("geometry", "No board shows enough corners. Capture the boards again, evenly lit and sharp.")
     lens = Intrinsics.of_geometry(result.term).vector
     points, place = _posed(_points(views, result, rules), lens, rules)
     each = [_prediction(points, place, result, view) for view in range(len(points.names))]
     ratios = np.array([one.chi2 / one.dof for one in each])
+    noise = float(np.sqrt(2 * np.mean(points.sigma[points.used] ** 2)))
     # Boards by hand scatter unequally, by blur and light: as in the fit, each view has a scale of its own.
     points = points.scaled(np.sqrt(np.maximum(ratios, 1.0)))
     found = _prediction(points, place, result)
-    cell, shape = _cells(points, profile.rig.camera.columns, profile.rig.camera.rows, rules.pattern_cells)
+    cell, shape = _cells(points, image_size, rules.pattern_cells)
     test, size = found.pattern(np.repeat(cell, 2) * 2 + np.tile([0, 1], len(cell)))
-    sigma = float(np.sqrt(np.mean(points.sigma[points.used] ** 2)))
+    unit = float(np.sqrt(np.mean(points.sigma[points.used] ** 2)))
     off = rms_px(linearised(place, points)[0], points)
     checks = (
         at_most(
             "geometry",
             "pattern of the corners",
-            size * sigma,
+            size * unit,
             limits.rays_px,
             "px",
-            f"Corners lie {off:.3f} px (RMS) from where the profile's lens images them, {sigma * np.sqrt(2):.3f} px by "
+            f"Corners lie {off:.3f} px (RMS) from where the profile's lens images them, {noise:.3f} px by "
             f"noise alone; {'they share directions over the sensor' if test.found else 'no pattern is seen'}.",
         ),
         chi2_check(
             "geometry",
             float(np.median(ratios)),
-            float(np.median([one.dof for one in each])),
+            int(np.median([one.dof for one in each])),
             result.chi2_dof,
             limits.board_factor,
             limits,
@@ -79,7 +88,9 @@ def validate_geometry(profile: Profile, session: Session, limits: ValidationLimi
         ),
         *_jig_check(views, points, place, result.term, limits),
     )
-    caption = "Corners, seen less predicted, mean over a part of the sensor in sigma: along x at the left, y at the right."
+    caption = (
+        "Corners, seen less predicted, mean over a part of the sensor in sigma: along x at the left, y at the right."
+    )
     return Judged(checks, ZMap(_cell_means(found.z, cell, shape), "x", "y", caption))
 
 
@@ -120,9 +131,9 @@ def _prediction(points: Points, place: Bundle, result: FitResult[Geometry], only
     return Prediction(z.ravel(), own, jacobian[:, :, :LENS].reshape(-1, LENS) @ lens)
 
 
-def _cells(points: Points, columns: int, rows: int, across: int) -> tuple[Int[np.ndarray, " n"], tuple[int, int]]:
+def _cells(points: Points, image_size: tuple[int, int], across: int) -> tuple[Int[np.ndarray, " n"], tuple[int, int]]:
     """Each used corner's part of the sensor."""
-    part = np.clip(points.image[points.used] / [columns, rows] * across, 0, across - 1).astype(np.int64)
+    part = np.clip(points.image[points.used] / np.array(image_size) * across, 0, across - 1).astype(np.int64)
     return part[:, 1] * across + part[:, 0], (across, across)
 
 

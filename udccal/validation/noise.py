@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from udccal.fitting.engine.gaussian import square_root
-from udccal.fitting.noise.data import NoiseRules, read_noise
+from udccal.fitting.noise.data import NoiseData, NoiseRules, read_noise
 from udccal.fitting.noise.flats import stacked
 from udccal.fitting.noise.moments import Moments, NoiseMoments, reduced
 from udccal.fitting.noise.transfer import linear_signal, temporal_variance
@@ -31,24 +31,29 @@ _UP_TO, _NOISE, _SHADING = 0.9, 5.0, 2.5
 
 
 def validate_noise(profile: Profile, session: Session, limits: ValidationLimits) -> Judged:
-    """Judge black level, dark current, gain, and the scatter of variances.
+    """Judge a session's noise frames; see ``judge_noise``.
 
     Raises:
         SessionError: when a file of the session is missing or damaged.
         FitError: when the frames are not those of one sensor.
     """
-    seen = reduced(read_noise(session), NoiseRules())
+    return judge_noise(read_noise(session), profile.noise, limits)
+
+
+def judge_noise(data: NoiseData, result: FitResult[Noise], limits: ValidationLimits) -> Judged:
+    """Judge black level, dark current, gain, and the scatter of variances, by a profile's noise."""
+    seen = reduced(data, NoiseRules())
     if seen is None:
         return unusable("noise", "There are no pairs of dark and bright frames. Capture the noise steps again.")
-    transfer = _Transfer.of(profile.noise, seen)
+    transfer = _Transfer.of(result, seen)
     if not transfer.usable.any():
         return unusable("noise", "No flat lies between dark noise and saturation. Set up the lamp and capture again.")
     found, gain = transfer.prediction(), transfer.gain()
     z = np.full(transfer.usable.shape, np.nan)
     z[transfer.usable] = found.z
-    own = profile.noise.chi2_dof
+    own = result.chi2_dof
     checks = (
-        *_dark_checks(seen, profile.noise.term, limits),
+        *_dark_checks(seen, result.term, limits),
         at_most(
             "noise",
             "gain",
@@ -110,8 +115,7 @@ class _Transfer:
 
     def gain(self) -> float:
         """The gain by these flats over the profile's, by weighted least squares."""
-        expected = self.predicted(self.values)
-        K, black, sigma_d, row, _ = self.values
+        expected, (K, _, sigma_d, row, _) = self.predicted(self.values), self.values
         floor = (K * sigma_d) ** 2 - row**2 + self.rounding
         light, weight = expected - floor, self.dof[self.usable] / np.maximum(expected, 1e-9) ** 2
         return float(np.sum(weight * light * (self.variance[self.usable] - floor)) / np.sum(weight * light**2))

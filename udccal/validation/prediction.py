@@ -50,7 +50,8 @@ class Prediction:
         count, sums = inside.sum(axis=1), inside @ self.z
         removed, moved = inside @ self.own, inside @ self._by_profile()
         cov = np.diag(count) - removed @ removed.T + moved @ moved.T
-        test = chi2_test(*chi2_of(sums, cov))
+        statistic, dof = chi2_of(sums, cov)
+        test = chi2_test(statistic, float(dof))
         excess = float(((sums**2 - np.diag(cov)) / count).sum() / count.sum())
         return test, float(np.sqrt(max(excess, 0.0))) if test.found else 0.0
 

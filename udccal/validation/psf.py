@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float, Int
 
-from udccal.fitting.psf.data import HUBER, PsfRules, Shots, held_out_positions
+from udccal.fitting.psf.data import HUBER, PsfData, PsfRules, Shots, held_out_positions
 from udccal.fitting.psf.image import Sources, make_windows
 from udccal.fitting.psf.kernel import Evaluator, fit_lattice, pack
 from udccal.fitting.psf.orders import Compared, compare
@@ -18,6 +18,7 @@ from udccal.models.fields import polynomial_basis
 from udccal.models.psf import PsfField
 from udccal.numerics import in_float64
 from udccal.profiles.profile import Profile
+from udccal.result import FitResult
 from udccal.sessions.store import Session
 from udccal.validation.checks import Check, Judged, ZMap, at_most, chi2_check, unusable
 from udccal.validation.limits import ValidationLimits
@@ -26,26 +27,31 @@ from udccal.validation.limits import ValidationLimits
 _PICTURES = 2
 
 
-@in_float64
-def validate_psf(profile: Profile, session: Session, limits: ValidationLimits, own: bool = False) -> Judged:
-    """Judge the relative L2 error of the LEDs' pictures, and their chi-squared.
-
-    Of the profile's ``own`` session, only the positions count that its fit held out.
+def validate_psf(profile: Profile, session: Session, limits: ValidationLimits, own: bool) -> Judged:
+    """Judge a session's LEDs; see ``judge_psf``.
 
     Raises:
         SessionError: when a file of the session is missing or damaged.
     """
-    rules, term = PsfRules(), profile.psf.term
+    return judge_psf(read_psf(session, profile.noise.term, profile.wire.term), profile.psf, limits, own)
+
+
+@in_float64
+def judge_psf(data: PsfData, result: FitResult[PsfField], limits: ValidationLimits, own: bool) -> Judged:
+    """Judge the relative L2 error of the LEDs' pictures, and their chi-squared.
+
+    Of the profile's ``own`` session, only the positions count that its fit held out.
+    """
+    rules, term = PsfRules(), result.term
     if not float(term.diffraction_fraction):
         why = "The profile's psf is an image without diffraction, which does not place an LED closely enough."
         return Judged((Check("psf", "not predicted", None, None, "", None, why),))
-    data = read_psf(session, profile.noise.term, profile.wire.term, rules)
     if data.shots is None:
         return unusable("psf", "No bracket shows an LED that is not clipped. Capture the psf steps again.")
     shots = data.shots.within(rules.half_px)
     shots = shots.pick(held_out_positions(shots.positions)[shots.position]) if own else shots
     shots = shots.pick(_some(shots))
-    stated = {one.name: one.value for one in profile.psf.diagnostics}
+    stated = {one.name: one.value for one in result.diagnostics}
     model_error = stated.get("model_error", 0.0)
     found = _compared(term, shots, model_error, rules)
     colours = found.relative_l2(shots.channel)
@@ -67,7 +73,7 @@ def validate_psf(profile: Profile, session: Session, limits: ValidationLimits, o
             "psf",
             float(HUBER.loss(z[found.known]).sum()) / count,
             count,
-            profile.psf.chi2_dof,
+            result.chi2_dof,
             limits.chi2_factor,
             limits,
             "Samples of LEDs' pictures",

@@ -84,7 +84,6 @@ def judge(
     sha256 = sha256_file(session.path / MANIFEST_NAME)
     own = sha256 == profile.provenance.session_sha256
 
-
     def one(term: TermName) -> Judged:
         progress(term)
         return _judged(term, profile, session, limits, own)
@@ -119,7 +118,9 @@ def _judged(term: TermName, profile: Profile, session: Session, limits: Validati
     if not session.steps(term):
         return _not_counted(term, "NOT_CAPTURED", "The session has no captures of this term.")
     if profile.result(term).status is FitStatus.NOT_CAPTURED:
-        return _not_counted(term, "NOT_CAPTURED", "The profile has no captures of this term: there is nothing to judge.")
+        return _not_counted(
+            term, "NOT_CAPTURED", "The profile has no captures of this term: there is nothing to judge."
+        )
     match term:
         case "noise":
             return validate_noise(profile, session, limits)
@@ -140,7 +141,9 @@ def _not_counted(term: TermName, name: str, what: str) -> Judged:
 def _advice(failed: tuple[TermName, ...], own: bool) -> str:
     if failed:
         terms = " and ".join(failed)
-        return f"Do not rely on {terms} of this profile for captures like these: calibrate the rig again, or look below."
+        return (
+            f"Do not rely on {terms} of this profile for captures like these: calibrate the rig again, or look below."
+        )
     if own:
         return "The profile describes the session that it was fitted to; capture another one to confirm it."
     return "Go on with this profile: it predicts the session's captures."

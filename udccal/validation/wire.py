@@ -6,12 +6,11 @@ over the sensor are solved for.
 
 from __future__ import annotations
 
-
 import numpy as np
 from jaxtyping import Float
 
 from udccal.cfa import cfa_named
-from udccal.fitting.wire.data import FlatNoise, Pixels, Weighed, flat_noise, read_wire, sample_pixels, weighed
+from udccal.fitting.wire.data import FlatNoise, Pixels, Weighed, WireData, flat_noise, read_wire, sample_pixels, weighed
 from udccal.fitting.wire.fit import site_means, unusable_flat
 from udccal.fitting.wire.jacobian import values_at
 from udccal.fitting.wire.report import misfit
@@ -19,26 +18,26 @@ from udccal.fitting.wire.rules import WireRules
 from udccal.models.wire import Wire
 from udccal.numerics import in_float64
 from udccal.profiles.profile import Profile
+from udccal.result import FitResult
 from udccal.sessions.store import Session
 from udccal.validation.checks import Judged, ZMap, at_most, chi2_check, unusable
+from udccal.validation.flats import cell_medians, light_design
 from udccal.validation.limits import ValidationLimits
 
-# Parts of the sensor whose mean is judged, down and across; the worst one counts where it has so many pixels.
-_CELLS, _LEAST = (24, 32), 8
-# Sigma of a median over that of a mean, for a normal distribution.
-_OF_MEDIAN = 1.2533
 
-
-@in_float64
 def validate_wire(profile: Profile, session: Session, limits: ValidationLimits) -> Judged:
-    """Judge patterns by the rows' and columns' period, the worst part of the sensor, and the scatter of pixels.
+    """Judge a session's flat; see ``judge_wire``.
 
     Raises:
         SessionError: when a file of the session is missing or damaged.
     """
-    rules, result = WireRules(), profile.wire
-    data = read_wire(session, profile.noise.term, result.term.geometry, rules)
-    means = site_means(data)
+    return judge_wire(read_wire(session, profile.noise.term, profile.wire.term.geometry), profile.wire, limits)
+
+
+@in_float64
+def judge_wire(data: WireData, result: FitResult[Wire], limits: ValidationLimits) -> Judged:
+    """Judge patterns by the rows' and columns' period, the worst part of the sensor, and the scatter of pixels."""
+    rules, means = WireRules(), site_means(data)
     if (refused := unusable_flat(data, means, rules)) is not None:
         return unusable("wire", " ".join((refused[1], refused[0].value)))
     values = data.signal / means[cfa_named(data.cfa).site_map(*data.signal.shape)]
@@ -48,7 +47,7 @@ def validate_wire(profile: Profile, session: Session, limits: ValidationLimits) 
     stated = {one.name: one.value / 100 for one in result.diagnostics}.get("wire_map_rms_sigma", 0.0)
     panel = result.term if len(result.term.harmonics) else None
     off = misfit(seen, panel, stated, held_out=True)
-    cells, z = _cells(seen, noise, stated)
+    cells, sigma = cell_medians(seen, noise)
     worst, dof = float(np.nanmax(np.abs(cells))), seen.pixels.used
     checks = (
         at_most(
@@ -79,7 +78,7 @@ def validate_wire(profile: Profile, session: Session, limits: ValidationLimits) 
         ),
     )
     caption = "The flat over the wire map, median of a part of the sensor, in sigma."
-    return Judged(checks, ZMap(z, "x", "y", caption))
+    return Judged(checks, ZMap(cells / np.hypot(sigma, stated), "x", "y", caption))
 
 
 def _predicted(wire: Wire, pixels: Pixels, noise: FlatNoise) -> Weighed:
@@ -93,36 +92,7 @@ def _predicted(wire: Wire, pixels: Pixels, noise: FlatNoise) -> Weighed:
 
 
 def _smooth(pixels: Pixels, expected: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    """The light of the day: a level per site, and a polynomial of second degree, by weighted least squares."""
-    x, y = pixels.scaled.T
-    sites = np.eye(int(pixels.site.max()) + 1)[pixels.site]
-    design = np.column_stack([sites, x, y, x * x, x * y, y * y])
-    root = np.sqrt(pixels.weight) * expected
+    """The light of the day over that of the map, by weighted least squares."""
+    design, root = light_design(pixels), np.sqrt(pixels.weight) * expected
     ratio = np.where(pixels.weight > 0, pixels.value / np.maximum(expected, 1e-9), 0.0)
-    solved = np.linalg.lstsq(design * root[:, None], ratio * root, rcond=None)[0]
-    return np.asarray(design @ solved)
-
-
-def _cells(
-    seen: Weighed, noise: FlatNoise, stated: float
-) -> tuple[Float[np.ndarray, "down across"], Float[np.ndarray, "down across"]]:
-    """Median of the flat over the map, less 1, by part of the sensor; the same in sigmas of noise and map.
-
-    Pixels that are far off count here, as a smudge has many. Single defects do not move a median.
-    """
-    pixels, (down, across) = seen.pixels, _CELLS
-    here = (pixels.weight > 0) | seen.outlying
-    x, y = (np.clip(((pixels.scaled[here, i] + 1) / 2 * n).astype(int), 0, n - 1) for i, n in enumerate((across, down)))
-    expected = seen.expected[here]
-    part, variance = pixels.value[here] / expected - 1, noise.variance(pixels.site[here], expected) / expected**2
-    cell = y * across + x
-    order, ends = np.argsort(cell, kind="stable"), np.cumsum(np.bincount(cell, minlength=down * across))[:-1]
-    groups = zip(*(np.split(of[order], ends) for of in (part, variance)), strict=True)
-    found = [
-        (float(np.median(one)), float(np.hypot(_OF_MEDIAN / np.sqrt(np.sum(1 / noisy)), stated)))
-        if len(one) >= _LEAST
-        else (np.nan, np.nan)
-        for one, noisy in groups
-    ]
-    middle, sigma = np.array(found).T.reshape(2, down, across)
-    return middle, middle / sigma
+    return np.asarray(design @ np.linalg.lstsq(design * root[:, None], ratio * root, rcond=None)[0])
