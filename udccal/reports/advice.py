@@ -68,9 +68,7 @@ def _mend(term: str, status: FitStatus) -> str:
         case FitStatus.TOO_DARK:
             return f"Capture {term} again with more light or a longer exposure: noise hides it."
         case FitStatus.NOT_CONVERGED:
-            return (
-                f"Look at the residuals of {term} before you rely on it: its fit stopped early. More captures may help."
-            )
+            return f"Look at the residuals of {term} before you rely on it: its fit stopped early."
         case _:
             return (
                 f"For {term}, compare rig.toml with the rig, and capture it again if something moved or stood in the "
