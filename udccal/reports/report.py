@@ -6,11 +6,13 @@ import numpy as np
 from jaxtyping import UInt8
 
 from udccal.calibration import Calibration
+from udccal.comparison.rig_state import rig_state
 from udccal.reports import figures
 from udccal.reports.accuracy import accuracies
 from udccal.reports.advice import advice
 from udccal.reports.board_views import board_evidence
 from udccal.reports.evidence import photon_transfer
+from udccal.reports.fit_tables import state_table
 from udccal.reports.maps import fitted_maps
 from udccal.reports.page import Fact, Illustration, Page
 from udccal.reports.pictures import PictureComparison
@@ -78,6 +80,8 @@ def calibration_page(session: Session, evidence: Evidence, scene: PictureCompari
         Fact("fits", ", ".join(f"{t.term} {t.seconds:.1f} s" for t in calibration.times)),
     )
     tables = (truth_table(evidence.rows),) if evidence.rows else ()
+    if all(result.usable for result in calibration.results) and (state := rig_state(calibration)).terms:
+        tables = (state_table(state), *tables)
     return Page(
         title=f"Calibration of {calibration.rig.name}",
         advice=advice(calibration),
