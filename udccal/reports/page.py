@@ -32,6 +32,15 @@ class Illustration:
 
 
 @dataclass(frozen=True)
+class Advice:
+    """What a page begins with: a headline and at most three sentences; ``mood`` is a CSS class, such as good or bad."""
+
+    headline: str
+    mood: str
+    sentences: tuple[str, ...]
+
+
+@dataclass(frozen=True)
 class TermSection:
     """One term's chapter."""
 
@@ -60,7 +69,7 @@ class Page:
     template: ClassVar[str] = "report.html.j2"
 
     title: str
-    verdict: str
+    advice: Advice
     facts: tuple[Fact, ...]
     pictures: tuple[Illustration, ...]
     picture_sentence: str
@@ -93,7 +102,7 @@ class DiffPage:
     template: ClassVar[str] = "diff.html.j2"
 
     title: str
-    verdict: str
+    advice: Advice
     facts: tuple[Fact, ...]
     movement_sentence: str
     movement: Table
