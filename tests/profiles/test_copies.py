@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from tests.profiles.test_store import assert_same
-from tests.profiles.test_versions import stored_in_version_1
+from tests.profiles.test_versions import stored_in_version
 from udccal.errors import ProfileError
 from udccal.profiles.copies import migrate_profile, pack_profile, unpack_profile
 from udccal.profiles.history import identity
@@ -116,7 +116,7 @@ def test_half_a_profile_is_not_packed(folder: Path, fault: str) -> None:
 
 @pytest.mark.medium
 def test_an_old_version_is_written_anew_with_the_old_one_as_its_parent(tmp_path: Path) -> None:
-    old, new = stored_in_version_1(tmp_path / "old"), tmp_path / "new.zip"
+    old, new = stored_in_version(1, tmp_path / "old"), tmp_path / "new.zip"
     migrate_profile(old, new)
     assert (identity(old).version, identity(new).version) == (1, VERSION)
     profile = read_profile(new)
