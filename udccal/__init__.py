@@ -41,6 +41,8 @@ if TYPE_CHECKING:
     from udccal.rig import load_rig as load_rig
     from udccal.sessions.store import Session as Session
     from udccal.tiers import Tier as Tier
+    from udccal.validation.validate import Validation as Validation
+    from udccal.validation.validate import validate as validate
 
 __version__ = "0.1.0"
 
@@ -55,6 +57,7 @@ _HOMES = {
     "Session": "udccal.sessions.store",
     "Tier": "udccal.tiers",
     "UdccalError": "udccal.errors",
+    "Validation": "udccal.validation.validate",
     "calibrate": "udccal.calibration",
     "capture": "udccal.benches.capture",
     "deblur": "udccal.restoration.deblur",
@@ -70,6 +73,7 @@ _HOMES = {
     "restore": "udccal.restoration.one_frame",
     "save_profile": "udccal.profiles.store",
     "simulate": "udccal.benches.bench",
+    "validate": "udccal.validation.validate",
 }
 
 __all__ = list(_HOMES)

@@ -6,15 +6,16 @@ import abc
 import enum
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Generic, Protocol, TypeVar, final, runtime_checkable
+from typing import Generic, Literal, Protocol, TypeVar, final, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Float32
 
 from udccal.errors import FitError
 
 Term = TypeVar("Term")
 _Term_co = TypeVar("_Term_co", covariant=True)
+Effort = Literal["full", "quick", "own"]
 
 
 class FitStatus(enum.Enum):
@@ -35,13 +36,30 @@ class FitStatus(enum.Enum):
 
 
 @dataclass(frozen=True)
+class EstimatePrior:
+    """What was known of a quantity before the data: a nominal value, and its tolerance as one standard deviation."""
+
+    value: float
+    sigma: float
+
+
+@dataclass(frozen=True)
 class Estimate:
-    """One named quantity with its unit and its standard deviation."""
+    """One named quantity with its unit and its standard deviation.
+
+    ``quantities.toml`` says what it is. ``prior`` is what the fit started from; None where nothing was assumed.
+    """
 
     name: str
     value: float
     sigma: float
     unit: str
+    prior: EstimatePrior | None = None
+
+    @property
+    def by_prior(self) -> bool:
+        """Whether the prior decides: at least half of what is known of the quantity is the prior."""
+        return self.prior is not None and self.sigma**2 >= self.prior.sigma**2 / 2
 
 
 @dataclass(frozen=True)
@@ -84,6 +102,26 @@ class ResidualSample:
 
     positions_px: Float[np.ndarray, "n 2"]
     z: Float[np.ndarray, " n"]
+
+
+@dataclass(frozen=True)
+class Captures:
+    """The captures of a term that a fit used.
+
+    Attributes:
+        sha256: of the checksums of their files, in any order: fits of the same files have the same.
+        files: number of the files. frames: number of the camera's frames in them.
+        gain_dB: lowest and highest.
+        completed_at: of the first and of the last step, in ISO 8601.
+        temperature_C: lowest and highest of the sensor; None where the session has none.
+    """
+
+    sha256: str
+    files: int
+    frames: int
+    gain_dB: tuple[float, float]
+    completed_at: tuple[str, str]
+    temperature_C: tuple[float, float] | None = None
 
 
 @final
@@ -134,6 +172,7 @@ class FitResult(Generic[Term]):
         status: how the fit ended; NOT_CAPTURED where the session has no captures of the term, IMPORTED where the term
             is of another program.
         estimates: named numbers of the term, each with its standard deviation.
+            An element of the term's arrays has the array's name and its indices: ``fields.3.0.1.2``.
         cov: covariance of the leading estimates, in their units; of all estimates unless a note says otherwise.
         chi2_dof: reduced chi-squared; about 1 where model and noise describe the data.
         samples: number of samples used.
@@ -143,6 +182,10 @@ class FitResult(Generic[Term]):
         outliers: samples left out, by rule.
         residuals: an even sample of the residuals.
         posterior: distribution of the whole term; None where the fit failed or the result was read from a profile.
+        map_sigma: sigma of the term's map, on a coarse grid over the sensor: of the wire, relative; of the panel's
+            white in e-/s, by colour. None where none was stated.
+        captures: what the fit used; None where that is not known.
+        effort: of the fit: full, quick or own (``FitEffort.label``); None where that is not known.
     """
 
     name: str
@@ -158,11 +201,18 @@ class FitResult(Generic[Term]):
     outliers: tuple[Outliers, ...] = ()
     residuals: ResidualSample | None = None
     posterior: TermPosterior[Term] | None = None
+    map_sigma: Float32[np.ndarray, "channels grid_rows grid_columns"] | None = None
+    captures: Captures | None = None
+    effort: Effort | None = None
 
     @classmethod
     def failed(cls, name: str, term: Term, status: FitStatus, *notes: str) -> FitResult[Term]:
         """A result without estimates: the fit could not begin, or the session has no data for it."""
         return cls(name, term, status, (), np.zeros((0, 0)), 0.0, 0, notes=notes)
+
+    def diagnostic(self, name: str) -> float | None:
+        """The diagnostic of this name; None where the fit has none."""
+        return next((item.value for item in self.diagnostics if item.name == name), None)
 
     @property
     def ok(self) -> bool:
@@ -183,6 +233,11 @@ class FitResult(Generic[Term]):
         numbers = [number for e in self.estimates for number in (e.value, e.sigma)]
         stated = bool(self.estimates) and self.cov.size > 0 and np.isfinite(self.chi2_dof)
         return self.ok or bool(stated and np.isfinite(numbers).all() and np.isfinite(self.cov).all())
+
+    @property
+    def numbers(self) -> tuple[Estimate, ...]:
+        """The estimates that have a meaning of their own, without elements of the term's arrays."""
+        return tuple(one for one in self.estimates if "." not in one.name)
 
     @property
     def warning(self) -> str:

@@ -16,6 +16,7 @@ VERBS = (
     [],
     ["demo"],
     ["doctor"],
+    ["board"],
     ["calibrate"],
     ["fit"],
     ["plan"],

@@ -27,7 +27,7 @@ def udccal(*words: str | Path) -> subprocess.CompletedProcess[str]:
 
 
 def headline(report: str) -> str:
-    return report.partition('<p class="verdict">')[2].partition("</p>")[0]
+    return report.partition('<h2 class="verdict">')[2].partition("</h2>")[0]
 
 
 @pytest.fixture(scope="module")

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.linalg import block_diag
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
@@ -19,6 +20,7 @@ from udccal.fitting.geometry.fit import term_at
 from udccal.models.geometry import unproject
 from udccal.numerics import in_float64
 from udccal.profiles.profile import Profile
+from udccal.result import Estimate
 from udccal.sessions.schema import TermName
 
 
@@ -114,6 +116,13 @@ def test_the_wires_pose_makes_up_for_an_error_of_the_lens(measured: Profile) -> 
 def test_what_has_no_covariance_is_told(measured: Profile) -> None:
     assert not_covered(measured.psf, measured.psf) == ("kernel_relative_l2",)
     assert not_covered(measured.noise, measured.noise) == ("q_DN",)
+    element = Estimate("fields.0.0.0.1", 0.5, 0.1, "1")
+    with_field = replace(
+        measured.wire, estimates=(*measured.wire.estimates, element), cov=block_diag(measured.wire.cov, 0.01)
+    )
+    assert not_covered(with_field, with_field) == ()
+    names = held_estimates(replace(measured, wire=with_field)).names
+    assert names == held_estimates(measured).names
     shorter = replace(
         measured.geometry, estimates=measured.geometry.estimates[:11], cov=measured.geometry.cov[:11, :11]
     )

@@ -161,3 +161,13 @@ def test_backscatter_from_arrays() -> None:
     value, sigma = float(gamma[1]), float(gamma[3])
     assert abs(value - load_profile("lg55-reduced").backscatter.estimate("gamma").value) < 1e-3
     assert 0 < sigma < 1e-3
+
+
+@pytest.mark.slow
+def test_the_tour_makes_the_pictures_of_its_page(tmp_path: Path) -> None:
+    run("examples/tour.py", tmp_path, "--tiers", "preview")
+    made = {file.name for file in tmp_path.iterdir()}
+    page = (ROOT / "docs" / "tour.md").read_text(encoding="utf-8")
+    assert made == {file.name for file in (ROOT / "docs" / "images").glob("tour_*")}
+    assert all(f"images/{name}" in page for name in made)
+    assert all(file.stat().st_size < 100_000 for file in tmp_path.iterdir())

@@ -12,7 +12,7 @@ from udccal.cli.options import CHANGED, RigName
 from udccal.tiers import Tier
 
 profile_app = typer.Typer(
-    help="Show, compare, copy or prepare profiles, and exchange them with other programs.",
+    help="Show, compare, validate, copy or prepare profiles, and exchange them with other programs.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
 )
@@ -150,3 +150,19 @@ def import_(
     from udccal.cli.jobs.exchange import import_
 
     import_(context.obj, of.value, file, rig, out)
+
+
+@profile_app.command(no_args_is_help=True)
+def validate(
+    context: typer.Context,
+    path: ProfileArgument,
+    session: Annotated[Path, typer.Option("--session", help="Folder of a session of the same rig, best a later one.")],
+    out: Annotated[
+        Path | None, typer.Option("--out", help="Write validation.json and validation.html to this folder.")
+    ] = None,
+) -> None:
+    """Say whether a profile predicts a session that it was not fitted to, with a map for each term."""
+    from udccal.cli.jobs.validate import validate_profile
+
+    if not validate_profile(context.obj, path, session, out):
+        raise typer.Exit(CHANGED)

@@ -204,7 +204,6 @@ def stored_files(stored: StoredProfile) -> set[str]:
     files = {picture.file for picture in stored.pictures}
     for section in sections:
         files |= {array.file for array in section.arrays}
-        covariance = section.fit.covariance
-        if isinstance(covariance, StoredArray):
-            files.add(covariance.file)
+        evidence = (section.fit.covariance, section.fit.residuals)
+        files |= {array.file for array in evidence if isinstance(array, StoredArray)}
     return files

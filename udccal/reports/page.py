@@ -32,6 +32,15 @@ class Illustration:
 
 
 @dataclass(frozen=True)
+class Advice:
+    """What a page begins with: a headline and at most three sentences; ``mood`` is a CSS class, such as good or bad."""
+
+    headline: str
+    mood: str
+    sentences: tuple[str, ...]
+
+
+@dataclass(frozen=True)
 class TermSection:
     """One term's chapter."""
 
@@ -60,7 +69,7 @@ class Page:
     template: ClassVar[str] = "report.html.j2"
 
     title: str
-    verdict: str
+    advice: Advice
     facts: tuple[Fact, ...]
     pictures: tuple[Illustration, ...]
     picture_sentence: str
@@ -93,14 +102,41 @@ class DiffPage:
     template: ClassVar[str] = "diff.html.j2"
 
     title: str
-    verdict: str
+    advice: Advice
     facts: tuple[Fact, ...]
     movement_sentence: str
     movement: Table
     sections: tuple[DiffSection, ...]
 
 
-def render(page: Page | DiffPage) -> str:
+@dataclass(frozen=True)
+class ValidationSection:
+    """One term's chapter; ``mood`` is the CSS class of its verdict."""
+
+    term: str
+    verdict: str
+    mood: str
+    sentences: tuple[str, ...]
+    checks: Table
+    illustrations: tuple[Illustration, ...]
+
+
+@dataclass(frozen=True)
+class ValidationPage:
+    """A profile's predictions of a session."""
+
+    template: ClassVar[str] = "validation.html.j2"
+
+    title: str
+    verdict: str
+    facts: tuple[Fact, ...]
+    sections: tuple[ValidationSection, ...]
+
+
+AnyPage = Page | DiffPage | ValidationPage
+
+
+def render(page: AnyPage) -> str:
     """Return the page as HTML; all text is escaped."""
     environment = Environment(
         loader=PackageLoader("udccal.reports"),
@@ -112,7 +148,7 @@ def render(page: Page | DiffPage) -> str:
     return environment.get_template(page.template).render(page=page)
 
 
-def write_page(path: Path, page: Page | DiffPage) -> None:
+def write_page(path: Path, page: AnyPage) -> None:
     """Render ``page`` and write it to ``path`` atomically."""
     path.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(path, render(page).encode("utf-8"))

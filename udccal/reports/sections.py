@@ -13,8 +13,10 @@ from udccal.reports.board_views import BoardEvidence
 from udccal.reports.evidence import PhotonTransfer
 from udccal.reports.fit_tables import (
     candidates_table,
+    captures_sentence,
     diagnostics_table,
     estimates_table,
+    meanings_table,
     more_orders,
     orders_table,
     outliers_table,
@@ -63,7 +65,7 @@ def sections(evidence: Evidence) -> tuple[TermSection, ...]:
 def _section(term: TermName, evidence: Evidence) -> TermSection:
     result = evidence.calibration.result(term)
     shown = () if result.unfitted else (*_illustrations(term, evidence), *_quality(term, evidence))
-    details = [diagnostics_table("Diagnostics of the fit", result)]
+    details = [meanings_table(result), diagnostics_table("Diagnostics of the fit", result)]
     estimates = estimates_table("Fitted", result)
     shown_tables = _numbers(term, evidence)
     if len(estimates.rows) > _LONGEST_LIST:
@@ -83,7 +85,7 @@ def _section(term: TermName, evidence: Evidence) -> TermSection:
         illustrations=shown,
         tables=shown_tables,
         details=tuple(details) if result.samples else (),
-        notes=result.notes,
+        notes=tuple(filter(None, (*result.notes, captures_sentence(result)))),
     )
 
 

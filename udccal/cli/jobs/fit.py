@@ -22,7 +22,7 @@ from udccal.profiles.profile import Profile
 from udccal.profiles.store import check_replaceable, read_profile
 from udccal.refit import refit
 from udccal.reports.page import write_page
-from udccal.reports.report import calibration_page, gather, verdict
+from udccal.reports.report import calibration_page, gather
 from udccal.reports.tables import Table
 from udccal.sessions.schema import TermName
 from udccal.sessions.store import Session
@@ -103,7 +103,9 @@ def fit_to_profile(
     except FitError as error:
         raise FitError(f"{error} No profile was written; the report {report} shows every term.") from error
     output.say(f"Compilation took {clock.seconds:.1f} s of this (less in the next run)")
-    output.say(f"Profile: {profile_path}\nReport: {report}\n{verdict(calibration)}")
+    output.say(f"Profile: {profile_path}\nReport: {report}\n{page.advice.headline}")
+    for sentence in page.advice.sentences:
+        output.say(sentence)
     for warning in calibration.warnings:
         output.say(warning)
     ended, times = summaries(calibration), tuple(output.times)

@@ -19,7 +19,7 @@ from udccal.errors import FitError
 from udccal.fitting.engine.gaussian import Posterior, Prior, square_root
 from udccal.fitting.engine.misfit import excess_sigma
 from udccal.fitting.engine.report import estimates, residual_sample
-from udccal.fitting.geometry.bundle import INTRINSIC_NAMES, INTRINSIC_UNITS, LENS, GeometryRules, Intrinsics
+from udccal.fitting.geometry.bundle import INTRINSIC_NAMES, LENS, GeometryRules, Intrinsics
 from udccal.fitting.geometry.calibrated import CalibratedViews, Gauge
 from udccal.fitting.geometry.corners import board_points_mm
 from udccal.fitting.geometry.data import BoardView, GeometryData, gather
@@ -30,7 +30,7 @@ from udccal.result import Diagnostic, FitResult, FitStatus, Outliers
 
 # Scatter in addition to noise of the board on the jig, and of the median other view: a plan reads them.
 ON_JIG, BY_HAND = "corner_scatter_on_jig", "corner_scatter_by_hand"
-_NAMES, _UNITS = (*INTRINSIC_NAMES, "tilt_deg", "roll_deg", "yaw_deg"), (*INTRINSIC_UNITS, "deg", "deg", "deg")
+_NAMES = (*INTRINSIC_NAMES, "tilt_deg", "roll_deg", "yaw_deg")
 
 
 def fit_geometry(
@@ -208,7 +208,7 @@ def _result(
         name="geometry",
         term=posterior.term_at(x),
         status=bundle.status,
-        estimates=estimates(_NAMES[:count], _UNITS[:count], x[:count], cov[:count, :count]),
+        estimates=estimates("geometry", _NAMES[:count], x[:count], cov[:count, :count]),
         cov=cov[:count, :count],
         chi2_dof=bundle.chi2_dof,
         samples=2 * int(use.sum()),
