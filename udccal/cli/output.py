@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import PurePath
 from typing import Any
 
+from pydantic import BaseModel
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table as RichTable
@@ -139,11 +140,15 @@ class Output:
 
 
 def plain(value: object) -> Any:
-    """Convert a dataclass, path, enumeration, number or sequence to JSON's types; non-finite numbers become null.
+    """Convert a dataclass, a part of a stored file, a path, an enumeration, a number or a sequence to JSON's types.
+
+    Numbers that are not finite become null.
 
     Raises:
         TypeError: for anything else.
     """
+    if isinstance(value, BaseModel):
+        return value.model_dump(mode="json")
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {item.name: plain(getattr(value, item.name)) for item in dataclasses.fields(value)}
     if isinstance(value, enum.Enum):
