@@ -68,7 +68,9 @@ class PaintedRig:
     def features(self) -> Features:
         camera = self.rig.camera
         exposures = Range(camera.min_exposure_s, camera.max_exposure_s)
-        return Features(exposures, Range(0.0, 0.0), Range(1.0, 100.0), ("BayerRG12",), (Trigger.FREE_RUN,), (2, 2, 2, 2))
+        return Features(
+            exposures, Range(0.0, 0.0), Range(1.0, 100.0), ("BayerRG12",), (Trigger.FREE_RUN,), (2, 2, 2, 2)
+        )
 
     def __enter__(self) -> PaintedRig:
         return self

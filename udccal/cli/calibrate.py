@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import enum
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -15,7 +16,7 @@ from udccal.errors import CameraError
 
 if TYPE_CHECKING:
     from udccal.cli.jobs.capture import Wanted
-    from udccal.guide.events import DoneEvent
+    from udccal.guide.events import DoneEvent, Person
     from udccal.rig import RigDescription
 
 
@@ -74,18 +75,23 @@ def calibrate(
     json_events: Annotated[
         bool, typer.Option("--json-events", help="Write what happens on standard output, one JSON object a line.")
     ] = False,
+    web: Annotated[bool, typer.Option("--web", help="Lead by a page in a browser; see docs/web.md.")] = False,
+    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="Port of --web; 0 for any that is free.")] = 0,
     log: IterationLog = None,
 ) -> None:
     """Capture every calibration step of a rig, then fit them. An interrupted session continues where it stopped."""
     from udccal.cli.jobs.capture import Wanted
     from udccal.cli.jobs.fit import fit_to_profile
+    from udccal.cli.jobs.guided import led_by
     from udccal.io.out_folder import check_writable
     from udccal.profiles.store import check_replaceable
     from udccal.rig import load_rig
     from udccal.sessions.changes import Exchanged
 
     led = practice or camera in (CameraKind.u3v, CameraKind.pylon)
-    _check_words(camera, led, practice, yes or json_events)
+    _check_words(camera, led, practice, yes or json_events or web)
+    if port and not web:
+        raise typer.BadParameter("--port is for the page: give --web with it, or leave it out.")
     output: Output = replace(context.obj, events=json_events)
     description = load_rig(rig)
     check_replaceable(profile)
@@ -95,8 +101,12 @@ def calibrate(
     )
     if not led:
         _capture(output, description, wanted, camera, files, seed)
-    elif _lead(output, description, wanted, Source(camera, serial, display, monitor, seed), yes).stopped:
-        raise typer.Exit(STOPPED)
+    else:
+        with _person(output, description, port if web else None) as person:
+            source = Source(camera, serial, display, monitor, seed)
+            done = _lead(output, description, wanted, source, led_by(output, person, yes))
+        if done.stopped:
+            raise typer.Exit(STOPPED)
     if not fit_to_profile(output, session, profile, log):
         raise typer.Exit(DOUBTFUL)
 
@@ -116,7 +126,7 @@ def _check_words(camera: CameraKind, led: bool, practice: bool, of_led: bool) ->
     if practice and camera is not CameraKind.sim:
         raise typer.BadParameter("--practice is for the simulated rig: give --camera sim with it, or leave it out.")
     if of_led and not led:
-        raise typer.BadParameter("--yes and --json-events are for --camera u3v or pylon, and for --practice.")
+        raise typer.BadParameter("--yes, --json-events and --web are for --camera u3v or pylon, and for --practice.")
 
 
 def _capture(
@@ -137,12 +147,18 @@ def _capture(
         capture_watched(output, bench, wanted)
 
 
-def _lead(output: Output, rig: RigDescription, wanted: Wanted, source: Source, yes: bool) -> DoneEvent:
+def _person(output: Output, rig: RigDescription, port: int | None) -> AbstractContextManager[Person]:
+    """A person before a page, or at the terminal where there is no port."""
+    from udccal.cli.jobs.terminal import TerminalPerson
+    from udccal.cli.jobs.web import web_person
+
+    return nullcontext(TerminalPerson(output)) if port is None else web_person(output, rig, port)
+
+
+def _lead(output: Output, rig: RigDescription, wanted: Wanted, source: Source, person: Person) -> DoneEvent:
     """Capture with a person who is led, at a real rig or at a simulated one."""
     from udccal.cli.jobs import benches, guided
-    from udccal.cli.jobs.terminal import TerminalPerson
 
-    person = guided.led_by(output, TerminalPerson(output), yes)
     if source.camera is CameraKind.sim:
         with guided.practice_bench(rig, source.seed, person) as (bench, practising):
             return guided.capture_led(output, bench, practising, wanted)
