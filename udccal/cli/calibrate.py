@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import enum
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from udccal.cli.options import DOUBTFUL, IterationLog, ProfilePath, RigName, Seed, SessionFolder, TermChoice
+from udccal.cli.options import DOUBTFUL, STOPPED, IterationLog, ProfilePath, RigName, Seed, SessionFolder, TermChoice
 from udccal.cli.output import Output
 from udccal.errors import CameraError
 
 if TYPE_CHECKING:
-    from udccal.benches.bench import CaptureBench
+    from udccal.cli.jobs.capture import Wanted
+    from udccal.guide.events import DoneEvent, Person
     from udccal.rig import RigDescription
 
 
@@ -66,65 +68,105 @@ def calibrate(
         list[str] | None,
         typer.Option("--again", metavar="STEP", help="Capture this captured step once more; may be given again."),
     ] = None,
+    practice: Annotated[
+        bool, typer.Option("--practice", help="With --camera sim: you lead a simulated hand, which may do wrong.")
+    ] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="Go on by itself wherever all is in order.")] = False,
+    json_events: Annotated[
+        bool, typer.Option("--json-events", help="Write what happens on standard output, one JSON object a line.")
+    ] = False,
+    web: Annotated[bool, typer.Option("--web", help="Lead by a page in a browser; see docs/web.md.")] = False,
+    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="Port of --web; 0 for any that is free.")] = 0,
     log: IterationLog = None,
 ) -> None:
     """Capture every calibration step of a rig, then fit them. An interrupted session continues where it stopped."""
-    from udccal.cli.jobs.capture import capture_watched
+    from udccal.cli.jobs.capture import Wanted
     from udccal.cli.jobs.fit import fit_to_profile
+    from udccal.cli.jobs.guided import led_by
     from udccal.io.out_folder import check_writable
     from udccal.profiles.store import check_replaceable
     from udccal.rig import load_rig
     from udccal.sessions.changes import Exchanged
 
-    output: Output = context.obj
+    led = practice or camera in (CameraKind.u3v, CameraKind.pylon)
+    _check_words(camera, led, practice, yes or json_events or web)
+    if port and not web:
+        raise typer.BadParameter("--port is for the page: give --web with it, or leave it out.")
+    output: Output = replace(context.obj, events=json_events)
     description = load_rig(rig)
     check_replaceable(profile)
     check_writable(profile.parent)
-    pictures = session.resolve().with_name(f"{session.resolve().name}-pictures")
-    match camera:
-        case CameraKind.sim:
-            opened = _simulated(description, seed)
-        case CameraKind.files:
-            opened = _files(output, description, files, pictures)
-        case _:
-            opened = _real(output, description, camera, serial, display, monitor, pictures)
-    with opened as bench:
-        parts = {Exchanged(part.value) for part in exchanged or ()}
-        capture_watched(output, bench, session, [t.value for t in term or TermChoice], parts, again or ())
+    wanted = Wanted(
+        session, [t.value for t in term or TermChoice], {Exchanged(part.value) for part in exchanged or ()}, again or ()
+    )
+    if not led:
+        _capture(output, description, wanted, camera, files, seed)
+    else:
+        with _person(output, description, port if web else None) as person:
+            source = Source(camera, serial, display, monitor, seed)
+            done = _lead(output, description, wanted, source, led_by(output, person, yes))
+        if done.stopped:
+            raise typer.Exit(STOPPED)
     if not fit_to_profile(output, session, profile, log):
         raise typer.Exit(DOUBTFUL)
 
 
-def _simulated(rig: RigDescription, seed: int) -> AbstractContextManager[CaptureBench]:
-    from udccal.benches.bench import simulated_bench, simulated_rig
+@dataclass(frozen=True)
+class Source:
+    """Where the frames of a guided capture come from, and how the panel is operated."""
 
-    return simulated_bench(simulated_rig(rig, seed))
+    camera: CameraKind
+    serial: str | None
+    display: DisplayKind
+    monitor: int
+    seed: int
 
 
-def _files(
-    output: Output, rig: RigDescription, files: Path | None, pictures: Path
-) -> AbstractContextManager[CaptureBench]:
+def _check_words(camera: CameraKind, led: bool, practice: bool, of_led: bool) -> None:
+    if practice and camera is not CameraKind.sim:
+        raise typer.BadParameter("--practice is for the simulated rig: give --camera sim with it, or leave it out.")
+    if of_led and not led:
+        raise typer.BadParameter("--yes, --json-events and --web are for --camera u3v or pylon, and for --practice.")
+
+
+def _capture(
+    output: Output, rig: RigDescription, wanted: Wanted, camera: CameraKind, files: Path | None, seed: int
+) -> None:
+    """Capture with nobody at the rig: a simulated one, or pictures of files."""
+    from udccal.benches.bench import simulate
     from udccal.cli.jobs.benches import files_bench
+    from udccal.cli.jobs.capture import capture_watched
 
-    if files is None:
+    if camera is CameraKind.sim:
+        opened = simulate(rig, seed)
+    elif files is None:
         raise CameraError("Expected the folder with the pictures of each step, found none. Give it with --files.")
-    return files_bench(output, rig, files, pictures)
-
-
-def _real(
-    output: Output,
-    rig: RigDescription,
-    camera: CameraKind,
-    serial: str | None,
-    display: DisplayKind,
-    monitor: int,
-    pictures: Path,
-) -> AbstractContextManager[CaptureBench]:
-    from udccal.cli.jobs import benches
-
-    seen = benches.u3v_camera(serial) if camera is CameraKind.u3v else benches.pylon_camera(serial)
-    if display is DisplayKind.window:
-        shown = benches.window_display(rig, monitor)
     else:
-        shown = benches.manual_display(output, rig, pictures)
-    return benches.real_bench(output, rig, seen, shown)
+        opened = files_bench(output, rig, files, wanted.pictures)
+    with opened as bench:
+        capture_watched(output, bench, wanted)
+
+
+def _person(output: Output, rig: RigDescription, port: int | None) -> AbstractContextManager[Person]:
+    """A person before a page, or at the terminal where there is no port."""
+    from udccal.cli.jobs.terminal import TerminalPerson
+    from udccal.cli.jobs.web import web_person
+
+    return nullcontext(TerminalPerson(output)) if port is None else web_person(output, rig, port)
+
+
+def _lead(output: Output, rig: RigDescription, wanted: Wanted, source: Source, person: Person) -> DoneEvent:
+    """Capture with a person who is led, at a real rig or at a simulated one."""
+    from udccal.cli.jobs import benches, guided
+
+    if source.camera is CameraKind.sim:
+        with guided.practice_bench(rig, source.seed, person) as (bench, practising):
+            return guided.capture_led(output, bench, practising, wanted)
+    find = benches.u3v_camera if source.camera is CameraKind.u3v else benches.pylon_camera
+    seen = find(source.serial)
+    if source.display is DisplayKind.window:
+        shown = benches.window_display(rig, source.monitor)
+    else:
+        shown = benches.manual_display(rig, wanted.pictures, person)
+    with benches.real_bench(rig, seen, shown) as bench:
+        return guided.capture_led(output, bench, person, wanted)
