@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import enum
 from contextlib import AbstractContextManager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -41,8 +42,11 @@ class ExchangedPart(enum.StrEnum):
     lens = "lens"
 
 
-_CAMERA_HELP = "sim: a simulated rig; u3v: any USB3 Vision camera; pylon: through Basler's SDK; files: see --files."
-_DISPLAY_HELP = "For a real rig. window: full screen on --monitor; manual: you show the named files."
+CAMERA_HELP = "sim: a simulated rig; u3v: any USB3 Vision camera; pylon: through Basler's SDK; files: see --files."
+DISPLAY_HELP = "For a real rig. window: full screen on --monitor; manual: you show the named files."
+Serial = Annotated[str | None, typer.Option("--serial", help="Serial number; needed if there are several.")]
+Files = Annotated[Path | None, typer.Option("--files", help="Folder with one folder of pictures per step.")]
+Monitor = Annotated[int, typer.Option("--monitor", help="Number of the monitor that is the panel; see doctor.")]
 
 
 def calibrate(
@@ -50,11 +54,11 @@ def calibrate(
     rig: RigName,
     session: SessionFolder,
     profile: ProfilePath,
-    camera: Annotated[CameraKind, typer.Option("--camera", help=_CAMERA_HELP)] = CameraKind.sim,
-    serial: Annotated[str | None, typer.Option("--serial", help="Serial number; needed if there are several.")] = None,
-    files: Annotated[Path | None, typer.Option("--files", help="Folder with one folder of pictures per step.")] = None,
-    display: Annotated[DisplayKind, typer.Option("--display", help=_DISPLAY_HELP)] = DisplayKind.manual,
-    monitor: Annotated[int, typer.Option("--monitor", help="Number of the monitor that is the panel; see doctor.")] = 0,
+    camera: Annotated[CameraKind, typer.Option("--camera", help=CAMERA_HELP)] = CameraKind.sim,
+    serial: Serial = None,
+    files: Files = None,
+    display: Annotated[DisplayKind, typer.Option("--display", help=DISPLAY_HELP)] = DisplayKind.manual,
+    monitor: Monitor = 0,
     seed: Seed = 0,
     term: Annotated[
         list[TermChoice] | None, typer.Option("--term", help="Capture this term only; may be given again.")
@@ -80,25 +84,42 @@ def calibrate(
     description = load_rig(rig)
     check_replaceable(profile)
     check_writable(profile.parent)
-    pictures = session.resolve().with_name(f"{session.resolve().name}-pictures")
-    match camera:
-        case CameraKind.sim:
-            opened = _simulated(description, seed)
-        case CameraKind.files:
-            opened = _files(output, description, files, pictures)
-        case _:
-            opened = _real(output, description, camera, serial, display, monitor, pictures)
-    with opened as bench:
+    rig_on = RigOn(camera, serial, files, display, monitor, seed)
+    with rig_on.opened(output, description, session) as bench:
         parts = {Exchanged(part.value) for part in exchanged or ()}
         capture_watched(output, bench, session, [t.value for t in term or TermChoice], parts, again or ())
     if not fit_to_profile(output, session, profile, log):
         raise typer.Exit(DOUBTFUL)
 
 
-def _simulated(rig: RigDescription, seed: int) -> AbstractContextManager[CaptureBench]:
+@dataclass(frozen=True)
+class RigOn:
+    """Where a rig is: simulated, at this computer, or in files; the options of the verbs that capture."""
+
+    camera: CameraKind
+    serial: str | None
+    files: Path | None
+    display: DisplayKind
+    monitor: int
+    seed: int
+    noise_seed: int | None = None
+
+    def opened(self, output: Output, rig: RigDescription, session: Path) -> AbstractContextManager[CaptureBench]:
+        """Open the bench for a session; the panel's pictures go next to it."""
+        pictures = session.resolve().with_name(f"{session.resolve().name}-pictures")
+        match self.camera:
+            case CameraKind.sim:
+                return _simulated(rig, self.seed, self.noise_seed)
+            case CameraKind.files:
+                return _files(output, rig, self.files, pictures)
+            case _:
+                return _real(output, rig, self.camera, self.serial, self.display, self.monitor, pictures)
+
+
+def _simulated(rig: RigDescription, seed: int, noise_seed: int | None) -> AbstractContextManager[CaptureBench]:
     from udccal.benches.bench import simulated_bench, simulated_rig
 
-    return simulated_bench(simulated_rig(rig, seed))
+    return simulated_bench(simulated_rig(rig, seed, noise_seed))
 
 
 def _files(
