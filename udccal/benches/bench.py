@@ -35,9 +35,13 @@ class CaptureBench:
     now: Now
 
 
-def simulated_rig(rig: RigDescription, seed: int) -> SimulatedWorld:
-    """Return a simulated rig with the description ``rig``; another ``seed`` gives another specimen and other noise."""
-    return SimulatedWorld(draw_truth(rig, seed), seed=seed)
+def simulated_rig(rig: RigDescription, seed: int, noise_seed: int | None = None) -> SimulatedWorld:
+    """Return a simulated rig with the description ``rig``.
+
+    Another ``seed`` gives another specimen and other noise. Another ``noise_seed`` gives the same specimen on another
+    day; it is ``seed`` where there is none.
+    """
+    return SimulatedWorld(draw_truth(rig, seed), seed=seed if noise_seed is None else noise_seed)
 
 
 @contextmanager
@@ -47,11 +51,12 @@ def simulated_bench(world: SimulatedWorld) -> Iterator[CaptureBench]:
         yield CaptureBench(world.truth.description, camera, display, world, world.now)
 
 
-def simulate(rig: RigDescription, seed: int = 0) -> AbstractContextManager[CaptureBench]:
+def simulate(rig: RigDescription, seed: int = 0, noise_seed: int | None = None) -> AbstractContextManager[CaptureBench]:
     """Simulate a rig to capture with: ``with simulate(rig) as bench``.
 
     Args:
         rig: description; the simulated rig differs from it within its tolerances.
         seed: chooses the specimen and its noise.
+        noise_seed: chooses the noise alone: the same rig on another day.
     """
-    return simulated_bench(simulated_rig(rig, seed))
+    return simulated_bench(simulated_rig(rig, seed, noise_seed))

@@ -4,36 +4,28 @@ from __future__ import annotations
 
 import enum
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import replace
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from udccal.cli.options import DOUBTFUL, STOPPED, IterationLog, ProfilePath, RigName, Seed, SessionFolder, TermChoice
 from udccal.cli.output import Output
-from udccal.errors import CameraError
+from udccal.cli.rig_on import (
+    Agree,
+    Camera,
+    CameraKind,
+    Display,
+    DisplayKind,
+    Files,
+    Monitor,
+    RigOn,
+    Serial,
+)
 
 if TYPE_CHECKING:
-    from udccal.cli.jobs.capture import Wanted
-    from udccal.guide.events import DoneEvent, Person
+    from udccal.guide.events import Person
     from udccal.rig import RigDescription
-
-
-class CameraKind(enum.StrEnum):
-    """Which camera captures."""
-
-    sim = "sim"
-    u3v = "u3v"
-    pylon = "pylon"
-    files = "files"
-
-
-class DisplayKind(enum.StrEnum):
-    """How pictures are shown on the panel of a real rig."""
-
-    window = "window"
-    manual = "manual"
 
 
 class ExchangedPart(enum.StrEnum):
@@ -43,20 +35,16 @@ class ExchangedPart(enum.StrEnum):
     lens = "lens"
 
 
-_CAMERA_HELP = "sim: a simulated rig; u3v: any USB3 Vision camera; pylon: through Basler's SDK; files: see --files."
-_DISPLAY_HELP = "For a real rig. window: full screen on --monitor; manual: you show the named files."
-
-
 def calibrate(
     context: typer.Context,
     rig: RigName,
     session: SessionFolder,
     profile: ProfilePath,
-    camera: Annotated[CameraKind, typer.Option("--camera", help=_CAMERA_HELP)] = CameraKind.sim,
-    serial: Annotated[str | None, typer.Option("--serial", help="Serial number; needed if there are several.")] = None,
-    files: Annotated[Path | None, typer.Option("--files", help="Folder with one folder of pictures per step.")] = None,
-    display: Annotated[DisplayKind, typer.Option("--display", help=_DISPLAY_HELP)] = DisplayKind.manual,
-    monitor: Annotated[int, typer.Option("--monitor", help="Number of the monitor that is the panel; see doctor.")] = 0,
+    camera: Camera = CameraKind.sim,
+    serial: Serial = None,
+    files: Files = None,
+    display: Display = DisplayKind.manual,
+    monitor: Monitor = 0,
     seed: Seed = 0,
     term: Annotated[
         list[TermChoice] | None, typer.Option("--term", help="Capture this term only; may be given again.")
@@ -71,7 +59,7 @@ def calibrate(
     practice: Annotated[
         bool, typer.Option("--practice", help="With --camera sim: you lead a simulated hand, which may do wrong.")
     ] = False,
-    yes: Annotated[bool, typer.Option("--yes", help="Go on by itself wherever all is in order.")] = False,
+    yes: Agree = False,
     json_events: Annotated[
         bool, typer.Option("--json-events", help="Write what happens on standard output, one JSON object a line.")
     ] = False,
@@ -88,7 +76,8 @@ def calibrate(
     from udccal.rig import load_rig
     from udccal.sessions.changes import Exchanged
 
-    led = practice or camera in (CameraKind.u3v, CameraKind.pylon)
+    rig_on = RigOn(camera, serial, files, display, monitor, seed)
+    led = practice or rig_on.real
     _check_words(camera, led, practice, yes or json_events or web)
     if port and not web:
         raise typer.BadParameter("--port is for the page: give --web with it, or leave it out.")
@@ -99,27 +88,12 @@ def calibrate(
     wanted = Wanted(
         session, [t.value for t in term or TermChoice], {Exchanged(part.value) for part in exchanged or ()}, again or ()
     )
-    if not led:
-        _capture(output, description, wanted, camera, files, seed)
-    else:
-        with _person(output, description, port if web else None) as person:
-            source = Source(camera, serial, display, monitor, seed)
-            done = _lead(output, description, wanted, source, led_by(output, person, yes))
-        if done.stopped:
-            raise typer.Exit(STOPPED)
+    with _person(output, description, port if web else None) if led else nullcontext() as person:
+        goes_on = rig_on.capture(output, description, wanted, person and led_by(output, person, yes))
+    if not goes_on:
+        raise typer.Exit(STOPPED)
     if not fit_to_profile(output, session, profile, log):
         raise typer.Exit(DOUBTFUL)
-
-
-@dataclass(frozen=True)
-class Source:
-    """Where the frames of a guided capture come from, and how the panel is operated."""
-
-    camera: CameraKind
-    serial: str | None
-    display: DisplayKind
-    monitor: int
-    seed: int
 
 
 def _check_words(camera: CameraKind, led: bool, practice: bool, of_led: bool) -> None:
@@ -129,44 +103,9 @@ def _check_words(camera: CameraKind, led: bool, practice: bool, of_led: bool) ->
         raise typer.BadParameter("--yes, --json-events and --web are for --camera u3v or pylon, and for --practice.")
 
 
-def _capture(
-    output: Output, rig: RigDescription, wanted: Wanted, camera: CameraKind, files: Path | None, seed: int
-) -> None:
-    """Capture with nobody at the rig: a simulated one, or pictures of files."""
-    from udccal.benches.bench import simulate
-    from udccal.cli.jobs.benches import files_bench
-    from udccal.cli.jobs.capture import capture_watched
-
-    if camera is CameraKind.sim:
-        opened = simulate(rig, seed)
-    elif files is None:
-        raise CameraError("Expected the folder with the pictures of each step, found none. Give it with --files.")
-    else:
-        opened = files_bench(output, rig, files, wanted.pictures)
-    with opened as bench:
-        capture_watched(output, bench, wanted)
-
-
 def _person(output: Output, rig: RigDescription, port: int | None) -> AbstractContextManager[Person]:
     """A person before a page, or at the terminal where there is no port."""
     from udccal.cli.jobs.terminal import TerminalPerson
     from udccal.cli.jobs.web import web_person
 
     return nullcontext(TerminalPerson(output)) if port is None else web_person(output, rig, port)
-
-
-def _lead(output: Output, rig: RigDescription, wanted: Wanted, source: Source, person: Person) -> DoneEvent:
-    """Capture with a person who is led, at a real rig or at a simulated one."""
-    from udccal.cli.jobs import benches, guided
-
-    if source.camera is CameraKind.sim:
-        with guided.practice_bench(rig, source.seed, person) as (bench, practising):
-            return guided.capture_led(output, bench, practising, wanted)
-    find = benches.u3v_camera if source.camera is CameraKind.u3v else benches.pylon_camera
-    seen = find(source.serial)
-    if source.display is DisplayKind.window:
-        shown = benches.window_display(rig, source.monitor)
-    else:
-        shown = benches.manual_display(rig, wanted.pictures, person)
-    with benches.real_bench(rig, seen, shown) as bench:
-        return guided.capture_led(output, bench, person, wanted)

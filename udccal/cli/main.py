@@ -13,6 +13,7 @@ import typer
 from udccal import __version__
 from udccal.cli.board import board
 from udccal.cli.calibrate import calibrate
+from udccal.cli.check import check
 from udccal.cli.demo import demo
 from udccal.cli.doctor import doctor
 from udccal.cli.fit import fit
@@ -59,7 +60,7 @@ def globals_(
     context.obj = Output(as_json=as_json, debug=debug)
 
 
-for _verb in (demo, doctor, board, plan, calibrate, fit, restore, run, simulate):
+for _verb in (demo, doctor, board, plan, calibrate, fit, check, restore, run, simulate):
     app.command(no_args_is_help=_verb not in (demo, doctor))(_verb)
 app.add_typer(profile_app, name="profile")
 app.add_typer(rig_app, name="rig")
