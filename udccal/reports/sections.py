@@ -110,7 +110,8 @@ def _finding(term: TermName, evidence: Evidence) -> str:
         return f"{quantity.meaning[0].upper()}{quantity.meaning[1:]}: sigma {accuracy.sigma:.2g} {quantity.unit}."
     first = result.estimates[0]
     unit = "" if first.unit == "1" else f" {first.unit}"
-    return f"{first.name} = {number(first.value, first.sigma)} ± {spread(first.sigma)}{unit}."
+    name = quantity(term, first.name).plain
+    return f"{name[0].upper()}{name[1:]}: {number(first.value, first.sigma)} ± {spread(first.sigma)}{unit}."
 
 
 def _illustrations(term: TermName, evidence: Evidence) -> tuple[Illustration, ...]:
