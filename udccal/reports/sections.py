@@ -106,8 +106,8 @@ def _finding(term: TermName, evidence: Evidence) -> str:
     if not result.estimates:
         return "Nothing was fitted."
     if accuracy is not None and term != "noise":
-        quantity = accuracy.forecast.quantity
-        return f"{quantity.meaning[0].upper()}{quantity.meaning[1:]}: sigma {accuracy.sigma:.2g} {quantity.unit}."
+        told = accuracy.forecast.quantity
+        return f"{told.meaning[0].upper()}{told.meaning[1:]}: sigma {accuracy.sigma:.2g} {told.unit}."
     first = result.estimates[0]
     unit = "" if first.unit == "1" else f" {first.unit}"
     name = quantity(term, first.name).plain
