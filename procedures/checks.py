@@ -8,7 +8,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from procedures.metering import lowest_saturation_DN, spot_light
+from procedures.metering import spot_light
 from udccal.arrangements import BoardSpec
 from udccal.cameras.protocol import Frame
 from udccal.errors import CaptureError
@@ -35,7 +35,7 @@ def dark_limit_DN(rig: RigDescription, exposure_s: float) -> float:
 
 def frame_limits(rig: RigDescription, exposure_s: float, dark: bool) -> FrameLimits:
     """Return the limits of each frame of a step's captures."""
-    limits = FrameLimits(rig.camera.black_DN.value, lowest_saturation_DN(rig))
+    limits = FrameLimits(rig.camera.black_DN.value, rig.lowest_saturation_DN)
     return replace(limits, dark_DN=dark_limit_DN(rig, exposure_s)) if dark else limits
 
 

@@ -131,13 +131,6 @@ def saturation_DN(rig: RigDescription) -> float:
     return min(float(rig.saturation_DN), camera.black_DN.value + camera.K_DN_per_e.value * camera.full_well_e.value)
 
 
-def lowest_saturation_DN(rig: RigDescription) -> float:
-    """Return the lowest level in DN at which a sample may clip within the tolerances of the rig."""
-    camera = rig.camera
-    K, well = (nominal.value - nominal.tolerance for nominal in (camera.K_DN_per_e, camera.full_well_e))
-    return min(float(rig.saturation_DN), camera.black_DN.value - camera.black_DN.tolerance + K * well)
-
-
 def _fraction(level_DN: float, rig: RigDescription) -> float:
     black = rig.camera.black_DN.value
     return (level_DN - black) / (saturation_DN(rig) - black)

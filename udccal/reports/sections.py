@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from matplotlib.figure import Figure
 
 from udccal.calibration import ORDER, Calibration
+from udccal.quantities import quantity
 from udccal.reports import figures, fit_figures
 from udccal.reports.accuracy import Accuracy, accuracy_table, forecast_sentence
 from udccal.reports.board_views import BoardEvidence
