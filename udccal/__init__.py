@@ -31,7 +31,9 @@ if TYPE_CHECKING:
     from udccal.fitting.wire.fit import fit_wire as fit_wire
     from udccal.profiles.profile import Profile as Profile
     from udccal.profiles.store import load_profile as load_profile
+    from udccal.profiles.store import save_profile as save_profile
     from udccal.restoration.deblur import deblur as deblur
+    from udccal.restoration.one_frame import restore as restore
     from udccal.restoration.runtime import Restorer as Restorer
     from udccal.result import FitResult as FitResult
     from udccal.result import FitStatus as FitStatus
@@ -39,6 +41,8 @@ if TYPE_CHECKING:
     from udccal.rig import load_rig as load_rig
     from udccal.sessions.store import Session as Session
     from udccal.tiers import Tier as Tier
+    from udccal.validation.validate import Validation as Validation
+    from udccal.validation.validate import validate as validate
 
 __version__ = "0.1.0"
 
@@ -53,6 +57,7 @@ _HOMES = {
     "Session": "udccal.sessions.store",
     "Tier": "udccal.tiers",
     "UdccalError": "udccal.errors",
+    "Validation": "udccal.validation.validate",
     "calibrate": "udccal.calibration",
     "capture": "udccal.benches.capture",
     "deblur": "udccal.restoration.deblur",
@@ -65,7 +70,10 @@ _HOMES = {
     "fit_wire": "udccal.fitting.wire.fit",
     "load_profile": "udccal.profiles.store",
     "load_rig": "udccal.rig",
+    "restore": "udccal.restoration.one_frame",
+    "save_profile": "udccal.profiles.store",
     "simulate": "udccal.benches.bench",
+    "validate": "udccal.validation.validate",
 }
 
 __all__ = list(_HOMES)

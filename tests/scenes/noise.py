@@ -106,6 +106,11 @@ def _read_noise(
 
 def measure(sensor: ToySensor, seed: int) -> FitResult[Noise]:
     """Capture a new sensor of this kind and fit it through the public API."""
+    return fit_noise(captured(sensor, seed))
+
+
+def captured(sensor: ToySensor, seed: int) -> NoiseData:
+    """Frames of a new sensor of this kind."""
     rng = np.random.default_rng([seed, 77])
     fixed = patterns(sensor, rng)
     shoot = partial(expose, sensor, fixed, rng=rng)
@@ -116,7 +121,7 @@ def measure(sensor: ToySensor, seed: int) -> FitResult[Noise]:
     levels += [ExposureLevel(t, dark=(shoot(t, False), shoot(t, False))) for t in sensor.dark_times_s]
     t = sensor.exposure_s(sensor.stack_level)
     dark, bright = ([shoot(t, lit) for _ in range(sensor.stack_frames)] for lit in (False, True))
-    return fit_noise(NoiseData(levels, SpatialStack(t, dark, bright), top_code=2**sensor.bits - 1))
+    return NoiseData(levels, SpatialStack(t, dark, bright), top_code=2**sensor.bits - 1)
 
 
 def truth(sensor: ToySensor) -> dict[str, float]:

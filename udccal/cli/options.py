@@ -21,7 +21,7 @@ class TermChoice(enum.StrEnum):
 
 # Exit status of a fit whose profile was written with a warning.
 DOUBTFUL = 3
-# Exit status of a comparison of profiles that have changed by more than is harmless.
+# Exit status of a comparison of profiles that have changed by more than is harmless, and of a failed validation.
 CHANGED = 3
 
 RigName = Annotated[str, typer.Option("--rig", help="Name of a shipped rig or of your own, or a folder.")]

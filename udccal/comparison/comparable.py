@@ -9,6 +9,8 @@ from jaxtyping import Float
 
 from udccal.errors import ProfileError
 from udccal.profiles.profile import Profile
+from udccal.rig import RigDescription
+from udccal.sessions.schema import StoredCamera
 
 
 def check_comparable(a: Profile, b: Profile) -> None:
@@ -17,12 +19,35 @@ def check_comparable(a: Profile, b: Profile) -> None:
     Raises:
         ProfileError: when rig, panel, sensor or camera differ; the message names the first difference.
     """
-    for (what, first), (_, second) in zip(_identity(a), _identity(b), strict=True):
+    if (found := _difference(a, b.rig, b.provenance.camera)) is not None:
+        what, first, second = found
+        raise ProfileError(
+            f"Expected two profiles of one rig, found another {what}: {first} in A, {second} in B. "
+            "Compare profiles of the same rig and camera."
+        )
+
+
+def check_same_rig(profile: Profile, rig: RigDescription, taken_by: StoredCamera) -> None:
+    """Refuse a profile that does not describe the rig and the camera of a session.
+
+    Raises:
+        ProfileError: when rig, panel, sensor or camera differ; the message names the first difference.
+    """
+    if (found := _difference(profile, rig, taken_by)) is not None:
+        what, first, second = found
+        raise ProfileError(
+            f"Expected a session of the profile's rig, found another {what}: {second} in the session, {first} in the "
+            "profile. Give a session of the same rig and camera."
+        )
+
+
+def _difference(a: Profile, rig: RigDescription, taken_by: StoredCamera | None) -> tuple[str, object, object] | None:
+    """The first thing that differs, in A, and in the other rig and camera."""
+    pairs = zip(_identity(a.rig, a.provenance.camera), _identity(rig, taken_by), strict=True)
+    for (what, first), (_, second) in pairs:
         if first != second and None not in (first, second):
-            raise ProfileError(
-                f"Expected two profiles of one rig, found another {what}: {first} in A, {second} in B. "
-                "Compare profiles of the same rig and camera."
-            )
+            return what, first, second
+    return None
 
 
 def check_finite(*numbers: Float[np.ndarray, "..."]) -> None:
@@ -38,9 +63,8 @@ def check_finite(*numbers: Float[np.ndarray, "..."]) -> None:
         )
 
 
-def _identity(profile: Profile) -> Iterator[tuple[str, object]]:
+def _identity(rig: RigDescription, taken_by: StoredCamera | None) -> Iterator[tuple[str, object]]:
     """What must agree. Lengths of the mounting are among it because places count from the nominal one."""
-    rig, taken_by = profile.rig, profile.provenance.camera
     yield "rig", rig.name
     yield "panel", rig.panel.model
     yield "size of the panel in pixels", (rig.panel.columns, rig.panel.rows)

@@ -137,11 +137,11 @@ def measured_state(rig: RigDescription, fits: Calibration | Profile) -> RigState
         model_errors=ModelErrors(
             on_jig_px=_corners_px(fits.geometry, ON_JIG) if geometry_seen else None,
             by_hand_px=_corners_px(fits.geometry, BY_HAND) if geometry_seen else None,
-            wire=_diagnostic(fits.wire, "wire_map_model_sigma") / 100,
-            psf=_diagnostic(fits.psf, "model_error"),
-            psf_kernel=_diagnostic(fits.psf, "kernel_error_l2"),
-            backscatter=_diagnostic(fits.backscatter, "model_error_of_white"),
-            inflation=max(_diagnostic(fits.backscatter, "pattern_inflation"), 1.0),
+            wire=(fits.wire.diagnostic("wire_map_model_sigma") or 0.0) / 100,
+            psf=fits.psf.diagnostic("model_error") or 0.0,
+            psf_kernel=fits.psf.diagnostic("kernel_error_l2") or 0.0,
+            backscatter=fits.backscatter.diagnostic("model_error_of_white") or 0.0,
+            inflation=max(fits.backscatter.diagnostic("pattern_inflation") or 0.0, 1.0),
         ),
     )
 
@@ -152,14 +152,8 @@ def _converged(result: FitResult[Any]) -> bool:
 
 def _corners_px(geometry: FitResult[Geometry], name: str) -> float | None:
     """Scatter of corners in addition to noise, disagreement of views included; None where the fit lacks the number."""
-    if all(item.name != name for item in geometry.diagnostics):
-        return None
-    return _diagnostic(geometry, name) * float(np.sqrt(max(_diagnostic(geometry, "variance_factor"), 1.0)))
-
-
-def _diagnostic(result: FitResult[Any], name: str) -> float:
-    """A diagnostic of a fit by its name; 0 where the fit has none of that name."""
-    return next((item.value for item in result.diagnostics if item.name == name), 0.0)
+    scatter_px, factor = geometry.diagnostic(name), geometry.diagnostic("variance_factor") or 0.0
+    return None if scatter_px is None else scatter_px * float(np.sqrt(max(factor, 1.0)))
 
 
 def full_s(arrangement: Arrangement, state: RigState) -> float:

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import re
 import struct
+import tempfile
 import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from udccal.errors import ProfileError
@@ -33,8 +36,27 @@ def pack_archive(folder: Path, path: Path) -> None:
             archive.write(file, file.name, compress_type=kind)
 
 
-def unpack_archive(path: Path, folder: Path) -> None:
-    """Unpack a profile's zip file into an empty folder.
+@contextmanager
+def unpacked(path: Path, only: str | None = None) -> Iterator[Path]:
+    """Yield the folder of a profile: ``path`` itself, or a temporary folder for as long as its zip file is needed.
+
+    Args:
+        path: the profile's folder or zip file.
+        only: the one file that is needed; None for all.
+
+    Raises:
+        ProfileError: as ``unpack_archive``.
+    """
+    if not path.is_file():
+        yield path
+        return
+    with tempfile.TemporaryDirectory(prefix="udccal-") as folder:
+        unpack_archive(path, Path(folder), only)
+        yield Path(folder)
+
+
+def unpack_archive(path: Path, folder: Path, only: str | None = None) -> None:
+    """Unpack a profile's zip file into an empty folder; with ``only`` just that file, after the same checks.
 
     Raises:
         ProfileError: when the file is damaged or not a zip file, holds a name that no profile has (folders, ``..``,
@@ -45,7 +67,7 @@ def unpack_archive(path: Path, folder: Path) -> None:
         with zipfile.ZipFile(path) as archive:
             entries = archive.infolist()
             _check_entries(path, entries)
-            for entry in entries:
+            for entry in (entry for entry in entries if only in (None, entry.filename)):
                 _unpack_entry(path, archive, entry, folder / entry.filename)
     except (zipfile.BadZipFile, EOFError, NotImplementedError, RuntimeError, OSError) as error:
         raise ProfileError(f"Expected {path} to be a whole zip file, found: {error}. Copy it again.") from error

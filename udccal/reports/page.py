@@ -57,8 +57,9 @@ class TermSection:
     @property
     def mood(self) -> str:
         """CSS class of the status: good, absent or bad."""
-        moods = {FitStatus.CONVERGED: "good", FitStatus.ABSENT: "absent", FitStatus.NOT_CAPTURED: "absent"}
-        return moods.get(self.status, "bad")
+        if self.status is FitStatus.CONVERGED:
+            return "good"
+        return "absent" if self.status in (FitStatus.ABSENT, FitStatus.NOT_CAPTURED, FitStatus.IMPORTED) else "bad"
 
 
 @dataclass(frozen=True)
@@ -108,7 +109,34 @@ class DiffPage:
     sections: tuple[DiffSection, ...]
 
 
-def render(page: Page | DiffPage) -> str:
+@dataclass(frozen=True)
+class ValidationSection:
+    """One term's chapter; ``mood`` is the CSS class of its verdict."""
+
+    term: str
+    verdict: str
+    mood: str
+    sentences: tuple[str, ...]
+    checks: Table
+    illustrations: tuple[Illustration, ...]
+
+
+@dataclass(frozen=True)
+class ValidationPage:
+    """A profile's predictions of a session."""
+
+    template: ClassVar[str] = "validation.html.j2"
+
+    title: str
+    verdict: str
+    facts: tuple[Fact, ...]
+    sections: tuple[ValidationSection, ...]
+
+
+AnyPage = Page | DiffPage | ValidationPage
+
+
+def render(page: AnyPage) -> str:
     """Return the page as HTML; all text is escaped."""
     environment = Environment(
         loader=PackageLoader("udccal.reports"),
@@ -120,7 +148,7 @@ def render(page: Page | DiffPage) -> str:
     return environment.get_template(page.template).render(page=page)
 
 
-def write_page(path: Path, page: Page | DiffPage) -> None:
+def write_page(path: Path, page: AnyPage) -> None:
     """Render ``page`` and write it to ``path`` atomically."""
     path.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(path, render(page).encode("utf-8"))

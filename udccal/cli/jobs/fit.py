@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from udccal.calibration import ORDER, Calibration, Foundation, calibrate
@@ -17,6 +17,7 @@ from udccal.errors import FitError, UdccalError
 from udccal.fitting.engine.iteration_log import LOG
 from udccal.io.links import refuse_links
 from udccal.io.out_folder import check_writable, storing_in
+from udccal.profiles.history import identity
 from udccal.profiles.profile import Profile
 from udccal.profiles.store import check_replaceable, read_profile
 from udccal.refit import refit
@@ -75,6 +76,7 @@ def fit_to_profile(
     check_replaceable(profile_path)
     check_writable(profile_path.parent)
     before = read_profile(profile_path) if terms else None
+    parent = identity(profile_path).sha256 if terms else None
     keep_compilations()
     clock = compilation_clock()
     session = Session.open(session_path)
@@ -85,6 +87,7 @@ def fit_to_profile(
         )
     with _iterations_to(log):
         calibration = run_fits(output, session) if before is None else run_some(output, session, before, terms)
+    calibration = replace(calibration, parent=parent)
     profile_path = profile_path.resolve()
     report = profile_path.with_name(f"{profile_path.name.removesuffix('.zip')}-report.html")
     with output.stage("report"):

@@ -72,7 +72,8 @@ def fit_psf(
         return FitResult.failed("psf", _field(start, geometry), status, note)
     shots = data.shots.within(rules.half_px)
     fit = fit_diffraction(shots.pick(some_shots(shots, rules)), geometry, start, start_prior(rig, start, rules), rules)
-    own, explained = explain(fit.problem, fit.theta, shots, geometry, max(fit.model_error, rules.first_model_error))
+    error = max(fit.model_error, rules.first_model_error)
+    own, explained = explain(fit.problem.evaluator, fit.theta, shots, geometry, error)
     sources = Sources(own[:, :2], own[:, 2:5], own[:, 5]).with_light_of_peak(shots, explained)
     size = np.array([rig.camera.columns - 1, rig.camera.rows - 1]) / 2.0
     selection = select_field(shots, sources, explained, (shots.positions_px() - size) / size, fit.model_error, rules)

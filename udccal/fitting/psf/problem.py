@@ -277,10 +277,10 @@ def _slopes(
 
 
 def explain(
-    problem: DiffractionProblem, theta: Float[np.ndarray, " p"], shots: Shots, geometry: Geometry, model_error: float
+    evaluator: Evaluator, theta: Float[np.ndarray, " p"], shots: Shots, geometry: Geometry, model_error: float
 ) -> tuple[Float[np.ndarray, "shots l"], Crops]:
-    """Apply a fit's diffraction to whole crops: return own parameters, (x, y) on the sensor, and light per unit."""
-    evaluator = replace(problem.evaluator, lattice=fit_lattice(shots.half))
+    """Apply diffraction to whole crops: return own parameters, (x, y) on the sensor, and light per unit."""
+    evaluator = replace(evaluator, lattice=fit_lattice(shots.half))
     samples = weighed(gather(shots, geometry, np.ones(shots.rate.shape, dtype=bool)), model_error)
     kernels = coefficients_of(evaluator, theta, samples)
     found, explained = np.zeros((shots.count, OWN)), np.zeros(shots.rate.shape)

@@ -58,8 +58,8 @@ def fit_wire(data: WireData, rules: WireRules | None = None, start: Wire | None 
         pixels, model error included. The status of a flat that cannot be used says why.
     """
     rules, shape = rules or WireRules(), data.signal.shape
-    means = _site_means(data)
-    refused = _unusable(data, means, rules)
+    means = site_means(data)
+    refused = unusable_flat(data, means, rules)
     if refused:
         return FitResult.failed("wire", ideal_wire(data.geometry, data.start, np.zeros((0, 2)), rules), *refused)
     noise, values = flat_noise(data, means), data.signal / means[cfa_named(data.cfa).site_map(*shape)]
@@ -116,15 +116,15 @@ def sensor_map(wire: Wire, rows: int, columns: int) -> Float[np.ndarray, "rows c
     return np.asarray(wire_map(wire, rows, columns), dtype=np.float64)
 
 
-def _site_means(data: WireData) -> Float[np.ndarray, " sites"]:
-    """Mean signal of each site's finite, unclipped pixels; NaN where there are none."""
+def site_means(data: WireData) -> Float[np.ndarray, " sites"]:
+    """Return the mean signal of each site's finite, unclipped pixels; NaN where there are none."""
     by_site = (data.signal[site.samples] for site in cfa_named(data.cfa).sites)
     good = (some[np.isfinite(some) & (some < data.clip)] for some in by_site)
     return np.array([float(some.mean(dtype=np.float64)) if some.size else np.nan for some in good])
 
 
-def _unusable(data: WireData, means: Float[np.ndarray, " sites"], rules: WireRules) -> tuple[FitStatus, str] | None:
-    """Why a flat cannot be fitted."""
+def unusable_flat(data: WireData, means: Float[np.ndarray, " sites"], rules: WireRules) -> tuple[FitStatus, str] | None:
+    """Return why a flat cannot be fitted; None where it can be."""
     if data.clipped > rules.most_clipped:
         return FitStatus.SATURATED, f"{100 * data.clipped:.1f} % of the flat is clipped."
     if not np.isfinite(means).all():

@@ -1,0 +1,90 @@
+"""Corners of boards as their own lens images them, and as a wrong one does."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from tests.profiles.conftest import fitted
+from tests.validation.judged import failed, named
+from udccal.arrangements import BoardSpec
+from udccal.fitting.geometry.bundle import Intrinsics
+from udccal.fitting.geometry.corners import BoardCorners, board_points_mm
+from udccal.fitting.geometry.data import BoardView
+from udccal.models.geometry import Geometry
+from udccal.result import Diagnostic, FitResult
+from udccal.validation.geometry import judge_geometry
+from udccal.validation.limits import ValidationLimits
+
+SIZE, SIGMA_PX = (1024, 768), 0.01
+SPEC = BoardSpec(12, 9, 50.0, 37.0)
+
+
+def lens() -> Geometry:
+    return Geometry(
+        focal_px=np.array([880.0, 880.2]),
+        principal_point_px=np.array([506.0, 379.0]),
+        distortion=np.array([-0.06, 0.02, 0.0, 0.0, 0.0]),
+        rotation_rad=Rotation.from_euler("YXZ", [0.2, -17.0, 0.8], degrees=True).as_rotvec(),
+        pupil_mm=np.array([600.0, 190.0, -14.0]),
+    )
+
+
+@pytest.fixture(scope="module")
+def result() -> FitResult[Geometry]:
+    scatter = (Diagnostic("corner_scatter_on_jig", 0.0, "px"), Diagnostic("corner_scatter_by_hand", 0.0, "px"))
+    return replace(fitted("geometry", lens()), diagnostics=scatter)
+
+
+@pytest.fixture(scope="module")
+def views() -> tuple[BoardView, ...]:
+    """A board on the jig and six by hand."""
+    rng = np.random.default_rng(3)
+    panel = Rotation.from_rotvec(lens().rotation_rad).inv()
+    leaning = [Rotation.from_euler("xyz", rng.uniform(-25, 25, 3), degrees=True) for _ in range(6)]
+    return tuple(_view(rng, turn, number) for number, turn in enumerate((panel, *leaning)))
+
+
+def _view(rng: np.random.Generator, turn: Rotation, number: int) -> BoardView:
+    of, board = lens(), board_points_mm(SPEC)
+    matrix = Intrinsics.of_geometry(of).matrix
+    away = np.array([*rng.uniform(-80, 80, 2), 800.0]) - turn.apply(board.mean(axis=0))
+    seen = cv2.projectPoints(board, turn.as_rotvec(), away, matrix, of.distortion)[0].reshape(-1, 2)
+    seen = seen + SIGMA_PX * rng.normal(size=seen.shape)
+    corners = BoardCorners(np.arange(len(board)), seen, np.full(len(board), SIGMA_PX))
+    return BoardView(f"geometry/view_{number}", SPEC, number == 0, corners, 0.0)
+
+
+def test_boards_of_the_same_lens_are_predicted(result: FitResult[Geometry], views: tuple[BoardView, ...]) -> None:
+    found = judge_geometry(views, result, SIZE, ValidationLimits())
+    assert not failed(found)
+    assert named(found, "chi-squared").value == pytest.approx(1.0, abs=0.25)
+    assert (named(found, "camera's turn").value or 1.0) < 0.01
+
+
+def test_another_focal_length_fails(result: FitResult[Geometry], views: tuple[BoardView, ...]) -> None:
+    wrong = replace(result, term=replace(lens(), focal_px=1.01 * lens().focal_px))
+    assert "chi-squared" in failed(judge_geometry(views, wrong, SIZE, ValidationLimits()))
+
+
+def test_another_distortion_leaves_a_pattern(result: FitResult[Geometry], views: tuple[BoardView, ...]) -> None:
+    wrong = replace(result, term=replace(lens(), distortion=np.array([0.04, 0.0, 0.0, 0.0, 0.0])))
+    assert {"pattern of the corners", "chi-squared"} <= failed(judge_geometry(views, wrong, SIZE, ValidationLimits()))
+
+
+def test_a_turned_camera_fails_on_the_jig(result: FitResult[Geometry], views: tuple[BoardView, ...]) -> None:
+    turned = Rotation.from_euler("x", 0.2, degrees=True) * Rotation.from_rotvec(lens().rotation_rad)
+    wrong = replace(result, term=replace(lens(), rotation_rad=turned.as_rotvec()))
+    found = judge_geometry(views, wrong, SIZE, ValidationLimits())
+    assert failed(found) == {"camera's turn"}
+    assert named(found, "camera's turn").value == pytest.approx(0.2, abs=0.01)
+
+
+def test_pictures_without_boards_cannot_be_judged(result: FitResult[Geometry], views: tuple[BoardView, ...]) -> None:
+    empty = BoardCorners(np.zeros(0, dtype=np.int64), np.zeros((0, 2)), np.zeros(0))
+    bare = tuple(replace(view, corners=empty) for view in views)
+    assert failed(judge_geometry(bare, result, SIZE, ValidationLimits())) == {"captures"}

@@ -1,0 +1,93 @@
+"""``udccal profile validate`` as it is installed, on a toy rig whose noise alone is captured, on two days."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+import udccal
+from tests.comparison.perturbed import with_result
+from tests.reports.widths import layouts
+from tests.toy_rigs import write_toy_rig
+from udccal.benches.bench import simulated_bench
+from udccal.profiles.store import load_profile, write_profile
+from udccal.simulation.truth import draw_truth
+from udccal.simulation.world import SimulatedWorld
+
+pytestmark = pytest.mark.slow
+
+
+def validate(*words: str | Path) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "udccal.cli.main", "profile", "validate", *map(str, words)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=600)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A profile of the first day, and sessions of both days."""
+    folder = tmp_path_factory.mktemp("with a space, µ")
+    truth = draw_truth(udccal.load_rig(write_toy_rig(folder)), 0)
+    for day in ("first", "second"):
+        with simulated_bench(SimulatedWorld(truth, seed=len(day))) as bench:
+            session = udccal.capture(folder / day, bench, terms=("noise",))
+        if day == "first":
+            udccal.calibrate(session).write(folder / "profile")
+    profile = load_profile(folder / "profile")
+    more = replace(profile.noise.term, K_DN_per_e=1.02 * profile.noise.term.K_DN_per_e)
+    write_profile(folder / "wrong", with_result(profile, "noise", term=more))
+    return folder
+
+
+def test_another_day_is_predicted_and_terms_without_captures_are_not_counted(folder: Path) -> None:
+    out = folder / "out" / "deep"
+    done = validate(folder / "profile", "--session", folder / "second", "--out", out, "--json")
+    assert done.returncode == 0, done.stderr
+    document = json.loads(done.stdout)
+    assert document == json.loads((out / "validation.json").read_text(encoding="utf-8"))
+    assert (document["ok"], document["own_session"]) == (True, False)
+    for check in document["checks"]:
+        assert list(check) == ["term", "name", "value", "limit", "unit", "ok", "what"]
+        assert check["what"].endswith(".")
+    named = {check["term"]: check["name"] for check in document["checks"] if check["ok"] is None}
+    assert named == dict.fromkeys(("geometry", "wire", "psf", "backscatter"), "NOT_CAPTURED")
+    page = (out / "validation.html").read_text(encoding="utf-8")
+    assert document["advice"] in page.replace("&#39;", "'")
+    assert not re.findall(r"(?:src|href)=\"(?!data:|#)", page)
+    assert page.count("<img ") == 1
+    for layout in layouts(page, folder):
+        assert not layout.sideways
+
+
+def test_a_gain_of_2_percent_more_has_status_3(folder: Path) -> None:
+    done = validate(folder / "wrong", "--session", folder / "second")
+    assert done.returncode == 3, done.stderr
+    assert done.stdout.startswith("Do not rely on noise of this profile")
+    assert "0.98" in done.stdout
+
+
+def test_the_profiles_own_session_confirms_nothing(folder: Path) -> None:
+    found = udccal.validate(load_profile(folder / "profile"), udccal.Session.open(folder / "first"))
+    assert found.own_session
+    assert "capture another one" in found.advice
+
+
+def refused(*words: str | Path) -> str:
+    done = validate(*words, "--json")
+    assert done.returncode == 1, done.stdout + done.stderr
+    assert "Traceback" not in done.stderr
+    return str(json.loads(done.stdout)["error"])
+
+
+def test_what_cannot_be_compared_is_refused_in_a_sentence(folder: Path) -> None:
+    session = ("--session", folder / "second")
+    assert "found another rig: toy in the session, lg55-reduced in the profile" in refused("lg55-reduced", *session)
+    assert "found none" in refused(folder / "missing", *session)
+    assert "session" in refused(folder / "profile", "--session", folder / "missing")
+    into = folder / "toy" / "rig.toml" / "out"
+    assert "Choose another folder" in refused(folder / "profile", *session, "--out", into)

@@ -1,0 +1,47 @@
+"""The page of a validation: what to do, then each term's checks with its map."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from udccal.comparison.estimates import ORDER
+from udccal.reports.figures import embedded_png
+from udccal.reports.page import Fact, Illustration, ValidationPage, ValidationSection
+from udccal.reports.validation_figures import z_figure
+from udccal.reports.validation_tables import term_checks_table
+from udccal.sessions.schema import TermName
+from udccal.validation.checks import Check, ZMap
+from udccal.validation.validate import Validation
+
+
+def validation_page(found: Validation, maps: Mapping[TermName, ZMap]) -> ValidationPage:
+    """Build the page of one validation."""
+    counted = [check for check in found.checks if check.ok is not None]
+    return ValidationPage(
+        title=f"A profile of {found.rig}, validated by a session",
+        verdict=found.advice,
+        facts=(
+            Fact("checks within their limits", f"{sum(bool(check.ok) for check in counted)} of {len(counted)}"),
+            Fact("profile made", found.profile_created_at),
+            Fact("session begun", found.session_created_at),
+            Fact("session", "the profile's own" if found.own_session else "another one"),
+        ),
+        sections=tuple(
+            _section(term, [one for one in found.checks if one.term == term], maps.get(term)) for term in ORDER
+        ),
+    )
+
+
+def _section(term: TermName, checks: list[Check], z_map: ZMap | None) -> ValidationSection:
+    judged = [check.ok for check in checks if check.ok is not None]
+    failed = judged.count(False)
+    verdict = "not judged" if not judged else f"{failed} of {len(judged)} failed" if failed else "predicted"
+    figure = () if z_map is None else (Illustration(embedded_png(z_figure(z_map)), z_map.caption, f"map of {term}"),)
+    return ValidationSection(
+        term=term,
+        verdict=verdict,
+        mood="absent" if not judged else "bad" if failed else "good",
+        sentences=tuple(check.what for check in checks),
+        checks=term_checks_table([check for check in checks if check.value is not None]),
+        illustrations=figure,
+    )

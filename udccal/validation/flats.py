@@ -1,0 +1,47 @@
+"""A flat over a wire map: the light of the day in front of the panel, and medians over parts of the sensor."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from udccal.fitting.wire.data import FlatNoise, Pixels, Weighed
+
+# Parts of the sensor, down and across; a part has a median where it has so many pixels.
+CELLS, _LEAST = (24, 32), 8
+# Sigma of a median over that of a mean, for a normal distribution.
+_OF_MEDIAN = 1.2533
+
+
+def light_design(pixels: Pixels) -> Float[np.ndarray, "n columns"]:
+    """Return the columns of a light that changes slowly: a level per colour site, and a polynomial of second degree."""
+    x, y = pixels.scaled.T
+    sites = np.eye(int(pixels.site.max()) + 1)[pixels.site]
+    return np.column_stack([sites, x, y, x * x, x * y, y * y])
+
+
+def cell_numbers(scaled: Float[np.ndarray, "n 2"]) -> Int[np.ndarray, " n"]:
+    """Return the number of each position's part of the sensor, row by row; positions are from -1 to 1."""
+    down, across = CELLS
+    x, y = (np.clip(((scaled[:, i] + 1) / 2 * n).astype(np.int64), 0, n - 1) for i, n in enumerate((across, down)))
+    return np.asarray(y * across + x)
+
+
+def cell_medians(
+    seen: Weighed, noise: FlatNoise
+) -> tuple[Float[np.ndarray, "down across"], Float[np.ndarray, "down across"]]:
+    """Return the median of the flat over the map, less 1, by part of the sensor, and its sigma; NaN without pixels.
+
+    Pixels that are far off count here, as a smudge has many. Single defects do not move a median.
+    """
+    pixels = seen.pixels
+    here = (pixels.weight > 0) | seen.outlying
+    expected, cell = seen.expected[here], cell_numbers(pixels.scaled[here])
+    part, variance = pixels.value[here] / expected - 1, noise.variance(pixels.site[here], expected) / expected**2
+    order, ends = np.argsort(cell, kind="stable"), np.cumsum(np.bincount(cell, minlength=CELLS[0] * CELLS[1]))[:-1]
+    found = [
+        (float(np.median(one)), float(_OF_MEDIAN / np.sqrt(np.sum(1 / noisy)))) if len(one) >= _LEAST else (np.nan,) * 2
+        for one, noisy in zip(*(np.split(of[order], ends) for of in (part, variance)), strict=True)
+    ]
+    middle, sigma = np.array(found).T.reshape(2, *CELLS)
+    return middle, sigma

@@ -1,0 +1,149 @@
+"""Validation of a profile by a session: every term's captures predicted, and a verdict."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import final
+
+from udccal.comparison.comparable import check_same_rig
+from udccal.comparison.estimates import ORDER
+from udccal.errors import SessionError
+from udccal.io.hashing import sha256_file
+from udccal.profiles.profile import Profile
+from udccal.result import FitStatus
+from udccal.sessions.manifest import MANIFEST_NAME
+from udccal.sessions.schema import TermName
+from udccal.sessions.store import Session
+from udccal.validation.backscatter import validate_backscatter
+from udccal.validation.checks import Check, Judged, ZMap
+from udccal.validation.geometry import validate_geometry
+from udccal.validation.limits import ValidationLimits
+from udccal.validation.noise import validate_noise
+from udccal.validation.psf import validate_psf
+from udccal.validation.wire import validate_wire
+
+FORMAT, VERSION = "udccal-validation", 1
+# Terms that are judged at the same time.
+_AT_ONCE = 2
+
+
+@final
+@dataclass(frozen=True)
+class Validation:
+    """Whether a profile predicts a session. docs/validate.md describes each number.
+
+    Attributes:
+        ok: whether every check that counts is within its limit.
+        advice: one sentence that says what to do.
+        own_session: whether the profile was fitted to this session: most of its captures then confirm nothing.
+        checks: of all terms, in their order.
+    """
+
+    format: str
+    version: int
+    rig: str
+    ok: bool
+    advice: str
+    profile_created_at: str
+    session_created_at: str
+    session_sha256: str
+    own_session: bool
+    checks: tuple[Check, ...]
+    limits: ValidationLimits
+
+
+def validate(profile: Profile, session: Session, limits: ValidationLimits | None = None) -> Validation:
+    """Predict a session's captures with a profile's terms, without fitting these, and judge what is left.
+
+    What belongs to the captures alone is solved for: level, colour and slow change of a flat's light, place and light
+    of an LED, pose of a board.
+
+    Args:
+        profile: of the same rig and camera.
+        session: best one that the profile was not fitted to.
+        limits: of the checks.
+
+    Raises:
+        ProfileError: when the session is of another rig or camera.
+        SessionError: when a file of the session is missing or damaged, or no term can be judged.
+        FitError: when frames or boards are not what a fit takes.
+    """
+    return judge(profile, session, limits or ValidationLimits())[0]
+
+
+def judge(
+    profile: Profile,
+    session: Session,
+    limits: ValidationLimits,
+    progress: Callable[[TermName], None] = lambda term: None,
+) -> tuple[Validation, Mapping[TermName, ZMap]]:
+    """Validate, and keep the maps for figures; see ``validate``. ``progress`` gets each term when it begins."""
+    check_same_rig(profile, session.rig, session.camera)
+    sha256 = sha256_file(session.path / MANIFEST_NAME)
+    own = sha256 == profile.provenance.session_sha256
+
+    def one(term: TermName) -> Judged:
+        progress(term)
+        return _judged(term, profile, session, limits, own)
+
+    with ThreadPoolExecutor(_AT_ONCE) as pool:
+        judged = dict(zip(ORDER, pool.map(one, ORDER), strict=True))
+    checks = tuple(check for one in judged.values() for check in one.checks)
+    counted = [check for check in checks if check.ok is not None]
+    if not counted:
+        raise SessionError(
+            f"Expected a session with captures of a term that the profile measured, found none in {session.path}. "
+            "Capture some steps of the rig first."
+        )
+    failed = tuple(dict.fromkeys(check.term for check in counted if not check.ok))
+    answer = Validation(
+        format=FORMAT,
+        version=VERSION,
+        rig=profile.rig.name,
+        ok=not failed,
+        advice=_advice(failed, own),
+        profile_created_at=profile.provenance.created_at,
+        session_created_at=session.manifest.created_at,
+        session_sha256=sha256,
+        own_session=own,
+        checks=checks,
+        limits=limits,
+    )
+    return answer, {term: one.z_map for term, one in judged.items() if one.z_map is not None}
+
+
+def _judged(term: TermName, profile: Profile, session: Session, limits: ValidationLimits, own: bool) -> Judged:
+    if not session.steps(term):
+        return _not_counted(term, "NOT_CAPTURED", "The session has no captures of this term.")
+    if profile.result(term).status is FitStatus.NOT_CAPTURED:
+        return _not_counted(
+            term, "NOT_CAPTURED", "The profile has no captures of this term: there is nothing to judge."
+        )
+    match term:
+        case "noise":
+            return validate_noise(profile, session, limits)
+        case "geometry":
+            return validate_geometry(profile, session, limits)
+        case "wire":
+            return validate_wire(profile, session, limits)
+        case "psf":
+            return validate_psf(profile, session, limits, own)
+        case "backscatter":
+            return validate_backscatter(profile, session, limits)
+
+
+def _not_counted(term: TermName, name: str, what: str) -> Judged:
+    return Judged((Check(term, name, None, None, "", None, what),))
+
+
+def _advice(failed: tuple[TermName, ...], own: bool) -> str:
+    if failed:
+        terms = " and ".join(failed)
+        return (
+            f"Do not rely on {terms} of this profile for captures like these: calibrate the rig again, or look below."
+        )
+    if own:
+        return "The profile describes the session that it was fitted to; capture another one to confirm it."
+    return "Go on with this profile: it predicts the session's captures."

@@ -1,0 +1,98 @@
+"""Wire: a session's averaged flat over a profile's wire map, at pixels that the map was not fitted to.
+
+The light in front of the panel differs from day to day: its level in each colour and a polynomial of second degree
+over the sensor are solved for.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+
+from udccal.cfa import cfa_named
+from udccal.fitting.wire.data import FlatNoise, Pixels, Weighed, WireData, flat_noise, read_wire, sample_pixels, weighed
+from udccal.fitting.wire.fit import site_means, unusable_flat
+from udccal.fitting.wire.jacobian import values_at
+from udccal.fitting.wire.report import misfit
+from udccal.fitting.wire.rules import WireRules
+from udccal.models.wire import Wire
+from udccal.numerics import in_float64
+from udccal.profiles.profile import Profile
+from udccal.result import FitResult
+from udccal.sessions.store import Session
+from udccal.validation.checks import Judged, ZMap, at_most, chi2_check, unusable
+from udccal.validation.flats import cell_medians, light_design
+from udccal.validation.limits import ValidationLimits
+
+
+def validate_wire(profile: Profile, session: Session, limits: ValidationLimits) -> Judged:
+    """Judge a session's flat; see ``judge_wire``.
+
+    Raises:
+        SessionError: when a file of the session is missing or damaged.
+    """
+    return judge_wire(read_wire(session, profile.noise.term, profile.wire.term.geometry), profile.wire, limits)
+
+
+@in_float64
+def judge_wire(data: WireData, result: FitResult[Wire], limits: ValidationLimits) -> Judged:
+    """Judge patterns by the rows' and columns' period, the worst part of the sensor, and the scatter of pixels."""
+    rules, means = WireRules(), site_means(data)
+    if (refused := unusable_flat(data, means, rules)) is not None:
+        return unusable("wire", " ".join((refused[1], refused[0].value)))
+    values = data.signal / means[cfa_named(data.cfa).site_map(*data.signal.shape)]
+    pixels = sample_pixels(values, result.term.geometry, rules.samples, data.cfa, other=True)
+    noise = flat_noise(data, means)
+    seen = _predicted(result.term, pixels, noise)
+    stated = {one.name: one.value / 100 for one in result.diagnostics}.get("wire_map_rms_sigma", 0.0)
+    panel = result.term if len(result.term.harmonics) else None
+    off = misfit(seen, panel, stated, held_out=True)
+    cells, sigma = cell_medians(seen, noise)
+    worst, dof = float(np.nanmax(np.abs(cells))), seen.pixels.used
+    checks = (
+        at_most(
+            "wire",
+            "pattern by rows and columns",
+            100 * off.sigma,
+            limits.wire_percent,
+            "%",
+            f"The flat over the wire map {'has a pattern of' if off.test.found else 'has no pattern,'} "
+            f"{100 * off.sigma:.3f} % (RMS) by rows and columns.",
+        ),
+        at_most(
+            "wire",
+            "worst part of the sensor",
+            100 * worst,
+            limits.cell_percent,
+            "%",
+            f"The part of the sensor that is farthest off is off by {100 * worst:.2f} %: dust or a smudge shows here.",
+        ),
+        chi2_check(
+            "wire",
+            float(np.sum(seen.z**2)) / max(dof, 1),
+            dof,
+            result.chi2_dof,
+            limits.chi2_factor,
+            limits,
+            "Pixels of the flat over the wire map",
+        ),
+    )
+    caption = "The flat over the wire map, median of a part of the sensor, in sigma."
+    return Judged(checks, ZMap(cells / np.hypot(sigma, stated), "x", "y", caption))
+
+
+def _predicted(wire: Wire, pixels: Pixels, noise: FlatNoise) -> Weighed:
+    """The sample with the light that the map predicts, at the best light in front of the panel."""
+    whole, base = values_at(wire, pixels.ideal, pixels.scaled)
+    plain = weighed(pixels, whole * base, noise)
+    for _ in range(2):  # What is far off counts once more after the light's level is known.
+        smooth = _smooth(plain.pixels, whole * base)
+        plain = weighed(pixels, whole * base * smooth, noise)
+    return plain
+
+
+def _smooth(pixels: Pixels, expected: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    """The light of the day over that of the map, by weighted least squares."""
+    design, root = light_design(pixels), np.sqrt(pixels.weight) * expected
+    ratio = np.where(pixels.weight > 0, pixels.value / np.maximum(expected, 1e-9), 0.0)
+    return np.asarray(design @ np.linalg.lstsq(design * root[:, None], ratio * root, rcond=None)[0])
