@@ -11,9 +11,11 @@ from typing import Any
 import pytest
 
 from tests.profiles.exchange.test_ros_camera_info import CALIBRATOR
-from tests.profiles.test_versions import stored_in_version_1
+from tests.profiles.test_versions import written_in_version_2
 from tests.toy_rigs import write_toy_rig
+from udccal.profiles.profile import Profile
 from udccal.profiles.schema import VERSION
+from udccal.profiles.store import write_profile
 
 pytestmark = pytest.mark.medium
 
@@ -34,15 +36,15 @@ def folder(tmp_path: Path) -> Path:
     return folder
 
 
-def test_an_old_profile_is_migrated_packed_and_unpacked_and_tells_so(folder: Path) -> None:
-    stored_in_version_1(folder / "old")
+def test_an_old_profile_is_migrated_packed_and_unpacked_and_tells_so(folder: Path, toy_profile: Profile) -> None:
+    written_in_version_2(folder / "old", toy_profile)
     migrated = profile("migrate", folder / "old", "--out", folder / "new")
     assert migrated["version"] == VERSION
     packed = profile("pack", folder / "new", folder / "new.zip")
     unpacked = profile("unpack", folder / "new.zip", folder / "again")
     assert packed["sha256"] == unpacked["sha256"] == migrated["sha256"]
     new, old = profile("log", folder / "again")["history"]
-    assert (new["identity"]["version"], old["identity"]["version"]) == (VERSION, 1)
+    assert (new["identity"]["version"], old["identity"]["version"]) == (VERSION, 2)
     assert new["parent"] == old["identity"]["sha256"]
     assert new["provenance"]["created_at"] == old["provenance"]["created_at"]
     assert not any(term["changed"] for term in new["terms"])
@@ -62,16 +64,17 @@ def test_an_exported_lens_is_imported(folder: Path) -> None:
     assert [term["status"] for term in shown["terms"]] == ["NOT_CAPTURED", "IMPORTED", *["NOT_CAPTURED"] * 3]
 
 
-def test_what_cannot_be_done_is_a_sentence(folder: Path) -> None:
+def test_what_cannot_be_done_is_a_sentence(folder: Path, toy_profile: Profile) -> None:
+    write_profile(folder.parent / "present", toy_profile)
     (folder / "letter.txt").write_text("Dear all")
     out = folder / "p"
     for words, sentence in (
-        (("migrate", "lg55-reduced", "--out", out), "nothing to migrate"),
-        (("pack", "lg55-reduced", folder / "letter.txt"), "ends in .zip"),
-        (("pack", "lg55-reduced", folder / "letter.txt" / "p.zip"), "Choose another folder"),
+        (("migrate", folder.parent / "present", "--out", out), "nothing to migrate"),
+        (("pack", folder.parent / "present", folder / "letter.txt"), "ends in .zip"),
+        (("pack", folder.parent / "present", folder / "letter.txt" / "p.zip"), "Choose another folder"),
         (("unpack", folder / "letter.txt", out), "whole zip file"),
         (("log", folder / "letter.txt"), "whole zip file"),
-        (("export", "lg55-reduced", "--to", "csv", "--out", folder / "letter.txt"), "exists"),
+        (("export", folder.parent / "present", "--to", "csv", "--out", folder / "letter.txt"), "exists"),
         (("import", folder / "letter.txt", "--from", "mrcal", "--rig", "lg55-reduced", "--out", out), "camera model"),
         (("import", folder / "none", "--from", "mrcal", "--rig", "lg55-reduced", "--out", out), "found none"),
         (("import", folder / "letter.txt", "--from", "mrcal", "--rig", "lg55", "--out", out), "Did you mean"),
