@@ -1,4 +1,4 @@
-"""A board held in one pose after the other: a view is taken when the board is still and the view adds information."""
+"""A board held in one pose after the other: a view is taken when the board is still and unlike the views before."""
 
 from __future__ import annotations
 
@@ -6,32 +6,32 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from typing import Final, final
 
-import cv2
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
+from scipy.spatial.transform import Rotation
 
 from procedures.aiming import nominal_pixels
-from procedures.board_information import LensInformation
 from procedures.live import LiveFrames
 from procedures.plans import Metered
 from procedures.readings import CornersSeen, find_corners, head_room, sharpness, why_not
 from procedures.step import Bench, Step, run_step, set_up
-from udccal.arrangements import Board, BoardSpec
+from udccal.arrangements import Board
 from udccal.guide.events import Outline, Reading
 from udccal.guide.steps import Look
 from udccal.rig import RigDescription
 from udccal.sessions.writer import SessionWriter
 
-_STILL_PX, _STILL_LOOKS, _UNKNOWN_PX = 1.0, 3, 99.0
+_STILL_PX, _STILL_LOOKS, _UNKNOWN_PX = 1.0, 3, 999.0
 _FEWEST_COMMON: Final = 4
-_NEWS: Final = 50.0  # % of what the suggested pose would add
+_UNLIKE: Final = 0.02  # of the sensor's width, by which the corners of two views differ at least
 
 
 @final
 class BoardVisit:
     """Implements ``udccal.guide.steps.Visit`` for all views held by hand: a capture is one view.
 
-    For each view a pose is suggested as an outline. Any other is taken too that adds half as much information.
+    For each view a pose is suggested as an outline. Any other is taken too whose corners lie elsewhere than those of
+    the views before: the board was moved, or it leans in another way.
     """
 
     def __init__(
@@ -50,10 +50,9 @@ class BoardVisit:
         """
         self._rig, self._step_ids, self._poses, self._view = writer.manifest.rig, step_ids, poses, view
         self._bench, self._writer = bench, writer
-        self._lens = LensInformation(self._rig)
-        for number, step_id in enumerate(step_ids):
-            if step_id in writer.completed_ids:  # how it was held is in its picture; it is taken to be as suggested
-                self._lens.add(self._lens.of_board(poses[number]))
+        # How a board was held is in its picture; after an interruption it is taken to be as suggested.
+        captured = [number for number, step_id in enumerate(step_ids) if step_id in writer.completed_ids]
+        self._views = [_nominal_corners(self._rig, poses[number]) for number in captured]
         self._seen: deque[CornersSeen] = deque(maxlen=_STILL_LOOKS)
         self._tries = 0
         self._asked = self._ask()
@@ -73,19 +72,16 @@ class BoardVisit:
         room, seen = head_room(level, self._target), find_corners(frame, self._board.spec)
         corners = seen.reading(self._board.spec)
         self._seen.append(seen)
-        readings = (room, corners, sharpness(frame), _movement(self._seen), self._news(seen))
+        readings = (room, corners, sharpness(frame), _movement(self._seen), self._unlike(seen))
         wanted = Outline(_polygon(_edge(self._rig, self._board)), "wanted")
-        if not len(seen.numbers):
-            return Look(frame, readings, self._why_not(readings), (wanted,))
-        hull = cv2.convexHull(seen.points_px.astype(np.float32)).reshape(-1, 2)
-        return Look(frame, readings, self._why_not(readings), (wanted, Outline(_polygon(hull), "seen")))
+        return Look(frame, readings, self._why_not(readings), (wanted, *seen.outlines))
 
     def capture(self) -> Iterator[None]:
         """Take the view; raises as ``run_step`` does."""
-        information = self._lens.of_corners(self._seen[-1], self._board.spec)
+        view = self._seen[-1]
         self._seen.clear()
         run_step(self._asked, self._bench, self._writer, None)
-        self._lens.add(information)
+        self._views.append(view)
         self._tries = 0
         if any(step_id not in self._writer.completed_ids for step_id in self._step_ids):
             self._asked = self._ask()
@@ -99,15 +95,13 @@ class BoardVisit:
         set_up(step, self._bench, self._writer)
         return step
 
-    def _news(self, seen: CornersSeen) -> Reading:
-        gain, suggested = (
-            self._lens.gain(information)
-            for information in (self._lens.of_corners(seen, self._board.spec), self._lens.of_board(self._board))
-        )
-        return Reading("news of the lens", 100 * gain / max(suggested, 1e-6), _NEWS, None, "%")
+    def _unlike(self, seen: CornersSeen) -> Reading:
+        width = float(self._rig.camera.columns)
+        nearest = min((_moved_px(view, seen) for view in self._views), default=width)
+        return Reading("unlike other views", nearest, _UNLIKE * width, None, "px")
 
     def _why_not(self, readings: tuple[Reading, ...]) -> str:
-        room, corners, sharp, movement, news = readings
+        room, corners, sharp, movement, unlike = readings
         if not room.ok:
             return why_not(room)
         if not corners.ok:
@@ -119,11 +113,11 @@ class BoardVisit:
             return "Hold the board still."
         if not sharp.ok:
             return why_not(sharp)
-        if not news.ok:
+        if not unlike.ok:
             self._tries += 1
             self._asked = self._ask()
             self._seen.clear()
-            return "This view shows little that is new. Hold the board as the outline shows it."
+            return "Such a view is there already. Hold the board as the outline shows it."
         return ""
 
 
@@ -143,12 +137,21 @@ def _moved_px(one: CornersSeen, other: CornersSeen) -> float:
 
 
 def _edge(rig: RigDescription, board: Board) -> Float[np.ndarray, "4 2"]:
-    """Return where a nominal camera sees the board's corners."""
-    spec: BoardSpec = board.spec
-    width, height = spec.columns * spec.square_mm, spec.rows * spec.square_mm
-    corners = np.array([[0, 0, 0], [width, 0, 0], [width, height, 0], [0, height, 0.0]])
-    turn = cv2.Rodrigues(np.array(board.rotation_vector))[0]
-    return nominal_pixels(rig, corners @ turn.T + np.array(board.translation_mm))
+    """Return where a nominal camera sees the board's outer corners."""
+    spec = board.spec
+    return _places(rig, board, np.array([[0, 0], [spec.columns, 0], [spec.columns, spec.rows], [0, spec.rows]]))
+
+
+def _nominal_corners(rig: RigDescription, board: Board) -> CornersSeen:
+    """Return where a nominal camera sees the inner corners, which OpenCV numbers along the board's rows."""
+    x, y = np.meshgrid(np.arange(1, board.spec.columns), np.arange(1, board.spec.rows))
+    squares = np.stack([x.ravel(), y.ravel()], axis=1)
+    return CornersSeen(np.arange(len(squares)), _places(rig, board, squares))
+
+
+def _places(rig: RigDescription, board: Board, squares: Int[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
+    on_board = np.pad(squares * board.spec.square_mm, ((0, 0), (0, 1)))
+    return nominal_pixels(rig, Rotation.from_rotvec(board.rotation_vector).apply(on_board) + board.translation_mm)
 
 
 def _polygon(points: Float[np.ndarray, "n 2"]) -> tuple[tuple[float, float], ...]:

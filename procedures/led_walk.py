@@ -136,7 +136,7 @@ class LedVisit:
         self._writer.add_step(step_id, "psf", led, captures)
         self._taken_px.append(place)
         if len(self._taken_px) < len(self._cell.step_ids):
-            self._asked = self._ask(self._next_phase())
+            self._ask_from(place, self._next_phase())
         yield
 
     def _held_place(self, first: Capture, region: Region) -> Place:
@@ -161,8 +161,10 @@ class LedVisit:
         self._bench.stage.arrange(led, Occasion(step_id, self._writer.number(step_id), ""))
         return led
 
-    def _ask_again(self, place_px: Place) -> None:
-        self._asked = self._ask(place_px)
+    def _ask_from(self, seen_px: Place, wanted_px: Place) -> None:
+        """Have the LED brought from where it is seen to where it is wanted."""
+        right, down = wanted_px[0] - seen_px[0], wanted_px[1] - seen_px[1]
+        self._asked = self._ask((self._asked.x_px + right, self._asked.y_px + down))
         self._seen_px.clear()
 
     def _ask_inwards(self) -> None:
@@ -202,12 +204,12 @@ class LedVisit:
         if not off.ok:
             wanted = self._taken_px[0] if self._taken_px else self._cell.place_px
             if movement.ok:
-                self._ask_again(_moved(self._asked, place_px, wanted))
+                self._ask_from(place_px, wanted)
             return f"{move_led(place_px, wanted)}."
         if not movement.ok:
             return "Let the LED rest."
         if not new.ok:
-            self._ask_again(self._next_phase())
+            self._ask_from(place_px, self._next_phase())
             return "A picture with the LED at this place within a pixel is there already. Nudge it by a pixel or so."
         return ""
 
@@ -215,10 +217,6 @@ class LedVisit:
         if not led.room.ok:
             return "The surroundings are nearly as bright as the LED. Darken the room."
         return why_not(room) if seen else "No LED is seen. Switch it on and bring it into the camera's view."
-
-
-def _moved(asked: Led, from_px: Place, to_px: Place) -> Place:
-    return (asked.x_px + to_px[0] - from_px[0], asked.y_px + to_px[1] - from_px[1])
 
 
 def _distance(one: Place, other: Place) -> float:

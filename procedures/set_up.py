@@ -18,14 +18,13 @@ from udccal.errors import CaptureError
 from udccal.guide.drawing import side_view
 from udccal.guide.events import Outline, Reading
 from udccal.guide.steps import GuidedStep, Look
+from udccal.planning.exposures import with_small_panel
 from udccal.rig import RigDescription
 from udccal.sessions.writer import SessionWriter
 
 Steps = Callable[[RigDescription], Iterator[Step]]
 # Level at which a light is looked at where the step itself takes up another's exposure.
 _LOOKED_AT = Metered(0.5)
-# Steps are listed with pictures this small.
-_COUNTING_PX = 8
 
 
 def set_ups(rig: RigDescription, steps: Steps) -> Iterator[GuidedStep]:
@@ -35,9 +34,7 @@ def set_ups(rig: RigDescription, steps: Steps) -> Iterator[GuidedStep]:
         rig: gives the drawing.
         steps: of a procedure; made anew for each use, since pictures of a panel are large.
     """
-    panel = rig.panel.model_copy(update={"columns": _COUNTING_PX, "rows": _COUNTING_PX})
-    small = rig.model_copy(update={"panel": panel})  # nothing but the pictures depends on it
-    for _, alike in groupby(steps(small), key=lambda step: step.instruction):
+    for _, alike in groupby(steps(with_small_panel(rig)), key=lambda step: step.instruction):
         yield _guided(rig, steps, tuple(alike))
 
 
@@ -90,9 +87,8 @@ class SetUpVisit:
                 return self._judged(frame, (room, evenness(frame, self._rig)))
             case Board(spec):
                 seen = find_corners(frame, spec)
-                outline = Outline(tuple((float(x), float(y)) for x, y in seen.points_px), "seen")
                 readings = (room, seen.reading(spec), sharpness(frame))
-                return self._judged(frame, readings, (outline,) if len(seen.numbers) else ())
+                return self._judged(frame, readings, seen.outlines)
             case _:
                 return self._judged(frame, (room,))
 

@@ -21,13 +21,12 @@ _PATTERN = np.array([[0.6, 1.0], [1.0, 0.7]])
 _FULL_S = {Led: 125e-6, FlatLight: 12e-3, Board: 12e-3, PanelPicture: 0.1}
 
 
-def painted_rig(name: str = "lg55-aca2040", **captures: int) -> RigDescription:
-    """A shipped rig with a sensor of a quarter of the pixels across, and few frames."""
-    rig = load_rig(name)
-    camera = rig.camera.model_copy(
-        update={"columns": rig.camera.columns // 4, "rows": rig.camera.rows // 4, "pitch_um": 4 * rig.camera.pitch_um}
-    )
-    few = {"flats": 6, "noise_levels": 4, "noise_stack": 3, "psf_shifts": 2, "psf_exposures": 2, "board_views": 5}
+def painted_rig(fewer: int = 8, **captures: int) -> RigDescription:
+    """The full-size rig with ``fewer`` times fewer pixels across, and few frames."""
+    rig = load_rig("lg55-aca2040")
+    size = {"columns": rig.camera.columns // fewer, "rows": rig.camera.rows // fewer}
+    camera = rig.camera.model_copy(update={**size, "pitch_um": fewer * rig.camera.pitch_um})
+    few = {"flats": 6, "noise_levels": 4, "noise_stack": 3, "psf_shifts": 2, "psf_exposures": 2, "board_views": 3}
     few |= {"backscatter_pictures": 2, "backscatter_frames": 2, "psf_region_columns": 32, "psf_region_rows": 48}
     panel = rig.panel.model_copy(update={"columns": 64, "rows": 36})
     changed = rig.captures.model_copy(update=few | captures)

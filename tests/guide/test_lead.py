@@ -31,9 +31,9 @@ def led(
     return person
 
 
-@pytest.mark.medium
+@pytest.mark.slow
 def test_a_whole_rig_takes_at_most_40_prompts(tmp_path: Path) -> None:
-    rig, real = painted_rig(), load_rig("lg55-aca2040")
+    rig, real = painted_rig(4, psf_shifts=1, board_views=2), load_rig("lg55-aca2040")
     assert [step.id for step in guided_steps(rig)] == [step.id for step in guided_steps(real)]
     person = led(tmp_path, ["noise", "geometry", "wire", "psf", "backscatter"], painted=PaintedRig(rig))
     assert person.done.complete
@@ -72,7 +72,7 @@ def test_the_place_of_an_led_is_measured(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("put", "sentence"),
     [
-        (Led(100.0, 300.0, 2000.0, 1.15), "Move the LED so that its image goes"),
+        (Led(60.0, 150.0, 2000.0, 1.15), "Move the LED so that its image goes"),
         (FlatLight(), "The surroundings are nearly as bright as the LED. Darken the room."),
         (Dark(), "No LED is seen."),
     ],
@@ -82,17 +82,14 @@ def test_a_wrong_led_is_not_captured_and_the_person_is_told_why(tmp_path: Path, 
     painted = PaintedRig(painted_rig(psf_columns=2, psf_rows=1))
 
     def react(event: Event, offered: tuple[Answer, ...]) -> Answer | None:
-        painted.put = put if len(person_looks(event)) and painted.frames_taken < 60 else None
+        if painted.frames_taken > 20:
+            painted.put = None
         return None
 
     painted.put = put
     person = led(tmp_path, ["psf"], react, painted)
     assert any(said.startswith(sentence) for said in person.sentences("psf/p00"))
     assert person.done.complete
-
-
-def person_looks(event: Event) -> tuple[object, ...]:
-    return (event,) if isinstance(event, ReadingsEvent) else ()
 
 
 def test_a_moving_led_is_not_captured(tmp_path: Path) -> None:
@@ -113,13 +110,13 @@ def test_a_moving_led_is_not_captured(tmp_path: Path) -> None:
     ("term", "step_id", "put", "sentence"),
     [
         ("wire", "wire/flat", Dark(), "Expected to see the light"),
-        ("wire", "wire/flat", Led(200.0, 200.0, 2000.0, 1.15), "Expected an even light"),
+        ("wire", "wire/flat", Led(100.0, 100.0, 2000.0, 1.15), "Expected an even light"),
         ("wire", "wire/dark", FlatLight(), "Expected a dark frame"),
-        ("geometry", "geometry/panel", FlatLight(), "Expected to find at least"),
+        pytest.param("geometry", "geometry/panel", FlatLight(), "Expected to find at least", marks=pytest.mark.medium),
     ],
 )
 def test_a_wrong_set_up_is_refused(tmp_path: Path, term: TermName, step_id: str, put: object, sentence: str) -> None:
-    painted = PaintedRig(painted_rig())
+    painted = PaintedRig(painted_rig(4 if term == "geometry" else 8, board_views=1))
     before: list[str] = []
 
     def react(event: Event, offered: tuple[Answer, ...]) -> Answer | None:
@@ -139,8 +136,9 @@ def test_a_wrong_set_up_is_refused(tmp_path: Path, term: TermName, step_id: str,
     assert person.done.complete
 
 
+@pytest.mark.medium
 def test_a_missing_board_is_told(tmp_path: Path) -> None:
-    painted = PaintedRig(painted_rig(board_views=3))
+    painted = PaintedRig(painted_rig(4, board_views=2))
 
     def react(event: Event, offered: tuple[Answer, ...]) -> Answer | None:
         if isinstance(event, StepEvent | ReadingsEvent) and getattr(event, "step_id", "") == "geometry/views":
@@ -152,18 +150,19 @@ def test_a_missing_board_is_told(tmp_path: Path) -> None:
     assert person.done.complete
 
 
+@pytest.mark.medium
 def test_the_same_view_again_is_not_taken(tmp_path: Path) -> None:
-    painted = PaintedRig(painted_rig(board_views=4))
+    painted = PaintedRig(painted_rig(4, board_views=3))
 
     def react(event: Event, offered: tuple[Answer, ...]) -> Answer | None:
         views = [step for step in painted.asked if hasattr(step, "spec") and not step.parallel_to_panel]
-        done = isinstance(event, ReadingsEvent) and "shows little that is new" in event.sentence
+        done = isinstance(event, ReadingsEvent) and "Such a view is there already" in event.sentence
         painted.put = None if done or not views else views[0]
         return Answer.quit if done else None
 
     person = led(tmp_path, ["geometry"], react, painted)
     assert person.done.stopped
-    assert 1 <= len(Session.open(tmp_path).steps("geometry")) - 1 < 4
+    assert 1 <= len(Session.open(tmp_path).steps("geometry")) - 1 < 3
 
 
 def test_skip_leaves_out_and_what_needs_it_cannot_be_captured(tmp_path: Path) -> None:

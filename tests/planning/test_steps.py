@@ -11,7 +11,7 @@ from procedures.plans import Bracket, Fixed, Metered, Singles, Stack, TimesThatO
 from tests.procedures.benches import new_writer, simulated_bench, small_rig
 from udccal.errors import UdccalError
 from udccal.guide.capture import guided_steps
-from udccal.planning import steps
+from udccal.planning import exposures
 from udccal.planning.state import nominal_state
 from udccal.planning.steps import cost_of, planned_steps
 from udccal.plugins import find_procedure
@@ -77,6 +77,6 @@ def test_a_procedure_that_does_not_tell_is_named(missing: str, monkeypatch: pyte
     whole = next(iter(find_procedure("wire")().steps(small_rig())))
     parts = {name: getattr(whole, name) for name in ("id", "arrangement", "instruction", "region", "exposure", "plan")}
     step = SimpleNamespace(**(parts | {missing: object()}))
-    monkeypatch.setattr(steps, "find_procedure", lambda term: lambda: SimpleNamespace(steps=lambda rig: [step]))
+    monkeypatch.setattr(exposures, "find_procedure", lambda term: lambda: SimpleNamespace(steps=lambda rig: [step]))
     with pytest.raises(UdccalError, match="Expected the step 'wire/flat' to tell"):
         list(planned_steps("wire", nominal_state(small_rig())))

@@ -56,7 +56,7 @@ class Practised(Protocol):
         ...
 
     def correct(self) -> None:
-        """Set up what was asked for."""
+        """Set up as asked what is asked for next."""
         ...
 
 

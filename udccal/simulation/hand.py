@@ -21,8 +21,8 @@ _AIM_PX, _AIM = 20.0, 0.02
 class Hand:
     """Implements ``udccal.arrangements.Stage`` on a simulated world.
 
-    The same steps of the same world have the same errors. An LED or board that is asked for at one place again stays
-    where it is. A short way is gone more exactly than a long one: an error is at most half the way.
+    The same steps of the same world, begun anew, have the same errors. An LED or board that is asked for at one place
+    again stays where it is. A short way is gone more exactly than a long one: an error is at most half the way.
     """
 
     def __init__(self, world: SimulatedWorld, lean_deg: float = 3.0) -> None:
@@ -60,10 +60,8 @@ class Hand:
         self._world.arrange(self._wrong, self._told[1])
 
     def correct(self) -> None:
-        """Set up what was asked for after all, where a mistake stands."""
-        if self._wrong is not None and self._told is not None:
-            self._wrong = None
-            self._world.arrange(self._placed, self._told[1])
+        """Begin anew: set up as asked what is asked for next."""
+        self._wrong, self._told, self._placed = None, None, Dark()
 
     def _inexact(self, arrangement: Arrangement, occasion: Occasion) -> Arrangement:
         seed = [self._world.seed, 0x4A4D, crc32(occasion.step_id.encode()), self._moves]
