@@ -6,7 +6,6 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from typing import Final, final
 
-import cv2
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
@@ -75,10 +74,7 @@ class BoardVisit:
         self._seen.append(seen)
         readings = (room, corners, sharpness(frame), _movement(self._seen), self._unlike(seen))
         wanted = Outline(_polygon(_edge(self._rig, self._board)), "wanted")
-        if not len(seen.numbers):
-            return Look(frame, readings, self._why_not(readings), (wanted,))
-        hull = cv2.convexHull(seen.points_px.astype(np.float32)).reshape(-1, 2)
-        return Look(frame, readings, self._why_not(readings), (wanted, Outline(_polygon(hull), "seen")))
+        return Look(frame, readings, self._why_not(readings), (wanted, *seen.outlines))
 
     def capture(self) -> Iterator[None]:
         """Take the view; raises as ``run_step`` does."""

@@ -12,7 +12,7 @@ from jaxtyping import Float, Int, UInt16
 from procedures.metering import spot_light
 from udccal.arrangements import BoardSpec
 from udccal.cameras.protocol import Frame
-from udccal.guide.events import Reading
+from udccal.guide.events import Outline, Reading
 from udccal.rig import RigDescription
 from udccal.sessions.patches import brightest_patch_DN
 
@@ -62,6 +62,14 @@ class CornersSeen:
         quarter = (spec.columns - 1) * (spec.rows - 1) // 4
         needed = min(max(quarter, _FEWEST_CORNERS), _ENOUGH_CORNERS)
         return Reading("corners seen", float(len(self.numbers)), float(needed), None, "")
+
+    @property
+    def outlines(self) -> tuple[Outline, ...]:
+        """The polygon around all corners; none where none is seen."""
+        if not len(self.numbers):
+            return ()
+        hull = cv2.convexHull(self.points_px.astype(np.float32)).reshape(-1, 2)
+        return (Outline(tuple((float(x), float(y)) for x, y in hull), "seen"),)
 
 
 def dark_limit_DN(rig: RigDescription, exposure_s: float) -> float:

@@ -87,9 +87,8 @@ class SetUpVisit:
                 return self._judged(frame, (room, evenness(frame, self._rig)))
             case Board(spec):
                 seen = find_corners(frame, spec)
-                outline = Outline(tuple((float(x), float(y)) for x, y in seen.points_px), "seen")
                 readings = (room, seen.reading(spec), sharpness(frame))
-                return self._judged(frame, readings, (outline,) if len(seen.numbers) else ())
+                return self._judged(frame, readings, seen.outlines)
             case _:
                 return self._judged(frame, (room,))
 

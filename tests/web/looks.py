@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import json
+from typing import Final
 
 from tests.chromium import Page
+
+# Widths and heights of a telephone, a tablet and a computer.
+SIZES: Final = ((390, 844), (820, 1180), (1280, 800))
 
 
 def says(page: Page, words: str) -> None:

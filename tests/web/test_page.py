@@ -5,11 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 from tests.chromium import Page, chromium
-from tests.web.looks import check_layout, says, see_the_picture
+from tests.web.looks import SIZES, check_layout, says, see_the_picture
 from tests.web.serving import Served, played
 from udccal.guide.events import Answer, StepEvent, VerdictEvent
-
-SIZES = ((390, 844), (820, 1180), (1280, 800))
 
 
 def go_through(page: Page, served: Served) -> None:
