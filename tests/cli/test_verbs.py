@@ -106,6 +106,13 @@ def test_profile_show_lists_what_was_measured(folder: Path) -> None:
     assert "K_DN_per_e" in {estimate["name"] for estimate in shown["estimates"]}
     assert [term["status"] for term in shown["terms"]] == ["CONVERGED", *(4 * ["NOT_CAPTURED"])]
     assert done.stderr.count(": Nobody looked: the session has no captures of this term.") == 4
+    noise = shown["terms"][0]
+    assert (len(noise["captures"]["sha256"]), noise["effort"]) == (64, "full")
+    assert noise["captures"]["frames"] >= noise["captures"]["files"] > 0
+    assert noise["captures"]["temperature_C"] is None
+    assert "The noise fit used" in done.stderr
+    assert shown["estimates"][0]["what"] == "Digital numbers per electron (EMVA 1288: K)."
+    assert (shown["rig_state"]["terms"], len(shown["rig_state"]["estimates"])) == ([], 11)
 
 
 def test_a_profile_from_before_that_status_is_read_as_what_it_says(folder: Path) -> None:

@@ -27,7 +27,9 @@ from udccal.sessions.schema import TermName
 def test_a_profile_does_not_differ_from_itself(measured: Profile) -> None:
     held = held_estimates(measured)
     found = difference(held, held)
-    assert [found.of(term).chi2() for term in ORDER] == [(0.0, 9), (0.0, 12), (0.0, 10), (0.0, 6), (0.0, 18)]
+    kept = [[e for e in r.estimates[: len(r.cov)] if e in r.numbers and e.sigma > 0] for r in measured.results]
+    assert [found.of(term).chi2() for term in ORDER] == [(0.0, len(some)) for some in kept]
+    assert min(map(len, kept)) >= 6
     assert not found.values.any()
 
 
@@ -81,7 +83,7 @@ def test_chi2_of_draws_follows_its_degrees_of_freedom(measured: Profile, term: T
 
 def test_chi2_of_draws_with_too_small_a_covariance_is_noticed(measured: Profile) -> None:
     """The check above fails where sigmas are 20 % too small."""
-    cov, rng = measured.psf.cov, np.random.default_rng(3)
+    cov, rng = measured.psf.cov[:6, :6], np.random.default_rng(3)
     draws = rng.multivariate_normal(np.zeros(6), 2 * cov, size=300)
     values = np.array([chi2_of(one, 2 * 0.8**2 * cov)[0] for one in draws])
     assert abs(values.mean() - 6) > 4 * np.sqrt(2 * 6 / 300)
@@ -114,7 +116,8 @@ def test_the_wires_pose_makes_up_for_an_error_of_the_lens(measured: Profile) -> 
 
 
 def test_what_has_no_covariance_is_told(measured: Profile) -> None:
-    assert not_covered(measured.psf, measured.psf) == ("kernel_relative_l2",)
+    older = replace(measured.psf, cov=measured.psf.cov[:6, :6])
+    assert not_covered(older, measured.psf) == ("kernel_relative_l2",)
     assert not_covered(measured.noise, measured.noise) == ("q_DN",)
     element = Estimate("fields.0.0.0.1", 0.5, 0.1, "1")
     with_field = replace(

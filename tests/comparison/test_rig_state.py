@@ -8,6 +8,7 @@ import pytest
 from tests.comparison.perturbed import drawn, moved, with_estimates, with_result
 from udccal.comparison.combining import combine
 from udccal.comparison.rig_state import NAMES, RigState, rig_state
+from udccal.errors import ProfileError
 from udccal.profiles.profile import Profile
 from udccal.result import Estimate, EstimatePrior
 from udccal.sessions.schema import TermName
@@ -60,7 +61,8 @@ def test_a_movement_shows_in_the_state(measured: Profile) -> None:
     assert change["standoff_mm"] == pytest.approx(0.2, rel=0.02)  # the rig file pulls a little
     assert change["panel_y_px"] == pytest.approx(1.0, abs=1e-3)
     assert change["tilt_deg"] == pytest.approx(0.1, abs=1e-3)
-    assert after.agreement_chi2 == pytest.approx(before.agreement_chi2, abs=0.5)
+    # The pupil's shadow becomes smaller with distance, which ``moved`` leaves out.
+    assert after.agreement_chi2 == pytest.approx(before.agreement_chi2, abs=2.0)
 
 
 @pytest.mark.parametrize(
@@ -103,6 +105,26 @@ def test_an_estimate_that_repeats_the_rig_file_does_not_count_twice(measured: Pr
         for one in measured.psf.estimates
     ))  # fmt: skip
     assert number(rig_state(wide), "row_open").value == pytest.approx(0.4)
+
+
+def test_hostile_numbers_are_refused_or_combined(measured: Profile) -> None:
+    rng, refusals = np.random.default_rng(11), 0
+    hostile = [0.0, -1.0, 5e-324, 1e-300, -1e-300, 1e9, -1e9, 1e150, 1e300, -1e300, 2.0**63]
+    for _ in range(60):
+        term = ("geometry", "wire", "psf", "backscatter")[rng.integers(4)]
+        result = measured.result(term)
+        cov, at = result.cov.copy(), rng.integers(len(result.cov), size=2)
+        cov[at[0], at[1]] = cov[at[1], at[0]] = hostile[rng.integers(len(hostile))]
+        numbers = {result.estimates[at[0]].name: hostile[rng.integers(len(hostile))] if rng.random() < 0.3 else 0.0}
+        try:
+            state = rig_state(with_result(with_estimates(measured, term, numbers), term, cov=cov))  # type: ignore[arg-type]
+        except ProfileError:
+            refusals += 1
+            continue
+        assert np.isfinite(
+            [state.agreement_chi2, *(number for e in state.estimates for number in (e.value, e.sigma))]
+        ).all()
+    assert 10 < refusals < 60
 
 
 def test_combining_is_a_weighted_mean_and_knows_what_it_does_not_know() -> None:

@@ -8,6 +8,7 @@ from typing import final
 import numpy as np
 from jaxtyping import Bool, Float
 
+from udccal.comparison.comparable import check_finite
 from udccal.comparison.estimates import chi2_of
 from udccal.fitting.engine.gaussian import scaled_inverse
 
@@ -38,13 +39,20 @@ def combine(
         design: derivatives of the measurements by the unknowns.
         values: the measurements.
         cov: their covariance.
+
+    Raises:
+        ProfileError: when numbers are too large to combine.
     """
     known = np.any(design != 0, axis=0)
     design, weight = design[:, known], scaled_inverse(cov)
-    found_cov = scaled_inverse(design.T @ weight @ design)
-    found = found_cov @ design.T @ weight @ values
-    left = values - design @ found
-    dof = chi2_of(values, cov)[1] - chi2_of(found, found_cov)[1]
+    with np.errstate(over="ignore", invalid="ignore"):
+        information = design.T @ weight @ design
+        check_finite(information)
+        found_cov = scaled_inverse(information)
+        found = found_cov @ design.T @ weight @ values
+        left = values - design @ found
+        chi2, dof = float(left @ weight @ left), chi2_of(values, cov)[1] - chi2_of(found, found_cov)[1]
+    check_finite(found, np.array(chi2))
     every, every_cov = np.full(len(known), np.nan), np.full((len(known),) * 2, np.nan)
     every[known], every_cov[np.ix_(known, known)] = found, found_cov
-    return Combined(every, every_cov, known, max(float(left @ weight @ left), 0.0), dof)
+    return Combined(every, every_cov, known, max(chi2, 0.0), dof)

@@ -114,23 +114,26 @@ def _in_pitches(held: Estimates, rig: RigDescription) -> Estimates:
     """
     values, cov, at = held.values.copy(), held.cov.copy(), {name: i for i, name in enumerate(held.names)}
     pitch, change, by_pitch = rig.panel.pitch_mm, np.eye(len(values)), np.zeros(len(values))
-    for name in (("psf", "depth_mm"), ("psf", "pupil_diameter_mm")):
-        if name in at and ("psf", "pitch_mm") in at:
-            i, own = at[name], at["psf", "pitch_mm"]
-            change[i, i], change[i, own] = 1 / held.values[own], -held.values[i] / held.values[own] ** 2
-            values[i] /= held.values[own]
-    for name in (("backscatter", "standoff_mm"), ("backscatter", "pupil_diameter_mm")):
-        if name in at:
-            i = at[name]
-            change[i, i] = 1 / pitch.value
-            values[i] /= pitch.value
-            by_pitch[i] = values[i] * pitch.tolerance / pitch.value
-    if {("wire", "footprint_per_pitch"), ("wire", "standoff_per_pitch")} <= set(at):
-        i, standoff_mm = at["wire", "footprint_per_pitch"], values[at["wire", "standoff_per_pitch"]] * pitch.value
-        # Rays converge from the pupil towards the focus.
-        change[i, i] = 1 / (1 - standoff_mm / rig.lens.focus_mm)
-        values[i] *= change[i, i]
-    root = square_root(change @ cov @ change.T - np.outer(by_pitch, by_pitch))
+    with np.errstate(all="ignore"):
+        for name in (("psf", "depth_mm"), ("psf", "pupil_diameter_mm")):
+            if name in at and ("psf", "pitch_mm") in at:
+                i, own = at[name], at["psf", "pitch_mm"]
+                change[i, i], change[i, own] = 1 / held.values[own], -held.values[i] / held.values[own] ** 2
+                values[i] /= held.values[own]
+        for name in (("backscatter", "standoff_mm"), ("backscatter", "pupil_diameter_mm")):
+            if name in at:
+                i = at[name]
+                change[i, i] = 1 / pitch.value
+                values[i] /= pitch.value
+                by_pitch[i] = values[i] * pitch.tolerance / pitch.value
+        if {("wire", "footprint_per_pitch"), ("wire", "standoff_per_pitch")} <= set(at):
+            i, standoff_mm = at["wire", "footprint_per_pitch"], values[at["wire", "standoff_per_pitch"]] * pitch.value
+            # Rays converge from the pupil towards the focus.
+            change[i, i] = 1 / (1 - standoff_mm / rig.lens.focus_mm)
+            values[i] *= change[i, i]
+        cov = change @ cov @ change.T - np.outer(by_pitch, by_pitch)
+    check_finite(values, cov)
+    root = square_root(cov)
     return Estimates(held.names, held.units, values, root @ root.T)
 
 
