@@ -84,8 +84,8 @@ def calibrate(
     description = load_rig(rig)
     check_replaceable(profile)
     check_writable(profile.parent)
-    rig_on = RigOn(camera, serial, files, display, monitor, seed)
-    with rig_on.opened(output, description, session) as bench:
+    options = BenchOptions(camera, serial, files, display, monitor, seed)
+    with options.opened(output, description, session) as bench:
         parts = {Exchanged(part.value) for part in exchanged or ()}
         capture_watched(output, bench, session, [t.value for t in term or TermChoice], parts, again or ())
     if not fit_to_profile(output, session, profile, log):
@@ -93,7 +93,7 @@ def calibrate(
 
 
 @dataclass(frozen=True)
-class RigOn:
+class BenchOptions:
     """Where a rig is: simulated, at this computer, or in files; the options of the verbs that capture."""
 
     camera: CameraKind

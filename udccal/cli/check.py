@@ -7,7 +7,16 @@ from typing import Annotated
 
 import typer
 
-from udccal.cli.calibrate import CAMERA_HELP, DISPLAY_HELP, CameraKind, DisplayKind, Files, Monitor, RigOn, Serial
+from udccal.cli.calibrate import (
+    CAMERA_HELP,
+    DISPLAY_HELP,
+    BenchOptions,
+    CameraKind,
+    DisplayKind,
+    Files,
+    Monitor,
+    Serial,
+)
 from udccal.cli.options import CHANGED, FoundProfile, Seed
 
 
@@ -33,6 +42,6 @@ def check(
     """Check a rig against its profile: ten flats, some dark frames and three panel pictures, in a few minutes."""
     from udccal.cli.jobs.check import check_profile
 
-    rig_on = RigOn(camera, serial, files, display, monitor, seed, noise_seed)
-    if not check_profile(context.obj, profile, rig_on, out, update):
+    options = BenchOptions(camera, serial, files, display, monitor, seed, noise_seed)
+    if not check_profile(context.obj, profile, options, out, update):
         raise typer.Exit(CHANGED)

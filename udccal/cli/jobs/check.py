@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from udccal.cli.calibrate import RigOn
+from udccal.cli.calibrate import BenchOptions
 from udccal.cli.jobs.capture import capture_watched
 from udccal.cli.output import Output, plain
 from udccal.compilation import keep_compilations
@@ -20,13 +20,13 @@ from udccal.reports.page import write_page
 from udccal.sessions.store import Session
 
 
-def check_profile(output: Output, path: Path, rig_on: RigOn, out: Path, update: Path | None) -> bool:
+def check_profile(output: Output, path: Path, options: BenchOptions, out: Path, update: Path | None) -> bool:
     """Capture, compare and print; return whether the rig is the same, or changed by less than matters.
 
     Args:
         output: shows the changes.
         path: folder or zip file of the profile, or a rig's name.
-        rig_on: where the rig is.
+        options: where the rig is.
         out: folder for ``session``, ``check.json`` and ``check.html``.
         update: path of a new profile with what changed; None for none.
 
@@ -43,7 +43,7 @@ def check_profile(output: Output, path: Path, rig_on: RigOn, out: Path, update: 
         check_writable(update.parent)
     profile = load_profile(path)
     rig, folder = short_rig(profile.rig), out / "session"
-    with rig_on.opened(output, rig, folder) as bench:
+    with options.opened(output, rig, folder) as bench:
         capture_watched(output, bench, folder, ("wire", "backscatter"))
     with output.stage("comparing"):
         found, solved = check_rig(profile, Session.open(folder))
