@@ -22,8 +22,8 @@ class DriftLimits:
     chance: float = 1e-3
     errors: float = 4.0
     moved_mm: float = 0.03
-    turned_deg: float = 0.05
-    focus_percent: float = 0.1
+    turned_deg: float = 0.02
+    focus_percent: float = 0.05
     smudge_percent: float = 1.0
     panel_percent: float = 2.0
     gain_percent: float = 1.0

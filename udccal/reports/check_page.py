@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from udccal.drift.check import Change, RigCheck, Solved, Verdict
+from udccal.drift.changes import Change
+from udccal.drift.check import RigCheck, Solved, Verdict
 from udccal.reports.figures import embedded_png
 from udccal.reports.page import Advice, Fact, Illustration, ValidationPage, ValidationSection
 from udccal.reports.tables import Table, number, spread
