@@ -8,6 +8,8 @@ ACCURACY_OUT ?= accuracy
 ACCURACY_SEEDS ?= 8
 EFFICIENCY_OUT ?= efficiency
 PARETO_OUT ?= pareto
+DRIFT_OUT ?= drift
+DRIFT_RIGS ?= 200
 LIVE_OUT ?= live.json
 COVERAGE_OUT ?= coverage
 ROBUST_OUT ?= robust
@@ -15,7 +17,7 @@ ROBUST ?=
 PEERS ?=
 USB ?=
 
-.PHONY: install demo test test-medium test-slow test-usb fuzz load lint types contracts check accuracy tables efficiency coverage extremes pareto live robust peers growth docs clean
+.PHONY: install demo test test-medium test-slow test-usb fuzz load lint types contracts check accuracy tables efficiency coverage extremes pareto drift live robust peers growth docs clean
 
 install: $(STAMP)
 
@@ -95,6 +97,11 @@ peers: $(STAMP)
 # Seconds and memory of every fit as its data double. Writes the table of docs/numerics.md.
 growth: $(STAMP)
 	$(BIN)/python -m tests.benchmarks.growth.run
+
+# Simulated rigs, half of them changed, by `udccal check`. Writes a file per rig, which a second run goes on from, and the
+# table of docs/check.md.
+drift: $(STAMP)
+	$(BIN)/python -m tests.benchmarks.drift --rigs $(DRIFT_RIGS) --out $(DRIFT_OUT)
 
 # Every tier of restoration on the shared scenes. Writes pareto.json, pareto.csv and the table of docs/restoration.md;
 # non-zero exit where a tier misses a limit.

@@ -11,9 +11,10 @@ from jaxtyping import Float
 
 from tests.board.prints import Print, corners_mm, marks_mm, printed
 from udccal.arrangements import BoardSpec
+from udccal.board.paper import Paper
 from udccal.board.pdf import board_pdf
 from udccal.board.set_up import SetUp, set_up_of
-from udccal.board.sheets import MARGIN_MM, Paper, Strip, tile
+from udccal.board.sheets import MARGIN_MM, Strip, tile
 from udccal.errors import RigError, UdccalError
 from udccal.rig import RigDescription, load_rig
 

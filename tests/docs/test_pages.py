@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 import udccal
+from udccal.result import FitStatus
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = sorted((ROOT / "docs").glob("*.md"))
@@ -49,6 +50,11 @@ def test_troubleshooting_quotes_what_the_program_says() -> None:
     page = (ROOT / "docs" / "troubleshooting.md").read_text(encoding="utf-8")
     assert len(list(quoted_parts(page))) > 40
     assert unsaid(page) == []
+
+
+def test_troubleshooting_lists_every_status() -> None:
+    page = (ROOT / "docs" / "troubleshooting.md").read_text(encoding="utf-8")
+    assert set(re.findall(r"^\| ([A-Z_]+) \|", page, re.MULTILINE)) == {status.name for status in FitStatus}
 
 
 def test_a_sentence_that_nobody_says_is_noticed() -> None:

@@ -8,17 +8,17 @@ import shutil
 import zipfile
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from tests.profiles.test_store import assert_same
-from tests.profiles.test_versions import stored_in_version_1
+from tests.profiles.test_versions import written_in_version_2
 from udccal.errors import ProfileError
 from udccal.profiles.copies import migrate_profile, pack_profile, unpack_profile
 from udccal.profiles.history import identity
 from udccal.profiles.profile import Profile
 from udccal.profiles.provenance import PROFILE_NAME
 from udccal.profiles.schema import VERSION
-from udccal.profiles.store import load_profile, read_profile, write_profile
+from udccal.profiles.store import read_profile, write_profile
 
 
 @pytest.fixture(scope="module")
@@ -114,15 +114,15 @@ def test_half_a_profile_is_not_packed(folder: Path, fault: str) -> None:
     assert sorted(folder.parent.iterdir()) == before
 
 
-@pytest.mark.medium
-def test_an_old_version_is_written_anew_with_the_old_one_as_its_parent(tmp_path: Path) -> None:
-    old, new = stored_in_version_1(tmp_path / "old"), tmp_path / "new.zip"
+def test_an_old_version_is_written_anew_with_the_old_one_as_its_parent(tmp_path: Path, toy_profile: Profile) -> None:
+    old, new = written_in_version_2(tmp_path / "old", toy_profile), tmp_path / "new.zip"
     migrate_profile(old, new)
-    assert (identity(old).version, identity(new).version) == (1, VERSION)
-    profile = read_profile(new)
-    assert profile.parent == identity(old).sha256
-    assert profile.provenance == load_profile("lg55-reduced").provenance
-    assert_same(read_profile(old), type(profile)(**{**vars(profile), "parent": None}))
+    assert (identity(old).version, identity(new).version) == (2, VERSION)
+    before, after = read_profile(old), read_profile(new)
+    assert after.parent == identity(old).sha256
+    assert after.provenance == before.provenance == toy_profile.provenance
+    assert after.noise.estimates == before.noise.estimates
+    np.testing.assert_array_equal(after.wire_map, before.wire_map)
 
 
 def test_what_is_not_old_is_not_migrated(folder: Path) -> None:

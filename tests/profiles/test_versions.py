@@ -85,10 +85,10 @@ def test_what_older_versions_did_not_keep_is_unknown_and_not_invented(tmp_path: 
     assert {picture.name for picture in stored.pictures} == {"wire_map", "psf_atlas", "backscatter_white"}
 
 
-def test_an_older_profile_is_read_and_written_anew(tmp_path: Path, toy_profile: Profile) -> None:
-    """Written again, what is unknown stays unknown; what the older version has not is gone."""
-    write_profile(tmp_path / "p", toy_profile)
-    document = json.loads((tmp_path / "p" / "profile.json").read_bytes())
+def written_in_version_2(folder: Path, profile: Profile) -> Path:
+    """A profile with its arrays as version 2 wrote it."""
+    write_profile(folder, profile)
+    document = json.loads((folder / "profile.json").read_bytes())
     document["version"], document["pictures"] = 2, document["pictures"][:3]
     for section in document["terms"].values():
         for name in ("outliers", "residuals", "captures", "effort"):
@@ -96,8 +96,13 @@ def test_an_older_profile_is_read_and_written_anew(tmp_path: Path, toy_profile: 
         for one in section["fit"]["estimates"]:
             one.pop("what")
             one.pop("prior")
-    (tmp_path / "p" / "profile.json").write_text(json.dumps(document))
-    old = read_profile(tmp_path / "p")
+    (folder / "profile.json").write_text(json.dumps(document))
+    return folder
+
+
+def test_an_older_profile_is_read_and_written_anew(tmp_path: Path, toy_profile: Profile) -> None:
+    """Written again, what is unknown stays unknown; what the older version has not is gone."""
+    old = read_profile(written_in_version_2(tmp_path / "p", toy_profile))
     assert old.wire.map_sigma is None
     assert old.noise.estimates == tuple(replace(one, prior=None) for one in toy_profile.noise.estimates)
     write_profile(tmp_path / "again", old)

@@ -76,6 +76,11 @@ def test_what_was_not_captured_is_asked_for_by_its_command(whole: Profile) -> No
     )
 
 
+def test_what_is_to_be_done_comes_before_what_is_good_to_know(whole: Profile) -> None:
+    found = advice(ended(whole, psf=FitStatus.NOT_CONVERGED, wire=FitStatus.NOT_CAPTURED))
+    assert [sentence.split()[0] for sentence in found.sentences] == ["Look", "Capture", "Until"]
+
+
 def test_there_are_never_more_than_three_sentences(whole: Profile) -> None:
     worst = whole
     for term in ("noise", "geometry", "wire", "psf", "backscatter"):

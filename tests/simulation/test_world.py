@@ -141,6 +141,17 @@ def test_knock_moves_the_camera_from_its_frame_on() -> None:
     assert np.abs(world.expected_rate(WHOLE) / before - 1).max() > 1e-3
 
 
+def test_a_smudge_takes_light_away_where_it_is() -> None:
+    dirty = SimulatedWorld(toy_truth(), Disturbances(smudge_fraction=0.05, smudge_px=(30.0, 60.0, 8.0)))
+    clean = SimulatedWorld(toy_truth())
+    for world in (dirty, clean):
+        world.arrange(FlatLight())
+    part = Region(20, 40, 64, 48)
+    left = dirty.expected_rate(part) / clean.expected_rate(part)
+    assert left[20, 10] == pytest.approx(0.95)
+    assert left[0, 60] == pytest.approx(1.0, abs=1e-6)
+
+
 def test_same_seed_same_aim() -> None:
     images = []
     for seed in (0, 0, 1):

@@ -113,10 +113,10 @@ class PlayedCapture:
                 answer = self._take(step)
                 captured += answer is Answer.go
             if answer is Answer.quit:
-                self.person.tell(DoneEvent(False, f"Stopped at {step.title}. The same command continues."))
+                self.person.tell(DoneEvent(False, True, f"Stopped at {step.title}. The same command continues."))
                 return
             place = {Answer.again: place, Answer.back: max(place - 1, 0)}.get(answer, place + 1)
-        self.person.tell(DoneEvent(captured == len(self.steps), f"Captured {captured} steps."))
+        self.person.tell(DoneEvent(captured == len(self.steps), False, f"Captured {captured} steps."))
 
     def _announce(self, step: Step, place: int) -> None:
         left = 4.0 * (len(self.steps) - place)

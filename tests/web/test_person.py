@@ -77,7 +77,7 @@ def test_what_was_not_offered_is_no_answer(person: WebPerson) -> None:
     assert person.answer((Answer.go, Answer.quit), 0.0) is None
 
 
-@pytest.mark.parametrize("event", [STEP, VERDICT_EVENT, DoneEvent(True, "All.")])
+@pytest.mark.parametrize("event", [STEP, VERDICT_EVENT, DoneEvent(True, False, "All.")])
 def test_an_answer_that_the_capture_has_not_taken_ends_with_its_step(
     person: WebPerson, event: StepEvent | VerdictEvent | DoneEvent
 ) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 
@@ -26,7 +26,6 @@ class CaptureBench:
         camera, display: open.
         stage: puts things in front of the camera.
         now: returns the bench's time of day.
-        try_again: gets the sentence of a refused step and returns whether to repeat the step.
     """
 
     rig: RigDescription
@@ -34,26 +33,30 @@ class CaptureBench:
     display: Display
     stage: Stage
     now: Now
-    try_again: Callable[[str], bool]
 
 
-def simulated_rig(rig: RigDescription, seed: int) -> SimulatedWorld:
-    """Return a simulated rig with the description ``rig``; another ``seed`` gives another specimen and other noise."""
-    return SimulatedWorld(draw_truth(rig, seed), seed=seed)
+def simulated_rig(rig: RigDescription, seed: int, noise_seed: int | None = None) -> SimulatedWorld:
+    """Return a simulated rig with the description ``rig``.
+
+    Another ``seed`` gives another specimen and other noise. Another ``noise_seed`` gives the same specimen on another
+    day; it is ``seed`` where there is none.
+    """
+    return SimulatedWorld(draw_truth(rig, seed), seed=seed if noise_seed is None else noise_seed)
 
 
 @contextmanager
 def simulated_bench(world: SimulatedWorld) -> Iterator[CaptureBench]:
-    """Open camera, display, stage and clock of ``world``; a refused step is not repeated."""
+    """Open camera, display, stage and clock of ``world``."""
     with SimulatedCamera(world) as camera, SimulatedDisplay(world) as display:
-        yield CaptureBench(world.truth.description, camera, display, world, world.now, lambda sentence: False)
+        yield CaptureBench(world.truth.description, camera, display, world, world.now)
 
 
-def simulate(rig: RigDescription, seed: int = 0) -> AbstractContextManager[CaptureBench]:
+def simulate(rig: RigDescription, seed: int = 0, noise_seed: int | None = None) -> AbstractContextManager[CaptureBench]:
     """Simulate a rig to capture with: ``with simulate(rig) as bench``.
 
     Args:
         rig: description; the simulated rig differs from it within its tolerances.
         seed: chooses the specimen and its noise.
+        noise_seed: chooses the noise alone: the same rig on another day.
     """
-    return simulated_bench(simulated_rig(rig, seed))
+    return simulated_bench(simulated_rig(rig, seed, noise_seed))

@@ -18,9 +18,10 @@ from matplotlib.path import Path
 from matplotlib.transforms import Affine2D
 
 from udccal.board.instructions import joining, sentences
+from udccal.board.paper import SIDES_MM, Paper
 from udccal.board.pattern import black_rectangles_mm
 from udccal.board.set_up import SetUp
-from udccal.board.sheets import FOOT_MM, MARGIN_MM, SIDES_MM, Paper, Strip, Tiling, tile
+from udccal.board.sheets import FOOT_MM, MARGIN_MM, Strip, Tiling, tile
 from udccal.errors import UdccalError
 
 _MM_PER_INCH = 25.4

@@ -2,29 +2,18 @@
 
 from __future__ import annotations
 
-import enum
 import math
 from dataclasses import dataclass
 from typing import final
 
 from udccal.arrangements import BoardSpec
+from udccal.board.paper import SIDES_MM, Paper
 from udccal.errors import UdccalError
 
 # A sheet's blank edges; below, there is room for the marks of cuts and for the ruler.
 MARGIN_MM, FOOT_MM = 10.0, 28.0
 # Both of two neighbours show this much of the board around their seam.
 _OVERLAP_MM = 10.0
-
-
-class Paper(enum.StrEnum):
-    """Sheets that a board is spread over."""
-
-    a4 = "a4"
-    a3 = "a3"
-    letter = "letter"
-
-
-SIDES_MM = {Paper.a4: (210.0, 297.0), Paper.a3: (297.0, 420.0), Paper.letter: (215.9, 279.4)}
 
 
 @final

@@ -3,35 +3,29 @@
 from __future__ import annotations
 
 import enum
-from contextlib import AbstractContextManager
-from pathlib import Path
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import replace
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from udccal.cli.options import DOUBTFUL, IterationLog, ProfilePath, RigName, Seed, SessionFolder, TermChoice
+from udccal.cli.bench_options import (
+    Agree,
+    BenchOptions,
+    Camera,
+    CameraKind,
+    Display,
+    DisplayKind,
+    Files,
+    Monitor,
+    Serial,
+)
+from udccal.cli.options import DOUBTFUL, STOPPED, IterationLog, ProfilePath, RigName, Seed, SessionFolder, TermChoice
 from udccal.cli.output import Output
-from udccal.errors import CameraError
 
 if TYPE_CHECKING:
-    from udccal.benches.bench import CaptureBench
+    from udccal.guide.events import Person
     from udccal.rig import RigDescription
-
-
-class CameraKind(enum.StrEnum):
-    """Which camera captures."""
-
-    sim = "sim"
-    u3v = "u3v"
-    pylon = "pylon"
-    files = "files"
-
-
-class DisplayKind(enum.StrEnum):
-    """How pictures are shown on the panel of a real rig."""
-
-    window = "window"
-    manual = "manual"
 
 
 class ExchangedPart(enum.StrEnum):
@@ -41,20 +35,16 @@ class ExchangedPart(enum.StrEnum):
     lens = "lens"
 
 
-_CAMERA_HELP = "sim: a simulated rig; u3v: any USB3 Vision camera; pylon: through Basler's SDK; files: see --files."
-_DISPLAY_HELP = "For a real rig. window: full screen on --monitor; manual: you show the named files."
-
-
 def calibrate(
     context: typer.Context,
     rig: RigName,
     session: SessionFolder,
     profile: ProfilePath,
-    camera: Annotated[CameraKind, typer.Option("--camera", help=_CAMERA_HELP)] = CameraKind.sim,
-    serial: Annotated[str | None, typer.Option("--serial", help="Serial number; needed if there are several.")] = None,
-    files: Annotated[Path | None, typer.Option("--files", help="Folder with one folder of pictures per step.")] = None,
-    display: Annotated[DisplayKind, typer.Option("--display", help=_DISPLAY_HELP)] = DisplayKind.manual,
-    monitor: Annotated[int, typer.Option("--monitor", help="Number of the monitor that is the panel; see doctor.")] = 0,
+    camera: Camera = CameraKind.sim,
+    serial: Serial = None,
+    files: Files = None,
+    display: Display = DisplayKind.manual,
+    monitor: Monitor = 0,
     seed: Seed = 0,
     term: Annotated[
         list[TermChoice] | None, typer.Option("--term", help="Capture this term only; may be given again.")
@@ -66,65 +56,56 @@ def calibrate(
         list[str] | None,
         typer.Option("--again", metavar="STEP", help="Capture this captured step once more; may be given again."),
     ] = None,
+    practice: Annotated[
+        bool, typer.Option("--practice", help="With --camera sim: you lead a simulated hand, which may do wrong.")
+    ] = False,
+    yes: Agree = False,
+    json_events: Annotated[
+        bool, typer.Option("--json-events", help="Write what happens on standard output, one JSON object a line.")
+    ] = False,
+    web: Annotated[bool, typer.Option("--web", help="Lead by a page in a browser; see docs/web.md.")] = False,
+    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="Port of --web; 0 for any that is free.")] = 0,
     log: IterationLog = None,
 ) -> None:
     """Capture every calibration step of a rig, then fit them. An interrupted session continues where it stopped."""
-    from udccal.cli.jobs.capture import capture_watched
+    from udccal.cli.jobs.capture import Wanted
     from udccal.cli.jobs.fit import fit_to_profile
+    from udccal.cli.jobs.guided import led_by
     from udccal.io.out_folder import check_writable
     from udccal.profiles.store import check_replaceable
     from udccal.rig import load_rig
     from udccal.sessions.changes import Exchanged
 
-    output: Output = context.obj
+    options = BenchOptions(camera, serial, files, display, monitor, seed)
+    led = practice or options.real
+    _check_words(camera, led, practice, yes or json_events or web)
+    if port and not web:
+        raise typer.BadParameter("--port is for the page: give --web with it, or leave it out.")
+    output: Output = replace(context.obj, events=json_events)
     description = load_rig(rig)
     check_replaceable(profile)
     check_writable(profile.parent)
-    pictures = session.resolve().with_name(f"{session.resolve().name}-pictures")
-    match camera:
-        case CameraKind.sim:
-            opened = _simulated(description, seed)
-        case CameraKind.files:
-            opened = _files(output, description, files, pictures)
-        case _:
-            opened = _real(output, description, camera, serial, display, monitor, pictures)
-    with opened as bench:
-        parts = {Exchanged(part.value) for part in exchanged or ()}
-        capture_watched(output, bench, session, [t.value for t in term or TermChoice], parts, again or ())
+    wanted = Wanted(
+        session, [t.value for t in term or TermChoice], {Exchanged(part.value) for part in exchanged or ()}, again or ()
+    )
+    with _person(output, description, port if web else None) if led else nullcontext() as person:
+        goes_on = options.capture(output, description, wanted, person and led_by(output, person, yes))
+    if not goes_on:
+        raise typer.Exit(STOPPED)
     if not fit_to_profile(output, session, profile, log):
         raise typer.Exit(DOUBTFUL)
 
 
-def _simulated(rig: RigDescription, seed: int) -> AbstractContextManager[CaptureBench]:
-    from udccal.benches.bench import simulated_bench, simulated_rig
-
-    return simulated_bench(simulated_rig(rig, seed))
-
-
-def _files(
-    output: Output, rig: RigDescription, files: Path | None, pictures: Path
-) -> AbstractContextManager[CaptureBench]:
-    from udccal.cli.jobs.benches import files_bench
-
-    if files is None:
-        raise CameraError("Expected the folder with the pictures of each step, found none. Give it with --files.")
-    return files_bench(output, rig, files, pictures)
+def _check_words(camera: CameraKind, led: bool, practice: bool, of_led: bool) -> None:
+    if practice and camera is not CameraKind.sim:
+        raise typer.BadParameter("--practice is for the simulated rig: give --camera sim with it, or leave it out.")
+    if of_led and not led:
+        raise typer.BadParameter("--yes, --json-events and --web are for --camera u3v or pylon, and for --practice.")
 
 
-def _real(
-    output: Output,
-    rig: RigDescription,
-    camera: CameraKind,
-    serial: str | None,
-    display: DisplayKind,
-    monitor: int,
-    pictures: Path,
-) -> AbstractContextManager[CaptureBench]:
-    from udccal.cli.jobs import benches
+def _person(output: Output, rig: RigDescription, port: int | None) -> AbstractContextManager[Person]:
+    """A person before a page, or at the terminal where there is no port."""
+    from udccal.cli.jobs.terminal import TerminalPerson
+    from udccal.cli.jobs.web import web_person
 
-    seen = benches.u3v_camera(serial) if camera is CameraKind.u3v else benches.pylon_camera(serial)
-    if display is DisplayKind.window:
-        shown = benches.window_display(rig, monitor)
-    else:
-        shown = benches.manual_display(output, rig, pictures)
-    return benches.real_bench(output, rig, seen, shown)
+    return nullcontext(TerminalPerson(output)) if port is None else web_person(output, rig, port)

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from udccal.cli.calibrate import CameraKind
+from udccal.cli.bench_options import CameraKind
 from udccal.cli.options import FoundProfile, PanelPicturePath, Seed
 from udccal.tiers import Tier
 

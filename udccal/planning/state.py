@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.ndimage import map_coordinates
 
-from udccal.arrangements import Arrangement, Board, Dark, FlatLight, Led, PanelPicture, Photograph
+from udccal.arrangements import Arrangement, PanelPicture
 from udccal.calibration import Calibration
 from udccal.cfa import cfa_named
 from udccal.fitting.geometry.fit import BY_HAND, ON_JIG
@@ -20,6 +20,7 @@ from udccal.models.geometry import Geometry
 from udccal.models.noise import Noise, variance_e
 from udccal.models.wire import Wire, wire_values
 from udccal.numerics import in_float64
+from udccal.planning.exposures import nominal_full_s
 from udccal.profiles.profile import Profile
 from udccal.result import FitResult, FitStatus
 from udccal.rig import Captures, RigDescription
@@ -33,8 +34,6 @@ WHITE = (0.6, 1.0, 0.7)
 _DISTORTION = (-0.07, 0.035, 0.0, 0.0, -0.005)
 # Shading is smooth; the modulation by the rows hardly changes the number of electrons.
 _FIELD_GRID = (49, 65)
-# Exposures that fill the wells. Flats and boards are lit so that they fill them within a frame.
-_LED_FULL_S, _PANEL_FULL_S = 125e-6, 0.1
 _wire_values = jax.jit(wire_values, static_argnums=(2, 3))
 
 
@@ -158,15 +157,9 @@ def _corners_px(geometry: FitResult[Geometry], name: str) -> float | None:
 
 def full_s(arrangement: Arrangement, state: RigState) -> float:
     """Exposure in seconds at which the brightest sample of an arrangement would fill its well."""
-    match arrangement:
-        case Led():
-            return _LED_FULL_S
-        case PanelPicture():
-            if state.backscatter is not None and np.max(state.backscatter.mask) > 0:
-                return state.full_well_e / float(np.max(state.backscatter.mask))
-            return _PANEL_FULL_S
-        case FlatLight() | Board() | Dark() | Photograph():
-            return 1.0 / state.rig.camera.frame_rate_hz
+    if isinstance(arrangement, PanelPicture) and state.backscatter is not None and np.max(state.backscatter.mask) > 0:
+        return state.full_well_e / float(np.max(state.backscatter.mask))
+    return nominal_full_s(arrangement, state.rig)
 
 
 def sensor_samples(rig: RigDescription, across: int) -> Float[np.ndarray, "n 2"]:

@@ -6,6 +6,7 @@ import re
 import struct
 import tempfile
 import zipfile
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -25,6 +26,18 @@ _MAX_LIST_BYTES = 1024 * 1024
 _END = struct.Struct("<4s8xI4x2s")
 _END_SIGNATURE, _LARGE_SIGNATURE, _NO_COMMENT = b"PK\5\6", b"PK\6\7", b"\0\0"
 _LARGE_BYTES = 20
+# What zipfile raises for damaged files: names and numbers that cannot be, and content that does not unpack.
+_DAMAGES = (
+    zipfile.BadZipFile,
+    zlib.error,
+    struct.error,
+    EOFError,
+    NotImplementedError,
+    OSError,
+    OverflowError,
+    RuntimeError,
+    ValueError,
+)
 
 
 def pack_archive(folder: Path, path: Path) -> None:
@@ -69,7 +82,7 @@ def unpack_archive(path: Path, folder: Path, only: str | None = None) -> None:
             _check_entries(path, entries)
             for entry in (entry for entry in entries if only in (None, entry.filename)):
                 _unpack_entry(path, archive, entry, folder / entry.filename)
-    except (zipfile.BadZipFile, EOFError, NotImplementedError, RuntimeError, OSError) as error:
+    except _DAMAGES as error:
         raise ProfileError(f"Expected {path} to be a whole zip file, found: {error}. Copy it again.") from error
 
 

@@ -13,7 +13,7 @@ from udccal.io.links import is_plain_file
 from udccal.io.whole_folder import standing
 from udccal.profiles.archive import unpacked
 from udccal.profiles.provenance import MAX_JSON_BYTES, PROFILE_NAME, profile_sha256
-from udccal.profiles.schema import Provenance, Section, StoredProfile
+from udccal.profiles.schema import Provenance, Section, StoredCaptures, StoredProfile
 from udccal.profiles.store import read_stored
 from udccal.sessions.schema import TermName
 
@@ -37,6 +37,7 @@ class PastTerm:
 
     Attributes:
         status: name of its ``FitStatus``. chi2_dof: of its fit. notes: sentences of its fit.
+        effort, captures: of its fit; None where that is not known.
         changed: whether it differs from the same term of the parent; None where the parent is not at hand.
     """
 
@@ -44,6 +45,8 @@ class PastTerm:
     status: str
     chi2_dof: float
     notes: tuple[str, ...]
+    effort: str | None
+    captures: StoredCaptures | None
     changed: bool | None
 
 
@@ -119,7 +122,8 @@ def _past(read: _Read, before: _Read | None) -> PastProfile:
     def term(name: TermName) -> PastTerm:
         section: Section = getattr(read.stored.terms, name)
         changed = None if before is None else _numbers(section) != _numbers(getattr(before.stored.terms, name))
-        return PastTerm(name, section.fit.status, section.fit.chi2_dof, section.fit.notes, changed)
+        fit = section.fit
+        return PastTerm(name, fit.status, fit.chi2_dof, fit.notes, fit.effort, fit.captures, changed)
 
     terms = tuple(term(name) for name in get_args(TermName))
     return PastProfile(read.path, read.identity, read.stored.lineage.parent, read.stored.provenance, terms)

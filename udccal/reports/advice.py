@@ -32,16 +32,15 @@ def advice(results: TermResults) -> Advice:
     doubtful = [one.name for one in results.results if one.warning]
     missing = [one.name for one in results.results if one.status is FitStatus.NOT_CAPTURED]
     noted = [one.name for one in results.results if one.notes and one.usable and not one.unfitted]
-    wanted = [_mend(term, results.result(term).status) for term in (*failed, *doubtful)]
+    to_do = [_mend(term, results.result(term).status) for term in (*failed, *doubtful)]
     if missing:
         again = " ".join(f"--term {term}" for term in missing)
-        wanted.append(f"Capture {_listed(missing)}, where nobody looked yet: udccal calibrate with {again}.")
-    if not failed:
-        wanted.append(_IN_THE_MEANTIME if doubtful else _UNTIL)
+        to_do.append(f"Capture {_listed(missing)}, where nobody looked yet: udccal calibrate with {again}.")
+    to_know = [] if failed else [_IN_THE_MEANTIME if doubtful else _UNTIL]
     if noted:
-        wanted.append(f"Read the notes of {_listed(noted)}: they say what the fits held, or left out.")
+        to_know.append(f"Read the notes of {_listed(noted)}: they say what the fits held, or left out.")
     mood = "bad" if failed else "careful" if doubtful else "absent" if missing else "good"
-    return Advice(_headline(failed, doubtful, missing), mood, _first(wanted))
+    return Advice(_headline(failed, doubtful, missing), mood, _first(to_do, to_know))
 
 
 def _headline(failed: list[str], doubtful: list[str], missing: list[str]) -> str:
@@ -76,10 +75,10 @@ def _mend(term: str, status: FitStatus) -> str:
             )
 
 
-def _first(wanted: list[str]) -> tuple[str, ...]:
-    if len(wanted) <= _MOST_SENTENCES:
-        return tuple(wanted)
-    return (*wanted[: _MOST_SENTENCES - 1], "The sections of the other terms say what else to do.")
+def _first(to_do: list[str], to_know: list[str]) -> tuple[str, ...]:
+    if len(to_do) > _MOST_SENTENCES:
+        return (*to_do[: _MOST_SENTENCES - 1], "The sections of the other terms say what else to do.")
+    return tuple([*to_do, *to_know][:_MOST_SENTENCES])
 
 
 def _listed(terms: list[str]) -> str:

@@ -95,7 +95,8 @@ def finding(one: TermDiff) -> str:
 
 def notes(one: TermDiff) -> tuple[str, ...]:
     """Return what a person should know of a term, with what chi-squared leaves out."""
-    left = (f"Not in χ², as no covariance is kept of it: {', '.join(one.not_covered)}.",) if one.not_covered else ()
+    names = ", ".join(quantity(one.term, name).plain for name in one.not_covered)
+    left = (f"Not in χ², as no covariance is kept of it: {names}.",) if names else ()
     return (*one.notes, *left)
 
 

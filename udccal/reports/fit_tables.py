@@ -18,16 +18,16 @@ def estimates_table(title: str, result: FitResult) -> Table:
     Elements of the term's arrays are left out: they mean nothing on their own.
     """
     rows = tuple(
-        (e.name, quantity(result.name, e.name).plain, number(e.value, e.sigma), spread(e.sigma), e.unit, _before(e))
+        (quantity(result.name, e.name).plain, number(e.value, e.sigma), spread(e.sigma), e.unit, _before(e), e.name)
         for e in result.numbers
     )
-    return Table(title, ("quantity", "in words", "value", "sigma", "unit", "before the data"), rows, frozenset({2, 3}))
+    return Table(title, ("quantity", "value", "sigma", "unit", "before the data", "name"), rows, _NUMBERS)
 
 
 def meanings_table(result: FitResult) -> Table:
     """Return a table of what each estimate is."""
-    rows = tuple((e.name, quantity(result.name, e.name).what) for e in result.numbers)
-    return Table("What these are", ("quantity", "what it is"), rows)
+    meant = [(e.name, quantity(result.name, e.name)) for e in result.numbers]
+    return Table("What these are", ("quantity", "what it is", "name"), tuple((q.plain, q.what, n) for n, q in meant))
 
 
 def state_table(state: RigState) -> Table:

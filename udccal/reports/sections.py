@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from matplotlib.figure import Figure
 
 from udccal.calibration import ORDER, Calibration
+from udccal.quantities import quantity
 from udccal.reports import figures, fit_figures
 from udccal.reports.accuracy import Accuracy, accuracy_table, forecast_sentence
 from udccal.reports.board_views import BoardEvidence
@@ -106,11 +107,12 @@ def _finding(term: TermName, evidence: Evidence) -> str:
     if not result.estimates:
         return "Nothing was fitted."
     if accuracy is not None and term != "noise":
-        quantity = accuracy.forecast.quantity
-        return f"{quantity.meaning[0].upper()}{quantity.meaning[1:]}: sigma {accuracy.sigma:.2g} {quantity.unit}."
+        told = accuracy.forecast.quantity
+        return f"{told.meaning[0].upper()}{told.meaning[1:]}: sigma {accuracy.sigma:.2g} {told.unit}."
     first = result.estimates[0]
     unit = "" if first.unit == "1" else f" {first.unit}"
-    return f"{first.name} = {number(first.value, first.sigma)} ± {spread(first.sigma)}{unit}."
+    name = quantity(term, first.name).plain
+    return f"{name[0].upper()}{name[1:]}: {number(first.value, first.sigma)} ± {spread(first.sigma)}{unit}."
 
 
 def _illustrations(term: TermName, evidence: Evidence) -> tuple[Illustration, ...]:

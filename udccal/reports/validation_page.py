@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 from udccal.comparison.estimates import ORDER
 from udccal.reports.figures import embedded_png
-from udccal.reports.page import Fact, Illustration, ValidationPage, ValidationSection
+from udccal.reports.page import Advice, Fact, Illustration, ValidationPage, ValidationSection
 from udccal.reports.validation_figures import z_figure
 from udccal.reports.validation_tables import term_checks_table
 from udccal.sessions.schema import TermName
@@ -17,9 +17,10 @@ from udccal.validation.validate import Validation
 def validation_page(found: Validation, maps: Mapping[TermName, ZMap]) -> ValidationPage:
     """Build the page of one validation."""
     counted = [check for check in found.checks if check.ok is not None]
+    headline, mood = ("The profile holds.", "good") if found.ok else ("The profile does not hold.", "bad")
     return ValidationPage(
         title=f"A profile of {found.rig}, validated by a session",
-        verdict=found.advice,
+        advice=Advice(headline, mood, (found.advice,)),
         facts=(
             Fact("checks within their limits", f"{sum(bool(check.ok) for check in counted)} of {len(counted)}"),
             Fact("profile made", found.profile_created_at),

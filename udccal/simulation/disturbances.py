@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from jaxtyping import Float
 
 from udccal.simulation.truth import RigTruth
 
@@ -20,6 +21,8 @@ class Disturbances:
         dropped_frame_every: number of frames of which one is lost; 0 for no loss.
         knock_at_frame: first frame after the camera was knocked; None for no knock.
         knock_mm: displacement of the camera by the knock, along panel axes.
+        smudge_fraction: light that a smudge takes away in its middle; it is in front of the lens in every arrangement.
+        smudge_px: the smudge's middle (x, y) and radius on the sensor; it fades as a Gaussian bell of that sigma.
     """
 
     flicker_fraction: float = 0.0
@@ -28,11 +31,19 @@ class Disturbances:
     dropped_frame_every: int = 0
     knock_at_frame: int | None = None
     knock_mm: tuple[float, float, float] = (0.0, 0.05, 0.0)
+    smudge_fraction: float = 0.0
+    smudge_px: tuple[float, float, float] = (0.0, 0.0, 1.0)
 
     def flicker(self, timestamp_s: float, exposure_s: float) -> float:
         """Return the mean relative brightness of the flat light over an exposure that starts at ``timestamp_s``."""
         phase = 2 * np.pi * self.flicker_hz * (timestamp_s + exposure_s / 2)
         return float(1 + self.flicker_fraction * np.cos(phase) * np.sinc(self.flicker_hz * exposure_s))
+
+    def transmission(self, x: int, y: int, columns: int, rows: int) -> Float[np.ndarray, "rows columns"]:
+        """Return the part of the light that a smudge lets through, in a rectangle of the sensor."""
+        across, down, radius = self.smudge_px
+        square = (x + np.arange(columns) - across) ** 2 + (y + np.arange(rows)[:, None] - down) ** 2
+        return np.asarray(1 - self.smudge_fraction * np.exp(-0.5 * square / radius**2))
 
     def drops(self, frame_id: int) -> bool:
         """Return whether this frame is lost."""

@@ -105,6 +105,8 @@ class SimulatedWorld:
             self._rendered = self._render(region)
         x, y = region.x - self._rendered.region.x, region.y - self._rendered.region.y
         rate = self._rendered.rate[y : y + region.rows, x : x + region.columns]
+        if self.disturbances.smudge_fraction:
+            rate = rate * self.disturbances.transmission(region.x, region.y, region.columns, region.rows)
         return rate + self.disturbances.leak_e_per_s if self.disturbances.leak_e_per_s else rate
 
     def next_frame(self, period_s: float) -> tuple[int, float]:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import final
 
 import numpy as np
+from jaxtyping import Float
 
 from udccal.fitting.backscatter.data import BackscatterData, Binned, grid_rays, read_backscatter
 from udccal.fitting.backscatter.model import PerShot, Usable, ratios
@@ -42,7 +43,7 @@ def judge_backscatter(data: BackscatterData, result: FitResult[Backscatter], lim
     if data.shots.rate.shape[1:] != np.shape(result.term.mask):
         return unusable("backscatter", "The profile's grid is not that of this session's rig. Calibrate the rig again.")
     stated = {one.name: one.value for one in result.diagnostics}
-    seen = _Seen.of(data, result.term, stated.get("model_error_of_white", 0.0))
+    seen = SeenLight.of(data, result.term, stated.get("model_error_of_white", 0.0))
     worst = int(np.argmax(np.abs(seen.z).mean(axis=(1, 2))))
     count = int(seen.usable.sum())
     checks = (
@@ -65,8 +66,8 @@ def judge_backscatter(data: BackscatterData, result: FitResult[Backscatter], lim
 
 @final
 @dataclass(frozen=True)
-class _Seen:
-    """White and the pictures at some bins, in e-/s.
+class SeenLight:
+    """White and the pictures at some bins of the term's grid, in e-/s.
 
     Attributes:
         light: predicted. off: measured less predicted. noise: its variance by noise.
@@ -83,7 +84,7 @@ class _Seen:
     shape: tuple[int, int]
 
     @classmethod
-    def of(cls, data: BackscatterData, term: Backscatter, model_error: float) -> _Seen:
+    def of(cls, data: BackscatterData, term: Backscatter, model_error: float) -> SeenLight:
         """From all bins of a session, and a profile's term."""
         rows, columns = data.shots.rate.shape[2:]
         down, across = np.arange(0, rows, _EVERY), np.arange(0, columns, _EVERY)
@@ -115,10 +116,15 @@ def _noise(shots: Binned, light: PerShot) -> PerShot:
     return np.asarray(shots.variance(np.concatenate([light, np.zeros_like(light[:1])]))[:-1] + dark)
 
 
-def _brightness(seen: _Seen, limits: ValidationLimits) -> Check:
-    """The panel's light over the predicted one, by colour."""
+def brightness(seen: SeenLight) -> Float[np.ndarray, "3"]:
+    """Return the panel's light over the predicted one, by colour."""
     top, bottom = (np.sum(seen.weight * seen.light * one, axis=(0, 2)) for one in (seen.light + seen.off, seen.light))
-    level = np.where(bottom > 0, top / np.where(bottom > 0, bottom, 1.0), 1.0)
+    return np.where(bottom > 0, top / np.where(bottom > 0, bottom, 1.0), 1.0)
+
+
+def _brightness(seen: SeenLight, limits: ValidationLimits) -> Check:
+    """Whether the panel is as bright as predicted."""
+    level = brightness(seen)
     worst = int(np.argmax(np.abs(level - 1)))
     return at_most(
         "backscatter",
@@ -131,7 +137,7 @@ def _brightness(seen: _Seen, limits: ValidationLimits) -> Check:
     )
 
 
-def _light_check(seen: _Seen, limits: ValidationLimits) -> Check:
+def _light_check(seen: SeenLight, limits: ValidationLimits) -> Check:
     """The worst picture's error without noise, of its peak."""
     square = np.where(seen.usable, seen.off**2 - seen.noise, 0.0).sum(axis=(1, 2))
     mean = square / np.maximum(seen.usable.sum(axis=(1, 2)), 1)

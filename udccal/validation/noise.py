@@ -86,7 +86,7 @@ class _Transfer:
         """From the profile's fit, and the session's frames by exposure."""
         flats = tuple(sorted(seen.flats, key=lambda one: one.exposure_s))
         mean, variance, samples = (stacked(flats, name) for name in ("mean_DN", "variance_DN2", "samples"))
-        values, cov = _stated(result)
+        values, cov = transfer_numbers(result)
         term, rounding = result.term, float(np.asarray(result.term.q_DN)) ** 2 / 12
         # A bin's variance and mean have a common error for light, and independent ones for read noise.
         quiet = values[0] ** 2 * max((values[0] * values[2]) ** 2 - values[3] ** 2, 0.0)
@@ -121,8 +121,12 @@ class _Transfer:
         return float(np.sum(weight * light * (self.variance[self.usable] - floor)) / np.sum(weight * light**2))
 
 
-def _stated(result: FitResult[Noise]) -> tuple[Float[np.ndarray, "5"], Float[np.ndarray, "5 5"]]:
-    """The profile's numbers and their covariance; of a straight response, the curvature is 0 and certain."""
+def transfer_numbers(result: FitResult[Noise]) -> tuple[Float[np.ndarray, "5"], Float[np.ndarray, "5 5"]]:
+    """Return the numbers of photon transfer and their covariance.
+
+    They are K [DN/e], black level [DN], dark noise [e], row noise [DN] and curvature [1/DN]. The curvature of a
+    straight response is 0 and certain.
+    """
     term, names = result.term, [one.name for one in result.estimates[: len(result.cov)]]
     span = float(np.asarray(term.saturation_DN)) - float(np.asarray(term.black_DN))
     bent = result.estimate("nonlinearity").value if "nonlinearity" in names else 0.0

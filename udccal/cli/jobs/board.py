@@ -8,9 +8,9 @@ from typing import final
 
 from udccal.arrangements import BoardSpec
 from udccal.board.instructions import sentences
+from udccal.board.paper import Paper
 from udccal.board.pdf import board_pdf
 from udccal.board.set_up import set_up_of
-from udccal.board.sheets import Paper
 from udccal.cli.output import Output
 from udccal.errors import UdccalError
 from udccal.io.atomic import write_atomically
@@ -31,7 +31,7 @@ class PrintedBoard:
     height_mm: float
 
 
-def write_board(output: Output, rig_name: str, out: Path, paper: str | None) -> None:
+def write_board(output: Output, rig_name: str, out: Path, paper: Paper | None) -> None:
     """Write the PDF, and say what is on it.
 
     Raises:
@@ -43,7 +43,7 @@ def write_board(output: Output, rig_name: str, out: Path, paper: str | None) -> 
     rig = load_rig(rig_name)
     check_writable(out.parent)
     set_up = set_up_of(rig)
-    pdf, pages = board_pdf(rig.name, set_up, None if paper is None else Paper(paper))
+    pdf, pages = board_pdf(rig.name, set_up, paper)
     with storing_in(out.parent):
         out.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(out, pdf)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import final
 
 from udccal.cli.output import Output
-from udccal.profiles.history import PastProfile, history
+from udccal.profiles.history import PastProfile, PastTerm, history
 from udccal.profiles.store import find_profile
 from udccal.reports.tables import Table
 
@@ -66,5 +66,14 @@ def _sentences(profile: PastProfile) -> Iterator[str]:
 
 
 def _terms(profile: PastProfile) -> Table:
-    rows = tuple((t.term, t.status, f"{t.chi2_dof:.3f}", " ".join(t.notes)) for t in profile.terms)
-    return Table("Terms", ("term", "status", "reduced χ²", "notes"), rows, frozenset({2}))
+    rows = tuple(
+        (t.term, t.status, f"{t.chi2_dof:.3f}", _captured(t), t.effort or "not known", " ".join(t.notes))
+        for t in profile.terms
+    )
+    return Table("Terms", ("term", "status", "reduced χ²", "captured", "effort", "notes"), rows, frozenset({2}))
+
+
+def _captured(term: PastTerm) -> str:
+    """When, and the digits that tell whether two fits used the same captures."""
+    captures = term.captures
+    return "not known" if captures is None else f"{captures.completed_at[1]} ({captures.sha256[:_DIGITS]})"

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
+from dataclasses import dataclass
 from pathlib import Path
+from typing import final
 
 import numpy as np
 
@@ -12,9 +15,35 @@ from udccal.errors import ProfileError
 from udccal.io.atomic import write_atomically
 from udccal.profiles.exchange.format import ExportFormat
 from udccal.profiles.profile import Profile
-from udccal.result import FitResult
+from udccal.result import Estimate
 
 FORMAT, VERSION = "udccal-covariance", 1
+
+
+@final
+@dataclass(frozen=True)
+class _TermCovariance:
+    """Of one term; ``covariance`` is that of the leading estimates, in products of their units."""
+
+    term: str
+    status: str
+    estimates: tuple[Estimate, ...]
+    covariance: list[list[float]]
+
+
+@final
+@dataclass(frozen=True)
+class _Covariances:
+    """What the file beside an export holds; docs/profile.md describes it."""
+
+    format: str
+    version: int
+    rig: str
+    created_at: str
+    session_sha256: str | None
+    exported_to: str
+    not_held: tuple[str, ...]
+    terms: tuple[_TermCovariance, ...]
 
 
 def covariance_file(path: Path) -> Path:
@@ -38,8 +67,8 @@ def export_profile(profile: Profile, to: ExportFormat, path: Path) -> None:
     for file in (path, beside):
         if os.path.lexists(file):
             raise ProfileError(f"Expected a new file, found that {file} exists. Remove it, or choose another name.")
-    content = to.encode(profile)
-    write_atomically(beside, json.dumps(_covariances(profile, to), indent=1, allow_nan=False).encode("utf-8") + b"\n")
+    content, known = to.encode(profile), dataclasses.asdict(_covariances(profile, to))
+    write_atomically(beside, json.dumps(known, indent=1, allow_nan=False).encode("utf-8") + b"\n")
     try:
         write_atomically(path, content)
     except OSError:
@@ -47,27 +76,9 @@ def export_profile(profile: Profile, to: ExportFormat, path: Path) -> None:
         raise
 
 
-def _covariances(profile: Profile, to: ExportFormat) -> dict[str, object]:
-    made = profile.provenance
-    return {
-        "format": FORMAT,
-        "version": VERSION,
-        "rig": profile.rig.name,
-        "created_at": made.created_at,
-        "session_sha256": made.session_sha256,
-        "exported_to": to.name,
-        "not_held": list(to.not_held),
-        "terms": [_term(profile.result(name)) for name in to.terms],
-    }
-
-
-def _term(result: FitResult) -> dict[str, object]:
-    """Covariance of the leading estimates, in products of their units."""
-    return {
-        "term": result.name,
-        "status": result.status.name,
-        "estimates": [
-            {"name": e.name, "value": float(e.value), "sigma": float(e.sigma), "unit": e.unit} for e in result.estimates
-        ],
-        "covariance": np.asarray(result.cov, dtype=np.float64).tolist(),
-    }
+def _covariances(profile: Profile, to: ExportFormat) -> _Covariances:
+    made, results = profile.provenance, [profile.result(name) for name in to.terms]
+    terms = tuple(_TermCovariance(r.name, r.status.name, r.estimates, np.asarray(r.cov).tolist()) for r in results)
+    return _Covariances(
+        FORMAT, VERSION, profile.rig.name, made.created_at, made.session_sha256, to.name, to.not_held, terms
+    )

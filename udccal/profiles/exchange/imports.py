@@ -21,14 +21,14 @@ from udccal.result import FitResult, FitStatus
 from udccal.rig import RigDescription
 
 # mrcal's models hold their observations, some megabytes of them; the other formats are short.
-MOST_BYTES = 16 * 1024 * 1024
+MOST_BYTES = 8 * 1024 * 1024
 
 
 def read_lens(path: Path, of: ImportFormat) -> Lens:
     """Read the lens in another program's file.
 
     Raises:
-        ProfileError: when there is no such file, it is larger than 16 MiB, not text, or not of the format.
+        ProfileError: when there is no such file, it is larger than 8 MiB, not text, or not of the format.
     """
     if not path.is_file():
         raise ProfileError(f"Expected a file at {path}, found none. Check the path.")

@@ -94,8 +94,8 @@ def lens_with(
     further = [value for value in coefficients[COEFFICIENTS:] if value != 0]
     if len(coefficients) > _MOST_COEFFICIENTS or further:
         raise ProfileError(
-            f"Expected the distortion k1, k2, p1, p2, k3 in {where}, found {len(coefficients)} coefficients, of which "
-            "more are not 0. Calibrate with five coefficients."
+            f"Expected no distortion beyond k1, k2, p1, p2, k3 in {where}, found {len(coefficients)} coefficients "
+            "of which further ones are not 0. Calibrate with five."
         )
     held = np.zeros(COEFFICIENTS)
     held[: len(coefficients)] = coefficients[:COEFFICIENTS]

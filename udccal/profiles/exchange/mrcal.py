@@ -74,11 +74,7 @@ def _decode(text: str, where: str) -> Lens:
 def _literal(text: str, where: str) -> Mapping[str, object]:
     """The file's mapping; what could make Python's parser work long or deep is refused before it runs."""
     left = _WORDS.sub("", text)
-    depth = most = 0
-    for letter in left:
-        depth += (letter in "{[(") - (letter in "}])")
-        most = max(most, depth)
-    if len(left) > _MOST_LEFT or most > _DEEPEST or not _LITERAL.fullmatch(left) or _SIGNS.search(left):
+    if len(left) > _MOST_LEFT or not _LITERAL.fullmatch(left) or _SIGNS.search(left) or _depth(left) > _DEEPEST:
         raise _no_literal(where, "another text")
     try:
         with warnings.catch_warnings():
@@ -89,6 +85,14 @@ def _literal(text: str, where: str) -> Mapping[str, object]:
     if not isinstance(found, dict):
         raise _no_literal(where, "another value")
     return found
+
+
+def _depth(text: str) -> int:
+    depth = most = 0
+    for letter in text:
+        depth += (letter in "{[(") - (letter in "}])")
+        most = max(most, depth)
+    return most
 
 
 def _no_literal(where: str, found: str) -> ProfileError:

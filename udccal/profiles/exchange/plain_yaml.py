@@ -125,6 +125,8 @@ def _lines(text: str, where: str) -> list[_Line]:
 
 
 def _without_comment(line: str) -> str:
+    if "#" not in line:
+        return line
     quote = ""
     for at, letter in enumerate(line):
         if quote:

@@ -1,0 +1,86 @@
+"""A profile with what a check has found, against the old one."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from udccal.comparison.estimates import difference
+from udccal.comparison.held import held_estimates
+from udccal.comparison.limits import DiffLimits
+from udccal.comparison.movement import movement
+from udccal.drift.causes import Explained
+from udccal.drift.changes import Change
+from udccal.drift.check import FORMAT, VERSION, RigCheck, Solved
+from udccal.drift.limits import DriftLimits
+from udccal.drift.pose import PoseChange
+from udccal.drift.update import updated
+from udccal.fitting.wire.fit import sensor_map
+from udccal.profiles.profile import Profile
+from udccal.profiles.provenance import profile_sha256
+from udccal.profiles.store import find_profile, load_profile, read_profile, write_profile
+from udccal.sessions.manifest import MANIFEST_NAME
+
+pytestmark = pytest.mark.medium
+MOVED_MM, TURNED_RAD = np.array([0.05, -0.03, 0.02]), np.deg2rad(0.1)
+
+
+@pytest.fixture(scope="module")
+def profile() -> Profile:
+    return load_profile("lg55-reduced")
+
+
+def checked(profile: Profile, names: tuple[str, ...]) -> tuple[RigCheck, Solved]:
+    """A check that found these changes."""
+    wire, pitch = profile.wire.term, profile.rig.panel.pitch_mm.value
+    x, y, z = MOVED_MM / pitch
+    values = np.array([TURNED_RAD, 0.0, 0.0, np.log1p(-z / float(wire.standoff_per_pitch)), x, y, 0.0])
+    values[:3] *= "tilted" in names
+    values[3:6] *= "moved" in names
+    cov = np.diag(np.full(7, 1e-6))
+    pose = PoseChange(values, cov, wire, np.zeros((24, 32)), np.ones((24, 32)), 1.0)
+    changes = tuple(Change(name, 1.0, 0.1, 0.5, "1", True, "It changed.", "Mend it.") for name in names)
+    found = RigCheck(FORMAT, VERSION, "x", "changed", names, "Mend it.", changes, (0.0, 0.0, 0.0), 1.0, DriftLimits())
+    return found, Solved(pose, Explained(names, values, cov), np.full(3, 0.9), 1.02)
+
+
+@pytest.fixture
+def session(tmp_path: Path) -> Path:
+    (tmp_path / MANIFEST_NAME).write_text("{}", encoding="utf-8")
+    return tmp_path
+
+
+def test_the_movement_found_is_the_difference_of_the_profiles(profile: Profile, session: Path) -> None:
+    new = updated(profile, Path("lg55-reduced"), *checked(profile, ("moved", "tilted")), session)
+    found = movement(
+        difference(held_estimates(profile), held_estimates(new)), profile.rig.panel.pitch_mm.value, DiffLimits()
+    )
+    parts = {part.name: part.value for part in found.parts}
+    assert [parts[axis] for axis in "xyz"] == pytest.approx(MOVED_MM, abs=1e-4)
+    assert found.angle.value == pytest.approx(0.1, abs=2e-3)
+    assert found.agreement_p_value > 0.1
+    camera = profile.rig.camera
+    assert new.wire_map == pytest.approx(sensor_map(new.wire.term, camera.rows, camera.columns), rel=1e-5)
+
+
+def test_only_what_changed_is_replaced_and_the_parent_is_named(profile: Profile, session: Path) -> None:
+    new = updated(profile, Path("lg55-reduced"), *checked(profile, ("gain", "panel level")), session)
+    assert new.parent == profile_sha256(find_profile("lg55-reduced"))
+    assert float(new.noise.term.K_DN_per_e) == pytest.approx(1.02 * float(profile.noise.term.K_DN_per_e))
+    assert new.noise.estimate("K_DN_per_e").value == pytest.approx(float(new.noise.term.K_DN_per_e))
+    assert new.backscatter.term.mask == pytest.approx(0.9 * np.asarray(profile.backscatter.term.mask))
+    assert np.array_equal(new.wire_map, profile.wire_map)
+    assert new.geometry.estimates == profile.geometry.estimates
+
+
+def test_an_updated_profile_is_written_and_read(profile: Profile, session: Path, tmp_path: Path) -> None:
+    write_profile(tmp_path / "old.zip", profile)
+    new = updated(profile, tmp_path / "old.zip", *checked(profile, ("moved",)), session)
+    write_profile(tmp_path / "new", new)
+    read = read_profile(tmp_path / "new")
+    assert read.parent == new.parent
+    assert "by a check" in read.wire.notes[-1]
+    assert replace(read.noise, posterior=None).estimates == profile.noise.estimates

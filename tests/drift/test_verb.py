@@ -1,0 +1,45 @@
+"""``udccal check`` as it is installed, on the simulated rig whose profile ships."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from udccal.profiles.provenance import profile_sha256
+from udccal.profiles.store import find_profile, load_profile
+
+pytestmark = pytest.mark.slow
+
+
+def check(*words: str | Path) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "udccal.cli.main", "check", "--profile", "lg55-reduced", *map(str, words)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=900)
+
+
+def test_the_same_rig_on_another_day_is_the_same(tmp_path: Path) -> None:
+    out = tmp_path / "with a space, µ"
+    done = check("--noise-seed", "7", "--out", out, "--update", tmp_path / "new", "--json")
+    assert done.returncode == 0, done.stderr
+    document = json.loads(done.stdout)
+    assert document == json.loads((out / "check.json").read_text(encoding="utf-8"))
+    assert (document["verdict"], document["changed"]) == ("same", [])
+    names = [one["name"] for one in document["changes"]]
+    assert names == ["moved", "tilted", "refocused", "smudge", "panel level", "gain"]
+    sigma = {one["name"]: one["sigma"] for one in document["changes"]}
+    assert sigma["moved"] < 0.01
+    assert sigma["tilted"] < 0.02
+    page = (out / "check.html").read_text(encoding="utf-8")
+    assert document["advice"] in page
+    assert not re.findall(r"(?:src|href)=\"(?!data:|#)", page)
+    assert load_profile(tmp_path / "new").parent == profile_sha256(find_profile("lg55-reduced"))
+
+
+def test_another_specimen_is_refused_before_it_is_compared(tmp_path: Path) -> None:
+    done = check("--seed", "1", "--out", tmp_path / "out", "--json")
+    assert done.returncode == 1, done.stdout
+    assert "found another camera" in json.loads(done.stdout)["error"]

@@ -1,0 +1,50 @@
+"""``udccal check``: a few minutes at the rig say whether its profile still holds, and what changed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from udccal.cli.bench_options import (
+    Agree,
+    BenchOptions,
+    Camera,
+    CameraKind,
+    Display,
+    DisplayKind,
+    Files,
+    Monitor,
+    Serial,
+)
+from udccal.cli.options import CHANGED, STOPPED, FoundProfile, Seed
+
+
+def check(
+    context: typer.Context,
+    profile: FoundProfile,
+    camera: Camera = CameraKind.sim,
+    serial: Serial = None,
+    files: Files = None,
+    display: Display = DisplayKind.manual,
+    monitor: Monitor = 0,
+    seed: Seed = 0,
+    noise_seed: Annotated[
+        int | None, typer.Option("--noise-seed", min=0, help="Noise of the simulated rig: the same rig, another day.")
+    ] = None,
+    yes: Agree = False,
+    out: Annotated[Path, typer.Option("--out", help="Folder for the captures, check.json and check.html.")] = Path(
+        "udccal-check"
+    ),
+    update: Annotated[
+        Path | None, typer.Option("--update", help="Write the profile with what changed solved for again.")
+    ] = None,
+) -> None:
+    """Check a rig against its profile: ten flats, some dark frames and three panel pictures, in a few minutes."""
+    from udccal.cli.jobs.check import check_profile
+
+    options = BenchOptions(camera, serial, files, display, monitor, seed, noise_seed)
+    same = check_profile(context.obj, profile, options, yes, out, update)
+    if not same:
+        raise typer.Exit(STOPPED if same is None else CHANGED)

@@ -1,0 +1,69 @@
+"""Captures a short session of a rig, says what has changed since its profile, and writes it down."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from udccal.cli.bench_options import BenchOptions
+from udccal.cli.jobs.capture import Wanted
+from udccal.cli.jobs.guided import led_by
+from udccal.cli.jobs.terminal import TerminalPerson
+from udccal.cli.output import Output, plain
+from udccal.compilation import keep_compilations
+from udccal.drift.check import check_rig
+from udccal.drift.short import short_rig
+from udccal.drift.update import updated
+from udccal.io.atomic import write_atomically
+from udccal.io.out_folder import check_writable, storing_in
+from udccal.profiles.store import check_replaceable, load_profile, write_profile
+from udccal.reports.check_page import changes_table, check_page
+from udccal.reports.page import write_page
+from udccal.sessions.store import Session
+
+
+def check_profile(
+    output: Output, path: Path, options: BenchOptions, agree: bool, out: Path, update: Path | None
+) -> bool | None:
+    """Capture, compare and print; return whether the rig is the same, or changed by less than matters.
+
+    None when the person at the rig has stopped the capture.
+
+    Args:
+        output: shows the changes.
+        path: folder or zip file of the profile, or a rig's name.
+        options: where the rig is.
+        agree: whether a capture that a person is led through goes on by itself wherever all is in order.
+        out: folder for ``session``, ``check.json`` and ``check.html``.
+        update: path of a new profile with what changed; None for none.
+
+    Raises:
+        ProfileError: when the profile cannot be read, or is not of this rig and camera.
+        CaptureError: when the camera does not see what a step needs.
+        SessionError: when the captures cannot be stored or read.
+        UdccalError: when ``out`` cannot be written to; this is found before any work.
+    """
+    keep_compilations()
+    check_writable(out)
+    if update is not None:
+        check_replaceable(update)
+        check_writable(update.parent)
+    profile = load_profile(path)
+    rig, folder = short_rig(profile.rig), out / "session"
+    person = led_by(output, TerminalPerson(output), agree) if options.real else None
+    if not options.capture(output, rig, Wanted(folder, ("wire", "backscatter")), person):
+        return None
+    with output.stage("comparing"):
+        found, solved = check_rig(profile, Session.open(folder))
+    output.answer(found.advice)
+    output.table(changes_table(found))
+    if update is not None:
+        with storing_in(update.parent):
+            write_profile(update, updated(profile, path, found, solved, folder))
+        output.say(f"Updated profile: {update}")
+    with storing_in(out):
+        write_page(out / "check.html", check_page(found, solved))
+        write_atomically(out / "check.json", json.dumps(plain(found), indent=2, allow_nan=False).encode() + b"\n")
+    output.say(f"Written: {out / 'check.html'} and {out / 'check.json'}")
+    output.result(found)
+    return found.verdict != "changed"

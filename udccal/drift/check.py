@@ -1,0 +1,163 @@
+"""What has changed at a rig since its profile was made: pose, focus, smudges, the panel's brightness, the gain."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, final
+
+import numpy as np
+from jaxtyping import Float
+
+from udccal.comparison.comparable import check_same_rig
+from udccal.drift.causes import Explained, explained
+from udccal.drift.changes import Change, gain_change, panel_level, pose_changes, smudge
+from udccal.drift.gain import gain_ratio
+from udccal.drift.limits import DriftLimits
+from udccal.drift.moved import moved_backscatter, movement_mm
+from udccal.drift.pose import PoseChange, pose_change
+from udccal.errors import ProfileError, SessionError
+from udccal.fitting.backscatter.data import read_backscatter
+from udccal.fitting.wire.data import read_wire
+from udccal.fitting.wire.fit import site_means, unusable_flat
+from udccal.fitting.wire.rules import WireRules
+from udccal.numerics import in_float64
+from udccal.profiles.profile import Profile
+from udccal.sessions.store import Session
+from udccal.validation.backscatter import SeenLight, brightness
+
+Verdict = Literal["same", "changed, harmless", "changed"]
+FORMAT, VERSION = "udccal-check", 1
+# Flats that no pose explains to this many times their noise were of a rig that changed in another way.
+_UNEXPLAINED = 1.5
+
+
+@final
+@dataclass(frozen=True)
+class RigCheck:
+    """A rig against its profile. docs/check.md describes each number.
+
+    Attributes:
+        changed: names of the changes that matter.
+        advice: one sentence that says what to do.
+        changes: all that were looked for.
+        movement_mm: of the camera (x, y, z) in the panel's frame; zero where none was found.
+        flat_over_noise: reduced chi-squared of the flat at the pose found.
+    """
+
+    format: str
+    version: int
+    rig: str
+    verdict: Verdict
+    changed: tuple[str, ...]
+    advice: str
+    changes: tuple[Change, ...]
+    movement_mm: tuple[float, float, float]
+    flat_over_noise: float
+    limits: DriftLimits
+
+
+@final
+@dataclass(frozen=True)
+class Solved:
+    """What a check has solved for: the pose by causes, the panel's level by camera colour, and the gain's ratio."""
+
+    pose: PoseChange
+    cause: Explained
+    level: Float[np.ndarray, "3"]
+    gain: float
+
+
+@in_float64
+def check_rig(profile: Profile, session: Session, limits: DriftLimits | None = None) -> tuple[RigCheck, Solved]:
+    """Compare a rig with its profile by a short session: flats and darks of the wire, and pictures on the panel.
+
+    Args:
+        profile: of the rig.
+        session: with the steps ``wire/flat``, ``wire/dark`` and those of backscatter, as ``udccal check`` captures it.
+        limits: of the verdict.
+
+    Raises:
+        ProfileError: when the session is of another rig or camera, or the profile lacks a term that this needs.
+        SessionError: when steps are missing, flats are clipped or dark, or a file is missing or damaged.
+    """
+    limits = limits or DriftLimits()
+    check_same_rig(profile, session.rig, session.camera)
+    _check_measured(profile)
+    flat, dark = (session.average(session.step(f"wire/{name}").captures[0]) for name in ("flat", "dark"))
+    gain, gain_sigma = gain_ratio(flat, dark, profile.noise, profile.rig.camera.cfa)
+    data = read_wire(session, profile.noise.term, profile.wire.term.geometry)
+    if (refused := unusable_flat(data, site_means(data), WireRules())) is not None:
+        raise SessionError(f"Expected flats that can be compared, found: {refused[1]} {refused[0].value}")
+    pose = pose_change(profile.wire.term, data)
+    cause = explained(pose.values, pose.cov + _own_cov(profile), limits.chance)
+    level = _level(profile, session, cause) / gain
+    solved = Solved(pose, cause, level, gain)
+    changes = (
+        *pose_changes(profile, cause, limits),
+        smudge(profile, pose, limits),
+        panel_level(profile, level, limits),
+        gain_change(gain, gain_sigma, limits),
+    )
+    return _answer(profile, changes, solved, limits), solved
+
+
+def _check_measured(profile: Profile) -> None:
+    missing = [one.name for one in (profile.noise, profile.wire, profile.backscatter) if one.unfitted]
+    if missing:
+        raise ProfileError(
+            f"Expected a profile with noise, wire and backscatter as measured, found none of {' and '.join(missing)}. "
+            "Calibrate these terms first: the check compares with them."
+        )
+
+
+def _own_cov(profile: Profile) -> Float[np.ndarray, "7 7"]:
+    """Covariance of the profile's own pose in the units of ``PoseChange``, whose focal length counts from this one."""
+    cov, whole = profile.wire.cov, np.zeros((7, 7))
+    if len(cov) < 6:
+        return whole
+    unit = np.array([np.pi / 180] * 3 + [1 / float(profile.wire.term.standoff_per_pitch), 1.0, 1.0])
+    whole[:6, :6] = cov[:6, :6] * np.outer(unit, unit)
+    return whole
+
+
+def _level(profile: Profile, session: Session, cause: Explained) -> Float[np.ndarray, "3"]:
+    """The panel's brightness over the profile's, by camera colour, seen from where the camera is now."""
+    term = moved_backscatter(profile.backscatter.term, profile.wire.term, cause.values, np.ones(3))
+    shading = profile.wire_map.astype(np.float64)
+    data = read_backscatter(session, profile.noise.term, term.geometry, shading)
+    stated = {one.name: one.value for one in profile.backscatter.diagnostics}
+    return brightness(SeenLight.of(data, term, stated.get("model_error_of_white", 0.0)))
+
+
+def _answer(profile: Profile, changes: Sequence[Change], solved: Solved, limits: DriftLimits) -> RigCheck:
+    harmful = [one for one in changes if one.harmful]
+    odd = solved.pose.variance > _UNEXPLAINED
+    verdict: Verdict = "same"
+    if harmful or odd:
+        verdict = "changed"
+    elif any(one.significant for one in changes):
+        verdict = "changed, harmless"
+    x, y, z = movement_mm(profile.wire.term, solved.cause.values, profile.rig.panel.pitch_mm.value)
+    return RigCheck(
+        format=FORMAT,
+        version=VERSION,
+        rig=profile.rig.name,
+        verdict=verdict,
+        changed=tuple(one.name for one in harmful),
+        advice=_advice(harmful, odd, verdict),
+        changes=tuple(changes),
+        movement_mm=(float(x), float(y), float(z)),
+        flat_over_noise=solved.pose.variance,
+        limits=limits,
+    )
+
+
+def _advice(harmful: Sequence[Change], odd: bool, verdict: Verdict) -> str:
+    if odd:
+        return "Calibrate the rig again: no movement of the camera explains how the flats look now."
+    if harmful:
+        return " ".join(dict.fromkeys([*(one.what for one in harmful), *(one.advice for one in harmful)]))
+    if verdict == "same":
+        return "Go on with this profile: the rig is as it was."
+    return "Go on with this profile: the rig changed, too little to matter."

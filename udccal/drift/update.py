@@ -1,0 +1,109 @@
+"""The profile of a rig that changed: what a check has solved for replaces the old, all else stays."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from udccal.comparison.estimates import ANGLES
+from udccal.drift.causes import CAUSES
+from udccal.drift.check import RigCheck, Solved
+from udccal.drift.moved import moved_backscatter, moved_geometry, moved_psf, moved_wire, movement_mm
+from udccal.fitting.geometry.fit import angles_deg
+from udccal.fitting.wire.fit import sensor_map
+from udccal.profiles.archive import unpack_archive
+from udccal.profiles.profile import Profile, build_profile
+from udccal.profiles.provenance import profile_sha256, provenance_now
+from udccal.profiles.store import find_profile
+from udccal.result import FitResult
+from udccal.sessions.manifest import MANIFEST_NAME
+
+
+def updated(profile: Profile, path: Path, found: RigCheck, solved: Solved, session: Path) -> Profile:
+    """Return the profile with what the check found significant, and with the old one as its parent.
+
+    Args:
+        profile: the rig's.
+        path: where it was read from, which gives its SHA-256.
+        found, solved: of ``check_rig``.
+        session: folder of the check's session.
+    """
+    significant = {one.name for one in found.changes if one.significant}
+    change, wire = solved.cause.values, profile.wire.term
+    level = solved.level if "panel level" in significant else np.ones(3)
+    results = _results(profile, solved, level, solved.gain if "gain" in significant else 1.0)
+    moved = bool(significant & set(CAUSES))
+    camera, provenance = profile.rig.camera, provenance_now(session / MANIFEST_NAME, profile.provenance.camera)
+    new_map = sensor_map(moved_wire(wire, change), camera.rows, camera.columns) if moved else profile.wire_map
+    return build_profile(profile.rig, provenance, *results, np.asarray(new_map, dtype=np.float64), _sha256(path))
+
+
+def _sha256(path: Path) -> str:
+    place = find_profile(path)
+    if not place.is_file():
+        return profile_sha256(place)
+    with tempfile.TemporaryDirectory(prefix="udccal-") as folder:
+        unpack_archive(place, Path(folder))
+        return profile_sha256(Path(folder))
+
+
+def _results(
+    profile: Profile, solved: Solved, level: Float[np.ndarray, "3"], gain: float
+) -> tuple[FitResult, FitResult, FitResult, FitResult, FitResult]:
+    """All terms, those that changed with a note and with other estimates."""
+    change, wire = solved.cause.values, profile.wire.term
+    pitch = profile.rig.panel.pitch_mm.value
+    x, y, z = movement_mm(wire, change, pitch)
+    sigma = np.sqrt(np.diag(solved.pose.cov))
+    away = float(wire.standoff_per_pitch)
+    geometry = moved_geometry(profile.geometry.term, change)
+    before, after = (angles_deg(np.asarray(one.rotation_rad)) for one in (profile.geometry.term, geometry))
+    turned = dict(zip(ANGLES, after - before, strict=True)) if change[:3].any() else {}
+    focal = {name: value * np.expm1(change[6]) for name, value in _focal(profile).items()} if change[6] else {}
+    moves = {"standoff_per_pitch": -z / pitch, "offset_x_periods": x / pitch, "offset_y_periods": y / pitch}
+    shifts = {"standoff_mm": -z, "offset_x_px": -x / pitch, "offset_y_px": -y / pitch}
+    moved = bool(change[3:6].any())
+    spread = {"standoff_per_pitch": away * sigma[3], "offset_x_periods": sigma[4], "offset_y_periods": sigma[5]}
+    return (
+        _changed(
+            profile.noise,
+            replace(profile.noise.term, K_DN_per_e=np.asarray(profile.noise.term.K_DN_per_e) * gain),
+            {"K_DN_per_e": float(profile.noise.term.K_DN_per_e) * (gain - 1)} if gain != 1 else {},
+        ),
+        _changed(profile.geometry, geometry, turned | focal, dict.fromkeys(turned, float(np.rad2deg(sigma[:3].max())))),
+        _changed(profile.wire, moved_wire(wire, change), moves if moved else {}, spread if moved else {}),
+        _changed(profile.psf, moved_psf(profile.psf.term, change), {}),
+        _changed(
+            profile.backscatter,
+            moved_backscatter(profile.backscatter.term, wire, change, level),
+            shifts if moved else {},
+        ),
+    )
+
+
+def _focal(profile: Profile) -> Mapping[str, float]:
+    return {one.name: one.value for one in profile.geometry.estimates if one.name in ("fx", "fy")}
+
+
+def _changed(
+    result: FitResult, term: object, added: Mapping[str, float], sigma: Mapping[str, float] | None = None
+) -> FitResult:
+    """The result with another term, with numbers added to its estimates, and the sigmas by the check."""
+    if not added:
+        return replace(result, term=term)
+    sigmas, cov = sigma or {}, result.cov.copy()
+    estimates = []
+    for index, one in enumerate(result.estimates):
+        if index < len(cov) and one.name in sigmas:
+            cov[index], cov[:, index] = 0.0, 0.0
+            cov[index, index] = sigmas[one.name] ** 2
+        estimates.append(
+            replace(one, value=one.value + added.get(one.name, 0.0), sigma=sigmas.get(one.name, one.sigma))
+        )
+    note = f"{', '.join(added)} by a check of a few minutes; the other numbers are older."
+    return replace(result, term=term, estimates=tuple(estimates), cov=cov, notes=(*result.notes, note))
