@@ -29,6 +29,7 @@ from udccal.restoration.prepared import kept
 from udccal.restoration.preview import Preview
 from udccal.restoration.rectify import Rectification
 from udccal.restoration.sharpen import Sharpener
+from udccal.restoration.stages import Stage
 from udccal.restoration.tone import Tone
 from udccal.restoration.view import inscribed_view
 from udccal.rig import RigDescription
@@ -90,6 +91,7 @@ class Restorer:
         tier: Tier = Tier.balanced,
         options: PlanOptions | None = None,
         keep: Path | None = None,
+        without: frozenset[Stage] = frozenset(),
     ) -> Restorer:
         """Prepare a profile.
 
@@ -99,6 +101,8 @@ class Restorer:
             options: accuracy against time within the tier.
             keep: folder that keeps what is computed, so that the next start of a program reads it instead; None to
                 keep nothing. ``prepared_folder()`` is the one of the ``udccal`` command.
+            without: stages that the scene does not need (``chosen_stages``). Nothing is computed for them, and frames
+                do not pass them.
 
         Raises:
             RestorationError: when its geometry leaves no view through the panel, or a term gives values that are not
@@ -110,7 +114,7 @@ class Restorer:
         view = inscribed_view(geometry, camera.columns, camera.rows, rig.view.columns, rig.view.rows)
         rectification = Rectification.within(geometry, view, camera.columns, camera.rows)
         quick = tier is Tier.preview
-        unscattered = profile.backscatter.unfitted
+        unscattered = profile.backscatter.unfitted or Stage.backscatter in without
         unblurred = quick or profile.psf.unfitted
         even = profile.wire.unfitted and bool(np.all(profile.wire_map == 1.0))
         return cls(
@@ -118,7 +122,7 @@ class Restorer:
             rig=rig,
             noise=profile.noise.term,
             view=view,
-            wire=None if even else profile.wire_map,
+            wire=None if even or Stage.wire in without else profile.wire_map,
             mask=None
             if unscattered
             else PanelMask(mask_mosaic(profile.backscatter_mask, cfa, camera.rows, camera.columns), cfa),
@@ -154,6 +158,24 @@ class Restorer:
             RestorationError: when the frame, its exposure or the panel picture does not belong to this rig, or the
                 panel's picture alone would give more light than the frame has: the exposure is wrong, or the picture.
         """
+        signal, variance = self.scene_light_e(mosaic, exposure_s, panel_picture)
+        if self.sharpener is None:
+            return self._on_view(demosaic(signal, self.rig.camera.cfa), exposure_s)
+        sharp = self.sharpener.apply(signal, variance)
+        linear = self._strip_rectification.apply(sharp, self.options.interpolation)
+        linear /= np.float32(exposure_s)
+        return linear
+
+    def scene_light_e(
+        self,
+        mosaic: UInt16[np.ndarray, "frame_rows frame_columns"],
+        exposure_s: float,
+        panel_picture: UInt8[np.ndarray, "panel_rows panel_columns 3"] | None = None,
+    ) -> tuple[Mosaic, Mosaic]:
+        """Return the signal of the scene alone in e-, divided by the wire, and its variance in e-^2.
+
+        Arguments and errors are those of ``restore``.
+        """
         check_frame(mosaic, exposure_s, self.rig)
         check_panel_picture(panel_picture, self.rig)
         signal = without_defects(to_electrons(mosaic, self.noise, exposure_s), self.noise, self.rig.camera.cfa)
@@ -166,12 +188,7 @@ class Restorer:
             if panel_picture is not None:
                 refuse_excess(signal, panel_e, saturated(mosaic, self.noise))
             signal -= panel_e
-        if self.sharpener is None:
-            return self._on_view(demosaic(signal, self.rig.camera.cfa), exposure_s)
-        sharp = self.sharpener.apply(signal, variance)
-        linear = self._strip_rectification.apply(sharp, self.options.interpolation)
-        linear /= np.float32(exposure_s)
-        return linear
+        return signal, variance
 
     def display(
         self,
