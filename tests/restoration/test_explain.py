@@ -122,4 +122,4 @@ def test_what_does_not_belong_to_the_profile_is_refused_before_any_work(
 )
 def test_options_that_contradict_each_other_are_wrong_words(options: dict[str, Any], said: str) -> None:
     with pytest.raises(typer.BadParameter, match=said):
-        restore(MagicMock(), [Path("frame.png")], Path("p"), **options)
+        restore(MagicMock(spec=typer.Context), [Path("frame.png")], Path("p"), **options)
