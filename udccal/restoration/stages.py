@@ -79,7 +79,7 @@ def _wire(profile: Profile, light_e: Float32[np.ndarray, "down across"], exposur
     return StageChoice(
         Stage.wire,
         most >= _LEAST_SIGMAS,
-        f"where the frame is brightest, it changes a sample by {most:.2g} of its noise",
+        f"where the frame is brightest, it changes a sample by {most:.3g} times its noise",
     )
 
 
@@ -97,7 +97,7 @@ def _backscatter(
         return StageChoice(Stage.backscatter, False, "the panel is black")
     dark_sigma_e = float(np.sqrt(variance_e2(np.zeros((1, 1), np.float32), noise, exposure_s)[0, 0]))
     most = part * exposure_s * float(profile.backscatter_mask.max()) / dark_sigma_e
-    shown = "of a white panel, as its picture is not known," if panel_picture is None else "of the panel's picture"
+    shown = "of a white panel (its picture is not known)" if panel_picture is None else "of the panel's picture"
     return StageChoice(
-        Stage.backscatter, most >= _LEAST_SIGMAS, f"the light {shown} is up to {most:.2g} of a dark sample's noise"
+        Stage.backscatter, most >= _LEAST_SIGMAS, f"the light {shown} is up to {most:.3g} times a dark sample's noise"
     )
