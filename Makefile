@@ -17,7 +17,7 @@ ROBUST ?=
 PEERS ?=
 USB ?=
 
-.PHONY: install demo test test-medium test-slow test-usb fuzz load lint types contracts check accuracy tables efficiency coverage extremes pareto drift live robust peers growth clean
+.PHONY: install demo test test-medium test-slow test-usb fuzz load lint types contracts check accuracy tables efficiency coverage extremes pareto drift live robust peers growth docs clean
 
 install: $(STAMP)
 
@@ -66,7 +66,7 @@ contracts: $(STAMP)
 
 check: lint types contracts test
 
-# The accuracy table of README.md: two full-size rigs, and ACCURACY_SEEDS specimens of each reduced one. Goes on where it
+# The table of docs/accuracy.md: two full-size rigs, and ACCURACY_SEEDS specimens of each reduced one. Goes on where it
 # was stopped. Writes accuracy.json; non-zero exit where a number is missed.
 accuracy: $(STAMP)
 	$(BIN)/python -m tests.benchmarks.accuracy --out $(ACCURACY_OUT) --seeds $(ACCURACY_SEEDS)
@@ -113,9 +113,14 @@ pareto: $(STAMP)
 live: $(STAMP)
 	$(BIN)/python -m tests.benchmarks.live --out $(LIVE_OUT)
 
-# Puts the measured tables into README.md.
+# Puts the measured tables into docs/accuracy.md.
 tables: $(STAMP)
 	$(BIN)/python -m tests.benchmarks.readme_tables --accuracy $(ACCURACY_OUT)
 
+# The documentation as a site of its own, in site/; non-zero exit where a link or a reference leads nowhere.
+docs: $(STAMP)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[docs]"
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+
 clean:
-	rm -rf $(VENV) $(DEMO_OUT) $(ACCURACY_OUT) $(EFFICIENCY_OUT) $(ROBUST_OUT) $(PARETO_OUT) $(LIVE_OUT) peers build dist *.egg-info
+	rm -rf $(VENV) $(DEMO_OUT) $(ACCURACY_OUT) $(EFFICIENCY_OUT) $(ROBUST_OUT) $(PARETO_OUT) $(LIVE_OUT) site peers build dist *.egg-info

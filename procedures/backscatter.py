@@ -8,9 +8,10 @@ from typing import ClassVar, final
 import numpy as np
 from jaxtyping import UInt8
 
-from procedures.base import PictureRole, Procedure, Step, whole_sensor
+from procedures.base import Procedure
 from procedures.checks import is_dark, sees_anything
 from procedures.plans import Exposure, Metered, Stack, TimesThatOf
+from procedures.step import PictureRole, Step, whole_sensor
 from udccal.arrangements import Dark, PanelPicture
 from udccal.displays.pictures import face_picture
 from udccal.rig import RigDescription
@@ -19,7 +20,12 @@ from udccal.sessions.schema import TermName
 _WHITE = "backscatter/white"
 _LEVEL = 0.7  # of saturation, with the white picture
 _GAMMA, _GAIN, _LIFT = 2.2, 2.0, 0.3
-_BLACKOUT = "Keep all light out. The only light is our display, which shows the picture by itself."
+_BLACKOUT = (
+    "Keep all light out. The only light is our display, which shows each picture by itself and for the step "
+    "backscatter/dark is off."
+)
+_TITLE = "Blackout for the panel's own light"
+_WHY = "Pictures on the panel show how much of its light comes back into the lens, and where."
 
 Picture = UInt8[np.ndarray, "panel_rows panel_columns 3"]
 
@@ -39,11 +45,13 @@ class BackscatterProcedure(Procedure):
             id="backscatter/dark",
             term="backscatter",
             arrangement=Dark(),
-            instruction="Keep all light out and switch our display off.",
+            instruction=_BLACKOUT,
             check=is_dark,
             region=whole_sensor(rig),
             exposure=TimesThatOf(_WHITE),
             plan=Stack(rig.captures.backscatter_frames),
+            title=_TITLE,
+            why=_WHY,
         )
         brightened_count = count // 3
         for index in range(count - brightened_count):
@@ -72,4 +80,6 @@ def _shown(rig: RigDescription, step_id: str, picture: Picture, role: PictureRol
         exposure=exposure,
         plan=Stack(rig.captures.backscatter_frames),
         role=role,
+        title=_TITLE,
+        why=_WHY,
     )

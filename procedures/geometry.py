@@ -3,17 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import islice
 from typing import ClassVar, final
 
 import numpy as np
 
 from procedures.aiming import board_facing, board_parallel, low_discrepancy
-from procedures.base import Procedure, Step, whole_sensor
+from procedures.base import Procedure
+from procedures.board_walk import BoardVisit
 from procedures.checks import shows_board
 from procedures.plans import Metered, Stack
-from udccal.arrangements import Board, BoardSpec
+from procedures.set_up import set_ups
+from procedures.step import Bench, Step, whole_sensor
+from udccal.arrangements import Board, BoardSpec, Stage
+from udccal.cameras.protocol import Camera
+from udccal.displays.protocol import Display
+from udccal.guide.drawing import side_view
+from udccal.guide.steps import GuidedStep
 from udccal.rig import RigDescription
 from udccal.sessions.schema import TermName
+from udccal.sessions.writer import SessionWriter
 
 _MOST_SQUARES, _FEWEST_SQUARES, _SQUARE_PX = 12, 5, 40.0
 _MARKER = 0.75  # marker side over square side
@@ -21,6 +30,7 @@ _SPAN_AT_MM, _SPAN = 850.0, 0.6  # at this distance the board spans this part of
 _NEAREST_MM, _FARTHEST_MM = 570.0, 1250.0
 _JIG_MM = 700.0
 _LEVEL = 0.75
+_WHY = "The corners of a board of known size give the lens and the pose of the camera."
 _FRAMES = 8
 _MOST_LEAN_RAD, _MOST_TURN_RAD = np.deg2rad(40.0), np.deg2rad(20.0)
 # Middle of the board as a fraction of the sensor: centre, corners, edges, repeatedly.
@@ -37,9 +47,44 @@ class GeometryProcedure(Procedure):
         """Yield the view on the jig, then the views held by hand."""
         spec = board_spec(rig)
         jig = board_parallel(rig, spec, _JIG_MM)
-        yield _view(rig, "geometry/panel", jig, "Put the board on the jig that holds it parallel to the display.")
+        on_jig = f"Put the board ({_named(spec)}) on the jig that holds it parallel to the display."
+        yield _view(rig, "geometry/panel", jig, on_jig)
         for index, board in enumerate(board_poses(rig, spec)):
             yield _view(rig, f"geometry/view_{index}", board, _describe(rig, board))
+
+    def guided(self, rig: RigDescription) -> Iterator[GuidedStep]:
+        """Yield the view on the jig, then all views held by hand as one."""
+        yield from set_ups(rig, lambda rig: islice(self.steps(rig), 1))
+        yield _by_hand(rig)
+
+
+def _by_hand(rig: RigDescription) -> GuidedStep:
+    spec = board_spec(rig)
+    poses = tuple(board_poses(rig, spec))
+    step_ids = tuple(f"geometry/view_{index}" for index in range(len(poses)))
+
+    def begin(camera: Camera, display: Display, stage: Stage, writer: SessionWriter) -> BoardVisit:
+        bench = Bench(camera, display, stage)
+        return BoardVisit(step_ids, poses, lambda step_id, board: _view(rig, step_id, board, ""), bench, writer)
+
+    return GuidedStep(
+        id="geometry/views",
+        term="geometry",
+        title="Board held by hand",
+        why=_WHY,
+        instruction=f"Hold the board ({_named(spec)}) so that it roughly fills the outline, leaning as the outline "
+        f"does, and keep still until the view is taken. Then the next outline is shown, {len(poses)} in all.",
+        drawing=side_view(rig, poses[0]),
+        step_ids=step_ids,
+        needs=(),
+        frames=_FRAMES * len(poses),
+        by_itself=True,
+        begin=begin,
+    )
+
+
+def _named(spec: BoardSpec) -> str:
+    return f"ChArUco, {spec.columns} x {spec.rows} squares of {spec.square_mm:g} mm, {spec.dictionary}"
 
 
 def board_spec(rig: RigDescription) -> BoardSpec:
@@ -75,6 +120,8 @@ def _view(rig: RigDescription, step_id: str, board: Board, instruction: str) -> 
         region=whole_sensor(rig),
         exposure=Metered(_LEVEL),
         plan=Stack(_FRAMES),
+        title="Board on the jig",
+        why=_WHY,
     )
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from jaxtyping import Float, UInt16
 
@@ -18,6 +19,8 @@ _CLIPPED = 0.88  # of the range: tolerances of full well and gain leave the true
 _BURIED = 0.02  # of the range: below it the true level is too uncertain to scale by
 _CLOSE = 0.05  # accepted relative distance from the target
 _ENOUGH = 0.25  # least fraction of the target at the longest exposure
+
+_NEIGHBOURS = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], np.uint8)
 
 Level = Callable[[UInt16[np.ndarray, "rows columns"], RigDescription], float]
 
@@ -65,13 +68,7 @@ def meter(camera: Camera, region: Region, plan: Metered, rig: RigDescription, st
         frame = trial_frame(camera, region, float(exposure))
         exposure = frame.settings.exposure_s
         level = level_of(frame.data, rig)
-        if level > _CLIPPED:
-            wanted = exposure / 8
-        elif level < _BURIED:
-            wanted = exposure * 8
-        else:
-            wanted = exposure * plan.target / level
-        bounded = min(max(wanted, shortest), longest)
+        bounded = min(max(next_exposure_s(exposure, level, plan.target), shortest), longest)
         if abs(bounded / exposure - 1) < _CLOSE and level <= _CLIPPED:
             _refuse_dark(level, plan, exposure)
             return Exposed(exposure, frame)
@@ -91,6 +88,13 @@ def meter(camera: Camera, region: Region, plan: Metered, rig: RigDescription, st
     )
 
 
+def next_exposure_s(exposure_s: float, level: float, target: float) -> float:
+    """Return the exposure that brings the light, which is at ``level`` now, nearer to ``target``."""
+    if level > _CLIPPED:
+        return exposure_s / 8
+    return exposure_s * (8 if level < _BURIED else target / level)
+
+
 def even_level(data: UInt16[np.ndarray, "rows columns"], rig: RigDescription) -> float:
     """Return the level of the brightest channel of an even field (99.9th percentile), 0 at black, 1 at saturation."""
     return _fraction(float(np.percentile(data, 99.9)), rig)
@@ -108,12 +112,7 @@ def spot_light(data: UInt16[np.ndarray, "rows columns"]) -> Float[np.ndarray, "r
     neighbour.
     """
     above = np.maximum(data - float(np.median(data)), 0.0)
-    brightest_near = np.zeros_like(above)
-    for dy in (-1, 0, 1):
-        for dx in (-1, 0, 1):
-            if dx or dy:
-                np.maximum(brightest_near, np.roll(above, (dy, dx), axis=(0, 1)), out=brightest_near)
-    return np.minimum(above, 10.0 * brightest_near)
+    return np.minimum(above, 10.0 * cv2.dilate(above, _NEIGHBOURS))
 
 
 def _refuse_dark(level: float, plan: Metered, exposure_s: float) -> None:
@@ -129,13 +128,6 @@ def saturation_DN(rig: RigDescription) -> float:
     """Return the nominal level in DN at which a sample clips: the converter's end or the full well, if lower."""
     camera = rig.camera
     return min(float(rig.saturation_DN), camera.black_DN.value + camera.K_DN_per_e.value * camera.full_well_e.value)
-
-
-def lowest_saturation_DN(rig: RigDescription) -> float:
-    """Return the lowest level in DN at which a sample may clip within the tolerances of the rig."""
-    camera = rig.camera
-    K, well = (nominal.value - nominal.tolerance for nominal in (camera.K_DN_per_e, camera.full_well_e))
-    return min(float(rig.saturation_DN), camera.black_DN.value - camera.black_DN.tolerance + K * well)
 
 
 def _fraction(level_DN: float, rig: RigDescription) -> float:

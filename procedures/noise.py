@@ -7,9 +7,10 @@ from typing import ClassVar, final
 
 import numpy as np
 
-from procedures.base import Procedure, Step, whole_sensor
+from procedures.base import Procedure
 from procedures.checks import is_dark, is_even, sees_anything
 from procedures.plans import Exposure, Fixed, Metered, Plan, Singles, Stack, TimesThatOf
+from procedures.step import Step, whole_sensor
 from udccal.arrangements import Dark, FlatLight
 from udccal.rig import RigDescription
 from udccal.sessions.schema import TermName
@@ -46,8 +47,30 @@ class NoiseProcedure(Procedure):
 
 def _lit(rig: RigDescription, step_id: str, exposure: Exposure, plan: Plan) -> Step:
     check = is_even if isinstance(exposure, Metered) else sees_anything  # the long ones clip on purpose
-    return Step(step_id, "noise", FlatLight(), _FLAT, check, whole_sensor(rig), exposure, plan)
+    return Step(
+        step_id,
+        "noise",
+        FlatLight(),
+        _FLAT,
+        check,
+        whole_sensor(rig),
+        exposure,
+        plan,
+        title="Even light for the noise",
+        why="How the noise grows with the light gives the camera's gain, and from where on it clips.",
+    )
 
 
 def _dark(rig: RigDescription, step_id: str, exposure: Exposure, plan: Plan) -> Step:
-    return Step(step_id, "noise", Dark(), _DARK, is_dark, whole_sensor(rig), exposure, plan)
+    return Step(
+        step_id,
+        "noise",
+        Dark(),
+        _DARK,
+        is_dark,
+        whole_sensor(rig),
+        exposure,
+        plan,
+        title="Darkness for the noise",
+        why="Dark frames give the black level, the read noise and the dark current.",
+    )

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import ClassVar, final
 
-from procedures.base import Procedure, Step, whole_sensor
+from procedures.base import Procedure
 from procedures.checks import is_dark, is_even
 from procedures.plans import Metered, Stack, TimesThatOf
+from procedures.step import Step, whole_sensor
 from udccal.arrangements import Dark, FlatLight
 from udccal.rig import RigDescription
 from udccal.sessions.schema import TermName
@@ -34,6 +35,8 @@ class WireProcedure(Procedure):
             region=whole_sensor(rig),
             exposure=Metered(_LEVEL),
             plan=Stack(rig.captures.flats),
+            title="Even light for the wire",
+            why="The panel's rows modulate an even light; many frames show that above the noise.",
         )
         yield Step(
             id="wire/dark",
@@ -44,4 +47,6 @@ class WireProcedure(Procedure):
             region=whole_sensor(rig),
             exposure=TimesThatOf("wire/flat"),
             plan=Stack(_DARKS),
+            title="Darkness for the wire",
+            why="What the camera gives without light is subtracted from the even light.",
         )

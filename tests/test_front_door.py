@@ -33,6 +33,11 @@ def test_every_name_is_there_and_documented(name: str) -> None:
     assert getattr(udccal, name).__doc__
 
 
+def test_a_whole_programs_verbs_are_there() -> None:
+    verbs = {"load_rig", "simulate", "capture", "fit", "load_profile", "save_profile", "diff", "restore"}
+    assert verbs <= set(udccal.__all__)
+
+
 def test_an_unknown_name_is_answered_with_those_there_are() -> None:
     with pytest.raises(AttributeError, match=r"no attribute 'calibrat'; it has .*calibrate"):
         udccal.calibrat  # noqa: B018

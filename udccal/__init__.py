@@ -31,7 +31,9 @@ if TYPE_CHECKING:
     from udccal.fitting.wire.fit import fit_wire as fit_wire
     from udccal.profiles.profile import Profile as Profile
     from udccal.profiles.store import load_profile as load_profile
+    from udccal.profiles.store import save_profile as save_profile
     from udccal.restoration.deblur import deblur as deblur
+    from udccal.restoration.one_frame import restore as restore
     from udccal.restoration.runtime import Restorer as Restorer
     from udccal.result import FitResult as FitResult
     from udccal.result import FitStatus as FitStatus
@@ -68,6 +70,8 @@ _HOMES = {
     "fit_wire": "udccal.fitting.wire.fit",
     "load_profile": "udccal.profiles.store",
     "load_rig": "udccal.rig",
+    "restore": "udccal.restoration.one_frame",
+    "save_profile": "udccal.profiles.store",
     "simulate": "udccal.benches.bench",
     "validate": "udccal.validation.validate",
 }

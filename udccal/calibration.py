@@ -52,13 +52,18 @@ class Foundation:
 
 @dataclass(frozen=True)
 class Calibration(TermResults):
-    """The five results of one session and their durations."""
+    """The five results of one session and their durations.
+
+    Attributes:
+        parent: SHA-256 that names the profile whose terms were kept where some only were fitted; None where all were.
+    """
 
     session: Session
     foundation: Foundation
     psf: FitResult[PsfField]
     backscatter: FitResult[Backscatter]
     times: tuple[FitTime, ...]
+    parent: str | None = None
 
     @property
     def rig(self) -> RigDescription:
@@ -114,7 +119,8 @@ class Calibration(TermResults):
             ProfileError: when ``path`` holds something that is not a profile.
         """
         provenance = provenance_now(self.session.path / MANIFEST_NAME, self.session.camera)
-        write_profile(Path(path), build_profile(self.rig, provenance, *self.results, self.foundation.wire_map))
+        profile = build_profile(self.rig, provenance, *self.results, self.foundation.wire_map, self.parent)
+        write_profile(Path(path), profile)
         return Path(path)
 
 

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from udccal.fitting.psf.data import PsfRules
 from udccal.fitting.wire.rules import WireRules
+from udccal.result import Effort
 
 
 @dataclass(frozen=True)
@@ -23,6 +24,12 @@ class FitEffort:
     psf: PsfRules = field(default_factory=PsfRules)
     backscatter_positions: int = 96
     workers: int = 1
+
+    @property
+    def label(self) -> Effort:
+        """Name of the effort in a profile: full, quick (a demonstration's), or one of your own."""
+        alike = replace(self, workers=1)
+        return "full" if alike == FitEffort() else "quick" if alike == replace(QUICK, workers=1) else "own"
 
 
 # For a demonstration.

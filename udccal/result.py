@@ -6,15 +6,16 @@ import abc
 import enum
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Generic, Protocol, TypeVar, runtime_checkable
+from typing import Generic, Literal, Protocol, TypeVar, final, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Float32
 
 from udccal.errors import FitError
 
 Term = TypeVar("Term")
 _Term_co = TypeVar("_Term_co", covariant=True)
+Effort = Literal["full", "quick", "own"]
 
 
 class FitStatus(enum.Enum):
@@ -26,6 +27,7 @@ class FitStatus(enum.Enum):
         "Nobody looked: the session has no captures of this term. It keeps the rig description's nominal values, or is "
         "left out. Capture it to measure it."
     )
+    IMPORTED = "Taken from another program's file, which gives no error bars. Capture it to measure it."
     NOT_CONVERGED = "The solver stopped before it converged. Check the residual map, or allow more iterations."
     TOO_FEW_DATA = "There are fewer usable samples than parameters. Capture more positions, exposures or views."
     SATURATED = "Too much of the data is clipped. Capture again with a shorter exposure or less light."
@@ -34,13 +36,30 @@ class FitStatus(enum.Enum):
 
 
 @dataclass(frozen=True)
+class EstimatePrior:
+    """What was known of a quantity before the data: a nominal value, and its tolerance as one standard deviation."""
+
+    value: float
+    sigma: float
+
+
+@dataclass(frozen=True)
 class Estimate:
-    """One named quantity with its unit and its standard deviation."""
+    """One named quantity with its unit and its standard deviation.
+
+    ``quantities.toml`` says what it is. ``prior`` is what the fit started from; None where nothing was assumed.
+    """
 
     name: str
     value: float
     sigma: float
     unit: str
+    prior: EstimatePrior | None = None
+
+    @property
+    def by_prior(self) -> bool:
+        """Whether the prior decides: at least half of what is known of the quantity is the prior."""
+        return self.prior is not None and self.sigma**2 >= self.prior.sigma**2 / 2
 
 
 @dataclass(frozen=True)
@@ -85,12 +104,59 @@ class ResidualSample:
     z: Float[np.ndarray, " n"]
 
 
+@dataclass(frozen=True)
+class Captures:
+    """The captures of a term that a fit used.
+
+    Attributes:
+        sha256: of the checksums of their files, in any order: fits of the same files have the same.
+        files: number of the files. frames: number of the camera's frames in them.
+        gain_dB: lowest and highest.
+        completed_at: of the first and of the last step, in ISO 8601.
+        temperature_C: lowest and highest of the sensor; None where the session has none.
+    """
+
+    sha256: str
+    files: int
+    frames: int
+    gain_dB: tuple[float, float]
+    completed_at: tuple[str, str]
+    temperature_C: tuple[float, float] | None = None
+
+
+@final
+@dataclass(frozen=True)
+class Propagated:
+    """A function of a term, with the uncertainty that it has by the term's posterior, to first order.
+
+    Attributes:
+        value: of the function at the fitted term.
+        factor: derivatives of the flattened value along the posterior's directions; ``factor @ factor.T`` is ``cov``.
+    """
+
+    value: Float[np.ndarray, "*shape"]
+    factor: Float[np.ndarray, "n k"]
+
+    @property
+    def sigma(self) -> Float[np.ndarray, "*shape"]:
+        """One standard deviation of every element of ``value``, in its unit."""
+        return np.asarray(np.sqrt((self.factor**2).sum(axis=1)).reshape(np.shape(self.value)))
+
+    @property
+    def cov(self) -> Float[np.ndarray, "n n"]:
+        """Covariance of the flattened ``value``, in products of its units."""
+        return np.asarray(self.factor @ self.factor.T)
+
+
 @runtime_checkable
 class TermPosterior(Protocol[_Term_co]):
     """Posterior distribution of a whole term, field coefficients included."""
 
     def sigma_of(self, f: Callable[[_Term_co], Float[np.ndarray, "*shape"]]) -> Float[np.ndarray, "*shape"]:
         """Return one standard deviation of every element of ``f(term)``."""
+
+    def propagate(self, f: Callable[[_Term_co], Float[np.ndarray, "*shape"]]) -> Propagated:
+        """Return ``f(term)`` with its covariance."""
 
     def draws(self, rng: np.random.Generator, count: int) -> tuple[_Term_co, ...]:
         """Draw ``count`` terms from the posterior."""
@@ -103,8 +169,10 @@ class FitResult(Generic[Term]):
     Attributes:
         name: noise, geometry, wire, psf or backscatter.
         term: the fitted term; the rig description's nominal term where the fit failed.
-        status: how the fit ended; NOT_CAPTURED where the session has no captures of the term.
+        status: how the fit ended; NOT_CAPTURED where the session has no captures of the term, IMPORTED where the term
+            is of another program.
         estimates: named numbers of the term, each with its standard deviation.
+            An element of the term's arrays has the array's name and its indices: ``fields.3.0.1.2``.
         cov: covariance of the leading estimates, in their units; of all estimates unless a note says otherwise.
         chi2_dof: reduced chi-squared; about 1 where model and noise describe the data.
         samples: number of samples used.
@@ -114,6 +182,10 @@ class FitResult(Generic[Term]):
         outliers: samples left out, by rule.
         residuals: an even sample of the residuals.
         posterior: distribution of the whole term; None where the fit failed or the result was read from a profile.
+        map_sigma: sigma of the term's map, on a coarse grid over the sensor: of the wire, relative; of the panel's
+            white in e-/s, by colour. None where none was stated.
+        captures: what the fit used; None where that is not known.
+        effort: of the fit: full, quick or own (``FitEffort.label``); None where that is not known.
     """
 
     name: str
@@ -129,16 +201,23 @@ class FitResult(Generic[Term]):
     outliers: tuple[Outliers, ...] = ()
     residuals: ResidualSample | None = None
     posterior: TermPosterior[Term] | None = None
+    map_sigma: Float32[np.ndarray, "channels grid_rows grid_columns"] | None = None
+    captures: Captures | None = None
+    effort: Effort | None = None
 
     @classmethod
     def failed(cls, name: str, term: Term, status: FitStatus, *notes: str) -> FitResult[Term]:
         """A result without estimates: the fit could not begin, or the session has no data for it."""
         return cls(name, term, status, (), np.zeros((0, 0)), 0.0, 0, notes=notes)
 
+    def diagnostic(self, name: str) -> float | None:
+        """The diagnostic of this name; None where the fit has none."""
+        return next((item.value for item in self.diagnostics if item.name == name), None)
+
     @property
     def ok(self) -> bool:
         """Whether nothing went wrong: the fit ended well, or there was nothing to fit."""
-        return self.status is FitStatus.CONVERGED or self.unfitted
+        return self.status in (FitStatus.CONVERGED, FitStatus.IMPORTED) or self.unfitted
 
     @property
     def unfitted(self) -> bool:
@@ -154,6 +233,11 @@ class FitResult(Generic[Term]):
         numbers = [number for e in self.estimates for number in (e.value, e.sigma)]
         stated = bool(self.estimates) and self.cov.size > 0 and np.isfinite(self.chi2_dof)
         return self.ok or bool(stated and np.isfinite(numbers).all() and np.isfinite(self.cov).all())
+
+    @property
+    def numbers(self) -> tuple[Estimate, ...]:
+        """The estimates that have a meaning of their own, without elements of the term's arrays."""
+        return tuple(one for one in self.estimates if "." not in one.name)
 
     @property
     def warning(self) -> str:
@@ -188,12 +272,33 @@ class FitResult(Generic[Term]):
         Raises:
             FitError: when the fit failed, or when the result was read from a profile.
         """
+        return self._whole_posterior().sigma_of(f)
+
+    def propagate(self, f: Callable[[Term], Float[np.ndarray, "*shape"]]) -> Propagated:
+        """Return any function of the term with its sigma and its covariance.
+
+        The covariance is that of the delta method: the function's derivatives along the posterior, which are held
+        together. Of a large array, such as a whole map, ``sigma_of`` needs far less memory.
+
+        Args:
+            f: pure function from a term to a number or an array. It is called twice for every direction of the
+                posterior.
+
+        Returns:
+            the value, its sigma and its covariance, in the units of ``f(term)``.
+
+        Raises:
+            FitError: when the fit failed, or when the result was read from a profile.
+        """
+        return self._whole_posterior().propagate(f)
+
+    def _whole_posterior(self) -> TermPosterior[Term]:
         if self.posterior is None:
             raise FitError(
                 f"Expected a {self.name} fit with a posterior, found none: the fit failed, or the result was read from "
                 "a profile, which keeps only the covariance of the estimates. Fit the session again."
             )
-        return self.posterior.sigma_of(f)
+        return self.posterior
 
     def or_raise(self) -> FitResult[Term]:
         """Return itself when the fit ended well.

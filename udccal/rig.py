@@ -170,6 +170,13 @@ class RigDescription(_Strict):
         """Largest number that the converter can deliver."""
         return int(2**self.camera.bits - 1)
 
+    @property
+    def lowest_saturation_DN(self) -> float:
+        """Lowest level at which a sample may clip within the tolerances: the converter's end, or the full well."""
+        camera = self.camera
+        K, well = (nominal.value - nominal.tolerance for nominal in (camera.K_DN_per_e, camera.full_well_e))
+        return min(float(self.saturation_DN), camera.black_DN.value - camera.black_DN.tolerance + K * well)
+
 
 def load_rig(name_or_path: str | Path) -> RigDescription:
     """Read and check a rig description.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TypeVar, final
 
@@ -32,6 +32,7 @@ from udccal.models.noise import Noise
 from udccal.models.psf import PsfField
 from udccal.models.wire import Wire
 from udccal.result import FitResult, FitStatus
+from udccal.sessions.evidence import captures_of
 from udccal.sessions.schema import TermName
 from udccal.sessions.store import Session
 
@@ -127,6 +128,9 @@ class TermFits:
         self._progress(term)
         start = time.perf_counter()
         captured = self._session.steps(term)
-        result = fit() if captured else FitResult.failed(term, absent(), FitStatus.NOT_CAPTURED)
+        if captured:
+            result = replace(fit(), captures=captures_of(captured), effort=self._effort.label)
+        else:
+            result = FitResult.failed(term, absent(), FitStatus.NOT_CAPTURED)
         self.times.append(FitTime(term, time.perf_counter() - start))
         return result

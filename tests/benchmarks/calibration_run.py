@@ -11,7 +11,7 @@ from typing import get_args
 
 from tests.benchmarks.draws import Draw
 from udccal.benches.bench import simulated_bench
-from udccal.cli.jobs.capture import capture_watched
+from udccal.cli.jobs.capture import Wanted, capture_watched
 from udccal.cli.jobs.fit import fit_to_profile
 from udccal.cli.output import Output
 from udccal.sessions.schema import TermName
@@ -43,7 +43,7 @@ def main(draw: Draw, session: Path, profile: Path) -> None:
     """What `udccal calibrate` does, on a specimen that it cannot name: capture all terms, fit, write the profile."""
     output = Output()
     with simulated_bench(SimulatedWorld(draw.truth, seed=draw.seed)) as bench:
-        capture_watched(output, bench, session, get_args(TermName))
+        capture_watched(output, bench, Wanted(session, get_args(TermName)))
     fit_to_profile(output, session, profile)
 
 

@@ -1,4 +1,4 @@
-"""`make tables`: put the tables that `make accuracy` measured into README.md, between their markers."""
+"""`make tables`: put the tables that `make accuracy` measured into docs/accuracy.md, between their markers."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 from tests.benchmarks.accuracy import finished, summaries, table
 from tests.benchmarks.commit import stamped
 
-_README = Path(__file__).resolve().parents[2] / "README.md"
+_PAGE = Path(__file__).resolve().parents[2] / "docs" / "accuracy.md"
 
 
 def between(text: str, marker: str, content: str) -> str:
@@ -42,10 +42,10 @@ def write_tables(folder: Path, page: Path) -> None:
 
 
 def main() -> None:
-    """Read the results and rewrite README.md."""
+    """Read the results and rewrite the page."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--accuracy", type=Path, default=Path("accuracy"), help="folder that `make accuracy` wrote")
-    write_tables(parser.parse_args().accuracy, _README)
+    write_tables(parser.parse_args().accuracy, _PAGE)
 
 
 if __name__ == "__main__":

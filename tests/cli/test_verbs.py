@@ -15,6 +15,7 @@ from tests.reports.widths import layouts
 from tests.toy_rigs import write_toy_rig
 from udccal.io.exr import read_rgb_exr
 from udccal.io.png import read_png16, read_rgb8, write_png16
+from udccal.profiles.provenance import profile_sha256
 
 PORTRAIT = Path(__file__).resolve().parents[2] / "udccal" / "data" / "portrait.jpg"
 pytestmark = pytest.mark.slow
@@ -26,7 +27,7 @@ def udccal(*words: str | Path) -> subprocess.CompletedProcess[str]:
 
 
 def headline(report: str) -> str:
-    return report.partition('<p class="verdict">')[2].partition("</p>")[0]
+    return report.partition('<h2 class="verdict">')[2].partition("</h2>")[0]
 
 
 @pytest.fixture(scope="module")
@@ -105,6 +106,13 @@ def test_profile_show_lists_what_was_measured(folder: Path) -> None:
     assert "K_DN_per_e" in {estimate["name"] for estimate in shown["estimates"]}
     assert [term["status"] for term in shown["terms"]] == ["CONVERGED", *(4 * ["NOT_CAPTURED"])]
     assert done.stderr.count(": Nobody looked: the session has no captures of this term.") == 4
+    noise = shown["terms"][0]
+    assert (len(noise["captures"]["sha256"]), noise["effort"]) == (64, "full")
+    assert noise["captures"]["frames"] >= noise["captures"]["files"] > 0
+    assert noise["captures"]["temperature_C"] is None
+    assert "The noise fit used" in done.stderr
+    assert shown["estimates"][0]["what"] == "Digital numbers per electron (EMVA 1288: K)."
+    assert (shown["rig_state"]["terms"], len(shown["rig_state"]["estimates"])) == ([], 11)
 
 
 def test_a_profile_from_before_that_status_is_read_as_what_it_says(folder: Path) -> None:
@@ -128,6 +136,7 @@ def test_a_profile_from_before_that_status_is_read_as_what_it_says(folder: Path)
 
 def test_one_term_is_fitted_again_and_the_others_are_kept(folder: Path) -> None:
     before = json.loads((folder / "profile" / "profile.json").read_text())
+    parent = profile_sha256(folder / "profile")
     done = udccal("fit", folder / "session", "--profile", folder / "profile", "--term", "wire", "--term", "psf")
     assert done.returncode == 0, done.stderr
     terms = {term["term"]: term for term in json.loads(done.stdout)["terms"]}
@@ -135,6 +144,7 @@ def test_one_term_is_fitted_again_and_the_others_are_kept(folder: Path) -> None:
     assert "Fitted with an earlier wire term." in terms["backscatter"]["notes"]
     after = json.loads((folder / "profile" / "profile.json").read_text())
     assert after["terms"]["noise"] == before["terms"]["noise"]
+    assert (before["lineage"]["parent"], after["lineage"]["parent"]) == (None, parent)
     strange = json.loads((folder / "session" / "session.json").read_text())
     other = Path(shutil.copytree(folder / "session", folder / "other"))
     del strange["manifest_sha256"]

@@ -20,7 +20,8 @@ from udccal.comparison.limits import DiffLimits
 from udccal.errors import ProfileError
 from udccal.fitting.wire.fit import sensor_map
 from udccal.profiles.profile import Profile, build_profile
-from udccal.result import FitStatus
+from udccal.reports.diff_tables import movement_sentence
+from udccal.result import Captures, FitStatus
 
 LIMITS = DiffLimits()
 
@@ -143,6 +144,25 @@ def test_what_changed_is_named_and_mirrored(toy: Profile) -> None:
     assert rays.value == pytest.approx(np.deg2rad(0.5) * focal, rel=0.6)
     assert rays.value > np.deg2rad(0.5) * focal  # it is more beside the axis
     assert there.terms[4].effects[0].value == pytest.approx(10.0, rel=0.6)
+
+
+@pytest.mark.medium
+def test_fits_of_the_same_captures_are_not_independent(toy: Profile) -> None:
+    """What differs is the fits' doing: no probability is told, and no movement; what matters is still said."""
+    other = changed(toy)
+    for name in ("noise", "geometry"):
+        used = Captures(name[0] * 64, 2, 20, (0.0, 0.0), ("2026-01-02", "2026-01-02"))
+        toy, other = (with_result(one, name, captures=used, effort="quick") for one in (toy, other))
+    found = udccal.diff(toy, other)
+    noise, geometry, wire = found.terms[:3]
+    assert [one.same_captures for one in found.terms] == [True, True, False, False, False]
+    assert (noise.verdict, geometry.verdict, wire.verdict) == ("changed", "changed", "changed")
+    assert "same captures" in noise.notes[0]
+    assert noise.notes[1] == "A: The effort of its fit was quick: a full fit may be better."
+    assert (found.movement.terms, found.movement.angle.value) == ((), None)
+    assert movement_sentence(found) == "Both profiles were fitted to the same captures: they tell no movement."
+    harmless = with_estimates(toy, "noise", {"black_DN": 5.0})
+    assert udccal.diff(toy, harmless).terms[0].verdict == "same"
 
 
 @pytest.mark.medium

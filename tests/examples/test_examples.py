@@ -113,6 +113,39 @@ def test_every_term_has_an_array_example_of_under_40_lines() -> None:
         assert not any("udccal.cli" in line for line in lines), name
 
 
+def test_own_camera_is_captured_with_and_fitted() -> None:
+    said = run("examples/own_camera.py").splitlines()
+    assert [line.split()[1] for line in said] == ["K_DN_per_e", "black_DN"]
+    for line in said:
+        status, _, value, _, sigma, _, truth = line.split()
+        assert status == "CONVERGED:"
+        assert abs(float(value) - float(truth)) < 4 * float(sigma)
+
+
+def test_own_procedure_captures_a_session(tmp_path: Path) -> None:
+    said = run("examples/own_procedure.py", tmp_path / "session").splitlines()
+    assert [line.split(" of ")[0] for line in said] == ["wire/flat: 8 frames", "wire/dark: 4 frames"]
+
+
+def test_own_term_is_fitted_and_its_sigma_propagated() -> None:
+    words = run("examples/own_term.py").split()
+    assert words[0] == "CONVERGED:"
+    value, sigma = float(words[4]), float(words[6])
+    truth = (1 + (62.0**2 + 50.0**2) / 110.0**2) ** -2
+    assert 0 < sigma < 1e-3
+    assert abs(value - truth) < 4 * sigma
+
+
+def test_every_example_of_a_users_own_part_has_under_60_lines() -> None:
+    for path in sorted((ROOT / "examples").glob("own_*.py")):
+        assert len(path.read_text().splitlines()) < 60, path.name
+
+
+def test_no_example_needs_the_command_line() -> None:
+    for path in sorted((ROOT / "examples").glob("*.py")):
+        assert "udccal.cli" not in path.read_text(), path.name
+
+
 @pytest.mark.slow
 def test_wire_from_flat() -> None:
     said = run("examples/wire_from_flat.py")
@@ -128,3 +161,13 @@ def test_backscatter_from_arrays() -> None:
     value, sigma = float(gamma[1]), float(gamma[3])
     assert abs(value - load_profile("lg55-reduced").backscatter.estimate("gamma").value) < 1e-3
     assert 0 < sigma < 1e-3
+
+
+@pytest.mark.slow
+def test_the_tour_makes_the_pictures_of_its_page(tmp_path: Path) -> None:
+    run("examples/tour.py", tmp_path, "--tiers", "preview")
+    made = {file.name for file in tmp_path.iterdir()}
+    page = (ROOT / "docs" / "tour.md").read_text(encoding="utf-8")
+    assert made == {file.name for file in (ROOT / "docs" / "images").glob("tour_*")}
+    assert all(f"images/{name}" in page for name in made)
+    assert all(file.stat().st_size < 100_000 for file in tmp_path.iterdir())

@@ -3,7 +3,12 @@
 from __future__ import annotations
 
 from tests.fuzz.device_targets import DEVICE_TARGETS
+from tests.fuzz.diff_targets import DIFF_TARGETS
+from tests.fuzz.exchange_targets import EXCHANGE_TARGETS
 from tests.fuzz.file_targets import FILE_TARGETS
 from tests.fuzz.profile_targets import PROFILE_TARGETS
 
-TARGETS = {target.name: target for target in (*DEVICE_TARGETS, *FILE_TARGETS, *PROFILE_TARGETS)}
+TARGETS = {
+    target.name: target
+    for target in (*DEVICE_TARGETS, *FILE_TARGETS, *EXCHANGE_TARGETS, *PROFILE_TARGETS, *DIFF_TARGETS)
+}

@@ -4,17 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 from types import SimpleNamespace
-from typing import get_args
 
 import pytest
 
 from procedures.plans import Bracket, Fixed, Metered, Singles, Stack, TimesThatOf
 from tests.procedures.benches import new_writer, simulated_bench, small_rig
-from udccal.arrangements import Occasion
-from udccal.cli.jobs.person import PersonStage
-from udccal.cli.output import Output
 from udccal.errors import UdccalError
-from udccal.planning import steps
+from udccal.guide.capture import guided_steps
+from udccal.planning import exposures
 from udccal.planning.state import nominal_state
 from udccal.planning.steps import cost_of, planned_steps
 from udccal.plugins import find_procedure
@@ -35,16 +32,10 @@ def test_frames_are_those_of_a_session(term: TermName, tmp_path: Path) -> None:
     assert cost.frames == pytest.approx(taken, rel=0.25)
 
 
-@pytest.mark.parametrize("term", get_args(TermName))
-def test_set_ups_are_what_a_person_is_asked_for(term: TermName, monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[str] = []
-    output = Output()
-    monkeypatch.setattr(output, "ask", lambda question: asked.append(question) or "")
-    state = nominal_state(small_rig())
-    person = PersonStage(output)
-    for number, step in enumerate(planned_steps(term, state)):
-        person.arrange(step.arrangement, Occasion(step.id, number, step.instruction))
-    assert cost_of(term, state).set_ups == len(asked)
+@pytest.mark.parametrize("term", ["noise", "wire", "backscatter"])
+def test_set_ups_are_those_that_a_person_is_led_through(term: TermName) -> None:
+    rig = small_rig()
+    assert cost_of(term, nominal_state(rig)).set_ups == len(guided_steps(rig, [term]))
 
 
 def test_no_frame_is_quicker_than_its_exposure_or_the_camera() -> None:
@@ -86,6 +77,6 @@ def test_a_procedure_that_does_not_tell_is_named(missing: str, monkeypatch: pyte
     whole = next(iter(find_procedure("wire")().steps(small_rig())))
     parts = {name: getattr(whole, name) for name in ("id", "arrangement", "instruction", "region", "exposure", "plan")}
     step = SimpleNamespace(**(parts | {missing: object()}))
-    monkeypatch.setattr(steps, "find_procedure", lambda term: lambda: SimpleNamespace(steps=lambda rig: [step]))
+    monkeypatch.setattr(exposures, "find_procedure", lambda term: lambda: SimpleNamespace(steps=lambda rig: [step]))
     with pytest.raises(UdccalError, match="Expected the step 'wire/flat' to tell"):
         list(planned_steps("wire", nominal_state(small_rig())))

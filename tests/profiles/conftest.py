@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -11,7 +13,17 @@ from udccal.fitting.wire.fit import sensor_map
 from udccal.models.noise import Noise
 from udccal.profiles.profile import Profile, build_profile
 from udccal.profiles.provenance import provenance_now
-from udccal.result import Candidate, Diagnostic, Estimate, FitResult, FitStatus
+from udccal.result import (
+    Candidate,
+    Captures,
+    Diagnostic,
+    Estimate,
+    EstimatePrior,
+    FitResult,
+    FitStatus,
+    Outliers,
+    ResidualSample,
+)
 from udccal.rig import RigDescription, load_rig
 from udccal.sessions.schema import StoredCamera
 
@@ -32,6 +44,10 @@ def fitted(
         candidates=(Candidate("order 1", 3, -10.1, True), Candidate("order 2", 6, -9.7, False)),
         diagnostics=(Diagnostic("residual RMS", 0.1 + 0.2, "e-"),),
         notes=("One frame was left out.",),
+        outliers=(Outliers("frames that differ", 3, ("flat 2", "flat 7")),),
+        residuals=ResidualSample(np.array([[0.5, 2.0], [95.0, 63.0]]), np.array([-1.5, 0.25])),
+        captures=Captures("cd" * 32, 4, 60, (0.0, 6.0), ("2026-01-02T03:04:05+00:00", "2026-01-02T03:14:05+00:00")),
+        effort="quick",
     )
 
 
@@ -54,14 +70,17 @@ def toy_profile(toy_rig: RigDescription) -> Profile:
     # Big enough to go into an EXR file.
     residual = np.pad(rng.normal(0, 1e-6, (1, 3, 15, 15)), 0)
     residual[0, :, 7, 7] = 1.0
-    estimates = (Estimate("K_DN_per_e", 0.355, 1e-3, "DN/e-"), Estimate("black_DN", 64.1, 0.1, "DN"))
+    estimates = (
+        Estimate("K_DN_per_e", 0.355, 1e-3, "DN/e-"),
+        Estimate("black_DN", 64.1, 0.1, "DN", EstimatePrior(64.0, 0.12)),
+    )
     wire = absent_wire(toy_rig, geometry)
     return build_profile(
         toy_rig,
         provenance_now(None, StoredCamera(vendor="Basler", model="acA2040", serial="1", backend="simulated")),
         noise=fitted("noise", noise, estimates),
         geometry=fitted("geometry", geometry),
-        wire=fitted("wire", wire),
+        wire=replace(fitted("wire", wire), map_sigma=np.full((1, 3, 4), 1e-4, np.float32)),
         psf=fitted("psf", type(psf)(**{**vars(psf), "residual": residual})),
         backscatter=fitted("backscatter", absent_backscatter(toy_rig, geometry), status=FitStatus.ABSENT),
         wire_map=sensor_map(wire, toy_rig.camera.rows, toy_rig.camera.columns),

@@ -68,6 +68,22 @@ def test_other_files_are_refused(tmp_path: Path, target: Path) -> None:
         unpack_archive(tmp_path / "p.zip", target)
 
 
+def test_damaged_content_and_names_are_refused(tmp_path: Path, target: Path) -> None:
+    path = archive_with(tmp_path / "p.zip", "profile.json", content=bytes(range(256)) * 8)
+    whole = path.read_bytes()
+    garbled = bytearray(whole)
+    garbled[60:70] = b"\xff" * 10  # of the packed content
+    unnamed = bytearray(whole)
+    unnamed[6:8] = (0x0800).to_bytes(2, "little")  # the name counts as UTF-8, which it then is not
+    unnamed[30] = 0xBB
+    for content in (garbled, unnamed):
+        path.write_bytes(content)
+        with pytest.raises(ProfileError, match="to be a whole zip file"):
+            unpack_archive(path, target)
+        for item in target.iterdir():
+            item.unlink()
+
+
 BOMB = 64 * 1024 * 1024
 
 

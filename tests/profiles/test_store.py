@@ -12,6 +12,8 @@ import numpy as np
 import pytest
 
 from udccal.errors import FitError, ProfileError
+from udccal.io.exr import write_exr
+from udccal.io.hashing import sha256_file
 from udccal.profiles.profile import Profile, build_profile
 from udccal.profiles.provenance import PROFILE_NAME, profile_sha256
 from udccal.profiles.store import RIG_PROFILE, find_profile, read_profile, read_stored, write_profile
@@ -19,6 +21,7 @@ from udccal.result import FitStatus
 from udccal.rig import load_rig
 from udccal.rig_folders import shipped_rig_folder
 
+ARRAYS = ("term", "cov", "residuals", "map_sigma")
 TERMS = ("noise", "geometry", "wire", "psf", "backscatter")
 
 
@@ -29,9 +32,16 @@ def assert_same(a: Profile, b: Profile) -> None:
         for x, y in zip(jax.tree.leaves(one.term), jax.tree.leaves(other.term), strict=True):
             np.testing.assert_array_equal(x, y)
             assert np.asarray(x).dtype == np.asarray(y).dtype
-        plain = [field.name for field in dataclasses.fields(one) if field.name not in ("term", "cov")]
+        plain = [field.name for field in dataclasses.fields(one) if field.name not in ARRAYS]
         assert [getattr(one, name) for name in plain] == [getattr(other, name) for name in plain]
         np.testing.assert_array_equal(one.cov, other.cov)
+        assert one.residuals is not None
+        assert other.residuals is not None
+        np.testing.assert_array_equal(one.residuals.positions_px, other.residuals.positions_px)
+        np.testing.assert_array_equal(one.residuals.z, other.residuals.z)
+        assert (one.map_sigma is None) == (other.map_sigma is None)
+        if one.map_sigma is not None:
+            np.testing.assert_array_equal(one.map_sigma, other.map_sigma)
     np.testing.assert_array_equal(a.wire_map, b.wire_map)
     np.testing.assert_array_equal(a.backscatter_mask, b.backscatter_mask)
     assert (a.rig, a.provenance, a.parent, a.invalidated_by) == (b.rig, b.provenance, b.parent, b.invalidated_by)
@@ -128,11 +138,31 @@ def array_of(document: dict[str, Any]) -> dict[str, Any]:
     return document["terms"]["psf"]["arrays"][0]
 
 
+def noise_fit(document: dict[str, Any]) -> dict[str, Any]:
+    return document["terms"]["noise"]["fit"]
+
+
+def black_level(document: dict[str, Any]) -> dict[str, Any]:
+    return noise_fit(document)["estimates"][1]
+
+
+FAR = {
+    "kind": "numbers", "name": "residuals", "dtype": "float32", "shape": [1, 3], "value": [2e5, 0.0, 0.0],
+    "unit": "px, px, 1", "sigma": None,
+}  # fmt: skip
+
+
+def sigma_map(folder: Path, value: float) -> None:
+    """Write another map of the wire's sigma, with its checksum."""
+    write_exr(folder / "wire_sigma.exr", {"sigma": np.full((3, 4), value, np.float32)})
+    damaged(lambda d: d["pictures"][3].update(sha256=sha256_file(folder / "wire_sigma.exr")))(folder)
+
+
 DAMAGES: dict[str, tuple[Callable[[Path], object], str]] = {
     "no profile.json": (lambda f: (f / PROFILE_NAME).unlink(), "found none"),
     "cut short": (lambda f: (f / PROFILE_NAME).write_bytes((f / PROFILE_NAME).read_bytes()[:500]), "to be JSON"),
     "not an object": (lambda f: (f / PROFILE_NAME).write_text("[1]"), "JSON object"),
-    "newer": (damaged(lambda d: d.update(version=3)), "newer version 3"),
+    "newer": (damaged(lambda d: d.update(version=4)), "newer version 4"),
     "another format": (damaged(lambda d: d.update(format="udccal-session")), "format 'udccal-profile'"),
     "unknown entry": (damaged(lambda d: d.update(extra=1)), "'extra'"),
     "missing entry": (damaged(lambda d: d.pop("rig")), "'rig'"),
@@ -152,6 +182,20 @@ DAMAGES: dict[str, tuple[Callable[[Path], object], str]] = {
     "array missing": (lambda f: (f / "psf_residual.exr").unlink(), "found none"),
     "array changed": (lambda f: (f / "psf_residual.exr").write_bytes(b"x"), "SHA-256"),
     "wire map missing": (lambda f: (f / "wire_map.exr").unlink(), "found none"),
+    "a prior narrower than 0": (damaged(lambda d: black_level(d)["prior"].update(sigma=-0.1)), "sigma"),
+    "a prior that is no number": (damaged(lambda d: black_level(d)["prior"].update(value=float("inf"))), "value"),
+    "no word of what it is": (damaged(lambda d: black_level(d).pop("what")), "what"),
+    "outliers below none": (damaged(lambda d: noise_fit(d)["outliers"][0].update(count=-1)), "count"),
+    "residuals of two columns": (damaged(lambda d: noise_fit(d)["residuals"].update(shape=[3, 2])), "shape"),
+    "residuals far away": (damaged(lambda d: noise_fit(d).update(residuals=FAR)), "within"),
+    "a short digest": (damaged(lambda d: noise_fit(d)["captures"].update(sha256="ab")), "sha256"),
+    "no frames": (damaged(lambda d: noise_fit(d)["captures"].update(frames=0)), "frames"),
+    "gains in the wrong order": (damaged(lambda d: noise_fit(d)["captures"].update(gain_dB=[6.0, 0.0])), "lower"),
+    "too cold": (damaged(lambda d: noise_fit(d)["captures"].update(temperature_C=[-300.0, 0.0])), "temperature_C"),
+    "another effort": (damaged(lambda d: noise_fit(d).update(effort="some")), "effort"),
+    "no evidence": (damaged(lambda d: noise_fit(d).pop("captures")), "captures"),
+    "a sigma below 0": (lambda f: sigma_map(f, -1e-4), "values from 0"),
+    "a sigma of another size": (damaged(lambda d: d["pictures"][3].update(rows=5)), "samples"),
     "picture not listed": (damaged(lambda d: d["pictures"].pop(0)), "found none"),
 }  # fmt: skip
 

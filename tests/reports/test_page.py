@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from tests.reports.widths import layouts
-from udccal.reports.page import Fact, Illustration, Page, TermSection, render, write_page
+from udccal.reports.page import Advice, Fact, Illustration, Page, TermSection, render, write_page
 from udccal.reports.tables import Table
 from udccal.result import FitStatus
 
@@ -38,7 +38,7 @@ def section(status: FitStatus = FitStatus.CONVERGED, finding: str = "K = 0.355 �
 def page(*sections: TermSection) -> Page:
     return Page(
         title="Calibration of toy",
-        verdict="All five terms can be used.",
+        advice=Advice("All five terms can be used.", "good", ("Restore with this profile.",)),
         facts=(Fact("rig", "toy"),),
         pictures=(Illustration(DOT, "Before.", "before"),),
         picture_sentence="From 21 dB to 32 dB.",
@@ -77,6 +77,15 @@ def test_the_page_is_whole_and_refers_to_nothing_outside(tmp_path: Path) -> None
     assert not re.search(r"https?://", text)
     for said in ("Calibration of toy", "K = 0.355 ± 0.001", "The fit converged.", "A note.", "From 21 dB to 32 dB."):
         assert said in text
+
+
+def test_the_page_begins_with_what_to_do() -> None:
+    text = render(page(section()))
+    before = text.partition("Restore with this profile.")[0]
+    assert '<h2 class="verdict">All five terms can be used.</h2>' in before
+    for later in ("<table", "<figure", "K = 0.355 ± 0.001", 'class="facts"'):
+        assert later in text
+        assert later not in before
 
 
 def test_a_bad_status_shows_its_advice() -> None:

@@ -1,7 +1,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -10,6 +12,7 @@ from udccal.cfa import cfa_named
 from udccal.errors import RestorationError
 from udccal.models.geometry import Geometry
 from udccal.models.noise import Noise
+from udccal.restoration.backscatter import PanelMask
 from udccal.restoration.kernel_grid import KernelGrid
 from udccal.restoration.metrics import display_exposure, encode_srgb, least_squares_gain, psnr
 from udccal.restoration.plan import PlanOptions
@@ -121,6 +124,26 @@ def test_a_preview_shows_the_colours_of_every_pattern(
     found = preview.rgb8(mosaic, EXPOSURE_S, Tone(EXPOSURE_S / 2500))
     expected = to_rgb8(encode_srgb(np.array([0.32, 0.8, 0.16])[None, None]))[0, 0]
     assert np.abs(found.astype(int) - expected).max() <= 1
+
+
+def test_a_dark_scene_stays_grey_where_the_panels_light_is_known_badly(
+    restorer: Restorer, toy_grid: KernelGrid
+) -> None:
+    cfa, camera = cfa_named(restorer.rig.camera.cfa), restorer.rig.camera
+    white = np.full((camera.rows, camera.columns), 4e5, np.float32)
+    # The panel gives up to 6 % more red light, or blue, than the mask says.
+    wrong = 0.06 * np.sin(np.arange(camera.columns) / 20.0)[:, None] * np.array([1.0, 0.0, -1.0])
+    channels = cfa.channel_map(camera.rows, camera.columns)
+    truly = white * (1 + wrong[np.arange(camera.columns), channels])
+    counts = np.random.default_rng(9).poisson((truly * EXPOSURE_S + 20.0) * restorer.wire)
+    frame = np.rint(64 + 0.355 * counts).astype(np.uint16)
+    colour_e = []
+    for error in (0.0, 0.06):
+        picture = replace(restorer, mask=PanelMask(white, cfa, error)).restore(frame, EXPOSURE_S) * EXPOSURE_S
+        smooth = cv2.blur(picture, (9, 9))
+        colour_e.append(float(np.sqrt(np.mean((smooth[..., 0] - smooth[..., 2]) ** 2))))
+    assert colour_e[0] > 100.0
+    assert colour_e[1] < 0.5 * colour_e[0]
 
 
 def test_the_result_is_in_e_per_s(restorer: Restorer, frame: np.ndarray, toy_scene: np.ndarray) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 
@@ -26,7 +26,6 @@ class CaptureBench:
         camera, display: open.
         stage: puts things in front of the camera.
         now: returns the bench's time of day.
-        try_again: gets the sentence of a refused step and returns whether to repeat the step.
     """
 
     rig: RigDescription
@@ -34,7 +33,6 @@ class CaptureBench:
     display: Display
     stage: Stage
     now: Now
-    try_again: Callable[[str], bool]
 
 
 def simulated_rig(rig: RigDescription, seed: int, noise_seed: int | None = None) -> SimulatedWorld:
@@ -48,9 +46,9 @@ def simulated_rig(rig: RigDescription, seed: int, noise_seed: int | None = None)
 
 @contextmanager
 def simulated_bench(world: SimulatedWorld) -> Iterator[CaptureBench]:
-    """Open camera, display, stage and clock of ``world``; a refused step is not repeated."""
+    """Open camera, display, stage and clock of ``world``."""
     with SimulatedCamera(world) as camera, SimulatedDisplay(world) as display:
-        yield CaptureBench(world.truth.description, camera, display, world, world.now, lambda sentence: False)
+        yield CaptureBench(world.truth.description, camera, display, world, world.now)
 
 
 def simulate(rig: RigDescription, seed: int = 0, noise_seed: int | None = None) -> AbstractContextManager[CaptureBench]:

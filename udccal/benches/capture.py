@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any, get_args
 
 from udccal.benches.bench import CaptureBench
-from udccal.errors import CameraTimeout, CaptureError, DisplayError
 from udccal.plugins import find_procedure
 from udccal.sessions.changes import Exchanged
 from udccal.sessions.schema import TermName
@@ -52,7 +51,7 @@ def capture(
 def capture_term(
     writer: SessionWriter, bench: CaptureBench, term: TermName, progress: Callable[[int, int | None], None]
 ) -> None:
-    """Run one term's procedure; repeat a refused step while the bench says so.
+    """Run one term's procedure.
 
     Args:
         writer: open session.
@@ -68,10 +67,4 @@ def capture_term(
     def report(at: Any) -> None:
         progress(at.done, at.total)
 
-    while True:
-        try:
-            procedure.run(bench.camera, bench.display, bench.stage, writer, report)
-            return
-        except (CaptureError, CameraTimeout, DisplayError) as error:
-            if not bench.try_again(str(error)):
-                raise
+    procedure.run(bench.camera, bench.display, bench.stage, writer, report)

@@ -1,10 +1,11 @@
-"""Chooses the camera's mode for a rig."""
+"""Chooses the camera's mode for a rig, and checks that it is the rig's camera."""
 
 from __future__ import annotations
 
 from udccal.cameras.pixel_formats import PIXEL_FORMATS, payload_bytes
-from udccal.cameras.protocol import Features, Mode, Region
+from udccal.cameras.protocol import Camera, Features, Mode, Region
 from udccal.errors import CameraError
+from udccal.rig import RigDescription
 
 # Half of the rate of USB 3: a driver that reads one transfer after the other, on a computer that does other things,
 # keeps up with it. Faster cameras are limited to it; a calibration waits for light and hands, not for frames.
@@ -37,3 +38,19 @@ def mode_for(
     rate_hz = most_bytes_per_s / payload_bytes(chosen, sensor.rows, sensor.columns)
     rates = features.frame_rate_hz
     return Mode(chosen.name, None if rate_hz >= rates.high else max(rate_hz, rates.low))
+
+
+def check_camera(camera: Camera, rig: RigDescription) -> None:
+    """Check that an open camera is that of a rig's description.
+
+    Raises:
+        CameraError: when its size, pattern or bits differ.
+    """
+    expected = (rig.camera.columns, rig.camera.rows, rig.camera.cfa, rig.camera.bits)
+    found = (camera.sensor.columns, camera.sensor.rows, camera.cfa, camera.bits)
+    if found != expected:
+        raise CameraError(
+            f"Expected a camera of {expected[0]} x {expected[1]}, {expected[2]}, {expected[3]} bits as in the rig "
+            f"'{rig.name}', found {found[0]} x {found[1]}, {found[2]}, {found[3]} bits. "
+            "Connect the right camera, or correct rig.toml."
+        )

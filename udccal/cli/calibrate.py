@@ -3,36 +3,29 @@
 from __future__ import annotations
 
 import enum
-from contextlib import AbstractContextManager
-from dataclasses import dataclass
-from pathlib import Path
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import replace
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from udccal.cli.options import DOUBTFUL, IterationLog, ProfilePath, RigName, Seed, SessionFolder, TermChoice
+from udccal.cli.options import DOUBTFUL, STOPPED, IterationLog, ProfilePath, RigName, Seed, SessionFolder, TermChoice
 from udccal.cli.output import Output
-from udccal.errors import CameraError
+from udccal.cli.rig_on import (
+    Agree,
+    Camera,
+    CameraKind,
+    Display,
+    DisplayKind,
+    Files,
+    Monitor,
+    RigOn,
+    Serial,
+)
 
 if TYPE_CHECKING:
-    from udccal.benches.bench import CaptureBench
+    from udccal.guide.events import Person
     from udccal.rig import RigDescription
-
-
-class CameraKind(enum.StrEnum):
-    """Which camera captures."""
-
-    sim = "sim"
-    u3v = "u3v"
-    pylon = "pylon"
-    files = "files"
-
-
-class DisplayKind(enum.StrEnum):
-    """How pictures are shown on the panel of a real rig."""
-
-    window = "window"
-    manual = "manual"
 
 
 class ExchangedPart(enum.StrEnum):
@@ -42,22 +35,15 @@ class ExchangedPart(enum.StrEnum):
     lens = "lens"
 
 
-CAMERA_HELP = "sim: a simulated rig; u3v: any USB3 Vision camera; pylon: through Basler's SDK; files: see --files."
-DISPLAY_HELP = "For a real rig. window: full screen on --monitor; manual: you show the named files."
-Serial = Annotated[str | None, typer.Option("--serial", help="Serial number; needed if there are several.")]
-Files = Annotated[Path | None, typer.Option("--files", help="Folder with one folder of pictures per step.")]
-Monitor = Annotated[int, typer.Option("--monitor", help="Number of the monitor that is the panel; see doctor.")]
-
-
 def calibrate(
     context: typer.Context,
     rig: RigName,
     session: SessionFolder,
     profile: ProfilePath,
-    camera: Annotated[CameraKind, typer.Option("--camera", help=CAMERA_HELP)] = CameraKind.sim,
+    camera: Camera = CameraKind.sim,
     serial: Serial = None,
     files: Files = None,
-    display: Annotated[DisplayKind, typer.Option("--display", help=DISPLAY_HELP)] = DisplayKind.manual,
+    display: Display = DisplayKind.manual,
     monitor: Monitor = 0,
     seed: Seed = 0,
     term: Annotated[
@@ -70,82 +56,56 @@ def calibrate(
         list[str] | None,
         typer.Option("--again", metavar="STEP", help="Capture this captured step once more; may be given again."),
     ] = None,
+    practice: Annotated[
+        bool, typer.Option("--practice", help="With --camera sim: you lead a simulated hand, which may do wrong.")
+    ] = False,
+    yes: Agree = False,
+    json_events: Annotated[
+        bool, typer.Option("--json-events", help="Write what happens on standard output, one JSON object a line.")
+    ] = False,
+    web: Annotated[bool, typer.Option("--web", help="Lead by a page in a browser; see docs/web.md.")] = False,
+    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="Port of --web; 0 for any that is free.")] = 0,
     log: IterationLog = None,
 ) -> None:
     """Capture every calibration step of a rig, then fit them. An interrupted session continues where it stopped."""
-    from udccal.cli.jobs.capture import capture_watched
+    from udccal.cli.jobs.capture import Wanted
     from udccal.cli.jobs.fit import fit_to_profile
+    from udccal.cli.jobs.guided import led_by
     from udccal.io.out_folder import check_writable
     from udccal.profiles.store import check_replaceable
     from udccal.rig import load_rig
     from udccal.sessions.changes import Exchanged
 
-    output: Output = context.obj
+    rig_on = RigOn(camera, serial, files, display, monitor, seed)
+    led = practice or rig_on.real
+    _check_words(camera, led, practice, yes or json_events or web)
+    if port and not web:
+        raise typer.BadParameter("--port is for the page: give --web with it, or leave it out.")
+    output: Output = replace(context.obj, events=json_events)
     description = load_rig(rig)
     check_replaceable(profile)
     check_writable(profile.parent)
-    options = BenchOptions(camera, serial, files, display, monitor, seed)
-    with options.opened(output, description, session) as bench:
-        parts = {Exchanged(part.value) for part in exchanged or ()}
-        capture_watched(output, bench, session, [t.value for t in term or TermChoice], parts, again or ())
+    wanted = Wanted(
+        session, [t.value for t in term or TermChoice], {Exchanged(part.value) for part in exchanged or ()}, again or ()
+    )
+    with _person(output, description, port if web else None) if led else nullcontext() as person:
+        goes_on = rig_on.capture(output, description, wanted, person and led_by(output, person, yes))
+    if not goes_on:
+        raise typer.Exit(STOPPED)
     if not fit_to_profile(output, session, profile, log):
         raise typer.Exit(DOUBTFUL)
 
 
-@dataclass(frozen=True)
-class BenchOptions:
-    """Where a rig is: simulated, at this computer, or in files; the options of the verbs that capture."""
-
-    camera: CameraKind
-    serial: str | None
-    files: Path | None
-    display: DisplayKind
-    monitor: int
-    seed: int
-    noise_seed: int | None = None
-
-    def opened(self, output: Output, rig: RigDescription, session: Path) -> AbstractContextManager[CaptureBench]:
-        """Open the bench for a session; the panel's pictures go next to it."""
-        pictures = session.resolve().with_name(f"{session.resolve().name}-pictures")
-        match self.camera:
-            case CameraKind.sim:
-                return _simulated(rig, self.seed, self.noise_seed)
-            case CameraKind.files:
-                return _files(output, rig, self.files, pictures)
-            case _:
-                return _real(output, rig, self.camera, self.serial, self.display, self.monitor, pictures)
+def _check_words(camera: CameraKind, led: bool, practice: bool, of_led: bool) -> None:
+    if practice and camera is not CameraKind.sim:
+        raise typer.BadParameter("--practice is for the simulated rig: give --camera sim with it, or leave it out.")
+    if of_led and not led:
+        raise typer.BadParameter("--yes, --json-events and --web are for --camera u3v or pylon, and for --practice.")
 
 
-def _simulated(rig: RigDescription, seed: int, noise_seed: int | None) -> AbstractContextManager[CaptureBench]:
-    from udccal.benches.bench import simulated_bench, simulated_rig
+def _person(output: Output, rig: RigDescription, port: int | None) -> AbstractContextManager[Person]:
+    """A person before a page, or at the terminal where there is no port."""
+    from udccal.cli.jobs.terminal import TerminalPerson
+    from udccal.cli.jobs.web import web_person
 
-    return simulated_bench(simulated_rig(rig, seed, noise_seed))
-
-
-def _files(
-    output: Output, rig: RigDescription, files: Path | None, pictures: Path
-) -> AbstractContextManager[CaptureBench]:
-    from udccal.cli.jobs.benches import files_bench
-
-    if files is None:
-        raise CameraError("Expected the folder with the pictures of each step, found none. Give it with --files.")
-    return files_bench(output, rig, files, pictures)
-
-
-def _real(
-    output: Output,
-    rig: RigDescription,
-    camera: CameraKind,
-    serial: str | None,
-    display: DisplayKind,
-    monitor: int,
-    pictures: Path,
-) -> AbstractContextManager[CaptureBench]:
-    from udccal.cli.jobs import benches
-
-    seen = benches.u3v_camera(serial) if camera is CameraKind.u3v else benches.pylon_camera(serial)
-    if display is DisplayKind.window:
-        shown = benches.window_display(rig, monitor)
-    else:
-        shown = benches.manual_display(output, rig, pictures)
-    return benches.real_bench(output, rig, seen, shown)
+    return nullcontext(TerminalPerson(output)) if port is None else web_person(output, rig, port)

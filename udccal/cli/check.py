@@ -7,31 +7,23 @@ from typing import Annotated
 
 import typer
 
-from udccal.cli.calibrate import (
-    CAMERA_HELP,
-    DISPLAY_HELP,
-    BenchOptions,
-    CameraKind,
-    DisplayKind,
-    Files,
-    Monitor,
-    Serial,
-)
-from udccal.cli.options import CHANGED, FoundProfile, Seed
+from udccal.cli.options import CHANGED, STOPPED, FoundProfile, Seed
+from udccal.cli.rig_on import Agree, Camera, CameraKind, Display, DisplayKind, Files, Monitor, RigOn, Serial
 
 
 def check(
     context: typer.Context,
     profile: FoundProfile,
-    camera: Annotated[CameraKind, typer.Option("--camera", help=CAMERA_HELP)] = CameraKind.sim,
+    camera: Camera = CameraKind.sim,
     serial: Serial = None,
     files: Files = None,
-    display: Annotated[DisplayKind, typer.Option("--display", help=DISPLAY_HELP)] = DisplayKind.manual,
+    display: Display = DisplayKind.manual,
     monitor: Monitor = 0,
     seed: Seed = 0,
     noise_seed: Annotated[
         int | None, typer.Option("--noise-seed", min=0, help="Noise of the simulated rig: the same rig, another day.")
     ] = None,
+    yes: Agree = False,
     out: Annotated[Path, typer.Option("--out", help="Folder for the captures, check.json and check.html.")] = Path(
         "udccal-check"
     ),
@@ -42,6 +34,7 @@ def check(
     """Check a rig against its profile: ten flats, some dark frames and three panel pictures, in a few minutes."""
     from udccal.cli.jobs.check import check_profile
 
-    options = BenchOptions(camera, serial, files, display, monitor, seed, noise_seed)
-    if not check_profile(context.obj, profile, options, out, update):
-        raise typer.Exit(CHANGED)
+    rig_on = RigOn(camera, serial, files, display, monitor, seed, noise_seed)
+    same = check_profile(context.obj, profile, rig_on, yes, out, update)
+    if not same:
+        raise typer.Exit(STOPPED if same is None else CHANGED)

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from udccal.cli.calibrate import CameraKind, DisplayKind
+from udccal.cli.rig_on import CameraKind, DisplayKind
 
 _SESSION_HELP = "Folder of the session: checks that its disk has room."
 

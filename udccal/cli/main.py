@@ -11,11 +11,13 @@ from typing import Annotated
 import typer
 
 from udccal import __version__
+from udccal.cli.board import board
 from udccal.cli.calibrate import calibrate
 from udccal.cli.check import check
 from udccal.cli.demo import demo
 from udccal.cli.doctor import doctor
 from udccal.cli.fit import fit
+from udccal.cli.options import STOPPED
 from udccal.cli.output import Output
 from udccal.cli.plan import plan
 from udccal.cli.profile import profile_app
@@ -26,8 +28,8 @@ from udccal.cli.simulate import simulate
 from udccal.errors import UdccalError
 
 _GLOBAL_FLAGS = ("--json", "--debug")
-# The statuses that a shell gives to a program which ended by SIGINT, and by SIGPIPE.
-_STOPPED, _PIPE_CLOSED = 130, 141
+# The status that a shell gives to a program which ended by SIGPIPE.
+_PIPE_CLOSED = 141
 
 app = typer.Typer(
     name="udccal",
@@ -58,7 +60,7 @@ def globals_(
     context.obj = Output(as_json=as_json, debug=debug)
 
 
-for _verb in (demo, doctor, plan, calibrate, fit, check, restore, run, simulate):
+for _verb in (demo, doctor, board, plan, calibrate, fit, check, restore, run, simulate):
     app.command(no_args_is_help=_verb not in (demo, doctor))(_verb)
 app.add_typer(profile_app, name="profile")
 app.add_typer(rig_app, name="rig")
@@ -76,9 +78,9 @@ def main(arguments: list[str] | None = None) -> None:
     except UdccalError as error:
         _fail(str(error), 1, flags)
     except SystemExit as left:  # typer and rich turn Ctrl-C and a closed pipe into this, without a word
-        if left.code == _STOPPED:
+        if left.code == STOPPED:
             sentence = "Stopped. Run the same command again to continue; completed steps of a session are kept."
-            _fail(sentence, _STOPPED, flags)
+            _fail(sentence, STOPPED, flags)
         if isinstance(left.__context__, BrokenPipeError):
             # What is still buffered goes nowhere; else Python would complain when it ends.
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

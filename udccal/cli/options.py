@@ -23,6 +23,8 @@ class TermChoice(enum.StrEnum):
 DOUBTFUL = 3
 # Exit status of a comparison of profiles that have changed by more than is harmless, of a failed validation or check.
 CHANGED = 3
+# Exit status of a run that a person stopped, as shells give it to a program that ended by SIGINT.
+STOPPED = 130
 
 RigName = Annotated[str, typer.Option("--rig", help="Name of a shipped rig or of your own, or a folder.")]
 SessionFolder = Annotated[Path, typer.Option("--session", help="Folder of the session; continues an unfinished one.")]

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import PurePath
 from typing import Any
 
+from pydantic import BaseModel
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table as RichTable
@@ -49,10 +50,18 @@ class Stage:
 
 @dataclass
 class Output:
-    """Where and how a verb prints."""
+    """Where and how a verb prints.
+
+    Attributes:
+        as_json: whether standard output gets the result alone, as one JSON object.
+        debug: whether tracebacks are shown.
+        events: whether standard output gets events, and at last the result, as one JSON object a line.
+        times: how long each stage took.
+    """
 
     as_json: bool = False
     debug: bool = False
+    events: bool = False
     times: list[StageTime] = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -96,8 +105,8 @@ class Output:
         return answer
 
     def table(self, table: Table) -> None:
-        """Print a table on standard output; print nothing with ``--json``."""
-        if self.as_json:
+        """Print a table on standard output; print nothing with ``--json`` and ``--json-events``."""
+        if self.as_json or self.events:
             return
         shown = RichTable(title=table.title, title_justify="left", title_style="bold")
         for index, column in enumerate(table.columns):
@@ -107,14 +116,20 @@ class Output:
         self._standard.print(shown, markup=False)
 
     def answer(self, sentence: str) -> None:
-        """Print a sentence that is part of the result on standard output; print nothing with ``--json``."""
-        if not self.as_json:
+        """Print a sentence that is part of the result on standard output; print nothing where a table is not."""
+        if not (self.as_json or self.events):
             self._standard.print(sentence, highlight=False, markup=False, soft_wrap=True)
 
     def result(self, result: object) -> None:
         """Print the result (a dataclass) as JSON on standard output; print nothing without ``--json``."""
-        if self.as_json:
+        if self.events:
+            self.line(result)
+        elif self.as_json:
             print(json.dumps(plain(result), indent=2, allow_nan=False), flush=True)
+
+    def line(self, event: object) -> None:
+        """Print a dataclass as JSON on one line of standard output."""
+        print(json.dumps(plain(event), allow_nan=False), flush=True)
 
     @contextmanager
     def stage(self, name: str) -> Iterator[Stage]:
@@ -139,11 +154,15 @@ class Output:
 
 
 def plain(value: object) -> Any:
-    """Convert a dataclass, path, enumeration, number or sequence to JSON's types; non-finite numbers become null.
+    """Convert a dataclass, a part of a stored file, a path, an enumeration, a number or a sequence to JSON's types.
+
+    Numbers that are not finite become null.
 
     Raises:
         TypeError: for anything else.
     """
+    if isinstance(value, BaseModel):
+        return value.model_dump(mode="json")
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {item.name: plain(getattr(value, item.name)) for item in dataclasses.fields(value)}
     if isinstance(value, enum.Enum):

@@ -1,20 +1,41 @@
-"""``udccal profile``: shows what a profile holds, compares two, validates one, and prepares restoration with one."""
+"""``udccal profile``: what can be done with a profile."""
 
 from __future__ import annotations
 
+import enum
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from udccal.cli.options import CHANGED
+from udccal.cli.options import CHANGED, RigName
 from udccal.tiers import Tier
 
 profile_app = typer.Typer(
-    help="Show what a profile holds, compare two, validate one, or prepare one.",
+    help="Show, compare, validate, copy or prepare profiles, and exchange them with other programs.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
 )
+
+
+class ExportTo(enum.StrEnum):
+    """A format that profiles are exported to."""
+
+    opencv_yaml = "opencv-yaml"
+    ros_camera_info = "ros-camera-info"
+    mrcal = "mrcal"
+    npz = "npz"
+    csv = "csv"
+
+
+class ImportFrom(enum.StrEnum):
+    """A format that lenses are imported from."""
+
+    opencv_yaml = "opencv-yaml"
+    ros_camera_info = "ros-camera-info"
+    mrcal = "mrcal"
+
+
 ProfileArgument = Annotated[
     Path, typer.Argument(metavar="PROFILE", help="The profile's folder or zip file, or a rig's name.")
 ]
@@ -55,6 +76,80 @@ def diff(
 
     if not diff_profiles(context.obj, a, b, out):
         raise typer.Exit(CHANGED)
+
+
+@profile_app.command(no_args_is_help=True)
+def log(
+    context: typer.Context,
+    path: ProfileArgument,
+) -> None:
+    """Tell a profile's past: when, with what and from which session it was made, and what it was derived from."""
+    from udccal.cli.jobs.log import log_profile
+
+    log_profile(context.obj, path)
+
+
+@profile_app.command(no_args_is_help=True)
+def pack(
+    context: typer.Context,
+    path: ProfileArgument,
+    file: Annotated[Path, typer.Argument(metavar="FILE.zip", help="The zip file to write.")],
+) -> None:
+    """Write a profile as one zip file, byte for byte."""
+    from udccal.cli.jobs import copies
+
+    copies.pack(context.obj, path, file)
+
+
+@profile_app.command(no_args_is_help=True)
+def unpack(
+    context: typer.Context,
+    file: Annotated[Path, typer.Argument(metavar="FILE.zip", help="A profile's zip file.")],
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="The folder to write.")],
+) -> None:
+    """Write the profile of a zip file as a folder, byte for byte."""
+    from udccal.cli.jobs import copies
+
+    copies.unpack(context.obj, file, folder)
+
+
+@profile_app.command(no_args_is_help=True)
+def migrate(
+    context: typer.Context,
+    path: ProfileArgument,
+    out: Annotated[Path, typer.Option("--out", help="Folder to write, or a zip file.")],
+) -> None:
+    """Write a profile of an older format version anew in the present one; the old one becomes its parent."""
+    from udccal.cli.jobs import copies
+
+    copies.migrate(context.obj, path, out)
+
+
+@profile_app.command(no_args_is_help=True)
+def export(
+    context: typer.Context,
+    path: ProfileArgument,
+    to: Annotated[ExportTo, typer.Option("--to", help="The format; the covariance goes into a .json beside the file.")],
+    out: Annotated[Path, typer.Option("--out", help="The new file.")],
+) -> None:
+    """Write a profile's numbers for another program, and say what its format cannot hold."""
+    from udccal.cli.jobs.exchange import export
+
+    export(context.obj, path, to.value, out)
+
+
+@profile_app.command("import", no_args_is_help=True)
+def import_(
+    context: typer.Context,
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="Another program's calibration of the camera.")],
+    of: Annotated[ImportFrom, typer.Option("--from", help="The format of the file.")],
+    rig: RigName,
+    out: Annotated[Path, typer.Option("--out", help="Folder of the profile to write, or a zip file.")],
+) -> None:
+    """Make a profile with the lens of another program's calibration; the other terms stay nominal."""
+    from udccal.cli.jobs.exchange import import_
+
+    import_(context.obj, of.value, file, rig, out)
 
 
 @profile_app.command(no_args_is_help=True)

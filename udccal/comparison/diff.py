@@ -6,6 +6,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal, final, get_args
 
+import numpy as np
+
 from udccal.comparison.advice import advice
 from udccal.comparison.comparable import check_comparable
 from udccal.comparison.effects import Effect, effects_of
@@ -46,6 +48,7 @@ class TermDiff:
 
     Attributes:
         chi2, dof, p_value: of all its estimates jointly, by both covariances.
+        same_captures: whether both were fitted to the same captures: then the rig cannot differ, only the fits.
         effects: what the difference does to what is seen.
         not_covered: estimates that chi-squared leaves out, as a profile keeps no covariance of them.
         notes: what a person should know before relying on the verdict.
@@ -56,6 +59,7 @@ class TermDiff:
     chi2: float
     dof: int
     p_value: float
+    same_captures: bool
     effects: tuple[Effect, ...]
     estimates: tuple[EstimateDiff, ...]
     not_covered: tuple[str, ...]
@@ -124,7 +128,9 @@ def compare(a: Profile, b: Profile, limits: DiffLimits) -> tuple[ProfileDiff, Di
     loss = picture_loss(a, b, maps)
     effects = effects_of(a, b, maps, loss, limits)
     terms = tuple(_term(a, b, term, found.of(term), effects[term], limits) for term in ORDER)
-    moved = movement(found, a.rig.panel.pitch_mm.value, limits)
+    # What was fitted to the same captures tells no movement.
+    told = [not _same_captures(a.result(term), b.result(term)) for term, _ in found.names]
+    moved = movement(found.only(np.array(told, dtype=bool)), a.rig.panel.pitch_mm.value, limits)
     verdict = max((one.verdict for one in terms), key=VERDICTS.index)
     changed = [(one.term, one.worst) for one in terms if one.verdict == "changed"]
     harmless = [one.term for one in terms if one.verdict == "changed, harmless"]
@@ -165,7 +171,11 @@ def _term(
 ) -> TermDiff:
     results = a.result(term), b.result(term)
     chi2, dof = found.chi2()
+    same_captures = _same_captures(*results)
     verdict = verdict_of(chi2, dof, effects, limits)
+    if same_captures:
+        # Both errors are the same frames': no probability can be told, but what the fits differ by can matter.
+        verdict = "changed" if any(effect.harmful for effect in effects) else "same"
     columns = zip(found.names, found.units, found.a, found.b, found.values, found.sigma, strict=True)
     return TermDiff(
         term=term,
@@ -173,6 +183,7 @@ def _term(
         chi2=chi2,
         dof=dof,
         p_value=chi2_tail(chi2, dof),
+        same_captures=same_captures,
         effects=effects,
         estimates=tuple(EstimateDiff(name, unit, *map(float, rest)) for (_, name), unit, *rest in columns),
         not_covered=not_covered(*results),
@@ -180,11 +191,23 @@ def _term(
     )
 
 
+def _same_captures(a: FitResult, b: FitResult) -> bool:
+    """Whether both are known to be fits of the same files."""
+    return a.captures is not None and b.captures is not None and a.captures.sha256 == b.captures.sha256
+
+
 def _notes(results: tuple[FitResult, FitResult], verdict: Verdict, effects: Sequence[Effect]) -> Iterator[str]:
     silent = [name for name, result in zip("AB", results, strict=True) if not result.estimates]
     if silent:
         yield f"{' and '.join(silent)}: no number of this term was measured; what restoration uses is compared."
+    if _same_captures(*results):
+        yield (
+            "A and B were fitted to the same captures, and are not independent: sigmas are too large and χ² is too "
+            "small. What differs is the fits' doing, not the rig's."
+        )
     for name, result in zip("AB", results, strict=True):
+        if result.effort not in ("full", None):
+            yield f"{name}: The effort of its fit was {result.effort}: a full fit may be better."
         if result.warning:
             yield f"{name}: {result.warning}"
     if verdict == "same" and any(effect.harmful for effect in effects):

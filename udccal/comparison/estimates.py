@@ -99,5 +99,5 @@ def difference(a: Estimates, b: Estimates) -> Difference:
 def not_covered(a: FitResult, b: FitResult) -> tuple[str, ...]:
     """Names of estimates of a term that no chi-squared covers: without a covariance, or in one profile only."""
     held = [{one.name for one in result.estimates[: len(result.cov)] if one.sigma > 0} for result in (a, b)]
-    named = [one.name for one in (*a.estimates, *b.estimates)]
+    named = [one.name for one in (*a.numbers, *b.numbers)]
     return tuple(dict.fromkeys(name for name in named if name not in held[0] & held[1]))

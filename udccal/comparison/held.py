@@ -13,6 +13,7 @@ from jaxtyping import Float
 from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
+from udccal.calibration import Calibration
 from udccal.comparison.comparable import check_finite
 from udccal.comparison.estimates import ANGLES, ORDER, Estimates, Name
 from udccal.comparison.grid import sensor_grid
@@ -25,6 +26,7 @@ from udccal.numerics import in_float64
 from udccal.profiles.profile import Profile
 from udccal.result import FitResult
 
+Measured = Profile | Calibration
 # Steps of numerical derivatives: focal length and principal point (px), distortion, angles (deg).
 STEPS = np.array([1e-2] * 4 + [1e-5] * 5 + [1e-3] * 3)
 # Rotation, stand-off and offset, and the steps of their derivatives.
@@ -33,18 +35,22 @@ _POSE, _POSE_STEP = SHAPE_NAMES[:6], 1e-3
 _ROUNDING = 1e-6
 
 
-def held_estimates(profile: Profile) -> Estimates:
-    """Return the estimates of all terms that are in a covariance.
+def held_estimates(profile: Measured) -> Estimates:
+    """Return the estimates of all terms that are in a covariance, without elements of the terms' arrays.
+
+    Which elements a fit has, its data decide; they are compared by what they do to the maps.
 
     Raises:
         ProfileError: when a covariance cannot be one.
     """
     results = [profile.result(term) for term in ORDER]
     covs = [_checked(result) for result in results]
-    kept = [(term, one) for term, r, cov in zip(ORDER, results, covs, strict=True) for one in r.estimates[: len(cov)]]
+    every = [(term, one) for term, r, cov in zip(ORDER, results, covs, strict=True) for one in r.estimates[: len(cov)]]
+    own = np.array([i for i, (_, one) in enumerate(every) if "." not in one.name], dtype=np.int64)
+    kept = [every[i] for i in own]
     names: tuple[Name, ...] = tuple((term, one.name) for term, one in kept)
     values = np.array([one.value for _, one in kept], dtype=np.float64)
-    found = Estimates(names, tuple(one.unit for _, one in kept), values, block_diag(*covs))
+    found = Estimates(names, tuple(one.unit for _, one in kept), values, block_diag(*covs)[np.ix_(own, own)])
     return _with_whole_rotation(found, profile) if {("wire", name) for name in _POSE} <= set(names) else found
 
 
@@ -65,7 +71,7 @@ def _checked(result: FitResult) -> Float[np.ndarray, "n n"]:
     return (cov + cov.T) / 2
 
 
-def _with_whole_rotation(found: Estimates, profile: Profile) -> Estimates:
+def _with_whole_rotation(found: Estimates, profile: Measured) -> Estimates:
     """The angles of the wire's whole rotation from camera to panel, and the lens's share of the pose's covariance."""
     at = np.array([found.names.index(("wire", name)) for name in _POSE])
     values, change = found.values.copy(), np.eye(len(found.names))
@@ -85,14 +91,14 @@ def _with_whole_rotation(found: Estimates, profile: Profile) -> Estimates:
     return Estimates(tuple(names), tuple(units), values, cov)
 
 
-def _whole_deg(profile: Profile, turn_deg: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
+def _whole_deg(profile: Measured, turn_deg: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
     """(tilt, roll, yaw) of the geometry's rotation followed by ``turn_deg``, a rotation vector."""
     base = Rotation.from_rotvec(np.asarray(profile.wire.term.geometry.rotation_rad, dtype=np.float64))
     return angles_deg((Rotation.from_rotvec(turn_deg, degrees=True) * base).as_rotvec())
 
 
 @in_float64
-def _by_lens(profile: Profile) -> Float[np.ndarray, "6 9"]:
+def _by_lens(profile: Measured) -> Float[np.ndarray, "6 9"]:
     """Derivatives of the wire's pose by the lens that its fit held.
 
     A flat shows the phase of rows and columns at every pixel. Where the lens is off, the pose makes up for it as far as

@@ -18,9 +18,9 @@ from typing import final
 import numpy as np
 from jaxtyping import Float
 
+from udccal.comparison.combining import combine
 from udccal.comparison.estimates import ANGLES, Difference, Name, chi2_of
 from udccal.comparison.limits import DiffLimits
-from udccal.fitting.engine.gaussian import scaled_inverse
 from udccal.fitting.engine.tails import chi2_tail
 
 _UNITS = ("mm", "mm", "mm", "deg", "deg", "deg")
@@ -65,38 +65,31 @@ class Movement:
     terms: tuple[str, ...]
 
 
-def movement(found: Difference, pitch_mm: float, limits: DiffLimits) -> Movement:
+def movement(differences: Difference, pitch_mm: float, limits: DiffLimits) -> Movement:
     """Solve the movement that explains the differences of all terms best.
 
     Args:
-        found: B less A.
+        differences: B less A.
         pitch_mm: nominal pitch of the panel.
         limits: says when backscatter tells whole pitches.
     """
     rows = _design(pitch_mm)
-    seen = found.only(np.array([name in rows for name in found.names], dtype=bool))
+    seen = differences.only(np.array([name in rows for name in differences.names], dtype=bool))
     seen, pitches = _with_whole_pitches(seen, limits)
-    design = np.array([rows[name] for name in seen.names], dtype=np.float64).reshape(-1, 6)
-    known = np.any(design != 0, axis=0)
-    design, weight = design[:, known], scaled_inverse(seen.cov)
-    cov = scaled_inverse(design.T @ weight @ design)
-    solved = cov @ design.T @ weight @ seen.values
-    chi2, dof = chi2_of(solved, cov)
-    left, size = seen.values - design @ solved, chi2_of(seen.values, seen.cov)[1]
-    off = max(float(left @ weight @ left), 0.0)
-    values, whole = np.full(6, np.nan), np.full((6, 6), np.nan)
-    values[known], whole[np.ix_(known, known)] = solved, cov
+    found = combine(np.array([rows[name] for name in seen.names]).reshape(-1, 6), seen.values, seen.cov)
+    values, cov, known = found.values, found.cov, found.known
+    chi2, dof = chi2_of(values[known], cov[np.ix_(known, known)])
     return Movement(
-        parts=tuple(_moved(*one) for one in zip(_PARTS, values, np.sqrt(np.diag(whole)), _UNITS, strict=True)),
-        distance=_length("distance", values[:3], whole[:3, :3], "mm"),
-        angle=_length("angle", values[3:], whole[3:, 3:], "deg"),
+        parts=tuple(_moved(*one) for one in zip(_PARTS, values, np.sqrt(np.diag(cov)), _UNITS, strict=True)),
+        distance=_length("distance", values[:3], cov[:3, :3], "mm"),
+        angle=_length("angle", values[3:], cov[3:, 3:], "deg"),
         whole_pitches=pitches,
         chi2=chi2,
         dof=dof,
         p_value=chi2_tail(chi2, dof),
-        agreement_chi2=off,
-        agreement_dof=size - dof,
-        agreement_p_value=chi2_tail(off, size - dof),
+        agreement_chi2=found.chi2,
+        agreement_dof=found.dof,
+        agreement_p_value=chi2_tail(found.chi2, found.dof),
         terms=tuple(dict.fromkeys(term for term, _ in seen.names)),
     )
 

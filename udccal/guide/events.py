@@ -10,13 +10,14 @@ from udccal.cameras.protocol import Frame
 
 
 class Answer(enum.StrEnum):
-    """What a person may answer."""
+    """What a person may answer; ``wrong`` is offered at a simulated rig alone: the hand there makes a mistake."""
 
     go = "go"
     again = "again"
     skip = "skip"
     back = "back"
     quit = "quit"
+    wrong = "wrong"
 
 
 @final
@@ -108,9 +109,10 @@ class VerdictEvent:
 @final
 @dataclass(frozen=True)
 class DoneEvent:
-    """The capture has ended; ``complete`` says whether every step was captured."""
+    """The capture has ended; it is complete when every step was captured, and stopped when the person has quit."""
 
     complete: bool
+    stopped: bool
     sentence: str
     event: Literal["done"] = "done"
 

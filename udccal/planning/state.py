@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.ndimage import map_coordinates
 
-from udccal.arrangements import Arrangement, Board, Dark, FlatLight, Led, PanelPicture, Photograph
+from udccal.arrangements import Arrangement, PanelPicture
 from udccal.calibration import Calibration
 from udccal.cfa import cfa_named
 from udccal.fitting.geometry.fit import BY_HAND, ON_JIG
@@ -20,6 +20,7 @@ from udccal.models.geometry import Geometry
 from udccal.models.noise import Noise, variance_e
 from udccal.models.wire import Wire, wire_values
 from udccal.numerics import in_float64
+from udccal.planning.exposures import nominal_full_s
 from udccal.profiles.profile import Profile
 from udccal.result import FitResult, FitStatus
 from udccal.rig import Captures, RigDescription
@@ -33,8 +34,6 @@ WHITE = (0.6, 1.0, 0.7)
 _DISTORTION = (-0.07, 0.035, 0.0, 0.0, -0.005)
 # Shading is smooth; the modulation by the rows hardly changes the number of electrons.
 _FIELD_GRID = (49, 65)
-# Exposures that fill the wells. Flats and boards are lit so that they fill them within a frame.
-_LED_FULL_S, _PANEL_FULL_S = 125e-6, 0.1
 _wire_values = jax.jit(wire_values, static_argnums=(2, 3))
 
 
@@ -137,11 +136,11 @@ def measured_state(rig: RigDescription, fits: Calibration | Profile) -> RigState
         model_errors=ModelErrors(
             on_jig_px=_corners_px(fits.geometry, ON_JIG) if geometry_seen else None,
             by_hand_px=_corners_px(fits.geometry, BY_HAND) if geometry_seen else None,
-            wire=_diagnostic(fits.wire, "wire_map_model_sigma") / 100,
-            psf=_diagnostic(fits.psf, "model_error"),
-            psf_kernel=_diagnostic(fits.psf, "kernel_error_l2"),
-            backscatter=_diagnostic(fits.backscatter, "model_error_of_white"),
-            inflation=max(_diagnostic(fits.backscatter, "pattern_inflation"), 1.0),
+            wire=(fits.wire.diagnostic("wire_map_model_sigma") or 0.0) / 100,
+            psf=fits.psf.diagnostic("model_error") or 0.0,
+            psf_kernel=fits.psf.diagnostic("kernel_error_l2") or 0.0,
+            backscatter=fits.backscatter.diagnostic("model_error_of_white") or 0.0,
+            inflation=max(fits.backscatter.diagnostic("pattern_inflation") or 0.0, 1.0),
         ),
     )
 
@@ -152,27 +151,15 @@ def _converged(result: FitResult[Any]) -> bool:
 
 def _corners_px(geometry: FitResult[Geometry], name: str) -> float | None:
     """Scatter of corners in addition to noise, disagreement of views included; None where the fit lacks the number."""
-    if all(item.name != name for item in geometry.diagnostics):
-        return None
-    return _diagnostic(geometry, name) * float(np.sqrt(max(_diagnostic(geometry, "variance_factor"), 1.0)))
-
-
-def _diagnostic(result: FitResult[Any], name: str) -> float:
-    """A diagnostic of a fit by its name; 0 where the fit has none of that name."""
-    return next((item.value for item in result.diagnostics if item.name == name), 0.0)
+    scatter_px, factor = geometry.diagnostic(name), geometry.diagnostic("variance_factor") or 0.0
+    return None if scatter_px is None else scatter_px * float(np.sqrt(max(factor, 1.0)))
 
 
 def full_s(arrangement: Arrangement, state: RigState) -> float:
     """Exposure in seconds at which the brightest sample of an arrangement would fill its well."""
-    match arrangement:
-        case Led():
-            return _LED_FULL_S
-        case PanelPicture():
-            if state.backscatter is not None and np.max(state.backscatter.mask) > 0:
-                return state.full_well_e / float(np.max(state.backscatter.mask))
-            return _PANEL_FULL_S
-        case FlatLight() | Board() | Dark() | Photograph():
-            return 1.0 / state.rig.camera.frame_rate_hz
+    if isinstance(arrangement, PanelPicture) and state.backscatter is not None and np.max(state.backscatter.mask) > 0:
+        return state.full_well_e / float(np.max(state.backscatter.mask))
+    return nominal_full_s(arrangement, state.rig)
 
 
 def sensor_samples(rig: RigDescription, across: int) -> Float[np.ndarray, "n 2"]:

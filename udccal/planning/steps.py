@@ -4,37 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Any, final
+from typing import final
 
-from udccal.arrangements import Arrangement
-from udccal.errors import UdccalError
+from udccal.planning.exposures import PlannedStep, steps_at, with_small_panel
 from udccal.planning.state import RigState, full_s
-from udccal.plugins import find_procedure
-from udccal.rig import RigDescription
 from udccal.sessions.schema import TermName
-
-# The time of a capture does not depend on the panel's picture: pictures are drawn this small for counting.
-_COUNTING_PX = 8
-
-
-@final
-@dataclass(frozen=True)
-class PlannedStep:
-    """One step as it will be carried out.
-
-    Attributes:
-        exposures_s: exposure of every frame that is kept.
-        level: of the range from black to saturation that the brightest sample of the first frame reaches in the light
-            that the exposure was metered in; None where the exposure does not aim at a level.
-        test_frames: frames at the first exposure, taken to find it and to check the scene.
-    """
-
-    id: str
-    arrangement: Arrangement
-    instruction: str
-    exposures_s: tuple[float, ...]
-    level: float | None
-    test_frames: int
 
 
 @final
@@ -57,25 +31,8 @@ NOTHING = Cost(0, 0.0, 0)
 
 
 def planned_steps(term: TermName, state: RigState) -> Iterator[PlannedStep]:
-    """The steps of a term's procedure, one at a time, at the expected exposures.
-
-    Raises:
-        UdccalError: when no procedure is installed, or a step of it does not state its frames and exposure.
-    """
-    steps: Any = find_procedure(term)().steps(state.rig)
-    longest_s = state.rig.camera.max_exposure_s
-    earlier: dict[str, Any] = {}
-    for step in steps:
-        try:
-            at = step.exposure.planned(_metered_s(step, state), earlier)
-            exposures_s = step.plan.exposures_s(_within(at.exposure_s, state.rig), longest_s)
-        except (AttributeError, KeyError) as error:
-            raise UdccalError(
-                f"Expected the step '{step.id}' to tell how many frames it takes and at which exposure, found that it "
-                f"does not ({error}). Give its plan and exposure the methods of those in procedures.plans."
-            ) from error
-        earlier[step.id] = at
-        yield PlannedStep(step.id, step.arrangement, step.instruction, exposures_s, at.level, at.test_frames)
+    """The steps of a term's procedure at the exposures of a rig's state; raises as ``steps_at`` does."""
+    return steps_at(term, state.rig, lambda arrangement: full_s(arrangement, state))
 
 
 def cost_of(term: TermName, state: RigState) -> Cost:
@@ -91,17 +48,6 @@ def cost_of(term: TermName, state: RigState) -> Cost:
     return total
 
 
-def _metered_s(step: Any, state: RigState) -> float:
-    """Exposure in seconds that metering is expected to find; 0 where nothing is metered."""
-    target = getattr(step.exposure, "target", 0.0)
-    return _within(target * full_s(step.arrangement, state), state.rig)
-
-
-def _within(exposure_s: float, rig: RigDescription) -> float:
-    return min(max(exposure_s, rig.camera.min_exposure_s), rig.camera.max_exposure_s)
-
-
 def without_pictures(state: RigState) -> RigState:
-    """The same state with a tiny panel, on which the frames and exposures of its steps do not depend."""
-    small = state.rig.panel.model_copy(update={"columns": _COUNTING_PX, "rows": _COUNTING_PX})
-    return replace(state, rig=state.rig.model_copy(update={"panel": small}))
+    """The same state with a tiny panel, for counting."""
+    return replace(state, rig=with_small_panel(state.rig))

@@ -4,7 +4,11 @@ from __future__ import annotations
 
 import re
 import struct
+import tempfile
 import zipfile
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from udccal.errors import ProfileError
@@ -22,6 +26,18 @@ _MAX_LIST_BYTES = 1024 * 1024
 _END = struct.Struct("<4s8xI4x2s")
 _END_SIGNATURE, _LARGE_SIGNATURE, _NO_COMMENT = b"PK\5\6", b"PK\6\7", b"\0\0"
 _LARGE_BYTES = 20
+# What zipfile raises for damaged files: names and numbers that cannot be, and content that does not unpack.
+_DAMAGES = (
+    zipfile.BadZipFile,
+    zlib.error,
+    struct.error,
+    EOFError,
+    NotImplementedError,
+    OSError,
+    OverflowError,
+    RuntimeError,
+    ValueError,
+)
 
 
 def pack_archive(folder: Path, path: Path) -> None:
@@ -33,8 +49,27 @@ def pack_archive(folder: Path, path: Path) -> None:
             archive.write(file, file.name, compress_type=kind)
 
 
-def unpack_archive(path: Path, folder: Path) -> None:
-    """Unpack a profile's zip file into an empty folder.
+@contextmanager
+def unpacked(path: Path, only: str | None = None) -> Iterator[Path]:
+    """Yield the folder of a profile: ``path`` itself, or a temporary folder for as long as its zip file is needed.
+
+    Args:
+        path: the profile's folder or zip file.
+        only: the one file that is needed; None for all.
+
+    Raises:
+        ProfileError: as ``unpack_archive``.
+    """
+    if not path.is_file():
+        yield path
+        return
+    with tempfile.TemporaryDirectory(prefix="udccal-") as folder:
+        unpack_archive(path, Path(folder), only)
+        yield Path(folder)
+
+
+def unpack_archive(path: Path, folder: Path, only: str | None = None) -> None:
+    """Unpack a profile's zip file into an empty folder; with ``only`` just that file, after the same checks.
 
     Raises:
         ProfileError: when the file is damaged or not a zip file, holds a name that no profile has (folders, ``..``,
@@ -45,9 +80,9 @@ def unpack_archive(path: Path, folder: Path) -> None:
         with zipfile.ZipFile(path) as archive:
             entries = archive.infolist()
             _check_entries(path, entries)
-            for entry in entries:
+            for entry in (entry for entry in entries if only in (None, entry.filename)):
                 _unpack_entry(path, archive, entry, folder / entry.filename)
-    except (zipfile.BadZipFile, EOFError, NotImplementedError, RuntimeError, OSError) as error:
+    except _DAMAGES as error:
         raise ProfileError(f"Expected {path} to be a whole zip file, found: {error}. Copy it again.") from error
 
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +31,8 @@ from udccal.sessions.schema import TermName
 Channels = Mapping[str, Float[np.ndarray, "rows columns"]]
 # Ranges of the maps: the wire as a factor, backscatter in e-/s, kernels that sum to 1.
 _WIRE_RANGE, _RATE_RANGE, _KERNEL_RANGE = (1e-4, 1e4), (-1e10, 1e10), (-10.0, 10.0)
+_SIGMA_RANGE = (0.0, 1e20)
+_SIGMA_CHANNELS = {"wire": ("sigma",), "backscatter": tuple("RGB")}
 
 
 def encode(profile: Profile, folder: Path) -> StoredProfile:
@@ -68,12 +71,12 @@ def decode(stored: StoredProfile, folder: Path) -> Profile:
     camera = stored.rig.camera
     geometry = _load_section(stored, "geometry", Geometry, folder, None)
     shared = geometry.term
-    pictures = {picture.name: picture for picture in stored.pictures}
+    pictures: dict[str, StoredPicture] = {picture.name: picture for picture in stored.pictures}
     for name in ("wire_map", "psf_atlas", "backscatter_white"):
         if name not in pictures:
             raise ProfileError(f"Expected the picture '{name}' in {folder}, found none. Make the profile again.")
     size, half_size = (camera.rows, camera.columns), (camera.rows // 2, camera.columns // 2)
-    wire = _load_picture(pictures["wire_map"], folder, ("wire",), size, _WIRE_RANGE)
+    wire_map = _load_picture(pictures["wire_map"], folder, ("wire",), size, _WIRE_RANGE)
     mask = _load_picture(pictures["backscatter_white"], folder, tuple("RGB"), half_size, _RATE_RANGE)
     atlas = pictures["psf_atlas"]
     _load_picture(atlas, folder, tuple("RGB"), (atlas.rows, atlas.columns), _KERNEL_RANGE)
@@ -83,10 +86,10 @@ def decode(stored: StoredProfile, folder: Path) -> Profile:
         parent=stored.lineage.parent,
         noise=_load_section(stored, "noise", Noise, folder, shared),
         geometry=geometry,
-        wire=_load_section(stored, "wire", Wire, folder, shared),
+        wire=_with_sigma(_load_section(stored, "wire", Wire, folder, shared), pictures, folder),
         psf=_load_section(stored, "psf", PsfField, folder, shared),
-        backscatter=_load_section(stored, "backscatter", Backscatter, folder, shared),
-        wire_map=np.array(wire["wire"], dtype=np.float32),
+        backscatter=_with_sigma(_load_section(stored, "backscatter", Backscatter, folder, shared), pictures, folder),
+        wire_map=np.array(wire_map["wire"], dtype=np.float32),
         backscatter_mask=np.stack([mask[name] for name in "RGB"], axis=-1).astype(np.float32),
         invalidated_by=stored.invalidated_by,
     )
@@ -114,6 +117,24 @@ def _load_section(
     return load_fit(name, section.fit, term, folder)
 
 
+def _with_sigma(result: FitResult, pictures: Mapping[str, StoredPicture], folder: Path) -> FitResult:
+    """The result with the map of its sigma, where the profile has one."""
+    picture = pictures.get(f"{result.name}_sigma")
+    if picture is None:
+        return result
+    names, size = _SIGMA_CHANNELS[result.name], (picture.rows, picture.columns)
+    channels = _load_picture(picture, folder, names, size, _SIGMA_RANGE)
+    return replace(result, map_sigma=np.stack([channels[name] for name in names]).astype(np.float32))
+
+
+def _store_sigmas(profile: Profile, folder: Path) -> Iterator[StoredPicture]:
+    for result, unit, of in ((profile.wire, "1", "the wire map, relative"), (profile.backscatter, "e-/s", "the white")):
+        if result.map_sigma is not None:
+            channels = dict(zip(_SIGMA_CHANNELS[result.name], result.map_sigma, strict=True))
+            what = f"One standard deviation of {of}, RMS over each cell of an even grid over the sensor."
+            yield _store_picture(folder, f"{result.name}_sigma", channels, unit, what)
+
+
 def _store_pictures(profile: Profile, folder: Path) -> tuple[StoredPicture, ...]:
     mask = {name: profile.backscatter_mask[..., index] for index, name in enumerate("RGB")}
     atlas = psf_atlas(profile.psf.term, profile.rig)
@@ -134,6 +155,7 @@ def _store_pictures(profile: Profile, folder: Path) -> tuple[StoredPicture, ...]
             "e-/s",
             "Backscatter of an all-white panel, one sample per 2 x 2 cell of the sensor, before the wire.",
         ),
+        *_store_sigmas(profile, folder),
     )
 
 

@@ -1,16 +1,17 @@
-"""``profile.json``, format version 2, which docs/profile.md describes."""
+"""``profile.json``, format version 3, which docs/profile.md describes."""
 
 from __future__ import annotations
 
 from typing import Annotated, Final, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
+from udccal.result import Effort
 from udccal.rig import RigDescription
 from udccal.sessions.schema import Sha256, StoredCamera
 
 FORMAT: Final = "udccal-profile"
-VERSION: Final = 2
+VERSION: Final = 3
 # Arrays of at most this many values are stored in profile.json, where a person can read and compare them.
 INLINE_VALUES = 512
 
@@ -20,8 +21,16 @@ FileName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*\.exr$", max_length=10
 Sentence = Annotated[str, Field(max_length=2000)]
 Unit = Annotated[str, Field(max_length=40)]
 Sigma = Annotated[float, Field(ge=0)]
+Decibel = Annotated[float, Field(ge=-200, le=200)]
+Celsius = Annotated[float, Field(ge=-273.15, le=500)]
 Shape = Annotated[tuple[Annotated[int, Field(ge=0, le=2**24)], ...], Field(max_length=6)]
 DType = Literal["float64", "float32", "int64", "int32", "uint8", "bool"]
+
+
+def _rising(span: tuple[float, float]) -> tuple[float, float]:
+    if span[0] > span[1]:
+        raise ValueError(f"the lower of two numbers first, not {span[0]:g} and {span[1]:g}")
+    return span
 
 
 class _Strict(BaseModel):
@@ -102,7 +111,7 @@ class StoredArray(_Strict):
 class StoredPicture(_Strict):
     """A map evaluated from the terms, for viewing and for restoration."""
 
-    name: Literal["wire_map", "psf_atlas", "backscatter_white"]
+    name: Literal["wire_map", "psf_atlas", "backscatter_white", "wire_sigma", "backscatter_sigma"]
     file: FileName
     sha256: Sha256
     columns: Annotated[int, Field(ge=1, le=16384)]
@@ -111,13 +120,23 @@ class StoredPicture(_Strict):
     what: Sentence
 
 
+class StoredPrior(_Strict):
+    """What was known before the data: nominal value, tolerance as one standard deviation, and whether that decides."""
+
+    value: float
+    sigma: Sigma
+    decides: bool
+
+
 class StoredEstimate(_Strict):
-    """One named quantity of a fit with its unit and one standard deviation."""
+    """One named quantity of a fit with its unit and one standard deviation; ``what`` says in words what it is."""
 
     name: Annotated[str, Field(max_length=120)]
     value: float
     sigma: Sigma
     unit: Unit
+    what: Sentence
+    prior: StoredPrior | None
 
 
 class StoredCandidate(_Strict):
@@ -137,8 +156,30 @@ class StoredDiagnostic(_Strict):
     unit: Unit
 
 
+class StoredOutliers(_Strict):
+    """Samples left out by a rule: how many, and the first of their places."""
+
+    rule: Annotated[str, Field(max_length=400)]
+    count: Annotated[int, Field(ge=0, le=2**40)]
+    places: Annotated[tuple[Annotated[str, Field(max_length=200)], ...], Field(max_length=100)]
+
+
+class StoredCaptures(_Strict):
+    """The captures that a fit used; ``sha256`` is of the sorted checksums of their files, one a line."""
+
+    sha256: Sha256
+    files: Annotated[int, Field(ge=1, le=2**32)]
+    frames: Annotated[int, Field(ge=1, le=2**40)]
+    gain_dB: Annotated[tuple[Decibel, Decibel], AfterValidator(_rising)]
+    completed_at: tuple[Annotated[str, Field(max_length=40)], Annotated[str, Field(max_length=40)]]
+    temperature_C: Annotated[tuple[Celsius, Celsius], AfterValidator(_rising)] | None
+
+
 class StoredFit(_Strict):
-    """Evidence of a term's fit. ``covariance`` is the array, or null when the fit gave no covariance."""
+    """Evidence of a term's fit. ``covariance`` is the array, or null when the fit gave no covariance.
+
+    ``residuals`` has the columns x, y (px) and residual over sigma. Null says that something is not known.
+    """
 
     status: Annotated[str, Field(pattern=r"^[A-Z_]{1,40}$")]
     chi2_dof: Annotated[float, Field(ge=0)]
@@ -148,6 +189,10 @@ class StoredFit(_Strict):
     diagnostics: Annotated[tuple[StoredDiagnostic, ...], Field(max_length=20000)]
     notes: Annotated[tuple[Sentence, ...], Field(max_length=1000)]
     covariance: Numbers | StoredArray | None
+    outliers: Annotated[tuple[StoredOutliers, ...], Field(max_length=1000)] | None
+    residuals: Numbers | StoredArray | None
+    captures: StoredCaptures | None
+    effort: Effort | None
 
 
 class Section(_Strict):
@@ -193,10 +238,10 @@ class StoredProfile(_Strict):
     """The whole of ``profile.json``."""
 
     format: Literal["udccal-profile"]
-    version: Literal[2]
+    version: Literal[3]
     rig: RigDescription
     lineage: Lineage
     provenance: Provenance
     invalidated_by: Annotated[tuple[Sentence, ...], Field(max_length=100)]
     terms: Terms
-    pictures: Annotated[tuple[StoredPicture, ...], Field(max_length=3)]
+    pictures: Annotated[tuple[StoredPicture, ...], Field(max_length=5)]

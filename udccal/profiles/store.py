@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import tempfile
 from pathlib import Path
 
 from pydantic import ValidationError
@@ -11,8 +10,9 @@ from pydantic import ValidationError
 from udccal.errors import FileFormatError, ProfileError, RigError
 from udccal.io.atomic import write_atomically
 from udccal.io.links import is_plain_file
+from udccal.io.out_folder import storing_in
 from udccal.io.whole_folder import folder_beside, replace_whole, standing
-from udccal.profiles.archive import pack_archive, unpack_archive
+from udccal.profiles.archive import pack_archive, unpacked
 from udccal.profiles.encode import decode, encode
 from udccal.profiles.profile import Profile
 from udccal.profiles.provenance import MAX_JSON_BYTES, PROFILE_NAME
@@ -39,11 +39,41 @@ def write_profile(path: Path, profile: Profile) -> None:
     with folder_beside(path) as folder:
         stored = encode(profile, folder)
         write_atomically(folder / PROFILE_NAME, stored.model_dump_json(indent=1).encode() + b"\n")
-        if path.suffix == ".zip":
-            pack_archive(folder, folder / path.name)
-            replace_whole(folder / path.name, path)
-        else:
-            replace_whole(folder, path)
+        put(folder, path)
+
+
+def save_profile(profile: Profile, path: str | Path) -> Path:
+    """Write a profile as a folder, or as one file if ``path`` ends in ``.zip``, whole or not at all.
+
+    Args:
+        profile: what to write.
+        path: where to; a profile that is there is replaced, anything else is left alone.
+
+    Returns:
+        the path that was written.
+
+    Raises:
+        ProfileError: as ``write_profile``.
+        UdccalError: when it cannot be written.
+    """
+    target = Path(path)
+    with storing_in(target.parent):
+        write_profile(target, profile)
+    return target
+
+
+def put(folder: Path, path: Path) -> None:
+    """Move a profile's files to ``path``, as a folder or as one zip file, in place of what is there.
+
+    Args:
+        folder: of ``folder_beside(path)``, with a profile's files and nothing else.
+        path: where to; one zip file if it ends in ``.zip``.
+    """
+    if path.suffix == ".zip":
+        pack_archive(folder, folder / path.name)
+        replace_whole(folder / path.name, path)
+    else:
+        replace_whole(folder, path)
 
 
 def read_profile(path: Path) -> Profile:
@@ -73,11 +103,8 @@ def _identity(path: Path) -> int | None:
 
 
 def _read(path: Path) -> Profile:
-    if path.is_file():
-        with tempfile.TemporaryDirectory(prefix="udccal-") as folder:
-            unpack_archive(path, Path(folder))
-            return decode(read_stored(Path(folder)), Path(folder))
-    return decode(read_stored(path), path)
+    with unpacked(path) as folder:
+        return decode(read_stored(folder), folder)
 
 
 def load_profile(name_or_path: str | Path) -> Profile:
@@ -154,17 +181,15 @@ def check_replaceable(path: Path) -> None:
     if not path.exists() or (path.is_dir() and not any(path.iterdir())):
         return
     try:
-        if path.is_file():
-            with tempfile.TemporaryDirectory(prefix="udccal-") as folder:
-                unpack_archive(path, Path(folder))
-                read_stored(Path(folder))
-            return
-        stored = read_stored(path)
+        with unpacked(path, PROFILE_NAME) as folder:
+            stored = read_stored(folder)
     except ProfileError as error:
         raise ProfileError(
             f"Expected {path} to be free or to hold a profile that may be replaced, found something else ({error}) "
             "Choose another path."
         ) from error
+    if path.is_file():
+        return
     ours = {PROFILE_NAME, *stored_files(stored)}
     others = sorted(item.name for item in path.iterdir() if item.name not in ours)
     if others:
@@ -179,7 +204,6 @@ def stored_files(stored: StoredProfile) -> set[str]:
     files = {picture.file for picture in stored.pictures}
     for section in sections:
         files |= {array.file for array in section.arrays}
-        covariance = section.fit.covariance
-        if isinstance(covariance, StoredArray):
-            files.add(covariance.file)
+        evidence = (section.fit.covariance, section.fit.residuals)
+        files |= {array.file for array in evidence if isinstance(array, StoredArray)}
     return files

@@ -11,6 +11,7 @@ from typing import Any
 
 from udccal.errors import ProfileError
 from udccal.profiles.schema import FORMAT, VERSION
+from udccal.quantities import quantity
 
 # JSON before a schema applies to it: the only place where a profile is an untyped object.
 JsonObject = dict[str, Any]
@@ -85,8 +86,28 @@ def _renamed_entry(entry: Any, names: Mapping[str, str]) -> Any:
     return {**entry, "name": f"{group}{dot}{name}", **unit}
 
 
+def _second_to_third(found: JsonObject) -> JsonObject:
+    """Say what each estimate is; what was not kept before is null: priors, outliers, residuals, captures, effort."""
+    terms = found.get("terms")
+    if isinstance(terms, dict):
+        terms = {name: _third_section(name, section) for name, section in terms.items()}
+    return {**found, "version": 3, "terms": terms}
+
+
+def _third_section(term: str, section: Any) -> Any:
+    if not isinstance(section, dict) or not isinstance(section.get("fit"), dict):
+        return section
+    fit = {**section["fit"], **dict.fromkeys(("outliers", "residuals", "captures", "effort"))}
+    if isinstance(fit.get("estimates"), list):
+        fit["estimates"] = [
+            {**one, "what": quantity(term, str(one.get("name"))).what, "prior": None} if isinstance(one, dict) else one
+            for one in fit["estimates"]
+        ]
+    return {**section, "fit": fit}
+
+
 # By the version that a function starts from; it returns the next version.
-MIGRATIONS: Mapping[int, Migration] = {1: _first_to_second}
+MIGRATIONS: Mapping[int, Migration] = {1: _first_to_second, 2: _second_to_third}
 
 
 def migrated(

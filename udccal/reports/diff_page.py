@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from udccal.comparison.diff import ProfileDiff, TermDiff
+from udccal.comparison.diff import ProfileDiff, TermDiff, Verdict
 from udccal.comparison.maps import DifferenceMaps
 from udccal.reports.diff_figures import rays_figure, wire_difference_figure
 from udccal.reports.diff_tables import (
@@ -14,7 +14,13 @@ from udccal.reports.diff_tables import (
     notes,
 )
 from udccal.reports.figures import embedded_png
-from udccal.reports.page import DiffPage, DiffSection, Fact, Illustration
+from udccal.reports.page import Advice, DiffPage, DiffSection, Fact, Illustration
+
+_HEADLINES: dict[Verdict, str] = {
+    "same": "The profiles agree.",
+    "changed, harmless": "The profiles differ, but nobody would see it.",
+    "changed": "The profiles differ by more than is harmless.",
+}
 
 
 def diff_page(found: ProfileDiff, maps: DifferenceMaps) -> DiffPage:
@@ -33,9 +39,8 @@ def diff_page(found: ProfileDiff, maps: DifferenceMaps) -> DiffPage:
     }
     return DiffPage(
         title=f"Two profiles of {found.rig}",
-        verdict=found.advice,
+        advice=Advice(_HEADLINES[found.verdict], found.verdict.split()[-1], (found.advice,)),
         facts=(
-            Fact("verdict", found.verdict),
             Fact("A made", found.a.created_at),
             Fact("B made", found.b.created_at),
             Fact("lost by restoring with the other profile", f"{found.picture_dB_lost:.2f} dB"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from udccal.comparison.diff import ProfileDiff, TermDiff
 from udccal.comparison.movement import Moved, Movement
+from udccal.quantities import quantity
 from udccal.reports.tables import Table, number, spread
 
 
@@ -32,7 +33,12 @@ def effects_table(one: TermDiff) -> Table:
 def estimates_diff_table(one: TermDiff) -> Table:
     """Return all estimates of a term: A's value, B less A, and that in sigmas."""
     rows = tuple(
-        (f"{e.name} [{e.unit}]", number(e.a, e.sigma), number(e.difference, e.sigma), f"{e.difference / e.sigma:.1f}")
+        (
+            f"{quantity(one.term, e.name).plain} [{e.unit}]",
+            number(e.a, e.sigma),
+            number(e.difference, e.sigma),
+            f"{e.difference / e.sigma:.1f}",
+        )
         for e in one.estimates
     )
     return Table("Estimates", ("quantity", "A", "B − A", "in σ"), rows, frozenset({1, 2, 3}))
@@ -59,6 +65,8 @@ _PLAIN = {
 def movement_sentence(found: ProfileDiff) -> str:
     """Return who tells the movement, whether it is significant, and whether the terms agree on it."""
     moved = found.movement
+    if not moved.terms and all(one.same_captures for one in found.terms if one.dof):
+        return "Both profiles were fitted to the same captures: they tell no movement."
     if not moved.terms:
         return "No term of both profiles tells where the camera was."
     said = "No movement is seen" if moved.p_value >= found.limits.chance else "The camera moved"
@@ -78,15 +86,17 @@ def finding(one: TermDiff) -> str:
     if not one.dof:
         return "No estimate of this term has a covariance in both profiles: only the effects below are compared."
     largest = max(one.estimates, key=lambda e: abs(e.difference) / e.sigma)
+    name = quantity(one.term, largest.name).plain
     return (
-        f"χ² is {one.chi2:.4g} for {one.dof} estimates ({_probability(one.p_value)}); the farthest is {largest.name}, "
+        f"χ² is {one.chi2:.4g} for {one.dof} estimates ({_probability(one.p_value)}); the farthest is {name}, "
         f"{abs(largest.difference) / largest.sigma:.1f} σ."
     )
 
 
 def notes(one: TermDiff) -> tuple[str, ...]:
     """Return what a person should know of a term, with what chi-squared leaves out."""
-    left = (f"Not in χ², as no covariance is kept of it: {', '.join(one.not_covered)}.",) if one.not_covered else ()
+    names = ", ".join(quantity(one.term, name).plain for name in one.not_covered)
+    left = (f"Not in χ², as no covariance is kept of it: {names}.",) if names else ()
     return (*one.notes, *left)
 
 

@@ -2,17 +2,68 @@
 
 from __future__ import annotations
 
+from udccal.comparison.limits import DiffLimits
+from udccal.comparison.rig_state import RigState
+from udccal.quantities import quantity
 from udccal.reports.tables import Table, number, spread
-from udccal.result import FitResult
+from udccal.result import Estimate, FitResult
 
 MOST_ORDERS, MOST_CHOICES = 6, 16
 _NUMBERS = frozenset({1, 2})
 
 
 def estimates_table(title: str, result: FitResult) -> Table:
-    """Return a table with ``title`` of every estimate in ``result`` with its sigma and unit."""
-    rows = tuple((e.name, number(e.value, e.sigma), spread(e.sigma), e.unit) for e in result.estimates)
-    return Table(title, ("quantity", "value", "sigma", "unit"), rows, frozenset({1, 2}))
+    """Return a table with ``title`` of every estimate in ``result`` with its sigma and unit, and what was known before.
+
+    Elements of the term's arrays are left out: they mean nothing on their own.
+    """
+    rows = tuple(
+        (quantity(result.name, e.name).plain, number(e.value, e.sigma), spread(e.sigma), e.unit, _before(e), e.name)
+        for e in result.numbers
+    )
+    return Table(title, ("quantity", "value", "sigma", "unit", "before the data", "name"), rows, _NUMBERS)
+
+
+def meanings_table(result: FitResult) -> Table:
+    """Return a table of what each estimate is."""
+    meant = [(e.name, quantity(result.name, e.name)) for e in result.numbers]
+    return Table("What these are", ("quantity", "what it is", "name"), tuple((q.plain, q.what, n) for n, q in meant))
+
+
+def state_table(state: RigState) -> Table:
+    """Return the rig as found, from which terms, and whether they agree on it."""
+    agree = "agree" if state.agreement_p_value >= DiffLimits().chance else "do not agree"
+    chi2 = f" (they {agree}: χ² {state.agreement_chi2:.3g} of {state.agreement_dof})" if state.agreement_dof else ""
+    rows = tuple(
+        (quantity("rig", e.name).plain, number(e.value, e.sigma), spread(e.sigma), e.unit, _before(e))
+        for e in state.estimates
+    )
+    columns = ("quantity", "value", "sigma", "unit", "rig file")
+    return Table(f"The rig as found from {', '.join(state.terms)}{chi2}", columns, rows, frozenset({1, 2}))
+
+
+def captures_sentence(result: FitResult) -> str:
+    """Return what a fit used, as far as it is known; empty for a term that was not fitted."""
+    if result.unfitted:
+        return ""
+    used = result.captures
+    if used is None:
+        return f"What the {result.name} fit used and left out is not known: older profiles do not say so."
+    gains = " to ".join(dict.fromkeys(f"{gain:g}" for gain in used.gain_dB))
+    times = " to ".join(dict.fromkeys(used.completed_at))
+    effort = "" if result.effort in ("full", None) else f" Its effort was {result.effort}: a full fit may be better."
+    return (
+        f"The {result.name} fit used {used.frames} frames in {used.files} files, with a gain of {gains} dB, captured "
+        f"{times}.{effort}"
+    )
+
+
+def _before(one: Estimate) -> str:
+    """What was known before the data, and whether that decides."""
+    if one.prior is None:
+        return "–"
+    decides = ", decides" if one.by_prior else ""
+    return f"{one.prior.value:.4g} ± {one.prior.sigma:.2g}{decides}"
 
 
 def diagnostics_table(title: str, result: FitResult) -> Table:

@@ -32,6 +32,15 @@ class Illustration:
 
 
 @dataclass(frozen=True)
+class Advice:
+    """What a page begins with: a headline and at most three sentences; ``mood`` is a CSS class, such as good or bad."""
+
+    headline: str
+    mood: str
+    sentences: tuple[str, ...]
+
+
+@dataclass(frozen=True)
 class TermSection:
     """One term's chapter."""
 
@@ -48,8 +57,9 @@ class TermSection:
     @property
     def mood(self) -> str:
         """CSS class of the status: good, absent or bad."""
-        moods = {FitStatus.CONVERGED: "good", FitStatus.ABSENT: "absent", FitStatus.NOT_CAPTURED: "absent"}
-        return moods.get(self.status, "bad")
+        if self.status is FitStatus.CONVERGED:
+            return "good"
+        return "absent" if self.status in (FitStatus.ABSENT, FitStatus.NOT_CAPTURED, FitStatus.IMPORTED) else "bad"
 
 
 @dataclass(frozen=True)
@@ -59,7 +69,7 @@ class Page:
     template: ClassVar[str] = "report.html.j2"
 
     title: str
-    verdict: str
+    advice: Advice
     facts: tuple[Fact, ...]
     pictures: tuple[Illustration, ...]
     picture_sentence: str
@@ -92,7 +102,7 @@ class DiffPage:
     template: ClassVar[str] = "diff.html.j2"
 
     title: str
-    verdict: str
+    advice: Advice
     facts: tuple[Fact, ...]
     movement_sentence: str
     movement: Table

@@ -5,11 +5,14 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import UInt8
 
-from udccal.calibration import ORDER, Calibration
+from udccal.calibration import Calibration
+from udccal.comparison.rig_state import rig_state
 from udccal.reports import figures
 from udccal.reports.accuracy import accuracies
+from udccal.reports.advice import advice
 from udccal.reports.board_views import board_evidence
 from udccal.reports.evidence import photon_transfer
+from udccal.reports.fit_tables import state_table
 from udccal.reports.maps import fitted_maps
 from udccal.reports.page import Fact, Illustration, Page
 from udccal.reports.pictures import PictureComparison
@@ -77,32 +80,17 @@ def calibration_page(session: Session, evidence: Evidence, scene: PictureCompari
         Fact("fits", ", ".join(f"{t.term} {t.seconds:.1f} s" for t in calibration.times)),
     )
     tables = (truth_table(evidence.rows),) if evidence.rows else ()
+    if all(result.usable for result in calibration.results) and (state := rig_state(calibration)).terms:
+        tables = (state_table(state), *tables)
     return Page(
         title=f"Calibration of {calibration.rig.name}",
-        verdict=verdict(calibration),
+        advice=advice(calibration),
         facts=facts,
         pictures=() if scene is None else scene_illustrations(scene),
         picture_sentence="" if scene is None else scene_sentence(scene),
         tables=tables,
         sections=sections(evidence),
     )
-
-
-def verdict(calibration: Calibration) -> str:
-    """Return the headline: which of the captured terms can be used, and which were not captured."""
-    bad = [term for term in ORDER if not calibration.result(term).usable]
-    doubtful = [term for term in ORDER if calibration.result(term).warning]
-    missing = calibration.not_captured
-    captured = [term for term in ORDER if term not in missing]
-    if bad:
-        said = f"Not usable: {', '.join(bad)}. Each section says what to do."
-    elif doubtful:
-        said = f"Usable with care: {', '.join(doubtful)}. Each section says why; the error bars include it."
-    elif not missing:
-        said = "All five terms can be used."
-    else:
-        said = f"{len(captured)} of {len(ORDER)} terms measured, and can be used: {', '.join(captured) or 'none'}."
-    return f"{said} Not captured: {', '.join(missing)}." if missing else said
 
 
 def scene_sentence(scene: PictureComparison) -> str:

@@ -7,14 +7,17 @@ from dataclasses import dataclass
 from matplotlib.figure import Figure
 
 from udccal.calibration import ORDER, Calibration
+from udccal.quantities import quantity
 from udccal.reports import figures, fit_figures
 from udccal.reports.accuracy import Accuracy, accuracy_table, forecast_sentence
 from udccal.reports.board_views import BoardEvidence
 from udccal.reports.evidence import PhotonTransfer
 from udccal.reports.fit_tables import (
     candidates_table,
+    captures_sentence,
     diagnostics_table,
     estimates_table,
+    meanings_table,
     more_orders,
     orders_table,
     outliers_table,
@@ -63,7 +66,7 @@ def sections(evidence: Evidence) -> tuple[TermSection, ...]:
 def _section(term: TermName, evidence: Evidence) -> TermSection:
     result = evidence.calibration.result(term)
     shown = () if result.unfitted else (*_illustrations(term, evidence), *_quality(term, evidence))
-    details = [diagnostics_table("Diagnostics of the fit", result)]
+    details = [meanings_table(result), diagnostics_table("Diagnostics of the fit", result)]
     estimates = estimates_table("Fitted", result)
     shown_tables = _numbers(term, evidence)
     if len(estimates.rows) > _LONGEST_LIST:
@@ -83,7 +86,7 @@ def _section(term: TermName, evidence: Evidence) -> TermSection:
         illustrations=shown,
         tables=shown_tables,
         details=tuple(details) if result.samples else (),
-        notes=result.notes,
+        notes=tuple(filter(None, (*result.notes, captures_sentence(result)))),
     )
 
 
@@ -104,11 +107,12 @@ def _finding(term: TermName, evidence: Evidence) -> str:
     if not result.estimates:
         return "Nothing was fitted."
     if accuracy is not None and term != "noise":
-        quantity = accuracy.forecast.quantity
-        return f"{quantity.meaning[0].upper()}{quantity.meaning[1:]}: sigma {accuracy.sigma:.2g} {quantity.unit}."
+        told = accuracy.forecast.quantity
+        return f"{told.meaning[0].upper()}{told.meaning[1:]}: sigma {accuracy.sigma:.2g} {told.unit}."
     first = result.estimates[0]
     unit = "" if first.unit == "1" else f" {first.unit}"
-    return f"{first.name} = {number(first.value, first.sigma)} ± {spread(first.sigma)}{unit}."
+    name = quantity(term, first.name).plain
+    return f"{name[0].upper()}{name[1:]}: {number(first.value, first.sigma)} ± {spread(first.sigma)}{unit}."
 
 
 def _illustrations(term: TermName, evidence: Evidence) -> tuple[Illustration, ...]:

@@ -11,6 +11,7 @@ from udccal.calibration import Calibration
 from udccal.kernels import kernel_size
 from udccal.models.geometry import Geometry, project
 from udccal.numerics import in_float64
+from udccal.quantities import quantity
 from udccal.reports.maps import TermMaps
 from udccal.reports.tables import Table, number, spread
 from udccal.reports.true_values import true_values
@@ -81,7 +82,7 @@ def truth_table(rows: tuple[TruthRow, ...]) -> Table:
     text = tuple(
         (
             row.term,
-            row.quantity,
+            quantity(row.term, row.quantity).plain,
             "–" if row.fitted is None else number(row.fitted, row.sigma),
             "–" if row.truth is None else number(row.truth, row.sigma),
             f"{row.error:.2g}",

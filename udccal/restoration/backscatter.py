@@ -226,10 +226,12 @@ class PanelMask:
     Attributes:
         white: backscatter of a white panel in e-/s.
         cfa: the camera's colour pattern.
+        error: sigma of the light over the light, as the calibration states it; 0 when it does not.
     """
 
     white: Float32[np.ndarray, "rows columns"]
     cfa: Cfa
+    error: float = 0.0
 
     @functools.cached_property
     def _possible(self) -> list[Float32[np.ndarray, "down across"]]:

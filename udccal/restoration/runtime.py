@@ -21,6 +21,7 @@ from udccal.models.psf import PsfField
 from udccal.profiles.profile import Profile
 from udccal.profiles.store import load_profile
 from udccal.restoration.backscatter import PanelLight, PanelMask, mask_mosaic, refuse_excess
+from udccal.restoration.dark_places import plausible
 from udccal.restoration.demosaic import demosaic
 from udccal.restoration.kernel_grid import KernelGrid
 from udccal.restoration.linear import saturated, to_electrons, variance_e2, without_defects
@@ -111,6 +112,7 @@ class Restorer:
         rectification = Rectification.within(geometry, view, camera.columns, camera.rows)
         quick = tier is Tier.preview
         unscattered = profile.backscatter.unfitted
+        error = profile.backscatter.diagnostic("held_out_without_noise_of_peak") or 0.0
         unblurred = quick or profile.psf.unfitted
         even = profile.wire.unfitted and bool(np.all(profile.wire_map == 1.0))
         return cls(
@@ -121,7 +123,7 @@ class Restorer:
             wire=None if even else profile.wire_map,
             mask=None
             if unscattered
-            else PanelMask(mask_mosaic(profile.backscatter_mask, cfa, camera.rows, camera.columns), cfa),
+            else PanelMask(mask_mosaic(profile.backscatter_mask, cfa, camera.rows, camera.columns), cfa, error),
             panel=None
             if quick or unscattered
             else PanelLight.of(profile.backscatter.term, rig, options.panel_block, keep),
@@ -161,14 +163,18 @@ class Restorer:
         if self.wire is not None:
             signal /= self.wire
             variance /= self.wire**2
+        panel_error_e: Mosaic | None = None
         if self.mask is not None:
             panel_e = self._panel_light_e(signal, self.mask, exposure_s, panel_picture)
             if panel_picture is not None:
                 refuse_excess(signal, panel_e, saturated(mosaic, self.noise))
             signal -= panel_e
+            panel_error_e = np.float32(self.mask.error) * panel_e
         if self.sharpener is None:
             return self._on_view(demosaic(signal, self.rig.camera.cfa), exposure_s)
         sharp = self.sharpener.apply(signal, variance)
+        if panel_error_e is not None:
+            sharp = plausible(sharp, panel_error_e[self.sharpener.rows])
         linear = self._strip_rectification.apply(sharp, self.options.interpolation)
         linear /= np.float32(exposure_s)
         return linear

@@ -174,6 +174,10 @@ class SessionWriter:
                 )
         self.again = self.again.union(step_ids)
 
+    def keep_captured(self, step_ids: Collection[str]) -> None:
+        """Leave captured steps as they are, after all, where they were to be captured once more."""
+        self.again -= frozenset(step_ids)
+
     def step(self, step_id: str) -> StoredStep | None:
         """Return a step that was captured (its files may be damaged), or None."""
         return next((step for step in self.manifest.steps if step.id == step_id), None)

@@ -116,12 +116,12 @@ class Errors:
 def errors(fit: FitResult[Wire], truth: Wire, used: Bounds, every: Bounds) -> Errors:
     """Estimate minus truth, sigma, bounds."""
     result = fit.or_raise()
-    found = np.array([e.value for e in result.estimates])
+    found = np.array([e.value for e in result.numbers])
     off = found - shape_values(truth)
     off[4:6] -= np.round(off[4:6])
     whole = map_at(truth, _grid(192, 256)).mean()
     error = map_at(result.term, places()) - map_at(truth, places()) / whole
-    stated = np.array([e.sigma for e in result.estimates])
+    stated = np.array([e.sigma for e in result.numbers])
     shape, sigma = np.stack([off, stated, used[0], every[0]]), map_sigma(result, places())
     return Errors(shape, np.stack([error, sigma, used[1], every[1]]))
 

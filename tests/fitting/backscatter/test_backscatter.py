@@ -149,6 +149,25 @@ def test_what_the_simulator_was_built_with_is_found(fitted: FitResult[Backscatte
     assert all(e.sigma >= 0 for e in fitted.estimates)
 
 
+def test_the_map_of_sigma_is_below_that_of_white_alone(data: BackscatterData, fitted: FitResult[Backscatter]) -> None:
+    """All pictures help: the mask is better known than by the frames of white, by at most their number."""
+    assert fitted.map_sigma is not None
+    assert fitted.map_sigma.shape[0] == 3
+    white = np.sqrt(data.shots.variance(data.shots.rate)[0])
+    ratio = float(np.median(fitted.map_sigma) / np.median(white))
+    assert (len(SHOWN) + 1) ** -0.5 < ratio < 1.0
+
+
+def test_what_was_known_before_is_the_rig_file(fitted: FitResult[Backscatter]) -> None:
+    standoff, gamma = (fitted.estimate(name) for name in ("standoff_mm", "gamma"))
+    assert standoff.prior is not None
+    assert gamma.prior is not None
+    assert standoff.prior.value == pytest.approx(RIG.mounting.standoff_mm.value)
+    assert standoff.prior.sigma == pytest.approx(RIG.mounting.standoff_mm.tolerance + 0.1)
+    assert gamma.prior.value == pytest.approx(RIG.panel.gamma.value)
+    assert not gamma.by_prior
+
+
 def test_the_candidate_of_the_largest_evidence_is_chosen(fitted: FitResult[Backscatter]) -> None:
     assert sum(c.chosen for c in fitted.candidates) == 1
     chosen = next(c for c in fitted.candidates if c.chosen)

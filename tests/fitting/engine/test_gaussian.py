@@ -43,6 +43,27 @@ def test_sigma_of_a_curved_function_is_that_of_its_draws() -> None:
     assert abs(alone.sigma_of(f)[1] / drawn[1] - 1) > 0.03
 
 
+def test_a_propagated_function_has_value_sigma_and_covariance() -> None:
+    slopes = np.array([[1.0, 0.0, 0.0], [1.0, 100.0, 3.0]])
+    found = _posterior().propagate(lambda x: slopes @ x)
+    assert found.value == pytest.approx(slopes @ [10.0, 0.02, 5.0])
+    assert found.cov == pytest.approx(slopes @ COV @ slopes.T, rel=1e-9)
+    assert found.sigma == pytest.approx(_posterior().sigma_of(lambda x: slopes @ x), rel=1e-12)
+    number = _posterior().propagate(lambda x: x[0] * x[1])
+    assert (number.value.shape, number.sigma.shape, number.cov.shape) == ((), (), (1, 1))
+    assert number.sigma == pytest.approx(np.sqrt([0.02, 10.0] @ COV[:2, :2] @ [0.02, 10.0]), rel=1e-6)
+    # Of a function that two correlated parameters enter, the sigma is not that of independent ones.
+    assert abs(number.sigma / np.hypot(0.02 * 2.0, 10.0 * 1e-3) - 1) > 0.1
+
+
+def test_a_propagated_map_keeps_its_shape() -> None:
+    found = _posterior().propagate(lambda x: np.outer(x, x))
+    assert found.value.shape == found.sigma.shape == (3, 3)
+    assert found.cov.shape == (9, 9)
+    certain = Posterior(np.zeros(2), np.zeros((2, 2)), lambda x: x).propagate(lambda x: x)
+    assert certain.cov == pytest.approx(np.zeros((2, 2)))
+
+
 def test_parameters_of_unlike_size_keep_their_digits() -> None:
     cov = np.array([[1e18, 3e5], [3e5, 1e-6]])
     root = square_root(cov)
@@ -58,5 +79,6 @@ def test_directions_without_information_have_no_inverse() -> None:
 def test_results_answer_for_functions_of_their_term_or_say_why_not() -> None:
     fitted = FitResult("wire", np.zeros(3), FitStatus.CONVERGED, (), COV, 1.0, 9, posterior=_posterior())
     assert fitted.sigma_of(lambda x: x[:1]) == pytest.approx([2.0])
+    assert fitted.propagate(lambda x: x[:1]).sigma == pytest.approx([2.0])
     with pytest.raises(FitError, match="wire fit with a posterior, found none"):
         FitResult.failed("wire", np.zeros(3), FitStatus.TOO_DARK, "No light.").sigma_of(lambda x: x)

@@ -147,6 +147,9 @@ def test_one_board_on_the_jig_tells_the_tilt_when_the_lens_is_known_beforehand()
     tilt = result.estimate("tilt_deg")
     assert abs(tilt.value - TILT_DEG) < 4 * tilt.sigma
     assert 0.1 < tilt.sigma < 1.5  # 3 px of the centre are 0.6 degrees
+    assert tilt.prior is None
+    assert [e.prior.sigma for e in result.estimates if e.prior] == pytest.approx(sigma.tolist())
+    assert result.estimate("k3").by_prior  # one board says nothing of it
 
 
 def test_the_rig_says_what_its_lens_may_be() -> None:

@@ -107,7 +107,12 @@ def test_a_grating_is_predicted_where_it_was_not_captured(grating: Fitted) -> No
     assert grating.worst_l2 < 0.03
     assert grating.result.estimate("row_open").value == pytest.approx(0.3917, abs=0.004)
     assert all(estimate.sigma > 0 for estimate in grating.result.estimates)
-    assert grating.result.cov.shape == (6, 6)
+    assert grating.result.cov.shape == (7, 7)
+    sigmas = [estimate.sigma for estimate in grating.result.estimates]
+    np.testing.assert_allclose(np.sqrt(np.diag(grating.result.cov)), sigmas)
+    # The rig file alone tells the pitch.
+    assert grating.result.estimate("pitch_mm").by_prior
+    assert not grating.result.estimate("row_open").by_prior
     # One of the wire's phase, one of the residual's orders, and how far light reaches along rows and along columns.
     assert [c.chosen for c in grating.result.candidates][:2] == [True, False]
     assert sum(candidate.chosen for candidate in grating.result.candidates) == 4

@@ -106,6 +106,46 @@ def test_shape_errors_are_as_large_as_claimed(bench: Bench, fitted: FitResult[Wi
 
 
 @pytest.mark.medium
+def test_every_fitted_element_of_the_term_is_an_estimate(fitted: FitResult[Wire]) -> None:
+    """With its sigma and its place in the covariance: the posterior's own terms scatter by as much."""
+    assert fitted.posterior is not None
+    assert fitted.cov.shape == (len(fitted.estimates),) * 2
+    elements = [one for one in fitted.estimates if "." in one.name]
+    assert len(elements) >= 15
+    assert len(fitted.numbers) == 10
+    draws = fitted.posterior.draws(np.random.default_rng(3), 400)
+
+    def element(term: Wire, name: str) -> float:
+        array, *place = name.split(".")
+        return float(np.asarray(getattr(term, array))[tuple(map(int, place))])
+
+    for one in elements[:3] + elements[-8:]:
+        assert one.value == pytest.approx(element(fitted.term, one.name), abs=1e-12), one.name
+        scatter = np.std([element(draw, one.name) for draw in draws])
+        assert scatter == pytest.approx(one.sigma, rel=0.15), one.name
+
+
+@pytest.mark.medium
+def test_the_map_of_sigma_is_the_posteriors(fitted: FitResult[Wire]) -> None:
+    assert fitted.map_sigma is not None
+    assert fitted.map_sigma.shape == (1, 16, 16)
+    every = fitted.sigma_of(lambda wire: np.asarray(wire_map(wire, ROWS, COLUMNS)))
+    cells = every.reshape(16, ROWS // 16, 16, COLUMNS // 16).swapaxes(1, 2).reshape(16, 16, -1)
+    np.testing.assert_allclose(fitted.map_sigma[0], np.sqrt(np.mean(cells**2, axis=2)), rtol=0.3)
+    stated = next(d.value for d in fitted.diagnostics if d.name == "wire_map_rms_sigma")
+    assert 100 * float(np.sqrt(np.mean(fitted.map_sigma**2))) == pytest.approx(stated, rel=1e-5)
+
+
+@pytest.mark.medium
+def test_estimates_say_what_was_known_before(fitted: FitResult[Wire]) -> None:
+    opening = fitted.estimate("row_open")
+    assert opening.prior is not None
+    assert (opening.prior.value, opening.prior.sigma) == pytest.approx((0.40, 0.04))
+    assert not opening.by_prior
+    assert fitted.estimate("offset_x_periods").prior is None
+
+
+@pytest.mark.medium
 def test_hot_pixels_are_left_out_and_listed(bench: Bench, fitted: FitResult[Wire]) -> None:
     left_out = next(d.value for d in fitted.diagnostics if d.name == "pixels_left_out")
     signal, _ = flat_of(bench.truth, 1)

@@ -54,9 +54,9 @@ def test_map_and_shape_are_within_their_errors_from_a_start_that_is_a_fifth_off(
     )
     fit = fitted(flat, wrong, geometry())
     result = fit.or_raise()
-    off = np.array([e.value for e in result.estimates]) - shape_values(flat.truth)
+    off = np.array([e.value for e in result.numbers]) - shape_values(flat.truth)
     off[4:6] -= np.round(off[4:6])
-    assert np.all(np.abs(off) < 4 * np.array([e.sigma for e in result.estimates]))
+    assert np.all(np.abs(off) < 4 * np.array([e.sigma for e in result.numbers]))
     error = map_at(result.term, places()) - map_at(flat.truth, places())
     assert np.all(np.abs(error) < 4.5 * map_sigma(fit, places()))
     assert columns_kept(result) == _PLAIN
@@ -70,10 +70,10 @@ def test_openings_without_sharp_edges_are_found_and_told(seed: int, sharpness: f
     truth = drawn_truth(seed, start(), geometry(), sharpness=sharpness)
     result = fitted(noisy(truth, seed), start(), geometry())
     assert result.status is FitStatus.CONVERGED
-    sigmas = np.array([e.sigma for e in result.estimates])
+    sigmas = np.array([e.sigma for e in result.numbers])
     begun = shape_values(drawn_truth(seed, start(), geometry(), sharpness=sharpness))[3] - start().standoff_per_pitch
     assert abs(begun) > 10 * sigmas[3]
-    off = np.array([e.value for e in result.estimates]) - shape_values(truth)
+    off = np.array([e.value for e in result.numbers]) - shape_values(truth)
     off[4:6] -= np.round(off[4:6])
     assert np.all(np.abs(off) < 4.5 * sigmas)
     error = map_at(result.term, places()) - map_at(truth, places())

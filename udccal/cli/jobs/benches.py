@@ -10,27 +10,28 @@ from udccal.benches.bench import CaptureBench
 from udccal.cameras.choice import mode_for
 from udccal.cameras.protocol import Camera
 from udccal.cameras.step_folders import StepFolders
-from udccal.cli.jobs.person import PersonStage
+from udccal.cli.jobs.guided import show_on_panel
 from udccal.cli.output import Output
 from udccal.displays.manual import ManualDisplay
 from udccal.displays.mirrored import MirroredDisplay
 from udccal.displays.protocol import Display, PanelSize
+from udccal.guide.events import Person
+from udccal.guide.people import ByHand
 from udccal.rig import RigDescription
 from udccal.sessions.writer import utc_now
 
 
 @contextmanager
-def real_bench(output: Output, rig: RigDescription, camera: Camera, display: Display) -> Iterator[CaptureBench]:
-    """Open a real camera and display, with the person at the rig as the stage.
+def real_bench(rig: RigDescription, camera: Camera, display: Display) -> Iterator[CaptureBench]:
+    """Open a real camera and display; the person who is led sets everything else up.
 
     Raises:
         CameraError: when the camera cannot be opened, or has no pixel format that fits the rig.
         DisplayError: when the display cannot be opened.
     """
-    person = PersonStage(output)
     with camera, display:
         camera.set_mode(mode_for(camera.features, camera.sensor, rig.camera.cfa, rig.camera.bits))
-        yield CaptureBench(rig, camera, MirroredDisplay(display), person, utc_now, person.try_again)
+        yield CaptureBench(rig, camera, MirroredDisplay(display), ByHand(), utc_now)
 
 
 @contextmanager
@@ -50,7 +51,7 @@ def files_bench(output: Output, rig: RigDescription, root: Path, pictures: Path)
     folders = StepFolders(root, rig.camera.cfa, rig.camera.bits)
     display = MirroredDisplay(ManualDisplay(pictures, panel_size(rig), output.say, lambda question: True))
     with folders.camera as camera, display:
-        yield CaptureBench(rig, camera, display, folders, utc_now, lambda sentence: False)
+        yield CaptureBench(rig, camera, display, folders, utc_now)
 
 
 def u3v_camera(serial: str | None) -> Camera:
@@ -79,10 +80,7 @@ def window_display(rig: RigDescription, monitor: int) -> Display:
     return WindowDisplay(monitor, panel_size(rig))
 
 
-def manual_display(output: Output, rig: RigDescription, folder: Path) -> Display:
-    """Return a panel that the person at the rig operates, with its pictures in a folder."""
-
-    def confirm(question: str) -> bool:
-        return output.choose(f"{question} (Enter for yes, n for no)", ("", "n")) != "n"
-
-    return ManualDisplay(folder, panel_size(rig), output.say, confirm)
+def manual_display(rig: RigDescription, folder: Path, person: Person) -> Display:
+    """Return a panel that the person who is led operates, with its pictures in a folder."""
+    asked: list[str] = []
+    return ManualDisplay(folder, panel_size(rig), asked.append, lambda question: show_on_panel(person, asked[-1]))

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence, Set
+from collections.abc import Collection, Iterator, Sequence, Set
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
+from typing import final
 
 from udccal.benches.bench import CaptureBench
 from udccal.benches.capture import TERMS, capture_term
@@ -15,41 +18,72 @@ from udccal.sessions.store import Session
 from udccal.sessions.writer import SessionWriter
 
 
-def capture_watched(
-    output: Output,
-    bench: CaptureBench,
-    path: Path,
-    terms: Sequence[TermName],
-    exchanged: Set[Exchanged] = frozenset(),
-    again: Collection[str] = (),
-) -> None:
-    """Capture a session with one stage per term.
+@final
+@dataclass(frozen=True)
+class Wanted:
+    """What is to be captured.
 
-    Args:
-        output: shows stages and messages.
-        bench: camera, display and stage.
-        path: folder of the session.
+    Attributes:
+        session: its folder.
         terms: terms to capture.
         exchanged: parts of the rig that were exchanged on purpose since the session began.
         again: ids of captured steps to capture once more; each stays until its new captures are whole.
+    """
+
+    session: Path
+    terms: Sequence[TermName]
+    exchanged: Set[Exchanged] = frozenset()
+    again: Collection[str] = ()
+
+    @property
+    def pictures(self) -> Path:
+        """Folder beside the session for pictures that a person shows on the panel."""
+        session = self.session.resolve()
+        return session.with_name(f"{session.name}-pictures")
+
+
+def capture_watched(output: Output, bench: CaptureBench, wanted: Wanted) -> None:
+    """Capture a session with one stage per term.
 
     Raises:
         UdccalError: as ``udccal.benches.capture.capture`` does.
-        SessionError: when a step of ``again`` was not captured, or is none of the terms' steps.
+        SessionError: as ``open_session`` and ``refuse_unknown`` do.
     """
-    if again:
-        _check_captured(Session.open(path), again, terms)
-    with SessionWriter.create_or_resume(path, bench.rig, bench.camera.identity, exchanged, bench.now) as writer:
-        _say_damage(output, writer)
-        writer.capture_again(again)
-        for term in (name for name in TERMS if name in terms):
+    with open_session(output, bench, wanted) as writer:
+        for term in (name for name in TERMS if name in wanted.terms):
             with output.stage(f"capturing {term}") as stage:
                 capture_term(writer, bench, term, stage.update)
-        if writer.again:
-            raise SessionError(
-                f"Expected the rig's procedures to have the steps {', '.join(sorted(writer.again))} of {path}, found "
-                "none with these names. They stay as they are."
-            )
+        refuse_unknown(writer)
+
+
+@contextmanager
+def open_session(output: Output, bench: CaptureBench, wanted: Wanted) -> Iterator[SessionWriter]:
+    """Begin or continue a session, and say what is damaged in it.
+
+    Raises:
+        SessionError: when a step of ``wanted.again`` was not captured, or is of another term; also from the session.
+    """
+    if wanted.again:
+        _check_captured(Session.open(wanted.session), wanted.again, wanted.terms)
+    with SessionWriter.create_or_resume(
+        wanted.session, bench.rig, bench.camera.identity, wanted.exchanged, bench.now
+    ) as writer:
+        _say_damage(output, writer)
+        writer.capture_again(wanted.again)
+        yield writer
+
+
+def refuse_unknown(writer: SessionWriter) -> None:
+    """Refuse steps that were to be captured again and that no procedure has come to.
+
+    Raises:
+        SessionError: when there are any.
+    """
+    if writer.again:
+        raise SessionError(
+            f"Expected the rig's procedures to have the steps {', '.join(sorted(writer.again))} of {writer.path}, "
+            "found none with these names. They stay as they are."
+        )
 
 
 def _check_captured(session: Session, again: Collection[str], terms: Sequence[TermName]) -> None:

@@ -5,9 +5,11 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from udccal.cli.calibrate import BenchOptions
-from udccal.cli.jobs.capture import capture_watched
+from udccal.cli.jobs.capture import Wanted
+from udccal.cli.jobs.guided import led_by
+from udccal.cli.jobs.terminal import TerminalPerson
 from udccal.cli.output import Output, plain
+from udccal.cli.rig_on import RigOn
 from udccal.compilation import keep_compilations
 from udccal.drift.check import check_rig
 from udccal.drift.short import short_rig
@@ -20,13 +22,18 @@ from udccal.reports.page import write_page
 from udccal.sessions.store import Session
 
 
-def check_profile(output: Output, path: Path, options: BenchOptions, out: Path, update: Path | None) -> bool:
+def check_profile(
+    output: Output, path: Path, rig_on: RigOn, agree: bool, out: Path, update: Path | None
+) -> bool | None:
     """Capture, compare and print; return whether the rig is the same, or changed by less than matters.
+
+    None when the person at the rig has stopped the capture.
 
     Args:
         output: shows the changes.
         path: folder or zip file of the profile, or a rig's name.
-        options: where the rig is.
+        rig_on: where the rig is.
+        agree: whether a capture that a person is led through goes on by itself wherever all is in order.
         out: folder for ``session``, ``check.json`` and ``check.html``.
         update: path of a new profile with what changed; None for none.
 
@@ -43,8 +50,9 @@ def check_profile(output: Output, path: Path, options: BenchOptions, out: Path, 
         check_writable(update.parent)
     profile = load_profile(path)
     rig, folder = short_rig(profile.rig), out / "session"
-    with options.opened(output, rig, folder) as bench:
-        capture_watched(output, bench, folder, ("wire", "backscatter"))
+    person = led_by(output, TerminalPerson(output), agree) if rig_on.real else None
+    if not rig_on.capture(output, rig, Wanted(folder, ("wire", "backscatter")), person):
+        return None
     with output.stage("comparing"):
         found, solved = check_rig(profile, Session.open(folder))
     output.answer(found.advice)

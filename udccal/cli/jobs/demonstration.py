@@ -14,7 +14,7 @@ from jaxtyping import Float, UInt8
 from udccal.benches.bench import simulated_bench, simulated_rig
 from udccal.benches.photograph import capture_photograph
 from udccal.calibration import ORDER, Foundation, fit_foundation
-from udccal.cli.jobs.capture import capture_watched
+from udccal.cli.jobs.capture import Wanted, capture_watched
 from udccal.cli.jobs.fit import UNSEEN_PICTURE, run_fits, show_status, store_profile
 from udccal.cli.output import Output, StageTime
 from udccal.compilation import compilation_clock, keep_compilations
@@ -90,10 +90,10 @@ def demonstrate(output: Output, rig_name: str, out: Path, seed: int) -> None:
         # In parallel with the captures: first what only the simulated world needs, then the fits of complete terms, at
         # last the data of the report.
         pool.submit(lambda: (world.light.blur, world.light.backscatterer))
-        capture_watched(output, bench, out / "session", _EARLY)
+        capture_watched(output, bench, Wanted(out / "session", _EARLY))
         foundation = pool.submit(fit_foundation, Session.open(out / "session"), effort=QUICK)
         pool.submit(lambda: _prepare_kernels(rig, foundation.result()))
-        capture_watched(output, bench, out / "session", [term for term in ORDER if term not in _EARLY])
+        capture_watched(output, bench, Wanted(out / "session", [term for term in ORDER if term not in _EARLY]))
         session = Session.open(out / "session")
         calibration = run_fits(output, session, QUICK, foundation.result())
         show_status(output, calibration)

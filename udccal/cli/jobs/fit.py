@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from udccal.calibration import ORDER, Calibration, Foundation, calibrate
@@ -17,11 +17,12 @@ from udccal.errors import FitError, UdccalError
 from udccal.fitting.engine.iteration_log import LOG
 from udccal.io.links import refuse_links
 from udccal.io.out_folder import check_writable, storing_in
+from udccal.profiles.history import identity
 from udccal.profiles.profile import Profile
 from udccal.profiles.store import check_replaceable, read_profile
 from udccal.refit import refit
 from udccal.reports.page import write_page
-from udccal.reports.report import calibration_page, gather, verdict
+from udccal.reports.report import calibration_page, gather
 from udccal.reports.tables import Table
 from udccal.sessions.schema import TermName
 from udccal.sessions.store import Session
@@ -75,6 +76,7 @@ def fit_to_profile(
     check_replaceable(profile_path)
     check_writable(profile_path.parent)
     before = read_profile(profile_path) if terms else None
+    parent = identity(profile_path).sha256 if terms else None
     keep_compilations()
     clock = compilation_clock()
     session = Session.open(session_path)
@@ -85,6 +87,7 @@ def fit_to_profile(
         )
     with _iterations_to(log):
         calibration = run_fits(output, session) if before is None else run_some(output, session, before, terms)
+    calibration = replace(calibration, parent=parent)
     profile_path = profile_path.resolve()
     report = profile_path.with_name(f"{profile_path.name.removesuffix('.zip')}-report.html")
     with output.stage("report"):
@@ -100,7 +103,9 @@ def fit_to_profile(
     except FitError as error:
         raise FitError(f"{error} No profile was written; the report {report} shows every term.") from error
     output.say(f"Compilation took {clock.seconds:.1f} s of this (less in the next run)")
-    output.say(f"Profile: {profile_path}\nReport: {report}\n{verdict(calibration)}")
+    output.say(f"Profile: {profile_path}\nReport: {report}\n{page.advice.headline}")
+    for sentence in page.advice.sentences:
+        output.say(sentence)
     for warning in calibration.warnings:
         output.say(warning)
     ended, times = summaries(calibration), tuple(output.times)

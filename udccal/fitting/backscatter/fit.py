@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import final
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Float32, Int
 
 from udccal.fitting.absent import absent_backscatter
 from udccal.fitting.backscatter.data import BackscatterData, Binned, grid_rays
@@ -27,19 +27,19 @@ from udccal.fitting.backscatter.parameters import (
     NAMES,
     OFFSET,
     PUPIL,
-    UNITS,
     BackscatterRules,
     Moments,
     Vector,
     footprint_per_pupil,
     linear_of,
     linear_slope,
+    nominal_of,
     with_linear,
 )
 from udccal.fitting.backscatter.solve import Problem, Profile
 from udccal.fitting.engine.gaussian import Posterior, square_root
 from udccal.fitting.engine.misfit import MisfitTest
-from udccal.fitting.engine.report import estimates, residual_sample
+from udccal.fitting.engine.report import coarse, estimates, priors_of, residual_sample
 from udccal.fitting.engine.robust import outliers
 from udccal.models.backscatter import Backscatter
 from udccal.models.geometry import Geometry
@@ -49,6 +49,8 @@ from udccal.rig import RigDescription
 
 # Interpolation never combines bins at this distance.
 _TILE = 4
+# Cells of the map of sigma, down and across.
+_CELLS = 48
 
 
 @in_float64
@@ -112,16 +114,17 @@ def result_of(found: Found, data: BackscatterData, rig: RigDescription, clipped:
     moved = np.where(np.isin(np.arange(len(NAMES)), [DISTANCE, PUPIL, DEPTH]), values.mean, 0.0)
     scale[PUPIL] = 1 / footprint_per_pupil(rig)
     cov = (values.cov + (pitch.tolerance / pitch.value) ** 2 * np.outer(moved, moved)) * np.outer(scale, scale)
+    priors = priors_of(NAMES, *(part * scale for part in nominal_of(found.problem.prior)))
     posterior = term_posterior(data, found, np.maximum(wider, rest.inflation))
-    status, advice = _status(found)
+    term, (status, advice) = posterior.term_at(posterior.mean), _status(found)
     # Variance between the frames of a shot over the noise model's, as the median of all shots; 0: unknown.
     known = data.shots.scatter[:-1][np.isfinite(data.shots.scatter[:-1])]
     scatter = float(np.median(known)) if known.size else 0.0
     return FitResult(
         name="backscatter",
-        term=posterior.term_at(posterior.mean),
+        term=term,
         status=status,
-        estimates=estimates(NAMES, UNITS, values.mean * scale, cov),
+        estimates=estimates("backscatter", NAMES, values.mean * scale, cov, priors),
         cov=cov,
         chi2_dof=fitted.best.chi2 / found.dof,
         samples=int(used.sum()),
@@ -141,7 +144,17 @@ def result_of(found: Found, data: BackscatterData, rig: RigDescription, clipped:
             found.places[np.nonzero(used)[2]] * template.step, fitted.z[used] * np.sqrt(used.sum() / found.dof)
         ),
         posterior=posterior,
+        map_sigma=_mask_sigma(term, posterior),
     )
+
+
+def _mask_sigma(term: Backscatter, posterior: Posterior[Backscatter]) -> Float32[np.ndarray, "3 down across"]:
+    """Sigma of the light of white by the frames' noise, at the fitted kernels, in e-/s over cells of the sensor."""
+    noise = np.repeat([0.0, 1.0], [len(NAMES), len(posterior.mean) - len(NAMES)])
+    # The noise has random signs, and the mask is never below 0: the brighter one is a sigma above the mean.
+    up, down = (posterior.term_at(posterior.mean + sign * noise).mask for sign in (1.0, -1.0))
+    sigma = np.maximum(np.maximum(up, down) - np.asarray(term.mask), 1e-30)
+    return np.asarray(coarse(sigma**-2.0, _CELLS) ** -0.5, dtype=np.float32)
 
 
 def _status(found: Found) -> tuple[FitStatus, tuple[str, ...]]:

@@ -25,7 +25,6 @@ NAMES = (
     "offset_x_px", "offset_y_px", "red_x_px", "red_y_px", "blue_x_px", "blue_y_px",
     "mix_rg", "mix_rb", "mix_gr", "mix_gb", "mix_br", "mix_bg",
 )  # fmt: skip
-UNITS = ("1", "mm", "mm", "px", "1", "mm", *["px"] * 6, *["1"] * 6)
 DISTANCE, PUPIL, SOFTNESS, REFLECTION, DEPTH = range(1, 6)
 # Offset of the green emitters from the centres of their pixels, and of red and blue from green; crosstalk.
 OFFSET, EMITTERS, MIX = slice(6, 8), slice(8, 12), slice(12, 18)
@@ -156,7 +155,7 @@ def prior_of(rig: RigDescription) -> Prior:
     include a leak of half a per cent on one side, and a coated face, which reflects a tenth as much, on the other.
 
     Args:
-        rig: gives the values (mean) and their tolerances (sigma), in the units of ``UNITS``.
+        rig: gives the values (mean) and their tolerances (sigma), in the units of the estimates.
     """
     panel, lens, mounting = rig.panel, rig.lens, rig.mounting
     standoff, pitch = mounting.standoff_mm, panel.pitch_mm
@@ -175,15 +174,21 @@ def prior_of(rig: RigDescription) -> Prior:
 
 
 def values_of(x: Vector) -> Vector:
-    """Return the parameters in the units of ``UNITS``: lengths at the nominal pitch, the footprint for the pupil."""
+    """Return the parameters in the estimates' units: lengths at the nominal pitch, the footprint for the pupil."""
     with np.errstate(over="ignore"):
         return np.where(_LOGARITHMIC, np.where(x > _ABSENT, np.exp(x), 0.0), x)
+
+
+def nominal_of(prior: Prior) -> tuple[Vector, Vector]:
+    """Return the prior's values and their sigmas, in the units of the estimates."""
+    nominal = values_of(prior.mean)
+    return nominal, prior.sigma * np.where(_LOGARITHMIC, nominal, 1.0)
 
 
 @final
 @dataclass(frozen=True)
 class Moments:
-    """Mean and covariance of parameters, such as the values in the units of ``UNITS``."""
+    """Mean and covariance of parameters, such as the values in the units of the estimates."""
 
     mean: Vector
     cov: Float[np.ndarray, "18 18"]

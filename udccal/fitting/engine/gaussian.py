@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Generic, TypeVar, final
 
@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from udccal.numerics import in_float64
+from udccal.result import Propagated
 
 Term = TypeVar("Term")
 
@@ -106,14 +107,33 @@ class Posterior(Generic[Term]):
             an array of the shape and in the units of ``f(term)``.
         """
         variance = np.zeros(np.shape(f(self.term_at(self.mean))))
+        for slope in self._slopes(f):
+            variance += slope**2
+        return np.asarray(np.sqrt(variance))
+
+    @in_float64
+    def propagate(self, f: Callable[[Term], Float[np.ndarray, "*shape"]]) -> Propagated:
+        """``f(term)`` with its covariance, to first order; unlike ``sigma_of`` it holds all derivatives together.
+
+        Args:
+            f: as for ``sigma_of``.
+
+        Returns:
+            the value, and its derivatives along the columns of ``factor``.
+        """
+        value = np.asarray(f(self.term_at(self.mean)), dtype=np.float64)
+        slopes = [slope.ravel() for slope in self._slopes(f)]
+        return Propagated(value, np.stack(slopes, axis=1) if slopes else np.zeros((value.size, 0)))
+
+    def _slopes(self, f: Callable[[Term], Float[np.ndarray, "*shape"]]) -> Iterator[Float[np.ndarray, "*shape"]]:
+        """Derivatives of ``f`` along each column of ``factor`` that is not zero."""
         for column in self.factor.T:
             if column.any():
                 up, down = (
                     np.asarray(f(self.term_at(self.mean + step * column)), dtype=np.float64)
                     for step in (_STEP_SIGMA, -_STEP_SIGMA)
                 )
-                variance += ((up - down) / (2 * _STEP_SIGMA)) ** 2
-        return np.asarray(np.sqrt(variance))
+                yield (up - down) / (2 * _STEP_SIGMA)
 
     @in_float64
     def draws(self, rng: np.random.Generator, count: int) -> tuple[Term, ...]:

@@ -20,7 +20,6 @@ from udccal.models.arrays import Arrayish
 from udccal.models.geometry import Geometry
 
 INTRINSIC_NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
-INTRINSIC_UNITS = ("px", "px", "px", "px", "1", "1", "1", "1", "1")
 LENS = len(INTRINSIC_NAMES)
 # Orders of the distortion, simplest first: which intrinsics are free. Each includes the coefficients of the one before.
 ORDERS = {

@@ -18,8 +18,8 @@ from scipy.spatial.transform import Rotation
 from udccal.errors import FitError
 from udccal.fitting.engine.gaussian import Posterior, Prior, square_root
 from udccal.fitting.engine.misfit import excess_sigma
-from udccal.fitting.engine.report import estimates, residual_sample
-from udccal.fitting.geometry.bundle import INTRINSIC_NAMES, INTRINSIC_UNITS, LENS, GeometryRules, Intrinsics
+from udccal.fitting.engine.report import estimates, priors_of, residual_sample
+from udccal.fitting.geometry.bundle import INTRINSIC_NAMES, LENS, GeometryRules, Intrinsics
 from udccal.fitting.geometry.calibrated import CalibratedViews, Gauge
 from udccal.fitting.geometry.corners import board_points_mm
 from udccal.fitting.geometry.data import BoardView, GeometryData, gather
@@ -30,7 +30,7 @@ from udccal.result import Diagnostic, FitResult, FitStatus, Outliers
 
 # Scatter in addition to noise of the board on the jig, and of the median other view: a plan reads them.
 ON_JIG, BY_HAND = "corner_scatter_on_jig", "corner_scatter_by_hand"
-_NAMES, _UNITS = (*INTRINSIC_NAMES, "tilt_deg", "roll_deg", "yaw_deg"), (*INTRINSIC_UNITS, "deg", "deg", "deg")
+_NAMES = (*INTRINSIC_NAMES, "tilt_deg", "roll_deg", "yaw_deg")
 
 
 def fit_geometry(
@@ -73,7 +73,7 @@ def fit_geometry(
         usual = Intrinsics(np.full(2, float(max(image_size))), (np.array(image_size) - 1) / 2, np.zeros(5))
         return FitResult.failed("geometry", start or usual.camera(), FitStatus.TOO_FEW_DATA, str(error))
     picks = np.vstack([np.eye(LENS, len(views.cov)), -views.turn(Gauge.BOARDS)])
-    return _result(views, np.append(views.intrinsics.vector, np.zeros(3)), picks @ views.cov @ picks.T, _lens_at, LENS)
+    return _result(views, np.append(views.intrinsics.vector, np.zeros(3)), picks @ views.cov @ picks.T, _lens_at, prior)
 
 
 def fit_boards(data: GeometryData, rules: GeometryRules | None = None) -> FitResult[Geometry]:
@@ -101,7 +101,7 @@ def fit_boards(data: GeometryData, rules: GeometryRules | None = None) -> FitRes
         bundle, scatter_px = _calibrated(usable, data, rules)
     except FitError as error:
         return FitResult.failed("geometry", data.nominal, FitStatus.TOO_FEW_DATA, *notes, str(error))
-    return _mounted(bundle, scatter_px, [usable[k] for k in bundle.points.names], data.nominal, notes, rules)
+    return _mounted(bundle, scatter_px, [usable[k] for k in bundle.points.names], data, notes, rules)
 
 
 @in_float64
@@ -164,7 +164,7 @@ def _mounted(
     bundle: CalibratedViews,
     scatter_px: Float[np.ndarray, " n"],
     views: list[BoardView],
-    nominal: Geometry,
+    data: GeometryData,
     lost: tuple[str, ...],
     rules: GeometryRules,
 ) -> FitResult[Geometry]:
@@ -172,10 +172,10 @@ def _mounted(
     parallel = [k for k, view in enumerate(views) if view.parallel]
     if bundle.status is FitStatus.TOO_FEW_DATA or not parallel:
         tilt = () if parallel else ("No usable view shows the board parallel to the panel; capture that view again.",)
-        return FitResult.failed("geometry", nominal, FitStatus.TOO_FEW_DATA, *lost, *bundle.notes, *tilt)
+        return FitResult.failed("geometry", data.nominal, FitStatus.TOO_FEW_DATA, *lost, *bundle.notes, *tilt)
     x, cov = with_angles(bundle.intrinsics.vector, bundle.poses, bundle.cov, parallel)
-    pupil = np.asarray(nominal.pupil_mm, dtype=np.float64)
-    result = _result(bundle, x, cov, partial(term_at, pupil=pupil), len(_NAMES))
+    pupil = np.asarray(data.nominal.pupil_mm, dtype=np.float64)
+    result = _result(bundle, x, cov, partial(term_at, pupil=pupil), data.prior, len(_NAMES))
     left_out, sentences = _outliers(bundle, views, rules)
     poor = bundle.rms_px > rules.worst_rms_px and bundle.chi2_dof > rules.worst_chi2_dof
     mounting = "Stand-off and panel position are the rig's nominal ones; the wire fit refines them."
@@ -193,7 +193,8 @@ def _result(
     x: Float[np.ndarray, "12"],
     cov: Float[np.ndarray, "12 12"],
     lens_at: Callable[[Float[np.ndarray, "12"]], Geometry],
-    count: int,
+    prior: Prior | None,
+    count: int = LENS,
 ) -> FitResult[Geometry]:
     """The result of a bundle, whose first ``count`` parameters are estimates.
 
@@ -204,11 +205,12 @@ def _result(
     points, use = bundle.points, bundle.points.used
     z = bundle.residuals_px[use] / points.sigma[use, None]
     held = [name for name, free in zip(INTRINSIC_NAMES, bundle.free, strict=True) if not free]
+    priors = None if prior is None else priors_of(INTRINSIC_NAMES, prior.mean, prior.sigma)
     return FitResult(
         name="geometry",
         term=posterior.term_at(x),
         status=bundle.status,
-        estimates=estimates(_NAMES[:count], _UNITS[:count], x[:count], cov[:count, :count]),
+        estimates=estimates("geometry", _NAMES[:count], x[:count], cov[:count, :count], priors),
         cov=cov[:count, :count],
         chi2_dof=bundle.chi2_dof,
         samples=2 * int(use.sum()),

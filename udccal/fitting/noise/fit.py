@@ -24,7 +24,6 @@ from udccal.rig import RigDescription
 
 # The term's fields, and the fraction of the signal that is missing at full scale, where the data ask for it.
 NAMES = (*Noise.__dataclass_fields__, "nonlinearity")
-UNITS = ("DN/e", "DN", "DN", "e", "1", "DN", "DN", "e/s", "e", "1", "1")
 
 
 def nominal_noise(rig: RigDescription) -> Noise:
@@ -190,7 +189,7 @@ def _assembled(data: NoiseMoments, dark: DarkTerms, curve: Curve, rules: NoiseRu
         name="noise",
         term=_term(values[:-1]),
         status=status,
-        estimates=estimates(NAMES[:shown], UNITS[:shown], values[:shown], cov[:shown, :shown]),
+        estimates=estimates("noise", NAMES[:shown], values[:shown], cov[:shown, :shown]),
         cov=cov[:shown, :shown],
         chi2_dof=fit.chi2_dof,
         samples=int(curve.levels.usable.sum()) + data.dark_samples,

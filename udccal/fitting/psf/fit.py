@@ -12,10 +12,11 @@ from typing import Final
 
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy.linalg import block_diag
 
 from udccal.fitting.engine.gaussian import Posterior, square_root
 from udccal.fitting.engine.misfit import SIGNIFICANT
-from udccal.fitting.engine.report import estimates, residual_sample
+from udccal.fitting.engine.report import estimates, priors_of, residual_sample
 from udccal.fitting.psf.data import PsfData, PsfRules, Shots, about_middle, held_out_positions
 from udccal.fitting.psf.diffraction import DiffractionFit, efficiency, fit_diffraction, kernel_sigma, pattern_p_value
 from udccal.fitting.psf.held_out import (
@@ -29,7 +30,7 @@ from udccal.fitting.psf.held_out import (
     with_support,
 )
 from udccal.fitting.psf.image import Sources
-from udccal.fitting.psf.kernel import BLUR, as_numpy, pitch_tolerance, start_model, start_prior
+from udccal.fitting.psf.kernel import BLUR, PITCH, as_numpy, pitch_tolerance, start_model, start_prior
 from udccal.fitting.psf.orders import Selection, select_field
 from udccal.fitting.psf.problem import explain
 from udccal.models.diffraction import Diffraction
@@ -40,15 +41,9 @@ from udccal.numerics import in_float64
 from udccal.result import Diagnostic, Estimate, FitResult, FitStatus
 from udccal.rig import RigDescription
 
-# The first parameters: name, unit, and true for a length on the panel, which is measured in pitches.
-_NUMBERS: Final = (
-    ("pitch_mm", "mm", True),
-    ("column_open", "1", False),
-    ("row_open", "1", False),
-    ("depth_mm", "mm", True),
-    ("pupil_diameter_mm", "mm", True),
-    ("blur_px", "px", False),
-)
+# The first parameters, and which of them are lengths on the panel, which are measured in pitches.
+_NUMBERS: Final = ("pitch_mm", "column_open", "row_open", "depth_mm", "pupil_diameter_mm", "blur_px")
+_LENGTHS: Final = np.array([True, False, False, True, True, False])
 
 
 @in_float64
@@ -200,7 +195,7 @@ def _report(
     misfit = ""
     if pattern_p <= SIGNIFICANT:
         off = f" The kernel is off by {100 * error_l2:.2g} % where it was not captured; sigmas include that."
-        numbered = f"{', '.join(name for name, *_ in _NUMBERS)} are numbers of a model that they refute"
+        numbered = f"{', '.join(_NUMBERS)} are numbers of a model that they refute"
         misfit = (
             f"Residuals of diffraction have a pattern (p = {pattern_p:.1g}): {numbered}.{off if error.size else ''}"
         )
@@ -235,14 +230,20 @@ def _estimates(
     spread = float(held_out_l2.std(ddof=1) / np.sqrt(held_out_l2.size))
     if not diffracts:
         return (Estimate("kernel_relative_l2", error, spread, "1"),), np.array([[spread**2]])
-    kernel = Estimate("kernel_relative_l2", error, float(np.hypot(kernel_sigma(fit, whole), spread)), "1")
-    names, units, lengths = zip(*_NUMBERS, strict=True)
     # The fit's own parameter is the logarithm of the blur.
-    values, unit = fit.theta[:count].copy(), np.ones(count)
+    prior = fit.problem.prior
+    values, unit, known, wide = fit.theta[:count].copy(), np.ones(count), prior.mean[:count].copy(), np.ones(count)
     values[BLUR] = unit[BLUR] = np.exp(fit.theta[BLUR])
-    by_pitch = np.where(lengths, values, 0.0) * tolerance
+    known[BLUR] = wide[BLUR] = np.exp(prior.mean[BLUR])
+    sigma = prior.sigma[:count] * wide
+    # The fit holds the pitch: its tolerance scales all lengths.
+    sigma[PITCH] = known[PITCH] * tolerance
+    by_pitch = np.where(_LENGTHS, values, 0.0) * tolerance
     cov = whole[:count, :count] * np.outer(unit, unit) + np.outer(by_pitch, by_pitch)
-    return (*estimates(names, units, values, cov), kernel), cov
+    # The error of kernels is that of held-out positions, which the numbers do not depend on.
+    cov = block_diag(cov, kernel_sigma(fit, whole) ** 2 + spread**2)
+    names, priors = (*_NUMBERS, "kernel_relative_l2"), priors_of(_NUMBERS, known, sigma)
+    return estimates("psf", names, np.append(values, error), cov, priors), cov
 
 
 def _posterior(
@@ -293,7 +294,7 @@ def _notes(data: PsfData, diffracts: bool, misfit: str, support: tuple[str, ...]
     ]
     if diffracts:
         notes = [
-            "cov covers the numbers of diffraction; field coefficients of the residual and spectra are left out of it.",
+            "cov leaves out spectra and field coefficients of the residual.",
             "chi2_dof is of the fit of diffraction and allows for the model error of its residuals.",
             *([misfit] if misfit else []),
         ]

@@ -248,7 +248,7 @@ def _report(
         name="psf",
         term=term,
         status=status,
-        estimates=estimates(names, ["1"] * len(names), np.concatenate([[size], warp.ravel()]), cov),
+        estimates=estimates("psf", names, np.concatenate([[size], warp.ravel()]), cov),
         cov=cov,
         chi2_dof=chi2_dof,
         samples=z.size,

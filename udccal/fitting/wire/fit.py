@@ -11,12 +11,13 @@ from dataclasses import dataclass, replace
 from typing import final
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Float32
 
 from udccal.cfa import cfa_named
 from udccal.fitting.engine.gaussian import Posterior, square_root
 from udccal.fitting.engine.least_squares import SolverRules, minimise
 from udccal.fitting.engine.misfit import clustered_cov
+from udccal.fitting.engine.report import coarse
 from udccal.fitting.wire.data import (
     BLOCK,
     FlatNoise,
@@ -31,13 +32,16 @@ from udccal.fitting.wire.data import (
 )
 from udccal.fitting.wire.jacobian import block_jacobian, values_at, weighed_at, with_harmonics
 from udccal.fitting.wire.parameters import Kind, Parameters, parameters_of, select, shape_vector, with_shape
-from udccal.fitting.wire.report import Joint, misfit, omitted, unseen, wire_result
+from udccal.fitting.wire.report import Joint, misfit, omitted, rms, unseen, wire_result
 from udccal.fitting.wire.rules import WireRules, ideal_wire, possible_harmonics
 from udccal.fitting.wire.search import SOLVER, Descent, Found, Search, WireProblem
 from udccal.models.geometry import Geometry
 from udccal.models.wire import Wire, wire_map
 from udccal.numerics import in_float64
 from udccal.result import FitResult, FitStatus
+
+# Places of the map's Jacobian, down and across.
+_PLACES = 64
 
 
 @in_float64
@@ -85,7 +89,8 @@ def fit_wire(data: WireData, rules: WireRules | None = None, start: Wire | None 
         left_out = unseen(possible_harmonics(data.start, rules.least_amplitude), found.searched, rules)
     model = float(np.hypot(off.sigma, left_out))
     posterior = _posterior(joint, jacobian, model)
-    return wire_result(joint, off, left_out, jacobian.sigma(joint.cov, model), posterior, shape, rules)
+    map_sigma, cov = jacobian.sigma_map(joint.cov, model), jacobian.cov_of_mean_one(joint.cov)
+    return wire_result(joint, cov, off, left_out, map_sigma, posterior, shape, rules)
 
 
 def _resumed(wire: Wire, many: Pixels, data: WireData, noise: FlatNoise, rules: WireRules) -> Found:
@@ -204,18 +209,28 @@ class MapJacobian:
     rows: Float[np.ndarray, "n places"]
     of_mean: Float[np.ndarray, " n"]
 
+    def sigma_map(self, cov: Float[np.ndarray, "n n"], model: float = 0.0) -> Float32[np.ndarray, "1 16 16"]:
+        """Relative sigma of the map, RMS over 16 x 16 cells; ``model`` is the relative model error."""
+        variance = np.einsum("ip,ij,jp->p", self.rows, cov, self.rows, optimize=True) + (model * self.value) ** 2
+        return np.sqrt(coarse(variance.reshape(1, _PLACES, _PLACES), 16)).astype(np.float32)
+
     def sigma(self, cov: Float[np.ndarray, "n n"], model: float = 0.0) -> float:
         """Relative sigma of the map, RMS over the sensor; ``model`` is the relative model error."""
-        variance = np.einsum("ip,ij,jp->p", self.rows, cov, self.rows, optimize=True)
-        return float(np.sqrt(np.mean(variance + (model * self.value) ** 2)))
+        return rms(self.sigma_map(cov, model))
+
+    def cov_of_mean_one(self, cov: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
+        """Covariance of the parameters where the first coefficient of the shading keeps the map's mean at 1."""
+        change = np.eye(len(cov))
+        change[0] -= self.of_mean
+        return np.asarray(change @ cov @ change.T)
 
 
 def map_jacobian(
     parameters: Parameters, x: Float[np.ndarray, " n"], geometry: Geometry, shape: tuple[int, int]
 ) -> MapJacobian:
-    """Jacobian of the map at ``x``, whose mean is 1, on a grid of 64 x 64 places of a sensor (rows, columns)."""
+    """Jacobian of the map at ``x``, whose mean is 1, on a grid of places over a sensor (rows, columns)."""
     site, wire = np.zeros(BLOCK, dtype=np.int64), parameters.wire(x)
-    grid = _grid(geometry, shape, (64, 64))
+    grid = _grid(geometry, shape, (_PLACES, _PLACES))
     whole, base, rows = over_blocks(lambda *at: block_jacobian(parameters, wire, at[0], at[1], site), *grid)
     value, rows = whole * base, rows * base
     # Site gains are not in the map.

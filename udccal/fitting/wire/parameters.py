@@ -19,7 +19,6 @@ from udccal.models.wire import Wire
 _POSE = "rotation_x_deg", "rotation_y_deg", "rotation_z_deg", "standoff_per_pitch"
 _PUPIL = "offset_x_periods", "offset_y_periods", "footprint_per_pitch"
 SHAPE_NAMES = (*_POSE, *_PUPIL, "row_open", "column_open", "depth_per_pitch")
-SHAPE_UNITS = ("deg", "deg", "deg", "1", "period", "period", "1", "1", "1", "1")
 
 
 def shape_vector(wire: Wire) -> Float[np.ndarray, "10"]:
@@ -64,6 +63,13 @@ class Kind(enum.IntEnum):
     AMPLITUDE = 2
     FIELD = 3
     SHAPE = 4
+
+
+def element_name(kind: int, a: int, b: int, c: int, d: int) -> str:
+    """Name of a fitted element of the wire's arrays: the array, and its indices."""
+    if kind == Kind.SHADING:
+        return f"baseline.{c}.{d}"
+    return f"{'amplitudes' if kind == Kind.AMPLITUDE else 'fields'}.{a}.{b}.{c}.{d}"
 
 
 @final

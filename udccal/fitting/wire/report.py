@@ -7,15 +7,15 @@ from dataclasses import dataclass, replace
 from typing import final
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Float32, Int
 
 from udccal.fitting.engine.gaussian import Posterior
 from udccal.fitting.engine.misfit import NO_TEST, MisfitTest, chi2_test, excess_sigma, sharper
 from udccal.fitting.engine.orders import Choice
-from udccal.fitting.engine.report import estimates, residual_sample
+from udccal.fitting.engine.report import estimates, priors_of, residual_sample
 from udccal.fitting.wire.data import BLOCK, Pixels, Weighed
 from udccal.fitting.wire.jacobian import rays_at, tilt_deg, values_at, with_harmonics
-from udccal.fitting.wire.parameters import SHAPE_NAMES, SHAPE_UNITS, Parameters
+from udccal.fitting.wire.parameters import SHAPE_NAMES, Kind, Parameters, element_name
 from udccal.fitting.wire.rules import Harmonics, WireRules, WireStart, possible_harmonics
 from udccal.fitting.wire.search import LEAST_VARIANCE, TILES, WireProblem, tile_numbers
 from udccal.models.wire import Wire
@@ -179,19 +179,26 @@ class Joint:
         return bool(np.any(wide > 3 * np.sqrt(np.diag(self.cov)[self.parameters.linear :][7:9])))
 
 
+def rms(values: Float[np.ndarray, "..."]) -> float:
+    """Root mean square."""
+    return float(np.sqrt(np.mean(np.square(values, dtype=np.float64))))
+
+
 def wire_result(
     joint: Joint,
+    cov: Float[np.ndarray, "n n"],
     found: Misfit,
     left_out: float,
-    map_sigma: float,
+    map_sigma: Float32[np.ndarray, "1 down across"],
     posterior: Posterior[Wire],
     shape: tuple[int, int],
     rules: WireRules,
 ) -> FitResult[Wire]:
     """The result of a finished fit, on a sensor of that shape.
 
-    ``map_sigma`` is the whole sigma of the map. ``left_out`` is the part by omitted harmonics, or by rows that may be
-    there unseen. Both are relative, RMS over the sensor.
+    ``cov`` is that of the parameters of a map whose mean is 1. ``map_sigma`` is the whole sigma of the map.
+    ``left_out`` is the part by omitted harmonics, or by rows that may be there unseen, RMS over the sensor. Both are
+    relative.
     """
     panel, seen = joint.parameters.panel, joint.seen
     term = _trimmed(posterior.term_at(posterior.mean), panel)
@@ -199,9 +206,9 @@ def wire_result(
     drawn = np.flatnonzero(seen.pixels.weight > 0)
     few = seen.pixels.thinned(8 * BLOCK)
     tilt, nominal = (tilt_deg(one) for one in (term, replace(term, rotation_rad=np.zeros(3))))
-    named, cov = _estimates(joint) if panel else ((), np.zeros((0, 0)))
+    named, named_cov = _estimates(joint, cov) if panel else ((), np.zeros((0, 0)))
     diagnostics = (
-        ("wire_map_rms_sigma", 100 * map_sigma, "%"),
+        ("wire_map_rms_sigma", 100 * rms(map_sigma), "%"),
         ("wire_map_model_sigma", 100 * float(np.hypot(found.sigma, left_out)), "%"),
         ("harmonics_left_out", 100 * left_out, "%"),
         ("residual_pattern_p_value", found.test.p_value, "1"),
@@ -219,7 +226,7 @@ def wire_result(
         term=term,
         status=_status(joint, rules),
         estimates=named,
-        cov=cov,
+        cov=named_cov,
         chi2_dof=joint.variance,
         samples=seen.pixels.used,
         candidates=joint.orders.candidates,
@@ -228,6 +235,7 @@ def wire_result(
         outliers=outliers,
         residuals=residual_sample((seen.pixels.scaled[drawn] + 1) / 2 * [shape[1] - 1, shape[0] - 1], seen.z[drawn]),
         posterior=posterior,
+        map_sigma=map_sigma,
     )
 
 
@@ -250,7 +258,6 @@ def _status(joint: Joint, rules: WireRules) -> FitStatus:
 
 def _notes(joint: Joint, found: Misfit, left_out: float, rules: WireRules) -> Iterator[str]:
     if joint.parameters.panel:
-        yield "cov covers the shape parameters, as fitted together with all coefficients of the fields."
         prior = joint.problem.prior
         off = (prior.root @ (joint.x - prior.mean))[joint.parameters.linear :]
         if joint.sharpness < 1:
@@ -281,11 +288,27 @@ def _notes(joint: Joint, found: Misfit, left_out: float, rules: WireRules) -> It
         yield "Capture more flats, or give the fit more pixels."
 
 
-def _estimates(joint: Joint) -> tuple[tuple[Estimate, ...], Float[np.ndarray, "10 10"]]:
-    # The fit's own parameters are radians and, for stand-off and pupil, logarithms.
-    values, unit = joint.x[joint.parameters.linear :].copy(), np.ones(len(SHAPE_NAMES))
+def _estimates(
+    joint: Joint, cov: Float[np.ndarray, "all all"]
+) -> tuple[tuple[Estimate, ...], Float[np.ndarray, "n n"]]:
+    """The shape, then all elements of the wire's arrays that were fitted, with their covariance."""
+    parameters, prior = joint.parameters, joint.problem.prior
+    # Gains of the CFA sites are not in the term: their errors remain in the variances of the others.
+    others = np.flatnonzero(~parameters.of(Kind.SITE) & ~parameters.of(Kind.SHAPE))
+    order = np.concatenate([np.flatnonzero(parameters.of(Kind.SHAPE)), others])
+    names = (*SHAPE_NAMES, *(element_name(*column) for column in parameters.columns[others].tolist()))
+    (values, unit), (known, wide) = _in_units(joint.x[order]), _in_units(prior.mean[order])
+    sigma = prior.sigma[order] * wide
+    # Places have no origin beforehand.
+    values[4:6], sigma[4:6] = values[4:6] % 1.0, np.inf
+    cov = cov[np.ix_(order, order)] * np.outer(unit, unit)
+    return estimates("wire", names, values, cov, priors_of(names, known, sigma)), cov
+
+
+def _in_units(x: Float[np.ndarray, " n"]) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """Values from the fit's own parameters, of which the shape is first, and their derivatives by these."""
+    values, unit = x.copy(), np.ones(len(x))
+    # The fit's own are radians and, for stand-off and pupil, logarithms.
     values[[3, 6]] = unit[[3, 6]] = np.exp(values[[3, 6]])
     values[:3], unit[:3] = np.rad2deg(values[:3]), 180 / np.pi
-    values[4:6] %= 1.0
-    cov = joint.cov[joint.parameters.linear :, joint.parameters.linear :] * np.outer(unit, unit)
-    return estimates(SHAPE_NAMES, SHAPE_UNITS, values, cov), cov
+    return values, unit

@@ -1,0 +1,158 @@
+"""A board held in one pose after the other: a view is taken when the board is still and unlike the views before."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterator
+from typing import Final, final
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.spatial.transform import Rotation
+
+from procedures.aiming import nominal_pixels
+from procedures.live import LiveFrames
+from procedures.plans import Metered
+from procedures.readings import CornersSeen, find_corners, head_room, sharpness, why_not
+from procedures.step import Bench, Step, run_step, set_up
+from udccal.arrangements import Board
+from udccal.guide.events import Outline, Reading
+from udccal.guide.steps import Look
+from udccal.rig import RigDescription
+from udccal.sessions.writer import SessionWriter
+
+_STILL_PX, _STILL_LOOKS, _UNKNOWN_PX = 1.0, 3, 999.0
+_FEWEST_COMMON: Final = 4
+_UNLIKE: Final = 0.02  # of the sensor's width, by which the corners of two views differ at least
+
+
+@final
+class BoardVisit:
+    """Implements ``udccal.guide.steps.Visit`` for all views held by hand: a capture is one view.
+
+    For each view a pose is suggested as an outline. Any other is taken too whose corners lie elsewhere than those of
+    the views before: the board was moved, or it leans in another way.
+    """
+
+    def __init__(
+        self,
+        step_ids: tuple[str, ...],
+        poses: tuple[Board, ...],
+        view: Callable[[str, Board], Step],
+        bench: Bench,
+        writer: SessionWriter,
+    ) -> None:
+        """Args:
+        step_ids: the views.
+        poses: suggestions, at least one for each view.
+        view: makes the step of a view.
+        bench, writer: as for a step.
+        """
+        self._rig, self._step_ids, self._poses, self._view = writer.manifest.rig, step_ids, poses, view
+        self._bench, self._writer = bench, writer
+        # How a board was held is in its picture; after an interruption it is taken to be as suggested.
+        captured = [number for number, step_id in enumerate(step_ids) if step_id in writer.completed_ids]
+        self._views = [_nominal_corners(self._rig, poses[number]) for number in captured]
+        self._seen: deque[CornersSeen] = deque(maxlen=_STILL_LOOKS)
+        self._tries = 0
+        self._asked = self._ask()
+        step = self._asked
+        assert isinstance(step.exposure, Metered)
+        self._target = step.exposure.target
+        self._live = LiveFrames(bench.camera, step.region, step.exposure, self._rig)
+
+    @property
+    def _board(self) -> Board:
+        assert isinstance(self._asked.arrangement, Board)
+        return self._asked.arrangement
+
+    def look(self) -> Look:
+        """Take a frame, find the board, and say how it should be held."""
+        frame, level = self._live.next()
+        room, seen = head_room(level, self._target), find_corners(frame, self._board.spec)
+        corners = seen.reading(self._board.spec)
+        self._seen.append(seen)
+        readings = (room, corners, sharpness(frame), _movement(self._seen), self._unlike(seen))
+        wanted = Outline(_polygon(_edge(self._rig, self._board)), "wanted")
+        return Look(frame, readings, self._why_not(readings), (wanted, *seen.outlines))
+
+    def capture(self) -> Iterator[None]:
+        """Take the view; raises as ``run_step`` does."""
+        view = self._seen[-1]
+        self._seen.clear()
+        run_step(self._asked, self._bench, self._writer, None)
+        self._views.append(view)
+        self._tries = 0
+        if any(step_id not in self._writer.completed_ids for step_id in self._step_ids):
+            self._asked = self._ask()
+        yield
+
+    def _ask(self) -> Step:
+        """Suggest the pose of the next view, or another one where that had nothing new to show."""
+        done = self._writer.completed_ids
+        number = next(number for number, step_id in enumerate(self._step_ids) if step_id not in done)
+        step = self._view(self._step_ids[number], self._poses[(number + self._tries) % len(self._poses)])
+        set_up(step, self._bench, self._writer)
+        return step
+
+    def _unlike(self, seen: CornersSeen) -> Reading:
+        width = float(self._rig.camera.columns)
+        nearest = min((_moved_px(view, seen) for view in self._views), default=width)
+        return Reading("unlike other views", nearest, _UNLIKE * width, None, "px")
+
+    def _why_not(self, readings: tuple[Reading, ...]) -> str:
+        room, corners, sharp, movement, unlike = readings
+        if not room.ok:
+            return why_not(room)
+        if not corners.ok:
+            return (
+                f"{corners.value:.0f} of the board's corners are seen, at least {corners.low:.0f} are needed. Hold the "
+                "board in the outline, evenly lit and flat."
+            )
+        if not movement.ok:
+            return "Hold the board still."
+        if not sharp.ok:
+            return why_not(sharp)
+        if not unlike.ok:
+            self._tries += 1
+            self._asked = self._ask()
+            self._seen.clear()
+            return "Such a view is there already. Hold the board as the outline shows it."
+        return ""
+
+
+def _movement(looks: deque[CornersSeen]) -> Reading:
+    """Return the largest movement of a corner over the last looks; unknown, and too large, before there are enough."""
+    moved = _UNKNOWN_PX
+    if len(looks) == _STILL_LOOKS:
+        moved = max(_moved_px(earlier, looks[-1]) for earlier in looks)
+    return Reading("movement", moved, None, _STILL_PX, "px")
+
+
+def _moved_px(one: CornersSeen, other: CornersSeen) -> float:
+    common, first, second = np.intersect1d(one.numbers, other.numbers, return_indices=True)
+    if len(common) < _FEWEST_COMMON:
+        return _UNKNOWN_PX
+    return float(np.median(np.linalg.norm(one.points_px[first] - other.points_px[second], axis=1)))
+
+
+def _edge(rig: RigDescription, board: Board) -> Float[np.ndarray, "4 2"]:
+    """Return where a nominal camera sees the board's outer corners."""
+    spec = board.spec
+    return _places(rig, board, np.array([[0, 0], [spec.columns, 0], [spec.columns, spec.rows], [0, spec.rows]]))
+
+
+def _nominal_corners(rig: RigDescription, board: Board) -> CornersSeen:
+    """Return where a nominal camera sees the inner corners, which OpenCV numbers along the board's rows."""
+    x, y = np.meshgrid(np.arange(1, board.spec.columns), np.arange(1, board.spec.rows))
+    squares = np.stack([x.ravel(), y.ravel()], axis=1)
+    return CornersSeen(np.arange(len(squares)), _places(rig, board, squares))
+
+
+def _places(rig: RigDescription, board: Board, squares: Int[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
+    on_board = np.pad(squares * board.spec.square_mm, ((0, 0), (0, 1)))
+    return nominal_pixels(rig, Rotation.from_rotvec(board.rotation_vector).apply(on_board) + board.translation_mm)
+
+
+def _polygon(points: Float[np.ndarray, "n 2"]) -> tuple[tuple[float, float], ...]:
+    return tuple((float(x), float(y)) for x, y in points)

@@ -1,0 +1,184 @@
+"""What a frame shows of a set-up, as numbers with the bounds in which they are right; checks and guides share them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final, final
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Int, UInt16
+
+from procedures.metering import spot_light
+from udccal.arrangements import BoardSpec
+from udccal.cameras.protocol import Frame
+from udccal.guide.events import Outline, Reading
+from udccal.rig import RigDescription
+from udccal.sessions.patches import brightest_patch_DN
+
+_STRAY_E = 60.0  # electrons above the nominal black level that a dark frame may show, in addition to the tolerances
+_UNEVEN = 15.0  # % of an even light's brightest patch that the darkest has at least, vignetting included
+_ROOM = 50.0  # % of an LED's light that its surroundings may have
+_FEWEST_CORNERS, _ENOUGH_CORNERS = 6, 12  # a quarter of the board, within these bounds
+_LEAST_HEAD_ROOM = 12.0  # %: tolerances of full well and gain leave the true level uncertain
+_MAGNIFIED_BELOW_PX = 600  # markers of few pixels are found more reliably in a magnified picture
+# Half the side of the window in which an LED's place is measured.
+_ABOUT_PX: Final = 6
+_CORE_PX: Final = 1.5
+_CENTRING: Final = 8  # rounds
+
+
+@final
+@dataclass(frozen=True)
+class LedSeen:
+    """The brightest small light of a frame.
+
+    Attributes:
+        place_px: its (x, y) on the sensor; some tenths of a pixel off, as colours sample it at different places.
+        peak_DN: its brightest sample above its surroundings.
+        room_DN: level of its surroundings above black.
+    """
+
+    place_px: tuple[float, float]
+    peak_DN: float
+    room_DN: float
+
+    @property
+    def room(self) -> Reading:
+        """Light of the room, as a part of the LED's."""
+        return Reading("room light", 100 * self.room_DN / max(self.peak_DN, 1.0), None, _ROOM, "%")
+
+
+@final
+@dataclass(frozen=True)
+class CornersSeen:
+    """Inner corners of a ChArUco board: their numbers on the board, and (x, y) on the sensor in px."""
+
+    numbers: Int[np.ndarray, " corners"]
+    points_px: Float[np.ndarray, "corners 2"]
+
+    def reading(self, spec: BoardSpec) -> Reading:
+        """How many are seen; a quarter of the board's is enough, 6 to 12."""
+        quarter = (spec.columns - 1) * (spec.rows - 1) // 4
+        needed = min(max(quarter, _FEWEST_CORNERS), _ENOUGH_CORNERS)
+        return Reading("corners seen", float(len(self.numbers)), float(needed), None, "")
+
+    @property
+    def outlines(self) -> tuple[Outline, ...]:
+        """The polygon around all corners; none where none is seen."""
+        if not len(self.numbers):
+            return ()
+        hull = cv2.convexHull(self.points_px.astype(np.float32)).reshape(-1, 2)
+        return (Outline(tuple((float(x), float(y)) for x, y in hull), "seen"),)
+
+
+def dark_limit_DN(rig: RigDescription, exposure_s: float) -> float:
+    """Return the level in DN that no patch of a dark frame exceeds through black level and dark current."""
+    camera = rig.camera
+    # 100 e-/s over half the sensor is more dark current than any camera within its specification has.
+    allowed_e = _STRAY_E + 100.0 * exposure_s
+    return camera.black_DN.value + camera.black_DN.tolerance + allowed_e * camera.K_DN_per_e.value
+
+
+def light_leak(frame: Frame, rig: RigDescription) -> Reading:
+    """Return the level of the brightest patch above black."""
+    black = rig.camera.black_DN.value
+    limit = dark_limit_DN(rig, frame.settings.exposure_s)
+    return Reading("light leak", brightest_patch_DN(frame.data) - black, None, limit - black, "DN")
+
+
+def evenness(frame: Frame, rig: RigDescription) -> Reading:
+    """Return the light of the darkest patch as a part of the brightest's."""
+    light = _patches(frame) - rig.camera.black_DN.value
+    darkest, brightest = max(float(light.min()), 0.0), max(float(light.max()), 1e-3)
+    return Reading("evenness", 100 * darkest / brightest, _UNEVEN, None, "%")
+
+
+def head_room(level: float, target: float | None) -> Reading:
+    """Return how far a level (0 at black, 1 at saturation) lies below saturation; a target bounds it from above too."""
+    most = None if target is None else 100 * (1 - 0.25 * target)
+    return Reading("head-room", 100 * (1 - level), _LEAST_HEAD_ROOM, most, "%")
+
+
+def find_led(frame: Frame, rig: RigDescription) -> LedSeen:
+    """Return the brightest small light of a frame; hot pixels are too narrow to count."""
+    light = spot_light(frame.data)
+    row, column = (int(index) for index in np.unravel_index(int(light.argmax()), light.shape))
+    surroundings_DN = float(np.median(frame.data)) - rig.camera.black_DN.value
+    region = frame.settings.region
+    x, y = _centroid(light, column, row)
+    return LedSeen((region.x + x, region.y + y), float(light[row, column]), surroundings_DN)
+
+
+def find_corners(frame: Frame, spec: BoardSpec) -> CornersSeen:
+    """Return the inner corners of a board that a frame shows."""
+    picture, scale = _picture(frame.data)
+    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, spec.dictionary))
+    board = cv2.aruco.CharucoBoard((spec.columns, spec.rows), spec.square_mm, spec.marker_mm, dictionary)
+    corners, numbers = cv2.aruco.CharucoDetector(board).detectBoard(picture)[:2]
+    if corners is None:
+        return CornersSeen(np.zeros(0, np.int64), np.zeros((0, 2)))
+    # The blur of 2 x 2 moves a picture by half a pixel, the magnification by another.
+    points = (np.asarray(corners, np.float64).reshape(-1, 2) - (scale - 1) / 2) / scale - 0.5
+    region = frame.settings.region
+    return CornersSeen(np.asarray(numbers, np.int64).reshape(-1), points + np.array([region.x, region.y]))
+
+
+def sharpness(frame: Frame) -> Reading:
+    """Return the steepest edges of a picture of black and white, per px; 0.5 for the sharpest that pixels can show."""
+    picture = cv2.blur(frame.data.astype(np.float32), (2, 2))
+    low, high = np.percentile(picture[::4, ::4], (2, 98))
+    steep = np.abs(np.diff(picture, axis=1))
+    found = float(np.percentile(steep[::4], 99.5)) / max(float(high - low), 1.0)
+    return Reading("sharpness", found, 0.05, None, "1/px")
+
+
+def why_not(reading: Reading) -> str:
+    """Return a sentence for a reading that is out of its bounds, for those that no check of a step has one for."""
+    low = reading.low is not None and reading.value < reading.low
+    match reading.name:
+        case "head-room" if low:
+            return "The light is too bright for this exposure; a shorter one is tried. If this stays, dim the light."
+        case "head-room":
+            return "Little light is seen; a longer exposure is tried. If this stays, see that the light is on."
+        case "sharpness":
+            return "The picture is blurred. Hold still what is seen, and check the focus."
+        case _:
+            return f"Expected another {reading.name} than {reading.value:.3g} {reading.unit}".rstrip() + "."
+
+
+def _picture(data: UInt16[np.ndarray, "rows columns"]) -> tuple[np.ndarray, int]:
+    """Return a mosaic as a grey 8-bit picture, and how many times it is magnified."""
+    grey = cv2.blur(data.astype(np.float32), (2, 2))  # every 2 x 2 holds each site of the pattern once
+    low, high = np.percentile(grey, (0.5, 99.5))
+    picture = np.clip((grey - low) / max(float(high - low), 1.0) * 255, 0, 255).astype(np.uint8)
+    if min(picture.shape) >= _MAGNIFIED_BELOW_PX:
+        return picture, 1
+    return cv2.resize(picture, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC), 2
+
+
+def _patches(frame: Frame) -> np.ndarray:
+    """Return means over about 16 x 16 patches of whole 2 x 2 cells: colour and noise average out."""
+    height, width = (2 * max(1, side // 32) for side in frame.data.shape)
+    down, across = frame.data.shape[0] // height, frame.data.shape[1] // width
+    whole = frame.data[: down * height, : across * width]
+    return whole.reshape(down, height, across, width).mean(axis=(1, 3))
+
+
+def _centroid(light: Float[np.ndarray, "rows columns"], column: int, row: int) -> tuple[float, float]:
+    """Return (x, y) of a small light near a sample: the centroid under a Gaussian that is centred on it.
+
+    Each site of the 2 x 2 pattern counts by its own light in the window, so that the colours draw alike.
+    """
+    top, left = (max(0, (at - _ABOUT_PX) // 2 * 2) for at in (row, column))
+    part = light[top : row + _ABOUT_PX + 1, left : column + _ABOUT_PX + 1].copy()
+    for down in (0, 1):
+        for across in (0, 1):
+            site = part[down::2, across::2]
+            site /= max(float(site.mean()), 1e-9)
+    y, x = np.mgrid[: part.shape[0], : part.shape[1]]
+    place = np.array([column - left, row - top], np.float64)
+    for _ in range(_CENTRING):
+        near = part * np.exp(-((x - place[0]) ** 2 + (y - place[1]) ** 2) / (2 * _CORE_PX**2))
+        place = np.array([np.average(x, weights=near), np.average(y, weights=near)])
+    return left + float(place[0]), top + float(place[1])

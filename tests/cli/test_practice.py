@@ -1,0 +1,166 @@
+"""A calibration of a simulated rig by keys in a pseudo-terminal, with mistakes and an interruption."""
+
+from __future__ import annotations
+
+import json
+import os
+import pty
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from tests.toy_rigs import change_rig, write_toy_rig
+from udccal.sessions.store import Session
+
+_TERMS = ("--term", "wire", "--term", "psf")
+_PATIENCE_S = 240.0
+
+
+@pytest.fixture
+def rig(tmp_path: Path) -> Path:
+    """The toy rig with two cells of the field."""
+    rig = write_toy_rig(tmp_path)
+    few = {"psf_columns = 3": "psf_columns = 2", "psf_rows = 3": "psf_rows = 1", "psf_shifts = 3": "psf_shifts = 2"}
+    change_rig(rig, few | {"psf_exposures = 6": "psf_exposures = 3", "flats = 100": "flats = 16"})
+    return rig
+
+
+def command(rig: Path, folder: Path, *words: str) -> list[str]:
+    places = ["--rig", str(rig), "--session", str(folder / "s"), "--profile", str(folder / "p")]
+    return [sys.executable, "-m", "udccal.cli.main", "calibrate", *places, "--practice", *_TERMS, *words]
+
+
+class Terminal:
+    """A program in a pseudo-terminal, by keys."""
+
+    def __init__(self, words: list[str]) -> None:
+        self._keys, theirs = pty.openpty()
+        self.process = subprocess.Popen(
+            words,
+            stdin=theirs,
+            stdout=theirs,
+            stderr=theirs,
+            start_new_session=True,
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+        )
+        os.close(theirs)
+        os.set_blocking(self._keys, False)
+        self.shown = ""
+        self._read = 0
+
+    def until(self, words: str) -> None:
+        """Wait until the words are shown, after those waited for before."""
+        self._wait(lambda: words in self.shown[self._read :], words)
+        self._read = self.shown.index(words, self._read) + len(words)
+
+    def type(self, line: str = "") -> None:
+        os.write(self._keys, f"{line}\n".encode())
+
+    def press_ctrl_c(self) -> None:
+        os.killpg(self.process.pid, signal.SIGINT)
+
+    def ended(self) -> int:
+        self._wait(lambda: self.process.poll() is not None, "the end")
+        return self.process.returncode
+
+    def _wait(self, there: Callable[[], bool], what: str) -> None:
+        until = time.monotonic() + _PATIENCE_S
+        while not there():
+            assert time.monotonic() < until, f"waited for {what!r}, found: {self.shown[-2000:]}"
+            try:
+                self.shown += os.read(self._keys, 65536).decode(errors="replace").replace("\r\n", "\n")
+            except (BlockingIOError, OSError):
+                assert self.process.poll() is None or there(), f"ended before {what!r}: {self.shown[-2000:]}"
+                time.sleep(0.05)
+
+
+@pytest.mark.slow
+def test_a_practice_by_keys_gives_the_session_that_no_mistake_has_touched(rig: Path, tmp_path: Path) -> None:
+    (tmp_path / "plain").mkdir()
+    plain = subprocess.run(
+        command(rig, tmp_path / "plain", "--yes", "--json-events"), capture_output=True, text=True, timeout=280
+    )
+    assert plain.returncode in (0, 1, 3), plain.stderr  # without geometry the fits of so few pixels may fail
+    events = [json.loads(line) for line in plain.stdout.splitlines() if line.startswith('{"')]
+    told = [event.get("event") for event in events]
+    assert {"step", "readings", "progress", "verdict", "done"} <= set(told)
+    assert next(event for event in events if event.get("event") == "done")["complete"]
+
+    first = Terminal(command(rig, tmp_path))
+    first.until("Step 1 of 4")
+    first.until("Enter · skip · back · quit · wrong")
+    first.type("jump")
+    first.until("'jump' is none of the answers: Enter, skip, back, quit, wrong.")
+    first.type("wrong")
+    first.until("Expected to see the light")
+    first.type()
+    first.until("✗ Step wire/flat: Expected to see the light")
+    first.type()  # tries again
+    first.until("evenness")
+    first.type("skip")
+    first.until("This step takes up the exposure of wire/flat, which was not captured.")
+    first.type("back")
+    first.until("Step 1 of 4")
+    first.until("Enter · skip · back · quit · wrong")
+    first.type()
+    first.until("✓ Even light for the wire")
+    first.press_ctrl_c()
+    assert first.ended() == 130
+    assert "Stopped. Run the same command again" in first.shown.replace("\n", " ")
+    assert "Traceback" not in first.shown
+
+    second = Terminal(command(rig, tmp_path))
+    second.until("Step 2 of 4")
+    second.until("Enter · skip · back · quit · wrong")
+    second.type()
+    second.until("✓ Darkness for the wire")
+    second.type()
+    second.until("Step 3 of 4")
+    second.type("wrong")
+    second.until("Move the LED so that its image goes")
+    second.type("again")
+    second.until("✓ LED in cell 1 of 2")
+    second.until("✓ LED in cell 2 of 2")
+    second.until("Everything is captured.")
+    second.ended()
+
+    one, other = (Session.open(folder / "s") for folder in (tmp_path / "plain", tmp_path))
+    assert [step.id for step in one.manifest.steps] == [step.id for step in other.manifest.steps]
+    for mine, theirs in zip(one.manifest.steps, other.manifest.steps, strict=True):
+        assert mine.subject == theirs.subject
+        assert [capture.sha256 for capture in mine.captures] == [capture.sha256 for capture in theirs.captures]
+
+
+@pytest.mark.medium
+def test_quit_leaves_with_130_and_fits_nothing(rig: Path, tmp_path: Path) -> None:
+    terminal = Terminal(command(rig, tmp_path))
+    terminal.until("Enter · skip · back · quit · wrong")
+    terminal.type("quit")
+    assert terminal.ended() == 130
+    assert not (tmp_path / "p").exists()
+
+
+@pytest.mark.parametrize(
+    "words", [["--practice", "--camera", "files"], ["--yes"], ["--json-events", "--camera", "files"]], ids=str
+)
+def test_words_that_do_not_go_together_are_refused(words: list[str], rig: Path, tmp_path: Path) -> None:
+    places = ["--rig", str(rig), "--session", str(tmp_path / "s"), "--profile", str(tmp_path / "p")]
+    done = subprocess.run(
+        [sys.executable, "-m", "udccal.cli.main", "calibrate", *places, *words],
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert done.returncode == 2
+    assert not (tmp_path / "s").exists()
+
+
+def test_nobody_at_the_keys_is_said(rig: Path, tmp_path: Path) -> None:
+    done = subprocess.run(command(rig, tmp_path), stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=200)
+    assert done.returncode == 1
+    assert "Expected a person to answer, found that standard input is closed." in done.stderr.replace("\n", " ")

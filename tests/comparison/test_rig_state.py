@@ -1,0 +1,135 @@
+"""The rig as all terms find it: against the truth, with its sigmas, and with terms that contradict or say nothing."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.comparison.perturbed import drawn, moved, with_estimates, with_result
+from udccal.comparison.combining import combine
+from udccal.comparison.rig_state import NAMES, RigState, rig_state
+from udccal.errors import ProfileError
+from udccal.profiles.profile import Profile
+from udccal.result import Estimate, EstimatePrior
+from udccal.sessions.schema import TermName
+from udccal.simulation.truth import draw_truth
+
+
+def number(state: RigState, name: str) -> Estimate:
+    return state.estimates[NAMES.index(name)]
+
+
+def silent(profile: Profile, *terms: TermName) -> Profile:
+    for term in terms:
+        profile = with_result(profile, term, estimates=(), cov=np.zeros((0, 0)))
+    return profile
+
+
+def test_the_state_is_that_of_the_simulated_rig(measured: Profile) -> None:
+    """All but the rows' openings, which wire and psf both find a little too wide: a thousandth, by 3.7 sigma."""
+    state, truth = rig_state(measured), draw_truth(measured.rig, 0)
+    true = {
+        "standoff_mm": -float(truth.optics.pupil_mm[2]),
+        "pitch_mm": truth.panel.pitch_mm,
+        "column_open": truth.panel.column_open,
+        "depth_mm": truth.panel.depth_mm,
+        "pupil_diameter_mm": truth.optics.pupil_diameter_mm,
+    }
+    for name, value in true.items():
+        assert abs(number(state, name).value - value) < 3 * number(state, name).sigma, name
+    assert number(state, "row_open").value == pytest.approx(truth.panel.row_open, abs=1.5e-3)
+    assert (state.terms, state.agreement_dof) == (("geometry", "wire", "psf", "backscatter"), 9)
+    assert state.agreement_p_value > 0.01
+    assert [one.name for one in state.estimates if one.by_prior] == ["pitch_mm"]
+    np.testing.assert_allclose(np.sqrt(np.diag(state.cov)), [one.sigma for one in state.estimates])
+
+
+def test_terms_together_know_more_than_each(measured: Profile) -> None:
+    state = rig_state(measured)
+    for term, name in (("geometry", "tilt_deg"), ("wire", "row_open"), ("psf", "row_open")):
+        assert number(state, name).sigma <= measured.result(term).estimate(name).sigma * 1.01, name  # type: ignore[arg-type]
+    # All lengths have the pitch's error in common, which the rig file alone limits.
+    lengths = [NAMES.index(name) for name in ("standoff_mm", "pitch_mm", "pupil_diameter_mm")]
+    sigma = np.sqrt(np.diag(state.cov))
+    correlation = (state.cov / np.outer(sigma, sigma))[np.ix_(lengths, lengths)]
+    assert correlation.min() > 0.95
+
+
+def test_a_movement_shows_in_the_state(measured: Profile) -> None:
+    before, after = (rig_state(one) for one in (measured, moved(measured, (0.0, 0.63, -0.2), (0.1, 0.0, 0.0))))
+    change = {name: number(after, name).value - number(before, name).value for name in NAMES}
+    assert change["standoff_mm"] == pytest.approx(0.2, rel=0.02)  # the rig file pulls a little
+    assert change["panel_y_px"] == pytest.approx(1.0, abs=1e-3)
+    assert change["tilt_deg"] == pytest.approx(0.1, abs=1e-3)
+    # The pupil's shadow becomes smaller with distance, which ``moved`` leaves out.
+    assert after.agreement_chi2 == pytest.approx(before.agreement_chi2, abs=2.0)
+
+
+@pytest.mark.parametrize(
+    ("term", "name", "sigmas"),
+    [
+        ("wire", "standoff_per_pitch", 2000),
+        ("backscatter", "standoff_mm", 20),
+        ("psf", "row_open", 20),
+        ("geometry", "tilt_deg", 20),
+    ],
+)
+def test_a_term_that_contradicts_the_others_is_noticed(
+    measured: Profile, term: TermName, name: str, sigmas: float
+) -> None:
+    off = with_estimates(measured, term, {name: sigmas * measured.result(term).estimate(name).sigma})
+    assert rig_state(off).agreement_p_value < 1e-6
+
+
+def test_agreement_of_draws_follows_its_degrees_of_freedom(measured: Profile) -> None:
+    rng, terms = np.random.default_rng(5), ("wire", "psf", "backscatter")
+    states = [rig_state(drawn(silent(measured, "geometry"), rng, terms)) for _ in range(40)]  # type: ignore[arg-type]
+    spread = np.std([[one.value for one in state.estimates] for state in states], axis=0)
+    told = [NAMES.index(name) for name in ("panel_x_px", "row_open", "column_open", "tilt_deg")]
+    stated = np.array([states[0].estimates[i].sigma for i in told])
+    np.testing.assert_allclose(spread[told] / stated, 1.0, atol=0.35)
+
+
+def test_without_terms_the_rig_file_is_left(measured: Profile) -> None:
+    state = rig_state(silent(measured, "geometry", "wire", "psf", "backscatter"))
+    assert (state.terms, state.agreement_dof, state.agreement_p_value) == ((), 0, 1.0)
+    for one in state.estimates:
+        assert one.prior is not None
+        assert (one.value, one.sigma) == pytest.approx((one.prior.value, one.prior.sigma), rel=1e-2), one.name
+        assert one.by_prior
+
+
+def test_an_estimate_that_repeats_the_rig_file_does_not_count_twice(measured: Profile) -> None:
+    wide = with_result(silent(measured, "wire", "geometry", "backscatter"), "psf", estimates=tuple(
+        Estimate(one.name, 0.5, 0.02, one.unit, EstimatePrior(0.4, 0.02)) if one.name == "row_open" else one
+        for one in measured.psf.estimates
+    ))  # fmt: skip
+    assert number(rig_state(wide), "row_open").value == pytest.approx(0.4)
+
+
+def test_hostile_numbers_are_refused_or_combined(measured: Profile) -> None:
+    rng, refusals = np.random.default_rng(11), 0
+    hostile = [0.0, -1.0, 5e-324, 1e-300, -1e-300, 1e9, -1e9, 1e150, 1e300, -1e300, 2.0**63]
+    for _ in range(60):
+        term = ("geometry", "wire", "psf", "backscatter")[rng.integers(4)]
+        result = measured.result(term)
+        cov, at = result.cov.copy(), rng.integers(len(result.cov), size=2)
+        cov[at[0], at[1]] = cov[at[1], at[0]] = hostile[rng.integers(len(hostile))]
+        numbers = {result.estimates[at[0]].name: hostile[rng.integers(len(hostile))] if rng.random() < 0.3 else 0.0}
+        try:
+            state = rig_state(with_result(with_estimates(measured, term, numbers), term, cov=cov))  # type: ignore[arg-type]
+        except ProfileError:
+            refusals += 1
+            continue
+        assert np.isfinite(
+            [state.agreement_chi2, *(number for e in state.estimates for number in (e.value, e.sigma))]
+        ).all()
+    assert 10 < refusals < 60
+
+
+def test_combining_is_a_weighted_mean_and_knows_what_it_does_not_know() -> None:
+    found = combine(np.array([[1.0, 0.0], [1.0, 0.0]]), np.array([1.0, 2.0]), np.diag([1.0, 0.25]))
+    assert found.values[0] == pytest.approx(1.8)
+    assert found.cov[0, 0] == pytest.approx(0.2)
+    assert (found.chi2, found.dof) == (pytest.approx(0.8), 1)
+    assert (found.known.tolist(), bool(np.isnan(found.values[1]))) == ([True, False], True)

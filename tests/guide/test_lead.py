@@ -1,0 +1,223 @@
+"""A person is led through whole captures of a painted rig: prompts, mistakes, skip, back, again, quit, resume."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from tests.guide.painted import PaintedRig, painted_bench, painted_rig
+from tests.guide.scripted import Reaction, Scripted
+from udccal.arrangements import Dark, FlatLight, Led
+from udccal.guide.capture import guided_steps, lead_capture
+from udccal.guide.events import Answer, Event, ProgressEvent, ReadingsEvent, StepEvent, VerdictEvent
+from udccal.rig import load_rig
+from udccal.sessions.schema import TermName
+from udccal.sessions.store import Session
+from udccal.sessions.writer import SessionWriter
+
+
+def led(
+    folder: Path,
+    terms: list[TermName],
+    react: Reaction = lambda event, offered: None,
+    painted: PaintedRig | None = None,
+) -> Scripted:
+    painted = painted or PaintedRig(painted_rig(psf_columns=2, psf_rows=1))
+    bench, person = painted_bench(painted), Scripted(react)
+    with SessionWriter.create_or_resume(folder, bench.rig, bench.camera.identity, now=bench.now) as writer:
+        done = lead_capture(writer, bench, person, terms)
+    assert person.done is done
+    return person
+
+
+@pytest.mark.slow
+def test_a_whole_rig_takes_at_most_40_prompts(tmp_path: Path) -> None:
+    rig, real = painted_rig(4, psf_shifts=1, board_views=2), load_rig("lg55-aca2040")
+    assert [step.id for step in guided_steps(rig)] == [step.id for step in guided_steps(real)]
+    person = led(tmp_path, ["noise", "geometry", "wire", "psf", "backscatter"], painted=PaintedRig(rig))
+    assert person.done.complete
+    assert person.prompts <= 40
+    session = Session.open(tmp_path)
+    assert {step.id for step in session.manifest.steps} == {i for step in guided_steps(rig) for i in step.step_ids}
+    steps = [event for event in person.events if isinstance(event, StepEvent)]
+    assert [event.number for event in steps] == list(range(1, steps[0].of + 1))
+    left = [event.minutes_left for event in steps]
+    assert left == sorted(left, reverse=True)
+    assert all(event.why and event.instruction.endswith(".") and event.drawing.startswith("<svg") for event in steps)
+
+
+def test_frames_are_counted(tmp_path: Path) -> None:
+    person = led(tmp_path, ["noise"])
+    counted = [event for event in person.events if isinstance(event, ProgressEvent)]
+    assert [event.frames for event in counted if event.step_id == "noise/flat_stack"] == [3, 5, 7, 9, 11]
+    assert all(event.frames <= event.of for event in counted)
+    assert person.prompts == 4  # two set-ups and two verdicts
+
+
+def test_the_place_of_an_led_is_measured(tmp_path: Path) -> None:
+    painted = PaintedRig(painted_rig(psf_columns=2, psf_rows=1, psf_shifts=3), offset_px=3.3)
+    led(tmp_path, ["psf"], painted=painted)
+    session = Session.open(tmp_path)
+    assert [step.id for step in session.steps("psf")] == [f"psf/p0{p}_s{s}" for p in (0, 1) for s in (0, 1, 2)]
+    first = session.step("psf/p00_s0").subject
+    asked = next(each for each in painted.asked if isinstance(each, Led))
+    assert (first.x_px - asked.x_px, first.y_px - asked.y_px) == pytest.approx((3.3, 3.3), abs=0.2)
+    for step in session.steps("psf"):
+        region = step.captures[0].region
+        assert 0 < step.subject.x_px - region.x < region.columns
+        assert 0 < step.subject.y_px - region.y < region.rows
+
+
+@pytest.mark.parametrize(
+    ("put", "sentence"),
+    [
+        (Led(60.0, 150.0, 2000.0, 1.15), "Move the LED so that its image goes"),
+        (FlatLight(), "The surroundings are nearly as bright as the LED. Darken the room."),
+        (Dark(), "No LED is seen."),
+    ],
+    ids=["wrong place", "room lit", "LED off"],
+)
+def test_a_wrong_led_is_not_captured_and_the_person_is_told_why(tmp_path: Path, put: object, sentence: str) -> None:
+    painted = PaintedRig(painted_rig(psf_columns=2, psf_rows=1))
+
+    def react(event: Event, offered: tuple[Answer, ...]) -> Answer | None:
+        if painted.frames_taken > 20:
+            painted.put = None
+        return None
+
+    painted.put = put
+    person = led(tmp_path, ["psf"], react, painted)
+    assert any(said.startswith(sentence) for said in person.sentences("psf/p00"))
+    assert person.done.complete
+
+
+def test_a_moving_led_is_not_captured(tmp_path: Path) -> None:
+    painted = PaintedRig(painted_rig(psf_columns=1, psf_rows=1))
+    painted.drift_px = 0.2
+
+    def react(event: Event, offered: tuple[Answer, ...]) -> Answer | None:
+        if painted.frames_taken > 40:
+            painted.drift_px = 0.0
+        return None
+
+    person = led(tmp_path, ["psf"], react, painted)
+    assert "Let the LED rest." in person.sentences("psf/p00")
+    assert person.done.complete
+
+
+@pytest.mark.parametrize(
+    ("term", "step_id", "put", "sentence"),
+    [
+        ("wire", "wire/flat", Dark(), "Expected to see the light"),
+        ("wire", "wire/flat", Led(100.0, 100.0, 2000.0, 1.15), "Expected an even light"),
+        ("wire", "wire/dark", FlatLight(), "Expected a dark frame"),
+        pytest.param("geometry", "geometry/panel", FlatLight(), "Expected to find at least", marks=pytest.mark.medium),
+    ],
+)
+def test_a_wrong_set_up_is_refused(tmp_path: Path, term: TermName, step_id: str, put: object, sentence: str) -> None:
+    painted = PaintedRig(painted_rig(4 if term == "geometry" else 8, board_views=1))
+    before: list[str] = []
+
+    def react(event: Event, offered: tuple[Answer, ...]) -> Answer | None:
+        if isinstance(event, ReadingsEvent) and event.step_id == step_id and not before:
+            painted.put = put
+            before.append("went on all the same")
+            return Answer.go
+        if isinstance(event, VerdictEvent) and not event.ok:
+            painted.put = None
+            return Answer.go
+        return None
+
+    person = led(tmp_path, [term], react, painted)
+    (refused,) = (event for event in person.events if isinstance(event, VerdictEvent) and not event.ok)
+    assert sentence in refused.sentence
+    assert refused.offered == (Answer.go, Answer.skip, Answer.back, Answer.quit)
+    assert person.done.complete
+
+
+@pytest.mark.medium
+def test_a_missing_board_is_told(tmp_path: Path) -> None:
+    painted = PaintedRig(painted_rig(4, board_views=2))
+
+    def react(event: Event, offered: tuple[Answer, ...]) -> Answer | None:
+        if isinstance(event, StepEvent | ReadingsEvent) and getattr(event, "step_id", "") == "geometry/views":
+            painted.put = None if painted.frames_taken > 60 else FlatLight()
+        return None
+
+    person = led(tmp_path, ["geometry"], react, painted)
+    assert any("of the board's corners are seen" in said for said in person.sentences("geometry/views"))
+    assert person.done.complete
+
+
+@pytest.mark.medium
+def test_the_same_view_again_is_not_taken(tmp_path: Path) -> None:
+    painted = PaintedRig(painted_rig(4, board_views=3))
+
+    def react(event: Event, offered: tuple[Answer, ...]) -> Answer | None:
+        views = [step for step in painted.asked if hasattr(step, "spec") and not step.parallel_to_panel]
+        done = isinstance(event, ReadingsEvent) and "Such a view is there already" in event.sentence
+        painted.put = None if done or not views else views[0]
+        return Answer.quit if done else None
+
+    person = led(tmp_path, ["geometry"], react, painted)
+    assert person.done.stopped
+    assert 1 <= len(Session.open(tmp_path).steps("geometry")) - 1 < 3
+
+
+def test_skip_leaves_out_and_what_needs_it_cannot_be_captured(tmp_path: Path) -> None:
+    def react(event: Event, offered: tuple[Answer, ...]) -> Answer | None:
+        if isinstance(event, ReadingsEvent) and event.step_id == "wire/flat":
+            return Answer.skip
+        return Answer.skip if offered == (Answer.skip, Answer.back, Answer.quit) else None
+
+    person = led(tmp_path, ["wire"], react)
+    assert not person.done.complete
+    assert not person.done.stopped
+    assert person.done.sentence.startswith("Captured, without wire/flat, wire/dark.")
+    assert person.sentences("wire/dark") == [
+        "This step takes up the exposure of wire/flat, which was not captured. Go back to it."
+    ]
+    assert Session.open(tmp_path).manifest.steps == ()
+
+
+def test_back_and_again_capture_a_step_once_more(tmp_path: Path) -> None:
+    todo = [Answer.again, Answer.back]
+
+    def react(event: Event, offered: tuple[Answer, ...]) -> Answer | None:
+        if isinstance(event, VerdictEvent) and event.step_id == "wire/flat" and len(todo) == 2:
+            return todo.pop(0)
+        if isinstance(event, ReadingsEvent) and event.step_id == "wire/dark" and todo:
+            return todo.pop(0)
+        return None
+
+    person = led(tmp_path, ["wire"], react)
+    assert person.visited == ["wire/flat", "wire/flat", "wire/dark", "wire/flat", "wire/dark"]
+    assert [step.id for step in Session.open(tmp_path).steps("wire")] == ["wire/flat", "wire/dark"]
+
+
+def test_a_step_that_is_left_after_back_stays_as_it_was(tmp_path: Path) -> None:
+    went = []
+
+    def react(event: Event, offered: tuple[Answer, ...]) -> Answer | None:
+        if isinstance(event, ReadingsEvent) and event.step_id == "wire/dark" and not went:
+            went.append(Session.open(tmp_path).step("wire/flat"))
+            return Answer.back
+        if isinstance(event, ReadingsEvent) and event.step_id == "wire/flat" and went:
+            return Answer.skip
+        return None
+
+    person = led(tmp_path, ["wire"], react)
+    assert person.done.complete
+    assert Session.open(tmp_path).step("wire/flat") == went[0]
+
+
+def test_quit_keeps_what_is_captured_and_the_next_run_continues(tmp_path: Path) -> None:
+    def react(event: Event, offered: tuple[Answer, ...]) -> Answer | None:
+        return Answer.quit if isinstance(event, VerdictEvent) else None
+
+    person = led(tmp_path, ["wire"], react)
+    assert person.done.stopped
+    assert person.visited == ["wire/flat"]
+    assert led(tmp_path, ["wire"]).visited == ["wire/dark"]
+    assert led(tmp_path, ["wire"]).visited == []

@@ -1,0 +1,94 @@
+"""Exports profiles for other programs, and imports lenses from them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import final
+
+from udccal.cli.output import Output
+from udccal.io.out_folder import storing_in
+from udccal.profiles.exchange.exports import covariance_file, export_profile
+from udccal.profiles.exchange.formats import EXPORTS, IMPORTS
+from udccal.profiles.exchange.imports import profile_of, read_lens
+from udccal.profiles.store import check_replaceable, load_profile, write_profile
+from udccal.result import FitStatus
+from udccal.rig import load_rig
+
+
+@final
+@dataclass(frozen=True)
+class ExportSummary:
+    """Result of ``profile export``; ``not_held`` are sentences that say what the file cannot hold."""
+
+    profile: Path
+    file: Path
+    covariance: Path
+    not_held: tuple[str, ...]
+
+
+@final
+@dataclass(frozen=True)
+class ImportSummary:
+    """Result of ``profile import``; ``notes`` are those of the geometry."""
+
+    file: Path
+    rig: str
+    profile: Path
+    notes: tuple[str, ...]
+
+
+def export(output: Output, path: Path, to: str, out: Path) -> None:
+    """Write a profile for another program, with the covariance beside it.
+
+    Args:
+        output: says what was written, and what the format cannot hold.
+        path: folder or zip file of the profile, or a rig's name.
+        to: name of the format.
+        out: the new file.
+
+    Raises:
+        ProfileError: when the profile cannot be read, or the file exists.
+        UdccalError: when the file cannot be written.
+    """
+    profile, into = load_profile(path), EXPORTS[to]
+    with storing_in(out.parent):
+        out.parent.mkdir(parents=True, exist_ok=True)
+        export_profile(profile, into, out)
+    beside = covariance_file(out)
+    output.say(f"{path} -> {out}, its covariance {beside}")
+    for term in into.terms:
+        status = profile.result(term).status
+        if status is not FitStatus.CONVERGED:
+            output.say(f"{term}: {status.value}")
+    for sentence in into.not_held:
+        output.say(sentence)
+    output.result(ExportSummary(path, out, beside, into.not_held))
+
+
+def import_(output: Output, of: str, file: Path, rig: str, out: Path) -> None:
+    """Write a profile whose geometry is the lens in another program's file.
+
+    Args:
+        output: says what was written, and what the file does not tell.
+        of: name of the format.
+        file: the other program's file.
+        rig: name of the rig, or its folder.
+        out: folder of the profile, or a zip file.
+
+    Raises:
+        RigError: when the rig is not known.
+        ProfileError: when the file cannot be read, does not fit the rig, or something else is at ``out``.
+        UdccalError: when the profile cannot be written.
+    """
+    check_replaceable(out)
+    profile = profile_of(read_lens(file, IMPORTS[of]), load_rig(rig), f"{file.name} ({of})")
+    with storing_in(out.parent):
+        write_profile(out, profile)
+    output.say(f"{file} -> {out}")
+    for sentence in (
+        *profile.geometry.notes,
+        "No other term is in the file: all are as in a session without captures.",
+    ):
+        output.say(sentence)
+    output.result(ImportSummary(file, profile.rig.name, out, profile.geometry.notes))

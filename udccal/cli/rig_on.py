@@ -1,0 +1,118 @@
+"""Where a rig is, for the verbs that capture: their common options, and how a session is captured there."""
+
+from __future__ import annotations
+
+import enum
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, final
+
+import typer
+
+from udccal.cli.output import Output
+from udccal.errors import CameraError
+
+if TYPE_CHECKING:
+    from udccal.cli.jobs.capture import Wanted
+    from udccal.guide.events import Person
+    from udccal.rig import RigDescription
+
+
+class CameraKind(enum.StrEnum):
+    """Which camera captures."""
+
+    sim = "sim"
+    u3v = "u3v"
+    pylon = "pylon"
+    files = "files"
+
+
+class DisplayKind(enum.StrEnum):
+    """How pictures are shown on the panel of a real rig."""
+
+    window = "window"
+    manual = "manual"
+
+
+_CAMERA_HELP = "sim: a simulated rig; u3v: any USB3 Vision camera; pylon: through Basler's SDK; files: see --files."
+_DISPLAY_HELP = "For a real rig. window: full screen on --monitor; manual: you show the named files."
+Camera = Annotated[CameraKind, typer.Option("--camera", help=_CAMERA_HELP)]
+Serial = Annotated[str | None, typer.Option("--serial", help="Serial number; needed if there are several.")]
+Files = Annotated[Path | None, typer.Option("--files", help="Folder with one folder of pictures per step.")]
+Display = Annotated[DisplayKind, typer.Option("--display", help=_DISPLAY_HELP)]
+Monitor = Annotated[int, typer.Option("--monitor", help="Number of the monitor that is the panel; see doctor.")]
+Agree = Annotated[bool, typer.Option("--yes", help="Go on by itself wherever all is in order.")]
+
+
+@final
+@dataclass(frozen=True)
+class RigOn:
+    """Where a rig is: simulated, at this computer, or in files.
+
+    Attributes:
+        camera: the backend.
+        serial: of a real camera; None for the only one.
+        files: folder with one folder of pictures per step, for ``CameraKind.files``.
+        display, monitor: how a real panel shows pictures.
+        seed, noise_seed: specimen and noise of a simulated rig; noise as the specimen where there is no seed for it.
+    """
+
+    camera: CameraKind
+    serial: str | None
+    files: Path | None
+    display: DisplayKind
+    monitor: int
+    seed: int
+    noise_seed: int | None = None
+
+    @property
+    def real(self) -> bool:
+        """Whether a person has to set things up before the camera."""
+        return self.camera in (CameraKind.u3v, CameraKind.pylon)
+
+    def capture(self, output: Output, rig: RigDescription, wanted: Wanted, person: Person | None) -> bool:
+        """Capture a session; return False when the person has stopped it.
+
+        Args:
+            output: shows stages and messages.
+            rig: the rig, with the captures that are wanted.
+            wanted: session, terms and steps.
+            person: who is led at a real rig, or at a simulated one for practice; None where nobody is.
+
+        Raises:
+            CameraError: when the camera cannot be opened or does not fit the rig.
+            UdccalError: as ``udccal.benches.capture.capture`` does.
+        """
+        if person is None:
+            self._watched(output, rig, wanted)
+            return True
+        return self._led(output, rig, wanted, person)
+
+    def _watched(self, output: Output, rig: RigDescription, wanted: Wanted) -> None:
+        from udccal.benches.bench import simulate
+        from udccal.cli.jobs.benches import files_bench
+        from udccal.cli.jobs.capture import capture_watched
+
+        if self.camera is CameraKind.sim:
+            opened = simulate(rig, self.seed, self.noise_seed)
+        elif self.files is None:
+            raise CameraError("Expected the folder with the pictures of each step, found none. Give it with --files.")
+        else:
+            opened = files_bench(output, rig, self.files, wanted.pictures)
+        with opened as bench:
+            capture_watched(output, bench, wanted)
+
+    def _led(self, output: Output, rig: RigDescription, wanted: Wanted, person: Person) -> bool:
+        from udccal.cli.jobs import benches, guided
+
+        if self.camera is CameraKind.sim:
+            with guided.practice_bench(rig, self.seed, person) as (bench, practising):
+                return not guided.capture_led(output, bench, practising, wanted).stopped
+        find = benches.u3v_camera if self.camera is CameraKind.u3v else benches.pylon_camera
+        seen = find(self.serial)
+        if self.display is DisplayKind.window:
+            shown = benches.window_display(rig, self.monitor)
+        else:
+            shown = benches.manual_display(rig, wanted.pictures, person)
+        with benches.real_bench(rig, seen, shown) as bench:
+            return not guided.capture_led(output, bench, person, wanted).stopped

@@ -1,0 +1,88 @@
+"""The steps that a procedure would take for a rig, at the exposures that are expected."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any, final
+
+from udccal.arrangements import Arrangement, Board, Dark, FlatLight, Led, PanelPicture, Photograph
+from udccal.errors import UdccalError
+from udccal.plugins import find_procedure
+from udccal.rig import RigDescription
+from udccal.sessions.schema import TermName
+
+# Exposures that fill the wells. Flats and boards are lit so that they fill them within a frame.
+_LED_FULL_S, _PANEL_FULL_S = 125e-6, 0.1
+# The time of a capture does not depend on the panel's picture: pictures are drawn this small for counting.
+_COUNTING_PX = 8
+
+
+@final
+@dataclass(frozen=True)
+class PlannedStep:
+    """One step as it will be carried out.
+
+    Attributes:
+        exposures_s: exposure of every frame that is kept.
+        level: of the range from black to saturation that the brightest sample of the first frame reaches in the light
+            that the exposure was metered in; None where the exposure does not aim at a level.
+        test_frames: frames at the first exposure, taken to find it and to check the scene.
+    """
+
+    id: str
+    arrangement: Arrangement
+    instruction: str
+    exposures_s: tuple[float, ...]
+    level: float | None
+    test_frames: int
+
+
+def steps_at(term: TermName, rig: RigDescription, full_s: Callable[[Arrangement], float]) -> Iterator[PlannedStep]:
+    """The steps of a term's procedure, one at a time, at the expected exposures.
+
+    Args:
+        term: of the procedure.
+        rig: with the captures that are wanted.
+        full_s: exposure in seconds at which the brightest sample of an arrangement fills its well.
+
+    Raises:
+        UdccalError: when no procedure is installed, or a step of it does not state its frames and exposure.
+    """
+    steps: Any = find_procedure(term)().steps(rig)
+    longest_s = rig.camera.max_exposure_s
+    earlier: dict[str, Any] = {}
+    for step in steps:
+        try:
+            # Nothing is metered where the exposure has no target.
+            metered_s = _within(getattr(step.exposure, "target", 0.0) * full_s(step.arrangement), rig)
+            at = step.exposure.planned(metered_s, earlier)
+            exposures_s = step.plan.exposures_s(_within(at.exposure_s, rig), longest_s)
+        except (AttributeError, KeyError) as error:
+            raise UdccalError(
+                f"Expected the step '{step.id}' to tell how many frames it takes and at which exposure, found that it "
+                f"does not ({error}). Give its plan and exposure the methods of those in procedures.plans."
+            ) from error
+        earlier[step.id] = at
+        yield PlannedStep(step.id, step.arrangement, step.instruction, exposures_s, at.level, at.test_frames)
+
+
+def nominal_full_s(arrangement: Arrangement, rig: RigDescription) -> float:
+    """Return the exposure in seconds that usually fills the well of an arrangement's brightest sample."""
+    match arrangement:
+        case Led():
+            return _LED_FULL_S
+        case PanelPicture():
+            return _PANEL_FULL_S
+        case FlatLight() | Board() | Dark() | Photograph():
+            return 1.0 / rig.camera.frame_rate_hz
+
+
+def with_small_panel(rig: RigDescription) -> RigDescription:
+    """Return a rig with a tiny panel, on which the frames and exposures of its steps do not depend."""
+    panel = rig.panel.model_copy(update={"columns": _COUNTING_PX, "rows": _COUNTING_PX})
+    return rig.model_copy(update={"panel": panel})
+
+
+def _within(exposure_s: float, rig: RigDescription) -> float:
+    return min(max(exposure_s, rig.camera.min_exposure_s), rig.camera.max_exposure_s)

@@ -1,0 +1,1 @@
+"""Exchange of profiles with other programs: one file for each format."""

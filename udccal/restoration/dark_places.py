@@ -1,0 +1,51 @@
+"""What is known of places that are darker than the error of the light subtracted there.
+
+Of backscatter, the calibration knows all but a few per mille. Where the scene is as dark as that, what is left of a
+colour may be anything, negative too: a display shows black, and patches of saturated green or blue. Two things are
+known beforehand. Light is not negative. And a colour deviates from grey by a fraction of its brightness, by and large.
+So brightness becomes its posterior mean under a flat prior above 0, and a deviation keeps the part of its variance that
+the error does not explain. The error is smooth, as the panel's light is; so is the correction.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from jaxtyping import Float32
+from scipy.special import log_ndtr
+
+# Variance of a colour's deviation from grey over the square of the grey: as in the filter's prior.
+_COLOURFUL = 0.2
+# Pixels across, of which the smooth picture has one.
+_STEP = 16
+# Where no deviation is wrong by more than this part, nothing is changed.
+_NEGLIGIBLE = 0.01
+_LEAST_E = 1e-6
+
+
+def plausible(
+    picture_e: Float32[np.ndarray, "rows columns 3"], error_e: Float32[np.ndarray, "rows columns"]
+) -> Float32[np.ndarray, "rows columns 3"]:
+    """Correct brightness and colour of dark places; return the picture itself where there are none.
+
+    Args:
+        picture_e: restored picture in e-.
+        error_e: sigma of the light that was subtracted, in e-.
+    """
+    rows, columns = error_e.shape
+    size = max(columns // _STEP, 1), max(rows // _STEP, 1)
+    small, error = (cv2.resize(each, size, interpolation=cv2.INTER_AREA) for each in (picture_e, error_e))
+    smooth, sigma = cv2.blur(small, (3, 3)), np.maximum(error, np.float32(_LEAST_E))[..., None]
+    grey = smooth.mean(axis=2, keepdims=True)
+    doubt = sigma**2 / (_COLOURFUL * np.maximum(grey, np.float32(0)) ** 2 + sigma**2)
+    if float(doubt.max()) < _NEGLIGIBLE:
+        return picture_e
+    # The errors of three colours average.
+    change = doubt * (grey - smooth) + _lift(grey, sigma / np.float32(np.sqrt(3)))
+    return picture_e + cv2.resize(change.astype(np.float32), (columns, rows), interpolation=cv2.INTER_LINEAR)
+
+
+def _lift(value: Float32[np.ndarray, "..."], sigma: Float32[np.ndarray, "..."]) -> Float32[np.ndarray, "..."]:
+    """Return the posterior mean less ``value`` of what is not negative (the truncated normal distribution's mean)."""
+    ratio = value / sigma
+    return sigma * np.exp(-(ratio**2) / 2 - log_ndtr(ratio)) / np.float32(np.sqrt(2 * np.pi))

@@ -1,0 +1,1 @@
+"""A guided capture as a page: who is led sits before a browser on this computer."""
