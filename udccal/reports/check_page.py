@@ -7,10 +7,16 @@ import numpy as np
 from udccal.drift.changes import Change
 from udccal.drift.check import RigCheck, Solved
 from udccal.reports.figures import embedded_png
-from udccal.reports.page import Fact, Illustration, ValidationPage, ValidationSection
+from udccal.reports.page import Advice, Fact, Illustration, ValidationPage, ValidationSection
 from udccal.reports.tables import Table, number, spread
 from udccal.reports.validation_figures import z_figure
 from udccal.validation.checks import ZMap
+
+_HEADLINES = {
+    "same": "The rig is as it was.",
+    "changed, harmless": "The rig changed, too little to matter.",
+    "changed": "The rig changed.",
+}
 
 
 def changes_table(found: RigCheck) -> Table:
@@ -33,7 +39,7 @@ def check_page(found: RigCheck, solved: Solved) -> ValidationPage:
     )
     return ValidationPage(
         title=f"A check of {found.rig}",
-        verdict=found.advice,
+        advice=Advice(_HEADLINES[found.verdict], mood, (found.advice,)),
         facts=(
             Fact("verdict", found.verdict),
             Fact("changed", ", ".join(found.changed) or "nothing that matters"),

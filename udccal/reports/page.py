@@ -128,7 +128,7 @@ class ValidationPage:
     template: ClassVar[str] = "validation.html.j2"
 
     title: str
-    verdict: str
+    advice: Advice
     facts: tuple[Fact, ...]
     sections: tuple[ValidationSection, ...]
 

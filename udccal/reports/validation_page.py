@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 from udccal.comparison.estimates import ORDER
 from udccal.reports.figures import embedded_png
-from udccal.reports.page import Fact, Illustration, ValidationPage, ValidationSection
+from udccal.reports.page import Advice, Fact, Illustration, ValidationPage, ValidationSection
 from udccal.reports.validation_figures import z_figure
 from udccal.reports.validation_tables import term_checks_table
 from udccal.sessions.schema import TermName
@@ -19,7 +19,11 @@ def validation_page(found: Validation, maps: Mapping[TermName, ZMap]) -> Validat
     counted = [check for check in found.checks if check.ok is not None]
     return ValidationPage(
         title=f"A profile of {found.rig}, validated by a session",
-        verdict=found.advice,
+        advice=Advice(
+            "The profile predicts this session." if found.ok else "The profile does not predict this session.",
+            "good" if found.ok else "bad",
+            (found.advice,),
+        ),
         facts=(
             Fact("checks within their limits", f"{sum(bool(check.ok) for check in counted)} of {len(counted)}"),
             Fact("profile made", found.profile_created_at),
