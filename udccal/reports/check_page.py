@@ -5,18 +5,17 @@ from __future__ import annotations
 import numpy as np
 
 from udccal.drift.changes import Change
-from udccal.drift.check import RigCheck, Solved, Verdict
+from udccal.drift.check import RigCheck, Solved
 from udccal.reports.figures import embedded_png
 from udccal.reports.page import Advice, Fact, Illustration, ValidationPage, ValidationSection
 from udccal.reports.tables import Table, number, spread
 from udccal.reports.validation_figures import z_figure
 from udccal.validation.checks import ZMap
 
-# With the CSS class of each verdict.
-_HEADLINES: dict[Verdict, tuple[str, str]] = {
-    "same": ("The rig is as its profile says.", "good"),
-    "changed, harmless": ("The rig changed, but nobody would see it.", "absent"),
-    "changed": ("The rig changed by more than is harmless.", "bad"),
+_HEADLINES = {
+    "same": "The rig is as it was.",
+    "changed, harmless": "The rig changed, too little to matter.",
+    "changed": "The rig changed.",
 }
 
 
@@ -31,7 +30,7 @@ def changes_table(found: RigCheck) -> Table:
 
 def check_page(found: RigCheck, solved: Solved) -> ValidationPage:
     """Build the page of one check."""
-    headline, mood = _HEADLINES[found.verdict]
+    mood = {"same": "good", "changed, harmless": "absent", "changed": "bad"}[found.verdict]
     z_map = ZMap(
         np.asarray(solved.pose.left / solved.pose.sigma),
         "x",
@@ -40,8 +39,9 @@ def check_page(found: RigCheck, solved: Solved) -> ValidationPage:
     )
     return ValidationPage(
         title=f"A check of {found.rig}",
-        advice=Advice(headline, mood, (found.advice,)),
+        advice=Advice(_HEADLINES[found.verdict], mood, (found.advice,)),
         facts=(
+            Fact("verdict", found.verdict),
             Fact("changed", ", ".join(found.changed) or "nothing that matters"),
             Fact("flat over noise", f"{found.flat_over_noise:.2f}"),
         ),
