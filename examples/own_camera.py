@@ -53,7 +53,7 @@ class MyCamera:  # makes its frames up; yours asks its driver. It is the Stage t
 
 world = simulated_rig(RIG, 0)
 with MyCamera() as camera, SimulatedDisplay(world) as display, tempfile.TemporaryDirectory() as folder:
-    bench = CaptureBench(RIG, camera, display, camera, world.now, lambda sentence: False)
+    bench = CaptureBench(RIG, camera, display, camera, world.now)
     noise = udccal.fit(udccal.capture(f"{folder}/session", bench, terms=["noise"]), "noise")
 for one, truth in zip(noise.estimates, (K_DN_PER_E, BLACK_DN), strict=False):
     print(f"{noise.status.name}: {one.name} {one.value:.4f} ± {one.sigma:.4f} of {truth}")

@@ -10,9 +10,10 @@ from collections.abc import Iterator
 from typing import ClassVar, final
 
 import udccal
-from procedures.base import Procedure, Step, whole_sensor
+from procedures.base import Procedure
 from procedures.checks import is_dark, is_even
 from procedures.plans import Metered, Stack, TimesThatOf
+from procedures.step import Step, whole_sensor
 from udccal.arrangements import Dark, FlatLight
 from udccal.benches.bench import simulated_rig
 from udccal.cameras.simulated import SimulatedCamera

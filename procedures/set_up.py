@@ -120,6 +120,8 @@ class SetUpVisit:
         wrong = [reading for reading in readings if not reading.ok]
         if not wrong:
             return Look(frame, readings, "", outlines)
+        if wrong[0].name == "head-room":  # what else is read from such a frame says little
+            return Look(frame, readings, why_not(wrong[0]), outlines)
         try:
             self._shown.check(frame, self._rig)
         except CaptureError as error:

@@ -14,7 +14,7 @@ import json
 import struct
 import tempfile
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 from unittest import mock
@@ -39,7 +39,7 @@ from udccal.restoration import runtime
 from udccal.restoration.kernel_grid import KernelGrid
 from udccal.restoration.plan import PlanOptions, kernel_grid
 from udccal.restoration.view import inscribed_view
-from udccal.result import Estimate, FitResult, FitStatus
+from udccal.result import Captures, Estimate, EstimatePrior, FitResult, FitStatus, Outliers, ResidualSample
 from udccal.rig import RigDescription, load_rig
 
 T = TypeVar("T")
@@ -85,15 +85,21 @@ def _profile() -> Profile:
     mask = np.full(np.shape(dark.mask), 2.0e4)
 
     def fitted(name: str, term: object, estimates: tuple[Estimate, ...] = ()) -> FitResult:
-        return FitResult(name, term, FitStatus.CONVERGED, estimates, np.eye(len(estimates)), 1.0, 100)
+        return FitResult(
+            name, term, FitStatus.CONVERGED, estimates, np.eye(len(estimates)), 1.0, 100,
+            outliers=(Outliers("off", 1, ("a",)),),
+            residuals=ResidualSample(np.ones((2, 2)), np.ones(2)),
+            captures=Captures("ab" * 32, 2, 20, (0.0, 6.0), ("2026-01-01", "2026-01-02"), (20.0, 30.0)),
+            effort="quick",
+        )  # fmt: skip
 
     wire = absent_wire(rig, geometry)
     return build_profile(
         rig,
         provenance_now(None, None),
-        noise=fitted("noise", noise, (Estimate("K_DN_per_e", 0.355, 1e-3, "DN/e-"),)),
+        noise=fitted("noise", noise, (Estimate("K_DN_per_e", 0.355, 1e-3, "DN/e-", EstimatePrior(0.36, 0.02)),)),
         geometry=fitted("geometry", geometry),
-        wire=fitted("wire", wire),
+        wire=replace(fitted("wire", wire), map_sigma=np.full((1, 2, 3), 1e-4, np.float32)),
         psf=fitted("psf", type(point)(**{**vars(point), "residual": residual})),
         backscatter=fitted("backscatter", type(dark)(**{**vars(dark), "mask": mask, "window": 5})),
         wire_map=sensor_map(wire, rig.camera.rows, rig.camera.columns),

@@ -14,8 +14,8 @@ import pytest
 
 from udccal.cameras.picture_files.mosaics import Layout, read_mosaic
 from udccal.cameras.protocol import CameraIdentity, Frame, Region, Settings
+from udccal.cli.jobs.explain import _checked_frame
 from udccal.cli.jobs.panel_picture import read_panel_picture
-from udccal.cli.jobs.restore import _checked_frame
 from udccal.errors import FileFormatError, ProfileError, SessionError
 from udccal.io.exr import read_exr, read_rgb_exr, write_exr
 from udccal.io.hashing import sha256_file

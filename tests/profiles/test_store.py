@@ -35,10 +35,10 @@ def assert_same(a: Profile, b: Profile) -> None:
         plain = [field.name for field in dataclasses.fields(one) if field.name not in ARRAYS]
         assert [getattr(one, name) for name in plain] == [getattr(other, name) for name in plain]
         np.testing.assert_array_equal(one.cov, other.cov)
-        assert one.residuals is not None
-        assert other.residuals is not None
-        np.testing.assert_array_equal(one.residuals.positions_px, other.residuals.positions_px)
-        np.testing.assert_array_equal(one.residuals.z, other.residuals.z)
+        assert (one.residuals is None) == (other.residuals is None)
+        if one.residuals is not None and other.residuals is not None:
+            np.testing.assert_array_equal(one.residuals.positions_px, other.residuals.positions_px)
+            np.testing.assert_array_equal(one.residuals.z, other.residuals.z)
         assert (one.map_sigma is None) == (other.map_sigma is None)
         if one.map_sigma is not None:
             np.testing.assert_array_equal(one.map_sigma, other.map_sigma)

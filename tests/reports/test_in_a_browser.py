@@ -9,7 +9,7 @@ import pytest
 
 from tests.chromium import Browser, Page, chromium
 from tests.reports.test_page import wide_page
-from udccal.reports.page import Advice, DiffPage, DiffSection, Fact, render
+from udccal.reports.page import Advice, DiffPage, DiffSection, Fact, ValidationPage, ValidationSection, render
 from udccal.reports.tables import Table
 
 pytestmark = pytest.mark.medium
@@ -42,6 +42,15 @@ def comparison() -> str:
     )
 
 
+def validation() -> str:
+    """The page of a validation, which that of a check is too."""
+    rows = (("a long name of a check", "1.23456789", "2", "%", "ok"),) * 9
+    table = Table("Checks", ("check", "value", "limit", "unit", ""), rows)
+    section = ValidationSection("wire", "predicted", "good", ("What was predicted. " * 5,), table, ())
+    advice = Advice("The profile holds.", "good", ("Go on with this profile.",))
+    return render(ValidationPage("A profile of toy", advice, (Fact("session", "another one"),), (section,) * 5))
+
+
 def check_shown(page: Page, height: int) -> None:
     """Nothing from outside, nothing wrong, nothing sticks out, and the advice is read first, without scrolling."""
     assert page.errors == []
@@ -63,7 +72,7 @@ def opened(browser: Browser, file: Path, text: str, width: int, height: int) -> 
 
 
 @pytest.mark.parametrize(("width", "height"), SIZES)
-@pytest.mark.parametrize("make", [wide_page, comparison])
+@pytest.mark.parametrize("make", [wide_page, comparison, validation])
 def test_a_page_can_be_read(browser: Browser, tmp_path: Path, make: object, width: int, height: int) -> None:
     assert callable(make)
     page = opened(browser, tmp_path / "page é.html", make(), width, height)

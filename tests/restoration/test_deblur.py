@@ -80,7 +80,7 @@ def test_a_picture_without_noise_or_light_stays_finite(toy_grid: KernelGrid, lev
         ({"x_px": np.arange(3.0)}, "Give the picture's px at which each kernel lies"),
         ({"y_px": np.array([3.0, 2.0, 1.0, 0.0])}, "Expected ascending places"),
         ({"scale": 2.0}, "Divide each by its sum"),
-        ({"tile_px": 40}, "Expected tiles of at least 80"),
+        ({"tile_px": 40}, "Expected tiles of at least 96"),
     ],
 )
 def test_what_does_not_fit_is_refused(toy_grid: KernelGrid, change: dict, sentence: str) -> None:

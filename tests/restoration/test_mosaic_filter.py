@@ -8,7 +8,7 @@ import pytest
 from udccal.cfa import PATTERNS, Cfa
 from udccal.restoration.kernel_grid import KernelGrid
 from udccal.restoration.mosaic_filter import (
-    _COLOURS,
+    COLOURS,
     STRENGTHS,
     FilterTables,
     _solve_chunk,
@@ -44,7 +44,7 @@ def dense_solution(tile: np.ndarray, kernel: np.ndarray, cfa: Cfa, strength: flo
     blurs = [circulant(np.fft.fft2(p)) for p in placed]
     channels = cfa.channel_map(SIZE, SIZE).ravel()
     seen = np.zeros((SIZE * SIZE, SIZE * SIZE))
-    mixed = _COLOURS
+    mixed = COLOURS
     across = [np.zeros((SIZE * SIZE, SIZE * SIZE)) for _ in range(3)]
     for i in range(3):
         for j in range(3):
@@ -92,7 +92,7 @@ def test_scenes_drawn_from_the_prior_choose_their_own_strength(strength: float) 
     shape = layout.rows, layout.columns
     tables = filter_tables(KernelGrid(np.zeros(1), np.zeros(1), point), layout, cfa, 1)
     amplitude = np.sqrt(strength * prior_density(*shape))
-    grey = np.linalg.cholesky(_COLOURS)
+    grey = np.linalg.cholesky(COLOURS)
     white = np.fft.fft2(rng.normal(size=(layout.count, 3, *shape)))
     scene = np.einsum("ij,njyx->niyx", grey, np.fft.ifft2(white * amplitude).real)
     own = cfa.channel_map(*shape)

@@ -32,7 +32,7 @@ def test_tiles_are_no_larger_than_what_they_cover_asks_for() -> None:
 
 
 def test_tiles_too_small_to_be_blended_are_refused() -> None:
-    with pytest.raises(RestorationError, match="at least 80 x 80 px, found 128 x 64"):
+    with pytest.raises(RestorationError, match="at least 96 x 96 px, found 128 x 64"):
         layout_for(300, 300, (2, 2), (64, 128), (0, 300))
 
 

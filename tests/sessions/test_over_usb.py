@@ -38,7 +38,7 @@ def bench_over_usb(rig: RigDescription, world: SimulatedWorld, device: VirtualCa
     with U3vCamera(backend=VirtualBackend([device])) as camera:
         camera.set_mode(mode_for(camera.features, camera.sensor, rig.camera.cfa, rig.camera.bits))
         description = world.truth.description
-        yield CaptureBench(description, camera, SimulatedDisplay(world), world, world.now, lambda sentence: False)
+        yield CaptureBench(description, camera, SimulatedDisplay(world), world, world.now)
 
 
 def rejections(session: Session) -> Counter[str]:

@@ -60,7 +60,7 @@ def walk(page: Page, painted: PaintedRig, steps: tuple[GuidedStep, ...]) -> None
 @pytest.mark.medium
 @pytest.mark.parametrize(("width", "height"), SIZES)
 def test_a_whole_rig_is_captured_with_mistakes_and_a_reload(tmp_path: Path, width: int, height: int) -> None:
-    painted = PaintedRig(painted_rig(psf_columns=2, psf_rows=1))
+    painted = PaintedRig(painted_rig(fewer=4, psf_columns=2, psf_rows=1))
     bench, person, done = painted_bench(painted), WebPerson(Sampling.of(painted.rig)), list[DoneEvent]()
 
     def capture() -> None:

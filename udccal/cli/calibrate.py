@@ -9,19 +9,19 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from udccal.cli.options import DOUBTFUL, STOPPED, IterationLog, ProfilePath, RigName, Seed, SessionFolder, TermChoice
-from udccal.cli.output import Output
-from udccal.cli.rig_on import (
+from udccal.cli.bench_options import (
     Agree,
+    BenchOptions,
     Camera,
     CameraKind,
     Display,
     DisplayKind,
     Files,
     Monitor,
-    RigOn,
     Serial,
 )
+from udccal.cli.options import DOUBTFUL, STOPPED, IterationLog, ProfilePath, RigName, Seed, SessionFolder, TermChoice
+from udccal.cli.output import Output
 
 if TYPE_CHECKING:
     from udccal.guide.events import Person
@@ -76,8 +76,8 @@ def calibrate(
     from udccal.rig import load_rig
     from udccal.sessions.changes import Exchanged
 
-    rig_on = RigOn(camera, serial, files, display, monitor, seed)
-    led = practice or rig_on.real
+    options = BenchOptions(camera, serial, files, display, monitor, seed)
+    led = practice or options.real
     _check_words(camera, led, practice, yes or json_events or web)
     if port and not web:
         raise typer.BadParameter("--port is for the page: give --web with it, or leave it out.")
@@ -89,7 +89,7 @@ def calibrate(
         session, [t.value for t in term or TermChoice], {Exchanged(part.value) for part in exchanged or ()}, again or ()
     )
     with _person(output, description, port if web else None) if led else nullcontext() as person:
-        goes_on = rig_on.capture(output, description, wanted, person and led_by(output, person, yes))
+        goes_on = options.capture(output, description, wanted, person and led_by(output, person, yes))
     if not goes_on:
         raise typer.Exit(STOPPED)
     if not fit_to_profile(output, session, profile, log):

@@ -7,8 +7,18 @@ from typing import Annotated
 
 import typer
 
+from udccal.cli.bench_options import (
+    Agree,
+    BenchOptions,
+    Camera,
+    CameraKind,
+    Display,
+    DisplayKind,
+    Files,
+    Monitor,
+    Serial,
+)
 from udccal.cli.options import CHANGED, STOPPED, FoundProfile, Seed
-from udccal.cli.rig_on import Agree, Camera, CameraKind, Display, DisplayKind, Files, Monitor, RigOn, Serial
 
 
 def check(
@@ -34,7 +44,7 @@ def check(
     """Check a rig against its profile: ten flats, some dark frames and three panel pictures, in a few minutes."""
     from udccal.cli.jobs.check import check_profile
 
-    rig_on = RigOn(camera, serial, files, display, monitor, seed, noise_seed)
-    same = check_profile(context.obj, profile, rig_on, yes, out, update)
+    options = BenchOptions(camera, serial, files, display, monitor, seed, noise_seed)
+    same = check_profile(context.obj, profile, options, yes, out, update)
     if not same:
         raise typer.Exit(STOPPED if same is None else CHANGED)

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from udccal.cli.rig_on import CameraKind, DisplayKind
+from udccal.cli.bench_options import CameraKind, DisplayKind
 
 _SESSION_HELP = "Folder of the session: checks that its disk has room."
 

@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 
+from udccal.cli.bench_options import CameraKind
 from udccal.cli.options import FoundProfile, PanelPicturePath, Seed
-from udccal.cli.rig_on import CameraKind
 from udccal.tiers import Tier
 
 

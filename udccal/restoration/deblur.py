@@ -61,7 +61,7 @@ def deblur(
         kernels: (grid rows, grid columns, 3, kernel rows, kernel columns), by place of the source and colour. Their
             middle sample is the source's place. Each sums to 1.
         x_px: columns of the picture at which the kernels lie, ascending. y_px: rows.
-        tile_px: rows and columns of a tile at most; a tile has one kernel and one prior. At least 80.
+        tile_px: rows and columns of a tile at most; a tile has one kernel and one prior. At least 96.
         workers: threads.
 
     Returns:

@@ -38,7 +38,7 @@ from udccal.restoration.tiles import TileLayout
 # cycles/px below which it is flat, and the variance of a colour's deviation from grey relative to that of the grey.
 _EXPONENT, _FLAT_BELOW, _COLOURFUL = 3.0, 0.003, 0.2
 # The prior's covariance of two colours relative to the variance of grey.
-_COLOURS = _COLOURFUL * np.eye(3) + 1 - _COLOURFUL / 3
+COLOURS = _COLOURFUL * np.eye(3) + 1 - _COLOURFUL / 3
 # Strengths of the prior in units of the noise: RMS difference of neighbours over the sigma of a sample, squared.
 STRENGTHS = np.exp2(np.arange(-6.0, 17.0)).astype(np.float32)
 # Every n-th frequency along both axes decides the strength.
@@ -118,7 +118,7 @@ def _tables_of(
         for j, other in enumerate(pattern.sites[: i + 1]):
             product = density * seen[i] * np.conj(seen[j])
             folded = product.reshape(pattern.rows, rows // pattern.rows, pattern.columns, -1).sum(axis=(0, 2))[:, :half]
-            matrix[..., i, j] = folded * (_COLOURS[own.channel, other.channel] / aliases)
+            matrix[..., i, j] = folded * (COLOURS[own.channel, other.channel] / aliases)
             matrix[..., j, i] = np.conj(matrix[..., i, j])
     values, vectors = np.linalg.eigh(matrix)
     return (
@@ -211,7 +211,7 @@ def _solve(
     planes = jnp.stack([whole[site.samples] for whole, site in zip(of_site, pattern.sites, strict=True)])
     windows = jnp.stack([taper[site.samples] for site in pattern.sites])
     channels = np.array([site.channel for site in pattern.sites])
-    own = np.array([channels == colour for colour in range(_COLOURS.shape[0])], dtype=np.float32)
+    own = np.array([channels == colour for colour in range(COLOURS.shape[0])], dtype=np.float32)
     # A colour without sites is like the mean of all.
     of_all = np.where(own.any(axis=1, keepdims=True), own, 1)
     level = (of_all / of_all.sum(axis=1, keepdims=True)) @ planes.mean(axis=(1, 2))
@@ -221,7 +221,7 @@ def _solve(
     strength = _likeliest(choices, spectrum, values, planes[0].size * jnp.mean(taper**2))
     weighted = strength / (strength * values + 1) * spectrum
     by_site = tables.matched * (jnp.conj(tables.vectors) * weighted[:, None]).sum(axis=0)
-    by_colour = [[w * by_site[:, site] for site, w in enumerate(row)] for row in _COLOURS[:, channels].tolist()]
+    by_colour = [[w * by_site[:, site] for site, w in enumerate(row)] for row in COLOURS[:, channels].tolist()]
     mixed = jnp.stack([functools.reduce(jnp.add, parts) for parts in by_colour])
     picture = _interleaved(jnp.fft.irfft2(mixed, s=planes.shape[1:]), pattern)
     return picture * noise_e[:, None, None] + level[:, None, None], strength

@@ -74,6 +74,13 @@ def kept(folder: Path | None, kind: type[T], depends_on: tuple[object, ...], mak
     return made
 
 
+def checksum(*values: object) -> str:
+    """Return the SHA-256 of values as ``depends_on`` may have them: the same numbers have the same in any precision."""
+    sha = hashlib.sha256()
+    _feed(sha, values)
+    return sha.hexdigest()
+
+
 def _read(path: Path, kind: type[T]) -> T | None:
     """Return what an entry holds, if it is whole and its arrays are what the class says; mark it as used."""
     try:

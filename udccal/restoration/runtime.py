@@ -9,6 +9,7 @@ from __future__ import annotations
 import functools
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import final
 
 import numpy as np
 from jaxtyping import Float32, UInt8, UInt16
@@ -30,6 +31,7 @@ from udccal.restoration.prepared import kept
 from udccal.restoration.preview import Preview
 from udccal.restoration.rectify import Rectification
 from udccal.restoration.sharpen import Sharpener
+from udccal.restoration.stages import Stage
 from udccal.restoration.tone import Tone
 from udccal.restoration.view import inscribed_view
 from udccal.rig import RigDescription
@@ -37,6 +39,22 @@ from udccal.tiers import Tier
 
 Mosaic = Float32[np.ndarray, "rows columns"]
 Picture = Float32[np.ndarray, "rows columns 3"]
+
+
+@final
+@dataclass(frozen=True)
+class SceneLight:
+    """The scene's part of a frame.
+
+    Attributes:
+        signal_e: in e-, divided by the wire.
+        variance_e2: of its noise in e-^2.
+        panel_error_e: sigma of the panel's light that was taken off, in e-; None where there was none.
+    """
+
+    signal_e: Mosaic
+    variance_e2: Mosaic
+    panel_error_e: Mosaic | None
 
 
 @dataclass(frozen=True)
@@ -91,6 +109,7 @@ class Restorer:
         tier: Tier = Tier.balanced,
         options: PlanOptions | None = None,
         keep: Path | None = None,
+        without: frozenset[Stage] = frozenset(),
     ) -> Restorer:
         """Prepare a profile.
 
@@ -100,6 +119,8 @@ class Restorer:
             options: accuracy against time within the tier.
             keep: folder that keeps what is computed, so that the next start of a program reads it instead; None to
                 keep nothing. ``prepared_folder()`` is the one of the ``udccal`` command.
+            without: stages that the scene does not need (``chosen_stages``). Nothing is computed for them, and frames
+                do not pass them.
 
         Raises:
             RestorationError: when its geometry leaves no view through the panel, or a term gives values that are not
@@ -111,7 +132,7 @@ class Restorer:
         view = inscribed_view(geometry, camera.columns, camera.rows, rig.view.columns, rig.view.rows)
         rectification = Rectification.within(geometry, view, camera.columns, camera.rows)
         quick = tier is Tier.preview
-        unscattered = profile.backscatter.unfitted
+        unscattered = profile.backscatter.unfitted or Stage.backscatter in without
         error = profile.backscatter.diagnostic("held_out_without_noise_of_peak") or 0.0
         unblurred = quick or profile.psf.unfitted
         even = profile.wire.unfitted and bool(np.all(profile.wire_map == 1.0))
@@ -120,7 +141,7 @@ class Restorer:
             rig=rig,
             noise=profile.noise.term,
             view=view,
-            wire=None if even else profile.wire_map,
+            wire=None if even or Stage.wire in without else profile.wire_map,
             mask=None
             if unscattered
             else PanelMask(mask_mosaic(profile.backscatter_mask, cfa, camera.rows, camera.columns), cfa, error),
@@ -156,6 +177,26 @@ class Restorer:
             RestorationError: when the frame, its exposure or the panel picture does not belong to this rig, or the
                 panel's picture alone would give more light than the frame has: the exposure is wrong, or the picture.
         """
+        light = self.scene_light(mosaic, exposure_s, panel_picture)
+        if self.sharpener is None:
+            return self._on_view(demosaic(light.signal_e, self.rig.camera.cfa), exposure_s)
+        sharp = self.sharpener.apply(light.signal_e, light.variance_e2)
+        if light.panel_error_e is not None:
+            sharp = plausible(sharp, light.panel_error_e[self.sharpener.rows])
+        linear = self._strip_rectification.apply(sharp, self.options.interpolation)
+        linear /= np.float32(exposure_s)
+        return linear
+
+    def scene_light(
+        self,
+        mosaic: UInt16[np.ndarray, "frame_rows frame_columns"],
+        exposure_s: float,
+        panel_picture: UInt8[np.ndarray, "panel_rows panel_columns 3"] | None = None,
+    ) -> SceneLight:
+        """Return the light of the scene alone, before it is deblurred.
+
+        Arguments and errors are those of ``restore``.
+        """
         check_frame(mosaic, exposure_s, self.rig)
         check_panel_picture(panel_picture, self.rig)
         signal = without_defects(to_electrons(mosaic, self.noise, exposure_s), self.noise, self.rig.camera.cfa)
@@ -170,14 +211,7 @@ class Restorer:
                 refuse_excess(signal, panel_e, saturated(mosaic, self.noise))
             signal -= panel_e
             panel_error_e = np.float32(self.mask.error) * panel_e
-        if self.sharpener is None:
-            return self._on_view(demosaic(signal, self.rig.camera.cfa), exposure_s)
-        sharp = self.sharpener.apply(signal, variance)
-        if panel_error_e is not None:
-            sharp = plausible(sharp, panel_error_e[self.sharpener.rows])
-        linear = self._strip_rectification.apply(sharp, self.options.interpolation)
-        linear /= np.float32(exposure_s)
-        return linear
+        return SceneLight(signal, variance, panel_error_e)
 
     def display(
         self,

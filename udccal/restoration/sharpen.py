@@ -31,6 +31,22 @@ _LOCAL_PX = 16
 
 @final
 @dataclass(frozen=True)
+class Solved:
+    """What the tiles' filters give.
+
+    Attributes:
+        picture: in e-, of the rows that the layout covers.
+        strengths: of each tile's prior, in units of its noise.
+        noise_e: sigma of a sample of each colour, by tile.
+    """
+
+    picture: Strip
+    strengths: Float32[np.ndarray, " tiles"]
+    noise_e: Float32[np.ndarray, "tiles 3"]
+
+
+@final
+@dataclass(frozen=True)
 class Sharpener:
     """Everything that depends on kernels alone.
 
@@ -100,15 +116,19 @@ class Sharpener:
         Returns:
             the picture in e-, of the rows that the layout covers.
         """
-        tile_noise = self._tile_noise(variance_e2)
+        solved = self.solved(signal_e, variance_e2)
+        if self.noise is None:
+            return solved.picture
+        bands = self.noise.of_tiles(solved.strengths)
+        local = cv2.blur(variance_e2, (_LOCAL_PX, _LOCAL_PX), borderType=cv2.BORDER_REFLECT_101)
+        return shrunk(solved.picture, solved.noise_e, local[self.rows], bands, self.layout, self.options.workers)
+
+    def solved(self, signal_e: Mosaic, variance_e2: Mosaic) -> Solved:
+        """Demosaic and deblur as ``apply`` does, but take out no noise."""
+        noise_e = self._tile_noise(variance_e2)
         tiles = self.layout.cut(signal_e)
-        pictures, strengths = filtered(tiles, tile_noise, self.tables, self.layout, self.cfa, self.options.workers)
-        picture = self.layout.join(pictures)
-        if self.noise is not None:
-            bands = self.noise.of_tiles(strengths)
-            local = cv2.blur(variance_e2, (_LOCAL_PX, _LOCAL_PX), borderType=cv2.BORDER_REFLECT_101)
-            picture = shrunk(picture, tile_noise, local[self.rows], bands, self.layout, self.options.workers)
-        return picture
+        pictures, strengths = filtered(tiles, noise_e, self.tables, self.layout, self.cfa, self.options.workers)
+        return Solved(self.layout.join(pictures), strengths, noise_e)
 
     def _tile_noise(self, variance_e2: Mosaic) -> Float32[np.ndarray, "tiles 3"]:
         """Return the sigma of a sample of each colour in each tile."""

@@ -19,6 +19,8 @@ from scipy import fft
 from udccal.errors import RestorationError
 
 TAPER_PX, BLEND_PX = 24, 16
+# A tile's part that is neither tapered nor blended must hold the bands of its noise.
+LEAST_PX = 2 * (TAPER_PX + BLEND_PX) + 16
 # From a tile's edge to the middle of its blend.
 _OUTSIDE = TAPER_PX + BLEND_PX // 2
 
@@ -143,10 +145,10 @@ def layout_for(
     Raises:
         RestorationError: when a tile is too small to have a part that is neither tapered nor blended.
     """
-    least = 2 * (TAPER_PX + BLEND_PX)
-    if min(largest) < least:
+    if min(largest) < LEAST_PX:
         raise RestorationError(
-            f"Expected tiles of at least {least} x {least} px, found {largest[1]} x {largest[0]}. Give larger ones."
+            f"Expected tiles of at least {LEAST_PX} x {LEAST_PX} px, found {largest[1]} x {largest[0]}. "
+            "Give larger ones."
         )
     first, last = max(rows[0], 0), min(rows[1], frame_rows)
     height = _fitted(last - first, largest[0], cell[0])
@@ -159,7 +161,7 @@ def _fitted(span: int, largest: int, cell: int) -> int:
     """Return the smallest size of tiles, of whole cells and with a fast transform, that needs no more tiles."""
     most = -(-largest // cell) * cell
     count = -(-(span + cell) // (most - 2 * _OUTSIDE))
-    needed = -(-(span + cell) // count) + 2 * _OUTSIDE
+    needed = max(-(-(span + cell) // count) + 2 * _OUTSIDE, LEAST_PX)
     return min(most, cell * int(fft.next_fast_len(-(-needed // cell), real=True)))
 
 

@@ -35,8 +35,9 @@ class LedTruth:
 
 @dataclass(frozen=True)
 class _Rendered:
-    """Expected rates of the present arrangement in a rectangle of the sensor."""
+    """Expected rates of an arrangement in a rectangle of the sensor."""
 
+    of: Arrangement
     region: Region
     rate: Float64[np.ndarray, "rows columns"]
 
@@ -90,7 +91,7 @@ class SimulatedWorld:
         if occasion is not None:
             self._clock_s = (1 + occasion.number) * _STEP_S
             self._noise_from = (1 + occasion.number) * _STEP_FRAMES - self._frames_begun
-        self._arrangement, self._rendered, self._led = arrangement, None, None
+        self._arrangement, self._led = arrangement, None
         if isinstance(arrangement, Led):
             self._led = self._aim(arrangement)
             self.truth_log.append(self._led)
@@ -101,7 +102,9 @@ class SimulatedWorld:
 
     def expected_rate(self, region: Region) -> Float64[np.ndarray, "rows columns"]:
         """Return expected photo-electrons per second in ``region``, before noise and flicker. Do not write to it."""
-        if self._rendered is None or not _covers(self._rendered.region, region):
+        # What is put back is not computed again: a person looks at it first, then has it captured.
+        kept = self._rendered is not None and self._rendered.of is self._arrangement
+        if self._rendered is None or not kept or not _covers(self._rendered.region, region):
             self._rendered = self._render(region)
         x, y = region.x - self._rendered.region.x, region.y - self._rendered.region.y
         rate = self._rendered.rate[y : y + region.rows, x : x + region.columns]
@@ -154,7 +157,7 @@ class SimulatedWorld:
         arrangement = self._arrangement
         match arrangement:
             case Led():
-                return _Rendered(region, self._led_rate(arrangement, region))
+                return _Rendered(arrangement, region, self._led_rate(arrangement, region))
             case Dark():
                 rate = np.zeros((self._whole.rows, self._whole.columns))
             case FlatLight():
@@ -166,7 +169,7 @@ class SimulatedWorld:
             case Photograph():
                 rate = self.light.photograph(arrangement)
         rate.flags.writeable = False
-        return _Rendered(self._whole, rate)
+        return _Rendered(arrangement, self._whole, rate)
 
     def _led_rate(self, led: Led, region: Region) -> Float64[np.ndarray, "rows columns"]:
         assert self._led is not None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 import threading
 import time
 from collections.abc import Callable
@@ -43,15 +44,21 @@ class LiveView:
 
     Args:
         make: makes a picture of a frame.
+        now_s, spent_s: the time, and how much of it this thread has computed.
     """
 
-    def __init__(self, make: Callable[[Frame], Picture]) -> None:
-        self._make = make
+    def __init__(
+        self,
+        make: Callable[[Frame], Picture],
+        now_s: Callable[[], float] = time.monotonic,
+        spent_s: Callable[[], float] = time.thread_time,
+    ) -> None:
+        self._make, self._now_s, self._spent_s = make, now_s, spent_s
         self._numbers = itertools.count(1)
         self._newest: _Seen | None = None
         self._making = threading.Lock()
         self._made: View | None = None
-        self._due_s = 0.0
+        self._due_s = -math.inf
 
     def look(self, frame: Frame, outlines: tuple[Outline, ...]) -> None:
         """Take the newest frame; nothing is copied, and nothing waits."""
@@ -66,10 +73,10 @@ class LiveView:
             return self._made if self._made is not None and self._made.number > number else None
 
     def _make_when_due(self, seen: _Seen) -> None:
-        now_s = time.monotonic()
+        now_s = self._now_s()
         if now_s < self._due_s:
             return
-        before_s = time.thread_time()
+        before_s = self._spent_s()
         picture = self._make(seen.frame)
-        self._due_s = now_s + max(PERIOD_S, (time.thread_time() - before_s) / _SHARE)
+        self._due_s = now_s + max(PERIOD_S, (self._spent_s() - before_s) / _SHARE)
         self._made = View(seen.number, seen.frame.settings.region, picture, seen.outlines)

@@ -5,11 +5,11 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+from udccal.cli.bench_options import BenchOptions
 from udccal.cli.jobs.capture import Wanted
 from udccal.cli.jobs.guided import led_by
 from udccal.cli.jobs.terminal import TerminalPerson
 from udccal.cli.output import Output, plain
-from udccal.cli.rig_on import RigOn
 from udccal.compilation import keep_compilations
 from udccal.drift.check import check_rig
 from udccal.drift.short import short_rig
@@ -23,7 +23,7 @@ from udccal.sessions.store import Session
 
 
 def check_profile(
-    output: Output, path: Path, rig_on: RigOn, agree: bool, out: Path, update: Path | None
+    output: Output, path: Path, options: BenchOptions, agree: bool, out: Path, update: Path | None
 ) -> bool | None:
     """Capture, compare and print; return whether the rig is the same, or changed by less than matters.
 
@@ -32,7 +32,7 @@ def check_profile(
     Args:
         output: shows the changes.
         path: folder or zip file of the profile, or a rig's name.
-        rig_on: where the rig is.
+        options: where the rig is.
         agree: whether a capture that a person is led through goes on by itself wherever all is in order.
         out: folder for ``session``, ``check.json`` and ``check.html``.
         update: path of a new profile with what changed; None for none.
@@ -50,8 +50,8 @@ def check_profile(
         check_writable(update.parent)
     profile = load_profile(path)
     rig, folder = short_rig(profile.rig), out / "session"
-    person = led_by(output, TerminalPerson(output), agree) if rig_on.real else None
-    if not rig_on.capture(output, rig, Wanted(folder, ("wire", "backscatter")), person):
+    person = led_by(output, TerminalPerson(output), agree) if options.real else None
+    if not options.capture(output, rig, Wanted(folder, ("wire", "backscatter")), person):
         return None
     with output.stage("comparing"):
         found, solved = check_rig(profile, Session.open(folder))

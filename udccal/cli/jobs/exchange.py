@@ -82,7 +82,8 @@ def import_(output: Output, of: str, file: Path, rig: str, out: Path) -> None:
         UdccalError: when the profile cannot be written.
     """
     check_replaceable(out)
-    profile = profile_of(read_lens(file, IMPORTS[of]), load_rig(rig), f"{file.name} ({of})")
+    description = load_rig(rig)
+    profile = profile_of(read_lens(file, IMPORTS[of]), description, f"{file.name} ({of})")
     with storing_in(out.parent):
         write_profile(out, profile)
     output.say(f"{file} -> {out}")

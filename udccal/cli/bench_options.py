@@ -46,7 +46,7 @@ Agree = Annotated[bool, typer.Option("--yes", help="Go on by itself wherever all
 
 @final
 @dataclass(frozen=True)
-class RigOn:
+class BenchOptions:
     """Where a rig is: simulated, at this computer, or in files.
 
     Attributes:

@@ -1,0 +1,125 @@
+"""``udccal restore --explain`` and ``--plan`` on files: what is printed, what is pinned, what is refused."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+from unittest.mock import MagicMock
+
+import numpy as np
+import pytest
+import typer
+
+from udccal.cli.jobs import explain
+from udccal.cli.jobs.explain import Frames, Plans, explain_plan
+from udccal.cli.jobs.restore import restore_files
+from udccal.cli.output import Output
+from udccal.cli.restore import TierChoice, restore
+from udccal.errors import FileFormatError, RestorationError
+from udccal.io.png import write_png16, write_rgb8
+from udccal.profiles.profile import Profile
+from udccal.profiles.store import write_profile
+from udccal.restoration import planner
+from udccal.restoration.frame_time import PartTimes
+from udccal.restoration.scene_plan import Wish
+from udccal.result import FitStatus
+from udccal.tiers import Tier
+
+TIMES = PartTimes(*(np.array(seconds) for seconds in (1e-8, 4e-8, 1e-7, 5e-8, 2e-8, 1e-8)))
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path: Path, profile: Profile, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with a profile without a psf, a frame and two panel pictures; a cache of its own; known times."""
+    monkeypatch.setenv("UDCCAL_COMPILATIONS", str(tmp_path / "cache"))
+    monkeypatch.setattr("udccal.cli.jobs.explain.keep_compilations", lambda: None)
+    monkeypatch.setattr("udccal.cli.jobs.restore.keep_compilations", lambda: None)
+    monkeypatch.setattr(planner, "part_times", lambda *_: TIMES)
+    write_profile(tmp_path / "profile", replace(profile, psf=replace(profile.psf, status=FitStatus.ABSENT)))
+    camera, panel = profile.rig.camera, profile.rig.panel
+    write_png16(tmp_path / "frame.png", np.full((camera.rows, camera.columns), 900, np.uint16))
+    write_rgb8(tmp_path / "black.png", np.zeros((panel.rows, panel.columns, 3), np.uint8))
+    write_rgb8(tmp_path / "small.png", np.zeros((panel.rows, panel.columns - 1, 3), np.uint8))
+    return tmp_path
+
+
+def frames(folder: Path, shown: str | None = None) -> Frames:
+    return Frames([folder / "frame.png"], folder / "profile", None if shown is None else folder / shown, 0.02)
+
+
+def test_it_says_what_would_be_done_and_restores_nothing(
+    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("udccal.restoration.runtime.Restorer.restore", lambda *_: pytest.fail("restored"))
+    explain_plan(Output(), frames(folder, "black.png"), Plans(Wish(), None), None)
+    said = capsys.readouterr().out
+    for words in (
+        "wire",
+        "backscatter",
+        "left out",
+        "the panel is black",
+        "preview",
+        "balanced",
+        "chosen",
+        "ms a frame",
+    ):
+        assert words in said
+    assert not (folder / "out").exists()
+
+
+def test_json_and_the_file_are_one_plan_that_can_be_pinned(
+    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    explain_plan(Output(as_json=True), frames(folder, "black.png"), Plans(Wish(budget_ms=0.1), None), folder / "made")
+    printed = json.loads(capsys.readouterr().out)
+    assert printed == json.loads((folder / "made" / "plan.json").read_text(encoding="utf-8"))
+    assert printed["tier"] == "preview"
+    monkeypatch.setattr(explain, "planned", lambda *_: pytest.fail("planned anew"))
+    pinned = Plans(Wish(), folder / "made" / "plan.json")
+    restore_files(Output(as_json=True), frames(folder), pinned, folder / "out", "png")
+    assert json.loads(capsys.readouterr().out)["tier"] == "preview"
+    assert (folder / "out" / "frame.png").exists()
+
+
+def test_without_a_wish_it_restores_at_the_most_accurate_tier(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    restore_files(Output(as_json=True), frames(folder), Plans(Wish(), None), folder / "out", "png")
+    assert json.loads(capsys.readouterr().out)["tier"] == "balanced"
+
+
+def test_what_does_not_belong_to_the_profile_is_refused_before_any_work(
+    folder: Path, profile: Profile, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("udccal.cli.jobs.restore.Restorer", None)
+    output, out = Output(), folder / "out"
+    explain_plan(output, frames(folder), Plans(Wish(), None), folder / "made")
+    other = replace(profile, wire_map=profile.wire_map * np.float32(1.01))
+    write_profile(folder / "other", other)
+    of_other = replace(frames(folder), profile=folder / "other")
+    pinned = Plans(Wish(), folder / "made" / "plan.json")
+    with pytest.raises(RestorationError, match="Expected a plan of this profile"):
+        restore_files(output, of_other, pinned, out, "png")
+    with pytest.raises(FileFormatError, match="32 x 24 samples, found 31 x 24"):
+        restore_files(output, frames(folder, "small.png"), Plans(Wish(), None), out, "png")
+    with pytest.raises(RestorationError, match=r"frame\.png: Expected a budget of at least"):
+        restore_files(output, frames(folder), Plans(Wish(budget_ms=1e-6), None), out, "png")
+    shipped = replace(frames(folder), profile=Path("lg55-reduced"))
+    with pytest.raises(FileFormatError, match="1024 x 768 samples, found 96 x 64"):
+        restore_files(output, shipped, Plans(Tier.fast, None), out, "png")
+    assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({}, "needed unless --explain"),
+        ({"out": Path("o"), "tier": TierChoice.fast, "budget_ms": 5.0}, "takes neither another --tier nor --plan"),
+        ({"out": Path("o"), "plan": Path("p"), "min_psnr": 30.0}, "takes neither another --tier nor --plan"),
+        ({"out": Path("o"), "plan": Path("p"), "tier": TierChoice.fast}, "takes neither --tier nor --explain"),
+        ({"plan": Path("p"), "explain": True}, "takes neither --tier nor --explain"),
+    ],
+)
+def test_options_that_contradict_each_other_are_wrong_words(options: dict[str, Any], said: str) -> None:
+    with pytest.raises(typer.BadParameter, match=said):
+        restore(MagicMock(spec=typer.Context), [Path("frame.png")], Path("p"), **options)

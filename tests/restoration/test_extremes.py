@@ -1,0 +1,159 @@
+"""Rigs and frames at the edge of what can be: every tier gives finite pictures, and none is worse than the preview."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.restoration.toy_restorer import EXPOSURE_S, exposed, made
+from udccal.cfa import cfa_named
+from udccal.errors import RestorationError
+from udccal.models.geometry import Geometry
+from udccal.models.noise import Noise
+from udccal.restoration.backscatter import PanelMask
+from udccal.restoration.deblur import deblur
+from udccal.restoration.kernel_grid import KernelGrid
+from udccal.restoration.metrics import display_exposure, encode_srgb, psnr
+from udccal.restoration.runtime import Restorer, check_frame
+from udccal.rig import RigDescription
+from udccal.tiers import Tier
+
+# A tier may be worse than the preview by this much, and overshoot an edge by this part of its step.
+_LOSS_DB, _OVERSHOOT = 0.3, 0.08
+
+
+@pytest.fixture(scope="module")
+def restorers(
+    toy_rig: RigDescription, toy_noise: Noise, toy_geometry: Geometry, toy_grid: KernelGrid
+) -> dict[Tier, Restorer]:
+    return {tier: made(tier, toy_rig, toy_noise, toy_geometry, toy_grid) for tier in Tier}
+
+
+def shown_psnr(restorer: Restorer, frame: np.ndarray, scene: np.ndarray) -> float:
+    truth = restorer.rectification.apply(scene) / EXPOSURE_S
+    exposure = display_exposure(truth)
+    return psnr(encode_srgb(restorer.restore(frame, EXPOSURE_S) * exposure), encode_srgb(truth * exposure))
+
+
+def no_worse_than_the_preview(restorers: dict[Tier, Restorer], frame: np.ndarray, scene: np.ndarray) -> None:
+    found = {tier: shown_psnr(restorer, frame, scene) for tier, restorer in restorers.items()}
+    assert all(dB >= found[Tier.preview] - _LOSS_DB for dB in found.values()), found
+
+
+@pytest.mark.parametrize("light", [1.0, 0.1, 0.01, 1e-3, 2e-4], ids=lambda light: f"light x {light:g}")
+def test_no_tier_is_worse_than_the_preview(
+    restorers: dict[Tier, Restorer], toy_grid: KernelGrid, toy_scene: np.ndarray, light: float
+) -> None:
+    """The last one has 1 e- in its bright places."""
+    scene = toy_scene * np.float32(light)
+    no_worse_than_the_preview(restorers, exposed(restorers[Tier.fast], toy_grid, scene), scene)
+
+
+@pytest.mark.parametrize("wire", ["1 %", "near zero in places"])
+def test_hardly_any_light_comes_through(
+    restorers: dict[Tier, Restorer], toy_grid: KernelGrid, toy_scene: np.ndarray, wire: str
+) -> None:
+    passed = np.full((96, 128), 0.01 if wire == "1 %" else 1.0, np.float32)
+    if wire != "1 %":
+        passed[40:44] = 1e-6
+    dim = {tier: replace(restorer, wire=passed) for tier, restorer in restorers.items()}
+    frame = exposed(dim[Tier.fast], toy_grid, toy_scene)
+    for restorer in dim.values():
+        assert np.isfinite(restorer.restore(frame, EXPOSURE_S)).all()
+    if wire == "1 %":
+        no_worse_than_the_preview(dim, frame, toy_scene)
+
+
+def test_a_transfer_with_zeros(
+    toy_rig: RigDescription, toy_noise: Noise, toy_geometry: Geometry, toy_grid: KernelGrid, toy_scene: np.ndarray
+) -> None:
+    """Two equal peaks swallow every frequency at which they cancel."""
+    kernels = np.zeros_like(toy_grid.kernels)
+    kernels[..., 16, 4] = kernels[..., 24, 4] = 0.5
+    grid = replace(toy_grid, kernels=kernels)
+    restorers = {tier: made(tier, toy_rig, toy_noise, toy_geometry, grid) for tier in Tier}
+    no_worse_than_the_preview(restorers, exposed(restorers[Tier.fast], grid, toy_scene), toy_scene)
+
+
+@pytest.mark.parametrize("cfa", ["RGGB", "BGGR", "GRBG", "GBRG"])
+def test_every_colour_pattern(
+    toy_rig: RigDescription,
+    toy_noise: Noise,
+    toy_geometry: Geometry,
+    toy_grid: KernelGrid,
+    toy_scene: np.ndarray,
+    cfa: str,
+) -> None:
+    rig = toy_rig.model_copy(update={"camera": toy_rig.camera.model_copy(update={"cfa": cfa})})
+    restorers = {tier: made(tier, rig, toy_noise, toy_geometry, toy_grid) for tier in Tier}
+    no_worse_than_the_preview(restorers, exposed(restorers[Tier.fast], toy_grid, toy_scene), toy_scene)
+
+
+@pytest.mark.parametrize("tier", list(Tier))
+def test_sensors_of_odd_sizes(
+    toy_rig: RigDescription, toy_noise: Noise, toy_geometry: Geometry, toy_grid: KernelGrid, tier: Tier
+) -> None:
+    camera = toy_rig.camera.model_copy(update={"rows": 95, "columns": 127})
+    rig = toy_rig.model_copy(update={"camera": camera})
+    restorer = made(tier, rig, toy_noise, toy_geometry, toy_grid)
+    frame = np.full((95, 127), 64 + round(0.355 * 2000), np.uint16)
+    restored = replace(restorer, wire=None).restore(frame, EXPOSURE_S)
+    np.testing.assert_allclose(restored * EXPOSURE_S, 2000.0, rtol=0.01)
+
+
+def test_a_crop_of_one_pixel_is_no_frame(toy_rig: RigDescription, toy_grid: KernelGrid) -> None:
+    with pytest.raises(RestorationError, match="128 x 96 samples"):
+        check_frame(np.zeros((1, 1), np.uint16), EXPOSURE_S, toy_rig)
+    one = deblur(np.full((1, 1, 3), 7.0, np.float32), toy_grid.kernels[:1, :1], np.zeros(1), np.zeros(1))
+    np.testing.assert_allclose(one, 7.0, rtol=0.01)
+
+
+@pytest.mark.parametrize("tier", list(Tier))
+@pytest.mark.parametrize("kind", ["90 % saturated", "a peak a million times the median", "every tenth column hot"])
+def test_frames_of_extremes(restorers: dict[Tier, Restorer], tier: Tier, kind: str) -> None:
+    frame = (64 + np.random.default_rng(7).poisson(0.4, (96, 128))).astype(np.uint16)
+    if kind == "90 % saturated":
+        frame[:, :115] = 3969
+    elif kind == "every tenth column hot":
+        frame[:, ::10] = 3969
+    else:  # the median is a hundredth of an electron
+        frame[:] = 64
+        frame[48:50, 64:66] = 3969
+    restored = restorers[tier].restore(frame, EXPOSURE_S)
+    assert np.isfinite(restored).all()
+    assert restored.max() * EXPOSURE_S < 10 * 3969 / 0.355
+
+
+def test_a_panel_brighter_than_the_scene(
+    restorers: dict[Tier, Restorer], toy_grid: KernelGrid, toy_scene: np.ndarray
+) -> None:
+    """Backscatter of 20 times the scene's light; the picture is not known, and the panel is white."""
+    scene = toy_scene * np.float32(0.02)
+    white = np.full((96, 128), 20 * float(scene.mean()) / EXPOSURE_S, np.float32)
+    lit = {tier: replace(restorer, mask=PanelMask(white, cfa_named("RGGB"))) for tier, restorer in restorers.items()}
+    wire = restorers[Tier.fast].wire
+    assert wire is not None
+    frame = exposed(restorers[Tier.fast], toy_grid, scene + np.float32(EXPOSURE_S) * white[..., None])
+    no_worse_than_the_preview(lit, frame, scene)
+
+
+@pytest.mark.parametrize("tier", [Tier.fast, Tier.balanced])
+@pytest.mark.parametrize("upright", [True, False], ids=["a step across", "a step down"])
+def test_a_step_is_not_overshot(
+    restorers: dict[Tier, Restorer], toy_grid: KernelGrid, tier: Tier, upright: bool
+) -> None:
+    low, high = 500.0, 5000.0
+    scene = np.full((96, 128, 3), low, np.float32)
+    if upright:
+        scene[:, 64:] = high
+    else:
+        scene[48:] = high
+    restorer = restorers[tier]
+    frame = exposed(restorer, toy_grid, scene)
+    restored = restorer.restore(frame, EXPOSURE_S) * EXPOSURE_S
+    # Of all places at one distance from the edge, so that noise does not count.
+    along = restored.mean(axis=0 if upright else 1)
+    assert along.max() <= high + _OVERSHOOT * (high - low)
+    assert along.min() >= low - _OVERSHOOT * (high - low)

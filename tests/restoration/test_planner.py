@@ -1,0 +1,112 @@
+"""Plans of a toy profile: what they compute, what they expect, what they refuse before any work."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from udccal.errors import RestorationError
+from udccal.profiles.profile import Profile
+from udccal.restoration import planner, runtime
+from udccal.restoration.frame_time import FrameSize, PartTimes
+from udccal.restoration.plan import PlanOptions
+from udccal.restoration.planner import planned
+from udccal.restoration.scene_plan import ScenePlan, Wish
+from udccal.restoration.stages import chosen_stages
+from udccal.result import FitStatus
+from udccal.tiers import Tier
+
+EXPOSURE_S = 0.02
+TIMES = PartTimes(*(np.array(seconds) for seconds in (1e-8, 4e-8, 1e-7, 5e-8, 2e-8, 1e-8)))
+
+
+@pytest.fixture
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A computer whose times are known."""
+    monkeypatch.setattr(planner, "part_times", lambda *_: TIMES)
+
+
+@pytest.fixture
+def frame(profile: Profile) -> np.ndarray:
+    rng, camera = np.random.default_rng(2), profile.rig.camera
+    light = np.full((camera.rows, camera.columns), 500.0)
+    light[20:40, 30:70] = 4000.0
+    return (64 + 0.355 * rng.poisson(light)).astype(np.uint16)
+
+
+def plan_of(profile: Profile, frame: np.ndarray, asked: Tier | Wish, forecast: bool = False) -> ScenePlan:
+    stages = chosen_stages(profile, frame, EXPOSURE_S, None)
+    return planned(profile, frame, EXPOSURE_S, None, asked, stages, forecast)
+
+
+def refuse(monkeypatch: pytest.MonkeyPatch, *names: str) -> None:
+    for name in names:
+        monkeypatch.setattr(
+            runtime if name == "kernel_grid" else planner, name, lambda *_, name=name: pytest.fail(f"called {name}")
+        )
+
+
+@pytest.mark.parametrize("asked", [Wish(), *Tier])
+def test_a_plan_without_a_wish_measures_nothing(
+    profile: Profile, frame: np.ndarray, asked: Tier | Wish, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    refuse(monkeypatch, "part_times", "expected_error", "kernel_grid")
+    plan = plan_of(profile, frame, asked)
+    assert plan.tier is (asked if isinstance(asked, Tier) else Tier.balanced)
+    assert plan.tiers == ()
+
+
+@pytest.mark.usefixtures("quick")
+def test_a_budget_alone_needs_no_kernels(profile: Profile, frame: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
+    refuse(monkeypatch, "expected_error", "kernel_grid")
+    assert plan_of(profile, frame, Wish(budget_ms=1e4)).tier is Tier.balanced
+    assert plan_of(profile, frame, Wish(budget_ms=0.1)).tier is Tier.preview
+    with pytest.raises(RestorationError, match="the fastest tier, preview, needs"):
+        plan_of(profile, frame, Wish(budget_ms=1e-6, min_psnr_dB=20.0))
+
+
+@pytest.mark.usefixtures("quick")
+def test_the_forecast_says_what_each_tier_gives(
+    profile: Profile, frame: np.ndarray, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    small = PlanOptions(grid_rows=2, grid_columns=2, tile_rows=96, tile_columns=128)
+    monkeypatch.setattr(runtime, "PlanOptions", lambda: small)
+    plan = plan_of(profile, frame, Tier.preview, forecast=True)
+    assert plan.tier is Tier.preview
+    preview, fast, balanced = plan.tiers
+    assert preview.frame_ms < fast.frame_ms < balanced.frame_ms
+    assert fast.psnr_dB is not None
+    assert balanced.psnr_dB is not None
+    assert 25 < fast.psnr_dB < balanced.psnr_dB < 60
+    darker = plan_of(profile, (64 + (frame - 64) // 20).astype(np.uint16), Tier.preview, forecast=True)
+    assert darker.tiers[1].psnr_dB is not None
+    assert darker.tiers[1].psnr_dB < fast.psnr_dB - 3.0
+
+
+@pytest.mark.usefixtures("quick")
+def test_without_a_psf_only_times_are_expected(profile: Profile, frame: np.ndarray) -> None:
+    sharp = replace(profile, psf=replace(profile.psf, status=FitStatus.ABSENT))
+    plan = plan_of(sharp, frame, Wish(min_psnr_dB=30.0), forecast=True)
+    assert [each.psnr_dB for each in plan.tiers] == [None, None, None]
+
+
+def test_a_frame_of_another_camera_is_refused_first(
+    profile: Profile, frame: np.ndarray, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    refuse(monkeypatch, "part_times", "expected_error", "kernel_grid")
+    stages = chosen_stages(profile, frame, EXPOSURE_S, None)
+    with pytest.raises(RestorationError, match="96 x 64 samples"):
+        planned(profile, frame[:-2], EXPOSURE_S, None, Wish(1e4, 30.0), stages)
+    with pytest.raises(RestorationError, match="32 x 24 8-bit RGB"):
+        planned(profile, frame, EXPOSURE_S, np.zeros((24, 31, 3), np.uint8), Wish(1e4, 30.0), stages)
+
+
+def test_times_grow_with_pixels_and_with_what_is_done() -> None:
+    small, large = FrameSize(1000, 600, 500, 1500), FrameSize(4000, 2400, 2000, 6000)
+    for tier in Tier:
+        assert large.ms(tier, TIMES) == pytest.approx(4 * small.ms(tier, TIMES))
+    assert small.ms(Tier.fast, TIMES) == pytest.approx(1e3 * (1000e-8 + 500 * 2e-8 + 1500e-7))
+    sharp = FrameSize(1000, 600, 500, 0)
+    assert sharp.ms(Tier.balanced, TIMES) == sharp.ms(Tier.fast, TIMES) < small.ms(Tier.fast, TIMES)

@@ -1,0 +1,158 @@
+"""How long a frame is expected to take at each tier, from a small measurement of this computer.
+
+Every part of restoration is timed once on arrays of a small camera, per pixel. A frame takes the sum over its pixels.
+The measurement is kept with what restoration prepares. A panel picture that stands still is summed once, so that it is
+not part of a frame's time; nor are reading and writing files.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import final
+
+import numpy as np
+from jaxtyping import Float64
+
+from udccal.cfa import Cfa, cfa_named
+from udccal.models.noise import Noise
+from udccal.restoration.backscatter import PanelMask
+from udccal.restoration.demosaic import demosaic
+from udccal.restoration.linear import to_electrons, variance_e2, without_defects
+from udccal.restoration.mosaic_filter import FilterTables, filtered
+from udccal.restoration.plan import PlanOptions
+from udccal.restoration.prepared import kept
+from udccal.restoration.preview import Preview
+from udccal.restoration.rectify import Rectification
+from udccal.restoration.shrink import shrunk
+from udccal.restoration.tiles import TileLayout, layout_for
+from udccal.restoration.tone import Tone
+from udccal.tiers import Tier
+
+_ROWS, _COLUMNS, _RUNS = 512, 768, 5
+
+Seconds = Float64[np.ndarray, ""]
+
+
+@final
+@dataclass(frozen=True)
+class PartTimes:
+    """Seconds of each part of restoration per pixel.
+
+    Attributes:
+        linear: electrons, defects, variance, wire and backscatter, per pixel of the sensor.
+        demosaicing: per pixel of the sensor.
+        filter: of the tiles, per pixel of a tile.
+        shrinkage: per pixel that the tiles cover.
+        view: resampling and tone, per pixel of the view.
+        preview: all of a preview, per pixel of the rows that the view needs.
+    """
+
+    linear: Seconds
+    demosaicing: Seconds
+    filter: Seconds
+    shrinkage: Seconds
+    view: Seconds
+    preview: Seconds
+
+
+@final
+@dataclass(frozen=True)
+class FrameSize:
+    """What a frame's time depends on.
+
+    Attributes:
+        sensor_px: pixels of the sensor.
+        covered_px: pixels of the rows that the view needs.
+        view_px: pixels of the view.
+        tile_px: pixels of all tiles; 0 where nothing is deblurred.
+    """
+
+    sensor_px: int
+    covered_px: int
+    view_px: int
+    tile_px: int
+
+    @classmethod
+    def of(cls, layout: TileLayout, view_px: int, blurred: bool) -> FrameSize:
+        """Return the size of a frame in the tiles of ``layout``."""
+        tile_px = layout.count * layout.rows * layout.columns
+        sensor_px = layout.frame_rows * layout.frame_columns
+        return cls(sensor_px, int(np.prod(layout.covered)), view_px, tile_px if blurred else 0)
+
+    def ms(self, tier: Tier, times: PartTimes) -> float:
+        """Return the milliseconds from a raw frame to a picture of 8 bits at a tier."""
+        if tier is Tier.preview:
+            return 1e3 * float(self.covered_px * times.preview)
+        seconds = self.sensor_px * times.linear + self.view_px * times.view
+        if self.tile_px == 0:
+            return 1e3 * float(seconds + self.sensor_px * times.demosaicing)
+        seconds = seconds + self.tile_px * times.filter
+        return 1e3 * float(seconds + (self.covered_px * times.shrinkage if tier is Tier.balanced else 0.0))
+
+
+def part_times(options: PlanOptions, keep: Path | None = None) -> PartTimes:
+    """Measure this computer, or read what an earlier start measured.
+
+    Args:
+        options: options of the restoration.
+        keep: folder that keeps the measurement; None to keep nothing.
+    """
+    return kept(keep, PartTimes, (options,), lambda: _measured(options))
+
+
+def _measured(options: PlanOptions) -> PartTimes:
+    rng, cfa, workers = np.random.default_rng(0x7135), cfa_named("RGGB"), options.workers
+    noise = Noise(0.4, 64.0, 3969.0, 5.0, 0.1, 0.2, 1.0, 20.0, 2.0, 0.005)
+    # An even frame with noise: without defects to look at, as most frames are.
+    mosaic = (64 + 0.4 * rng.poisson(3000.0, (_ROWS, _COLUMNS))).astype(np.uint16)
+    ones = np.ones(mosaic.shape, dtype=np.float32)
+    layout = layout_for(_ROWS, _COLUMNS, (2, 2), (options.tile_rows, options.tile_columns), (0, _ROWS))
+    view_y, view_x = np.mgrid[: _ROWS - 8, : _COLUMNS - 8].astype(np.float32) + np.float32(4.3)
+    rectification, tone, mask = Rectification(view_x, view_y), Tone(1e-4), PanelMask(ones, cfa)
+    preview = Preview.of(noise, ones, mask, cfa, rectification, mosaic.shape)
+    signal = to_electrons(mosaic, noise, 1.0)
+    tables, unit = _like_tables(layout, cfa, rng), np.full((layout.count, 3), 55.0, np.float32)
+    bands = np.full((layout.count, 3, 4, 3), 0.1, np.float32)
+    picture = demosaic(signal, cfa.name)
+
+    def linear() -> None:
+        clean = without_defects(to_electrons(mosaic, noise, 1.0), noise, cfa.name)
+        variance = variance_e2(clean, noise, 1.0)
+        clean /= ones
+        variance /= ones**2
+        clean -= np.float32(1.0) * ones
+
+    parts = (
+        (linear, mosaic.size),
+        (lambda: demosaic(signal, cfa.name), mosaic.size),
+        (
+            lambda: layout.join(filtered(layout.cut(signal), unit, tables, layout, cfa, workers)[0]),
+            layout.count * layout.rows * layout.columns,
+        ),
+        (lambda: shrunk(picture, unit, signal, bands, layout, workers), mosaic.size),
+        (lambda: tone.rgb8(rectification.apply(picture, options.interpolation)), view_x.size),
+        (lambda: preview.rgb8(mosaic, 1.0, tone), mosaic.size),
+    )
+    return PartTimes(*(np.array(_least_s(run) / pixels) for run, pixels in parts))
+
+
+def _like_tables(layout: TileLayout, cfa: Cfa, rng: np.random.Generator) -> FilterTables:
+    """Return tables of the right shapes; the numbers do not matter to their time."""
+    sites = len(cfa.sites)
+    planes = layout.rows // cfa.rows, layout.columns // cfa.columns // 2 + 1
+    square = rng.standard_normal((layout.count, sites, sites, *planes)).astype(np.complex64)
+    return FilterTables(square, square, np.abs(square[:, 0]).astype(np.float32))
+
+
+def _least_s(run: Callable[[], object]) -> float:
+    """Return the least seconds of some runs: other programs only add."""
+    run()  # compiles
+    seconds = []
+    for _ in range(_RUNS):
+        start = time.perf_counter()
+        run()
+        seconds.append(time.perf_counter() - start)
+    return min(seconds)

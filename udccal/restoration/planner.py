@@ -1,0 +1,73 @@
+"""Makes the plan of a scene from a profile, a frame and the panel's picture."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import UInt8, UInt16
+
+from udccal.cfa import cfa_named
+from udccal.profiles.profile import Profile
+from udccal.restoration.forecast import expected_error
+from udccal.restoration.frame_time import FrameSize, part_times
+from udccal.restoration.plan import PlanOptions
+from udccal.restoration.runtime import Restorer, check_frame, check_panel_picture
+from udccal.restoration.scene_plan import ScenePlan, TierForecast, Wish, chosen_tier
+from udccal.restoration.stages import Stage, StageChoice
+from udccal.restoration.tiles import layout_for
+from udccal.tiers import Tier
+
+
+def planned(
+    profile: Profile,
+    mosaic: UInt16[np.ndarray, "rows columns"],
+    exposure_s: float,
+    panel_picture: UInt8[np.ndarray, "panel_rows panel_columns 3"] | None,
+    asked: Tier | Wish,
+    stages: tuple[StageChoice, ...],
+    forecast: bool = False,
+    keep: Path | None = None,
+) -> ScenePlan:
+    """Make a plan, and compute for it no more than is asked.
+
+    A budget takes the times of this computer, a least PSNR the filters of the profile; a plan without both takes
+    neither.
+
+    Args:
+        profile: the rig as measured.
+        mosaic, exposure_s, panel_picture: as for ``Restorer.restore``, which would accept them.
+        asked: the tier, or what is asked of the one that is chosen.
+        stages: what the scene needs: ``chosen_stages`` of this frame, or ``needed_by_any`` of several.
+        forecast: whether the plan says what each tier is expected to give, whatever is asked.
+        keep: folder that keeps what is computed; None to keep nothing.
+
+    Raises:
+        RestorationError: when no tier does what is asked, or the profile gives no finite values.
+    """
+    check_frame(mosaic, exposure_s, profile.rig)
+    check_panel_picture(panel_picture, profile.rig)
+    tier, wish = (None, asked) if isinstance(asked, Wish) else (asked, Wish())
+    if not forecast and wish == Wish():
+        return ScenePlan.of(profile, tier or list(Tier)[-1], stages)
+    without = frozenset(choice.stage for choice in stages if not choice.runs)
+    tiers = _timed(profile, without, keep)
+    chosen_tier(tiers, Wish(budget_ms=wish.budget_ms))  # refuses before kernels are computed
+    if forecast or wish.min_psnr_dB is not None:
+        restorer = Restorer.from_profile(profile, Tier.fast, keep=keep, without=without)
+        error = expected_error(restorer, mosaic, exposure_s, panel_picture, keep)
+        if error is not None:
+            tiers = tuple(TierForecast(each.tier, error.psnr_dB(each.tier), each.frame_ms) for each in tiers)
+    return ScenePlan.of(profile, tier or chosen_tier(tiers, wish), stages, tiers)
+
+
+def _timed(profile: Profile, without: frozenset[Stage], keep: Path | None) -> tuple[TierForecast, ...]:
+    """Return every tier with its time for a frame; the PSNR is not known yet."""
+    options, camera = PlanOptions(), profile.rig.camera
+    quick = Restorer.from_profile(profile, Tier.preview, options, keep, without)
+    cfa = cfa_named(camera.cfa)
+    largest = options.tile_rows, options.tile_columns
+    layout = layout_for(camera.rows, camera.columns, (cfa.rows, cfa.columns), largest, quick.rectification.rows)
+    size = FrameSize.of(layout, quick.view.rows * quick.view.columns, not profile.psf.unfitted)
+    times = part_times(options, keep)
+    return tuple(TierForecast(tier, None, size.ms(tier, times)) for tier in Tier)

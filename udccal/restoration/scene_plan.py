@@ -1,0 +1,155 @@
+"""What is done to the frames of a scene, decided before any work: which stages run, and at which tier.
+
+``PlanOptions`` of ``plan.py`` are another thing: how accurately a tier does its work, whatever the scene.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, ClassVar, Final, Literal, final
+
+from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
+
+from udccal.errors import RestorationError
+from udccal.profiles.profile import Profile
+from udccal.restoration.prepared import checksum
+from udccal.restoration.stages import Stage, StageChoice
+from udccal.tiers import Tier
+
+_FORMAT: Final = "udccal-scene-plan"
+_MAX_BYTES: Final = 64 * 1024
+
+
+@final
+@dataclass(frozen=True)
+class TierForecast:
+    """What a tier is expected to give.
+
+    Attributes:
+        tier: the tier.
+        psnr_dB: PSNR of display-encoded values against a camera without a panel; None where it is not known.
+        frame_ms: time from a raw frame to a picture of 8 bits on this computer.
+    """
+
+    __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(extra="forbid", allow_inf_nan=False)
+
+    tier: Tier
+    psnr_dB: float | None
+    frame_ms: Annotated[float, Field(ge=0)]
+
+
+@final
+@dataclass(frozen=True)
+class Wish:
+    """What a person asks of a tier; with neither, it is the most accurate one.
+
+    Attributes:
+        budget_ms: time that a frame may take.
+        min_psnr_dB: PSNR that is enough.
+    """
+
+    budget_ms: float | None = None
+    min_psnr_dB: float | None = None
+
+
+@final
+@dataclass(frozen=True)
+class ScenePlan:
+    """What is done to the frames of a scene. A file of it is this as JSON.
+
+    Attributes:
+        format, version: of the file.
+        profile_sha256: of the profile that it was made for (``profile_sha256``).
+        tier: the tier at which frames are restored.
+        stages: stages that the scene needs or does not.
+        tiers: what each tier is expected to give; empty where nobody asked.
+    """
+
+    __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(extra="forbid", allow_inf_nan=False)
+
+    format: Literal["udccal-scene-plan"]
+    version: Literal[1]
+    profile_sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+    tier: Tier
+    stages: Annotated[tuple[StageChoice, ...], Field(max_length=len(Stage))]
+    tiers: Annotated[tuple[TierForecast, ...], Field(max_length=len(Tier))] = ()
+
+    @classmethod
+    def of(
+        cls, profile: Profile, tier: Tier, stages: tuple[StageChoice, ...], tiers: tuple[TierForecast, ...] = ()
+    ) -> ScenePlan:
+        """Return the plan of these choices for a profile."""
+        return cls(_FORMAT, 1, profile_sha256(profile), tier, stages, tiers)
+
+    @property
+    def without(self) -> frozenset[Stage]:
+        """Stages that do not run."""
+        return frozenset(choice.stage for choice in self.stages if not choice.runs)
+
+
+def profile_sha256(profile: Profile) -> str:
+    """Return a checksum of all that restoration reads of a profile."""
+    return checksum(profile.rig, *(result.term for result in profile.results), profile.wire_map)
+
+
+def chosen_tier(tiers: tuple[TierForecast, ...], wish: Wish) -> Tier:
+    """Return the quickest tier that is good enough within the budget; without a least PSNR, the most accurate one.
+
+    Args:
+        tiers: from quickest to most accurate.
+        wish: what is asked.
+
+    Raises:
+        RestorationError: when no tier keeps the budget, or none that does is good enough.
+    """
+    budget = float("inf") if wish.budget_ms is None else wish.budget_ms
+    quick = [each for each in tiers if each.frame_ms <= budget]
+    if not quick:
+        least = min(tiers, key=lambda each: each.frame_ms)
+        raise RestorationError(
+            f"Expected a budget of at least {least.frame_ms:.3g} ms, which the fastest tier, {least.tier}, needs for a "
+            f"frame on this computer, found {budget:g} ms. Give more time."
+        )
+    if wish.min_psnr_dB is None:
+        return quick[-1].tier
+    good = [each for each in quick if each.psnr_dB is None or each.psnr_dB >= wish.min_psnr_dB]
+    if not good:
+        best = max(quick, key=lambda each: each.psnr_dB or 0.0)
+        raise RestorationError(
+            f"Expected a PSNR that a tier reaches, found {wish.min_psnr_dB:g} dB: the best within the budget, "
+            f"{best.tier}, is expected to reach {best.psnr_dB:.1f} dB on this frame. Ask for less, or give more time."
+        )
+    return good[0].tier
+
+
+def read_scene_plan(path: Path, profile: Profile) -> ScenePlan:
+    """Read a pinned plan.
+
+    Raises:
+        RestorationError: when it cannot be read, is no plan, or is one of another profile.
+    """
+    try:
+        with path.open("rb") as stream:
+            content = stream.read(_MAX_BYTES + 1)
+    except OSError as error:
+        raise RestorationError(f"Expected a plan at {path}, found: {error.strerror}. Check the path.") from error
+    if len(content) > _MAX_BYTES:
+        raise RestorationError(
+            f"Expected {path} to hold at most {_MAX_BYTES} bytes, found more. It is not a plan that udccal wrote."
+        )
+    try:
+        plan = TypeAdapter(ScenePlan).validate_json(content, strict=True)
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(str(part) for part in first["loc"]) or "the whole"
+        raise RestorationError(
+            f"Expected {path} to be a plan that `udccal restore --explain` wrote, found a mistake in {place}: "
+            f"{first['msg']}. Let udccal write it again."
+        ) from error
+    if plan.profile_sha256 != profile_sha256(profile):
+        raise RestorationError(
+            f"Expected a plan of this profile, found that {path} was made for another one. Let udccal write it again "
+            "with this profile (--explain)."
+        )
+    return plan
