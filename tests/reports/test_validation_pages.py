@@ -46,10 +46,10 @@ def checked(verdict: Verdict) -> AnyPage:
 @pytest.mark.parametrize(
     ("page", "headline"),
     [
-        (lambda: validated(True), "The profile predicts this session."),
-        (lambda: validated(False), "The profile does not predict this session."),
-        (lambda: checked("same"), "The rig is as it was."),
-        (lambda: checked("changed"), "The rig changed."),
+        (lambda: validated(True), "The profile holds."),
+        (lambda: validated(False), "The profile does not hold."),
+        (lambda: checked("same"), "The rig is as its profile says."),
+        (lambda: checked("changed"), "The rig changed by more than is harmless."),
     ],
 )
 def test_a_page_begins_with_what_to_do(page, headline: str, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]

@@ -5,17 +5,18 @@ from __future__ import annotations
 import numpy as np
 
 from udccal.drift.changes import Change
-from udccal.drift.check import RigCheck, Solved
+from udccal.drift.check import RigCheck, Solved, Verdict
 from udccal.reports.figures import embedded_png
 from udccal.reports.page import Advice, Fact, Illustration, ValidationPage, ValidationSection
 from udccal.reports.tables import Table, number, spread
 from udccal.reports.validation_figures import z_figure
 from udccal.validation.checks import ZMap
 
-_HEADLINES = {
-    "same": "The rig is as it was.",
-    "changed, harmless": "The rig changed, too little to matter.",
-    "changed": "The rig changed.",
+# With the CSS class of each verdict.
+_HEADLINES: dict[Verdict, tuple[str, str]] = {
+    "same": ("The rig is as its profile says.", "good"),
+    "changed, harmless": ("The rig changed, but nobody would see it.", "absent"),
+    "changed": ("The rig changed by more than is harmless.", "bad"),
 }
 
 
@@ -30,7 +31,7 @@ def changes_table(found: RigCheck) -> Table:
 
 def check_page(found: RigCheck, solved: Solved) -> ValidationPage:
     """Build the page of one check."""
-    mood = {"same": "good", "changed, harmless": "absent", "changed": "bad"}[found.verdict]
+    headline, mood = _HEADLINES[found.verdict]
     z_map = ZMap(
         np.asarray(solved.pose.left / solved.pose.sigma),
         "x",
@@ -39,9 +40,8 @@ def check_page(found: RigCheck, solved: Solved) -> ValidationPage:
     )
     return ValidationPage(
         title=f"A check of {found.rig}",
-        advice=Advice(_HEADLINES[found.verdict], mood, (found.advice,)),
+        advice=Advice(headline, mood, (found.advice,)),
         facts=(
-            Fact("verdict", found.verdict),
             Fact("changed", ", ".join(found.changed) or "nothing that matters"),
             Fact("flat over noise", f"{found.flat_over_noise:.2f}"),
         ),

@@ -17,13 +17,10 @@ from udccal.validation.validate import Validation
 def validation_page(found: Validation, maps: Mapping[TermName, ZMap]) -> ValidationPage:
     """Build the page of one validation."""
     counted = [check for check in found.checks if check.ok is not None]
+    headline, mood = ("The profile holds.", "good") if found.ok else ("The profile does not hold.", "bad")
     return ValidationPage(
         title=f"A profile of {found.rig}, validated by a session",
-        advice=Advice(
-            "The profile predicts this session." if found.ok else "The profile does not predict this session.",
-            "good" if found.ok else "bad",
-            (found.advice,),
-        ),
+        advice=Advice(headline, mood, (found.advice,)),
         facts=(
             Fact("checks within their limits", f"{sum(bool(check.ok) for check in counted)} of {len(counted)}"),
             Fact("profile made", found.profile_created_at),
