@@ -94,6 +94,9 @@ def test_a_practice_by_keys_gives_the_session_that_no_mistake_has_touched(rig: P
     told = [json.loads(line) for line in plain.shown.splitlines() if line.startswith('{"')]
     assert {event["event"] for event in told} == {"step", "readings", "progress", "verdict", "done"}
     assert told[-1]["complete"]
+    readings = [reading for event in told if event["event"] == "readings" for reading in event["readings"]]
+    assert {reading["ok"] for reading in readings} <= {True, False}
+    assert len(readings) > 0
 
     first = Terminal(command(rig, tmp_path))
     first.until("Step 1 of 4")

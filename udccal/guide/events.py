@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import enum
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal, Protocol, final, runtime_checkable
 
 from udccal.cameras.protocol import Frame
@@ -23,18 +23,23 @@ class Answer(enum.StrEnum):
 @final
 @dataclass(frozen=True)
 class Reading:
-    """One number read from the newest frame, with the bounds in which it is right (None for no bound)."""
+    """One number read from the newest frame.
+
+    Attributes:
+        low, high: bounds in which it is right; None for no bound.
+        ok: whether it lies within them; a field, so that programs which read events see it.
+    """
 
     name: str
     value: float
     low: float | None
     high: float | None
     unit: str
+    ok: bool = field(init=False)
 
-    @property
-    def ok(self) -> bool:
-        """Whether the value lies within its bounds."""
-        return (self.low is None or self.value >= self.low) and (self.high is None or self.value <= self.high)
+    def __post_init__(self) -> None:
+        ok = (self.low is None or self.value >= self.low) and (self.high is None or self.value <= self.high)
+        object.__setattr__(self, "ok", ok)
 
 
 @final

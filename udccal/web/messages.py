@@ -59,7 +59,7 @@ def _shown(shown: Shown) -> dict[str, Any]:
 
 
 def _readings(event: ReadingsEvent) -> dict[str, Any]:
-    return {"sentence": event.sentence, "readings": [{**asdict(one), "ok": one.ok} for one in event.readings]}
+    return {"sentence": event.sentence, "readings": [asdict(one) for one in event.readings]}
 
 
 def _view(view: View) -> dict[str, Any]:
