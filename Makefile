@@ -8,6 +8,7 @@ ACCURACY_OUT ?= accuracy
 ACCURACY_SEEDS ?= 8
 EFFICIENCY_OUT ?= efficiency
 PARETO_OUT ?= pareto
+BUDGET_OUT ?= budget
 DRIFT_OUT ?= drift
 DRIFT_RIGS ?= 200
 LIVE_OUT ?= live.json
@@ -17,7 +18,7 @@ ROBUST ?=
 PEERS ?=
 USB ?=
 
-.PHONY: install demo test test-medium test-slow test-usb fuzz load lint types contracts check accuracy tables efficiency coverage extremes pareto drift live robust peers growth docs clean
+.PHONY: install demo test test-medium test-slow test-usb fuzz load lint types contracts check accuracy tables efficiency coverage extremes pareto budget drift live robust peers growth docs clean
 
 install: $(STAMP)
 
@@ -108,6 +109,11 @@ drift: $(STAMP)
 pareto: $(STAMP)
 	$(BIN)/python -m tests.benchmarks.pareto --out $(PARETO_OUT)
 
+# What each stage of restoration costs, with the truth in place of all others. Writes budget.json and the table of
+# docs/restoration.md.
+budget: $(STAMP)
+	$(BIN)/python -m tests.benchmarks.budget --out $(BUDGET_OUT)
+
 # Ten minutes of `udccal run` with the simulated camera at 30 Hz. Writes live.json; non-zero exit where frames dropped,
 # latency or memory miss their limits. Nothing else should run meanwhile.
 live: $(STAMP)
@@ -123,4 +129,4 @@ docs: $(STAMP)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
 clean:
-	rm -rf $(VENV) $(DEMO_OUT) $(ACCURACY_OUT) $(EFFICIENCY_OUT) $(ROBUST_OUT) $(PARETO_OUT) $(LIVE_OUT) site peers build dist *.egg-info
+	rm -rf $(VENV) $(DEMO_OUT) $(ACCURACY_OUT) $(EFFICIENCY_OUT) $(ROBUST_OUT) $(PARETO_OUT) $(BUDGET_OUT) $(LIVE_OUT) site peers build dist *.egg-info

@@ -32,7 +32,7 @@ from udccal.simulation.truth import draw_truth
 from udccal.tiers import Tier
 
 _PAGE = Path(__file__).resolve().parents[2] / "docs" / "restoration.md"
-_BLUR_GRID = (9, 13)
+BLUR_GRID = (9, 13)
 # No tier may be worse than the preview on any scene by more than this.
 _LOSS_DB = 0.3
 
@@ -62,7 +62,7 @@ def main() -> int:
         return 1
     truth, profile = draw_truth(load_rig(options.rig), options.seed), load_profile(options.profile or options.rig)
     captures = truth.description.captures
-    blur = build_full_blur(truth, *_BLUR_GRID, captures.psf_region_rows + 1, captures.psf_region_columns + 1)
+    blur = build_full_blur(truth, *BLUR_GRID, captures.psf_region_rows + 1, captures.psf_region_columns + 1)
     bench = PictureBench(truth, blur, Restorer.from_profile(profile, Tier.preview))
     shots = bench.shots(shared_scenes(data, options.every))
     light = bench.matched_room_light(shots)

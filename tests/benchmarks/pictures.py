@@ -29,7 +29,7 @@ from udccal.simulation.sensor import Sensor
 from udccal.simulation.truth import RigTruth
 from udccal.simulation.wire import wire_map
 
-_DISTANCE_MM, _WIDTH_MM = 2000.0, 3200.0
+DISTANCE_MM, WIDTH_MM = 2000.0, 3200.0
 _BEFORE_DB, _WITHIN_DB, _TRIES = 21.5, 0.1, 12
 _FILL = 0.85
 # Panel pictures that no calibration has shown.
@@ -114,7 +114,7 @@ class PictureBench:
     def _shot(self, index: int, scene: Scene) -> Shot:
         view = self._restorer.view
         centre = (float(np.asarray(view.principal_point_px)[0]), float(np.asarray(view.principal_point_px)[1]))
-        photograph = Photograph(scene.radiance, _WIDTH_MM, _DISTANCE_MM)
+        photograph = Photograph(scene.radiance, WIDTH_MM, DISTANCE_MM)
         ideal = ideal_view(self._truth, photograph, float(view.focal_px), centre, view.columns, view.rows)
         gain = display_exposure(ideal)
         light = render_photograph(self._truth, photograph, self._blur) * (gain * WHITE_E_PER_S)

@@ -43,7 +43,7 @@ class _ThreeColours:
     columns: int = 1
 
 
-_PATTERN: Final = _ThreeColours()
+THREE_COLOURS: Final = _ThreeColours()
 
 
 def deblur(
@@ -77,9 +77,9 @@ def deblur(
     tiles = np.stack([layout.cut(plane) for plane in cv2.split(light)], axis=1)
     read, slope = _noise_line(tiles)
     noise = np.sqrt(np.maximum(read + slope * tiles.mean(axis=(2, 3)), np.finfo(np.float32).tiny)).astype(np.float32)
-    tables = filter_tables(grid, layout, _PATTERN, workers)
-    pictures, strengths = filtered(tiles, noise, tables, layout, _PATTERN, workers)
-    bands = measured_noise(tables, layout, _PATTERN, workers).of_tiles(strengths)
+    tables = filter_tables(grid, layout, THREE_COLOURS, workers)
+    pictures, strengths = filtered(tiles, noise, tables, layout, THREE_COLOURS, workers)
+    bands = measured_noise(tables, layout, THREE_COLOURS, workers).of_tiles(strengths)
     local = (read + slope * np.maximum(cv2.blur(light.mean(axis=2), (16, 16)), 0)).astype(np.float32)
     return shrunk(layout.join(pictures), noise, local, bands, layout, workers)
 
