@@ -39,11 +39,12 @@ def _kept(folder: Path) -> list[Path]:
 @pytest.mark.medium
 def test_the_second_run_reads_what_the_first_compiled(tmp_path: Path) -> None:
     first = _run(tmp_path)
-    kept = {path: path.stat().st_size for path in _kept(tmp_path)}
+    kept = {path: path.stat().st_mtime_ns for path in _kept(tmp_path)}
     assert first > 0.1
-    assert kept
+    assert any("jit_work" in path.name for path in kept)
     _run(tmp_path)
-    assert {path: path.stat().st_size for path in _kept(tmp_path)} == kept
+    # A busy machine may find something small worth keeping that it compiled quickly the first time.
+    assert kept.items() <= {path: path.stat().st_mtime_ns for path in _kept(tmp_path)}.items()
 
 
 @pytest.mark.medium
