@@ -31,9 +31,9 @@ def led(
     return person
 
 
-@pytest.mark.slow
+@pytest.mark.medium
 def test_a_whole_rig_takes_at_most_40_prompts(tmp_path: Path) -> None:
-    rig, real = painted_rig(4, psf_shifts=1, board_views=2), load_rig("lg55-aca2040")
+    rig, real = painted_rig(4, psf_shifts=1, board_views=3), load_rig("lg55-aca2040")
     assert [step.id for step in guided_steps(rig)] == [step.id for step in guided_steps(real)]
     person = led(tmp_path, ["noise", "geometry", "wire", "psf", "backscatter"], painted=PaintedRig(rig))
     assert person.done.complete
