@@ -19,7 +19,7 @@ import numpy as np
 from tests.benchmarks.calibration_run import CalibrationRun, calibrate
 from tests.benchmarks.commit import this_commit
 from tests.benchmarks.draws import FULL, Draw
-from tests.benchmarks.full_blur import build_full_blur
+from tests.benchmarks.full_blur import BLUR_GRID, build_full_blur
 from tests.benchmarks.pictures import CONDITIONS, Conditions, PictureBench, Score
 from tests.benchmarks.rows import Row, at_least, at_most, table
 from tests.benchmarks.scenes import shared_scenes
@@ -34,7 +34,6 @@ from udccal.simulation.truth import RigTruth
 
 _FILE = "part.json"
 _MINUTES, _GIB, _GAIN_DB = 20.0, 4.0, 10.0
-_BLUR_GRID = (9, 13)
 
 
 @dataclass(frozen=True)
@@ -105,7 +104,7 @@ def _picture_rows(profile: Profile, truth: RigTruth, out: Path, every: int) -> l
         print("The shared photographs (../shared/data) are absent: pictures are left out.", file=sys.stderr)
         return []
     captures = truth.description.captures
-    blur = build_full_blur(truth, *_BLUR_GRID, captures.psf_region_rows + 1, captures.psf_region_columns + 1)
+    blur = build_full_blur(truth, *BLUR_GRID, captures.psf_region_rows + 1, captures.psf_region_columns + 1)
     bench = PictureBench(truth, blur, Restorer.from_profile(profile))
     shots = bench.shots(shared_scenes(data, every))
     light = bench.matched_room_light(shots)

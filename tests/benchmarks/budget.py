@@ -21,8 +21,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float32
 
-from tests.benchmarks.full_blur import FullBlur, build_full_blur
-from tests.benchmarks.pareto import BLUR_GRID
+from tests.benchmarks.full_blur import BLUR_GRID, FullBlur, build_full_blur
 from tests.benchmarks.pictures import DISTANCE_MM, WIDTH_MM, PictureBench, Shot
 from tests.benchmarks.readme_tables import put_table
 from tests.benchmarks.scenes import Scene, shared_scenes

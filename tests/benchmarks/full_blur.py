@@ -24,6 +24,8 @@ from udccal.simulation.panel import pupil_footprint
 from udccal.simulation.psf import captured_light
 from udccal.simulation.truth import RigTruth, pixels_to_directions
 
+# Columns and rows of the grid of kernels that benchmarks build the blur from.
+BLUR_GRID = (9, 13)
 _HARMONICS, _PHASES = 3, 7
 _CORE = (97, 49)
 _COLUMN_SHIFTS = (0.0, 0.5)

@@ -19,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tests.benchmarks.full_blur import build_full_blur
+from tests.benchmarks.full_blur import BLUR_GRID, build_full_blur
 from tests.benchmarks.pictures import PictureBench, Score, Shot
 from tests.benchmarks.readme_tables import put_table
 from tests.benchmarks.rows import Row, at_least, table, write_json
@@ -32,7 +32,6 @@ from udccal.simulation.truth import draw_truth
 from udccal.tiers import Tier
 
 _PAGE = Path(__file__).resolve().parents[2] / "docs" / "restoration.md"
-BLUR_GRID = (9, 13)
 # No tier may be worse than the preview on any scene by more than this.
 _LOSS_DB = 0.3
 

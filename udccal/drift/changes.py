@@ -72,7 +72,7 @@ def pose_changes(profile: Profile, cause: Explained, limits: DriftLimits) -> Ite
 
 def smudge(profile: Profile, pose: PoseChange, limits: DriftLimits) -> Change:
     """Return the change of the worst part of the sensor."""
-    stated = {one.name: one.value / 100 for one in profile.wire.diagnostics}.get("wire_map_rms_sigma", 0.0)
+    stated = (profile.wire.diagnostic("wire_map_rms_sigma") or 0.0) / 100
     sigma = np.hypot(pose.sigma, stated)
     row, column = np.unravel_index(int(np.nanargmax(np.abs(pose.left) / sigma)), CELLS)
     value, error = 100 * float(pose.left[row, column]), 100 * float(sigma[row, column])
@@ -95,9 +95,8 @@ def smudge(profile: Profile, pose: PoseChange, limits: DriftLimits) -> Change:
 
 def panel_level(profile: Profile, level: Float[np.ndarray, "3"], limits: DriftLimits) -> Change:
     """Return the change of the panel's brightness in the worst colour; ``level`` is over the profile's."""
-    stated = {one.name: one.value for one in profile.backscatter.diagnostics}
     # What the model leaves of single pictures is more than what it leaves of the whole panel's level.
-    sigma = 100 * max(stated.get("held_out_without_noise_of_peak", 0.0), 1e-3)
+    sigma = 100 * max(profile.backscatter.diagnostic("held_out_without_noise_of_peak") or 0.0, 1e-3)
     worst = int(np.argmax(np.abs(level - 1)))
     off = 100 * abs(float(level[worst]) - 1)
     return Change(

@@ -126,8 +126,7 @@ def _level(profile: Profile, session: Session, cause: Explained) -> Float[np.nda
     term = moved_backscatter(profile.backscatter.term, profile.wire.term, cause.values, np.ones(3))
     shading = profile.wire_map.astype(np.float64)
     data = read_backscatter(session, profile.noise.term, term.geometry, shading)
-    stated = {one.name: one.value for one in profile.backscatter.diagnostics}
-    return brightness(SeenLight.of(data, term, stated.get("model_error_of_white", 0.0)))
+    return brightness(SeenLight.of(data, term, profile.backscatter.diagnostic("model_error_of_white") or 0.0))
 
 
 def _answer(profile: Profile, changes: Sequence[Change], solved: Solved, limits: DriftLimits) -> RigCheck:

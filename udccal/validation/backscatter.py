@@ -42,8 +42,7 @@ def judge_backscatter(data: BackscatterData, result: FitResult[Backscatter], lim
         return unusable("backscatter", "The white picture or the dark frame is missing. Capture the backscatter steps.")
     if data.shots.rate.shape[1:] != np.shape(result.term.mask):
         return unusable("backscatter", "The profile's grid is not that of this session's rig. Calibrate the rig again.")
-    stated = {one.name: one.value for one in result.diagnostics}
-    seen = SeenLight.of(data, result.term, stated.get("model_error_of_white", 0.0))
+    seen = SeenLight.of(data, result.term, result.diagnostic("model_error_of_white") or 0.0)
     worst = int(np.argmax(np.abs(seen.z).mean(axis=(1, 2))))
     count = int(seen.usable.sum())
     checks = (

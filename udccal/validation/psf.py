@@ -51,8 +51,7 @@ def judge_psf(data: PsfData, result: FitResult[PsfField], limits: ValidationLimi
     shots = data.shots.within(rules.half_px)
     shots = shots.pick(held_out_positions(shots.positions)[shots.position]) if own else shots
     shots = shots.pick(_some(shots))
-    stated = {one.name: one.value for one in result.diagnostics}
-    model_error = stated.get("model_error", 0.0)
+    model_error = result.diagnostic("model_error") or 0.0
     found = _compared(term, shots, model_error, rules)
     colours = found.relative_l2(shots.channel)
     total = found.variance + (model_error * found.left_out) ** 2

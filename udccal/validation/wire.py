@@ -44,7 +44,7 @@ def judge_wire(data: WireData, result: FitResult[Wire], limits: ValidationLimits
     pixels = sample_pixels(values, result.term.geometry, rules.samples, data.cfa, other=True)
     noise = flat_noise(data, means)
     seen = _predicted(result.term, pixels, noise)
-    stated = {one.name: one.value / 100 for one in result.diagnostics}.get("wire_map_rms_sigma", 0.0)
+    stated = (result.diagnostic("wire_map_rms_sigma") or 0.0) / 100
     panel = result.term if len(result.term.harmonics) else None
     off = misfit(seen, panel, stated, held_out=True)
     cells, sigma = cell_medians(seen, noise)
