@@ -87,7 +87,7 @@ def _step(
     by_pose = np.concatenate([one.shape[:POSE] for one in found], axis=1) / whole
     ahead, light_there = values_at(wire, pixels.ideal * (1 - _SMALL), pixels.scaled)
     by_focal = np.log(ahead * light_there / (whole * base)) / _SMALL
-    design = np.column_stack([by_pose.T, by_focal, light_design(pixels)])
+    design = np.column_stack([by_pose.T, by_focal, light_design(pixels.scaled, pixels.site)])
     light = np.ones(len(whole))
     for _ in range(2):
         seen = weighed(pixels, whole * base * light, noise)
