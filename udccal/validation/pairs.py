@@ -208,7 +208,7 @@ def compare_panel(a: Session, b: Session, limits: ValidationLimits) -> Judged:
     return Judged(checks, ZMap(z, "x", "y", "The panel's light in the brightest picture, difference in sigma, green."))
 
 
-def _chi2(term: TermName, square: Float[np.ndarray, " n"], dof: int, limits: ValidationLimits, data: str) -> Check:
+def _chi2(term: TermName, square: Float[np.ndarray, " n"], dof: float, limits: ValidationLimits, data: str) -> Check:
     """The check of a reduced chi-squared by the noise of both sessions alone."""
     value = float(square.sum()) / max(dof, 1.0)
     what = f"{data} of the two sessions differ by {value**0.5:.2f} times what noise explains."
