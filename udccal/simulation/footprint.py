@@ -87,9 +87,9 @@ def _disc_in_crossings(
         begin, end = (np.arcsin(np.clip(edge, -1.0, 1.0)) for edge in (low, low + width / half))
         middle, span = (begin + end) / 2, (end - begin) / 2
         for node, weight in zip(*_CHORDS, strict=True):
-            angle = middle + node * span
-            cosine = np.cos(angle)
-            y = centre[:, 1] + slant * np.sin(angle)
+            sine = np.sin(middle + node * span)
+            cosine = np.sqrt(1.0 - sine * sine)
+            y = centre[:, 1] + slant * sine
             reached = reach * cosine
             length = _open_length(y + reached, rows) - _open_length(y - reached, rows)
             area += weight * span * cosine * length / reach
