@@ -37,9 +37,7 @@ def spread_of(rig: Rig, source_px: np.ndarray, reach_px: tuple[float, float], di
     limit = np.array(count) * cell / (rig.wavelengths_nm[0] * 1e-6)
     below, step = _power_below(rig, ray, limit)
     total = np.zeros((3, count[1] + 1, 2 * count[0] + 1))
-    for nm, band, weight in zip(
-        rig.wavelengths_nm, np.gradient(rig.wavelengths_nm), rig.spectrum.T, strict=True
-    ):
+    for nm, band, weight in zip(rig.wavelengths_nm, np.gradient(rig.wavelengths_nm), rig.spectrum.T, strict=True):
         width, of_node = (cell, band / nm), nm * 1e-6 * step
         columns = _between(below, cell * np.arange(-count[0], count[0] + 1), width, of_node[0], below.shape[0] // 2)
         # Rows from the source's own on: power is the same on both sides of the source.
@@ -71,7 +69,7 @@ def light(rig: Rig, spread: Spread, source_px: np.ndarray, x: np.ndarray, y: np.
 
 
 def kernel(rig: Rig, place_px: np.ndarray, rows: int, columns: int) -> np.ndarray:
-    """The kernel of a point imaged at the middle of its middle sample, colour x rows x columns; each colour sums to 1."""
+    """The kernel of a point imaged at its middle sample's middle, colour x rows x columns; each colour sums to 1."""
     place = np.asarray(place_px, float)
     spread = spread_of(rig, place, (columns / 2 + 1, rows / 2 + 1))
     x, y = (at + np.arange(count) - count // 2 for at, count in zip(place, (columns, rows), strict=True))

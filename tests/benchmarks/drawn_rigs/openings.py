@@ -25,7 +25,7 @@ class Openings:
         return (np.arange(LINES) + 0.5) / LINES - 0.5
 
     def coefficients(self, highest_y: int, highest_x: int) -> np.ndarray:
-        """C[m, n] of the open part's Fourier series, sum C exp(2 pi i (n x + m y)), m and n from -highest to highest."""
+        """C[m, n] of the Fourier series of the open part, sum C exp(2 pi i (n x + m y)), from -highest to highest."""
         n = np.arange(-highest_x, highest_x + 1)
         wave = -2j * np.pi * np.where(n == 0, 1, n)
         across = (np.exp(wave * self.end[..., None]) - np.exp(wave * self.begin[..., None])) / wave

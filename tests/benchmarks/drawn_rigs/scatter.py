@@ -20,13 +20,17 @@ class Scatter:
         self.rig = rig
         ripple_px = rig.lens.focal_px.mean() * rig.true("pitch_mm") / rig.true("standoff_mm")
         step = max(2, int(ripple_px / _PER_RIPPLE))
-        self.x, self.y = (np.arange(-2 * step, count + 3 * step, step, dtype=float) for count in (rig.columns, rig.rows))
+        self.x, self.y = (
+            np.arange(-2 * step, count + 3 * step, step, dtype=float) for count in (rig.columns, rig.rows)
+        )
         rays = directions(rig, np.stack(np.meshgrid(self.x, self.y), axis=-1).reshape(-1, 2))
         lobe, emission = rays[:, 2] ** rig.emission.lobe, rig.emission
         self._shares = [
             sparse.csr_array(
                 _shares(rig, rays, primary, 0.0, lobe / (1 + emission.reflected))
-                + _shares(rig, rays, primary, emission.reflected_mm, lobe * emission.reflected / (1 + emission.reflected))
+                + _shares(
+                    rig, rays, primary, emission.reflected_mm, lobe * emission.reflected / (1 + emission.reflected)
+                )
             )
             for primary in range(3)
         ]
@@ -54,7 +58,7 @@ def _shares(rig: Rig, rays: np.ndarray, primary: int, plane_mm: float, weight: n
     place, value, ray = [], [], []
     for j in range(int(2 * half[1]) + 2):
         for i in range(int(2 * half[0]) + 2):
-            pixel = first + [i, j]
+            pixel = first + np.array([i, j])
             away = pixel + emission.places[primary] - centre
             inside = sum(_inside(inverse, away + spot, emission.edge) for spot in spots) / len(spots) * weight
             used = (inside > 0) & (pixel >= 0).all(axis=1) & (pixel < [columns, rows]).all(axis=1)

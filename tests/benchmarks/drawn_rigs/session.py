@@ -1,12 +1,13 @@
 """Writes the session of a drawn rig as docs/session.md says, with nothing of udccal.
 
-    python -m tests.benchmarks.drawn_rigs.session SEED FOLDER [--size COLUMNS ROWS]
+python -m tests.benchmarks.drawn_rigs.session SEED FOLDER
 """
 
 from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -25,7 +26,7 @@ from tests.scenes.session_writer import Entry, SessionWriter, about
 WHITE = np.array([0.6, 1.0, 0.7])
 BOARD: Entry = {"columns": 7, "rows": 5, "square_mm": 75.0, "marker_mm": 56.0, "dictionary": "DICT_4X4_100"}
 CAMERA = {"vendor": "drawn", "model": "drawn", "serial": "1", "backend": "drawn"}
-_LONGEST_S, _LED_GRID, _LED_SHIFTS, _LED_FRAMES, _LED_REGION = 10.0, (4, 3), 4, 6, (48, 96)
+_LONGEST_S, _LED_GRID, _LED_SHIFTS, _LED_FRAMES, LED_REGION = 10.0, (3, 3), 4, 6, (48, 96)
 _FLATS, _LEVELS, _VIEWS, _PICTURES, _FRAMES = 80, 12, 10, 10, 4
 
 
@@ -85,7 +86,7 @@ def write_wire(scene: Scene) -> None:
 def write_psf(scene: Scene) -> None:
     """LEDs on a grid, several places each; the session says where they were to within a pixel."""
     rig, writer, rng = scene.rig, scene.writer, scene.rng
-    size, around = (rig.columns, rig.rows), np.array(_LED_REGION)
+    size, around = (rig.columns, rig.rows), np.array(LED_REGION)
     flux = scene.full_e * 2e4
     far = rig.led_distance_mm + rig.true("standoff_mm")
     disc_px = rig.led_mm / far * float(rig.lens.focal_px.mean())
@@ -131,7 +132,9 @@ def write_backscatter(scene: Scene) -> None:
 def panel_picture(rng: np.random.Generator, rig: Rig) -> np.ndarray:
     """Soft areas of varied colour, some ten panel pixels wide, and patches with edges."""
     columns, rows = rig.panel
-    soft = cv2.resize(rng.uniform(-40, 295, (rows // 9, columns // 9, 3)), (columns, rows), interpolation=cv2.INTER_CUBIC)
+    soft = cv2.resize(
+        rng.uniform(-40, 295, (rows // 9, columns // 9, 3)), (columns, rows), interpolation=cv2.INTER_CUBIC
+    )
     for _ in range(columns * rows // 150):
         x, y, w, h = rng.integers([0, 0, 3, 3], [columns, rows, 16, 16])
         soft[y : y + h, x : x + w] = rng.uniform(0, 255, 3)
@@ -201,32 +204,46 @@ def description(rig: Rig) -> Entry:
         "mounting": these("standoff_mm", "tilt_deg", "roll_deg", "yaw_deg", "panel_x_px", "panel_y_px"),
         "captures": {
             "psf_columns": _LED_GRID[0], "psf_rows": _LED_GRID[1], "psf_shifts": _LED_SHIFTS,
-            "psf_exposures": _LED_FRAMES, "psf_region_columns": _LED_REGION[0], "psf_region_rows": _LED_REGION[1],
+            "psf_exposures": _LED_FRAMES, "psf_region_columns": LED_REGION[0], "psf_region_rows": LED_REGION[1],
         },
         "view": {"columns": 256, "rows": 144},
     }  # fmt: skip
 
 
-def write_session(rig: Rig, folder: Path) -> None:
-    """Write the whole session."""
+WRITERS: dict[str, Callable[[Scene], None]] = {
+    "noise": write_noise, "geometry": write_geometry, "wire": write_wire, "psf": write_psf,
+    "backscatter": write_backscatter,
+}  # fmt: skip
+
+
+def write_session(rig: Rig, folder: Path, terms: Iterable[str] = WRITERS) -> None:
+    """Write the session of these terms."""
     writer = SessionWriter(folder, DrawnSensor(rig), rig.columns, rig.rows)
     scene = Scene(rig, writer, np.random.default_rng([rig.seed, 6]))
-    for write in (write_noise, write_geometry, write_wire, write_psf, write_backscatter):
-        write(scene)
+    for term in terms:
+        WRITERS[term](scene)
     writer.finish(description(rig), CAMERA)
 
 
+def require_own(modules: Iterable[str]) -> None:
+    """Make sure that nothing of udccal had a part in the light.
+
+    Raises:
+        RuntimeError: when one of these modules is udccal's.
+    """
+    used = [name for name in modules if name.split(".")[0] in ("udccal", "procedures")]
+    if used:
+        raise RuntimeError(f"Expected a program of its own, found {', '.join(used)} imported. Remove the import.")
+
+
 def main() -> None:
-    """Write the session of a seed, and make sure that nothing of udccal had a part in it."""
+    """Write the session of a seed."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("seed", type=int)
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--size", type=int, nargs=2, metavar=("COLUMNS", "ROWS"), help="in place of a drawn one")
     options = parser.parse_args()
-    write_session(draw(options.seed, tuple(options.size) if options.size else None), options.folder)
-    used = [name for name in sys.modules if name.split(".")[0] in ("udccal", "procedures", "jax")]
-    if used:
-        raise RuntimeError(f"Expected a program of its own, found {', '.join(used)} imported. Remove the import.")
+    write_session(draw(options.seed), options.folder)
+    require_own(sys.modules)
 
 
 if __name__ == "__main__":
