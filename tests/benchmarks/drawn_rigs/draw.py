@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-SIZES = ((480, 320), (480, 360), (512, 384), (560, 420), (640, 400), (640, 480))
+SIZES = ((400, 300), (416, 320), (480, 320), (480, 360), (512, 384))
 # Part of a tolerance by which the truth is off at most.
 _WITHIN = 0.9
 _NM = np.arange(400.0, 701.0, 10.0)
