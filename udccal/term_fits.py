@@ -105,11 +105,11 @@ class TermFits:
     @cached_property
     def psf(self) -> FitResult[PsfField]:
         """The psf fit."""
-        noise, geometry, wire = self.noise.term, self.geometry.term, self.wire.term
+        noise, geometry, wire, wire_map = self.noise.term, self.geometry.term, self.wire.term, self.wire_map
         rig, rules = self._session.rig, self._effort.psf
         return self._run(
             "psf",
-            lambda: fit_psf(read_psf(self._session, noise, wire, rules), rig, geometry, wire, rules),
+            lambda: fit_psf(read_psf(self._session, noise, wire_map, rules), rig, geometry, wire, rules),
             lambda: absent_psf(rig, geometry),
         )
 
