@@ -138,8 +138,8 @@ def disc_overlap_coefficient(lag: Float[Arrayish, "*n 2"], wave: Float[Arrayish,
     t = half[..., None] * jnp.sin(angle)
     width = jnp.maximum(jnp.sqrt(0.25 - t * t) - distance[..., None] / 2.0, 0.0)
     phase = 2.0 * jnp.pi * across[..., None] * width
-    narrow = jnp.abs(phase) < 1e-3
-    slab = 2.0 * width * jnp.where(narrow, 1.0, sine_cosine(phase)[0] / jnp.where(narrow, 1.0, phase))
+    small = jnp.abs(phase) < 1e-2
+    slab = 2.0 * width * jnp.where(small, 1.0 - phase**2 / 6.0, sine_cosine(phase)[0] / jnp.where(small, 1.0, phase))
     integrand = slab * sine_cosine(2.0 * jnp.pi * along[..., None] * t)[1] * half[..., None] * jnp.cos(angle)
     return integrand @ weight * (4.0 / jnp.pi)
 

@@ -164,11 +164,12 @@ def _brightest(
 def shot_noise(merged: HdrMerge, noise: Noise) -> Float[np.ndarray, "rows columns"]:
     """Return the derivative of a merged sample's variance by its rate, in (e-/s)^2 per e-/s.
 
-    One exposure of 1/u seconds has the variance (r + d) u + f u^2, where f is a dark sample's. A bracket is treated as
-    the single exposure that has its variance.
+    One exposure of 1/u seconds has the variance (r + d) u + f u^2, where f is a dark sample's, its pixel's offset
+    included. A bracket is treated as the single exposure that has its variance.
     """
-    K, dark = float(np.asarray(noise.K_DN_per_e)), float(np.asarray(noise.dark_current_e_per_s))
-    floor = float(np.asarray(noise.sigma_d_e)) ** 2 + (float(np.asarray(noise.q_DN)) / K) ** 2 / 12.0
+    parts = noise.K_DN_per_e, noise.dark_current_e_per_s, noise.sigma_d_e, noise.q_DN, noise.DSNU1288_e
+    K, dark, sigma_d, q, offset = (float(np.asarray(part)) for part in parts)
+    floor = sigma_d**2 + (q / K) ** 2 / 12.0 + offset**2
     light, variance = np.maximum(merged.rate_e_per_s + dark, 0.0), merged.sigma_e_per_s**2
     slope = 2.0 * variance / (light + np.sqrt(light**2 + 4.0 * floor * variance))
     return np.where(merged.used > 0, slope, 0.0)
