@@ -89,7 +89,8 @@ def test_slopes_are_those_of_the_model() -> None:
         expected = np.asarray(by_shape(jnp.zeros(10)))
         found = wire_derivatives(wire, pixels.ideal, pixels.scaled)
         shape = (np.asarray(found.shape) * np.asarray(found.base)).T
-    np.testing.assert_allclose(shape, expected, atol=1e-9 * np.abs(expected).max())
+    # Sums over harmonics are in single precision.
+    assert (np.abs(shape - expected).max(axis=0) <= 1e-4 * np.abs(expected).max(axis=0)).all()
     assert np.all(np.abs(expected).max(axis=0) > 1e-3)
 
 
@@ -104,9 +105,9 @@ def test_columns_of_linear_coefficients_are_differences_of_the_map() -> None:
         level = base * parameters.gains(x)[pixels.site]
         # Shading, a site's gain, an amplitude, two corrections to the pupil.
         for column in (5, 46, 60, parameters.linear - 3, parameters.linear - 1):
-            other = x + 1e-6 * (np.arange(len(x)) == column)
-            here, there = (expected_of(parameters.wire(p), parameters.gains(p), pixels) for p in (x, other))
-            np.testing.assert_allclose((there - here) / 1e-6, design[column] * level, atol=1e-5)
+            step, wanted = 1e-2 * (np.arange(len(x)) == column), design[column] * level
+            less, more = (expected_of(parameters.wire(p), parameters.gains(p), pixels) for p in (x - step, x + step))
+            np.testing.assert_allclose((more - less) / 2e-2, wanted, atol=2e-3 * np.abs(wanted).max())
 
 
 def test_a_vector_of_parameters_makes_the_wire_that_it_was_read_from() -> None:

@@ -230,7 +230,7 @@ def _unit_at(
 def _slopes(evaluator: Evaluator, theta: Theta, one: Samples, own: Own) -> Float[np.ndarray, "shots n p"]:
     """Return derivatives of the light of one position's samples by the shared parameters."""
     spectra = softmax(theta[HEAD:].reshape(3, -1), axis=1)
-    # In single precision it takes half the time, and its errors are a millionth of the kernel's.
+    # Single precision takes less time, and its errors are a millionth of a derivative.
     with jax.enable_x64(False):
         made = kernel_jacobian(evaluator, theta, one.frame, one.disc_px, one.overlaps)
         coefficients, chain = (np.asarray(part) for part in made)

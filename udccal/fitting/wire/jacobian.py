@@ -142,7 +142,7 @@ def values_at(
 
 
 def _of_groups(wire: Wire, rays: Rays, scaled: Float[np.ndarray, "n 2"]) -> list[tuple[np.ndarray, ...]]:
-    """Return ``_group_derivatives`` of all groups, in single precision: twice as fast, and as accurate as its J0."""
+    """Return ``_group_derivatives`` of all groups, in single precision, which is as accurate as its J0."""
     rays = rays._replace(periods=rays.periods - np.round(rays.periods))
     # A wire may hold JAX's arrays, which that setting leaves as they are.
     every = [jax.tree.map(lambda part: np.asarray(part, np.float32), (some, rays, scaled)) for some in _groups(wire)]
