@@ -38,7 +38,7 @@ def test_the_state_is_that_of_the_simulated_rig(measured: Profile) -> None:
     for name, value in true.items():
         assert abs(number(state, name).value - value) < 3 * number(state, name).sigma, name
     assert number(state, "row_open").value == pytest.approx(truth.panel.row_open, abs=1.5e-3)
-    assert (state.terms, state.agreement_dof) == (("geometry", "wire", "psf", "backscatter"), 9)
+    assert (state.terms, state.agreement_dof) == (("geometry", "wire", "psf", "backscatter"), 8)
     assert state.agreement_p_value > 0.01
     assert [one.name for one in state.estimates if one.by_prior] == ["pitch_mm"]
     np.testing.assert_allclose(np.sqrt(np.diag(state.cov)), [one.sigma for one in state.estimates])

@@ -93,10 +93,14 @@ def smudge(profile: Profile, pose: PoseChange, limits: DriftLimits) -> Change:
     )
 
 
-def panel_level(profile: Profile, level: Float[np.ndarray, "3"], limits: DriftLimits) -> Change:
-    """Return the change of the panel's brightness in the worst colour; ``level`` is over the profile's."""
+def panel_level(profile: Profile, level: Float[np.ndarray, "3"], gain_sigma: float, limits: DriftLimits) -> Change:
+    """Return the change of the panel's brightness in the worst colour.
+
+    ``level`` is over the profile's, after division by the gain, whose relative error it has.
+    """
     # What the model leaves of single pictures is more than what it leaves of the whole panel's level.
-    sigma = 100 * max(profile.backscatter.diagnostic("held_out_without_noise_of_peak") or 0.0, 1e-3)
+    stated = max(profile.backscatter.diagnostic("held_out_without_noise_of_peak") or 0.0, 1e-3)
+    sigma = 100 * float(np.hypot(stated, gain_sigma))
     worst = int(np.argmax(np.abs(level - 1)))
     off = 100 * abs(float(level[worst]) - 1)
     return Change(

@@ -96,7 +96,7 @@ def check_rig(profile: Profile, session: Session, limits: DriftLimits | None = N
     changes = (
         *pose_changes(profile, cause, limits),
         smudge(profile, pose, limits),
-        panel_level(profile, level, limits),
+        panel_level(profile, level, gain_sigma, limits),
         gain_change(gain, gain_sigma, limits),
     )
     return _answer(profile, changes, solved, limits), solved
