@@ -33,7 +33,7 @@ from udccal.restoration.rectify import Rectification
 from udccal.restoration.sharpen import Sharpener
 from udccal.restoration.stages import Stage
 from udccal.restoration.tone import Tone
-from udccal.restoration.view import inscribed_view
+from udccal.restoration.view import kept_view
 from udccal.rig import RigDescription
 from udccal.tiers import Tier
 
@@ -129,8 +129,13 @@ class Restorer:
         options = options or PlanOptions()
         rig, geometry = profile.rig, profile.geometry.term
         camera, cfa = rig.camera, cfa_named(rig.camera.cfa)
-        view = inscribed_view(geometry, camera.columns, camera.rows, rig.view.columns, rig.view.rows)
-        rectification = Rectification.within(geometry, view, camera.columns, camera.rows)
+        view = kept_view(geometry, rig, keep)
+        rectification = kept(
+            keep,
+            Rectification,
+            (geometry, view, camera),
+            lambda: Rectification.within(geometry, view, camera.columns, camera.rows),
+        )
         quick = tier is Tier.preview
         unscattered = profile.backscatter.unfitted or Stage.backscatter in without
         error = profile.backscatter.diagnostic("held_out_without_noise_of_peak") or 0.0
