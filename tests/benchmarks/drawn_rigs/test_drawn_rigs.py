@@ -92,8 +92,7 @@ def test_more_light_is_never_darker() -> None:
 
 
 def test_the_program_knows_nothing_of_udccal() -> None:
-    code = "import sys; from tests.benchmarks.drawn_rigs.sensor import DrawnSensor
-from tests.benchmarks.drawn_rigs.session import require_own; require_own(sys.modules)"
+    code = "import sys; from tests.benchmarks.drawn_rigs.session import require_own; require_own(sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT)
     with pytest.raises(RuntimeError, match=r"udccal\.models"):
         require_own(["numpy", "udccal.models.wire"])
