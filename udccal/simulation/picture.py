@@ -60,9 +60,9 @@ def supersample(
     offsets = [(index + 0.5) / SUPERSAMPLING - 0.5 for index in range(SUPERSAMPLING)]
     centre = slopes.astype(np.float32)
     across, down = (np.gradient(slopes, axis=axis).astype(np.float32) for axis in (1, 0))
-    total = 0.0
+    total = np.zeros(())
     for dy in offsets:
         row = centre + dy * down
         for dx in offsets:
-            total += render(row + dx * across)
+            total = total + render(row + dx * across)
     return total / SUPERSAMPLING**2
