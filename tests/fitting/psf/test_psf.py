@@ -238,7 +238,8 @@ def test_bad_captures_are_said_to_be_bad(tmp_path: Path, level_DN: int, places: 
     session = session_of(tmp_path / "session", level_DN, places)
     rig, geometry = session.rig, nominal_geometry(session.rig)
     wire = absent_wire(rig, geometry)
-    result = fit_psf(read_psf(session, nominal_noise(rig), wire), rig, geometry, wire)
+    data = read_psf(session, nominal_noise(rig), np.ones((rig.camera.rows, rig.camera.columns)))
+    result = fit_psf(data, rig, geometry, wire)
     assert result.status is status
     assert result.notes
     assert not result.ok
@@ -248,8 +249,8 @@ def test_bad_captures_are_said_to_be_bad(tmp_path: Path, level_DN: int, places: 
 @pytest.mark.parametrize(("hot", "clipped"), [((2, 2), 0), ((30, 30), 3)])
 def test_a_hot_pixel_costs_a_picture_only_next_to_its_led(tmp_path: Path, hot: tuple[int, int], clipped: int) -> None:
     session = session_of(tmp_path / "session", 2000, 3, hot)
-    wire = absent_wire(session.rig, nominal_geometry(session.rig))
-    data = read_psf(session, nominal_noise(session.rig), wire)
+    camera = session.rig.camera
+    data = read_psf(session, nominal_noise(session.rig), np.ones((camera.rows, camera.columns)))
     assert (data.taken, data.dark, data.clipped) == (3, 0, clipped)
 
 

@@ -204,7 +204,7 @@ def wide_support(wide: Shots, sources: Sources, term: PsfField, rig: RigDescript
     windows = make_windows(wide, sources, np.zeros_like(wide.rate), at_position, 0.0)
     light = predict(windows, kernels)
     windows = make_windows(wide, sources.with_light_of_peak(wide, light), light, at_position, 0.0)
-    found = compare(wide, windows, light * windows.flux, np.arange(wide.count))
+    found = compare(wide, windows, light * windows.flux)
     # Near the source, whole pixels are too coarse for a kernel that moves by fractions of one; all windows hold it.
     core = (np.abs(wide.offsets()) <= 4).all(axis=-1)
     return choose_support(replace(found, known=found.known & ~core))
