@@ -176,6 +176,22 @@ def test_a_wrong_noise_model_is_told_by_the_scatter() -> None:
             assert "Check K" in wrong.notes[-1]
 
 
+@pytest.mark.parametrize("exposures", [EXPOSURES, np.repeat(EXPOSURES[-1:], 5)], ids=["bracket", "repeats"])
+def test_offsets_of_pixels_are_in_sigma_and_no_doubt(exposures: np.ndarray) -> None:
+    offsets_e = 4.0 * np.random.default_rng(61).standard_normal((120, 120))
+    frames = bracket(1e3, exposures, 60).astype(np.int64) + np.rint(0.355 * offsets_e).astype(np.int64)
+    frames = np.maximum(frames, 0).astype(np.uint16)
+    uneven = replace(NOISE, DSNU1288_e=4.0)
+    merge = merge_bracket(frames, exposures, uneven)
+    assert merge.status is FitStatus.CONVERGED, merge.notes
+    error = merge.rate_e_per_s - 1e3
+    assert error.std() == pytest.approx(np.sqrt(np.mean(merge.sigma_e_per_s**2)), rel=0.05)
+    # Offsets that the noise model does not have make a sigma that is too small.
+    blind = merge_bracket(frames, exposures, NOISE)
+    assert error.std() > 1.01 * np.sqrt(np.mean(blind.sigma_e_per_s**2))
+    assert (blind.status is FitStatus.POOR_FIT) == (exposures is EXPOSURES)
+
+
 @pytest.mark.parametrize(
     "wrong",
     [{"K_DN_per_e": 0.0}, {"K_DN_per_e": np.nan}, {"sigma_d_e": -1.0}, {"saturation_DN": 60.0}, {"q_DN": np.inf}],

@@ -134,15 +134,15 @@ def merge_bracket(
 
 def sensor_numbers(noise: Noise, unit_s: float, rules: HdrRules) -> SensorNumbers:
     """The numbers of a noise model that the likelihood uses, times in units of ``unit_s``."""
-    parts = noise.K_DN_per_e, noise.black_DN, noise.saturation_DN, noise.sigma_d_e, noise.q_DN
-    K, black, saturation, sigma_d, q = (float(np.asarray(part)) for part in parts)
-    if not (np.isfinite([K, black, saturation, sigma_d, q]).all() and K > 0 and sigma_d >= 0 and saturation > black):
+    parts = noise.K_DN_per_e, noise.black_DN, noise.saturation_DN, noise.sigma_d_e, noise.q_DN, noise.DSNU1288_e
+    K, black, saturation, sigma_d, q, offset = values = [float(np.asarray(part)) for part in parts]
+    if not (np.isfinite(values).all() and K > 0 and sigma_d >= 0 and saturation > black):
         found = f"K {K:g} DN/e, black {black:g} DN, saturation {saturation:g} DN, sigma_d {sigma_d:g} e"
         raise FitError(f"Expected a noise model with a gain above 0 and saturation above black, found {found}. Fit it.")
     # A sensor without any dark noise still has a least variance: the likelihood of its dark pixels stays finite.
     floor = max(sigma_d**2 + (q / K) ** 2 / 12.0, 1e-4)
     level = (saturation - black) / K - rules.margin_sigma * math.sqrt(floor)
-    numbers = black, 1 / K, float(np.asarray(noise.dark_current_e_per_s)) * unit_s, floor, level
+    numbers = black, 1 / K, float(np.asarray(noise.dark_current_e_per_s)) * unit_s, floor, level, offset
     return SensorNumbers(*(np.float32(n) for n in numbers))
 
 
@@ -229,7 +229,13 @@ class _Bracket:
         clear = ~dropped & sure & (mean + 5 * np.sqrt(variance) < level_e)
         # Hits in pixels of two samples are not found: a few of them must not count much.
         chi2 = np.minimum((light - mean) ** 2 / variance, 4.0**2)
-        dof = float(np.sum((1 - np.minimum((times * merged.sigma[lit]) ** 2 / variance, 1))[clear]))
+        # A pixel's offset moves its light by `follows` of itself, and its samples by what is left.
+        slope = np.where(~dropped & (mean < level_e), times / variance, 0.0)
+        follows = slope.sum(axis=0) / np.maximum((slope * times).sum(axis=0), 1e-30)
+        offset_e = float(self.sensor.offset_e)
+        known = times**2 * np.maximum(merged.sigma[lit].astype(np.float64) ** 2 - (offset_e * follows) ** 2, 0)
+        expected = 1 - np.minimum(known / variance, 1) + (offset_e * (1 - follows * times)) ** 2 / variance
+        dof = float(np.sum(expected[clear]))
         found = float(np.sum(chi2[clear])) / max(dof, 1e-9)
         return found if abs(found - 1) > max(self.rules.scatter_off, 6 * math.sqrt(2 / max(dof, 1e-9))) else 1.0
 
