@@ -262,7 +262,8 @@ class _Bracket:
         """
         _, light, mean, variance = self._lit(merged, 2, -np.inf)
         times, floor = self.times[:, None].astype(np.float64), float(self.sensor.floor_e2)
-        weight = np.where(~dropped & (mean < 30 * floor), 1 / variance, 0.0)
+        dim = (mean < 30 * floor) & (mean + 5 * np.sqrt(variance) < float(self.sensor.level_e))
+        weight = np.where(~dropped & dim, 1 / variance, 0.0)
         light_taken = times * (weight * times).sum(axis=0) / np.maximum((weight * times**2).sum(axis=0), 1e-30)
         slope = 1 - light_taken
         information = max(float(np.sum(weight * slope)), 1e-30)
