@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +13,7 @@ from tests.benchmarks.drawn_rigs.draw import Rig
 from tests.benchmarks.drawn_rigs.optics import directions, tilt_deg
 from tests.benchmarks.drawn_rigs.scatter import Scatter
 from tests.benchmarks.drawn_rigs.sensor import DrawnSensor
-from tests.benchmarks.drawn_rigs.session import LED_REGION, panel_picture
+from tests.benchmarks.drawn_rigs.session import LED_REGION, WRITERS, panel_picture
 from tests.benchmarks.drawn_rigs.wire import wire_map
 from udccal.fitting.geometry.fit import term_at
 from udccal.models.backscatter import backscatter_rate
@@ -67,15 +68,10 @@ def judged(
 
 
 @in_float64
-def judge(profile: Profile, rig: Rig) -> list[Judged]:
-    """All quantities of docs/accuracy.md that concern the terms."""
-    return [
-        *_wire(profile, rig),
-        *_psf(profile, rig),
-        *_scatter(profile, rig),
-        *_noise(profile, rig),
-        *_rays(profile, rig),
-    ]
+def judge(profile: Profile, rig: Rig, terms: Iterable[str] = WRITERS) -> list[Judged]:
+    """All quantities of docs/accuracy.md that concern these terms."""
+    of_term = {"noise": _noise, "geometry": _rays, "wire": _wire, "psf": _psf, "backscatter": _scatter}
+    return [one for term in terms for one in of_term[term](profile, rig)]
 
 
 def _wire(profile: Profile, rig: Rig) -> list[Judged]:

@@ -257,9 +257,10 @@ def fit_dark_terms(
     more = unexplained_variance(data, expected, rules.most_hits)
     foreign = abs(more.value) > rules.foreign_sigma * more.variance**0.5
     if foreign:
-        # Where rounding hides the distribution, half of what was not expected may be an effect of it.
+        # Where rounding hides the distribution, half of what was not expected may be an effect of it, and what the
+        # codes tell of the rest depends on the distribution as well.
         value = max(read_DN2.value + more.value, 0.0)
-        read_DN2 = Quantity(value, more.variance + (0.0 if white else 0.25 * more.value**2))
+        read_DN2 = Quantity(value, more.variance + (0.0 if white else 0.25 * more.value**2 + variance))
     elif read_DN2.value <= 1.001 * _LOW[2]:
         read_DN2 = Quantity(0.0, max(variance, _LOW[2] ** 2))
     # DSNU comes from the stack's average, or from the histograms where rounding biases the average.
