@@ -7,18 +7,20 @@ from collections.abc import Callable, Iterator
 from typing import Final, final
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from procedures.aiming import nominal_pixels
 from procedures.live import LiveFrames
 from procedures.plans import Metered
-from procedures.readings import CornersSeen, find_corners, head_room, sharpness, why_not
+from procedures.readings import CornersSeen, corners_in, find_corners, head_room, sharpness, why_not
 from procedures.step import Bench, Step, run_step, set_up
-from udccal.arrangements import Board
+from udccal.arrangements import Board, BoardSpec
 from udccal.guide.events import Outline, Reading
 from udccal.guide.steps import Look
+from udccal.planning.next_view import NextView
 from udccal.rig import RigDescription
+from udccal.sessions.store import Session
 from udccal.sessions.writer import SessionWriter
 
 _STILL_PX, _STILL_LOOKS, _UNKNOWN_PX = 1.0, 3, 999.0
@@ -30,8 +32,8 @@ _UNLIKE: Final = 0.02  # of the sensor's width, by which the corners of two view
 class BoardVisit:
     """Implements ``udccal.guide.steps.Visit`` for all views held by hand: a capture is one view.
 
-    For each view a pose is suggested as an outline. Any other is taken too whose corners lie elsewhere than those of
-    the views before: the board was moved, or it leans in another way.
+    For each view the pose that would tell most about the lens is suggested as an outline. Any other is taken too whose
+    corners lie elsewhere than those of the views before: the board was moved, or it leans in another way.
     """
 
     def __init__(
@@ -44,17 +46,17 @@ class BoardVisit:
     ) -> None:
         """Args:
         step_ids: the views.
-        poses: suggestions, at least one for each view.
+        poses: to choose suggestions from, at least one for each view.
         view: makes the step of a view.
         bench, writer: as for a step.
         """
-        self._rig, self._step_ids, self._poses, self._view = writer.manifest.rig, step_ids, poses, view
+        self._rig, self._step_ids, self._view = writer.manifest.rig, step_ids, view
         self._bench, self._writer = bench, writer
-        # How a board was held is in its picture; after an interruption it is taken to be as suggested.
-        captured = [number for number, step_id in enumerate(step_ids) if step_id in writer.completed_ids]
-        self._views = [_nominal_corners(self._rig, poses[number]) for number in captured]
+        self._next = NextView(self._rig, poses)
+        self._views: list[CornersSeen] = []
+        for seen in _captured(step_ids, writer, poses[0].spec):
+            self._count(seen)
         self._seen: deque[CornersSeen] = deque(maxlen=_STILL_LOOKS)
-        self._tries = 0
         self._asked = self._ask()
         step = self._asked
         assert isinstance(step.exposure, Metered)
@@ -81,17 +83,19 @@ class BoardVisit:
         view = self._seen[-1]
         self._seen.clear()
         run_step(self._asked, self._bench, self._writer, None)
-        self._views.append(view)
-        self._tries = 0
+        self._count(view)
         if any(step_id not in self._writer.completed_ids for step_id in self._step_ids):
             self._asked = self._ask()
         yield
 
+    def _count(self, view: CornersSeen) -> None:
+        self._views.append(view)
+        self._next.taken(view.numbers, view.points_px)
+
     def _ask(self) -> Step:
         """Suggest the pose of the next view, or another one where that had nothing new to show."""
         done = self._writer.completed_ids
-        number = next(number for number, step_id in enumerate(self._step_ids) if step_id not in done)
-        step = self._view(self._step_ids[number], self._poses[(number + self._tries) % len(self._poses)])
+        step = self._view(next(step_id for step_id in self._step_ids if step_id not in done), self._next.pose())
         set_up(step, self._bench, self._writer)
         return step
 
@@ -114,7 +118,6 @@ class BoardVisit:
         if not sharp.ok:
             return why_not(sharp)
         if not unlike.ok:
-            self._tries += 1
             self._asked = self._ask()
             self._seen.clear()
             return "Such a view is there already. Hold the board as the outline shows it."
@@ -138,20 +141,16 @@ def _moved_px(one: CornersSeen, other: CornersSeen) -> float:
 
 def _edge(rig: RigDescription, board: Board) -> Float[np.ndarray, "4 2"]:
     """Return where a nominal camera sees the board's outer corners."""
-    spec = board.spec
-    return _places(rig, board, np.array([[0, 0], [spec.columns, 0], [spec.columns, spec.rows], [0, spec.rows]]))
-
-
-def _nominal_corners(rig: RigDescription, board: Board) -> CornersSeen:
-    """Return where a nominal camera sees the inner corners, which OpenCV numbers along the board's rows."""
-    x, y = np.meshgrid(np.arange(1, board.spec.columns), np.arange(1, board.spec.rows))
-    squares = np.stack([x.ravel(), y.ravel()], axis=1)
-    return CornersSeen(np.arange(len(squares)), _places(rig, board, squares))
-
-
-def _places(rig: RigDescription, board: Board, squares: Int[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
-    on_board = np.pad(squares * board.spec.square_mm, ((0, 0), (0, 1)))
+    right, down = board.spec.columns * board.spec.square_mm, board.spec.rows * board.spec.square_mm
+    on_board = np.array([[0, 0, 0], [right, 0, 0], [right, down, 0], [0, down, 0]])
     return nominal_pixels(rig, Rotation.from_rotvec(board.rotation_vector).apply(on_board) + board.translation_mm)
+
+
+def _captured(step_ids: tuple[str, ...], writer: SessionWriter, spec: BoardSpec) -> Iterator[CornersSeen]:
+    """Yield the views that the session holds; how the board was held is read from their pictures."""
+    session = Session(writer.path, writer.manifest)
+    for step_id in (step_id for step_id in step_ids if step_id in writer.completed_ids):
+        yield corners_in(session.average(session.step(step_id).captures[0]).mean, spec)
 
 
 def _polygon(points: Float[np.ndarray, "n 2"]) -> tuple[tuple[float, float], ...]:

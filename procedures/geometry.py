@@ -32,6 +32,7 @@ _JIG_MM = 700.0
 _LEVEL = 0.75
 _WHY = "The corners of a board of known size give the lens and the pose of the camera."
 _FRAMES = 8
+_CHOICE = 3  # poses that a guided view is chosen from, for each view
 _MOST_LEAN_RAD, _MOST_TURN_RAD = np.deg2rad(40.0), np.deg2rad(20.0)
 # Middle of the board as a fraction of the sensor: centre, corners, edges, repeatedly.
 _SPOTS = ((0.5, 0.5), (0.2, 0.2), (0.8, 0.8), (0.8, 0.2), (0.2, 0.8), (0.5, 0.2), (0.5, 0.8), (0.2, 0.5), (0.8, 0.5))
@@ -49,7 +50,7 @@ class GeometryProcedure(Procedure):
         jig = board_parallel(rig, spec, _JIG_MM)
         on_jig = f"Put the board ({_named(spec)}) on the jig that holds it parallel to the display."
         yield _view(rig, "geometry/panel", jig, on_jig)
-        for index, board in enumerate(board_poses(rig, spec)):
+        for index, board in enumerate(board_poses(rig, spec, rig.captures.board_views)):
             yield _view(rig, f"geometry/view_{index}", board, _describe(rig, board))
 
     def guided(self, rig: RigDescription) -> Iterator[GuidedStep]:
@@ -60,8 +61,9 @@ class GeometryProcedure(Procedure):
 
 def _by_hand(rig: RigDescription) -> GuidedStep:
     spec = board_spec(rig)
-    poses = tuple(board_poses(rig, spec))
-    step_ids = tuple(f"geometry/view_{index}" for index in range(len(poses)))
+    count = rig.captures.board_views
+    poses = tuple(board_poses(rig, spec, _CHOICE * count))
+    step_ids = tuple(f"geometry/view_{index}" for index in range(count))
 
     def begin(camera: Camera, display: Display, stage: Stage, writer: SessionWriter) -> BoardVisit:
         bench = Bench(camera, display, stage)
@@ -73,11 +75,11 @@ def _by_hand(rig: RigDescription) -> GuidedStep:
         title="Board held by hand",
         why=_WHY,
         instruction=f"Hold the board ({_named(spec)}) so that it roughly fills the outline, leaning as the outline "
-        f"does, and keep still until the view is taken. Then the next outline is shown, {len(poses)} in all.",
+        f"does, and keep still until the view is taken. Then the next outline is shown, {count} in all.",
         drawing=side_view(rig, poses[0]),
         step_ids=step_ids,
         needs=(),
-        frames=_FRAMES * len(poses),
+        frames=_FRAMES * count,
         by_itself=True,
         begin=begin,
     )
@@ -95,9 +97,9 @@ def board_spec(rig: RigDescription) -> BoardSpec:
     return BoardSpec(columns, round(0.75 * columns), square, _MARKER * square)
 
 
-def board_poses(rig: RigDescription, spec: BoardSpec) -> Iterator[Board]:
-    """Return ``captures.board_views`` poses."""
-    camera, count = rig.camera, rig.captures.board_views
+def board_poses(rig: RigDescription, spec: BoardSpec, count: int) -> Iterator[Board]:
+    """Yield poses that cover the field and lean every way; the first are the same at any ``count``."""
+    camera = rig.camera
     for index, (near, lean_x, lean_y, turn) in enumerate(low_discrepancy(count, 4)):
         across, down = _SPOTS[index % len(_SPOTS)]
         reach = 1.0 - abs(across - 0.5) - abs(down - 0.5)  # boards at the corners are held nearer

@@ -7,7 +7,7 @@ from typing import Final, final
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Int, UInt16
+from jaxtyping import Float, Int, Shaped
 
 from procedures.metering import spot_light
 from udccal.arrangements import BoardSpec
@@ -112,7 +112,13 @@ def find_led(frame: Frame, rig: RigDescription) -> LedSeen:
 
 def find_corners(frame: Frame, spec: BoardSpec) -> CornersSeen:
     """Return the inner corners of a board that a frame shows."""
-    picture, scale = _picture(frame.data)
+    seen, region = corners_in(frame.data, spec), frame.settings.region
+    return CornersSeen(seen.numbers, seen.points_px + np.array([region.x, region.y]))
+
+
+def corners_in(mosaic: Shaped[np.ndarray, "rows columns"], spec: BoardSpec) -> CornersSeen:
+    """Return the inner corners of a board that a mosaic shows, in px of the mosaic."""
+    picture, scale = _picture(mosaic)
     dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, spec.dictionary))
     board = cv2.aruco.CharucoBoard((spec.columns, spec.rows), spec.square_mm, spec.marker_mm, dictionary)
     corners, numbers = cv2.aruco.CharucoDetector(board).detectBoard(picture)[:2]
@@ -120,8 +126,7 @@ def find_corners(frame: Frame, spec: BoardSpec) -> CornersSeen:
         return CornersSeen(np.zeros(0, np.int64), np.zeros((0, 2)))
     # The blur of 2 x 2 moves a picture by half a pixel, the magnification by another.
     points = (np.asarray(corners, np.float64).reshape(-1, 2) - (scale - 1) / 2) / scale - 0.5
-    region = frame.settings.region
-    return CornersSeen(np.asarray(numbers, np.int64).reshape(-1), points + np.array([region.x, region.y]))
+    return CornersSeen(np.asarray(numbers, np.int64).reshape(-1), points)
 
 
 def sharpness(frame: Frame) -> Reading:
@@ -147,7 +152,7 @@ def why_not(reading: Reading) -> str:
             return f"Expected another {reading.name} than {reading.value:.3g} {reading.unit}".rstrip() + "."
 
 
-def _picture(data: UInt16[np.ndarray, "rows columns"]) -> tuple[np.ndarray, int]:
+def _picture(data: Shaped[np.ndarray, "rows columns"]) -> tuple[np.ndarray, int]:
     """Return a mosaic as a grey 8-bit picture, and how many times it is magnified."""
     grey = cv2.blur(data.astype(np.float32), (2, 2))  # every 2 x 2 holds each site of the pattern once
     low, high = np.percentile(grey, (0.5, 99.5))

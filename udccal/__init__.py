@@ -41,6 +41,8 @@ if TYPE_CHECKING:
     from udccal.rig import load_rig as load_rig
     from udccal.sessions.store import Session as Session
     from udccal.tiers import Tier as Tier
+    from udccal.validation.sessions import SessionComparison as SessionComparison
+    from udccal.validation.sessions import compare_sessions as compare_sessions
     from udccal.validation.validate import Validation as Validation
     from udccal.validation.validate import validate as validate
 
@@ -55,11 +57,13 @@ _HOMES = {
     "Restorer": "udccal.restoration.runtime",
     "RigDescription": "udccal.rig",
     "Session": "udccal.sessions.store",
+    "SessionComparison": "udccal.validation.sessions",
     "Tier": "udccal.tiers",
     "UdccalError": "udccal.errors",
     "Validation": "udccal.validation.validate",
     "calibrate": "udccal.calibration",
     "capture": "udccal.benches.capture",
+    "compare_sessions": "udccal.validation.sessions",
     "deblur": "udccal.restoration.deblur",
     "diff": "udccal.comparison.diff",
     "fit": "udccal.calibration",

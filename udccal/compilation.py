@@ -14,8 +14,6 @@ import jax
 
 FOLDER_VARIABLE = "UDCCAL_COMPILATIONS"
 _MOST_BYTES = 512 * 2**20
-# Shorter ones cost more to read than to make again.
-_LEAST_S = 0.1
 # The compiler's own share, and tracing and lowering before it.
 _EVENTS = (
     "/jax/core/compile/jaxpr_trace_duration",
@@ -54,7 +52,8 @@ def keep_compilations() -> None:
     folder = compilation_folder()
     if private_folder(folder):
         jax.config.update("jax_compilation_cache_dir", str(folder))
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", _LEAST_S)
+        # The smallest ones, too: to read one takes a quarter of the time to make it.
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
         jax.config.update("jax_compilation_cache_max_size", _MOST_BYTES)
         jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
 

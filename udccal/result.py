@@ -24,8 +24,8 @@ class FitStatus(enum.Enum):
     CONVERGED = "The fit converged."
     ABSENT = "The data show no sign of this term; it is left out and costs nothing later."
     NOT_CAPTURED = (
-        "Nobody looked: the session has no captures of this term. It keeps the rig description's nominal values, or is "
-        "left out. Capture it to measure it."
+        "Nobody looked: the session has no captures of this term, or too few. It keeps the rig description's nominal "
+        "values, or is left out. Capture it to measure it."
     )
     IMPORTED = "Taken from another program's file, which gives no error bars. Capture it to measure it."
     NOT_CONVERGED = "The solver stopped before it converged. Check the residual map, or allow more iterations."
@@ -169,7 +169,7 @@ class FitResult(Generic[Term]):
     Attributes:
         name: noise, geometry, wire, psf or backscatter.
         term: the fitted term; the rig description's nominal term where the fit failed.
-        status: how the fit ended; NOT_CAPTURED where the session has no captures of the term, IMPORTED where the term
+        status: how the fit ended; NOT_CAPTURED where the session lacks captures of the term, IMPORTED where the term
             is of another program.
         estimates: named numbers of the term, each with its standard deviation.
             An element of the term's arrays has the array's name and its indices: ``fields.3.0.1.2``.

@@ -18,6 +18,7 @@ from udccal.fitting.backscatter.fit import fit_backscatter
 from udccal.fitting.backscatter.parameters import BackscatterRules
 from udccal.fitting.geometry.data import BoardView, read_geometry
 from udccal.fitting.geometry.fit import fit_boards
+from udccal.fitting.lacking import lacking
 from udccal.fitting.noise.data import read_noise
 from udccal.fitting.noise.fit import fit_noise, nominal_noise
 from udccal.fitting.nominal import nominal_geometry
@@ -104,11 +105,11 @@ class TermFits:
     @cached_property
     def psf(self) -> FitResult[PsfField]:
         """The psf fit."""
-        noise, geometry, wire = self.noise.term, self.geometry.term, self.wire.term
+        noise, geometry, wire, wire_map = self.noise.term, self.geometry.term, self.wire.term, self.wire_map
         rig, rules = self._session.rig, self._effort.psf
         return self._run(
             "psf",
-            lambda: fit_psf(read_psf(self._session, noise, wire, rules), rig, geometry, wire, rules),
+            lambda: fit_psf(read_psf(self._session, noise, wire_map, rules), rig, geometry, wire, rules),
             lambda: absent_psf(rig, geometry),
         )
 
@@ -124,13 +125,15 @@ class TermFits:
         )
 
     def _run(self, term: TermName, fit: Callable[[], FitResult[Term]], absent: Callable[[], Term]) -> FitResult[Term]:
-        """Run and time the fit of a term, or return its absent form where the session has no steps of it."""
+        """Run and time the fit of a term, or return its absent form where the session lacks what the fit needs."""
         self._progress(term)
         start = time.perf_counter()
         captured = self._session.steps(term)
-        if captured:
+        lacks = lacking(self._session, term)
+        if captured and not lacks:
             result = replace(fit(), captures=captures_of(captured), effort=self._effort.label)
         else:
-            result = FitResult.failed(term, absent(), FitStatus.NOT_CAPTURED)
+            notes = (f"Captured in part: the fit needs {lacks} as well.",) if captured else ()
+            result = FitResult.failed(term, absent(), FitStatus.NOT_CAPTURED, *notes)
         self.times.append(FitTime(term, time.perf_counter() - start))
         return result

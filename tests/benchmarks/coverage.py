@@ -153,7 +153,7 @@ def kernel_samples(rig: Specimen) -> Float[np.ndarray, " n"]:
     """The psf where no LED was, fitted from the session as a calibration does; a sample of known value has no sigma."""
     session, base, rules = rig.session, rig.base, FitEffort().psf
     geometry, wire_term = base.geometry.term, base.wire.term
-    data = read_psf(session, base.noise.term, wire_term, rules)
+    data = read_psf(session, base.noise.term, base.wire_map, rules)
     fit = fit_psf(data, session.rig, geometry, wire_term, rules).or_raise()
     places = held_out_positions(rig.truth)
 

@@ -91,7 +91,7 @@ def build_full_blur(truth: RigTruth, grid_columns: int, grid_rows: int, rows: in
     def decomposed(stack: Float[np.ndarray, "3 nodes rows columns"], most: int, tolerance: float) -> SpaceVariantBlur:
         size = stack.shape[2:]
         components, coefficients, error = low_rank(stack.reshape(3, len(nodes), -1), most, tolerance)
-        shaped = components.reshape(3, -1, *size), coefficients.reshape(3, -1, grid_rows, grid_columns)
+        shaped = components.reshape(3, -1, *size), coefficients.reshape(-1, grid_rows, grid_columns)
         return SpaceVariantBlur(*shaped, grid_x_px=grid_x, grid_y_px=grid_y, relative_error=error)
 
     ripples = tuple(

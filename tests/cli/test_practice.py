@@ -170,3 +170,35 @@ def test_nobody_at_the_keys_is_said(rig: Path, tmp_path: Path) -> None:
     done = subprocess.run(command(rig, tmp_path), stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=200)
     assert done.returncode == 1
     assert "Expected a person to answer, found that standard input is closed." in done.stderr.replace("\n", " ")
+
+
+@pytest.mark.slow
+def test_what_is_skipped_is_said_in_fit_report_and_profile(rig: Path, tmp_path: Path) -> None:
+    """Of noise and wire the darkness is skipped, of the psf one cell of two."""
+    captured, skipped = "\n\n", "skip\n"
+    words = [*command(rig, tmp_path), "--term", "noise", "--json"]
+    typed = captured + skipped + captured + skipped + skipped
+    done = subprocess.run(words, input=typed, capture_output=True, text=True, timeout=_PATIENCE_S)
+    assert done.returncode == 0, done.stderr
+    assert "Captured, without noise/dark_stack, wire/dark, psf/p00." in done.stderr.replace("\n", " ")
+    notes = {
+        "noise": "Captured in part: the fit needs 2 more exposures in the dark as well.",
+        "wire": "Captured in part: the fit needs wire/dark as well.",
+        "psf": "Captured in part: the fit needs 2 more places of the LED as well.",
+    }
+    report = (tmp_path / "p-report.html").read_text(encoding="utf-8")
+    show = subprocess.run(
+        [sys.executable, "-m", "udccal.cli.main", "profile", "show", str(tmp_path / "p"), "--json"],
+        capture_output=True,
+        text=True,
+        timeout=_PATIENCE_S,
+    )
+    for terms in (json.loads(done.stdout)["terms"], json.loads(show.stdout)["terms"]):
+        assert {term["term"]: term["status"] for term in terms} == dict.fromkeys(
+            ("noise", "geometry", "wire", "psf", "backscatter"), "NOT_CAPTURED"
+        )
+        assert {term["term"]: term["notes"] for term in terms if term["notes"]} == {
+            term: [note] for term, note in notes.items()
+        }
+    for note in notes.values():
+        assert note in report

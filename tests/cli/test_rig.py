@@ -73,6 +73,8 @@ def test_a_wrong_description_is_told_of_all_its_mistakes(rigs: Path) -> None:
     assert listed["problem"] == sentence
     file.write_text(good.replace("max_exposure_s = 10.0", "max_exposure_s = 1e-6"), encoding="utf-8")
     assert "longer than the longest" in refused("rig", "check", "lobby")
+    file.write_text(good.replace("columns = 2048", "columns = 2047"), encoding="utf-8")
+    assert "Give 2046 x 1536" in refused("rig", "check", "lobby")
 
 
 def test_a_wrong_name_is_told_the_nearest_and_the_own_rigs(rigs: Path) -> None:

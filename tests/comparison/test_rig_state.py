@@ -38,7 +38,7 @@ def test_the_state_is_that_of_the_simulated_rig(measured: Profile) -> None:
     for name, value in true.items():
         assert abs(number(state, name).value - value) < 3 * number(state, name).sigma, name
     assert number(state, "row_open").value == pytest.approx(truth.panel.row_open, abs=1.5e-3)
-    assert (state.terms, state.agreement_dof) == (("geometry", "wire", "psf", "backscatter"), 9)
+    assert (state.terms, state.agreement_dof) == (("geometry", "wire", "psf", "backscatter"), 8)
     assert state.agreement_p_value > 0.01
     assert [one.name for one in state.estimates if one.by_prior] == ["pitch_mm"]
     np.testing.assert_allclose(np.sqrt(np.diag(state.cov)), [one.sigma for one in state.estimates])
@@ -79,6 +79,13 @@ def test_a_term_that_contradicts_the_others_is_noticed(
 ) -> None:
     off = with_estimates(measured, term, {name: sigmas * measured.result(term).estimate(name).sigma})
     assert rig_state(off).agreement_p_value < 1e-6
+
+
+def test_the_width_of_backscatters_footprint_says_nothing_of_the_pupil(measured: Profile) -> None:
+    before, sigma = rig_state(measured), measured.backscatter.estimate("pupil_diameter_mm").sigma
+    after = rig_state(with_estimates(measured, "backscatter", {"pupil_diameter_mm": 20 * sigma}))
+    for name in NAMES:
+        assert abs(number(after, name).value - number(before, name).value) < 0.1 * number(before, name).sigma, name
 
 
 def test_agreement_of_draws_follows_its_degrees_of_freedom(measured: Profile) -> None:

@@ -8,7 +8,7 @@ import pytest
 
 from tests.guide.painted import PaintedRig, painted_bench, painted_rig
 from tests.guide.scripted import Reaction, Scripted
-from udccal.arrangements import Dark, FlatLight, Led
+from udccal.arrangements import Board, Dark, FlatLight, Led
 from udccal.guide.capture import guided_steps, lead_capture
 from udccal.guide.events import Answer, Event, ProgressEvent, ReadingsEvent, StepEvent, VerdictEvent
 from udccal.rig import load_rig
@@ -221,3 +221,24 @@ def test_quit_keeps_what_is_captured_and_the_next_run_continues(tmp_path: Path) 
     assert person.visited == ["wire/flat"]
     assert led(tmp_path, ["wire"]).visited == ["wire/dark"]
     assert led(tmp_path, ["wire"]).visited == []
+
+
+@pytest.mark.medium
+def test_views_held_before_an_interruption_count_as_they_were_held(tmp_path: Path) -> None:
+    """Held as before, the board is refused after a restart too: its pose was read from the session's picture."""
+    painted = PaintedRig(painted_rig(4, board_views=3))
+
+    def held() -> list[Board]:
+        boards = [step for step in painted.asked if isinstance(step, Board) and not step.parallel_to_panel]
+        return list(dict.fromkeys(boards))
+
+    first = led(tmp_path, ["geometry"], lambda event, offered: Answer.quit if len(held()) > 1 else None, painted)
+    assert first.done.stopped
+
+    def again(event: Event, offered: tuple[Answer, ...]) -> Answer | None:
+        done = isinstance(event, ReadingsEvent) and "Such a view is there already" in event.sentence
+        painted.put = held()[0]
+        return Answer.quit if done else None
+
+    assert led(tmp_path, ["geometry"], again, painted).done.stopped
+    assert len(Session.open(tmp_path).steps("geometry")) == 2

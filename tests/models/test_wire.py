@@ -127,7 +127,8 @@ def test_an_amplitude_beside_the_pupils_is_a_polynomial_over_the_sensor() -> Non
     with jax.enable_x64(True):
         without, with_it = (np.asarray(_values(w, pixels, ROWS, COLUMNS)) for w in (wire, free))
         slope = slopes(wire, unproject(wire.geometry, pixels))
-        cosine, sine = np.asarray(waves(wire, slope))[:, 0]
+        periods = np.asarray(wire.offset_periods)[:, None] + wire.standoff_per_pitch * np.asarray(slope)
+        cosine, sine = np.asarray(waves(wire, periods))[:, 0]
         base = without / (1 + np.asarray(modulation(wire, slope, np.zeros((3, 2)))))
     x, y = 2 * pixels[:, 0] / (COLUMNS - 1) - 1, 2 * pixels[:, 1] / (ROWS - 1) - 1
     np.testing.assert_allclose(with_it - without, base * (0.02 * y * cosine + 0.03 * x * sine), atol=1e-12)

@@ -229,9 +229,11 @@ def test_profiles_are_found_by_path_and_by_name(
     assert find_profile(original) == original
     with pytest.raises(ProfileError, match=r"Expected a profile .* found none"):
         read_profile(find_profile("mine"))
-    with pytest.raises(ProfileError, match=r"Expected a profile .* found none"):
+    with pytest.raises(ProfileError, match=r"name a rig that has one: lg55-reduced\.$"):
         read_profile(find_profile("no-such-rig"))
     shutil.copytree(original, mine / RIG_PROFILE)
+    with pytest.raises(ProfileError, match=r"name a rig that has one: mine, lg55-reduced\.$"):
+        read_profile(find_profile("no-such-rig"))
     assert find_profile("mine") == mine / RIG_PROFILE
 
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
+from udccal.fitting.psf.held_out import KernelError
 from udccal.reports import figures
 from udccal.reports.board_views import BoardEvidence
 from udccal.reports.evidence import PhotonTransfer
@@ -36,8 +37,8 @@ DRAWN = {
     "board": lambda: figures.board_figure(BoardEvidence(np.ones((5, 2)), np.zeros((5, 2)), 1), 32, 24),
     "wire": lambda: figures.wire_figure(maps(1), None),
     "wire and truth": lambda: figures.wire_figure(maps(1), maps(2)),
-    "psf": lambda: figures.psf_figure(maps(1), None),
-    "psf and truth": lambda: figures.psf_figure(maps(1), maps(2)),
+    "psf": lambda: figures.psf_figure(maps(1), None, None),
+    "psf and truth": lambda: figures.psf_figure(maps(1), maps(2), KernelError(0.01, 0.3, 0.75)),
     "backscatter": lambda: figures.backscatter_figure(maps(1), None),
     "backscatter and truth": lambda: figures.backscatter_figure(maps(1), maps(2)),
     "difference": lambda: figures.difference_figure(np.zeros((8, 8)), "nothing"),

@@ -1,89 +1,22 @@
 """Writes a session as docs/session.md says, and imports nothing of udccal.
 
-Run it as a program: ``python foreign_writer.py FOLDER``.
+Run it as a program from the project's folder: ``python -m tests.sessions.foreign_writer FOLDER``.
 """
 
-import hashlib
-import json
 import sys
-from pathlib import Path
 
 import cv2
-import foreign_world as world
 import numpy as np
-import OpenEXR
 
-NOW = "2024-05-01T12:00:00+00:00"
+from tests.scenes.session_writer import SessionWriter, about
+from tests.sessions import foreign_world as world
+
 BOARD = {"columns": 7, "rows": 5, "square_mm": 75.0, "marker_mm": 56.0, "dictionary": "DICT_4X4_100"}
-WHOLE = {"x": 0, "y": 0, "columns": world.COLUMNS, "rows": world.ROWS}
-
-
-class Writer:
-    """Collects steps; files go straight to disk."""
-
-    def __init__(self, folder):
-        self.folder, self.steps, self.clock = Path(folder), [], 0.0
-        self.sensor = world.Sensor()
-
-    def put(self, name, content):
-        file = self.folder / name
-        file.parent.mkdir(parents=True, exist_ok=True)
-        file.write_bytes(content)
-        return hashlib.sha256(content).hexdigest()
-
-    def capture(self, kind, name, sha256, frames, exposure_s, region):
-        self.clock += 1.0
-        return {
-            "kind": kind,
-            "file": name,
-            "sha256": sha256,
-            "frames": frames,
-            "exposure_s": exposure_s,
-            "gain_dB": 0.0,
-            "region": region,
-            "first_timestamp_s": self.clock,
-            "last_timestamp_s": self.clock,
-            "rejected": [],
-        }
-
-    def single(self, name, rate, exposure_s, region=WHOLE):
-        data = self.sensor.frame(rate, exposure_s, **region)
-        sha256 = self.put(f"{name}.png", cv2.imencode(".png", data)[1].tobytes())
-        return self.capture("frame", f"{name}.png", sha256, 1, exposure_s, region)
-
-    def average(self, name, rate, exposure_s, frames):
-        stack = np.stack([self.sensor.frame(rate, exposure_s) for _ in range(frames)]).astype(np.float64)
-        channels = {"mean": stack.mean(0).astype(np.float32), "variance": stack.var(0, ddof=1).astype(np.float32)}
-        file = self.folder / f"{name}.exr"
-        file.parent.mkdir(parents=True, exist_ok=True)
-        header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-        with OpenEXR.File(header, channels) as exr:
-            exr.write(str(file))
-        sha256 = hashlib.sha256(file.read_bytes()).hexdigest()
-        return self.capture("average", f"{name}.exr", sha256, frames, exposure_s, WHOLE)
-
-    def step(self, step_id, subject, captures):
-        term = step_id.split("/")[0]
-        self.steps.append({"id": step_id, "term": term, "subject": subject, "completed_at": NOW, "captures": captures})
-
-    def finish(self):
-        manifest = {
-            "format": "udccal-session",
-            "version": 1,
-            "created_at": NOW,
-            "rig": rig(),
-            "camera": {"vendor": "other", "model": "tiny", "serial": "7", "backend": "foreign"},
-            "steps": self.steps,
-        }
-        self.put("session.json", json.dumps(manifest).encode())
+CAMERA = {"vendor": "other", "model": "tiny", "serial": "7", "backend": "foreign"}
 
 
 def rig():
     """The description of the rig: nominal values near the true ones, with tolerances."""
-
-    def about(value, tolerance):
-        return {"value": value, "tolerance": tolerance}
-
     return {
         "format": "udccal-rig",
         "version": 2,
@@ -182,9 +115,8 @@ def write_backscatter(writer):
     seconds = float(0.7 * 11000 / world.backscatter_rate(pictures["white"][1]).max())
     for key, (role, picture) in pictures.items():
         name = f"backscatter/{key}"
-        sha256 = writer.put(f"{name}_shown.png", cv2.imencode(".png", picture[..., ::-1])[1].tobytes())
-        subject = {"kind": "panel", "picture": f"{name}_shown.png", "picture_sha256": sha256, "role": role}
-        writer.step(name, subject, [writer.average(name, world.backscatter_rate(picture), seconds, 4)])
+        average = writer.average(name, world.backscatter_rate(picture), seconds, 4)
+        writer.step(name, writer.picture(name, picture, role), [average])
     dark = np.zeros((world.ROWS, world.COLUMNS))
     writer.step("backscatter/dark", {"kind": "dark"}, [writer.average("backscatter/dark", dark, seconds, 4)])
 
@@ -211,10 +143,10 @@ def write_geometry(writer):
 
 def main(folder):
     """Write the whole session."""
-    writer = Writer(folder)
+    writer = SessionWriter(folder, world.Sensor(), world.COLUMNS, world.ROWS)
     for write in (write_noise, write_geometry, write_wire, write_psf, write_backscatter):
         write(writer)
-    writer.finish()
+    writer.finish(rig(), CAMERA)
     used = [name for name in sys.modules if name.split(".")[0] in ("udccal", "procedures")]
     assert not used, used
 

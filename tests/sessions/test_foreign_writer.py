@@ -19,7 +19,9 @@ HERE = Path(__file__).parent
 def session(tmp_path_factory: pytest.TempPathFactory) -> Session:
     folder = tmp_path_factory.mktemp("foreign") / "session"
     # A process of its own, which ends with an error if anything of udccal was imported.
-    subprocess.run([sys.executable, str(HERE / "foreign_writer.py"), str(folder)], check=True)
+    subprocess.run(
+        [sys.executable, "-m", "tests.sessions.foreign_writer", str(folder)], check=True, cwd=HERE.parents[1]
+    )
     return Session.open(folder)
 
 

@@ -155,14 +155,28 @@ def import_(
 @profile_app.command(no_args_is_help=True)
 def validate(
     context: typer.Context,
-    path: ProfileArgument,
     session: Annotated[Path, typer.Option("--session", help="Folder of a session of the same rig, best a later one.")],
+    path: Annotated[
+        Path | None, typer.Argument(metavar="[PROFILE]", help="The profile's folder or zip file, or a rig's name.")
+    ] = None,
+    against: Annotated[
+        Path | None, typer.Option("--against", help="Instead of a profile: folder of another session of the rig.")
+    ] = None,
     out: Annotated[
         Path | None, typer.Option("--out", help="Write validation.json and validation.html to this folder.")
     ] = None,
 ) -> None:
-    """Say whether a profile predicts a session that it was not fitted to, with a map for each term."""
-    from udccal.cli.jobs.validate import validate_profile
+    """Say whether a profile predicts a session that it was not fitted to, with a map for each term.
 
-    if not validate_profile(context.obj, path, session, out):
+    With --against instead of a profile: say whether two sessions show the same rig, by what both captured alike.
+    """
+    from udccal.cli.jobs import validate as job
+
+    if path is not None and against is None:
+        ok = job.validate_profile(context.obj, path, session, out)
+    elif path is None and against is not None:
+        ok = job.validate_session(context.obj, session, against, out)
+    else:
+        raise typer.BadParameter("Expected a profile or --against with another session, and not both.")
+    if not ok:
         raise typer.Exit(CHANGED)

@@ -1,4 +1,4 @@
-"""Which profiles may be compared: those of one rig with one sensor, with finite numbers."""
+"""Which profiles and sessions may be compared: those of one rig with one sensor, with finite numbers."""
 
 from __future__ import annotations
 
@@ -7,10 +7,11 @@ from collections.abc import Iterator
 import numpy as np
 from jaxtyping import Float
 
-from udccal.errors import ProfileError
+from udccal.errors import ProfileError, SessionError
 from udccal.profiles.profile import Profile
 from udccal.rig import RigDescription
 from udccal.sessions.schema import StoredCamera
+from udccal.sessions.store import Session
 
 
 def check_comparable(a: Profile, b: Profile) -> None:
@@ -19,7 +20,7 @@ def check_comparable(a: Profile, b: Profile) -> None:
     Raises:
         ProfileError: when rig, panel, sensor or camera differ; the message names the first difference.
     """
-    if (found := _difference(a, b.rig, b.provenance.camera)) is not None:
+    if (found := _difference(a.rig, a.provenance.camera, b.rig, b.provenance.camera)) is not None:
         what, first, second = found
         raise ProfileError(
             f"Expected two profiles of one rig, found another {what}: {first} in A, {second} in B. "
@@ -33,7 +34,7 @@ def check_same_rig(profile: Profile, rig: RigDescription, taken_by: StoredCamera
     Raises:
         ProfileError: when rig, panel, sensor or camera differ; the message names the first difference.
     """
-    if (found := _difference(profile, rig, taken_by)) is not None:
+    if (found := _difference(profile.rig, profile.provenance.camera, rig, taken_by)) is not None:
         what, first, second = found
         raise ProfileError(
             f"Expected a session of the profile's rig, found another {what}: {second} in the session, {first} in the "
@@ -41,10 +42,25 @@ def check_same_rig(profile: Profile, rig: RigDescription, taken_by: StoredCamera
         )
 
 
-def _difference(a: Profile, rig: RigDescription, taken_by: StoredCamera | None) -> tuple[str, object, object] | None:
-    """The first thing that differs, in A, and in the other rig and camera."""
-    pairs = zip(_identity(a.rig, a.provenance.camera), _identity(rig, taken_by), strict=True)
-    for (what, first), (_, second) in pairs:
+def check_sessions(a: Session, b: Session) -> None:
+    """Refuse two sessions that are not of one rig and camera.
+
+    Raises:
+        SessionError: when rig, panel, sensor or camera differ; the message names the first difference.
+    """
+    if (found := _difference(a.rig, a.camera, b.rig, b.camera)) is not None:
+        what, first, second = found
+        raise SessionError(
+            f"Expected two sessions of one rig, found another {what}: {first} in {a.path}, {second} in {b.path}. "
+            "Compare sessions of the same rig and camera."
+        )
+
+
+def _difference(
+    a: RigDescription, camera_a: StoredCamera | None, b: RigDescription, camera_b: StoredCamera | None
+) -> tuple[str, object, object] | None:
+    """The first thing that differs, in A and in B."""
+    for (what, first), (_, second) in zip(_identity(a, camera_a), _identity(b, camera_b), strict=True):
         if first != second and None not in (first, second):
             return what, first, second
     return None

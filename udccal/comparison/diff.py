@@ -126,8 +126,9 @@ def compare(a: Profile, b: Profile, limits: DiffLimits) -> tuple[ProfileDiff, Di
     found = difference(held_estimates(a), held_estimates(b))
     maps = difference_maps(a, b)
     loss = picture_loss(a, b, maps)
-    effects = effects_of(a, b, maps, loss, limits)
-    terms = tuple(_term(a, b, term, found.of(term), effects[term], limits) for term in ORDER)
+    terms = tuple(
+        _term(a, b, term, found.of(term), effects_of(term, a, b, maps, loss, limits), limits) for term in ORDER
+    )
     # What was fitted to the same captures tells no movement.
     told = [not _same_captures(a.result(term), b.result(term)) for term, _ in found.names]
     moved = movement(found.only(np.array(told, dtype=bool)), a.rig.panel.pitch_mm.value, limits)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import final
 
@@ -43,43 +42,25 @@ class Effect:
 
 
 def effects_of(
-    a: Profile, b: Profile, maps: DifferenceMaps, loss: PictureLoss, limits: DiffLimits
-) -> Mapping[TermName, tuple[Effect, ...]]:
-    """Return the effects of each term's difference, the first with what the accuracy tables measure."""
-    return {
-        "noise": _noise(a, b, limits),
-        "geometry": _geometry(maps, limits),
-        "wire": (
-            Effect(
-                "wire map, RMS",
-                100 * _rms(maps.wire),
-                "%",
-                limits.wire_percent,
-                _stated(a.wire, b.wire, "wire_map_rms_sigma", 1.0),
-            ),
-            Effect(_LOSS, loss.wire, "dB", limits.picture_dB),
-        ),
-        "psf": (
-            Effect(
-                "kernels, L2",
-                _kernels(maps),
-                "%",
-                limits.kernel_percent,
-                _stated(a.psf, b.psf, "kernel_relative_l2", 100.0),
-            ),
-            Effect(_LOSS, loss.psf, "dB", limits.picture_dB),
-        ),
-        "backscatter": (
-            Effect(
-                "panel's light, RMS, of its peak",
-                _light(maps),
-                "%",
-                limits.backscatter_percent,
-                _stated(a.backscatter, b.backscatter, "held_out_without_noise_of_peak", 100.0),
-            ),
-            Effect(_LOSS, loss.backscatter, "dB", limits.picture_dB),
-        ),
-    }
+    term: TermName, a: Profile, b: Profile, maps: DifferenceMaps, loss: PictureLoss, limits: DiffLimits
+) -> tuple[Effect, ...]:
+    """Return the effects of a term's difference, the first with what the accuracy tables measure."""
+    match term:
+        case "noise":
+            return _noise(a, b, limits)
+        case "geometry":
+            return _geometry(maps, limits)
+        case "wire":
+            error = _stated(a.wire, b.wire, "wire_map_rms_sigma", 1.0)
+            first, lost = Effect("wire map, RMS", 100 * _rms(maps.wire), "%", limits.wire_percent, error), loss.wire
+        case "psf":
+            error = _stated(a.psf, b.psf, "kernel_relative_l2", 100.0)
+            first, lost = Effect("kernels, L2", _kernels(maps), "%", limits.kernel_percent, error), loss.psf
+        case "backscatter":
+            error = _stated(a.backscatter, b.backscatter, "held_out_without_noise_of_peak", 100.0)
+            name, lost = "panel's light, RMS, of its peak", loss.backscatter
+            first = Effect(name, _light(maps), "%", limits.backscatter_percent, error)
+    return first, Effect(_LOSS, lost, "dB", limits.picture_dB)
 
 
 def _noise(a: Profile, b: Profile, limits: DiffLimits) -> tuple[Effect, ...]:
@@ -128,5 +109,10 @@ def _rms(values: Float[np.ndarray, "..."]) -> float:
 
 def _stated(a: FitResult, b: FitResult, name: str, unit: float) -> float | None:
     """Error that both profiles state of themselves under this name, as an estimate or a diagnostic."""
-    stated = [{**{d.name: d.value for d in r.diagnostics}, **{e.name: e.value for e in r.estimates}} for r in (a, b)]
-    return unit * float(np.hypot(stated[0][name], stated[1][name])) if all(name in one for one in stated) else None
+    one, other = (_number(result, name) for result in (a, b))
+    return None if one is None or other is None else unit * float(np.hypot(one, other))
+
+
+def _number(result: FitResult, name: str) -> float | None:
+    estimate = next((one.value for one in result.estimates if one.name == name), None)
+    return result.diagnostic(name) if estimate is None else estimate

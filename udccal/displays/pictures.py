@@ -8,6 +8,7 @@ over, so that edges, eyes and hair cross any such place.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -17,6 +18,8 @@ _SKINS = ((247, 214, 190), (234, 187, 154), (198, 143, 108), (141, 96, 70), (92,
 _HEADS_PER_MEGAPIXEL = 430
 _SMALLEST_HEAD_PX = 14.0
 _SUBPIXEL_BITS = 4
+# A procedure's steps are listed several times in a session, each time with their pictures.
+_KEPT_PICTURES = 8
 
 Picture = UInt8[np.ndarray, "rows columns 3"]
 
@@ -31,8 +34,9 @@ class _Head:
     lean_deg: float
 
 
+@lru_cache(maxsize=_KEPT_PICTURES)
 def face_picture(seed: int, columns: int, rows: int) -> Picture:
-    """Draw a crowd in 8-bit RGB.
+    """Draw a crowd in 8-bit RGB; the array is shared, and cannot be written to.
 
     Args:
         seed: each seed gives another crowd, in other colours and another light.
@@ -47,7 +51,9 @@ def face_picture(seed: int, columns: int, rows: int) -> Picture:
         x, y, lean_deg = (float(v) for v in rng.uniform([0, 0, -20], [columns, rows, 20]))
         _draw_person(picture, rng, _Head(x, y, float(size), lean_deg))
     light = rng.uniform(0.75, 1.0) * rng.uniform(0.75, 1.0, 3)
-    return np.rint(picture * light).astype(np.uint8)
+    shown = np.rint(picture * light).astype(np.uint8)
+    shown.flags.writeable = False
+    return shown
 
 
 def _wall(rng: np.random.Generator, columns: int, rows: int) -> Picture:

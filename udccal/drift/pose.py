@@ -24,7 +24,8 @@ from udccal.validation.flats import CELLS, cell_medians, cell_numbers, light_des
 
 # Rotation (3), stand-off, offset (2) as in ``shape_vector``, and the focal length.
 POSE, _FOCAL = 6, 6
-_SAMPLES, _ROUNDS = 110_000, 3
+# Pixels of each step: few until the pose is near.
+_SAMPLES = (14_000, 14_000, 110_000)
 # Parts of the sensor are left out that are off by so many sigma and so much.
 _ODD_SIGMA, _ODD = 6.0, 0.004
 # Relative step of the derivative by the focal length.
@@ -60,8 +61,8 @@ def pose_change(wire: Wire, data: WireData) -> PoseChange:
     values = data.signal / means[cfa_named(data.cfa).site_map(*data.signal.shape)]
     noise, start = flat_noise(data, means), wire
     odd = np.zeros(CELLS, dtype=bool)
-    for _ in range(_ROUNDS):
-        pixels = sample_pixels(values, wire.geometry, _SAMPLES, data.cfa)
+    for samples in _SAMPLES:
+        pixels = sample_pixels(values, wire.geometry, samples, data.cfa)
         step, cov, light, variance = _step(wire, _without(pixels, odd), noise)
         wire = _moved(wire, step)
         whole, base = values_at(wire, pixels.ideal, pixels.scaled)
@@ -84,9 +85,9 @@ def _step(
     found = [wire_derivatives(wire, ideal, scaled) for ideal, scaled in blocks(pixels.ideal, pixels.scaled)]
     whole, base = (np.concatenate([getattr(one, name) for one in found]) for name in ("whole", "base"))
     by_pose = np.concatenate([one.shape[:POSE] for one in found], axis=1) / whole
-    ahead, behind = (np.log(_map(wire, pixels.ideal * (1 - sign * _SMALL), pixels.scaled)) for sign in (1, -1))
-    by_focal = (ahead - behind) / (2 * _SMALL)
-    design = np.column_stack([by_pose.T, by_focal, light_design(pixels)])
+    ahead, light_there = values_at(wire, pixels.ideal * (1 - _SMALL), pixels.scaled)
+    by_focal = np.log(ahead * light_there / (whole * base)) / _SMALL
+    design = np.column_stack([by_pose.T, by_focal, light_design(pixels.scaled, pixels.site)])
     light = np.ones(len(whole))
     for _ in range(2):
         seen = weighed(pixels, whole * base * light, noise)
@@ -99,11 +100,6 @@ def _step(
     off = (right - tall @ solved)[used]
     variance = float(off @ off) / max(int(used.sum()) - len(solved), 1)
     return solved[: _FOCAL + 1], max(variance, 1.0) * matrix[: _FOCAL + 1, : _FOCAL + 1], light, variance
-
-
-def _map(wire: Wire, ideal: Float[np.ndarray, "n 2"], scaled: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
-    whole, base = values_at(wire, ideal, scaled)
-    return whole * base
 
 
 def _moved(wire: Wire, step: Float[np.ndarray, "7"]) -> Wire:

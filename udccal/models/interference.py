@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from udccal.models.arrays import Arrayish
+from udccal.models.bessel import sine_cosine
 from udccal.models.diffraction import (
     Diffraction,
     LocalFrame,
@@ -136,8 +137,10 @@ def disc_overlap_coefficient(lag: Float[Arrayish, "*n 2"], wave: Float[Arrayish,
     weight = jnp.asarray(weights * np.pi / 2, lag.dtype)
     t = half[..., None] * jnp.sin(angle)
     width = jnp.maximum(jnp.sqrt(0.25 - t * t) - distance[..., None] / 2.0, 0.0)
-    slab = 2.0 * width * jnp.sinc(2.0 * across[..., None] * width)
-    integrand = slab * jnp.cos(2.0 * jnp.pi * along[..., None] * t) * half[..., None] * jnp.cos(angle)
+    phase = 2.0 * jnp.pi * across[..., None] * width
+    small = jnp.abs(phase) < 1e-2
+    slab = 2.0 * width * jnp.where(small, 1.0 - phase**2 / 6.0, sine_cosine(phase)[0] / jnp.where(small, 1.0, phase))
+    integrand = slab * sine_cosine(2.0 * jnp.pi * along[..., None] * t)[1] * half[..., None] * jnp.cos(angle)
     return integrand @ weight * (4.0 / jnp.pi)
 
 

@@ -147,16 +147,15 @@ def slits(
     return jnp.where(order == 0, 1.0, 2.0 * sinc), jnp.where(order == 0, 0.0, slope)
 
 
-def waves(wire: Wire, slope: Float[Arrayish, "2 n"]) -> Float[Array, "2 harmonics n"]:
+def waves(wire: Wire, periods: Float[Arrayish, "2 n"]) -> Float[Array, "2 harmonics n"]:
     """Return cos and sin of each harmonic's phase 2 pi (n X + m Y).
 
     Args:
         wire: the wire term.
-        slope: slopes of the rays, from ``slopes``.
+        periods: (X, Y) where the rays meet the panel.
     """
-    periods = jnp.asarray(wire.offset_periods)[:, None] + wire.standoff_per_pitch * jnp.asarray(slope)
     # Subtract whole periods, which would cost digits in single precision.
-    phase = 2 * jnp.pi * (periods - jnp.round(periods))
+    phase = 2 * jnp.pi * (jnp.asarray(periods) - jnp.round(periods))
     order = jnp.asarray(wire.harmonics)
     (cosine_x, sine_x), (cosine_y, sine_y) = (_multiples(p, o) for p, o in zip(phase, order.T, strict=True))
     return jnp.stack([cosine_x * cosine_y - sine_x * sine_y, sine_x * cosine_y + cosine_x * sine_y])
@@ -194,7 +193,8 @@ def modulation(wire: Wire, slope: Float[Arrayish, "2 n"], scaled: Float[Arrayish
     seen = kappa(wire, slope)
     fields = jnp.asarray(wire.fields)
     powers = field_powers(wire, seen, fields.shape[-1])
-    carrier, wave = carriers(wire, slope, seen), waves(wire, slope)
+    periods = jnp.asarray(wire.offset_periods)[:, None] + wire.standoff_per_pitch * jnp.asarray(slope)
+    carrier, wave = carriers(wire, slope, seen), waves(wire, periods)
     total = jnp.zeros_like(seen)
     # Unrolled over the few phases, carriers and degrees: the compiler fuses it into one fast loop.
     for p, c in ((0, 0), (0, 1), (1, 0), (1, 1)):

@@ -143,14 +143,14 @@ def _expected(state: RigState, shots: Shots, evaluator: Evaluator, prior: Prior)
     made = gather(shots, state.geometry, choose_samples(shots, _RULES))
     problem = DiffractionProblem(made, evaluator, prior).with_overlaps(prior.mean)
     own = np.tile([0.0, 0.0, *WHITE, 0.0], (shots.positions, len(_SHIFTS_PX), 1))
-    light = problem.light_at(Place(prior.mean, own))
-    peak = light.max(axis=2, keepdims=True)
-    own[..., 2:5] /= peak
-    return replace(problem, samples=replace(problem.samples, rate=light / peak)), Place(prior.mean, own)
+    own[..., 2:5] /= problem.at(prior.mean, own).light.max(axis=2, keepdims=True)
+    place = problem.at(prior.mean, own)
+    return replace(problem, samples=replace(problem.samples, rate=place.light)), place
 
 
 def _part(problem: DiffractionProblem, place: Place, which: slice) -> tuple[DiffractionProblem, Place]:
-    return replace(problem, samples=problem.samples.at(which)), Place(place.theta, place.own[which])
+    parts = (part[which] for part in (place.own, place.light, place.by_theta, place.by_own))
+    return replace(problem, samples=problem.samples.at(which)), Place(place.theta, *parts)
 
 
 def _half(captures: Captures) -> tuple[int, int]:

@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Float32
 
 from udccal.errors import ProfileError
+from udccal.fitting.psf.held_out import stated_by
 from udccal.io.exr import write_exr
 from udccal.io.hashing import sha256_file
 from udccal.models.backscatter import Backscatter
@@ -21,7 +22,7 @@ from udccal.models.wire import Wire
 from udccal.profiles.arrays import read_checked
 from udccal.profiles.evidence import load_fit, store_fit
 from udccal.profiles.packing import Packed, pack, unpack
-from udccal.profiles.pictures import ATLAS_COLUMNS, ATLAS_ROWS, psf_atlas
+from udccal.profiles.pictures import ATLAS_COLUMNS, ATLAS_ROWS, psf_atlas, tiled
 from udccal.profiles.profile import Profile
 from udccal.profiles.ranges import check_term
 from udccal.profiles.schema import FORMAT, VERSION, Lineage, Section, StoredPicture, StoredProfile, Terms
@@ -78,8 +79,9 @@ def decode(stored: StoredProfile, folder: Path) -> Profile:
     size, half_size = (camera.rows, camera.columns), (camera.rows // 2, camera.columns // 2)
     wire_map = _load_picture(pictures["wire_map"], folder, ("wire",), size, _WIRE_RANGE)
     mask = _load_picture(pictures["backscatter_white"], folder, tuple("RGB"), half_size, _RATE_RANGE)
-    atlas = pictures["psf_atlas"]
-    _load_picture(atlas, folder, tuple("RGB"), (atlas.rows, atlas.columns), _KERNEL_RANGE)
+    for name, allowed in (("psf_atlas", _KERNEL_RANGE), ("psf_sigma", _SIGMA_RANGE)):
+        if (of_kernels := pictures.get(name)) is not None:
+            _load_picture(of_kernels, folder, tuple("RGB"), (of_kernels.rows, of_kernels.columns), allowed)
     return Profile(
         rig=stored.rig,
         provenance=stored.provenance,
@@ -135,6 +137,16 @@ def _store_sigmas(profile: Profile, folder: Path) -> Iterator[StoredPicture]:
             yield _store_picture(folder, f"{result.name}_sigma", channels, unit, what)
 
 
+def _store_kernel_sigma(
+    result: FitResult[PsfField], atlas: Float32[np.ndarray, "places 3 ky kx"], folder: Path
+) -> Iterator[StoredPicture]:
+    """The sigma of each sample of the atlas, where the fit states it."""
+    if (stated := stated_by(result)) is not None:
+        sigma = stated.of_kernels(atlas.astype(np.float64)).astype(np.float32)
+        what = "One standard deviation of every sample of psf_atlas, in its unit, tiled as there."
+        yield _store_picture(folder, "psf_sigma", tiled(sigma), "1", what)
+
+
 def _store_pictures(profile: Profile, folder: Path) -> tuple[StoredPicture, ...]:
     mask = {name: profile.backscatter_mask[..., index] for index, name in enumerate("RGB")}
     atlas = psf_atlas(profile.psf.term, profile.rig)
@@ -143,7 +155,7 @@ def _store_pictures(profile: Profile, folder: Path) -> tuple[StoredPicture, ...]
         _store_picture(
             folder,
             "psf_atlas",
-            atlas,
+            tiled(atlas),
             "1",
             f"Kernels at {ATLAS_COLUMNS} x {ATLAS_ROWS} field positions, from 5 % to 95 % of the sensor's width and "
             "height, tiled as they lie on the sensor. Raise the exposure to view it.",
@@ -155,6 +167,7 @@ def _store_pictures(profile: Profile, folder: Path) -> tuple[StoredPicture, ...]
             "e-/s",
             "Backscatter of an all-white panel, one sample per 2 x 2 cell of the sensor, before the wire.",
         ),
+        *_store_kernel_sigma(profile.psf, atlas, folder),
         *_store_sigmas(profile, folder),
     )
 

@@ -26,12 +26,17 @@ def backscatter_mask(term: Backscatter, rig: RigDescription) -> Float32[np.ndarr
     return cfa_named(rig.camera.cfa).cell_means(mosaic).astype(np.float32)
 
 
-def psf_atlas(term: PsfField, rig: RigDescription) -> Mapping[str, Float32[np.ndarray, "rows columns"]]:
-    """Return kernels on a grid of field positions, tiled as the positions lie on the sensor; channels R, G, B."""
+def psf_atlas(term: PsfField, rig: RigDescription) -> Float32[np.ndarray, "places 3 ky kx"]:
+    """Return kernels on a grid of field positions, row by row of positions."""
     x = np.linspace(_INSET, 1 - _INSET, ATLAS_COLUMNS) * (rig.camera.columns - 1)
     y = np.linspace(_INSET, 1 - _INSET, ATLAS_ROWS) * (rig.camera.rows - 1)
     rows, columns = fitted_size(term, rig)
-    kernels = kernels_at(term, np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2), rows, columns)
-    tiles = kernels.reshape(ATLAS_ROWS, ATLAS_COLUMNS, 3, rows, columns)
-    atlas = tiles.transpose(2, 0, 3, 1, 4).reshape(3, ATLAS_ROWS * rows, -1)
-    return dict(zip("RGB", atlas, strict=True))
+    return kernels_at(term, np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2), rows, columns)
+
+
+def tiled(atlas: Float32[np.ndarray, "places 3 ky kx"]) -> Mapping[str, Float32[np.ndarray, "rows columns"]]:
+    """Return an atlas as one picture, tiled as the positions lie on the sensor; channels R, G, B."""
+    rows, columns = atlas.shape[2:]
+    tiles = atlas.reshape(ATLAS_ROWS, ATLAS_COLUMNS, 3, rows, columns)
+    whole = tiles.transpose(2, 0, 3, 1, 4).reshape(3, ATLAS_ROWS * rows, -1)
+    return dict(zip("RGB", whole, strict=True))

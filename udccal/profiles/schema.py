@@ -111,7 +111,7 @@ class StoredArray(_Strict):
 class StoredPicture(_Strict):
     """A map evaluated from the terms, for viewing and for restoration."""
 
-    name: Literal["wire_map", "psf_atlas", "backscatter_white", "wire_sigma", "backscatter_sigma"]
+    name: Literal["wire_map", "psf_atlas", "backscatter_white", "wire_sigma", "psf_sigma", "backscatter_sigma"]
     file: FileName
     sha256: Sha256
     columns: Annotated[int, Field(ge=1, le=16384)]

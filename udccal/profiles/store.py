@@ -18,7 +18,7 @@ from udccal.profiles.profile import Profile
 from udccal.profiles.provenance import MAX_JSON_BYTES, PROFILE_NAME
 from udccal.profiles.schema import StoredArray, StoredProfile
 from udccal.profiles.versions import migrated
-from udccal.rig_folders import find_rig
+from udccal.rig_folders import find_rig, rig_names, shipped_rig_folder, user_rig_folder
 
 # Name of the profile in a rig's folder, next to rig.toml.
 RIG_PROFILE = "profile"
@@ -139,6 +139,11 @@ def find_profile(name_or_path: str | Path) -> Path:
     return of_rig if standing(of_rig).is_dir() else path
 
 
+def _rigs_with_profiles() -> list[str]:
+    folders = user_rig_folder(), shipped_rig_folder()
+    return [name for folder in folders for name in rig_names(folder) if standing(folder / name / RIG_PROFILE).is_dir()]
+
+
 def read_stored(folder: Path) -> StoredProfile:
     """Read ``profile.json`` of a folder, migrated to the present version and checked; the arrays are not read.
 
@@ -148,7 +153,8 @@ def read_stored(folder: Path) -> StoredProfile:
     file = folder / PROFILE_NAME
     if not is_plain_file(folder, file):
         raise ProfileError(
-            f"Expected a profile with a {PROFILE_NAME} at {folder}, found none. Check the path, or calibrate the rig."
+            f"Expected a profile with a {PROFILE_NAME} at {folder}, found none. Check the path, calibrate the rig, or "
+            f"name a rig that has one: {', '.join(_rigs_with_profiles())}."
         )
     size = file.stat().st_size
     if size > MAX_JSON_BYTES:

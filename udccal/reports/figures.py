@@ -12,6 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from udccal.fitting.psf.held_out import KernelError
 from udccal.reports.board_views import BoardEvidence
 from udccal.reports.evidence import PhotonTransfer
 from udccal.reports.maps import TermMaps, ripple
@@ -95,16 +96,23 @@ def wire_figure(fitted: TermMaps, true: TermMaps | None) -> Figure:
     return figure
 
 
-def psf_figure(fitted: TermMaps, true: TermMaps | None) -> Figure:
-    """Draw kernels on a logarithmic scale over five decades, in the channels' colours; fitted above, true below."""
-    rows = [("fitted", fitted.kernels)] + ([("truth", true.kernels)] if true is not None else [])
-    places = fitted.kernels.shape[0]
+def psf_figure(fitted: TermMaps, true: TermMaps | None, sigma: KernelError | None) -> Figure:
+    """Draw kernels on a logarithmic scale over five decades below their peaks, in the channels' colours.
+
+    Below the fitted ones are one standard deviation of each sample, where it is stated, and the true kernels.
+    """
+    rows = [("fitted", fitted.kernels)]
+    if sigma is not None:
+        rows.append(("σ", sigma.of_kernels(fitted.kernels)))
+    if true is not None:
+        rows.append(("truth", true.kernels))
+    places, peaks = fitted.kernels.shape[0], fitted.kernels.max(axis=(2, 3), keepdims=True)
     ky, kx = min(fitted.kernels.shape[2], _MOST_ROWS), fitted.kernels.shape[3]
     figure = Figure(figsize=(2.4 * places, 2.4 * len(rows) * ky / kx + 0.5), dpi=_DPI, layout="constrained")
     for r, (name, kernels) in enumerate(rows):
         for p in range(places):
             axis = figure.add_subplot(len(rows), places, r * places + p + 1)
-            axis.imshow(_log_colour(_middle_rows(kernels[p], ky)), interpolation="nearest")
+            axis.imshow(_log_colour(_middle_rows(kernels[p], ky), peaks[p]), interpolation="nearest")
             x, y = fitted.positions_px[p]
             bare(axis, f"{name}, at ({x:.0f}, {y:.0f})")
     return figure
@@ -115,8 +123,7 @@ def _middle_rows(kernel: Float[np.ndarray, "3 ky kx"], rows: int) -> Float[np.nd
     return kernel[:, top : top + rows]
 
 
-def _log_colour(kernel: Float[np.ndarray, "3 ky kx"]) -> Float[np.ndarray, "ky kx 3"]:
-    peak = kernel.max(axis=(1, 2), keepdims=True)
+def _log_colour(kernel: Float[np.ndarray, "3 ky kx"], peak: Float[np.ndarray, "3 1 1"]) -> Float[np.ndarray, "ky kx 3"]:
     decades = np.log10(np.maximum(kernel / np.maximum(peak, 1e-30), 1e-12))
     return np.clip(1.0 + decades / _DECADES, 0.0, 1.0).transpose(1, 2, 0)
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from matplotlib.figure import Figure
 
 from udccal.calibration import ORDER, Calibration
+from udccal.fitting.psf.held_out import stated_by
 from udccal.quantities import quantity
 from udccal.reports import figures, fit_figures
 from udccal.reports.accuracy import Accuracy, accuracy_table, forecast_sentence
@@ -170,8 +171,13 @@ def _wire(evidence: Evidence) -> tuple[Illustration, ...]:
 
 
 def _psf(evidence: Evidence) -> tuple[Illustration, ...]:
-    caption = "A point of light at places between the captured ones; brightness is logarithmic over five decades."
-    return _illustration(figures.psf_figure(evidence.fitted, evidence.true), caption, "point-spread functions")
+    sigma = stated_by(evidence.calibration.psf)
+    told = "" if sigma is None else " σ is one standard deviation of each sample, on the same scale."
+    caption = (
+        f"A point of light at places between the captured ones; brightness is logarithmic over five decades.{told}"
+    )
+    figure = figures.psf_figure(evidence.fitted, evidence.true, sigma)
+    return _illustration(figure, caption, "point-spread functions")
 
 
 def _backscatter(evidence: Evidence) -> tuple[Illustration, ...]:

@@ -1,8 +1,8 @@
-"""The page of a validation: what to do, then each term's checks with its map."""
+"""The page of a validation, or of a comparison of sessions: what to do, then each term's checks with its map."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from udccal.comparison.estimates import ORDER
 from udccal.reports.figures import embedded_png
@@ -11,26 +11,48 @@ from udccal.reports.validation_figures import z_figure
 from udccal.reports.validation_tables import term_checks_table
 from udccal.sessions.schema import TermName
 from udccal.validation.checks import Check, ZMap
+from udccal.validation.sessions import SessionComparison
 from udccal.validation.validate import Validation
 
 
 def validation_page(found: Validation, maps: Mapping[TermName, ZMap]) -> ValidationPage:
     """Build the page of one validation."""
-    counted = [check for check in found.checks if check.ok is not None]
     headline, mood = ("The profile holds.", "good") if found.ok else ("The profile does not hold.", "bad")
     return ValidationPage(
         title=f"A profile of {found.rig}, validated by a session",
         advice=Advice(headline, mood, (found.advice,)),
         facts=(
-            Fact("checks within their limits", f"{sum(bool(check.ok) for check in counted)} of {len(counted)}"),
+            _counted(found.checks),
             Fact("profile made", found.profile_created_at),
             Fact("session begun", found.session_created_at),
             Fact("session", "the profile's own" if found.own_session else "another one"),
         ),
-        sections=tuple(
-            _section(term, [one for one in found.checks if one.term == term], maps.get(term)) for term in ORDER
-        ),
+        sections=_sections(found.checks, maps),
     )
+
+
+def comparison_page(found: SessionComparison, maps: Mapping[TermName, ZMap]) -> ValidationPage:
+    """Build the page of one comparison of sessions."""
+    headline, mood = ("The rig is the same.", "good") if found.ok else ("The rig changed.", "bad")
+    return ValidationPage(
+        title=f"Two sessions of {found.rig}, compared",
+        advice=Advice(headline, mood, (found.advice,)),
+        facts=(
+            _counted(found.checks),
+            Fact("session begun", found.session_created_at),
+            Fact("the other one begun", found.against_created_at),
+        ),
+        sections=_sections(found.checks, maps),
+    )
+
+
+def _counted(checks: Sequence[Check]) -> Fact:
+    counted = [check for check in checks if check.ok is not None]
+    return Fact("checks within their limits", f"{sum(bool(check.ok) for check in counted)} of {len(counted)}")
+
+
+def _sections(checks: Sequence[Check], maps: Mapping[TermName, ZMap]) -> tuple[ValidationSection, ...]:
+    return tuple(_section(term, [one for one in checks if one.term == term], maps.get(term)) for term in ORDER)
 
 
 def _section(term: TermName, checks: list[Check], z_map: ZMap | None) -> ValidationSection:

@@ -31,6 +31,8 @@ _DIAGONAL = np.outer([1.0, -2.0, 1.0], [1.0, -2.0, 1.0]).astype(np.float32)
 # Median of |x| of a normal distribution with sigma 1.
 _MEDIAN = 0.6745
 _REWEIGHTINGS = 3
+# The result is in single precision, and overshoots.
+_MOST = 1e36
 
 
 @final
@@ -68,10 +70,13 @@ def deblur(
         the picture as it was before the blur, in its unit. Where there is noise alone, values scatter about 0.
 
     Raises:
-        RestorationError: when a number is not finite, the kernels do not sum to 1, or shapes do not agree.
+        RestorationError: when a number is not finite or beyond single precision, the kernels do not sum to 1, or shapes
+            do not agree.
     """
-    grid = _checked(picture, kernels, x_px, y_px)
-    light = np.ascontiguousarray(picture, dtype=np.float32)
+    grid = _checked(*(np.asarray(each) for each in (picture, kernels, x_px, y_px)))
+    # In units of its largest value: squares stay in single precision's range.
+    unit = float(np.max(np.abs(picture), initial=0.0)) or 1.0
+    light = np.ascontiguousarray(np.asarray(picture) / unit, dtype=np.float32)
     rows, columns = light.shape[:2]
     layout = layout_for(rows, columns, (1, 1), (tile_px, tile_px), (0, rows))
     tiles = np.stack([layout.cut(plane) for plane in cv2.split(light)], axis=1)
@@ -81,7 +86,7 @@ def deblur(
     pictures, strengths = filtered(tiles, noise, tables, layout, THREE_COLOURS, workers)
     bands = measured_noise(tables, layout, THREE_COLOURS, workers).of_tiles(strengths)
     local = (read + slope * np.maximum(cv2.blur(light.mean(axis=2), (16, 16)), 0)).astype(np.float32)
-    return shrunk(layout.join(pictures, workers), noise, local, bands, layout, workers)
+    return shrunk(layout.join(pictures, workers), noise, local, bands, layout, workers) * np.float32(unit)
 
 
 def _noise_line(tiles: Float32[np.ndarray, "tiles 3 rows columns"]) -> tuple[float, float]:
@@ -104,7 +109,7 @@ def _noise_line(tiles: Float32[np.ndarray, "tiles 3 rows columns"]) -> tuple[flo
 
 
 def _checked(picture: np.ndarray, kernels: np.ndarray, x_px: np.ndarray, y_px: np.ndarray) -> KernelGrid:
-    if picture.ndim != 3 or picture.shape[2] != 3 or kernels.ndim != 5 or kernels.shape[2] != 3:
+    if picture.ndim != 3 or picture.shape[2] != 3 or kernels.ndim != 5 or kernels.shape[2] != 3 or not picture.size:
         raise RestorationError(
             "Expected a picture of rows x columns x 3 and kernels of grid rows x grid columns x 3 x rows x columns, "
             f"found {picture.shape} and {kernels.shape}. Give three colours of both."
@@ -114,8 +119,10 @@ def _checked(picture: np.ndarray, kernels: np.ndarray, x_px: np.ndarray, y_px: n
             f"Expected ascending places of {kernels.shape[1]} columns and {kernels.shape[0]} rows of kernels, found "
             f"{len(x_px)} and {len(y_px)}. Give the picture's px at which each kernel lies."
         )
-    if not (np.all(np.isfinite(picture)) and np.all(np.isfinite(kernels))):
-        raise RestorationError("Expected finite numbers, found NaN or infinity. Replace such pixels first.")
+    if not all(np.all(np.abs(each) < _MOST) for each in (picture, kernels, x_px, y_px)):
+        raise RestorationError(
+            f"Expected numbers between -{_MOST:g} and {_MOST:g}, found others, NaN or infinity. Replace them first."
+        )
     sums = kernels.sum(axis=(3, 4))
     if not np.allclose(sums, 1.0, atol=0.02):
         raise RestorationError(

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import final
 
 import numpy as np
-from jaxtyping import Float32, UInt8, UInt16
+from jaxtyping import Bool, Float32, UInt8, UInt16
 
 from udccal.cfa import cfa_named
 from udccal.errors import RestorationError
@@ -34,7 +34,7 @@ from udccal.restoration.rectify import Rectification
 from udccal.restoration.sharpen import Sharpener
 from udccal.restoration.stages import Stage
 from udccal.restoration.tone import Tone
-from udccal.restoration.view import inscribed_view
+from udccal.restoration.view import kept_view
 from udccal.rig import RigDescription
 from udccal.tiers import Tier
 
@@ -50,11 +50,13 @@ class SceneLight:
     Attributes:
         signal_e: in e-, divided by the wire.
         variance_e2: of its noise in e-^2.
+        clipped: samples whose light was more than they say.
         panel_error_e: sigma of the panel's light that was taken off, in e-; None where it is 0 or not known.
     """
 
     signal_e: Mosaic
     variance_e2: Mosaic
+    clipped: Bool[np.ndarray, "rows columns"]
     panel_error_e: Mosaic | None
 
 
@@ -130,8 +132,13 @@ class Restorer:
         options = options or PlanOptions()
         rig, geometry = profile.rig, profile.geometry.term
         camera, cfa = rig.camera, cfa_named(rig.camera.cfa)
-        view = inscribed_view(geometry, camera.columns, camera.rows, rig.view.columns, rig.view.rows)
-        rectification = Rectification.within(geometry, view, camera.columns, camera.rows)
+        view = kept_view(geometry, rig, keep)
+        rectification = kept(
+            keep,
+            Rectification,
+            (geometry, view, camera),
+            lambda: Rectification.within(geometry, view, camera.columns, camera.rows),
+        )
         quick = tier is Tier.preview
         unscattered = profile.backscatter.unfitted or Stage.backscatter in without
         error = profile.backscatter.diagnostic("held_out_without_noise_of_peak") or 0.0
@@ -192,7 +199,7 @@ class Restorer:
         light = self.scene_light(mosaic, exposure_s, panel_picture)
         if self.sharpener is None:
             return self.rectification.apply(demosaic(light.signal_e, self.rig.camera.cfa))
-        sharp = self.sharpener.apply(light.signal_e, light.variance_e2)
+        sharp = self.sharpener.apply(light.signal_e, light.variance_e2, light.clipped)
         if light.panel_error_e is not None:
             sharp = plausible(sharp, light.panel_error_e[self.sharpener.rows])
         return self._strip_rectification.apply(sharp, self.options.interpolation)
@@ -217,15 +224,16 @@ class Restorer:
             signal /= self.wire
             variance /= self.wire
             variance /= self.wire
+        clipped = saturated(mosaic, self.noise)
         panel_error_e: Mosaic | None = None
         if self.mask is not None:
             panel_e = self._panel_light_e(signal, self.mask, exposure_s, panel_picture)
             if panel_picture is not None:
-                refuse_excess(signal, panel_e, saturated(mosaic, self.noise))
+                refuse_excess(signal, panel_e, clipped)
             signal -= panel_e
             if self.mask.error > 0:
                 panel_error_e = np.float32(self.mask.error) * panel_e
-        return SceneLight(signal, variance, panel_error_e)
+        return SceneLight(signal, variance, clipped, panel_error_e)
 
     def display(
         self,

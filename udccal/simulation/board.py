@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Float, Float32, Float64
 
 from udccal.arrangements import Board, BoardSpec
 from udccal.simulation.picture import SUPERSAMPLING, supersample
@@ -17,7 +17,7 @@ _TEXELS_PER_SQUARE = (24, 400)
 
 def render_board_radiance(
     truth: RigTruth, board: Board, margin: tuple[int, int] = (0, 0)
-) -> Float[np.ndarray, "rows columns 3"]:
+) -> Float64[np.ndarray, "rows columns 1"]:
     """Render a board in grey surroundings on the sensor's pixels and ``margin`` = (rows, columns) around them.
 
     The result is a radiance; white paper has the radiance 1.
@@ -32,10 +32,10 @@ def render_board_radiance(
     texels = texels_per_mm * (np.outer(origin[:2], depth) - origin[2] * rotation[:, :2].T) - 0.5 * depth
     projection = np.vstack([texels, depth])
 
-    def one_sample(dx: float, dy: float) -> Float[np.ndarray, "rows columns"]:
-        rays = cv2.transform(slope_grid(truth, x + dx, y + dy), projection)
+    def seen_along(slopes: Float32[np.ndarray, "rows columns 2"]) -> Float64[np.ndarray, "rows columns 1"]:
+        rays = cv2.transform(slopes, projection)
         # Rays that run into the board see its face; all others see the surroundings.
-        texel = (rays[..., :2] / np.maximum(rays[..., 2:], 1e-9)).astype(np.float32)
+        texel = rays[..., :2] / np.maximum(rays[..., 2:], 1e-9)
         np.clip(texel, -10.0, max(texture.shape) + 10.0, out=texel)
         grey = cv2.remap(
             texture,
@@ -45,9 +45,9 @@ def render_board_radiance(
             borderMode=cv2.BORDER_CONSTANT,
             borderValue=(_SURROUND,),
         )
-        return grey.astype(np.float64)
+        return grey[..., None].astype(np.float64)
 
-    return np.repeat(supersample(one_sample)[..., None], 3, axis=-1)
+    return supersample(slope_grid(truth, x, y), seen_along)
 
 
 def board_corners_mm(spec: BoardSpec) -> Float[np.ndarray, "corners 3"]:

@@ -18,7 +18,7 @@ EMITTER_COLUMN_OFFSETS = (-0.3, 0.0, 0.3)
 EMITTER_ROW_OFFSET = 0.5
 _EMITTER_WIDTH = 0.22
 _HEIGHT_IN_STRIP = 0.5
-_CHORDS_PER_ROW = 6
+_CHORDS = np.polynomial.legendre.leggauss(6)
 # Their arrays fit into a processor's cache.
 _RAYS_AT_ONCE = 4096
 
@@ -41,12 +41,10 @@ def emitter_shares(
     """
     pitch = truth.panel.pitch_mm
     centre, shape = (array / pitch for array in converging_footprint(truth, directions, depth_mm))
-    half_x, half_y = (np.linalg.norm(shape[:, axis], axis=-1) for axis in range(2))
-    rows_touched, columns_touched = (int(np.ceil(2 * half.max())) + 2 for half in (half_y, half_x))
     parts = []
     for first in range(0, len(weight), _RAYS_AT_ONCE):
         rays = slice(first, first + _RAYS_AT_ONCE)
-        parts.append(_shares(truth, centre[rays], shape[rays], weight[rays], primary, (rows_touched, columns_touched)))
+        parts.append(_shares(truth, centre[rays], shape[rays], weight[rays], primary))
     return sparse.csr_array(sparse.vstack(parts, format="csr"))
 
 
@@ -56,20 +54,23 @@ def _shares(
     shape: Float[np.ndarray, "n 2 2"],
     weight: Float[np.ndarray, "n"],
     primary: int,
-    touched: tuple[int, int],
 ) -> sparse.csr_array:
-    """Return ``emitter_shares`` of some rays, whose footprints touch at most so many (rows, columns)."""
+    """Return ``emitter_shares`` of some rays."""
     height = _HEIGHT_IN_STRIP * (1 - truth.panel.row_open)
-    low = centre - np.linalg.norm(shape, axis=-1)
+    half = np.linalg.norm(shape, axis=-1)
+    low = centre - half
+    # Emitters lie at most so far from the middle of their column, and as high, that these many may be touched.
+    reach = np.array([max(EMITTER_COLUMN_OFFSETS) + _EMITTER_WIDTH / 2, height])
+    columns_touched, rows_touched = (int(most) for most in np.ceil(2 * half.max(axis=0) + reach) + 1)
     first_row = np.floor(low[:, 1] - EMITTER_ROW_OFFSET).astype(np.int64)
     first_column = np.floor(low[:, 0]).astype(np.int64)
-    columns = first_column[:, None] + np.arange(touched[1])
+    columns = first_column[:, None] + np.arange(columns_touched)
     # Boxes are counted from each ray's first column: single precision is then enough, and takes half the time.
-    left = np.arange(touched[1]) + EMITTER_COLUMN_OFFSETS[primary] - _EMITTER_WIDTH / 2
+    left = np.arange(columns_touched) + EMITTER_COLUMN_OFFSETS[primary] - _EMITTER_WIDTH / 2
     centre = centre - np.stack([first_column, np.zeros_like(first_column)], axis=-1)
     scale = (weight / (np.pi * height * _EMITTER_WIDTH))[:, None]
     shares, pixels = [], []
-    for i in range(touched[0]):
+    for i in range(rows_touched):
         row = first_row + i
         top = row + EMITTER_ROW_OFFSET - height / 2
         shares.append(scale * _disc_in_boxes(centre, shape, top, height, left))
@@ -94,7 +95,7 @@ def _disc_in_boxes(
     middle, span = (begin + end) / 2, (end - begin) / 2
     left, right = left.astype(np.float32), (left + _EMITTER_WIDTH).astype(np.float32)
     area = np.zeros((half.size, left.size), np.float32)
-    for node, weight in zip(*np.polynomial.legendre.leggauss(_CHORDS_PER_ROW), strict=True):
+    for node, weight in zip(*_CHORDS, strict=True):
         angle = middle + node * span
         cosine = np.cos(angle)
         x = centre[:, 0] + slant * np.sin(angle)

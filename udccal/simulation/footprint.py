@@ -14,7 +14,7 @@ from jaxtyping import Float
 from udccal.simulation.panel import column_open_interval, pupil_footprint, row_open_interval
 from udccal.simulation.truth import RigTruth
 
-_CHORDS_PER_COLUMN = 8
+_CHORDS = np.polynomial.legendre.leggauss(8)
 
 
 def converging_footprint(
@@ -81,16 +81,15 @@ def _disc_in_crossings(
     reach = np.abs(shape[:, 1, 1] * along[:, 0] - shape[:, 1, 0] * along[:, 1])
     start, width = columns
     first = np.floor(centre[:, 0] - half - start)
-    nodes, weights = np.polynomial.legendre.leggauss(_CHORDS_PER_COLUMN)
     area = np.zeros_like(half)
     for j in range(_strips_touched(half)):
         low = (first + j + start - centre[:, 0]) / half
         begin, end = (np.arcsin(np.clip(edge, -1.0, 1.0)) for edge in (low, low + width / half))
         middle, span = (begin + end) / 2, (end - begin) / 2
-        for node, weight in zip(nodes, weights, strict=True):
-            angle = middle + node * span
-            cosine = np.cos(angle)
-            y = centre[:, 1] + slant * np.sin(angle)
+        for node, weight in zip(*_CHORDS, strict=True):
+            sine = np.sin(middle + node * span)
+            cosine = np.sqrt(1.0 - sine * sine)
+            y = centre[:, 1] + slant * sine
             reached = reach * cosine
             length = _open_length(y + reached, rows) - _open_length(y - reached, rows)
             area += weight * span * cosine * length / reach

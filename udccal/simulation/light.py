@@ -16,7 +16,7 @@ from udccal.cameras.protocol import Region
 from udccal.cfa import cfa_named
 from udccal.simulation.backscatter import Backscatterer, backscatterer
 from udccal.simulation.blur import SpaceVariantBlur, build_blur
-from udccal.simulation.psf import SHARED_PX, captured_light, spread_at
+from udccal.simulation.psf import captured_light, spread_at
 from udccal.simulation.scene import render_board, render_photograph
 from udccal.simulation.spread import AngularSpread
 from udccal.simulation.truth import RigTruth
@@ -27,9 +27,10 @@ LED_WHITE = np.array([0.6, 1.0, 0.7])
 _FLAT_FILL, _FLAT_EXPOSURE_S = 0.65, 8e-3
 _LED_FILL, _LED_EXPOSURE_S = 0.8, 100e-6
 # A board is located by its corners: light scattered far from them, or a percent of the kernel, does not matter.
-_BOARD_BLUR = (7, 129, 65)  # rank, rows, columns
-# Shifts of an LED around one place fall into at most four cells; each pattern takes about 50 MB at full size.
+_BOARD_BLUR = (8, 129, 65)  # rank, rows, columns
+# Each pattern takes about 50 MB at full size. The psf procedure's shifts of an LED lie within one Bayer cell.
 _KEPT_SPREADS = 4
+_CELL_PX = 2
 
 
 @final
@@ -92,7 +93,7 @@ class RigLight:
         rows, columns = region.rows | 1, region.columns | 1
         middle = np.array([region.x + columns // 2, region.y + rows // 2], dtype=float)
         offset = (float(image_px[0] - middle[0]), float(image_px[1] - middle[1]))
-        spread = self._spread_near(image_px, region)
+        spread = self._spread_near(led, region)
         light = captured_light(self.truth, middle, rows, columns, offset, disc_px, spread=spread)
         light = light[:, : region.rows, : region.columns]
         down, across = slice(region.y, region.y + region.rows), slice(region.x, region.x + region.columns)
@@ -100,15 +101,15 @@ class RigLight:
         coloured = LED_WHITE[channels] * np.take_along_axis(light, channels[None], axis=0)[0]
         return self._led_flux(disc_px) * coloured * self.wire[down, across]
 
-    def _spread_near(self, image_px: tuple[float, float], region: Region) -> AngularSpread:
-        """Return the diffraction pattern at the centre of the LED's cell, for all pixels of the region.
+    def _spread_near(self, led: Led, region: Region) -> AngularSpread:
+        """Return the diffraction pattern at the centre of the cell that the LED is aimed at, for all of the region.
 
         The pattern depends on the cell, not on the previous LED, so that a resumed session sees the same light as an
         uninterrupted one.
         """
-        x, y = ((np.floor(v / SHARED_PX) + 0.5) * SHARED_PX for v in image_px)
-        reach_x = max(x - region.x, region.x + region.columns - x) + SHARED_PX
-        reach_y = max(y - region.y, region.y + region.rows - y) + SHARED_PX
+        x, y = (_CELL_PX * np.floor(v / _CELL_PX) + _CELL_PX / 2 for v in (led.x_px, led.y_px))
+        reach_x = max(x - region.x, region.x + region.columns - x)
+        reach_y = max(y - region.y, region.y + region.rows - y)
         return self._spread_at(float(x), float(y), float(reach_x), float(reach_y))
 
     def led_disc_px(self, led: Led) -> float:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Float, Float32, Float64
 
 # Every pixel of a rendered view is the mean of this many samples per axis.
 SUPERSAMPLING = 3
@@ -48,11 +48,21 @@ def place_picture(
 
 
 def supersample(
-    render: Callable[[float, float], Float[np.ndarray, "rows columns *colours"]],
-) -> Float[np.ndarray, "rows columns *colours"]:
-    """Return the mean of ``render(dx, dy)`` over sample points (dx, dy) spread evenly over a pixel."""
-    offsets = (np.arange(SUPERSAMPLING) + 0.5) / SUPERSAMPLING - 0.5
-    total = render(float(offsets[0]), float(offsets[0]))
-    for index in range(1, SUPERSAMPLING**2):
-        total += render(float(offsets[index % SUPERSAMPLING]), float(offsets[index // SUPERSAMPLING]))
+    slopes: Float[np.ndarray, "rows columns 2"],
+    render: Callable[[Float32[np.ndarray, "rows columns 2"]], Float[np.ndarray, "rows columns *colours"]],
+) -> Float64[np.ndarray, "rows columns *colours"]:
+    """Return the mean of ``render(slopes)`` over rays spread evenly over each pixel.
+
+    Args:
+        slopes: of the rays of the pixels' centres. Within a pixel they are linear to some 1e-5 px.
+        render: returns the light of rays.
+    """
+    offsets = [(index + 0.5) / SUPERSAMPLING - 0.5 for index in range(SUPERSAMPLING)]
+    centre = slopes.astype(np.float32)
+    across, down = (np.gradient(slopes, axis=axis).astype(np.float32) for axis in (1, 0))
+    total = np.zeros(())
+    for dy in offsets:
+        row = centre + dy * down
+        for dx in offsets:
+            total = total + render(row + dx * across)
     return total / SUPERSAMPLING**2

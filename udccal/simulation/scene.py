@@ -35,7 +35,7 @@ def render_photograph(
     x = np.arange(-margin_columns, camera.columns + margin_columns, dtype=float)
     y = np.arange(-margin_rows, camera.rows + margin_rows, dtype=float)
     picture = _placed(truth, photograph, truth.optics.fx_px)
-    canvas = supersample(lambda dx, dy: picture.at(_points_mm(truth, photograph, slope_grid(truth, x + dx, y + dy))))
+    canvas = supersample(slope_grid(truth, x, y), lambda slopes: picture.at(_points_mm(truth, photograph, slopes)))
     return WHITE_E_PER_S * (blur.apply(canvas) if blur else canvas)
 
 
@@ -58,12 +58,8 @@ def ideal_view(
     """
     x, y = (np.arange(columns) - centre[0]) / focal_px, (np.arange(rows) - centre[1]) / focal_px
     picture = _placed(truth, photograph, focal_px)
-
-    def one_sample(dx: float, dy: float) -> Float[np.ndarray, "rows columns 3"]:
-        slopes = np.stack(np.meshgrid(x + dx / focal_px, y + dy / focal_px), axis=-1)
-        return picture.at(_points_mm(truth, photograph, slopes))
-
-    return WHITE_E_PER_S * supersample(one_sample)
+    slopes = np.stack(np.meshgrid(x, y), axis=-1)
+    return WHITE_E_PER_S * supersample(slopes, lambda near: picture.at(_points_mm(truth, photograph, near)))
 
 
 def render_board(
@@ -71,7 +67,7 @@ def render_board(
 ) -> Float[np.ndarray, "rows columns 3"]:
     """Render a board in even grey surroundings in e-/s on every sensor pixel; white paper has the radiance 1."""
     radiance = render_board_radiance(truth, board, blur.margin if blur else (0, 0))
-    return WHITE_E_PER_S * (blur.apply(radiance) if blur else radiance)
+    return WHITE_E_PER_S * (blur.apply(radiance) if blur else np.repeat(radiance, 3, axis=-1))
 
 
 def _points_mm(truth: RigTruth, photograph: Photograph, slopes: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 2"]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float, Int
 
-from udccal.fitting.wire.data import FlatNoise, Pixels, Weighed
+from udccal.fitting.wire.data import FlatNoise, Weighed
 
 # Parts of the sensor, down and across; a part has a median where it has so many pixels.
 CELLS, _LEAST = (24, 32), 8
@@ -13,10 +13,13 @@ CELLS, _LEAST = (24, 32), 8
 _OF_MEDIAN = 1.2533
 
 
-def light_design(pixels: Pixels) -> Float[np.ndarray, "n columns"]:
-    """Return the columns of a light that changes slowly: a level per colour site, and a polynomial of second degree."""
-    x, y = pixels.scaled.T
-    sites = np.eye(int(pixels.site.max()) + 1)[pixels.site]
+def light_design(scaled: Float[np.ndarray, "n 2"], site: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n columns"]:
+    """Return the columns of a light that changes slowly: a level per colour site, and a polynomial of second degree.
+
+    Positions are from -1 to 1 over the sensor.
+    """
+    x, y = scaled.T
+    sites = np.eye(int(site.max()) + 1)[site]
     return np.column_stack([sites, x, y, x * x, x * y, y * y])
 
 
@@ -36,12 +39,20 @@ def cell_medians(
     """
     pixels = seen.pixels
     here = (pixels.weight > 0) | seen.outlying
-    expected, cell = seen.expected[here], cell_numbers(pixels.scaled[here])
-    part, variance = pixels.value[here] / expected - 1, noise.variance(pixels.site[here], expected) / expected**2
+    expected = seen.expected[here]
+    variance = noise.variance(pixels.site[here], expected) / expected**2
+    return part_medians(pixels.value[here] / expected - 1, variance, pixels.scaled[here])
+
+
+def part_medians(
+    values: Float[np.ndarray, " n"], variance: Float[np.ndarray, " n"], scaled: Float[np.ndarray, "n 2"]
+) -> tuple[Float[np.ndarray, "down across"], Float[np.ndarray, "down across"]]:
+    """Return medians of values at positions from -1 to 1 by part of the sensor, and their sigma; NaN without pixels."""
+    cell = cell_numbers(scaled)
     order, ends = np.argsort(cell, kind="stable"), np.cumsum(np.bincount(cell, minlength=CELLS[0] * CELLS[1]))[:-1]
     found = [
         (float(np.median(one)), float(_OF_MEDIAN / np.sqrt(np.sum(1 / noisy)))) if len(one) >= _LEAST else (np.nan,) * 2
-        for one, noisy in zip(*(np.split(of[order], ends) for of in (part, variance)), strict=True)
+        for one, noisy in zip(*(np.split(of[order], ends) for of in (values, variance)), strict=True)
     ]
     middle, sigma = np.array(found).T.reshape(2, *CELLS)
     return middle, sigma

@@ -96,8 +96,8 @@ def judge_geometry(
 
 def _points(views: Sequence[BoardView], result: FitResult[Geometry], rules: GeometryRules) -> Points:
     """The corners of all views, with noise and the scatter that the profile states."""
-    stated = {one.name: one.value for one in result.diagnostics}
-    scatter = [stated.get(ON_JIG if view.parallel else BY_HAND, rules.start_scatter_px) for view in views]
+    stated = [result.diagnostic(ON_JIG if view.parallel else BY_HAND) for view in views]
+    scatter = [rules.start_scatter_px if own is None else own for own in stated]
     return gather(
         [board_points_mm(view.spec)[view.corners.ids] for view in views],
         [view.corners.xy for view in views],

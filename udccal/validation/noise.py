@@ -148,17 +148,22 @@ def _inside(flats: tuple[Moments, ...], term: Noise) -> Bool[np.ndarray, "flats 
     return np.asarray((above > noise) & (above <= _UP_TO * (top - black)) & (mean + noise + shading < top))
 
 
-def _dark_checks(seen: NoiseMoments, term: Noise, limits: ValidationLimits) -> tuple[Check, ...]:
-    """The dark frames' means by exposure, as a straight line."""
+def dark_line(seen: NoiseMoments) -> tuple[float, float, float]:
+    """Return the dark frames' mean at no exposure in DN, its change in DN/s, and the longest exposure in s."""
     exposure = np.array([one.exposure_s for one in seen.dark_moments])
     mean = np.array([np.average(one.mean_DN, weights=one.samples) for one in seen.dark_moments])
+    slope, start = np.polyfit(exposure, mean, 1) if np.ptp(exposure) > 0 else (0.0, mean.mean())
+    return float(start), float(slope), float(exposure.max())
+
+
+def _dark_checks(seen: NoiseMoments, term: Noise, limits: ValidationLimits) -> tuple[Check, ...]:
+    """The dark frames' means by exposure against the profile's."""
     K, black, rate, noise = (
         float(np.asarray(getattr(term, name)))
         for name in ("K_DN_per_e", "black_DN", "dark_current_e_per_s", "sigma_d_e")
     )
-    off, unit = mean - black - K * rate * exposure, K * noise
-    slope, start = np.polyfit(exposure, off, 1) if np.ptp(exposure) > 0 else (0.0, off.mean())
-    most = float(exposure.max())
+    unit, (level, by_time, most) = K * noise, dark_line(seen)
+    start, slope = level - black, by_time - K * rate
     return (
         at_most(
             "noise",

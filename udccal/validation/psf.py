@@ -33,7 +33,7 @@ def validate_psf(profile: Profile, session: Session, limits: ValidationLimits, o
     Raises:
         SessionError: when a file of the session is missing or damaged.
     """
-    return judge_psf(read_psf(session, profile.noise.term, profile.wire.term), profile.psf, limits, own)
+    return judge_psf(read_psf(session, profile.noise.term, profile.wire_map), profile.psf, limits, own)
 
 
 @in_float64
@@ -99,7 +99,7 @@ def _compared(term: PsfField, shots: Shots, model_error: float, rules: PsfRules)
     basis = np.asarray(polynomial_basis(unit, term.degree), dtype=np.float64)[shots.position]
     windows = make_windows(shots, sources, explained, basis, model_error)
     light = windows.expected(False, _framed(np.asarray(term.residual, dtype=np.float64), shots.rate.shape[1:]))
-    return compare(shots, windows, light, np.arange(shots.count))
+    return compare(shots, windows, light)
 
 
 def _framed(

@@ -93,6 +93,6 @@ def _predicted(wire: Wire, pixels: Pixels, noise: FlatNoise) -> Weighed:
 
 def _smooth(pixels: Pixels, expected: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
     """The light of the day over that of the map, by weighted least squares."""
-    design, root = light_design(pixels), np.sqrt(pixels.weight) * expected
+    design, root = light_design(pixels.scaled, pixels.site), np.sqrt(pixels.weight) * expected
     ratio = np.where(pixels.weight > 0, pixels.value / np.maximum(expected, 1e-9), 0.0)
     return np.asarray(design @ np.linalg.lstsq(design * root[:, None], ratio * root, rcond=None)[0])

@@ -35,6 +35,7 @@ class Bracket:
     lamp: Float[np.ndarray, " n"]
     rates: Float[np.ndarray, " pixels"]
     hits: float
+    offsets_e: Float[np.ndarray, " pixels"]
 
 
 def draw(seed: int) -> Case:
@@ -56,6 +57,10 @@ def draw(seed: int) -> Case:
     darkest = max(min(read / times[-1] * float(rng.uniform(0.1, 3.0)), 0.1 * brightest), 1e-5 * brightest)
     rates = np.exp(rng.uniform(np.log(darkest), np.log(brightest), _PIXELS))
     sensor = Noise(K, black, full, read, 0.14, 0.0, 1.0, float(rng.choice([0.0, 20.0])), 0.0, 0.0)
+    # Draws of their own, so that a set's other numbers do not depend on them.
+    uneven = np.random.default_rng([seed, 19])
+    sensor = _with(sensor, DSNU1288_e=float(uneven.choice([0.0, uneven.uniform(0.0, read)])))
+    offsets_e = sensor.DSNU1288_e * uneven.standard_normal(_PIXELS)
     hits = float(rng.choice([0.0, rng.uniform(0.0, 1e-3)]))
     wrong = str(rng.choice(["K", "black", "time", "lamp"])) if count >= 4 and rng.random() < 0.5 else ""
     off, frame = float(rng.choice([-1.0, 1.0]) * rng.uniform(0.1, 0.4)), int(rng.integers(0, count))
@@ -70,7 +75,8 @@ def draw(seed: int) -> Case:
         lamp[frame] += off
     what = f"{wrong} {off:+.0%}" if wrong else "nothing wrong"
     what = f"{what}, {count} x {step:.1f}, K {K:.3g}, read {read:.2g} e, {math.log2(top + 1):.0f} bit, hits {hits:.1e}"
-    bracket = Bracket(sensor, told, times, told_s, lamp, rates, hits)
+    what = f"{what}, DSNU {sensor.DSNU1288_e:.2g} e"
+    bracket = Bracket(sensor, told, times, told_s, lamp, rates, hits, offsets_e)
     return Case(what, functools.partial(answer, bracket, seed), sound=not wrong)
 
 
@@ -86,7 +92,7 @@ def codes(bracket: Bracket, rng: np.random.Generator) -> UInt16[np.ndarray, "n p
     counts = rng.poisson(np.minimum(expected, 1e9)).astype(np.float64)
     hit = rng.random(counts.shape) < bracket.hits
     counts += hit * np.exp(rng.uniform(np.log(100.0), np.log(2e4), counts.shape))
-    light = counts + sensor.sigma_d_e * rng.standard_normal(counts.shape)
+    light = counts + bracket.offsets_e + sensor.sigma_d_e * rng.standard_normal(counts.shape)
     signal = np.rint(sensor.black_DN + sensor.K_DN_per_e * light)
     return np.clip(signal, 0, np.floor(sensor.saturation_DN)).astype(np.uint16)
 

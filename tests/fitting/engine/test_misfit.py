@@ -70,6 +70,15 @@ def test_a_robust_size_is_that_of_most_residuals() -> None:
     assert excess_sigma(residual**2, noise, light**2, 5000.0) > 0.1
 
 
+def test_the_noise_of_groups_does_not_count_twice() -> None:
+    """Along each direction the larger of noise and scatter counts: never below either, and not their sum."""
+    rng, cov = np.random.default_rng(6), np.array([[2e-6, 1e-4], [1e-4, 3e-2]])
+    root, groups = np.linalg.cholesky(np.linalg.inv(cov) / 40), 40
+    ratios = [np.diag(clustered_cov(cov, rng.standard_normal((groups, 2)) @ root.T)) / np.diag(cov) for _ in range(200)]
+    assert np.min(ratios) >= 1.0
+    assert np.mean(ratios) < 1.2
+
+
 @pytest.mark.parametrize("with_information", [True, False])
 def test_groups_that_differ_widen_the_covariance_to_the_true_scatter(with_information: bool) -> None:
     """A straight line through groups that each have an offset of their own, which the model lacks."""

@@ -18,6 +18,7 @@ from udccal.fitting.noise.fit import nominal_noise
 from udccal.fitting.nominal import nominal_geometry
 from udccal.fitting.psf.data import PsfData, PsfRules, Shots, group, joined
 from udccal.fitting.psf.fit import fit_psf
+from udccal.fitting.psf.held_out import stated_by
 from udccal.fitting.psf.image import shifts
 from udccal.fitting.psf.kernel import start_model, wire_shows
 from udccal.fitting.psf.read import cut_crop, read_psf, window_half
@@ -143,6 +144,12 @@ def test_the_posterior_knows_the_numbers_and_what_the_kernel_is_off_by(grating: 
     off = result.sigma_of(lambda term: term.residual[0, 1])
     brightest = np.unravel_index(off.argmax(), off.shape)
     assert np.abs(np.subtract(brightest, np.array(off.shape) // 2)).max() <= 1
+    # What a profile states of kernels is what the posterior gives, as far as one shape of the error can.
+    stated, place = stated_by(result), np.array([[300.0, 240.0]])
+    assert stated is not None
+    by_posterior = result.sigma_of(lambda term: kernels(term, place, 41, 21))
+    map_of_sigma = stated.of_kernels(kernels(result.term, place, 41, 21))
+    assert float(np.linalg.norm(map_of_sigma) / np.linalg.norm(by_posterior)) == pytest.approx(1.0, abs=0.5)
     (drawn,) = result.posterior.draws(np.random.default_rng(1), 1)
     assert np.isfinite(np.asarray(drawn.residual)).all()
     assert np.abs(drawn.residual).max() > 0
@@ -231,7 +238,8 @@ def test_bad_captures_are_said_to_be_bad(tmp_path: Path, level_DN: int, places: 
     session = session_of(tmp_path / "session", level_DN, places)
     rig, geometry = session.rig, nominal_geometry(session.rig)
     wire = absent_wire(rig, geometry)
-    result = fit_psf(read_psf(session, nominal_noise(rig), wire), rig, geometry, wire)
+    data = read_psf(session, nominal_noise(rig), np.ones((rig.camera.rows, rig.camera.columns)))
+    result = fit_psf(data, rig, geometry, wire)
     assert result.status is status
     assert result.notes
     assert not result.ok
@@ -241,8 +249,8 @@ def test_bad_captures_are_said_to_be_bad(tmp_path: Path, level_DN: int, places: 
 @pytest.mark.parametrize(("hot", "clipped"), [((2, 2), 0), ((30, 30), 3)])
 def test_a_hot_pixel_costs_a_picture_only_next_to_its_led(tmp_path: Path, hot: tuple[int, int], clipped: int) -> None:
     session = session_of(tmp_path / "session", 2000, 3, hot)
-    wire = absent_wire(session.rig, nominal_geometry(session.rig))
-    data = read_psf(session, nominal_noise(session.rig), wire)
+    camera = session.rig.camera
+    data = read_psf(session, nominal_noise(session.rig), np.ones((camera.rows, camera.columns)))
     assert (data.taken, data.dark, data.clipped) == (3, 0, clipped)
 
 

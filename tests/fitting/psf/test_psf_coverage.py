@@ -7,7 +7,7 @@ import pytest
 
 from tests.scenes.psf_wave_optics import COVERED, coverage
 from udccal.fitting.psf.data import PsfRules
-from udccal.fitting.psf.held_out import KernelError, estimate_kernel_error
+from udccal.fitting.psf.held_out import KernelError, estimate_kernel_error, stated_error
 
 SIZES = np.geomspace(1e-5, 1.0, 4000)
 
@@ -40,6 +40,15 @@ def test_hits_are_no_error_of_the_kernel() -> None:
     residual[::400] += 0.5
     found = estimate_kernel_error(residual, variance, SIZES, PsfRules())
     assert found.of_peak(np.array([1e-2]))[0] == pytest.approx(true.of_peak(np.array([1e-2]))[0], rel=0.4)
+
+
+@pytest.mark.parametrize("error", [KernelError(0.01, 0.3, 0.75), KernelError(0.0)])
+def test_the_stated_error_has_the_size_of_both_its_parts(error: KernelError) -> None:
+    magnitude = np.random.default_rng(4).random((3, 21, 11)) ** 6
+    stated = stated_error(error, 0.004, magnitude, PsfRules())
+    wanted = np.hypot(error.relative_l2(magnitude).mean(), 0.004)
+    assert float(stated.relative_l2(magnitude).mean()) == pytest.approx(wanted)
+    assert (stated.knee, stated.power) == (0.3, 0.75)
 
 
 def test_an_error_is_in_the_unit_of_its_kernels() -> None:

@@ -24,7 +24,7 @@ from udccal.fitting.psf.kernel import (
     start_prior,
     wavelengths_nm,
 )
-from udccal.fitting.psf.problem import DiffractionProblem, Place, stepped
+from udccal.fitting.psf.problem import DiffractionProblem, stepped
 from udccal.fitting.psf.samples import gather, unit_light
 from udccal.numerics import in_float64
 from udccal.result import FitStatus
@@ -100,7 +100,7 @@ def overlap_slopes(scene: Scene, prior: Prior, shots: Shots) -> tuple[np.ndarray
     """What the fit adds for interference per mm of (pitch, pupil) and unit of light, and differences of kernels."""
     problem, theta = problem_of(scene, prior, shots, True), prior.mean
     own = np.zeros((1, shots.position.tolist().count(0), 6))
-    one = problem.about(Place(theta, own)).samples.at(0)
+    one = problem.about(theta, own).samples.at(0)
     wanted = []
     for number, step_mm in ((PITCH, 0.0004), (PUPIL, 0.002)):
         lit = []
@@ -132,14 +132,11 @@ def equations_near(scene: Scene, prior: Prior, shots: Shots) -> list[tuple[float
     problem, theta = problem_of(scene, prior, shots, False), prior.mean
     own = np.zeros((1, shots.position.tolist().count(0), 6))
     own[..., 2:5] = shots.rate.max()
-    here = Place(theta, own)
-    alone, found = problem.equations_at(here), []
+    alone, found = problem.equations_at(problem.at(theta, own)), []
     for off in (1e-4, 0.1):
         other = theta.copy()
         other[PUPIL] *= 1.0 + off
-        base = Place(other, own)
-        problem.equations_at(base)
-        made = problem.equations_at(Place(theta, own, base))
+        made = problem.equations_at(problem.at(theta, own, problem.at(other, own)))
         found.append((made.cost, made.right))
     return [(alone.cost, alone.right), *found]
 

@@ -89,8 +89,12 @@ def demonstrate(output: Output, rig_name: str, out: Path, seed: int) -> None:
     with ThreadPoolExecutor(1) as pool, simulated_bench(world) as bench:
         # In parallel with the captures: first what only the simulated world needs, then the fits of complete terms, at
         # last the data of the report.
-        pool.submit(lambda: (world.light.blur, world.light.backscatterer))
-        capture_watched(output, bench, Wanted(out / "session", _EARLY))
+        blur = pool.submit(lambda: world.light.blur)
+        backscatterer = pool.submit(lambda: world.light.backscatterer)
+        capture_watched(output, bench, Wanted(out / "session", _EARLY[:1]))
+        blur.result()  # Boards are seen through it: two threads would compute it twice.
+        capture_watched(output, bench, Wanted(out / "session", _EARLY[1:]))
+        backscatterer.result()
         foundation = pool.submit(fit_foundation, Session.open(out / "session"), effort=QUICK)
         pool.submit(lambda: _prepare_kernels(rig, foundation.result()))
         capture_watched(output, bench, Wanted(out / "session", [term for term in ORDER if term not in _EARLY]))

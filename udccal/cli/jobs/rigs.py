@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import final
 
+from udccal.cfa import cfa_named
 from udccal.cli.output import Output
 from udccal.errors import RigError
 from udccal.io.atomic import write_atomically
@@ -109,9 +110,17 @@ def check_rig(output: Output, name: str) -> None:
     """Check a description and show what follows from it.
 
     Raises:
-        RigError: when it is not known, or a value is missing, unknown or out of range.
+        RigError: when it is not known, a value is missing, unknown or out of range, or no capture can have the camera's
+            size.
     """
     rig = load_rig(name)
+    camera, cfa = rig.camera, cfa_named(rig.camera.cfa)
+    if camera.columns % cfa.columns or camera.rows % cfa.rows:
+        raise RigError(
+            f"Expected a camera of whole cells of its {camera.cfa} pattern, found {camera.columns} x {camera.rows} "
+            f"pixels. Give {camera.columns // cfa.columns * cfa.columns} x {camera.rows // cfa.rows * cfa.rows}, and "
+            "set the camera to that part of its sensor."
+        )
     follows = consequences(rig)
     rows = tuple((c.what, f"{c.value:.4g}", c.unit) for c in follows)
     output.table(Table(f"What follows from {rig.name}", ("quantity", "value", "unit"), rows, frozenset({1})))

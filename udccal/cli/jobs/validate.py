@@ -1,4 +1,4 @@
-"""Validates a profile by a session, prints the checks, and writes them as JSON and as a page."""
+"""Validates a profile or a session by a session, prints the checks, and writes them as JSON and as a page."""
 
 from __future__ import annotations
 
@@ -10,12 +10,13 @@ from udccal.compilation import keep_compilations
 from udccal.io.atomic import write_atomically
 from udccal.io.out_folder import check_writable, storing_in
 from udccal.profiles.store import load_profile
-from udccal.reports.page import write_page
-from udccal.reports.validation_page import validation_page
+from udccal.reports.page import ValidationPage, write_page
+from udccal.reports.validation_page import comparison_page, validation_page
 from udccal.reports.validation_tables import checks_table
 from udccal.sessions.store import Session
 from udccal.validation.limits import ValidationLimits
-from udccal.validation.validate import judge
+from udccal.validation.sessions import SessionComparison, compared
+from udccal.validation.validate import Validation, judge
 
 
 def validate_profile(output: Output, path: Path, session: Path, out: Path | None) -> bool:
@@ -38,6 +39,33 @@ def validate_profile(output: Output, path: Path, session: Path, out: Path | None
     profile, captured = load_profile(path), Session.open(session)
     with output.stage("validating"):
         found, maps = judge(profile, captured, ValidationLimits())
+    _tell(output, found, validation_page(found, maps), out)
+    return found.ok
+
+
+def validate_session(output: Output, session: Path, against: Path, out: Path | None) -> bool:
+    """Print how two sessions of one rig differ; return whether every check is within its limit.
+
+    Args:
+        output: shows the checks.
+        session, against: folders of the sessions.
+        out: folder for ``validation.json`` and ``validation.html``; None for none.
+
+    Raises:
+        SessionError: when a session cannot be read, or they cannot be compared.
+        UdccalError: when ``out`` cannot be written to; this is found before any work.
+    """
+    if out is not None:
+        check_writable(out)
+    both = Session.open(session), Session.open(against)
+    with output.stage("comparing"):
+        found, maps = compared(*both, ValidationLimits())
+    _tell(output, found, comparison_page(found, maps), out)
+    return found.ok
+
+
+def _tell(output: Output, found: Validation | SessionComparison, page: ValidationPage, out: Path | None) -> None:
+    """Print the answer and the checks, and write them to a folder where there is one."""
     output.answer(found.advice)
     output.table(checks_table(found.checks))
     for check in found.checks:
@@ -45,9 +73,8 @@ def validate_profile(output: Output, path: Path, session: Path, out: Path | None
             output.answer(f"{check.term}: {check.what}")
     if out is not None:
         with output.stage("report"), storing_in(out):
-            write_page(out / "validation.html", validation_page(found, maps))
+            write_page(out / "validation.html", page)
             document = json.dumps(plain(found), indent=2, allow_nan=False).encode() + b"\n"
             write_atomically(out / "validation.json", document)
         output.say(f"Written: {out / 'validation.html'} and {out / 'validation.json'}")
     output.result(found)
-    return found.ok

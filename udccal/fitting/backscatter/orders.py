@@ -249,9 +249,11 @@ def disagreement(found: Found) -> Vector:
     signs of the pictures' edges. But it moves a parameter by different amounts in different places, and then by more
     than independent residuals do. Each part moves the parameters by its score (``clustered_cov``). Parts are cells, and
     bands of rows and of columns. Where chance is no explanation for the scatter of any parameter, the model is refuted,
-    and the scatter of every parameter is the measure of its sigma.
+    and the scatter of every parameter is the measure of its sigma. So few parts tell it roughly: errors over it follow
+    Student's t, whose variance is larger.
     """
     fitted, solved, across = found.fitted, found.fitted.found, found.problem.rules.cells
+    dof = across**2 - 1
     free = np.flatnonzero(fitted.order.free)
     errors, jacobian = found.problem.errors_at(fitted.best.weight)(solved.x)
     shifts = (jacobian @ solved.cov) * errors[:, None], (jacobian @ solved.cov) ** 2
@@ -266,7 +268,7 @@ def disagreement(found: Found) -> Vector:
             seen = expected[:, k] > 0
             square, most = moved[seen, k] ** 2, expected[seen, k]
             tests.append(chi2_test(float((square / most).sum()), float(seen.sum() - 1)))
-            factors[k] = max(factors[k], float(square.sum() / most.sum()))
+            factors[k] = max(factors[k], dof / (dof - 2) * float(square.sum() / most.sum()))
     return factors if sharper(*tests).found else np.ones(len(solved.x))
 
 

@@ -15,6 +15,7 @@ from typing import final
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from udccal.fitting.engine.gaussian import scaled_inverse, square_root
 from udccal.fitting.engine.robust import MAD_TO_SIGMA
 from udccal.fitting.engine.tails import chi2_tail, f_tail
 
@@ -189,6 +190,7 @@ def clustered_cov(
 ) -> Float[np.ndarray, "n n"]:
     """Covariance of parameters whose groups of data differ by more than their noise, never below ``cov``.
 
+    The scatter of groups holds their noise already: along each direction the larger of the two counts, not their sum.
     Each group is left out in one Newton step (jackknife: Efron, CBMS 38, 1982). Without the groups' information the
     step uses ``cov`` alone (sandwich: Huber, Proc. 5th Berkeley Symposium, 1967).
 
@@ -210,5 +212,9 @@ def clustered_cov(
         shifts = np.stack(
             [np.linalg.pinv(matrix - own, hermitian=True) @ one for own, one in zip(information, scores, strict=True)]
         )
-    spread = shifts - shifts.mean(axis=0)
-    return np.asarray(cov + spread.T @ spread * (groups - 1) / groups)
+    spread = (shifts - shifts.mean(axis=0)) * np.sqrt((groups - 1) / groups)
+    # In units of ``cov``, in which noise alone has a variance of 1 along every direction.
+    root = square_root(cov)
+    size, axes = np.linalg.eigh(root.T @ scaled_inverse(cov) @ spread.T @ spread @ scaled_inverse(cov) @ root)
+    wider = root @ axes * np.sqrt(np.maximum(size - 1.0, 0.0))
+    return np.asarray(cov + wider @ wider.T)

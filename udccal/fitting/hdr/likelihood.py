@@ -7,7 +7,8 @@ and variance v is therefore
     t (x - m) / v            below the level,
     t h(z) / sqrt(v)         at or above it,   z = (level - m) / sqrt(v),
 
-with h the inverse Mills ratio of the normal distribution.
+with h the inverse Mills ratio of the normal distribution. A pixel's own offset (DSNU) is the same in all its samples.
+It enters the rate's sigma and the deviation of a sample, not the weights.
 """
 
 from __future__ import annotations
@@ -34,6 +35,7 @@ class SensorNumbers(eqx.Module):
     dark_e_per_s: Float[Arrayish, ""]
     floor_e2: Float[Arrayish, ""]
     level_e: Float[Arrayish, ""]
+    offset_e: Float[Arrayish, ""]
 
 
 class BlockMerge(eqx.Module):
@@ -101,7 +103,7 @@ def merge_block(
     beyond = xp.where(is_open, light - mean, xp.maximum(sensor.level_e - mean, 0)) / xp.sqrt(left)
     # One sample alone may have made the rate so low that it seems to be known well: the others may give a higher one.
     mean = xp.maximum(mean, mean - (1 - left) / xp.sqrt(left) * beyond)
-    variance = xp.maximum(variance, mean + sensor.floor_e2)
+    variance = xp.maximum(variance, mean + sensor.floor_e2) + sensor.offset_e**2
     own = xp.where(left_out, 0, beyond**2 / variance)
     worst, used = own.argmax(axis=0), is_open.sum(axis=0, dtype=np.int32)
     # Few electrons scatter more upwards than downwards: the deviance of scaled counts of this variance and skewness.
@@ -109,7 +111,8 @@ def merge_block(
     relative = xp.maximum(beyond * scale / variance, 0)
     upwards = 2 * variance / scale**2 * ((1 + relative) * xp.log1p(relative) - relative)
     deviation2 = xp.take_along_axis(xp.where(beyond > 0, xp.minimum(own, upwards), own), worst[None], axis=0)[0]
-    return BlockMerge(rate, 1 / xp.sqrt(total), used, worst, deviation2)
+    offset = sensor.offset_e * slope.sum(axis=0) / now
+    return BlockMerge(rate, xp.sqrt(1 / total + offset**2), used, worst, deviation2)
 
 
 compiled_merge_block = jax.jit(merge_block, static_argnames=("believed_sigma", "xp"))

@@ -110,14 +110,14 @@ def merge_bracket(
         unlike = bad.tolist() if len(bad) > 1 else unlike
         merged = bracket.merged(dropped)
     hits, black_e = bracket.mend_hits(merged, dropped), bracket.black_off(merged, dropped)
-    scatter = bracket.scatter(merged, dropped)
+    scatter, unsure = bracket.scatter(merged, dropped), bracket.light_off(merged, dropped)
     # In place: copies of a full frame would cost as much as a third of the merging.
     for values in (merged.rate, merged.sigma):
         values /= np.float32(unit)
     unknown = merged.used <= 0
     merged.rate[unknown], merged.sigma[unknown] = 0.0, UNKNOWN_SIGMA
     notes = [f"{unknown.sum()} of {unknown.size} pixels have no sample that could be used."] if unknown.any() else []
-    doubted = doubts(scatter, black_e * float(np.asarray(noise.K_DN_per_e)), unlike)
+    doubted = doubts(scatter, black_e * float(np.asarray(noise.K_DN_per_e)), unlike, unsure)
     notes += doubted
     if rounded_e > rules.black_off * math.sqrt(sensor.floor_e2):
         notes.append("Dark noise is far below a code: rounding moves dark pixels by up to half a code. Raise the gain.")
@@ -134,15 +134,15 @@ def merge_bracket(
 
 def sensor_numbers(noise: Noise, unit_s: float, rules: HdrRules) -> SensorNumbers:
     """The numbers of a noise model that the likelihood uses, times in units of ``unit_s``."""
-    parts = noise.K_DN_per_e, noise.black_DN, noise.saturation_DN, noise.sigma_d_e, noise.q_DN
-    K, black, saturation, sigma_d, q = (float(np.asarray(part)) for part in parts)
-    if not (np.isfinite([K, black, saturation, sigma_d, q]).all() and K > 0 and sigma_d >= 0 and saturation > black):
+    parts = noise.K_DN_per_e, noise.black_DN, noise.saturation_DN, noise.sigma_d_e, noise.q_DN, noise.DSNU1288_e
+    K, black, saturation, sigma_d, q, offset = values = [float(np.asarray(part)) for part in parts]
+    if not (np.isfinite(values).all() and K > 0 and sigma_d >= 0 and saturation > black):
         found = f"K {K:g} DN/e, black {black:g} DN, saturation {saturation:g} DN, sigma_d {sigma_d:g} e"
         raise FitError(f"Expected a noise model with a gain above 0 and saturation above black, found {found}. Fit it.")
     # A sensor without any dark noise still has a least variance: the likelihood of its dark pixels stays finite.
     floor = max(sigma_d**2 + (q / K) ** 2 / 12.0, 1e-4)
     level = (saturation - black) / K - rules.margin_sigma * math.sqrt(floor)
-    numbers = black, 1 / K, float(np.asarray(noise.dark_current_e_per_s)) * unit_s, floor, level
+    numbers = black, 1 / K, float(np.asarray(noise.dark_current_e_per_s)) * unit_s, floor, level, offset
     return SensorNumbers(*(np.float32(n) for n in numbers))
 
 
@@ -229,9 +229,31 @@ class _Bracket:
         clear = ~dropped & sure & (mean + 5 * np.sqrt(variance) < level_e)
         # Hits in pixels of two samples are not found: a few of them must not count much.
         chi2 = np.minimum((light - mean) ** 2 / variance, 4.0**2)
-        dof = float(np.sum((1 - np.minimum((times * merged.sigma[lit]) ** 2 / variance, 1))[clear]))
+        # A pixel's offset moves its light by `follows` of itself, and its samples by what is left.
+        slope = np.where(~dropped & (mean < level_e), times / variance, 0.0)
+        follows = slope.sum(axis=0) / np.maximum((slope * times).sum(axis=0), 1e-30)
+        offset_e = float(self.sensor.offset_e)
+        known = times**2 * np.maximum(merged.sigma[lit].astype(np.float64) ** 2 - (offset_e * follows) ** 2, 0)
+        expected = 1 - np.minimum(known / variance, 1) + (offset_e * (1 - follows * times)) ** 2 / variance
+        dof = float(np.sum(expected[clear]))
         found = float(np.sum(chi2[clear])) / max(dof, 1e-9)
         return found if abs(found - 1) > max(self.rules.scatter_off, 6 * math.sqrt(2 / max(dof, 1e-9))) else 1.0
+
+    def light_off(self, merged: BlockMerge, dropped: Bool[np.ndarray, "n 1"]) -> list[int]:
+        """The frame whose light is off most, where it is off by too much in pixels of two samples; or none.
+
+        Where exposures lie far apart, few pixels have a third sample that tells which frame is wrong.
+        """
+        _, light, mean, variance = self._lit(merged, 2)
+        sigma, signal = np.sqrt(variance), mean - float(self.sensor.dark_e_per_s) * self.times[:, None]
+        clear = ~dropped & (mean + 5 * sigma < float(self.sensor.level_e)) & (3 * sigma < signal)
+        # Hits count as samples at the limit.
+        most = self.rules.believed_sigma * sigma
+        weight = np.where(clear, signal / variance, 0.0)
+        information = np.maximum((weight * signal).sum(axis=1), 1e-30)
+        off = np.abs((weight * np.clip(light - mean, -most, most)).sum(axis=1) / information)
+        score = np.where(off > self.rules.frame_off, off * np.sqrt(information), 0.0)
+        return [int(score.argmax())] if score.max() > self.rules.frame_sigma else []
 
     def black_off(self, merged: BlockMerge, dropped: Bool[np.ndarray, "n 1"]) -> float:
         """The error of the black level that dark samples show, in electrons; 0 where it is not too much.
@@ -240,7 +262,7 @@ class _Bracket:
         """
         _, light, mean, variance = self._lit(merged, 2, -np.inf)
         times, floor = self.times[:, None].astype(np.float64), float(self.sensor.floor_e2)
-        weight = np.where(~dropped & (mean < 3 * floor), 1 / variance, 0.0)
+        weight = np.where(~dropped & (mean < 30 * floor), 1 / variance, 0.0)
         light_taken = times * (weight * times).sum(axis=0) / np.maximum((weight * times**2).sum(axis=0), 1e-30)
         slope = 1 - light_taken
         information = max(float(np.sum(weight * slope)), 1e-30)

@@ -23,8 +23,11 @@ from udccal.fitting.psf.kernel import FOOTPRINT, Evaluator, fit_lattice
 from udccal.fitting.psf.problem import DiffractionProblem, Place, coefficients_of
 from udccal.fitting.psf.samples import (
     Lights,
+    Owns,
     Samples,
+    Theta,
     choose_samples,
+    flux_of,
     gather,
     sensor_variance,
     stands_for,
@@ -101,7 +104,7 @@ class DiffractionFit:
 
     def errors(self) -> Lights:
         """Data less expectation in units of sigma."""
-        return self.problem.errors(self.solution.place, self.problem.light_at(self.solution.place))
+        return self.problem.errors(self.solution.place)
 
 
 def fit_diffraction(
@@ -123,14 +126,14 @@ def fit_diffraction(
     own[..., :2] = 0.0
     shots = replace(shots, centre_px=places)
     problem = replace(problem, samples=gather(shots, geometry, chosen))
-    fit = _refine(problem, shots, Place(near.place.theta, own), rules, near.iterations)
+    fit = _refine(problem, shots, near.place.theta, own, rules, near.iterations)
     if not evaluator.interference:
         return fit
     phase = phase_evidence(fit)
     if phase.best is not phase.tried[0]:
         alone = Evaluator(evaluator.wavelengths_nm, evaluator.lattice, False)
         averaged = DiffractionProblem(problem.samples, alone, prior)
-        fit = _refine(averaged, shots, fit.solution.place, rules, 0)
+        fit = _refine(averaged, shots, fit.theta, fit.solution.place.own, rules, 0)
     return replace(fit, phase=phase)
 
 
@@ -139,11 +142,11 @@ def _approach(problem: DiffractionProblem, rules: PsfRules) -> Solution[Place, B
     theta, problem = problem.prior.mean, replace(problem, samples=weighed(problem.samples, rules.first_model_error))
     coefficients = coefficients_of(problem.evaluator, theta, problem.samples)
     own = start_own(problem.evaluator, problem.samples, coefficients)
-    return minimise(problem, Place(theta.copy(), own), _solver(1e-3 * problem.used, rules.iterations))
+    return minimise(problem, problem.at(theta, own), _solver(1e-3 * problem.used, rules.iterations))
 
 
 def _refine(
-    problem: DiffractionProblem, shots: Shots, place: Place, rules: PsfRules, iterations: int
+    problem: DiffractionProblem, shots: Shots, theta: Theta, own: Owns, rules: PsfRules, iterations: int
 ) -> DiffractionFit:
     """Go from near the minimum to the maximum of the likelihood.
 
@@ -151,9 +154,9 @@ def _refine(
     weights has little effect.
     """
     whole, enough = None, 1.0
+    problem = problem.about(theta, own)
+    place = problem.at(theta, own)
     for _ in range(15):
-        # A change of less than a sigma is small enough for the interference set up before.
-        problem = problem.about(place) if enough == 1.0 else problem
         problem, model_error, found = _reweighed(problem, place, rules)
         solution = minimise(problem, place, _solver(enough, rules.iterations - iterations))
         iterations += solution.iterations
@@ -167,6 +170,10 @@ def _refine(
         if enough < 1.0 and moved < 0.1:
             return fit
         whole, place, enough = fit, solution.place, 1e-2 if moved < 1.0 else 1.0
+        # A change of less than a sigma is small enough for the interference set up before, of five for its derivatives.
+        if moved >= 1.0:
+            problem = problem.about(place.theta, place.own, moved < 5.0)
+            place = problem.at(place.theta, place.own)
     # Weights that go on to change the parameters give no minimum.
     return replace(fit, solution=replace(fit.solution, converged=False))
 
@@ -180,13 +187,13 @@ def _reweighed(
     problem: DiffractionProblem, place: Place, rules: PsfRules
 ) -> tuple[DiffractionProblem, float, tuple[Outliers, ...]]:
     """Set weights at the model's light, with the model error of the residuals, and leave outliers out."""
-    samples, light, background = problem.samples, problem.light_at(place), place.own[..., 5:]
+    samples, light, background = problem.samples, place.light, place.own[..., 5:]
     seen, level = samples.known > 0, light + background
     of_samples = (samples.rate - level, sensor_variance(samples, level), left_out(light * seen, 1.0))
     residual, variance, unit = (part[seen] for part in of_samples)
     model_error = estimate_model_error(residual, variance, unit, problem.unknowns)
     problem = replace(problem, samples=weighed(samples, model_error, light, background))
-    kept, found = without_outliers(problem.samples, problem.errors(place, light), rules)
+    kept, found = without_outliers(problem.samples, problem.errors(place), rules)
     return replace(problem, samples=kept), model_error, found
 
 
@@ -216,10 +223,9 @@ def without_outliers(samples: Samples, z: Lights, rules: PsfRules) -> tuple[Samp
 def phase_evidence(fit: DiffractionFit) -> Choice[tuple[float, float]]:
     """Compare a fit with interference to the same fit without it, to second order about the fit."""
     problem, place, here = fit.problem, fit.solution.place, fit.solution.equations
-    light = problem.light_at(place)
-    change = light - problem.light_of_average(place)
+    change = place.light - problem.light_of_average(place)
     in_sigma = change * np.sqrt(problem.samples.weight)
-    score, alone = float((in_sigma * problem.errors(place, light)).sum()), float((in_sigma**2).sum())
+    score, alone = float((in_sigma * problem.errors(place)).sum()), float((in_sigma**2).sum())
     # Residuals change by so small a part of the phase's light that their outliers stay the same.
     part = 1e-3
     moved = replace(problem.samples, rate=problem.samples.rate + part * change)
@@ -250,18 +256,14 @@ def efficiency(fit: DiffractionFit, rules: PsfRules, available: int, reported: i
 
 
 def kernel_sigma(fit: DiffractionFit, cov: Float[np.ndarray, "p p"]) -> float:
-    """Return the relative L2 sigma of the kernel at the first position, in all colours.
-
-    With equal weights for all samples of the kernel, the equations' matrix is the sum of its squared derivatives.
-    """
-    samples = fit.problem.samples.at(slice(1))
-    even = samples.colour / np.maximum(samples.colour.sum(axis=2, keepdims=True), 1)
-    own = np.concatenate([fit.solution.place.own[:1, :, :2], np.tile([1.0, 1.0, 1.0, 0.0], (1, even.shape[1], 1))], -1)
-    place, weighed_evenly = Place(fit.theta, own), replace(samples, weight=even.sum(axis=-1))
-    one = DiffractionProblem(weighed_evenly, fit.problem.evaluator, fit.problem.prior)
-    light = one.light_at(place)
-    (sums,) = replace(one, samples=replace(one.samples, rate=light)).by_position(place)
-    return float(np.sqrt(max(float((sums.shared * cov).sum()), 0.0) / float((even.sum(axis=-1) * light**2).sum())))
+    """Return the relative L2 sigma of the kernel at the first position, in all colours."""
+    one, place = fit.problem.samples.at(0), fit.solution.place
+    # All samples of a colour have equal weights; padding has none.
+    even = (one.colour / np.maximum(one.colour.sum(axis=1, keepdims=True), 1)).sum(axis=-1)
+    flux = flux_of(one, place.own[0])
+    weight = np.where(flux > 0, even / np.where(flux > 0, flux, 1.0) ** 2, 0.0)
+    variance = np.einsum("sn,snp,pq,snq->", weight, place.by_theta[0], cov, place.by_theta[0], optimize=True)
+    return float(np.sqrt(max(float(variance), 0.0) / float((weight * place.light[0] ** 2).sum())))
 
 
 def pattern_p_value(samples: Samples, z: Lights) -> float:

@@ -20,11 +20,13 @@ from udccal.fitting.engine.report import estimates, priors_of, residual_sample
 from udccal.fitting.psf.data import PsfData, PsfRules, Shots, about_middle, held_out_positions
 from udccal.fitting.psf.diffraction import DiffractionFit, efficiency, fit_diffraction, kernel_sigma, pattern_p_value
 from udccal.fitting.psf.held_out import (
+    SIGMA_NAMES,
     KernelError,
     Support,
     choose_support,
     error_patterns,
     kernel_error,
+    stated_error,
     support_notes,
     wide_support,
     with_support,
@@ -174,7 +176,9 @@ def _report(
     errors, used = fit.errors(), samples.weight > 0
     pattern_p, error_l2 = pattern_p_value(samples, errors), float(error.relative_l2(selection.magnitude).mean())
     cov = fit.refuted_cov() if pattern_p <= SIGNIFICANT else fit.cov()
-    numbers, cov_of_numbers = _estimates(fit, diffracts, held_out_l2, cov, tolerance)
+    by_parameters = kernel_sigma(fit, cov) if diffracts else 0.0
+    numbers, cov_of_numbers = _estimates(fit, diffracts, held_out_l2, cov, by_parameters, tolerance)
+    stated = stated_error(error, by_parameters, selection.magnitude, rules)
     places = fit.shots.centre_px[np.broadcast_to(samples.index[..., None], used.shape)[used]]
     names = (f"held_out_l2_{name}" for name in ("red", "green", "blue"))
     figures = dict(zip(names, held_out_l2, strict=True)) | {
@@ -189,6 +193,7 @@ def _report(
         "efficiency": efficiency(fit, rules, shots.count, len(_NUMBERS)),
         "residual_pattern_p": pattern_p,
     }
+    figures |= dict(zip(SIGMA_NAMES, (stated.size, stated.knee, stated.power), strict=True))
     if fit.phase:
         figures["wire_phase_strength"], figures["wire_phase_strength_sigma"] = fit.phase.best.fit
     lengths = zip(("support_rows", "support_columns"), support.half_px, strict=True)
@@ -224,6 +229,7 @@ def _estimates(
     diffracts: bool,
     held_out_l2: Float[np.ndarray, "3"],
     whole: Float[np.ndarray, "p p"],
+    by_parameters: float,
     tolerance: float,
 ) -> tuple[tuple[Estimate, ...], Float[np.ndarray, "n n"]]:
     count, error = len(_NUMBERS), float(held_out_l2.mean())
@@ -241,7 +247,7 @@ def _estimates(
     by_pitch = np.where(_LENGTHS, values, 0.0) * tolerance
     cov = whole[:count, :count] * np.outer(unit, unit) + np.outer(by_pitch, by_pitch)
     # The error of kernels is that of held-out positions, which the numbers do not depend on.
-    cov = block_diag(cov, kernel_sigma(fit, whole) ** 2 + spread**2)
+    cov = block_diag(cov, by_parameters**2 + spread**2)
     names, priors = (*_NUMBERS, "kernel_relative_l2"), priors_of(_NUMBERS, known, sigma)
     return estimates("psf", names, np.append(values, error), cov, priors), cov
 

@@ -19,8 +19,11 @@ from udccal.fitting.psf.orders import Compared, compare
 from udccal.kernels import kernel_size, kernels_at
 from udccal.models.fields import polynomial_basis
 from udccal.models.psf import PsfField
-from udccal.result import Candidate
+from udccal.result import Candidate, FitResult
 from udccal.rig import RigDescription
+
+# The diagnostics that state the sigma of a kernel's samples: the fields of ``KernelError``.
+SIGMA_NAMES = ("kernel_sigma_size", "kernel_sigma_knee", "kernel_sigma_power")
 
 
 @final
@@ -103,6 +106,30 @@ def kernel_error(
     )
 
 
+def stated_error(
+    error: KernelError, by_parameters: float, magnitude: Float[np.ndarray, "3 rows columns"], rules: PsfRules
+) -> KernelError:
+    """Return the sigma of a kernel's samples by all that the fit states of it, in the shape of the held-out error.
+
+    That error holds the parameters' errors at positions held out, and so has their shape.
+
+    Args:
+        error: of positions held out, without noise; of size 0 where they show none.
+        by_parameters: relative L2 sigma of the kernel by the covariance of the parameters.
+        magnitude: the kernel's average size.
+        rules: the shape where no error was found.
+    """
+    shape = error if error.size else KernelError(1.0, rules.error_knee[0], rules.error_power[0])
+    unit = float(shape.relative_l2(magnitude).mean()) / shape.size
+    return replace(shape, size=float(np.hypot(error.relative_l2(magnitude).mean(), by_parameters)) / max(unit, 1e-300))
+
+
+def stated_by(result: FitResult[PsfField]) -> KernelError | None:
+    """Return the same of a result, or of a profile's; None where the fit does not state it."""
+    size, knee, power = (result.diagnostic(name) for name in SIGMA_NAMES)
+    return None if size is None or knee is None or power is None else KernelError(size, knee, power)
+
+
 def error_patterns(
     term: PsfField, error: KernelError, rig: RigDescription, patterns: int
 ) -> tuple[int, Float[np.ndarray, "terms 3 rows columns"], Float[np.ndarray, "patterns 3 rows columns"]]:
@@ -177,7 +204,7 @@ def wide_support(wide: Shots, sources: Sources, term: PsfField, rig: RigDescript
     windows = make_windows(wide, sources, np.zeros_like(wide.rate), at_position, 0.0)
     light = predict(windows, kernels)
     windows = make_windows(wide, sources.with_light_of_peak(wide, light), light, at_position, 0.0)
-    found = compare(wide, windows, light * windows.flux, np.arange(wide.count))
+    found = compare(wide, windows, light * windows.flux)
     # Near the source, whole pixels are too coarse for a kernel that moves by fractions of one; all windows hold it.
     core = (np.abs(wide.offsets()) <= 4).all(axis=-1)
     return choose_support(replace(found, known=found.known & ~core))

@@ -15,14 +15,14 @@ whose variables separate", 1973).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Final, final
 
 import numpy as np
 import scipy.linalg
 import scipy.ndimage
 import scipy.sparse.linalg
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from udccal.fitting.psf.data import Crops, PsfRules, Shots, left_out, noise_at
 
@@ -77,9 +77,9 @@ class Windows:
     left_out: Float[np.ndarray, "shots rows columns"]
     weight: Float[np.ndarray, "shots rows columns"]
 
-    def only(self, keep: Bool[np.ndarray, " shots"]) -> Windows:
-        """Set the weights of the other shots to 0."""
-        return replace(self, weight=self.weight * keep[:, None, None])
+    def pick(self, keep: np.ndarray) -> Windows:
+        """The shots selected by an index or mask."""
+        return Windows(*(getattr(self, field.name)[keep] for field in fields(self)))
 
     def expected(self, free: bool, image: Image) -> Crops:
         """Return each sample's light in e-/s, by an image, and by diffraction unless the image is ``free``."""
@@ -217,8 +217,13 @@ def solve_image(
 
     iterations, tolerance = (150, 1e-5) if free else (60, 1e-4)
     operator = scipy.sparse.linalg.LinearOperator((sigma.size, sigma.size), matvec=normal, dtype=np.float64)
+    # Pixels hardly share nodes: divided by the diagonal, bright nodes and dark ones converge alike, in few iterations.
+    squared = replace(windows, basis=windows.basis**2, down=windows.down**2, across=windows.across**2)
+    diagonal = 1.0 + sigma**2 * smoothed(_gathered(squared, flux**2 * weight, len(sigma)), free)
     right = backward(data - forward(start)).ravel()
-    added, _ = scipy.sparse.linalg.cg(operator, right, rtol=tolerance, maxiter=iterations)
+    added, _ = scipy.sparse.linalg.cg(
+        operator, right, rtol=tolerance, maxiter=iterations, M=scipy.sparse.diags_array(1.0 / diagonal.ravel())
+    )
     image = start + added.reshape(sigma.shape)
     return image, changes if moves is None else moves.fitted(data - forward(image), weight)
 

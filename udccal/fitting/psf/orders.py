@@ -83,16 +83,14 @@ class Compared:
         return np.array([by_shot[position == place].mean() for place in places]) if len(places) > 1 else by_shot
 
 
-def compare(shots: Shots, windows: Windows, light: Crops, pick: np.ndarray) -> Compared:
-    """Compare the data of the picked shots with the ``light`` (e-/s) that is expected of all shots."""
-    parts = (windows.rate, shots.weight, shots.noise_per_rate, windows.left_out, light)
-    rate, weight, slope, one, light = (part[pick] for part in parts)
-    known = weight > 0
-    measured = 1.0 / np.where(known, weight, 1.0)
-    variance = noise_at(light, rate, measured, slope)
+def compare(shots: Shots, windows: Windows, light: Crops) -> Compared:
+    """Compare the shots with the ``light`` (e-/s) that is expected of them."""
+    known, residual = shots.weight > 0, windows.rate - light
+    measured = 1.0 / np.where(known, shots.weight, 1.0)
+    variance = noise_at(light, windows.rate, measured, shots.noise_per_rate)
     # All orders have the same deviation here; it is above 0 where one of them expects no light.
-    model_error = estimate_model_error((rate - light)[known], variance[known], one[known], 0)
-    return Compared(rate - light, light, measured, variance, one, known, model_error)
+    model_error = estimate_model_error(residual[known], variance[known], windows.left_out[known], 0)
+    return Compared(residual, light, measured, variance, windows.left_out, known, model_error)
 
 
 @final
@@ -184,8 +182,8 @@ class _Orders:
     def attempt(self, sources: Sources, order: Order) -> Attempt[Trial]:
         """Solve from all shots but those held out, and compare with these."""
         windows = self._windows(sources, order)
-        light = windows.expected(order.free, self._solve(windows.only(~self.test), order))
-        found = compare(self.shots, windows, light, self.test)
+        light = windows.pick(self.test).expected(order.free, self._solve(windows.pick(~self.test), order))
+        found = compare(self.shots.pick(self.test), windows.pick(self.test), light)
         trial = Trial(order, sources, found, found.loss(self.shots.position[self.test]))
         return Attempt(order.name, order.coefficients(self.shots.half), float(trial.loss.mean()), trial)
 

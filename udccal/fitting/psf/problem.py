@@ -5,9 +5,10 @@ Own parameters of a shot are (x, y) in px from the first assumed place, light pe
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Final, final
 
+import jax
 import numpy as np
 from jaxtyping import Float
 from scipy.special import softmax
@@ -55,32 +56,14 @@ _IN_OVERLAPS: Final = np.array([PITCH, PUPIL])
 class Place:
     """A descent's current parameters: those of diffraction, which are shared, and those of every shot.
 
-    ``near`` is a place a few sigmas away at most, whose derivatives serve here too; by default it is this place.
+    ``light`` is that of the samples, in e-/s without background, with its derivatives; those may be of a place nearby.
     """
 
     theta: Float[np.ndarray, " p"]
     own: Owns
-    near: Place | None = None
-
-    def same(self, other: Place) -> bool:
-        """Whether all parameters are equal."""
-        return np.array_equal(self.theta, other.theta) and np.array_equal(self.own, other.own)
-
-
-@final
-@dataclass(frozen=True)
-class _Slopes:
-    """The light of all samples at a ``place``, in e-/s, and its derivatives."""
-
-    samples: Samples
-    place: Place
     light: Lights
     by_theta: Float[np.ndarray, "positions shots n p"]
     by_own: Float[np.ndarray, "positions shots n l"]
-
-    def of(self, samples: Samples) -> bool:
-        """Whether these are of the samples; their weights and rates do not matter."""
-        return all(getattr(self.samples, n) is getattr(samples, n) for n in ("points", "overlaps", "correction"))
 
 
 @final
@@ -96,8 +79,6 @@ class DiffractionProblem:
     evaluator: Evaluator
     prior: Prior
     name: str = "psf"
-    # The last derivatives, for problems that differ in the weights or the rates only.
-    _last: list[_Slopes] = field(default_factory=list, repr=False)
 
     @property
     def used(self) -> int:
@@ -109,13 +90,25 @@ class DiffractionProblem:
         """Number of parameters, those of each shot included."""
         return self.prior.mean.size + OWN * int((self.samples.index >= 0).sum())
 
+    def at(self, theta: Theta, own: Owns, near: Place | None = None) -> Place:
+        """Return the place of these parameters, with the derivatives of a place ``near`` it, or with its own."""
+        evaluator, kernels = self.evaluator, coefficients_of(self.evaluator, theta, self.samples)
+        parts = list(zip(self.samples.each(), own, kernels, strict=True))
+        here = [unit_light(evaluator, one, its[:, :2], kernel) for one, its, kernel in parts]
+        changed = [_changed(one, theta) for one in self.samples.each()]
+        light = (np.stack(here) + np.stack(changed)) * flux_of(self.samples, own)
+        if near is not None:
+            return Place(theta, own, light, near.by_theta, near.by_own)
+        by_theta = np.stack([_slopes(evaluator, theta, one, its) for one, its, _ in parts])
+        by_own = [own_slopes(evaluator, *part, *lit) for part, *lit in zip(parts, here, changed, strict=True)]
+        return Place(theta, own, light, by_theta, np.stack(by_own))
+
     def by_position(self, place: Place) -> list[Blocks]:
         """Return each position's part of the Gauss-Newton equations with Huber's weights, without the prior."""
-        slopes, weight = self._slopes_at(place), self.samples.weight
-        residual = self.samples.rate - slopes.light - place.own[..., 5:]
+        weight, residual = self.samples.weight, self.samples.rate - place.light - place.own[..., 5:]
         losses = HUBER.loss(residual * np.sqrt(weight))
         huber, made = huber_weight(residual, weight), []
-        for i, (by_theta, by_own) in enumerate(zip(slopes.by_theta, slopes.by_own, strict=True)):
+        for i, (by_theta, by_own) in enumerate(zip(place.by_theta, place.by_own, strict=True)):
             weighted, across = by_theta * huber[i, ..., None], np.swapaxes(by_own * huber[i, ..., None], 1, 2)
             flat = by_theta.reshape(-1, by_theta.shape[-1])
             shared, right = weighted.reshape(flat.shape).T @ flat, np.tensordot(residual[i], weighted, 2)
@@ -136,63 +129,35 @@ class DiffractionProblem:
         """Return the place after a step."""
         theta, own = stepped(place.theta, step.shared), moved_own(place.own, step.own.reshape(place.own.shape))
         # The gain is the square of the step's length in sigmas: derivatives hardly change over five of them.
-        return Place(theta, own, (place.near or place) if step.gain < 25.0 else None)
-
-    def light_at(self, place: Place) -> Lights:
-        """Return the samples' light under the model, in e-/s, without background."""
-        return self._slopes_at(place).light
+        return self.at(theta, own, place if step.gain < 25.0 else None)
 
     def light_of_average(self, place: Place) -> Lights:
-        """Return the same averaged over the footprint's place, without interference."""
+        """Return the light averaged over the footprint's place, without interference."""
         samples = self.samples
         none = {name: np.zeros_like(getattr(samples, name)) for name in ("overlaps", "correction", "by_overlaps")}
-        return replace(self, samples=replace(samples, **none))._light(place)
+        return replace(self, samples=replace(samples, **none)).at(place.theta, place.own, place).light
 
-    def errors(self, place: Place, light: Lights) -> Lights:
-        """Return data less expectation in units of sigma, 0 for unused samples; ``light`` is of that place."""
-        return (self.samples.rate - light - place.own[..., 5:]) * np.sqrt(self.samples.weight)
+    def errors(self, place: Place) -> Lights:
+        """Return data less expectation in units of sigma, 0 for unused samples."""
+        return (self.samples.rate - place.light - place.own[..., 5:]) * np.sqrt(self.samples.weight)
 
     def with_overlaps(self, theta: Float[np.ndarray, " p"]) -> DiffractionProblem:
         """Set the overlaps to those of ``theta``: they hardly change in a descent."""
         overlaps = [overlaps_of(self.evaluator, theta, one.frame) for one in self.samples.each()]
         return replace(self, samples=replace(self.samples, overlaps=np.stack(overlaps)))
 
-    def about(self, place: Place) -> DiffractionProblem:
-        """Set interference up about a place."""
+    def about(self, theta: Theta, own: Owns, near: bool = False) -> DiffractionProblem:
+        """Set interference up about these parameters; ``near`` the last ones, derivatives by overlaps stay."""
+        problem = self.with_overlaps(theta)
         if not self.evaluator.interference:
-            return self.with_overlaps(place.theta)
-        found = [
-            _about(self.evaluator, place.theta, one, own[:, :2])
-            for one, own in zip(self.samples.each(), place.own, strict=True)
-        ]
-        overlaps, correction, by_overlaps = (np.stack(part) for part in zip(*found, strict=True))
-        at = np.tile(place.theta[_IN_OVERLAPS], (len(found), 1))
-        made = replace(self.samples, overlaps=overlaps, correction=correction, by_overlaps=by_overlaps, overlaps_at=at)
-        return replace(self, samples=made)
-
-    def _slopes_at(self, place: Place) -> _Slopes:
-        last = self._last[0] if self._last and self._last[0].of(self.samples) else None
-        if last and last.place.same(place):
-            return last
-        if last and place.near and (last.place.near or last.place).same(place.near):
-            found = _Slopes(self.samples, place, self._light(place), last.by_theta, last.by_own)
-        else:
-            place = replace(place, near=None)
-            made = (
-                _slopes(self.evaluator, place.theta, *one) for one in zip(self.samples.each(), place.own, strict=True)
-            )
-            found = _Slopes(self.samples, place, *(np.stack(part) for part in zip(*made, strict=True)))
-        self._last[:] = [found]
-        return found
-
-    def _light(self, place: Place) -> Lights:
-        kernels = coefficients_of(self.evaluator, place.theta, self.samples)
-        parts = zip(self.samples.each(), place.own, kernels, strict=True)
-        units = [
-            unit_light(self.evaluator, one, own[:, :2], kernel) + _changed(one, place.theta)
-            for one, own, kernel in parts
-        ]
-        return np.stack(units) * flux_of(self.samples, place.own)
+            return problem
+        parts = [(self.evaluator, theta, *part) for part in zip(problem.samples.each(), own[..., :2], strict=True)]
+        changed = {
+            "correction": np.stack([_correction(*part) for part in parts]),
+            "by_overlaps": self.samples.by_overlaps if near else np.stack([_by_overlaps(*part) for part in parts]),
+            "overlaps_at": np.tile(theta[_IN_OVERLAPS], (len(own), 1)),
+        }
+        return replace(problem, samples=replace(problem.samples, **changed))
 
 
 def _changed(one: Samples, theta: Theta) -> Light:
@@ -224,43 +189,51 @@ def coefficients_of(evaluator: Evaluator, theta: Theta, samples: Samples) -> Flo
     return np.stack(kernels)
 
 
-def _about(
-    evaluator: Evaluator, theta: Theta, one: Samples, offset_px: Float[np.ndarray, "shots 2"]
-) -> tuple[Float[np.ndarray, "nodes terms rows half"], Light, Float[np.ndarray, "shots n 2"]]:
-    """Return one position's overlaps at ``theta``, and corrections of the light per unit.
-
-    The first is for each shot's own place, the second a derivative, by what the overlaps depend on.
-    """
-    overlaps = np.asarray(overlaps_of(evaluator, theta, one.frame))
-
-    def light(theta: Theta, overlaps: Float[Arrayish, "nodes terms rows half"]) -> Light:
-        kernel = np.asarray(kernel_coefficients(evaluator, theta, one.frame, one.disc_px, overlaps))
-        return unit_light(evaluator, one, offset_px, kernel)
-
-    here = light(theta, overlaps)
-    # Overlaps are in single precision: steps of this length (mm) keep their difference precise. Steps ten times as
-    # long change derivatives by some per cent.
-    steps = zip(_IN_OVERLAPS, (2e-4, 1e-3), strict=True)
-    moved = [(step, theta + step * np.eye(theta.size)[i]) for i, step in steps]
-    by_overlaps = [(light(theta, overlaps_of(evaluator, there, one.frame)) - here) / step for step, there in moved]
+def _correction(evaluator: Evaluator, theta: Theta, one: Samples, offset_px: Float[np.ndarray, "shots 2"]) -> Light:
+    """Return what the light per unit of each shot differs by, as its own place is not the mean place."""
     slope = one.frame.direction[:2] / one.frame.direction[2]
     tangent = (np.eye(2) + np.outer(slope, slope)) / one.frame.direction[2]
     along = theta[FOOTPRINT][2] * (one.begun_px + offset_px) @ (tangent @ one.frame.jacobian).T
+    here = _unit_at(evaluator, theta, one, offset_px, one.overlaps)
     correction = np.zeros_like(here)
     for shot, move in enumerate(along):
         elsewhere = theta.copy()
         elsewhere[FOOTPRINT][:2] += move
-        correction[shot] = (light(elsewhere, overlaps) - here)[shot]
-    return overlaps, correction, np.stack(by_overlaps, axis=-1)
+        correction[shot] = (_unit_at(evaluator, elsewhere, one, offset_px, one.overlaps) - here)[shot]
+    return correction
 
 
-def _slopes(
-    evaluator: Evaluator, theta: Theta, one: Samples, own: Own
-) -> tuple[Light, Float[np.ndarray, "shots n p"], Float[np.ndarray, "shots n l"]]:
-    """Return the light of one position's samples, and its derivatives by shared and by own parameters."""
+def _by_overlaps(
+    evaluator: Evaluator, theta: Theta, one: Samples, offset_px: Float[np.ndarray, "shots 2"]
+) -> Float[np.ndarray, "shots n 2"]:
+    """Return derivatives of the light per unit by what the overlaps depend on."""
+    # Overlaps are in single precision: steps of this length (mm) keep their difference precise. Steps ten times as
+    # long change derivatives by some per cent.
+    here, found = _unit_at(evaluator, theta, one, offset_px, one.overlaps), []
+    for i, step in zip(_IN_OVERLAPS, (2e-4, 1e-3), strict=True):
+        moved = overlaps_of(evaluator, theta + step * np.eye(theta.size)[i], one.frame)
+        found.append((_unit_at(evaluator, theta, one, offset_px, moved) - here) / step)
+    return np.stack(found, axis=-1)
+
+
+def _unit_at(
+    evaluator: Evaluator,
+    theta: Theta,
+    one: Samples,
+    offset_px: Float[np.ndarray, "shots 2"],
+    overlaps: Float[Arrayish, "nodes terms rows half"],
+) -> Light:
+    kernel = np.asarray(kernel_coefficients(evaluator, theta, one.frame, one.disc_px, overlaps))
+    return unit_light(evaluator, one, offset_px, kernel)
+
+
+def _slopes(evaluator: Evaluator, theta: Theta, one: Samples, own: Own) -> Float[np.ndarray, "shots n p"]:
+    """Return derivatives of the light of one position's samples by the shared parameters."""
     spectra = softmax(theta[HEAD:].reshape(3, -1), axis=1)
-    made = kernel_jacobian(evaluator, theta, one.frame, one.disc_px, one.overlaps)
-    coefficients, chain = (np.asarray(part) for part in made)
+    # In single precision it takes half the time, and its errors are a millionth of the kernel's.
+    with jax.enable_x64(False):
+        made = kernel_jacobian(evaluator, theta, one.frame, one.disc_px, one.overlaps)
+        coefficients, chain = (np.asarray(part) for part in made)
     count = spectra.shape[1]
     values = sampled(evaluator, one, coefficients, own[:, :2])
     nodes, by_colour = values[..., :count], values[..., count:].reshape(*values.shape[:2], -1, 3)
@@ -269,11 +242,8 @@ def _slopes(
     by_head = np.einsum("snfc,snc->snf", by_colour, one.colour) @ chain
     by_head[..., _IN_OVERLAPS] += one.by_overlaps
     by_logs = one.colour[..., None] * (of_colour * (nodes - unit[..., None]))[..., None, :]
-    flux = flux_of(one, own)
-    by_theta = np.concatenate([by_head, by_logs.reshape(*unit.shape, -1)], axis=-1) * flux[..., None]
-    unit = unit + _changed(one, theta)
-    kernel = coefficients[..., :count] @ spectra.T
-    return unit * flux, by_theta, own_slopes(evaluator, one, own, unit, kernel)
+    by_theta = np.concatenate([by_head, by_logs.reshape(*unit.shape, -1)], axis=-1)
+    return by_theta * flux_of(one, own)[..., None]
 
 
 def explain(
@@ -287,7 +257,7 @@ def explain(
     for one, own, kernel in zip(samples.each(), start_own(evaluator, samples, kernels), kernels, strict=True):
         for _ in range(3):
             unit = unit_light(evaluator, one, own[:, :2], kernel)
-            slopes = own_slopes(evaluator, one, own, unit, kernel)
+            slopes = own_slopes(evaluator, one, own, kernel, unit)
             residual = one.rate - unit * flux_of(one, own) - own[:, 5:]
             across = np.swapaxes(slopes * huber_weight(residual, one.weight)[..., None], 1, 2)
             step = scaled_inverse(across @ slopes, 1e-14) @ (across @ residual[..., None])

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Final
 
-import equinox as eqx
 import numpy as np
 import scipy.ndimage
 from jaxtyping import Float
@@ -15,7 +14,6 @@ from udccal.fitting.hdr.merge import HdrMerge, merge_bracket
 from udccal.fitting.psf.data import PsfData, PsfRules, Shots, joined
 from udccal.kernels import kernel_size
 from udccal.models.noise import Noise
-from udccal.models.wire import Wire, wire_values
 from udccal.result import FitStatus
 from udccal.sessions.schema import LedSubject, StoredStep
 from udccal.sessions.store import Session
@@ -23,16 +21,16 @@ from udccal.sessions.store import Session
 # The search for an LED reaches this far from its aim.
 _SEARCH_PX: Final = 16
 
-_wire_values = eqx.filter_jit(wire_values)
 
-
-def read_psf(session: Session, noise: Noise, wire: Wire, rules: PsfRules | None = None) -> PsfData:
+def read_psf(
+    session: Session, noise: Noise, wire_map: Float[np.ndarray, "rows columns"], rules: PsfRules | None = None
+) -> PsfData:
     """Read the LED pictures of a session's steps ``psf/...``, in windows as wide as a profile's kernel or the fit's.
 
     Args:
         session: brackets of an LED at field positions, each at some sub-pixel shifts.
         noise: gives K, black level, saturation and variances for merging brackets.
-        wire: its map divides the rates.
+        wire_map: the wire at every pixel of the sensor, which divides the rates.
         rules: the largest windows in px.
 
     Returns:
@@ -56,8 +54,7 @@ def read_psf(session: Session, noise: Noise, wire: Wire, rules: PsfRules | None 
         if crop is not None:
             crops.append(crop)
             aims.append((subject.x_px, subject.y_px))
-    camera = session.rig.camera
-    shots = _without_wire(joined(crops, np.array(aims)), wire, camera.rows, camera.columns) if crops else None
+    shots = _without_wire(joined(crops, np.array(aims)), wire_map) if crops else None
     return PsfData(shots, len(steps), dark, clipped, tuple(doubted))
 
 
@@ -68,11 +65,10 @@ def window_half(session: Session, largest: tuple[int, int]) -> tuple[int, int]:
     return max(4, min(largest[0], rows // 2 - 4)), max(4, min(largest[1], columns // 2 - 4))
 
 
-def _without_wire(shots: Shots, wire: Wire, rows: int, columns: int) -> Shots:
-    """Divide rates by the wire's map of a sensor of ``rows`` x ``columns``."""
-    pixels = shots.offsets()[None] + shots.origin_px[:, None, None]
-    gains = np.stack([np.asarray(_wire_values(wire, p.reshape(-1, 2) * 1.0, rows, columns)) for p in pixels])
-    gain = gains.reshape(shots.rate.shape)
+def _without_wire(shots: Shots, wire_map: Float[np.ndarray, "rows columns"]) -> Shots:
+    """Divide rates by the wire; samples beyond the sensor have no weight."""
+    x, y = np.moveaxis(shots.offsets()[None] + shots.origin_px[:, None, None], -1, 0)
+    gain = wire_map[np.clip(y, 0, wire_map.shape[0] - 1), np.clip(x, 0, wire_map.shape[1] - 1)]
     return replace(
         shots, rate=shots.rate / gain, weight=shots.weight * gain**2, noise_per_rate=shots.noise_per_rate / gain
     )
@@ -168,11 +164,12 @@ def _brightest(
 def shot_noise(merged: HdrMerge, noise: Noise) -> Float[np.ndarray, "rows columns"]:
     """Return the derivative of a merged sample's variance by its rate, in (e-/s)^2 per e-/s.
 
-    One exposure of 1/u seconds has the variance (r + d) u + f u^2, where f is a dark sample's. A bracket is treated as
-    the single exposure that has its variance.
+    One exposure of 1/u seconds has the variance (r + d) u + f u^2, where f is a dark sample's, its pixel's offset
+    included. A bracket is treated as the single exposure that has its variance.
     """
-    K, dark = float(np.asarray(noise.K_DN_per_e)), float(np.asarray(noise.dark_current_e_per_s))
-    floor = float(np.asarray(noise.sigma_d_e)) ** 2 + (float(np.asarray(noise.q_DN)) / K) ** 2 / 12.0
+    parts = noise.K_DN_per_e, noise.dark_current_e_per_s, noise.sigma_d_e, noise.q_DN, noise.DSNU1288_e
+    K, dark, sigma_d, q, offset = (float(np.asarray(part)) for part in parts)
+    floor = sigma_d**2 + (q / K) ** 2 / 12.0 + offset**2
     light, variance = np.maximum(merged.rate_e_per_s + dark, 0.0), merged.sigma_e_per_s**2
     slope = 2.0 * variance / (light + np.sqrt(light**2 + 4.0 * floor * variance))
     return np.where(merged.used > 0, slope, 0.0)

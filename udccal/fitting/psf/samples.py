@@ -197,16 +197,22 @@ def flux_of(samples: Samples, own: Float[np.ndarray, "*k l"]) -> Float[np.ndarra
 
 
 def own_slopes(
-    evaluator: Evaluator, one: Samples, own: Own, unit: Light, coefficients: Float[np.ndarray, "y x 3"]
+    evaluator: Evaluator,
+    one: Samples,
+    own: Own,
+    coefficients: Float[np.ndarray, "y x 3"],
+    here: Light,
+    changed: Light | float = 0.0,
 ) -> Float[np.ndarray, "shots n l"]:
-    """Derivatives of one position's light by each shot's own parameters; ``unit`` is the light per unit."""
+    """Derivatives of one position's light by each shot's own parameters.
+
+    ``here`` is the light per unit by the ``coefficients`` at the shots' places; ``changed`` is what is added to it.
+    """
     # Differences over a 250th of the lattice's spacing: a cubic spline has no more detail.
-    moves = 1e-3 * np.eye(2)
-    ahead, behind = (
-        [unit_light(evaluator, one, own[:, :2] + sign * move, coefficients) for move in moves] for sign in (1, -1)
-    )
-    by_move = np.stack([(a - b) / 2e-3 for a, b in zip(ahead, behind, strict=True)], axis=-1)
-    flux = flux_of(one, own)[..., None]
+    step, offset = 1e-3, own[:, :2]
+    ahead = [unit_light(evaluator, one, offset + step * move, coefficients) for move in np.eye(2)]
+    by_move = (np.stack(ahead, axis=-1) - here[..., None]) / step
+    flux, unit = flux_of(one, own)[..., None], here + changed
     return np.concatenate([flux * by_move, unit[..., None] * one.colour, np.ones_like(flux)], axis=-1)
 
 

@@ -22,7 +22,7 @@ from jaxtyping import Array, Float, Int
 from udccal.fitting.wire.data import BLOCK, FlatNoise, Pixels, Weighed, over_blocks, weighed
 from udccal.fitting.wire.parameters import Kind, Parameters
 from udccal.models.bessel import bessel_j0_j1
-from udccal.models.wire import LEAST_OPEN, Wire, field_powers, legendre, modulation, slits, waves
+from udccal.models.wire import LEAST_OPEN, Wire, field_powers, legendre, slits, waves
 
 # Harmonics that are summed at once.
 _GROUP = 50
@@ -128,18 +128,24 @@ def _groups(wire: Wire) -> Iterator[Wire]:
         yield replace(wire, harmonics=harmonics, frequency=frequency, fields=fields, amplitudes=amplitudes)
 
 
-_modulation = jax.jit(modulation)
-
-
 def values_at(
     wire: Wire, ideal: Float[np.ndarray, "n 2"], scaled: Float[np.ndarray, "n 2"]
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """1 + modulation and exp(B), whose product is the map, at points that fill whole blocks."""
-    rays = rays_at(wire, ideal)
-    whole = np.ones(len(ideal))
-    for some in _groups(wire):
-        whole += over_blocks(lambda slope, at, some=some: _modulation(some, slope.T, at), rays.slope.T, scaled)
-    return whole, _base(wire, scaled, rays)
+
+    def at(ideal: Float[np.ndarray, "n 2"], scaled: Float[np.ndarray, "n 2"]) -> tuple[np.ndarray, np.ndarray]:
+        rays = rays_at(wire, ideal)
+        modulated = (sums[0] for sums, *_ in _of_groups(wire, rays, scaled))
+        return sum(modulated, start=np.ones(len(ideal))), _base(wire, scaled, rays)
+
+    return over_blocks(at, ideal, scaled)
+
+
+def _of_groups(wire: Wire, rays: Rays, scaled: Float[np.ndarray, "n 2"]) -> list[tuple[np.ndarray, ...]]:
+    """Return ``_group_derivatives`` of all groups, in single precision: twice as fast, and as accurate as its J0."""
+    rays = rays._replace(periods=rays.periods - np.round(rays.periods))
+    with jax.enable_x64(False):
+        return [jax.tree.map(np.asarray, _group_derivatives(some, rays, scaled)) for some in _groups(wire)]
 
 
 def _base(wire: Wire, scaled: Float[np.ndarray, "n 2"], rays: Rays) -> Float[np.ndarray, " n"]:
@@ -162,7 +168,7 @@ def weighed_at(parameters: Parameters, x: Float[np.ndarray, " n"], pixels: Pixel
 def wire_derivatives(wire: Wire, ideal: Float[np.ndarray, "n 2"], scaled: Float[np.ndarray, "n 2"]) -> Derivatives:
     """Values and derivatives at ideal image points of one block, which lie at ``scaled`` positions of the sensor."""
     rays = rays_at(wire, ideal)
-    found = [jax.tree.map(np.asarray, _group_derivatives(some, rays, scaled)) for some in _groups(wire)]
+    found = _of_groups(wire, rays, scaled)
     sums = sum((one[0] for one in found), start=np.zeros((9, len(ideal))))
     count = len(wire.harmonics)
     wave, carrier, powers = (
@@ -204,7 +210,7 @@ def _group_derivatives(
 ) -> tuple[Float[Array, "9 n"], Float[Array, "2 group n"], Float[Array, "2 group n"], Float[Array, "degrees group n"]]:
     """Modulation and its derivatives by periods, openings, ellipse and log pupil; waves, carriers and powers."""
     harmonics = jnp.asarray(wire.harmonics)
-    wave = waves(wire, rays.slope)
+    wave = waves(wire, rays.periods)
     kappa, bessel, slit, slit_slope, powers = _factors(wire, rays)
     series = _series(wire, powers)
     # Without the barrier the compiler computes the Bessel functions anew for every sum below.

@@ -1,0 +1,164 @@
+"""Views of boards, as a plan expects them or as a camera has seen them, and what they tell about the lens."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import final
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.spatial.transform import Rotation
+from scipy.special import erf
+
+from udccal.arrangements import Board, BoardSpec
+from udccal.fitting.geometry.bundle import (
+    LENS,
+    Bundle,
+    GeometryRules,
+    Intrinsics,
+    Points,
+    by_view,
+    in_sigma,
+    projected,
+)
+from udccal.fitting.geometry.corners import board_points_mm, charuco_board
+from udccal.planning.state import WHITE, EvenField, RigState, sample_variance_e
+from udccal.planning.steps import PlannedStep
+
+# Scatter of corners by axis in addition to noise, where no profile has measured it. Edges of the board on the jig run
+# along the sensor's rows: samples see them at few phases, and corners scatter more than on boards that lean.
+_ON_JIG_PX, _BY_HAND_PX = 0.0085, 0.006
+# White paper reflects so much more than black ink that half the difference is this part of white.
+_HALF_CONTRAST = 0.47
+# Edges after lens, pixel and the filter that makes a grey picture of a mosaic (one sigma).
+_EDGE_PX = 1.0
+# Radius of a saddle's window in squares: markers lie outside it.
+_WINDOW_SQUARES = 0.16
+_RULES = GeometryRules()
+
+
+@final
+@dataclass(frozen=True)
+class BoardView:
+    """Corners of one view (on the board, in px, with scatter), and its pose, board to camera."""
+
+    board: Float[np.ndarray, "n 3"]
+    image: Float[np.ndarray, "n 2"]
+    sigma: Float[np.ndarray, " n"]
+    pose: Float[np.ndarray, "6"]
+    parallel: bool
+
+
+@final
+class BoardViews:
+    """Makes the views of one rig's boards."""
+
+    def __init__(self, state: RigState) -> None:
+        self._state, self._field = state, EvenField(state)
+        self.intrinsics = Intrinsics.of_geometry(state.geometry).vector
+
+    def planned(self, step: PlannedStep, board: Board) -> BoardView | None:
+        """Return the view of a board; None where it shows too few corners to hold its pose."""
+        state = self._state
+        to_camera = Rotation.from_rotvec(np.asarray(state.geometry.rotation_rad)).inv()
+        rotation = to_camera * Rotation.from_rotvec(np.array(board.rotation_vector))
+        origin = to_camera.apply(np.array(board.translation_mm) - np.asarray(state.geometry.pupil_mm))
+        corners = board_points_mm(board.spec)
+        markers = np.asarray(charuco_board(board.spec).getObjPoints(), dtype=np.float64).reshape(-1, 3)
+        image, marks = (projected(self.intrinsics, rotation.apply(points) + origin)[0] for points in (corners, markers))
+        depth = float((rotation.apply(corners.mean(axis=0)) + origin)[2])
+        radius = self._window_px(board.spec, depth)
+        whole = _inside(state, marks, 1.0).reshape(-1, 4).all(axis=1)
+        # Only corners with both markers in the picture count: without these the detector does not know their numbers.
+        near = np.linalg.norm(corners[:, None] - markers.reshape(-1, 4, 3).mean(axis=1), axis=2) < board.spec.square_mm
+        good = _inside(state, image, np.ceil(radius) + 1) & ~(near & ~whole).any(axis=1)
+        if depth <= 0 or good.sum() < _RULES.least_corners:
+            return None
+        pose = np.concatenate([rotation.as_rotvec(), origin])
+        sigma = self._sigma_px(step, image[good], radius, board.parallel_to_panel)
+        return BoardView(corners[good], image[good], sigma, pose, board.parallel_to_panel)
+
+    def seen(
+        self,
+        step: PlannedStep,
+        spec: BoardSpec,
+        numbers: Int[np.ndarray, " n"],
+        points_px: Float[np.ndarray, "n 2"],
+    ) -> BoardView | None:
+        """Return the view of corners that were found; None where they are too few to hold its pose.
+
+        Args:
+            step: gives the light.
+            spec: the board, held by hand.
+            numbers: of the corners, as OpenCV counts them.
+            points_px: where they are on the sensor.
+        """
+        corners, lens = board_points_mm(spec)[numbers], Intrinsics.of(self.intrinsics)
+        if len(corners) < _RULES.least_corners:
+            return None
+        found, turn, shift = cv2.solvePnP(corners, points_px, lens.matrix, lens.distortion)
+        if not found:
+            return None
+        pose = np.concatenate([turn.ravel(), shift.ravel()])
+        sigma = self._sigma_px(step, points_px, self._window_px(spec, float(pose[5])), parallel=False)
+        return BoardView(corners, points_px, sigma, pose, parallel=False)
+
+    def _window_px(self, spec: BoardSpec, depth_mm: float) -> float:
+        square_px = spec.square_mm / depth_mm * Intrinsics.of(self.intrinsics).focal_px[0]
+        return float(np.clip(_WINDOW_SQUARES * square_px, *_RULES.window_px))
+
+    def _sigma_px(
+        self, step: PlannedStep, pixels: Float[np.ndarray, "n 2"], radius: float, parallel: bool
+    ) -> Float[np.ndarray, " n"]:
+        """Scatter by noise of the board's frames and by all else; that of the flat field, of far more, is left out."""
+        state, errors = self._state, self._state.model_errors
+        white = (step.level or 0.0) * state.full_well_e * self._field.at(pixels)
+        signal = white[:, None] * np.array(WHITE)[[0, 1, 1, 2]] / max(WHITE)
+        temporal = sample_variance_e(state, 0.5 * signal, step.exposures_s[0]) / len(step.exposures_s)
+        relative = temporal / signal**2
+        noise = np.sqrt(relative.mean(axis=1)) / _HALF_CONTRAST * _saddle_scatter(radius)
+        known, usual = (errors.on_jig_px, _ON_JIG_PX) if parallel else (errors.by_hand_px, _BY_HAND_PX)
+        return np.asarray(np.hypot(noise, usual if known is None else known))
+
+
+def points_of(views: Sequence[BoardView]) -> Points:
+    """Return the corners of views, one after another."""
+    sizes = [len(view.sigma) for view in views]
+    return Points(
+        board=np.concatenate([view.board for view in views]),
+        image=np.concatenate([view.image for view in views]),
+        sigma=np.concatenate([view.sigma for view in views]),
+        view=np.repeat(np.arange(len(views)), sizes),
+        index=np.concatenate([np.arange(size) for size in sizes]),
+        used=np.ones(sum(sizes), dtype=bool),
+        names=tuple(range(len(views))),
+    )
+
+
+def lens_information(view: BoardView | None, intrinsics: Float[np.ndarray, "9"]) -> Float[np.ndarray, "9 9"]:
+    """Return the Fisher information of one view on the intrinsics, whatever its own pose; none without a view."""
+    if view is None:
+        return np.zeros((LENS, LENS))
+    points = points_of([view])
+    (matrix,), _ = by_view(*in_sigma(Bundle(intrinsics, view.pose[None]), points), points)
+    cross = matrix[:LENS, LENS:]
+    return np.asarray(matrix[:LENS, :LENS] - cross @ np.linalg.solve(matrix[LENS:, LENS:], cross.T))
+
+
+def _saddle_scatter(radius_px: float) -> float:
+    """Scatter by axis in px of a weighted fit of erf(x) erf(y) with a free slope, at unit noise over contrast."""
+    half = int(np.ceil(radius_px))
+    y, x = np.mgrid[-half : half + 1, -half : half + 1].astype(np.float64) / _EDGE_PX
+    weight = np.clip(1 - (x**2 + y**2) * (_EDGE_PX / radius_px) ** 2, 0.0, None).ravel()
+    across = np.sqrt(2 / np.pi) / _EDGE_PX * np.exp(-0.5 * x**2) * erf(y / np.sqrt(2))
+    design = np.stack([across.ravel(), y.ravel()], axis=1)
+    # The window's weights are not those of the noise: the covariance is a sandwich.
+    solved = np.linalg.solve(design.T @ (design * weight[:, None]), (design * weight[:, None]).T)
+    return float(np.linalg.norm(solved[0]))
+
+
+def _inside(state: RigState, pixels: Float[np.ndarray, "n 2"], margin: float) -> Bool[np.ndarray, " n"]:
+    last = np.array([state.rig.camera.columns, state.rig.camera.rows]) - 1 - margin
+    return np.asarray(np.all((pixels >= margin) & (pixels <= last), axis=1))
