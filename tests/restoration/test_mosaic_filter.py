@@ -70,11 +70,9 @@ def test_the_filter_is_the_posteriors_mean(name: str, monkeypatch: pytest.Monkey
     found, chosen = filtered(tile[None], unit, tables, layout, cfa, 1, given)
     expected = dense_solution(tile.astype(float), kernel, cfa, strength)
     assert float(chosen[0]) == strength
-    wrong = np.moveaxis(found[0], -1, 0) - expected
-    means = wrong.reshape(3, SIZE // 2, 2, SIZE // 2, 2).mean(axis=(1, 3))
     # In sigma of a sample's noise: single precision costs most at the tile's mean, where the prior is widest.
-    np.testing.assert_allclose(means, 0.0, atol=1e-2)
-    np.testing.assert_allclose(wrong - np.tile(means, (SIZE // 2, SIZE // 2)), 0.0, atol=1e-4)
+    # A level per site in place of one per colour gives 8e-3.
+    np.testing.assert_allclose(np.moveaxis(found[0], -1, 0), expected, atol=6e-3)
 
 
 def test_it_tells_the_source_point_from_the_mirrored_kernel() -> None:

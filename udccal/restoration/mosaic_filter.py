@@ -17,6 +17,7 @@ Samples come in units of their noise. Then one table serves every brightness, ex
 
 from __future__ import annotations
 
+import functools
 import itertools
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -25,7 +26,7 @@ from typing import Protocol, final, runtime_checkable
 
 import cv2
 import numpy as np
-from jaxtyping import Complex64, Complex128, Float, Float32, Float64
+from jaxtyping import Complex64, Complex128, Float, Float32, Float64, Int
 from scipy import fft
 
 from udccal.cfa import Site
@@ -38,6 +39,8 @@ from udccal.restoration.tiles import TileLayout
 _EXPONENT, _FLAT_BELOW, _COLOURFUL = 3.0, 0.003, 0.2
 # The prior's covariance of two colours relative to the variance of grey.
 COLOURS = _COLOURFUL * np.eye(3) + 1 - _COLOURFUL / 3
+# Of the variance that colours share, over that of each one's deviation.
+_COMMON = (1 - _COLOURFUL / 3) / _COLOURFUL
 # Strengths of the prior in units of the noise: RMS difference of neighbours over the sigma of a sample, squared.
 STRENGTHS = np.exp2(np.arange(-6.0, 17.0)).astype(np.float32)
 # Every n-th frequency along both axes decides the strength.
@@ -184,11 +187,17 @@ def filtered(
     return pictures, chosen
 
 
-def _levels(tile: Float32[np.ndarray, "*colours rows columns"], pattern: Pattern) -> Float32[np.ndarray, "sites"]:
-    """Return the mean of each site."""
+def _levels(tile: Float32[np.ndarray, "*colours rows columns"], pattern: Pattern) -> Float32[np.ndarray, "3"]:
+    """Return the mean of each colour; a colour without sites is as bright as the mean of all."""
     lines = [layer[row :: pattern.rows] for layer in _layers(tile) for row in range(pattern.rows)]
     by_line = [cv2.mean(line.reshape(len(line), -1, pattern.columns))[: pattern.columns] for line in lines]
-    return np.array(by_line, dtype=np.float32).reshape(-1)
+    of_site, channels = np.array(by_line, dtype=np.float32).ravel(), _channels(pattern)
+    own = [channels == colour for colour in range(len(COLOURS))]
+    return np.array([of_site[mine].mean() if mine.any() else of_site.mean() for mine in own], dtype=np.float32)
+
+
+def _channels(pattern: Pattern) -> Int[np.ndarray, " sites"]:
+    return np.array([site.channel for site in pattern.sites])
 
 
 def _layers(tile: Float32[np.ndarray, "*colours rows columns"]) -> Float32[np.ndarray, "layers rows columns"]:
@@ -197,17 +206,16 @@ def _layers(tile: Float32[np.ndarray, "*colours rows columns"]) -> Float32[np.nd
 
 def _whitened(
     tile: Float32[np.ndarray, "*colours rows columns"],
-    levels: Float32[np.ndarray, "sites"],
+    levels: Float32[np.ndarray, "3"],
     noise_e: Float32[np.ndarray, "3"],
     tables: FilterTables,
     layout: TileLayout,
     pattern: Pattern,
 ) -> Complex64[np.ndarray, "sites site_rows site_half"]:
-    """Return V Y: the tile's samples in units of their noise, less the sites' levels, along the eigenvectors."""
+    """Return V Y: the tile's samples in units of their noise, less their colours' levels, along the eigenvectors."""
     cell = pattern.rows, pattern.columns
     parts = []
-    scales = 1 / noise_e[[site.channel for site in pattern.sites]]
-    cells = (each.reshape(-1, *cell) for each in (levels, scales))
+    cells = (each[_channels(pattern)].reshape(-1, *cell) for each in (levels, 1 / noise_e))
     for layer, *of_cell in zip(_layers(tile), *cells, strict=True):
         flat = np.empty_like(layer)
         for row, (level, scale) in enumerate(zip(*of_cell, strict=True)):
@@ -223,7 +231,7 @@ def _whitened(
 def _picture(
     whitened: Complex64[np.ndarray, "sites site_rows site_half"],
     strength: np.float32,
-    levels: Float32[np.ndarray, "sites"],
+    levels: Float32[np.ndarray, "3"],
     noise_e: Float32[np.ndarray, "3"],
     tables: FilterTables,
     layout: TileLayout,
@@ -233,16 +241,14 @@ def _picture(
     weighted = np.conjugate(whitened)
     weighted *= 1 / (tables.values + 1 / strength)
     by_site = np.conjugate(_products(tables.vectors.swapaxes(0, 1), weighted, range(len(weighted))), out=weighted)
-    channels = np.array([site.channel for site in pattern.sites])
-    colours = np.flatnonzero(np.bincount(channels, minlength=len(COLOURS)))
-    cell = pattern.rows, pattern.columns
-    sites = [np.flatnonzero(channels == colour).tolist() for colour in colours]
-    planes = [joined_planes(_products(tables.matched, by_site, own), cell, layout.columns) for own in sites]
-    # A colour without sites is as bright as the mean of all.
-    level = np.full(len(COLOURS), levels.mean(), dtype=np.float32)
-    level[colours] = [levels[own].mean() for own in sites]
-    mixed = (noise_e[:, None] * COLOURS[:, colours]).astype(np.float32)
-    return cv2.transform(cv2.merge(planes), np.column_stack([mixed, level]))
+    cell, channels = (pattern.rows, pattern.columns), _channels(pattern)
+    own = [np.flatnonzero(channels == colour).tolist() for colour in range(len(COLOURS))]
+    spectra = [_products(tables.matched, by_site, sites) if sites else None for sites in own]
+    # Colours have much that cancels in their sum. In single precision, they are mixed before they become pictures.
+    common = functools.reduce(np.add, [each for each in spectra if each is not None]) * np.float32(_COMMON)
+    mixed = [common if each is None else np.add(each, common, out=each) for each in spectra]
+    planes = [joined_planes(each, cell, layout.columns) for each in mixed]
+    return cv2.transform(cv2.merge(planes), np.column_stack([np.diag(_COLOURFUL * noise_e), levels]))
 
 
 def _products(

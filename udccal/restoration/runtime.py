@@ -185,15 +185,24 @@ class Restorer:
             RestorationError: when the frame, its exposure or the panel picture does not belong to this rig, or the
                 panel's picture alone would give more light than the frame has: the exposure is wrong, or the picture.
         """
+        linear = self._restored_e(mosaic, exposure_s, panel_picture)
+        linear /= np.float32(exposure_s)
+        return linear
+
+    def _restored_e(
+        self,
+        mosaic: UInt16[np.ndarray, "frame_rows frame_columns"],
+        exposure_s: float,
+        panel_picture: UInt8[np.ndarray, "panel_rows panel_columns 3"] | None,
+    ) -> Picture:
+        """Return the clean picture in e-."""
         light = self.scene_light(mosaic, exposure_s, panel_picture)
         if self.sharpener is None:
-            return self._on_view(demosaic(light.signal_e, self.rig.camera.cfa), exposure_s)
+            return self.rectification.apply(demosaic(light.signal_e, self.rig.camera.cfa))
         sharp = self.sharpener.apply(light.signal_e, light.variance_e2, light.clipped)
         if light.panel_error_e is not None:
             sharp = plausible(sharp, light.panel_error_e[self.sharpener.rows])
-        linear = self._strip_rectification.apply(sharp, self.options.interpolation)
-        linear /= np.float32(exposure_s)
-        return linear
+        return self._strip_rectification.apply(sharp, self.options.interpolation)
 
     def scene_light(
         self,
@@ -247,7 +256,8 @@ class Restorer:
             RestorationError: as ``restore``.
         """
         if self.tier is not Tier.preview:
-            return tone.rgb8(self.restore(mosaic, exposure_s, panel_picture))
+            of_e = replace(tone, exposure=tone.exposure / exposure_s)
+            return of_e.rgb8(self._restored_e(mosaic, exposure_s, panel_picture))
         check_frame(mosaic, exposure_s, self.rig)
         check_panel_picture(panel_picture, self.rig)
         return self._preview.rgb8(mosaic, exposure_s, tone)
@@ -255,9 +265,7 @@ class Restorer:
     def before(self, mosaic: UInt16[np.ndarray, "frame_rows frame_columns"], exposure_s: float) -> Picture:
         """Return the frame without restoration: black level, demosaicing and geometry only, linear RGB in e-/s."""
         check_frame(mosaic, exposure_s, self.rig)
-        return self._on_view(demosaic(to_electrons(mosaic, self.noise, exposure_s), self.rig.camera.cfa), exposure_s)
-
-    def _on_view(self, sensor_e: Float32[np.ndarray, "sensor_rows sensor_columns 3"], exposure_s: float) -> Picture:
+        sensor_e = demosaic(to_electrons(mosaic, self.noise, exposure_s), self.rig.camera.cfa)
         return self.rectification.apply(sensor_e) / np.float32(exposure_s)
 
     def _panel_light_e(

@@ -143,17 +143,19 @@ def _shrink_level(
 ) -> Plane:
     """Shrink a plane's bands at this level, and at coarser ones by what they change."""
     bands, smooth = _split(plane)
-    removed = np.zeros_like(plane)
+    result = smooth.copy()
     down, across = (_Runs.of(s, count, 0.5**level) for s, count in zip(layout.strips, plane.shape, strict=True))
     for index, band in enumerate(bands):
         energy = cv2.blur(band * band, _WINDOW)
         energy += np.float32(1e-20)
-        # The part that noise explains, in place: these are the passes over memory that cost most.
-        explained = cv2.divide(brightness[level], energy, dst=energy)
-        _scale_by_tile(explained, noise[:, :, level, index], down, across)
-        np.minimum(explained, np.float32(1), out=explained)
-        cv2.accumulateProduct(explained, band, removed)
-    result = plane - removed
+        # 1 - noise / energy, in place: these are the passes over memory that cost most.
+        keep = _largest(noise[:, :, level, index], down, across)
+        keep *= brightness[level]
+        keep /= energy
+        np.subtract(np.float32(1), keep, out=keep)
+        np.maximum(keep, np.float32(0), out=keep)
+        keep *= band
+        result += keep
     if level + 1 < _LEVELS and min(plane.shape) > 2 * len(_SMOOTH):
         half = np.ascontiguousarray(smooth[::2, ::2])
         change = _shrink_level(half, noise, layout, brightness, level + 1) - half
@@ -198,16 +200,11 @@ class _Runs:
         return cls(first[begins], last[begins], np.diff(begins, append=count))
 
 
-def _scale_by_tile(
-    plane: Plane, values: Float32[np.ndarray, "tiles_down tiles_across"], down: _Runs, across: _Runs
-) -> None:
-    """Multiply each sample by the value of its tile; of two tiles, the larger one."""
+def _largest(values: Float32[np.ndarray, "tiles_down tiles_across"], down: _Runs, across: _Runs) -> Plane:
+    """Return the value of each sample's tile; of two tiles, the larger one."""
     rows = np.maximum(values[down.first], values[down.last])
     blocks = np.maximum(rows[:, across.first], rows[:, across.last])
-    begin = 0
-    for line, samples in zip(np.repeat(blocks, across.samples, axis=1), down.samples.tolist(), strict=True):
-        plane[begin : begin + samples] *= line
-        begin += samples
+    return np.repeat(np.repeat(blocks, across.samples, axis=1), down.samples, axis=0)
 
 
 def _smooth(
