@@ -107,7 +107,7 @@ class Filter:
         pictures, strengths = filtered(tiles, noise_e, self.tables, self.layout, self.pattern, _WORKERS)
         local = cv2.blur(variance.mean(axis=2), (16, 16))
         bands = self.noise.of_tiles(strengths)
-        return shrunk(self.layout.join(pictures), noise_e, local, bands, self.layout, _WORKERS)
+        return shrunk(self.layout.join(pictures, _WORKERS), noise_e, local, bands, self.layout, _WORKERS)
 
     def _cut(self, planes: Rgb) -> Float32[np.ndarray, "tiles 3 tile_rows tile_columns"]:
         return np.stack([self.layout.cut(np.ascontiguousarray(plane)) for plane in cv2.split(planes)], axis=1)

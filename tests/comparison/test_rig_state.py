@@ -81,6 +81,13 @@ def test_a_term_that_contradicts_the_others_is_noticed(
     assert rig_state(off).agreement_p_value < 1e-6
 
 
+def test_the_width_of_backscatters_footprint_says_nothing_of_the_pupil(measured: Profile) -> None:
+    before, sigma = rig_state(measured), measured.backscatter.estimate("pupil_diameter_mm").sigma
+    after = rig_state(with_estimates(measured, "backscatter", {"pupil_diameter_mm": 20 * sigma}))
+    for name in NAMES:
+        assert abs(number(after, name).value - number(before, name).value) < 0.1 * number(before, name).sigma, name
+
+
 def test_agreement_of_draws_follows_its_degrees_of_freedom(measured: Profile) -> None:
     rng, terms = np.random.default_rng(5), ("wire", "psf", "backscatter")
     states = [rig_state(drawn(silent(measured, "geometry"), rng, terms)) for _ in range(40)]  # type: ignore[arg-type]

@@ -35,7 +35,7 @@ from udccal.numerics import in_float64
 from udccal.profiles.profile import Profile, build_profile
 from udccal.profiles.provenance import PROFILE_NAME, provenance_now
 from udccal.profiles.store import read_profile, write_profile
-from udccal.restoration import runtime
+from udccal.restoration import runtime, view
 from udccal.restoration.kernel_grid import KernelGrid
 from udccal.restoration.plan import PlanOptions, kernel_grid
 from udccal.restoration.view import inscribed_view
@@ -215,8 +215,10 @@ def _restore(data: bytes) -> None:
     profile = read_profile(folder)
     with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
         show_profile(Output(as_json=False, debug=False), folder)
-    kernels, view = _remembered(_kernels), _remembered(inscribed_view)
-    with mock.patch.multiple(runtime, kernel_grid=kernels, inscribed_view=view):
+    with (
+        mock.patch.object(runtime, "kernel_grid", _remembered(_kernels)),
+        mock.patch.object(view, "inscribed_view", _remembered(inscribed_view)),
+    ):
         restorer = runtime.Restorer.from_profile(profile, options=_OPTIONS)
     camera, panel = profile.rig.camera, profile.rig.panel
     frame = np.random.default_rng(2).integers(60, 250, (camera.rows, camera.columns)).astype(np.uint16)

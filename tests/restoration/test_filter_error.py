@@ -36,8 +36,8 @@ def test_noise_lost_detail_and_blur_are_those_of_draws() -> None:
             tile = mosaic.astype(np.float32)[None]
             unit = np.ones((1, 3), np.float32)
             found, _ = filtered(tile, unit, one, layout, cfa, 1, np.array([strength], np.float32))
-            truth = scene if kept is wrong else 0.0
-            kept.append(np.mean((found[0] - truth)[:, inner, inner] ** 2, axis=(1, 2)))
+            truth = np.moveaxis(scene, 0, -1) if kept is wrong else 0.0
+            kept.append(np.mean((found[0] - truth)[inner, inner] ** 2, axis=(0, 1)))
         changed.append(np.mean((blurred - scene) ** 2, axis=(1, 2)))
     noise_variance, lost = expected.noise[0, INDEX], expected.lost[0, INDEX]
     np.testing.assert_allclose(np.mean(noise_alone, axis=0), noise_variance, rtol=0.05)

@@ -15,7 +15,7 @@ import pytest
 from jaxtyping import Float32, Int
 
 from udccal.profiles.profile import Profile
-from udccal.restoration import backscatter, prepared, runtime, sharpen
+from udccal.restoration import backscatter, prepared, rectify, runtime, sharpen, view
 from udccal.restoration.backscatter import PanelLight
 from udccal.restoration.plan import PlanOptions
 from udccal.restoration.prepared import kept, prepared_bytes, prepared_folder
@@ -256,6 +256,8 @@ def _refuse(monkeypatch: pytest.MonkeyPatch, *names: str) -> None:
         (sharpen, "filter_tables"),
         (sharpen, "measured_noise"),
         (backscatter, "panel_response"),
+        (view, "inscribed_view"),
+        (rectify, "_sensor_pixels"),
     ):
         if name in names:
             monkeypatch.setattr(module, name, lambda *_, name=name: pytest.fail(f"computed {name}"))
@@ -278,7 +280,15 @@ def test_the_second_start_computes_nothing(
     profile: Profile, filled: tuple[Path, Restorer], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder, first = filled
-    _refuse(monkeypatch, "kernel_grid", "filter_tables", "measured_noise", "panel_response")
+    _refuse(
+        monkeypatch,
+        "kernel_grid",
+        "filter_tables",
+        "measured_noise",
+        "panel_response",
+        "inscribed_view",
+        "_sensor_pixels",
+    )
     second = Restorer.from_profile(profile, Tier.balanced, replace(_OPTIONS, workers=1), folder)
     assert isinstance(first.sharpener, Sharpener)
     assert isinstance(second.sharpener, Sharpener)

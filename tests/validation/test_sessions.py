@@ -73,6 +73,9 @@ def test_another_day_shows_the_same_rig(folder: Path, truth: RigTruth, first: ud
     assert document == json.loads((folder / "out" / "validation.json").read_text(encoding="utf-8"))
     assert (document["format"], document["ok"]) == ("udccal-session-comparison", True)
     assert all(check["what"].endswith(".") for check in document["checks"])
+    # On a simulated rig the light is the same, so that noise explains everything.
+    told = [check["value"] for check in document["checks"] if check["name"] == "chi-squared"]
+    assert told == pytest.approx([1.0, 1.0], abs=0.15)
     page = (folder / "out" / "validation.html").read_text(encoding="utf-8")
     assert document["advice"] in page
     for layout in layouts(page, folder):

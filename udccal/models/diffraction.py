@@ -21,6 +21,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from udccal.models.arrays import Arrayish
+from udccal.models.bessel import sine_cosine
 from udccal.models.geometry import Geometry, panel_directions, rotation_matrix
 from udccal.models.lattice import Frequencies
 
@@ -200,8 +201,8 @@ def slit_coefficients(
     here, next_one = jnp.maximum(opened - lag + whole, 0.0), jnp.maximum(opened - 1.0 + lag - whole, 0.0)
     made = [(here + next_one) / opened]
     odd = 1.0 - 2.0 * jnp.mod(whole, 2.0)
-    sines = [(jnp.zeros_like(lag), jnp.sin(jnp.pi * width)) for width in (here, next_one)]
-    twice = [2.0 * jnp.cos(jnp.pi * width) for width in (here, next_one)]
+    waves = [sine_cosine(jnp.pi * width) for width in (here, next_one)]
+    sines, twice = [(jnp.zeros_like(lag), sine) for sine, _ in waves], [2.0 * cosine for _, cosine in waves]
     for order in range(1, highest + 1):
         (_, near), (_, far) = sines
         parity = odd if order % 2 else 1.0
@@ -293,7 +294,7 @@ def _disc_transfer(z: Float[Array, "*n"]) -> Float[Array, "*n"]:
 
     def add(total: Float[Array, "*n"], node: tuple[Array, Array]) -> tuple[Float[Array, "*n"], None]:
         cosine, weight = node
-        return total + weight * jnp.cos(z * cosine), None
+        return total + weight * sine_cosine(z * cosine)[1], None
 
     # As a loop: unrolled, its cosines take longer to compile than everything else.
     return jax.lax.scan(add, jnp.zeros_like(z), (jnp.cos(angle), weights))[0]

@@ -86,7 +86,7 @@ def deblur(
     pictures, strengths = filtered(tiles, noise, tables, layout, THREE_COLOURS, workers)
     bands = measured_noise(tables, layout, THREE_COLOURS, workers).of_tiles(strengths)
     local = (read + slope * np.maximum(cv2.blur(light.mean(axis=2), (16, 16)), 0)).astype(np.float32)
-    return shrunk(layout.join(pictures), noise, local, bands, layout, workers) * np.float32(unit)
+    return shrunk(layout.join(pictures, workers), noise, local, bands, layout, workers) * np.float32(unit)
 
 
 def _noise_line(tiles: Float32[np.ndarray, "tiles 3 rows columns"]) -> tuple[float, float]:

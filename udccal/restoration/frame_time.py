@@ -19,8 +19,9 @@ from jaxtyping import Float64
 from udccal.cfa import Cfa, cfa_named
 from udccal.models.noise import Noise
 from udccal.restoration.backscatter import PanelMask
+from udccal.restoration.defects import without_defects
 from udccal.restoration.demosaic import demosaic
-from udccal.restoration.linear import to_electrons, variance_e2, without_defects
+from udccal.restoration.linear import to_electrons, variance_e2
 from udccal.restoration.mosaic_filter import FilterTables, filtered
 from udccal.restoration.plan import PlanOptions
 from udccal.restoration.prepared import kept
@@ -119,7 +120,7 @@ def _measured(options: PlanOptions) -> PartTimes:
     picture = demosaic(signal, cfa.name)
 
     def linear() -> None:
-        clean = without_defects(to_electrons(mosaic, noise, 1.0), noise, cfa.name)
+        clean = to_electrons(without_defects(mosaic, noise, 1.0, cfa.name), noise, 1.0)
         variance = variance_e2(clean, noise, 1.0)
         clean /= ones
         variance /= ones**2
@@ -129,7 +130,7 @@ def _measured(options: PlanOptions) -> PartTimes:
         (linear, mosaic.size),
         (lambda: demosaic(signal, cfa.name), mosaic.size),
         (
-            lambda: layout.join(filtered(layout.cut(signal), unit, tables, layout, cfa, workers)[0]),
+            lambda: layout.join(filtered(layout.cut(signal), unit, tables, layout, cfa, workers)[0], workers),
             layout.count * layout.rows * layout.columns,
         ),
         (lambda: shrunk(picture, unit, signal, bands, layout, workers), mosaic.size),

@@ -17,21 +17,20 @@ Samples come in units of their noise. Then one table serves every brightness, ex
 
 from __future__ import annotations
 
-import functools
 import itertools
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
+from dataclasses import dataclass
 from typing import Protocol, final, runtime_checkable
 
-import equinox as eqx
-import jax
-import jax.numpy as jnp
+import cv2
 import numpy as np
-from jaxtyping import Array, Complex64, Complex128, Float, Float32, Float64
+from jaxtyping import Complex64, Complex128, Float, Float32, Float64
 from scipy import fft
 
 from udccal.cfa import Site
 from udccal.restoration.kernel_grid import KernelGrid, centred, interpolated_kernels
+from udccal.restoration.site_planes import joined_planes, plane_spectra
 from udccal.restoration.tiles import TileLayout
 
 # Of the prior, fitted on photographs of two magnifications: the exponent of its power spectrum, the frequency in
@@ -43,7 +42,8 @@ COLOURS = _COLOURFUL * np.eye(3) + 1 - _COLOURFUL / 3
 STRENGTHS = np.exp2(np.arange(-6.0, 17.0)).astype(np.float32)
 # Every n-th frequency along both axes decides the strength.
 _SPARSE = 3
-_CHUNK = 6
+# Every n-th strength is tried first.
+_STRIDE = 4
 
 
 @runtime_checkable
@@ -64,8 +64,9 @@ class Pattern(Protocol):
 
 
 @final
-class FilterTables(eqx.Module):
-    """What the filter needs of each tile's kernels. Within jitted functions, its arrays are JAX's.
+@dataclass(frozen=True)
+class FilterTables:
+    """What the filter needs of the kernels of one tile, or of several.
 
     Attributes:
         matched: transfer from each site plane of the mosaic to the picture's plane at each place of the cell: prior
@@ -74,9 +75,9 @@ class FilterTables(eqx.Module):
         values: lambda, in units of the noise.
     """
 
-    matched: Complex64[np.ndarray, "tiles places sites site_rows site_half"]
-    vectors: Complex64[np.ndarray, "tiles sites sites site_rows site_half"]
-    values: Float32[np.ndarray, "tiles sites site_rows site_half"]
+    matched: Complex64[np.ndarray, "*tiles places sites site_rows site_half"]
+    vectors: Complex64[np.ndarray, "*tiles sites sites site_rows site_half"]
+    values: Float32[np.ndarray, "*tiles sites site_rows site_half"]
 
 
 def filter_tables(grid: KernelGrid, layout: TileLayout, pattern: Pattern, workers: int) -> FilterTables:
@@ -151,7 +152,7 @@ def filtered(
     pattern: Pattern,
     workers: int,
     strengths: Float32[np.ndarray, "tiles"] | None = None,
-) -> tuple[Float32[np.ndarray, "tiles 3 rows columns"], Float32[np.ndarray, " tiles"]]:
+) -> tuple[Float32[np.ndarray, "tiles rows columns 3"], Float32[np.ndarray, " tiles"]]:
     """Demosaic and deblur tiles.
 
     Args:
@@ -166,84 +167,111 @@ def filtered(
     Returns:
         pictures in e-, and the strength of the prior that each tile chose, in units of its noise.
     """
-    # One compilation serves both: a tile whose strength is given chooses among equal ones.
-    choices = np.tile(STRENGTHS, (len(tiles), 1))
-    if strengths is not None:
-        choices[:] = strengths[:, None]
-    inputs = tiles, noise_e, choices, tables
+    pictures = np.empty((len(tiles), layout.rows, layout.columns, 3), dtype=np.float32)
+    chosen = np.empty(len(tiles), dtype=np.float32) if strengths is None else strengths
+    samples = float(np.sum(layout.taper**2)) / (pattern.rows * pattern.columns)
 
-    def one(start: int) -> tuple[np.ndarray, np.ndarray]:
-        # One compilation serves the last chunk too: it repeats tiles.
-        at = np.minimum(np.arange(start, start + _CHUNK), len(tiles) - 1)
-        count = min(_CHUNK, len(tiles) - start)
-        part = jax.tree.map(lambda array: array[start : start + count] if count == _CHUNK else array[at], inputs)
-        pictures, chosen = _solve_chunk(*part, layout.taper, pattern=pattern)
-        return np.asarray(pictures)[:count], np.asarray(chosen)[:count]
+    def one(index: int) -> None:
+        own = FilterTables(tables.matched[index], tables.vectors[index], tables.values[index])
+        levels = _levels(tiles[index], pattern)
+        spectrum = _whitened(tiles[index], levels, noise_e[index], own, layout, pattern)
+        if strengths is None:
+            chosen[index] = _likeliest(spectrum, own.values, samples)
+        pictures[index] = _picture(spectrum, chosen[index], levels, noise_e[index], own, layout, pattern)
 
-    chunks = range(0, len(tiles), _CHUNK)
     with ThreadPoolExecutor(workers) as pool:
-        parts = list(pool.map(one, chunks))
-    return np.concatenate([p for p, _ in parts]), np.concatenate([s for _, s in parts])
+        list(pool.map(one, range(len(tiles))))
+    return pictures, chosen
 
 
-@partial(jax.jit, static_argnames="pattern")
-def _solve_chunk(
-    tiles: Float32[Array, "tiles *colours rows columns"],
-    noise_e: Float32[Array, "tiles 3"],
-    choices: Float32[Array, "tiles choices"],
+def _levels(tile: Float32[np.ndarray, "*colours rows columns"], pattern: Pattern) -> Float32[np.ndarray, "sites"]:
+    """Return the mean of each site."""
+    lines = [layer[row :: pattern.rows] for layer in _layers(tile) for row in range(pattern.rows)]
+    by_line = [cv2.mean(line.reshape(len(line), -1, pattern.columns))[: pattern.columns] for line in lines]
+    return np.array(by_line, dtype=np.float32).reshape(-1)
+
+
+def _layers(tile: Float32[np.ndarray, "*colours rows columns"]) -> Float32[np.ndarray, "layers rows columns"]:
+    return tile[None] if tile.ndim == 2 else tile
+
+
+def _whitened(
+    tile: Float32[np.ndarray, "*colours rows columns"],
+    levels: Float32[np.ndarray, "sites"],
+    noise_e: Float32[np.ndarray, "3"],
     tables: FilterTables,
-    taper: Float32[Array, "rows columns"],
+    layout: TileLayout,
     pattern: Pattern,
-) -> tuple[Float32[Array, "tiles 3 rows columns"], Float32[Array, " tiles"]]:
-    return jax.vmap(partial(_solve, taper=taper, pattern=pattern))(tiles, noise_e, choices, tables)
+) -> Complex64[np.ndarray, "sites site_rows site_half"]:
+    """Return V Y: the tile's samples in units of their noise, less the sites' levels, along the eigenvectors."""
+    cell = pattern.rows, pattern.columns
+    parts = []
+    scales = 1 / noise_e[[site.channel for site in pattern.sites]]
+    cells = (each.reshape(-1, *cell) for each in (levels, scales))
+    for layer, *of_cell in zip(_layers(tile), *cells, strict=True):
+        flat = np.empty_like(layer)
+        for row, (level, scale) in enumerate(zip(*of_cell, strict=True)):
+            line = flat[row :: cell[0]]
+            np.subtract(layer[row :: cell[0]], np.tile(level, layer.shape[1] // cell[1]), out=line)
+            line *= np.tile(scale, layer.shape[1] // cell[1])
+        flat *= layout.taper
+        parts.append(plane_spectra(flat, cell))
+    spectrum = parts[0] if len(parts) == 1 else np.concatenate(parts)
+    return _products(tables.vectors, spectrum, range(len(spectrum)))
 
 
-def _solve(
-    tile: Float32[Array, "*colours rows columns"],
-    noise_e: Float32[Array, "3"],
-    choices: Float32[Array, " choices"],
+def _picture(
+    whitened: Complex64[np.ndarray, "sites site_rows site_half"],
+    strength: np.float32,
+    levels: Float32[np.ndarray, "sites"],
+    noise_e: Float32[np.ndarray, "3"],
     tables: FilterTables,
-    taper: Float32[Array, "rows columns"],
+    layout: TileLayout,
     pattern: Pattern,
-) -> tuple[Float32[Array, "3 rows columns"], Float32[Array, ""]]:
-    """Solve one tile; its tables have no axis of tiles."""
-    of_site = [tile] * len(pattern.sites) if tile.ndim == 2 else list(tile)
-    planes = jnp.stack([whole[site.samples] for whole, site in zip(of_site, pattern.sites, strict=True)])
-    windows = jnp.stack([taper[site.samples] for site in pattern.sites])
+) -> Float32[np.ndarray, "rows columns 3"]:
+    """Return the posterior's mean in e-."""
+    weighted = np.conjugate(whitened)
+    weighted *= 1 / (tables.values + 1 / strength)
+    by_site = np.conjugate(_products(tables.vectors.swapaxes(0, 1), weighted, range(len(weighted))), out=weighted)
     channels = np.array([site.channel for site in pattern.sites])
-    own = np.array([channels == colour for colour in range(COLOURS.shape[0])], dtype=np.float32)
-    # A colour without sites is like the mean of all.
-    of_all = np.where(own.any(axis=1, keepdims=True), own, 1)
-    level = (of_all / of_all.sum(axis=1, keepdims=True)) @ planes.mean(axis=(1, 2))
-    scaled = (planes - level[channels, None, None]) / noise_e[channels, None, None] * windows
-    spectrum = (tables.vectors * jnp.fft.rfft2(scaled)).sum(axis=1)
-    values = jnp.asarray(tables.values)
-    strength = _likeliest(choices, spectrum, values, planes[0].size * jnp.mean(taper**2))
-    weighted = strength / (strength * values + 1) * spectrum
-    by_site = tables.matched * (jnp.conj(tables.vectors) * weighted[:, None]).sum(axis=0)
-    by_colour = [[w * by_site[:, site] for site, w in enumerate(row)] for row in COLOURS[:, channels].tolist()]
-    mixed = jnp.stack([functools.reduce(jnp.add, parts) for parts in by_colour])
-    picture = _interleaved(jnp.fft.irfft2(mixed, s=planes.shape[1:]), pattern)
-    return picture * noise_e[:, None, None] + level[:, None, None], strength
+    colours = np.flatnonzero(np.bincount(channels, minlength=len(COLOURS)))
+    cell = pattern.rows, pattern.columns
+    sites = [np.flatnonzero(channels == colour).tolist() for colour in colours]
+    planes = [joined_planes(_products(tables.matched, by_site, own), cell, layout.columns) for own in sites]
+    # A colour without sites is as bright as the mean of all.
+    level = np.full(len(COLOURS), levels.mean(), dtype=np.float32)
+    level[colours] = [levels[own].mean() for own in sites]
+    mixed = (noise_e[:, None] * COLOURS[:, colours]).astype(np.float32)
+    return cv2.transform(cv2.merge(planes), np.column_stack([mixed, level]))
 
 
-def _interleaved(
-    planes: Float32[Array, "3 places site_rows site_columns"], pattern: Pattern
-) -> Float32[Array, "3 rows columns"]:
-    colours, _, rows, columns = planes.shape
-    by_place = planes.reshape(colours, pattern.rows, pattern.columns, rows, columns)
-    return by_place.transpose(0, 3, 1, 4, 2).reshape(colours, rows * pattern.rows, columns * pattern.columns)
+def _products(
+    matrices: Complex64[np.ndarray, "to sites site_rows site_half"],
+    spectra: Complex64[np.ndarray, "sites site_rows site_half"],
+    sites: Sequence[int],
+) -> Complex64[np.ndarray, "to site_rows site_half"]:
+    """Return the product of a matrix and a vector at each frequency, of some sites. It stays within the cache."""
+    found = matrices[:, sites[0]] * spectra[sites[0]]
+    part = np.empty_like(found)
+    for site in sites[1:]:
+        found += np.multiply(matrices[:, site], spectra[site], out=part)
+    return found
 
 
 def _likeliest(
-    choices: Float32[Array, " choices"],
-    spectrum: Complex64[Array, "sites site_rows site_half"],
-    values: Float32[Array, "sites site_rows site_half"],
-    samples: Float32[Array, ""],
-) -> Float32[Array, ""]:
+    spectrum: Complex64[np.ndarray, "sites site_rows site_half"],
+    values: Float32[np.ndarray, "sites site_rows site_half"],
+    samples: float,
+) -> np.float32:
     """Return the prior's strength under which the spectrum is most probable."""
-    some = (slice(None), slice(None, None, _SPARSE), slice(None, None, _SPARSE))
-    power, value = jnp.abs(spectrum[some]) ** 2 / samples, values[some]
-    variance = choices[:, None, None, None] * value + 1
-    cost = (power / variance + jnp.log(variance)).sum(axis=(1, 2, 3))
-    return choices[jnp.argmin(cost)]
+    some = spectrum[:, ::_SPARSE, ::_SPARSE]
+    power, value = (some.real**2 + some.imag**2) / np.float32(samples), values[:, ::_SPARSE, ::_SPARSE]
+
+    def cost(strength: np.float32) -> float:
+        variance = strength * value
+        variance += 1
+        return float(np.sum(power / variance)) + float(np.sum(np.log(variance)))
+
+    # The cost has one valley: first where it is, then where it is lowest.
+    near = min(range(0, len(STRENGTHS), _STRIDE), key=lambda index: cost(STRENGTHS[index]))
+    return min(STRENGTHS[max(near - _STRIDE + 1, 0) : near + _STRIDE], key=cost)

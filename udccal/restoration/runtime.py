@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import final
 
 import numpy as np
-from jaxtyping import Float32, UInt8, UInt16
+from jaxtyping import Bool, Float32, UInt8, UInt16
 
 from udccal.cfa import cfa_named
 from udccal.errors import RestorationError
@@ -23,9 +23,10 @@ from udccal.profiles.profile import Profile
 from udccal.profiles.store import load_profile
 from udccal.restoration.backscatter import PanelLight, PanelMask, mask_mosaic, refuse_excess
 from udccal.restoration.dark_places import plausible
+from udccal.restoration.defects import without_defects
 from udccal.restoration.demosaic import demosaic
 from udccal.restoration.kernel_grid import KernelGrid
-from udccal.restoration.linear import saturated, to_electrons, variance_e2, without_defects
+from udccal.restoration.linear import saturated, to_electrons, variance_e2
 from udccal.restoration.plan import PlanOptions, kernel_grid
 from udccal.restoration.prepared import kept
 from udccal.restoration.preview import Preview
@@ -33,7 +34,7 @@ from udccal.restoration.rectify import Rectification
 from udccal.restoration.sharpen import Sharpener
 from udccal.restoration.stages import Stage
 from udccal.restoration.tone import Tone
-from udccal.restoration.view import inscribed_view
+from udccal.restoration.view import kept_view
 from udccal.rig import RigDescription
 from udccal.tiers import Tier
 
@@ -49,11 +50,13 @@ class SceneLight:
     Attributes:
         signal_e: in e-, divided by the wire.
         variance_e2: of its noise in e-^2.
-        panel_error_e: sigma of the panel's light that was taken off, in e-; None where there was none.
+        clipped: samples whose light was more than they say.
+        panel_error_e: sigma of the panel's light that was taken off, in e-; None where it is 0 or not known.
     """
 
     signal_e: Mosaic
     variance_e2: Mosaic
+    clipped: Bool[np.ndarray, "rows columns"]
     panel_error_e: Mosaic | None
 
 
@@ -129,8 +132,13 @@ class Restorer:
         options = options or PlanOptions()
         rig, geometry = profile.rig, profile.geometry.term
         camera, cfa = rig.camera, cfa_named(rig.camera.cfa)
-        view = inscribed_view(geometry, camera.columns, camera.rows, rig.view.columns, rig.view.rows)
-        rectification = Rectification.within(geometry, view, camera.columns, camera.rows)
+        view = kept_view(geometry, rig, keep)
+        rectification = kept(
+            keep,
+            Rectification,
+            (geometry, view, camera),
+            lambda: Rectification.within(geometry, view, camera.columns, camera.rows),
+        )
         quick = tier is Tier.preview
         unscattered = profile.backscatter.unfitted or Stage.backscatter in without
         error = profile.backscatter.diagnostic("held_out_without_noise_of_peak") or 0.0
@@ -180,7 +188,7 @@ class Restorer:
         light = self.scene_light(mosaic, exposure_s, panel_picture)
         if self.sharpener is None:
             return self._on_view(demosaic(light.signal_e, self.rig.camera.cfa), exposure_s)
-        sharp = self.sharpener.apply(light.signal_e, light.variance_e2)
+        sharp = self.sharpener.apply(light.signal_e, light.variance_e2, light.clipped)
         if light.panel_error_e is not None:
             sharp = plausible(sharp, light.panel_error_e[self.sharpener.rows])
         linear = self._strip_rectification.apply(sharp, self.options.interpolation)
@@ -199,19 +207,24 @@ class Restorer:
         """
         check_frame(mosaic, exposure_s, self.rig)
         check_panel_picture(panel_picture, self.rig)
-        signal = without_defects(to_electrons(mosaic, self.noise, exposure_s), self.noise, self.rig.camera.cfa)
+        signal = to_electrons(
+            without_defects(mosaic, self.noise, exposure_s, self.rig.camera.cfa), self.noise, exposure_s
+        )
         variance = variance_e2(signal, self.noise, exposure_s)
         if self.wire is not None:
             signal /= self.wire
-            variance /= self.wire**2
+            variance /= self.wire
+            variance /= self.wire
+        clipped = saturated(mosaic, self.noise)
         panel_error_e: Mosaic | None = None
         if self.mask is not None:
             panel_e = self._panel_light_e(signal, self.mask, exposure_s, panel_picture)
             if panel_picture is not None:
-                refuse_excess(signal, panel_e, saturated(mosaic, self.noise))
+                refuse_excess(signal, panel_e, clipped)
             signal -= panel_e
-            panel_error_e = np.float32(self.mask.error) * panel_e
-        return SceneLight(signal, variance, panel_error_e)
+            if self.mask.error > 0:
+                panel_error_e = np.float32(self.mask.error) * panel_e
+        return SceneLight(signal, variance, clipped, panel_error_e)
 
     def display(
         self,

@@ -8,9 +8,10 @@ from typing import final
 
 import cv2
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Bool, Float32, Float64, Int
 
 from udccal.cfa import Cfa, cfa_named
+from udccal.restoration.clipped import clipped_tiles, completed
 from udccal.restoration.kernel_grid import KernelGrid
 from udccal.restoration.mosaic_filter import FilterTables, filter_tables, filtered
 from udccal.restoration.plan import PlanOptions
@@ -21,6 +22,7 @@ from udccal.rig import RigDescription
 from udccal.tiers import Tier
 
 Mosaic = Float32[np.ndarray, "rows columns"]
+Clipped = Bool[np.ndarray, "rows columns"]
 Strip = Float32[np.ndarray, "covered_rows columns 3"]
 
 # Every n-th cell of a tile gives the mean noise of its samples.
@@ -106,46 +108,56 @@ class Sharpener:
         """Rows of the sensor that ``apply`` returns."""
         return slice(self.layout.first_row, self.layout.last_row)
 
-    def apply(self, signal_e: Mosaic, variance_e2: Mosaic) -> Strip:
+    def apply(self, signal_e: Mosaic, variance_e2: Mosaic, clipped: Clipped) -> Strip:
         """Demosaic and deblur.
 
         Args:
             signal_e: signal in e-, divided by the wire, without backscatter.
             variance_e2: variance of its noise in e-^2.
+            clipped: samples whose light was more than they say.
 
         Returns:
             the picture in e-, of the rows that the layout covers.
         """
-        solved = self.solved(signal_e, variance_e2)
+        solved = self.solved(signal_e, variance_e2, clipped)
         if self.noise is None:
             return solved.picture
         bands = self.noise.of_tiles(solved.strengths)
         local = cv2.blur(variance_e2, (_LOCAL_PX, _LOCAL_PX), borderType=cv2.BORDER_REFLECT_101)
         return shrunk(solved.picture, solved.noise_e, local[self.rows], bands, self.layout, self.options.workers)
 
-    def solved(self, signal_e: Mosaic, variance_e2: Mosaic) -> Solved:
+    def solved(self, signal_e: Mosaic, variance_e2: Mosaic, clipped: Clipped) -> Solved:
         """Demosaic and deblur as ``apply`` does, but take out no noise."""
         noise_e = self._tile_noise(variance_e2)
         tiles = self.layout.cut(signal_e)
         pictures, strengths = filtered(tiles, noise_e, self.tables, self.layout, self.cfa, self.options.workers)
-        return Solved(self.layout.join(pictures), strengths, noise_e)
+        at, missing = clipped_tiles(clipped, self.layout)
+        if len(at):
+            own = FilterTables(self.tables.matched[at], self.tables.vectors[at], self.tables.values[at])
+            given = noise_e[at], own, self.layout, self.cfa, self.options.workers
+            pictures[at], strengths[at] = filtered(completed(tiles[at], missing, strengths[at], *given), *given)
+        return Solved(self.layout.join(pictures, self.options.workers), strengths, noise_e)
 
     def _tile_noise(self, variance_e2: Mosaic) -> Float32[np.ndarray, "tiles 3"]:
         """Return the sigma of a sample of each colour in each tile."""
-        sites = {channel: [s for s in self.cfa.sites if s.channel == channel] for channel in range(3)}
-        rows, columns = variance_e2.shape
-        found = np.empty((self.layout.count, 3), dtype=np.float32)
-        for index, (x, y) in enumerate(self.layout.centres_px.tolist()):
-            down = _within(y, self.layout.rows, rows)
-            across = _within(x, self.layout.columns, columns)
-            part = variance_e2[down, across]
-            for channel in range(3):
-                planes = [part[site.samples] for site in sites[channel] or self.cfa.sites]
-                found[index, channel] = np.mean([plane[::_SPARSE, ::_SPARSE].mean() for plane in planes])
-        return np.sqrt(np.maximum(found, np.float32(1e-6)))
+        of_site = [_tile_means(variance_e2[site.samples][::_SPARSE, ::_SPARSE], self.layout) for site in self.cfa.sites]
+        channels = np.array([site.channel for site in self.cfa.sites])
+        own = [channels == channel if channel in channels else channels >= 0 for channel in range(3)]
+        found = np.stack([np.mean(np.array(of_site)[mine], axis=0) for mine in own], axis=1)
+        return np.sqrt(np.maximum(found, 1e-6)).astype(np.float32)
 
 
-def _within(centre: float, size: int, most: int) -> slice:
-    """Return the part of a tile on the frame along one axis, from an even sample on."""
-    start = int(np.clip(centre - (size - 1) / 2, 0, max(most - size, 0))) // 4 * 4
-    return slice(start, start + size)
+def _tile_means(some: Float32[np.ndarray, "rows columns"], layout: TileLayout) -> Float64[np.ndarray, " tiles"]:
+    """Return the mean of each tile's part of the frame; ``some`` are samples at even steps over the frame."""
+    sums = cv2.integral(np.ascontiguousarray(some))
+    top, bottom = _ends(layout.tops, layout.rows, layout.frame_rows, some.shape[0])
+    left, right = _ends(layout.lefts, layout.columns, layout.frame_columns, some.shape[1])
+    total = sums[bottom][:, right] - sums[bottom][:, left] - sums[top][:, right] + sums[top][:, left]
+    return (total / np.outer(bottom - top, right - left)).ravel()
+
+
+def _ends(starts: tuple[int, ...], size: int, most: int, count: int) -> Int[np.ndarray, "2 starts"]:
+    """Return the first of ``count`` samples of each tile along one axis of ``most`` px, and the one after its last."""
+    ends = np.clip(np.array([starts, [start + size for start in starts]]), 0, most) * count / most
+    first = np.minimum(np.floor(ends[0]), count - 1)
+    return np.array([first, np.maximum(np.ceil(ends[1]), first + 1)]).astype(int)

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from typing import TypeAlias, final
 
 import cv2
-import jax
 import numpy as np
 from jaxtyping import Float, Float32, Int
 
@@ -76,12 +75,12 @@ def measured_noise(tables: FilterTables, layout: TileLayout, pattern: Pattern, w
     shape = (len(chosen), *(() if colours == 1 else (colours,)), layout.rows, layout.columns)
     noise = np.random.default_rng(0x5EED).standard_normal(shape, dtype=np.float32)
     tiles = np.repeat(noise, len(STRENGTHS), axis=0)
-    picked = jax.tree.map(lambda table: table[repeated], tables)
+    picked = FilterTables(*(table[repeated] for table in (tables.matched, tables.vectors, tables.values)))
     unit = np.ones((len(tiles), 3), dtype=np.float32)
     pictures, _ = filtered(tiles, unit, picked, layout, pattern, workers, np.tile(STRENGTHS, len(chosen)))
     inner = slice(TAPER_PX + BLEND_PX, -TAPER_PX - BLEND_PX)
     with ThreadPoolExecutor(workers) as pool:
-        parts = list(pool.map(lambda picture: _band_variances(picture[:, inner, inner]), pictures))
+        parts = list(pool.map(lambda picture: _band_variances(picture[inner, inner]), pictures))
     return BandNoise(np.stack(parts).reshape(len(chosen), len(STRENGTHS), 3, _LEVELS, _BANDS), probe.reshape(-1))
 
 
@@ -89,10 +88,10 @@ def _probes(count: int) -> Int[np.ndarray, " probes"]:
     return np.unique(np.linspace(0, count - 1, _PROBES).round().astype(int))
 
 
-def _band_variances(picture: Float32[np.ndarray, "3 rows columns"]) -> Float32[np.ndarray, "3 levels bands"]:
+def _band_variances(picture: Float32[np.ndarray, "rows columns 3"]) -> Float32[np.ndarray, "3 levels bands"]:
     found = np.zeros((3, _LEVELS, _BANDS), dtype=np.float32)
-    for colour, plane in enumerate(np.tensordot(_OPPONENT, picture, 1)):
-        rest = np.ascontiguousarray(plane)
+    for colour, plane in enumerate(cv2.split(cv2.transform(picture, _OPPONENT))):
+        rest = plane
         for level in range(_LEVELS):
             bands, smooth = _split(rest)
             found[colour, level] = [float(np.mean(band**2)) for band in bands]
@@ -144,19 +143,17 @@ def _shrink_level(
 ) -> Plane:
     """Shrink a plane's bands at this level, and at coarser ones by what they change."""
     bands, smooth = _split(plane)
-    result = smooth.copy()
+    removed = np.zeros_like(plane)
     down, across = (_Runs.of(s, count, 0.5**level) for s, count in zip(layout.strips, plane.shape, strict=True))
     for index, band in enumerate(bands):
         energy = cv2.blur(band * band, _WINDOW)
         energy += np.float32(1e-20)
-        # 1 - noise / energy, in place: these are the passes over memory that cost most.
-        keep = _largest(noise[:, :, level, index], down, across)
-        keep *= brightness[level]
-        keep /= energy
-        np.subtract(np.float32(1), keep, out=keep)
-        np.maximum(keep, np.float32(0), out=keep)
-        keep *= band
-        result += keep
+        # The part that noise explains, in place: these are the passes over memory that cost most.
+        explained = cv2.divide(brightness[level], energy, dst=energy)
+        _scale_by_tile(explained, noise[:, :, level, index], down, across)
+        np.minimum(explained, np.float32(1), out=explained)
+        cv2.accumulateProduct(explained, band, removed)
+    result = plane - removed
     if level + 1 < _LEVELS and min(plane.shape) > 2 * len(_SMOOTH):
         half = np.ascontiguousarray(smooth[::2, ::2])
         change = _shrink_level(half, noise, layout, brightness, level + 1) - half
@@ -201,11 +198,16 @@ class _Runs:
         return cls(first[begins], last[begins], np.diff(begins, append=count))
 
 
-def _largest(values: Float32[np.ndarray, "tiles_down tiles_across"], down: _Runs, across: _Runs) -> Plane:
-    """Return the value of each sample's tile; of two tiles, the larger one."""
+def _scale_by_tile(
+    plane: Plane, values: Float32[np.ndarray, "tiles_down tiles_across"], down: _Runs, across: _Runs
+) -> None:
+    """Multiply each sample by the value of its tile; of two tiles, the larger one."""
     rows = np.maximum(values[down.first], values[down.last])
     blocks = np.maximum(rows[:, across.first], rows[:, across.last])
-    return np.repeat(np.repeat(blocks, across.samples, axis=1), down.samples, axis=0)
+    begin = 0
+    for line, samples in zip(np.repeat(blocks, across.samples, axis=1), down.samples.tolist(), strict=True):
+        plane[begin : begin + samples] *= line
+        begin += samples
 
 
 def _smooth(

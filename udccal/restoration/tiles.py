@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import functools
 import itertools
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import final
 
@@ -96,21 +97,27 @@ class TileLayout:
         """Return the tiles of a mosaic, which is mirrored at its borders cell by cell."""
         rows = _mirrored(self.tops, self.rows, self.frame_rows, self.cell_rows)
         columns = _mirrored(self.lefts, self.columns, self.frame_columns, self.cell_columns)
-        low = min(int(rows.min()), self.frame_rows - 1)
-        strip = mosaic[low : int(rows.max()) + 1]
         tiles = np.empty((self.count, self.rows, self.columns), dtype=np.float32)
-        for tile, (down, across) in zip(tiles, itertools.product(rows - low, columns), strict=True):
-            np.take(strip[_run(down)], across, axis=1, out=tile, mode="clip")
+        for tile, (down, across) in zip(tiles, itertools.product(rows, columns), strict=True):
+            tile[:] = mosaic[_run(down)][:, _run(across)]
         return tiles
 
     def join(
-        self, pictures: Float32[np.ndarray, "tiles 3 rows columns"]
+        self, pictures: Float32[np.ndarray, "tiles rows columns 3"], workers: int
     ) -> Float32[np.ndarray, "covered_rows frame_columns 3"]:
-        """Blend the tiles' pictures into one of the rows that are covered."""
+        """Blend the tiles' pictures, by some threads, into one of the rows that are covered."""
         joined = np.zeros((*self.covered, 3), dtype=np.float32)
-        for picture, (down, across) in zip(pictures, itertools.product(*self.strips), strict=True):
-            weight = down.weights[:, None] * across.weights
-            joined[down.at, across.at] += cv2.merge(list(picture[:, down.part, across.part] * weight))
+
+        def join_row(down: Strip, row: Float32[np.ndarray, "across rows columns 3"]) -> None:
+            for picture, across in zip(row, self.strips[1], strict=True):
+                weights = cv2.merge([np.outer(down.weights, across.weights)] * 3)
+                cv2.accumulateProduct(picture[down.part, across.part], weights, joined[down.at, across.at])
+
+        rows = list(zip(self.strips[0], self.by_place(pictures), strict=True))
+        with ThreadPoolExecutor(workers) as pool:
+            # Rows of tiles that do not touch at once.
+            for first in (0, 1):
+                list(pool.map(lambda row: join_row(*row), rows[first::2]))
         return joined
 
     @property

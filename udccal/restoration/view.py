@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from pathlib import Path
+
 import jax
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Float64
 
 from udccal.errors import RestorationError
 from udccal.models.geometry import Geometry, VirtualView, panel_directions, project_directions
 from udccal.numerics import in_float64
+from udccal.restoration.prepared import kept
+from udccal.rig import RigDescription
 
 _BORDER_POINTS = 48
 _CENTRES = 15
@@ -16,6 +21,26 @@ _REFINEMENTS = 4
 _BISECTIONS = 24
 
 _project, _directions = jax.jit(project_directions), jax.jit(panel_directions)
+
+
+@dataclass(frozen=True)
+class _Pinhole:
+    """A view's numbers, as they are kept."""
+
+    focal_px: Float64[np.ndarray, ""]
+    principal_point_px: Float64[np.ndarray, "2"]
+
+
+def kept_view(geometry: Geometry, rig: RigDescription, keep: Path | None) -> VirtualView:
+    """Return ``inscribed_view`` for the rig's sizes, kept in a folder; None keeps nothing."""
+    camera, wanted = rig.camera, rig.view
+
+    def find() -> _Pinhole:
+        view = inscribed_view(geometry, camera.columns, camera.rows, wanted.columns, wanted.rows)
+        return _Pinhole(np.asarray(view.focal_px, np.float64), np.asarray(view.principal_point_px, np.float64))
+
+    pinhole = kept(keep, _Pinhole, (geometry, camera, wanted), find)
+    return VirtualView(wanted.columns, wanted.rows, float(pinhole.focal_px), pinhole.principal_point_px)
 
 
 @in_float64

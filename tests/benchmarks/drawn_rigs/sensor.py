@@ -32,6 +32,8 @@ class DrawnSensor:
         part = np.s_[y : y + (rows or len(self.response)), x : x + (columns or self.response.shape[1])]
         rate = rate[part] if rate.shape == self.response.shape else rate
         electrons = self._counted((rate * self.response[part] + noise.dark_e_per_s) * exposure_s)
+        # The bend is a parabola, which would fall again far beyond the full well.
+        electrons = np.minimum(electrons, 2 * noise.well_e)
         electrons = np.minimum(electrons * (1 - noise.bend * electrons / noise.well_e), noise.well_e)
         electrons = electrons + self.offset[part] + self._read(electrons.shape, self.restless[part])
         rows_DN = rng.normal(0, noise.row_DN, (len(electrons), 1))

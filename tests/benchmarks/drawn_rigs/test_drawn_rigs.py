@@ -17,6 +17,7 @@ from tests.benchmarks.drawn_rigs.judge import Judged, judge
 from tests.benchmarks.drawn_rigs.one import Finished
 from tests.benchmarks.drawn_rigs.openings import area_below, openings
 from tests.benchmarks.drawn_rigs.optics import directions, footprint
+from tests.benchmarks.drawn_rigs.sensor import DrawnSensor
 from tests.benchmarks.drawn_rigs.session import require_own, write_session
 from tests.benchmarks.drawn_rigs.wire import open_part
 from udccal.calibration import calibrate
@@ -81,6 +82,13 @@ def test_kernels_are_even_and_keep_their_light() -> None:
         rig, spread, rig.lens.centre_px, middle[0] + np.arange(-10, 11), middle[1] + np.arange(-20, 21)
     )
     assert ((light.sum(axis=(0, 1)) > 0.85) & (light.sum(axis=(0, 1)) < 1.0)).all()
+
+
+def test_more_light_is_never_darker() -> None:
+    rig = draw(1000)
+    sensor = DrawnSensor(replace(rig, noise=replace(rig.noise, bend=0.02)))
+    frames = [sensor.frame(np.full((rig.rows, rig.columns), light), 1.0).mean() for light in (1e2, 1e4, 1e6, 1e8)]
+    assert (np.diff(frames) >= 0).all()
 
 
 def test_the_program_knows_nothing_of_udccal() -> None:

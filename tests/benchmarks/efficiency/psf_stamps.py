@@ -86,7 +86,7 @@ def make_truth(rng: np.random.Generator) -> Truth:
     images = (draw @ rng.standard_normal((NODES**2, 2))).T.reshape(2, NODES, NODES)
     while True:
         warp = rng.standard_normal((5, 2, 2)) / np.sqrt(OF_MAP).reshape(5, 2, 2)
-        field = PsfField(np.stack([base, *images])[None], warp[None], np.zeros((0, 5, 2)), 1.0)
+        field = PsfField(np.stack([base, *images])[None], warp[None], np.zeros((0, 5, 2)), np.eye(3), 1.0)
         # The model class is that of the nodes: those of the fit, whose number follows from the map, are the truth's.
         if grid_size((SIZE, SIZE), 1.0, reach(field, unit)) == (NODES, NODES):
             break

@@ -19,7 +19,7 @@ from tests.benchmarks.robust.family import MOST_OVER_BOUND, WORST_Z, Family, Kin
 from tests.benchmarks.rows import Row, at_most, table, write_json
 
 # Each module has ``FAMILY``.
-MODULES = ("noise", "hdr", "geometry", "wire", "backscatter", "wrong")
+MODULES = ("noise", "hdr", "geometry", "wire", "backscatter", "stamps", "wrong")
 _PAGE = Path(__file__).resolve().parents[3] / "docs" / "numerics.md"
 _LISTED = 5
 

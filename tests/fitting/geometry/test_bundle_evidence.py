@@ -157,3 +157,17 @@ def test_coarse_corners_of_a_real_board_are_no_poor_fit() -> None:
     points = board_points_mm(scene.spec)
     found = calibrated([points[v.corners.ids] for v in views], [v.corners.xy for v in views], scene.size)
     assert found.status is FitStatus.CONVERGED
+
+
+@pytest.mark.medium
+def test_sigmas_hold_where_small_coefficients_are_dropped() -> None:
+    """Tangential terms that BIC drops in most draws move the centre by twice the sigma of one order."""
+    z = []
+    for seed in range(12):
+        small = np.random.default_rng([seed, 5]).normal(0, 4e-4, 2)
+        scene = sight(seed=seed, views=6, distortion=np.array([-0.1, 0.02, *small, 0.0]), sigma_px=0.2)
+        boards, images, _ = arrays(scene, seed)
+        found = calibrated(boards, images, scene.size)
+        centre = np.array(found.intrinsics.principal_point_px)
+        z.append((centre - scene.camera.principal_point_px) / np.sqrt(np.diag(found.cov)[2:4]))
+    assert np.sqrt(np.mean(np.square(z))) < 1.6

@@ -231,6 +231,27 @@ def test_a_wrong_black_level_is_told_by_dark_samples() -> None:
     assert "+0.6 DN off the black level" in wrong.notes[-1]
 
 
+def test_a_wrong_black_level_is_told_where_no_sample_is_dark() -> None:
+    frames = bracket(3e4, EXPOSURES[2:5], 8)
+    assert merge_bracket(frames, EXPOSURES[2:5], NOISE).status is FitStatus.CONVERGED
+    wrong = merge_bracket(frames, EXPOSURES[2:5], replace(NOISE, black_DN=63.3))
+    assert wrong.status is FitStatus.POOR_FIT
+    assert "DN off the black level" in wrong.notes[-1]
+
+
+def test_a_frame_of_other_light_is_told_where_exposures_lie_far_apart() -> None:
+    # Some 300 electrons fill a pixel: none has three samples of many electrons.
+    noise = replace(NOISE, K_DN_per_e=12.0, sigma_d_e=1.0, dark_current_e_per_s=0.0)
+    rates, times = np.geomspace(1e2, 2e5, 9000).reshape(90, 100), 1e-3 * 6.0 ** np.arange(4)
+    for lamp, status in ((1.0, FitStatus.CONVERGED), (0.85, FitStatus.POOR_FIT)):
+        rng = np.random.default_rng(12)
+        light = np.where(np.arange(4)[:, None, None] == 0, lamp, 1.0) * rates * times[:, None, None]
+        noisy = 64.3 + 12.0 * (rng.poisson(light) + rng.standard_normal(light.shape))
+        merge = merge_bracket(np.clip(np.rint(noisy), 0, 3960).astype(np.uint16), times, noise)
+        assert merge.status is status
+        assert any("light of frame 0 differs" in note for note in merge.notes) is (lamp != 1.0)
+
+
 def test_a_psf_of_doubted_brackets_says_so() -> None:
     told = psf_notes(PsfData(None, 3, doubted=("psf/1: Check K.",)), True, "", ())
     assert "1 of 3 brackets are in doubt. psf/1: Check K." in told

@@ -11,6 +11,7 @@ import pytest
 from tests.fitting.psf_stamps.test_psf_stamps import make
 from udccal.fitting.psf_stamps.data import Stamps, StampsRules
 from udccal.fitting.psf_stamps.equations import (
+    Band,
     divided,
     factor,
     laplace,
@@ -26,29 +27,28 @@ from udccal.fitting.psf_stamps.search import Evidence, improve, start
 _ROWS, _N, _RULES = 6, 5, StampsRules()
 
 
-def dense(band: np.ndarray) -> np.ndarray:
+def dense(band: Band) -> np.ndarray:
     """All of a symmetric matrix whose upper half is a band."""
-    rows, n = band.shape[:2]
-    out = np.zeros((rows * n, (rows + TAPS) * n))
-    for i in range(rows):
-        out[i * n : (i + 1) * n, i * n : (i + TAPS) * n] = band[i]
-        out[i * n : (i + 1) * n, i * n : (i + 1) * n] = np.triu(band[i, :, :n])
-    out = out[:, : rows * n]
-    return out + np.triu(out, 1).T
+    size, at = sum(len(row) for row in band), 0
+    out = np.zeros((size, size))
+    for row in band:
+        out[at : at + len(row), at : at + row.shape[1]] = row
+        at += len(row)
+    return np.triu(out) + np.triu(out, 1).T
 
 
-def band(seed: int) -> np.ndarray:
-    """Positive definite."""
-    out = np.random.default_rng(seed).standard_normal((_ROWS, _N, TAPS * _N))
-    out[:, :, :_N] = 40.0 * np.eye(_N)
-    for i in range(1, TAPS):
-        out[-i, :, i * _N :] = 0
-    return out
+def band(seed: int) -> Band:
+    """Positive definite, of rows of different length."""
+    rng, sizes = np.random.default_rng(seed), [_N] * 3 + [_N - 2] * (_ROWS - 3)
+    rows = [rng.standard_normal((n, sum(sizes[i : i + TAPS]))) for i, n in enumerate(sizes)]
+    for row in rows:
+        row[:, : len(row)] = 40.0 * np.eye(len(row))
+    return tuple(rows)
 
 
 def stamps_and_state() -> tuple[Stamps, State]:
     stamps, _ = make(1, count=12, size=9)
-    return stamps, start(stamps, _RULES).with_degrees(1, 1, _RULES)
+    return stamps, start(stamps, _RULES).with_map(1, _RULES).with_images(np.eye(3), _RULES)
 
 
 @pytest.fixture
@@ -75,25 +75,27 @@ def test_factor_and_solutions_are_those_of_the_dense_matrix() -> None:
     found = factor(band(3))
     upper = np.triu(dense(found))
     np.testing.assert_allclose(upper.T @ upper, matrix, atol=1e-10)
-    right = np.random.default_rng(4).standard_normal((_ROWS * _N, 3))
+    right = np.random.default_rng(4).standard_normal((len(matrix), 3))
     solution = divided(found, divided(found, right.copy(), True), False)
     np.testing.assert_allclose(matrix @ solution, right, atol=1e-10)
 
 
 def test_a_matrix_that_is_not_positive_is_refused() -> None:
     broken = band(3)
-    broken[4, :, :_N] -= 200 * np.eye(_N)
+    broken[4][:, : len(broken[4])] -= 200 * np.eye(len(broken[4]))
     with pytest.raises(np.linalg.LinAlgError, match="not positive definite"):
         factor(broken)
 
 
-def test_sums_over_samples_are_those_of_the_design(weighted: tuple[Stamps, State, Weighted]) -> None:
+@pytest.mark.parametrize("margin", [0, 4])
+def test_sums_over_samples_are_those_of_the_design(weighted: tuple[Stamps, State, Weighted], margin: int) -> None:
     stamps, state, seen = weighted
     grid, basis = state.field.nodes.shape[2:], polynomials(stamps.unit, 1)
     seen.weight[2, 5] = 0.0
-    taps = design(seen, basis, grid)
+    kept = replace(state, margin=margin).kept
+    taps = design(seen, basis, grid)[:, kept.ravel()]
     expected = taps.T @ (seen.weight.ravel()[:, None] * taps)
-    found = node_sums(basis, seen, np.flatnonzero(seen.weight), grid)
+    found = node_sums(basis, seen, np.flatnonzero(seen.weight), kept)
     np.testing.assert_allclose(dense(found), expected, atol=1e-10 * np.abs(expected).max())
 
 
@@ -101,11 +103,12 @@ def test_right_sides_and_blocks_are_those_of_the_jacobian(weighted: tuple[Stamps
     stamps, state, seen = weighted
     _, shared = shared_by(state.field, stamps.unit, 0)
     taps = design(seen, polynomials(stamps.unit, 1), state.field.nodes.shape[2:])
-    stars, samples, own = seen.seen.jacobian.shape
+    own_jacobian = np.concatenate([seen.seen.jacobian, np.ones((*seen.weight.shape, 1))], axis=2)
+    stars, samples, own = own_jacobian.shape
     spread = np.zeros((stars, samples, stars, own))
-    spread[np.arange(stars), :, np.arange(stars)] = seen.seen.jacobian
+    spread[np.arange(stars), :, np.arange(stars)] = own_jacobian
     jacobian = spread.reshape(stars * samples, -1) @ shared.toarray()
-    normal, weight = normal_equations(stamps, state.field, seen, 0), seen.weight.ravel()[:, None]
+    normal, weight = normal_equations(stamps, state, seen, 0), seen.weight.ravel()[:, None]
     for found, expected in (
         (normal.cross, taps.T @ (weight * jacobian)),
         (normal.dense, jacobian.T @ (weight * jacobian)),
@@ -118,7 +121,7 @@ def test_right_sides_and_blocks_are_those_of_the_jacobian(weighted: tuple[Stamps
 def test_the_jacobian_of_the_dense_block_is_that_of_the_expectation() -> None:
     stamps, _ = make(1, count=12, size=9)
     mosaic = replace(stamps, channel=np.arange(12 * 81).reshape(12, 9, 9) % 3)
-    state = start(mosaic, _RULES).with_degrees(1, 1, _RULES)
+    state = start(mosaic, _RULES).with_map(1, _RULES).with_images(np.eye(3), _RULES)
     size = state.maps_from + len(state.maps)
     change = 1e-5 * np.random.default_rng(2).standard_normal(size)
     whole = np.concatenate([change, np.zeros(np.size(state.field.nodes))])
@@ -128,7 +131,7 @@ def test_the_jacobian_of_the_dense_block_is_that_of_the_expectation() -> None:
     for plane in range(3):
         index, shared = shared_by(state.field, mosaic.unit, plane)
         own = (shared @ change[index]).reshape(12, -1)
-        expected = np.einsum("kso,ko->ks", seen.seen.jacobian, own)
+        expected = np.einsum("kso,ko->ks", seen.seen.jacobian, own[:, :-1]) + own[:, -1:]
         seen_here = mosaic.by_plane[plane] & (seen.weight > 0)
         found = (ends[0] - ends[1])[seen_here] / 2
         np.testing.assert_allclose(found, expected[seen_here], atol=1e-4 * np.abs(expected).max())
@@ -148,9 +151,10 @@ def test_a_star_that_is_left_out_brings_nothing() -> None:
 
 def test_the_mode_and_its_covariance_are_those_of_equations_written_out() -> None:
     stamps, state = stamps_and_state()
+    state = replace(state, precisions=np.append(state.precisions[:-2], [0.2, 0.7]))
     with jax.enable_x64(True):
         found, seen = laplace(stamps, state), expectation(stamps, state)
-        normal = normal_equations(stamps, state.field, seen, 0)
+        normal = normal_equations(stamps, state, seen, 0)
     size, nodes = state.maps_from + len(state.maps), len(normal.right_nodes)
     matrix, pull = np.zeros((2, size + nodes, size + nodes)), np.zeros(size + nodes)
     matrix[0, :size, :size], matrix[0, size:, size:] = normal.dense, dense(normal.band)
@@ -158,14 +162,17 @@ def test_the_mode_and_its_covariance_are_those_of_equations_written_out() -> Non
     scale = np.diag(1 / state.size[0].ravel())
     matrix[1, size - 8 : size, size - 8 : size] = np.diag(state.precisions[state.map_groups])
     rough = laplacian(*state.size.shape[1:])[0].toarray() @ scale
-    for term, (a, b) in enumerate(state.of_images[0, [0, 1, 1]]):
+    for term, (a, b) in enumerate(state.of_images[0]):
         image = np.s_[size + term :: 3]
         matrix[1, image, image] = a * scale**2 + b * rough.T @ rough
+    background = np.arange(3, 48, 4)
+    mean, scatter = state.precisions[-2:]
+    matrix[1][np.ix_(background, background)] = scatter * np.eye(12) + (mean - scatter) / 12
     here = np.concatenate([np.zeros(size), np.reshape(state.field.nodes, (3, -1)).T.ravel()])
     pull[: len(normal.right_dense)], pull[size:] = normal.right_dense, normal.right_nodes
     held = np.zeros((3, size + nodes))
     for j in range(3):
-        own = np.arange(j, 36, 3)
+        own = np.arange(j, 48, 4)
         held[j, own] = np.sqrt(normal.dense.diagonal()[own].mean())
     whole = matrix.sum(axis=0) + held.T @ held
     mode = np.linalg.solve(whole, pull - matrix[1] @ here)
@@ -186,7 +193,8 @@ def test_the_prior_is_that_of_its_eigenvalues() -> None:
     np.testing.assert_allclose(np.linalg.eigvalsh((matrix.T @ matrix).toarray()), np.sort(eigenvalues), atol=1e-9)
     scale = 1 / state.size[0].ravel()
     volume, squares = float(np.log(state.precisions[state.map_groups]).sum()), 0.0
-    for image, (a, b) in zip(state.field.nodes[0], state.of_images[0, [0, 1, 1]], strict=True):
+    volume += np.log(state.precisions[-2:]) @ [1, 11]
+    for image, (a, b) in zip(state.field.nodes[0], state.of_images[0], strict=True):
         prior = (a * np.eye(len(scale)) + b * (matrix.T @ matrix).toarray()) * np.outer(scale, scale)
         volume += np.linalg.slogdet(prior)[1]
         squares += image.ravel() @ prior @ image.ravel()

@@ -1,4 +1,4 @@
-"""Fields of known order: the orders that the data choose are those, of map and images alike."""
+"""Fields of known order: the data choose as many images as the truth has; a map alone needs no further image."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ import pytest
 from tests.fitting.psf_stamps.test_psf_stamps import READ_E, SENSOR, places
 from udccal.fitting.psf_stamps.data import Stamps, StampsRules
 from udccal.fitting.psf_stamps.fit import fit_psf_stamps
-from udccal.fitting.psf_stamps.search import Found, Orders, coarse, improve
+from udccal.fitting.psf_stamps.images import with_more_images
+from udccal.fitting.psf_stamps.search import Found, coarse, improve
 from udccal.numerics import in_float64
 
 # (map degree, image degree) of the truths.
@@ -43,26 +44,40 @@ def made(order: tuple[int, int], seed: int) -> Stamps:
     return Stamps(noisy, middle, READ_E)
 
 
-def chosen(order: tuple[int, int], seed: int) -> tuple[int, int]:
-    """Degrees of map and images that a fit comes to."""
-    return fit_psf_stamps(made(order, seed)).or_raise().term.field.degrees
+def chosen(order: tuple[int, int], seed: int) -> int:
+    """Number of images that a fit comes to."""
+    return int(fit_psf_stamps(made(order, seed)).or_raise().term.field.nodes.shape[1])
 
 
 @in_float64
-def fitted(order: tuple[int, int], degrees: tuple[int, int]) -> tuple[Stamps, Found]:
-    """Stamps of a field of known order, and a fit of other degrees."""
+def fitted(order: tuple[int, int], map_degree: int) -> tuple[Stamps, Found]:
+    """Stamps of a field of known order, and a fit of one image behind a map of some degree."""
     stamps = made(order, 3)
-    state = coarse(stamps, RULES, Orders(*degrees, 1.0))
-    return stamps, improve(stamps, state.with_degrees(*degrees, RULES), RULES, 12)
+    return stamps, improve(stamps, coarse(stamps, RULES, map_degree), RULES, 12)
 
 
 @pytest.mark.medium
-def test_a_field_that_does_not_change_needs_no_order() -> None:
-    assert chosen((0, 0), 1) == (0, 0)
+def test_a_field_that_does_not_change_needs_one_image_and_no_map() -> None:
+    field = fit_psf_stamps(made((0, 0), 1)).or_raise().term.field
+    assert field.nodes.shape[1] == 1
+    assert np.abs(field.warp).max() < 0.005
+
+
+def test_a_map_alone_needs_one_image_and_a_lobe_that_fades_another() -> None:
+    assert [chosen(order, 2) for order in ((2, 0), (0, 1))] == [1, 2]
+
+
+def test_new_images_have_strengths_that_the_residuals_show() -> None:
+    stamps, fit = fitted((0, 1), 0)
+    state = in_float64(with_more_images)(stamps, fit.place, 3, RULES)
+    x = stamps.unit[:, 0] - stamps.unit[:, 0].mean()
+    assert state.field.nodes.shape[1] == 2
+    assert abs(np.corrcoef(state.field.strengths(stamps.unit)[:, 1], x)[0, 1]) > 0.98
+    np.testing.assert_array_equal(state.field.nodes[:, 1:], 0.0)
 
 
 def test_every_step_raises_the_evidence_and_the_last_ones_are_the_same_from_elsewhere() -> None:
-    stamps, fit = fitted((1, 0), (1, 0))
+    stamps, fit = fitted((1, 0), 1)
     again = in_float64(improve)(stamps, replace(fit.place, light_e=0.97 * fit.place.light_e), RULES, 12)
     assert again.converged
     assert again.iterations > 1
@@ -72,8 +87,8 @@ def test_every_step_raises_the_evidence_and_the_last_ones_are_the_same_from_else
 
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
-def test_orders_are_right_in_95_of_100_runs() -> None:
+def test_numbers_of_images_are_right_in_95_of_100_runs() -> None:
     runs = [(order, seed) for seed in range(_RUNS // len(ORDERS)) for order in ORDERS]
-    wrong = [(order, seed, found) for order, seed in runs if (found := chosen(order, seed)) != order]
+    wrong = [(order, seed, found) for order, seed in runs if (found := chosen(order, seed)) != 1 + order[1]]
     assert len(runs) == _RUNS
     assert len(wrong) <= _RUNS - _RIGHT, wrong

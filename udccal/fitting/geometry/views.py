@@ -80,6 +80,7 @@ def calibrate_views(
     free = ORDERS[orders.best.name]
     final, points, dof = _rescaled(orders.best.fit, points, free, known)
     evidence, cov = weigh(final, points, free, image_size, dof, rules)
+    cov = cov if by_prior else cov + _between_orders(orders, 2 * int(points.used.sum()), rules)
     bundle = Bundle(final.place.intrinsics, facing(final.place.poses))
     residuals_px = linearised(bundle, points)[0]
     status, advice = status_of(final, cov, rms_px(residuals_px, points), image_size, rules)
@@ -270,6 +271,21 @@ def _choose_order(full: Solved, points: Points, prior: Prior, rules: GeometryRul
     known = Intrinsics.of(np.diag(full.equations.cov()) * np.diag(prior.precision))
     by_prior = bool(max(*known.focal_px, *known.principal_point_px) > rules.prior_share)
     return (Choice(tried[-1], tuple(tried)) if by_prior else choose(tried)), by_prior
+
+
+def _between_orders(orders: Choice[Solved], samples: int, rules: GeometryRules) -> Float[np.ndarray, "n n"]:
+    """Spread of the orders' solutions about the chosen one, by Akaike's weights (Buckland et al., Biometrics 53, 1997).
+
+    BIC drops coefficients that are small and not 0. The others then take their part, which no order's own error shows.
+    """
+    further = [2 * place * np.log(rules.further_order) for place in range(len(orders.tried))]
+    parameters = np.array([one.parameters for one in orders.tried])
+    akaike = np.array([one.criterion for one in orders.tried]) - further - (np.log(samples) - 2) * parameters
+    weight = np.exp(-0.5 * (akaike - akaike.min()))
+    places = [one.fit.place for one in (orders.best, *orders.tried)]
+    chosen, *every = [np.concatenate([at.intrinsics, at.poses.ravel()]) for at in places]
+    away = np.array(every) - chosen
+    return np.asarray((away.T * (weight / weight.sum())) @ away)
 
 
 def _criterion(solved: Solved, points: Points, parameters: int) -> float:

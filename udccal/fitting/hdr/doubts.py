@@ -26,7 +26,7 @@ def checked(frames: object, exposures_s: object) -> Float[np.ndarray, " exposure
     return times
 
 
-def doubts(scatter: float, black_DN: float, unlike: list[int]) -> list[str]:
+def doubts(scatter: float, black_DN: float, unlike: list[int], off: list[int]) -> list[str]:
     """Sentences for samples that contradict the noise model, or one another."""
     found = []
     if scatter != 1:
@@ -45,6 +45,11 @@ def doubts(scatter: float, black_DN: float, unlike: list[int]) -> list[str]:
             f"The light of frames {frames} differs, and no other frame tells which one is right: frame {unlike[0]} is "
             "left out. Check their exposure times, or take exposures that lie closer together."
         )
+    found += [
+        f"The light of frame {frame} differs from that of the frames beside it, and too few pixels have a third sample "
+        "that tells which one is right. Check their exposure times, or take exposures that lie closer together."
+        for frame in (off if not found else [])
+    ]
     return found
 
 

@@ -110,14 +110,14 @@ def merge_bracket(
         unlike = bad.tolist() if len(bad) > 1 else unlike
         merged = bracket.merged(dropped)
     hits, black_e = bracket.mend_hits(merged, dropped), bracket.black_off(merged, dropped)
-    scatter = bracket.scatter(merged, dropped)
+    scatter, unsure = bracket.scatter(merged, dropped), bracket.light_off(merged, dropped)
     # In place: copies of a full frame would cost as much as a third of the merging.
     for values in (merged.rate, merged.sigma):
         values /= np.float32(unit)
     unknown = merged.used <= 0
     merged.rate[unknown], merged.sigma[unknown] = 0.0, UNKNOWN_SIGMA
     notes = [f"{unknown.sum()} of {unknown.size} pixels have no sample that could be used."] if unknown.any() else []
-    doubted = doubts(scatter, black_e * float(np.asarray(noise.K_DN_per_e)), unlike)
+    doubted = doubts(scatter, black_e * float(np.asarray(noise.K_DN_per_e)), unlike, unsure)
     notes += doubted
     if rounded_e > rules.black_off * math.sqrt(sensor.floor_e2):
         notes.append("Dark noise is far below a code: rounding moves dark pixels by up to half a code. Raise the gain.")
@@ -239,6 +239,22 @@ class _Bracket:
         found = float(np.sum(chi2[clear])) / max(dof, 1e-9)
         return found if abs(found - 1) > max(self.rules.scatter_off, 6 * math.sqrt(2 / max(dof, 1e-9))) else 1.0
 
+    def light_off(self, merged: BlockMerge, dropped: Bool[np.ndarray, "n 1"]) -> list[int]:
+        """The frame whose light is off most, where it is off by too much in pixels of two samples; or none.
+
+        Where exposures lie far apart, few pixels have a third sample that tells which frame is wrong.
+        """
+        _, light, mean, variance = self._lit(merged, 2)
+        sigma, signal = np.sqrt(variance), mean - float(self.sensor.dark_e_per_s) * self.times[:, None]
+        clear = ~dropped & (mean + 5 * sigma < float(self.sensor.level_e)) & (3 * sigma < signal)
+        # Hits count as samples at the limit.
+        most = self.rules.believed_sigma * sigma
+        weight = np.where(clear, signal / variance, 0.0)
+        information = np.maximum((weight * signal).sum(axis=1), 1e-30)
+        off = np.abs((weight * np.clip(light - mean, -most, most)).sum(axis=1) / information)
+        score = np.where(off > self.rules.frame_off, off * np.sqrt(information), 0.0)
+        return [int(score.argmax())] if score.max() > self.rules.frame_sigma else []
+
     def black_off(self, merged: BlockMerge, dropped: Bool[np.ndarray, "n 1"]) -> float:
         """The error of the black level that dark samples show, in electrons; 0 where it is not too much.
 
@@ -246,7 +262,7 @@ class _Bracket:
         """
         _, light, mean, variance = self._lit(merged, 2, -np.inf)
         times, floor = self.times[:, None].astype(np.float64), float(self.sensor.floor_e2)
-        weight = np.where(~dropped & (mean < 3 * floor), 1 / variance, 0.0)
+        weight = np.where(~dropped & (mean < 30 * floor), 1 / variance, 0.0)
         light_taken = times * (weight * times).sum(axis=0) / np.maximum((weight * times**2).sum(axis=0), 1e-30)
         slope = 1 - light_taken
         information = max(float(np.sum(weight * slope)), 1e-30)

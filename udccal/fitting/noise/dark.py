@@ -245,6 +245,7 @@ def fit_dark_terms(
         # Coarse codes hardly show the distribution, and all that they tell depends on it.
         depends = (free.values - normal.values) * np.array([1.0, 1.0, 1.0, 1.0, 0.0])
         fit = replace(fit, cov=fit.cov + np.outer(depends, depends))
+        fit.cov[2, 2] += (0.5 * fit.values[2]) ** 2
         row = replace(row, variance=row.variance + (0.5 * row.value) ** 2)
     spread2, variance = float(fit.values[3]), float(fit.cov[2, 2])
     read_DN2 = Quantity(float(fit.values[2]), variance)

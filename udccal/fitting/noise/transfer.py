@@ -231,6 +231,16 @@ def _fitted(problem: TransferProblem, start: Five) -> Attempt[TransferFit]:
     return Attempt(order.name, parameters, criterion, fit)
 
 
+def _rounding_off(variance_DN2: Grid, rounding_DN2: float) -> Grid:
+    """Relative mean square by which variances of rounded codes differ from noise plus q^2/12 (Widrow and Kollar, 2008).
+
+    It is that of the first harmonic, whose phase is the mean's place between two codes: all bins of a level share it.
+    """
+    noise = np.maximum(variance_DN2 / (12 * rounding_DN2) - 1 / 12, 0.0)
+    most = (1 / np.pi**2 + 4 * noise) * np.exp(-2 * np.pi**2 * noise)
+    return np.asarray(0.5 * (most * 12 * rounding_DN2 / np.maximum(variance_DN2, 1e-9)) ** 2)
+
+
 def choose_transfer(levels: Levels, dark: DarkVariance, full_DN: float, rules: NoiseRules) -> Choice[TransferFit]:
     """The order with the least BIC, its fit, and the criterion of every order; at least one bin is usable."""
     # A straight line with rough weights, and the response through the origin.
@@ -242,6 +252,7 @@ def choose_transfer(levels: Levels, dark: DarkVariance, full_DN: float, rules: N
     start = np.array([K, V0, 0.0, gain if gain > 0 else 1.0, 0.0])
     # A variance and the mean of its bin have correlated errors for Poisson counts, and independent ones for read noise.
     apart = K**2 * max(V0, 0.0) / levels.samples / np.maximum(levels.variance_DN2, 1e-9) ** 2
+    apart += _rounding_off(levels.variance_DN2, dark.rounding_DN2) * levels.usable.sum(axis=1, keepdims=True)
     levels = replace(levels, dof=levels.dof / (1 + 0.5 * levels.dof * apart))
     sizes = np.abs(start) + np.array([1e-9, dark.rounding_DN2 + 1e-3, 0.1 / full_DN, 1e-9, max(light.max(), 1e-30)])
     simplest = TransferProblem(levels, dark, Order(), rules.most_bent / full_DN, sizes)

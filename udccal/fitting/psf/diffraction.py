@@ -170,10 +170,10 @@ def _refine(
         if enough < 1.0 and moved < 0.1:
             return fit
         whole, place, enough = fit, solution.place, 1e-2 if moved < 1.0 else 1.0
-        # A change of less than a sigma is small enough for the interference set up before, of five for derivatives.
+        # A change of less than a sigma is small enough for the interference set up before, of five for its derivatives.
         if moved >= 1.0:
             problem = problem.about(place.theta, place.own, moved < 5.0)
-            place = problem.at(place.theta, place.own, place if moved < 5.0 else None)
+            place = problem.at(place.theta, place.own)
     # Weights that go on to change the parameters give no minimum.
     return replace(fit, solution=replace(fit.solution, converged=False))
 

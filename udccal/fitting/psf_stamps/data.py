@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float, Int
 
 from udccal.cfa import cfa_named
 from udccal.errors import FitError, found_instead
+from udccal.fitting.engine.robust import robust_sigma
 from udccal.result import FitStatus
 
 _FARTHEST_PX = 2**20
@@ -117,20 +118,28 @@ class StampsRules:
         outlier_sigma: samples further off, in robust sigma, are left out.
         star_ratio, star_lost: a stamp is left out if its mean square exceeds the median's by the first factor, or if it
             loses more than the second fraction of its samples.
-        coarse: degrees of map and images, and the assumed relative model error, of the fits that lead from a round
-            star to a field.
+        coarse: degrees of the map and the assumed relative model error, of the fits that lead from a round star to a
+            field.
         spacings_px: spacings of nodes, the coarsest first.
+        highest: largest degrees of the map and of the images' strengths.
+        image_beyond, images_at_once: new images are as many as this, of those whose significance is at least this part
+            of the best one's.
+        narrow_px: kernels whose Gaussian of the same area is narrower start with denser nodes.
+        most_work: rows of nodes times the cube of unknowns in a row; images other than the first have nodes in the
+            middle of the grid only, so many that a factor takes a quarter of a second and 0.1 GB.
+        most_images: largest number of images that a search tries.
         worth_finer: expected decrease of the criterion from which denser nodes are tried.
-        highest: largest degrees of map and images.
         steps_to_compare, steps_to_end: most steps of one fit, for orders that are compared, and for the chosen one.
-        evidence: a fit has converged when the last step gained less log evidence than this, and the next predicts less
-            than half of it in log posterior. Near the maximum, steps still gain hundredths.
-        beyond_doubt: log posterior; maps of lower degrees that are expected to lose more are not fitted.
-        first_image: precisions before the data: of images of degree 0 (size, roughness) and of higher ones.
+        evidence, evidence_of_nodes: a fit has converged when the last step gained less log evidence than this (or than
+            the second number times the nodes), and the next predicts less than half of it in log posterior: 0.03 is a
+            quarter of a sigma for each node. Every sigma includes the way that is left.
+        beyond_doubt: log posterior; a mode further away is not trusted.
+        first_image: precisions before the data: of the first image (size, roughness), and of further ones.
         first_map, first_lateral: the same of maps of degrees 1 and 2, and of lateral colour.
-        new_image, new_map: the same of new degrees, relative to the degree below, and absolute. They start nearly
-            absent; one update makes them appear where the data support them.
+        new_map: the same of higher degrees. They start nearly absent; one update makes them appear where the data
+            support them.
         draws: numbers of posterior draws: for updates of precisions, and for error bars (5 % of a sigma).
+        parts: of the stars, of which one at a time is left out to see the errors of the others' field.
         inflate_above: reduced chi-squared above which every sigma grows with its root. Counts are skewed, so that
             their chi-squared scatters more than that of normal samples.
         poor_above: reduced chi-squared above which the fit is poor.
@@ -141,20 +150,26 @@ class StampsRules:
     outlier_sigma: float = 5.0
     star_ratio: float = 3.0
     star_lost: float = 0.2
-    coarse: tuple[tuple[int, int, float], ...] = ((0, 0, 0.3), (0, 0, 0.1), (2, 0, 0.05), (2, 1, 0.02))
-    spacings_px: tuple[float, ...] = (1.0, 0.75, 0.5)
+    coarse: tuple[tuple[int, float], ...] = ((0, 0.3), (0, 0.1), (2, 0.05), (4, 0.02))
+    spacings_px: tuple[float, ...] = (1.0, 0.7, 0.5, 0.35)
+    highest: tuple[int, int] = (4, 4)
+    image_beyond: float = 0.1
+    images_at_once: int = 3
+    narrow_px: float = 0.7
+    most_work: float = 3e8
+    most_images: int = 10
     worth_finer: float = 200.0
-    highest: tuple[int, int] = (4, 3)
-    steps_to_compare: int = 1
-    steps_to_end: int = 12
+    steps_to_compare: int = 2
+    steps_to_end: int = 5
     evidence: float = 2.0
+    evidence_of_nodes: float = 0.03
     beyond_doubt: float = 200.0
     first_image: tuple[tuple[float, float], tuple[float, float]] = ((1e-3, 1e-4), (30.0, 30.0))
     first_map: float = 100.0
     first_lateral: float = 10.0
-    new_image: float = 20.0
     new_map: float = 3e4
     draws: tuple[int, int] = (16, 192)
+    parts: int = 4
     inflate_above: float = 1.05
     poor_above: float = 2.0
 
@@ -181,13 +196,15 @@ def mosaic_channels(
     return pattern.channels[y[:, :, None] % pattern.rows, x[:, None, :] % pattern.columns]
 
 
-def centroids(stamps: Stamps, window_px: float) -> Float[np.ndarray, "stars 2"]:
+def centroids(
+    stamps: Stamps, background_e: Float[np.ndarray, "stars planes"], window_px: float
+) -> Float[np.ndarray, "stars 2"]:
     """Return each star's centroid, (x, y) in px, under a Gaussian that follows it, from all colours together."""
     centre = np.zeros((len(stamps.unit), 2))
     for _ in range(15):
         off = stamps.offset_px - centre[:, None]
         weight = stamps.by_plane * np.exp(-0.5 * (off**2).sum(axis=2) / window_px**2)
-        light = weight * np.maximum(stamps.value_e, 0.0)
+        light = weight * np.maximum(stamps.value_e - background_e.T[..., None], 0.0)
         # Subtract the mean under the weight alone: samples of a mosaic do not lie evenly about the centre.
         mean = np.einsum("pks,ksi->pki", weight, off) / np.maximum(weight.sum(axis=2), 1e-300)[..., None]
         top = np.einsum("pks,ksi->ki", light, off) - (light.sum(axis=2)[..., None] * mean).sum(axis=0)
@@ -196,17 +213,46 @@ def centroids(stamps: Stamps, window_px: float) -> Float[np.ndarray, "stars 2"]:
     return centre
 
 
-def light_of(stamps: Stamps) -> Float[np.ndarray, "stars planes"]:
+def backgrounds(stamps: Stamps) -> Float[np.ndarray, "stars planes"]:
+    """Return the light per sample that is not the stars', from the stamps' edges; 0 for all where there is none.
+
+    A psf's own light at the edge grows with a star's light, a background does not.
+    """
+    far = (np.abs(stamps.offset_px) / (np.array(stamps.values_e.shape[:0:-1]) // 2)).max(axis=1) > 0.85
+    out = np.zeros((len(stamps.unit), len(stamps.by_plane)))
+    for plane, seen in enumerate(stamps.by_plane):
+        stars = np.flatnonzero((seen & far).sum(axis=1) > 8)
+        if len(stars) < 4:
+            continue
+        edge = np.array([np.median(stamps.value_e[star, seen[star] & far]) for star in stars])
+        light = ((stamps.value_e[stars] - edge[:, None]) * seen[stars]).sum(axis=1)
+        off = light - np.median(light)
+        spread = np.median(np.abs(off)) + 1e-300
+        # The slope of the edge by light, from stars of usual light.
+        usual = np.abs(off) < 5 * spread
+        wing = max(float(off[usual] @ edge[usual]) / max(float(off[usual] @ off[usual]), 1e-300), 0.0)
+        left = edge - wing * light
+        scatter, noise = robust_sigma(left - np.median(left)), np.median(np.maximum(edge, 0.0)) + stamps.read_e**2
+        noise = np.sqrt(1.6 * noise / (seen & far)[stars].sum(axis=1).mean())
+        doubt = max(scatter, noise) * np.sqrt((1.0 + (np.median(light) / spread) ** 2) / len(stars))
+        if abs(np.median(left)) > 5.0 * doubt or scatter > max(4.0 * noise, wing * np.median(light)):
+            out[:, plane] = np.median(left)
+            out[stars, plane] = left
+    return out
+
+
+def light_of(stamps: Stamps, background_e: Float[np.ndarray, "stars planes"]) -> Float[np.ndarray, "stars planes"]:
     """Return each star's light by colour: sums, scaled up for missing samples, as light per pixel of all colours."""
     known = np.maximum(stamps.by_plane.sum(axis=2), 1)
-    total = (stamps.value_e * stamps.by_plane).sum(axis=2) * stamps.value_e.shape[1] / known
+    light = (stamps.value_e - background_e.T[..., None]) * stamps.by_plane
+    total = light.sum(axis=2) * stamps.value_e.shape[1] / known
     return np.maximum(total, 10 * stamps.read_e).T
 
 
 def unusable(stamps: Stamps, rules: StampsRules) -> tuple[FitStatus, str] | None:
     """Return a status and a note if a fit is impossible, or None."""
     core = stamps.by_plane & (np.abs(stamps.offset_px).max(axis=1) <= 1.5)
-    light = (stamps.value_e * stamps.by_plane).sum(axis=2)
+    light = ((stamps.value_e - backgrounds(stamps).T[..., None]) * stamps.by_plane).sum(axis=2)
     noise = np.sqrt(np.maximum(light, 0.0) + stamps.by_plane.sum(axis=2) * stamps.read_e**2)
     snr = float(np.median(light / np.maximum(noise, 1e-300), axis=1).min())
     if snr < rules.least_snr:

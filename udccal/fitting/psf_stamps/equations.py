@@ -1,8 +1,9 @@
 """The equations of a psf field in stamps: banded blocks of nodes by colour, and a dense block that colours share.
 
-Nodes are eliminated colour by colour (Schur's complement); the dense block holds places and light of the stars, maps
-and lateral colour. A cubic B-spline spans four rows, so that a row of nodes has entries with itself and the three that
-follow: a band is the upper half of a matrix, a row of nodes after the other. A factor lies where its matrix was.
+Nodes are eliminated colour by colour (Schur's complement); the dense block holds places, light and background of the
+stars, maps and lateral colour. A cubic B-spline spans four rows, so that a row of nodes has entries with itself and the
+three that follow: a band is the upper half of a matrix, a block for each row of nodes. A factor lies where its matrix
+was.
 """
 
 from __future__ import annotations
@@ -10,18 +11,21 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy.ndimage
 import scipy.sparse
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.linalg import cholesky, solve_triangular
 from scipy.linalg.blas import dtrsm
 
 from udccal.fitting.engine.least_squares import Step
 from udccal.fitting.psf_stamps.data import Stamps
-from udccal.fitting.psf_stamps.field import TAPS, PsfField, degree_of, degrees, polynomials, taps
-from udccal.fitting.psf_stamps.probability import State, Weighted, expectation, laplacian
+from udccal.fitting.psf_stamps.field import TAPS, Changes, PsfField, degree_of, polynomials, taps
+from udccal.fitting.psf_stamps.probability import State, Weighted, expectation
 
-# Parameters of one star: relative light, centre (x, y), and the four numbers of its map, row by row.
-OWN = 7
+# Parameters of one star: relative light, centre (x, y), the four numbers of its map, row by row, and background.
+OWN = 8
+
+Band = tuple[Float[np.ndarray, "_ _"], ...]
 
 
 @dataclass(frozen=True)
@@ -33,7 +37,7 @@ class Colour:
     """
 
     index: Int[np.ndarray, " own"]
-    band: Float[np.ndarray, "rows n 4*n"]
+    band: Band
     cross: Float[np.ndarray, "nodes own"]
     dense: Float[np.ndarray, "own own"]
     right_nodes: Float[np.ndarray, " nodes"]
@@ -48,7 +52,7 @@ class Laplace:
         cost: -2 log of the evidence, expanded about the state. samples: number of samples with a value.
         mode: relative to the state. gain: increase of the log posterior up to the mode.
         root: lower Cholesky factor of the dense block's precision.
-        colours: equations with their nodes eliminated.
+        colours: equations with their nodes eliminated. kept: True for nodes of a colour that may change.
         tuned: logarithm of each precision's factor of change in a step.
     """
 
@@ -58,6 +62,7 @@ class Laplace:
     gain: float
     root: Float[np.ndarray, "dense dense"]
     colours: tuple[Colour, ...]
+    kept: Bool[np.ndarray, " nodes"]
     tuned: Float[np.ndarray, " groups"]
 
     @property
@@ -74,7 +79,18 @@ class Laplace:
         """Draw from the Gaussian about the mode."""
         dense = solve_triangular(self.root, rng.standard_normal((len(self.root), count)), lower=True, trans=1)
         own = [rng.standard_normal((len(c.cross), count)) - c.cross @ dense[c.index] for c in self.colours]
-        return np.concatenate([dense, *(divided(c.band, x, False) for c, x in zip(self.colours, own, strict=True))])
+        return _with_nodes(
+            dense, [divided(c.band, x, False) for c, x in zip(self.colours, own, strict=True)], self.kept
+        )
+
+
+def _with_nodes(
+    dense: Float[np.ndarray, "dense k"], nodes: list[Float[np.ndarray, "own k"]], kept: Bool[np.ndarray, " nodes"]
+) -> Float[np.ndarray, "unknowns k"]:
+    """Return changes of all unknowns, in the order of ``Changes``."""
+    every = np.zeros((len(nodes), len(kept), dense.shape[1]))
+    every[:, kept] = nodes
+    return np.concatenate([dense, every.reshape(-1, dense.shape[1])])
 
 
 def laplace(stamps: Stamps, state: State) -> Laplace:
@@ -82,24 +98,27 @@ def laplace(stamps: Stamps, state: State) -> Laplace:
     seen, colours = expectation(stamps, state), []
     size = np.zeros(state.maps_from + len(state.maps))
     for plane in range(state.light_e.shape[1]):
-        colour = normal_equations(stamps, state.field, seen, plane)
+        colour = normal_equations(stamps, state, seen, plane)
         size[colour.index] += colour.dense.diagonal()
         colours.append(_eliminated(colour, state, plane))
     schur, right = _dense_prior(state, size)
     for c in colours:
         schur[np.ix_(c.index, c.index)] += c.dense
         right[c.index] += c.right_dense
+    if not (np.isfinite(schur).all() and np.isfinite(right).all()):
+        raise np.linalg.LinAlgError("the equations are not finite")
     root = cholesky(schur, lower=True)
     half = solve_triangular(root, right, lower=True)
     dense = solve_triangular(root, half, lower=True, trans=1)
-    nodes = [divided(c.band, (c.right_nodes - c.cross @ dense[c.index])[:, None], False)[:, 0] for c in colours]
+    nodes = [divided(c.band, (c.right_nodes - c.cross @ dense[c.index])[:, None], False) for c in colours]
     gain = 0.5 * float(half @ half + sum(c.right_nodes @ c.right_nodes for c in colours))
-    diagonals = [np.einsum("rii->ri", c.band[:, :, : c.band.shape[1]]).ravel() for c in colours]
+    diagonals = [np.diag(row) for c in colours for row in c.band]
     log_det = 2 * np.log(np.concatenate([np.diag(root), *diagonals])).sum()
     # Minus twice the log prior, up to constants that all orders have in common.
     prior = float(state.precisions @ state.squares()) - state.volume()[0]
-    cost, mode = float(log_det - 2 * seen.log_likelihood + prior), np.concatenate([dense, *nodes])
-    return Laplace(cost, int(stamps.known.sum()), mode, gain, root, tuple(colours), np.zeros_like(state.precisions))
+    cost, kept = float(log_det - 2 * seen.log_likelihood + prior), state.kept.ravel()
+    mode, tuned = _with_nodes(dense[:, None], nodes, kept)[:, 0], np.zeros_like(state.precisions)
+    return Laplace(cost, int(stamps.known.sum()), mode, gain, root, tuple(colours), kept, tuned)
 
 
 def marginal_cov(root: Float[np.ndarray, "dense dense"], index: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n n"]:
@@ -113,11 +132,11 @@ def shared_by(
 ) -> tuple[Int[np.ndarray, " own"], scipy.sparse.csr_array]:
     """Return the dense block's unknowns that a colour depends on, and the matrix to the stars' own changes."""
     planes, stars, one = len(field.nodes), len(unit), np.eye(OWN)
-    place = (2 + planes) * np.arange(stars)[:, None] + np.array([0, 1, 2 + plane])
-    numbers = stars * (2 + planes) + np.arange(field.warp.size + field.lateral.size)
+    place = (2 + 2 * planes) * np.arange(stars)[:, None] + np.array([0, 1, 2 + plane, 2 + planes + plane])
+    numbers = stars * (2 + 2 * planes) + np.arange(field.warp.size + field.lateral.size)
     warp, lateral = np.split(numbers, [field.warp.size])
-    parts = [(place, np.eye(stars), one[:, [1, 2, 0]])]
-    parts += [(warp.reshape(field.warp.shape)[plane], polynomials(unit, field.degrees[0])[:, 1:], one[:, 3:])]
+    parts = [(place, np.eye(stars), one[:, [1, 2, 0, 7]])]
+    parts += [(warp.reshape(field.warp.shape)[plane], polynomials(unit, field.map_degree)[:, 1:], one[:, 3:7])]
     if plane != field.reference:
         basis = polynomials(unit, degree_of(1 + field.lateral.shape[1]))[:, 1:]
         parts += [(lateral.reshape(field.lateral.shape)[plane - (plane > field.reference)], basis, one[:, 1:3])]
@@ -125,87 +144,132 @@ def shared_by(
     return np.concatenate([index.ravel() for index, _, _ in parts]), scipy.sparse.csr_array(matrix)
 
 
-def normal_equations(stamps: Stamps, field: PsfField, seen: Weighted, plane: int) -> Colour:
+def normal_equations(stamps: Stamps, state: State, seen: Weighted, plane: int) -> Colour:
     """Return the equations of one colour, without priors."""
-    basis, grid = polynomials(stamps.unit, field.degrees[1]), field.nodes.shape[2:]
+    field = state.field
+    basis, grid, kept = field.strengths(stamps.unit), field.nodes.shape[2:], state.kept
     index, shared = shared_by(field, stamps.unit, plane)
     weight = seen.weight * stamps.by_plane[plane]
-    weighted = np.concatenate([seen.seen.jacobian, seen.residual[..., None]], axis=2) * weight[..., None]
+    jacobian = _by_own(seen)
+    weighted = np.concatenate([jacobian, seen.residual[..., None]], axis=2) * weight[..., None]
     used = np.flatnonzero(weight)
     onto = taps(seen.seen, used, grid).T @ weighted.reshape(-1, OWN + 1)[used]
     onto = onto.reshape(len(stamps.unit), -1, OWN + 1).transpose(1, 0, 2)
     cross = [(onto[..., :OWN] * part[:, None]).reshape(len(onto), -1) @ shared for part in basis.T]
-    own = seen.seen.jacobian.transpose(0, 2, 1) @ weighted
+    own = jacobian.transpose(0, 2, 1) @ weighted
     return Colour(
         index=index,
-        band=node_sums(basis, seen, used, grid),
-        cross=np.stack(cross, axis=1).reshape(-1, len(index)),
+        band=node_sums(basis, seen, used, kept),
+        cross=np.stack(cross, axis=1).reshape(-1, len(index))[kept.ravel()],
         dense=(shared.T @ scipy.sparse.block_diag(list(own[..., :OWN]), format="csr") @ shared).toarray(),
-        right_nodes=(onto[..., OWN] @ basis).ravel(),
+        right_nodes=(onto[..., OWN] @ basis).ravel()[kept.ravel()],
         right_dense=shared.T @ own[..., OWN].ravel(),
     )
 
 
+def _by_own(seen: Weighted) -> Float[np.ndarray, "stars samples own"]:
+    """Return derivatives by a star's own parameters, of which the last one is its background."""
+    return np.concatenate([seen.seen.jacobian, np.ones((*seen.weight.shape, 1))], axis=2)
+
+
+def changes_of_samples(
+    stamps: Stamps, field: PsfField, seen: Weighted, draws: Float[np.ndarray, "unknowns k"]
+) -> Float[np.ndarray, "stars samples k"]:
+    """Return the changes of samples' expectation under changes of all unknowns, zero for unused samples."""
+    out, jacobian = np.zeros((stamps.known.size, draws.shape[1])), _by_own(seen)
+    nodes = Changes.of(field, len(stamps.unit), draws).nodes
+    for plane, own in enumerate(nodes):
+        index, shared = shared_by(field, stamps.unit, plane)
+        used = np.flatnonzero(seen.weight * stamps.by_plane[plane])
+        images = np.tensordot(field.strengths(stamps.unit), own, axes=1).reshape(-1, draws.shape[1])
+        by_own = jacobian @ (shared @ draws[index]).reshape(len(stamps.unit), OWN, -1)
+        out[used] = by_own.reshape(out.shape)[used] + taps(seen.seen, used, field.nodes.shape[2:]) @ images
+    return out.reshape(*stamps.known.shape, -1)
+
+
 def node_sums(
-    basis: Float[np.ndarray, "stars terms"], seen: Weighted, used: Int[np.ndarray, " used"], grid: tuple[int, ...]
-) -> Float[np.ndarray, "rows n 4*n"]:
-    """Sum products of two nodes' contributions over samples, as a band; raise LinAlgError without samples."""
-    # Light of a star at position X enters the image t with the factor B_t(X), for every sample, and the weights of
-    # a sample's 4 x 4 nodes are products of four down and four across. The contribution of a grid cell's samples is
-    # therefore a product of pairs down, pairs across, and pairs of polynomials.
+    basis: Float[np.ndarray, "stars terms"],
+    seen: Weighted,
+    used: Int[np.ndarray, " used"],
+    kept: Bool[np.ndarray, "rows columns terms"],
+) -> Band:
+    """Sum products of two nodes over samples, as a band of the nodes ``kept``; LinAlgError without samples."""
     if not used.size:
         raise np.linalg.LinAlgError("no sample is in use")
-    (rows, columns), terms, reach = grid, basis.shape[1], TAPS - 1
-    down, across = (part.reshape(-1, TAPS)[used] for part in (seen.seen.down, seen.seen.across))
-    (one, other), (t, u) = np.triu_indices(TAPS), np.triu_indices(terms)
-    both = (basis[:, t] * basis[:, u])[used // seen.weight.shape[1]] * seen.weight.ravel()[used, None]
-    right = ((down[:, one] * down[:, other])[:, :, None] * both[:, None]).reshape(len(used), -1)
-    index = seen.seen.first.ravel()[used, None] * len(one) + np.arange(len(one))
-    products = (across[:, one] * across[:, other]).ravel(), index.ravel(), np.arange(0, index.size + 1, len(one))
-    sums = scipy.sparse.csc_array(products, shape=(rows * columns * len(one), len(used))) @ right
-    sums = sums.reshape(rows, columns, len(one), len(one), -1)[:-reach, :-reach]
-    # Nodes at each distance in columns, for all pairs down; then these.
-    spread = np.zeros((rows - reach, columns, 2 * reach + 1, len(one), len(t)))
-    for pair, (j, k) in enumerate(zip(one, other, strict=True)):
-        for first, beside in {(j, k - j), (k, j - k)}:
-            spread[:, first : first + columns - reach, reach + beside] += sums[:, :, pair]
-    stencil = np.zeros((rows, TAPS, columns, 2 * reach + 1, len(t)))
-    for pair, (i, k) in enumerate(zip(one, other, strict=True)):
-        stencil[i : i + rows - reach, k - i] += spread[:, :, :, pair]
+    (rows, columns, terms), reach = kept.shape, TAPS - 1
+    t, u = np.triu_indices(terms)
     place = np.empty((terms, terms), dtype=int)
     place[t, u] = place[u, t] = np.arange(len(t))
-    out = np.zeros((rows, columns, terms, TAPS, columns, terms))
-    for away in range(-reach, TAPS):
-        own, there = (slice(max(e, 0), columns + min(e, 0)) for e in (-away, away))
-        np.einsum("rctdcu->rdctu", out[:, own, :, :, there])[...] = stencil[:, :, own, reach + away][..., place]
-    return out.reshape(rows, columns * terms, -1)
+    near = scipy.ndimage.maximum_filter(kept[:, :, -1], 2 * reach + 1)
+    inner = used[near.ravel()[seen.seen.first.ravel()[used]]]
+    # Samples far from the nodes of further images do not contribute to them.
+    parts = (used, t[:1], u[:1]), (inner, t[1:], u[1:])
+    stencil = np.concatenate([_stencil(basis, seen, (rows, columns), *part) for part in parts], axis=-1)
+    band = []
+    for i, own in enumerate(kept):
+        out = np.zeros((columns, terms, TAPS, columns, terms))
+        for away in range(-reach, TAPS):
+            here, there = (slice(max(e, 0), columns + min(e, 0)) for e in (-away, away))
+            np.einsum("ctdcu->dctu", out[here, :, :, there])[...] = stencil[i, :, here, reach + away][..., place]
+        beyond = kept[i : i + TAPS].ravel()
+        band.append(out.reshape(columns * terms, -1)[own.ravel()][:, : len(beyond)][:, beyond])
+    return tuple(band)
 
 
-def factor(band: Float[np.ndarray, "rows n 4*n"]) -> Float[np.ndarray, "rows n 4*n"]:
+def _stencil(
+    basis: Float[np.ndarray, "stars terms"],
+    seen: Weighted,
+    grid: tuple[int, int],
+    used: Int[np.ndarray, " used"],
+    t: Int[np.ndarray, " pairs"],
+    u: Int[np.ndarray, " pairs"],
+) -> Float[np.ndarray, "rows down columns across pairs"]:
+    """Sum products of nodes at each distance, down from 0 and across from -3, for pairs of images."""
+    # Light of a star at position X enters the image t with the factor C_t(X), for every sample, and the weights of
+    # a sample's 4 x 4 nodes are products of four down and four across. The contribution of a grid cell's samples is
+    # therefore a product of pairs down, pairs across, and pairs of images.
+    (rows, columns), reach = grid, TAPS - 1
+    stencil = np.zeros((rows, TAPS, columns, 2 * reach + 1, len(t)))
+    down, across = (part.reshape(-1, TAPS)[used] for part in (seen.seen.down, seen.seen.across))
+    one, other = np.triu_indices(TAPS)
+    both = (basis[:, t] * basis[:, u])[used // seen.weight.shape[1]] * seen.weight.ravel()[used, None]
+    index = seen.seen.first.ravel()[used, None] * len(one) + np.arange(len(one))
+    products = (across[:, one] * across[:, other]).ravel(), index.ravel(), np.arange(0, index.size + 1, len(one))
+    onto = scipy.sparse.csc_array(products, shape=(rows * columns * len(one), len(used)))
+    for i, k in zip(one, other, strict=True):
+        sums = onto @ (both * (down[:, i] * down[:, k])[:, None])
+        sums = sums.reshape(rows, columns, len(one), -1)[:-reach, :-reach]
+        # Nodes at each distance in columns.
+        spread = stencil[i : i + rows - reach, k - i]
+        for pair, (j, n) in enumerate(zip(one, other, strict=True)):
+            for first, beside in {(j, n - j), (n, j - n)}:
+                spread[:, first : first + columns - reach, reach + beside] += sums[:, :, pair]
+    return stencil
+
+
+def factor(band: Band) -> Band:
     """Replace the matrix by Cholesky's factor U of U^T U; raise LinAlgError if it is not positive definite."""
-    rows, n = band.shape[:2]
     for i, row in enumerate(band):
+        n, at = len(row), 0
         row[:, :n] = cholesky(row[:, :n], check_finite=False)
         beyond = row[:, n:] = _divide(row[:, :n], row[:, n:], True)
-        for j in range(min(TAPS, rows - i) - 1):
-            band[i + 1 + j, :, : (TAPS - 1 - j) * n] -= beyond[:, j * n : (j + 1) * n].T @ beyond[:, j * n :]
+        for below in band[i + 1 : i + TAPS]:
+            below[:, : beyond.shape[1] - at] -= beyond[:, at : at + len(below)].T @ beyond[:, at:]
+            at += len(below)
     return band
 
 
-def divided(
-    band: Float[np.ndarray, "rows n 4*n"], right: Float[np.ndarray, "size k"], transposed: bool
-) -> Float[np.ndarray, "size k"]:
+def divided(band: Band, right: Float[np.ndarray, "size k"], transposed: bool) -> Float[np.ndarray, "size k"]:
     """Return U^-1 right, or U^-T right, of a factor U; ``right`` is overwritten."""
-    rows, n = band.shape[:2]
-    out = right.reshape(rows, n, -1)
-    for i in range(rows) if transposed else reversed(range(rows)):
-        ahead = out[i + 1 : i + TAPS].reshape(-1, out.shape[2])
-        beyond = band[i, :, n : n + len(ahead)]
+    ends = np.cumsum([len(row) for row in band])
+    for row, end in list(zip(band, ends, strict=True))[:: 1 if transposed else -1]:
+        n = len(row)
+        own, ahead, beyond = right[end - n : end], right[end : end - n + row.shape[1]], row[:, n:]
         if not transposed:
-            out[i] -= beyond @ ahead
-        out[i] = _divide(band[i, :, :n], out[i], transposed)
+            own -= beyond @ ahead
+        own[...] = _divide(row[:, :n], own, transposed)
         if transposed:
-            ahead -= beyond.T @ out[i]
+            ahead -= beyond.T @ own
     return right
 
 
@@ -216,21 +280,13 @@ def _divide(upper: Float[np.ndarray, "n n"], right: Float[np.ndarray, "n k"], tr
 
 def _eliminated(colour: Colour, state: State, plane: int) -> Colour:
     """Add the prior of images and eliminate the nodes; their arrays are overwritten."""
-    terms, rows, columns = state.field.nodes.shape[1:]
-    scale = scipy.sparse.diags_array(1.0 / state.size[plane].ravel())
-    rough = laplacian(rows, columns)[0] @ scale
-    rough, size = (rough.T @ rough).tocoo(), (scale @ scale).tocoo()
-    right, band = colour.right_nodes.reshape(-1, terms), colour.band.reshape(rows, columns, terms, TAPS, columns, terms)
-    for term, own in enumerate(state.of_images[plane][degrees(state.field.degrees[1])]):
-        nodes = state.field.nodes[plane, term].ravel()
-        for precision, prior in zip(own, (size, rough), strict=True):
-            right[:, term] -= precision * (prior @ nodes)
-            (r, c), (below, beside) = np.divmod(prior.row, columns), np.divmod(prior.col, columns)
-            half = below >= r
-            place = r[half], c[half], term, (below - r)[half], beside[half], term
-            band[place] += precision * prior.data[half]
+    prior, at = state.prior(plane), 0
+    right = colour.right_nodes - prior @ np.moveaxis(state.field.nodes[plane], 0, 2)[state.kept]
+    for row in colour.band:
+        row += prior[at : at + row.shape[0], at : at + row.shape[1]].toarray()
+        at += len(row)
     factor(colour.band)
-    half = divided(colour.band, colour.right_nodes[:, None], True)[:, 0]
+    half = divided(colour.band, right[:, None], True)[:, 0]
     cross = divided(colour.band, colour.cross, True)
     schur, left = colour.dense - cross.T @ cross, colour.right_dense - cross.T @ half
     return replace(colour, cross=cross, right_nodes=half, dense=schur, right_dense=left)
@@ -240,11 +296,19 @@ def _dense_prior(
     state: State, size: Float[np.ndarray, " dense"]
 ) -> tuple[Float[np.ndarray, "dense dense"], Float[np.ndarray, " dense"]]:
     """Return the dense block's prior precision and right side; it holds changes that images can make as well."""
-    seen = size[: state.maps_from].reshape(len(state.light_e), -1)
+    (stars, planes), from_ = state.light_e.shape, state.maps_from
+    own = np.arange(from_).reshape(stars, -1)
+    light, matrix, right = own[:, : 2 + planes], np.zeros((len(size), len(size))), np.zeros(len(size))
     # Stars that are left out completely keep their places and light.
-    own = np.concatenate([np.where(seen > 0, 0.0, 1.0).ravel(), state.precisions[state.map_groups]])
-    values = np.concatenate([np.zeros(seen.size), state.maps])
+    seen = size[light]
     held = (np.sqrt(seen.mean(axis=0)) * (seen > 0))[:, :, None] * np.eye(seen.shape[1])
-    matrix, held = np.diag(own), held.reshape(seen.size, -1)
-    matrix[: seen.size, : seen.size] += held @ held.T
-    return matrix, -own * values
+    held = held.reshape(seen.size, -1)
+    matrix[np.ix_(light.ravel(), light.ravel())] = held @ held.T + np.diag(np.where(seen > 0, 0.0, 1.0).ravel())
+    mean, scatter = state.precisions[-2:]
+    for index, values in zip(own[:, 2 + planes :].T, state.background_e.T, strict=True):
+        matrix[np.ix_(index, index)] = scatter * np.eye(stars) + (mean - scatter) / stars
+        right[index] = -matrix[np.ix_(index, index)] @ values
+    maps = state.precisions[state.map_groups]
+    matrix[from_:, from_:] = np.diag(maps)
+    right[from_:] = -maps * state.maps
+    return matrix, right

@@ -1,12 +1,16 @@
-"""A psf field in stamps: an image whose nodes are polynomials of the position, with a map of polynomials as well.
+"""A psf field in stamps: images whose strengths are polynomials of the position, behind a map of polynomials.
 
-With w the distance to the centre of the light, X the position and B_t(X) polynomials,
+With w the distance to the centre of the light, X the position, B_t(X) polynomials, and C_i(X) some mixtures of them,
 
-    psf(w; X) = 1 / |M(X)|  sum_t B_t(X) P_t(M(X)^-1 (w - L(X))),    M(X) = 1 + sum_t>0 B_t(X) M_t.
+    psf(w; X) = 1 / |M(X)|  sum_i C_i(X) P_i(M(X)^-1 (w - L(X))),    M(X) = 1 + sum_t>0 B_t(X) M_t,    C_0 = 1.
 
-The map M stretches, shears and turns an image over the field, with few numbers. Images P_t are cubic B-splines on a
+The map M stretches, shears and turns an image over the field, with few numbers. Images P_i are cubic B-splines on a
 square grid of nodes and describe the rest. L, of polynomials too, is the distance of a colour's centre from the centre
 that all colours of a stamp have in common.
+
+An image contains the mean over a pixel, and the map would stretch the pixel as well. Light that is stretched before
+pixels average it differs, to second order in the pixel's size a = 1 px, by (a^2 / 24) tr((M^-1 M^-T - 1) D) of the
+image, where D are its second derivatives.
 """
 
 from __future__ import annotations
@@ -26,6 +30,7 @@ from numpy.polynomial.legendre import legvander
 from udccal.models.arrays import Arrayish
 
 TAPS = 4  # nodes along an axis under a cubic B-spline
+_Taps = Float[Array, "samples 4"]
 
 
 class PsfField(eqx.Module):
@@ -36,12 +41,14 @@ class PsfField(eqx.Module):
         warp: the map's polynomials without the constant, which is 1.
         lateral: polynomials of lateral colour, in px (x, y), without the constant, which the images contain; of all
             planes except the reference, from which it is measured.
+        mix: the polynomials' coefficients in the strength C of each image.
         spacing_px: between nodes.
     """
 
-    nodes: Float[Arrayish, "planes terms grid_rows grid_columns"]
+    nodes: Float[Arrayish, "planes images grid_rows grid_columns"]
     warp: Float[Arrayish, "planes warp_terms 2 2"]
     lateral: Float[Arrayish, "other_planes lateral_terms 2"]
+    mix: Float[Arrayish, "images terms"]
     spacing_px: float = eqx.field(static=True)
 
     @property
@@ -50,13 +57,17 @@ class PsfField(eqx.Module):
         return 1 if len(self.nodes) == 3 else 0
 
     @property
-    def degrees(self) -> tuple[int, int]:
-        """Degrees of the map and of the images."""
-        return degree_of(1 + self.warp.shape[1]), degree_of(self.nodes.shape[1])
+    def map_degree(self) -> int:
+        """Highest degree of the map."""
+        return degree_of(1 + self.warp.shape[1])
+
+    def strengths(self, unit: Float[np.ndarray, "stars 2"]) -> Float[np.ndarray, "stars images"]:
+        """Return C at positions scaled to about [-1, 1]."""
+        return polynomials(unit, degree_of(self.mix.shape[1])) @ np.transpose(self.mix)
 
     def maps(self, unit: Float[np.ndarray, "stars 2"]) -> Float[np.ndarray, "stars planes 2 2"]:
         """Return M at positions scaled to about [-1, 1]."""
-        return np.eye(2) + np.einsum("sm,pmij->spij", polynomials(unit, self.degrees[0])[:, 1:], self.warp)
+        return np.eye(2) + np.einsum("sm,pmij->spij", polynomials(unit, self.map_degree)[:, 1:], self.warp)
 
     def centres(self, unit: Float[np.ndarray, "stars 2"]) -> Float[np.ndarray, "stars planes 2"]:
         """Return L in px at positions scaled to about [-1, 1]."""
@@ -74,22 +85,23 @@ class Changes(NamedTuple):
     """Changes of all unknowns, ``k`` at a time: parts of one vector, in this order.
 
     Attributes:
-        stars: (x, y) in px, then relative light by colour.
+        stars: (x, y) in px, then relative light by colour, then background by colour in electrons.
         maps: the map's numbers, then the lateral colour's. With ``stars`` they form the dense block of the equations.
         nodes: in the vector colour by colour and node by node, the images of a node together.
     """
 
     stars: Float[np.ndarray, "stars own k"]
     maps: Float[np.ndarray, "numbers k"]
-    nodes: Float[np.ndarray, "planes terms grid_rows grid_columns k"]
+    nodes: Float[np.ndarray, "planes images grid_rows grid_columns k"]
 
     @classmethod
     def of(cls, field: PsfField, stars: int, vector: Float[np.ndarray, "unknowns k"]) -> Changes:
         """Split a vector into its parts."""
-        planes, terms, *grid = field.nodes.shape
-        ends = np.cumsum([stars * (2 + planes), np.size(field.warp) + np.size(field.lateral)])
+        planes, images, *grid = field.nodes.shape
+        ends = np.cumsum([stars * (2 + 2 * planes), np.size(field.warp) + np.size(field.lateral)])
         own, maps, nodes = np.split(vector, ends)
-        return cls(own.reshape(stars, 2 + planes, -1), maps, np.moveaxis(nodes.reshape(planes, *grid, terms, -1), 3, 1))
+        nodes = np.moveaxis(nodes.reshape(planes, *grid, images, -1), 3, 1)
+        return cls(own.reshape(stars, 2 + 2 * planes, -1), maps, nodes)
 
 
 class Seen(NamedTuple):
@@ -115,11 +127,6 @@ def degree_of(terms: int) -> int:
     return math.isqrt(2 * terms) - 1
 
 
-def degrees(highest: int) -> Int[np.ndarray, " terms"]:
-    """Return the degree of every polynomial up to the highest, in their order."""
-    return np.repeat(np.arange(highest + 1), np.arange(1, highest + 2))
-
-
 def polynomials(unit: Float[np.ndarray, "stars 2"], degree: int) -> Float[np.ndarray, "stars terms"]:
     """Return all B_t up to a degree at positions scaled to about [-1, 1]; lower degrees are the first columns."""
     x, y = (legvander(part, degree) for part in unit.T)
@@ -135,10 +142,10 @@ def see(
     plane: Int[np.ndarray, "stars samples"],
 ) -> Seen:
     """Return values and derivatives at samples of colours ``plane``; centres and samples are (x, y) in px."""
-    planes, terms, rows, columns = field.nodes.shape
-    images = polynomials(unit, field.degrees[1]) @ np.asarray(field.nodes).reshape(planes, terms, -1)
+    planes, count, rows, columns = field.nodes.shape
+    images = field.strengths(unit) @ np.asarray(field.nodes).reshape(planes, count, -1)
     # One compilation serves all orders, and numbers of nodes and stars up to multiples of these.
-    filled = _filled(np.moveaxis(images, 0, 1), (0, 8), (2, 4096))
+    filled = _filled(np.moveaxis(images, 0, 1), (0, 8), (2, 16384))
     by_star = (field.maps(unit), centre_px[:, None] + field.centres(unit), plane.astype(np.int32))
     grid = np.int32(rows), np.int32(columns), np.float64(field.spacing_px)
     seen = response(filled, *(_filled(part, (0, 8)) for part in by_star), offset_px, *grid)
@@ -182,16 +189,28 @@ def response(
         turned = jnp.stack([warp[:, 1, 1], -warp[:, 0, 1], -warp[:, 1, 0], warp[:, 0, 0]], axis=1)
         inverse, scale = (thinner[:, None] * turned).reshape(-1, 2, 2)[own], thinner[own]
         at = jnp.sum(inverse * (offset_px - centre[own])[:, None, :], axis=2)
-        first_y, down, by_y, inside_y = _weights(at[:, 1] / spacing_px + (rows - 1) / 2, rows)
-        first_x, across, by_x, inside_x = _weights(at[:, 0] / spacing_px + (columns - 1) / 2, columns)
+        shrunk = jnp.sum(inverse[:, :, None] * inverse[:, None], axis=3) / (24 * spacing_px**2)
+        pixel = shrunk - jnp.eye(2) / (24 * spacing_px**2)
+        first_y, down, by_y, bend_y, inside_y = _weights(at[:, 1] / spacing_px + (rows - 1) / 2, rows, pixel[:, 1, 1])
+        first_x, across, by_x, bend_x, inside_x = _weights(
+            at[:, 0] / spacing_px + (columns - 1) / 2, columns, pixel[:, 0, 0]
+        )
         first, step = first_y * columns + first_x, jnp.arange(TAPS)
         index = first[:, None, None] + step[:, None] * columns + step
         patch = image.ravel()[own[:, None, None] * image.shape[1] + index]
-        level, rising = (jnp.sum(patch * by[:, None, :], axis=2) for by in (across, by_x))
-        value = scale * jnp.sum(level * down, axis=1)
-        rise = jnp.stack([jnp.sum(rising * down, axis=1), jnp.sum(level * by_y, axis=1)], axis=1)
+        level, rising, bent = (jnp.sum(patch * by[:, None, :], axis=2) for by in (across, by_x, bend_x))
+        # The mixed derivative is no product; it is the only part that ``down`` and ``across`` do not contain.
+        mixed, turn = jnp.sum(rising * by_y, axis=1), 2 * pixel[:, 0, 1]
+        value = scale * (jnp.sum(level * down, axis=1) + turn * mixed)
+        rise_x = jnp.sum(rising * down, axis=1) + turn * jnp.sum(bent * by_y, axis=1)
+        rise_y = jnp.sum(level * by_y, axis=1) + turn * jnp.sum(rising * bend_y, axis=1)
+        rise = jnp.stack([rise_x, rise_y], axis=1)
         rise = jnp.sum((scale / spacing_px)[:, None, None] * rise[:, :, None] * inverse, axis=1)
+        # By the map: the image's place, its area, and the pixel that it does not stretch.
+        second = jnp.stack([jnp.sum(bent * down, axis=1), mixed, mixed, jnp.sum(level * bend_y, axis=1)], axis=1)
+        second = scale[:, None, None] * second.reshape(-1, 2, 2)
         by_map = -rise[:, :, None] * at[:, None, :] - value[:, None, None] * inverse.transpose(0, 2, 1)
+        by_map -= 2 * jnp.einsum("sai,sab,sbj->sij", inverse, second, shrunk)
         jacobian = jnp.concatenate([value[:, None], -rise, by_map.reshape(-1, 4)], axis=1)
         return Seen(value, jacobian, first, scale[:, None] * down, across, inside_y & inside_x)
 
@@ -199,9 +218,12 @@ def response(
 
 
 def _weights(
-    place: Float[Array, " samples"], nodes: Int[Arrayish, ""]
-) -> tuple[Int[Array, " samples"], Float[Array, "samples 4"], Float[Array, "samples 4"], Bool[Array, " samples"]]:
-    """Return first node, weights, derivatives, and True where all four nodes exist (else the weights are zero)."""
+    place: Float[Array, " samples"], nodes: Int[Arrayish, ""], pixel: Float[Array, " samples"]
+) -> tuple[Int[Array, " samples"], _Taps, _Taps, _Taps, Bool[Array, " samples"]]:
+    """Return first node, weights, derivatives, and True where all four nodes exist (else the weights are zero).
+
+    Weights and first derivatives include ``pixel`` times their second derivative; the plain second one comes last.
+    """
     cell = jnp.floor(place)
     f = (place - cell)[:, None]
     first = cell.astype(jnp.int32) - 1
@@ -209,5 +231,13 @@ def _weights(
     g = 1.0 - f
     weights = [g**3 / 6, (3 * f**3 - 6 * f**2 + 4) / 6, (3 * g**3 - 6 * g**2 + 4) / 6, f**3 / 6]
     derivatives = [-(g**2) / 2, (3 * f**2 - 4 * f) / 2, (4 * g - 3 * g**2) / 2, f**2 / 2]
-    kept, slope = (jnp.where(inside[:, None], jnp.concatenate(part, axis=1), 0.0) for part in (weights, derivatives))
-    return jnp.clip(first, 0, nodes - TAPS), kept, slope, inside
+    bend, third = jnp.concatenate([g, 3 * f - 2, 3 * g - 2, f], axis=1), jnp.array([-1.0, 3.0, -3.0, 1.0])
+    own, slope, second = (
+        jnp.where(inside[:, None], part + pixel[:, None] * more, 0.0)
+        for part, more in (
+            (jnp.concatenate(weights, axis=1), bend),
+            (jnp.concatenate(derivatives, axis=1), third),
+            (bend, 0.0),
+        )
+    )
+    return jnp.clip(first, 0, nodes - TAPS), own, slope, second, inside

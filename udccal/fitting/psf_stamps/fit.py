@@ -14,11 +14,12 @@ from udccal.errors import FitError
 from udccal.fitting.engine.gaussian import Posterior
 from udccal.fitting.engine.orders import Choice
 from udccal.fitting.engine.report import estimates, residual_sample
-from udccal.fitting.engine.robust import OutlierRule, outliers
+from udccal.fitting.engine.robust import OutlierRule, outliers, robust_sigma
 from udccal.fitting.psf_stamps.data import Stamps, StampsRules, offsets, unusable
 from udccal.fitting.psf_stamps.equations import laplace, marginal_cov
 from udccal.fitting.psf_stamps.field import Changes, PsfField, degree_of, polynomials, see, taps
-from udccal.fitting.psf_stamps.probability import State, expectation
+from udccal.fitting.psf_stamps.model_error import without_error
+from udccal.fitting.psf_stamps.probability import LEAST, State, expectation, laplacian
 from udccal.fitting.psf_stamps.search import WINDOW_PX, Found, Orders, search
 from udccal.numerics import in_float64
 from udccal.result import Diagnostic, FitResult, FitStatus, Outliers
@@ -84,7 +85,11 @@ class StampsPsf:
     @in_float64
     def sigma(self, position_px: Float[np.ndarray, "n 2"], plane: int = 0) -> Float[np.ndarray, "n rows columns"]:
         """Return one standard deviation of every pixel of ``predict``."""
-        parts = [np.linalg.norm(kernels.change, axis=2) for kernels in self._kernels(position_px, plane)]
+        parts = []
+        for kernels in self._kernels(position_px, plane):
+            sigma, peak = np.linalg.norm(kernels.change, axis=2), np.abs(kernels.value).max(axis=1, keepdims=True)
+            # Beyond the nodes, nothing is known but that light is below the least that the prior expects.
+            parts.append(np.where(sigma > 0, sigma, LEAST * peak))
         return np.concatenate(parts).reshape(-1, self.rows, self.columns)
 
     @in_float64
@@ -123,7 +128,7 @@ class StampsPsf:
             self,
             field=self.field.moved(changes),
             star_place_px=self.star_place_px + changes.stars[:, :2, 0],
-            star_light_e=self.star_light_e * np.exp(changes.stars[:, 2:, 0]),
+            star_light_e=self.star_light_e * np.exp(changes.stars[:, 2 : 2 + len(self.field.nodes), 0]),
         )
 
     def _kernels(self, position_px: Float[np.ndarray, "n 2"], plane: int) -> Iterator[Kernels]:
@@ -164,7 +169,7 @@ class StampsPsf:
         field, grid, k = self.field, offsets(self.rows, self.columns), self.factor.shape[1]
         changes = Changes.of(field, len(self.star_px), self.factor)
         seen = see(field, unit, centre, grid, np.full((len(unit), len(grid)), plane))
-        images = np.tensordot(polynomials(unit, field.degrees[1]), changes.nodes[plane], axes=1)
+        images = np.tensordot(field.strengths(unit), changes.nodes[plane], axes=1)
         every = taps(seen, np.arange(seen.value.size), field.nodes.shape[2:])
         change = (every @ images.reshape(every.shape[1], k)).reshape(*seen.value.shape, k)
         maps, centres = np.split(changes.maps, [field.warp.size])
@@ -201,12 +206,15 @@ def fit_psf_stamps(
     if (lit := int((stamps.value_e > stamps.read_e).any(axis=1).sum())) < 4:
         raise FitError(f"Expected light above the noise in at least 4 stamps, found it in {lit}. Check what was cut.")
     bad, lowest = unusable(stamps, rules), Orders(0, 0, rules.spacings_px[0])
-    try:
-        chosen = search(stamps, rules, orders if bad is None else lowest)
-    except np.linalg.LinAlgError:
-        bad = FitStatus.NOT_CONVERGED, "The equations were singular; what is given is one psf for all places."
-        chosen = _one_for_all(stamps, rules, lowest)
-    return _report(stamps, chosen, seed, rules, bad)
+    # Stamps that determine nothing lead to numbers that are not finite, which the equations refuse.
+    with np.errstate(all="ignore"):
+        try:
+            chosen = search(stamps, rules, orders if bad is None else lowest)
+        except np.linalg.LinAlgError:
+            note = "The equations were singular; what is given is one psf for all places."
+            bad = bad or (FitStatus.NOT_CONVERGED, note)
+            chosen = _one_for_all(stamps, rules, lowest)
+        return _report(stamps, chosen, seed, rules, bad)
 
 
 def _one_for_all(stamps: Stamps, rules: StampsRules, lowest: Orders) -> Choice[Found]:
@@ -229,20 +237,24 @@ def _report(
     z = (seen.residual * np.sqrt(seen.weight))[used]
     # All unknowns (except total light and common shift, which are held), less the part that the priors determine.
     held = float(state.precisions @ state.squares(draws))
-    effective = state.field.nodes.size + len(state.maps) + state.maps_from - 2 - state.light_e.shape[1] - held
+    unknowns = int(state.kept.sum()) * state.light_e.shape[1] + len(state.maps) + state.maps_from
+    effective = unknowns - 2 - state.light_e.shape[1] - held
     chi2_dof = float(z @ z) / max(z.size - effective, 1.0)
     inflation = float(np.sqrt(chi2_dof)) if chi2_dof > rules.inflate_above else 1.0
-    term = _term(stamps, state, draws * (inflation / np.sqrt(rules.draws[1])))
+    draws = draws * inflation + _errors(state, *draws.shape)
+    # The way that is left is one more standard deviation.
+    draws += posterior.mode[:, None] * np.random.default_rng(2).standard_normal(rules.draws[1])
+    term = _term(stamps, state, draws / np.sqrt(rules.draws[1]))
     # The expected error, then the maps' coefficients, named by colour, element and degrees in x and y.
     size, spread = np.sqrt((term.relative_l2(term.star_px, term.field.reference) ** 2).mean(axis=0))
     warp = state.field.warp
     cov = inflation**2 * marginal_cov(posterior.root, state.maps_from + np.arange(warp.size))
     cov, names = block_diag(spread**2, cov), ["kernel_relative_l2", *_names(state)]
     status, note = bad or (FitStatus.CONVERGED, "")
-    if not bad and chi2_dof > rules.poor_above:
+    if not bad and max(chi2_dof, _faint_scatter(stamps, state)) > rules.poor_above:
         status, note = FitStatus.POOR_FIT, "Check the noise given, and that each stamp holds one point source."
     elif not bad and not found.converged:
-        left = f"It was left after {found.iterations} steps; use more or brighter stamps."
+        left = f"It was left after {found.iterations} steps; give lower orders, or leave out stamps that differ."
         status, note = FitStatus.NOT_CONVERGED, left
     return FitResult(
         name="psf",
@@ -259,12 +271,41 @@ def _report(
             Diagnostic("clipped_samples", float(stamps.clipped.sum()), "1"),
             Diagnostic("samples_beyond_the_image", float((stamps.known & state.keep).sum() - z.size), "1"),
             Diagnostic("sigma_inflation", inflation, "1"),
+            Diagnostic("model_error", _model_error(state), "1"),
+            Diagnostic("background", float(state.background_e.mean()), "e-"),
         ),
-        notes=(note,) if note else (),
+        notes=(*([note] if note else []), *_told(state)),
         outliers=_left_out(stamps, state, rules),
         residuals=residual_sample((term.star_px[:, None] + stamps.offset_px)[used], z),
         posterior=Posterior(np.zeros(len(term.factor)), term.factor, term.changed),
     )
+
+
+def _faint_scatter(stamps: Stamps, state: State) -> float:
+    """Return the mean square, by the median, of residuals where light is faint: errors of the psf hardly show there."""
+    plain = expectation(stamps, without_error(state))
+    used = (plain.weight > 0) & (plain.mean_e <= np.quantile(plain.mean_e, 0.25))
+    return robust_sigma((plain.residual * np.sqrt(plain.weight))[used]) ** 2
+
+
+def _errors(state: State, unknowns: int, count: int) -> Float[np.ndarray, "unknowns k"]:
+    """Draw what the model does not describe, as noise of the first images' nodes that gives kernels its model error."""
+    out = np.zeros((unknowns, count))
+    nodes = Changes.of(state.field, len(state.light_e), out).nodes
+    # The mean sum of squared weights of a cubic B-spline is 0.479 along an axis.
+    rng = np.random.default_rng(1)
+    nodes[:, 0] += state.model_error[..., None] / 0.479 * rng.standard_normal((*state.size.shape, count))
+    # Where further images have no nodes, they may be as large as their prior, which the others set.
+    eigenvalues, left = laplacian(*state.size.shape[1:])[1], ~np.moveaxis(state.kept, 2, 0)
+    for image in np.flatnonzero(left.any(axis=(1, 2))):
+        a, b = state.of_images[:, image].T[..., None]
+        spread = np.sqrt((1.0 / (a + b * eigenvalues)).mean(axis=1))[:, None, None] * state.size * left[image]
+        nodes[:, image] += spread[..., None] / 0.479 * rng.standard_normal((*spread.shape, count))
+    # Light of the psf that is constant over a stamp differs from a background only by its growth with a star's light.
+    spread = np.maximum(state.light_e.std(axis=0), 1e-3 * state.light_e.mean(axis=0)) * np.sqrt(len(state.light_e))
+    edge = state.background_e.std(axis=0) / spread
+    nodes[:, 0] += edge[:, None, None, None] * rng.standard_normal((len(edge), 1, 1, count))
+    return out
 
 
 def _term(stamps: Stamps, state: State, factor: np.ndarray) -> StampsPsf:
@@ -276,8 +317,26 @@ def _term(stamps: Stamps, state: State, factor: np.ndarray) -> StampsPsf:
     return replace(term, window_px=float(1 / np.sqrt(4 * np.pi * (kernel**2).sum())))
 
 
+def _told(state: State) -> tuple[str, ...]:
+    """Return notes on what was found outside the model, and is part of it now."""
+    notes, mean = [], state.background_e.mean(axis=0)
+    if state.lit:
+        found = ", ".join(f"{level:.3g}" for level in mean)
+        told = "It was fitted stamp by stamp; subtract it beforehand to know the psf's edge better."
+        notes.append(f"The stamps have a background of {found} e- that is not zero. {told}")
+    if error := _model_error(state):
+        told = "Error bars include it: the field changes more than its orders follow, or the noise given is wrong."
+        notes.append(f"The psf differs from the model by {100 * error:.2g} %. {told}")
+    return tuple(notes)
+
+
+def _model_error(state: State) -> float:
+    """Return the model error relative to the kernel, root mean square."""
+    return float(np.linalg.norm(state.model_error) / np.linalg.norm(state.size))
+
+
 def _names(state: State) -> list[str]:
-    powers = [(i, d - i) for d in range(1, state.field.degrees[0] + 1) for i in range(d, -1, -1)]
+    powers = [(i, d - i) for d in range(1, state.field.map_degree + 1) for i in range(d, -1, -1)]
     prefixes = ["map_r", "map_g", "map_b"][: len(state.field.warp)] if len(state.field.warp) > 1 else ["map"]
     return [f"{p}_{e}_{i}{j}" for p in prefixes for i, j in powers for e in ("xx", "xy", "yx", "yy")]
 

@@ -3,11 +3,11 @@
 The model's own light gives the weights of samples (shot noise is that of the expectation, not of the sample). Clipped
 samples have the likelihood of a clipped normal.
 
-The prior expects that a kernel has its own size, is smooth, and changes little over the field. Images of the same
-degree have one Gaussian prior with the precision E^-1 (a + b D^2) E^-1, where E is the kernel's size nearby and D the
-Laplacian on the nodes. Maps and lateral colour have one precision per degree. The precisions maximise the evidence
-(empirical Bayes), by the updates of Fellner and Schall (Wood and Fasiolo, "A generalized Fellner-Schall method for
-smoothing parameter optimization", Biometrics 73, 2017).
+The prior expects that a kernel has its own size, is smooth, and changes little over the field. Each image has a
+Gaussian prior with the precision E^-1 (a + b D^2) E^-1, where E is the kernel's size nearby and D the Laplacian on the
+nodes. Maps and lateral colour have one precision per degree, and so have the backgrounds' mean and scatter. The
+precisions maximise the evidence (empirical Bayes), by the updates of Fellner and Schall (Wood and Fasiolo, "A
+generalized Fellner-Schall method for smoothing parameter optimization", Biometrics 73, 2017).
 """
 
 from __future__ import annotations
@@ -24,15 +24,18 @@ from scipy.sparse.linalg import LaplacianNd
 from scipy.special import log_ndtr
 
 from udccal.fitting.psf_stamps.data import Stamps, StampsRules
-from udccal.fitting.psf_stamps.field import Changes, PsfField, Seen, degree_of, degrees, see
+from udccal.fitting.psf_stamps.field import Changes, PsfField, Seen, degree_of, see
 from udccal.models.fields import polynomial_terms
+
+LEAST = 2e-5  # size of the faintest light that the prior expects, relative to the peak
+ABSENT = 1e8  # precision of a term that is not there, relative to the kernel
 
 
 def envelope(nodes: Float[np.ndarray, "*k rows columns"], spacing_px: float) -> Float[np.ndarray, "*k rows columns"]:
-    """Return the kernel's size E on the nodes of images of degree 0: their root mean square nearby."""
+    """Return the kernel's size E on the nodes of the first images: their root mean square nearby."""
     width = [0.0] * (nodes.ndim - 2) + [1.5 / spacing_px] * 2
     peak = np.abs(nodes).max(axis=(-2, -1), keepdims=True)
-    return np.sqrt(scipy.ndimage.gaussian_filter(nodes**2, width, mode="nearest") + (2e-5 * peak) ** 2)
+    return np.sqrt(scipy.ndimage.gaussian_filter(nodes**2, width, mode="nearest") + (LEAST * peak) ** 2)
 
 
 def grid_size(shape: tuple[int, ...], spacing_px: float, reach: float) -> tuple[int, int]:
@@ -54,30 +57,65 @@ class State:
 
     Attributes:
         centre_px: of the stars, from their middle samples.
-        precisions: of the priors: (a, b) of images by colour and degree, from 0; of maps by colour and degree, from 1;
-            of lateral colour likewise, of all colours but the reference.
+        background_e: light per sample that is not the stars'.
+        precisions: of the priors: (a, b) of images by colour and image; of maps by colour and degree, from 1; of
+            lateral colour likewise, of all colours but the reference; of backgrounds' mean and scatter.
         size: E of the priors, see ``envelope``.
         keep: True for samples that are not outliers.
-        model_error: relative error of a model that is still coarse, which adds to the noise.
+        model_error: what the model does not describe, in light per pixel at the nodes, which adds to the noise.
+        margin: of the nodes' grid, where images other than the first are zero.
     """
 
     field: PsfField
     centre_px: Float[np.ndarray, "stars 2"]
     light_e: Float[np.ndarray, "stars planes"]
+    background_e: Float[np.ndarray, "stars planes"]
     precisions: Float[np.ndarray, " groups"]
     size: Float[np.ndarray, "planes grid_rows grid_columns"]
     keep: Bool[np.ndarray, "stars samples"]
-    model_error: float = 0.0
+    model_error: Float[np.ndarray, "planes grid_rows grid_columns"]
+    margin: int = 0
+
+    @property
+    def name(self) -> str:
+        """Name in the table of candidates."""
+        field, count = self.field, self.field.nodes.shape[1]
+        images = "1 image" if count == 1 else f"{count} images"
+        return f"map degree {field.map_degree}, {images}, nodes every {field.spacing_px:g} px"
 
     @property
     def maps_from(self) -> int:
-        """Index in the dense block of the first number of a map, after places and light of the stars."""
-        return self.centre_px.size + self.light_e.size
+        """Index in the dense block of the first number of a map, after the stars' own unknowns."""
+        return self.centre_px.size + self.light_e.size + self.background_e.size
 
     @property
-    def of_images(self) -> Float[np.ndarray, "planes image_degrees 2"]:
+    def lit(self) -> bool:
+        """Whether there is a background that matters, of an electron in a sample."""
+        return bool((self.background_e**2).mean() > 1.0)
+
+    @property
+    def width_px(self) -> float:
+        """Standard deviation of a Gaussian as wide as the kernel in the middle, by its noise-equivalent area."""
+        nodes = self.field.nodes[self.field.reference, 0] * self.field.spacing_px
+        return float(nodes.sum() * self.field.spacing_px / np.sqrt(4 * np.pi * (nodes**2).sum()))
+
+    @property
+    def inner(self) -> tuple[slice, slice]:
+        """Rows and columns of the nodes of images other than the first."""
+        rows, columns = self.size.shape[1:]
+        return slice(self.margin, rows - self.margin), slice(self.margin, columns - self.margin)
+
+    @property
+    def kept(self) -> Bool[np.ndarray, "grid_rows grid_columns images"]:
+        """True for nodes that images have."""
+        out = np.zeros((*self.size.shape[1:], self.field.nodes.shape[1]), dtype=bool)
+        out[..., 0] = out[self.inner] = True
+        return out
+
+    @property
+    def of_images(self) -> Float[np.ndarray, "planes images 2"]:
         """Precisions of the images."""
-        planes, count = len(self.size), self.field.degrees[1] + 1
+        planes, count = self.field.nodes.shape[:2]
         return self.precisions[: 2 * planes * count].reshape(planes, count, 2)
 
     @property
@@ -96,25 +134,33 @@ class State:
     def shifted(self, vector: Float[np.ndarray, " unknowns"]) -> State:
         """Return the state with changes added, in the order of ``Changes``."""
         changes = Changes.of(self.field, len(self.light_e), vector[:, None])
-        centre, light = np.split(changes.stars[..., 0], [2], axis=1)
-        field, light = self.field.moved(changes), self.light_e * np.exp(light)
-        return replace(self, field=field, centre_px=self.centre_px + centre, light_e=light)
+        centre, light, background = np.split(changes.stars[..., 0], [2, 2 + self.light_e.shape[1]], axis=1)
+        return replace(
+            self,
+            field=self.field.moved(changes),
+            centre_px=self.centre_px + centre,
+            light_e=self.light_e * np.exp(light),
+            background_e=self.background_e + background,
+        )
 
-    def with_degrees(self, warp: int, image: int, rules: StampsRules) -> State:
-        """Return the state with other degrees: new numbers start at zero, and dropped ones are lost."""
-        (old_warp, old_image), planes = self.field.degrees, len(self.size)
-        nodes = _resized(self.field.nodes, polynomial_terms(image))
-        field = replace(self.field, nodes=nodes, warp=_resized(self.field.warp, polynomial_terms(warp) - 1))
-        _, warps, lateral = np.split(self.precisions, np.cumsum([self.of_images.size, planes * old_warp]))
-        images = _resized(self.of_images, image + 1)
-        for degree in range(old_image + 1, image + 1):
-            least = rules.new_image * images[:, degree - 1] if degree > 1 else 0.0
-            images[:, degree] = np.maximum(rules.first_image[1], least)
-        new = np.tile([rules.first_map] * 2 + [rules.new_map] * warp, (planes, 1))
-        warps = np.concatenate([warps.reshape(planes, old_warp), new[:, old_warp:]], axis=1)[:, :warp]
-        return replace(self, field=field, precisions=np.concatenate([images.ravel(), warps.ravel(), lateral]))
+    def with_map(self, degree: int, rules: StampsRules) -> State:
+        """Return the state with a map of another degree: new numbers start at zero, and dropped ones are lost."""
+        old, planes, before = self.field.map_degree, len(self.size), self.of_images.size
+        images, maps, others = np.split(self.precisions, [before, before + planes * old])
+        new = np.tile([rules.first_map] * 2 + [rules.new_map] * degree, (planes, 1))
+        maps = np.concatenate([maps.reshape(planes, old), new[:, old:]], axis=1)[:, :degree]
+        field = replace(self.field, warp=_resized(self.field.warp, polynomial_terms(degree) - 1))
+        return replace(self, field=field, precisions=np.concatenate([images, maps.ravel(), others]))
 
-    def with_spacing(self, stamps: Stamps, spacing_px: float) -> State:
+    def with_images(self, mix: Float[np.ndarray, "images terms"], rules: StampsRules) -> State:
+        """Return the state with more images, of strengths ``mix``: they start at zero."""
+        others, old = self.precisions[self.of_images.size :], self.of_images
+        new = np.tile(rules.first_image[1], (len(old), len(mix) - old.shape[1], 1))
+        images = np.concatenate([old, new], axis=1)
+        field = replace(self.field, nodes=_resized(self.field.nodes, len(mix)), mix=mix)
+        return replace(self, field=field, precisions=np.concatenate([images.ravel(), others]))._confined(rules)
+
+    def with_spacing(self, stamps: Stamps, spacing_px: float, rules: StampsRules) -> State:
         """Return the state on other nodes, which give the same images and cover the reach of the maps."""
         reach = np.abs(np.linalg.inv(self.field.maps(stamps.unit))).sum(axis=3).max()
         ratio = spacing_px / self.field.spacing_px
@@ -124,33 +170,68 @@ class State:
         precisions = self.precisions.copy()
         precisions[: self.of_images.size] *= np.tile([ratio**2, ratio**-2], self.of_images.size // 2)
         field = replace(self.field, nodes=nodes, spacing_px=spacing_px)
-        return replace(self, field=field, precisions=precisions, size=envelope(nodes[:, 0], spacing_px))
+        size = envelope(nodes[:, 0], spacing_px)
+        state = replace(self, field=field, precisions=precisions, size=size, model_error=np.zeros_like(size))
+        return state._confined(rules)
+
+    def _confined(self, rules: StampsRules) -> State:
+        """Return the state with further images in the middle of the grid, as far as the work requires."""
+        (rows, columns), more = self.size.shape[1:], self.field.nodes.shape[1] - 1
+        for margin in range(max(min(rows, columns) // 2 - 3, 1) if more else 1):
+            inner = rows - 2 * margin, columns - 2 * margin
+            if inner[0] * (columns + more * inner[1]) ** 3 <= rules.most_work:
+                break
+        state = replace(self, margin=margin)
+        return replace(state, field=replace(self.field, nodes=self.field.nodes * np.moveaxis(state.kept, 2, 0)))
+
+    def prior(self, plane: int) -> scipy.sparse.csr_array:
+        """Return the precision of a colour's nodes, as far as images have them, node by node."""
+        kept, parts = self.kept, []
+        index = np.where(kept, np.cumsum(kept.ravel()).reshape(kept.shape) - 1, 0)
+        for image, (a, b) in enumerate(self.of_images[plane]):
+            own = self.inner if image else np.s_[:, :]
+            scale = scipy.sparse.diags_array(1.0 / self.size[plane][own].ravel())
+            rough = laplacian(*self.size[plane][own].shape)[0] @ scale
+            one, place = (a * (scale @ scale) + b * (rough.T @ rough)).tocoo(), index[own][..., image].ravel()
+            parts.append((one.data, place[one.row], place[one.col]))
+        data, row, column = (np.concatenate(part) for part in zip(*parts, strict=True))
+        return scipy.sparse.csr_array((data, (row, column)), shape=(kept.sum(), kept.sum()))
 
     def squares(self, vectors: Float[np.ndarray, "unknowns k"] | None = None) -> Float[np.ndarray, " groups"]:
         """Return each precision's factor in minus twice the log prior: of the field, or a mean over changes."""
-        nodes, maps = self.field.nodes[..., None], self.maps[:, None]
+        nodes, maps, background = self.field.nodes[..., None], self.maps[:, None], self.background_e[..., None]
         if vectors is not None:
-            _, maps, nodes = Changes.of(self.field, len(self.light_e), vectors)
-        planes, terms, rows, columns, k = nodes.shape
-        z = np.moveaxis(nodes / self.size[:, None, :, :, None], (2, 3), (0, 1)).reshape(rows * columns, -1)
-        both = np.stack([(z**2).sum(axis=0), ((laplacian(rows, columns)[0] @ z) ** 2).sum(axis=0)])
-        each = both.reshape(2, planes, terms, k).mean(axis=3)
-        first = np.flatnonzero(np.diff(degrees(self.field.degrees[1]), prepend=-1))
-        image = np.moveaxis(np.add.reduceat(each, first, axis=2), 0, 2).ravel()
-        return np.concatenate([image, np.bincount(self.map_groups, (maps**2).mean(axis=1))[image.size :]])
+            stars, maps, nodes = Changes.of(self.field, len(self.light_e), vectors)
+            background = stars[:, -background.shape[1] :]
+        z = nodes / self.size[:, None, :, :, None]
+        each = np.concatenate([_quadratics(z[:, :1]), _quadratics(z[:, 1:, *self.inner])], axis=2).mean(axis=3)
+        each = np.moveaxis(each, 0, 2).ravel()
+        own = np.bincount(self.map_groups, (maps**2).mean(axis=1), minlength=each.size)[each.size :]
+        mean = (background.mean(axis=0) ** 2).sum(axis=0) * len(background)
+        ends = np.stack([mean, (background**2).sum(axis=(0, 1)) - mean]).mean(axis=1)
+        return np.concatenate([each, own, ends])
 
     def volume(self) -> tuple[float, Float[np.ndarray, " groups"]]:
         """Return the log determinant of the priors' precision, and its derivatives: the squares that priors expect."""
-        images, count = self.of_images.size, 1.0 + np.arange(self.of_images.shape[1])
-        maps, own = np.bincount(self.map_groups)[images:], self.precisions[images:]
-        a, b = np.moveaxis(self.of_images, 2, 0)[..., None]
-        eigenvalues = laplacian(*self.size.shape[1:])[1]
-        prior = a + b * eigenvalues
-        log_det = (
-            maps @ np.log(own) + (np.log(prior).sum(axis=2) @ count).sum() - 2 * count.sum() * np.log(self.size).sum()
-        )
-        squares = np.stack([(1 / prior).sum(axis=2), (eigenvalues / prior).sum(axis=2)], axis=2) * count[:, None]
-        return float(log_det), np.concatenate([squares.ravel(), maps / own])
+        count, (stars, planes) = self.of_images.size, self.light_e.shape
+        maps = np.bincount(self.map_groups, minlength=count)[count:]
+        numbers, own = np.concatenate([maps, [planes, planes * (stars - 1)]]), self.precisions[count:]
+        log_det, squares = numbers @ np.log(own), np.empty_like(self.of_images)
+        for image, (a, b) in enumerate(np.moveaxis(self.of_images, 0, 2)[..., None]):
+            size = self.size[:, *self.inner] if image else self.size
+            eigenvalues = laplacian(*size.shape[1:])[1]
+            prior = a + b * eigenvalues
+            log_det += np.log(prior).sum() - 2 * np.log(size).sum()
+            squares[:, image] = np.stack([(1 / prior).sum(axis=1), (eigenvalues / prior).sum(axis=1)], axis=1)
+        return float(log_det), np.concatenate([squares.ravel(), numbers / own])
+
+
+def _quadratics(z: Float[np.ndarray, "planes images rows columns k"]) -> Float[np.ndarray, "2 planes images k"]:
+    """Return sums of squares of images, and of their Laplacian."""
+    planes, images, rows, columns, k = z.shape
+    flat = np.moveaxis(z, (2, 3), (0, 1)).reshape(rows * columns, -1)
+    both = np.stack([(flat**2).sum(axis=0), ((laplacian(rows, columns)[0] @ flat) ** 2).sum(axis=0)])
+    return both.reshape(2, planes, images, k)
 
 
 def _resized(values: Float[np.ndarray, "planes n *rest"], count: int) -> Float[np.ndarray, "planes count *rest"]:
@@ -171,29 +252,33 @@ def _resampled(
 
 @dataclass(frozen=True)
 class Weighted:
-    """Samples under the model; ``seen`` has stars' light in ``down`` and ``jacobian``; unused ones have weight 0."""
+    """Samples under the model; ``seen`` has stars' light in ``down`` and ``jacobian``; unused ones have weight 0.
+
+    ``node`` is the flat index of a node next to each sample, over all colours.
+    """
 
     seen: Seen
     residual: Float[np.ndarray, "stars samples"]
     weight: Float[np.ndarray, "stars samples"]
+    mean_e: Float[np.ndarray, "stars samples"]
+    node: Int[np.ndarray, "stars samples"]
     log_likelihood: float
 
 
 def expectation(stamps: Stamps, state: State) -> Weighted:
     """Return the expectation of samples under the model, with residuals and weights."""
-    # Shot noise and read noise r together are those of y + r^2 ~ Poisson(m + r^2) (Snyder et al., J. Opt. Soc. Am. A
-    # 10, 1993), whose score (y - m) / (m + r^2) needs only the variance.
+    # Shot noise, and read noise r with the model's error, together are those of y + r^2 ~ Poisson(m + r^2) (Snyder et
+    # al., J. Opt. Soc. Am. A 10, 1993), whose score (y - m) / (m + r^2) needs only the variance.
     seen = see(state.field, stamps.unit, state.centre_px, stamps.offset_px, stamps.plane)
-    light = np.take_along_axis(state.light_e, stamps.plane, axis=1)
-    mean, read = light * seen.value, stamps.read_e**2
+    _, rows, columns = state.size.shape
+    node = seen.first + columns + 1 + rows * columns * stamps.plane
+    light, background = (np.take_along_axis(own, stamps.plane, axis=1) for own in (state.light_e, state.background_e))
+    mean, read = light * seen.value + background, stamps.read_e**2 + (light * state.model_error.ravel()[node]) ** 2
     # Expected light below zero has no shot noise.
-    variance = np.maximum(mean, 0.0) + read + (state.model_error * mean) ** 2
+    variance = np.maximum(mean, 0.0) + read
     residual, weight = stamps.value_e - mean, 1.0 / variance
-    if state.model_error:
-        likelihood = -0.5 * (residual**2 * weight + np.log(variance / read))
-    else:
-        below = np.where(mean < 0, mean * stamps.value_e - 0.5 * mean**2, 0.0) / read
-        likelihood = (stamps.value_e + read) * np.log(variance / read) - np.maximum(mean, 0.0) + below
+    below = np.where(mean < 0, mean * stamps.value_e - 0.5 * mean**2, 0.0) / read
+    likelihood = (stamps.value_e + read) * np.log(variance / read) - np.maximum(mean, 0.0) + below
     cut = stamps.clipped
     sigma = np.sqrt(variance[cut])
     z = (stamps.clip_e - mean[cut]) / sigma
@@ -204,4 +289,4 @@ def expectation(stamps: Stamps, state: State) -> Weighted:
     used = stamps.known & state.keep & seen.inside
     residual, weight = np.where(used, residual, 0.0), np.where(used, weight, 0.0)
     seen = seen._replace(down=light[..., None] * seen.down, jacobian=light[..., None] * seen.jacobian)
-    return Weighted(seen, residual, weight, float(likelihood[used].sum()))
+    return Weighted(seen, residual, weight, mean, node, float(likelihood[used].sum()))

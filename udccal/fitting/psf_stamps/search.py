@@ -1,8 +1,8 @@
-"""The search for the orders of a psf field: from a middle one, a degree at a time, by evidence.
+"""The search for the orders of a psf field: from one image on wide nodes, to more images or denser nodes, by evidence.
 
 The criterion is -2 log of the evidence (fields, places and light integrated out by Laplace's method), plus the
-logarithm of the number of samples for each precision that was tuned (Schwarz, "Estimating the dimension of a model",
-Annals of Statistics 6, 1978).
+logarithm of the number of samples for each precision and each number of the images' strengths (Schwarz, "Estimating
+the dimension of a model", Annals of Statistics 6, 1978). Maps need no search: precisions hold degrees that are absent.
 """
 
 from __future__ import annotations
@@ -11,16 +11,16 @@ from dataclasses import dataclass, replace
 from typing import final
 
 import numpy as np
-from jaxtyping import Bool
 
-from udccal.fitting.engine.gaussian import scaled_inverse
 from udccal.fitting.engine.least_squares import Solution, SolverRules, Step, minimise
 from udccal.fitting.engine.orders import Attempt, Choice, choose
-from udccal.fitting.engine.robust import OutlierRule
-from udccal.fitting.psf_stamps.data import Stamps, StampsRules, centroids, light_of
-from udccal.fitting.psf_stamps.equations import Laplace, laplace, marginal_cov
+from udccal.fitting.engine.robust import OutlierRule, robust_sigma
+from udccal.fitting.psf_stamps.data import Stamps, StampsRules, backgrounds, centroids, light_of
+from udccal.fitting.psf_stamps.equations import Laplace, laplace
 from udccal.fitting.psf_stamps.field import PsfField
-from udccal.fitting.psf_stamps.probability import State, envelope, expectation, grid_size
+from udccal.fitting.psf_stamps.images import with_more_images
+from udccal.fitting.psf_stamps.model_error import of_residuals, of_stars_left_out, placed, without_error
+from udccal.fitting.psf_stamps.probability import ABSENT, State, envelope, expectation, grid_size
 from udccal.models.fields import polynomial_terms
 
 WINDOW_PX = 1.6  # standard deviation of a Gaussian as wide as a star, before the kernel is known
@@ -42,14 +42,14 @@ class Evidence:
         try:
             found = laplace(self.stamps, place)
         except np.linalg.LinAlgError:
-            return Laplace(np.inf, 1, np.zeros(0), np.inf, np.zeros((0, 0)), (), np.zeros(0))
+            return Laplace(np.inf, 1, np.zeros(0), np.inf, np.zeros((0, 0)), (), np.zeros(0, dtype=bool), np.zeros(0))
         # The draws are the same every time, so that a descent ends.
         left = place.squares(found.draws(np.random.default_rng(0), self.rules.draws[0]))
         (_, expected), there = place.volume(), place.shifted(found.mode).squares()
         # Fellner and Schall: squares that the prior expects, less those that the data leave open, over those found;
-        # no more than 30 times as much at once, and no more than 1e14, where a term is absent.
+        # no more than 30 times as much at once, and no more than that of an absent term.
         ratio = np.clip(np.maximum(expected - left, 1e-6 * expected) / np.maximum(there, 1e-300), 1 / 30, 30.0)
-        tuned = np.minimum(np.log(ratio), np.log(1e14 / place.precisions))
+        tuned = np.minimum(np.log(ratio), np.log(ABSENT / place.precisions))
         # Drop the factors, the largest arrays of a fit, so that memory never holds two of them.
         return replace(found, tuned=tuned, colours=())
 
@@ -61,13 +61,19 @@ class Evidence:
 def improve(stamps: Stamps, state: State, rules: StampsRules, steps: int) -> Found:
     """Go to the most probable state nearby, in ``steps`` and one more at most; LinAlgError if singular at first."""
     # The last step's gain is more reliable than the next one's prediction, which ignores the precisions.
-    ends = dict(least_gain=0.0, stalled_gain=2 * rules.evidence, small_gain=rules.evidence)
-    solver = SolverRules(iterations=steps, first_damping=0.03, most_damping=10.0, **ends)
+    evidence = max(rules.evidence, rules.evidence_of_nodes * float(state.kept.sum()))
+    ends = dict(least_gain=0.0, stalled_gain=2 * evidence, small_gain=evidence)
+    solver = SolverRules(iterations=steps, first_damping=0.03, most_damping=1.0, **ends)
     problem = Evidence(stamps, rules)
     found = minimise(problem, state, solver)
     if not np.isfinite(found.equations.cost):
         raise np.linalg.LinAlgError("singular at the start")
-    return replace(found, place=problem.moved(found.place, found.equations.step(0.0)))
+    # Far from the mode, a step that nobody has tried may lead anywhere.
+    if found.equations.gain >= rules.beyond_doubt:
+        return found
+    # Where precisions still move, steps to the mode may cost evidence although they are small.
+    converged = bool(found.converged or found.equations.gain < evidence)
+    return replace(found, place=problem.moved(found.place, found.equations.step(0.0)), converged=converged)
 
 
 def without_outliers(stamps: Stamps, state: State, rules: StampsRules) -> State:
@@ -75,11 +81,17 @@ def without_outliers(stamps: Stamps, state: State, rules: StampsRules) -> State:
     everything, out = replace(state, keep=np.ones_like(state.keep)), np.asarray(~state.keep.any(axis=1))
     if out.any():
         # Otherwise a star that was left out would be compared at its place and light of a coarse field.
-        everything = _placed(stamps, everything, out)
-    seen = expectation(stamps, everything)
+        everything = placed(stamps, everything, out)
+    # What the model does not describe, in most stars, is no hit.
+    seen = expectation(stamps, replace(everything, model_error=of_residuals(stamps, everything)))
     # Clipped samples are not tested: their errors have a bound on one side.
     used = (seen.weight > 0) & ~stamps.clipped
     z = np.where(used, seen.residual * np.sqrt(seen.weight), 0.0)
+    # The same for samples at like distances from their star's centre: sharp cores move within a node's square.
+    distance = np.linalg.norm(stamps.offset_px - everything.centre_px[:, None], axis=2).astype(int)
+    for ring in range(distance.max() + 1):
+        own = used & (distance == ring)
+        z[own] /= max(1.0, robust_sigma(z[own]))
     keep = ~OutlierRule("samples", rules.outlier_sigma).off(z, used)
     kept, lost = stamps.known & keep, stamps.known & ~keep
     mean = np.where(kept, z**2, 0.0).sum(axis=1) / np.maximum(kept.sum(axis=1), 1)
@@ -88,37 +100,14 @@ def without_outliers(stamps: Stamps, state: State, rules: StampsRules) -> State:
     return replace(everything, keep=keep & ~bad[:, None])
 
 
-def _placed(stamps: Stamps, state: State, stars: Bool[np.ndarray, " stars"]) -> State:
-    """Fit some stars' places and light again, with the field held."""
-    for _ in range(4):
-        seen = expectation(stamps, state)
-        by_light = seen.seen.jacobian[..., :1] * np.moveaxis(stamps.by_plane, 0, 2)
-        jacobian = np.concatenate([seen.seen.jacobian[..., 1:3], by_light], axis=2)
-        weighted = (jacobian * seen.weight[..., None]).transpose(0, 2, 1)
-        step = (scaled_inverse(weighted @ jacobian) @ weighted @ seen.residual[..., None])[..., 0]
-        centre, light = np.split(np.clip(step, -0.5, 0.5) * stars[:, None], [2], axis=1)
-        state = replace(state, centre_px=state.centre_px + centre, light_e=state.light_e * np.exp(light))
-    return state
-
-
 @final
 @dataclass(frozen=True)
 class Orders:
-    """Degrees of the map and of the images over the field, and spacing of nodes in px."""
+    """Orders that are given: degrees of the map, and of the polynomials that have an image each; spacing of nodes."""
 
     warp: int
     image: int
     spacing_px: float
-
-    @classmethod
-    def of(cls, state: State) -> Orders:
-        """Return the orders of a state."""
-        return cls(*state.field.degrees, state.field.spacing_px)
-
-    @property
-    def name(self) -> str:
-        """Name in the table of candidates."""
-        return f"map degree {self.warp}, image degree {self.image}, nodes every {self.spacing_px:g} px"
 
 
 def start(stamps: Stamps, rules: StampsRules) -> State:
@@ -128,88 +117,77 @@ def start(stamps: Stamps, rules: StampsRules) -> State:
     image = np.exp(-0.5 * (y[:, None] ** 2 + x**2) * (spacing_px / WINDOW_PX) ** 2) + 1e-3
     nodes = np.tile(image / (image.sum() * spacing_px**2), (planes, 1, 1, 1))
     # Lateral colour of degree 2.
-    field = PsfField(nodes, np.zeros((planes, 0, 2, 2)), np.zeros((planes - 1, 5, 2)), spacing_px)
-    first = np.concatenate([np.tile(rules.first_image[0], planes), np.full(2 * planes - 2, rules.first_lateral)])
-    centre_px, size = centroids(stamps, WINDOW_PX), envelope(nodes[:, 0], spacing_px)
-    return State(field, centre_px, light_of(stamps), first, size, np.ones_like(stamps.known))
+    field = PsfField(nodes, np.zeros((planes, 0, 2, 2)), np.zeros((planes - 1, 5, 2)), np.ones((1, 1)), spacing_px)
+    background_e, size = backgrounds(stamps), envelope(nodes[:, 0], spacing_px)
+    # A background too faint for the edges to show may still be as large as the noise; the evidence decides.
+    squares = np.array([(background_e.mean(axis=0) ** 2).mean(), background_e.var(axis=0).mean()])
+    lateral, images = np.full(2 * planes - 2, rules.first_lateral), np.tile(rules.first_image[0], planes)
+    precisions = np.concatenate([images, lateral, 1.0 / np.maximum(squares, stamps.read_e**2)])
+    centre_px, light_e = centroids(stamps, background_e, WINDOW_PX), light_of(stamps, background_e)
+    keep = np.ones_like(stamps.known)
+    return State(field, centre_px, light_e, background_e, precisions, size, keep, np.zeros_like(size))
 
 
-def coarse(stamps: Stamps, rules: StampsRules, most: Orders) -> State:
-    """Fit places, light and a first field, with a model error for the parts that the model cannot describe yet."""
+def coarse(stamps: Stamps, rules: StampsRules, map_degree: int) -> State:
+    """Fit places, light and a map, with a model error for the parts that the model cannot describe yet."""
     state = start(stamps, rules)
-    for warp, image, allowed in rules.coarse:
-        state = replace(state.with_degrees(min(warp, most.warp), min(image, most.image), rules), model_error=allowed)
-        state = without_outliers(stamps, state, rules) if warp else state
-        state = improve(stamps, state, rules, 1).place
-        state = replace(state, size=envelope(state.field.nodes[:, 0], state.field.spacing_px))
-    state = state.with_spacing(stamps, rules.spacings_px[0])
-    return without_outliers(stamps, replace(state, model_error=0.0), rules)
+    for degree, allowed in rules.coarse:
+        state = state.with_map(min(degree, map_degree), rules)
+        state = without_outliers(stamps, state, rules) if degree else state
+        state = improve(stamps, replace(state, model_error=allowed * state.size), rules, 1).place
+        # Images cannot make up for nodes too wide for the kernel.
+        narrow = state.field.spacing_px == rules.spacings_px[0] and state.width_px < rules.narrow_px
+        state = state.with_spacing(stamps, rules.spacings_px[-2] if narrow else state.field.spacing_px, rules)
+    return without_outliers(stamps, without_error(state), rules)
 
 
 def search(stamps: Stamps, rules: StampsRules, orders: Orders | None) -> Choice[Found]:
     """Search for the orders, unless they are given, and fit; raise LinAlgError when equations are singular."""
     # Degrees have at most half as many polynomials as there are stars.
     limit = max(d for d in range(9) if d == 0 or 2 * polynomial_terms(d) <= len(stamps.unit))
-    warp, image = (min(limit, highest) for highest in rules.highest)
-    most = orders or Orders(warp, image, rules.spacings_px[0])
-    state, tried = coarse(stamps, rules, most), []
-    if orders is not None:
-        state = state.with_spacing(stamps, orders.spacing_px).with_degrees(orders.warp, orders.image, rules)
-        found = improve(stamps, state, rules, rules.steps_to_end)
-    else:
-        tried = _spacings(stamps, _degrees(stamps, state, rules, most), rules)
-        found = choose(tried).best.fit
-    state = without_outliers(stamps, found.place, rules)
-    if not (found.converged and np.array_equal(state.keep, found.place.keep)):
-        found = improve(stamps, state, rules, rules.steps_to_end)
-    final = attempt(stamps, found)
-    return Choice(final, (*(t for t in tried if t.name != final.name), final))
+    map_degree, image_degree = (min(limit, highest) for highest in rules.highest)
+    state = coarse(stamps, rules, orders.warp if orders else map_degree)
+    if orders:
+        mix = np.eye(polynomial_terms(orders.image))
+        state = (
+            state.with_map(orders.warp, rules).with_spacing(stamps, orders.spacing_px, rules).with_images(mix, rules)
+        )
+    best = attempt(stamps, improve(stamps, state, rules, rules.steps_to_compare), rules)
+    tried = [best] if orders else _neighbours(stamps, best, image_degree, rules)
+    best = choose(tried).best
+    # Others were compared without a model error and with the same samples left out; this fit does not compare.
+    state = without_outliers(stamps, best.fit.place, rules)
+    state = replace(state, model_error=of_stars_left_out(stamps, state, rules))
+    final = replace(best, fit=improve(stamps, state, rules, rules.steps_to_end))
+    return Choice(final, (*(t for t in tried if t is not best), final))
 
 
-def attempt(stamps: Stamps, found: Found, more: float = 0.0) -> Attempt[Found]:
-    """Return a fit with its criterion; ``more`` adds to the equations' log evidence."""
-    state = found.place
-    criterion = np.log(stamps.known.sum()) * len(state.precisions) - 2 * (found.equations.evidence + more)
-    return Attempt(Orders.of(state).name, state.field.nodes.size + len(state.maps), float(criterion), found)
+def attempt(stamps: Stamps, found: Found, rules: StampsRules) -> Attempt[Found]:
+    """Return a fit with its criterion."""
+    state, gain = found.place, found.equations.gain
+    # Far from the mode, what another step promises is worth no more than the last one gained, nor much at all.
+    last = -0.5 * float(np.diff(found.history)[-1:].sum())
+    evidence = found.equations.evidence - gain + min(gain, last, rules.beyond_doubt)
+    images, terms = state.field.mix.shape
+    tuned = len(state.precisions) + (images - 1) * (terms - 1)
+    criterion = np.log(stamps.known.sum()) * tuned - 2 * evidence
+    return Attempt(state.name, state.field.nodes.size + len(state.maps), float(criterion), found)
 
 
-def _degrees(stamps: Stamps, state: State, rules: StampsRules, most: Orders) -> list[Attempt[Found]]:
-    """Return all fits of a search that goes from neighbour to neighbour until none is better."""
-    best = attempt(stamps, improve(stamps, state, rules, rules.steps_to_compare + 1))
-    tried, known = [best], {Orders.of(state)}
+def _neighbours(stamps: Stamps, best: Attempt[Found], degree: int, rules: StampsRules) -> list[Attempt[Found]]:
+    """Return all fits of a search that adds images as long as they help, then makes nodes denser, and begins again."""
+    tried, gain = [best], np.inf
     while True:
-        own = Orders.of(best.fit.place)
-        steps = ((0, -1), (-1, 0), (-2, 0), (1, 0), (2, 0), (0, 1))
-        near = [Orders(own.warp + w, own.image + i, own.spacing_px) for w, i in steps]
-        near = [o for o in near if o not in known and 0 <= o.warp <= most.warp and 0 <= o.image <= most.image]
-        tried += [_judged(stamps, best, o, rules) for o in near]
-        known.update(near)
-        if (better := choose(tried).best) is best:
-            return tried
-        best = better
-
-
-def _judged(stamps: Stamps, best: Attempt[Found], orders: Orders, rules: StampsRules) -> Attempt[Found]:
-    """Fit these degrees, or predict the fit by curvature if a map that matters beyond doubt is left out."""
-    place, warp = best.fit.place, best.fit.place.field.warp
-    dropped = np.arange(warp.size).reshape(warp.shape)[:, polynomial_terms(orders.warp) - 1 :].ravel()
-    value, cov = place.maps[dropped], marginal_cov(best.fit.equations.root, place.maps_from + dropped)
-    loss = 0.5 * float(value @ np.linalg.solve(cov, value))
-    state = place.with_degrees(orders.warp, orders.image, rules)
-    if loss > rules.beyond_doubt:
-        return attempt(stamps, replace(best.fit, place=state), -loss)
-    return attempt(stamps, improve(stamps, state, rules, rules.steps_to_compare))
-
-
-def _spacings(stamps: Stamps, tried: list[Attempt[Found]], rules: StampsRules) -> list[Attempt[Found]]:
-    """Try the best degrees on denser nodes, while the last gain predicts another that is large enough."""
-    gain, first, *finer = np.inf, *rules.spacings_px
-    for spacing in finer:
-        best = choose(tried).best
+        state, known = best.fit.place, {one.name for one in tried}
+        spacings = [one for one in rules.spacings_px if one < state.field.spacing_px]
         # The error of cubic splines falls with the spacing's fourth power, its cost in likelihood with the eighth.
-        if gain * (finer[0] / first) ** 8 < rules.worth_finer:
-            break
-        state = without_outliers(stamps, best.fit.place.with_spacing(stamps, spacing), rules)
-        tried = [*tried, attempt(stamps, improve(stamps, state, rules, rules.steps_to_end))]
-        gain = best.criterion - tried[-1].criterion
-    return tried
+        worth = spacings and gain * (spacings[0] / state.field.spacing_px) ** 8 > rules.worth_finer
+        near, finer = with_more_images(stamps, state, degree, rules), False
+        if near.name in known:
+            if not worth:
+                return tried
+            near, finer = state.with_spacing(stamps, spacings[0], rules), True
+        tried.append(attempt(stamps, improve(stamps, near, rules, rules.steps_to_compare), rules))
+        gained = best.criterion - tried[-1].criterion
+        gain = max(gained, 0.0) if finer else gain
+        best = choose((best, tried[-1])).best

@@ -1,0 +1,141 @@
+"""The model error of a psf field: what is neither noise nor uncertainty, in light per pixel at the nodes of its images.
+
+A field that follows the psf too coarsely, or that follows noise, leaves small residuals at the stars that it was fitted
+to. Stars that it was not fitted to show its errors in full. A lobe far from the middle may change over the field while
+the core does not. The error is therefore measured twice: near each node, and at all nodes of similar light together,
+which shows smaller errors. The larger one counts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from udccal.fitting.engine.gaussian import scaled_inverse
+from udccal.fitting.engine.misfit import excess_sigma
+from udccal.fitting.engine.robust import MAD_TO_SIGMA
+from udccal.fitting.psf_stamps.data import Stamps, StampsRules
+from udccal.fitting.psf_stamps.equations import changes_of_samples, laplace
+from udccal.fitting.psf_stamps.field import Changes
+from udccal.fitting.psf_stamps.probability import State, Weighted, expectation
+
+_NEAR_PX = 2.0  # size of the squares whose nodes are near each other
+_FACTOR = 4.0  # within which nodes are of similar light
+
+Nodes = Float[np.ndarray, "planes grid_rows grid_columns"]
+# The size of an error from squares, their variance by noise, and what an error of size 1 adds.
+Size = Callable[[np.ndarray, np.ndarray, np.ndarray], float]
+
+
+def without_error(state: State) -> State:
+    """Return the state with noise alone."""
+    return replace(state, model_error=np.zeros_like(state.size))
+
+
+def of_residuals(stamps: Stamps, state: State) -> Nodes:
+    """Return the model error that a fit's own residuals show, in most stars: hits have little weight."""
+    seen = expectation(stamps, without_error(state))
+    variance = np.divide(1.0, seen.weight, out=np.zeros_like(seen.weight), where=seen.weight > 0)
+    return _shown(stamps, state, seen.node, seen.residual**2, variance, _of_most)
+
+
+def of_stars_left_out(stamps: Stamps, state: State, rules: StampsRules) -> Nodes:
+    """Return the model error that stars show which are left out of a fit, a part at a time.
+
+    Their squares are compared with noise and the uncertainty of the others' field, both less what a star's own place
+    and light take up. Zeros where these explain the squares.
+    """
+    rng = np.random.default_rng(0)
+    part = rng.permutation(len(stamps.unit)) % rules.parts
+    square, variance = np.zeros((2, *stamps.known.shape))
+    for own in range(rules.parts):
+        out = part == own
+        found = laplace(stamps, replace(state, keep=state.keep & ~out[:, None]))
+        draws = found.draws(rng, rules.draws[0])
+        Changes.of(state.field, len(out), draws).stars[out] = 0.0
+        there = placed(stamps, without_error(state.shifted(found.mode)), out)
+        seen = expectation(stamps, there)
+        root = np.sqrt(seen.weight)[..., None]
+        change = root * changes_of_samples(stamps, there.field, seen, draws)
+        taken = np.linalg.qr(root * _by_star(stamps, there, seen))[0]
+        change -= taken @ (taken.transpose(0, 2, 1) @ change)
+        every = 1.0 - (taken**2).sum(axis=2) + (change**2).mean(axis=2)
+        square[out] = (seen.residual**2)[out]
+        np.divide(every, seen.weight, out=variance, where=(seen.weight > 0) & out[:, None])
+    node = expectation(stamps, state).node
+    return _shown(stamps, state, node, square, variance, _significant)
+
+
+def placed(stamps: Stamps, state: State, stars: Bool[np.ndarray, " stars"]) -> State:
+    """Fit some stars' places, light and background again, with the field held."""
+    planes = state.light_e.shape[1]
+    for _ in range(4):
+        seen = expectation(stamps, state)
+        jacobian = _by_star(stamps, state, seen)
+        weighted = (jacobian * seen.weight[..., None]).transpose(0, 2, 1)
+        step = (scaled_inverse(weighted @ jacobian) @ weighted @ seen.residual[..., None])[..., 0] * stars[:, None]
+        centre, light, background = np.split(step, [2, 2 + planes], axis=1)
+        state = replace(
+            state,
+            centre_px=state.centre_px + np.clip(centre, -0.5, 0.5),
+            light_e=state.light_e * np.exp(np.clip(light, -0.5, 0.5)),
+            background_e=state.background_e + background if state.lit else state.background_e,
+        )
+    return state
+
+
+def _by_star(stamps: Stamps, state: State, seen: Weighted) -> Float[np.ndarray, "stars samples own"]:
+    """Return derivatives of samples by (x, y), light by colour, and background by colour where there is one."""
+    own = np.moveaxis(stamps.by_plane, 0, 2)
+    parts = [seen.seen.jacobian[..., 1:3], seen.seen.jacobian[..., :1] * own, *([own] if state.lit else [])]
+    return np.concatenate(parts, axis=2)
+
+
+def _shown(
+    stamps: Stamps,
+    state: State,
+    node: Int[np.ndarray, "stars samples"],
+    square: Float[np.ndarray, "stars samples"],
+    variance: Float[np.ndarray, "stars samples"],
+    size_of: Size,
+) -> Nodes:
+    """Return the model error that squares of residuals show; samples of zero variance are not used."""
+    used = (variance > 0) & ~stamps.clipped
+    # Squares of an error that is as large as the light nearby; the measured one is relative to it.
+    unit = (np.take_along_axis(state.light_e, stamps.plane, axis=1)[used] * state.size.ravel()[node[used]]) ** 2
+    square, variance, found = square[used], variance[used], np.zeros(state.size.size)
+    for groups in _groups(state):
+        own = groups.ravel()[node[used]]
+        order = np.argsort(own, kind="stable")
+        for index in np.split(order, np.flatnonzero(np.diff(own[order])) + 1):
+            size = size_of(square[index], variance[index], unit[index])
+            here = np.isin(groups.ravel(), own[index[:1]])
+            found[here] = np.maximum(found[here], size)
+    return state.size * found.reshape(state.size.shape)
+
+
+def _of_most(
+    square: Float[np.ndarray, " n"], variance: Float[np.ndarray, " n"], unit: Float[np.ndarray, " n"]
+) -> float:
+    """Return the size of the error in most samples, by medians, significant or not."""
+    excess = MAD_TO_SIGMA**2 * np.median(square / unit) - np.median(variance / unit)
+    return float(np.sqrt(max(excess, 0.0)))
+
+
+def _significant(
+    square: Float[np.ndarray, " n"], variance: Float[np.ndarray, " n"], unit: Float[np.ndarray, " n"]
+) -> float:
+    """The same where it is significant; stars at the edge, for which the others extrapolate, have little weight."""
+    return _of_most(square, variance, unit) if excess_sigma(square, variance, unit, dof=float(square.size)) else 0.0
+
+
+def _groups(state: State) -> tuple[Int[np.ndarray, "planes grid_rows grid_columns"], ...]:
+    """Return numbers of the nodes' groups, whose errors are measured together: by place, and by light."""
+    planes, *grid = state.size.shape
+    y, x = (np.rint((np.arange(n) - (n - 1) / 2) * state.field.spacing_px / _NEAR_PX).astype(int) for n in grid)
+    light = np.log(state.size.max(axis=(1, 2), keepdims=True) / state.size) / np.log(_FACTOR)
+    plane = np.arange(planes)[:, None, None] * 10**6
+    return plane + 1000 * (y[:, None] - y[0]) + (x - x[0]), plane + light.astype(int)
