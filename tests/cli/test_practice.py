@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import pty
+import shutil
 import signal
 import subprocess
 import sys
@@ -202,3 +203,42 @@ def test_what_is_skipped_is_said_in_fit_report_and_profile(rig: Path, tmp_path: 
         }
     for note in notes.values():
         assert note in report
+
+
+def practised(rig: Path, folder: Path, typed: str) -> tuple[int, str]:
+    """The status, and what was said, without the breaks of lines."""
+    words = command(rig, folder, "--term", "wire")
+    done = subprocess.run(words, input=typed, capture_output=True, text=True, timeout=_PATIENCE_S)
+    assert "Traceback" not in done.stderr
+    return done.returncode, " ".join(done.stderr.split())
+
+
+@pytest.mark.slow
+def test_two_at_once_do_not_share_a_session(rig: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "à 用户 'x'"
+    folder.mkdir()
+    first = Terminal(command(rig, folder))
+    first.until("Enter · skip · back · quit · wrong")
+    status, said = practised(rig, folder, "\n")
+    assert status == 1
+    assert "to be free, found that another process is writing to it." in said, said
+    first.type("quit")
+    assert first.ended() == 130
+
+
+@pytest.mark.slow
+def test_a_full_disk_ends_a_practice_with_a_sentence_and_a_session_to_go_on_with(rig: Path, tmp_path: Path) -> None:
+    disk = tmp_path / "disk µ"
+    disk.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", "size=64k", "udccal-test", str(disk)]
+    if shutil.which("mount") is None or subprocess.run(mount, capture_output=True).returncode != 0:
+        pytest.skip("needs the right to mount a small file system")
+    try:
+        status, said = practised(rig, disk, "\n\n")
+        assert status == 1
+        assert "No space left on device" in said
+        assert not list(disk.rglob("*.partial*"))
+        assert not (disk / "p").exists()
+        assert Session.open(disk / "s").steps("wire") == ()
+    finally:
+        subprocess.run(["umount", str(disk)], check=True)

@@ -72,6 +72,20 @@ def test_dead_pixels_are_no_smudge(truth: Wire, flat: WireData) -> None:
     assert not failed(judge_wire(replace(flat, signal=signal), fitted("wire", truth), ValidationLimits()))
 
 
+@pytest.mark.parametrize("level", [np.nan, 1e200])
+def test_a_map_of_impossible_values_is_refused(truth: Wire, flat: WireData, level: float) -> None:
+    strange = replace(truth, row_open=np.float64(level))
+    found = judge_wire(flat, fitted("wire", strange), ValidationLimits())
+    assert "values that no panel gives" in named(found, "captures").what
+
+
+def test_a_flat_of_few_pixels_cannot_be_judged(truth: Wire, flat: WireData) -> None:
+    few = slice(0, 64), slice(0, 96)  # eight pixels for each part of the sensor, not all of which are looked at
+    small = replace(flat, signal=flat.signal[few], variance=flat.variance[few])
+    found = judge_wire(small, fitted("wire", truth), ValidationLimits())
+    assert "No part of the sensor has enough pixels" in named(found, "captures").what
+
+
 def test_a_clipped_flat_cannot_be_judged(truth: Wire, flat: WireData) -> None:
     found = judge_wire(replace(flat, clipped=0.5), fitted("wire", truth), ValidationLimits())
     assert failed(found) == {"captures"}

@@ -30,6 +30,12 @@ def cell_numbers(scaled: Float[np.ndarray, "n 2"]) -> Int[np.ndarray, " n"]:
     return np.asarray(y * across + x)
 
 
+NO_PARTS = (
+    "No part of the sensor has enough pixels that can be compared: the sensor is very small, or nearly all pixels of "
+    "the flat are far off. Calibrate the rig again."
+)
+
+
 def cell_medians(
     seen: Weighed, noise: FlatNoise
 ) -> tuple[Float[np.ndarray, "down across"], Float[np.ndarray, "down across"]]:

@@ -23,7 +23,7 @@ from udccal.fitting.wire.data import odd_step, scaled_places
 from udccal.sessions.schema import DarkSubject, PanelSubject, StoredStep, TermName
 from udccal.sessions.store import Average, Session
 from udccal.validation.checks import Check, Judged, ZMap, at_most, unusable
-from udccal.validation.flats import light_design, part_medians
+from udccal.validation.flats import NO_PARTS, light_design, part_medians
 from udccal.validation.limits import ValidationLimits
 from udccal.validation.noise import dark_line
 
@@ -139,6 +139,8 @@ def compare_flats(a: Session, b: Session, limits: ValidationLimits) -> Judged:
         used = (one.signal > 0) & (np.abs(ratio - light) < np.maximum(_DEFECT * sigma, 0.3 * light))
     off, variance, dof = (ratio / light - 1)[used], ((sigma / light) ** 2)[used], float(used.sum() - design.shape[1])
     cells, cell_sigma = part_medians(off, variance, scaled[used])
+    if np.isnan(cells).all():
+        return unusable("wire", NO_PARTS)
     excess, worst = excess_sigma(off**2, variance, np.ones(len(off)), dof), float(np.nanmax(np.abs(cells)))
     checks = (
         at_most(

@@ -21,7 +21,7 @@ from udccal.profiles.profile import Profile
 from udccal.result import FitResult
 from udccal.sessions.store import Session
 from udccal.validation.checks import Judged, ZMap, at_most, chi2_check, unusable
-from udccal.validation.flats import cell_medians, light_design
+from udccal.validation.flats import NO_PARTS, cell_medians, light_design
 from udccal.validation.limits import ValidationLimits
 
 
@@ -34,6 +34,10 @@ def validate_wire(profile: Profile, session: Session, limits: ValidationLimits) 
     return judge_wire(read_wire(session, profile.noise.term, profile.wire.term.geometry), profile.wire, limits)
 
 
+# Over a mean of 1; numbers beyond are of a profile that was altered, and NaN is none.
+_MOST_LIGHT = 1e3
+
+
 @in_float64
 def judge_wire(data: WireData, result: FitResult[Wire], limits: ValidationLimits) -> Judged:
     """Judge patterns by the rows' and columns' period, the worst part of the sensor, and the scatter of pixels."""
@@ -43,11 +47,16 @@ def judge_wire(data: WireData, result: FitResult[Wire], limits: ValidationLimits
     values = data.signal / means[cfa_named(data.cfa).site_map(*data.signal.shape)]
     pixels = sample_pixels(values, result.term.geometry, rules.samples, data.cfa, other=True)
     noise = flat_noise(data, means)
-    seen = _predicted(result.term, pixels, noise)
+    whole, base = values_at(result.term, pixels.ideal, pixels.scaled)
+    if not (np.abs(whole * base) < _MOST_LIGHT).all():
+        return unusable("wire", "The profile's wire map has values that no panel gives. Calibrate the rig again.")
+    seen = _predicted(whole * base, pixels, noise)
     stated = (result.diagnostic("wire_map_rms_sigma") or 0.0) / 100
     panel = result.term if len(result.term.harmonics) else None
     off = misfit(seen, panel, stated, held_out=True)
     cells, sigma = cell_medians(seen, noise)
+    if np.isnan(cells).all():
+        return unusable("wire", NO_PARTS)
     worst, dof = float(np.nanmax(np.abs(cells))), seen.pixels.used
     checks = (
         at_most(
@@ -81,13 +90,12 @@ def judge_wire(data: WireData, result: FitResult[Wire], limits: ValidationLimits
     return Judged(checks, ZMap(cells / np.hypot(sigma, stated), "x", "y", caption))
 
 
-def _predicted(wire: Wire, pixels: Pixels, noise: FlatNoise) -> Weighed:
+def _predicted(light: Float[np.ndarray, " n"], pixels: Pixels, noise: FlatNoise) -> Weighed:
     """The sample with the light that the map predicts, at the best light in front of the panel."""
-    whole, base = values_at(wire, pixels.ideal, pixels.scaled)
-    plain = weighed(pixels, whole * base, noise)
+    plain = weighed(pixels, light, noise)
     for _ in range(2):  # What is far off counts once more after the light's level is known.
-        smooth = _smooth(plain.pixels, whole * base)
-        plain = weighed(pixels, whole * base * smooth, noise)
+        smooth = _smooth(plain.pixels, light)
+        plain = weighed(pixels, light * smooth, noise)
     return plain
 
 
