@@ -29,8 +29,7 @@ from tests.benchmarks.rows import Row, at_least, at_most, table, write_json
 from udccal.benches.bench import simulate, simulated_bench
 from udccal.benches.capture import capture
 from udccal.compilation import keep_compilations
-from udccal.drift.check import check_rig
-from udccal.drift.short import short_rig
+from udccal.drift.check import check_rig, short_rig
 from udccal.profiles.profile import Profile, build_profile
 from udccal.profiles.provenance import provenance_now
 from udccal.profiles.store import read_profile, write_profile

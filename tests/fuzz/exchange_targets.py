@@ -11,8 +11,7 @@ import numpy as np
 
 from tests.fuzz.target import Target, of_file, written
 from udccal.profiles.archive import unpack_archive
-from udccal.profiles.exchange.formats import IMPORTS
-from udccal.profiles.exchange.imports import profile_of, read_lens
+from udccal.profiles.exchange.imports import IMPORTS, profile_of, read_lens
 from udccal.rig import RigDescription, load_rig
 
 _MATRIX = "  rows: 3\n  cols: {}\n  data: [{}]\n"

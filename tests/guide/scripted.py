@@ -5,7 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from udccal.cameras.protocol import Frame
-from udccal.guide.events import Answer, DoneEvent, Event, Outline, ReadingsEvent, StepEvent, VerdictEvent
+from udccal.guide.events import (
+    Answer,
+    DoneEvent,
+    Event,
+    Outline,
+    ReadingsEvent,
+    StepEvent,
+    VerdictEvent,
+    in_order,
+)
 
 MOST_LOOKS = 150
 
@@ -66,7 +75,7 @@ class Scripted:
 def _in_order(event: Event) -> bool:
     match event:
         case ReadingsEvent(readings=readings, sentence=sentence):
-            return bool(readings) and not sentence and all(reading.ok for reading in readings)
+            return in_order(readings, sentence)
         case VerdictEvent(ok=ok):
             return ok
     return False

@@ -16,9 +16,8 @@ from tests.live.test_pipeline import ListSink
 from udccal import plugins
 from udccal.errors import LiveError, UdccalError
 from udccal.io.png import read_rgb8
-from udccal.live.sinks.choice import make_sink
 from udccal.live.sinks.images import ImagesSink
-from udccal.live.sinks.protocol import Sink
+from udccal.live.sinks.protocol import Sink, make_sink
 from udccal.live.sinks.shared_memory import SharedMemorySink
 from udccal.live.sinks.video import VideoSink
 from udccal.live.sinks.virtual_camera import VirtualCameraSink

@@ -11,6 +11,7 @@ from jaxtyping import Float
 from scipy.special import ndtri
 
 from udccal.drift.causes import CAUSES, Explained
+from udccal.drift.gain import GainRatio
 from udccal.drift.limits import DriftLimits
 from udccal.drift.pose import PoseChange
 from udccal.profiles.profile import Profile
@@ -116,16 +117,22 @@ def panel_level(profile: Profile, level: Float[np.ndarray, "3"], gain_sigma: flo
     )
 
 
-def gain_change(gain: float, sigma: float, limits: DriftLimits) -> Change:
-    """Return the change of the sensor's gain; ``gain`` is over the profile's."""
-    off = 100 * abs(gain - 1)
+def gain_change(gain: GainRatio, limits: DriftLimits) -> Change:
+    """Return the change of the sensor's gain; what flicker of the lamp makes of it is told."""
+    off, sigma = 100 * abs(gain.value - 1), 100 * gain.sigma
+    told = f"The sensor's gain is {gain.value:.4f} times that of the profile."
+    if gain.flicker:
+        told += (
+            f" The lamp flickers by {100 * gain.flicker:.2f} % from frame to frame: {gain.raised:.4f} of that is its "
+            "doing, not the gain's. Use a steady lamp."
+        )
     return Change(
         "gain",
         off,
-        100 * sigma,
+        sigma,
         limits.gain_percent,
         "%",
-        off > limits.errors * 100 * sigma,
-        f"The sensor's gain is {gain:.4f} times that of the profile.",
+        off > limits.errors * sigma,
+        told,
         "Set the camera's gain back, or go on with a profile that --update writes.",
     )

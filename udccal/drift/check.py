@@ -23,11 +23,14 @@ from udccal.fitting.wire.fit import site_means, unusable_flat
 from udccal.fitting.wire.rules import WireRules
 from udccal.numerics import in_float64
 from udccal.profiles.profile import Profile
+from udccal.rig import RigDescription
 from udccal.sessions.store import Session
 from udccal.validation.backscatter import SeenLight, brightness
 
 Verdict = Literal["same", "changed, harmless", "changed"]
 FORMAT, VERSION = "udccal-check", 1
+# Ten flats tell a movement of some micrometres; two pictures beside white tell where on the panel the camera is.
+_FEW = {"flats": 10, "backscatter_pictures": 2, "backscatter_frames": 4}
 # Flats that no pose explains to this many times their noise were of a rig that changed in another way.
 _UNEXPLAINED = 1.5
 
@@ -68,6 +71,11 @@ class Solved:
     gain: float
 
 
+def short_rig(rig: RigDescription) -> RigDescription:
+    """Return the description of the same rig with the captures of a check."""
+    return rig.model_copy(update={"captures": rig.captures.model_copy(update=_FEW)})
+
+
 @in_float64
 def check_rig(profile: Profile, session: Session, limits: DriftLimits | None = None) -> tuple[RigCheck, Solved]:
     """Compare a rig with its profile by a short session: flats and darks of the wire, and pictures on the panel.
@@ -85,19 +93,19 @@ def check_rig(profile: Profile, session: Session, limits: DriftLimits | None = N
     check_same_rig(profile, session.rig, session.camera)
     _check_measured(profile)
     flat, dark = (session.average(session.step(f"wire/{name}").captures[0]) for name in ("flat", "dark"))
-    gain, gain_sigma = gain_ratio(flat, dark, profile.noise, profile.rig.camera.cfa)
     data = read_wire(session, profile.noise.term, profile.wire.term.geometry)
     if (refused := unusable_flat(data, site_means(data), WireRules())) is not None:
         raise SessionError(f"Expected flats that can be compared, found: {refused[1]} {refused[0].value}")
+    gain = gain_ratio(flat, dark, profile.noise, profile.rig.camera.cfa)
     pose = pose_change(profile.wire.term, data)
     cause = explained(pose.values, pose.cov + _own_cov(profile), limits.chance)
-    level = _level(profile, session, cause) / gain
-    solved = Solved(pose, cause, level, gain)
+    level = _level(profile, session, cause) / gain.value
+    solved = Solved(pose, cause, level, gain.value)
     changes = (
         *pose_changes(profile, cause, limits),
         smudge(profile, pose, limits),
-        panel_level(profile, level, gain_sigma, limits),
-        gain_change(gain, gain_sigma, limits),
+        panel_level(profile, level, gain.sigma, limits),
+        gain_change(gain, limits),
     )
     return _answer(profile, changes, solved, limits), solved
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import enum
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Literal, Protocol, final, runtime_checkable
 
@@ -40,6 +41,11 @@ class Reading:
     def __post_init__(self) -> None:
         ok = (self.low is None or self.value >= self.low) and (self.high is None or self.value <= self.high)
         object.__setattr__(self, "ok", ok)
+
+
+def in_order(readings: Iterable[Reading], sentence: str) -> bool:
+    """Whether a look found nothing wrong: no sentence says what is, and all readings are within their bounds."""
+    return not sentence and all(reading.ok for reading in readings)
 
 
 @final

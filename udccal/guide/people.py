@@ -6,7 +6,7 @@ from typing import Protocol, final, runtime_checkable
 
 from udccal.arrangements import Arrangement, Occasion
 from udccal.cameras.protocol import Frame
-from udccal.guide.events import Answer, Event, Outline, Person, ReadingsEvent, VerdictEvent
+from udccal.guide.events import Answer, Event, Outline, Person, ReadingsEvent, VerdictEvent, in_order
 
 
 @final
@@ -29,7 +29,7 @@ class Agreeing:
         """Pass the event on."""
         match event:
             case ReadingsEvent(readings=readings, sentence=sentence):
-                self._in_order = bool(readings) and not sentence and all(reading.ok for reading in readings)
+                self._in_order = in_order(readings, sentence)
             case VerdictEvent(ok=ok):
                 self._in_order = ok
             case _:

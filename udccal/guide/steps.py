@@ -9,7 +9,7 @@ from typing import Protocol, final, runtime_checkable
 from udccal.arrangements import Stage
 from udccal.cameras.protocol import Camera, Frame
 from udccal.displays.protocol import Display
-from udccal.guide.events import Outline, Reading
+from udccal.guide.events import Outline, Reading, in_order
 from udccal.sessions.schema import TermName
 from udccal.sessions.writer import SessionWriter
 
@@ -34,7 +34,7 @@ class Look:
     @property
     def in_order(self) -> bool:
         """Whether the step may be captured now."""
-        return not self.sentence and all(reading.ok for reading in self.readings)
+        return in_order(self.readings, self.sentence)
 
 
 @runtime_checkable

@@ -90,7 +90,7 @@ def expected_error(
     source = sharpener.grid, sharpener.tables, sharpener.layout, sharpener.cfa
     error = kept(keep, FilterError, (sharpener.grid, sharpener.layout, sharpener.cfa), lambda: filter_error(*source))
     light = restorer.scene_light(mosaic, exposure_s, panel_picture)
-    solved = sharpener.solved(light.signal_e, light.variance_e2)
+    solved = sharpener.solved(light.signal_e, light.variance_e2, light.clipped)
     missed = _missed_by_preview(restorer, light.signal_e, exposure_s, panel_picture)
     white_e = 1 / display_exposure(solved.picture)
     return _at_places(sharpener, solved, error, light.variance_e2, missed[sharpener.rows], white_e)

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import final
 
 import numpy as np
-from jaxtyping import Float32, UInt8, UInt16
+from jaxtyping import Bool, Float32, UInt8, UInt16
 
 from udccal.cfa import cfa_named
 from udccal.errors import RestorationError
@@ -50,11 +50,13 @@ class SceneLight:
     Attributes:
         signal_e: in e-, divided by the wire.
         variance_e2: of its noise in e-^2.
+        clipped: samples whose light was more than they say.
         panel_error_e: sigma of the panel's light that was taken off, in e-; None where it is 0 or not known.
     """
 
     signal_e: Mosaic
     variance_e2: Mosaic
+    clipped: Bool[np.ndarray, "rows columns"]
     panel_error_e: Mosaic | None
 
 
@@ -186,7 +188,7 @@ class Restorer:
         light = self.scene_light(mosaic, exposure_s, panel_picture)
         if self.sharpener is None:
             return self._on_view(demosaic(light.signal_e, self.rig.camera.cfa), exposure_s)
-        sharp = self.sharpener.apply(light.signal_e, light.variance_e2)
+        sharp = self.sharpener.apply(light.signal_e, light.variance_e2, light.clipped)
         if light.panel_error_e is not None:
             sharp = plausible(sharp, light.panel_error_e[self.sharpener.rows])
         linear = self._strip_rectification.apply(sharp, self.options.interpolation)
@@ -213,15 +215,16 @@ class Restorer:
             signal /= self.wire
             variance /= self.wire
             variance /= self.wire
+        clipped = saturated(mosaic, self.noise)
         panel_error_e: Mosaic | None = None
         if self.mask is not None:
             panel_e = self._panel_light_e(signal, self.mask, exposure_s, panel_picture)
             if panel_picture is not None:
-                refuse_excess(signal, panel_e, saturated(mosaic, self.noise))
+                refuse_excess(signal, panel_e, clipped)
             signal -= panel_e
             if self.mask.error > 0:
                 panel_error_e = np.float32(self.mask.error) * panel_e
-        return SceneLight(signal, variance, panel_error_e)
+        return SceneLight(signal, variance, clipped, panel_error_e)
 
     def display(
         self,

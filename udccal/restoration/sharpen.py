@@ -8,9 +8,10 @@ from typing import final
 
 import cv2
 import numpy as np
-from jaxtyping import Float32, Float64, Int
+from jaxtyping import Bool, Float32, Float64, Int
 
 from udccal.cfa import Cfa, cfa_named
+from udccal.restoration.clipped import clipped_tiles, completed
 from udccal.restoration.kernel_grid import KernelGrid
 from udccal.restoration.mosaic_filter import FilterTables, filter_tables, filtered
 from udccal.restoration.plan import PlanOptions
@@ -21,6 +22,7 @@ from udccal.rig import RigDescription
 from udccal.tiers import Tier
 
 Mosaic = Float32[np.ndarray, "rows columns"]
+Clipped = Bool[np.ndarray, "rows columns"]
 Strip = Float32[np.ndarray, "covered_rows columns 3"]
 
 # Every n-th cell of a tile gives the mean noise of its samples.
@@ -106,28 +108,34 @@ class Sharpener:
         """Rows of the sensor that ``apply`` returns."""
         return slice(self.layout.first_row, self.layout.last_row)
 
-    def apply(self, signal_e: Mosaic, variance_e2: Mosaic) -> Strip:
+    def apply(self, signal_e: Mosaic, variance_e2: Mosaic, clipped: Clipped) -> Strip:
         """Demosaic and deblur.
 
         Args:
             signal_e: signal in e-, divided by the wire, without backscatter.
             variance_e2: variance of its noise in e-^2.
+            clipped: samples whose light was more than they say.
 
         Returns:
             the picture in e-, of the rows that the layout covers.
         """
-        solved = self.solved(signal_e, variance_e2)
+        solved = self.solved(signal_e, variance_e2, clipped)
         if self.noise is None:
             return solved.picture
         bands = self.noise.of_tiles(solved.strengths)
         local = cv2.blur(variance_e2, (_LOCAL_PX, _LOCAL_PX), borderType=cv2.BORDER_REFLECT_101)
         return shrunk(solved.picture, solved.noise_e, local[self.rows], bands, self.layout, self.options.workers)
 
-    def solved(self, signal_e: Mosaic, variance_e2: Mosaic) -> Solved:
+    def solved(self, signal_e: Mosaic, variance_e2: Mosaic, clipped: Clipped) -> Solved:
         """Demosaic and deblur as ``apply`` does, but take out no noise."""
         noise_e = self._tile_noise(variance_e2)
         tiles = self.layout.cut(signal_e)
         pictures, strengths = filtered(tiles, noise_e, self.tables, self.layout, self.cfa, self.options.workers)
+        at, missing = clipped_tiles(clipped, self.layout)
+        if len(at):
+            own = FilterTables(self.tables.matched[at], self.tables.vectors[at], self.tables.values[at])
+            given = noise_e[at], own, self.layout, self.cfa, self.options.workers
+            pictures[at], strengths[at] = filtered(completed(tiles[at], missing, strengths[at], *given), *given)
         return Solved(self.layout.join(pictures, self.options.workers), strengths, noise_e)
 
     def _tile_noise(self, variance_e2: Mosaic) -> Float32[np.ndarray, "tiles 3"]:

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from udccal.errors import ProfileError
-from udccal.profiles.exchange.exports import covariance_file, export_profile
-from udccal.profiles.exchange.formats import EXPORTS
+from udccal.profiles.exchange.exports import EXPORTS, covariance_file, export_profile
 from udccal.profiles.profile import Profile
 
 

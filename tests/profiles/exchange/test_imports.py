@@ -14,9 +14,8 @@ from tests.profiles.exchange.test_ros_camera_info import CALIBRATOR
 from tests.profiles.test_store import assert_same
 from udccal.cli.profile import ExportTo, ImportFrom
 from udccal.errors import ProfileError
-from udccal.profiles.exchange.exports import export_profile
-from udccal.profiles.exchange.formats import EXPORTS, IMPORTS
-from udccal.profiles.exchange.imports import MOST_BYTES, profile_of, read_lens
+from udccal.profiles.exchange.exports import EXPORTS, export_profile
+from udccal.profiles.exchange.imports import IMPORTS, MOST_BYTES, profile_of, read_lens
 from udccal.profiles.exchange.lens import lens_of
 from udccal.profiles.profile import Profile
 from udccal.profiles.store import read_profile, write_profile

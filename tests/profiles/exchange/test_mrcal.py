@@ -17,9 +17,8 @@ from tests.profiles.exchange.conftest import LENS
 from udccal.comparison.maps import _rays
 from udccal.models.geometry import Geometry, project, project_directions
 from udccal.numerics import in_float64
-from udccal.profiles.exchange.exports import export_profile
-from udccal.profiles.exchange.formats import EXPORTS, IMPORTS
-from udccal.profiles.exchange.imports import read_lens
+from udccal.profiles.exchange.exports import EXPORTS, export_profile
+from udccal.profiles.exchange.imports import IMPORTS, read_lens
 from udccal.profiles.profile import Profile
 
 PYTHON = "/usr/bin/python3"

@@ -11,9 +11,8 @@ import pytest
 from tests.profiles.exchange.conftest import LENS
 from udccal.models.geometry import project
 from udccal.numerics import in_float64
-from udccal.profiles.exchange.exports import covariance_file, export_profile
-from udccal.profiles.exchange.formats import EXPORTS, IMPORTS
-from udccal.profiles.exchange.imports import read_lens
+from udccal.profiles.exchange.exports import EXPORTS, covariance_file, export_profile
+from udccal.profiles.exchange.imports import IMPORTS, read_lens
 from udccal.profiles.profile import Profile
 
 FORMAT = EXPORTS["opencv-yaml"]

@@ -14,8 +14,8 @@ import pytest
 from tests.profiles.exchange.conftest import LENS
 from udccal.models.geometry import project
 from udccal.numerics import in_float64
-from udccal.profiles.exchange.formats import EXPORTS, IMPORTS
-from udccal.profiles.exchange.imports import read_lens
+from udccal.profiles.exchange.exports import EXPORTS
+from udccal.profiles.exchange.imports import IMPORTS, read_lens
 from udccal.profiles.exchange.plain_yaml import Document, read_yaml
 from udccal.profiles.profile import Profile
 

@@ -11,8 +11,7 @@ from udccal.cli.jobs.guided import led_by
 from udccal.cli.jobs.terminal import TerminalPerson
 from udccal.cli.output import Output, plain
 from udccal.compilation import keep_compilations
-from udccal.drift.check import check_rig
-from udccal.drift.short import short_rig
+from udccal.drift.check import check_rig, short_rig
 from udccal.drift.update import updated
 from udccal.io.atomic import write_atomically
 from udccal.io.out_folder import check_writable, storing_in

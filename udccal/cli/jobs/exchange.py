@@ -8,9 +8,8 @@ from typing import final
 
 from udccal.cli.output import Output
 from udccal.io.out_folder import storing_in
-from udccal.profiles.exchange.exports import covariance_file, export_profile
-from udccal.profiles.exchange.formats import EXPORTS, IMPORTS
-from udccal.profiles.exchange.imports import profile_of, read_lens
+from udccal.profiles.exchange.exports import EXPORTS, covariance_file, export_profile
+from udccal.profiles.exchange.imports import IMPORTS, profile_of, read_lens
 from udccal.profiles.store import check_replaceable, load_profile, write_profile
 from udccal.result import FitStatus
 from udccal.rig import load_rig

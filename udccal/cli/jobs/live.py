@@ -22,7 +22,7 @@ from udccal.live.follow import ProfileFollower
 from udccal.live.hook import TimedHook, load_hook
 from udccal.live.pipeline import Limits, Pipeline
 from udccal.live.restoring import Restoring
-from udccal.live.sinks.choice import make_sink
+from udccal.live.sinks.protocol import make_sink
 from udccal.live.tally import Figures
 from udccal.profiles.store import find_profile
 from udccal.reports.tables import Table

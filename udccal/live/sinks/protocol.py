@@ -1,4 +1,4 @@
-"""The protocol that every sink implements."""
+"""The protocol that every sink implements, and the sink that a person names."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ from typing import Protocol, final, runtime_checkable
 
 import numpy as np
 from jaxtyping import UInt8
+
+from udccal.plugins import find_sink
 
 
 @final
@@ -46,3 +48,18 @@ class Sink(Protocol):
     def close(self) -> None:
         """End; what was written is whole afterwards. Called after an error in ``open`` or ``write``, too."""
         ...
+
+
+def make_sink(text: str, rate_hz: float) -> Sink:
+    """Return the sink of ``NAME:TARGET``; nothing is opened yet.
+
+    Args:
+        text: name of an installed sink, and after a colon what it writes to.
+        rate_hz: rate of the frames.
+
+    Raises:
+        UdccalError: when there is no such sink, or it refuses its target.
+    """
+    name, _, target = text.partition(":")
+    sink: Sink = find_sink(name)(target, rate_hz)
+    return sink

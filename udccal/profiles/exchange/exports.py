@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import final
@@ -13,11 +14,15 @@ import numpy as np
 
 from udccal.errors import ProfileError
 from udccal.io.atomic import write_atomically
+from udccal.profiles.exchange import estimates_csv, mrcal, npz, opencv_yaml, ros_camera_info
 from udccal.profiles.exchange.format import ExportFormat
 from udccal.profiles.profile import Profile
 from udccal.result import Estimate
 
 FORMAT, VERSION = "udccal-covariance", 1
+EXPORTS: Mapping[str, ExportFormat] = {
+    module.EXPORT.name: module.EXPORT for module in (opencv_yaml, ros_camera_info, mrcal, npz, estimates_csv)
+}
 
 
 @final

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from udccal.fitting.absent import absent_backscatter, absent_psf, absent_wire
 from udccal.fitting.noise.fit import nominal_noise
 from udccal.fitting.nominal import nominal_geometry
 from udccal.models.geometry import Geometry
+from udccal.profiles.exchange import mrcal, opencv_yaml, ros_camera_info
 from udccal.profiles.exchange.format import ImportFormat
 from udccal.profiles.exchange.lens import Lens
 from udccal.profiles.profile import Profile, build_profile
@@ -22,6 +24,9 @@ from udccal.rig import RigDescription
 
 # mrcal's models hold their observations, some megabytes of them; the other formats are short.
 MOST_BYTES = 8 * 1024 * 1024
+IMPORTS: Mapping[str, ImportFormat] = {
+    module.IMPORT.name: module.IMPORT for module in (opencv_yaml, ros_camera_info, mrcal)
+}
 
 
 def read_lens(path: Path, of: ImportFormat) -> Lens:
