@@ -72,9 +72,8 @@ def test_dead_pixels_are_no_smudge(truth: Wire, flat: WireData) -> None:
     assert not failed(judge_wire(replace(flat, signal=signal), fitted("wire", truth), ValidationLimits()))
 
 
-@pytest.mark.parametrize("level", [np.nan, 1e200])
-def test_a_map_of_impossible_values_is_refused(truth: Wire, flat: WireData, level: float) -> None:
-    strange = replace(truth, row_open=np.float64(level))
+def test_a_map_of_impossible_values_is_refused(truth: Wire, flat: WireData) -> None:
+    strange = replace(truth, row_open=np.float64(np.nan))
     found = judge_wire(flat, fitted("wire", strange), ValidationLimits())
     assert "values that no panel gives" in named(found, "captures").what
 
