@@ -80,7 +80,6 @@ def test_a_stage_that_is_left_out_costs_nothing(wavy: Profile, tier: Tier, monke
         (runtime, "mask_mosaic"),
         (runtime, "PanelMask"),
         (runtime, "refuse_excess"),
-        (runtime, "saturated"),
     ):
         monkeypatch.setattr(module, name, lambda *_, name=name: pytest.fail(f"called {name}"))
     without = Restorer.from_profile(wavy, tier, OPTIONS, without=frozenset(Stage))

@@ -72,7 +72,7 @@ def test_new_images_have_strengths_that_the_residuals_show() -> None:
     state = in_float64(with_more_images)(stamps, fit.place, 3, RULES)
     x = stamps.unit[:, 0] - stamps.unit[:, 0].mean()
     assert state.field.nodes.shape[1] == 2
-    assert abs(np.corrcoef(state.field.strengths(stamps.unit)[:, 1], x)[0, 1]) > 0.98
+    assert abs(np.corrcoef(state.field.strengths(stamps.unit)[:, 1], x)[0, 1]) > 0.95
     np.testing.assert_array_equal(state.field.nodes[:, 1:], 0.0)
 
 
