@@ -159,8 +159,8 @@ class StampsRules:
     most_work: float = 3e8
     most_images: int = 10
     worth_finer: float = 200.0
-    steps_to_compare: int = 2
-    steps_to_end: int = 5
+    steps_to_compare: int = 4
+    steps_to_end: int = 20
     evidence: float = 2.0
     evidence_of_nodes: float = 0.03
     beyond_doubt: float = 200.0

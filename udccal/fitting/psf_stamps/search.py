@@ -63,7 +63,7 @@ def improve(stamps: Stamps, state: State, rules: StampsRules, steps: int) -> Fou
     # The last step's gain is more reliable than the next one's prediction, which ignores the precisions.
     evidence = max(rules.evidence, rules.evidence_of_nodes * float(state.kept.sum()))
     ends = dict(least_gain=0.0, stalled_gain=2 * evidence, small_gain=evidence)
-    solver = SolverRules(iterations=steps, first_damping=0.03, most_damping=1.0, **ends)
+    solver = SolverRules(iterations=steps, first_damping=0.03, most_damping=1e3, **ends)
     problem = Evidence(stamps, rules)
     found = minimise(problem, state, solver)
     if not np.isfinite(found.equations.cost):
