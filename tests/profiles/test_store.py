@@ -5,17 +5,19 @@ import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import jax
 import numpy as np
 import pytest
+from pydantic import ValidationError
 
 from udccal.errors import FitError, ProfileError
 from udccal.io.exr import write_exr
 from udccal.io.hashing import sha256_file
 from udccal.profiles.profile import Profile, build_profile
 from udccal.profiles.provenance import PROFILE_NAME, profile_sha256
+from udccal.profiles.schema import PictureName, StoredProfile
 from udccal.profiles.store import RIG_PROFILE, find_profile, read_profile, read_stored, write_profile
 from udccal.result import FitStatus
 from udccal.rig import load_rig
@@ -213,6 +215,15 @@ def test_a_link_out_of_the_folder_is_refused(stored: Path) -> None:
     (stored / "wire_map.exr").symlink_to(stored.parent / "elsewhere.exr")
     with pytest.raises(ProfileError, match="found none"):
         read_profile(stored)
+
+
+def test_a_profile_has_room_for_every_kind_of_picture_once(stored: Path) -> None:
+    form = read_stored(stored).model_dump()
+    one, names = form["pictures"][0], get_args(PictureName)
+    form["pictures"] = [{**one, "name": name} for name in names]
+    assert len(StoredProfile.model_validate(form).pictures) == len(names)
+    with pytest.raises(ValidationError, match="at most"):
+        StoredProfile.model_validate({**form, "pictures": [*form["pictures"], one]})
 
 
 def test_the_stored_form_can_be_read_without_its_arrays(stored: Path, toy_profile: Profile) -> None:

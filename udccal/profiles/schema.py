@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Final, Literal
+from typing import Annotated, Final, Literal, get_args
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
@@ -108,10 +108,13 @@ class StoredArray(_Strict):
     unit: Unit
 
 
+PictureName = Literal["wire_map", "psf_atlas", "backscatter_white", "wire_sigma", "psf_sigma", "backscatter_sigma"]
+
+
 class StoredPicture(_Strict):
     """A map evaluated from the terms, for viewing and for restoration."""
 
-    name: Literal["wire_map", "psf_atlas", "backscatter_white", "wire_sigma", "psf_sigma", "backscatter_sigma"]
+    name: PictureName
     file: FileName
     sha256: Sha256
     columns: Annotated[int, Field(ge=1, le=16384)]
@@ -244,4 +247,4 @@ class StoredProfile(_Strict):
     provenance: Provenance
     invalidated_by: Annotated[tuple[Sentence, ...], Field(max_length=100)]
     terms: Terms
-    pictures: Annotated[tuple[StoredPicture, ...], Field(max_length=5)]
+    pictures: Annotated[tuple[StoredPicture, ...], Field(max_length=len(get_args(PictureName)))]
