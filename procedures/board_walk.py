@@ -149,8 +149,9 @@ def _edge(rig: RigDescription, board: Board) -> Float[np.ndarray, "4 2"]:
 def _captured(step_ids: tuple[str, ...], writer: SessionWriter, spec: BoardSpec) -> Iterator[CornersSeen]:
     """Yield the views that the session holds; how the board was held is read from their pictures."""
     session = Session(writer.path, writer.manifest)
-    for step_id in (step_id for step_id in step_ids if step_id in writer.completed_ids):
-        yield corners_in(session.average(session.step(step_id).captures[0]).mean, spec)
+    for step_id in step_ids:
+        if step_id in writer.completed_ids:
+            yield corners_in(session.average(session.step(step_id).captures[0]).mean, spec)
 
 
 def _polygon(points: Float[np.ndarray, "n 2"]) -> tuple[tuple[float, float], ...]:

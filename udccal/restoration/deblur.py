@@ -73,10 +73,11 @@ def deblur(
         RestorationError: when a number is not finite or beyond single precision, the kernels do not sum to 1, or shapes
             do not agree.
     """
-    grid = _checked(*(np.asarray(each) for each in (picture, kernels, x_px, y_px)))
+    picture, *places = (np.asarray(each) for each in (picture, kernels, x_px, y_px))
+    grid = _checked(picture, *places)
     # In units of its largest value: squares stay in single precision's range.
     unit = float(np.max(np.abs(picture), initial=0.0)) or 1.0
-    light = np.ascontiguousarray(np.asarray(picture) / unit, dtype=np.float32)
+    light = np.ascontiguousarray(picture / unit, dtype=np.float32)
     rows, columns = light.shape[:2]
     layout = layout_for(rows, columns, (1, 1), (tile_px, tile_px), (0, rows))
     tiles = np.stack([layout.cut(plane) for plane in cv2.split(light)], axis=1)

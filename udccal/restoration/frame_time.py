@@ -123,7 +123,8 @@ def _measured(options: PlanOptions) -> PartTimes:
         clean = to_electrons(without_defects(mosaic, noise, 1.0, cfa.name), noise, 1.0)
         variance = variance_e2(clean, noise, 1.0)
         clean /= ones
-        variance /= ones**2
+        variance /= ones
+        variance /= ones
         clean -= np.float32(1.0) * ones
 
     parts = (

@@ -82,6 +82,10 @@ class FilterTables:
     vectors: Complex64[np.ndarray, "*tiles sites sites site_rows site_half"]
     values: Float32[np.ndarray, "*tiles sites site_rows site_half"]
 
+    def at(self, tiles: int | Int[np.ndarray, " some"]) -> FilterTables:
+        """Return the tables of one tile, or of several."""
+        return FilterTables(self.matched[tiles], self.vectors[tiles], self.values[tiles])
+
 
 def filter_tables(grid: KernelGrid, layout: TileLayout, pattern: Pattern, workers: int) -> FilterTables:
     """Compute the tables of every tile.
@@ -175,7 +179,7 @@ def filtered(
     samples = float(np.sum(layout.taper**2)) / (pattern.rows * pattern.columns)
 
     def one(index: int) -> None:
-        own = FilterTables(tables.matched[index], tables.vectors[index], tables.values[index])
+        own = tables.at(index)
         levels = _levels(tiles[index], pattern)
         spectrum = _whitened(tiles[index], levels, noise_e[index], own, layout, pattern)
         if strengths is None:

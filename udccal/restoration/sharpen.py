@@ -133,8 +133,7 @@ class Sharpener:
         pictures, strengths = filtered(tiles, noise_e, self.tables, self.layout, self.cfa, self.options.workers)
         at, missing = clipped_tiles(clipped, self.layout)
         if len(at):
-            own = FilterTables(self.tables.matched[at], self.tables.vectors[at], self.tables.values[at])
-            given = noise_e[at], own, self.layout, self.cfa, self.options.workers
+            given = noise_e[at], self.tables.at(at), self.layout, self.cfa, self.options.workers
             pictures[at], strengths[at] = filtered(completed(tiles[at], missing, strengths[at], *given), *given)
         return Solved(self.layout.join(pictures, self.options.workers), strengths, noise_e)
 

@@ -75,9 +75,8 @@ def measured_noise(tables: FilterTables, layout: TileLayout, pattern: Pattern, w
     shape = (len(chosen), *(() if colours == 1 else (colours,)), layout.rows, layout.columns)
     noise = np.random.default_rng(0x5EED).standard_normal(shape, dtype=np.float32)
     tiles = np.repeat(noise, len(STRENGTHS), axis=0)
-    picked = FilterTables(*(table[repeated] for table in (tables.matched, tables.vectors, tables.values)))
     unit = np.ones((len(tiles), 3), dtype=np.float32)
-    pictures, _ = filtered(tiles, unit, picked, layout, pattern, workers, np.tile(STRENGTHS, len(chosen)))
+    pictures, _ = filtered(tiles, unit, tables.at(repeated), layout, pattern, workers, np.tile(STRENGTHS, len(chosen)))
     inner = slice(TAPER_PX + BLEND_PX, -TAPER_PX - BLEND_PX)
     with ThreadPoolExecutor(workers) as pool:
         parts = list(pool.map(lambda picture: _band_variances(picture[inner, inner]), pictures))

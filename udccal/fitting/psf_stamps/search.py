@@ -62,8 +62,14 @@ def improve(stamps: Stamps, state: State, rules: StampsRules, steps: int) -> Fou
     """Go to the most probable state nearby, in ``steps`` and one more at most; LinAlgError if singular at first."""
     # The last step's gain is more reliable than the next one's prediction, which ignores the precisions.
     evidence = max(rules.evidence, rules.evidence_of_nodes * float(state.kept.sum()))
-    ends = dict(least_gain=0.0, stalled_gain=2 * evidence, small_gain=evidence)
-    solver = SolverRules(iterations=steps, first_damping=0.03, most_damping=1e3, **ends)
+    solver = SolverRules(
+        iterations=steps,
+        least_gain=0.0,
+        stalled_gain=2 * evidence,
+        small_gain=evidence,
+        first_damping=0.03,
+        most_damping=1e3,
+    )
     problem = Evidence(stamps, rules)
     found = minimise(problem, state, solver)
     if not np.isfinite(found.equations.cost):
