@@ -16,11 +16,12 @@ RIGS ?= 12
 LIVE_OUT ?= live.json
 COVERAGE_OUT ?= coverage
 ROBUST_OUT ?= robust
+NETWORK_MINUTES ?= 60
 ROBUST ?=
 PEERS ?=
 USB ?=
 
-.PHONY: install demo test test-medium test-slow test-usb fuzz load lint types contracts check accuracy tables efficiency coverage extremes pareto budget drift rigs live robust peers growth docs clean
+.PHONY: install demo test test-medium test-slow test-usb fuzz load lint types contracts check accuracy tables efficiency coverage extremes pareto network budget drift rigs live robust peers growth docs clean
 
 install: $(STAMP)
 
@@ -115,6 +116,10 @@ rigs: $(STAMP)
 # non-zero exit where a tier misses a limit.
 pareto: $(STAMP)
 	$(BIN)/python -m tests.benchmarks.pareto --out $(PARETO_OUT)
+
+# Train the network of the tier accurate for NETWORK_MINUTES; writes its weights.
+network: $(STAMP)
+	$(BIN)/python -m tests.benchmarks.network.train --minutes $(NETWORK_MINUTES)
 
 # What each stage of restoration costs, with the truth in place of all others. Writes budget.json and the table of
 # docs/restoration.md.

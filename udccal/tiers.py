@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import enum
+from typing import Final
 
 
 class Tier(enum.StrEnum):
@@ -12,8 +13,14 @@ class Tier(enum.StrEnum):
     ``fast``: backscatter of the panel's picture; demosaicing and deblurring in one linear filter per tile, each with
     the prior that its samples make likeliest.
     ``balanced``: also takes out noise band by band.
+    ``accurate``: lets a small network take out noise, and find edges that the filter loses.
     """
 
     preview = "preview"
     fast = "fast"
     balanced = "balanced"
+    accurate = "accurate"
+
+
+# What is done where nobody asks for anything else.
+DEFAULT_TIER: Final = Tier.balanced

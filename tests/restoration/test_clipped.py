@@ -98,6 +98,20 @@ def test_a_tile_without_any_sound_sample_stays_finite_and_no_darker() -> None:
     assert np.isfinite(after).all()
 
 
+@pytest.mark.parametrize("unit", [1.0, 1e-20])
+@pytest.mark.parametrize("place", [(64, 64), (0, 5), (3, 100)])
+def test_a_single_sample_is_solved_at_once(place: tuple[int, int], unit: float) -> None:
+    """One step of conjugate gradients ends there; what is left of the slope underflows when it is squared."""
+    _, layout, tables = prepared()
+    tiles = np.float32(unit) * layout.cut(mosaic_of(scene()))[:1]
+    clipped = np.zeros(tiles.shape, bool)
+    clipped[0, place[0], place[1]] = True
+    noise, strengths = np.full((1, 3), NOISE_E, np.float32), np.array([64.0], np.float32)
+    found = completed(tiles, clipped, strengths, noise, tables.at(np.array([0])), layout, CFA, 1)
+    assert np.all(np.isfinite(found))
+    assert np.all(found >= tiles - 1e-3 * np.abs(tiles))
+
+
 def test_only_tiles_with_patches_are_completed() -> None:
     layout = layout_for(512, 512, (2, 2), (128, 128), (0, 512))
     frame = np.zeros((512, 512), bool)

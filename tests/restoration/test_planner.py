@@ -19,7 +19,7 @@ from udccal.result import FitStatus
 from udccal.tiers import Tier
 
 EXPOSURE_S = 0.02
-TIMES = PartTimes(*(np.array(seconds) for seconds in (1e-8, 4e-8, 1e-7, 5e-8, 2e-8, 1e-8)))
+TIMES = PartTimes(*(np.array(seconds) for seconds in (1e-8, 4e-8, 1e-7, 5e-8, 1e-6, 2e-8, 1e-8)))
 
 
 @pytest.fixture
@@ -61,7 +61,8 @@ def test_a_plan_without_a_wish_measures_nothing(
 @pytest.mark.usefixtures("quick")
 def test_a_budget_alone_needs_no_kernels(profile: Profile, frame: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
     refuse(monkeypatch, "expected_error", "kernel_grid")
-    assert plan_of(profile, frame, Wish(budget_ms=1e4)).tier is Tier.balanced
+    assert plan_of(profile, frame, Wish(budget_ms=1e4)).tier is Tier.accurate
+    assert plan_of(profile, frame, Wish(budget_ms=5.0)).tier is Tier.balanced
     assert plan_of(profile, frame, Wish(budget_ms=0.1)).tier is Tier.preview
     with pytest.raises(RestorationError, match="the fastest tier, preview, needs"):
         plan_of(profile, frame, Wish(budget_ms=1e-6, min_psnr_dB=20.0))
@@ -75,8 +76,8 @@ def test_the_forecast_says_what_each_tier_gives(
     monkeypatch.setattr(runtime, "PlanOptions", lambda: small)
     plan = plan_of(profile, frame, Tier.preview, forecast=True)
     assert plan.tier is Tier.preview
-    preview, fast, balanced = plan.tiers
-    assert preview.frame_ms < fast.frame_ms < balanced.frame_ms
+    preview, fast, balanced, accurate = plan.tiers
+    assert preview.frame_ms < fast.frame_ms < balanced.frame_ms < accurate.frame_ms
     assert fast.psnr_dB is not None
     assert balanced.psnr_dB is not None
     assert 25 < fast.psnr_dB < balanced.psnr_dB < 60
@@ -89,7 +90,7 @@ def test_the_forecast_says_what_each_tier_gives(
 def test_without_a_psf_only_times_are_expected(profile: Profile, frame: np.ndarray) -> None:
     sharp = replace(profile, psf=replace(profile.psf, status=FitStatus.ABSENT))
     plan = plan_of(sharp, frame, Wish(min_psnr_dB=30.0), forecast=True)
-    assert [each.psnr_dB for each in plan.tiers] == [None, None, None]
+    assert [each.psnr_dB for each in plan.tiers] == [None] * len(Tier)
 
 
 def test_a_frame_of_another_camera_is_refused_first(

@@ -26,6 +26,7 @@ class TierChoice(enum.StrEnum):
     preview = "preview"
     fast = "fast"
     balanced = "balanced"
+    accurate = "accurate"
 
 
 def restore(
@@ -44,7 +45,7 @@ def restore(
         typer.Option(
             "--tier",
             help="preview: no deblurring. fast: one linear filter per tile. balanced: takes out noise as well. "
-            "auto: by --budget-ms and --min-psnr; balanced without them.",
+            "accurate: with a network, in seconds. auto: by --budget-ms and --min-psnr; balanced without them.",
         ),
     ] = TierChoice.auto,
     budget_ms: Annotated[

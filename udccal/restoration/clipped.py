@@ -122,10 +122,12 @@ def _solved(
     found, rest = start.copy(), -precision(start) * free
     step, power = rest, float(np.vdot(rest, rest))
     for _ in range(_STEPS):
-        if power == 0.0:
-            break
         change = precision(step) * free
-        length = np.float32(power / float(np.vdot(step, change)))
+        curvature = float(np.vdot(step, change))
+        # Where the taper leaves next to nothing of a sample, squares of its slope underflow.
+        if power == 0.0 or curvature <= 0.0:
+            break
+        length = np.float32(power / curvature)
         found += length * step
         rest = rest - length * change
         before, power = power, float(np.vdot(rest, rest))

@@ -22,8 +22,10 @@ from udccal.cfa import BLUE, GREEN, RED, Site
 from udccal.errors import RestorationError
 from udccal.restoration.kernel_grid import KernelGrid
 from udccal.restoration.mosaic_filter import filter_tables, filtered
+from udccal.restoration.network import refined, sharper
 from udccal.restoration.shrink import measured_noise, shrunk
 from udccal.restoration.tiles import layout_for
+from udccal.tiers import Tier
 
 _EVERY = (slice(None), slice(None))
 # The finest diagonal detail: second differences along both axes.
@@ -55,6 +57,7 @@ def deblur(
     y_px: Float[np.ndarray, "..."],
     tile_px: int = 256,
     workers: int = 2,
+    tier: Tier = Tier.balanced,
 ) -> Float32[np.ndarray, "rows columns 3"]:
     """Deblur a picture.
 
@@ -65,14 +68,17 @@ def deblur(
         x_px: columns of the picture at which the kernels lie, ascending. y_px: rows.
         tile_px: rows and columns of a tile at most; a tile has one kernel and one prior. At least 96.
         workers: threads.
+        tier: how much is done; not ``preview``, which does not deblur.
 
     Returns:
         the picture as it was before the blur, in its unit. Where there is noise alone, values scatter about 0.
 
     Raises:
-        RestorationError: when a number is not finite or beyond single precision, the kernels do not sum to 1, or shapes
-            do not agree.
+        RestorationError: when a number is not finite or beyond single precision, the kernels do not sum to 1, shapes
+            do not agree, or the tier does not deblur.
     """
+    if tier is Tier.preview:
+        raise RestorationError("Expected a tier that deblurs, found preview. Give fast, balanced or accurate.")
     picture, *places = (np.asarray(each) for each in (picture, kernels, x_px, y_px))
     grid = _checked(picture, *places)
     # In units of its largest value: squares stay in single precision's range.
@@ -85,9 +91,17 @@ def deblur(
     noise = np.sqrt(np.maximum(read + slope * tiles.mean(axis=(2, 3)), np.finfo(np.float32).tiny)).astype(np.float32)
     tables = filter_tables(grid, layout, THREE_COLOURS, workers)
     pictures, strengths = filtered(tiles, noise, tables, layout, THREE_COLOURS, workers)
+    chosen = layout.join(pictures, workers)
+    if tier is Tier.fast:
+        return chosen * np.float32(unit)
     bands = measured_noise(tables, layout, THREE_COLOURS, workers).of_tiles(strengths)
     local = (read + slope * np.maximum(cv2.blur(light.mean(axis=2), (16, 16)), 0)).astype(np.float32)
-    return shrunk(layout.join(pictures, workers), noise, local, bands, layout, workers) * np.float32(unit)
+    balanced = shrunk(chosen, noise, local, bands, layout, workers)
+    if tier is Tier.balanced:
+        return balanced * np.float32(unit)
+    pictures, _ = filtered(tiles, noise, tables, layout, THREE_COLOURS, workers, sharper(strengths))
+    sharp = layout.join(pictures, workers)
+    return refined(balanced, chosen, sharp, noise, local, bands, layout) * np.float32(unit)
 
 
 def _noise_line(tiles: Float32[np.ndarray, "tiles 3 rows columns"]) -> tuple[float, float]:

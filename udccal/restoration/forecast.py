@@ -61,7 +61,7 @@ class ExpectedError:
     def psnr_dB(self, tier: Tier) -> float:
         """Return the PSNR of display-encoded values after the least-squares gain of each colour."""
         seen = self.light + self.panel if tier is Tier.preview else self.light
-        passed = {Tier.preview: 0.0, Tier.fast: 1.0, Tier.balanced: _LEFT}[tier]
+        passed = {Tier.preview: 0.0, Tier.fast: 1.0, Tier.balanced: _LEFT, Tier.accurate: _LEFT}[tier]
         detail = self.blur if tier is Tier.preview else self.lost
         sigma = np.sqrt(passed * self.noise + _DETAIL * detail)
         gain = least_squares_gain(np.clip(seen, 0.0, 1.0), np.minimum(self.light, 1.0)).astype(np.float32)

@@ -23,6 +23,7 @@ from udccal.restoration.defects import without_defects
 from udccal.restoration.demosaic import demosaic
 from udccal.restoration.linear import to_electrons, variance_e2
 from udccal.restoration.mosaic_filter import FilterTables, filtered
+from udccal.restoration.network import corrected, noise_planes
 from udccal.restoration.plan import PlanOptions
 from udccal.restoration.prepared import kept
 from udccal.restoration.preview import Preview
@@ -47,6 +48,7 @@ class PartTimes:
         demosaicing: per pixel of the sensor.
         filter: of the tiles, per pixel of a tile.
         shrinkage: per pixel that the tiles cover.
+        network: of the tier ``accurate``, per pixel that the tiles cover.
         view: resampling and tone, per pixel of the view.
         preview: all of a preview, per pixel of the rows that the view needs.
     """
@@ -55,6 +57,7 @@ class PartTimes:
     demosaicing: Seconds
     filter: Seconds
     shrinkage: Seconds
+    network: Seconds
     view: Seconds
     preview: Seconds
 
@@ -91,7 +94,11 @@ class FrameSize:
         if self.tile_px == 0:
             return 1e3 * float(seconds + self.sensor_px * times.demosaicing)
         seconds = seconds + self.tile_px * times.filter
-        return 1e3 * float(seconds + (self.covered_px * times.shrinkage if tier is Tier.balanced else 0.0))
+        if tier in (Tier.balanced, Tier.accurate):
+            seconds = seconds + self.covered_px * times.shrinkage
+        if tier is Tier.accurate:
+            seconds = seconds + self.tile_px * times.filter + self.covered_px * times.network
+        return 1e3 * float(seconds)
 
 
 def part_times(options: PlanOptions, keep: Path | None = None) -> PartTimes:
@@ -127,6 +134,9 @@ def _measured(options: PlanOptions) -> PartTimes:
         variance /= ones
         clean -= np.float32(1.0) * ones
 
+    def network() -> None:
+        corrected(picture, picture, picture, picture, noise_planes(bands, unit, signal, layout))
+
     parts = (
         (linear, mosaic.size),
         (lambda: demosaic(signal, cfa.name), mosaic.size),
@@ -135,6 +145,7 @@ def _measured(options: PlanOptions) -> PartTimes:
             layout.count * layout.rows * layout.columns,
         ),
         (lambda: shrunk(picture, unit, signal, bands, layout, workers), mosaic.size),
+        (network, mosaic.size),
         (lambda: tone.rgb8(rectification.apply(picture, options.interpolation)), view_x.size),
         (lambda: preview.rgb8(mosaic, 1.0, tone), mosaic.size),
     )

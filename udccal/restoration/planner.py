@@ -16,7 +16,7 @@ from udccal.restoration.runtime import Restorer, check_frame, check_panel_pictur
 from udccal.restoration.scene_plan import ScenePlan, TierForecast, Wish, chosen_tier
 from udccal.restoration.stages import Stage, StageChoice
 from udccal.restoration.tiles import layout_for
-from udccal.tiers import Tier
+from udccal.tiers import DEFAULT_TIER, Tier
 
 
 def planned(
@@ -49,7 +49,7 @@ def planned(
     check_panel_picture(panel_picture, profile.rig)
     tier, wish = (None, asked) if isinstance(asked, Wish) else (asked, Wish())
     if not forecast and wish == Wish():
-        return ScenePlan.of(profile, tier or list(Tier)[-1], stages)
+        return ScenePlan.of(profile, tier or DEFAULT_TIER, stages)
     without = frozenset(choice.stage for choice in stages if not choice.runs)
     tiers = _timed(profile, without, keep)
     chosen_tier(tiers, Wish(budget_ms=wish.budget_ms))  # refuses before kernels are computed

@@ -15,7 +15,7 @@ from udccal.errors import RestorationError
 from udccal.profiles.profile import Profile
 from udccal.restoration.prepared import checksum
 from udccal.restoration.stages import Stage, StageChoice
-from udccal.tiers import Tier
+from udccal.tiers import DEFAULT_TIER, Tier
 
 _FORMAT: Final = "udccal-scene-plan"
 _MAX_BYTES: Final = 64 * 1024
@@ -42,7 +42,7 @@ class TierForecast:
 @final
 @dataclass(frozen=True)
 class Wish:
-    """What a person asks of a tier; with neither, it is the most accurate one.
+    """What a person asks of a tier; with neither, it is the default one.
 
     Attributes:
         budget_ms: time that a frame may take.
@@ -96,6 +96,8 @@ def profile_sha256(profile: Profile) -> str:
 def chosen_tier(tiers: tuple[TierForecast, ...], wish: Wish) -> Tier:
     """Return the quickest tier that is good enough within the budget; without a least PSNR, the most accurate one.
 
+    Without a budget either, it is the default tier.
+
     Args:
         tiers: from quickest to most accurate.
         wish: what is asked.
@@ -103,6 +105,8 @@ def chosen_tier(tiers: tuple[TierForecast, ...], wish: Wish) -> Tier:
     Raises:
         RestorationError: when no tier keeps the budget, or none that does is good enough.
     """
+    if wish == Wish():
+        return DEFAULT_TIER
     budget = float("inf") if wish.budget_ms is None else wish.budget_ms
     quick = [each for each in tiers if each.frame_ms <= budget]
     if not quick:

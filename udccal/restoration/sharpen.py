@@ -11,9 +11,11 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int
 
 from udccal.cfa import Cfa, cfa_named
+from udccal.restoration.blur import blurred
 from udccal.restoration.clipped import clipped_tiles, completed
 from udccal.restoration.kernel_grid import KernelGrid
 from udccal.restoration.mosaic_filter import FilterTables, filter_tables, filtered
+from udccal.restoration.network import refined, sharper
 from udccal.restoration.plan import PlanOptions
 from udccal.restoration.prepared import kept
 from udccal.restoration.shrink import BandNoise, measured_noise, shrunk
@@ -49,18 +51,31 @@ class Solved:
 
 @final
 @dataclass(frozen=True)
+class _Filtered:
+    """What ``Solved`` is made of: tiles with their clipped samples completed, and the pictures of each."""
+
+    tiles: Float32[np.ndarray, "tiles rows columns"]
+    pictures: Float32[np.ndarray, "tiles rows columns 3"]
+    strengths: Float32[np.ndarray, " tiles"]
+    noise_e: Float32[np.ndarray, "tiles 3"]
+
+
+@final
+@dataclass(frozen=True)
 class Sharpener:
     """Everything that depends on kernels alone.
 
     Attributes:
+        tier: how much is done.
         grid: kernels over the sensor.
         rig: the rig description.
         layout: the tiles.
         tables: of the tiles' filters.
-        noise: what the filters leave of noise; None for the tier that does not take it out.
+        noise: what the filters leave of noise; None for the tier fast, which does not take it out.
         options: options of the restoration.
     """
 
+    tier: Tier
     grid: KernelGrid
     rig: RigDescription
     layout: TileLayout
@@ -84,7 +99,7 @@ class Sharpener:
             grid: kernels over the sensor.
             rig: the rig description.
             rows: first row of the sensor that the view needs, and the row after the last one.
-            tier: fast or balanced.
+            tier: one that deblurs.
             options: options of the restoration.
             keep: folder that keeps tables and noise between starts; None to keep nothing.
         """
@@ -94,9 +109,9 @@ class Sharpener:
         source = grid, layout, cfa
         tables = kept(keep, FilterTables, source, lambda: filter_tables(*source, options.workers))
         noise = None
-        if tier is Tier.balanced:
+        if tier in (Tier.balanced, Tier.accurate):
             noise = kept(keep, BandNoise, source, lambda: measured_noise(tables, layout, cfa, options.workers))
-        return cls(grid, rig, layout, tables, noise, options)
+        return cls(tier, grid, rig, layout, tables, noise, options)
 
     @property
     def cfa(self) -> Cfa:
@@ -119,23 +134,56 @@ class Sharpener:
         Returns:
             the picture in e-, of the rows that the layout covers.
         """
-        solved = self.solved(signal_e, variance_e2, clipped)
+        found = self._filtered(signal_e, variance_e2, clipped)
+        picture = self.layout.join(found.pictures, self.options.workers)
         if self.noise is None:
-            return solved.picture
-        bands = self.noise.of_tiles(solved.strengths)
-        local = cv2.blur(variance_e2, (_LOCAL_PX, _LOCAL_PX), borderType=cv2.BORDER_REFLECT_101)
-        return shrunk(solved.picture, solved.noise_e, local[self.rows], bands, self.layout, self.options.workers)
+            return picture
+        bands = self.noise.of_tiles(found.strengths)
+        local = cv2.blur(variance_e2, (_LOCAL_PX, _LOCAL_PX), borderType=cv2.BORDER_REFLECT_101)[self.rows]
+        balanced = shrunk(picture, found.noise_e, local, bands, self.layout, self.options.workers)
+        if self.tier is Tier.balanced:
+            return balanced
+        best = refined(balanced, picture, self._sharper(found), found.noise_e, local, bands, self.layout)
+        return best + self._contradicted(best, signal_e, clipped, found.noise_e)
 
     def solved(self, signal_e: Mosaic, variance_e2: Mosaic, clipped: Clipped) -> Solved:
         """Demosaic and deblur as ``apply`` does, but take out no noise."""
+        found = self._filtered(signal_e, variance_e2, clipped)
+        return Solved(self.layout.join(found.pictures, self.options.workers), found.strengths, found.noise_e)
+
+    def _filtered(self, signal_e: Mosaic, variance_e2: Mosaic, clipped: Clipped) -> _Filtered:
         noise_e = self._tile_noise(variance_e2)
         tiles = self.layout.cut(signal_e)
         pictures, strengths = filtered(tiles, noise_e, self.tables, self.layout, self.cfa, self.options.workers)
         at, missing = clipped_tiles(clipped, self.layout)
         if len(at):
             given = noise_e[at], self.tables.at(at), self.layout, self.cfa, self.options.workers
-            pictures[at], strengths[at] = filtered(completed(tiles[at], missing, strengths[at], *given), *given)
-        return Solved(self.layout.join(pictures, self.options.workers), strengths, noise_e)
+            tiles[at] = completed(tiles[at], missing, strengths[at], *given)
+            pictures[at], strengths[at] = filtered(tiles[at], *given)
+        return _Filtered(tiles, pictures, strengths, noise_e)
+
+    def _sharper(self, found: _Filtered) -> Strip:
+        """Filter again, with a stronger prior than the one that each tile chose."""
+        given = self.tables, self.layout, self.cfa, self.options.workers
+        return self.layout.join(
+            filtered(found.tiles, found.noise_e, *given, sharper(found.strengths))[0], self.options.workers
+        )
+
+    def _contradicted(
+        self, picture: Strip, signal_e: Mosaic, clipped: Clipped, noise_e: Float32[np.ndarray, "tiles 3"]
+    ) -> Strip:
+        """Return what the samples say against a picture: the filter of what they have more or less than it gives.
+
+        With it, the picture is the most probable one where its own error has the filter's prior, at the strength that
+        is likeliest for what is left of each tile. A clipped sample speaks against a picture that is darker only.
+        """
+        expected = blurred(picture, self.grid, self.layout)
+        channels = self.cfa.channel_map(*signal_e.shape)[self.rows]
+        rest = np.zeros_like(signal_e)
+        rest[self.rows] = signal_e[self.rows] - np.take_along_axis(expected, channels[..., None], axis=2)[..., 0]
+        rest[clipped] = np.maximum(rest[clipped], 0.0)
+        given = self.tables, self.layout, self.cfa, self.options.workers
+        return self.layout.join(filtered(self.layout.cut(rest), noise_e, *given)[0], self.options.workers)
 
     def _tile_noise(self, variance_e2: Mosaic) -> Float32[np.ndarray, "tiles 3"]:
         """Return the sigma of a sample of each colour in each tile."""

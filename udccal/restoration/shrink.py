@@ -116,7 +116,7 @@ def shrunk(
         layout: the tiles.
         workers: threads.
     """
-    scale = _smooth(layout, layout.by_place(noise_e))
+    scale = interpolated(layout, layout.by_place(noise_e))
     opponent = cv2.transform(picture / scale, _OPPONENT)
     # Within a tile, bright places are noisier than dark ones.
     brightness = [local_variance_e2 / (cv2.transform(scale * scale, _MEAN))]
@@ -206,17 +206,25 @@ def _largest(values: Float32[np.ndarray, "tiles_down tiles_across"], down: _Runs
     return np.repeat(np.repeat(blocks, across.samples, axis=1), down.samples, axis=0)
 
 
-def _smooth(
-    layout: TileLayout, values: Float32[np.ndarray, "tiles_down tiles_across 3"]
-) -> Float32[np.ndarray, "rows columns 3"]:
-    """Interpolate values linearly between the tiles' centres, constant beyond the outer ones."""
+def interpolated(
+    layout: TileLayout, values: Float32[np.ndarray, "tiles_down tiles_across planes"], step: int = 1
+) -> Float32[np.ndarray, "rows columns *planes"]:
+    """Interpolate values linearly between the tiles' centres, constant beyond the outer ones.
+
+    Args:
+        layout: the tiles.
+        values: of each tile.
+        step: px between the samples that are returned, of the rows that the layout covers. One plane has no axis.
+    """
     down, across = (
-        _hats(np.array([strip.middle for strip in strips]), count)
+        linear_weights(np.array([strip.middle for strip in strips]), np.arange(0, count, step))
         for strips, count in zip(layout.strips, layout.covered, strict=True)
     )
     return cv2.merge([down @ plane @ across.T for plane in np.moveaxis(values, -1, 0)])
 
 
-def _hats(nodes: Float[np.ndarray, " nodes"], count: int) -> Float32[np.ndarray, "count nodes"]:
-    """Return the matrix of linear interpolation from ``nodes`` to 0 ... count - 1, constant beyond the outer ones."""
-    return np.stack([np.interp(np.arange(count), nodes, one) for one in np.eye(len(nodes))], axis=1).astype(np.float32)
+def linear_weights(
+    nodes: Float[np.ndarray, " nodes"], at: Int[np.ndarray, " samples"]
+) -> Float32[np.ndarray, "samples nodes"]:
+    """Return the weights of linear interpolation from ``nodes`` to ``at``, constant beyond the outer ones."""
+    return np.stack([np.interp(at, nodes, one) for one in np.eye(len(nodes))], axis=1).astype(np.float32)

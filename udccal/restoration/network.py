@@ -1,0 +1,202 @@
+"""A small convolutional network that takes out what the linear filter leaves: noise, and detail it does not know.
+
+A linear filter knows a scene's spectrum; a network learned from pictures knows edges. It sees the picture of the tier
+``balanced``, to which it adds what it finds, two filtered pictures, one at the strength that the tile chose and a
+sharper one, and how much noise the filter leaves in each band. It has no
+biases, so that it commutes with a change of scale (Mohan et al., "Robust and interpretable blind image denoising via
+bias-free convolutional neural networks", ICLR 2020): light, exposure and gain do not matter. Pictures are taken apart
+into their 2 x 2 places first (Zhang, Zuo and Zhang, "FFDNet", IEEE Trans. Image Processing 27, 2018), and a second
+level works at a quarter of the resolution.
+
+``make network`` trains it on drawn shapes and photographs, blurred and filtered as restoration does.
+"""
+
+from __future__ import annotations
+
+import functools
+from pathlib import Path
+
+import cv2
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Float32
+
+from udccal.restoration.mosaic_filter import STRENGTHS
+from udccal.restoration.shrink import interpolated
+from udccal.restoration.tiles import TileLayout
+
+# Planes of a picture, and of noise: bands at which the filter's noise is told.
+COLOURS, BANDS = 3, 12
+_PLACES = 4
+# Channels that the network is given: three pictures by place, and the noise.
+INPUTS = 3 * COLOURS * _PLACES + BANDS
+# The sharper picture has the prior's strength times this.
+_SHARPER = np.float32(16)
+# Detail is what differs from the mean over this many px.
+_DETAIL_PX = (31, 31)
+# How far the network looks, rows that it is given at once, and the coarse level's cell.
+_REACH_PX, _BLOCK_ROWS, _CELL_PX = 48, 256, 4
+# Channels at half and at a quarter of the resolution, and residual blocks there.
+_FINE, _COARSE, _FINE_BLOCKS, _COARSE_BLOCKS = 40, 64, 2, 3
+
+WEIGHTS_FILE = Path(__file__).with_name("network.npz")
+
+Weights = dict[str, Array]
+
+
+def details(
+    balanced: Float32[np.ndarray, "rows columns 3"],
+    chosen: Float32[np.ndarray, "rows columns 3"],
+    sharp: Float32[np.ndarray, "rows columns 3"],
+    scale: Float32[np.ndarray, "*rows_columns 3"],
+) -> Float32[np.ndarray, "rows columns 9"]:
+    """Return what the network sees of three pictures, in units of the samples' noise ``scale``."""
+    first = balanced / scale
+    first -= cv2.blur(first, _DETAIL_PX, borderType=cv2.BORDER_REFLECT_101)
+    return np.concatenate([first, (chosen - balanced) / scale, (sharp - chosen) / scale], axis=-1)
+
+
+def noise_planes(
+    variance: Float32[np.ndarray, "tiles 3 levels bands"],
+    noise_e: Float32[np.ndarray, "tiles 3"],
+    local_variance_e2: Float32[np.ndarray, "rows columns"],
+    layout: TileLayout,
+) -> Float32[np.ndarray, "half_rows half_columns 12"]:
+    """Return sigma of the grey noise that the filter leaves in each band, at half of the resolution.
+
+    Arguments are those of ``shrink.shrunk``; the unit is the noise of a sample.
+    """
+    rows, columns = (-(-count // 2) for count in local_variance_e2.shape)
+    brightness = local_variance_e2 / interpolated(layout, layout.by_place(np.mean(noise_e**2, axis=1, keepdims=True)))
+    half = np.sqrt(cv2.resize(brightness, (columns, rows), interpolation=cv2.INTER_AREA))
+    sigma = interpolated(layout, layout.by_place(np.sqrt(variance[:, 0]).reshape(len(variance), -1)), step=2)
+    return sigma * half[..., None]
+
+
+def sharper(strengths: Float32[np.ndarray, " tiles"]) -> Float32[np.ndarray, " tiles"]:
+    """Return the strengths at which tiles are filtered a second time, for the network, given those that they chose."""
+    return np.minimum(strengths * _SHARPER, STRENGTHS[-1])
+
+
+def refined(
+    balanced: Float32[np.ndarray, "rows columns 3"],
+    chosen: Float32[np.ndarray, "rows columns 3"],
+    sharp: Float32[np.ndarray, "rows columns 3"],
+    noise_e: Float32[np.ndarray, "tiles 3"],
+    local_variance_e2: Float32[np.ndarray, "rows columns"],
+    variance: Float32[np.ndarray, "tiles 3 levels bands"],
+    layout: TileLayout,
+) -> Float32[np.ndarray, "rows columns 3"]:
+    """Return the picture of the tier ``balanced`` with what the network adds to it.
+
+    Args:
+        balanced: the picture of that tier. chosen: as filtered at the strengths that tiles chose. sharp: at
+            ``sharper`` ones.
+        noise_e, local_variance_e2, variance, layout: as for ``shrink.shrunk``.
+    """
+    scale = interpolated(layout, layout.by_place(noise_e))
+    return corrected(balanced, chosen, sharp, scale, noise_planes(variance, noise_e, local_variance_e2, layout))
+
+
+def corrected(
+    balanced: Float32[np.ndarray, "rows columns 3"],
+    chosen: Float32[np.ndarray, "rows columns 3"],
+    sharp: Float32[np.ndarray, "rows columns 3"],
+    scale: Float32[np.ndarray, "rows columns 3"],
+    noise: Float32[np.ndarray, "half_rows half_columns 12"],
+) -> Float32[np.ndarray, "rows columns 3"]:
+    """Return the picture of the tier ``balanced`` with what the network adds to it, in the unit of the pictures.
+
+    Args:
+        balanced, chosen, sharp: as for ``refined``.
+        scale: noise of a sample of each colour. noise: of each band, in units of ``scale`` (``noise_planes``).
+    """
+    rows, columns = balanced.shape[:2]
+    weights, detail = network_weights(), details(balanced, chosen, sharp, scale)
+    count = -(-rows // _BLOCK_ROWS)
+    # Blocks of one shape are compiled once; what surrounds each is as far as the network looks.
+    down = (_REACH_PX, _REACH_PX + count * _BLOCK_ROWS - rows)
+    across = (_REACH_PX, _REACH_PX + -columns % _CELL_PX)
+    detail = np.pad(detail, (down, across, (0, 0)), mode="symmetric")
+    half = [
+        (before // 2, (before + size + after) // 2 - before // 2 - noise.shape[axis])
+        for axis, (size, (before, after)) in enumerate(zip((rows, columns), (down, across), strict=True))
+    ]
+    noise = np.pad(noise, (*half, (0, 0)), mode="edge")
+    result = np.empty_like(balanced)
+    for top in range(0, rows, _BLOCK_ROWS):
+        bottom = top + _BLOCK_ROWS + 2 * _REACH_PX
+        found = np.asarray(_compiled(weights, detail[None, top:bottom], noise[None, top // 2 : bottom // 2]))[0]
+        inner = found[_REACH_PX : _REACH_PX + min(_BLOCK_ROWS, rows - top), _REACH_PX : _REACH_PX + columns]
+        result[top : top + _BLOCK_ROWS] = inner
+    result *= scale
+    result += balanced
+    return result
+
+
+@functools.cache
+def network_weights() -> Weights:
+    """Read the weights that ship with udccal."""
+    with np.load(WEIGHTS_FILE, allow_pickle=False) as stored:
+        return {name: jnp.asarray(stored[name], jnp.float32) for name in shapes()}
+
+
+def shapes() -> dict[str, tuple[int, int, int, int]]:
+    """Return the shape of each kernel: rows, columns, channels in, channels out."""
+    found = {"in": (3, 3, INPUTS, _FINE), "down": (2, 2, _FINE, _COARSE), "up": (1, 1, _COARSE, 4 * _FINE)}
+    for level, count, channels in (("fine", _FINE_BLOCKS, _FINE), ("coarse", _COARSE_BLOCKS, _COARSE)):
+        for block in range(count):
+            found |= {f"{level}{block}a": (3, 3, channels, channels), f"{level}{block}b": (3, 3, channels, channels)}
+    return found | {"out": (3, 3, _FINE, COLOURS * _PLACES)}
+
+
+def correction(
+    weights: Weights,
+    detail: Float[Array, "tiles rows columns 9"],
+    noise: Float[Array, "tiles half_rows half_columns 12"],
+) -> Float[Array, "tiles rows columns 3"]:
+    """Return what is to be added to the first picture.
+
+    Args:
+        weights: of the network.
+        detail: of three pictures by channel (``details``).
+        noise: sigma that the filter leaves in each band, at half of the resolution; in the same unit as ``detail``.
+    """
+    first = _convolved(jnp.concatenate([_apart(detail), noise], axis=-1), weights["in"])
+    fine = _block(first, weights, "fine0")
+    coarse = _convolved(fine, weights["down"], stride=2)
+    for block in range(_COARSE_BLOCKS):
+        coarse = _block(coarse, weights, f"coarse{block}")
+    fine = fine + _together(_convolved(coarse, weights["up"]), _FINE)
+    for block in range(1, _FINE_BLOCKS):
+        fine = _block(fine, weights, f"fine{block}")
+    return _together(_convolved(jax.nn.relu(fine), weights["out"]), COLOURS)
+
+
+def _block(planes: Float[Array, "n y x c"], weights: Weights, name: str) -> Float[Array, "n y x c"]:
+    inner = jax.nn.relu(_convolved(jax.nn.relu(planes), weights[f"{name}a"]))
+    return planes + _convolved(inner, weights[f"{name}b"])
+
+
+def _convolved(
+    planes: Float[Array, "n y x c"], kernel: Float[Array, "ky kx c d"], stride: int = 1
+) -> Float[Array, "n y2 x2 d"]:
+    order = ("NHWC", "HWIO", "NHWC")
+    return jax.lax.conv_general_dilated(planes, kernel, (stride, stride), "SAME", dimension_numbers=order)
+
+
+def _apart(planes: Float[Array, "n y x c"]) -> Float[Array, "n y2 x2 c4"]:
+    """Return the 2 x 2 places of a picture as channels."""
+    n, y, x, c = planes.shape
+    return planes.reshape(n, y // 2, 2, x // 2, 2, c).transpose(0, 1, 3, 2, 4, 5).reshape(n, y // 2, x // 2, 4 * c)
+
+
+def _together(planes: Float[Array, "n y x c4"], channels: int) -> Float[Array, "n y2 x2 c"]:
+    """Return pictures from the channels of their 2 x 2 places."""
+    n, y, x, _ = planes.shape
+    apart = planes.reshape(n, y, x, 2, 2, channels).transpose(0, 1, 3, 2, 4, 5)
+    return apart.reshape(n, 2 * y, 2 * x, channels)
+
+
+_compiled = jax.jit(correction)
