@@ -10,7 +10,7 @@ from udccal.cameras.choice import check_camera
 from udccal.guide.events import DoneEvent, Person
 from udccal.guide.lead import Leading
 from udccal.guide.steps import GuidedStep
-from udccal.planning.exposures import nominal_full_s, steps_at, with_small_panel
+from udccal.planning.steps import nominal_full_s, steps_at, with_small_panel
 from udccal.plugins import find_procedure
 from udccal.rig import RigDescription
 from udccal.sessions.schema import TermName

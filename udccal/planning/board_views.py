@@ -13,23 +13,21 @@ from scipy.spatial.transform import Rotation
 from scipy.special import erf
 
 from udccal.arrangements import Board, BoardSpec
+from udccal.fitting.engine.gaussian import Prior
 from udccal.fitting.geometry.bundle import (
+    EVERY,
     LENS,
     Bundle,
+    BundleProblem,
     GeometryRules,
     Intrinsics,
     Points,
-    by_view,
-    in_sigma,
     projected,
 )
 from udccal.fitting.geometry.corners import board_points_mm, charuco_board
-from udccal.planning.state import WHITE, EvenField, RigState, sample_variance_e
+from udccal.planning.state import WHITE, EvenField, RigState
 from udccal.planning.steps import PlannedStep
 
-# Scatter of corners by axis in addition to noise, where no profile has measured it. Edges of the board on the jig run
-# along the sensor's rows: samples see them at few phases, and corners scatter more than on boards that lean.
-_ON_JIG_PX, _BY_HAND_PX = 0.0085, 0.006
 # White paper reflects so much more than black ink that half the difference is this part of white.
 _HALF_CONTRAST = 0.47
 # Edges after lens, pixel and the filter that makes a grey picture of a mosaic (one sigma).
@@ -37,6 +35,7 @@ _EDGE_PX = 1.0
 # Radius of a saddle's window in squares: markers lie outside it.
 _WINDOW_SQUARES = 0.16
 _RULES = GeometryRules()
+_NOTHING_KNOWN = Prior(np.zeros(LENS), np.zeros((0, LENS)))
 
 
 @final
@@ -60,20 +59,25 @@ class BoardViews:
         self.intrinsics = Intrinsics.of_geometry(state.geometry).vector
 
     def planned(self, step: PlannedStep, board: Board) -> BoardView | None:
-        """Return the view of a board; None where it shows too few corners to hold its pose."""
-        state = self._state
-        to_camera = Rotation.from_rotvec(np.asarray(state.geometry.rotation_rad)).inv()
+        """Return the view of a board; None where it shows too few corners to hold its pose.
+
+        Args:
+            step: gives the light.
+            board: where it is held.
+        """
+        geometry, spec = self._state.geometry, board.spec
+        to_camera = Rotation.from_rotvec(np.asarray(geometry.rotation_rad)).inv()
         rotation = to_camera * Rotation.from_rotvec(np.array(board.rotation_vector))
-        origin = to_camera.apply(np.array(board.translation_mm) - np.asarray(state.geometry.pupil_mm))
-        corners = board_points_mm(board.spec)
-        markers = np.asarray(charuco_board(board.spec).getObjPoints(), dtype=np.float64).reshape(-1, 3)
+        origin = to_camera.apply(np.array(board.translation_mm) - np.asarray(geometry.pupil_mm))
+        corners = board_points_mm(spec)
+        markers = np.asarray(charuco_board(spec).getObjPoints(), dtype=np.float64).reshape(-1, 3)
         image, marks = (projected(self.intrinsics, rotation.apply(points) + origin)[0] for points in (corners, markers))
         depth = float((rotation.apply(corners.mean(axis=0)) + origin)[2])
-        radius = self._window_px(board.spec, depth)
-        whole = _inside(state, marks, 1.0).reshape(-1, 4).all(axis=1)
+        radius = self._window_px(spec, depth)
+        whole = self._inside(marks, 1.0).reshape(-1, 4).all(axis=1)
         # Only corners with both markers in the picture count: without these the detector does not know their numbers.
-        near = np.linalg.norm(corners[:, None] - markers.reshape(-1, 4, 3).mean(axis=1), axis=2) < board.spec.square_mm
-        good = _inside(state, image, np.ceil(radius) + 1) & ~(near & ~whole).any(axis=1)
+        near = np.linalg.norm(corners[:, None] - markers.reshape(-1, 4, 3).mean(axis=1), axis=2) < spec.square_mm
+        good = self._inside(image, np.ceil(radius) + 1) & ~(near & ~whole).any(axis=1)
         if depth <= 0 or good.sum() < _RULES.least_corners:
             return None
         pose = np.concatenate([rotation.as_rotvec(), origin])
@@ -81,11 +85,7 @@ class BoardViews:
         return BoardView(corners[good], image[good], sigma, pose, board.parallel_to_panel)
 
     def seen(
-        self,
-        step: PlannedStep,
-        spec: BoardSpec,
-        numbers: Int[np.ndarray, " n"],
-        points_px: Float[np.ndarray, "n 2"],
+        self, step: PlannedStep, spec: BoardSpec, numbers: Int[np.ndarray, " n"], points_px: Float[np.ndarray, "n 2"]
     ) -> BoardView | None:
         """Return the view of corners that were found; None where they are too few to hold its pose.
 
@@ -106,21 +106,23 @@ class BoardViews:
         return BoardView(corners, points_px, sigma, pose, parallel=False)
 
     def _window_px(self, spec: BoardSpec, depth_mm: float) -> float:
-        square_px = spec.square_mm / depth_mm * Intrinsics.of(self.intrinsics).focal_px[0]
+        square_px = spec.square_mm / depth_mm * self.intrinsics[0]
         return float(np.clip(_WINDOW_SQUARES * square_px, *_RULES.window_px))
+
+    def _inside(self, pixels: Float[np.ndarray, "n 2"], margin: float) -> Bool[np.ndarray, " n"]:
+        last = np.array([self._state.rig.camera.columns, self._state.rig.camera.rows]) - 1 - margin
+        return np.asarray(np.all((pixels >= margin) & (pixels <= last), axis=1))
 
     def _sigma_px(
         self, step: PlannedStep, pixels: Float[np.ndarray, "n 2"], radius: float, parallel: bool
     ) -> Float[np.ndarray, " n"]:
         """Scatter by noise of the board's frames and by all else; that of the flat field, of far more, is left out."""
         state, errors = self._state, self._state.model_errors
-        white = (step.level or 0.0) * state.full_well_e * self._field.at(pixels)
-        signal = white[:, None] * np.array(WHITE)[[0, 1, 1, 2]] / max(WHITE)
-        temporal = sample_variance_e(state, 0.5 * signal, step.exposures_s[0]) / len(step.exposures_s)
-        relative = temporal / signal**2
-        noise = np.sqrt(relative.mean(axis=1)) / _HALF_CONTRAST * _saddle_scatter(radius)
-        known, usual = (errors.on_jig_px, _ON_JIG_PX) if parallel else (errors.by_hand_px, _BY_HAND_PX)
-        return np.asarray(np.hypot(noise, usual if known is None else known))
+        signal = step.level * state.full_well_e * np.outer(self._field.at(pixels), WHITE[[0, 1, 1, 2]])
+        temporal = state.variance_e(0.5 * signal, step.exposures_s[0]) / len(step.exposures_s)
+        relative = np.sqrt((temporal / signal**2).mean(axis=1))
+        beside_px = errors.on_jig_px if parallel else errors.by_hand_px
+        return np.hypot(relative / _HALF_CONTRAST * _saddle_scatter(radius), beside_px)
 
 
 def points_of(views: Sequence[BoardView]) -> Points:
@@ -141,10 +143,8 @@ def lens_information(view: BoardView | None, intrinsics: Float[np.ndarray, "9"])
     """Return the Fisher information of one view on the intrinsics, whatever its own pose; none without a view."""
     if view is None:
         return np.zeros((LENS, LENS))
-    points = points_of([view])
-    (matrix,), _ = by_view(*in_sigma(Bundle(intrinsics, view.pose[None]), points), points)
-    cross = matrix[:LENS, LENS:]
-    return np.asarray(matrix[:LENS, :LENS] - cross @ np.linalg.solve(matrix[LENS:, LENS:], cross.T))
+    problem = BundleProblem(points_of([view]), EVERY, _NOTHING_KNOWN)
+    return problem.equations_at(Bundle(intrinsics, view.pose[None])).marginal()[0]
 
 
 def _saddle_scatter(radius_px: float) -> float:
@@ -157,8 +157,3 @@ def _saddle_scatter(radius_px: float) -> float:
     # The window's weights are not those of the noise: the covariance is a sandwich.
     solved = np.linalg.solve(design.T @ (design * weight[:, None]), (design * weight[:, None]).T)
     return float(np.linalg.norm(solved[0]))
-
-
-def _inside(state: RigState, pixels: Float[np.ndarray, "n 2"], margin: float) -> Bool[np.ndarray, " n"]:
-    last = np.array([state.rig.camera.columns, state.rig.camera.rows]) - 1 - margin
-    return np.asarray(np.all((pixels >= margin) & (pixels <= last), axis=1))

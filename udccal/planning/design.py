@@ -6,10 +6,11 @@ reached. Then it prunes the design. It uses no random numbers.
 
 from __future__ import annotations
 
+import functools
 import math
-from collections.abc import Callable, Iterator
+from bisect import bisect_left
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from types import MappingProxyType
 from typing import Final, Protocol, final, runtime_checkable
 
 from udccal.planning.steps import Cost
@@ -32,15 +33,13 @@ class Quantity:
     meaning: str
 
 
-QUANTITIES: Final = MappingProxyType[TermName, Quantity](
-    {
-        "noise": Quantity("%", "conversion gain K, relative"),
-        "geometry": Quantity("px", "where a ray lands, root mean square over the sensor"),
-        "wire": Quantity("%", "wire map, root mean square over the sensor"),
-        "psf": Quantity("%", "kernel, relative L2"),
-        "backscatter": Quantity("%", "predicted light, root mean square, of its peak"),
-    }
-)
+QUANTITIES: Final[Mapping[TermName, Quantity]] = {
+    "noise": Quantity("%", "conversion gain K, relative"),
+    "geometry": Quantity("px", "where a ray lands, root mean square over the sensor"),
+    "wire": Quantity("%", "wire map, root mean square over the sensor"),
+    "psf": Quantity("%", "kernel, relative L2"),
+    "backscatter": Quantity("%", "predicted light, root mean square, of its peak"),
+}
 
 
 @final
@@ -88,37 +87,33 @@ class DesignVariable:
         return captures.model_copy(update={self.name: value})
 
 
-DESIGN_VARIABLES: Final = MappingProxyType[TermName, tuple[DesignVariable, ...]](
-    {
-        # PRNU and DSNU depend on the stack, K on the levels: with fewer, the other noise quantities would suffer.
-        "noise": (
-            DesignVariable("noise_levels", 5, 400, "levels of light"),
-            DesignVariable("noise_stack", 8, 1000, "frames of a stack"),
-        ),
-        "geometry": (DesignVariable("board_views", 3, 200, "views of the board"),),
-        "wire": (DesignVariable("flats", 2, 20_000, "flats"),),
-        "psf": (
-            DesignVariable("psf_columns", 2, 24, "columns of LED positions"),
-            DesignVariable("psf_rows", 2, 24, "rows of LED positions"),
-            DesignVariable("psf_shifts", 1, 64, "shifts at each position"),
-            DesignVariable("psf_exposures", 3, 12, "exposures of a bracket"),
-        ),
-        "backscatter": (
-            DesignVariable("backscatter_pictures", 6, 200, "pictures on the panel"),
-            DesignVariable("backscatter_frames", 2, 1000, "frames of a picture"),
-        ),
-    }
-)
+DESIGN_VARIABLES: Final[Mapping[TermName, tuple[DesignVariable, ...]]] = {
+    # PRNU and DSNU depend on the stack, K on the levels: with fewer, the other noise quantities would suffer.
+    "noise": (
+        DesignVariable("noise_levels", 5, 400, "levels of light"),
+        DesignVariable("noise_stack", 8, 1000, "frames of a stack"),
+    ),
+    "geometry": (DesignVariable("board_views", 3, 200, "views of the board"),),
+    "wire": (DesignVariable("flats", 2, 20_000, "flats"),),
+    "psf": (
+        DesignVariable("psf_columns", 2, 24, "columns of LED positions"),
+        DesignVariable("psf_rows", 2, 24, "rows of LED positions"),
+        DesignVariable("psf_shifts", 1, 64, "shifts at each position"),
+        DesignVariable("psf_exposures", 3, 12, "exposures of a bracket"),
+    ),
+    "backscatter": (
+        DesignVariable("backscatter_pictures", 6, 200, "pictures on the panel"),
+        DesignVariable("backscatter_frames", 2, 1000, "frames of a picture"),
+    ),
+}
 
 
 @final
-@dataclass(frozen=True)
 class Objective:
-    """Sigma and cost of one term's captures, as functions of the captures."""
+    """Sigma and cost of one term's captures, as functions of the captures that are evaluated once for each."""
 
-    term: TermName
-    sigma: Callable[[Captures], float]
-    cost: Callable[[Captures], Cost]
+    def __init__(self, term: TermName, sigma: Callable[[Captures], float], cost: Callable[[Captures], Cost]) -> None:
+        self.term, self.sigma, self.cost = term, functools.cache(sigma), functools.cache(cost)
 
 
 @final
@@ -147,14 +142,13 @@ def one_step_up(term: TermName, captures: Captures) -> Iterator[tuple[DesignVari
 
 def worthwhile(objective: Objective, design: Captures) -> list[Addition]:
     """Additions that lower sigma at all, in the order of the design variables."""
-    before, spent = objective.sigma(design), objective.cost(design)
-    found = []
+    before, found = objective.sigma(design), []
     for variable, more in one_step_up(objective.term, design):
         after = objective.sigma(more)
         # From an infinite sigma, any finite one is a gain.
         gain = math.log(before / after) if math.isfinite(before) else 100.0 if math.isfinite(after) else 1.0
         if gain > _LEAST_GAIN:
-            found.append(Addition(variable, more, gain, objective.cost(more) - spent))
+            found.append(Addition(variable, more, gain, objective.cost(more) - objective.cost(design)))
     return found
 
 
@@ -175,19 +169,14 @@ def _pruned(objective: Objective, design: Captures, target: float) -> Captures:
     """Lower every variable as far as the target allows, beginning with the one that saves most time."""
     while True:
         lower = [_lowered(objective, design, target, variable) for variable in DESIGN_VARIABLES[objective.term]]
-        best = min(lower, key=lambda one: objective.cost(one).seconds)
-        if objective.cost(best).seconds >= objective.cost(design).seconds:
+        best = min([design, *lower], key=lambda one: objective.cost(one).seconds)
+        if best == design:
             return design
         design = best
 
 
 def _lowered(objective: Objective, design: Captures, target: float, variable: DesignVariable) -> Captures:
     """Lower one variable by halving an interval, since more captures never raise sigma."""
-    low, high = variable.least - 1, variable.of(design)
-    while high - low > 1:
-        middle = (low + high) // 2
-        if objective.sigma(variable.set(design, middle)) <= target:
-            high = middle
-        else:
-            low = middle
-    return variable.set(design, high)
+    counts = range(variable.least, variable.of(design))
+    spared = bisect_left(counts, True, key=lambda count: objective.sigma(variable.set(design, count)) <= target)
+    return variable.set(design, variable.least + spared)

@@ -11,9 +11,8 @@ from jaxtyping import Float, Int
 from udccal.arrangements import Board
 from udccal.fitting.engine.gaussian import scaled_inverse
 from udccal.fitting.geometry.data import rig_prior
-from udccal.planning.board_views import BoardViews, lens_information
+from udccal.planning.board_views import BoardView, BoardViews, lens_information
 from udccal.planning.state import nominal_state
-from udccal.planning.steps import planned_steps
 from udccal.rig import RigDescription
 
 
@@ -31,24 +30,18 @@ class NextView:
         poses: to choose from, all of one board.
         """
         state = nominal_state(rig)
-        self._views = BoardViews(state)
-        self._spec = poses[0].spec
-        prior, by_hand = rig_prior(rig).precision, []
-        for step in planned_steps("geometry", state):
+        self._views, self._poses, self._open = BoardViews(state), poses, list(range(len(poses)))
+        self._known, by_hand = rig_prior(rig).precision, []
+        for step in state.steps("geometry"):
             if isinstance(board := step.arrangement, Board):
-                told = lens_information(self._views.planned(step, board), self._views.intrinsics)
+                told, self._step = self._told(self._views.planned(step, board)), step
                 if board.parallel_to_panel:
-                    prior = prior + told
+                    self._known = self._known + told
                 else:
-                    self._step = step
                     by_hand.append(told)
-        self._known, self._to_come, self._average = prior, len(by_hand), np.mean(by_hand, axis=0)
-        self._usual = _sigma(prior + np.sum(by_hand, axis=0))
-        self._poses = poses
-        self._tell = np.array(
-            [lens_information(self._views.planned(self._step, pose), self._views.intrinsics) for pose in poses]
-        )
-        self._open = list(range(len(poses)))
+        self._to_come, self._average = len(by_hand), np.mean(by_hand, axis=0)
+        self._usual = _sigma(self._known + np.sum(by_hand, axis=0))
+        self._tell = np.array([self._told(self._views.planned(self._step, pose)) for pose in poses])
 
     def taken(self, numbers: Int[np.ndarray, " n"], points_px: Float[np.ndarray, "n 2"]) -> None:
         """Count a view that was captured.
@@ -57,8 +50,7 @@ class NextView:
             numbers: of the corners seen, as OpenCV counts them.
             points_px: where they are on the sensor.
         """
-        view = self._views.seen(self._step, self._spec, numbers, points_px)
-        self._known = self._known + lens_information(view, self._views.intrinsics)
+        self._known = self._known + self._told(self._views.seen(self._step, self._poses[0].spec, numbers, points_px))
         self._to_come -= 1
 
     def pose(self) -> Board:
@@ -67,6 +59,9 @@ class NextView:
         later = max(self._to_come - 1, 0) * self._average
         worst = (_sigma(self._known + later + self._tell[self._open]) / self._usual).max(axis=-1)
         return self._poses[self._open.pop(int(worst.argmin()))]
+
+    def _told(self, view: BoardView | None) -> Float[np.ndarray, "9 9"]:
+        return lens_information(view, self._views.intrinsics)
 
 
 def _sigma(information: Float[np.ndarray, "*k n n"]) -> Float[np.ndarray, "*k n"]:
