@@ -104,7 +104,7 @@ class BackscatterPredictor:
 
     def _planned(self, captures: Captures) -> tuple[Binned, int] | None:
         """Shots of the pictures drawn, and the number of pictures in all; None where these are too few."""
-        steps = self._state.with_captures(captures).counted("backscatter")
+        steps = self._state.with_captures(captures).steps("backscatter", drawn=False)
         shown, darks = ([step for step in steps if isinstance(step.arrangement, kind)] for kind in (PanelPicture, Dark))
         if len(shown) - 1 < _RULES.fewest_pictures or not darks:
             return None

@@ -38,7 +38,6 @@ _FIELD: Final = ((0.45, 0.55), (0.15, 0.2), (0.85, 0.7))
 _CAPTURED: Final = ((0.05, 0.06), (0.5, 0.94), (0.9, 0.5))
 _SHIFTS_PX: Final = np.array([[0.4, 1.3], [1.7, 0.2]])
 _RULES: Final = PsfRules()
-Information = Float[np.ndarray, "p p"]
 
 
 @final
@@ -51,11 +50,10 @@ class PsfPredictor:
         if wire is None:
             built = wire_start(rig)
             wire = ideal_wire(state.geometry, built, possible_harmonics(built).orders)
-        start = start_model(rig, state.geometry, wire)
-        shots, prior = _dark_shots(rig), start_prior(rig, start)
+        start, shots = start_model(rig, state.geometry, wire), _dark_shots(rig)
+        samples, prior = gather(shots, state.geometry, choose_samples(shots, _RULES)), start_prior(rig, start)
         lattice = fit_lattice(_RULES.close(shots.half))
-        evaluator = Evaluator(np.asarray(start.wavelengths_nm), lattice, bool(start.visibility))
-        samples = gather(shots, state.geometry, choose_samples(shots, _RULES))
+        evaluator = Evaluator(start.wavelengths_nm, lattice, bool(start.visibility))
         problem = DiffractionProblem(samples, evaluator, prior).with_overlaps(prior.mean)
         # The light is that of the start, 1 for the brightest sample.
         own = np.tile([0.0, 0.0, *WHITE, 0.0], (shots.positions, len(_SHIFTS_PX), 1))
@@ -64,8 +62,8 @@ class PsfPredictor:
         self._problem = replace(problem, samples=replace(problem.samples, rate=self._place.light))
         # With weights that give every colour's kernel the norm 1, the equations hold its squared derivatives.
         relative = replace(self._problem, samples=_relative(self._problem.samples, shots))
-        in_field = relative.by_position(self._place)[: len(_FIELD)]
-        self._of_kernel = _per_shot([one.shared for one in in_field])
+        in_field = [one.shared for one in relative.by_position(self._place)[: len(_FIELD)]]
+        self._of_kernel = np.mean(in_field, axis=0) / len(_SHIFTS_PX)
         self._information = functools.cache(self._information_by)
 
     def sigma(self, captures: Captures) -> float:
@@ -81,13 +79,12 @@ class PsfPredictor:
     def floor(self) -> Floor:
         """The sigma of all positions and shifts that the fit uses, at endless light."""
         most, shots = self._state.rig.captures.model_copy(update=_MOST_EXPOSURES), _RULES.positions * _RULES.shifts
+        why = (
+            f"The fit of diffraction looks at {_RULES.positions} positions and {_RULES.shifts} shifts of each, and "
+            "pixels differ in their response (PRNU): a larger effort (FitEffort's psf) would lower it."
+        )
         if self._state.model_errors.psf_kernel**2 > self._of_noise(most, shots):
             why = "That much of the kernel the fit of the present profile could not describe; no capture changes it."
-        else:
-            why = (
-                f"The fit of diffraction looks at {_RULES.positions} positions and {_RULES.shifts} shifts of each, and "
-                "pixels differ in their response (PRNU): a larger effort (FitEffort's psf) would lower it."
-            )
         return Floor(self._kernel_sigma(most, shots), why)
 
     def _kernel_sigma(self, captures: Captures, shots: int) -> float:
@@ -100,14 +97,22 @@ class PsfPredictor:
         return float(np.sum(self._of_kernel * scaled_inverse(self._problem.prior.precision + shots * information)))
 
     @in_float64
-    def _information_by(self, step: PlannedStep) -> Information:
-        """Information of one shot on the diffraction parameters, averaged over the places that represent all."""
-        merged = replace(self._problem, samples=_merged(self._state, self._problem.samples, step))
-        return _per_shot([one.marginal()[0] for one in merged.by_position(self._place)[len(_FIELD) :]])
+    def _information_by(self, step: PlannedStep) -> Float[np.ndarray, "p p"]:
+        """Information of one shot on the diffraction parameters, averaged over the places that represent all.
 
-
-def _per_shot(matrices: list[Information]) -> Information:
-    return np.asarray(np.mean(matrices, axis=0) / len(_SHIFTS_PX))
+        Samples are weighted by their brackets' noise, PRNU, and the model error that a profile's fit found. Exposures
+        that would fill a sample's well do not count for it.
+        """
+        state, samples = self._state, self._problem.samples
+        light, known = np.maximum(samples.rate, 0.0), np.zeros_like(samples.rate)
+        for exposure_s in step.exposures_s:
+            full_e = step.level * state.full_well_e * exposure_s / step.exposures_s[0]
+            counts = full_e * light < state.full_well_e
+            known += np.where(counts, full_e**2 / state.variance_e(full_e * light, exposure_s), 0.0)
+        known *= (samples.known > 0) / (1 + known * (state.noise.PRNU1288 * light) ** 2)
+        merged = replace(self._problem, samples=weighed(replace(samples, known=known), state.model_errors.psf))
+        by_place = [one.marginal()[0] for one in merged.by_position(self._place)[len(_FIELD) :]]
+        return np.mean(by_place, axis=0) / len(_SHIFTS_PX)
 
 
 def _shots_used(captures: Captures) -> int:
@@ -116,21 +121,6 @@ def _shots_used(captures: Captures) -> int:
     fitted = int((~held_out_positions(positions)).sum())
     used = min(fitted, _RULES.positions) * min(captures.psf_shifts, _RULES.shifts)
     return used if positions >= _RULES.least_positions else 0
-
-
-def _merged(state: RigState, samples: Samples, step: PlannedStep) -> Samples:
-    """The samples weighted by their brackets' noise, PRNU, and the model error that a profile's fit found.
-
-    Exposures that would fill a sample's well do not count for it.
-    """
-    light = np.maximum(samples.rate, 0.0)
-    known = np.zeros_like(light)
-    for exposure_s in step.exposures_s:
-        full_e = step.level * state.full_well_e * exposure_s / step.exposures_s[0]
-        counts = full_e * light < state.full_well_e
-        known += np.where(counts, full_e**2 / state.variance_e(full_e * light, exposure_s), 0.0)
-    known /= 1 + known * (state.noise.PRNU1288 * light) ** 2
-    return weighed(replace(samples, known=known * (samples.known > 0)), state.model_errors.psf)
 
 
 def _relative(samples: Samples, shots: Shots) -> Samples:

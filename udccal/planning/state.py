@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import final
 
@@ -81,17 +80,16 @@ class RigState:
         """The same with other captures."""
         return replace(self, rig=self.rig.model_copy(update={"captures": captures}))
 
-    def steps(self, term: TermName) -> Iterator[PlannedStep]:
-        """The steps of a term's procedure at the exposures of this state; it raises the errors of ``steps_at``."""
-        return steps_at(term, self.rig, self._full_s)
+    def steps(self, term: TermName, drawn: bool = True) -> list[PlannedStep]:
+        """The steps of a term's procedure at the exposures of this state; it raises the errors of ``steps_at``.
 
-    def counted(self, term: TermName) -> list[PlannedStep]:
-        """The same steps with tiny pictures on the panel, for counting."""
-        return list(steps_at(term, with_small_panel(self.rig), self._full_s))
+        For counting, pictures on the panel need not be ``drawn``: they are tiny then.
+        """
+        return list(steps_at(term, self.rig if drawn else with_small_panel(self.rig), self._full_s))
 
     def cost(self, term: TermName) -> Cost:
         """Frames, seconds and set-ups of a term's procedure; it raises the errors of ``steps_at``."""
-        return cost_of(self.counted(term), self.rig)
+        return cost_of(self.steps(term, drawn=False), self.rig)
 
     def _full_s(self, arrangement: Arrangement) -> float:
         """Exposure in seconds at which the brightest sample of an arrangement would fill its well."""

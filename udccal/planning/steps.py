@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from itertools import groupby
 from typing import Any, final
 
-from udccal.arrangements import Arrangement, Board, Dark, FlatLight, Led, PanelPicture, Photograph
+from udccal.arrangements import Arrangement, Led, PanelPicture
 from udccal.errors import UdccalError
 from udccal.plugins import find_procedure
 from udccal.rig import RigDescription
@@ -86,13 +86,9 @@ def steps_at(term: TermName, rig: RigDescription, full_s: Callable[[Arrangement]
 
 def nominal_full_s(arrangement: Arrangement, rig: RigDescription) -> float:
     """Return the exposure in seconds that usually fills the well of an arrangement's brightest sample."""
-    match arrangement:
-        case Led():
-            return _LED_FULL_S
-        case PanelPicture():
-            return _PANEL_FULL_S
-        case FlatLight() | Board() | Dark() | Photograph():
-            return 1.0 / rig.camera.frame_rate_hz
+    if isinstance(arrangement, Led):
+        return _LED_FULL_S
+    return _PANEL_FULL_S if isinstance(arrangement, PanelPicture) else 1.0 / rig.camera.frame_rate_hz
 
 
 def with_small_panel(rig: RigDescription) -> RigDescription:

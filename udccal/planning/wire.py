@@ -75,7 +75,7 @@ class WirePredictor:
 
     def _noise_variance(self, captures: Captures) -> Float[np.ndarray, " n"] | None:
         """Variance of flat minus dark by noise over the signal squared, pixel by pixel; None without flats or darks."""
-        state, steps = self._state, list(self._state.with_captures(captures).steps("wire"))
+        state, steps = self._state, self._state.with_captures(captures).steps("wire")
         flat, dark = (next((s for s in steps if isinstance(s.arrangement, kind)), None) for kind in (FlatLight, Dark))
         if flat is None or dark is None:
             return None
