@@ -20,7 +20,7 @@ from udccal.sessions.schema import TermName
 # One step up adds this part of the present number, and one at least.
 _SHARE: Final = 0.25
 _MOST_ADDITIONS: Final = 200
-# An addition that lowers the logarithm of sigma by less than this does not count.
+# An addition that lowers sigma by less than this part of it does not count.
 _LEAST_GAIN: Final = 1e-6
 
 
@@ -118,13 +118,33 @@ class Objective:
 
 @final
 @dataclass(frozen=True)
-class Addition:
-    """One design variable one step up: the fall of the logarithm of sigma, and the cost."""
+class Setting:
+    """One design variable: as it was, and as planned."""
 
-    variable: DesignVariable
-    captures: Captures
-    gain: float
+    name: str
+    before: int
+    planned: int
+
+
+@final
+@dataclass(frozen=True)
+class Suggestion:
+    """One design variable one step up: the fall of sigma in per cent of itself, and the cost."""
+
+    term: TermName
+    setting: Setting
+    gain_percent: float
     cost: Cost
+
+    @property
+    def per_second(self) -> float:
+        """Fall of the logarithm of sigma per second of the camera's time."""
+        return -math.log(max(1 - self.gain_percent / 100, 1e-16)) / max(self.cost.seconds, 1e-9)
+
+    @property
+    def per_set_up(self) -> tuple[bool, float]:
+        """Orders suggestions by their gain per set-up; those without a set-up go first."""
+        return self.cost.set_ups <= 0, self.gain_percent / max(self.cost.set_ups, 1)
 
 
 def least_captures(term: TermName, captures: Captures) -> Captures:
@@ -140,15 +160,17 @@ def one_step_up(term: TermName, captures: Captures) -> Iterator[tuple[DesignVari
             yield variable, variable.set(captures, min(variable.most, value + max(1, round(_SHARE * value))))
 
 
-def worthwhile(objective: Objective, design: Captures) -> list[Addition]:
+def worthwhile(objective: Objective, design: Captures) -> list[Suggestion]:
     """Additions that lower sigma at all, in the order of the design variables."""
     before, found = objective.sigma(design), []
     for variable, more in one_step_up(objective.term, design):
         after = objective.sigma(more)
-        # From an infinite sigma, any finite one is a gain.
-        gain = math.log(before / after) if math.isfinite(before) else 100.0 if math.isfinite(after) else 1.0
-        if gain > _LEAST_GAIN:
-            found.append(Addition(variable, more, gain, objective.cost(more) - objective.cost(design)))
+        # From an infinite sigma, any finite one is a gain, and further captures may lead to one.
+        left = after / before if math.isfinite(before) else 0.0 if math.isfinite(after) else 0.5
+        if left < 1 - _LEAST_GAIN:
+            setting = Setting(variable.name, variable.of(design), variable.of(more))
+            cost = objective.cost(more) - objective.cost(design)
+            found.append(Suggestion(objective.term, setting, 100 * (1 - left), cost))
     return found
 
 
@@ -161,7 +183,8 @@ def cheapest(objective: Objective, captures: Captures, target: float) -> Capture
         additions = worthwhile(objective, design)
         if not additions:
             return None
-        design = max(additions, key=lambda one: one.gain / max(one.cost.seconds, 1e-9)).captures
+        best = max(additions, key=lambda one: one.per_second).setting
+        design = design.model_copy(update={best.name: best.planned})
     return None
 
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final, final, get_args
 
 from udccal.errors import UdccalError
-from udccal.planning.design import DESIGN_VARIABLES, QUANTITIES, DesignVariable, Objective, cheapest, worthwhile
+from udccal.planning.design import DESIGN_VARIABLES, QUANTITIES, Objective, Setting, Suggestion, cheapest, worthwhile
 from udccal.planning.forecast import predictor_for
 from udccal.planning.state import RigState
 from udccal.planning.steps import Cost
@@ -30,27 +30,6 @@ class Target:
 
     term: TermName
     sigma: float
-
-
-@final
-@dataclass(frozen=True)
-class Setting:
-    """One design variable: as the rig has it, and as planned."""
-
-    name: str
-    before: int
-    planned: int
-
-
-@final
-@dataclass(frozen=True)
-class Suggestion:
-    """One design variable one step up: the fall of sigma in per cent of itself, and the cost."""
-
-    term: TermName
-    setting: Setting
-    gain_percent: float
-    cost: Cost
 
 
 @final
@@ -163,8 +142,8 @@ def make_plan(
         untouched=untouched,
         cost=sum((plan.cost for plan in plans), start=rest),
         cost_before=sum((plan.cost_before for plan in plans), start=rest),
-        per_second=_most_per_second(plan.per_second for plan in plans),
-        per_set_up=_most_per_set_up(plan.per_set_up for plan in plans),
+        per_second=max(filter(None, (p.per_second for p in plans)), key=lambda one: one.per_second, default=None),
+        per_set_up=max(filter(None, (p.per_set_up for p in plans)), key=lambda one: one.per_set_up, default=None),
     )
 
 
@@ -174,10 +153,7 @@ def _plan_term(state: RigState, target: Target, captures: Captures) -> tuple[Cap
     floor, quantity, planned = predictor.floor(), QUANTITIES[term], captures
     if target.sigma > _NEAR_FLOOR * floor.sigma:
         planned = cheapest(objective, captures, target.sigma) or captures
-    more = [
-        Suggestion(term, _setting(one.variable, planned, one.captures), 100 * (1 - math.exp(-one.gain)), one.cost)
-        for one in worthwhile(objective, planned)
-    ]
+    more = worthwhile(objective, planned)
     return planned, TermPlan(
         term=term,
         unit=quantity.unit,
@@ -188,24 +164,9 @@ def _plan_term(state: RigState, target: Target, captures: Captures) -> tuple[Cap
         floor=floor.sigma,
         reached=objective.sigma(planned) <= target.sigma,
         lowered_by=floor.lowered_by,
-        settings=tuple(_setting(variable, before, planned) for variable in DESIGN_VARIABLES[term]),
+        settings=tuple(Setting(one.name, one.of(before), one.of(planned)) for one in DESIGN_VARIABLES[term]),
         cost=objective.cost(planned),
         cost_before=objective.cost(before),
-        per_second=_most_per_second(more),
-        per_set_up=_most_per_set_up(more),
+        per_second=max(more, key=lambda one: one.per_second, default=None),
+        per_set_up=max(more, key=lambda one: one.per_set_up, default=None),
     )
-
-
-def _setting(variable: DesignVariable, before: Captures, planned: Captures) -> Setting:
-    return Setting(variable.name, variable.of(before), variable.of(planned))
-
-
-def _most_per_second(suggestions: Iterable[Suggestion | None]) -> Suggestion | None:
-    made = filter(None, suggestions)
-    return max(made, key=lambda one: one.gain_percent / max(one.cost.seconds, 1e-9), default=None)
-
-
-def _most_per_set_up(suggestions: Iterable[Suggestion | None]) -> Suggestion | None:
-    """The suggestion that lowers sigma most per set-up; suggestions without a set-up go first."""
-    made = filter(None, suggestions)
-    return max(made, key=lambda one: (one.cost.set_ups <= 0, one.gain_percent / max(one.cost.set_ups, 1)), default=None)
