@@ -13,7 +13,7 @@ from udccal.arrangements import Board, Occasion
 from udccal.fitting.engine.gaussian import scaled_inverse
 from udccal.fitting.geometry.corners import board_points_mm
 from udccal.fitting.geometry.data import rig_prior
-from udccal.planning.board_views import BoardView, BoardViews, NextView, lens_information
+from udccal.planning.geometry import BoardView, BoardViews, NextView, lens_information
 from udccal.planning.state import RigState, nominal_state
 from udccal.planning.steps import PlannedStep
 from udccal.reports.true_values import true_geometry

@@ -166,7 +166,7 @@ def worthwhile(objective: Objective, design: Captures) -> list[Suggestion]:
     for variable, more in one_step_up(objective.term, design):
         after = objective.sigma(more)
         # From an infinite sigma, any finite one is a gain, and further captures may lead to one.
-        left = after / before if math.isfinite(before) else 0.0 if math.isfinite(after) else 0.5
+        left = after / before if math.isfinite(before) else 0.0 if math.isfinite(after) else math.exp(-1)
         if left < 1 - _LEAST_GAIN:
             setting = Setting(variable.name, variable.of(design), variable.of(more))
             cost = objective.cost(more) - objective.cost(design)

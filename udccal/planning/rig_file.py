@@ -21,9 +21,6 @@ _SECTION: Final = re.compile(r"^\[captures\][^\n]*\n(?:(?!\[)[^\n]*(?:\n|\Z))*",
 def check_absent(path: Path) -> None:
     """Check that nothing exists at a path that is to be written.
 
-    Args:
-        path: of the new file.
-
     Raises:
         RigError: when something exists there.
     """

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
-from typing import final
+from typing import Any, final
 
 import jax
 import numpy as np
 from jaxtyping import Float
-from scipy.ndimage import map_coordinates
+from scipy.interpolate import RegularGridInterpolator
 
 from udccal.arrangements import Arrangement, PanelPicture
 from udccal.cfa import cfa_named
@@ -81,21 +82,20 @@ class RigState:
         return replace(self, rig=self.rig.model_copy(update={"captures": captures}))
 
     def steps(self, term: TermName, drawn: bool = True) -> list[PlannedStep]:
-        """The steps of a term's procedure at the exposures of this state; it raises the errors of ``steps_at``.
+        """The steps of a term's procedure at the expected exposures; it raises the errors of ``steps_at``.
 
         For counting, pictures on the panel need not be ``drawn``: they are tiny then.
         """
-        return list(steps_at(term, self.rig if drawn else with_small_panel(self.rig), self._full_s))
+
+        def full_s(arrangement: Arrangement) -> float:
+            white = self.white if isinstance(arrangement, PanelPicture) else None
+            return nominal_full_s(arrangement, self.rig) if white is None else self.full_well_e / float(white.max())
+
+        return list(steps_at(term, self.rig if drawn else with_small_panel(self.rig), full_s))
 
     def cost(self, term: TermName) -> Cost:
         """Frames, seconds and set-ups of a term's procedure; it raises the errors of ``steps_at``."""
         return cost_of(self.steps(term, drawn=False), self.rig)
-
-    def _full_s(self, arrangement: Arrangement) -> float:
-        """Exposure in seconds at which the brightest sample of an arrangement would fill its well."""
-        if isinstance(arrangement, PanelPicture) and (white := self.white) is not None:
-            return self.full_well_e / float(white.max())
-        return nominal_full_s(arrangement, self.rig)
 
     @property
     def white(self) -> Float[np.ndarray, "3 a b"] | None:
@@ -115,10 +115,7 @@ class RigState:
 
 
 def nominal_state(rig: RigDescription) -> RigState:
-    """The state of a rig that was never calibrated.
-
-    Args:
-        rig: its description, with the captures that are evaluated.
+    """The state of a rig that was never calibrated, with the captures of its description, which are evaluated.
 
     Returns:
         terms at the description's nominal values, with usual noise and distortion, and no model errors.
@@ -150,43 +147,32 @@ def measured_state(rig: RigDescription, fits: TermResults) -> RigState:
     Returns:
         terms and model errors as fitted; a term whose fit did not converge is that of the rig as built.
     """
-    nominal = nominal_state(rig)
-    noise, geometry, wire, psf, backscatter = fits.results
-    return RigState(
-        rig=rig,
-        noise=noise.term if _converged(noise) else nominal.noise,
-        geometry=geometry.term if _converged(geometry) else nominal.geometry,
-        wire=wire.term if _converged(wire) else None,
-        backscatter=backscatter.term if _converged(backscatter) else None,
-        model_errors=ModelErrors(
-            on_jig_px=_corners_px(geometry, ON_JIG, ModelErrors.on_jig_px),
-            by_hand_px=_corners_px(geometry, BY_HAND, ModelErrors.by_hand_px),
-            wire=(wire.diagnostic("wire_map_model_sigma") or 0.0) / 100,
-            psf=psf.diagnostic("model_error") or 0.0,
-            psf_kernel=psf.diagnostic("kernel_error_l2") or 0.0,
-            backscatter=backscatter.diagnostic("model_error_of_white") or 0.0,
-            inflation=max(backscatter.diagnostic("pattern_inflation") or 0.0, 1.0),
-        ),
+    built, (noise, geometry, wire, psf, backscatter) = nominal_state(rig), fits.results
+
+    def fitted(result: FitResult[Any], otherwise: Any = None) -> Any:
+        return result.term if result.status is FitStatus.CONVERGED else otherwise
+
+    def corners_px(name: str, usual: float) -> float:
+        scatter_px = geometry.diagnostic(name) if fitted(geometry) else None
+        # Views that disagree scatter by more.
+        factor = max(geometry.diagnostic("variance_factor") or 0.0, 1.0)
+        return usual if scatter_px is None else scatter_px * math.sqrt(factor)
+
+    errors = ModelErrors(
+        on_jig_px=corners_px(ON_JIG, ModelErrors.on_jig_px),
+        by_hand_px=corners_px(BY_HAND, ModelErrors.by_hand_px),
+        wire=(wire.diagnostic("wire_map_model_sigma") or 0.0) / 100,
+        psf=psf.diagnostic("model_error") or 0.0,
+        psf_kernel=psf.diagnostic("kernel_error_l2") or 0.0,
+        backscatter=backscatter.diagnostic("model_error_of_white") or 0.0,
+        inflation=max(backscatter.diagnostic("pattern_inflation") or 0.0, 1.0),
     )
-
-
-def _converged(result: FitResult) -> bool:
-    return result.status is FitStatus.CONVERGED
-
-
-def _corners_px(geometry: FitResult[Geometry], name: str, usual: float) -> float:
-    """Scatter of corners in addition to noise, disagreement of views included; the usual one where none was fitted."""
-    scatter_px = geometry.diagnostic(name) if _converged(geometry) else None
-    factor = max(geometry.diagnostic("variance_factor") or 0.0, 1.0)
-    return usual if scatter_px is None else scatter_px * float(np.sqrt(factor))
+    terms = fitted(noise, built.noise), fitted(geometry, built.geometry), fitted(wire), fitted(backscatter)
+    return RigState(rig, *terms, errors)
 
 
 def sensor_samples(rig: RigDescription, across: int) -> Float[np.ndarray, "n 2"]:
-    """Pixels spread evenly over the sensor.
-
-    Args:
-        rig: for the size of the sensor.
-        across: number of pixels along x and along y.
+    """Pixels spread evenly over the sensor: ``across`` along x, and as many along y.
 
     Returns:
         (x, y) in px, ``across`` squared of them, not rounded to whole pixels.
@@ -201,21 +187,21 @@ class EvenField:
 
     @in_float64
     def __init__(self, state: RigState) -> None:
-        camera, geometry = state.rig.camera, state.geometry
-        self._size, self._cfa = np.array([camera.columns, camera.rows]), cfa_named(camera.cfa)
-        x, y = (np.linspace(0, size - 1, count) for size, count in zip(self._size, _FIELD_GRID[::-1], strict=True))
+        camera, geometry, self._cfa = state.rig.camera, state.geometry, cfa_named(state.rig.camera.cfa)
+        sizes = zip((camera.rows, camera.columns), _FIELD_GRID, strict=True)
+        y, x = (np.linspace(0, size - 1, count) for size, count in sizes)
         pixels = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
         if state.wire is None:
-            ideal = (pixels - np.asarray(geometry.principal_point_px)) / np.asarray(geometry.focal_px)
+            ideal = (pixels - geometry.principal_point_px) / geometry.focal_px
             values = (1 + (ideal**2).sum(axis=1)) ** -2.0
         else:
             values = np.asarray(_wire_values(state.wire, pixels, camera.rows, camera.columns), dtype=np.float64)
-        self._grid = (values / values.max()).reshape(_FIELD_GRID)
+        values = (values / values.max()).reshape(_FIELD_GRID)
+        self._light = RegularGridInterpolator((y, x), values, bounds_error=False, fill_value=None)
 
     def at(self, pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
         """Light at pixels, by linear interpolation."""
-        places = (pixels / (self._size - 1) * (np.array(_FIELD_GRID[::-1]) - 1)).T[::-1]
-        return np.asarray(map_coordinates(self._grid, places, order=1, mode="nearest"))
+        return np.asarray(self._light(pixels[:, ::-1]))
 
     def signal(self, pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
         """Signal of samples of a white field, 1 for the brightest of all."""

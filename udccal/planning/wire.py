@@ -43,54 +43,55 @@ class WirePredictor:
         shape, size = (camera.rows, camera.columns), camera.rows * camera.columns
         pixels = sample_pixels(np.ones(shape), state.geometry, _PIXELS, camera.cfa)
         parameters, x = _expected(state, pixels)
-        self._problem = WireProblem(
-            "wire, planned", parameters, pixels, parameters.prior(wire_start(state.rig), _RULES)
-        )
+        prior = parameters.prior(wire_start(state.rig), _RULES)
+        self._problem = WireProblem("wire, planned", parameters, pixels, prior)
         self._x = mean_one(parameters, x, state.geometry, shape)
         self._jacobian = map_jacobian(parameters, self._x, state.geometry, shape)
         self._value = expected_of(parameters.wire(self._x), np.ones(parameters.sites), pixels)
-        y, x_px = np.divmod(np.maximum(pixels.place, 0), camera.columns)
-        self._signal_e = state.full_well_e * EvenField(state).signal(np.stack([x_px, y], axis=1).astype(float))
+        places = np.stack(np.divmod(np.maximum(pixels.place, 0), camera.columns)[::-1], axis=1)
+        self._signal_e = state.full_well_e * EvenField(state).signal(places.astype(float))
         # Each sampled pixel represents this many of the sensor's pixels, and of those that the fit uses.
         self._every = size / pixels.used
         self._spent = self._every / odd_step(size, _RULES.samples)
 
     def sigma(self, captures: Captures) -> float:
         """Root mean square over the sensor; see ``Predictor``."""
-        return self._map_sigma(self._noise_variance(captures), self._spent, self._state.model_errors.wire)
+        return self._map_sigma(self._noise(captures), self._spent, self._state.model_errors.wire)
 
     def used(self, captures: Captures) -> float:
         """Less than 1 where the sensor has more pixels than the fit uses; see ``Predictor``."""
-        noise = self._noise_variance(captures)
+        noise = self._noise(captures)
         return min((self._map_sigma(noise, self._every) / self._map_sigma(noise, self._spent)) ** 2, 1.0)
 
     def floor(self) -> Floor:
         """The sigma that PRNU and the model error leave."""
-        more = "a fit to more of the sensor's pixels (FitEffort's wire_samples)"
+        fewer = self._spent < 0.9 * self._every
+        more = "a fit to more of the sensor's pixels (FitEffort's wire_samples)" if fewer else "more pixels"
         return Floor(
-            self._map_sigma(np.zeros(len(self._value)), self._spent, self._state.model_errors.wire),
+            self._map_sigma(np.zeros(1), self._spent, self._state.model_errors.wire),
             f"Pixels differ in their response by {100 * self._state.noise.PRNU1288:.2g} % (PRNU), and that does not "
-            f"average over frames: {more if self._spent < 0.9 * self._every else 'more pixels'} would lower it.",
+            f"average over frames: {more} would lower it.",
         )
 
-    def _noise_variance(self, captures: Captures) -> Float[np.ndarray, " n"] | None:
+    def _noise(self, captures: Captures) -> Float[np.ndarray, " n"] | None:
         """Variance of flat minus dark by noise over the signal squared, pixel by pixel; None without flats or darks."""
         state, steps = self._state, self._state.with_captures(captures).steps("wire")
         flat, dark = (next((s for s in steps if isinstance(s.arrangement, kind)), None) for kind in (FlatLight, Dark))
         if flat is None or dark is None:
             return None
         signal = np.maximum(flat.level * self._signal_e, 1e-3)
-        variance = state.variance_e(signal, flat.exposures_s[0]) / len(flat.exposures_s)
-        return (variance + state.variance_e(np.zeros(1), dark.exposures_s[0]) / len(dark.exposures_s)) / signal**2
+        lights = (flat, signal), (dark, np.zeros(1))
+        variances = (state.variance_e(light, step.exposures_s[0]) / len(step.exposures_s) for step, light in lights)
+        return sum(variances) / signal**2
 
     @in_float64
-    def _map_sigma(self, noise: Float[np.ndarray, " n"] | None, count: float, model: float = 0.0) -> float:
+    def _map_sigma(self, noise: Float[np.ndarray, " some"] | None, count: float, model: float = 0.0) -> float:
         """Sigma in per cent where each pixel represents ``count`` of them; ``model`` is the model error."""
         if noise is None:
             return math.inf
         problem, relative = self._problem, noise + self._state.noise.PRNU1288**2
         weight = np.where(problem.pixels.place >= 0, count / np.maximum(relative * self._value**2, 1e-12), 0.0)
-        information, _, _ = replace(problem, pixels=replace(problem.pixels, weight=weight)).sums(self._x)
+        information = replace(problem, pixels=replace(problem.pixels, weight=weight)).sums(self._x)[0]
         return 100.0 * self._jacobian.sigma(scaled_inverse(information + problem.prior.precision), model)
 
 
@@ -107,16 +108,11 @@ def _expected(state: RigState, pixels: Pixels) -> tuple[Parameters, Float[np.nda
     parameters = parameters_of(built, _RULES, gains.size, possible.bounds[:_HARMONICS])
     keep = parameters.groups < 0
     if state.wire is not None and len(state.wire.harmonics):
-        baseline, fields = _over(built.baseline, state.wire.baseline), _over(built.fields, state.wire.fields)
-        measured = replace(built, baseline=baseline, fields=fields)
-        keep |= parameters.vector(measured, gains) != parameters.vector(built, gains)
+        baseline, fields = built.baseline.copy(), built.fields.copy()
+        for made, measured in ((baseline, state.wire.baseline), (fields, state.wire.fields)):
+            both = tuple(slice(size) for size in np.minimum(made.shape, np.shape(measured)))
+            made[both] = measured[both]
+        corrected = replace(built, baseline=baseline, fields=fields)
+        keep |= parameters.vector(corrected, gains) != parameters.vector(built, gains)
     kept = parameters.kept(keep)
     return kept, kept.vector(built, gains)
-
-
-def _over(values: Float[np.ndarray, "..."], others: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
-    """Values, replaced by the others as far as these reach."""
-    both = tuple(slice(size) for size in np.minimum(values.shape, others.shape))
-    made = values.copy()
-    made[both] = others[both]
-    return made
