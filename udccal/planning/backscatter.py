@@ -64,9 +64,8 @@ class BackscatterPredictor:
         self._every = grid[0] * grid[1] / len(flat)
         # Factors from a sample's variance, and from that of a row's offset, to the variance of a bin's average.
         bins, one = Bins(rig.camera.cfa, step_px), np.ones((rig.camera.rows, rig.camera.columns))
-        self._by_sample, self._by_row = (
-            variance.reshape(3, -1)[:, flat] for variance in (bins.variance(one), bins.row_variance(one))
-        )
+        by_bin = bins.variance(one), bins.row_variance(one)
+        self._by_sample, self._by_row = (factor.reshape(3, -1)[:, flat] for factor in by_bin)
 
     def sigma(self, captures: Captures) -> float:
         """Root mean square over sensor, colours and pictures, relative to the pictures' peaks; see ``Predictor``."""
@@ -108,24 +107,22 @@ class BackscatterPredictor:
         shown, darks = ([step for step in steps if isinstance(step.arrangement, kind)] for kind in (PanelPicture, Dark))
         if len(shown) - 1 < _RULES.fewest_pictures or not darks:
             return None
-        (shot, rest), (_, dark) = self._of_step(shown[0]), self._of_step(darks[0])
-        return self._binned(shot, rest, dark), len(shown) - 1
+        full_e = shown[0].level * self._state.full_well_e * self._shading
+        rest, in_dark = (self._in_dark_e2(step) / full_e**2 for step in (shown[0], darks[0]))
+        return self._binned(self._by_sample / (full_e * len(shown[0].exposures_s)), rest, in_dark), len(shown) - 1
+
+    def _in_dark_e2(self, step: PlannedStep) -> PerBin:
+        """Variance of a bin's average without light."""
+        noise, sample_e2 = self._state.noise, float(self._state.variance_e(np.zeros(1), step.exposures_s[0])[0])
+        row_e2 = (noise.sigma_row_DN / noise.K_DN_per_e) ** 2
+        whole_e2 = max(sample_e2 - row_e2, 0.0) * self._by_sample + row_e2 * self._by_row
+        return np.asarray(whole_e2 / len(step.exposures_s))
 
     def _binned(self, shot: PerBin, rest: PerBin, dark: PerBin) -> Binned:
         """Shots with these variances, in units of the brightest light of a shaded white picture."""
-        light = self._mask * self._ratio
-        by_shot = np.broadcast_to(rest, light.shape).copy()
-        by_shot[-1] = dark
-        one = np.ones(len(light))
-        return Binned(light, np.broadcast_to(shot, light.shape), by_shot, np.zeros(light.shape, dtype=bool), one, one)
-
-    def _of_step(self, step: PlannedStep) -> tuple[PerBin, PerBin]:
-        """Variance of a bin per unit of its light, and in the dark."""
-        noise, full_e = self._state.noise, step.level * self._state.full_well_e * self._shading
-        row = (noise.sigma_row_DN / noise.K_DN_per_e) ** 2
-        rest = max(float(self._state.variance_e(np.zeros(1), step.exposures_s[0])[0]) - row, 0.0)
-        frames = len(step.exposures_s)
-        return self._by_sample / (full_e * frames), (rest * self._by_sample + row * self._by_row) / (full_e**2 * frames)
+        light, one = self._mask * self._ratio, np.ones(len(self._ratio))
+        whole = np.stack([*[rest] * (len(light) - 1), dark])
+        return Binned(light, np.broadcast_to(shot, light.shape), whole, np.zeros(light.shape, dtype=bool), one, one)
 
 
 def _pictures(state: RigState) -> Pictures:

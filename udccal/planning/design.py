@@ -190,12 +190,9 @@ def cheapest(objective: Objective, captures: Captures, target: float) -> Capture
 
 def _pruned(objective: Objective, design: Captures, target: float) -> Captures:
     """Lower every variable as far as the target allows, beginning with the one that saves most time."""
-    while True:
-        lower = [_lowered(objective, design, target, variable) for variable in DESIGN_VARIABLES[objective.term]]
-        best = min([design, *lower], key=lambda one: objective.cost(one).seconds)
-        if best == design:
-            return design
-        design = best
+    lower = [_lowered(objective, design, target, variable) for variable in DESIGN_VARIABLES[objective.term]]
+    best = min([design, *lower], key=lambda one: objective.cost(one).seconds)
+    return design if best == design else _pruned(objective, best, target)
 
 
 def _lowered(objective: Objective, design: Captures, target: float, variable: DesignVariable) -> Captures:

@@ -24,7 +24,6 @@ from udccal.fitting.engine.gaussian import Posterior, Prior, scaled_inverse
 from udccal.fitting.engine.orders import bic
 from udccal.fitting.geometry.bundle import (
     EVERY,
-    LENS,
     ORDERS,
     Bundle,
     BundleProblem,
@@ -34,7 +33,7 @@ from udccal.fitting.geometry.bundle import (
     projected,
 )
 from udccal.fitting.geometry.corners import board_points_mm, charuco_board
-from udccal.fitting.geometry.data import rig_prior
+from udccal.fitting.geometry.data import gather, rig_prior
 from udccal.fitting.geometry.fit import term_at, with_angles
 from udccal.models.geometry import panel_directions, project_directions
 from udccal.numerics import in_float64
@@ -138,24 +137,16 @@ class BoardViews:
 
 
 def points_of(views: Sequence[BoardView]) -> Points:
-    """Return the corners of views, one after another."""
-    sizes = [len(view.sigma) for view in views]
-    return Points(
-        board=np.concatenate([view.board for view in views]),
-        image=np.concatenate([view.image for view in views]),
-        sigma=np.concatenate([view.sigma for view in views]),
-        view=np.repeat(np.arange(len(views)), sizes),
-        index=np.concatenate([np.arange(size) for size in sizes]),
-        used=np.ones(sum(sizes), dtype=bool),
-        names=tuple(range(len(views))),
-    )
+    """Return the corners of those views that hold a pose, as a fit gathers them."""
+    return gather([v.board for v in views], [v.image for v in views], [v.sigma for v in views]).points
 
 
 def lens_information(view: BoardView | None, intrinsics: Float[np.ndarray, "9"]) -> Float[np.ndarray, "9 9"]:
-    """Return the Fisher information of one view on the intrinsics, whatever its own pose; none without a view."""
-    if view is None:
-        return np.zeros((LENS, LENS))
-    problem = BundleProblem(points_of([view]), EVERY, Prior(np.zeros(LENS), np.zeros((0, LENS))))
+    """Return the Fisher information of one view on the intrinsics, whatever its own pose; none without a pose."""
+    size = len(intrinsics)
+    if view is None or not (points := points_of([view])).names:
+        return np.zeros((size, size))
+    problem = BundleProblem(points, EVERY, Prior(np.zeros(size), np.zeros((0, size))))
     return problem.equations_at(Bundle(intrinsics, view.pose[None])).marginal()[0]
 
 
@@ -200,12 +191,13 @@ class GeometryPredictor:
     def _ray_sigma(self, captures: Captures, count: float) -> float:
         """Sigma in px of rays, by axis, where each view held by hand counts ``count`` times."""
         steps = self._state.with_captures(captures).steps("geometry")
-        planned = [self._view_of(step, step.arrangement) for step in steps if isinstance(step.arrangement, Board)]
-        views = [view for view in planned if view is not None]
+        planned = (self._view_of(step, step.arrangement) for step in steps if isinstance(step.arrangement, Board))
+        points = points_of(shown := [view for view in planned if view is not None])
+        views = [shown[k] for k in points.names]
         parallel = [k for k, view in enumerate(views) if view.parallel]
         if not parallel:
             return math.inf
-        points = points_of(views).scaled(np.array([1.0 if view.parallel else count**-0.5 for view in views]))
+        points = points.scaled(np.array([1.0 if view.parallel else count**-0.5 for view in views]))
         bundle = Bundle(self._intrinsics, np.array([view.pose for view in views]))
         problem = BundleProblem(points, self._order(points, bundle), self._prior)
         x, cov = with_angles(bundle.intrinsics, bundle.poses, problem.equations_at(bundle).joint_cov(), parallel)

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 import re
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Final, final, get_args
+from typing import Final, final
 
 from udccal.errors import UdccalError
 from udccal.planning.design import DESIGN_VARIABLES, QUANTITIES, Objective, Setting, Suggestion, cheapest, worthwhile
@@ -92,11 +93,10 @@ def parse_targets(words: Sequence[str]) -> tuple[Target, ...]:
         UdccalError: when a word is no target, names no term or a wrong unit, or a term has two targets.
     """
     targets = [_target(word) for word in words]
-    terms = [target.term for target in targets]
-    for term in terms:
-        if terms.count(term) > 1:
-            raise UdccalError(f"Expected one target for {term}, found {terms.count(term)}. Keep one of them.")
-    return tuple(sorted(targets, key=lambda target: get_args(TermName).index(target.term)))
+    for term, many in Counter(target.term for target in targets).items():
+        if many > 1:
+            raise UdccalError(f"Expected one target for {term}, found {many}. Keep one of them.")
+    return tuple(sorted(targets, key=lambda target: list(QUANTITIES).index(target.term)))
 
 
 def _target(word: str) -> Target:
@@ -106,8 +106,7 @@ def _target(word: str) -> Target:
     term = next((name for name in QUANTITIES if name == match["term"]), None)
     if term is None:
         raise UdccalError(f"Expected a target for {', '.join(QUANTITIES)}, found one for '{match['term']}'. {_EXAMPLE}")
-    unit = QUANTITIES[term].unit
-    if match["unit"] != unit:
+    if match["unit"] != (unit := QUANTITIES[term].unit):
         found = f"'{match['unit']}'" if match["unit"] else "none"
         raise UdccalError(f"Expected the target of {term} in {unit}, found the unit {found} in '{word}'. {_EXAMPLE}")
     return Target(term, float(match["value"]))

@@ -11,7 +11,6 @@ import numpy as np
 from jaxtyping import Float
 from scipy.interpolate import RegularGridInterpolator
 
-from udccal.arrangements import Arrangement, PanelPicture
 from udccal.cfa import cfa_named
 from udccal.fitting.geometry.fit import BY_HAND, ON_JIG
 from udccal.fitting.nominal import nominal_geometry
@@ -20,7 +19,7 @@ from udccal.models.geometry import Geometry
 from udccal.models.noise import Noise, variance_e
 from udccal.models.wire import Wire, wire_values
 from udccal.numerics import in_float64
-from udccal.planning.steps import Cost, PlannedStep, cost_of, nominal_full_s, steps_at, with_small_panel
+from udccal.planning.steps import Cost, PlannedStep, cost_of, steps_at, with_small_panel
 from udccal.result import FitResult, FitStatus, TermResults
 from udccal.rig import Captures, RigDescription
 from udccal.sessions.schema import TermName
@@ -86,12 +85,9 @@ class RigState:
 
         For counting, pictures on the panel need not be ``drawn``: they are tiny then.
         """
-
-        def full_s(arrangement: Arrangement) -> float:
-            white = self.white if isinstance(arrangement, PanelPicture) else None
-            return nominal_full_s(arrangement, self.rig) if white is None else self.full_well_e / float(white.max())
-
-        return list(steps_at(term, self.rig if drawn else with_small_panel(self.rig), full_s))
+        rig = self.rig if drawn else with_small_panel(self.rig)
+        measured_s = () if self.white is None else (self.full_well_e / float(self.white.max()),)
+        return list(steps_at(term, rig, *measured_s))
 
     def cost(self, term: TermName) -> Cost:
         """Frames, seconds and set-ups of a term's procedure; it raises the errors of ``steps_at``."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from typing import Any, final
@@ -13,8 +13,8 @@ from udccal.plugins import find_procedure
 from udccal.rig import RigDescription
 from udccal.sessions.schema import TermName
 
-# Exposures that fill the wells. Flats and boards are lit so that they fill them within a frame.
-_LED_FULL_S, _PANEL_FULL_S = 125e-6, 0.1
+# Exposure at which an LED usually fills the well of its brightest sample.
+_LED_FULL_S = 125e-6
 # The time of a capture does not depend on the panel's picture: pictures are drawn this small for counting.
 _COUNTING_PX = 8
 
@@ -55,25 +55,26 @@ class Cost:
         return Cost(self.frames - other.frames, self.seconds - other.seconds, self.set_ups - other.set_ups)
 
 
-def steps_at(term: TermName, rig: RigDescription, full_s: Callable[[Arrangement], float]) -> Iterator[PlannedStep]:
+def steps_at(term: TermName, rig: RigDescription, panel_full_s: float = 0.1) -> Iterator[PlannedStep]:
     """The steps of a term's procedure, one at a time, at the expected exposures.
 
     Args:
         term: of the procedure.
         rig: with the captures that are wanted.
-        full_s: exposure in seconds at which the brightest sample of an arrangement fills its well.
+        panel_full_s: exposure in seconds at which the brightest sample of a white picture on the panel fills its well.
 
     Raises:
         UdccalError: when no procedure is installed, or a step of it does not state its frames and exposure.
     """
     steps: Any = find_procedure(term)().steps(rig)
     shortest_s, longest_s = rig.camera.min_exposure_s, rig.camera.max_exposure_s
-    earlier: dict[str, Any] = {}
+    full_s, earlier = {Led: _LED_FULL_S, PanelPicture: panel_full_s}, dict[str, Any]()
     for step in steps:
         try:
-            # Nothing is metered where the exposure has no target.
-            metered_s = getattr(step.exposure, "target", 0.0) * full_s(step.arrangement)
-            at = step.exposure.planned(min(max(metered_s, shortest_s), longest_s), earlier)
+            # Nothing is metered where the exposure has no target. Flats and boards fill the wells within a frame.
+            well_s = full_s.get(type(step.arrangement), 1.0 / rig.camera.frame_rate_hz)
+            metered_s = min(max(getattr(step.exposure, "target", 0.0) * well_s, shortest_s), longest_s)
+            at = step.exposure.planned(metered_s, earlier)
             exposures_s = step.plan.exposures_s(min(max(at.exposure_s, shortest_s), longest_s), longest_s)
         except (AttributeError, KeyError) as error:
             raise UdccalError(
@@ -82,13 +83,6 @@ def steps_at(term: TermName, rig: RigDescription, full_s: Callable[[Arrangement]
             ) from error
         earlier[step.id] = at
         yield PlannedStep(step.id, step.arrangement, step.instruction, exposures_s, at.level or 0.0, at.test_frames)
-
-
-def nominal_full_s(arrangement: Arrangement, rig: RigDescription) -> float:
-    """Return the exposure in seconds that usually fills the well of an arrangement's brightest sample."""
-    if isinstance(arrangement, Led):
-        return _LED_FULL_S
-    return _PANEL_FULL_S if isinstance(arrangement, PanelPicture) else 1.0 / rig.camera.frame_rate_hz
 
 
 def with_small_panel(rig: RigDescription) -> RigDescription:
