@@ -19,7 +19,7 @@ from udccal.models.geometry import Geometry
 from udccal.models.noise import Noise, variance_e
 from udccal.models.wire import Wire, wire_values
 from udccal.numerics import in_float64
-from udccal.planning.steps import Cost, PlannedStep, cost_of, steps_at, with_small_panel
+from udccal.planning.steps import PANEL_FULL_S, Cost, PlannedStep, cost_of, steps_at, with_small_panel
 from udccal.result import FitResult, FitStatus, TermResults
 from udccal.rig import Captures, RigDescription
 from udccal.sessions.schema import TermName
@@ -85,9 +85,9 @@ class RigState:
 
         For counting, pictures on the panel need not be ``drawn``: they are tiny then.
         """
-        rig = self.rig if drawn else with_small_panel(self.rig)
-        measured_s = () if self.white is None else (self.full_well_e / float(self.white.max()),)
-        return list(steps_at(term, rig, *measured_s))
+        rig, white = self.rig if drawn else with_small_panel(self.rig), self.white
+        panel_full_s = PANEL_FULL_S if white is None else self.full_well_e / float(white.max())
+        return list(steps_at(term, rig, panel_full_s))
 
     def cost(self, term: TermName) -> Cost:
         """Frames, seconds and set-ups of a term's procedure; it raises the errors of ``steps_at``."""

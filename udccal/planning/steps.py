@@ -13,8 +13,8 @@ from udccal.plugins import find_procedure
 from udccal.rig import RigDescription
 from udccal.sessions.schema import TermName
 
-# Exposure at which an LED usually fills the well of its brightest sample.
-_LED_FULL_S = 125e-6
+# Exposures at which an LED and the panel usually fill the well of their brightest sample.
+_LED_FULL_S, PANEL_FULL_S = 125e-6, 0.1
 # The time of a capture does not depend on the panel's picture: pictures are drawn this small for counting.
 _COUNTING_PX = 8
 
@@ -55,7 +55,7 @@ class Cost:
         return Cost(self.frames - other.frames, self.seconds - other.seconds, self.set_ups - other.set_ups)
 
 
-def steps_at(term: TermName, rig: RigDescription, panel_full_s: float = 0.1) -> Iterator[PlannedStep]:
+def steps_at(term: TermName, rig: RigDescription, panel_full_s: float = PANEL_FULL_S) -> Iterator[PlannedStep]:
     """The steps of a term's procedure, one at a time, at the expected exposures.
 
     Args:
