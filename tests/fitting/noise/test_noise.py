@@ -73,7 +73,7 @@ def average(sensor: Sensor, light: np.ndarray, exposure_s: float, region: Region
 @pytest.fixture(scope="module", params=["lg55-aca2040", "mk31-imx1600"])
 def fitted(request: pytest.FixtureRequest) -> tuple[Sensor, FitResult[Noise]]:
     rig, sensor = toy(request.param, seed=3)
-    return sensor, fit_moments(reduced(sensor, np.linspace(0.02, 1.6, 14), 5), nominal_noise(rig), RULES)
+    return sensor, fit_moments(reduced(sensor, np.linspace(0.02, 1.6, 14), 5), nominal_noise(rig))
 
 
 def test_recovers_what_the_rig_needs(fitted: tuple[Sensor, FitResult[Noise]]) -> None:
@@ -118,27 +118,27 @@ def test_hot_pixels_are_listed(fitted: tuple[Sensor, FitResult[Noise]]) -> None:
 
 def test_no_light_is_too_dark() -> None:
     rig, sensor = toy("lg55-aca2040", 1)
-    result = fit_moments(reduced(sensor, np.full(6, 1e-5), 1), nominal_noise(rig), RULES)
+    result = fit_moments(reduced(sensor, np.full(6, 1e-5), 1), nominal_noise(rig))
     assert result.status is FitStatus.TOO_DARK
     assert result.term.K_DN_per_e == rig.camera.K_DN_per_e.value
 
 
 def test_clipped_flats_are_saturated() -> None:
     rig, sensor = toy("lg55-aca2040", 1)
-    result = fit_moments(reduced(sensor, np.linspace(3.0, 4.0, 6), 1), nominal_noise(rig), RULES)
+    result = fit_moments(reduced(sensor, np.linspace(3.0, 4.0, 6), 1), nominal_noise(rig))
     assert result.status is FitStatus.SATURATED
 
 
 def test_a_clipped_stack_is_saturated() -> None:
     rig, sensor = toy("lg55-aca2040", 1)
-    result = fit_moments(reduced(sensor, np.linspace(0.05, 1.6, 10), 1, stack_level=3.0), nominal_noise(rig), RULES)
+    result = fit_moments(reduced(sensor, np.linspace(0.05, 1.6, 10), 1, stack_level=3.0), nominal_noise(rig))
     assert result.status is FitStatus.SATURATED
     assert "flat stack" in result.notes[0]
 
 
 def test_two_levels_are_too_few() -> None:
     rig, sensor = toy("lg55-aca2040", 1)
-    result = fit_moments(reduced(sensor, np.array([0.2, 0.4]), 1), nominal_noise(rig), RULES)
+    result = fit_moments(reduced(sensor, np.array([0.2, 0.4]), 1), nominal_noise(rig))
     assert result.status is FitStatus.TOO_FEW_DATA
 
 
@@ -147,7 +147,7 @@ def test_a_lamp_of_changing_pattern_is_a_poor_fit() -> None:
     rig, sensor = toy("lg55-aca2040", 1)
     data = reduced(sensor, np.linspace(0.05, 0.6, 8), 1)
     bent = tuple(replace(flat, variance_DN2=flat.variance_DN2 * (1 + flat.mean_DN / 1000)) for flat in data.flats)
-    assert fit_moments(replace(data, flats=bent), nominal_noise(rig), RULES).status is FitStatus.POOR_FIT
+    assert fit_moments(replace(data, flats=bent), nominal_noise(rig)).status is FitStatus.POOR_FIT
 
 
 def test_pairs_of_one_frame_twice_are_a_poor_fit() -> None:
@@ -158,7 +158,7 @@ def test_pairs_of_one_frame_twice_are_a_poor_fit() -> None:
     for t in 0.02 * np.linspace(0.05, 0.6, 8):
         frame = sensor.expose(light, float(t), Region(0, 0, COLUMNS, ROWS), np.random.default_rng(0))
         twice.append(reduce_pair(frame, frame, float(t)))
-    result = fit_moments(replace(data, flats=tuple(twice)), nominal_noise(rig), RULES)
+    result = fit_moments(replace(data, flats=tuple(twice)), nominal_noise(rig))
     assert result.status is FitStatus.POOR_FIT
     assert "copies of each other" in result.notes[0]
 
@@ -249,8 +249,8 @@ def test_a_flat_that_lies_off_the_curve_is_left_out_of_it() -> None:
     data = reduced(sensor, np.linspace(0.05, 1.6, 10), 4)
     flats = list(data.flats)
     flats[3] = replace(flats[3], variance_DN2=flats[3].variance_DN2 * np.where(np.arange(16) == 5, 1.5, 1.0))
-    result = fit_moments(replace(data, flats=tuple(flats)), nominal_noise(rig), RULES)
-    clean = fit_moments(data, nominal_noise(rig), RULES)
+    result = fit_moments(replace(data, flats=tuple(flats)), nominal_noise(rig))
+    clean = fit_moments(data, nominal_noise(rig))
     assert any(one.rule.startswith("bins of flats off") and one.count == 1 for one in result.outliers)
     K = clean.estimate("K_DN_per_e")
     assert result.estimate("K_DN_per_e").value == pytest.approx(K.value, abs=0.5 * K.sigma)

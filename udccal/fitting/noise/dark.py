@@ -206,6 +206,7 @@ class DarkTerms:
     """
 
     K_DN_per_e: float
+    curvature: float
     black_DN: float
     dark_DN_per_s: Quantity
     levels_cov: Float[np.ndarray, "2 2"]
@@ -220,12 +221,13 @@ class DarkTerms:
 
 
 def fit_dark_terms(
-    data: NoiseMoments, K_DN_per_e: float, rules: NoiseRules, start: Five | None = None, curvature: float = 0.0
+    data: NoiseMoments, K_DN_per_e: float, start: Five | None = None, curvature: float = 0.0
 ) -> DarkTerms:
     """Fit all dark quantities; only the dark current's shot noise depends on ``K_DN_per_e``.
 
     ``curvature`` is the response's in 1/DN: dark signal bends as light does.
     """
+    rules = data.rules
     row, in_pairs = row_noise(data, np.ones(len(data.darks)))
     fit = fit_dark(data.darks, K_DN_per_e, in_pairs, rules, start)
     if not fit.follows:
@@ -273,7 +275,9 @@ def fit_dark_terms(
         offsets = replace(offsets, variance=spread2, sigma=sigma, samples=pixels, mean_variance=spread2 / pixels)
     black, levels_cov, current = _levels(data, fit, in_pairs**2, single, offsets, curvature)
     DSNU2 = Quantity.asked("DSNU", offsets.variance, offsets.sigma**2, offsets.samples)
-    return DarkTerms(K_DN_per_e, black, current, levels_cov, read_DN2, shape, row, DSNU2, white, foreign, fit, offsets)
+    return DarkTerms(
+        K_DN_per_e, curvature, black, current, levels_cov, read_DN2, shape, row, DSNU2, white, foreign, fit, offsets
+    )
 
 
 def _coded_variances(pairs: tuple[DarkPair, ...], fit: DarkFit, K_DN_per_e: float, row_DN: float) -> list[float]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import final
 
 import cv2
@@ -249,7 +249,7 @@ class NoiseMoments:
     ``dark_moments`` are those of the pairs in ``darks``; both stacks have about the same exposure; colour sites repeat
     after ``period`` samples (1: monochrome). ``dark_seen`` and ``flat_seen`` are moments of the stacks' frames. They
     are None for an average that was made elsewhere, whose variance would include the lamp's flicker, and for frames of
-    a pair, which must not count twice.
+    a pair, which must not count twice. ``rules`` are those of the whole fit.
     """
 
     darks: tuple[DarkPair, ...]
@@ -262,6 +262,7 @@ class NoiseMoments:
     period: int = 2
     dark_seen: Moments | None = None
     flat_seen: Moments | None = None
+    rules: NoiseRules = field(default_factory=NoiseRules)
 
     @property
     def dark_samples(self) -> int:
@@ -307,4 +308,4 @@ def reduced(data: NoiseData, rules: NoiseRules) -> NoiseMoments | None:
         stacks = [(moments(near.dark, near.exposure_s)[0], None), (moments(middle.bright, middle.exposure_s)[0], None)]
     (dark_stack, dark_seen), (flat_stack, flat_seen) = stacks
     pairs = histograms, dark_moments, flats
-    return NoiseMoments(*pairs, dark_stack, flat_stack, q_DN, float(top), period, dark_seen, flat_seen)
+    return NoiseMoments(*pairs, dark_stack, flat_stack, q_DN, float(top), period, dark_seen, flat_seen, rules)
