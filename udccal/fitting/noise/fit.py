@@ -11,7 +11,8 @@ from jaxtyping import Float
 from udccal.fitting.engine.gaussian import Posterior
 from udccal.fitting.engine.orders import Quantity
 from udccal.fitting.engine.report import estimates, residual_sample
-from udccal.fitting.noise.dark import DarkTerms, fit_dark_terms, start_values
+from udccal.fitting.noise.codes import start_values
+from udccal.fitting.noise.dark import DarkTerms, fit_dark_terms
 from udccal.fitting.noise.data import NoiseData, NoiseRules
 from udccal.fitting.noise.flats import Curve, find_saturation, fit_curve, rough_gain, stacked
 from udccal.fitting.noise.moments import NoiseMoments, bins, reduced

@@ -11,9 +11,9 @@ from scipy.special import ndtri
 
 from udccal.fitting.engine.orders import Choice
 from udccal.fitting.engine.robust import OutlierRule, robust_sigma
+from udccal.fitting.noise.codes import excess_kurtosis
 from udccal.fitting.noise.dark import DarkTerms
 from udccal.fitting.noise.moments import Moments, NoiseMoments
-from udccal.fitting.noise.read_noise import excess_kurtosis
 from udccal.fitting.noise.transfer import DarkVariance, Five, Levels, TransferFit, robust_transfer
 
 Bins = Bool[np.ndarray, "flats bins"]

@@ -14,9 +14,10 @@ from typing import final
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Float32, Int
+from jaxtyping import Float, Float32
 
 from udccal.errors import FitError
+from udccal.fitting.noise.codes import DarkPair, dark_pair
 from udccal.fitting.noise.data import Averaged, Codes, ExposureLevel, Frame, NoiseData, NoiseRules, SpatialStack, loaded
 
 Grid = Float[np.ndarray, "groups_y groups_x"]
@@ -155,50 +156,6 @@ def _temporal(
     variance = (mixed * (1 - 1 / columns) - average / columns) / (1 - 2 / columns)
     observed = float(np.sum((rows - rows.mean(axis=1, keepdims=True)) ** 2)) / ((frames - 1) * max(height - 1, 1))
     return variance, dof, down @ about / counts, observed, float(np.average(variance, weights=counts)) / columns
-
-
-@final
-@dataclass(frozen=True)
-class DarkPair:
-    """A pair of dark frames reduced to the joint histogram of the two codes of each pixel, in groups of ``step_DN``.
-
-    The outermost edges are infinite where the codes stop there (at 0, or at the converter's end).
-    """
-
-    exposure_s: float
-    edges_DN: Float[np.ndarray, " codes_plus_1"]
-    step_DN: float
-    counts: Int[np.ndarray, "codes codes"]
-    rows: int
-
-    @property
-    def centres_DN(self) -> Float[np.ndarray, " codes"]:
-        """Middle of each group of codes; that of a cut-off end is extrapolated from its neighbours."""
-        inner = self.edges_DN[1:-1]
-        edges = np.clip(self.edges_DN, inner[0] - self.step_DN, inner[-1] + self.step_DN)
-        return np.asarray(0.5 * (edges[1:] + edges[:-1]))
-
-
-def dark_pair(first: Codes, second: Codes, exposure_s: float, q_DN: int = 1, top_code: int = 65535) -> DarkPair:
-    """Joint histogram over a window of codes around the median; codes beyond it are left out."""
-    low, middle, high = np.percentile(first[:: max(1, first.size // 65536)], [2.0, 50.0, 98.0])
-    # 98th minus 2nd percentile is 4.1 sigma; 1.9 times that each side is about 7.8 sigma.
-    half = int(np.ceil(1.9 * (high - low) / q_DN)) + 4
-    # At most about 160 groups a side: a wide window loses nothing by coarser ones.
-    group = max(1, int(np.ceil((2 * half + 1) / 160)))
-    start = max(round(middle / q_DN) - half, 0)
-    codes = min((round(middle / q_DN) + half - start) // group, (top_code // q_DN - start) // group) + 1
-    # One more group takes all that lies outside the window.
-    side = codes + 1
-    group_of = (np.arange(65536) // q_DN - start) // group
-    group_of = np.where((group_of >= 0) & (group_of < codes), group_of, codes).astype(np.uint16)
-    both = group_of[first] * np.uint16(side) + group_of[second]
-    joint = cv2.calcHist([both], [0], None, [side**2], [0, side**2]).astype(np.int64)
-    counts = joint.reshape(side, side)[:codes, :codes]
-    edges = (start + group * np.arange(codes + 1) - 0.5) * q_DN
-    edges[0] = -np.inf if start == 0 else edges[0]
-    edges[-1] = np.inf if edges[-1] >= top_code else edges[-1]
-    return DarkPair(exposure_s, edges, float(group * q_DN), counts, len(first))
 
 
 def converter_step(frame: Codes) -> int:
