@@ -70,7 +70,7 @@ def fit_dark_terms(
         row = replace(row, variance=row.variance + (0.5 * row.value) ** 2)
     spread2, variance = float(fit.values[3]), float(fit.cov[2, 2])
     read_DN2 = Quantity(float(fit.values[2]), variance)
-    rate, rounding, stack = max(float(fit.values[1]), 0.0), data.q_DN**2 / 12.0, data.dark_stack
+    rate, rounding, stack = max(float(fit.values[1]), 0.0), data.rounding_DN2, data.dark_stack
     if white:
         expected = [read_DN2.value + rounding + K_DN_per_e * rate * pair.exposure_s for pair in data.darks]
     else:
@@ -114,7 +114,7 @@ def _levels(
 ) -> tuple[float, Float[np.ndarray, "2 2"], Quantity]:
     """Black and dark current from the mean of every dark exposure, with its own weight."""
     means, variances, times = fit.means_DN, fit.variances_DN2, np.array([pair.exposure_s for pair in data.darks])
-    stack, rounding = data.dark_stack, data.q_DN**2 / 12.0
+    stack, rounding = data.dark_stack, data.rounding_DN2
     if fit.follows:
         means, times = np.append(means, offsets.mean), np.append(times, stack.exposure_s)
         rows = row_DN2 / len(stack.mean_DN)

@@ -115,7 +115,7 @@ def _no_gain(data: NoiseMoments, dark: DarkTerms, curve: Curve) -> tuple[FitStat
     full_DN, K = curve.ceiling_DN - dark.black_DN, float(curve.values[0])
     above, levels, least = stacked(data.flats, "mean_DN") - dark.black_DN, curve.levels, data.rules.levels
     lit = stacked(data.flats, "variance_DN2")[(above > 0) & (above < 0.9 * full_DN)]
-    if lit.size and float(np.median(lit)) < 0.3 * (dark.read_DN2.value + data.q_DN**2 / 12.0):
+    if lit.size and float(np.median(lit)) < 0.3 * (dark.read_DN2.value + data.rounding_DN2):
         return FitStatus.POOR_FIT, (
             f"Expected the variance of flats to grow with their mean, found a slope of {K:.3g} DN per electron: the "
             "two frames of a pair may be copies of each other."
@@ -143,7 +143,7 @@ def _photo_response(data: NoiseMoments, dark: DarkTerms, curve: Curve) -> Patter
     """PRNU from the stacks; the photon transfer curve gives the temporal variance of the averages."""
     K, V0, c = curve.values[:3].tolist()
     bright, stack, rate = data.flat_stack, data.dark_stack, dark.dark_DN_per_s.value
-    quiet = max(V0, 0.0) + data.q_DN**2 / 12.0
+    quiet = max(V0, 0.0) + data.rounding_DN2
     at_no_light = (quiet + K * rate * bright.exposure_s) / bright.frames
     if dark.white:
         signal = bright.mean_DN.astype(np.float32) - stack.mean_DN.astype(np.float32)

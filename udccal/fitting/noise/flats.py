@@ -120,7 +120,7 @@ def _inside(data: NoiseMoments, dark: DarkTerms, up_to_DN: float, ceiling_DN: fl
 
 def _dark_variance(data: NoiseMoments, dark: DarkTerms) -> DarkVariance:
     """V0 from the histograms, and from the temporal variance of the dark stack where its frames were seen."""
-    rounding, K, rate, read = data.q_DN**2 / 12.0, dark.K_DN_per_e, dark.dark_DN_per_s.value, dark.read_DN2
+    rounding, K, rate, read = data.rounding_DN2, dark.K_DN_per_e, dark.dark_DN_per_s.value, dark.read_DN2
     drift = rate * np.array([pair.exposure_s for pair in data.darks])
     # Dark signal in the pairs as their read noise depends on it: long exposures are noisier and count less.
     total = read.value + dark.row_DN2.value + rounding + K * drift
@@ -156,7 +156,7 @@ def _flickering(data: NoiseMoments, dark: DarkTerms) -> tuple[int, ...]:
 def rough_gain(data: NoiseMoments, black_DN: float, dark_DN2: float) -> float:
     """Conversion gain in DN per electron from moments alone, for the first fit of the dark frames."""
     mean = stacked(data.flats, "mean_DN") - black_DN
-    variance = stacked(data.flats, "variance_DN2") - data.q_DN**2 / 12.0
+    variance = stacked(data.flats, "variance_DN2") - data.rounding_DN2
     lit = mean > max(0.05 * mean.max(), 0.0)
     # Clipping lowers the ratio and nothing raises it.
     return max(float(np.quantile((variance[lit] - dark_DN2) / mean[lit], 0.75)), 1e-6) if lit.any() else 1.0
@@ -176,7 +176,7 @@ def _saturated(data: NoiseMoments, dark: DarkTerms) -> Bins:
     # Below saturation variance over mean is K plus a small positive part; clipping only lowers it.
     slope = variance / np.maximum(mean, 1e-9)
     collapsed: Bins = highest & (slope < 0.3 * float(np.quantile(slope[bright], 0.75)))
-    quiet: Bins = highest & (variance <= 1.3 * (dark.read_DN2.value + data.q_DN**2 / 12.0 + dark.row_DN2.value))
+    quiet: Bins = highest & (variance <= 1.3 * (dark.read_DN2.value + data.rounding_DN2 + dark.row_DN2.value))
     return quiet if not collapsed.any() and quiet[bright].mean() > 0.5 else collapsed
 
 
@@ -209,7 +209,7 @@ def _level(
     flat: Moments, full: Bool[np.ndarray, " bins"], data: NoiseMoments, dark: DarkTerms, V0: float, peak: int
 ) -> tuple[float, float, bool]:
     """Saturation in DN by one flat, its variance, and whether all pixels of a bin are full."""
-    temporal = V0 + data.q_DN**2 / 12.0
+    temporal = V0 + data.rounding_DN2
     excess = flat.variance_DN2 - temporal
     sure = full & (excess < 3.0 * temporal * np.sqrt(2 / flat.dof))
     chosen = sure if sure.any() else full

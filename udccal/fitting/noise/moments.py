@@ -81,35 +81,44 @@ def reduce_frames(
     """Mean per pixel, and temporal moments per bin without common changes of brightness and row noise."""
     source = iter(frames)
     first = next(source)
-    down, right = bins(*first.shape, period)
-    counts, total = np.outer(down.sum(axis=1), right.sum(axis=0)), np.zeros(first.shape, np.float32)
-    outliers, powers = 0, np.zeros(2)
-    # The first frame's difference from itself is zero.
-    by_row, peaks = [np.zeros((len(first), right.shape[1]))], [_peak(first, down, right)]
-    squares = np.zeros_like(by_row[0])
+    (height, columns), (down, right) = first.shape, bins(*first.shape, period)
+    width = right.sum(axis=0, dtype=np.float64)
+    counts, total = np.outer(down.sum(axis=1), width), np.zeros(first.shape, np.float32)
+    outliers, powers, squares = 0, np.zeros(2), np.zeros_like(counts)
+    # Of every frame: its rows' means and its bins' sums less these, as differences from the first frame, and its peak.
+    by_row, by_bin, peaks = [np.zeros(height)], [np.zeros_like(counts)], [_peak(first, down, right)]
     for frame in source:
         difference = cv2.subtract(frame, first, dtype=cv2.CV_32F)
         square = cv2.multiply(difference, difference)
         # The usual difference is the median over some rows, which hits do not move; ten codes are never a hit.
-        usual = np.median(square[:: max(len(first) // 128, 1)] @ right, axis=0) / right.sum(axis=0)
+        usual = np.median(square[:: max(height // 128, 1)] @ right, axis=0) / width
         hits = square > max(rules.hit_sigma**2 * float(usual.max()), 10.0**2)
         if count := int(np.count_nonzero(hits)):
             large = square[hits].astype(np.float64)
             outliers, powers = outliers + count, powers + np.array([large.sum(), np.square(large).sum()])
-            difference[hits] = square[hits] = 0.0
+            difference[hits] = 0.0
+        by_row.append(difference.mean(axis=1, dtype=np.float64))
+        difference -= by_row[-1][:, None]
         total += difference
-        squares += square @ right
-        by_row.append(np.asarray(difference @ right, dtype=np.float64))
+        by_bin.append(down @ (difference @ right))
+        squares += down @ (cv2.multiply(difference, difference) @ right)
         peaks.append(_peak(frame, down, right))
-    number, middle = len(by_row), float(np.median(first[:: max(len(first) // 64, 1)]))
-    peak = max(code for code, _ in peaks)
-    at_peak = sum((count for code, count in peaks if code == peak), start=np.zeros_like(counts))
-    squares -= cv2.multiply(total, total, scale=1.0 / number) @ right
+    number, middle = len(by_row), float(np.median(first[:: max(height // 64, 1)]))
+    rows, left = np.stack(by_row), np.stack(by_bin)
     mean = cv2.addWeighted(first, 1.0, total, 1.0 / number, 0.0, dtype=cv2.CV_32F)
-    variance, dof, shift, rows, sampling = _temporal(down, right, np.stack(by_row), squares)
+    mean += rows.mean(axis=0)[:, None]
+    rows, left = rows - rows.mean(axis=0), left - left.mean(axis=0)
+    dof = np.maximum((number - 1) * (counts * (1 - 1 / columns) - 1), 1.0)
+    squares -= down @ (cv2.multiply(total, total, scale=1.0 / number) @ right) + np.square(left).sum(axis=0) / counts
+    # The rows' means were taken from all of a row: a quiet bin beside noisy ones gains their part of the mean's
+    # variance, v' (1 - 1/n) = v (1 - 2/n) + row average / n.
+    mixed = squares / dof
+    variance = (mixed * (1 - 1 / columns) - (mixed @ width)[:, None] / columns**2) / (1 - 2 / columns)
     about = cv2.subtract(mean, middle)
     level, square = (down @ (of @ right) / counts for of in (about, cv2.multiply(about, about)))
     spatial = np.maximum(square - level**2, 0.0)
+    peak = max(code for code, _ in peaks)
+    at_peak = np.sum([count for code, count in peaks if code == peak], axis=0) / (number * counts)
     return Averaged(exposure_s, mean, number), Moments(
         exposure_s=exposure_s,
         light=exposure_s if light is None else light,
@@ -118,12 +127,12 @@ def reduce_frames(
         dof=dof.ravel(),
         samples=number * counts.ravel(),
         spread_DN=np.sqrt(spatial + np.maximum(variance, 0.0) * (1 - 1 / number)).ravel(),
-        shift_DN=shift.reshape(number, -1),
-        rows_DN2=rows,
-        sampling_DN2=sampling,
-        height=len(first),
+        shift_DN=((left + (rows @ down.T)[..., None] * width) / counts).reshape(number, -1),
+        rows_DN2=float(np.square(rows - rows.mean(axis=1, keepdims=True)).sum()) / ((number - 1) * max(height - 1, 1)),
+        sampling_DN2=float(np.average(variance, weights=counts)) / columns,
+        height=height,
         peak_DN=peak,
-        at_peak=(at_peak / (number * counts)).ravel(),
+        at_peak=at_peak.ravel(),
         outliers=outliers,
         outlier_powers=(float(powers[0]), float(powers[1])),
     )
@@ -133,29 +142,6 @@ def _peak(frame: Codes, down: Float[np.ndarray, "_ _"], right: Float32[np.ndarra
     """The largest code, and the number of samples with it by bin."""
     top = frame.max()
     return int(top), down @ ((frame == top).astype(np.float32) @ right)
-
-
-def _temporal(
-    down: Float[np.ndarray, "groups_y rows"],
-    right: Float32[np.ndarray, "columns groups_x"],
-    by_row: Float[np.ndarray, "frames rows groups_x"],
-    squares: Float[np.ndarray, "rows groups_x"],
-) -> tuple[Grid, Grid, Float[np.ndarray, "frames groups_y groups_x"], float, float]:
-    """Variances of bins, their degrees of freedom, the frames' shifts, the rows' variance and its sampling part."""
-    (frames, height, _), columns, width = by_row.shape, len(right), right.sum(axis=0, dtype=np.float64)
-    counts = np.outer(down.sum(axis=1), width)
-    about = by_row - by_row.mean(axis=0)
-    rows = about.sum(axis=2) / columns
-    within = squares - 2 * np.einsum("kr,krm->rm", rows, about) + np.square(rows).sum(axis=0)[:, None] * width
-    left = down @ (about - rows[:, :, None] * width)
-    dof = np.maximum((frames - 1) * (counts * (1 - 1 / columns) - 1), 1.0)
-    mixed = (down @ within - np.square(left).sum(axis=0) / counts) / dof
-    # The rows' means were taken from all of a row: a quiet bin beside noisy ones gains their part of the mean's
-    # variance, v' (1 - 1/n) = v (1 - 2/n) + row average / n.
-    average = (mixed @ width / columns)[:, None]
-    variance = (mixed * (1 - 1 / columns) - average / columns) / (1 - 2 / columns)
-    observed = float(np.sum((rows - rows.mean(axis=1, keepdims=True)) ** 2)) / ((frames - 1) * max(height - 1, 1))
-    return variance, dof, down @ about / counts, observed, float(np.average(variance, weights=counts)) / columns
 
 
 def converter_step(frame: Codes) -> int:
@@ -220,6 +206,11 @@ class NoiseMoments:
     dark_seen: Moments | None = None
     flat_seen: Moments | None = None
     rules: NoiseRules = field(default_factory=NoiseRules)
+
+    @property
+    def rounding_DN2(self) -> float:
+        """Variance of white rounding."""
+        return self.q_DN**2 / 12.0
 
     @property
     def dark_samples(self) -> int:
