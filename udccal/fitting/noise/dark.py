@@ -55,10 +55,10 @@ def fit_dark_terms(
     # Temporal noise below 0.15 of a code cannot be distinguished from the pattern of rounding.
     resolved = float(fit.values[2]) + in_pairs**2 >= (0.15 * data.q_DN) ** 2
     row = row if resolved else row_noise(data, np.zeros(len(data.darks)))[0]
-    value, variance = float(fit.values[4]), float(fit.cov[4, 4])
+    free, normal = fit, fit_dark(data.darks, K_DN_per_e, in_pairs, rules, fit.values, True)
+    value, variance = float(free.values[4]), float(free.cov[4, 4])
     name, gain = f"read noise of another shape than normal ({NORMAL_SHAPE:.2f})", (value - NORMAL_SHAPE) ** 2 / variance
     shape = Quantity.asked(name, value, variance, data.dark_samples, gain, without=NORMAL_SHAPE)
-    free, normal = fit, fit_dark(data.darks, K_DN_per_e, in_pairs, rules, fit.values, True)
     fit = free if shape.there else normal
     # Different offsets smear the rounding in the mean over all pixels; only a pixel's own noise smears its rounding.
     white = fit.follows and 4 * np.pi**2 * float(fit.values[2]) >= rules.smeared * data.q_DN**2
@@ -68,29 +68,30 @@ def fit_dark_terms(
         fit = replace(fit, cov=fit.cov + np.outer(depends, depends))
         fit.cov[2, 2] += (0.5 * fit.values[2]) ** 2
         row = replace(row, variance=row.variance + (0.5 * row.value) ** 2)
-    spread2, variance = float(fit.values[3]), float(fit.cov[2, 2])
-    read_DN2 = Quantity(float(fit.values[2]), variance)
-    rate, rounding, stack = max(float(fit.values[1]), 0.0), data.rounding_DN2, data.dark_stack
-    if white:
-        expected = [read_DN2.value + rounding + K_DN_per_e * rate * pair.exposure_s for pair in data.darks]
-    else:
+    (_, rate, read, spread2, _), variance = fit.values.tolist(), float(fit.cov[2, 2])
+    read_DN2, shot, stack = Quantity(read, variance), K_DN_per_e * max(rate, 0.0), data.dark_stack
+    expected = [read + data.rounding_DN2 + shot * pair.exposure_s for pair in data.darks]
+    if not white:
         expected = _coded_variances(data.darks, fit, K_DN_per_e, in_pairs)
     more = unexplained_variance(data, expected, rules.most_hits)
     foreign = abs(more.value) > rules.foreign_sigma * more.variance**0.5
     if foreign:
         # Where rounding hides the distribution, half of what was not expected may be an effect of it, and what the
         # codes tell of the rest depends on the distribution as well.
-        value = max(read_DN2.value + more.value, 0.0)
-        read_DN2 = Quantity(value, more.variance + (0.0 if white else 0.25 * more.value**2 + variance))
-    elif read_DN2.value <= 1.001 * LOW[2]:
+        depends_on = 0.0 if white else 0.25 * more.value**2 + variance
+        read_DN2 = Quantity(max(read + more.value, 0.0), more.variance + depends_on)
+    elif read <= 1.001 * LOW[2]:
         read_DN2 = Quantity(0.0, max(variance, LOW[2] ** 2))
     # DSNU comes from the stack's average, or from the histograms where rounding biases the average.
-    single = read_DN2.value + K_DN_per_e * rate * stack.exposure_s + rounding
+    single = read_DN2.value + shot * stack.exposure_s + data.rounding_DN2
     if foreign and data.dark_seen is not None:
         single = float(np.average(data.dark_seen.variance_DN2, weights=data.dark_seen.dof))
     offsets = dsnu(stack.mean_DN, single / stack.frames, in_pairs**2 / stack.frames, rules.defect_sigma)
     if not white:
-        pixels, sigma = stack.mean_DN.size, float(np.hypot(fit.cov[3, 3] ** 0.5, 0.0 if resolved else rounding))
+        pixels, sigma = (
+            stack.mean_DN.size,
+            float(np.hypot(fit.cov[3, 3] ** 0.5, 0.0 if resolved else data.rounding_DN2)),
+        )
         offsets = replace(offsets, variance=spread2, sigma=sigma, samples=pixels, mean_variance=spread2 / pixels)
     black, levels_cov, current = _levels(data, fit, in_pairs**2, single, offsets, curvature)
     DSNU2 = Quantity.asked("DSNU", offsets.variance, offsets.sigma**2, offsets.samples)
@@ -114,8 +115,8 @@ def _levels(
 ) -> tuple[float, Float[np.ndarray, "2 2"], Quantity]:
     """Black and dark current from the mean of every dark exposure, with its own weight."""
     means, variances, times = fit.means_DN, fit.variances_DN2, np.array([pair.exposure_s for pair in data.darks])
-    stack, rounding = data.dark_stack, data.rounding_DN2
     if fit.follows:
+        stack = data.dark_stack
         means, times = np.append(means, offsets.mean), np.append(times, stack.exposure_s)
         rows = row_DN2 / len(stack.mean_DN)
         variances = np.append(variances, (single_DN2 / stack.mean_DN.size + rows) / stack.frames)
@@ -132,11 +133,10 @@ def _levels(
     cov[0, 0] += offsets.mean_variance
     if not fit.follows:
         # With coarse or cut-off codes, the errors of black, spread and noise are common to all pairs.
-        cov[0, 0] = max(float(cov[0, 0]), len(data.darks) * float(fit.cov[0, 0]))
-        cov[1, 1] = max(float(cov[1, 1]), float(fit.cov[1, 1]))
+        cov[[0, 1], [0, 1]] = np.maximum(np.diag(cov), np.diag(fit.cov)[:2] * [len(data.darks), 1])
     if any(own == pair.step_DN**2 / 12.0 for own, pair in zip(fit.variances_DN2, data.darks, strict=True)):
         # Rounding hides the same in every exposure.
-        cov[0, 0] += rounding
+        cov[0, 0] += data.rounding_DN2
     # Black stays that of the line: a dark current too weak to be chosen must not shift it.
     return float(line[0]), cov, current
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +11,7 @@ from jaxtyping import Float
 from udccal.fitting.engine.gaussian import Posterior
 from udccal.fitting.engine.orders import Quantity
 from udccal.fitting.engine.report import estimates, residual_sample
+from udccal.fitting.engine.robust import outliers
 from udccal.fitting.noise.codes import start_values
 from udccal.fitting.noise.dark import DarkTerms, fit_dark_terms
 from udccal.fitting.noise.data import NoiseData, NoiseRules
@@ -246,21 +247,16 @@ def _values(
 def _outliers(
     data: NoiseMoments, dark: DarkTerms, curve: Curve, saturation_DN: float, uneven: Pattern
 ) -> Iterable[Outliers]:
-    rules = data.rules
-
-    def named(levels: Sequence[int]) -> tuple[str, ...]:
-        stack = len(data.flats)
-        return tuple("flat stack" if i >= stack else f"flat {i} ({data.flats[i].exposure_s:.4g} s)" for i in levels)[:8]
-
+    rules, names = data.rules, [f"flat {i} ({flat.exposure_s:.4g} s)" for i, flat in enumerate(data.flats)]
+    names.append("flat stack")
     # Unclipped samples stand out among clipped ones; that is no defect.
     ceiling = saturation_DN - 0.1 * (curve.ceiling_DN - dark.black_DN)
     seen = (*(flat for flat in data.flats if float(flat.mean_DN.max()) < ceiling), *data.dark_moments)
     hits, sigma = sum(moments.outliers for moments in seen), f"{rules.outlier_sigma:g} robust sigma"
     yield Outliers(f"two codes of a pixel {rules.hit_sigma:g} sigma apart in a pair (hits, blinking pixels)", hits)
-    off_response = np.flatnonzero(np.isnan(curve.levels.light) & ~np.isnan(curve.inside.light)).tolist()
-    for what, levels in (("flats of a pair that differ in brightness by", curve.flickering),
-                         ("brightness off the response by", off_response)):  # fmt: skip
-        yield Outliers(f"{what} {sigma}", len(levels), named(levels))
+    yield from outliers(f"flats of a pair that differ in brightness by {sigma}", (names[i] for i in curve.flickering))
+    off_response = np.flatnonzero(np.isnan(curve.levels.light) & ~np.isnan(curve.inside.light))
+    yield from outliers(f"brightness off the response by {sigma}", (names[i] for i in off_response))
     bins = int(np.sum(curve.inside.usable & ~curve.levels.usable))
     yield Outliers(f"bins of flats off the photon transfer curve by {sigma}", bins)
     for what, beside, found in (("dark", "(hot)", dark.offsets), ("flat", "their surroundings", uneven)):

@@ -168,9 +168,9 @@ def _saturated(data: NoiseMoments, dark: DarkTerms) -> Bins:
     Where all flats are saturated there is no rest: bins with no more variance than the dark frames are then saturated.
     """
     mean, variance = stacked(data.flats, "mean_DN") - dark.black_DN, stacked(data.flats, "variance_DN2")
-    bright = mean > 0.05 * (data.top_DN - dark.black_DN)
+    bright: Bins = mean > 0.05 * (data.top_DN - dark.black_DN)
     if not bright.any():
-        return np.zeros(mean.shape, bool)
+        return bright
     # Saturation is a ceiling: a quiet bin well below the brightest one is something else.
     highest = bright & (mean >= 0.9 * mean.max())
     # Below saturation variance over mean is K plus a small positive part; clipping only lowers it.
