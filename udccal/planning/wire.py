@@ -17,10 +17,9 @@ from udccal.cfa import cfa_named
 from udccal.fitting.engine.gaussian import scaled_inverse
 from udccal.fitting.wire.data import Pixels, odd_step, sample_pixels
 from udccal.fitting.wire.fit import map_jacobian, mean_one
-from udccal.fitting.wire.jacobian import expected_of, with_harmonics
+from udccal.fitting.wire.jacobian import WireProblem, expected_of, with_harmonics
 from udccal.fitting.wire.parameters import Parameters, parameters_of
 from udccal.fitting.wire.rules import WireRules, ideal_wire, possible_harmonics, wire_start
-from udccal.fitting.wire.search import WireProblem
 from udccal.numerics import in_float64
 from udccal.planning.design import Floor
 from udccal.planning.state import EvenField, RigState, sample_variance_e
@@ -107,7 +106,7 @@ def _expected(state: RigState, pixels: Pixels) -> tuple[Parameters, Float[np.nda
     start = wire_start(state.rig)
     possible = possible_harmonics(start)
     harmonics, bounds = possible.orders[:_HARMONICS], possible.bounds[:_HARMONICS]
-    built = with_harmonics(ideal_wire(state.geometry, start, harmonics), harmonics, pixels.ideal)
+    built = with_harmonics(ideal_wire(state.geometry, start, harmonics), harmonics, pixels)
     gains = np.ones(len(cfa_named(state.rig.camera.cfa).sites))
     parameters = parameters_of(built, _RULES, gains.size, bounds)
     x = parameters.vector(built, gains)
