@@ -107,7 +107,7 @@ def _groups(wire: Wire) -> Iterator[Wire]:
     Amplitudes that no pupil explains are those of the first harmonics: only the first group has them.
     """
     free = wire.amplitudes if len(wire.amplitudes) else np.zeros((1, 2, 1, 1))
-    for first in range(0, max(len(wire.harmonics), 1), _GROUP):
+    for first in range(0, len(wire.harmonics), _GROUP):
         some = np.s_[first : first + _GROUP]
         fill = _GROUP - len(wire.harmonics[some])
         harmonics, frequency, fields = (

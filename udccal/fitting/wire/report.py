@@ -238,10 +238,14 @@ def wire_result(
 
 
 def _trimmed(wire: Wire) -> Wire:
-    """The wire without unused Legendre degrees and amplitudes: it is faster."""
+    """The wire without unused Legendre degrees, amplitudes, and harmonics where there is no panel: it is faster."""
     used = np.flatnonzero(np.any(np.asarray(wire.fields) != 0, axis=(0, 1, 2)))
     beside = wire.amplitudes if np.any(wire.amplitudes) else np.zeros((0, 2, 1, 1))
-    return replace(wire, fields=wire.fields[..., : used.max(initial=0) + 1], amplitudes=beside)
+    seen = np.s_[: len(wire.harmonics) if used.size or len(beside) else 0]
+    fields = wire.fields[seen, ..., : used.max(initial=0) + 1]
+    return replace(
+        wire, harmonics=wire.harmonics[seen], frequency=wire.frequency[seen], fields=fields, amplitudes=beside
+    )
 
 
 def _status(joint: Joint, rules: WireRules) -> FitStatus:

@@ -97,7 +97,7 @@ class Search:
         harmonics = self.harmonics.orders
         strongest = harmonics[: rules.search_harmonics]
         for sample in (few, many):
-            bare = self._shading(sample)
+            bare = self._shading(strongest, sample)
             sample = bare.weighs(sample, self.noise)
             places, gain = scan_rows(bare.wire, bare.gains, start, sample, rules)
             if gain >= rules.least_gain:
@@ -132,10 +132,10 @@ class Search:
             found.append(Found(descent, pixels, float(without - with_rows) / descent.variance, sharpness))
         return min(found, key=lambda one: one.descent.criterion)
 
-    def _shading(self, sample: Pixels) -> Descent:
+    def _shading(self, harmonics: Float[np.ndarray, "harmonics 2"], sample: Pixels) -> Descent:
         """Fit the shading without any panel: no modulation, and no openings that narrow with obliquity."""
-        bare = ideal_wire(self.data.geometry, self.data.start, np.zeros((0, 2)), self.rules)
-        bare = replace(bare, depth_per_pitch=np.float64(0.0))
+        built = ideal_wire(self.data.geometry, self.data.start, harmonics, self.rules)
+        bare = replace(built, fields=np.zeros_like(built.fields), depth_per_pitch=np.float64(0.0))
         parameters = parameters_of(bare, self.rules, self.noise.floor.size, panel=False)
         prior, x = parameters.prior(self.data.start, self.rules), parameters.vector(bare, np.ones(parameters.sites))
         x[0] = -np.log(float(bare.row_open) * float(bare.column_open))
