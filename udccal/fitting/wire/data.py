@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import TypeVar, final
 
+import cv2
 import equinox as eqx
 import jax
 import numpy as np
@@ -21,9 +22,8 @@ from udccal.cfa import PATTERNS, cfa_named
 from udccal.errors import FitError, found_instead
 from udccal.fitting.engine.robust import OutlierRule
 from udccal.fitting.wire.rules import WireRules, WireStart, wire_start
-from udccal.models.geometry import Geometry, unproject
+from udccal.models.geometry import Geometry
 from udccal.models.noise import Noise
-from udccal.numerics import in_float64
 from udccal.result import Outliers
 from udccal.sessions.store import Session
 
@@ -31,7 +31,6 @@ from udccal.sessions.store import Session
 BLOCK = 2048
 Result = TypeVar("Result")
 _OUTLIERS = OutlierRule("pixels (row, column)")
-_unprojected = jax.jit(unproject)
 
 
 @final
@@ -207,12 +206,11 @@ class Pixels(eqx.Module):
 
 def pixels_at(positions_px: Float[np.ndarray, "n 2"], geometry: Geometry, shape: tuple[int, int]) -> Pixels:
     """Pixels (x, y) of a sensor of that shape (rows, columns), without values; their number fills whole blocks."""
-    ideal, zero = np.asarray(_unprojected(geometry, positions_px)), np.zeros(len(positions_px))
-    site = zero.astype(np.int64)
-    return Pixels(ideal, scaled_places(positions_px, shape), site, value=zero, weight=zero, place=site - 1)
+    zero = np.zeros(len(positions_px))
+    site, scaled = zero.astype(np.int64), scaled_places(positions_px, shape)
+    return Pixels(ideal_points(geometry, positions_px), scaled, site, value=zero, weight=zero, place=site - 1)
 
 
-@in_float64
 def sample_pixels(
     value: Float[np.ndarray, "rows columns"], geometry: Geometry, samples: int, cfa: str, other: bool = False
 ) -> Pixels:
@@ -242,6 +240,15 @@ def sample_pixels(
         weight=np.where(real, 1.0, 0.0),
         place=np.where(real, y * columns + x, -1),
     )
+
+
+def ideal_points(geometry: Geometry, positions_px: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
+    """Ideal image points of pixels (x, y), as ``models.geometry.unproject`` gives them."""
+    matrix = np.eye(3)
+    matrix[[0, 1], [0, 1]], matrix[:2, 2] = np.asarray(geometry.focal_px), np.asarray(geometry.principal_point_px)
+    until = cv2.TERM_CRITERIA_MAX_ITER + cv2.TERM_CRITERIA_EPS, 60, 1e-14
+    lens = matrix, np.asarray(geometry.distortion, dtype=np.float64)
+    return cv2.undistortPoints(positions_px[:, None], *lens, R=np.eye(3), P=np.eye(3), criteria=until)[:, 0]
 
 
 def scaled_places(pixels: Float[np.ndarray, "n 2"], shape: tuple[int, int]) -> Float[np.ndarray, "n 2"]:
