@@ -9,7 +9,6 @@ that each function is compiled once.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import NamedTuple, final
 
@@ -101,23 +100,6 @@ def with_harmonics(
     return replace(wire, harmonics=harmonics, frequency=frequency, fields=fields)
 
 
-def _groups(wire: Wire) -> Iterator[Wire]:
-    """The wire's harmonics in groups of one size, the last filled up with harmonics of no amplitude.
-
-    Amplitudes that no pupil explains are those of the first harmonics: only the first group has them.
-    """
-    free = wire.amplitudes if len(wire.amplitudes) else np.zeros((1, 2, 1, 1))
-    for first in range(0, len(wire.harmonics), _GROUP):
-        some = np.s_[first : first + _GROUP]
-        fill = _GROUP - len(wire.harmonics[some])
-        harmonics, frequency, fields = (
-            np.concatenate([np.asarray(part)[some], np.full((fill, *np.shape(part)[1:]), value)])
-            for part, value in ((wire.harmonics, 1.0), (wire.frequency, 1.0), (wire.fields, 0.0))
-        )
-        amplitudes = free if first == 0 else np.zeros_like(free)
-        yield replace(wire, harmonics=harmonics, frequency=frequency, fields=fields, amplitudes=amplitudes)
-
-
 def values_at(wire: Wire, pixels: Pixels) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """1 + modulation and exp(B), whose product is the map."""
 
@@ -130,12 +112,27 @@ def values_at(wire: Wire, pixels: Pixels) -> tuple[Float[np.ndarray, " n"], Floa
 
 
 def _of_groups(wire: Wire, rays: Rays, scaled: Float[np.ndarray, "n 2"]) -> list[tuple[np.ndarray, ...]]:
-    """Return ``_group_derivatives`` of all groups, in single precision, which is as accurate as its J0."""
+    """``_group_derivatives`` of harmonics in groups of one size, the last filled up with some of no amplitude.
+
+    Single precision is as accurate as its J0. Amplitudes that no pupil explains are those of the first harmonics: only
+    the first group has them.
+    """
     rays = rays._replace(periods=rays.periods - np.round(rays.periods))
-    # A wire may hold JAX's arrays, which that setting leaves as they are.
-    every = [jax.tree.map(lambda part: np.asarray(part, np.float32), (some, rays, scaled)) for some in _groups(wire)]
-    with jax.enable_x64(False):
-        return [jax.tree.map(np.asarray, _group_derivatives(*one)) for one in every]
+    free, found = wire.amplitudes if len(wire.amplitudes) else np.zeros((1, 2, 1, 1)), []
+    for first in range(0, len(wire.harmonics), _GROUP):
+        some = np.s_[first : first + _GROUP]
+        fill = _GROUP - len(wire.harmonics[some])
+        harmonics, frequency, fields = (
+            np.concatenate([np.asarray(part)[some], np.full((fill, *np.shape(part)[1:]), value)])
+            for part, value in ((wire.harmonics, 1.0), (wire.frequency, 1.0), (wire.fields, 0.0))
+        )
+        group = replace(wire, harmonics=harmonics, frequency=frequency, fields=fields, amplitudes=free)
+        # A wire may hold JAX's arrays, which the setting of single precision leaves as they are.
+        single = jax.tree.map(lambda part: np.asarray(part, np.float32), (group, rays, scaled))
+        with jax.enable_x64(False):
+            found.append(jax.tree.map(np.asarray, _group_derivatives(*single)))
+        free = np.zeros_like(free)
+    return found
 
 
 def _base(wire: Wire, rays: Rays, scaled: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
@@ -182,11 +179,17 @@ def _group_derivatives(
     n, m = harmonics.T[..., None]
     xx, xy, yy = jnp.asarray(rays.ellipse)
     kappa = jnp.sqrt(n * n * xx + 2 * n * m * xy + m * m * yy)
+    z = jnp.pi * wire.footprint_per_pitch * kappa
+    j0, j1 = bessel_j0_j1(z)
+    g = 2.0 * j1 / z
+    second = 2.0 * (j0 - g)
+    # G, z G' and z (z G')' of the pupil's transform.
+    bessel = jnp.stack([g, second, -z * z * g - 2.0 * second])
     powers = field_powers(wire, kappa, jnp.shape(wire.fields)[-1])
     slit, slit_slope = slits(wire, jnp.asarray(rays.openings))
     # Without the barrier the compiler computes the Bessel functions anew for every sum below.
     wave, bessel, slit, slit_slope, powers, series = jax.lax.optimization_barrier(
-        (waves(wire, rays.periods), _bessel(wire, kappa), slit, slit_slope, powers, _series(wire, powers))
+        (waves(wire, rays.periods), bessel, slit, slit_slope, powers, _series(wire, powers))
     )
     crossed = jnp.where((n != 0) & (m != 0), 0.5, 1.0)
     both = crossed * slit[0] * slit[1]
@@ -206,15 +209,6 @@ def _group_derivatives(
     modulated, by_pupil = jnp.sum(size * wave, axis=(0, 1))[None], jnp.sum(by_log_z, axis=0)[None]
     sums = jnp.concatenate([modulated, by_periods, by_open, by_ellipse, by_pupil])
     return sums, wave, both * bessel[:2], powers
-
-
-def _bessel(wire: Wire, kappa: Float[Array, "harmonics n"]) -> Float[Array, "3 harmonics n"]:
-    """G, z G' and z (z G')' of the pupil's transform."""
-    z = jnp.pi * wire.footprint_per_pitch * kappa
-    j0, j1 = bessel_j0_j1(z)
-    g = 2.0 * j1 / z
-    second = 2.0 * (j0 - g)
-    return jnp.stack([g, second, -z * z * g - 2.0 * second])
 
 
 def _series(wire: Wire, powers: Float[Array, "degrees harmonics n"]) -> Float[Array, "2 2 harmonics n"]:

@@ -122,19 +122,9 @@ def omitted(start: WireStart, wire: Wire, seen: Weighed, rules: WireRules) -> Om
 
 
 def harmonics_alone(wire: Wire, orders: Float[np.ndarray, "any 2"], pixels: Pixels) -> Float[np.ndarray, " n"]:
-    """The modulation by these harmonics of a round pupil, at a wire's shape.
-
-    Chunks have as many harmonics as the wire, so that the fit's compiled functions serve here; tiny chunks are slow.
-    """
-    size = max(len(wire.harmonics), 64)
-    plain = replace(wire, amplitudes=np.zeros_like(wire.amplitudes))
-    total = np.zeros(len(pixels.value))
-    for first in range(0, len(orders), size):
-        some = orders[first : first + size]
-        chunk = with_harmonics(plain, np.resize(some, (size, 2)), pixels)
-        fields = np.where(np.arange(size)[:, None, None, None] < len(some), chunk.fields, 0.0)
-        total += values_at(replace(chunk, fields=fields), pixels)[0] - 1
-    return total
+    """The modulation by these harmonics of a round pupil, at a wire's shape."""
+    plain = replace(wire, amplitudes=np.zeros((0, 2, 1, 1)))
+    return values_at(with_harmonics(plain, orders, pixels), pixels)[0] - 1
 
 
 def unseen(harmonics: Harmonics, searched: Pixels, rules: WireRules) -> float:
