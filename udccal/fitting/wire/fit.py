@@ -64,8 +64,8 @@ def fit_wire(data: WireData, rules: WireRules | None = None, start: Wire | None 
     if held_out:
         others = sample_pixels(values, data.geometry, rules.samples, data.cfa, other=True)
         tested = weighed_at(joint.parameters, joint.x, others, noise)
-    joint = replace(joint, x=mean_one(joint.parameters, joint.x, data.geometry, shape))
-    jacobian, wire = map_jacobian(joint.parameters, joint.x, data.geometry, shape), joint.parameters.wire(joint.x)
+    joint = replace(joint, x=mean_one(joint.parameters, joint.x, shape))
+    jacobian, wire = map_jacobian(joint.parameters, joint.x, shape), joint.parameters.wire(joint.x)
     off = misfit(tested, wire if joint.parameters.panel else None, jacobian.sigma(joint.cov), held_out)
     if off.test.found:
         joint = replace(joint, cov=clustered_cov(joint.cov, joint.last.problem.sums(joint.x)[1] / joint.variance))
@@ -135,14 +135,13 @@ def _grid(geometry: Geometry, shape: tuple[int, int], parts: tuple[int, int]) ->
     return pixels_at(np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2), geometry, shape)
 
 
-def mean_one(
-    parameters: Parameters, x: Float[np.ndarray, " n"], geometry: Geometry, shape: tuple[int, int]
-) -> Float[np.ndarray, " n"]:
+def mean_one(parameters: Parameters, x: Float[np.ndarray, " n"], shape: tuple[int, int]) -> Float[np.ndarray, " n"]:
     """``x`` with the first coefficient of the shading that gives the map a mean of 1, by the midpoint rule.
 
     ``shape`` is the sensor's (rows, columns).
     """
-    whole, base = values_at(parameters.wire(x), _grid(geometry, shape, (192, 256)))
+    wire = parameters.wire(x)
+    whole, base = values_at(wire, _grid(wire.geometry, shape, (192, 256)))
     scaled = x.copy()
     scaled[0] -= np.log(float(np.mean(whole * base)))
     return scaled
@@ -176,11 +175,10 @@ class MapJacobian:
         return np.asarray(change @ cov @ change.T)
 
 
-def map_jacobian(
-    parameters: Parameters, x: Float[np.ndarray, " n"], geometry: Geometry, shape: tuple[int, int]
-) -> MapJacobian:
+def map_jacobian(parameters: Parameters, x: Float[np.ndarray, " n"], shape: tuple[int, int]) -> MapJacobian:
     """Jacobian of the map at ``x``, whose mean is 1, on a grid of places over a sensor (rows, columns)."""
-    grid, wire = _grid(geometry, shape, (_PLACES, _PLACES)), parameters.wire(x)
+    wire = parameters.wire(x)
+    grid = _grid(wire.geometry, shape, (_PLACES, _PLACES))
     whole, base, rows = grid.by_block(lambda block: block_jacobian(parameters, wire, block))
     value, rows = whole * base, rows * base
     # Site gains are not in the map.

@@ -134,18 +134,17 @@ class Search:
 
     def _shading(self, harmonics: Float[np.ndarray, "harmonics 2"], sample: Pixels) -> Descent:
         """Fit the shading without any panel: no modulation, and no openings that narrow with obliquity."""
-        built = ideal_wire(self.data.geometry, self.data.start, harmonics, self.rules)
-        bare = replace(built, fields=np.zeros_like(built.fields), depth_per_pitch=np.float64(0.0))
-        parameters = parameters_of(bare, self.rules, self.noise.floor.size, panel=False)
-        prior, x = parameters.prior(self.data.start, self.rules), parameters.vector(bare, np.ones(parameters.sites))
-        x[0] = -np.log(float(bare.row_open) * float(bare.column_open))
+        wire = ideal_wire(self.data.geometry, self.data.start, harmonics, self.rules)
+        baseline = np.zeros_like(wire.baseline)
+        baseline[0, 0] = -np.log(float(wire.row_open) * float(wire.column_open))
+        nothing, gains = np.zeros_like(wire.fields), np.ones(self.noise.floor.size)
+        wire = replace(wire, baseline=baseline, fields=nothing, depth_per_pitch=np.float64(0.0))
         # At first, clipped pixels are left out by their own values; later, by the model's.
         clip = self.noise.clip[sample.site]
         pixels = weighed(sample, np.where(sample.value < clip, 1.0, clip), self.noise).pixels
         for _ in range(2):
-            problem = WireProblem("wire, shading", parameters, pixels, prior)
-            descent = Descent(problem, minimise(problem, x, SOLVER))
-            x, pixels = descent.solution.place, descent.weighs(sample, self.noise)
+            descent = self._descent(wire, gains, pixels, name="wire, shading", panel=False)
+            wire, gains, pixels = descent.wire, descent.gains, descent.weighs(sample, self.noise)
         return descent
 
     def _search(
@@ -182,9 +181,10 @@ class Search:
         pixels: Pixels,
         solver: SolverRules = SOLVER,
         name: str = "wire, shape",
+        panel: bool = True,
     ) -> Descent:
         """Descend from a wire, whose origin becomes the prior's."""
-        parameters = parameters_of(wire, self.rules, gains.size)
+        parameters = parameters_of(wire, self.rules, gains.size, panel=panel)
         problem = WireProblem(name, parameters, pixels, parameters.prior(self.data.start, self.rules))
         return Descent(problem, minimise(problem, parameters.vector(wire, gains), solver))
 
