@@ -1,10 +1,10 @@
-"""The wire's values and their derivatives, pixel by pixel, in closed form, and the equations of a sample.
+"""The wire's values and their derivatives, pixel by pixel, and the equations of a sample.
 
 The modulation depends on the ten shape parameters through few numbers per pixel: the point where its ray meets the
 panel (X, Y), two openings, three numbers of the footprint's ellipse, and the pupil. Sums over the harmonics are made
-once per such number. Its derivatives by the shape parameters do not depend on the harmonics. That is several times
-faster than automatic derivatives of the whole model, in either mode. Harmonics are summed in groups of one size, so
-that each function is compiled once.
+once per such number, in closed form. Derivatives of these numbers by the shape parameters do not depend on the
+harmonics and are automatic. That is several times faster than automatic derivatives of the whole model, in either mode.
+Harmonics are summed in groups of one size, so that each function is compiled once.
 """
 
 from __future__ import annotations
