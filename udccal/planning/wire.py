@@ -18,10 +18,9 @@ from udccal.cfa import cfa_named
 from udccal.fitting.engine.gaussian import scaled_inverse
 from udccal.fitting.wire.data import Pixels, odd_step, sample_pixels
 from udccal.fitting.wire.fit import map_jacobian, mean_one
-from udccal.fitting.wire.jacobian import expected_of, with_harmonics
+from udccal.fitting.wire.jacobian import WireProblem, expected_of, with_harmonics
 from udccal.fitting.wire.parameters import Parameters, parameters_of
 from udccal.fitting.wire.rules import WireRules, ideal_wire, possible_harmonics, wire_start
-from udccal.fitting.wire.search import WireProblem
 from udccal.numerics import in_float64
 from udccal.planning.design import Floor
 from udccal.planning.state import EvenField, RigState
@@ -45,8 +44,8 @@ class WirePredictor:
         parameters, x = _expected(state, pixels)
         prior = parameters.prior(wire_start(state.rig), _RULES)
         self._problem = WireProblem("wire, planned", parameters, pixels, prior)
-        self._x = mean_one(parameters, x, state.geometry, shape)
-        self._jacobian = map_jacobian(parameters, self._x, state.geometry, shape)
+        self._x = mean_one(parameters, x, shape)
+        self._jacobian = map_jacobian(parameters, self._x, shape)
         self._value = expected_of(parameters.wire(self._x), np.ones(parameters.sites), pixels)
         places = np.stack(np.divmod(np.maximum(pixels.place, 0), camera.columns)[::-1], axis=1)
         self._signal_e = state.full_well_e * EvenField(state).signal(places.astype(float))
@@ -103,7 +102,7 @@ def _expected(state: RigState, pixels: Pixels) -> tuple[Parameters, Float[np.nda
     start = wire_start(state.rig)
     possible = possible_harmonics(start)
     harmonics = possible.orders[:_HARMONICS]
-    built = with_harmonics(ideal_wire(state.geometry, start, harmonics), harmonics, pixels.ideal)
+    built = with_harmonics(ideal_wire(state.geometry, start, harmonics), harmonics, pixels)
     gains = np.ones(len(cfa_named(state.rig.camera.cfa).sites))
     parameters = parameters_of(built, _RULES, gains.size, possible.bounds[:_HARMONICS])
     keep = parameters.groups < 0
