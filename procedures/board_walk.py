@@ -18,7 +18,7 @@ from procedures.step import Bench, Step, run_step, set_up
 from udccal.arrangements import Board, BoardSpec
 from udccal.guide.events import Outline, Reading
 from udccal.guide.steps import Look
-from udccal.planning.next_view import NextView
+from udccal.planning.geometry import NextView
 from udccal.rig import RigDescription
 from udccal.sessions.store import Session
 from udccal.sessions.writer import SessionWriter

@@ -23,7 +23,6 @@ from udccal.fitting.psf.kernel import WAVELENGTHS_NM, Evaluator, fit_lattice, st
 from udccal.numerics import in_float64
 from udccal.planning.psf import PsfPredictor
 from udccal.planning.state import RigState
-from udccal.planning.steps import planned_steps
 from udccal.rig import Captures, RigDescription
 
 _HALF = (14, 7)
@@ -87,14 +86,14 @@ def _scene(design: tuple[int, int, int, int]) -> tuple[Scene, Captures]:
         }
     )
     planned = rig.model_copy(update={"captures": captures})
-    step = next(s for s in planned_steps("psf", RigState(planned, scene.noise, scene.geometry)) if _is_led(s))
+    step = next(s for s in RigState(planned, scene.noise, scene.geometry).steps("psf") if _is_led(s))
     return replace(
         scene,
         rig=planned,
         places_px=_inside(planned),
         shifts=shifts,
         exposures_s=step.exposures_s,
-        level=step.level or 0.0,
+        level=step.level,
     ), captures
 
 

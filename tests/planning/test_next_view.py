@@ -13,10 +13,9 @@ from udccal.arrangements import Board, Occasion
 from udccal.fitting.engine.gaussian import scaled_inverse
 from udccal.fitting.geometry.corners import board_points_mm
 from udccal.fitting.geometry.data import rig_prior
-from udccal.planning.board_views import BoardView, BoardViews, lens_information
-from udccal.planning.next_view import NextView
+from udccal.planning.geometry import BoardView, BoardViews, NextView, lens_information
 from udccal.planning.state import RigState, nominal_state
-from udccal.planning.steps import PlannedStep, planned_steps
+from udccal.planning.steps import PlannedStep
 from udccal.reports.true_values import true_geometry
 from udccal.rig import load_rig
 from udccal.simulation.hand import Hand
@@ -37,7 +36,7 @@ class Session:
         self.hand = Hand(self.world)
         nominal = nominal_state(self.rig)
         self.views = BoardViews(RigState(self.rig, nominal.noise, true_geometry(truth)))
-        boards = [step for step in planned_steps("geometry", nominal) if isinstance(step.arrangement, Board)]
+        boards = [step for step in nominal.steps("geometry") if isinstance(step.arrangement, Board)]
         self.on_jig, *self.by_hand = boards
 
     def exact(self, step: PlannedStep) -> BoardView | None:

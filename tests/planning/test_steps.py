@@ -11,9 +11,8 @@ from procedures.plans import Bracket, Fixed, Metered, Singles, Stack, TimesThatO
 from tests.procedures.benches import new_writer, simulated_bench, small_rig
 from udccal.errors import UdccalError
 from udccal.guide.capture import guided_steps
-from udccal.planning import exposures
+from udccal.planning import steps
 from udccal.planning.state import nominal_state
-from udccal.planning.steps import cost_of, planned_steps
 from udccal.plugins import find_procedure
 from udccal.sessions.schema import TermName
 
@@ -25,8 +24,8 @@ def test_frames_are_those_of_a_session(term: TermName, tmp_path: Path) -> None:
         find_procedure(term)().run(bench.camera, bench.display, bench.stage, writer)
         kept = sum(capture.frames for step in writer.manifest.steps for capture in step.captures)
         taken = bench.camera.counts.delivered
-    cost = cost_of(term, nominal_state(rig))
-    tested = sum(step.test_frames for step in planned_steps(term, nominal_state(rig)))
+    cost = nominal_state(rig).cost(term)
+    tested = sum(step.test_frames for step in nominal_state(rig).steps(term))
     assert cost.frames - tested == kept
     # Metering takes a frame more or less.
     assert cost.frames == pytest.approx(taken, rel=0.25)
@@ -35,13 +34,13 @@ def test_frames_are_those_of_a_session(term: TermName, tmp_path: Path) -> None:
 @pytest.mark.parametrize("term", ["noise", "wire", "backscatter"])
 def test_set_ups_are_those_that_a_person_is_led_through(term: TermName) -> None:
     rig = small_rig()
-    assert cost_of(term, nominal_state(rig)).set_ups == len(guided_steps(rig, [term]))
+    assert nominal_state(rig).cost(term).set_ups == len(guided_steps(rig, [term]))
 
 
 def test_no_frame_is_quicker_than_its_exposure_or_the_camera() -> None:
     state = nominal_state(small_rig())
     rate = state.rig.camera.frame_rate_hz
-    cost = cost_of("noise", state)
+    cost = state.cost("noise")
     assert cost.seconds > cost.frames / rate
     # The long dark frames: 0.25 s, 1 s and 4 s, two each and one to look at.
     assert cost.seconds > 3 * 5.25
@@ -50,7 +49,7 @@ def test_no_frame_is_quicker_than_its_exposure_or_the_camera() -> None:
 def test_more_flats_take_as_much_longer() -> None:
     state = nominal_state(small_rig())
     more = state.with_captures(state.rig.captures.model_copy(update={"flats": 112}))
-    change = cost_of("wire", more) - cost_of("wire", state)
+    change = more.cost("wire") - state.cost("wire")
     assert change.frames == 100
     assert change.set_ups == 0
     assert change.seconds == pytest.approx(100 / state.rig.camera.frame_rate_hz)
@@ -77,6 +76,6 @@ def test_a_procedure_that_does_not_tell_is_named(missing: str, monkeypatch: pyte
     whole = next(iter(find_procedure("wire")().steps(small_rig())))
     parts = {name: getattr(whole, name) for name in ("id", "arrangement", "instruction", "region", "exposure", "plan")}
     step = SimpleNamespace(**(parts | {missing: object()}))
-    monkeypatch.setattr(exposures, "find_procedure", lambda term: lambda: SimpleNamespace(steps=lambda rig: [step]))
+    monkeypatch.setattr(steps, "find_procedure", lambda term: lambda: SimpleNamespace(steps=lambda rig: [step]))
     with pytest.raises(UdccalError, match="Expected the step 'wire/flat' to tell"):
-        list(planned_steps("wire", nominal_state(small_rig())))
+        list(nominal_state(small_rig()).steps("wire"))

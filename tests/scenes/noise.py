@@ -9,9 +9,9 @@ from functools import partial
 import numpy as np
 from jaxtyping import Float, UInt16
 
+from udccal.fitting.noise.codes import NORMAL_SHAPE, tukey_lambda_std
 from udccal.fitting.noise.data import ExposureLevel, NoiseData, SpatialStack
 from udccal.fitting.noise.fit import fit_noise
-from udccal.fitting.noise.read_noise import NORMAL_SHAPE, tukey_lambda_std
 from udccal.models.noise import Noise
 from udccal.result import FitResult
 

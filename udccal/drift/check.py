@@ -19,7 +19,7 @@ from udccal.drift.pose import PoseChange, pose_change
 from udccal.errors import ProfileError, SessionError
 from udccal.fitting.backscatter.data import read_backscatter
 from udccal.fitting.wire.data import read_wire
-from udccal.fitting.wire.fit import site_means, unusable_flat
+from udccal.fitting.wire.fit import unusable_flat
 from udccal.fitting.wire.rules import WireRules
 from udccal.numerics import in_float64
 from udccal.profiles.profile import Profile
@@ -94,7 +94,7 @@ def check_rig(profile: Profile, session: Session, limits: DriftLimits | None = N
     _check_measured(profile)
     flat, dark = (session.average(session.step(f"wire/{name}").captures[0]) for name in ("flat", "dark"))
     data = read_wire(session, profile.noise.term, profile.wire.term.geometry)
-    if (refused := unusable_flat(data, site_means(data), WireRules())) is not None:
+    if (refused := unusable_flat(data, WireRules())) is not None:
         raise SessionError(f"Expected flats that can be compared, found: {refused[1]} {refused[0].value}")
     gain = gain_ratio(flat, dark, profile.noise, profile.rig.camera.cfa)
     pose = pose_change(profile.wire.term, data)

@@ -12,10 +12,8 @@ from typing import final
 import numpy as np
 from jaxtyping import Bool, Float
 
-from udccal.cfa import cfa_named
 from udccal.fitting.engine.gaussian import scaled_inverse
-from udccal.fitting.wire.data import FlatNoise, Pixels, WireData, blocks, flat_noise, sample_pixels, weighed
-from udccal.fitting.wire.fit import site_means
+from udccal.fitting.wire.data import FlatNoise, Pixels, WireData, flat_noise, sample_pixels, weighed
 from udccal.fitting.wire.jacobian import values_at, wire_derivatives
 from udccal.fitting.wire.parameters import shape_vector, with_shape
 from udccal.models.wire import Wire
@@ -57,15 +55,13 @@ class PoseChange:
 @in_float64
 def pose_change(wire: Wire, data: WireData) -> PoseChange:
     """Solve for the pose by Gauss and Newton's method, from the profile's wire on."""
-    means = site_means(data)
-    values = data.signal / means[cfa_named(data.cfa).site_map(*data.signal.shape)]
-    noise, start = flat_noise(data, means), wire
+    noise, start = flat_noise(data), wire
     odd = np.zeros(CELLS, dtype=bool)
     for samples in _SAMPLES:
-        pixels = sample_pixels(values, wire.geometry, samples, data.cfa)
+        pixels = sample_pixels(data.balanced, wire.geometry, samples, data.cfa)
         step, cov, light, variance = _step(wire, _without(pixels, odd), noise)
         wire = _moved(wire, step)
-        whole, base = values_at(wire, pixels.ideal, pixels.scaled)
+        whole, base = values_at(wire, pixels)
         left, sigma = cell_medians(weighed(pixels, whole * base * light, noise), noise)
         with np.errstate(invalid="ignore"):
             odd = (np.abs(left) > _ODD) & (np.abs(left) > _ODD_SIGMA * sigma)
@@ -82,10 +78,10 @@ def _step(
     wire: Wire, pixels: Pixels, noise: FlatNoise
 ) -> tuple[Float[np.ndarray, "7"], Float[np.ndarray, "7 7"], Float[np.ndarray, " n"], float]:
     """The next step, its covariance, the light in front of the panel at the sample's places, and the variance."""
-    found = [wire_derivatives(wire, ideal, scaled) for ideal, scaled in blocks(pixels.ideal, pixels.scaled)]
+    found = [wire_derivatives(wire, block) for block in pixels.blocks()]
     whole, base = (np.concatenate([getattr(one, name) for one in found]) for name in ("whole", "base"))
     by_pose = np.concatenate([one.shape[:POSE] for one in found], axis=1) / whole
-    ahead, light_there = values_at(wire, pixels.ideal * (1 - _SMALL), pixels.scaled)
+    ahead, light_there = values_at(wire, replace(pixels, ideal=pixels.ideal * (1 - _SMALL)))
     by_focal = np.log(ahead * light_there / (whole * base)) / _SMALL
     design = np.column_stack([by_pose.T, by_focal, light_design(pixels.scaled, pixels.site)])
     light = np.ones(len(whole))

@@ -10,7 +10,7 @@ from udccal.cameras.choice import check_camera
 from udccal.guide.events import DoneEvent, Person
 from udccal.guide.lead import Leading
 from udccal.guide.steps import GuidedStep
-from udccal.planning.exposures import nominal_full_s, steps_at, with_small_panel
+from udccal.planning.steps import steps_at, with_small_panel
 from udccal.plugins import find_procedure
 from udccal.rig import RigDescription
 from udccal.sessions.schema import TermName
@@ -44,7 +44,7 @@ def expected_seconds(rig: RigDescription, steps: Collection[GuidedStep]) -> tupl
     camera_s = {
         step.id: sum(max(period_s, exposure_s) for exposure_s in step.exposures_s)
         for term in {step.term for step in steps}
-        for step in steps_at(term, small, lambda arrangement: nominal_full_s(arrangement, rig))
+        for step in steps_at(term, small)
     }
     return tuple(
         sum(camera_s.get(step_id, 0.0) for step_id in step.step_ids)

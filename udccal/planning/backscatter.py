@@ -6,11 +6,11 @@ predicted: they are samples without weight.
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import Final, final
 
 import numpy as np
-from jaxtyping import Float, Int
 
 from udccal.arrangements import Dark, PanelPicture
 from udccal.displays.pictures import face_picture
@@ -23,8 +23,8 @@ from udccal.fitting.engine.least_squares import Blocks
 from udccal.fitting.nominal import nominal_backscatter
 from udccal.numerics import in_float64
 from udccal.planning.design import Floor
-from udccal.planning.state import WHITE, EvenField, RigState, sample_variance_e
-from udccal.planning.steps import PlannedStep, planned_steps, without_pictures
+from udccal.planning.state import WHITE, EvenField, RigState
+from udccal.planning.steps import PlannedStep
 from udccal.rig import Captures
 
 # Number of the procedure's pictures that represent all: drawing takes long, and further ones are of the same kind.
@@ -49,43 +49,47 @@ class BackscatterPredictor:
         theta = linear_of(self._x)
         template = nominal_backscatter(state.geometry, rig, np.zeros((3, 1, 1)), step_px, window=1)
         template = replace(template, window=window_for(template, theta, rays, slack=1.0))
+        self._ratio, jacobian = ratios_and_jacobian(template, theta, rays, _pictures(state))
+        self._jacobian = jacobian * linear_slope(self._x)[:, None, None, None]
         # Shading of the scattered light: light that leaves the panel evenly is shaded as all light is.
         grid = rig.camera.rows // step_px, rig.camera.columns // step_px
         rows, columns = np.divmod(flat, grid[1])
         self._shading = EvenField(state).at(step_px * (np.stack([columns, rows], axis=1) + 0.5) - 0.5)
-        self._mask = _white_light(state, flat, self._shading)
+        # Light of white: even, or as a profile's mask has it.
+        light = np.tile(WHITE[:, None], len(flat))
+        if (white := state.white) is not None:
+            light = np.maximum(white.reshape(3, -1)[:, flat], 1e-3 * white.max())
+        self._mask = light / (light * self._shading).max()
         # The fit looks at some of the sensor's bins.
         self._every = grid[0] * grid[1] / len(flat)
         # Factors from a sample's variance, and from that of a row's offset, to the variance of a bin's average.
         bins, one = Bins(rig.camera.cfa, step_px), np.ones((rig.camera.rows, rig.camera.columns))
-        self._by_sample = bins.variance(one).reshape(3, -1)[:, flat]
-        self._by_row = bins.row_variance(one).reshape(3, -1)[:, flat]
-        shown = _pictures(state)
-        self._ratio, jacobian = ratios_and_jacobian(template, theta, rays, shown)
-        self._jacobian = jacobian * linear_slope(self._x)[:, None, None, None]
+        by_bin = bins.variance(one), bins.row_variance(one)
+        self._by_sample, self._by_row = (factor.reshape(3, -1)[:, flat] for factor in by_bin)
 
     def sigma(self, captures: Captures) -> float:
         """Root mean square over sensor, colours and pictures, relative to the pictures' peaks; see ``Predictor``."""
-        planned = self._planned(captures)
-        return float("inf") if planned is None else self._light_sigma(*planned)
+        return self._light_sigma(self._planned(captures))
 
     def used(self, captures: Captures) -> float:
         """Less than 1, since the fit uses only some of the sensor's bins; see ``Predictor``."""
         planned = self._planned(captures)
-        return 1.0 if planned is None else (self._light_sigma(*planned, self._every) / self._light_sigma(*planned)) ** 2
+        return (self._light_sigma(planned, self._every) / self._light_sigma(planned)) ** 2
 
     def floor(self) -> Floor:
         """The model error that a profile's fit found, of a new picture's peak; 0 without a profile."""
-        almost_none = np.full(self._mask.shape, 1e-15)
-        endless = self._binned(almost_none, almost_none, almost_none)
+        none = np.full(self._mask.shape, 1e-15)
+        endless = self._binned(none, none, none), 1_000_000
         return Floor(
-            0.0 if self._state.model_errors.backscatter == 0 else self._light_sigma(endless, 1_000_000),
+            0.0 if self._state.model_errors.backscatter == 0 else self._light_sigma(endless),
             "That much of the light the fit of the present profile could not describe; no further picture changes it.",
         )
 
-    def _light_sigma(self, seen: Binned, pictures: int, count: float = 1.0) -> float:
+    def _light_sigma(self, planned: tuple[Binned, int] | None, count: float = 1.0) -> float:
         """Sigma of new pictures' light in per cent of their peak; bins count ``count`` times for the parameters."""
-        error = self._state.model_errors.backscatter
+        if planned is None:
+            return math.inf
+        (seen, pictures), error = planned, self._state.model_errors.backscatter
         weight = seen.weights(seen.rate, self._mask, error, seen.usable)
         weight[_SHOWN] *= np.sqrt(pictures / len(weight[_SHOWN]))
         weight[_NEW] = 0.0
@@ -99,50 +103,33 @@ class BackscatterPredictor:
 
     def _planned(self, captures: Captures) -> tuple[Binned, int] | None:
         """Shots of the pictures drawn, and the number of pictures in all; None where these are too few."""
-        steps = list(planned_steps("backscatter", without_pictures(self._state.with_captures(captures))))
-        shown = [step for step in steps if isinstance(step.arrangement, PanelPicture)]
-        darks = [step for step in steps if isinstance(step.arrangement, Dark)]
+        steps = self._state.with_captures(captures).steps("backscatter", drawn=False)
+        shown, darks = ([step for step in steps if isinstance(step.arrangement, kind)] for kind in (PanelPicture, Dark))
         if len(shown) - 1 < _RULES.fewest_pictures or not darks:
             return None
-        (shot, rest), (_, dark) = self._of_step(shown[0]), self._of_step(darks[0])
-        return self._binned(shot, rest, dark), len(shown) - 1
+        full_e = shown[0].level * self._state.full_well_e * self._shading
+        rest, in_dark = (self._in_dark_e2(step) / full_e**2 for step in (shown[0], darks[0]))
+        return self._binned(self._by_sample / (full_e * len(shown[0].exposures_s)), rest, in_dark), len(shown) - 1
+
+    def _in_dark_e2(self, step: PlannedStep) -> PerBin:
+        """Variance of a bin's average without light."""
+        noise, sample_e2 = self._state.noise, float(self._state.variance_e(np.zeros(1), step.exposures_s[0])[0])
+        row_e2 = (noise.sigma_row_DN / noise.K_DN_per_e) ** 2
+        whole_e2 = max(sample_e2 - row_e2, 0.0) * self._by_sample + row_e2 * self._by_row
+        return np.asarray(whole_e2 / len(step.exposures_s))
 
     def _binned(self, shot: PerBin, rest: PerBin, dark: PerBin) -> Binned:
         """Shots with these variances, in units of the brightest light of a shaded white picture."""
-        light = self._mask * self._ratio
-        by_shot = np.broadcast_to(rest, light.shape).copy()
-        by_shot[-1] = dark
-        one = np.ones(len(light))
-        return Binned(light, np.broadcast_to(shot, light.shape), by_shot, np.zeros(light.shape, dtype=bool), one, one)
-
-    def _of_step(self, step: PlannedStep) -> tuple[PerBin, PerBin]:
-        """Variance of a bin per unit of its light, and in the dark."""
-        state = self._state
-        full = (step.level or 0.0) * state.full_well_e * np.ones((3, 1)) * self._shading
-        row = float(np.asarray(state.noise.sigma_row_DN / state.noise.K_DN_per_e)) ** 2
-        dark = float(sample_variance_e(state, np.zeros(1), step.exposures_s[0])[0])
-        rest = max(dark - row, 0.0) * self._by_sample + row * self._by_row
-        frames = len(step.exposures_s)
-        return self._by_sample / (full * frames), rest / (full**2 * frames)
-
-
-def _white_light(state: RigState, flat: Int[np.ndarray, " n"], shading: Float[np.ndarray, " n"]) -> PerBin:
-    """Light of white at grid positions: even, or as a profile's mask has it."""
-    light = (np.array(WHITE) / max(WHITE))[:, None] * np.ones(len(flat))
-    if state.backscatter is not None and np.max(state.backscatter.mask) > 0:
-        mask = np.asarray(state.backscatter.mask, dtype=np.float64).reshape(3, -1)
-        light = np.maximum(mask[:, flat], 1e-3 * mask.max())
-    return np.asarray(light / (light * shading).max())
+        light, one = self._mask * self._ratio, np.ones(len(self._ratio))
+        whole = np.stack([*[rest] * (len(light) - 1), dark])
+        return Binned(light, np.broadcast_to(shot, light.shape), whole, np.zeros(light.shape, dtype=bool), one, one)
 
 
 def _pictures(state: RigState) -> Pictures:
     """Pictures as the procedure shows them, followed by those for the prediction."""
     panel, crop = state.rig.panel, visible_crop(state.geometry, state.rig)
     few = state.with_captures(state.rig.captures.model_copy(update={"backscatter_pictures": _DRAWN}))
-    shown = [
-        step.arrangement.picture
-        for step in planned_steps("backscatter", few)
-        if isinstance(step.arrangement, PanelPicture) and step.arrangement.picture.min() < 255
-    ]
+    panels = (step.arrangement for step in few.steps("backscatter") if isinstance(step.arrangement, PanelPicture))
+    shown = [one.picture for one in panels if one.picture.min() < 255]
     shown += [face_picture(seed, panel.columns, panel.rows) for seed in _NEW_SEEDS]
     return Pictures.of(np.stack([crop.of(picture) for picture in shown]), crop)

@@ -6,10 +6,11 @@ reached. Then it prunes the design. It uses no random numbers.
 
 from __future__ import annotations
 
+import functools
 import math
-from collections.abc import Callable, Iterator
+from bisect import bisect_left
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from types import MappingProxyType
 from typing import Final, Protocol, final, runtime_checkable
 
 from udccal.planning.steps import Cost
@@ -19,7 +20,7 @@ from udccal.sessions.schema import TermName
 # One step up adds this part of the present number, and one at least.
 _SHARE: Final = 0.25
 _MOST_ADDITIONS: Final = 200
-# An addition that lowers the logarithm of sigma by less than this does not count.
+# An addition that lowers sigma by less than this part of it does not count.
 _LEAST_GAIN: Final = 1e-6
 
 
@@ -32,15 +33,13 @@ class Quantity:
     meaning: str
 
 
-QUANTITIES: Final = MappingProxyType[TermName, Quantity](
-    {
-        "noise": Quantity("%", "conversion gain K, relative"),
-        "geometry": Quantity("px", "where a ray lands, root mean square over the sensor"),
-        "wire": Quantity("%", "wire map, root mean square over the sensor"),
-        "psf": Quantity("%", "kernel, relative L2"),
-        "backscatter": Quantity("%", "predicted light, root mean square, of its peak"),
-    }
-)
+QUANTITIES: Final[Mapping[TermName, Quantity]] = {
+    "noise": Quantity("%", "conversion gain K, relative"),
+    "geometry": Quantity("px", "where a ray lands, root mean square over the sensor"),
+    "wire": Quantity("%", "wire map, root mean square over the sensor"),
+    "psf": Quantity("%", "kernel, relative L2"),
+    "backscatter": Quantity("%", "predicted light, root mean square, of its peak"),
+}
 
 
 @final
@@ -88,48 +87,64 @@ class DesignVariable:
         return captures.model_copy(update={self.name: value})
 
 
-DESIGN_VARIABLES: Final = MappingProxyType[TermName, tuple[DesignVariable, ...]](
-    {
-        # PRNU and DSNU depend on the stack, K on the levels: with fewer, the other noise quantities would suffer.
-        "noise": (
-            DesignVariable("noise_levels", 5, 400, "levels of light"),
-            DesignVariable("noise_stack", 8, 1000, "frames of a stack"),
-        ),
-        "geometry": (DesignVariable("board_views", 3, 200, "views of the board"),),
-        "wire": (DesignVariable("flats", 2, 20_000, "flats"),),
-        "psf": (
-            DesignVariable("psf_columns", 2, 24, "columns of LED positions"),
-            DesignVariable("psf_rows", 2, 24, "rows of LED positions"),
-            DesignVariable("psf_shifts", 1, 64, "shifts at each position"),
-            DesignVariable("psf_exposures", 3, 12, "exposures of a bracket"),
-        ),
-        "backscatter": (
-            DesignVariable("backscatter_pictures", 6, 200, "pictures on the panel"),
-            DesignVariable("backscatter_frames", 2, 1000, "frames of a picture"),
-        ),
-    }
-)
+DESIGN_VARIABLES: Final[Mapping[TermName, tuple[DesignVariable, ...]]] = {
+    # PRNU and DSNU depend on the stack, K on the levels: with fewer, the other noise quantities would suffer.
+    "noise": (
+        DesignVariable("noise_levels", 5, 400, "levels of light"),
+        DesignVariable("noise_stack", 8, 1000, "frames of a stack"),
+    ),
+    "geometry": (DesignVariable("board_views", 3, 200, "views of the board"),),
+    "wire": (DesignVariable("flats", 2, 20_000, "flats"),),
+    "psf": (
+        DesignVariable("psf_columns", 2, 24, "columns of LED positions"),
+        DesignVariable("psf_rows", 2, 24, "rows of LED positions"),
+        DesignVariable("psf_shifts", 1, 64, "shifts at each position"),
+        DesignVariable("psf_exposures", 3, 12, "exposures of a bracket"),
+    ),
+    "backscatter": (
+        DesignVariable("backscatter_pictures", 6, 200, "pictures on the panel"),
+        DesignVariable("backscatter_frames", 2, 1000, "frames of a picture"),
+    ),
+}
+
+
+@final
+class Objective:
+    """Sigma and cost of one term's captures, as functions of the captures that are evaluated once for each."""
+
+    def __init__(self, term: TermName, sigma: Callable[[Captures], float], cost: Callable[[Captures], Cost]) -> None:
+        self.term, self.sigma, self.cost = term, functools.cache(sigma), functools.cache(cost)
 
 
 @final
 @dataclass(frozen=True)
-class Objective:
-    """Sigma and cost of one term's captures, as functions of the captures."""
+class Setting:
+    """One design variable: as it was, and as planned."""
+
+    name: str
+    before: int
+    planned: int
+
+
+@final
+@dataclass(frozen=True)
+class Suggestion:
+    """One design variable one step up: the fall of sigma in per cent of itself, and the cost."""
 
     term: TermName
-    sigma: Callable[[Captures], float]
-    cost: Callable[[Captures], Cost]
-
-
-@final
-@dataclass(frozen=True)
-class Addition:
-    """One design variable one step up: the fall of the logarithm of sigma, and the cost."""
-
-    variable: DesignVariable
-    captures: Captures
-    gain: float
+    setting: Setting
+    gain_percent: float
     cost: Cost
+
+    @property
+    def per_second(self) -> float:
+        """Fall of the logarithm of sigma per second of the camera's time."""
+        return -math.log(max(1 - self.gain_percent / 100, 1e-16)) / max(self.cost.seconds, 1e-9)
+
+    @property
+    def per_set_up(self) -> tuple[bool, float]:
+        """Orders suggestions by their gain per set-up; those without a set-up go first."""
+        return self.cost.set_ups <= 0, self.gain_percent / max(self.cost.set_ups, 1)
 
 
 def least_captures(term: TermName, captures: Captures) -> Captures:
@@ -145,16 +160,17 @@ def one_step_up(term: TermName, captures: Captures) -> Iterator[tuple[DesignVari
             yield variable, variable.set(captures, min(variable.most, value + max(1, round(_SHARE * value))))
 
 
-def worthwhile(objective: Objective, design: Captures) -> list[Addition]:
+def worthwhile(objective: Objective, design: Captures) -> list[Suggestion]:
     """Additions that lower sigma at all, in the order of the design variables."""
-    before, spent = objective.sigma(design), objective.cost(design)
-    found = []
+    before, found = objective.sigma(design), []
     for variable, more in one_step_up(objective.term, design):
         after = objective.sigma(more)
-        # From an infinite sigma, any finite one is a gain.
-        gain = math.log(before / after) if math.isfinite(before) else 100.0 if math.isfinite(after) else 1.0
-        if gain > _LEAST_GAIN:
-            found.append(Addition(variable, more, gain, objective.cost(more) - spent))
+        # From an infinite sigma, any finite one is a gain, and further captures may lead to one.
+        left = after / before if math.isfinite(before) else 0.0 if math.isfinite(after) else math.exp(-1)
+        if left < 1 - _LEAST_GAIN:
+            setting = Setting(variable.name, variable.of(design), variable.of(more))
+            cost = objective.cost(more) - objective.cost(design)
+            found.append(Suggestion(objective.term, setting, 100 * (1 - left), cost))
     return found
 
 
@@ -167,27 +183,20 @@ def cheapest(objective: Objective, captures: Captures, target: float) -> Capture
         additions = worthwhile(objective, design)
         if not additions:
             return None
-        design = max(additions, key=lambda one: one.gain / max(one.cost.seconds, 1e-9)).captures
+        best = max(additions, key=lambda one: one.per_second).setting
+        design = design.model_copy(update={best.name: best.planned})
     return None
 
 
 def _pruned(objective: Objective, design: Captures, target: float) -> Captures:
     """Lower every variable as far as the target allows, beginning with the one that saves most time."""
-    while True:
-        lower = [_lowered(objective, design, target, variable) for variable in DESIGN_VARIABLES[objective.term]]
-        best = min(lower, key=lambda one: objective.cost(one).seconds)
-        if objective.cost(best).seconds >= objective.cost(design).seconds:
-            return design
-        design = best
+    lower = [_lowered(objective, design, target, variable) for variable in DESIGN_VARIABLES[objective.term]]
+    best = min([design, *lower], key=lambda one: objective.cost(one).seconds)
+    return design if best == design else _pruned(objective, best, target)
 
 
 def _lowered(objective: Objective, design: Captures, target: float, variable: DesignVariable) -> Captures:
     """Lower one variable by halving an interval, since more captures never raise sigma."""
-    low, high = variable.least - 1, variable.of(design)
-    while high - low > 1:
-        middle = (low + high) // 2
-        if objective.sigma(variable.set(design, middle)) <= target:
-            high = middle
-        else:
-            low = middle
-    return variable.set(design, high)
+    counts = range(variable.least, variable.of(design))
+    spared = bisect_left(counts, True, key=lambda count: objective.sigma(variable.set(design, count)) <= target)
+    return variable.set(design, variable.least + spared)

@@ -6,13 +6,12 @@ Their information gives the sigma of one quantity, which stands for the term.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from types import MappingProxyType
 from typing import Final, final
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from udccal.planning.backscatter import BackscatterPredictor
 from udccal.planning.design import DESIGN_VARIABLES, QUANTITIES, DesignVariable, Floor, Predictor, Quantity
@@ -25,21 +24,16 @@ from udccal.rig import Captures
 from udccal.sessions.schema import TermName
 
 # Curves reach from a quarter of what was captured to four times as much.
-_REACH: Final = 4.0
-_POINTS: Final = 9
+_REACH: Final = np.geomspace(1 / 4, 4, 9)
 # Design variables that change sigma by less than this part of it do not matter to the quantity.
 _FLAT: Final = 1e-3
-
-
-_PREDICTORS: Final = MappingProxyType[TermName, Callable[[RigState], Predictor]](
-    {
-        "noise": NoisePredictor,
-        "geometry": GeometryPredictor,
-        "wire": WirePredictor,
-        "psf": PsfPredictor,
-        "backscatter": BackscatterPredictor,
-    }
-)
+_PREDICTORS: Final[Mapping[TermName, Callable[[RigState], Predictor]]] = {
+    "noise": NoisePredictor,
+    "geometry": GeometryPredictor,
+    "wire": WirePredictor,
+    "psf": PsfPredictor,
+    "backscatter": BackscatterPredictor,
+}
 
 
 def predictor_for(term: TermName, state: RigState) -> Predictor:
@@ -106,21 +100,15 @@ def forecast(term: TermName, state: RigState) -> Forecast | None:
     if not (np.isfinite(sigma) and sigma > 0):
         return None
     curves = [_curve(predictor, captures, variable) for variable in DESIGN_VARIABLES[term]]
-    matter = [curve for curve in curves if len(curve.counts) > 1 and np.ptp(curve.sigma) > _FLAT * sigma]
+    matter = tuple(curve for curve in curves if len(curve.counts) > 1 and np.ptp(curve.sigma) > _FLAT * sigma)
     idle = tuple(curve.variable.counted for curve in curves if curve not in matter)
-    used = predictor.used(captures)
-    return Forecast(term, QUANTITIES[term], sigma, predictor.floor(), used, tuple(matter), idle)
+    return Forecast(term, QUANTITIES[term], sigma, predictor.floor(), predictor.used(captures), matter, idle)
 
 
 def _curve(predictor: Predictor, captures: Captures, variable: DesignVariable) -> Curve:
     now = variable.of(captures)
-    counts = _counts(variable, now)
+    wanted = np.clip(np.rint(now * _REACH), min(variable.least, now), max(variable.most, now))
+    counts = np.unique(wanted)
     sigma = np.array([predictor.sigma(variable.set(captures, int(count))) for count in counts])
     finite = np.isfinite(sigma)
-    return Curve(variable, now, counts[finite].astype(np.float64), sigma[finite])
-
-
-def _counts(variable: DesignVariable, now: int) -> Int[np.ndarray, " n"]:
-    """From a quarter of ``now`` to four times as many, within what can be asked for."""
-    wanted = np.rint(now * np.geomspace(1 / _REACH, _REACH, _POINTS)).astype(int)
-    return np.unique(np.clip(wanted, min(variable.least, now), max(variable.most, now)))
+    return Curve(variable, now, counts[finite], sigma[finite])

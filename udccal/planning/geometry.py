@@ -1,4 +1,4 @@
-"""Prediction for geometry: the bundle of the boards that the procedure asks for, and the sigma of rays to the panel.
+"""Planning for geometry: views of boards, what they tell about rays to the panel, and which view to take next.
 
 A planned view holds the corners that it would show, with their scatter. The fit's own equations give the covariance of
 intrinsics and poses. The pose of the board on the jig gives the panel's rotation.
@@ -6,37 +6,160 @@ intrinsics and poses. The pose of the board on the jig gives the panel's rotatio
 
 from __future__ import annotations
 
-from functools import partial
+import functools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import final
 
+import cv2
 import jax
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float, Int
+from scipy.spatial.transform import Rotation
+from scipy.special import erf
 
-from udccal.arrangements import Board
-from udccal.fitting.engine.gaussian import Posterior, scaled_inverse
+from udccal.arrangements import Board, BoardSpec
+from udccal.fitting.engine.gaussian import Posterior, Prior, scaled_inverse
 from udccal.fitting.engine.orders import bic
 from udccal.fitting.geometry.bundle import (
     EVERY,
     ORDERS,
     Bundle,
     BundleProblem,
+    GeometryRules,
+    Intrinsics,
     Points,
+    projected,
 )
-from udccal.fitting.geometry.data import rig_prior
+from udccal.fitting.geometry.corners import board_points_mm, charuco_board
+from udccal.fitting.geometry.data import gather, rig_prior
 from udccal.fitting.geometry.fit import term_at, with_angles
 from udccal.models.geometry import panel_directions, project_directions
 from udccal.numerics import in_float64
-from udccal.planning.board_views import BoardView, BoardViews, points_of
 from udccal.planning.design import Floor
-from udccal.planning.state import RigState, sensor_samples
-from udccal.planning.steps import planned_steps
-from udccal.rig import Captures
+from udccal.planning.state import WHITE, EvenField, RigState, nominal_state, sensor_samples
+from udccal.planning.steps import PlannedStep
+from udccal.rig import Captures, RigDescription
 
+# White paper reflects so much more than black ink that half the difference is this part of white.
+_HALF_CONTRAST = 0.47
+# Edges after lens, pixel and the filter that makes a grey picture of a mosaic (one sigma).
+_EDGE_PX = 1.0
+# Radius of a saddle's window in squares: markers lie outside it.
+_WINDOW_SQUARES = 0.16
+# Rays are looked at in so many places along each side of the sensor.
 _ACROSS = 17
 # Stands for endless views.
 _MANY = 1e6
+_RULES = GeometryRules()
 _places, _directions = jax.jit(project_directions), jax.jit(panel_directions)
+
+
+@final
+@dataclass(frozen=True)
+class BoardView:
+    """Corners of one view (on the board, in px, with scatter), and its pose, board to camera."""
+
+    board: Float[np.ndarray, "n 3"]
+    image: Float[np.ndarray, "n 2"]
+    sigma: Float[np.ndarray, " n"]
+    pose: Float[np.ndarray, "6"]
+    parallel: bool
+
+
+@final
+class BoardViews:
+    """Makes the views of one rig's boards."""
+
+    def __init__(self, state: RigState) -> None:
+        self._state, self._field = state, EvenField(state)
+        self.intrinsics = Intrinsics.of_geometry(state.geometry).vector
+
+    def planned(self, step: PlannedStep, board: Board) -> BoardView | None:
+        """Return the view of a board in the light of a step; None where it shows too few corners to hold its pose."""
+        geometry, spec = self._state.geometry, board.spec
+        to_camera = Rotation.from_rotvec(np.asarray(geometry.rotation_rad)).inv()
+        rotation = to_camera * Rotation.from_rotvec(np.array(board.rotation_vector))
+        origin = to_camera.apply(np.array(board.translation_mm) - np.asarray(geometry.pupil_mm))
+        corners = board_points_mm(spec)
+        markers = np.asarray(charuco_board(spec).getObjPoints(), dtype=np.float64).reshape(-1, 3)
+        image, marks = (projected(self.intrinsics, rotation.apply(points) + origin)[0] for points in (corners, markers))
+        depth = float((rotation.apply(corners.mean(axis=0)) + origin)[2])
+        radius = self._window_px(spec, depth)
+        whole = self._inside(marks, 1.0).reshape(-1, 4).all(axis=1)
+        # Only corners with both markers in the picture count: without these the detector does not know their numbers.
+        near = np.linalg.norm(corners[:, None] - markers.reshape(-1, 4, 3).mean(axis=1), axis=2) < spec.square_mm
+        good = self._inside(image, np.ceil(radius) + 1) & ~(near & ~whole).any(axis=1)
+        if depth <= 0 or good.sum() < _RULES.least_corners:
+            return None
+        pose = np.append(rotation.as_rotvec(), origin)
+        sigma = self._sigma_px(step, image[good], radius, board.parallel_to_panel)
+        return BoardView(corners[good], image[good], sigma, pose, board.parallel_to_panel)
+
+    def seen(
+        self, step: PlannedStep, spec: BoardSpec, numbers: Int[np.ndarray, " n"], points_px: Float[np.ndarray, "n 2"]
+    ) -> BoardView | None:
+        """Return the view of corners that were found; None where they are too few to hold its pose.
+
+        Args:
+            step, spec: the light; the board, held by hand.
+            numbers, points_px: of the corners, as OpenCV counts them; where they are on the sensor.
+        """
+        corners, lens = board_points_mm(spec)[numbers], Intrinsics.of(self.intrinsics)
+        if len(corners) < _RULES.least_corners:
+            return None
+        found, turn, shift = cv2.solvePnP(corners, points_px, lens.matrix, lens.distortion)
+        if not found:
+            return None
+        pose = np.append(turn, shift)
+        sigma = self._sigma_px(step, points_px, self._window_px(spec, float(pose[5])), parallel=False)
+        return BoardView(corners, points_px, sigma, pose, parallel=False)
+
+    def _window_px(self, spec: BoardSpec, depth_mm: float) -> float:
+        square_px = spec.square_mm / depth_mm * self.intrinsics[0]
+        return float(np.clip(_WINDOW_SQUARES * square_px, *_RULES.window_px))
+
+    def _inside(self, pixels: Float[np.ndarray, "n 2"], margin: float) -> Bool[np.ndarray, " n"]:
+        last = np.array([self._state.rig.camera.columns, self._state.rig.camera.rows]) - 1 - margin
+        return np.asarray(np.all((pixels >= margin) & (pixels <= last), axis=1))
+
+    def _sigma_px(
+        self, step: PlannedStep, pixels: Float[np.ndarray, "n 2"], radius: float, parallel: bool
+    ) -> Float[np.ndarray, " n"]:
+        """Scatter by noise of the board's frames and by all else; that of the flat field, of far more, is left out."""
+        state, errors = self._state, self._state.model_errors
+        signal = step.level * state.full_well_e * np.outer(self._field.at(pixels), WHITE[[0, 1, 1, 2]])
+        temporal = state.variance_e(0.5 * signal, step.exposures_s[0]) / len(step.exposures_s)
+        relative = np.sqrt((temporal / signal**2).mean(axis=1))
+        beside_px = errors.on_jig_px if parallel else errors.by_hand_px
+        return np.hypot(relative / _HALF_CONTRAST * _saddle_scatter(radius), beside_px)
+
+
+def points_of(views: Sequence[BoardView]) -> Points:
+    """Return the corners of those views that hold a pose, as a fit gathers them."""
+    return gather([v.board for v in views], [v.image for v in views], [v.sigma for v in views]).points
+
+
+def lens_information(view: BoardView | None, intrinsics: Float[np.ndarray, "9"]) -> Float[np.ndarray, "9 9"]:
+    """Return the Fisher information of one view on the intrinsics, whatever its own pose; none without a pose."""
+    size = len(intrinsics)
+    if view is None or not (points := points_of([view])).names:
+        return np.zeros((size, size))
+    problem = BundleProblem(points, EVERY, Prior(np.zeros(size), np.zeros((0, size))))
+    return problem.equations_at(Bundle(intrinsics, view.pose[None])).marginal()[0]
+
+
+def _saddle_scatter(radius_px: float) -> float:
+    """Scatter by axis in px of a weighted fit of erf(x) erf(y) with a free slope, at unit noise over contrast."""
+    half = int(np.ceil(radius_px))
+    y, x = np.mgrid[-half : half + 1, -half : half + 1].astype(np.float64) / _EDGE_PX
+    weight = np.clip(1 - (x**2 + y**2) * (_EDGE_PX / radius_px) ** 2, 0.0, None).ravel()
+    across = np.sqrt(2 / np.pi) / _EDGE_PX * np.exp(-0.5 * x**2) * erf(y / np.sqrt(2))
+    design = np.stack([across.ravel(), y.ravel()], axis=1)
+    # The window's weights are not those of the noise: the covariance is a sandwich.
+    solved = np.linalg.solve(design.T @ (design * weight[:, None]), (design * weight[:, None]).T)
+    return float(np.linalg.norm(solved[0]))
 
 
 @final
@@ -44,19 +167,18 @@ class GeometryPredictor:
     """Predicts the sigma in px, by axis, of where rays fixed to the panel land."""
 
     def __init__(self, state: RigState) -> None:
-        self._state = state
-        self._boards = BoardViews(state)
-        self._prior = rig_prior(state.rig)
-        self._known: dict[Board, BoardView | None] = {}
+        self._state, self._prior = state, rig_prior(state.rig)
+        boards = BoardViews(state)
+        self._intrinsics, self._view_of = boards.intrinsics, functools.cache(boards.planned)
 
     def sigma(self, captures: Captures) -> float:
         """Root mean square over the sensor and both axes; see ``Predictor``."""
-        return self._ray_sigma(self._views(captures), 1.0)
+        return self._ray_sigma(captures, 1.0)
 
     def floor(self) -> Floor:
         """The sigma when endless views held by hand have determined the lens."""
         return Floor(
-            self._ray_sigma(self._views(self._state.rig.captures), _MANY),
+            self._ray_sigma(self._state.rig.captures, _MANY),
             "The panel's rotation rests on the one view of the board on the jig: a larger or nearer board there, or "
             "corners that scatter less, would lower that.",
         )
@@ -65,28 +187,22 @@ class GeometryPredictor:
         """1, since the fit uses all corners; see ``Predictor``."""
         return 1.0
 
-    def _views(self, captures: Captures) -> list[BoardView]:
-        views = []
-        for step in planned_steps("geometry", self._state.with_captures(captures)):
-            if isinstance(board := step.arrangement, Board):
-                if board not in self._known:
-                    self._known[board] = self._boards.planned(step, board)
-                views.append(self._known[board])
-        return [view for view in views if view is not None]
-
     @in_float64
-    def _ray_sigma(self, views: list[BoardView], count: float) -> float:
+    def _ray_sigma(self, captures: Captures, count: float) -> float:
         """Sigma in px of rays, by axis, where each view held by hand counts ``count`` times."""
+        steps = self._state.with_captures(captures).steps("geometry")
+        planned = (self._view_of(step, step.arrangement) for step in steps if isinstance(step.arrangement, Board))
+        points = points_of(shown := [view for view in planned if view is not None])
+        views = [shown[k] for k in points.names]
         parallel = [k for k, view in enumerate(views) if view.parallel]
         if not parallel:
-            return float("inf")
-        by_hand = [1.0 if view.parallel else count**-0.5 for view in views]
-        points = points_of(views).scaled(np.array(by_hand))
-        bundle = Bundle(self._boards.intrinsics, np.array([view.pose for view in views]))
-        free = self._order(points, bundle)
-        cov = BundleProblem(points, free, self._prior).equations_at(bundle).joint_cov()
-        x, cov = with_angles(bundle.intrinsics, bundle.poses, cov, parallel)
-        posterior = Posterior.from_cov(x, cov, partial(term_at, pupil=np.asarray(self._state.geometry.pupil_mm)))
+            return math.inf
+        points = points.scaled(np.array([1.0 if view.parallel else count**-0.5 for view in views]))
+        bundle = Bundle(self._intrinsics, np.array([view.pose for view in views]))
+        problem = BundleProblem(points, self._order(points, bundle), self._prior)
+        x, cov = with_angles(bundle.intrinsics, bundle.poses, problem.equations_at(bundle).joint_cov(), parallel)
+        pupil = np.asarray(self._state.geometry.pupil_mm)
+        posterior = Posterior.from_cov(x, cov, functools.partial(term_at, pupil=pupil))
         directions = np.asarray(_directions(posterior.term_at(x), sensor_samples(self._state.rig, _ACROSS)))
         sigma = posterior.sigma_of(lambda term: np.asarray(_places(term, directions)))
         return float(np.sqrt((sigma**2).mean()))
@@ -98,8 +214,55 @@ class GeometryPredictor:
         freedom = max(samples - EVERY.sum() - bundle.poses.size, 1)
 
         def criterion(free: Bool[np.ndarray, "9"]) -> float:
-            held = self._boards.intrinsics * ~free
+            held = self._intrinsics * ~free
             rise = float(held @ scaled_inverse(cov * np.outer(~free, ~free)) @ held)
             return bic(samples * float(np.log1p(rise / freedom)), float(free.sum()), samples)
 
         return min(ORDERS.values(), key=criterion)
+
+
+@final
+class NextView:
+    """Chooses poses one at a time: where a view lowers most the intrinsic's sigma that is worst.
+
+    Sigmas count in units of those that the procedure's own poses would give, held exactly. Views still to come count
+    as those poses do on average. No pose is chosen twice before all others.
+    """
+
+    def __init__(self, rig: RigDescription, poses: Sequence[Board]) -> None:
+        """Args:
+        rig: with the procedure's captures; its nominal values are used.
+        poses: to choose from, all of one board.
+        """
+        state = nominal_state(rig)
+        self._views, self._poses, self._open = BoardViews(state), poses, list(range(len(poses)))
+        self._known, by_hand = rig_prior(rig).precision, []
+        for step in state.steps("geometry"):
+            if isinstance(board := step.arrangement, Board):
+                told, self._step = self._told(self._views.planned(step, board)), step
+                if board.parallel_to_panel:
+                    self._known = self._known + told
+                else:
+                    by_hand.append(told)
+        self._to_come, self._average = len(by_hand), np.mean(by_hand, axis=0)
+        self._usual = _sigma(self._known + np.sum(by_hand, axis=0))
+        self._tell = np.array([self._told(self._views.planned(self._step, pose)) for pose in poses])
+
+    def taken(self, numbers: Int[np.ndarray, " n"], points_px: Float[np.ndarray, "n 2"]) -> None:
+        """Count a view that was captured, by the corners seen; see ``BoardViews.seen``."""
+        self._known = self._known + self._told(self._views.seen(self._step, self._poses[0].spec, numbers, points_px))
+        self._to_come -= 1
+
+    def pose(self) -> Board:
+        """Return the pose to ask for now; another one each time."""
+        self._open = self._open or list(range(len(self._poses)))
+        later = max(self._to_come - 1, 0) * self._average
+        worst = (_sigma(self._known + later + self._tell[self._open]) / self._usual).max(axis=-1)
+        return self._poses[self._open.pop(int(worst.argmin()))]
+
+    def _told(self, view: BoardView | None) -> Float[np.ndarray, "9 9"]:
+        return lens_information(view, self._views.intrinsics)
+
+
+def _sigma(information: Float[np.ndarray, "*k n n"]) -> Float[np.ndarray, "*k n"]:
+    return np.asarray(np.sqrt(np.diagonal(scaled_inverse(information, 1e-15), axis1=-2, axis2=-1)))

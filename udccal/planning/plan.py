@@ -2,24 +2,25 @@
 
 from __future__ import annotations
 
-import functools
 import math
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections import Counter
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Final, final, get_args
+from typing import Final, final
 
 from udccal.errors import UdccalError
-from udccal.planning.design import DESIGN_VARIABLES, QUANTITIES, Addition, Objective, cheapest, worthwhile
+from udccal.planning.design import DESIGN_VARIABLES, QUANTITIES, Objective, Setting, Suggestion, cheapest, worthwhile
 from udccal.planning.forecast import predictor_for
 from udccal.planning.state import RigState
-from udccal.planning.steps import NOTHING, Cost, cost_of
+from udccal.planning.steps import Cost
 from udccal.rig import Captures
 from udccal.sessions.schema import TermName
 
 # A target closer to the floor than this factor needs endless captures.
 _NEAR_FLOOR: Final = 1.001
-_FORM: Final = re.compile(r"(?P<term>[^=\s]+)=(?P<value>[-+.0-9]*(?:[eE][-+]?[0-9]+)?)(?P<unit>%|[a-zA-Z]*)")
+_NUMBER: Final = r"[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?"
+_FORM: Final = re.compile(rf"(?P<term>[^=\s]+)=(?P<value>{_NUMBER})(?P<unit>%|[a-zA-Z]*)")
 _EXAMPLE: Final = "Write, for example, wire=0.05% or geometry=0.1px."
 
 
@@ -30,27 +31,6 @@ class Target:
 
     term: TermName
     sigma: float
-
-
-@final
-@dataclass(frozen=True)
-class Setting:
-    """One design variable: as the rig has it, and as planned."""
-
-    name: str
-    before: int
-    planned: int
-
-
-@final
-@dataclass(frozen=True)
-class Suggestion:
-    """One design variable one step up: the fall of sigma in per cent of itself, and the cost."""
-
-    term: TermName
-    setting: Setting
-    gain_percent: float
-    cost: Cost
 
 
 @final
@@ -113,32 +93,23 @@ def parse_targets(words: Sequence[str]) -> tuple[Target, ...]:
         UdccalError: when a word is no target, names no term or a wrong unit, or a term has two targets.
     """
     targets = [_target(word) for word in words]
-    terms = [target.term for target in targets]
-    for term in terms:
-        if terms.count(term) > 1:
-            raise UdccalError(f"Expected one target for {term}, found {terms.count(term)}. Keep one of them.")
-    return tuple(sorted(targets, key=lambda target: get_args(TermName).index(target.term)))
+    for term, many in Counter(target.term for target in targets).items():
+        if many > 1:
+            raise UdccalError(f"Expected one target for {term}, found {many}. Keep one of them.")
+    return tuple(sorted(targets, key=lambda target: list(QUANTITIES).index(target.term)))
 
 
 def _target(word: str) -> Target:
     match = _FORM.fullmatch(word.strip())
-    if match is None:
-        raise UdccalError(f"Expected a target such as wire=0.05%, found '{word}'. {_EXAMPLE}")
-    names: tuple[TermName, ...] = get_args(TermName)
-    term = next((name for name in names if name == match["term"]), None)
+    if match is None or not 0 < float(match["value"]) < math.inf:
+        raise UdccalError(f"Expected a target above zero, such as wire=0.05%, found '{word}'. {_EXAMPLE}")
+    term = next((name for name in QUANTITIES if name == match["term"]), None)
     if term is None:
-        raise UdccalError(f"Expected a target for {', '.join(names)}, found one for '{match['term']}'. {_EXAMPLE}")
-    try:
-        sigma = float(match["value"])
-    except ValueError:
-        sigma = math.nan
-    if not (math.isfinite(sigma) and sigma > 0):
-        raise UdccalError(f"Expected a target above zero, found '{word}'. {_EXAMPLE}")
-    unit = QUANTITIES[term].unit
-    if match["unit"] != unit:
+        raise UdccalError(f"Expected a target for {', '.join(QUANTITIES)}, found one for '{match['term']}'. {_EXAMPLE}")
+    if match["unit"] != (unit := QUANTITIES[term].unit):
         found = f"'{match['unit']}'" if match["unit"] else "none"
         raise UdccalError(f"Expected the target of {term} in {unit}, found the unit {found} in '{word}'. {_EXAMPLE}")
-    return Target(term, sigma)
+    return Target(term, float(match["value"]))
 
 
 def make_plan(
@@ -162,33 +133,30 @@ def make_plan(
         progress(target.term)
         captures, plan = _plan_term(state, target, captures)
         plans.append(plan)
-    untouched = tuple(term for term in get_args(TermName) if term not in {plan.term for plan in plans})
-    rest = sum((cost_of(term, state) for term in untouched), start=NOTHING)
+    untouched = tuple(term for term in QUANTITIES if term not in {plan.term for plan in plans})
+    rest = sum((state.cost(term) for term in untouched), start=Cost())
     return CapturePlan(
         captures=captures,
         terms=tuple(plans),
         untouched=untouched,
         cost=sum((plan.cost for plan in plans), start=rest),
         cost_before=sum((plan.cost_before for plan in plans), start=rest),
-        per_second=_most_per_second(plan.per_second for plan in plans),
-        per_set_up=_most_per_set_up(plan.per_set_up for plan in plans),
+        per_second=max(filter(None, (p.per_second for p in plans)), key=lambda one: one.per_second, default=None),
+        per_set_up=max(filter(None, (p.per_set_up for p in plans)), key=lambda one: one.per_set_up, default=None),
     )
 
 
 def _plan_term(state: RigState, target: Target, captures: Captures) -> tuple[Captures, TermPlan]:
-    term, before = target.term, state.rig.captures
-    predictor = predictor_for(term, state)
-    objective = Objective(
-        term, functools.cache(predictor.sigma), functools.cache(lambda some: cost_of(term, state.with_captures(some)))
-    )
-    floor = predictor.floor()
-    found = cheapest(objective, captures, target.sigma) if target.sigma > _NEAR_FLOOR * floor.sigma else None
-    planned = captures if found is None else found
-    more = [_suggestion(term, planned, one) for one in worthwhile(objective, planned)]
+    term, before, predictor = target.term, state.rig.captures, predictor_for(target.term, state)
+    objective = Objective(term, predictor.sigma, lambda some: state.with_captures(some).cost(term))
+    floor, quantity, planned = predictor.floor(), QUANTITIES[term], captures
+    if target.sigma > _NEAR_FLOOR * floor.sigma:
+        planned = cheapest(objective, captures, target.sigma) or captures
+    more = worthwhile(objective, planned)
     return planned, TermPlan(
         term=term,
-        unit=QUANTITIES[term].unit,
-        meaning=QUANTITIES[term].meaning,
+        unit=quantity.unit,
+        meaning=quantity.meaning,
         target=target.sigma,
         sigma=objective.sigma(planned),
         sigma_before=objective.sigma(before),
@@ -198,23 +166,6 @@ def _plan_term(state: RigState, target: Target, captures: Captures) -> tuple[Cap
         settings=tuple(Setting(one.name, one.of(before), one.of(planned)) for one in DESIGN_VARIABLES[term]),
         cost=objective.cost(planned),
         cost_before=objective.cost(before),
-        per_second=_most_per_second(more),
-        per_set_up=_most_per_set_up(more),
+        per_second=max(more, key=lambda one: one.per_second, default=None),
+        per_set_up=max(more, key=lambda one: one.per_set_up, default=None),
     )
-
-
-def _suggestion(term: TermName, planned: Captures, addition: Addition) -> Suggestion:
-    one = addition.variable
-    setting = Setting(one.name, one.of(planned), one.of(addition.captures))
-    return Suggestion(term, setting, 100 * (1 - math.exp(-addition.gain)), addition.cost)
-
-
-def _most_per_second(suggestions: Iterable[Suggestion | None]) -> Suggestion | None:
-    made = filter(None, suggestions)
-    return max(made, key=lambda one: one.gain_percent / max(one.cost.seconds, 1e-9), default=None)
-
-
-def _most_per_set_up(suggestions: Iterable[Suggestion | None]) -> Suggestion | None:
-    """The suggestion that lowers sigma most per set-up; suggestions without a set-up go first."""
-    made = filter(None, suggestions)
-    return max(made, key=lambda one: (one.cost.set_ups <= 0, one.gain_percent / max(one.cost.set_ups, 1)), default=None)

@@ -12,7 +12,7 @@ from pydantic import ValidationError
 from udccal.errors import RigError
 from udccal.io.atomic import write_atomically
 from udccal.rig import Captures, RigDescription
-from udccal.rig_folders import find_rig
+from udccal.rig_folders import RIG_FILE, find_rig
 
 # The section from its heading to the next, or to the end.
 _SECTION: Final = re.compile(r"^\[captures\][^\n]*\n(?:(?!\[)[^\n]*(?:\n|\Z))*", re.MULTILINE)
@@ -20,9 +20,6 @@ _SECTION: Final = re.compile(r"^\[captures\][^\n]*\n(?:(?!\[)[^\n]*(?:\n|\Z))*",
 
 def check_absent(path: Path) -> None:
     """Check that nothing exists at a path that is to be written.
-
-    Args:
-        path: of the new file.
 
     Raises:
         RigError: when something exists there.
@@ -43,10 +40,19 @@ def write_planned_rig(rig_name: str | Path, captures: Captures, path: Path) -> N
         RigError: when ``path`` exists or cannot be written, or when the captures of the description cannot be replaced.
     """
     check_absent(path)
-    source = find_rig(rig_name) / "rig.toml"
+    source = find_rig(rig_name) / RIG_FILE
     text = source.read_text(encoding="utf-8")
     planned = with_captures(text, captures)
-    _check(text, planned, captures, source)
+    try:
+        wanted = RigDescription.model_validate({**tomllib.loads(text), "captures": captures.model_dump()})
+        changed = RigDescription.model_validate(tomllib.loads(planned)) != wanted
+    except (tomllib.TOMLDecodeError, ValidationError):
+        changed = True
+    if changed:
+        raise RigError(
+            f"Expected one plain [captures] section in {source} that can be replaced, found another form of it. Write "
+            "it as one section with a line per number."
+        )
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(path, planned.encode("utf-8"))
@@ -58,27 +64,8 @@ def write_planned_rig(rig_name: str | Path, captures: Captures, path: Path) -> N
 
 def with_captures(text: str, captures: Captures) -> str:
     """The description's text with another block of captures, added at its end where there was none."""
-    lines = [f"{name} = {value!r}" for name, value in captures.model_dump().items()]
-    block = "\n".join(["[captures]", *lines]) + "\n"
-    found = _SECTION.search(text)
-    if found is None:
-        return f"{text.rstrip()}\n\n{block}"
-    after = text[found.end() :]
-    return text[: found.start()] + block + ("\n" if after else "") + after
-
-
-def _check(before: str, after: str, captures: Captures, source: Path) -> None:
-    """Check that the new text differs from the old one in the captures alone."""
-    try:
-        wanted = RigDescription.model_validate({**tomllib.loads(before), "captures": captures.model_dump()})
-        found = RigDescription.model_validate(tomllib.loads(after))
-    except (tomllib.TOMLDecodeError, ValidationError) as error:
-        raise RigError(
-            f"Expected a [captures] section in {source} that can be replaced, found: {error}. Write it as one section "
-            "with a line per number."
-        ) from error
-    if found != wanted:
-        raise RigError(
-            f"Expected one plain [captures] section in {source}, found another form of it. Write it as one section "
-            "with a line per number."
-        )
+    block = "\n".join(["[captures]", *(f"{name} = {value!r}" for name, value in captures.model_dump().items())]) + "\n"
+    before, *after = _SECTION.split(text, maxsplit=1)
+    if not after:
+        return f"{before.rstrip()}\n\n{block}"
+    return before + block + (f"\n{after[0]}" if after[0] else "")

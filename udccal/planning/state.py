@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Any, final
 
 import jax
 import numpy as np
 from jaxtyping import Float
-from scipy.ndimage import map_coordinates
+from scipy.interpolate import RegularGridInterpolator
 
-from udccal.arrangements import Arrangement, PanelPicture
-from udccal.calibration import Calibration
 from udccal.cfa import cfa_named
 from udccal.fitting.geometry.fit import BY_HAND, ON_JIG
 from udccal.fitting.nominal import nominal_geometry
@@ -20,16 +19,13 @@ from udccal.models.geometry import Geometry
 from udccal.models.noise import Noise, variance_e
 from udccal.models.wire import Wire, wire_values
 from udccal.numerics import in_float64
-from udccal.planning.exposures import nominal_full_s
-from udccal.profiles.profile import Profile
-from udccal.result import FitResult, FitStatus
+from udccal.planning.steps import PANEL_FULL_S, Cost, PlannedStep, cost_of, steps_at, with_small_panel
+from udccal.result import FitResult, FitStatus, TermResults
 from udccal.rig import Captures, RigDescription
+from udccal.sessions.schema import TermName
 
-# Numbers that data sheets of industrial cameras leave out, as EMVA 1288 reports commonly show them.
-_SIGMA_D_E, _LAMBDA, _SIGMA_ROW_E = 5.0, 0.14, 0.6
-_DARK_E_PER_S, _DSNU_E, _PRNU = 15.0, 2.0, 0.0055
-# White light of LEDs as red, green and blue photodiodes see it.
-WHITE = (0.6, 1.0, 0.7)
+# White light of LEDs as red, green and blue photodiodes see it, 1 for the brightest.
+WHITE = np.array([0.6, 1.0, 0.7])
 # Distortion (k1, k2) that is usual for lenses of a short focal length.
 _DISTORTION = (-0.07, 0.035, 0.0, 0.0, -0.005)
 # Shading is smooth; the modulation by the rows hardly changes the number of electrons.
@@ -44,15 +40,16 @@ class ModelErrors:
     """Model errors of the terms, in addition to noise, as a profile's fits have found them.
 
     Attributes:
-        on_jig_px, by_hand_px: scatter of a board's corners by axis in addition to noise; None where not known.
+        on_jig_px, by_hand_px: scatter of a board's corners by axis in addition to noise. Edges of the board on the jig
+            run along the sensor's rows: samples see them at few phases, and corners scatter more.
         wire, psf: relative model error; the psf's is that which its fit allows for, see ``fitting.psf.data.left_out``.
         psf_kernel: relative L2 error of the kernel, in addition to noise, where it was not captured.
         backscatter: error of the ratio to white.
         inflation: factor on the variances of the backscatter's parameters, since its residuals are correlated.
     """
 
-    on_jig_px: float | None = None
-    by_hand_px: float | None = None
+    on_jig_px: float = 0.0085
+    by_hand_px: float = 0.006
     wire: float = 0.0
     psf: float = 0.0
     psf_kernel: float = 0.0
@@ -83,92 +80,95 @@ class RigState:
         """The same with other captures."""
         return replace(self, rig=self.rig.model_copy(update={"captures": captures}))
 
+    def steps(self, term: TermName, drawn: bool = True) -> list[PlannedStep]:
+        """The steps of a term's procedure at the expected exposures; it raises the errors of ``steps_at``.
+
+        For counting, pictures on the panel need not be ``drawn``: they are tiny then.
+        """
+        rig, white = self.rig if drawn else with_small_panel(self.rig), self.white
+        panel_full_s = PANEL_FULL_S if white is None else self.full_well_e / float(white.max())
+        return list(steps_at(term, rig, panel_full_s))
+
+    def cost(self, term: TermName) -> Cost:
+        """Frames, seconds and set-ups of a term's procedure; it raises the errors of ``steps_at``."""
+        return cost_of(self.steps(term, drawn=False), self.rig)
+
+    @property
+    def white(self) -> Float[np.ndarray, "3 a b"] | None:
+        """Measured light of a white picture on the backscatter's grid in e-/s; None where no light was measured."""
+        mask = None if self.backscatter is None else np.asarray(self.backscatter.mask, dtype=np.float64)
+        return None if mask is None or mask.max() <= 0 else mask
+
     @property
     def full_well_e(self) -> float:
         """Electrons between black level and saturation."""
-        noise = self.noise
-        return float(np.asarray((noise.saturation_DN - noise.black_DN) / noise.K_DN_per_e))
+        return float((self.noise.saturation_DN - self.noise.black_DN) / self.noise.K_DN_per_e)
+
+    @in_float64
+    def variance_e(self, signal_e: Float[np.ndarray, "*n"], exposure_s: float) -> Float[np.ndarray, "*n"]:
+        """Temporal variance of single samples in e-^2; see ``models.noise.variance_e``."""
+        return np.asarray(_variance_e(self.noise, signal_e, exposure_s))
 
 
 def nominal_state(rig: RigDescription) -> RigState:
-    """The state of a rig that was never calibrated.
-
-    Args:
-        rig: its description, with the captures that are evaluated.
+    """The state of a rig that was never calibrated, with the captures of its description, which are evaluated.
 
     Returns:
         terms at the description's nominal values, with usual noise and distortion, and no model errors.
     """
-    camera = rig.camera
-    K, black = camera.K_DN_per_e.value, camera.black_DN.value
+    K, black = rig.camera.K_DN_per_e.value, rig.camera.black_DN.value
+    # Data sheets of industrial cameras leave most numbers out: these are as EMVA 1288 reports commonly show them.
     noise = Noise(
         K_DN_per_e=K,
         black_DN=black,
-        saturation_DN=min(float(rig.saturation_DN), black + K * camera.full_well_e.value),
-        sigma_d_e=_SIGMA_D_E,
-        lambda_read=_LAMBDA,
-        sigma_row_DN=_SIGMA_ROW_E * K,
+        saturation_DN=min(float(rig.saturation_DN), black + K * rig.camera.full_well_e.value),
+        sigma_d_e=5.0,
+        lambda_read=0.14,
+        sigma_row_DN=0.6 * K,
         q_DN=1.0,
-        dark_current_e_per_s=_DARK_E_PER_S,
-        DSNU1288_e=_DSNU_E,
-        PRNU1288=_PRNU,
+        dark_current_e_per_s=15.0,
+        DSNU1288_e=2.0,
+        PRNU1288=0.0055,
     )
     return RigState(rig, noise, replace(nominal_geometry(rig), distortion=np.array(_DISTORTION)))
 
 
-def measured_state(rig: RigDescription, fits: Calibration | Profile) -> RigState:
+def measured_state(rig: RigDescription, fits: TermResults) -> RigState:
     """The state of a rig that was calibrated.
 
     Args:
         rig: its description, with the captures that are evaluated.
-        fits: of that rig.
+        fits: of that rig: a calibration or a profile.
 
     Returns:
         terms and model errors as fitted; a term whose fit did not converge is that of the rig as built.
     """
-    nominal = nominal_state(rig)
-    geometry_seen = _converged(fits.geometry)
-    return RigState(
-        rig=rig,
-        noise=fits.noise.term if _converged(fits.noise) else nominal.noise,
-        geometry=fits.geometry.term if geometry_seen else nominal.geometry,
-        wire=fits.wire.term if _converged(fits.wire) else None,
-        backscatter=fits.backscatter.term if _converged(fits.backscatter) else None,
-        model_errors=ModelErrors(
-            on_jig_px=_corners_px(fits.geometry, ON_JIG) if geometry_seen else None,
-            by_hand_px=_corners_px(fits.geometry, BY_HAND) if geometry_seen else None,
-            wire=(fits.wire.diagnostic("wire_map_model_sigma") or 0.0) / 100,
-            psf=fits.psf.diagnostic("model_error") or 0.0,
-            psf_kernel=fits.psf.diagnostic("kernel_error_l2") or 0.0,
-            backscatter=fits.backscatter.diagnostic("model_error_of_white") or 0.0,
-            inflation=max(fits.backscatter.diagnostic("pattern_inflation") or 0.0, 1.0),
-        ),
+    built, (noise, geometry, wire, psf, backscatter) = nominal_state(rig), fits.results
+
+    def fitted(result: FitResult[Any], otherwise: Any = None) -> Any:
+        return result.term if result.status is FitStatus.CONVERGED else otherwise
+
+    def corners_px(name: str, usual: float) -> float:
+        scatter_px = geometry.diagnostic(name) if fitted(geometry) else None
+        # Views that disagree scatter by more.
+        factor = max(geometry.diagnostic("variance_factor") or 0.0, 1.0)
+        return usual if scatter_px is None else scatter_px * math.sqrt(factor)
+
+    errors = ModelErrors(
+        on_jig_px=corners_px(ON_JIG, ModelErrors.on_jig_px),
+        by_hand_px=corners_px(BY_HAND, ModelErrors.by_hand_px),
+        wire=(wire.diagnostic("wire_map_model_sigma") or 0.0) / 100,
+        psf=psf.diagnostic("model_error") or 0.0,
+        psf_kernel=psf.diagnostic("kernel_error_l2") or 0.0,
+        backscatter=backscatter.diagnostic("model_error_of_white") or 0.0,
+        inflation=max(backscatter.diagnostic("pattern_inflation") or 0.0, 1.0),
     )
-
-
-def _converged(result: FitResult[Any]) -> bool:
-    return result.status is FitStatus.CONVERGED
-
-
-def _corners_px(geometry: FitResult[Geometry], name: str) -> float | None:
-    """Scatter of corners in addition to noise, disagreement of views included; None where the fit lacks the number."""
-    scatter_px, factor = geometry.diagnostic(name), geometry.diagnostic("variance_factor") or 0.0
-    return None if scatter_px is None else scatter_px * float(np.sqrt(max(factor, 1.0)))
-
-
-def full_s(arrangement: Arrangement, state: RigState) -> float:
-    """Exposure in seconds at which the brightest sample of an arrangement would fill its well."""
-    if isinstance(arrangement, PanelPicture) and state.backscatter is not None and np.max(state.backscatter.mask) > 0:
-        return state.full_well_e / float(np.max(state.backscatter.mask))
-    return nominal_full_s(arrangement, state.rig)
+    terms = fitted(noise, built.noise), fitted(geometry, built.geometry), fitted(wire), fitted(backscatter)
+    return RigState(rig, *terms, errors)
 
 
 def sensor_samples(rig: RigDescription, across: int) -> Float[np.ndarray, "n 2"]:
-    """Pixels spread evenly over the sensor.
-
-    Args:
-        rig: for the size of the sensor.
-        across: number of pixels along x and along y.
+    """Pixels spread evenly over the sensor: ``across`` along x, and as many along y.
 
     Returns:
         (x, y) in px, ``across`` squared of them, not rounded to whole pixels.
@@ -177,45 +177,29 @@ def sensor_samples(rig: RigDescription, across: int) -> Float[np.ndarray, "n 2"]
     return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
 
 
-def built_wire(state: RigState) -> Wire:
-    """The wire as the rig was built, with a round pupil and its strongest harmonics."""
-    from udccal.fitting.wire.rules import ideal_wire, possible_harmonics, wire_start
-
-    start = wire_start(state.rig)
-    return ideal_wire(state.geometry, start, possible_harmonics(start).orders)
-
-
 @final
 class EvenField:
     """An even white field as one rig sees it, 1 at its brightest: the wire's measured shading, or the cos^4 law."""
 
     @in_float64
     def __init__(self, state: RigState) -> None:
-        camera, geometry, wire = state.rig.camera, state.geometry, state.wire
-        self._size = np.array([camera.columns, camera.rows])
-        self._cfa = cfa_named(camera.cfa)
-        y, x = (np.linspace(0, size - 1, count) for size, count in zip(self._size[::-1], _FIELD_GRID, strict=True))
+        camera, geometry, self._cfa = state.rig.camera, state.geometry, cfa_named(state.rig.camera.cfa)
+        sizes = zip((camera.rows, camera.columns), _FIELD_GRID, strict=True)
+        y, x = (np.linspace(0, size - 1, count) for size, count in sizes)
         pixels = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-        if wire is None:
-            ideal = (pixels - np.asarray(geometry.principal_point_px)) / np.asarray(geometry.focal_px)
+        if state.wire is None:
+            ideal = (pixels - geometry.principal_point_px) / geometry.focal_px
             values = (1 + (ideal**2).sum(axis=1)) ** -2.0
         else:
-            values = np.asarray(_wire_values(wire, pixels, camera.rows, camera.columns), dtype=np.float64)
-        self._grid = (values / values.max()).reshape(_FIELD_GRID)
+            values = np.asarray(_wire_values(state.wire, pixels, camera.rows, camera.columns), dtype=np.float64)
+        values = (values / values.max()).reshape(_FIELD_GRID)
+        self._light = RegularGridInterpolator((y, x), values, bounds_error=False, fill_value=None)
 
     def at(self, pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
         """Light at pixels, by linear interpolation."""
-        places = (pixels / (self._size - 1) * (np.array(_FIELD_GRID[::-1]) - 1)).T[::-1]
-        return np.asarray(map_coordinates(self._grid, places, order=1, mode="nearest"))
+        return np.asarray(self._light(pixels[:, ::-1]))
 
     def signal(self, pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
         """Signal of samples of a white field, 1 for the brightest of all."""
         x, y = np.round(pixels).astype(np.int64).T
-        channel = self._cfa.channels[y % self._cfa.rows, x % self._cfa.columns]
-        return np.asarray(self.at(pixels) * (np.array(WHITE) / max(WHITE))[channel])
-
-
-@in_float64
-def sample_variance_e(state: RigState, signal_e: Float[np.ndarray, "*n"], exposure_s: float) -> Float[np.ndarray, "*n"]:
-    """Temporal variance of single samples in e-^2; see ``models.noise.variance_e``."""
-    return np.asarray(_variance_e(state.noise, signal_e, exposure_s))
+        return np.asarray(self.at(pixels) * WHITE[self._cfa.channels[y % self._cfa.rows, x % self._cfa.columns]])

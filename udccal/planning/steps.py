@@ -1,14 +1,42 @@
-"""The steps that the procedures would take for a rig, the time of their frames, and the set-ups by a person."""
+"""The steps that a procedure would take for a rig, at the exposures that are expected, and their cost."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
-from typing import final
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import groupby
+from typing import Any, final
 
-from udccal.planning.exposures import PlannedStep, steps_at, with_small_panel
-from udccal.planning.state import RigState, full_s
+from udccal.arrangements import Arrangement, Led, PanelPicture
+from udccal.errors import UdccalError
+from udccal.plugins import find_procedure
+from udccal.rig import RigDescription
 from udccal.sessions.schema import TermName
+
+# Exposures at which an LED and the panel usually fill the well of their brightest sample.
+_LED_FULL_S, PANEL_FULL_S = 125e-6, 0.1
+# The time of a capture does not depend on the panel's picture: pictures are drawn this small for counting.
+_COUNTING_PX = 8
+
+
+@final
+@dataclass(frozen=True)
+class PlannedStep:
+    """One step as it will be carried out.
+
+    Attributes:
+        exposures_s: exposure of every frame that is kept.
+        level: of the range from black to saturation that the brightest sample of the first frame reaches in the light
+            that the exposure was metered in; 0 where the exposure does not aim at a level.
+        test_frames: frames at the first exposure, taken to find it and to check the scene.
+    """
+
+    id: str
+    arrangement: Arrangement
+    instruction: str
+    exposures_s: tuple[float, ...]
+    level: float
+    test_frames: int
 
 
 @final
@@ -16,9 +44,9 @@ from udccal.sessions.schema import TermName
 class Cost:
     """Cost of a capture: frames of the camera, the camera's time for them in seconds, and set-ups by a person."""
 
-    frames: int
-    seconds: float
-    set_ups: int
+    frames: int = 0
+    seconds: float = 0.0
+    set_ups: int = 0
 
     def __add__(self, other: Cost) -> Cost:
         return Cost(self.frames + other.frames, self.seconds + other.seconds, self.set_ups + other.set_ups)
@@ -27,27 +55,46 @@ class Cost:
         return Cost(self.frames - other.frames, self.seconds - other.seconds, self.set_ups - other.set_ups)
 
 
-NOTHING = Cost(0, 0.0, 0)
+def steps_at(term: TermName, rig: RigDescription, panel_full_s: float = PANEL_FULL_S) -> Iterator[PlannedStep]:
+    """The steps of a term's procedure, one at a time, at the expected exposures.
+
+    Args:
+        term: of the procedure.
+        rig: with the captures that are wanted.
+        panel_full_s: exposure in seconds at which the brightest sample of a white picture on the panel fills its well.
+
+    Raises:
+        UdccalError: when no procedure is installed, or a step of it does not state its frames and exposure.
+    """
+    steps: Any = find_procedure(term)().steps(rig)
+    shortest_s, longest_s = rig.camera.min_exposure_s, rig.camera.max_exposure_s
+    full_s, earlier = {Led: _LED_FULL_S, PanelPicture: panel_full_s}, dict[str, Any]()
+    for step in steps:
+        try:
+            # Nothing is metered where the exposure has no target. Flats and boards fill the wells within a frame.
+            well_s = full_s.get(type(step.arrangement), 1.0 / rig.camera.frame_rate_hz)
+            metered_s = min(max(getattr(step.exposure, "target", 0.0) * well_s, shortest_s), longest_s)
+            at = step.exposure.planned(metered_s, earlier)
+            exposures_s = step.plan.exposures_s(min(max(at.exposure_s, shortest_s), longest_s), longest_s)
+        except (AttributeError, KeyError) as error:
+            raise UdccalError(
+                f"Expected the step '{step.id}' to tell how many frames it takes and at which exposure, found that it "
+                f"does not ({error}). Give its plan and exposure the methods of those in procedures.plans."
+            ) from error
+        earlier[step.id] = at
+        yield PlannedStep(step.id, step.arrangement, step.instruction, exposures_s, at.level or 0.0, at.test_frames)
 
 
-def planned_steps(term: TermName, state: RigState) -> Iterator[PlannedStep]:
-    """The steps of a term's procedure at the exposures of a rig's state; raises as ``steps_at`` does."""
-    return steps_at(term, state.rig, lambda arrangement: full_s(arrangement, state))
+def with_small_panel(rig: RigDescription) -> RigDescription:
+    """Return a rig with a tiny panel, on which the frames and exposures of its steps do not depend."""
+    panel = rig.panel.model_copy(update={"columns": _COUNTING_PX, "rows": _COUNTING_PX})
+    return rig.model_copy(update={"panel": panel})
 
 
-def cost_of(term: TermName, state: RigState) -> Cost:
-    """Frames, seconds and set-ups of a term's procedure; it raises the errors of ``planned_steps``."""
-    total, standing = NOTHING, ""
-    for step in planned_steps(term, without_pictures(state)):
-        period_s = 1.0 / state.rig.camera.frame_rate_hz
-        seconds = sum(max(period_s, exposure_s) for exposure_s in step.exposures_s)
-        seconds += step.test_frames * max(period_s, step.exposures_s[0])
-        # A person is asked when the instruction changes; pictures of the panel follow each other by themselves.
-        total += Cost(len(step.exposures_s) + step.test_frames, seconds, int(step.instruction != standing))
-        standing = step.instruction
-    return total
-
-
-def without_pictures(state: RigState) -> RigState:
-    """The same state with a tiny panel, for counting."""
-    return replace(state, rig=with_small_panel(state.rig))
+def cost_of(steps: Sequence[PlannedStep], rig: RigDescription) -> Cost:
+    """Frames, seconds and set-ups of the steps of one procedure; ``rig`` gives the camera's frame rate."""
+    exposures_s = [one for step in steps for one in (*step.exposures_s, *step.exposures_s[:1] * step.test_frames)]
+    # A person is asked when the instruction changes; pictures of the panel follow each other by themselves.
+    set_ups = sum(1 for _ in groupby(steps, key=lambda step: step.instruction))
+    period_s = 1.0 / rig.camera.frame_rate_hz
+    return Cost(len(exposures_s), sum(max(period_s, one) for one in exposures_s), set_ups)

@@ -9,9 +9,8 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-from udccal.cfa import cfa_named
 from udccal.fitting.wire.data import FlatNoise, Pixels, Weighed, WireData, flat_noise, read_wire, sample_pixels, weighed
-from udccal.fitting.wire.fit import site_means, unusable_flat
+from udccal.fitting.wire.fit import unusable_flat
 from udccal.fitting.wire.jacobian import values_at
 from udccal.fitting.wire.report import misfit
 from udccal.fitting.wire.rules import WireRules
@@ -41,13 +40,12 @@ _MOST_LIGHT = 1e3
 @in_float64
 def judge_wire(data: WireData, result: FitResult[Wire], limits: ValidationLimits) -> Judged:
     """Judge patterns by the rows' and columns' period, the worst part of the sensor, and the scatter of pixels."""
-    rules, means = WireRules(), site_means(data)
-    if (refused := unusable_flat(data, means, rules)) is not None:
+    rules = WireRules()
+    if (refused := unusable_flat(data, rules)) is not None:
         return unusable("wire", " ".join((refused[1], refused[0].value)))
-    values = data.signal / means[cfa_named(data.cfa).site_map(*data.signal.shape)]
-    pixels = sample_pixels(values, result.term.geometry, rules.samples, data.cfa, other=True)
-    noise = flat_noise(data, means)
-    whole, base = values_at(result.term, pixels.ideal, pixels.scaled)
+    pixels = sample_pixels(data.balanced, result.term.geometry, rules.samples, data.cfa, other=True)
+    noise = flat_noise(data)
+    whole, base = values_at(result.term, pixels)
     if not (np.abs(whole * base) < _MOST_LIGHT).all():
         return unusable("wire", "The profile's wire map has values that no panel gives. Calibrate the rig again.")
     seen = _predicted(whole * base, pixels, noise)

@@ -16,10 +16,8 @@ from jaxtyping import Array, Float
 from tests.benchmarks.efficiency.trials import Trials, column
 from tests.scenes.noise import ToySensor, expose, measure, patterns, truth
 from udccal.fitting.engine.information import cramer_rao, fisher_information
-from udccal.fitting.noise.dark import pair_probability
+from udccal.fitting.noise.codes import DarkPair, dark_pair, excess_kurtosis, pair_probability
 from udccal.fitting.noise.data import NoiseRules
-from udccal.fitting.noise.moments import DarkPair, dark_pair
-from udccal.fitting.noise.read_noise import excess_kurtosis
 from udccal.fitting.noise.transfer import temporal_variance
 
 # Every sensor has so many realisations: its bound takes longer than they do.

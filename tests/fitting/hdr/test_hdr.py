@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from udccal.errors import FitError
-from udccal.fitting.hdr.likelihood import merge_block
-from udccal.fitting.hdr.merge import UNKNOWN_SIGMA, HdrRules, merge_bracket, sensor_numbers
+from udccal.fitting.hdr.likelihood import HdrRules, SensorNumbers, merge_block
+from udccal.fitting.hdr.merge import UNKNOWN_SIGMA, merge_bracket
 from udccal.fitting.psf.data import PsfData
 from udccal.fitting.psf.fit import _notes as psf_notes
 from udccal.models.noise import Noise
@@ -146,7 +146,7 @@ def test_a_frame_of_other_light_is_left_out_and_listed() -> None:
 def test_single_precision_moves_no_rate_by_a_hundredth_of_its_sigma() -> None:
     frames = np.concatenate([bracket(rate, EXPOSURES, 11, (20, 20)) for rate in (0.0, 30.0, 1e3, 1e5, 1e7)], axis=1)
     merge = merge_bracket(frames, EXPOSURES, NOISE)
-    numbers = jax.tree.map(lambda n: np.float64(n), sensor_numbers(NOISE, float(EXPOSURES.max()), HdrRules()))
+    numbers = jax.tree.map(np.float64, SensorNumbers.of(NOISE, float(EXPOSURES.max()), HdrRules()))
     codes = frames.reshape(7, -1)
     double = merge_block(codes, EXPOSURES / EXPOSURES.max(), numbers, np.zeros(codes.shape, bool), 6.0)
     assert double.rate.dtype == np.float64

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from udccal.cameras.protocol import Region
-from udccal.fitting.noise import dark, moments
+from udccal.fitting.noise import codes, moments
 from udccal.fitting.noise.data import Averaged, Codes, NoiseRules
 from udccal.fitting.noise.fit import fit_moments, nominal_noise
-from udccal.fitting.noise.moments import NoiseMoments, converter_step, dark_pair
+from udccal.fitting.noise.moments import NoiseMoments, converter_step
 from udccal.fitting.noise.patterns import dsnu, prnu
 from udccal.models.noise import Noise
 from udccal.result import FitResult, FitStatus
@@ -51,7 +51,7 @@ def reduced(sensor: Sensor, levels: np.ndarray, seed: int, stack_level: float | 
     top = 2**sensor.truth.bits - 1
     for t in (0.0005, 0.002, 0.01, 0.02, 0.25, 1.0):
         pair = [sensor.expose(none, t, region, rng) for _ in range(2)]
-        darks.append(dark_pair(pair[0], pair[1], t, 1, top))
+        darks.append(codes.dark_pair(pair[0], pair[1], t, 1, top))
         rows.append(reduce_pair(pair[0], pair[1], t))
     middle = 0.02 * float(levels[len(levels) // 2] if stack_level is None else stack_level)
     return NoiseMoments(
@@ -73,7 +73,7 @@ def average(sensor: Sensor, light: np.ndarray, exposure_s: float, region: Region
 @pytest.fixture(scope="module", params=["lg55-aca2040", "mk31-imx1600"])
 def fitted(request: pytest.FixtureRequest) -> tuple[Sensor, FitResult[Noise]]:
     rig, sensor = toy(request.param, seed=3)
-    return sensor, fit_moments(reduced(sensor, np.linspace(0.02, 1.6, 14), 5), nominal_noise(rig), RULES)
+    return sensor, fit_moments(reduced(sensor, np.linspace(0.02, 1.6, 14), 5), nominal_noise(rig))
 
 
 def test_recovers_what_the_rig_needs(fitted: tuple[Sensor, FitResult[Noise]]) -> None:
@@ -118,27 +118,27 @@ def test_hot_pixels_are_listed(fitted: tuple[Sensor, FitResult[Noise]]) -> None:
 
 def test_no_light_is_too_dark() -> None:
     rig, sensor = toy("lg55-aca2040", 1)
-    result = fit_moments(reduced(sensor, np.full(6, 1e-5), 1), nominal_noise(rig), RULES)
+    result = fit_moments(reduced(sensor, np.full(6, 1e-5), 1), nominal_noise(rig))
     assert result.status is FitStatus.TOO_DARK
     assert result.term.K_DN_per_e == rig.camera.K_DN_per_e.value
 
 
 def test_clipped_flats_are_saturated() -> None:
     rig, sensor = toy("lg55-aca2040", 1)
-    result = fit_moments(reduced(sensor, np.linspace(3.0, 4.0, 6), 1), nominal_noise(rig), RULES)
+    result = fit_moments(reduced(sensor, np.linspace(3.0, 4.0, 6), 1), nominal_noise(rig))
     assert result.status is FitStatus.SATURATED
 
 
 def test_a_clipped_stack_is_saturated() -> None:
     rig, sensor = toy("lg55-aca2040", 1)
-    result = fit_moments(reduced(sensor, np.linspace(0.05, 1.6, 10), 1, stack_level=3.0), nominal_noise(rig), RULES)
+    result = fit_moments(reduced(sensor, np.linspace(0.05, 1.6, 10), 1, stack_level=3.0), nominal_noise(rig))
     assert result.status is FitStatus.SATURATED
     assert "flat stack" in result.notes[0]
 
 
 def test_two_levels_are_too_few() -> None:
     rig, sensor = toy("lg55-aca2040", 1)
-    result = fit_moments(reduced(sensor, np.array([0.2, 0.4]), 1), nominal_noise(rig), RULES)
+    result = fit_moments(reduced(sensor, np.array([0.2, 0.4]), 1), nominal_noise(rig))
     assert result.status is FitStatus.TOO_FEW_DATA
 
 
@@ -147,7 +147,7 @@ def test_a_lamp_of_changing_pattern_is_a_poor_fit() -> None:
     rig, sensor = toy("lg55-aca2040", 1)
     data = reduced(sensor, np.linspace(0.05, 0.6, 8), 1)
     bent = tuple(replace(flat, variance_DN2=flat.variance_DN2 * (1 + flat.mean_DN / 1000)) for flat in data.flats)
-    assert fit_moments(replace(data, flats=bent), nominal_noise(rig), RULES).status is FitStatus.POOR_FIT
+    assert fit_moments(replace(data, flats=bent), nominal_noise(rig)).status is FitStatus.POOR_FIT
 
 
 def test_pairs_of_one_frame_twice_are_a_poor_fit() -> None:
@@ -158,7 +158,7 @@ def test_pairs_of_one_frame_twice_are_a_poor_fit() -> None:
     for t in 0.02 * np.linspace(0.05, 0.6, 8):
         frame = sensor.expose(light, float(t), Region(0, 0, COLUMNS, ROWS), np.random.default_rng(0))
         twice.append(reduce_pair(frame, frame, float(t)))
-    result = fit_moments(replace(data, flats=tuple(twice)), nominal_noise(rig), RULES)
+    result = fit_moments(replace(data, flats=tuple(twice)), nominal_noise(rig))
     assert result.status is FitStatus.POOR_FIT
     assert "copies of each other" in result.notes[0]
 
@@ -169,8 +169,8 @@ def test_rounding_coarser_than_the_noise(fraction: float) -> None:
     sigma, spread = 0.28, 0.08
     offset = 24 + fraction + spread * rng.standard_normal((400, 400))
     frames = [np.rint(offset + sigma * rng.standard_normal((400, 400))).astype(np.uint16) for _ in range(2)]
-    pair = dark_pair(frames[0], frames[1], 0.01)
-    fit = dark.fit_dark((pair, replace(pair, exposure_s=0.02)), 0.06, 0.0, RULES)
+    pair = codes.dark_pair(frames[0], frames[1], 0.01)
+    fit = codes.fit_dark((pair, replace(pair, exposure_s=0.02)), 0.06, 0.0, RULES)
     assert np.sqrt(fit.values[2]) == pytest.approx(sigma, rel=0.03)
     # What the textbook's white quantisation makes of the same frames is worse than what is asked for.
     naive = 0.5 * np.var(frames[0].astype(float) - frames[1]) - 1 / 12
@@ -183,10 +183,10 @@ def test_codes_cut_off_at_zero_are_censored() -> None:
     black, sigma = 0.3, 2.0
     frames = [np.clip(np.rint(black + sigma * rng.standard_normal((300, 400))), 0, None) for _ in range(4)]
     pairs = tuple(
-        dark_pair(frames[i].astype(np.uint16), frames[i + 1].astype(np.uint16), 0.01 * (i + 1)) for i in (0, 2)
+        codes.dark_pair(frames[i].astype(np.uint16), frames[i + 1].astype(np.uint16), 0.01 * (i + 1)) for i in (0, 2)
     )
     assert pairs[0].edges_DN[0] == -np.inf
-    fit = dark.fit_dark(pairs, 0.3, 0.0, RULES, normal=True)
+    fit = codes.fit_dark(pairs, 0.3, 0.0, RULES, normal=True)
     assert fit.values[0] == pytest.approx(black, abs=0.05)
     assert np.sqrt(fit.values[2]) == pytest.approx(sigma, rel=0.02)
     # Moments of the cut-off codes are far away.
@@ -197,10 +197,10 @@ def test_a_wide_window_of_codes_is_grouped_and_loses_nothing() -> None:
     rng = np.random.default_rng(9)
     frames = [np.rint(2000 + 200 * rng.standard_normal((200, 300))).astype(np.uint16) for _ in range(2)]
     frames[0][0, 0] = 3  # far below the window
-    pair = dark_pair(frames[0], frames[1], 0.01)
+    pair = codes.dark_pair(frames[0], frames[1], 0.01)
     assert pair.counts.shape[0] <= 161
     assert frames[0].size - 100 < pair.counts.sum() < frames[0].size
-    assert np.sqrt(dark.start_values((pair,))[2]) == pytest.approx(200, rel=0.02)
+    assert np.sqrt(codes.start_values((pair,))[2]) == pytest.approx(200, rel=0.02)
 
 
 def test_hot_pixels_do_not_carry_the_prnu() -> None:
@@ -249,8 +249,8 @@ def test_a_flat_that_lies_off_the_curve_is_left_out_of_it() -> None:
     data = reduced(sensor, np.linspace(0.05, 1.6, 10), 4)
     flats = list(data.flats)
     flats[3] = replace(flats[3], variance_DN2=flats[3].variance_DN2 * np.where(np.arange(16) == 5, 1.5, 1.0))
-    result = fit_moments(replace(data, flats=tuple(flats)), nominal_noise(rig), RULES)
-    clean = fit_moments(data, nominal_noise(rig), RULES)
+    result = fit_moments(replace(data, flats=tuple(flats)), nominal_noise(rig))
+    clean = fit_moments(data, nominal_noise(rig))
     assert any(one.rule.startswith("bins of flats off") and one.count == 1 for one in result.outliers)
     K = clean.estimate("K_DN_per_e")
     assert result.estimate("K_DN_per_e").value == pytest.approx(K.value, abs=0.5 * K.sigma)

@@ -10,10 +10,10 @@ import pytest
 
 from tests.scenes.noise import PLAIN, ToySensor, errors_in_sigma, measure
 from udccal.errors import FitError
+from udccal.fitting.noise.dark import unexplained_variance
 from udccal.fitting.noise.data import ExposureLevel, NoiseData, NoiseRules
 from udccal.fitting.noise.fit import fit_noise
 from udccal.fitting.noise.moments import reduced
-from udccal.fitting.noise.read_noise import unexplained_variance
 from udccal.result import FitResult, FitStatus
 
 SENSOR = ToySensor(rows=192, columns=256, lambda_read=None, row_DN=0.0, bend=0.0, DSNU_e=1.0)

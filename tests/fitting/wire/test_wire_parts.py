@@ -14,7 +14,7 @@ from tests.scenes import wire as drawn
 from udccal.cfa import cfa_named
 from udccal.fitting.engine.least_squares import minimise
 from udccal.fitting.wire.data import FlatNoise, Pixels, Weighed, WireData, flat_noise, sample_pixels, weighed
-from udccal.fitting.wire.jacobian import block_jacobian, expected_of, wire_derivatives
+from udccal.fitting.wire.jacobian import WireProblem, block_jacobian, expected_of, wire_derivatives
 from udccal.fitting.wire.parameters import (
     Kind,
     parameters_of,
@@ -25,8 +25,7 @@ from udccal.fitting.wire.parameters import (
 )
 from udccal.fitting.wire.report import misfit
 from udccal.fitting.wire.rules import WireRules, WireStart, ideal_wire, possible_harmonics
-from udccal.fitting.wire.scan import scan_rows
-from udccal.fitting.wire.search import WireProblem
+from udccal.fitting.wire.search import scan_rows
 from udccal.models.geometry import Geometry
 from udccal.models.wire import Wire, log_baseline, modulation, slopes
 
@@ -87,7 +86,7 @@ def test_slopes_are_those_of_the_model() -> None:
 
     with jax.enable_x64(True):
         expected = np.asarray(by_shape(jnp.zeros(10)))
-        found = wire_derivatives(wire, pixels.ideal, pixels.scaled)
+        found = wire_derivatives(wire, pixels)
         shape = (np.asarray(found.shape) * np.asarray(found.base)).T
     # Sums over harmonics are in single precision.
     assert (np.abs(shape - expected).max(axis=0) <= 1e-4 * np.abs(expected).max(axis=0)).all()
@@ -101,7 +100,7 @@ def test_columns_of_linear_coefficients_are_differences_of_the_map() -> None:
     with jax.enable_x64(True):
         parameters = parameters_of(wire, RULES, 4, np.full(len(HARMONICS), 1e-2))
         x = parameters.vector(wire, np.array([1.2, 0.9, 1.1, 1 / (1.2 * 0.9 * 1.1)]))
-        base, design = block_jacobian(parameters, parameters.wire(x), pixels.ideal, pixels.scaled, pixels.site)[1:]
+        base, design = block_jacobian(parameters, parameters.wire(x), pixels)[1:]
         level = base * parameters.gains(x)[pixels.site]
         # Shading, a site's gain, an amplitude, two corrections to the pupil.
         for column in (5, 46, 60, parameters.linear - 3, parameters.linear - 1):
@@ -156,7 +155,7 @@ def test_variance_is_a_line_through_noisy_variances(cfa: str) -> None:
     variance = true * rng.chisquare(3, values.shape) / 3
     variance[rng.random(values.shape) < 1e-3] *= 1e4
     sites = len(cfa_named(cfa).sites)
-    noise = flat_noise(WireData(100 * values, variance, GEOMETRY, START, 0.0, cfa=cfa), np.full(sites, 100.0))
+    noise = flat_noise(WireData(100 * values, variance, GEOMETRY, START, 0.0, cfa=cfa))
     at = np.array([0.5, 1.0, 1.5, 1.0])[:sites]
     np.testing.assert_allclose(noise.variance(np.arange(sites), at), (3.0 + 700 * at) / 100**2, rtol=0.05)
 

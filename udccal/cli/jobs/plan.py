@@ -11,7 +11,8 @@ from typing import final, get_args
 from udccal.cli.output import Output
 from udccal.compilation import keep_compilations
 from udccal.errors import RigError
-from udccal.planning.plan import CapturePlan, Suggestion, TermPlan, make_plan, parse_targets
+from udccal.planning.design import Suggestion
+from udccal.planning.plan import CapturePlan, TermPlan, make_plan, parse_targets
 from udccal.planning.rig_file import check_absent, write_planned_rig
 from udccal.planning.state import RigState, measured_state, nominal_state
 from udccal.planning.steps import Cost

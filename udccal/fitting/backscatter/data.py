@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import final
 
-import cv2
 import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped, UInt8
@@ -25,6 +24,7 @@ from udccal.fitting.backscatter.model import (
 from udccal.fitting.backscatter.parameters import BackscatterRules, linear_of, prior_of
 from udccal.fitting.bins import Bins
 from udccal.fitting.nominal import nominal_backscatter
+from udccal.fitting.wire.data import ideal_points
 from udccal.models.geometry import Geometry
 from udccal.models.noise import Noise, variance_e
 from udccal.rig import RigDescription
@@ -274,10 +274,6 @@ def grid_rays(
 
 def directions(geometry: Geometry, pixels: Float[np.ndarray, "n 2"]) -> Rays:
     """Return the rays of sensor pixels in panel coordinates, as ``models.geometry.panel_directions`` does."""
-    matrix = np.eye(3)
-    matrix[[0, 1], [0, 1]], matrix[:2, 2] = np.asarray(geometry.focal_px), np.asarray(geometry.principal_point_px)
-    until = cv2.TERM_CRITERIA_MAX_ITER + cv2.TERM_CRITERIA_EPS, 60, 1e-14
-    lens = matrix, np.asarray(geometry.distortion, dtype=np.float64)
-    ideal = cv2.undistortPoints(pixels[:, None], *lens, R=np.eye(3), P=np.eye(3), criteria=until)[:, 0]
+    ideal = ideal_points(geometry, pixels)
     rays = np.insert(ideal, 2, 1.0, axis=1) @ Rotation.from_rotvec(np.asarray(geometry.rotation_rad)).as_matrix().T
     return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import final
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int
+from jaxtyping import Bool, Float, Float32
 
 from udccal.fitting.absent import absent_backscatter
 from udccal.fitting.backscatter.data import BackscatterData, Binned, grid_rays
@@ -260,7 +261,7 @@ class TermAt:
     @functools.cached_property
     def _mask(self) -> tuple[Float[np.ndarray, "3 a b"], Float[np.ndarray, "3 a b"]]:
         """Light of white over the whole grid, and its sigma with a random sign, in e-/s."""
-        found, shape = [self._best(flat)[1] for flat in self._parts(512)], self.data.shots.rate.shape[1:]
+        found, shape = [best for _, best in self._profiles(512)], self.data.shots.rate.shape[1:]
         mask = np.concatenate([np.maximum(one.mask, 0.0) for one in found], axis=1)
         sigma = np.concatenate([np.maximum(one.information, 1e-30) for one in found], axis=1) ** -0.5
         sign = np.random.default_rng(0).choice([-1.0, 1.0], mask.shape)
@@ -269,28 +270,24 @@ class TermAt:
     @functools.cached_property
     def _mask_jacobian(self) -> Float[np.ndarray, "18 3 a b"]:
         """Derivatives of the mask by the parameters, computed only when the posterior is used."""
-        parts = []
-        for flat in self._parts(256):
-            rays, best = self._best(flat)
-            of_ratio = ratios_and_jacobian(self.template, self.theta, rays, self.data.pictures)[1]
-            parts.append(best.mask_jacobian(of_ratio))
+        parts = [
+            best.mask_jacobian(ratios_and_jacobian(self.template, self.theta, rays, self.data.pictures)[1])
+            for rays, best in self._profiles(256)
+        ]
         return np.concatenate(parts, axis=2).reshape(-1, *self.data.shots.rate.shape[1:])
 
-    def _parts(self, size: int) -> list[Int[np.ndarray, " n"]]:
-        """Split the grid positions into parts of ``size``, which fit into memory."""
-        flat = np.arange(self.data.shots.rate[0, 0].size)
-        return np.split(flat, flat[size::size])
-
-    def _best(self, flat: Int[np.ndarray, " n"]) -> tuple[Rays, Profile]:
-        """Return rays, mask and dark signal: first with the data's weights, then with the model's."""
+    def _profiles(self, size: int) -> Iterator[tuple[Rays, Profile]]:
+        """Rays, mask and dark signal of ``size`` positions at once: first with the data's weights, then the model's."""
         shots, template = self.data.shots, self.template
-        rays, seen = grid_rays(template.geometry, shots.rate.shape[2:], template.step, flat), shots.at(flat)
-        usable = seen.usable & self.used[:, None, None]
-        ratio = ratios(template, self.theta, rays, self.data.pictures)
-        best = Profile.of(seen, ratio, np.where(usable, seen.first_weights(), 0.0))
-        for _ in range(2):
-            best = Profile.of(seen, ratio, seen.weights(best.mask * ratio, best.mask, self.model_error, usable))
-        return rays, best
+        every = np.arange(shots.rate[0, 0].size)
+        for flat in np.split(every, every[size::size]):
+            rays, seen = grid_rays(template.geometry, shots.rate.shape[2:], template.step, flat), shots.at(flat)
+            usable = seen.usable & self.used[:, None, None]
+            ratio = ratios(template, self.theta, rays, self.data.pictures)
+            best = Profile.of(seen, ratio, np.where(usable, seen.first_weights(), 0.0))
+            for _ in range(2):
+                best = Profile.of(seen, ratio, seen.weights(best.mask * ratio, best.mask, self.model_error, usable))
+            yield rays, best
 
     def posterior(self, cov: Float[np.ndarray, "18 18"]) -> Posterior[Backscatter]:
         """Return the posterior with this covariance of the parameters, and with the mask's noise."""

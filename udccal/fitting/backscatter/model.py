@@ -6,7 +6,7 @@ compiling takes longer than computing. White is the first shot, the dark frame t
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple, final
 
 import numpy as np
@@ -79,12 +79,8 @@ def _window(at: _Footprints, theta: Vector, edge_px: Float[np.ndarray, "*n"] | f
 
 def corners_of(template: Backscatter, theta: Vector, rays: Rays) -> Int[np.ndarray, "n 2"]:
     """Return (column, row) of the first panel pixel of the window around each position's footprints."""
-    return _corners(_footprints(template, theta, rays), theta, template.window)
-
-
-def _corners(at: _Footprints, theta: Vector, window: int) -> Int[np.ndarray, "n 2"]:
-    middle = at.centre.mean(axis=1) - emitters_of(theta).mean(axis=0)
-    return np.round(middle - (window - 1) / 2).astype(np.int64)
+    middle = _footprints(template, theta, rays).centre.mean(axis=1) - emitters_of(theta).mean(axis=0)
+    return np.round(middle - (template.window - 1) / 2).astype(np.int64)
 
 
 @final
@@ -167,7 +163,7 @@ class Shares:
         reach = _EDGE_SIGMAS * softness / np.linalg.svd(feet.shape, compute_uv=False)[:, 1]
         needed = _window(feet, theta, reach * np.linalg.norm(feet.shape, axis=2).max(axis=1) + 0.5)
         window = min(needed, template.window)
-        corner = _corners(feet, theta, window)
+        corner = corners_of(replace(template, window=window), theta, rays)
         # The emitter of each window's first pixel, seen from the footprint's centre, in units of the ellipse.
         first = corner[:, None, None] + emitters_of(theta) - feet.centre[:, :, None]
         first, step = np.einsum("nij,npcj->inpc", inverse, first)[..., None, None], np.arange(window)

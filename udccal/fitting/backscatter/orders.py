@@ -253,22 +253,21 @@ def disagreement(found: Found) -> Vector:
     Student's t, whose variance is larger.
     """
     fitted, solved, across = found.fitted, found.fitted.found, found.problem.rules.cells
-    dof = across**2 - 1
-    free = np.flatnonzero(fitted.order.free)
+    dof, free = across**2 - 1, fitted.order.free
     errors, jacobian = found.problem.errors_at(fitted.best.weight)(solved.x)
-    shifts = (jacobian @ solved.cov) * errors[:, None], (jacobian @ solved.cov) ** 2
+    shifts = (jacobian @ solved.cov)[:, free]
     column, row = _cells(found.places, across)
     factors, tests = np.ones(len(solved.x)), [NO_TEST]
     for parts in (row * across + column, row, column):
         part = np.broadcast_to(parts, fitted.z.shape).ravel()
-        moved, expected = np.zeros((2, parts.max() + 1, len(solved.x)))
-        np.add.at(moved, part, shifts[0])
-        np.add.at(expected, part, shifts[1])
-        for k in free:
-            seen = expected[:, k] > 0
-            square, most = moved[seen, k] ** 2, expected[seen, k]
-            tests.append(chi2_test(float((square / most).sum()), float(seen.sum() - 1)))
-            factors[k] = max(factors[k], dof / (dof - 2) * float(square.sum() / most.sum()))
+        square, expected = np.zeros((2, parts.max() + 1, free.sum()))
+        np.add.at(square, part, shifts * errors[:, None])
+        np.add.at(expected, part, shifts**2)
+        square, seen = square**2, expected > 0
+        statistics = np.divide(square, expected, out=np.zeros_like(square), where=seen).sum(axis=0)
+        tests += [chi2_test(float(one), float(n - 1)) for one, n in zip(statistics, seen.sum(axis=0), strict=True)]
+        wider = dof / (dof - 2) * square.sum(axis=0) / np.maximum(expected.sum(axis=0), 1e-300)
+        factors[free] = np.maximum(factors[free], wider)
     return factors if sharper(*tests).found else np.ones(len(solved.x))
 
 

@@ -13,22 +13,51 @@ It enters the rate's sigma and the deviation of a sample, not the weights.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from types import ModuleType
+from typing import final
 
 import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt16
 
+from udccal.errors import FitError
 from udccal.models.arrays import Arrayish
+from udccal.models.noise import Noise
 
 # Below zero rate the variance goes on falling, so that the estimate stays unbiased in the dark, down to this part.
 _LEAST_VARIANCE = 0.25
 _TINY = 1e-30
 
 
+@final
+@dataclass(frozen=True)
+class HdrRules:
+    """The constants of a merge.
+
+    Attributes:
+        believed_sigma: a sample farther than this from the other samples of its pixel is a hit, clipped or not.
+        margin_sigma: samples count as clipped from this many sigma of dark noise below saturation on.
+        frame_off, frame_sigma: a frame is left out when its light is off by more than both (relative, and in sigma).
+        least_to_judge: the fewest samples of a pixel for finding hits and testing frames.
+        scatter_off: scatter of samples about their light, relative to the noise model's variance, that is too much.
+        sure_electrons: electrons that a pixel's light is worth before the scatter about it is judged.
+        black_off: error of the black level, in sigma of dark noise, that is too much.
+    """
+
+    believed_sigma: float = 6.0
+    margin_sigma: float = 6.0
+    frame_off: float = 0.02
+    frame_sigma: float = 5.0
+    least_to_judge: int = 3
+    scatter_off: float = 0.05
+    sure_electrons: float = 100.0
+    black_off: float = 0.1
+
+
 class SensorNumbers(eqx.Module):
-    """The numbers of the noise model that the likelihood uses, in electrons; single precision."""
+    """The numbers of the noise model, in electrons, single precision; ``rounding_e`` shifts dark samples at most."""
 
     black_DN: Float[Arrayish, ""]
     e_per_DN: Float[Arrayish, ""]
@@ -36,6 +65,27 @@ class SensorNumbers(eqx.Module):
     floor_e2: Float[Arrayish, ""]
     level_e: Float[Arrayish, ""]
     offset_e: Float[Arrayish, ""]
+    rounding_e: Float[Arrayish, ""]
+
+    @classmethod
+    def of(cls, noise: Noise, unit_s: float, rules: HdrRules) -> SensorNumbers:
+        """The numbers of a noise model, times in units of ``unit_s``."""
+        K, black, saturation, sigma_d, q, dark, offset = values = [
+            float(np.asarray(part))
+            for part in (noise.K_DN_per_e, noise.black_DN, noise.saturation_DN, noise.sigma_d_e, noise.q_DN,
+                         noise.dark_current_e_per_s, noise.DSNU1288_e)
+        ]  # fmt: skip
+        if not (np.isfinite(values).all() and K > 0 and sigma_d >= 0 and saturation > black):
+            found = f"K {K:g} DN/e, black {black:g} DN, saturation {saturation:g} DN, sigma_d {sigma_d:g} e"
+            raise FitError(
+                f"Expected a noise model with a gain above 0 and saturation above black, found {found}. Fit it."
+            )
+        # A sensor without any dark noise still has a least variance: the likelihood of its dark pixels stays finite.
+        floor = max(sigma_d**2 + (q / K) ** 2 / 12.0, 1e-4)
+        # The first harmonic of the codes' steps, as far as noise does not smear them.
+        rounding = q / K / np.pi * np.exp(-2 * (np.pi * sigma_d * K / q) ** 2)
+        level = (saturation - black) / K - rules.margin_sigma * floor**0.5
+        return cls(black, 1 / K, dark * unit_s, floor, level, offset, float(rounding))
 
 
 class BlockMerge(eqx.Module):

@@ -121,20 +121,19 @@ class NoiseData:
 
     def check(self) -> None:
         """Check numbers of frames, exposures and photons; a FitError names the level or stack that is not possible."""
-        stack = self.stack
-        given = () if stack is None else (stack.dark, stack.bright)
-        if wrong := [type(one).__name__ for one in given if not isinstance(one, Sequence | np.ndarray | Averaged)]:
+        of_stack = () if self.stack is None else (self.stack.dark, self.stack.bright)
+        if wrong := [type(one).__name__ for one in of_stack if not isinstance(one, Sequence | np.ndarray | Averaged)]:
             raise FitError(f"Expected the stack's frames as a sequence or an average, found {wrong[0]}. Leave it out.")
-        stacks = [one for one in given if not isinstance(one, Averaged)]
+        stacks = [one for one in of_stack if not isinstance(one, Averaged)]
         if max([len(self.levels), *map(len, stacks)]) > _MOST_FRAMES:
             raise FitError(f"Expected at most {_MOST_FRAMES} levels and frames of a stack. Average some first.")
         if stacks and min(map(len, stacks)) < 2:
             raise FitError("Expected at least two dark and two bright frames in the stack, found fewer. Leave it out.")
         for index, level in enumerate(self.levels):
-            if not (np.isfinite(level.exposure_s) and level.exposure_s >= 0):
-                raise FitError(f"Expected level {index} to have an exposure in seconds, found {level.exposure_s}.")
-            if level.photons is not None and not (np.isfinite(level.photons) and level.photons >= 0):
-                raise FitError(f"Expected level {index} to have a number of photons, found {level.photons}.")
+            given = (("an exposure in seconds", level.exposure_s), ("a number of photons", level.photons or 0.0))
+            for name, value in given:
+                if not (np.isfinite(value) and value >= 0):
+                    raise FitError(f"Expected level {index} to have {name}, found {value}.")
             for name, frames in (("dark", level.dark), ("bright", level.bright)):
                 if len(frames) not in (0, 2):
                     raise FitError(f"Expected two {name} frames in level {index} or none, found {len(frames)}.")
@@ -143,11 +142,8 @@ class NoiseData:
 def loaded(frame: Frame, shape: tuple[int, ...] | None = None) -> Codes:
     """A frame as codes; a FitError where it is not a picture of codes, or differs from ``shape``."""
     array = frame() if callable(frame) else frame
-    if (
-        not isinstance(array, np.ndarray)
-        or array.dtype.newbyteorder("=") not in (np.uint8, np.uint16)
-        or array.ndim != 2
-    ):
+    kind = array.dtype.newbyteorder("=") if isinstance(array, np.ndarray) else None
+    if kind not in (np.uint8, np.uint16) or array.ndim != 2:
         found = f"{array.dtype} of shape {array.shape}" if isinstance(array, np.ndarray) else type(array).__name__
         raise FitError(f"Expected a frame as uint8 or uint16 array of rows x columns, found {found}. Pass raw codes.")
     if min(array.shape) < _LEAST_SIDE or max(array.shape) > _MOST_SIDE:

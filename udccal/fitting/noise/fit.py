@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +11,9 @@ from jaxtyping import Float
 from udccal.fitting.engine.gaussian import Posterior
 from udccal.fitting.engine.orders import Quantity
 from udccal.fitting.engine.report import estimates, residual_sample
-from udccal.fitting.noise.dark import DarkTerms, fit_dark_terms, start_values
+from udccal.fitting.engine.robust import outliers
+from udccal.fitting.noise.codes import start_values
+from udccal.fitting.noise.dark import DarkTerms, fit_dark_terms
 from udccal.fitting.noise.data import NoiseData, NoiseRules
 from udccal.fitting.noise.flats import Curve, find_saturation, fit_curve, rough_gain, stacked
 from udccal.fitting.noise.moments import NoiseMoments, bins, reduced
@@ -55,45 +57,43 @@ def fit_noise(data: NoiseData, nominal: Noise | None = None, rules: NoiseRules |
         FitError: when a frame is not a picture of codes like the others, or an exposure is not a time.
         SessionError: when a file of the session is missing or damaged.
     """
-    rules = rules or NoiseRules()
-    moments = reduced(data, rules)
+    moments = reduced(data, rules or NoiseRules())
     nominal = nominal or _assumed(1.0, 0.0, moments.top_DN if moments else 4095.0)
     if moments:
-        return fit_moments(moments, nominal, rules)
+        return fit_moments(moments, nominal)
     note = "Expected dark and bright pairs of frames, found none."
     return FitResult.failed("noise", nominal, FitStatus.TOO_FEW_DATA, note)
 
 
-def fit_moments(data: NoiseMoments, nominal: Noise, rules: NoiseRules) -> FitResult[Noise]:
+def fit_moments(data: NoiseMoments, nominal: Noise) -> FitResult[Noise]:
     """Fit the noise term to frames that are reduced; ``nominal`` is returned as the term where no fit is possible."""
-    if refused := _too_little(data, rules):
+    if refused := _too_little(data):
         return FitResult.failed("noise", nominal, *refused)
     start = start_values(data.darks)
-    dark = fit_dark_terms(data, rough_gain(data, float(start[0]), float(start[2])), rules, start)
-    curve = fit_curve(data, dark, rules)
-    longest, curvature = max(pair.exposure_s for pair in data.darks), 0.0
+    dark = fit_dark_terms(data, rough_gain(data, float(start[0]), float(start[2])), start)
+    curve, longest = fit_curve(data, dark), max(pair.exposure_s for pair in data.darks)
     # The dark fit needs the gain, and the gain the dark fit. To first order the curve corrects the read noise for the
     # gain; a second round is for a gain that moves dark current's shot noise by half of the read noise's sigma, or
     # for a curvature that moves black by half of its own.
     for _ in range(30):
-        K = float(curve.fit.values[0]) if curve.choice else 0.0
-        c, signal = (float(curve.fit.values[2]) if curve.choice else 0.0), dark.dark_DN_per_s.value * longest
+        (K, _, c), signal = curve.values[:3].tolist(), dark.dark_DN_per_s.value * longest
         moved = abs(K - dark.K_DN_per_e) * signal > 0.5 * dark.read_DN2.variance**0.5
-        moved |= abs(c - curvature) * signal**2 > 0.5 * float(dark.levels_cov[0, 0]) ** 0.5
-        if curve.usable_levels < rules.levels or K <= 0 or not moved:
+        moved |= abs(c - dark.curvature) * signal**2 > 0.5 * float(dark.levels_cov[0, 0]) ** 0.5
+        if curve.usable_levels < data.rules.levels or K <= 0 or not moved:
             break
-        dark, curvature = fit_dark_terms(data, K, rules, dark.fit.values, c), c
-        curve = fit_curve(data, dark, rules)
-    if refused := _no_gain(data, dark, curve, rules):
+        dark = fit_dark_terms(data, K, dark.fit.values, c)
+        curve = fit_curve(data, dark)
+    if refused := _no_gain(data, dark, curve):
         return FitResult.failed("noise", nominal, *refused)
-    return _assembled(data, dark, curve, rules)
+    return _assembled(data, dark, curve)
 
 
-def _too_little(data: NoiseMoments, rules: NoiseRules) -> tuple[FitStatus, str] | None:
+def _too_little(data: NoiseMoments) -> tuple[FitStatus, str] | None:
     """The status and sentence of data that cannot be fitted; None where the fit may begin."""
-    if len(data.darks) < 2 or len(data.flats) < rules.levels:
-        found = f"{len(data.darks)} and {len(data.flats)}"
-        return FitStatus.TOO_FEW_DATA, f"Expected at least 2 dark and {rules.levels} flat exposures, found {found}."
+    darks, flats, least = len(data.darks), len(data.flats), data.rules.levels
+    if darks < 2 or flats < least:
+        found = f"found {darks} and {flats}"
+        return FitStatus.TOO_FEW_DATA, f"Expected at least 2 dark and {least} flat exposures, {found}."
     if any(pair.counts.sum() < 100 for pair in data.darks):
         return FitStatus.TOO_FEW_DATA, "A dark pair holds fewer than 100 samples of like codes."
     start = start_values(data.darks)
@@ -105,7 +105,7 @@ def _too_little(data: NoiseMoments, rules: NoiseRules) -> tuple[FitStatus, str] 
     return None
 
 
-def _no_gain(data: NoiseMoments, dark: DarkTerms, curve: Curve, rules: NoiseRules) -> tuple[FitStatus, str] | None:
+def _no_gain(data: NoiseMoments, dark: DarkTerms, curve: Curve) -> tuple[FitStatus, str] | None:
     """Status and sentence where darks do not show black, or flats are copies, too few, too dark, or clipped."""
     # With codes cut off at 0 and offsets of pixels far larger than their noise, no code shows black.
     cut = any(pair.edges_DN[0] == -np.inf and pair.counts[0].sum() > 0.01 * pair.counts.sum() for pair in data.darks)
@@ -113,25 +113,23 @@ def _no_gain(data: NoiseMoments, dark: DarkTerms, curve: Curve, rules: NoiseRule
     if cut and not dark.white and dark.dsnu_DN2.value > 30.0**2 * quiet:
         note = "Dark codes are cut off at 0 and show too little noise to find black. Raise the black level."
         return FitStatus.POOR_FIT, note
-    full_DN = curve.ceiling_DN - dark.black_DN
-    above, levels = stacked(data.flats, "mean_DN") - dark.black_DN, curve.levels
+    full_DN, K = curve.ceiling_DN - dark.black_DN, float(curve.values[0])
+    above, levels, least = stacked(data.flats, "mean_DN") - dark.black_DN, curve.levels, data.rules.levels
     lit = stacked(data.flats, "variance_DN2")[(above > 0) & (above < 0.9 * full_DN)]
-    K = float(curve.fit.values[0]) if curve.choice else 0.0
-    if lit.size and float(np.median(lit)) < 0.3 * (dark.read_DN2.value + data.q_DN**2 / 12.0):
+    if lit.size and float(np.median(lit)) < 0.3 * (dark.read_DN2.value + data.rounding_DN2):
         return FitStatus.POOR_FIT, (
             f"Expected the variance of flats to grow with their mean, found a slope of {K:.3g} DN per electron: the "
             "two frames of a pair may be copies of each other."
         )
-    if curve.usable_levels < rules.levels:
-        return FitStatus.SATURATED if curve.full.any() else FitStatus.TOO_DARK, (
-            f"Expected at least {rules.levels} flat exposures between the dark noise and 90 % of saturation, found "
-            f"{curve.usable_levels}."
-        )
+    if curve.usable_levels < least:
+        wanted = f"at least {least} flat exposures between the dark noise and 90 % of saturation"
+        status = FitStatus.SATURATED if curve.full.any() else FitStatus.TOO_DARK
+        return status, f"Expected {wanted}, found {curve.usable_levels}."
     # Shot noise of the light in all bins, in sigma of their variances.
     shot = K * (levels.mean_DN - levels.dark_DN[:, None]) / np.maximum(levels.variance_DN2, 1e-9)
     significance = float(np.sqrt(np.sum((levels.dof / 2 * shot**2)[levels.usable])))
     sigma = float(np.sqrt(curve.fit.cov[0, 0]))
-    if not (0 < sigma < np.inf and min(abs(K) / sigma, significance) >= rules.gain_sigma):
+    if not (0 < sigma < np.inf and min(abs(K) / sigma, significance) >= data.rules.gain_sigma):
         note = f"The gain comes out as {K:.3g} ± {sigma:.2g} DN per electron: the flats hold too little shot noise."
         return FitStatus.TOO_DARK, note
     if K < 0:
@@ -142,11 +140,11 @@ def _no_gain(data: NoiseMoments, dark: DarkTerms, curve: Curve, rules: NoiseRule
     return None
 
 
-def _photo_response(data: NoiseMoments, dark: DarkTerms, curve: Curve, rules: NoiseRules) -> Pattern:
+def _photo_response(data: NoiseMoments, dark: DarkTerms, curve: Curve) -> Pattern:
     """PRNU from the stacks; the photon transfer curve gives the temporal variance of the averages."""
-    K, V0, c = (float(v) for v in curve.fit.values[:3])
+    K, V0, c = curve.values[:3].tolist()
     bright, stack, rate = data.flat_stack, data.dark_stack, dark.dark_DN_per_s.value
-    quiet = max(V0, 0.0) + data.q_DN**2 / 12.0
+    quiet = max(V0, 0.0) + data.rounding_DN2
     at_no_light = (quiet + K * rate * bright.exposure_s) / bright.frames
     if dark.white:
         signal = bright.mean_DN.astype(np.float32) - stack.mean_DN.astype(np.float32)
@@ -158,24 +156,24 @@ def _photo_response(data: NoiseMoments, dark: DarkTerms, curve: Curve, rules: No
     level = max(rough_median(signal), 1e-6)
     z = float(linear_signal(np.array(level), c, K))
     steep = 1 - 2 * c * z
-    found = prnu(signal, at_no_light, K * z * steep**2 / level / bright.frames, data.period, rules.defect_sigma)
+    found = prnu(signal, at_no_light, K * z * steep**2 / level / bright.frames, data.period, data.rules.defect_sigma)
     # Where the response bends, a relative change of light is a smaller relative change of signal.
     scale = (level / (z * steep)) ** 2
     offsets = 0.0 if dark.white else float(np.sqrt(dark.dsnu_DN2.variance)) / level**2
     return replace(found, variance=found.variance * scale, sigma=float(np.hypot(found.sigma, offsets)) * scale)
 
 
-def _assembled(data: NoiseMoments, dark: DarkTerms, curve: Curve, rules: NoiseRules) -> FitResult[Noise]:
+def _assembled(data: NoiseMoments, dark: DarkTerms, curve: Curve) -> FitResult[Noise]:
     """The result of a finished fit."""
-    fit, response = curve.fit, curve.choice
+    fit, response, rules = curve.fit, curve.choice, data.rules
     assert response is not None, "a fit that went through has a curve"
-    saturation, uneven = find_saturation(data, dark, curve), _photo_response(data, dark, curve, rules)
+    saturation, uneven = find_saturation(data, dark, curve), _photo_response(data, dark, curve)
     PRNU2 = Quantity.asked("PRNU", uneven.variance, uneven.sigma**2, uneven.samples)
     values, cov = _values(data, dark, curve, saturation, PRNU2)
     bent_too_far = abs(float(fit.values[2])) * max(curve.ceiling_DN - dark.black_DN, 1.0) >= 0.999 * rules.most_bent
     converged = fit.converged and (dark.fit.converged or dark.foreign)
     status = FitStatus.CONVERGED if converged else FitStatus.NOT_CONVERGED
-    if fit.chi2_dof > rules.worst_chi2 or bent_too_far:
+    if fit.misfit.ratio > rules.worst_chi2 or bent_too_far:
         status = FitStatus.POOR_FIT
     shown = len(NAMES) - (not fit.order.curved)
     terms = (dark.row_DN2, dark.shape, dark.dark_DN_per_s, dark.dsnu_DN2, PRNU2)
@@ -191,7 +189,7 @@ def _assembled(data: NoiseMoments, dark: DarkTerms, curve: Curve, rules: NoiseRu
         status=status,
         estimates=estimates("noise", NAMES[:shown], values[:shown], cov[:shown, :shown]),
         cov=cov[:shown, :shown],
-        chi2_dof=fit.chi2_dof,
+        chi2_dof=fit.misfit.ratio,
         samples=int(curve.levels.usable.sum()) + data.dark_samples,
         candidates=tuple(candidate for candidate in candidates if np.isfinite(candidate.criterion)),
         diagnostics=(
@@ -208,7 +206,7 @@ def _assembled(data: NoiseMoments, dark: DarkTerms, curve: Curve, rules: NoiseRu
             Diagnostic("edge_gain", float(np.sqrt(np.mean(dark.fit.edge_gains**2))), "1"),
         ),
         notes=tuple(_notes(data, dark, curve, uneven, values, bent_too_far)),
-        outliers=tuple(one for one in _outliers(data, dark, curve, float(values[2]), uneven, rules) if one.count),
+        outliers=tuple(one for one in _outliers(data, dark, curve, float(values[2]), uneven) if one.count),
         residuals=residual_sample(places[np.nonzero(used)[1]], fit.variance_z[used]),
         posterior=Posterior.from_cov(values[:-1], cov[:-1, :-1], _term),
     )
@@ -222,7 +220,7 @@ def _values(
     data: NoiseMoments, dark: DarkTerms, curve: Curve, saturation: tuple[float, float], PRNU2: Quantity
 ) -> tuple[Float[np.ndarray, "11"], Float[np.ndarray, "11 11"]]:
     """The estimates, and their covariance from that of the fitted quantities."""
-    K, V0, c = (float(v) for v in curve.fit.values[:3])
+    K, V0, c = curve.values[:3].tolist()
     transfer = curve.fit.cov[:3, :3] * curve.fit.misfit.inflation
     total = Quantity(V0 + dark.row_DN2.value, float(transfer[1, 1]) + dark.row_DN2.variance)
     roots = [one.root() for one in (total, dark.row_DN2, dark.dsnu_DN2, PRNU2)]
@@ -247,21 +245,18 @@ def _values(
 
 
 def _outliers(
-    data: NoiseMoments, dark: DarkTerms, curve: Curve, saturation_DN: float, uneven: Pattern, rules: NoiseRules
+    data: NoiseMoments, dark: DarkTerms, curve: Curve, saturation_DN: float, uneven: Pattern
 ) -> Iterable[Outliers]:
-    def named(levels: Sequence[int]) -> tuple[str, ...]:
-        stack = len(data.flats)
-        return tuple("flat stack" if i >= stack else f"flat {i} ({data.flats[i].exposure_s:.4g} s)" for i in levels)[:8]
-
+    rules, names = data.rules, [f"flat {i} ({flat.exposure_s:.4g} s)" for i, flat in enumerate(data.flats)]
+    names.append("flat stack")
     # Unclipped samples stand out among clipped ones; that is no defect.
     ceiling = saturation_DN - 0.1 * (curve.ceiling_DN - dark.black_DN)
     seen = (*(flat for flat in data.flats if float(flat.mean_DN.max()) < ceiling), *data.dark_moments)
     hits, sigma = sum(moments.outliers for moments in seen), f"{rules.outlier_sigma:g} robust sigma"
     yield Outliers(f"two codes of a pixel {rules.hit_sigma:g} sigma apart in a pair (hits, blinking pixels)", hits)
-    off_response = np.flatnonzero(np.isnan(curve.levels.light) & ~np.isnan(curve.inside.light)).tolist()
-    for what, levels in (("flats of a pair that differ in brightness by", curve.flickering),
-                         ("brightness off the response by", off_response)):  # fmt: skip
-        yield Outliers(f"{what} {sigma}", len(levels), named(levels))
+    yield from outliers(f"flats of a pair that differ in brightness by {sigma}", (names[i] for i in curve.flickering))
+    off_response = np.flatnonzero(np.isnan(curve.levels.light) & ~np.isnan(curve.inside.light))
+    yield from outliers(f"brightness off the response by {sigma}", (names[i] for i in off_response))
     bins = int(np.sum(curve.inside.usable & ~curve.levels.usable))
     yield Outliers(f"bins of flats off the photon transfer curve by {sigma}", bins)
     for what, beside, found in (("dark", "(hot)", dark.offsets), ("flat", "their surroundings", uneven)):

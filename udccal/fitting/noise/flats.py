@@ -11,11 +11,10 @@ from scipy.special import ndtri
 
 from udccal.fitting.engine.orders import Choice
 from udccal.fitting.engine.robust import OutlierRule, robust_sigma
+from udccal.fitting.noise.codes import excess_kurtosis
 from udccal.fitting.noise.dark import DarkTerms
-from udccal.fitting.noise.data import NoiseRules
 from udccal.fitting.noise.moments import Moments, NoiseMoments
-from udccal.fitting.noise.read_noise import excess_kurtosis
-from udccal.fitting.noise.transfer import DarkVariance, Levels, TransferFit, robust_transfer
+from udccal.fitting.noise.transfer import DarkVariance, Five, Levels, TransferFit, robust_transfer
 
 Bins = Bool[np.ndarray, "flats bins"]
 
@@ -44,19 +43,24 @@ class Curve:
         return self.choice.best.fit
 
     @property
+    def values(self) -> Five:
+        """The fit's values; zeros where there is none."""
+        return np.zeros(5) if self.choice is None else self.choice.best.fit.values
+
+    @property
     def usable_levels(self) -> int:
         """Exposures inside the range of the fit, the stack not counted."""
         return int(self.inside.usable[: len(self.full)].any(axis=1).sum())
 
 
-def fit_curve(data: NoiseMoments, dark: DarkTerms, rules: NoiseRules) -> Curve:
+def fit_curve(data: NoiseMoments, dark: DarkTerms) -> Curve:
     """The curve up to 90 % of saturation, or up to 70 % where the model describes that far better."""
-    full, flickering = _saturated(data, dark), _flickering(data.flats, dark, rules)
+    full, flickering, rules = _saturated(data, dark), _flickering(data, dark), data.rules
     # Upper median of the saturated bins, or the converter's largest code where there is none.
     ceiling = float(np.quantile(stacked(data.flats, "mean_DN")[full], 0.75)) if full.any() else data.top_DN
 
     def up_to(part: float) -> Curve:
-        inside = _inside(data, dark, part * (ceiling - dark.black_DN), ceiling, rules)
+        inside = _inside(data, dark, part * (ceiling - dark.black_DN), ceiling)
         inside.usable[list(flickering)] = False
         empty = Curve(full, ceiling, part, flickering, inside, inside, None)
         if not empty.usable_levels:
@@ -65,9 +69,9 @@ def fit_curve(data: NoiseMoments, dark: DarkTerms, rules: NoiseRules) -> Curve:
         return replace(empty, levels=levels, choice=choice)
 
     found = up_to(rules.fit_up_to)
-    if found.choice and found.fit.chi2_dof > 2:
+    if found.choice and found.fit.misfit.ratio > 2:
         narrow = up_to(rules.narrow_up_to)
-        if narrow.usable_levels >= rules.levels and narrow.fit.chi2_dof < 0.5 * found.fit.chi2_dof:
+        if narrow.usable_levels >= rules.levels and narrow.fit.misfit.ratio < 0.5 * found.fit.misfit.ratio:
             return narrow
     return found
 
@@ -77,7 +81,7 @@ def stacked(flats: tuple[Moments, ...], name: str) -> Float[np.ndarray, "levels 
     return np.stack([getattr(flat, name) for flat in flats])
 
 
-def _inside(data: NoiseMoments, dark: DarkTerms, up_to_DN: float, ceiling_DN: float, rules: NoiseRules) -> Levels:
+def _inside(data: NoiseMoments, dark: DarkTerms, up_to_DN: float, ceiling_DN: float) -> Levels:
     """The flats as the transfer fit takes them, with the bins that lie safely inside the sensor's range."""
     flats = data.flats if data.flat_seen is None else (*data.flats, data.flat_seen)
     mean, variance, spread = (stacked(flats, name) for name in ("mean_DN", "variance_DN2", "spread_DN"))
@@ -100,7 +104,7 @@ def _inside(data: NoiseMoments, dark: DarkTerms, up_to_DN: float, ceiling_DN: fl
     # of thirty codes they do not matter.
     smeared = 2 * above / max(K, 1e-9) * (1 - np.cos(2 * np.pi * K / q))
     smeared += 4 * np.pi**2 * (dark.read_DN2.value + dark.row_DN2.value) / q**2
-    usable &= (smeared >= rules.smeared) | (variance >= 30 * q**2)
+    usable &= (smeared >= data.rules.smeared) | (variance >= 30 * q**2)
     return Levels(
         mean_DN=above,
         variance_DN2=variance,
@@ -116,7 +120,7 @@ def _inside(data: NoiseMoments, dark: DarkTerms, up_to_DN: float, ceiling_DN: fl
 
 def _dark_variance(data: NoiseMoments, dark: DarkTerms) -> DarkVariance:
     """V0 from the histograms, and from the temporal variance of the dark stack where its frames were seen."""
-    rounding, K, rate, read = data.q_DN**2 / 12.0, dark.K_DN_per_e, dark.dark_DN_per_s.value, dark.read_DN2
+    rounding, K, rate, read = data.rounding_DN2, dark.K_DN_per_e, dark.dark_DN_per_s.value, dark.read_DN2
     drift = rate * np.array([pair.exposure_s for pair in data.darks])
     # Dark signal in the pairs as their read noise depends on it: long exposures are noisier and count less.
     total = read.value + dark.row_DN2.value + rounding + K * drift
@@ -136,23 +140,23 @@ def _dark_variance(data: NoiseMoments, dark: DarkTerms) -> DarkVariance:
     return DarkVariance(values, np.hypot(np.maximum(sigmas, 1e-9), shifted), rounding, K, drifts)
 
 
-def _flickering(flats: tuple[Moments, ...], dark: DarkTerms, rules: NoiseRules) -> tuple[int, ...]:
+def _flickering(data: NoiseMoments, dark: DarkTerms) -> tuple[int, ...]:
     """Flats whose frames differ in mean by more than noise explains, and by more than the frames of other flats."""
-    signal = np.array([flat.mean_DN.mean() for flat in flats]) - dark.black_DN
+    flats, signal = data.flats, stacked(data.flats, "mean_DN").mean(axis=1) - dark.black_DN
     lit = np.flatnonzero(signal > 0)
     if len(lit) < 4:
         return ()
     apart = np.array([np.ptp(flat.shift_DN.mean(axis=1)) for flat in flats])
     noise = [4 * of.variance_DN2.mean() / of.samples.sum() + 2 * dark.row_DN2.value / of.height for of in flats]
     relative, own = apart[lit] / signal[lit], np.sqrt(np.array(noise)[lit]) / signal[lit]
-    wrong = OutlierRule("flats", rules.outlier_sigma).off(relative / np.hypot(robust_sigma(relative), own))
+    wrong = OutlierRule("flats", data.rules.outlier_sigma).off(relative / np.hypot(robust_sigma(relative), own))
     return tuple(int(i) for i in lit[wrong])
 
 
 def rough_gain(data: NoiseMoments, black_DN: float, dark_DN2: float) -> float:
     """Conversion gain in DN per electron from moments alone, for the first fit of the dark frames."""
     mean = stacked(data.flats, "mean_DN") - black_DN
-    variance = stacked(data.flats, "variance_DN2") - data.q_DN**2 / 12.0
+    variance = stacked(data.flats, "variance_DN2") - data.rounding_DN2
     lit = mean > max(0.05 * mean.max(), 0.0)
     # Clipping lowers the ratio and nothing raises it.
     return max(float(np.quantile((variance[lit] - dark_DN2) / mean[lit], 0.75)), 1e-6) if lit.any() else 1.0
@@ -164,15 +168,15 @@ def _saturated(data: NoiseMoments, dark: DarkTerms) -> Bins:
     Where all flats are saturated there is no rest: bins with no more variance than the dark frames are then saturated.
     """
     mean, variance = stacked(data.flats, "mean_DN") - dark.black_DN, stacked(data.flats, "variance_DN2")
-    bright = mean > 0.05 * (data.top_DN - dark.black_DN)
+    bright: Bins = mean > 0.05 * (data.top_DN - dark.black_DN)
     if not bright.any():
-        return np.zeros(mean.shape, bool)
+        return bright
     # Saturation is a ceiling: a quiet bin well below the brightest one is something else.
     highest = bright & (mean >= 0.9 * mean.max())
     # Below saturation variance over mean is K plus a small positive part; clipping only lowers it.
     slope = variance / np.maximum(mean, 1e-9)
     collapsed: Bins = highest & (slope < 0.3 * float(np.quantile(slope[bright], 0.75)))
-    quiet: Bins = highest & (variance <= 1.3 * (dark.read_DN2.value + data.q_DN**2 / 12.0 + dark.row_DN2.value))
+    quiet: Bins = highest & (variance <= 1.3 * (dark.read_DN2.value + data.rounding_DN2 + dark.row_DN2.value))
     return quiet if not collapsed.any() and quiet[bright].mean() > 0.5 else collapsed
 
 
@@ -192,7 +196,7 @@ def find_saturation(data: NoiseMoments, dark: DarkTerms, curve: Curve) -> tuple[
     if max(float(flat.at_peak[bins].max()) for flat, bins in full if flat.peak_DN == peak) >= 0.5:
         # A level at the converter's end is certain; a level below it is known to within rounding.
         return float(peak), float(1 / np.sqrt(12.0)) if peak < data.top_DN else 0.0
-    V0 = max(float(curve.fit.values[1]), 0.0) if curve.choice else 0.0
+    V0 = max(float(curve.values[1]), 0.0)
     found = np.array([_level(flat, bins, data, dark, V0, peak) for flat, bins in full])
     # An outlier among full pixels is a pixel that is not full.
     clean = (found[:, 2] > 0) & np.array([of.frames * of.outliers <= 1e-5 * of.samples.sum() for of, _ in full])
@@ -205,7 +209,7 @@ def _level(
     flat: Moments, full: Bool[np.ndarray, " bins"], data: NoiseMoments, dark: DarkTerms, V0: float, peak: int
 ) -> tuple[float, float, bool]:
     """Saturation in DN by one flat, its variance, and whether all pixels of a bin are full."""
-    temporal = V0 + data.q_DN**2 / 12.0
+    temporal = V0 + data.rounding_DN2
     excess = flat.variance_DN2 - temporal
     sure = full & (excess < 3.0 * temporal * np.sqrt(2 / flat.dof))
     chosen = sure if sure.any() else full

@@ -9,14 +9,15 @@ from __future__ import annotations
 import functools
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import final
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Float32, Int
+from jaxtyping import Float, Float32
 
 from udccal.errors import FitError
+from udccal.fitting.noise.codes import DarkPair, dark_pair
 from udccal.fitting.noise.data import Averaged, Codes, ExposureLevel, Frame, NoiseData, NoiseRules, SpatialStack, loaded
 
 Grid = Float[np.ndarray, "groups_y groups_x"]
@@ -80,35 +81,44 @@ def reduce_frames(
     """Mean per pixel, and temporal moments per bin without common changes of brightness and row noise."""
     source = iter(frames)
     first = next(source)
-    down, right = bins(*first.shape, period)
-    counts, total = np.outer(down.sum(axis=1), right.sum(axis=0)), np.zeros(first.shape, np.float32)
-    outliers, powers = 0, np.zeros(2)
-    # The first frame's difference from itself is zero.
-    by_row, peaks = [np.zeros((len(first), right.shape[1]))], [_peak(first, down, right)]
-    squares = np.zeros_like(by_row[0])
+    (height, columns), (down, right) = first.shape, bins(*first.shape, period)
+    width = right.sum(axis=0, dtype=np.float64)
+    counts, total = np.outer(down.sum(axis=1), width), np.zeros(first.shape, np.float32)
+    outliers, powers, squares = 0, np.zeros(2), np.zeros_like(counts)
+    # Of every frame: its rows' means and its bins' sums less these, as differences from the first frame, and its peak.
+    by_row, by_bin, peaks = [np.zeros(height)], [np.zeros_like(counts)], [_peak(first, down, right)]
     for frame in source:
         difference = cv2.subtract(frame, first, dtype=cv2.CV_32F)
         square = cv2.multiply(difference, difference)
         # The usual difference is the median over some rows, which hits do not move; ten codes are never a hit.
-        usual = np.median(square[:: max(len(first) // 128, 1)] @ right, axis=0) / right.sum(axis=0)
+        usual = np.median(square[:: max(height // 128, 1)] @ right, axis=0) / width
         hits = square > max(rules.hit_sigma**2 * float(usual.max()), 10.0**2)
         if count := int(np.count_nonzero(hits)):
             large = square[hits].astype(np.float64)
             outliers, powers = outliers + count, powers + np.array([large.sum(), np.square(large).sum()])
-            difference[hits] = square[hits] = 0.0
+            difference[hits] = 0.0
+        by_row.append(difference.mean(axis=1, dtype=np.float64))
+        difference -= by_row[-1][:, None]
         total += difference
-        squares += square @ right
-        by_row.append(np.asarray(difference @ right, dtype=np.float64))
+        by_bin.append(down @ (difference @ right))
+        squares += down @ (cv2.multiply(difference, difference) @ right)
         peaks.append(_peak(frame, down, right))
-    number, middle = len(by_row), float(np.median(first[:: max(len(first) // 64, 1)]))
-    peak = max(code for code, _ in peaks)
-    at_peak = sum((count for code, count in peaks if code == peak), start=np.zeros_like(counts))
-    squares -= cv2.multiply(total, total, scale=1.0 / number) @ right
+    number, middle = len(by_row), float(np.median(first[:: max(height // 64, 1)]))
+    rows, left = np.stack(by_row), np.stack(by_bin)
     mean = cv2.addWeighted(first, 1.0, total, 1.0 / number, 0.0, dtype=cv2.CV_32F)
-    variance, dof, shift, rows, sampling = _temporal(down, right, np.stack(by_row), squares)
+    mean += rows.mean(axis=0)[:, None]
+    rows, left = rows - rows.mean(axis=0), left - left.mean(axis=0)
+    dof = np.maximum((number - 1) * (counts * (1 - 1 / columns) - 1), 1.0)
+    squares -= down @ (cv2.multiply(total, total, scale=1.0 / number) @ right) + np.square(left).sum(axis=0) / counts
+    # The rows' means were taken from all of a row: a quiet bin beside noisy ones gains their part of the mean's
+    # variance, v' (1 - 1/n) = v (1 - 2/n) + row average / n.
+    mixed = squares / dof
+    variance = (mixed * (1 - 1 / columns) - (mixed @ width)[:, None] / columns**2) / (1 - 2 / columns)
     about = cv2.subtract(mean, middle)
     level, square = (down @ (of @ right) / counts for of in (about, cv2.multiply(about, about)))
     spatial = np.maximum(square - level**2, 0.0)
+    peak = max(code for code, _ in peaks)
+    at_peak = np.sum([count for code, count in peaks if code == peak], axis=0) / (number * counts)
     return Averaged(exposure_s, mean, number), Moments(
         exposure_s=exposure_s,
         light=exposure_s if light is None else light,
@@ -117,12 +127,12 @@ def reduce_frames(
         dof=dof.ravel(),
         samples=number * counts.ravel(),
         spread_DN=np.sqrt(spatial + np.maximum(variance, 0.0) * (1 - 1 / number)).ravel(),
-        shift_DN=shift.reshape(number, -1),
-        rows_DN2=rows,
-        sampling_DN2=sampling,
-        height=len(first),
+        shift_DN=((left + (rows @ down.T)[..., None] * width) / counts).reshape(number, -1),
+        rows_DN2=float(np.square(rows - rows.mean(axis=1, keepdims=True)).sum()) / ((number - 1) * max(height - 1, 1)),
+        sampling_DN2=float(np.average(variance, weights=counts)) / columns,
+        height=height,
         peak_DN=peak,
-        at_peak=(at_peak / (number * counts)).ravel(),
+        at_peak=at_peak.ravel(),
         outliers=outliers,
         outlier_powers=(float(powers[0]), float(powers[1])),
     )
@@ -132,73 +142,6 @@ def _peak(frame: Codes, down: Float[np.ndarray, "_ _"], right: Float32[np.ndarra
     """The largest code, and the number of samples with it by bin."""
     top = frame.max()
     return int(top), down @ ((frame == top).astype(np.float32) @ right)
-
-
-def _temporal(
-    down: Float[np.ndarray, "groups_y rows"],
-    right: Float32[np.ndarray, "columns groups_x"],
-    by_row: Float[np.ndarray, "frames rows groups_x"],
-    squares: Float[np.ndarray, "rows groups_x"],
-) -> tuple[Grid, Grid, Float[np.ndarray, "frames groups_y groups_x"], float, float]:
-    """Variances of bins, their degrees of freedom, the frames' shifts, the rows' variance and its sampling part."""
-    (frames, height, _), columns, width = by_row.shape, len(right), right.sum(axis=0, dtype=np.float64)
-    counts = np.outer(down.sum(axis=1), width)
-    about = by_row - by_row.mean(axis=0)
-    rows = about.sum(axis=2) / columns
-    within = squares - 2 * np.einsum("kr,krm->rm", rows, about) + np.square(rows).sum(axis=0)[:, None] * width
-    left = down @ (about - rows[:, :, None] * width)
-    dof = np.maximum((frames - 1) * (counts * (1 - 1 / columns) - 1), 1.0)
-    mixed = (down @ within - np.square(left).sum(axis=0) / counts) / dof
-    # The rows' means were taken from all of a row: a quiet bin beside noisy ones gains their part of the mean's
-    # variance, v' (1 - 1/n) = v (1 - 2/n) + row average / n.
-    average = (mixed @ width / columns)[:, None]
-    variance = (mixed * (1 - 1 / columns) - average / columns) / (1 - 2 / columns)
-    observed = float(np.sum((rows - rows.mean(axis=1, keepdims=True)) ** 2)) / ((frames - 1) * max(height - 1, 1))
-    return variance, dof, down @ about / counts, observed, float(np.average(variance, weights=counts)) / columns
-
-
-@final
-@dataclass(frozen=True)
-class DarkPair:
-    """A pair of dark frames reduced to the joint histogram of the two codes of each pixel, in groups of ``step_DN``.
-
-    The outermost edges are infinite where the codes stop there (at 0, or at the converter's end).
-    """
-
-    exposure_s: float
-    edges_DN: Float[np.ndarray, " codes_plus_1"]
-    step_DN: float
-    counts: Int[np.ndarray, "codes codes"]
-    rows: int
-
-    @property
-    def centres_DN(self) -> Float[np.ndarray, " codes"]:
-        """Middle of each group of codes; that of a cut-off end is extrapolated from its neighbours."""
-        inner = self.edges_DN[1:-1]
-        edges = np.clip(self.edges_DN, inner[0] - self.step_DN, inner[-1] + self.step_DN)
-        return np.asarray(0.5 * (edges[1:] + edges[:-1]))
-
-
-def dark_pair(first: Codes, second: Codes, exposure_s: float, q_DN: int = 1, top_code: int = 65535) -> DarkPair:
-    """Joint histogram over a window of codes around the median; codes beyond it are left out."""
-    low, middle, high = np.percentile(first[:: max(1, first.size // 65536)], [2.0, 50.0, 98.0])
-    # 98th minus 2nd percentile is 4.1 sigma; 1.9 times that each side is about 7.8 sigma.
-    half = int(np.ceil(1.9 * (high - low) / q_DN)) + 4
-    # At most about 160 groups a side: a wide window loses nothing by coarser ones.
-    group = max(1, int(np.ceil((2 * half + 1) / 160)))
-    start = max(round(middle / q_DN) - half, 0)
-    codes = min((round(middle / q_DN) + half - start) // group, (top_code // q_DN - start) // group) + 1
-    # One more group takes all that lies outside the window.
-    side = codes + 1
-    group_of = (np.arange(65536) // q_DN - start) // group
-    group_of = np.where((group_of >= 0) & (group_of < codes), group_of, codes).astype(np.uint16)
-    both = group_of[first] * np.uint16(side) + group_of[second]
-    joint = cv2.calcHist([both], [0], None, [side**2], [0, side**2]).astype(np.int64)
-    counts = joint.reshape(side, side)[:codes, :codes]
-    edges = (start + group * np.arange(codes + 1) - 0.5) * q_DN
-    edges[0] = -np.inf if start == 0 else edges[0]
-    edges[-1] = np.inf if edges[-1] >= top_code else edges[-1]
-    return DarkPair(exposure_s, edges, float(group * q_DN), counts, len(first))
 
 
 def converter_step(frame: Codes) -> int:
@@ -249,7 +192,7 @@ class NoiseMoments:
     ``dark_moments`` are those of the pairs in ``darks``; both stacks have about the same exposure; colour sites repeat
     after ``period`` samples (1: monochrome). ``dark_seen`` and ``flat_seen`` are moments of the stacks' frames. They
     are None for an average that was made elsewhere, whose variance would include the lamp's flicker, and for frames of
-    a pair, which must not count twice.
+    a pair, which must not count twice. ``rules`` are those of the whole fit.
     """
 
     darks: tuple[DarkPair, ...]
@@ -262,6 +205,12 @@ class NoiseMoments:
     period: int = 2
     dark_seen: Moments | None = None
     flat_seen: Moments | None = None
+    rules: NoiseRules = field(default_factory=NoiseRules)
+
+    @property
+    def rounding_DN2(self) -> float:
+        """Variance of white rounding."""
+        return self.q_DN**2 / 12.0
 
     @property
     def dark_samples(self) -> int:
@@ -307,4 +256,4 @@ def reduced(data: NoiseData, rules: NoiseRules) -> NoiseMoments | None:
         stacks = [(moments(near.dark, near.exposure_s)[0], None), (moments(middle.bright, middle.exposure_s)[0], None)]
     (dark_stack, dark_seen), (flat_stack, flat_seen) = stacks
     pairs = histograms, dark_moments, flats
-    return NoiseMoments(*pairs, dark_stack, flat_stack, q_DN, float(top), period, dark_seen, flat_seen)
+    return NoiseMoments(*pairs, dark_stack, flat_stack, q_DN, float(top), period, dark_seen, flat_seen, rules)

@@ -45,7 +45,7 @@ def row_noise(data: NoiseMoments, edge_gains: Float[np.ndarray, " pairs"]) -> tu
             if gain >= 0.2 and of.rows_DN2 > 0
         ]
         # Row noise that rounding hides completely may be as large as rounding itself.
-        found = excess_variance(*np.array(rows).T) if rows else (0.0, (data.q_DN**2 / 12.0) ** 2, 0.0)
+        found = excess_variance(*np.array(rows).T) if rows else (0.0, data.rounding_DN2**2, 0.0)
         return Quantity.asked("row noise", found[0], found[1], data.dark_samples, found[2])
 
     row = asked(pairs + stack)
@@ -67,10 +67,10 @@ class Pattern:
     variance: float
     sigma: float
     samples: int
-    mean: float
-    mean_variance: float
     outliers: int
     places: tuple[tuple[int, int], ...]
+    mean: float = 0.0
+    mean_variance: float = 0.0
     structure2: float = 0.0
 
 
@@ -90,16 +90,14 @@ def dsnu(dark_DN: Picture, temporal_DN2: float, row_DN2: float, defect_sigma: fl
     about[bad] = 0.0
     (rows, columns), samples = about.shape, int(about.size - bad.sum())
     total = float(np.vdot(about, about)) / max(samples - 1, 1)
-    row_part, column_part = float(np.var(about.mean(axis=1))), float(np.var(about.mean(axis=0)))
-    pixel_part = max(total - row_part - column_part, 0.0)
-    own_row, own_column = (max(part - pixel_part / n, 0.0) for part, n in ((row_part, columns), (column_part, rows)))
-    own_pixel, own_row = max(pixel_part - temporal_DN2, 0.0), max(own_row - row_DN2, 0.0)
+    by_row, by_column = float(np.var(about.mean(axis=1))), float(np.var(about.mean(axis=0)))
+    pixel = max(total - by_row - by_column, 0.0)
+    parts, counts = np.array([pixel, by_row, by_column]), np.array([samples, rows, columns])
+    own = np.maximum(parts - [temporal_DN2, pixel / columns + row_DN2, pixel / rows], 0.0)
     # Each part is chi-squared with its own number of values; this sensor's own pattern is what is asked for.
-    parts = ((pixel_part, own_pixel, samples), (row_part, own_row, rows), (column_part, own_column, columns))
-    sigma = np.sqrt(sum(2 * max(part**2 - own**2, 0.0) / n for part, own, n in parts))
-    of_mean = own_pixel / samples + own_row / rows + own_column / columns
-    variance = total - temporal_DN2 - row_DN2
-    return Pattern(variance, float(sigma), samples, mean, float(of_mean), int(bad.sum()), _first_places(bad))
+    sigma = float(np.sqrt(np.sum(2 * np.maximum(parts**2 - own**2, 0.0) / counts)))
+    variance, of_mean = total - temporal_DN2 - row_DN2, float(np.sum(own / counts))
+    return Pattern(variance, sigma, samples, int(bad.sum()), _first_places(bad), mean, of_mean)
 
 
 def _first_places(bad: Mask) -> tuple[tuple[int, int], ...]:
@@ -147,9 +145,8 @@ def prnu(signal_DN: Picture, temporal_DN2: float, shot_DN: float, period: int, d
     for phase, site in zip(phases, sites, strict=True):
         defects[phase] = site.defects
     outliers = signal_DN.size - sum(int(np.count_nonzero(site.inverse_DN)) for site in sites)
-    of_mean = max(variance, 0.0) / max(samples, 1)
-    places, sigma, structure2 = _first_places(defects), float(weights.sum() ** -0.5), float(structures.mean())
-    return Pattern(variance, sigma, samples, 0.0, of_mean, outliers, places, structure2)
+    sigma, structure2 = float(weights.sum() ** -0.5), float(structures.mean())
+    return Pattern(variance, sigma, samples, outliers, _first_places(defects), structure2=structure2)
 
 
 def _site(signal_DN: Picture, window: int, reach: float) -> _Site:
@@ -226,7 +223,7 @@ def white_coefficients(powers: list[Float32[np.ndarray, "rows columns"]], taken:
 
 
 def _by_block(values: np.ndarray, block: int) -> Grid:
-    """Sums over blocks; coefficients that fill no block are left out."""
+    """Sums over blocks; coefficients that fill none are left out."""
     high, wide = (n // block * block for n in values.shape)
     # Rows first: sums along contiguous memory are the slow part.
     by_row = np.add.reduce(values[:high, :wide].reshape(high, wide // block, block), axis=2, dtype=np.float32)

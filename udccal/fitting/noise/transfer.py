@@ -25,6 +25,7 @@ from udccal.fitting.noise.data import NoiseRules
 
 Grid = Float[np.ndarray, "levels bins"]
 PerLevel = Float[np.ndarray, " levels"]
+PerBin = Float[np.ndarray, " usable"]
 # K [DN/e], V0 [DN^2], curvature [1/DN], response [DN per light], offset of the light.
 Five = Float[np.ndarray, "5"]
 
@@ -98,7 +99,10 @@ class Order:
 @final
 @dataclass(frozen=True)
 class TransferFit:
-    """One order: values, covariance, relative scatter of the light by level, and residuals in sigma (nan: unused)."""
+    """One order: values, covariance, relative scatter of the light by level, and residuals in sigma (nan: unused).
+
+    ``misfit`` tells whether the variances scatter by more than noise.
+    """
 
     order: Order
     values: Five
@@ -107,20 +111,7 @@ class TransferFit:
     converged: bool
     variance_z: Grid
     level_z: PerLevel
-
-    @property
-    def chi2_dof(self) -> float:
-        """Reduced chi-squared of the variances."""
-        return float(np.nansum(self.variance_z**2)) / self._dof
-
-    @property
-    def misfit(self) -> MisfitTest:
-        """Whether the variances scatter by more than noise."""
-        return chi2_test(float(np.nansum(self.variance_z**2)), self._dof)
-
-    @property
-    def _dof(self) -> float:
-        return float(max(int(np.isfinite(self.variance_z).sum()) - 1, 1))
+    misfit: MisfitTest
 
 
 def linear_signal(mean_DN, curvature_per_DN, K_DN_per_e):  # type: ignore[no-untyped-def]
@@ -150,38 +141,39 @@ class TransferProblem:
     sizes: Five
     name: str = "noise, photon transfer"
 
-    def modelled(self, x: Five) -> tuple[Grid, Float[np.ndarray, " points"], PerLevel]:
-        """Variances and estimates of V0 by the model, and the relative excess of the levels' brightness over it."""
+    def modelled(self, x: Five) -> tuple[PerBin, Float[np.ndarray, " points"], PerLevel]:
+        """Usable variances and estimates of V0 by the model, and the relative excess of the levels' light over it."""
         K, V0, c, gain, offset = x
         levels, dark = self.levels, self.dark
         with np.errstate(divide="ignore", invalid="ignore"):
             signal = np.nan_to_num(linear_signal(np.where(levels.usable, levels.mean_DN, 0.0), c, K), posinf=0.0)
-            variance = np.maximum(temporal_variance(signal, K, V0, c, dark.rounding_DN2), 1e-9)
+            variance = np.maximum(temporal_variance(signal[levels.usable], K, V0, c, dark.rounding_DN2), 1e-9)
             bright = _brightness(signal - levels.dark_DN[:, None], levels.usable) / (gain * (levels.light + offset))
-        return variance, V0 + (K - dark.K_DN_per_e) * dark.drift_DN, bright - 1
+        return variance, V0 + (K - dark.K_DN_per_e) * dark.drift_DN, (bright - 1)[levels.responding]
 
-    def scatter2(self, relative: PerLevel) -> float:
-        """Maximum-likelihood variance of the light from level to level, in addition to noise."""
-        known = self.levels.brightness_variance[self.levels.responding]
-        return excess_variance(relative**2, known, np.ones(len(known)))[0] if self.order.unsteady else 0.0
+    def spread2(self, relative: PerLevel) -> tuple[PerLevel, float]:
+        """Relative variance of responding levels, and the maximum-likelihood part of it that is no noise."""
+        known, own = self.levels.brightness_variance[self.levels.responding], 0.0
+        if self.order.unsteady:
+            own = excess_variance(relative**2, known, np.ones(len(known)))[0]
+        return known + own, own
 
     def equations_at(self, place: Five) -> Blocks:
         """Score and Fisher information; the scatter of the light is the maximum-likelihood one at this place."""
-        levels, dark, use, responds = self.levels, self.dark, self.levels.usable, self.levels.responding
 
         def predicted(at: Five) -> Float[np.ndarray, " data"]:
             variance, floor, relative = self.modelled(at)
-            return np.concatenate([variance[use], floor, -relative[responds]])
+            return np.concatenate([variance, floor, -relative])
 
-        everywhere, floor, above = self.modelled(place)
-        variance, relative = everywhere[use], above[responds]
-        spread2 = levels.brightness_variance[responds] + self.scatter2(relative)
-        dof, ratio = levels.dof[use], np.maximum(levels.variance_DN2[use] / variance, 1e-12)
-        off = np.concatenate([levels.variance_DN2[use] - variance, dark.V0_DN2 - floor, relative])
+        levels, dark, (variance, floor, relative) = self.levels, self.dark, self.modelled(place)
+        spread2, _ = self.spread2(relative)
+        observed, dof = levels.variance_DN2[levels.usable], levels.dof[levels.usable]
+        ratio = np.maximum(observed / variance, 1e-12)
+        off = np.concatenate([observed - variance, dark.V0_DN2 - floor, relative])
         weight = np.concatenate([0.5 * dof / variance**2, dark.sigma_DN2**-2, 1 / spread2])
         # Free parameters are those of the order that the data determine.
         free, jacobian = np.array([True, True, self.order.curved, True, self.order.offset]), np.zeros((len(off), 5))
-        free[3:] &= responds.any()
+        free[3:] &= relative.size > 0
         for i in np.flatnonzero(free):
             step = 1e-4 * self.sizes[i] * np.eye(5)[i]
             jacobian[:, i] = (predicted(place + step) - predicted(place - step)) / (2 * step[i])
@@ -215,19 +207,18 @@ def _brightness(light_DN: Grid, usable: np.ndarray) -> PerLevel:
 
 def _fitted(problem: TransferProblem, start: Five) -> Attempt[TransferFit]:
     order, levels = problem.order, problem.levels
-    start = np.where([True, True, order.curved, True, order.offset], start, 0.0)
-    found = minimise(problem, start)
-    x, cost = found.place, found.equations.cost
+    found = minimise(problem, np.where([True, True, order.curved, True, order.offset], start, 0.0))
     cov = found.with_rest(found.equations.cov(), found.equations.step(0.0).shared)
-    variance, _, relative = problem.modelled(x)
-    scatter2 = problem.scatter2(relative[levels.responding])
-    variance_z = np.where(levels.usable, (levels.variance_DN2 / variance - 1) * np.sqrt(levels.dof / 2), np.nan)
-    spread2 = np.where(levels.responding, levels.brightness_variance + scatter2, np.inf)
-    level_z = np.where(levels.responding, np.nan_to_num(relative) / np.sqrt(spread2), np.nan)
-    converged = bool(found.converged and np.isfinite(x).all() and np.isfinite(cov).all() and np.isfinite(cost))
+    variance, _, relative = problem.modelled(found.place)
+    spread2, own = problem.spread2(relative)
+    variance_z, level_z = np.full(levels.usable.shape, np.nan), np.full(len(levels.light), np.nan)
+    dof = levels.dof[levels.usable]
+    variance_z[levels.usable] = (levels.variance_DN2[levels.usable] / variance - 1) * np.sqrt(dof / 2)
+    level_z[levels.responding] = np.nan_to_num(relative) / np.sqrt(spread2)
+    misfit = chi2_test(float(np.nansum(variance_z**2)), max(dof.size - 1.0, 1.0))
     parameters = order.curved + order.offset + order.unsteady
-    criterion = bic(cost, float(parameters), int(levels.dof[levels.usable].sum())) if converged else np.inf
-    fit = TransferFit(order, x, cov, float(np.sqrt(scatter2)), converged, variance_z, level_z)
+    criterion = bic(found.equations.cost, float(parameters), int(dof.sum())) if found.converged else np.inf
+    fit = TransferFit(order, found.place, cov, float(np.sqrt(own)), found.converged, variance_z, level_z, misfit)
     return Attempt(order.name, parameters, criterion, fit)
 
 

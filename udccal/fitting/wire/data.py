@@ -6,23 +6,24 @@ more (or less) than its neighbours, and the map would be biased.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import TypeVar, cast, final
+from typing import TypeVar, final
 
+import cv2
 import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, Shaped
+from jaxtyping import Bool, Float, Int
 from scipy.optimize import nnls
 
 from udccal.cfa import PATTERNS, cfa_named
 from udccal.errors import FitError, found_instead
 from udccal.fitting.engine.robust import OutlierRule
 from udccal.fitting.wire.rules import WireRules, WireStart, wire_start
-from udccal.models.geometry import Geometry, unproject
+from udccal.models.geometry import Geometry
 from udccal.models.noise import Noise
-from udccal.numerics import in_float64
 from udccal.result import Outliers
 from udccal.sessions.store import Session
 
@@ -81,6 +82,18 @@ class WireData:
                 f"Expected one of the patterns {', '.join(PATTERNS)}, found '{self.cfa}'. Name the sensor's."
             )
 
+    @functools.cached_property
+    def site_means(self) -> Float[np.ndarray, " sites"]:
+        """Mean signal of each site's finite, unclipped pixels; NaN where there are none."""
+        by_site = (self.signal[site.samples] for site in cfa_named(self.cfa).sites)
+        good = (some[np.isfinite(some) & (some < self.clip)] for some in by_site)
+        return np.array([float(some.mean(dtype=np.float64)) if some.size else np.nan for some in good])
+
+    @property
+    def balanced(self) -> Float[np.ndarray, "rows columns"]:
+        """The signal over the mean of each pixel's site."""
+        return self.signal / self.site_means[cfa_named(self.cfa).site_map(*self.signal.shape)]
+
 
 def read_wire(session: Session, noise: Noise, geometry: Geometry, rules: WireRules | None = None) -> WireData:
     """Read the steps ``wire/dark`` and ``wire/flat`` of a session, at one exposure, in DN.
@@ -129,32 +142,27 @@ class FlatNoise:
         return np.asarray(self.floor[site] + self.by_signal[site] * some + unequal**2)
 
 
-def flat_noise(data: WireData, means: Float[np.ndarray, " sites"]) -> FlatNoise:
+def flat_noise(data: WireData) -> FlatNoise:
     """Straight lines through variance against signal, site by site (EMVA 1288's photon transfer).
 
-    The variance of few frames is itself too noisy for the weight of single pixels. ``means`` are the sites' mean
-    signals, in the unit of ``data.signal``.
+    The variance of few frames is itself too noisy for the weight of single pixels.
     """
-    sites = cfa_named(data.cfa).site_map(*data.signal.shape)
-    lines = np.array(
-        [_line(data.signal[sites == k] / m, data.variance[sites == k] / m**2) for k, m in enumerate(means)]
-    )
-    return FlatNoise(lines[:, 0], lines[:, 1], data.PRNU1288, data.clip / means)
+    sites, means = cfa_named(data.cfa).site_map(*data.signal.shape), data.site_means
+    parts = ((data.signal[sites == k] / mean, data.variance[sites == k] / mean**2) for k, mean in enumerate(means))
+    floor, by_signal = np.array([_line(*part) for part in parts]).T
+    return FlatNoise(floor, by_signal, data.PRNU1288, data.clip / means)
 
 
 def _line(signal: Float[np.ndarray, " n"], variance: Float[np.ndarray, " n"]) -> Float[np.ndarray, "2"]:
     """Constant and slope, neither negative, through the means of 32 bins of equal counts."""
     good = np.isfinite(variance) & np.isfinite(signal) & (variance >= 0)
-    order = np.argsort(signal[good], kind="stable")
-    bins = []
-    for x, y in zip(*(np.array_split(part[good][order], 32) for part in (signal, variance)), strict=True):
-        # A sample variance beyond 30 medians of its bin is a pixel that blinks, not noise.
-        kept = y <= 30.0 * np.median(y) if len(y) else np.zeros(0, dtype=bool)
-        if kept.any():
-            bins.append((max(float(x[kept].mean()), 0.0), float(y[kept].mean())))
-    if not bins:
+    if not good.any():
         return np.zeros(2)
-    at, mean = np.array(bins).T
+    order = np.argsort(signal[good], kind="stable")
+    parts = (np.array_split(part[good][order], min(32, len(order))) for part in (signal, variance))
+    # A sample variance beyond 30 medians of its bin is a pixel that blinks, not noise.
+    kept = [(x[steady := y <= 30.0 * np.median(y)], y[steady]) for x, y in zip(*parts, strict=True)]
+    at, mean = np.array([(max(float(x.mean()), 0.0), float(y.mean())) for x, y in kept]).T
     # Sample variances scatter in proportion to themselves.
     weight = 1.0 / np.maximum(mean, 1e-3 * mean.max() + 1e-300)
     line, _ = nnls(np.stack([weight, at * weight], axis=1), mean * weight)
@@ -185,8 +193,24 @@ class Pixels(eqx.Module):
         """Number of pixels with a weight."""
         return int(np.count_nonzero(self.weight))
 
+    def blocks(self) -> Iterator[Pixels]:
+        """The sample in pieces of one size."""
+        firsts = range(0, len(self.value), BLOCK)
+        return (jax.tree.map(lambda a, first=first: a[first : first + BLOCK], self) for first in firsts)
 
-@in_float64
+    def by_block(self, function: Callable[[Pixels], Result]) -> Result:
+        """Join what a compiled function makes of each block; its results have pixels last."""
+        joined: Result = jax.tree.map(lambda *parts: np.concatenate(parts, axis=-1), *map(function, self.blocks()))
+        return joined
+
+
+def pixels_at(positions_px: Float[np.ndarray, "n 2"], geometry: Geometry, shape: tuple[int, int]) -> Pixels:
+    """Pixels (x, y) of a sensor of that shape (rows, columns), without values; their number fills whole blocks."""
+    zero = np.zeros(len(positions_px))
+    site, scaled = zero.astype(np.int64), scaled_places(positions_px, shape)
+    return Pixels(ideal_points(geometry, positions_px), scaled, site, value=zero, weight=zero, place=site - 1)
+
+
 def sample_pixels(
     value: Float[np.ndarray, "rows columns"], geometry: Geometry, samples: int, cfa: str, other: bool = False
 ) -> Pixels:
@@ -209,14 +233,22 @@ def sample_pixels(
     positions = np.stack([x, y], axis=-1).astype(np.float64)
     seen = value[y, x].astype(np.float64)
     real = (np.arange(padded) < count) & np.isfinite(seen)
-    return Pixels(
-        ideal=ideal_points(geometry, positions),
-        scaled=scaled_places(positions, value.shape),
+    return replace(
+        pixels_at(positions, geometry, value.shape),
         site=cfa_named(cfa).site_map(rows, columns)[y, x],
         value=np.where(real, seen, 0.0),
         weight=np.where(real, 1.0, 0.0),
         place=np.where(real, y * columns + x, -1),
     )
+
+
+def ideal_points(geometry: Geometry, positions_px: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
+    """Ideal image points of pixels (x, y), as ``models.geometry.unproject`` gives them."""
+    matrix = np.eye(3)
+    matrix[[0, 1], [0, 1]], matrix[:2, 2] = np.asarray(geometry.focal_px), np.asarray(geometry.principal_point_px)
+    until = cv2.TERM_CRITERIA_MAX_ITER + cv2.TERM_CRITERIA_EPS, 60, 1e-14
+    lens = matrix, np.asarray(geometry.distortion, dtype=np.float64)
+    return cv2.undistortPoints(positions_px[:, None], *lens, R=np.eye(3), P=np.eye(3), criteria=until)[:, 0]
 
 
 def scaled_places(pixels: Float[np.ndarray, "n 2"], shape: tuple[int, int]) -> Float[np.ndarray, "n 2"]:
@@ -228,27 +260,6 @@ def odd_step(size: int, samples: int) -> int:
     """Step from pixel to pixel for so many ``samples`` of ``size`` pixels; an odd step visits all CFA sites."""
     step = max(1, size // max(samples, 1))
     return step + 1 - step % 2
-
-
-def ideal_points(geometry: Geometry, positions_px: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
-    """Undistorted image points of pixels (x, y), whose number fills whole blocks."""
-    return over_blocks(lambda part: _ideal_points(geometry, part), positions_px).T
-
-
-@jax.jit
-def _ideal_points(geometry: Geometry, positions_px: Float[Array, "n 2"]) -> Float[Array, "2 n"]:
-    return unproject(geometry, positions_px).T
-
-
-def blocks(*arrays: Shaped[np.ndarray, "n ..."]) -> Iterator[tuple[Shaped[np.ndarray, "block ..."], ...]]:
-    """Arrays over pixels in pieces of one size, which they fill."""
-    return zip(*(part.reshape(-1, BLOCK, *part.shape[1:]) for part in arrays), strict=True)
-
-
-def over_blocks(function: Callable[..., Result], *arrays: Shaped[np.ndarray, "n ..."]) -> Result:
-    """Apply a compiled function to arrays over pixels, block by block; the results have pixels last."""
-    found = [function(*part) for part in blocks(*arrays)]
-    return cast(Result, jax.tree.map(lambda *parts: np.concatenate(parts, axis=-1), *found))
 
 
 @final

@@ -13,28 +13,16 @@ from typing import final
 import numpy as np
 from jaxtyping import Float, Float32
 
-from udccal.cfa import cfa_named
 from udccal.fitting.engine.gaussian import Posterior, square_root
-from udccal.fitting.engine.least_squares import SolverRules, minimise
+from udccal.fitting.engine.least_squares import minimise
 from udccal.fitting.engine.misfit import clustered_cov
 from udccal.fitting.engine.report import coarse
-from udccal.fitting.wire.data import (
-    BLOCK,
-    FlatNoise,
-    Pixels,
-    WireData,
-    flat_noise,
-    ideal_points,
-    over_blocks,
-    sample_pixels,
-    scaled_places,
-    weighed,
-)
-from udccal.fitting.wire.jacobian import block_jacobian, values_at, weighed_at, with_harmonics
-from udccal.fitting.wire.parameters import Kind, Parameters, parameters_of, select, shape_vector, with_shape
+from udccal.fitting.wire.data import Pixels, WireData, flat_noise, pixels_at, sample_pixels
+from udccal.fitting.wire.jacobian import WireProblem, block_jacobian, values_at, weighed_at
+from udccal.fitting.wire.parameters import Kind, Parameters, parameters_of, select
 from udccal.fitting.wire.report import Joint, misfit, omitted, rms, unseen, wire_result
-from udccal.fitting.wire.rules import WireRules, ideal_wire, possible_harmonics
-from udccal.fitting.wire.search import SOLVER, Descent, Found, Search, WireProblem
+from udccal.fitting.wire.rules import WireRules, ideal_wire
+from udccal.fitting.wire.search import SOLVER, Descent, Found, Search
 from udccal.models.geometry import Geometry
 from udccal.models.wire import Wire, wire_map
 from udccal.numerics import in_float64
@@ -58,56 +46,38 @@ def fit_wire(data: WireData, rules: WireRules | None = None, start: Wire | None 
         pixels, model error included. The status of a flat that cannot be used says why.
     """
     rules, shape = rules or WireRules(), data.signal.shape
-    means = site_means(data)
-    refused = unusable_flat(data, means, rules)
+    refused = unusable_flat(data, rules)
     if refused:
         return FitResult.failed("wire", ideal_wire(data.geometry, data.start, np.zeros((0, 2)), rules), *refused)
-    noise, values = flat_noise(data, means), data.signal / means[cfa_named(data.cfa).site_map(*shape)]
-    few, coarse, every = (
+    noise, values = flat_noise(data), data.balanced
+    few, many, every = (
         sample_pixels(values, data.geometry, max(int(part * rules.samples), 1), data.cfa)
         for part in (rules.search_part, rules.shape_part, 1.0)
     )
-    harmonics = possible_harmonics(data.start, rules.least_amplitude).orders
-    if start is not None and np.array_equal(start.harmonics, harmonics):
-        found = _resumed(start, coarse, data, noise, rules)
+    search = Search(data, noise, rules)
+    if start is not None and np.array_equal(start.harmonics, search.harmonics.orders):
+        found = search.resumed(start, many)
     else:
-        found = Search(data.start, noise, rules).found(data.geometry, few, coarse)
-    joint = _joint(found, every, data, noise, rules)
+        found = search.found(few, many)
+    joint = _joint(found, every, search)
     tested, held_out = joint.seen, every.used < values.size / 2
     if held_out:
         others = sample_pixels(values, data.geometry, rules.samples, data.cfa, other=True)
         tested = weighed_at(joint.parameters, joint.x, others, noise)
-    joint = replace(joint, x=mean_one(joint.parameters, joint.x, data.geometry, shape))
-    jacobian, wire = map_jacobian(joint.parameters, joint.x, data.geometry, shape), joint.parameters.wire(joint.x)
+    joint = replace(joint, x=mean_one(joint.parameters, joint.x, shape))
+    jacobian, wire = map_jacobian(joint.parameters, joint.x, shape), joint.parameters.wire(joint.x)
     off = misfit(tested, wire if joint.parameters.panel else None, jacobian.sigma(joint.cov), held_out)
     if off.test.found:
-        joint = replace(joint, cov=clustered_cov(joint.cov, joint.problem.sums(joint.x)[1] / joint.variance))
+        joint = replace(joint, cov=clustered_cov(joint.cov, joint.last.problem.sums(joint.x)[1] / joint.variance))
     if joint.parameters.panel:
         missing = omitted(data.start, wire, joint.seen, rules)
         left_out = missing.sigma if missing else 0.0
     else:
-        left_out = unseen(possible_harmonics(data.start, rules.least_amplitude), found.searched, rules)
+        left_out = unseen(search.harmonics, found.searched, rules)
     model = float(np.hypot(off.sigma, left_out))
     posterior = _posterior(joint, jacobian, model)
     map_sigma, cov = jacobian.sigma_map(joint.cov, model), jacobian.cov_of_mean_one(joint.cov)
     return wire_result(joint, cov, off, left_out, map_sigma, posterior, shape, rules)
-
-
-def _resumed(wire: Wire, many: Pixels, data: WireData, noise: FlatNoise, rules: WireRules) -> Found:
-    """The shape and the shading of an earlier fit as they are; its corrections of the pupil are chosen anew."""
-    ideal, gains = ideal_wire(data.geometry, data.start, wire.harmonics, rules), np.ones(noise.floor.size)
-    shaped = replace(with_shape(ideal, shape_vector(wire)), baseline=wire.baseline, amplitudes=wire.amplitudes)
-    whole, base = values_at(wire, many.ideal, many.scaled)
-    # The weights are those of the earlier fit's own map.
-    pixels, found = weighed(many, whole * base, noise).pixels, []
-    without, with_rows = (np.sum((many.value - of) ** 2 * pixels.weight) for of in (base, whole * base))
-    for sharpness in rules.sharpness:
-        one = with_harmonics(shaped, wire.harmonics, many.ideal, sharpness)
-        parameters = parameters_of(one, rules, gains.size)
-        problem = WireProblem("wire, resumed", parameters, pixels, parameters.prior(data.start, rules))
-        descent = Descent(problem, minimise(problem, parameters.vector(one, gains), SolverRules(iterations=0)))
-        found.append(Found(descent, pixels, float(without - with_rows) / descent.variance, sharpness))
-    return min(found, key=lambda one: one.descent.criterion)
 
 
 @in_float64
@@ -116,15 +86,9 @@ def sensor_map(wire: Wire, rows: int, columns: int) -> Float[np.ndarray, "rows c
     return np.asarray(wire_map(wire, rows, columns), dtype=np.float64)
 
 
-def site_means(data: WireData) -> Float[np.ndarray, " sites"]:
-    """Return the mean signal of each site's finite, unclipped pixels; NaN where there are none."""
-    by_site = (data.signal[site.samples] for site in cfa_named(data.cfa).sites)
-    good = (some[np.isfinite(some) & (some < data.clip)] for some in by_site)
-    return np.array([float(some.mean(dtype=np.float64)) if some.size else np.nan for some in good])
-
-
-def unusable_flat(data: WireData, means: Float[np.ndarray, " sites"], rules: WireRules) -> tuple[FitStatus, str] | None:
+def unusable_flat(data: WireData, rules: WireRules) -> tuple[FitStatus, str] | None:
     """Return why a flat cannot be fitted; None where it can be."""
+    means = data.site_means
     if data.clipped > rules.most_clipped:
         return FitStatus.SATURATED, f"{100 * data.clipped:.1f} % of the flat is clipped."
     if not np.isfinite(means).all():
@@ -133,19 +97,20 @@ def unusable_flat(data: WireData, means: Float[np.ndarray, " sites"], rules: Wir
         return FitStatus.TOO_DARK, "A CFA site has no light; check the lamp."
     if data.signal.size < rules.least_samples:
         return FitStatus.TOO_FEW_DATA, f"There are {data.signal.size} pixels; use a larger region of the sensor."
-    worst = float(np.sqrt(flat_noise(data, means).variance(np.arange(means.size), np.ones(means.size)).max()))
+    worst = float(np.sqrt(flat_noise(data).variance(np.arange(means.size), np.ones(means.size)).max()))
     if worst > 1.0:
         note = f"A pixel's noise is {worst:.2g} of its signal. Average more frames, or expose longer."
         return FitStatus.TOO_DARK, note
     return None
 
 
-def _joint(found: Found, every: Pixels, data: WireData, noise: FlatNoise, rules: WireRules) -> Joint:
+def _joint(found: Found, every: Pixels, search: Search) -> Joint:
     """Choose the columns that the data support, and fit them with the shape until the solver converges."""
     descent, panel = found.descent, found.descent.problem.parameters.panel
-    bounds = possible_harmonics(data.start, rules.least_amplitude).bounds
-    full = parameters_of(descent.wire, rules, descent.gains.size, bounds if panel else (), panel)
-    prior, x = full.prior(data.start, rules), full.vector(descent.wire, descent.gains)
+    start, noise, rules = search.data.start, search.noise, search.rules
+    bounds = search.harmonics.bounds if panel else ()
+    full = parameters_of(descent.wire, rules, descent.gains.size, bounds, panel)
+    prior, x = full.prior(start, rules), full.vector(descent.wire, descent.gains)
     here = WireProblem("wire, orders", full, descent.weighs(every, noise), prior).equations_at(x)
     # The equations are moved to where the columns are 0, so that the present coefficients count as the columns' own.
     already = np.where(full.groups >= 0, x - prior.mean, 0.0)
@@ -154,44 +119,29 @@ def _joint(found: Found, every: Pixels, data: WireData, noise: FlatNoise, rules:
     orders = select(here.shared, right, power, here.samples, full.groups)
     chosen = orders.best.fit
     kept, x = full.kept(chosen.keep), (x - already + chosen.values)[chosen.keep]
-    pixels = weighed_at(kept, x, every, noise).pixels
-    problem = WireProblem("wire, joint", kept, pixels, kept.prior(data.start, rules))
+    problem = WireProblem("wire, joint", kept, weighed_at(kept, x, every, noise).pixels, kept.prior(start, rules))
     solution = minimise(problem, x, SOLVER)
     ahead = solution.equations.step(0.0).shared
     # A last step whose expected gain is below the solver's limit is taken without a check of the cost.
     x = solution.place + (ahead if solution.converged else 0.0)
     seen = weighed_at(kept, x, every, noise)
-    return Joint(
-        problem=problem,
-        x=x,
-        cov=solution.with_rest(solution.equations.cov(), ahead),
-        variance=problem.variance(float(seen.z @ seen.z)),
-        seen=seen,
-        orders=orders,
-        converged=solution.converged,
-        iterations=descent.solution.iterations + solution.iterations,
-        gain=found.gain,
-        sharpness=found.sharpness,
-    )
+    cov, last = solution.with_rest(solution.equations.cov(), ahead), Descent(problem, solution)
+    return Joint(found, last, x, cov, problem.variance(float(seen.z @ seen.z)), seen, orders)
 
 
-def _grid(
-    geometry: Geometry, shape: tuple[int, int], parts: tuple[int, int]
-) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"]]:
-    """Ideal and scaled points of the middles of ``parts`` (down, across) of a sensor of that shape."""
+def _grid(geometry: Geometry, shape: tuple[int, int], parts: tuple[int, int]) -> Pixels:
+    """The middles of ``parts`` (down, across) of a sensor of that shape."""
     y, x = ((np.arange(n) + 0.5) / n * size - 0.5 for n, size in zip(parts, shape, strict=True))
-    pixels = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-    return ideal_points(geometry, pixels), scaled_places(pixels, shape)
+    return pixels_at(np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2), geometry, shape)
 
 
-def mean_one(
-    parameters: Parameters, x: Float[np.ndarray, " n"], geometry: Geometry, shape: tuple[int, int]
-) -> Float[np.ndarray, " n"]:
+def mean_one(parameters: Parameters, x: Float[np.ndarray, " n"], shape: tuple[int, int]) -> Float[np.ndarray, " n"]:
     """``x`` with the first coefficient of the shading that gives the map a mean of 1, by the midpoint rule.
 
     ``shape`` is the sensor's (rows, columns).
     """
-    whole, base = values_at(parameters.wire(x), *_grid(geometry, shape, (192, 256)))
+    wire = parameters.wire(x)
+    whole, base = values_at(wire, _grid(wire.geometry, shape, (192, 256)))
     scaled = x.copy()
     scaled[0] -= np.log(float(np.mean(whole * base)))
     return scaled
@@ -225,13 +175,11 @@ class MapJacobian:
         return np.asarray(change @ cov @ change.T)
 
 
-def map_jacobian(
-    parameters: Parameters, x: Float[np.ndarray, " n"], geometry: Geometry, shape: tuple[int, int]
-) -> MapJacobian:
+def map_jacobian(parameters: Parameters, x: Float[np.ndarray, " n"], shape: tuple[int, int]) -> MapJacobian:
     """Jacobian of the map at ``x``, whose mean is 1, on a grid of places over a sensor (rows, columns)."""
-    site, wire = np.zeros(BLOCK, dtype=np.int64), parameters.wire(x)
-    grid = _grid(geometry, shape, (_PLACES, _PLACES))
-    whole, base, rows = over_blocks(lambda *at: block_jacobian(parameters, wire, at[0], at[1], site), *grid)
+    wire = parameters.wire(x)
+    grid = _grid(wire.geometry, shape, (_PLACES, _PLACES))
+    whole, base, rows = grid.by_block(lambda block: block_jacobian(parameters, wire, block))
     value, rows = whole * base, rows * base
     # Site gains are not in the map.
     rows[parameters.of(Kind.SITE)] = 0.0

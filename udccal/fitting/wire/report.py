@@ -14,11 +14,12 @@ from udccal.fitting.engine.misfit import NO_TEST, MisfitTest, chi2_test, excess_
 from udccal.fitting.engine.orders import Choice
 from udccal.fitting.engine.report import estimates, priors_of, residual_sample
 from udccal.fitting.wire.data import BLOCK, Pixels, Weighed
-from udccal.fitting.wire.jacobian import rays_at, tilt_deg, values_at, with_harmonics
+from udccal.fitting.wire.jacobian import LEAST_VARIANCE, TILES, rays_at, tile_numbers, values_at, with_harmonics
 from udccal.fitting.wire.parameters import SHAPE_NAMES, Kind, Parameters, element_name
 from udccal.fitting.wire.rules import Harmonics, WireRules, WireStart, possible_harmonics
-from udccal.fitting.wire.search import LEAST_VARIANCE, TILES, WireProblem, tile_numbers
-from udccal.models.wire import Wire
+from udccal.fitting.wire.search import Descent, Found
+from udccal.models.geometry import tilt_rad
+from udccal.models.wire import Wire, panel_rotation
 from udccal.result import Diagnostic, Estimate, FitResult, FitStatus
 
 
@@ -60,7 +61,7 @@ def misfit(tested: Weighed, wire: Wire | None, statistical: float, held_out: boo
 def _bins(pixels: Pixels, wire: Wire | None, down: int, across: int) -> Int[np.ndarray, " n"]:
     """Number of each pixel's bin in its tile: by its ray's phase in rows and columns, or by place without a panel."""
     by_place = 0.5 * (pixels.scaled.T + 1) * np.array([[TILES[1]], [TILES[0]]])
-    periods = rays_at(wire, pixels.ideal).periods if wire is not None else by_place
+    periods = rays_at(wire, pixels).periods if wire is not None else by_place
     phase = periods - np.floor(periods)
     x, y = (np.minimum((p * n).astype(np.int64), n - 1) for p, n in zip(phase, (across, down), strict=True))
     return np.asarray((tile_numbers(pixels.scaled) * down + y) * across + x)
@@ -121,19 +122,9 @@ def omitted(start: WireStart, wire: Wire, seen: Weighed, rules: WireRules) -> Om
 
 
 def harmonics_alone(wire: Wire, orders: Float[np.ndarray, "any 2"], pixels: Pixels) -> Float[np.ndarray, " n"]:
-    """The modulation by these harmonics of a round pupil, at a wire's shape.
-
-    Chunks have as many harmonics as the wire, so that the fit's compiled functions serve here; tiny chunks are slow.
-    """
-    size = max(len(wire.harmonics), 64)
-    plain = replace(wire, amplitudes=np.zeros_like(wire.amplitudes))
-    total = np.zeros(len(pixels.value))
-    for first in range(0, len(orders), size):
-        some = orders[first : first + size]
-        chunk = with_harmonics(plain, np.resize(some, (size, 2)), pixels.ideal)
-        fields = np.where(np.arange(size)[:, None, None, None] < len(some), chunk.fields, 0.0)
-        total += values_at(replace(chunk, fields=fields), pixels.ideal, pixels.scaled)[0] - 1
-    return total
+    """The modulation by these harmonics of a round pupil, at a wire's shape."""
+    plain = replace(wire, amplitudes=np.zeros((0, 2, 1, 1)))
+    return values_at(with_harmonics(plain, orders, pixels), pixels)[0] - 1
 
 
 def unseen(harmonics: Harmonics, searched: Pixels, rules: WireRules) -> float:
@@ -150,27 +141,23 @@ def unseen(harmonics: Harmonics, searched: Pixels, rules: WireRules) -> float:
 @final
 @dataclass(frozen=True)
 class Joint:
-    """A fitted wire: the problem that was solved, the parameters' values and covariance, and facts about the fit.
+    """A fitted wire: the search, the last descent, and the parameters' values and covariance.
 
-    ``variance`` is that of the residuals in units of the noise's, ``seen`` the pixels of the fit with their weights,
-    ``gain`` the chi-squared that the rows explained in the scan, ``sharpness`` that of the openings' edges.
+    ``variance`` is that of the residuals in units of the noise's, ``seen`` the pixels of the fit with their weights.
     """
 
-    problem: WireProblem
+    found: Found
+    last: Descent
     x: Float[np.ndarray, " n"]
     cov: Float[np.ndarray, "n n"]
     variance: float
     seen: Weighed
     orders: Choice
-    converged: bool
-    iterations: int
-    gain: float
-    sharpness: float
 
     @property
     def parameters(self) -> Parameters:
         """The parameters kept."""
-        return self.problem.parameters
+        return self.last.problem.parameters
 
     @property
     def impossible(self) -> bool:
@@ -201,25 +188,26 @@ def wire_result(
     relative.
     """
     panel, seen = joint.parameters.panel, joint.seen
-    term = _trimmed(posterior.term_at(posterior.mean), panel)
+    term = _trimmed(posterior.term_at(posterior.mean))
     outliers = seen.outliers(shape[1])
     drawn = np.flatnonzero(seen.pixels.weight > 0)
     few = seen.pixels.thinned(8 * BLOCK)
-    tilt, nominal = (tilt_deg(one) for one in (term, replace(term, rotation_rad=np.zeros(3))))
+    tilt = float(np.rad2deg(np.arcsin(np.clip(panel_rotation(term)[1, 2], -1.0, 1.0))))
+    nominal = float(np.rad2deg(tilt_rad(term.geometry)))
     named, named_cov = _estimates(joint, cov) if panel else ((), np.zeros((0, 0)))
     diagnostics = (
         ("wire_map_rms_sigma", 100 * rms(map_sigma), "%"),
         ("wire_map_model_sigma", 100 * float(np.hypot(found.sigma, left_out)), "%"),
         ("harmonics_left_out", 100 * left_out, "%"),
         ("residual_pattern_p_value", found.test.p_value, "1"),
-        ("modulation_peak_to_peak", 100 * float(np.ptp(values_at(term, few.ideal, few.scaled)[0])), "%"),
+        ("modulation_peak_to_peak", 100 * float(np.ptp(values_at(term, few)[0])), "%"),
         ("harmonics", float(len(term.harmonics)), "1"),
         ("parameters", float(joint.parameters.linear), "1"),
         ("pixels_left_out", float(sum(one.count for one in outliers)), "1"),
-        ("gain_in_chi2", joint.gain, "1"),
+        ("gain_in_chi2", joint.found.gain, "1"),
         ("tilt_by_wire", tilt, "deg"),
         ("tilt_by_wire_minus_geometry", tilt - nominal, "deg"),
-        ("iterations", float(joint.iterations), "1"),
+        ("iterations", float(joint.found.descent.solution.iterations + joint.last.solution.iterations), "1"),
     )
     return FitResult(
         name="wire",
@@ -239,13 +227,15 @@ def wire_result(
     )
 
 
-def _trimmed(wire: Wire, panel: bool) -> Wire:
-    """The wire without unused Legendre degrees, and without harmonics where there is no panel: it is faster."""
+def _trimmed(wire: Wire) -> Wire:
+    """The wire without unused Legendre degrees, amplitudes, and harmonics where there is no panel: it is faster."""
     used = np.flatnonzero(np.any(np.asarray(wire.fields) != 0, axis=(0, 1, 2)))
-    degrees, count = (int(used.max()) + 1 if used.size else 1), (None if panel else 0)
     beside = wire.amplitudes if np.any(wire.amplitudes) else np.zeros((0, 2, 1, 1))
-    harmonics, frequency, fields = wire.harmonics[:count], wire.frequency[:count], wire.fields[:count, ..., :degrees]
-    return replace(wire, harmonics=harmonics, frequency=frequency, fields=fields, amplitudes=beside)
+    seen = np.s_[: len(wire.harmonics) if used.size or len(beside) else 0]
+    fields = wire.fields[seen, ..., : used.max(initial=0) + 1]
+    return replace(
+        wire, harmonics=wire.harmonics[seen], frequency=wire.frequency[seen], fields=fields, amplitudes=beside
+    )
 
 
 def _status(joint: Joint, rules: WireRules) -> FitStatus:
@@ -253,14 +243,14 @@ def _status(joint: Joint, rules: WireRules) -> FitStatus:
         return FitStatus.POOR_FIT
     if not joint.parameters.panel:
         return FitStatus.ABSENT
-    return FitStatus.CONVERGED if joint.converged else FitStatus.NOT_CONVERGED
+    return FitStatus.CONVERGED if joint.last.solution.converged else FitStatus.NOT_CONVERGED
 
 
 def _notes(joint: Joint, found: Misfit, left_out: float, rules: WireRules) -> Iterator[str]:
     if joint.parameters.panel:
-        prior = joint.problem.prior
+        prior = joint.last.problem.prior
         off = (prior.root @ (joint.x - prior.mean))[joint.parameters.linear :]
-        if joint.sharpness < 1:
+        if joint.found.sharpness < 1:
             yield (
                 "The rows lack the higher harmonics of rectangular openings: row_open and column_open describe the "
                 "strength of the first harmonics, not edges that a microscope would show."
@@ -284,7 +274,7 @@ def _notes(joint: Joint, found: Misfit, left_out: float, rules: WireRules) -> It
         yield "An opening came out wider than its period: check panel, pitch and lens in the rig description."
     if joint.variance > rules.worst_variance:
         yield "Look at the residual map for dust, glare or uneven light; check PRNU and the rig description."
-    elif not joint.converged:
+    elif not joint.last.solution.converged:
         yield "Capture more flats, or give the fit more pixels."
 
 
@@ -292,7 +282,7 @@ def _estimates(
     joint: Joint, cov: Float[np.ndarray, "all all"]
 ) -> tuple[tuple[Estimate, ...], Float[np.ndarray, "n n"]]:
     """The shape, then all elements of the wire's arrays that were fitted, with their covariance."""
-    parameters, prior = joint.parameters, joint.problem.prior
+    parameters, prior = joint.parameters, joint.last.problem.prior
     # Gains of the CFA sites are not in the term: their errors remain in the variances of the others.
     others = np.flatnonzero(~parameters.of(Kind.SITE) & ~parameters.of(Kind.SHAPE))
     order = np.concatenate([np.flatnonzero(parameters.of(Kind.SHAPE)), others])

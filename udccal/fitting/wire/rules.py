@@ -121,12 +121,11 @@ class Harmonics:
     bounds: Float[np.ndarray, " harmonics"]
 
 
-def possible_harmonics(start: WireStart, least: float | None = None, below: float = np.inf) -> Harmonics:
+def possible_harmonics(start: WireStart, least: float = WireRules.least_amplitude, below: float = np.inf) -> Harmonics:
     """Harmonics whose relative amplitude has a bound from ``least`` (by default the fitted ones') to ``below``.
 
     The bound is the slits' times the envelope of 2 J1(z) / z, z = pi D kappa / pitch, for a round pupil.
     """
-    least = WireRules().least_amplitude if least is None else least
     orders = np.arange(HIGHEST_ORDER + 1.0)
     m, n = (part.ravel() for part in np.meshgrid(orders, np.concatenate([-orders[:0:-1], orders]), indexing="ij"))
     n, m = n[(m > 0) | (n > 0)], m[(m > 0) | (n > 0)]

@@ -1,4 +1,7 @@
-"""The search for the wire far around the rig description: descents from the places that a scan finds."""
+"""The search for the wire far around the rig description: descents from the places that a scan finds.
+
+The scan finds stand-off, pupil and origin by demodulation of the rows' and the columns' first harmonic.
+"""
 
 from __future__ import annotations
 
@@ -7,80 +10,20 @@ from dataclasses import dataclass, replace
 from typing import final
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
+from scipy.ndimage import maximum_filter
+from scipy.special import j1
 
-from udccal.fitting.engine.gaussian import Prior
-from udccal.fitting.engine.least_squares import Blocks, Solution, SolverRules, Step, minimise
+from udccal.fitting.engine.least_squares import Blocks, Solution, SolverRules, minimise
 from udccal.fitting.engine.orders import bic
-from udccal.fitting.wire.data import FlatNoise, Pixels, blocks, weighed
-from udccal.fitting.wire.jacobian import block_jacobian, expected_of, weighed_at, with_harmonics
-from udccal.fitting.wire.parameters import Parameters, parameters_of
-from udccal.fitting.wire.rules import WireRules, WireStart, ideal_wire, possible_harmonics
-from udccal.fitting.wire.scan import beside, scan_columns, scan_rows
-from udccal.models.geometry import Geometry
+from udccal.fitting.wire.data import FlatNoise, Pixels, WireData, weighed
+from udccal.fitting.wire.jacobian import WireProblem, expected_of, rays_at, values_at, weighed_at, with_harmonics
+from udccal.fitting.wire.parameters import parameters_of, shape_sigma, shape_vector, with_shape
+from udccal.fitting.wire.rules import Harmonics, WireRules, WireStart, ideal_wire, possible_harmonics
 from udccal.models.wire import Wire
 
-# Tiles of the sensor, down and across, whose residuals are tested as a whole.
-TILES = (6, 8)
-# Least residual variance in units of the noise's, so that quotients by it stay finite.
-LEAST_VARIANCE = 1e-12
 # Weakly determined parameters may creep on for ever: the descent ends at a tenth of a sigma, or when steps stall.
 SOLVER = SolverRules(least_gain=1e-2, stalled_gain=0.1)
-
-
-@final
-@dataclass(frozen=True)
-class WireProblem:
-    """The likelihood of the parameters by a sample of weighted pixels.
-
-    The scale of the noise is estimated with them, so that the prior's weight does not depend on how well PRNU is
-    known. With the scale profiled out, minus twice the log likelihood is dof ln(chi-squared / dof).
-    """
-
-    name: str
-    parameters: Parameters
-    pixels: Pixels
-    prior: Prior
-
-    def equations_at(self, place: Float[np.ndarray, " n"]) -> Blocks:
-        """Cost and normal equations in units of the residual variance."""
-        matrix, by_tile, chi2 = self.sums(place)
-        used, variance = self.pixels.used, self.variance(chi2)
-        cost = max(used - len(place), 1) * float(np.log(variance))
-        by_data = Blocks.dense(cost, used, matrix / variance, by_tile.sum(axis=0) / variance)
-        return by_data.with_prior(self.prior, place)
-
-    def variance(self, chi2: float) -> float:
-        """Variance of the residuals in units of the noise's."""
-        return chi2 / max(self.pixels.used - len(self.prior.mean), 1) + LEAST_VARIANCE
-
-    def sums(
-        self, place: Float[np.ndarray, " n"]
-    ) -> tuple[Float[np.ndarray, "n n"], Float[np.ndarray, "tiles n"], float]:
-        """Information by the pixels' weights, the right side by tile, and chi-squared."""
-        wire, gains, size = self.parameters.wire(place), self.parameters.gains(place), len(place)
-        matrix, by_tile, chi2, p = np.zeros((size, size)), np.zeros((TILES[0] * TILES[1], size)), 0.0, self.pixels
-        for ideal, scaled, site, value, weight in blocks(p.ideal, p.scaled, p.site, p.value, p.weight):
-            whole, base, rows = block_jacobian(self.parameters, wire, ideal, scaled, site)
-            level, root = base * gains[site], np.sqrt(weight)
-            errors, rows = (value - whole * level) * root, rows * (root * level)
-            matrix += rows @ rows.T
-            # A block is some rows of the sensor, which cross few of the tiles.
-            tile = tile_numbers(scaled)
-            crossed = np.unique(tile)
-            by_tile[crossed] += np.where(tile == crossed[:, None], errors, 0.0) @ rows.T
-            chi2 += float(errors @ errors)
-        return matrix, by_tile, chi2
-
-    def moved(self, place: Float[np.ndarray, " n"], step: Step) -> Float[np.ndarray, " n"]:
-        """The place after a step."""
-        return place + step.shared
-
-
-def tile_numbers(scaled: Float[np.ndarray, "n 2"]) -> Int[np.ndarray, " n"]:
-    """Number of the sensor's tile in which each position lies."""
-    x, y = (np.clip((0.5 * (scaled[:, i] + 1) * n).astype(np.int64), 0, n - 1) for i, n in enumerate(TILES[::-1]))
-    return np.asarray(y * TILES[1] + x)
 
 
 @final
@@ -133,94 +76,117 @@ class Found:
 @final
 @dataclass(frozen=True)
 class Search:
-    """A search by the rig as built, the noise and the rules."""
+    """A search by a flat with the rig as built, its noise and the rules."""
 
-    start: WireStart
+    data: WireData
     noise: FlatNoise
     rules: WireRules
 
-    def found(self, geometry: Geometry, few: Pixels, many: Pixels) -> Found:
+    @property
+    def harmonics(self) -> Harmonics:
+        """Those that are fitted."""
+        return possible_harmonics(self.data.start, self.rules.least_amplitude)
+
+    def found(self, few: Pixels, many: Pixels) -> Found:
         """Fit the shading alone, then stand-off and origin by demodulation of the first harmonics, then all together.
 
         The search uses ``few`` pixels and the strongest harmonics; the last fit uses ``many`` pixels and all harmonics.
         Rows that ``few`` do not show are searched in ``many``.
         """
-        harmonics = possible_harmonics(self.start, self.rules.least_amplitude).orders
-        strongest = harmonics[: self.rules.search_harmonics]
-        built = ideal_wire(geometry, self.start, strongest, self.rules)
+        start, rules = self.data.start, self.rules
+        harmonics = self.harmonics.orders
+        strongest = harmonics[: rules.search_harmonics]
         for sample in (few, many):
-            bare = self._shading(with_harmonics(built, strongest, sample.ideal), sample)
+            bare = self._shading(strongest, sample)
             sample = bare.weighs(sample, self.noise)
-            places, gain = scan_rows(bare.wire, bare.gains, self.start, sample, self.rules)
-            if gain >= self.rules.least_gain:
+            places, gain = scan_rows(bare.wire, bare.gains, start, sample, rules)
+            if gain >= rules.least_gain:
                 break
         else:
             return Found(bare, sample, gain)
-        first, *others = self.rules.sharpness
-        sharp = self._search(places, bare, strongest, sample, first)
-        weights, tried = sharp[0].weighs(many, self.noise), [(first, sharp)]
-        for sharpness in others:
+        sharp = self._search(places, bare.gains, strongest, sample)
+        weights, tried = sharp[0].weighs(many, self.noise), [(rules.sharpness[0], one) for one in sharp]
+        for sharpness in rules.sharpness[1:]:
             # From where sharp edges led; only edges that these pixels prefer are finished.
-            placed = (with_harmonics(one.wire, strongest, sample.ideal, sharpness) for one in sharp)
-            soft = [self._descent(wire, sharp[0].gains, sample, SOLVER) for wire in placed]
-            tried.append((sharpness, [one for one in soft if one.criterion < sharp[0].criterion]))
+            placed = (with_harmonics(one.wire, strongest, sample, sharpness) for one in sharp)
+            soft = [self._descent(wire, sharp[0].gains, sample) for wire in placed]
+            tried += [(sharpness, one) for one in soft if one.criterion < sharp[0].criterion]
         finished = []
-        for sharpness, rivals in tried:
-            for one in rivals:
-                columns = _best_columns(one, weights, self.start.column_open)
-                wire = with_harmonics(columns, harmonics, few.ideal, sharpness)
-                finished.append(Found(self._descent(wire, one.gains, weights, SOLVER), sample, gain, sharpness))
+        for sharpness, one in tried:
+            wire = with_harmonics(_best_columns(one, weights, start.column_open), harmonics, few, sharpness)
+            finished.append(Found(self._descent(wire, one.gains, weights), sample, gain, sharpness))
         return min(finished, key=lambda one: one.descent.criterion)
 
-    def _shading(self, built: Wire, sample: Pixels) -> Descent:
+    def resumed(self, wire: Wire, many: Pixels) -> Found:
+        """The shape and the shading of an earlier fit as they are; its corrections of the pupil are chosen anew."""
+        ideal = ideal_wire(self.data.geometry, self.data.start, wire.harmonics, self.rules)
+        shaped = replace(with_shape(ideal, shape_vector(wire)), baseline=wire.baseline, amplitudes=wire.amplitudes)
+        whole, base = values_at(wire, many)
+        # The weights are those of the earlier fit's own map.
+        pixels, gains = weighed(many, whole * base, self.noise).pixels, np.ones(self.noise.floor.size)
+        without, with_rows = (np.sum((many.value - of) ** 2 * pixels.weight) for of in (base, whole * base))
+        found = []
+        for sharpness in self.rules.sharpness:
+            one = with_harmonics(shaped, wire.harmonics, many, sharpness)
+            descent = self._descent(one, gains, pixels, SolverRules(iterations=0), "wire, resumed")
+            found.append(Found(descent, pixels, float(without - with_rows) / descent.variance, sharpness))
+        return min(found, key=lambda one: one.descent.criterion)
+
+    def _shading(self, harmonics: Float[np.ndarray, "harmonics 2"], sample: Pixels) -> Descent:
         """Fit the shading without any panel: no modulation, and no openings that narrow with obliquity."""
-        bare = replace(built, fields=np.zeros_like(built.fields), depth_per_pitch=np.float64(0.0))
-        parameters = parameters_of(bare, self.rules, self.noise.floor.size, panel=False)
-        prior, x = parameters.prior(self.start, self.rules), parameters.vector(bare, np.ones(parameters.sites))
-        x[0] = -np.log(float(bare.row_open) * float(bare.column_open))
+        wire = ideal_wire(self.data.geometry, self.data.start, harmonics, self.rules)
+        baseline = np.zeros_like(wire.baseline)
+        baseline[0, 0] = -np.log(float(wire.row_open) * float(wire.column_open))
+        nothing, gains = np.zeros_like(wire.fields), np.ones(self.noise.floor.size)
+        wire = replace(wire, baseline=baseline, fields=nothing, depth_per_pitch=np.float64(0.0))
         # At first, clipped pixels are left out by their own values; later, by the model's.
         clip = self.noise.clip[sample.site]
         pixels = weighed(sample, np.where(sample.value < clip, 1.0, clip), self.noise).pixels
         for _ in range(2):
-            problem = WireProblem("wire, shading", parameters, pixels, prior)
-            descent = Descent(problem, minimise(problem, x, SOLVER))
-            x, pixels = descent.solution.place, descent.weighs(sample, self.noise)
+            descent = self._descent(wire, gains, pixels, name="wire, shading", panel=False)
+            wire, gains, pixels = descent.wire, descent.gains, descent.weighs(sample, self.noise)
         return descent
 
     def _search(
         self,
         places: list[Wire],
-        bare: Descent,
+        gains: Float[np.ndarray, " sites"],
         harmonics: Float[np.ndarray, "harmonics 2"],
         sample: Pixels,
-        sharpness: float,
     ) -> list[Descent]:
         """Descend from the places of a scan: a few steps from each, and to the end from the best.
 
         A pupil one period larger, with the origin half a period on, has nearly the same first harmonic. Where few
         pixels cannot distinguish such rivals, all of them come back, best first.
         """
-        depth, tried = np.float64(self.start.depth_per_pitch), []
+        depth, tried = np.float64(self.data.start.depth_per_pitch), []
         for place in (places[0], *beside(places[0]), *places[1:]):
-            placed = replace(scan_columns(place, bare.gains, sample), depth_per_pitch=depth)
-            wire = with_harmonics(placed, harmonics, sample.ideal, sharpness)
-            tried.append(self._descent(wire, bare.gains, sample, SolverRules(least_gain=1e-2, iterations=3)))
+            placed = replace(scan_columns(place, gains, sample), depth_per_pitch=depth)
+            wire = with_harmonics(placed, harmonics, sample, self.rules.sharpness[0])
+            tried.append(self._descent(wire, gains, sample, SolverRules(least_gain=1e-2, iterations=3)))
         unfinished = _rivals(tried, self.rules.unfinished)
-        rivals = [self._descent(one.wire, one.gains, sample, SOLVER) for one in unfinished]
-        rivals = _rivals(rivals, self.rules.rival)
+        rivals = _rivals([self._descent(one.wire, one.gains, sample) for one in unfinished], self.rules.rival)
         best, (count, degree) = rivals[0], self.rules.free
         if (variance := best.variance) <= self.rules.doubtful_variance:
             return rivals
         room = np.zeros((min(count, len(harmonics)), 2, degree + 1, degree + 1))
-        other = self._descent(replace(best.wire, amplitudes=room), best.gains, sample, SOLVER)
+        other = self._descent(replace(best.wire, amplitudes=room), best.gains, sample)
         # Chance, or noise somewhat larger than given, must not add that many parameters.
         return [other] if other.variance < 0.95 * variance else rivals
 
-    def _descent(self, wire: Wire, gains: Float[np.ndarray, " sites"], pixels: Pixels, rules: SolverRules) -> Descent:
+    def _descent(
+        self,
+        wire: Wire,
+        gains: Float[np.ndarray, " sites"],
+        pixels: Pixels,
+        solver: SolverRules = SOLVER,
+        name: str = "wire, shape",
+        panel: bool = True,
+    ) -> Descent:
         """Descend from a wire, whose origin becomes the prior's."""
-        parameters = parameters_of(wire, self.rules, gains.size)
-        problem = WireProblem("wire, shape", parameters, pixels, parameters.prior(self.start, self.rules))
-        return Descent(problem, minimise(problem, parameters.vector(wire, gains), rules))
+        parameters = parameters_of(wire, self.rules, gains.size, panel=panel)
+        problem = WireProblem(name, parameters, pixels, parameters.prior(self.data.start, self.rules))
+        return Descent(problem, minimise(problem, parameters.vector(wire, gains), solver))
 
 
 def _best_columns(descent: Descent, pixels: Pixels, column_open: float) -> Wire:
@@ -238,3 +204,86 @@ def _rivals(tried: Sequence[Descent], margin: float) -> list[Descent]:
     """The descents that the data so far cannot distinguish from the best one, best first."""
     ordered = sorted(tried, key=lambda one: one.solution.equations.cost)
     return [one for one in ordered if one.solution.equations.cost < ordered[0].solution.equations.cost + margin]
+
+
+def scan_rows(
+    wire: Wire, gains: Float[np.ndarray, " sites"], start: WireStart, pixels: Pixels, rules: WireRules
+) -> tuple[list[Wire], float]:
+    """Wires whose stand-off, pupil and origin along Y put most signal into the rows' first harmonic, best first.
+
+    There may be several: a pupil one period larger with the origin half a period on has nearly the same harmonic.
+    ``wire`` has no modulation and the start's stand-off and pupil; ``pixels`` have its weights. The second result is
+    the chi-squared that the best one's first harmonic explains, 0 where there is none.
+    """
+    rays, sigma = rays_at(wire, pixels), shape_sigma(start, rules)
+    half_field = max(float(np.ptp(rays.periods[1])) / 2, 1.0)
+    z = max(np.pi * start.footprint_per_pitch * float(np.sqrt(np.max(rays.ellipse[2]))), 1.0)
+    step, step_z = rules.scan_steps
+    off = _trials(rules.scan_range, step / half_field, 2500), _trials(rules.scan_range, step_z / z, 80)
+    standoffs, pupils = start.standoff_per_pitch * np.exp(off[0]), start.footprint_per_pitch * np.exp(off[1])
+    gain, angle = _demodulate(wire, gains, pixels, 1, standoffs, pupils)
+    unlikely = (off[0] / sigma[3])[:, None] ** 2 + (off[1] / sigma[6]) ** 2
+    score = np.where(gain > 0, gain - np.minimum(unlikely, 0.5 * gain), 0.0)
+    # Other places count if they explain a good part of the best one's chi-squared.
+    peaks = np.argwhere((maximum_filter(score, size=3, mode="nearest") == score) & (score >= 0.3 * score.max()))
+    order = np.argsort([-score[i, j] for i, j in peaks], kind="stable")[: rules.places]
+    found = [_placed(wire, standoffs[i], pupils[j], 1, angle[i, j]) for i, j in peaks[order]]
+    return found, float(gain[tuple(peaks[order[0]])]) if found else 0.0
+
+
+def beside(place: Wire) -> list[Wire]:
+    """The places with a pupil one period larger or smaller, where the first harmonic's sign and the origin change.
+
+    For a pupil of several periods, a period of diameter is one zero more, or less, in the pupil's transform.
+    """
+    pupil, standoff = float(place.footprint_per_pitch), float(place.standoff_per_pitch)
+    angle = 2 * np.pi * (float(np.asarray(place.offset_periods)[1]) + 0.5)
+    return [_placed(place, standoff, size, 1, angle) for size in (pupil - 1.0, pupil + 1.0) if size > 1.0]
+
+
+def scan_columns(wire: Wire, gains: Float[np.ndarray, " sites"], pixels: Pixels) -> Wire:
+    """The wire with the origin along X from the columns' first harmonic; the rows have given the rest."""
+    standoff, pupil = float(wire.standoff_per_pitch), float(wire.footprint_per_pitch)
+    _gain, angle = _demodulate(wire, gains, pixels, 0, np.array([standoff]), np.array([pupil]))
+    return _placed(wire, standoff, pupil, 0, angle[0, 0])
+
+
+def _trials(ends: tuple[float, float], step: float, most: int) -> Float[np.ndarray, " n"]:
+    """Logarithms of the factors to try; one factor is 1, the rig description itself."""
+    low, high = np.log(ends)
+    count = int(np.clip(np.ceil((high - low) / step), 8, most))
+    below = max(round(count * -low / (high - low)), 1)
+    return np.concatenate([np.linspace(low, 0, below + 1)[:-1], np.linspace(0, high, count - below + 1)])
+
+
+def _demodulate(
+    wire: Wire,
+    gains: Float[np.ndarray, " sites"],
+    pixels: Pixels,
+    axis: int,
+    standoffs: Float[np.ndarray, " s"],
+    pupils: Float[np.ndarray, " p"],
+) -> tuple[Float[np.ndarray, "s p"], Float[np.ndarray, "s p"]]:
+    """Demodulate the residuals of ``wire``: chi-squared by an axis' first harmonic, in residual variances; phase."""
+    whole, base = values_at(wire, pixels)
+    level = base * gains[pixels.site]
+    root = np.sqrt(pixels.weight) * level
+    errors = (pixels.value / level - whole) * root
+    variance = max(float(np.sum(errors**2)) / max(pixels.used, 1), 1e-300)
+    rays = rays_at(wire, pixels)
+    slope = (rays.periods[axis] - np.asarray(wire.offset_periods)[axis]) / float(wire.standoff_per_pitch)
+    z = np.pi * pupils[:, None] * np.sqrt(rays.ellipse[2 * axis])
+    sizes = root * 2.0 * np.sinc(rays.openings[axis]) * 2.0 * j1(z) / z
+    power = np.maximum(np.sum(sizes**2, axis=1), 1e-300)
+    # errors = a cos(phase + t) = a (cos t cos(phase) - sin t sin(phase)): the angle found is t.
+    phases = (2 * np.pi * standoff * slope for standoff in standoffs)
+    sums = np.stack([sizes @ np.stack([errors * np.cos(p), -errors * np.sin(p)], axis=1) for p in phases])
+    return 2 * np.sum(sums**2, axis=-1) / power / variance, np.arctan2(sums[..., 1], sums[..., 0])
+
+
+def _placed(wire: Wire, standoff: float, pupil: float, axis: int, angle: float) -> Wire:
+    offset = np.array(wire.offset_periods, dtype=np.float64)
+    offset[axis] = float(angle) / (2 * np.pi)
+    return replace(
+        wire, standoff_per_pitch=np.float64(standoff), footprint_per_pitch=np.float64(pupil), offset_periods=offset
+    )
