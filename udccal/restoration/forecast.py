@@ -26,10 +26,11 @@ from udccal.restoration.sharpen import Sharpener, Solved
 from udccal.tiers import Tier
 
 # Part of the prior's detail beyond what the filter finds that photographs have: the prior's power falls slowly and
-# without end. The one constant that was fitted, to the scenes of docs/restoration.md.
+# without end. Fitted to the scenes of docs/restoration.md.
 _DETAIL: Final = 0.25
-# Part of the noise that shrinkage leaves: it takes out 1.6 times the noise where nothing else is, little at edges.
-_LEFT: Final = 0.5
+# Part of the noise that a tier leaves. Shrinkage takes out 1.6 times the noise where nothing else is, little at edges;
+# the network's part was fitted to what it gains on eight of these scenes.
+_LEFT: Final = {Tier.preview: 0.0, Tier.fast: 1.0, Tier.balanced: 0.5, Tier.accurate: 0.36}
 # Width in px over which light is averaged to tell bright places from dark ones.
 _LOCAL_PX: Final = 16
 # Every n-th row and column is looked at.
@@ -61,9 +62,8 @@ class ExpectedError:
     def psnr_dB(self, tier: Tier) -> float:
         """Return the PSNR of display-encoded values after the least-squares gain of each colour."""
         seen = self.light + self.panel if tier is Tier.preview else self.light
-        passed = {Tier.preview: 0.0, Tier.fast: 1.0, Tier.balanced: _LEFT, Tier.accurate: _LEFT}[tier]
         detail = self.blur if tier is Tier.preview else self.lost
-        sigma = np.sqrt(passed * self.noise + _DETAIL * detail)
+        sigma = np.sqrt(_LEFT[tier] * self.noise + _DETAIL * detail)
         gain = least_squares_gain(np.clip(seen, 0.0, 1.0), np.minimum(self.light, 1.0)).astype(np.float32)
         truth = encode_srgb(self.light)
         squared = [np.mean((encode_srgb((seen + node * sigma) * gain) - truth) ** 2) for node in _NODES]
