@@ -64,6 +64,7 @@ lint: $(STAMP)
 
 types: $(STAMP)
 	$(BIN)/mypy
+	$(BIN)/mypy examples/*.py
 
 contracts: $(STAMP)
 	$(BIN)/lint-imports

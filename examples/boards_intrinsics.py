@@ -32,7 +32,7 @@ def chessboard_corners(picture: np.ndarray) -> np.ndarray | None:
 
 def calibrate(name: str, files: list[Path]) -> FitResult[Geometry] | None:
     """Calibrate one camera from its photographs and print the result."""
-    pictures = [cv2.imread(str(file), cv2.IMREAD_GRAYSCALE) for file in files]
+    pictures = [picture for file in files if (picture := cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)) is not None]
     found = [corners for corners in map(chessboard_corners, pictures) if corners is not None]
     if len(found) < 3:
         print(f"{name}: a board was found in {len(found)} of {len(files)} photographs; at least 3 are needed.")

@@ -10,6 +10,8 @@ import sys
 import tempfile
 from pathlib import Path
 
+import numpy as np
+
 import udccal
 from udccal.models.noise import electrons
 
@@ -40,7 +42,7 @@ def main(arguments: list[str]) -> None:
         session = udccal.capture(Path(folder) / "session", bench, terms=["noise"])
         noise = udccal.fit(session, "noise")
     report(noise)
-    sigma = float(noise.sigma_of(lambda term: electrons(term, 1000.0)))
+    sigma = float(noise.sigma_of(lambda term: np.asarray(electrons(term, 1000.0))))
     print(f"A sample of 1000 DN is {float(electrons(noise.or_raise().term, 1000.0)):.1f} ± {sigma:.1f} electrons.")
 
 

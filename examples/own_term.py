@@ -12,7 +12,7 @@ import numpy as np
 import udccal
 from udccal.fitting.engine.gaussian import Posterior
 from udccal.fitting.engine.least_squares import Blocks, Step, minimise
-from udccal.fitting.engine.report import estimates
+from udccal.result import Estimate
 
 TRUTH, NOISE_E = np.array([9000.0, 62.0, 50.0, 110.0]), 40.0
 NAMES, UNITS = ("light_e", "centre_x_px", "centre_y_px", "focal_px"), ("e-", "px", "px", "px")
@@ -48,8 +48,11 @@ seen = Falloff(TRUTH).at(PIXELS) + NOISE_E * np.random.default_rng(0).standard_n
 found = minimise(Problem(seen), np.array([8000.0, 63.5, 47.5, 128.0]))
 cov, chi2_dof = found.equations.cov(), found.equations.cost / (len(seen) - len(TRUTH))
 status = udccal.FitStatus.CONVERGED if found.converged else udccal.FitStatus.NOT_CONVERGED
-numbers, posterior = estimates(NAMES, UNITS, found.place, cov), Posterior.from_cov(found.place, cov, Falloff)
+sigmas, posterior = np.sqrt(np.diag(cov)), Posterior.from_cov(found.place, cov, Falloff)
+numbers = tuple(Estimate(*each) for each in zip(NAMES, found.place, sigmas, UNITS, strict=True))
 term = Falloff(found.place)
 result = udccal.FitResult("falloff", term, status, numbers, cov, chi2_dof, len(seen), posterior=posterior)
 corner = result.propagate(lambda term: term.at(np.zeros(2)) / term.numbers[0])
+for each in result.estimates:
+    print(f"{each.name} {each.value:.4f} ± {each.sigma:.4f} {each.unit}")
 print(f"{status.name}: the corner has {corner.value:.4f} ± {corner.sigma:.4f} of the light at the centre")

@@ -91,7 +91,7 @@ def restored(
 ) -> None:
     """Write the whole view before and after, and a detail at every tier."""
     tone = Tone(display_exposure(scene.ideal))
-    views = []
+    views: list[np.ndarray] = []
     for tier in tiers:
         restorer = udccal.Restorer.from_profile(profile, tier)
         if not views:
@@ -114,7 +114,7 @@ def main() -> None:
     shown = panel_picture(profile.rig)
     maps = term_maps(profile, shown)
     write_figure(given.out / "tour_wire.jpg", wire_figure(maps, None))
-    write_figure(given.out / "tour_psf.jpg", psf_figure(maps, None))
+    write_figure(given.out / "tour_psf.jpg", psf_figure(maps, None, None))
     write_figure(given.out / "tour_backscatter.jpg", backscatter_figure(maps, None))
     view = udccal.Restorer.from_profile(profile, udccal.Tier.preview).view
     scene = capture_photograph(simulated_rig(profile.rig, seed=0), photograph(), view, shown)

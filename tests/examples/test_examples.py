@@ -128,7 +128,13 @@ def test_own_procedure_captures_a_session(tmp_path: Path) -> None:
 
 
 def test_own_term_is_fitted_and_its_sigma_propagated() -> None:
-    words = run("examples/own_term.py").split()
+    *numbers, last = run("examples/own_term.py").splitlines()
+    found = {name: (float(value), float(one), unit) for name, value, _, one, unit in map(str.split, numbers)}
+    for name, truth, unit in (("light_e", 9000.0, "e-"), ("centre_x_px", 62.0, "px"), ("focal_px", 110.0, "px")):
+        value, sigma, own = found[name]
+        assert own == unit
+        assert abs(value - truth) < 4 * sigma
+    words = last.split()
     assert words[0] == "CONVERGED:"
     value, sigma = float(words[4]), float(words[6])
     truth = (1 + (62.0**2 + 50.0**2) / 110.0**2) ** -2
