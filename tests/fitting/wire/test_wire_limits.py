@@ -193,6 +193,12 @@ _INPUTS = {
 }
 
 
+@pytest.mark.medium
+def test_a_flat_below_black_is_told() -> None:
+    """One pixel in a hundred that is stuck at a large number lifts the mean above zero."""
+    finite_or_told(seed=0, electrons=1.0, prnu=0.0, broken=0.01, level=-1e3)
+
+
 @pytest.mark.slow
 @settings(max_examples=3)
 @given(**_INPUTS)
