@@ -124,7 +124,7 @@ def _solved(
     for _ in range(_STEPS):
         change = precision(step) * free
         curvature = float(np.vdot(step, change))
-        # Where the taper leaves next to nothing of a sample, squares of its slope underflow.
+        # Nothing is left to solve, or so little that squares of the slope underflow.
         if power == 0.0 or curvature <= 0.0:
             break
         length = np.float32(power / curvature)

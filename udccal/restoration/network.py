@@ -2,11 +2,10 @@
 
 A linear filter knows a scene's spectrum; a network learned from pictures knows edges. It sees the picture of the tier
 ``balanced``, to which it adds what it finds, two filtered pictures, one at the strength that the tile chose and a
-sharper one, and how much noise the filter leaves in each band. It has no
-biases, so that it commutes with a change of scale (Mohan et al., "Robust and interpretable blind image denoising via
-bias-free convolutional neural networks", ICLR 2020): light, exposure and gain do not matter. Pictures are taken apart
-into their 2 x 2 places first (Zhang, Zuo and Zhang, "FFDNet", IEEE Trans. Image Processing 27, 2018), and a second
-level works at a quarter of the resolution.
+sharper one, and how much noise the filter leaves in each band. It has no biases, so that it commutes with a change of
+scale (Mohan et al., "Robust and interpretable blind image denoising via bias-free convolutional neural networks", ICLR
+2020): light, exposure and gain do not matter. Pictures are taken apart into their 2 x 2 places first (Zhang, Zuo and
+Zhang, "FFDNet", IEEE Trans. Image Processing 27, 2018), and a second level works at a quarter of the resolution.
 
 ``make network`` trains it on drawn shapes and photographs, blurred and filtered as restoration does.
 """
