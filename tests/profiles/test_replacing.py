@@ -223,3 +223,35 @@ def test_links_in_a_profile_are_not_read(tmp_path: Path, toy_profile: Profile, n
     (tmp_path / "p" / name).symlink_to(tmp_path / name)
     with pytest.raises(ProfileError, match="found none"):
         read_profile(tmp_path / "p")
+
+
+@pytest.mark.parametrize("left_as", [".p-0123456789ab.old", "p"])
+def test_a_profile_replaced_during_reading_is_read_anew(tmp_path: Path, left_as: str) -> None:
+    """The folder that reading began with is gone before its end, wherever it stood."""
+    old, new = tmp_path / left_as, tmp_path / "p"
+    old.mkdir()
+    read: list[Path] = []
+
+    def replaced_meanwhile(place: Path) -> Path:
+        read.append(place)
+        if len(read) == 1:
+            shutil.rmtree(place)
+            new.mkdir()
+            raise FileNotFoundError(place)
+        return place
+
+    assert whole_folder.read_standing(new, replaced_meanwhile) == new
+    assert read == [old, new]
+
+
+def test_a_profile_that_nobody_replaces_is_read_once(tmp_path: Path) -> None:
+    read: list[Path] = []
+
+    def damaged(place: Path) -> Path:
+        read.append(place)
+        raise ProfileError("Expected a profile, found none.")
+
+    for path in (tmp_path, tmp_path / "missing"):
+        with pytest.raises(ProfileError):
+            whole_folder.read_standing(path, damaged)
+    assert read == [tmp_path, tmp_path / "missing"]

@@ -13,13 +13,16 @@ import re
 import secrets
 import shutil
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TypeVar
 
+from udccal.errors import UdccalError
 from udccal.io.atomic import flush, flush_folder
 
 _AT_FDCWD, _RENAME_EXCHANGE = -100, 2  # fcntl.h and linux/fs.h
+_T = TypeVar("_T")
 _NOT_HERE = (errno.EINVAL, errno.ENOSYS, errno.ENOTSUP)
 
 
@@ -69,6 +72,31 @@ def standing(path: Path) -> Path:
     """Return where to read the folder ``path``: there, or where a process that ended while replacing it left it."""
     left = () if os.path.lexists(path) else _beside(path, "old")
     return next(iter(left), path)
+
+
+def read_standing(path: Path, read: Callable[[Path], _T]) -> _T:
+    """Return what ``read`` makes of the folder or file ``path``; when it is replaced meanwhile, the new one is read.
+
+    Raises:
+        UdccalError, OSError: as ``read``, for something that nobody replaced during reading.
+    """
+    while True:
+        place = standing(path)
+        before = _identity(place)
+        try:
+            return read(place)
+        except (UdccalError, OSError):
+            if standing(path) == place and _identity(place) == before:
+                raise
+
+
+def _identity(path: Path) -> tuple[int, int] | None:
+    """Return numbers that change when ``path`` is replaced; None when nothing is there."""
+    try:
+        found = path.stat()
+    except OSError:
+        return None
+    return found.st_ino, found.st_ctime_ns  # the time too: the system gives a removed folder's number to the next
 
 
 def _swap(new: Path, path: Path) -> None:

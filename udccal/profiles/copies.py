@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import shutil
+from functools import partial
 from pathlib import Path
 
 from udccal.errors import ProfileError
 from udccal.io.links import is_plain_file
-from udccal.io.whole_folder import folder_beside, standing
+from udccal.io.whole_folder import folder_beside, read_standing
 from udccal.profiles.archive import unpacked
 from udccal.profiles.arrays import MAX_FILE_BYTES
 from udccal.profiles.encode import decode
@@ -76,7 +77,11 @@ def _copy(source: Path, target: Path) -> None:
     """Copy the files that a profile lists, and read all of the copy before it takes its place."""
     check_replaceable(target)
     target.parent.mkdir(parents=True, exist_ok=True)
-    with unpacked(standing(source)) as folder, folder_beside(target) as copy:
+    read_standing(source, partial(_copy_standing, target=target))
+
+
+def _copy_standing(source: Path, target: Path) -> None:
+    with unpacked(source) as folder, folder_beside(target) as copy:
         for name in (PROFILE_NAME, *sorted(stored_files(read_stored(folder)))):
             file = folder / name
             if not is_plain_file(folder, file) or file.stat().st_size > MAX_FILE_BYTES:

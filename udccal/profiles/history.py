@@ -10,7 +10,7 @@ from typing import final, get_args
 
 from udccal.errors import ProfileError
 from udccal.io.links import is_plain_file
-from udccal.io.whole_folder import standing
+from udccal.io.whole_folder import read_standing
 from udccal.profiles.archive import unpacked
 from udccal.profiles.provenance import MAX_JSON_BYTES, PROFILE_NAME, profile_sha256
 from udccal.profiles.schema import Provenance, Section, StoredCaptures, StoredProfile
@@ -112,10 +112,13 @@ def history(path: Path) -> tuple[PastProfile, ...]:
 
 
 def _read(path: Path) -> _Read:
-    with unpacked(standing(path), PROFILE_NAME) as folder:
-        stored = read_stored(folder)
-        version = json.loads((folder / PROFILE_NAME).read_bytes())["version"]
-        return _Read(path, Identity(profile_sha256(folder), version), stored)
+    def read(place: Path) -> _Read:
+        with unpacked(place, PROFILE_NAME) as folder:
+            stored = read_stored(folder)
+            version = json.loads((folder / PROFILE_NAME).read_bytes())["version"]
+            return _Read(path, Identity(profile_sha256(folder), version), stored)
+
+    return read_standing(path, read)
 
 
 def _past(read: _Read, before: _Read | None) -> PastProfile:

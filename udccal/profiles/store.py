@@ -7,11 +7,11 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
-from udccal.errors import FileFormatError, ProfileError, RigError
+from udccal.errors import ProfileError, RigError
 from udccal.io.atomic import write_atomically
 from udccal.io.links import is_plain_file
 from udccal.io.out_folder import storing_in
-from udccal.io.whole_folder import folder_beside, replace_whole, standing
+from udccal.io.whole_folder import folder_beside, read_standing, replace_whole, standing
 from udccal.profiles.archive import pack_archive, unpacked
 from udccal.profiles.encode import decode, encode
 from udccal.profiles.profile import Profile
@@ -85,21 +85,7 @@ def read_profile(path: Path) -> Profile:
     Raises:
         ProfileError: when it is missing, damaged, altered, too large, newer, or does not follow docs/profile.md.
     """
-    while True:
-        place, before = standing(path), _identity(path)
-        try:
-            return _read(place)
-        except (ProfileError, FileFormatError, OSError):
-            if _identity(path) == before:
-                raise
-
-
-def _identity(path: Path) -> int | None:
-    """Return a number that changes when the profile at ``path`` is replaced; None when there is no profile."""
-    try:
-        return standing(path).stat().st_ino
-    except OSError:
-        return None
+    return read_standing(path, _read)
 
 
 def _read(path: Path) -> Profile:
