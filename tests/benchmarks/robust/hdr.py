@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, UInt16
+from scipy.stats import poisson
 
 from tests.benchmarks.robust.family import Answer, Case, Family, Number, all_finite
 from udccal.fitting.hdr.merge import HdrMerge, merge_bracket
@@ -128,8 +129,10 @@ def _groups(bracket: Bracket, merged: HdrMerge) -> tuple[Number, ...]:
         error = merged.rate_e_per_s[group] - bracket.rates[group]
         # Rates spread within a group: each pixel's error in its own sigma, at the sigma of all of the same light.
         z = error / _smooth(merged.sigma_e_per_s[group])
-        # A hit of less than six sigma is not seen; a group of hits would be.
-        z = z[np.argsort(np.abs(z))][: len(z) - max(1, math.ceil(4 * bracket.hits * len(z) * len(bracket.told_s)))]
+        # A hit of less than six sigma is not seen, nor any where a pixel has fewer than three samples; more hits than
+        # there can be would be.
+        most = int(poisson.ppf(1 - 1e-6, bracket.hits * len(z) * len(bracket.told_s)))
+        z = z[np.argsort(np.abs(z))][: len(z) - max(1, most)]
         light, count = float(np.median(bracket.rates[group])), len(z)
         offset, width = float(z.mean()), float(np.sqrt(np.mean(z**2))) - 1
         numbers += [

@@ -131,6 +131,17 @@ def test_rounding_is_in_the_sigma_of_a_saturation_between_codes(read_e: float) -
     assert found.sigma < 0.35
 
 
+def test_a_full_well_just_below_the_last_code_is_in_the_sigma_of_saturation() -> None:
+    # Nearly all full pixels are rounded to the last code.
+    sensor = replace(PLAIN, bits=8, K_DN_per_e=0.017, black_DN=5.0, full_well_e=249.95 / 0.017, read_e=11.0)
+    sensor = replace(sensor, row_DN=0.0, DSNU_e=0.0, flux_e_per_s=5 * 249.95 / 0.017)
+    found = measure(sensor, 2).estimate("saturation_DN")
+    assert found.value == 255
+    assert 0.05 / 3 < found.sigma < 0.1
+    beyond = measure(replace(sensor, full_well_e=2e4, read_e=60.0), 2).estimate("saturation_DN")
+    assert (beyond.value, beyond.sigma) == (255, 0)
+
+
 @pytest.mark.parametrize("brightest", [0.5, 0.7])
 def test_codes_that_end_in_one_colour_only_are_the_saturation(brightest: float) -> None:
     # Red and blue get half of green's light: less than half of the frame's samples have the converter's last code.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 from jaxtyping import Float
@@ -94,3 +95,15 @@ def test_a_picture_without_light_has_no_prnu_and_no_nan() -> None:
     found = prnu(np.zeros((64, 96)), 1.0, 0.3, 2, 6.0)
     assert np.isfinite([found.variance, found.sigma]).all()
     assert found.outliers == 64 * 96
+
+
+def test_blobs_too_weak_to_be_seen_are_in_the_sigma() -> None:
+    """Whether a response is white cannot be told below some size: the sigma then holds what may be there."""
+    rng = np.random.default_rng(5)
+    shape, off = (144, 192), []
+    for part in (0.0, 0.1, 0.15, 0.2, 0.25, 0.3):
+        blobs = cv2.GaussianBlur(rng.standard_normal(shape), (0, 0), 1.0)
+        response = 1 + PRNU * (rng.standard_normal(shape) + part * blobs / blobs.std())
+        found = prnu(1000 * response, 0.0, 0.0, 1, 6.0)
+        off.append(0.0 if found.structure2 else abs(found.variance - np.var(response)) / found.sigma)
+    assert max(off) < 4.5

@@ -193,10 +193,15 @@ def find_saturation(data: NoiseMoments, dark: DarkTerms, curve: Curve) -> tuple[
         return data.top_DN, max(data.top_DN - seen, 0.0) / float(np.sqrt(3.0))
     peak = max(flat.peak_DN for flat, _ in full)
     # Bins in which most samples have the last code; of a whole frame, colours that are not full hide them.
-    if max(float(flat.at_peak[bins].max()) for flat, bins in full if flat.peak_DN == peak) >= 0.5:
-        # A level at the converter's end is certain; a level below it is known to within rounding.
-        return float(peak), float(1 / np.sqrt(12.0)) if peak < data.top_DN else 0.0
+    part = max(float(flat.at_peak[bins].max()) for flat, bins in full if flat.peak_DN == peak)
     V0 = max(float(curve.values[1]), 0.0)
+    if part >= 0.5 and peak < data.top_DN:
+        return float(peak), float(1 / np.sqrt(12.0))  # known to within rounding
+    if part >= 0.5:
+        # So many samples come to the converter's end from a level within half a code of it, where noise is small.
+        spread = float(np.sqrt(V0 + dark.dsnu_DN2.value + dark.row_DN2.value))
+        below = 0.5 * data.q_DN - spread * float(ndtri(min(part, 1 - 1e-4)))
+        return float(peak), max(below, 0.0) / float(np.sqrt(3.0))
     found = np.array([_level(flat, bins, data, dark, V0, peak) for flat, bins in full])
     # An outlier among full pixels is a pixel that is not full.
     clean = (found[:, 2] > 0) & np.array([of.frames * of.outliers <= 1e-5 * of.samples.sum() for of, _ in full])

@@ -138,14 +138,17 @@ def prnu(signal_DN: Picture, temporal_DN2: float, shot_DN: float, period: int, d
     rows, columns = (min(site.power.shape[axis] for site in sites) for axis in (0, 1))
     taken = (3 * rows // window + 1, 3 * columns // window + 1)
     white = white_coefficients([site.power[:rows, :columns] for site in sites], taken)
-    variances, sigmas, structures = np.array([_response(site, white, temporal_DN2, shot_DN) for site in sites]).T
+    found = np.array([_response(site, white, temporal_DN2, shot_DN) for site in sites])
+    variances, sigmas, structures, seen = found.T
     weights = 1 / np.maximum(sigmas, 1e-30) ** 2
     variance, samples = float(np.average(variances, weights=weights)), len(sites) * int(np.count_nonzero(white))
     defects = np.zeros(signal_DN.shape, bool)
     for phase, site in zip(phases, sites, strict=True):
         defects[phase] = site.defects
     outliers = signal_DN.size - sum(int(np.count_nonzero(site.inverse_DN)) for site in sites)
-    sigma, structure2 = float(weights.sum() ** -0.5), float(structures.mean())
+    # What is not white but too weak to be seen may be the pixels' own.
+    sigma = float(np.hypot(weights.sum() ** -0.5, max(float(np.mean(structures * (1 - seen))), 0.0)))
+    structure2 = float(np.mean(structures * seen))
     return Pattern(variance, sigma, samples, outliers, _first_places(defects), structure2=structure2)
 
 
@@ -168,8 +171,8 @@ def _site(signal_DN: Picture, window: int, reach: float) -> _Site:
     return _Site(np.where(bad, 0, 1 + relative), np.where(bad, 0, 1 / level), bad & ~unlit, np.square(power, out=power))
 
 
-def _response(site: _Site, white: Mask, temporal_DN2: float, shot_DN: float) -> tuple[float, float, float]:
-    """Variance of the response and its standard deviation, and the variance of what is not white."""
+def _response(site: _Site, white: Mask, temporal_DN2: float, shot_DN: float) -> tuple[float, float, float, bool]:
+    """Variance of the response and its standard deviation, the variance of what is not white, and whether it shows."""
     light, inverse = site.light, site.inverse_DN
     kept, good = (max(int(np.count_nonzero(mask)), 1) for mask in (white, inverse))
     power = site.power[: white.shape[0], : white.shape[1]]
@@ -186,7 +189,7 @@ def _response(site: _Site, white: Mask, temporal_DN2: float, shot_DN: float) -> 
     unlike = float(np.mean(own**2)) / max(float(np.mean(own)) ** 2, 1e-300)
     # The pattern of all pixels is what is asked for; the coefficients that are left out have a part of it.
     sigma2 = 2.0 * max(unlike, 1.0) / kept * (floor / square) ** 2 - 2.0 * max(variance, 0.0) ** 2 / good
-    return variance, float(np.sqrt(max(sigma2, 0.0))), structure2 * seen
+    return variance, float(np.sqrt(max(sigma2, 0.0))), structure2, seen
 
 
 def _mean_product(first: np.ndarray, second: np.ndarray, count: int) -> float:
