@@ -273,7 +273,10 @@ class _Bracket:
         """
         clear = seen.clear & (3 * np.sqrt(seen.variance) < seen.signal)
         weight = np.where(clear, seen.signal / seen.variance, 0.0)
-        information = np.maximum((weight * seen.signal).sum(axis=1), 1e-30)
+        # A sample that gives its pixel most of its light follows it: what the others say of it is what counts.
+        own = np.where(~self.dropped & (seen.light < self.sensor.level_e), seen.times**2 / seen.variance, 0.0)
+        by_others = 1 - own / np.maximum(own.sum(axis=0), 1e-30)
+        information = np.maximum((weight * seen.signal * by_others).sum(axis=1), 1e-30)
         off = np.abs((weight * seen.errors(self.rules.believed_sigma)).sum(axis=1) / information)
         score = np.where(off > self.rules.frame_off, off * np.sqrt(information), 0.0)
         return int(score.argmax()) if score.max() > self.rules.frame_sigma else None
