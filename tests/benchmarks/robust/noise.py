@@ -23,6 +23,7 @@ _WORDS = {
     "dark_current_e_per_s": ("dark current of", *_CODED),
     "black_DN": _CODED,
     "sigma_d_e": _CODED,
+    "sigma_row_DN": _CODED,
     "DSNU1288_e": _CODED,
 }
 

@@ -57,6 +57,23 @@ class Choice(Generic[Fit]):
         odds = np.exp(-0.5 * (criteria - self.best.criterion))
         return np.asarray(odds / odds.sum())
 
+    def spread(
+        self,
+        akaike: Float[np.ndarray, " tried"],
+        values: Callable[[Fit], Float[np.ndarray, " values"]],
+    ) -> Float[np.ndarray, "values values"]:
+        """Spread of the orders' values about the chosen one's (Buckland et al., Biometrics 53, 1997).
+
+        BIC drops parameters that are small and not 0. Others then take their part, which no order's own error shows.
+
+        Args:
+            akaike: Akaike's criterion of every order that was tried; an infinite one counts for nothing.
+            values: of a fit, those whose spread is asked for.
+        """
+        away = np.array([values(one.fit) for one in self.tried]) - values(self.best.fit)
+        weight = np.exp(-0.5 * (akaike - akaike.min())) if np.isfinite(akaike.min()) else np.zeros(len(akaike))
+        return np.asarray((away.T * (weight / max(weight.sum(), 1.0))) @ away)
+
 
 def choose(tried: Iterable[Attempt[Fit]]) -> Choice[Fit]:
     """Choose the order with the lowest criterion; of equal ones, the first.

@@ -274,18 +274,11 @@ def _choose_order(full: Solved, points: Points, prior: Prior, rules: GeometryRul
 
 
 def _between_orders(orders: Choice[Solved], samples: int, rules: GeometryRules) -> Float[np.ndarray, "n n"]:
-    """Spread of the orders' solutions about the chosen one, by Akaike's weights (Buckland et al., Biometrics 53, 1997).
-
-    BIC drops coefficients that are small and not 0. The others then take their part, which no order's own error shows.
-    """
+    """Covariance that the choice of an order adds to that of all values."""
     further = [2 * place * np.log(rules.further_order) for place in range(len(orders.tried))]
     parameters = np.array([one.parameters for one in orders.tried])
     akaike = np.array([one.criterion for one in orders.tried]) - further - (np.log(samples) - 2) * parameters
-    weight = np.exp(-0.5 * (akaike - akaike.min()))
-    places = [one.fit.place for one in (orders.best, *orders.tried)]
-    chosen, *every = [np.concatenate([at.intrinsics, at.poses.ravel()]) for at in places]
-    away = np.array(every) - chosen
-    return np.asarray((away.T * (weight / weight.sum())) @ away)
+    return orders.spread(akaike, lambda of: np.concatenate([of.place.intrinsics, of.place.poses.ravel()]))
 
 
 def _criterion(solved: Solved, points: Points, parameters: int) -> float:

@@ -221,7 +221,7 @@ def _values(
 ) -> tuple[Float[np.ndarray, "11"], Float[np.ndarray, "11 11"]]:
     """The estimates, and their covariance from that of the fitted quantities."""
     K, V0, c = curve.values[:3].tolist()
-    transfer = curve.fit.cov[:3, :3] * curve.fit.misfit.inflation
+    transfer = curve.cov[:3, :3]
     total = Quantity(V0 + dark.row_DN2.value, float(transfer[1, 1]) + dark.row_DN2.variance)
     roots = [one.root() for one in (total, dark.row_DN2, dark.dsnu_DN2, PRNU2)]
     (sigma_d, by_total), (row, by_row), (spread, by_spread), (response, by_response) = roots
@@ -277,8 +277,8 @@ def _notes(
         yield f"No flat reached saturation; the converter's largest code, {values[2]:.0f} DN, is taken for it."
     if not dark.white:
         yield (
-            "Rounding or cut-off codes bend the dark codes: black, dark noise, dark current and DSNU come from "
-            "histograms, and hold for read noise of the model's kind (Tukey's lambda)."
+            "Rounding or cut-off codes bend the dark codes: black, dark noise, row noise, dark current and DSNU come "
+            "from histograms, and hold for read noise of the model's kind (Tukey's lambda)."
         )
     if len({pair.exposure_s for pair in data.darks}) < 2:
         yield "Dark frames of one exposure time do not tell dark current from black: black holds both."

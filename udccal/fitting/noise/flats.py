@@ -11,7 +11,7 @@ from scipy.special import ndtri
 
 from udccal.fitting.engine.orders import Choice
 from udccal.fitting.engine.robust import OutlierRule, robust_sigma
-from udccal.fitting.noise.codes import excess_kurtosis
+from udccal.fitting.noise.codes import excess_kurtosis, smeared
 from udccal.fitting.noise.dark import DarkTerms
 from udccal.fitting.noise.moments import Moments, NoiseMoments
 from udccal.fitting.noise.transfer import DarkVariance, Five, Levels, TransferFit, robust_transfer
@@ -46,6 +46,15 @@ class Curve:
     def values(self) -> Five:
         """The fit's values; zeros where there is none."""
         return np.zeros(5) if self.choice is None else self.choice.best.fit.values
+
+    @property
+    def cov(self) -> Float[np.ndarray, "5 5"]:
+        """Covariance of the values, with what the variances' misfit and the choice of an order add."""
+        assert self.choice is not None, "asked for where there are usable levels"
+        parameters = np.array([one.parameters for one in self.choice.tried])
+        akaike = np.array([one.criterion for one in self.choice.tried])
+        akaike -= (np.log(max(self.fit.samples, 2)) - 2) * parameters
+        return np.asarray(self.fit.cov * self.fit.misfit.inflation + self.choice.spread(akaike, lambda of: of.values))
 
     @property
     def usable_levels(self) -> int:
@@ -229,10 +238,14 @@ def _level(
         # The fraction gives the level by the shape of the noise, which is then another one.
         own += 0.2**2 * spread2 if dark.foreign else 0.0
         return peak - 0.5 * data.q_DN + float(np.sqrt(spread2)) * z, own + rows, bool(sure.any())
-    # Rounding adds sum over k of (-1)^k q sin(2 pi k x / q) exp(-2 (pi k s / q)^2) / (pi k) to the mean of normal noise
-    # of sigma s (Widrow and Kollar, Quantization Noise, chapter 5): this is its uncertainty.
-    k = np.arange(1, 8)
-    rounding = float(np.sum(np.exp(-4 * (np.pi * k / data.q_DN) ** 2 * spread2) / (2 * (np.pi * k / data.q_DN) ** 2)))
+    # Rounding adds sum over k of (-1)^k q sin(2 pi k x / q) f(2 pi k / q) / (pi k) to the mean of noise that has the
+    # characteristic function f (Widrow and Kollar, Quantization Noise, chapter 5): this is its uncertainty. Tails leave
+    # more of it than normal noise does; as much as Laplace's where the fitted shape has them.
+    frequency, shape = 2 * np.pi * np.arange(1, 8) / data.q_DN, dark.shape.value
+    tails = dark.foreign or shape < 0
+    read = 1 / (1 + 0.5 * frequency**2 * V0) if tails else smeared(shape, frequency * np.sqrt(V0))
+    left = read * np.exp(-0.5 * frequency**2 * (spread2 - V0))
+    rounding = float(np.sum(2 * (left / frequency) ** 2))
     # Where some pixels are not full, the possible shift of the mean adds to it.
     low = 0.0 if sure.any() else 0.5 * max(float(excess[chosen].mean()), 0.0)
     mean = float(np.average(flat.mean_DN[chosen], weights=flat.samples[chosen]))

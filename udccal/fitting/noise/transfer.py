@@ -101,7 +101,7 @@ class Order:
 class TransferFit:
     """One order: values, covariance, relative scatter of the light by level, and residuals in sigma (nan: unused).
 
-    ``misfit`` tells whether the variances scatter by more than noise.
+    ``misfit`` tells whether the variances scatter by more than noise, ``samples`` how many data there are.
     """
 
     order: Order
@@ -112,6 +112,7 @@ class TransferFit:
     variance_z: Grid
     level_z: PerLevel
     misfit: MisfitTest
+    samples: int
 
 
 def linear_signal(mean_DN, curvature_per_DN, K_DN_per_e):  # type: ignore[no-untyped-def]
@@ -217,8 +218,11 @@ def _fitted(problem: TransferProblem, start: Five) -> Attempt[TransferFit]:
     level_z[levels.responding] = np.nan_to_num(relative) / np.sqrt(spread2)
     misfit = chi2_test(float(np.nansum(variance_z**2)), max(dof.size - 1.0, 1.0))
     parameters = order.curved + order.offset + order.unsteady
-    criterion = bic(found.equations.cost, float(parameters), int(dof.sum())) if found.converged else np.inf
-    fit = TransferFit(order, found.place, cov, float(np.sqrt(own)), found.converged, variance_z, level_z, misfit)
+    samples = int(dof.sum())
+    criterion = bic(found.equations.cost, float(parameters), samples) if found.converged else np.inf
+    fit = TransferFit(
+        order, found.place, cov, float(np.sqrt(own)), found.converged, variance_z, level_z, misfit, samples
+    )
     return Attempt(order.name, parameters, criterion, fit)
 
 
