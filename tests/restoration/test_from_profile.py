@@ -52,8 +52,8 @@ def test_a_frame_darker_than_the_panels_light_is_refused(profile: Profile, tmp_p
     write_rgb8(tmp_path / "shown.png", np.full((rig.panel.rows, rig.panel.columns, 3), 255, np.uint8))
     mask = Restorer.from_profile(whole_panel, Tier.preview).mask
     assert mask is not None
-    exposure_s = 6.0 / mask.mean()  # the panel gives 6 e- per pixel then, the scene 2000
-    write_png16(tmp_path / "frame.png", np.rint(64 + 0.355 * (2000.0 + exposure_s * mask)).astype(np.uint16))
+    exposure_s = 6.0 / mask.white.mean()  # the panel gives 6 e- per pixel then, the scene 2000
+    write_png16(tmp_path / "frame.png", np.rint(64 + 0.355 * (2000.0 + exposure_s * mask.white)).astype(np.uint16))
     words = ["restore", "frame.png", "--profile", "p", "--panel-picture", "shown.png", "--tier", "fast", "--out", "out"]
     for given_s, status in ((1000 * exposure_s, 1), (exposure_s, 0)):
         command = [sys.executable, "-m", "udccal.cli.main", *words, "--exposure-s", str(given_s), "--json"]

@@ -257,6 +257,11 @@ _ANY_SENSOR = given(
 @example(
     K=0.78, bits=16, read_e=24.4, black=0.0006, top=0.11, row=0.85, dark=1.5, bend=0.03, flicker=0.0, seed=200
 )  # fmt: skip
+# No dark noise at all.
+@example(
+    K=0.36, bits=10, read_e=0.0, black=0.1, top=0.053342991926067285, row=0.0, dark=0.0, bend=0.0, flicker=0.03,
+    seed=3381,
+)  # fmt: skip
 @_examples(3)
 @_ANY_SENSOR
 @pytest.mark.medium

@@ -199,6 +199,11 @@ def test_a_flat_below_black_is_told() -> None:
     finite_or_told(seed=0, electrons=1.0, prnu=0.0, broken=0.01, level=-1e3)
 
 
+@pytest.mark.medium
+def test_one_pixel_stuck_high_does_not_make_a_dark_flat_bright() -> None:
+    finite_or_told(seed=1, electrons=2.0, prnu=0.0, broken=1e-4, level=0.0)
+
+
 @pytest.mark.slow
 @settings(max_examples=3)
 @given(**_INPUTS)

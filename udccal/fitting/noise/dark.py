@@ -119,7 +119,9 @@ def _levels(
         stack = data.dark_stack
         means, times = np.append(means, offsets.mean), np.append(times, stack.exposure_s)
         rows = row_DN2 / len(stack.mean_DN)
-        variances = np.append(variances, (single_DN2 / stack.mean_DN.size + rows) / stack.frames)
+        # Rounding of a pixel with little noise is nearly the same in every frame.
+        own = single_DN2 / stack.frames + data.rounding_DN2 * float(np.exp(-4 * np.pi**2 * single_DN2 / data.q_DN**2))
+        variances = np.append(variances, own / stack.mean_DN.size + rows / stack.frames)
     above = np.maximum(means - float(fit.values[0]), 0.0)
     means = means + curvature * above**2
     # One exposure time does not tell dark current from black: all is black, and all of it may be dark current.

@@ -84,15 +84,23 @@ class WireData:
 
     @functools.cached_property
     def site_means(self) -> Float[np.ndarray, " sites"]:
-        """Mean signal of each site's finite, unclipped pixels; NaN where there are none."""
+        """Mean signal of each site's finite, unclipped pixels; NaN where there are none.
+
+        A few pixels that are stuck high would lift the mean of a dark flat: those far beyond all shading do not count.
+        """
         by_site = (self.signal[site.samples] for site in cfa_named(self.cfa).sites)
         good = (some[np.isfinite(some) & (some < self.clip)] for some in by_site)
-        return np.array([float(some.mean(dtype=np.float64)) if some.size else np.nan for some in good])
+        return np.array([_usual_mean(some) if some.size else np.nan for some in good])
 
     @property
     def balanced(self) -> Float[np.ndarray, "rows columns"]:
         """The signal over the mean of each pixel's site."""
         return self.signal / self.site_means[cfa_named(self.cfa).site_map(*self.signal.shape)]
+
+
+def _usual_mean(values: Float[np.ndarray, " n"]) -> float:
+    off = np.abs(values - np.median(values))
+    return float(values[off <= 20 * np.median(off)].mean(dtype=np.float64))
 
 
 def read_wire(session: Session, noise: Noise, geometry: Geometry, rules: WireRules | None = None) -> WireData:

@@ -13,7 +13,6 @@ from typing import final
 import numpy as np
 from jaxtyping import Float, Float32
 
-from udccal.cfa import cfa_named
 from udccal.fitting.engine.gaussian import Posterior, square_root
 from udccal.fitting.engine.least_squares import minimise
 from udccal.fitting.engine.misfit import clustered_cov
@@ -21,9 +20,10 @@ from udccal.fitting.engine.report import coarse
 from udccal.fitting.wire.data import Pixels, WireData, flat_noise, pixels_at, sample_pixels
 from udccal.fitting.wire.jacobian import WireProblem, block_jacobian, values_at, weighed_at
 from udccal.fitting.wire.parameters import Kind, Parameters, parameters_of, select
-from udccal.fitting.wire.report import Joint, misfit, omitted, rms, unseen, wire_result
+from udccal.fitting.wire.report import Joint, misfit, rms, wire_result
 from udccal.fitting.wire.rules import WireRules, ideal_wire
 from udccal.fitting.wire.search import SOLVER, Descent, Found, Search
+from udccal.fitting.wire.weak import omitted, strengths_of, tied_sigma, unseen
 from udccal.models.geometry import Geometry
 from udccal.models.wire import Wire, wire_map
 from udccal.numerics import in_float64
@@ -72,7 +72,8 @@ def fit_wire(data: WireData, rules: WireRules | None = None, start: Wire | None 
         joint = replace(joint, cov=clustered_cov(joint.cov, joint.last.problem.sums(joint.x)[1] / joint.variance))
     if joint.parameters.panel:
         missing = omitted(data.start, wire, joint.seen, rules)
-        left_out = missing.sigma if missing else 0.0
+        tied = tied_sigma(joint.strengths, wire, joint.seen, joint.variance)
+        left_out = float(np.hypot(tied, missing.sigma if missing else 0.0))
     else:
         left_out = unseen(search.harmonics, found.searched, rules)
     model = float(np.hypot(off.sigma, left_out))
@@ -94,8 +95,7 @@ def unusable_flat(data: WireData, rules: WireRules) -> tuple[FitStatus, str] | N
         return FitStatus.SATURATED, f"{100 * data.clipped:.1f} % of the flat is clipped."
     if not np.isfinite(means).all():
         return FitStatus.SATURATED, "All of a CFA site is clipped, or no number; expose shorter."
-    # A few pixels that are stuck high would lift a mean.
-    if not all(np.nanmedian(data.signal[site.samples]) > 0 for site in cfa_named(data.cfa).sites):
+    if not all(means > 0):
         return FitStatus.TOO_DARK, "A CFA site has no light; check the lamp."
     if data.signal.size < rules.least_samples:
         return FitStatus.TOO_FEW_DATA, f"There are {data.signal.size} pixels; use a larger region of the sensor."
@@ -120,6 +120,7 @@ def _joint(found: Found, every: Pixels, search: Search) -> Joint:
     power = here.samples - len(x) + prior.cost(x) + float((here.right + right) @ already)
     orders = select(here.shared, right, power, here.samples, full.groups)
     chosen = orders.best.fit
+    strengths = strengths_of(full, here.shared, right, chosen)
     kept, x = full.kept(chosen.keep), (x - already + chosen.values)[chosen.keep]
     problem = WireProblem("wire, joint", kept, weighed_at(kept, x, every, noise).pixels, kept.prior(start, rules))
     solution = minimise(problem, x, SOLVER)
@@ -128,7 +129,7 @@ def _joint(found: Found, every: Pixels, search: Search) -> Joint:
     x = solution.place + (ahead if solution.converged else 0.0)
     seen = weighed_at(kept, x, every, noise)
     cov, last = solution.with_rest(solution.equations.cov(), ahead), Descent(problem, solution)
-    return Joint(found, last, x, cov, problem.variance(float(seen.z @ seen.z)), seen, orders)
+    return Joint(found, last, x, cov, problem.variance(float(seen.z @ seen.z)), seen, orders, strengths)
 
 
 def _grid(geometry: Geometry, shape: tuple[int, int], parts: tuple[int, int]) -> Pixels:

@@ -110,6 +110,14 @@ class Parameters:
         """Whether there is a panel; without one there is no shape."""
         return self.linear < len(self.columns)
 
+    @property
+    def strengths(self) -> Int[np.ndarray, " harmonics"]:
+        """Column of each harmonic's strength in even light; -1 where there is none."""
+        found = np.full(len(self.nothing.harmonics), -1)
+        columns = np.flatnonzero(self.of(Kind.FIELD) & ~self.columns[:, 2:].any(axis=1))
+        found[self.columns[columns, 1]] = columns
+        return found
+
     def kept(self, keep: Bool[np.ndarray, " n"]) -> Parameters:
         """Only the columns marked."""
         return Parameters(self.nothing, self.columns[keep], self.groups[keep])

@@ -1,4 +1,4 @@
-"""The result of a wire fit: patterns in its residuals, the harmonics that it leaves out, and numbers for a person."""
+"""The result of a wire fit: patterns in its residuals, and numbers for a person."""
 
 from __future__ import annotations
 
@@ -14,10 +14,11 @@ from udccal.fitting.engine.misfit import NO_TEST, MisfitTest, chi2_test, excess_
 from udccal.fitting.engine.orders import Choice
 from udccal.fitting.engine.report import estimates, priors_of, residual_sample
 from udccal.fitting.wire.data import BLOCK, Pixels, Weighed
-from udccal.fitting.wire.jacobian import LEAST_VARIANCE, TILES, rays_at, tile_numbers, values_at, with_harmonics
+from udccal.fitting.wire.jacobian import LEAST_VARIANCE, TILES, rays_at, tile_numbers, values_at
 from udccal.fitting.wire.parameters import SHAPE_NAMES, Kind, Parameters, element_name
-from udccal.fitting.wire.rules import Harmonics, WireRules, WireStart, possible_harmonics
+from udccal.fitting.wire.rules import WireRules
 from udccal.fitting.wire.search import Descent, Found
+from udccal.fitting.wire.weak import Strengths
 from udccal.models.geometry import tilt_rad
 from udccal.models.wire import Wire, panel_rotation
 from udccal.result import Diagnostic, Estimate, FitResult, FitStatus
@@ -69,77 +70,6 @@ def _bins(pixels: Pixels, wire: Wire | None, down: int, across: int) -> Int[np.n
 
 @final
 @dataclass(frozen=True)
-class Omitted:
-    """The harmonics that a fit leaves out: hundreds, each too weak to be fitted.
-
-    A panel has all of them, by its openings and a round pupil; a synthetic map without them has none. Together they
-    are one template, whose amplitude in the residuals is one number with a sigma.
-
-    Attributes:
-        rms: their relative RMS over the sensor, if they are there.
-        part, part_sigma: amplitude of the template in the residuals, 1 where all are there, and its sigma.
-    """
-
-    rms: float
-    part: float
-    part_sigma: float
-
-    @property
-    def probability(self) -> float:
-        """Probability that they are there, from 1/2 before the data.
-
-        The expected part is 0 or 1 within the part's sigma; around 1, real pupils differ by a further 0.3.
-        """
-        wide = np.hypot(self.part_sigma, 0.3)
-        present = -0.5 * ((self.part - 1) / wide) ** 2 - np.log(wide)
-        absent = -0.5 * (self.part / self.part_sigma) ** 2 - np.log(self.part_sigma)
-        return float(1.0 / (1.0 + np.exp(np.clip(absent - present, -700.0, 700.0))))
-
-    @property
-    def sigma(self) -> float:
-        """Their expected part of the map's relative sigma, RMS over the sensor."""
-        return self.rms * float(np.sqrt(self.probability))
-
-
-def omitted(start: WireStart, wire: Wire, seen: Weighed, rules: WireRules) -> Omitted | None:
-    """Look for the omitted harmonics at the fitted shape, with a round pupil; None where the fit omits none.
-
-    The pixels may be those of the fit, since it absorbs little of hundreds of harmonics.
-    """
-    left_out = possible_harmonics(start, rules.least_counted, rules.least_amplitude)
-    if not len(left_out.bounds):
-        return None
-    pixels, expected = seen.pixels, seen.expected
-    # The search is for the strongest, with nine tenths of the power: the others are not worth the time.
-    power = np.cumsum(left_out.bounds**2)
-    strongest = left_out.orders[: int(np.searchsorted(power, 0.9 * power[-1])) + 1]
-    template = harmonics_alone(wire, strongest, pixels)
-    weight = pixels.weight * np.where(expected > 0, expected, 0.0)
-    information = max(float(np.sum(weight * expected * template**2)), 1e-300)
-    part = float(np.sum(weight * (pixels.value - expected) * template)) / information
-    rms = float(np.std(harmonics_alone(wire, left_out.orders, pixels.thinned(BLOCK))))
-    return Omitted(rms, part, information**-0.5)
-
-
-def harmonics_alone(wire: Wire, orders: Float[np.ndarray, "any 2"], pixels: Pixels) -> Float[np.ndarray, " n"]:
-    """The modulation by these harmonics of a round pupil, at a wire's shape."""
-    plain = replace(wire, amplitudes=np.zeros((0, 2, 1, 1)))
-    return values_at(with_harmonics(plain, orders, pixels), pixels)[0] - 1
-
-
-def unseen(harmonics: Harmonics, searched: Pixels, rules: WireRules) -> float:
-    """Relative RMS modulation that the harmonics may have though the searched pixels show none; else 0."""
-    power = float(np.sum(harmonics.bounds**2)) / 2
-    # The mean value is 1 apart from shading; a few outliers must not count as light.
-    expected_gain = power * float(np.sum(searched.weight))
-    # Rows of half the expected amplitude would still have been found.
-    if expected_gain > 4.0 * rules.least_gain:
-        return 0.0
-    return float(np.sqrt(power * min(1.0, rules.least_gain / max(expected_gain, 1e-300))))
-
-
-@final
-@dataclass(frozen=True)
 class Joint:
     """A fitted wire: the search, the last descent, and the parameters' values and covariance.
 
@@ -153,6 +83,7 @@ class Joint:
     variance: float
     seen: Weighed
     orders: Choice
+    strengths: Strengths
 
     @property
     def parameters(self) -> Parameters:
@@ -184,8 +115,8 @@ def wire_result(
     """The result of a finished fit, on a sensor of that shape.
 
     ``cov`` is that of the parameters of a map whose mean is 1. ``map_sigma`` is the whole sigma of the map.
-    ``left_out`` is the part by omitted harmonics, or by rows that may be there unseen, RMS over the sensor. Both are
-    relative.
+    ``left_out`` is the part by harmonics that are tied or omitted, or by rows that may be there unseen, RMS over the
+    sensor. Both are relative.
     """
     panel, seen = joint.parameters.panel, joint.seen
     term = _trimmed(posterior.term_at(posterior.mean))
