@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import final
 
@@ -11,11 +12,13 @@ from scipy.special import ndtri
 
 from udccal.fitting.engine.orders import Choice
 from udccal.fitting.engine.robust import OutlierRule, robust_sigma
-from udccal.fitting.noise.codes import excess_kurtosis, smeared
+from udccal.fitting.noise.codes import excess_kurtosis, smeared, standard_cdf
 from udccal.fitting.noise.dark import DarkTerms
 from udccal.fitting.noise.moments import Moments, NoiseMoments
 from udccal.fitting.noise.transfer import DarkVariance, Five, Levels, TransferFit, robust_transfer
 
+# Part of full samples with the last code above which that part, and not the mean, gives the level.
+_MANY_AT_THE_END = 0.02
 Bins = Bool[np.ndarray, "flats bins"]
 
 
@@ -231,13 +234,17 @@ def _level(
     rows = dark.row_DN2.value / (flat.frames * flat.height) * (full.size / float(chosen.sum()))
     spread2 = V0 + dark.dsnu_DN2.value + dark.row_DN2.value
     part = float(np.average(flat.at_peak[chosen], weights=flat.samples[chosen]))
-    if flat.peak_DN >= data.top_DN and part > 1e-3:
-        z = float(ndtri(part))
-        density2 = float(np.exp(-(z**2)) / (2 * np.pi))
-        own = spread2 * part * (1 - part) / density2 / samples
-        # The fraction gives the level by the shape of the noise, which is then another one.
-        own += 0.2**2 * spread2 if dark.foreign else 0.0
-        return peak - 0.5 * data.q_DN + float(np.sqrt(spread2)) * z, own + rows, bool(sure.any())
+    spread, clipped = float(np.sqrt(spread2)), flat.peak_DN >= data.top_DN and part > 0.0
+    z = float(ndtri(part)) if clipped else 0.0
+    density = float(np.exp(-0.5 * z**2)) / math.sqrt(2 * math.pi)
+    if clipped and part > _MANY_AT_THE_END:
+        own = spread2 * part * (1 - part) / density**2 / samples
+        # The fraction gives the level by the shape of the noise, of which the read noise's is not quite normal.
+        quantile, probability = standard_cdf(dark.shape.value)
+        own += V0 * (0.2 if dark.foreign else float(np.interp(part, probability, quantile)) - z) ** 2
+        return peak - 0.5 * data.q_DN + spread * z, own + rows, bool(sure.any())
+    # Few samples beyond the end lower the mean by this, if their noise is normal.
+    lost = spread * (density + z * part) if clipped else 0.0
     # Rounding adds sum over k of (-1)^k q sin(2 pi k x / q) f(2 pi k / q) / (pi k) to the mean of noise that has the
     # characteristic function f (Widrow and Kollar, Quantization Noise, chapter 5): this is its uncertainty. Tails leave
     # more of it than normal noise does; as much as Laplace's where the fitted shape has them.
@@ -249,4 +256,4 @@ def _level(
     # Where some pixels are not full, the possible shift of the mean adds to it.
     low = 0.0 if sure.any() else 0.5 * max(float(excess[chosen].mean()), 0.0)
     mean = float(np.average(flat.mean_DN[chosen], weights=flat.samples[chosen]))
-    return mean, temporal / samples + rounding + low + rows, bool(sure.any())
+    return mean + lost, temporal / samples + rounding + low + rows + lost**2, bool(sure.any())
