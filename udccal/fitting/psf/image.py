@@ -217,13 +217,15 @@ def solve_image(
 
     iterations, tolerance = (150, 1e-5) if free else (60, 1e-4)
     operator = scipy.sparse.linalg.LinearOperator((sigma.size, sigma.size), matvec=normal, dtype=np.float64)
-    # Pixels hardly share nodes: divided by the diagonal, bright nodes and dark ones converge alike, in few iterations.
-    squared = replace(windows, basis=windows.basis**2, down=windows.down**2, across=windows.across**2)
-    diagonal = 1.0 + sigma**2 * smoothed(_gathered(squared, flux**2 * weight, len(sigma)), free)
+    # Pixels hardly share a residual's nodes: divided by the diagonal, bright nodes and dark ones converge alike, in few
+    # iterations. A free image's are finer, and smoothed: it gains nothing.
+    preconditioner = None
+    if not free:
+        squared = replace(windows, basis=windows.basis**2, down=windows.down**2, across=windows.across**2)
+        diagonal = 1.0 + sigma**2 * _gathered(squared, flux**2 * weight, len(sigma))
+        preconditioner = scipy.sparse.diags_array(1.0 / diagonal.ravel())
     right = backward(data - forward(start)).ravel()
-    added, _ = scipy.sparse.linalg.cg(
-        operator, right, rtol=tolerance, maxiter=iterations, M=scipy.sparse.diags_array(1.0 / diagonal.ravel())
-    )
+    added, _ = scipy.sparse.linalg.cg(operator, right, rtol=tolerance, maxiter=iterations, M=preconditioner)
     image = start + added.reshape(sigma.shape)
     return image, changes if moves is None else moves.fitted(data - forward(image), weight)
 

@@ -263,8 +263,10 @@ def select_field(
     plain = orders.attempt(sources, Order(-1, False, 0.0, model_error))
     tried = orders.rising(sources, False, rules.residual_sizes, plain.fit.compared.model_error, (plain,))
     if np.sqrt((plain.fit.compared.relative_l2(shots.channel[test]) ** 2).mean()) > rules.doubtful:
-        linear = polynomial_terms(1) if polynomial_terms(1) <= shots.positions else 1
-        free = free_sources(shots, basis, linear, magnitude, rules)
+        # Places and light by an image of too low a degree take a part of what it lacks.
+        terms = [polynomial_terms(degree) for degree in range(rules.highest_degree + 1)]
+        most = max(count for count in terms if 2 * count <= max(shots.positions, 2))
+        free = free_sources(shots, basis, most, magnitude, rules)
         tried += orders.rising(free, True, (1.0,), rules.free_model_error, ())
     best = tried[0]
     for attempt in tried[1:]:
