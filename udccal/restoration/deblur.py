@@ -20,11 +20,12 @@ from scipy.optimize import nnls
 
 from udccal.cfa import BLUE, GREEN, RED, Site
 from udccal.errors import RestorationError
+from udccal.restoration.blur import blurred
 from udccal.restoration.kernel_grid import KernelGrid
 from udccal.restoration.mosaic_filter import filter_tables, filtered
 from udccal.restoration.network import refined, sharper
 from udccal.restoration.shrink import measured_noise, shrunk
-from udccal.restoration.tiles import layout_for
+from udccal.restoration.tiles import TileLayout, layout_for
 from udccal.tiers import Tier
 
 _EVERY = (slice(None), slice(None))
@@ -86,11 +87,12 @@ def deblur(
     light = np.ascontiguousarray(picture / unit, dtype=np.float32)
     rows, columns = light.shape[:2]
     layout = layout_for(rows, columns, (1, 1), (tile_px, tile_px), (0, rows))
-    tiles = np.stack([layout.cut(plane) for plane in cv2.split(light)], axis=1)
+    tiles = _cut(light, layout)
     read, slope = _noise_line(tiles)
     noise = np.sqrt(np.maximum(read + slope * tiles.mean(axis=(2, 3)), np.finfo(np.float32).tiny)).astype(np.float32)
     tables = filter_tables(grid, layout, THREE_COLOURS, workers)
-    pictures, strengths = filtered(tiles, noise, tables, layout, THREE_COLOURS, workers)
+    given = noise, tables, layout, THREE_COLOURS, workers
+    pictures, strengths = filtered(tiles, *given)
     chosen = layout.join(pictures, workers)
     if tier is Tier.fast:
         return chosen * np.float32(unit)
@@ -99,9 +101,17 @@ def deblur(
     balanced = shrunk(chosen, noise, local, bands, layout, workers)
     if tier is Tier.balanced:
         return balanced * np.float32(unit)
-    pictures, _ = filtered(tiles, noise, tables, layout, THREE_COLOURS, workers, sharper(strengths))
-    sharp = layout.join(pictures, workers)
-    return refined(balanced, chosen, sharp, noise, local, bands, layout) * np.float32(unit)
+    sharp = layout.join(filtered(tiles, *given, sharper(strengths))[0], workers)
+    best = refined(balanced, chosen, sharp, noise, local, bands, layout)
+    # The samples have the last word: the filter of what they have more or less than the picture gives.
+    rest = _cut(light - blurred(best, grid, layout), layout)
+    return (best + layout.join(filtered(rest, *given)[0], workers)) * np.float32(unit)
+
+
+def _cut(
+    light: Float32[np.ndarray, "rows columns 3"], layout: TileLayout
+) -> Float32[np.ndarray, "tiles 3 down across"]:
+    return np.stack([layout.cut(plane) for plane in cv2.split(light)], axis=1)
 
 
 def _noise_line(tiles: Float32[np.ndarray, "tiles 3 rows columns"]) -> tuple[float, float]:
