@@ -157,6 +157,14 @@ def test_a_step_makes_spectra_grow_by_what_it_says() -> None:
     np.testing.assert_allclose(small, theta + 1e-4 * step, atol=1e-5)
 
 
+def test_a_step_keeps_lengths_and_openings_positive() -> None:
+    theta, step = np.full(HEAD + 15, 0.8), np.full(HEAD + 15, -2.0)
+    moved = stepped(theta, step)
+    np.testing.assert_allclose(moved[[0, 1, 2, PUPIL]], 0.4)
+    assert moved[3] == pytest.approx(-1.2)  # the depth has a sign
+    np.testing.assert_allclose(stepped(theta, -step)[[0, 1, 2, PUPIL]], 1.6)
+
+
 def with_pitch_tolerance(rig: RigDescription, share: float) -> RigDescription:
     pitch = rig.panel.pitch_mm
     known = pitch.model_copy(update={"tolerance": share * pitch.value})

@@ -49,6 +49,8 @@ from udccal.models.geometry import Geometry
 
 # Overlaps of the pupil's footprint change with these parameters.
 _IN_OVERLAPS: Final = np.array([PITCH, PUPIL])
+# The pitch, both openings and the pupil's diameter: none of them is 0 or less.
+_POSITIVE: Final = np.array([PITCH, 1, 2, PUPIL])
 
 
 @final
@@ -166,13 +168,18 @@ def _changed(one: Samples, theta: Theta) -> Light:
 
 
 def stepped(theta: Float[np.ndarray, " p"], step: Float[np.ndarray, " p"]) -> Float[np.ndarray, " p"]:
-    """Return parameters after a step; spectra grow by the step itself, not by its exponential."""
+    """Return parameters after a step; spectra grow by the step itself, not by its exponential.
+
+    Lengths and openings stay positive: they at most halve, or double.
+    """
     spectra = softmax(theta[HEAD:].reshape(3, -1), axis=1)
     logs = step[HEAD:].reshape(3, -1)
     mean = np.sum(spectra * logs, axis=1, keepdims=True)
     grown = logs - mean
     grown = np.where(grown > 0, np.log1p(np.maximum(grown, 0.0)), grown)
-    return theta + np.concatenate([step[:HEAD], (mean + grown).ravel()])
+    moved = theta + np.concatenate([step[:HEAD], (mean + grown).ravel()])
+    moved[_POSITIVE] = np.clip(moved[_POSITIVE], 0.5 * theta[_POSITIVE], 2.0 * theta[_POSITIVE])
+    return moved
 
 
 def moved_own(own: Float[np.ndarray, "*k l"], step: Float[np.ndarray, "*k l"]) -> Float[np.ndarray, "*k l"]:
