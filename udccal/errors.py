@@ -13,6 +13,10 @@ class SessionError(UdccalError):
     """A session on disk is missing, damaged, or does not follow docs/session.md."""
 
 
+class MissingStepError(SessionError):
+    """A step of a session was not captured."""
+
+
 class ProfileError(UdccalError):
     """A profile on disk is missing, damaged, or does not follow docs/profile.md."""
 

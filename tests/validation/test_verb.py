@@ -17,6 +17,7 @@ from tests.reports.widths import layouts
 from tests.toy_rigs import write_toy_rig
 from udccal.benches.bench import simulated_bench
 from udccal.profiles.store import load_profile, write_profile
+from udccal.result import FitStatus
 from udccal.simulation.truth import draw_truth
 from udccal.simulation.world import SimulatedWorld
 
@@ -75,6 +76,20 @@ def test_the_profiles_own_session_confirms_nothing(folder: Path) -> None:
     found = udccal.validate(load_profile(folder / "profile"), udccal.Session.open(folder / "first"))
     assert found.own_session
     assert "capture another one" in found.advice
+
+
+def test_a_term_without_its_dark_frames_is_not_counted(folder: Path) -> None:
+    profile = with_result(load_profile(folder / "profile"), "wire", status=FitStatus.CONVERGED)
+    with simulated_bench(SimulatedWorld(draw_truth(profile.rig, 0), seed=7)) as bench:
+        session = udccal.capture(folder / "third", bench, terms=("noise", "wire"))
+    steps = tuple(step for step in session.manifest.steps if step.id != "wire/dark")
+    assert len(steps) < len(session.manifest.steps)
+    partial = udccal.Session(session.path, session.manifest.model_copy(update={"steps": steps}))
+    found = udccal.validate(profile, partial)
+    assert found.ok
+    (wire,) = (check for check in found.checks if check.term == "wire")
+    assert (wire.name, wire.ok) == ("NOT_CAPTURED", None)
+    assert "Expected the step 'wire/dark'" in wire.what
 
 
 def refused(*words: str | Path) -> str:

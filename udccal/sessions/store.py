@@ -10,7 +10,7 @@ from typing import TypeVar, final
 import numpy as np
 from jaxtyping import Float32, UInt8, UInt16
 
-from udccal.errors import FileFormatError, SessionError
+from udccal.errors import FileFormatError, MissingStepError, SessionError
 from udccal.io.exr import read_exr
 from udccal.io.hashing import sha256_file
 from udccal.io.limits import Shape
@@ -70,12 +70,12 @@ class Session:
         """Return a completed step by its id.
 
         Raises:
-            SessionError: when it was not captured.
+            MissingStepError: when it was not captured.
         """
         for step in self.manifest.steps:
             if step.id == step_id:
                 return step
-        raise SessionError(
+        raise MissingStepError(
             f"Expected the step '{step_id}' in the session {self.path}, found that it was not captured. Capture it."
         )
 

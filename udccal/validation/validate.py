@@ -9,7 +9,7 @@ from typing import final
 
 from udccal.comparison.comparable import check_same_rig
 from udccal.comparison.estimates import ORDER
-from udccal.errors import SessionError
+from udccal.errors import MissingStepError, SessionError
 from udccal.io.hashing import sha256_file
 from udccal.profiles.profile import Profile
 from udccal.result import FitStatus
@@ -121,6 +121,13 @@ def _judged(term: TermName, profile: Profile, session: Session, limits: Validati
         return _not_counted(
             term, "NOT_CAPTURED", "The profile has no captures of this term: there is nothing to judge."
         )
+    try:
+        return _predicted(term, profile, session, limits, own)
+    except MissingStepError as error:
+        return _not_counted(term, "NOT_CAPTURED", f"The session has captures of a part of this term. {error}")
+
+
+def _predicted(term: TermName, profile: Profile, session: Session, limits: ValidationLimits, own: bool) -> Judged:
     match term:
         case "noise":
             return validate_noise(profile, session, limits)
