@@ -6,6 +6,7 @@ import json
 import re
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -43,3 +44,24 @@ def test_another_specimen_is_refused_before_it_is_compared(tmp_path: Path) -> No
     done = check("--seed", "1", "--out", tmp_path / "out", "--json")
     assert done.returncode == 1, done.stdout
     assert "found another camera" in json.loads(done.stdout)["error"]
+
+
+def test_a_full_disk_is_said_and_leaves_no_half_result(nearly_full: Path) -> None:
+    done = check("--out", nearly_full / "c", "--update", nearly_full / "p", "--json")
+    assert done.returncode == 1, done.stdout
+    assert "Traceback" not in done.stderr
+    assert "No space left on device" in json.loads(done.stdout)["error"]
+    # What was captured stays, as a session to go on with; of results there is nothing.
+    assert sorted(item.name for item in nearly_full.iterdir()) == ["c", "other"]
+    assert [item.name for item in (nearly_full / "c").iterdir()] == ["session"]
+
+
+def test_two_at_once_leave_one_whole_result(tmp_path: Path) -> None:
+    with ThreadPoolExecutor(2) as pool:
+        both = list(pool.map(lambda _: check("--out", tmp_path / "c", "--update", tmp_path / "p"), range(2)))
+    assert {done.returncode for done in both} <= {0, 1}, [done.stderr for done in both]
+    assert 0 in {done.returncode for done in both}
+    assert sorted(file.name for file in (tmp_path / "c").iterdir()) == ["check.html", "check.json", "session"]
+    assert json.loads((tmp_path / "c" / "check.json").read_text(encoding="utf-8"))["verdict"] == "same"
+    assert load_profile(tmp_path / "p").parent == profile_sha256(find_profile("lg55-reduced"))
+    assert sorted(item.name for item in tmp_path.iterdir()) == ["c", "p"]

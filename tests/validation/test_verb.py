@@ -6,6 +6,7 @@ import json
 import re
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -70,6 +71,23 @@ def test_a_gain_of_2_percent_more_has_status_3(folder: Path) -> None:
     assert done.returncode == 3, done.stderr
     assert done.stdout.startswith("Do not rely on noise of this profile")
     assert "0.98" in done.stdout
+
+
+def test_a_full_disk_is_said_and_nothing_is_left(folder: Path, nearly_full: Path) -> None:
+    words = folder / "profile", "--session", folder / "second", "--out", nearly_full / "v"
+    sentence = refused(*words)
+    assert "No space left on device" in sentence
+    assert [file.name for file in nearly_full.rglob("*") if file.is_file()] == ["other"]
+
+
+def test_two_at_once_leave_one_whole_result(folder: Path, tmp_path: Path) -> None:
+    words = folder / "profile", "--session", folder / "second", "--out", tmp_path / "v"
+    with ThreadPoolExecutor(2) as pool:
+        both = list(pool.map(lambda _: validate(*words), range(2)))
+    assert {done.returncode for done in both} <= {0, 1}
+    assert 0 in {done.returncode for done in both}
+    assert sorted(file.name for file in (tmp_path / "v").iterdir()) == ["validation.html", "validation.json"]
+    assert json.loads((tmp_path / "v" / "validation.json").read_text(encoding="utf-8"))["ok"]
 
 
 def test_the_profiles_own_session_confirms_nothing(folder: Path) -> None:
