@@ -164,7 +164,8 @@ def merge_block(
         total = xp.maximum(information.sum(axis=0), _TINY)
         rate = rate + score.sum(axis=0) / total
     scale = xp.where(is_open | believed, time / xp.sqrt(variance), 0)
-    bias = _bias_by_information(z, ratio, scale, xp) / total
+    # Where exposures lie so far apart that the first order is a sigma and more, it is no longer the bias.
+    bias = xp.minimum(_bias_by_information(z, ratio, scale, xp) / total, 1 / xp.sqrt(total))
     mean, variance = expected(rate)
     # Below zero rate the rounds may not have settled: a sample's deviation is that from the rate of these weights.
     slope = xp.where(is_open, time / variance, 0)
