@@ -61,7 +61,9 @@ def tied_sigma(strengths: Strengths, wire: Wire, seen: Weighed, variance: float)
     if not held.any():
         return 0.0
     off, own = strengths.off[held], variance / strengths.known[held]
-    part2 = excess_variance(off**2, own, np.ones(len(off)))[0]
+    found, error2, _ = excess_variance(off**2, own, np.ones(len(off)))
+    # Few strengths tell how much they differ: what they may differ by more counts, too.
+    part2 = found + float(np.sqrt(error2)) if found > 0 else 0.0
     shrunk = part2 / np.maximum(part2 + own, 1e-300)
     square = np.where(strengths.tied[held], (shrunk * off) ** 2 + shrunk * own, 0.0)
     effect = square @ strengths.known[held] / np.sum(seen.pixels.weight * seen.expected**2)
