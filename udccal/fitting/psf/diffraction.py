@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.special import ndtr
 
-from udccal.fitting.engine.gaussian import Prior, scaled_inverse
+from udccal.fitting.engine.gaussian import Prior, scaled_inverse, square_root
 from udccal.fitting.engine.iteration_log import LOG
 from udccal.fitting.engine.least_squares import Blocks, Solution, SolverRules, minimise
 from udccal.fitting.engine.misfit import clustered_cov
@@ -87,14 +87,18 @@ class DiffractionFit:
         alone = [position.marginal() for position in self.problem.by_position(self.solution.place)]
         return clustered_cov(self.noise_cov, np.stack([a[1] for a in alone]), np.stack([a[0] for a in alone]))
 
-    def refuted_cov(self) -> Float[np.ndarray, "p p"]:
+    def refuted_cov(self, kernel_error: float = np.inf) -> Float[np.ndarray, "p p"]:
         """The same where residuals refute the model: its deviation may be common to all positions.
 
-        Then it does not average out over positions as it does in ``cov``.
+        Then it does not average out over positions as it does in ``cov``. Along directions in which it would change
+        the kernel by more than its ``kernel_error`` at positions held out (relative L2), it is no larger than that.
         """
-        weight = self.problem.samples.weight
+        weight, cov = self.problem.samples.weight, self.cov()
         positions = int((weight.reshape(len(weight), -1) > 0).any(axis=1).sum())
-        return self.noise_cov + max(positions, 1) * (self.cov() - self.noise_cov)
+        root = square_root(max(positions - 1, 0) * (cov - self.noise_cov))
+        square, ways = np.linalg.eigh(root.T @ kernel_metric(self) @ root)
+        most = np.minimum(1.0, kernel_error**2 / np.maximum(square, 1e-300))
+        return cov + (root @ ways * most) @ (root @ ways).T
 
     @property
     def chi2_dof(self) -> float:
@@ -255,15 +259,20 @@ def efficiency(fit: DiffractionFit, rules: PsfRules, available: int, reported: i
     return float(np.mean(np.diag(best)[:reported] / np.diag(fit.noise_cov)[:reported]))
 
 
-def kernel_sigma(fit: DiffractionFit, cov: Float[np.ndarray, "p p"]) -> float:
-    """Return the relative L2 sigma of the kernel at the first position, in all colours."""
+def kernel_metric(fit: DiffractionFit) -> Float[np.ndarray, "p p"]:
+    """Return the square of the kernel's relative L2 change at the first position, in all colours, by the parameters."""
     one, place = fit.problem.samples.at(0), fit.solution.place
     # All samples of a colour have equal weights; padding has none.
     even = (one.colour / np.maximum(one.colour.sum(axis=1, keepdims=True), 1)).sum(axis=-1)
     flux = flux_of(one, place.own[0])
     weight = np.where(flux > 0, even / np.where(flux > 0, flux, 1.0) ** 2, 0.0)
-    variance = np.einsum("sn,snp,pq,snq->", weight, place.by_theta[0], cov, place.by_theta[0], optimize=True)
-    return float(np.sqrt(max(float(variance), 0.0) / float((weight * place.light[0] ** 2).sum())))
+    square = np.einsum("sn,snp,snq->pq", weight, place.by_theta[0], place.by_theta[0], optimize=True)
+    return np.asarray(square / float((weight * place.light[0] ** 2).sum()))
+
+
+def kernel_sigma(fit: DiffractionFit, cov: Float[np.ndarray, "p p"]) -> float:
+    """Return the relative L2 sigma of the kernel at the first position, in all colours."""
+    return float(np.sqrt(max(float(np.sum(kernel_metric(fit) * cov)), 0.0)))
 
 
 def pattern_p_value(samples: Samples, z: Lights) -> float:

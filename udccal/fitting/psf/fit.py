@@ -175,10 +175,8 @@ def _report(
     tolerance, samples = pitch_tolerance(rig), fit.problem.samples
     errors, used = fit.errors(), samples.weight > 0
     pattern_p, error_l2 = pattern_p_value(samples, errors), float(error.relative_l2(selection.magnitude).mean())
-    cov = fit.refuted_cov() if pattern_p <= SIGNIFICANT else fit.cov()
-    # Numbers that residuals refute may be off together where the kernel is not: positions held out tell of the kernel.
-    of_kernel = fit.cov() if error.size else cov
-    by_parameters = kernel_sigma(fit, of_kernel) if diffracts else 0.0
+    cov = fit.refuted_cov(error_l2 or np.inf) if pattern_p <= SIGNIFICANT else fit.cov()
+    by_parameters = kernel_sigma(fit, cov) if diffracts else 0.0
     numbers, cov_of_numbers = _estimates(fit, diffracts, held_out_l2, cov, by_parameters, tolerance)
     stated = stated_error(error, by_parameters, selection.magnitude, rules)
     places = fit.shots.centre_px[np.broadcast_to(samples.index[..., None], used.shape)[used]]
@@ -222,7 +220,7 @@ def _report(
         notes=_notes(data, diffracts, misfit, support_notes(term, support)),
         outliers=fit.outliers,
         residuals=residual_sample(places, errors[used]) if diffracts else None,
-        posterior=_posterior(fit, diffracts, error, term, rig, of_kernel, tolerance),
+        posterior=_posterior(fit, diffracts, error, term, rig, cov, tolerance),
     )
 
 
