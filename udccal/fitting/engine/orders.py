@@ -59,17 +59,21 @@ class Choice(Generic[Fit]):
 
     def spread(
         self,
-        akaike: Float[np.ndarray, " tried"],
+        samples: int,
         values: Callable[[Fit], Float[np.ndarray, " values"]],
+        against: Float[np.ndarray, " tried"] | float = 0.0,
     ) -> Float[np.ndarray, "values values"]:
-        """Spread of the orders' values about the chosen one's (Buckland et al., Biometrics 53, 1997).
+        """Spread of values about the chosen order's, by Akaike's weights (Buckland et al., Biometrics 53, 1997).
 
         BIC drops parameters that are small and not 0. Others then take their part, which no order's own error shows.
 
         Args:
-            akaike: Akaike's criterion of every order that was tried; an infinite one counts for nothing.
+            samples: number of data of the criteria, which are those of ``bic``; an infinite one counts for nothing.
             values: of a fit, those whose spread is asked for.
+            against: part of each criterion that is no cost of its parameters.
         """
+        parameters = np.array([one.parameters for one in self.tried])
+        akaike = np.array([one.criterion for one in self.tried]) - against - (np.log(max(samples, 2)) - 2) * parameters
         away = np.array([values(one.fit) for one in self.tried]) - values(self.best.fit)
         weight = np.exp(-0.5 * (akaike - akaike.min())) if np.isfinite(akaike.min()) else np.zeros(len(akaike))
         return np.asarray((away.T * (weight / max(weight.sum(), 1.0))) @ away)

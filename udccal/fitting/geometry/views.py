@@ -275,10 +275,8 @@ def _choose_order(full: Solved, points: Points, prior: Prior, rules: GeometryRul
 
 def _between_orders(orders: Choice[Solved], samples: int, rules: GeometryRules) -> Float[np.ndarray, "n n"]:
     """Covariance that the choice of an order adds to that of all values."""
-    further = [2 * place * np.log(rules.further_order) for place in range(len(orders.tried))]
-    parameters = np.array([one.parameters for one in orders.tried])
-    akaike = np.array([one.criterion for one in orders.tried]) - further - (np.log(samples) - 2) * parameters
-    return orders.spread(akaike, lambda of: np.concatenate([of.place.intrinsics, of.place.poses.ravel()]))
+    further = 2 * np.log(rules.further_order) * np.arange(len(orders.tried))
+    return orders.spread(samples, lambda of: np.concatenate([of.place.intrinsics, of.place.poses.ravel()]), further)
 
 
 def _criterion(solved: Solved, points: Points, parameters: int) -> float:

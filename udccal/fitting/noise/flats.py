@@ -54,10 +54,9 @@ class Curve:
     def cov(self) -> Float[np.ndarray, "5 5"]:
         """Covariance of the values, with what the variances' misfit and the choice of an order add."""
         assert self.choice is not None, "asked for where there are usable levels"
-        parameters = np.array([one.parameters for one in self.choice.tried])
-        akaike = np.array([one.criterion for one in self.choice.tried])
-        akaike -= (np.log(max(self.fit.samples, 2)) - 2) * parameters
-        return np.asarray(self.fit.cov * self.fit.misfit.inflation + self.choice.spread(akaike, lambda of: of.values))
+        return np.asarray(
+            self.fit.cov * self.fit.misfit.inflation + self.choice.spread(self.fit.samples, lambda of: of.values)
+        )
 
     @property
     def usable_levels(self) -> int:

@@ -98,7 +98,8 @@ class DiffractionFit:
         root = square_root(max(positions - 1, 0) * (cov - self.noise_cov))
         square, ways = np.linalg.eigh(root.T @ kernel_metric(self) @ root)
         most = np.minimum(1.0, kernel_error**2 / np.maximum(square, 1e-300))
-        return cov + (root @ ways * most) @ (root @ ways).T
+        along = root @ ways
+        return cov + (along * most) @ along.T
 
     @property
     def chi2_dof(self) -> float:
