@@ -90,6 +90,8 @@ def written_in_version_2(folder: Path, profile: Profile) -> Path:
     write_profile(folder, profile)
     document = json.loads((folder / "profile.json").read_bytes())
     document["version"], document["pictures"] = 2, document["pictures"][:3]
+    psf = document["terms"]["psf"]
+    psf["parameters"] = [one for one in psf["parameters"] if one["name"] != "diffraction.blur_growth"]
     for section in document["terms"].values():
         for name in ("outliers", "residuals", "captures", "effort"):
             section["fit"].pop(name)
@@ -112,11 +114,19 @@ def test_an_older_profile_is_read_and_written_anew(tmp_path: Path, toy_profile: 
     assert "not known" in captures_sentence(read_profile(tmp_path / "again").noise)
 
 
+def test_a_blur_of_version_3_is_the_same_all_over_the_field(tmp_path: Path, toy_profile: Profile) -> None:
+    old = read_profile(written_in_version_2(tmp_path / "p", toy_profile)).psf.term.diffraction
+    np.testing.assert_array_equal(old.blur_growth, [0.0, 0.0])
+    assert old.blur_px == toy_profile.psf.term.diffraction.blur_px
+
+
 BROKEN: dict[str, tuple[Callable[[JsonObject], object], str]] = {
     "no terms": (lambda d: d.pop("terms"), "'terms'"),
     "terms of another kind": (lambda d: d.update(terms=[1]), "'terms'"),
     "a section of another kind": (lambda d: d["terms"].update(wire=3), "'terms.wire'"),
     "parameters of another kind": (lambda d: d["terms"]["wire"].update(parameters={"name": 1}), "parameters"),
+    "a psf without parameters": (lambda d: d["terms"]["psf"].update(parameters=None), "parameters"),
+    "a psf parameter of another kind": (lambda d: d["terms"]["psf"]["parameters"].append(5), "parameters"),
     "an unnamed parameter": (lambda d: d["terms"]["wire"]["parameters"][1].update(name=[1]), "name"),
     "a name of version 2": (lambda d: d["terms"]["wire"]["parameters"][1].update(name="tilt"), "rotation_rad"),
     "a rig without a panel": (lambda d: d["rig"].pop("panel"), "'rig.panel'"),

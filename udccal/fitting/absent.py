@@ -48,6 +48,7 @@ def absent_psf(rig: RigDescription, geometry: Geometry) -> PsfField:
             standoff_per_pitch=np.float64(rig.mounting.standoff_mm.value / panel.pitch_mm.value),
             visibility=np.float64(0.0),
             blur_px=np.float64(0.0),
+            blur_growth=np.zeros(2),
             wavelengths_nm=wavelengths_nm,
             spectrum=np.full((3, len(wavelengths_nm)), 1.0 / len(wavelengths_nm)),
         ),

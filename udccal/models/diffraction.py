@@ -41,7 +41,9 @@ class Diffraction(eqx.Module):
             opening, modulo 1.
         standoff_per_pitch: distance from the pupil to the openings in pitches; the centre moves by this times slope.
         visibility: 1, or 0 to leave out the interference between orders, where the footprint's place is not known.
-        blur_px: standard deviation of a Gaussian that represents all other small blur.
+        blur_px: standard deviation of a Gaussian that represents all other small blur, on the camera's axis.
+        blur_growth: (radial, tangential) growth of the logarithm of that deviation by the square of the image's
+            distance from the axis in focal lengths. A lens's field curvature and astigmatism are of this order.
         wavelengths_nm: nodes of the spectra, evenly spaced.
         spectrum: light per colour channel at the nodes, linear between them; each channel sums to 1.
     """
@@ -54,6 +56,7 @@ class Diffraction(eqx.Module):
     standoff_per_pitch: Float[Arrayish, ""]
     visibility: Float[Arrayish, ""]
     blur_px: Float[Arrayish, ""]
+    blur_growth: Float[Arrayish, "2"]
     wavelengths_nm: Float[Arrayish, " nodes"]
     spectrum: Float[Arrayish, "3 nodes"]
 
@@ -65,11 +68,13 @@ class LocalFrame(eqx.Module):
         direction: (l_x, l_y, l_z) of the source in panel coordinates.
         jacobian: d(l_x, l_y) / d(pixel x, y).
         footprint: matrix that takes the unit disc of the pupil (camera x, y) to the panel plane along the source's ray.
+        radius: (x, y) of the source's image from the camera's axis, in focal lengths.
     """
 
     direction: Float[Array, "3"]
     jacobian: Float[Array, "2 2"]
     footprint: Float[Array, "2 2"]
+    radius: Float[Array, "2"]
 
 
 def local_frame(geometry: Geometry, position_px: Float[Arrayish, "2"]) -> LocalFrame:
@@ -83,7 +88,8 @@ def local_frame(geometry: Geometry, position_px: Float[Arrayish, "2"]) -> LocalF
     jacobian = jax.jacfwd(cosines)(position)[:2]
     across = rotation_matrix(geometry.rotation_rad)[:, :2]
     footprint = across[:2] - jnp.outer(direction[:2] / direction[2], across[2])
-    return LocalFrame(direction, jacobian, footprint)
+    radius = (position - jnp.asarray(geometry.principal_point_px)) / jnp.asarray(geometry.focal_px)
+    return LocalFrame(direction, jacobian, footprint, radius)
 
 
 def node_scale(frame: LocalFrame) -> Float[Array, "2"]:
@@ -110,7 +116,7 @@ def average_transfer(
     fx, fy = lattice_frequencies(frame, lattice)
     columns, rows = (table[0] for table in slits_of(model, open_fractions(model, frame), fx, fy, 0))
     total = average_of(columns, rows, pupil_overlaps(model, frame, lattice), pupil_anchors(model)[1], spectra)
-    return through_sensor(total, sensor_transfer(frame, fx, fy, model.blur_px, disc_px))
+    return through_sensor(total, sensor_transfer(frame, fx, fy, blur_variance(model, frame), disc_px))
 
 
 def pupil_overlaps(model: Diffraction, frame: LocalFrame, lattice: Frequencies) -> Float[Array, "anchors rows half"]:
@@ -263,11 +269,22 @@ def pupil_anchors(model: Diffraction) -> tuple[Float[Array, " a"], Float[Array, 
     return anchors, jnp.prod(jnp.where(own, 1.0, above / jnp.where(own, 1.0, below[..., None])), axis=1)
 
 
+def blur_variance(model: Diffraction, frame: LocalFrame) -> Float[Array, "3"]:
+    """Return the covariance of the small Gaussian blur at the source of ``frame``, in px^2: of x, of y, of both."""
+    square = jnp.sum(frame.radius**2)
+    radial, tangential = 2.0 * jnp.asarray(model.blur_growth) * square
+    # Round on the axis, where the radius has no direction.
+    further = jnp.where(square > 1e-12, jnp.exp(radial) - jnp.exp(tangential), 0.0) / jnp.maximum(square, 1e-12)
+    x, y = frame.radius
+    round_part = jnp.exp(tangential) * jnp.array([1.0, 1.0, 0.0])
+    return model.blur_px**2 * (round_part + further * jnp.stack([x * x, y * y, x * y]))
+
+
 def sensor_transfer(
     frame: LocalFrame,
     fx: Float[Array, " half"],
     fy: Float[Array, " rows"],
-    blur_px: Float[Arrayish, ""],
+    variance_px2: Float[Arrayish, "3"],
     disc_px: Float[Arrayish, ""],
 ) -> Float[Array, "rows half"]:
     """Return the transfer function of the square pixel, the small Gaussian blur and the round source together.
@@ -275,15 +292,16 @@ def sensor_transfer(
     Args:
         frame: geometry around the source.
         fx: cycles per unit direction cosine along x. fy: the same along y.
-        blur_px: standard deviation of the Gaussian.
+        variance_px2: of the Gaussian; see ``blur_variance``.
         disc_px: diameter of the source on the sensor; 0 for a point.
     """
     jacobian = frame.jacobian
     nu_x = jacobian[0, 0] * fx + jacobian[1, 0] * fy[:, None]
     nu_y = jacobian[0, 1] * fx + jacobian[1, 1] * fy[:, None]
-    nu2 = nu_x**2 + nu_y**2
-    gaussian = jnp.exp(-2.0 * (jnp.pi * blur_px) ** 2 * nu2)
-    return jnp.sinc(nu_x) * jnp.sinc(nu_y) * gaussian * _disc_transfer(jnp.pi * disc_px * jnp.sqrt(nu2 + 1e-30))
+    along_x, along_y, both = jnp.asarray(variance_px2)
+    blurred = along_x * nu_x**2 + along_y * nu_y**2 + 2.0 * both * nu_x * nu_y
+    disc = _disc_transfer(jnp.pi * disc_px * jnp.sqrt(nu_x**2 + nu_y**2 + 1e-30))
+    return jnp.sinc(nu_x) * jnp.sinc(nu_y) * jnp.exp(-2.0 * jnp.pi**2 * blurred) * disc
 
 
 def _disc_transfer(z: Float[Array, "*n"]) -> Float[Array, "*n"]:

@@ -16,6 +16,7 @@ from udccal.models.bessel import sine_cosine
 from udccal.models.diffraction import (
     Diffraction,
     LocalFrame,
+    blur_variance,
     lattice_frequencies,
     open_fractions,
     relative_lag,
@@ -54,7 +55,7 @@ def interference_transfer(
     fx, fy = lattice_frequencies(frame, lattice)
     columns, rows = slits_of(model, open_fractions(model, frame), fx, fy, HIGHEST_ORDER)
     total = interference_of(strengths(model, footprint_place(model, frame)), columns, rows, overlaps, spectra)
-    return through_sensor(total, sensor_transfer(frame, fx, fy, model.blur_px, disc_px))
+    return through_sensor(total, sensor_transfer(frame, fx, fy, blur_variance(model, frame), disc_px))
 
 
 def footprint_place(model: Diffraction, frame: LocalFrame) -> Float[Array, "2"]:

@@ -97,6 +97,7 @@ RANGES: Mapping[type, Mapping[str, Range]] = {
         "standoff_per_pitch": Real(-1e6, 1e6),
         "visibility": _FRACTION,
         "blur_px": Real(-100.0, 100.0),
+        "blur_growth": Real(-100.0, 100.0, (2,)),
         "wavelengths_nm": Real(200.0, 2000.0, ("wavelengths",)),
         "spectrum": Real(-10.0, 10.0, (3, "wavelengths")),
     },

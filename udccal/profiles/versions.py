@@ -106,8 +106,22 @@ def _third_section(term: str, section: Any) -> Any:
     return {**section, "fit": fit}
 
 
+def _third_to_fourth(found: JsonObject) -> JsonObject:
+    """Say that the psf's further blur is the same all over the field, as it was before."""
+    terms = found.get("terms")
+    psf = terms.get("psf") if isinstance(terms, dict) else None
+    if isinstance(psf, dict) and isinstance(psf.get("parameters"), list):
+        even: JsonObject = {"kind": "numbers", "name": "diffraction.blur_growth", "dtype": "float64", "shape": [2]}
+        even |= {"value": [0.0, 0.0], "unit": "1", "sigma": None}
+        names = [one.get("name") if isinstance(one, dict) else None for one in psf["parameters"]]
+        at = names.index("diffraction.blur_px") + 1 if "diffraction.blur_px" in names else len(names)
+        parameters = [*psf["parameters"][:at], even, *psf["parameters"][at:]]
+        terms = {**found["terms"], "psf": {**psf, "parameters": parameters}}
+    return {**found, "version": 4, "terms": terms}
+
+
 # By the version that a function starts from; it returns the next version.
-MIGRATIONS: Mapping[int, Migration] = {1: _first_to_second, 2: _second_to_third}
+MIGRATIONS: Mapping[int, Migration] = {1: _first_to_second, 2: _second_to_third, 3: _third_to_fourth}
 
 
 def migrated(

@@ -126,10 +126,20 @@ def _between(
 
 
 def _blurred(rig: Rig, power: np.ndarray, source_px: np.ndarray, colour: int, disc_px: float) -> np.ndarray:
-    """One colour of the spread after the lens's further blur and over the source's disc."""
+    """One colour of the spread after the lens's further blur and over the source's disc, which are round on the sensor.
+
+    Power is over direction cosines of the panel: their frequencies become the sensor's by the source's own Jacobian.
+    """
     rows, columns = power.shape
     size = [scipy.fft.next_fast_len(n + 8 * _CELLS) for n in (rows, columns)]
-    nu = np.hypot(scipy.fft.fftfreq(size[0])[:, None], scipy.fft.rfftfreq(size[1])) * _CELLS
+    nu = np.stack(np.meshgrid(scipy.fft.rfftfreq(size[1]), scipy.fft.fftfreq(size[0])), axis=-1)
+    steps = np.concatenate([np.eye(2), -np.eye(2)]) / 2
+    right, below, left, above = directions(rig, source_px + steps)[:, :2]
+    nu = (
+        np.linalg.norm(nu @ np.stack([right - left, below - above], axis=1), axis=-1)
+        * _CELLS
+        * rig.lens.focal_px.mean()
+    )
     z = np.maximum(np.pi * disc_px * nu, 1e-9)
     field = np.linalg.norm((source_px - rig.lens.centre_px) / [rig.columns / 2, rig.rows / 2]) / np.sqrt(2)
     sigma = rig.lens.blur_px[colour] * (1 + rig.lens.blur_growth * field**2)

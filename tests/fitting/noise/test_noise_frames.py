@@ -180,6 +180,20 @@ def test_codes_that_end_in_one_colour_only_are_the_saturation(brightest: float) 
     assert saturation.sigma < 0.35
 
 
+@pytest.mark.parametrize("brightest", [1.15, 0.95])
+def test_flats_that_clip_in_their_middle_alone_show_saturation(brightest: float) -> None:
+    """No bin is full. Just below saturation, nothing piles up, and the converter's end is the only bound."""
+    y, x = np.mgrid[-1:1:96j, -1:1:128j]
+    sensor = replace(PLAIN, pattern=-0.4 * (x**2 + y**2), levels=(*PLAIN.levels[:-1], brightest))
+    levels, stack = capture(sensor, 3)
+    result = fit_noise(NoiseData(levels, stack, top_code=4095))
+    found, true = result.estimate("saturation_DN"), truth(sensor)["saturation_DN"]
+    seen = brightest > 1
+    assert any("No flat reached saturation" in note for note in result.notes) != seen
+    assert abs(found.value - true) < 3 * found.sigma
+    assert (found.sigma < 0.5) == seen
+
+
 def test_hot_pixels_are_named() -> None:
     levels, stack = capture(PLAIN, 6)
     for frame in stack.dark:

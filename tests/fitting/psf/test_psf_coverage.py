@@ -10,6 +10,8 @@ from udccal.fitting.psf.data import PsfRules
 from udccal.fitting.psf.held_out import KernelError, estimate_kernel_error, stated_error
 
 SIZES = np.geomspace(1e-5, 1.0, 4000)
+# Of each size some, so that no sample decides its picture's light.
+PICTURES = np.arange(4000) % 50
 
 
 def residuals(error: KernelError, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
@@ -23,22 +25,43 @@ def residuals(error: KernelError, rng: np.random.Generator) -> tuple[np.ndarray,
 )
 def test_the_error_of_a_kernel_is_found_as_large_as_it_is(true: KernelError) -> None:
     residual, variance = residuals(true, np.random.default_rng(1))
-    found = estimate_kernel_error(residual, variance, SIZES, PsfRules())
+    found = estimate_kernel_error(residual, variance, SIZES, PICTURES, PsfRules())
     for size in (1e-3, 1e-2, 0.1):
         assert found.of_peak(np.array([size]))[0] == pytest.approx(true.of_peak(np.array([size]))[0], rel=0.2)
 
 
 def test_noise_is_no_error_of_the_kernel() -> None:
     rng = np.random.default_rng(2)
-    found = [estimate_kernel_error(*residuals(KernelError(0.0), rng), SIZES, PsfRules()) for _ in range(20)]
+    found = [estimate_kernel_error(*residuals(KernelError(0.0), rng), SIZES, PICTURES, PsfRules()) for _ in range(20)]
     assert sum(error.size > 0 for error in found) <= 1
+
+
+def test_light_that_follows_the_brightest_sample_does_not_hide_its_error() -> None:
+    """Pictures with one bright sample each, whose own light fits that sample."""
+    rng, true = np.random.default_rng(5), KernelError(0.03, 1.0, 0.8)
+    light = np.tile([1.0, *np.geomspace(1e-4, 0.03, 40)], (60, 1))
+    off = rng.standard_normal(light.shape) * true.of_peak(light)
+    off -= light * ((off * light).sum(axis=1) / (light**2).sum(axis=1))[:, None]
+    assert np.abs(off[:, 0]).max() < 0.1 * true.of_peak(np.ones(1))[0]
+    picture = np.broadcast_to(np.arange(60)[:, None], light.shape).ravel()
+    found = estimate_kernel_error(off.ravel(), np.full(light.size, 1e-14), light.ravel(), picture, PsfRules())
+    assert found.of_peak(np.ones(1))[0] == pytest.approx(true.of_peak(np.ones(1))[0], rel=0.4)
+
+
+def test_faint_samples_do_not_decide_the_error_of_the_bright_ones() -> None:
+    """Far from the source the kernel is as wrong as it is large, in most samples; near it, in two hundred."""
+    rng, true = np.random.default_rng(6), KernelError(0.02, 0.5, 0.7)
+    light = np.concatenate([np.geomspace(1e-2, 1.0, 200), np.geomspace(1e-6, 1e-3, 20000)])
+    off = rng.standard_normal(light.size) * np.where(light > 2e-3, true.of_peak(light), light)
+    found = estimate_kernel_error(off, np.full(light.size, 1e-18), light, np.arange(light.size) % 20, PsfRules())
+    assert found.of_peak(np.array([0.3]))[0] == pytest.approx(true.of_peak(np.array([0.3]))[0], rel=0.4)
 
 
 def test_hits_are_no_error_of_the_kernel() -> None:
     true = KernelError(0.01, 0.3, 0.75)
     residual, variance = residuals(true, np.random.default_rng(3))
     residual[::400] += 0.5
-    found = estimate_kernel_error(residual, variance, SIZES, PsfRules())
+    found = estimate_kernel_error(residual, variance, SIZES, PICTURES, PsfRules())
     assert found.of_peak(np.array([1e-2]))[0] == pytest.approx(true.of_peak(np.array([1e-2]))[0], rel=0.4)
 
 

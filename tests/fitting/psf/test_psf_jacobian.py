@@ -32,7 +32,7 @@ from udccal.rig import RigDescription
 
 _HALF = (8, 6)
 # Forward and backward, of each parameter before the spectra.
-_STEPS = np.array([1e-6, 1e-5, 1e-5, 1e-5, 1e-4, 1e-3, 1e-4, 1e-4, 1e-4])
+_STEPS = np.array([1e-6, 1e-5, 1e-5, 1e-5, 1e-4, 1e-3, 1e-3, 1e-3, 1e-4, 1e-4, 1e-4])
 
 
 @pytest.fixture(scope="module")

@@ -27,7 +27,7 @@ def samples_of(rate: np.ndarray, variance: np.ndarray, noise_per_rate: float = 0
     shots, samples = rate.shape
     x = np.arange(samples)
     points = np.broadcast_to(np.stack([x % 20, x // 20], axis=-1) * 1.0, (shots, samples, 2))
-    frame = LocalFrame(jnp.array([0.0, 0.0, 1.0]), jnp.eye(2), jnp.eye(2))
+    frame = LocalFrame(jnp.array([0.0, 0.0, 1.0]), jnp.eye(2), jnp.eye(2), jnp.zeros(2))
     made = Samples(
         frame=frame,
         points=points,

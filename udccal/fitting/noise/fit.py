@@ -12,10 +12,11 @@ from udccal.fitting.engine.gaussian import Posterior
 from udccal.fitting.engine.orders import Quantity
 from udccal.fitting.engine.report import estimates, residual_sample
 from udccal.fitting.engine.robust import outliers
+from udccal.fitting.noise.clipping import stacked
 from udccal.fitting.noise.codes import start_values
 from udccal.fitting.noise.dark import DarkTerms, fit_dark_terms
 from udccal.fitting.noise.data import NoiseData, NoiseRules
-from udccal.fitting.noise.flats import Curve, find_saturation, fit_curve, rough_gain, stacked
+from udccal.fitting.noise.flats import Curve, find_saturation, fit_curve, rough_gain
 from udccal.fitting.noise.moments import NoiseMoments, bins, reduced
 from udccal.fitting.noise.patterns import Pattern, prnu, rough_median
 from udccal.fitting.noise.transfer import linear_signal
@@ -273,7 +274,7 @@ def _notes(
     values: Float[np.ndarray, "11"],
     bent_too_far: bool,
 ) -> Iterable[str]:
-    if not curve.full.any():
+    if not (curve.full.any() or curve.pile):
         yield f"No flat reached saturation; the converter's largest code, {values[2]:.0f} DN, is taken for it."
     if not dark.white:
         yield (

@@ -12,6 +12,7 @@ from scipy.special import ndtri
 
 from udccal.fitting.engine.orders import Choice
 from udccal.fitting.engine.robust import OutlierRule, robust_sigma
+from udccal.fitting.noise.clipping import Bins, full_bins, piled_up, stacked
 from udccal.fitting.noise.codes import excess_kurtosis, smeared, standard_cdf
 from udccal.fitting.noise.dark import DarkTerms
 from udccal.fitting.noise.moments import Moments, NoiseMoments
@@ -19,7 +20,6 @@ from udccal.fitting.noise.transfer import DarkVariance, Five, Levels, TransferFi
 
 # Part of full samples with the last code above which that part, and not the mean, gives the level.
 _MANY_AT_THE_END = 0.02
-Bins = Bool[np.ndarray, "flats bins"]
 
 
 @final
@@ -27,11 +27,13 @@ Bins = Bool[np.ndarray, "flats bins"]
 class Curve:
     """The photon transfer curve: the fits of all orders, None where no exposure is inside the range.
 
-    ``full`` are bins at saturation, whose rough level is ``ceiling_DN``; the fit reaches ``fit_up_to`` of it. The two
-    frames of ``flickering`` flats differ in brightness. ``levels`` are those ``inside`` the range, less outliers.
+    ``full`` are bins at saturation, whose rough level is ``ceiling_DN``; without any, the ``pile`` of full pixels has
+    a level and its sigma. The fit reaches ``fit_up_to`` of the rough level. The two frames of ``flickering`` flats
+    differ in brightness. ``levels`` are those ``inside`` the range, less outliers.
     """
 
     full: Bins
+    pile: tuple[float, float] | None
     ceiling_DN: float
     fit_up_to: float
     flickering: tuple[int, ...]
@@ -66,14 +68,16 @@ class Curve:
 
 def fit_curve(data: NoiseMoments, dark: DarkTerms) -> Curve:
     """The curve up to 90 % of saturation, or up to 70 % where the model describes that far better."""
-    full, flickering, rules = _saturated(data, dark), _flickering(data, dark), data.rules
-    # Upper median of the saturated bins, or the converter's largest code where there is none.
-    ceiling = float(np.quantile(stacked(data.flats, "mean_DN")[full], 0.75)) if full.any() else data.top_DN
+    full, flickering, rules = full_bins(data, dark), _flickering(data, dark), data.rules
+    pile = None if full.any() else piled_up(data, dark)
+    # Upper median of the saturated bins, or the converter's largest code where nothing is full.
+    ceiling = pile[0] if pile else data.top_DN
+    ceiling = float(np.quantile(stacked(data.flats, "mean_DN")[full], 0.75)) if full.any() else ceiling
 
     def up_to(part: float) -> Curve:
         inside = _inside(data, dark, part * (ceiling - dark.black_DN), ceiling)
         inside.usable[list(flickering)] = False
-        empty = Curve(full, ceiling, part, flickering, inside, inside, None)
+        empty = Curve(full, pile, ceiling, part, flickering, inside, inside, None)
         if not empty.usable_levels:
             return empty
         choice, levels = robust_transfer(inside, _dark_variance(data, dark), max(ceiling - dark.black_DN, 1.0), rules)
@@ -85,11 +89,6 @@ def fit_curve(data: NoiseMoments, dark: DarkTerms) -> Curve:
         if narrow.usable_levels >= rules.levels and narrow.fit.misfit.ratio < 0.5 * found.fit.misfit.ratio:
             return narrow
     return found
-
-
-def stacked(flats: tuple[Moments, ...], name: str) -> Float[np.ndarray, "levels bins"]:
-    """The field ``name`` of every flat and bin."""
-    return np.stack([getattr(flat, name) for flat in flats])
 
 
 def _inside(data: NoiseMoments, dark: DarkTerms, up_to_DN: float, ceiling_DN: float) -> Levels:
@@ -173,31 +172,15 @@ def rough_gain(data: NoiseMoments, black_DN: float, dark_DN2: float) -> float:
     return max(float(np.quantile((variance[lit] - dark_DN2) / mean[lit], 0.75)), 1e-6) if lit.any() else 1.0
 
 
-def _saturated(data: NoiseMoments, dark: DarkTerms) -> Bins:
-    """Saturated bins: as bright as any, with a variance far below the one that the rest predicts for their mean.
-
-    Where all flats are saturated there is no rest: bins with no more variance than the dark frames are then saturated.
-    """
-    mean, variance = stacked(data.flats, "mean_DN") - dark.black_DN, stacked(data.flats, "variance_DN2")
-    bright: Bins = mean > 0.05 * (data.top_DN - dark.black_DN)
-    if not bright.any():
-        return bright
-    # Saturation is a ceiling: a quiet bin well below the brightest one is something else.
-    highest = bright & (mean >= 0.9 * mean.max())
-    # Below saturation variance over mean is K plus a small positive part; clipping only lowers it.
-    slope = variance / np.maximum(mean, 1e-9)
-    collapsed: Bins = highest & (slope < 0.3 * float(np.quantile(slope[bright], 0.75)))
-    quiet: Bins = highest & (variance <= 1.3 * (dark.read_DN2.value + data.rounding_DN2 + dark.row_DN2.value))
-    return quiet if not collapsed.any() and quiet[bright].mean() > 0.5 else collapsed
-
-
 def find_saturation(data: NoiseMoments, dark: DarkTerms, curve: Curve) -> tuple[float, float]:
     """Level in DN at which the signal stops, with its sigma (patterns of the offsets not counted).
 
     It is the mean of the bins in which every pixel is full, or the last code where codes end before the full well. In
-    between, it follows from the fraction of samples at the end.
+    between, it follows from the fraction of samples at the end. Where no bin is full, full pixels may pile up.
     """
     full = [(flat, bins) for flat, bins in zip(data.flats, curve.full, strict=True) if bins.any()]
+    if not full and curve.pile:
+        return curve.pile
     if not full:
         # The level lies between the brightest code seen and the largest possible one.
         seen = max(flat.peak_DN for flat in data.flats)

@@ -14,7 +14,7 @@ from typing import final
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Float, Float32, Int
 
 from udccal.errors import FitError
 from udccal.fitting.noise.codes import DarkPair, dark_pair
@@ -49,8 +49,9 @@ class Moments:
     ``dof`` its degrees of freedom; ``samples`` are frames times pixels; ``spread_DN`` is the standard deviation over
     these, spatial and temporal; ``shift_DN`` is the mean of each frame less that of all. ``rows_DN2`` is the variance
     of the rows' means, and ``sampling_DN2`` the part of it that is sampling; frames have ``height`` rows. ``at_peak``
-    is the fraction of the samples with the largest code. ``outliers`` were hits, and left out; ``outlier_powers`` are
-    the sums of the second and fourth powers of their differences from the first frame.
+    is the fraction of the samples with the largest code, and ``codes`` the histogram of the first frame. ``outliers``
+    were hits, and left out; ``outlier_powers`` are the sums of the second and fourth powers of their differences from
+    the first frame.
     """
 
     exposure_s: float
@@ -66,6 +67,7 @@ class Moments:
     height: int
     peak_DN: int
     at_peak: Float[np.ndarray, " bins"]
+    codes: Int[np.ndarray, " codes"]
     outliers: int
     outlier_powers: tuple[float, float]
 
@@ -133,6 +135,7 @@ def reduce_frames(
         height=height,
         peak_DN=peak,
         at_peak=at_peak.ravel(),
+        codes=np.bincount(first.ravel()),
         outliers=outliers,
         outlier_powers=(float(powers[0]), float(powers[1])),
     )

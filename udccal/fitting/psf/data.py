@@ -40,6 +40,7 @@ class PsfRules:
         spectrum_bend, spectrum_sigma: prior standard deviations of the logarithm of a spectrum: of its second
             difference along the nodes, and about its start.
         blur_px, blur_log_sigma: prior of the blur in addition to pixel and disc: value, and sigma of its logarithm.
+        blur_growth: prior sigma of the growth of that logarithm over a focal length beside the axis.
         wire_tolerance: part of the rig's tolerances that is left after the wire's fit.
         pitch_tolerance: part of the pitch's tolerance that the fit may use; see ``start_prior``.
         pitch_well_known: where the pitch's relative tolerance is larger, the nodes cover more wavelengths than
@@ -59,6 +60,7 @@ class PsfRules:
         free_model_error: of such an image, before positions held out give it.
         own_sigma: prior standard deviations of a shot's place, in px, and relative light, along with such an image:
             centroids and sums of a crop's light have this accuracy.
+        error_samples: the most samples within a factor of three in brightness that the kernel error is taken from.
         error_knee, error_power: priors of the kernel error's knee and power; the knee's sigma is of its logarithm.
         poor: relative L2 error at positions held out from which the fit is poor.
     """
@@ -76,6 +78,7 @@ class PsfRules:
     spectrum_sigma: float = 5.0
     blur_px: float = 0.1
     blur_log_sigma: float = 1.0
+    blur_growth: float = 1.0
     wire_tolerance: float = 0.3
     pitch_tolerance: float = 0.05
     pitch_well_known: float = 0.02
@@ -90,6 +93,7 @@ class PsfRules:
     doubtful: float = 0.05
     free_model_error: float = 0.01
     own_sigma: tuple[float, float] = (0.05, 0.03)
+    error_samples: float = 100.0
     error_knee: tuple[float, float] = (0.3, 1.0)
     error_power: tuple[float, float] = (0.75, 0.15)
     poor: float = 0.2

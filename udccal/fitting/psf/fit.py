@@ -44,8 +44,9 @@ from udccal.result import Diagnostic, Estimate, FitResult, FitStatus
 from udccal.rig import RigDescription
 
 # The first parameters, and which of them are lengths on the panel, which are measured in pitches.
-_NUMBERS: Final = ("pitch_mm", "column_open", "row_open", "depth_mm", "pupil_diameter_mm", "blur_px")
-_LENGTHS: Final = np.array([True, False, False, True, True, False])
+_DIFFRACTION: Final = ("pitch_mm", "column_open", "row_open", "depth_mm", "pupil_diameter_mm")
+_NUMBERS: Final = (*_DIFFRACTION, "blur_px", "blur_growth_radial", "blur_growth_tangential")
+_LENGTHS: Final = np.array([True, False, False, True, True, False, False, False])
 
 
 @in_float64
@@ -166,7 +167,8 @@ def _report(
     trial, diffracts = selection.trial, not selection.trial.order.free
     channel = shots.channel[selection.test]
     held_out_l2, held_out = trial.compared.relative_l2(channel), trial.compared.errors()
-    error = kernel_error(trial.compared, channel, trial.sources.pick(selection.test), rules)
+    shown = selection.shown
+    error = kernel_error(selection.everywhere, shots.channel[shown], trial.sources.pick(shown), rules)
     worst, status = float(np.sqrt((held_out_l2**2).mean())), FitStatus.CONVERGED
     if not np.isfinite(worst) or worst > rules.poor:
         status = FitStatus.POOR_FIT

@@ -31,8 +31,8 @@ SIGMA_NAMES = ("kernel_sigma_size", "kernel_sigma_knee", "kernel_sigma_power")
 class KernelError:
     """Standard deviation of a kernel's samples, where 1 is the kernel's peak: size (s / (1 + s / knee))^power at s.
 
-    This power of the kernel's value becomes flat above a knee: near the peak, each picture's own place and light absorb
-    part of the error. A ``size`` of 0 means that nothing was found in addition to noise.
+    This power of the kernel's value becomes flat above a knee: near the peak, each picture's own place absorbs part of
+    the error. A ``size`` of 0 means that nothing was found in addition to noise.
     """
 
     size: float
@@ -59,26 +59,36 @@ def estimate_kernel_error(
     residual: Float[np.ndarray, " samples"],
     variance: Float[np.ndarray, " samples"],
     brightness: Float[np.ndarray, " samples"],
+    picture: Int[np.ndarray, " samples"],
     rules: PsfRules,
 ) -> KernelError:
     """Return the most probable error, or a size of 0 where BIC prefers noise alone.
 
-    All arrays are relative to the peak's light: data less expectation, noise's variance, and expected light.
+    All arrays are relative to the peak's light: data less expectation, noise's variance, and expected light. Samples of
+    one ``picture``, by number, have a light of their own, from unweighted least squares. It follows the errors of the
+    brightest samples, so that residuals hide them: each residual is an error less its part along the light. All sizes
+    of light count alike: most samples by far are so faint that a kernel's error does not depend on them.
     """
     seen = brightness > 1e-7
-    residual, variance, brightness = residual[seen], variance[seen], brightness[seen]
+    residual, variance, brightness, picture = residual[seen], variance[seen], brightness[seen], picture[seen]
     bounds = ((np.log(1e-5), np.log(2.0)), (np.log(3e-3), np.log(10.0)), (0.3, 1.2))
     if residual.size < len(bounds):
         return KernelError(0.0)
+    along = brightness**2 / np.maximum(np.bincount(picture, brightness**2), 1e-300)[picture]
+    level = np.unique(np.floor(np.log(brightness) / np.log(3.0)), return_inverse=True)[1].reshape(-1)
+    weight = np.minimum(rules.error_samples / np.bincount(level), 1.0)[level]
     mean, sigma = zip((np.log(rules.error_knee[0]), rules.error_knee[1]), rules.error_power, strict=True)
 
     def of(values: Float[np.ndarray, "3"]) -> KernelError:
         return KernelError(float(np.exp(values[0])), float(np.exp(values[1])), float(values[2]))
 
     def misfit(total: Float[np.ndarray, " samples"]) -> float:
+        by_others = np.bincount(picture, along * total)[picture] - along * total
+        total = total * np.maximum(1 - along, 1e-3) ** 2 + along * by_others
         # Beyond 5 sigma the loss grows as a logarithm: a cosmic hit counts little, a large model error still counts.
         square = residual**2 / (total * 25.0)
-        return float(np.sum(np.log(total) + 25.0 * np.where(square < 1, square, 1 + np.log(np.maximum(square, 1)))))
+        each = np.log(total) + 25.0 * np.where(square < 1, square, 1 + np.log(np.maximum(square, 1)))
+        return float(weight @ each)
 
     def loss(values: Float[np.ndarray, "3"]) -> float:
         off = ((values[1:] - np.array(mean)) / np.array(sigma)) ** 2
@@ -87,7 +97,7 @@ def estimate_kernel_error(
     starts = ((np.log(size), *mean) for size in (1e-3, 1e-2, 1e-1))
     tried = [scipy.optimize.minimize(loss, start, method="L-BFGS-B", bounds=bounds) for start in starts]
     found = min(tried, key=lambda one: float(one.fun))
-    worth = bic(float(found.fun), float(len(bounds)), residual.size) < misfit(variance)
+    worth = bic(float(found.fun), float(len(bounds)), round(weight.sum())) < misfit(variance)
     return of(found.x) if worth else KernelError(0.0)
 
 
@@ -101,8 +111,9 @@ def kernel_error(
     full = flux * np.array([unit[channel == colour].max(initial=1e-300) for colour in range(3)])[channel]
     seen = found.known & (full > 0)
     full = full[seen]
+    picture = (3 * np.arange(len(channel))[:, None, None] + channel)[seen]
     return estimate_kernel_error(
-        found.residual[seen] / full, found.variance[seen] / full**2, found.light[seen] / full, rules
+        found.residual[seen] / full, found.variance[seen] / full**2, found.light[seen] / full, picture, rules
     )
 
 

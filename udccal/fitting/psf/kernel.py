@@ -24,6 +24,7 @@ from udccal.models.diffraction import (
     Diffraction,
     LocalFrame,
     average_of,
+    blur_variance,
     lattice_frequencies,
     open_fractions,
     pupil_anchors,
@@ -50,18 +51,18 @@ WAVELENGTHS_NM: Final = np.linspace(400.0, 700.0, 13)
 
 # HEAD parameters precede the spectra. The others are indices among these: the panel's pitch in mm, the pupil's diameter
 # in mm, the logarithm of the blur in px, and the footprint's place on columns and rows with its stand-off, in pitches.
-HEAD: Final = 9
-PITCH, PUPIL, BLUR, FOOTPRINT = 0, 4, 5, slice(6, 9)
+HEAD: Final = 11
+PITCH, PUPIL, BLUR, FOOTPRINT = 0, 4, 5, slice(8, 11)
 
 
 def pack(model: Diffraction) -> Float[np.ndarray, " p"]:
-    """Return the parameters as one vector: pitch, open fractions, depth, pupil, log blur, footprint, log spectra.
+    """Return the parameters as one vector: see ``Evaluator.model``; blur and spectra as logarithms.
 
     The kernel depends on the square of the blur. The logarithm avoids its two signs and its zero derivative at 0.
     """
     logs = np.log(np.maximum(np.asarray(model.spectrum), 1e-6))
     head = [model.pitch_mm, *np.asarray(model.openings), model.depth_mm, model.pupil_diameter_mm, np.log(model.blur_px)]
-    head += [*np.asarray(model.offset_periods), model.standoff_per_pitch]
+    head += [*np.asarray(model.blur_growth), *np.asarray(model.offset_periods), model.standoff_per_pitch]
     return np.concatenate([np.array(head, dtype=float), (logs - logs.mean(axis=1, keepdims=True)).ravel()])
 
 
@@ -82,8 +83,9 @@ class Evaluator(eqx.Module):
             depth_mm=theta[3],
             pupil_diameter_mm=theta[PUPIL],
             blur_px=jnp.exp(theta[BLUR]),
-            offset_periods=theta[6:8],
-            standoff_per_pitch=theta[8],
+            blur_growth=theta[BLUR + 1 : FOOTPRINT.start],
+            offset_periods=theta[FOOTPRINT][:2],
+            standoff_per_pitch=theta[FOOTPRINT][2],
             visibility=float(self.interference),
             wavelengths_nm=jnp.asarray(self.wavelengths_nm),
             spectrum=jax.nn.softmax(theta[HEAD:].reshape(3, -1), axis=1),
@@ -126,7 +128,7 @@ def kernel_coefficients(
     if evaluator.interference:
         strength = strengths(model, footprint_place(model, frame))
         transfer = transfer + interference_of(strength, columns, rows, overlaps, spectra)
-    sensor = sensor_transfer(frame, fx, fy, model.blur_px, disc_px)
+    sensor = sensor_transfer(frame, fx, fy, blur_variance(model, frame), disc_px)
     return spline_coefficients(lattice, through_sensor(transfer, sensor))
 
 
@@ -141,7 +143,7 @@ def kernel_jacobian(
     """Return spline coefficients of the kernel at every wavelength node, and of its derivatives by factors and colours.
 
     Factors: open part of columns and of rows along the ray, the pitch where it scales lags, the pupil, the footprint's
-    place (x, y), and the logarithm of the blur, with the ``overlaps`` of interference held. The second result has their
+    place (x, y), and the blur's covariance, with the ``overlaps`` of interference held. The second result has their
     derivatives by the parameters before the spectra. The average over the footprint's place is one more term of
     interference, (0, 0), of strength 1.
     """
@@ -153,9 +155,9 @@ def kernel_jacobian(
         lambda mm: pupil_overlaps(eqx.tree_at(lambda m: m.pupil_diameter_mm, model, mm), frame, lattice),
         model.pupil_diameter_mm,
     )
-    sensor, by_blur = _with_derivative(
-        lambda log: sensor_transfer(frame, fx, fy, jnp.exp(log), disc_px), jnp.log(model.blur_px)
-    )
+    variance = blur_variance(model, frame)
+    sensor, along = jax.linearize(lambda at: sensor_transfer(frame, fx, fy, at, disc_px), variance)
+    by_blur = jax.vmap(along)(jnp.eye(3, dtype=variance.dtype))
     place, terms = footprint_place(model, frame), np.array([(0.0, 0.0), *TERMS][: 1 + np.shape(overlaps)[1]])
     column_of, row_of = np.abs(terms).astype(np.int32).T
     strength = jnp.append(1.0, strengths(model, place))[: len(terms), None]
@@ -181,12 +183,12 @@ def kernel_jacobian(
     # As one product of matrices: an einsum over the nodes takes five times as long.
     mixed = (spectra @ every.reshape(len(every), -1)).reshape(len(spectra), *every.shape[1:])
     channels = jnp.concatenate([every[:, 0], jnp.swapaxes(mixed[:, 1:], 0, 1).reshape(-1, *sensor.shape)])
-    seen = jnp.concatenate([through_sensor(channels, sensor), through_sensor(mixed[:, 0], by_blur)])
+    seen = jnp.concatenate([through_sensor(channels, sensor), *(through_sensor(mixed[:, 0], by) for by in by_blur)])
 
     def factors(head: Float[Array, " head"]) -> Float[Array, " factors"]:
         model = evaluator.model(jnp.concatenate([head, jnp.asarray(theta)[HEAD:]]))
         opened, place = open_fractions(model, frame), footprint_place(model, frame)
-        return jnp.stack([*opened, head[PITCH], head[PUPIL], *place, head[BLUR]])
+        return jnp.stack([*opened, head[PITCH], head[PUPIL], *place, *blur_variance(model, frame)])
 
     return spline_coefficients(lattice, seen), jax.jacfwd(factors)(jnp.asarray(theta)[:HEAD])
 
@@ -245,6 +247,7 @@ def start_model(rig: RigDescription, geometry: Geometry, wire: Wire, rules: PsfR
         depth_mm=np.float64(float(lengths[0]) * pitch),
         pupil_diameter_mm=np.float64(float(lengths[1]) * pitch),
         blur_px=np.float64(rules.blur_px),
+        blur_growth=np.zeros(2),
         offset_periods=np.asarray(offset, dtype=np.float64),
         standoff_per_pitch=np.float64(float(lengths[2])),
         visibility=np.float64(seen),
@@ -292,6 +295,7 @@ def start_prior(rig: RigDescription, start: Diffraction, rules: PsfRules | None 
         tighter * panel.depth_mm.tolerance,
         tighter * 2.0 * rig.pupil_diameter_mm * rig.lens.f_number.tolerance / rig.lens.f_number.value,
         rules.blur_log_sigma,
+        *(2 * (rules.blur_growth,)),
         *(3 * (rules.footprint_periods,)),
     ]
     roots = [np.eye(HEAD, theta.size) / np.maximum(np.array(sigma), 1e-6)[:, None]]

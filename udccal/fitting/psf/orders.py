@@ -158,6 +158,8 @@ class Selection:
         image: the residual on pixels, as wide as its order; a single zero for none.
         magnitude: the kernel's average size.
         test: which shots were held out.
+        everywhere: all shots by diffraction alone, or those held out where a residual has used the others.
+        shown: which shots these are.
     """
 
     trial: Trial
@@ -165,6 +167,8 @@ class Selection:
     image: Float[np.ndarray, "terms 3 rows columns"]
     magnitude: Float[np.ndarray, "3 window_rows window_columns"]
     test: Bool[np.ndarray, " shots"]
+    everywhere: Compared
+    shown: Bool[np.ndarray, " shots"]
 
 
 @final
@@ -181,11 +185,15 @@ class _Orders:
 
     def attempt(self, sources: Sources, order: Order) -> Attempt[Trial]:
         """Solve from all shots but those held out, and compare with these."""
-        windows = self._windows(sources, order)
-        light = windows.pick(self.test).expected(order.free, self._solve(windows.pick(~self.test), order))
-        found = compare(self.shots.pick(self.test), windows.pick(self.test), light)
+        found = self.compared(sources, order, self.test)
         trial = Trial(order, sources, found, found.loss(self.shots.position[self.test]))
         return Attempt(order.name, order.coefficients(self.shots.half), float(trial.loss.mean()), trial)
+
+    def compared(self, sources: Sources, order: Order, unseen: Bool[np.ndarray, " shots"]) -> Compared:
+        """Solve from all shots but the ``unseen``, and compare with these."""
+        windows = self._windows(sources, order)
+        light = windows.pick(unseen).expected(order.free, self._solve(windows.pick(~unseen), order))
+        return compare(self.shots.pick(unseen), windows.pick(unseen), light)
 
     def image(self, trial: Trial) -> Float[np.ndarray, "terms 3 rows columns"]:
         """Solve for the residual from all shots."""
@@ -274,7 +282,12 @@ def select_field(
     if best.fit.order.degree >= 0 and not best.fit.order.free:
         narrower = orders.narrowed(best)
         tried, best = (*tried, *(one for one in narrower if one is not best)), narrower[-1]
-    return Selection(best.fit, Choice(best, tried).candidates, orders.image(best.fit), magnitude, test)
+    # Diffraction has few parameters: the shots that it was fitted to show its error as well as others do.
+    shown = test | (best.fit.order.degree < 0)
+    everywhere = orders.compared(best.fit.sources, best.fit.order, shown)
+    return Selection(
+        best.fit, Choice(best, tried).candidates, orders.image(best.fit), magnitude, test, everywhere, shown
+    )
 
 
 def _mean_kernel(shots: Shots, sources: Sources) -> Float[np.ndarray, "3 rows columns"]:
