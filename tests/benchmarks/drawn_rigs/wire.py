@@ -5,24 +5,20 @@ from __future__ import annotations
 import itertools
 
 import numpy as np
-from scipy.interpolate import RectBivariateSpline
 
 from tests.benchmarks.drawn_rigs.draw import Rig
 from tests.benchmarks.drawn_rigs.openings import area_below, openings
-from tests.benchmarks.drawn_rigs.optics import directions, footprint, rotation
+from tests.benchmarks.drawn_rigs.optics import directions, footprint, rotation, sensor_pixels
 
-_STEP, _STRIPS = 2, 48
-# Openings narrow evenly with the slope to either side of 0: these nodes have all of it.
-_SLOPES = np.array([-1.6, -0.8, 0.0, 0.8, 1.6])
+# Twice as many strips and slopes change the map by less than 0.01 % RMS; coarser ones made it wrong by up to 0.1 %.
+_STRIPS, _SLOPE = 100, 0.05
 
 
 def wire_map(rig: Rig) -> np.ndarray:
     """Relative sensitivity of every pixel to an even field, mean 1."""
-    x, y = (np.arange(-2 * _STEP, count + 3 * _STEP, _STEP, dtype=float) for count in (rig.columns, rig.rows))
-    rays = directions(rig, np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2))
-    coarse = (open_part(rig, rays) * shading(rig, rays)).reshape(y.size, x.size)
-    fine = RectBivariateSpline(y, x, coarse, kx=5, ky=5)(np.arange(rig.rows), np.arange(rig.columns))
-    return fine / fine.mean()
+    rays = directions(rig, sensor_pixels(rig).reshape(-1, 2))
+    seen = (open_part(rig, rays) * shading(rig, rays)).reshape(rig.rows, rig.columns)
+    return seen / seen.mean()
 
 
 def shading(rig: Rig, rays: np.ndarray) -> np.ndarray:
@@ -37,8 +33,10 @@ def shading(rig: Rig, rays: np.ndarray) -> np.ndarray:
 def open_part(rig: Rig, rays: np.ndarray) -> np.ndarray:
     """Part of the footprint that is open, for each ray: between openings computed at a few slopes."""
     slope, found = rays[:, :2] / rays[:, 2:], np.zeros(len(rays))
-    for at in itertools.product(_SLOPES, _SLOPES):
-        near = np.prod(np.clip(1 - np.abs(slope - at) / np.diff(_SLOPES)[0], 0.0, 1.0), axis=1)
+    low, high = np.floor(slope.min(axis=0) / _SLOPE), np.ceil(slope.max(axis=0) / _SLOPE)
+    for node in itertools.product(*(np.arange(a, b + 1) for a, b in zip(low, high, strict=True))):
+        at = (node[0] * _SLOPE, node[1] * _SLOPE)
+        near = np.prod(np.clip(1 - np.abs(slope - at) / _SLOPE, 0.0, 1.0), axis=1)
         chosen = near > 0
         if chosen.any():
             found[chosen] += near[chosen] * _area(rig, rays[chosen], openings(rig.shape, at).table())

@@ -36,6 +36,8 @@ _NUMBERS = {
     "depth_mm": 3,
     "pupil_diameter_mm": 4,
     "log_blur": 5,
+    "blur_growth_radial": 6,
+    "blur_growth_tangential": 7,
 }
 POINTS_PX = np.array([[350.0, 260.0], [700.0, 480.0]])
 WINDOW = (17, 9)

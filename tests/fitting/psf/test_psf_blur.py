@@ -1,0 +1,57 @@
+"""The lens's further blur, which grows away from the camera's axis, along the radius and across it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from tests.scenes.psf import pictures, shots_of, small_scene
+from udccal.fitting.psf.data import PsfRules
+from udccal.fitting.psf.diffraction import fit_diffraction
+from udccal.fitting.psf.kernel import BLUR, start_model, start_prior
+from udccal.models.diffraction import Diffraction, blur_variance, local_frame
+from udccal.models.geometry import Geometry
+from udccal.numerics import in_float64
+
+GROWTH = slice(BLUR + 1, BLUR + 3)
+
+
+@pytest.mark.medium
+@pytest.mark.parametrize("growth", [(0.9, 0.3), (0.0, 0.0)])
+@in_float64
+def test_a_growing_blur_is_found(growth: tuple[float, float]) -> None:
+    scene, rng = small_scene(positions=(3, 2), shifts=2, half=(8, 6)), np.random.default_rng(3)
+    start = start_model(scene.rig, scene.geometry, scene.wire)
+    prior = start_prior(scene.rig, start)
+    theta = prior.mean.copy()
+    theta[BLUR], theta[GROWTH] = np.log(0.35), growth
+    shots = shots_of(scene, pictures(scene, theta, rng), rng)
+    fit = fit_diffraction(shots, scene.geometry, start, prior, replace(PsfRules(), close_px=scene.half))
+    found, sigma = fit.theta[GROWTH], np.sqrt(np.diag(fit.cov())[GROWTH])
+    assert fit.converged
+    assert np.abs((found - theta[GROWTH]) / sigma).max() < 4
+    assert sigma.max() < 0.1
+    assert abs(np.exp(fit.theta[BLUR]) - 0.35) < 0.01
+
+
+@in_float64
+def ellipse(model: Diffraction, geometry: Geometry, place: tuple[float, float]) -> np.ndarray:
+    x, y, both = np.asarray(blur_variance(model, local_frame(geometry, jnp.array(place))))
+    return np.array([[x, both], [both, y]])
+
+
+def test_the_blur_is_an_ellipse_along_the_radius() -> None:
+    scene = small_scene()
+    model = start_model(scene.rig, scene.geometry, scene.wire)
+    model = replace(model, blur_px=np.float64(0.3), blur_growth=np.array([0.8, 0.2]))
+    centre, focal = np.asarray(scene.geometry.principal_point_px), np.asarray(scene.geometry.focal_px)
+    np.testing.assert_allclose(ellipse(model, scene.geometry, tuple(centre)), 0.09 * np.eye(2), rtol=1e-6)
+    radius = np.array([0.3, 0.4])
+    found = ellipse(model, scene.geometry, tuple(centre + radius * focal))
+    for direction, growth in ((radius / 0.5, 0.8), (np.array([-0.8, 0.6]), 0.2)):
+        assert np.sqrt(direction @ found @ direction) == pytest.approx(0.3 * np.exp(growth * 0.25), rel=1e-5)
+    even = replace(model, blur_growth=np.zeros(2))
+    np.testing.assert_allclose(ellipse(even, scene.geometry, (5.0, 700.0)), 0.09 * np.eye(2), rtol=1e-6)
