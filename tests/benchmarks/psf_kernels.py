@@ -53,8 +53,8 @@ def light_and_slopes(
         return node_overlaps(model, frame, grid, overlap_tables(model, frame))
 
     def lit(
-        values: Float[Array, " p"], own: Float[Array, "nodes terms rows half"] | None, light: Float[Array, "c nodes"]
-    ) -> Float[Array, "n c"]:
+        values: Float[Array, " p"], own: Float[Array, "nodes terms rows half"] | None, light: Float[Array, "3 nodes"]
+    ) -> Float[Array, "n 3"]:
         model = evaluator.model(values)
         transfer = average_transfer(model, frame, grid, light, disc_px)
         if own is not None:
@@ -74,7 +74,7 @@ def light_and_slopes(
         # Apart, since the overlaps are by far the slowest to follow.
         slopes = slopes.at[_IN_OVERLAPS].add(jax.lax.map(through_overlaps, each[_IN_OVERLAPS]))
     # The light is linear in the spectra, which are normalised exponentials.
-    nodes = lit(at, here, jnp.eye(spectra.shape[1]))
-    light = nodes @ spectra.T
-    by_log = jnp.einsum("cd,cj,njc->cjnd", jnp.eye(3), spectra, nodes[:, :, None] - light[:, None, :])
+    nodes = jax.lax.map(lambda one: lit(at, here, jnp.tile(one, (3, 1))), jnp.eye(spectra.shape[1]))
+    light = jnp.einsum("jnc,cj->nc", nodes, spectra)
+    by_log = jnp.einsum("cd,cj,jnc->cjnd", jnp.eye(3), spectra, nodes - light)
     return light, jnp.concatenate([slopes, by_log.reshape(-1, *light.shape)])

@@ -46,6 +46,7 @@ def true_field(truth: RigTruth) -> PsfField:
         pupil_diameter_mm=np.float64(optics.pupil_diameter_mm),
         blur_px=np.float64(0.0),
         blur_growth=np.zeros(2),
+        blur_colour=np.zeros(3),
         offset_periods=optics.pupil_mm[:2] / panel.pitch_mm,
         standoff_per_pitch=np.float64((panel.depth_mm / 2 - optics.pupil_mm[2]) / panel.pitch_mm),
         visibility=np.float64(1.0),

@@ -91,7 +91,9 @@ def written_in_version_2(folder: Path, profile: Profile) -> Path:
     document = json.loads((folder / "profile.json").read_bytes())
     document["version"], document["pictures"] = 2, document["pictures"][:3]
     psf = document["terms"]["psf"]
-    psf["parameters"] = [one for one in psf["parameters"] if one["name"] != "diffraction.blur_growth"]
+    psf["parameters"] = [
+        one for one in psf["parameters"] if "diffraction.blur_" not in one["name"] or one["name"].endswith("px")
+    ]
     for section in document["terms"].values():
         for name in ("outliers", "residuals", "captures", "effort"):
             section["fit"].pop(name)
@@ -114,9 +116,12 @@ def test_an_older_profile_is_read_and_written_anew(tmp_path: Path, toy_profile: 
     assert "not known" in captures_sentence(read_profile(tmp_path / "again").noise)
 
 
-def test_a_blur_of_version_3_is_the_same_all_over_the_field(tmp_path: Path, toy_profile: Profile) -> None:
+def test_a_blur_of_version_3_is_the_same_all_over_the_field_and_in_all_colours(
+    tmp_path: Path, toy_profile: Profile
+) -> None:
     old = read_profile(written_in_version_2(tmp_path / "p", toy_profile)).psf.term.diffraction
-    np.testing.assert_array_equal(old.blur_growth, [0.0, 0.0])
+    np.testing.assert_array_equal(old.blur_growth, np.zeros(2))
+    np.testing.assert_array_equal(old.blur_colour, np.zeros(3))
     assert old.blur_px == toy_profile.psf.term.diffraction.blur_px
 
 

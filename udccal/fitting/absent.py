@@ -49,6 +49,7 @@ def absent_psf(rig: RigDescription, geometry: Geometry) -> PsfField:
             visibility=np.float64(0.0),
             blur_px=np.float64(0.0),
             blur_growth=np.zeros(2),
+            blur_colour=np.zeros(3),
             wavelengths_nm=wavelengths_nm,
             spectrum=np.full((3, len(wavelengths_nm)), 1.0 / len(wavelengths_nm)),
         ),

@@ -44,6 +44,7 @@ class Diffraction(eqx.Module):
         blur_px: standard deviation of a Gaussian that represents all other small blur, on the camera's axis.
         blur_growth: (radial, tangential) growth of the logarithm of that deviation by the square of the image's
             distance from the axis in focal lengths. A lens's field curvature and astigmatism are of this order.
+        blur_colour: logarithm of each colour's deviation over ``blur_px``: lenses focus colours at different distances.
         wavelengths_nm: nodes of the spectra, evenly spaced.
         spectrum: light per colour channel at the nodes, linear between them; each channel sums to 1.
     """
@@ -57,6 +58,7 @@ class Diffraction(eqx.Module):
     visibility: Float[Arrayish, ""]
     blur_px: Float[Arrayish, ""]
     blur_growth: Float[Arrayish, "2"]
+    blur_colour: Float[Arrayish, "3"]
     wavelengths_nm: Float[Arrayish, " nodes"]
     spectrum: Float[Arrayish, "3 nodes"]
 
@@ -101,16 +103,16 @@ def average_transfer(
     model: Diffraction,
     frame: LocalFrame,
     lattice: Frequencies,
-    spectra: Float[Array, "c nodes"],
+    spectra: Float[Array, "3 nodes"],
     disc_px: Float[Arrayish, ""] = 0.0,
-) -> Float[Array, "c rows half"]:
+) -> Float[Array, "3 rows half"]:
     """Return transfer functions averaged over the footprint's place: the term g = h = 0, pixel included.
 
     Args:
         model: the diffraction term.
         frame: geometry around the source.
         lattice: lattice in panel directions around the source.
-        spectra: light at the model's wavelength nodes, one row per result.
+        spectra: light of each colour at the model's wavelength nodes.
         disc_px: diameter of a round source on the sensor; 0 for a point.
     """
     fx, fy = lattice_frequencies(frame, lattice)
@@ -160,10 +162,10 @@ def average_of(
 
 
 def through_sensor(
-    transfer: Float[Array, "c rows half"], sensor: Float[Array, "rows half"]
-) -> Float[Array, "c rows half"]:
-    """Multiply each ``transfer`` by ``sensor``, from ``sensor_transfer``; the loop has it computed only once."""
-    return jax.lax.map(lambda one: one * sensor, transfer)
+    transfer: Float[Array, "3 rows half"], sensor: Float[Array, "3 rows half"]
+) -> Float[Array, "3 rows half"]:
+    """Multiply each colour's ``transfer`` by its ``sensor_transfer``; the loop has both computed only once."""
+    return jax.lax.map(lambda one: one[0] * one[1], (transfer, sensor))
 
 
 def lattice_frequencies(frame: LocalFrame, lattice: Frequencies) -> tuple[Float[Array, " half"], Float[Array, " rows"]]:
@@ -269,25 +271,26 @@ def pupil_anchors(model: Diffraction) -> tuple[Float[Array, " a"], Float[Array, 
     return anchors, jnp.prod(jnp.where(own, 1.0, above / jnp.where(own, 1.0, below[..., None])), axis=1)
 
 
-def blur_variance(model: Diffraction, frame: LocalFrame) -> Float[Array, "3"]:
-    """Return the covariance of the small Gaussian blur at the source of ``frame``, in px^2: of x, of y, of both."""
+def blur_variance(model: Diffraction, frame: LocalFrame) -> Float[Array, "3 3"]:
+    """Return the covariance of each colour's small blur at the source of ``frame``, in px^2: of x, of y, of both."""
     square = jnp.sum(frame.radius**2)
     radial, tangential = 2.0 * jnp.asarray(model.blur_growth) * square
     # Round on the axis, where the radius has no direction.
     further = jnp.where(square > 1e-12, jnp.exp(radial) - jnp.exp(tangential), 0.0) / jnp.maximum(square, 1e-12)
     x, y = frame.radius
     round_part = jnp.exp(tangential) * jnp.array([1.0, 1.0, 0.0])
-    return model.blur_px**2 * (round_part + further * jnp.stack([x * x, y * y, x * y]))
+    own = jnp.exp(2.0 * jnp.asarray(model.blur_colour))[:, None]
+    return model.blur_px**2 * own * (round_part + further * jnp.stack([x * x, y * y, x * y]))
 
 
 def sensor_transfer(
     frame: LocalFrame,
     fx: Float[Array, " half"],
     fy: Float[Array, " rows"],
-    variance_px2: Float[Arrayish, "3"],
+    variance_px2: Float[Arrayish, "3 3"],
     disc_px: Float[Arrayish, ""],
-) -> Float[Array, "rows half"]:
-    """Return the transfer function of the square pixel, the small Gaussian blur and the round source together.
+) -> Float[Array, "3 rows half"]:
+    """Return each colour's transfer function of the square pixel, the small blur and the round source together.
 
     Args:
         frame: geometry around the source.
@@ -298,10 +301,9 @@ def sensor_transfer(
     jacobian = frame.jacobian
     nu_x = jacobian[0, 0] * fx + jacobian[1, 0] * fy[:, None]
     nu_y = jacobian[0, 1] * fx + jacobian[1, 1] * fy[:, None]
-    along_x, along_y, both = jnp.asarray(variance_px2)
-    blurred = along_x * nu_x**2 + along_y * nu_y**2 + 2.0 * both * nu_x * nu_y
+    blurred = jnp.tensordot(jnp.asarray(variance_px2), jnp.stack([nu_x**2, nu_y**2, 2.0 * nu_x * nu_y]), 1)
     disc = _disc_transfer(jnp.pi * disc_px * jnp.sqrt(nu_x**2 + nu_y**2 + 1e-30))
-    return jnp.sinc(nu_x) * jnp.sinc(nu_y) * jnp.exp(-2.0 * jnp.pi**2 * blurred) * disc
+    return jnp.sinc(nu_x) * jnp.sinc(nu_y) * disc * jnp.exp(-2.0 * jnp.pi**2 * blurred)
 
 
 def _disc_transfer(z: Float[Array, "*n"]) -> Float[Array, "*n"]:

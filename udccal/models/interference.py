@@ -38,17 +38,17 @@ def interference_transfer(
     model: Diffraction,
     frame: LocalFrame,
     lattice: Lattice,
-    spectra: Float[Array, "c nodes"],
+    spectra: Float[Array, "3 nodes"],
     overlaps: Float[Arrayish, "nodes terms rows half"],
     disc_px: Float[Arrayish, ""] = 0.0,
-) -> Float[Array, "c rows half"]:
+) -> Float[Array, "3 rows half"]:
     """Return the transfer functions of the interference, to be added to ``average_transfer``.
 
     Args:
         model: the diffraction term.
         frame: geometry around the source.
         lattice: lattice in panel directions around the source.
-        spectra: light at the model's wavelength nodes, one row per result.
+        spectra: light of each colour at the model's wavelength nodes.
         overlaps: from ``node_overlaps``; they hardly change during a fit.
         disc_px: diameter of a round source on the sensor; 0 for a point.
     """

@@ -98,6 +98,7 @@ RANGES: Mapping[type, Mapping[str, Range]] = {
         "visibility": _FRACTION,
         "blur_px": Real(-100.0, 100.0),
         "blur_growth": Real(-100.0, 100.0, (2,)),
+        "blur_colour": Real(-10.0, 10.0, (3,)),
         "wavelengths_nm": Real(200.0, 2000.0, ("wavelengths",)),
         "spectrum": Real(-10.0, 10.0, (3, "wavelengths")),
     },

@@ -107,15 +107,18 @@ def _third_section(term: str, section: Any) -> Any:
 
 
 def _third_to_fourth(found: JsonObject) -> JsonObject:
-    """Say that the psf's further blur is the same all over the field, as it was before."""
+    """Say that the psf's further blur is the same all over the field and in all colours, as it was before."""
     terms = found.get("terms")
     psf = terms.get("psf") if isinstance(terms, dict) else None
     if isinstance(psf, dict) and isinstance(psf.get("parameters"), list):
-        even: JsonObject = {"kind": "numbers", "name": "diffraction.blur_growth", "dtype": "float64", "shape": [2]}
-        even |= {"value": [0.0, 0.0], "unit": "1", "sigma": None}
+        even: list[JsonObject] = [
+            {"kind": "numbers", "name": f"diffraction.{name}", "dtype": "float64", "shape": [size]}
+            | {"value": [0.0] * size, "unit": "1", "sigma": None}
+            for name, size in (("blur_growth", 2), ("blur_colour", 3))
+        ]
         names = [one.get("name") if isinstance(one, dict) else None for one in psf["parameters"]]
         at = names.index("diffraction.blur_px") + 1 if "diffraction.blur_px" in names else len(names)
-        parameters = [*psf["parameters"][:at], even, *psf["parameters"][at:]]
+        parameters = [*psf["parameters"][:at], *even, *psf["parameters"][at:]]
         terms = {**found["terms"], "psf": {**psf, "parameters": parameters}}
     return {**found, "version": 4, "terms": terms}
 

@@ -38,6 +38,8 @@ _NUMBERS = {
     "log_blur": 5,
     "blur_growth_radial": 6,
     "blur_growth_tangential": 7,
+    "blur_red": 8,
+    "blur_blue": 9,
 }
 POINTS_PX = np.array([[350.0, 260.0], [700.0, 480.0]])
 WINDOW = (17, 9)

@@ -11,35 +11,35 @@ import pytest
 from tests.scenes.psf import pictures, shots_of, small_scene
 from udccal.fitting.psf.data import PsfRules
 from udccal.fitting.psf.diffraction import fit_diffraction
-from udccal.fitting.psf.kernel import BLUR, start_model, start_prior
+from udccal.fitting.psf.kernel import BLUR, BLUR_BLUE, BLUR_RED, GROWTH, start_model, start_prior
 from udccal.models.diffraction import Diffraction, blur_variance, local_frame
 from udccal.models.geometry import Geometry
 from udccal.numerics import in_float64
 
-GROWTH = slice(BLUR + 1, BLUR + 3)
+NUMBERS = [*range(GROWTH.start, GROWTH.stop), BLUR_RED, BLUR_BLUE]
 
 
 @pytest.mark.medium
-@pytest.mark.parametrize("growth", [(0.9, 0.3), (0.0, 0.0)])
+@pytest.mark.parametrize("blur", [(0.9, 0.3, 0.1, -0.15), (0.0, 0.0, 0.0, 0.0)])
 @in_float64
-def test_a_growing_blur_is_found(growth: tuple[float, float]) -> None:
+def test_a_blur_that_grows_and_differs_by_colour_is_found(blur: tuple[float, ...]) -> None:
     scene, rng = small_scene(positions=(3, 2), shifts=2, half=(8, 6)), np.random.default_rng(3)
     start = start_model(scene.rig, scene.geometry, scene.wire)
     prior = start_prior(scene.rig, start)
     theta = prior.mean.copy()
-    theta[BLUR], theta[GROWTH] = np.log(0.35), growth
+    theta[BLUR], theta[NUMBERS] = np.log(0.35), blur
     shots = shots_of(scene, pictures(scene, theta, rng), rng)
     fit = fit_diffraction(shots, scene.geometry, start, prior, replace(PsfRules(), close_px=scene.half))
-    found, sigma = fit.theta[GROWTH], np.sqrt(np.diag(fit.cov())[GROWTH])
+    found, sigma = fit.theta[NUMBERS], np.sqrt(np.diag(fit.cov())[NUMBERS])
     assert fit.converged
-    assert np.abs((found - theta[GROWTH]) / sigma).max() < 4
+    assert np.abs((found - theta[NUMBERS]) / sigma).max() < 4
     assert sigma.max() < 0.1
     assert abs(np.exp(fit.theta[BLUR]) - 0.35) < 0.01
 
 
 @in_float64
 def ellipse(model: Diffraction, geometry: Geometry, place: tuple[float, float]) -> np.ndarray:
-    x, y, both = np.asarray(blur_variance(model, local_frame(geometry, jnp.array(place))))
+    x, y, both = np.asarray(blur_variance(model, local_frame(geometry, jnp.array(place))))[1]
     return np.array([[x, both], [both, y]])
 
 
@@ -53,5 +53,11 @@ def test_the_blur_is_an_ellipse_along_the_radius() -> None:
     found = ellipse(model, scene.geometry, tuple(centre + radius * focal))
     for direction, growth in ((radius / 0.5, 0.8), (np.array([-0.8, 0.6]), 0.2)):
         assert np.sqrt(direction @ found @ direction) == pytest.approx(0.3 * np.exp(growth * 0.25), rel=1e-5)
+    red, green, blue = np.asarray(
+        blur_variance(
+            replace(model, blur_colour=np.log([2.0, 1.0, 0.5])), local_frame(scene.geometry, jnp.array([5.0, 700.0]))
+        )
+    )
+    np.testing.assert_allclose([red / green, blue / green], [[4.0] * 3, [0.25] * 3])
     even = replace(model, blur_growth=np.zeros(2))
     np.testing.assert_allclose(ellipse(even, scene.geometry, (5.0, 700.0)), 0.09 * np.eye(2), rtol=1e-6)

@@ -32,7 +32,7 @@ from udccal.rig import RigDescription
 
 _HALF = (8, 6)
 # Forward and backward, of each parameter before the spectra.
-_STEPS = np.array([1e-6, 1e-5, 1e-5, 1e-5, 1e-4, 1e-3, 1e-3, 1e-3, 1e-4, 1e-4, 1e-4])
+_STEPS = np.array([1e-6, 1e-5, 1e-5, 1e-5, 1e-4, 1e-3, 1e-3, 1e-3, 1e-3, 1e-3, 1e-4, 1e-4, 1e-4])
 
 
 @pytest.fixture(scope="module")
@@ -69,7 +69,7 @@ def slopes_both_ways(scene: Scene, prior: Prior, shots: Shots, interference: boo
     one, theta, evaluator = problem.samples.at(0), prior.mean, problem.evaluator
     made, chain = (np.asarray(p) for p in kernel_jacobian(evaluator, theta, one.frame, one.disc_px, one.overlaps))
     by_factor = made[..., len(WAVELENGTHS_NM) :].reshape(*made.shape[:2], -1, 3)
-    found = np.einsum("yxfc,fp->pyxc", by_factor, chain)
+    found = np.einsum("yxfc,fcp->pyxc", by_factor, chain)
     wanted = []
     for step in np.eye(HEAD, theta.size) * _STEPS[:, None]:
         more, less = (

@@ -40,7 +40,8 @@ class PsfRules:
         spectrum_bend, spectrum_sigma: prior standard deviations of the logarithm of a spectrum: of its second
             difference along the nodes, and about its start.
         blur_px, blur_log_sigma: prior of the blur in addition to pixel and disc: value, and sigma of its logarithm.
-        blur_growth: prior sigma of the growth of that logarithm over a focal length beside the axis.
+        blur_growth, blur_colour: prior sigmas of that logarithm's growth over a focal length beside the axis, and of
+            its differences between colours.
         wire_tolerance: part of the rig's tolerances that is left after the wire's fit.
         pitch_tolerance: part of the pitch's tolerance that the fit may use; see ``start_prior``.
         pitch_well_known: where the pitch's relative tolerance is larger, the nodes cover more wavelengths than
@@ -79,6 +80,7 @@ class PsfRules:
     blur_px: float = 0.1
     blur_log_sigma: float = 1.0
     blur_growth: float = 1.0
+    blur_colour: float = 0.2
     wire_tolerance: float = 0.3
     pitch_tolerance: float = 0.05
     pitch_well_known: float = 0.02

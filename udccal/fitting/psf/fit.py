@@ -45,8 +45,9 @@ from udccal.rig import RigDescription
 
 # The first parameters, and which of them are lengths on the panel, which are measured in pitches.
 _DIFFRACTION: Final = ("pitch_mm", "column_open", "row_open", "depth_mm", "pupil_diameter_mm")
-_NUMBERS: Final = (*_DIFFRACTION, "blur_px", "blur_growth_radial", "blur_growth_tangential")
-_LENGTHS: Final = np.array([True, False, False, True, True, False, False, False])
+_BLUR: Final = ("blur_px", "blur_growth_radial", "blur_growth_tangential", "blur_red", "blur_blue")
+_NUMBERS: Final = (*_DIFFRACTION, *_BLUR)
+_LENGTHS: Final = np.isin(_NUMBERS, ("pitch_mm", "depth_mm", "pupil_diameter_mm"))
 
 
 @in_float64

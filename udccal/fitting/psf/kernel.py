@@ -51,8 +51,9 @@ WAVELENGTHS_NM: Final = np.linspace(400.0, 700.0, 13)
 
 # HEAD parameters precede the spectra. The others are indices among these: the panel's pitch in mm, the pupil's diameter
 # in mm, the logarithm of the blur in px, and the footprint's place on columns and rows with its stand-off, in pitches.
-HEAD: Final = 11
-PITCH, PUPIL, BLUR, FOOTPRINT = 0, 4, 5, slice(8, 11)
+HEAD: Final = 13
+PITCH, PUPIL, BLUR, GROWTH, FOOTPRINT = 0, 4, 5, slice(6, 8), slice(10, 13)
+BLUR_RED, BLUR_BLUE = 8, 9
 
 
 def pack(model: Diffraction) -> Float[np.ndarray, " p"]:
@@ -61,8 +62,16 @@ def pack(model: Diffraction) -> Float[np.ndarray, " p"]:
     The kernel depends on the square of the blur. The logarithm avoids its two signs and its zero derivative at 0.
     """
     logs = np.log(np.maximum(np.asarray(model.spectrum), 1e-6))
-    head = [model.pitch_mm, *np.asarray(model.openings), model.depth_mm, model.pupil_diameter_mm, np.log(model.blur_px)]
-    head += [*np.asarray(model.blur_growth), *np.asarray(model.offset_periods), model.standoff_per_pitch]
+    red, green, blue = np.asarray(model.blur_colour)
+    head = [model.pitch_mm, *np.asarray(model.openings), model.depth_mm, model.pupil_diameter_mm]
+    head += [
+        np.log(model.blur_px) + green,
+        *np.asarray(model.blur_growth),
+        red - green,
+        blue - green,
+        *np.asarray(model.offset_periods),
+        model.standoff_per_pitch,
+    ]
     return np.concatenate([np.array(head, dtype=float), (logs - logs.mean(axis=1, keepdims=True)).ravel()])
 
 
@@ -83,7 +92,8 @@ class Evaluator(eqx.Module):
             depth_mm=theta[3],
             pupil_diameter_mm=theta[PUPIL],
             blur_px=jnp.exp(theta[BLUR]),
-            blur_growth=theta[BLUR + 1 : FOOTPRINT.start],
+            blur_growth=theta[GROWTH],
+            blur_colour=jnp.stack([theta[BLUR_RED], jnp.zeros_like(theta[BLUR]), theta[BLUR_BLUE]]),
             offset_periods=theta[FOOTPRINT][:2],
             standoff_per_pitch=theta[FOOTPRINT][2],
             visibility=float(self.interference),
@@ -139,7 +149,7 @@ def kernel_jacobian(
     frame: LocalFrame,
     disc_px: Float[Arrayish, ""],
     overlaps: Float[Arrayish, "nodes terms rows half"],
-) -> tuple[Float[Array, "y x channels"], Float[Array, "factors head"]]:
+) -> tuple[Float[Array, "y x channels"], Float[Array, "factors 3 head"]]:
     """Return spline coefficients of the kernel at every wavelength node, and of its derivatives by factors and colours.
 
     Factors: open part of columns and of rows along the ray, the pitch where it scales lags, the pupil, the footprint's
@@ -157,7 +167,8 @@ def kernel_jacobian(
     )
     variance = blur_variance(model, frame)
     sensor, along = jax.linearize(lambda at: sensor_transfer(frame, fx, fy, at, disc_px), variance)
-    by_blur = jax.vmap(along)(jnp.eye(3, dtype=variance.dtype))
+    # Each colour depends on its own variance.
+    by_blur = jax.vmap(lambda way: along(jnp.tile(way, (3, 1))))(jnp.eye(3, dtype=variance.dtype))
     place, terms = footprint_place(model, frame), np.array([(0.0, 0.0), *TERMS][: 1 + np.shape(overlaps)[1]])
     column_of, row_of = np.abs(terms).astype(np.int32).T
     strength = jnp.append(1.0, strengths(model, place))[: len(terms), None]
@@ -182,13 +193,16 @@ def kernel_jacobian(
     every = jax.lax.map(at_node, (*slits, jnp.asarray(overlaps), pupil_anchors(model)[1].T))
     # As one product of matrices: an einsum over the nodes takes five times as long.
     mixed = (spectra @ every.reshape(len(every), -1)).reshape(len(spectra), *every.shape[1:])
-    channels = jnp.concatenate([every[:, 0], jnp.swapaxes(mixed[:, 1:], 0, 1).reshape(-1, *sensor.shape)])
-    seen = jnp.concatenate([through_sensor(channels, sensor), *(through_sensor(mixed[:, 0], by) for by in by_blur)])
+    by_factor = jax.lax.map(lambda one: one * sensor, jnp.swapaxes(mixed[:, 1:], 0, 1))
+    moved = jax.lax.map(lambda one: one * mixed[:, 0], by_blur)
+    # Of derivatives by spectra, the blur of green will do: those of other colours would be twice as many channels.
+    seen = jnp.concatenate([jax.lax.map(lambda one: one * sensor[1], every[:, 0]), *by_factor, *moved])
 
-    def factors(head: Float[Array, " head"]) -> Float[Array, " factors"]:
+    def factors(head: Float[Array, " head"]) -> Float[Array, "factors 3"]:
         model = evaluator.model(jnp.concatenate([head, jnp.asarray(theta)[HEAD:]]))
         opened, place = open_fractions(model, frame), footprint_place(model, frame)
-        return jnp.stack([*opened, head[PITCH], head[PUPIL], *place, *blur_variance(model, frame)])
+        common = jnp.stack([*opened, head[PITCH], head[PUPIL], *place])
+        return jnp.concatenate([jnp.tile(common[:, None], (1, 3)), blur_variance(model, frame).T])
 
     return spline_coefficients(lattice, seen), jax.jacfwd(factors)(jnp.asarray(theta)[:HEAD])
 
@@ -248,6 +262,7 @@ def start_model(rig: RigDescription, geometry: Geometry, wire: Wire, rules: PsfR
         pupil_diameter_mm=np.float64(float(lengths[1]) * pitch),
         blur_px=np.float64(rules.blur_px),
         blur_growth=np.zeros(2),
+        blur_colour=np.zeros(3),
         offset_periods=np.asarray(offset, dtype=np.float64),
         standoff_per_pitch=np.float64(float(lengths[2])),
         visibility=np.float64(seen),
@@ -296,6 +311,7 @@ def start_prior(rig: RigDescription, start: Diffraction, rules: PsfRules | None 
         tighter * 2.0 * rig.pupil_diameter_mm * rig.lens.f_number.tolerance / rig.lens.f_number.value,
         rules.blur_log_sigma,
         *(2 * (rules.blur_growth,)),
+        *(2 * (rules.blur_colour,)),
         *(3 * (rules.footprint_periods,)),
     ]
     roots = [np.eye(HEAD, theta.size) / np.maximum(np.array(sigma), 1e-6)[:, None]]

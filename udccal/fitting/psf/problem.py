@@ -246,7 +246,8 @@ def _slopes(evaluator: Evaluator, theta: Theta, one: Samples, own: Own) -> Float
     nodes, by_colour = values[..., :count], values[..., count:].reshape(*values.shape[:2], -1, 3)
     of_colour = one.colour @ spectra
     unit = np.einsum("snj,snj->sn", nodes, of_colour)
-    by_head = np.einsum("snfc,snc->snf", by_colour, one.colour) @ chain
+    of_own = by_colour * one.colour[:, :, None]
+    by_head = of_own.reshape(*unit.shape, -1) @ chain.reshape(-1, chain.shape[-1])
     by_head[..., _IN_OVERLAPS] += one.by_overlaps
     by_logs = one.colour[..., None] * (of_colour * (nodes - unit[..., None]))[..., None, :]
     by_theta = np.concatenate([by_head, by_logs.reshape(*unit.shape, -1)], axis=-1)
