@@ -136,11 +136,8 @@ def _blurred(rig: Rig, power: np.ndarray, source_px: np.ndarray, colour: int, di
     nu = np.stack(np.meshgrid(scipy.fft.rfftfreq(size[1]), scipy.fft.fftfreq(size[0])), axis=-1)
     steps = np.concatenate([np.eye(2), -np.eye(2)]) / 2
     right, below, left, above = directions(rig, source_px + steps)[:, :2]
-    nu = (
-        np.linalg.norm(nu @ np.stack([right - left, below - above], axis=1), axis=-1)
-        * _CELLS
-        * rig.lens.focal_px.mean()
-    )
+    per_px = np.stack([right - left, below - above], axis=1)
+    nu = np.linalg.norm(nu @ per_px, axis=-1) * _CELLS * rig.lens.focal_px.mean()
     z = np.maximum(np.pi * disc_px * nu, 1e-9)
     field = np.linalg.norm((source_px - rig.lens.centre_px) / [rig.columns / 2, rig.rows / 2]) / np.sqrt(2)
     sigma = rig.lens.blur_px[colour] * (1 + rig.lens.blur_growth * field**2)

@@ -71,8 +71,11 @@ def fit_curve(data: NoiseMoments, dark: DarkTerms) -> Curve:
     full, flickering, rules = full_bins(data, dark), _flickering(data, dark), data.rules
     pile = None if full.any() else piled_up(data, dark)
     # Upper median of the saturated bins, or the converter's largest code where nothing is full.
-    ceiling = pile[0] if pile else data.top_DN
-    ceiling = float(np.quantile(stacked(data.flats, "mean_DN")[full], 0.75)) if full.any() else ceiling
+    ceiling = data.top_DN
+    if full.any():
+        ceiling = float(np.quantile(stacked(data.flats, "mean_DN")[full], 0.75))
+    elif pile:
+        ceiling = pile[0]
 
     def up_to(part: float) -> Curve:
         inside = _inside(data, dark, part * (ceiling - dark.black_DN), ceiling)

@@ -283,8 +283,9 @@ def select_field(
         narrower = orders.narrowed(best)
         tried, best = (*tried, *(one for one in narrower if one is not best)), narrower[-1]
     # Diffraction has few parameters: the shots that it was fitted to show its error as well as others do.
-    shown = test | (best.fit.order.degree < 0)
-    everywhere = orders.compared(best.fit.sources, best.fit.order, shown)
+    alone = best.fit.order.degree < 0
+    shown = test | alone
+    everywhere = orders.compared(best.fit.sources, best.fit.order, shown) if alone else best.fit.compared
     return Selection(
         best.fit, Choice(best, tried).candidates, orders.image(best.fit), magnitude, test, everywhere, shown
     )
