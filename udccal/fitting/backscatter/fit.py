@@ -117,7 +117,7 @@ def result_of(found: Found, data: BackscatterData, rig: RigDescription, clipped:
     cov = (values.cov + (pitch.tolerance / pitch.value) ** 2 * np.outer(moved, moved)) * np.outer(scale, scale)
     priors = priors_of(NAMES, *(part * scale for part in nominal_of(found.problem.prior)))
     posterior = term_posterior(data, found, np.maximum(wider, rest.inflation))
-    term, (status, advice) = posterior.term_at(posterior.mean), _status(found)
+    term, (status, advice) = posterior.term, _status(found)
     # Variance between the frames of a shot over the noise model's, as the median of all shots; 0: unknown.
     known = data.shots.scatter[:-1][np.isfinite(data.shots.scatter[:-1])]
     scatter = float(np.median(known)) if known.size else 0.0

@@ -84,6 +84,11 @@ class Posterior(Generic[Term]):
         return cls(np.asarray(mean, dtype=np.float64), square_root(cov), term_at)
 
     @property
+    def term(self) -> Term:
+        """The term of the mean."""
+        return self.term_at(self.mean)
+
+    @property
     def cov(self) -> Float[np.ndarray, "n n"]:
         """Covariance of the parameters."""
         return np.asarray(self.factor @ self.factor.T)
@@ -106,7 +111,7 @@ class Posterior(Generic[Term]):
         Returns:
             an array of the shape and in the units of ``f(term)``.
         """
-        variance = np.zeros(np.shape(f(self.term_at(self.mean))))
+        variance = np.zeros(np.shape(f(self.term)))
         for slope in self._slopes(f):
             variance += slope**2
         return np.asarray(np.sqrt(variance))
@@ -121,7 +126,7 @@ class Posterior(Generic[Term]):
         Returns:
             the value, and its derivatives along the columns of ``factor``.
         """
-        value = np.asarray(f(self.term_at(self.mean)), dtype=np.float64)
+        value = np.asarray(f(self.term), dtype=np.float64)
         slopes = [slope.ravel() for slope in self._slopes(f)]
         return Propagated(value, np.stack(slopes, axis=1) if slopes else np.zeros((value.size, 0)))
 

@@ -105,11 +105,13 @@ def fit_boards(data: GeometryData, rules: GeometryRules | None = None) -> FitRes
 
 
 @in_float64
-def projection_sigma_px(result: FitResult[Geometry], pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
+def projection_sigma_px(
+    result: FitResult[Geometry] | Posterior[Geometry], pixels: Float[np.ndarray, "n 2"]
+) -> Float[np.ndarray, "n 2"]:
     """Sigma of the places at which directions fixed in panel coordinates appear; it includes the model error found.
 
     Args:
-        result: of ``fit_boards`` or ``fit_geometry``, with its posterior.
+        result: of ``fit_boards`` or ``fit_geometry``, with its posterior, or a posterior alone.
         pixels: (x, y) in px, where the directions appear.
 
     Returns:

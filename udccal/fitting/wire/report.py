@@ -119,7 +119,7 @@ def wire_result(
     sensor. Both are relative.
     """
     panel, seen = joint.parameters.panel, joint.seen
-    term = _trimmed(posterior.term_at(posterior.mean))
+    term = _trimmed(posterior.term)
     outliers = seen.outliers(shape[1])
     drawn = np.flatnonzero(seen.pixels.weight > 0)
     few = seen.pixels.thinned(8 * BLOCK)
