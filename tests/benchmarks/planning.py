@@ -34,7 +34,7 @@ from udccal.fitting.backscatter.fit import term_posterior
 from udccal.fitting.backscatter.orders import search
 from udccal.fitting.backscatter.solve import Problem
 from udccal.fitting.geometry.fit import projection_sigma_px
-from udccal.planning.forecast import predictor_for
+from udccal.planning.forecast import PREDICTORS
 from udccal.planning.state import ModelErrors, measured_state, sensor_samples
 from udccal.rig import Captures, RigDescription, load_rig
 from udccal.sessions.schema import TermName
@@ -115,7 +115,7 @@ def compared(term: TermName, designs: list[tuple[str, Captures, Obtained]]) -> l
     # A corner's scatter goes for its noise, whatever it comes from.
     known = state.model_errors
     by_noise = replace(state, model_errors=ModelErrors(on_jig_px=known.on_jig_px, by_hand_px=known.by_hand_px))
-    predictor = predictor_for(term, by_noise)
+    predictor = PREDICTORS[term](by_noise)
     rows = []
     for name, captures, made in designs:
         rows.append(_row(f"{term}, {name}", predictor.sigma(captures), "stated", made.sigma(term)))

@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from udccal.planning.design import DESIGN_VARIABLES, Objective, cheapest, least_captures, one_step_up, worthwhile
+from udccal.planning.design import DESIGN_VARIABLES, Objective, cheapest, worthwhile
 from udccal.planning.steps import Cost
 from udccal.rig import Captures
 from udccal.sessions.schema import TermName
@@ -89,10 +89,17 @@ def test_captures_too_few_for_a_fit_are_added_to() -> None:
 
 @pytest.mark.parametrize("term", list(DESIGN_VARIABLES))
 def test_every_least_design_is_a_valid_one_and_can_grow(term: TermName) -> None:
-    least = least_captures(term, Captures())
+    variables = DESIGN_VARIABLES[term]
+
+    def sigma(captures: Captures) -> float:
+        return 1 / math.prod(variable.of(captures) for variable in variables)
+
+    growing = Objective(term, sigma, lambda captures: Cost(1, 1 / sigma(captures), 1))
+    least = cheapest(growing, Captures(), 1.0)
+    assert least is not None
     assert Captures.model_validate(least.model_dump()) == least
-    grown = list(one_step_up(term, least))
-    assert len(grown) == len(DESIGN_VARIABLES[term])
-    for variable, more in grown:
-        assert variable.of(more) > variable.of(least)
-        assert Captures.model_validate(more.model_dump()) == more
+    steps_up = [one.setting for one in worthwhile(growing, least)]
+    assert [one.name for one in steps_up] == [variable.name for variable in variables]
+    for variable, setting in zip(variables, steps_up, strict=True):
+        assert setting.planned > setting.before == variable.least
+        Captures.model_validate(variable.set(least, setting.planned).model_dump())

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from udccal.planning import forecast as module
-from udccal.planning.forecast import Floor, forecast
+from udccal.planning.forecast import Limits, forecast
 from udccal.planning.state import nominal_state
 from udccal.rig import Captures, load_rig
 
@@ -25,15 +25,12 @@ class _Made:
         enough = captures.backscatter_pictures > self.fewest
         return float(captures.backscatter_pictures) ** -0.5 if enough else float("inf")
 
-    def used(self, captures: Captures) -> float:
-        return 0.25
-
-    def floor(self) -> Floor:
-        return Floor(0.01, "Another model would lower it.")
+    def limits(self, captures: Captures) -> Limits:
+        return Limits(0.01, "Another model would lower it.", 0.25)
 
 
 def test_curves_reach_from_a_quarter_to_four_times(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "predictor_for", lambda term, state: _Made())
+    monkeypatch.setattr(module, "PREDICTORS", {"backscatter": lambda state: _Made()})
     found = forecast("backscatter", nominal_state(load_rig("lg55-aca2040")))
     assert found is not None
     (curve,) = found.curves
@@ -41,16 +38,16 @@ def test_curves_reach_from_a_quarter_to_four_times(monkeypatch: pytest.MonkeyPat
     assert np.all(np.diff(curve.sigma) < 0)
     assert curve.most_gain == pytest.approx(2.0)
     assert found.idle == ("frames of a picture",)
-    assert (found.used, found.floor.sigma) == (0.25, 0.01)
+    assert (found.limits.used, found.limits.floor) == (0.25, 0.01)
 
 
 def test_captures_that_do_not_suffice_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
     state = nominal_state(load_rig("lg55-aca2040"))
-    monkeypatch.setattr(module, "predictor_for", lambda term, state: _Made(fewest=12))
+    monkeypatch.setattr(module, "PREDICTORS", {"backscatter": lambda state: _Made(fewest=12)})
     found = forecast("backscatter", state)
     assert found is not None
     assert found.curves[0].counts[0] > 12
-    monkeypatch.setattr(module, "predictor_for", lambda term, state: _Made(fewest=1000))
+    monkeypatch.setattr(module, "PREDICTORS", {"backscatter": lambda state: _Made(fewest=1000)})
     assert forecast("backscatter", state) is None
 
 

@@ -13,7 +13,7 @@ from udccal.arrangements import Board, Occasion
 from udccal.fitting.engine.gaussian import scaled_inverse
 from udccal.fitting.geometry.corners import board_points_mm
 from udccal.fitting.geometry.data import rig_prior
-from udccal.planning.geometry import BoardView, BoardViews, NextView, lens_information
+from udccal.planning.geometry import BoardView, BoardViews, NextView
 from udccal.planning.state import RigState, nominal_state
 from udccal.planning.steps import PlannedStep
 from udccal.reports.true_values import true_geometry
@@ -47,7 +47,7 @@ class Session:
         return self.views.planned(self.by_hand[0], self.world._arrangement)
 
     def sigma(self, views: list[BoardView | None]) -> np.ndarray:
-        told = sum(lens_information(view, self.views.intrinsics) for view in [self.exact(self.on_jig), *views])
+        told = sum(self.views.told(view) for view in [self.exact(self.on_jig), *views])
         return np.sqrt(np.diag(scaled_inverse(rig_prior(self.rig).precision + told, 1e-15)))
 
     def over_exact(self, views: list[BoardView | None]) -> float:

@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 
 from tests.toy_rigs import RIGS, write_toy_rig
-from udccal.errors import RigError
-from udccal.planning.rig_file import with_captures, write_planned_rig
+from udccal.errors import RigError, UdccalError
+from udccal.planning.rig_file import write_planned_rig
 from udccal.rig import Captures, load_rig
 
 CAPTURES = Captures(flats=77, psf_shifts=3, psf_led_mm=2.5)
@@ -27,8 +27,20 @@ def test_every_shipped_rig_can_be_taken_over(rig: str, tmp_path: Path) -> None:
     assert load_rig(tmp_path).captures == CAPTURES
 
 
-def test_a_description_without_captures_gets_them() -> None:
-    assert "[captures]\nflats = 77\n" in with_captures("[camera]\nrows = 8\n", CAPTURES)
+def test_a_description_without_captures_gets_them(tmp_path: Path) -> None:
+    toy = write_toy_rig(tmp_path)
+    head, rest = (toy / "rig.toml").read_text().split("[captures]\n")
+    (toy / "rig.toml").write_text(head + rest[rest.index("[view]") :])
+    write_planned_rig(toy, CAPTURES, tmp_path / "new" / "rig.toml")
+    assert load_rig(tmp_path / "new").captures == CAPTURES
+
+
+def test_comments_after_the_captures_stay(tmp_path: Path) -> None:
+    toy = write_toy_rig(tmp_path)
+    text = (toy / "rig.toml").read_text()
+    (toy / "rig.toml").write_text(text.replace("\n[view]", "\n# Where a person looks from.\n[view]"))
+    write_planned_rig(toy, CAPTURES, tmp_path / "new" / "rig.toml")
+    assert "\n\n# Where a person looks from.\n[view]" in (tmp_path / "new" / "rig.toml").read_text()
 
 
 @pytest.mark.parametrize("there", ["file", "folder", "broken link"])
@@ -60,5 +72,5 @@ def test_captures_written_otherwise_are_refused_and_nothing_is_left(tmp_path: Pa
 
 def test_a_place_that_cannot_be_written_is_a_sentence(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    with pytest.raises(RigError, match="cannot be written"):
+    with pytest.raises(UdccalError, match="Expected to write the results"):
         write_planned_rig("lg55-reduced", CAPTURES, tmp_path / "file" / "rig.toml")

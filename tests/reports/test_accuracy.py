@@ -10,7 +10,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from udccal.fitting.nominal import nominal_geometry
 from udccal.planning.design import DESIGN_VARIABLES
-from udccal.planning.forecast import QUANTITIES, Curve, Floor, Forecast
+from udccal.planning.forecast import QUANTITIES, Curve, Forecast, Limits
 from udccal.reports.accuracy import Accuracy, accuracy_table, forecast_sentence, stated
 from udccal.reports.fit_figures import forecast_figure
 from udccal.reports.fit_tables import MOST_ORDERS, more_orders, orders_table
@@ -23,7 +23,7 @@ def _forecast(floor: float = 0.05, gain: float = 0.5) -> Forecast:
     counts = np.array([25.0, 50.0, 100.0, 200.0, 400.0])
     sigma = 0.1 * (counts / 100) ** -gain
     curve = Curve(DESIGN_VARIABLES["wire"][0], 100, counts, sigma)
-    return Forecast("wire", QUANTITIES["wire"], 0.1, Floor(floor, "More pixels would lower it."), 0.33, (curve,), ())
+    return Forecast("wire", QUANTITIES["wire"], 0.1, Limits(floor, "More pixels would lower it.", 0.33), (curve,), ())
 
 
 def _result(*candidates: Candidate) -> FitResult[None]:

@@ -22,9 +22,9 @@ from udccal.fitting.bins import Bins
 from udccal.fitting.engine.least_squares import Blocks
 from udccal.fitting.nominal import nominal_backscatter
 from udccal.numerics import in_float64
-from udccal.planning.design import Floor
+from udccal.planning.design import Limits
 from udccal.planning.state import WHITE, EvenField, RigState
-from udccal.planning.steps import PlannedStep
+from udccal.planning.steps import PlannedStep, steps_at
 from udccal.rig import Captures
 
 # Number of the procedure's pictures that represent all: drawing takes long, and further ones are of the same kind.
@@ -71,18 +71,17 @@ class BackscatterPredictor:
         """Root mean square over sensor, colours and pictures, relative to the pictures' peaks; see ``Predictor``."""
         return self._light_sigma(self._planned(captures))
 
-    def used(self, captures: Captures) -> float:
-        """Less than 1, since the fit uses only some of the sensor's bins; see ``Predictor``."""
-        planned = self._planned(captures)
-        return (self._light_sigma(planned, self._every) / self._light_sigma(planned)) ** 2
+    def limits(self, captures: Captures) -> Limits:
+        """The floor is the model error that a profile's fit found, of a new picture's peak; see ``Predictor``.
 
-    def floor(self) -> Floor:
-        """The model error that a profile's fit found, of a new picture's peak; 0 without a profile."""
-        none = np.full(self._mask.shape, 1e-15)
+        The fit uses only some of the sensor's bins.
+        """
+        planned, none = self._planned(captures), np.full(self._mask.shape, 1e-15)
         endless = self._binned(none, none, none), 1_000_000
-        return Floor(
+        return Limits(
             0.0 if self._state.model_errors.backscatter == 0 else self._light_sigma(endless),
             "That much of the light the fit of the present profile could not describe; no further picture changes it.",
+            (self._light_sigma(planned, self._every) / self._light_sigma(planned)) ** 2,
         )
 
     def _light_sigma(self, planned: tuple[Binned, int] | None, count: float = 1.0) -> float:
@@ -103,7 +102,7 @@ class BackscatterPredictor:
 
     def _planned(self, captures: Captures) -> tuple[Binned, int] | None:
         """Shots of the pictures drawn, and the number of pictures in all; None where these are too few."""
-        steps = self._state.with_captures(captures).steps("backscatter", drawn=False)
+        steps = self._state.with_captures(captures).steps("backscatter")
         shown, darks = ([step for step in steps if isinstance(step.arrangement, kind)] for kind in (PanelPicture, Dark))
         if len(shown) - 1 < _RULES.fewest_pictures or not darks:
             return None
@@ -128,8 +127,8 @@ class BackscatterPredictor:
 def _pictures(state: RigState) -> Pictures:
     """Pictures as the procedure shows them, followed by those for the prediction."""
     panel, crop = state.rig.panel, visible_crop(state.geometry, state.rig)
-    few = state.with_captures(state.rig.captures.model_copy(update={"backscatter_pictures": _DRAWN}))
-    panels = (step.arrangement for step in few.steps("backscatter") if isinstance(step.arrangement, PanelPicture))
+    few = state.with_captures(state.rig.captures.model_copy(update={"backscatter_pictures": _DRAWN})).rig
+    panels = (step.arrangement for step in steps_at("backscatter", few) if isinstance(step.arrangement, PanelPicture))
     shown = [one.picture for one in panels if one.picture.min() < 255]
     shown += [face_picture(seed, panel.columns, panel.rows) for seed in _NEW_SEEDS]
     return Pictures.of(np.stack([crop.of(picture) for picture in shown]), crop)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 import math
 from bisect import bisect_left
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Final, Protocol, final, runtime_checkable
 
@@ -19,7 +19,6 @@ from udccal.sessions.schema import TermName
 
 # One step up adds this part of the present number, and one at least.
 _SHARE: Final = 0.25
-_MOST_ADDITIONS: Final = 200
 # An addition that lowers sigma by less than this part of it does not count.
 _LEAST_GAIN: Final = 1e-6
 
@@ -44,11 +43,18 @@ QUANTITIES: Final[Mapping[TermName, Quantity]] = {
 
 @final
 @dataclass(frozen=True)
-class Floor:
-    """The sigma that no number of captures lowers, in the quantity's unit, and a change that would lower it."""
+class Limits:
+    """What bounds a term's sigma apart from the number of captures.
 
-    sigma: float
+    Attributes:
+        floor: the sigma in the limit of endless captures, in the quantity's unit.
+        lowered_by: a change that would lower the floor; empty where there is no floor.
+        used: part of the captures' information on the quantity that the fit, at its default effort, uses; 1 is all.
+    """
+
+    floor: float
     lowered_by: str
+    used: float = 1.0
 
 
 @runtime_checkable
@@ -58,11 +64,8 @@ class Predictor(Protocol):
     def sigma(self, captures: Captures) -> float:
         """Sigma of the term's quantity; infinite where the captures do not suffice for a fit."""
 
-    def floor(self) -> Floor:
-        """Sigma in the limit of endless captures."""
-
-    def used(self, captures: Captures) -> float:
-        """Part of the captures' information on the quantity that the fit, at its default effort, uses; 1 is all."""
+    def limits(self, captures: Captures) -> Limits:
+        """The bounds of sigma, for captures that suffice for a fit."""
 
 
 @final
@@ -147,28 +150,17 @@ class Suggestion:
         return self.cost.set_ups <= 0, self.gain_percent / max(self.cost.set_ups, 1)
 
 
-def least_captures(term: TermName, captures: Captures) -> Captures:
-    """The captures with a term's design variables at their least."""
-    return captures.model_copy(update={variable.name: variable.least for variable in DESIGN_VARIABLES[term]})
-
-
-def one_step_up(term: TermName, captures: Captures) -> Iterator[tuple[DesignVariable, Captures]]:
-    """The captures with one of a term's design variables one step up, variable by variable."""
-    for variable in DESIGN_VARIABLES[term]:
-        value = variable.of(captures)
-        if value < variable.most:
-            yield variable, variable.set(captures, min(variable.most, value + max(1, round(_SHARE * value))))
-
-
 def worthwhile(objective: Objective, design: Captures) -> list[Suggestion]:
-    """Additions that lower sigma at all, in the order of the design variables."""
+    """Steps up of one design variable each that lower sigma at all, in the order of the design variables."""
     before, found = objective.sigma(design), []
-    for variable, more in one_step_up(objective.term, design):
+    for variable in DESIGN_VARIABLES[objective.term]:
+        value = variable.of(design)
+        more = variable.set(design, min(variable.most, value + max(1, round(_SHARE * value))))
         after = objective.sigma(more)
         # From an infinite sigma, any finite one is a gain, and further captures may lead to one.
         left = after / before if math.isfinite(before) else 0.0 if math.isfinite(after) else math.exp(-1)
         if left < 1 - _LEAST_GAIN:
-            setting = Setting(variable.name, variable.of(design), variable.of(more))
+            setting = Setting(variable.name, value, variable.of(more))
             cost = objective.cost(more) - objective.cost(design)
             found.append(Suggestion(objective.term, setting, 100 * (1 - left), cost))
     return found
@@ -176,27 +168,25 @@ def worthwhile(objective: Objective, design: Captures) -> list[Suggestion]:
 
 def cheapest(objective: Objective, captures: Captures, target: float) -> Captures | None:
     """The cheapest captures found whose sigma is at most ``target``; None where no captures reach it."""
-    design = least_captures(objective.term, captures)
-    for _ in range(_MOST_ADDITIONS):
-        if objective.sigma(design) <= target:
-            return _pruned(objective, design, target)
+    design = captures.model_copy(update={one.name: one.least for one in DESIGN_VARIABLES[objective.term]})
+    while not objective.sigma(design) <= target:
         additions = worthwhile(objective, design)
         if not additions:
             return None
         best = max(additions, key=lambda one: one.per_second).setting
         design = design.model_copy(update={best.name: best.planned})
-    return None
+    return _pruned(objective, design, target)
 
 
 def _pruned(objective: Objective, design: Captures, target: float) -> Captures:
     """Lower every variable as far as the target allows, beginning with the one that saves most time."""
-    lower = [_lowered(objective, design, target, variable) for variable in DESIGN_VARIABLES[objective.term]]
+
+    def lowered(variable: DesignVariable) -> Captures:
+        # More captures never raise sigma: halving an interval finds the fewest that suffice.
+        counts = range(variable.least, variable.of(design))
+        spared = bisect_left(counts, True, key=lambda count: objective.sigma(variable.set(design, count)) <= target)
+        return variable.set(design, variable.least + spared)
+
+    lower = map(lowered, DESIGN_VARIABLES[objective.term])
     best = min([design, *lower], key=lambda one: objective.cost(one).seconds)
     return design if best == design else _pruned(objective, best, target)
-
-
-def _lowered(objective: Objective, design: Captures, target: float, variable: DesignVariable) -> Captures:
-    """Lower one variable by halving an interval, since more captures never raise sigma."""
-    counts = range(variable.least, variable.of(design))
-    spared = bisect_left(counts, True, key=lambda count: objective.sigma(variable.set(design, count)) <= target)
-    return variable.set(design, variable.least + spared)

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from udccal.planning.backscatter import BackscatterPredictor
-from udccal.planning.design import DESIGN_VARIABLES, QUANTITIES, DesignVariable, Floor, Predictor, Quantity
+from udccal.planning.design import DESIGN_VARIABLES, QUANTITIES, DesignVariable, Limits, Predictor, Quantity
 from udccal.planning.geometry import GeometryPredictor
 from udccal.planning.noise import NoisePredictor
 from udccal.planning.psf import PsfPredictor
@@ -27,18 +27,13 @@ from udccal.sessions.schema import TermName
 _REACH: Final = np.geomspace(1 / 4, 4, 9)
 # Design variables that change sigma by less than this part of it do not matter to the quantity.
 _FLAT: Final = 1e-3
-_PREDICTORS: Final[Mapping[TermName, Callable[[RigState], Predictor]]] = {
+PREDICTORS: Final[Mapping[TermName, Callable[[RigState], Predictor]]] = {
     "noise": NoisePredictor,
     "geometry": GeometryPredictor,
     "wire": WirePredictor,
     "psf": PsfPredictor,
     "backscatter": BackscatterPredictor,
 }
-
-
-def predictor_for(term: TermName, state: RigState) -> Predictor:
-    """The predictor of a term, for one rig."""
-    return _PREDICTORS[term](state)
 
 
 @final
@@ -66,8 +61,7 @@ class Forecast:
     Attributes:
         quantity: name of the quantity that ``sigma`` belongs to, and its unit.
         sigma: predicted for the present captures.
-        floor: the sigma that no captures can lower.
-        used: part of the frames' information on the quantity that the fit, at its default effort, uses; 1 is all.
+        limits: what bounds sigma apart from the number of captures.
         curves: one per design variable on which sigma depends.
         idle: names of the other design variables, in words.
     """
@@ -75,34 +69,25 @@ class Forecast:
     term: TermName
     quantity: Quantity
     sigma: float
-    floor: Floor
-    used: float
+    limits: Limits
     curves: tuple[Curve, ...]
     idle: tuple[str, ...]
 
 
 def forecast(term: TermName, state: RigState) -> Forecast | None:
-    """Forecast the sigma of one term.
-
-    Args:
-        term: of which term.
-        state: the rig with its present captures, and the terms as expected.
-
-    Returns:
-        sigma, its floor and its curves, in the unit of ``QUANTITIES``; None where the captures do not suffice for a
-        fit.
+    """Forecast the sigma of one term for the rig's present captures; None where these do not suffice for a fit.
 
     Raises:
-        UdccalError: when no procedure is installed, or a step of it does not state its frames and exposure.
+        UdccalError: as ``steps_at``.
     """
-    predictor, captures = predictor_for(term, state), state.rig.captures
+    predictor, captures = PREDICTORS[term](state), state.rig.captures
     sigma = predictor.sigma(captures)
     if not (np.isfinite(sigma) and sigma > 0):
         return None
     curves = [_curve(predictor, captures, variable) for variable in DESIGN_VARIABLES[term]]
     matter = tuple(curve for curve in curves if len(curve.counts) > 1 and np.ptp(curve.sigma) > _FLAT * sigma)
     idle = tuple(curve.variable.counted for curve in curves if curve not in matter)
-    return Forecast(term, QUANTITIES[term], sigma, predictor.floor(), predictor.used(captures), matter, idle)
+    return Forecast(term, QUANTITIES[term], sigma, predictor.limits(captures), matter, idle)
 
 
 def _curve(predictor: Predictor, captures: Captures, variable: DesignVariable) -> Curve:

@@ -12,8 +12,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import final
 
-import cv2
-import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial.transform import Rotation
@@ -33,11 +31,10 @@ from udccal.fitting.geometry.bundle import (
     projected,
 )
 from udccal.fitting.geometry.corners import board_points_mm, charuco_board
-from udccal.fitting.geometry.data import gather, rig_prior
-from udccal.fitting.geometry.fit import term_at, with_angles
-from udccal.models.geometry import panel_directions, project_directions
+from udccal.fitting.geometry.data import best_poses, gather, rig_prior
+from udccal.fitting.geometry.fit import projection_sigma_px, term_at, with_angles
 from udccal.numerics import in_float64
-from udccal.planning.design import Floor
+from udccal.planning.design import Limits
 from udccal.planning.state import WHITE, EvenField, RigState, nominal_state, sensor_samples
 from udccal.planning.steps import PlannedStep
 from udccal.rig import Captures, RigDescription
@@ -53,7 +50,6 @@ _ACROSS = 17
 # Stands for endless views.
 _MANY = 1e6
 _RULES = GeometryRules()
-_places, _directions = jax.jit(project_directions), jax.jit(panel_directions)
 
 
 @final
@@ -106,15 +102,21 @@ class BoardViews:
             step, spec: the light; the board, held by hand.
             numbers, points_px: of the corners, as OpenCV counts them; where they are on the sensor.
         """
-        corners, lens = board_points_mm(spec)[numbers], Intrinsics.of(self.intrinsics)
-        if len(corners) < _RULES.least_corners:
+        corners = board_points_mm(spec)[numbers]
+        points = gather([corners], [points_px]).points
+        if not points.names:
             return None
-        found, turn, shift = cv2.solvePnP(corners, points_px, lens.matrix, lens.distortion)
-        if not found:
-            return None
-        pose = np.append(turn, shift)
+        pose = best_poses(points, self.intrinsics)[0][0]
         sigma = self._sigma_px(step, points_px, self._window_px(spec, float(pose[5])), parallel=False)
         return BoardView(corners, points_px, sigma, pose, parallel=False)
+
+    def told(self, view: BoardView | None) -> Float[np.ndarray, "9 9"]:
+        """Return the Fisher information of one view on the intrinsics, whatever its own pose; none without a pose."""
+        size = len(self.intrinsics)
+        if view is None or not (points := gather([view.board], [view.image], [view.sigma]).points).names:
+            return np.zeros((size, size))
+        problem = BundleProblem(points, EVERY, Prior(np.zeros(size), np.zeros((0, size))))
+        return problem.equations_at(Bundle(self.intrinsics, view.pose[None])).marginal()[0]
 
     def _window_px(self, spec: BoardSpec, depth_mm: float) -> float:
         square_px = spec.square_mm / depth_mm * self.intrinsics[0]
@@ -134,20 +136,6 @@ class BoardViews:
         relative = np.sqrt((temporal / signal**2).mean(axis=1))
         beside_px = errors.on_jig_px if parallel else errors.by_hand_px
         return np.hypot(relative / _HALF_CONTRAST * _saddle_scatter(radius), beside_px)
-
-
-def points_of(views: Sequence[BoardView]) -> Points:
-    """Return the corners of those views that hold a pose, as a fit gathers them."""
-    return gather([v.board for v in views], [v.image for v in views], [v.sigma for v in views]).points
-
-
-def lens_information(view: BoardView | None, intrinsics: Float[np.ndarray, "9"]) -> Float[np.ndarray, "9 9"]:
-    """Return the Fisher information of one view on the intrinsics, whatever its own pose; none without a pose."""
-    size = len(intrinsics)
-    if view is None or not (points := points_of([view])).names:
-        return np.zeros((size, size))
-    problem = BundleProblem(points, EVERY, Prior(np.zeros(size), np.zeros((0, size))))
-    return problem.equations_at(Bundle(intrinsics, view.pose[None])).marginal()[0]
 
 
 def _saddle_scatter(radius_px: float) -> float:
@@ -171,28 +159,13 @@ class GeometryPredictor:
         boards = BoardViews(state)
         self._intrinsics, self._view_of = boards.intrinsics, functools.cache(boards.planned)
 
-    def sigma(self, captures: Captures) -> float:
-        """Root mean square over the sensor and both axes; see ``Predictor``."""
-        return self._ray_sigma(captures, 1.0)
-
-    def floor(self) -> Floor:
-        """The sigma when endless views held by hand have determined the lens."""
-        return Floor(
-            self._ray_sigma(self._state.rig.captures, _MANY),
-            "The panel's rotation rests on the one view of the board on the jig: a larger or nearer board there, or "
-            "corners that scatter less, would lower that.",
-        )
-
-    def used(self, captures: Captures) -> float:
-        """1, since the fit uses all corners; see ``Predictor``."""
-        return 1.0
-
     @in_float64
-    def _ray_sigma(self, captures: Captures, count: float) -> float:
-        """Sigma in px of rays, by axis, where each view held by hand counts ``count`` times."""
+    def sigma(self, captures: Captures, count: float = 1.0) -> float:
+        """Root mean square over the sensor and both axes, where each view held by hand counts ``count`` times."""
         steps = self._state.with_captures(captures).steps("geometry")
         planned = (self._view_of(step, step.arrangement) for step in steps if isinstance(step.arrangement, Board))
-        points = points_of(shown := [view for view in planned if view is not None])
+        shown = [view for view in planned if view is not None]
+        points = gather([v.board for v in shown], [v.image for v in shown], [v.sigma for v in shown]).points
         views = [shown[k] for k in points.names]
         parallel = [k for k, view in enumerate(views) if view.parallel]
         if not parallel:
@@ -201,11 +174,17 @@ class GeometryPredictor:
         bundle = Bundle(self._intrinsics, np.array([view.pose for view in views]))
         problem = BundleProblem(points, self._order(points, bundle), self._prior)
         x, cov = with_angles(bundle.intrinsics, bundle.poses, problem.equations_at(bundle).joint_cov(), parallel)
-        pupil = np.asarray(self._state.geometry.pupil_mm)
-        posterior = Posterior.from_cov(x, cov, functools.partial(term_at, pupil=pupil))
-        directions = np.asarray(_directions(posterior.term_at(x), sensor_samples(self._state.rig, _ACROSS)))
-        sigma = posterior.sigma_of(lambda term: np.asarray(_places(term, directions)))
+        posterior = Posterior.from_cov(x, cov, functools.partial(term_at, pupil=self._state.geometry.pupil_mm))
+        sigma = projection_sigma_px(posterior, sensor_samples(self._state.rig, _ACROSS))
         return float(np.sqrt((sigma**2).mean()))
+
+    def limits(self, captures: Captures) -> Limits:
+        """The floor is that when endless views held by hand have determined the lens; see ``Predictor``."""
+        return Limits(
+            self.sigma(captures, _MANY),
+            "The panel's rotation rests on the one view of the board on the jig: a larger or nearer board there, or "
+            "corners that scatter less, would lower that.",
+        )
 
     def _order(self, points: Points, bundle: Bundle) -> Bool[np.ndarray, "9"]:
         """The order of the distortion that the fit is expected to choose, by its own BIC, n ln(chi2) + k ln(n)."""
@@ -239,18 +218,19 @@ class NextView:
         self._known, by_hand = rig_prior(rig).precision, []
         for step in state.steps("geometry"):
             if isinstance(board := step.arrangement, Board):
-                told, self._step = self._told(self._views.planned(step, board)), step
+                told, self._step = self._views.told(self._views.planned(step, board)), step
                 if board.parallel_to_panel:
                     self._known = self._known + told
                 else:
                     by_hand.append(told)
         self._to_come, self._average = len(by_hand), np.mean(by_hand, axis=0)
         self._usual = _sigma(self._known + np.sum(by_hand, axis=0))
-        self._tell = np.array([self._told(self._views.planned(self._step, pose)) for pose in poses])
+        self._tell = np.array([self._views.told(self._views.planned(self._step, pose)) for pose in poses])
 
     def taken(self, numbers: Int[np.ndarray, " n"], points_px: Float[np.ndarray, "n 2"]) -> None:
         """Count a view that was captured, by the corners seen; see ``BoardViews.seen``."""
-        self._known = self._known + self._told(self._views.seen(self._step, self._poses[0].spec, numbers, points_px))
+        view = self._views.seen(self._step, self._poses[0].spec, numbers, points_px)
+        self._known = self._known + self._views.told(view)
         self._to_come -= 1
 
     def pose(self) -> Board:
@@ -259,9 +239,6 @@ class NextView:
         later = max(self._to_come - 1, 0) * self._average
         worst = (_sigma(self._known + later + self._tell[self._open]) / self._usual).max(axis=-1)
         return self._poses[self._open.pop(int(worst.argmin()))]
-
-    def _told(self, view: BoardView | None) -> Float[np.ndarray, "9 9"]:
-        return lens_information(view, self._views.intrinsics)
 
 
 def _sigma(information: Float[np.ndarray, "*k n n"]) -> Float[np.ndarray, "*k n"]:

@@ -15,7 +15,7 @@ from udccal.arrangements import Dark, FlatLight
 from udccal.fitting.engine.information import cramer_rao
 from udccal.fitting.noise.data import NoiseRules
 from udccal.fitting.noise.transfer import temporal_variance
-from udccal.planning.design import Floor
+from udccal.planning.design import Limits
 from udccal.planning.state import EvenField, RigState, sensor_samples
 from udccal.rig import Captures
 
@@ -40,10 +40,8 @@ class NoisePredictor:
         K, samples = noise.K_DN_per_e, camera.rows * camera.columns
         pairs = [step for step in self._state.with_captures(captures).steps("noise") if len(step.exposures_s) == 2]
         flats, darks = ([step for step in pairs if isinstance(step.arrangement, kind)] for kind in (FlatLight, Dark))
-        flat_DN, dark_DN = (
-            K * noise.dark_current_e_per_s * np.array([step.exposures_s[0] for step in steps])
-            for steps in (flats, darks)
-        )
+        per_s = K * noise.dark_current_e_per_s
+        flat_DN, dark_DN = (per_s * np.array([step.exposures_s[0] for step in some]) for some in (flats, darks))
         full_DN = K * self._state.full_well_e
         light_DN = full_DN * np.outer([step.level for step in flats], self._light)
         usable = light_DN <= _RULES.fit_up_to * full_DN
@@ -56,10 +54,6 @@ class NoisePredictor:
         slopes = np.stack([signal_DN, np.ones_like(signal_DN)])
         return 100.0 * float(cramer_rao((0.5 * dof / variance**2 * slopes) @ slopes.T)[0]) / K
 
-    def floor(self) -> Floor:
-        """0, since every further pair lowers sigma."""
-        return Floor(0.0, "")
-
-    def used(self, captures: Captures) -> float:
-        """1, since the fit uses all pairs; see ``Predictor``."""
-        return 1.0
+    def limits(self, captures: Captures) -> Limits:
+        """There are none: every further pair lowers sigma, and the fit uses all pairs; see ``Predictor``."""
+        return Limits(0.0, "")

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import math
 import re
-from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final, final
 
 from udccal.errors import UdccalError
 from udccal.planning.design import DESIGN_VARIABLES, QUANTITIES, Objective, Setting, Suggestion, cheapest, worthwhile
-from udccal.planning.forecast import predictor_for
+from udccal.planning.forecast import PREDICTORS
 from udccal.planning.state import RigState
 from udccal.planning.steps import Cost
 from udccal.rig import Captures
@@ -22,15 +21,6 @@ _NEAR_FLOOR: Final = 1.001
 _NUMBER: Final = r"[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?"
 _FORM: Final = re.compile(rf"(?P<term>[^=\s]+)=(?P<value>{_NUMBER})(?P<unit>%|[a-zA-Z]*)")
 _EXAMPLE: Final = "Write, for example, wire=0.05% or geometry=0.1px."
-
-
-@final
-@dataclass(frozen=True)
-class Target:
-    """The sigma that a term is to reach, in the unit of ``QUANTITIES``."""
-
-    term: TermName
-    sigma: float
 
 
 @final
@@ -80,26 +70,23 @@ class CapturePlan:
         return all(term.reached for term in self.terms)
 
 
-def parse_targets(words: Sequence[str]) -> tuple[Target, ...]:
-    """Read targets such as ``wire=0.05%``.
-
-    Args:
-        words: one target each: a term, "=", and a sigma with the term's unit of ``QUANTITIES``.
+def parse_targets(words: Sequence[str]) -> dict[TermName, float]:
+    """Read targets such as ``wire=0.05%``: a term, "=", and a sigma with the term's unit of ``QUANTITIES``.
 
     Returns:
-        the targets in the order of the terms.
+        the sigma that each term is to reach, in the order of the terms.
 
     Raises:
         UdccalError: when a word is no target, names no term or a wrong unit, or a term has two targets.
     """
     targets = [_target(word) for word in words]
-    for term, many in Counter(target.term for target in targets).items():
-        if many > 1:
+    for term in QUANTITIES:
+        if (many := sum(named == term for named, _ in targets)) > 1:
             raise UdccalError(f"Expected one target for {term}, found {many}. Keep one of them.")
-    return tuple(sorted(targets, key=lambda target: list(QUANTITIES).index(target.term)))
+    return {term: sigma for term in QUANTITIES for named, sigma in targets if named == term}
 
 
-def _target(word: str) -> Target:
+def _target(word: str) -> tuple[TermName, float]:
     match = _FORM.fullmatch(word.strip())
     if match is None or not 0 < float(match["value"]) < math.inf:
         raise UdccalError(f"Expected a target above zero, such as wire=0.05%, found '{word}'. {_EXAMPLE}")
@@ -109,31 +96,25 @@ def _target(word: str) -> Target:
     if match["unit"] != (unit := QUANTITIES[term].unit):
         found = f"'{match['unit']}'" if match["unit"] else "none"
         raise UdccalError(f"Expected the target of {term} in {unit}, found the unit {found} in '{word}'. {_EXAMPLE}")
-    return Target(term, float(match["value"]))
+    return term, float(match["value"])
 
 
 def make_plan(
-    state: RigState, targets: Sequence[Target], progress: Callable[[TermName], None] = lambda term: None
+    state: RigState, targets: Mapping[TermName, float], progress: Callable[[TermName], None] = lambda term: None
 ) -> CapturePlan:
-    """Plan the captures of a rig.
+    """Plan captures for the sigmas that terms are to reach, in the units of ``QUANTITIES``.
 
-    Args:
-        state: the rig, with the captures that it has now.
-        targets: one per term at most.
-        progress: called with a term's name when its plan begins.
-
-    Returns:
-        captures and cost of every term, with the additions that would help most.
+    ``state`` has the captures that the rig has now; ``progress`` is called with a term's name when its plan begins.
 
     Raises:
-        UdccalError: when a procedure is not installed, or a step of it does not state its frames and exposure.
+        UdccalError: as ``steps_at``.
     """
     captures, plans = state.rig.captures, []
-    for target in targets:
-        progress(target.term)
-        captures, plan = _plan_term(state, target, captures)
+    for term, target in targets.items():
+        progress(term)
+        plan, captures = _plan_term(state, term, target, captures)
         plans.append(plan)
-    untouched = tuple(term for term in QUANTITIES if term not in {plan.term for plan in plans})
+    untouched = tuple(term for term in QUANTITIES if term not in targets)
     rest = sum((state.cost(term) for term in untouched), start=Cost())
     return CapturePlan(
         captures=captures,
@@ -146,26 +127,27 @@ def make_plan(
     )
 
 
-def _plan_term(state: RigState, target: Target, captures: Captures) -> tuple[Captures, TermPlan]:
-    term, before, predictor = target.term, state.rig.captures, predictor_for(target.term, state)
+def _plan_term(state: RigState, term: TermName, target: float, captures: Captures) -> tuple[TermPlan, Captures]:
+    before, predictor, quantity, planned = state.rig.captures, PREDICTORS[term](state), QUANTITIES[term], captures
     objective = Objective(term, predictor.sigma, lambda some: state.with_captures(some).cost(term))
-    floor, quantity, planned = predictor.floor(), QUANTITIES[term], captures
-    if target.sigma > _NEAR_FLOOR * floor.sigma:
-        planned = cheapest(objective, captures, target.sigma) or captures
+    limits = predictor.limits(before)
+    if target > _NEAR_FLOOR * limits.floor:
+        planned = cheapest(objective, captures, target) or captures
     more = worthwhile(objective, planned)
-    return planned, TermPlan(
+    plan = TermPlan(
         term=term,
         unit=quantity.unit,
         meaning=quantity.meaning,
-        target=target.sigma,
+        target=target,
         sigma=objective.sigma(planned),
         sigma_before=objective.sigma(before),
-        floor=floor.sigma,
-        reached=objective.sigma(planned) <= target.sigma,
-        lowered_by=floor.lowered_by,
+        floor=limits.floor,
+        reached=objective.sigma(planned) <= target,
+        lowered_by=limits.lowered_by,
         settings=tuple(Setting(one.name, one.of(before), one.of(planned)) for one in DESIGN_VARIABLES[term]),
         cost=objective.cost(planned),
         cost_before=objective.cost(before),
         per_second=max(more, key=lambda one: one.per_second, default=None),
         per_set_up=max(more, key=lambda one: one.per_set_up, default=None),
     )
+    return plan, planned

@@ -24,7 +24,7 @@ from udccal.fitting.psf.problem import DiffractionProblem
 from udccal.fitting.psf.samples import Samples, choose_samples, gather, stands_for, weighed
 from udccal.fitting.wire.rules import ideal_wire, possible_harmonics, wire_start
 from udccal.numerics import in_float64
-from udccal.planning.design import DESIGN_VARIABLES, Floor
+from udccal.planning.design import DESIGN_VARIABLES, Limits
 from udccal.planning.state import WHITE, RigState
 from udccal.planning.steps import PlannedStep
 from udccal.rig import Captures, RigDescription
@@ -71,21 +71,18 @@ class PsfPredictor:
         shots = _shots_used(captures)
         return self._kernel_sigma(captures, shots) if shots else math.inf
 
-    def used(self, captures: Captures) -> float:
-        """Less than 1 where there are more positions and shifts than the fit uses; see ``Predictor``."""
+    def limits(self, captures: Captures) -> Limits:
+        """The floor is that of all positions and shifts that the fit uses, at endless light; see ``Predictor``."""
+        most, shots = captures.model_copy(update=_MOST_EXPOSURES), _RULES.positions * _RULES.shifts
         every = captures.psf_columns * captures.psf_rows * captures.psf_shifts
-        return self._of_noise(captures, every) / self._of_noise(captures, _shots_used(captures))
-
-    def floor(self) -> Floor:
-        """The sigma of all positions and shifts that the fit uses, at endless light."""
-        most, shots = self._state.rig.captures.model_copy(update=_MOST_EXPOSURES), _RULES.positions * _RULES.shifts
+        used = self._of_noise(captures, every) / self._of_noise(captures, _shots_used(captures))
         why = (
             f"The fit of diffraction looks at {_RULES.positions} positions and {_RULES.shifts} shifts of each, and "
             "pixels differ in their response (PRNU): a larger effort (FitEffort's psf) would lower it."
         )
         if self._state.model_errors.psf_kernel**2 > self._of_noise(most, shots):
             why = "That much of the kernel the fit of the present profile could not describe; no capture changes it."
-        return Floor(self._kernel_sigma(most, shots), why)
+        return Limits(self._kernel_sigma(most, shots), why, used)
 
     def _kernel_sigma(self, captures: Captures, shots: int) -> float:
         return 100.0 * math.sqrt(self._of_noise(captures, shots) + self._state.model_errors.psf_kernel**2)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from itertools import groupby
 from typing import Any, final
 
 import jax
@@ -19,7 +20,7 @@ from udccal.models.geometry import Geometry
 from udccal.models.noise import Noise, variance_e
 from udccal.models.wire import Wire, wire_values
 from udccal.numerics import in_float64
-from udccal.planning.steps import PANEL_FULL_S, Cost, PlannedStep, cost_of, steps_at, with_small_panel
+from udccal.planning.steps import PANEL_FULL_S, Cost, PlannedStep, steps_at, with_small_panel
 from udccal.result import FitResult, FitStatus, TermResults
 from udccal.rig import Captures, RigDescription
 from udccal.sessions.schema import TermName
@@ -80,18 +81,18 @@ class RigState:
         """The same with other captures."""
         return replace(self, rig=self.rig.model_copy(update={"captures": captures}))
 
-    def steps(self, term: TermName, drawn: bool = True) -> list[PlannedStep]:
-        """The steps of a term's procedure at the expected exposures; it raises the errors of ``steps_at``.
-
-        For counting, pictures on the panel need not be ``drawn``: they are tiny then.
-        """
-        rig, white = self.rig if drawn else with_small_panel(self.rig), self.white
-        panel_full_s = PANEL_FULL_S if white is None else self.full_well_e / float(white.max())
-        return list(steps_at(term, rig, panel_full_s))
+    def steps(self, term: TermName) -> list[PlannedStep]:
+        """The steps of a term's procedure, pictures on the panel tiny; it raises the errors of ``steps_at``."""
+        panel_full_s = PANEL_FULL_S if self.white is None else self.full_well_e / float(self.white.max())
+        return list(steps_at(term, with_small_panel(self.rig), panel_full_s))
 
     def cost(self, term: TermName) -> Cost:
         """Frames, seconds and set-ups of a term's procedure; it raises the errors of ``steps_at``."""
-        return cost_of(self.steps(term, drawn=False), self.rig)
+        steps, period_s = self.steps(term), 1.0 / self.rig.camera.frame_rate_hz
+        exposures_s = [one for step in steps for one in (*step.exposures_s, *step.exposures_s[:1] * step.test_frames)]
+        # A person is asked when the instruction changes; pictures of the panel follow each other by themselves.
+        set_ups = sum(1 for _ in groupby(steps, key=lambda step: step.instruction))
+        return Cost(len(exposures_s), sum(max(period_s, one) for one in exposures_s), set_ups)
 
     @property
     def white(self) -> Float[np.ndarray, "3 a b"] | None:
@@ -111,11 +112,7 @@ class RigState:
 
 
 def nominal_state(rig: RigDescription) -> RigState:
-    """The state of a rig that was never calibrated, with the captures of its description, which are evaluated.
-
-    Returns:
-        terms at the description's nominal values, with usual noise and distortion, and no model errors.
-    """
+    """The state of a rig that was never calibrated: nominal values, usual noise and distortion, no model errors."""
     K, black = rig.camera.K_DN_per_e.value, rig.camera.black_DN.value
     # Data sheets of industrial cameras leave most numbers out: these are as EMVA 1288 reports commonly show them.
     noise = Noise(
@@ -134,14 +131,9 @@ def nominal_state(rig: RigDescription) -> RigState:
 
 
 def measured_state(rig: RigDescription, fits: TermResults) -> RigState:
-    """The state of a rig that was calibrated.
+    """The state of a rig by the fits of its calibration or profile: terms and model errors as fitted.
 
-    Args:
-        rig: its description, with the captures that are evaluated.
-        fits: of that rig: a calibration or a profile.
-
-    Returns:
-        terms and model errors as fitted; a term whose fit did not converge is that of the rig as built.
+    A term whose fit did not converge is that of the rig as built.
     """
     built, (noise, geometry, wire, psf, backscatter) = nominal_state(rig), fits.results
 
@@ -168,11 +160,7 @@ def measured_state(rig: RigDescription, fits: TermResults) -> RigState:
 
 
 def sensor_samples(rig: RigDescription, across: int) -> Float[np.ndarray, "n 2"]:
-    """Pixels spread evenly over the sensor: ``across`` along x, and as many along y.
-
-    Returns:
-        (x, y) in px, ``across`` squared of them, not rounded to whole pixels.
-    """
+    """Pixels (x, y) spread evenly over the sensor, ``across`` along each side, not rounded to whole pixels."""
     x, y = ((np.arange(across) + 0.5) / across * size - 0.5 for size in (rig.camera.columns, rig.camera.rows))
     return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
 

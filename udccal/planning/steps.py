@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import groupby
 from typing import Any, final
 
 from udccal.arrangements import Arrangement, Led, PanelPicture
@@ -56,12 +55,9 @@ class Cost:
 
 
 def steps_at(term: TermName, rig: RigDescription, panel_full_s: float = PANEL_FULL_S) -> Iterator[PlannedStep]:
-    """The steps of a term's procedure, one at a time, at the expected exposures.
+    """The steps of a term's procedure for a rig's captures, one at a time, at the expected exposures.
 
-    Args:
-        term: of the procedure.
-        rig: with the captures that are wanted.
-        panel_full_s: exposure in seconds at which the brightest sample of a white picture on the panel fills its well.
+    At ``panel_full_s`` seconds the brightest sample of a white picture on the panel fills its well.
 
     Raises:
         UdccalError: when no procedure is installed, or a step of it does not state its frames and exposure.
@@ -89,12 +85,3 @@ def with_small_panel(rig: RigDescription) -> RigDescription:
     """Return a rig with a tiny panel, on which the frames and exposures of its steps do not depend."""
     panel = rig.panel.model_copy(update={"columns": _COUNTING_PX, "rows": _COUNTING_PX})
     return rig.model_copy(update={"panel": panel})
-
-
-def cost_of(steps: Sequence[PlannedStep], rig: RigDescription) -> Cost:
-    """Frames, seconds and set-ups of the steps of one procedure; ``rig`` gives the camera's frame rate."""
-    exposures_s = [one for step in steps for one in (*step.exposures_s, *step.exposures_s[:1] * step.test_frames)]
-    # A person is asked when the instruction changes; pictures of the panel follow each other by themselves.
-    set_ups = sum(1 for _ in groupby(steps, key=lambda step: step.instruction))
-    period_s = 1.0 / rig.camera.frame_rate_hz
-    return Cost(len(exposures_s), sum(max(period_s, one) for one in exposures_s), set_ups)

@@ -22,7 +22,7 @@ from udccal.fitting.wire.jacobian import WireProblem, expected_of, with_harmonic
 from udccal.fitting.wire.parameters import Parameters, parameters_of
 from udccal.fitting.wire.rules import WireRules, ideal_wire, possible_harmonics, wire_start
 from udccal.numerics import in_float64
-from udccal.planning.design import Floor
+from udccal.planning.design import Limits
 from udccal.planning.state import EvenField, RigState
 from udccal.rig import Captures
 
@@ -57,19 +57,17 @@ class WirePredictor:
         """Root mean square over the sensor; see ``Predictor``."""
         return self._map_sigma(self._noise(captures), self._spent, self._state.model_errors.wire)
 
-    def used(self, captures: Captures) -> float:
-        """Less than 1 where the sensor has more pixels than the fit uses; see ``Predictor``."""
+    def limits(self, captures: Captures) -> Limits:
+        """PRNU and the model error, and sensors of more pixels than the fit uses; see ``Predictor``."""
         noise = self._noise(captures)
-        return min((self._map_sigma(noise, self._every) / self._map_sigma(noise, self._spent)) ** 2, 1.0)
-
-    def floor(self) -> Floor:
-        """The sigma that PRNU and the model error leave."""
+        used = min((self._map_sigma(noise, self._every) / self._map_sigma(noise, self._spent)) ** 2, 1.0)
         fewer = self._spent < 0.9 * self._every
         more = "a fit to more of the sensor's pixels (FitEffort's wire_samples)" if fewer else "more pixels"
-        return Floor(
+        return Limits(
             self._map_sigma(np.zeros(1), self._spent, self._state.model_errors.wire),
             f"Pixels differ in their response by {100 * self._state.noise.PRNU1288:.2g} % (PRNU), and that does not "
             f"average over frames: {more} would lower it.",
+            used,
         )
 
     def _noise(self, captures: Captures) -> Float[np.ndarray, " n"] | None:

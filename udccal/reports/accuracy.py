@@ -58,7 +58,8 @@ def accuracies(calibration: Calibration) -> tuple[Accuracy, ...]:
             continue
         if ahead is not None:
             used = _diagnostic(result, "efficiency")
-            found.append(Accuracy(ahead, stated(term, result, calibration.rig), ahead.used if used is None else used))
+            used = ahead.limits.used if used is None else used
+            found.append(Accuracy(ahead, stated(term, result, calibration.rig), used))
     return tuple(found)
 
 
@@ -85,7 +86,7 @@ def accuracy_table(accuracy: Accuracy) -> Table:
     rows = [("forecast for the captured frames (within 15 %)", f"{ahead.sigma:.3g} {unit}")]
     if accuracy.stated is not None:
         rows.append(("sigma of the fit", f"{accuracy.stated:.3g} {unit}"))
-    rows.append(("floor, however much is captured", f"{ahead.floor.sigma:.3g} {unit}" if ahead.floor.sigma else "–"))
+    rows.append(("floor, however much is captured", f"{ahead.limits.floor:.3g} {unit}" if ahead.limits.floor else "–"))
     rows.append(("efficiency: used part of the information in the frames", f"{100 * accuracy.efficiency:.0f} %"))
     rows.append(("unused part of the information", f"{100 * (1 - accuracy.efficiency):.0f} %"))
     title = f"Accuracy: σ of {ahead.quantity.meaning}"
@@ -100,8 +101,8 @@ def forecast_sentence(ahead: Forecast) -> str:
         said += "More captures would hardly lower sigma. "
     else:
         said += f"{_gain(ahead, best)} "
-    if ahead.floor.sigma and best.most_gain * ahead.floor.sigma > ahead.sigma / 2:
-        said += f"The floor is {ahead.floor.sigma:.3g} {ahead.quantity.unit}. {ahead.floor.lowered_by}"
+    if ahead.limits.floor and best.most_gain * ahead.limits.floor > ahead.sigma / 2:
+        said += f"The floor is {ahead.limits.floor:.3g} {ahead.quantity.unit}. {ahead.limits.lowered_by}"
     if ahead.idle:
         said += f" It does not depend on {' or '.join(ahead.idle)}."
     return said.strip()

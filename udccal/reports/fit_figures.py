@@ -43,12 +43,12 @@ def forecast_figure(ahead: Forecast) -> Figure:
     figure, panels = row_of_axes(len(curves), max(3.0 * len(curves), 4.2), 2.7)
     low = min(float(curve.sigma.min()) for curve in curves)
     high = max(float(curve.sigma.max()) for curve in curves)
-    low = min(low, ahead.floor.sigma) if ahead.floor.sigma > _NEAR * low else low
+    low = min(low, ahead.limits.floor) if ahead.limits.floor > _NEAR * low else low
     for axes, curve in zip(panels, curves, strict=True):
         axes.loglog(curve.counts, curve.sigma, "-", color=_BLUE, lw=1.8)
         axes.plot([curve.now], [ahead.sigma], "o", color=_RED, ms=6, label=f"captured: {curve.now}")
-        if low <= ahead.floor.sigma:
-            axes.axhline(ahead.floor.sigma, color="0.4", ls="--", lw=1, label="floor")
+        if low <= ahead.limits.floor:
+            axes.axhline(ahead.limits.floor, color="0.4", ls="--", lw=1, label="floor")
         axes.set(xlabel=curve.variable.counted, ylim=(low / _ROOM, high * _ROOM))
         _plain_ticks(axes, curve)
         axes.legend(frameon=False, fontsize=7.5, loc="upper right")

@@ -75,7 +75,7 @@ def plan_captures(output: Output, rig_name: str, words: Sequence[str], profile: 
     with output.stage("planning") as stage:
 
         def progress(term: TermName) -> None:
-            stage.update([t.term for t in targets].index(term), len(targets), f"planning {term}")
+            stage.update(list(targets).index(term), len(targets), f"planning {term}")
 
         made = make_plan(state, targets, progress)
     _show(output, made)
