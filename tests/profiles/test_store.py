@@ -65,6 +65,7 @@ def stored(tmp_path: Path, original: Path) -> Path:
 def test_everything_comes_back_bit_for_bit(tmp_path: Path, toy_profile: Profile, name: str) -> None:
     write_profile(tmp_path / name, toy_profile)
     assert_same(read_profile(tmp_path / name), toy_profile)
+    assert read_profile(str(tmp_path / name)).parent == toy_profile.parent
     assert [item.name for item in tmp_path.iterdir()] == [name]
 
 

@@ -72,8 +72,17 @@ def test_dead_pixels_are_no_smudge(truth: Wire, flat: WireData) -> None:
     assert not failed(judge_wire(replace(flat, signal=signal), fitted("wire", truth), ValidationLimits()))
 
 
+@pytest.mark.parametrize(
+    ("field", "value"), [("row_open", np.nan), ("row_open", 1e200), ("footprint_per_pitch", 1e200)]
+)
+def test_a_number_out_of_its_range_is_refused(truth: Wire, flat: WireData, field: str, value: float) -> None:
+    strange = replace(truth, **{field: np.float64(value)})
+    found = judge_wire(flat, fitted("wire", strange), ValidationLimits())
+    assert f"Expected 'wire.{field}' to be from" in named(found, "captures").what
+
+
 def test_a_map_of_impossible_values_is_refused(truth: Wire, flat: WireData) -> None:
-    strange = replace(truth, row_open=np.float64(np.nan))
+    strange = replace(truth, baseline=truth.baseline + 100.0)
     found = judge_wire(flat, fitted("wire", strange), ValidationLimits())
     assert "values that no panel gives" in named(found, "captures").what
 

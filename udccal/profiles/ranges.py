@@ -142,6 +142,15 @@ def check_term(term: Any, name: str, rig: RigDescription) -> None:
     Raises:
         ProfileError: with the field, what was expected and what was found.
     """
+    check_ranges(term, name)
+    for field, allowed in RANGES[type(term)].items():
+        if isinstance(allowed, type):
+            check_term(getattr(term, field), f"{name}.{field}", rig)
+    _TOGETHER.get(type(term), _nothing)(term, name, rig)
+
+
+def check_ranges(term: Any, name: str) -> None:
+    """Refuse a term with a number out of its own range, whatever the others are; name and errors as ``check_term``."""
     sizes: dict[str, int] = {}
     for field, allowed in RANGES[type(term)].items():
         value, where = getattr(term, field), f"{name}.{field}"
@@ -157,8 +166,7 @@ def check_term(term: Any, name: str, rig: RigDescription) -> None:
                 _require(isinstance(value, str), where, "a word", value)
             case _:
                 _require(isinstance(value, allowed), where, f"a {allowed.__name__}", value)
-                check_term(value, where, rig)
-    _TOGETHER.get(type(term), _nothing)(term, name, rig)
+                check_ranges(value, where)
 
 
 def _check_real(value: Any, allowed: Real, where: str, sizes: dict[str, int]) -> None:

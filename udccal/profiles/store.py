@@ -76,7 +76,7 @@ def put(folder: Path, path: Path) -> None:
         replace_whole(folder, path)
 
 
-def read_profile(path: Path) -> Profile:
+def read_profile(path: str | Path) -> Profile:
     """Read a profile.
 
     Args:
@@ -85,7 +85,7 @@ def read_profile(path: Path) -> Profile:
     Raises:
         ProfileError: when it is missing, damaged, altered, too large, newer, or does not follow docs/profile.md.
     """
-    return read_standing(path, _read)
+    return read_standing(Path(path), _read)
 
 
 def _read(path: Path) -> Profile:

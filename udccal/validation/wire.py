@@ -6,9 +6,11 @@ over the sensor are solved for.
 
 from __future__ import annotations
 
+import jax
 import numpy as np
 from jaxtyping import Float
 
+from udccal.errors import ProfileError
 from udccal.fitting.wire.data import FlatNoise, Pixels, Weighed, WireData, flat_noise, read_wire, sample_pixels, weighed
 from udccal.fitting.wire.fit import unusable_flat
 from udccal.fitting.wire.jacobian import values_at
@@ -17,6 +19,7 @@ from udccal.fitting.wire.rules import WireRules
 from udccal.models.wire import Wire
 from udccal.numerics import in_float64
 from udccal.profiles.profile import Profile
+from udccal.profiles.ranges import check_ranges
 from udccal.result import FitResult
 from udccal.sessions.store import Session
 from udccal.validation.checks import Judged, ZMap, at_most, chi2_check, unusable
@@ -39,13 +42,22 @@ _MOST_LIGHT = 1e3
 
 @in_float64
 def judge_wire(data: WireData, result: FitResult[Wire], limits: ValidationLimits) -> Judged:
-    """Judge patterns by the rows' and columns' period, the worst part of the sensor, and the scatter of pixels."""
+    """Judge patterns by the rows' and columns' period, the worst part of the sensor, and the scatter of pixels.
+
+    A flat that cannot be judged, or a wire of which a number is out of its range, fails with a sentence.
+    """
     rules = WireRules()
+    try:
+        # Compiled code may end the process at numbers far beyond a profile's ranges.
+        check_ranges(jax.tree.map(lambda part: np.asarray(part, dtype=np.float64), result.term), "wire")
+    except ProfileError as error:
+        return unusable("wire", str(error))
     if (refused := unusable_flat(data, rules)) is not None:
         return unusable("wire", " ".join((refused[1], refused[0].value)))
     pixels = sample_pixels(data.balanced, result.term.geometry, rules.samples, data.cfa, other=True)
     noise = flat_noise(data)
-    whole, base = values_at(result.term, pixels)
+    with np.errstate(over="ignore"):
+        whole, base = values_at(result.term, pixels)
     if not (np.abs(whole * base) < _MOST_LIGHT).all():
         return unusable("wire", "The profile's wire map has values that no panel gives. Calibrate the rig again.")
     seen = _predicted(whole * base, pixels, noise)

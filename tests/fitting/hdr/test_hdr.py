@@ -64,6 +64,16 @@ def test_light_at_the_edge_of_clipping_is_not_overestimated(brightness: float) -
     assert error.std() == pytest.approx(sigma, rel=0.15)
 
 
+def test_light_within_two_codes_of_black_is_told_where_the_noise_smears_no_code() -> None:
+    # 1 e- of dark noise is a fiftieth of a code: all samples of a pixel are rounded alike.
+    coarse = replace(NOISE, K_DN_per_e=np.float64(0.02), sigma_d_e=np.float64(1.0), saturation_DN=np.float64(250.0))
+    frames, longest = np.full((3, 8, 8), 66, np.uint16), 0.5
+    times = np.array([0.1, longest, 1e-3])
+    assert merge_bracket(frames, times, coarse).rounded_below == pytest.approx(2.0 / 0.02 / longest)
+    # 4.5 e- are 1.6 codes.
+    assert merge_bracket(frames, times, NOISE).rounded_below == 0.0
+
+
 @pytest.mark.medium
 def test_repeats_lower_sigma_as_they_should() -> None:
     one = merge_bracket(bracket(1e3, EXPOSURES[-1:], 2), EXPOSURES[-1:], NOISE)

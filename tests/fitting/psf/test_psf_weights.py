@@ -15,7 +15,7 @@ from tests.scenes.psf import frames_of, small_scene
 from udccal.fitting.hdr.merge import HdrMerge
 from udccal.fitting.psf.data import PsfRules, Shots, estimate_model_error, left_out
 from udccal.fitting.psf.diffraction import pattern_p_value, without_outliers
-from udccal.fitting.psf.read import shot_noise
+from udccal.fitting.psf.read import cut_crop, shot_noise
 from udccal.fitting.psf.samples import Samples, choose_samples, sensor_variance, stands_for, weighed
 from udccal.models.diffraction import LocalFrame
 
@@ -175,3 +175,19 @@ def test_brackets_are_clipped_and_quantised() -> None:
     assert frames.shape == (6, 1, 2)
     assert (frames[1:, 0, 1] == scene.rig.saturation_DN).all()
     assert abs(float(frames[0, 0, 0]) - float(scene.noise.black_DN)) < 12
+
+
+def test_samples_that_rounding_moves_alike_have_no_weight() -> None:
+    rows, columns = np.mgrid[:41, :41]
+    light = 1e5 * np.exp(-0.5 * np.hypot(rows - 20, columns - 20) ** 2 / 4.0) + 50.0 * (columns > 30)
+    ones = np.ones(light.shape)
+    kept = []
+    for below in (0.0, 40.0):
+        merged = HdrMerge(light, ones, ones.astype(int), (), below)
+        shots = cut_crop(merged, (0, 0), (20.0, 20.0), "mono", (20, 20), 1.0)
+        assert shots is not None
+        kept.append(shots.weight[0] > 0)
+    assert kept[0].all()
+    assert kept[1][light > 60].all()
+    assert kept[1][:, 33:].all()
+    assert not kept[1][:5, :25].any()

@@ -49,6 +49,8 @@ class HdrRules:
         scatter_off: scatter of samples about their light, relative to the noise model's variance, that is too much.
         sure_electrons: electrons that a pixel's light is worth before the scatter about it is judged.
         black_off: error of the black level, in sigma of dark noise, that is too much.
+        least_codes: codes above black from which neighbouring samples are rounded up as often as down: their light
+            differs by parts of a code, and its own noise smears the steps.
     """
 
     believed_sigma: float = 6.0
@@ -59,6 +61,7 @@ class HdrRules:
     scatter_off: float = 0.05
     sure_electrons: float = 100.0
     black_off: float = 0.1
+    least_codes: float = 2.0
 
 
 class SensorNumbers(eqx.Module):

@@ -34,6 +34,8 @@ class HdrMerge:
         rate_e_per_s, sigma_e_per_s: light of every pixel, with one standard deviation.
         used: number of samples used for each pixel; where it is 0 the rate is 0 and sigma ``UNKNOWN_SIGMA``.
         outliers: frames and samples that were left out.
+        rounded_below: light in e-/s below which rounding to codes moves samples alike, so that they do not average out:
+            some codes of the longest exposure where dark noise is far below a code, else 0.
         status, notes: SATURATED where no pixel has a sample that could be used, POOR_FIT where samples of a pixel
             scatter unlike the noise model says, so that rate and sigma are not to be trusted; sentences for a person.
     """
@@ -42,6 +44,7 @@ class HdrMerge:
     sigma_e_per_s: Float[np.ndarray, "*picture"]
     used: Int[np.ndarray, "*picture"]
     outliers: tuple[Outliers, ...] = ()
+    rounded_below: float = 0.0
     status: FitStatus = FitStatus.CONVERGED
     notes: tuple[str, ...] = ()
 
@@ -91,7 +94,10 @@ def merge_bracket(
     merged.rate[unknown], merged.sigma[unknown] = 0.0, UNKNOWN_SIGMA
     notes = [f"{unknown.sum()} of {unknown.size} pixels have no sample that could be used."] if unknown.any() else []
     notes += doubts
+    rounded_below = 0.0
     if sensor.rounding_e > rules.black_off * math.sqrt(sensor.floor_e2):
+        longest = float(times[~bracket.dropped[:, 0]].max())
+        rounded_below = rules.least_codes * float(noise.q_DN) * float(sensor.e_per_DN) / longest
         notes.append("Dark noise is far below a code: rounding moves dark pixels by up to half a code. Raise the gain.")
     off = f"frames whose light is off by more than {100 * rules.frame_off:g} % and {rules.frame_sigma:g} sigma"
     hit = f"pixels with a sample more than {rules.believed_sigma:g} sigma from what its other samples say; that sample"
@@ -101,7 +107,7 @@ def merge_bracket(
     status = FitStatus.POOR_FIT if doubts else FitStatus.CONVERGED
     status = FitStatus.SATURATED if unknown.size and unknown.all() else status
     rate, sigma, used = (part.reshape(shape) for part in (merged.rate, merged.sigma, merged.used))
-    return HdrMerge(rate, sigma, used, listed, status, tuple(notes))
+    return HdrMerge(rate, sigma, used, listed, rounded_below, status, tuple(notes))
 
 
 def _checked(frames: object, exposures_s: object) -> Float[np.ndarray, " exposures"]:

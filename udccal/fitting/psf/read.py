@@ -123,7 +123,12 @@ def cut_crop(
     ``shot_noise``) the merged sigma stays unchanged.
     """
     rate = merged.rate_e_per_s
-    weight = np.where(merged.used > 0, 1.0 / merged.sigma_e_per_s.astype(np.float64) ** 2, 0.0)
+    # Rounding moves the faintest samples alike: thousands of them would outvote the kernel's bright part. The mean of
+    # neighbours chooses them, so that a sample's own noise does not.
+    known = merged.used > 0
+    if merged.rounded_below > 0:
+        known &= scipy.ndimage.uniform_filter(rate, 3) >= merged.rounded_below
+    weight = np.where(known, 1.0 / merged.sigma_e_per_s.astype(np.float64) ** 2, 0.0)
     place = _brightest(rate, weight, np.asarray(aim_px) - corner_px)
     if place is None:
         return None
