@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from udccal.cameras.protocol import Region
+from udccal.fitting.engine.orders import Quantity
 from udccal.fitting.noise import codes, moments
 from udccal.fitting.noise.data import Averaged, Codes, NoiseRules
 from udccal.fitting.noise.fit import fit_moments, nominal_noise
@@ -229,7 +230,7 @@ def test_counts_hot_pixels_and_converter_steps() -> None:
     rng = np.random.default_rng(2)
     dark = 64 + 0.3 * rng.standard_normal((100, 100))
     dark[3, 4] = dark[50, 60] = 90.0
-    assert dsnu(dark, 0.09, 0.0, RULES.defect_sigma).places == ((3, 4), (50, 60))
+    assert dsnu(dark, Quantity(0.09, 0.0), 0.0, RULES.defect_sigma).places == ((3, 4), (50, 60))
     frame = rng.integers(100, 200, (50, 50)).astype(np.uint16)
     assert converter_step(frame) == 1
     assert converter_step(frame * np.uint16(16)) == 16
@@ -254,3 +255,16 @@ def test_a_flat_that_lies_off_the_curve_is_left_out_of_it() -> None:
     assert any(one.rule.startswith("bins of flats off") and one.count == 1 for one in result.outliers)
     K = clean.estimate("K_DN_per_e")
     assert result.estimate("K_DN_per_e").value == pytest.approx(K.value, abs=0.5 * K.sigma)
+
+
+@pytest.mark.parametrize(("row_DN", "offsets_DN"), [(0.05, 0.05), (0.4, 0.05), (0.4, 0.3)])
+def test_mean_codes_of_rows_scatter_as_row_gain_says(row_DN: float, offsets_DN: float) -> None:
+    rng = np.random.default_rng(8)
+    level, read_DN, K = 10.3, 0.12, 0.05
+    frames = [np.full((4, 4), 10, np.uint16)] * 2
+    pair = codes.dark_pair(frames[0], frames[1], 0.01)
+    values = np.array([level, 0.0, read_DN**2, offsets_DN**2, codes.NORMAL_SHAPE])
+    rows = level + row_DN * rng.standard_normal((4000, 1))
+    noise = np.hypot(read_DN, offsets_DN) * rng.standard_normal((4000, 2000))
+    scatter = float(np.rint(rows + noise).mean(axis=1).std())
+    assert codes.row_gain(pair, values, K, row_DN) * row_DN == pytest.approx(scatter, rel=0.05)

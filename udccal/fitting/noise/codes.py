@@ -142,6 +142,23 @@ def pair_probability(
     return np.asarray((1 - background) * joint + background / joint.size)
 
 
+def row_gain(pair: DarkPair, values: Five, K_DN_per_e: float, sigma_row_DN: float) -> float:
+    """How much rows' mean codes scatter for row noise of 1 DN: 1 where rounding is white and no code is cut off.
+
+    Mean codes follow the signal in steps that a pixel's noise and the offsets smear. Row noise that reaches over much
+    of a code moves them by more or less than the slope at black says.
+    """
+    black, per_s, variance, spread2, shape = (float(v) for v in values)
+    drift, z = per_s * pair.exposure_s, np.linspace(-4.0, 4.0, 33)
+    shift = max(sigma_row_DN, 0.01 * float(np.sqrt(variance))) * z
+    # Of single codes, offsets widen the distribution as normal noise does.
+    grid, cdf = _dark_cdf(float(np.sqrt(variance)), shape, float(np.sqrt(spread2)), drift, K_DN_per_e)
+    below = np.interp(pair.edges_DN - (black + drift + shift)[:, None], grid, cdf, left=0.0, right=1.0)
+    means, weights = np.diff(below, axis=1) @ pair.centres_DN, np.exp(-0.5 * z**2)
+    scatter, own = (float(np.cov(of, aweights=weights, ddof=0)) for of in (means, shift))
+    return float(np.sqrt(scatter / own))
+
+
 @final
 @dataclass(frozen=True)
 class DarkFit:

@@ -11,7 +11,17 @@ from jaxtyping import Float
 
 from udccal.fitting.engine.gaussian import scaled_inverse
 from udccal.fitting.engine.orders import Quantity
-from udccal.fitting.noise.codes import LOW, NORMAL_SHAPE, DarkFit, DarkPair, Five, fit_dark, pair_probability
+from udccal.fitting.noise.codes import (
+    LOW,
+    NORMAL_SHAPE,
+    DarkFit,
+    DarkPair,
+    Five,
+    excess_kurtosis,
+    fit_dark,
+    pair_probability,
+    row_gain,
+)
 from udccal.fitting.noise.moments import NoiseMoments
 from udccal.fitting.noise.patterns import Pattern, dsnu, row_noise
 
@@ -49,13 +59,24 @@ def fit_dark_terms(
     rules = data.rules
     row, in_pairs = row_noise(data, np.ones(len(data.darks)))
     fit = fit_dark(data.darks, K_DN_per_e, in_pairs, rules, start)
-    if not fit.follows:
-        row, in_pairs = row_noise(data, fit.edge_gains)
+    for _ in range(10):
+        gains = np.array([row_gain(pair, fit.values, K_DN_per_e, in_pairs) for pair in data.darks])
+        before, (row, in_pairs) = in_pairs, row_noise(data, gains)
+        if abs(in_pairs**2 - before**2) <= 0.1 * row.variance**0.5:
+            break
+        # Each depends on the other in the opposite sense: half-way between is near to where both agree.
+        in_pairs = float(np.sqrt(0.5 * (in_pairs**2 + before**2)))
         fit = fit_dark(data.darks, K_DN_per_e, in_pairs, rules, fit.values)
     # Temporal noise below 0.15 of a code cannot be distinguished from the pattern of rounding.
     resolved = float(fit.values[2]) + in_pairs**2 >= (0.15 * data.q_DN) ** 2
     row = row if resolved else row_noise(data, np.zeros(len(data.darks)))[0]
-    free, normal = fit, fit_dark(data.darks, K_DN_per_e, in_pairs, rules, fit.values, True)
+    normal = fit_dark(data.darks, K_DN_per_e, in_pairs, rules, fit.values, True)
+    free, normal = (_with_drawn_rows(one, data, in_pairs) for one in (fit, normal))
+    if in_pairs > 0 and np.abs(gains - 1).max() > rules.white:
+        # Rounding hides part of the row noise, and what is wrong with it is taken for read noise.
+        less = float(np.sqrt(max(in_pairs**2 - row.variance**0.5, 0.0)))
+        depends = fit_dark(data.darks, K_DN_per_e, less, rules, fit.values).values - fit.values
+        free = replace(free, cov=free.cov + np.outer(depends, depends))
     value, variance = float(free.values[4]), float(free.cov[4, 4])
     name, gain = f"read noise of another shape than normal ({NORMAL_SHAPE:.2f})", (value - NORMAL_SHAPE) ** 2 / variance
     shape = Quantity.asked(name, value, variance, data.dark_samples, gain, without=NORMAL_SHAPE)
@@ -67,7 +88,6 @@ def fit_dark_terms(
         depends = (free.values - normal.values) * np.array([1.0, 1.0, 1.0, 1.0, 0.0])
         fit = replace(fit, cov=fit.cov + np.outer(depends, depends))
         fit.cov[2, 2] += (0.5 * fit.values[2]) ** 2
-        row = replace(row, variance=row.variance + (0.5 * row.value) ** 2)
     (_, rate, read, spread2, _), variance = fit.values.tolist(), float(fit.cov[2, 2])
     read_DN2, shot, stack = Quantity(read, variance), K_DN_per_e * max(rate, 0.0), data.dark_stack
     expected = [read + data.rounding_DN2 + shot * pair.exposure_s for pair in data.darks]
@@ -83,30 +103,52 @@ def fit_dark_terms(
     elif read <= 1.001 * LOW[2]:
         read_DN2 = Quantity(0.0, max(variance, LOW[2] ** 2))
     # DSNU comes from the stack's average, or from the histograms where rounding biases the average.
-    single = read_DN2.value + shot * stack.exposure_s + data.rounding_DN2
-    if foreign and data.dark_seen is not None:
-        single = float(np.average(data.dark_seen.variance_DN2, weights=data.dark_seen.dof))
-    offsets = dsnu(stack.mean_DN, single / stack.frames, in_pairs**2 / stack.frames, rules.defect_sigma)
+    single = Quantity(read_DN2.value + shot * stack.exposure_s + data.rounding_DN2, read_DN2.variance)
+    if seen := data.dark_seen:
+        # Its own frames say what noise the average has, whatever the distribution.
+        value = float(np.average(seen.variance_DN2, weights=seen.dof))
+        single = Quantity(value, 2 * value**2 / float(seen.dof.sum()))
+    temporal = Quantity(single.value / stack.frames, single.variance / stack.frames**2)
+    offsets = dsnu(stack.mean_DN, temporal, in_pairs**2 / stack.frames, rules.defect_sigma)
     if not white:
         pixels, sigma = (
             stack.mean_DN.size,
             float(np.hypot(fit.cov[3, 3] ** 0.5, 0.0 if resolved else data.rounding_DN2)),
         )
         offsets = replace(offsets, variance=spread2, sigma=sigma, samples=pixels, mean_variance=spread2 / pixels)
-    black, levels_cov, current = _levels(data, fit, in_pairs**2, single, offsets, curvature)
+    black, levels_cov, current = _levels(data, fit, in_pairs**2, single.value, offsets, curvature)
     DSNU2 = Quantity.asked("DSNU", offsets.variance, offsets.sigma**2, offsets.samples)
     return DarkTerms(
         K_DN_per_e, curvature, black, current, levels_cov, read_DN2, shape, row, DSNU2, white, foreign, fit, offsets
     )
 
 
+def _with_drawn_rows(fit: DarkFit, data: NoiseMoments, row_DN: float) -> DarkFit:
+    """The fit with the error that a finite number of rows adds to its covariance.
+
+    All samples of a row share one draw of its noise, and the draws of a few hundred rows have tails of their own. The
+    fit, which takes them for normal, gives these to the read noise. Rows of two frames that agree by chance look like
+    offsets of pixels; where there are none, rows that disagree look like less read noise.
+    """
+    rows, (_, _, read, spread2, shape), cov = sum(pair.rows for pair in data.darks), fit.values.tolist(), fit.cov.copy()
+    cov[[2, 3], [2, 3]] += np.array([spread2 <= 1.001 * LOW[3], True]) * row_DN**4 / rows
+    if cov[4, 4] > 0:
+        slope = (excess_kurtosis(shape + 0.01) - excess_kurtosis(shape - 0.01)) / 0.02
+        # The fourth cumulant of n normal draws has the variance 24 sigma^8 / n, and a pair has two of each row.
+        error = min(float(np.sqrt(12 / rows)) * row_DN**4 / (abs(slope) * read**2), data.rules.shape_sigma)
+        along = fit.cov[:, 4] / fit.cov[4, 4] * error
+        cov += np.outer(along, along)
+    return replace(fit, cov=cov)
+
+
 def _coded_variances(pairs: tuple[DarkPair, ...], fit: DarkFit, K_DN_per_e: float, row_DN: float) -> list[float]:
     """Temporal variance without row noise that the fitted distribution has in each pair's codes."""
     found = []
-    for pair, gain in zip(pairs, fit.edge_gains, strict=True):
+    for pair in pairs:
         p = pair_probability(pair, fit.values, K_DN_per_e, row_DN, 0.0)
         square = (pair.centres_DN[:, None] - pair.centres_DN) ** 2
-        found.append(float(np.sum(p * square)) / (2 * float(p.sum())) - (float(gain) * row_DN) ** 2)
+        by_row = row_gain(pair, fit.values, K_DN_per_e, row_DN) * row_DN
+        found.append(float(np.sum(p * square)) / (2 * float(p.sum())) - by_row**2)
     return found
 
 

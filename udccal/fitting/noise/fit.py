@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import replace
+from itertools import compress
 
 import numpy as np
 from jaxtyping import Float
@@ -72,7 +73,14 @@ def fit_moments(data: NoiseMoments, nominal: Noise) -> FitResult[Noise]:
         return FitResult.failed("noise", nominal, *refused)
     start = start_values(data.darks)
     dark = fit_dark_terms(data, rough_gain(data, float(start[0]), float(start[2])), start)
-    curve, longest = fit_curve(data, dark), max(pair.exposure_s for pair in data.darks)
+    curve = fit_curve(data, dark)
+    below = [float(np.median(of.mean_DN + 4 * of.spread_DN)) < curve.ceiling_DN for of in data.dark_moments]
+    if curve.full.any() and 2 <= sum(below) < len(below):
+        darks, moments = compress(data.darks, below), compress(data.dark_moments, below)
+        result = fit_moments(replace(data, darks=tuple(darks), dark_moments=tuple(moments)), nominal)
+        note = f"{len(below) - sum(below)} dark exposures are left out: dark current nearly fills the pixels."
+        return replace(result, notes=(note, *result.notes))
+    longest = max(pair.exposure_s for pair in data.darks)
     # The dark fit needs the gain, and the gain the dark fit. To first order the curve corrects the read noise for the
     # gain; a second round is for a gain that moves dark current's shot noise by half of the read noise's sigma, or
     # for a curvature that moves black by half of its own.

@@ -28,25 +28,31 @@ Mask = Bool[np.ndarray, "rows columns"]
 Grid = Float[np.ndarray, "down across"]
 
 
-def row_noise(data: NoiseMoments, edge_gains: Float[np.ndarray, " pairs"]) -> tuple[Quantity, float]:
+def row_noise(data: NoiseMoments, row_gains: Float[np.ndarray, " pairs"]) -> tuple[Quantity, float]:
     """Variance by rows, and its root in the pairs alone, which is the one that widened their histograms.
 
-    Rounding and cut-off codes reduce the variance of a pair by the square of its ``edge_gains``.
+    Rounding and cut-off codes change the variance of a pair by the square of its ``row_gains``. How much depends on the
+    distribution of the read noise, which coarse codes hardly show: half of the change is in the sigma.
     """
     nearest = int(np.argmin([abs(pair.exposure_s - data.dark_stack.exposure_s) for pair in data.darks]))
-    pairs = list(zip(data.dark_moments, edge_gains, strict=True))
-    stack = [] if data.dark_seen is None else [(data.dark_seen, edge_gains[nearest])]
+    pairs = list(zip(data.dark_moments, row_gains, strict=True))
+    stack = [] if data.dark_seen is None else [(data.dark_seen, row_gains[nearest])]
 
     def asked(seen: list[tuple[Moments, float]]) -> Quantity:
         # Pairs whose mean code follows black to less than a fifth do not determine row noise.
-        rows = [
-            (of.rows_DN2 / gain**2, of.sampling_DN2 / gain**2, (of.frames - 1) * max(of.height - 1, 1))
-            for of, gain in seen
-            if gain >= 0.2 and of.rows_DN2 > 0
-        ]
-        # Row noise that rounding hides completely may be as large as rounding itself.
-        found = excess_variance(*np.array(rows).T) if rows else (0.0, data.rounding_DN2**2, 0.0)
-        return Quantity.asked("row noise", found[0], found[1], data.dark_samples, found[2])
+        used = [(of, gain) for of, gain in seen if gain >= 0.2 and of.rows_DN2 > 0]
+        if not used:
+            # Row noise that rounding hides completely may be as large as rounding itself.
+            return Quantity.asked("row noise", 0.0, data.rounding_DN2**2, data.dark_samples, 0.0)
+        parts = np.array([(of.rows_DN2, of.sampling_DN2, (of.frames - 1) * max(of.height - 1, 1)) for of, _ in used]).T
+        gains = np.array([gain for _, gain in used])
+
+        def excess(gains: Float[np.ndarray, " used"]) -> tuple[float, float, float]:
+            return excess_variance(parts[0] / gains**2, parts[1] / gains**2, parts[2])
+
+        value, variance, gain = excess(gains)
+        by_rounding = value - excess(0.5 * (1 + gains))[0]
+        return Quantity.asked("row noise", value, variance + by_rounding**2, data.dark_samples, gain)
 
     row = asked(pairs + stack)
     return row, float(np.sqrt(asked(pairs).value)) if row.there else 0.0
@@ -74,10 +80,10 @@ class Pattern:
     structure2: float = 0.0
 
 
-def dsnu(dark_DN: Picture, temporal_DN2: float, row_DN2: float, defect_sigma: float) -> Pattern:
+def dsnu(dark_DN: Picture, temporal: Quantity, row_DN2: float, defect_sigma: float) -> Pattern:
     """Variance of the pixels' offsets in an averaged dark frame (EMVA 1288, clause 8.2), with row and column patterns.
 
-    The average has the temporal variance ``temporal_DN2`` without row noise, which adds ``row_DN2``.
+    The average has the variance ``temporal`` [DN^2] without row noise, which adds ``row_DN2``.
     """
     about = dark_DN.astype(np.float64)
     sample = about[:: max(1, len(about) // 256)]
@@ -93,10 +99,11 @@ def dsnu(dark_DN: Picture, temporal_DN2: float, row_DN2: float, defect_sigma: fl
     by_row, by_column = float(np.var(about.mean(axis=1))), float(np.var(about.mean(axis=0)))
     pixel = max(total - by_row - by_column, 0.0)
     parts, counts = np.array([pixel, by_row, by_column]), np.array([samples, rows, columns])
-    own = np.maximum(parts - [temporal_DN2, pixel / columns + row_DN2, pixel / rows], 0.0)
+    own = np.maximum(parts - [temporal.value, pixel / columns + row_DN2, pixel / rows], 0.0)
     # Each part is chi-squared with its own number of values; this sensor's own pattern is what is asked for.
-    sigma = float(np.sqrt(np.sum(2 * np.maximum(parts**2 - own**2, 0.0) / counts)))
-    variance, of_mean = total - temporal_DN2 - row_DN2, float(np.sum(own / counts))
+    drawn = float(np.sum(2 * np.maximum(parts**2 - own**2, 0.0) / counts))
+    sigma = float(np.sqrt(drawn + temporal.variance))
+    variance, of_mean = total - temporal.value - row_DN2, float(np.sum(own / counts))
     return Pattern(variance, sigma, samples, int(bad.sum()), _first_places(bad), mean, of_mean)
 
 
