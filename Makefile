@@ -15,13 +15,14 @@ RIGS_OUT ?= drawn
 RIGS ?= 12
 LIVE_OUT ?= live.json
 COVERAGE_OUT ?= coverage
+OTHER_DAYS_OUT ?= other-days
 ROBUST_OUT ?= robust
 NETWORK_MINUTES ?= 60
 ROBUST ?=
 PEERS ?=
 USB ?=
 
-.PHONY: install demo test test-medium test-slow test-usb fuzz load lint types contracts check accuracy tables efficiency coverage extremes pareto network budget drift rigs live robust peers growth docs clean
+.PHONY: install demo test test-medium test-slow test-usb fuzz load lint types contracts check accuracy tables efficiency coverage extremes pareto network budget drift other-days rigs live robust peers growth docs clean
 
 install: $(STAMP)
 
@@ -108,6 +109,11 @@ growth: $(STAMP)
 drift: $(STAMP)
 	$(BIN)/python -m tests.benchmarks.drift --rigs $(DRIFT_RIGS) --out $(DRIFT_OUT)
 
+# The shipped profile against calibrations of its specimen on other days. Writes the tables of docs/diff.md,
+# docs/validate.md and docs/check.md and the example of README.md; non-zero exit where a number misses its limit.
+other-days: $(STAMP)
+	$(BIN)/python -m tests.benchmarks.other_days --out $(OTHER_DAYS_OUT)
+
 # Rigs of which every number, opening and noise is drawn, written by a program that is not udccal's. Goes on where it was
 # stopped. Writes drawn.json and the table of docs/accuracy.md; non-zero exit where a profile is wrong and does not say so.
 rigs: $(STAMP)
@@ -142,4 +148,4 @@ docs: $(STAMP)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
 clean:
-	rm -rf $(VENV) $(DEMO_OUT) $(ACCURACY_OUT) $(EFFICIENCY_OUT) $(ROBUST_OUT) $(PARETO_OUT) $(BUDGET_OUT) $(RIGS_OUT) $(LIVE_OUT) site peers build dist *.egg-info
+	rm -rf $(VENV) $(DEMO_OUT) $(ACCURACY_OUT) $(EFFICIENCY_OUT) $(ROBUST_OUT) $(PARETO_OUT) $(BUDGET_OUT) $(OTHER_DAYS_OUT) $(RIGS_OUT) $(LIVE_OUT) site peers build dist *.egg-info

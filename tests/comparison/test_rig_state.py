@@ -26,18 +26,17 @@ def silent(profile: Profile, *terms: TermName) -> Profile:
 
 
 def test_the_state_is_that_of_the_simulated_rig(measured: Profile) -> None:
-    """All but the rows' openings, which wire and psf both find a little too wide: a thousandth, by 3.7 sigma."""
     state, truth = rig_state(measured), draw_truth(measured.rig, 0)
     true = {
         "standoff_mm": -float(truth.optics.pupil_mm[2]),
         "pitch_mm": truth.panel.pitch_mm,
+        "row_open": truth.panel.row_open,
         "column_open": truth.panel.column_open,
         "depth_mm": truth.panel.depth_mm,
         "pupil_diameter_mm": truth.optics.pupil_diameter_mm,
     }
     for name, value in true.items():
         assert abs(number(state, name).value - value) < 3 * number(state, name).sigma, name
-    assert number(state, "row_open").value == pytest.approx(truth.panel.row_open, abs=1.5e-3)
     assert (state.terms, state.agreement_dof) == (("geometry", "wire", "psf", "backscatter"), 8)
     assert state.agreement_p_value > 0.01
     assert [one.name for one in state.estimates if one.by_prior] == ["pitch_mm"]

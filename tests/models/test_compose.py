@@ -1,11 +1,13 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from udccal.cfa import cfa_named
 from udccal.models.compose import bilinear_weights, expected_frame, mosaic_rate, space_varying_blur
-from udccal.models.noise import Noise
+from udccal.models.noise import Noise, electrons
 from udccal.numerics import in_float64
 
 NOISE = Noise(0.4, 64.0, 4000.0, 5.0, 0.1, 0.2, 1.0, 20.0, 2.0, 0.005)
@@ -50,3 +52,12 @@ def test_mean_and_variance_follow_the_photon_transfer_curve() -> None:
     mean, variance = (np.asarray(v) for v in expected_frame(NOISE, np.full((2, 2), 1.0e5), 0.01))
     np.testing.assert_allclose(mean, 64.0 + 0.4 * 1000.2, rtol=1e-6)
     np.testing.assert_allclose(variance, 0.4**2 * (1000.0 + 0.2 + 25.0) + 1.0 / 12.0, rtol=1e-6)
+
+
+def test_of_a_frame_whose_response_bends_electrons_are_found_again() -> None:
+    bent = replace(NOISE, nonlinearity=0.02)
+    mean, _ = expected_frame(bent, np.array([[0.0, 4e5, 9e5]]), 0.01)
+    straight, _ = expected_frame(NOISE, np.array([[0.0, 4e5, 9e5]]), 0.01)
+    assert float(mean[0, 2]) < float(straight[0, 2]) - 5
+    found = np.asarray(electrons(bent, mean)) - float(NOISE.dark_current_e_per_s) * 0.01
+    np.testing.assert_allclose(found, [[0.0, 4e3, 9e3]], rtol=1e-5, atol=1e-3)

@@ -165,7 +165,7 @@ DAMAGES: dict[str, tuple[Callable[[Path], object], str]] = {
     "no profile.json": (lambda f: (f / PROFILE_NAME).unlink(), "found none"),
     "cut short": (lambda f: (f / PROFILE_NAME).write_bytes((f / PROFILE_NAME).read_bytes()[:500]), "to be JSON"),
     "not an object": (lambda f: (f / PROFILE_NAME).write_text("[1]"), "JSON object"),
-    "newer": (damaged(lambda d: d.update(version=5)), "newer version 5"),
+    "newer": (damaged(lambda d: d.update(version=6)), "newer version 6"),
     "another format": (damaged(lambda d: d.update(format="udccal-session")), "format 'udccal-profile'"),
     "unknown entry": (damaged(lambda d: d.update(extra=1)), "'extra'"),
     "missing entry": (damaged(lambda d: d.pop("rig")), "'rig'"),

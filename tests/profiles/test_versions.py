@@ -90,7 +90,8 @@ def written_in_version_2(folder: Path, profile: Profile) -> Path:
     write_profile(folder, profile)
     document = json.loads((folder / "profile.json").read_bytes())
     document["version"], document["pictures"] = 2, document["pictures"][:3]
-    psf = document["terms"]["psf"]
+    noise, psf = document["terms"]["noise"], document["terms"]["psf"]
+    noise["parameters"] = [one for one in noise["parameters"] if one["name"] != "nonlinearity"]
     psf["parameters"] = [
         one for one in psf["parameters"] if "diffraction.blur_" not in one["name"] or one["name"].endswith("px")
     ]
@@ -123,6 +124,13 @@ def test_a_blur_of_version_3_is_the_same_all_over_the_field_and_in_all_colours(
     np.testing.assert_array_equal(old.blur_growth, np.zeros(2))
     np.testing.assert_array_equal(old.blur_colour, np.zeros(3))
     assert old.blur_px == toy_profile.psf.term.diffraction.blur_px
+
+
+def test_frames_of_version_4_are_linear(tmp_path: Path, toy_profile: Profile) -> None:
+    bent = replace(toy_profile.noise, term=replace(toy_profile.noise.term, nonlinearity=0.01))
+    old = read_profile(written_in_version_2(tmp_path / "p", replace(toy_profile, noise=bent))).noise.term
+    assert old == toy_profile.noise.term
+    assert toy_profile.noise.term.nonlinearity == 0.0
 
 
 BROKEN: dict[str, tuple[Callable[[JsonObject], object], str]] = {

@@ -61,11 +61,17 @@ def test_every_estimate_of_the_shipped_profile_has_its_truth_but_those_of_the_mo
     of_the_model = {
         ("psf", "blur_px"),
         ("psf", "kernel_relative_l2"),
+        ("psf", "blur_growth_radial"),
+        ("psf", "blur_growth_tangential"),
+        ("psf", "blur_red"),
+        ("psf", "blur_blue"),
         ("backscatter", "softness_px"),
         ("backscatter", "reflection"),
     }
     sections = {term: getattr(profile, term) for term in ("noise", "geometry", "wire", "psf", "backscatter")}
-    given = {(term, one.name) for term, section in sections.items() for one in section.estimates}
+    estimates = {(term, one.name) for term, section in sections.items() for one in section.estimates}
+    # How the light of a wire flat falls over the sensor is the lamp's and the lens's, not the rig's.
+    given = {(term, name) for term, name in estimates if not name.startswith("baseline.")}
     assert given - known == of_the_model
     assert known <= given
 

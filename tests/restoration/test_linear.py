@@ -13,6 +13,15 @@ def test_black_level_gain_and_dark_current(toy_noise: Noise) -> None:
     np.testing.assert_allclose(to_electrons(mosaic, toy_noise, 0.5), [[-10.0, 990.0]], atol=1e-3)
 
 
+def test_a_response_that_bends_is_straightened(toy_noise: Noise) -> None:
+    full_DN = 3969 - 64
+    linear_DN = np.array([[0.0, 100.0, 2000.0, 3800.0]])
+    codes = np.rint(64 + linear_DN * (1 - 0.03 * linear_DN / full_DN)).astype(np.uint16)
+    found = to_electrons(codes, replace(toy_noise, nonlinearity=0.03, dark_current_e_per_s=20.0), 0.5)
+    np.testing.assert_allclose(found, linear_DN / 0.355 - 10.0, atol=0.6 / 0.355)
+    assert abs(to_electrons(codes, toy_noise, 0.5)[0, 3] - 3800 / 0.355) > 100
+
+
 def test_saturation_is_a_margin_below_the_full_well(toy_noise: Noise) -> None:
     assert saturated(np.array([[3800, 3960, 3969]], np.uint16), toy_noise).tolist() == [[False, True, True]]
 

@@ -38,17 +38,17 @@ def test_the_shipped_weights_are_those_of_the_network() -> None:
 @pytest.mark.parametrize("factor", [1e-3, 7.0, 1e5])
 def test_light_does_not_matter_to_the_network(factor: float) -> None:
     balanced, chosen, sharper, scale, noise = inputs(64, 80)
-    found = corrected(balanced, chosen, sharper, scale, noise)
+    found = corrected(balanced, chosen, sharper, scale, noise, 1)
     of = np.float32(factor)
-    brighter = corrected(of * balanced, of * chosen, of * sharper, of * scale, noise)
+    brighter = corrected(of * balanced, of * chosen, of * sharper, of * scale, noise, 1)
     np.testing.assert_allclose(brighter, of * found, rtol=1e-4, atol=factor * 1e-3)
     assert np.abs(found - balanced).max() > 0.1
 
 
 def test_a_colour_is_not_taken_for_another() -> None:
     balanced, chosen, sharper, scale, noise = inputs(64, 80)
-    grey = corrected(balanced, chosen, sharper, scale, noise)
-    swapped = corrected(*(np.ascontiguousarray(p[..., ::-1]) for p in (balanced, chosen, sharper, scale)), noise)
+    grey = corrected(balanced, chosen, sharper, scale, noise, 1)
+    swapped = corrected(*(np.ascontiguousarray(p[..., ::-1]) for p in (balanced, chosen, sharper, scale)), noise, 1)
     assert np.abs(swapped[..., ::-1] - grey).max() > 1e-3
 
 
@@ -58,12 +58,23 @@ def test_blocks_leave_no_seams() -> None:
     detail = jnp.asarray(details(*pictures, scale))[None]
     direct = pictures[0] + scale * np.asarray(correction(network_weights(), detail, jnp.asarray(noise)[None]))[0]
     inner = np.s_[64:-64, 64:-64]
-    np.testing.assert_allclose(corrected(*given)[inner], direct[inner], atol=2e-3)
+    np.testing.assert_allclose(corrected(*given, 1)[inner], direct[inner], atol=2e-3)
+
+
+def test_seen_four_ways_round_no_way_counts_more() -> None:
+    """Pictures of whole cells: others are padded at their end, whichever that is."""
+    *pictures, scale, noise = inputs(128, 160)
+    for down, across in ((-1, 1), (1, -1)):
+        turned = [np.ascontiguousarray(planes[::down, ::across]) for planes in (*pictures, scale, noise)]
+        for views, tolerance in ((4, 2e-3), (1, None)):
+            found = corrected(*pictures, scale, noise, views)
+            off = np.abs(corrected(*turned, views)[::down, ::across] - found)[48:-48, 48:-48].max()
+            assert off < tolerance if tolerance else off > 0.05
 
 
 @pytest.mark.parametrize("size", [(1, 1), (3, 5), (37, 51), (258, 2)])
 def test_odd_sizes(size: tuple[int, int]) -> None:
-    found = corrected(*inputs(*size))
+    found = corrected(*inputs(*size), 4)
     assert found.shape == (*size, COLOURS)
     assert np.all(np.isfinite(found))
 

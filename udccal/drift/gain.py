@@ -8,8 +8,8 @@ from typing import final
 import numpy as np
 
 from udccal.cfa import cfa_named
-from udccal.fitting.noise.transfer import linear_signal, temporal_variance
-from udccal.models.noise import Noise
+from udccal.fitting.noise.transfer import temporal_variance
+from udccal.models.noise import Noise, linear_signal
 from udccal.result import FitResult
 from udccal.sessions.store import Average
 from udccal.validation.noise import transfer_numbers

@@ -103,7 +103,11 @@ def _changed(
             cov[index], cov[:, index] = 0.0, 0.0
             cov[index, index] = sigmas[one.name] ** 2
         estimates.append(
-            replace(one, value=one.value + added.get(one.name, 0.0), sigma=sigmas.get(one.name, one.sigma))
+            replace(
+                one,
+                value=float(one.value + added.get(one.name, 0.0)),
+                sigma=float(sigmas.get(one.name, one.sigma)),
+            )
         )
     note = f"{', '.join(added)} by a check of a few minutes; the other numbers are older."
     return replace(result, term=term, estimates=tuple(estimates), cov=cov, notes=(*result.notes, note))

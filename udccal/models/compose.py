@@ -95,5 +95,6 @@ def expected_frame(
         exposure_s: exposure time.
     """
     signal = jnp.asarray(rate) * exposure_s
-    mean = jnp.asarray(noise.black_DN) + noise.K_DN_per_e * (signal + noise.dark_current_e_per_s * exposure_s)
+    linear_DN = noise.K_DN_per_e * (signal + noise.dark_current_e_per_s * exposure_s)
+    mean = jnp.asarray(noise.black_DN) + linear_DN * (1 - noise.bend_per_DN * linear_DN)
     return mean, jnp.asarray(noise.K_DN_per_e) ** 2 * variance_e(noise, signal, exposure_s)

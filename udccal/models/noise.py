@@ -1,4 +1,4 @@
-"""Noise: EMVA 1288's linear camera model with the extra terms of the ELD model (Tukey-lambda read noise, row noise)."""
+"""Noise: EMVA 1288's camera model, a response that may bend, and Tukey-lambda read noise and row noise as in ELD."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ class Noise(eqx.Module):
     """Noise parameters of the sensor under their EMVA 1288 and ELD names.
 
     ``sigma_d_e`` is the temporal dark noise of one frame at zero exposure. It includes row noise but not quantisation.
+    ``nonlinearity`` is the fraction of the signal that is missing at saturation; K is that of small signals.
     """
 
     K_DN_per_e: Float[Arrayish, ""]
@@ -25,11 +26,28 @@ class Noise(eqx.Module):
     dark_current_e_per_s: Float[Arrayish, ""]
     DSNU1288_e: Float[Arrayish, ""]
     PRNU1288: Float[Arrayish, ""]
+    nonlinearity: Float[Arrayish, ""] = 0.0
+
+    @property
+    def bend_per_DN(self) -> Float[Arrayish, ""]:
+        """What the response lacks at a linear signal z, over z^2."""
+        return self.nonlinearity / (self.saturation_DN - self.black_DN)
+
+
+def linear_signal(mean_DN, bend_per_DN, K_DN_per_e=0.0):  # type: ignore[no-untyped-def]
+    """Return the linear signal z above black of a response y = z - bend (z^2 + K z), in DN.
+
+    K z is the variance of shot noise, for means of many frames; a single sample has none. Arguments and result are
+    numpy or JAX arrays. Beyond the parabola's top, which lies beyond saturation, values are finite.
+    """
+    slope = 1 - bend_per_DN * K_DN_per_e
+    # The root that goes to y / slope for a bend of 0, in the form without cancellation.
+    return 2 * mean_DN / (slope + abs(slope**2 - 4 * bend_per_DN * mean_DN) ** 0.5)
 
 
 def electrons(noise: Noise, signal_DN: Float[Arrayish, "*n"]) -> Float[Array, "*n"]:
-    """Return the linear signal in e-: (DN - black) / K."""
-    return (jnp.asarray(signal_DN) - noise.black_DN) / noise.K_DN_per_e
+    """Return the linear signal in e-: DN above black, without the response's bend, over K."""
+    return jnp.asarray(linear_signal(jnp.asarray(signal_DN) - noise.black_DN, noise.bend_per_DN) / noise.K_DN_per_e)
 
 
 def variance_e(noise: Noise, signal_e: Float[Arrayish, "*n"], exposure_s: Float[Arrayish, ""]) -> Float[Array, "*n"]:

@@ -64,6 +64,7 @@ RANGES: Mapping[type, Mapping[str, Range]] = {
         "dark_current_e_per_s": Real(-1e6, 1e8),
         "DSNU1288_e": Real(0.0, 1e6),
         "PRNU1288": Real(0.0, 10.0),
+        "nonlinearity": Real(-0.25, 0.25),
     },
     Geometry: {
         "focal_px": Real(1.0, 1e6, (2,)),

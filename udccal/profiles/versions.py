@@ -123,8 +123,23 @@ def _third_to_fourth(found: JsonObject) -> JsonObject:
     return {**found, "version": 4, "terms": terms}
 
 
+def _fourth_to_fifth(found: JsonObject) -> JsonObject:
+    """Say that frames are taken as linear, as they were before."""
+    terms = found.get("terms")
+    noise = terms.get("noise") if isinstance(terms, dict) else None
+    if isinstance(noise, dict) and isinstance(noise.get("parameters"), list):
+        linear = {"kind": "number", "name": "nonlinearity", "value": 0.0, "unit": "1", "sigma": None}
+        terms = {**found["terms"], "noise": {**noise, "parameters": [*noise["parameters"], linear]}}
+    return {**found, "version": 5, "terms": terms}
+
+
 # By the version that a function starts from; it returns the next version.
-MIGRATIONS: Mapping[int, Migration] = {1: _first_to_second, 2: _second_to_third, 3: _third_to_fourth}
+MIGRATIONS: Mapping[int, Migration] = {
+    1: _first_to_second,
+    2: _second_to_third,
+    3: _third_to_fourth,
+    4: _fourth_to_fifth,
+}
 
 
 def migrated(

@@ -24,6 +24,7 @@ from udccal.restoration.blur import blurred
 from udccal.restoration.kernel_grid import KernelGrid
 from udccal.restoration.mosaic_filter import filter_tables, filtered
 from udccal.restoration.network import refined, sharper
+from udccal.restoration.plan import PlanOptions
 from udccal.restoration.shrink import measured_noise, shrunk
 from udccal.restoration.tiles import TileLayout, layout_for
 from udccal.tiers import Tier
@@ -102,7 +103,7 @@ def deblur(
     if tier is Tier.balanced:
         return balanced * np.float32(unit)
     sharp = layout.join(filtered(tiles, *given, sharper(strengths))[0], workers)
-    best = refined(balanced, chosen, sharp, noise, local, bands, layout)
+    best = refined(balanced, chosen, sharp, noise, local, bands, layout, PlanOptions.network_views)
     # The samples have the last word: the filter of what they have more or less than the picture gives.
     rest = _cut(light - blurred(best, grid, layout), layout)
     return (best + layout.join(filtered(rest, *given)[0], workers)) * np.float32(unit)

@@ -135,7 +135,8 @@ def _measured(options: PlanOptions) -> PartTimes:
         clean -= np.float32(1.0) * ones
 
     def network() -> None:
-        corrected(picture, picture, picture, picture, noise_planes(bands, unit, signal, layout))
+        planes = noise_planes(bands, unit, signal, layout)
+        corrected(picture, picture, picture, picture, planes, options.network_views)
 
     parts = (
         (linear, mosaic.size),

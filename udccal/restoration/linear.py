@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from jaxtyping import ArrayLike, Bool, Float32, UInt16
 
-from udccal.models.noise import Noise
+from udccal.models.noise import Noise, linear_signal
 
 # Part of the range above black: where a sample says less than its light was.
 _SATURATION_MARGIN = 0.015
@@ -25,10 +25,23 @@ def dark_DN(noise: Noise, exposure_s: float) -> float:
 def to_electrons(
     mosaic: UInt16[np.ndarray, "rows columns"], noise: Noise, exposure_s: float
 ) -> Float32[np.ndarray, "rows columns"]:
-    """Return the signal in e-: DN above dark over K. Negative values stay."""
-    signal = cv2.subtract(mosaic, dark_DN(noise, exposure_s), dtype=cv2.CV_32F)
+    """Return the signal in e-: DN above dark, without the response's bend, over K. Negative values stay."""
+    signal = above_dark_DN(mosaic, noise, exposure_s)
     signal *= np.float32(1 / scalar(noise.K_DN_per_e))
     return signal
+
+
+def above_dark_DN(
+    mosaic: UInt16[np.ndarray, "rows columns"], noise: Noise, exposure_s: float
+) -> Float32[np.ndarray, "rows columns"]:
+    """Return the signal above dark in DN, without the response's bend."""
+    dark, bend = dark_DN(noise, exposure_s), scalar(noise.bend_per_DN)
+    if bend == 0:
+        return cv2.subtract(mosaic, dark, dtype=cv2.CV_32F)
+    black = scalar(noise.black_DN)
+    signal = linear_signal(cv2.subtract(mosaic, black, dtype=cv2.CV_32F), np.float32(bend))
+    signal -= np.float32(dark - black)
+    return np.asarray(signal)
 
 
 def saturated(mosaic: UInt16[np.ndarray, "rows columns"], noise: Noise) -> Bool[np.ndarray, "rows columns"]:

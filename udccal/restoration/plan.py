@@ -30,6 +30,7 @@ class PlanOptions:
         panel_block: pixels across the blocks of the panel's picture whose mean light makes backscatter; 1 takes pixels.
             2 is some three times as quick, and costs up to 0.8 dB where the scene is dark.
         interpolation: with which sharp pictures are resampled onto the view.
+        network_views: ways round in which the network of the tier ``accurate`` sees the picture, 1 to 4.
         workers: threads of the Fourier transforms.
     """
 
@@ -41,6 +42,7 @@ class PlanOptions:
     tile_columns: int = 256
     panel_block: int = 1
     interpolation: Interpolation = Interpolation.CUBIC
+    network_views: int = 4
     workers: int = 2
 
 

@@ -18,7 +18,7 @@ from jaxtyping import Array, Float32, UInt8, UInt16
 from udccal.cfa import Cfa
 from udccal.models.noise import Noise
 from udccal.restoration.backscatter import PanelMask
-from udccal.restoration.linear import dark_DN, scalar
+from udccal.restoration.linear import above_dark_DN, scalar
 from udccal.restoration.rectify import Interpolation, Rectification
 from udccal.restoration.tone import CODES, Tone
 
@@ -99,7 +99,7 @@ class Preview:
             tone: exposure and colour gains of the picture.
         """
         raw = mosaic[self.first_row : self.first_row + len(self.gain)]
-        signal = cv2.subtract(raw, dark_DN(self.noise, exposure_s), dtype=cv2.CV_32F)
+        signal = above_dark_DN(raw, self.noise, exposure_s)
         signal *= self.gain
         scale = tone.scale() / np.float32(exposure_s)
         if self.mask is None:

@@ -143,7 +143,8 @@ class Sharpener:
         balanced = shrunk(picture, found.noise_e, local, bands, self.layout, self.options.workers)
         if self.tier is Tier.balanced:
             return balanced
-        best = refined(balanced, picture, self._sharper(found), found.noise_e, local, bands, self.layout)
+        given = found.noise_e, local, bands, self.layout, self.options.network_views
+        best = refined(balanced, picture, self._sharper(found), *given)
         return best + self._contradicted(best, signal_e, clipped, found.noise_e)
 
     def solved(self, signal_e: Mosaic, variance_e2: Mosaic, clipped: Clipped) -> Solved:

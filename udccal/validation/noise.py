@@ -15,8 +15,8 @@ from udccal.fitting.engine.gaussian import square_root
 from udccal.fitting.noise.data import NoiseData, NoiseRules, read_noise
 from udccal.fitting.noise.flats import stacked
 from udccal.fitting.noise.moments import Moments, NoiseMoments, reduced
-from udccal.fitting.noise.transfer import linear_signal, temporal_variance
-from udccal.models.noise import Noise
+from udccal.fitting.noise.transfer import temporal_variance
+from udccal.models.noise import Noise, linear_signal
 from udccal.profiles.profile import Profile
 from udccal.result import FitResult
 from udccal.sessions.store import Session

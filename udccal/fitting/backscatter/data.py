@@ -26,7 +26,7 @@ from udccal.fitting.bins import Bins
 from udccal.fitting.nominal import nominal_backscatter
 from udccal.fitting.wire.data import ideal_points
 from udccal.models.geometry import Geometry
-from udccal.models.noise import Noise, variance_e
+from udccal.models.noise import Noise, linear_signal, variance_e
 from udccal.rig import RigDescription
 from udccal.sessions.schema import DarkSubject, PanelSubject
 from udccal.sessions.store import Average, Session
@@ -195,7 +195,8 @@ class Binning:
             float(np.asarray(getattr(self.noise, name)))
             for name in ("K_DN_per_e", "black_DN", "sigma_row_DN", "saturation_DN")
         )
-        signal_e, clipped = (average.mean - black_DN) / gain, average.mean >= self.most * saturation_DN
+        above_DN, clipped = average.mean - black_DN, average.mean >= self.most * saturation_DN
+        signal_e = linear_signal(above_DN, float(np.asarray(self.noise.bend_per_DN))) / gain
         # Variance in the dark, e-^2: of a row's offset, and of each sample independently.
         row_e2 = (row_DN / gain) ** 2
         rest_e2 = max(float(np.asarray(_variance_e(self.noise, np.zeros(()), np.float64(exposure_s)))) - row_e2, 0.0)

@@ -25,7 +25,7 @@ from udccal.fitting.geometry.bundle import GeometryRules, Intrinsics, Points
 from udccal.fitting.geometry.corners import BoardCorners, detect_corners, luminance, sites
 from udccal.fitting.nominal import nominal_geometry
 from udccal.models.geometry import Geometry
-from udccal.models.noise import Noise, variance_e
+from udccal.models.noise import Noise, linear_signal, variance_e
 from udccal.result import Outliers
 from udccal.rig import RigDescription
 from udccal.sessions.schema import BoardSubject, StoredCapture, StoredStep
@@ -154,7 +154,8 @@ def _read_view(
         raise TypeError(f"step {step.id} shows no board")
     mean = session.frame(capture) if capture.kind == "frame" else session.average(capture).mean
     spec = BoardSpec(subject.columns, subject.rows, subject.square_mm, subject.marker_mm, subject.dictionary)
-    light = mean.astype(np.float64) - float(np.asarray(noise.black_DN))
+    above_DN = mean.astype(np.float64) - float(np.asarray(noise.black_DN))
+    light = linear_signal(above_DN, float(np.asarray(noise.bend_per_DN)))
     area, offsets_DN = capture.region, float(np.asarray(noise.K_DN_per_e)) * float(np.asarray(noise.DSNU1288_e))
     variance = _temporal_variance_DN2(noise, light, capture) + offsets_DN**2
     part = np.s_[area.y : area.y + area.rows, area.x : area.x + area.columns]

@@ -28,7 +28,7 @@ from jaxtyping import Bool, Float, Int, UInt16
 
 from udccal.errors import FitError
 from udccal.models.arrays import Arrayish
-from udccal.models.noise import Noise
+from udccal.models.noise import Noise, linear_signal
 
 _PEAK = 0.3989422804  # of the normal density
 # Below zero rate the variance goes on falling, so that the estimate stays unbiased in the dark, down to this part.
@@ -74,6 +74,7 @@ class SensorNumbers(eqx.Module):
     level_e: Float[Arrayish, ""]
     offset_e: Float[Arrayish, ""]
     rounding_e: Float[Arrayish, ""]
+    bend_per_DN: Float[Arrayish, ""]
 
     @classmethod
     def of(cls, noise: Noise, unit_s: float, rules: HdrRules) -> SensorNumbers:
@@ -92,8 +93,14 @@ class SensorNumbers(eqx.Module):
         floor = max(sigma_d**2 + (q / K) ** 2 / 12.0, 1e-4)
         # The first harmonic of the codes' steps, as far as noise does not smear them.
         rounding = q / K / np.pi * np.exp(-2 * (np.pi * sigma_d * K / q) ** 2)
-        level = (saturation - black) / K - rules.margin_sigma * floor**0.5
-        return cls(black, 1 / K, dark * unit_s, floor, level, offset, float(rounding))
+        bend = float(np.asarray(noise.bend_per_DN))
+        level = linear_signal(saturation - black, bend) / K - rules.margin_sigma * floor**0.5
+        return cls(black, 1 / K, dark * unit_s, floor, level, offset, float(rounding), bend)
+
+    def electrons(self, codes: Float[Arrayish, "n pixels"]) -> Float[Arrayish, "n pixels"]:
+        """Light of samples in e-, dark current included; the response's bend is taken out."""
+        signal: Float[Arrayish, "n pixels"] = linear_signal(codes - self.black_DN, self.bend_per_DN)
+        return signal * self.e_per_DN
 
 
 class BlockMerge(eqx.Module):
@@ -147,7 +154,7 @@ def merge_block(
         mean = (rate + sensor.dark_e_per_s) * time
         return mean, xp.maximum(mean + sensor.floor_e2, _LEAST_VARIANCE * sensor.floor_e2)
 
-    light = (frames.astype(np.float32) - sensor.black_DN) * sensor.e_per_DN
+    light = sensor.electrons(frames.astype(np.float32))
     is_open, is_clipped = (light < sensor.level_e) & ~left_out, (light >= sensor.level_e) & ~left_out
     electrons = xp.where(is_open, light - sensor.dark_e_per_s * time, 0).sum(axis=0)
     rate = electrons / xp.maximum(xp.where(is_open, time, 0).sum(axis=0), _TINY)

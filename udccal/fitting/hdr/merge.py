@@ -195,7 +195,7 @@ class _Bracket:
         """Samples, in electrons, of some pixels with more than ``least_rate`` and at least so many samples."""
         sensor, pixels = self.sensor, np.flatnonzero((merged.used >= least) & (merged.rate > least_rate))
         pixels = pixels[:: max(1, len(pixels) // 20_000)]
-        light = (self.codes[:, pixels].astype(np.float64) - sensor.black_DN) * sensor.e_per_DN
+        light = np.asarray(sensor.electrons(self.codes[:, pixels].astype(np.float64)))
         times = self.times[:, None].astype(np.float64)
         signal = merged.rate[pixels] * times
         mean = signal + sensor.dark_e_per_s * times

@@ -20,14 +20,13 @@ from udccal.fitting.noise.data import NoiseData, NoiseRules
 from udccal.fitting.noise.flats import Curve, find_saturation, fit_curve, rough_gain
 from udccal.fitting.noise.moments import NoiseMoments, bins, reduced
 from udccal.fitting.noise.patterns import Pattern, prnu, rough_median
-from udccal.fitting.noise.transfer import linear_signal
-from udccal.models.noise import Noise
+from udccal.models.noise import Noise, linear_signal
 from udccal.numerics import in_float64
 from udccal.result import Diagnostic, FitResult, FitStatus, Outliers
 from udccal.rig import RigDescription
 
-# The term's fields, and the fraction of the signal that is missing at full scale, where the data ask for it.
-NAMES = (*Noise.__dataclass_fields__, "nonlinearity")
+# The last one, the fraction of the signal that is missing at full scale, is estimated where the data ask for it.
+NAMES = tuple(Noise.__dataclass_fields__)
 
 
 def nominal_noise(rig: RigDescription) -> Noise:
@@ -194,7 +193,7 @@ def _assembled(data: NoiseMoments, dark: DarkTerms, curve: Curve) -> FitResult[N
     places = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
     return FitResult(
         name="noise",
-        term=_term(values[:-1]),
+        term=_term(values[:shown]),
         status=status,
         estimates=estimates("noise", NAMES[:shown], values[:shown], cov[:shown, :shown]),
         cov=cov[:shown, :shown],
@@ -217,11 +216,11 @@ def _assembled(data: NoiseMoments, dark: DarkTerms, curve: Curve) -> FitResult[N
         notes=tuple(_notes(data, dark, curve, uneven, values, bent_too_far)),
         outliers=tuple(one for one in _outliers(data, dark, curve, float(values[2]), uneven) if one.count),
         residuals=residual_sample(places[np.nonzero(used)[1]], fit.variance_z[used]),
-        posterior=Posterior.from_cov(values[:-1], cov[:-1, :-1], _term),
+        posterior=Posterior.from_cov(values[:shown], cov[:shown, :shown], _term),
     )
 
 
-def _term(values: Float[np.ndarray, "10"]) -> Noise:
+def _term(values: Float[np.ndarray, " shown"]) -> Noise:
     return Noise(*(float(value) for value in values))
 
 

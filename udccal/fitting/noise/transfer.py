@@ -22,6 +22,7 @@ from udccal.fitting.engine.misfit import MisfitTest, chi2_test, excess_variance
 from udccal.fitting.engine.orders import Attempt, Choice, bic, choose
 from udccal.fitting.engine.robust import OutlierRule
 from udccal.fitting.noise.data import NoiseRules
+from udccal.models.noise import linear_signal
 
 Grid = Float[np.ndarray, "levels bins"]
 PerLevel = Float[np.ndarray, " levels"]
@@ -113,13 +114,6 @@ class TransferFit:
     level_z: PerLevel
     misfit: MisfitTest
     samples: int
-
-
-def linear_signal(mean_DN, curvature_per_DN, K_DN_per_e):  # type: ignore[no-untyped-def]
-    """z from y = z - c (z^2 + K z); works on numpy and JAX arrays alike."""
-    slope = 1 - curvature_per_DN * K_DN_per_e
-    # The root that goes to y / slope for c -> 0, in the form without cancellation.
-    return 2 * mean_DN / (slope + (slope**2 - 4 * curvature_per_DN * mean_DN) ** 0.5)
 
 
 def temporal_variance(signal_DN, K_DN_per_e, V0_DN2, curvature_per_DN, rounding_DN2):  # type: ignore[no-untyped-def]

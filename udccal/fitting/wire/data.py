@@ -23,7 +23,7 @@ from udccal.errors import FitError, found_instead
 from udccal.fitting.engine.robust import OutlierRule
 from udccal.fitting.wire.rules import WireRules, WireStart, wire_start
 from udccal.models.geometry import Geometry
-from udccal.models.noise import Noise
+from udccal.models.noise import Noise, linear_signal
 from udccal.result import Outliers
 from udccal.sessions.store import Session
 
@@ -113,12 +113,17 @@ def read_wire(session: Session, noise: Noise, geometry: Geometry, rules: WireRul
     """
     rules = rules or WireRules()
     flat, dark = (session.average(session.step(f"wire/{step}").captures[0]) for step in ("flat", "dark"))
-    saturation = float(np.asarray(noise.saturation_DN))
-    headroom = saturation - float(np.mean(dark.mean))
+    saturation, black, bend = (
+        float(np.asarray(one)) for one in (noise.saturation_DN, noise.black_DN, noise.bend_per_DN)
+    )
+    lit, unlit = (linear_signal(one.mean - np.float32(black), np.float32(bend)) for one in (flat, dark))
+    # Where the response bends, it shows less of the noise as well: the slope of linear signals, to first order.
+    steep2 = (1 + 2 * np.float32(bend) * lit) ** 2
+    headroom = float(linear_signal(saturation - black, bend)) - float(np.mean(unlit))
     shot = np.sqrt(max(headroom * float(np.asarray(noise.K_DN_per_e)), 0.0))
     return WireData(
-        signal=flat.mean - dark.mean,
-        variance=flat.variance / flat.frames + dark.variance / dark.frames,
+        signal=lit - unlit,
+        variance=flat.variance * steep2 / flat.frames + dark.variance / dark.frames,
         geometry=geometry,
         start=wire_start(session.rig),
         PRNU1288=float(np.asarray(noise.PRNU1288)),
