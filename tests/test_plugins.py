@@ -15,7 +15,7 @@ OWN = ("wire", "procedures.wire:WireProcedure")
 
 def install(monkeypatch: pytest.MonkeyPatch, *points: tuple[str, str]) -> None:
     found = EntryPoints(EntryPoint(name, value, plugins.PROCEDURES) for name, value in points)
-    monkeypatch.setattr(plugins, "entry_points", lambda **chosen: found.select(**chosen))
+    monkeypatch.setattr(plugins, "_installed", lambda group: found.select(group=group))
 
 
 @pytest.mark.parametrize("term", ["noise", "geometry", "wire", "psf", "backscatter"])

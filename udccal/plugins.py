@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from importlib.metadata import EntryPoint, entry_points
+import functools
+from importlib.metadata import EntryPoint, EntryPoints, entry_points
 
 from udccal.errors import UdccalError
 
@@ -29,10 +30,10 @@ def find_sink(name: str) -> type:
 
 
 def _find(group: str, name: str, what: str) -> type:
-    found = entry_points(group=group, name=name)
+    found = _installed(group).select(name=name)
     others = [point for point in found if not _is_our_own(point)]
     if not found:
-        present = ", ".join(sorted({point.name for point in entry_points(group=group)})) or "nothing"
+        present = ", ".join(sorted({point.name for point in _installed(group)})) or "nothing"
         raise UdccalError(
             f"Expected an installed {what}, found none in the entry-point group '{group}', which has {present}. "
             "Choose one of these, install udccal with pip, or install the package that provides it."
@@ -41,6 +42,12 @@ def _find(group: str, name: str, what: str) -> type:
         values = " and ".join(point.value for point in others)
         raise UdccalError(f"Expected one {what}, found {values}. Uninstall the package you do not want.")
     return _load(next(iter(others or found)), what)
+
+
+@functools.cache
+def _installed(group: str) -> EntryPoints:
+    """Return the entry points of a group; reading the metadata of all packages takes 20 ms, so it is done once."""
+    return entry_points(group=group)
 
 
 def _is_our_own(point: EntryPoint) -> bool:
