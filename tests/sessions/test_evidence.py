@@ -47,5 +47,5 @@ def test_counts_gains_and_times_are_those_of_all_steps() -> None:
 
 
 def test_a_quick_fit_can_be_told() -> None:
-    efforts = (FitEffort(), FitEffort(workers=2), QUICK, replace(QUICK, workers=1), FitEffort(wire_samples=1000))
+    efforts = (FitEffort(), FitEffort(workers=1), QUICK, replace(QUICK, workers=1), FitEffort(wire_samples=1000))
     assert [effort.label for effort in efforts] == ["full", "full", "quick", "quick", "own"]

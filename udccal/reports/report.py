@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 from jaxtyping import UInt8
 
@@ -41,7 +43,11 @@ def gather(
     Raises:
         SessionError: when a file of the session is damaged.
     """
-    fitted = fitted_maps(calibration, picture)
+    # The maps wait for compiled code, and the forecasts are Python: they run at the same time.
+    with ThreadPoolExecutor(1) as beside:
+        maps = beside.submit(fitted_maps, calibration, picture)
+        accuracy = accuracies(calibration)
+    fitted = maps.result()
     true = None if light is None else true_maps(light, fitted)
     rows = () if light is None or true is None else compare_with_truth(calibration, light.truth, fitted, true)
     noise, geometry = calibration.noise.term, calibration.geometry.term
@@ -52,7 +58,7 @@ def gather(
         rows,
         photon_transfer(session, noise),
         board_evidence(calibration.foundation.boards, geometry),
-        accuracies(calibration),
+        accuracy,
     )
 
 
