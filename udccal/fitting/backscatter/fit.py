@@ -137,7 +137,7 @@ def result_of(found: Found, data: BackscatterData, rig: RigDescription, clipped:
         outliers=_outliers(found, data, clipped),
         # The eliminated mask reduces the residuals' variance; the factor corrects for it.
         residuals=residual_sample(
-            found.places[np.nonzero(used)[2]] * problem.template.step,
+            found.places[np.nonzero(used)[2]] * float(problem.template.step),
             fitted.best.z[used] * np.sqrt(used.sum() / found.dof),
         ),
         posterior=posterior,
