@@ -57,6 +57,7 @@ from udccal.rig import RigDescription
 
 BAD_PICTURES = OutlierRule("pictures in brightness or pattern")
 BAD_BINS = OutlierRule("bins")
+PerSample = Float[np.ndarray, " k"]
 
 
 @final
@@ -81,7 +82,7 @@ class Fitted:
         used[-1] = False
         return used
 
-    def squares(self, seen: Binned, used: Usable) -> tuple[Float[np.ndarray, " k"], ...]:
+    def squares(self, seen: Binned, used: Usable) -> tuple[PerSample, PerSample, PerSample]:
         """Return squared errors of some samples, their variance by noise, and that by a model error of 1."""
         unit = np.broadcast_to(self.best.mask**2, used.shape).copy()
         # White is the mask by definition, and dark has no light: neither has a model error.
@@ -183,7 +184,7 @@ class Found:
     @property
     def good(self) -> Bool[np.ndarray, " shots"]:
         """Shots (white first, dark last) that are not left out whole."""
-        return self.fitted.best.weight.any(axis=(1, 2))
+        return np.asarray((self.fitted.best.weight > 0).any(axis=(1, 2)))
 
     @property
     def places(self) -> Int[np.ndarray, "n 2"]:
