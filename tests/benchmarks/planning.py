@@ -30,9 +30,8 @@ from udccal.calibration import Calibration, calibrate
 from udccal.compilation import keep_compilations
 from udccal.displays.pictures import face_picture
 from udccal.fitting.backscatter.data import read_backscatter
-from udccal.fitting.backscatter.fit import term_posterior
-from udccal.fitting.backscatter.orders import search
-from udccal.fitting.backscatter.solve import Problem
+from udccal.fitting.backscatter.fit import TermAt, linear_cov
+from udccal.fitting.backscatter.solve import Problem, search
 from udccal.fitting.geometry.fit import projection_sigma_px
 from udccal.planning.forecast import PREDICTORS
 from udccal.planning.state import ModelErrors, measured_state, sensor_samples
@@ -102,7 +101,7 @@ def _backscatter_percent(made: Obtained) -> float:
     found = search(Problem.of(data, geometry, rig))
     # By noise alone.
     found = replace(found, model_error=0.0)
-    posterior = term_posterior(data, found, np.ones(len(found.fitted.found.x)))
+    posterior = TermAt.of(data, found).posterior(linear_cov(found, np.ones(len(found.fitted.found.x))))
     light = predicted_light(posterior.term_at(posterior.mean), posterior, 0.0, rig, new, found.problem.flat)
     peak = light.rate.max(axis=(1, 2))
     return 100 * float(np.sqrt((light.sigma**2).mean() / (peak**2).mean()))

@@ -26,16 +26,17 @@ from tests.scenes.backscatter import (
 )
 from udccal.fitting.backscatter.data import BackscatterData, grid_rays
 from udccal.fitting.backscatter.fit import TermAt, result_of
-from udccal.fitting.backscatter.orders import moments_along_reflection, search
 from udccal.fitting.backscatter.parameters import (
     NAMES,
     TWO_PLANES,
     footprint_per_pupil,
     linear_of,
     linear_slope,
+    moments_along_reflection,
+    most_probable,
     prior_of,
 )
-from udccal.fitting.backscatter.solve import Problem, most_probable
+from udccal.fitting.backscatter.solve import Problem, search
 from udccal.fitting.engine.gaussian import Posterior
 from udccal.models.backscatter import Backscatter
 from udccal.numerics import in_float64
@@ -72,7 +73,7 @@ def ideal_of(of: World, expected: BackscatterData, flat: np.ndarray, template: B
     used = np.ones(len(seen.rate), dtype=bool)
     # The prior draws what is hardly seen towards its mean.
     found = most_probable(errors_at, of.x, free, prior)
-    sigma = np.sqrt(np.diag(moments_along_reflection(errors_at, found, free, prior, RULES).cov))
+    sigma = np.sqrt(np.diag(moments_along_reflection(errors_at, found, free, prior).cov))
     sigma[2] /= footprint_per_pupil(of.rig)
     return Ideal(TermAt(template, expected, used, 0.0, theta).posterior(cov), sigma)
 

@@ -21,10 +21,9 @@ from tests.scenes.backscatter import (
     world_at,
 )
 from udccal.fitting.backscatter.data import BackscatterData
-from udccal.fitting.backscatter.fit import fit_backscatter, term_posterior
-from udccal.fitting.backscatter.orders import search
+from udccal.fitting.backscatter.fit import TermAt, fit_backscatter, linear_cov
 from udccal.fitting.backscatter.parameters import KERNELS, MIX, REFLECTION, TWO_PLANES, Order, prior_of, values_of
-from udccal.fitting.backscatter.solve import Fitted, Problem
+from udccal.fitting.backscatter.solve import Fitted, Problem, search
 from udccal.fitting.engine.gaussian import Posterior
 from udccal.fitting.engine.orders import Attempt, Choice
 from udccal.models.backscatter import Backscatter
@@ -132,7 +131,7 @@ def test_predicted_light_is_as_unsure_as_its_order() -> None:
 
     def predicted(*tried: Attempt[Fitted]) -> tuple[Posterior[Backscatter], Light]:
         known = replace(found, orders=Choice(tried[0], tried))
-        posterior = term_posterior(shots, known, np.ones(18))
+        posterior = TermAt.of(shots, known).posterior(linear_cov(known, np.ones(18)))
         term = posterior.term_at(posterior.mean)
         return posterior, predicted_light(term, posterior, 0.0, RIG, new, place)
 

@@ -8,7 +8,7 @@ import jax
 import numpy as np
 import pytest
 
-from udccal.fitting.backscatter.data import Binned, directions, grid_step, sampled_rays, visible_crop
+from udccal.fitting.backscatter.data import Binned, Profile, directions, grid_step, sampled_rays, visible_crop
 from udccal.fitting.backscatter.model import (
     PanelCrop,
     Pictures,
@@ -17,20 +17,20 @@ from udccal.fitting.backscatter.model import (
     ratios_and_jacobian,
     window_for,
 )
-from udccal.fitting.backscatter.orders import typical_error
 from udccal.fitting.backscatter.parameters import (
     KERNELS,
     PUPIL,
     REFLECTION,
     SOFTNESS,
     TWO_PLANES,
+    MostProbable,
     linear_of,
     linear_slope,
     prior_of,
     vector_of,
     with_linear,
 )
-from udccal.fitting.backscatter.solve import Fitted, MostProbable, Profile
+from udccal.fitting.backscatter.solve import Fitted, typical_error
 from udccal.fitting.nominal import nominal_backscatter, nominal_geometry
 from udccal.models.backscatter import emitter_shares, panel_response, response_grid, window_corners
 from udccal.models.geometry import panel_directions
@@ -93,7 +93,7 @@ def test_shares_are_those_of_the_model(softness: float, window: int) -> None:
         wanted = np.moveaxis(np.asarray(emitter_shares(term, rays, corner)), 1, 2)
     shares, found = Shares.of(template, theta, rays), np.zeros((len(rays) * 6, window**2))
     column, row = (shares.panel_px - corner[shares.row // 6]).T
-    found[shares.row, row * window + column] = shares.value
+    found[shares.row, row * window + column] = shares.values[0]
     direct, reflected = np.moveaxis(found.reshape(len(rays), 2, 3, -1), 1, 0)
     whole = (1 - theta[REFLECTION]) * direct + theta[REFLECTION] * reflected
     np.testing.assert_allclose(whole, wanted, atol=1e-12)
@@ -111,8 +111,7 @@ def test_nothing_comes_from_beyond_the_crop() -> None:
     pictures = Pictures.of(np.full((1, 2, 3, 3), 255, np.uint8), PanelCrop(1, 1, 3, 2))
     column, row = np.divmod(np.arange(9), 3)
     panel_px = np.stack([column, row], axis=1)
-    shares = Shares(2, np.zeros(9, int), panel_px, np.ones(9), np.zeros(9, dtype=bool), np.zeros((0, 0)))
-    sums = shares.light(pictures, pictures.light(2.2)[0])
+    sums = Shares(2, np.zeros(9, int), panel_px, np.ones((1, 9))).light(pictures, pictures.light(2.2)[0])[0]
     np.testing.assert_array_equal(sums[0, 0, 0], [4.0, 4.0, 0.0])
     assert not sums[1].any()
 

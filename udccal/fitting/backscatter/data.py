@@ -12,15 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped, UInt8
 from scipy.spatial.transform import Rotation
 
-from udccal.fitting.backscatter.model import (
-    PanelCrop,
-    PerBin,
-    PerShot,
-    Pictures,
-    Rays,
-    Usable,
-    corners_of,
-)
+from udccal.fitting.backscatter.model import Moves, PanelCrop, PerBin, PerShot, Pictures, Rays, Usable, corners_of
 from udccal.fitting.backscatter.parameters import BackscatterRules, linear_of, prior_of
 from udccal.fitting.bins import Bins
 from udccal.fitting.nominal import nominal_backscatter
@@ -96,11 +88,81 @@ class Binned:
         variance[1:-1] += (model_error * mask) ** 2
         return np.where(usable, 1 / np.sqrt(variance), 0.0)
 
-    def first_weights(self) -> PerShot:
-        """Return weights at the measured light plus one electron, for safety."""
-        rate = np.maximum(self.excess, 0.0) + self.shot
+    def first_weights(self, usable: Usable, model_error: float = 0.0) -> PerShot:
+        """Return weights at the measured light, plus one electron for safety, and with the measured mask."""
+        light = np.maximum(self.excess, 0.0)
+        rate = light + self.shot
         rate[-1] = 0.0
-        return self.weights(rate, np.zeros(rate.shape[1:]), 0.0, self.usable)
+        return self.weights(rate, light[0], model_error, usable)
+
+
+@final
+@dataclass(frozen=True)
+class Profile:
+    """The most probable mask and dark signal for given ratios, bin by bin.
+
+    Light of shot i at a position and colour is  y_i = m r_i + u_i d + noise. r_i is the picture's light over that of
+    white (1 for white itself, 0 for the dark frame), m the mask and d the dark signal there, u_i the dark frame's
+    exposure over the shot's. m and d have no prior and enter linearly: they are eliminated exactly, bin by bin, so that
+    the noise of white and dark, which is common to all pictures of a bin, has its right weight.
+
+    Attributes:
+        mask, dark: e-/s.
+        errors: measured less modelled rates; ``weight`` is 1 / sigma of each.
+        information: on the mask, with the dark signal eliminated.
+        by_mask, by_dark: orthonormal directions of the whitened errors that mask and dark remove.
+    """
+
+    mask: PerBin
+    dark: PerBin
+    errors: PerShot
+    weight: PerShot
+    information: PerBin
+    by_mask: PerShot
+    by_dark: PerShot
+
+    @property
+    def z(self) -> PerShot:
+        """Errors in units of their sigma, 0 for samples without weight."""
+        return self.errors * self.weight
+
+    @property
+    def chi2(self) -> float:
+        """Chi-squared without the prior."""
+        return float((self.z**2).sum())
+
+    @classmethod
+    def of(cls, seen: Binned, ratio: PerShot, weight: PerShot) -> Profile:
+        """Solve for mask and dark signal from the ratios of all shots."""
+        light, exposure = seen.rate, (seen.exposure_s[-1] / seen.exposure_s)[:, None, None]
+        apart = exposure * weight
+        length = np.sqrt((apart**2).sum(axis=0))
+        by_dark = apart / length
+        across = ratio * weight - by_dark * (by_dark * ratio * weight).sum(axis=0)
+        information = (across**2).sum(axis=0)
+        root = np.sqrt(np.where(information > 0, information, 1.0))
+        by_mask = across / root
+        mask = (by_mask * light * weight).sum(axis=0) / root
+        dark = (by_dark * (light - mask * ratio) * weight).sum(axis=0) / length
+        return cls(mask, dark, light - mask * ratio - exposure * dark, weight, information, by_mask, by_dark)
+
+    def jacobian(self, of_ratio: Moves) -> Moves:
+        """Return the whitened errors' Jacobian without the parts that mask and dark remove (Kaufman, BIT 15, 1975)."""
+        jacobian = -(self.mask * self.weight) * of_ratio
+        for way in (self.by_dark, self.by_mask):
+            jacobian -= way * np.einsum("scn,kscn->kcn", way, jacobian)[:, None]
+        return jacobian
+
+    def mask_jacobian(self, of_ratio: Moves) -> Float[np.ndarray, "k 3 n"]:
+        """Return the mask's derivatives for the expected light; the contribution of noise is of second order."""
+        along = np.einsum("scn,kscn->kcn", self.by_mask * self.weight, of_ratio)
+        return -self.mask * along / np.sqrt(np.where(self.information > 0, self.information, 1.0))
+
+    def light_variance(self, ratio: PerShot, of_ratio: Moves, cov: Float[np.ndarray, "k k"]) -> PerShot:
+        """Return predicted light's variance: from the parameters and their effect on the mask, and from its noise."""
+        moves = self.mask * of_ratio + ratio * self.mask_jacobian(of_ratio)[:, None]
+        by_parameters = np.einsum("kicn,kl,licn->icn", moves, cov, moves, optimize=True)
+        return np.asarray(by_parameters + ratio**2 / np.maximum(self.information, 1e-30))
 
 
 @final
@@ -133,11 +195,7 @@ class BackscatterData:
 
 
 def read_backscatter(
-    session: Session,
-    noise: Noise,
-    geometry: Geometry,
-    shading: Float[np.ndarray, "rows columns"],
-    rules: BackscatterRules | None = None,
+    session: Session, noise: Noise, geometry: Geometry, shading: Float[np.ndarray, "rows columns"]
 ) -> BackscatterData:
     """Bin the averages of the steps ``backscatter/*`` of a session, one at a time.
 
@@ -146,7 +204,6 @@ def read_backscatter(
         noise: gives K, black level and saturation, and the variance of samples.
         geometry: the rays of pixels.
         shading: the wire's map of the sensor (``fitting.wire.sensor_map``), which divides the rates.
-        rules: give the fraction of saturation from which a mean is clipped.
 
     Returns:
         rates in e-/s by bin and colour; without shots where white or dark were not captured.
@@ -155,8 +212,7 @@ def read_backscatter(
         SessionError: when a file is missing or damaged.
     """
     crop, bins = visible_crop(geometry, session.rig), Bins(session.rig.camera.cfa, grid_step(session.rig))
-    binning = Binning(noise, shading, bins, (rules or BackscatterRules()).clipped)
-    steps = session.steps("backscatter")
+    binning, steps = Binning(noise, shading, bins), session.steps("backscatter")
     panels = [(step, step.subject) for step in steps if isinstance(step.subject, PanelSubject)]
     white = [step for step, subject in panels if subject.role == "white"]
     dark = [step for step in steps if isinstance(step.subject, DarkSubject)]
@@ -165,12 +221,10 @@ def read_backscatter(
     if not white or not dark:
         nothing, none = np.zeros((0, 3, 1, 1)), np.zeros(0)
         return BackscatterData(Binned(nothing, nothing, nothing, nothing > 0, none, none), shown, crop, ())
-    shots = [
-        binning.of(session.average(step.captures[0]), step.captures[0].exposure_s)
-        for step in (white[0], *(step for step, _ in others), dark[0])
-    ]
+    captures = [step.captures[0] for step in (white[0], *(step for step, _ in others), dark[0])]
+    shots = Binned.joined([binning.of(session.average(one), one.exposure_s) for one in captures])
     shown = np.concatenate([shown, *(crop.of(session.picture(subject))[None] for _, subject in others)])
-    return BackscatterData(Binned.joined(shots), shown, crop, tuple(step.id for step, _ in others))
+    return BackscatterData(shots, shown, crop, tuple(step.id for step, _ in others))
 
 
 @final
@@ -181,7 +235,7 @@ class Binning:
     noise: Noise
     shading: Float[np.ndarray, "rows columns"]
     bins: Bins
-    most: float
+    most: float = BackscatterRules.clipped
 
     @functools.cached_property
     def _variances(self) -> tuple[Float[np.ndarray, "3 a b"], ...]:
@@ -191,12 +245,12 @@ class Binning:
 
     def of(self, average: Average, exposure_s: float) -> Binned:
         """Bin one shot from its average in DN."""
-        gain, black_DN, row_DN, saturation_DN = (
+        gain, black_DN, row_DN, saturation_DN, bend_per_DN = (
             float(np.asarray(getattr(self.noise, name)))
-            for name in ("K_DN_per_e", "black_DN", "sigma_row_DN", "saturation_DN")
+            for name in ("K_DN_per_e", "black_DN", "sigma_row_DN", "saturation_DN", "bend_per_DN")
         )
-        above_DN, clipped = average.mean - black_DN, average.mean >= self.most * saturation_DN
-        signal_e = linear_signal(above_DN, float(np.asarray(self.noise.bend_per_DN))) / gain
+        signal_e = linear_signal(average.mean - black_DN, bend_per_DN) / gain
+        clipped = average.mean >= self.most * saturation_DN
         # Variance in the dark, e-^2: of a row's offset, and of each sample independently.
         row_e2 = (row_DN / gain) ** 2
         rest_e2 = max(float(np.asarray(_variance_e(self.noise, np.zeros(()), np.float64(exposure_s)))) - row_e2, 0.0)

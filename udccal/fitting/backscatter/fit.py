@@ -3,25 +3,17 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import final
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32
+from jaxtyping import Bool, Float, Int
+from scipy.linalg import block_diag
 
 from udccal.fitting.absent import absent_backscatter
-from udccal.fitting.backscatter.data import BackscatterData, Binned, grid_rays
+from udccal.fitting.backscatter.data import BackscatterData, Binned, Profile, grid_rays
 from udccal.fitting.backscatter.model import Rays, Usable, ratios, ratios_and_jacobian, window_for
-from udccal.fitting.backscatter.orders import (
-    BAD_BINS,
-    BAD_PICTURES,
-    Found,
-    disagreement,
-    residual_pattern,
-    search,
-    value_moments,
-)
 from udccal.fitting.backscatter.parameters import (
     DEPTH,
     DISTANCE,
@@ -30,16 +22,20 @@ from udccal.fitting.backscatter.parameters import (
     PUPIL,
     BackscatterRules,
     Moments,
+    MostProbable,
     Vector,
     footprint_per_pupil,
     linear_of,
     linear_slope,
-    nominal_of,
+    moments_along_reflection,
+    most_probable,
+    value_slope,
+    values_of,
     with_linear,
 )
-from udccal.fitting.backscatter.solve import Problem, Profile
+from udccal.fitting.backscatter.solve import BAD_BINS, BAD_PICTURES, Found, Problem, search
 from udccal.fitting.engine.gaussian import Posterior, square_root
-from udccal.fitting.engine.misfit import MisfitTest
+from udccal.fitting.engine.misfit import NO_TEST, MisfitTest, chi2_test, group_means_test, sharper
 from udccal.fitting.engine.report import coarse, estimates, priors_of, residual_sample
 from udccal.fitting.engine.robust import outliers
 from udccal.models.backscatter import Backscatter
@@ -92,8 +88,7 @@ def _unusable(
     if (clipped := shots.clipped[0].mean()) > rules.most_clipped:
         return FitStatus.SATURATED, f"{clipped:.0%} of the white picture's bins hold clipped samples."
     sigma = shots.excess[0] / np.sqrt(shots.variance(np.zeros(shots.rate.shape))[0] + shots.rest[-1])
-    present = float(sigma.sum()) > rules.present_sigma * np.sqrt(sigma.size)
-    if not (present and float(np.percentile(sigma, 90)) > rules.visible_sigma):
+    if not np.percentile(sigma, 90) > rules.visible_sigma:
         return FitStatus.ABSENT, "The white picture gives no light that shows above noise."
     found = f"found {keep.sum()} ({(~keep).sum()} clipped)"
     if keep.sum() < rules.fewest_pictures:
@@ -103,27 +98,27 @@ def _unusable(
 
 def result_of(found: Found, data: BackscatterData, rig: RigDescription, clipped: list[str]) -> FitResult[Backscatter]:
     """Return the fit as a result; ``clipped`` names the pictures that were left out before it."""
-    fitted, template, used = found.fitted, found.problem.template, found.fitted.used
-    rest = residual_pattern(found)
-    wider = disagreement(found)
+    fitted, used, problem = found.fitted, found.fitted.used, found.problem
+    rest, wider = residual_pattern(found), disagreement(found)
     values = value_moments(found, rest.inflation)
     # A pattern has widened all parameters already.
     scale = np.sqrt(np.maximum(wider / rest.inflation, 1.0))
-    values = replace(values, cov=values.cov * np.outer(scale, scale))
+    cov = values.cov * np.outer(scale, scale)
     # Pictures give lengths in panel pixels only: lengths change with the pitch.
-    pitch, scale = rig.panel.pitch_mm, np.ones(len(NAMES))
-    moved = np.where(np.isin(np.arange(len(NAMES)), [DISTANCE, PUPIL, DEPTH]), values.mean, 0.0)
-    scale[PUPIL] = 1 / footprint_per_pupil(rig)
-    cov = (values.cov + (pitch.tolerance / pitch.value) ** 2 * np.outer(moved, moved)) * np.outer(scale, scale)
-    priors = priors_of(NAMES, *(part * scale for part in nominal_of(found.problem.prior)))
-    posterior = term_posterior(data, found, np.maximum(wider, rest.inflation))
-    term, (status, advice) = posterior.term, _status(found)
+    pitch, lengths = rig.panel.pitch_mm, np.isin(np.arange(len(NAMES)), [DISTANCE, PUPIL, DEPTH]) * values.mean
+    cov += (pitch.tolerance / pitch.value) ** 2 * np.outer(lengths, lengths)
+    scale = np.where(np.arange(len(NAMES)) == PUPIL, 1 / footprint_per_pupil(rig), 1.0)
+    cov *= np.outer(scale, scale)
+    term_at, (status, advice) = TermAt.of(data, found), _status(found)
+    posterior = term_at.posterior(linear_cov(found, np.maximum(wider, rest.inflation)))
+    nominal = values_of(problem.prior.mean)
+    priors = priors_of(NAMES, nominal * scale, problem.prior.sigma * value_slope(nominal) * scale)
     # Variance between the frames of a shot over the noise model's, as the median of all shots; 0: unknown.
     known = data.shots.scatter[:-1][np.isfinite(data.shots.scatter[:-1])]
     scatter = float(np.median(known)) if known.size else 0.0
     return FitResult(
         name="backscatter",
-        term=term,
+        term=posterior.term,
         status=status,
         estimates=estimates("backscatter", NAMES, values.mean * scale, cov, priors),
         cov=cov,
@@ -136,26 +131,19 @@ def result_of(found: Found, data: BackscatterData, rig: RigDescription, clipped:
             Diagnostic("pattern_p_value", rest.p_value, "1"),
             Diagnostic("pattern_inflation", rest.inflation, "1"),
             Diagnostic("frame_scatter_over_noise", scatter, "1"),
-            Diagnostic("pictures", float((~found.bad_shots[1:-1]).sum()), "1"),
+            Diagnostic("pictures", float(found.good[1:-1].sum()), "1"),
         ),
         notes=(*advice, *_notes(found, rest, wider, scatter, clipped)),
         outliers=_outliers(found, data, clipped),
         # The eliminated mask reduces the residuals' variance; the factor corrects for it.
         residuals=residual_sample(
-            found.places[np.nonzero(used)[2]] * template.step, fitted.z[used] * np.sqrt(used.sum() / found.dof)
+            found.places[np.nonzero(used)[2]] * float(problem.template.step),
+            fitted.best.z[used] * np.sqrt(used.sum() / found.dof),
         ),
         posterior=posterior,
-        map_sigma=_mask_sigma(term, posterior),
+        # Of the light of white by the frames' noise, at the fitted kernels.
+        map_sigma=np.asarray(coarse(term_at.mask[1] ** -2.0, _CELLS) ** -0.5, dtype=np.float32),
     )
-
-
-def _mask_sigma(term: Backscatter, posterior: Posterior[Backscatter]) -> Float32[np.ndarray, "3 down across"]:
-    """Sigma of the light of white by the frames' noise, at the fitted kernels, in e-/s over cells of the sensor."""
-    noise = np.repeat([0.0, 1.0], [len(NAMES), len(posterior.mean) - len(NAMES)])
-    # The noise has random signs, and the mask is never below 0: the brighter one is a sigma above the mean.
-    up, down = (posterior.term_at(posterior.mean + sign * noise).mask for sign in (1.0, -1.0))
-    sigma = np.maximum(np.maximum(up, down) - np.asarray(term.mask), 1e-30)
-    return np.asarray(coarse(sigma**-2.0, _CELLS) ** -0.5, dtype=np.float32)
 
 
 def _status(found: Found) -> tuple[FitStatus, tuple[str, ...]]:
@@ -181,7 +169,7 @@ def _status(found: Found) -> tuple[FitStatus, tuple[str, ...]]:
             f"Pictures held out of the fit are predicted {found.held_out:.0%} of their peak wrong, "
             "noise apart. Check that every frame was stored with the picture that the panel showed.",
         )
-    bad = found.bad_shots[:-1]
+    bad = ~found.good[:-1]
     if bad.mean() > rules.most_outliers:
         return FitStatus.POOR_FIT, (
             f"{bad.sum()} of {bad.size} pictures do not fit the others. Capture again, with exposures of whole periods "
@@ -217,8 +205,8 @@ def _notes(found: Found, rest: MisfitTest, wider: Vector, scatter: float, clippe
 
 def _outliers(found: Found, data: BackscatterData, clipped: list[str]) -> tuple[Outliers, ...]:
     """Return the samples and pictures that were left out, by rule."""
-    names, usable, bad = ("white", *data.names), found.problem.seen.usable[:-1], found.bad_shots[:-1]
-    places = found.places.astype(int)
+    names, usable, bad = ("white", *data.names), found.problem.seen.usable[:-1], ~found.good[:-1]
+    outlying, places = usable & (found.fitted.best.weight[:-1] == 0), found.places
 
     def named(which: Usable) -> list[str]:
         return [f"{names[i]} {'RGB'[c]} bin ({places[n, 0]}, {places[n, 1]})" for i, c, n in np.argwhere(which)]
@@ -227,8 +215,77 @@ def _outliers(found: Found, data: BackscatterData, clipped: list[str]) -> tuple[
         *outliers(f"pictures with more than {found.problem.rules.most_clipped:.0%} of their bins clipped", clipped),
         *BAD_PICTURES.listed(name for name, one in zip(names, bad, strict=True) if one),
         *outliers("bins with clipped samples", named(~usable)),
-        *BAD_BINS.listed(named(usable & ~found.usable[:-1] & ~bad[:, None, None])),
+        *BAD_BINS.listed(named(outlying & ~bad[:, None, None])),
     )
+
+
+def residual_pattern(found: Found) -> MisfitTest:
+    """Test whether residuals of a shot and colour have the same sign over parts of the sensor or all of it."""
+    best, used, cells = found.fitted.best, found.fitted.used, _cells(found)[0]
+    groups = np.arange(used[..., 0].size).reshape(*used.shape[:2], 1) * (cells.max() + 1)
+    scale = max(best.chi2 / found.dof, 1.0) * found.dof / max(used.sum(), 1)
+    tests = (
+        group_means_test(best.z.ravel(), (groups + parts).ravel(), used.ravel(), scale) for parts in (cells, 0 * cells)
+    )
+    return sharper(*tests)
+
+
+def _cells(found: Found) -> tuple[Int[np.ndarray, " n"], ...]:
+    """Return the part of the sensor in which each position lies: its cell, its band of rows and of columns."""
+    places, across = found.places, found.problem.rules.cells
+    low, high = places.min(axis=0), places.max(axis=0)
+    column, row = np.minimum((places - low) / np.maximum(high - low, 1e-9) * across, across - 1).astype(int).T
+    return row * across + column, row, column
+
+
+def disagreement(found: Found) -> Vector:
+    """Factors of the parameters' variances, above 1 where parts of the sensor ask for different values.
+
+    A kernel that is wrong by an amount that changes slowly over the field hardly shows in residuals, which have the
+    signs of the pictures' edges. But it moves a parameter by different amounts in different places, and then by more
+    than independent residuals do. Each part moves the parameters by its score (``clustered_cov``). Where chance is no
+    explanation for the scatter of any parameter, the model is refuted, and the scatter of every parameter is the
+    measure of its sigma. So few parts tell it roughly: errors over it follow Student's t, whose variance is larger.
+    """
+    solved, free, shape = found.fitted.found, found.fitted.order.free, found.fitted.ratio.shape
+    errors, jacobian = found.problem.errors_at(found.fitted.best.weight)(solved.x)
+    shifts, factors, tests = (jacobian @ solved.cov)[:, free], np.ones(len(free)), [NO_TEST]
+    dof = found.problem.rules.cells**2 - 1
+    for parts in _cells(found):
+        member = 1.0 * (np.broadcast_to(parts, shape).ravel() == np.unique(parts)[:, None])
+        square, expected = (member @ (shifts * errors[:, None])) ** 2, np.maximum(member @ shifts**2, 1e-300)
+        tests += [chi2_test(float(one), len(member) - 1.0) for one in (square / expected).sum(axis=0)]
+        wider = dof / (dof - 2) * square.sum(axis=0) / expected.sum(axis=0)
+        factors[free] = np.maximum(factors[free], wider)
+    return factors if sharper(*tests).found else np.ones(len(free))
+
+
+def value_moments(found: Found, inflation: float) -> Moments:
+    """Return the values' moments; ``inflation`` is the factor of the noise's variance that a pattern asks for."""
+    problem, free, solved = found.problem, found.fitted.order.free, found.fitted.found
+    errors_at = problem.errors_at(found.fitted.best.weight / np.sqrt(inflation))
+    if inflation > 1:
+        # The prior stays the same: only the pictures hold less information.
+        solved = most_probable(errors_at, solved.x, free, problem.prior)
+    own = moments_along_reflection(errors_at, solved, free, problem.prior)
+    return _over_orders(found, own, lambda other: Moments.log_normal(other.x, other.cov))
+
+
+def linear_cov(found: Found, inflation: Vector) -> Float[np.ndarray, "18 18"]:
+    """Return the covariance of the numbers of ``linear_of``; ``inflation`` has factors of the parameters' variances."""
+
+    def moments(of: MostProbable, factor: Vector | float = 1.0) -> Moments:
+        slope = linear_slope(of.x) * np.sqrt(factor)
+        return Moments(linear_of(of.x), of.cov * np.outer(slope, slope))
+
+    return _over_orders(found, moments(found.fitted.found, inflation), moments).cov
+
+
+def _over_orders(found: Found, own: Moments, moments: Callable[[MostProbable], Moments]) -> Moments:
+    """Return the chosen order's moments; other orders widen the covariance by their probability."""
+    orders = found.orders
+    parts = [own if one is orders.best else moments(one.fit.found) for one in orders.tried]
+    return Moments.mixture(parts, orders.probabilities, own.mean)
 
 
 @final
@@ -243,29 +300,35 @@ class TermAt:
 
     template: Backscatter
     data: BackscatterData
-    used: Bool[np.ndarray, " shots"]
+    good: Bool[np.ndarray, " shots"]
     model_error: float
     theta: Vector
+
+    @classmethod
+    def of(cls, data: BackscatterData, found: Found) -> TermAt:
+        """The term of a fit, from all shots over the whole grid."""
+        theta, template, shape = linear_of(found.fitted.found.x), found.problem.template, data.shots.rate.shape[2:]
+        rays = grid_rays(template.geometry, shape, template.step, np.arange(shape[0] * shape[1]))
+        template = replace(template, window=window_for(template, theta, rays, slack=0.5))
+        return cls(template, data, found.good, found.model_error, theta)
 
     @in_float64
     def __call__(self, parameters: Float[np.ndarray, " n"]) -> Backscatter:
         """Return the term; its mask is never below 0."""
-        theta, noise = parameters[: len(self.theta)], parameters[len(self.theta) :].reshape(_TILE, _TILE)
-        mask, sigma = self._mask
-        rows, columns = mask.shape[1:]
-        mask = mask + sigma * np.tile(noise, (-(-rows // _TILE), -(-columns // _TILE)))[:rows, :columns]
+        (theta, noise), (mask, sigma) = np.split(parameters, [len(self.theta)]), self.mask
+        down, across = np.indices(mask.shape[1:]) % _TILE
+        mask = mask + sigma * noise.reshape(_TILE, _TILE)[down, across]
         if (moved := theta - self.theta).any():
             mask = mask + np.einsum("k,kcij->cij", moved, self._mask_jacobian)
         return replace(with_linear(self.template, theta), mask=np.maximum(mask, 0.0))
 
     @functools.cached_property
-    def _mask(self) -> tuple[Float[np.ndarray, "3 a b"], Float[np.ndarray, "3 a b"]]:
+    def mask(self) -> tuple[Float[np.ndarray, "3 a b"], Float[np.ndarray, "3 a b"]]:
         """Light of white over the whole grid, and its sigma with a random sign, in e-/s."""
-        found, shape = [best for _, best in self._profiles(512)], self.data.shots.rate.shape[1:]
-        mask = np.concatenate([np.maximum(one.mask, 0.0) for one in found], axis=1)
-        sigma = np.concatenate([np.maximum(one.information, 1e-30) for one in found], axis=1) ** -0.5
-        sign = np.random.default_rng(0).choice([-1.0, 1.0], mask.shape)
-        return mask.reshape(shape), (sign * sigma).reshape(shape)
+        shape = self.data.shots.rate.shape[1:]
+        parts = [(np.maximum(one.mask, 0.0), np.maximum(one.information, 1e-30)) for _, one in self._profiles(512)]
+        mask, information = (np.concatenate(part, axis=1).reshape(shape) for part in zip(*parts, strict=True))
+        return mask, np.random.default_rng(0).choice([-1.0, 1.0], shape) / np.sqrt(information)
 
     @functools.cached_property
     def _mask_jacobian(self) -> Float[np.ndarray, "18 3 a b"]:
@@ -282,38 +345,14 @@ class TermAt:
         every = np.arange(shots.rate[0, 0].size)
         for flat in np.split(every, every[size::size]):
             rays, seen = grid_rays(template.geometry, shots.rate.shape[2:], template.step, flat), shots.at(flat)
-            usable = seen.usable & self.used[:, None, None]
+            usable = seen.usable & self.good[:, None, None]
             ratio = ratios(template, self.theta, rays, self.data.pictures)
-            best = Profile.of(seen, ratio, np.where(usable, seen.first_weights(), 0.0))
+            best = Profile.of(seen, ratio, seen.first_weights(usable))
             for _ in range(2):
                 best = Profile.of(seen, ratio, seen.weights(best.mask * ratio, best.mask, self.model_error, usable))
             yield rays, best
 
     def posterior(self, cov: Float[np.ndarray, "18 18"]) -> Posterior[Backscatter]:
         """Return the posterior with this covariance of the parameters, and with the mask's noise."""
-        count, noise = len(cov), _TILE**2
-        factor = np.eye(count + noise)
-        factor[:count, :count] = square_root(cov)
-        return Posterior(np.concatenate([self.theta, np.zeros(noise)]), factor, self)
-
-
-@in_float64
-def term_posterior(data: BackscatterData, found: Found, inflation: Vector) -> Posterior[Backscatter]:
-    """Return the whole term's posterior: its parameters, the mask that follows them, its noise, and other orders.
-
-    The model error of a picture (``model_error_of_white``) is not an error of the term and adds to it.
-
-    Args:
-        data, found: all shots; the chosen order's fit, and the others.
-        inflation: factors of the parameters' variances.
-    """
-    theta, orders, parts = linear_of(found.fitted.found.x), found.orders, []
-    template, shape = found.problem.template, data.shots.rate.shape[2:]
-    rays = grid_rays(template.geometry, shape, template.step, np.arange(shape[0] * shape[1]))
-    template = replace(template, window=window_for(template, theta, rays, slack=0.5))
-    for one in orders.tried:
-        fit, factor = (found.fitted.found, inflation) if one is orders.best else (one.fit.found, np.ones(len(theta)))
-        slope = linear_slope(fit.x) * np.sqrt(factor)
-        parts.append(Moments(linear_of(fit.x), fit.cov * np.outer(slope, slope)))
-    cov = Moments.mixture(parts, orders.probabilities, theta).cov
-    return TermAt(template, data, ~found.bad_shots, found.model_error, theta).posterior(cov)
+        factor = block_diag(square_root(cov), np.eye(_TILE**2))
+        return Posterior(np.concatenate([self.theta, np.zeros(_TILE**2)]), factor, self)

@@ -37,8 +37,8 @@ Usable = Bool[np.ndarray, "shots 3 n"]
 Rays = Float[np.ndarray, "n 3"]
 Moves = Float[np.ndarray, "k shots 3 n"]
 _LEAST_WHITE = 1e-9
-# The soft edge differs from 0 or 1 by 1e-12 at this many of its sigmas.
-_EDGE_SIGMAS = 7.0
+# A window holds the soft edge up to this many of its sigmas; at so many it differs from 0 or 1 by 1e-12.
+_WINDOW_SIGMAS, _EDGE_SIGMAS = 4.0, 7.0
 
 
 class _Footprints(NamedTuple):
@@ -68,13 +68,10 @@ def window_for(template: Backscatter, theta: Vector, rays: Rays, slack: float) -
         rays: in panel coordinates.
         slack: distance between footprints and the window's edge in panel px.
     """
-    return _window(_footprints(template, theta, rays), theta, 4 * float(np.exp(theta[SOFTNESS])) + slack)
-
-
-def _window(at: _Footprints, theta: Vector, edge_px: Float[np.ndarray, "*n"] | float) -> int:
+    at, emitters = _footprints(template, theta, rays), emitters_of(theta)
     reach_px = np.linalg.norm(at.shape, axis=2).max(axis=1) + np.abs(at.centre[:, 1] - at.centre[:, 0]).max(axis=1) / 2
-    spread = np.abs(emitters_of(theta) - emitters_of(theta).mean(axis=0)).max()
-    return 2 * int(np.ceil((reach_px + edge_px).max() + spread)) + 1
+    edge_px = _WINDOW_SIGMAS * float(np.exp(theta[SOFTNESS])) + slack
+    return 2 * int(np.ceil(reach_px.max() + edge_px + np.abs(emitters - emitters.mean(axis=0)).max())) + 1
 
 
 def corners_of(template: Backscatter, theta: Vector, rays: Rays) -> Int[np.ndarray, "n 2"]:
@@ -103,7 +100,7 @@ class PanelCrop:
 class Pictures:
     """The pictures in the part of the panel that the camera sees: white first, and black last.
 
-    Values are 0 to 255 by primary. Pixels of the crop are row by row; a black one follows for all beyond the crop.
+    Values are 0 to 255 by primary, pixels row by row. A black border of one pixel stands for all beyond the crop.
     """
 
     values: UInt8[np.ndarray, "3 pixels shots"]
@@ -112,9 +109,9 @@ class Pictures:
     @classmethod
     def of(cls, shown: UInt8[np.ndarray, "pictures crop_rows crop_columns 3"], crop: PanelCrop) -> Pictures:
         """Add white and black to pictures in the crop with values 0 to 255."""
-        values = shown.reshape(len(shown), crop.rows * crop.columns, 3).transpose(2, 1, 0)
-        white = np.full((3, values.shape[1], 1), 255, np.uint8)
-        return cls(np.pad(np.concatenate([white, values], axis=2), ((0, 0), (0, 1), (0, 1))), crop)
+        white, black = (np.full((1, *shown.shape[1:]), value, np.uint8) for value in (255, 0))
+        every = np.pad(np.concatenate([white, shown, black]), ((0, 0), (1, 1), (1, 1), (0, 0)))
+        return cls(every.reshape(len(every), -1, 3).T.copy(), crop)
 
     def light(self, gamma: float) -> Float[np.ndarray, "2 3 pixels shots"]:
         """Return the light of the panel's primaries, 1 at most, and its derivative by gamma."""
@@ -124,10 +121,9 @@ class Pictures:
 
     def index(self, panel_px: Int[np.ndarray, "k 2"]) -> Int[np.ndarray, " k"]:
         """Return the indices of panel pixels (column, row) among those of ``light``."""
-        crop = self.crop
-        column, row = panel_px[:, 0] - crop.column, panel_px[:, 1] - crop.row
-        inside = (column >= 0) & (column < crop.columns) & (row >= 0) & (row < crop.rows)
-        return np.where(inside, row * crop.columns + column, crop.rows * crop.columns)
+        inner = np.array([self.crop.columns, self.crop.rows])
+        column, row = np.clip(panel_px - [self.crop.column, self.crop.row] + 1, 0, inner + 1).T
+        return row * (self.crop.columns + 2) + column
 
 
 @final
@@ -138,113 +134,86 @@ class Shares:
     Attributes:
         positions: number of positions.
         row, panel_px: of each share; (column, row) of its panel pixel.
-        value: the share.
-        edge: which of them are at their footprint's edge.
-        slopes: derivatives of these by the emitter's place (x, y), and by the logarithms of softness and of the pupil,
-            whose area is constant here.
+        values: the shares; then, on request, their derivatives by the emitter's place (x, y), and by the logarithms of
+            softness and of the pupil, whose area is constant here.
     """
 
     positions: int
     row: Int[np.ndarray, " k"]
     panel_px: Int[np.ndarray, "k 2"]
-    value: Float[np.ndarray, " k"]
-    edge: Bool[np.ndarray, " k"]
-    slopes: Float[np.ndarray, "d e"]
+    values: Float[np.ndarray, "d k"]
 
     @classmethod
     def of(cls, template: Backscatter, theta: Vector, rays: Rays, derivatives: bool = False) -> Shares:
-        """Return ``models.backscatter.emitter_shares`` of each plane; without derivatives ``slopes`` has no rows.
+        """Return ``models.backscatter.emitter_shares`` of each plane.
 
         A window wider than the template's, as only a fit that goes astray needs it, is cut to that.
         """
         feet, softness = _footprints(template, theta, rays), float(np.exp(theta[SOFTNESS]))
         inverse, area = np.linalg.inv(feet.shape), np.pi * np.abs(np.linalg.det(feet.shape))
-        # Half width of the soft edge where the ellipse is narrowest, in units of the ellipse.
-        reach = _EDGE_SIGMAS * softness / np.linalg.svd(feet.shape, compute_uv=False)[:, 1]
-        needed = _window(feet, theta, reach * np.linalg.norm(feet.shape, axis=2).max(axis=1) + 0.5)
+        needed = window_for(template, theta, rays, (_EDGE_SIGMAS - _WINDOW_SIGMAS) * softness + 0.5)
         window = min(needed, template.window)
         corner = corners_of(replace(template, window=window), theta, rays)
-        # The emitter of each window's first pixel, seen from the footprint's centre, in units of the ellipse.
+        # Emitters seen from the footprints' centres, in units of the ellipse: that of the window's corner, then all.
         first = corner[:, None, None] + emitters_of(theta) - feet.centre[:, :, None]
-        first, step = np.einsum("nij,npcj->inpc", inverse, first)[..., None, None], np.arange(window)
-        x, y = (
-            (first[i] + (inverse[:, i, 1, None] * step)[:, None, None, :, None])
-            + (inverse[:, i, 0, None] * step)[:, None, None, None, :]
-            for i in (0, 1)
-        )
-        square = x * x + y * y + 1e-6
-        inside = np.flatnonzero(square < ((1 + reach) ** 2)[:, None, None, None, None])
+        inner = np.stack(np.divmod(np.arange(window**2), window)[::-1])
+        across = np.moveaxis(inverse @ inner, 1, 0)[:, :, None, None]
+        x, y = np.einsum("nij,npcj->inpc", inverse, first)[..., None] + across
+        # The edge is widest in these units where the ellipse is narrowest.
+        reach = 1 + _EDGE_SIGMAS * softness / np.linalg.svd(feet.shape, compute_uv=False)[:, 1]
+        inside = np.flatnonzero(x * x + y * y < (reach**2)[:, None, None, None])
         row, pixel = np.divmod(inside, window**2)
-        panel_px = corner[row // 6] + np.stack([pixel % window, pixel // window], axis=1)
-        value, square = (1 / area)[row // 6], square.ravel()[inside]
-        edge = square > (np.maximum(1 - reach, 0.0) ** 2)[row // 6]
-        n, inside, square = row[edge] // 6, inside[edge], square[edge]
-        share, *slopes = _soft_edge(x.ravel()[inside], y.ravel()[inside], square, inverse[n], softness, derivatives)
-        value[edge] *= share
-        return cls(len(area), row, panel_px, value, edge, np.reshape(slopes, (len(slopes), len(n))) / area[n])
+        n = row // 6
+        values = _soft_edge(x.ravel()[inside], y.ravel()[inside], inverse[n], softness, derivatives)
+        return cls(len(area), row, corner[n] + inner.T[pixel], np.stack(values) / area[n])
 
     def light(
         self, shown: Pictures, panel: Float[np.ndarray, "3 pixels shots"]
-    ) -> Float[np.ndarray, "positions 2 3 shots"]:
-        """Sum the light ``panel`` of each primary over the footprints."""
-        return self._sums(np.ones_like(self.edge), self.value[None], shown, panel)[0]
-
-    def light_slopes(
-        self, shown: Pictures, panel: Float[np.ndarray, "3 pixels shots"]
     ) -> Float[np.ndarray, "d positions 2 3 shots"]:
-        """Return the derivatives of ``light`` in the order of ``slopes``."""
-        return self._sums(self.edge, self.slopes, shown, panel)
-
-    def _sums(
-        self, which: np.ndarray, values: np.ndarray, shown: Pictures, panel: np.ndarray
-    ) -> Float[np.ndarray, "d positions 2 3 shots"]:
-        row, rows, (_, pixels, shots) = self.row[which], 6 * self.positions, panel.shape
-        columns, ends = row % 3 * pixels + shown.index(self.panel_px[which]), np.searchsorted(row, np.arange(rows + 1))
-        matrices = [sparse.csr_array((one, columns, ends), shape=(rows, 3 * pixels)) for one in values]
-        return np.stack([one @ panel.reshape(-1, shots) for one in matrices]).reshape(-1, self.positions, 2, 3, shots)
+        """Sum the light ``panel`` of each primary over the footprints, for each of ``values``."""
+        rows, (_, pixels, shots) = 6 * self.positions, panel.shape
+        columns, ends = self.row % 3 * pixels + shown.index(self.panel_px), self.row.searchsorted(np.arange(rows + 1))
+        matrices = (sparse.csr_array((one, columns, ends), shape=(rows, 3 * pixels)) for one in self.values)
+        sums = np.stack([one @ panel.reshape(-1, shots) for one in matrices])
+        return sums.reshape(-1, self.positions, 2, 3, shots)
 
 
 def _soft_edge(
-    x: Float[np.ndarray, " e"],
-    y: Float[np.ndarray, " e"],
-    square: Float[np.ndarray, " e"],
-    inverse: Float[np.ndarray, "e 2 2"],
+    x: Float[np.ndarray, " k"],
+    y: Float[np.ndarray, " k"],
+    inverse: Float[np.ndarray, "k 2 2"],
     softness: float,
     derivatives: bool,
-) -> tuple[Float[np.ndarray, " e"], ...]:
-    """Return the part of emitters inside, and on request the derivatives of ``Shares.slopes``.
+) -> tuple[Float[np.ndarray, " k"], ...]:
+    """Return the part of emitters inside, and on request its derivatives; see ``Shares.values``.
 
-    At u = inverse @ place, r^2 = |u|^2 + 1e-6, the distance from the edge is d = (1 - r) / |g|, g = inverse^T u / r.
+    At u = inverse @ place, r^2 = |u|^2 + 1e-6 and h = inverse^T u, the distance from the edge is d = (1 - r) r / |h|.
     """
     (a, b), (c, d) = inverse.transpose(1, 2, 0)
-    radius = np.sqrt(square)
-    g_x, g_y = (a * x + c * y) / radius, (b * x + d * y) / radius
-    steep = g_x * g_x + g_y * g_y
-    length = np.sqrt(steep + 1e-12)
-    distance = (1 - radius) / length
+    square, h_x, h_y = x * x + y * y + 1e-6, a * x + c * y, b * x + d * y
+    radius, steep = np.sqrt(square), h_x * h_x + h_y * h_y + 1e-12 * square
+    distance = (1 - radius) * radius / np.sqrt(steep)
     share = 0.5 + 0.5 * erf(distance / (np.sqrt(2.0) * softness))
     if not derivatives:
         return (share,)
     density = np.exp(-0.5 * (distance / softness) ** 2) / (np.sqrt(2 * np.pi) * softness)
-    # The change of |g| with the place, times r: (inverse^T inverse - |g|^2) g.
-    along = a * g_x + b * g_y, c * g_x + d * g_y
-    bent = distance / (radius * length)
-    by_x = -density / length * (g_x + bent * (a * along[0] + c * along[1] - steep * g_x))
-    by_y = -density / length * (g_y + bent * (b * along[0] + d * along[1] - steep * g_y))
-    # A larger pupil makes u shorter.
-    shorter = 1 - 1e-6 / square
-    by_pupil = density * (radius * shorter / length + distance * steep / length**2 * (2 - shorter))
-    return share, by_x, by_y, -distance * density, by_pupil
+    # By r, whose derivative by the place is h / r, and by |h|, whose derivative is inverse^T inverse h / |h|.
+    along, bent = (1 - 2 * radius) / (radius * np.sqrt(steep)), distance / steep
+    g_x, g_y = a * h_x + b * h_y, c * h_x + d * h_y
+    by_x = density * (along * h_x - bent * (a * g_x + c * g_y))
+    by_y = density * (along * h_y - bent * (b * g_x + d * g_y))
+    # A larger pupil makes u shorter, and h by twice as much.
+    return share, by_x, by_y, -distance * density, density * (2 * distance - along * (square - 1e-6))
 
 
 def ratios(template: Backscatter, theta: Vector, rays: Rays, shown: Pictures) -> PerShot:
     """Return the light of pictures over that of white, by shot, colour and position."""
-    return ratios_of(theta, Shares.of(template, theta, rays).light(shown, shown.light(float(theta[0]))[0]))
+    return ratios_of(theta, Shares.of(template, theta, rays), shown, shown.light(float(theta[0]))[0])
 
 
-def ratios_of(theta: Vector, light: Float[np.ndarray, "n 2 3 shots"]) -> PerShot:
-    """Return ratios from the light of both planes."""
-    mixed = _mixed(theta, _joined(theta, light)[None])[0]
+def ratios_of(theta: Vector, shares: Shares, shown: Pictures, panel: Float[np.ndarray, "3 pixels shots"]) -> PerShot:
+    """Return the same from the shares of emitters and the light ``panel`` of the primaries."""
+    mixed = _mixed(theta, _joined(theta, shares.light(shown, panel)[:1]))[0]
     return mixed / np.maximum(mixed[0], _LEAST_WHITE)
 
 
@@ -256,16 +225,15 @@ def ratios_and_jacobian(template: Backscatter, theta: Vector, rays: Rays, shown:
         rays, shown: in panel coordinates; what the panel showed.
     """
     shares, (panel, by_gamma) = Shares.of(template, theta, rays, derivatives=True), shown.light(float(theta[0]))
-    light, slopes = shares.light(shown, panel), shares.light_slopes(shown, panel)
-    slope, whole = _footprints(template, theta, rays).slope.T[:, :, None, None], _joined(theta, light)
-    by_x, by_y, by_softness, by_pupil = _joined(theta, slopes)
+    light, slope = shares.light(shown, panel), _footprints(template, theta, rays).slope.T[:, :, None, None]
+    whole, by_x, by_y, by_softness, by_pupil = _joined(theta, light)
     moves = np.zeros((len(theta), *whole.shape))
-    moves[0] = _joined(theta, shares.light(shown, by_gamma))
+    moves[0] = _joined(theta, replace(shares, values=shares.values[:1]).light(shown, by_gamma)[0])
     moves[DISTANCE] = -np.exp(theta[DISTANCE]) * (slope[0] * by_x + slope[1] * by_y)
     moves[PUPIL] = by_pupil - 2 * whole
     moves[SOFTNESS] = by_softness
-    moves[REFLECTION] = light[:, 1] - light[:, 0]
-    deeper = slope[0] * slopes[0, :, 1] + slope[1] * slopes[1, :, 1]
+    moves[REFLECTION] = light[0, :, 1] - light[0, :, 0]
+    deeper = slope[0] * light[1, :, 1] + slope[1] * light[2, :, 1]
     moves[DEPTH] = -np.exp(theta[DEPTH]) * theta[REFLECTION] * deeper
     moves[OFFSET] = by_x, by_y
     # The emitters of red, and of blue.

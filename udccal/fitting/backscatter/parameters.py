@@ -1,4 +1,4 @@
-"""The backscatter term as a vector of parameters: coordinates, prior, orders, and the documented constants of its fit.
+"""The backscatter term as a vector of parameters: coordinates, prior, orders, most probable values and their moments.
 
 Lengths, softness, reflection and crosstalk cannot be negative: the solver works on their logarithms. The prior is
 normal in the solver's coordinates: nominal values with the tolerances of the rig, and wide where no data sheet helps.
@@ -7,15 +7,16 @@ Light is close to linear in other coordinates (``linear_of``), in which orders w
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import final
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from udccal.fitting.engine.gaussian import Prior
-from udccal.fitting.engine.least_squares import SolverRules
+from udccal.fitting.engine.least_squares import Blocks, Step, minimise
+from udccal.fitting.engine.orders import evidence
 from udccal.models.backscatter import Backscatter
 from udccal.rig import RigDescription
 
@@ -31,6 +32,8 @@ OFFSET, EMITTERS, MIX = slice(6, 8), slice(8, 12), slice(12, 18)
 # Rows and columns of the crosstalk in the mix.
 OFF_DIAGONAL = np.nonzero(~np.eye(3, dtype=bool))
 _LOGARITHMIC = np.isin(np.arange(18), np.r_[1:6, 12:18])
+# Parameters in the solver's coordinates to whitened errors and their Jacobian.
+ErrorsAt = Callable[[Vector], tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m 18"]]]
 # Replaces the logarithm of 0.
 _ABSENT = -40.0
 
@@ -45,8 +48,7 @@ class BackscatterRules:
         fewest_pictures: in addition to white and dark.
         clipped: fraction of saturation from which a mean counts as clipped.
         most_clipped: fraction of clipped bins above which a shot is left out whole; others lose their clipped bins.
-        visible_sigma, present_sigma: white counts as dark below this many sigma of a bin at the 90th percentile of
-            bins, or of all bins together.
+        visible_sigma: white counts as dark below this many sigma of a bin at the 90th percentile of bins.
         most_wider: a fit whose footprints are this many times as wide as nominal ones has gone astray.
         first_error: assumed model error of a fit from far away, as a fraction of white.
         settled: such a fit continues while its model error falls below this factor of the one before.
@@ -61,7 +63,6 @@ class BackscatterRules:
         known: unless sigma is below this: ln of distance and pupil, offsets in panel px.
         steady: variance between frames of a picture, over noise, from which the panel may flicker.
         most_outliers: the largest fraction of pictures that may be outliers.
-        solver: rules of every descent.
     """
 
     positions: int = 96
@@ -69,7 +70,6 @@ class BackscatterRules:
     clipped: float = 0.98
     most_clipped: float = 0.02
     visible_sigma: float = 2.0
-    present_sigma: float = 5.0
     most_wider: float = 3.0
     first_error: float = 0.3
     settled: float = 0.7
@@ -83,7 +83,6 @@ class BackscatterRules:
     known: tuple[float, float, float, float] = (0.1, 0.1, 0.5, 0.5)
     steady: float = 1.3
     most_outliers: float = 0.25
-    solver: SolverRules = field(default_factory=SolverRules)
 
 
 @final
@@ -116,10 +115,7 @@ class Order:
 
     def without(self, name: str, *held: int | slice) -> Order:
         """Return an order in which more parameters are held."""
-        free = self.free.copy()
-        for one in held:
-            free[one] = False
-        return Order(name, free)
+        return Order(name, self.free & ~np.isin(np.arange(len(self.free)), np.r_[held]))
 
     def without_crosstalk(self) -> Order:
         """Return an order in which every camera colour sees only its own primary."""
@@ -179,10 +175,9 @@ def values_of(x: Vector) -> Vector:
         return np.where(_LOGARITHMIC, np.where(x > _ABSENT, np.exp(x), 0.0), x)
 
 
-def nominal_of(prior: Prior) -> tuple[Vector, Vector]:
-    """Return the prior's values and their sigmas, in the units of the estimates."""
-    nominal = values_of(prior.mean)
-    return nominal, prior.sigma * np.where(_LOGARITHMIC, nominal, 1.0)
+def value_slope(values: Vector) -> Vector:
+    """Return the derivative of each of ``values_of`` by its own solver's coordinate."""
+    return np.where(_LOGARITHMIC, values, 1.0)
 
 
 @final
@@ -197,9 +192,8 @@ class Moments:
     def log_normal(cls, x: Vector, cov: Float[np.ndarray, "18 18"]) -> Moments:
         """Return the moments of the values if the solver's coordinates are normal."""
         mean = values_of(x) * np.where(_LOGARITHMIC, np.exp(0.5 * np.diag(cov)), 1.0)
-        scale = np.where(_LOGARITHMIC, mean, 1.0)
-        both = np.outer(_LOGARITHMIC, _LOGARITHMIC)
-        return cls(mean, np.outer(scale, scale) * np.where(both, np.expm1(cov), cov))
+        slope, both = value_slope(mean), np.outer(_LOGARITHMIC, _LOGARITHMIC)
+        return cls(mean, np.outer(slope, slope) * np.where(both, np.expm1(cov), cov))
 
     @classmethod
     def mixture(
@@ -263,3 +257,78 @@ def with_linear(term: Backscatter, theta: Vector) -> Backscatter:
         emitters_px=emitters_of(theta),
         mix=mix / mix.sum(axis=1, keepdims=True),
     )
+
+
+@final
+@dataclass(frozen=True)
+class MostProbable:
+    """The most probable parameters; ``cov`` is 0 for those that are held, ``cost`` includes the prior's part."""
+
+    x: Vector
+    cov: Float[np.ndarray, "18 18"]
+    cost: float
+    converged: bool
+
+
+@final
+@dataclass(frozen=True)
+class _Descent:
+    """The engine's problem, with a prior that says nothing of the parameters that are held."""
+
+    errors_at: ErrorsAt
+    free: Bool[np.ndarray, "18"]
+    prior: Prior
+    name: str = "backscatter"
+
+    def equations_at(self, place: Vector) -> Blocks:
+        errors, jacobian = self.errors_at(place)
+        return replace(Blocks.of_errors(errors, jacobian * self.free).with_prior(self.prior, place), held=~self.free)
+
+    def moved(self, place: Vector, step: Step) -> Vector:
+        return place + step.shared
+
+
+def most_probable(errors_at: ErrorsAt, start: Vector, free: Bool[np.ndarray, "18"], prior: Prior) -> MostProbable:
+    """Minimise the cost of errors and prior over the free parameters."""
+    found = minimise(_Descent(errors_at, free, Prior(prior.mean, prior.root * free)), start)
+    last, cov = found.equations, np.zeros((len(free), len(free)))
+    if np.isfinite(last.cost):
+        cov = found.with_rest(last.cov(), last.step(0.0).shared)
+    return MostProbable(found.place, cov, last.cost, found.converged)
+
+
+def moments_along_reflection(
+    errors_at: ErrorsAt, solved: MostProbable, free: Bool[np.ndarray, "18"], prior: Prior
+) -> Moments:
+    """Return mean and covariance of the values around the most probable parameters.
+
+    The log likelihood is close to a parabola in all of the solver's coordinates except the logarithm of the reflection.
+    That has no bound once nearly all light, or nearly none, comes by way of the glass. Along it the posterior is
+    computed at equal steps. At each step all other parameters are normal and are integrated out by Laplace's method
+    (Tierney and Kadane, Journal of the American Statistical Association 81, 1986).
+    """
+    step = float(np.sqrt(max(solved.cov[REFLECTION, REFLECTION], 0.0)))
+    # A posterior this narrow is normal: its mean is off by a twentieth of a sigma at most.
+    if not free[REFLECTION] or step < 0.1 or not solved.converged:
+        return Moments.log_normal(solved.x, solved.cov)
+    others = free & (np.arange(len(free)) != REFLECTION)
+
+    def node(start: Vector) -> tuple[MostProbable, float]:
+        """Return the others at this reflection, and the posterior's logarithm there."""
+        held = most_probable(errors_at, start, others, prior)
+        off = float((start - prior.mean)[REFLECTION] / prior.sigma[REFLECTION])
+        return held, -0.5 * evidence(held.cost + off**2, held.cov[np.ix_(others, others)], prior.sigma[others])
+
+    nodes = [node(solved.x)]
+    for sign in (1.0, -1.0):
+        x, way = nodes[0][0].x, sign * solved.cov[:, REFLECTION] / step
+        for _ in range(12):
+            nodes.append(node(x + way))
+            x, way = nodes[-1][0].x, nodes[-1][0].x - x
+            # The variance grows with the square of the value, so that larger values have more weight.
+            ahead = 2 * max(float(x[REFLECTION] - nodes[0][0].x[REFLECTION]), 0.0)
+            if not nodes[-1][1] - nodes[0][1] + ahead > -6.0:
+                break
+    # With equal steps, sums approximate integrals of such smooth functions to many digits.
+    weights = np.exp([log - max(log for _, log in nodes) for _, log in nodes])
+    return Moments.mixture([Moments.log_normal(one.x, one.cov) for one, _ in nodes], weights / weights.sum())

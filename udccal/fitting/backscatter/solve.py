@@ -1,25 +1,22 @@
-"""Likelihood of the backscatter term, and the most probable parameters of an order.
+"""The backscatter's most probable parameters, by likelihood (``Profile``) and prior, and the search for its order.
 
-Light of shot i at a position and colour is  y_i = m r_i + u_i d + noise. r_i is the picture's light over that of white
-(1 for white itself, 0 for the dark frame), m the mask and d the dark signal there, u_i the dark frame's exposure over
-the shot's. m and d have no prior and enter linearly: they are eliminated exactly, bin by bin, so that the noise of
-white and dark, which is common to all pictures of a bin, has its right weight. The model gives the variances: shot
-noise, noise in the dark, and (e m)^2 for the model error e, which is relative to white.
+A scan over whole panel pixels gives the start for one plane of emitters, which gives the start for two planes. The
+evidence compares two planes with simpler orders. The chosen order's model error is estimated from all pictures, and
+from those held out of another fit. It counts as noise: (e m)^2 for the error e, which is relative to white.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import final
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.special import ndtri
 
-from udccal.fitting.backscatter.data import BackscatterData, Binned, grid_step, sampled_rays
+from udccal.fitting.backscatter.data import BackscatterData, Binned, Profile, grid_step, sampled_rays
 from udccal.fitting.backscatter.model import (
     Moves,
-    PerBin,
     PerShot,
     Pictures,
     Rays,
@@ -31,126 +28,36 @@ from udccal.fitting.backscatter.model import (
     window_for,
 )
 from udccal.fitting.backscatter.parameters import (
+    KERNELS,
+    MIX,
     OFFSET,
+    ONE_PLANE,
+    REFLECTION,
+    TWO_PLANES,
     BackscatterRules,
+    ErrorsAt,
+    MostProbable,
     Order,
     Vector,
     linear_of,
     linear_slope,
+    most_probable,
     prior_of,
+    split_plane,
+    values_of,
 )
 from udccal.fitting.engine.gaussian import Prior
-from udccal.fitting.engine.least_squares import Blocks, SolverRules, Step, minimise
+from udccal.fitting.engine.misfit import chi2_test, excess_sigma, robust_excess_sigma
+from udccal.fitting.engine.orders import Attempt, Choice, choose, evidence
+from udccal.fitting.engine.robust import OutlierRule, robust_sigma
 from udccal.fitting.nominal import nominal_backscatter
 from udccal.models.backscatter import Backscatter
 from udccal.models.geometry import Geometry
-from udccal.numerics import in_float64
 from udccal.rig import RigDescription
 
-# Parameters in the solver's coordinates to whitened errors and their Jacobian.
-ErrorsAt = Callable[[Vector], tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m 18"]]]
-
-
-@final
-@dataclass(frozen=True)
-class MostProbable:
-    """The most probable parameters; ``cov`` is 0 for those that are held, ``cost`` includes the prior's part."""
-
-    x: Vector
-    cov: Float[np.ndarray, "18 18"]
-    cost: float
-    converged: bool
-
-
-@final
-@dataclass(frozen=True)
-class _Free:
-    """The free parameters as the engine's problem; the others are held."""
-
-    errors_at: ErrorsAt
-    free: Bool[np.ndarray, "18"]
-    prior: Prior
-    name: str = "backscatter"
-
-    def equations_at(self, place: Vector) -> Blocks:
-        errors, jacobian = self.errors_at(place)
-        return Blocks.of_errors(errors, jacobian[:, self.free]).with_prior(self.prior, place[self.free])
-
-    def moved(self, place: Vector, step: Step) -> Vector:
-        moved = place.copy()
-        moved[self.free] += step.shared
-        return moved
-
-
-@in_float64
-def most_probable(
-    errors_at: ErrorsAt, start: Vector, free: Bool[np.ndarray, "18"], prior: Prior, rules: SolverRules | None = None
-) -> MostProbable:
-    """Minimise the cost of errors and prior over the free parameters."""
-    problem = _Free(errors_at, free, Prior(prior.mean[free], prior.root[:, free]))
-    found, cov = minimise(problem, start, rules), np.zeros((len(free), len(free)))
-    if np.isfinite(found.equations.cost):
-        cov[np.ix_(free, free)] = found.with_rest(found.equations.cov(), found.equations.step(0.0).shared)
-    return MostProbable(found.place, cov, found.equations.cost, found.converged)
-
-
-@final
-@dataclass(frozen=True)
-class Profile:
-    """The most probable mask and dark signal for given ratios, bin by bin.
-
-    Attributes:
-        mask, dark: e-/s.
-        errors: measured less modelled rates; ``weight`` is 1 / sigma of each.
-        information: on the mask, with the dark signal eliminated.
-        by_mask, by_dark: orthonormal directions of the whitened errors that mask and dark remove.
-    """
-
-    mask: PerBin
-    dark: PerBin
-    errors: PerShot
-    weight: PerShot
-    information: PerBin
-    by_mask: PerShot
-    by_dark: PerShot
-
-    @property
-    def chi2(self) -> float:
-        """Chi-squared without the prior."""
-        return float(((self.errors * self.weight) ** 2).sum())
-
-    @classmethod
-    def of(cls, seen: Binned, ratio: PerShot, weight: PerShot) -> Profile:
-        """Solve for mask and dark signal from the ratios of all shots."""
-        light, exposure = seen.rate, (seen.exposure_s[-1] / seen.exposure_s)[:, None, None]
-        apart = exposure * weight
-        length = np.sqrt((apart**2).sum(axis=0))
-        by_dark = apart / length
-        across = ratio * weight - by_dark * (by_dark * ratio * weight).sum(axis=0)
-        information = (across**2).sum(axis=0)
-        root = np.sqrt(np.where(information > 0, information, 1.0))
-        by_mask = across / root
-        mask = (by_mask * light * weight).sum(axis=0) / root
-        dark = (by_dark * (light - mask * ratio) * weight).sum(axis=0) / length
-        return cls(mask, dark, light - mask * ratio - exposure * dark, weight, information, by_mask, by_dark)
-
-    def jacobian(self, of_ratio: Moves) -> Moves:
-        """Return the whitened errors' Jacobian without the parts that mask and dark remove (Kaufman, BIT 15, 1975)."""
-        jacobian = -(self.mask * self.weight) * of_ratio
-        for way in (self.by_dark, self.by_mask):
-            jacobian -= way * np.einsum("scn,kscn->kcn", way, jacobian)[:, None]
-        return jacobian
-
-    def mask_jacobian(self, of_ratio: Moves) -> Float[np.ndarray, "k 3 n"]:
-        """Return the mask's derivatives for the expected light; the contribution of noise is of second order."""
-        along = np.einsum("scn,kscn->kcn", self.by_mask * self.weight, of_ratio)
-        return -self.mask * along / np.sqrt(np.where(self.information > 0, self.information, 1.0))
-
-    def light_variance(self, ratio: PerShot, of_ratio: Moves, cov: Float[np.ndarray, "k k"]) -> PerShot:
-        """Return predicted light's variance: from the parameters and their effect on the mask, and from its noise."""
-        moves = self.mask * of_ratio + ratio * self.mask_jacobian(of_ratio)[:, None]
-        by_parameters = np.einsum("kicn,kl,licn->icn", moves, cov, moves, optimize=True)
-        return np.asarray(by_parameters + ratio**2 / np.maximum(self.information, 1e-30))
+BAD_PICTURES = OutlierRule("pictures in brightness or pattern")
+BAD_BINS = OutlierRule("bins")
+PerSample = Float[np.ndarray, " k"]
 
 
 @final
@@ -169,20 +76,18 @@ class Fitted:
         return self.best.mask * self.ratio
 
     @property
-    def z(self) -> PerShot:
-        """Errors in units of their sigma, 0 for unused samples."""
-        return self.best.errors * self.best.weight
-
-    @property
     def used(self) -> Usable:
         """Samples with a weight, without the dark frame's."""
         used = self.best.weight > 0
         used[-1] = False
         return used
 
-    def weighed(self, weight: PerShot) -> Fitted:
-        """Return the same parameters, mask and dark signal with other weights."""
-        return replace(self, best=replace(self.best, weight=weight))
+    def squares(self, seen: Binned, used: Usable) -> tuple[PerSample, PerSample, PerSample]:
+        """Return squared errors of some samples, their variance by noise, and that by a model error of 1."""
+        unit = np.broadcast_to(self.best.mask**2, used.shape).copy()
+        # White is the mask by definition, and dark has no light: neither has a model error.
+        unit[[0, -1]] = 0.0
+        return self.best.errors[used] ** 2, seen.variance(self.light)[used], unit[used]
 
     def dof(self, prior: Prior) -> float:
         """Return samples less one mask per bin (the dark signal has a sample of its own) less parameters."""
@@ -215,19 +120,17 @@ class Problem:
         rays, flat = sampled_rays(geometry, rig, step, rules.positions)
         # The likelihood gives the mask; the template's has a single bin.
         template = nominal_backscatter(geometry, rig, np.zeros((3, 1, 1)), step, window=1)
+        theta = linear_of(prior.mean)
         # Beyond this width a fit has gone astray.
-        most = int(rules.most_wider * window_for(template, linear_of(prior.mean), rays, 0.5))
-        template = replace(template, window=most)
+        template = replace(template, window=int(rules.most_wider * window_for(template, theta, rays, 0.5)))
         seen, shown, start = data.shots.at(flat), data.pictures, prior.mean.copy()
-        weight = seen.first_weights()
-
-        theta = linear_of(start)
+        weight = seen.first_weights(seen.usable)
         shares, panel = Shares.of(template, theta, rays), shown.light(float(theta[0]))[0]
 
         def cost(offset: tuple[int, int]) -> float:
             # An offset of whole pixels leaves the shares as they are.
             moved = replace(shares, panel_px=shares.panel_px - offset)
-            return Profile.of(seen, ratios_of(theta, moved.light(shown, panel)), weight).chi2
+            return Profile.of(seen, ratios_of(theta, moved, shown, panel), weight).chi2
 
         across, down = (range(-int(np.ceil(reach)), int(np.ceil(reach)) + 1) for reach in prior.sigma[OFFSET])
         start[OFFSET] = min(((x, y) for y in down for x in across), key=cost)
@@ -236,7 +139,7 @@ class Problem:
     def solved(self, order: Order, x: Vector, weight: PerShot) -> Fitted:
         """Solve for the most probable parameters of an order at given weights, from ``x`` on."""
         start = order.start(x, self.prior)
-        found = most_probable(self.errors_at(weight), start, order.free, self.prior, self.rules.solver)
+        found = most_probable(self.errors_at(weight), start, order.free, self.prior)
         ratio = ratios(self.template, linear_of(found.x), self.rays, self.shown)
         return Fitted(order, found, ratio, Profile.of(self.seen, ratio, weight))
 
@@ -251,6 +154,162 @@ class Problem:
         def of(x: Vector) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m 18"]]:
             ratio, of_ratio = self.ratios(x)
             best = Profile.of(self.seen, ratio, weight)
-            return (best.errors * weight).ravel(), best.jacobian(of_ratio).reshape(len(x), -1).T
+            return best.z.ravel(), best.jacobian(of_ratio).reshape(len(x), -1).T
 
         return of
+
+
+@final
+@dataclass(frozen=True)
+class Found:
+    """The chosen order and its fit.
+
+    Attributes:
+        model_error: one sigma of the model's deviation from the truth, as a ratio to white.
+        orders: all candidates and their evidence.
+        held_out: rms error of held-out pictures over their peaks, without noise.
+    """
+
+    problem: Problem
+    fitted: Fitted
+    model_error: float
+    orders: Choice[Fitted]
+    held_out: float
+
+    @property
+    def dof(self) -> float:
+        """Degrees of freedom of chi-squared without the prior's part."""
+        return self.fitted.dof(self.problem.prior)
+
+    @property
+    def good(self) -> Bool[np.ndarray, " shots"]:
+        """Shots (white first, dark last) that are not left out whole."""
+        return np.asarray((self.fitted.best.weight > 0).any(axis=(1, 2)))
+
+    @property
+    def places(self) -> Int[np.ndarray, "n 2"]:
+        """Grid columns and rows of the positions."""
+        template = self.problem.template
+        return np.stack(np.divmod(self.problem.flat, template.columns // template.step)[::-1], axis=1)
+
+
+def search(problem: Problem, kernels: tuple[Order, ...] = KERNELS) -> Found:
+    """Fit the orders and choose the one of largest evidence; ``kernels`` has one item if the order is known."""
+    rules, usable = problem.rules, problem.seen.usable
+    simple = _from_afar(problem, ONE_PLANE, problem.start, usable, rules.first_error)
+    rich = _two_planes(problem, simple, usable & ~_bad_shots(problem, simple))
+    # Look for bad shots again: one plane describes some good pictures badly.
+    usable = _without_outliers(problem, rich, usable & ~_bad_shots(problem, rich))
+    rich, error = refit(problem, rich, usable)
+    orders = _compared(problem, rich, simple.found.x, kernels if error <= rules.nothing_fits else (TWO_PLANES,))
+    fitted, error = refit(problem, orders.best.fit, usable)
+    held, new = held_out(problem, fitted)
+    # Held-out pictures show the error to expect of new ones.
+    return Found(problem, fitted, max(error, new), orders, held)
+
+
+def refit(problem: Problem, fitted: Fitted, usable: Usable) -> tuple[Fitted, float]:
+    """Fit again with weights by the model and its model error; return the fit and that error."""
+    for _ in range(2):
+        error = excess_sigma(*fitted.squares(problem.seen, usable), fitted.dof(problem.prior))
+        weight = problem.seen.weights(fitted.light, fitted.best.mask, error, usable)
+        fitted = problem.solved(fitted.order, fitted.found.x, weight)
+    return fitted, error
+
+
+def _from_afar(problem: Problem, order: Order, x: Vector, usable: Usable, error: float) -> Fitted:
+    """Fit with this model error of the start as noise: with noise alone, the prior would have no effect."""
+    for _ in range(30):
+        fitted = problem.solved(order, x, problem.seen.first_weights(usable, error))
+        x, before, error = fitted.found.x, error, typical_error(fitted, problem.seen)
+        if error > problem.rules.settled * before:
+            break
+    return fitted
+
+
+def typical_error(fitted: Fitted, seen: Binned) -> float:
+    """Return a robust model error relative to white, on which bad pictures have little effect."""
+    used = fitted.used
+    used[0] = False
+    return robust_excess_sigma(*fitted.squares(seen, used))
+
+
+def _two_planes(problem: Problem, simple: Fitted, usable: Usable) -> Fitted:
+    """Return the best of several fits, which start with reflections brighter and fainter than the emitters."""
+    prior, seen = problem.prior, problem.seen
+    # Not above one plane's model error: with a much larger one, all starts would end at the prior's mean.
+    error, noise = typical_error(simple, seen), seen.first_weights(usable)
+    starts = [split_plane(simple.found.x, prior, reflection) for reflection in problem.rules.reflections]
+    fits = [_from_afar(problem, TWO_PLANES, x, usable, error) for x in starts]
+    return min(fits, key=lambda one: Profile.of(seen, one.ratio, noise).chi2 + prior.cost(one.found.x))
+
+
+def _bad_shots(problem: Problem, fitted: Fitted) -> Bool[np.ndarray, "shots 1 1"]:
+    """Find shots that dropped, flickered or show another picture, by brightness and by size of residuals."""
+    usable = problem.seen.usable
+    weight = problem.seen.first_weights(usable)[:-1]
+    z, model = fitted.best.errors[:-1] * weight, fitted.light[:-1] * weight
+    typical = np.ma.median(np.ma.array(np.abs(z), mask=~usable[:-1]), axis=(1, 2)).filled(0.0)
+    bad = typical > problem.rules.worse_pictures * max(float(np.median(typical)), ndtri(0.75))
+    # Excess brightness over the model, relative to its light, in units of noise or of all shots' scatter.
+    information = np.maximum((model**2).sum(axis=(1, 2)), 1e-12)
+    off = (z * model).sum(axis=(1, 2)) / information
+    off -= np.median(off)
+    bad |= BAD_PICTURES.off(off / np.maximum(robust_sigma(off), 1 / np.sqrt(information)))
+    return np.append(bad, False)[:, None, None]
+
+
+def _without_outliers(problem: Problem, fitted: Fitted, usable: Usable) -> Usable:
+    """Remove the worst sample of a bin, which may have biased the others, and fit the bin's mask again."""
+    for _ in range(4):
+        best = Profile.of(problem.seen, fitted.ratio, problem.seen.first_weights(usable))
+        size, lit = np.abs(best.z), usable.copy()
+        size[-1], lit[-1] = 0.0, False
+        usable = usable & ~(BAD_BINS.off(size, lit) & (size == size.max(axis=0)))
+    return usable
+
+
+def _compared(problem: Problem, rich: Fitted, simple: Vector, kernels: tuple[Order, ...]) -> Choice[Fitted]:
+    """Compare all orders at the same weights."""
+    prior, weight = problem.prior, rich.best.weight
+
+    def attempt(fitted: Fitted, more: float = 0.0) -> Attempt[Fitted]:
+        order, found, free = fitted.order, fitted.found, fitted.order.free
+        criterion = evidence(found.cost + more, found.cov[np.ix_(free, free)], prior.sigma[free], order.against)
+        return Attempt(order.name, order.parameters, criterion, fitted)
+
+    tried = []
+    for order in kernels:
+        start = rich.found.x if order.free[REFLECTION] else simple
+        tried.append(attempt(rich if order is TWO_PLANES else problem.solved(order, start, weight)))
+    best = choose(tried).best.fit
+    # Rise of chi-squared without crosstalk, to second order (Wald's test). If it is large, a fit without crosstalk
+    # would take many steps to no purpose.
+    crosstalk, plain = values_of(best.found.x)[MIX], best.order.without_crosstalk()
+    cov = best.found.cov[MIX, MIX] * np.outer(crosstalk, crosstalk)
+    rise = float(crosstalk @ np.linalg.pinv(cov, hermitian=True) @ crosstalk)
+    if rise > 1000.0:
+        return choose([*tried, attempt(replace(best, order=plain), rise)])
+    return choose([*tried, attempt(problem.solved(plain, best.found.x, weight))])
+
+
+def held_out(problem: Problem, full: Fitted) -> tuple[float, float]:
+    """Return the errors of pictures left out of a fit: relative to their peaks, and as a model error of ratios.
+
+    Both are without noise; the model error is 0 where it is not significant. ``full`` includes these pictures.
+    """
+    every, seen, weight = problem.rules.held_out, problem.seen, full.best.weight.copy()
+    weight[every:-1:every] = 0.0
+    used = full.used & (weight == 0)
+    if not used.any():
+        return 0.0, 0.0
+    fitted = problem.solved(full.order, full.found.x, weight)
+    by_fit = fitted.best.light_variance(fitted.ratio, problem.ratios(fitted.found.x)[1], fitted.found.cov)
+    square, noise, unit = fitted.squares(seen, used)
+    excess = square - noise - by_fit[used]
+    peak = np.maximum(np.where(used, fitted.light, 0.0).max(axis=(1, 2), keepdims=True), 1e-12)
+    of_peak = float((excess / np.broadcast_to(peak**2, used.shape)[used]).mean())
+    of_white = float(excess.sum() / max(float(unit.sum()), 1e-30))
+    # The rise of chi-squared by added pictures equals their chi-squared by the prediction's whole covariance.
+    found = chi2_test(full.found.cost - fitted.found.cost, float(used.sum())).found
+    return float(np.sqrt(max(of_peak, 0.0))), float(np.sqrt(max(of_white, 0.0)) * found)
