@@ -13,7 +13,7 @@ from udccal.fitting.engine.gaussian import Posterior
 from udccal.fitting.engine.orders import Quantity
 from udccal.fitting.engine.report import estimates, residual_sample
 from udccal.fitting.engine.robust import outliers
-from udccal.fitting.noise.clipping import stacked
+from udccal.fitting.noise.moments import stacked
 from udccal.fitting.noise.codes import start_values
 from udccal.fitting.noise.dark import DarkTerms, fit_dark_terms
 from udccal.fitting.noise.data import NoiseData, NoiseRules
