@@ -151,7 +151,7 @@ class _Samples:
     def amount(
         self, left: Float[np.ndarray, "n some"], used: Bool[np.ndarray, "n some"], most_sigma: float
     ) -> tuple[float, float]:
-        """How much of a deviation, of which so much is left, the errors have, and its sigma; hits count as the limit."""
+        """How much of a deviation the errors have, by what is ``left`` of it, and its sigma; hits count as the limit."""
         sigma, weight = np.sqrt(self.variance), np.where(used, left / self.variance, 0.0)
         information = max(float(np.sum(weight * left)), 1e-30)
         errors = np.clip(self.errors, -most_sigma * sigma, most_sigma * sigma)
@@ -267,8 +267,9 @@ class _Bracket:
             # Where exposures lie far apart, few pixels have a third sample that tells which frame is wrong.
             scores = self._frame_scores(merged, 2, 3.0)
             if scores.max() > self.rules.frame_sigma:
+                differs = f"frame {scores.argmax()} differs from that of the frames beside it"
                 few = "too few pixels have a third sample that tells which one is right"
-                yield f"The light of frame {scores.argmax()} differs from that of the frames beside it, and {few}. {advice}"
+                yield f"The light of {differs}, and {few}. {advice}"
 
     def _scatter(self, merged: BlockMerge) -> float:
         """Variance of samples about their pixel's light over the model's; 1 where that is what chance gives."""
