@@ -151,7 +151,7 @@ class _Samples:
     def amount(
         self, left: Float[np.ndarray, "n some"], used: Bool[np.ndarray, "n some"], most_sigma: float
     ) -> tuple[float, float]:
-        """How much of a deviation the errors have, by what is ``left`` of it, and its sigma; hits count as the limit."""
+        """How much of a deviation the errors have, by what is ``left`` of it, with its sigma; hits count as limits."""
         sigma, weight = np.sqrt(self.variance), np.where(used, left / self.variance, 0.0)
         information = max(float(np.sum(weight * left)), 1e-30)
         errors = np.clip(self.errors, -most_sigma * sigma, most_sigma * sigma)

@@ -117,12 +117,13 @@ def piled_up(data: NoiseMoments, dark: DarkTerms) -> tuple[float, float] | None:
     """
     q, spread2 = data.q_DN, dark.read_DN2.value + dark.dsnu_DN2.value + dark.row_DN2.value + data.rounding_DN2
     half, count, floor, middle = max(int(np.ceil(2.5 * np.sqrt(spread2) / q)), 1), 0, 0, 0.0
+    width = 2 * half + 1
     for flat in data.flats:
         codes = flat.codes[::q]
         # At code c the pile has codes c - half to c + half; the floor is as many codes below them.
-        sums, total, end = np.convolve(codes, np.ones(2 * half + 1, np.int64)), int(codes.sum()), len(codes)
-        inside, below = sums[half : half + end], np.append(np.zeros(half + 1, np.int64), sums)[:end]
-        above = total - np.append(np.cumsum(codes), np.full(half, total))[half : half + end]
+        up_to = np.cumsum(np.pad(codes, (2 * width, half)))
+        total, end, sums = int(codes.sum()), len(codes), up_to[width:] - up_to[:-width]
+        inside, below, above = sums[width + half :], sums[half : half + end], total - up_to[2 * width + half :]
         piles = (inside >= max(100, 1e-3 * total)) & (inside >= 5 * below) & (above <= 0.02 * inside)
         at = int(np.argmax(np.where(piles, inside, 0)))
         if piles[at] and inside[at] > count:

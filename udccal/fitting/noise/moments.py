@@ -173,15 +173,6 @@ def converter_step(frame: Codes) -> int:
     return int(np.gcd.reduce(np.diff(codes))) if codes.size > 2 else 1
 
 
-def _converter_top(peak: int, declared: int | None, q_DN: int) -> int:
-    """Largest possible code; a FitError where a code in the frames is larger than the declared one."""
-    if declared is None:
-        return int(2 ** max(int(np.ceil(np.log2(peak + q_DN))), 8) - q_DN)
-    if peak > declared:
-        raise FitError(f"Expected codes up to {declared}, found {peak}. Give the converter's largest code as top_code.")
-    return declared
-
-
 def _check_levels(flats: Sequence[Moments], darks: Sequence[Moments]) -> None:
     """A FitError where levels hold the same frames: moments of different frames never agree in all digits."""
     for name, levels in (("bright", flats), ("dark", darks)):
@@ -268,7 +259,11 @@ def reduced(data: NoiseData, rules: NoiseRules) -> NoiseMoments | None:
         # The stacks are the longest tasks: they go first.
         tasks = [pool.submit(average, frames, stack) for frames in (stack.dark, stack.bright)] if stack else []
         flats = tuple(pool.map(lambda level: moments(level.bright, level.exposure_s, level.photons)[1], brights))
-        top = _converter_top(max(flat.peak_DN for flat in flats), data.top_code, q_DN)
+        peak = max(flat.peak_DN for flat in flats)
+        possible = int(2 ** max(int(np.ceil(np.log2(peak + q_DN))), 8) - q_DN)
+        top = possible if data.top_code is None else data.top_code
+        if peak > top:
+            raise FitError(f"Expected codes up to {top}, found {peak}. Give the converter's largest code as top_code.")
         histograms, dark_moments = zip(*pool.map(dark, darks), strict=True)
         stacks = [task.result() for task in tasks]
     _check_levels(flats, dark_moments)
