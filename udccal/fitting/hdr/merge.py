@@ -128,20 +128,34 @@ def _checked(frames: object, exposures_s: object) -> Float[np.ndarray, " exposur
 @final
 @dataclass(frozen=True)
 class _Samples:
-    """Samples of some pixels, their mean, signal above dark and variance by the merged light; ``clear`` of clipping."""
+    """Samples of some pixels in electrons: light less its mean, signal above dark and variance, by the merged light.
 
-    pixels: Int[np.ndarray, " some"]
+    ``weight`` is what each tells of its pixel's light, 0 for clipped ones; ``clear`` ones are clear of clipping.
+    """
+
     times: Float[np.ndarray, "n 1"]
-    light: Float[np.ndarray, "n some"]
+    errors: Float[np.ndarray, "n some"]
     mean: Float[np.ndarray, "n some"]
     signal: Float[np.ndarray, "n some"]
     variance: Float[np.ndarray, "n some"]
+    weight: Float[np.ndarray, "n some"]
     clear: Bool[np.ndarray, "n some"]
 
-    def errors(self, most_sigma: float) -> Float[np.ndarray, "n some"]:
-        """Samples less their mean; hits count as samples at the limit."""
-        most = most_sigma * np.sqrt(self.variance)
-        return np.clip(self.light - self.mean, -most, most)
+    def left(
+        self, deviation: Float[np.ndarray, "n some"], weight: Float[np.ndarray, "n some"]
+    ) -> Float[np.ndarray, "n some"]:
+        """What of a deviation is left in the errors where each pixel's light, with these weights, follows it."""
+        information = np.maximum((weight * self.times**2).sum(axis=0), 1e-30)
+        return deviation - self.times * (weight * self.times * deviation).sum(axis=0) / information
+
+    def amount(
+        self, left: Float[np.ndarray, "n some"], used: Bool[np.ndarray, "n some"], most_sigma: float
+    ) -> tuple[float, float]:
+        """How much of a deviation the errors have, by what is ``left`` of it, with its sigma; hits count as limits."""
+        sigma, weight = np.sqrt(self.variance), np.where(used, left / self.variance, 0.0)
+        information = max(float(np.sum(weight * left)), 1e-30)
+        errors = np.clip(self.errors, -most_sigma * sigma, most_sigma * sigma)
+        return float(np.sum(weight * errors)) / information, information**-0.5
 
 
 @final
@@ -182,17 +196,17 @@ class _Bracket:
 
     def frames_off(self, merged: BlockMerge) -> Int[np.ndarray, " off"]:
         """Frames without any one of which the others agree, the best first; none where all agree."""
-        if not self._frame_scores(merged, self.rules.least_to_judge).max() > self.rules.frame_sigma:
+        if not self._frame_scores(merged, self.rules.least_to_judge, 10.0).max() > self.rules.frame_sigma:
             return np.zeros(0, int)
         # The frame of most light sets the merged light: where it is wrong, the others are off. Each is left out once.
         part, left = self.part(np.s_[:: max(1, self.codes.shape[1] // 20_000)]), np.full(len(self.times), np.inf)
         for i in np.flatnonzero(~self.dropped).tolist():
             rest = part.without(i)
-            left[i] = rest._frame_scores(rest.merged(), self.rules.least_to_judge - 1).max()
+            left[i] = rest._frame_scores(rest.merged(), self.rules.least_to_judge - 1, 10.0).max()
         return np.argsort(left)[: max(1, int(np.sum(left <= self.rules.frame_sigma)))]
 
     def _samples(self, merged: BlockMerge, least: int, least_rate: float = 0.0) -> _Samples:
-        """Samples, in electrons, of some pixels with more than ``least_rate`` and at least so many samples."""
+        """Of some pixels with more than ``least_rate`` and at least so many samples."""
         sensor, pixels = self.sensor, np.flatnonzero((merged.used >= least) & (merged.rate > least_rate))
         pixels = pixels[:: max(1, len(pixels) // 20_000)]
         light = np.asarray(sensor.electrons(self.codes[:, pixels].astype(np.float64)))
@@ -200,23 +214,22 @@ class _Bracket:
         signal = merged.rate[pixels] * times
         mean = signal + sensor.dark_e_per_s * times
         variance = np.maximum(mean, 0.0) + sensor.floor_e2
+        weight = np.where(~self.dropped & (light < sensor.level_e), 1 / variance, 0.0)
         clear = ~self.dropped & (mean + 5 * np.sqrt(variance) < sensor.level_e)
-        return _Samples(pixels, times, light, mean, signal, variance, clear)
+        return _Samples(times, light - mean, mean, signal, variance, weight, clear)
 
-    def _frame_scores(self, merged: BlockMerge, least: int) -> Float[np.ndarray, " n"]:
-        """How far each frame's light is off that of all, in sigma; 0 where that is little or unknown."""
-        seen = self._samples(merged, least)
-        sigma = np.sqrt(seen.variance)
-        # Unclipped samples near the level are the low ones of their kind; samples of few electrons are skewed. Both are
-        # left out here. The median keeps hits from counting as a lamp that flickers.
-        clear, score = seen.clear & (10 * sigma < seen.signal), np.zeros(len(self.times))
+    def _frame_scores(self, merged: BlockMerge, least: int, bright: float) -> Float[np.ndarray, " n"]:
+        """How far each frame's light is off that of all, in sigma; 0 where that is little or unknown.
+
+        It is seen in samples of ``bright`` sigma and more, of pixels with at least so many samples.
+        """
+        seen, score = self._samples(merged, least), np.zeros(len(self.times))
+        clear = seen.clear & (bright * np.sqrt(seen.variance) < seen.signal)
         for i in np.flatnonzero(clear.sum(axis=1) >= 8):
-            part = np.s_[i, clear[i]]
-            signal = seen.signal[part]
-            off = abs(float(np.median((seen.light - seen.mean)[part] / signal)))
-            # A median's standard error is 1.2533 times a mean's.
-            error = 1.2533 * float(np.median(sigma[part] / signal)) / math.sqrt(len(signal))
-            score[i] = off / error if off > self.rules.frame_off else 0.0
+            frame = (np.arange(len(score)) == i)[:, None]
+            left = seen.left(frame * seen.signal, seen.weight)
+            off, sigma = seen.amount(left, clear, self.rules.believed_sigma)
+            score[i] = abs(off) / sigma if abs(off) > self.rules.frame_off else 0.0
         return score
 
     def mend_hits(self, merged: BlockMerge) -> Int[np.ndarray, " hits"]:
@@ -235,8 +248,7 @@ class _Bracket:
 
     def doubts(self, merged: BlockMerge, unlike: Int[np.ndarray, " off"]) -> Iterator[str]:
         """Sentences for samples that contradict the noise model, or one another."""
-        seen = self._samples(merged, 2)
-        scatter, black_DN = self._scatter(seen, merged), self._black_off(merged) / self.sensor.e_per_DN
+        scatter, black_DN = self._scatter(merged), self._black_off(merged) / self.sensor.e_per_DN
         if scatter != 1:
             yield (
                 f"Samples scatter about a pixel's light with {scatter:.2f} times the variance of the noise model. "
@@ -251,55 +263,38 @@ class _Bracket:
         if unlike.size:
             differ = f"frames {' and '.join(map(str, unlike))} differs, and no other frame tells which one is right"
             yield f"The light of {differ}: frame {unlike[0]} is left out. {advice}"
-        elif scatter == 1 and not black_DN and (frame := self._unlike_neighbours(seen)) is not None:
-            few = "too few pixels have a third sample that tells which one is right"
-            yield f"The light of frame {frame} differs from that of the frames beside it, and {few}. {advice}"
+        elif scatter == 1 and not black_DN:
+            # Where exposures lie far apart, few pixels have a third sample that tells which frame is wrong.
+            scores = self._frame_scores(merged, 2, 3.0)
+            if scores.max() > self.rules.frame_sigma:
+                differs = f"frame {scores.argmax()} differs from that of the frames beside it"
+                few = "too few pixels have a third sample that tells which one is right"
+                yield f"The light of {differs}, and {few}. {advice}"
 
-    def _scatter(self, seen: _Samples, merged: BlockMerge) -> float:
+    def _scatter(self, merged: BlockMerge) -> float:
         """Variance of samples about their pixel's light over the model's; 1 where that is what chance gives."""
-        times, sigma, offset_e = seen.times, merged.sigma[seen.pixels], self.sensor.offset_e
+        seen = self._samples(merged, 2)
         # Clear of pixels whose light is known badly: that the variance is that of the light as merged, and not as it
         # is, changes nothing then.
-        clear = seen.clear & (merged.rate[seen.pixels] > self.rules.sure_electrons**0.5 * sigma)
+        known = 1 / np.maximum((seen.weight * seen.times**2).sum(axis=0), 1e-30)
+        clear = seen.clear & (seen.signal**2 > self.rules.sure_electrons * known * seen.times**2)
         # Hits in pixels of two samples are not found: a few of them must not count much.
-        chi2 = np.minimum((seen.light - seen.mean) ** 2 / seen.variance, 4.0**2)
-        # A pixel's offset moves its light by `follows` of itself, and its samples by what is left.
-        slope = np.where(~self.dropped & (seen.mean < self.sensor.level_e), times / seen.variance, 0.0)
-        follows = slope.sum(axis=0) / np.maximum((slope * times).sum(axis=0), 1e-30)
-        known = times**2 * np.maximum(sigma.astype(np.float64) ** 2 - (offset_e * follows) ** 2, 0)
-        expected = 1 - np.minimum(known / seen.variance, 1) + (offset_e * (1 - follows * times)) ** 2 / seen.variance
+        chi2 = np.minimum(seen.errors**2 / seen.variance, 4.0**2)
+        # A pixel's offset moves its samples by what its light does not follow.
+        offset = self.sensor.offset_e * seen.left(np.ones_like(seen.mean), seen.weight)
+        expected = 1 - np.minimum(known * seen.times**2 / seen.variance, 1) + offset**2 / seen.variance
         dof = max(float(np.sum(expected[clear])), 1e-9)
         found = float(np.sum(chi2[clear])) / dof
         return found if abs(found - 1) > max(self.rules.scatter_off, 6 * math.sqrt(2 / dof)) else 1.0
 
-    def _unlike_neighbours(self, seen: _Samples) -> int | None:
-        """The frame whose light is off most, where it is off by too much in pixels of two samples.
-
-        Where exposures lie far apart, few pixels have a third sample that tells which frame is wrong.
-        """
-        clear = seen.clear & (3 * np.sqrt(seen.variance) < seen.signal)
-        weight = np.where(clear, seen.signal / seen.variance, 0.0)
-        # A sample that gives its pixel most of its light follows it: what the others say of it is what counts.
-        own = np.where(~self.dropped & (seen.light < self.sensor.level_e), seen.times**2 / seen.variance, 0.0)
-        by_others = 1 - own / np.maximum(own.sum(axis=0), 1e-30)
-        information = np.maximum((weight * seen.signal * by_others).sum(axis=1), 1e-30)
-        off = np.abs((weight * seen.errors(self.rules.believed_sigma)).sum(axis=1) / information)
-        score = np.where(off > self.rules.frame_off, off * np.sqrt(information), 0.0)
-        return int(score.argmax()) if score.max() > self.rules.frame_sigma else None
-
     def _black_off(self, merged: BlockMerge) -> float:
-        """The error of the black level that dark samples show, in electrons; 0 where it is not too much.
-
-        A wrong black level is the same in all exposures, and light is not: this is its weighted mean, light taken out.
-        """
-        seen, sensor = self._samples(merged, 2, -np.inf), self.sensor
-        weight, times = np.where(seen.clear & (seen.mean < 30 * sensor.floor_e2), 1 / seen.variance, 0.0), seen.times
-        light_taken = times * (weight * times).sum(axis=0) / np.maximum((weight * times**2).sum(axis=0), 1e-30)
-        weight = weight * (1 - light_taken)
-        information = max(float(np.sum(weight)), 1e-30)
-        found = float(np.sum(weight * seen.errors(self.rules.believed_sigma))) / information
-        limit = max(self.rules.black_off * sensor.floor_e2**0.5, 6 / information**0.5, sensor.rounding_e)
-        return found if abs(found) > limit else 0.0
+        """The error of the black level, which is the same in all exposures, in electrons; 0 where it is small."""
+        seen, floor = self._samples(merged, 2, -np.inf), float(self.sensor.floor_e2)
+        dark = seen.clear & (seen.mean < 30 * floor)
+        # Light whose brighter samples are off themselves must not count.
+        left = seen.left(np.ones_like(seen.mean), dark / seen.variance)
+        found, sigma = seen.amount(left, dark, self.rules.believed_sigma)
+        return found if abs(found) > max(self.rules.black_off * floor**0.5, 6 * sigma, self.sensor.rounding_e) else 0.0
 
 
 def _put(out: BlockMerge, where: slice | Int[np.ndarray, " some"], part: BlockMerge) -> None:

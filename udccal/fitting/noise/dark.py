@@ -56,9 +56,13 @@ def fit_dark_terms(
 
     ``curvature`` is the response's in 1/DN: dark signal bends as light does.
     """
-    rules = data.rules
+    rules, stack, rounding = data.rules, data.dark_stack, data.rounding_DN2
+
+    def fitted(row_DN: float, start: Five | None, normal: bool = False) -> DarkFit:
+        return fit_dark(data.darks, K_DN_per_e, row_DN, rules, start, normal)
+
     row, in_pairs = row_noise(data, np.ones(len(data.darks)))
-    fit = fit_dark(data.darks, K_DN_per_e, in_pairs, rules, start)
+    fit = fitted(in_pairs, start)
     for _ in range(10):
         gains = np.array([row_gain(pair, fit.values, K_DN_per_e, in_pairs) for pair in data.darks])
         before, (row, in_pairs) = in_pairs, row_noise(data, gains)
@@ -66,17 +70,16 @@ def fit_dark_terms(
             break
         # Each depends on the other in the opposite sense: half-way between is near to where both agree.
         in_pairs = float(np.sqrt(0.5 * (in_pairs**2 + before**2)))
-        fit = fit_dark(data.darks, K_DN_per_e, in_pairs, rules, fit.values)
-    # Temporal noise below 0.15 of a code cannot be distinguished from the pattern of rounding.
-    resolved = float(fit.values[2]) + in_pairs**2 >= (0.15 * data.q_DN) ** 2
-    row = row if resolved else row_noise(data, np.zeros(len(data.darks)))[0]
-    normal = fit_dark(data.darks, K_DN_per_e, in_pairs, rules, fit.values, True)
-    free, normal = (_with_drawn_rows(one, data, in_pairs) for one in (fit, normal))
+        fit = fitted(in_pairs, fit.values)
+    if float(fit.values[2]) + in_pairs**2 < (0.15 * data.q_DN) ** 2:
+        # Temporal noise below 0.15 of a code cannot be distinguished from the pattern of rounding.
+        row, unresolved = row_noise(data, np.zeros(len(data.darks)))[0], rounding
+    else:
+        unresolved = 0.0
+    free, normal = (_with_drawn_rows(one, data, in_pairs) for one in (fit, fitted(in_pairs, fit.values, True)))
     if in_pairs > 0 and np.abs(gains - 1).max() > rules.white:
         # Rounding hides part of the row noise, and what is wrong with it is taken for read noise.
-        less = float(np.sqrt(max(in_pairs**2 - row.variance**0.5, 0.0)))
-        depends = fit_dark(data.darks, K_DN_per_e, less, rules, fit.values).values - fit.values
-        free = replace(free, cov=free.cov + np.outer(depends, depends))
+        free = free.doubted(fitted(float(np.sqrt(max(in_pairs**2 - row.variance**0.5, 0.0))), fit.values).values)
     value, variance = float(free.values[4]), float(free.cov[4, 4])
     name, gain = f"read noise of another shape than normal ({NORMAL_SHAPE:.2f})", (value - NORMAL_SHAPE) ** 2 / variance
     shape = Quantity.asked(name, value, variance, data.dark_samples, gain, without=NORMAL_SHAPE)
@@ -84,13 +87,12 @@ def fit_dark_terms(
     # Different offsets smear the rounding in the mean over all pixels; only a pixel's own noise smears its rounding.
     white = fit.follows and 4 * np.pi**2 * float(fit.values[2]) >= rules.smeared * data.q_DN**2
     if not white:
-        # Coarse codes hardly show the distribution, and all that they tell depends on it.
-        depends = (free.values - normal.values) * np.array([1.0, 1.0, 1.0, 1.0, 0.0])
-        fit = replace(fit, cov=fit.cov + np.outer(depends, depends))
+        # Coarse codes hardly show the distribution, and all that they tell but its shape depends on it.
+        fit = fit.doubted(np.append((fit.values + free.values - normal.values)[:4], fit.values[4]))
         fit.cov[2, 2] += (0.5 * fit.values[2]) ** 2
     (_, rate, read, spread2, _), variance = fit.values.tolist(), float(fit.cov[2, 2])
-    read_DN2, shot, stack = Quantity(read, variance), K_DN_per_e * max(rate, 0.0), data.dark_stack
-    expected = [read + data.rounding_DN2 + shot * pair.exposure_s for pair in data.darks]
+    read_DN2, shot = Quantity(read, variance), K_DN_per_e * max(rate, 0.0)
+    expected = [read + rounding + shot * pair.exposure_s for pair in data.darks]
     if not white:
         expected = _coded_variances(data.darks, fit, K_DN_per_e, in_pairs)
     more = unexplained_variance(data, expected, rules.most_hits)
@@ -103,18 +105,14 @@ def fit_dark_terms(
     elif read <= 1.001 * LOW[2]:
         read_DN2 = Quantity(0.0, max(variance, LOW[2] ** 2))
     # DSNU comes from the stack's average, or from the histograms where rounding biases the average.
-    single = Quantity(read_DN2.value + shot * stack.exposure_s + data.rounding_DN2, read_DN2.variance)
+    single = Quantity(read_DN2.value + shot * stack.exposure_s + rounding, read_DN2.variance)
     if seen := data.dark_seen:
         # Its own frames say what noise the average has, whatever the distribution.
-        value = float(np.average(seen.variance_DN2, weights=seen.dof))
-        single = Quantity(value, 2 * value**2 / float(seen.dof.sum()))
+        single = Quantity(seen.temporal_DN2, 2 * seen.temporal_DN2**2 / float(seen.dof.sum()))
     temporal = Quantity(single.value / stack.frames, single.variance / stack.frames**2)
     offsets = dsnu(stack.mean_DN, temporal, in_pairs**2 / stack.frames, rules.defect_sigma)
     if not white:
-        pixels, sigma = (
-            stack.mean_DN.size,
-            float(np.hypot(fit.cov[3, 3] ** 0.5, 0.0 if resolved else data.rounding_DN2)),
-        )
+        pixels, sigma = stack.mean_DN.size, float(np.hypot(fit.cov[3, 3] ** 0.5, unresolved))
         offsets = replace(offsets, variance=spread2, sigma=sigma, samples=pixels, mean_variance=spread2 / pixels)
     black, levels_cov, current = _levels(data, fit, in_pairs**2, single.value, offsets, curvature)
     DSNU2 = Quantity.asked("DSNU", offsets.variance, offsets.sigma**2, offsets.samples)
@@ -145,10 +143,9 @@ def _coded_variances(pairs: tuple[DarkPair, ...], fit: DarkFit, K_DN_per_e: floa
     """Temporal variance without row noise that the fitted distribution has in each pair's codes."""
     found = []
     for pair in pairs:
-        p = pair_probability(pair, fit.values, K_DN_per_e, row_DN, 0.0)
-        square = (pair.centres_DN[:, None] - pair.centres_DN) ** 2
+        p, apart = pair_probability(pair, fit.values, K_DN_per_e, row_DN, 0.0), pair.differences_DN
         by_row = row_gain(pair, fit.values, K_DN_per_e, row_DN) * row_DN
-        found.append(float(np.sum(p * square)) / (2 * float(p.sum())) - by_row**2)
+        found.append(float(np.sum(p * apart**2)) / (2 * float(p.sum())) - by_row**2)
     return found
 
 
@@ -164,8 +161,7 @@ def _levels(
         # Rounding of a pixel with little noise is nearly the same in every frame.
         own = single_DN2 / stack.frames + data.rounding_DN2 * float(np.exp(-4 * np.pi**2 * single_DN2 / data.q_DN**2))
         variances = np.append(variances, own / stack.mean_DN.size + rows / stack.frames)
-    above = np.maximum(means - float(fit.values[0]), 0.0)
-    means = means + curvature * above**2
+    means = means + curvature * np.maximum(means - float(fit.values[0]), 0.0) ** 2
     # One exposure time does not tell dark current from black: all is black, and all of it may be dark current.
     apart = bool(np.ptp(times) > 0)
     design = np.column_stack([np.ones_like(times), times * apart])
@@ -192,16 +188,12 @@ def unexplained_variance(data: NoiseMoments, expected_DN2: Sequence[float], most
     where they are more than ``most_hits`` of all: radiation does not hit so often, so that they are tails of the noise,
     or pixels with random telegraph noise (EMVA 1288, clause 6.3, averages the variance over all pixels).
     """
-    hits = sum(of.outliers for of in data.dark_moments)
-    tails = hits > most_hits * sum(of.samples.sum() / of.frames for of in data.dark_moments)
+    tails = sum(of.outliers for of in data.dark_moments) > most_hits * sum(of.pixels for of in data.dark_moments)
     values, variances = [], []
-    for pair, of, expected in zip(data.darks, data.dark_moments, expected_DN2, strict=True):
-        pixels = float(of.samples.sum()) / of.frames
-        second, fourth = of.outlier_powers if tails else (0.0, 0.0)
-        value = float(np.average(of.variance_DN2, weights=of.dof)) + second / (2 * pixels)
-        difference = pair.centres_DN[:, None] - pair.centres_DN
-        fourth_moment = float(np.sum(pair.counts * difference**4) + fourth) / pixels
-        values.append(value - expected)
-        variances.append(max(fourth_moment / 4 - value**2, value**2) / pixels)
+    for pair, of in zip(data.darks, data.dark_moments, strict=True):
+        value = of.temporal_DN2 + tails * of.outlier_variance_DN2
+        fourth = (np.sum(pair.counts * pair.differences_DN**4) + tails * of.outlier_powers[1]) / of.pixels
+        values.append(value)
+        variances.append(max(fourth / 4 - value**2, value**2) / of.pixels)
     weights = 1.0 / np.maximum(variances, 1e-30)
-    return Quantity(float(np.average(values, weights=weights)), float(1.0 / weights.sum()))
+    return Quantity(float(np.average(np.subtract(values, expected_DN2), weights=weights)), float(1.0 / weights.sum()))

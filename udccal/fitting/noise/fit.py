@@ -13,12 +13,11 @@ from udccal.fitting.engine.gaussian import Posterior
 from udccal.fitting.engine.orders import Quantity
 from udccal.fitting.engine.report import estimates, residual_sample
 from udccal.fitting.engine.robust import outliers
-from udccal.fitting.noise.clipping import stacked
 from udccal.fitting.noise.codes import start_values
 from udccal.fitting.noise.dark import DarkTerms, fit_dark_terms
 from udccal.fitting.noise.data import NoiseData, NoiseRules
 from udccal.fitting.noise.flats import Curve, find_saturation, fit_curve, rough_gain
-from udccal.fitting.noise.moments import NoiseMoments, bins, reduced
+from udccal.fitting.noise.moments import NoiseMoments, bins, reduced, stacked
 from udccal.fitting.noise.patterns import Pattern, prnu, rough_median
 from udccal.models.noise import Noise, linear_signal
 from udccal.numerics import in_float64

@@ -1,4 +1,4 @@
-"""Flats: which of their bins lie inside the sensor's range, the photon transfer curve, and saturation."""
+"""Flats: which of their bins are full or inside the sensor's range, the photon transfer curve, and saturation."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from scipy.special import ndtri
 
 from udccal.fitting.engine.orders import Choice
 from udccal.fitting.engine.robust import OutlierRule, robust_sigma
-from udccal.fitting.noise.clipping import Bins, full_bins, piled_up, stacked
 from udccal.fitting.noise.codes import excess_kurtosis, smeared, standard_cdf
 from udccal.fitting.noise.dark import DarkTerms
-from udccal.fitting.noise.moments import Moments, NoiseMoments
+from udccal.fitting.noise.moments import NoiseMoments, stacked
 from udccal.fitting.noise.transfer import DarkVariance, Five, Levels, TransferFit, robust_transfer
 
+Bins = Bool[np.ndarray, "flats bins"]
 # Part of full samples with the last code above which that part, and not the mean, gives the level.
 _MANY_AT_THE_END = 0.02
 
@@ -50,15 +50,14 @@ class Curve:
     @property
     def values(self) -> Five:
         """The fit's values; zeros where there is none."""
-        return np.zeros(5) if self.choice is None else self.choice.best.fit.values
+        return np.zeros(5) if self.choice is None else self.fit.values
 
     @property
     def cov(self) -> Float[np.ndarray, "5 5"]:
         """Covariance of the values, with what the variances' misfit and the choice of an order add."""
         assert self.choice is not None, "asked for where there are usable levels"
-        return np.asarray(
-            self.fit.cov * self.fit.misfit.inflation + self.choice.spread(self.fit.samples, lambda of: of.values)
-        )
+        orders = self.choice.spread(self.fit.samples, lambda of: of.values)
+        return np.asarray(self.fit.cov * self.fit.misfit.inflation + orders)
 
     @property
     def usable_levels(self) -> int:
@@ -71,11 +70,9 @@ def fit_curve(data: NoiseMoments, dark: DarkTerms) -> Curve:
     full, flickering, rules = full_bins(data, dark), _flickering(data, dark), data.rules
     pile = None if full.any() else piled_up(data, dark)
     # Upper median of the saturated bins, or the converter's largest code where nothing is full.
-    ceiling = data.top_DN
+    ceiling = pile[0] if pile else data.top_DN
     if full.any():
         ceiling = float(np.quantile(stacked(data.flats, "mean_DN")[full], 0.75))
-    elif pile:
-        ceiling = pile[0]
 
     def up_to(part: float) -> Curve:
         inside = _inside(data, dark, part * (ceiling - dark.black_DN), ceiling)
@@ -94,15 +91,59 @@ def fit_curve(data: NoiseMoments, dark: DarkTerms) -> Curve:
     return found
 
 
+def full_bins(data: NoiseMoments, dark: DarkTerms) -> Bins:
+    """The saturated bins: as bright as any, with far less variance than the rest predicts for their mean.
+
+    Where all flats are saturated there is no rest: bins with no more variance than the dark frames are then saturated.
+    """
+    mean, variance = stacked(data.flats, "mean_DN") - dark.black_DN, stacked(data.flats, "variance_DN2")
+    bright: Bins = mean > 0.05 * (data.top_DN - dark.black_DN)
+    if not bright.any():
+        return bright
+    # Saturation is a ceiling: a quiet bin well below the brightest one is something else.
+    highest = bright & (mean >= 0.9 * mean.max())
+    # Below saturation variance over mean is K plus a small positive part; clipping only lowers it.
+    slope = variance / np.maximum(mean, 1e-9)
+    collapsed: Bins = highest & (slope < 0.3 * float(np.quantile(slope[bright], 0.75)))
+    quiet: Bins = highest & (variance <= 1.3 * (dark.read_DN2.value + data.rounding_DN2 + dark.row_DN2.value))
+    return quiet if not collapsed.any() and quiet[bright].mean() > 0.5 else collapsed
+
+
+def piled_up(data: NoiseMoments, dark: DarkTerms) -> tuple[float, float] | None:
+    """Level and sigma in DN where full pixels of uneven flats pile up, or None.
+
+    Flats that are dimmer towards the corners clip in their middle alone: no bin is full. The full pixels have the dark
+    noise about one level, nothing is brighter, and shot noise has spread all others over far more codes.
+    """
+    q, spread2 = data.q_DN, dark.read_DN2.value + dark.dsnu_DN2.value + dark.row_DN2.value + data.rounding_DN2
+    half, count, floor, middle = max(int(np.ceil(2.5 * np.sqrt(spread2) / q)), 1), 0, 0, 0.0
+    width = 2 * half + 1
+    for flat in data.flats:
+        codes = flat.codes[::q]
+        # At code c the pile has codes c - half to c + half; the floor is as many codes below them.
+        up_to = np.cumsum(np.pad(codes, (2 * width, half)))
+        total, end, sums = int(codes.sum()), len(codes), up_to[width:] - up_to[:-width]
+        inside, below, above = sums[width + half :], sums[half : half + end], total - up_to[2 * width + half :]
+        piles = (inside >= max(100, 1e-3 * total)) & (inside >= 5 * below) & (above <= 0.02 * inside)
+        at = int(np.argmax(np.where(piles, inside, 0)))
+        if piles[at] and inside[at] > count:
+            near = np.arange(max(at - half, 0), min(at + half + 1, end))
+            count, floor, middle = int(inside[at]), int(below[at]), float(np.average(near, weights=codes[near]))
+    level, spread = middle * q, float(np.sqrt(spread2))
+    shot2 = dark.K_DN_per_e * (level - dark.black_DN)
+    if not count or shot2 < 9.0 * spread2 or level + 3.0 * spread >= data.top_DN:
+        return None
+    # The light of unclipped pixels shifts the mean by at most the part that they have, to the pile's end.
+    return level, float(np.hypot(spread / np.sqrt(count), floor / count * half * q))
+
+
 def _inside(data: NoiseMoments, dark: DarkTerms, up_to_DN: float, ceiling_DN: float) -> Levels:
     """The flats as the transfer fit takes them, with the bins that lie safely inside the sensor's range."""
     flats = data.flats if data.flat_seen is None else (*data.flats, data.flat_seen)
     mean, variance, spread = (stacked(flats, name) for name in ("mean_DN", "variance_DN2", "spread_DN"))
     if dark.foreign:
         # What was taken for hits were tails of the noise.
-        pixels = [2 * (of.frames - 1) * float(of.samples.sum()) / of.frames for of in flats]
-        tails = np.array([of.outlier_powers[0] / n for of, n in zip(flats, pixels, strict=True)])
-        variance = variance + tails[:, None]
+        variance = variance + np.array([[of.outlier_variance_DN2] for of in flats])
     above, K, q = mean - dark.black_DN, dark.K_DN_per_e, data.q_DN
     # Frames of different brightness differ, in addition to noise, by the bin's pattern (shading, PRNU) times that.
     shift2 = np.stack([np.var(flat.shift_DN, axis=0, ddof=1) for flat in flats])
@@ -141,12 +182,11 @@ def _dark_variance(data: NoiseMoments, dark: DarkTerms) -> DarkVariance:
     seen = data.dark_seen
     # Hits were left out of the stack: where tails of the noise were taken for hits, it shows too little.
     if seen is not None and dark.white and not dark.foreign:
-        observed = float(np.average(seen.variance_DN2, weights=seen.dof))
         # The tails are the read noise's: rounding and counts of dark current have hardly any.
         excess = excess_kurtosis(dark.shape.value) if dark.shape.there else 0.0
-        tails = excess * min(read.value, observed) ** 2 * (1 - 1 / seen.frames)
-        sigma = float(np.sqrt((2 * observed**2 + tails) / float(seen.dof.sum())))
-        points.append((observed - rounding - K * rate * seen.exposure_s, sigma, rate * seen.exposure_s))
+        tails = excess * min(read.value, seen.temporal_DN2) ** 2 * (1 - 1 / seen.frames)
+        sigma = float(np.sqrt((2 * seen.temporal_DN2**2 + tails) / float(seen.dof.sum())))
+        points.append((seen.temporal_DN2 - rounding - K * rate * seen.exposure_s, sigma, rate * seen.exposure_s))
     values, sigmas, drifts = np.array(points).T
     # An error of black acts on the curve as an error of V0 that is K times as large.
     shifted = K * np.sqrt(max(float(dark.levels_cov[0, 0]) - dark.offsets.mean_variance, 0.0))
@@ -181,64 +221,55 @@ def find_saturation(data: NoiseMoments, dark: DarkTerms, curve: Curve) -> tuple[
     It is the mean of the bins in which every pixel is full, or the last code where codes end before the full well. In
     between, it follows from the fraction of samples at the end. Where no bin is full, full pixels may pile up.
     """
-    full = [(flat, bins) for flat, bins in zip(data.flats, curve.full, strict=True) if bins.any()]
-    if not full and curve.pile:
-        return curve.pile
-    if not full:
+    full, flats, q = curve.full, data.flats, data.q_DN
+    if not full.any():
         # The level lies between the brightest code seen and the largest possible one.
-        seen = max(flat.peak_DN for flat in data.flats)
-        return data.top_DN, max(data.top_DN - seen, 0.0) / float(np.sqrt(3.0))
-    peak = max(flat.peak_DN for flat, _ in full)
+        unseen = max(data.top_DN - max(flat.peak_DN for flat in flats), 0.0)
+        return curve.pile or (data.top_DN, unseen / math.sqrt(3.0))
+    names = ("mean_DN", "variance_DN2", "dof", "samples", "at_peak")
+    mean, variance, dof, samples, at_peak = (stacked(flats, name) for name in names)
+    peaks = np.array([flat.peak_DN for flat in flats])
+    peak = int(peaks[full.any(axis=1)].max())
+    at_peak = at_peak * (peaks == peak)[:, None]
+    V0, row = max(float(curve.values[1]), 0.0), dark.row_DN2.value
+    spread = float(np.sqrt(spread2 := V0 + dark.dsnu_DN2.value + row))
     # Bins in which most samples have the last code; of a whole frame, colours that are not full hide them.
-    part = max(float(flat.at_peak[bins].max()) for flat, bins in full if flat.peak_DN == peak)
-    V0 = max(float(curve.values[1]), 0.0)
-    if part >= 0.5 and peak < data.top_DN:
-        return float(peak), float(1 / np.sqrt(12.0))  # known to within rounding
-    if part >= 0.5:
+    if (most := float(at_peak[full].max())) >= 0.5 and peak < data.top_DN:
+        return float(peak), q / math.sqrt(12.0)  # known to within rounding
+    if most >= 0.5:
         # So many samples come to the converter's end from a level within half a code of it, where noise is small.
-        spread = float(np.sqrt(V0 + dark.dsnu_DN2.value + dark.row_DN2.value))
-        below = 0.5 * data.q_DN - spread * float(ndtri(min(part, 1 - 1e-4)))
-        return float(peak), max(below, 0.0) / float(np.sqrt(3.0))
-    found = np.array([_level(flat, bins, data, dark, V0, peak) for flat, bins in full])
-    # An outlier among full pixels is a pixel that is not full.
-    clean = (found[:, 2] > 0) & np.array([of.frames * of.outliers <= 1e-5 * of.samples.sum() for of, _ in full])
-    values, variances, _ = (found[clean] if clean.any() else found).T
-    weight = 1 / np.maximum(variances, 1e-12)
-    return float(np.average(values, weights=weight)), float(weight.sum() ** -0.5)
-
-
-def _level(
-    flat: Moments, full: Bool[np.ndarray, " bins"], data: NoiseMoments, dark: DarkTerms, V0: float, peak: int
-) -> tuple[float, float, bool]:
-    """Saturation in DN by one flat, its variance, and whether all pixels of a bin are full."""
+        below = 0.5 * q - spread * float(ndtri(min(most, 1 - 1e-4)))
+        return float(peak), max(below, 0.0) / math.sqrt(3.0)
+    # Bins whose pixels are all full have no other noise, and no outliers: these would be pixels that are not full.
     temporal = V0 + data.rounding_DN2
-    excess = flat.variance_DN2 - temporal
-    sure = full & (excess < 3.0 * temporal * np.sqrt(2 / flat.dof))
-    chosen = sure if sure.any() else full
-    samples = float(flat.samples[chosen].sum())
-    rows = dark.row_DN2.value / (flat.frames * flat.height) * (full.size / float(chosen.sum()))
-    spread2 = V0 + dark.dsnu_DN2.value + dark.row_DN2.value
-    part = float(np.average(flat.at_peak[chosen], weights=flat.samples[chosen]))
-    spread, clipped = float(np.sqrt(spread2)), flat.peak_DN >= data.top_DN and part > 0.0
-    z = float(ndtri(part)) if clipped else 0.0
-    density = float(np.exp(-0.5 * z**2)) / math.sqrt(2 * math.pi)
-    if clipped and part > _MANY_AT_THE_END:
-        own = spread2 * part * (1 - part) / density**2 / samples
+    excess = variance - temporal
+    sure = full & (excess < 3.0 * temporal * np.sqrt(2 / dof))
+    clean = sure & np.array([[of.frames * of.outliers <= 1e-5 * of.samples.sum()] for of in flats])
+    chosen = next(bins for bins in (clean, sure, full) if bins.any())
+    weights, count = samples[chosen], float(samples[chosen].sum())
+    part = float(np.average(at_peak[chosen], weights=weights)) if peak >= data.top_DN else 0.0
+    # Each frame has its own row noise, which the bins of a row share.
+    seen = [of.frames * of.height * bins.mean() for of, bins in zip(flats, chosen, strict=True)]
+    z, rows = float(ndtri(part)) if part > 0 else 0.0, row / float(sum(seen))
+    density = math.exp(-0.5 * z**2) / math.sqrt(2 * math.pi)
+    shape = dark.shape.value
+    if part > _MANY_AT_THE_END:
+        own = spread2 * part * (1 - part) / density**2 / count
         # The fraction gives the level by the shape of the noise, of which the read noise's is not quite normal.
-        quantile, probability = standard_cdf(dark.shape.value)
+        quantile, probability = standard_cdf(shape)
         own += V0 * (0.2 if dark.foreign else float(np.interp(part, probability, quantile)) - z) ** 2
-        return peak - 0.5 * data.q_DN + spread * z, own + rows, bool(sure.any())
+        return peak - 0.5 * q + spread * z, math.sqrt(own + rows)
     # Few samples beyond the end lower the mean by this, if their noise is normal.
-    lost = spread * (density + z * part) if clipped else 0.0
+    lost = spread * (density + z * part) if part > 0 else 0.0
     # Rounding adds sum over k of (-1)^k q sin(2 pi k x / q) f(2 pi k / q) / (pi k) to the mean of noise that has the
     # characteristic function f (Widrow and Kollar, Quantization Noise, chapter 5): this is its uncertainty. Tails leave
     # more of it than normal noise does; as much as Laplace's where the fitted shape has them.
-    frequency, shape = 2 * np.pi * np.arange(1, 8) / data.q_DN, dark.shape.value
+    frequency = 2 * np.pi * np.arange(1, 8) / q
     tails = dark.foreign or shape < 0
     read = 1 / (1 + 0.5 * frequency**2 * V0) if tails else smeared(shape, frequency * np.sqrt(V0))
     left = read * np.exp(-0.5 * frequency**2 * (spread2 - V0))
     rounding = float(np.sum(2 * (left / frequency) ** 2))
     # Where some pixels are not full, the possible shift of the mean adds to it.
     low = 0.0 if sure.any() else 0.5 * max(float(excess[chosen].mean()), 0.0)
-    mean = float(np.average(flat.mean_DN[chosen], weights=flat.samples[chosen]))
-    return mean + lost, temporal / samples + rounding + low + rows + lost**2, bool(sure.any())
+    level = float(np.average(mean[chosen], weights=weights)) + lost
+    return level, math.sqrt(temporal / count + rounding + low + rows + lost**2)

@@ -76,6 +76,26 @@ class Moments:
         """How many."""
         return len(self.shift_DN)
 
+    @property
+    def pixels(self) -> float:
+        """Pixels of a frame."""
+        return float(self.samples.sum()) / self.frames
+
+    @property
+    def temporal_DN2(self) -> float:
+        """Temporal variance of all bins."""
+        return float(np.average(self.variance_DN2, weights=self.dof))
+
+    @property
+    def outlier_variance_DN2(self) -> float:
+        """What the hits would add to the temporal variance."""
+        return self.outlier_powers[0] / (2 * (self.frames - 1) * self.pixels)
+
+
+def stacked(levels: tuple[Moments, ...], name: str) -> Float[np.ndarray, "levels bins"]:
+    """The field ``name`` of every level and bin."""
+    return np.stack([getattr(level, name) for level in levels])
+
 
 def reduce_frames(
     frames: Iterable[Codes], exposure_s: float, light: float | None, period: int, rules: NoiseRules
@@ -84,43 +104,49 @@ def reduce_frames(
     source = iter(frames)
     first = next(source)
     (height, columns), (down, right) = first.shape, bins(*first.shape, period)
+
+    def binned(picture: Float32[np.ndarray, "rows columns"]) -> Grid:
+        return down @ (picture @ right)
+
+    def at_peak(frame: Codes) -> tuple[int, Grid]:
+        return int(top := frame.max()), binned((frame == top).astype(np.float32))
+
     width = right.sum(axis=0, dtype=np.float64)
     counts, total = np.outer(down.sum(axis=1), width), np.zeros(first.shape, np.float32)
     outliers, powers, squares = 0, np.zeros(2), np.zeros_like(counts)
     # Of every frame: its rows' means and its bins' sums less these, as differences from the first frame, and its peak.
-    by_row, by_bin, peaks = [np.zeros(height)], [np.zeros_like(counts)], [_peak(first, down, right)]
+    by_row, by_bin, peaks = [np.zeros(height)], [np.zeros_like(counts)], [at_peak(first)]
     for frame in source:
         difference = cv2.subtract(frame, first, dtype=cv2.CV_32F)
         square = cv2.multiply(difference, difference)
         # The usual difference is the median over some rows, which hits do not move; ten codes are never a hit.
         usual = np.median(square[:: max(height // 128, 1)] @ right, axis=0) / width
         hits = square > max(rules.hit_sigma**2 * float(usual.max()), 10.0**2)
-        if count := int(np.count_nonzero(hits)):
+        if hits.any():
             large = square[hits].astype(np.float64)
-            outliers, powers = outliers + count, powers + np.array([large.sum(), np.square(large).sum()])
+            outliers, powers = outliers + large.size, powers + np.array([large.sum(), np.square(large).sum()])
             difference[hits] = 0.0
         by_row.append(difference.mean(axis=1, dtype=np.float64))
         difference -= by_row[-1][:, None]
         total += difference
-        by_bin.append(down @ (difference @ right))
-        squares += down @ (cv2.multiply(difference, difference) @ right)
-        peaks.append(_peak(frame, down, right))
+        by_bin.append(binned(difference))
+        squares += binned(cv2.multiply(difference, difference))
+        peaks.append(at_peak(frame))
     number, middle = len(by_row), float(np.median(first[:: max(height // 64, 1)]))
     rows, left = np.stack(by_row), np.stack(by_bin)
     mean = cv2.addWeighted(first, 1.0, total, 1.0 / number, 0.0, dtype=cv2.CV_32F)
     mean += rows.mean(axis=0)[:, None]
     rows, left = rows - rows.mean(axis=0), left - left.mean(axis=0)
     dof = np.maximum((number - 1) * (counts * (1 - 1 / columns) - 1), 1.0)
-    squares -= down @ (cv2.multiply(total, total, scale=1.0 / number) @ right) + np.square(left).sum(axis=0) / counts
+    squares -= binned(cv2.multiply(total, total, scale=1.0 / number)) + np.square(left).sum(axis=0) / counts
     # The rows' means were taken from all of a row: a quiet bin beside noisy ones gains their part of the mean's
     # variance, v' (1 - 1/n) = v (1 - 2/n) + row average / n.
     mixed = squares / dof
     variance = (mixed * (1 - 1 / columns) - (mixed @ width)[:, None] / columns**2) / (1 - 2 / columns)
     about = cv2.subtract(mean, middle)
-    level, square = (down @ (of @ right) / counts for of in (about, cv2.multiply(about, about)))
-    spatial = np.maximum(square - level**2, 0.0)
+    level = binned(about) / counts
+    spatial = np.maximum(binned(cv2.multiply(about, about)) / counts - level**2, 0.0)
     peak = max(code for code, _ in peaks)
-    at_peak = np.sum([count for code, count in peaks if code == peak], axis=0) / (number * counts)
     return Averaged(exposure_s, mean, number), Moments(
         exposure_s=exposure_s,
         light=exposure_s if light is None else light,
@@ -134,32 +160,17 @@ def reduce_frames(
         sampling_DN2=float(np.average(variance, weights=counts)) / columns,
         height=height,
         peak_DN=peak,
-        at_peak=at_peak.ravel(),
+        at_peak=(sum(count for code, count in peaks if code == peak) / (number * counts)).ravel(),
         codes=np.bincount(first.ravel()),
         outliers=outliers,
         outlier_powers=(float(powers[0]), float(powers[1])),
     )
 
 
-def _peak(frame: Codes, down: Float[np.ndarray, "_ _"], right: Float32[np.ndarray, "_ _"]) -> tuple[int, Grid]:
-    """The largest code, and the number of samples with it by bin."""
-    top = frame.max()
-    return int(top), down @ ((frame == top).astype(np.float32) @ right)
-
-
 def converter_step(frame: Codes) -> int:
     """Smallest step between codes: greater than 1 where a converter's bits are shifted up in 16-bit samples."""
     codes = np.flatnonzero(np.bincount(frame.ravel(), minlength=2))
     return int(np.gcd.reduce(np.diff(codes))) if codes.size > 2 else 1
-
-
-def _converter_top(peak: int, declared: int | None, q_DN: int) -> int:
-    """Largest possible code; a FitError where a code in the frames is larger than the declared one."""
-    if declared is None:
-        return int(2 ** max(int(np.ceil(np.log2(peak + q_DN))), 8) - q_DN)
-    if peak > declared:
-        raise FitError(f"Expected codes up to {declared}, found {peak}. Give the converter's largest code as top_code.")
-    return declared
 
 
 def _check_levels(flats: Sequence[Moments], darks: Sequence[Moments]) -> None:
@@ -248,7 +259,11 @@ def reduced(data: NoiseData, rules: NoiseRules) -> NoiseMoments | None:
         # The stacks are the longest tasks: they go first.
         tasks = [pool.submit(average, frames, stack) for frames in (stack.dark, stack.bright)] if stack else []
         flats = tuple(pool.map(lambda level: moments(level.bright, level.exposure_s, level.photons)[1], brights))
-        top = _converter_top(max(flat.peak_DN for flat in flats), data.top_code, q_DN)
+        peak = max(flat.peak_DN for flat in flats)
+        possible = int(2 ** max(int(np.ceil(np.log2(peak + q_DN))), 8) - q_DN)
+        top = possible if data.top_code is None else data.top_code
+        if peak > top:
+            raise FitError(f"Expected codes up to {top}, found {peak}. Give the converter's largest code as top_code.")
         histograms, dark_moments = zip(*pool.map(dark, darks), strict=True)
         stacks = [task.result() for task in tasks]
     _check_levels(flats, dark_moments)

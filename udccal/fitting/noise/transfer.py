@@ -136,42 +136,41 @@ class TransferProblem:
     sizes: Five
     name: str = "noise, photon transfer"
 
-    def modelled(self, x: Five) -> tuple[PerBin, Float[np.ndarray, " points"], PerLevel]:
-        """Usable variances and estimates of V0 by the model, and the relative excess of the levels' light over it."""
+    @property
+    def free(self) -> Bool[np.ndarray, "5"]:
+        """Parameters of the order."""
+        return np.array([True, True, self.order.curved, True, self.order.offset])
+
+    def predicted(self, x: Five) -> tuple[PerBin, Float[np.ndarray, " points"], PerLevel]:
+        """Usable variances and estimates of V0 by the model, and how much less light than it the levels have."""
         K, V0, c, gain, offset = x
         levels, dark = self.levels, self.dark
         with np.errstate(divide="ignore", invalid="ignore"):
             signal = np.nan_to_num(linear_signal(np.where(levels.usable, levels.mean_DN, 0.0), c, K), posinf=0.0)
             variance = np.maximum(temporal_variance(signal[levels.usable], K, V0, c, dark.rounding_DN2), 1e-9)
             bright = _brightness(signal - levels.dark_DN[:, None], levels.usable) / (gain * (levels.light + offset))
-        return variance, V0 + (K - dark.K_DN_per_e) * dark.drift_DN, (bright - 1)[levels.responding]
+        return variance, V0 + (K - dark.K_DN_per_e) * dark.drift_DN, (1 - bright)[levels.responding]
 
-    def spread2(self, relative: PerLevel) -> tuple[PerLevel, float]:
+    def spread2(self, lacking: PerLevel) -> tuple[PerLevel, float]:
         """Relative variance of responding levels, and the maximum-likelihood part of it that is no noise."""
-        known, own = self.levels.brightness_variance[self.levels.responding], 0.0
-        if self.order.unsteady:
-            own = excess_variance(relative**2, known, np.ones(len(known)))[0]
+        known = self.levels.brightness_variance[self.levels.responding]
+        own = excess_variance(lacking**2, known, np.ones(len(known)))[0] if self.order.unsteady else 0.0
         return known + own, own
 
     def equations_at(self, place: Five) -> Blocks:
         """Score and Fisher information; the scatter of the light is the maximum-likelihood one at this place."""
-
-        def predicted(at: Five) -> Float[np.ndarray, " data"]:
-            variance, floor, relative = self.modelled(at)
-            return np.concatenate([variance, floor, -relative])
-
-        levels, dark, (variance, floor, relative) = self.levels, self.dark, self.modelled(place)
-        spread2, _ = self.spread2(relative)
+        levels, dark, (variance, floor, lacking) = self.levels, self.dark, self.predicted(place)
+        spread2, _ = self.spread2(lacking)
         observed, dof = levels.variance_DN2[levels.usable], levels.dof[levels.usable]
-        ratio = np.maximum(observed / variance, 1e-12)
-        off = np.concatenate([observed - variance, dark.V0_DN2 - floor, relative])
+        off = np.concatenate([observed - variance, dark.V0_DN2 - floor, -lacking])
         weight = np.concatenate([0.5 * dof / variance**2, dark.sigma_DN2**-2, 1 / spread2])
         # Free parameters are those of the order that the data determine.
-        free, jacobian = np.array([True, True, self.order.curved, True, self.order.offset]), np.zeros((len(off), 5))
-        free[3:] &= relative.size > 0
+        free, jacobian = self.free & ((np.arange(5) < 3) | (lacking.size > 0)), np.zeros((len(off), 5))
         for i in np.flatnonzero(free):
             step = 1e-4 * self.sizes[i] * np.eye(5)[i]
-            jacobian[:, i] = (predicted(place + step) - predicted(place - step)) / (2 * step[i])
+            up, down = (np.concatenate(self.predicted(place + sign * step)) for sign in (1, -1))
+            jacobian[:, i] = (up - down) / (2 * step[i])
+        ratio = np.maximum(observed / variance, 1e-12)
         cost = float(np.sum(dof * (ratio - 1 - np.log(ratio))) + np.sum(np.log(spread2)))
         cost += float(np.sum((weight * off**2)[len(dof) :]))
         score, information = jacobian.T @ (weight * off), jacobian.T @ (weight[:, None] * jacobian)
@@ -184,6 +183,23 @@ class TransferProblem:
         x = place + step.shared
         x[2] = np.clip(x[2], -self.bound, self.bound)
         return x
+
+    def attempt(self, start: Five) -> Attempt[TransferFit]:
+        """The fit of the order."""
+        order, levels, usable = self.order, self.levels, self.levels.usable
+        found = minimise(self, np.where(self.free, start, 0.0))
+        cov = found.with_rest(found.equations.cov(), found.equations.step(0.0).shared)
+        variance, _, lacking = self.predicted(found.place)
+        spread2, own = self.spread2(lacking)
+        variance_z, level_z, dof = np.full(usable.shape, np.nan), np.full(len(usable), np.nan), levels.dof[usable]
+        variance_z[usable] = (levels.variance_DN2[usable] / variance - 1) * np.sqrt(dof / 2)
+        level_z[levels.responding] = np.nan_to_num(-lacking) / np.sqrt(spread2)
+        misfit, samples = chi2_test(float(np.nansum(variance_z**2)), max(dof.size - 1.0, 1.0)), int(dof.sum())
+        parameters, scatter = order.curved + order.offset + order.unsteady, float(np.sqrt(own))
+        criterion = bic(found.equations.cost, float(parameters), samples) if found.converged else np.inf
+        residuals = variance_z, level_z
+        fit = TransferFit(order, found.place, cov, scatter, found.converged, *residuals, misfit, samples)
+        return Attempt(order.name, parameters, criterion, fit)
 
 
 def _brightness(light_DN: Grid, usable: np.ndarray) -> PerLevel:
@@ -198,26 +214,6 @@ def _brightness(light_DN: Grid, usable: np.ndarray) -> PerLevel:
         pattern = np.where(weight > 0, level @ seen / np.maximum(weight, 1e-12), 1.0)
         pattern /= max(float(pattern.mean()), 1e-9)
     return np.asarray(level)
-
-
-def _fitted(problem: TransferProblem, start: Five) -> Attempt[TransferFit]:
-    order, levels = problem.order, problem.levels
-    found = minimise(problem, np.where([True, True, order.curved, True, order.offset], start, 0.0))
-    cov = found.with_rest(found.equations.cov(), found.equations.step(0.0).shared)
-    variance, _, relative = problem.modelled(found.place)
-    spread2, own = problem.spread2(relative)
-    variance_z, level_z = np.full(levels.usable.shape, np.nan), np.full(len(levels.light), np.nan)
-    dof = levels.dof[levels.usable]
-    variance_z[levels.usable] = (levels.variance_DN2[levels.usable] / variance - 1) * np.sqrt(dof / 2)
-    level_z[levels.responding] = np.nan_to_num(relative) / np.sqrt(spread2)
-    misfit = chi2_test(float(np.nansum(variance_z**2)), max(dof.size - 1.0, 1.0))
-    parameters = order.curved + order.offset + order.unsteady
-    samples = int(dof.sum())
-    criterion = bic(found.equations.cost, float(parameters), samples) if found.converged else np.inf
-    fit = TransferFit(
-        order, found.place, cov, float(np.sqrt(own)), found.converged, variance_z, level_z, misfit, samples
-    )
-    return Attempt(order.name, parameters, criterion, fit)
 
 
 def _rounding_off(variance_DN2: Grid, rounding_DN2: float) -> Grid:
@@ -245,12 +241,12 @@ def choose_transfer(levels: Levels, dark: DarkVariance, full_DN: float, rules: N
     levels = replace(levels, dof=levels.dof / (1 + 0.5 * levels.dof * apart))
     sizes = np.abs(start) + np.array([1e-9, dark.rounding_DN2 + 1e-3, 0.1 / full_DN, 1e-9, max(light.max(), 1e-30)])
     simplest = TransferProblem(levels, dark, Order(), rules.most_bent / full_DN, sizes)
-    first = _fitted(simplest, start)
+    first = simplest.attempt(start)
     # The other orders start from the simplest one.
     start = first.fit.values if first.fit.converged else start
     others = [Order(curved, offset, unsteady) for unsteady, offset, curved in product((False, True), repeat=3)][1:]
     others = others if levels.responding.any() else [Order(curved=True)]
-    return choose([first, *(_fitted(replace(simplest, order=order), start) for order in others)])
+    return choose([first, *(replace(simplest, order=order).attempt(start) for order in others)])
 
 
 def robust_transfer(
