@@ -8,7 +8,6 @@ parameters' covariance is that of groups that differ by more than their noise; (
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import final
 
@@ -21,7 +20,6 @@ from udccal.fitting.engine.tails import chi2_tail, f_tail
 
 # Chance finds a misfit where there is none once in a thousand fits.
 SIGNIFICANT = 1e-3
-_HALVINGS = 60
 
 
 @final
@@ -128,7 +126,14 @@ def excess_sigma(
     """
     if not unit.any() or chi2_tail(float((square / noise).sum()), dof) > chance:
         return 0.0
-    return _halved(square, unit, lambda size: float((square / (noise + size**2 * unit)).sum()) > dof)
+    found, most = 0.0, float(square.max() / unit[unit > 0].min())
+    for _ in range(100):  # Newton's method: chi-squared is convex in the variance, so that no step goes too far.
+        variance = noise + found * unit
+        excess = float((square / variance).sum()) - dof
+        if excess <= 1e-12 * dof or found == most:
+            break
+        found = min(found + excess / float((square * unit / variance**2).sum()), most)
+    return float(np.sqrt(found))
 
 
 def robust_excess_sigma(
@@ -144,8 +149,10 @@ def robust_excess_sigma(
     Returns:
         the size, as in ``excess_sigma``.
     """
-    probable = MAD_TO_SIGMA**-2
-    return _halved(square, unit, lambda size: float(np.median(square / (noise + size**2 * unit))) > probable)
+    seen = unit > 0
+    # The variance that makes each residual just its probable error: half of them need less.
+    needed = (square[seen] * MAD_TO_SIGMA**2 - noise[seen]) / unit[seen]
+    return float(np.sqrt(max(np.median(needed), 0.0))) if seen.any() else 0.0
 
 
 def excess_variance(
@@ -168,19 +175,6 @@ def excess_variance(
     without, total = observed / known, observed / (found + known)
     gain = np.sum(dof * (np.log(known) + without - np.log(found + known) - total))
     return found, float(2 / np.sum(dof / (found + known) ** 2)), float(gain)
-
-
-def _halved(
-    square: Float[np.ndarray, " n"], unit: Float[np.ndarray, " n"], too_small: Callable[[float], bool]
-) -> float:
-    """The smallest size that is not too small, by halving an interval."""
-    if not unit.any():
-        return 0.0
-    low, high = 0.0, float(np.sqrt(square.max() / unit[unit > 0].min()))
-    for _ in range(_HALVINGS):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if too_small(middle) else (low, middle)
-    return 0.5 * (low + high)
 
 
 def clustered_cov(
