@@ -10,7 +10,6 @@ from typing import final
 import numpy as np
 from jaxtyping import Bool, Float, Float32
 
-from udccal.fitting.absent import absent_backscatter
 from udccal.fitting.backscatter.data import BackscatterData, Binned, grid_rays
 from udccal.fitting.backscatter.model import Rays, Usable, ratios, ratios_and_jacobian, window_for
 from udccal.fitting.backscatter.orders import (
@@ -42,6 +41,7 @@ from udccal.fitting.engine.gaussian import Posterior, square_root
 from udccal.fitting.engine.misfit import MisfitTest
 from udccal.fitting.engine.report import coarse, estimates, priors_of, residual_sample
 from udccal.fitting.engine.robust import outliers
+from udccal.fitting.nominal import absent_backscatter
 from udccal.models.backscatter import Backscatter
 from udccal.models.geometry import Geometry
 from udccal.numerics import in_float64
