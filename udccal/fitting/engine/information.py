@@ -39,9 +39,6 @@ def fisher_information(
         x: the n parameters.
         args: further arguments of ``predict``.
         clip: samples at or above this value are known only to lie there; in the unit of the means.
-
-    Returns:
-        n x n, in the inverse products of the parameters' units.
     """
     (mean, variance), (mean_slope, variance_slope) = (
         tuple(np.asarray(part, dtype=np.float64) for part in pair) for pair in _linearised(predict, x, args)

@@ -201,14 +201,9 @@ def _damped(matrix: Float[np.ndarray, "*k n n"], damping: float) -> Float[np.nda
 
 
 def solve(matrix: Float[np.ndarray, "p p"], right: Float[np.ndarray, " p"]) -> Float[np.ndarray, " p"]:
-    """Solution of symmetric positive semi-definite equations, scaled to a unit diagonal.
+    """Solution of symmetric positive semi-definite equations, which are scaled to a unit diagonal.
 
-    Args:
-        matrix: p x p, such as half a Hessian.
-        right: p numbers.
-
-    Returns:
-        the p parameters; directions that the matrix does not determine are zero.
+    Directions that the matrix does not determine are zero.
     """
     unit = 1 / np.sqrt(np.maximum(np.diag(matrix), _TINY))
     try:
@@ -255,16 +250,8 @@ def minimise(
 ) -> Solution[Place, _Equations]:
     """The minimum of the cost next to ``start``, by Levenberg-Marquardt steps.
 
-    The descent has converged when another step is expected to lower the cost by less than ``rules.least_gain``. Where
-    the cost is not finite at the start, the start comes back, not converged.
-
-    Args:
-        problem: gives equations at a place, and the place after a step.
-        start: where to begin.
-        rules: see ``SolverRules``.
-
-    Returns:
-        the place of the lowest cost with its equations, and whether the descent converged.
+    ``rules`` say when a descent has converged. Where the cost is not finite at the start, the start comes back, not
+    converged.
     """
     rules = rules or SolverRules()
     place, here = start, problem.equations_at(start)

@@ -45,15 +45,7 @@ NO_TEST = MisfitTest(1.0, 1.0)
 
 
 def chi2_test(statistic: float, dof: float) -> MisfitTest:
-    """Chi-squared test of a sum of squares of independent unit normals.
-
-    Args:
-        statistic: the sum.
-        dof: its degrees of freedom; where there are none the result is ``NO_TEST``.
-
-    Returns:
-        the reduced chi-squared and its p-value.
-    """
+    """Test a sum of squares of independent unit normals by chi-squared; ``NO_TEST`` without degrees of freedom."""
     return MisfitTest(statistic / dof, chi2_tail(statistic, dof)) if dof > 0 and np.isfinite(statistic) else NO_TEST
 
 
@@ -65,10 +57,8 @@ def f_test(statistic: float, rank: int, dof: float) -> MisfitTest:
     Args:
         statistic: the sum, in units of the estimated variance.
         rank: its degrees of freedom.
-        dof: degrees of freedom of all residuals behind the scale, those of ``rank`` included.
-
-    Returns:
-        F and its p-value; ``NO_TEST`` where either has no degrees of freedom.
+        dof: degrees of freedom of all residuals behind the scale, those of ``rank`` included; without any left the
+            result is ``NO_TEST``.
     """
     rest = dof - rank
     if rank < 1 or rest < 1 or not np.isfinite(statistic):
@@ -86,16 +76,13 @@ def sharper(*tests: MisfitTest) -> MisfitTest:
 def group_means_test(
     z: Float[np.ndarray, " n"], group: Int[np.ndarray, " n"], used: Bool[np.ndarray, " n"], scale: float = 1.0
 ) -> MisfitTest:
-    """Test whether means of groups scatter as those of independent residuals do.
+    """Test by chi-squared whether means of groups scatter as those of independent residuals do.
 
     Args:
         z: residuals of the fit in units of their sigma.
-        group: number of each sample's group.
+        group: number of each sample's group, which has one degree of freedom.
         used: samples that count.
         scale: variance of ``z`` where the model holds.
-
-    Returns:
-        the chi-squared test of the groups' means, one degree of freedom per group.
     """
     count = np.bincount(group[used])
     total = np.bincount(group[used], z[used])
@@ -139,18 +126,9 @@ def excess_sigma(
 def robust_excess_sigma(
     square: Float[np.ndarray, " n"], noise: Float[np.ndarray, " n"], unit: Float[np.ndarray, " n"]
 ) -> float:
-    """The same by the median, significant or not: half of the residuals lie below their probable error.
-
-    Args:
-        square: squared residuals; outliers have little weight.
-        noise: variance of each residual by noise, in the same unit.
-        unit: variance that an error of size 1 adds to each residual.
-
-    Returns:
-        the size, as in ``excess_sigma``.
-    """
+    """The same by the median, which outliers hardly change, significant or not; arguments as for ``excess_sigma``."""
     seen = unit > 0
-    # The variance that makes each residual just its probable error: half of them need less.
+    # The variance that makes each residual just its probable error; half of the residuals lie below theirs.
     needed = (square[seen] * MAD_TO_SIGMA**2 - noise[seen]) / unit[seen]
     return float(np.sqrt(max(np.median(needed), 0.0))) if seen.any() else 0.0
 
