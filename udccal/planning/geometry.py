@@ -28,11 +28,10 @@ from udccal.fitting.geometry.bundle import (
     GeometryRules,
     Intrinsics,
     Points,
-    best_poses,
     projected,
 )
 from udccal.fitting.geometry.corners import board_points_mm, charuco_board
-from udccal.fitting.geometry.data import gather, rig_prior
+from udccal.fitting.geometry.data import best_poses, gather, rig_prior
 from udccal.fitting.geometry.fit import projection_sigma_px, term_at, with_angles
 from udccal.numerics import in_float64
 from udccal.planning.design import Limits

@@ -17,14 +17,13 @@ from udccal.fitting.geometry.bundle import (
     GeometryRules,
     Intrinsics,
     Points,
-    best_poses,
     in_sigma,
     linearised,
     solve,
 )
 from udccal.fitting.geometry.calibrated import rms_px
 from udccal.fitting.geometry.corners import board_points_mm
-from udccal.fitting.geometry.data import BoardView, gather, read_geometry
+from udccal.fitting.geometry.data import BoardView, best_poses, gather, read_geometry
 from udccal.fitting.geometry.fit import BY_HAND, ON_JIG
 from udccal.models.geometry import Geometry
 from udccal.profiles.profile import Profile

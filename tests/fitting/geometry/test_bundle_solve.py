@@ -16,11 +16,10 @@ from udccal.fitting.geometry.bundle import (
     GeometryRules,
     Intrinsics,
     Solved,
-    best_poses,
     linearised,
     solve,
 )
-from udccal.fitting.geometry.data import gather
+from udccal.fitting.geometry.data import best_poses, gather
 from udccal.fitting.geometry.views import starts
 from udccal.models.geometry import project, rotation_matrix
 

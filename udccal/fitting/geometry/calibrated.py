@@ -9,7 +9,7 @@ model with normal noise.
 from __future__ import annotations
 
 import enum
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import final
 
@@ -19,7 +19,16 @@ from jaxtyping import Bool, Float
 
 from udccal.errors import FitError
 from udccal.fitting.engine.misfit import MisfitTest, clustered_cov, f_test
-from udccal.fitting.geometry.bundle import LENS, BundleProblem, Intrinsics, Points, Solved, in_sigma, projected
+from udccal.fitting.geometry.bundle import (
+    LENS,
+    BundleProblem,
+    GeometryRules,
+    Intrinsics,
+    Points,
+    Solved,
+    in_sigma,
+    projected,
+)
 from udccal.result import Candidate, FitStatus, Outliers
 
 
@@ -219,3 +228,48 @@ def _pattern(
     # Mean over the points of the squared mean of their cell, less the part that noise has in it.
     excess = float(((sums**2 - np.diag(expected)) / count).sum() / count.sum())
     return found, float(np.sqrt(max(excess, 0.0) * np.mean(points.sigma[points.used] ** 2)))
+
+
+def status_of(
+    solved: Solved, cov: Float[np.ndarray, "n n"], off_px: float, image_size: tuple[int, int], rules: GeometryRules
+) -> tuple[FitStatus, tuple[str, ...]]:
+    """Whether the views determine the lens, with residuals of RMS ``off_px``; else what to capture."""
+    order = "Check that the points of each view are in the order of the board's."
+    if off_px > rules.no_corners_px:
+        return FitStatus.POOR_FIT, (
+            f"Expected corners within {rules.no_corners_px:g} px of the fitted lens, found {off_px:.3g} px (RMS): no "
+            f"lens puts these board points there. {order}",
+        )
+    sigma = np.sqrt(np.diag(cov))[:4] / [*np.abs(solved.place.intrinsics[:2]), image_size[0], image_size[0]]
+    if sigma.max() > rules.most_uncertain:
+        what = "focal length" if sigma.argmax() < 2 else "centre of the picture"
+        return FitStatus.TOO_FEW_DATA, (
+            f"The views do not determine the {what} (one sigma is {min(sigma.max(), 99.0):.0%}). "
+            "Lean the board by 20 to 40 degrees, another way in each view, and let it fill the picture.",
+        )
+    return (FitStatus.CONVERGED, ()) if solved.converged else (FitStatus.NOT_CONVERGED, (order,))
+
+
+def remarks(
+    points: Points, scales: Float[np.ndarray, " views"], evidence: Evidence, by_prior: bool, rules: GeometryRules
+) -> Iterator[str]:
+    """What a person should know of a fit that can be used; ``scales`` are the views' scatter."""
+    if by_prior:
+        yield (
+            "The views alone do not determine the whole lens: what is known beforehand gives part of it, and every "
+            "distortion coefficient stays free within that. Lean the board another way in each view to know more."
+        )
+    relative = scales / np.median(scales)
+    loud = [f"{points.names[k]} ({relative[k]:.1f} x)" for k in np.flatnonzero(relative > rules.loud_view)]
+    if loud:
+        yield f"Views that scatter more than the median view, and count for less: {', '.join(loud)}."
+    if evidence.views.found:
+        yield (
+            f"The views disagree on the lens beyond their noise (ratio {evidence.views.ratio:.1f}, "
+            f"p = {evidence.views.p_value:.1g}); sigma is that of views that differ so. Is the board flat?"
+        )
+    if evidence.pattern.found:
+        yield (
+            f"The residuals follow a pattern over the picture (p = {evidence.pattern.p_value:.1g}, about "
+            f"{evidence.pattern_px:.3f} px): the lens bends rays in a way that no order has."
+        )

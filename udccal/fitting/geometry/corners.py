@@ -131,11 +131,8 @@ def _edges_px(
 class _Saddles:
     """The model at shapes (px, py, angle1, angle2, log s1, log s2), each with its best linear part (b, gx, gy, A).
 
-    Attributes:
-        weight: of each sample: it falls from 1 at a corner to 0 at its radius.
-        residual: sample less model.
-        jacobian: derivatives of the model by the shape and the linear part.
-        contrast: A.
+    ``jacobian`` has the derivatives by both, ``contrast`` is A. A sample's weight falls from 1 at a corner to 0 at its
+    radius.
     """
 
     weight: Float[np.ndarray, "n m"]
@@ -144,13 +141,7 @@ class _Saddles:
     contrast: Float[np.ndarray, " n"]
 
     @classmethod
-    def at(
-        cls,
-        shape: Float[np.ndarray, "n 6"],
-        offsets: Float[np.ndarray, "m 2"],
-        samples: Float[np.ndarray, "n m"],
-        radius: Float[np.ndarray, " n"],
-    ) -> _Saddles:
+    def at(cls, shape: np.ndarray, offsets: np.ndarray, samples: np.ndarray, radius: np.ndarray) -> _Saddles:
         """Fit the linear parts; ``samples`` lie at the same ``offsets`` from a whole pixel near each corner."""
         u = offsets - shape[:, None, :2]
         weight = np.clip(1 - (u**2).sum(-1) / radius[:, None] ** 2, 0.0, None)

@@ -1,4 +1,4 @@
-"""The points of views, from a session's boards behind its flat field or from arrays.
+"""The points of views, from a session's boards behind its flat field or from arrays, and poses to start from.
 
 A gradient of the picture's brightness at a corner moves it. Out-of-focus rows of the panel make such gradients. On a
 rig whose wire modulates by 3 %, corners scatter half as much once the flat field is divided out (EMVA 1288's flat-field
@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import final
 
+import cv2
 import jax
 import numpy as np
 from jaxtyping import Bool, Float
@@ -155,12 +156,11 @@ def _corners(
 @final
 @dataclass(frozen=True)
 class Gathered:
-    """Points of the usable ones of ``views``, what was left out, and notes; ``weighted`` if sigmas were given."""
+    """Points of all usable views, what was left out, a note for each other view; ``weighted`` if sigmas were given."""
 
     points: Points
     outliers: tuple[Outliers, ...]
     notes: tuple[str, ...]
-    views: int
     weighted: bool
 
 
@@ -178,14 +178,20 @@ def gather(
         )
     # Without sigmas any common value serves: its scale is estimated.
     given = [np.full(len(pixels), 0.1) for pixels in image] if sigmas is None else sigmas
-    lost: list[str] = []
-    notes: list[str] = []
+    lost, notes = list[str](), list[str]()
     parts = {-1: (np.zeros((0, 3)), np.zeros((0, 2)), np.zeros(0), np.zeros(0, dtype=np.int64))}
     for number, arrays in enumerate(zip(board, image, given, strict=True)):
-        points, pixels, own = _view(number, *(np.asarray(a, dtype=np.float64) for a in arrays))
-        good = np.isfinite(points).all(axis=1) & np.isfinite(pixels).all(axis=1) & np.isfinite(own) & (own > 0)
+        points, pixels, own = (np.asarray(one, dtype=np.float64) for one in arrays)
+        n = len(pixels)
+        if points.shape not in ((n, 3), (n, 1, 3)) or pixels.shape not in ((n, 2), (n, 1, 2)) or own.shape != (n,):
+            raise FitError(
+                f"Expected board points (n, 3), image points (n, 2) and sigmas (n,) of equal n in view {number}, found "
+                f"{points.shape}, {pixels.shape} and {own.shape}. Give each seen corner its point on the board."
+            )
+        whole = np.hstack([points.reshape(n, 3), pixels.reshape(n, 2), own[:, None]])
+        good = np.isfinite(whole).all(axis=1) & (own > 0)
         lost += [f"view {number}, point {k}" for k in np.flatnonzero(~good)]
-        part = (points[good], pixels[good], own[good], np.flatnonzero(good))
+        part = (whole[good, :3], whole[good, 3:5], own[good], np.flatnonzero(good))
         if complaint := _complaint(part[0], part[1], list(parts.values()), rules):
             notes.append(f"View {number} is left out: {complaint}")
         else:
@@ -194,18 +200,7 @@ def gather(
     view = np.repeat(np.arange(len(parts)) - 1, [len(part[0]) for part in parts.values()])
     found = Points(points, pixels, own, view, index, np.ones(len(points), dtype=bool), tuple(parts)[1:])
     left_out = outliers("not a finite position with a positive sigma", lost)
-    return Gathered(found, left_out, tuple(notes), len(board), sigmas is not None)
-
-
-def _view(number: int, points: np.ndarray, pixels: np.ndarray, own: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Board points (n, 3), pixels (n, 2) and sigma (n,) of a view, whatever the shape OpenCV gave them."""
-    n = len(pixels)
-    if points.shape not in ((n, 3), (n, 1, 3)) or pixels.shape not in ((n, 2), (n, 1, 2)) or own.shape != (n,):
-        raise FitError(
-            f"Expected board points (n, 3), image points (n, 2) and sigmas (n,) of equal n in view {number}, found "
-            f"{points.shape}, {pixels.shape} and {own.shape}. Give each seen corner its point on the board."
-        )
-    return points.reshape(-1, 3), pixels.reshape(-1, 2), own
+    return Gathered(found, left_out, tuple(notes), sigmas is not None)
 
 
 def _complaint(board: np.ndarray, image: np.ndarray, before: list[tuple[np.ndarray, ...]], rules: GeometryRules) -> str:
@@ -222,3 +217,48 @@ def _complaint(board: np.ndarray, image: np.ndarray, before: list[tuple[np.ndarr
     if any(np.array_equal(image, other[1]) and np.array_equal(board, other[0]) for other in before):
         return "it repeats another view to the last digit, and so adds nothing. Capture every view anew."
     return ""
+
+
+def best_poses(
+    points: Points, intrinsics: Float[np.ndarray, "9"]
+) -> tuple[Float[np.ndarray, "views 6"], Float[np.ndarray, "views 6"]]:
+    """The best pose of each view at these intrinsics, and the one mirrored at the line of sight."""
+    pairs = [_pose_pair(points, view, Intrinsics.of(intrinsics)) for view in range(len(points.names))]
+    return np.array([first for first, _ in pairs]), np.array([second for _, second in pairs])
+
+
+def _pose_pair(points: Points, view: int, lens: Intrinsics) -> tuple[np.ndarray, np.ndarray]:
+    mine = (points.view == view) & points.used
+    board, image = points.board[mine], points.image[mine]
+    good = _consistent(board, image)
+    flat = np.linalg.svd(board - board.mean(axis=0), compute_uv=False)
+    method = cv2.SOLVEPNP_IPPE if flat[2] <= 1e-6 * flat[0] else cv2.SOLVEPNP_SQPNP
+    try:
+        _, turns, shifts, _ = cv2.solvePnPGeneric(board[good], image[good], lens.matrix, lens.distortion, flags=method)
+    except cv2.error:
+        turns, shifts = (), ()
+    found = [np.concatenate([t.ravel(), s.ravel()]) for t, s in zip(turns, shifts, strict=True)]
+    found = [pose for pose in found if np.isfinite(pose).all()] or [_ahead(board, image, lens)]
+    return found[0], found[-1]
+
+
+def _ahead(board: np.ndarray, image: np.ndarray, lens: Intrinsics) -> np.ndarray:
+    """A pose that faces the camera, at the distance and place by the points' spread."""
+    (across, down), middle = image.mean(axis=0), board.mean(axis=0)
+    seen = max(float(np.linalg.norm(image - image.mean(axis=0))), 1e-9)
+    distance = lens.matrix[0, 0] * float(np.linalg.norm(board - middle)) / seen
+    return np.concatenate([np.zeros(3), np.linalg.solve(lens.matrix, [across, down, 1.0]) * distance - middle])
+
+
+def _consistent(board: np.ndarray, image: np.ndarray) -> Bool[np.ndarray, " n"]:
+    """Points that one homography puts near their places; all points where there are too few for it.
+
+    The limit is a part of the board's size: distortion bends straight lines by less, and a corner with its neighbour's
+    number is off by more.
+    """
+    if len(board) >= 12:
+        limit = max(0.02 * float(np.ptp(image, axis=0).max()), 1.0)
+        _, inside = cv2.findHomography(board[:, :2], image, cv2.RANSAC, limit)
+        if inside is not None and inside.sum() >= max(6, len(board) // 3):
+            return inside.ravel().astype(bool)
+    return np.ones(len(board), dtype=bool)

@@ -205,6 +205,18 @@ def _result(
         zero = f"Held at 0, as the data do not ask for it: {', '.join(held)}."
         notes = (*notes, f"{zero} The sigmas are those of a lens without it.")
     priors = None if prior is None else priors_of(INTRINSIC_NAMES, prior.mean, prior.sigma)
+    evidence = bundle.evidence
+    diagnostics = (
+        ("rms_reprojection", bundle.rms_px, "px"),
+        ("views", len(points.names), "1"),
+        ("corners_used", use.sum(), "1"),
+        ("corners_rejected", (~use).sum(), "1"),
+        ("iterations", bundle.iterations, "1"),
+        ("views_disagree_p", evidence.views.p_value, "1"),
+        ("variance_factor", evidence.views.inflation, "1"),
+        ("residual_pattern_p", evidence.pattern.p_value, "1"),
+        ("residual_pattern", evidence.pattern_px, "px"),
+    )
     return FitResult(
         name="geometry",
         term=posterior.term_at(x),
@@ -214,7 +226,7 @@ def _result(
         chi2_dof=bundle.chi2_dof,
         samples=2 * int(use.sum()),
         candidates=bundle.candidates,
-        diagnostics=_diagnostics(bundle),
+        diagnostics=tuple(Diagnostic(name, float(value), unit) for name, value, unit in diagnostics),
         notes=notes,
         outliers=bundle.outliers,
         residuals=residual_sample(np.repeat(points.image[use], 2, axis=0), z.ravel()),
@@ -255,21 +267,6 @@ def term_at(x: Float[np.ndarray, "12"], pupil: Float[np.ndarray, "3"]) -> Geomet
     lens, (tilt, roll, yaw) = Intrinsics.of(x[:LENS]), x[LENS:]
     rotation = Rotation.from_euler("YXZ", [yaw, -tilt, roll], degrees=True).as_rotvec()
     return Geometry(lens.focal_px, lens.principal_point_px, lens.distortion, np.asarray(rotation), pupil)
-
-
-def _diagnostics(bundle: CalibratedViews) -> tuple[Diagnostic, ...]:
-    evidence, used = bundle.evidence, bundle.points.used
-    return (
-        Diagnostic("rms_reprojection", bundle.rms_px, "px"),
-        Diagnostic("views", float(len(bundle.points.names)), "1"),
-        Diagnostic("corners_used", float(used.sum()), "1"),
-        Diagnostic("corners_rejected", float((~used).sum()), "1"),
-        Diagnostic("iterations", float(bundle.iterations), "1"),
-        Diagnostic("views_disagree_p", evidence.views.p_value, "1"),
-        Diagnostic("variance_factor", evidence.views.inflation, "1"),
-        Diagnostic("residual_pattern_p", evidence.pattern.p_value, "1"),
-        Diagnostic("residual_pattern", evidence.pattern_px, "px"),
-    )
 
 
 def _outliers(

@@ -7,7 +7,6 @@ is estimated. All views have one scale unless a test finds that they differ (by 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import final
 
@@ -17,10 +16,9 @@ from jaxtyping import Bool, Float
 
 from udccal.errors import FitError
 from udccal.fitting.engine.gaussian import Prior
-from udccal.fitting.engine.misfit import SIGNIFICANT
+from udccal.fitting.engine.misfit import chi2_test
 from udccal.fitting.engine.orders import Attempt, Choice, bic, choose
 from udccal.fitting.engine.robust import outliers, robust_sigma
-from udccal.fitting.engine.tails import chi2_tail
 from udccal.fitting.geometry.bundle import (
     EVERY,
     NOTHING_KNOWN,
@@ -32,15 +30,13 @@ from udccal.fitting.geometry.bundle import (
     Intrinsics,
     Points,
     Solved,
-    best_poses,
     linearised,
     solve,
 )
-from udccal.fitting.geometry.calibrated import CalibratedViews, Evidence, rms_px, weigh
-from udccal.fitting.geometry.data import Gathered
+from udccal.fitting.geometry.calibrated import CalibratedViews, remarks, rms_px, status_of, weigh
+from udccal.fitting.geometry.data import Gathered, best_poses
 from udccal.models.geometry import Geometry
 from udccal.numerics import in_float64
-from udccal.result import FitStatus
 
 
 @in_float64
@@ -66,9 +62,10 @@ def calibrate_views(
     least, known = (rules.least_views, NOTHING_KNOWN) if prior is None else (1, prior)
     given, left_out = gathered.points, gathered.outliers
     if len(given.names) < least:
+        found = f"{len(given.names) + len(gathered.notes)} views, {len(given.names)} of them usable"
         raise FitError(
-            f"Expected at least {least} views of at least {rules.least_corners} points each, found {gathered.views} "
-            f"views, {len(given.names)} of them usable. {' '.join(gathered.notes)} Capture more views of the board."
+            f"Expected at least {least} views of at least {rules.least_corners} points each, found {found}. "
+            f"{' '.join(gathered.notes)} Capture more views of the board."
         )
     robust = _settled(given, image_size, start, start_poses, known, rules)
     strange = robust.scales > rules.strange_view * np.median(robust.scales)
@@ -134,10 +131,7 @@ def _focal_px(points: Points, size: tuple[int, int]) -> float:
 @final
 @dataclass(frozen=True)
 class _Fitted:
-    """A minimum, and the points with outliers marked and sigmas multiplied by the ``scales`` of their views.
-
-    ``dof`` are the degrees of freedom behind the scales.
-    """
+    """A minimum, and the points with outliers marked and sigmas times the ``scales`` of their views, by ``dof``."""
 
     solved: Solved
     points: Points
@@ -254,7 +248,7 @@ def _differ(square: Float[np.ndarray, " views"], dof: Float[np.ndarray, " views"
         return False
     ratio = float((dof * np.log(square.sum() / dof.sum() / (square / dof))).sum())
     correction = 1 + ((1 / dof).sum() - 1 / dof.sum()) / (3 * (len(dof) - 1))
-    return chi2_tail(ratio / correction, len(dof) - 1) < SIGNIFICANT
+    return chi2_test(ratio / correction, len(dof) - 1.0).found
 
 
 def _choose_order(
@@ -284,48 +278,3 @@ def _choose_order(
         return Choice(tried[-1], tuple(tried)), None
     orders = choose(tried)
     return orders, orders.spread(samples, lambda of: np.append(of.place.intrinsics, of.place.poses), against)
-
-
-def status_of(
-    solved: Solved, cov: Float[np.ndarray, "n n"], off_px: float, image_size: tuple[int, int], rules: GeometryRules
-) -> tuple[FitStatus, tuple[str, ...]]:
-    """Whether the views determine the lens, with residuals of RMS ``off_px``; else what to capture."""
-    order = "Check that the points of each view are in the order of the board's."
-    if off_px > rules.no_corners_px:
-        return FitStatus.POOR_FIT, (
-            f"Expected corners within {rules.no_corners_px:g} px of the fitted lens, found {off_px:.3g} px (RMS): no "
-            f"lens puts these board points there. {order}",
-        )
-    sigma = np.sqrt(np.diag(cov))[:4] / [*np.abs(solved.place.intrinsics[:2]), image_size[0], image_size[0]]
-    if sigma.max() > rules.most_uncertain:
-        what = "focal length" if sigma.argmax() < 2 else "centre of the picture"
-        return FitStatus.TOO_FEW_DATA, (
-            f"The views do not determine the {what} (one sigma is {min(sigma.max(), 99.0):.0%}). "
-            "Lean the board by 20 to 40 degrees, another way in each view, and let it fill the picture.",
-        )
-    return (FitStatus.CONVERGED, ()) if solved.converged else (FitStatus.NOT_CONVERGED, (order,))
-
-
-def remarks(
-    points: Points, scales: Float[np.ndarray, " views"], evidence: Evidence, by_prior: bool, rules: GeometryRules
-) -> Iterator[str]:
-    """What a person should know of a fit that can be used; ``scales`` are the views' scatter."""
-    if by_prior:
-        yield (
-            "The views alone do not determine the whole lens: what is known beforehand gives part of it, and every "
-            "distortion coefficient stays free within that. Lean the board another way in each view to know more."
-        )
-    relative = scales / np.median(scales)
-    loud = [f"{points.names[k]} ({relative[k]:.1f} x)" for k in np.flatnonzero(relative > rules.loud_view)]
-    if loud:
-        yield f"Views that scatter more than the median view, and count for less: {', '.join(loud)}."
-    if evidence.views.found:
-        yield (
-            f"The views disagree on the lens beyond their noise (ratio {evidence.views.ratio:.1f}, "
-            f"p = {evidence.views.p_value:.1g}); sigma is that of views that differ so. Is the board flat?"
-        )
-    if evidence.pattern.found:
-        yield (
-            f"The residuals follow a pattern over the picture (p = {evidence.pattern.p_value:.1g}, about "
-            f"{evidence.pattern_px:.3f} px): the lens bends rays in a way that no order has."
-        )
