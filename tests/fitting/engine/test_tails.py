@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from udccal.fitting.engine.tails import chi2_tail, f_tail
+from udccal.fitting.engine.misfit import chi2_tail, f_tail
 
 
 @pytest.mark.parametrize("dof", [1.0, 3.0, 47.5, 1e6])

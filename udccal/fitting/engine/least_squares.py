@@ -12,6 +12,7 @@ scaled by the diagonal (More, Lecture Notes in Mathematics 630, 1978), follows N
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Generic, Protocol, TypeVar, final, runtime_checkable
@@ -20,7 +21,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from udccal.fitting.engine.gaussian import Prior, scaled_inverse
-from udccal.fitting.engine.iteration_log import LOG
+
+# Every solver writes its iterations here at level DEBUG: `udccal fit --log` shows them.
+LOG = logging.getLogger("udccal.fitting")
 
 Place = TypeVar("Place")
 _Place_contra = TypeVar("_Place_contra", contravariant=True)

@@ -9,14 +9,14 @@ parameters' covariance is that of groups that differ by more than their noise; (
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import final
+from typing import SupportsFloat, final
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.special import chdtrc, fdtrc
 
 from udccal.fitting.engine.gaussian import scaled_inverse, square_root
 from udccal.fitting.engine.robust import MAD_TO_SIGMA
-from udccal.fitting.engine.tails import chi2_tail, f_tail
 
 # Chance finds a misfit where there is none once in a thousand fits.
 SIGNIFICANT = 1e-3
@@ -42,6 +42,18 @@ class MisfitTest:
 
 
 NO_TEST = MisfitTest(1.0, 1.0)
+
+
+# Tails come from scipy.special: scipy.stats takes longer to load than everything else that a fit needs.
+def chi2_tail(statistic: SupportsFloat, dof: SupportsFloat) -> float:
+    """Probability that chi-squared of ``dof`` degrees of freedom is above ``statistic``; 1 where there are none."""
+    return float(chdtrc(float(dof), max(float(statistic), 0.0))) if float(dof) > 0 else 1.0
+
+
+def f_tail(statistic: SupportsFloat, above: SupportsFloat, below: SupportsFloat) -> float:
+    """Probability that F is above ``statistic``; 1 where numerator or denominator has no degrees of freedom."""
+    degrees = float(above), float(below)
+    return float(fdtrc(*degrees, max(float(statistic), 0.0))) if min(degrees) > 0 else 1.0
 
 
 def chi2_test(statistic: float, dof: float) -> MisfitTest:
