@@ -67,13 +67,13 @@ def calibrate_views(
             f"Expected at least {least} views of at least {rules.least_corners} points each, found {found}. "
             f"{' '.join(gathered.notes)} Capture more views of the board."
         )
-    robust = _settled(given, image_size, start, start_poses, known, rules)
+    robust = _Search(given, known, rules).best_of(starts(given, image_size, start, start_poses))
     strange = robust.scales > rules.strange_view * np.median(robust.scales)
     if strange.any() and (~strange).sum() >= least:
         rule = f"of a view that scatters more than {rules.strange_view:g} times as much as the median view"
         left_out = (*left_out, *outliers(rule, (f"view {given.names[k]}" for k in np.flatnonzero(strange))))
         given = given.without(strange)
-        robust = _settled(given, image_size, start, start_poses, known, rules)
+        robust = _Search(given, known, rules).best_of(starts(given, image_size, start, start_poses))
     likely = _scaled(robust, replace(given, used=robust.points.used), EVERY, known)
     orders, between = _choose_order(likely, known, rules)
     free = ORDERS[orders.best.name]
@@ -110,7 +110,9 @@ def starts(
     lenses = [] if given is None else [Intrinsics.of_geometry(given).vector]
     lenses.append(Intrinsics.centred(_focal_px(points, size), size).vector)
     found = [Bundle(lens, best_poses(points, lens)[0]) for lens in lenses]
-    return found if poses is None else [replace(found[0], poses=poses), *found[1:]]
+    if poses is not None:
+        found[0] = replace(found[0], poses=np.asarray(poses, dtype=np.float64)[list(points.names)])
+    return found
 
 
 def _focal_px(points: Points, size: tuple[int, int]) -> float:
@@ -139,39 +141,63 @@ class _Fitted:
     dof: float = 0.0
 
 
-def _settled(
-    given: Points,
-    size: tuple[int, int],
-    start: Geometry | None,
-    poses: Float[np.ndarray, "views 6"] | None,
-    prior: Prior,
-    rules: GeometryRules,
-) -> _Fitted:
-    """The best minimum of all starts with every distortion free.
+@final
+@dataclass(frozen=True)
+class _Search:
+    """The search of a minimum with every distortion free, by the points as given and what is known of the lens."""
 
-    Starts may leave out different points; the robust spread of all points compares them.
-    """
-    own = None if poses is None else np.asarray(poses, dtype=np.float64)[list(given.names)]
-    found = [_descended(one, given, prior, rules) for one in starts(given, size, start, own)]
-    best = min(found, key=lambda one: float(np.log1p(_squares(one.solved.place, given)).mean()))
-    for _ in range(8):  # Views whose mirrored pose fits better take it, and all is solved again.
-        place = best.solved.place
-        mirrored = replace(place, poses=best_poses(best.points, place.intrinsics)[1])
-        other = solve(mirrored, best.points, ~EVERY, prior).place
-        better = costs(other, best.points) < 0.99 * costs(place, best.points)
-        if not better.any():
-            break
-        swapped = replace(place, poses=np.where(better[:, None], other.facing().poses, place.poses))
-        best = _without_outliers(swapped, given, prior, rules)
-    return best
+    given: Points
+    known: Prior
+    rules: GeometryRules
 
+    def best_of(self, begun: list[Bundle]) -> _Fitted:
+        """The best minimum of all starts; these may leave out different points: the spread of all compares them."""
+        found = [self._descended(one) for one in begun]
+        best = min(found, key=lambda one: float(np.log1p(_squares(one.solved.place, self.given)).mean()))
+        for _ in range(8):  # Views whose mirrored pose fits better take it, and all is solved again.
+            place = best.solved.place
+            mirrored = replace(place, poses=best_poses(best.points, place.intrinsics)[1])
+            other = solve(mirrored, best.points, ~EVERY, self.known).place
+            better = costs(other, best.points) < 0.99 * costs(place, best.points)
+            if not better.any():
+                break
+            swapped = replace(place, poses=np.where(better[:, None], other.facing().poses, place.poses))
+            best = self._without_outliers(swapped)
+        return best
 
-def _descended(bundle: Bundle, given: Points, prior: Prior, rules: GeometryRules) -> _Fitted:
-    """Descend robustly and with few coefficients first: from far off, all five may lead to a wrong minimum."""
-    for free in (ORDERS["k1"], EVERY):
-        scaled = given.scaled(_judged(bundle, given, rules)[0])
-        bundle = solve(bundle, scaled, free, prior, rules.robust).place.facing()
-    return _without_outliers(bundle, given, prior, rules)
+    def _descended(self, bundle: Bundle) -> _Fitted:
+        """Descend robustly and with few coefficients first: from far off, all five may lead to a wrong minimum."""
+        for free in (ORDERS["k1"], EVERY):
+            scaled = self.given.scaled(self._judged(bundle, self.given.used)[0])
+            bundle = solve(bundle, scaled, free, self.known, self.rules.robust).place.facing()
+        return self._without_outliers(bundle)
+
+    def _without_outliers(self, place: Bundle) -> _Fitted:
+        """Leave out points that are too far off and solve, until nothing changes; points that fit again return."""
+        scales, used = np.full(len(self.given.names), np.inf), self.given.used
+        for _ in range(9):
+            before, was = scales, used
+            scales, used = self._judged(place, used)
+            points = replace(self.given.scaled(scales), used=used)
+            if (used == was).all() and np.allclose(scales, before, rtol=0.1):
+                break
+            solved = solve(place, points, EVERY, self.known)
+            place = solved.place
+        return _Fitted(solved, points, scales)
+
+    def _judged(self, place: Bundle, used: Bool[np.ndarray, " points"]) -> tuple[np.ndarray, np.ndarray]:
+        """Scatter over sigma of each view, from medians of its used points, and which points are not too far off.
+
+        The pose of a view with few points may fit them all: its scale is at least half of all views'. Its points stay
+        where too few would be left to determine its pose.
+        """
+        view, views = self.given.view, len(self.given.names)
+        z = linearised(place, self.given)[0] / self.given.sigma[:, None]
+        seen = np.where(used[:, None], z, np.nan)
+        own = np.array([robust_sigma(seen[view == k]) for k in range(views)])
+        scales = np.maximum(np.maximum(own, 0.5 * robust_sigma(seen)), _least_scale(self.given))
+        off = self.rules.corners.off(z / scales[view, None]).any(axis=1)
+        return scales, ~off | (np.bincount(view[~off], minlength=views) < self.rules.least_corners)[view]
 
 
 def costs(bundle: Bundle, points: Points) -> Float[np.ndarray, " views"]:
@@ -183,37 +209,6 @@ def _squares(bundle: Bundle, points: Points) -> Float[np.ndarray, " points"]:
     """Squared residuals in units of sigma; infinite where a point's projection is not finite."""
     square = (linearised(bundle, points)[0] ** 2).sum(axis=1) / points.sigma**2
     return np.where(np.isfinite(square), square, np.inf)
-
-
-def _without_outliers(place: Bundle, given: Points, prior: Prior, rules: GeometryRules) -> _Fitted:
-    """Leave out points that are too far off and solve, until nothing changes; points that fit again return."""
-    scales, used = np.full(len(given.names), np.inf), given.used
-    for _ in range(9):
-        before, was = scales, used
-        scales, used = _judged(place, replace(given, used=used), rules)
-        points = replace(given.scaled(scales), used=used)
-        if (used == was).all() and np.allclose(scales, before, rtol=0.1):
-            break
-        solved = solve(place, points, EVERY, prior)
-        place = solved.place
-    return _Fitted(solved, points, scales)
-
-
-def _judged(
-    place: Bundle, points: Points, rules: GeometryRules
-) -> tuple[Float[np.ndarray, " views"], Bool[np.ndarray, " points"]]:
-    """Scatter over sigma of each view, from medians of its points in use, and which points are not too far off.
-
-    The pose of a view with few points may fit them all: its scale is at least half of all views'. Its points stay where
-    too few would be left to determine its pose.
-    """
-    z = linearised(place, points)[0] / points.sigma[:, None]
-    seen = np.where(points.used[:, None], z, np.nan)
-    own = np.array([robust_sigma(seen[points.view == k]) for k in range(len(points.names))])
-    scales = np.maximum(np.maximum(own, 0.5 * robust_sigma(seen)), _least_scale(points))
-    off = rules.corners.off(z / scales[points.view, None]).any(axis=1)
-    kept = np.bincount(points.view[~off], minlength=len(points.names))
-    return scales, ~off | (kept < rules.least_corners)[points.view]
 
 
 def _least_scale(points: Points) -> float:
