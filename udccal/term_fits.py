@@ -12,16 +12,14 @@ import numpy as np
 from jaxtyping import Float
 
 from udccal.effort import FitEffort
-from udccal.fitting.absent import absent_backscatter, absent_psf, absent_wire
 from udccal.fitting.backscatter.data import read_backscatter
 from udccal.fitting.backscatter.fit import fit_backscatter
 from udccal.fitting.backscatter.parameters import BackscatterRules
 from udccal.fitting.geometry.data import BoardView, read_geometry
 from udccal.fitting.geometry.fit import fit_boards
-from udccal.fitting.lacking import lacking
 from udccal.fitting.noise.data import read_noise
 from udccal.fitting.noise.fit import fit_noise, nominal_noise
-from udccal.fitting.nominal import nominal_geometry
+from udccal.fitting.nominal import absent_backscatter, absent_psf, absent_wire, lacking, nominal_geometry
 from udccal.fitting.psf.fit import fit_psf
 from udccal.fitting.psf.read import read_psf
 from udccal.fitting.wire.data import read_wire

@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 
 from tests.profiles import conftest as profiles
-from udccal.fitting.absent import absent_backscatter, absent_psf, absent_wire
 from udccal.fitting.geometry.bundle import INTRINSIC_NAMES
 from udccal.fitting.geometry.fit import angles_deg
-from udccal.fitting.nominal import nominal_geometry
+from udccal.fitting.nominal import absent_backscatter, absent_psf, absent_wire, nominal_geometry
 from udccal.models.noise import Noise
 from udccal.profiles.profile import Profile, build_profile
 from udccal.profiles.provenance import provenance_now

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from udccal.fitting.absent import absent_backscatter, absent_psf, absent_wire
-from udccal.fitting.nominal import nominal_geometry
+from udccal.fitting.nominal import absent_backscatter, absent_psf, absent_wire, nominal_geometry
 from udccal.models.backscatter import backscatter_rate
 from udccal.models.psf import psf_kernels
 from udccal.models.wire import wire_map

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from udccal.cameras.protocol import CameraIdentity, Frame, Region, Settings
-from udccal.fitting.lacking import lacking
+from udccal.fitting.nominal import lacking
 from udccal.rig import load_rig
 from udccal.sessions.captured import SingleFrame
 from udccal.sessions.schema import BoardSubject, DarkSubject, FlatSubject, LedSubject, TermName

@@ -25,8 +25,7 @@ import numpy as np
 from tests.fuzz.target import Target
 from udccal.cli.jobs.show import show_profile
 from udccal.cli.output import Output
-from udccal.fitting.absent import absent_backscatter, absent_psf, absent_wire
-from udccal.fitting.nominal import nominal_geometry
+from udccal.fitting.nominal import absent_backscatter, absent_psf, absent_wire, nominal_geometry
 from udccal.fitting.wire.fit import sensor_map
 from udccal.kernels import fitted_size
 from udccal.models.noise import Noise

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from udccal.cameras.protocol import Frame, Region, Settings
-from udccal.fitting.absent import absent_backscatter, absent_psf, absent_wire
-from udccal.fitting.nominal import nominal_geometry
+from udccal.fitting.nominal import absent_backscatter, absent_psf, absent_wire, nominal_geometry
 from udccal.fitting.wire.fit import sensor_map
 from udccal.live.sinks.protocol import RestoredFrame
 from udccal.models.noise import Noise

@@ -7,8 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from udccal.fitting.absent import absent_backscatter, absent_psf, absent_wire
-from udccal.fitting.nominal import nominal_geometry
+from udccal.fitting.nominal import absent_backscatter, absent_psf, absent_wire, nominal_geometry
 from udccal.fitting.wire.fit import sensor_map
 from udccal.models.noise import Noise
 from udccal.profiles.profile import Profile, build_profile

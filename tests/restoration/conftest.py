@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from udccal.fitting.absent import absent_backscatter, absent_psf, absent_wire
-from udccal.fitting.nominal import nominal_geometry
+from udccal.fitting.nominal import absent_backscatter, absent_psf, absent_wire, nominal_geometry
 from udccal.fitting.wire.fit import sensor_map
 from udccal.models.geometry import Geometry
 from udccal.models.noise import Noise

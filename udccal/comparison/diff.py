@@ -17,7 +17,7 @@ from udccal.comparison.limits import DiffLimits
 from udccal.comparison.maps import DifferenceMaps, difference_maps
 from udccal.comparison.movement import Movement, movement
 from udccal.comparison.picture import picture_loss
-from udccal.fitting.engine.tails import chi2_tail
+from udccal.fitting.engine.misfit import chi2_tail
 from udccal.profiles.profile import Profile
 from udccal.result import FitResult
 from udccal.sessions.schema import TermName

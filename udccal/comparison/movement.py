@@ -21,7 +21,7 @@ from jaxtyping import Float
 from udccal.comparison.combining import combine
 from udccal.comparison.estimates import ANGLES, Difference, Name, chi2_of
 from udccal.comparison.limits import DiffLimits
-from udccal.fitting.engine.tails import chi2_tail
+from udccal.fitting.engine.misfit import chi2_tail
 
 _UNITS = ("mm", "mm", "mm", "deg", "deg", "deg")
 _PARTS = ("x", "y", "z", "tilt", "roll", "yaw")

@@ -33,7 +33,7 @@ from udccal.comparison.comparable import check_finite
 from udccal.comparison.estimates import ANGLES, Estimates, Name
 from udccal.comparison.held import Measured, held_estimates
 from udccal.fitting.engine.gaussian import square_root
-from udccal.fitting.engine.tails import chi2_tail
+from udccal.fitting.engine.misfit import chi2_tail
 from udccal.quantities import quantity
 from udccal.result import Estimate, EstimatePrior
 from udccal.rig import RigDescription

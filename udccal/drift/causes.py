@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from udccal.fitting.engine.gaussian import scaled_inverse
-from udccal.fitting.engine.tails import chi2_tail
+from udccal.fitting.engine.misfit import chi2_tail
 
 # Places of each cause's numbers in ``PoseChange.values``.
 CAUSES = {"moved": (3, 4, 5), "tilted": (0, 1, 2), "refocused": (6,)}

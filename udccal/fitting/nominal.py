@@ -1,15 +1,29 @@
-"""Terms with the values of the rig's description: fits start from them."""
+"""What a term is without its data: nominal values to start from, an absent form, and what a session lacks for a fit.
+
+A calibration uses the absent form, which does nothing, where a session has no steps for a term.
+"""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
+from udccal.fitting.backscatter.parameters import BackscatterRules
+from udccal.fitting.noise.data import NoiseRules
+from udccal.fitting.psf.data import PsfRules, group
+from udccal.fitting.psf.kernel import start_model
+from udccal.fitting.wire.rules import ideal_wire, wire_start
 from udccal.models.backscatter import Backscatter
 from udccal.models.geometry import Geometry
+from udccal.models.psf import PsfField
+from udccal.models.wire import Wire
 from udccal.mounting import nominal_pupil_mm, nominal_rotation
 from udccal.rig import RigDescription
+from udccal.sessions.schema import BoardSubject, DarkSubject, FlatSubject, LedSubject, PanelSubject, TermName
+from udccal.sessions.store import Session
 
 
 def nominal_geometry(rig: RigDescription) -> Geometry:
@@ -18,10 +32,9 @@ def nominal_geometry(rig: RigDescription) -> Geometry:
     Args:
         rig: gives the focal length in px, the sensor's size, and the mounting (angles in degrees, lengths in mm).
     """
-    camera = rig.camera
     return Geometry(
         focal_px=np.array([rig.focal_px, rig.focal_px]),
-        principal_point_px=np.array([(camera.columns - 1) / 2, (camera.rows - 1) / 2]),
+        principal_point_px=np.array([rig.camera.columns - 1, rig.camera.rows - 1]) / 2,
         distortion=np.zeros(5),
         rotation_rad=np.asarray(Rotation.from_matrix(nominal_rotation(rig)).as_rotvec(), dtype=np.float64),
         pupil_mm=nominal_pupil_mm(rig),
@@ -59,3 +72,64 @@ def nominal_backscatter(
         step=step,
         window=window,
     )
+
+
+def absent_wire(rig: RigDescription, geometry: Geometry) -> Wire:
+    """Return a wire map that is 1 everywhere: the rig's panel, open all over, where ``geometry``'s rays meet it."""
+    ideal = ideal_wire(geometry, wire_start(rig), np.zeros((0, 2)))
+    return replace(ideal, row_open=np.float64(1.0), column_open=np.float64(1.0), depth_per_pitch=np.float64(0.0))
+
+
+def absent_psf(rig: RigDescription, geometry: Geometry) -> PsfField:
+    """Return a field whose kernel is a single pixel everywhere; the rig's nominal diffraction has the fraction 0."""
+    middle, start = nominal_geometry(rig).principal_point_px, start_model(rig, geometry, absent_wire(rig, geometry))
+    return PsfField(
+        geometry=geometry,
+        diffraction=replace(start, wavelengths_nm=np.linspace(400.0, 700.0, 4), spectrum=np.full((3, 4), 0.25)),
+        diffraction_fraction=np.float64(0.0),
+        residual=np.ones((1, 3, 1, 1)),
+        centre_px=middle,
+        half_px=middle,
+        support_px=np.zeros(2),
+        degree=0,
+    )
+
+
+def absent_backscatter(rig: RigDescription, geometry: Geometry) -> Backscatter:
+    """Return a panel that sends no light back, with the nominal dimensions of panel and sensor of ``rig``."""
+    step = min(rig.camera.columns, rig.camera.rows) // 2
+    mask = np.zeros((3, rig.camera.rows // step, rig.camera.columns // step))
+    term, nothing = nominal_backscatter(geometry, rig, mask, step, window=1), np.float64(0.0)
+    return replace(term, softness_px=np.float64(0.2), reflection=nothing, reflection_mm=nothing)
+
+
+def lacking(session: Session, term: TermName) -> str:
+    """Return what the fit of a term cannot do without and the session does not have, in words; empty where nothing is.
+
+    What was captured badly is not lacking: the fit says what is wrong with it.
+    """
+    steps = session.steps(term)
+    shown, captured = [step.subject for step in steps], {step.id for step in steps}
+    # A stack of frames at one exposure is no further exposure.
+    flats, darks = (
+        sum(isinstance(step.subject, kind) and not step.id.endswith("_stack") for step in steps)
+        for kind in (FlatSubject, DarkSubject)
+    )
+    aims = np.array([(led.x_px, led.y_px) for led in shown if isinstance(led, LedSubject)]).reshape(-1, 2)
+    roles = [picture.role for picture in shown if isinstance(picture, PanelSubject)]
+    on_jig = any(isinstance(board, BoardSubject) and board.parallel_to_panel for board in shown)
+    once = {
+        "geometry": {"a view of the board on the jig, parallel to the display": on_jig},
+        "wire": {step_id: step_id in captured for step_id in ("wire/flat", "wire/dark")},
+        "backscatter": {"backscatter/white": "white" in roles, "backscatter/dark": darks > 0},
+    }
+    counted = {
+        "noise": [("exposures of the even light", flats, NoiseRules().levels), ("exposures in the dark", darks, 2)],
+        "psf": [("places of the LED", len(set(group(aims))), PsfRules().least_positions)],
+        "backscatter": [
+            ("pictures beside the white one", len(roles) - roles.count("white"), BackscatterRules().fewest_pictures)
+        ],
+    }
+    missing = [what for what, there in once.get(term, {}).items() if not there]
+    missing += [f"{least - seen} more {what}" for what, seen, least in counted.get(term, []) if seen < least]
+    return ", ".join(missing)

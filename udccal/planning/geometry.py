@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import erf
 
 from udccal.arrangements import Board, BoardSpec
-from udccal.fitting.engine.gaussian import Posterior, Prior, scaled_inverse
+from udccal.fitting.engine.gaussian import Posterior, scaled_inverse
 from udccal.fitting.engine.orders import bic
 from udccal.fitting.geometry.bundle import (
     EVERY,
@@ -115,8 +115,7 @@ class BoardViews:
         size = len(self.intrinsics)
         if view is None or not (points := gather([view.board], [view.image], [view.sigma]).points).names:
             return np.zeros((size, size))
-        problem = BundleProblem(points, EVERY, Prior(np.zeros(size), np.zeros((0, size))))
-        return problem.equations_at(Bundle(self.intrinsics, view.pose[None])).marginal()[0]
+        return BundleProblem(points, EVERY).equations_at(Bundle(self.intrinsics, view.pose[None])).marginal()[0]
 
     def _window_px(self, spec: BoardSpec, depth_mm: float) -> float:
         square_px = spec.square_mm / depth_mm * self.intrinsics[0]

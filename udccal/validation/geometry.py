@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
-from udccal.fitting.engine.gaussian import Prior, square_root
+from udccal.fitting.engine.gaussian import square_root
 from udccal.fitting.geometry.bundle import (
     INTRINSIC_NAMES,
     LENS,
@@ -23,7 +23,7 @@ from udccal.fitting.geometry.bundle import (
 )
 from udccal.fitting.geometry.calibrated import rms_px
 from udccal.fitting.geometry.corners import board_points_mm
-from udccal.fitting.geometry.data import BoardView, best_poses, facing, gather, read_geometry
+from udccal.fitting.geometry.data import BoardView, best_poses, gather, read_geometry
 from udccal.fitting.geometry.fit import BY_HAND, ON_JIG
 from udccal.models.geometry import Geometry
 from udccal.profiles.profile import Profile
@@ -32,8 +32,6 @@ from udccal.sessions.store import Session
 from udccal.validation.checks import Check, Judged, ZMap, at_most, chi2_check, unusable
 from udccal.validation.limits import ValidationLimits
 from udccal.validation.prediction import Prediction
-
-_NOTHING_KNOWN = Prior(np.zeros(LENS), np.zeros((0, LENS)))
 
 
 def validate_geometry(profile: Profile, session: Session, limits: ValidationLimits) -> Judged:
@@ -110,10 +108,10 @@ def _posed(points: Points, lens: Float[np.ndarray, "9"], rules: GeometryRules) -
     """The best pose of every view with the lens held, without outliers, which are marked."""
     place, held = Bundle(lens, best_poses(points, lens)[0]), np.zeros(LENS, dtype=bool)
     for _ in range(2):
-        place = solve(place, points, held, _NOTHING_KNOWN).place
+        place = solve(place, points, held).place
         size = np.abs(linearised(place, points)[0] / points.sigma[:, None]).max(axis=1)
         points = replace(points, used=~rules.corners.off(size))
-    return points, solve(place, points, held, _NOTHING_KNOWN).place
+    return points, solve(place, points, held).place
 
 
 def _prediction(points: Points, place: Bundle, result: FitResult[Geometry], only: int | None = None) -> Prediction:
@@ -157,7 +155,7 @@ def _jig_check(
     parallel = [k for k, name in enumerate(points.names) if views[name].parallel]
     if not parallel:
         return ()
-    seen = Rotation.from_rotvec(-facing(place.poses)[parallel, :3]).mean()
+    seen = Rotation.from_rotvec(-place.facing().poses[parallel, :3]).mean()
     angle = np.rad2deg((seen * Rotation.from_rotvec(np.asarray(term.rotation_rad)).inv()).magnitude())
     what = f"By the board on its jig, the camera is turned by {angle:.4f}° against the profile."
     return (at_most("geometry", "camera's turn", angle, limits.jig_deg, "deg", what),)

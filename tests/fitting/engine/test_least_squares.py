@@ -11,8 +11,7 @@ import pytest
 from jaxtyping import Float
 
 from udccal.fitting.engine.gaussian import Prior
-from udccal.fitting.engine.iteration_log import LOG
-from udccal.fitting.engine.least_squares import Blocks, SolverRules, Step, minimise
+from udccal.fitting.engine.least_squares import LOG, Blocks, SolverRules, Step, minimise
 
 Errors = Callable[[Float[np.ndarray, " p"]], Float[np.ndarray, " m"]]
 

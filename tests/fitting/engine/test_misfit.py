@@ -2,12 +2,15 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from udccal.fitting.engine.misfit import (
+    chi2_tail,
     chi2_test,
     clustered_cov,
     excess_sigma,
     excess_variance,
+    f_tail,
     f_test,
     group_means_test,
     robust_excess_sigma,
@@ -112,3 +115,17 @@ def test_an_excess_variance_is_found_within_its_error_and_none_where_there_is_no
     assert np.mean(none[:, 0] == 0) == pytest.approx(0.5, abs=0.1)
     # Half of a chi-squared of one degree of freedom (Chernoff, Ann. Math. Stat. 25, 1954).
     assert np.mean(none[:, 2] > 2.71) == pytest.approx(0.05, abs=0.03)
+
+
+@pytest.mark.parametrize("dof", [1.0, 3.0, 47.5, 1e6])
+@pytest.mark.parametrize("per_dof", [0.0, 0.5, 1.0, 1.3, 40.0, np.inf])
+def test_tails_are_those_of_the_distributions(dof: float, per_dof: float) -> None:
+    assert chi2_tail(per_dof * dof, dof) == pytest.approx(stats.chi2.sf(per_dof * dof, dof), rel=1e-9, abs=1e-300)
+    assert f_tail(per_dof, dof, 20.0) == pytest.approx(stats.f.sf(per_dof, dof, 20.0), rel=1e-9, abs=1e-300)
+
+
+@pytest.mark.parametrize(
+    "tail", [chi2_tail(-0.1, 3.0), chi2_tail(5.0, 0.0), f_tail(-0.1, 3.0, 9.0), f_tail(5.0, 0.0, 9.0)]
+)
+def test_nothing_compared_is_never_unlikely(tail: float) -> None:
+    assert tail == 1.0

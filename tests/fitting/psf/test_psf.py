@@ -12,10 +12,9 @@ from scipy.special import ndtr
 from tests.scenes.psf_wave_optics import seen_by_the_wire
 from udccal.cameras.protocol import CameraIdentity, Frame, Region, Settings
 from udccal.cfa import cfa_named
-from udccal.fitting.absent import absent_wire
 from udccal.fitting.hdr.merge import HdrMerge
 from udccal.fitting.noise.fit import nominal_noise
-from udccal.fitting.nominal import nominal_geometry
+from udccal.fitting.nominal import absent_wire, nominal_geometry
 from udccal.fitting.psf.data import PsfData, PsfRules, Shots, group, joined
 from udccal.fitting.psf.fit import fit_psf
 from udccal.fitting.psf.held_out import stated_by

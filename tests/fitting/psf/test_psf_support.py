@@ -13,9 +13,8 @@ from hypothesis import given
 
 from udccal.cameras.protocol import CameraIdentity, Frame, Region, Settings
 from udccal.cfa import cfa_named
-from udccal.fitting.absent import absent_wire
 from udccal.fitting.noise.fit import nominal_noise
-from udccal.fitting.nominal import nominal_geometry
+from udccal.fitting.nominal import absent_wire, nominal_geometry
 from udccal.fitting.psf.fit import nominal_psf
 from udccal.fitting.psf.held_out import (
     Support,

@@ -30,7 +30,7 @@ from tests.scenes.wire import (
     start,
 )
 from udccal.errors import FitError
-from udccal.fitting.engine.iteration_log import LOG
+from udccal.fitting.engine.least_squares import LOG
 from udccal.fitting.wire.data import WireData
 from udccal.fitting.wire.fit import fit_wire
 from udccal.fitting.wire.rules import WireRules

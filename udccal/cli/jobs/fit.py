@@ -14,7 +14,7 @@ from udccal.compilation import compilation_clock, keep_compilations
 from udccal.displays.pictures import face_picture
 from udccal.effort import FitEffort
 from udccal.errors import FitError, UdccalError
-from udccal.fitting.engine.iteration_log import LOG
+from udccal.fitting.engine.least_squares import LOG
 from udccal.io.links import refuse_links
 from udccal.io.out_folder import check_writable, storing_in
 from udccal.profiles.history import identity

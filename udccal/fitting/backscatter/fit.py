@@ -11,7 +11,6 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.linalg import block_diag
 
-from udccal.fitting.absent import absent_backscatter
 from udccal.fitting.backscatter.data import BackscatterData, Binned, Profile, grid_rays
 from udccal.fitting.backscatter.model import Rays, Usable, ratios, ratios_and_jacobian, window_for
 from udccal.fitting.backscatter.parameters import (
@@ -38,6 +37,7 @@ from udccal.fitting.engine.gaussian import Posterior, square_root
 from udccal.fitting.engine.misfit import NO_TEST, MisfitTest, chi2_test, group_means_test, sharper
 from udccal.fitting.engine.report import coarse, estimates, priors_of, residual_sample
 from udccal.fitting.engine.robust import outliers
+from udccal.fitting.nominal import absent_backscatter
 from udccal.models.backscatter import Backscatter
 from udccal.models.geometry import Geometry
 from udccal.numerics import in_float64

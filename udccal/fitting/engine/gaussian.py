@@ -118,14 +118,7 @@ class Posterior(Generic[Term]):
 
     @in_float64
     def propagate(self, f: Callable[[Term], Float[np.ndarray, "*shape"]]) -> Propagated:
-        """``f(term)`` with its covariance, to first order; unlike ``sigma_of`` it holds all derivatives together.
-
-        Args:
-            f: as for ``sigma_of``.
-
-        Returns:
-            the value, and its derivatives along the columns of ``factor``.
-        """
+        """``f(term)`` with its covariance, to first order; unlike ``sigma_of`` it holds all derivatives together."""
         value = np.asarray(f(self.term), dtype=np.float64)
         slopes = [slope.ravel() for slope in self._slopes(f)]
         return Propagated(value, np.stack(slopes, axis=1) if slopes else np.zeros((value.size, 0)))

@@ -17,7 +17,6 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 from scipy.special import log_ndtr, ndtr
@@ -40,12 +39,9 @@ def fisher_information(
         x: the n parameters.
         args: further arguments of ``predict``.
         clip: samples at or above this value are known only to lie there; in the unit of the means.
-
-    Returns:
-        n x n, in the inverse products of the parameters' units.
     """
     (mean, variance), (mean_slope, variance_slope) = (
-        tuple(np.asarray(part, dtype=np.float64) for part in pair) for pair in _linearised(predict)(x, args)
+        tuple(np.asarray(part, dtype=np.float64) for part in pair) for pair in _linearised(predict, x, args)
     )
     sigma = np.sqrt(variance)
     # Scores are linear in (u, u^2) below the clipping, u = (y - mean) / sigma.
@@ -81,16 +77,14 @@ def cramer_rao(
     return np.where(lost, np.inf, np.sqrt(np.maximum(variance, 0.0)))
 
 
-@functools.lru_cache(maxsize=32)
-def _linearised(predict: Predict) -> Callable[..., tuple[tuple[Array, Array], tuple[Array, Array]]]:
-    @jax.jit
-    def both(x: Array, args: tuple[Any, ...]) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-        def at(values: Array) -> tuple[Array, Array]:
-            return predict(values, *args)
+@functools.partial(jax.jit, static_argnums=0)
+def _linearised(
+    predict: Predict, x: Float[Array, " n"], args: tuple[Any, ...]
+) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+    def at(values: Array) -> tuple[Array, Array]:
+        return predict(values, *args)
 
-        return at(jnp.asarray(x)), jax.jacfwd(at)(jnp.asarray(x))
-
-    return both
+    return at(x), jax.jacfwd(at)(x)
 
 
 def _clipped_moments(

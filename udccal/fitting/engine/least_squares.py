@@ -12,6 +12,8 @@ scaled by the diagonal (More, Lecture Notes in Mathematics 630, 1978), follows N
 
 from __future__ import annotations
 
+import logging
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Generic, Protocol, TypeVar, final, runtime_checkable
 
@@ -19,7 +21,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from udccal.fitting.engine.gaussian import Prior, scaled_inverse
-from udccal.fitting.engine.iteration_log import LOG
+
+# Every solver writes its iterations here at level DEBUG: `udccal fit --log` shows them.
+LOG = logging.getLogger("udccal.fitting")
 
 Place = TypeVar("Place")
 _Place_contra = TypeVar("_Place_contra", contravariant=True)
@@ -135,26 +139,36 @@ class Blocks:
         """Without groups, from errors in units of their sigma and their Jacobian."""
         return cls.dense(float(errors @ errors), len(errors), slopes.T @ slopes, -slopes.T @ errors)
 
+    @classmethod
+    def joined(cls, parts: Sequence[Blocks]) -> Blocks:
+        """Of all data together: parts add up in the shared parameters, and each has groups of its own."""
+        cost, samples = sum(one.cost for one in parts), sum(one.samples for one in parts)
+        shared, right = np.sum([one.shared for one in parts], axis=0), np.sum([one.right for one in parts], axis=0)
+        own = (np.concatenate([getattr(one, name) for one in parts]) for name in ("own", "own_right", "cross"))
+        return cls(cost, samples, shared, right, *own)
+
     def with_prior(self, prior: Prior, x: Float[np.ndarray, " p"]) -> Blocks:
         """The same with a prior on the shared parameters, whose values are ``x``."""
         cost, matrix = self.cost + prior.cost(x), self.shared + prior.precision
         return replace(self, cost=cost, shared=matrix, right=self.right + prior.right(x))
 
-    def marginal(self, damping: float = 0.0) -> tuple[Float[np.ndarray, "p p"], Float[np.ndarray, " p"]]:
+    def marginal(self) -> tuple[Float[np.ndarray, "p p"], Float[np.ndarray, " p"]]:
         """Matrix and right side of the shared parameters once the nuisance parameters are eliminated."""
-        return self._marginal(damping, self._own_inverse(damping))
+        return self._eliminated(0.0)[:2]
 
-    def _marginal(
-        self, damping: float, own_inverse: Float[np.ndarray, "k l l"]
-    ) -> tuple[Float[np.ndarray, "p p"], Float[np.ndarray, " p"]]:
-        solved = self.cross @ own_inverse
+    def _eliminated(self, damping: float) -> tuple[np.ndarray, np.ndarray, Float[np.ndarray, "k l l"]]:
+        """The same with a raised diagonal, and the inverse of each group's block.
+
+        A group that only fills up the array has zeros there, and does not move.
+        """
+        inverse = scaled_inverse(_damped(self.own, damping), 1e-14)
+        solved = self.cross @ inverse
         matrix = _damped(self.shared, damping) - np.tensordot(solved, self.cross, ((0, 2), (0, 2)))
-        return matrix, self.right - np.tensordot(solved, self.own_right, ((0, 2), (0, 1)))
+        return matrix, self.right - np.tensordot(solved, self.own_right, ((0, 2), (0, 1))), inverse
 
     def step(self, damping: float) -> Step:
         """To the minimum of the quadratic model, whose diagonal is raised by the part ``damping``."""
-        inverse = self._own_inverse(damping)
-        matrix, right = self._marginal(damping, inverse)
+        matrix, right, inverse = self._eliminated(damping)
         if self.held is not None:
             matrix = np.where(self.held[:, None] | self.held, np.diag(np.where(self.held, 1.0, 0.0)), matrix)
             right = np.where(self.held, 0.0, right)
@@ -167,38 +181,32 @@ class Blocks:
         """Covariance of the shared parameters, nuisance parameters marginalised; 0 where they are not determined."""
         return scaled_inverse(self.marginal()[0])
 
-    def joint_cov(self) -> Float[np.ndarray, "n n"]:
-        """Covariance of the shared, then of the nuisance parameters group by group; ``n`` is p + k l."""
-        shared, inverse = self.cov(), self._own_inverse(0.0)
+    def joint_cov(self, shared: Float[np.ndarray, "p p"] | None = None, widen: float = 1.0) -> Float[np.ndarray, "n n"]:
+        """Covariance of the shared, then of the nuisance parameters group by group; ``n`` is p + k l.
+
+        Args:
+            shared: that of the shared parameters, if it is not ``cov()``; nuisance parameters follow them.
+            widen: factor on the variance that a group's nuisance parameters have where the shared ones are known.
+        """
+        matrix, _, inverse = self._eliminated(0.0)
+        shared = scaled_inverse(matrix) if shared is None else shared
         carried = -(inverse @ np.swapaxes(self.cross, 1, 2)).reshape(-1, len(self.right))
         cov = np.block([[shared, shared @ carried.T], [carried @ shared, carried @ shared @ carried.T]])
         size = inverse.shape[1]
         for group, block in enumerate(inverse):
             mine = slice(len(self.right) + group * size, len(self.right) + (group + 1) * size)
-            cov[mine, mine] += block
+            cov[mine, mine] += widen * block
         return cov
-
-    def _own_inverse(self, damping: float) -> Float[np.ndarray, "k l l"]:
-        """Inverse of each group's block; a group that only fills up the array has zeros there, and does not move."""
-        return scaled_inverse(_damped(self.own, damping), 1e-14)
 
 
 def _damped(matrix: Float[np.ndarray, "*k n n"], damping: float) -> Float[np.ndarray, "*k n n"]:
-    if damping == 0.0:
-        return matrix
-    diagonal = np.einsum("...ii->...i", matrix)
-    return matrix + damping * diagonal[..., None] * np.eye(matrix.shape[-1])
+    return matrix * (1.0 + damping * np.eye(matrix.shape[-1])) if damping else matrix
 
 
 def solve(matrix: Float[np.ndarray, "p p"], right: Float[np.ndarray, " p"]) -> Float[np.ndarray, " p"]:
-    """Solution of symmetric positive semi-definite equations, scaled to a unit diagonal.
+    """Solution of symmetric positive semi-definite equations, which are scaled to a unit diagonal.
 
-    Args:
-        matrix: p x p, such as half a Hessian.
-        right: p numbers.
-
-    Returns:
-        the p parameters; directions that the matrix does not determine are zero.
+    Directions that the matrix does not determine are zero.
     """
     unit = 1 / np.sqrt(np.maximum(np.diag(matrix), _TINY))
     try:
@@ -245,16 +253,8 @@ def minimise(
 ) -> Solution[Place, _Equations]:
     """The minimum of the cost next to ``start``, by Levenberg-Marquardt steps.
 
-    The descent has converged when another step is expected to lower the cost by less than ``rules.least_gain``. Where
-    the cost is not finite at the start, the start comes back, not converged.
-
-    Args:
-        problem: gives equations at a place, and the place after a step.
-        start: where to begin.
-        rules: see ``SolverRules``.
-
-    Returns:
-        the place of the lowest cost with its equations, and whether the descent converged.
+    ``rules`` say when a descent has converged. Where the cost is not finite at the start, the start comes back, not
+    converged.
     """
     rules = rules or SolverRules()
     place, here = start, problem.equations_at(start)

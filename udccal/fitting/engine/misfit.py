@@ -8,20 +8,18 @@ parameters' covariance is that of groups that differ by more than their noise; (
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import final
+from typing import SupportsFloat, final
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.special import chdtrc, fdtrc
 
 from udccal.fitting.engine.gaussian import scaled_inverse, square_root
 from udccal.fitting.engine.robust import MAD_TO_SIGMA
-from udccal.fitting.engine.tails import chi2_tail, f_tail
 
 # Chance finds a misfit where there is none once in a thousand fits.
 SIGNIFICANT = 1e-3
-_HALVINGS = 60
 
 
 @final
@@ -46,16 +44,20 @@ class MisfitTest:
 NO_TEST = MisfitTest(1.0, 1.0)
 
 
+# Tails come from scipy.special: scipy.stats takes longer to load than everything else that a fit needs.
+def chi2_tail(statistic: SupportsFloat, dof: SupportsFloat) -> float:
+    """Probability that chi-squared of ``dof`` degrees of freedom is above ``statistic``; 1 where there are none."""
+    return float(chdtrc(float(dof), max(float(statistic), 0.0))) if float(dof) > 0 else 1.0
+
+
+def f_tail(statistic: SupportsFloat, above: SupportsFloat, below: SupportsFloat) -> float:
+    """Probability that F is above ``statistic``; 1 where numerator or denominator has no degrees of freedom."""
+    degrees = float(above), float(below)
+    return float(fdtrc(*degrees, max(float(statistic), 0.0))) if min(degrees) > 0 else 1.0
+
+
 def chi2_test(statistic: float, dof: float) -> MisfitTest:
-    """Chi-squared test of a sum of squares of independent unit normals.
-
-    Args:
-        statistic: the sum.
-        dof: its degrees of freedom; where there are none the result is ``NO_TEST``.
-
-    Returns:
-        the reduced chi-squared and its p-value.
-    """
+    """Test a sum of squares of independent unit normals by chi-squared; ``NO_TEST`` without degrees of freedom."""
     return MisfitTest(statistic / dof, chi2_tail(statistic, dof)) if dof > 0 and np.isfinite(statistic) else NO_TEST
 
 
@@ -67,10 +69,8 @@ def f_test(statistic: float, rank: int, dof: float) -> MisfitTest:
     Args:
         statistic: the sum, in units of the estimated variance.
         rank: its degrees of freedom.
-        dof: degrees of freedom of all residuals behind the scale, those of ``rank`` included.
-
-    Returns:
-        F and its p-value; ``NO_TEST`` where either has no degrees of freedom.
+        dof: degrees of freedom of all residuals behind the scale, those of ``rank`` included; without any left the
+            result is ``NO_TEST``.
     """
     rest = dof - rank
     if rank < 1 or rest < 1 or not np.isfinite(statistic):
@@ -88,16 +88,13 @@ def sharper(*tests: MisfitTest) -> MisfitTest:
 def group_means_test(
     z: Float[np.ndarray, " n"], group: Int[np.ndarray, " n"], used: Bool[np.ndarray, " n"], scale: float = 1.0
 ) -> MisfitTest:
-    """Test whether means of groups scatter as those of independent residuals do.
+    """Test by chi-squared whether means of groups scatter as those of independent residuals do.
 
     Args:
         z: residuals of the fit in units of their sigma.
-        group: number of each sample's group.
+        group: number of each sample's group, which has one degree of freedom.
         used: samples that count.
         scale: variance of ``z`` where the model holds.
-
-    Returns:
-        the chi-squared test of the groups' means, one degree of freedom per group.
     """
     count = np.bincount(group[used])
     total = np.bincount(group[used], z[used])
@@ -128,24 +125,24 @@ def excess_sigma(
     """
     if not unit.any() or chi2_tail(float((square / noise).sum()), dof) > chance:
         return 0.0
-    return _halved(square, unit, lambda size: float((square / (noise + size**2 * unit)).sum()) > dof)
+    found, most = 0.0, float(square.max() / unit[unit > 0].min())
+    for _ in range(100):  # Newton's method: chi-squared is convex in the variance, so that no step goes too far.
+        variance = noise + found * unit
+        excess = float((square / variance).sum()) - dof
+        if excess <= 1e-12 * dof or found == most:
+            break
+        found = min(found + excess / float((square * unit / variance**2).sum()), most)
+    return float(np.sqrt(found))
 
 
 def robust_excess_sigma(
     square: Float[np.ndarray, " n"], noise: Float[np.ndarray, " n"], unit: Float[np.ndarray, " n"]
 ) -> float:
-    """The same by the median, significant or not: half of the residuals lie below their probable error.
-
-    Args:
-        square: squared residuals; outliers have little weight.
-        noise: variance of each residual by noise, in the same unit.
-        unit: variance that an error of size 1 adds to each residual.
-
-    Returns:
-        the size, as in ``excess_sigma``.
-    """
-    probable = MAD_TO_SIGMA**-2
-    return _halved(square, unit, lambda size: float(np.median(square / (noise + size**2 * unit))) > probable)
+    """The same by the median, which outliers hardly change, significant or not; arguments as for ``excess_sigma``."""
+    seen = unit > 0
+    # The variance that makes each residual just its probable error; half of the residuals lie below theirs.
+    needed = (square[seen] * MAD_TO_SIGMA**2 - noise[seen]) / unit[seen]
+    return float(np.sqrt(max(np.median(needed), 0.0))) if seen.any() else 0.0
 
 
 def excess_variance(
@@ -168,19 +165,6 @@ def excess_variance(
     without, total = observed / known, observed / (found + known)
     gain = np.sum(dof * (np.log(known) + without - np.log(found + known) - total))
     return found, float(2 / np.sum(dof / (found + known) ** 2)), float(gain)
-
-
-def _halved(
-    square: Float[np.ndarray, " n"], unit: Float[np.ndarray, " n"], too_small: Callable[[float], bool]
-) -> float:
-    """The smallest size that is not too small, by halving an interval."""
-    if not unit.any():
-        return 0.0
-    low, high = 0.0, float(np.sqrt(square.max() / unit[unit > 0].min()))
-    for _ in range(_HALVINGS):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if too_small(middle) else (low, middle)
-    return 0.5 * (low + high)
 
 
 def clustered_cov(

@@ -80,14 +80,7 @@ class Choice(Generic[Fit]):
 
 
 def choose(tried: Iterable[Attempt[Fit]]) -> Choice[Fit]:
-    """Choose the order with the lowest criterion; of equal ones, the first.
-
-    Args:
-        tried: at least one attempt.
-
-    Returns:
-        the best attempt, with all of them.
-    """
+    """Choose the order with the lowest criterion, of at least one; of equal ones, the first."""
     found = tuple(tried)
     return Choice(min(found, key=lambda t: t.criterion), found)
 
@@ -97,15 +90,12 @@ def rising(
     beats: Callable[[Attempt[Fit], Attempt[Fit]], bool],
     patience: int = 2,
 ) -> tuple[Attempt[Fit], ...]:
-    """Try rising orders until ``patience`` of them in a row do not beat the best one before them.
+    """Try rising orders until ``patience`` of them in a row do not beat the best one before them; return all attempts.
 
     Args:
         orders: functions that fit one order each, simplest first.
         beats: whether its first argument, the later attempt, is better than the second.
         patience: more than 1, since an effect that is odd over the field needs a further order to show.
-
-    Returns:
-        all attempts that were made.
     """
     tried: list[Attempt[Fit]] = []
     best, in_vain = None, 0
@@ -125,9 +115,6 @@ def bic(cost: float, parameters: float, samples: int) -> float:
         cost: minus twice the log likelihood at its maximum, such as chi-squared.
         parameters: how many the order has.
         samples: how many data the fit uses.
-
-    Returns:
-        the criterion; lower is better.
     """
     return cost + parameters * float(np.log(max(samples, 2)))
 
@@ -144,9 +131,6 @@ def evidence(
         cov: covariance of the n free parameters after the data.
         prior_sigma: sigma of the same parameters before the data.
         against: -2 ln of how probable the order is beforehand.
-
-    Returns:
-        the criterion; lower is better.
     """
     narrowed = cov / np.outer(prior_sigma, prior_sigma)
     return cost - float(np.linalg.slogdet(narrowed)[1]) + against

@@ -24,9 +24,7 @@ def estimates(
 
     Args:
         term: the term's name.
-        names: of the quantities.
-        values: one per name, in its unit.
-        cov: covariance, in the order of the names; further rows are ignored.
+        names, values: of the quantities. cov: covariance, in the order of the names; further rows are ignored.
         priors: by name, what was known before the data.
     """
     sigma, known = np.sqrt(np.maximum(np.diag(cov), 0.0)), priors or {}

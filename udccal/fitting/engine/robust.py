@@ -60,15 +60,7 @@ class OutlierRule:
 
 
 def outliers(rule: str, places: Iterable[str]) -> tuple[Outliers, ...]:
-    """The samples that a rule left out: how many, and the first of them.
-
-    Args:
-        rule: sentence that states the rule.
-        places: where each sample is, for a person.
-
-    Returns:
-        one entry; empty where no sample was left out.
-    """
+    """The samples that a rule, stated in words, left out at ``places``: how many, and the first; empty without any."""
     named = iter(places)
     first = tuple(islice(named, _NAMED))
     return (Outliers(rule, len(first) + sum(1 for _ in named), first),) if first else ()

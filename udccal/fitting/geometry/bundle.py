@@ -12,6 +12,7 @@ from typing import final
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.spatial.transform import Rotation
 
 from udccal.fitting.engine.gaussian import Prior
 from udccal.fitting.engine.least_squares import Blocks, Solution, SolverRules, Step, minimise
@@ -27,6 +28,7 @@ ORDERS = {
     for name, count in (("no distortion", 4), ("k1", 5), ("k1 k2", 6), ("k1 k2 p1 p2", 8), ("k1 k2 p1 p2 k3", 9))
 }
 EVERY = np.ones(LENS, dtype=bool)
+NOTHING_KNOWN = Prior(np.zeros(LENS), np.zeros((0, LENS)))
 
 
 @final
@@ -87,6 +89,9 @@ class GeometryRules:
     worst_corner_sigma_px: float = 1.0
 
 
+USUAL = GeometryRules()
+
+
 @final
 @dataclass(frozen=True)
 class Intrinsics:
@@ -108,6 +113,11 @@ class Intrinsics:
     def of_geometry(cls, geometry: Geometry) -> Intrinsics:
         """Of a fitted or nominal term."""
         return cls(geometry.focal_px, geometry.principal_point_px, geometry.distortion)
+
+    @classmethod
+    def centred(cls, focal_px: float, image_size: tuple[int, int]) -> Intrinsics:
+        """Without distortion, about the middle of the picture of (columns, rows)."""
+        return cls(np.full(2, focal_px), (np.array(image_size) - 1) / 2, np.zeros(5))
 
     @property
     def vector(self) -> Float[np.ndarray, "9"]:
@@ -135,6 +145,15 @@ class Bundle:
     intrinsics: Float[np.ndarray, "9"]
     poses: Float[np.ndarray, "views 6"]
 
+    def facing(self) -> Bundle:
+        """The same pictures with every board in front of the camera, and rotations of at most half a turn.
+
+        Behind the camera, a flat board turned by half a turn about its normal projects to the same points.
+        """
+        behind = self.poses[:, 5:] < 0
+        turn = Rotation.from_rotvec(self.poses[:, :3]) * Rotation.from_rotvec(behind * np.array([0.0, 0.0, np.pi]))
+        return Bundle(self.intrinsics, np.hstack([turn.as_rotvec(), np.where(behind, -1.0, 1.0) * self.poses[:, 3:]]))
+
 
 @final
 @dataclass(frozen=True)
@@ -161,19 +180,13 @@ class Points:
 
     def without(self, views: Bool[np.ndarray, " views"]) -> Points:
         """Without these views; the others move up."""
-        stay = ~views[self.view]
-        number = np.cumsum(~views) - 1
-        names = tuple(name for name, gone in zip(self.names, views, strict=True) if not gone)
-        parts = (self.board[stay], self.image[stay], self.sigma[stay], number[self.view[stay]])
-        return Points(*parts, self.index[stay], self.used[stay], names)
+        number, stay = (np.cumsum(~views) - 1)[self.view], ~views[self.view]
+        parts = (self.board, self.image, self.sigma, number, self.index, self.used)
+        return Points(*(part[stay] for part in parts), tuple(np.array(self.names)[~views].tolist()))
 
     def sums(self, values: Float[np.ndarray, " points"]) -> Float[np.ndarray, " views"]:
         """Sums over each view's points in use."""
         return np.bincount(self.view[self.used], values[self.used], len(self.names))
-
-    def places(self, points: Int[np.ndarray, " some"]) -> tuple[str, ...]:
-        """Points by their view and their number there, as given."""
-        return tuple(f"view {self.names[self.view[k]]}, point {self.index[k]}" for k in points)
 
 
 def projected(
@@ -210,17 +223,6 @@ def in_sigma(bundle: Bundle, points: Points) -> tuple[Float[np.ndarray, "points 
     return residuals * weight, jacobian * weight[..., None]
 
 
-def by_view(
-    z: Float[np.ndarray, "points 2"], jacobian: Float[np.ndarray, "points 2 15"], points: Points
-) -> tuple[Float[np.ndarray, "views 15 15"], Float[np.ndarray, "views 15"]]:
-    """Half the Hessian and minus half the gradient of each view's chi-squared, by intrinsics and own pose."""
-    ends = np.cumsum(np.bincount(points.view, minlength=len(points.names)))[:-1]
-    tall = [
-        (j.reshape(-1, LENS + 6), r.ravel()) for j, r in zip(np.split(jacobian, ends), np.split(z, ends), strict=True)
-    ]
-    return np.array([j.T @ j for j, _ in tall]), np.array([-j.T @ r for j, r in tall])
-
-
 @final
 @dataclass(frozen=True)
 class BundleProblem:
@@ -231,7 +233,7 @@ class BundleProblem:
 
     points: Points
     free: Bool[np.ndarray, "9"]
-    prior: Prior
+    prior: Prior = NOTHING_KNOWN
     robust: Cauchy | None = None
 
     @property
@@ -243,35 +245,41 @@ class BundleProblem:
         """The place after a step."""
         return Bundle(place.intrinsics + step.shared, place.poses + step.own)
 
+    def by_view(self, place: Bundle) -> list[Blocks]:
+        """The equations of each view alone, without the prior: intrinsics are shared, with zeros for those held."""
+        z, jacobian = in_sigma(place, self.points)
+        jacobian[..., :LENS] *= self.free
+        made, loss = [], (z**2).sum(axis=1)
+        if self.robust is not None:
+            root, loss = np.sqrt(self.robust.weight(np.sqrt(loss))), self.robust.loss(np.sqrt(loss))
+            z, jacobian = z * root[:, None], jacobian * root[:, None, None]
+        for mine in np.split(np.arange(len(z)), np.flatnonzero(np.diff(self.points.view)) + 1):
+            slopes, errors = jacobian[mine].reshape(-1, LENS + 6), z[mine].ravel()
+            whole, right, used = slopes.T @ slopes, -slopes.T @ errors, 2 * int(self.points.used[mine].sum())
+            # Each intrinsic gets this part of the information that known poses would bring: an intrinsic that views
+            # do not determine has then a very large variance, not none. It is above rounding, and changes no other.
+            shared = whole[:LENS, :LENS] + 1e-11 * np.diag(np.diag(whole)[:LENS])
+            own = whole[None, LENS:, LENS:], right[None, LENS:], whole[None, :LENS, LENS:]
+            made.append(Blocks(float(loss[mine].sum()), used, shared, right[:LENS], *own))
+        return made
+
     def equations_at(self, place: Bundle) -> Blocks:
-        """Intrinsics are the shared parameters, with zeros for those held; a group is a view."""
+        """Those of all views together, with the prior's part."""
         with np.errstate(all="ignore"):  # A step too far may lead to points behind the camera; the cost refuses it.
-            z, jacobian = in_sigma(place, self.points)
-            size = np.sqrt((z**2).sum(axis=1))
-            if self.robust is None:
-                cost = float((size**2).sum())
-            else:
-                cost, root = float(self.robust.loss(size).sum()), np.sqrt(self.robust.weight(size))
-                z, jacobian = z * root[:, None], jacobian * root[:, None, None]
-            matrix, right = by_view(z, jacobian, self.points)
-        shared = matrix[:, :LENS, :LENS].sum(axis=0) + self.prior.precision
-        # Each intrinsic gets this part of the information that known poses would bring: an intrinsic that views do not
-        # determine has then a very large variance, not none. It is above rounding, and changes no other sigma.
-        shared = (shared + 1e-11 * np.diag(np.diag(shared))) * np.outer(self.free, self.free)
-        shared_right = (right[:, :LENS].sum(axis=0) + self.prior.right(place.intrinsics)) * self.free
-        cross = matrix[:, :LENS, LENS:] * self.free[:, None]
-        cost, samples = cost + self.prior.cost(place.intrinsics), 2 * int(self.points.used.sum())
-        return Blocks(cost, samples, shared, shared_right, matrix[:, LENS:, LENS:], right[:, LENS:], cross)
+            together = Blocks.joined(self.by_view(place))
+        return together.with_prior(Prior(self.prior.mean, self.prior.root * self.free), place.intrinsics)
 
 
 Solved = Solution[Bundle, Blocks]
 
 
 def solve(
-    start: Bundle, points: Points, free: Bool[np.ndarray, "9"], prior: Prior, robust: Cauchy | None = None
+    start: Bundle,
+    points: Points,
+    free: Bool[np.ndarray, "9"],
+    prior: Prior = NOTHING_KNOWN,
+    robust: Cauchy | None = None,
 ) -> Solved:
-    """The minimum next to ``start``, roughly if robust or of poses alone; arguments as for ``BundleProblem``."""
-    # A descent ends a thousandth of a sigma from the minimum; if another one follows, a tenth is enough.
-    rough = robust is not None or not free.any()
-    rules = SolverRules(least_gain=1e-2 if rough else 1e-6)
+    """The minimum next to ``start``, to a thousandth of a sigma or, where robust, a tenth: another descent follows."""
+    rules = SolverRules(least_gain=1e-6 if robust is None else 1e-2)
     return minimise(BundleProblem(points, free, prior, robust), start, rules)

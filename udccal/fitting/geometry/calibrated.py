@@ -9,7 +9,7 @@ model with normal noise.
 from __future__ import annotations
 
 import enum
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import final
 
@@ -18,9 +18,17 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from udccal.errors import FitError
-from udccal.fitting.engine.gaussian import scaled_inverse
 from udccal.fitting.engine.misfit import MisfitTest, clustered_cov, f_test
-from udccal.fitting.geometry.bundle import LENS, GeometryRules, Intrinsics, Points, Solved, by_view, in_sigma, projected
+from udccal.fitting.geometry.bundle import (
+    LENS,
+    BundleProblem,
+    GeometryRules,
+    Intrinsics,
+    Points,
+    Solved,
+    in_sigma,
+    projected,
+)
 from udccal.result import Candidate, FitStatus, Outliers
 
 
@@ -47,20 +55,6 @@ class Evidence:
     pattern: MisfitTest
     views: MisfitTest
     pattern_px: float
-
-    @property
-    def notes(self) -> Iterator[str]:
-        """Sentences for a person about the model errors found."""
-        if self.views.found:
-            yield (
-                f"The views disagree on the lens beyond their noise (ratio {self.views.ratio:.1f}, "
-                f"p = {self.views.p_value:.1g}); sigma is that of views that differ so. Is the board flat?"
-            )
-        if self.pattern.found:
-            yield (
-                f"The residuals follow a pattern over the picture (p = {self.pattern.p_value:.1g}, about "
-                f"{self.pattern_px:.3f} px): the lens bends rays in a way that no order has."
-            )
 
 
 @final
@@ -118,17 +112,16 @@ class CalibratedViews:
             FitError: when the fitted distortion folds before a pixel, so that no ray lands there.
         """
         by_lens, by_turn = self._ray_slopes(np.asarray(pixels, dtype=np.float64))
-        slope = np.einsum("nai,ij->naj", by_turn, self.turn(gauge))
+        slope = by_turn @ self.turn(gauge)
         slope[..., :LENS] += by_lens
-        return np.einsum("nai,ij,nbj->nab", slope, self.cov, slope) + self.evidence.pattern_px**2 * np.eye(2)
+        return slope @ self.cov @ np.swapaxes(slope, 1, 2) + self.evidence.pattern_px**2 * np.eye(2)
 
     def turn(self, gauge: Gauge) -> Float[np.ndarray, "3 n"]:
         """Derivatives of the rays' rotation, in camera coordinates, by the intrinsics and poses."""
-        turn = np.zeros((3, len(self.cov)))
         if gauge is Gauge.BOARDS:
-            for view, pose in enumerate(self.poses):
-                turn[:, LENS + 6 * view : LENS + 6 * view + 3] = _turn_by_vector(pose[:3]) / len(self.poses)
-        elif gauge is Gauge.ALIGNED:
+            return turn_with(self.poses, range(len(self.poses)))
+        turn = np.zeros((3, len(self.cov)))
+        if gauge is Gauge.ALIGNED:
             lens, by_turn = self._ray_slopes(field_grid(self.image_size))
             turn[:, :LENS] = -np.linalg.lstsq(by_turn.reshape(-1, 3), lens.reshape(-1, LENS), rcond=None)[0]
         return turn
@@ -137,17 +130,11 @@ class CalibratedViews:
         self, pixels: Float[np.ndarray, "rays 2"]
     ) -> tuple[Float[np.ndarray, "rays 2 9"], Float[np.ndarray, "rays 2 3"]]:
         """Derivatives of the places where rays land, by the intrinsics and by a small rotation of the rays."""
-        lens = self.intrinsics
-        rays = np.hstack([(pixels - lens.principal_point_px) / lens.focal_px, np.ones((len(pixels), 1))])
-        with np.errstate(all="ignore"):  # Rays that do not come near are found below.
-            for _ in range(40):  # Newton's method on the distortion.
-                places, by = projected(lens.vector, rays)
-                (xx, xy), (yx, yy) = np.moveaxis(by[:, :, LENS + 3 : LENS + 5], 0, -1)
-                area, (dx, dy) = xx * yy - xy * yx, (pixels - places).T
-                lost = ~((np.hypot(dx, dy) < 1e-7) & (area > 0))
-                if not lost.any():
-                    break
-                rays[:, :2] += np.stack([yy * dx - xy * dy, xx * dy - yx * dx], axis=1) / area[:, None]
+        lens, enough = self.intrinsics, (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 1000, 1e-9)
+        ideal = cv2.undistortPoints(pixels, lens.matrix, lens.distortion, criteria=enough)
+        places, by = projected(lens.vector, cv2.convertPointsToHomogeneous(ideal).reshape(-1, 3))
+        near = np.abs(places - pixels).max(axis=1) < 1e-6
+        lost = ~near | (np.linalg.det(np.where(near[:, None, None], by[:, :, LENS + 3 : LENS + 5], 0.0)) <= 0)
         if lost.any():
             x, y = pixels[lost][0]
             raise FitError(
@@ -169,60 +156,40 @@ def field_grid(image_size: tuple[int, int]) -> Float[np.ndarray, "81 2"]:
     return np.stack([x.ravel(), y.ravel()], axis=1)
 
 
-def _turn_by_vector(vector: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
-    """The left Jacobian of SO(3): a change of the rotation vector to the small rotation that follows the old one."""
-    matrix, by = cv2.Rodrigues(np.ascontiguousarray(vector))
-    small = by.reshape(3, 3, 3) @ matrix.T
-    return np.array([small[:, 2, 1], small[:, 0, 2], small[:, 1, 0]])
+def turn_with(poses: Float[np.ndarray, "views 6"], views: Sequence[int]) -> Float[np.ndarray, "3 n"]:
+    """Derivatives, by intrinsics and all poses, of the mean rotation of some views' boards in camera coordinates.
+
+    It is the small rotation that follows the old one; the left Jacobian of SO(3) takes the rotation vectors to it.
+    """
+    turn = np.zeros((3, LENS + poses.size))
+    for view in views:
+        matrix, by = cv2.Rodrigues(np.ascontiguousarray(poses[view, :3]))
+        small = by.reshape(3, 3, 3) @ matrix.T
+        mine = slice(LENS + 6 * view, LENS + 6 * view + 3)
+        turn[:, mine] = np.array([small[:, 2, 1], small[:, 0, 2], small[:, 1, 0]]) / len(views)
+    return turn
 
 
 def weigh(
-    solved: Solved,
-    points: Points,
-    free: Bool[np.ndarray, "9"],
-    image_size: tuple[int, int],
-    dof: float,
-    rules: GeometryRules,
+    solved: Solved, points: Points, free: Bool[np.ndarray, "9"], image_size: tuple[int, int], dof: float, cells: int
 ) -> tuple[Evidence, Float[np.ndarray, "n n"]]:
-    """Tests of a solution, and its covariance, widened where the views disagree; ``dof`` are those behind sigma."""
-    z, jacobian = in_sigma(solved.place, points)
-    jacobian = jacobian * np.concatenate([free, np.ones(6)])
-    matrix, right = by_view(z, jacobian, points)
-    own = scaled_inverse(matrix[:, LENS:, LENS:], 1e-14)
-    carried = -own @ matrix[:, LENS:, :LENS]
-    # Each view's information on the free intrinsics, its pose eliminated; all views together have the size 1.
-    information = (matrix[:, :LENS, :LENS] + matrix[:, :LENS, LENS:] @ carried)[:, free][:, :, free]
-    score = (right[:, :LENS] + np.einsum("kji,kj->ki", carried, right[:, LENS:]))[:, free]
-    unit = 1 / np.sqrt(np.maximum(np.einsum("kii->i", information), 1e-300))
-    information, score = information * np.outer(unit, unit), score * unit
-    views, cov = _disagreement(information, score, dof), solved.equations.joint_cov()
-    pattern, size = _pattern(z, jacobian, points, cov, image_size, dof, rules.pattern_cells)
-    if views.found:
-        lens = solved.equations.cov()[np.ix_(free, free)] / np.outer(unit, unit)
-        spread = np.zeros((LENS, LENS))
-        spread[np.ix_(free, free)] = (clustered_cov(lens, score, information) - lens) * np.outer(unit, unit)
-        cov = _widened(cov, spread, carried, own * (views.inflation - 1))
-    return Evidence(pattern, views, size if pattern.found else 0.0), cov
+    """Tests of a solution, and its covariance, widened where the views disagree; ``dof`` are those behind sigma.
 
-
-def _widened(
-    cov: Float[np.ndarray, "n n"],
-    spread: Float[np.ndarray, "9 9"],
-    carried: Float[np.ndarray, "views 6 9"],
-    own: Float[np.ndarray, "views 6 6"],
-) -> Float[np.ndarray, "n n"]:
-    """The covariance with the spread of the lens, carried to the poses, and an addition to each pose's own part.
-
-    The spread is that of the lens when one view after another is left out. Its 95 % intervals hold 93 to 98 % where
-    boards are bent or lenses move; with one factor for all (Birge, 1932) they hold 83 to 99 %. Only its own view
-    determines a pose.
+    The lens then has the spread that it has when one view after another is left out, and the poses follow. Its 95 %
+    intervals hold 93 to 98 % where boards are bent or lenses move; with one factor for all (Birge, 1932) they hold 83
+    to 99 %. Only its own view determines a pose.
     """
-    along = np.vstack([np.eye(LENS), carried.reshape(-1, LENS)])
-    wide = cov + along @ spread @ along.T
-    for view, block in enumerate(own):
-        mine = slice(LENS + 6 * view, LENS + 6 * view + 6)
-        wide[mine, mine] += block
-    return wide
+    parts = [one.marginal() for one in BundleProblem(points, free).by_view(solved.place)]
+    # Each view's information on the free intrinsics, its pose eliminated; all views together have the size 1.
+    information, score = (np.array(part)[:, free] for part in zip(*parts, strict=True))
+    unit = 1 / np.sqrt(np.maximum(np.einsum("kii->i", information[:, :, free]), 1e-300))
+    units, among = np.outer(unit, unit), np.ix_(free, free)
+    information, score = information[:, :, free] * units, score * unit
+    views, lens = _disagreement(information, score, dof), solved.equations.cov()
+    pattern, size = _pattern(solved, points, image_size, dof, cells)
+    if views.found:
+        lens[among] = clustered_cov(lens[among] / units, score, information) * units
+    return Evidence(pattern, views, size if pattern.found else 0.0), solved.equations.joint_cov(lens, views.inflation)
 
 
 def _disagreement(information: np.ndarray, score: np.ndarray, dof: float) -> MisfitTest:
@@ -235,29 +202,26 @@ def _disagreement(information: np.ndarray, score: np.ndarray, dof: float) -> Mis
 
 
 def _pattern(
-    z: np.ndarray,
-    jacobian: np.ndarray,
-    points: Points,
-    cov: np.ndarray,
-    image_size: tuple[int, int],
-    dof: float,
-    cells: int,
+    solved: Solved, points: Points, image_size: tuple[int, int], dof: float, cells: int
 ) -> tuple[MisfitTest, float]:
     """Test of sums over the cells of a grid by their covariance under the model, and the pattern's size in px.
 
     ``group_means_test`` does not serve here: the fit absorbs most of a smooth pattern, so that means of cells scatter
     far less than those of independent residuals. The covariance of the sums accounts for that.
     """
+    z, jacobian = in_sigma(solved.place, points)
     place = np.clip(points.image / np.array(image_size) * cells, 0, cells - 1).astype(np.int64)
-    cell = np.where(points.used, place[:, 1] * cells + place[:, 0], -1)
-    inside = np.equal.outer(np.unique(cell[points.used]), cell).astype(np.float64)
+    cell = place[:, 1] * cells + place[:, 0]
+    inside = np.equal.outer(np.unique(cell[points.used]), cell) * points.used.astype(np.float64)
     count, sums = np.repeat(inside.sum(axis=1), 2), (inside @ z).ravel()
-    whole = np.zeros((len(z), 2, len(cov)))
-    whole[:, :, :LENS] = jacobian[:, :, :LENS]
-    columns = LENS + 6 * points.view[:, None, None] + np.arange(6)
-    np.put_along_axis(whole, np.repeat(columns, 2, axis=1), jacobian[:, :, LENS:], axis=2)
-    gathered = np.tensordot(inside, whole, 1).reshape(len(sums), -1)
-    expected = np.diag(count) - gathered @ cov @ gathered.T
+    slopes = np.zeros((len(inside), 2, LENS + solved.place.poses.size))
+    for view in range(len(points.names)):
+        mine = points.view == view
+        part = np.tensordot(inside[:, mine], jacobian[mine], 1)
+        slopes[..., :LENS] += part[..., :LENS]
+        slopes[..., LENS + 6 * view : LENS + 6 * view + 6] = part[..., LENS:]
+    slopes = slopes.reshape(len(sums), -1)
+    expected = np.diag(count) - slopes @ solved.equations.joint_cov() @ slopes.T
     values, vectors = np.linalg.eigh(expected)
     seen = values > 1e-6 * count.max()
     found = f_test(float(((vectors[:, seen].T @ sums) ** 2 / values[seen]).sum()), int(seen.sum()), dof)
@@ -270,23 +234,20 @@ def status_of(
     solved: Solved, cov: Float[np.ndarray, "n n"], off_px: float, image_size: tuple[int, int], rules: GeometryRules
 ) -> tuple[FitStatus, tuple[str, ...]]:
     """Whether the views determine the lens, with residuals of RMS ``off_px``; else what to capture."""
+    order = "Check that the points of each view are in the order of the board's."
     if off_px > rules.no_corners_px:
         return FitStatus.POOR_FIT, (
             f"Expected corners within {rules.no_corners_px:g} px of the fitted lens, found {off_px:.3g} px (RMS): no "
-            "lens puts these board points there. Check that the points of each view are in the order of the board's.",
+            f"lens puts these board points there. {order}",
         )
-    sigma, lens = Intrinsics.of(np.sqrt(np.diag(cov))), Intrinsics.of(solved.place.intrinsics)
-    by_focal = float(np.max(sigma.focal_px / np.abs(lens.focal_px)))
-    by_centre = float(np.max(sigma.principal_point_px)) / image_size[0]
-    if max(by_focal, by_centre) > rules.most_uncertain:
-        what = "focal length" if by_focal > by_centre else "centre of the picture"
+    sigma = np.sqrt(np.diag(cov))[:4] / [*np.abs(solved.place.intrinsics[:2]), image_size[0], image_size[0]]
+    if sigma.max() > rules.most_uncertain:
+        what = "focal length" if sigma.argmax() < 2 else "centre of the picture"
         return FitStatus.TOO_FEW_DATA, (
-            f"The views do not determine the {what} (one sigma is {min(max(by_focal, by_centre), 99.0):.0%}). "
+            f"The views do not determine the {what} (one sigma is {min(sigma.max(), 99.0):.0%}). "
             "Lean the board by 20 to 40 degrees, another way in each view, and let it fill the picture.",
         )
-    if not solved.converged:
-        return FitStatus.NOT_CONVERGED, ("Check that the points of each view are in the order of the board's.",)
-    return FitStatus.CONVERGED, ()
+    return (FitStatus.CONVERGED, ()) if solved.converged else (FitStatus.NOT_CONVERGED, (order,))
 
 
 def remarks(
@@ -302,4 +263,13 @@ def remarks(
     loud = [f"{points.names[k]} ({relative[k]:.1f} x)" for k in np.flatnonzero(relative > rules.loud_view)]
     if loud:
         yield f"Views that scatter more than the median view, and count for less: {', '.join(loud)}."
-    yield from evidence.notes
+    if evidence.views.found:
+        yield (
+            f"The views disagree on the lens beyond their noise (ratio {evidence.views.ratio:.1f}, "
+            f"p = {evidence.views.p_value:.1g}); sigma is that of views that differ so. Is the board flat?"
+        )
+    if evidence.pattern.found:
+        yield (
+            f"The residuals follow a pattern over the picture (p = {evidence.pattern.p_value:.1g}, about "
+            f"{evidence.pattern_px:.3f} px): the lens bends rays in a way that no order has."
+        )

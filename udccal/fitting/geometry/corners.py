@@ -21,8 +21,9 @@ from scipy.ndimage import convolve1d
 from scipy.special import erf
 
 from udccal.arrangements import BoardSpec
+from udccal.cfa import cfa_named
 from udccal.errors import FitError
-from udccal.fitting.geometry.bundle import GeometryRules
+from udccal.fitting.geometry.bundle import USUAL, GeometryRules
 
 
 @final
@@ -42,16 +43,11 @@ def luminance(mosaic: Float[np.ndarray, "rows columns"], variance: Float[np.ndar
     """
     grey, spread = np.asarray(mosaic, dtype=np.float64).copy(), np.asarray(variance, dtype=np.float64).copy()
     total = max(float(grey.mean()), 1e-12)
-    for site in sites():
-        gain = total / max(float(grey[site].mean()), 1e-12)
-        grey[site] *= gain
-        spread[site] *= gain**2
+    for site in cfa_named("RGGB").sites:  # Any pattern of 2 x 2 has these sites.
+        gain = total / max(float(grey[site.samples].mean()), 1e-12)
+        grey[site.samples] *= gain
+        spread[site.samples] *= gain**2
     return Luminance(_filtered(grey), spread)
-
-
-def sites() -> list[tuple[slice, slice]]:
-    """The four sites of a colour filter's pattern."""
-    return [(slice(row, None, 2), slice(column, None, 2)) for row in (0, 1) for column in (0, 1)]
 
 
 def _filtered(picture: Float[np.ndarray, "*stack rows columns"]) -> Float[np.ndarray, "*stack rows columns"]:
@@ -89,26 +85,15 @@ def board_points_mm(spec: BoardSpec) -> Float[np.ndarray, "corners 3"]:
     return np.asarray(charuco_board(spec).getChessboardCorners(), dtype=np.float64).reshape(-1, 3)
 
 
-def detect_corners(picture: Luminance, spec: BoardSpec, rules: GeometryRules | None = None) -> BoardCorners:
-    """Find a board's inner corners in a grey picture; errors as for ``charuco_board``.
+def detect_corners(picture: Luminance, spec: BoardSpec, rules: GeometryRules = USUAL) -> BoardCorners:
+    """Find a board's inner corners in a grey picture; the arrays are empty where there are none.
 
-    Args:
-        picture: from ``luminance``.
-        spec: of the board.
-        rules: see ``GeometryRules``.
-
-    Returns:
-        the corners; the arrays are empty where there are none.
+    Errors are those of ``charuco_board``.
     """
-    rules = rules or GeometryRules()
     ids, rough = _detect(picture.grey, spec)
     if len(ids) < rules.least_corners:
         return BoardCorners(np.zeros(0, dtype=np.int64), np.zeros((0, 2)), np.zeros(0))
-    edges = _edges_px(board_points_mm(spec)[ids, :2], rough, spec.square_mm)
-    margin = rules.marker_margin * np.sqrt(2.0) * (spec.square_mm - spec.marker_mm) / (2.0 * spec.square_mm)
-    side = np.linalg.norm(edges, axis=2).min(axis=1)
-    radius = np.clip(min(margin, rules.window_squares) * side, *rules.window_px)
-    return _saddles(picture, ids, rough, edges, radius, rules)
+    return _placed(picture, ids, rough, _edges_px(board_points_mm(spec)[ids, :2], rough, spec.square_mm), spec, rules)
 
 
 def _detect(
@@ -135,112 +120,115 @@ def _edges_px(
 ) -> Float[np.ndarray, "n 2 2"]:
     """The sides of a square to the right and down at each corner, as vectors in px."""
     homography, _ = cv2.findHomography(board, image, cv2.RANSAC, 5.0)
-    if homography is None:
-        homography = np.eye(3)
     ends = board[:, None] + square_mm / 2 * np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
-    seen = cv2.perspectiveTransform(ends.reshape(-1, 1, 2), homography).reshape(-1, 4, 2)
+    whole = np.eye(3) if homography is None else homography
+    seen = cv2.perspectiveTransform(ends.reshape(-1, 1, 2), whole).reshape(-1, 4, 2)
     return np.asarray(seen[:, :2] - seen[:, 2:])
 
 
 @final
-class _Saddle:
-    """The model at a shape (px, py, angle1, angle2, log s1, log s2), with its best linear part (b, gx, gy, A).
+@dataclass(frozen=True)
+class _Saddles:
+    """The model at shapes (px, py, angle1, angle2, log s1, log s2), each with its best linear part (b, gx, gy, A).
 
-    Samples lie in squares around whole pixels near corners, at ``offsets``; those within ``radius`` count.
+    ``jacobian`` has the derivatives by both, ``contrast`` is A. A sample's weight falls from 1 at a corner to 0 at its
+    radius.
     """
 
-    def __init__(
-        self,
-        shape: Float[np.ndarray, "n 6"],
-        offsets: Float[np.ndarray, "m 2"],
-        samples: Float[np.ndarray, "n m"],
-        radius: Float[np.ndarray, " n"],
-    ) -> None:
-        self.u = offsets[None] - shape[:, None, :2]
-        self.weight = np.clip(1 - (self.u**2).sum(-1) / radius[:, None] ** 2, 0.0, None)
-        self.normals = np.stack([np.cos(shape[:, 2:4]), np.sin(shape[:, 2:4])], axis=-1)
-        self.width = np.exp(shape[:, 4:6])
-        self.across = self.normals @ np.swapaxes(self.u, 1, 2) / self.width[..., None]
-        self.profile = erf(self.across / np.sqrt(2.0))
-        product = self.profile[:, 0] * self.profile[:, 1]
-        self.design = np.stack([np.ones_like(samples), self.u[..., 0], self.u[..., 1], product], axis=-1)
-        normal, right = self.equations(self.design, samples)
-        self.linear = np.linalg.solve(normal + 1e-9 * np.eye(4), right[..., None])[..., 0]
-        self.residual = samples - (self.design @ self.linear[..., None])[..., 0]
-        self.cost = (self.weight * self.residual**2).sum(-1)
+    weight: Float[np.ndarray, "n m"]
+    residual: Float[np.ndarray, "n m"]
+    jacobian: Float[np.ndarray, "n m 10"]
+    contrast: Float[np.ndarray, " n"]
 
-    def equations(
-        self, slopes: Float[np.ndarray, "n m p"], values: Float[np.ndarray, "n m"]
-    ) -> tuple[Float[np.ndarray, "n p p"], Float[np.ndarray, "n p"]]:
-        """Weighted normal equations of each corner."""
-        weighted = np.swapaxes(slopes * self.weight[..., None], 1, 2)
-        return weighted @ slopes, (weighted @ values[..., None])[..., 0]
+    @classmethod
+    def at(cls, shape: np.ndarray, offsets: np.ndarray, samples: np.ndarray, radius: np.ndarray) -> _Saddles:
+        """Fit the linear parts; ``samples`` lie at the same ``offsets`` from a whole pixel near each corner."""
+        u = offsets - shape[:, None, :2]
+        weight = np.clip(1 - (u**2).sum(-1) / radius[:, None] ** 2, 0.0, None)
+        normals = np.stack([np.cos(shape[:, 2:4]), np.sin(shape[:, 2:4])], axis=-1)
+        tangents = np.stack([-normals[..., 1], normals[..., 0]], axis=-1)
+        width = np.exp(shape[:, 4:6])[..., None]
+        across = normals @ np.swapaxes(u, 1, 2) / width
+        profile = erf(across / np.sqrt(2.0))
+        design = np.stack([np.ones_like(samples), u[..., 0], u[..., 1], profile.prod(axis=1)], axis=-1)
+        normal, right = _equations(weight, design, samples)
+        linear = np.linalg.solve(normal + 1e-9 * np.eye(4), right)
+        slope = linear[:, 3:] * np.sqrt(2 / np.pi) * np.exp(-(across**2) / 2) * profile[:, ::-1]
+        position = -np.swapaxes(slope / width, 1, 2) @ normals - np.swapaxes(linear[:, 1:3], 1, 2)
+        turn, grow = slope / width * (tangents @ np.swapaxes(u, 1, 2)), -slope * across
+        parts = [position, np.swapaxes(turn, 1, 2), np.swapaxes(grow, 1, 2), design]
+        return cls(weight, samples - (design @ linear)[..., 0], np.concatenate(parts, axis=-1), linear[:, 3, 0])
 
-    def jacobian(self) -> Float[np.ndarray, "n m 10"]:
-        """Derivatives by the shape and the linear part."""
-        bell = np.sqrt(2 / np.pi) * np.exp(-(self.across**2) / 2)
-        common = self.linear[:, 3, None, None] * bell * self.profile[:, ::-1]
-        by_width = common / self.width[..., None]
-        position = -np.swapaxes(by_width, 1, 2) @ self.normals - self.linear[:, None, 1:3]
-        tangents = np.stack([-self.normals[..., 1], self.normals[..., 0]], axis=-1)
-        turn, grow = by_width * (tangents @ np.swapaxes(self.u, 1, 2)), -common * self.across
-        return np.concatenate([position, np.moveaxis(turn, 1, 2), np.moveaxis(grow, 1, 2), self.design], axis=-1)
+    @property
+    def cost(self) -> Float[np.ndarray, " n"]:
+        """Weighted sum of squares."""
+        return (self.weight * self.residual**2).sum(axis=-1)
 
     def step(self, damping: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 6"]:
         """Damped Gauss-Newton step of the shape; the linear part follows by itself."""
-        normal, right = self.equations(self.jacobian(), self.residual)
+        normal, right = _equations(self.weight, self.jacobian, self.residual)
         diagonal = np.einsum("nii->ni", normal)
         raised = damping[:, None] * diagonal + 1e-12 * diagonal.max(1, keepdims=True) + 1e-30
-        return np.linalg.solve(normal + raised[:, :, None] * np.eye(10), right[..., None])[:, :6, 0]
+        return np.linalg.solve(normal + raised[:, :, None] * np.eye(10), right)[:, :6, 0]
 
     def noise_sigma(self, variance: Float[np.ndarray, "n m"]) -> Float[np.ndarray, " n"]:
         """One sigma by axis in px of the corners, from the samples' noise, the filter and the window's weights.
 
         Weighted least squares moves a corner by G = (J' W J)^-1 J' W per filtered sample: the covariance is a sandwich.
         """
-        jacobian = self.jacobian()
-        inverse = np.linalg.pinv(self.equations(jacobian, self.residual)[0], hermitian=True)[:, :2]
-        moves = inverse @ np.swapaxes(jacobian * self.weight[..., None], 1, 2)
+        normal, _ = _equations(self.weight, self.jacobian, self.residual)
+        weighted = np.swapaxes(self.jacobian * self.weight[..., None], 1, 2)
+        moves = np.linalg.pinv(normal, hermitian=True)[:, :2] @ weighted
         side = int(np.sqrt(moves.shape[2]))
         by_sample = _filtered(moves.reshape(*moves.shape[:2], side, side)).reshape(moves.shape)
         return np.sqrt((by_sample**2 * variance[:, None]).sum(axis=(1, 2)) / 2)
 
 
-def _saddles(
+def _equations(
+    weight: Float[np.ndarray, "n m"], slopes: Float[np.ndarray, "n m p"], values: Float[np.ndarray, "n m"]
+) -> tuple[Float[np.ndarray, "n p p"], Float[np.ndarray, "n p 1"]]:
+    """Weighted normal equations of each corner."""
+    weighted = np.swapaxes(slopes * weight[..., None], 1, 2)
+    return weighted @ slopes, weighted @ values[..., None]
+
+
+def _placed(
     picture: Luminance,
     ids: Int[np.ndarray, " n"],
     rough: Float[np.ndarray, "n 2"],
     edges: Float[np.ndarray, "n 2 2"],
-    radius: Float[np.ndarray, " n"],
+    spec: BoardSpec,
     rules: GeometryRules,
 ) -> BoardCorners:
     """Place all corners at once; those out of the picture, moved away or without contrast are left out."""
-    rows, columns = picture.grey.shape
+    margin = rules.marker_margin * np.sqrt(2.0) * (spec.square_mm - spec.marker_mm) / (2.0 * spec.square_mm)
+    side = np.linalg.norm(edges, axis=2).min(axis=1)
+    radius = np.clip(min(margin, rules.window_squares) * side, *rules.window_px)
     half = int(np.ceil(radius.max())) + 1
-    base = np.round(rough).astype(np.int64)
-    inside = np.all((base >= half) & (base < np.array([columns - half, rows - half])), axis=1)
-    base = np.clip(base, half, np.array([columns - half - 1, rows - half - 1]))
+    last = np.array(picture.grey.shape[::-1]) - half - 1
+    base = np.clip(np.round(rough).astype(np.int64), half, last)
+    inside = (base == np.round(rough)).all(axis=1)
     dy, dx = (a.ravel() for a in np.mgrid[-half : half + 1, -half : half + 1])
     where = (base[:, 1, None] + dy, base[:, 0, None] + dx)
     windows = np.stack([dx, dy], axis=1).astype(np.float64), picture.grey[where], radius
     angles = np.arctan2(edges[..., 0], -edges[..., 1])
     shape = np.concatenate([rough - base, angles, np.full((len(base), 2), np.log(1.5))], axis=1)
-    saddle, damping = _Saddle(shape, *windows), np.full(len(base), 1e-3)
+    saddles, damping = _Saddles.at(shape, *windows), np.full(len(base), 1e-3)
     for _ in range(12):
-        trial = shape + np.clip(saddle.step(damping), -1.0, 1.0)
+        trial = shape + np.clip(saddles.step(damping), -1.0, 1.0)
         trial[:, 4:] = np.clip(trial[:, 4:], np.log(0.3), np.log(20.0))
-        tried = _Saddle(trial, *windows)
-        better = tried.cost < saddle.cost
+        tried = _Saddles.at(trial, *windows)
+        better = tried.cost < saddles.cost
         step = np.abs(trial - shape).max()
         shape = np.where(better[:, None], trial, shape)
-        saddle = tried if better.all() else _Saddle(shape, *windows)
+        saddles = tried if better.all() else _Saddles.at(shape, *windows)
         if step < 1e-4:  # The next one would be its square.
             break
         damping = np.clip(np.where(better, damping / 5, damping * 10), 1e-9, 1e9)
-    sigma = saddle.noise_sigma(picture.variance[where])
-    misfit = np.sqrt(saddle.cost / np.maximum(saddle.weight.sum(-1) - 10, 1.0))
+    sigma = saddles.noise_sigma(picture.variance[where])
+    misfit = np.sqrt(saddles.cost / np.maximum(saddles.weight.sum(-1) - 10, 1.0))
     xy = base + shape[:, :2]
     near = np.linalg.norm(xy - rough, axis=1) < np.maximum(radius / 2, 3.0)
-    contrast = np.abs(saddle.linear[:, 3]) > rules.least_contrast * misfit
+    contrast = np.abs(saddles.contrast) > rules.least_contrast * misfit
     good = inside & near & contrast & (sigma < rules.worst_corner_sigma_px) & np.isfinite(xy).all(axis=1)
     return BoardCorners(ids[good], xy[good], sigma[good])

@@ -15,20 +15,21 @@ import cv2
 import jax
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.spatial.transform import Rotation
 
 from udccal.arrangements import BoardSpec
+from udccal.cfa import cfa_named
 from udccal.errors import FitError
 from udccal.fitting.engine.gaussian import Prior
 from udccal.fitting.engine.robust import outliers
-from udccal.fitting.geometry.bundle import GeometryRules, Intrinsics, Points
-from udccal.fitting.geometry.corners import BoardCorners, detect_corners, luminance, sites
+from udccal.fitting.geometry.bundle import USUAL, GeometryRules, Intrinsics, Points
+from udccal.fitting.geometry.corners import BoardCorners, detect_corners, luminance
 from udccal.fitting.nominal import nominal_geometry
+from udccal.fitting.wire.data import read_wire
 from udccal.models.geometry import Geometry
 from udccal.models.noise import Noise, linear_signal, variance_e
 from udccal.result import Outliers
 from udccal.rig import RigDescription
-from udccal.sessions.schema import BoardSubject, StoredCapture, StoredStep
+from udccal.sessions.schema import BoardSubject, StoredCapture
 from udccal.sessions.store import Session
 
 _variance_e = jax.jit(variance_e)
@@ -48,9 +49,8 @@ class BoardView:
     corners: BoardCorners
     clipped: float
 
-    def usable(self, rules: GeometryRules | None = None) -> bool:
+    def usable(self, rules: GeometryRules = USUAL) -> bool:
         """Whether enough corners were found in an unclipped picture."""
-        rules = rules or GeometryRules()
         return len(self.corners.ids) >= rules.least_corners and self.clipped <= rules.most_clipped
 
 
@@ -69,7 +69,7 @@ class GeometryData:
     prior: Prior | None = None
 
 
-def read_geometry(session: Session, noise: Noise, rules: GeometryRules | None = None) -> GeometryData:
+def read_geometry(session: Session, noise: Noise, rules: GeometryRules = USUAL) -> GeometryData:
     """Read the boards of all steps ``geometry/*``, and the prior on the lens from the rig's description.
 
     The noise term gives the black level, the saturation and the corners' sigma.
@@ -78,23 +78,30 @@ def read_geometry(session: Session, noise: Noise, rules: GeometryRules | None = 
         SessionError: when a file is missing or damaged.
         FitError: when a board's dictionary is unknown.
     """
-    rules, rig = rules or GeometryRules(), session.rig
-    steps = [step for step in session.steps("geometry") if isinstance(step.subject, BoardSubject)]
-    flat = _read_flat_field(session, noise, rules) if steps else None
-    views = tuple(_read_view(session, step, noise, flat, rules) for step in steps)
-    return GeometryData(views, nominal_geometry(rig), (rig.camera.columns, rig.camera.rows), rig_prior(rig, rules))
+    rig, nominal = session.rig, nominal_geometry(session.rig)
+    shape = rig.camera.rows, rig.camera.columns
+    # Without a flat field every pixel may be as unequal as the noise term says.
+    flat = FlatField(np.ones(shape), np.full(shape, float(np.asarray(noise.PRNU1288)) ** 2))
+    if {"wire/dark", "wire/flat"} <= {step.id for step in session.steps("wire")}:
+        wire = read_wire(session, noise, nominal)
+        flat = flat_field(wire.signal.astype(np.float64), wire.variance, wire.signal < wire.clip, rules)
+    views = []
+    for step in session.steps("geometry"):
+        if isinstance(board := step.subject, BoardSubject):
+            spec = BoardSpec(board.columns, board.rows, board.square_mm, board.marker_mm, board.dictionary)
+            found = _corners(session, step.captures[0], spec, noise, flat, rules)
+            views.append(BoardView(step.id, spec, board.parallel_to_panel, *found))
+    return GeometryData(tuple(views), nominal, shape[::-1], rig_prior(rig, rules))
 
 
-def rig_prior(rig: RigDescription, rules: GeometryRules | None = None) -> Prior:
+def rig_prior(rig: RigDescription, rules: GeometryRules = USUAL) -> Prior:
     """Prior on the intrinsics, in their order, from a rig's description.
 
     The focal length's tolerance is its sigma; ``rules`` have those of principal point and distortion.
     """
-    rules = rules or GeometryRules()
     focal = rig.focal_px * max(rig.lens.focal_mm.tolerance / rig.lens.focal_mm.value, 1e-4)
-    centre = rules.centre_sigma * rig.camera.columns
-    sigma = Intrinsics(np.full(2, focal), np.full(2, centre), np.array(rules.distortion_sigma))
-    return Prior.independent(Intrinsics.of_geometry(nominal_geometry(rig)).vector, sigma.vector)
+    sigma = [*[focal] * 2, *[rules.centre_sigma * rig.camera.columns] * 2, *rules.distortion_sigma]
+    return Prior.independent(Intrinsics.of_geometry(nominal_geometry(rig)).vector, np.array(sigma))
 
 
 @final
@@ -110,75 +117,50 @@ def flat_field(
     light: Float[np.ndarray, "rows columns"],
     variance: Float[np.ndarray, "rows columns"],
     unclipped: Bool[np.ndarray, "rows columns"],
-    rules: GeometryRules | None = None,
+    rules: GeometryRules = USUAL,
 ) -> FlatField:
     """Response of a sensor to an even field; clipped, dead and covered samples have a response of 1.
 
     ``light`` has any linear unit, its black level subtracted; ``variance`` is its own, in that unit squared.
     """
-    least = (rules or GeometryRules()).least_response
     response, relative = np.ones_like(light), np.zeros_like(light)
-    for site in sites():
-        own = light[site] / max(float(light[site].mean()), 1e-12)
-        good = unclipped[site] & (own > least)
-        response[site] = np.where(good, own, 1.0)
-        relative[site] = np.where(good, variance[site] / np.where(good, light[site], 1.0) ** 2, 0.0)
+    for site in cfa_named("RGGB").sites:  # Any pattern of 2 x 2 has these sites.
+        own = light[site.samples] / max(float(light[site.samples].mean()), 1e-12)
+        good = unclipped[site.samples] & (own > rules.least_response)
+        response[site.samples][good] = own[good]
+        relative[site.samples][good] = variance[site.samples][good] / light[site.samples][good] ** 2
     return FlatField(response, relative)
 
 
-def _read_flat_field(session: Session, noise: Noise, rules: GeometryRules) -> FlatField | None:
-    """The flat field by the averages of the wire fit; None where the session has none."""
-    if not {"wire/dark", "wire/flat"} <= {step.id for step in session.steps("wire")}:
-        return None
-    capture = session.step("wire/flat").captures[0]
-    flat = session.average(capture).mean.astype(np.float64)
-    light = flat - session.average(session.step("wire/dark").captures[0]).mean
-    unclipped = flat < rules.clipped * float(np.asarray(noise.saturation_DN))
-    return flat_field(light, _temporal_variance_DN2(noise, light, capture), unclipped, rules)
-
-
-def _temporal_variance_DN2(
-    noise: Noise, light_DN: Float[np.ndarray, "rows columns"], capture: StoredCapture
-) -> Float[np.ndarray, "rows columns"]:
-    """Temporal variance of a capture's mean in DN^2 (EMVA 1288's photon transfer)."""
-    gain, exposure_s = float(np.asarray(noise.K_DN_per_e)), np.float64(capture.exposure_s)
-    return gain**2 * np.asarray(_variance_e(noise, light_DN / gain, exposure_s), dtype=np.float64) / capture.frames
-
-
-def _read_view(
-    session: Session, step: StoredStep, noise: Noise, flat: FlatField | None, rules: GeometryRules
-) -> BoardView:
-    """The board in the first capture of a step (its average, or a single frame)."""
-    subject, capture = step.subject, step.captures[0]
-    if not isinstance(subject, BoardSubject):
-        raise TypeError(f"step {step.id} shows no board")
+def _corners(
+    session: Session, capture: StoredCapture, spec: BoardSpec, noise: Noise, flat: FlatField, rules: GeometryRules
+) -> tuple[BoardCorners, float]:
+    """The board in a capture (an average, or a single frame), and the part of its samples that are clipped."""
     mean = session.frame(capture) if capture.kind == "frame" else session.average(capture).mean
-    spec = BoardSpec(subject.columns, subject.rows, subject.square_mm, subject.marker_mm, subject.dictionary)
-    above_DN = mean.astype(np.float64) - float(np.asarray(noise.black_DN))
-    light = linear_signal(above_DN, float(np.asarray(noise.bend_per_DN)))
-    area, offsets_DN = capture.region, float(np.asarray(noise.K_DN_per_e)) * float(np.asarray(noise.DSNU1288_e))
-    variance = _temporal_variance_DN2(noise, light, capture) + offsets_DN**2
+    black, top, bend, gain = (
+        float(np.asarray(one)) for one in (noise.black_DN, noise.saturation_DN, noise.bend_per_DN, noise.K_DN_per_e)
+    )
+    light = linear_signal(mean.astype(np.float64) - black, bend)
+    temporal_e2 = np.asarray(_variance_e(noise, light / gain, np.float64(capture.exposure_s)), dtype=np.float64)
+    variance = gain**2 * (temporal_e2 / capture.frames + float(np.asarray(noise.DSNU1288_e)) ** 2)
+    area = capture.region
     part = np.s_[area.y : area.y + area.rows, area.x : area.x + area.columns]
     # The picture as equal pixels would see it; the remaining inequality adds to the temporal noise.
-    response, unequal = np.ones_like(light), np.full_like(light, float(np.asarray(noise.PRNU1288)) ** 2)
-    if flat is not None:
-        response, unequal = flat.response[part], flat.relative_variance[part]
-    even = light / response
-    corners = detect_corners(luminance(even, variance / response**2 + unequal * even**2), spec, rules)
-    moved = BoardCorners(corners.ids, corners.xy + np.array([area.x, area.y], dtype=np.float64), corners.sigma)
-    clipped = float(np.mean(mean >= rules.clipped * float(np.asarray(noise.saturation_DN))))
-    return BoardView(step.id, spec, subject.parallel_to_panel, moved, clipped)
+    even = light / flat.response[part]
+    spread = variance / flat.response[part] ** 2 + flat.relative_variance[part] * even**2
+    found = detect_corners(luminance(even, spread), spec, rules)
+    placed = BoardCorners(found.ids, found.xy + np.array([area.x, area.y], dtype=np.float64), found.sigma)
+    return placed, float(np.mean(mean >= rules.clipped * top))
 
 
 @final
 @dataclass(frozen=True)
 class Gathered:
-    """Points of the usable ones of ``views``, what was left out, and notes; ``weighted`` if sigmas were given."""
+    """Points of all usable views, what was left out, a note for each other view; ``weighted`` if sigmas were given."""
 
     points: Points
     outliers: tuple[Outliers, ...]
     notes: tuple[str, ...]
-    views: int
     weighted: bool
 
 
@@ -186,10 +168,9 @@ def gather(
     board: Sequence[np.ndarray],
     image: Sequence[np.ndarray],
     sigmas: Sequence[np.ndarray] | None = None,
-    rules: GeometryRules | None = None,
+    rules: GeometryRules = USUAL,
 ) -> Gathered:
     """Every finite point of every view that determines a pose; arguments and errors as for ``fit_geometry``."""
-    rules = rules or GeometryRules()
     if len({len(board), len(image), len(image if sigmas is None else sigmas)}) > 1:
         raise FitError(
             f"Expected as many views on the board as in pictures (and of sigmas), found {len(board)} and {len(image)}. "
@@ -197,14 +178,20 @@ def gather(
         )
     # Without sigmas any common value serves: its scale is estimated.
     given = [np.full(len(pixels), 0.1) for pixels in image] if sigmas is None else sigmas
-    lost: list[str] = []
-    notes: list[str] = []
+    lost, notes = list[str](), list[str]()
     parts = {-1: (np.zeros((0, 3)), np.zeros((0, 2)), np.zeros(0), np.zeros(0, dtype=np.int64))}
     for number, arrays in enumerate(zip(board, image, given, strict=True)):
-        points, pixels, own = _view(number, *(np.asarray(a, dtype=np.float64) for a in arrays))
-        good = np.isfinite(points).all(axis=1) & np.isfinite(pixels).all(axis=1) & np.isfinite(own) & (own > 0)
+        points, pixels, own = (np.asarray(one, dtype=np.float64) for one in arrays)
+        n = len(pixels)
+        if points.shape not in ((n, 3), (n, 1, 3)) or pixels.shape not in ((n, 2), (n, 1, 2)) or own.shape != (n,):
+            raise FitError(
+                f"Expected board points (n, 3), image points (n, 2) and sigmas (n,) of equal n in view {number}, found "
+                f"{points.shape}, {pixels.shape} and {own.shape}. Give each seen corner its point on the board."
+            )
+        whole = np.hstack([points.reshape(n, 3), pixels.reshape(n, 2), own[:, None]])
+        good = np.isfinite(whole).all(axis=1) & (own > 0)
         lost += [f"view {number}, point {k}" for k in np.flatnonzero(~good)]
-        part = (points[good], pixels[good], own[good], np.flatnonzero(good))
+        part = (whole[good, :3], whole[good, 3:5], own[good], np.flatnonzero(good))
         if complaint := _complaint(part[0], part[1], list(parts.values()), rules):
             notes.append(f"View {number} is left out: {complaint}")
         else:
@@ -213,18 +200,7 @@ def gather(
     view = np.repeat(np.arange(len(parts)) - 1, [len(part[0]) for part in parts.values()])
     found = Points(points, pixels, own, view, index, np.ones(len(points), dtype=bool), tuple(parts)[1:])
     left_out = outliers("not a finite position with a positive sigma", lost)
-    return Gathered(found, left_out, tuple(notes), len(board), sigmas is not None)
-
-
-def _view(number: int, points: np.ndarray, pixels: np.ndarray, own: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Board points (n, 3), pixels (n, 2) and sigma (n,) of a view, whatever the shape OpenCV gave them."""
-    n = len(pixels)
-    if points.shape not in ((n, 3), (n, 1, 3)) or pixels.shape not in ((n, 2), (n, 1, 2)) or own.shape != (n,):
-        raise FitError(
-            f"Expected board points (n, 3), image points (n, 2) and sigmas (n,) of equal n in view {number}, found "
-            f"{points.shape}, {pixels.shape} and {own.shape}. Give each seen corner its point on the board."
-        )
-    return points.reshape(-1, 3), pixels.reshape(-1, 2), own
+    return Gathered(found, left_out, tuple(notes), sigmas is not None)
 
 
 def _complaint(board: np.ndarray, image: np.ndarray, before: list[tuple[np.ndarray, ...]], rules: GeometryRules) -> str:
@@ -249,16 +225,6 @@ def best_poses(
     """The best pose of each view at these intrinsics, and the one mirrored at the line of sight."""
     pairs = [_pose_pair(points, view, Intrinsics.of(intrinsics)) for view in range(len(points.names))]
     return np.array([first for first, _ in pairs]), np.array([second for _, second in pairs])
-
-
-def facing(poses: Float[np.ndarray, "views 6"]) -> Float[np.ndarray, "views 6"]:
-    """The same pictures with every board in front of the camera, and rotations of at most half a turn.
-
-    Behind the camera, a flat board turned by half a turn about its normal projects to the same points.
-    """
-    side = np.where(poses[:, 5:] < 0, -1.0, 1.0)
-    turn = Rotation.from_rotvec(poses[:, :3]) * Rotation.from_rotvec(np.pi * (side < 0) * np.array([0.0, 0.0, 1.0]))
-    return np.hstack([turn.as_rotvec(), side * poses[:, 3:]])
 
 
 def _pose_pair(points: Points, view: int, lens: Intrinsics) -> tuple[np.ndarray, np.ndarray]:

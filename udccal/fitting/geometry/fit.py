@@ -6,7 +6,7 @@ One view of a rig shows the board parallel to the panel. Its axes are then the p
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -19,8 +19,8 @@ from udccal.errors import FitError
 from udccal.fitting.engine.gaussian import Posterior, Prior, square_root
 from udccal.fitting.engine.misfit import excess_sigma
 from udccal.fitting.engine.report import estimates, priors_of, residual_sample
-from udccal.fitting.geometry.bundle import INTRINSIC_NAMES, LENS, GeometryRules, Intrinsics
-from udccal.fitting.geometry.calibrated import CalibratedViews, Gauge
+from udccal.fitting.geometry.bundle import INTRINSIC_NAMES, LENS, USUAL, GeometryRules, Intrinsics
+from udccal.fitting.geometry.calibrated import CalibratedViews, turn_with
 from udccal.fitting.geometry.corners import board_points_mm
 from udccal.fitting.geometry.data import BoardView, GeometryData, gather
 from udccal.fitting.geometry.views import calibrate_views
@@ -41,7 +41,7 @@ def fit_geometry(
     sigmas: Sequence[Float[np.ndarray, " _"]] | None = None,
     *,
     prior: Prior | None = None,
-    rules: GeometryRules | None = None,
+    rules: GeometryRules = USUAL,
 ) -> FitResult[Geometry]:
     """Fit the lens to views of flat boards, given as arrays; ``views.calibrate_views`` gives their poses as well.
 
@@ -66,17 +66,17 @@ def fit_geometry(
     Raises:
         FitError: when the arrays do not belong together.
     """
-    rules, gathered = rules or GeometryRules(), gather(board_points, image_points, sigmas, rules)
+    gathered = gather(board_points, image_points, sigmas, rules)
     try:
         views = calibrate_views(gathered, image_size, start, prior, rules=rules)
     except FitError as error:
-        usual = Intrinsics(np.full(2, float(max(image_size))), (np.array(image_size) - 1) / 2, np.zeros(5))
-        return FitResult.failed("geometry", start or usual.camera(), FitStatus.TOO_FEW_DATA, str(error))
-    picks = np.vstack([np.eye(LENS, len(views.cov)), -views.turn(Gauge.BOARDS)])
-    return _result(views, np.append(views.intrinsics.vector, np.zeros(3)), picks @ views.cov @ picks.T, _lens_at, prior)
+        lens = start or Intrinsics.centred(float(max(image_size)), image_size).camera()
+        return FitResult.failed("geometry", lens, FitStatus.TOO_FEW_DATA, str(error))
+    x, cov = with_angles(views.intrinsics.vector, views.poses, views.cov, range(len(views.poses)), Rotation.identity())
+    return _result(views, x, cov, np.zeros(3), prior)
 
 
-def fit_boards(data: GeometryData, rules: GeometryRules | None = None) -> FitResult[Geometry]:
+def fit_boards(data: GeometryData, rules: GeometryRules = USUAL) -> FitResult[Geometry]:
     """Fit lens and mounting to a session's boards.
 
     Every corner has its own noise and a scatter common to all (paper that is not flat, blur that a saddle does not
@@ -84,24 +84,46 @@ def fit_boards(data: GeometryData, rules: GeometryRules | None = None) -> FitRes
 
     Args:
         data: boards, one of them parallel to the panel; at least 3 usable ones, or any number with a prior.
+        rules: see ``GeometryRules``.
 
     Returns:
         the term, with estimates of the intrinsics and of tilt, roll and yaw; the status says what to capture.
     """
-    rules = rules or GeometryRules()
     usable = [view for view in data.views if view.usable(rules)]
-    notes = tuple(_lost(data.views, rules))
+    lost, status = tuple(_lost(data.views, rules)), FitStatus.TOO_FEW_DATA
     least, parallel = 1 if data.prior else rules.least_views, sum(view.parallel for view in usable)
     if len(usable) < least or not parallel:
-        clipped = sum(view.clipped > rules.most_clipped for view in data.views)
-        status = FitStatus.SATURATED if clipped > len(data.views) / 2 else FitStatus.TOO_FEW_DATA
+        if sum(view.clipped > rules.most_clipped for view in data.views) > len(data.views) / 2:
+            status = FitStatus.SATURATED
         found = f"Expected {least} views with a board and one of them parallel to the panel, found {len(usable)} "
-        return FitResult.failed("geometry", data.nominal, status, *notes, f"{found}and {parallel}.")
+        return FitResult.failed("geometry", data.nominal, status, *lost, f"{found}and {parallel}.")
     try:
         bundle, scatter_px = _calibrated(usable, data, rules)
     except FitError as error:
-        return FitResult.failed("geometry", data.nominal, FitStatus.TOO_FEW_DATA, *notes, str(error))
-    return _mounted(bundle, scatter_px, [usable[k] for k in bundle.points.names], data, notes, rules)
+        return FitResult.failed("geometry", data.nominal, status, *lost, str(error))
+    views = [usable[k] for k in bundle.points.names]
+    on_jig = [k for k, view in enumerate(views) if view.parallel]
+    if bundle.status is status or not on_jig:
+        tilt = () if on_jig else ("No usable view shows the board parallel to the panel; capture that view again.",)
+        return FitResult.failed("geometry", data.nominal, status, *lost, *bundle.notes, *tilt)
+    x, cov = with_angles(bundle.intrinsics.vector, bundle.poses, bundle.cov, on_jig)
+    result = _result(bundle, x, cov, np.asarray(data.nominal.pupil_mm, dtype=np.float64), data.prior, len(_NAMES))
+    left_out, sentences = _outliers(bundle, views, rules)
+    poor = bundle.rms_px > rules.worst_rms_px and bundle.chi2_dof > rules.worst_chi2_dof
+    mounting = "Stand-off and panel position are the rig's nominal ones; the wire fit refines them."
+    by_hand = [k for k in range(len(views)) if k not in on_jig]
+    scatter = {
+        "corner_scatter_beside_noise": scatter_px[0],
+        ON_JIG: np.median(scatter_px[1:][on_jig]),
+        BY_HAND: np.median(scatter_px[1:][by_hand or on_jig]),
+    }
+    return replace(
+        result,
+        status=FitStatus.POOR_FIT if poor else result.status,
+        diagnostics=(*result.diagnostics, *(Diagnostic(name, float(size), "px") for name, size in scatter.items())),
+        notes=(*lost, *result.notes, *sentences, mounting),
+        outliers=left_out,
+    )
 
 
 @in_float64
@@ -162,39 +184,11 @@ def _lost(views: Sequence[BoardView], rules: GeometryRules) -> Iterator[str]:
         yield f"More than {rules.most_clipped:.0%} of the samples clipped in {', '.join(clipped)}."
 
 
-def _mounted(
-    bundle: CalibratedViews,
-    scatter_px: Float[np.ndarray, " n"],
-    views: list[BoardView],
-    data: GeometryData,
-    lost: tuple[str, ...],
-    rules: GeometryRules,
-) -> FitResult[Geometry]:
-    """The result of a bundle, which uses ``views``, with the rotation of the board that is parallel to the panel."""
-    parallel = [k for k, view in enumerate(views) if view.parallel]
-    if bundle.status is FitStatus.TOO_FEW_DATA or not parallel:
-        tilt = () if parallel else ("No usable view shows the board parallel to the panel; capture that view again.",)
-        return FitResult.failed("geometry", data.nominal, FitStatus.TOO_FEW_DATA, *lost, *bundle.notes, *tilt)
-    x, cov = with_angles(bundle.intrinsics.vector, bundle.poses, bundle.cov, parallel)
-    pupil = np.asarray(data.nominal.pupil_mm, dtype=np.float64)
-    result = _result(bundle, x, cov, partial(term_at, pupil=pupil), data.prior, len(_NAMES))
-    left_out, sentences = _outliers(bundle, views, rules)
-    poor = bundle.rms_px > rules.worst_rms_px and bundle.chi2_dof > rules.worst_chi2_dof
-    mounting = "Stand-off and panel position are the rig's nominal ones; the wire fit refines them."
-    return replace(
-        result,
-        status=FitStatus.POOR_FIT if poor else result.status,
-        diagnostics=(*result.diagnostics, *_scatter_diagnostics(scatter_px, views)),
-        notes=(*lost, *result.notes, *sentences, mounting),
-        outliers=left_out,
-    )
-
-
 def _result(
     bundle: CalibratedViews,
     x: Float[np.ndarray, "12"],
     cov: Float[np.ndarray, "12 12"],
-    lens_at: Callable[[Float[np.ndarray, "12"]], Geometry],
+    pupil_mm: Float[np.ndarray, "3"],
     prior: Prior | None,
     count: int = LENS,
 ) -> FitResult[Geometry]:
@@ -202,12 +196,27 @@ def _result(
 
     A pattern in the residuals is modelled as an error of the principal point, which moves every place by its size.
     """
-    pattern = bundle.evidence.pattern_px * np.asarray(Intrinsics.of(np.eye(LENS, len(x))).principal_point_px).T
-    posterior = Posterior(x, np.hstack([square_root(cov), pattern]), lens_at)
+    pattern = bundle.evidence.pattern_px * np.eye(len(x))[:, 2:4]
+    posterior = Posterior(x, np.hstack([square_root(cov), pattern]), partial(term_at, pupil=pupil_mm))
     points, use = bundle.points, bundle.points.used
     z = bundle.residuals_px[use] / points.sigma[use, None]
-    held = [name for name, free in zip(INTRINSIC_NAMES, bundle.free, strict=True) if not free]
+    notes, held = bundle.notes, [name for name, free in zip(INTRINSIC_NAMES, bundle.free, strict=True) if not free]
+    if held:
+        zero = f"Held at 0, as the data do not ask for it: {', '.join(held)}."
+        notes = (*notes, f"{zero} The sigmas are those of a lens without it.")
     priors = None if prior is None else priors_of(INTRINSIC_NAMES, prior.mean, prior.sigma)
+    evidence = bundle.evidence
+    diagnostics = (
+        ("rms_reprojection", bundle.rms_px, "px"),
+        ("views", len(points.names), "1"),
+        ("corners_used", use.sum(), "1"),
+        ("corners_rejected", (~use).sum(), "1"),
+        ("iterations", bundle.iterations, "1"),
+        ("views_disagree_p", evidence.views.p_value, "1"),
+        ("variance_factor", evidence.views.inflation, "1"),
+        ("residual_pattern_p", evidence.pattern.p_value, "1"),
+        ("residual_pattern", evidence.pattern_px, "px"),
+    )
     return FitResult(
         name="geometry",
         term=posterior.term_at(x),
@@ -217,13 +226,8 @@ def _result(
         chi2_dof=bundle.chi2_dof,
         samples=2 * int(use.sum()),
         candidates=bundle.candidates,
-        diagnostics=_diagnostics(bundle),
-        notes=(
-            *bundle.notes,
-            f"Held at 0, as the data do not ask for it: {', '.join(held)}. The sigmas are those of a lens without it.",
-        )
-        if held
-        else bundle.notes,
+        diagnostics=tuple(Diagnostic(name, float(value), unit) for name, value, unit in diagnostics),
+        notes=notes,
         outliers=bundle.outliers,
         residuals=residual_sample(np.repeat(points.image[use], 2, axis=0), z.ravel()),
         posterior=posterior,
@@ -234,22 +238,22 @@ def with_angles(
     intrinsics: Float[np.ndarray, "9"],
     poses: Float[np.ndarray, "views 6"],
     cov: Float[np.ndarray, "n n"],
-    parallel: Sequence[int],
+    views: Sequence[int],
+    rotation: Rotation | None = None,
 ) -> tuple[Float[np.ndarray, "12"], Float[np.ndarray, "12 12"]]:
-    """The argument of ``term_at``, and its covariance; several parallel views count as their mean.
+    """The argument of ``term_at``, and its covariance; the camera's axes turn with the boards of some views.
 
     Args:
         intrinsics, poses: as in ``bundle.Bundle``. cov: of intrinsics and all poses one after another.
-        parallel: which views show the board parallel to the panel.
+        views: their boards are at rest.
+        rotation: of the camera against these boards; without it they have the panel's axes, in the mean.
     """
-    rotation = np.asarray(Rotation.from_rotvec(-poses[parallel, :3]).mean().as_rotvec())
-    steps = 1e-5 * np.eye(3)
-    slope = np.array([angles_deg(rotation + step) - angles_deg(rotation - step) for step in steps]).T / 2e-5
-    picks = np.zeros((LENS + 3, len(cov)))
-    picks[:LENS, :LENS] = np.eye(LENS)
-    for view in parallel:
-        picks[LENS:, LENS + 6 * view : LENS + 6 * view + 3] = -slope / len(parallel)
-    return np.concatenate([intrinsics, angles_deg(rotation)]), picks @ cov @ picks.T
+    rotation = Rotation.from_rotvec(-poses[views, :3]).mean() if rotation is None else rotation
+    near = [Rotation.from_rotvec(step) for step in 1e-5 * np.vstack([np.eye(3), -np.eye(3), np.zeros((1, 3))])]
+    angles = np.array([angles_deg((rotation * step).as_rotvec()) for step in near])
+    slope = (angles[:3] - angles[3:6]).T / 2e-5
+    picks = np.vstack([np.eye(LENS, len(cov)), -slope @ turn_with(poses, views)])
+    return np.append(intrinsics, angles[6]), picks @ cov @ picks.T
 
 
 def angles_deg(rotation: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
@@ -263,33 +267,6 @@ def term_at(x: Float[np.ndarray, "12"], pupil: Float[np.ndarray, "3"]) -> Geomet
     lens, (tilt, roll, yaw) = Intrinsics.of(x[:LENS]), x[LENS:]
     rotation = Rotation.from_euler("YXZ", [yaw, -tilt, roll], degrees=True).as_rotvec()
     return Geometry(lens.focal_px, lens.principal_point_px, lens.distortion, np.asarray(rotation), pupil)
-
-
-def _lens_at(x: Float[np.ndarray, "12"]) -> Geometry:
-    return replace(Intrinsics.of(x).camera(), rotation_rad=x[LENS:])
-
-
-def _diagnostics(bundle: CalibratedViews) -> tuple[Diagnostic, ...]:
-    evidence, used = bundle.evidence, bundle.points.used
-    return (
-        Diagnostic("rms_reprojection", bundle.rms_px, "px"),
-        Diagnostic("views", float(len(bundle.points.names)), "1"),
-        Diagnostic("corners_used", float(used.sum()), "1"),
-        Diagnostic("corners_rejected", float((~used).sum()), "1"),
-        Diagnostic("iterations", float(bundle.iterations), "1"),
-        Diagnostic("views_disagree_p", evidence.views.p_value, "1"),
-        Diagnostic("variance_factor", evidence.views.inflation, "1"),
-        Diagnostic("residual_pattern_p", evidence.pattern.p_value, "1"),
-        Diagnostic("residual_pattern", evidence.pattern_px, "px"),
-    )
-
-
-def _scatter_diagnostics(scatter_px: Float[np.ndarray, " n"], views: list[BoardView]) -> Iterator[Diagnostic]:
-    parallel = np.array([view.parallel for view in views])
-    on_jig, by_hand = scatter_px[1:][parallel], scatter_px[1:][~parallel]
-    yield Diagnostic("corner_scatter_beside_noise", float(scatter_px[0]), "px")
-    yield Diagnostic(ON_JIG, float(np.median(on_jig)), "px")
-    yield Diagnostic(BY_HAND, float(np.median(by_hand if len(by_hand) else on_jig)), "px")
 
 
 def _outliers(

@@ -13,8 +13,7 @@ from jaxtyping import Float
 from scipy.special import ndtr
 
 from udccal.fitting.engine.gaussian import Prior, scaled_inverse, square_root
-from udccal.fitting.engine.iteration_log import LOG
-from udccal.fitting.engine.least_squares import Blocks, Solution, SolverRules, minimise
+from udccal.fitting.engine.least_squares import LOG, Blocks, Solution, SolverRules, minimise
 from udccal.fitting.engine.misfit import clustered_cov
 from udccal.fitting.engine.orders import Attempt, Choice, bic, choose
 from udccal.fitting.engine.robust import OutlierRule, outliers

@@ -9,9 +9,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from udccal.errors import ProfileError
-from udccal.fitting.absent import absent_backscatter, absent_psf, absent_wire
 from udccal.fitting.noise.fit import nominal_noise
-from udccal.fitting.nominal import nominal_geometry
+from udccal.fitting.nominal import absent_backscatter, absent_psf, absent_wire, nominal_geometry
 from udccal.models.geometry import Geometry
 from udccal.profiles.exchange import mrcal, opencv_yaml, ros_camera_info
 from udccal.profiles.exchange.format import ImportFormat
