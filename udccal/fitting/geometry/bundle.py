@@ -181,8 +181,8 @@ class Points:
     def without(self, views: Bool[np.ndarray, " views"]) -> Points:
         """Without these views; the others move up."""
         number, stay = (np.cumsum(~views) - 1)[self.view], ~views[self.view]
-        parts = (self.board, self.image, self.sigma, number, self.index, self.used)
-        return Points(*(part[stay] for part in parts), tuple(np.array(self.names)[~views].tolist()))
+        parts = (self.board[stay], self.image[stay], self.sigma[stay], number[stay])
+        return Points(*parts, self.index[stay], self.used[stay], tuple(np.array(self.names)[~views].tolist()))
 
     def sums(self, values: Float[np.ndarray, " points"]) -> Float[np.ndarray, " views"]:
         """Sums over each view's points in use."""

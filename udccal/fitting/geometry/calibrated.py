@@ -220,8 +220,8 @@ def _pattern(
         part = np.tensordot(inside[:, mine], jacobian[mine], 1)
         slopes[..., :LENS] += part[..., :LENS]
         slopes[..., LENS + 6 * view : LENS + 6 * view + 6] = part[..., LENS:]
-    slopes = slopes.reshape(len(sums), -1)
-    expected = np.diag(count) - slopes @ solved.equations.joint_cov() @ slopes.T
+    flat = slopes.reshape(len(sums), -1)
+    expected = np.diag(count) - flat @ solved.equations.joint_cov() @ flat.T
     values, vectors = np.linalg.eigh(expected)
     seen = values > 1e-6 * count.max()
     found = f_test(float(((vectors[:, seen].T @ sums) ** 2 / values[seen]).sum()), int(seen.sum()), dof)
