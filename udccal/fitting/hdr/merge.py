@@ -146,7 +146,7 @@ class _Samples:
     ) -> Float[np.ndarray, "n some"]:
         """What of a deviation is left in the errors where each pixel's light, with these weights, follows it."""
         information = np.maximum((weight * self.times**2).sum(axis=0), 1e-30)
-        return deviation - self.times * (weight * self.times * deviation).sum(axis=0) / information
+        return np.asarray(deviation - self.times * (weight * self.times * deviation).sum(axis=0) / information)
 
     def amount(
         self, left: Float[np.ndarray, "n some"], used: Bool[np.ndarray, "n some"], most_sigma: float

@@ -55,7 +55,7 @@ class DarkPair:
     @property
     def differences_DN(self) -> PerCode:
         """First code less the second."""
-        return self.centres_DN[:, None] - self.centres_DN
+        return np.asarray(self.centres_DN[:, None] - self.centres_DN)
 
 
 def dark_pair(first: Codes, second: Codes, exposure_s: float, q_DN: int = 1, top_code: int = 65535) -> DarkPair:

@@ -106,7 +106,7 @@ def reduce_frames(
     (height, columns), (down, right) = first.shape, bins(*first.shape, period)
 
     def binned(picture: Float32[np.ndarray, "rows columns"]) -> Grid:
-        return down @ (picture @ right)
+        return np.asarray(down @ (picture @ right))
 
     def at_peak(frame: Codes) -> tuple[int, Grid]:
         return int(top := frame.max()), binned((frame == top).astype(np.float32))
