@@ -10,7 +10,7 @@ single precision, which is as accurate as its J0.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import NamedTuple, final
 
@@ -26,7 +26,7 @@ from udccal.fitting.wire.parameters import Kind, Parameters, shape_vector
 from udccal.models.arrays import Arrayish
 from udccal.models.bessel import bessel_j0_j1, sine_cosine
 from udccal.models.geometry import rotation_matrix
-from udccal.models.wire import LEAST_OPEN, Wire, carriers, field_powers, kappa, legendre, slopes, waves
+from udccal.models.wire import LEAST_OPEN, Wire, legendre, waves
 
 # Tiles of the sensor, down and across, whose residuals are tested as a whole.
 TILES = (6, 8)
@@ -98,13 +98,15 @@ def with_harmonics(
 def values_at(wire: Wire, pixels: Pixels) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """1 + modulation and exp(B), whose product is the map."""
     filled = _filled(wire)
-    return pixels.by_block(lambda block: _values(*filled, block.ideal, block.scaled))
+    whole, opened = pixels.by_block(lambda block: _values(*filled, block.ideal, block.scaled))
+    return whole, _base(wire, opened, pixels.scaled)
 
 
 def wire_derivatives(wire: Wire, pixels: Pixels) -> Derivatives:
     """Values and derivatives at pixels."""
     filled = _filled(wire)
-    return pixels.by_block(lambda block: _derivatives(*filled, block.ideal, block.scaled))
+    found = pixels.by_block(lambda block: _derivatives(*filled, block.ideal, block.scaled))
+    return found._replace(base=_base(wire, found.base, pixels.scaled))
 
 
 def _filled(wire: Wire) -> tuple[Wire, Float[np.ndarray, "10"], int]:
@@ -158,15 +160,21 @@ class _Harmonic(NamedTuple):
         return values, slopes
 
     def waved(
-        self, series: Sequence[Float[Array, " n"]], pupil: Sequence[Float[Array, " n"]], wave: Sequence[Array]
+        self,
+        series: Float[Array, "degrees n"],
+        pupil: tuple[Float[Array, " n"], ...],
+        wave: tuple[Float[Array, " n"], ...],
     ) -> Float[Array, " n"]:
         """The wave by the field coefficients, whose degrees have these series and whose carriers are of the pupil."""
-        # cos(nX) cos(mY) is half the sum over (n, m) and (-n, m).
-        crossed, total = jnp.where(jnp.all(self.order != 0), jnp.float32(0.5), jnp.float32(1.0)), 0.0
+        total = jnp.zeros_like(wave[0])
         for by_carrier, part in zip(self.fields, wave, strict=True):
             for by_degree, carrier in zip(by_carrier, pupil, strict=True):
                 total += sum(one * power for one, power in zip(by_degree, series, strict=True)) * carrier * part
-        return crossed * total
+        return self.crossed() * total
+
+    def crossed(self) -> Float[Array, ""]:
+        """cos(nX) cos(mY) is half the sum over (n, m) and (-n, m)."""
+        return jnp.where(jnp.all(self.order != 0), jnp.float32(0.5), jnp.float32(1.0))
 
     def value(self) -> Float[Array, " n"]:
         """Its part of the modulation."""
@@ -186,7 +194,10 @@ class _Harmonic(NamedTuple):
         bent = [jnp.zeros_like(kappa), jnp.ones_like(kappa)]
         for k in range(2, len(powers)):
             bent.append(bent[k - 2] + (2 * k - 1) * powers[k - 1])
-        by_kappa = by_log_z / kappa + both * self.waved(bent, pupil[:2], (cosine, sine)) / self.frequency[1]
+        by_kappa = (
+            by_log_z / kappa
+            + both * self.waved(jnp.stack(bent[: len(powers)]), pupil[:2], (cosine, sine)) / self.frequency[1]
+        )
         by_ellipse = (part * by_kappa / kappa for part in (n * n / 2, n * m, m * m / 2))
         by_openings = along * slope_x * slit_y, along * slope_y * slit_x
         return along * both, n * by_phase, m * by_phase, *by_openings, *by_ellipse, by_log_z
@@ -201,19 +212,28 @@ def _harmonics(wire: Wire, rays: Rays) -> Callable[[Int[Array, ""]], _Harmonic]:
     return lambda h: _Harmonic(*(one[h] for one in each), footprint, rays)
 
 
+# With the openings alone in place of exp(B), which needs no compiled code.
 @jax.jit
 def _values(
-    wire: Wire, shape: Float[Array, "10"], count: int, ideal: Float[Array, "n 2"], scaled: Float[Array, "n 2"]
+    wire: Wire,
+    shape: Float[Array, "10"],
+    count: Int[Arrayish, ""],
+    ideal: Float[Array, "n 2"],
+    scaled: Float[Array, "n 2"],
 ) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
     rays = _rays(shape, wire.geometry.rotation_rad, ideal)
     harmonic, nothing = _harmonics(wire, rays), jnp.zeros(len(ideal), jnp.float32)
     modulated = jax.lax.fori_loop(0, count, lambda h, total: total + harmonic(h).value(), nothing)
-    return 1.0 + modulated + _beside(wire, rays, scaled)[0], _base(wire, rays, scaled)
+    return 1.0 + modulated + _beside(wire, rays, scaled)[0], rays.openings.prod(axis=0)
 
 
 @jax.jit
 def _derivatives(
-    wire: Wire, shape: Float[Array, "10"], count: int, ideal: Float[Array, "n 2"], scaled: Float[Array, "n 2"]
+    wire: Wire,
+    shape: Float[Array, "10"],
+    count: Int[Arrayish, ""],
+    ideal: Float[Array, "n 2"],
+    scaled: Float[Array, "n 2"],
 ) -> Derivatives:
     mounted = wire.geometry.rotation_rad
     rays = _rays(shape, mounted, ideal)
@@ -235,36 +255,39 @@ def _derivatives(
     moved = jnp.concatenate(jax.jacfwd(_rays)(shape, mounted, ideal))
     # The pupil acts on the harmonics alone.
     by_shape = jnp.einsum("kn,knp->pn", by_ray, moved).at[6].add(sums[8])
-    return Derivatives(whole, _base(wire, rays, scaled), by_shape)
+    return Derivatives(whole, rays.openings.prod(axis=0), by_shape)
 
 
 def _beside(wire: Wire, rays: Rays, scaled: Float[Array, "n 2"]) -> tuple[Float[Array, " n"], Float[Array, "2 n"]]:
     """Modulation by the first harmonics' amplitudes that no pupil explains, and its derivatives by periods."""
     strongest, _, count_y, count_x = jnp.shape(wire.amplitudes)
     in_x, in_y = legendre(scaled[:, 0], count_x), legendre(scaled[:, 1], count_y)
-    some = replace(wire, harmonics=wire.harmonics[:strongest])
+    first = {name: getattr(wire, name)[:strongest] for name in ("harmonics", "frequency", "fields")}
+    some = replace(wire, **first)
     cosine, sine = waves(some, rays.periods)
     cos, sin = jnp.einsum("hpyx,yn,xn->phn", wire.amplitudes, in_y, in_x)
     return (cos * cosine + sin * sine).sum(axis=0), 2 * jnp.pi * some.harmonics.T @ (sin * cosine - cos * sine)
 
 
-def _base(wire: Wire, rays: Rays, scaled: Float[Array, "n 2"]) -> Float[Array, " n"]:
+def _base(wire: Wire, opened: Float[np.ndarray, " n"], scaled: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
     """exp(B): the shading times the openings."""
-    count_y, count_x = jnp.shape(wire.baseline)
-    in_x, in_y = legendre(scaled[:, 0], count_x), legendre(scaled[:, 1], count_y)
-    return jnp.exp(jnp.sum(wire.baseline.T @ in_y * in_x, axis=0)) * rays.openings.prod(axis=0)
+    in_x, in_y = np.polynomial.legendre.legvander(scaled.T, len(wire.baseline) - 1)
+    return np.exp(((in_y @ wire.baseline) * in_x).sum(axis=1)) * opened
 
 
 @jax.jit
-def _few_waves(
-    wire: Wire, shape: Float[Array, "10"], ideal: Float[Array, "n 2"]
-) -> tuple[Float[Array, "2 few n"], Float[Array, "2 few n"], Float[Array, "degrees few n"]]:
-    """Waves, carriers and powers: the factors of the linear coefficients."""
-    rays, slope = _rays(shape, wire.geometry.rotation_rad, ideal), slopes(wire, ideal)
-    single = wire, slope, rays.periods - jnp.round(rays.periods)
-    wire, slope, periods = jax.tree.map(lambda part: jnp.asarray(part, jnp.float32), single)
-    seen = kappa(wire, slope)
-    return waves(wire, periods), carriers(wire, slope, seen), field_powers(wire, seen, _DEGREES)
+def _linear(
+    wire: Wire, shape: Float[Array, "10"], few: Int[Array, " few"], ideal: Float[Array, "n 2"]
+) -> tuple[Float[Array, "few 2 n"], Float[Array, "few 2 n"], Float[Array, "few degrees n"]]:
+    """Wave, carriers and powers of some harmonics: the factors of their linear coefficients."""
+    harmonic = _harmonics(wire, _rays(shape, wire.geometry.rotation_rad, ideal))
+
+    def factors(h: Int[Array, ""]) -> tuple[Float[Array, "2 n"], Float[Array, "2 n"], Float[Array, "degrees n"]]:
+        one = harmonic(h)
+        (kappa, pupil, wave), (slits, _) = one.factors(), one.slits()
+        return jnp.stack(wave), one.crossed() * slits[0] * slits[1] * jnp.stack(pupil[:2]), one.powers(kappa)
+
+    return jax.lax.map(factors, few)
 
 
 def expected_of(wire: Wire, gains: Float[np.ndarray, " sites"], pixels: Pixels) -> Float[np.ndarray, " n"]:
@@ -282,7 +305,8 @@ def block_jacobian(
     parameters: Parameters, wire: Wire, block: Pixels
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.ndarray, "parameters n"]]:
     """1 + modulation, exp(B), and derivatives by the parameters relative to exp(B) and the gain, for one block."""
-    whole, base, by_shape = wire_derivatives(wire, block)
+    filled, shape, count = _filled(wire)
+    whole, opened, by_shape = map(np.asarray, _derivatives(filled, shape, count, block.ideal, block.scaled))
     in_x, in_y = np.polynomial.legendre.legvander(block.scaled.T, np.shape(wire.baseline)[0] - 1).transpose(0, 2, 1)
     # The baseline acts on everything: the change of exp(B) (1 + M), relative to exp(B), is (1 + M) dB.
     _, _, degree_y, degree_x = parameters.indices(Kind.SHADING)
@@ -290,23 +314,16 @@ def block_jacobian(
     of_site = np.append(np.eye(parameters.sites - 1), -np.ones((parameters.sites - 1, 1)), axis=1)[:, block.site]
     rows.append(of_site[parameters.indices(Kind.SITE)[0]] * whole)
     beside, free = parameters.indices(Kind.AMPLITUDE), parameters.indices(Kind.FIELD)
-    few, place = np.unique(np.append(beside[0], free[0]), return_inverse=True)
-    if len(few):
-        chosen = np.resize(few, -(-len(few) // _FEW) * _FEW)
-        some = replace(
-            wire,
-            harmonics=wire.harmonics[chosen],
-            frequency=wire.frequency[chosen],
-            fields=np.zeros((0, 2, 2, 1)),
-            amplitudes=np.zeros((0, 2, 1, 1)),
-        )
-        wave, carrier, powers = (np.asarray(part) for part in _few_waves(some, shape_vector(wire), block.ideal))
-        (_, phase, degree_y, degree_x), at = beside, place[: len(beside[0])]
-        rows.append(wave[phase, at] * in_y[degree_y] * in_x[degree_x])
-        (_, phase, kind, degree), at = free, place[len(beside[0]) :]
-        rows.append(wave[phase, at] * carrier[kind, at] * powers[degree, at])
+    if linear := 1 + int(max(beside[0].max(initial=-1), free[0].max(initial=-1))):
+        firsts = np.arange(-(-linear // _FEW) * _FEW).reshape(-1, _FEW)
+        parts = (_linear(filled, shape, few, block.ideal) for few in firsts)
+        wave, carrier, powers = (np.concatenate(part) for part in zip(*parts, strict=True))
+        harmonic, phase, degree_y, degree_x = beside
+        rows.append(wave[harmonic, phase] * in_y[degree_y] * in_x[degree_x])
+        harmonic, phase, kind, degree = free
+        rows.append(wave[harmonic, phase] * carrier[harmonic, kind] * powers[harmonic, degree])
     rows.append(by_shape[parameters.indices(Kind.SHAPE)[0]])
-    return whole, base, np.concatenate(rows)
+    return whole, _base(wire, opened, block.scaled), np.concatenate(rows)
 
 
 @final
