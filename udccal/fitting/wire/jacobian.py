@@ -51,9 +51,9 @@ class Rays(NamedTuple):
 class Derivatives(NamedTuple):
     """At each pixel: 1 + modulation, exp(B), and derivatives by ``shape_vector`` relative to exp(B)."""
 
-    whole: Float[np.ndarray, " n"]
-    base: Float[np.ndarray, " n"]
-    shape: Float[np.ndarray, "10 n"]
+    whole: Float[Arrayish, " n"]
+    base: Float[Arrayish, " n"]
+    shape: Float[Arrayish, "10 n"]
 
 
 def _rays(shape: Float[Array, "10"], mounted: Float[Arrayish, "3"], ideal: Float[Array, "n 2"]) -> Rays:
@@ -98,29 +98,31 @@ def with_harmonics(
 def values_at(wire: Wire, pixels: Pixels) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """1 + modulation and exp(B), whose product is the map."""
     filled = _filled(wire)
-    whole, opened = pixels.by_block(lambda block: _values(*filled, block.ideal, block.scaled))
+    whole, opened = pixels.by_block(lambda block: _values(filled, block))
     return whole, _base(wire, opened, pixels.scaled)
 
 
 def wire_derivatives(wire: Wire, pixels: Pixels) -> Derivatives:
     """Values and derivatives at pixels."""
     filled = _filled(wire)
-    found = pixels.by_block(lambda block: _derivatives(*filled, block.ideal, block.scaled))
+    found = pixels.by_block(lambda block: _derivatives(filled, block))
     return found._replace(base=_base(wire, found.base, pixels.scaled))
 
 
-def _filled(wire: Wire) -> tuple[Wire, Float[np.ndarray, "10"], int]:
+_Filled = tuple[Wire, Float[Arrayish, "10"], Int[Arrayish, ""]]
+
+
+def _filled(wire: Wire) -> _Filled:
     """The wire with room for more harmonics, its ``shape_vector``, and the number of harmonics."""
     count, degrees = len(wire.harmonics), np.shape(wire.fields)[-1]
     more = (0, _ROOM - count % _ROOM), (0, 0)
     orders, frequency = (np.pad(part, more, constant_values=1.0) for part in (wire.harmonics, wire.frequency))
     fields = np.pad(wire.fields, (*more, (0, 0), (0, max(_DEGREES - degrees, 0))))
     filled = replace(wire, harmonics=orders, frequency=frequency, fields=fields)
-    return jax.tree.map(jnp.asarray, filled), shape_vector(wire), count
+    return jax.tree.map(jnp.asarray, filled), shape_vector(wire), np.asarray(count)
 
 
 _Factors = tuple[Float[Array, " n"], tuple[Float[Array, " n"], ...], tuple[Float[Array, " n"], ...]]
-
 _Carried = tuple[list[Float[Array, " n"]], _Factors]
 
 
@@ -209,35 +211,26 @@ def _harmonics(wire: Wire, rays: Rays) -> Callable[[Int[Array, ""]], _Harmonic]:
     rays = rays._replace(periods=rays.periods - jnp.round(rays.periods))
     double = wire.harmonics, wire.frequency, wire.fields, wire.footprint_per_pitch, rays
     *each, footprint, rays = jax.tree.map(lambda one: jnp.asarray(one, jnp.float32), double)
-    return lambda h: _Harmonic(*(one[h] for one in each), footprint, rays)
+    orders, frequency, fields = each
+    return lambda h: _Harmonic(orders[h], frequency[h], fields[h], footprint, rays)
 
 
 # With the openings alone in place of exp(B), which needs no compiled code.
 @jax.jit
-def _values(
-    wire: Wire,
-    shape: Float[Array, "10"],
-    count: Int[Arrayish, ""],
-    ideal: Float[Array, "n 2"],
-    scaled: Float[Array, "n 2"],
-) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
-    rays = _rays(shape, wire.geometry.rotation_rad, ideal)
-    harmonic, nothing = _harmonics(wire, rays), jnp.zeros(len(ideal), jnp.float32)
+def _values(filled: _Filled, block: Pixels) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+    wire, shape, count = filled
+    rays = _rays(shape, wire.geometry.rotation_rad, block.ideal)
+    harmonic, nothing = _harmonics(wire, rays), jnp.zeros(len(block.ideal), jnp.float32)
     modulated = jax.lax.fori_loop(0, count, lambda h, total: total + harmonic(h).value(), nothing)
-    return 1.0 + modulated + _beside(wire, rays, scaled)[0], rays.openings.prod(axis=0)
+    return 1.0 + modulated + _beside(wire, rays, block.scaled)[0], rays.openings.prod(axis=0)
 
 
 @jax.jit
-def _derivatives(
-    wire: Wire,
-    shape: Float[Array, "10"],
-    count: Int[Arrayish, ""],
-    ideal: Float[Array, "n 2"],
-    scaled: Float[Array, "n 2"],
-) -> Derivatives:
+def _derivatives(filled: _Filled, block: Pixels) -> Derivatives:
+    wire, shape, count = filled
     mounted = wire.geometry.rotation_rad
-    rays = _rays(shape, mounted, ideal)
-    harmonic, nothing = _harmonics(wire, rays), jnp.zeros(len(ideal), jnp.float32)
+    rays = _rays(shape, mounted, block.ideal)
+    harmonic, nothing = _harmonics(wire, rays), jnp.zeros(len(block.ideal), jnp.float32)
 
     def added(h: Int[Array, ""], carried: _Carried) -> _Carried:
         sums, factors = carried
@@ -249,10 +242,10 @@ def _derivatives(
     one = nothing + 1.0
     found, _ = jax.lax.fori_loop(-1, count, added, ([nothing] * 9, (one, (one, one, one), (one, one))))
     sums = jnp.stack(found)
-    beside, by_periods = _beside(wire, rays, scaled)
+    beside, by_periods = _beside(wire, rays, block.scaled)
     whole = 1.0 + sums[0] + beside
     by_ray = jnp.concatenate([sums[1:3] + by_periods, sums[3:5] + whole / rays.openings, sums[5:8]])
-    moved = jnp.concatenate(jax.jacfwd(_rays)(shape, mounted, ideal))
+    moved = jnp.concatenate(jax.jacfwd(_rays)(shape, mounted, block.ideal))
     # The pupil acts on the harmonics alone.
     by_shape = jnp.einsum("kn,knp->pn", by_ray, moved).at[6].add(sums[8])
     return Derivatives(whole, rays.openings.prod(axis=0), by_shape)
@@ -277,10 +270,11 @@ def _base(wire: Wire, opened: Float[np.ndarray, " n"], scaled: Float[np.ndarray,
 
 @jax.jit
 def _linear(
-    wire: Wire, shape: Float[Array, "10"], few: Int[Array, " few"], ideal: Float[Array, "n 2"]
+    filled: _Filled, few: Int[Array, " few"], block: Pixels
 ) -> tuple[Float[Array, "few 2 n"], Float[Array, "few 2 n"], Float[Array, "few degrees n"]]:
     """Wave, carriers and powers of some harmonics: the factors of their linear coefficients."""
-    harmonic = _harmonics(wire, _rays(shape, wire.geometry.rotation_rad, ideal))
+    wire, shape, _ = filled
+    harmonic = _harmonics(wire, _rays(shape, wire.geometry.rotation_rad, block.ideal))
 
     def factors(h: Int[Array, ""]) -> tuple[Float[Array, "2 n"], Float[Array, "2 n"], Float[Array, "degrees n"]]:
         one = harmonic(h)
@@ -305,8 +299,8 @@ def block_jacobian(
     parameters: Parameters, wire: Wire, block: Pixels
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.ndarray, "parameters n"]]:
     """1 + modulation, exp(B), and derivatives by the parameters relative to exp(B) and the gain, for one block."""
-    filled, shape, count = _filled(wire)
-    whole, opened, by_shape = map(np.asarray, _derivatives(filled, shape, count, block.ideal, block.scaled))
+    filled = _filled(wire)
+    whole, opened, by_shape = map(np.asarray, _derivatives(filled, block))
     in_x, in_y = np.polynomial.legendre.legvander(block.scaled.T, np.shape(wire.baseline)[0] - 1).transpose(0, 2, 1)
     # The baseline acts on everything: the change of exp(B) (1 + M), relative to exp(B), is (1 + M) dB.
     _, _, degree_y, degree_x = parameters.indices(Kind.SHADING)
@@ -316,7 +310,7 @@ def block_jacobian(
     beside, free = parameters.indices(Kind.AMPLITUDE), parameters.indices(Kind.FIELD)
     if linear := 1 + int(max(beside[0].max(initial=-1), free[0].max(initial=-1))):
         firsts = np.arange(-(-linear // _FEW) * _FEW).reshape(-1, _FEW)
-        parts = (_linear(filled, shape, few, block.ideal) for few in firsts)
+        parts = (_linear(filled, few, block) for few in firsts)
         wave, carrier, powers = (np.concatenate(part) for part in zip(*parts, strict=True))
         harmonic, phase, degree_y, degree_x = beside
         rows.append(wave[harmonic, phase] * in_y[degree_y] * in_x[degree_x])
@@ -365,8 +359,8 @@ class WireProblem:
             by_tile = np.where(tile_numbers(block.scaled) == tiles[:, None], errors, 0.0) @ rows.T
             return rows @ rows.T, by_tile, float(errors @ errors)
 
-        matrix, by_tile, chi2 = (sum(part) for part in zip(*self.pixels.mapped(of), strict=True))
-        return matrix, by_tile, float(chi2)
+        matrices, by_tile, chi2 = zip(*self.pixels.mapped(of), strict=True)
+        return np.sum(matrices, axis=0), np.sum(by_tile, axis=0), float(np.sum(chi2))
 
     def moved(self, place: Float[np.ndarray, " n"], step: Step) -> Float[np.ndarray, " n"]:
         """The place after a step."""
