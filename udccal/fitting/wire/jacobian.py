@@ -56,7 +56,7 @@ class Derivatives(NamedTuple):
     shape: Float[Arrayish, "10 n"]
 
 
-def _rays(shape: Float[Array, "10"], mounted: Float[Arrayish, "3"], ideal: Float[Array, "n 2"]) -> Rays:
+def _rays(shape: Float[Array, "10"], mounted: Float[Arrayish, "3"], ideal: Float[Arrayish, "n 2"]) -> Rays:
     """Where rays of ideal image points meet the panel, by ``shape_vector`` and the geometry's rotation."""
     rotation = rotation_matrix(shape[:3]) @ rotation_matrix(mounted)
     ray = rotation @ jnp.insert(ideal, 2, 1.0, axis=1).T
@@ -251,7 +251,7 @@ def _derivatives(filled: _Filled, block: Pixels) -> Derivatives:
     return Derivatives(whole, rays.openings.prod(axis=0), by_shape)
 
 
-def _beside(wire: Wire, rays: Rays, scaled: Float[Array, "n 2"]) -> tuple[Float[Array, " n"], Float[Array, "2 n"]]:
+def _beside(wire: Wire, rays: Rays, scaled: Float[Arrayish, "n 2"]) -> tuple[Float[Array, " n"], Float[Array, "2 n"]]:
     """Modulation by the first harmonics' amplitudes that no pupil explains, and its derivatives by periods."""
     strongest, _, count_y, count_x = jnp.shape(wire.amplitudes)
     in_x, in_y = legendre(scaled[:, 0], count_x), legendre(scaled[:, 1], count_y)
