@@ -78,9 +78,8 @@ def _step(
     wire: Wire, pixels: Pixels, noise: FlatNoise
 ) -> tuple[Float[np.ndarray, "7"], Float[np.ndarray, "7 7"], Float[np.ndarray, " n"], float]:
     """The next step, its covariance, the light in front of the panel at the sample's places, and the variance."""
-    found = [wire_derivatives(wire, block) for block in pixels.blocks()]
-    whole, base = (np.concatenate([getattr(one, name) for one in found]) for name in ("whole", "base"))
-    by_pose = np.concatenate([one.shape[:POSE] for one in found], axis=1) / whole
+    whole, base, by_shape = wire_derivatives(wire, pixels)
+    by_pose = by_shape[:POSE] / whole
     ahead, light_there = values_at(wire, replace(pixels, ideal=pixels.ideal * (1 - _SMALL)))
     by_focal = np.log(ahead * light_there / (whole * base)) / _SMALL
     design = np.column_stack([by_pose.T, by_focal, light_design(pixels.scaled, pixels.site)])

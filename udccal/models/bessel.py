@@ -44,7 +44,8 @@ def sine_cosine(x: Float[Array, "*n"]) -> tuple[Float[Array, "*n"], Float[Array,
     quarters = jnp.round(x * 0.6366197723675814)
     r = ((x - quarters * 1.5703125) - quarters * 4.837512969970703125e-4) - quarters * 7.549789954891882e-08
     square = r * r
-    sine, cosine = r * _polynomial(_SINE, square), _polynomial(_COSINE, square)
+    terms = 5 if x.dtype == jnp.float32 else 9
+    sine, cosine = r * _polynomial(_SINE[:terms], square), _polynomial(_COSINE[:terms], square)
     turn = quarters - 4.0 * jnp.floor(quarters / 4.0)
     swapped = (turn == 1.0) | (turn == 3.0)
     up, right = jnp.where(swapped, cosine, sine), jnp.where(swapped, sine, cosine)

@@ -4,11 +4,13 @@ The modulation depends on the ten shape parameters through few numbers per pixel
 panel (X, Y), two openings, three numbers of the footprint's ellipse, and the pupil. Sums over the harmonics are made
 once per such number, in closed form. Derivatives of these numbers by the shape parameters do not depend on the
 harmonics and are automatic. That is several times faster than automatic derivatives of the whole model, in either mode.
-Harmonics are summed in groups of one size, so that each function is compiled once.
+The sums run from harmonic to harmonic over the pixels of a block, which stay in the processor's cache. They are in
+single precision, which is as accurate as its J0.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import NamedTuple, final
 
@@ -22,16 +24,17 @@ from udccal.fitting.engine.least_squares import Blocks, Step
 from udccal.fitting.wire.data import BLOCK, FlatNoise, Pixels, Weighed, weighed
 from udccal.fitting.wire.parameters import Kind, Parameters, shape_vector
 from udccal.models.arrays import Arrayish
-from udccal.models.bessel import bessel_j0_j1
+from udccal.models.bessel import bessel_j0_j1, sine_cosine
 from udccal.models.geometry import rotation_matrix
-from udccal.models.wire import LEAST_OPEN, Wire, field_powers, legendre, slits, waves
+from udccal.models.wire import LEAST_OPEN, Wire, legendre, waves
 
 # Tiles of the sensor, down and across, whose residuals are tested as a whole.
 TILES = (6, 8)
 # Least residual variance in units of the noise's, so that quotients by it stay finite.
 LEAST_VARIANCE = 1e-12
-# Harmonics that are summed at once.
-_GROUP = 50
+# Harmonics are filled up to multiples of these numbers, and degrees to the fit's own, so that functions are compiled
+# once.
+_ROOM, _FEW, _DEGREES = 1280, 8, 4
 
 
 class Rays(NamedTuple):
@@ -46,22 +49,14 @@ class Rays(NamedTuple):
 
 
 class Derivatives(NamedTuple):
-    """At each pixel: 1 + modulation, exp(B), and derivatives relative to exp(B).
+    """At each pixel: 1 + modulation, exp(B), and derivatives by ``shape_vector`` relative to exp(B)."""
 
-    ``shape`` is by the ten parameters of ``shape_vector``; ``wave``, ``carrier`` (slits' coefficients included) and
-    ``powers`` are the factors of the linear field coefficients.
-    """
-
-    whole: Float[np.ndarray, " n"]
-    base: Float[np.ndarray, " n"]
-    shape: Float[np.ndarray, "10 n"]
-    wave: Float[np.ndarray, "2 harmonics n"]
-    carrier: Float[np.ndarray, "2 harmonics n"]
-    powers: Float[np.ndarray, "degrees harmonics n"]
+    whole: Float[Arrayish, " n"]
+    base: Float[Arrayish, " n"]
+    shape: Float[Arrayish, "10 n"]
 
 
-@jax.jit
-def _rays(shape: Float[Array, "10"], mounted: Float[Array, "3"], ideal: Float[Array, "n 2"]) -> Rays:
+def _rays(shape: Float[Array, "10"], mounted: Float[Arrayish, "3"], ideal: Float[Arrayish, "n 2"]) -> Rays:
     """Where rays of ideal image points meet the panel, by ``shape_vector`` and the geometry's rotation."""
     rotation = rotation_matrix(shape[:3]) @ rotation_matrix(mounted)
     ray = rotation @ jnp.insert(ideal, 2, 1.0, axis=1).T
@@ -73,13 +68,13 @@ def _rays(shape: Float[Array, "10"], mounted: Float[Array, "3"], ideal: Float[Ar
     return Rays(shape[4:6, None] + jnp.exp(shape[3]) * slope, openings, ellipse)
 
 
-_rays_by_shape = jax.jit(jax.jacfwd(_rays))
+_compiled_rays = jax.jit(_rays)
 
 
 def rays_at(wire: Wire, pixels: Pixels) -> Rays:
     """Where the pixels' rays meet the panel."""
     shape, mounted = shape_vector(wire), np.asarray(wire.geometry.rotation_rad)
-    return pixels.by_block(lambda block: _rays(shape, mounted, block.ideal))
+    return pixels.by_block(lambda block: _compiled_rays(shape, mounted, block.ideal))
 
 
 def with_harmonics(
@@ -102,43 +97,191 @@ def with_harmonics(
 
 def values_at(wire: Wire, pixels: Pixels) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """1 + modulation and exp(B), whose product is the map."""
-
-    def at(block: Pixels) -> tuple[np.ndarray, np.ndarray]:
-        rays = rays_at(wire, block)
-        modulated = (sums[0] for sums, *_ in _of_groups(wire, rays, block.scaled))
-        return sum(modulated, start=np.ones(len(block.value))), _base(wire, rays, block.scaled)
-
-    return pixels.by_block(at)
+    filled = _filled(wire)
+    whole, opened = pixels.by_block(lambda block: _values(filled, block))
+    return whole, _base(wire, opened, pixels.scaled)
 
 
-def _of_groups(wire: Wire, rays: Rays, scaled: Float[np.ndarray, "n 2"]) -> list[tuple[np.ndarray, ...]]:
-    """``_group_derivatives`` of harmonics in groups of one size, the last filled up with some of no amplitude.
+def wire_derivatives(wire: Wire, pixels: Pixels) -> Derivatives:
+    """Values and derivatives at pixels."""
+    filled = _filled(wire)
+    found = pixels.by_block(lambda block: _derivatives(filled, block))
+    return found._replace(base=_base(wire, found.base, pixels.scaled))
 
-    Single precision is as accurate as its J0. Amplitudes that no pupil explains are those of the first harmonics: only
-    the first group has them.
-    """
-    rays = rays._replace(periods=rays.periods - np.round(rays.periods))
-    free, found = wire.amplitudes if len(wire.amplitudes) else np.zeros((1, 2, 1, 1)), []
-    for first in range(0, len(wire.harmonics), _GROUP):
-        some = np.s_[first : first + _GROUP]
-        fill = _GROUP - len(wire.harmonics[some])
-        harmonics, frequency, fields = (
-            np.concatenate([np.asarray(part)[some], np.full((fill, *np.shape(part)[1:]), value)])
-            for part, value in ((wire.harmonics, 1.0), (wire.frequency, 1.0), (wire.fields, 0.0))
+
+_Filled = tuple[Wire, Float[Arrayish, "10"], Int[Arrayish, ""]]
+
+
+def _filled(wire: Wire) -> _Filled:
+    """The wire with room for more harmonics, its ``shape_vector``, and the number of harmonics."""
+    count, degrees = len(wire.harmonics), np.shape(wire.fields)[-1]
+    more = (0, _ROOM - count % _ROOM), (0, 0)
+    orders, frequency = (np.pad(part, more, constant_values=1.0) for part in (wire.harmonics, wire.frequency))
+    fields = np.pad(wire.fields, (*more, (0, 0), (0, max(_DEGREES - degrees, 0))))
+    filled = replace(wire, harmonics=orders, frequency=frequency, fields=fields)
+    return jax.tree.map(jnp.asarray, filled), shape_vector(wire), np.asarray(count)
+
+
+_Factors = tuple[Float[Array, " n"], tuple[Float[Array, " n"], ...], tuple[Float[Array, " n"], ...]]
+_Carried = tuple[list[Float[Array, " n"]], _Factors]
+
+
+class _Harmonic(NamedTuple):
+    """One harmonic (n, m) at each pixel, in single precision."""
+
+    order: Float[Array, "2"]
+    frequency: Float[Array, "2"]
+    fields: Float[Array, "2 2 degrees"]
+    footprint: Float[Array, ""]
+    rays: Rays
+
+    def factors(self) -> _Factors:
+        """Kappa; G, z G' and z (z G')' of a round pupil; cosine and sine of the phase."""
+        (xx, xy, yy), (n, m), (x, y) = self.rays.ellipse, self.order, self.rays.periods
+        kappa = jnp.sqrt(n * n * xx + 2 * n * m * xy + m * m * yy)
+        z = jnp.pi * self.footprint * kappa
+        j0, j1 = bessel_j0_j1(z)
+        g = 2.0 * j1 / z
+        slope = 2.0 * (j0 - g)
+        sine, cosine = sine_cosine(2 * jnp.pi * (n * x + m * y))
+        return kappa, (g, slope, -z * z * g - 2.0 * slope), (cosine, sine)
+
+    def powers(self, kappa: Float[Array, " n"]) -> Float[Array, "degrees n"]:
+        """Legendre polynomials of kappa, scaled to its range."""
+        return legendre((kappa - self.frequency[0]) / self.frequency[1], self.fields.shape[-1])
+
+    def slits(self) -> tuple[list[Float[Array, " n"]], list[Float[Array, " n"]]]:
+        """Coefficients 2 sin(pi m f) / (pi m f) along X and Y, 1 where m is 0, and their derivatives by f."""
+        values, slopes = [], []
+        for order, width in zip(jnp.abs(self.order), self.rays.openings, strict=True):
+            half_turns = jnp.pi * jnp.maximum(order, 1.0) * width
+            sine, cosine = sine_cosine(half_turns)
+            sinc = sine / half_turns
+            values.append(jnp.where(order == 0, 1.0, 2.0 * sinc))
+            slopes.append(jnp.where(order == 0, 0.0, 2.0 * (cosine - sinc) / width))
+        return values, slopes
+
+    def waved(
+        self,
+        series: Float[Array, "degrees n"],
+        pupil: tuple[Float[Array, " n"], ...],
+        wave: tuple[Float[Array, " n"], ...],
+    ) -> Float[Array, " n"]:
+        """The wave by the field coefficients, whose degrees have these series and whose carriers are of the pupil."""
+        total = jnp.zeros_like(wave[0])
+        for by_carrier, part in zip(self.fields, wave, strict=True):
+            for by_degree, carrier in zip(by_carrier, pupil, strict=True):
+                total += sum(one * power for one, power in zip(by_degree, series, strict=True)) * carrier * part
+        return self.crossed() * total
+
+    def crossed(self) -> Float[Array, ""]:
+        """cos(nX) cos(mY) is half the sum over (n, m) and (-n, m)."""
+        return jnp.where(jnp.all(self.order != 0), jnp.float32(0.5), jnp.float32(1.0))
+
+    def value(self) -> Float[Array, " n"]:
+        """Its part of the modulation."""
+        kappa, pupil, wave = self.factors()
+        (slit_x, slit_y), _ = self.slits()
+        return self.waved(self.powers(kappa), pupil[:2], wave) * slit_x * slit_y
+
+    def derivatives(self, factors: _Factors) -> tuple[Float[Array, " n"], ...]:
+        """Its part of the modulation, and derivatives by periods, openings, ellipse and the pupil's logarithm."""
+        (n, m), (kappa, pupil, (cosine, sine)) = self.order, factors
+        ((slit_x, slit_y), (slope_x, slope_y)), powers = self.slits(), self.powers(kappa)
+        both = slit_x * slit_y
+        along = self.waved(powers, pupil[:2], (cosine, sine))
+        by_phase = 2 * jnp.pi * both * self.waved(powers, pupil[:2], (-sine, cosine))
+        by_log_z = both * self.waved(powers, pupil[1:], (cosine, sine))
+        # The corrections to the pupil's transform are themselves series in kappa; P'_k = P'_(k-2) + (2 k - 1) P_(k-1).
+        bent = [jnp.zeros_like(kappa), jnp.ones_like(kappa)]
+        for k in range(2, len(powers)):
+            bent.append(bent[k - 2] + (2 * k - 1) * powers[k - 1])
+        by_kappa = (
+            by_log_z / kappa
+            + both * self.waved(jnp.stack(bent[: len(powers)]), pupil[:2], (cosine, sine)) / self.frequency[1]
         )
-        group = replace(wire, harmonics=harmonics, frequency=frequency, fields=fields, amplitudes=free)
-        # A wire may hold JAX's arrays, which the setting of single precision leaves as they are.
-        single = jax.tree.map(lambda part: np.asarray(part, np.float32), (group, rays, scaled))
-        with jax.enable_x64(False):
-            found.append(jax.tree.map(np.asarray, _group_derivatives(*single)))
-        free = np.zeros_like(free)
-    return found
+        by_ellipse = (part * by_kappa / kappa for part in (n * n / 2, n * m, m * m / 2))
+        by_openings = along * slope_x * slit_y, along * slope_y * slit_x
+        return along * both, n * by_phase, m * by_phase, *by_openings, *by_ellipse, by_log_z
 
 
-def _base(wire: Wire, rays: Rays, scaled: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
+def _harmonics(wire: Wire, rays: Rays) -> Callable[[Int[Array, ""]], _Harmonic]:
+    """Each harmonic by its number."""
+    # Whole periods would cost digits in single precision.
+    rays = rays._replace(periods=rays.periods - jnp.round(rays.periods))
+    double = wire.harmonics, wire.frequency, wire.fields, wire.footprint_per_pitch, rays
+    *each, footprint, rays = jax.tree.map(lambda one: jnp.asarray(one, jnp.float32), double)
+    orders, frequency, fields = each
+    return lambda h: _Harmonic(orders[h], frequency[h], fields[h], footprint, rays)
+
+
+# With the openings alone in place of exp(B), which needs no compiled code.
+@jax.jit
+def _values(filled: _Filled, block: Pixels) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+    wire, shape, count = filled
+    rays = _rays(shape, wire.geometry.rotation_rad, block.ideal)
+    harmonic, nothing = _harmonics(wire, rays), jnp.zeros(len(block.ideal), jnp.float32)
+    modulated = jax.lax.fori_loop(0, count, lambda h, total: total + harmonic(h).value(), nothing)
+    return 1.0 + modulated + _beside(wire, rays, block.scaled)[0], rays.openings.prod(axis=0)
+
+
+@jax.jit
+def _derivatives(filled: _Filled, block: Pixels) -> Derivatives:
+    wire, shape, count = filled
+    mounted = wire.geometry.rotation_rad
+    rays = _rays(shape, mounted, block.ideal)
+    harmonic, nothing = _harmonics(wire, rays), jnp.zeros(len(block.ideal), jnp.float32)
+
+    def added(h: Int[Array, ""], carried: _Carried) -> _Carried:
+        sums, factors = carried
+        more = harmonic(h).derivatives(factors)
+        # What the loop carries is computed once. Otherwise each sum would compute the factors anew.
+        return [a + b for a, b in zip(sums, more, strict=True)], harmonic(h + 1).factors()
+
+    # The loop begins with the last place, which has no amplitude.
+    one = nothing + 1.0
+    found, _ = jax.lax.fori_loop(-1, count, added, ([nothing] * 9, (one, (one, one, one), (one, one))))
+    sums = jnp.stack(found)
+    beside, by_periods = _beside(wire, rays, block.scaled)
+    whole = 1.0 + sums[0] + beside
+    by_ray = jnp.concatenate([sums[1:3] + by_periods, sums[3:5] + whole / rays.openings, sums[5:8]])
+    moved = jnp.concatenate(jax.jacfwd(_rays)(shape, mounted, block.ideal))
+    # The pupil acts on the harmonics alone.
+    by_shape = jnp.einsum("kn,knp->pn", by_ray, moved).at[6].add(sums[8])
+    return Derivatives(whole, rays.openings.prod(axis=0), by_shape)
+
+
+def _beside(wire: Wire, rays: Rays, scaled: Float[Arrayish, "n 2"]) -> tuple[Float[Array, " n"], Float[Array, "2 n"]]:
+    """Modulation by the first harmonics' amplitudes that no pupil explains, and its derivatives by periods."""
+    strongest, _, count_y, count_x = jnp.shape(wire.amplitudes)
+    in_x, in_y = legendre(scaled[:, 0], count_x), legendre(scaled[:, 1], count_y)
+    first = {name: getattr(wire, name)[:strongest] for name in ("harmonics", "frequency", "fields")}
+    some = replace(wire, **first)
+    cosine, sine = waves(some, rays.periods)
+    cos, sin = jnp.einsum("hpyx,yn,xn->phn", wire.amplitudes, in_y, in_x)
+    return (cos * cosine + sin * sine).sum(axis=0), 2 * jnp.pi * some.harmonics.T @ (sin * cosine - cos * sine)
+
+
+def _base(wire: Wire, opened: Float[np.ndarray, " n"], scaled: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
     """exp(B): the shading times the openings."""
     in_x, in_y = np.polynomial.legendre.legvander(scaled.T, len(wire.baseline) - 1)
-    return np.exp(((in_y @ wire.baseline) * in_x).sum(axis=1)) * rays.openings.prod(axis=0)
+    return np.exp(((in_y @ wire.baseline) * in_x).sum(axis=1)) * opened
+
+
+@jax.jit
+def _linear(
+    filled: _Filled, few: Int[Array, " few"], block: Pixels
+) -> tuple[Float[Array, "few 2 n"], Float[Array, "few 2 n"], Float[Array, "few degrees n"]]:
+    """Wave, carriers and powers of some harmonics: the factors of their linear coefficients."""
+    wire, shape, _ = filled
+    harmonic = _harmonics(wire, _rays(shape, wire.geometry.rotation_rad, block.ideal))
+
+    def factors(h: Int[Array, ""]) -> tuple[Float[Array, "2 n"], Float[Array, "2 n"], Float[Array, "degrees n"]]:
+        one = harmonic(h)
+        (kappa, pupil, wave), (slits, _) = one.factors(), one.slits()
+        return jnp.stack(wave), one.crossed() * slits[0] * slits[1] * jnp.stack(pupil[:2]), one.powers(kappa)
+
+    return jax.lax.map(factors, few)
 
 
 def expected_of(wire: Wire, gains: Float[np.ndarray, " sites"], pixels: Pixels) -> Float[np.ndarray, " n"]:
@@ -152,96 +295,29 @@ def weighed_at(parameters: Parameters, x: Float[np.ndarray, " n"], pixels: Pixel
     return weighed(pixels, expected_of(parameters.wire(x), parameters.gains(x), pixels), noise)
 
 
-def wire_derivatives(wire: Wire, block: Pixels) -> Derivatives:
-    """Values and derivatives at the pixels of one block."""
-    rays = rays_at(wire, block)
-    found = _of_groups(wire, rays, block.scaled)
-    sums = sum((one[0] for one in found), start=np.zeros((9, len(block.value))))
-    wave, carrier, powers = (
-        np.concatenate(parts, axis=1)[:, : len(wire.harmonics)]
-        for parts in zip(*(one[1:] for one in found), strict=True)
-    )
-    sums[0] += 1.0
-    sums[3:5] += sums[0] / rays.openings
-    moved = np.concatenate(_rays_by_shape(shape_vector(wire), np.asarray(wire.geometry.rotation_rad), block.ideal))
-    shape = np.einsum("kn,knp->pn", sums[1:8], moved)
-    # The pupil acts on the harmonics alone.
-    shape[6] += sums[8]
-    return Derivatives(sums[0], _base(wire, rays, block.scaled), shape, wave, carrier, powers)
-
-
-@jax.jit
-def _group_derivatives(
-    wire: Wire, rays: Rays, scaled: Float[Array, "n 2"]
-) -> tuple[Float[Array, "9 n"], Float[Array, "2 group n"], Float[Array, "2 group n"], Float[Array, "degrees group n"]]:
-    """Modulation and its derivatives by periods, openings, ellipse and log pupil; waves, carriers and powers."""
-    harmonics = jnp.asarray(wire.harmonics)
-    n, m = harmonics.T[..., None]
-    xx, xy, yy = jnp.asarray(rays.ellipse)
-    kappa = jnp.sqrt(n * n * xx + 2 * n * m * xy + m * m * yy)
-    z = jnp.pi * wire.footprint_per_pitch * kappa
-    j0, j1 = bessel_j0_j1(z)
-    g = 2.0 * j1 / z
-    second = 2.0 * (j0 - g)
-    # G, z G' and z (z G')' of the pupil's transform.
-    bessel = jnp.stack([g, second, -z * z * g - 2.0 * second])
-    powers = field_powers(wire, kappa, jnp.shape(wire.fields)[-1])
-    slit, slit_slope = slits(wire, jnp.asarray(rays.openings))
-    # Without the barrier the compiler computes the Bessel functions anew for every sum below.
-    wave, bessel, slit, slit_slope, powers, series = jax.lax.optimization_barrier(
-        (waves(wire, rays.periods), bessel, slit, slit_slope, powers, _series(wire, powers))
-    )
-    crossed = jnp.where((n != 0) & (m != 0), 0.5, 1.0)
-    both = crossed * slit[0] * slit[1]
-    free = bessel[0] * series[:, 0] + bessel[1] * series[:, 1]
-    size = both * free + _beside(wire, scaled)
-    by_periods = 2 * jnp.pi * harmonics.T @ (size[1] * wave[0] - size[0] * wave[1])
-    along = jnp.sum(free * wave, axis=0) * crossed
-    by_open = jnp.stack([jnp.sum(along * slit_slope[i] * slit[1 - i], axis=0) for i in (0, 1)])
-    by_log_z = both * jnp.sum((bessel[1] * series[:, 0] + bessel[2] * series[:, 1]) * wave, axis=0)
-    # The corrections to the pupil's transform are themselves series in kappa; P'_k = P'_(k-2) + (2 k - 1) P_(k-1).
-    bent = [jnp.zeros_like(powers[0]), jnp.ones_like(powers[0])]
-    for k in range(2, len(powers)):
-        bent.append(bent[k - 2] + (2 * k - 1) * powers[k - 1])
-    curved = _series(wire, jnp.stack(bent[: len(powers)])) / jnp.asarray(wire.frequency)[:, 1:]
-    by_kappa = by_log_z / kappa + both * jnp.sum((bessel[0] * curved[:, 0] + bessel[1] * curved[:, 1]) * wave, axis=0)
-    by_ellipse = jnp.stack([n * n / 2, n * m, m * m / 2])[..., 0] @ (by_kappa / kappa)
-    modulated, by_pupil = jnp.sum(size * wave, axis=(0, 1))[None], jnp.sum(by_log_z, axis=0)[None]
-    sums = jnp.concatenate([modulated, by_periods, by_open, by_ellipse, by_pupil])
-    return sums, wave, both * bessel[:2], powers
-
-
-def _series(wire: Wire, powers: Float[Array, "degrees harmonics n"]) -> Float[Array, "2 2 harmonics n"]:
-    """Sums of the field coefficients times the Legendre powers, by phase and carrier."""
-    fields = jnp.moveaxis(jnp.asarray(wire.fields), 0, -1)[..., None]
-    return sum((fields[:, :, d] * powers[d] for d in range(1, len(powers))), start=fields[:, :, 0] * powers[0])
-
-
-def _beside(wire: Wire, scaled: Float[Array, "n 2"]) -> Float[Array, "2 harmonics n"]:
-    """Amplitudes (cos, sin) that are polynomials over the sensor."""
-    strongest, _, count_y, count_x = jnp.shape(wire.amplitudes)
-    in_x, in_y = legendre(scaled[:, 0], count_x), legendre(scaled[:, 1], count_y)
-    some = jnp.einsum("hpyx,yn,xn->phn", jnp.asarray(wire.amplitudes), in_y, in_x)
-    return jnp.pad(some, ((0, 0), (0, jnp.shape(wire.harmonics)[0] - strongest), (0, 0)))
-
-
 def block_jacobian(
     parameters: Parameters, wire: Wire, block: Pixels
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.ndarray, "parameters n"]]:
     """1 + modulation, exp(B), and derivatives by the parameters relative to exp(B) and the gain, for one block."""
-    found = wire_derivatives(wire, block)
+    filled = _filled(wire)
+    whole, opened, by_shape = map(np.asarray, _derivatives(filled, block))
     in_x, in_y = np.polynomial.legendre.legvander(block.scaled.T, np.shape(wire.baseline)[0] - 1).transpose(0, 2, 1)
     # The baseline acts on everything: the change of exp(B) (1 + M), relative to exp(B), is (1 + M) dB.
     _, _, degree_y, degree_x = parameters.indices(Kind.SHADING)
-    rows = [in_y[degree_y] * in_x[degree_x] * found.whole]
+    rows = [in_y[degree_y] * in_x[degree_x] * whole]
     of_site = np.append(np.eye(parameters.sites - 1), -np.ones((parameters.sites - 1, 1)), axis=1)[:, block.site]
-    rows.append(of_site[parameters.indices(Kind.SITE)[0]] * found.whole)
-    harmonic, phase, degree_y, degree_x = parameters.indices(Kind.AMPLITUDE)
-    rows.append(found.wave[phase, harmonic] * in_y[degree_y] * in_x[degree_x])
-    harmonic, phase, carrier, degree = parameters.indices(Kind.FIELD)
-    rows.append(found.wave[phase, harmonic] * found.carrier[carrier, harmonic] * found.powers[degree, harmonic])
-    rows.append(found.shape[parameters.indices(Kind.SHAPE)[0]])
-    return found.whole, found.base, np.concatenate(rows)
+    rows.append(of_site[parameters.indices(Kind.SITE)[0]] * whole)
+    beside, free = parameters.indices(Kind.AMPLITUDE), parameters.indices(Kind.FIELD)
+    if linear := 1 + int(max(beside[0].max(initial=-1), free[0].max(initial=-1))):
+        firsts = np.arange(-(-linear // _FEW) * _FEW).reshape(-1, _FEW)
+        parts = (_linear(filled, few, block) for few in firsts)
+        wave, carrier, powers = (np.concatenate(part) for part in zip(*parts, strict=True))
+        harmonic, phase, degree_y, degree_x = beside
+        rows.append(wave[harmonic, phase] * in_y[degree_y] * in_x[degree_x])
+        harmonic, phase, kind, degree = free
+        rows.append(wave[harmonic, phase] * carrier[harmonic, kind] * powers[harmonic, degree])
+    rows.append(by_shape[parameters.indices(Kind.SHAPE)[0]])
+    return whole, _base(wire, opened, block.scaled), np.concatenate(rows)
 
 
 @final
@@ -274,19 +350,17 @@ class WireProblem:
         self, place: Float[np.ndarray, " n"]
     ) -> tuple[Float[np.ndarray, "n n"], Float[np.ndarray, "tiles n"], float]:
         """Information by the pixels' weights, the right side by tile, and chi-squared."""
-        wire, gains, size = self.parameters.wire(place), self.parameters.gains(place), len(place)
-        matrix, by_tile, chi2 = np.zeros((size, size)), np.zeros((TILES[0] * TILES[1], size)), 0.0
-        for block in self.pixels.blocks():
+        wire, gains, tiles = self.parameters.wire(place), self.parameters.gains(place), np.arange(TILES[0] * TILES[1])
+
+        def of(block: Pixels) -> tuple[Float[np.ndarray, "n n"], Float[np.ndarray, "tiles n"], float]:
             whole, base, rows = block_jacobian(self.parameters, wire, block)
             level, root = base * gains[block.site], np.sqrt(block.weight)
             errors, rows = (block.value - whole * level) * root, rows * (root * level)
-            matrix += rows @ rows.T
-            # A block is some rows of the sensor, which cross few of the tiles.
-            tile = tile_numbers(block.scaled)
-            crossed = np.unique(tile)
-            by_tile[crossed] += np.where(tile == crossed[:, None], errors, 0.0) @ rows.T
-            chi2 += float(errors @ errors)
-        return matrix, by_tile, chi2
+            by_tile = np.where(tile_numbers(block.scaled) == tiles[:, None], errors, 0.0) @ rows.T
+            return rows @ rows.T, by_tile, float(errors @ errors)
+
+        matrices, by_tile, chi2 = zip(*self.pixels.mapped(of), strict=True)
+        return np.sum(matrices, axis=0), np.sum(by_tile, axis=0), float(np.sum(chi2))
 
     def moved(self, place: Float[np.ndarray, " n"], step: Step) -> Float[np.ndarray, " n"]:
         """The place after a step."""

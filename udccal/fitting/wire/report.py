@@ -8,6 +8,7 @@ from typing import final
 
 import numpy as np
 from jaxtyping import Float, Float32, Int
+from scipy.spatial.transform import Rotation
 
 from udccal.fitting.engine.gaussian import Posterior
 from udccal.fitting.engine.misfit import NO_TEST, MisfitTest, chi2_test, excess_sigma, sharper
@@ -19,8 +20,7 @@ from udccal.fitting.wire.parameters import SHAPE_NAMES, Kind, Parameters, elemen
 from udccal.fitting.wire.rules import WireRules
 from udccal.fitting.wire.search import Descent, Found
 from udccal.fitting.wire.weak import Strengths
-from udccal.models.geometry import tilt_rad
-from udccal.models.wire import Wire, panel_rotation
+from udccal.models.wire import Wire
 from udccal.result import Diagnostic, Estimate, FitResult, FitStatus
 
 
@@ -123,8 +123,9 @@ def wire_result(
     outliers = seen.outliers(shape[1])
     drawn = np.flatnonzero(seen.pixels.weight > 0)
     few = seen.pixels.thinned(8 * BLOCK)
-    tilt = float(np.rad2deg(np.arcsin(np.clip(panel_rotation(term)[1, 2], -1.0, 1.0))))
-    nominal = float(np.rad2deg(tilt_rad(term.geometry)))
+    mounted = Rotation.from_rotvec(term.geometry.rotation_rad)
+    turned = Rotation.from_rotvec(term.rotation_rad) * mounted
+    tilt, nominal = (np.rad2deg(np.arcsin(np.clip(one.as_matrix()[1, 2], -1.0, 1.0))) for one in (turned, mounted))
     named, named_cov = _estimates(joint, cov) if panel else ((), np.zeros((0, 0)))
     diagnostics = (
         ("wire_map_rms_sigma", 100 * rms(map_sigma), "%"),
@@ -136,8 +137,8 @@ def wire_result(
         ("parameters", float(joint.parameters.linear), "1"),
         ("pixels_left_out", float(sum(one.count for one in outliers)), "1"),
         ("gain_in_chi2", joint.found.gain, "1"),
-        ("tilt_by_wire", tilt, "deg"),
-        ("tilt_by_wire_minus_geometry", tilt - nominal, "deg"),
+        ("tilt_by_wire", float(tilt), "deg"),
+        ("tilt_by_wire_minus_geometry", float(tilt - nominal), "deg"),
         ("iterations", float(joint.found.descent.solution.iterations + joint.last.solution.iterations), "1"),
     )
     return FitResult(
