@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from udccal.fitting.psf.data import HUBER, PsfData, PsfRules, Shots, held_out_positions
-from udccal.fitting.psf.image import Sources, make_windows
+from udccal.fitting.psf.image import make_windows
 from udccal.fitting.psf.kernel import Evaluator, fit_lattice, pack
 from udccal.fitting.psf.orders import Compared, compare
 from udccal.fitting.psf.problem import explain
@@ -53,7 +53,7 @@ def judge_psf(data: PsfData, result: FitResult[PsfField], limits: ValidationLimi
     shots = shots.pick(_some(shots))
     model_error = result.diagnostic("model_error") or 0.0
     found = _compared(term, shots, model_error, rules)
-    colours = found.relative_l2(shots.channel)
+    colours = found.relative_l2()
     total = found.variance + (model_error * found.left_out) ** 2
     z = np.where(found.known, found.residual / np.sqrt(total), 0.0)
     count = int(found.known.sum())
@@ -93,8 +93,7 @@ def _compared(term: PsfField, shots: Shots, model_error: float, rules: PsfRules)
     model = term.diffraction
     evaluator = Evaluator(np.asarray(model.wavelengths_nm), fit_lattice(shots.half), bool(model.visibility))
     error = max(model_error, rules.first_model_error)
-    own, explained = explain(evaluator, pack(model), shots, term.geometry, error)
-    sources = Sources(own[:, :2], own[:, 2:5], own[:, 5]).with_light_of_peak(shots, explained)
+    sources, explained = explain(evaluator, pack(model), shots, term.geometry, error)
     unit = (shots.positions_px() - np.asarray(term.centre_px)) / np.asarray(term.half_px)
     basis = np.asarray(polynomial_basis(unit, term.degree), dtype=np.float64)[shots.position]
     windows = make_windows(shots, sources, explained, basis, model_error)

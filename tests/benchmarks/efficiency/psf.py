@@ -22,7 +22,7 @@ from udccal.fitting.engine.information import cramer_rao
 from udccal.fitting.psf.data import PsfRules, Shots
 from udccal.fitting.psf.diffraction import fit_diffraction
 from udccal.fitting.psf.kernel import WAVELENGTHS_NM, Evaluator, fit_lattice, start_model, start_prior
-from udccal.fitting.psf.problem import DiffractionProblem, coefficients_of
+from udccal.fitting.psf.problem import DiffractionProblem, kernel_of
 from udccal.fitting.psf.samples import Samples, choose_samples, gather, sensor_variance, unit_light
 from udccal.numerics import in_float64
 from udccal.rig import load_rig
@@ -140,7 +140,7 @@ def _information(
     total = prior.precision
     chosen = gather(shots, scene.geometry, choose_samples(shots, rules))
     problem = DiffractionProblem(chosen, evaluator, prior).with_overlaps(theta)
-    kernels = coefficients_of(evaluator, theta, problem.samples)
+    kernels = [kernel_of(evaluator, theta, one) for one in problem.samples.each()]
     for position, kernel in enumerate(kernels):
         one = problem.samples.at(position)
         flux = np.stack([made[i].flux for i in one.index])

@@ -54,7 +54,8 @@ def compared_of(true_half: tuple[int, int], rng: np.random.Generator, background
     inside = (y <= true_half[0])[:, None] & (x <= true_half[1])
     sigma = np.hypot(1e-4, 2e-3 * light)
     residual = sigma * rng.standard_normal(light.shape) - light * ~inside + background
-    return Compared(residual, light, sigma**2, sigma**2, light, np.ones(light.shape, dtype=bool), 0.0)
+    known, channel = np.ones(light.shape, dtype=bool), np.zeros(light.shape, dtype=np.int64)
+    return Compared(residual, light, sigma**2, sigma**2, light, known, channel, np.ones(light.shape), 0.0)
 
 
 def test_the_right_window_is_chosen_in_95_of_100_runs() -> None:

@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float, Int
 
 from udccal.fitting.engine.orders import bic
 from udccal.fitting.engine.robust import Huber
+from udccal.result import FitStatus
 
 HUBER: Final = Huber()
 Crops = Float[np.ndarray, "shots rows columns"]
@@ -213,6 +214,18 @@ class PsfData:
     dark: int = 0
     clipped: int = 0
     doubted: tuple[str, ...] = ()
+
+    def unfit(self, rules: PsfRules) -> tuple[FitStatus, str] | None:
+        """Return why these data cannot be fitted, or None."""
+        most = 0.5 * max(self.taken, 1)
+        if self.clipped > most:
+            return FitStatus.SATURATED, f"{self.clipped} of {self.taken} pictures are clipped."
+        if self.dark > most:
+            return FitStatus.TOO_DARK, f"{self.dark} of {self.taken} pictures show no LED."
+        if self.shots is not None and self.shots.positions < rules.least_positions:
+            needed = f"{rules.least_positions} are needed at least."
+            return FitStatus.TOO_FEW_DATA, f"{self.shots.positions} field positions were captured; {needed}"
+        return None
 
 
 def left_out(light: Float[np.ndarray, "*shots n"], model_error: float) -> Float[np.ndarray, "*shots n"]:

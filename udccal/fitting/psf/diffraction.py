@@ -6,6 +6,7 @@ Each round is a descent with fixed weights. Between rounds the weights follow th
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import final
 
 import numpy as np
@@ -17,11 +18,14 @@ from udccal.fitting.engine.least_squares import LOG, Blocks, Solution, SolverRul
 from udccal.fitting.engine.misfit import clustered_cov
 from udccal.fitting.engine.orders import Attempt, Choice, bic, choose
 from udccal.fitting.engine.robust import OutlierRule, outliers
+from udccal.fitting.engine.workers import beside, each
 from udccal.fitting.psf.data import HUBER, PsfRules, Shots, estimate_model_error, left_out
 from udccal.fitting.psf.kernel import FOOTPRINT, Evaluator, fit_lattice
-from udccal.fitting.psf.problem import DiffractionProblem, Place, coefficients_of
+from udccal.fitting.psf.problem import DiffractionProblem, Place, kernel_of, slopes
 from udccal.fitting.psf.samples import (
+    OWN,
     Lights,
+    Own,
     Owns,
     Samples,
     Theta,
@@ -144,8 +148,14 @@ def fit_diffraction(
 def _approach(problem: DiffractionProblem, rules: PsfRules) -> Solution[Place, Blocks]:
     """Go from the prior's mean until a step gains a thousandth of the cost; weights are by the data."""
     theta, problem = problem.prior.mean, replace(problem, samples=weighed(problem.samples, rules.first_model_error))
-    coefficients = coefficients_of(problem.evaluator, theta, problem.samples)
-    own = start_own(problem.evaluator, problem.samples, coefficients)
+
+    def start(one: Samples) -> Own:
+        return start_own(problem.evaluator, one, kernel_of(problem.evaluator, theta, one))
+
+    one = problem.samples.at(0)
+    # Derivatives take longest to compile.
+    with beside(partial(slopes, problem.evaluator, theta, one, np.zeros((len(one.index), OWN)))):
+        own = np.stack(each(start, problem.samples.each()))
     return minimise(problem, problem.at(theta, own), _solver(1e-3 * problem.used, rules.iterations))
 
 
@@ -157,12 +167,12 @@ def _refine(
     The last round moves no parameter by a tenth of a sigma. Descents go to a hundredth of chi-squared once a change of
     weights has little effect.
     """
-    whole, enough = None, 1.0
+    whole, enough, damping = None, 1.0, 1e6
     problem = problem.about(theta, own)
     place = problem.at(theta, own)
     for _ in range(15):
         problem, model_error, found = _reweighed(problem, place, rules)
-        solution = minimise(problem, place, _solver(enough, rules.iterations - iterations))
+        solution = minimise(problem, place, _solver(enough, rules.iterations - iterations, damping))
         iterations += solution.iterations
         change = solution.place.theta - place.theta
         moved = float(np.sqrt(change @ solution.equations.marginal()[0] @ change))
@@ -173,7 +183,8 @@ def _refine(
             return whole or fit
         if enough < 1.0 and moved < 0.1:
             return fit
-        whole, place, enough = fit, solution.place, 1e-2 if moved < 1.0 else 1.0
+        # So near, a step that does not succeed shows the end of what the derivatives can tell.
+        whole, place, (enough, damping) = fit, solution.place, (1e-2, 1.0) if moved < 1.0 else (1.0, 1e6)
         # A change of less than a sigma is small enough for the interference set up before, of five for its derivatives.
         if moved >= 1.0:
             problem = problem.about(place.theta, place.own, moved < 5.0)
@@ -182,9 +193,9 @@ def _refine(
     return replace(fit, solution=replace(fit.solution, converged=False))
 
 
-def _solver(enough: float, iterations: int) -> SolverRules:
+def _solver(enough: float, iterations: int, most_damping: float = 1e6) -> SolverRules:
     # Derivatives are sums over a lattice, whose errors predict a small gain without end.
-    return SolverRules(enough, stalled_gain=0.05, iterations=iterations, first_damping=1e-2, most_damping=1e6)
+    return SolverRules(enough, stalled_gain=0.05, iterations=iterations, first_damping=1e-2, most_damping=most_damping)
 
 
 def _reweighed(
@@ -285,15 +296,13 @@ def pattern_p_value(samples: Samples, z: Lights) -> float:
     ``z`` is data less expectation, in units of sigma.
     """
     z = np.clip(z, -HUBER.sigma, HUBER.sigma)
-    cell = np.concatenate([np.floor(samples.points), samples.colour.argmax(axis=-1)[..., None]], axis=-1).astype(
-        np.int64
-    )
-    position = np.broadcast_to(np.arange(len(z))[:, None, None, None], (*z.shape, 1))
-    number = np.unique(np.concatenate([position, cell], axis=-1).reshape(-1, 4), axis=0, return_inverse=True)[1]
-    shot = np.broadcast_to(np.arange(z.shape[1])[:, None], z.shape).ravel()
-    sums, squares = (np.zeros((int(number.max()) + 1, z.shape[1])) for _ in range(2))
-    np.add.at(sums, (number.reshape(-1), shot), z.ravel())
-    np.add.at(squares, (number.reshape(-1), shot), z.ravel() ** 2)
+    position, shot = (number[..., None] for number in np.ogrid[: len(z), : z.shape[1]])
+    place = np.broadcast_to(position, z.shape), *np.moveaxis(np.floor(samples.points), -1, 0)
+    cells = np.stack([*place, samples.colour.argmax(axis=-1)], axis=-1).reshape(-1, 4)
+    number = np.unique(cells, axis=0, return_inverse=True)[1].reshape(z.shape)
+    pair = (number * z.shape[1] + shot).ravel()
+    sums, squares = (np.bincount(pair, part.ravel(), (number.max() + 1) * z.shape[1]) for part in (z, z**2))
     # Only pairs of different pictures count.
-    total, variance = (float((part.sum(axis=1) ** 2 - (part**2).sum(axis=1)).sum()) / 2.0 for part in (sums, squares))
+    by_cell = (part.reshape(-1, z.shape[1]) for part in (sums, squares))
+    total, variance = (float((part.sum(axis=1) ** 2 - (part**2).sum(axis=1)).sum()) / 2.0 for part in by_cell)
     return float(ndtr(-total / np.sqrt(variance))) if variance > 0 else 1.0

@@ -6,17 +6,19 @@ coefficients may be added to it or replace it. Positions held out decide whether
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from typing import Final
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from scipy.linalg import block_diag
 
 from udccal.fitting.engine.gaussian import Posterior, square_root
 from udccal.fitting.engine.misfit import SIGNIFICANT
 from udccal.fitting.engine.report import estimates, priors_of, residual_sample
+from udccal.fitting.engine.workers import beside
 from udccal.fitting.psf.data import PsfData, PsfRules, Shots, about_middle, held_out_positions
 from udccal.fitting.psf.diffraction import DiffractionFit, efficiency, fit_diffraction, kernel_sigma, pattern_p_value
 from udccal.fitting.psf.held_out import (
@@ -31,10 +33,21 @@ from udccal.fitting.psf.held_out import (
     wide_support,
     with_support,
 )
-from udccal.fitting.psf.image import Sources
-from udccal.fitting.psf.kernel import BLUR, PITCH, as_numpy, pitch_tolerance, start_model, start_prior
+from udccal.fitting.psf.kernel import (
+    BLUR,
+    PITCH,
+    Evaluator,
+    as_numpy,
+    fit_lattice,
+    pack,
+    pitch_tolerance,
+    start_model,
+    start_prior,
+)
 from udccal.fitting.psf.orders import Selection, select_field
 from udccal.fitting.psf.problem import explain
+from udccal.fitting.psf.samples import some_shots
+from udccal.kernels import kernel_size, kernels_at
 from udccal.models.diffraction import Diffraction
 from udccal.models.geometry import Geometry
 from udccal.models.psf import PsfField, fine_oversample
@@ -74,11 +87,11 @@ def fit_psf(
     if unfit is not None or data.shots is None:
         status, note = unfit or (FitStatus.TOO_FEW_DATA, "No field position was captured.")
         return FitResult.failed("psf", _field(start, geometry), status, note)
-    shots = data.shots.within(rules.half_px)
-    fit = fit_diffraction(shots.pick(some_shots(shots, rules)), geometry, start, start_prior(rig, start, rules), rules)
+    shots, prior = data.shots.within(rules.half_px), start_prior(rig, start, rules)
+    with beside(*_needed_later(data.shots, shots, geometry, start, rig, rules)):
+        fit = fit_diffraction(shots.pick(some_shots(shots, rules)), geometry, start, prior, rules)
     error = max(fit.model_error, rules.first_model_error)
-    own, explained = explain(fit.problem.evaluator, fit.theta, shots, geometry, error)
-    sources = Sources(own[:, :2], own[:, 2:5], own[:, 5]).with_light_of_peak(shots, explained)
+    sources, explained = explain(fit.problem.evaluator, fit.theta, shots, geometry, error)
     size = np.array([rig.camera.columns - 1, rig.camera.rows - 1]) / 2.0
     selection = select_field(shots, sources, explained, (shots.positions_px() - size) / size, fit.model_error, rules)
     order, support = selection.trial.order, choose_support(selection.trial.compared)
@@ -99,6 +112,19 @@ def fit_psf(
     return _report(data, shots, fit, selection, support, with_support(term, support, rig), rig, rules)
 
 
+def _needed_later(
+    wide: Shots, shots: Shots, geometry: Geometry, start: Diffraction, rig: RigDescription, rules: PsfRules
+) -> list[Callable[[], object]]:
+    """Return calls that compile what follows the fit of diffraction: kernels of a profile's size, and whole crops."""
+    evaluator = Evaluator(np.asarray(start.wavelengths_nm), fit_lattice(shots.half), bool(start.visibility))
+    later: list[Callable[[], object]] = []
+    if wide.half != shots.half:
+        later.append(partial(kernels_at, _field(start, geometry), shots.centre_px[:1], *kernel_size(rig)))
+    if shots.half != rules.close(shots.half):
+        later.append(partial(explain, evaluator, pack(start), shots.pick(np.array([0])), geometry, 0.0))
+    return later
+
+
 def nominal_psf(rig: RigDescription, geometry: Geometry, wire: Wire) -> PsfField:
     """Return the term that the fit starts from: diffraction by the panel of the rig's description and of the wire.
 
@@ -110,28 +136,10 @@ def nominal_psf(rig: RigDescription, geometry: Geometry, wire: Wire) -> PsfField
     return _field(start_model(rig, geometry, wire), geometry)
 
 
-def some_shots(shots: Shots, rules: PsfRules) -> Bool[np.ndarray, " shots"]:
-    """Choose shots for the fit of diffraction, evenly over the positions not held out and over their shifts."""
-
-    def spread(items: np.ndarray, most: int) -> np.ndarray:
-        return items[np.unique(np.linspace(0, len(items) - 1, most).round().astype(int))]
-
-    keep = np.zeros(shots.count, dtype=bool)
-    for place in spread(np.flatnonzero(~held_out_positions(shots.positions)), rules.positions):
-        keep[spread(np.flatnonzero(shots.position == place), rules.shifts)] = True
-    return keep
-
-
 def _unfit(data: PsfData, rig: RigDescription, rules: PsfRules) -> tuple[FitStatus, str] | None:
     """Return why there can be no fit, or None."""
-    most = 0.5 * max(data.taken, 1)
-    if data.clipped > most:
-        return FitStatus.SATURATED, f"{data.clipped} of {data.taken} pictures are clipped."
-    if data.dark > most:
-        return FitStatus.TOO_DARK, f"{data.dark} of {data.taken} pictures show no LED."
-    if data.shots is not None and data.shots.positions < rules.least_positions:
-        needed = f"{rules.least_positions} are needed at least."
-        return FitStatus.TOO_FEW_DATA, f"{data.shots.positions} field positions were captured; {needed}"
+    if unfit := data.unfit(rules):
+        return unfit
     if pitch_tolerance(rig) > rules.pitch_least_known:
         pitch = rig.panel.pitch_mm
         known = f"The panel's pitch is {pitch.value:g} ± {pitch.tolerance:g} mm in the rig's description."
@@ -166,10 +174,8 @@ def _report(
     rules: PsfRules,
 ) -> FitResult[PsfField]:
     trial, diffracts = selection.trial, not selection.trial.order.free
-    channel = shots.channel[selection.test]
-    held_out_l2, held_out = trial.compared.relative_l2(channel), trial.compared.errors()
-    shown = selection.shown
-    error = kernel_error(selection.everywhere, shots.channel[shown], trial.sources.pick(shown), rules)
+    held_out_l2, held_out = trial.compared.relative_l2(), trial.compared.errors()
+    error = kernel_error(selection.everywhere, rules)
     worst, status = float(np.sqrt((held_out_l2**2).mean())), FitStatus.CONVERGED
     if not np.isfinite(worst) or worst > rules.poor:
         status = FitStatus.POOR_FIT

@@ -101,17 +101,14 @@ def estimate_kernel_error(
     return of(found.x) if worth else KernelError(0.0)
 
 
-def kernel_error(
-    found: Compared, channel: Int[np.ndarray, "shots rows columns"], sources: Sources, rules: PsfRules
-) -> KernelError:
+def kernel_error(found: Compared, rules: PsfRules) -> KernelError:
     """Estimate the kernel's error without noise, from samples that it has not used."""
-    flux = np.take_along_axis(np.abs(sources.flux), channel.reshape(len(channel), -1), axis=1).reshape(channel.shape)
+    flux, channel = np.abs(found.flux), found.channel
     unit = found.light / np.maximum(flux, 1e-300) * found.known
     # Pictures sample the peak at different fractions of a pixel: the largest sample is nearest to it.
     full = flux * np.array([unit[channel == colour].max(initial=1e-300) for colour in range(3)])[channel]
     seen = found.known & (full > 0)
-    full = full[seen]
-    picture = (3 * np.arange(len(channel))[:, None, None] + channel)[seen]
+    full, picture = full[seen], (3 * np.arange(len(channel))[:, None, None] + channel)[seen]
     return estimate_kernel_error(
         found.residual[seen] / full, found.variance[seen] / full**2, found.light[seen] / full, picture, rules
     )

@@ -15,14 +15,13 @@ whose variables separate", 1973).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Final, final
 
 import numpy as np
-import scipy.linalg
 import scipy.ndimage
 import scipy.sparse.linalg
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from udccal.fitting.psf.data import Crops, PsfRules, Shots, left_out, noise_at
 
@@ -60,7 +59,7 @@ class Windows:
         basis: polynomials at each shot's position.
         down, across: from nodes to samples, along columns and along rows: shift and disc.
         flux: light of each sample's own colour, 0 where nothing is known.
-        colour: one-hot.
+        channel: each sample's colour: 0, 1, 2 for R, G, B.
         explained: light of each sample by diffraction, per unit of the LED's light.
         rate: e-/s without background.
         left_out: standard deviation of the rate that a model error of 1 would add; see ``data.left_out``.
@@ -71,7 +70,7 @@ class Windows:
     down: Float[np.ndarray, "shots rows node_rows"]
     across: Float[np.ndarray, "shots columns node_columns"]
     flux: Float[np.ndarray, "shots rows columns"]
-    colour: Float[np.ndarray, "shots rows columns 3"]
+    channel: Int[np.ndarray, "shots rows columns"]
     explained: Float[np.ndarray, "shots rows columns"]
     rate: Float[np.ndarray, "shots rows columns"]
     left_out: Float[np.ndarray, "shots rows columns"]
@@ -79,7 +78,7 @@ class Windows:
 
     def pick(self, keep: np.ndarray) -> Windows:
         """The shots selected by an index or mask."""
-        return Windows(*(getattr(self, field.name)[keep] for field in fields(self)))
+        return Windows(*(part[keep] for part in vars(self).values()))
 
     def expected(self, free: bool, image: Image) -> Crops:
         """Return each sample's light in e-/s, by an image, and by diffraction unless the image is ``free``."""
@@ -100,9 +99,8 @@ def make_windows(
     ``model_error``, relative to the peak, adds to the data's noise. The image has ``per_px`` nodes to a pixel, the
     first and last on the first and last pixels.
     """
-    colour, known = shots.colour, shots.weight > 0
-    rate = shots.rate - sources.background[:, None, None]
-    flux = np.einsum("syxc,sc->syx", colour, sources.flux)
+    known, rate = shots.weight > 0, shots.rate - sources.background[:, None, None]
+    flux = sources.flux[np.arange(shots.count)[:, None, None], shots.channel]
     smooth = np.maximum(scipy.ndimage.uniform_filter(np.abs(rate), (0, 3, 3)), np.abs(flux * explained))
     unexplained = left_out(smooth.reshape(shots.count, -1), 1.0).reshape(smooth.shape)
     measured = 1.0 / np.where(known, shots.weight, 1.0)
@@ -113,7 +111,7 @@ def make_windows(
         down=shifts(y, shots.disc_px, shots.rate.shape[1], per_px),
         across=shifts(x, shots.disc_px, shots.rate.shape[2], per_px),
         flux=flux * known,
-        colour=colour,
+        channel=shots.channel,
         explained=explained,
         rate=rate * known,
         left_out=unexplained,
@@ -156,13 +154,16 @@ def predict(windows: Windows, image: Image) -> Crops:
     """Return each sample's light by an image, per unit of the LED's light."""
     of_shots = np.tensordot(windows.basis[:, : len(image)], image, 1)
     moved = windows.down[:, None] @ of_shots @ np.swapaxes(windows.across, 1, 2)[:, None]
-    return np.einsum("scyx,syxc->syx", moved, windows.colour)
+    return np.take_along_axis(moved, windows.channel[:, None], axis=1)[:, 0]
+
+
+def _by_colour(windows: Windows, light: Crops) -> Float[np.ndarray, "shots 3 rows columns"]:
+    return light[:, None] * (windows.channel[:, None] == np.arange(3)[:, None, None])
 
 
 def _gathered(windows: Windows, light: Crops, terms: int) -> Image:
     """Return the transpose of ``predict``."""
-    by_colour = np.moveaxis(light[..., None] * windows.colour, -1, 1)
-    moved = np.swapaxes(windows.down, 1, 2)[:, None] @ by_colour @ windows.across[:, None]
+    moved = np.swapaxes(windows.down, 1, 2)[:, None] @ _by_colour(windows, light) @ windows.across[:, None]
     return np.tensordot(windows.basis[:, :terms].T, moved, 1)
 
 
@@ -236,12 +237,10 @@ def image_of(scaled: Image, sigma: Image, free: bool) -> Image:
 
 
 def smoothed(image: Image, free: bool) -> Image:
-    """Smooth an image by a Gaussian of one node where it is free."""
+    """Smooth an image by a Gaussian of one node where it is free; the smoothing is its own transpose."""
     if not free:
         return image
-    taps = [np.where(np.arange(n) <= 4, np.exp(-0.5 * np.arange(n) ** 2.0), 0.0) for n in image.shape[-2:]]
-    down, across = (scipy.linalg.toeplitz(half) / (2.0 * half.sum() - 1.0) for half in taps)
-    return down @ image @ across
+    return np.asarray(scipy.ndimage.gaussian_filter(image, 1.0, mode="constant", axes=(-2, -1)))
 
 
 def free_sources(
@@ -260,18 +259,17 @@ def free_sources(
     start = Sources(shots.centre_px, light / np.maximum(covered, 1e-6), np.zeros(shots.count))
     nothing = np.zeros_like(shots.rate)
     sigma = np.tile(prior_sigma(magnitude, 1.0, FREE_PER_PX), (terms, 1, 1, 1))
-    sources, changed = start, np.zeros((shots.count, 5))
-    windows = make_windows(shots, sources, nothing, basis, rules.free_model_error, FREE_PER_PX)
-    scaled, _ = solve_image(windows, sigma, True, np.zeros_like(sigma))
-    for _ in range(2):
-        moves = _moves(shots, sources, windows, image_of(scaled, sigma, True), changed, rules)
+    sources, changed, scaled = start, np.zeros((shots.count, 5)), np.zeros_like(sigma)
+    for moving in (False, True, True):
+        windows = make_windows(shots, sources, nothing, basis, rules.free_model_error, FREE_PER_PX)
+        image = image_of(scaled, sigma, True)
+        moves = _moves(shots, sources, windows, image, changed, rules) if moving else None
         scaled, found = solve_image(windows, sigma, True, scaled, moves)
         # A change of the image has the same effect as a change common to the shots of a position.
         mean = np.stack([found[shots.position == g].mean(axis=0) for g in range(shots.positions)])
         # Places and light change by less than this (px; relative).
         changed = np.clip(found - mean[shots.position], -0.7, 0.7)
         sources = replace(start, place_px=start.place_px + changed[:, :2], flux=start.flux * (1.0 + changed[:, 2:]))
-        windows = make_windows(shots, sources, nothing, basis, rules.free_model_error, FREE_PER_PX)
     return sources
 
 
@@ -293,6 +291,5 @@ def _moves(
 
     h = 0.05
     by_place = [(at(h, 0.0) - at(-h, 0.0)) / (2 * h), (at(0.0, h) - at(0.0, -h)) / (2 * h)]
-    light = np.moveaxis(at(0.0, 0.0)[..., None] * windows.colour, -1, 1)
-    design = np.concatenate([np.stack(by_place, 1), light], 1) * windows.flux[:, None]
+    design = np.concatenate([np.stack(by_place, 1), _by_colour(windows, at(0.0, 0.0))], 1) * windows.flux[:, None]
     return Moves(design, changed, np.repeat(rules.own_sigma, (2, 3)))

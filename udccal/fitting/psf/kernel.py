@@ -8,7 +8,6 @@ serves all colours and all their derivatives.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Final, final
 
 import equinox as eqx
@@ -161,9 +160,11 @@ def kernel_jacobian(
     spectra = jnp.asarray(model.spectrum)
     fx, fy = lattice_frequencies(frame, lattice)
     slits = _slits(model, frame, fx, fy)
-    pupils, by_pupil = _with_derivative(
+    pupil_mm = jnp.asarray(model.pupil_diameter_mm)
+    pupils, by_pupil = jax.jvp(
         lambda mm: pupil_overlaps(eqx.tree_at(lambda m: m.pupil_diameter_mm, model, mm), frame, lattice),
-        model.pupil_diameter_mm,
+        (pupil_mm,),
+        (jnp.ones_like(pupil_mm),),
     )
     variance = blur_variance(model, frame)
     sensor, along = jax.linearize(lambda at: sensor_transfer(frame, fx, fy, at, disc_px), variance)
@@ -222,12 +223,6 @@ def _slits(
         jnp.moveaxis(jnp.concatenate([own[None], by]), -1, 0) for own, by in zip(value, derivatives, strict=True)
     )
     return columns, rows
-
-
-def _with_derivative(of: Callable[[Array], Array], at: Float[Arrayish, ""]) -> tuple[Array, Array]:
-    number = jnp.asarray(at)
-    value, derivative = jax.jvp(of, (number,), (jnp.ones_like(number),))
-    return value, derivative
 
 
 def as_numpy(model: Diffraction) -> Diffraction:

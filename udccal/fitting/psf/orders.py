@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import final
@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from udccal.fitting.engine.orders import Attempt, Choice, choose, held_out_beats, rising
+from udccal.fitting.engine.workers import each
 from udccal.fitting.psf.data import (
     HUBER,
     Crops,
@@ -46,6 +47,7 @@ class Compared:
         measured, variance: variance of the sensor's noise, as measured, and at the expected light.
         left_out: standard deviation that a model error of 1 would add.
         known: True for samples that were measured.
+        channel: each sample's colour; flux: the LED's light in that colour, in e-/s.
         model_error: the one of greatest likelihood for the residuals.
     """
 
@@ -55,6 +57,8 @@ class Compared:
     variance: Crops
     left_out: Crops
     known: Bool[np.ndarray, "shots rows columns"]
+    channel: Int[np.ndarray, "shots rows columns"]
+    flux: Crops
     model_error: float
 
     @property
@@ -66,10 +70,10 @@ class Compared:
         """Errors of all samples, in units of their sigma."""
         return (self.residual / np.sqrt(self.total))[self.known]
 
-    def relative_l2(self, channel: Int[np.ndarray, "shots rows columns"]) -> Float[np.ndarray, "3"]:
+    def relative_l2(self) -> Float[np.ndarray, "3"]:
         """Return the expectation's error by colour, which includes the data's own noise."""
-        squares = ((part**2)[self.known] for part in (self.residual, self.light))
-        error, light = (np.bincount(channel[self.known], square, 3) for square in squares)
+        channel = self.channel[self.known]
+        error, light = (np.bincount(channel, part[self.known] ** 2, 3) for part in (self.residual, self.light))
         return np.sqrt(error / np.maximum(light, 1e-30))
 
     def loss(self, position: Int[np.ndarray, " shots"]) -> Float[np.ndarray, " places"]:
@@ -90,7 +94,9 @@ def compare(shots: Shots, windows: Windows, light: Crops) -> Compared:
     variance = noise_at(light, windows.rate, measured, shots.noise_per_rate)
     # All orders have the same deviation here; it is above 0 where one of them expects no light.
     model_error = estimate_model_error(residual[known], variance[known], windows.left_out[known], 0)
-    return Compared(residual, light, measured, variance, windows.left_out, known, model_error)
+    return Compared(
+        residual, light, measured, variance, windows.left_out, known, windows.channel, windows.flux, model_error
+    )
 
 
 @final
@@ -157,18 +163,14 @@ class Selection:
         trial: the chosen one of the ``candidates``.
         image: the residual on pixels, as wide as its order; a single zero for none.
         magnitude: the kernel's average size.
-        test: which shots were held out.
         everywhere: all shots by diffraction alone, or those held out where a residual has used the others.
-        shown: which shots these are.
     """
 
     trial: Trial
     candidates: tuple[Candidate, ...]
     image: Float[np.ndarray, "terms 3 rows columns"]
     magnitude: Float[np.ndarray, "3 window_rows window_columns"]
-    test: Bool[np.ndarray, " shots"]
     everywhere: Compared
-    shown: Bool[np.ndarray, " shots"]
 
 
 @final
@@ -204,7 +206,7 @@ class _Orders:
         return about_middle(image, order.half_px(self.shots.half))
 
     def rising(
-        self, sources: Sources, free: bool, sizes: Sequence[float], allowed: float, first: tuple[Attempt[Trial], ...]
+        self, sources: Sources, free: bool, sizes: Sequence[float], allowed: float
     ) -> tuple[Attempt[Trial], ...]:
         """Try rising degrees while they help, each with its best size; see ``engine.orders.rising``.
 
@@ -214,14 +216,13 @@ class _Orders:
         allowances = [allowed]
 
         def attempt(degree: int) -> Attempt[Trial]:
-            orders = (Order(degree, free, size, allowances[-1]) for size in sizes)
-            best = choose(self.attempt(sources, order) for order in orders).best
+            orders = (Order(degree, free, size, allowances[-1]) for size in (sizes if degree >= 0 else (0.0,)))
+            best = choose(each(partial(self.attempt, sources), orders)).best
             allowances.append(best.fit.compared.model_error)
             return best
 
-        degrees = [d for d in range(self.rules.highest_degree + 1) if polynomial_terms(d) <= positions]
-        tried: list[Callable[[], Attempt[Trial]]] = [partial(lambda one: one, one) for one in first]
-        return rising([*tried, *(partial(attempt, degree) for degree in degrees)], self.beats)
+        degrees = range(0 if free else -1, self.rules.highest_degree + 1)
+        return rising([partial(attempt, d) for d in degrees if polynomial_terms(d) <= positions], self.beats)
 
     def beats(self, one: Attempt[Trial], other: Attempt[Trial]) -> bool:
         """Return whether ``one`` lowers the held-out loss by more than it costs."""
@@ -268,27 +269,24 @@ def select_field(
     test = held_out_positions(shots.positions)[shots.position]
     basis = np.asarray(polynomial_basis(unit_positions, rules.highest_degree))[shots.position]
     orders = _Orders(shots, explained, basis, magnitude, test, rules)
-    plain = orders.attempt(sources, Order(-1, False, 0.0, model_error))
-    tried = orders.rising(sources, False, rules.residual_sizes, plain.fit.compared.model_error, (plain,))
-    if np.sqrt((plain.fit.compared.relative_l2(shots.channel[test]) ** 2).mean()) > rules.doubtful:
+    tried = orders.rising(sources, False, rules.residual_sizes, model_error)
+    if np.sqrt((tried[0].fit.compared.relative_l2() ** 2).mean()) > rules.doubtful:
         # Places and light by an image of too low a degree take a part of what it lacks.
         terms = [polynomial_terms(degree) for degree in range(rules.highest_degree + 1)]
         most = max(count for count in terms if 2 * count <= max(shots.positions, 2))
         free = free_sources(shots, basis, most, magnitude, rules)
-        tried += orders.rising(free, True, (1.0,), rules.free_model_error, ())
+        tried += orders.rising(free, True, (1.0,), rules.free_model_error)
     best = tried[0]
     for attempt in tried[1:]:
         best = attempt if orders.beats(attempt, best) else best
     if best.fit.order.degree >= 0 and not best.fit.order.free:
         narrower = orders.narrowed(best)
         tried, best = (*tried, *(one for one in narrower if one is not best)), narrower[-1]
-    # Diffraction has few parameters: the shots that it was fitted to show its error as well as others do.
-    alone = best.fit.order.degree < 0
-    shown = test | alone
-    everywhere = orders.compared(best.fit.sources, best.fit.order, shown) if alone else best.fit.compared
-    return Selection(
-        best.fit, Choice(best, tried).candidates, orders.image(best.fit), magnitude, test, everywhere, shown
-    )
+    everywhere = best.fit.compared
+    if best.fit.order.degree < 0:
+        # Diffraction has few parameters: the shots that it was fitted to show its error as well as others do.
+        everywhere = orders.compared(best.fit.sources, best.fit.order, np.ones_like(test))
+    return Selection(best.fit, Choice(best, tried).candidates, orders.image(best.fit), magnitude, everywhere)
 
 
 def _mean_kernel(shots: Shots, sources: Sources) -> Float[np.ndarray, "3 rows columns"]:

@@ -15,7 +15,9 @@ from scipy.special import softmax
 
 from udccal.fitting.engine.gaussian import Prior, scaled_inverse
 from udccal.fitting.engine.least_squares import Blocks, Step
+from udccal.fitting.engine.workers import each
 from udccal.fitting.psf.data import HUBER, Crops, Shots
+from udccal.fitting.psf.image import Sources
 from udccal.fitting.psf.kernel import (
     FOOTPRINT,
     HEAD,
@@ -44,7 +46,6 @@ from udccal.fitting.psf.samples import (
     unit_light,
     weighed,
 )
-from udccal.models.arrays import Arrayish
 from udccal.models.geometry import Geometry
 
 # Overlaps of the pupil's footprint change with these parameters.
@@ -94,16 +95,15 @@ class DiffractionProblem:
 
     def at(self, theta: Theta, own: Owns, near: Place | None = None) -> Place:
         """Return the place of these parameters, with the derivatives of a place ``near`` it, or with its own."""
-        evaluator, kernels = self.evaluator, coefficients_of(self.evaluator, theta, self.samples)
-        parts = list(zip(self.samples.each(), own, kernels, strict=True))
-        here = [unit_light(evaluator, one, its[:, :2], kernel) for one, its, kernel in parts]
-        changed = [_changed(one, theta) for one in self.samples.each()]
-        light = (np.stack(here) + np.stack(changed)) * flux_of(self.samples, own)
+
+        def lit(part: tuple[Samples, Own]) -> tuple[np.ndarray, ...]:
+            return _lit(self.evaluator, theta, *part, near is None)
+
+        parts = each(lit, zip(self.samples.each(), own, strict=True))
+        light, *derivatives = (np.stack(one) for one in zip(*parts, strict=True))
         if near is not None:
-            return Place(theta, own, light, near.by_theta, near.by_own)
-        by_theta = np.stack([_slopes(evaluator, theta, one, its) for one, its, _ in parts])
-        by_own = [own_slopes(evaluator, *part, *lit) for part, *lit in zip(parts, here, changed, strict=True)]
-        return Place(theta, own, light, by_theta, np.stack(by_own))
+            derivatives = [near.by_theta, near.by_own]
+        return Place(theta, own, light, *derivatives)
 
     def by_position(self, place: Place) -> list[Blocks]:
         """Return each position's part of the Gauss-Newton equations with Huber's weights, without the prior."""
@@ -145,26 +145,36 @@ class DiffractionProblem:
 
     def with_overlaps(self, theta: Float[np.ndarray, " p"]) -> DiffractionProblem:
         """Set the overlaps to those of ``theta``: they hardly change in a descent."""
-        overlaps = [overlaps_of(self.evaluator, theta, one.frame) for one in self.samples.each()]
-        return replace(self, samples=replace(self.samples, overlaps=np.stack(overlaps)))
+
+        def overlaps(one: Samples) -> np.ndarray:
+            return np.asarray(overlaps_of(self.evaluator, theta, one.frame))
+
+        return replace(self, samples=replace(self.samples, overlaps=np.stack(each(overlaps, self.samples.each()))))
 
     def about(self, theta: Theta, own: Owns, near: bool = False) -> DiffractionProblem:
         """Set interference up about these parameters; ``near`` the last ones, derivatives by overlaps stay."""
-        problem = self.with_overlaps(theta)
         if not self.evaluator.interference:
-            return problem
-        parts = [(self.evaluator, theta, *part) for part in zip(problem.samples.each(), own[..., :2], strict=True)]
-        changed = {
-            "correction": np.stack([_correction(*part) for part in parts]),
-            "by_overlaps": self.samples.by_overlaps if near else np.stack([_by_overlaps(*part) for part in parts]),
-            "overlaps_at": np.tile(theta[_IN_OVERLAPS], (len(own), 1)),
-        }
-        return replace(problem, samples=replace(problem.samples, **changed))
+            return self.with_overlaps(theta)
+
+        def set_up(part: tuple[Samples, Own]) -> Samples:
+            return _set_up(self.evaluator, theta, *part, near)
+
+        made = each(set_up, zip(self.samples.each(), own[..., :2], strict=True))
+        return replace(self, samples=jax.tree.map(lambda *parts: np.stack(parts), *made))
 
 
-def _changed(one: Samples, theta: Theta) -> Light:
-    """Return changes of the light per unit by a shot's own place and by overlaps, to first order."""
-    return one.correction + one.by_overlaps @ (theta[_IN_OVERLAPS] - one.overlaps_at)
+def _lit(evaluator: Evaluator, theta: Theta, one: Samples, own: Own, with_slopes: bool) -> tuple[np.ndarray, ...]:
+    """Return the light of one position's samples, and its derivatives by shared and own parameters if wanted.
+
+    A shot's own place and the overlaps change the light to first order.
+    """
+    kernel = kernel_of(evaluator, theta, one)
+    here = unit_light(evaluator, one, own[:, :2], kernel)
+    changed = one.correction + one.by_overlaps @ (theta[_IN_OVERLAPS] - one.overlaps_at)
+    light = (here + changed) * flux_of(one, own)
+    if not with_slopes:
+        return (light,)
+    return light, slopes(evaluator, theta, one, own), own_slopes(evaluator, one, own, kernel, here, changed)
 
 
 def stepped(theta: Float[np.ndarray, " p"], step: Float[np.ndarray, " p"]) -> Float[np.ndarray, " p"]:
@@ -187,54 +197,42 @@ def moved_own(own: Float[np.ndarray, "*k l"], step: Float[np.ndarray, "*k l"]) -
     return own + np.concatenate([np.clip(step[..., :2], -0.5, 0.5), step[..., 2:]], axis=-1)
 
 
-def coefficients_of(evaluator: Evaluator, theta: Theta, samples: Samples) -> Float[np.ndarray, "positions y x 3"]:
-    """Return the kernel's spline coefficients at every position."""
-    kernels = []
-    for one in samples.each():
-        overlaps = one.overlaps if one.overlaps.shape[-1] else overlaps_of(evaluator, theta, one.frame)
-        kernels.append(np.asarray(kernel_coefficients(evaluator, theta, one.frame, one.disc_px, overlaps)))
-    return np.stack(kernels)
+def kernel_of(evaluator: Evaluator, theta: Theta, one: Samples) -> Float[np.ndarray, "y x 3"]:
+    """Return the kernel's spline coefficients at one position."""
+    return np.asarray(kernel_coefficients(evaluator, theta, one.frame, one.disc_px, one.overlaps))
 
 
-def _correction(evaluator: Evaluator, theta: Theta, one: Samples, offset_px: Float[np.ndarray, "shots 2"]) -> Light:
-    """Return what the light per unit of each shot differs by, as its own place is not the mean place."""
+def _set_up(
+    evaluator: Evaluator, theta: Theta, one: Samples, offset_px: Float[np.ndarray, "shots 2"], near: bool
+) -> Samples:
+    """Return one position's samples with interference set up about these parameters; see ``Samples``."""
+    one = replace(one, overlaps=np.asarray(overlaps_of(evaluator, theta, one.frame)), overlaps_at=theta[_IN_OVERLAPS])
+
+    def light(theta: Theta, overlaps: np.ndarray) -> Light:
+        return unit_light(evaluator, one, offset_px, kernel_of(evaluator, theta, replace(one, overlaps=overlaps)))
+
+    here = light(theta, one.overlaps)
+    # The pupil's footprint moves with a shot's own place.
     slope = one.frame.direction[:2] / one.frame.direction[2]
     tangent = (np.eye(2) + np.outer(slope, slope)) / one.frame.direction[2]
     along = theta[FOOTPRINT][2] * (one.begun_px + offset_px) @ (tangent @ one.frame.jacobian).T
-    here = _unit_at(evaluator, theta, one, offset_px, one.overlaps)
     correction = np.zeros_like(here)
     for shot, move in enumerate(along):
         elsewhere = theta.copy()
         elsewhere[FOOTPRINT][:2] += move
-        correction[shot] = (_unit_at(evaluator, elsewhere, one, offset_px, one.overlaps) - here)[shot]
-    return correction
-
-
-def _by_overlaps(
-    evaluator: Evaluator, theta: Theta, one: Samples, offset_px: Float[np.ndarray, "shots 2"]
-) -> Float[np.ndarray, "shots n 2"]:
-    """Return derivatives of the light per unit by what the overlaps depend on."""
+        correction[shot] = (light(elsewhere, one.overlaps) - here)[shot]
+    if near:
+        return replace(one, correction=correction)
     # Overlaps are in single precision: steps of this length (mm) keep their difference precise. Steps ten times as
     # long change derivatives by some per cent.
-    here, found = _unit_at(evaluator, theta, one, offset_px, one.overlaps), []
+    by_overlaps = []
     for i, step in zip(_IN_OVERLAPS, (2e-4, 1e-3), strict=True):
-        moved = overlaps_of(evaluator, theta + step * np.eye(theta.size)[i], one.frame)
-        found.append((_unit_at(evaluator, theta, one, offset_px, moved) - here) / step)
-    return np.stack(found, axis=-1)
+        moved = np.asarray(overlaps_of(evaluator, theta + step * np.eye(theta.size)[i], one.frame))
+        by_overlaps.append((light(theta, moved) - here) / step)
+    return replace(one, correction=correction, by_overlaps=np.stack(by_overlaps, axis=-1))
 
 
-def _unit_at(
-    evaluator: Evaluator,
-    theta: Theta,
-    one: Samples,
-    offset_px: Float[np.ndarray, "shots 2"],
-    overlaps: Float[Arrayish, "nodes terms rows half"],
-) -> Light:
-    kernel = np.asarray(kernel_coefficients(evaluator, theta, one.frame, one.disc_px, overlaps))
-    return unit_light(evaluator, one, offset_px, kernel)
-
-
-def _slopes(evaluator: Evaluator, theta: Theta, one: Samples, own: Own) -> Float[np.ndarray, "shots n p"]:
+def slopes(evaluator: Evaluator, theta: Theta, one: Samples, own: Own) -> Float[np.ndarray, "shots n p"]:
     """Return derivatives of the light of one position's samples by the shared parameters."""
     spectra = softmax(theta[HEAD:].reshape(3, -1), axis=1)
     # Single precision takes less time, and its errors are a millionth of a derivative.
@@ -256,22 +254,27 @@ def _slopes(evaluator: Evaluator, theta: Theta, one: Samples, own: Own) -> Float
 
 def explain(
     evaluator: Evaluator, theta: Float[np.ndarray, " p"], shots: Shots, geometry: Geometry, model_error: float
-) -> tuple[Float[np.ndarray, "shots l"], Crops]:
-    """Apply diffraction to whole crops: return own parameters, (x, y) on the sensor, and light per unit."""
+) -> tuple[Sources, Crops]:
+    """Apply diffraction to whole crops: return place and light of the LEDs, and the samples' light per unit."""
     evaluator = replace(evaluator, lattice=fit_lattice(shots.half))
     samples = weighed(gather(shots, geometry, np.ones(shots.rate.shape, dtype=bool)), model_error)
-    kernels = coefficients_of(evaluator, theta, samples)
     found, explained = np.zeros((shots.count, OWN)), np.zeros(shots.rate.shape)
-    for one, own, kernel in zip(samples.each(), start_own(evaluator, samples, kernels), kernels, strict=True):
+
+    def fitted(one: Samples) -> tuple[Own, Light]:
+        overlaps = np.asarray(overlaps_of(evaluator, theta, one.frame))
+        kernel = kernel_of(evaluator, theta, replace(one, overlaps=overlaps))
+        own = start_own(evaluator, one, kernel)
         for _ in range(3):
             unit = unit_light(evaluator, one, own[:, :2], kernel)
-            slopes = own_slopes(evaluator, one, own, kernel, unit)
+            by_own = own_slopes(evaluator, one, own, kernel, unit)
             residual = one.rate - unit * flux_of(one, own) - own[:, 5:]
-            across = np.swapaxes(slopes * huber_weight(residual, one.weight)[..., None], 1, 2)
-            step = scaled_inverse(across @ slopes, 1e-14) @ (across @ residual[..., None])
+            across = np.swapaxes(by_own * huber_weight(residual, one.weight)[..., None], 1, 2)
+            step = scaled_inverse(across @ by_own, 1e-14) @ (across @ residual[..., None])
             own = moved_own(own, step[..., 0])
-        real = one.index >= 0
-        unit = unit_light(evaluator, one, own[:, :2], kernel)
-        found[one.index[real]], explained[one.index[real]] = own[real], unit[real].reshape(-1, *shots.rate.shape[1:])
-    found[:, :2] += shots.centre_px
-    return found, explained
+        return own, unit_light(evaluator, one, own[:, :2], kernel)
+
+    for index, (own, unit) in zip(samples.index, each(fitted, samples.each()), strict=True):
+        real = index >= 0
+        found[index[real]], explained[index[real]] = own[real], unit[real].reshape(-1, *shots.rate.shape[1:])
+    sources = Sources(shots.centre_px + found[:, :2], found[:, 2:5], found[:, 5])
+    return sources.with_light_of_peak(shots, explained), explained

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from udccal.fitting.engine.gaussian import scaled_inverse
-from udccal.fitting.psf.data import HUBER, PsfRules, Shots, left_out, noise_at
+from udccal.fitting.psf.data import HUBER, PsfRules, Shots, held_out_positions, left_out, noise_at
 from udccal.fitting.psf.kernel import Evaluator
 from udccal.models.arrays import Arrayish
 from udccal.models.diffraction import LocalFrame, local_frame
@@ -76,9 +76,26 @@ class Samples(eqx.Module):
         """Return the samples of one position, or of several."""
         return jax.tree.map(lambda part: part[which], self)
 
+    def about(self, shots: Int[np.ndarray, " k"], samples: Int[np.ndarray, "#k few"]) -> Samples:
+        """Return some samples of some shots, of one position."""
+        of_shots = {name: getattr(self, name)[shots] for name in ("begun_px", "index")}
+        return replace(self, **of_shots, **{name: getattr(self, name)[shots[:, None], samples] for name in _PER_SAMPLE})
+
     def each(self) -> list[Samples]:
         """Return the samples of every position."""
         return [self.at(position) for position in range(len(self.index))]
+
+
+def some_shots(shots: Shots, rules: PsfRules) -> Bool[np.ndarray, " shots"]:
+    """Choose shots for the fit of diffraction, evenly over the positions not held out and over their shifts."""
+
+    def spread(items: np.ndarray, most: int) -> np.ndarray:
+        return items[np.unique(np.linspace(0, len(items) - 1, most).round().astype(int))]
+
+    keep = np.zeros(shots.count, dtype=bool)
+    for place in spread(np.flatnonzero(~held_out_positions(shots.positions)), rules.positions):
+        keep[spread(np.flatnonzero(shots.position == place), rules.shifts)] = True
+    return keep
 
 
 def choose_samples(shots: Shots, rules: PsfRules) -> Bool[np.ndarray, "shots rows columns"]:
@@ -221,29 +238,24 @@ def huber_weight(residual: np.ndarray, weight: np.ndarray) -> np.ndarray:
     return np.asarray(weight * np.minimum(1.0, HUBER.sigma / np.maximum(np.abs(residual) * np.sqrt(weight), 1e-12)))
 
 
-def start_own(evaluator: Evaluator, samples: Samples, coefficients: Float[np.ndarray, "positions y x 3"]) -> Owns:
-    """Start every shot's own parameters at the best of a grid of places, with light and background by least squares.
+def start_own(evaluator: Evaluator, one: Samples, kernel: Float[np.ndarray, "y x 3"]) -> Own:
+    """Start own parameters of one position's shots: the best of a grid of places, light and background linear in it.
 
     A centroid is not accurate enough. Neighbouring diffraction orders are half as bright as the middle one, and the
     mosaic samples each colour unevenly: it can be off by a pixel, and a descent then ends on a neighbouring order.
     """
     moves = np.stack(np.meshgrid(*2 * (np.linspace(-1.25, 1.25, 11),)), axis=-1).reshape(-1, 2)
     # Places are compared on the samples about the brightest spot; 117 of them are enough.
-    core = np.argsort((samples.points**2).sum(axis=-1), axis=-1, kind="stable")[..., :117]
-    near = replace(samples, **{name: _taken(getattr(samples, name), core) for name in _PER_SAMPLE})
-    owns = []
-    for position, kernel in enumerate(coefficients):
-        core_of, all_of = near.at(position), samples.at(position)
-        shots = len(core_of.rate)
-        units = np.stack([unit_light(evaluator, core_of, np.tile(move, (shots, 1)), kernel) for move in moves])
-        offset = moves[_linear(core_of, units)[1].argmin(axis=0)]
-        light, _ = _linear(all_of, unit_light(evaluator, all_of, offset, kernel)[None])
-        owns.append(np.concatenate([offset, light[0]], axis=-1))
-    return np.stack(owns)
-
-
-def _taken(values: np.ndarray, core: Int[np.ndarray, "positions shots few"]) -> np.ndarray:
-    return np.take_along_axis(values, core.reshape(*core.shape, *(1,) * (values.ndim - core.ndim)), axis=2)
+    shots = np.arange(len(one.rate))
+    core = np.argsort((one.points**2).sum(axis=-1), axis=-1, kind="stable")[:, :117]
+    near = one.about(shots, core)
+    # At all places at once.
+    every = near.about(np.tile(shots, len(moves)), np.arange(core.shape[1])[None])
+    units = unit_light(evaluator, every, np.repeat(moves, len(shots), axis=0), kernel)
+    units = units.reshape(len(moves), *core.shape)
+    offset = moves[_linear(near, units)[1].argmin(axis=0)]
+    light, _ = _linear(one, unit_light(evaluator, one, offset, kernel)[None])
+    return np.concatenate([offset, light[0]], axis=-1)
 
 
 def _linear(
