@@ -8,6 +8,7 @@ was.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -24,6 +25,8 @@ from udccal.fitting.psf_stamps.probability import State, Weighted, expectation
 
 # Parameters of one star: relative light, centre (x, y), the four numbers of its map, row by row, and background.
 OWN = 8
+REACH, ACROSS = TAPS - 1, 2 * TAPS - 1  # of nodes that a sample has in common, along an axis
+_AT_ONCE = 2**23  # numbers of a temporary array
 
 Band = tuple[Float[np.ndarray, "_ _"], ...]
 
@@ -154,15 +157,18 @@ def normal_equations(stamps: Stamps, state: State, seen: Weighted, plane: int) -
     weighted = np.concatenate([jacobian, seen.residual[..., None]], axis=2) * weight[..., None]
     used = np.flatnonzero(weight)
     onto = taps(seen.seen, used, grid).T @ weighted.reshape(-1, OWN + 1)[used]
-    onto = onto.reshape(len(stamps.unit), -1, OWN + 1).transpose(1, 0, 2)
-    cross = [(onto[..., :OWN] * part[:, None]).reshape(len(onto), -1) @ shared for part in basis.T]
+    onto = np.ascontiguousarray(onto.reshape(len(stamps.unit), -1, OWN + 1).transpose(0, 2, 1))
+    cross, images = np.empty((kept.sum(), len(index))), np.nonzero(kept)[2]
+    for image, strength in enumerate(basis.T):
+        by_own = onto[:, :OWN, kept[..., image].ravel()] * strength[:, None, None]
+        cross[images == image] = (shared.T @ by_own.reshape(len(stamps.unit) * OWN, -1)).T
     own = jacobian.transpose(0, 2, 1) @ weighted
     return Colour(
         index=index,
         band=node_sums(basis, seen, used, kept),
-        cross=np.stack(cross, axis=1).reshape(-1, len(index))[kept.ravel()],
+        cross=cross,
         dense=(shared.T @ scipy.sparse.block_diag(list(own[..., :OWN]), format="csr") @ shared).toarray(),
-        right_nodes=(onto[..., OWN] @ basis).ravel()[kept.ravel()],
+        right_nodes=(onto[:, OWN].T @ basis)[kept.reshape(-1, len(basis.T))],
         right_dense=shared.T @ own[..., OWN].ravel(),
     )
 
@@ -196,55 +202,77 @@ def node_sums(
     """Sum products of two nodes over samples, as a band of the nodes ``kept``; LinAlgError without samples."""
     if not used.size:
         raise np.linalg.LinAlgError("no sample is in use")
-    (rows, columns, terms), reach = kept.shape, TAPS - 1
+    terms = kept.shape[2]
+    # Light of a star at position X enters the image t with the factor C_t(X), for every sample. Sums of one star serve
+    # all pairs of images, therefore, and those of all stars a single image.
     t, u = np.triu_indices(terms)
-    place = np.empty((terms, terms), dtype=int)
-    place[t, u] = place[u, t] = np.arange(len(t))
-    near = scipy.ndimage.maximum_filter(kept[:, :, -1], 2 * reach + 1)
-    inner = used[near.ravel()[seen.seen.first.ravel()[used]]]
-    # Samples far from the nodes of further images do not contribute to them.
-    parts = (used, t[:1], u[:1]), (inner, t[1:], u[1:])
-    stencil = np.concatenate([_stencil(basis, seen, (rows, columns), *part) for part in parts], axis=-1)
-    band = []
-    for i, own in enumerate(kept):
-        out = np.zeros((columns, terms, TAPS, columns, terms))
-        for away in range(-reach, TAPS):
-            here, there = (slice(max(e, 0), columns + min(e, 0)) for e in (-away, away))
-            np.einsum("ctdcu->dctu", out[here, :, :, there])[...] = stencil[i, :, here, reach + away][..., place]
-        beyond = kept[i : i + TAPS].ravel()
-        band.append(out.reshape(columns * terms, -1)[own.ravel()][:, : len(beyond)][:, beyond])
-    return tuple(band)
+    pairs = basis[:, t] * basis[:, u]
+    # Nodes of further images, and those of the first one in their reach.
+    near = scipy.ndimage.maximum_filter(kept[..., -1], 2 * REACH + 1)
+    inner = tuple(slice(*np.flatnonzero(near.any(axis=axis))[[0, -1]] + [0, 1]) for axis in (1, 0))
+    first, every = 0.0, 0.0
+    for stars, sums in _stencils(seen, used, kept.shape[:2], alone=terms == 1):
+        first += np.tensordot(pairs[stars, 0][: len(sums)], sums, axes=1)
+        if terms > 1:
+            close = sums[:, *inner]
+            every += (close.reshape(len(close), -1).T @ pairs[stars]).reshape(*close.shape[1:], -1)
+    place = np.where(kept, np.cumsum(kept).reshape(kept.shape) - 1, -1)
+    rows = [kept[i : i + TAPS].sum(axis=(1, 2)) for i in range(len(kept))]
+    size, width = np.array([(row[0], row.sum()) for row in rows]).T
+    ends = np.cumsum(size * width)
+    whole, start = np.zeros(ends[-1]), ends - size * width - (np.cumsum(size) - size) * (width + 1)
+    _fill(whole, place[..., :1], start, width, first[..., None, None])
+    if terms > 1:
+        number = np.empty((terms, terms), dtype=int)
+        number[t, u] = number[u, t] = np.arange(len(t))
+        _fill(whole, place[inner], start[inner[0]], width[inner[0]], every[..., number])
+    return tuple(part.reshape(-1, n) for part, n in zip(np.split(whole, ends[:-1]), width, strict=True))
 
 
-def _stencil(
-    basis: Float[np.ndarray, "stars terms"],
-    seen: Weighted,
-    grid: tuple[int, int],
-    used: Int[np.ndarray, " used"],
-    t: Int[np.ndarray, " pairs"],
-    u: Int[np.ndarray, " pairs"],
-) -> Float[np.ndarray, "rows down columns across pairs"]:
-    """Sum products of nodes at each distance, down from 0 and across from -3, for pairs of images."""
-    # Light of a star at position X enters the image t with the factor C_t(X), for every sample, and the weights of
-    # a sample's 4 x 4 nodes are products of four down and four across. The contribution of a grid cell's samples is
-    # therefore a product of pairs down, pairs across, and pairs of images.
-    (rows, columns), reach = grid, TAPS - 1
-    stencil = np.zeros((rows, TAPS, columns, 2 * reach + 1, len(t)))
-    down, across = (part.reshape(-1, TAPS)[used] for part in (seen.seen.down, seen.seen.across))
-    one, other = np.triu_indices(TAPS)
-    both = (basis[:, t] * basis[:, u])[used // seen.weight.shape[1]] * seen.weight.ravel()[used, None]
-    index = seen.seen.first.ravel()[used, None] * len(one) + np.arange(len(one))
-    products = (across[:, one] * across[:, other]).ravel(), index.ravel(), np.arange(0, index.size + 1, len(one))
-    onto = scipy.sparse.csc_array(products, shape=(rows * columns * len(one), len(used)))
-    for i, k in zip(one, other, strict=True):
-        sums = onto @ (both * (down[:, i] * down[:, k])[:, None])
-        sums = sums.reshape(rows, columns, len(one), -1)[:-reach, :-reach]
-        # Nodes at each distance in columns.
-        spread = stencil[i : i + rows - reach, k - i]
-        for pair, (j, n) in enumerate(zip(one, other, strict=True)):
-            for first, beside in {(j, n - j), (n, j - n)}:
-                spread[:, first : first + columns - reach, reach + beside] += sums[:, :, pair]
-    return stencil
+def _stencils(
+    seen: Weighted, used: Int[np.ndarray, " used"], grid: tuple[int, ...], alone: bool
+) -> Iterator[tuple[slice, Float[np.ndarray, "stars rows columns down across"]]]:
+    """Yield sums of products of nodes so far apart, down from 0 and across from -3, for some stars, or all together."""
+    stars, samples = seen.weight.shape
+    nodes, step = grid[0] * grid[1], np.arange(TAPS)
+    some = stars if alone else max(1, _AT_ONCE // (nodes * TAPS * ACROSS))
+    for begin in range(0, stars, some):
+        part = slice(begin, min(begin + some, stars))
+        own = used[slice(*np.searchsorted(used, (part.start * samples, part.stop * samples)))]
+        down, across = (taps.reshape(-1, TAPS)[own] for taps in (seen.seen.down, seen.seen.across))
+        first = seen.seen.first.ravel()[own] + (0 if alone else nodes * (own // samples - begin))
+        beside = np.zeros((len(own), TAPS, ACROSS))
+        for tap in step:
+            beside[:, tap, REACH - tap : ACROSS - tap] = across[:, tap, None] * across
+        beside, weighted = beside.reshape(-1, ACROSS), seen.weight.ravel()[own, None] * down
+        groups = 1 if alone else part.stop - part.start
+        sums = np.empty((groups * nodes, TAPS, ACROSS))
+        for away in step:
+            # Of each sample and node across, the nodes down that have another one so far away.
+            index = first[:, None, None] + step[:, None] + grid[1] * step[: TAPS - away]
+            product = np.broadcast_to((weighted[:, : TAPS - away] * down[:, away:])[:, None], index.shape)
+            ends, shape = np.arange(0, index.size + 1, TAPS - away), (len(sums), len(beside))
+            sums[:, away] = scipy.sparse.csc_array((product.ravel(), index.ravel(), ends), shape=shape) @ beside
+        yield part, sums.reshape(groups, *grid, TAPS, ACROSS)
+
+
+def _fill(
+    whole: Float[np.ndarray, " entries"],
+    place: Int[np.ndarray, "rows columns terms"],
+    start: Int[np.ndarray, " rows"],
+    width: Int[np.ndarray, " rows"],
+    values: Float[np.ndarray, "rows columns down across terms terms"],
+) -> None:
+    """Put sums where a band has their nodes, of number ``place``; -1 for those that it lacks."""
+    rows, columns, _ = place.shape
+    first = start[:, None, None] + place * width[:, None, None]
+    for down in range(TAPS):
+        for across in range(-REACH if down else 0, TAPS):
+            here = np.s_[: rows - down, max(-across, 0) : columns - max(across, 0)]
+            there = place[down:, max(across, 0) : columns + min(across, 0), None]
+            both = (place[here][..., None] >= 0) & (there >= 0)
+            at = first[here][..., None] + there
+            whole[at[both]] = values[here][:, :, down, REACH + across][both]
 
 
 def factor(band: Band) -> Band:

@@ -290,3 +290,8 @@ def expectation(stamps: Stamps, state: State) -> Weighted:
     residual, weight = np.where(used, residual, 0.0), np.where(used, weight, 0.0)
     seen = seen._replace(down=light[..., None] * seen.down, jacobian=light[..., None] * seen.jacobian)
     return Weighted(seen, residual, weight, mean, node, float(likelihood[used].sum()))
+
+
+def log_posterior(stamps: Stamps, state: State) -> float:
+    """Return the logarithm of likelihood times prior, up to a constant and the precisions' own part."""
+    return expectation(stamps, state).log_likelihood - 0.5 * float(state.precisions @ state.squares())

@@ -20,9 +20,10 @@ from udccal.fitting.psf_stamps.equations import Laplace, laplace
 from udccal.fitting.psf_stamps.field import PsfField
 from udccal.fitting.psf_stamps.images import with_more_images
 from udccal.fitting.psf_stamps.model_error import of_residuals, of_stars_left_out, placed, without_error
-from udccal.fitting.psf_stamps.probability import ABSENT, State, envelope, expectation, grid_size
+from udccal.fitting.psf_stamps.probability import ABSENT, State, envelope, expectation, grid_size, log_posterior
 from udccal.models.fields import polynomial_terms
 
+_LEAST_PART = 0.01  # of a step to the mode
 WINDOW_PX = 1.6  # standard deviation of a Gaussian as wide as a star, before the kernel is known
 
 Found = Solution[State, Laplace]
@@ -54,8 +55,16 @@ class Evidence:
         return replace(found, tuned=tuned, colours=())
 
     def moved(self, place: State, step: Step) -> State:
-        """Return the state after a step of all unknowns, and of the logarithms of the precisions."""
-        return replace(place.shifted(step.shared), precisions=place.precisions * np.exp(step.own[0]))
+        """Return the state after a step of all unknowns, and of the logarithms of the precisions.
+
+        The step is halved until the log posterior rises, which is known long before the evidence is.
+        """
+        least, part = log_posterior(self.stamps, place), 1.0
+        while True:
+            there = place.shifted(part * step.shared)
+            if part < _LEAST_PART or log_posterior(self.stamps, there) > least + 0.1 * part * step.gain:
+                return replace(there, precisions=place.precisions * np.exp(part * step.own[0]))
+            part *= 0.5
 
 
 def improve(stamps: Stamps, state: State, rules: StampsRules, steps: int) -> Found:
@@ -68,7 +77,7 @@ def improve(stamps: Stamps, state: State, rules: StampsRules, steps: int) -> Fou
         stalled_gain=2 * evidence,
         small_gain=evidence,
         first_damping=0.03,
-        most_damping=1e3,
+        most_damping=0.3,
     )
     problem = Evidence(stamps, rules)
     found = minimise(problem, state, solver)
