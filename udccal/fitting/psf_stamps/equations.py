@@ -20,11 +20,9 @@ from scipy.linalg.blas import dtrsm
 
 from udccal.fitting.engine.least_squares import Step
 from udccal.fitting.psf_stamps.data import Stamps
-from udccal.fitting.psf_stamps.field import TAPS, Changes, PsfField, degree_of, polynomials, taps
+from udccal.fitting.psf_stamps.field import OWN, TAPS, Changes, PsfField, by_maps, changes_of_light, taps
 from udccal.fitting.psf_stamps.probability import State, Weighted, expectation
 
-# Parameters of one star: relative light, centre (x, y), the four numbers of its map, row by row, and background.
-OWN = 8
 REACH, ACROSS = TAPS - 1, 2 * TAPS - 1  # of nodes that a sample has in common, along an axis
 _AT_ONCE = 2**23  # numbers of a temporary array
 
@@ -98,13 +96,17 @@ def _with_nodes(
 
 def laplace(stamps: Stamps, state: State) -> Laplace:
     """Build and solve the equations at a state with priors; raise LinAlgError when they are singular."""
-    seen, colours = expectation(stamps, state), []
-    size = np.zeros(state.maps_from + len(state.maps))
-    for plane in range(state.light_e.shape[1]):
-        colour = normal_equations(stamps, state, seen, plane)
+    seen, (stars, planes), kept = expectation(stamps, state), state.light_e.shape, state.kept.ravel()
+    numbers, count = np.arange(state.vector.size), state.maps_from + state.maps
+    prior, nodes = state.prior, numbers[count:].reshape(planes, -1)[:, kept]
+    pull, size, colours = prior @ state.vector, np.zeros(count), []
+    for own, mine in enumerate(nodes):
+        colour = normal_equations(stamps, state, seen, own)
         size[colour.index] += colour.dense.diagonal()
-        colours.append(_eliminated(colour, state, plane))
-    schur, right = _dense_prior(state, size)
+        colours.append(_eliminated(colour, prior[mine][:, mine], pull[mine]))
+    schur, right = prior[:count, :count].toarray(), -pull[:count]
+    light = numbers[: state.maps_from].reshape(stars, -1)[:, : 2 + planes].ravel()
+    schur[np.ix_(light, light)] += _held(state, size)
     for c in colours:
         schur[np.ix_(c.index, c.index)] += c.dense
         right[c.index] += c.right_dense
@@ -113,14 +115,14 @@ def laplace(stamps: Stamps, state: State) -> Laplace:
     root = cholesky(schur, lower=True)
     half = solve_triangular(root, right, lower=True)
     dense = solve_triangular(root, half, lower=True, trans=1)
-    nodes = [divided(c.band, (c.right_nodes - c.cross @ dense[c.index])[:, None], False) for c in colours]
+    images = [divided(c.band, (c.right_nodes - c.cross @ dense[c.index])[:, None], False) for c in colours]
     gain = 0.5 * float(half @ half + sum(c.right_nodes @ c.right_nodes for c in colours))
     diagonals = [np.diag(row) for c in colours for row in c.band]
     log_det = 2 * np.log(np.concatenate([np.diag(root), *diagonals])).sum()
     # Minus twice the log prior, up to constants that all orders have in common.
-    prior = float(state.precisions @ state.squares()) - state.volume()[0]
-    cost, kept = float(log_det - 2 * seen.log_likelihood + prior), state.kept.ravel()
-    mode, tuned = _with_nodes(dense[:, None], nodes, kept)[:, 0], np.zeros_like(state.precisions)
+    of_prior = float(state.precisions @ state.squares()) - state.volume()[0]
+    cost = float(log_det - 2 * seen.log_likelihood + of_prior)
+    mode, tuned = _with_nodes(dense[:, None], images, kept)[:, 0], np.zeros_like(state.precisions)
     return Laplace(cost, int(stamps.known.sum()), mode, gain, root, tuple(colours), kept, tuned)
 
 
@@ -134,17 +136,11 @@ def shared_by(
     field: PsfField, unit: Float[np.ndarray, "stars 2"], plane: int
 ) -> tuple[Int[np.ndarray, " own"], scipy.sparse.csr_array]:
     """Return the dense block's unknowns that a colour depends on, and the matrix to the stars' own changes."""
-    planes, stars, one = len(field.nodes), len(unit), np.eye(OWN)
+    planes, stars = len(field.nodes), len(unit)
     place = (2 + 2 * planes) * np.arange(stars)[:, None] + np.array([0, 1, 2 + plane, 2 + planes + plane])
-    numbers = stars * (2 + 2 * planes) + np.arange(field.warp.size + field.lateral.size)
-    warp, lateral = np.split(numbers, [field.warp.size])
-    parts = [(place, np.eye(stars), one[:, [1, 2, 0, 7]])]
-    parts += [(warp.reshape(field.warp.shape)[plane], polynomials(unit, field.map_degree)[:, 1:], one[:, 3:7])]
-    if plane != field.reference:
-        basis = polynomials(unit, degree_of(1 + field.lateral.shape[1]))[:, 1:]
-        parts += [(lateral.reshape(field.lateral.shape)[plane - (plane > field.reference)], basis, one[:, 1:3])]
-    matrix = scipy.sparse.hstack([scipy.sparse.kron(basis, own) for _, basis, own in parts], format="csr")
-    return np.concatenate([index.ravel() for index, _, _ in parts]), scipy.sparse.csr_array(matrix)
+    of_maps, matrix = by_maps(field, unit, plane)
+    whole = scipy.sparse.hstack([scipy.sparse.kron(np.eye(stars), np.eye(OWN)[:, [1, 2, 0, 7]]), matrix], format="csr")
+    return np.concatenate([place.ravel(), stars * (2 + 2 * planes) + of_maps]), scipy.sparse.csr_array(whole)
 
 
 def normal_equations(stamps: Stamps, state: State, seen: Weighted, plane: int) -> Colour:
@@ -153,7 +149,7 @@ def normal_equations(stamps: Stamps, state: State, seen: Weighted, plane: int) -
     basis, grid, kept = field.strengths(stamps.unit), field.nodes.shape[2:], state.kept
     index, shared = shared_by(field, stamps.unit, plane)
     weight = seen.weight * stamps.by_plane[plane]
-    jacobian = _by_own(seen)
+    jacobian = seen.seen.jacobian
     weighted = np.concatenate([jacobian, seen.residual[..., None]], axis=2) * weight[..., None]
     used = np.flatnonzero(weight)
     onto = taps(seen.seen, used, grid).T @ weighted.reshape(-1, OWN + 1)[used]
@@ -173,23 +169,15 @@ def normal_equations(stamps: Stamps, state: State, seen: Weighted, plane: int) -
     )
 
 
-def _by_own(seen: Weighted) -> Float[np.ndarray, "stars samples own"]:
-    """Return derivatives by a star's own parameters, of which the last one is its background."""
-    return np.concatenate([seen.seen.jacobian, np.ones((*seen.weight.shape, 1))], axis=2)
-
-
 def changes_of_samples(
     stamps: Stamps, field: PsfField, seen: Weighted, draws: Float[np.ndarray, "unknowns k"]
 ) -> Float[np.ndarray, "stars samples k"]:
     """Return the changes of samples' expectation under changes of all unknowns, zero for unused samples."""
-    out, jacobian = np.zeros((stamps.known.size, draws.shape[1])), _by_own(seen)
-    nodes = Changes.of(field, len(stamps.unit), draws).nodes
-    for plane, own in enumerate(nodes):
+    out = np.zeros((stamps.known.size, draws.shape[1]))
+    for plane, nodes in enumerate(Changes.of(field, len(stamps.unit), draws).nodes):
         index, shared = shared_by(field, stamps.unit, plane)
         used = np.flatnonzero(seen.weight * stamps.by_plane[plane])
-        images = np.tensordot(field.strengths(stamps.unit), own, axes=1).reshape(-1, draws.shape[1])
-        by_own = jacobian @ (shared @ draws[index]).reshape(len(stamps.unit), OWN, -1)
-        out[used] = by_own.reshape(out.shape)[used] + taps(seen.seen, used, field.nodes.shape[2:]) @ images
+        out[used] = changes_of_light(field, seen.seen, stamps.unit, shared @ draws[index], nodes, used)
     return out.reshape(*stamps.known.shape, -1)
 
 
@@ -306,37 +294,26 @@ def _divide(upper: Float[np.ndarray, "n n"], right: Float[np.ndarray, "n k"], tr
     return np.asarray(dtrsm(1.0, upper.T, right.T, side=1, lower=1, trans_a=int(transposed), overwrite_b=1)).T
 
 
-def _eliminated(colour: Colour, state: State, plane: int) -> Colour:
+def _eliminated(
+    colour: Colour, prior: scipy.sparse.csr_array, pull: Float[np.ndarray, " nodes"]
+) -> Colour:
     """Add the prior of images and eliminate the nodes; their arrays are overwritten."""
-    prior, at = state.prior(plane), 0
-    right = colour.right_nodes - prior @ np.moveaxis(state.field.nodes[plane], 0, 2)[state.kept]
+    at = 0
     for row in colour.band:
         row += prior[at : at + row.shape[0], at : at + row.shape[1]].toarray()
         at += len(row)
     factor(colour.band)
-    half = divided(colour.band, right[:, None], True)[:, 0]
+    half = divided(colour.band, (colour.right_nodes - pull)[:, None], True)[:, 0]
     cross = divided(colour.band, colour.cross, True)
     schur, left = colour.dense - cross.T @ cross, colour.right_dense - cross.T @ half
     return replace(colour, cross=cross, right_nodes=half, dense=schur, right_dense=left)
 
 
-def _dense_prior(
-    state: State, size: Float[np.ndarray, " dense"]
-) -> tuple[Float[np.ndarray, "dense dense"], Float[np.ndarray, " dense"]]:
-    """Return the dense block's prior precision and right side; it holds changes that images can make as well."""
-    (stars, planes), from_ = state.light_e.shape, state.maps_from
-    own = np.arange(from_).reshape(stars, -1)
-    light, matrix, right = own[:, : 2 + planes], np.zeros((len(size), len(size))), np.zeros(len(size))
+def _held(state: State, size: Float[np.ndarray, " dense"]) -> Float[np.ndarray, "light light"]:
+    """Return what holds changes of places and light that images can make as well, the first unknowns of each star."""
+    stars, planes = state.light_e.shape
     # Stars that are left out completely keep their places and light.
-    seen = size[light]
-    held = (np.sqrt(seen.mean(axis=0)) * (seen > 0))[:, :, None] * np.eye(seen.shape[1])
+    seen = size[: state.maps_from].reshape(stars, -1)[:, : 2 + planes]
+    held = (np.sqrt(seen.mean(axis=0)) * (seen > 0))[:, :, None] * np.eye(2 + planes)
     held = held.reshape(seen.size, -1)
-    matrix[np.ix_(light.ravel(), light.ravel())] = held @ held.T + np.diag(np.where(seen > 0, 0.0, 1.0).ravel())
-    mean, scatter = state.precisions[-2:]
-    for index, values in zip(own[:, 2 + planes :].T, state.background_e.T, strict=True):
-        matrix[np.ix_(index, index)] = scatter * np.eye(stars) + (mean - scatter) / stars
-        right[index] = -matrix[np.ix_(index, index)] @ values
-    maps = state.precisions[state.map_groups]
-    matrix[from_:, from_:] = np.diag(maps)
-    right[from_:] = -maps * state.maps
-    return matrix, right
+    return held @ held.T + np.diag(np.where(seen > 0, 0.0, 1.0).ravel())

@@ -17,7 +17,7 @@ from udccal.fitting.engine.report import estimates, residual_sample
 from udccal.fitting.engine.robust import OutlierRule, outliers, robust_sigma
 from udccal.fitting.psf_stamps.data import Stamps, StampsRules, offsets, unusable
 from udccal.fitting.psf_stamps.equations import laplace, marginal_cov
-from udccal.fitting.psf_stamps.field import Changes, PsfField, degree_of, polynomials, see, taps
+from udccal.fitting.psf_stamps.field import Changes, PsfField, by_maps, changes_of_light, see
 from udccal.fitting.psf_stamps.model_error import without_error
 from udccal.fitting.psf_stamps.probability import LEAST, State, expectation, laplacian
 from udccal.fitting.psf_stamps.search import WINDOW_PX, Found, Orders, search
@@ -169,16 +169,10 @@ class StampsPsf:
         field, grid, k = self.field, offsets(self.rows, self.columns), self.factor.shape[1]
         changes = Changes.of(field, len(self.star_px), self.factor)
         seen = see(field, unit, centre, grid, np.full((len(unit), len(grid)), plane))
-        images = np.tensordot(field.strengths(unit), changes.nodes[plane], axes=1)
-        every = taps(seen, np.arange(seen.value.size), field.nodes.shape[2:])
-        change = (every @ images.reshape(every.shape[1], k)).reshape(*seen.value.shape, k)
-        maps, centres = np.split(changes.maps, [field.warp.size])
-        warp = maps.reshape(*field.warp.shape[:2], 4, k)
-        lateral = np.insert(centres.reshape(*field.lateral.shape, k), field.reference, 0.0, axis=0)
-        for own, by in ((lateral[plane], seen.jacobian[..., 1:3]), (warp[plane], seen.jacobian[..., 3:])):
-            basis = polynomials(unit, degree_of(1 + len(own)))[:, 1:]
-            change += by @ np.tensordot(basis, own, axes=1)
-        return seen.value, change, seen.jacobian[..., 1:3]
+        index, matrix = by_maps(field, unit, plane)
+        used = np.arange(seen.value.size)
+        change = changes_of_light(field, seen, unit, matrix @ changes.maps[index], changes.nodes[plane], used)
+        return seen.value, change.reshape(*seen.value.shape, k), seen.jacobian[..., 1:3]
 
 
 @in_float64
@@ -237,7 +231,7 @@ def _report(
     z = (seen.residual * np.sqrt(seen.weight))[used]
     # All unknowns (except total light and common shift, which are held), less the part that the priors determine.
     held = float(state.precisions @ state.squares(draws))
-    unknowns = int(state.kept.sum()) * state.light_e.shape[1] + len(state.maps) + state.maps_from
+    unknowns = int(state.kept.sum()) * state.light_e.shape[1] + state.maps + state.maps_from
     effective = unknowns - 2 - state.light_e.shape[1] - held
     chi2_dof = float(z @ z) / max(z.size - effective, 1.0)
     inflation = float(np.sqrt(chi2_dof)) if chi2_dof > rules.inflate_above else 1.0
