@@ -148,12 +148,13 @@ def see(
     """Return values and derivatives at samples of colours ``plane``; centres and samples are (x, y) in px."""
     planes, count, rows, columns = field.nodes.shape
     images = field.strengths(unit) @ np.asarray(field.nodes).reshape(planes, count, -1)
-    # One compilation serves all orders, and numbers of nodes and stars up to multiples of these.
-    filled = _filled(np.moveaxis(images, 0, 1), (0, 8), (2, 16384))
-    by_star = (field.maps(unit), centre_px[:, None] + field.centres(unit), plane.astype(np.int32))
+    # One compilation serves all orders, stars eight at a time, and numbers of nodes up to a multiple of this.
+    filled = _filled(np.moveaxis(images, 0, 1), 2, 16384)
+    by_star = (filled, field.maps(unit), centre_px[:, None] + field.centres(unit), plane.astype(np.int32))
     grid = np.int32(rows), np.int32(columns), np.float64(field.spacing_px)
-    seen = response(filled, *(_filled(part, (0, 8)) for part in by_star), offset_px, *grid)
-    return Seen(*(np.asarray(part)[: len(unit)] for part in seen))
+    parts = ([_filled(part[at : at + 8], 0, 8) for part in by_star] for at in range(0, len(unit), 8))
+    seen = [response(*part, offset_px, *grid) for part in parts]
+    return Seen(*(np.concatenate(part)[: len(unit)] for part in zip(*seen, strict=True)))
 
 
 def taps(seen: Seen, used: Int[np.ndarray, " used"], grid: tuple[int, ...]) -> scipy.sparse.csr_array:
@@ -191,16 +192,15 @@ def changes_of_light(
 ) -> Float[np.ndarray, "used k"]:
     """Return changes of light in samples under changes of stars' own parameters, and of a colour's nodes."""
     stars, samples, count = seen.jacobian.shape
-    by_own = (seen.jacobian @ own.reshape(stars, count, -1)).reshape(stars * samples, -1)[used]
-    images = np.tensordot(field.strengths(unit), nodes, axes=1).reshape(-1, by_own.shape[1])
-    return by_own + taps(seen, used, field.nodes.shape[2:]) @ images
+    by_own = (seen.jacobian @ own.reshape(stars, count, own.shape[1])).reshape(stars * samples, own.shape[1])
+    images = np.tensordot(field.strengths(unit), nodes, axes=1)
+    weights = taps(seen, used, images.shape[1:3])
+    return by_own[used] + weights @ images.reshape(weights.shape[1], own.shape[1])
 
 
-def _filled(values: Shaped[np.ndarray, "..."], *multiples: tuple[int, int]) -> Shaped[np.ndarray, "..."]:
-    """Repeat the last entry along some axes up to a multiple."""
-    widths = [(0, 0)] * values.ndim
-    for axis, multiple in multiples:
-        widths[axis] = (0, -values.shape[axis] % multiple)
+def _filled(values: Shaped[np.ndarray, "..."], axis: int, multiple: int) -> Shaped[np.ndarray, "..."]:
+    """Repeat the last entry along an axis up to a multiple."""
+    widths = [(0, -values.shape[axis] % multiple if one == axis else 0) for one in range(values.ndim)]
     return np.pad(values, widths, mode="edge")
 
 
