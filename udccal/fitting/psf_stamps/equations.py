@@ -294,9 +294,7 @@ def _divide(upper: Float[np.ndarray, "n n"], right: Float[np.ndarray, "n k"], tr
     return np.asarray(dtrsm(1.0, upper.T, right.T, side=1, lower=1, trans_a=int(transposed), overwrite_b=1)).T
 
 
-def _eliminated(
-    colour: Colour, prior: scipy.sparse.csr_array, pull: Float[np.ndarray, " nodes"]
-) -> Colour:
+def _eliminated(colour: Colour, prior: scipy.sparse.csr_array, pull: Float[np.ndarray, " nodes"]) -> Colour:
     """Add the prior of images and eliminate the nodes; their arrays are overwritten."""
     at = 0
     for row in colour.band:

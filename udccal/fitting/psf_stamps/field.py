@@ -245,9 +245,7 @@ def response(
         second = scale[:, None, None] * second.reshape(-1, 2, 2)
         by_map = -rise[:, :, None] * at[:, None, :] - value[:, None, None] * inverse.transpose(0, 2, 1)
         by_map -= 2 * jnp.einsum("sai,sab,sbj->sij", inverse, second, shrunk)
-        jacobian = jnp.concatenate(
-            [value[:, None], -rise, by_map.reshape(-1, 4), jnp.ones((len(value), 1))], axis=1
-        )
+        jacobian = jnp.concatenate([value[:, None], -rise, by_map.reshape(-1, 4), jnp.ones((len(value), 1))], axis=1)
         return Seen(value, jacobian, first, scale[:, None] * down, across, inside_y & inside_x)
 
     return jax.vmap(star)(images, maps, centres, plane)

@@ -20,7 +20,7 @@ from udccal.fitting.engine.tails import chi2_tail
 from udccal.fitting.psf_stamps.data import Stamps, StampsRules
 from udccal.fitting.psf_stamps.equations import changes_of_samples, laplace
 from udccal.fitting.psf_stamps.field import Changes
-from udccal.fitting.psf_stamps.probability import State, Weighted, expectation
+from udccal.fitting.psf_stamps.probability import State, Weighted, expectation, laplacian
 
 _NEAR_PX = 2.0  # size of the squares whose nodes are near each other
 _FACTOR = 4.0  # within which nodes are of similar light
@@ -125,3 +125,23 @@ def _groups(state: State) -> tuple[Int[np.ndarray, "planes grid_rows grid_column
     light = np.log(state.size.max(axis=(1, 2), keepdims=True) / state.size) / np.log(_FACTOR)
     plane = np.arange(planes)[:, None, None] * 10**6
     return plane + 1000 * (y[:, None] - y[0]) + (x - x[0]), plane + light.astype(int)
+
+
+def drawn(state: State, unknowns: int, count: int) -> Float[np.ndarray, "unknowns k"]:
+    """Draw what the model does not describe, as noise of the first images' nodes that gives kernels its model error."""
+    out = np.zeros((unknowns, count))
+    nodes = Changes.of(state.field, len(state.light_e), out).nodes
+    # The mean sum of squared weights of a cubic B-spline is 0.479 along an axis.
+    rng = np.random.default_rng(1)
+    nodes[:, 0] += state.model_error[..., None] / 0.479 * rng.standard_normal((*state.size.shape, count))
+    # Where further images have no nodes, they may be as large as their prior, which the others set.
+    eigenvalues, left = laplacian(*state.size.shape[1:])[1], ~np.moveaxis(state.kept, 2, 0)
+    for image in np.flatnonzero(left.any(axis=(1, 2))):
+        a, b = state.of_images[:, image].T[..., None]
+        spread = np.sqrt((1.0 / (a + b * eigenvalues)).mean(axis=1))[:, None, None] * state.size * left[image]
+        nodes[:, image] += spread[..., None] / 0.479 * rng.standard_normal((*spread.shape, count))
+    # Light of the psf that is constant over a stamp differs from a background only by its growth with a star's light.
+    spread = np.maximum(state.light_e.std(axis=0), 1e-3 * state.light_e.mean(axis=0)) * np.sqrt(len(state.light_e))
+    edge = state.background_e.std(axis=0) / spread
+    nodes[:, 0] += edge[:, None, None, None] * rng.standard_normal((len(edge), 1, 1, count))
+    return out

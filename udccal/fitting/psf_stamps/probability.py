@@ -93,6 +93,11 @@ class State:
         return bool((self.background_e**2).mean() > 1.0)
 
     @property
+    def misfit(self) -> float:
+        """Model error relative to the kernel, root mean square."""
+        return float(np.linalg.norm(self.model_error) / np.linalg.norm(self.size))
+
+    @property
     def width_px(self) -> float:
         """Standard deviation of a Gaussian as wide as the kernel in the middle, by its noise-equivalent area."""
         nodes = self.field.nodes[self.field.reference, 0] * self.field.spacing_px

@@ -73,11 +73,11 @@ def improve(stamps: Stamps, state: State, rules: StampsRules, steps: int) -> Fou
     evidence = max(rules.evidence, rules.evidence_of_nodes * float(state.kept.sum()))
     solver = SolverRules(
         iterations=steps,
-        least_gain=0.0,
+        least_gain=0.5 * evidence,
         stalled_gain=2 * evidence,
         small_gain=evidence,
         first_damping=0.03,
-        most_damping=0.3,
+        most_damping=0.1,
     )
     problem = Evidence(stamps, rules)
     found = minimise(problem, state, solver)
