@@ -198,7 +198,8 @@ def node_sums(
     # Nodes of further images, and those of the first one in their reach.
     near = scipy.ndimage.maximum_filter(kept[..., -1], 2 * REACH + 1)
     inner = tuple(slice(*np.flatnonzero(near.any(axis=axis))[[0, -1]] + [0, 1]) for axis in (1, 0))
-    first, every = 0.0, 0.0
+    first = np.zeros((*kept.shape[:2], TAPS, ACROSS))
+    every = np.zeros((*first[inner].shape, len(t)))
     for stars, sums in _stencils(seen, used, kept.shape[:2], alone=terms == 1):
         first += np.tensordot(pairs[stars, 0][: len(sums)], sums, axes=1)
         if terms > 1:
@@ -229,10 +230,10 @@ def _stencils(
         own = used[slice(*np.searchsorted(used, (part.start * samples, part.stop * samples)))]
         down, across = (taps.reshape(-1, TAPS)[own] for taps in (seen.seen.down, seen.seen.across))
         first = seen.seen.first.ravel()[own] + (0 if alone else nodes * (own // samples - begin))
-        beside = np.zeros((len(own), TAPS, ACROSS))
+        products = np.zeros((len(own), TAPS, ACROSS))
         for tap in step:
-            beside[:, tap, REACH - tap : ACROSS - tap] = across[:, tap, None] * across
-        beside, weighted = beside.reshape(-1, ACROSS), seen.weight.ravel()[own, None] * down
+            products[:, tap, REACH - tap : ACROSS - tap] = across[:, tap, None] * across
+        beside, weighted = products.reshape(-1, ACROSS), seen.weight.ravel()[own, None] * down
         groups = 1 if alone else part.stop - part.start
         sums = np.empty((groups * nodes, TAPS, ACROSS))
         for away in step:

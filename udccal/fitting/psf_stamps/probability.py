@@ -140,10 +140,10 @@ class State:
         (stars, planes), field, every = self.light_e.shape, self.field, scipy.sparse.eye_array(self.vector.size).tocsr()
         numbers, parts = Changes.of(field, stars, np.arange(self.vector.size)[:, None]), []
         for plane, image in np.ndindex(*field.nodes.shape[:2]):
-            own = self.inner if image else np.s_[:, :]
-            index, size = (part[own].ravel() for part in (numbers.nodes[plane, image, ..., 0], self.size[plane]))
+            inside = self.inner if image else np.s_[:, :]
+            index, size = (part[inside].ravel() for part in (numbers.nodes[plane, image, ..., 0], self.size[plane]))
             parts.append(scipy.sparse.diags_array(1.0 / size) @ every[index])
-            parts.append(laplacian(*self.size[plane][own].shape)[0] @ parts[-1])
+            parts.append(laplacian(*self.size[plane][inside].shape)[0] @ parts[-1])
         for own, like in zip(np.split(numbers.maps, [field.warp.size]), (field.warp, field.lateral), strict=True):
             ends = np.cumsum(np.arange(2, degree_of(1 + like.shape[1]) + 1))
             parts += [every[one.ravel()] for of in own.reshape(like.shape) for one in np.split(of, ends) if one.size]
