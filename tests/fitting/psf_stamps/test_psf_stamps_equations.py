@@ -48,7 +48,7 @@ def band(seed: int) -> Band:
 
 def stamps_and_state() -> tuple[Stamps, State]:
     stamps, _ = make(1, count=12, size=9)
-    return stamps, start(stamps, _RULES).with_map(1, _RULES).with_images(np.eye(3), _RULES)
+    return stamps, start(stamps, _RULES, 1).with_images(np.eye(3), _RULES)
 
 
 @pytest.fixture
@@ -103,10 +103,9 @@ def test_right_sides_and_blocks_are_those_of_the_jacobian(weighted: tuple[Stamps
     stamps, state, seen = weighted
     _, shared = shared_by(state.field, stamps.unit, 0)
     taps = design(seen, polynomials(stamps.unit, 1), state.field.nodes.shape[2:])
-    own_jacobian = np.concatenate([seen.seen.jacobian, np.ones((*seen.weight.shape, 1))], axis=2)
-    stars, samples, own = own_jacobian.shape
+    stars, samples, own = seen.seen.jacobian.shape
     spread = np.zeros((stars, samples, stars, own))
-    spread[np.arange(stars), :, np.arange(stars)] = own_jacobian
+    spread[np.arange(stars), :, np.arange(stars)] = seen.seen.jacobian
     jacobian = spread.reshape(stars * samples, -1) @ shared.toarray()
     normal, weight = normal_equations(stamps, state, seen, 0), seen.weight.ravel()[:, None]
     for found, expected in (
@@ -121,8 +120,8 @@ def test_right_sides_and_blocks_are_those_of_the_jacobian(weighted: tuple[Stamps
 def test_the_jacobian_of_the_dense_block_is_that_of_the_expectation() -> None:
     stamps, _ = make(1, count=12, size=9)
     mosaic = replace(stamps, channel=np.arange(12 * 81).reshape(12, 9, 9) % 3)
-    state = start(mosaic, _RULES).with_map(1, _RULES).with_images(np.eye(3), _RULES)
-    size = state.maps_from + len(state.maps)
+    state = start(mosaic, _RULES, 1).with_images(np.eye(3), _RULES)
+    size = state.maps_from + state.maps
     change = 1e-5 * np.random.default_rng(2).standard_normal(size)
     whole = np.concatenate([change, np.zeros(np.size(state.field.nodes))])
     with jax.enable_x64(True):
@@ -131,7 +130,7 @@ def test_the_jacobian_of_the_dense_block_is_that_of_the_expectation() -> None:
     for plane in range(3):
         index, shared = shared_by(state.field, mosaic.unit, plane)
         own = (shared @ change[index]).reshape(12, -1)
-        expected = np.einsum("kso,ko->ks", seen.seen.jacobian, own[:, :-1]) + own[:, -1:]
+        expected = np.einsum("kso,ko->ks", seen.seen.jacobian, own)
         seen_here = mosaic.by_plane[plane] & (seen.weight > 0)
         found = (ends[0] - ends[1])[seen_here] / 2
         np.testing.assert_allclose(found, expected[seen_here], atol=1e-4 * np.abs(expected).max())
@@ -155,12 +154,12 @@ def test_the_mode_and_its_covariance_are_those_of_equations_written_out() -> Non
     with jax.enable_x64(True):
         found, seen = laplace(stamps, state), expectation(stamps, state)
         normal = normal_equations(stamps, state, seen, 0)
-    size, nodes = state.maps_from + len(state.maps), len(normal.right_nodes)
+    size, nodes = state.maps_from + state.maps, len(normal.right_nodes)
     matrix, pull = np.zeros((2, size + nodes, size + nodes)), np.zeros(size + nodes)
     matrix[0, :size, :size], matrix[0, size:, size:] = normal.dense, dense(normal.band)
     matrix[0, size:, :size], matrix[0, :size, size:] = normal.cross, normal.cross.T
     scale = np.diag(1 / state.size[0].ravel())
-    matrix[1, size - 8 : size, size - 8 : size] = np.diag(state.precisions[state.map_groups])
+    matrix[1, size - 8 : size, size - 8 : size] = np.diag(np.repeat(state.precisions[-3:-2], 8))
     rough = laplacian(*state.size.shape[1:])[0].toarray() @ scale
     for term, (a, b) in enumerate(state.of_images[0]):
         image = np.s_[size + term :: 3]
@@ -192,7 +191,7 @@ def test_the_prior_is_that_of_its_eigenvalues() -> None:
     matrix, eigenvalues = laplacian(rows, columns)
     np.testing.assert_allclose(np.linalg.eigvalsh((matrix.T @ matrix).toarray()), np.sort(eigenvalues), atol=1e-9)
     scale = 1 / state.size[0].ravel()
-    volume, squares = float(np.log(state.precisions[state.map_groups]).sum()), 0.0
+    volume, squares = float(8 * np.log(state.precisions[-3])), 0.0
     volume += np.log(state.precisions[-2:]) @ [1, 11]
     for image, (a, b) in zip(state.field.nodes[0], state.of_images[0], strict=True):
         prior = (a * np.eye(len(scale)) + b * (matrix.T @ matrix).toarray()) * np.outer(scale, scale)

@@ -11,8 +11,7 @@ import pytest
 from tests.fitting.psf_stamps.test_psf_stamps import READ_E, SENSOR, places
 from udccal.fitting.psf_stamps.data import Stamps, StampsRules
 from udccal.fitting.psf_stamps.fit import fit_psf_stamps
-from udccal.fitting.psf_stamps.images import with_more_images
-from udccal.fitting.psf_stamps.search import Found, coarse, improve
+from udccal.fitting.psf_stamps.search import Found, coarse, improve, with_more_images
 from udccal.numerics import in_float64
 
 # (map degree, image degree) of the truths.

@@ -118,8 +118,7 @@ class StampsRules:
         outlier_sigma: samples further off, in robust sigma, are left out.
         star_ratio, star_lost: a stamp is left out if its mean square exceeds the median's by the first factor, or if it
             loses more than the second fraction of its samples.
-        coarse: degrees of the map and the assumed relative model error, of the fits that lead from a round star to a
-            field.
+        coarse: assumed relative model errors of the fits that lead from a round star to a field.
         spacings_px: spacings of nodes, the coarsest first.
         highest: largest degrees of the map and of the images' strengths.
         image_beyond, images_at_once: new images are as many as this, of those whose significance is at least this part
@@ -150,7 +149,7 @@ class StampsRules:
     outlier_sigma: float = 5.0
     star_ratio: float = 3.0
     star_lost: float = 0.2
-    coarse: tuple[tuple[int, float], ...] = ((0, 0.3), (0, 0.1), (2, 0.05), (4, 0.02))
+    coarse: tuple[float, ...] = (0.3, 0.1, 0.05, 0.02)
     spacings_px: tuple[float, ...] = (1.0, 0.7, 0.5, 0.35)
     highest: tuple[int, int] = (4, 4)
     image_beyond: float = 0.1

@@ -8,6 +8,7 @@ was.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,11 +20,11 @@ from scipy.linalg.blas import dtrsm
 
 from udccal.fitting.engine.least_squares import Step
 from udccal.fitting.psf_stamps.data import Stamps
-from udccal.fitting.psf_stamps.field import TAPS, Changes, PsfField, degree_of, polynomials, taps
+from udccal.fitting.psf_stamps.field import OWN, TAPS, Changes, PsfField, by_maps, changes_of_light, taps
 from udccal.fitting.psf_stamps.probability import State, Weighted, expectation
 
-# Parameters of one star: relative light, centre (x, y), the four numbers of its map, row by row, and background.
-OWN = 8
+REACH, ACROSS = TAPS - 1, 2 * TAPS - 1  # of nodes that a sample has in common, along an axis
+_AT_ONCE = 2**23  # numbers of a temporary array
 
 Band = tuple[Float[np.ndarray, "_ _"], ...]
 
@@ -95,13 +96,17 @@ def _with_nodes(
 
 def laplace(stamps: Stamps, state: State) -> Laplace:
     """Build and solve the equations at a state with priors; raise LinAlgError when they are singular."""
-    seen, colours = expectation(stamps, state), []
-    size = np.zeros(state.maps_from + len(state.maps))
-    for plane in range(state.light_e.shape[1]):
-        colour = normal_equations(stamps, state, seen, plane)
+    seen, (stars, planes), kept = expectation(stamps, state), state.light_e.shape, state.kept.ravel()
+    numbers, count = np.arange(state.vector.size), state.maps_from + state.maps
+    prior, nodes = state.prior, numbers[count:].reshape(planes, -1)[:, kept]
+    pull, size, colours = prior @ state.vector, np.zeros(count), []
+    for own, mine in enumerate(nodes):
+        colour = normal_equations(stamps, state, seen, own)
         size[colour.index] += colour.dense.diagonal()
-        colours.append(_eliminated(colour, state, plane))
-    schur, right = _dense_prior(state, size)
+        colours.append(_eliminated(colour, prior[mine][:, mine], pull[mine]))
+    schur, right = prior[:count, :count].toarray(), -pull[:count]
+    light = numbers[: state.maps_from].reshape(stars, -1)[:, : 2 + planes].ravel()
+    schur[np.ix_(light, light)] += _held(state, size)
     for c in colours:
         schur[np.ix_(c.index, c.index)] += c.dense
         right[c.index] += c.right_dense
@@ -110,14 +115,14 @@ def laplace(stamps: Stamps, state: State) -> Laplace:
     root = cholesky(schur, lower=True)
     half = solve_triangular(root, right, lower=True)
     dense = solve_triangular(root, half, lower=True, trans=1)
-    nodes = [divided(c.band, (c.right_nodes - c.cross @ dense[c.index])[:, None], False) for c in colours]
+    images = [divided(c.band, (c.right_nodes - c.cross @ dense[c.index])[:, None], False) for c in colours]
     gain = 0.5 * float(half @ half + sum(c.right_nodes @ c.right_nodes for c in colours))
     diagonals = [np.diag(row) for c in colours for row in c.band]
     log_det = 2 * np.log(np.concatenate([np.diag(root), *diagonals])).sum()
     # Minus twice the log prior, up to constants that all orders have in common.
-    prior = float(state.precisions @ state.squares()) - state.volume()[0]
-    cost, kept = float(log_det - 2 * seen.log_likelihood + prior), state.kept.ravel()
-    mode, tuned = _with_nodes(dense[:, None], nodes, kept)[:, 0], np.zeros_like(state.precisions)
+    of_prior = float(state.precisions @ state.squares()) - state.volume()[0]
+    cost = float(log_det - 2 * seen.log_likelihood + of_prior)
+    mode, tuned = _with_nodes(dense[:, None], images, kept)[:, 0], np.zeros_like(state.precisions)
     return Laplace(cost, int(stamps.known.sum()), mode, gain, root, tuple(colours), kept, tuned)
 
 
@@ -131,17 +136,11 @@ def shared_by(
     field: PsfField, unit: Float[np.ndarray, "stars 2"], plane: int
 ) -> tuple[Int[np.ndarray, " own"], scipy.sparse.csr_array]:
     """Return the dense block's unknowns that a colour depends on, and the matrix to the stars' own changes."""
-    planes, stars, one = len(field.nodes), len(unit), np.eye(OWN)
+    planes, stars = len(field.nodes), len(unit)
     place = (2 + 2 * planes) * np.arange(stars)[:, None] + np.array([0, 1, 2 + plane, 2 + planes + plane])
-    numbers = stars * (2 + 2 * planes) + np.arange(field.warp.size + field.lateral.size)
-    warp, lateral = np.split(numbers, [field.warp.size])
-    parts = [(place, np.eye(stars), one[:, [1, 2, 0, 7]])]
-    parts += [(warp.reshape(field.warp.shape)[plane], polynomials(unit, field.map_degree)[:, 1:], one[:, 3:7])]
-    if plane != field.reference:
-        basis = polynomials(unit, degree_of(1 + field.lateral.shape[1]))[:, 1:]
-        parts += [(lateral.reshape(field.lateral.shape)[plane - (plane > field.reference)], basis, one[:, 1:3])]
-    matrix = scipy.sparse.hstack([scipy.sparse.kron(basis, own) for _, basis, own in parts], format="csr")
-    return np.concatenate([index.ravel() for index, _, _ in parts]), scipy.sparse.csr_array(matrix)
+    of_maps, matrix = by_maps(field, unit, plane)
+    whole = scipy.sparse.hstack([scipy.sparse.kron(np.eye(stars), np.eye(OWN)[:, [1, 2, 0, 7]]), matrix], format="csr")
+    return np.concatenate([place.ravel(), stars * (2 + 2 * planes) + of_maps]), scipy.sparse.csr_array(whole)
 
 
 def normal_equations(stamps: Stamps, state: State, seen: Weighted, plane: int) -> Colour:
@@ -150,40 +149,35 @@ def normal_equations(stamps: Stamps, state: State, seen: Weighted, plane: int) -
     basis, grid, kept = field.strengths(stamps.unit), field.nodes.shape[2:], state.kept
     index, shared = shared_by(field, stamps.unit, plane)
     weight = seen.weight * stamps.by_plane[plane]
-    jacobian = _by_own(seen)
+    jacobian = seen.seen.jacobian
     weighted = np.concatenate([jacobian, seen.residual[..., None]], axis=2) * weight[..., None]
     used = np.flatnonzero(weight)
     onto = taps(seen.seen, used, grid).T @ weighted.reshape(-1, OWN + 1)[used]
-    onto = onto.reshape(len(stamps.unit), -1, OWN + 1).transpose(1, 0, 2)
-    cross = [(onto[..., :OWN] * part[:, None]).reshape(len(onto), -1) @ shared for part in basis.T]
+    onto = np.ascontiguousarray(onto.reshape(len(stamps.unit), -1, OWN + 1).transpose(0, 2, 1))
+    cross, images = np.empty((kept.sum(), len(index))), np.nonzero(kept)[2]
+    for image, strength in enumerate(basis.T):
+        by_own = onto[:, :OWN, kept[..., image].ravel()] * strength[:, None, None]
+        cross[images == image] = (shared.T @ by_own.reshape(len(stamps.unit) * OWN, -1)).T
     own = jacobian.transpose(0, 2, 1) @ weighted
     return Colour(
         index=index,
         band=node_sums(basis, seen, used, kept),
-        cross=np.stack(cross, axis=1).reshape(-1, len(index))[kept.ravel()],
+        cross=cross,
         dense=(shared.T @ scipy.sparse.block_diag(list(own[..., :OWN]), format="csr") @ shared).toarray(),
-        right_nodes=(onto[..., OWN] @ basis).ravel()[kept.ravel()],
+        right_nodes=(onto[:, OWN].T @ basis)[kept.reshape(-1, len(basis.T))],
         right_dense=shared.T @ own[..., OWN].ravel(),
     )
-
-
-def _by_own(seen: Weighted) -> Float[np.ndarray, "stars samples own"]:
-    """Return derivatives by a star's own parameters, of which the last one is its background."""
-    return np.concatenate([seen.seen.jacobian, np.ones((*seen.weight.shape, 1))], axis=2)
 
 
 def changes_of_samples(
     stamps: Stamps, field: PsfField, seen: Weighted, draws: Float[np.ndarray, "unknowns k"]
 ) -> Float[np.ndarray, "stars samples k"]:
     """Return the changes of samples' expectation under changes of all unknowns, zero for unused samples."""
-    out, jacobian = np.zeros((stamps.known.size, draws.shape[1])), _by_own(seen)
-    nodes = Changes.of(field, len(stamps.unit), draws).nodes
-    for plane, own in enumerate(nodes):
+    out = np.zeros((stamps.known.size, draws.shape[1]))
+    for plane, nodes in enumerate(Changes.of(field, len(stamps.unit), draws).nodes):
         index, shared = shared_by(field, stamps.unit, plane)
         used = np.flatnonzero(seen.weight * stamps.by_plane[plane])
-        images = np.tensordot(field.strengths(stamps.unit), own, axes=1).reshape(-1, draws.shape[1])
-        by_own = jacobian @ (shared @ draws[index]).reshape(len(stamps.unit), OWN, -1)
-        out[used] = by_own.reshape(out.shape)[used] + taps(seen.seen, used, field.nodes.shape[2:]) @ images
+        out[used] = changes_of_light(field, seen.seen, stamps.unit, shared @ draws[index], nodes, used)
     return out.reshape(*stamps.known.shape, -1)
 
 
@@ -196,55 +190,78 @@ def node_sums(
     """Sum products of two nodes over samples, as a band of the nodes ``kept``; LinAlgError without samples."""
     if not used.size:
         raise np.linalg.LinAlgError("no sample is in use")
-    (rows, columns, terms), reach = kept.shape, TAPS - 1
+    terms = kept.shape[2]
+    # Light of a star at position X enters the image t with the factor C_t(X), for every sample. Sums of one star serve
+    # all pairs of images, therefore, and those of all stars a single image.
     t, u = np.triu_indices(terms)
-    place = np.empty((terms, terms), dtype=int)
-    place[t, u] = place[u, t] = np.arange(len(t))
-    near = scipy.ndimage.maximum_filter(kept[:, :, -1], 2 * reach + 1)
-    inner = used[near.ravel()[seen.seen.first.ravel()[used]]]
-    # Samples far from the nodes of further images do not contribute to them.
-    parts = (used, t[:1], u[:1]), (inner, t[1:], u[1:])
-    stencil = np.concatenate([_stencil(basis, seen, (rows, columns), *part) for part in parts], axis=-1)
-    band = []
-    for i, own in enumerate(kept):
-        out = np.zeros((columns, terms, TAPS, columns, terms))
-        for away in range(-reach, TAPS):
-            here, there = (slice(max(e, 0), columns + min(e, 0)) for e in (-away, away))
-            np.einsum("ctdcu->dctu", out[here, :, :, there])[...] = stencil[i, :, here, reach + away][..., place]
-        beyond = kept[i : i + TAPS].ravel()
-        band.append(out.reshape(columns * terms, -1)[own.ravel()][:, : len(beyond)][:, beyond])
-    return tuple(band)
+    pairs = basis[:, t] * basis[:, u]
+    # Nodes of further images, and those of the first one in their reach.
+    near = scipy.ndimage.maximum_filter(kept[..., -1], 2 * REACH + 1)
+    inner = tuple(slice(*np.flatnonzero(near.any(axis=axis))[[0, -1]] + [0, 1]) for axis in (1, 0))
+    first = np.zeros((*kept.shape[:2], TAPS, ACROSS))
+    every = np.zeros((*first[inner].shape, len(t)))
+    for stars, sums in _stencils(seen, used, kept.shape[:2], alone=terms == 1):
+        first += np.tensordot(pairs[stars, 0][: len(sums)], sums, axes=1)
+        if terms > 1:
+            close = sums[:, *inner]
+            every += (close.reshape(len(close), -1).T @ pairs[stars]).reshape(*close.shape[1:], -1)
+    place = np.where(kept, np.cumsum(kept).reshape(kept.shape) - 1, -1)
+    rows = [kept[i : i + TAPS].sum(axis=(1, 2)) for i in range(len(kept))]
+    size, width = np.array([(row[0], row.sum()) for row in rows]).T
+    ends = np.cumsum(size * width)
+    whole, start = np.zeros(ends[-1]), ends - size * width - (np.cumsum(size) - size) * (width + 1)
+    _fill(whole, place[..., :1], start, width, first[..., None, None])
+    if terms > 1:
+        number = np.empty((terms, terms), dtype=int)
+        number[t, u] = number[u, t] = np.arange(len(t))
+        _fill(whole, place[inner], start[inner[0]], width[inner[0]], every[..., number])
+    return tuple(part.reshape(-1, n) for part, n in zip(np.split(whole, ends[:-1]), width, strict=True))
 
 
-def _stencil(
-    basis: Float[np.ndarray, "stars terms"],
-    seen: Weighted,
-    grid: tuple[int, int],
-    used: Int[np.ndarray, " used"],
-    t: Int[np.ndarray, " pairs"],
-    u: Int[np.ndarray, " pairs"],
-) -> Float[np.ndarray, "rows down columns across pairs"]:
-    """Sum products of nodes at each distance, down from 0 and across from -3, for pairs of images."""
-    # Light of a star at position X enters the image t with the factor C_t(X), for every sample, and the weights of
-    # a sample's 4 x 4 nodes are products of four down and four across. The contribution of a grid cell's samples is
-    # therefore a product of pairs down, pairs across, and pairs of images.
-    (rows, columns), reach = grid, TAPS - 1
-    stencil = np.zeros((rows, TAPS, columns, 2 * reach + 1, len(t)))
-    down, across = (part.reshape(-1, TAPS)[used] for part in (seen.seen.down, seen.seen.across))
-    one, other = np.triu_indices(TAPS)
-    both = (basis[:, t] * basis[:, u])[used // seen.weight.shape[1]] * seen.weight.ravel()[used, None]
-    index = seen.seen.first.ravel()[used, None] * len(one) + np.arange(len(one))
-    products = (across[:, one] * across[:, other]).ravel(), index.ravel(), np.arange(0, index.size + 1, len(one))
-    onto = scipy.sparse.csc_array(products, shape=(rows * columns * len(one), len(used)))
-    for i, k in zip(one, other, strict=True):
-        sums = onto @ (both * (down[:, i] * down[:, k])[:, None])
-        sums = sums.reshape(rows, columns, len(one), -1)[:-reach, :-reach]
-        # Nodes at each distance in columns.
-        spread = stencil[i : i + rows - reach, k - i]
-        for pair, (j, n) in enumerate(zip(one, other, strict=True)):
-            for first, beside in {(j, n - j), (n, j - n)}:
-                spread[:, first : first + columns - reach, reach + beside] += sums[:, :, pair]
-    return stencil
+def _stencils(
+    seen: Weighted, used: Int[np.ndarray, " used"], grid: tuple[int, ...], alone: bool
+) -> Iterator[tuple[slice, Float[np.ndarray, "stars rows columns down across"]]]:
+    """Yield sums of products of nodes so far apart, down from 0 and across from -3, for some stars, or all together."""
+    stars, samples = seen.weight.shape
+    nodes, step = grid[0] * grid[1], np.arange(TAPS)
+    some = stars if alone else max(1, _AT_ONCE // (nodes * TAPS * ACROSS))
+    for begin in range(0, stars, some):
+        part = slice(begin, min(begin + some, stars))
+        own = used[slice(*np.searchsorted(used, (part.start * samples, part.stop * samples)))]
+        down, across = (taps.reshape(-1, TAPS)[own] for taps in (seen.seen.down, seen.seen.across))
+        first = seen.seen.first.ravel()[own] + (0 if alone else nodes * (own // samples - begin))
+        products = np.zeros((len(own), TAPS, ACROSS))
+        for tap in step:
+            products[:, tap, REACH - tap : ACROSS - tap] = across[:, tap, None] * across
+        beside, weighted = products.reshape(-1, ACROSS), seen.weight.ravel()[own, None] * down
+        groups = 1 if alone else part.stop - part.start
+        sums = np.empty((groups * nodes, TAPS, ACROSS))
+        for away in step:
+            # Of each sample and node across, the nodes down that have another one so far away.
+            index = first[:, None, None] + step[:, None] + grid[1] * step[: TAPS - away]
+            product = np.broadcast_to((weighted[:, : TAPS - away] * down[:, away:])[:, None], index.shape)
+            ends, shape = np.arange(0, index.size + 1, TAPS - away), (len(sums), len(beside))
+            sums[:, away] = scipy.sparse.csc_array((product.ravel(), index.ravel(), ends), shape=shape) @ beside
+        yield part, sums.reshape(groups, *grid, TAPS, ACROSS)
+
+
+def _fill(
+    whole: Float[np.ndarray, " entries"],
+    place: Int[np.ndarray, "rows columns terms"],
+    start: Int[np.ndarray, " rows"],
+    width: Int[np.ndarray, " rows"],
+    values: Float[np.ndarray, "rows columns down across terms terms"],
+) -> None:
+    """Put sums where a band has their nodes, of number ``place``; -1 for those that it lacks."""
+    rows, columns, _ = place.shape
+    first = start[:, None, None] + place * width[:, None, None]
+    for down in range(TAPS):
+        for across in range(-REACH if down else 0, TAPS):
+            here = np.s_[: rows - down, max(-across, 0) : columns - max(across, 0)]
+            there = place[down:, max(across, 0) : columns + min(across, 0), None]
+            both = (place[here][..., None] >= 0) & (there >= 0)
+            at = first[here][..., None] + there
+            whole[at[both]] = values[here][:, :, down, REACH + across][both]
 
 
 def factor(band: Band) -> Band:
@@ -278,37 +295,24 @@ def _divide(upper: Float[np.ndarray, "n n"], right: Float[np.ndarray, "n k"], tr
     return np.asarray(dtrsm(1.0, upper.T, right.T, side=1, lower=1, trans_a=int(transposed), overwrite_b=1)).T
 
 
-def _eliminated(colour: Colour, state: State, plane: int) -> Colour:
+def _eliminated(colour: Colour, prior: scipy.sparse.csr_array, pull: Float[np.ndarray, " nodes"]) -> Colour:
     """Add the prior of images and eliminate the nodes; their arrays are overwritten."""
-    prior, at = state.prior(plane), 0
-    right = colour.right_nodes - prior @ np.moveaxis(state.field.nodes[plane], 0, 2)[state.kept]
+    at = 0
     for row in colour.band:
         row += prior[at : at + row.shape[0], at : at + row.shape[1]].toarray()
         at += len(row)
     factor(colour.band)
-    half = divided(colour.band, right[:, None], True)[:, 0]
+    half = divided(colour.band, (colour.right_nodes - pull)[:, None], True)[:, 0]
     cross = divided(colour.band, colour.cross, True)
     schur, left = colour.dense - cross.T @ cross, colour.right_dense - cross.T @ half
     return replace(colour, cross=cross, right_nodes=half, dense=schur, right_dense=left)
 
 
-def _dense_prior(
-    state: State, size: Float[np.ndarray, " dense"]
-) -> tuple[Float[np.ndarray, "dense dense"], Float[np.ndarray, " dense"]]:
-    """Return the dense block's prior precision and right side; it holds changes that images can make as well."""
-    (stars, planes), from_ = state.light_e.shape, state.maps_from
-    own = np.arange(from_).reshape(stars, -1)
-    light, matrix, right = own[:, : 2 + planes], np.zeros((len(size), len(size))), np.zeros(len(size))
+def _held(state: State, size: Float[np.ndarray, " dense"]) -> Float[np.ndarray, "light light"]:
+    """Return what holds changes of places and light that images can make as well, the first unknowns of each star."""
+    stars, planes = state.light_e.shape
     # Stars that are left out completely keep their places and light.
-    seen = size[light]
-    held = (np.sqrt(seen.mean(axis=0)) * (seen > 0))[:, :, None] * np.eye(seen.shape[1])
+    seen = size[: state.maps_from].reshape(stars, -1)[:, : 2 + planes]
+    held = (np.sqrt(seen.mean(axis=0)) * (seen > 0))[:, :, None] * np.eye(2 + planes)
     held = held.reshape(seen.size, -1)
-    matrix[np.ix_(light.ravel(), light.ravel())] = held @ held.T + np.diag(np.where(seen > 0, 0.0, 1.0).ravel())
-    mean, scatter = state.precisions[-2:]
-    for index, values in zip(own[:, 2 + planes :].T, state.background_e.T, strict=True):
-        matrix[np.ix_(index, index)] = scatter * np.eye(stars) + (mean - scatter) / stars
-        right[index] = -matrix[np.ix_(index, index)] @ values
-    maps = state.precisions[state.map_groups]
-    matrix[from_:, from_:] = np.diag(maps)
-    right[from_:] = -maps * state.maps
-    return matrix, right
+    return held @ held.T + np.diag(np.where(seen > 0, 0.0, 1.0).ravel())

@@ -30,6 +30,10 @@ from numpy.polynomial.legendre import legvander
 from udccal.models.arrays import Arrayish
 
 TAPS = 4  # nodes along an axis under a cubic B-spline
+# Parameters of one star: relative light, centre (x, y), the four numbers of its map, row by row, and background.
+OWN = 8
+# Coefficients of 1, f, f^2 and f^3 in the weight of each of these nodes.
+_SPLINE = np.array([[1.0, 4.0, 1.0, 0.0], [-3.0, 0.0, 3.0, 0.0], [3.0, -6.0, 3.0, 0.0], [-1.0, 3.0, -3.0, 1.0]]) / 6
 _Taps = Float[Array, "samples 4"]
 
 
@@ -95,7 +99,7 @@ class Changes(NamedTuple):
     nodes: Float[np.ndarray, "planes images grid_rows grid_columns k"]
 
     @classmethod
-    def of(cls, field: PsfField, stars: int, vector: Float[np.ndarray, "unknowns k"]) -> Changes:
+    def of(cls, field: PsfField, stars: int, vector: Shaped[np.ndarray, "unknowns k"]) -> Changes:
         """Split a vector into its parts."""
         planes, images, *grid = field.nodes.shape
         ends = np.cumsum([stars * (2 + 2 * planes), np.size(field.warp) + np.size(field.lateral)])
@@ -108,14 +112,14 @@ class Seen(NamedTuple):
     """A field's light in samples of stamps, per unit of a star's light.
 
     Attributes:
-        jacobian: derivatives by a star's own parameters: relative light, centre (x, y), map (row by row).
+        jacobian: derivatives by a star's own parameters, of which there are ``OWN``.
         first: flat index of the first of 4 x 4 nodes.
         down, across: weights of these nodes times 1 / |M|, as a product.
         inside: True for samples on the grid.
     """
 
     value: Float[Arrayish, "stars samples"]
-    jacobian: Float[Arrayish, "stars samples 7"]
+    jacobian: Float[Arrayish, "stars samples 8"]
     first: Int[Arrayish, "stars samples"]
     down: Float[Arrayish, "stars samples 4"]
     across: Float[Arrayish, "stars samples 4"]
@@ -144,12 +148,13 @@ def see(
     """Return values and derivatives at samples of colours ``plane``; centres and samples are (x, y) in px."""
     planes, count, rows, columns = field.nodes.shape
     images = field.strengths(unit) @ np.asarray(field.nodes).reshape(planes, count, -1)
-    # One compilation serves all orders, and numbers of nodes and stars up to multiples of these.
-    filled = _filled(np.moveaxis(images, 0, 1), (0, 8), (2, 16384))
-    by_star = (field.maps(unit), centre_px[:, None] + field.centres(unit), plane.astype(np.int32))
+    # One compilation serves all orders, stars eight at a time, and numbers of nodes up to a multiple of this.
+    filled = _filled(np.moveaxis(images, 0, 1), 2, 16384)
+    by_star = (filled, field.maps(unit), centre_px[:, None] + field.centres(unit), plane.astype(np.int32))
     grid = np.int32(rows), np.int32(columns), np.float64(field.spacing_px)
-    seen = response(filled, *(_filled(part, (0, 8)) for part in by_star), offset_px, *grid)
-    return Seen(*(np.asarray(part)[: len(unit)] for part in seen))
+    parts = ([_filled(part[at : at + 8], 0, 8) for part in by_star] for at in range(0, len(unit), 8))
+    seen = [response(*part, offset_px, *grid) for part in parts]
+    return Seen(*(np.concatenate(part)[: len(unit)] for part in zip(*seen, strict=True)))
 
 
 def taps(seen: Seen, used: Int[np.ndarray, " used"], grid: tuple[int, ...]) -> scipy.sparse.csr_array:
@@ -162,11 +167,40 @@ def taps(seen: Seen, used: Int[np.ndarray, " used"], grid: tuple[int, ...]) -> s
     return scipy.sparse.csr_array(((down[:, :, None] * across[:, None]).ravel(), index.ravel(), ends), shape=shape)
 
 
-def _filled(values: Shaped[np.ndarray, "..."], *multiples: tuple[int, int]) -> Shaped[np.ndarray, "..."]:
-    """Repeat the last entry along some axes up to a multiple."""
-    widths = [(0, 0)] * values.ndim
-    for axis, multiple in multiples:
-        widths[axis] = (0, -values.shape[axis] % multiple)
+def by_maps(
+    field: PsfField, unit: Float[np.ndarray, "stars 2"], plane: int
+) -> tuple[Int[np.ndarray, " own"], scipy.sparse.csr_array]:
+    """Return which numbers of ``Changes.maps`` a colour depends on, and the matrix from these to the stars' own."""
+    one = np.eye(OWN)
+    warp, lateral = np.split(np.arange(field.warp.size + field.lateral.size), [field.warp.size])
+    index, basis = [warp.reshape(field.warp.shape)[plane].ravel()], polynomials(unit, field.map_degree)[:, 1:]
+    parts = [scipy.sparse.kron(basis, one[:, 3:7])]
+    if plane != field.reference:
+        index.append(lateral.reshape(field.lateral.shape)[plane - (plane > field.reference)].ravel())
+        basis = polynomials(unit, degree_of(1 + field.lateral.shape[1]))[:, 1:]
+        parts.append(scipy.sparse.kron(basis, one[:, 1:3]))
+    return np.concatenate(index), scipy.sparse.csr_array(scipy.sparse.hstack(parts, format="csr"))
+
+
+def changes_of_light(
+    field: PsfField,
+    seen: Seen,
+    unit: Float[np.ndarray, "stars 2"],
+    own: Float[np.ndarray, "parameters k"],
+    nodes: Float[np.ndarray, "images grid_rows grid_columns k"],
+    used: Int[np.ndarray, " used"],
+) -> Float[np.ndarray, "used k"]:
+    """Return changes of light in samples under changes of stars' own parameters, and of a colour's nodes."""
+    stars, samples, count = seen.jacobian.shape
+    by_own = (seen.jacobian @ own.reshape(stars, count, own.shape[1])).reshape(stars * samples, own.shape[1])
+    images = np.tensordot(field.strengths(unit), nodes, axes=1)
+    weights = taps(seen, used, images.shape[1:3])
+    return by_own[used] + weights @ images.reshape(weights.shape[1], own.shape[1])
+
+
+def _filled(values: Shaped[np.ndarray, "..."], axis: int, multiple: int) -> Shaped[np.ndarray, "..."]:
+    """Repeat the last entry along an axis up to a multiple."""
+    widths = [(0, -values.shape[axis] % multiple if one == axis else 0) for one in range(values.ndim)]
     return np.pad(values, widths, mode="edge")
 
 
@@ -211,7 +245,7 @@ def response(
         second = scale[:, None, None] * second.reshape(-1, 2, 2)
         by_map = -rise[:, :, None] * at[:, None, :] - value[:, None, None] * inverse.transpose(0, 2, 1)
         by_map -= 2 * jnp.einsum("sai,sab,sbj->sij", inverse, second, shrunk)
-        jacobian = jnp.concatenate([value[:, None], -rise, by_map.reshape(-1, 4)], axis=1)
+        jacobian = jnp.concatenate([value[:, None], -rise, by_map.reshape(-1, 4), jnp.ones((len(value), 1))], axis=1)
         return Seen(value, jacobian, first, scale[:, None] * down, across, inside_y & inside_x)
 
     return jax.vmap(star)(images, maps, centres, plane)
@@ -225,19 +259,12 @@ def _weights(
     Weights and first derivatives include ``pixel`` times their second derivative; the plain second one comes last.
     """
     cell = jnp.floor(place)
-    f = (place - cell)[:, None]
     first = cell.astype(jnp.int32) - 1
     inside = (first >= 0) & (first + TAPS <= nodes)
-    g = 1.0 - f
-    weights = [g**3 / 6, (3 * f**3 - 6 * f**2 + 4) / 6, (3 * g**3 - 6 * g**2 + 4) / 6, f**3 / 6]
-    derivatives = [-(g**2) / 2, (3 * f**2 - 4 * f) / 2, (4 * g - 3 * g**2) / 2, f**2 / 2]
-    bend, third = jnp.concatenate([g, 3 * f - 2, 3 * g - 2, f], axis=1), jnp.array([-1.0, 3.0, -3.0, 1.0])
-    own, slope, second = (
-        jnp.where(inside[:, None], part + pixel[:, None] * more, 0.0)
-        for part, more in (
-            (jnp.concatenate(weights, axis=1), bend),
-            (jnp.concatenate(derivatives, axis=1), third),
-            (bend, 0.0),
-        )
-    )
-    return jnp.clip(first, 0, nodes - TAPS), own, slope, second, inside
+    # Powers of the distance from the second node, and their derivatives.
+    f, zero = place - cell, jnp.zeros_like(place)
+    powers = (zero + 1, f, f**2, f**3), (zero, zero + 1, 2 * f, 3 * f**2), (zero, zero, zero + 2, 6 * f)
+    value, slope, bend = (jnp.where(inside[:, None], jnp.stack(p, axis=1) @ _SPLINE, 0.0) for p in powers)
+    third = jnp.where(inside[:, None], _SPLINE[3] * 6, 0.0)
+    own, rise = (part + pixel[:, None] * more for part, more in ((value, bend), (slope, third)))
+    return jnp.clip(first, 0, nodes - TAPS), own, rise, bend, inside

@@ -17,9 +17,9 @@ from udccal.fitting.engine.report import estimates, residual_sample
 from udccal.fitting.engine.robust import OutlierRule, outliers, robust_sigma
 from udccal.fitting.psf_stamps.data import Stamps, StampsRules, offsets, unusable
 from udccal.fitting.psf_stamps.equations import laplace, marginal_cov
-from udccal.fitting.psf_stamps.field import Changes, PsfField, degree_of, polynomials, see, taps
-from udccal.fitting.psf_stamps.model_error import without_error
-from udccal.fitting.psf_stamps.probability import LEAST, State, expectation, laplacian
+from udccal.fitting.psf_stamps.field import Changes, PsfField, by_maps, changes_of_light, see
+from udccal.fitting.psf_stamps.model_error import drawn, without_error
+from udccal.fitting.psf_stamps.probability import LEAST, State, expectation
 from udccal.fitting.psf_stamps.search import WINDOW_PX, Found, Orders, search
 from udccal.numerics import in_float64
 from udccal.result import Diagnostic, FitResult, FitStatus, Outliers
@@ -169,16 +169,10 @@ class StampsPsf:
         field, grid, k = self.field, offsets(self.rows, self.columns), self.factor.shape[1]
         changes = Changes.of(field, len(self.star_px), self.factor)
         seen = see(field, unit, centre, grid, np.full((len(unit), len(grid)), plane))
-        images = np.tensordot(field.strengths(unit), changes.nodes[plane], axes=1)
-        every = taps(seen, np.arange(seen.value.size), field.nodes.shape[2:])
-        change = (every @ images.reshape(every.shape[1], k)).reshape(*seen.value.shape, k)
-        maps, centres = np.split(changes.maps, [field.warp.size])
-        warp = maps.reshape(*field.warp.shape[:2], 4, k)
-        lateral = np.insert(centres.reshape(*field.lateral.shape, k), field.reference, 0.0, axis=0)
-        for own, by in ((lateral[plane], seen.jacobian[..., 1:3]), (warp[plane], seen.jacobian[..., 3:])):
-            basis = polynomials(unit, degree_of(1 + len(own)))[:, 1:]
-            change += by @ np.tensordot(basis, own, axes=1)
-        return seen.value, change, seen.jacobian[..., 1:3]
+        index, matrix = by_maps(field, unit, plane)
+        used = np.arange(seen.value.size)
+        change = changes_of_light(field, seen, unit, matrix @ changes.maps[index], changes.nodes[plane], used)
+        return seen.value, change.reshape(*seen.value.shape, k), seen.jacobian[..., 1:3]
 
 
 @in_float64
@@ -237,11 +231,11 @@ def _report(
     z = (seen.residual * np.sqrt(seen.weight))[used]
     # All unknowns (except total light and common shift, which are held), less the part that the priors determine.
     held = float(state.precisions @ state.squares(draws))
-    unknowns = int(state.kept.sum()) * state.light_e.shape[1] + len(state.maps) + state.maps_from
+    unknowns = int(state.kept.sum()) * state.light_e.shape[1] + state.maps + state.maps_from
     effective = unknowns - 2 - state.light_e.shape[1] - held
     chi2_dof = float(z @ z) / max(z.size - effective, 1.0)
     inflation = float(np.sqrt(chi2_dof)) if chi2_dof > rules.inflate_above else 1.0
-    draws = draws * inflation + _errors(state, *draws.shape)
+    draws = draws * inflation + drawn(state, *draws.shape)
     # The way that is left is one more standard deviation.
     draws += posterior.mode[:, None] * np.random.default_rng(2).standard_normal(rules.draws[1])
     term = _term(stamps, state, draws / np.sqrt(rules.draws[1]))
@@ -271,7 +265,7 @@ def _report(
             Diagnostic("clipped_samples", float(stamps.clipped.sum()), "1"),
             Diagnostic("samples_beyond_the_image", float((stamps.known & state.keep).sum() - z.size), "1"),
             Diagnostic("sigma_inflation", inflation, "1"),
-            Diagnostic("model_error", _model_error(state), "1"),
+            Diagnostic("model_error", state.misfit, "1"),
             Diagnostic("background", float(state.background_e.mean()), "e-"),
         ),
         notes=(*([note] if note else []), *_told(state)),
@@ -286,26 +280,6 @@ def _faint_scatter(stamps: Stamps, state: State) -> float:
     plain = expectation(stamps, without_error(state))
     used = (plain.weight > 0) & (plain.mean_e <= np.quantile(plain.mean_e, 0.25))
     return robust_sigma((plain.residual * np.sqrt(plain.weight))[used]) ** 2
-
-
-def _errors(state: State, unknowns: int, count: int) -> Float[np.ndarray, "unknowns k"]:
-    """Draw what the model does not describe, as noise of the first images' nodes that gives kernels its model error."""
-    out = np.zeros((unknowns, count))
-    nodes = Changes.of(state.field, len(state.light_e), out).nodes
-    # The mean sum of squared weights of a cubic B-spline is 0.479 along an axis.
-    rng = np.random.default_rng(1)
-    nodes[:, 0] += state.model_error[..., None] / 0.479 * rng.standard_normal((*state.size.shape, count))
-    # Where further images have no nodes, they may be as large as their prior, which the others set.
-    eigenvalues, left = laplacian(*state.size.shape[1:])[1], ~np.moveaxis(state.kept, 2, 0)
-    for image in np.flatnonzero(left.any(axis=(1, 2))):
-        a, b = state.of_images[:, image].T[..., None]
-        spread = np.sqrt((1.0 / (a + b * eigenvalues)).mean(axis=1))[:, None, None] * state.size * left[image]
-        nodes[:, image] += spread[..., None] / 0.479 * rng.standard_normal((*spread.shape, count))
-    # Light of the psf that is constant over a stamp differs from a background only by its growth with a star's light.
-    spread = np.maximum(state.light_e.std(axis=0), 1e-3 * state.light_e.mean(axis=0)) * np.sqrt(len(state.light_e))
-    edge = state.background_e.std(axis=0) / spread
-    nodes[:, 0] += edge[:, None, None, None] * rng.standard_normal((len(edge), 1, 1, count))
-    return out
 
 
 def _term(stamps: Stamps, state: State, factor: np.ndarray) -> StampsPsf:
@@ -324,15 +298,10 @@ def _told(state: State) -> tuple[str, ...]:
         found = ", ".join(f"{level:.3g}" for level in mean)
         told = "It was fitted stamp by stamp; subtract it beforehand to know the psf's edge better."
         notes.append(f"The stamps have a background of {found} e- that is not zero. {told}")
-    if error := _model_error(state):
+    if error := state.misfit:
         told = "Error bars include it: the field changes more than its orders follow, or the noise given is wrong."
         notes.append(f"The psf differs from the model by {100 * error:.2g} %. {told}")
     return tuple(notes)
-
-
-def _model_error(state: State) -> float:
-    """Return the model error relative to the kernel, root mean square."""
-    return float(np.linalg.norm(state.model_error) / np.linalg.norm(state.size))
 
 
 def _names(state: State) -> list[str]:

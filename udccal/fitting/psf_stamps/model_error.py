@@ -8,26 +8,24 @@ which shows smaller errors. The larger one counts.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from udccal.fitting.engine.gaussian import scaled_inverse
-from udccal.fitting.engine.misfit import excess_sigma
+from udccal.fitting.engine.misfit import SIGNIFICANT
 from udccal.fitting.engine.robust import MAD_TO_SIGMA
+from udccal.fitting.engine.tails import chi2_tail
 from udccal.fitting.psf_stamps.data import Stamps, StampsRules
 from udccal.fitting.psf_stamps.equations import changes_of_samples, laplace
 from udccal.fitting.psf_stamps.field import Changes
-from udccal.fitting.psf_stamps.probability import State, Weighted, expectation
+from udccal.fitting.psf_stamps.probability import State, Weighted, expectation, laplacian
 
 _NEAR_PX = 2.0  # size of the squares whose nodes are near each other
 _FACTOR = 4.0  # within which nodes are of similar light
 
 Nodes = Float[np.ndarray, "planes grid_rows grid_columns"]
-# The size of an error from squares, their variance by noise, and what an error of size 1 adds.
-Size = Callable[[np.ndarray, np.ndarray, np.ndarray], float]
 
 
 def without_error(state: State) -> State:
@@ -39,7 +37,7 @@ def of_residuals(stamps: Stamps, state: State) -> Nodes:
     """Return the model error that a fit's own residuals show, in most stars: hits have little weight."""
     seen = expectation(stamps, without_error(state))
     variance = np.divide(1.0, seen.weight, out=np.zeros_like(seen.weight), where=seen.weight > 0)
-    return _shown(stamps, state, seen.node, seen.residual**2, variance, _of_most)
+    return _shown(stamps, state, seen.residual**2, variance, chance=1.0)
 
 
 def of_stars_left_out(stamps: Stamps, state: State, rules: StampsRules) -> Nodes:
@@ -65,8 +63,7 @@ def of_stars_left_out(stamps: Stamps, state: State, rules: StampsRules) -> Nodes
         every = 1.0 - (taken**2).sum(axis=2) + (change**2).mean(axis=2)
         square[out] = (seen.residual**2)[out]
         np.divide(every, seen.weight, out=variance, where=(seen.weight > 0) & out[:, None])
-    node = expectation(stamps, state).node
-    return _shown(stamps, state, node, square, variance, _significant)
+    return _shown(stamps, state, square, variance, chance=SIGNIFICANT)
 
 
 def placed(stamps: Stamps, state: State, stars: Bool[np.ndarray, " stars"]) -> State:
@@ -97,39 +94,28 @@ def _by_star(stamps: Stamps, state: State, seen: Weighted) -> Float[np.ndarray, 
 def _shown(
     stamps: Stamps,
     state: State,
-    node: Int[np.ndarray, "stars samples"],
     square: Float[np.ndarray, "stars samples"],
     variance: Float[np.ndarray, "stars samples"],
-    size_of: Size,
+    chance: float,
 ) -> Nodes:
-    """Return the model error that squares of residuals show; samples of zero variance are not used."""
+    """Return the model error that squares of residuals show in most samples, by medians, where chance is less likely.
+
+    Samples of zero variance are not used. Stars at the edge, for which the others extrapolate, have little weight.
+    """
     used = (variance > 0) & ~stamps.clipped
+    node = expectation(stamps, state).node[used]
     # Squares of an error that is as large as the light nearby; the measured one is relative to it.
-    unit = (np.take_along_axis(state.light_e, stamps.plane, axis=1)[used] * state.size.ravel()[node[used]]) ** 2
+    unit = (np.take_along_axis(state.light_e, stamps.plane, axis=1)[used] * state.size.ravel()[node]) ** 2
     square, variance, found = square[used], variance[used], np.zeros(state.size.size)
     for groups in _groups(state):
-        own = groups.ravel()[node[used]]
+        own = groups.ravel()[node]
         order = np.argsort(own, kind="stable")
         for index in np.split(order, np.flatnonzero(np.diff(own[order])) + 1):
-            size = size_of(square[index], variance[index], unit[index])
-            here = np.isin(groups.ravel(), own[index[:1]])
-            found[here] = np.maximum(found[here], size)
+            excess = MAD_TO_SIGMA**2 * np.median(square[index] / unit[index]) - np.median(variance[index] / unit[index])
+            if excess > 0 and chi2_tail(float((square[index] / variance[index]).sum()), index.size) <= chance:
+                here = groups.ravel() == own[index[0]]
+                found[here] = np.maximum(found[here], np.sqrt(excess))
     return state.size * found.reshape(state.size.shape)
-
-
-def _of_most(
-    square: Float[np.ndarray, " n"], variance: Float[np.ndarray, " n"], unit: Float[np.ndarray, " n"]
-) -> float:
-    """Return the size of the error in most samples, by medians, significant or not."""
-    excess = MAD_TO_SIGMA**2 * np.median(square / unit) - np.median(variance / unit)
-    return float(np.sqrt(max(excess, 0.0)))
-
-
-def _significant(
-    square: Float[np.ndarray, " n"], variance: Float[np.ndarray, " n"], unit: Float[np.ndarray, " n"]
-) -> float:
-    """The same where it is significant; stars at the edge, for which the others extrapolate, have little weight."""
-    return _of_most(square, variance, unit) if excess_sigma(square, variance, unit, dof=float(square.size)) else 0.0
 
 
 def _groups(state: State) -> tuple[Int[np.ndarray, "planes grid_rows grid_columns"], ...]:
@@ -139,3 +125,23 @@ def _groups(state: State) -> tuple[Int[np.ndarray, "planes grid_rows grid_column
     light = np.log(state.size.max(axis=(1, 2), keepdims=True) / state.size) / np.log(_FACTOR)
     plane = np.arange(planes)[:, None, None] * 10**6
     return plane + 1000 * (y[:, None] - y[0]) + (x - x[0]), plane + light.astype(int)
+
+
+def drawn(state: State, unknowns: int, count: int) -> Float[np.ndarray, "unknowns k"]:
+    """Draw what the model does not describe, as noise of the first images' nodes that gives kernels its model error."""
+    out = np.zeros((unknowns, count))
+    nodes = Changes.of(state.field, len(state.light_e), out).nodes
+    # The mean sum of squared weights of a cubic B-spline is 0.479 along an axis.
+    rng = np.random.default_rng(1)
+    nodes[:, 0] += state.model_error[..., None] / 0.479 * rng.standard_normal((*state.size.shape, count))
+    # Where further images have no nodes, they may be as large as their prior, which the others set.
+    eigenvalues, left = laplacian(*state.size.shape[1:])[1], ~np.moveaxis(state.kept, 2, 0)
+    for image in np.flatnonzero(left.any(axis=(1, 2))):
+        a, b = state.of_images[:, image].T[..., None]
+        spread = np.sqrt((1.0 / (a + b * eigenvalues)).mean(axis=1))[:, None, None] * state.size * left[image]
+        nodes[:, image] += spread[..., None] / 0.479 * rng.standard_normal((*spread.shape, count))
+    # Light of the psf that is constant over a stamp differs from a background only by its growth with a star's light.
+    spread = np.maximum(state.light_e.std(axis=0), 1e-3 * state.light_e.mean(axis=0)) * np.sqrt(len(state.light_e))
+    edge = state.background_e.std(axis=0) / spread
+    nodes[:, 0] += edge[:, None, None, None] * rng.standard_normal((len(edge), 1, 1, count))
+    return out

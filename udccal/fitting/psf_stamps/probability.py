@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 import scipy.ndimage
@@ -25,7 +25,6 @@ from scipy.special import log_ndtr
 
 from udccal.fitting.psf_stamps.data import Stamps, StampsRules
 from udccal.fitting.psf_stamps.field import Changes, PsfField, Seen, degree_of, see
-from udccal.models.fields import polynomial_terms
 
 LEAST = 2e-5  # size of the faintest light that the prior expects, relative to the peak
 ABSENT = 1e8  # precision of a term that is not there, relative to the kernel
@@ -94,6 +93,11 @@ class State:
         return bool((self.background_e**2).mean() > 1.0)
 
     @property
+    def misfit(self) -> float:
+        """Model error relative to the kernel, root mean square."""
+        return float(np.linalg.norm(self.model_error) / np.linalg.norm(self.size))
+
+    @property
     def width_px(self) -> float:
         """Standard deviation of a Gaussian as wide as the kernel in the middle, by its noise-equivalent area."""
         nodes = self.field.nodes[self.field.reference, 0] * self.field.spacing_px
@@ -119,17 +123,40 @@ class State:
         return self.precisions[: 2 * planes * count].reshape(planes, count, 2)
 
     @property
-    def map_groups(self) -> Int[np.ndarray, " numbers"]:
-        """Index of the precision of every number of maps and lateral colour."""
-        parts = (self.field.warp, 4), (self.field.lateral, 2)
-        sizes = [np.tile(k * np.arange(2, degree_of(1 + part.shape[1]) + 2), len(part)) for part, k in parts]
-        every = np.concatenate(sizes).astype(int)
-        return np.repeat(self.of_images.size + np.arange(len(every)), every)
+    def maps(self) -> int:
+        """How many numbers maps and lateral colour have."""
+        return int(np.size(self.field.warp) + np.size(self.field.lateral))
 
-    @property
-    def maps(self) -> Float[np.ndarray, " numbers"]:
-        """Numbers of the maps, then of lateral colour."""
-        return np.concatenate([np.ravel(self.field.warp), np.ravel(self.field.lateral)])
+    @cached_property
+    def vector(self) -> Float[np.ndarray, " unknowns"]:
+        """Values of the unknowns, in the order of ``Changes``; 0 for places and light, of which no prior knows."""
+        stars = np.concatenate([np.zeros((len(self.light_e), 2 + self.light_e.shape[1])), self.background_e], axis=1)
+        parts = stars, self.field.warp, self.field.lateral, np.moveaxis(self.field.nodes, 1, 3)
+        return np.concatenate([np.ravel(part) for part in parts])
+
+    @cached_property
+    def roots(self) -> tuple[scipy.sparse.csr_array, Int[np.ndarray, " groups"]]:
+        """Matrix whose product with the unknowns gives the squares of each precision, and how many each has."""
+        (stars, planes), field, every = self.light_e.shape, self.field, scipy.sparse.eye_array(self.vector.size).tocsr()
+        numbers, parts = Changes.of(field, stars, np.arange(self.vector.size)[:, None]), []
+        for plane, image in np.ndindex(*field.nodes.shape[:2]):
+            inside = self.inner if image else np.s_[:, :]
+            index, size = (part[inside].ravel() for part in (numbers.nodes[plane, image, ..., 0], self.size[plane]))
+            parts.append(scipy.sparse.diags_array(1.0 / size) @ every[index])
+            parts.append(laplacian(*self.size[plane][inside].shape)[0] @ parts[-1])
+        for own, like in zip(np.split(numbers.maps, [field.warp.size]), (field.warp, field.lateral), strict=True):
+            ends = np.cumsum(np.arange(2, degree_of(1 + like.shape[1]) + 1))
+            parts += [every[one.ravel()] for of in own.reshape(like.shape) for one in np.split(of, ends) if one.size]
+        level, mean = every[numbers.stars[:, -planes:, 0].T.ravel()], np.full((1, stars), 1 / np.sqrt(stars))
+        means = scipy.sparse.kron(np.eye(planes), mean)
+        parts += [means @ level, level - means.T @ means @ level]
+        return scipy.sparse.csr_array(scipy.sparse.vstack(parts)), np.array([part.shape[0] for part in parts])
+
+    @cached_property
+    def prior(self) -> scipy.sparse.csr_array:
+        """Precision of all unknowns before the data."""
+        root, counts = self.roots
+        return scipy.sparse.csr_array(root.T @ scipy.sparse.diags_array(np.repeat(self.precisions, counts)) @ root)
 
     def shifted(self, vector: Float[np.ndarray, " unknowns"]) -> State:
         """Return the state with changes added, in the order of ``Changes``."""
@@ -143,22 +170,13 @@ class State:
             background_e=self.background_e + background,
         )
 
-    def with_map(self, degree: int, rules: StampsRules) -> State:
-        """Return the state with a map of another degree: new numbers start at zero, and dropped ones are lost."""
-        old, planes, before = self.field.map_degree, len(self.size), self.of_images.size
-        images, maps, others = np.split(self.precisions, [before, before + planes * old])
-        new = np.tile([rules.first_map] * 2 + [rules.new_map] * degree, (planes, 1))
-        maps = np.concatenate([maps.reshape(planes, old), new[:, old:]], axis=1)[:, :degree]
-        field = replace(self.field, warp=_resized(self.field.warp, polynomial_terms(degree) - 1))
-        return replace(self, field=field, precisions=np.concatenate([images, maps.ravel(), others]))
-
     def with_images(self, mix: Float[np.ndarray, "images terms"], rules: StampsRules) -> State:
         """Return the state with more images, of strengths ``mix``: they start at zero."""
-        others, old = self.precisions[self.of_images.size :], self.of_images
-        new = np.tile(rules.first_image[1], (len(old), len(mix) - old.shape[1], 1))
-        images = np.concatenate([old, new], axis=1)
-        field = replace(self.field, nodes=_resized(self.field.nodes, len(mix)), mix=mix)
-        return replace(self, field=field, precisions=np.concatenate([images.ravel(), others]))._confined(rules)
+        old, more = self.of_images, len(mix) - self.field.nodes.shape[1]
+        images = np.concatenate([old, np.tile(rules.first_image[1], (len(old), more, 1))], axis=1)
+        nodes = np.pad(self.field.nodes, [(0, 0), (0, more), (0, 0), (0, 0)])
+        precisions = np.concatenate([images.ravel(), self.precisions[old.size :]])
+        return replace(self, field=replace(self.field, nodes=nodes, mix=mix), precisions=precisions)._confined(rules)
 
     def with_spacing(self, stamps: Stamps, spacing_px: float, rules: StampsRules) -> State:
         """Return the state on other nodes, which give the same images and cover the reach of the maps."""
@@ -184,38 +202,18 @@ class State:
         state = replace(self, margin=margin)
         return replace(state, field=replace(self.field, nodes=self.field.nodes * np.moveaxis(state.kept, 2, 0)))
 
-    def prior(self, plane: int) -> scipy.sparse.csr_array:
-        """Return the precision of a colour's nodes, as far as images have them, node by node."""
-        kept, parts = self.kept, []
-        index = np.where(kept, np.cumsum(kept.ravel()).reshape(kept.shape) - 1, 0)
-        for image, (a, b) in enumerate(self.of_images[plane]):
-            own = self.inner if image else np.s_[:, :]
-            scale = scipy.sparse.diags_array(1.0 / self.size[plane][own].ravel())
-            rough = laplacian(*self.size[plane][own].shape)[0] @ scale
-            one, place = (a * (scale @ scale) + b * (rough.T @ rough)).tocoo(), index[own][..., image].ravel()
-            parts.append((one.data, place[one.row], place[one.col]))
-        data, row, column = (np.concatenate(part) for part in zip(*parts, strict=True))
-        return scipy.sparse.csr_array((data, (row, column)), shape=(kept.sum(), kept.sum()))
-
     def squares(self, vectors: Float[np.ndarray, "unknowns k"] | None = None) -> Float[np.ndarray, " groups"]:
         """Return each precision's factor in minus twice the log prior: of the field, or a mean over changes."""
-        nodes, maps, background = self.field.nodes[..., None], self.maps[:, None], self.background_e[..., None]
-        if vectors is not None:
-            stars, maps, nodes = Changes.of(self.field, len(self.light_e), vectors)
-            background = stars[:, -background.shape[1] :]
-        z = nodes / self.size[:, None, :, :, None]
-        each = np.concatenate([_quadratics(z[:, :1]), _quadratics(z[:, 1:, *self.inner])], axis=2).mean(axis=3)
-        each = np.moveaxis(each, 0, 2).ravel()
-        own = np.bincount(self.map_groups, (maps**2).mean(axis=1), minlength=each.size)[each.size :]
-        mean = (background.mean(axis=0) ** 2).sum(axis=0) * len(background)
-        ends = np.stack([mean, (background**2).sum(axis=(0, 1)) - mean]).mean(axis=1)
-        return np.concatenate([each, own, ends])
+        root, counts = self.roots
+        each = ((root @ (self.vector[:, None] if vectors is None else vectors)) ** 2).mean(axis=1)
+        ends = np.concatenate([[0.0], np.cumsum(each)])[np.concatenate([[0], np.cumsum(counts)])]
+        return np.diff(ends)
 
     def volume(self) -> tuple[float, Float[np.ndarray, " groups"]]:
         """Return the log determinant of the priors' precision, and its derivatives: the squares that priors expect."""
         count, (stars, planes) = self.of_images.size, self.light_e.shape
-        maps = np.bincount(self.map_groups, minlength=count)[count:]
-        numbers, own = np.concatenate([maps, [planes, planes * (stars - 1)]]), self.precisions[count:]
+        numbers, own = self.roots[1][count:].copy(), self.precisions[count:]
+        numbers[-1] = planes * (stars - 1)
         log_det, squares = numbers @ np.log(own), np.empty_like(self.of_images)
         for image, (a, b) in enumerate(np.moveaxis(self.of_images, 0, 2)[..., None]):
             size = self.size[:, *self.inner] if image else self.size
@@ -224,20 +222,6 @@ class State:
             log_det += np.log(prior).sum() - 2 * np.log(size).sum()
             squares[:, image] = np.stack([(1 / prior).sum(axis=1), (eigenvalues / prior).sum(axis=1)], axis=1)
         return float(log_det), np.concatenate([squares.ravel(), numbers / own])
-
-
-def _quadratics(z: Float[np.ndarray, "planes images rows columns k"]) -> Float[np.ndarray, "2 planes images k"]:
-    """Return sums of squares of images, and of their Laplacian."""
-    planes, images, rows, columns, k = z.shape
-    flat = np.moveaxis(z, (2, 3), (0, 1)).reshape(rows * columns, -1)
-    both = np.stack([(flat**2).sum(axis=0), ((laplacian(rows, columns)[0] @ flat) ** 2).sum(axis=0)])
-    return both.reshape(2, planes, images, k)
-
-
-def _resized(values: Float[np.ndarray, "planes n *rest"], count: int) -> Float[np.ndarray, "planes count *rest"]:
-    """Return the first ``count`` of each colour, with zeros where there were fewer."""
-    kept = values[:, :count]
-    return np.concatenate([kept, np.zeros((len(kept), count - kept.shape[1], *kept.shape[2:]))], axis=1)
 
 
 def _resampled(
@@ -288,5 +272,12 @@ def expectation(stamps: Stamps, state: State) -> Weighted:
     residual[cut], weight[cut], likelihood[cut] = sigma * score / information, information / variance[cut], log_ndtr(-z)
     used = stamps.known & state.keep & seen.inside
     residual, weight = np.where(used, residual, 0.0), np.where(used, weight, 0.0)
-    seen = seen._replace(down=light[..., None] * seen.down, jacobian=light[..., None] * seen.jacobian)
+    jacobian = light[..., None] * seen.jacobian
+    jacobian[..., -1] = 1.0
+    seen = seen._replace(down=light[..., None] * seen.down, jacobian=jacobian)
     return Weighted(seen, residual, weight, mean, node, float(likelihood[used].sum()))
+
+
+def log_posterior(stamps: Stamps, state: State) -> float:
+    """Return the logarithm of likelihood times prior, up to a constant and the precisions' own part."""
+    return expectation(stamps, state).log_likelihood - 0.5 * float(state.precisions @ state.squares())

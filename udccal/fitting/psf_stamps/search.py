@@ -11,18 +11,19 @@ from dataclasses import dataclass, replace
 from typing import final
 
 import numpy as np
+from jaxtyping import Float
 
 from udccal.fitting.engine.least_squares import Solution, SolverRules, Step, minimise
 from udccal.fitting.engine.orders import Attempt, Choice, choose
 from udccal.fitting.engine.robust import OutlierRule, robust_sigma
 from udccal.fitting.psf_stamps.data import Stamps, StampsRules, backgrounds, centroids, light_of
 from udccal.fitting.psf_stamps.equations import Laplace, laplace
-from udccal.fitting.psf_stamps.field import PsfField
-from udccal.fitting.psf_stamps.images import with_more_images
+from udccal.fitting.psf_stamps.field import PsfField, polynomials, taps
 from udccal.fitting.psf_stamps.model_error import of_residuals, of_stars_left_out, placed, without_error
-from udccal.fitting.psf_stamps.probability import ABSENT, State, envelope, expectation, grid_size
+from udccal.fitting.psf_stamps.probability import ABSENT, State, envelope, expectation, grid_size, log_posterior
 from udccal.models.fields import polynomial_terms
 
+_LEAST_PART = 0.01  # of a step to the mode
 WINDOW_PX = 1.6  # standard deviation of a Gaussian as wide as a star, before the kernel is known
 
 Found = Solution[State, Laplace]
@@ -54,8 +55,16 @@ class Evidence:
         return replace(found, tuned=tuned, colours=())
 
     def moved(self, place: State, step: Step) -> State:
-        """Return the state after a step of all unknowns, and of the logarithms of the precisions."""
-        return replace(place.shifted(step.shared), precisions=place.precisions * np.exp(step.own[0]))
+        """Return the state after a step of all unknowns, and of the logarithms of the precisions.
+
+        The step is halved until the log posterior rises, which is known long before the evidence is.
+        """
+        least, part = log_posterior(self.stamps, place), 1.0
+        while True:
+            there = place.shifted(part * step.shared)
+            if part < _LEAST_PART or log_posterior(self.stamps, there) > least + 0.1 * part * step.gain:
+                return replace(there, precisions=place.precisions * np.exp(part * step.own[0]))
+            part *= 0.5
 
 
 def improve(stamps: Stamps, state: State, rules: StampsRules, steps: int) -> Found:
@@ -64,11 +73,11 @@ def improve(stamps: Stamps, state: State, rules: StampsRules, steps: int) -> Fou
     evidence = max(rules.evidence, rules.evidence_of_nodes * float(state.kept.sum()))
     solver = SolverRules(
         iterations=steps,
-        least_gain=0.0,
+        least_gain=0.1 * evidence,
         stalled_gain=2 * evidence,
         small_gain=evidence,
         first_damping=0.03,
-        most_damping=1e3,
+        most_damping=0.1,
     )
     problem = Evidence(stamps, rules)
     found = minimise(problem, state, solver)
@@ -116,19 +125,21 @@ class Orders:
     spacing_px: float
 
 
-def start(stamps: Stamps, rules: StampsRules) -> State:
-    """Return a state of the lowest orders: a round image of the stamps' size."""
+def start(stamps: Stamps, rules: StampsRules, map_degree: int) -> State:
+    """Return a state of the lowest orders: a round image of the stamps' size, behind a map that is none yet."""
     planes, spacing_px = len(stamps.by_plane), rules.spacings_px[0]
     y, x = (np.arange(n) - (n - 1) / 2 for n in grid_size(stamps.values_e.shape[1:], spacing_px, 1.1))
     image = np.exp(-0.5 * (y[:, None] ** 2 + x**2) * (spacing_px / WINDOW_PX) ** 2) + 1e-3
     nodes = np.tile(image / (image.sum() * spacing_px**2), (planes, 1, 1, 1))
+    warp = np.zeros((planes, polynomial_terms(map_degree) - 1, 2, 2))
     # Lateral colour of degree 2.
-    field = PsfField(nodes, np.zeros((planes, 0, 2, 2)), np.zeros((planes - 1, 5, 2)), np.ones((1, 1)), spacing_px)
+    field = PsfField(nodes, warp, np.zeros((planes - 1, 5, 2)), np.ones((1, 1)), spacing_px)
     background_e, size = backgrounds(stamps), envelope(nodes[:, 0], spacing_px)
     # A background too faint for the edges to show may still be as large as the noise; the evidence decides.
     squares = np.array([(background_e.mean(axis=0) ** 2).mean(), background_e.var(axis=0).mean()])
     lateral, images = np.full(2 * planes - 2, rules.first_lateral), np.tile(rules.first_image[0], planes)
-    precisions = np.concatenate([images, lateral, 1.0 / np.maximum(squares, stamps.read_e**2)])
+    maps = np.tile(([rules.first_map] * 2 + [rules.new_map] * map_degree)[:map_degree], planes)
+    precisions = np.concatenate([images, maps, lateral, 1.0 / np.maximum(squares, stamps.read_e**2)])
     centre_px, light_e = centroids(stamps, background_e, WINDOW_PX), light_of(stamps, background_e)
     keep = np.ones_like(stamps.known)
     return State(field, centre_px, light_e, background_e, precisions, size, keep, np.zeros_like(size))
@@ -136,10 +147,9 @@ def start(stamps: Stamps, rules: StampsRules) -> State:
 
 def coarse(stamps: Stamps, rules: StampsRules, map_degree: int) -> State:
     """Fit places, light and a map, with a model error for the parts that the model cannot describe yet."""
-    state = start(stamps, rules)
-    for degree, allowed in rules.coarse:
-        state = state.with_map(min(degree, map_degree), rules)
-        state = without_outliers(stamps, state, rules) if degree else state
+    state = start(stamps, rules, map_degree)
+    for number, allowed in enumerate(rules.coarse):
+        state = without_outliers(stamps, state, rules) if number > 1 else state
         state = improve(stamps, replace(state, model_error=allowed * state.size), rules, 1).place
         # Images cannot make up for nodes too wide for the kernel.
         narrow = state.field.spacing_px == rules.spacings_px[0] and state.width_px < rules.narrow_px
@@ -155,9 +165,7 @@ def search(stamps: Stamps, rules: StampsRules, orders: Orders | None) -> Choice[
     state = coarse(stamps, rules, orders.warp if orders else map_degree)
     if orders:
         mix = np.eye(polynomial_terms(orders.image))
-        state = (
-            state.with_map(orders.warp, rules).with_spacing(stamps, orders.spacing_px, rules).with_images(mix, rules)
-        )
+        state = state.with_spacing(stamps, orders.spacing_px, rules).with_images(mix, rules)
     best = attempt(stamps, improve(stamps, state, rules, rules.steps_to_compare), rules)
     tried = [best] if orders else _neighbours(stamps, best, image_degree, rules)
     best = choose(tried).best
@@ -177,7 +185,7 @@ def attempt(stamps: Stamps, found: Found, rules: StampsRules) -> Attempt[Found]:
     images, terms = state.field.mix.shape
     tuned = len(state.precisions) + (images - 1) * (terms - 1)
     criterion = np.log(stamps.known.sum()) * tuned - 2 * evidence
-    return Attempt(state.name, state.field.nodes.size + len(state.maps), float(criterion), found)
+    return Attempt(state.name, state.field.nodes.size + state.maps, float(criterion), found)
 
 
 def _neighbours(stamps: Stamps, best: Attempt[Found], degree: int, rules: StampsRules) -> list[Attempt[Found]]:
@@ -197,3 +205,41 @@ def _neighbours(stamps: Stamps, best: Attempt[Found], degree: int, rules: Stamps
         gained = best.criterion - tried[-1].criterion
         gain = max(gained, 0.0) if finer else gain
         best = choose((best, tried[-1])).best
+
+
+def with_more_images(stamps: Stamps, state: State, degree: int, rules: StampsRules) -> State:
+    """Return the state with new images, which are zero; the same state where there is no room for more.
+
+    Coma, a ring that opens, or an order of diffraction that fades change a psf in a few ways, whatever the degree of
+    the polynomials that describe them. The most significant mixtures of all polynomials in the residuals become
+    strengths of new images; one image for every polynomial would need several times as many nodes.
+    """
+    every, have = polynomials(stamps.unit, degree), state.field.strengths(stamps.unit)
+    taken = np.linalg.qr(have)[0]
+    free, left, _ = np.linalg.svd(every - taken @ (taken.T @ every), full_matrices=False)
+    free = free[:, left > 1e-6]
+    room = min(rules.images_at_once, rules.most_images - have.shape[1])
+    if not free.size or room <= 0:
+        return state
+    score, information = _scores(stamps, state)
+    # Of each polynomial and node: what residuals ask for, in units of its noise.
+    z = (free.T @ score) / np.sqrt(np.maximum((free**2).T @ information, 1e-300))
+    found, size, _ = np.linalg.svd(z, full_matrices=False)
+    beyond = size**2 - np.median(size**2)
+    count = int(np.clip((beyond > rules.image_beyond * beyond[0]).sum(), 1, room))
+    strength = np.sqrt(len(free)) * free @ found[:, :count]
+    old = np.zeros((have.shape[1], polynomial_terms(degree)))
+    old[:, : state.field.mix.shape[1]] = state.field.mix
+    return state.with_images(np.concatenate([old, np.linalg.lstsq(every, strength, rcond=None)[0].T]), rules)
+
+
+def _scores(stamps: Stamps, state: State) -> tuple[Float[np.ndarray, "stars nodes"], Float[np.ndarray, "stars nodes"]]:
+    """Return each star's derivatives of the log likelihood by the nodes of all colours, and their information."""
+    seen, parts = expectation(stamps, state), []
+    for own in stamps.by_plane:
+        used = np.flatnonzero(seen.weight * own)
+        onto, weight = taps(seen.seen, used, state.size.shape[1:]).T, seen.weight.ravel()[used]
+        both = onto @ (weight * seen.residual.ravel()[used]), onto.power(2) @ weight
+        parts.append([part.reshape(len(own), -1) for part in both])
+    score, information = (np.concatenate(part, axis=1) for part in zip(*parts, strict=True))
+    return score, information
