@@ -14,9 +14,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from udccal.fitting.engine.gaussian import scaled_inverse
-from udccal.fitting.engine.misfit import SIGNIFICANT
+from udccal.fitting.engine.misfit import SIGNIFICANT, chi2_tail
 from udccal.fitting.engine.robust import MAD_TO_SIGMA
-from udccal.fitting.engine.tails import chi2_tail
 from udccal.fitting.psf_stamps.data import Stamps, StampsRules
 from udccal.fitting.psf_stamps.equations import changes_of_samples, laplace
 from udccal.fitting.psf_stamps.field import Changes
