@@ -75,29 +75,38 @@ def estimate_kernel_error(
     if residual.size < len(bounds):
         return KernelError(0.0)
     along = brightness**2 / np.maximum(np.bincount(picture, brightness**2), 1e-300)[picture]
+    alone = np.maximum(1 - along, 1e-3) ** 2 - along**2
     level = np.unique(np.floor(np.log(brightness) / np.log(3.0)), return_inverse=True)[1].reshape(-1)
     weight = np.minimum(rules.error_samples / np.bincount(level), 1.0)[level]
-    mean, sigma = zip((np.log(rules.error_knee[0]), rules.error_knee[1]), rules.error_power, strict=True)
+    mean, sigma = np.array([(np.log(rules.error_knee[0]), rules.error_knee[1]), rules.error_power]).T
+
+    def of_residuals(samples: Float[np.ndarray, " samples"]) -> Float[np.ndarray, " samples"]:
+        """Return what a symmetric matrix makes of the samples' variances: those of residuals."""
+        return np.asarray(alone * samples + along * np.bincount(picture, along * samples)[picture])
+
+    def misfit(variance: Float[np.ndarray, " samples"]) -> tuple[float, Float[np.ndarray, " samples"]]:
+        """Return the cost of these variances, and its derivatives by them."""
+        total = of_residuals(variance)
+        # Beyond 5 sigma the loss grows as a logarithm: a cosmic hit counts little, a large model error still counts.
+        square = residual**2 / (total * 25.0)
+        each = np.log(total) + 25.0 * np.where(square < 1, square, 1 + np.log(np.maximum(square, 1)))
+        return float(weight @ each), of_residuals(weight * (1 - 25.0 * np.minimum(square, 1)) / total)
 
     def of(values: Float[np.ndarray, "3"]) -> KernelError:
         return KernelError(float(np.exp(values[0])), float(np.exp(values[1])), float(values[2]))
 
-    def misfit(total: Float[np.ndarray, " samples"]) -> float:
-        by_others = np.bincount(picture, along * total)[picture] - along * total
-        total = total * np.maximum(1 - along, 1e-3) ** 2 + along * by_others
-        # Beyond 5 sigma the loss grows as a logarithm: a cosmic hit counts little, a large model error still counts.
-        square = residual**2 / (total * 25.0)
-        each = np.log(total) + 25.0 * np.where(square < 1, square, 1 + np.log(np.maximum(square, 1)))
-        return float(weight @ each)
+    def loss(values: Float[np.ndarray, "3"]) -> tuple[float, Float[np.ndarray, "3"]]:
+        error, bend = of(values).of_peak(brightness), brightness / np.exp(values[1])
+        cost, slope = misfit(variance + error**2)
+        off = (values[1:] - mean) / sigma
+        by = np.stack([np.ones_like(bend), values[2] * bend / (1 + bend), np.log(brightness / (1 + bend))])
+        return cost + float(off @ off), 2 * by @ (error**2 * slope) + np.append(0.0, 2 * off / sigma)
 
-    def loss(values: Float[np.ndarray, "3"]) -> float:
-        off = ((values[1:] - np.array(mean)) / np.array(sigma)) ** 2
-        return misfit(variance + of(values).of_peak(brightness) ** 2) + float(off.sum())
-
-    starts = ((np.log(size), *mean) for size in (1e-3, 1e-2, 1e-1))
-    tried = [scipy.optimize.minimize(loss, start, method="L-BFGS-B", bounds=bounds) for start in starts]
+    # The default tolerance leaves a part in a hundred of the size open.
+    options = {"method": "L-BFGS-B", "jac": True, "bounds": bounds, "options": {"ftol": 1e-13}}
+    tried = [scipy.optimize.minimize(loss, (np.log(size), *mean), **options) for size in (1e-3, 1e-2, 1e-1)]
     found = min(tried, key=lambda one: float(one.fun))
-    worth = bic(float(found.fun), float(len(bounds)), round(weight.sum())) < misfit(variance)
+    worth = bic(float(found.fun), float(len(bounds)), round(weight.sum())) < misfit(variance)[0]
     return of(found.x) if worth else KernelError(0.0)
 
 
