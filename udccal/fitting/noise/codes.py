@@ -281,11 +281,12 @@ def fit_dark(
     # One-sided derivatives predict a small gain for ever.
     found = minimise(problem, values, SolverRules(least_gain=1e-3, stalled_gain=1e-4))
     values, information = found.place, found.equations.shared
-    # Codes that are all the same still tell this much: rounding hides no more than its own size, and chance no more
-    # than the noise.
-    size2 = pairs[0].step_DN ** 2 / 12.0 + values[2] + values[3]
-    least = np.array([1 / size2, problem.longest_s**2 / size2, size2**-2, size2**-2, 0.0])
-    information = information + np.diag(np.where(free, least, 0.0))
+    # Rounding hides no more than its own size: codes that are all the same give this bound. Noise and offsets within a
+    # code may be hidden by rounding, and otherwise only by chance.
+    step2 = pairs[0].step_DN ** 2 / 12.0
+    least = np.array([1 / step2, problem.longest_s**2 / step2, step2**-2, step2**-2, rules.shape_sigma**-2])
+    lost = free & bool(values[2] + values[3] < 12 * step2) & (np.diag(information) < least)
+    information = np.where(lost[:, None] | lost, np.diag(np.where(lost, least, 0.0)), information)
     widen = np.sqrt(np.array([1.0, 1.0, 1.0, len(pairs), 1.0]))
     cov = found.with_rest(scaled_inverse(information) * np.outer(widen, widen), found.equations.step(0.0).shared)
     levels = np.array([problem.level(pair, values) for pair in pairs]).T
