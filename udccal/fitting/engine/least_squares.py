@@ -200,7 +200,10 @@ class Blocks:
 
 
 def _damped(matrix: Float[np.ndarray, "*k n n"], damping: float) -> Float[np.ndarray, "*k n n"]:
-    return matrix * (1.0 + damping * np.eye(matrix.shape[-1])) if damping else matrix
+    if damping == 0.0:
+        return matrix
+    diagonal = np.einsum("...ii->...i", matrix)
+    return matrix + damping * diagonal[..., None] * np.eye(matrix.shape[-1])
 
 
 def solve(matrix: Float[np.ndarray, "p p"], right: Float[np.ndarray, " p"]) -> Float[np.ndarray, " p"]:
