@@ -35,7 +35,7 @@ def test_sinks_are_found_by_name() -> None:
 
 def test_another_packages_sink_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
     mine = EntryPoint("mine", "tests.live.test_pipeline:ListSink", plugins.SINKS)
-    monkeypatch.setattr(plugins, "entry_points", lambda **chosen: EntryPoints([mine]).select(**chosen))
+    monkeypatch.setattr(plugins, "_installed", lambda group: EntryPoints([mine]).select(group=group))
     sink = make_sink("mine:3", 30.0)
     assert isinstance(sink, ListSink)
     assert sink.fails_at == 3
