@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from contextvars import copy_context
 from typing import TypeVar
 
 from udccal.numerics import in_float64
@@ -25,12 +26,14 @@ def each(function: Callable[[Part], Result], parts: Iterable[Part]) -> list[Resu
         function: returns numpy arrays; it must not change what parts have in common.
         parts: at least one.
     """
-    first, *others = parts
-    found = in_float64(function)(first)
+    made, (first, *others) = in_float64(function), parts
+    found = made(first)
     if not others:
         return [found]
+    # The threads know by their context that BLAS is limited already: to limit it takes as long as a small part.
+    contexts = [copy_context() for _ in others]
     with ThreadPoolExecutor(_THREADS) as pool:
-        return [found, *pool.map(in_float64(function), others)]
+        return [found, *pool.map(lambda context, part: context.run(made, part), contexts, others)]
 
 
 @contextmanager

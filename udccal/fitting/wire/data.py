@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import TypeVar, final
 
@@ -22,6 +21,7 @@ from scipy.optimize import nnls
 from udccal.cfa import PATTERNS, cfa_named
 from udccal.errors import FitError, found_instead
 from udccal.fitting.engine.robust import OutlierRule
+from udccal.fitting.engine.workers import each
 from udccal.fitting.wire.rules import WireRules, WireStart, wire_start
 from udccal.models.geometry import Geometry
 from udccal.models.noise import Noise, linear_signal
@@ -30,8 +30,6 @@ from udccal.sessions.store import Session
 
 # Functions are compiled for blocks of this many pixels.
 BLOCK = 4096
-# Blocks are computed on so many threads.
-_THREADS = 2
 Result = TypeVar("Result")
 _OUTLIERS = OutlierRule("pixels (row, column)")
 
@@ -214,22 +212,9 @@ class Pixels(eqx.Module):
         firsts = range(0, len(self.value), BLOCK)
         return (jax.tree.map(lambda a, first=first: a[first : first + BLOCK], self) for first in firsts)
 
-    def mapped(self, function: Callable[[Pixels], Result]) -> list[Result]:
-        """What a function makes of each block; compiled functions leave the interpreter to another thread."""
-
-        def made(block: Pixels) -> Result:
-            with jax.enable_x64(True):
-                return function(block)
-
-        blocks = self.blocks()
-        # Two threads that need the same function at once would both compile it.
-        first = made(next(blocks))
-        with ThreadPoolExecutor(_THREADS) as pool:
-            return [first, *pool.map(made, blocks)]
-
     def by_block(self, function: Callable[[Pixels], Result]) -> Result:
         """Join what a compiled function makes of each block; its results have pixels last."""
-        joined: Result = jax.tree.map(lambda *parts: np.concatenate(parts, axis=-1), *self.mapped(function))
+        joined: Result = jax.tree.map(lambda *parts: np.concatenate(parts, axis=-1), *each(function, self.blocks()))
         return joined
 
 
