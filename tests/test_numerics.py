@@ -1,13 +1,15 @@
-"""How fits compute: double precision and BLAS on one thread, and neither of them afterwards."""
+"""How fits compute: double precision and BLAS on one thread, neither of them afterwards, and parts in two threads."""
 
 from __future__ import annotations
+
+import threading
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from threadpoolctl import ThreadpoolController, threadpool_limits
 
-from udccal.numerics import in_float64
+from udccal.numerics import in_float64, in_two_threads
 
 
 def blas_threads() -> set[int]:
@@ -39,3 +41,32 @@ def test_a_fit_computes_in_double_precision_on_one_thread_and_leaves_no_trace() 
             failing()
         assert blas_threads() == {2}
     assert jnp.zeros(1).dtype == jnp.float32
+
+
+def test_results_come_in_the_order_of_the_parts_in_double_precision() -> None:
+    found = in_two_threads(lambda part: np.asarray(jnp.sqrt(jnp.float64(part))), range(40))
+    assert [one.dtype for one in found] == [np.float64] * 40
+    assert [float(one) for one in found] == [np.sqrt(part) for part in range(40)]
+
+
+def test_the_first_part_is_done_before_others_begin() -> None:
+    done: list[int] = []
+
+    def part(number: int) -> int:
+        assert number == 0 or 0 in done
+        done.append(number)
+        return number
+
+    assert in_two_threads(part, range(20)) == list(range(20))
+    assert in_two_threads(part, [0]) == [0]
+
+
+def test_two_threads_share_the_parts() -> None:
+    both = threading.Barrier(2)
+    # Each of two parts waits for the other: one thread alone would wait for ever.
+    in_two_threads(lambda number: number and both.wait(timeout=20), range(3))
+
+
+def test_an_error_of_a_part_is_raised() -> None:
+    with pytest.raises(ZeroDivisionError):
+        in_two_threads(lambda number: 1 / (number - 3), range(6))

@@ -1,11 +1,12 @@
-"""Run fits in double precision, without changing the importing program's JAX settings, and with BLAS on one thread."""
+"""How fits compute: in double precision whatever the program has set JAX to, BLAS on one thread, parts in two."""
 
 from __future__ import annotations
 
 import contextlib
 import functools
-from collections.abc import Callable, Iterator
-from contextvars import ContextVar
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextvars import ContextVar, copy_context
 from typing import ParamSpec, TypeVar
 
 import jax
@@ -13,6 +14,7 @@ from threadpoolctl import ThreadpoolController
 
 P = ParamSpec("P")
 T = TypeVar("T")
+Part = TypeVar("Part")
 
 
 def in_float64(function: Callable[P, T]) -> Callable[P, T]:
@@ -54,3 +56,23 @@ def _one_blas_thread() -> Iterator[None]:
             yield
     finally:
         _ALREADY.reset(before)
+
+
+def in_two_threads(function: Callable[[Part], T], parts: Iterable[Part]) -> list[T]:
+    """Results of a function of every part, in order, in double precision, by two threads.
+
+    Compiled functions and loops of numpy let the other thread run. The first part is alone, so that what it compiles is
+    compiled once. More threads would need more memory, and most of them would wait for the interpreter.
+
+    Args:
+        function: returns numpy arrays; it must not change what parts have in common.
+        parts: at least one.
+    """
+    made, (first, *others) = in_float64(function), parts
+    found = made(first)
+    if not others:
+        return [found]
+    # The threads know by their context that BLAS is limited already: to limit it takes as long as a small part.
+    contexts = [copy_context() for _ in others]
+    with ThreadPoolExecutor(2) as pool:
+        return [found, *pool.map(lambda context, part: context.run(made, part), contexts, others)]

@@ -6,7 +6,6 @@ Each round is a descent with fixed weights. Between rounds the weights follow th
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import final
 
 import numpy as np
@@ -18,12 +17,10 @@ from udccal.fitting.engine.least_squares import LOG, Blocks, Solution, SolverRul
 from udccal.fitting.engine.misfit import clustered_cov
 from udccal.fitting.engine.orders import Attempt, Choice, bic, choose
 from udccal.fitting.engine.robust import OutlierRule, outliers
-from udccal.fitting.engine.workers import beside, each
 from udccal.fitting.psf.data import HUBER, PsfRules, Shots, estimate_model_error, left_out
 from udccal.fitting.psf.kernel import FOOTPRINT, Evaluator, fit_lattice
-from udccal.fitting.psf.problem import DiffractionProblem, Place, kernel_of, slopes
+from udccal.fitting.psf.problem import DiffractionProblem, Place, kernel_of
 from udccal.fitting.psf.samples import (
-    OWN,
     Lights,
     Own,
     Owns,
@@ -39,6 +36,7 @@ from udccal.fitting.psf.samples import (
 )
 from udccal.models.diffraction import Diffraction
 from udccal.models.geometry import Geometry
+from udccal.numerics import in_two_threads
 from udccal.result import Outliers
 
 
@@ -152,10 +150,7 @@ def _approach(problem: DiffractionProblem, rules: PsfRules) -> Solution[Place, B
     def start(one: Samples) -> Own:
         return start_own(problem.evaluator, one, kernel_of(problem.evaluator, theta, one))
 
-    one = problem.samples.at(0)
-    # Derivatives take longest to compile.
-    with beside(partial(slopes, problem.evaluator, theta, one, np.zeros((len(one.index), OWN)))):
-        own = np.stack(each(start, problem.samples.each()))
+    own = np.stack(in_two_threads(start, problem.samples.each()))
     return minimise(problem, problem.at(theta, own), _solver(1e-3 * problem.used, rules.iterations))
 
 

@@ -6,9 +6,8 @@ coefficients may be added to it or replace it. Positions held out decide whether
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
-from functools import cache, partial
+from functools import cache
 from typing import Final
 
 import numpy as np
@@ -18,7 +17,6 @@ from scipy.linalg import block_diag
 from udccal.fitting.engine.gaussian import Posterior, square_root
 from udccal.fitting.engine.misfit import SIGNIFICANT
 from udccal.fitting.engine.report import estimates, priors_of, residual_sample
-from udccal.fitting.engine.workers import beside
 from udccal.fitting.psf.data import PsfData, PsfRules, Shots, about_middle, held_out_positions
 from udccal.fitting.psf.diffraction import DiffractionFit, efficiency, fit_diffraction, kernel_sigma, pattern_p_value
 from udccal.fitting.psf.held_out import (
@@ -36,10 +34,7 @@ from udccal.fitting.psf.held_out import (
 from udccal.fitting.psf.kernel import (
     BLUR,
     PITCH,
-    Evaluator,
     as_numpy,
-    fit_lattice,
-    pack,
     pitch_tolerance,
     start_model,
     start_prior,
@@ -47,7 +42,6 @@ from udccal.fitting.psf.kernel import (
 from udccal.fitting.psf.orders import Selection, select_field
 from udccal.fitting.psf.problem import explain
 from udccal.fitting.psf.samples import some_shots
-from udccal.kernels import kernel_size, kernels_at
 from udccal.models.diffraction import Diffraction
 from udccal.models.geometry import Geometry
 from udccal.models.psf import PsfField, fine_oversample
@@ -88,8 +82,7 @@ def fit_psf(
         status, note = unfit or (FitStatus.TOO_FEW_DATA, "No field position was captured.")
         return FitResult.failed("psf", _field(start, geometry), status, note)
     shots, prior = data.shots.within(rules.half_px), start_prior(rig, start, rules)
-    with beside(*_needed_later(data.shots, shots, geometry, start, rig, rules)):
-        fit = fit_diffraction(shots.pick(some_shots(shots, rules)), geometry, start, prior, rules)
+    fit = fit_diffraction(shots.pick(some_shots(shots, rules)), geometry, start, prior, rules)
     error = max(fit.model_error, rules.first_model_error)
     sources, explained = explain(fit.problem.evaluator, fit.theta, shots, geometry, error)
     size = np.array([rig.camera.columns - 1, rig.camera.rows - 1]) / 2.0
@@ -110,19 +103,6 @@ def fit_psf(
         looked_at = np.concatenate([np.flatnonzero(shots.position == p)[:2] for p in held_out])
         support = wide_support(data.shots.pick(looked_at), selection.trial.sources.pick(looked_at), term, rig)
     return _report(data, shots, fit, selection, support, with_support(term, support, rig), rig, rules)
-
-
-def _needed_later(
-    wide: Shots, shots: Shots, geometry: Geometry, start: Diffraction, rig: RigDescription, rules: PsfRules
-) -> list[Callable[[], object]]:
-    """Return calls that compile what follows the fit of diffraction: kernels of a profile's size, and whole crops."""
-    evaluator = Evaluator(np.asarray(start.wavelengths_nm), fit_lattice(shots.half), bool(start.visibility))
-    later: list[Callable[[], object]] = []
-    if wide.half != shots.half:
-        later.append(partial(kernels_at, _field(start, geometry), shots.centre_px[:1], *kernel_size(rig)))
-    if shots.half != rules.close(shots.half):
-        later.append(partial(explain, evaluator, pack(start), shots.pick(np.array([0])), geometry, 0.0))
-    return later
 
 
 def nominal_psf(rig: RigDescription, geometry: Geometry, wire: Wire) -> PsfField:

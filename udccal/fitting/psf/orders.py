@@ -11,7 +11,6 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from udccal.fitting.engine.orders import Attempt, Choice, choose, held_out_beats, rising
-from udccal.fitting.engine.workers import each
 from udccal.fitting.psf.data import (
     HUBER,
     Crops,
@@ -217,7 +216,7 @@ class _Orders:
 
         def attempt(degree: int) -> Attempt[Trial]:
             orders = (Order(degree, free, size, allowances[-1]) for size in (sizes if degree >= 0 else (0.0,)))
-            best = choose(each(partial(self.attempt, sources), orders)).best
+            best = choose(self.attempt(sources, order) for order in orders).best
             allowances.append(best.fit.compared.model_error)
             return best
 

@@ -15,7 +15,6 @@ from scipy.special import softmax
 
 from udccal.fitting.engine.gaussian import Prior, scaled_inverse
 from udccal.fitting.engine.least_squares import Blocks, Step
-from udccal.fitting.engine.workers import each
 from udccal.fitting.psf.data import HUBER, Crops, Shots
 from udccal.fitting.psf.image import Sources
 from udccal.fitting.psf.kernel import (
@@ -47,6 +46,7 @@ from udccal.fitting.psf.samples import (
     weighed,
 )
 from udccal.models.geometry import Geometry
+from udccal.numerics import in_two_threads
 
 # Overlaps of the pupil's footprint change with these parameters.
 _IN_OVERLAPS: Final = np.array([PITCH, PUPIL])
@@ -99,7 +99,7 @@ class DiffractionProblem:
         def lit(part: tuple[Samples, Own]) -> tuple[np.ndarray, ...]:
             return _lit(self.evaluator, theta, *part, near is None)
 
-        parts = each(lit, zip(self.samples.each(), own, strict=True))
+        parts = in_two_threads(lit, zip(self.samples.each(), own, strict=True))
         light, *derivatives = (np.stack(one) for one in zip(*parts, strict=True))
         if near is not None:
             derivatives = [near.by_theta, near.by_own]
@@ -149,7 +149,8 @@ class DiffractionProblem:
         def overlaps(one: Samples) -> np.ndarray:
             return np.asarray(overlaps_of(self.evaluator, theta, one.frame))
 
-        return replace(self, samples=replace(self.samples, overlaps=np.stack(each(overlaps, self.samples.each()))))
+        found = in_two_threads(overlaps, self.samples.each())
+        return replace(self, samples=replace(self.samples, overlaps=np.stack(found)))
 
     def about(self, theta: Theta, own: Owns, near: bool = False) -> DiffractionProblem:
         """Set interference up about these parameters; ``near`` the last ones, derivatives by overlaps stay."""
@@ -159,7 +160,7 @@ class DiffractionProblem:
         def set_up(part: tuple[Samples, Own]) -> Samples:
             return _set_up(self.evaluator, theta, *part, near)
 
-        made = each(set_up, zip(self.samples.each(), own[..., :2], strict=True))
+        made = in_two_threads(set_up, zip(self.samples.each(), own[..., :2], strict=True))
         return replace(self, samples=jax.tree.map(lambda *parts: np.stack(parts), *made))
 
 
@@ -273,7 +274,7 @@ def explain(
             own = moved_own(own, step[..., 0])
         return own, unit_light(evaluator, one, own[:, :2], kernel)
 
-    for index, (own, unit) in zip(samples.index, each(fitted, samples.each()), strict=True):
+    for index, (own, unit) in zip(samples.index, in_two_threads(fitted, samples.each()), strict=True):
         real = index >= 0
         found[index[real]], explained[index[real]] = own[real], unit[real].reshape(-1, *shots.rate.shape[1:])
     sources = Sources(shots.centre_px + found[:, :2], found[:, 2:5], found[:, 5])

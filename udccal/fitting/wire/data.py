@@ -21,10 +21,10 @@ from scipy.optimize import nnls
 from udccal.cfa import PATTERNS, cfa_named
 from udccal.errors import FitError, found_instead
 from udccal.fitting.engine.robust import OutlierRule
-from udccal.fitting.engine.workers import each
 from udccal.fitting.wire.rules import WireRules, WireStart, wire_start
 from udccal.models.geometry import Geometry
 from udccal.models.noise import Noise, linear_signal
+from udccal.numerics import in_two_threads
 from udccal.result import Outliers
 from udccal.sessions.store import Session
 
@@ -214,7 +214,8 @@ class Pixels(eqx.Module):
 
     def by_block(self, function: Callable[[Pixels], Result]) -> Result:
         """Join what a compiled function makes of each block; its results have pixels last."""
-        joined: Result = jax.tree.map(lambda *parts: np.concatenate(parts, axis=-1), *each(function, self.blocks()))
+        found = in_two_threads(function, self.blocks())
+        joined: Result = jax.tree.map(lambda *parts: np.concatenate(parts, axis=-1), *found)
         return joined
 
 

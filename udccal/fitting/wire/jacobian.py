@@ -21,13 +21,13 @@ from jaxtyping import Array, Float, Int
 
 from udccal.fitting.engine.gaussian import Prior
 from udccal.fitting.engine.least_squares import Blocks, Step
-from udccal.fitting.engine.workers import each
 from udccal.fitting.wire.data import BLOCK, FlatNoise, Pixels, Weighed, weighed
 from udccal.fitting.wire.parameters import Kind, Parameters, shape_vector
 from udccal.models.arrays import Arrayish
 from udccal.models.bessel import bessel_j0_j1, sine_cosine
 from udccal.models.geometry import rotation_matrix
 from udccal.models.wire import LEAST_OPEN, Wire, legendre, waves
+from udccal.numerics import in_two_threads
 
 # Tiles of the sensor, down and across, whose residuals are tested as a whole.
 TILES = (6, 8)
@@ -360,7 +360,7 @@ class WireProblem:
             by_tile = np.where(tile_numbers(block.scaled) == tiles[:, None], errors, 0.0) @ rows.T
             return rows @ rows.T, by_tile, float(errors @ errors)
 
-        matrices, by_tile, chi2 = zip(*each(of, self.pixels.blocks()), strict=True)
+        matrices, by_tile, chi2 = zip(*in_two_threads(of, self.pixels.blocks()), strict=True)
         return np.sum(matrices, axis=0), np.sum(by_tile, axis=0), float(np.sum(chi2))
 
     def moved(self, place: Float[np.ndarray, " n"], step: Step) -> Float[np.ndarray, " n"]:
