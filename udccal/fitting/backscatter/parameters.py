@@ -293,7 +293,7 @@ def most_probable(errors_at: ErrorsAt, start: Vector, free: Bool[np.ndarray, "18
     found = minimise(_Descent(errors_at, free, Prior(prior.mean, prior.root * free)), start)
     last, cov = found.equations, np.zeros((len(free), len(free)))
     if np.isfinite(last.cost):
-        cov = found.with_rest(last.cov(), last.step(0.0).shared)
+        cov = found.with_rest(last.cov())
     return MostProbable(found.place, cov, last.cost, found.converged)
 
 

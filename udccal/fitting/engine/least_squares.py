@@ -243,11 +243,11 @@ class Solution(Generic[Place, _Equations]):
     iterations: int
     ahead: float = 1.0
 
-    def with_rest(self, cov: Float[np.ndarray, "n n"], step: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n n"]:
-        """A covariance of parameters whose next step, undamped, is ``step``; the way left is one more error in it."""
+    def with_rest(self, cov: Float[np.ndarray, "p p"]) -> Float[np.ndarray, "p p"]:
+        """A covariance of the shared parameters, to which the way that is left to the minimum is one more error."""
         if not np.isfinite(self.gain):
             return cov
-        rest = step if self.converged else self.ahead * step
+        rest = self.equations.step(0.0).shared * (1.0 if self.converged else self.ahead)
         return np.asarray(cov + np.outer(rest, rest))
 
 

@@ -288,6 +288,6 @@ def fit_dark(
     lost = free & bool(values[2] + values[3] < 12 * step2) & (np.diag(information) < least)
     information = np.where(lost[:, None] | lost, np.diag(np.where(lost, least, 0.0)), information)
     widen = np.sqrt(np.array([1.0, 1.0, 1.0, len(pairs), 1.0]))
-    cov = found.with_rest(scaled_inverse(information) * np.outer(widen, widen), found.equations.step(0.0).shared)
+    cov = found.with_rest(scaled_inverse(information) * np.outer(widen, widen))
     levels = np.array([problem.level(pair, values) for pair in pairs]).T
     return DarkFit(values, cov, found.converged, bool(np.abs(levels[0] - 1).max() < rules.white), *levels)

@@ -188,7 +188,7 @@ class TransferProblem:
         """The fit of the order."""
         order, levels, usable = self.order, self.levels, self.levels.usable
         found = minimise(self, np.where(self.free, start, 0.0))
-        cov = found.with_rest(found.equations.cov(), found.equations.step(0.0).shared)
+        cov = found.with_rest(found.equations.cov())
         variance, _, lacking = self.predicted(found.place)
         spread2, own = self.spread2(lacking)
         variance_z, level_z, dof = np.full(usable.shape, np.nan), np.full(len(usable), np.nan), levels.dof[usable]

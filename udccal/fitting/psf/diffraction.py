@@ -75,8 +75,7 @@ class DiffractionFit:
     @property
     def noise_cov(self) -> Float[np.ndarray, "p p"]:
         """Covariance of the shared parameters if the model error is independent from sample to sample."""
-        equations = self.solution.equations
-        return self.solution.with_rest(equations.cov(), equations.step(0.0).shared)
+        return self.solution.with_rest(self.solution.equations.cov())
 
     def cov(self) -> Float[np.ndarray, "p p"]:
         """Covariance of the shared parameters.

@@ -121,11 +121,7 @@ class DiffractionProblem:
 
     def equations_at(self, place: Place) -> Blocks:
         """Return cost and normal equations, with the prior's."""
-        made = self.by_position(place)
-        own = (np.concatenate([getattr(one, part) for one in made]) for part in ("own", "own_right", "cross"))
-        shared, right = np.sum([one.shared for one in made], axis=0), np.sum([one.right for one in made], axis=0)
-        whole = Blocks(sum(one.cost for one in made), self.used, shared, right, *own)
-        return whole.with_prior(self.prior, place.theta)
+        return Blocks.joined(self.by_position(place)).with_prior(self.prior, place.theta)
 
     def moved(self, place: Place, step: Step) -> Place:
         """Return the place after a step."""

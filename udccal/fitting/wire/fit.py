@@ -124,11 +124,10 @@ def _joint(found: Found, every: Pixels, search: Search) -> Joint:
     kept, x = full.kept(chosen.keep), (x - already + chosen.values)[chosen.keep]
     problem = WireProblem("wire, joint", kept, weighed_at(kept, x, every, noise).pixels, kept.prior(start, rules))
     solution = minimise(problem, x, SOLVER)
-    ahead = solution.equations.step(0.0).shared
     # A last step whose expected gain is below the solver's limit is taken without a check of the cost.
-    x = solution.place + (ahead if solution.converged else 0.0)
+    x = solution.place + (solution.equations.step(0.0).shared if solution.converged else 0.0)
     seen = weighed_at(kept, x, every, noise)
-    cov, last = solution.with_rest(solution.equations.cov(), ahead), Descent(problem, solution)
+    cov, last = solution.with_rest(solution.equations.cov()), Descent(problem, solution)
     return Joint(found, last, x, cov, problem.variance(float(seen.z @ seen.z)), seen, orders, strengths)
 
 
