@@ -226,6 +226,8 @@ FRAME = np.full((32, 32), 100, np.uint16)
         ([ExposureLevel(-1.0, (FRAME, FRAME), ())], None, "exposure in seconds"),
         ([ExposureLevel(float("nan"), (FRAME, FRAME), ())], None, "exposure in seconds"),
         ([ExposureLevel(0.1, (FRAME, FRAME), (FRAME, FRAME), -5.0)], None, "number of photons"),
+        ([], SpatialStack(float("nan"), [FRAME] * 2, [FRAME] * 2), "the stack to have an exposure in seconds"),
+        ([], SpatialStack(0.1, [FRAME] * 2, [FRAME] * 2, -5.0), "the stack to have a number of photons"),
         ([ExposureLevel(0.1, (FRAME, FRAME[:20]), (FRAME, FRAME))], None, "found"),
         ([ExposureLevel(0.1, (lambda: FRAME.astype(float), FRAME), (FRAME, FRAME))], None, "uint8 or uint16"),
         ([ExposureLevel(0.1, (lambda: "frame", FRAME), (FRAME, FRAME))], None, "found str"),
@@ -238,6 +240,14 @@ FRAME = np.full((32, 32), 100, np.uint16)
 def test_what_is_no_frame_is_refused(levels: list[ExposureLevel], stack: SpatialStack | None, sentence: str) -> None:
     with pytest.raises(FitError, match=sentence):
         fit_noise(NoiseData(levels, stack, top_code=4095))
+
+
+def test_an_exposure_that_is_a_frame_is_refused() -> None:
+    level = ExposureLevel(0.1, (FRAME, FRAME), (FRAME, FRAME))
+    # What runs with types checked refuses it earlier.
+    object.__setattr__(level, "exposure_s", FRAME)
+    with pytest.raises(FitError, match=r"level 0 to have an exposure in seconds, found uint16 of shape \(32, 32\)"):
+        fit_noise(NoiseData([level]))
 
 
 def test_nothing_at_all_is_too_few() -> None:

@@ -8,12 +8,13 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
+from numbers import Real
 from typing import final
 
 import numpy as np
 from jaxtyping import Float32, UInt8, UInt16
 
-from udccal.errors import FitError
+from udccal.errors import FitError, found_instead
 from udccal.sessions.store import Session
 
 Codes = UInt16[np.ndarray, "rows columns"]
@@ -129,11 +130,15 @@ class NoiseData:
             raise FitError(f"Expected at most {_MOST_FRAMES} levels and frames of a stack. Average some first.")
         if stacks and min(map(len, stacks)) < 2:
             raise FitError("Expected at least two dark and two bright frames in the stack, found fewer. Leave it out.")
-        for index, level in enumerate(self.levels):
-            given = (("an exposure in seconds", level.exposure_s), ("a number of photons", level.photons or 0.0))
-            for name, value in given:
+        exposed = [(f"level {index}", level) for index, level in enumerate(self.levels)]
+        for where, one in (*exposed, *((("the stack", self.stack),) if self.stack else ())):
+            photons = 0.0 if one.photons is None else one.photons
+            for name, value in (("an exposure in seconds", one.exposure_s), ("a number of photons", photons)):
+                if not isinstance(value, Real):
+                    raise FitError(f"Expected {where} to have {name}, found {found_instead(value)}. Give one number.")
                 if not (np.isfinite(value) and value >= 0):
-                    raise FitError(f"Expected level {index} to have {name}, found {value}.")
+                    raise FitError(f"Expected {where} to have {name}, found {value}. Give a number of 0 or more.")
+        for index, level in enumerate(self.levels):
             for name, frames in (("dark", level.dark), ("bright", level.bright)):
                 if len(frames) not in (0, 2):
                     raise FitError(f"Expected two {name} frames in level {index} or none, found {len(frames)}.")
