@@ -9,6 +9,7 @@ import resource
 import sys
 from collections.abc import Iterable
 from concurrent.futures import ProcessPoolExecutor
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -34,6 +35,7 @@ def main() -> None:
     parser.add_argument("--family", choices=MODULES, action="append", help="only this one; may be repeated")
     parser.add_argument("--sets", type=int, default=200, help="data sets of each family")
     parser.add_argument("--seed", type=int, default=0, help="the first seed")
+    parser.add_argument("--workers", type=int, default=2, help="data sets at a time")
     parser.add_argument("--only-worst", action="store_true", help="print only what was missed")
     parser.add_argument("--page", action="store_true", help="put the tables of fewer than 200 sets into the page, too")
     parser.add_argument("--again", metavar="FAMILY/SEED", help="one data set again, with all its numbers")
@@ -44,13 +46,12 @@ def main() -> None:
     seeds, rows = range(options.seed, options.seed + options.sets), list[Row]()
     options.out.mkdir(parents=True, exist_ok=True)
     for name in options.family or MODULES:
-        verdicts, peak_MiB = list[Verdict](), 0.0
-        for first in range(0, len(seeds), _IN_A_PROCESS):
-            # In processes of their own: the peak of memory is the family's, and compilations do not pile up.
-            with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as own:
-                part = own.submit(run, name, seeds[first : first + _IN_A_PROCESS], options.only_worst).result()
-            verdicts, peak_MiB = verdicts + part[0], max(peak_MiB, part[1])
-        found = rows_of(family(name), verdicts, peak_MiB)
+        parts = [seeds[first : first + _IN_A_PROCESS] for first in range(0, len(seeds), _IN_A_PROCESS)]
+        # In processes of their own: the peak of memory is the family's, and compilations do not pile up.
+        spawn = multiprocessing.get_context("spawn")
+        with ProcessPoolExecutor(options.workers, spawn, max_tasks_per_child=1) as pool:
+            judged, peaks_MiB = zip(*pool.map(partial(run, name, only_worst=options.only_worst), parts), strict=True)
+        found = rows_of(family(name), [verdict for part in judged for verdict in part], max(peaks_MiB))
         print(f"{table(found)}\n", flush=True)
         rows += found
         write_json(rows, options.out / "robust.json")
