@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from numbers import Real
 from typing import final
 
 import numpy as np
@@ -134,7 +133,7 @@ class NoiseData:
         for where, one in (*exposed, *((("the stack", self.stack),) if self.stack else ())):
             photons = 0.0 if one.photons is None else one.photons
             for name, value in (("an exposure in seconds", one.exposure_s), ("a number of photons", photons)):
-                if not isinstance(value, Real):
+                if not isinstance(value, int | float | np.integer | np.floating):
                     raise FitError(f"Expected {where} to have {name}, found {found_instead(value)}. Give one number.")
                 if not (np.isfinite(value) and value >= 0):
                     raise FitError(f"Expected {where} to have {name}, found {value}. Give a number of 0 or more.")
