@@ -121,7 +121,7 @@ def carriers(
 ) -> Float[Array, "2 harmonics n"]:
     """Return G and z G' of each harmonic times the slits' coefficients, for ``seen`` = ``kappa(wire, slope)``."""
     harmonics = jnp.asarray(wire.harmonics)[:, :, None]
-    slit, _ = slits(wire, openings(wire, slope))
+    slit = slits(wire, openings(wire, slope))
     # cos(nX) cos(mY) is half the sum over (n, m) and (-n, m).
     crossed = jnp.where(jnp.all(harmonics != 0, axis=1), 0.5, 1.0)
     z = jnp.pi * wire.footprint_per_pitch * jnp.asarray(seen)
@@ -130,21 +130,17 @@ def carriers(
     return crossed * slit[0] * slit[1] * jnp.stack([g, 2.0 * (j0 - g)])
 
 
-def slits(
-    wire: Wire, width: Float[Array, "2 n"]
-) -> tuple[Float[Array, "2 harmonics n"], Float[Array, "2 harmonics n"]]:
-    """Return the slits' coefficients 2 sin(pi m f) / (pi m f), 1 where m is 0, and their derivatives by f.
+def slits(wire: Wire, width: Float[Array, "2 n"]) -> Float[Array, "2 harmonics n"]:
+    """Return the slits' coefficients 2 sin(pi m f) / (pi m f), 1 where m is 0.
 
     Args:
         wire: the wire term.
         width: openings f along X and Y, from ``openings``.
     """
     order = jnp.abs(jnp.asarray(wire.harmonics)).T[..., None]
-    waved = [_multiples(jnp.pi * f, m[:, 0]) for f, m in zip(width, order, strict=True)]
-    cosine, sine = (jnp.stack(part) for part in zip(*waved, strict=True))
+    sine = jnp.stack([_multiples(jnp.pi * f, m[:, 0])[1] for f, m in zip(width, order, strict=True)])
     sinc = sine / (jnp.pi * jnp.maximum(order, 1.0) * width[:, None])
-    slope = 2.0 * (cosine - sinc) / width[:, None]
-    return jnp.where(order == 0, 1.0, 2.0 * sinc), jnp.where(order == 0, 0.0, slope)
+    return jnp.where(order == 0, 1.0, 2.0 * sinc)
 
 
 def waves(wire: Wire, periods: Float[Arrayish, "2 n"]) -> Float[Array, "2 harmonics n"]:

@@ -129,8 +129,11 @@ class NoiseData:
             raise FitError(f"Expected at most {_MOST_FRAMES} levels and frames of a stack. Average some first.")
         if stacks and min(map(len, stacks)) < 2:
             raise FitError("Expected at least two dark and two bright frames in the stack, found fewer. Leave it out.")
+        exposed: list[tuple[str, ExposureLevel | SpatialStack]]
         exposed = [(f"level {index}", level) for index, level in enumerate(self.levels)]
-        for where, one in (*exposed, *((("the stack", self.stack),) if self.stack else ())):
+        if self.stack is not None:
+            exposed.append(("the stack", self.stack))
+        for where, one in exposed:
             photons = 0.0 if one.photons is None else one.photons
             for name, value in (("an exposure in seconds", one.exposure_s), ("a number of photons", photons)):
                 if not isinstance(value, int | float | np.integer | np.floating):

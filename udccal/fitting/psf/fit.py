@@ -31,14 +31,7 @@ from udccal.fitting.psf.held_out import (
     wide_support,
     with_support,
 )
-from udccal.fitting.psf.kernel import (
-    BLUR,
-    PITCH,
-    as_numpy,
-    pitch_tolerance,
-    start_model,
-    start_prior,
-)
+from udccal.fitting.psf.kernel import BLUR, PITCH, as_numpy, pitch_tolerance, start_model, start_prior
 from udccal.fitting.psf.orders import Selection, select_field
 from udccal.fitting.psf.problem import explain
 from udccal.fitting.psf.samples import some_shots
