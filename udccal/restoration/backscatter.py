@@ -22,15 +22,15 @@ from udccal.rig import RigDescription
 # Shares below this fraction of all light are left out.
 _LEAST_SHARE = 1e-6
 # Side in samples of the blocks that give the level: large enough to average noise, small enough to find dark places.
-_BLOCK = 16
-_PERCENTILE = 1.0
+BLOCK = 16
+PERCENTILE = 1.0
 # Least sigma over the light of a picture that is not known. One level misses such light by some half of it; but told
 # that, colours that are right turn grey.
 UNKNOWN_ERROR = 0.1
 # A frame is darker than its panel's light where this is more than so many times the frame, and more than so few e-.
 _MORE, _NEGLIGIBLE_E = 1.2, 1.0
 # Samples of which the sums are taken: few, and by an odd step, so that every colour is among them.
-_SPARSE = np.s_[::5, ::5]
+SPARSE = np.s_[::5, ::5]
 
 
 @final
@@ -200,9 +200,13 @@ def refuse_excess(
     Raises:
         RestorationError: when the panel's light is more than the frame's by a fifth, far beyond the mask's errors.
     """
-    use = ~clipped[_SPARSE]
-    seen, expected = (float(np.sum(light[_SPARSE], where=use, dtype=np.float64)) for light in (signal, panel_light))
-    samples = int(np.count_nonzero(use))
+    use = ~clipped[SPARSE]
+    seen, expected = (float(np.sum(light[SPARSE], where=use, dtype=np.float64)) for light in (signal, panel_light))
+    refuse_excess_of(seen, expected, int(np.count_nonzero(use)))
+
+
+def refuse_excess_of(seen: float, expected: float, samples: int) -> None:
+    """Refuse a frame as ``refuse_excess`` does, by the sums of its light and of the panel's over some samples."""
     if expected > _MORE * max(seen, 0.0) + samples * _NEGLIGIBLE_E:
         raise RestorationError(
             f"Expected a frame at least as bright as the panel's own light, found {seen / samples:.3g} e- per pixel "
@@ -254,7 +258,7 @@ class PanelMask:
             seen, possible = (np.sum([planes[index] for index in same], axis=0) for planes in (light, self._possible))
             usable = possible > 0
             if usable.any():
-                ratio = np.percentile(seen[usable] / possible[usable], _PERCENTILE)
+                ratio = np.percentile(seen[usable] / possible[usable], PERCENTILE)
                 levels[channel] = np.clip(ratio / exposure_s, 0.0, 1.0)
         return levels
 
@@ -268,9 +272,9 @@ class PanelMask:
 
 def _block_means(mosaic: Float32[np.ndarray, "rows columns"], cfa: Cfa) -> list[Float32[np.ndarray, "down across"]]:
     """Return each site's mean in blocks."""
-    down, across = (max(size // _BLOCK, 1) for size in mosaic.shape)
-    columns = (across * _BLOCK if mosaic.shape[1] >= _BLOCK else mosaic.shape[1]) // cfa.columns * cfa.columns
-    cut = mosaic[: down * _BLOCK, :columns]
+    down, across = (max(size // BLOCK, 1) for size in mosaic.shape)
+    columns = (across * BLOCK if mosaic.shape[1] >= BLOCK else mosaic.shape[1]) // cfa.columns * cfa.columns
+    cut = mosaic[: down * BLOCK, :columns]
     # A line of the sites of one row is a line of pixels with as many channels: no site has to be picked out.
     lines = [cut[row :: cfa.rows].reshape(-1, columns // cfa.columns, cfa.columns) for row in range(cfa.rows)]
     blocks = [cv2.resize(line, (across, down), interpolation=cv2.INTER_AREA) for line in lines]

@@ -26,9 +26,9 @@ from udccal.restoration.tiles import TileLayout
 
 # Samples of a tile that clip at least, where the taper leaves more than half of them. Single ones are hot pixels, which
 # have been replaced.
-_LEAST, _HALF = 8, 0.5
+LEAST, HALF = 8, 0.5
 # More steps give more: of the photograph with the largest lamps, 8 give 0.35 dB, 24 0.5 dB, 100 1.4 dB.
-_ROUNDS, _STEPS = 2, 4
+ROUNDS, STEPS = 2, 4
 
 
 def clipped_tiles(
@@ -40,10 +40,10 @@ def clipped_tiles(
         clipped: samples of the frame that say less than their light was.
         layout: the tiles.
     """
-    if np.count_nonzero(clipped) < _LEAST:
+    if np.count_nonzero(clipped) < LEAST:
         return np.empty(0, dtype=int), np.empty((0, layout.rows, layout.columns), dtype=bool)
     tiles = layout.cut(clipped.astype(np.float32)) > 0
-    at = np.flatnonzero(np.count_nonzero(tiles & (layout.taper > _HALF), axis=(1, 2)) >= _LEAST)
+    at = np.flatnonzero(np.count_nonzero(tiles & (layout.taper > HALF), axis=(1, 2)) >= LEAST)
     return at, tiles[at]
 
 
@@ -104,7 +104,7 @@ def _completed(
 
     least = (planes - level) / scale
     found, free = least.copy(), missing
-    for _ in range(_ROUNDS):
+    for _ in range(ROUNDS):
         found = np.where(missing, np.maximum(_solved(found, free, precision), least), least)
         free = missing & (found > least)
     picture = tile.copy()
@@ -121,7 +121,7 @@ def _solved(
     """Return likelier values of the free samples: some steps of conjugate gradients from ``start``."""
     found, rest = start.copy(), -precision(start) * free
     step, power = rest, float(np.vdot(rest, rest))
-    for _ in range(_STEPS):
+    for _ in range(STEPS):
         change = precision(step) * free
         curvature = float(np.vdot(step, change))
         # Nothing is left to solve, or so little that squares of the slope underflow.

@@ -15,12 +15,12 @@ from jaxtyping import Float32
 from scipy.special import log_ndtr
 
 # Variance of a colour's deviation from grey over the square of the grey: as in the filter's prior.
-_COLOURFUL = 0.2
+COLOURFUL = 0.2
 # Pixels across, of which the smooth picture has one.
-_STEP = 16
+STEP = 16
 # Where no deviation is wrong by more than this part, nothing is changed.
-_NEGLIGIBLE = 0.01
-_LEAST_E = 1e-6
+NEGLIGIBLE = 0.01
+LEAST_E = 1e-6
 # Every n-th row is looked at first.
 _SPARSE = 4
 
@@ -35,13 +35,13 @@ def plausible(
         error_e: sigma of the light that was subtracted, in e-.
     """
     rows, columns = error_e.shape
-    size = max(columns // _STEP, 1), max(rows // _STEP, 1)
+    size = max(columns // STEP, 1), max(rows // STEP, 1)
     # Most pictures are bright everywhere, which some of their rows tell.
-    if float(_doubt(*_smooth(picture_e[::_SPARSE], error_e[::_SPARSE], size)).max()) < _NEGLIGIBLE / 2:
+    if float(_doubt(*_smooth(picture_e[::_SPARSE], error_e[::_SPARSE], size)).max()) < NEGLIGIBLE / 2:
         return picture_e
     smooth, sigma = _smooth(picture_e, error_e, size)
     doubt = _doubt(smooth, sigma)
-    if float(doubt.max()) < _NEGLIGIBLE:
+    if float(doubt.max()) < NEGLIGIBLE:
         return picture_e
     # The errors of three colours average.
     grey = smooth.mean(axis=2, keepdims=True)
@@ -56,7 +56,7 @@ def _smooth(
 ) -> tuple[Float32[np.ndarray, "down across 3"], Float32[np.ndarray, "down across 1"]]:
     """Return the smooth picture, of ``size`` (columns, rows), and sigma of its error."""
     small, error = (cv2.resize(each, size, interpolation=cv2.INTER_AREA) for each in (picture_e, error_e))
-    return cv2.blur(small, (3, 3)), np.maximum(error, np.float32(_LEAST_E))[..., None]
+    return cv2.blur(small, (3, 3)), np.maximum(error, np.float32(LEAST_E))[..., None]
 
 
 def _doubt(
@@ -64,7 +64,7 @@ def _doubt(
 ) -> Float32[np.ndarray, "down across 1"]:
     """Return the part of a colour's variance that the error explains."""
     grey = smooth.mean(axis=2, keepdims=True)
-    return sigma**2 / (_COLOURFUL * np.maximum(grey, np.float32(0)) ** 2 + sigma**2)
+    return sigma**2 / (COLOURFUL * np.maximum(grey, np.float32(0)) ** 2 + sigma**2)
 
 
 def _lift(value: Float32[np.ndarray, "..."], sigma: Float32[np.ndarray, "..."]) -> Float32[np.ndarray, "..."]:

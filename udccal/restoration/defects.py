@@ -18,9 +18,9 @@ from udccal.cfa import Cfa, cfa_named
 from udccal.models.noise import Noise
 from udccal.restoration.linear import dark_DN, scalar, to_electrons
 
-_OUTLIER_SIGMA: Final = 8.0
+OUTLIER_SIGMA: Final = 8.0
 # A point of light seen through the panel stays below 4 times the range: its kernel is wide.
-_OUTLIER_RATIO: Final = 5.0
+OUTLIER_RATIO: Final = 5.0
 _NEIGHBOURS: Final = tuple((down, across) for down in (-1, 0, 1) for across in (-1, 0, 1) if down or across)
 
 Places = tuple[Int[np.ndarray, " places"], Int[np.ndarray, " places"]]
@@ -69,7 +69,7 @@ def _codes(dark: float, K_DN_per_e: float, floor_e2: float, most_DN: int) -> tup
     roots = np.sqrt(light + least_e2) + np.minimum(signal, 0.0) / (2 * np.sqrt(least_e2))
     scale = 255 / max(roots[most_DN] - roots[0], 1e-6)
     codes = np.clip(scale * (roots - roots[0]), 0, 255).astype(np.uint8)
-    allowed_DN = K_DN_per_e * _OUTLIER_SIGMA * np.sqrt(light + floor_e2)
+    allowed_DN = K_DN_per_e * OUTLIER_SIGMA * np.sqrt(light + floor_e2)
     apart = 255
     for bound_DN in (np.floor(values_DN + allowed_DN), np.ceil(values_DN - allowed_DN)):
         possible = (values_DN <= most_DN) & (bound_DN >= 0) & (bound_DN <= most_DN)
@@ -97,7 +97,7 @@ def _is_defective(
 ) -> Bool[np.ndarray, " places"]:
     high, low = around_e.max(axis=0), around_e.min(axis=0)
     sigma = np.sqrt(np.maximum(high, 0.0) + np.float32(floor_e2))
-    allowed = np.maximum(_OUTLIER_SIGMA * sigma, _OUTLIER_RATIO * (high - low))
+    allowed = np.maximum(OUTLIER_SIGMA * sigma, OUTLIER_RATIO * (high - low))
     return (at_e > high + allowed) | (at_e < low - allowed)
 
 

@@ -46,8 +46,13 @@ def above_dark_DN(
 
 def saturated(mosaic: UInt16[np.ndarray, "rows columns"], noise: Noise) -> Bool[np.ndarray, "rows columns"]:
     """Return the samples within 1.5 % of the range above black of saturation."""
+    return mosaic >= least_saturated_DN(noise)
+
+
+def least_saturated_DN(noise: Noise) -> float:
+    """Return the value from which on a sample counts as saturated."""
     top, black = scalar(noise.saturation_DN), scalar(noise.black_DN)
-    return mosaic >= top - _SATURATION_MARGIN * (top - black)
+    return top - _SATURATION_MARGIN * (top - black)
 
 
 def variance_e2(
@@ -55,16 +60,21 @@ def variance_e2(
 ) -> Float32[np.ndarray, "rows columns"]:
     """Return the temporal variance of every sample in e-^2 (EMVA 1288, linear camera model).
 
-    A measured dark current slightly below zero adds no noise.
-
     Args:
         signal_e: signal in e-, dark signal excluded, backscatter included.
         noise: the noise term.
         exposure_s: exposure time.
     """
+    variance = np.maximum(signal_e, np.float32(0))
+    variance += np.float32(variance_floor_e2(noise, exposure_s))
+    return variance
+
+
+def variance_floor_e2(noise: Noise, exposure_s: float) -> float:
+    """Return the variance of a sample without light in e-^2.
+
+    A measured dark current slightly below zero adds no noise.
+    """
     dark_e = scalar(noise.dark_current_e_per_s) * exposure_s
     quantisation = (scalar(noise.q_DN) / scalar(noise.K_DN_per_e)) ** 2 / 12.0
-    floor = max(dark_e, 0.0) + scalar(noise.sigma_d_e) ** 2 + quantisation
-    variance = np.maximum(signal_e, np.float32(0))
-    variance += np.float32(floor)
-    return variance
+    return max(dark_e, 0.0) + scalar(noise.sigma_d_e) ** 2 + quantisation

@@ -36,15 +36,15 @@ from udccal.restoration.tiles import TileLayout
 
 # Of the prior, fitted on photographs of two magnifications: the exponent of its power spectrum, the frequency in
 # cycles/px below which it is flat, and the variance of a colour's deviation from grey relative to that of the grey.
-_EXPONENT, _FLAT_BELOW, _COLOURFUL = 3.0, 0.003, 0.2
+_EXPONENT, _FLAT_BELOW, COLOURFUL = 3.0, 0.003, 0.2
 # The prior's covariance of two colours relative to the variance of grey.
-COLOURS = _COLOURFUL * np.eye(3) + 1 - _COLOURFUL / 3
+COLOURS = COLOURFUL * np.eye(3) + 1 - COLOURFUL / 3
 # Of the variance that colours share, over that of each one's deviation.
-_COMMON = (1 - _COLOURFUL / 3) / _COLOURFUL
+COMMON = (1 - COLOURFUL / 3) / COLOURFUL
 # Strengths of the prior in units of the noise: RMS difference of neighbours over the sigma of a sample, squared.
 STRENGTHS = np.exp2(np.arange(-6.0, 17.0)).astype(np.float32)
 # Every n-th frequency along both axes decides the strength.
-_SPARSE = 3
+SPARSE = 3
 # Every n-th strength is tried first.
 _STRIDE = 4
 
@@ -249,10 +249,10 @@ def _picture(
     own = [np.flatnonzero(channels == colour).tolist() for colour in range(len(COLOURS))]
     spectra = [_products(tables.matched, by_site, sites) if sites else None for sites in own]
     # Colours have much that cancels in their sum. In single precision, they are mixed before they become pictures.
-    common = functools.reduce(np.add, [each for each in spectra if each is not None]) * np.float32(_COMMON)
+    common = functools.reduce(np.add, [each for each in spectra if each is not None]) * np.float32(COMMON)
     mixed = [common if each is None else np.add(each, common, out=each) for each in spectra]
     planes = [joined_planes(each, cell, layout.columns) for each in mixed]
-    return cv2.transform(cv2.merge(planes), np.column_stack([np.diag(_COLOURFUL * noise_e), levels]))
+    return cv2.transform(cv2.merge(planes), np.column_stack([np.diag(COLOURFUL * noise_e), levels]))
 
 
 def _products(
@@ -274,8 +274,8 @@ def _likeliest(
     samples: float,
 ) -> np.float32:
     """Return the prior's strength under which the spectrum is most probable."""
-    some = spectrum[:, ::_SPARSE, ::_SPARSE]
-    power, value = (some.real**2 + some.imag**2) / np.float32(samples), values[:, ::_SPARSE, ::_SPARSE]
+    some = spectrum[:, ::SPARSE, ::SPARSE]
+    power, value = (some.real**2 + some.imag**2) / np.float32(samples), values[:, ::SPARSE, ::SPARSE]
 
     def cost(strength: np.float32) -> float:
         variance = strength * value

@@ -31,13 +31,13 @@ _PLACES = 4
 # Channels that the network is given: three pictures by place, and the noise.
 INPUTS = 3 * COLOURS * _PLACES + BANDS
 # The sharper picture has the prior's strength times this.
-_SHARPER = np.float32(16)
+SHARPER = np.float32(16)
 # Detail is what differs from the mean over this many px.
-_DETAIL_PX = (31, 31)
+DETAIL_PX = (31, 31)
 # How far the network looks, rows that it is given at once, and the coarse level's cell.
-_REACH_PX, _BLOCK_ROWS, _CELL_PX = 48, 256, 4
+REACH_PX, _BLOCK_ROWS, CELL_PX = 48, 256, 4
 # Ways round in which a picture can be shown: steps through its rows and columns.
-_WAYS = ((1, 1), (-1, -1), (1, -1), (-1, 1))
+WAYS = ((1, 1), (-1, -1), (1, -1), (-1, 1))
 # Channels at half and at a quarter of the resolution, and residual blocks there.
 _FINE, _COARSE, _FINE_BLOCKS, _COARSE_BLOCKS = 40, 64, 2, 3
 
@@ -54,7 +54,7 @@ def details(
 ) -> Float32[np.ndarray, "rows columns 9"]:
     """Return what the network sees of three pictures, in units of the samples' noise ``scale``."""
     first = balanced / scale
-    first -= cv2.blur(first, _DETAIL_PX, borderType=cv2.BORDER_REFLECT_101)
+    first -= cv2.blur(first, DETAIL_PX, borderType=cv2.BORDER_REFLECT_101)
     return np.concatenate([first, (chosen - balanced) / scale, (sharp - chosen) / scale], axis=-1)
 
 
@@ -77,7 +77,7 @@ def noise_planes(
 
 def sharper(strengths: Float32[np.ndarray, " tiles"]) -> Float32[np.ndarray, " tiles"]:
     """Return the strengths at which tiles are filtered a second time, for the network, given those that they chose."""
-    return np.minimum(strengths * _SHARPER, STRENGTHS[-1])
+    return np.minimum(strengths * SHARPER, STRENGTHS[-1])
 
 
 def refined(
@@ -123,8 +123,8 @@ def corrected(
     weights, detail = network_weights(), details(balanced, chosen, sharp, scale)
     count = -(-rows // _BLOCK_ROWS)
     # Blocks of one shape are compiled once; what surrounds each is as far as the network looks.
-    down = (_REACH_PX, _REACH_PX + count * _BLOCK_ROWS - rows)
-    across = (_REACH_PX, _REACH_PX + -columns % _CELL_PX)
+    down = (REACH_PX, REACH_PX + count * _BLOCK_ROWS - rows)
+    across = (REACH_PX, REACH_PX + -columns % CELL_PX)
     detail = np.pad(detail, (down, across, (0, 0)), mode="symmetric")
     half = [
         (before // 2, (before + size + after) // 2 - before // 2 - noise.shape[axis])
@@ -133,9 +133,9 @@ def corrected(
     noise = np.pad(noise, (*half, (0, 0)), mode="edge")
     result = np.empty_like(balanced)
     for top in range(0, rows, _BLOCK_ROWS):
-        bottom = top + _BLOCK_ROWS + 2 * _REACH_PX
+        bottom = top + _BLOCK_ROWS + 2 * REACH_PX
         found = _mean(weights, detail[top:bottom], noise[top // 2 : bottom // 2], views)
-        inner = found[_REACH_PX : _REACH_PX + min(_BLOCK_ROWS, rows - top), _REACH_PX : _REACH_PX + columns]
+        inner = found[REACH_PX : REACH_PX + min(_BLOCK_ROWS, rows - top), REACH_PX : REACH_PX + columns]
         result[top : top + _BLOCK_ROWS] = inner
     result *= scale
     result += balanced
@@ -150,7 +150,7 @@ def _mean(
 ) -> Float32[np.ndarray, "rows columns 3"]:
     """Return the mean of what the network finds when it sees a block ``views`` ways round."""
     total = np.zeros((*detail.shape[:2], COLOURS), np.float32)
-    for down, across in _WAYS[:views]:
+    for down, across in WAYS[:views]:
         shown = (np.ascontiguousarray(planes[None, ::down, ::across]) for planes in (detail, noise))
         total += np.asarray(_compiled(weights, *shown))[0, ::down, ::across]
     return total / np.float32(views)

@@ -64,7 +64,7 @@ class Rectification:
         return Rectification(self.map_x, self.map_y - np.float32(first))
 
     @functools.cached_property
-    def _fixed(self) -> tuple[Int16[np.ndarray, "rows columns 2"], UInt16[np.ndarray, "rows columns"]]:
+    def fixed(self) -> tuple[Int16[np.ndarray, "rows columns 2"], UInt16[np.ndarray, "rows columns"]]:
         """Both maps as OpenCV uses them: whole pixels, and 1024 steps of 1/32 px."""
         return cv2.convertMaps(self.map_x, self.map_y, cv2.CV_16SC2)
 
@@ -72,7 +72,7 @@ class Rectification:
         self, picture: Real[np.ndarray, "rows columns 3"], interpolation: Interpolation = Interpolation.LANCZOS
     ) -> Real[np.ndarray, "view_rows view_columns 3"]:
         """Resample a sensor picture onto the view; its type, float32 or 8 bits, is kept."""
-        return cv2.remap(picture, *self._fixed, interpolation, borderMode=cv2.BORDER_REFLECT_101)
+        return cv2.remap(picture, *self.fixed, interpolation, borderMode=cv2.BORDER_REFLECT_101)
 
 
 _sensor_places = jax.jit(view_to_sensor)

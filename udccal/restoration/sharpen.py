@@ -28,9 +28,9 @@ Clipped = Bool[np.ndarray, "rows columns"]
 Strip = Float32[np.ndarray, "covered_rows columns 3"]
 
 # Every n-th cell of a tile gives the mean noise of its samples.
-_SPARSE = 4
+SPARSE = 4
 # Width in px over which the noise's variance is averaged to tell bright places of a tile from dark ones.
-_LOCAL_PX = 16
+LOCAL_PX = 16
 
 
 @final
@@ -139,7 +139,7 @@ class Sharpener:
         if self.noise is None:
             return picture
         bands = self.noise.of_tiles(found.strengths)
-        local = cv2.blur(variance_e2, (_LOCAL_PX, _LOCAL_PX), borderType=cv2.BORDER_REFLECT_101)[self.rows]
+        local = cv2.blur(variance_e2, (LOCAL_PX, LOCAL_PX), borderType=cv2.BORDER_REFLECT_101)[self.rows]
         balanced = shrunk(picture, found.noise_e, local, bands, self.layout, self.options.workers)
         if self.tier is Tier.balanced:
             return balanced
@@ -188,7 +188,7 @@ class Sharpener:
 
     def _tile_noise(self, variance_e2: Mosaic) -> Float32[np.ndarray, "tiles 3"]:
         """Return the sigma of a sample of each colour in each tile."""
-        of_site = [_tile_means(variance_e2[site.samples][::_SPARSE, ::_SPARSE], self.layout) for site in self.cfa.sites]
+        of_site = [_tile_means(variance_e2[site.samples][::SPARSE, ::SPARSE], self.layout) for site in self.cfa.sites]
         channels = np.array([site.channel for site in self.cfa.sites])
         own = [channels == channel if channel in channels else channels >= 0 for channel in range(3)]
         found = np.stack([np.mean(np.array(of_site)[mine], axis=0) for mine in own], axis=1)
@@ -198,13 +198,13 @@ class Sharpener:
 def _tile_means(some: Float32[np.ndarray, "rows columns"], layout: TileLayout) -> Float64[np.ndarray, " tiles"]:
     """Return the mean of each tile's part of the frame; ``some`` are samples at even steps over the frame."""
     sums = cv2.integral(np.ascontiguousarray(some))
-    top, bottom = _ends(layout.tops, layout.rows, layout.frame_rows, some.shape[0])
-    left, right = _ends(layout.lefts, layout.columns, layout.frame_columns, some.shape[1])
+    top, bottom = tile_ends(layout.tops, layout.rows, layout.frame_rows, some.shape[0])
+    left, right = tile_ends(layout.lefts, layout.columns, layout.frame_columns, some.shape[1])
     total = sums[bottom][:, right] - sums[bottom][:, left] - sums[top][:, right] + sums[top][:, left]
     return (total / np.outer(bottom - top, right - left)).ravel()
 
 
-def _ends(starts: tuple[int, ...], size: int, most: int, count: int) -> Int[np.ndarray, "2 starts"]:
+def tile_ends(starts: tuple[int, ...], size: int, most: int, count: int) -> Int[np.ndarray, "2 starts"]:
     """Return the first of ``count`` samples of each tile along one axis of ``most`` px, and the one after its last."""
     ends = np.clip(np.array([starts, [start + size for start in starts]]), 0, most) * count / most
     first = np.minimum(np.floor(ends[0]), count - 1)

@@ -19,15 +19,15 @@ from jaxtyping import Float, Float32, Int
 from udccal.restoration.mosaic_filter import STRENGTHS, FilterTables, Pattern, filtered
 from udccal.restoration.tiles import BLEND_PX, TAPER_PX, Strip, TileLayout
 
-_LEVELS, _BANDS = 4, 3
+LEVELS, BANDS = 4, 3
 # A sample keeps 1 - margin * noise / energy: the energy of noise alone scatters about its mean.
-_MARGIN = 1.6
-_WINDOW = (5, 5)
-_SMOOTH = np.array([1, 4, 6, 4, 1], dtype=np.float32) / np.float32(16)
+MARGIN = 1.6
+WINDOW = (5, 5)
+SMOOTH = np.array([1, 4, 6, 4, 1], dtype=np.float32) / np.float32(16)
 _ONE = np.ones(1, dtype=np.float32)
 # Grey, red against blue, green against both; orthonormal.
-_OPPONENT = np.array([[1, 1, 1], [1, 0, -1], [1, -2, 1]], dtype=np.float32)
-_OPPONENT /= np.linalg.norm(_OPPONENT, axis=1, keepdims=True)
+OPPONENT = np.array([[1, 1, 1], [1, 0, -1], [1, -2, 1]], dtype=np.float32)
+OPPONENT /= np.linalg.norm(OPPONENT, axis=1, keepdims=True)
 # Tiles whose noise is measured, down and across the frame; the others are like the nearest of them.
 _PROBES = 3
 
@@ -80,7 +80,7 @@ def measured_noise(tables: FilterTables, layout: TileLayout, pattern: Pattern, w
     inner = slice(TAPER_PX + BLEND_PX, -TAPER_PX - BLEND_PX)
     with ThreadPoolExecutor(workers) as pool:
         parts = list(pool.map(lambda picture: _band_variances(picture[inner, inner]), pictures))
-    return BandNoise(np.stack(parts).reshape(len(chosen), len(STRENGTHS), 3, _LEVELS, _BANDS), probe.reshape(-1))
+    return BandNoise(np.stack(parts).reshape(len(chosen), len(STRENGTHS), 3, LEVELS, BANDS), probe.reshape(-1))
 
 
 def _probes(count: int) -> Int[np.ndarray, " probes"]:
@@ -88,10 +88,10 @@ def _probes(count: int) -> Int[np.ndarray, " probes"]:
 
 
 def _band_variances(picture: Float32[np.ndarray, "rows columns 3"]) -> Float32[np.ndarray, "3 levels bands"]:
-    found = np.zeros((3, _LEVELS, _BANDS), dtype=np.float32)
-    for colour, plane in enumerate(cv2.split(cv2.transform(picture, _OPPONENT))):
+    found = np.zeros((3, LEVELS, BANDS), dtype=np.float32)
+    for colour, plane in enumerate(cv2.split(cv2.transform(picture, OPPONENT))):
         rest = plane
-        for level in range(_LEVELS):
+        for level in range(LEVELS):
             bands, smooth = _split(rest)
             found[colour, level] = [float(np.mean(band**2)) for band in bands]
             rest = np.ascontiguousarray(smooth[::2, ::2])
@@ -117,20 +117,20 @@ def shrunk(
         workers: threads.
     """
     scale = interpolated(layout, layout.by_place(noise_e))
-    opponent = cv2.transform(picture / scale, _OPPONENT)
+    opponent = cv2.transform(picture / scale, OPPONENT)
     # Within a tile, bright places are noisier than dark ones.
     brightness = [local_variance_e2 / (cv2.transform(scale * scale, _MEAN))]
-    for _ in range(1, _LEVELS):
+    for _ in range(1, LEVELS):
         rows, columns = brightness[-1].shape
         brightness.append(cv2.resize(brightness[-1], (-(-columns // 2), -(-rows // 2)), interpolation=cv2.INTER_AREA))
-    by_place = np.float32(_MARGIN) * layout.by_place(variance)
+    by_place = np.float32(MARGIN) * layout.by_place(variance)
 
     def one(colour: int) -> Plane:
         return _shrink_level(np.ascontiguousarray(opponent[..., colour]), by_place[:, :, colour], layout, brightness)
 
     with ThreadPoolExecutor(workers) as pool:
         calm = cv2.merge(list(pool.map(one, range(3))))
-    return cv2.transform(calm, np.ascontiguousarray(_OPPONENT.T)) * scale
+    return cv2.transform(calm, np.ascontiguousarray(OPPONENT.T)) * scale
 
 
 def _shrink_level(
@@ -143,9 +143,9 @@ def _shrink_level(
     """Shrink a plane's bands at this level, and at coarser ones by what they change."""
     bands, smooth = _split(plane)
     result = smooth.copy()
-    down, across = (_Runs.of(s, count, 0.5**level) for s, count in zip(layout.strips, plane.shape, strict=True))
+    down, across = (Runs.of(s, count, 0.5**level) for s, count in zip(layout.strips, plane.shape, strict=True))
     for index, band in enumerate(bands):
-        energy = cv2.blur(band * band, _WINDOW)
+        energy = cv2.blur(band * band, WINDOW)
         energy += np.float32(1e-20)
         # 1 - noise / energy, in place: these are the passes over memory that cost most.
         keep = _largest(noise[:, :, level, index], down, across)
@@ -155,7 +155,7 @@ def _shrink_level(
         np.maximum(keep, np.float32(0), out=keep)
         keep *= band
         result += keep
-    if level + 1 < _LEVELS and min(plane.shape) > 2 * len(_SMOOTH):
+    if level + 1 < LEVELS and min(plane.shape) > 2 * len(SMOOTH):
         half = np.ascontiguousarray(smooth[::2, ::2])
         change = _shrink_level(half, noise, layout, brightness, level + 1) - half
         result += cv2.resize(change, plane.shape[::-1], interpolation=cv2.INTER_LINEAR)
@@ -165,9 +165,9 @@ def _shrink_level(
 def _split(plane: Plane) -> tuple[tuple[Plane, Plane, Plane], Plane]:
     """Split a plane into detail across, down and diagonal, and what is smooth; their sum is the plane."""
     border = cv2.BORDER_REFLECT_101
-    down = cv2.sepFilter2D(plane, cv2.CV_32F, _ONE, _SMOOTH, borderType=border)
-    across = cv2.sepFilter2D(plane, cv2.CV_32F, _SMOOTH, _ONE, borderType=border)
-    smooth = cv2.sepFilter2D(down, cv2.CV_32F, _SMOOTH, _ONE, borderType=border)
+    down = cv2.sepFilter2D(plane, cv2.CV_32F, _ONE, SMOOTH, borderType=border)
+    across = cv2.sepFilter2D(plane, cv2.CV_32F, SMOOTH, _ONE, borderType=border)
+    smooth = cv2.sepFilter2D(down, cv2.CV_32F, SMOOTH, _ONE, borderType=border)
     diagonal = plane - down
     diagonal -= across
     diagonal += smooth
@@ -178,7 +178,7 @@ def _split(plane: Plane) -> tuple[tuple[Plane, Plane, Plane], Plane]:
 
 @final
 @dataclass(frozen=True)
-class _Runs:
+class Runs:
     """Runs of samples along one axis of the picture, or of a smaller copy, that come from the same tiles.
 
     Attributes:
@@ -191,7 +191,8 @@ class _Runs:
     samples: Int[np.ndarray, " runs"]
 
     @classmethod
-    def of(cls, strips: list[Strip], count: int, factor: float) -> _Runs:
+    def of(cls, strips: list[Strip], count: int, factor: float) -> Runs:
+        """Find the runs of ``count`` samples along an axis of a picture made smaller by ``factor``."""
         at = (np.arange(count) + 0.5) / factor
         first = np.searchsorted([strip.at.stop for strip in strips], at, side="right").clip(max=len(strips) - 1)
         last = np.searchsorted([strip.at.start for strip in strips], at, side="right") - 1
@@ -199,7 +200,7 @@ class _Runs:
         return cls(first[begins], last[begins], np.diff(begins, append=count))
 
 
-def _largest(values: Float32[np.ndarray, "tiles_down tiles_across"], down: _Runs, across: _Runs) -> Plane:
+def _largest(values: Float32[np.ndarray, "tiles_down tiles_across"], down: Runs, across: Runs) -> Plane:
     """Return the value of each sample's tile; of two tiles, the larger one."""
     rows = np.maximum(values[down.first], values[down.last])
     blocks = np.maximum(rows[:, across.first], rows[:, across.last])
