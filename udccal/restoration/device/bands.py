@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from udccal.restoration.device.planes import along, box_mean, convolved, resized
+from udccal.restoration.device.planes import box_mean, convolved, resized
 from udccal.restoration.shrink import BANDS, LEVELS, MARGIN, OPPONENT, SMOOTH, WINDOW, BandNoise, Runs, linear_weights
 from udccal.restoration.tiles import TileLayout
 
@@ -68,23 +68,23 @@ class Bands(eqx.Module):
 
     def _largest(self, values: Float[Array, "3 down across"], shape: tuple[int, ...], level: int) -> Planes:
         """Return the value of each sample's tile; of two tiles, the larger one."""
+        spread = []
         for axis, strips, count in zip((1, 2), self.layout.strips, shape, strict=True):
             runs = Runs.of(strips, count, 0.5**level)
-            first, last = (np.repeat(tile, runs.samples) for tile in (runs.first, runs.last))
-            values = jnp.maximum(jnp.take(values, first, axis=axis), jnp.take(values, last, axis=axis))
-        return values
+            values = jnp.maximum(jnp.take(values, runs.first, axis=axis), jnp.take(values, runs.last, axis=axis))
+            spread.append(np.repeat(np.eye(len(runs.samples), dtype=np.float32), runs.samples, axis=0))
+        return spread[0] @ values @ spread[1].T
 
 
 def between(
     layout: TileLayout, values: Float[Array, "tiles planes"], step: int = 1
 ) -> Float[Array, "planes rows columns"]:
     """Interpolate values between the tiles' centres, as ``shrink.interpolated`` does."""
-    planes = values.T.reshape(-1, len(layout.tops), len(layout.lefts))
-    for axis, strips, count in zip((-2, -1), layout.strips, layout.covered, strict=True):
-        planes = along(
-            linear_weights(np.array([strip.middle for strip in strips]), np.arange(0, count, step)), planes, axis
-        )
-    return planes
+    down, across = (
+        linear_weights(np.array([strip.middle for strip in strips]), np.arange(0, count, step))
+        for strips, count in zip(layout.strips, layout.covered, strict=True)
+    )
+    return down @ values.T.reshape(-1, len(layout.tops), len(layout.lefts)) @ across.T
 
 
 def halved(plane: Local) -> Local:
@@ -94,4 +94,5 @@ def halved(plane: Local) -> Local:
 
 
 def _mixed(matrix: Float[np.ndarray, "3 3"], picture: Planes) -> Planes:
-    return jnp.stack([sum(weight * plane for weight, plane in zip(row, picture, strict=True)) for row in matrix])
+    # A product of matrices: XLA would compute what sums need anew for each of the three planes.
+    return jnp.einsum("ij,jyx->iyx", matrix, picture)

@@ -38,10 +38,8 @@ def convolved(
     pads = [(0, 0)] * planes.ndim
     pads[axis] = (size // 2, size - 1 - size // 2)
     wide = jnp.pad(planes, pads, mode="reflect")
-    # Without the barrier, XLA computes a first filter anew for every tap of the second one.
-    return jax.lax.optimization_barrier(
-        sum(tap * jax.lax.slice_in_dim(wide, k, k + count, axis=axis % planes.ndim) for k, tap in enumerate(taps))
-    )
+    taken = (jax.lax.slice_in_dim(wide, k, k + count, axis=axis % planes.ndim) for k in range(size))
+    return sum(tap * part for tap, part in zip(taps, taken, strict=True))
 
 
 def box_mean(planes: Float[Array, "*n rows columns"], size: int) -> Float[Array, "*n rows columns"]:
@@ -59,9 +57,8 @@ def along(
     weights = np.take_along_axis(matrix, index, axis=1)
     shape = [1] * values.ndim
     shape[axis] = len(matrix)
-    return sum(
-        jnp.take(values, at, axis=axis) * weight.reshape(shape) for at, weight in zip(index.T, weights.T, strict=True)
-    )
+    taken = (jnp.take(values, at, axis=axis) for at in index.T)
+    return sum(part * weight.reshape(shape) for part, weight in zip(taken, weights.T, strict=True))
 
 
 def resized(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import enum
 from dataclasses import dataclass, replace
 from typing import Any, final
 
@@ -30,14 +29,6 @@ from udccal.tiers import Tier
 
 Picture = UInt8[np.ndarray, "view_rows view_columns 3"]
 PanelPicture = UInt8[np.ndarray, "panel_rows panel_columns 3"]
-
-
-class TableType(enum.StrEnum):
-    """Numbers in which the filters' complex tables are kept."""
-
-    float32 = "float32"
-    bfloat16 = "bfloat16"
-    float16 = "float16"
 
 
 class _Stages(eqx.Module):
@@ -122,15 +113,12 @@ class DeviceRestorer:
     latest: _Latest
 
     @classmethod
-    def of(
-        cls, restorer: Restorer, device: jax.Device | None = None, tables: TableType = TableType.float32
-    ) -> DeviceRestorer:
+    def of(cls, restorer: Restorer, device: jax.Device | None = None) -> DeviceRestorer:
         """Take a restorer to a device.
 
         Args:
             restorer: of a tier that deblurs.
             device: of JAX; None for the first one, which is a GPU where JAX has one.
-            tables: numbers of the filters' tables.
 
         Raises:
             RestorationError: when the restorer does not deblur, or its frames do not have whole cells of the pattern.
@@ -154,7 +142,7 @@ class DeviceRestorer:
             learned = Learned.of(sharpener.grid, layout, restorer.options.network_views)
         stages = _Stages(
             FrontEnd.of(restorer),
-            TileFilter.of(sharpener.tables, layout, cfa, jnp.dtype(tables.value)),
+            TileFilter.of(sharpener.tables, layout, cfa),
             None if sharpener.noise is None else Bands.of(sharpener.noise, layout),
             learned,
             Resampling.of(maps, restorer.options.interpolation),
@@ -185,11 +173,10 @@ class DeviceRestorer:
         given: Any = jax.device_put(
             (mosaic, Exposed(*(np.float32(each) for each in numbers)), self._rate(panel_picture), scale), self.device
         )
-        picture, excess = self.stages.shown(*given)
-        shown = np.asarray(picture)
+        shown, excess = jax.device_get(self.stages.shown(*given))
         if excess is not None:
             refuse_excess_of(float(excess.seen_e), float(excess.expected_e), int(excess.samples))
-        return shown
+        return np.asarray(shown)
 
     def _rate(self, picture: PanelPicture | None) -> Mosaic | None:
         """Return the backscatter of a picture; the latest picture's is kept."""

@@ -1,8 +1,8 @@
 """The filter of all tiles at once, on a device: ``mosaic_filter``, ``clipped`` and ``tiles`` with fixed shapes.
 
-Complex tables are kept as real and imaginary parts, which may have half of the bits. Numbers of half precision end at
-65504, and the prior's power spans eight decades. So it is taken out of ``matched``, frequency by frequency, and
-eigenvalues stay in single precision.
+Tables stay in single precision. At one frequency the eigenvalues span eight decades, and eigenvectors that are rounded
+to 16 bits let the strongest part of the samples leak into the weakest, which the filter amplifies most: a picture is
+ruined. Half of the tables' bytes would save an H100 some microseconds of a frame.
 """
 
 from __future__ import annotations
@@ -25,8 +25,7 @@ Mosaic = Float[Array, "rows columns"]
 Tiles = Float[Array, "tiles tile_rows tile_columns"]
 ByColour = Float[Array, "tiles 3"]
 Spectrum = Complex64[Array, "tiles to y x"]
-# Real and imaginary parts.
-Matrix = tuple[Float[Array, "tiles to of y x"], Float[Array, "tiles to of y x"]]
+Matrix = Complex64[Array, "tiles to of y x"]
 
 
 class Whitened(eqx.Module):
@@ -48,8 +47,7 @@ class TileFilter(eqx.Module):
     """The tables of all tiles.
 
     Attributes:
-        matched, vectors, values: as in ``FilterTables``; ``matched`` in units of ``power``.
-        power: the largest of ``matched`` at each frequency.
+        matched, vectors, values: as in ``FilterTables``.
         volume: sum of log(1 + s lambda) over the frequencies that decide the strength, by strength s.
         layout: of the tiles. cfa: the colour pattern.
     """
@@ -57,23 +55,17 @@ class TileFilter(eqx.Module):
     matched: Matrix
     vectors: Matrix
     values: Float[Array, "tiles sites y x"]
-    power: Float[Array, "y x"]
     volume: Float[Array, "tiles strengths"]
     layout: TileLayout = eqx.field(static=True)
     cfa: Cfa = eqx.field(static=True)
 
     @classmethod
-    def of(cls, tables: FilterTables, layout: TileLayout, cfa: Cfa, kind: jnp.dtype) -> TileFilter:
-        """Take over tables, with complex ones in numbers of some ``kind``."""
-        power = np.abs(tables.matched).max(axis=(0, 1, 2))
-        matched, vectors = (
-            (jnp.asarray(table.real, kind), jnp.asarray(table.imag, kind))
-            for table in (tables.matched / power, tables.vectors)
-        )
+    def of(cls, tables: FilterTables, layout: TileLayout, cfa: Cfa) -> TileFilter:
+        """Take over the tables of a layout's tiles."""
         some = tables.values[:, :, ::SPARSE, ::SPARSE]
         volume = np.stack([np.log1p(s * some).sum(axis=(1, 2, 3)) for s in STRENGTHS], axis=1)
-        rest = (jnp.asarray(each) for each in (tables.values, power, volume))
-        return cls(matched, vectors, *rest, layout, cfa)
+        arrays = (jnp.asarray(each) for each in (tables.matched, tables.vectors, tables.values, volume))
+        return cls(*arrays, layout, cfa)
 
     @property
     def cell(self) -> tuple[int, int]:
@@ -141,8 +133,9 @@ class TileFilter(eqx.Module):
         spectrum = _product(self.vectors, jnp.fft.rfft2(flat))
         some, value = (each[:, :, ::SPARSE, ::SPARSE] for each in (spectrum, self.values))
         power = (some.real**2 + some.imag**2) / (np.sum(self.layout.taper**2) / np.prod(self.cell))
-        explained = jax.lax.map(lambda s: jnp.sum(power / (s * value + 1), axis=(1, 2, 3)), jnp.asarray(STRENGTHS))
-        return Whitened(tiles, levels, noise_e, spectrum, jnp.argmin(explained.T + self.volume, axis=1))
+        variance = jnp.asarray(STRENGTHS)[:, None, None, None] * value[:, None] + 1
+        cost = jnp.sum(power[:, None] / variance, axis=(2, 3, 4)) + self.volume
+        return Whitened(tiles, levels, noise_e, spectrum, jnp.argmin(cost, axis=1))
 
     def _of_site(self, of_colour: ByColour) -> Float[Array, "tiles sites 1 1"]:
         return of_colour[:, self.channels, None, None]
@@ -150,7 +143,7 @@ class TileFilter(eqx.Module):
     def pictures(self, found: Whitened, strengths: Float[Array, " tiles"]) -> Float[Array, "tiles 3 rows columns"]:
         """Return the posterior's mean in e- at some strengths of the prior."""
         weighted = found.spectrum / (self.values + 1 / strengths[:, None, None, None])
-        by_site = _product(_adjoint(self.vectors), weighted) * self.power
+        by_site = _product(_adjoint(self.vectors), weighted)
         own = [np.flatnonzero(self.channels == colour).tolist() for colour in range(3)]
         spectra = [_product(self.matched, by_site, sites) if sites else jnp.zeros_like(by_site) for sites in own]
         common = (spectra[0] + spectra[1] + spectra[2]) * COMMON
@@ -212,15 +205,10 @@ def _inner(one: Float[Array, "tiles *n"], other: Float[Array, "tiles *n"]) -> Fl
 
 
 def _adjoint(matrix: Matrix) -> Matrix:
-    real, imaginary = (jnp.swapaxes(part, 1, 2) for part in matrix)
-    return real, -imaginary
+    return jnp.conj(jnp.swapaxes(matrix, 1, 2))
 
 
 def _product(matrix: Matrix, spectrum: Spectrum, some: list[int] | None = None) -> Spectrum:
     """Return the product of a matrix and a vector at each frequency, of ``some`` of its columns."""
-    found: list[Array] = [jnp.zeros((), jnp.float32)] * 2
-    for at in range(spectrum.shape[1]) if some is None else some:
-        real, imaginary = (part[:, :, at].astype(jnp.float32) for part in matrix)
-        one = spectrum[:, None, at]
-        found = [found[0] + real * one.real - imaginary * one.imag, found[1] + real * one.imag + imaginary * one.real]
-    return jax.lax.complex(*found)
+    columns = range(spectrum.shape[1]) if some is None else some
+    return sum(matrix[:, :, column] * spectrum[:, None, column] for column in columns)
