@@ -50,12 +50,12 @@ class Bands(eqx.Module):
         return _mixed(OPPONENT.T, calm) * scale
 
     def _level(
-        self, planes: Planes, noise: Float[Array, "3 levels bands down across"], brightness: list[Local], level: int
+        self, planes: Planes, noise: Float[Array, "3 levels bands down across"], brightness: list[Array], level: int
     ) -> Planes:
         """Shrink the bands at this level, and at coarser ones by what they change."""
         down, across = convolved(planes, SMOOTH, -2), convolved(planes, SMOOTH, -1)
         smooth = convolved(down, SMOOTH, -1)
-        shape, result = planes.shape[1:], smooth
+        shape, result = (planes.shape[1], planes.shape[2]), smooth
         for index, band in enumerate((down - smooth, across - smooth, planes - down - across + smooth)):
             energy = box_mean(band * band, WINDOW[0]) + 1e-20
             unexplained = 1 - self._largest(noise[:, level, index], shape, level) * brightness[level] / energy
@@ -66,14 +66,14 @@ class Bands(eqx.Module):
             result += resized(change, shape, cv2.INTER_LINEAR)
         return result
 
-    def _largest(self, values: Float[Array, "3 down across"], shape: tuple[int, ...], level: int) -> Planes:
+    def _largest(self, values: Float[Array, "3 down across"], shape: tuple[int, int], level: int) -> Planes:
         """Return the value of each sample's tile; of two tiles, the larger one."""
         spread = []
         for axis, strips, count in zip((1, 2), self.layout.strips, shape, strict=True):
             runs = Runs.of(strips, count, 0.5**level)
             values = jnp.maximum(jnp.take(values, runs.first, axis=axis), jnp.take(values, runs.last, axis=axis))
             spread.append(np.repeat(np.eye(len(runs.samples), dtype=np.float32), runs.samples, axis=0))
-        return spread[0] @ values @ spread[1].T
+        return jnp.einsum("yi,cij,xj->cyx", spread[0], values, spread[1])
 
 
 def between(
@@ -87,7 +87,7 @@ def between(
     return down @ values.T.reshape(-1, len(layout.tops), len(layout.lefts)) @ across.T
 
 
-def halved(plane: Local) -> Local:
+def halved(plane: Local) -> Float[Array, "half_rows half_columns"]:
     """Return the mean of every 2 x 2 samples; of an odd number of samples, of as many more as are needed."""
     rows, columns = plane.shape
     return resized(plane, (-(-rows // 2), -(-columns // 2)), cv2.INTER_AREA)

@@ -49,7 +49,7 @@ class Resampling(eqx.Module):
     """
 
     pixel: Int[Array, "view_rows view_columns 2"]
-    step: Int[Array, "view_rows view_columns 2"]
+    step: UInt8[Array, "view_rows view_columns 2"]
     taps: Float[Array, "32 taps"]
     before: int = eqx.field(static=True)
 
@@ -73,11 +73,11 @@ class Resampling(eqx.Module):
             for tap in range(taps.shape[-1])
         ]
         x, y = at[: taps.shape[-1]], at[taps.shape[-1] :]
-        return sum(
-            taps[..., 1, k, None]
-            * sum(taps[..., 0, j, None] * flat[row * size[0] + column] for j, column in enumerate(x))
-            for k, row in enumerate(y)
-        )
+        result = jnp.zeros(())
+        for down, row in enumerate(y):
+            line = sum(taps[..., 0, right, None] * flat[row * size[0] + column] for right, column in enumerate(x))
+            result += taps[..., 1, down, None] * line
+        return result
 
 
 def _mirrored(index: Int[Array, "*n"], count: int) -> Int[Array, "*n"]:

@@ -104,7 +104,7 @@ class Learned(eqx.Module):
 
 
 def _padded(
-    weights: list[tuple[slice, Float[np.ndarray, " samples"]]],
+    weights: list[tuple[slice, Float[np.ndarray, " _"]]],
 ) -> tuple[Int[np.ndarray, " tiles"], Float[np.ndarray, "tiles samples"]]:
     """Return where each tile's part begins, and its weights with zeros behind up to the longest."""
     most = max(len(hat) for _, hat in weights)

@@ -21,15 +21,18 @@ _AROUND = tuple((down, across) for down in range(3) for across in range(3) if (d
 
 
 class Exposed(eqx.Module):
-    """What depends on the exposure of a frame.
+    """What depends on a frame's exposure, and on the panel's picture.
 
     Attributes:
         exposure_s: time. dark_DN: what a sample reads without light. floor_e2: variance of a sample without light.
+        known: whether the panel's picture is known. rate: its backscatter in e-/s; anything when it is not.
     """
 
     exposure_s: Float[Array, ""]
     dark_DN: Float[Array, ""]
     floor_e2: Float[Array, ""]
+    known: Bool[Array, ""]
+    rate: Mosaic
 
 
 class Excess(eqx.Module):
@@ -77,30 +80,22 @@ class FrontEnd(eqx.Module):
         )
 
     def light(
-        self, mosaic: UInt16[Array, "rows columns"], exposed: Exposed, rate: Mosaic | None
-    ) -> tuple[Mosaic, Mosaic, Bool[Array, "rows columns"], Mosaic | None, Excess | None]:
-        """Return signal, variance, clipped samples and the panel's light as ``Restorer.scene_light`` does, in e-.
-
-        Args:
-            mosaic: raw frame.
-            exposed: of the frame.
-            rate: backscatter of the panel's picture in e-/s; None when it is not known.
-        """
+        self, mosaic: UInt16[Array, "rows columns"], exposed: Exposed
+    ) -> tuple[Mosaic, Mosaic, Bool[Array, "rows columns"], Mosaic, Excess]:
+        """Return signal, variance, clipped samples and the panel's light as ``Restorer.scene_light`` does, in e-."""
         signal = self._without_defects(self._electrons(mosaic.astype(jnp.float32), exposed.dark_DN))
         variance = jnp.maximum(signal, 0) + exposed.floor_e2
         if self.wire is not None:
             signal, variance = signal / self.wire, variance / self.wire / self.wire
-        clipped = mosaic >= self.saturated_DN
-        if self.white is None:
-            return signal, variance, clipped, None, None
-        excess = None
-        if rate is None:
-            panel = exposed.exposure_s * self._unknown(signal / exposed.exposure_s, self.white)
-        else:
-            panel, use = exposed.exposure_s * rate, ~clipped[SPARSE]
-            sums = (jnp.sum(jnp.where(use, light[SPARSE], 0)) for light in (signal, panel))
-            excess = Excess(*sums, jnp.count_nonzero(use))
-        return signal - panel, variance, clipped, panel, excess
+        clipped, panel = mosaic >= self.saturated_DN, jnp.zeros_like(signal)
+        if self.white is not None:
+            white, rate = self.white, signal / exposed.exposure_s
+            panel = exposed.exposure_s * jax.lax.cond(
+                exposed.known, lambda: exposed.rate, lambda: self._unknown(rate, white)
+            )
+        use = ~clipped[SPARSE]
+        sums = (jnp.sum(jnp.where(use, light[SPARSE], 0)) for light in (signal, panel))
+        return signal - panel, variance, clipped, panel, Excess(*sums, jnp.count_nonzero(use))
 
     def _electrons(self, mosaic_DN: Mosaic, dark_DN: Float[Array, ""]) -> Mosaic:
         if self.bend_per_DN == 0:

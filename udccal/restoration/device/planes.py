@@ -9,12 +9,12 @@ import cv2
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Float32, Real
+from jaxtyping import Array, Float, Float32, Shaped
 
 
 def apart(
-    mosaic: Real[Array, "*n rows columns"], cell: tuple[int, int]
-) -> Real[Array, "*n places place_rows place_columns"]:
+    mosaic: Shaped[Array, "*n rows columns"], cell: tuple[int, int]
+) -> Shaped[Array, "*n places place_rows place_columns"]:
     """Return the samples of each place of a ``cell`` (rows, columns) as a plane of its own, row by row."""
     *n, rows, columns = mosaic.shape
     split = mosaic.reshape(*n, rows // cell[0], cell[0], columns // cell[1], cell[1])
@@ -22,8 +22,8 @@ def apart(
 
 
 def together(
-    planes: Real[Array, "*n places place_rows place_columns"], cell: tuple[int, int]
-) -> Real[Array, "*n rows columns"]:
+    planes: Shaped[Array, "*n places place_rows place_columns"], cell: tuple[int, int]
+) -> Shaped[Array, "*n rows columns"]:
     """Return the mosaic whose places ``apart`` finds."""
     *n, _, rows, columns = planes.shape
     split = jnp.moveaxis(planes.reshape(*n, *cell, rows, columns), (-4, -3), (-3, -1))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, final
+from typing import final
 
 import equinox as eqx
 import jax
@@ -44,22 +44,22 @@ class _Stages(eqx.Module):
 
     @jax.jit
     def shown(
-        self, mosaic: UInt16[Array, "rows columns"], exposed: Exposed, rate: Mosaic | None, scale: Float[Array, "3"]
-    ) -> tuple[UInt8[Array, "view_rows view_columns 3"], Excess | None]:
+        self, mosaic: UInt16[Array, "rows columns"], exposed: Exposed, scale: Float[Array, "3"]
+    ) -> tuple[UInt8[Array, "view_rows view_columns 3"], Excess]:
         """Return what a display shows, and how the frame's light compares with the panel's."""
         with jax.default_matmul_precision("highest"):
-            signal, variance, clipped, panel, excess = self.front.light(mosaic, exposed, rate)
+            signal, variance, clipped, panel, excess = self.front.light(mosaic, exposed)
             sharp = self._sharp(signal, variance, clipped)
-            error = self.error_known if rate is not None else max(self.error_known, UNKNOWN_ERROR)
-            if panel is not None and error > 0:
-                sharp = plausible(sharp, error * panel[self._rows])
+            if self.front.white is not None:
+                error = jnp.where(exposed.known, self.error_known, max(self.error_known, UNKNOWN_ERROR))
+                sharp = jnp.where(error > 0, plausible(sharp, error * panel[self._rows]), sharp)
             return rgb8(self.resampling.apply(sharp), scale, self.codes), excess
 
     @property
     def _rows(self) -> slice:
         return slice(self.tiles.layout.first_row, self.tiles.layout.last_row)
 
-    def _sharp(self, signal: Mosaic, variance_e2: Mosaic, clipped: Array) -> Float[Array, "3 rows columns"]:
+    def _sharp(self, signal: Mosaic, variance_e2: Mosaic, clipped: Array) -> Float[Array, "3 covered_rows columns"]:
         """Demosaic and deblur as ``Sharpener.apply`` does."""
         tiles, strengths = self.tiles, jnp.asarray(STRENGTHS)
         found = tiles.completed(tiles.whitened(tiles.cut(signal), tiles.noise(variance_e2)), clipped)
@@ -76,7 +76,7 @@ class _Stages(eqx.Module):
         rest = tiles.whitened(tiles.cut(self._rest(best, signal, clipped)), found.noise_e)
         return best + tiles.join(tiles.pictures(rest, strengths[rest.strength]))
 
-    def _rest(self, picture: Float[Array, "3 rows columns"], signal: Mosaic, clipped: Array) -> Mosaic:
+    def _rest(self, picture: Float[Array, "3 covered_rows columns"], signal: Mosaic, clipped: Array) -> Mosaic:
         """Return what the samples have more or less than a picture gives, in the rows that it covers."""
         assert self.learned is not None
         channels = self.tiles.cfa.channel_map(*signal.shape)[self._rows]
@@ -90,8 +90,8 @@ class _Stages(eqx.Module):
 class _Latest:
     """The latest picture of a panel, and its backscatter on the device."""
 
-    picture: PanelPicture | None = None
-    rate: Mosaic | None = None
+    picture: PanelPicture | None
+    rate: Mosaic
 
 
 @final
@@ -99,8 +99,10 @@ class _Latest:
 class DeviceRestorer:
     """A restorer whose tables lie on a device.
 
-    It shows what ``Restorer.display`` shows, but for rounding. The first frame with a panel picture, and the first one
-    without, take the seconds of a compilation.
+    It shows what ``Restorer.display`` shows, but for rounding. The first frame takes the seconds of a compilation.
+    Three things are done another way. Every strength of a tile's prior is tried, not only those beside the best of
+    some. A tile where clipped samples are completed has no picture of its own before that. Whether a scene has dark
+    places is decided by all of its rows.
 
     Attributes:
         restorer: as prepared. device: of JAX. stages: what frames pass. panel: backscatter of known pictures.
@@ -150,7 +152,9 @@ class DeviceRestorer:
             0.0 if restorer.mask is None else restorer.mask.error,
         )
         panel = None if restorer.panel is None else PanelRows.of(restorer.panel)
-        return cls(restorer, device, *jax.device_put((stages, panel), device), _Latest())
+        dark = jnp.zeros((camera.rows, camera.columns), jnp.float32)
+        stages, panel, dark = jax.device_put((stages, panel, dark), device)
+        return cls(restorer, device, stages, panel, _Latest(None, dark))
 
     @property
     def table_bytes(self) -> int:
@@ -167,23 +171,20 @@ class DeviceRestorer:
         """Restore a frame for a display as ``Restorer.display`` does; arguments and errors are the same."""
         check_frame(mosaic, exposure_s, self.restorer.rig)
         check_panel_picture(panel_picture, self.restorer.rig)
-        noise = self.restorer.noise
+        noise, known = self.restorer.noise, panel_picture is not None and self.panel is not None
         numbers = exposure_s, dark_DN(noise, exposure_s), variance_floor_e2(noise, exposure_s)
+        rate = self.latest.rate if panel_picture is None else self._rate(panel_picture)
         scale = replace(tone, exposure=tone.exposure / exposure_s).scale()
-        given: Any = jax.device_put(
-            (mosaic, Exposed(*(np.float32(each) for each in numbers)), self._rate(panel_picture), scale), self.device
-        )
-        shown, excess = jax.device_get(self.stages.shown(*given))
-        if excess is not None:
+        small = *(np.float32(each) for each in numbers), np.bool_(known)
+        raw, factors, *scalars = jax.device_put((mosaic, scale, *small), self.device)
+        shown, excess = jax.device_get(self.stages.shown(raw, Exposed(*scalars, rate), factors))
+        if known:
             refuse_excess_of(float(excess.seen_e), float(excess.expected_e), int(excess.samples))
         return np.asarray(shown)
 
-    def _rate(self, picture: PanelPicture | None) -> Mosaic | None:
+    def _rate(self, picture: PanelPicture) -> Mosaic:
         """Return the backscatter of a picture; the latest picture's is kept."""
-        if picture is None or self.panel is None:
-            return None
         latest = self.latest
-        if latest.picture is None or not np.array_equal(latest.picture, picture):
-            latest.rate = self.panel.rate(jax.device_put(picture, self.device))
-            latest.picture = picture.copy()
+        if self.panel is not None and (latest.picture is None or not np.array_equal(latest.picture, picture)):
+            latest.picture, latest.rate = picture.copy(), self.panel.rate(jax.device_put(picture, self.device))
         return latest.rate

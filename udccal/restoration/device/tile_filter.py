@@ -169,7 +169,7 @@ class TileFilter(eqx.Module):
             own = _product(self.vectors, jnp.fft.rfft2(taper * of)) * weight
             return taper * jnp.fft.irfft2(_product(_adjoint(self.vectors), own), s=planes.shape[-2:])
 
-        def step(_: int, state: tuple[Array, ...]) -> tuple[Array, ...]:
+        def step(_: Int[Array, ""], state: tuple[Array, ...]) -> tuple[Array, ...]:
             """One step of conjugate gradients; a tile that is solved, or nearly so, stays as it is."""
             value, free, rest, ahead, power, going = state
             change = precision(ahead) * free
@@ -211,4 +211,5 @@ def _adjoint(matrix: Matrix) -> Matrix:
 def _product(matrix: Matrix, spectrum: Spectrum, some: list[int] | None = None) -> Spectrum:
     """Return the product of a matrix and a vector at each frequency, of ``some`` of its columns."""
     columns = range(spectrum.shape[1]) if some is None else some
-    return sum(matrix[:, :, column] * spectrum[:, None, column] for column in columns)
+    parts = (matrix[:, :, column] * spectrum[:, None, column] for column in columns)
+    return sum(parts, jnp.zeros((), jnp.complex64))

@@ -1,0 +1,178 @@
+"""The device path shows what the numpy path shows. Here the device is JAX's CPU."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from tests.restoration.conftest import COLUMNS, ROWS
+from tests.restoration.toy_restorer import EXPOSURE_S, exposed, made
+from udccal.cfa import cfa_named
+from udccal.errors import RestorationError
+from udccal.fitting.nominal import nominal_geometry
+from udccal.models.noise import Noise
+from udccal.restoration.backscatter import PanelLight, PanelMask, PanelSums
+from udccal.restoration.device.restorer import DeviceRestorer
+from udccal.restoration.kernel_grid import KernelGrid
+from udccal.restoration.runtime import Restorer
+from udccal.restoration.shrink import linear_weights
+from udccal.restoration.tone import Tone
+from udccal.rig import RigDescription
+from udccal.tiers import Tier
+
+TONE = Tone(EXPOSURE_S / 6000.0)
+TIERS = (Tier.fast, Tier.balanced, Tier.accurate)
+Broken = Callable[[DeviceRestorer], DeviceRestorer]
+
+
+def panel_light(rig: RigDescription) -> PanelLight:
+    """Up to six pixels of the panel, anywhere, give light to each place of a grid over the sensor."""
+    rng, nodes = np.random.default_rng(4), (8, 12)
+    starts = np.concatenate([[0], np.cumsum(rng.integers(1, 7, nodes[0] * nodes[1]))]).astype(np.int32)
+    down, across = (
+        linear_weights(np.linspace(0, size - 1, count), np.arange(size))
+        for count, size in zip(nodes, (rig.camera.rows, rig.camera.columns), strict=True)
+    )
+    sums = PanelSums(
+        rng.uniform(0.1, 0.4, (3, starts[-1])).astype(np.float32),
+        rng.integers(0, rig.panel.rows * rig.panel.columns, starts[-1]).astype(np.int32),
+        starts,
+        np.full((3, nodes[0] * nodes[1]), 5e4, np.float32),
+        (np.eye(3) + 0.1).astype(np.float32),
+        ((np.arange(256) / 255) ** 2.2).astype(np.float32),
+        down,
+        across,
+    )
+    return PanelLight(sums, cfa_named(rig.camera.cfa), rig.panel.rows, rig.panel.columns, 1)
+
+
+@pytest.fixture(scope="module")
+def restorers(small_rig: RigDescription, toy_noise: Noise, toy_grid: KernelGrid) -> dict[Tier, Restorer]:
+    """Every stage has something to do."""
+    panel, geometry = panel_light(small_rig), nominal_geometry(small_rig)
+    white = panel.rate(np.full((small_rig.panel.rows, small_rig.panel.columns, 3), 255, np.uint8))
+    mask = PanelMask(white, panel.cfa, 0.02)
+    return {
+        tier: replace(made(tier, small_rig, toy_noise, geometry, toy_grid), mask=mask, panel=panel) for tier in TIERS
+    }
+
+
+@pytest.fixture(scope="module")
+def devices(restorers: dict[Tier, Restorer]) -> dict[Tier, DeviceRestorer]:
+    return {tier: DeviceRestorer.of(restorer, jax.devices("cpu")[0]) for tier, restorer in restorers.items()}
+
+
+@pytest.fixture(scope="module")
+def picture(small_rig: RigDescription) -> np.ndarray:
+    return np.random.default_rng(5).integers(0, 256, (small_rig.panel.rows, small_rig.panel.columns, 3), np.uint8)
+
+
+@pytest.fixture(scope="module")
+def frame(restorers: dict[Tier, Restorer], toy_grid: KernelGrid, toy_scene: np.ndarray) -> np.ndarray:
+    """A dark corner, a lamp that clips, and two defects; more light than the panel gives."""
+    scene = toy_scene.copy()
+    scene[:30, :40] *= 0.002
+    scene[60:72, 50:62] = 1.4e4
+    rig = restorers[Tier.fast].rig
+    wide = rig.model_copy(update={"camera": rig.camera.model_copy(update={"rows": ROWS, "columns": COLUMNS})})
+    wire = np.ones((ROWS, COLUMNS), np.float32)
+    raw = exposed(replace(restorers[Tier.fast], rig=wide, wire=wire), toy_grid, scene + 500.0)[10:74, 10:106].copy()
+    raw[20, 31], raw[41, 60] = 3900, 0
+    return raw
+
+
+def off(restorer: Restorer, device: DeviceRestorer, frame: np.ndarray, shown: np.ndarray | None) -> np.ndarray:
+    """By how many codes the device's picture differs."""
+    expected = restorer.display(frame, EXPOSURE_S, TONE, shown)
+    assert expected.std() > 20
+    return np.abs(device.display(frame, EXPOSURE_S, TONE, shown).astype(int) - expected)
+
+
+def agree(codes: np.ndarray, most: int = 1) -> bool:
+    return bool(np.mean(codes > 0) < 0.05 and np.mean(codes > most) < 1e-3)
+
+
+@pytest.mark.medium
+@pytest.mark.parametrize("tier", TIERS)
+def test_a_device_shows_what_the_cpu_shows(
+    restorers: dict[Tier, Restorer],
+    devices: dict[Tier, DeviceRestorer],
+    frame: np.ndarray,
+    picture: np.ndarray,
+    tier: Tier,
+) -> None:
+    for shown in (picture, np.zeros_like(picture), None):
+        assert agree(off(restorers[tier], devices[tier], frame, shown), 2 if tier is Tier.accurate else 1)
+
+
+def with_tables(kind: jnp.dtype) -> Broken:
+    """Return what rounds the eigenvectors to numbers of 16 bits."""
+
+    def broken(device: DeviceRestorer) -> DeviceRestorer:
+        vectors = device.stages.tiles.vectors
+        rounded = (part.astype(kind).astype(jnp.float32) for part in (vectors.real, vectors.imag))
+        return replace(device, stages=eqx.tree_at(lambda s: s.tiles.vectors, device.stages, jax.lax.complex(*rounded)))
+
+    return broken
+
+
+def changed(where: Callable, to: Callable) -> Broken:
+    return lambda device: replace(device, stages=eqx.tree_at(where, device.stages, replace_fn=to))
+
+
+BROKEN: dict[str, Broken] = {
+    "bfloat16": with_tables(jnp.dtype(jnp.bfloat16)),
+    "matched": changed(lambda s: s.tiles.matched, lambda table: 1.05 * table),
+    "another tile's tables": changed(lambda s: s.tiles.vectors, lambda table: table[::-1]),
+    "wire": changed(lambda s: s.front.wire, lambda wire: wire[::-1]),
+    "mask": changed(lambda s: s.front.white, lambda white: 0.5 * white),
+    "bands": changed(lambda s: s.bands.variance, lambda variance: 2 * variance),
+    "kernels": changed(lambda s: s.learned.kernels, lambda kernels: kernels[..., ::-1]),
+    "network": changed(lambda s: s.learned.weights["out"], lambda kernel: -kernel),
+    "maps": changed(lambda s: s.resampling.step, lambda step: step[..., ::-1]),
+}
+
+
+@pytest.mark.medium
+@pytest.mark.parametrize("name", BROKEN)
+def test_the_comparison_sees_a_wrong_table(
+    restorers: dict[Tier, Restorer], devices: dict[Tier, DeviceRestorer], frame: np.ndarray, name: str
+) -> None:
+    broken = BROKEN[name](devices[Tier.accurate])
+    assert not agree(off(restorers[Tier.accurate], broken, frame, None), 2)
+
+
+@pytest.mark.medium
+def test_the_comparison_sees_another_panel_picture(
+    restorers: dict[Tier, Restorer], devices: dict[Tier, DeviceRestorer], frame: np.ndarray, picture: np.ndarray
+) -> None:
+    expected = restorers[Tier.fast].display(frame, EXPOSURE_S, TONE, picture)
+    shown = devices[Tier.fast].display(frame, EXPOSURE_S, TONE, np.ascontiguousarray(picture[::-1]))
+    assert not agree(np.abs(shown.astype(int) - expected))
+
+
+@pytest.mark.medium
+def test_what_the_cpu_refuses_is_refused(devices: dict[Tier, DeviceRestorer], frame: np.ndarray) -> None:
+    panel = devices[Tier.fast].restorer.rig.panel
+    white = np.full((panel.rows, panel.columns, 3), 255, np.uint8)
+    with pytest.raises(RestorationError, match="as bright as the panel's own light"):
+        devices[Tier.fast].display(np.full_like(frame, 80), 1.0, TONE, white)
+    with pytest.raises(RestorationError, match="96 x 64 samples"):
+        devices[Tier.fast].display(frame[:-2], EXPOSURE_S, TONE)
+    with pytest.raises(RestorationError, match="positive exposure"):
+        devices[Tier.fast].display(frame, 0.0, TONE)
+
+
+def test_what_a_device_cannot_do_is_refused(restorers: dict[Tier, Restorer]) -> None:
+    restorer = restorers[Tier.fast]
+    with pytest.raises(RestorationError, match="a restorer that deblurs"):
+        DeviceRestorer.of(replace(restorer, sharpener=None, tier=Tier.preview))
+    odd = restorer.rig.camera.model_copy(update={"rows": 63})
+    with pytest.raises(RestorationError, match="whole 2 x 2 cells"):
+        DeviceRestorer.of(replace(restorer, rig=restorer.rig.model_copy(update={"camera": odd})))
