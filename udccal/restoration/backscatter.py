@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import final
 
@@ -101,6 +101,10 @@ class PanelLight:
         """
         sums = kept(keep, PanelSums, (term, rig, block), lambda: _panel_sums(term, rig, block))
         return cls(sums, cfa_named(rig.camera.cfa), rig.panel.rows, rig.panel.columns, block)
+
+    def of_rows(self, rows: slice) -> PanelLight:
+        """Return the same for some rows of the mosaic, the first of which begins a cell of the colour pattern."""
+        return replace(self, sums=replace(self.sums, down=self.sums.down[rows]))
 
     def rate(self, picture: UInt8[np.ndarray, "panel_rows panel_columns 3"]) -> Float32[np.ndarray, "rows columns"]:
         """Return the backscatter in e-/s at every sample of the mosaic while the panel shows ``picture``.
