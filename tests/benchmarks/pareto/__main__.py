@@ -19,7 +19,7 @@ from pathlib import Path
 from tests.benchmarks.pareto.choices import traded, traded_table
 from tests.benchmarks.pareto.drawing import draw
 from tests.benchmarks.pareto.groups import Group
-from tests.benchmarks.pareto.measuring import measured, seen_by
+from tests.benchmarks.pareto.measuring import kept_of, measured, seen_by
 from tests.benchmarks.pareto.runs import write_csv
 from tests.benchmarks.pareto.tables import Measured, compact_table, full_table
 from tests.benchmarks.readme_tables import has_table, put_table
@@ -53,7 +53,7 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as folder:
         found = measured(name, profile, seen, options.out, Path(folder), say)
         some = [sight for sight in seen.usual if sight.case.group is Group.nineteen][::_CHOICES_EVERY]
-        choices = traded_table(traded(name, some, found.runs, Path(folder)))
+        choices = traded_table(traded(name, some, found.runs, kept_of(Path(folder))))
         say("choices are traded")
     _write(found, choices, options)
     return 0 if all(row.ok for row in found.rows) else 1

@@ -63,7 +63,7 @@ def draw(runs: Sequence[Run], clear: Iterable[Clear], title: str, path: Path) ->
     axes.set_title(title, fontsize=11)
     axes.grid(which="major", color="#dddddd", linewidth=0.6)
     axes.margins(x=0.12, y=0.08)
-    axes.legend(loc="lower right", framealpha=1.0)
+    axes.legend(title="group (pictures)", loc="lower right", framealpha=1.0)
     figure.savefig(path, metadata={"Date": None})
 
 
@@ -75,7 +75,8 @@ def _curve(axes: Axes, runs: Sequence[Run], group: Group) -> None:
     )
     colour, marker = _STYLE[group]
     cases = len(own[Tier.preview])
-    axes.plot(ms, dB, color=colour, marker=marker, markersize=6, linewidth=1.8, label=f"{group} ({cases} pictures)")
+    axes.plot(ms, dB, color=colour, marker=marker, markersize=6, linewidth=1.8, label=f"{group} ({cases})")
     if group is Group.nineteen:
         for tier, x, y in zip(Tier, ms, dB, strict=True):
-            axes.annotate(tier, (x, y), (0, 9), textcoords="offset points", ha="center", fontsize=10, color=colour)
+            aside = "right" if tier is Tier.preview else "center"
+            axes.annotate(tier, (x, y), (0, 9), textcoords="offset points", ha=aside, fontsize=10, color=colour)

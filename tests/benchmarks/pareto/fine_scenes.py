@@ -1,8 +1,8 @@
 """Scenes with detail to the pixel: pictures that are hung so large that a texel is about one pixel of the sensor.
 
 A photograph of the Kodak suite that fills the view has a texel of some two to four pixels: the finest detail that a
-sensor can see is not in it. Several of them side by side have it, and so have panoramas hung flat. The panoramas are
-the two that no training of the network has seen.
+sensor can see is not in it. Several of them side by side have it, and so have panoramas hung flat, in bands. The
+panoramas are the two that no training of the network has seen.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ import numpy as np
 from jaxtyping import Float
 
 from tests.benchmarks.scenes import DISTANCE_MM, Scene, linear_panorama, linear_photograph
-from udccal.restoration.tone import display_exposure
 from udccal.simulation.truth import RigTruth
 
 _MOSAICS = 3
@@ -39,8 +38,8 @@ def fine_scenes(folder: Path, truth: RigTruth, every: int = 1) -> list[Scene]:
         for index in range(_MOSAICS)
     ]
     for name in _PANORAMAS:
-        equirect = linear_panorama(folder / "environments" / name)
-        scenes.append(Scene(f"{Path(name).stem}, whole", equirect * display_exposure(equirect)))
+        bands = bands_of(linear_panorama(folder / "environments" / name), camera.rows, camera.columns)
+        scenes.append(Scene(f"{Path(name).stem} bands", bands))
     return [_hung(scene, truth) for scene in scenes[::every]]
 
 
@@ -60,6 +59,22 @@ def mosaic_of(photographs: list[Radiance], index: int, rows: int, columns: int) 
     across, down = -(-columns // width), -(-rows // height)
     chosen = [inner[order[place % len(order)]][:height, :width] for place in range(across * down)]
     return np.concatenate([np.concatenate(chosen[row * across : (row + 1) * across], axis=1) for row in range(down)])
+
+
+def bands_of(equirect: Radiance, rows: int, columns: int) -> Radiance:
+    """The middle of a panorama, hung in bands below each other, each turned to another side.
+
+    Towards its poles a panorama is stretched, and has no fine detail.
+
+    Args:
+        equirect: the panorama.
+        rows: that are covered at least. columns: that are covered at least.
+    """
+    pole = equirect.shape[0] // 8
+    band = equirect[pole:-pole]
+    down, across = -(-rows // len(band)), -(-columns // band.shape[1])
+    turned = [np.roll(band, index * band.shape[1] // down, axis=1) for index in range(down)]
+    return np.concatenate([np.concatenate([each] * across, axis=1) for each in turned])
 
 
 def _lying(photograph: Radiance) -> Radiance:

@@ -72,7 +72,12 @@ def seen_by(truth: RigTruth, profile: Profile, data: Path, every: int) -> Seen:
     return Seen(bench, cases, sights, clear)
 
 
-def measured(name: str, profile: Profile, seen: Seen, out: Path, keep: Path, say: Callable[[str], None]) -> Measured:
+def kept_of(folder: Path) -> Path:
+    """Where, after ``measured``, all is kept that any tier's defaults need."""
+    return folder / Tier.accurate
+
+
+def measured(name: str, profile: Profile, seen: Seen, out: Path, folder: Path, say: Callable[[str], None]) -> Measured:
     """Measure everything but what choices trade.
 
     Args:
@@ -80,15 +85,16 @@ def measured(name: str, profile: Profile, seen: Seen, out: Path, keep: Path, say
         profile: the same, read.
         seen: what the camera took.
         out: folder for the sheets of pictures.
-        keep: folder of prepared arrays, empty at first.
+        folder: for a folder of prepared arrays per tier, empty at first: each tier prepares all that it needs.
         say: tells a person how far it is.
     """
     runs, ready_s = list[Run](), dict[Tier, float]()
     for tier in Tier:
-        setup = Setup(name, tier, PlanOptions(), keep)
+        setup = Setup(name, tier, PlanOptions(), folder / tier)
         own, ready_s[tier] = _runs_of(setup, seen, out / f"{tier}.png")
         runs += own
         say(f"{tier} has restored them")
+    keep = kept_of(folder)
     starts = starts_of(name, seen.usual[0].taken)
     say("programs have started")
     plans = plans_of(profile, seen.usual, keep)
@@ -113,10 +119,15 @@ def measured(name: str, profile: Profile, seen: Seen, out: Path, keep: Path, say
 
 
 def _runs_of(setup: Setup, seen: Seen, sheet: Path) -> tuple[list[Run], float]:
-    """One tier on every picture, and the seconds to prepare it; also writes its sheet of pictures."""
-    found, shown = dict[tuple[str, str], Run](), list[Shown]()
+    """One tier on every picture, and the seconds to prepare it; also writes its sheet of pictures.
+
+    One process prepares, another restores: what preparation takes is not part of a frame's memory.
+    """
+    found, shown, first = dict[tuple[str, str], Run](), list[Shown](), seen.usual[0].taken
     with TierProcess(setup) as process:
-        ready_s = process.ready_s(seen.usual[0].taken)
+        ready_s = process.ready_s(first)
+    with TierProcess(setup) as process:
+        process.ready_s(first)
         for key, sight in seen.sights.items():
             restored = process.restored(sight.taken)
             picture = sight.after(restored.linear)
@@ -124,7 +135,7 @@ def _runs_of(setup: Setup, seen: Seen, sheet: Path) -> tuple[list[Run], float]:
             if is_shown(sight):
                 shot, grey = sight.case.shot, sight.case.conditions.grey
                 before = seen.bench.before(shot, sight.room_light, grey)
-                title = f"{shot.name}, {sight.case.conditions.name}: before | {setup.tier} | truth"
-                shown.append(shown_part(title, before, picture, sight.truth))
+                title = ", ".join(name for name in key if name)
+                shown.append(shown_part(f"{title}: before | {setup.tier} | truth", before, picture, sight.truth))
     write_sheet(shown, sheet)
     return [replace(found[case.key], group=case.group) for case in seen.cases], ready_s

@@ -37,7 +37,7 @@ def is_shown(sight: Sight) -> bool:
     if case.group is Group.lamps:
         return True
     if case.conditions == USUAL:
-        return case.shot.name in ("kodim05", "kodim23", "lobby view", "mosaic 1", "mosaic 3", "park, whole")
+        return case.shot.name in ("kodim05", "kodim23", "lobby view", "mosaic 1", "mosaic 3", "park bands")
     return case.conditions.name in ("light / 64", "white, known", "faces, unknown")
 
 

@@ -10,7 +10,7 @@ import pytest
 from jaxtyping import Float
 
 from tests.benchmarks.pareto.drawing import draw
-from tests.benchmarks.pareto.fine_scenes import mosaic_of
+from tests.benchmarks.pareto.fine_scenes import bands_of, mosaic_of
 from tests.benchmarks.pareto.groups import Group, cases_of
 from tests.benchmarks.pareto.made_runs import DB, good_runs, made
 from tests.benchmarks.pareto.runs import Clear, flip, mean_dB, median_ms, of_group, write_csv
@@ -58,6 +58,16 @@ def test_a_mosaic_covers_the_sensor_without_the_edges_of_the_scans() -> None:
     assert set(np.unique(mosaic)) == {0.0, 1.0, 2.0, 3.0}
     assert not np.array_equal(mosaic, mosaic_of(photographs, 1, 60, 100))
     assert np.array_equal(mosaic, mosaic_of(photographs, 0, 60, 100))
+
+
+def test_bands_of_a_panorama_cover_the_sensor_without_its_poles() -> None:
+    equirect = np.broadcast_to(np.arange(16.0)[:, None, None], (16, 32, 3)).copy()
+    equirect[:, 0] = 99.0
+    bands = bands_of(equirect, 20, 40)
+    assert bands.shape == (24, 64, 3)
+    assert bands[:, 1, 0].tolist() == [*range(2, 14)] * 2
+    assert np.argwhere(bands[0, :, 0] == 99.0).ravel().tolist() == [0, 32]
+    assert np.argwhere(bands[12, :, 0] == 99.0).ravel().tolist() == [16, 48]
 
 
 def test_flip_tells_a_spoilt_picture_from_a_good_one() -> None:

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -25,7 +26,7 @@ SCENES = sorted({run.scene for run in RUNS})
 BEST = dict(zip(BUDGETS_MS, (Tier.fast, Tier.balanced, Tier.balanced, Tier.accurate), strict=True))
 
 
-def plans(chosen: dict[float | None, Tier | None] = BEST, dB: float = 0.0, slower: float = 1.0) -> Plans:  # type: ignore[assignment]
+def plans(chosen: Mapping[float | None, Tier | None] = BEST, dB: float = 0.0, slower: float = 1.0) -> Plans:
     """What a planner says that errs by so many dB and by a factor of time."""
     return Plans(
         tuple(Choice(scene, budget, tier) for scene in SCENES for budget, tier in chosen.items()),
