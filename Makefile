@@ -119,8 +119,9 @@ other-days: $(STAMP)
 rigs: $(STAMP)
 	$(BIN)/python -m tests.benchmarks.drawn_rigs --out $(RIGS_OUT) --rigs $(RIGS)
 
-# Every tier of restoration on the shared scenes. Writes pareto.json, pareto.csv and the table of docs/restoration.md;
-# non-zero exit where a tier misses a limit.
+# Every tier of restoration on scenes of five kinds, and the planner. Writes pareto.json, pareto.csv, pareto.svg, a sheet
+# of pictures per tier, and the tables of docs/restoration.md and README.md; non-zero exit where a number misses its
+# limit. Nothing else should run meanwhile.
 pareto: $(STAMP)
 	$(BIN)/python -m tests.benchmarks.pareto --out $(PARETO_OUT)
 
