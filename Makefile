@@ -22,7 +22,7 @@ ROBUST ?=
 PEERS ?=
 USB ?=
 
-.PHONY: install demo test test-medium test-slow test-usb fuzz load lint types contracts check accuracy tables efficiency coverage extremes pareto network budget drift other-days rigs live robust peers growth docs clean
+.PHONY: install demo test test-medium test-slow test-usb fuzz load lint types contracts check accuracy tables efficiency coverage extremes pareto device network budget drift other-days rigs live robust peers growth docs clean
 
 install: $(STAMP)
 
@@ -119,10 +119,16 @@ other-days: $(STAMP)
 rigs: $(STAMP)
 	$(BIN)/python -m tests.benchmarks.drawn_rigs --out $(RIGS_OUT) --rigs $(RIGS)
 
-# Every tier of restoration on the shared scenes. Writes pareto.json, pareto.csv and the table of docs/restoration.md;
-# non-zero exit where a tier misses a limit.
+# Every tier of restoration on scenes of five kinds, and the planner. Writes pareto.json, pareto.csv, pareto.svg, a sheet
+# of pictures per tier, and the tables of docs/restoration.md and README.md; non-zero exit where a number misses its
+# limit. Nothing else should run meanwhile.
 pareto: $(STAMP)
 	$(BIN)/python -m tests.benchmarks.pareto --out $(PARETO_OUT)
+
+# The tiers that deblur on a GPU beside the CPU: time, and how far pictures differ. Writes the table of
+# docs/restoration.md; where JAX finds no GPU it says so.
+device: $(STAMP)
+	$(BIN)/python -m tests.benchmarks.device
 
 # Train the network of the tier accurate for NETWORK_MINUTES; writes its weights.
 network: $(STAMP)

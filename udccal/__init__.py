@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from udccal.profiles.store import load_profile as load_profile
     from udccal.profiles.store import save_profile as save_profile
     from udccal.restoration.deblur import deblur as deblur
+    from udccal.restoration.device.restorer import DeviceRestorer as DeviceRestorer
     from udccal.restoration.one_frame import restore as restore
     from udccal.restoration.runtime import Restorer as Restorer
     from udccal.result import FitResult as FitResult
@@ -50,6 +51,7 @@ __version__ = "0.1.0"
 
 _HOMES = {
     "Calibration": "udccal.calibration",
+    "DeviceRestorer": "udccal.restoration.device.restorer",
     "FitResult": "udccal.result",
     "FitStatus": "udccal.result",
     "Profile": "udccal.profiles.profile",

@@ -34,7 +34,7 @@ from udccal.restoration.demosaic import demosaic
 from udccal.restoration.kernel_grid import KernelGrid, interpolated_kernels
 from udccal.restoration.linear import variance_e2
 from udccal.restoration.metrics import encode_srgb, least_squares_gain, psnr
-from udccal.restoration.mosaic_filter import FilterTables, Pattern, filter_tables, filtered
+from udccal.restoration.mosaic_filter import FilterTables, Pattern, filter_tables, filtered_and_joined
 from udccal.restoration.plan import PlanOptions, kernel_grid
 from udccal.restoration.runtime import Restorer
 from udccal.restoration.shrink import BandNoise, measured_noise, shrunk
@@ -104,10 +104,11 @@ class Filter:
             for site in self.pattern.sites:
                 channels[site.samples] = site.channel
             tiles = np.take_along_axis(tiles, channels[None, None], axis=1)[:, 0]
-        pictures, strengths = filtered(tiles, noise_e, self.tables, self.layout, self.pattern, _WORKERS)
+        given = self.tables, self.layout, self.pattern, _WORKERS
+        picture, strengths = filtered_and_joined(tiles, noise_e, *given)
         local = cv2.blur(variance.mean(axis=2), (16, 16))
         bands = self.noise.of_tiles(strengths)
-        return shrunk(self.layout.join(pictures, _WORKERS), noise_e, local, bands, self.layout, _WORKERS)
+        return shrunk(picture, noise_e, local, bands, self.layout, _WORKERS)
 
     def _cut(self, planes: Rgb) -> Float32[np.ndarray, "tiles 3 tile_rows tile_columns"]:
         return np.stack([self.layout.cut(np.ascontiguousarray(plane)) for plane in cv2.split(planes)], axis=1)

@@ -57,18 +57,28 @@ class Frame:
 
 
 def main() -> int:
-    """Measure; the exit status is 0 also where there is no GPU to measure on."""
+    """Measure as the command line says."""
     options = _options()
+    return measure(options.device, options.rig, options.rig, options.frames, options.every)
+
+
+def measure(backend: str, rig: str, profile_name: str, frames_timed: int = 20, every: int = 6) -> int:
+    """Measure on a backend of JAX; the exit status is 0 also where there is no device to measure on.
+
+    Args:
+        backend: gpu or cpu. rig: a rig's name. profile_name: name or folder of its profile.
+        frames_timed: warm frames that are timed. every: use each n-th scene only.
+    """
     try:
-        device = jax.devices(options.device)[0]
+        device = jax.devices(backend)[0]
     except RuntimeError:
-        print(f"JAX finds no device '{options.device}' here; --device cpu runs on its CPU backend.")
+        print(f"JAX finds no device '{backend}' here, so nothing is measured.")
         return 0
     data = Path(__file__).resolve().parents[3] / "shared" / "data"
     if not data.is_dir():
         print("The shared photographs (../shared/data) are absent: there is nothing to restore.", file=sys.stderr)
         return 1
-    truth, profile = draw_truth(load_rig(options.rig), 0), load_profile(options.rig)
+    truth, profile = draw_truth(load_rig(rig), 0), load_profile(profile_name)
     keep = prepared_folder()
     restorers = [Restorer.from_profile(profile, tier, keep=keep) for tier in _TIERS]
     bench = PictureBench(truth, build_blur(truth, *_BLUR), restorers[0])
@@ -79,17 +89,17 @@ def main() -> int:
             Tone(1 / (_LIGHT * WHITE_E_PER_S)),
             bench.pictures[shot.picture],
         )
-        for shot in bench.shots(shared_scenes(data, options.every))
+        for shot in bench.shots(shared_scenes(data, every))
     ]
     lines = [
         "| tier | tables | frame ms | frame CPU ms | first frame s | most codes off | RMS codes off | tables MB |",
         "| --- | --- | ---: | ---: | ---: | ---: | ---: | ---: |",
     ]
     for restorer in restorers:
-        lines += _measured(restorer, device, frames, options.frames)
+        lines += _measured(restorer, device, frames, frames_timed)
     print("\n".join(lines))
     if device.platform == "gpu":
-        put_table(_PAGE, f"device {options.rig}", f"{device.device_kind}:\n\n" + "\n".join(lines))
+        put_table(_PAGE, f"device {rig}", f"{device.device_kind}:\n\n" + "\n".join(lines))
     return 0
 
 
@@ -106,9 +116,13 @@ def _measured(restorer: Restorer, device: jax.Device, frames: list[Frame], count
         saved = 0 if kind == "float32" else (tables.matched.nbytes + tables.vectors.nbytes) // 2
         lines.append(
             f"| {restorer.tier} | {kind} | {wall:.1f} | {cpu:.1f} | {first:.1f} | {off.max()} | "
-            f"{np.sqrt(np.mean(off**2)):.3f} | {(found.table_bytes - saved) / 1e6:.1f} |"
+            f"{np.sqrt(np.mean(off**2)):.3f} | {(_table_bytes(found) - saved) / 1e6:.1f} |"
         )
     return lines
+
+
+def _table_bytes(found: DeviceRestorer) -> int:
+    return sum(table.nbytes for table in jax.tree_util.tree_leaves(found.stages.tiles))
 
 
 def _timed(

@@ -25,6 +25,11 @@ def between(text: str, marker: str, content: str) -> str:
     return f"{text[: start + len(first)]}\n{content.strip()}\n{text[end:]}"
 
 
+def has_table(page: Path, marker: str) -> bool:
+    """Whether a page has a place for a table."""
+    return f"<!-- {marker} -->" in page.read_text(encoding="utf-8")
+
+
 def put_table(page: Path, marker: str, table: str, commits: Iterable[str] | None = None) -> None:
     """Put a table into a page between its markers, with the commit that it was measured at (``stamped``)."""
     text = between(page.read_text(encoding="utf-8"), marker, stamped(table, commits))

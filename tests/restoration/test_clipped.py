@@ -60,7 +60,7 @@ def solved(whole: np.ndarray, clipped: np.ndarray) -> tuple[np.ndarray, np.ndarr
     for tile, (top, left) in zip(filled, ((t, a) for t in layout.tops for a in layout.lefts), strict=True):
         down, across = slice(max(top, 0), top + layout.rows), slice(max(left, 0), left + layout.columns)
         back[down, across] = tile[down.start - top :, across.start - left :][: SIZE - down.start, : SIZE - across.start]
-    return back, layout.join(before, 1), layout.join(after, 1)
+    return back, layout.join(before), layout.join(after)
 
 
 def rms(values: np.ndarray) -> float:

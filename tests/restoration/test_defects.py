@@ -62,4 +62,5 @@ def test_eight_bits_overlook_no_defect(name: str, sigma_d_e: float, toy_noise: N
         wrong = (own > high + allowed) | (own < low - allowed)
         expected[site.samples] = np.where(wrong, np.median(stack, axis=0), plane)
     assert 5 < np.count_nonzero(expected != frame) < 0.05 * frame.size
-    np.testing.assert_array_equal(without_defects(frame, noise, EXPOSURE_S, name), expected)
+    for workers in (1, 2, 5):
+        np.testing.assert_array_equal(without_defects(frame, noise, EXPOSURE_S, name, workers), expected)

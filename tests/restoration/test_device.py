@@ -27,6 +27,7 @@ from udccal.rig import RigDescription
 from udccal.tiers import Tier
 
 TONE = Tone(EXPOSURE_S / 6000.0)
+FRAME_ROWS = 200
 TIERS = (Tier.fast, Tier.balanced, Tier.accurate)
 Broken = Callable[[DeviceRestorer], DeviceRestorer]
 
@@ -54,13 +55,17 @@ def panel_light(rig: RigDescription) -> PanelLight:
 
 @pytest.fixture(scope="module")
 def restorers(small_rig: RigDescription, toy_noise: Noise, toy_grid: KernelGrid) -> dict[Tier, Restorer]:
-    """Every stage has something to do."""
-    panel, geometry = panel_light(small_rig), nominal_geometry(small_rig)
-    white = panel.rate(np.full((small_rig.panel.rows, small_rig.panel.columns, 3), 255, np.uint8))
-    mask = PanelMask(white, panel.cfa, 0.02)
-    return {
-        tier: replace(made(tier, small_rig, toy_noise, geometry, toy_grid), mask=mask, panel=panel) for tier in TIERS
-    }
+    """Every stage has something to do, and the view and its tiles need the lower rows of a frame only."""
+    rig = small_rig.model_copy(update={"camera": small_rig.camera.model_copy(update={"rows": FRAME_ROWS})})
+    panel, geometry, found = panel_light(rig), nominal_geometry(rig), {}
+    white = panel.rate(np.full((rig.panel.rows, rig.panel.columns, 3), 255, np.uint8))
+    for tier in TIERS:
+        whole = made(tier, rig, toy_noise, geometry, toy_grid)
+        rows = whole.rows
+        assert rows.start > 0
+        mask, wire = PanelMask(white[rows], panel.cfa, 0.02), whole.wire[rows]
+        found[tier] = replace(whole, wire=wire, mask=mask, panel=panel.of_rows(rows))
+    return found
 
 
 @pytest.fixture(scope="module")
@@ -84,7 +89,7 @@ def frame(restorers: dict[Tier, Restorer], toy_grid: KernelGrid, toy_scene: np.n
     wire = np.ones((ROWS, COLUMNS), np.float32)
     raw = exposed(replace(restorers[Tier.fast], rig=wide, wire=wire), toy_grid, scene + 500.0)[10:74, 10:106].copy()
     raw[20, 31], raw[41, 60] = 3900, 0
-    return raw
+    return np.tile(raw, (4, 1))[:FRAME_ROWS]
 
 
 def off(restorer: Restorer, device: DeviceRestorer, frame: np.ndarray, shown: np.ndarray | None) -> np.ndarray:
@@ -132,10 +137,10 @@ BROKEN: dict[str, Broken] = {
     "another tile's tables": changed(lambda s: s.tiles.vectors, lambda table: table[::-1]),
     "wire": changed(lambda s: s.front.wire, lambda wire: wire[::-1]),
     "mask": changed(lambda s: s.front.white, lambda white: 0.5 * white),
-    "bands": changed(lambda s: s.bands.variance, lambda variance: 2 * variance),
-    "kernels": changed(lambda s: s.learned.kernels, lambda kernels: kernels[..., ::-1]),
-    "network": changed(lambda s: s.learned.weights["out"], lambda kernel: -kernel),
-    "maps": changed(lambda s: s.resampling.step, lambda step: step[..., ::-1]),
+    "bands": changed(lambda s: s.bands[0], lambda variance: 2 * variance),
+    "kernels": changed(lambda s: s.learned[1], lambda kernels: kernels[..., ::-1]),
+    "network": changed(lambda s: s.learned[0]["out"], lambda kernel: -kernel),
+    "maps": changed(lambda s: s.maps[1], lambda step: step[..., ::-1]),
 }
 
 
@@ -163,7 +168,7 @@ def test_what_the_cpu_refuses_is_refused(devices: dict[Tier, DeviceRestorer], fr
     white = np.full((panel.rows, panel.columns, 3), 255, np.uint8)
     with pytest.raises(RestorationError, match="as bright as the panel's own light"):
         devices[Tier.fast].display(np.full_like(frame, 80), 1.0, TONE, white)
-    with pytest.raises(RestorationError, match="96 x 64 samples"):
+    with pytest.raises(RestorationError, match="96 x 200 samples"):
         devices[Tier.fast].display(frame[:-2], EXPOSURE_S, TONE)
     with pytest.raises(RestorationError, match="positive exposure"):
         devices[Tier.fast].display(frame, 0.0, TONE)
@@ -173,6 +178,6 @@ def test_what_a_device_cannot_do_is_refused(restorers: dict[Tier, Restorer]) -> 
     restorer = restorers[Tier.fast]
     with pytest.raises(RestorationError, match="a restorer that deblurs"):
         DeviceRestorer.of(replace(restorer, sharpener=None, tier=Tier.preview))
-    odd = restorer.rig.camera.model_copy(update={"rows": 63})
+    odd = restorer.rig.camera.model_copy(update={"rows": 199})
     with pytest.raises(RestorationError, match="whole 2 x 2 cells"):
         DeviceRestorer.of(replace(restorer, rig=restorer.rig.model_copy(update={"camera": odd})))

@@ -19,7 +19,7 @@ def test_what_is_cut_and_joined_is_the_frame(
     cfa = PATTERNS[name]
     layout = layout_for(*frame, (cfa.rows, cfa.columns), size, rows)
     mosaic = np.random.default_rng(0).random(frame, dtype=np.float32)
-    joined = layout.join(layout.cut(mosaic)[..., None] * np.array([1, 2, 3], np.float32), 2)
+    joined = layout.join(layout.cut(mosaic[layout.reach])[..., None] * np.array([1, 2, 3], np.float32))
     covered = mosaic[max(rows[0], 0) : rows[1], :, None]
     np.testing.assert_allclose(joined, covered * np.array([1, 2, 3]), atol=2e-6)
 
@@ -52,6 +52,6 @@ def test_tiles_whose_values_differ_are_blended_without_a_step() -> None:
     layout = layout_for(200, 600, (2, 2), (128, 128), (0, 200))
     values = np.arange(layout.count, dtype=np.float32).repeat(layout.rows * layout.columns * 3)
     values = values.reshape(-1, layout.rows, layout.columns, 3)
-    joined = layout.join(values, 1)[..., 0]
+    joined = layout.join(values)[..., 0]
     steps = np.abs(np.diff(joined[:, layout.lefts[1] :], axis=1))
     assert steps.max() < 0.15

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import final
 
@@ -101,6 +101,10 @@ class PanelLight:
         """
         sums = kept(keep, PanelSums, (term, rig, block), lambda: _panel_sums(term, rig, block))
         return cls(sums, cfa_named(rig.camera.cfa), rig.panel.rows, rig.panel.columns, block)
+
+    def of_rows(self, rows: slice) -> PanelLight:
+        """Return the same for some rows of the mosaic, the first of which begins a cell of the colour pattern."""
+        return replace(self, sums=replace(self.sums, down=self.sums.down[rows]))
 
     def rate(self, picture: UInt8[np.ndarray, "panel_rows panel_columns 3"]) -> Float32[np.ndarray, "rows columns"]:
         """Return the backscatter in e-/s at every sample of the mosaic while the panel shows ``picture``.
@@ -202,10 +206,10 @@ def refuse_excess(
     """
     use = ~clipped[SPARSE]
     seen, expected = (float(np.sum(light[SPARSE], where=use, dtype=np.float64)) for light in (signal, panel_light))
-    refuse_excess_of(seen, expected, int(np.count_nonzero(use)))
+    refuse_excess_of(seen, expected, float(np.count_nonzero(use)))
 
 
-def refuse_excess_of(seen: float, expected: float, samples: int) -> None:
+def refuse_excess_of(seen: float, expected: float, samples: float) -> None:
     """Refuse a frame as ``refuse_excess`` does, by the sums of its light and of the panel's over some samples."""
     if expected > _MORE * max(seen, 0.0) + samples * _NEGLIGIBLE_E:
         raise RestorationError(

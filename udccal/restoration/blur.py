@@ -27,7 +27,7 @@ def blurred(
     down, across = (size // 2 for size in kernels.shape[2:])
     wide = np.pad(picture, ((down, down), (across, across), (0, 0)), mode="symmetric")
     result = np.zeros((wide.shape[0] + 2 * down, wide.shape[1] + 2 * across, 3), dtype=np.float32)
-    weights = [kernel_weights(*each) for each in zip(layout.strips, layout.covered, (down, across), strict=True)]
+    weights = [_weights(*each) for each in zip(layout.strips, layout.covered, (down, across), strict=True)]
     for own, ((rows, row_weights), (columns, column_weights)) in zip(kernels, product(*weights), strict=True):
         part = wide[rows, columns] * np.outer(row_weights, column_weights)[..., None]
         reached = result[rows.start : rows.stop + 2 * down, columns.start : columns.stop + 2 * across]
@@ -36,7 +36,7 @@ def blurred(
     return result[2 * down : -2 * down or None, 2 * across : -2 * across or None]
 
 
-def kernel_weights(strips: list[Strip], count: int, reach: int) -> list[tuple[slice, Float32[np.ndarray, " samples"]]]:
+def _weights(strips: list[Strip], count: int, reach: int) -> list[tuple[slice, Float32[np.ndarray, " samples"]]]:
     """Return where each tile's kernel takes part along one axis of a picture with ``reach`` px more on both sides."""
     hats = linear_weights(np.array([strip.middle for strip in strips]), np.arange(-reach, count + reach))
     found = []

@@ -37,7 +37,7 @@ def clipped_tiles(
     """Return the tiles in which samples clip, and these samples.
 
     Args:
-        clipped: samples of the frame that say less than their light was.
+        clipped: samples of the frame's rows ``layout.reach`` that say less than their light was.
         layout: the tiles.
     """
     if np.count_nonzero(clipped) < LEAST:

@@ -22,7 +22,7 @@ from udccal.cfa import BLUE, GREEN, RED, Site
 from udccal.errors import RestorationError
 from udccal.restoration.blur import blurred
 from udccal.restoration.kernel_grid import KernelGrid
-from udccal.restoration.mosaic_filter import filter_tables, filtered
+from udccal.restoration.mosaic_filter import filter_tables, filtered_and_joined
 from udccal.restoration.network import refined, sharper
 from udccal.restoration.plan import PlanOptions
 from udccal.restoration.shrink import measured_noise, shrunk
@@ -93,8 +93,7 @@ def deblur(
     noise = np.sqrt(np.maximum(read + slope * tiles.mean(axis=(2, 3)), np.finfo(np.float32).tiny)).astype(np.float32)
     tables = filter_tables(grid, layout, THREE_COLOURS, workers)
     given = noise, tables, layout, THREE_COLOURS, workers
-    pictures, strengths = filtered(tiles, *given)
-    chosen = layout.join(pictures, workers)
+    chosen, strengths = filtered_and_joined(tiles, *given)
     if tier is Tier.fast:
         return chosen * np.float32(unit)
     bands = measured_noise(tables, layout, THREE_COLOURS, workers).of_tiles(strengths)
@@ -102,11 +101,11 @@ def deblur(
     balanced = shrunk(chosen, noise, local, bands, layout, workers)
     if tier is Tier.balanced:
         return balanced * np.float32(unit)
-    sharp = layout.join(filtered(tiles, *given, sharper(strengths))[0], workers)
+    sharp, _ = filtered_and_joined(tiles, *given, sharper(strengths))
     best = refined(balanced, chosen, sharp, noise, local, bands, layout, PlanOptions.network_views)
     # The samples have the last word: the filter of what they have more or less than the picture gives.
     rest = _cut(light - blurred(best, grid, layout), layout)
-    return (best + layout.join(filtered(rest, *given)[0], workers)) * np.float32(unit)
+    return (best + filtered_and_joined(rest, *given)[0]) * np.float32(unit)
 
 
 def _cut(

@@ -8,6 +8,7 @@ samples lie so far outside the range. So all samples are looked at in eight bits
 from __future__ import annotations
 
 import functools
+from concurrent.futures import ThreadPoolExecutor
 from typing import Final
 
 import cv2
@@ -27,7 +28,7 @@ Places = tuple[Int[np.ndarray, " places"], Int[np.ndarray, " places"]]
 
 
 def without_defects(
-    mosaic: UInt16[np.ndarray, "rows columns"], noise: Noise, exposure_s: float, cfa: str
+    mosaic: UInt16[np.ndarray, "rows columns"], noise: Noise, exposure_s: float, cfa: str, workers: int = 1
 ) -> UInt16[np.ndarray, "rows columns"]:
     """Replace hot and dead samples by the median of their 3 x 3 neighbourhood of the same colour.
 
@@ -36,13 +37,14 @@ def without_defects(
         noise: the noise term.
         exposure_s: exposure time of the frame.
         cfa: name of the colour pattern.
+        workers: threads.
 
     Returns:
         a frame of its own, or the mosaic itself where no sample is defective.
     """
     pattern, floor_e2 = cfa_named(cfa), scalar(noise.sigma_d_e) ** 2
     codes = _codes(dark_DN(noise, exposure_s), scalar(noise.K_DN_per_e), floor_e2, int(mosaic.max()))
-    places = _suspects(mosaic, pattern, *codes)
+    places = _suspects(mosaic, pattern, *codes, workers)
     if len(places[0]) == 0:
         return mosaic
     around = np.stack([mosaic[_mirrored(places, mosaic.shape, step, pattern)] for step in _NEIGHBOURS])
@@ -79,17 +81,38 @@ def _codes(dark: float, K_DN_per_e: float, floor_e2: float, most_DN: int) -> tup
 
 
 def _suspects(
-    mosaic: UInt16[np.ndarray, "rows columns"], pattern: Cfa, codes: UInt8[np.ndarray, "values"], apart: int
+    mosaic: UInt16[np.ndarray, "rows columns"],
+    pattern: Cfa,
+    codes: UInt8[np.ndarray, "values"],
+    apart: int,
+    workers: int,
 ) -> Places:
     """Return the samples that differ by ``apart`` codes or more from the range of their neighbours."""
+    rows = len(mosaic)
+    step = -(-rows // workers)
+
+    def within(first: int) -> Places:
+        """Look at some rows, and at those of their neighbours."""
+        begin, end = max(first - pattern.rows, 0), min(first + step + pattern.rows, rows)
+        y, x = np.nonzero(_outside(mosaic[begin:end], pattern, codes, apart)[first - begin : first - begin + step])
+        return y + first, x
+
+    with ThreadPoolExecutor(workers) as pool:
+        parts = list(pool.map(within, range(0, rows, step)))
+    return np.concatenate([y for y, _ in parts]), np.concatenate([x for _, x in parts])
+
+
+def _outside(
+    mosaic: UInt16[np.ndarray, "rows columns"], pattern: Cfa, codes: UInt8[np.ndarray, "values"], apart: int
+) -> UInt8[np.ndarray, "rows columns"]:
+    """Return where a sample lies outside the range of its neighbours, as a number above 0."""
     code = cv2.LUT(mosaic, codes)
     ring = np.zeros((2 * pattern.rows + 1, 2 * pattern.columns + 1), dtype=np.uint8)
     ring[:: pattern.rows, :: pattern.columns] = 1
     ring[pattern.rows, pattern.columns] = 0
     outside = cv2.subtract(code, cv2.dilate(code, ring))
     outside = cv2.max(outside, cv2.subtract(cv2.erode(code, ring), code))
-    y, x = np.nonzero(cv2.compare(outside, apart, cv2.CMP_GE))
-    return y, x
+    return np.asarray(cv2.compare(outside, apart, cv2.CMP_GE))
 
 
 def _is_defective(

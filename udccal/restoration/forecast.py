@@ -93,7 +93,7 @@ def expected_error(
     solved = sharpener.solved(light.signal_e, light.variance_e2, light.clipped)
     missed = _missed_by_preview(restorer, light.signal_e, exposure_s, panel_picture)
     white_e = 1 / display_exposure(solved.picture)
-    return _at_places(sharpener, solved, error, light.variance_e2, missed[sharpener.rows], white_e)
+    return _at_places(sharpener, solved, error, light.variance_e2, missed[sharpener.layout.inner], white_e)
 
 
 def _missed_by_preview(
@@ -114,7 +114,7 @@ def _at_places(
     sharpener: Sharpener,
     solved: Solved,
     error: FilterError,
-    variance_e2: Float32[np.ndarray, "sensor_rows columns"],
+    variance_e2: Float32[np.ndarray, "strip_rows columns"],
     missed: Float32[np.ndarray, "rows columns 3"],
     white_e: float,
 ) -> ExpectedError:
@@ -122,7 +122,7 @@ def _at_places(
     some = np.s_[::_SPARSE, ::_SPARSE]
     size = (_LOCAL_PX, _LOCAL_PX)
     light = np.maximum(solved.picture, np.float32(0))
-    brightness = _relative(cv2.blur(variance_e2, size)[sharpener.rows][some][..., None], tile)
+    brightness = _relative(cv2.blur(variance_e2, size)[sharpener.layout.inner][some][..., None], tile)
     contrast = _relative(cv2.blur(light, size)[some] ** 2, tile)
     unit = (solved.noise_e / np.float32(white_e)) ** 2
     strength = np.searchsorted(STRENGTHS, solved.strengths)

@@ -22,7 +22,7 @@ from udccal.restoration.backscatter import PanelMask
 from udccal.restoration.defects import without_defects
 from udccal.restoration.demosaic import demosaic
 from udccal.restoration.linear import to_electrons, variance_e2
-from udccal.restoration.mosaic_filter import FilterTables, filtered
+from udccal.restoration.mosaic_filter import FilterTables, filtered_and_joined
 from udccal.restoration.network import corrected, noise_planes
 from udccal.restoration.plan import PlanOptions
 from udccal.restoration.prepared import kept
@@ -68,13 +68,13 @@ class FrameSize:
     """What a frame's time depends on.
 
     Attributes:
-        sensor_px: pixels of the sensor.
+        strip_px: pixels of the rows that are worked on.
         covered_px: pixels of the rows that the view needs.
         view_px: pixels of the view.
         tile_px: pixels of all tiles; 0 where nothing is deblurred.
     """
 
-    sensor_px: int
+    strip_px: int
     covered_px: int
     view_px: int
     tile_px: int
@@ -83,16 +83,17 @@ class FrameSize:
     def of(cls, layout: TileLayout, view_px: int, blurred: bool) -> FrameSize:
         """Return the size of a frame in the tiles of ``layout``."""
         tile_px = layout.count * layout.rows * layout.columns
-        sensor_px = layout.frame_rows * layout.frame_columns
-        return cls(sensor_px, int(np.prod(layout.covered)), view_px, tile_px if blurred else 0)
+        strip_rows = layout.reach.stop - layout.reach.start if blurred else layout.frame_rows
+        strip_px = strip_rows * layout.frame_columns
+        return cls(strip_px, int(np.prod(layout.covered)), view_px, tile_px if blurred else 0)
 
     def ms(self, tier: Tier, times: PartTimes) -> float:
         """Return the milliseconds from a raw frame to a picture of 8 bits at a tier."""
         if tier is Tier.preview:
             return 1e3 * float(self.covered_px * times.preview)
-        seconds = self.sensor_px * times.linear + self.view_px * times.view
+        seconds = self.strip_px * times.linear + self.view_px * times.view
         if self.tile_px == 0:
-            return 1e3 * float(seconds + self.sensor_px * times.demosaicing)
+            return 1e3 * float(seconds + self.strip_px * times.demosaicing)
         seconds = seconds + self.tile_px * times.filter
         if tier in (Tier.balanced, Tier.accurate):
             seconds = seconds + self.covered_px * times.shrinkage
@@ -127,7 +128,7 @@ def _measured(options: PlanOptions) -> PartTimes:
     picture = demosaic(signal, cfa.name)
 
     def linear() -> None:
-        clean = to_electrons(without_defects(mosaic, noise, 1.0, cfa.name), noise, 1.0)
+        clean = to_electrons(without_defects(mosaic, noise, 1.0, cfa.name, workers), noise, 1.0)
         variance = variance_e2(clean, noise, 1.0)
         clean /= ones
         variance /= ones
@@ -142,7 +143,7 @@ def _measured(options: PlanOptions) -> PartTimes:
         (linear, mosaic.size),
         (lambda: demosaic(signal, cfa.name), mosaic.size),
         (
-            lambda: layout.join(filtered(layout.cut(signal), unit, tables, layout, cfa, workers)[0], workers),
+            lambda: filtered_and_joined(layout.cut(signal), unit, tables, layout, cfa, workers),
             layout.count * layout.rows * layout.columns,
         ),
         (lambda: shrunk(picture, unit, signal, bands, layout, workers), mosaic.size),

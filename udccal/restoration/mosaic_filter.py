@@ -17,9 +17,8 @@ Samples come in units of their noise. Then one table serves every brightness, ex
 
 from __future__ import annotations
 
-import functools
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Protocol, final, runtime_checkable
@@ -45,8 +44,10 @@ COMMON = (1 - COLOURFUL / 3) / COLOURFUL
 STRENGTHS = np.exp2(np.arange(-6.0, 17.0)).astype(np.float32)
 # Every n-th frequency along both axes decides the strength.
 SPARSE = 3
-# Every n-th strength is tried first.
-_STRIDE = 4
+# Every n-th strength is tried first, then those around the likeliest.
+_STRIDE, _HALF_STEPS = 4, (2, 1)
+# Every n-th row of cells gives a tile's level.
+LEVEL_ROWS = 4
 
 
 @runtime_checkable
@@ -129,10 +130,11 @@ def _tables_of(
             matrix[..., i, j] = folded * (COLOURS[own.channel, other.channel] / aliases)
             matrix[..., j, i] = np.conj(matrix[..., i, j])
     values, vectors = np.linalg.eigh(matrix)
+    # In the order in which they are read: a filter takes half as long again where frequencies do not lie side by side.
     return (
         _polyphase(fft.ifft2(density * np.conj(transfer)).real, pattern).astype(np.complex64),
-        np.conj(np.moveaxis(vectors, (3, 2), (0, 1))).astype(np.complex64),
-        np.moveaxis(np.maximum(values, 0.0), 2, 0).astype(np.float32),
+        np.conj(np.moveaxis(vectors, (3, 2), (0, 1))).astype(np.complex64, order="C"),
+        np.moveaxis(np.maximum(values, 0.0), 2, 0).astype(np.float32, order="C"),
     )
 
 
@@ -175,32 +177,74 @@ def filtered(
         pictures in e-, and the strength of the prior that each tile chose, in units of its noise.
     """
     pictures = np.empty((len(tiles), layout.rows, layout.columns, 3), dtype=np.float32)
-    chosen = np.empty(len(tiles), dtype=np.float32) if strengths is None else strengths
-    samples = float(np.sum(layout.taper**2)) / (pattern.rows * pattern.columns)
+    chosen = np.empty(len(tiles), dtype=np.float32)
 
     def one(index: int) -> None:
-        own = tables.at(index)
-        levels = _levels(tiles[index], pattern)
-        spectrum = _whitened(tiles[index], levels, noise_e[index], own, layout, pattern)
-        if strengths is None:
-            chosen[index] = _likeliest(spectrum, own.values, samples)
-        pictures[index] = _picture(spectrum, chosen[index], levels, noise_e[index], own, layout, pattern)
+        own = noise_e[index], tables.at(index), layout, pattern, None if strengths is None else strengths[index]
+        pictures[index], chosen[index] = _filtered_tile(tiles[index], *own)
 
     with ThreadPoolExecutor(workers) as pool:
         list(pool.map(one, range(len(tiles))))
     return pictures, chosen
 
 
+def filtered_and_joined(
+    tiles: Sequence[Float32[np.ndarray, "*colours rows columns"]] | Float32[np.ndarray, "tiles *colours rows columns"],
+    noise_e: Float32[np.ndarray, "tiles 3"],
+    tables: FilterTables,
+    layout: TileLayout,
+    pattern: Pattern,
+    workers: int,
+    strengths: Float32[np.ndarray, "tiles"] | None = None,
+) -> tuple[Float32[np.ndarray, "covered_rows frame_columns 3"], Float32[np.ndarray, " tiles"]]:
+    """Demosaic and deblur all tiles of a layout, and blend their pictures into one.
+
+    Every picture is blended while a core's cache has it. Arguments and strengths are those of ``filtered``.
+    """
+    joined, chosen = np.zeros((*layout.covered, 3), dtype=np.float32), np.empty(layout.count, dtype=np.float32)
+
+    def one(index: int) -> None:
+        own = noise_e[index], tables.at(index), layout, pattern, None if strengths is None else strengths[index]
+        picture, chosen[index] = _filtered_tile(tiles[index], *own)
+        layout.blend(picture, index, joined)
+
+    with ThreadPoolExecutor(workers) as pool:
+        for some in layout.apart:
+            list(pool.map(one, some))
+    return joined, chosen
+
+
+def _filtered_tile(
+    tile: Float32[np.ndarray, "*colours rows columns"],
+    noise_e: Float32[np.ndarray, "3"],
+    tables: FilterTables,
+    layout: TileLayout,
+    pattern: Pattern,
+    strength: np.float32 | None,
+) -> tuple[Float32[np.ndarray, "rows columns 3"], np.float32]:
+    levels = _levels(tile, pattern)
+    spectrum = _whitened(tile, levels, noise_e, tables, layout, pattern)
+    if strength is None:
+        samples = layout.power / (pattern.rows * pattern.columns)
+        strength = _likeliest(spectrum, tables.values, samples)
+    return _picture(spectrum, strength, levels, noise_e, tables, layout, pattern), strength
+
+
 def _levels(tile: Float32[np.ndarray, "*colours rows columns"], pattern: Pattern) -> Float32[np.ndarray, "3"]:
-    """Return the mean of each colour; a colour without sites is as bright as the mean of all."""
-    lines = [layer[row :: pattern.rows] for layer in _layers(tile) for row in range(pattern.rows)]
+    """Return about the mean of each colour; a colour without sites is as bright as the mean of all.
+
+    The prior's power at the lowest frequency is so high that the samples have the last word.
+    """
+    step = LEVEL_ROWS * pattern.rows
+    lines = [layer[row::step] for layer in _layers(tile) for row in range(pattern.rows)]
     by_line = [cv2.mean(line.reshape(len(line), -1, pattern.columns))[: pattern.columns] for line in lines]
-    of_site, channels = np.array(by_line, dtype=np.float32).ravel(), _channels(pattern)
+    of_site, channels = np.array(by_line, dtype=np.float32).ravel(), channels_of(pattern)
     own = [channels == colour for colour in range(len(COLOURS))]
     return np.array([of_site[mine].mean() if mine.any() else of_site.mean() for mine in own], dtype=np.float32)
 
 
-def _channels(pattern: Pattern) -> Int[np.ndarray, " sites"]:
+def channels_of(pattern: Pattern) -> Int[np.ndarray, " sites"]:
+    """Return the colour of each site."""
     return np.array([site.channel for site in pattern.sites])
 
 
@@ -219,7 +263,7 @@ def _whitened(
     """Return V Y: the tile's samples in units of their noise, less their colours' levels, along the eigenvectors."""
     cell = pattern.rows, pattern.columns
     parts = []
-    cells = (each[_channels(pattern)].reshape(-1, *cell) for each in (levels, 1 / noise_e))
+    cells = (each[channels_of(pattern)].reshape(-1, *cell) for each in (levels, 1 / noise_e))
     for layer, *of_cell in zip(_layers(tile), *cells, strict=True):
         flat = np.empty_like(layer)
         for row, (level, scale) in enumerate(zip(*of_cell, strict=True)):
@@ -229,7 +273,7 @@ def _whitened(
         flat *= layout.taper
         parts.append(plane_spectra(flat, cell))
     spectrum = parts[0] if len(parts) == 1 else np.concatenate(parts)
-    return _products(tables.vectors, spectrum, range(len(spectrum)))
+    return _products(tables.vectors, spectrum)
 
 
 def _picture(
@@ -244,27 +288,34 @@ def _picture(
     """Return the posterior's mean in e-."""
     weighted = np.conjugate(whitened)
     weighted *= 1 / (tables.values + 1 / strength)
-    by_site = np.conjugate(_products(tables.vectors.swapaxes(0, 1), weighted, range(len(weighted))), out=weighted)
-    cell, channels = (pattern.rows, pattern.columns), _channels(pattern)
-    own = [np.flatnonzero(channels == colour).tolist() for colour in range(len(COLOURS))]
-    spectra = [_products(tables.matched, by_site, sites) if sites else None for sites in own]
+    by_site = np.conjugate(_products(tables.vectors.swapaxes(0, 1), weighted), out=weighted)
+    cell, channels = (pattern.rows, pattern.columns), channels_of(pattern)
+    mixed = np.zeros((len(COLOURS), len(tables.matched), *by_site.shape[1:]), dtype=np.complex64)
+    for colour, spectrum in enumerate(mixed):
+        own = _evenly(np.flatnonzero(channels == colour))
+        np.sum(tables.matched[:, own] * by_site[own], axis=1, out=spectrum)
     # Colours have much that cancels in their sum. In single precision, they are mixed before they become pictures.
-    common = functools.reduce(np.add, [each for each in spectra if each is not None]) * np.float32(COMMON)
-    mixed = [common if each is None else np.add(each, common, out=each) for each in spectra]
-    planes = [joined_planes(each, cell, layout.columns) for each in mixed]
-    return cv2.transform(cv2.merge(planes), np.column_stack([np.diag(COLOURFUL * noise_e), levels]))
+    common = mixed.sum(axis=0)
+    common *= np.float32(COMMON)
+    mixed += common
+    planes = joined_planes(mixed, cell, layout.columns)
+    return cv2.transform(cv2.merge(list(planes)), np.column_stack([np.diag(COLOURFUL * noise_e), levels]))
+
+
+def _evenly(sites: Int[np.ndarray, " some"]) -> slice | Int[np.ndarray, " some"]:
+    """Return indices as a slice, which needs no copy, where they are two at most."""
+    if not 1 <= len(sites) <= 2:
+        return sites
+    first, last = int(sites[0]), int(sites[-1])
+    return slice(first, last + 1, max(last - first, 1))
 
 
 def _products(
     matrices: Complex64[np.ndarray, "to sites site_rows site_half"],
     spectra: Complex64[np.ndarray, "sites site_rows site_half"],
-    sites: Sequence[int],
 ) -> Complex64[np.ndarray, "to site_rows site_half"]:
-    """Return the product of a matrix and a vector at each frequency, of some sites. It stays within the cache."""
-    found = matrices[:, sites[0]] * spectra[sites[0]]
-    part = np.empty_like(found)
-    for site in sites[1:]:
-        found += np.multiply(matrices[:, site], spectra[site], out=part)
+    """Return the product of a matrix and a vector at each frequency. Few calls: threads wait for each other at each."""
+    found: Complex64[np.ndarray, "to site_rows site_half"] = (matrices * spectra).sum(axis=1)
     return found
 
 
@@ -275,13 +326,19 @@ def _likeliest(
 ) -> np.float32:
     """Return the prior's strength under which the spectrum is most probable."""
     some = spectrum[:, ::SPARSE, ::SPARSE]
-    power, value = (some.real**2 + some.imag**2) / np.float32(samples), values[:, ::SPARSE, ::SPARSE]
+    power = ((some.real**2 + some.imag**2) / np.float32(samples)).ravel()
+    value = values[:, ::SPARSE, ::SPARSE].ravel()
 
-    def cost(strength: np.float32) -> float:
-        variance = strength * value
+    def cheapest(indices: Iterable[int]) -> int:
+        """Return the likeliest of some strengths, all of which are tried at once: threads wait for every call."""
+        some = [index for index in indices if 0 <= index < len(STRENGTHS)]
+        variance = STRENGTHS[some, None] * value
         variance += 1
-        return float(np.sum(power / variance)) + float(np.sum(np.log(variance)))
+        cost = np.log(variance).sum(axis=1) + np.divide(power, variance, out=variance).sum(axis=1)
+        return some[int(cost.argmin())]
 
-    # The cost has one valley: first where it is, then where it is lowest.
-    near = min(range(0, len(STRENGTHS), _STRIDE), key=lambda index: cost(STRENGTHS[index]))
-    return min(STRENGTHS[max(near - _STRIDE + 1, 0) : near + _STRIDE], key=cost)
+    # The cost has one valley: first where it is, then by half steps where it is lowest.
+    best = cheapest(range(0, len(STRENGTHS), _STRIDE))
+    for step in _HALF_STEPS:
+        best = cheapest((best - step, best, best + step))
+    return STRENGTHS[best]

@@ -13,6 +13,7 @@ Zhang, "FFDNet", IEEE Trans. Image Processing 27, 2018), and a second level work
 from __future__ import annotations
 
 import functools
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -126,11 +127,7 @@ def corrected(
     down = (REACH_PX, REACH_PX + count * _BLOCK_ROWS - rows)
     across = (REACH_PX, REACH_PX + -columns % CELL_PX)
     detail = np.pad(detail, (down, across, (0, 0)), mode="symmetric")
-    half = [
-        (before // 2, (before + size + after) // 2 - before // 2 - noise.shape[axis])
-        for axis, (size, (before, after)) in enumerate(zip((rows, columns), (down, across), strict=True))
-    ]
-    noise = np.pad(noise, (*half, (0, 0)), mode="edge")
+    noise = np.pad(noise, (*half_pads((rows, columns), (down, across), noise.shape[:2]), (0, 0)), mode="edge")
     result = np.empty_like(balanced)
     for top in range(0, rows, _BLOCK_ROWS):
         bottom = top + _BLOCK_ROWS + 2 * REACH_PX
@@ -140,6 +137,14 @@ def corrected(
     result *= scale
     result += balanced
     return result
+
+
+def half_pads(size: tuple[int, ...], pads: Sequence[tuple[int, int]], half: tuple[int, ...]) -> list[tuple[int, int]]:
+    """Return by how much planes of the size ``half`` are padded where a picture of a ``size`` is, by ``pads``."""
+    return [
+        (before // 2, (before + count + after) // 2 - before // 2 - of_half)
+        for count, (before, after), of_half in zip(size, pads, half, strict=True)
+    ]
 
 
 def _mean(

@@ -15,6 +15,9 @@ from udccal.errors import RestorationError
 from udccal.models.geometry import Geometry, VirtualView, view_to_sensor
 from udccal.numerics import in_float64
 
+# Steps of a pixel, and pixels that the widest interpolation reads along one axis, that many of them before the place.
+_STEPS, _WIDEST, _BEFORE = 32, 8, 3
+
 
 class Interpolation(enum.IntEnum):
     """How a picture is resampled: over 2 x 2, 4 x 4 or 8 x 8 pixels."""
@@ -73,6 +76,16 @@ class Rectification:
     ) -> Real[np.ndarray, "view_rows view_columns 3"]:
         """Resample a sensor picture onto the view; its type, float32 or 8 bits, is kept."""
         return cv2.remap(picture, *self.fixed, interpolation, borderMode=cv2.BORDER_REFLECT_101)
+
+
+def interpolation_taps(interpolation: Interpolation) -> tuple[int, Float32[np.ndarray, "32 taps"]]:
+    """Return how many px before a place OpenCV begins to read, and its weights at each step of 1/32 px."""
+    # What it makes of single points.
+    x = np.tile(_BEFORE + np.arange(_STEPS, dtype=np.float32) / _STEPS, (_WIDEST, 1))
+    y = np.tile(np.arange(_WIDEST, dtype=np.float32)[:, None], (1, _STEPS))
+    taps = cv2.remap(np.eye(_WIDEST, dtype=np.float32), x, y, interpolation).T
+    used = np.flatnonzero(np.any(taps != 0, axis=0))
+    return _BEFORE - int(used[0]), taps[:, used[0] : used[-1] + 1]
 
 
 _sensor_places = jax.jit(view_to_sensor)

@@ -45,7 +45,7 @@ Picture = Float32[np.ndarray, "rows columns 3"]
 @final
 @dataclass(frozen=True)
 class SceneLight:
-    """The scene's part of a frame.
+    """The scene's part of some rows of a frame.
 
     Attributes:
         signal_e: in e-, divided by the wire.
@@ -69,10 +69,10 @@ class Restorer:
         rig: the rig description.
         noise: the noise term.
         view: the view of restored pictures.
-        wire: map to divide by; None when it is 1 everywhere.
-        mask: backscatter of pictures that are not known; None when the rig has none.
-        panel: backscatter of known panel pictures; None when the rig has none, or the tier does not ask for the
-            picture.
+        wire: map to divide the frame's ``rows`` by; None when it is 1 everywhere.
+        mask: backscatter in these rows of pictures that are not known; None when the rig has none.
+        panel: backscatter in these rows of known panel pictures; None when the rig has none, or the tier does not ask
+            for the picture.
         sharpener: demosaics and deblurs; None when the rig has no blur, or the tier leaves it.
         rectification: map from sensor to view.
         options: options of the restoration.
@@ -140,30 +140,38 @@ class Restorer:
             lambda: Rectification.within(geometry, view, camera.columns, camera.rows),
         )
         quick = tier is Tier.preview
+        sharpener = (
+            None
+            if quick or profile.psf.unfitted
+            else Sharpener.of(
+                _kept_grid(profile.psf.term, rig, options, keep), rig, rectification.rows, tier, options, keep
+            )
+        )
+        rows = _needed_rows(sharpener, rig)
         unscattered = profile.backscatter.unfitted or Stage.backscatter in without
         error = profile.backscatter.diagnostic("held_out_without_noise_of_peak") or 0.0
-        unblurred = quick or profile.psf.unfitted
         even = profile.wire.unfitted and bool(np.all(profile.wire_map == 1.0))
         return cls(
             tier=tier,
             rig=rig,
             noise=profile.noise.term,
             view=view,
-            wire=None if even or Stage.wire in without else profile.wire_map,
+            wire=None if even or Stage.wire in without else profile.wire_map[rows],
             mask=None
             if unscattered
-            else PanelMask(mask_mosaic(profile.backscatter_mask, cfa, camera.rows, camera.columns), cfa, error),
+            else PanelMask(mask_mosaic(profile.backscatter_mask, cfa, camera.rows, camera.columns)[rows], cfa, error),
             panel=None
             if quick or unscattered
-            else PanelLight.of(profile.backscatter.term, rig, options.panel_block, keep),
-            sharpener=None
-            if unblurred
-            else Sharpener.of(
-                _kept_grid(profile.psf.term, rig, options, keep), rig, rectification.rows, tier, options, keep
-            ),
+            else PanelLight.of(profile.backscatter.term, rig, options.panel_block, keep).of_rows(rows),
+            sharpener=sharpener,
             rectification=rectification,
             options=options,
         )
+
+    @property
+    def rows(self) -> slice:
+        """Rows of the frame that are worked on: those that the view sees, and what their tiles reach beyond."""
+        return _needed_rows(self.sharpener, self.rig)
 
     def restore(
         self,
@@ -201,7 +209,7 @@ class Restorer:
             return self.rectification.apply(demosaic(light.signal_e, self.rig.camera.cfa))
         sharp = self.sharpener.apply(light.signal_e, light.variance_e2, light.clipped)
         if light.panel_error_e is not None:
-            sharp = plausible(sharp, light.panel_error_e[self.sharpener.rows])
+            sharp = plausible(sharp, light.panel_error_e[self.sharpener.layout.inner])
         return self._strip_rectification.apply(sharp, self.options.interpolation)
 
     def scene_light(
@@ -210,15 +218,15 @@ class Restorer:
         exposure_s: float,
         panel_picture: UInt8[np.ndarray, "panel_rows panel_columns 3"] | None = None,
     ) -> SceneLight:
-        """Return the light of the scene alone, before it is deblurred.
+        """Return the light of the scene alone, before it is deblurred, of the frame's ``rows``.
 
         Arguments and errors are those of ``restore``.
         """
         check_frame(mosaic, exposure_s, self.rig)
         check_panel_picture(panel_picture, self.rig)
-        signal = to_electrons(
-            without_defects(mosaic, self.noise, exposure_s, self.rig.camera.cfa), self.noise, exposure_s
-        )
+        cfa, workers = self.rig.camera.cfa, self.options.workers
+        mosaic = without_defects(mosaic[self.rows], self.noise, exposure_s, cfa, workers)
+        signal = to_electrons(mosaic, self.noise, exposure_s)
         variance = variance_e2(signal, self.noise, exposure_s)
         if self.wire is not None:
             signal /= self.wire
@@ -292,6 +300,10 @@ class Restorer:
         cfa = cfa_named(camera.cfa)
         sensor = camera.rows, camera.columns
         return Preview.of(self.noise, self.wire, self.mask, cfa, self.rectification, sensor)
+
+
+def _needed_rows(sharpener: Sharpener | None, rig: RigDescription) -> slice:
+    return slice(0, rig.camera.rows) if sharpener is None else sharpener.layout.reach
 
 
 def _kept_grid(psf: PsfField, rig: RigDescription, options: PlanOptions, keep: Path | None) -> KernelGrid:

@@ -14,7 +14,7 @@ from udccal.cfa import Cfa, cfa_named
 from udccal.restoration.blur import blurred
 from udccal.restoration.clipped import clipped_tiles, completed
 from udccal.restoration.kernel_grid import KernelGrid
-from udccal.restoration.mosaic_filter import FilterTables, filter_tables, filtered
+from udccal.restoration.mosaic_filter import FilterTables, filter_tables, filtered, filtered_and_joined
 from udccal.restoration.network import refined, sharper
 from udccal.restoration.plan import PlanOptions
 from udccal.restoration.prepared import kept
@@ -28,7 +28,7 @@ Clipped = Bool[np.ndarray, "rows columns"]
 Strip = Float32[np.ndarray, "covered_rows columns 3"]
 
 # Every n-th cell of a tile gives the mean noise of its samples.
-SPARSE = 4
+SPARSE_CELLS = 4
 # Width in px over which the noise's variance is averaged to tell bright places of a tile from dark ones.
 LOCAL_PX = 16
 
@@ -52,10 +52,10 @@ class Solved:
 @final
 @dataclass(frozen=True)
 class _Filtered:
-    """What ``Solved`` is made of: tiles with their clipped samples completed, and the pictures of each."""
+    """What ``Solved`` has, and the tiles with their clipped samples completed."""
 
-    tiles: Float32[np.ndarray, "tiles rows columns"]
-    pictures: Float32[np.ndarray, "tiles rows columns 3"]
+    tiles: list[Float32[np.ndarray, "tile_rows tile_columns"]]
+    picture: Strip
     strengths: Float32[np.ndarray, " tiles"]
     noise_e: Float32[np.ndarray, "tiles 3"]
 
@@ -127,7 +127,7 @@ class Sharpener:
         """Demosaic and deblur.
 
         Args:
-            signal_e: signal in e-, divided by the wire, without backscatter.
+            signal_e: signal in e-, divided by the wire, without backscatter, of the frame's rows ``layout.reach``.
             variance_e2: variance of its noise in e-^2.
             clipped: samples whose light was more than they say.
 
@@ -135,40 +135,41 @@ class Sharpener:
             the picture in e-, of the rows that the layout covers.
         """
         found = self._filtered(signal_e, variance_e2, clipped)
-        picture = self.layout.join(found.pictures, self.options.workers)
         if self.noise is None:
-            return picture
+            return found.picture
         bands = self.noise.of_tiles(found.strengths)
-        local = cv2.blur(variance_e2, (LOCAL_PX, LOCAL_PX), borderType=cv2.BORDER_REFLECT_101)[self.rows]
-        balanced = shrunk(picture, found.noise_e, local, bands, self.layout, self.options.workers)
+        local = cv2.blur(variance_e2, (LOCAL_PX, LOCAL_PX), borderType=cv2.BORDER_REFLECT_101)[self.layout.inner]
+        balanced = shrunk(found.picture, found.noise_e, local, bands, self.layout, self.options.workers)
         if self.tier is Tier.balanced:
             return balanced
         given = found.noise_e, local, bands, self.layout, self.options.network_views
-        best = refined(balanced, picture, self._sharper(found), *given)
+        best = refined(balanced, found.picture, self._sharper(found), *given)
         return best + self._contradicted(best, signal_e, clipped, found.noise_e)
 
     def solved(self, signal_e: Mosaic, variance_e2: Mosaic, clipped: Clipped) -> Solved:
         """Demosaic and deblur as ``apply`` does, but take out no noise."""
         found = self._filtered(signal_e, variance_e2, clipped)
-        return Solved(self.layout.join(found.pictures, self.options.workers), found.strengths, found.noise_e)
+        return Solved(found.picture, found.strengths, found.noise_e)
+
+    @property
+    def _given(self) -> tuple[FilterTables, TileLayout, Cfa, int]:
+        return self.tables, self.layout, self.cfa, self.options.workers
 
     def _filtered(self, signal_e: Mosaic, variance_e2: Mosaic, clipped: Clipped) -> _Filtered:
         noise_e = self._tile_noise(variance_e2)
-        tiles = self.layout.cut(signal_e)
-        pictures, strengths = filtered(tiles, noise_e, self.tables, self.layout, self.cfa, self.options.workers)
+        tiles = [self.layout.tile(signal_e, index) for index in range(self.layout.count)]
         at, missing = clipped_tiles(clipped, self.layout)
         if len(at):
-            given = noise_e[at], self.tables.at(at), self.layout, self.cfa, self.options.workers
-            tiles[at] = completed(tiles[at], missing, strengths[at], *given)
-            pictures[at], strengths[at] = filtered(tiles[at], *given)
-        return _Filtered(tiles, pictures, strengths, noise_e)
+            given = noise_e[at], self.tables.at(at), *self._given[1:]
+            own = np.stack([tiles[index] for index in at])
+            whole = completed(own, missing, filtered(own, *given)[1], *given)
+            for index, tile in zip(at, whole, strict=True):
+                tiles[index] = tile
+        return _Filtered(tiles, *filtered_and_joined(tiles, noise_e, *self._given), noise_e)
 
     def _sharper(self, found: _Filtered) -> Strip:
         """Filter again, with a stronger prior than the one that each tile chose."""
-        given = self.tables, self.layout, self.cfa, self.options.workers
-        return self.layout.join(
-            filtered(found.tiles, found.noise_e, *given, sharper(found.strengths))[0], self.options.workers
-        )
+        return filtered_and_joined(found.tiles, found.noise_e, *self._given, sharper(found.strengths))[0]
 
     def _contradicted(
         self, picture: Strip, signal_e: Mosaic, clipped: Clipped, noise_e: Float32[np.ndarray, "tiles 3"]
@@ -178,17 +179,19 @@ class Sharpener:
         With it, the picture is the most probable one where its own error has the filter's prior, at the strength that
         is likeliest for what is left of each tile. A clipped sample speaks against a picture that is darker only.
         """
-        expected = blurred(picture, self.grid, self.layout)
-        channels = self.cfa.channel_map(*signal_e.shape)[self.rows]
+        expected, inner = blurred(picture, self.grid, self.layout), self.layout.inner
+        channels = self.cfa.channel_map(*signal_e.shape)[inner]
         rest = np.zeros_like(signal_e)
-        rest[self.rows] = signal_e[self.rows] - np.take_along_axis(expected, channels[..., None], axis=2)[..., 0]
+        rest[inner] = signal_e[inner] - np.take_along_axis(expected, channels[..., None], axis=2)[..., 0]
         rest[clipped] = np.maximum(rest[clipped], 0.0)
-        given = self.tables, self.layout, self.cfa, self.options.workers
-        return self.layout.join(filtered(self.layout.cut(rest), noise_e, *given)[0], self.options.workers)
+        return filtered_and_joined(self.layout.cut(rest), noise_e, *self._given)[0]
 
     def _tile_noise(self, variance_e2: Mosaic) -> Float32[np.ndarray, "tiles 3"]:
         """Return the sigma of a sample of each colour in each tile."""
-        of_site = [_tile_means(variance_e2[site.samples][::SPARSE, ::SPARSE], self.layout) for site in self.cfa.sites]
+        of_site = [
+            _tile_means(variance_e2[site.samples][::SPARSE_CELLS, ::SPARSE_CELLS], self.layout)
+            for site in self.cfa.sites
+        ]
         channels = np.array([site.channel for site in self.cfa.sites])
         own = [channels == channel if channel in channels else channels >= 0 for channel in range(3)]
         found = np.stack([np.mean(np.array(of_site)[mine], axis=0) for mine in own], axis=1)
@@ -196,15 +199,26 @@ class Sharpener:
 
 
 def _tile_means(some: Float32[np.ndarray, "rows columns"], layout: TileLayout) -> Float64[np.ndarray, " tiles"]:
-    """Return the mean of each tile's part of the frame; ``some`` are samples at even steps over the frame."""
+    """Return the mean of each tile's part of the frame; ``some`` are samples at even steps over the strip."""
     sums = cv2.integral(np.ascontiguousarray(some))
-    top, bottom = tile_ends(layout.tops, layout.rows, layout.frame_rows, some.shape[0])
-    left, right = tile_ends(layout.lefts, layout.columns, layout.frame_columns, some.shape[1])
+    (top, bottom), (left, right) = tile_ends(layout, some.shape)
     total = sums[bottom][:, right] - sums[bottom][:, left] - sums[top][:, right] + sums[top][:, left]
     return (total / np.outer(bottom - top, right - left)).ravel()
 
 
-def tile_ends(starts: tuple[int, ...], size: int, most: int, count: int) -> Int[np.ndarray, "2 starts"]:
+def tile_ends(
+    layout: TileLayout, shape: tuple[int, ...]
+) -> tuple[Int[np.ndarray, "2 tiles_down"], Int[np.ndarray, "2 tiles_across"]]:
+    """Return the first row of each tile and the one after its last, and its columns, among so many over the strip."""
+    reach = layout.reach
+    tops = tuple(top - reach.start for top in layout.tops)
+    return (
+        _ends(tops, layout.rows, reach.stop - reach.start, shape[0]),
+        _ends(layout.lefts, layout.columns, layout.frame_columns, shape[1]),
+    )
+
+
+def _ends(starts: tuple[int, ...], size: int, most: int, count: int) -> Int[np.ndarray, "2 starts"]:
     """Return the first of ``count`` samples of each tile along one axis of ``most`` px, and the one after its last."""
     ends = np.clip(np.array([starts, [start + size for start in starts]]), 0, most) * count / most
     first = np.minimum(np.floor(ends[0]), count - 1)

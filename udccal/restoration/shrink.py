@@ -8,6 +8,7 @@ Processing 52, 2004). The filter's noise in each band is measured once per profi
 
 from __future__ import annotations
 
+import functools
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TypeAlias, final
@@ -15,6 +16,7 @@ from typing import TypeAlias, final
 import cv2
 import numpy as np
 from jaxtyping import Float, Float32, Int
+from scipy import sparse
 
 from udccal.restoration.mosaic_filter import STRENGTHS, FilterTables, Pattern, filtered
 from udccal.restoration.tiles import BLEND_PX, TAPER_PX, Strip, TileLayout
@@ -217,11 +219,18 @@ def interpolated(
         values: of each tile.
         step: px between the samples that are returned, of the rows that the layout covers. One plane has no axis.
     """
+    down, across = hats(layout, step)
+    return cv2.merge([down @ np.ascontiguousarray((across @ plane.T).T) for plane in np.moveaxis(values, -1, 0)])
+
+
+@functools.lru_cache(maxsize=8)
+def hats(layout: TileLayout, step: int) -> tuple[sparse.csr_array, sparse.csr_array]:
+    """Return the weights of both axes. They are sparse: BLAS would split such products among threads that spin."""
     down, across = (
-        linear_weights(np.array([strip.middle for strip in strips]), np.arange(0, count, step))
+        sparse.csr_array(linear_weights(np.array([strip.middle for strip in strips]), np.arange(0, count, step)))
         for strips, count in zip(layout.strips, layout.covered, strict=True)
     )
-    return cv2.merge([down @ plane @ across.T for plane in np.moveaxis(values, -1, 0)])
+    return down, across
 
 
 def linear_weights(

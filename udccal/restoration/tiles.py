@@ -8,13 +8,12 @@ from __future__ import annotations
 
 import functools
 import itertools
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import final
+from typing import TypeAlias, final
 
 import cv2
 import numpy as np
-from jaxtyping import Float32, Int
+from jaxtyping import Float32, Int, Real
 from scipy import fft
 
 from udccal.errors import RestorationError
@@ -24,6 +23,8 @@ TAPER_PX, BLEND_PX = 24, 16
 LEAST_PX = 2 * (TAPER_PX + BLEND_PX) + 16
 # From a tile's edge to the middle of its blend.
 _OUTSIDE = TAPER_PX + BLEND_PX // 2
+
+_Run: TypeAlias = slice | Int[np.ndarray, " _"]
 
 
 @final
@@ -93,31 +94,71 @@ class TileLayout:
         """Weights of a tile's samples before the transform."""
         return _ramped(self.rows, 0, TAPER_PX)[:, None] * _ramped(self.columns, 0, TAPER_PX)
 
-    def cut(self, mosaic: Float32[np.ndarray, "frame_rows frame_columns"]) -> Float32[np.ndarray, "tiles rows columns"]:
-        """Return the tiles of a mosaic, which is mirrored at its borders cell by cell."""
-        rows = _mirrored(self.tops, self.rows, self.frame_rows, self.cell_rows)
-        columns = _mirrored(self.lefts, self.columns, self.frame_columns, self.cell_columns)
+    @functools.cached_property
+    def power(self) -> float:
+        """Samples of a tile, each weighted by the square of its taper."""
+        return float(np.sum(self.taper**2))
+
+    @property
+    def reach(self) -> slice:
+        """Rows of the frame that the tiles see: the strip."""
+        return slice(max(self.tops[0], 0), min(self.tops[-1] + self.rows, self.frame_rows))
+
+    @property
+    def inner(self) -> slice:
+        """Rows of the strip that are covered."""
+        return slice(self.first_row - self.reach.start, self.last_row - self.reach.start)
+
+    def cut(self, strip: Float32[np.ndarray, "strip_rows frame_columns"]) -> Float32[np.ndarray, "tiles rows columns"]:
+        """Return the tiles of a frame's rows ``reach``. At the frame's borders it is mirrored cell by cell."""
         tiles = np.empty((self.count, self.rows, self.columns), dtype=np.float32)
-        for tile, (down, across) in zip(tiles, itertools.product(rows, columns), strict=True):
-            tile[:] = mosaic[_run(down)][:, _run(across)]
+        for index, tile in enumerate(tiles):
+            tile[:] = self.tile(strip, index)
         return tiles
 
+    def tile(
+        self, strip: Float32[np.ndarray, "strip_rows frame_columns"], index: int
+    ) -> Float32[np.ndarray, "rows columns"]:
+        """Return one tile, as ``cut`` does; a view of the strip where it can be."""
+        down, across = divmod(index, len(self.lefts))
+        return strip[self._runs[0][down]][:, self._runs[1][across]]
+
+    @property
+    def samples(self) -> tuple[Int[np.ndarray, "tiles_down rows"], Int[np.ndarray, "tiles_across columns"]]:
+        """Rows of the strip, and columns, of each row and column of tiles."""
+        rows = _mirrored(self.tops, self.rows, self.frame_rows, self.cell_rows) - self.reach.start
+        return rows, _mirrored(self.lefts, self.columns, self.frame_columns, self.cell_columns)
+
+    @functools.cached_property
+    def _runs(self) -> tuple[list[_Run], list[_Run]]:
+        rows, columns = self.samples
+        return [_run(each) for each in rows], [_run(each) for each in columns]
+
+    @functools.cached_property
+    def apart(self) -> list[list[int]]:
+        """Numbers of the tiles in four groups. Tiles of a group do not touch: threads may blend them at once."""
+        at = self.by_place(np.arange(self.count))
+        return [at[down::2, across::2].ravel().tolist() for down in (0, 1) for across in (0, 1)]
+
+    def blend(
+        self,
+        picture: Float32[np.ndarray, "rows columns 3"],
+        index: int,
+        joined: Float32[np.ndarray, "covered_rows frame_columns 3"],
+    ) -> None:
+        """Add a tile's picture, by its weights, to that of the rows that are covered."""
+        places = divmod(index, len(self.lefts))
+        down, across = (strips[place] for strips, place in zip(self.strips, places, strict=True))
+        weights = cv2.merge([np.outer(down.weights, across.weights)] * 3)
+        cv2.accumulateProduct(picture[down.part, across.part], weights, joined[down.at, across.at])
+
     def join(
-        self, pictures: Float32[np.ndarray, "tiles rows columns 3"], workers: int
+        self, pictures: Float32[np.ndarray, "tiles rows columns 3"]
     ) -> Float32[np.ndarray, "covered_rows frame_columns 3"]:
-        """Blend the tiles' pictures, by some threads, into one of the rows that are covered."""
+        """Blend the tiles' pictures into one of the rows that are covered."""
         joined = np.zeros((*self.covered, 3), dtype=np.float32)
-
-        def join_row(down: Strip, row: Float32[np.ndarray, "across rows columns 3"]) -> None:
-            for picture, across in zip(row, self.strips[1], strict=True):
-                weights = cv2.merge([np.outer(down.weights, across.weights)] * 3)
-                cv2.accumulateProduct(picture[down.part, across.part], weights, joined[down.at, across.at])
-
-        rows = list(zip(self.strips[0], self.by_place(pictures), strict=True))
-        with ThreadPoolExecutor(workers) as pool:
-            # Rows of tiles that do not touch at once.
-            for first in (0, 1):
-                list(pool.map(lambda row: join_row(*row), rows[first::2]))
+        for index in itertools.chain(*self.apart):
+            self.blend(pictures[index], index, joined)
         return joined
 
     @property
@@ -133,7 +174,7 @@ class TileLayout:
             _blended(self.lefts, self.columns, 0, self.frame_columns),
         )
 
-    def by_place(self, values: Float32[np.ndarray, "tiles *k"]) -> Float32[np.ndarray, "tiles_down tiles_across *k"]:
+    def by_place(self, values: Real[np.ndarray, "tiles *k"]) -> Real[np.ndarray, "tiles_down tiles_across *k"]:
         """Return the tiles' values by row and column of tiles."""
         return values.reshape(len(self.tops), len(self.lefts), *values.shape[1:])
 
@@ -190,7 +231,7 @@ def _mirrored(starts: tuple[int, ...], size: int, most: int, cell: int) -> Int[n
     return np.where(inside, index, np.minimum(folded * cell + index % cell, most - 1))
 
 
-def _run(index: Int[np.ndarray, " n"]) -> slice | Int[np.ndarray, " n"]:
+def _run(index: Int[np.ndarray, " n"]) -> _Run:
     """Return consecutive indices as a slice, which needs no copy."""
     return slice(index[0], index[-1] + 1) if np.all(np.diff(index) == 1) else index
 

@@ -15,7 +15,7 @@ from udccal.cfa import Cfa, cfa_named
 from udccal.restoration.clipped import completed
 from udccal.restoration.deblur import THREE_COLOURS
 from udccal.restoration.kernel_grid import KernelGrid, centred
-from udccal.restoration.mosaic_filter import FilterTables, Pattern, filter_tables, filtered
+from udccal.restoration.mosaic_filter import FilterTables, Pattern, filter_tables, filtered, filtered_and_joined
 from udccal.restoration.network import details, noise_planes, sharper
 from udccal.restoration.shrink import BandNoise, measured_noise, shrunk
 from udccal.restoration.tiles import TileLayout, layout_for
@@ -134,9 +134,8 @@ class Examples:
         given = optics.tables, optics.layout, optics.pattern, 1
         if lit:
             tile = _clipped(tile, most_e, noise_e, given)
-        pictures, strength = filtered(tile[None], noise_e, *given)
-        sharp, _ = filtered(tile[None], noise_e, *given, sharper(strength))
-        chosen, sharp = (optics.layout.join(each, 1) for each in (pictures, sharp))
+        chosen, strength = filtered_and_joined(tile[None], noise_e, *given)
+        sharp, _ = filtered_and_joined(tile[None], noise_e, *given, sharper(strength))
         first = (_CANVAS_PX - _TILE_PX) // 2 - optics.layout.tops[0]
         truth = scene[first : first + _USED_PX, first : first + _USED_PX]
         first = -optics.layout.tops[0]

@@ -1,98 +1,114 @@
-"""Noise taken out band by band on a device, as ``shrink`` does it."""
+"""Noise taken out on a device: band by band as ``shrink`` does it, and by the network of the tier ``accurate``."""
 
 from __future__ import annotations
 
 import cv2
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
+from scipy.fft import next_fast_len
 
-from udccal.restoration.device.planes import box_mean, convolved, resized
-from udccal.restoration.shrink import BANDS, LEVELS, MARGIN, OPPONENT, SMOOTH, WINDOW, BandNoise, Runs, linear_weights
+from udccal.restoration.device.planes import Mosaic, box_mean, convolved, cut, joined, placing, resized
+from udccal.restoration.network import CELL_PX, DETAIL_PX, REACH_PX, WAYS, Weights, correction, half_pads
+from udccal.restoration.shrink import BANDS, LEVELS, MARGIN, OPPONENT, SMOOTH, WINDOW, Runs, hats, linear_weights
 from udccal.restoration.tiles import TileLayout
 
 Planes = Float[Array, "3 rows columns"]
-Local = Float[Array, "rows columns"]
+# Sigma of a sample of each colour, a sample's variance over some px, that of unit noise in each band; e- and e-^2.
+Noise = tuple[Float[Array, "tiles 3"], Mosaic, Float[Array, "tiles 3 levels bands"]]
 
 
-class Bands(eqx.Module):
-    """``BandNoise`` on a device.
-
-    Attributes:
-        variance: by probed tile and strength. probe: which one stands for each tile. layout: of the tiles.
-    """
-
-    variance: Float[Array, "probes strengths 3 levels bands"]
-    probe: Int[Array, " tiles"]
-    layout: TileLayout = eqx.field(static=True)
-
-    @classmethod
-    def of(cls, noise: BandNoise, layout: TileLayout) -> Bands:
-        """Take over what a profile's filters leave."""
-        return cls(jnp.asarray(noise.variance), jnp.asarray(noise.probe), layout)
-
-    def of_tiles(self, strength: Int[Array, " tiles"]) -> Float[Array, "tiles 3 levels bands"]:
-        """Return the variances of each tile at the strength of this index."""
-        return self.variance[self.probe, strength]
-
-    def shrunk(
-        self, picture: Planes, noise_e: Float[Array, "tiles 3"], local_e2: Local, variance: Float[Array, "tiles 3 _ _"]
-    ) -> Planes:
-        """Take noise out of a filtered picture. Arguments are those of ``shrink.shrunk``."""
-        scale = between(self.layout, noise_e)
-        brightness = [local_e2 / jnp.mean(scale**2, axis=0)]
-        for _ in range(1, LEVELS):
-            brightness.append(halved(brightness[-1]))
-        places = len(self.layout.tops), len(self.layout.lefts)
-        by_place = jnp.moveaxis(MARGIN * variance, 0, -1).reshape(3, LEVELS, BANDS, *places)
-        calm = self._level(_mixed(OPPONENT, picture / scale), by_place, brightness, 0)
-        return _mixed(OPPONENT.T, calm) * scale
-
-    def _level(
-        self, planes: Planes, noise: Float[Array, "3 levels bands down across"], brightness: list[Array], level: int
-    ) -> Planes:
-        """Shrink the bands at this level, and at coarser ones by what they change."""
-        down, across = convolved(planes, SMOOTH, -2), convolved(planes, SMOOTH, -1)
-        smooth = convolved(down, SMOOTH, -1)
-        shape, result = (planes.shape[1], planes.shape[2]), smooth
-        for index, band in enumerate((down - smooth, across - smooth, planes - down - across + smooth)):
-            energy = box_mean(band * band, WINDOW[0]) + 1e-20
-            unexplained = 1 - self._largest(noise[:, level, index], shape, level) * brightness[level] / energy
-            result += jnp.maximum(unexplained, 0) * band
-        if level + 1 < LEVELS and min(shape) > 2 * len(SMOOTH):
-            half = smooth[:, ::2, ::2]
-            change = self._level(half, noise, brightness, level + 1) - half
-            result += resized(change, shape, cv2.INTER_LINEAR)
-        return result
-
-    def _largest(self, values: Float[Array, "3 down across"], shape: tuple[int, int], level: int) -> Planes:
-        """Return the value of each sample's tile; of two tiles, the larger one."""
-        spread = []
-        for axis, strips, count in zip((1, 2), self.layout.strips, shape, strict=True):
-            runs = Runs.of(strips, count, 0.5**level)
-            values = jnp.maximum(jnp.take(values, runs.first, axis=axis), jnp.take(values, runs.last, axis=axis))
-            spread.append(np.repeat(np.eye(len(runs.samples), dtype=np.float32), runs.samples, axis=0))
-        return jnp.einsum("yi,cij,xj->cyx", spread[0], values, spread[1])
+def shrunk(picture: Planes, noise: Noise, layout: TileLayout) -> Planes:
+    """Take noise out of a filtered picture. Arguments are those of ``shrink.shrunk``."""
+    noise_e, local_e2, variance = noise
+    scale = between(layout, noise_e)
+    brightness = [local_e2 / jnp.mean(scale**2, axis=0)]
+    for _ in range(1, LEVELS):
+        brightness.append(halved(brightness[-1]))
+    by_place = jnp.moveaxis(MARGIN * variance, 0, -1).reshape(3, LEVELS, BANDS, len(layout.tops), -1)
+    # Products of matrices: XLA would compute what sums need anew for each of the three planes.
+    opponent = jnp.einsum("ij,jyx->iyx", OPPONENT, picture / scale)
+    calm = _level(opponent, by_place, brightness, layout)
+    return jnp.einsum("ji,jyx->iyx", OPPONENT, calm) * scale
 
 
-def between(
-    layout: TileLayout, values: Float[Array, "tiles planes"], step: int = 1
-) -> Float[Array, "planes rows columns"]:
+def _level(
+    planes: Planes, noise: Float[Array, "3 _ _ _ _"], brightness: list[Array], layout: TileLayout, level: int = 0
+) -> Planes:
+    """Shrink the bands at this level, and at coarser ones by what they change."""
+    down, across = convolved(planes, SMOOTH, -2), convolved(planes, SMOOTH, -1)
+    smooth = convolved(down, SMOOTH, -1)
+    shape, result = (planes.shape[1], planes.shape[2]), smooth
+    for index, band in enumerate((down - smooth, across - smooth, planes - down - across + smooth)):
+        energy = box_mean(band * band, WINDOW[0]) + 1e-20
+        unexplained = 1 - _largest(noise[:, level, index], shape, layout, level) * brightness[level] / energy
+        result += jnp.maximum(unexplained, 0) * band
+    if level + 1 < LEVELS and min(shape) > 2 * len(SMOOTH):
+        half = smooth[:, ::2, ::2]
+        change = _level(half, noise, brightness, layout, level + 1) - half
+        result += resized(change, shape, cv2.INTER_LINEAR)
+    return result
+
+
+def _largest(values: Float[Array, "3 down across"], shape: tuple[int, int], layout: TileLayout, level: int) -> Planes:
+    """Return the value of each sample's tile; of two tiles, the larger one."""
+    for axis, strips, count in zip((1, 2), layout.strips, shape, strict=True):
+        runs = Runs.of(strips, count, 0.5**level)
+        both = (jnp.take(values, np.repeat(of, runs.samples), axis=axis) for of in (runs.first, runs.last))
+        values = jnp.maximum(*both)
+    return values
+
+
+def between(layout: TileLayout, values: Float[Array, "tiles planes"], step: int = 1) -> Float[Array, "planes _ _"]:
     """Interpolate values between the tiles' centres, as ``shrink.interpolated`` does."""
-    down, across = (
-        linear_weights(np.array([strip.middle for strip in strips]), np.arange(0, count, step))
-        for strips, count in zip(layout.strips, layout.covered, strict=True)
-    )
+    down, across = (each.toarray() for each in hats(layout, step))
     return down @ values.T.reshape(-1, len(layout.tops), len(layout.lefts)) @ across.T
 
 
-def halved(plane: Local) -> Float[Array, "half_rows half_columns"]:
+def halved(plane: Mosaic) -> Float[Array, "half_rows half_columns"]:
     """Return the mean of every 2 x 2 samples; of an odd number of samples, of as many more as are needed."""
     rows, columns = plane.shape
     return resized(plane, (-(-rows // 2), -(-columns // 2)), cv2.INTER_AREA)
 
 
-def _mixed(matrix: Float[np.ndarray, "3 3"], picture: Planes) -> Planes:
-    # A product of matrices: XLA would compute what sums need anew for each of the three planes.
-    return jnp.einsum("ij,jyx->iyx", matrix, picture)
+def refined(weights: Weights, pictures: list[Planes], noise: Noise, layout: TileLayout, views: int) -> Planes:
+    """Return the picture of the tier ``balanced`` with what the network adds, as ``network.refined`` does.
+
+    Args:
+        weights: of the network. pictures: of that tier, at the strengths that tiles chose, and at sharper ones.
+        noise: as for ``shrunk``. layout: of the tiles. views: ways round in which the network sees a picture.
+    """
+    (balanced, chosen, sharp), (noise_e, local_e2, variance) = pictures, noise
+    size, scale = balanced.shape[1:], between(layout, noise_e)
+    first = balanced / scale
+    first -= box_mean(first, DETAIL_PX[0])
+    detail = jnp.concatenate([first, (chosen - balanced) / scale, (sharp - chosen) / scale])
+    brightness = local_e2 / between(layout, jnp.mean(noise_e**2, axis=1, keepdims=True))[0]
+    sigma = between(layout, jnp.sqrt(variance[:, 0].reshape(len(variance), -1)), step=2)
+    left = sigma * jnp.sqrt(halved(brightness))
+    pads = [(REACH_PX, REACH_PX + -count % CELL_PX) for count in size]
+    detail = jnp.pad(detail, ((0, 0), *pads), mode="symmetric")
+    left = jnp.pad(left, ((0, 0), *half_pads(size, pads, left.shape[1:])), mode="edge")
+    ways = WAYS[:views]
+    turned = (jnp.stack([jnp.moveaxis(each, 0, -1)[::y, ::x] for y, x in ways]) for each in (detail, left))
+    mean = sum(one[::y, ::x] for one, (y, x) in zip(correction(weights, *turned), ways, strict=True)) / len(ways)
+    inner = tuple(slice(REACH_PX, REACH_PX + count) for count in size)
+    return balanced + jnp.moveaxis(mean[inner], -1, 0) * scale
+
+
+def blurred(picture: Planes, kernels: Float[Array, "tiles 3 ky kx"], layout: TileLayout) -> Planes:
+    """Blur a sharp picture as ``blur.blurred`` does, by the kernels of the tiles, of odd size."""
+    places, weights, blends, size = [], [], [], []
+    for strips, count, samples in zip(layout.strips, layout.covered, kernels.shape[2:], strict=True):
+        reach = samples // 2
+        hat = linear_weights(np.array([strip.middle for strip in strips]), np.arange(-reach, count + reach))
+        most = int(np.count_nonzero(hat, axis=0).max())
+        at = np.minimum((hat > 0).argmax(axis=0), len(hat) - most)[:, None] + np.arange(most)
+        places.append(np.pad(np.arange(count), reach, mode="symmetric")[at])
+        weights.append(hat[at, np.arange(len(at))[:, None]])
+        size.append(int(next_fast_len(most + 2 * reach, real=True)))
+        blends.append(placing(at[:, 0] - 2 * reach, np.ones((len(at), size[-1]), np.float32), count))
+    down, across = np.repeat(weights[0], len(weights[1]), axis=0), np.tile(weights[1], (len(weights[0]), 1))
+    tiles = cut(picture, *places) * down[:, None, :, None] * across[:, None, None, :]
+    spectrum = jnp.fft.rfft2(tiles, s=size) * jnp.fft.rfft2(kernels, s=size)
+    return joined(jnp.fft.irfft2(spectrum, s=size), *blends)

@@ -1,199 +1,140 @@
-"""From raw samples to the scene's light on a device: black level, defects, wire, backscatter."""
+"""The scene's light on a device, of raw samples: black level, defects, wire, backscatter, and places it leaves dark."""
 
 from __future__ import annotations
 
+import functools
+
+import cv2
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, UInt8, UInt16
+from jax.scipy.special import log_ndtr
+from jaxtyping import Array, Bool, Float, UInt8, UInt16
 
-from udccal.cfa import Cfa, cfa_named
-from udccal.models.noise import linear_signal
-from udccal.restoration.backscatter import BLOCK, PERCENTILE, SPARSE, PanelLight
+from udccal.cfa import Cfa
+from udccal.models.noise import Noise, linear_signal
+from udccal.restoration.backscatter import BLOCK, PERCENTILE, SPARSE
+from udccal.restoration.dark_places import COLOURFUL, LEAST_E, NEGLIGIBLE, STEP
 from udccal.restoration.defects import OUTLIER_RATIO, OUTLIER_SIGMA
-from udccal.restoration.device.planes import apart, together
-from udccal.restoration.linear import least_saturated_DN, scalar
-from udccal.restoration.runtime import Restorer
+from udccal.restoration.device.planes import Mosaic, apart, box_mean, resized, together
+from udccal.restoration.mosaic_filter import channels_of
 
-Mosaic = Float[Array, "rows columns"]
 _AROUND = tuple((down, across) for down in range(3) for across in range(3) if (down, across) != (1, 1))
 
 
-class Exposed(eqx.Module):
-    """What depends on a frame's exposure, and on the panel's picture.
-
-    Attributes:
-        exposure_s: time. dark_DN: what a sample reads without light. floor_e2: variance of a sample without light.
-        known: whether the panel's picture is known. rate: its backscatter in e-/s; anything when it is not.
-    """
-
-    exposure_s: Float[Array, ""]
-    dark_DN: Float[Array, ""]
-    floor_e2: Float[Array, ""]
-    known: Bool[Array, ""]
-    rate: Mosaic
-
-
-class Excess(eqx.Module):
-    """Sums over some samples, by which ``refuse_excess`` tells a frame that is darker than its panel's light.
-
-    Attributes:
-        seen_e: the frame's light. expected_e: the panel's. samples: how many.
-    """
-
-    seen_e: Float[Array, ""]
-    expected_e: Float[Array, ""]
-    samples: Int[Array, ""]
-
-
 class FrontEnd(eqx.Module):
-    """Noise, wire and mask of a rig.
+    """What the rows of a frame pass before they are deblurred.
 
     Attributes:
         wire: map to divide by. white: backscatter of a white panel in e-/s. None where the restorer has none.
-        cfa: the colour pattern. The others: of the noise term.
+        noise: the noise term. saturated_DN: from where on a sample counts as saturated. cfa: the colour pattern.
     """
 
     wire: Mosaic | None
     white: Mosaic | None
+    noise: Noise
+    saturated_DN: Float[Array, ""]
     cfa: Cfa = eqx.field(static=True)
-    K_DN_per_e: float = eqx.field(static=True)
-    black_DN: float = eqx.field(static=True)
-    bend_per_DN: float = eqx.field(static=True)
-    sigma_d_e: float = eqx.field(static=True)
-    saturated_DN: float = eqx.field(static=True)
-
-    @classmethod
-    def of(cls, restorer: Restorer) -> FrontEnd:
-        """Take over what a restorer has."""
-        noise = restorer.noise
-        return cls(
-            None if restorer.wire is None else jnp.asarray(restorer.wire),
-            None if restorer.mask is None else jnp.asarray(restorer.mask.white),
-            cfa_named(restorer.rig.camera.cfa),
-            scalar(noise.K_DN_per_e),
-            scalar(noise.black_DN),
-            scalar(noise.bend_per_DN),
-            scalar(noise.sigma_d_e),
-            least_saturated_DN(noise),
-        )
 
     def light(
-        self, mosaic: UInt16[Array, "rows columns"], exposed: Exposed
-    ) -> tuple[Mosaic, Mosaic, Bool[Array, "rows columns"], Mosaic, Excess]:
-        """Return signal, variance, clipped samples and the panel's light as ``Restorer.scene_light`` does, in e-."""
-        signal = self._without_defects(self._electrons(mosaic.astype(jnp.float32), exposed.dark_DN))
-        variance = jnp.maximum(signal, 0) + exposed.floor_e2
+        self, mosaic: UInt16[Array, "rows columns"], exposed: Float[Array, "3"], known: Bool[Array, ""], rate: Mosaic
+    ) -> tuple[Mosaic, Mosaic, Bool[Array, "rows columns"], Mosaic, Float[Array, "3"]]:
+        """Return signal, variance, clipped samples and the panel's light as ``Restorer.scene_light`` does, in e-.
+
+        The last are arguments of ``refuse_excess_of``.
+
+        Args:
+            mosaic: rows of a frame in DN. exposed: exposure in s, DN and variance in e-^2 of a sample without light.
+            known: whether the panel's picture is known. rate: its backscatter in e-/s; anything when it is not.
+        """
+        exposure_s, dark_DN, floor_e2 = exposed
+        signal = self._without_defects(self._electrons(mosaic.astype(jnp.float32), dark_DN))
+        clipped = signal >= self._electrons(self.saturated_DN, dark_DN)
+        variance = jnp.maximum(signal, 0) + floor_e2
         if self.wire is not None:
             signal, variance = signal / self.wire, variance / self.wire / self.wire
-        clipped, panel = mosaic >= self.saturated_DN, jnp.zeros_like(signal)
+        panel = jnp.zeros_like(signal)
         if self.white is not None:
-            white, rate = self.white, signal / exposed.exposure_s
-            panel = exposed.exposure_s * jax.lax.cond(
-                exposed.known, lambda: exposed.rate, lambda: self._unknown(rate, white)
-            )
+            seen, white = signal / exposure_s, self.white
+            panel = exposure_s * jax.lax.cond(known, lambda: rate, lambda: self._unknown(seen, white))
         use = ~clipped[SPARSE]
-        sums = (jnp.sum(jnp.where(use, light[SPARSE], 0)) for light in (signal, panel))
-        return signal - panel, variance, clipped, panel, Excess(*sums, jnp.count_nonzero(use))
+        sums = (jnp.sum(light[SPARSE], where=use) for light in (signal, panel))
+        excess = jnp.stack([*sums, jnp.count_nonzero(use)])
+        return signal - panel, variance, clipped, panel, excess
 
-    def _electrons(self, mosaic_DN: Mosaic, dark_DN: Float[Array, ""]) -> Mosaic:
-        if self.bend_per_DN == 0:
-            return (mosaic_DN - dark_DN) / self.K_DN_per_e
-        straight = linear_signal(mosaic_DN - self.black_DN, self.bend_per_DN)
-        return (straight - (dark_DN - self.black_DN)) / self.K_DN_per_e
+    def _electrons(self, value_DN: Float[Array, "*n"], dark_DN: Float[Array, ""]) -> Float[Array, "*n"]:
+        black = self.noise.black_DN
+        straight = linear_signal(value_DN - black, self.noise.bend_per_DN)
+        return (straight - (dark_DN - black)) / self.noise.K_DN_per_e
 
     def _without_defects(self, signal_e: Mosaic) -> Mosaic:
         """Replace the samples that ``defects.without_defects`` does, by the same medians."""
-        planes = apart(signal_e, (self.cfa.rows, self.cfa.columns))
+        planes = apart(signal_e, self.cfa)
         (_, rows, columns), wide = planes.shape, jnp.pad(planes, ((0, 0), (1, 1), (1, 1)), mode="reflect")
         around = [wide[:, down : down + rows, across : across + columns] for down, across in _AROUND]
         high, low = jnp.max(jnp.stack(around), 0), jnp.min(jnp.stack(around), 0)
-        sigma = jnp.sqrt(jnp.maximum(high, 0) + self.sigma_d_e**2)
+        sigma = jnp.sqrt(jnp.maximum(high, 0) + self.noise.sigma_d_e**2)
         allowed = jnp.maximum(OUTLIER_SIGMA * sigma, OUTLIER_RATIO * (high - low))
         wrong = (planes > high + allowed) | (planes < low - allowed)
 
         def mended() -> Mosaic:
             median = jnp.median(jnp.stack([planes, *around]), axis=0)
-            return together(jnp.where(wrong, median, planes), (self.cfa.rows, self.cfa.columns))
+            return together(jnp.where(wrong, median, planes), self.cfa)
 
         return jax.lax.cond(jnp.any(wrong), mended, lambda: signal_e)
 
     def _unknown(self, rate: Mosaic, white: Mosaic) -> Mosaic:
         """Return the mask at the levels that ``PanelMask.levels`` finds, in e-/s."""
-        cell, channels = (self.cfa.rows, self.cfa.columns), np.array([site.channel for site in self.cfa.sites])
-        both = [_block_means(apart(light, cell), cell) for light in (rate, white)]
+        cfa, channels = self.cfa, channels_of(self.cfa)
+        down, across = (max(most // BLOCK, 1) for most in rate.shape)
+        cut = np.s_[: down * BLOCK, : across * BLOCK]
+        both = [resized(apart(light[cut], cfa), (down, across), cv2.INTER_AREA) for light in (rate, white)]
         levels = []
         for channel in range(3):
             seen, possible = (each[channels == channel].sum(axis=0) for each in both)
             ratio = jnp.where(possible > 0, seen / possible, jnp.nan)
             levels.append(jnp.clip(jnp.nan_to_num(jnp.nanpercentile(ratio, PERCENTILE)), 0, 1))
-        return together(jnp.stack(levels)[channels, None, None] * apart(white, cell), cell)
+        return together(jnp.stack(levels)[channels, None, None] * apart(white, cfa), cfa)
 
 
-def _block_means(
-    planes: Float[Array, "sites rows columns"], cell: tuple[int, int]
-) -> Float[Array, "sites down across"]:
-    """Return each site's mean in blocks of the mosaic."""
-    (down, high), (across, wide) = (
-        (max(most // (BLOCK // step), 1), min(most, BLOCK // step))
-        for most, step in zip(planes.shape[1:], cell, strict=True)
-    )
-    cut = planes[:, : down * high, : across * wide]
-    return cut.reshape(-1, down, high, across, wide).mean(axis=(2, 4))
+@functools.partial(jax.jit, static_argnames=("block", "cfa"))
+def panel_rate(
+    picture: UInt8[Array, "panel_rows panel_columns 3"], sums: dict[str, Array], block: int, cfa: Cfa
+) -> Mosaic:
+    """Return the backscatter of a panel's picture in e-/s as ``PanelLight.rate`` does, by the tables of ``PanelSums``.
 
-
-class PanelRows(eqx.Module):
-    """``PanelSums`` with as many shares in every row, filled up with zeros, so that a sum is a gather and a reduction.
-
-    Attributes:
-        shares, blocks: of each place. gain, mix, light, down, across: as in ``PanelSums``.
-        block: pixels across a block. cfa: the colour pattern.
+    Args:
+        picture: what the panel shows. sums: tables by their names. block: pixels across. cfa: the colour pattern.
     """
+    light, starts = jnp.moveaxis(sums["light"][picture], 2, 0), sums["starts"]
+    # At the panel's edge a block goes on mirrored.
+    light = jnp.pad(light, ((0, 0), *((0, -size % block) for size in light.shape[1:])), mode="symmetric")
+    blocks = resized(light, (light.shape[1] // block, light.shape[2] // block), cv2.INTER_AREA).reshape(3, -1)
+    shares = (sums["shares"] * blocks[:, sums["blocks"]]).T
+    place = jnp.repeat(jnp.arange(len(starts) - 1), jnp.diff(starts), total_repeat_length=len(shares))
+    collected = jax.ops.segment_sum(shares, place, len(starts) - 1, indices_are_sorted=True)
+    with jax.default_matmul_precision("highest"):
+        grid = (sums["gain"] * (sums["mix"] @ collected.T)).reshape(3, sums["down"].shape[1], -1)
+        whole = sums["down"] @ grid @ sums["across"].T
+    return together(jnp.stack([apart(whole[site.channel], cfa)[at] for at, site in enumerate(cfa.sites)]), cfa)
 
-    shares: Float[Array, "places most 3"]
-    blocks: Int[Array, "places most"]
-    gain: Float[Array, "3 places"]
-    mix: Float[Array, "3 3"]
-    light: Float[Array, " 256"]
-    down: Float[Array, "rows grid_rows"]
-    across: Float[Array, "columns grid_columns"]
-    block: int = eqx.field(static=True)
-    cfa: Cfa = eqx.field(static=True)
 
-    @classmethod
-    def of(cls, panel: PanelLight) -> PanelRows:
-        """Rearrange the sums of a panel."""
-        sums = panel.sums
-        counts = np.diff(sums.starts)
-        at = (
-            np.repeat(np.arange(len(counts)), counts),
-            np.arange(len(sums.blocks)) - np.repeat(sums.starts[:-1], counts),
-        )
-        shares = np.zeros((len(counts), int(counts.max()), 3), np.float32)
-        blocks = np.zeros(shares.shape[:2], np.int32)
-        shares[at], blocks[at] = sums.shares.T, sums.blocks
-        tables = (
-            jnp.asarray(each) for each in (shares, blocks, sums.gain, sums.mix, sums.light, sums.down, sums.across)
-        )
-        return cls(*tables, panel.block, panel.cfa)
+def plausible(picture_e: Float[Array, "3 rows columns"], error_e: Mosaic) -> Float[Array, "3 rows columns"]:
+    """Correct brightness and colour of dark places, as ``dark_places.plausible`` does.
 
-    @jax.jit
-    def rate(self, picture: UInt8[Array, "panel_rows panel_columns 3"]) -> Mosaic:
-        """Return the backscatter in e-/s as ``PanelLight.rate`` does."""
-        light, n = self.light[picture], self.block
-        rows, columns, _ = light.shape
-        # At the panel's edge a block goes on mirrored.
-        light = jnp.pad(light, ((0, -rows % n), (0, -columns % n), (0, 0)), mode="symmetric")
-        light = light.reshape(-(-rows // n), n, -(-columns // n), n, 3).mean(axis=(1, 3)).reshape(-1, 3)
-        collected = jnp.sum(self.shares * light[self.blocks], axis=1)
-        with jax.default_matmul_precision("highest"):
-            grid = self.gain * (self.mix @ collected.T)
-            grid = grid.reshape(3, self.down.shape[1], self.across.shape[1])
-            sites = [
-                self.down[site.row :: self.cfa.rows]
-                @ grid[site.channel]
-                @ self.across[site.column :: self.cfa.columns].T
-                for site in self.cfa.sites
-            ]
-        return together(jnp.stack(sites), (self.cfa.rows, self.cfa.columns))
+    Args:
+        picture_e: restored picture in e-. error_e: sigma of the light that was subtracted, in e-.
+    """
+    rows, columns = error_e.shape
+    size = max(rows // STEP, 1), max(columns // STEP, 1)
+    smooth = box_mean(resized(picture_e, size, cv2.INTER_AREA), 3)
+    error = jnp.maximum(resized(error_e, size, cv2.INTER_AREA), LEAST_E)
+    grey = smooth.mean(axis=0)
+    doubt = error**2 / (COLOURFUL * jnp.maximum(grey, 0) ** 2 + error**2)
+    # The errors of three colours average.
+    sigma = error / np.sqrt(np.float32(3))
+    ratio = grey / sigma
+    lift = sigma * jnp.exp(-(ratio**2) / 2 - log_ndtr(ratio)) / np.sqrt(np.float32(2 * np.pi))
+    change = resized(doubt * (grey - smooth) + lift, (rows, columns), cv2.INTER_LINEAR)
+    return jnp.where(doubt.max() < NEGLIGIBLE, picture_e, picture_e + change)

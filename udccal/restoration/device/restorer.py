@@ -1,4 +1,4 @@
-"""A prepared restorer on a device of JAX: one compiled function takes a raw frame to 8 bits."""
+"""A prepared restorer on a device of JAX: one compiled function takes the rows of a raw frame to 8 bits."""
 
 from __future__ import annotations
 
@@ -13,89 +13,81 @@ from jaxtyping import Array, Float, UInt8, UInt16
 
 from udccal.errors import RestorationError
 from udccal.restoration.backscatter import UNKNOWN_ERROR, refuse_excess_of
-from udccal.restoration.device.bands import Bands
-from udccal.restoration.device.finish import Resampling, plausible, rgb8
-from udccal.restoration.device.learned import Learned
-from udccal.restoration.device.light import Excess, Exposed, FrontEnd, Mosaic, PanelRows
-from udccal.restoration.device.planes import box_mean
+from udccal.restoration.device.bands import blurred, refined, shrunk
+from udccal.restoration.device.light import FrontEnd, panel_rate, plausible
+from udccal.restoration.device.planes import Mosaic, box_mean, cut, resampled
 from udccal.restoration.device.tile_filter import TileFilter
-from udccal.restoration.linear import dark_DN, variance_floor_e2
+from udccal.restoration.kernel_grid import interpolated_kernels
+from udccal.restoration.linear import dark_DN, least_saturated_DN, variance_floor_e2
 from udccal.restoration.mosaic_filter import STRENGTHS
-from udccal.restoration.network import SHARPER
+from udccal.restoration.network import SHARPER, Weights, network_weights
+from udccal.restoration.rectify import interpolation_taps
 from udccal.restoration.runtime import Restorer, check_frame, check_panel_picture
 from udccal.restoration.sharpen import LOCAL_PX
 from udccal.restoration.tone import CODES, Tone
 from udccal.tiers import Tier
 
-Picture = UInt8[np.ndarray, "view_rows view_columns 3"]
 PanelPicture = UInt8[np.ndarray, "panel_rows panel_columns 3"]
 
 
 class _Stages(eqx.Module):
-    """Everything that a frame passes, by arrays on the device."""
+    """Everything that a frame passes, by arrays on the device.
+
+    Attributes:
+        front, tiles: as they say. bands: what ``BandNoise`` has. learned: the network's weights, the tiles' kernels.
+        maps: arguments of ``resampled``. views: ways round in which the network sees a picture.
+        error_known: of the light of a known panel picture, relative.
+    """
 
     front: FrontEnd
     tiles: TileFilter
-    bands: Bands | None
-    learned: Learned | None
-    resampling: Resampling
-    codes: UInt8[Array, " levels"]
+    bands: tuple[Array, Array] | None
+    learned: tuple[Weights, Array] | None
+    maps: tuple[Array, Array, Array]
+    views: int = eqx.field(static=True)
     error_known: float = eqx.field(static=True)
 
     @jax.jit
     def shown(
-        self, mosaic: UInt16[Array, "rows columns"], exposed: Exposed, scale: Float[Array, "3"]
-    ) -> tuple[UInt8[Array, "view_rows view_columns 3"], Excess]:
-        """Return what a display shows, and how the frame's light compares with the panel's."""
+        self, raw: UInt16[Array, "rows columns"], scale: Array, exposed: Array, known: Array, rate: Mosaic
+    ) -> tuple[UInt8[Array, "view_rows view_columns 3"], Float[Array, "3"]]:
+        """Return what a display shows of some rows, and the arguments of ``refuse_excess_of``."""
         with jax.default_matmul_precision("highest"):
-            signal, variance, clipped, panel, excess = self.front.light(mosaic, exposed)
+            signal, variance, clipped, panel, excess = self.front.light(raw, exposed, known, rate)
             sharp = self._sharp(signal, variance, clipped)
             if self.front.white is not None:
-                error = jnp.where(exposed.known, self.error_known, max(self.error_known, UNKNOWN_ERROR))
-                sharp = jnp.where(error > 0, plausible(sharp, error * panel[self._rows]), sharp)
-            return rgb8(self.resampling.apply(sharp), scale, self.codes), excess
-
-    @property
-    def _rows(self) -> slice:
-        return slice(self.tiles.layout.first_row, self.tiles.layout.last_row)
+                error = jnp.where(known, self.error_known, max(self.error_known, UNKNOWN_ERROR))
+                sharp = jnp.where(error > 0, plausible(sharp, error * panel[self.tiles.layout.inner]), sharp)
+            # The table of ``Tone.rgb8``.
+            steps = jnp.round(resampled(sharp, *self.maps) * scale * (len(CODES) - 1))
+            return jnp.asarray(CODES)[jnp.clip(steps, 0, len(CODES) - 1).astype(jnp.int32)], excess
 
     def _sharp(self, signal: Mosaic, variance_e2: Mosaic, clipped: Array) -> Float[Array, "3 covered_rows columns"]:
         """Demosaic and deblur as ``Sharpener.apply`` does."""
-        tiles, strengths = self.tiles, jnp.asarray(STRENGTHS)
-        found = tiles.completed(tiles.whitened(tiles.cut(signal), tiles.noise(variance_e2)), clipped)
+        tiles, strengths, layout = self.tiles, jnp.asarray(STRENGTHS), self.tiles.layout
+        found = tiles.completed(tiles.whitened(cut(signal, *layout.samples), tiles.noise(variance_e2)), clipped)
         chosen = tiles.join(tiles.pictures(found, strengths[found.strength]))
         if self.bands is None:
             return chosen
-        bands, local = self.bands.of_tiles(found.strength), box_mean(variance_e2, LOCAL_PX)[self._rows]
-        balanced = self.bands.shrunk(chosen, found.noise_e, local, bands)
+        variance, probe = self.bands
+        noise = found.noise_e, box_mean(variance_e2, LOCAL_PX)[layout.inner], variance[probe, found.strength]
+        balanced = shrunk(chosen, noise, layout)
         if self.learned is None:
             return balanced
         sharper = jnp.minimum(strengths[found.strength] * SHARPER, STRENGTHS[-1])
-        sharp = tiles.join(tiles.pictures(found, sharper))
-        best = self.learned.refined(balanced, chosen, sharp, found.noise_e, local, bands)
-        rest = tiles.whitened(tiles.cut(self._rest(best, signal, clipped)), found.noise_e)
-        return best + tiles.join(tiles.pictures(rest, strengths[rest.strength]))
-
-    def _rest(self, picture: Float[Array, "3 covered_rows columns"], signal: Mosaic, clipped: Array) -> Mosaic:
-        """Return what the samples have more or less than a picture gives, in the rows that it covers."""
-        assert self.learned is not None
-        channels = self.tiles.cfa.channel_map(*signal.shape)[self._rows]
-        expected = jnp.take_along_axis(self.learned.blurred(picture), channels[None], axis=0)[0]
-        rest = jnp.zeros_like(signal).at[self._rows].set(signal[self._rows] - expected)
-        return jnp.where(clipped, jnp.maximum(rest, 0), rest)
+        (weights, kernels), sharp = self.learned, tiles.join(tiles.pictures(found, sharper))
+        best = refined(weights, [balanced, chosen, sharp], noise, layout, self.views)
+        # What the samples have more or less than the picture gives.
+        channels = tiles.cfa.channel_map(*signal.shape)[layout.inner]
+        expected = jnp.take_along_axis(blurred(best, kernels, layout), channels[None], axis=0)[0]
+        rest = jnp.zeros_like(signal).at[layout.inner].set(signal[layout.inner] - expected)
+        rest = jnp.where(clipped, jnp.maximum(rest, 0), rest)
+        against = tiles.whitened(cut(rest, *layout.samples), found.noise_e)
+        return best + tiles.join(tiles.pictures(against, strengths[against.strength]))
 
 
 @final
 @dataclass
-class _Latest:
-    """The latest picture of a panel, and its backscatter on the device."""
-
-    picture: PanelPicture | None
-    rate: Mosaic
-
-
-@final
-@dataclass(frozen=True)
 class DeviceRestorer:
     """A restorer whose tables lie on a device.
 
@@ -105,14 +97,15 @@ class DeviceRestorer:
     places is decided by all of its rows.
 
     Attributes:
-        restorer: as prepared. device: of JAX. stages: what frames pass. panel: backscatter of known pictures.
+        restorer: as prepared. stages: what frames pass. panel: tables of ``PanelSums``.
+        latest: picture of the panel. rate: its backscatter in e-/s.
     """
 
     restorer: Restorer
-    device: jax.Device
     stages: _Stages
-    panel: PanelRows | None
-    latest: _Latest
+    panel: dict[str, Array] | None
+    latest: PanelPicture
+    rate: Mosaic
 
     @classmethod
     def of(cls, restorer: Restorer, device: jax.Device | None = None) -> DeviceRestorer:
@@ -125,41 +118,37 @@ class DeviceRestorer:
         Raises:
             RestorationError: when the restorer does not deblur, or its frames do not have whole cells of the pattern.
         """
-        sharpener = restorer.sharpener
+        sharpener, camera, options = restorer.sharpener, restorer.rig.camera, restorer.options
         if sharpener is None:
             raise RestorationError(
                 f"Expected a restorer that deblurs, found tier '{restorer.tier}' of rig '{restorer.rig.name}', which "
                 "does not. Use Restorer.display, which takes some milliseconds."
             )
-        camera, cfa, layout = restorer.rig.camera, sharpener.cfa, sharpener.layout
+        cfa, layout, noise = sharpener.cfa, sharpener.layout, sharpener.noise
         if camera.rows % cfa.rows or camera.columns % cfa.columns:
             raise RestorationError(
                 f"Expected frames of whole {cfa.columns} x {cfa.rows} cells, found {camera.columns} x {camera.rows} "
                 "samples. Use Restorer.display."
             )
-        device = jax.devices()[0] if device is None else device
-        maps = restorer.rectification.from_row(layout.first_row)
-        learned = None
-        if restorer.tier is Tier.accurate:
-            learned = Learned.of(sharpener.grid, layout, restorer.options.network_views)
-        stages = _Stages(
-            FrontEnd.of(restorer),
-            TileFilter.of(sharpener.tables, layout, cfa),
-            None if sharpener.noise is None else Bands.of(sharpener.noise, layout),
-            learned,
-            Resampling.of(maps, restorer.options.interpolation),
-            jnp.asarray(CODES),
-            0.0 if restorer.mask is None else restorer.mask.error,
+        tables, kernels = sharpener.tables, interpolated_kernels(sharpener.grid, layout.centres_px)
+        white, error = (None, 0.0) if restorer.mask is None else (restorer.mask.white, restorer.mask.error)
+        pixel, index = restorer.rectification.from_row(layout.first_row).fixed
+        before, taps = interpolation_taps(options.interpolation)
+        front, filters, bands, learned, maps, panel, dark = jax.device_put(
+            (
+                (restorer.wire, white, restorer.noise, least_saturated_DN(restorer.noise)),
+                (tables.matched, tables.vectors, tables.values),
+                None if noise is None else (noise.variance, noise.probe),
+                (network_weights(), kernels) if restorer.tier is Tier.accurate else None,
+                (pixel.astype(np.int32) - before, np.stack([index % len(taps), index // len(taps)], axis=-1), taps),
+                None if restorer.panel is None else vars(restorer.panel.sums),
+                np.zeros((layout.reach.stop - layout.reach.start, camera.columns), np.float32),
+            ),
+            device or jax.devices()[0],
         )
-        panel = None if restorer.panel is None else PanelRows.of(restorer.panel)
-        dark = jnp.zeros((camera.rows, camera.columns), jnp.float32)
-        stages, panel, dark = jax.device_put((stages, panel, dark), device)
-        return cls(restorer, device, stages, panel, _Latest(None, dark))
-
-    @property
-    def table_bytes(self) -> int:
-        """Bytes of the filters' tables on the device."""
-        return sum(leaf.nbytes for leaf in jax.tree_util.tree_leaves(self.stages.tiles))
+        tiles = TileFilter(*filters, layout, cfa)
+        stages = _Stages(FrontEnd(*front, cfa), tiles, bands, learned, maps, options.network_views, error)
+        return cls(restorer, stages, panel, np.empty((0, 0, 3), np.uint8), dark)
 
     def display(
         self,
@@ -167,24 +156,20 @@ class DeviceRestorer:
         exposure_s: float,
         tone: Tone,
         panel_picture: PanelPicture | None = None,
-    ) -> Picture:
+    ) -> UInt8[np.ndarray, "view_rows view_columns 3"]:
         """Restore a frame for a display as ``Restorer.display`` does; arguments and errors are the same."""
         check_frame(mosaic, exposure_s, self.restorer.rig)
         check_panel_picture(panel_picture, self.restorer.rig)
-        noise, known = self.restorer.noise, panel_picture is not None and self.panel is not None
-        numbers = exposure_s, dark_DN(noise, exposure_s), variance_floor_e2(noise, exposure_s)
-        rate = self.latest.rate if panel_picture is None else self._rate(panel_picture)
+        noise, panel = self.restorer.noise, self.restorer.panel
+        known = panel_picture is not None and panel is not None
+        # A panel that stands still costs a comparison.
+        if panel_picture is not None and panel is not None and not np.array_equal(self.latest, panel_picture):
+            picture = jax.device_put(panel_picture, self.rate.device)
+            self.latest, self.rate = panel_picture.copy(), panel_rate(picture, self.panel, panel.block, panel.cfa)
+        exposed = np.array([exposure_s, dark_DN(noise, exposure_s), variance_floor_e2(noise, exposure_s)], np.float32)
         scale = replace(tone, exposure=tone.exposure / exposure_s).scale()
-        small = *(np.float32(each) for each in numbers), np.bool_(known)
-        raw, factors, *scalars = jax.device_put((mosaic, scale, *small), self.device)
-        shown, excess = jax.device_get(self.stages.shown(raw, Exposed(*scalars, rate), factors))
+        given = mosaic[self.restorer.rows], scale, exposed, np.bool_(known)
+        shown, excess = jax.device_get(self.stages.shown(*jax.device_put(given, self.rate.device), self.rate))
         if known:
-            refuse_excess_of(float(excess.seen_e), float(excess.expected_e), int(excess.samples))
+            refuse_excess_of(*map(float, excess))
         return np.asarray(shown)
-
-    def _rate(self, picture: PanelPicture) -> Mosaic:
-        """Return the backscatter of a picture; the latest picture's is kept."""
-        latest = self.latest
-        if self.panel is not None and (latest.picture is None or not np.array_equal(latest.picture, picture)):
-            latest.picture, latest.rate = picture.copy(), self.panel.rate(jax.device_put(picture, self.device))
-        return latest.rate
