@@ -135,7 +135,7 @@ def _conditions(runs: Sequence[Run]) -> str:
 
 
 def _plans(measured: Measured) -> str:
-    said = ["none" if budget is None else f"{budget:g} ms" for budget in BUDGETS_MS]
+    said = [f"{budget:g} ms" for budget in BUDGETS_MS]
     lines = [f"| tier | {' | '.join(said)} | expected − measured dB |", f"| --- |{' ---: |' * (len(said) + 1)}"]
     for tier in (*Tier, None):
         chosen = [
