@@ -4,8 +4,8 @@
 
 The profile is that of the simulated rig's specimen ``--seed``. Writes DIR/pareto.csv, a line per run; DIR/pareto.json,
 the numbers that have a limit; DIR/pareto.svg; DIR/TIER.png, pictures to look at; and DIR/pareto.md, all tables. A run
-of all scenes also puts the tables into docs/restoration.md, docs/tiers.md and README.md where these have markers for the rig. Exits
-with 1 where a number misses its limit. Nothing else should run meanwhile.
+of all scenes also puts the tables into docs/restoration.md, docs/tiers.md and README.md where these have markers for
+the rig. Exits with 1 where a number misses its limit. Nothing else should run meanwhile.
 """
 
 from __future__ import annotations
