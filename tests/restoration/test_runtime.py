@@ -104,13 +104,24 @@ def test_a_dark_scene_stays_grey_where_the_panels_light_is_known_badly(
     panel = restorer.rig.panel
     shown = np.full((panel.rows, panel.columns, 3), 255, np.uint8)
     colour_e = []
-    # A picture that is not known is in doubt, whatever the calibration states.
-    for error, known in ((0.0, shown), (0.06, shown), (0.0, None)):
+    for error, known in ((0.0, shown), (0.06, shown), (0.06, None)):
         picture = replace(restorer, mask=PanelMask(white, cfa, error)).restore(frame, EXPOSURE_S, known) * EXPOSURE_S
         smooth = cv2.blur(picture, (9, 9))
         colour_e.append(float(np.sqrt(np.mean((smooth[..., 0] - smooth[..., 2]) ** 2))))
     assert colour_e[0] > 100.0
     assert max(colour_e[1:]) < 0.5 * colour_e[0]
+
+
+def test_colours_behind_an_even_panel_stay_when_its_picture_is_not_known(restorer: Restorer) -> None:
+    cfa, camera = cfa_named(restorer.rig.camera.cfa), restorer.rig.camera
+    white = np.full((camera.rows, camera.columns), 4e5, np.float32)
+    scene = np.array([6e4, 3e4, 1e4])[cfa.channel_map(camera.rows, camera.columns)]
+    scene[:, : camera.columns // 3] = 0.0
+    counts = np.random.default_rng(9).poisson((white + scene) * EXPOSURE_S * restorer.wire)
+    frame = np.rint(64 + 0.355 * counts).astype(np.uint16)
+    found = replace(restorer, mask=PanelMask(white, cfa, 0.002)).restore(frame, EXPOSURE_S)
+    inside = found[:, found.shape[1] * 2 // 3 :].mean(axis=(0, 1))
+    np.testing.assert_allclose(inside, [6e4, 3e4, 1e4], rtol=0.15, atol=3e3)
 
 
 def test_the_result_is_in_e_per_s(restorer: Restorer, frame: np.ndarray, toy_scene: np.ndarray) -> None:

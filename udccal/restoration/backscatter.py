@@ -24,9 +24,6 @@ _LEAST_SHARE = 1e-6
 # Side in samples of the blocks that give the level: large enough to average noise, small enough to find dark places.
 BLOCK = 16
 PERCENTILE = 1.0
-# Least sigma over the light of a picture that is not known. One level misses such light by some half of it; but told
-# that, colours that are right turn grey.
-UNKNOWN_ERROR = 0.1
 # A frame is darker than its panel's light where this is more than so many times the frame, and more than so few e-.
 _MORE, _NEGLIGIBLE_E = 1.2, 1.0
 # Samples of which the sums are taken: few, and by an odd step, so that every colour is among them.

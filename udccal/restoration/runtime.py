@@ -21,7 +21,7 @@ from udccal.models.noise import Noise
 from udccal.models.psf import PsfField
 from udccal.profiles.profile import Profile
 from udccal.profiles.store import load_profile
-from udccal.restoration.backscatter import UNKNOWN_ERROR, PanelLight, PanelMask, mask_mosaic, refuse_excess
+from udccal.restoration.backscatter import PanelLight, PanelMask, mask_mosaic, refuse_excess
 from udccal.restoration.dark_places import plausible
 from udccal.restoration.defects import without_defects
 from udccal.restoration.demosaic import demosaic
@@ -239,9 +239,8 @@ class Restorer:
             if panel_picture is not None:
                 refuse_excess(signal, panel_e, clipped)
             signal -= panel_e
-            error = self.mask.error if panel_picture is not None else max(self.mask.error, UNKNOWN_ERROR)
-            if error > 0:
-                panel_error_e = np.float32(error) * panel_e
+            if self.mask.error > 0:
+                panel_error_e = np.float32(self.mask.error) * panel_e
         return SceneLight(signal, variance, clipped, panel_error_e)
 
     def display(

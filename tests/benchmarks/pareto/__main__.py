@@ -4,9 +4,9 @@
 
 The profile is that of the simulated rig's specimen ``--seed``. Writes DIR/pareto.csv, a line per run; DIR/pareto.json,
 the numbers that have a limit; DIR/pareto.svg; DIR/TIER.png, pictures to look at; and DIR/pareto.md, all tables. A run
-of all scenes also puts the tables into docs/restoration.md and README.md where these have markers for the rig. Exits
-with 1 where a number misses its limit. Nothing else should run meanwhile. With ``--device gpu``, the tiers on a GPU are
-measured instead (``tests.benchmarks.device``).
+of all scenes also puts the tables into docs/restoration.md, docs/tiers.md and README.md where these have markers for
+the rig. Exits with 1 where a number misses its limit. Nothing else should run meanwhile. With ``--device gpu``, the
+tiers on a GPU are measured instead (``tests.benchmarks.device``).
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from udccal.rig import load_rig
 from udccal.simulation.truth import draw_truth
 
 _ROOT = Path(__file__).resolve().parents[3]
-_PAGE, _README = _ROOT / "docs" / "restoration.md", _ROOT / "README.md"
+_PAGE, _TIERS, _README = _ROOT / "docs" / "restoration.md", _ROOT / "docs" / "tiers.md", _ROOT / "README.md"
 # Every n-th of the nineteen shows what a choice trades.
 _CHOICES_EVERY = 3
 
@@ -72,6 +72,7 @@ def _write(found: Measured, choices: str, options: argparse.Namespace) -> None:
     contents = (
         (_PAGE, "pareto", full_table(found)),
         (_PAGE, "choices", choices),
+        (_TIERS, "pareto", compact_table(found)),
         (_README, "pareto", compact_table(found)),
     )
     (out / "pareto.md").write_text("\n\n".join(content for *_, content in contents) + "\n", encoding="utf-8")

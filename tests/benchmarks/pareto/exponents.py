@@ -80,23 +80,20 @@ def cut(restorer: Restorer, rows: int, columns: int) -> Restorer:
         rows: of what is left, whole cells. columns: of what is left, whole cells.
     """
     camera = restorer.rig.camera
-    part = np.s_[:rows, :columns]
     rig = restorer.rig.model_copy(update={"camera": camera.model_copy(update={"rows": rows, "columns": columns})})
     down, across = rows / camera.rows, columns / camera.columns
     maps = restorer.rectification.map_x * np.float32(across), restorer.rectification.map_y * np.float32(down)
     size = round(restorer.view.columns * across), round(restorer.view.rows * down)
     rectification = Rectification(*(cv2.resize(each, size, interpolation=cv2.INTER_AREA) for each in maps))
     sharpener, mask = restorer.sharpener, restorer.mask
+    if sharpener is not None:
+        sharpener = Sharpener.of(sharpener.grid, rig, rectification.rows, restorer.tier, restorer.options)
+    smaller = replace(restorer, rig=rig, panel=None, sharpener=sharpener, rectification=rectification)
+    part = np.s_[: len(range(rows)[smaller.rows]), :columns]
     return replace(
-        restorer,
-        rig=rig,
+        smaller,
         wire=None if restorer.wire is None else np.ascontiguousarray(restorer.wire[part]),
         mask=None if mask is None else PanelMask(np.ascontiguousarray(mask.white[part]), cfa_named(camera.cfa)),
-        panel=None,
-        sharpener=None
-        if sharpener is None
-        else Sharpener.of(sharpener.grid, rig, rectification.rows, restorer.tier, restorer.options),
-        rectification=rectification,
     )
 
 

@@ -11,6 +11,7 @@ from tests.benchmarks.pareto.clear_camera import without_panel
 from tests.benchmarks.pareto.exponents import growth_rows, growths_of
 from tests.benchmarks.pareto.fine_scenes import fine_scenes
 from tests.benchmarks.pareto.groups import COMPARED, Case, Group, cases_of
+from tests.benchmarks.pareto.instead import peer_rows, peers_of
 from tests.benchmarks.pareto.judging import gain_rows, loss_rows, order_rows, time_rows
 from tests.benchmarks.pareto.plans import choice_rows, error_rows, plans_of
 from tests.benchmarks.pareto.precision import losses_of
@@ -28,6 +29,8 @@ from udccal.restoration.runtime import Restorer
 from udccal.simulation.truth import RigTruth
 from udccal.tiers import Tier
 
+# Every n-th of the nineteen is restored by others too.
+_PEERS_EVERY = 5
 # In these nothing clips.
 _PRECISION_SCENES = ("Carrots", "kodim05", "kodim15", "mosaic 1")
 
@@ -104,6 +107,9 @@ def measured(name: str, profile: Profile, seen: Seen, out: Path, folder: Path, s
     say("tables are rounded")
     growths = growths_of(name, seen.usual[0].taken, keep)
     say("growth is measured")
+    compared = [sight for sight in seen.usual if sight.case.group is Group.nineteen][::_PEERS_EVERY]
+    peers = peers_of(Restorer.from_profile(profile, Tier.fast, keep=keep), compared)
+    say("others have restored them")
     camera = profile.rig.camera
     rows = [
         *time_rows(runs, camera.rows * camera.columns),
@@ -114,8 +120,9 @@ def measured(name: str, profile: Profile, seen: Seen, out: Path, folder: Path, s
         *error_rows(plans, runs),
         *start_rows(starts),
         *growth_rows(growths),
+        *peer_rows(peers, runs, [sight.case.shot.name for sight in compared]),
     ]
-    return Measured(runs, seen.clear, ready_s, plans, losses, rows)
+    return Measured(runs, seen.clear, ready_s, plans, losses, peers, rows)
 
 
 def _runs_of(setup: Setup, seen: Seen, sheet: Path) -> tuple[list[Run], float]:

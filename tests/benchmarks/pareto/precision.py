@@ -152,7 +152,7 @@ def _double_gain_dB(restorer: Restorer, sharpener: Sharpener, sight: Sight) -> f
     """dB by which the filter in double precision is better than in single precision."""
     light = restorer.scene_light(sight.taken.frame, sight.taken.exposure_s, sight.taken.panel_picture)
     single = sharpener.solved(light.signal_e, light.variance_e2, light.clipped)
-    double = sharpener.layout.join(in_double(sharpener, light, single), restorer.options.workers)
+    double = sharpener.layout.join(in_double(sharpener, light, single))
     onto_view = restorer.rectification.from_row(sharpener.rows.start)
 
     def dB(picture: Float32[np.ndarray, "rows columns 3"]) -> float:

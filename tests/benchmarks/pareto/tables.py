@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tests.benchmarks.pareto.groups import COMPARED, Group
+from tests.benchmarks.pareto.instead import Peer, peer_table
 from tests.benchmarks.pareto.plans import BUDGETS_MS, Plans, bias_dB
 from tests.benchmarks.pareto.precision import LEAST_DB, Loss, cheapest
 from tests.benchmarks.pareto.runs import Clear, Run, mean_dB, of_group
@@ -32,6 +33,7 @@ class Measured:
     ready_s: Mapping[Tier, float]
     plans: Plans
     losses: Sequence[Loss]
+    peers: Sequence[Peer]
     rows: Sequence[Row]
 
 
@@ -50,6 +52,8 @@ def full_table(measured: Measured) -> str:
             _plans(measured),
             "What rounding costs, on some scenes in which nothing clips (tables: of the filters, as they are stored):",
             precision_table(measured.losses),
+            "What a user would take instead, on every fifth of the nineteen, with the best strength for these scenes:",
+            peer_table(measured.peers),
             "What has a limit:",
             table(list(measured.rows)),
         )
@@ -135,7 +139,7 @@ def _conditions(runs: Sequence[Run]) -> str:
 
 
 def _plans(measured: Measured) -> str:
-    said = ["none" if budget is None else f"{budget:g} ms" for budget in BUDGETS_MS]
+    said = [f"{budget:g} ms" for budget in BUDGETS_MS]
     lines = [f"| tier | {' | '.join(said)} | expected − measured dB |", f"| --- |{' ---: |' * (len(said) + 1)}"]
     for tier in (*Tier, None):
         chosen = [

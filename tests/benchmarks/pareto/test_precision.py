@@ -39,7 +39,7 @@ def light() -> SceneLight:
 
 def test_the_filter_in_double_precision_is_the_same_filter(sharpener: Sharpener, light: SceneLight) -> None:
     solved = sharpener.solved(light.signal_e, light.variance_e2, light.clipped)
-    double = sharpener.layout.join(in_double(sharpener, light, solved), 1)
+    double = sharpener.layout.join(in_double(sharpener, light, solved))
     # Single precision rounds to some 1 e- of 3000 here: much cancels in the sum over sites. The noise is 55 e-.
     assert np.abs(double - solved.picture).max() < 2
 
@@ -47,7 +47,7 @@ def test_the_filter_in_double_precision_is_the_same_filter(sharpener: Sharpener,
 def test_a_filter_of_other_strength_is_told_from_it(sharpener: Sharpener, light: SceneLight) -> None:
     solved = sharpener.solved(light.signal_e, light.variance_e2, light.clipped)
     weaker = replace(solved, strengths=solved.strengths / np.float32(2))
-    double = sharpener.layout.join(in_double(sharpener, light, weaker), 1)
+    double = sharpener.layout.join(in_double(sharpener, light, weaker))
     assert np.abs(double - solved.picture).max() > 5
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float, UInt8, UInt16
 
 from udccal.errors import RestorationError
-from udccal.restoration.backscatter import UNKNOWN_ERROR, refuse_excess_of
+from udccal.restoration.backscatter import refuse_excess_of
 from udccal.restoration.device.bands import blurred, refined, shrunk
 from udccal.restoration.device.light import FrontEnd, panel_rate, plausible
 from udccal.restoration.device.planes import Mosaic, box_mean, cut, resampled
@@ -36,7 +36,7 @@ class _Stages(eqx.Module):
     Attributes:
         front, tiles: as they say. bands: what ``BandNoise`` has. learned: the network's weights, the tiles' kernels.
         maps: arguments of ``resampled``. views: ways round in which the network sees a picture.
-        error_known: of the light of a known panel picture, relative.
+        error: sigma of the panel's light over the light.
     """
 
     front: FrontEnd
@@ -45,7 +45,7 @@ class _Stages(eqx.Module):
     learned: tuple[Weights, Array] | None
     maps: tuple[Array, Array, Array]
     views: int = eqx.field(static=True)
-    error_known: float = eqx.field(static=True)
+    error: float = eqx.field(static=True)
 
     @jax.jit
     def shown(
@@ -55,9 +55,8 @@ class _Stages(eqx.Module):
         with jax.default_matmul_precision("highest"):
             signal, variance, clipped, panel, excess = self.front.light(raw, exposed, known, rate)
             sharp = self._sharp(signal, variance, clipped)
-            if self.front.white is not None:
-                error = jnp.where(known, self.error_known, max(self.error_known, UNKNOWN_ERROR))
-                sharp = jnp.where(error > 0, plausible(sharp, error * panel[self.tiles.layout.inner]), sharp)
+            if self.error > 0:
+                sharp = plausible(sharp, self.error * panel[self.tiles.layout.inner])
             # The table of ``Tone.rgb8``.
             steps = jnp.round(resampled(sharp, *self.maps) * scale * (len(CODES) - 1))
             return jnp.asarray(CODES)[jnp.clip(steps, 0, len(CODES) - 1).astype(jnp.int32)], excess
