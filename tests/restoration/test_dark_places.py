@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from udccal.restoration.dark_places import plausible
 
@@ -30,6 +31,15 @@ def colour(picture: np.ndarray) -> np.ndarray:
 
 def error_map(sigma_e: float) -> np.ndarray:
     return np.full((ROWS, COLUMNS), sigma_e, np.float32)
+
+
+@pytest.mark.parametrize("sigma_e", [0.0, 1e-6, 0.3, 300.0])
+def test_what_is_far_below_zero_comes_out_as_black(sigma_e: float) -> None:
+    found = plausible(flat(-0.5, -2000.0, -4.0), error_map(sigma_e))
+    grey = found.mean(axis=2)
+    assert np.all(np.isfinite(found))
+    assert np.all(grey > -1e-3)
+    assert grey.max() < max(sigma_e, 1e-3)
 
 
 def test_a_picture_far_brighter_than_the_error_is_returned_itself() -> None:

@@ -12,7 +12,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 from jaxtyping import Float32
-from scipy.special import log_ndtr
+from scipy.special import erfcx
 
 # Variance of a colour's deviation from grey over the square of the grey: as in the filter's prior.
 COLOURFUL = 0.2
@@ -69,5 +69,5 @@ def _doubt(
 
 def _lift(value: Float32[np.ndarray, "..."], sigma: Float32[np.ndarray, "..."]) -> Float32[np.ndarray, "..."]:
     """Return the posterior mean less ``value`` of what is not negative (the truncated normal distribution's mean)."""
-    ratio = value / sigma
-    return sigma * np.exp(-(ratio**2) / 2 - log_ndtr(ratio)) / np.float32(np.sqrt(2 * np.pi))
+    # The normal density over its integral, by the scaled error function: both underflow far below 0.
+    return sigma * np.float32(np.sqrt(2 / np.pi)) / erfcx(value / (-np.float32(np.sqrt(2)) * sigma))

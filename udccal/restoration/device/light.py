@@ -22,6 +22,9 @@ from udccal.restoration.mosaic_filter import channels_of
 
 _AROUND = tuple((down, across) for down in range(3) for across in range(3) if (down, across) != (1, 1))
 
+# Sigmas below 0 from which the mean of what is not negative is taken from a series.
+_FAR = 8.0
+
 
 class FrontEnd(eqx.Module):
     """What the rows of a frame pass before they are deblurred.
@@ -134,7 +137,10 @@ def plausible(picture_e: Float[Array, "3 rows columns"], error_e: Mosaic) -> Flo
     doubt = error**2 / (COLOURFUL * jnp.maximum(grey, 0) ** 2 + error**2)
     # The errors of three colours average.
     sigma = error / np.sqrt(np.float32(3))
-    ratio = grey / sigma
-    lift = sigma * jnp.exp(-(ratio**2) / 2 - log_ndtr(ratio)) / np.sqrt(np.float32(2 * np.pi))
+    # The normal density over its integral; both underflow far below 0, where their ratio is a series.
+    ratio = jnp.clip(grey / sigma, -_FAR, None)
+    far = -grey / (1 - ratio**-2 + 3 * ratio**-4)
+    near = sigma * jnp.exp(-(ratio**2) / 2 - log_ndtr(ratio)) / np.sqrt(np.float32(2 * np.pi))
+    lift = jnp.where(ratio > -_FAR, near, far)
     change = resized(doubt * (grey - smooth) + lift, (rows, columns), cv2.INTER_LINEAR)
     return jnp.where(doubt.max() < NEGLIGIBLE, picture_e, picture_e + change)
