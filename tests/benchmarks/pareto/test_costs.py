@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import mmap
 import sys
 
-import numpy as np
 import pytest
 
 from tests.benchmarks.pareto.exponents import Growth, growth_rows
@@ -31,8 +31,8 @@ def test_each_late_start_is_told() -> None:
 
 
 def test_the_start_of_a_program_lasts_until_it_speaks() -> None:
-    script = "import time; time.sleep(0.2); print('restored', flush=True); time.sleep(0.5)"
-    assert 0.2 < to_first_line_s([sys.executable, "-c", script], {}) < 0.7
+    script = "import time; time.sleep(0.2); print('restored', flush=True); time.sleep(2)"
+    assert 0.2 < to_first_line_s([sys.executable, "-c", script], {}) < 2.0
 
 
 @pytest.mark.parametrize(
@@ -47,7 +47,9 @@ def test_a_program_that_fails_has_no_start(script: str) -> None:
 def test_a_peak_of_memory_is_seen_and_set_back() -> None:
     reset_peak()
     before = peak_MiB()
-    np.ones(32 * 2**20, dtype=np.uint8).sum()
+    # Pages of their own, which go back to the system at once; an array may stay within the heap.
+    with mmap.mmap(-1, 32 * 2**20) as pages:
+        pages.write(bytes(range(256)) * 2**17)
     assert 25 < peak_MiB() - before < 100
     reset_peak()
     assert peak_MiB() - before < 16
