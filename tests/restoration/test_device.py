@@ -17,7 +17,9 @@ from udccal.cfa import cfa_named
 from udccal.errors import RestorationError
 from udccal.fitting.nominal import nominal_geometry
 from udccal.models.noise import Noise
+from udccal.restoration import dark_places
 from udccal.restoration.backscatter import PanelLight, PanelMask, PanelSums
+from udccal.restoration.device.light import plausible as dark_on_device
 from udccal.restoration.device.restorer import DeviceRestorer
 from udccal.restoration.kernel_grid import KernelGrid
 from udccal.restoration.runtime import Restorer
@@ -181,3 +183,15 @@ def test_what_a_device_cannot_do_is_refused(restorers: dict[Tier, Restorer]) -> 
     odd = restorer.rig.camera.model_copy(update={"rows": 199})
     with pytest.raises(RestorationError, match="whole 2 x 2 cells"):
         DeviceRestorer.of(replace(restorer, rig=restorer.rig.model_copy(update={"camera": odd})))
+
+
+@pytest.mark.parametrize("light_e", [-5e4, -2000.0, -30.0, -1.0, 0.5, 40.0])
+@pytest.mark.parametrize("sigma_e", [1e-6, 2.0, 200.0])
+def test_dark_places_are_those_of_the_cpu_however_far_below_zero(light_e: float, sigma_e: float) -> None:
+    picture = np.broadcast_to(np.float32([1.0, 0.5, 1.5]) * np.float32(light_e), (64, 80, 3)).copy()
+    error = np.full(picture.shape[:2], sigma_e, np.float32)
+    found = np.moveaxis(
+        np.asarray(dark_on_device(jnp.moveaxis(jnp.asarray(picture), -1, 0), jnp.asarray(error))), 0, -1
+    )
+    expected = dark_places.plausible(picture, error)
+    np.testing.assert_allclose(found, expected, atol=1e-3 * max(sigma_e, 1e-3 * abs(light_e), 1e-2))

@@ -18,10 +18,10 @@ Samples come in units of their noise. Then one table serves every brightness, ex
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Protocol, final, runtime_checkable
+from typing import Protocol, TypeAlias, final, runtime_checkable
 
 import cv2
 import numpy as np
@@ -48,6 +48,10 @@ SPARSE = 3
 _STRIDE, _HALF_STEPS = 4, (2, 1)
 # Every n-th row of cells gives a tile's level.
 LEVEL_ROWS = 4
+
+Tiles: TypeAlias = (
+    Sequence[Float32[np.ndarray, "*colours rows columns"]] | Float32[np.ndarray, "tiles *colours rows columns"]
+)
 
 
 @runtime_checkable
@@ -177,19 +181,12 @@ def filtered(
         pictures in e-, and the strength of the prior that each tile chose, in units of its noise.
     """
     pictures = np.empty((len(tiles), layout.rows, layout.columns, 3), dtype=np.float32)
-    chosen = np.empty(len(tiles), dtype=np.float32)
-
-    def one(index: int) -> None:
-        own = noise_e[index], tables.at(index), layout, pattern, None if strengths is None else strengths[index]
-        pictures[index], chosen[index] = _filtered_tile(tiles[index], *own)
-
-    with ThreadPoolExecutor(workers) as pool:
-        list(pool.map(one, range(len(tiles))))
-    return pictures, chosen
+    given = tiles, noise_e, tables, layout, pattern, workers, strengths
+    return pictures, _filter_each(*given, [range(len(tiles))], pictures.__setitem__)
 
 
 def filtered_and_joined(
-    tiles: Sequence[Float32[np.ndarray, "*colours rows columns"]] | Float32[np.ndarray, "tiles *colours rows columns"],
+    tiles: Tiles,
     noise_e: Float32[np.ndarray, "tiles 3"],
     tables: FilterTables,
     layout: TileLayout,
@@ -201,17 +198,34 @@ def filtered_and_joined(
 
     Every picture is blended while a core's cache has it. Arguments and strengths are those of ``filtered``.
     """
-    joined, chosen = np.zeros((*layout.covered, 3), dtype=np.float32), np.empty(layout.count, dtype=np.float32)
+    joined = np.zeros((*layout.covered, 3), dtype=np.float32)
+    given = tiles, noise_e, tables, layout, pattern, workers, strengths
+    return joined, _filter_each(*given, layout.apart, lambda index, picture: layout.blend(picture, index, joined))
+
+
+def _filter_each(
+    tiles: Tiles,
+    noise_e: Float32[np.ndarray, "tiles 3"],
+    tables: FilterTables,
+    layout: TileLayout,
+    pattern: Pattern,
+    workers: int,
+    strengths: Float32[np.ndarray, "tiles"] | None,
+    groups: Iterable[Sequence[int]],
+    take: Callable[[int, Float32[np.ndarray, "rows columns 3"]], None],
+) -> Float32[np.ndarray, " tiles"]:
+    """Filter one group of tiles after the other, hand over every picture, and return the strengths."""
+    chosen = np.empty(len(tiles), dtype=np.float32)
 
     def one(index: int) -> None:
         own = noise_e[index], tables.at(index), layout, pattern, None if strengths is None else strengths[index]
         picture, chosen[index] = _filtered_tile(tiles[index], *own)
-        layout.blend(picture, index, joined)
+        take(index, picture)
 
     with ThreadPoolExecutor(workers) as pool:
-        for some in layout.apart:
-            list(pool.map(one, some))
-    return joined, chosen
+        for group in groups:
+            list(pool.map(one, group))
+    return chosen
 
 
 def _filtered_tile(

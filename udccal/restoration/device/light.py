@@ -138,9 +138,10 @@ def plausible(picture_e: Float[Array, "3 rows columns"], error_e: Mosaic) -> Flo
     # The errors of three colours average.
     sigma = error / np.sqrt(np.float32(3))
     # The normal density over its integral; both underflow far below 0, where their ratio is a series.
-    ratio = jnp.clip(grey / sigma, -_FAR, None)
-    far = -grey / (1 - ratio**-2 + 3 * ratio**-4)
-    near = sigma * jnp.exp(-(ratio**2) / 2 - log_ndtr(ratio)) / np.sqrt(np.float32(2 * np.pi))
+    ratio = grey / sigma
+    low, high = jnp.minimum(ratio, -_FAR), jnp.maximum(ratio, -_FAR)
+    far = -grey / (1 - low**-2 + 3 * low**-4)
+    near = sigma * jnp.exp(-(high**2) / 2 - log_ndtr(high)) / np.sqrt(np.float32(2 * np.pi))
     lift = jnp.where(ratio > -_FAR, near, far)
     change = resized(doubt * (grey - smooth) + lift, (rows, columns), cv2.INTER_LINEAR)
     return jnp.where(doubt.max() < NEGLIGIBLE, picture_e, picture_e + change)
