@@ -16,13 +16,14 @@ RIGS ?= 12
 LIVE_OUT ?= live.json
 COVERAGE_OUT ?= coverage
 OTHER_DAYS_OUT ?= other-days
+GUIDED_OUT ?= guided
 ROBUST_OUT ?= robust
 NETWORK_MINUTES ?= 60
 ROBUST ?=
 PEERS ?=
 USB ?=
 
-.PHONY: install demo test test-medium test-slow test-usb fuzz load lint types contracts check accuracy tables efficiency coverage extremes pareto device network budget drift other-days rigs live robust peers growth docs clean
+.PHONY: install demo test test-medium test-slow test-usb fuzz load lint types contracts check accuracy tables efficiency coverage extremes pareto device network budget drift other-days guided rigs live robust peers growth docs clean
 
 install: $(STAMP)
 
@@ -105,7 +106,7 @@ growth: $(STAMP)
 	$(BIN)/python -m tests.benchmarks.growth.run
 
 # Simulated rigs, half of them changed, by `udccal check`. Writes a file per rig, which a second run goes on from, and the
-# table of docs/check.md.
+# table of docs/drift.md.
 drift: $(STAMP)
 	$(BIN)/python -m tests.benchmarks.drift --rigs $(DRIFT_RIGS) --out $(DRIFT_OUT)
 
@@ -113,6 +114,11 @@ drift: $(STAMP)
 # docs/validate.md and docs/check.md and the example of README.md; non-zero exit where a number misses its limit.
 other-days: $(STAMP)
 	$(BIN)/python -m tests.benchmarks.other_days --out $(OTHER_DAYS_OUT)
+
+# A full-size rig captured by a hand that misses its aims, against exact captures, both fitted. Goes on where it was
+# stopped. Writes guided.json and the table of docs/cli.md; non-zero exit where a number misses its limit.
+guided: $(STAMP)
+	$(BIN)/python -m tests.benchmarks.guided --out $(GUIDED_OUT)
 
 # Rigs of which every number, opening and noise is drawn, written by a program that is not udccal's. Goes on where it was
 # stopped. Writes drawn.json and the table of docs/accuracy.md; non-zero exit where a profile is wrong and does not say so.
@@ -154,4 +160,4 @@ docs: $(STAMP)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
 clean:
-	rm -rf $(VENV) $(DEMO_OUT) $(ACCURACY_OUT) $(EFFICIENCY_OUT) $(ROBUST_OUT) $(PARETO_OUT) $(BUDGET_OUT) $(OTHER_DAYS_OUT) $(RIGS_OUT) $(LIVE_OUT) site peers build dist *.egg-info
+	rm -rf $(VENV) $(DEMO_OUT) $(ACCURACY_OUT) $(EFFICIENCY_OUT) $(ROBUST_OUT) $(PARETO_OUT) $(BUDGET_OUT) $(OTHER_DAYS_OUT) $(GUIDED_OUT) $(RIGS_OUT) $(LIVE_OUT) site peers build dist *.egg-info

@@ -2,11 +2,11 @@
 
     python -m tests.benchmarks.drift [--rigs N] [--out DIR]
 
-A rig is a specimen of the reduced mirror with a sixteenth of its pixels, so that two hundred take minutes. Each
+A rig is a specimen of the reduced mirror with a quarter of its pixels, so that two hundred take less than an hour. Each
 specimen is calibrated once: its lens is the true one, as boards have too few pixels, and it has no psf, which a check
 does not use. Then it is checked on twelve other days: untouched on six, and on the others changed in one way each, in a
 direction or at a place of its own. Writes one file
-per rig to DIR, which a second run goes on from, DIR/drift.json and the table of docs/check.md; exits with 1 where a
+per rig to DIR, which a second run goes on from, DIR/drift.json and the table of docs/drift.md; exits with 1 where a
 number misses its limit.
 """
 
@@ -44,12 +44,14 @@ from udccal.simulation.truth import RigTruth, draw_truth, rotation_matrix
 from udccal.simulation.world import SimulatedWorld
 from udccal.term_fits import TermFits
 
-_PAGE = Path(__file__).resolve().parents[2] / "docs" / "check.md"
+_PAGE = Path(__file__).resolve().parents[2] / "docs" / "drift.md"
 _UNTOUCHED = "untouched"
 _FIRST_DAY = 1000
 # Each specimen's days: as many untouched as changed.
 _DAYS = 12
 _MOST_FALSE, _LEAST_CAUGHT, _LEAST_NAMED = 5.0, 95.0, 90.0
+_KNOCK_MM, _TILT_DEG = 0.05, 0.2
+_MOST_OFF_MM, _MOST_OFF_DEG = 0.01, 0.02
 
 Changed = tuple[RigTruth, Disturbances]
 
@@ -57,13 +59,13 @@ Changed = tuple[RigTruth, Disturbances]
 def knocked(truth: RigTruth, rng: np.random.Generator) -> Changed:
     """Move the camera by 0.05 mm in some direction."""
     way = rng.normal(size=3)
-    x, y, z = 0.05 * way / np.linalg.norm(way)
+    x, y, z = _KNOCK_MM * way / np.linalg.norm(way)
     return knock(truth, (float(x), float(y), float(z))), Disturbances()
 
 
 def tilted(truth: RigTruth, rng: np.random.Generator) -> Changed:
     """Turn the camera by 0.2 degree about its x axis, up or down."""
-    angle, optics = 0.2 * float(rng.choice([-1.0, 1.0])), truth.optics
+    angle, optics = _TILT_DEG * float(rng.choice([-1.0, 1.0])), truth.optics
     turned = optics.R_panel_camera @ rotation_matrix(0, -np.deg2rad(angle))
     return replace(
         truth, optics=replace(optics, R_panel_camera=turned, tilt_deg=optics.tilt_deg + angle)
@@ -108,10 +110,10 @@ CHANGES: dict[str, Callable[[RigTruth, np.random.Generator], Changed]] = {
 
 
 def small_rig() -> RigDescription:
-    """The reduced rig with a quarter of its pixels across and down, and a panel little larger than what it sees."""
+    """The reduced rig with half of its pixels across and down, and a panel little larger than what it sees."""
     rig = load_rig("lg55-reduced")
     camera, panel, mounting = rig.camera, rig.panel, rig.mounting
-    sensor = {"columns": camera.columns // 4, "rows": camera.rows // 4, "pitch_um": 4 * camera.pitch_um}
+    sensor = {"columns": camera.columns // 2, "rows": camera.rows // 2, "pitch_um": 2 * camera.pitch_um}
     middle = {
         name: getattr(mounting, name).model_copy(update={"value": value})
         for name, value in (("panel_x_px", 120.0), ("panel_y_px", 60.0))
@@ -199,7 +201,7 @@ def run_trial(number: int, specimen: Specimen) -> Trial:
 
 
 def judged(trials: list[Trial]) -> list[Row]:
-    """False alarms of untouched rigs, and by change how many were caught and named."""
+    """False alarms of untouched rigs, by change how many were caught and named, and errors of movements."""
     alone = [one for one in trials if one.case == _UNTOUCHED]
     rows = [
         at_most(
@@ -215,6 +217,12 @@ def judged(trials: list[Trial]) -> list[Row]:
             caught, named = ([one.verdict == "changed" for one in some], [one.changed == [name] for one in some])
             rows.append(at_least(f"{name}: caught, of {len(some)}", _percent(caught), _LEAST_CAUGHT, "%"))
             rows.append(at_least(f"{name}: named and nothing else", _percent(named), _LEAST_NAMED, "%"))
+    for name, found, true, most, unit in (
+        ("moved", "moved_mm", _KNOCK_MM, _MOST_OFF_MM, "mm"),
+        ("tilted", "turned_deg", _TILT_DEG, _MOST_OFF_DEG, "°"),
+    ):
+        off = [abs(getattr(one, found) - true) for one in trials if one.case == name]
+        rows.append(at_most(f"{name}: size found, worst error", max(off, default=float("nan")), most, unit))
     return rows
 
 

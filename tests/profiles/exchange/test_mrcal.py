@@ -94,7 +94,7 @@ def test_mrcal_tells_the_difference_that_udccal_tells(tmp_path: Path, profile: P
     files = write(profile, tmp_path / "a.cameramodel"), write(changed, tmp_path / "b.cameramodel")
     answer = mrcal_reads(*files, points=points, panel_m=panel_points_m())
     rays, lens, _ = _rays(profile, changed)
-    # Of the lens alone, mrcal takes the turn that brings angles closest, udccal the one that brings pixels closest.
+    # Of the lens alone, mrcal takes the turn of least fourth powers of angles, udccal of least squares in pixels.
     for ours, theirs, within in ((rays, answer["rays"], 0.01), (lens, answer["lens"], 0.03)):
         size = np.percentile(np.hypot(*ours.T), 95)
         assert size > 0.01

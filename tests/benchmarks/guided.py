@@ -1,0 +1,129 @@
+"""`make guided`: a rig calibrated by a hand that misses its aims, against one whose captures are commanded exactly.
+
+    python -m tests.benchmarks.guided [--rig RIG] [--out DIR]
+
+The rig is specimen 0 of the accuracy table. The simulated hand holds the LED up to 20 px and boards up to 3 degrees
+away from where they are wanted, and goes on wherever the guide says that all is in order. Both sessions are fitted.
+Captures and profiles in DIR are kept, and a second run goes on from there. Writes DIR/guided.json and, of
+the full-size rig, the table of docs/cli.md; exits with 1 where a number misses its limit.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import get_args
+
+import numpy as np
+
+from tests.benchmarks.commit import this_commit
+from tests.benchmarks.draws import FULL, REDUCED, Draw
+from tests.benchmarks.readme_tables import put_table
+from tests.benchmarks.rows import Row, at_most, table, write_json
+from tests.benchmarks.terms import term_rows
+from tests.guide.scripted import Scripted
+from udccal.benches.bench import simulated_bench
+from udccal.benches.capture import capture
+from udccal.cli.jobs.fit import fit_to_profile
+from udccal.cli.output import Output
+from udccal.guide.capture import lead_capture
+from udccal.io.atomic import write_atomically
+from udccal.profiles.profile import Profile
+from udccal.profiles.store import read_profile
+from udccal.result import FitResult
+from udccal.sessions.schema import TermName
+from udccal.sessions.writer import SessionWriter
+from udccal.simulation.hand import Hand
+from udccal.simulation.world import SimulatedWorld
+
+_PAGE = Path(__file__).resolve().parents[2] / "docs" / "cli.md"
+_MOST_PROMPTS, _MOST_SIGMA = 40, 1.10
+_AIMED: tuple[TermName, ...] = ("geometry", "psf")
+
+
+@dataclass(frozen=True)
+class Calibrated:
+    """A profile, and how often a person was asked for it."""
+
+    profile: Profile
+    prompts: int
+    commit: str
+
+
+def calibrated(draw: Draw, folder: Path, by_hand: bool) -> Calibrated:
+    """Capture and fit a specimen, or take what the folder holds from before."""
+    session, profile, commit, asked = (folder / name for name in ("session", "profile", "commit.txt", "prompts.txt"))
+    if not commit.exists():
+        world = SimulatedWorld(draw.truth, seed=draw.seed)
+        if by_hand:
+            write_atomically(asked, str(_led(world, session)).encode())
+        else:
+            with simulated_bench(world) as bench:
+                capture(session, bench)
+        fit_to_profile(Output(), session, profile)
+        write_atomically(commit, this_commit().encode())
+    prompts = int(asked.read_text(encoding="utf-8")) if by_hand else 0
+    return Calibrated(read_profile(profile), prompts, commit.read_text(encoding="utf-8").strip())
+
+
+def _led(world: SimulatedWorld, session: Path) -> int:
+    """Lead a willing person, whose hand is inexact, through every step; returns how often it was asked."""
+    person = Scripted()
+    with simulated_bench(world) as bench:
+        held = replace(bench, stage=Hand(world))
+        with SessionWriter.create_or_resume(session, bench.rig, bench.camera.identity, now=bench.now) as writer:
+            lead_capture(writer, held, person, get_args(TermName))
+    assert person.done.complete, person.done.sentence
+    return person.prompts
+
+
+def judged(commanded: Calibrated, guided: Calibrated, draw: Draw) -> list[Row]:
+    """The person's prompts, what sigmas have become, and the errors of the terms that are aimed."""
+    rows = [at_most("prompts of the guided capture", guided.prompts, _MOST_PROMPTS, "")]
+    for term in _AIMED:
+        one, other = (getattr(each.profile, term) for each in (commanded, guided))
+        ratios = sigma_ratios(one, other)
+        worst = max(ratios, key=lambda name: ratios[name])
+        rows.append(
+            at_most(
+                f"{term}: sigma, guided over commanded, median of {len(ratios)}",
+                float(np.median(list(ratios.values()))),
+                _MOST_SIGMA,
+                "",
+            )
+        )
+        rows.append(at_most(f"{term}: sigma, guided over commanded, worst ({worst})", ratios[worst], _MOST_SIGMA, ""))
+    told = [row for row in term_rows(guided.profile, draw.truth) if row.name.startswith(("psf", "projection", "tilt"))]
+    return rows + [replace(row, name=f"guided: {row.name}") for row in told]
+
+
+def sigma_ratios(commanded: FitResult, guided: FitResult) -> dict[str, float]:
+    """Of every quantity that has a meaning of its own, and whose sigma the data decide."""
+    one, other = ({each.name: each for each in result.numbers} for result in (commanded, guided))
+    return {
+        name: other[name].sigma / one[name].sigma
+        for name in one
+        if name in other and one[name].sigma > 0 and not one[name].by_prior
+    }
+
+
+def main() -> int:
+    """Calibrate twice and compare."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--rig", choices=FULL + REDUCED, default=FULL[0])
+    parser.add_argument("--out", type=Path, default=Path("guided"))
+    options = parser.parse_args()
+    draw, out = Draw(options.rig, 0), options.out
+    commanded, guided = (calibrated(draw, out / f"{draw}-{name}", name == "guided") for name in ("commanded", "guided"))
+    rows = judged(commanded, guided, draw)
+    write_json(rows, out / "guided.json")
+    print(table(rows))
+    if options.rig == FULL[0]:
+        put_table(_PAGE, "guided", table(rows), [commanded.commit, guided.commit])
+    return 0 if all(row.ok for row in rows) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,40 @@
+"""The table of guided captures refuses wider error bars, and judges only what the data decide."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+
+from tests.benchmarks.draws import Draw
+from tests.benchmarks.guided import Calibrated, judged, sigma_ratios
+from udccal.profiles.profile import Profile
+from udccal.profiles.store import load_profile
+from udccal.result import FitResult
+
+
+@pytest.fixture(scope="module")
+def shipped() -> Profile:
+    return load_profile("lg55-reduced")
+
+
+def wider(result: FitResult, by: float) -> FitResult:
+    estimates = tuple(dataclasses.replace(each, sigma=by * each.sigma) for each in result.estimates)
+    return dataclasses.replace(result, estimates=estimates)
+
+
+def test_sigmas_are_compared_by_name(shipped: Profile) -> None:
+    ratios = sigma_ratios(shipped.geometry, wider(shipped.geometry, 1.2))
+    assert {"fx", "cx", "k1", "tilt_deg"} <= ratios.keys()
+    assert all(ratio == pytest.approx(1.2) for ratio in ratios.values())
+    # Its sigma is the rig's tolerance, however an LED is held.
+    assert "pitch_mm" not in sigma_ratios(shipped.psf, shipped.psf)
+
+
+@pytest.mark.medium
+@pytest.mark.parametrize(("by", "prompts", "missed"), [(1.0, 12, 0), (1.2, 12, 2), (1.0, 41, 1)])
+def test_wider_error_bars_and_many_prompts_are_missed(shipped: Profile, by: float, prompts: int, missed: int) -> None:
+    changed = dataclasses.replace(shipped, geometry=wider(shipped.geometry, by))
+    rows = judged(Calibrated(shipped, 0, "a"), Calibrated(changed, prompts, "b"), Draw("lg55-reduced", 0))
+    # The shipped profile is of another specimen: its errors are not judged here.
+    assert sum(not row.ok for row in rows if not row.name.startswith("guided:")) == missed
