@@ -11,6 +11,7 @@ from typing import final
 
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy.ndimage import binary_dilation
 
 from udccal.fitting.engine.gaussian import scaled_inverse
 from udccal.fitting.wire.data import FlatNoise, Pixels, WireData, flat_noise, sample_pixels, weighed
@@ -23,9 +24,13 @@ from udccal.validation.flats import CELLS, cell_medians, cell_numbers, light_des
 # Rotation (3), stand-off, offset (2) as in ``shape_vector``, and the focal length.
 POSE, _FOCAL = 6, 6
 # Pixels of each step: few until the pose is near.
-_SAMPLES = (14_000, 14_000, 110_000)
+_SAMPLES = (14_000, 14_000, 110_000, 110_000)
 # Parts of the sensor are left out that are off by so many sigma and so much.
 _ODD_SIGMA, _ODD = 6.0, 0.004
+# So many parts around them are left out, too: a smudge has no edge, and what is left of it there moves the pose.
+_MARGIN = 2
+# Not where as much of the sensor is off: that is no smudge.
+_MOST_ODD = 0.5
 # Relative step of the derivative by the focal length.
 _SMALL = 1e-4
 
@@ -65,6 +70,8 @@ def pose_change(wire: Wire, data: WireData) -> PoseChange:
         left, sigma = cell_medians(weighed(pixels, whole * base * light, noise), noise)
         with np.errstate(invalid="ignore"):
             odd = (np.abs(left) > _ODD) & (np.abs(left) > _ODD_SIGMA * sigma)
+        around = binary_dilation(odd, np.ones((3, 3)), iterations=_MARGIN)
+        odd = around if around.mean() < _MOST_ODD else odd
     change = shape_vector(wire)[:POSE] - shape_vector(start)[:POSE]
     focal = np.log(np.asarray(wire.geometry.focal_px)[0] / np.asarray(start.geometry.focal_px)[0])
     return PoseChange(np.append(change, focal), cov, wire, left, sigma, variance)
