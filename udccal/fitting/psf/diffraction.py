@@ -172,16 +172,20 @@ def _refine(
         moved = float(np.sqrt(change @ solution.equations.marginal()[0] @ change))
         LOG.debug("psf: model error %.3g, moved by %.3g sigma", model_error, moved)
         fit = DiffractionFit(problem, solution, shots, model_error, found, iterations)
-        # Without iterations left, the round before counts: it has ended, with weights of a slightly different model.
-        if not solution.converged:
+        # Derivatives are those of a place nearby: a descent may stop where they are not those of the cost, and the next
+        # one goes on with new ones. Otherwise, and without iterations left, the round before counts: it has ended, with
+        # weights of a slightly different model.
+        if not solution.converged and (moved < 0.1 or iterations >= rules.iterations):
             return whole or fit
         if enough < 1.0 and moved < 0.1:
             return fit
         # So near, a step that does not succeed shows the end of what the derivatives can tell.
-        whole, place, (enough, damping) = fit, solution.place, (1e-2, 1.0) if moved < 1.0 else (1.0, 1e6)
+        place, (enough, damping) = solution.place, (1e-2, 1.0) if moved < 1.0 else (1.0, 1e6)
+        whole = fit if solution.converged else whole
         # A change of less than a sigma is small enough for the interference set up before, of five for its derivatives.
         if moved >= 1.0:
             problem = problem.about(place.theta, place.own, moved < 5.0)
+        if moved >= 1.0 or not solution.converged:
             place = problem.at(place.theta, place.own)
     # Weights that go on to change the parameters give no minimum.
     return replace(fit, solution=replace(fit.solution, converged=False))
