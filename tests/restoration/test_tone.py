@@ -64,3 +64,11 @@ def test_other_forms_are_refused(tmp_path: Path, name: str, bits: int) -> None:
     with pytest.raises(RestorationError, match=r"Expected a picture name ending in"):
         write_picture(tmp_path / name, PICTURE, Tone(1.0), bits)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_light_far_beyond_white_is_white() -> None:
+    linear = np.array([[[1.0, 1e5, 1e30], [0.0, -1.0, 0.5]]], np.float32)
+    tone = Tone(3.0)
+    shown = tone.rgb8(linear)
+    assert shown[0, 0].tolist() == [255, 255, 255]
+    assert np.abs(shown.astype(int) - to_rgb8(tone.apply(linear))).max() <= 1

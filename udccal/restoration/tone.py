@@ -24,8 +24,10 @@ class Tone:
 
     def rgb8(self, linear: Float32[np.ndarray, "rows columns 3"]) -> UInt8[np.ndarray, "rows columns 3"]:
         """Return what a display shows, in 8 bits: ``to_rgb8(apply(linear))`` by a table, within 1 of 255."""
-        # Rounded, and clipped at both ends.
-        steps = cv2.multiply(linear, (*(self.scale() * (len(CODES) - 1)).tolist(), 0.0), dtype=cv2.CV_16U)
+        # Rounded, and clipped at both ends; beyond the range of 32-bit integers the product would be 0.
+        most = 1e4 / max(float(self.scale().max()), 1e-30)
+        bounded = cv2.threshold(linear, most, most, cv2.THRESH_TRUNC)[1]
+        steps = cv2.multiply(bounded, (*(self.scale() * (len(CODES) - 1)).tolist(), 0.0), dtype=cv2.CV_16U)
         return cv2.LUT(steps, CODES)
 
     def apply(self, linear: Float[np.ndarray, "rows columns 3"]) -> Float32[np.ndarray, "rows columns 3"]:

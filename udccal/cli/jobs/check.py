@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 from udccal.cli.bench_options import BenchOptions
@@ -49,6 +50,7 @@ def check_profile(
         check_writable(update.parent)
     profile = load_profile(path)
     rig, folder = short_rig(profile.rig), out / "session"
+    _put_aside(folder, out / "check.json")
     person = led_by(output, TerminalPerson(output), agree) if options.real else None
     if not options.capture(output, rig, Wanted(folder, ("wire", "backscatter")), person):
         return None
@@ -66,3 +68,12 @@ def check_profile(
     output.say(f"Written: {out / 'check.html'} and {out / 'check.json'}")
     output.result(found)
     return found.verdict != "changed"
+
+
+def _put_aside(session: Path, answer: Path) -> None:
+    """Keep the captures of a check that was answered as ``session-before``: a rig of today is not judged by them."""
+    if answer.exists() and session.is_dir():
+        before = session.with_name("session-before")
+        shutil.rmtree(before, ignore_errors=True)
+        session.rename(before)
+    answer.unlink(missing_ok=True)
