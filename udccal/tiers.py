@@ -5,6 +5,8 @@ from __future__ import annotations
 import enum
 from typing import Final
 
+from udccal.errors import RestorationError
+
 
 class Tier(enum.StrEnum):
     """How much is done to a frame, from quickest to most accurate. docs/restoration.md has seconds and dB of each.
@@ -24,3 +26,16 @@ class Tier(enum.StrEnum):
 
 # What is done where nobody asks for anything else.
 DEFAULT_TIER: Final = Tier.balanced
+
+
+def tier_named(tier: Tier | str) -> Tier:
+    """Return the tier of a name.
+
+    Raises:
+        RestorationError: when there is no such tier.
+    """
+    try:
+        return Tier(tier)
+    except ValueError:
+        names = ", ".join(Tier)
+        raise RestorationError(f"Expected a tier, found {tier!r}. Give one of {names}.") from None

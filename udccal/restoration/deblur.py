@@ -27,7 +27,7 @@ from udccal.restoration.network import refined, sharper
 from udccal.restoration.plan import PlanOptions
 from udccal.restoration.shrink import measured_noise, shrunk
 from udccal.restoration.tiles import TileLayout, layout_for
-from udccal.tiers import Tier
+from udccal.tiers import Tier, tier_named
 
 _EVERY = (slice(None), slice(None))
 # The finest diagonal detail: second differences along both axes.
@@ -59,7 +59,7 @@ def deblur(
     y_px: Float[np.ndarray, "..."],
     tile_px: int = 256,
     workers: int = 2,
-    tier: Tier = Tier.balanced,
+    tier: Tier | str = Tier.balanced,
 ) -> Float32[np.ndarray, "rows columns 3"]:
     """Deblur a picture.
 
@@ -79,6 +79,7 @@ def deblur(
         RestorationError: when a number is not finite or beyond single precision, the kernels do not sum to 1, shapes
             do not agree, or the tier does not deblur.
     """
+    tier = tier_named(tier)
     if tier is Tier.preview:
         raise RestorationError("Expected a tier that deblurs, found preview. Give fast, balanced or accurate.")
     picture, *places = (np.asarray(each) for each in (picture, kernels, x_px, y_px))

@@ -36,7 +36,7 @@ from udccal.restoration.stages import Stage
 from udccal.restoration.tone import Tone
 from udccal.restoration.view import kept_view
 from udccal.rig import RigDescription
-from udccal.tiers import Tier
+from udccal.tiers import Tier, tier_named
 
 Mosaic = Float32[np.ndarray, "rows columns"]
 Picture = Float32[np.ndarray, "rows columns 3"]
@@ -109,7 +109,7 @@ class Restorer:
     def from_profile(
         cls,
         profile: Profile,
-        tier: Tier = Tier.balanced,
+        tier: Tier | str = Tier.balanced,
         options: PlanOptions | None = None,
         keep: Path | None = None,
         without: frozenset[Stage] = frozenset(),
@@ -129,7 +129,7 @@ class Restorer:
             RestorationError: when its geometry leaves no view through the panel, or a term gives values that are not
                 finite.
         """
-        options = options or PlanOptions()
+        options, tier = options or PlanOptions(), tier_named(tier)
         rig, geometry = profile.rig, profile.geometry.term
         camera, cfa = rig.camera, cfa_named(rig.camera.cfa)
         view = kept_view(geometry, rig, keep)
