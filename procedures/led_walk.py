@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Final, final
 
@@ -33,7 +33,6 @@ _STILL_PX, _STILL_LOOKS, _UNKNOWN_PX = 0.1, 3, 99.0
 # Of the distance of places that are spread as evenly as can be. Chance finds a new one in two or three nudges.
 _APART: Final = 0.4
 _SEEN: Final = 0.2  # of the range
-_UNSATURATED: Final = 0.85  # of the range
 # (x, y) on the sensor in px.
 Place = tuple[float, float]
 
@@ -130,7 +129,7 @@ class LedVisit:
         self._seen_px.clear()
         start_s = exposure_of(self._cell.step_ids[0], self._writer) if self._taken_px else None
         captures = take_step(step, self._bench, self._writer, start_s)
-        place = self._held_place(captures, region)
+        place = self._held_place(captures[0], region)
         led = LedSubject(
             x_px=place[0], y_px=place[1], distance_mm=self._asked.distance_mm, diameter_mm=self._asked.diameter_mm
         )
@@ -140,17 +139,11 @@ class LedVisit:
             self._ask_from(place, self._next_phase())
         yield
 
-    def _held_place(self, captures: Sequence[Capture], region: Region) -> Place:
-        """Return where the LED was in a bracket, once it is sure that it still is there.
-
-        Of its frames the brightest that is not saturated counts: noise moves the place in a dark one by 0.1 px.
-        """
-        frames = [capture.frame for capture in captures if isinstance(capture, SingleFrame)]
-        full = saturation_DN(self._rig) - self._rig.camera.black_DN.value
-        bright = [frame for frame in frames if find_led(frame, self._rig).peak_DN < _UNSATURATED * full] or frames
-        best = max(bright, key=lambda frame: frame.settings.exposure_s)
-        place = find_led(best, self._rig).place_px
-        after = trial_frame(self._bench.camera, region, best.settings.exposure_s)
+    def _held_place(self, first: Capture, region: Region) -> Place:
+        """Return where the LED was in the first frame of a bracket, once it is sure that it still is there."""
+        assert isinstance(first, SingleFrame)
+        place = find_led(first.frame, self._rig).place_px
+        after = trial_frame(self._bench.camera, region, first.frame.settings.exposure_s)
         moved = _distance(place, find_led(after, self._rig).place_px)
         if moved > _STILL_PX:
             raise CaptureError(

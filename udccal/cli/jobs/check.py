@@ -50,7 +50,8 @@ def check_profile(
         check_writable(update.parent)
     profile = load_profile(path)
     rig, folder = short_rig(profile.rig), out / "session"
-    _put_aside(folder, out / "check.json")
+    with storing_in(out):
+        _put_aside(folder, out / "check.json")
     person = led_by(output, TerminalPerson(output), agree) if options.real else None
     if not options.capture(output, rig, Wanted(folder, ("wire", "backscatter")), person):
         return None
