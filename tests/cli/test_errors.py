@@ -24,7 +24,16 @@ def broken_session(folder: Path) -> Path:
     return folder
 
 
+def nested_rig(folder: Path) -> Path:
+    folder.mkdir()
+    (folder / "rig.toml").write_text("name = " + "[" * 100_000)
+    return folder
+
+
 FAILURES = {
+    "a rig of lists in lists": lambda tmp: (["rig", "check", str(nested_rig(tmp / "r"))], "rig"),
+    "a name of 5000 letters": lambda tmp: (["rig", "check", "r" * 5000], "File name too long"),
+    "a path of 5000 letters": lambda tmp: (["fit", "s" * 5000, "--profile", str(tmp / "p")], "File name too long"),
     "no session": lambda tmp: (["fit", str(tmp / "absent"), "--profile", str(tmp / "p")], "Expected"),
     "broken session": lambda tmp: (["fit", str(broken_session(tmp / "s")), "--profile", str(tmp / "p")], "session"),
     "no profile": lambda tmp: (["profile", "show", str(tmp / "absent")], "profile.json"),
@@ -60,6 +69,13 @@ def test_with_json_the_failure_is_json_and_with_debug_there_is_a_traceback(tmp_p
     assert done.returncode == 1
     assert "profile.json" in json.loads(done.stdout)["error"]
     assert "Traceback" in done.stderr
+
+
+def test_with_events_the_failure_is_the_last_event(tmp_path: Path) -> None:
+    places = ["--session", str(tmp_path / "s"), "--profile", str(tmp_path / "p")]
+    done = udccal("calibrate", "--rig", "no-such-rig", *places, "--practice", "--json-events")
+    assert done.returncode == 1
+    assert "no-such-rig" in json.loads(done.stdout.splitlines()[-1])["error"]
 
 
 @pytest.mark.parametrize("words", [["restore"], ["calibrate", "--rig", "lg55-reduced"], ["nonsense"]], ids=str)

@@ -26,30 +26,85 @@ def udccal(*words: str | Path) -> subprocess.CompletedProcess[str]:
     return subprocess.run([*COMMAND, *map(str, words)], capture_output=True, text=True, timeout=280)
 
 
-@pytest.mark.medium
-@pytest.mark.parametrize("flags", [[], ["--json"]], ids=str)
-def test_ctrl_c_leaves_with_130_and_a_sentence(flags: list[str], tmp_path: Path) -> None:
-    words = ["calibrate", "--rig", write_toy_rig(tmp_path), "--session", tmp_path / "s", "--profile", tmp_path / "p"]
+def interrupted(words: list[str | Path], sign: Path | None, wait_s: float) -> tuple[int, str, str]:
+    """Press Ctrl-C some time after a file is there, or after the start; return status, output and errors."""
     with subprocess.Popen(
-        [*COMMAND, *map(str, words), *flags],
+        [*COMMAND, *map(str, words)],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
         # A shell that runs these tests in the background has them ignore it.
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
     ) as process:
-        while not (tmp_path / "s" / "session.json").exists():
+        while sign is not None and not sign.exists():
             assert process.poll() is None
-            time.sleep(0.02)
+            time.sleep(0.002)
+        time.sleep(wait_s)
         process.send_signal(signal.SIGINT)
         out, err = process.communicate(timeout=200)
-    assert process.returncode == 130
+    return process.returncode, out, err
+
+
+# While verbs are imported, frames are captured, and a camera's threads end.
+@pytest.mark.medium
+@pytest.mark.parametrize(
+    ("wait_s", "flags"), [(0.0, []), (0.01, ["--json"]), (0.03, []), (0.1, []), (0.25, []), (0.4, ["--json"])], ids=str
+)
+def test_ctrl_c_leaves_with_130_and_a_sentence(wait_s: float, flags: list[str], tmp_path: Path) -> None:
+    words = ["calibrate", "--rig", write_toy_rig(tmp_path), "--session", tmp_path / "s", "--profile", tmp_path / "p"]
+    status, out, err = interrupted([*words, *flags], tmp_path / "s" / "session.json", wait_s)
+    assert status == 130, err
     assert err.strip().splitlines()[-1].startswith("udccal: Stopped. Run the same command again to continue")
     assert "Traceback" not in err
     if flags:
         assert json.loads(out)["error"].startswith("Stopped.")
     else:
         assert out == ""
+
+
+@pytest.mark.parametrize("wait_s", [0.15, 0.3])
+def test_ctrl_c_while_the_command_starts_is_met_with_a_sentence(wait_s: float) -> None:
+    status, _, err = interrupted(["demo", "--out", "/dev/null/demo"], None, wait_s)
+    assert status in (1, 130)  # on a quick machine the place is refused before
+    assert err.startswith("udccal: ")
+    assert "Traceback" not in err
+
+
+@pytest.mark.parametrize(
+    "swallowed",
+    [
+        "exec('raise KeyboardInterrupt')",  # Python then ends by the signal, whatever the status is
+        "Freed(); time.sleep(20)",  # Python prints it and goes on
+    ],
+    ids=["in text", "while freed"],
+)
+def test_ctrl_c_is_met_wherever_python_is(swallowed: str, tmp_path: Path) -> None:
+    (tmp_path / "program.py").write_text(
+        "import sys, time\n"
+        "import udccal.cli.jobs.show as job\n"
+        "from udccal.cli.main import main\n"
+        "class Freed:\n"
+        "    def __del__(self): raise KeyboardInterrupt\n"
+        "def interrupted(*_):\n"
+        f"    {swallowed}\n"
+        "job.show_profile = interrupted\n"
+        "main(['profile', 'show', 'anything'])\n"
+    )
+    done = subprocess.run([sys.executable, "-m", "program"], cwd=tmp_path, capture_output=True, text=True, timeout=280)
+    assert done.returncode == 130
+    (sentence,) = done.stderr.strip().splitlines()
+    assert sentence.startswith("udccal: Stopped.")
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a file that is always full")
+@pytest.mark.parametrize("flags", [[], ["--json"]], ids=str)
+def test_a_full_disk_behind_the_output_is_a_sentence(flags: list[str]) -> None:
+    with Path("/dev/full").open("w") as full:
+        words = [*COMMAND, "rig", "list", *flags]
+        done = subprocess.run(words, stdout=full, stderr=subprocess.PIPE, text=True, timeout=280)
+    assert done.returncode == 1
+    assert "No space left on device" in done.stderr.strip().splitlines()[-1]
+    assert "Traceback" not in done.stderr
 
 
 @pytest.mark.parametrize(

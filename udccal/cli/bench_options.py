@@ -106,7 +106,7 @@ class BenchOptions:
         from udccal.cli.jobs import benches, guided
 
         if self.camera is CameraKind.sim:
-            with guided.practice_bench(rig, self.seed, person) as (bench, practising):
+            with guided.practice_bench(rig, self.seed, self.noise_seed, person) as (bench, practising):
                 return not guided.capture_led(output, bench, practising, wanted).stopped
         find = benches.u3v_camera if self.camera is CameraKind.u3v else benches.pylon_camera
         seen = find(self.serial)

@@ -20,7 +20,17 @@ from udccal.cli.bench_options import (
     Monitor,
     Serial,
 )
-from udccal.cli.options import DOUBTFUL, STOPPED, IterationLog, ProfilePath, RigName, Seed, SessionFolder, TermChoice
+from udccal.cli.options import (
+    DOUBTFUL,
+    STOPPED,
+    IterationLog,
+    NoiseSeed,
+    ProfilePath,
+    RigName,
+    Seed,
+    SessionFolder,
+    TermChoice,
+)
 from udccal.cli.output import Output
 
 if TYPE_CHECKING:
@@ -46,6 +56,7 @@ def calibrate(
     display: Display = DisplayKind.manual,
     monitor: Monitor = 0,
     seed: Seed = 0,
+    noise_seed: NoiseSeed = None,
     term: Annotated[
         list[TermChoice] | None, typer.Option("--term", help="Capture this term only; may be given again.")
     ] = None,
@@ -76,7 +87,7 @@ def calibrate(
     from udccal.rig import load_rig
     from udccal.sessions.changes import Exchanged
 
-    options = BenchOptions(camera, serial, files, display, monitor, seed)
+    options = BenchOptions(camera, serial, files, display, monitor, seed, noise_seed)
     led = practice or options.real
     _check_words(camera, led, practice, yes or json_events or web)
     if port and not web:

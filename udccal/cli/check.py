@@ -18,7 +18,7 @@ from udccal.cli.bench_options import (
     Monitor,
     Serial,
 )
-from udccal.cli.options import CHANGED, STOPPED, FoundProfile, Seed
+from udccal.cli.options import CHANGED, STOPPED, FoundProfile, NoiseSeed, Seed
 
 
 def check(
@@ -30,9 +30,7 @@ def check(
     display: Display = DisplayKind.manual,
     monitor: Monitor = 0,
     seed: Seed = 0,
-    noise_seed: Annotated[
-        int | None, typer.Option("--noise-seed", min=0, help="Noise of the simulated rig: the same rig, another day.")
-    ] = None,
+    noise_seed: NoiseSeed = None,
     yes: Agree = False,
     out: Annotated[Path, typer.Option("--out", help="Folder for the captures, check.json and check.html.")] = Path(
         "udccal-check"

@@ -31,6 +31,9 @@ SessionFolder = Annotated[Path, typer.Option("--session", help="Folder of the se
 ProfilePath = Annotated[Path, typer.Option("--profile", help="Folder of the profile, or a zip file.")]
 FoundProfile = Annotated[Path, typer.Option("--profile", help="A profile's folder or zip file, or a rig's name.")]
 OutFolder = Annotated[Path, typer.Option("--out", help="Folder for the results.")]
+NoiseSeed = Annotated[
+    int | None, typer.Option("--noise-seed", min=0, help="Noise of the simulated rig: the same rig, another day.")
+]
 Seed = Annotated[int, typer.Option("--seed", min=0, help="Chooses the specimen of the simulated rig, and its noise.")]
 IterationLog = Annotated[Path | None, typer.Option("--log", help="Write every iteration of every solver to this file.")]
 PanelPicturePath = Annotated[

@@ -40,9 +40,11 @@ class Reported:
 
 
 @contextmanager
-def practice_bench(rig: RigDescription, seed: int, person: Person) -> Iterator[tuple[CaptureBench, Person]]:
+def practice_bench(
+    rig: RigDescription, seed: int, noise_seed: int | None, person: Person
+) -> Iterator[tuple[CaptureBench, Person]]:
     """Open a simulated rig with a simulated hand, and return it with the person who tells the hand what to do."""
-    world = simulated_rig(rig, seed)
+    world = simulated_rig(rig, seed, noise_seed)
     hand = Hand(world)
     with simulated_bench(world) as bench:
         yield replace(bench, stage=hand), Practising(person, hand)
