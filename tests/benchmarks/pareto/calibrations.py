@@ -1,0 +1,124 @@
+"""The trade in calibration: what profiles of fewer captures lose in the pictures that they restore."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Final, get_args
+
+import numpy as np
+
+import udccal
+from tests.benchmarks.pareto.restoring import Setup, TierProcess
+from tests.benchmarks.pareto.runs import Sight
+from udccal.benches.bench import simulated_bench
+from udccal.planning.state import nominal_state
+from udccal.planning.steps import Cost
+from udccal.restoration.metrics import psnr
+from udccal.restoration.plan import PlanOptions
+from udccal.rig import Captures, RigDescription
+from udccal.sessions.schema import TermName
+from udccal.simulation.truth import RigTruth
+from udccal.simulation.world import SimulatedWorld
+from udccal.tiers import Tier
+
+# Noise of the captures; that of the frames to restore is another.
+_NOISE_SEED: Final = 1
+
+
+@dataclass(frozen=True)
+class Fewer:
+    """Captures that differ from those that the rig asks for, by the names of ``udccal.rig.Captures``."""
+
+    changes: dict[str, int] = field(default_factory=dict)
+
+    @property
+    def name(self) -> str:
+        """As a table shows it."""
+        return ", ".join(f"{name}: {count}" for name, count in self.changes.items()) or "as the rig asks"
+
+    def of(self, rig: RigDescription) -> RigDescription:
+        """Return the rig that asks for these captures; a wrong name or count is pydantic's error."""
+        captures = Captures.model_validate({**rig.captures.model_dump(), **self.changes})
+        return rig.model_copy(update={"captures": captures})
+
+
+ALL: Final = Fewer()
+# A third of the frames, and about the fewest that every fit accepts.
+_THIRD: Final = {
+    "flats": 6,
+    "psf_shifts": 1,
+    "psf_columns": 2,
+    "psf_rows": 2,
+    "backscatter_frames": 2,
+    "board_views": 4,
+}
+_FEWEST: Final = {**_THIRD, "flats": 2, "noise_levels": 4, "noise_stack": 2, "psf_exposures": 3, "board_views": 3}
+FEWER: Final = (
+    ALL,
+    Fewer({"flats": 6}),
+    Fewer({"psf_shifts": 1}),
+    Fewer({"psf_columns": 2, "psf_rows": 2}),
+    Fewer({"psf_exposures": 3}),
+    Fewer({"backscatter_frames": 2, "backscatter_pictures": 7}),
+    Fewer({"board_views": 3}),
+    Fewer(_THIRD),
+    Fewer({**_FEWEST, "backscatter_pictures": 7}),
+)
+
+
+@dataclass(frozen=True)
+class FromFewer:
+    """What a profile of these captures gives.
+
+    Attributes:
+        cost: frames and seconds of the camera.
+        dB: PSNR of each scene at ``balanced``.
+        doubtful: terms whose fit did not end well.
+    """
+
+    fewer: Fewer
+    cost: Cost
+    dB: tuple[float, ...]
+    doubtful: tuple[str, ...]
+
+
+def from_fewer(truth: RigTruth, sights: Sequence[Sight], folder: Path, tried: Iterable[Fewer]) -> list[FromFewer]:
+    """Calibrate a simulated rig by each set of captures, and restore some sights by the profile.
+
+    Args:
+        truth: the rig whose frames ``sights`` are.
+        sights: what is restored.
+        folder: an empty one for sessions and profiles.
+        tried: sets of captures.
+    """
+    found = []
+    for index, fewer in enumerate(tried):
+        rig, place = fewer.of(truth.description), folder / str(index)
+        with simulated_bench(SimulatedWorld(replace(truth, description=rig), seed=_NOISE_SEED)) as bench:
+            session = udccal.capture(place / "session", bench)
+        calibration = udccal.calibrate(session)
+        calibration.write(place / "profile")
+        doubtful = tuple(result.name for result in calibration.results if not result.ok)
+        cost = sum((nominal_state(rig).cost(term) for term in get_args(TermName)), Cost())
+        found.append(FromFewer(fewer, cost, _restored_dB(place, sights), doubtful))
+    return found
+
+
+def _restored_dB(place: Path, sights: Sequence[Sight]) -> tuple[float, ...]:
+    with TierProcess(Setup(str(place / "profile"), Tier.balanced, PlanOptions(), place / "kept")) as process:
+        return tuple(psnr(one.after(process.restored(one.taken).linear), one.truth) for one in sights)
+
+
+def fewer_table(found: Sequence[FromFewer]) -> str:
+    """As Markdown, the first being what the others are compared with."""
+    lines = [
+        "| captures | frames | camera s | dB − the first's | worst scene | doubtful terms |",
+        "| --- | ---: | ---: | ---: | ---: | --- |",
+    ]
+    for one in found:
+        lost = np.subtract(one.dB, found[0].dB)
+        numbers = f"{one.cost.frames} | {one.cost.seconds:.0f} | {np.mean(lost):+.2f} | {np.min(lost):+.2f}"
+        lines.append(f"| {one.fewer.name} | {numbers} | {', '.join(one.doubtful)} |")
+    return "\n".join(lines)
