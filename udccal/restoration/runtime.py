@@ -22,6 +22,7 @@ from udccal.models.psf import PsfField
 from udccal.profiles.profile import Profile
 from udccal.profiles.store import load_profile
 from udccal.restoration.backscatter import PanelLight, PanelMask, mask_mosaic, refuse_excess
+from udccal.restoration.blind import BlindSamples
 from udccal.restoration.dark_places import plausible
 from udccal.restoration.defects import without_defects
 from udccal.restoration.demosaic import demosaic
@@ -225,13 +226,13 @@ class Restorer:
         check_frame(mosaic, exposure_s, self.rig)
         check_panel_picture(panel_picture, self.rig)
         cfa, workers = self.rig.camera.cfa, self.options.workers
-        mosaic = without_defects(mosaic[self.rows], self.noise, exposure_s, cfa, workers)
+        mosaic = without_defects(self.blind.mended(mosaic[self.rows], exposure_s), self.noise, exposure_s, cfa, workers)
         signal = to_electrons(mosaic, self.noise, exposure_s)
         variance = variance_e2(signal, self.noise, exposure_s)
-        if self.wire is not None:
-            signal /= self.wire
-            variance /= self.wire
-            variance /= self.wire
+        if (wire := self.blind.wire) is not None:
+            signal /= wire
+            variance /= wire
+            variance /= wire
         clipped = saturated(mosaic, self.noise)
         panel_error_e: Mosaic | None = None
         if self.mask is not None:
@@ -287,6 +288,12 @@ class Restorer:
         if panel_picture is None or self.panel is None:
             return exposure * mask.rate(mask.levels(signal, exposure_s))
         return exposure * self.panel.rate(panel_picture)
+
+    @functools.cached_property
+    def blind(self) -> BlindSamples:
+        """Samples of the frame's ``rows`` that carry no information."""
+        shape = len(range(*self.rows.indices(self.rig.camera.rows))), self.rig.camera.columns
+        return BlindSamples.of(self.wire, shape, cfa_named(self.rig.camera.cfa), self.noise)
 
     @functools.cached_property
     def _strip_rectification(self) -> Rectification:
