@@ -14,6 +14,7 @@ from udccal.models.geometry import Geometry
 from udccal.models.noise import Noise
 from udccal.restoration.backscatter import PanelMask
 from udccal.restoration.deblur import deblur
+from udccal.restoration.demosaic import demosaic
 from udccal.restoration.kernel_grid import KernelGrid
 from udccal.restoration.metrics import display_exposure, encode_srgb, psnr
 from udccal.restoration.runtime import Restorer, check_frame
@@ -169,21 +170,39 @@ def test_a_panel_brighter_than_the_scene(
     no_worse_than_the_preview(lit, frame, scene)
 
 
-@pytest.mark.parametrize("tier", [Tier.fast, Tier.balanced])
-@pytest.mark.parametrize("upright", [True, False], ids=["a step across", "a step down"])
+def overshoot(picture: np.ndarray, axis: int, low: float, high: float) -> float:
+    """How far a picture of a step goes beyond it, as a part of its height.
+
+    It is that of the mean of all places at one distance from the edge, so that noise does not count.
+    """
+    along = picture.mean(axis=axis)
+    return float(max(along.max() - high, low - along.min()) / (high - low))
+
+
+@pytest.mark.parametrize("tier", list(Tier))
+@pytest.mark.parametrize("axis", [0, 1], ids=["a step across", "a step down"])
+@pytest.mark.parametrize("at", [0, 1], ids=["at a cell", "within a cell"])
+@pytest.mark.parametrize("rising", [True, False], ids=["rising", "falling"])
 def test_a_step_is_not_overshot(
-    restorers: dict[Tier, Restorer], toy_grid: KernelGrid, tier: Tier, upright: bool
+    restorers: dict[Tier, Restorer], toy_grid: KernelGrid, tier: Tier, axis: int, at: int, rising: bool
 ) -> None:
     low, high = 500.0, 5000.0
-    scene = np.full((96, 128, 3), low, np.float32)
-    if upright:
-        scene[:, 64:] = high
+    scene = np.full((96, 128, 3), low if rising else high, np.float32)
+    after = high if rising else low
+    if axis == 0:
+        scene[:, 64 + at :] = after
     else:
-        scene[48:] = high
-    restorer = restorers[tier]
-    frame = exposed(restorer, toy_grid, scene)
-    restored = restorer.restore(frame, EXPOSURE_S) * EXPOSURE_S
-    # Of all places at one distance from the edge, so that noise does not count.
-    along = restored.mean(axis=0 if upright else 1)
-    assert along.max() <= high + _OVERSHOOT * (high - low)
-    assert along.min() >= low - _OVERSHOOT * (high - low)
+        scene[48 + at :] = after
+    frame = exposed(restorers[tier], toy_grid, scene)
+    assert overshoot(restorers[tier].restore(frame, EXPOSURE_S) * EXPOSURE_S, axis, low, high) <= _OVERSHOOT
+    shown = restorers[tier].display(frame, EXPOSURE_S, Tone(EXPOSURE_S / 8000)) / 255.0
+    linear = 8000 * np.where(shown <= 0.04045, shown / 12.92, ((shown + 0.055) / 1.055) ** 2.4)
+    assert overshoot(linear, axis, low, high) <= _OVERSHOOT
+
+
+def test_all_the_detail_of_a_demosaicing_overshoots(restorers: dict[Tier, Restorer], toy_grid: KernelGrid) -> None:
+    scene = np.full((96, 128, 3), 500.0, np.float32)
+    scene[:, 64:] = 5000.0
+    preview = restorers[Tier.preview]
+    mosaic = preview.scene_light(exposed(preview, toy_grid, scene), EXPOSURE_S).signal_e
+    assert overshoot(preview.rectification.apply(demosaic(mosaic, "RGGB")), 0, 500.0, 5000.0) > _OVERSHOOT

@@ -39,6 +39,9 @@ from udccal.restoration.view import kept_view
 from udccal.rig import RigDescription
 from udccal.tiers import Tier, tier_named
 
+# A preview has no sharp edges to win, and overshoots those that it has by 7 % of their step and not by 12 %.
+_PREVIEW_DETAIL = 0.65
+
 Mosaic = Float32[np.ndarray, "rows columns"]
 Picture = Float32[np.ndarray, "rows columns 3"]
 
@@ -207,7 +210,7 @@ class Restorer:
         """Return the clean picture in e-."""
         light = self.scene_light(mosaic, exposure_s, panel_picture)
         if self.sharpener is None:
-            return self.rectification.apply(demosaic(light.signal_e, self.rig.camera.cfa))
+            return self.rectification.apply(demosaic(light.signal_e, self.rig.camera.cfa, _PREVIEW_DETAIL))
         sharp = self.sharpener.apply(light.signal_e, light.variance_e2, light.clipped)
         if light.panel_error_e is not None:
             sharp = plausible(sharp, light.panel_error_e[self.sharpener.layout.inner])
