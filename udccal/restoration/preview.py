@@ -110,7 +110,7 @@ class Preview:
         if self.mask is None:
             codes = _codes(signal, None, self.channels, np.zeros(3, np.float32), scale)
         else:
-            light = np.float32(exposure_s) * self.mask.levels(signal, exposure_s)
+            light = np.float32(exposure_s) * self.mask.levels(signal, exposure_s, self.noise)
             codes = _codes(signal, self.mask.white, self.channels, light, scale)
         picture = cv2.cvtColor(np.asarray(codes), _DEMOSAIC[self.cfa])
         return self.rectification.apply(picture, Interpolation.LINEAR)

@@ -289,7 +289,7 @@ class Restorer:
     ) -> Mosaic:
         exposure = np.float32(exposure_s)
         if panel_picture is None or self.panel is None:
-            return exposure * mask.rate(mask.levels(signal, exposure_s))
+            return exposure * mask.rate(mask.levels(signal, exposure_s, self.noise))
         return exposure * self.panel.rate(panel_picture)
 
     @functools.cached_property
