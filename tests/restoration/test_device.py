@@ -118,6 +118,17 @@ def test_a_device_shows_what_the_cpu_shows(
         assert agree(off(restorers[tier], devices[tier], frame, shown), 2 if tier is Tier.accurate else 1)
 
 
+@pytest.mark.medium
+def test_blind_and_dead_rows_are_filled_for_a_device(
+    restorers: dict[Tier, Restorer], frame: np.ndarray, picture: np.ndarray
+) -> None:
+    wire, dead = restorers[Tier.fast].wire.copy(), frame.copy()
+    wire[30:33] = 1e-4
+    dim = replace(restorers[Tier.fast], wire=wire)
+    dead[-20], dead[dim.rows][30:33] = 64, 64
+    assert agree(off(dim, DeviceRestorer.of(dim, jax.devices("cpu")[0]), dead, picture))
+
+
 def with_tables(kind: jnp.dtype) -> Broken:
     """Return what rounds the eigenvectors to numbers of 16 bits."""
 

@@ -15,15 +15,19 @@ from scipy import sparse
 from udccal.cfa import Cfa, cfa_named
 from udccal.errors import RestorationError
 from udccal.models.backscatter import Backscatter, cubic_weights, panel_light, panel_response
+from udccal.models.noise import Noise
 from udccal.numerics import in_float64
+from udccal.restoration.linear import variance_floor_e2
 from udccal.restoration.prepared import kept
 from udccal.rig import RigDescription
 
 # Shares below this fraction of all light are left out.
 _LEAST_SHARE = 1e-6
 # Side in samples of the blocks that give the level: large enough to average noise, small enough to find dark places.
-BLOCK = 16
-PERCENTILE = 1.0
+BLOCK = 8
+# Light of a block that noise hardly exceeds: so many sigma above its mean. Of that, the darkest places give the level.
+SIGMAS = 3.5
+PERCENTILE = 0.1
 # A frame is darker than its panel's light where this is more than so many times the frame, and more than so few e-.
 _MORE, _NEGLIGIBLE_E = 1.2, 1.0
 # Samples of which the sums are taken: few, and by an odd step, so that every colour is among them.
@@ -245,18 +249,28 @@ class PanelMask:
     def _possible(self) -> list[Float32[np.ndarray, "down across"]]:
         return _block_means(self.white, self.cfa)
 
-    def levels(self, signal_e: Float32[np.ndarray, "rows columns"], exposure_s: float) -> Float32[np.ndarray, "3"]:
+    def levels(
+        self, signal_e: Float32[np.ndarray, "rows columns"], exposure_s: float, noise: Noise
+    ) -> Float32[np.ndarray, "3"]:
         """Estimate each colour's level, from 0 to 1; 0 for a colour without samples.
 
-        Light only adds, so a frame is nowhere darker than its backscatter. The level is the 1st percentile of frame
-        over white panel in blocks of 16 x 16 samples. In a scene without dark places it is too high, by at most the
-        scene's own darkest percent.
+        Light only adds, so a frame is nowhere darker than its backscatter. The level is the 0.1st percentile of frame
+        over white panel in blocks of 8 x 8 samples, where each block is taken 3.5 sigma of its noise brighter than it
+        is: of some thousand blocks, the darkest are dark by noise. In a scene without dark places the level is too
+        high, by at most the scene's own darkest places.
+
+        Args:
+            signal_e: signal in e-, divided by the wire.
+            exposure_s: exposure time of the frame.
+            noise: the noise term.
         """
-        light = _block_means(signal_e, self.cfa)
+        light, floor_e2 = _block_means(signal_e, self.cfa), variance_floor_e2(noise, exposure_s)
         levels = np.zeros(3, dtype=np.float32)
         for channel in {site.channel for site in self.cfa.sites}:
             same = [index for index, site in enumerate(self.cfa.sites) if site.channel == channel]
-            seen, possible = (np.sum([planes[index] for index in same], axis=0) for planes in (light, self._possible))
+            seen, possible = (np.mean([planes[index] for index in same], axis=0) for planes in (light, self._possible))
+            samples = len(same) * min(BLOCK**2, signal_e.size) / len(self.cfa.sites)
+            seen += SIGMAS * np.sqrt((np.maximum(seen, 0) + np.float32(floor_e2)) / np.float32(samples))
             usable = possible > 0
             if usable.any():
                 ratio = np.percentile(seen[usable] / possible[usable], PERCENTILE)

@@ -106,7 +106,7 @@ def _missed_by_preview(
     if restorer.mask is None or restorer.panel is None or panel_picture is None:
         return np.zeros((*signal.shape, 3), dtype=np.float32)
     rate = restorer.panel.rate(panel_picture)
-    levels = restorer.mask.levels(signal + np.float32(exposure_s) * rate, exposure_s)
+    levels = restorer.mask.levels(signal + np.float32(exposure_s) * rate, exposure_s, restorer.noise)
     return demosaic(np.float32(exposure_s) * (rate - restorer.mask.rate(levels)), restorer.rig.camera.cfa)
 
 

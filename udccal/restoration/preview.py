@@ -18,6 +18,7 @@ from jaxtyping import Array, Float32, UInt8, UInt16
 from udccal.cfa import Cfa
 from udccal.models.noise import Noise
 from udccal.restoration.backscatter import PanelMask
+from udccal.restoration.blind import BlindSamples
 from udccal.restoration.linear import above_dark_DN, scalar
 from udccal.restoration.rectify import Interpolation, Rectification
 from udccal.restoration.tone import CODES, Tone
@@ -39,6 +40,7 @@ class Preview:
     Attributes:
         noise: the noise term.
         gain: e- per DN divided by the wire, of the rows that the view needs.
+        blind: samples of those rows that carry no information.
         mask: backscatter of those rows; None when the rig has none.
         cfa: name of the colour pattern, whose cell begins with the first of those rows.
         channels: channel of each of their samples.
@@ -48,6 +50,7 @@ class Preview:
 
     noise: Noise
     gain: Float32[np.ndarray, "rows columns"]
+    blind: BlindSamples
     mask: PanelMask | None
     cfa: str
     channels: UInt8[np.ndarray, "rows columns"]
@@ -78,9 +81,11 @@ class Preview:
         rows = slice(max(first, 0) // cfa.rows * cfa.rows, min(last, sensor[0]))
         shape = len(range(*rows.indices(sensor[0]))), sensor[1]
         gain = np.full(shape, 1 / scalar(noise.K_DN_per_e), dtype=np.float32)
+        blind = BlindSamples.of(None if wire is None else wire[rows], shape, cfa, noise)
         return cls(
             noise=noise,
-            gain=gain if wire is None else gain / wire[rows],
+            gain=gain if blind.wire is None else gain / blind.wire,
+            blind=blind,
             mask=None if mask is None else PanelMask(np.ascontiguousarray(mask.white[rows]), cfa),
             cfa=cfa.name,
             channels=cfa.channel_map(*shape).astype(np.uint8),
@@ -99,13 +104,13 @@ class Preview:
             tone: exposure and colour gains of the picture.
         """
         raw = mosaic[self.first_row : self.first_row + len(self.gain)]
-        signal = above_dark_DN(raw, self.noise, exposure_s)
+        signal = above_dark_DN(self.blind.mended(raw, exposure_s), self.noise, exposure_s)
         signal *= self.gain
         scale = tone.scale() / np.float32(exposure_s)
         if self.mask is None:
             codes = _codes(signal, None, self.channels, np.zeros(3, np.float32), scale)
         else:
-            light = np.float32(exposure_s) * self.mask.levels(signal, exposure_s)
+            light = np.float32(exposure_s) * self.mask.levels(signal, exposure_s, self.noise)
             codes = _codes(signal, self.mask.white, self.channels, light, scale)
         picture = cv2.cvtColor(np.asarray(codes), _DEMOSAIC[self.cfa])
         return self.rectification.apply(picture, Interpolation.LINEAR)

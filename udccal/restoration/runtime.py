@@ -22,6 +22,7 @@ from udccal.models.psf import PsfField
 from udccal.profiles.profile import Profile
 from udccal.profiles.store import load_profile
 from udccal.restoration.backscatter import PanelLight, PanelMask, mask_mosaic, refuse_excess
+from udccal.restoration.blind import BlindSamples
 from udccal.restoration.dark_places import plausible
 from udccal.restoration.defects import without_defects
 from udccal.restoration.demosaic import demosaic
@@ -37,6 +38,9 @@ from udccal.restoration.tone import Tone
 from udccal.restoration.view import kept_view
 from udccal.rig import RigDescription
 from udccal.tiers import Tier, tier_named
+
+# A preview has no sharp edges to win, and overshoots those that it has by 7 % of their step and not by 12 %.
+_PREVIEW_DETAIL = 0.65
 
 Mosaic = Float32[np.ndarray, "rows columns"]
 Picture = Float32[np.ndarray, "rows columns 3"]
@@ -206,7 +210,7 @@ class Restorer:
         """Return the clean picture in e-."""
         light = self.scene_light(mosaic, exposure_s, panel_picture)
         if self.sharpener is None:
-            return self.rectification.apply(demosaic(light.signal_e, self.rig.camera.cfa))
+            return self.rectification.apply(demosaic(light.signal_e, self.rig.camera.cfa, _PREVIEW_DETAIL))
         sharp = self.sharpener.apply(light.signal_e, light.variance_e2, light.clipped)
         if light.panel_error_e is not None:
             sharp = plausible(sharp, light.panel_error_e[self.sharpener.layout.inner])
@@ -225,13 +229,13 @@ class Restorer:
         check_frame(mosaic, exposure_s, self.rig)
         check_panel_picture(panel_picture, self.rig)
         cfa, workers = self.rig.camera.cfa, self.options.workers
-        mosaic = without_defects(mosaic[self.rows], self.noise, exposure_s, cfa, workers)
+        mosaic = without_defects(self.blind.mended(mosaic[self.rows], exposure_s), self.noise, exposure_s, cfa, workers)
         signal = to_electrons(mosaic, self.noise, exposure_s)
         variance = variance_e2(signal, self.noise, exposure_s)
-        if self.wire is not None:
-            signal /= self.wire
-            variance /= self.wire
-            variance /= self.wire
+        if (wire := self.blind.wire) is not None:
+            signal /= wire
+            variance /= wire
+            variance /= wire
         clipped = saturated(mosaic, self.noise)
         panel_error_e: Mosaic | None = None
         if self.mask is not None:
@@ -285,8 +289,14 @@ class Restorer:
     ) -> Mosaic:
         exposure = np.float32(exposure_s)
         if panel_picture is None or self.panel is None:
-            return exposure * mask.rate(mask.levels(signal, exposure_s))
+            return exposure * mask.rate(mask.levels(signal, exposure_s, self.noise))
         return exposure * self.panel.rate(panel_picture)
+
+    @functools.cached_property
+    def blind(self) -> BlindSamples:
+        """Samples of the frame's ``rows`` that carry no information."""
+        shape = len(range(*self.rows.indices(self.rig.camera.rows))), self.rig.camera.columns
+        return BlindSamples.of(self.wire, shape, cfa_named(self.rig.camera.cfa), self.noise)
 
     @functools.cached_property
     def _strip_rectification(self) -> Rectification:

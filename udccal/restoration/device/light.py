@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, UInt8, UInt16
 
 from udccal.cfa import Cfa
 from udccal.models.noise import Noise, linear_signal
-from udccal.restoration.backscatter import BLOCK, PERCENTILE, SPARSE
+from udccal.restoration.backscatter import BLOCK, PERCENTILE, SIGMAS, SPARSE
 from udccal.restoration.dark_places import COLOURFUL, LEAST_E, NEGLIGIBLE, STEP
 from udccal.restoration.defects import OUTLIER_RATIO, OUTLIER_SIGMA
 from udccal.restoration.device.planes import Mosaic, apart, box_mean, resized, together
@@ -59,8 +59,8 @@ class FrontEnd(eqx.Module):
             signal, variance = signal / self.wire, variance / self.wire / self.wire
         panel = jnp.zeros_like(signal)
         if self.white is not None:
-            seen, white = signal / exposure_s, self.white
-            panel = exposure_s * jax.lax.cond(known, lambda: rate, lambda: self._unknown(seen, white))
+            given = signal, self.white, exposure_s, floor_e2
+            panel = exposure_s * jax.lax.cond(known, lambda: rate, lambda: self._unknown(*given))
         use = ~clipped[SPARSE]
         sums = (jnp.sum(light[SPARSE], where=use) for light in (signal, panel))
         excess = jnp.stack([*sums, jnp.count_nonzero(use)])
@@ -87,16 +87,20 @@ class FrontEnd(eqx.Module):
 
         return jax.lax.cond(jnp.any(wrong), mended, lambda: signal_e)
 
-    def _unknown(self, rate: Mosaic, white: Mosaic) -> Mosaic:
+    def _unknown(
+        self, signal: Mosaic, white: Mosaic, exposure_s: Float[Array, ""], floor_e2: Float[Array, ""]
+    ) -> Mosaic:
         """Return the mask at the levels that ``PanelMask.levels`` finds, in e-/s."""
         cfa, channels = self.cfa, channels_of(self.cfa)
-        down, across = (max(most // BLOCK, 1) for most in rate.shape)
+        down, across = (max(most // BLOCK, 1) for most in signal.shape)
         cut = np.s_[: down * BLOCK, : across * BLOCK]
-        both = [resized(apart(light[cut], cfa), (down, across), cv2.INTER_AREA) for light in (rate, white)]
+        both = [resized(apart(light[cut], cfa), (down, across), cv2.INTER_AREA) for light in (signal, white)]
         levels = []
         for channel in range(3):
-            seen, possible = (each[channels == channel].sum(axis=0) for each in both)
-            ratio = jnp.where(possible > 0, seen / possible, jnp.nan)
+            seen, possible = (each[channels == channel].mean(axis=0) for each in both)
+            samples = np.count_nonzero(channels == channel) * min(BLOCK**2, signal.size) / len(channels)
+            seen += SIGMAS * jnp.sqrt((jnp.maximum(seen, 0) + floor_e2) / samples)
+            ratio = jnp.where(possible > 0, seen / (possible * exposure_s), jnp.nan)
             levels.append(jnp.clip(jnp.nan_to_num(jnp.nanpercentile(ratio, PERCENTILE)), 0, 1))
         return together(jnp.stack(levels)[channels, None, None] * apart(white, cfa), cfa)
 

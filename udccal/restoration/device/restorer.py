@@ -135,7 +135,7 @@ class DeviceRestorer:
         before, taps = interpolation_taps(options.interpolation)
         front, filters, bands, learned, maps, panel, dark = jax.device_put(
             (
-                (restorer.wire, white, restorer.noise, least_saturated_DN(restorer.noise)),
+                (restorer.blind.wire, white, restorer.noise, least_saturated_DN(restorer.noise)),
                 (tables.matched, tables.vectors, tables.values),
                 None if noise is None else (noise.variance, noise.probe),
                 (network_weights(), kernels) if restorer.tier is Tier.accurate else None,
@@ -167,7 +167,8 @@ class DeviceRestorer:
             self.latest, self.rate = panel_picture.copy(), panel_rate(picture, self.panel, panel.block, panel.cfa)
         exposed = np.array([exposure_s, dark_DN(noise, exposure_s), variance_floor_e2(noise, exposure_s)], np.float32)
         scale = replace(tone, exposure=tone.exposure / exposure_s).scale()
-        given = mosaic[self.restorer.rows], scale, exposed, np.bool_(known)
+        rows = self.restorer.blind.mended(mosaic[self.restorer.rows], exposure_s)
+        given = rows, scale, exposed, np.bool_(known)
         shown, excess = jax.device_get(self.stages.shown(*jax.device_put(given, self.rate.device), self.rate))
         if known:
             refuse_excess_of(*map(float, excess))
