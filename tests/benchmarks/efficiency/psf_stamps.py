@@ -16,7 +16,7 @@ from scipy.linalg import block_diag
 
 from tests.benchmarks.efficiency.trials import Trials
 from udccal.fitting.engine.information import cramer_rao, fisher_information
-from udccal.fitting.psf_stamps.data import Stamps, offsets
+from udccal.fitting.psf_stamps.data import Stamps, StampsRules, offsets
 from udccal.fitting.psf_stamps.field import PsfField, Seen, response
 from udccal.fitting.psf_stamps.fit import fit_psf_stamps
 from udccal.fitting.psf_stamps.probability import envelope, grid_size, laplacian
@@ -47,8 +47,9 @@ class Truth:
 
     @property
     def vector(self) -> Float[np.ndarray, " n"]:
-        """Nodes, map, places, logarithm of light."""
-        parts = (self.field.nodes, self.field.warp, self.centre_px, np.log(self.flux_e))
+        """Nodes, map, pedestal, background, places, logarithm of light."""
+        field = self.field
+        parts = (field.nodes, field.warp, field.pedestal, 0.0, self.centre_px, np.log(self.flux_e))
         return np.concatenate([np.ravel(part) for part in parts])
 
 
@@ -86,7 +87,7 @@ def make_truth(rng: np.random.Generator) -> Truth:
     images = (draw @ rng.standard_normal((NODES**2, 2))).T.reshape(2, NODES, NODES)
     while True:
         warp = rng.standard_normal((5, 2, 2)) / np.sqrt(OF_MAP).reshape(5, 2, 2)
-        field = PsfField(np.stack([base, *images])[None], warp[None], np.zeros((0, 5, 2)), np.eye(3), 1.0)
+        field = PsfField(np.stack([base, *images])[None], warp[None], np.zeros((0, 5, 2)), np.eye(3), np.zeros(1), 1.0)
         # The model class is that of the nodes: those of the fit, whose number follows from the map, are the truth's.
         if grid_size((SIZE, SIZE), 1.0, reach(field, unit)) == (NODES, NODES):
             break
@@ -103,11 +104,13 @@ def prior_matrix(base: Float[np.ndarray, "rows columns"], ab: Float[np.ndarray, 
     return ab[0] * scale**2 + ab[1] * rough.T @ rough
 
 
-def unpack(x: Array, like: PsfField) -> tuple[PsfField, Array, Array]:
+def unpack(x: Array, like: PsfField) -> tuple[PsfField, Array, Array, Array]:
+    """Field, background, places and light."""
     count = np.size(like.nodes)
-    nodes, warp, centre, light = jnp.split(x, [count, count + np.size(like.warp), len(x) - STARS])
-    field = replace(like, nodes=nodes.reshape(like.nodes.shape), warp=warp.reshape(like.warp.shape))
-    return field, centre.reshape(-1, 2), jnp.exp(light)
+    ends = [count, count + np.size(like.warp), len(x) - 3 * STARS - 1, len(x) - 3 * STARS, len(x) - STARS]
+    nodes, warp, pedestal, background, centre, light = jnp.split(x, ends)
+    field = replace(like, nodes=nodes.reshape(like.nodes.shape), warp=warp.reshape(like.warp.shape), pedestal=pedestal)
+    return field, background, centre.reshape(-1, 2), jnp.exp(light)
 
 
 def seen_at(field: PsfField, unit: Array, centre: Array) -> Seen:
@@ -116,19 +119,20 @@ def seen_at(field: PsfField, unit: Array, centre: Array) -> Seen:
     images = basis[:, :3] @ field.nodes.reshape(3, -1)
     maps = jnp.eye(2) + jnp.einsum("sm,mij->sij", basis[:, 1:], field.warp[0])
     plane = np.zeros((len(images), SIZE**2), dtype=int)
-    return response(images[:, None], maps[:, None], centre[:, None], plane, offsets(SIZE, SIZE), NODES, NODES, 1.0)
+    seen = response(images[:, None], maps[:, None], centre[:, None], plane, offsets(SIZE, SIZE), NODES, NODES, 1.0)
+    return seen._replace(value=seen.value + field.pedestal)
 
 
 def expected(x: Array, like: PsfField, unit: Array) -> tuple[Array, Array]:
     """Mean and variance of every sample."""
-    field, centre, light = unpack(x, like)
-    mean = (light[:, None] * seen_at(field, unit, centre).value).ravel()
+    field, background, centre, light = unpack(x, like)
+    mean = (light[:, None] * seen_at(field, unit, centre).value).ravel() + background
     return mean, jnp.maximum(mean, 0.0) + READ_E**2
 
 
 def wanted(x: Array, like: PsfField, unit: Array, window_px: Array) -> Array:
     """Kernels at the points, places, logarithms of light, all in the term's convention."""
-    field, centre, light = unpack(x, like)
+    field, _, centre, light = unpack(x, like)
     everywhere = jnp.concatenate([jnp.asarray(POINTS), unit])
     grid = offsets(SIZE, SIZE)
     weight = grid * jnp.exp(-0.5 * (grid**2).sum(axis=1) / window_px**2)[:, None]
@@ -151,7 +155,8 @@ def at_best(truth: Truth) -> tuple[Float[np.ndarray, " q"], Float[np.ndarray, " 
     information = fisher_information(expected, x, truth.field, truth.unit)
     base = np.asarray(truth.field.nodes[0, 0])
     first, second = prior_matrix(base, IMAGE[0]), prior_matrix(base, IMAGE[1])
-    prior = block_diag(first, second, second, np.diag(OF_MAP))
+    pedestal = (SIZE**2 / StampsRules().most_pedestal) ** 2
+    prior = block_diag(first, second, second, np.diag(OF_MAP), pedestal, READ_E**-2)
     information[: len(prior), : len(prior)] += prior
     args = (truth.field, jnp.asarray(truth.unit), jnp.asarray(truth.window_px))
     slopes = np.asarray(jax.jacfwd(wanted)(jnp.asarray(x), *args))

@@ -135,6 +135,7 @@ class StampsRules:
         beyond_doubt: log posterior; a mode further away is not trusted.
         first_image: precisions before the data: of the first image (size, roughness), and of further ones.
         first_map, first_lateral: the same of maps of degrees 1 and 2, and of lateral colour.
+        most_pedestal: part of a star's light that lies evenly all over a stamp: one standard deviation before the data.
         new_map: the same of higher degrees. They start nearly absent; one update makes them appear where the data
             support them.
         draws: numbers of posterior draws: for updates of precisions, and for error bars (5 % of a sigma).
@@ -166,6 +167,7 @@ class StampsRules:
     first_image: tuple[tuple[float, float], tuple[float, float]] = ((1e-3, 1e-4), (30.0, 30.0))
     first_map: float = 100.0
     first_lateral: float = 10.0
+    most_pedestal: float = 0.1
     new_map: float = 3e4
     draws: tuple[int, int] = (16, 192)
     parts: int = 4
@@ -217,7 +219,7 @@ def backgrounds(stamps: Stamps) -> Float[np.ndarray, "stars planes"]:
 
     A psf's own light at the edge grows with a star's light, a background does not.
     """
-    far = (np.abs(stamps.offset_px) / (np.array(stamps.values_e.shape[:0:-1]) // 2)).max(axis=1) > 0.85
+    far = _at_edge(stamps)
     out = np.zeros((len(stamps.unit), len(stamps.by_plane)))
     for plane, seen in enumerate(stamps.by_plane):
         stars = np.flatnonzero((seen & far).sum(axis=1) > 8)
@@ -238,6 +240,16 @@ def backgrounds(stamps: Stamps) -> Float[np.ndarray, "stars planes"]:
             out[:, plane] = np.median(left)
             out[stars, plane] = left
     return out
+
+
+def edge_light(stamps: Stamps) -> float:
+    """Return the light of a sample at the stamps' edges, wings and background together: root mean square over colours."""
+    light = [np.median(stamps.value_e[own]) if own.any() else 0.0 for own in stamps.by_plane & _at_edge(stamps)]
+    return float(np.linalg.norm(light) / np.sqrt(len(light)))
+
+
+def _at_edge(stamps: Stamps) -> Bool[np.ndarray, " samples"]:
+    return (np.abs(stamps.offset_px) / (np.array(stamps.values_e.shape[:0:-1]) // 2)).max(axis=1) > 0.85
 
 
 def light_of(stamps: Stamps, background_e: Float[np.ndarray, "stars planes"]) -> Float[np.ndarray, "stars planes"]:

@@ -20,7 +20,7 @@ from scipy.linalg.blas import dtrsm
 
 from udccal.fitting.engine.least_squares import Step
 from udccal.fitting.psf_stamps.data import Stamps
-from udccal.fitting.psf_stamps.field import OWN, TAPS, Changes, PsfField, by_maps, changes_of_light, taps
+from udccal.fitting.psf_stamps.field import BACKGROUND, OWN, TAPS, Changes, PsfField, by_maps, changes_of_light, taps
 from udccal.fitting.psf_stamps.probability import State, Weighted, expectation
 
 REACH, ACROSS = TAPS - 1, 2 * TAPS - 1  # of nodes that a sample has in common, along an axis
@@ -139,7 +139,8 @@ def shared_by(
     planes, stars = len(field.nodes), len(unit)
     place = (2 + 2 * planes) * np.arange(stars)[:, None] + np.array([0, 1, 2 + plane, 2 + planes + plane])
     of_maps, matrix = by_maps(field, unit, plane)
-    whole = scipy.sparse.hstack([scipy.sparse.kron(np.eye(stars), np.eye(OWN)[:, [1, 2, 0, 7]]), matrix], format="csr")
+    own = np.eye(OWN)[:, [1, 2, 0, BACKGROUND]]
+    whole = scipy.sparse.hstack([scipy.sparse.kron(np.eye(stars), own), matrix], format="csr")
     return np.concatenate([place.ravel(), stars * (2 + 2 * planes) + of_maps]), scipy.sparse.csr_array(whole)
 
 

@@ -2,11 +2,12 @@
 
 With w the distance to the centre of the light, X the position, B_t(X) polynomials, and C_i(X) some mixtures of them,
 
-    psf(w; X) = 1 / |M(X)|  sum_i C_i(X) P_i(M(X)^-1 (w - L(X))),    M(X) = 1 + sum_t>0 B_t(X) M_t,    C_0 = 1.
+    psf(w; X) = p + 1 / |M(X)|  sum_i C_i(X) P_i(M(X)^-1 (w - L(X))),    M(X) = 1 + sum_t>0 B_t(X) M_t,    C_0 = 1.
 
 The map M stretches, shears and turns an image over the field, with few numbers. Images P_i are cubic B-splines on a
 square grid of nodes and describe the rest. L, of polynomials too, is the distance of a colour's centre from the centre
-that all colours of a stamp have in common.
+that all colours of a stamp have in common. The pedestal p is the same all over a stamp, as the far wings of a psf nearly
+are. They differ from a background only by their growth with a star's light.
 
 An image contains the mean over a pixel, and the map would stretch the pixel as well. Light that is stretched before
 pixels average it differs, to second order in the pixel's size a = 1 px, by (a^2 / 24) tr((M^-1 M^-T - 1) D) of the
@@ -30,8 +31,8 @@ from numpy.polynomial.legendre import legvander
 from udccal.models.arrays import Arrayish
 
 TAPS = 4  # nodes along an axis under a cubic B-spline
-# Parameters of one star: relative light, centre (x, y), the four numbers of its map, row by row, and background.
-OWN = 8
+# Parameters of one star: relative light, centre (x, y), the four numbers of its map, row by row, background, pedestal.
+OWN, BACKGROUND, PEDESTAL = 9, 7, 8
 # Coefficients of 1, f, f^2 and f^3 in the weight of each of these nodes.
 _SPLINE = np.array([[1.0, 4.0, 1.0, 0.0], [-3.0, 0.0, 3.0, 0.0], [3.0, -6.0, 3.0, 0.0], [-1.0, 3.0, -3.0, 1.0]]) / 6
 _Taps = Float[Array, "samples 4"]
@@ -46,6 +47,7 @@ class PsfField(eqx.Module):
         lateral: polynomials of lateral colour, in px (x, y), without the constant, which the images contain; of all
             planes except the reference, from which it is measured.
         mix: the polynomials' coefficients in the strength C of each image.
+        pedestal: light per pixel that all samples of a stamp have in common.
         spacing_px: between nodes.
     """
 
@@ -53,12 +55,22 @@ class PsfField(eqx.Module):
     warp: Float[Arrayish, "planes warp_terms 2 2"]
     lateral: Float[Arrayish, "other_planes lateral_terms 2"]
     mix: Float[Arrayish, "images terms"]
+    pedestal: Float[Arrayish, " planes"]
     spacing_px: float = eqx.field(static=True)
 
     @property
     def reference(self) -> int:
         """The plane whose places are the stars': green, where there are three."""
         return 1 if len(self.nodes) == 3 else 0
+
+    @property
+    def dense(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """What is not an image: numbers of the map, of lateral colour, and pedestals."""
+        return np.asarray(self.warp), np.asarray(self.lateral), np.asarray(self.pedestal)
+
+    def split(self, numbers: Shaped[np.ndarray, "numbers *k"]) -> list[Shaped[np.ndarray, "_ *k"]]:
+        """Split an array over all numbers of ``dense`` into those of each part."""
+        return np.split(numbers, np.cumsum([part.size for part in self.dense[:-1]]))
 
     @property
     def map_degree(self) -> int:
@@ -80,9 +92,10 @@ class PsfField(eqx.Module):
 
     def moved(self, changes: Changes) -> PsfField:
         """Return the field after the first of these changes."""
-        maps = np.split(changes.maps[:, 0], [np.size(self.warp)])
-        warp, lateral = (old + own.reshape(old.shape) for old, own in zip((self.warp, self.lateral), maps, strict=True))
-        return replace(self, nodes=self.nodes + changes.nodes[..., 0], warp=warp, lateral=lateral)
+        parts = zip(self.dense, self.split(changes.maps[:, 0]), strict=True)
+        warp, lateral, pedestal = (old + own.reshape(np.shape(old)) for old, own in parts)
+        nodes = self.nodes + changes.nodes[..., 0]
+        return replace(self, nodes=nodes, warp=warp, lateral=lateral, pedestal=pedestal)
 
 
 class Changes(NamedTuple):
@@ -90,7 +103,7 @@ class Changes(NamedTuple):
 
     Attributes:
         stars: (x, y) in px, then relative light by colour, then background by colour in electrons.
-        maps: the map's numbers, then the lateral colour's. With ``stars`` they form the dense block of the equations.
+        maps: the map's numbers, the lateral colour's, pedestals. With ``stars`` they form the equations' dense block.
         nodes: in the vector colour by colour and node by node, the images of a node together.
     """
 
@@ -102,7 +115,7 @@ class Changes(NamedTuple):
     def of(cls, field: PsfField, stars: int, vector: Shaped[np.ndarray, "unknowns k"]) -> Changes:
         """Split a vector into its parts."""
         planes, images, *grid = field.nodes.shape
-        ends = np.cumsum([stars * (2 + 2 * planes), np.size(field.warp) + np.size(field.lateral)])
+        ends = np.cumsum([stars * (2 + 2 * planes), sum(part.size for part in field.dense)])
         own, maps, nodes = np.split(vector, ends)
         nodes = np.moveaxis(nodes.reshape(planes, *grid, images, -1), 3, 1)
         return cls(own.reshape(stars, 2 + 2 * planes, -1), maps, nodes)
@@ -119,7 +132,7 @@ class Seen(NamedTuple):
     """
 
     value: Float[Arrayish, "stars samples"]
-    jacobian: Float[Arrayish, "stars samples 8"]
+    jacobian: Float[Arrayish, "stars samples 9"]
     first: Int[Arrayish, "stars samples"]
     down: Float[Arrayish, "stars samples 4"]
     across: Float[Arrayish, "stars samples 4"]
@@ -153,8 +166,11 @@ def see(
     by_star = (filled, field.maps(unit), centre_px[:, None] + field.centres(unit), plane.astype(np.int32))
     grid = np.int32(rows), np.int32(columns), np.float64(field.spacing_px)
     parts = ([_filled(part[at : at + 8], 0, 8) for part in by_star] for at in range(0, len(unit), 8))
-    seen = [response(*part, offset_px, *grid) for part in parts]
-    return Seen(*(np.concatenate(part)[: len(unit)] for part in zip(*seen, strict=True)))
+    by_part = [response(*part, offset_px, *grid) for part in parts]
+    seen = Seen(*(np.concatenate(part)[: len(unit)] for part in zip(*by_part, strict=True)))
+    common, jacobian = np.asarray(field.pedestal)[plane], seen.jacobian.copy()
+    jacobian[..., 0] += common
+    return seen._replace(value=seen.value + common, jacobian=jacobian)
 
 
 def taps(seen: Seen, used: Int[np.ndarray, " used"], grid: tuple[int, ...]) -> scipy.sparse.csr_array:
@@ -172,13 +188,15 @@ def by_maps(
 ) -> tuple[Int[np.ndarray, " own"], scipy.sparse.csr_array]:
     """Return which numbers of ``Changes.maps`` a colour depends on, and the matrix from these to the stars' own."""
     one = np.eye(OWN)
-    warp, lateral = np.split(np.arange(field.warp.size + field.lateral.size), [field.warp.size])
+    warp, lateral, pedestal = field.split(np.arange(sum(part.size for part in field.dense)))
     index, basis = [warp.reshape(field.warp.shape)[plane].ravel()], polynomials(unit, field.map_degree)[:, 1:]
     parts = [scipy.sparse.kron(basis, one[:, 3:7])]
     if plane != field.reference:
         index.append(lateral.reshape(field.lateral.shape)[plane - (plane > field.reference)].ravel())
         basis = polynomials(unit, degree_of(1 + field.lateral.shape[1]))[:, 1:]
         parts.append(scipy.sparse.kron(basis, one[:, 1:3]))
+    index.append(pedestal[[plane]])
+    parts.append(scipy.sparse.kron(np.ones((len(unit), 1)), one[:, [PEDESTAL]]))
     return np.concatenate(index), scipy.sparse.csr_array(scipy.sparse.hstack(parts, format="csr"))
 
 
@@ -245,7 +263,7 @@ def response(
         second = scale[:, None, None] * second.reshape(-1, 2, 2)
         by_map = -rise[:, :, None] * at[:, None, :] - value[:, None, None] * inverse.transpose(0, 2, 1)
         by_map -= 2 * jnp.einsum("sai,sab,sbj->sij", inverse, second, shrunk)
-        jacobian = jnp.concatenate([value[:, None], -rise, by_map.reshape(-1, 4), jnp.ones((len(value), 1))], axis=1)
+        jacobian = jnp.concatenate([value[:, None], -rise, by_map.reshape(-1, 4), jnp.ones((len(value), 2))], axis=1)
         return Seen(value, jacobian, first, scale[:, None] * down, across, inside_y & inside_x)
 
     return jax.vmap(star)(images, maps, centres, plane)

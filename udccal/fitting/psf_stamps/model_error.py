@@ -139,8 +139,4 @@ def drawn(state: State, unknowns: int, count: int) -> Float[np.ndarray, "unknown
         a, b = state.of_images[:, image].T[..., None]
         spread = np.sqrt((1.0 / (a + b * eigenvalues)).mean(axis=1))[:, None, None] * state.size * left[image]
         nodes[:, image] += spread[..., None] / 0.479 * rng.standard_normal((*spread.shape, count))
-    # Light of the psf that is constant over a stamp differs from a background only by its growth with a star's light.
-    spread = np.maximum(state.light_e.std(axis=0), 1e-3 * state.light_e.mean(axis=0)) * np.sqrt(len(state.light_e))
-    edge = state.background_e.std(axis=0) / spread
-    nodes[:, 0] += edge[:, None, None, None] * rng.standard_normal((len(edge), 1, 1, count))
     return out

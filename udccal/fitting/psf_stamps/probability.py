@@ -24,17 +24,30 @@ from scipy.sparse.linalg import LaplacianNd
 from scipy.special import log_ndtr
 
 from udccal.fitting.psf_stamps.data import Stamps, StampsRules
-from udccal.fitting.psf_stamps.field import Changes, PsfField, Seen, degree_of, see
+from udccal.fitting.psf_stamps.field import BACKGROUND, Changes, PsfField, Seen, degree_of, see
 
 LEAST = 2e-5  # size of the faintest light that the prior expects, relative to the peak
 ABSENT = 1e8  # precision of a term that is not there, relative to the kernel
+HELD = slice(-3, -1)  # precisions of the pedestals and of the backgrounds' mean
 
 
-def envelope(nodes: Float[np.ndarray, "*k rows columns"], spacing_px: float) -> Float[np.ndarray, "*k rows columns"]:
-    """Return the kernel's size E on the nodes of the first images: their root mean square nearby."""
+def envelope(
+    nodes: Float[np.ndarray, "*k rows columns"], spacing_px: float, noise: Float[np.ndarray, "*k"] | float = 0.0
+) -> Float[np.ndarray, "*k rows columns"]:
+    """Return the kernel's size E on the nodes of the first images: their root mean square nearby.
+
+    It is not below ``noise``, that of a sample in all stars together (relative to their light): a prior that is tighter
+    than the data takes faint rings for nothing, and then knows that there are none.
+    """
     width = [0.0] * (nodes.ndim - 2) + [1.5 / spacing_px] * 2
     peak = np.abs(nodes).max(axis=(-2, -1), keepdims=True)
-    return np.sqrt(scipy.ndimage.gaussian_filter(nodes**2, width, mode="nearest") + (LEAST * peak) ** 2)
+    least = (LEAST * peak) ** 2 + np.square(noise)[..., None, None]
+    return np.sqrt(scipy.ndimage.gaussian_filter(nodes**2, width, mode="nearest") + least)
+
+
+def faintest(stamps: Stamps, light_e: Float[np.ndarray, "stars planes"]) -> Float[np.ndarray, " planes"]:
+    """Return the noise without light of a sample in all stars together, relative to their light."""
+    return stamps.read_e / np.linalg.norm(light_e, axis=0)
 
 
 def grid_size(shape: tuple[int, ...], spacing_px: float, reach: float) -> tuple[int, int]:
@@ -58,7 +71,7 @@ class State:
         centre_px: of the stars, from their middle samples.
         background_e: light per sample that is not the stars'.
         precisions: of the priors: (a, b) of images by colour and image; of maps by colour and degree, from 1; of
-            lateral colour likewise, of all colours but the reference; of backgrounds' mean and scatter.
+            lateral colour likewise, of all colours but the reference; of pedestals; of backgrounds' mean and scatter.
         size: E of the priors, see ``envelope``.
         keep: True for samples that are not outliers.
         model_error: what the model does not describe, in light per pixel at the nodes, which adds to the noise.
@@ -124,14 +137,14 @@ class State:
 
     @property
     def maps(self) -> int:
-        """How many numbers maps and lateral colour have."""
-        return int(np.size(self.field.warp) + np.size(self.field.lateral))
+        """How many numbers maps, lateral colour and pedestals have."""
+        return sum(part.size for part in self.field.dense)
 
     @cached_property
     def vector(self) -> Float[np.ndarray, " unknowns"]:
         """Values of the unknowns, in the order of ``Changes``; 0 for places and light, of which no prior knows."""
         stars = np.concatenate([np.zeros((len(self.light_e), 2 + self.light_e.shape[1])), self.background_e], axis=1)
-        parts = stars, self.field.warp, self.field.lateral, np.moveaxis(self.field.nodes, 1, 3)
+        parts = stars, *self.field.dense, np.moveaxis(self.field.nodes, 1, 3)
         return np.concatenate([np.ravel(part) for part in parts])
 
     @cached_property
@@ -144,9 +157,11 @@ class State:
             index, size = (part[inside].ravel() for part in (numbers.nodes[plane, image, ..., 0], self.size[plane]))
             parts.append(scipy.sparse.diags_array(1.0 / size) @ every[index])
             parts.append(laplacian(*self.size[plane][inside].shape)[0] @ parts[-1])
-        for own, like in zip(np.split(numbers.maps, [field.warp.size]), (field.warp, field.lateral), strict=True):
+        *maps, pedestal = field.split(numbers.maps)
+        for own, like in zip(maps, (field.warp, field.lateral), strict=True):
             ends = np.cumsum(np.arange(2, degree_of(1 + like.shape[1]) + 1))
             parts += [every[one.ravel()] for of in own.reshape(like.shape) for one in np.split(of, ends) if one.size]
+        parts.append(every[pedestal.ravel()])
         level, mean = every[numbers.stars[:, -planes:, 0].T.ravel()], np.full((1, stars), 1 / np.sqrt(stars))
         means = scipy.sparse.kron(np.eye(planes), mean)
         parts += [means @ level, level - means.T @ means @ level]
@@ -188,7 +203,7 @@ class State:
         precisions = self.precisions.copy()
         precisions[: self.of_images.size] *= np.tile([ratio**2, ratio**-2], self.of_images.size // 2)
         field = replace(self.field, nodes=nodes, spacing_px=spacing_px)
-        size = envelope(nodes[:, 0], spacing_px)
+        size = envelope(nodes[:, 0], spacing_px, faintest(stamps, self.light_e))
         state = replace(self, field=field, precisions=precisions, size=size, model_error=np.zeros_like(size))
         return state._confined(rules)
 
@@ -273,7 +288,7 @@ def expectation(stamps: Stamps, state: State) -> Weighted:
     used = stamps.known & state.keep & seen.inside
     residual, weight = np.where(used, residual, 0.0), np.where(used, weight, 0.0)
     jacobian = light[..., None] * seen.jacobian
-    jacobian[..., -1] = 1.0
+    jacobian[..., BACKGROUND] = 1.0
     seen = seen._replace(down=light[..., None] * seen.down, jacobian=jacobian)
     return Weighted(seen, residual, weight, mean, node, float(likelihood[used].sum()))
 

@@ -16,11 +16,20 @@ from jaxtyping import Float
 from udccal.fitting.engine.least_squares import Solution, SolverRules, Step, minimise
 from udccal.fitting.engine.orders import Attempt, Choice, choose
 from udccal.fitting.engine.robust import OutlierRule, robust_sigma
-from udccal.fitting.psf_stamps.data import Stamps, StampsRules, backgrounds, centroids, light_of
+from udccal.fitting.psf_stamps.data import Stamps, StampsRules, backgrounds, centroids, edge_light, light_of
 from udccal.fitting.psf_stamps.equations import Laplace, laplace
 from udccal.fitting.psf_stamps.field import PsfField, polynomials, taps
 from udccal.fitting.psf_stamps.model_error import of_residuals, of_stars_left_out, placed, without_error
-from udccal.fitting.psf_stamps.probability import ABSENT, State, envelope, expectation, grid_size, log_posterior
+from udccal.fitting.psf_stamps.probability import (
+    ABSENT,
+    HELD,
+    State,
+    envelope,
+    expectation,
+    faintest,
+    grid_size,
+    log_posterior,
+)
 from udccal.models.fields import polynomial_terms
 
 _LEAST_PART = 0.01  # of a step to the mode
@@ -51,6 +60,9 @@ class Evidence:
         # no more than 30 times as much at once, and no more than that of an absent term.
         ratio = np.clip(np.maximum(expected - left, 1e-6 * expected) / np.maximum(there, 1e-300), 1 / 30, 30.0)
         tuned = np.minimum(np.log(ratio), np.log(ABSENT / place.precisions))
+        # Pedestal and background differ only where stars are of different brightness. Tuned, the precision of one would
+        # rise until it is absent, and nothing would say that it could as well have been the other.
+        tuned[HELD] = 0.0
         # Drop the factors, the largest arrays of a fit, so that memory never holds two of them.
         return replace(found, tuned=tuned, colours=())
 
@@ -133,14 +145,17 @@ def start(stamps: Stamps, rules: StampsRules, map_degree: int) -> State:
     nodes = np.tile(image / (image.sum() * spacing_px**2), (planes, 1, 1, 1))
     warp = np.zeros((planes, polynomial_terms(map_degree) - 1, 2, 2))
     # Lateral colour of degree 2.
-    field = PsfField(nodes, warp, np.zeros((planes - 1, 5, 2)), np.ones((1, 1)), spacing_px)
-    background_e, size = backgrounds(stamps), envelope(nodes[:, 0], spacing_px)
-    # A background too faint for the edges to show may still be as large as the noise; the evidence decides.
-    squares = np.array([(background_e.mean(axis=0) ** 2).mean(), background_e.var(axis=0).mean()])
+    field = PsfField(nodes, warp, np.zeros((planes - 1, 5, 2)), np.ones((1, 1)), np.zeros(planes), spacing_px)
+    background_e = backgrounds(stamps)
+    # A background may be all of the edges' light; one too faint for these to show may still be as large as the noise.
+    squares = np.array([edge_light(stamps) ** 2, background_e.var(axis=0).mean()])
+    expected = np.maximum(squares, stamps.read_e**2) * [len(stamps.unit), 1]
     lateral, images = np.full(2 * planes - 2, rules.first_lateral), np.tile(rules.first_image[0], planes)
     maps = np.tile(([rules.first_map] * 2 + [rules.new_map] * map_degree)[:map_degree], planes)
-    precisions = np.concatenate([images, maps, lateral, 1.0 / np.maximum(squares, stamps.read_e**2)])
+    pedestal = (stamps.values_e[0].size / rules.most_pedestal) ** 2
+    precisions = np.concatenate([images, maps, lateral, [pedestal], 1.0 / expected])
     centre_px, light_e = centroids(stamps, background_e, WINDOW_PX), light_of(stamps, background_e)
+    size = envelope(nodes[:, 0], spacing_px, faintest(stamps, light_e))
     keep = np.ones_like(stamps.known)
     return State(field, centre_px, light_e, background_e, precisions, size, keep, np.zeros_like(size))
 
