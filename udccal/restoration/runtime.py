@@ -214,7 +214,7 @@ class Restorer:
         sharp = self.sharpener.apply(light.signal_e, light.variance_e2, light.clipped)
         if light.panel_error_e is not None:
             sharp = plausible(sharp, light.panel_error_e[self.sharpener.layout.inner])
-        return self._strip_rectification.apply(sharp, self.options.interpolation)
+        return self.strip_rectification.apply(sharp, self.options.interpolation)
 
     def scene_light(
         self,
@@ -299,7 +299,8 @@ class Restorer:
         return BlindSamples.of(self.wire, shape, cfa_named(self.rig.camera.cfa), self.noise)
 
     @functools.cached_property
-    def _strip_rectification(self) -> Rectification:
+    def strip_rectification(self) -> Rectification:
+        """Map from the rows that the sharpener returns to the view."""
         assert self.sharpener is not None
         return self.rectification.from_row(self.sharpener.rows.start)
 
