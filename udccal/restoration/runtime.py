@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float32, UInt8, UInt16
 
 from udccal.cfa import cfa_named
 from udccal.errors import RestorationError
+from udccal.kernels import fitted_size
 from udccal.models.geometry import VirtualView
 from udccal.models.noise import Noise
 from udccal.models.psf import PsfField
@@ -317,8 +318,11 @@ def _needed_rows(sharpener: Sharpener | None, rig: RigDescription) -> slice:
 
 
 def _kept_grid(psf: PsfField, rig: RigDescription, options: PlanOptions, keep: Path | None) -> KernelGrid:
-    """Return ``kernel_grid``; the number of threads does not matter to what is kept."""
-    return kept(keep, KernelGrid, (psf, rig, replace(options, workers=1)), lambda: kernel_grid(psf, rig, options))
+    """Return ``kernel_grid``. Of the rig and the options, sizes alone matter to what is kept."""
+    size = fitted_size(psf, rig, options.kernel_rows, options.kernel_columns)
+    nodes = options.grid_rows, options.grid_columns
+    sensor = rig.camera.rows, rig.camera.columns
+    return kept(keep, KernelGrid, (psf, size, nodes, sensor), lambda: kernel_grid(psf, rig, options))
 
 
 def check_frame(mosaic: np.ndarray, exposure_s: float, rig: RigDescription) -> None:
