@@ -157,6 +157,31 @@ def test_frames_of_extremes(restorers: dict[Tier, Restorer], tier: Tier, kind: s
     assert restored.max() * EXPOSURE_S < 10 * 3969 / 0.355
 
 
+@pytest.mark.parametrize("tier", list(Tier))
+@pytest.mark.parametrize(
+    "kind", ["an exposure of a nanosecond", "a full well", "a hundred times the noise", "no light"]
+)
+def test_cameras_at_their_limits(
+    restorers: dict[Tier, Restorer], toy_grid: KernelGrid, toy_scene: np.ndarray, tier: Tier, kind: str
+) -> None:
+    restorer, exposure_s = restorers[tier], EXPOSURE_S
+    frame = exposed(restorers[Tier.fast], toy_grid, toy_scene)
+    if kind == "an exposure of a nanosecond":
+        exposure_s = 1e-9
+    elif kind == "a full well":
+        frame[:] = 3969
+    elif kind == "a hundred times the noise":
+        restorer = replace(restorer, noise=replace(restorer.noise, sigma_d_e=500.0, sigma_row_DN=20.0))
+        noisy = frame + np.random.default_rng(1).normal(0.0, 177.0, frame.shape)
+        frame = np.clip(np.rint(noisy), 0, 3969).astype(np.uint16)
+    else:
+        frame[:] = 0
+    restored = restorer.restore(frame, exposure_s) * exposure_s
+    assert np.isfinite(restored).all()
+    assert np.abs(restored).max() < 10 * 3969 / 0.355
+    assert restorer.display(frame, exposure_s, Tone(exposure_s / 6000)).dtype == np.uint8
+
+
 def test_a_panel_brighter_than_the_scene(
     restorers: dict[Tier, Restorer], toy_grid: KernelGrid, toy_scene: np.ndarray
 ) -> None:

@@ -19,6 +19,7 @@ from udccal.restoration import backscatter, prepared, rectify, runtime, sharpen,
 from udccal.restoration.backscatter import PanelLight
 from udccal.restoration.plan import PlanOptions
 from udccal.restoration.prepared import kept, prepared_bytes, prepared_folder
+from udccal.restoration.rectify import Interpolation
 from udccal.restoration.runtime import Restorer
 from udccal.restoration.sharpen import Sharpener
 from udccal.tiers import Tier
@@ -320,6 +321,48 @@ def test_tiers_share_what_both_need(
 ) -> None:
     _refuse(monkeypatch, "kernel_grid", "filter_tables", "panel_response")
     Restorer.from_profile(profile, Tier.fast, _OPTIONS, filled[0])
+
+
+_USED_LATER = {
+    "panel_block": 2,
+    "interpolation": Interpolation.LINEAR,
+    "network_views": 1,
+    "kernel_rows": 301,  # the psf has fewer
+    "workers": 3,
+}
+
+
+@pytest.mark.parametrize("name", _USED_LATER)
+def test_what_kernels_do_not_depend_on_computes_none(
+    profile: Profile, filled: tuple[Path, Restorer], monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    _refuse(monkeypatch, "kernel_grid", "filter_tables", "measured_noise", "inscribed_view", "_sensor_pixels")
+    Restorer.from_profile(profile, Tier.balanced, replace(_OPTIONS, **{name: _USED_LATER[name]}), filled[0])
+
+
+def test_other_tiles_share_the_kernels(
+    profile: Profile, filled: tuple[Path, Restorer], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _refuse(monkeypatch, "kernel_grid", "filter_tables")
+    with pytest.raises(pytest.fail.Exception, match="filter_tables"):
+        Restorer.from_profile(profile, Tier.fast, replace(_OPTIONS, tile_columns=104), filled[0])
+
+
+def test_a_rig_of_another_name_shares_all(
+    profile: Profile, filled: tuple[Path, Restorer], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _refuse(monkeypatch, "kernel_grid", "filter_tables", "measured_noise", "panel_response", "_sensor_pixels")
+    renamed = replace(profile, rig=profile.rig.model_copy(update={"name": "another"}))
+    Restorer.from_profile(renamed, Tier.balanced, _OPTIONS, filled[0])
+
+
+@pytest.mark.parametrize("name", ["grid_rows", "grid_columns"])
+def test_kernels_at_other_places_are_computed_anew(
+    profile: Profile, filled: tuple[Path, Restorer], monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    _refuse(monkeypatch, "kernel_grid")
+    with pytest.raises(pytest.fail.Exception, match="kernel_grid"):
+        Restorer.from_profile(profile, Tier.fast, replace(_OPTIONS, **{name: 3}), filled[0])
 
 
 def test_a_changed_psf_computes_its_kernels_anew(

@@ -6,7 +6,7 @@ import pytest
 from udccal.cfa import PATTERNS
 from udccal.restoration.kernel_grid import KernelGrid
 from udccal.restoration.mosaic_filter import STRENGTHS, FilterTables, filter_tables, filtered
-from udccal.restoration.shrink import BandNoise, _split, measured_noise, shrunk
+from udccal.restoration.shrink import BandNoise, measured_noise, shrunk, split
 from udccal.restoration.tiles import TileLayout, layout_for
 
 CFA = PATTERNS["RGGB"]
@@ -41,7 +41,7 @@ def restored(
 
 def test_the_bands_sum_to_the_plane() -> None:
     plane = np.random.default_rng(0).random((37, 51), dtype=np.float32)
-    bands, smooth = _split(plane)
+    bands, smooth = split(plane)
     np.testing.assert_allclose(sum(bands) + smooth, plane, atol=1e-6)
 
 

@@ -100,7 +100,9 @@ class PanelLight:
         Raises:
             RestorationError: when a value is not finite.
         """
-        sums = kept(keep, PanelSums, (term, rig, block), lambda: _panel_sums(term, rig, block))
+        sums = kept(
+            keep, PanelSums, (term, rig.panel.rows, rig.panel.columns, block), lambda: _panel_sums(term, rig, block)
+        )
         return cls(sums, cfa_named(rig.camera.cfa), rig.panel.rows, rig.panel.columns, block)
 
     def of_rows(self, rows: slice) -> PanelLight:

@@ -1,9 +1,10 @@
 """The PSNR that each tier is expected to reach on a frame, against a camera without a panel.
 
-Each place of the picture gets the variance of its error: the tile's noise times what its filter passes, and the detail
-that the filter loses (``filter_error``). Within a tile, noise follows the light, and detail its square. The preview has
-the detail that its blur changes instead, and the panel's light that the mean of a mask misses. The error then passes
-the display's tone curve. Errors of the profile, and light that clips, are not part of it.
+The three quicker tiers' pictures are made. What ``balanced`` takes out of that of ``fast`` is noise, and tells how
+much noise it leaves. Each place also gets the variance of the detail that the tile's filter loses (``lost_detail``);
+within a tile it follows the square of the light. How much detail there is where the filter finds none, the finest
+detail that it finds tells: where two octaves of it hardly differ, the scene goes on as strong. The quicker tiers differ
+from ``balanced`` by errors of their own. Errors of the profile, and light that clips, are not part of it.
 """
 
 from __future__ import annotations
@@ -16,21 +17,23 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32, Int, UInt8, UInt16
 
-from udccal.restoration.demosaic import demosaic
-from udccal.restoration.filter_error import FilterError, filter_error
+from udccal.restoration.lost_detail import LostDetail, lost_detail
 from udccal.restoration.metrics import display_exposure, encode_srgb, least_squares_gain
 from udccal.restoration.mosaic_filter import STRENGTHS
 from udccal.restoration.prepared import kept
 from udccal.restoration.runtime import Restorer
 from udccal.restoration.sharpen import Sharpener, Solved
+from udccal.restoration.shrink import split
 from udccal.tiers import Tier
 
-# Part of the prior's detail beyond what the filter finds that photographs have: the prior's power falls slowly and
-# without end. Fitted to the scenes of docs/restoration.md.
-_DETAIL: Final = 0.25
-# Part of the noise that a tier leaves. Shrinkage takes out 1.6 times the noise where nothing else is, little at edges;
-# the network's part was fitted to what it gains on eight of these scenes.
-_LEFT: Final = {Tier.preview: 0.0, Tier.fast: 1.0, Tier.balanced: 0.5, Tier.accurate: 0.36}
+# Noise that ``balanced`` leaves, over what it takes out.
+_LEFT: Final = 1.6
+# Of the detail that a filter of some strength loses under the prior, the part that scenes have:
+# FLAT flatness^EXPONENT + COARSE / (1 + strength). At little strength the filter loses coarse detail too, which all
+# scenes have. These numbers were fitted to the scenes of docs/restoration.md, of which none is flatter than FLATTEST.
+_FLAT, _EXPONENT, _COARSE, _FLATTEST = 0.41, 3.2, 0.3, 1.4
+# Variance of the error of ``accurate`` over that of ``balanced``: the median of the same scenes.
+_NETWORK: Final = 0.84
 # Width in px over which light is averaged to tell bright places from dark ones.
 _LOCAL_PX: Final = 16
 # Every n-th row and column is looked at.
@@ -47,30 +50,25 @@ class ExpectedError:
 
     Attributes:
         light: the scene.
-        noise: variance of the noise that the filters pass.
-        lost: variance of the detail that they lose.
-        blur: variance of what the kernels change.
-        panel: backscatter that a preview misses.
+        lost: variance of the detail that the filters lose.
+        apart: mean square difference of quicker tiers' display-encoded pictures from that of ``balanced``.
     """
 
     light: Places
-    noise: Places
     lost: Places
-    blur: Places
-    panel: Places
+    apart: dict[Tier, float]
 
     def psnr_dB(self, tier: Tier) -> float:
-        """Return the PSNR of display-encoded values after the least-squares gain of each colour."""
-        seen = self.light + self.panel if tier is Tier.preview else self.light
-        detail = self.blur if tier is Tier.preview else self.lost
-        sigma = np.sqrt(_LEFT[tier] * self.noise + _DETAIL * detail)
-        gain = least_squares_gain(np.clip(seen, 0.0, 1.0), np.minimum(self.light, 1.0)).astype(np.float32)
-        truth = encode_srgb(self.light)
-        squared = [np.mean((encode_srgb((seen + node * sigma) * gain) - truth) ** 2) for node in _NODES]
-        return float(-10.0 * np.log10(max(np.dot(_WEIGHTS, squared) / _WEIGHTS.sum(), 1e-12)))
+        """Return the PSNR of display-encoded values."""
+        sigma, truth = np.sqrt(self.lost), encode_srgb(self.light)
+        squared = [np.mean((encode_srgb(self.light + node * sigma) - truth) ** 2) for node in _NODES]
+        balanced = _LEFT * self.apart[Tier.fast] + float(np.dot(_WEIGHTS, squared) / _WEIGHTS.sum())
+        error = _NETWORK * balanced if tier is Tier.accurate else balanced + self.apart.get(tier, 0.0)
+        return float(-10.0 * np.log10(max(error, 1e-12)))
 
 
 def expected_error(
+    preview: Restorer,
     restorer: Restorer,
     mosaic: UInt16[np.ndarray, "rows columns"],
     exposure_s: float,
@@ -80,60 +78,54 @@ def expected_error(
     """Return the errors that a frame is expected to be restored with; None where a profile has no psf.
 
     Args:
-        restorer: of the tier fast or balanced.
+        preview, restorer: of the tiers preview and balanced, of the same profile.
         mosaic, exposure_s, panel_picture: as for ``Restorer.restore``, with its errors.
         keep: folder that keeps what depends on the profile alone; None to keep nothing.
     """
     sharpener = restorer.sharpener
     if sharpener is None:
         return None
-    source = sharpener.grid, sharpener.tables, sharpener.layout, sharpener.cfa
-    error = kept(keep, FilterError, (sharpener.grid, sharpener.layout, sharpener.cfa), lambda: filter_error(*source))
+    depends_on, source = (sharpener.grid, sharpener.layout, sharpener.cfa), (sharpener.layout, sharpener.cfa)
+    lost = kept(keep, LostDetail, depends_on, lambda: lost_detail(sharpener.tables, *source))
     light = restorer.scene_light(mosaic, exposure_s, panel_picture)
-    solved = sharpener.solved(light.signal_e, light.variance_e2, light.clipped)
-    missed = _missed_by_preview(restorer, light.signal_e, exposure_s, panel_picture)
-    white_e = 1 / display_exposure(solved.picture)
-    return _at_places(sharpener, solved, error, light.variance_e2, missed[sharpener.layout.inner], white_e)
+    given = light.signal_e, light.variance_e2, light.clipped
+    solved, balanced = sharpener.solved(*given), sharpener.apply(*given)
+    white_e = np.float32(1 / display_exposure(balanced))
+    view = restorer.strip_rectification
+    best, found = (view.apply(picture) / white_e for picture in (balanced, solved.picture))
+    quick = preview.restore(mosaic, exposure_s, panel_picture) * (np.float32(exposure_s) / white_e)
+    apart = {Tier.preview: _apart(quick, best), Tier.fast: _apart(found, best)}
+    flatness = min(_flatness(encode_srgb(balanced / white_e)), _FLATTEST)
+    part = _FLAT * flatness**_EXPONENT + _COARSE / (1 + solved.strengths)
+    of_tile = lost.variance[np.arange(len(part)), np.searchsorted(STRENGTHS, solved.strengths)] * part[:, None]
+    return ExpectedError(*_at_places(sharpener, solved, of_tile, white_e), apart)
 
 
-def _missed_by_preview(
-    restorer: Restorer,
-    signal: Float32[np.ndarray, "rows columns"],
-    exposure_s: float,
-    panel_picture: UInt8[np.ndarray, "panel_rows panel_columns 3"] | None,
-) -> Float32[np.ndarray, "rows columns 3"]:
-    """Return the panel's light in e- that stays when its picture is taken for an even one."""
-    if restorer.mask is None or restorer.panel is None or panel_picture is None:
-        return np.zeros((*signal.shape, 3), dtype=np.float32)
-    rate = restorer.panel.rate(panel_picture)
-    levels = restorer.mask.levels(signal + np.float32(exposure_s) * rate, exposure_s, restorer.noise)
-    return demosaic(np.float32(exposure_s) * (rate - restorer.mask.rate(levels)), restorer.rig.camera.cfa)
+def _apart(picture: Places, best: Places) -> float:
+    """Return the mean square difference of display-encoded pictures after the least-squares gain of each colour."""
+    gain = least_squares_gain(np.clip(picture, 0.0, 1.0), np.clip(best, 0.0, 1.0)).astype(np.float32)
+    return float(np.mean((encode_srgb(picture * gain) - encode_srgb(best)) ** 2))
+
+
+def _flatness(shown: Places) -> float:
+    """Return the energy of the finest octave of detail over that of the next."""
+    energy = []
+    for plane in cv2.split(shown):
+        for _ in range(2):
+            bands, smooth = split(plane)
+            energy.append(sum(float(np.mean(band**2)) for band in bands))
+            plane = np.ascontiguousarray(smooth[::2, ::2])
+    return sum(energy[::2]) / max(sum(energy[1::2]), 1e-12)
 
 
 def _at_places(
-    sharpener: Sharpener,
-    solved: Solved,
-    error: FilterError,
-    variance_e2: Float32[np.ndarray, "strip_rows columns"],
-    missed: Float32[np.ndarray, "rows columns 3"],
-    white_e: float,
-) -> ExpectedError:
-    tile = _nearest_tile(sharpener)
-    some = np.s_[::_SPARSE, ::_SPARSE]
-    size = (_LOCAL_PX, _LOCAL_PX)
+    sharpener: Sharpener, solved: Solved, lost: Float32[np.ndarray, "tiles 3"], white_e: np.float32
+) -> tuple[Places, Places]:
+    """Return the light and the variance of lost detail, given by tile in units of its noise."""
+    tile, some = _nearest_tile(sharpener), np.s_[::_SPARSE, ::_SPARSE]
     light = np.maximum(solved.picture, np.float32(0))
-    brightness = _relative(cv2.blur(variance_e2, size)[sharpener.layout.inner][some][..., None], tile)
-    contrast = _relative(cv2.blur(light, size)[some] ** 2, tile)
-    unit = (solved.noise_e / np.float32(white_e)) ** 2
-    strength = np.searchsorted(STRENGTHS, solved.strengths)
-    each = np.arange(len(strength))
-    return ExpectedError(
-        light=light[some] / np.float32(white_e),
-        noise=(error.noise[each, strength] * unit)[tile] * brightness,
-        lost=(error.lost[each, strength] * unit)[tile] * contrast,
-        blur=(error.blur * solved.strengths[:, None] * unit)[tile] * contrast,
-        panel=missed[some] / np.float32(white_e),
-    )
+    contrast = _relative(cv2.blur(light, (_LOCAL_PX, _LOCAL_PX))[some] ** 2, tile)
+    return light[some] / white_e, (lost * (solved.noise_e / white_e) ** 2)[tile] * contrast
 
 
 def _nearest_tile(sharpener: Sharpener) -> Int[np.ndarray, "rows columns"]:

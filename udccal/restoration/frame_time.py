@@ -14,15 +14,16 @@ from pathlib import Path
 from typing import final
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64
 
 from udccal.cfa import Cfa, cfa_named
 from udccal.models.noise import Noise
 from udccal.restoration.backscatter import PanelMask
+from udccal.restoration.clipped import clipped_tiles, completed
 from udccal.restoration.defects import without_defects
 from udccal.restoration.demosaic import demosaic
 from udccal.restoration.linear import to_electrons, variance_e2
-from udccal.restoration.mosaic_filter import FilterTables, filtered_and_joined
+from udccal.restoration.mosaic_filter import FilterTables, filtered, filtered_and_joined
 from udccal.restoration.network import corrected, noise_planes
 from udccal.restoration.plan import PlanOptions
 from udccal.restoration.prepared import kept
@@ -34,6 +35,8 @@ from udccal.restoration.tone import Tone
 from udccal.tiers import Tier
 
 _ROWS, _COLUMNS, _RUNS = 512, 768, 5
+# Part of a tile's samples that clip; it hardly matters to their time.
+_CLIPPED = 0.02
 
 Seconds = Float64[np.ndarray, ""]
 
@@ -51,6 +54,7 @@ class PartTimes:
         network: of the tier ``accurate``, per pixel that the tiles cover.
         view: resampling and tone, per pixel of the view.
         preview: all of a preview, per pixel of the rows that the view needs.
+        completion: of clipped samples, per pixel of the tiles that have some.
     """
 
     linear: Seconds
@@ -60,6 +64,7 @@ class PartTimes:
     network: Seconds
     view: Seconds
     preview: Seconds
+    completion: Seconds
 
 
 @final
@@ -72,20 +77,27 @@ class FrameSize:
         covered_px: pixels of the rows that the view needs.
         view_px: pixels of the view.
         tile_px: pixels of all tiles; 0 where nothing is deblurred.
+        clipped_px: pixels of the tiles in which samples clip.
     """
 
     strip_px: int
     covered_px: int
     view_px: int
     tile_px: int
+    clipped_px: int
 
     @classmethod
-    def of(cls, layout: TileLayout, view_px: int, blurred: bool) -> FrameSize:
-        """Return the size of a frame in the tiles of ``layout``."""
-        tile_px = layout.count * layout.rows * layout.columns
+    def of(
+        cls, layout: TileLayout, view_px: int, blurred: bool, clipped: Bool[np.ndarray, "strip_rows columns"]
+    ) -> FrameSize:
+        """Return the size of a frame in the tiles of ``layout``; ``clipped`` are samples of the rows ``reach``."""
+        of_tile = layout.rows * layout.columns
+        tile_px, clipped_px = layout.count * of_tile, len(clipped_tiles(clipped, layout)[0]) * of_tile
         strip_rows = layout.reach.stop - layout.reach.start if blurred else layout.frame_rows
         strip_px = strip_rows * layout.frame_columns
-        return cls(strip_px, int(np.prod(layout.covered)), view_px, tile_px if blurred else 0)
+        return cls(
+            strip_px, int(np.prod(layout.covered)), view_px, tile_px if blurred else 0, clipped_px if blurred else 0
+        )
 
     def ms(self, tier: Tier, times: PartTimes) -> float:
         """Return the milliseconds from a raw frame to a picture of 8 bits at a tier."""
@@ -94,7 +106,7 @@ class FrameSize:
         seconds = self.strip_px * times.linear + self.view_px * times.view
         if self.tile_px == 0:
             return 1e3 * float(seconds + self.strip_px * times.demosaicing)
-        seconds = seconds + self.tile_px * times.filter
+        seconds = seconds + self.tile_px * times.filter + self.clipped_px * times.completion
         if tier in (Tier.balanced, Tier.accurate):
             seconds = seconds + self.covered_px * times.shrinkage
         if tier is Tier.accurate:
@@ -135,6 +147,13 @@ def _measured(options: PlanOptions) -> PartTimes:
         variance /= ones
         clean -= np.float32(1.0) * ones
 
+    given = unit, tables, layout, cfa, workers
+    tiles = layout.cut(signal)
+    clipped = np.broadcast_to(rng.random(tiles.shape[1:]) < _CLIPPED, tiles.shape)
+
+    def completion() -> None:
+        completed(tiles, clipped, filtered(tiles, *given)[1], *given)
+
     def network() -> None:
         planes = noise_planes(bands, unit, signal, layout)
         corrected(picture, picture, picture, picture, planes, options.network_views)
@@ -142,14 +161,12 @@ def _measured(options: PlanOptions) -> PartTimes:
     parts = (
         (linear, mosaic.size),
         (lambda: demosaic(signal, cfa.name), mosaic.size),
-        (
-            lambda: filtered_and_joined(layout.cut(signal), unit, tables, layout, cfa, workers),
-            layout.count * layout.rows * layout.columns,
-        ),
+        (lambda: filtered_and_joined(layout.cut(signal), *given), tiles.size),
         (lambda: shrunk(picture, unit, signal, bands, layout, workers), mosaic.size),
         (network, mosaic.size),
         (lambda: tone.rgb8(rectification.apply(picture, options.interpolation)), view_x.size),
         (lambda: preview.rgb8(mosaic, 1.0, tone), mosaic.size),
+        (completion, tiles.size),
     )
     return PartTimes(*(np.array(_least_s(run) / pixels) for run, pixels in parts))
 

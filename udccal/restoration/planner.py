@@ -11,10 +11,10 @@ from udccal.cfa import cfa_named
 from udccal.profiles.profile import Profile
 from udccal.restoration.forecast import expected_error
 from udccal.restoration.frame_time import FrameSize, part_times
-from udccal.restoration.plan import PlanOptions
+from udccal.restoration.linear import saturated
 from udccal.restoration.runtime import Restorer, check_frame, check_panel_picture
 from udccal.restoration.scene_plan import ScenePlan, TierForecast, Wish, chosen_tier
-from udccal.restoration.stages import Stage, StageChoice
+from udccal.restoration.stages import StageChoice
 from udccal.restoration.tiles import layout_for
 from udccal.tiers import DEFAULT_TIER, Tier
 
@@ -51,23 +51,30 @@ def planned(
     if not forecast and wish == Wish():
         return ScenePlan.of(profile, tier or DEFAULT_TIER, stages)
     without = frozenset(choice.stage for choice in stages if not choice.runs)
-    tiers = _timed(profile, without, keep)
+    preview = Restorer.from_profile(profile, Tier.preview, keep=keep, without=without)
+    tiers = _timed(profile, preview, mosaic, keep)
     chosen_tier(tiers, Wish(budget_ms=wish.budget_ms))  # refuses before kernels are computed
     if forecast or wish.min_psnr_dB is not None:
-        restorer = Restorer.from_profile(profile, Tier.fast, keep=keep, without=without)
-        error = expected_error(restorer, mosaic, exposure_s, panel_picture, keep)
+        restorer = Restorer.from_profile(profile, Tier.balanced, keep=keep, without=without)
+        error = expected_error(preview, restorer, mosaic, exposure_s, panel_picture, keep)
         if error is not None:
             tiers = tuple(TierForecast(each.tier, error.psnr_dB(each.tier), each.frame_ms) for each in tiers)
     return ScenePlan.of(profile, tier or chosen_tier(tiers, wish), stages, tiers)
 
 
-def _timed(profile: Profile, without: frozenset[Stage], keep: Path | None) -> tuple[TierForecast, ...]:
+def _timed(
+    profile: Profile, preview: Restorer, mosaic: UInt16[np.ndarray, "rows columns"], keep: Path | None
+) -> tuple[TierForecast, ...]:
     """Return every tier with its time for a frame; the PSNR is not known yet."""
-    options, camera = PlanOptions(), profile.rig.camera
-    quick = Restorer.from_profile(profile, Tier.preview, options, keep, without)
+    options, camera = preview.options, profile.rig.camera
     cfa = cfa_named(camera.cfa)
     largest = options.tile_rows, options.tile_columns
-    layout = layout_for(camera.rows, camera.columns, (cfa.rows, cfa.columns), largest, quick.rectification.rows)
-    size = FrameSize.of(layout, quick.view.rows * quick.view.columns, not profile.psf.unfitted)
+    layout = layout_for(camera.rows, camera.columns, (cfa.rows, cfa.columns), largest, preview.rectification.rows)
+    size = FrameSize.of(
+        layout,
+        preview.view.rows * preview.view.columns,
+        not profile.psf.unfitted,
+        saturated(mosaic[layout.reach], preview.noise),
+    )
     times = part_times(options, keep)
     return tuple(TierForecast(tier, None, size.ms(tier, times)) for tier in Tier)

@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float32, UInt8, UInt16
 
 from udccal.cfa import cfa_named
 from udccal.errors import RestorationError
+from udccal.kernels import fitted_size
 from udccal.models.geometry import VirtualView
 from udccal.models.noise import Noise
 from udccal.models.psf import PsfField
@@ -214,7 +215,7 @@ class Restorer:
         sharp = self.sharpener.apply(light.signal_e, light.variance_e2, light.clipped)
         if light.panel_error_e is not None:
             sharp = plausible(sharp, light.panel_error_e[self.sharpener.layout.inner])
-        return self._strip_rectification.apply(sharp, self.options.interpolation)
+        return self.strip_rectification.apply(sharp, self.options.interpolation)
 
     def scene_light(
         self,
@@ -299,7 +300,8 @@ class Restorer:
         return BlindSamples.of(self.wire, shape, cfa_named(self.rig.camera.cfa), self.noise)
 
     @functools.cached_property
-    def _strip_rectification(self) -> Rectification:
+    def strip_rectification(self) -> Rectification:
+        """Map from the rows that the sharpener returns to the view."""
         assert self.sharpener is not None
         return self.rectification.from_row(self.sharpener.rows.start)
 
@@ -316,8 +318,11 @@ def _needed_rows(sharpener: Sharpener | None, rig: RigDescription) -> slice:
 
 
 def _kept_grid(psf: PsfField, rig: RigDescription, options: PlanOptions, keep: Path | None) -> KernelGrid:
-    """Return ``kernel_grid``; the number of threads does not matter to what is kept."""
-    return kept(keep, KernelGrid, (psf, rig, replace(options, workers=1)), lambda: kernel_grid(psf, rig, options))
+    """Return ``kernel_grid``. Of the rig and the options, sizes alone matter to what is kept."""
+    size = fitted_size(psf, rig, options.kernel_rows, options.kernel_columns)
+    nodes = options.grid_rows, options.grid_columns
+    sensor = rig.camera.rows, rig.camera.columns
+    return kept(keep, KernelGrid, (psf, size, nodes, sensor), lambda: kernel_grid(psf, rig, options))
 
 
 def check_frame(mosaic: np.ndarray, exposure_s: float, rig: RigDescription) -> None:

@@ -94,7 +94,7 @@ def _band_variances(picture: Float32[np.ndarray, "rows columns 3"]) -> Float32[n
     for colour, plane in enumerate(cv2.split(cv2.transform(picture, OPPONENT))):
         rest = plane
         for level in range(LEVELS):
-            bands, smooth = _split(rest)
+            bands, smooth = split(rest)
             found[colour, level] = [float(np.mean(band**2)) for band in bands]
             rest = np.ascontiguousarray(smooth[::2, ::2])
     return found
@@ -143,7 +143,7 @@ def _shrink_level(
     level: int = 0,
 ) -> Plane:
     """Shrink a plane's bands at this level, and at coarser ones by what they change."""
-    bands, smooth = _split(plane)
+    bands, smooth = split(plane)
     result = smooth.copy()
     down, across = (Runs.of(s, count, 0.5**level) for s, count in zip(layout.strips, plane.shape, strict=True))
     for index, band in enumerate(bands):
@@ -164,7 +164,7 @@ def _shrink_level(
     return result
 
 
-def _split(plane: Plane) -> tuple[tuple[Plane, Plane, Plane], Plane]:
+def split(plane: Plane) -> tuple[tuple[Plane, Plane, Plane], Plane]:
     """Split a plane into detail across, down and diagonal, and what is smooth; their sum is the plane."""
     border = cv2.BORDER_REFLECT_101
     down = cv2.sepFilter2D(plane, cv2.CV_32F, _ONE, SMOOTH, borderType=border)
