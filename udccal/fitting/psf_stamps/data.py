@@ -243,7 +243,7 @@ def backgrounds(stamps: Stamps) -> Float[np.ndarray, "stars planes"]:
 
 
 def edge_light(stamps: Stamps) -> float:
-    """Return the light of a sample at the stamps' edges, wings and background together: root mean square over colours."""
+    """Return the light of a sample at the stamps' edges, wings and background together, RMS over colours."""
     light = [np.median(stamps.value_e[own]) if own.any() else 0.0 for own in stamps.by_plane & _at_edge(stamps)]
     return float(np.linalg.norm(light) / np.sqrt(len(light)))
 
