@@ -143,8 +143,8 @@ class PanelLight:
     @functools.cached_property
     def _matrices(self) -> list[sparse.csr_array]:
         top, bottom, left, right = self.sums.region
-        shape, pattern = (len(self.sums.starts) - 1, (bottom - top) * (right - left)), (self.sums.pixels, self.sums.starts)
-        return [sparse.csr_array((shares, *pattern), shape) for shares in self.sums.shares]
+        shape = len(self.sums.starts) - 1, (bottom - top) * (right - left)
+        return [sparse.csr_array((part, self.sums.pixels, self.sums.starts), shape) for part in self.sums.shares]
 
     @functools.cached_property
     def _interpolations(self) -> list[tuple[sparse.csr_array, sparse.csr_array]]:
