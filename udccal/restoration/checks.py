@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from numbers import Integral, Real
 from typing import Final
 
 import numpy as np
@@ -14,6 +13,8 @@ from udccal.rig import RigDescription
 
 # From a nanosecond to a day.
 EXPOSURES_S: Final = (1e-9, 86400.0)
+_WHOLE = int | np.integer
+_NUMBER = _WHOLE | float | np.floating
 
 
 def check_number(value: object, what: str, bounds: tuple[float, float], advice: str) -> None:
@@ -28,7 +29,7 @@ def check_number(value: object, what: str, bounds: tuple[float, float], advice: 
     Raises:
         RestorationError: with the bounds.
     """
-    if isinstance(value, bool) or not isinstance(value, Real) or not bounds[0] <= value <= bounds[1]:
+    if isinstance(value, bool) or not isinstance(value, _NUMBER) or not bounds[0] <= value <= bounds[1]:
         raise RestorationError(f"Expected {what} from {bounds[0]:g} to {bounds[1]:g}, found {_shown(value)}. {advice}")
 
 
@@ -38,7 +39,7 @@ def check_count(value: object, what: str, least: int, most: int) -> None:
     Raises:
         RestorationError: with the bounds.
     """
-    if isinstance(value, bool) or not isinstance(value, Integral) or not least <= value <= most:
+    if isinstance(value, bool) or not isinstance(value, _WHOLE) or not least <= value <= most:
         raise RestorationError(
             f"Expected {what} as a whole number from {least} to {most}, found {_shown(value)}. Give one of these."
         )
@@ -132,4 +133,4 @@ def check_raw_file(cfa: str, bits: int, black_DN: float, profile: Profile) -> No
 
 
 def _shown(value: object) -> str:
-    return repr(value)[:40] if isinstance(value, str | Real) else found_instead(value)
+    return repr(value)[:40] if isinstance(value, str | _NUMBER) else found_instead(value)
