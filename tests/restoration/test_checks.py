@@ -7,7 +7,9 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import jaxtyping
 import numpy as np
 import pytest
 
@@ -20,11 +22,22 @@ from udccal.profiles.profile import Profile
 from udccal.profiles.store import write_profile
 from udccal.restoration import one_frame
 from udccal.restoration.checks import check_frame, check_panel_picture, check_raw_file
+from udccal.restoration.deblur import deblur
+from udccal.restoration.plan import PlanOptions
+from udccal.restoration.scene_plan import Wish
+from udccal.restoration.tone import Tone
 from udccal.result import FitStatus
 from udccal.rig import RigDescription
 from udccal.tiers import Tier
 
+pytestmark = pytest.mark.usefixtures("as_other_programs_call")
 RIGHT = Shot(make="M", cfa="RGGB")
+
+
+@pytest.fixture
+def as_other_programs_call(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without the checks of types that tests alone have."""
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
 
 
 @pytest.fixture
@@ -119,3 +132,67 @@ def test_one_frame_is_checked_before_the_profile_is_prepared(
         one_frame.restore(small, 0.01, profile)
     with pytest.raises(RestorationError, match="Expected a panel picture of 32 x 24"):
         one_frame.restore(grey(profile), 0.01, profile, np.zeros((2, 2, 3), np.uint8))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"workers": 0}, r"PlanOptions\.workers as a whole number from 1 to 256, found 0"),
+        ({"workers": True}, "PlanOptions.workers .* found True"),
+        ({"workers": 2.0}, r"PlanOptions.workers .* found 2\.0"),
+        ({"panel_block": -1}, "PlanOptions.panel_block .* found -1"),
+        ({"kernel_rows": None}, "PlanOptions.kernel_rows .* found NoneType"),
+        ({"tile_rows": 95}, "PlanOptions.tile_rows as a whole number from 96"),
+        ({"grid_columns": np.nan}, "PlanOptions.grid_columns .* found nan"),
+        ({"network_views": 5}, "PlanOptions.network_views as a whole number from 1 to 4"),
+        ({"interpolation": "cubic"}, "PlanOptions.interpolation of .* found 'cubic'"),
+    ],
+)
+def test_options_that_cannot_be_are_refused(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(RestorationError, match=message):
+        PlanOptions(**options)
+
+
+@pytest.mark.parametrize("exposure", [-1.0, np.nan, np.inf, True, "1"])
+def test_a_tone_of_no_exposure_is_refused(exposure: Any) -> None:
+    with pytest.raises(RestorationError, match=r"an exposure of the display from 0 to 1e\+30, found"):
+        Tone(exposure)
+
+
+@pytest.mark.parametrize("gains", [(1.0, 1.0, 1.0, 1.0), (), 1.0, [1.0, 1.0, 1.0]])
+def test_a_tone_has_three_gains(gains: Any) -> None:
+    with pytest.raises(RestorationError, match="a tuple of three gains"):
+        Tone(1.0, gains)
+
+
+@pytest.mark.parametrize("gain", [-0.1, np.nan, True, None])
+def test_a_gain_is_a_number(gain: Any) -> None:
+    with pytest.raises(RestorationError, match=r"a gain of a colour from 0 to 1e\+06, found"):
+        Tone(1.0, (1.0, gain, 1.0))
+
+
+@pytest.mark.parametrize("wish", [{"budget_ms": -1.0}, {"budget_ms": np.nan}, {"min_psnr_dB": np.inf}])
+def test_a_wish_is_a_number(wish: Any) -> None:
+    with pytest.raises(RestorationError, match=r"Expected a (budget in ms|least PSNR in dB) from 0 to"):
+        Wish(**wish)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"picture": [[1, 2], [3]]}, "picture as an array of real numbers, found list"),
+        ({"picture": None}, "picture as an array of real numbers, found NoneType"),
+        ({"picture": np.ones((20, 30, 3)) * 1j}, "real numbers, found complex128"),
+        ({"kernels": np.full((1, 1, 3, 4, 3), 1 / 12)}, "kernels of odd rows and columns, .* found 4 x 3"),
+        ({"kernels": np.full((1, 1, 3, 3, 3), np.inf)}, "found others, NaN or infinity"),
+        ({"kernels": np.zeros((0, 0, 3, 3, 3)), "x_px": [], "y_px": []}, "ascending places of 0 columns"),
+        ({"x_px": 0.0}, r"found x_px of shape \(\) and y_px of \(1,\)"),
+        ({"tile_px": True}, "tile_px as a whole number"),
+        ({"workers": 0}, "workers as a whole number from 1 to 256, found 0"),
+    ],
+)
+def test_what_cannot_be_deblurred_is_refused(given: dict[str, Any], message: str) -> None:
+    right = {"picture": np.ones((20, 30, 3)), "kernels": np.full((1, 1, 3, 3, 3), 1 / 9), "x_px": [0.0], "y_px": [0.0]}
+    assert np.allclose(deblur(**right), 1.0, atol=0.01)
+    with pytest.raises(RestorationError, match=message):
+        deblur(**{**right, **given})

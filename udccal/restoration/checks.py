@@ -45,6 +45,23 @@ def check_count(value: object, what: str, least: int, most: int) -> None:
         )
 
 
+def real_array(value: object, what: str) -> np.ndarray:
+    """Return an array, or lists of numbers as one.
+
+    Raises:
+        RestorationError: when it does not hold real numbers; ``what`` names it.
+    """
+    try:
+        found = np.asarray(value)
+    except ValueError:  # lists of different lengths
+        found = np.empty(0, dtype=object)
+    if found.dtype.kind not in "iuf":
+        raise RestorationError(
+            f"Expected {what} as an array of real numbers, found {found_instead(value)}. Convert it first."
+        )
+    return found
+
+
 def check_exposure(exposure_s: object) -> None:
     """Refuse what cannot be the exposure of a frame in s.
 
