@@ -250,7 +250,7 @@ def main() -> int:
     captures, plan = truth.description.captures, PlanOptions()
     blur = build_full_blur(truth, *BLUR_GRID, captures.psf_region_rows + 1, captures.psf_region_columns + 1)
     restorer = Restorer.from_profile(profile, Tier.balanced)
-    panel = PanelLight.of(profile.backscatter.term, profile.rig, plan.panel_block)
+    panel = PanelLight.of(profile.backscatter.term, profile.rig)
     budget = Budget(truth, blur, restorer, panel, kernel_grid(profile.psf.term, profile.rig, plan))
     bench, scenes = PictureBench(truth, blur, restorer), list(shared_scenes(data, options.every))
     shots = bench.shots(scenes)

@@ -140,7 +140,7 @@ def test_one_frame_is_checked_before_the_profile_is_prepared(
         ({"workers": 0}, r"PlanOptions\.workers as a whole number from 1 to 256, found 0"),
         ({"workers": True}, "PlanOptions.workers .* found True"),
         ({"workers": 2.0}, r"PlanOptions.workers .* found 2\.0"),
-        ({"panel_block": -1}, "PlanOptions.panel_block .* found -1"),
+        ({"grid_rows": -1}, "PlanOptions.grid_rows .* found -1"),
         ({"kernel_rows": None}, "PlanOptions.kernel_rows .* found NoneType"),
         ({"tile_rows": 95}, "PlanOptions.tile_rows as a whole number from 96"),
         ({"grid_columns": np.nan}, "PlanOptions.grid_columns .* found nan"),

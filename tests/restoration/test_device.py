@@ -43,8 +43,9 @@ def panel_light(rig: RigDescription) -> PanelLight:
         for count, size in zip(nodes, (rig.camera.rows, rig.camera.columns), strict=True)
     )
     sums = PanelSums(
+        np.array([3, rig.panel.rows, 5, rig.panel.columns - 2], dtype=np.int32),
         rng.uniform(0.1, 0.4, (3, starts[-1])).astype(np.float32),
-        rng.integers(0, rig.panel.rows * rig.panel.columns, starts[-1]).astype(np.int32),
+        rng.integers(0, (rig.panel.rows - 3) * (rig.panel.columns - 7), starts[-1]).astype(np.int32),
         starts,
         np.full((3, nodes[0] * nodes[1]), 5e4, np.float32),
         (np.eye(3) + 0.1).astype(np.float32),
@@ -52,7 +53,7 @@ def panel_light(rig: RigDescription) -> PanelLight:
         down,
         across,
     )
-    return PanelLight(sums, cfa_named(rig.camera.cfa), rig.panel.rows, rig.panel.columns, 1)
+    return PanelLight(sums, cfa_named(rig.camera.cfa))
 
 
 @pytest.fixture(scope="module")

@@ -309,11 +309,11 @@ def test_kept_sums_give_the_terms_light(profile: Profile, folder: Path, monkeypa
     before_panel = replace(term.geometry, pupil_mm=np.array([16 * pitch_mm, 12 * pitch_mm, -14.0]))
     term = replace(term, geometry=before_panel)
     shown = np.random.default_rng(5).integers(0, 256, (rig.panel.rows, rig.panel.columns, 3)).astype(np.uint8)
-    expected = PanelLight.of(term, rig, 2).rate(shown)
+    expected = PanelLight.of(term, rig).rate(shown)
     assert expected.mean() > 100
-    PanelLight.of(term, rig, 2, folder)
+    PanelLight.of(term, rig, folder)
     _refuse(monkeypatch, "panel_response")
-    assert np.array_equal(PanelLight.of(term, rig, 2, folder).rate(shown), expected)
+    assert np.array_equal(PanelLight.of(term, rig, folder).rate(shown), expected)
 
 
 def test_tiers_share_what_both_need(
@@ -324,7 +324,6 @@ def test_tiers_share_what_both_need(
 
 
 _USED_LATER = {
-    "panel_block": 2,
     "interpolation": Interpolation.LINEAR,
     "network_views": 1,
     "kernel_rows": 301,  # the psf has fewer

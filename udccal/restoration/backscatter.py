@@ -37,11 +37,14 @@ SPARSE = np.s_[::5, ::5]
 @final
 @dataclass(frozen=True)
 class PanelSums:
-    """Backscatter as sums over blocks of panel pixels: for each place of the term's grid, a row of a sparse matrix.
+    """Backscatter as sums over panel pixels: for each place of the term's grid, a row of a sparse matrix.
+
+    A camera close behind a panel sees some thousand of its pixels; the others are left out.
 
     Attributes:
+        region: first row, end of rows, first column and end of columns of the panel's pixels that are seen.
         shares: fraction of each primary's light that the footprint collects.
-        blocks: index of the row-major block that it comes from.
+        pixels: row-major index, in the region, of the pixel that it comes from.
         starts: first share of each place, and the number of shares.
         gain: e-/s of each camera colour per mixed light, by place.
         mix: matrix from primaries to camera colours.
@@ -49,8 +52,9 @@ class PanelSums:
         down, across: weights from the grid to the rows and columns of the mosaic.
     """
 
+    region: Int32[np.ndarray, "4"]
     shares: Float32[np.ndarray, "3 shares"]
-    blocks: Int32[np.ndarray, " shares"]
+    pixels: Int32[np.ndarray, " shares"]
     starts: Int32[np.ndarray, " places_and_end"]
     gain: Float32[np.ndarray, "3 places"]
     mix: Float32[np.ndarray, "3 3"]
@@ -58,13 +62,20 @@ class PanelSums:
     down: Float32[np.ndarray, "rows grid_rows"]
     across: Float32[np.ndarray, "columns grid_columns"]
 
+    def seen(
+        self, picture: UInt8[np.ndarray, "panel_rows panel_columns 3"]
+    ) -> UInt8[np.ndarray, "seen_rows seen_columns 3"]:
+        """Return the part of a panel's picture that is seen, as a view."""
+        top, bottom, left, right = self.region
+        return picture[top:bottom, left:right]
+
 
 @final
 class _Latest:
-    """The latest picture of a panel, and its backscatter."""
+    """The part that is seen of the latest picture of a panel, and its backscatter."""
 
     def __init__(self) -> None:
-        self.picture: UInt8[np.ndarray, "panel_rows panel_columns 3"] | None = None
+        self.seen: UInt8[np.ndarray, "seen_rows seen_columns 3"] | None = None
         self.rate: Float32[np.ndarray, "rows columns"] = np.empty((0, 0), dtype=np.float32)
 
 
@@ -73,37 +84,29 @@ class _Latest:
 class PanelLight:
     """The backscatter of any picture on the rig's panel, quickly.
 
-    The footprint of the pupil covers some dozen panel pixels. Sums over blocks of them are quicker and less accurate.
-
     Attributes:
         sums: the term, evaluated.
         cfa: the camera's colour pattern.
-        panel_rows, panel_columns: pixels of the panel. block: pixels across a block.
     """
 
     sums: PanelSums
     cfa: Cfa
-    panel_rows: int
-    panel_columns: int
-    block: int
 
     @classmethod
-    def of(cls, term: Backscatter, rig: RigDescription, block: int, keep: Path | None = None) -> PanelLight:
+    def of(cls, term: Backscatter, rig: RigDescription, keep: Path | None = None) -> PanelLight:
         """Evaluate the term for the rig's panel.
 
         Args:
             term: the backscatter term.
             rig: the rig description.
-            block: pixels across a block; 1 sums over pixels.
             keep: folder that keeps the sums between starts; None to keep nothing.
 
         Raises:
             RestorationError: when a value is not finite.
         """
-        sums = kept(
-            keep, PanelSums, (term, rig.panel.rows, rig.panel.columns, block), lambda: _panel_sums(term, rig, block)
-        )
-        return cls(sums, cfa_named(rig.camera.cfa), rig.panel.rows, rig.panel.columns, block)
+        size = rig.panel.rows, rig.panel.columns
+        sums = kept(keep, PanelSums, (term, *size), lambda: _panel_sums(term, *size))
+        return cls(sums, cfa_named(rig.camera.cfa))
 
     def of_rows(self, rows: slice) -> PanelLight:
         """Return the same for some rows of the mosaic, the first of which begins a cell of the colour pattern."""
@@ -114,31 +117,24 @@ class PanelLight:
 
         The latest picture's is kept: a panel that stands still costs a comparison.
         """
-        latest = self._latest
-        if latest.picture is None or not np.array_equal(latest.picture, picture):
-            latest.picture, latest.rate = picture.copy(), self._summed(picture)
+        latest, seen = self._latest, self.sums.seen(picture)
+        if latest.seen is None or not np.array_equal(latest.seen, seen):
+            latest.seen, latest.rate = seen.copy(), self._summed(seen)
             latest.rate.setflags(write=False)
         return latest.rate
 
     def _summed(
-        self, picture: UInt8[np.ndarray, "rows columns 3"]
+        self, seen: UInt8[np.ndarray, "seen_rows seen_columns 3"]
     ) -> Float32[np.ndarray, "sensor_rows sensor_columns"]:
-        light = self._blocks(cv2.LUT(picture, self.sums.light))
-        collected = np.stack([sums @ plane.ravel() for sums, plane in zip(self._matrices, light, strict=True)])
-        nodes = len(self.sums.down[0]), len(self.sums.across[0])
-        grid = (self.sums.gain * (self.sums.mix @ collected)).reshape(3, *nodes)
-        rate = np.empty((len(self.sums.down), len(self.sums.across)), dtype=np.float32)
-        for site, (down, across) in zip(self.cfa.sites, self._interpolations, strict=True):
-            rate[site.samples] = down @ np.ascontiguousarray((across @ np.ascontiguousarray(grid[site.channel].T)).T)
+        sums = self.sums
+        light = np.ascontiguousarray(sums.light[seen].reshape(-1, 3).T)
+        collected = np.stack([shares @ plane for shares, plane in zip(self._matrices, light, strict=True)])
+        grid = (sums.gain * (sums.mix @ collected)).reshape(3, sums.down.shape[1], sums.across.shape[1])
+        columns = np.ascontiguousarray(np.moveaxis(grid, 1, 2)).reshape(-1, grid.shape[1])
+        rate = np.empty((len(sums.down), len(sums.across)), dtype=np.float32)
+        for first, (down, across) in enumerate(self._interpolations):
+            rate[first :: self.cfa.rows] = down @ np.ascontiguousarray((across @ columns).T)
         return rate
-
-    def _blocks(self, light: Float32[np.ndarray, "rows columns 3"]) -> list[Float32[np.ndarray, "down across"]]:
-        """Return the mean light of each primary in blocks; at the panel's edge, of what there is of them."""
-        down, across = (-(-most // self.block) for most in (self.panel_rows, self.panel_columns))
-        below, right = down * self.block - self.panel_rows, across * self.block - self.panel_columns
-        if below or right:
-            light = cv2.copyMakeBorder(light, 0, below, 0, right, cv2.BORDER_REFLECT)
-        return list(cv2.split(cv2.resize(light, (across, down), interpolation=cv2.INTER_AREA)))
 
     @functools.cached_property
     def _latest(self) -> _Latest:
@@ -146,44 +142,46 @@ class PanelLight:
 
     @functools.cached_property
     def _matrices(self) -> list[sparse.csr_array]:
-        shape = (len(self.sums.starts) - 1, -(-self.panel_rows // self.block) * -(-self.panel_columns // self.block))
-        pattern = self.sums.blocks, self.sums.starts
-        return [sparse.csr_array((shares, *pattern), shape) for shares in self.sums.shares]
+        top, bottom, left, right = self.sums.region
+        shape = len(self.sums.starts) - 1, (bottom - top) * (right - left)
+        return [sparse.csr_array((part, self.sums.pixels, self.sums.starts), shape) for part in self.sums.shares]
 
     @functools.cached_property
     def _interpolations(self) -> list[tuple[sparse.csr_array, sparse.csr_array]]:
-        both = self.sums.down, self.sums.across
-        return [
-            (sparse.csr_array(both[0][site.samples[0]]), sparse.csr_array(both[1][site.samples[1]]))
-            for site in self.cfa.sites
-        ]
+        """Of every row of the pattern's cell: weights down, and weights across from the grids of all three colours.
+
+        So whole rows of the mosaic come of one product; each site alone would be written sample by sample.
+        """
+        (columns, nodes), found = self.sums.across.shape, []
+        for first, channels in enumerate(self.cfa.channels):
+            across = np.zeros((columns, 3, nodes), dtype=np.float32)
+            for column, channel in enumerate(channels):
+                across[column :: self.cfa.columns, channel] = self.sums.across[column :: self.cfa.columns]
+            down = sparse.csr_array(self.sums.down[first :: self.cfa.rows])
+            found.append((down, sparse.csr_array(across.reshape(columns, -1))))
+        return found
 
 
 @in_float64
-def _panel_sums(term: Backscatter, rig: RigDescription, block: int) -> PanelSums:
-    response = panel_response(term, rig.panel.rows, rig.panel.columns)
+def _panel_sums(term: Backscatter, panel_rows: int, panel_columns: int) -> PanelSums:
+    response = panel_response(term, panel_rows, panel_columns)
     shares, pixels, gain = (np.asarray(part) for part in (response.shares, response.pixels, response.gain))
     if not (np.all(np.isfinite(shares)) and np.all(np.isfinite(gain))):
         raise RestorationError(
             "Expected a footprint of the pupil on the panel for every pixel, found places without one. Check the "
             "backscatter and geometry terms, or calibrate the rig again."
         )
-    across = -(-rig.panel.columns // block)
-    blocks = pixels // rig.panel.columns // block * across + pixels % rig.panel.columns // block
-    shape = len(pixels), -(-rig.panel.rows // block) * across
-    starts = np.arange(len(pixels) + 1) * pixels.shape[1]
     # Shares are a fraction of about 1; what is left out of one is far below its own error.
-    significant = [np.where(shares[..., p] > _LEAST_SHARE, shares[..., p], 0.0).ravel() for p in range(3)]
-    wide = [sparse.csr_array((own, blocks.ravel(), starts), shape, copy=True) for own in significant]
-    for matrix in wide:
-        matrix.sum_duplicates()
-    used = wide[0].data + wide[1].data + wide[2].data > 0
-    starts = np.concatenate([[0], np.cumsum(used)])[wide[0].indptr]
+    used = (shares > _LEAST_SHARE).any(axis=2)
+    row, column = np.divmod(pixels[used], panel_columns)
+    top, left = (int(part.min(initial=most - 1)) for part, most in ((row, panel_rows), (column, panel_columns)))
+    bottom, right = (max(int(part.max(initial=0)), first) + 1 for part, first in ((row, top), (column, left)))
     mask = np.shape(term.mask)
     return PanelSums(
-        np.stack([matrix.data[used] for matrix in wide]).astype(np.float32),
-        wide[0].indices[used].astype(np.int32),
-        starts.astype(np.int32),
+        np.array([top, bottom, left, right], dtype=np.int32),
+        np.ascontiguousarray(shares[used].T, dtype=np.float32),
+        ((row - top) * (right - left) + column - left).astype(np.int32),
+        np.concatenate([[0], np.cumsum(used.sum(axis=1))]).astype(np.int32),
         gain.astype(np.float32),
         np.asarray(term.mix, dtype=np.float32),
         np.asarray(panel_light(term, np.arange(256)[:, None].repeat(3, axis=1)), dtype=np.float32)[:, 0],

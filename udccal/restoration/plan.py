@@ -27,7 +27,6 @@ _BOUNDS: Final = {
     "grid_columns": (1, 256),
     "tile_rows": (LEAST_PX, 16384),
     "tile_columns": (LEAST_PX, 16384),
-    "panel_block": (1, 16384),
     "network_views": (1, 4),
     "workers": (1, 256),
 }
@@ -42,8 +41,6 @@ class PlanOptions:
             support, gets smaller kernels.
         grid_rows, grid_columns: field positions at which the psf is evaluated.
         tile_rows, tile_columns: size in px of the tiles, each of which has one kernel and one prior.
-        panel_block: pixels across the blocks of the panel's picture whose mean light makes backscatter; 1 takes pixels.
-            2 is some three times as quick, and costs up to 0.8 dB where the scene is dark.
         interpolation: with which sharp pictures are resampled onto the view.
         network_views: ways round in which the network of the tier ``accurate`` sees the picture, 1 to 4.
         workers: threads of the Fourier transforms.
@@ -58,7 +55,6 @@ class PlanOptions:
     grid_columns: int = 9
     tile_rows: int = 256
     tile_columns: int = 256
-    panel_block: int = 1
     interpolation: Interpolation = Interpolation.CUBIC
     network_views: int = 4
     workers: int = 2

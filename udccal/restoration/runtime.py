@@ -165,9 +165,7 @@ class Restorer:
             mask=None
             if unscattered
             else PanelMask(mask_mosaic(profile.backscatter_mask, cfa, camera.rows, camera.columns)[rows], cfa, error),
-            panel=None
-            if quick or unscattered
-            else PanelLight.of(profile.backscatter.term, rig, options.panel_block, keep).of_rows(rows),
+            panel=None if quick or unscattered else PanelLight.of(profile.backscatter.term, rig, keep).of_rows(rows),
             sharpener=sharpener,
             rectification=rectification,
             options=options,

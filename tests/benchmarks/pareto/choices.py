@@ -34,7 +34,6 @@ CHOICES: Final = (
     Choice(Tier.balanced, "tiles of 128 x 128", PlanOptions(tile_rows=128, tile_columns=128)),
     Choice(Tier.balanced, "tiles of 512 x 512", PlanOptions(tile_rows=512, tile_columns=512)),
     Choice(Tier.balanced, "kernels at 4 x 5 places", PlanOptions(grid_rows=4, grid_columns=5)),
-    Choice(Tier.balanced, "panel_block: 2", PlanOptions(panel_block=2)),
     Choice(Tier.accurate, "network_views: 1", PlanOptions(network_views=1)),
     Choice(Tier.accurate, "network_views: 2", PlanOptions(network_views=2)),
 )

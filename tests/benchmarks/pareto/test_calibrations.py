@@ -37,4 +37,4 @@ def test_the_table_compares_with_the_first() -> None:
     ]
     *_, full, fewer = fewer_table(found).splitlines()
     assert full == "| as the rig asks | 900 | 60 | +0.00 | +0.00 |  |"
-    assert fewer == "| flats: 25 | 90 | 6 | -1.50 | -2.00 | psf |"
+    assert fewer == "| flats: 6 | 90 | 6 | -1.50 | -2.00 | psf |"

@@ -57,9 +57,12 @@ class Evidence:
         left = place.squares(found.draws(np.random.default_rng(0), self.rules.draws[0]))
         (_, expected), there = place.volume(), place.shifted(found.mode).squares()
         # Fellner and Schall: squares that the prior expects, less those that the data leave open, over those found;
-        # no more than 30 times as much at once, and no more than that of an absent term.
+        # no more than 30 times as much at once, and no more than that of an absent term. Most nodes of a first image are
+        # its dark surroundings; these must not make its prior tighter than the kernel's size, or rings are lost.
         ratio = np.clip(np.maximum(expected - left, 1e-6 * expected) / np.maximum(there, 1e-300), 1 / 30, 30.0)
-        tuned = np.minimum(np.log(ratio), np.log(ABSENT / place.precisions))
+        most = np.full_like(ratio, ABSENT)
+        most[: place.of_images.size].reshape(place.of_images.shape)[:, 0, 0] = 1.0
+        tuned = np.minimum(np.log(ratio), np.log(most / place.precisions))
         # Pedestal and background differ only where stars are of different brightness. Tuned, the precision of one would
         # rise until it is absent, and nothing would say that it could as well have been the other.
         tuned[HELD] = 0.0

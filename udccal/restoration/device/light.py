@@ -105,20 +105,15 @@ class FrontEnd(eqx.Module):
         return together(jnp.stack(levels)[channels, None, None] * apart(white, cfa), cfa)
 
 
-@functools.partial(jax.jit, static_argnames=("block", "cfa"))
-def panel_rate(
-    picture: UInt8[Array, "panel_rows panel_columns 3"], sums: dict[str, Array], block: int, cfa: Cfa
-) -> Mosaic:
+@functools.partial(jax.jit, static_argnames=("cfa",))
+def panel_rate(seen: UInt8[Array, "seen_rows seen_columns 3"], sums: dict[str, Array], cfa: Cfa) -> Mosaic:
     """Return the backscatter of a panel's picture in e-/s as ``PanelLight.rate`` does, by the tables of ``PanelSums``.
 
     Args:
-        picture: what the panel shows. sums: tables by their names. block: pixels across. cfa: the colour pattern.
+        seen: the part of what the panel shows that the camera sees. sums: tables by their names. cfa: colour pattern.
     """
-    light, starts = jnp.moveaxis(sums["light"][picture], 2, 0), sums["starts"]
-    # At the panel's edge a block goes on mirrored.
-    light = jnp.pad(light, ((0, 0), *((0, -size % block) for size in light.shape[1:])), mode="symmetric")
-    blocks = resized(light, (light.shape[1] // block, light.shape[2] // block), cv2.INTER_AREA).reshape(3, -1)
-    shares = (sums["shares"] * blocks[:, sums["blocks"]]).T
+    light, starts = sums["light"][seen].reshape(-1, 3).T, sums["starts"]
+    shares = (sums["shares"] * light[:, sums["pixels"]]).T
     place = jnp.repeat(jnp.arange(len(starts) - 1), jnp.diff(starts), total_repeat_length=len(shares))
     collected = jax.ops.segment_sum(shares, place, len(starts) - 1, indices_are_sorted=True)
     with jax.default_matmul_precision("highest"):

@@ -163,9 +163,11 @@ class DeviceRestorer:
         noise, panel = self.restorer.noise, self.restorer.panel
         known = panel_picture is not None and panel is not None
         # A panel that stands still costs a comparison.
-        if panel_picture is not None and panel is not None and not np.array_equal(self.latest, panel_picture):
-            picture = jax.device_put(panel_picture, self.rate.device)
-            self.latest, self.rate = panel_picture.copy(), panel_rate(picture, self.panel, panel.block, panel.cfa)
+        if panel_picture is not None and panel is not None:
+            seen = panel.sums.seen(panel_picture)
+            if not np.array_equal(self.latest, seen):
+                self.latest = seen.copy()
+                self.rate = panel_rate(jax.device_put(self.latest, self.rate.device), self.panel, panel.cfa)
         exposed = np.array([exposure_s, dark_DN(noise, exposure_s), variance_floor_e2(noise, exposure_s)], np.float32)
         scale = replace(tone, exposure=tone.exposure / exposure_s).scale()
         rows = self.restorer.blind.mended(mosaic[self.restorer.rows], exposure_s)
