@@ -95,10 +95,12 @@ class Shot:
     model: str = "M1"
     serial: str = "0042"
     cfa: str = "RGGB"
+    black: int = 64
+    white: int = 4095
 
 
 def write_dng(path: Path, mosaic: UInt16[np.ndarray, "rows columns"], shot: Shot | None = None) -> None:
-    """A DNG of black level 64 and white level 4095."""
+    """A DNG of one picture."""
     shot = shot or Shot()
     pattern = [_CFA_BYTES[letter] for letter in shot.cfa]
     replaced = [whole(254, 0), shorts(262, 32803), text(271, shot.make), text(272, shot.model)]
@@ -108,8 +110,8 @@ def write_dng(path: Path, mosaic: UInt16[np.ndarray, "rows columns"], shot: Shot
         whole(33422, *pattern, kind=_BYTE),
         whole(50706, 1, 4, 0, 0, kind=_BYTE),
         text(50708, f"{shot.make} {shot.model}"),
-        whole(50714, 64),
-        whole(50717, 4095),
+        whole(50714, shot.black),
+        whole(50717, shot.white),
         Entry(50721, 10, 9, struct.pack("<18i", *(v for i in range(9) for v in (int(i % 4 == 0), 1)))),
         rational(50728, identity, identity, identity),
         text(50735, shot.serial),

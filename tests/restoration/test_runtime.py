@@ -13,11 +13,12 @@ from udccal.errors import RestorationError
 from udccal.models.geometry import Geometry
 from udccal.models.noise import Noise
 from udccal.restoration.backscatter import PanelMask
+from udccal.restoration.checks import check_frame, check_panel_picture
 from udccal.restoration.kernel_grid import KernelGrid
 from udccal.restoration.metrics import display_exposure, encode_srgb, least_squares_gain, psnr
 from udccal.restoration.preview import Preview
 from udccal.restoration.rectify import Rectification
-from udccal.restoration.runtime import Restorer, check_frame, check_panel_picture
+from udccal.restoration.runtime import Restorer
 from udccal.restoration.tone import Tone, to_rgb8
 from udccal.restoration.view import inscribed_view
 from udccal.rig import RigDescription
@@ -137,7 +138,7 @@ def test_the_result_is_in_e_per_s(restorer: Restorer, frame: np.ndarray, toy_sce
     [
         (lambda frame: frame[:-2], "128 x 96 samples"),
         (lambda frame: frame.astype(np.float32), "16-bit samples"),
-        (lambda frame: frame[..., None], "of 3 dimensions"),
+        (lambda frame: frame[..., None], "rows x columns of uint16"),
         (lambda frame: np.full_like(frame, 40000), "12 bits"),
     ],
 )

@@ -72,3 +72,14 @@ def test_light_far_beyond_white_is_white() -> None:
     shown = tone.rgb8(linear)
     assert shown[0, 0].tolist() == [255, 255, 255]
     assert np.abs(shown.astype(int) - to_rgb8(tone.apply(linear))).max() <= 1
+
+
+@pytest.mark.parametrize("light", [1e3, 1e4, 1e30, np.inf, -1e30])
+def test_one_bright_place_changes_no_other(light: float) -> None:
+    tone, bright = Tone(display_exposure(PICTURE)), PICTURE.copy()
+    bright[7, 9] = light / tone.exposure if np.isfinite(light) else light
+    given = bright.copy()
+    expected = tone.rgb8(PICTURE)
+    expected[7, 9] = 255 if light > 0 else 0
+    np.testing.assert_array_equal(tone.rgb8(bright), expected)
+    np.testing.assert_array_equal(bright, given)

@@ -63,8 +63,7 @@ class FileCamera:
         self._identity = _identity(facts, listed[0].path)
         first = read_mosaic(listed[0].path, self._layout)
         rows, columns = (2 * (side // 2) for side in first.data.shape)  # regions of whole 2 x 2 cells
-        self._shape, self._cfa = first.data.shape, first.cfa
-        self._bits = min(max(first.saturation_DN.bit_length(), 1), 16)
+        self._shape, self._cfa, self._bits = first.data.shape, first.cfa, first.bits
         self._sensor = Region(0, 0, columns, rows)
         self._mode = Mode(unpacked_format_name(self._cfa, self._bits))
         self._region, self._counts, self._taken_s = self._sensor, Counts(), -math.inf

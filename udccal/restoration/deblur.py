@@ -21,6 +21,7 @@ from scipy.optimize import nnls
 from udccal.cfa import BLUE, GREEN, RED, Site
 from udccal.errors import RestorationError
 from udccal.restoration.blur import blurred
+from udccal.restoration.checks import check_count, real_array
 from udccal.restoration.kernel_grid import KernelGrid
 from udccal.restoration.mosaic_filter import filter_tables, filtered_and_joined
 from udccal.restoration.network import refined, sharper
@@ -76,13 +77,16 @@ def deblur(
         the picture as it was before the blur, in its unit. Where there is noise alone, values scatter about 0.
 
     Raises:
-        RestorationError: when a number is not finite or beyond single precision, the kernels do not sum to 1, shapes
-            do not agree, or the tier does not deblur.
+        RestorationError: when a number is not finite or beyond single precision, the kernels do not sum to 1 or have
+            no middle sample, shapes do not agree, a number of tiles or threads cannot be, or the tier does not deblur.
     """
     tier = tier_named(tier)
     if tier is Tier.preview:
         raise RestorationError("Expected a tier that deblurs, found preview. Give fast, balanced or accurate.")
-    picture, *places = (np.asarray(each) for each in (picture, kernels, x_px, y_px))
+    check_count(tile_px, "tile_px", 1, 16384)
+    check_count(workers, "workers", 1, 256)
+    given_arrays = {"picture": picture, "kernels": kernels, "x_px": x_px, "y_px": y_px}
+    picture, *places = (real_array(each, what) for what, each in given_arrays.items())
     grid = _checked(picture, *places)
     # In units of its largest value: squares stay in single precision's range.
     unit = float(np.max(np.abs(picture), initial=0.0)) or 1.0
@@ -140,10 +144,16 @@ def _checked(picture: np.ndarray, kernels: np.ndarray, x_px: np.ndarray, y_px: n
             "Expected a picture of rows x columns x 3 and kernels of grid rows x grid columns x 3 x rows x columns, "
             f"found {picture.shape} and {kernels.shape}. Give three colours of both."
         )
-    if kernels.shape[:2] != (len(y_px), len(x_px)) or np.any(np.diff(x_px) <= 0) or np.any(np.diff(y_px) <= 0):
+    if kernels.shape[3] % 2 == 0 or kernels.shape[4] % 2 == 0:
+        raise RestorationError(
+            "Expected kernels of odd rows and columns, whose middle sample is the source's place, found "
+            f"{kernels.shape[3]} x {kernels.shape[4]}. Pad them by a row or column of zeros."
+        )
+    agree = kernels.shape[:2] == y_px.shape + x_px.shape and 0 not in kernels.shape
+    if not agree or np.any(np.diff(x_px) <= 0) or np.any(np.diff(y_px) <= 0):
         raise RestorationError(
             f"Expected ascending places of {kernels.shape[1]} columns and {kernels.shape[0]} rows of kernels, found "
-            f"{len(x_px)} and {len(y_px)}. Give the picture's px at which each kernel lies."
+            f"x_px of shape {x_px.shape} and y_px of {y_px.shape}. Give the picture's px at which each kernel lies."
         )
     if not all(np.all(np.abs(each) < _MOST) for each in (picture, kernels, x_px, y_px)):
         raise RestorationError(

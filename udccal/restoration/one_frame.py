@@ -9,6 +9,7 @@ from jaxtyping import UInt8, UInt16
 
 from udccal.profiles.profile import Profile
 from udccal.profiles.store import load_profile
+from udccal.restoration.checks import check_frame, check_panel_picture
 from udccal.restoration.runtime import Picture, Restorer
 from udccal.tiers import Tier
 
@@ -37,4 +38,6 @@ def restore(
         RestorationError: as ``Restorer.from_profile`` and ``Restorer.restore``.
     """
     found = profile if isinstance(profile, Profile) else load_profile(profile)
+    check_frame(mosaic, exposure_s, found.rig)
+    check_panel_picture(panel_picture, found.rig)
     return Restorer.from_profile(found, tier).restore(mosaic, exposure_s, panel_picture)

@@ -3,19 +3,33 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 
 from udccal.errors import RestorationError
 from udccal.kernels import KERNEL_COLUMNS, KERNEL_ROWS, fitted_size, kernels_at
 from udccal.models.psf import PsfField
+from udccal.restoration.checks import check_count
 from udccal.restoration.kernel_grid import KernelGrid
 from udccal.restoration.rectify import Interpolation
+from udccal.restoration.tiles import LEAST_PX
 from udccal.rig import RigDescription
 
 _CHANNELS = 3
 # A kernel sums to 1. If its absolute values sum to more than this, it is not a kernel.
 _MOST_LIGHT = 10.0
+# Least and largest value of each option that is a whole number.
+_BOUNDS: Final = {
+    "kernel_rows": (1, 16384),
+    "kernel_columns": (1, 16384),
+    "grid_rows": (1, 256),
+    "grid_columns": (1, 256),
+    "tile_rows": (LEAST_PX, 16384),
+    "tile_columns": (LEAST_PX, 16384),
+    "network_views": (1, 4),
+    "workers": (1, 256),
+}
 
 
 @dataclass(frozen=True)
@@ -27,10 +41,12 @@ class PlanOptions:
             support, gets smaller kernels.
         grid_rows, grid_columns: field positions at which the psf is evaluated.
         tile_rows, tile_columns: size in px of the tiles, each of which has one kernel and one prior.
-            2 is some three times as quick, and costs up to 0.8 dB where the scene is dark.
         interpolation: with which sharp pictures are resampled onto the view.
         network_views: ways round in which the network of the tier ``accurate`` sees the picture, 1 to 4.
         workers: threads of the Fourier transforms.
+
+    Raises:
+        RestorationError: when one is no whole number that it may be, or no ``Interpolation``.
     """
 
     kernel_rows: int = KERNEL_ROWS
@@ -42,6 +58,15 @@ class PlanOptions:
     interpolation: Interpolation = Interpolation.CUBIC
     network_views: int = 4
     workers: int = 2
+
+    def __post_init__(self) -> None:
+        for name, (least, most) in _BOUNDS.items():
+            check_count(getattr(self, name), f"PlanOptions.{name}", least, most)
+        if not isinstance(self.interpolation, Interpolation):
+            raise RestorationError(
+                f"Expected PlanOptions.interpolation of {', '.join(map(str, Interpolation))}, found "
+                f"{self.interpolation!r:.80}. Give one of these."
+            )
 
 
 def kernel_grid(psf: PsfField, rig: RigDescription, options: PlanOptions) -> KernelGrid:

@@ -9,10 +9,11 @@ from jaxtyping import UInt8, UInt16
 
 from udccal.cfa import cfa_named
 from udccal.profiles.profile import Profile
+from udccal.restoration.checks import check_frame, check_panel_picture
 from udccal.restoration.forecast import expected_error
 from udccal.restoration.frame_time import FrameSize, part_times
 from udccal.restoration.linear import saturated
-from udccal.restoration.runtime import Restorer, check_frame, check_panel_picture
+from udccal.restoration.runtime import Restorer
 from udccal.restoration.scene_plan import ScenePlan, TierForecast, Wish, chosen_tier
 from udccal.restoration.stages import StageChoice
 from udccal.restoration.tiles import layout_for

@@ -15,7 +15,6 @@ import numpy as np
 from jaxtyping import Bool, Float32, UInt8, UInt16
 
 from udccal.cfa import cfa_named
-from udccal.errors import RestorationError
 from udccal.kernels import fitted_size
 from udccal.models.geometry import VirtualView
 from udccal.models.noise import Noise
@@ -24,6 +23,7 @@ from udccal.profiles.profile import Profile
 from udccal.profiles.store import load_profile
 from udccal.restoration.backscatter import PanelLight, PanelMask, mask_mosaic, refuse_excess
 from udccal.restoration.blind import BlindSamples
+from udccal.restoration.checks import check_frame, check_panel_picture
 from udccal.restoration.dark_places import plausible
 from udccal.restoration.defects import without_defects
 from udccal.restoration.demosaic import demosaic
@@ -321,52 +321,3 @@ def _kept_grid(psf: PsfField, rig: RigDescription, options: PlanOptions, keep: P
     nodes = options.grid_rows, options.grid_columns
     sensor = rig.camera.rows, rig.camera.columns
     return kept(keep, KernelGrid, (psf, size, nodes, sensor), lambda: kernel_grid(psf, rig, options))
-
-
-def check_frame(mosaic: np.ndarray, exposure_s: float, rig: RigDescription) -> None:
-    """Refuse a frame that the rig cannot have taken.
-
-    Args:
-        mosaic: the frame; accepted are 16-bit samples of the camera's size and range.
-        exposure_s: exposure time; accepted is a positive number.
-        rig: the rig description.
-
-    Raises:
-        RestorationError: when the type, size or range of the samples is another, or the exposure is not positive.
-    """
-    camera = rig.camera
-    if mosaic.dtype != np.uint16 or mosaic.ndim != 2:
-        raise RestorationError(
-            f"Expected a mosaic of 16-bit samples, found {mosaic.dtype} of {mosaic.ndim} dimensions. "
-            "Give the raw frame."
-        )
-    if mosaic.shape != (camera.rows, camera.columns):
-        raise RestorationError(
-            f"Expected a frame of {camera.columns} x {camera.rows} samples as rig '{rig.name}' takes, found "
-            f"{mosaic.shape[1]} x {mosaic.shape[0]}. Use the profile of the rig that took it, and whole frames."
-        )
-    if int(mosaic.max()) > rig.saturation_DN:
-        raise RestorationError(
-            f"Expected samples of {camera.bits} bits, at most {rig.saturation_DN}, found {int(mosaic.max())}. "
-            "Give the frame as the camera delivered it, not scaled up."
-        )
-    if not (np.isfinite(exposure_s) and exposure_s > 0):
-        raise RestorationError(
-            f"Expected a positive exposure in seconds, found {exposure_s}. Give the exposure of the frame."
-        )
-
-
-def check_panel_picture(picture: np.ndarray | None, rig: RigDescription) -> None:
-    """Refuse a panel picture that the rig's panel cannot have shown pixel for pixel; None is accepted.
-
-    Raises:
-        RestorationError: when it is not 8-bit RGB of the panel's size.
-    """
-    if picture is None:
-        return
-    expected = (rig.panel.rows, rig.panel.columns, 3)
-    if picture.shape != expected or picture.dtype != np.uint8:
-        raise RestorationError(
-            f"Expected a panel picture of {expected[1]} x {expected[0]} 8-bit RGB pixels as the panel has, found shape "
-            f"{picture.shape} of {picture.dtype}. Give what the panel showed, or leave it out."
-        )

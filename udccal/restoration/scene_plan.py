@@ -13,6 +13,7 @@ from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 
 from udccal.errors import RestorationError
 from udccal.profiles.profile import Profile
+from udccal.restoration.checks import check_number
 from udccal.restoration.prepared import checksum
 from udccal.restoration.stages import Stage, StageChoice
 from udccal.tiers import DEFAULT_TIER, Tier
@@ -47,10 +48,19 @@ class Wish:
     Attributes:
         budget_ms: time that a frame may take.
         min_psnr_dB: PSNR that is enough.
+
+    Raises:
+        RestorationError: when one is no number from 0 to a day, or to 200 dB.
     """
 
     budget_ms: float | None = None
     min_psnr_dB: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.budget_ms is not None:
+            check_number(self.budget_ms, "a budget in ms", (0.0, 86400e3), "Leave it out to allow any time.")
+        if self.min_psnr_dB is not None:
+            check_number(self.min_psnr_dB, "a least PSNR in dB", (0.0, 200.0), "Leave it out to accept any.")
 
 
 @final

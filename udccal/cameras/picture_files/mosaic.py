@@ -22,3 +22,8 @@ class Mosaic:
     black_DN: float
     saturation_DN: int
     exposure_s: float | None = None
+
+    @property
+    def bits(self) -> int:
+        """Bits that hold the saturation level."""
+        return min(max(self.saturation_DN.bit_length(), 1), 16)

@@ -18,18 +18,16 @@ from udccal.cli.output import Output, plain
 from udccal.compilation import keep_compilations
 from udccal.errors import RestorationError
 from udccal.io.atomic import write_atomically
-from udccal.io.limits import Shape
 from udccal.io.out_folder import check_writable, storing_in
 from udccal.io.png import read_png16
 from udccal.profiles.profile import Profile
 from udccal.profiles.store import load_profile
 from udccal.reports.tables import Table
+from udccal.restoration.checks import check_frame, check_raw_file
 from udccal.restoration.planner import planned
 from udccal.restoration.prepared import prepared_folder
-from udccal.restoration.runtime import check_frame
 from udccal.restoration.scene_plan import ScenePlan, Wish, read_scene_plan
 from udccal.restoration.stages import StageChoice, chosen_stages, needed_by_any
-from udccal.rig import RigDescription
 from udccal.tiers import Tier
 
 _PLAN_NAME: Final = "plan.json"
@@ -86,7 +84,7 @@ class Scene:
 
     def frame(self, image: Path) -> tuple[UInt16[np.ndarray, "rows columns"], float]:
         """Return one of the frames, and its exposure in s."""
-        return _checked_frame(image, self.given.exposure_s, self.profile.rig)
+        return _checked_frame(image, self.given.exposure_s, self.profile)
 
     def plan(self, plans: Plans, forecast: bool = False) -> ScenePlan:
         """Return the plan for these frames; tiers are judged by the first of them.
@@ -150,7 +148,7 @@ def read_scene(output: Output, frames: Frames) -> Scene:
         output.say(warning)
     shown = None if frames.panel_picture is None else read_panel_picture(frames.panel_picture, profile.rig)
     needs = [
-        chosen_stages(profile, *_checked_frame(image, frames.exposure_s, profile.rig), shown) for image in frames.images
+        chosen_stages(profile, *_checked_frame(image, frames.exposure_s, profile), shown) for image in frames.images
     ]
     return Scene(frames, profile, shown, needed_by_any(needs))
 
@@ -185,23 +183,26 @@ def _tier_table(plan: ScenePlan) -> Table:
 
 
 def _checked_frame(
-    image: Path, given_s: float | None, rig: RigDescription
+    image: Path, given_s: float | None, profile: Profile
 ) -> tuple[UInt16[np.ndarray, "rows columns"], float]:
     """Return a frame that fits the rig, and its exposure in s: ``given_s``, else the file's own."""
-    mosaic, in_file = _read_mosaic(image, (rig.camera.rows, rig.camera.columns))
+    mosaic, in_file = _read_mosaic(image, profile)
     exposure = in_file if given_s is None else given_s
     if exposure is None:
         raise RestorationError(
             f"Expected the exposure of {image} in the file or from --exposure-s, found neither. Add --exposure-s."
         )
     with naming(image):
-        check_frame(mosaic, exposure, rig)
+        check_frame(mosaic, exposure, profile.rig)
     return mosaic, exposure
 
 
-def _read_mosaic(image: Path, shape: Shape) -> tuple[UInt16[np.ndarray, "rows columns"], float | None]:
-    """Return a mosaic and the exposure in its file, if any."""
+def _read_mosaic(image: Path, profile: Profile) -> tuple[UInt16[np.ndarray, "rows columns"], float | None]:
+    """Return a mosaic and the exposure in its file, if any; a raw file also says which camera took it."""
+    shape = profile.rig.camera.rows, profile.rig.camera.columns
     if image.suffix.lower() == ".png":
         return read_png16(image, shape), None
     raw = read_raw(image, shape)
+    with naming(image):
+        check_raw_file(raw.cfa, raw.bits, raw.black_DN, profile)
     return raw.data, raw.exposure_s

@@ -13,6 +13,7 @@ from jaxtyping import Array, Float, UInt8, UInt16
 
 from udccal.errors import RestorationError
 from udccal.restoration.backscatter import refuse_excess_of
+from udccal.restoration.checks import check_frame, check_panel_picture
 from udccal.restoration.device.bands import blurred, refined, shrunk
 from udccal.restoration.device.light import FrontEnd, panel_rate, plausible
 from udccal.restoration.device.planes import Mosaic, box_mean, cut, resampled
@@ -22,7 +23,7 @@ from udccal.restoration.linear import dark_DN, least_saturated_DN, variance_floo
 from udccal.restoration.mosaic_filter import STRENGTHS
 from udccal.restoration.network import SHARPER, Weights, network_weights
 from udccal.restoration.rectify import interpolation_taps
-from udccal.restoration.runtime import Restorer, check_frame, check_panel_picture
+from udccal.restoration.runtime import Restorer
 from udccal.restoration.sharpen import LOCAL_PX
 from udccal.restoration.tone import CODES, Tone
 from udccal.tiers import Tier
