@@ -68,9 +68,7 @@ def check_exposure(exposure_s: object) -> None:
     Raises:
         RestorationError: when it is no number from a nanosecond to a day.
     """
-    check_number(
-        exposure_s, "a positive exposure in seconds", EXPOSURES_S, "Give that of the frame; 8 ms are 0.008 s."
-    )
+    check_number(exposure_s, "a positive exposure in seconds", EXPOSURES_S, "Give that of the frame; 8 ms are 0.008 s.")
 
 
 def check_frame(mosaic: object, exposure_s: object, rig: RigDescription) -> None:
