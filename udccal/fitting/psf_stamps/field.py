@@ -6,8 +6,8 @@ With w the distance to the centre of the light, X the position, B_t(X) polynomia
 
 The map M stretches, shears and turns an image over the field, with few numbers. Images P_i are cubic B-splines on a
 square grid of nodes and describe the rest. L, of polynomials too, is the distance of a colour's centre from the centre
-that all colours of a stamp have in common. The pedestal p is the same all over a stamp, as far wings of a psf nearly are.
-They differ from a background only by their growth with a star's light.
+that all colours of a stamp have in common. The pedestal p is the same all over a stamp, as far wings of a psf nearly
+are. They differ from a background only by their growth with a star's light.
 
 An image contains the mean over a pixel, and the map would stretch the pixel as well. Light that is stretched before
 pixels average it differs, to second order in the pixel's size a = 1 px, by (a^2 / 24) tr((M^-1 M^-T - 1) D) of the
