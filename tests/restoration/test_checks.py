@@ -123,9 +123,7 @@ def test_a_panel_picture_is_an_array_of_8_bits(toy_rig: RigDescription, picture:
         check_panel_picture(picture, toy_rig)
 
 
-def test_one_frame_is_checked_before_the_profile_is_prepared(
-    profile: Profile, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_one_frame_is_checked_before_the_profile_is_prepared(profile: Profile, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("udccal.restoration.one_frame.Restorer", None)
     small = np.zeros((10, 10), np.uint16)
     with pytest.raises(RestorationError, match="Expected a frame of 96 x 64 samples"):
