@@ -4,6 +4,7 @@
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+#include <sys/file.h>
 #include <sys/mman.h>
 #include <sys/stat.h>
 #include <unistd.h>
@@ -28,9 +29,13 @@ int main(int count, char **words) {
         return fprintf(stderr, "expected frames of udccal, version 1, found something else\n"), 1;
     size_t bytes = (size_t)header->stride * header->height;
     unsigned char *picture = malloc(bytes);
-    for (uint64_t seen = 0; !word((const char *)&header->closed);) {
+    for (uint64_t seen = 0, waited = 0; !word((const char *)&header->closed);) {
         uint64_t newest = word((const char *)&header->newest);
-        if (newest == seen) { usleep(1000); continue; }
+        if (newest == seen) { /* the writer locks the memory for as long as it lives */
+            usleep(1000);
+            if (++waited % 250 != 0 || flock(file, LOCK_SH | LOCK_NB) != 0 || word((const char *)&header->closed)) continue;
+            return fprintf(stderr, "expected the writer to live, found that it was killed; start it again\n"), 1;
+        }
         const char *slot = memory + header->first_slot + (newest - 1) % header->slots * header->slot_bytes;
         uint64_t last = word(slot + header->slot_bytes - header->edge_bytes); /* first of all */
         memcpy(picture, slot + header->edge_bytes, bytes);
@@ -42,7 +47,7 @@ int main(int count, char **words) {
         if (whole) printf("frame %llu: mean %.2f\n", (unsigned long long)frame_id, (double)sum / bytes);
         else printf("frame %llu: torn\n", (unsigned long long)frame_id);
         fflush(stdout);
-        seen = newest;
+        seen = newest, waited = 0;
     }
     return 0;
 }

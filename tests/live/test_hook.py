@@ -76,6 +76,12 @@ def test_what_a_hook_must_not_do(function: object, message: str) -> None:
         TimedHook(function, 10.0).apply(PICTURE, 0)
 
 
+@pytest.mark.parametrize("limit_s", [0.0, -1.0, float("nan"), float("inf")])
+def test_a_hook_has_a_limit(limit_s: float) -> None:
+    with pytest.raises(LiveError, match=r"a hook's limit in s from 0.0001 to 60, found"):
+        TimedHook(brighter, limit_s)
+
+
 def test_a_hook_is_found_in_the_present_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "hook_of_mine.py").write_text("LEVEL = 3\ndef same(picture, frame_id):\n    return picture\n")
     monkeypatch.chdir(tmp_path)

@@ -67,6 +67,14 @@ def endless(rate_hz: float = 200.0) -> Iterator[Frame]:
     return looped([raw_frame(0)], rate_hz)
 
 
+@pytest.mark.parametrize(
+    "limits", [{"frames": 0}, {"frames": True}, {"seconds": 0.0}, {"seconds": float("nan")}, {"seconds": float("inf")}]
+)
+def test_limits_that_cannot_be_are_refused(limits: dict[str, float]) -> None:
+    with pytest.raises(LiveError, match=r"Expected a (number of frames|time in s) .* found"):
+        Limits(**limits)
+
+
 def test_it_ends_after_so_many_frames() -> None:
     sink = ListSink()
     figures = run(endless(), sink, Limits(frames=5))

@@ -6,6 +6,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -64,14 +65,17 @@ def test_a_living_writer_is_left_alone_and_a_dead_ones_segment_is_replaced(name:
     try:
         assert writer.stdout is not None
         assert writer.stdout.readline() == "written\n"
-        second = SharedMemorySink(name, 30.0)
         with pytest.raises(LiveError, match="a run that still writes to it"):
-            second.open((ROWS, COLUMNS))
-        second.close()
-        assert next(frames(name))[0] == 7
+            SharedMemorySink(name, 30.0)
+        reader = frames(name)
+        assert next(reader)[0] == 7
     finally:
         writer.send_signal(signal.SIGKILL)
         writer.wait(30)
+    start = time.monotonic()
+    with pytest.raises(SystemExit, match=f"writer of {name} to live, found that it was killed"):
+        next(reader)
+    assert time.monotonic() - start < 5.0
     assert (FOLDER / name).exists()
     sink = open_sink(name)
     sink.write(restored_frame(1))
@@ -82,8 +86,10 @@ def test_a_living_writer_is_left_alone_and_a_dead_ones_segment_is_replaced(name:
 
 @pytest.mark.parametrize("content", [b"", b"another program's data"])
 def test_other_programs_memory_is_not_touched(name: str, content: bytes) -> None:
-    (FOLDER / name).write_bytes(content)
     sink = SharedMemorySink(name, 30.0)
+    (FOLDER / name).write_bytes(content)
+    with pytest.raises(LiveError, match="another program's memory"):
+        SharedMemorySink(name, 30.0)
     with pytest.raises(LiveError, match="another program's memory"):
         sink.open((ROWS, COLUMNS))
     sink.close()
@@ -126,11 +132,39 @@ def test_a_stalled_reader_slows_nobody(name: str) -> None:
     sink.close()
 
 
-@pytest.mark.skipif(shutil.which("cc") is None, reason="needs a C compiler")
-def test_the_reader_in_c(name: str, tmp_path: Path) -> None:
-    program = tmp_path / "read_live"
+def test_a_reader_waits_for_a_writer_that_lives(name: str) -> None:
+    sink = open_sink(name)
+    later = threading.Timer(0.6, sink.write, [restored_frame(4)])
+    later.start()
+    assert next(frames(name))[0] == 4
+    later.join()
+    sink.close()
+
+
+@pytest.fixture(scope="module")
+def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    if shutil.which("cc") is None:
+        pytest.skip("needs a C compiler")
+    program = tmp_path_factory.mktemp("c") / "read_live"
     compiler = ["cc", "-O2", "-Wall", "-Wextra", "-Werror", "-o", program, ROOT / "examples" / "read_live.c"]
     subprocess.run(compiler, check=True, timeout=120)
+    return program
+
+
+@pytest.mark.medium
+def test_the_reader_in_c_ends_when_its_writer_was_killed(name: str, program: Path) -> None:
+    with subprocess.Popen([sys.executable, "-c", WRITER, name], stdout=subprocess.PIPE, text=True, cwd=ROOT) as writer:
+        assert writer.stdout is not None
+        assert writer.stdout.readline() == "written\n"
+        with subprocess.Popen([program, name], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as reader:
+            assert reader.stdout is not None
+            assert reader.stdout.readline() == "frame 7: mean 7.00\n"
+            writer.send_signal(signal.SIGKILL)
+            assert "found that it was killed" in reader.communicate(timeout=30)[1]
+            assert reader.returncode == 1
+
+
+def test_the_reader_in_c(name: str, program: Path) -> None:
     sink = open_sink(name)
     sink.write(restored_frame(5))
     with subprocess.Popen([program, name], stdout=subprocess.PIPE, text=True) as reader:

@@ -58,6 +58,27 @@ def test_images_are_whole_files_named_by_their_frames(tmp_path: Path, monkeypatc
     assert np.all(read_rgb8(file) == 2)
 
 
+@pytest.mark.parametrize("text", ["images:/proc/none", "images:{0}/file/folder", "images:" + "x" * 300])
+def test_a_folder_that_cannot_be_written_is_refused_before_a_run(tmp_path: Path, text: str) -> None:
+    (tmp_path / "file").write_bytes(b"mine")
+    with pytest.raises(UdccalError, match=r"Expected to write the results to .* found: "):
+        make_sink(text.format(tmp_path), 30.0)
+
+
+def test_a_video_that_cannot_be_written_is_refused_before_a_run(tmp_path: Path) -> None:
+    (tmp_path / "a.mp4").mkdir()
+    with pytest.raises(LiveError, match=r"video:FILE\.mp4 in a folder that exists"):
+        make_sink(f"video:{tmp_path / 'a.mp4'}", 30.0)
+    with pytest.raises(UdccalError, match="Expected to write the results to /proc"):
+        make_sink("video:/proc/a.mp4", 30.0)
+
+
+@pytest.mark.parametrize("rate_hz", [0.0, -1.0, float("nan"), float("inf")])
+def test_frames_have_a_rate(tmp_path: Path, rate_hz: float) -> None:
+    with pytest.raises(LiveError, match="a rate of frames in Hz"):
+        make_sink(f"video:{tmp_path / 'a.mp4'}", rate_hz)
+
+
 def test_a_folder_with_files_is_refused(tmp_path: Path) -> None:
     (tmp_path / "file").write_bytes(b"mine")
     for wrong in (tmp_path, tmp_path / "file", ""):
@@ -148,6 +169,9 @@ def test_a_virtual_camera_gets_its_format_before_its_frames(monkeypatch: pytest.
 
     library = SimpleNamespace(Camera=Camera, PixelFormat=SimpleNamespace(RGB="rgb"))
     monkeypatch.setattr("udccal.live.sinks.virtual_camera._library", lambda: library)
+    with pytest.raises(LiveError, match="a virtual camera at /dev/video7 that may be written to, found none"):
+        VirtualCameraSink("/dev/video7", 30.0)
+    monkeypatch.setattr("os.access", lambda path, mode: True)
     sink = VirtualCameraSink("/dev/video7", 30.0)
     sink.open((ROWS, COLUMNS))
     sink.write(restored_frame(0))

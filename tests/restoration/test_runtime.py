@@ -14,6 +14,7 @@ from udccal.models.geometry import Geometry
 from udccal.models.noise import Noise
 from udccal.restoration.backscatter import PanelMask
 from udccal.restoration.checks import check_frame, check_panel_picture
+from udccal.restoration.demosaic import demosaic
 from udccal.restoration.kernel_grid import KernelGrid
 from udccal.restoration.metrics import display_exposure, encode_srgb, least_squares_gain, psnr
 from udccal.restoration.preview import Preview
@@ -75,6 +76,24 @@ def test_a_display_shows_what_restore_returns(
         # The preview demosaics and resamples bytes, by other filters.
         off = np.abs(found - expected)
         assert np.median(off) <= 3 if tier is Tier.preview else off.max() <= 1, tier
+
+
+@pytest.mark.parametrize("tier", list(Tier))
+def test_hot_and_dead_samples_are_not_displayed(restorers: dict[Tier, Restorer], tier: Tier) -> None:
+    tone = Tone(EXPOSURE_S / 6000)
+    even = np.rint(64 + 0.355 * np.random.default_rng(2).poisson(3000.0, (96, 128))).astype(np.uint16)
+    broken = even.copy()
+    broken[[40, 51, 62, 73, 84], [30, 41, 64, 77, 90]] = 3969, 0, 3969, 0, 3969
+    shown, expected = (restorers[tier].display(frame, EXPOSURE_S, tone).astype(int) for frame in (broken, even))
+    assert np.abs(shown - expected).max() <= 12
+
+
+def test_a_preview_demosaics_only_what_the_view_reads(restorers: dict[Tier, Restorer], frame: np.ndarray) -> None:
+    preview = restorers[Tier.preview]
+    whole = demosaic(preview.scene_light(frame, EXPOSURE_S).signal_e, "RGGB", 0.65)
+    assert preview._seen[0].start > 0
+    expected = preview.rectification.apply(whole) / EXPOSURE_S
+    np.testing.assert_allclose(preview.restore(frame, EXPOSURE_S), expected, atol=1e-4 * expected.max())
 
 
 @pytest.mark.parametrize("cfa", ["RGGB", "BGGR", "GRBG", "GBRG"])

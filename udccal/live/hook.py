@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from udccal.errors import LiveError, found_instead
+from udccal.restoration.checks import check_number
 
 Picture = UInt8[np.ndarray, "rows columns 3"]
 # What a hook returns is checked.
@@ -51,10 +52,14 @@ class TimedHook:
 
     Args:
         function: gets a copy of the picture and the frame's number; returns a picture of the same size.
-        limit_s: how long one call may take.
+        limit_s: how long one call may take, at most a minute.
+
+    Raises:
+        LiveError: when the limit is no such time.
     """
 
     def __init__(self, function: Hook, limit_s: float) -> None:
+        check_number(limit_s, "a hook's limit in s", (1e-4, 60.0), "Give 0.01 for 10 ms.", LiveError)
         self._function, self._limit_s = function, limit_s
         self._asked: queue.SimpleQueue[tuple[Picture, int]] = queue.SimpleQueue()
         self._answers: queue.SimpleQueue[object] = queue.SimpleQueue()

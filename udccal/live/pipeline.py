@@ -14,6 +14,7 @@ from udccal.live.hook import Picture, TimedHook
 from udccal.live.newest import Newest
 from udccal.live.sinks.protocol import RestoredFrame, Sink
 from udccal.live.tally import Figures, Stage, Tally
+from udccal.restoration.checks import check_count, check_number
 
 _SHOW_EVERY_S = 1.0
 # The longest that a camera waits for a frame is its time-out of 2 s and an exposure.
@@ -23,10 +24,20 @@ _END_WITHIN_S = 20.0
 @final
 @dataclass(frozen=True)
 class Limits:
-    """When a run ends by itself; None for never."""
+    """When a run ends by itself; None for never.
+
+    Raises:
+        LiveError: when one is no number above 0: of frames a whole one, of seconds one up to a year.
+    """
 
     frames: int | None = None
     seconds: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.frames is not None:
+            check_count(self.frames, "a number of frames", 1, 2**63 - 1, LiveError)
+        if self.seconds is not None:
+            check_number(self.seconds, "a time in s", (1e-3, 366 * 86400.0), "Leave it out to run on.", LiveError)
 
 
 @final

@@ -6,7 +6,7 @@ from typing import Final
 
 import numpy as np
 
-from udccal.errors import RestorationError, found_instead
+from udccal.errors import RestorationError, UdccalError, found_instead
 from udccal.profiles.profile import Profile
 from udccal.restoration.linear import scalar
 from udccal.rig import RigDescription
@@ -17,7 +17,13 @@ _WHOLE = int | np.integer
 _NUMBER = _WHOLE | float | np.floating
 
 
-def check_number(value: object, what: str, bounds: tuple[float, float], advice: str) -> None:
+def check_number(
+    value: object,
+    what: str,
+    bounds: tuple[float, float],
+    advice: str,
+    error: type[UdccalError] = RestorationError,
+) -> None:
     """Refuse what is no number within bounds, both included; NaN and truth values are none.
 
     Args:
@@ -25,22 +31,23 @@ def check_number(value: object, what: str, bounds: tuple[float, float], advice: 
         what: its name and unit, for the message.
         bounds: least and largest value.
         advice: what to do, a sentence.
+        error: kind of the error.
 
     Raises:
-        RestorationError: with the bounds.
+        UdccalError: of that kind, with the bounds.
     """
     if isinstance(value, bool) or not isinstance(value, _NUMBER) or not bounds[0] <= value <= bounds[1]:
-        raise RestorationError(f"Expected {what} from {bounds[0]:g} to {bounds[1]:g}, found {_shown(value)}. {advice}")
+        raise error(f"Expected {what} from {bounds[0]:g} to {bounds[1]:g}, found {_shown(value)}. {advice}")
 
 
-def check_count(value: object, what: str, least: int, most: int) -> None:
+def check_count(value: object, what: str, least: int, most: int, error: type[UdccalError] = RestorationError) -> None:
     """Refuse what is no whole number within bounds, both included.
 
     Raises:
-        RestorationError: with the bounds.
+        UdccalError: of the kind ``error``, with the bounds.
     """
     if isinstance(value, bool) or not isinstance(value, _WHOLE) or not least <= value <= most:
-        raise RestorationError(
+        raise error(
             f"Expected {what} as a whole number from {least} to {most}, found {_shown(value)}. Give one of these."
         )
 

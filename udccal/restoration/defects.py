@@ -42,8 +42,10 @@ def without_defects(
     Returns:
         a frame of its own, or the mosaic itself where no sample is defective.
     """
-    pattern, floor_e2 = cfa_named(cfa), scalar(noise.sigma_d_e) ** 2
-    codes = _codes(dark_DN(noise, exposure_s), scalar(noise.K_DN_per_e), floor_e2, int(mosaic.max()))
+    pattern, floor_e2, most_DN = cfa_named(cfa), scalar(noise.sigma_d_e) ** 2, int(mosaic.max())
+    # Frames of a video differ in their largest sample; rounded up to few values, they share their codes.
+    most_DN |= (1 << max(most_DN.bit_length() - 4, 0)) - 1
+    codes = _codes(dark_DN(noise, exposure_s), scalar(noise.K_DN_per_e), floor_e2, most_DN)
     places = _suspects(mosaic, pattern, *codes, workers)
     if len(places[0]) == 0:
         return mosaic
@@ -94,7 +96,9 @@ def _suspects(
     def within(first: int) -> Places:
         """Look at some rows, and at those of their neighbours."""
         begin, end = max(first - pattern.rows, 0), min(first + step + pattern.rows, rows)
-        y, x = np.nonzero(_outside(mosaic[begin:end], pattern, codes, apart)[first - begin : first - begin + step])
+        outside = _outside(mosaic[begin:end], pattern, codes, apart)[first - begin : first - begin + step]
+        found = cv2.findNonZero(outside)  # ten times as quick as numpy's; None where there is none
+        x, y = np.empty((2, 0), dtype=int) if found is None else found.reshape(-1, 2).T.astype(int)
         return y + first, x
 
     with ThreadPoolExecutor(workers) as pool:

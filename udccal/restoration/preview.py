@@ -19,6 +19,7 @@ from udccal.cfa import Cfa
 from udccal.models.noise import Noise
 from udccal.restoration.backscatter import PanelMask
 from udccal.restoration.blind import BlindSamples
+from udccal.restoration.defects import without_defects
 from udccal.restoration.linear import above_dark_DN, scalar
 from udccal.restoration.rectify import Interpolation, Rectification
 from udccal.restoration.tone import CODES, Tone
@@ -104,7 +105,8 @@ class Preview:
             tone: exposure and colour gains of the picture.
         """
         raw = mosaic[self.first_row : self.first_row + len(self.gain)]
-        signal = above_dark_DN(self.blind.mended(raw, exposure_s), self.noise, exposure_s)
+        raw = without_defects(self.blind.mended(raw, exposure_s), self.noise, exposure_s, self.cfa)
+        signal = above_dark_DN(raw, self.noise, exposure_s)
         signal *= self.gain
         scale = tone.scale() / np.float32(exposure_s)
         if self.mask is None:

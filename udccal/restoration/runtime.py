@@ -209,7 +209,8 @@ class Restorer:
         """Return the clean picture in e-."""
         light = self.scene_light(mosaic, exposure_s, panel_picture)
         if self.sharpener is None:
-            return self.rectification.apply(demosaic(light.signal_e, self.rig.camera.cfa, _PREVIEW_DETAIL))
+            seen, rectification = self._seen
+            return rectification.apply(demosaic(light.signal_e[seen], self.rig.camera.cfa, _PREVIEW_DETAIL))
         sharp = self.sharpener.apply(light.signal_e, light.variance_e2, light.clipped)
         if light.panel_error_e is not None:
             sharp = plausible(sharp, light.panel_error_e[self.sharpener.layout.inner])
@@ -302,6 +303,14 @@ class Restorer:
         """Map from the rows that the sharpener returns to the view."""
         assert self.sharpener is not None
         return self.rectification.from_row(self.sharpener.rows.start)
+
+    @functools.cached_property
+    def _seen(self) -> tuple[slice, Rectification]:
+        """Rows of the frame that the view reads, with those that demosaicing reads beside them; map from them."""
+        first, last = self.rectification.rows
+        cell, beside = cfa_named(self.rig.camera.cfa).rows, 2
+        start = max(first - beside, 0) // cell * cell
+        return slice(start, last + beside), self.rectification.from_row(start)
 
     @functools.cached_property
     def _preview(self) -> Preview:

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import final
 
 from udccal.errors import LiveError
+from udccal.io.out_folder import check_writable, storing_in
 from udccal.io.png import write_rgb8
 from udccal.live.sinks.protocol import RestoredFrame
 
@@ -16,10 +17,13 @@ class ImagesSink:
 
     def __init__(self, target: str, rate_hz: float) -> None:
         self._folder = Path(target)
-        if not target or (self._folder.exists() and not (self._folder.is_dir() and not any(self._folder.iterdir()))):
+        with storing_in(self._folder):
+            taken = self._folder.exists() and not (self._folder.is_dir() and not any(self._folder.iterdir()))
+        if not target or taken:
             raise LiveError(
                 f"Expected images:FOLDER with a folder that is new or empty, found '{target}'. Choose another folder."
             )
+        check_writable(self._folder)
 
     def open(self, shape: tuple[int, int]) -> None:
         """Make the folder."""

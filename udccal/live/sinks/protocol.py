@@ -8,7 +8,9 @@ from typing import Protocol, final, runtime_checkable
 import numpy as np
 from jaxtyping import UInt8
 
+from udccal.errors import LiveError
 from udccal.plugins import find_sink
+from udccal.restoration.checks import check_number
 
 
 @final
@@ -32,7 +34,7 @@ class Sink(Protocol):
     """Takes restored frames, all of one size; one thread calls ``open``, ``write`` and ``close`` in this order.
 
     A sink is made from what follows its name on the command line and from the rate of the frames in Hz. Making one
-    touches nothing, and refuses what it can know to be wrong.
+    leaves nothing behind, and refuses what it can know to be wrong, such as a folder that cannot be written to.
     """
 
     def __init__(self, target: str, rate_hz: float) -> None: ...
@@ -60,6 +62,7 @@ def make_sink(text: str, rate_hz: float) -> Sink:
     Raises:
         UdccalError: when there is no such sink, or it refuses its target.
     """
+    check_number(rate_hz, "a rate of frames in Hz", (1e-3, 1e5), "Give that of the camera.", LiveError)
     name, _, target = text.partition(":")
     sink: Sink = find_sink(name)(target, rate_hz)
     return sink

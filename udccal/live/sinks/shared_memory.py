@@ -10,10 +10,13 @@ import mmap
 import os
 import re
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Final, final
 
 from udccal.errors import LiveError
+from udccal.io.out_folder import check_writable
 from udccal.live.sinks.frame_ring import MAGIC, FrameRing, Layout
 from udccal.live.sinks.protocol import RestoredFrame
 
@@ -33,6 +36,9 @@ class SharedMemorySink:
         if sys.platform != "linux":
             raise LiveError(f"Expected Linux for --sink shm, found {sys.platform}. Use --sink video:FILE.mp4.")
         self._path = _FOLDER / target
+        check_writable(_FOLDER)
+        with _stale(self._path):
+            pass
         self._descriptor: int | None = None
         self._ring: FrameRing | None = None
 
@@ -45,7 +51,9 @@ class SharedMemorySink:
         layout = Layout(*shape)
         self._descriptor = _unnamed(layout.total_bytes)
         self._ring = FrameRing(mmap.mmap(self._descriptor, layout.total_bytes), layout)
-        _remove_stale(self._path)
+        with _stale(self._path) as stale:
+            if stale is not None and _is_at(stale, self._path):
+                self._path.unlink()
         try:
             # A directory's descriptor makes Python ask the system to follow the link to the unnamed file.
             os.link(f"/proc/self/fd/{self._descriptor}", self._path, src_dir_fd=self._descriptor)
@@ -83,8 +91,9 @@ def _unnamed(size: int) -> int:
     return descriptor
 
 
-def _remove_stale(path: Path) -> None:
-    """Remove the segment of a writer that died.
+@contextmanager
+def _stale(path: Path) -> Iterator[int | None]:
+    """Yield the descriptor of the segment of a writer that died, locked; None where the name is free.
 
     Raises:
         LiveError: when the name is that of a living writer, or of something else.
@@ -92,6 +101,7 @@ def _remove_stale(path: Path) -> None:
     try:
         descriptor = os.open(path, os.O_RDWR | os.O_NOFOLLOW)
     except FileNotFoundError:
+        yield None
         return
     except OSError as error:
         raise _taken(path, str(error)) from error
@@ -99,8 +109,7 @@ def _remove_stale(path: Path) -> None:
         if os.read(descriptor, len(MAGIC)) != MAGIC:
             raise _taken(path, "another program's memory")
         _lock(descriptor)
-        if _is_at(descriptor, path):
-            path.unlink()
+        yield descriptor
     except BlockingIOError as error:
         raise _taken(path, "a run that still writes to it") from error
     finally:

@@ -10,6 +10,7 @@ import cv2
 
 from udccal.errors import LiveError
 from udccal.io.atomic import atomic_path
+from udccal.io.out_folder import check_writable, storing_in
 from udccal.live.sinks.protocol import RestoredFrame
 
 _CODEC = "mp4v"
@@ -30,11 +31,14 @@ class VideoSink:
         self._written = 0
         self._first_ns = 0
         self._last: RestoredFrame | None = None
-        if self._path.suffix != ".mp4" or not self._path.parent.is_dir():
+        with storing_in(self._path.parent):
+            fits = self._path.suffix == ".mp4" and self._path.parent.is_dir() and not self._path.is_dir()
+        if not fits:
             raise LiveError(
                 f"Expected video:FILE.mp4 in a folder that exists, found '{target}'. Choose another name, or make "
                 "the folder."
             )
+        check_writable(self._path.parent)
 
     def open(self, shape: tuple[int, int]) -> None:
         """Begin the file under its temporary name."""

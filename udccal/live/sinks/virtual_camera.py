@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import os
 import re
 from types import ModuleType
 from typing import Any, final
@@ -20,6 +21,11 @@ class VirtualCameraSink:
             raise LiveError(f"Expected v4l2:/dev/videoN, found '{target}'. Name the device of v4l2loopback.")
         self._target, self._rate_hz = target, rate_hz
         self._library = _library()
+        if not os.access(target, os.W_OK):
+            raise LiveError(
+                f"Expected a virtual camera at {target} that may be written to, found none. Load v4l2loopback "
+                "(modprobe v4l2loopback), or correct the device's permissions."
+            )
         self._camera: Any = None
 
     def open(self, shape: tuple[int, int]) -> None:
