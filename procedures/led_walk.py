@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -195,7 +196,7 @@ class LedVisit:
         """The largest change over the last looks; unknown, and too large, before there are enough."""
         changes = [led_change(before, self._looks[-1], self._rig) for before in self._looks]
         largest = max(changes, key=lambda change: change.value)
-        return largest if len(changes) == _STILL_LOOKS else replace(largest, value=100.0)
+        return largest if len(changes) == _STILL_LOOKS else replace(largest, value=math.inf)
 
     def _new_phase(self, place_px: Place) -> Reading:
         least = phase_distance_px(len(self._cell.step_ids))

@@ -23,8 +23,8 @@ _FEWEST_CORNERS, _ENOUGH_CORNERS = 6, 12  # a quarter of the board, within these
 _LEAST_HEAD_ROOM = 12.0  # %: tolerances of full well and gain leave the true level uncertain
 _MAGNIFIED_BELOW_PX = 600  # markers of few pixels are found more reliably in a magnified picture
 # Half the side of the window in which an LED's place is measured.
-_ABOUT_PX: Final = 6
-_CORE_PX: Final = 1.5
+_ABOUT_PX: Final = 12
+_CORE_PX: Final = 4.0
 _CENTRING: Final = 8  # rounds
 # Half the side of the window in which an LED's picture is compared, and how much of it may change. Behind rows that
 # diffract it finely it changes by 8 to 23 % when it moves by 0.1 px; a smooth spot changes by 10 % at 0.2 px.

@@ -93,6 +93,13 @@ def test_an_led_that_rests_is_told_from_one_that_moves_by_a_third_of_a_pixel(pea
         assert not led_change(first, diffracted(x, y, 0.0, rng), rig).ok
 
 
+def test_the_place_of_an_led_at_rest_does_not_jump_between_its_orders() -> None:
+    rig, rng = load_rig("lg55-aca2040"), np.random.default_rng(2)
+    for x, y in 24 + 2 * rng.random((30, 2)):
+        places = np.array([find_led(diffracted(x, y, 800.0, rng), rig).place_px for _ in range(6)])
+        assert np.ptp(places, axis=0).max() < 0.25
+
+
 @pytest.mark.slow
 def test_an_led_at_the_edge_of_a_full_size_field_is_seen_to_rest_and_to_move(tmp_path: Path) -> None:
     rig = load_rig("lg55-aca2040")
