@@ -5,8 +5,10 @@ from __future__ import annotations
 import threading
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from tests.cameras.small_tiff import Shot, write_dng
 from tests.live.test_pipeline import SHAPE, ListSink, restore
 from tests.virtual_u3v.backend import VirtualBackend
 from tests.virtual_u3v.camera import VirtualCamera
@@ -38,7 +40,8 @@ def plug(model: CameraModel, faults: Faults, monkeypatch: pytest.MonkeyPatch) ->
 
 def run(profile: Profile) -> Figures:
     camera = LiveCamera("u3v", None, None, 2e-3, 25.0, 0)
-    with camera.open(Restorer.from_profile(profile, Tier.preview), None) as frames:
+    with camera.open(profile.rig) as deliver:
+        frames = deliver(Restorer.from_profile(profile, Tier.preview).view, None)
         pipeline = Pipeline(frames, restore, SHAPE, ListSink(), None, Limits(frames=5), threading.Event())
         return pipeline.run(lambda figures: None)
 
@@ -69,11 +72,34 @@ def test_one_of_another_pattern_is_refused(live_profile: Profile, monkeypatch: p
         run(live_profile)
 
 
+def test_one_of_another_size_is_refused(live_profile: Profile, monkeypatch: pytest.MonkeyPatch) -> None:
+    plug(CameraModel(columns=128, rows=64, cfa="RGGB", bits=12), Faults(), monkeypatch)
+    with pytest.raises(CameraError, match=r"a camera of 96 x 64, RGGB, 12 bits .* found 128 x 64, RGGB, 12 bits"):
+        run(live_profile)
+
+
+def test_raw_files_of_another_pattern_are_refused(live_profile: Profile, tmp_path: Path) -> None:
+    write_dng(tmp_path / "a.dng", np.full((64, 96), 900, np.uint16), Shot(cfa="BGGR"))
+    camera = LiveCamera("files", None, tmp_path, None, 30.0, 0)
+    with pytest.raises(CameraError, match=r"RGGB, 12 bits .* found 96 x 64, BGGR"), camera.open(live_profile.rig):
+        pass
+
+
+@pytest.mark.parametrize("exposure_s", [0.0, 1e300, float("nan")])
+def test_an_exposure_that_cannot_be_is_refused(exposure_s: float) -> None:
+    with pytest.raises(CameraError, match="a positive exposure in seconds from 1e-09 to 86400"):
+        LiveCamera("sim", None, None, exposure_s, 30.0, 0)
+
+
+def test_an_exposure_that_a_simulated_camera_lacks_is_refused_before_it_is_rendered(live_profile: Profile) -> None:
+    camera = LiveCamera("sim", None, None, 1000.0, 30.0, 0)
+    with pytest.raises(CameraError, match=r"an exposure in s from .* found 1000"), camera.open(live_profile.rig):
+        pass
+
+
 def test_files_play_once(tmp_path: Path, live_profile: Profile) -> None:
     with (
         pytest.raises(CameraError, match="Expected pictures"),
-        LiveCamera("files", None, tmp_path, 1e-3, 30.0, 0).open(
-            Restorer.from_profile(live_profile, Tier.preview), None
-        ),
+        LiveCamera("files", None, tmp_path, 1e-3, 30.0, 0).open(live_profile.rig),
     ):
         pass

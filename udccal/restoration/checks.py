@@ -69,13 +69,14 @@ def real_array(value: object, what: str) -> np.ndarray:
     return found
 
 
-def check_exposure(exposure_s: object) -> None:
+def check_exposure(exposure_s: object, error: type[UdccalError] = RestorationError) -> None:
     """Refuse what cannot be the exposure of a frame in s.
 
     Raises:
-        RestorationError: when it is no number from a nanosecond to a day.
+        UdccalError: of the kind ``error``, when it is no number from a nanosecond to a day.
     """
-    check_number(exposure_s, "a positive exposure in seconds", EXPOSURES_S, "Give that of the frame; 8 ms are 0.008 s.")
+    advice = "Give that of the frame; 8 ms are 0.008 s."
+    check_number(exposure_s, "a positive exposure in seconds", EXPOSURES_S, advice, error)
 
 
 def check_frame(mosaic: object, exposure_s: object, rig: RigDescription) -> None:

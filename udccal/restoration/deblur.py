@@ -36,6 +36,8 @@ _DIAGONAL = np.outer([1.0, -2.0, 1.0], [1.0, -2.0, 1.0]).astype(np.float32)
 # Median of |x| of a normal distribution with sigma 1.
 _MEDIAN = 0.6745
 _REWEIGHTINGS = 3
+# Rounding to single precision, of the largest value. A picture that is flat in most places shows no noise at all.
+_LEAST_VARIANCE = float(np.finfo(np.float32).eps) ** 2
 # The result is in single precision, and overshoots.
 _MOST = 1e36
 
@@ -95,7 +97,7 @@ def deblur(
     layout = layout_for(rows, columns, (1, 1), (tile_px, tile_px), (0, rows))
     tiles = _cut(light, layout)
     read, slope = _noise_line(tiles)
-    noise = np.sqrt(np.maximum(read + slope * tiles.mean(axis=(2, 3)), np.finfo(np.float32).tiny)).astype(np.float32)
+    noise = np.sqrt(np.maximum(read + slope * tiles.mean(axis=(2, 3)), _LEAST_VARIANCE)).astype(np.float32)
     tables = filter_tables(grid, layout, THREE_COLOURS, workers)
     given = noise, tables, layout, THREE_COLOURS, workers
     chosen, strengths = filtered_and_joined(tiles, *given)

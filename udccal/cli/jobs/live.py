@@ -24,7 +24,8 @@ from udccal.live.pipeline import Limits, Pipeline
 from udccal.live.restoring import Restoring
 from udccal.live.sinks.protocol import make_sink
 from udccal.live.tally import Figures
-from udccal.profiles.store import find_profile
+from udccal.profiles.profile import Profile
+from udccal.profiles.store import find_profile, load_profile
 from udccal.reports.tables import Table
 from udccal.restoration.prepared import prepared_folder
 from udccal.restoration.runtime import Restorer
@@ -60,17 +61,19 @@ def run_live(output: Output, wanted: LiveRun) -> None:
     hook = None if wanted.hook is None else TimedHook(load_hook(wanted.hook), wanted.hook_s)
     path, stop = find_profile(wanted.profile), threading.Event()
 
-    def load() -> Restorer:
-        return Restorer.load(path, wanted.tier, keep=prepared_folder())
+    def prepared(profile: Profile) -> Restorer:
+        return Restorer.from_profile(profile, wanted.tier, keep=prepared_folder())
 
-    follower = ProfileFollower(path, lambda: restoring.replace(load()), output.say)
+    follower = ProfileFollower(path, lambda: restoring.replace(prepared(load_profile(path))), output.say)
     with contextlib.ExitStack() as open_:
         write = open_.enter_context(_log(wanted.log))
         with output.stage("preparing"):
-            restorer = load()
-            shown = None if wanted.panel_picture is None else read_panel_picture(wanted.panel_picture, restorer.rig)
+            profile = load_profile(path)
+            shown = None if wanted.panel_picture is None else read_panel_picture(wanted.panel_picture, profile.rig)
+            deliver = open_.enter_context(wanted.camera.open(profile.rig))  # another camera is refused at once
+            restorer = prepared(profile)
             restoring = Restoring(restorer, shown)
-            frames = open_.enter_context(wanted.camera.open(restorer, shown))
+            frames = deliver(restorer.view, shown)
         open_.enter_context(_ended_by_signals(stop))
         open_.enter_context(follower)
         output.say("Running; Ctrl-C ends it.")

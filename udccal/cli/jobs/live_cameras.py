@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final, Literal, final
@@ -13,7 +13,8 @@ from jaxtyping import UInt8
 
 from udccal.benches.bench import simulated_rig
 from udccal.benches.photograph import capture_photograph
-from udccal.cameras.choice import mode_for
+from udccal.cameras.checks import check_settings
+from udccal.cameras.choice import check_camera, mode_for
 from udccal.cameras.files import FileCamera
 from udccal.cameras.picture_files.sidecar import list_folder
 from udccal.cameras.protocol import Camera, Frame, Range, Settings
@@ -22,14 +23,18 @@ from udccal.cli.jobs.benches import pylon_camera, u3v_camera
 from udccal.cli.jobs.demonstration import portrait
 from udccal.errors import CameraError
 from udccal.live.pacing import looped, paced, streamed
-from udccal.restoration.runtime import Restorer
+from udccal.models.geometry import VirtualView
+from udccal.restoration.checks import check_exposure, check_number
 from udccal.rig import RigDescription
+from udccal.simulation.world import SimulatedWorld
 
 # Frames of the simulated loop. They differ in their noise.
 _LOOP: Final = 8
 _DEFAULT_EXPOSURE_S: Final = 8e-3
 
 PanelPicture = UInt8[np.ndarray, "panel_rows panel_columns 3"]
+# Delivers frames; a simulated camera sees a scene that fills the view, and what the panel shows.
+Frames = Callable[[VirtualView, PanelPicture | None], Iterator[Frame]]
 
 
 @final
@@ -56,29 +61,39 @@ class LiveCamera:
     def __post_init__(self) -> None:
         if (self.kind == "files") != (self.files is not None):
             raise CameraError("Expected --files with --camera files, and only there, found one of them. Give both.")
+        check_number(self.rate_hz, "a rate of frames in Hz", (1e-3, 1e5), "Give that of the camera.", CameraError)
+        if self.exposure_s is not None:
+            check_exposure(self.exposure_s, CameraError)
 
     @contextlib.contextmanager
-    def open(self, restorer: Restorer, panel_picture: PanelPicture | None) -> Iterator[Iterator[Frame]]:
-        """Open the camera and yield its frames.
+    def open(self, rig: RigDescription) -> Iterator[Frames]:
+        """Open the camera and check that it is the rig's; yield what then delivers its frames.
 
         Raises:
-            CameraError: when it cannot be opened or does not fit the rig.
+            CameraError: when it cannot be opened, does not fit the rig, or does not have the exposure.
         """
-        rig = restorer.rig
         if self.kind == "sim":
-            yield looped(self._rendered(restorer, panel_picture), self.rate_hz)
+            world = simulated_rig(rig, self.seed)
+            if self.exposure_s is not None:
+                camera = SimulatedCamera(world)
+                check_settings(Settings(self.exposure_s, 0.0, camera.sensor), camera.features, camera.sensor)
+            yield lambda view, shown: looped(self._rendered(world, view, shown), self.rate_hz)
         elif self.files is not None:
-            with FileCamera(self.files, rig.camera.cfa, rig.camera.bits, self.exposure_s) as camera:
-                yield paced(camera.frames(len(list_folder(self.files))), self.rate_hz)
+            with FileCamera(self.files, rig.camera.cfa, rig.camera.bits, self.exposure_s) as files:
+                check_camera(files, rig)
+                count = len(list_folder(self.files))
+                yield lambda view, shown: paced(files.frames(count), self.rate_hz)
         else:
-            with u3v_camera(self.serial) if self.kind == "u3v" else pylon_camera(self.serial) as camera:
-                self._set(camera, rig)
-                yield streamed(camera)
+            with u3v_camera(self.serial) if self.kind == "u3v" else pylon_camera(self.serial) as real:
+                self._set(real, rig)
+                check_camera(real, rig)
+                yield lambda view, shown: streamed(real)
 
-    def _rendered(self, restorer: Restorer, panel_picture: PanelPicture | None) -> tuple[Frame, ...]:
+    def _rendered(
+        self, world: SimulatedWorld, view: VirtualView, panel_picture: PanelPicture | None
+    ) -> tuple[Frame, ...]:
         """Return a few frames of a photograph before the simulated rig, so that simulation takes no time later."""
-        world = simulated_rig(restorer.rig, self.seed)
-        scene = capture_photograph(world, portrait(), restorer.view, panel_picture)
+        scene = capture_photograph(world, portrait(), view, panel_picture)
         with SimulatedCamera(world) as camera:
             camera.configure(Settings(self.exposure_s or scene.exposure_s, 0.0, camera.sensor))
             return tuple(camera.frames(_LOOP))
