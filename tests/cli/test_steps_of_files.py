@@ -1,6 +1,6 @@
 """Steps whose pictures lie in folders: those that cannot be right are refused, and captured steps captured once more.
 
-The last step has no pictures, so that the command ends before it fits.
+The last step has no pictures, so that the command ends before it fits; a fit can do without that step.
 """
 
 from __future__ import annotations
@@ -146,6 +146,23 @@ def test_a_captured_step_is_captured_again_alone(folder: Path) -> None:
     assert {str(p.relative_to(folder / "session")) for p in (folder / "session" / "noise").iterdir()} == named
     assert f"the step {LAST}" in refused(folder)  # whole, and not asked for once more
     assert steps(folder) == after
+
+
+@pytest.mark.slow
+def test_a_step_that_a_fit_can_do_without_is_named_by_fit_report_and_profile(folder: Path) -> None:
+    refused(folder)
+    said = f"14 of 15 planned steps captured, without {LAST}."
+    for words in (["fit", folder / "session", "--profile", folder / "p"], ["profile", "show", folder / "p"]):
+        done = subprocess.run(
+            [sys.executable, "-m", "udccal.cli.main", *map(str, words), "--json"],
+            capture_output=True,
+            text=True,
+            timeout=280,
+        )
+        terms = {term["term"]: term for term in json.loads(done.stdout)["terms"]}
+        assert terms["noise"]["status"] == "CONVERGED"
+        assert said in terms["noise"]["notes"]
+    assert said in (folder / "p-report.html").read_text(encoding="utf-8")
 
 
 def test_steps_that_cannot_be_captured_again_are_refused_and_change_nothing(folder: Path) -> None:
