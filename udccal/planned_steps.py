@@ -33,7 +33,8 @@ def skipped_note(term: TermName, rig: RigDescription, captured: Set[str]) -> str
     except UdccalError:
         return ""
     skipped = [step_id for step_id in planned if step_id not in captured]
-    if not skipped:
+    # Steps of other names are another program's, whose plan is not known.
+    if not skipped or not captured <= set(planned):
         return ""
     more = f" and {len(skipped) - _NAMED} more" if len(skipped) > _NAMED else ""
     done = len(planned) - len(skipped)
