@@ -23,7 +23,7 @@ ROBUST ?=
 PEERS ?=
 USB ?=
 
-.PHONY: install demo test test-medium test-slow test-usb fuzz load lint types contracts check accuracy tables efficiency coverage extremes pareto device network budget drift other-days guided rigs live robust peers growth docs clean
+.PHONY: install demo test test-medium test-slow test-usb fuzz load lint types contracts check accuracy tables efficiency coverage extremes pareto fewer device network budget drift other-days guided rigs live robust peers growth docs clean
 
 install: $(STAMP)
 
@@ -130,6 +130,10 @@ rigs: $(STAMP)
 # limit. Nothing else should run meanwhile.
 pareto: $(STAMP)
 	$(BIN)/python -m tests.benchmarks.pareto --out $(PARETO_OUT)
+
+# What pictures lose by profiles of fewer captures: nine calibrations of the small rig.
+fewer: $(STAMP)
+	$(BIN)/python -m tests.benchmarks.pareto.calibrations
 
 # The tiers that deblur on a GPU beside the CPU: time, and how far pictures differ. Writes the table of
 # docs/restoration.md; where JAX finds no GPU it says so.

@@ -18,7 +18,6 @@ import time
 from pathlib import Path
 
 from tests.benchmarks import device
-from tests.benchmarks.pareto.calibrations import FEWER, fewer_table, from_fewer
 from tests.benchmarks.pareto.choices import traded, traded_table
 from tests.benchmarks.pareto.drawing import draw
 from tests.benchmarks.pareto.groups import Group
@@ -53,21 +52,18 @@ def main() -> int:
 
     name = options.profile or options.rig
     profile = load_profile(name)
-    truth = draw_truth(load_rig(options.rig), options.seed)
-    seen = seen_by(truth, profile, data, options.every)
+    seen = seen_by(draw_truth(load_rig(options.rig), options.seed), profile, data, options.every)
     say(f"{len(seen.sights)} frames are taken")
     with tempfile.TemporaryDirectory() as folder:
         found = measured(name, profile, seen, options.out, Path(folder), say)
         some = [sight for sight in seen.usual if sight.case.group is Group.nineteen][::_CHOICES_EVERY]
         choices = traded_table(traded(name, some, found.runs, kept_of(Path(folder))))
         say("choices are traded")
-        fewer = fewer_table(from_fewer(truth, some, Path(folder) / "fewer", FEWER))
-        say("rigs are calibrated from fewer captures")
-    _write(found, choices, fewer, options)
+    _write(found, choices, options)
     return 0 if all(row.ok for row in found.rows) else 1
 
 
-def _write(found: Measured, choices: str, fewer: str, options: argparse.Namespace) -> None:
+def _write(found: Measured, choices: str, options: argparse.Namespace) -> None:
     """Everything but the sheets; part of the scenes leaves the pages as they are."""
     out, rig = options.out, options.rig
     write_csv(found.runs, out / "pareto.csv")
@@ -76,7 +72,6 @@ def _write(found: Measured, choices: str, fewer: str, options: argparse.Namespac
     contents = (
         (_PAGE, "pareto", full_table(found)),
         (_PAGE, "choices", choices),
-        (_PAGE, "calibrations", fewer),
         (_TIERS, "pareto", compact_table(found)),
         (_README, "pareto", compact_table(found)),
     )

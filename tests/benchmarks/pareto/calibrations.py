@@ -1,7 +1,16 @@
-"""The trade in calibration: what profiles of fewer captures lose in the pictures that they restore."""
+"""The trade in calibration: what profiles of fewer captures lose in the pictures that they restore.
+
+    python -m tests.benchmarks.pareto.calibrations [--rig NAME] [--seed N] [--every N]
+
+Calibrates the simulated rig's specimen ``--seed`` once for each set of captures, and restores every n-th of the
+nineteen scenes. Prints the table, and puts it into docs/restoration.md where that has markers for the rig.
+"""
 
 from __future__ import annotations
 
+import argparse
+import sys
+import tempfile
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -10,19 +19,24 @@ from typing import Final, get_args
 import numpy as np
 
 import udccal
+from tests.benchmarks.pareto.groups import Group
+from tests.benchmarks.pareto.measuring import seen_by
 from tests.benchmarks.pareto.restoring import Setup, TierProcess
 from tests.benchmarks.pareto.runs import Sight
+from tests.benchmarks.readme_tables import has_table, put_table
 from udccal.benches.bench import simulated_bench
 from udccal.planning.state import nominal_state
 from udccal.planning.steps import Cost
+from udccal.profiles.store import load_profile
 from udccal.restoration.metrics import psnr
 from udccal.restoration.plan import PlanOptions
-from udccal.rig import Captures, RigDescription
+from udccal.rig import Captures, RigDescription, load_rig
 from udccal.sessions.schema import TermName
-from udccal.simulation.truth import RigTruth
+from udccal.simulation.truth import RigTruth, draw_truth
 from udccal.simulation.world import SimulatedWorld
 from udccal.tiers import Tier
 
+_ROOT: Final = Path(__file__).resolve().parents[3]
 # Noise of the captures; that of the frames to restore is another.
 _NOISE_SEED: Final = 1
 
@@ -122,3 +136,30 @@ def fewer_table(found: Sequence[FromFewer]) -> str:
         numbers = f"{one.cost.frames} | {one.cost.seconds:.0f} | {np.mean(lost):+.2f} | {np.min(lost):+.2f}"
         lines.append(f"| {one.fewer.name} | {numbers} | {', '.join(one.doubtful)} |")
     return "\n".join(lines)
+
+
+def main() -> int:
+    """Run the benchmark; it has no limits to miss."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--rig", default="lg55-reduced", help="a rig whose profile ships")
+    parser.add_argument("--seed", type=int, default=0, help="specimen of the simulated rig")
+    parser.add_argument("--every", type=int, default=3, help="use each n-th scene only")
+    options = parser.parse_args()
+    data = _ROOT.parent / "shared" / "data"
+    if not data.is_dir():
+        print("The shared photographs (../shared/data) are absent: there is nothing to restore.", file=sys.stderr)
+        return 1
+    truth = draw_truth(load_rig(options.rig), options.seed)
+    seen = seen_by(truth, load_profile(options.rig), data, options.every)
+    sights = [sight for sight in seen.usual if sight.case.group is Group.nineteen]
+    with tempfile.TemporaryDirectory() as folder:
+        table = fewer_table(from_fewer(truth, sights, Path(folder), FEWER))
+    print(table)
+    page, marker = _ROOT / "docs" / "restoration.md", f"calibrations {options.rig}"
+    if has_table(page, marker):
+        put_table(page, marker, table)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
