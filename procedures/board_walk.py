@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Callable, Iterator
 from typing import Final, final
@@ -23,7 +24,7 @@ from udccal.rig import RigDescription
 from udccal.sessions.store import Session
 from udccal.sessions.writer import SessionWriter
 
-_STILL_PX, _STILL_LOOKS, _UNKNOWN_PX = 1.0, 3, 999.0
+_STILL_PX, _STILL_LOOKS, _UNKNOWN_PX = 1.0, 3, math.inf
 _FEWEST_COMMON: Final = 4
 _UNLIKE: Final = 0.02  # of the sensor's width, by which the corners of two views differ at least
 

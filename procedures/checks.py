@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Final
 
 from procedures.readings import dark_limit_DN, evenness, find_corners, find_led, light_leak
-from udccal.arrangements import BoardSpec
+from udccal.arrangements import Arrangement, Board, BoardSpec, FlatLight, Led
 from udccal.cameras.protocol import Frame
 from udccal.errors import CaptureError
 from udccal.rig import RigDescription
@@ -15,6 +16,10 @@ from udccal.sessions.frame_checks import FrameLimits
 Check = Callable[[Frame, RigDescription], None]
 
 _FAR = 100.0  # times: a camera without the exposure may lend its nearest; milliseconds for seconds are 1000 times off
+# Exposures in s at which fast lenses behind a panel fill most of a well. Wells, f-numbers and lights that are in use
+# change these by less than a hundred times.
+_USUAL_S: Final = {Led: 1e-4, FlatLight: 5e-3, Board: 1e-2}
+_PANEL_S: Final = 0.1
 _AIM_PX = 10  # the fit searches a little further
 
 
@@ -33,11 +38,16 @@ def refuse_far_exposure(found_s: float, wanted_s: float) -> None:
     if not 1 / _FAR <= found_s / wanted_s <= _FAR:
         factor = max(found_s / wanted_s, wanted_s / found_s)
         raise CaptureError(
-            f"Expected an exposure near {wanted_s:.3g} s, as follows from the rig and the earlier steps, found "
+            f"Expected an exposure near {wanted_s:.3g} s, as follows from the light and the earlier steps, found "
             f"{found_s:.3g} s: {factor:.0f} times too {'long' if found_s > wanted_s else 'short'}. Exposures are in "
             "seconds (s): correct a frames.csv that has milliseconds (ms), here or in an earlier step, or take the "
             "pictures again."
         )
+
+
+def usual_exposure_s(arrangement: Arrangement) -> float:
+    """Return the exposure in s at which an LED, an even light, a board or the panel usually fills most of a well."""
+    return _USUAL_S.get(type(arrangement), _PANEL_S)
 
 
 def is_dark(frame: Frame, rig: RigDescription) -> None:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final, final
 
 import numpy as np
@@ -14,10 +15,10 @@ from procedures.checks import move_led, shows_led
 from procedures.live import LiveFrames
 from procedures.metering import saturation_DN, trial_frame
 from procedures.plans import Bracket, Metered
-from procedures.readings import LedSeen, find_led, head_room, why_not
+from procedures.readings import LedSeen, find_led, head_room, led_change, why_not
 from procedures.step import Bench, Step, exposure_of, take_step, whole_sensor
 from udccal.arrangements import Led, Occasion
-from udccal.cameras.protocol import Region
+from udccal.cameras.protocol import Frame, Region
 from udccal.errors import CaptureError
 from udccal.guide.events import Outline, Reading
 from udccal.guide.steps import Look
@@ -29,7 +30,7 @@ from udccal.sessions.writer import SessionWriter
 CELL_PX: Final = 2.0  # side of the Bayer pattern's cell: places of the LED count within it
 # Brackets of one position lie this close to its first in x and y, less a margin: the fit takes them together then.
 _TOGETHER_PX: Final = 3.5
-_STILL_PX, _STILL_LOOKS, _UNKNOWN_PX = 0.1, 3, 99.0
+_STILL_LOOKS: Final = 3
 # Of the distance of places that are spread as evenly as can be. Chance finds a new one in two or three nudges.
 _APART: Final = 0.4
 _SEEN: Final = 0.2  # of the range
@@ -96,7 +97,8 @@ class LedVisit:
         writer.capture_again([step_id for step_id in cell.step_ids if step_id in writer.completed_ids])
         self._live = LiveFrames(bench.camera, whole_sensor(self._rig), exposure, self._rig)
         self._taken_px: list[Place] = []
-        self._seen_px: deque[Place] = deque(maxlen=_STILL_LOOKS)
+        self._near_px = cell.place_px
+        self._looks: deque[Frame] = deque(maxlen=_STILL_LOOKS)
         self._nudges = 0
         bench.display.off()
         self._asked = self._ask(cell.place_px)
@@ -107,11 +109,12 @@ class LedVisit:
         led, room = find_led(frame, self._rig), head_room(level, None)
         seen = led.peak_DN > _SEEN * (saturation_DN(self._rig) - self._rig.camera.black_DN.value)
         if not seen or not led.room.ok or not room.ok:
-            self._seen_px.clear()
+            self._looks.clear()
             if not seen:
                 self._ask_inwards()
             return Look(frame, (room, led.room), self._why_unseen(seen, led, room), (self._wanted(),))
-        self._seen_px.append(led.place_px)
+        self._near_px = led.place_px
+        self._looks.append(frame)
         readings = (room, led.room, self._off(led.place_px), self._movement(), self._new_phase(led.place_px))
         outlines = (self._wanted(), Outline((led.place_px,), "seen"))
         return Look(frame, readings, self._where_next(readings, led.place_px), outlines)
@@ -122,11 +125,11 @@ class LedVisit:
         Raises:
             CaptureError: when the LED moves meanwhile, or as ``take_step`` does.
         """
-        near, step_id = self._seen_px[-1], self._cell.step_ids[len(self._taken_px)]
+        near, step_id = self._near_px, self._cell.step_ids[len(self._taken_px)]
         region = region_around(self._rig, *(self._taken_px or [near])[0])
         plan = Bracket(self._rig.captures.psf_exposures)
         step = Step(step_id, "psf", self._asked, "", shows_led(*near), region, self._exposure, plan)
-        self._seen_px.clear()
+        self._looks.clear()
         start_s = exposure_of(self._cell.step_ids[0], self._writer) if self._taken_px else None
         captures = take_step(step, self._bench, self._writer, start_s)
         place = self._held_place(captures[0], region)
@@ -142,15 +145,14 @@ class LedVisit:
     def _held_place(self, first: Capture, region: Region) -> Place:
         """Return where the LED was in the first frame of a bracket, once it is sure that it still is there."""
         assert isinstance(first, SingleFrame)
-        place = find_led(first.frame, self._rig).place_px
         after = trial_frame(self._bench.camera, region, first.frame.settings.exposure_s)
-        moved = _distance(place, find_led(after, self._rig).place_px)
-        if moved > _STILL_PX:
+        change = led_change(first.frame, after, self._rig)
+        if not change.ok:
             raise CaptureError(
-                f"Expected the LED to rest, found that it moved by {moved:.1f} px while its frames were taken. Put it "
-                "on something firm."
+                f"Expected the LED to rest, found that its picture changed by {change.value:.0f}% (at most "
+                f"{change.high:.0f}% at rest) while its frames were taken. Put it on something firm."
             )
-        return place
+        return find_led(first.frame, self._rig).place_px
 
     def _ask(self, place_px: Place) -> Led:
         """Have the LED brought to a place by whoever or whatever moves it."""
@@ -165,7 +167,7 @@ class LedVisit:
         """Have the LED brought from where it is seen to where it is wanted."""
         right, down = wanted_px[0] - seen_px[0], wanted_px[1] - seen_px[1]
         self._asked = self._ask((self._asked.x_px + right, self._asked.y_px + down))
-        self._seen_px.clear()
+        self._looks.clear()
 
     def _ask_inwards(self) -> None:
         """Where an aim has missed the sensor, begin again halfway to its middle."""
@@ -191,8 +193,10 @@ class LedVisit:
         return Reading("LED outside its place", max(off, 0.0), None, 0.0, "px")
 
     def _movement(self) -> Reading:
-        moved = max(_distance(place, self._seen_px[-1]) for place in self._seen_px)
-        return Reading("movement", moved if len(self._seen_px) == _STILL_LOOKS else _UNKNOWN_PX, None, _STILL_PX, "px")
+        """The largest change over the last looks; unknown, and too large, before there are enough."""
+        changes = [led_change(before, self._looks[-1], self._rig) for before in self._looks]
+        largest = max(changes, key=lambda change: change.value)
+        return largest if len(changes) == _STILL_LOOKS else replace(largest, value=math.inf)
 
     def _new_phase(self, place_px: Place) -> Reading:
         least = phase_distance_px(len(self._cell.step_ids))
@@ -217,7 +221,3 @@ class LedVisit:
         if not led.room.ok:
             return "The surroundings are nearly as bright as the LED. Darken the room."
         return why_not(room) if seen else "No LED is seen. Switch it on and bring it into the camera's view."
-
-
-def _distance(one: Place, other: Place) -> float:
-    return float(np.hypot(one[0] - other[0], one[1] - other[1]))

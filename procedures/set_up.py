@@ -18,7 +18,7 @@ from udccal.errors import CaptureError
 from udccal.guide.drawing import side_view
 from udccal.guide.events import Outline, Reading
 from udccal.guide.steps import GuidedStep, Look
-from udccal.planning.steps import with_small_panel
+from udccal.planned_steps import with_small_panel
 from udccal.rig import RigDescription
 from udccal.sessions.writer import SessionWriter
 

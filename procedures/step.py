@@ -7,10 +7,11 @@ from dataclasses import dataclass
 from typing import Literal
 
 from procedures.capture import take
-from procedures.checks import Check, frame_limits, refuse_far_exposure
+from procedures.checks import Check, frame_limits, refuse_far_exposure, usual_exposure_s
 from procedures.metering import Exposed, meter, trial_frame
 from procedures.plans import Exposure, Fixed, Metered, Plan, TimesThatOf
 from udccal.arrangements import Arrangement, Board, Dark, FlatLight, Led, Occasion, PanelPicture, Stage
+from udccal.cameras.files import FILES
 from udccal.cameras.protocol import Camera, Region
 from udccal.displays.protocol import Display
 from udccal.errors import CaptureError, SessionError, UdccalError
@@ -131,12 +132,12 @@ def _expose(step: Step, camera: Camera, writer: SessionWriter, start_s: float | 
     rig = writer.manifest.rig
     match step.exposure:
         case Metered() if step.id in writer.again:
-            return meter(camera, step.region, step.exposure, rig, exposure_of(step.id, writer))
+            return _metered(step, step.exposure, camera, writer, exposure_of(step.id, writer))
         case Metered(signal="even") if (captured := writer.step(step.id)) is not None:
             # Its files are damaged but its exposure is known: other steps were captured at the same one.
             wanted = captured.captures[0].exposure_s
         case Metered():
-            return meter(camera, step.region, step.exposure, rig, start_s)
+            return _metered(step, step.exposure, camera, writer, start_s)
         case Fixed(exposure_s):
             wanted = exposure_s
         case TimesThatOf(step_id, factor):
@@ -148,6 +149,16 @@ def _expose(step: Step, camera: Camera, writer: SessionWriter, start_s: float | 
     frame = trial_frame(camera, step.region, bounded)
     refuse_far_exposure(frame.settings.exposure_s, bounded)
     return Exposed(frame.settings.exposure_s, frame)
+
+
+def _metered(step: Step, plan: Metered, camera: Camera, writer: SessionWriter, start_s: float | None) -> Exposed:
+    exposed = meter(camera, step.region, plan, writer.manifest.rig, start_s)
+    if camera.identity.backend == FILES:  # the exposure is what somebody wrote; a camera's own is what it did
+        alike = (other for other in writer.manifest.steps if other.term == step.term and other.id != step.id)
+        first = next(alike, None) if isinstance(step.arrangement, Led | Board) else None
+        usual_s = usual_exposure_s(step.arrangement) if first is None else first.captures[0].exposure_s
+        refuse_far_exposure(exposed.exposure_s, usual_s)
+    return exposed
 
 
 def _subject(step: Step, writer: SessionWriter) -> Subject:

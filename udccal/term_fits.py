@@ -30,6 +30,7 @@ from udccal.models.geometry import Geometry
 from udccal.models.noise import Noise
 from udccal.models.psf import PsfField
 from udccal.models.wire import Wire
+from udccal.planned_steps import skipped_note
 from udccal.result import FitResult, FitStatus
 from udccal.sessions.evidence import captures_of
 from udccal.sessions.schema import TermName
@@ -128,10 +129,12 @@ class TermFits:
         start = time.perf_counter()
         captured = self._session.steps(term)
         lacks = lacking(self._session, term)
+        skipped = skipped_note(term, self._session.rig, {step.id for step in captured}) if captured else ""
         if captured and not lacks:
             result = replace(fit(), captures=captures_of(captured), effort=self._effort.label)
         else:
             notes = (f"Captured in part: the fit needs {lacks} as well.",) if captured else ()
             result = FitResult.failed(term, absent(), FitStatus.NOT_CAPTURED, *notes)
+        result = replace(result, notes=(*result.notes, *filter(None, (skipped,))))
         self.times.append(FitTime(term, time.perf_counter() - start))
         return result

@@ -1,6 +1,6 @@
 """Steps whose pictures lie in folders: those that cannot be right are refused, and captured steps captured once more.
 
-The last step has no pictures, so that the command ends before it fits.
+The last step has no pictures, so that the command ends before it fits; a fit can do without that step.
 """
 
 from __future__ import annotations
@@ -9,12 +9,14 @@ import json
 import shutil
 import subprocess
 import sys
+from itertools import islice
 from pathlib import Path
 
 import pytest
 
 from tests.cli.step_pictures import photograph_steps
-from tests.toy_rigs import write_toy_rig
+from tests.toy_rigs import RIGS, write_toy_rig
+from udccal.plugins import find_procedure
 from udccal.rig import load_rig
 from udccal.sessions.schema import StoredStep
 from udccal.sessions.store import Session
@@ -81,13 +83,40 @@ def test_milliseconds_for_seconds_are_refused_at_their_step(folder: Path) -> Non
     assert f"the step {LAST}" in refused(folder)
 
 
-def test_a_first_step_in_milliseconds_is_captured_again_with_what_followed_from_it(folder: Path) -> None:
+def test_a_first_step_in_milliseconds_is_refused_though_nothing_came_before(folder: Path) -> None:
     table = folder / "pictures" / "noise" / "flat_stack" / "frames.csv"
     times(table, 1000.0)
-    assert "Step noise/flat_0: Expected an exposure near 0.088 s" in refused(folder)
+    sentence = refused(folder)
+    assert sentence.startswith("Step noise/flat_stack: Expected an exposure near 0.005 s, as follows from the light")
+    assert "found 4.4 s: 880 times too long" in sentence
+    assert not steps(folder)
     times(table, 1e-3)
-    assert f"the step {LAST}" in refused(folder, "--again", "noise/flat_stack")
-    assert steps(folder)["noise/flat_stack"].captures[0].exposure_s == pytest.approx(4.4e-3)
+    assert f"the step {LAST}" in refused(folder)
+
+
+@pytest.mark.parametrize(("term", "missing"), [("psf", "psf/p00_s2"), ("geometry", "geometry/view_1")])
+def test_milliseconds_at_an_led_or_a_board_are_refused(term: str, missing: str, tmp_path: Path) -> None:
+    # The toy rig has too few pixels for a board.
+    folder = write_toy_rig(tmp_path) if term == "psf" else shutil.copytree(RIGS / "lg55-reduced", tmp_path / "toy")
+    rig = load_rig(folder)
+    planned = list(islice(find_procedure(term)().steps(rig), 2))
+    photograph_steps(rig, tmp_path / "pictures", planned)
+    tables = [tmp_path / "pictures" / step.id / "frames.csv" for step in planned]
+    for step, table in zip(planned, tables, strict=True):
+        times(table, 1000.0)
+        sentence = refused(tmp_path, term=term)
+        assert sentence.startswith(f"Step {step.id}: Expected an exposure near "), sentence
+        assert "times too long. Exposures are in seconds" in sentence
+        assert step.id not in (steps(tmp_path) if (tmp_path / "session").exists() else {})
+        times(table, 1e-3)
+    for table in tables:  # a light twenty times fainter than usual is accepted
+        times(table, 20.0)
+    assert f"the step {missing}" in refused(tmp_path, term=term)
+    assert list(steps(tmp_path)) == [step.id for step in planned]
+
+
+def test_a_first_step_captured_again_takes_along_what_followed_from_it(folder: Path) -> None:
+    assert f"the step {LAST}" in refused(folder)
     # Of another exposure than before, so that the steps at multiples of it are captured anew.
     before = steps(folder)
     for name in (
@@ -117,6 +146,23 @@ def test_a_captured_step_is_captured_again_alone(folder: Path) -> None:
     assert {str(p.relative_to(folder / "session")) for p in (folder / "session" / "noise").iterdir()} == named
     assert f"the step {LAST}" in refused(folder)  # whole, and not asked for once more
     assert steps(folder) == after
+
+
+@pytest.mark.slow
+def test_a_step_that_a_fit_can_do_without_is_named_by_fit_report_and_profile(folder: Path) -> None:
+    refused(folder)
+    said = f"14 of 15 planned steps captured, without {LAST}."
+    for words in (["fit", folder / "session", "--profile", folder / "p"], ["profile", "show", folder / "p"]):
+        done = subprocess.run(
+            [sys.executable, "-m", "udccal.cli.main", *map(str, words), "--json"],
+            capture_output=True,
+            text=True,
+            timeout=280,
+        )
+        terms = {term["term"]: term for term in json.loads(done.stdout)["terms"]}
+        assert terms["noise"]["status"] == "CONVERGED"
+        assert said in terms["noise"]["notes"]
+    assert said in (folder / "p-report.html").read_text(encoding="utf-8")
 
 
 def test_steps_that_cannot_be_captured_again_are_refused_and_change_nothing(folder: Path) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from dataclasses import replace
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pytest
@@ -22,6 +22,7 @@ from udccal.fitting.wire.fit import sensor_map
 from udccal.profiles.profile import Profile, build_profile
 from udccal.reports.diff_tables import movement_sentence
 from udccal.result import Captures, FitStatus
+from udccal.sessions.schema import TermName
 
 LIMITS = DiffLimits()
 
@@ -55,7 +56,7 @@ def test_a_verdict_needs_significance_and_effect(
 
 
 def test_verdicts_are_ordered_from_best_to_worst() -> None:
-    assert VERDICTS == ("same", "changed, harmless", "changed")
+    assert VERDICTS == ("same", "not compared", "changed, harmless", "changed")
 
 
 def with_rig(profile: Profile, part: str, **changes: Any) -> Profile:
@@ -106,6 +107,28 @@ def test_a_profile_and_itself_are_the_same(toy: Profile) -> None:
     assert set(numbers(found)) == {0.0}
     assert (found.verdict, {one.verdict for one in found.terms}) == ("same", {"same"})
     assert found.advice == "Go on with either profile: they agree within their error bars."
+
+
+@pytest.mark.medium
+@pytest.mark.parametrize("lacks", [("wire",), ("wire", "psf"), get_args(TermName)], ids=str)
+def test_a_term_that_nobody_captured_is_not_compared(toy: Profile, lacks: tuple[TermName, ...]) -> None:
+    lacking = {term: replace(toy.result(term), status=FitStatus.NOT_CAPTURED) for term in lacks}
+    found = udccal.diff(toy, replace(toy, **lacking))
+    assert [one.term for one in found.terms if one.verdict == "not compared"] == list(lacks)
+    assert found.verdict == "not compared"
+    assert all("not captured for B" in one.notes[0] for one in found.terms if one.term in lacks)
+    assert found.advice.startswith("Capture ")
+    assert "either profile" not in found.advice
+
+
+@pytest.mark.medium
+def test_a_newer_profile_that_lacks_a_term_is_not_advised_as_it_is(toy: Profile) -> None:
+    other, later = changed(toy), toy.provenance.model_copy(update={"created_at": "2999-01-01T00:00:00+00:00"})
+    lacking = replace(other, provenance=later, psf=replace(other.psf, status=FitStatus.NOT_CAPTURED))
+    for found, newer in ((udccal.diff(toy, lacking), "B"), (udccal.diff(lacking, toy), "A")):
+        assert found.verdict == "changed"
+        assert found.advice.startswith(f"Capture psf for {newer}, the newer profile, then use it:")
+        assert "psf could not be compared" in found.advice
 
 
 def changed(toy: Profile) -> Profile:

@@ -7,14 +7,14 @@ import re
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from udccal.profiles.provenance import profile_sha256
-from udccal.profiles.store import find_profile, load_profile
-
-pytestmark = pytest.mark.slow
+from udccal.profiles.store import find_profile, load_profile, write_profile
+from udccal.result import FitStatus
 
 
 def check(*words: str | Path) -> subprocess.CompletedProcess[str]:
@@ -22,6 +22,7 @@ def check(*words: str | Path) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, text=True, timeout=900)
 
 
+@pytest.mark.slow
 def test_the_same_rig_on_another_day_is_the_same(tmp_path: Path) -> None:
     out = tmp_path / "with a space, µ"
     done = check("--noise-seed", "7", "--out", out, "--update", tmp_path / "new", "--json")
@@ -40,12 +41,26 @@ def test_the_same_rig_on_another_day_is_the_same(tmp_path: Path) -> None:
     assert load_profile(tmp_path / "new").parent == profile_sha256(find_profile("lg55-reduced"))
 
 
-def test_another_specimen_is_refused_before_it_is_compared(tmp_path: Path) -> None:
+@pytest.mark.medium
+def test_another_camera_is_refused_before_it_captures(tmp_path: Path) -> None:
     done = check("--seed", "1", "--out", tmp_path / "out", "--json")
     assert done.returncode == 1, done.stdout
     assert "found another camera" in json.loads(done.stdout)["error"]
+    assert not (tmp_path / "out" / "session").exists()
 
 
+def test_a_profile_without_the_terms_is_refused_before_it_captures(tmp_path: Path) -> None:
+    whole = load_profile("lg55-reduced")
+    lacking = replace(whole, wire=replace(whole.wire, status=FitStatus.NOT_CAPTURED))
+    write_profile(tmp_path / "lacking", lacking)
+    command = [sys.executable, "-m", "udccal.cli.main", "check", "--profile", str(tmp_path / "lacking")]
+    done = subprocess.run([*command, "--out", str(tmp_path / "out")], capture_output=True, text=True, timeout=280)
+    assert done.returncode == 1
+    assert "none of wire" in done.stderr
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.slow
 def test_a_full_disk_is_said_and_leaves_no_half_result(nearly_full: Path) -> None:
     done = check("--out", nearly_full / "c", "--update", nearly_full / "p", "--json")
     assert done.returncode == 1, done.stdout
@@ -56,6 +71,7 @@ def test_a_full_disk_is_said_and_leaves_no_half_result(nearly_full: Path) -> Non
     assert [item.name for item in (nearly_full / "c").iterdir()] == ["session"]
 
 
+@pytest.mark.slow
 def test_two_at_once_leave_one_whole_result(tmp_path: Path) -> None:
     with ThreadPoolExecutor(2) as pool:
         both = list(pool.map(lambda _: check("--out", tmp_path / "c", "--update", tmp_path / "p"), range(2)))

@@ -10,7 +10,7 @@ from tests.guide.painted import PaintedRig, painted_bench, painted_rig
 from tests.guide.scripted import Reaction, Scripted
 from udccal.arrangements import Board, Dark, FlatLight, Led
 from udccal.guide.capture import guided_steps, lead_capture
-from udccal.guide.events import Answer, Event, ProgressEvent, ReadingsEvent, StepEvent, VerdictEvent
+from udccal.guide.events import Answer, Event, ProgressEvent, ReadingsEvent, StepEvent, VerdictEvent, in_order
 from udccal.rig import load_rig
 from udccal.sessions.schema import TermName
 from udccal.sessions.store import Session
@@ -103,6 +103,20 @@ def test_a_moving_led_is_not_captured(tmp_path: Path) -> None:
 
     person = led(tmp_path, ["psf"], react, painted)
     assert "Let the LED rest." in person.sentences("psf/p00")
+    assert person.done.complete
+
+
+def test_an_led_that_moves_while_its_frames_are_taken_is_not_captured(tmp_path: Path) -> None:
+    painted = PaintedRig(painted_rig(psf_columns=1, psf_rows=1))
+
+    def react(event: Event, offered: tuple[Answer, ...]) -> Answer | None:
+        if isinstance(event, ReadingsEvent):
+            about_to_be_taken = in_order(event.readings, event.sentence)
+            painted.drift_px = 0.13 if about_to_be_taken and painted.frames_taken < 30 else 0.0
+        return None
+
+    person = led(tmp_path, ["psf"], react, painted)
+    assert any("found that its picture changed by" in said for said in person.sentences("psf/p00"))
     assert person.done.complete
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import math
 import sys
 import time
 from dataclasses import replace
@@ -166,7 +167,9 @@ def test_readings_are_printed_when_they_say_something_else(
     for value in (80.0, 81.0, 79.0):
         person.tell(looked(replace(GOOD, value=value)))
     person.tell(looked(BAD, "A shadow."))
+    person.tell(looked(Reading("movement", math.inf, None, 1.0, "px"), "Hold it still."))
     said = capsys.readouterr().err
+    assert "movement – ✗" in said
     assert said.count("evenness") == 2
     assert "evenness 8 % ✗" in said
     assert "A shadow." in said

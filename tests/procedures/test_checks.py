@@ -4,8 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
-from procedures.checks import is_dark, is_even, refuse_far_exposure, shows_board, shows_led
-from udccal.arrangements import BoardSpec
+from procedures.checks import is_dark, is_even, refuse_far_exposure, shows_board, shows_led, usual_exposure_s
+from udccal.arrangements import Arrangement, Board, BoardSpec, FlatLight, Led
 from udccal.cameras.protocol import Frame, Region, Settings
 from udccal.errors import CaptureError
 from udccal.rig import load_rig
@@ -88,3 +88,15 @@ def test_an_exposure_that_is_far_off_is_refused(found_s: float, way: str) -> Non
         refuse_far_exposure(near_s, 8e-3)
     with pytest.raises(CaptureError, match=rf"Expected an exposure near 0.008 s.* {way}\. .*milliseconds"):
         refuse_far_exposure(found_s, 8e-3)
+
+
+@pytest.mark.parametrize(
+    "arrangement",
+    [Led(1.0, 2.0, 2e3, 1.0), FlatLight(), Board(SPEC, (0.0, 0.0, 0.0), (0.0, 0.0, 700.0), parallel_to_panel=True)],
+)
+def test_a_usual_exposure_in_milliseconds_is_far_from_usual(arrangement: Arrangement) -> None:
+    usual_s = usual_exposure_s(arrangement)
+    for factor in (0.2, 1.0, 5.0):
+        refuse_far_exposure(factor * usual_s, usual_s)
+        with pytest.raises(CaptureError, match="too long"):
+            refuse_far_exposure(1000 * factor * usual_s, usual_s)

@@ -1,15 +1,21 @@
 from __future__ import annotations
 
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from procedures.led_walk import nearest_phase_px, phase_distance_px
 from procedures.psf import PsfProcedure, field_cells, led_positions_px
-from procedures.readings import find_led, head_room
+from procedures.readings import find_led, head_room, led_change
+from udccal.arrangements import Led
+from udccal.benches.bench import simulated_bench, simulated_rig
 from udccal.cameras.protocol import Frame, Region, Settings
 from udccal.rig import load_rig
+from udccal.sessions.writer import SessionWriter
+from udccal.simulation.hand import Hand
+from udccal.simulation.world import SimulatedWorld
 
 
 @pytest.mark.parametrize("name", ["lg55-aca2040", "lg55-reduced", "mk31-imx1600"])
@@ -59,3 +65,67 @@ def test_head_room_is_bounded_on_both_sides() -> None:
     assert not head_room(0.95, 0.65).ok
     assert not head_room(0.1, 0.65).ok
     assert head_room(0.1, None).ok
+
+
+def diffracted(x_px: float, y_px: float, peak_DN: float, rng: np.random.Generator) -> Frame:
+    """A frame of an LED behind rows that diffract it into a column of narrow lines, as at the edge of the field."""
+    y, x = np.mgrid[:64, :48]
+    lines = sum(
+        light * np.exp(-((y - y_px - off) ** 2) / 0.5)
+        for light, off in ((0.5, -2.9), (1.0, 0.0), (0.9, 2.6), (0.3, 5.1))
+    )
+    signal = peak_DN * lines * np.exp(-((x - x_px) ** 2) / 0.6)
+    signal[::2, ::2] *= 0.4
+    signal[1::2, 1::2] *= 0.5
+    noise = rng.normal(0, 1, signal.shape) * np.sqrt(4.0 + 0.355 * signal)
+    data = np.rint(np.clip(64 + signal + noise, 0, 4095)).astype(np.uint16)
+    return Frame(data, Settings(1e-3, 0.0, Region(100, 200, 48, 64)), 0.0, 0, True)
+
+
+@pytest.mark.parametrize("peak_DN", [800.0, 3000.0])
+def test_an_led_that_rests_is_told_from_one_that_moves_by_a_third_of_a_pixel(peak_DN: float) -> None:
+    rig, rng = load_rig("lg55-aca2040"), np.random.default_rng(1)
+    for x, y in 24 + 2 * rng.random((40, 2)):
+        first = diffracted(x, y, peak_DN, rng)
+        assert all(led_change(first, diffracted(x, y, k * peak_DN, rng), rig).ok for k in (1.0, 1.0, 0.7, 1.2))
+        for right, down in ((0.3, 0.0), (0.0, -0.3), (-0.21, 0.21)):
+            assert not led_change(first, diffracted(x + right, y + down, peak_DN, rng), rig).ok
+        assert not led_change(first, diffracted(x, y, 0.0, rng), rig).ok
+
+
+def test_the_place_of_an_led_at_rest_does_not_jump_between_its_orders() -> None:
+    rig, rng = load_rig("lg55-aca2040"), np.random.default_rng(2)
+    for x, y in 24 + 2 * rng.random((30, 2)):
+        places = np.array([find_led(diffracted(x, y, 800.0, rng), rig).place_px for _ in range(6)])
+        assert np.ptp(places, axis=0).max() < 0.25
+
+
+@pytest.mark.slow
+def test_an_led_at_the_edge_of_a_full_size_field_is_seen_to_rest_and_to_move(tmp_path: Path) -> None:
+    rig = load_rig("lg55-aca2040")
+    world = simulated_rig(rig, seed=0)
+    guided = next(step for step in PsfProcedure().guided(rig) if step.id == "psf/p30")
+    with simulated_bench(world) as bench:
+        writer = SessionWriter.create(tmp_path, rig, bench.camera.identity)
+        visit = guided.begin(bench.camera, bench.display, Hand(world), writer)
+        looks = [visit.look()]
+        while not looks[-1].in_order:
+            looks.append(visit.look())
+            assert len(looks) < 20, looks[-1].sentence
+        for _ in range(8):  # at rest it stays in order
+            look = visit.look()
+            assert look.in_order, look
+        shifted_by_0_3_px(world)
+        look = visit.look()
+        assert look.sentence == "Let the LED rest."
+        assert [reading.name for reading in look.readings if not reading.ok] == ["change of the LED's picture"]
+
+
+def shifted_by_0_3_px(world: SimulatedWorld) -> None:
+    """Arrange the LED anew until its image lies 0.3 px from where it was: aims have errors."""
+    (x, y), rest_px = world.truth_log[-1].asked_px, world.truth_log[-1].image_px
+    for right in np.linspace(0.01, 1.0, 100):
+        world.arrange(Led(x + float(right), y, 2000.0, 1.15))
+        if np.hypot(*np.subtract(world.truth_log[-1].image_px, rest_px)) == pytest.approx(0.3, abs=0.03):
+            return
+    pytest.fail("no aim came near")

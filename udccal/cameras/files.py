@@ -21,6 +21,7 @@ from udccal.errors import CameraError
 
 Source = str | Path | Sequence[str | Path]
 
+FILES: Final = "files"  # the backend by which a session names this camera
 _STEPS: Final = (2, 2, 2, 2)
 
 
@@ -252,7 +253,7 @@ def _name(facts: Facts) -> str:
 def _identity(facts: Facts, path: Path) -> CameraIdentity:
     """Return the camera of a file; all files without one share it, so that a session can continue with other files."""
     model = facts.model or path.suffix.lower().lstrip(".") or "unnamed"
-    return CameraIdentity(facts.vendor or "files", model, facts.serial or "not stated", "files")
+    return CameraIdentity(facts.vendor or "files", model, facts.serial or "not stated", FILES)
 
 
 def _distance(shot: _Shot, settings: Settings) -> tuple[float, float]:

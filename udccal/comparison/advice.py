@@ -3,30 +3,45 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 from udccal.comparison.effects import Effect
 from udccal.comparison.movement import Moved, Movement
 
+if TYPE_CHECKING:
+    from udccal.comparison.diff import TermDiff
 
-def advice(
-    changed: Sequence[tuple[str, Effect]], harmless: Sequence[str], moved: Movement, newer: str, chance: float
-) -> str:
+
+def advice(terms: Sequence[TermDiff], moved: Movement, newer: str, lacking: Sequence[str], chance: float) -> str:
     """Return one sentence.
 
     Args:
-        changed: each term that has changed, with the effect that is farthest beyond its limit.
-        harmless: terms that have changed by less than matters.
+        terms: as compared.
         moved: the movement.
         newer: name of the profile that was made later: A or B.
+        lacking: terms that the newer profile lacks and the other one has.
         chance: probability below which the movement is significant.
     """
-    if changed:
-        reasons = ", ".join(f"{term} ({_said(effect)})" for term, effect in changed)
-        return f"Use {newer}, the newer profile: the other one no longer describes {reasons}{_movement(moved, chance)}."
+    by = {verdict: [one for one in terms if one.verdict == verdict] for verdict in {one.verdict for one in terms}}
+    harmless, unknown = (_names(by.get(verdict, ())) for verdict in ("changed, harmless", "not compared"))
+    left = f"; {unknown} could not be compared" if unknown else ""
+    if changed := by.get("changed"):
+        reasons = ", ".join(f"{one.term} ({_said(one.worst)})" for one in changed)
+        found = f"the other one no longer describes {reasons}{_movement(moved, chance)}{left}."
+        if lacking:
+            return f"Capture {' and '.join(lacking)} for {newer}, the newer profile, then use it: {found}"
+        return f"Use {newer}, the newer profile: {found}"
     if harmless:
-        terms = " and ".join(harmless)
-        return f"Go on with either profile: {terms} changed, too little to matter{_movement(moved, chance)}."
+        return f"Go on with either profile: {harmless} changed, too little to matter{_movement(moved, chance)}{left}."
+    if len(by.get("not compared", ())) == len(terms):
+        return "Capture the terms that a profile lacks: nothing could be compared."
+    if unknown:
+        return f"Capture what a profile lacks: {unknown} could not be compared; the other terms agree."
     return "Go on with either profile: they agree within their error bars."
+
+
+def _names(terms: Sequence[TermDiff]) -> str:
+    return " and ".join(one.term for one in terms)
 
 
 def _said(effect: Effect) -> str:

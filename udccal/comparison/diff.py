@@ -19,10 +19,10 @@ from udccal.comparison.movement import Movement, movement
 from udccal.comparison.picture import picture_loss
 from udccal.fitting.engine.misfit import chi2_tail
 from udccal.profiles.profile import Profile
-from udccal.result import FitResult
+from udccal.result import FitResult, FitStatus
 from udccal.sessions.schema import TermName
 
-Verdict = Literal["same", "changed, harmless", "changed"]
+Verdict = Literal["same", "not compared", "changed, harmless", "changed"]
 # From best to worst.
 VERDICTS: tuple[Verdict, ...] = get_args(Verdict)
 FORMAT, VERSION = "udccal-diff", 1
@@ -86,7 +86,7 @@ class ProfileDiff:
     """Two profiles of one rig compared. docs/diff.md describes each number; ``diff.json`` holds these fields.
 
     Attributes:
-        verdict: the worst of the terms'.
+        verdict: the worst of the terms'; a term that a profile lacks is worse than one that is the same.
         advice: one sentence that says what to do.
         picture_dB_lost: by restoring frames of the one with the other; wire, psf and backscatter together.
         movement: of the camera against the panel, from A to B.
@@ -133,15 +133,16 @@ def compare(a: Profile, b: Profile, limits: DiffLimits) -> tuple[ProfileDiff, Di
     told = [not _same_captures(a.result(term), b.result(term)) for term, _ in found.names]
     moved = movement(found.only(np.array(told, dtype=bool)), a.rig.panel.pitch_mm.value, limits)
     verdict = max((one.verdict for one in terms), key=VERDICTS.index)
-    changed = [(one.term, one.worst) for one in terms if one.verdict == "changed"]
-    harmless = [one.term for one in terms if one.verdict == "changed, harmless"]
-    newer = "A" if a.provenance.created_at > b.provenance.created_at else "B"
+    newer, other = ("B", b), ("A", a)
+    if a.provenance.created_at > b.provenance.created_at:
+        newer, other = other, newer
+    lacking = [term for term in ORDER if _not_captured(newer[1].result(term)) > _not_captured(other[1].result(term))]
     answer = ProfileDiff(
         format=FORMAT,
         version=VERSION,
         rig=a.rig.name,
         verdict=verdict,
-        advice=advice(changed, harmless, moved, newer, limits.chance),
+        advice=advice(terms, moved, newer[0], lacking, limits.chance),
         a=_compared(a),
         b=_compared(b),
         terms=terms,
@@ -177,6 +178,8 @@ def _term(
     if same_captures:
         # Both errors are the same frames': no probability can be told, but what the fits differ by can matter.
         verdict = "changed" if any(effect.harmful for effect in effects) else "same"
+    if any(map(_not_captured, results)):
+        verdict = "not compared"
     columns = zip(found.names, found.units, found.a, found.b, found.values, found.sigma, strict=True)
     return TermDiff(
         term=term,
@@ -192,12 +195,20 @@ def _term(
     )
 
 
+def _not_captured(result: FitResult) -> bool:
+    """Whether nobody looked: what restoration uses of such a term is the rig's description."""
+    return result.status is FitStatus.NOT_CAPTURED
+
+
 def _same_captures(a: FitResult, b: FitResult) -> bool:
     """Whether both are known to be fits of the same files."""
     return a.captures is not None and b.captures is not None and a.captures.sha256 == b.captures.sha256
 
 
 def _notes(results: tuple[FitResult, FitResult], verdict: Verdict, effects: Sequence[Effect]) -> Iterator[str]:
+    without = [name for name, result in zip("AB", results, strict=True) if _not_captured(result)]
+    if without:
+        yield f"This term was not captured for {' and '.join(without)}: whether the rig has changed in it is not known."
     silent = [name for name, result in zip("AB", results, strict=True) if not result.estimates]
     if silent:
         yield f"{' and '.join(silent)}: no number of this term was measured; what restoration uses is compared."

@@ -91,7 +91,7 @@ def check_rig(profile: Profile, session: Session, limits: DriftLimits | None = N
     """
     limits = limits or DriftLimits()
     check_same_rig(profile, session.rig, session.camera)
-    _check_measured(profile)
+    check_measured(profile)
     flat, dark = (session.average(session.step(f"wire/{name}").captures[0]) for name in ("flat", "dark"))
     data = read_wire(session, profile.noise.term, profile.wire.term.geometry)
     if (refused := unusable_flat(data, WireRules())) is not None:
@@ -110,7 +110,12 @@ def check_rig(profile: Profile, session: Session, limits: DriftLimits | None = N
     return _answer(profile, changes, solved, limits), solved
 
 
-def _check_measured(profile: Profile) -> None:
+def check_measured(profile: Profile) -> None:
+    """Refuse a profile that lacks a term which a check compares with.
+
+    Raises:
+        ProfileError: with the names of those that lack.
+    """
     missing = [one.name for one in (profile.noise, profile.wire, profile.backscatter) if one.unfitted]
     if missing:
         raise ProfileError(

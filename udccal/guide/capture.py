@@ -10,7 +10,8 @@ from udccal.cameras.choice import check_camera
 from udccal.guide.events import DoneEvent, Person
 from udccal.guide.lead import Leading
 from udccal.guide.steps import GuidedStep
-from udccal.planning.steps import steps_at, with_small_panel
+from udccal.planned_steps import with_small_panel
+from udccal.planning.steps import steps_at
 from udccal.plugins import find_procedure
 from udccal.rig import RigDescription
 from udccal.sessions.schema import TermName

@@ -27,6 +27,7 @@ class Reading:
     """One number read from the newest frame.
 
     Attributes:
+        value: infinite where it is not known yet, as a movement is before a second look; ``null`` in JSON.
         low, high: bounds in which it is right; None for no bound.
         ok: whether it lies within them; a field, so that programs which read events see it.
     """

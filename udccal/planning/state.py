@@ -20,7 +20,8 @@ from udccal.models.geometry import Geometry
 from udccal.models.noise import Noise, variance_e
 from udccal.models.wire import Wire, wire_values
 from udccal.numerics import in_float64
-from udccal.planning.steps import PANEL_FULL_S, Cost, PlannedStep, steps_at, with_small_panel
+from udccal.planned_steps import with_small_panel
+from udccal.planning.steps import PANEL_FULL_S, Cost, PlannedStep, steps_at
 from udccal.result import FitResult, FitStatus, TermResults
 from udccal.rig import Captures, RigDescription
 from udccal.sessions.schema import TermName

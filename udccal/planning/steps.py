@@ -14,8 +14,6 @@ from udccal.sessions.schema import TermName
 
 # Exposures at which an LED and the panel usually fill the well of their brightest sample.
 _LED_FULL_S, PANEL_FULL_S = 125e-6, 0.1
-# The time of a capture does not depend on the panel's picture: pictures are drawn this small for counting.
-_COUNTING_PX = 8
 
 
 @final
@@ -79,9 +77,3 @@ def steps_at(term: TermName, rig: RigDescription, panel_full_s: float = PANEL_FU
             ) from error
         earlier[step.id] = at
         yield PlannedStep(step.id, step.arrangement, step.instruction, exposures_s, at.level or 0.0, at.test_frames)
-
-
-def with_small_panel(rig: RigDescription) -> RigDescription:
-    """Return a rig with a tiny panel, on which the frames and exposures of its steps do not depend."""
-    panel = rig.panel.model_copy(update={"columns": _COUNTING_PX, "rows": _COUNTING_PX})
-    return rig.model_copy(update={"panel": panel})

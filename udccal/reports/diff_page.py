@@ -18,6 +18,7 @@ from udccal.reports.page import Advice, DiffPage, DiffSection, Fact, Illustratio
 
 _HEADLINES: dict[Verdict, str] = {
     "same": "The profiles agree.",
+    "not compared": "Not all of the profiles could be compared.",
     "changed, harmless": "The profiles differ, but nobody would see it.",
     "changed": "The profiles differ by more than is harmless.",
 }

@@ -68,6 +68,13 @@ def without_corners(view: BoardView) -> BoardView:
     return replace(view, corners=BoardCorners(np.zeros(0, dtype=np.int64), np.zeros((0, 2)), np.zeros(0)))
 
 
+LENS_SIGMA = np.array([5.0, 5.0, 3.0, 3.0, 0.03, 0.02, 1e-3, 1e-3, 0.01])
+
+
+def lens_known() -> Prior:
+    return Prior.independent(np.array([300.0, 300.0, 160.0, 119.0, -0.08, 0.03, 0, 0, 0]), LENS_SIGMA)
+
+
 def fitted_to(found: list[BoardView], prior: Prior | None = None) -> FitResult[Geometry]:
     return fit_boards(GeometryData(tuple(found), START, SIZE, prior))
 
@@ -139,17 +146,27 @@ def test_the_outlier_is_in_the_list_and_residuals_are_in_sigma(fitted: FitResult
 
 
 def test_one_board_on_the_jig_tells_the_tilt_when_the_lens_is_known_beforehand() -> None:
-    sigma = np.array([5.0, 5.0, 3.0, 3.0, 0.03, 0.02, 1e-3, 1e-3, 0.01])
-    prior = Prior.independent(np.array([300.0, 300.0, 160.0, 119.0, -0.08, 0.03, 0, 0, 0]), sigma)
+    prior = lens_known()
     assert fitted_to(views()[:1]).status is FitStatus.TOO_FEW_DATA
     result = fitted_to(views()[:1], prior)
-    assert result.status is FitStatus.CONVERGED
+    assert result.status is FitStatus.TOO_FEW_DATA
+    assert result.usable
+    assert "at least 3 usable views of the board held by hand, found 0" in result.notes[0]
     tilt = result.estimate("tilt_deg")
     assert abs(tilt.value - TILT_DEG) < 4 * tilt.sigma
     assert 0.1 < tilt.sigma < 1.5  # 3 px of the centre are 0.6 degrees
     assert tilt.prior is None
-    assert [e.prior.sigma for e in result.estimates if e.prior] == pytest.approx(sigma.tolist())
+    assert [e.prior.sigma for e in result.estimates if e.prior] == pytest.approx(LENS_SIGMA.tolist())
     assert result.estimate("k3").by_prior  # one board says nothing of it
+
+
+@pytest.mark.parametrize(("by_hand", "status"), [(2, FitStatus.TOO_FEW_DATA), (3, FitStatus.CONVERGED)])
+@pytest.mark.parametrize("seen_too", [0, 2])
+def test_three_boards_held_by_hand_are_needed(by_hand: int, status: FitStatus, seen_too: int) -> None:
+    unseen = [without_corners(view) for view in views()[1 + by_hand :][:seen_too]]
+    result = fitted_to([*views()[: 1 + by_hand], *unseen], lens_known())
+    assert result.status is status
+    assert any(f"held by hand, found {by_hand}" in note for note in result.notes) is (status is not FitStatus.CONVERGED)
 
 
 def test_the_rig_says_what_its_lens_may_be() -> None:

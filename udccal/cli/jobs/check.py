@@ -12,7 +12,7 @@ from udccal.cli.jobs.guided import led_by
 from udccal.cli.jobs.terminal import TerminalPerson
 from udccal.cli.output import Output, plain
 from udccal.compilation import keep_compilations
-from udccal.drift.check import check_rig, short_rig
+from udccal.drift.check import check_measured, check_rig, short_rig
 from udccal.drift.update import updated
 from udccal.io.atomic import write_atomically
 from udccal.io.out_folder import check_writable, storing_in
@@ -38,7 +38,8 @@ def check_profile(
         update: path of a new profile with what changed; None for none.
 
     Raises:
-        ProfileError: when the profile cannot be read, or is not of this rig and camera.
+        ProfileError: when the profile cannot be read, lacks a term that this needs, or is not of this rig and camera;
+            each is found before a capture.
         CaptureError: when the camera does not see what a step needs.
         SessionError: when the captures cannot be stored or read.
         UdccalError: when ``out`` cannot be written to; this is found before any work.
@@ -49,11 +50,13 @@ def check_profile(
         check_replaceable(update)
         check_writable(update.parent)
     profile = load_profile(path)
+    check_measured(profile)
     rig, folder = short_rig(profile.rig), out / "session"
     with storing_in(out):
-        _put_aside(folder, out / "check.json")
+        _put_aside(folder, out / "check.json", out / "check.html")
+    wanted = Wanted(folder, ("wire", "backscatter"), like=profile)
     person = led_by(output, TerminalPerson(output), agree) if options.real else None
-    if not options.capture(output, rig, Wanted(folder, ("wire", "backscatter")), person):
+    if not options.capture(output, rig, wanted, person):
         return None
     with output.stage("comparing"):
         found, solved = check_rig(profile, Session.open(folder))
@@ -71,10 +74,14 @@ def check_profile(
     return found.verdict != "changed"
 
 
-def _put_aside(session: Path, answer: Path) -> None:
-    """Keep the captures of a check that was answered as ``session-before``: a rig of today is not judged by them."""
+def _put_aside(session: Path, answer: Path, page: Path) -> None:
+    """Keep the captures of a check that was answered as ``session-before``: a rig of today is not judged by them.
+
+    The answer goes with its page, which would else stay beside captures that it does not tell of.
+    """
     if answer.exists() and session.is_dir():
         before = session.with_name("session-before")
         shutil.rmtree(before, ignore_errors=True)
         session.rename(before)
-    answer.unlink(missing_ok=True)
+    for file in (page, answer):
+        file.unlink(missing_ok=True)

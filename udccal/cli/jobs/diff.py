@@ -19,7 +19,7 @@ from udccal.reports.page import write_page
 
 
 def diff_profiles(output: Output, a: Path, b: Path, out: Path | None) -> bool:
-    """Print the difference of two profiles; return whether they are the same, or differ by less than matters.
+    """Print the difference of two profiles; return whether all terms are the same, or differ by less than matters.
 
     Args:
         output: shows the tables.
@@ -47,7 +47,7 @@ def diff_profiles(output: Output, a: Path, b: Path, out: Path | None) -> bool:
     if out is not None:
         _write(output, out, found, maps)
     output.result(found)
-    return found.verdict != "changed"
+    return found.verdict in ("same", "changed, harmless") and all(one.verdict != "not compared" for one in found.terms)
 
 
 def _write(output: Output, out: Path, found: ProfileDiff, maps: DifferenceMaps) -> None:

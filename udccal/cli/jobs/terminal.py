@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import queue
 import sys
 import threading
@@ -120,7 +121,8 @@ class TerminalPerson:
 
 
 def _shown(reading: Reading) -> str:
-    return f"{reading.name} {reading.value:.3g} {reading.unit}".rstrip() + (" ✓" if reading.ok else " ✗")
+    known = f"{reading.value:.3g} {reading.unit}".rstrip() if math.isfinite(reading.value) else "–"
+    return f"{reading.name} {known}" + (" ✓" if reading.ok else " ✗")
 
 
 def _left(minutes: float) -> str:

@@ -87,7 +87,8 @@ def fit_boards(data: GeometryData, rules: GeometryRules = USUAL) -> FitResult[Ge
         rules: see ``GeometryRules``.
 
     Returns:
-        the term, with estimates of the intrinsics and of tilt, roll and yaw; the status says what to capture.
+        the term, with estimates of the intrinsics and of tilt, roll and yaw; the status says what to capture. With
+        fewer than 3 views beside the parallel one it is ``TOO_FEW_DATA``: the prior then decides about the lens.
     """
     usable = [view for view in data.views if view.usable(rules)]
     lost, status = tuple(_lost(data.views, rules)), FitStatus.TOO_FEW_DATA
@@ -112,6 +113,12 @@ def fit_boards(data: GeometryData, rules: GeometryRules = USUAL) -> FitResult[Ge
     poor = bundle.rms_px > rules.worst_rms_px and bundle.chi2_dof > rules.worst_chi2_dof
     mounting = "Stand-off and panel position are the rig's nominal ones; the wire fit refines them."
     by_hand = [k for k in range(len(views)) if k not in on_jig]
+    few: tuple[str, ...] = ()
+    if len(by_hand) < rules.least_views:
+        few = (
+            f"Expected at least {rules.least_views} usable views of the board held by hand, found {len(by_hand)}: the "
+            "rig description decides about the lens. Capture more, in varied poses.",
+        )
     scatter = {
         "corner_scatter_beside_noise": scatter_px[0],
         ON_JIG: np.median(scatter_px[1:][on_jig]),
@@ -119,9 +126,9 @@ def fit_boards(data: GeometryData, rules: GeometryRules = USUAL) -> FitResult[Ge
     }
     return replace(
         result,
-        status=FitStatus.POOR_FIT if poor else result.status,
+        status=FitStatus.POOR_FIT if poor else FitStatus.TOO_FEW_DATA if few else result.status,
         diagnostics=(*result.diagnostics, *(Diagnostic(name, float(size), "px") for name, size in scatter.items())),
-        notes=(*lost, *result.notes, *sentences, mounting),
+        notes=(*lost, *few, *result.notes, *sentences, mounting),
         outliers=left_out,
     )
 

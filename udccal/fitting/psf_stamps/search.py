@@ -57,8 +57,8 @@ class Evidence:
         left = place.squares(found.draws(np.random.default_rng(0), self.rules.draws[0]))
         (_, expected), there = place.volume(), place.shifted(found.mode).squares()
         # Fellner and Schall: squares that the prior expects, less those that the data leave open, over those found;
-        # no more than 30 times as much at once, and no more than that of an absent term. Most nodes of a first image are
-        # its dark surroundings; these must not make its prior tighter than the kernel's size, or rings are lost.
+        # no more than 30 times as much at once, and no more than that of an absent term. Most of a first image is
+        # dark; these must not make its prior tighter than the kernel's size, or rings are lost.
         ratio = np.clip(np.maximum(expected - left, 1e-6 * expected) / np.maximum(there, 1e-300), 1 / 30, 30.0)
         most = np.full_like(ratio, ABSENT)
         most[: place.of_images.size].reshape(place.of_images.shape)[:, 0, 0] = 1.0
