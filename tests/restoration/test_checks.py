@@ -16,7 +16,7 @@ import pytest
 from tests.cameras.small_tiff import Shot, write_dng
 from udccal.cli.jobs.explain import Frames, Plans, explain_plan
 from udccal.cli.output import Output
-from udccal.errors import RestorationError
+from udccal.errors import FileFormatError, RestorationError
 from udccal.io.png import write_png16
 from udccal.profiles.profile import Profile
 from udccal.profiles.store import write_profile
@@ -41,7 +41,8 @@ def as_other_programs_call(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def profile_folder(profile: Profile, tmp_path: Path) -> Path:
+def profile_folder(profile: Profile, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setattr("udccal.cli.jobs.explain.keep_compilations", lambda: None)
     write_profile(tmp_path / "profile", replace(profile, psf=replace(profile.psf, status=FitStatus.ABSENT)))
     return tmp_path / "profile"
 
@@ -64,6 +65,13 @@ def test_a_raw_file_of_another_camera_is_refused(
     write_dng(tmp_path / "frame.dng", grey(profile), shot)
     given = Frames([tmp_path / "frame.dng"], profile_folder, None, None)
     with pytest.raises(RestorationError, match=r"frame\.dng: Expected a raw file with the " + message):
+        explain_plan(Output(), given, Plans(Tier.fast, None), None)
+
+
+def test_a_file_of_one_pixel_is_refused(profile_folder: Path, tmp_path: Path) -> None:
+    write_png16(tmp_path / "a.png", np.zeros((1, 1), np.uint16))
+    given = Frames([tmp_path / "a.png"], profile_folder, None, 0.01)
+    with pytest.raises(FileFormatError, match="96 x 64 samples, found 1 x 1"):
         explain_plan(Output(), given, Plans(Tier.fast, None), None)
 
 
