@@ -11,6 +11,7 @@ import subprocess
 import sys
 from itertools import islice
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -148,21 +149,34 @@ def test_a_captured_step_is_captured_again_alone(folder: Path) -> None:
     assert steps(folder) == after
 
 
+def of_term(term: str, status: int, *words: object) -> dict[str, Any]:
+    """Run a command that lists the terms of a profile, and return what it says of one."""
+    command = [sys.executable, "-m", "udccal.cli.main", *map(str, words), "--json"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=280)
+    assert done.returncode == status, done.stderr
+    return next(each for each in json.loads(done.stdout)["terms"] if each["term"] == term)
+
+
 @pytest.mark.slow
 def test_a_step_that_a_fit_can_do_without_is_named_by_fit_report_and_profile(folder: Path) -> None:
     refused(folder)
     said = f"14 of 15 planned steps captured, without {LAST}."
     for words in (["fit", folder / "session", "--profile", folder / "p"], ["profile", "show", folder / "p"]):
-        done = subprocess.run(
-            [sys.executable, "-m", "udccal.cli.main", *map(str, words), "--json"],
-            capture_output=True,
-            text=True,
-            timeout=280,
-        )
-        terms = {term["term"]: term for term in json.loads(done.stdout)["terms"]}
-        assert terms["noise"]["status"] == "CONVERGED"
-        assert said in terms["noise"]["notes"]
+        noise = of_term("noise", 0, *words)
+        assert noise["status"] == "CONVERGED"
+        assert said in noise["notes"]
     assert said in (folder / "p-report.html").read_text(encoding="utf-8")
+
+
+@pytest.mark.slow
+def test_the_board_on_the_jig_alone_does_not_converge(tmp_path: Path) -> None:
+    rig = load_rig(shutil.copytree(RIGS / "lg55-reduced", tmp_path / "toy"))
+    photograph_steps(rig, tmp_path / "pictures", islice(find_procedure("geometry")().steps(rig), 1))
+    assert "the step geometry/view_0" in refused(tmp_path, term="geometry")
+    geometry = of_term("geometry", 3, "fit", tmp_path / "session", "--profile", tmp_path / "p")
+    assert geometry["status"] == "TOO_FEW_DATA"
+    assert any("Expected at least 3 usable views of the board held by hand, found 0" in n for n in geometry["notes"])
+    assert any(n.startswith("1 of 7 planned steps captured, without geometry/view_0") for n in geometry["notes"])
 
 
 def test_steps_that_cannot_be_captured_again_are_refused_and_change_nothing(folder: Path) -> None:
