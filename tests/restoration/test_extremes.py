@@ -183,22 +183,6 @@ def test_cameras_at_their_limits(
     assert restorer.display(frame, exposure_s, Tone(exposure_s / 6000)).dtype == np.uint8
 
 
-@pytest.mark.parametrize("tier", list(Tier))
-def test_frames_of_anything(restorers: dict[Tier, Restorer], tier: Tier) -> None:
-    """Samples, sites, rows, columns and patches at either end of the range, drawn."""
-    restorer, rng = restorers[tier], np.random.default_rng(11)
-    for exposure_s in (1e-9, EXPOSURE_S, 86400.0):
-        frame = rng.integers(0, 4096, (96, 128)).astype(np.uint16)
-        frame[rng.random(frame.shape) < rng.random()] = rng.choice([0, 4095])
-        frame[rng.integers(2) :: 2, rng.integers(2) :: 2] = rng.choice([0, 64, 4095])
-        frame[rng.integers(96, size=9)] = rng.choice([0, 4095])
-        frame[:, rng.integers(128, size=9)] = rng.choice([0, 4095])
-        frame[30 : rng.integers(31, 96), 40 : rng.integers(41, 128)] = rng.choice([0, 4095])
-        assert np.isfinite(restorer.restore(frame, exposure_s)).all()
-        assert np.isfinite(restorer.before(frame, exposure_s)).all()
-        assert restorer.display(frame, exposure_s, Tone(exposure_s / 6000)).shape == (54, 96, 3)
-
-
 def test_a_panel_brighter_than_the_scene(
     restorers: dict[Tier, Restorer], toy_grid: KernelGrid, toy_scene: np.ndarray
 ) -> None:
