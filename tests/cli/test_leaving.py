@@ -26,6 +26,11 @@ def udccal(*words: str | Path) -> subprocess.CompletedProcess[str]:
     return subprocess.run([*COMMAND, *map(str, words)], capture_output=True, text=True, timeout=280)
 
 
+def heeding_ctrl_c() -> None:
+    """In a new process: a shell that runs these tests in the background has them ignore Ctrl-C."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
 def interrupted(words: list[str | Path], sign: Path | None, wait_s: float) -> tuple[int, str, str]:
     """Press Ctrl-C some time after a file is there, or after the start; return status, output and errors."""
     with subprocess.Popen(
@@ -33,8 +38,7 @@ def interrupted(words: list[str | Path], sign: Path | None, wait_s: float) -> tu
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
-        # A shell that runs these tests in the background has them ignore it.
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+        preexec_fn=heeding_ctrl_c,
     ) as process:
         while sign is not None and not sign.exists():
             assert process.poll() is None
@@ -90,7 +94,8 @@ def test_ctrl_c_is_met_wherever_python_is(swallowed: str, tmp_path: Path) -> Non
         "job.show_profile = interrupted\n"
         "main(['profile', 'show', 'anything'])\n"
     )
-    done = subprocess.run([sys.executable, "-m", "program"], cwd=tmp_path, capture_output=True, text=True, timeout=280)
+    command = [sys.executable, "-m", "program"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=280, preexec_fn=heeding_ctrl_c)
     assert done.returncode == 130
     (sentence,) = done.stderr.strip().splitlines()
     assert sentence.startswith("udccal: Stopped.")

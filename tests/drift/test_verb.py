@@ -49,6 +49,7 @@ def test_another_camera_is_refused_before_it_captures(tmp_path: Path) -> None:
     assert not (tmp_path / "out" / "session").exists()
 
 
+@pytest.mark.medium
 def test_a_profile_without_the_terms_is_refused_before_it_captures(tmp_path: Path) -> None:
     whole = load_profile("lg55-reduced")
     lacking = replace(whole, wire=replace(whole.wire, status=FitStatus.NOT_CAPTURED))

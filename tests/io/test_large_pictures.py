@@ -23,6 +23,7 @@ from udccal.io.photograph import read_photograph
 from udccal.io.png import read_png16, write_png16
 from udccal.profiles.arrays import load, read_checked
 from udccal.profiles.schema import StoredArray
+from udccal.profiles.store import load_profile
 from udccal.rig import load_rig
 from udccal.sessions.captured import SingleFrame
 from udccal.sessions.schema import DarkSubject, PanelSubject
@@ -98,8 +99,9 @@ def test_the_picture_is_whole_but_for_its_size(tmp_path: Path, monkeypatch: pyte
 
 
 def test_frames_to_restore(tmp_path: Path) -> None:
-    refused(FileFormatError, lambda: _checked_frame(huge_png(tmp_path / "a.png", 16, 0), 0.01, RIG))
-    refused(FileFormatError, lambda: _checked_frame(huge_png(tmp_path / "b.png", 16, 0, 4096), 0.01, RIG), "4096 x")
+    profile = load_profile("lg55-reduced")
+    refused(FileFormatError, lambda: _checked_frame(huge_png(tmp_path / "a.png", 16, 0), 0.01, profile))
+    refused(FileFormatError, lambda: _checked_frame(huge_png(tmp_path / "b.png", 16, 0, 4096), 0.01, profile), "4096 x")
 
 
 def test_panel_pictures(tmp_path: Path) -> None:
