@@ -24,13 +24,13 @@ from udccal.io.png import read_png16, write_png16
 from udccal.profiles.arrays import load, read_checked
 from udccal.profiles.schema import StoredArray
 from udccal.profiles.store import load_profile
-from udccal.rig import load_rig
 from udccal.sessions.captured import SingleFrame
 from udccal.sessions.schema import DarkSubject, PanelSubject
 from udccal.sessions.store import Session
 from udccal.sessions.writer import SessionWriter
 
-RIG = load_rig("lg55-reduced")
+PROFILE = load_profile("lg55-reduced")
+RIG = PROFILE.rig
 SIDE = 16384
 
 
@@ -99,9 +99,8 @@ def test_the_picture_is_whole_but_for_its_size(tmp_path: Path, monkeypatch: pyte
 
 
 def test_frames_to_restore(tmp_path: Path) -> None:
-    profile = load_profile("lg55-reduced")
-    refused(FileFormatError, lambda: _checked_frame(huge_png(tmp_path / "a.png", 16, 0), 0.01, profile))
-    refused(FileFormatError, lambda: _checked_frame(huge_png(tmp_path / "b.png", 16, 0, 4096), 0.01, profile), "4096 x")
+    refused(FileFormatError, lambda: _checked_frame(huge_png(tmp_path / "a.png", 16, 0), 0.01, PROFILE))
+    refused(FileFormatError, lambda: _checked_frame(huge_png(tmp_path / "b.png", 16, 0, 4096), 0.01, PROFILE), "4096 x")
 
 
 def test_panel_pictures(tmp_path: Path) -> None:
