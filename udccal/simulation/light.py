@@ -31,6 +31,8 @@ _BOARD_BLUR = (8, 129, 65)  # rank, rows, columns
 # Each pattern takes about 50 MB at full size. The psf procedure's shifts of an LED lie within one Bayer cell.
 _KEPT_SPREADS = 4
 _CELL_PX = 2
+# Patterns reach a multiple of this far, so that one serves an LED that is nudged: each takes seconds to compute.
+_REACH_PX = 32
 
 
 @final
@@ -110,7 +112,8 @@ class RigLight:
         x, y = (_CELL_PX * np.floor(v / _CELL_PX) + _CELL_PX / 2 for v in (led.x_px, led.y_px))
         reach_x = max(x - region.x, region.x + region.columns - x)
         reach_y = max(y - region.y, region.y + region.rows - y)
-        return self._spread_at(float(x), float(y), float(reach_x), float(reach_y))
+        reach = (float(_REACH_PX * np.ceil(part / _REACH_PX)) for part in (reach_x, reach_y))
+        return self._spread_at(float(x), float(y), *reach)
 
     def led_disc_px(self, led: Led) -> float:
         """Return the diameter of the LED's image in px."""
