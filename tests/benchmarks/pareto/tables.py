@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from tests.benchmarks.pareto.deconvolution import Deconvolutions, deconv_table
 from tests.benchmarks.pareto.groups import COMPARED, Group
 from tests.benchmarks.pareto.instead import Peer, peer_table
 from tests.benchmarks.pareto.plans import BUDGETS_MS, Plans, bias_dB
@@ -34,6 +35,7 @@ class Measured:
     plans: Plans
     losses: Sequence[Loss]
     peers: Sequence[Peer]
+    deconvolutions: Deconvolutions
     rows: Sequence[Row]
 
 
@@ -54,6 +56,8 @@ def full_table(measured: Measured) -> str:
             precision_table(measured.losses),
             "What a user would take instead, on every fifth of the nineteen, with the best strength for these scenes:",
             peer_table(measured.peers),
+            "Pictures deblurred by given kernels, the work `deconv` of [peers.md](peers.md), in linear light:",
+            deconv_table(measured.deconvolutions),
             "What has a limit:",
             table(list(measured.rows)),
         )
