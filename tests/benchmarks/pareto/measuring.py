@@ -9,6 +9,7 @@ from pathlib import Path
 from tests.benchmarks.full_blur import BLUR_GRID, build_full_blur
 from tests.benchmarks.pareto.clear_camera import without_panel
 from tests.benchmarks.pareto.deconvolution import deconv_rows, deconvolutions_of
+from tests.benchmarks.pareto.edges import edge_rows, edges_of
 from tests.benchmarks.pareto.exponents import growth_rows, growths_of
 from tests.benchmarks.pareto.fine_scenes import fine_scenes
 from tests.benchmarks.pareto.groups import COMPARED, Case, Group, cases_of
@@ -129,6 +130,8 @@ def measured(
     say("others have restored them")
     deconvolutions = deconvolutions_of(peers.works, peers.environments)
     say("given kernels are deconvolved")
+    edges = edges_of()
+    say("extremes are restored")
     camera = profile.rig.camera
     rows = [
         *time_rows(runs, camera.rows * camera.columns),
@@ -141,6 +144,7 @@ def measured(
         *growth_rows(growths),
         *peer_rows(others, runs, [sight.case.shot.name for sight in compared]),
         *deconv_rows(deconvolutions),
+        *edge_rows(edges),
     ]
     return Measured(runs, seen.clear, ready_s, plans, losses, others, deconvolutions, rows)
 
