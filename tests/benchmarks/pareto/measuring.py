@@ -15,6 +15,7 @@ from tests.benchmarks.pareto.fine_scenes import fine_scenes
 from tests.benchmarks.pareto.groups import COMPARED, Case, Group, cases_of
 from tests.benchmarks.pareto.instead import peer_rows, peers_of
 from tests.benchmarks.pareto.judging import gain_rows, loss_rows, order_rows, time_rows
+from tests.benchmarks.pareto.others import others_of
 from tests.benchmarks.pareto.plans import choice_rows, error_rows, plans_of
 from tests.benchmarks.pareto.precision import losses_of
 from tests.benchmarks.pareto.restoring import Setup, TierProcess
@@ -33,6 +34,8 @@ from udccal.tiers import Tier
 
 # Every n-th of the nineteen is restored by others too.
 _PEERS_EVERY = 5
+# Of those, as many by libraries that need minutes for a frame.
+_OTHERS_SCENES = 2
 # In these nothing clips.
 _PRECISION_SCENES = ("Carrots", "kodim05", "kodim15", "mosaic 1")
 
@@ -126,7 +129,8 @@ def measured(
     growths = growths_of(name, seen.usual[0].taken, keep)
     say("growth is measured")
     compared = [sight for sight in seen.usual if sight.case.group is Group.nineteen][::_PEERS_EVERY]
-    others = peers_of(Restorer.from_profile(profile, Tier.fast, keep=keep), compared)
+    fast, few = Restorer.from_profile(profile, Tier.fast, keep=keep), compared[:_OTHERS_SCENES]
+    instead, others = peers_of(fast, compared), others_of(fast, few, peers.environments)
     say("others have restored them")
     deconvolutions = deconvolutions_of(peers.works, peers.environments)
     say("given kernels are deconvolved")
@@ -142,11 +146,12 @@ def measured(
         *error_rows(plans, runs),
         *start_rows(starts),
         *growth_rows(growths),
-        *peer_rows(others, runs, [sight.case.shot.name for sight in compared]),
+        *peer_rows(instead, runs, [sight.case.shot.name for sight in compared]),
+        *peer_rows(others, runs, [sight.case.shot.name for sight in few]),
         *deconv_rows(deconvolutions),
         *edge_rows(edges),
     ]
-    return Measured(runs, seen.clear, ready_s, plans, losses, others, deconvolutions, rows)
+    return Measured(runs, seen.clear, ready_s, plans, losses, [*instead, *others], deconvolutions, rows)
 
 
 def _runs_of(setup: Setup, seen: Seen, sheet: Path) -> tuple[list[Run], float]:
