@@ -29,6 +29,7 @@ from jaxtyping import Complex64, Complex128, Float, Float32, Float64, Int
 from scipy import fft
 
 from udccal.cfa import Site
+from udccal.restoration.eigen import eigen_of_three
 from udccal.restoration.kernel_grid import KernelGrid, centred, interpolated_kernels
 from udccal.restoration.site_planes import joined_planes, plane_spectra
 from udccal.restoration.tiles import TileLayout
@@ -121,7 +122,26 @@ def _tables_of(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     rows, columns = density.shape
     transfer = fft.fft2(np.stack([centred(kernel, rows, columns) for kernel in kernels]))
+    values, vectors = _decomposed(transfer, density, pattern)
+    return (
+        _polyphase(fft.ifft2(density * np.conj(transfer)).real, pattern).astype(np.complex64),
+        vectors.astype(np.complex64),
+        np.maximum(values, 0.0).astype(np.float32),
+    )
+
+
+def _decomposed(
+    transfer: Complex128[np.ndarray, "3 rows columns"], density: Float64[np.ndarray, "rows columns"], pattern: Pattern
+) -> tuple[Float64[np.ndarray, "sites site_rows site_half"], Complex128[np.ndarray, "sites sites site_rows site_half"]]:
+    """Return lambda and V.
+
+    They lie in the order in which they are read: a filter takes half as long again where frequencies do not lie side
+    by side.
+    """
+    rows, columns = density.shape
     half, count, aliases = columns // pattern.columns // 2 + 1, len(pattern.sites), pattern.rows * pattern.columns
+    if aliases == 1 and count == len(COLOURS):
+        return _decomposed_without_aliases(transfer[..., :half], density[:, :half], pattern)
     seen = [
         phase * transfer[site.channel]
         for site, phase in zip(pattern.sites, _phases(rows, columns, pattern), strict=True)
@@ -134,12 +154,19 @@ def _tables_of(
             matrix[..., i, j] = folded * (COLOURS[own.channel, other.channel] / aliases)
             matrix[..., j, i] = np.conj(matrix[..., i, j])
     values, vectors = np.linalg.eigh(matrix)
-    # In the order in which they are read: a filter takes half as long again where frequencies do not lie side by side.
-    return (
-        _polyphase(fft.ifft2(density * np.conj(transfer)).real, pattern).astype(np.complex64),
-        np.conj(np.moveaxis(vectors, (3, 2), (0, 1))).astype(np.complex64, order="C"),
-        np.moveaxis(np.maximum(values, 0.0), 2, 0).astype(np.float32, order="C"),
-    )
+    return np.moveaxis(values, 2, 0).copy(), np.conj(np.moveaxis(vectors, (3, 2), (0, 1))).copy()
+
+
+def _decomposed_without_aliases(
+    transfer: Complex128[np.ndarray, "3 rows half"], density: Float64[np.ndarray, "rows half"], pattern: Pattern
+) -> tuple[Float64[np.ndarray, "3 rows half"], Complex128[np.ndarray, "3 3 rows half"]]:
+    """B = P R P^H with a real matrix R and the transfers' phases P."""
+    seen = transfer[channels_of(pattern)]
+    size = np.abs(seen)
+    phase = np.where(size > 0, seen / np.where(size > 0, size, 1.0), 1.0)
+    colours = COLOURS[np.ix_(channels_of(pattern), channels_of(pattern))]
+    values, vectors = eigen_of_three(density * size[:, None] * size * colours[..., None, None])
+    return values, np.conj(phase) * np.swapaxes(vectors, 0, 1)
 
 
 def _phases(rows: int, columns: int, pattern: Pattern) -> list[Complex128[np.ndarray, "rows columns"]]:
