@@ -7,7 +7,8 @@ import pytest
 
 from udccal.restoration.deblur import THREE_COLOURS
 from udccal.restoration.eigen import eigen_of_three
-from udccal.restoration.mosaic_filter import COLOURS, _decomposed
+from udccal.restoration.kernel_grid import centred
+from udccal.restoration.mosaic_filter import COLOURS, _tables_of
 
 
 def rebuilt(values: np.ndarray, vectors: np.ndarray) -> np.ndarray:
@@ -54,14 +55,18 @@ def test_the_lower_triangle_is_not_read_and_another_matrix_has_other_eigenvalues
 
 def test_tables_without_aliases_hold_the_covariance_of_the_three_colours() -> None:
     rng = np.random.default_rng(1)
-    transfer = rng.normal(size=(3, 6, 8)) + 1j * rng.normal(size=(3, 6, 8))
-    # A frequency that one kernel swallows.
-    transfer[1, 2, 3] = 0
-    density = rng.random((6, 8)) + 0.1
-    values, vectors = _decomposed(transfer, density, THREE_COLOURS)
-    seen = transfer[..., :5]
-    expected = density[:, :5] * seen[:, None] * np.conj(seen) * COLOURS[..., None, None]
+    kernels = rng.random((3, 5, 3))
+    # It swallows a frequency.
+    kernels[1] = 0
+    kernels[1, 1::2, 1] = 0.5
+    density = rng.random((8, 12)) + 0.1
+    matched, vectors, values = _tables_of(kernels, density, THREE_COLOURS)
+    seen, half = np.fft.rfft2([centred(kernel, 8, 12) for kernel in kernels]), density[:, :7]
+    assert np.abs(seen[1]).min() < 1e-12
+    expected = half * seen[:, None] * np.conj(seen) * COLOURS[..., None, None]
+    within = {"rtol": 1e-5, "atol": 1e-6 * float(np.abs(expected).max())}
     found = np.einsum("kiyx,kyx,kjyx->ijyx", np.conj(vectors), values, vectors)
-    np.testing.assert_allclose(found, expected, atol=1e-12)
+    np.testing.assert_allclose(found, expected, **within)
+    np.testing.assert_allclose(matched[0], half * np.conj(seen), **within)
     mirrored = np.einsum("kiyx,kyx,kjyx->ijyx", vectors, values, np.conj(vectors))
-    assert np.abs(mirrored - expected).max() > 0.1
+    assert np.abs(mirrored - expected).max() > 100 * within["atol"]

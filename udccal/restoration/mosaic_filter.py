@@ -120,28 +120,11 @@ def prior_density(rows: int, columns: int) -> Float64[np.ndarray, "rows columns"
 def _tables_of(
     kernels: Float[np.ndarray, "3 ky kx"], density: Float64[np.ndarray, "rows columns"], pattern: Pattern
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    if len(pattern.sites) == len(COLOURS) and pattern.rows == pattern.columns == 1:
+        return _tables_without_aliases(kernels, density, pattern)
     rows, columns = density.shape
     transfer = fft.fft2(np.stack([centred(kernel, rows, columns) for kernel in kernels]))
-    values, vectors = _decomposed(transfer, density, pattern)
-    return (
-        _polyphase(fft.ifft2(density * np.conj(transfer)).real, pattern).astype(np.complex64),
-        vectors.astype(np.complex64),
-        np.maximum(values, 0.0).astype(np.float32),
-    )
-
-
-def _decomposed(
-    transfer: Complex128[np.ndarray, "3 rows columns"], density: Float64[np.ndarray, "rows columns"], pattern: Pattern
-) -> tuple[Float64[np.ndarray, "sites site_rows site_half"], Complex128[np.ndarray, "sites sites site_rows site_half"]]:
-    """Return lambda and V.
-
-    They lie in the order in which they are read: a filter takes half as long again where frequencies do not lie side
-    by side.
-    """
-    rows, columns = density.shape
     half, count, aliases = columns // pattern.columns // 2 + 1, len(pattern.sites), pattern.rows * pattern.columns
-    if aliases == 1 and count == len(COLOURS):
-        return _decomposed_without_aliases(transfer[..., :half], density[:, :half], pattern)
     seen = [
         phase * transfer[site.channel]
         for site, phase in zip(pattern.sites, _phases(rows, columns, pattern), strict=True)
@@ -154,19 +137,30 @@ def _decomposed(
             matrix[..., i, j] = folded * (COLOURS[own.channel, other.channel] / aliases)
             matrix[..., j, i] = np.conj(matrix[..., i, j])
     values, vectors = np.linalg.eigh(matrix)
-    return np.moveaxis(values, 2, 0).copy(), np.conj(np.moveaxis(vectors, (3, 2), (0, 1))).copy()
+    # In the order in which they are read: a filter takes half as long again where frequencies do not lie side by side.
+    return (
+        _polyphase(fft.ifft2(density * np.conj(transfer)).real, pattern).astype(np.complex64),
+        np.conj(np.moveaxis(vectors, (3, 2), (0, 1))).astype(np.complex64, order="C"),
+        np.moveaxis(np.maximum(values, 0.0), 2, 0).astype(np.float32, order="C"),
+    )
 
 
-def _decomposed_without_aliases(
-    transfer: Complex128[np.ndarray, "3 rows half"], density: Float64[np.ndarray, "rows half"], pattern: Pattern
-) -> tuple[Float64[np.ndarray, "3 rows half"], Complex128[np.ndarray, "3 3 rows half"]]:
-    """B = P R P^H with a real matrix R and the transfers' phases P."""
-    seen = transfer[channels_of(pattern)]
-    size = np.abs(seen)
-    phase = np.where(size > 0, seen / np.where(size > 0, size, 1.0), 1.0)
-    colours = COLOURS[np.ix_(channels_of(pattern), channels_of(pattern))]
-    values, vectors = eigen_of_three(density * size[:, None] * size * colours[..., None, None])
-    return values, np.conj(phase) * np.swapaxes(vectors, 0, 1)
+def _tables_without_aliases(
+    kernels: Float[np.ndarray, "3 ky kx"], density: Float64[np.ndarray, "rows columns"], pattern: Pattern
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Of three colours at every pixel: B = P R P^H with a real matrix R and the transfers' phases P."""
+    channels, (rows, columns) = channels_of(pattern), density.shape
+    transfer = fft.rfft2(np.stack([centred(kernels[channel], rows, columns) for channel in channels]))
+    density = density[:, : transfer.shape[2]]
+    size = np.abs(transfer)
+    phase = np.where(size > 0, transfer, 1.0) / np.where(size > 0, size, 1.0)
+    colours = COLOURS[np.ix_(channels, channels)][..., None, None]
+    values, vectors = eigen_of_three(density * size[:, None] * size * colours)
+    return (
+        (density * np.conj(transfer))[None].astype(np.complex64),
+        (np.conj(phase) * np.swapaxes(vectors, 0, 1)).astype(np.complex64),
+        np.maximum(values, 0.0).astype(np.float32),
+    )
 
 
 def _phases(rows: int, columns: int, pattern: Pattern) -> list[Complex128[np.ndarray, "rows columns"]]:
