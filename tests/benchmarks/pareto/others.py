@@ -66,14 +66,14 @@ def others_of(restorer: Restorer, sights: Sequence[Sight], environments: Path) -
 
 def _peer(name: str, other: Other, python: Path, restorer: Restorer, sights: Sequence[Sight]) -> Peer:
     assert restorer.sharpener is not None
-    grid, rows = restorer.sharpener.grid, restorer.sharpener.rows
+    grid, first_row = restorer.sharpener.grid, restorer.rows.start
     pictures = [_given(restorer, sight.taken) for sight in sights]
     most = [float(picture.max()) for picture in pictures]
     with tempfile.TemporaryDirectory() as folder:
         given, result = Path(folder) / "in.npz", Path(folder) / "out.npz"
         scaled = np.stack([picture / np.float32(peak) for picture, peak in zip(pictures, most, strict=True)])
         # Kernels lie on the sensor, pictures begin at the strip's first row.
-        np.savez(given, pictures=scaled, x_px=grid.x_px, y_px=grid.y_px - rows.start, kernels=grid.kernels)
+        np.savez(given, pictures=scaled, x_px=grid.x_px, y_px=grid.y_px - first_row, kernels=grid.kernels)
         command = [str(python), str(_SCRIPT), other.library, str(given), str(result)]
         done = subprocess.run(command, capture_output=True, text=True, timeout=_LIMIT_S, check=False)
         if done.returncode != 0:
@@ -81,7 +81,7 @@ def _peer(name: str, other: Other, python: Path, restorer: Restorer, sights: Seq
             return Peer(name, (math.nan,), math.nan)
         with np.load(result) as stored:
             restored, seconds = stored["restored"], stored["seconds"]
-    rectified = restorer.rectification.from_row(rows.start)
+    rectified = restorer.rectification.from_row(first_row)
 
     def dB(sight: Sight, picture: Rgb, peak: float) -> float:
         light = rectified.apply(np.ascontiguousarray(picture)) * np.float32(peak / sight.taken.exposure_s)

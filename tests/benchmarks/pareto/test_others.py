@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,8 +19,9 @@ from tests.benchmarks.pareto.restoring import Taken
 from tests.benchmarks.pareto.runs import Sight
 from tests.benchmarks.pictures import Shot
 from tests.scenes import toy_restorer
-from tests.scenes.toy_restorer import EXPOSURE_S, NOISE, exposed, made
+from tests.scenes.toy_restorer import EXPOSURE_S, NOISE, exposed, made, taken
 from udccal.arrangements import Photograph
+from udccal.models.geometry import Geometry
 from udccal.restoration.runtime import Restorer
 from udccal.tiers import Tier
 
@@ -50,15 +52,48 @@ def test_an_environment_without_its_library_is_told(
     fast: Restorer, sight: Sight, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for other in OTHERS:
-        python = other.python(tmp_path)
-        python.parent.mkdir(parents=True)
         # That of the tests, which has numpy and neither library.
-        python.write_text(f'#!/bin/sh\nexec "{sys.executable}" "$@"\n', encoding="utf-8")
-        python.chmod(0o755)
+        _write(other.python(tmp_path), f'exec "{sys.executable}" "$@"')
     peers = others_of(fast, [sight], tmp_path)
     assert all(math.isnan(peer.ms) for peer in peers)
     assert not any(row.ok for row in peer_rows(peers, good_runs(), ["a, nineteen"]))
     assert "No module named 'regularizepsf'" in capsys.readouterr().err
+
+
+def test_a_library_that_returns_what_it_is_given_has_it_in_its_place(tmp_path: Path) -> None:
+    """The view needs some rows of a tall sensor only, and so does what a library is given."""
+    toy, geometry, rows = toy_restorer.rig(), toy_restorer.geometry(), 200
+    wide = toy.view.model_copy(update={"rows": 16})
+    rig = toy.model_copy(update={"camera": toy.camera.model_copy(update={"rows": rows}), "view": wide})
+    middle = np.array([geometry.principal_point_px[0], rows / 2])
+    tall = made(
+        Tier.fast, rig, NOISE, Geometry(**{**vars(geometry), "principal_point_px": middle}), toy_restorer.grid()
+    )
+    assert tall.sharpener is not None
+    assert 0 < tall.sharpener.rows.start != tall.rows.start
+    waves = 3000 + 2000 * np.sin(np.arange(rows) / 9)[:, None, None]
+    scene = np.broadcast_to(waves, (rows, toy_restorer.COLUMNS, 3)).astype(np.float32)
+    frame = taken(replace(tall, wire=None), scene[..., 0], seed=1)
+    ideal = tall.rectification.apply(np.ascontiguousarray(scene)) / np.float32(5000)
+    shot = Shot("a", Photograph(EMPTY, 1.0, 1.0), 1.0, EMPTY[..., 0], ideal, 0)
+    own = Sight(Case(Group.nineteen, shot, USUAL), 1.0, Taken(frame, EXPOSURE_S, None), 20.0)
+    echo = (
+        "import sys, numpy as np; given, result = sys.argv[3:]; stored = np.load(given);"
+        "np.savez(result, restored=stored['pictures'][None], seconds=np.ones((1, 1)))"
+    )
+    for other in OTHERS:
+        _write(other.python(tmp_path), f'exec "{sys.executable}" -c "{echo}" "$@"')
+    even = replace(tall, wire=None)
+    assert min(peer.dB[0] for peer in others_of(even, [own], tmp_path)) > 35
+    flipped = replace(own, case=replace(own.case, shot=replace(shot, ideal=np.roll(ideal, 4, axis=0))))
+    assert max(peer.dB[0] for peer in others_of(even, [flipped], tmp_path)) < 30
+
+
+def _write(python: Path, line: str) -> None:
+    """An interpreter that does something else."""
+    python.parent.mkdir(parents=True)
+    python.write_text(f"#!/bin/sh\n{line}\n", encoding="utf-8")
+    python.chmod(0o755)
 
 
 def test_components_and_weights_are_the_kernels() -> None:
