@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from tests.restoration.blur import blurred as exactly_blurred
+from tests.scenes.grid_blur import blurred as exactly_blurred
 from udccal.restoration.blur import blurred
 from udccal.restoration.kernel_grid import KernelGrid
 from udccal.restoration.tiles import layout_for

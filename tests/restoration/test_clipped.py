@@ -7,8 +7,8 @@ from functools import cache
 import numpy as np
 import pytest
 
-from tests.restoration.blur import blurred
-from tests.restoration.toy_restorer import EXPOSURE_S, exposed, made
+from tests.scenes.grid_blur import blurred
+from tests.scenes.toy_restorer import EXPOSURE_S, exposed, made
 from udccal.cfa import PATTERNS
 from udccal.models.geometry import Geometry
 from udccal.models.noise import Noise

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import udccal
-from tests.restoration.blur import blurred
+from tests.scenes.grid_blur import blurred
 from udccal.errors import RestorationError
 from udccal.restoration.deblur import _noise_line
 from udccal.restoration.kernel_grid import KernelGrid

@@ -11,8 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tests.restoration.conftest import COLUMNS, ROWS
-from tests.restoration.toy_restorer import EXPOSURE_S, exposed, made
+from tests.scenes.toy_restorer import COLUMNS, EXPOSURE_S, ROWS, exposed, made
 from udccal.cfa import cfa_named
 from udccal.errors import RestorationError
 from udccal.fitting.nominal import nominal_geometry

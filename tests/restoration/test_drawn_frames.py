@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.restoration.toy_restorer import made
+from tests.scenes.toy_restorer import made
 from udccal.cfa import cfa_named
 from udccal.models.geometry import Geometry
 from udccal.models.noise import Noise

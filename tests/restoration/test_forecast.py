@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.restoration.toy_restorer import EXPOSURE_S, exposed, made
+from tests.scenes.toy_restorer import EXPOSURE_S, exposed, made
 from udccal.models.geometry import Geometry
 from udccal.models.noise import Noise
 from udccal.restoration.forecast import ExpectedError, expected_error

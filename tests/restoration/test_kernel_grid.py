@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tests.restoration.blur import blurred
+from tests.scenes.grid_blur import blurred
 from udccal.restoration.kernel_grid import KernelGrid, interpolated_kernels
 
 

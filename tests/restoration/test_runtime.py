@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.restoration.toy_restorer import EXPOSURE_S, exposed, made
+from tests.scenes.toy_restorer import EXPOSURE_S, exposed, made
 from udccal.cfa import cfa_named
 from udccal.errors import RestorationError
 from udccal.models.geometry import Geometry

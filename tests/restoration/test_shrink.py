@@ -45,6 +45,12 @@ def test_the_bands_sum_to_the_plane() -> None:
     np.testing.assert_allclose(sum(bands) + smooth, plane, atol=1e-6)
 
 
+def test_noise_at_some_strengths_is_that_at_all(layout: TileLayout, tables: FilterTables, noise: BandNoise) -> None:
+    some = measured_noise(tables, layout, CFA, 1, STRENGTHS[[3, 14]])
+    np.testing.assert_array_equal(some.variance[:, [3, 14]], noise.variance[:, [3, 14]])
+    assert some.variance[:, 4].max() == 0.0 < noise.variance[:, 4].min()
+
+
 def test_noise_alone_is_taken_out(layout: TileLayout, tables: FilterTables, noise: BandNoise) -> None:
     mosaic = np.random.default_rng(1).normal(500, 20, (160, 224)).astype(np.float32)
     before, after = restored(mosaic, 256.0, layout, tables, noise, 20.0)

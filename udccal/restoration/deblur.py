@@ -103,7 +103,7 @@ def deblur(
     chosen, strengths = filtered_and_joined(tiles, *given)
     if tier is Tier.fast:
         return chosen * np.float32(unit)
-    bands = measured_noise(tables, layout, THREE_COLOURS, workers).of_tiles(strengths)
+    bands = measured_noise(tables, layout, THREE_COLOURS, workers, np.unique(strengths)).of_tiles(strengths)
     local = (read + slope * np.maximum(cv2.blur(light.mean(axis=2), (16, 16)), 0)).astype(np.float32)
     balanced = shrunk(chosen, noise, local, bands, layout, workers)
     if tier is Tier.balanced:

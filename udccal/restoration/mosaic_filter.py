@@ -29,6 +29,7 @@ from jaxtyping import Complex64, Complex128, Float, Float32, Float64, Int
 from scipy import fft
 
 from udccal.cfa import Site
+from udccal.restoration.eigen import eigen_of_three
 from udccal.restoration.kernel_grid import KernelGrid, centred, interpolated_kernels
 from udccal.restoration.site_planes import joined_planes, plane_spectra
 from udccal.restoration.tiles import TileLayout
@@ -119,6 +120,8 @@ def prior_density(rows: int, columns: int) -> Float64[np.ndarray, "rows columns"
 def _tables_of(
     kernels: Float[np.ndarray, "3 ky kx"], density: Float64[np.ndarray, "rows columns"], pattern: Pattern
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    if len(pattern.sites) == len(COLOURS) and pattern.rows == pattern.columns == 1:
+        return _tables_without_aliases(kernels, density, pattern)
     rows, columns = density.shape
     transfer = fft.fft2(np.stack([centred(kernel, rows, columns) for kernel in kernels]))
     half, count, aliases = columns // pattern.columns // 2 + 1, len(pattern.sites), pattern.rows * pattern.columns
@@ -139,6 +142,24 @@ def _tables_of(
         _polyphase(fft.ifft2(density * np.conj(transfer)).real, pattern).astype(np.complex64),
         np.conj(np.moveaxis(vectors, (3, 2), (0, 1))).astype(np.complex64, order="C"),
         np.moveaxis(np.maximum(values, 0.0), 2, 0).astype(np.float32, order="C"),
+    )
+
+
+def _tables_without_aliases(
+    kernels: Float[np.ndarray, "3 ky kx"], density: Float64[np.ndarray, "rows columns"], pattern: Pattern
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Of three colours at every pixel: B = P R P^H with a real matrix R and the transfers' phases P."""
+    channels, (rows, columns) = channels_of(pattern), density.shape
+    transfer = fft.rfft2(np.stack([centred(kernels[channel], rows, columns) for channel in channels]))
+    density = density[:, : transfer.shape[2]]
+    size = np.abs(transfer)
+    phase = np.where(size > 0, transfer, 1.0) / np.where(size > 0, size, 1.0)
+    colours = COLOURS[np.ix_(channels, channels)][..., None, None]
+    values, vectors = eigen_of_three(density * size[:, None] * size * colours)
+    return (
+        (density * np.conj(transfer))[None].astype(np.complex64),
+        (np.conj(phase) * np.swapaxes(vectors, 0, 1)).astype(np.complex64),
+        np.maximum(values, 0.0).astype(np.float32),
     )
 
 

@@ -57,32 +57,41 @@ class BandNoise:
         return self.variance[self.probe, np.searchsorted(STRENGTHS, strengths)]
 
 
-def measured_noise(tables: FilterTables, layout: TileLayout, pattern: Pattern, workers: int) -> BandNoise:
-    """Filter noise at every strength of the prior, and measure what is left of it in each band.
+def measured_noise(
+    tables: FilterTables,
+    layout: TileLayout,
+    pattern: Pattern,
+    workers: int,
+    strengths: Float32[np.ndarray, " strengths"] = STRENGTHS,
+) -> BandNoise:
+    """Filter noise at strengths of the prior, and measure what is left of it in each band.
 
     Args:
         tables: of the tiles.
         layout: of the tiles.
         pattern: the colour pattern.
         workers: threads.
+        strengths: some of ``STRENGTHS``, ascending; at the others nothing is measured, and the variance is 0.
     """
     down, across = len(layout.tops), len(layout.lefts)
     rows, columns = _probes(down), _probes(across)
     nearest_row = rows[np.abs(np.arange(down)[:, None] - rows).argmin(axis=1)]
     nearest_column = columns[np.abs(np.arange(across)[:, None] - columns).argmin(axis=1)]
     chosen, probe = np.unique(nearest_row[:, None] * across + nearest_column, return_inverse=True)
-    repeated = np.repeat(chosen, len(STRENGTHS))
+    repeated = np.repeat(chosen, len(strengths))
     # Sites that share a place have samples of their own.
     colours = len(pattern.sites) // (pattern.rows * pattern.columns)
     shape = (len(chosen), *(() if colours == 1 else (colours,)), layout.rows, layout.columns)
     noise = np.random.default_rng(0x5EED).standard_normal(shape, dtype=np.float32)
-    tiles = np.repeat(noise, len(STRENGTHS), axis=0)
+    tiles = np.repeat(noise, len(strengths), axis=0)
     unit = np.ones((len(tiles), 3), dtype=np.float32)
-    pictures, _ = filtered(tiles, unit, tables.at(repeated), layout, pattern, workers, np.tile(STRENGTHS, len(chosen)))
+    pictures, _ = filtered(tiles, unit, tables.at(repeated), layout, pattern, workers, np.tile(strengths, len(chosen)))
     inner = slice(TAPER_PX + BLEND_PX, -TAPER_PX - BLEND_PX)
     with ThreadPoolExecutor(workers) as pool:
         parts = list(pool.map(lambda picture: _band_variances(picture[inner, inner]), pictures))
-    return BandNoise(np.stack(parts).reshape(len(chosen), len(STRENGTHS), 3, LEVELS, BANDS), probe.reshape(-1))
+    variance = np.zeros((len(chosen), len(STRENGTHS), 3, LEVELS, BANDS), dtype=np.float32)
+    variance[:, np.searchsorted(STRENGTHS, strengths)] = np.stack(parts).reshape(len(chosen), -1, 3, LEVELS, BANDS)
+    return BandNoise(variance, probe.reshape(-1))
 
 
 def _probes(count: int) -> Int[np.ndarray, " probes"]:

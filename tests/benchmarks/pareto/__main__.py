@@ -1,12 +1,14 @@
 """`make pareto`: every tier of restoration on many scenes: dB, SSIM, FLIP, time, memory, and what is planned.
 
     python -m tests.benchmarks.pareto [--out DIR] [--rig NAME] [--profile PROFILE] [--seed N] [--every N] [--device gpu]
+                                      [--peers DIR] [--environments DIR]
 
 The profile is that of the simulated rig's specimen ``--seed``. Writes DIR/pareto.csv, a line per run; DIR/pareto.json,
 the numbers that have a limit; DIR/pareto.svg; DIR/TIER.png, pictures to look at; and DIR/pareto.md, all tables. A run
 of all scenes also puts the tables into docs/restoration.md, docs/tiers.md and README.md where these have markers for
 the rig. Exits with 1 where a number misses its limit. Nothing else should run meanwhile. With ``--device gpu``, the
-tiers on a GPU are measured instead (``tests.benchmarks.device``).
+tiers on a GPU are measured instead (``tests.benchmarks.device``). Others' programs run in environments that ``make
+peers`` makes; rows of those that are absent say so.
 """
 
 from __future__ import annotations
@@ -21,7 +23,7 @@ from tests.benchmarks import device
 from tests.benchmarks.pareto.choices import traded, traded_table
 from tests.benchmarks.pareto.drawing import draw
 from tests.benchmarks.pareto.groups import Group
-from tests.benchmarks.pareto.measuring import kept_of, measured, seen_by
+from tests.benchmarks.pareto.measuring import PeerFolders, kept_of, measured, seen_by
 from tests.benchmarks.pareto.runs import write_csv
 from tests.benchmarks.pareto.tables import Measured, compact_table, full_table
 from tests.benchmarks.readme_tables import has_table, put_table
@@ -50,12 +52,13 @@ def main() -> int:
     def say(what: str) -> None:
         print(f"{(time.monotonic() - start) / 60:5.1f} min: {what}", flush=True)
 
+    peers = PeerFolders(options.peers, options.environments)
     name = options.profile or options.rig
     profile = load_profile(name)
     seen = seen_by(draw_truth(load_rig(options.rig), options.seed), profile, data, options.every)
     say(f"{len(seen.sights)} frames are taken")
     with tempfile.TemporaryDirectory() as folder:
-        found = measured(name, profile, seen, options.out, Path(folder), say)
+        found = measured(name, profile, seen, options.out, Path(folder), peers, say)
         some = [sight for sight in seen.usual if sight.case.group is Group.nineteen][::_CHOICES_EVERY]
         choices = traded_table(traded(name, some, found.runs, kept_of(Path(folder))))
         say("choices are traded")
@@ -91,6 +94,8 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--profile", help="its profile; by default the one that ships with the rig")
     parser.add_argument("--seed", type=int, default=0, help="specimen of the simulated rig")
     parser.add_argument("--every", type=int, default=1, help="use each n-th scene only")
+    parser.add_argument("--peers", type=Path, default=_ROOT.parent / "shared" / "peers", help="folder of works.py")
+    parser.add_argument("--environments", type=Path, default=Path(tempfile.gettempdir()) / "peers")
     parser.add_argument(
         "--device", choices=("cpu", "gpu"), default="cpu", help="gpu: measure the tiers on a GPU instead"
     )

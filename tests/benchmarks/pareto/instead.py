@@ -50,7 +50,7 @@ class Instead:
 
 @dataclass(frozen=True)
 class Peer:
-    """What a way gives: dB of each scene, and its median time.
+    """What a way gives: dB of each scene, and its median time; no scenes where it was not run.
 
     Attributes:
         name: of the way.
@@ -95,7 +95,7 @@ def peers_of(restorer: Restorer, sights: Sequence[Sight]) -> list[Peer]:
 
 
 def peer_rows(peers: Iterable[Peer], runs: Sequence[Run], scenes: Iterable[str]) -> list[Row]:
-    """For every peer: how many dB the best tier that is no slower gains on it.
+    """For every peer: how many dB the best tier that is no slower gains on it; one that was not run has lost nothing.
 
     Args:
         peers: measured on some scenes of the nineteen.
@@ -106,6 +106,9 @@ def peer_rows(peers: Iterable[Peer], runs: Sequence[Run], scenes: Iterable[str])
     of_tier = {tier: [run for run in of_group(runs, Group.nineteen, tier) if run.scene in some] for tier in Tier}
     rows = []
     for peer in peers:
+        if not peer.dB:
+            rows.append(Row(f"'{peer.name}' was not run", float("nan"), 0.0, "dB", True))
+            continue
         quicker = [own for own in of_tier.values() if statistics.median(run.ms for run in own) <= peer.ms]
         gain = max((mean_dB(own) for own in quicker), default=-np.inf) - float(np.mean(peer.dB))
         rows.append(at_least(f"a tier no slower than '{peer.name}' is better by", gain, 0.0, "dB"))
@@ -115,7 +118,9 @@ def peer_rows(peers: Iterable[Peer], runs: Sequence[Run], scenes: Iterable[str])
 def peer_table(peers: Iterable[Peer]) -> str:
     """As Markdown."""
     lines = ["| instead | dB | worst scene | ms |", "| --- | ---: | ---: | ---: |"]
-    lines += [f"| {peer.name} | {np.mean(peer.dB):.2f} | {min(peer.dB):.2f} | {peer.ms:.0f} |" for peer in peers]
+    for peer in peers:
+        numbers = f"{np.mean(peer.dB):.2f} | {min(peer.dB):.2f} | {peer.ms:.0f}" if peer.dB else "not run | | "
+        lines.append(f"| {peer.name} | {numbers} |")
     return "\n".join(lines)
 
 
@@ -124,11 +129,11 @@ def _divided(restorer: Restorer, taken: Taken) -> Rgb:
     signal = to_electrons(taken.frame[restorer.rows], restorer.noise, taken.exposure_s)
     if restorer.wire is not None:
         signal /= restorer.wire
-    picture = _demosaiced(signal, restorer.rig.camera.cfa) / np.float32(taken.exposure_s)
+    picture = demosaiced(signal, restorer.rig.camera.cfa) / np.float32(taken.exposure_s)
     return restorer.rectification.from_row(restorer.rows.start).apply(picture)
 
 
-def _demosaiced(signal: Plane, cfa: str) -> Rgb:
+def demosaiced(signal: Plane, cfa: str) -> Rgb:
     """By OpenCV in 16 bits; its edge-aware way leaves the outermost samples black, so there are more of them."""
     most = max(float(signal.max()), 1.0)
     codes = np.clip(signal * (65535 / most), 0, 65535).astype(np.uint16)
@@ -166,7 +171,7 @@ def _by_tiles(deblur: Callable[[Plane, Plane], Plane]) -> Callable[[Restorer, Ta
         layout = restorer.sharpener.layout
         signal = restorer.scene_light(taken.frame, taken.exposure_s, taken.panel_picture).signal_e
         most = float(signal.max())
-        planes = cv2.split(_demosaiced(signal, restorer.rig.camera.cfa) / np.float32(most))
+        planes = cv2.split(demosaiced(signal, restorer.rig.camera.cfa) / np.float32(most))
         kernels = interpolated_kernels(restorer.sharpener.grid, layout.centres_px)
         tiles = np.empty((layout.count, layout.rows, layout.columns, len(planes)), dtype=np.float32)
         for colour, plane in enumerate(planes):

@@ -8,11 +8,14 @@ from pathlib import Path
 
 from tests.benchmarks.full_blur import BLUR_GRID, build_full_blur
 from tests.benchmarks.pareto.clear_camera import without_panel
+from tests.benchmarks.pareto.deconvolution import deconv_rows, deconvolutions_of
+from tests.benchmarks.pareto.edges import edge_rows, edges_of
 from tests.benchmarks.pareto.exponents import growth_rows, growths_of
 from tests.benchmarks.pareto.fine_scenes import fine_scenes
 from tests.benchmarks.pareto.groups import COMPARED, Case, Group, cases_of
 from tests.benchmarks.pareto.instead import peer_rows, peers_of
 from tests.benchmarks.pareto.judging import gain_rows, loss_rows, order_rows, time_rows
+from tests.benchmarks.pareto.others import others_of
 from tests.benchmarks.pareto.plans import choice_rows, error_rows, plans_of
 from tests.benchmarks.pareto.precision import losses_of
 from tests.benchmarks.pareto.restoring import Setup, TierProcess
@@ -31,8 +34,23 @@ from udccal.tiers import Tier
 
 # Every n-th of the nineteen is restored by others too.
 _PEERS_EVERY = 5
+# Of those, as many by libraries that need minutes for a frame.
+_OTHERS_SCENES = 2
 # In these nothing clips.
 _PRECISION_SCENES = ("Carrots", "kodim05", "kodim15", "mosaic 1")
+
+
+@dataclass(frozen=True)
+class PeerFolders:
+    """Where others' programs are.
+
+    Attributes:
+        works: folder of works.py and of the peers' scripts.
+        environments: of the peers' environments, each of which may be absent.
+    """
+
+    works: Path
+    environments: Path
 
 
 @dataclass(frozen=True)
@@ -80,7 +98,9 @@ def kept_of(folder: Path) -> Path:
     return folder / Tier.accurate
 
 
-def measured(name: str, profile: Profile, seen: Seen, out: Path, folder: Path, say: Callable[[str], None]) -> Measured:
+def measured(
+    name: str, profile: Profile, seen: Seen, out: Path, folder: Path, peers: PeerFolders, say: Callable[[str], None]
+) -> Measured:
     """Measure everything but what choices trade.
 
     Args:
@@ -89,6 +109,7 @@ def measured(name: str, profile: Profile, seen: Seen, out: Path, folder: Path, s
         seen: what the camera took.
         out: folder for the sheets of pictures.
         folder: for a folder of prepared arrays per tier, empty at first: each tier prepares all that it needs.
+        peers: where others are.
         say: tells a person how far it is.
     """
     runs, ready_s = list[Run](), dict[Tier, float]()
@@ -108,8 +129,13 @@ def measured(name: str, profile: Profile, seen: Seen, out: Path, folder: Path, s
     growths = growths_of(name, seen.usual[0].taken, keep)
     say("growth is measured")
     compared = [sight for sight in seen.usual if sight.case.group is Group.nineteen][::_PEERS_EVERY]
-    peers = peers_of(Restorer.from_profile(profile, Tier.fast, keep=keep), compared)
+    fast, few = Restorer.from_profile(profile, Tier.fast, keep=keep), compared[:_OTHERS_SCENES]
+    instead, others = peers_of(fast, compared), others_of(fast, few, peers.environments)
     say("others have restored them")
+    deconvolutions = deconvolutions_of(peers.works, peers.environments)
+    say("given kernels are deconvolved")
+    edges = edges_of()
+    say("extremes are restored")
     camera = profile.rig.camera
     rows = [
         *time_rows(runs, camera.rows * camera.columns),
@@ -120,9 +146,12 @@ def measured(name: str, profile: Profile, seen: Seen, out: Path, folder: Path, s
         *error_rows(plans, runs),
         *start_rows(starts),
         *growth_rows(growths),
-        *peer_rows(peers, runs, [sight.case.shot.name for sight in compared]),
+        *peer_rows(instead, runs, [sight.case.shot.name for sight in compared]),
+        *peer_rows(others, runs, [sight.case.shot.name for sight in few]),
+        *deconv_rows(deconvolutions),
+        *edge_rows(edges),
     ]
-    return Measured(runs, seen.clear, ready_s, plans, losses, peers, rows)
+    return Measured(runs, seen.clear, ready_s, plans, losses, [*instead, *others], deconvolutions, rows)
 
 
 def _runs_of(setup: Setup, seen: Seen, sheet: Path) -> tuple[list[Run], float]:

@@ -6,6 +6,7 @@ import csv
 from collections.abc import Iterable
 from dataclasses import astuple, dataclass, fields
 from pathlib import Path
+from typing import Final
 
 import flip_evaluator
 import numpy as np
@@ -17,6 +18,9 @@ from tests.benchmarks.pictures import PictureBench, Rgb, displayed
 from udccal.restoration.metrics import encode_srgb, psnr, ssim
 from udccal.tiers import Tier
 
+# Of the panel's weakest transfer, in cycles/px down the columns.
+_BAND: Final = (0.18, 0.30)
+
 
 @dataclass(frozen=True)
 class Run:
@@ -25,6 +29,7 @@ class Run:
     Attributes:
         group, tier, scene, condition: what was restored, and how.
         before_dB, after_dB: PSNR of the display-encoded picture.
+        band_percent: error in the band that the panel swallows (``band_percent``), 0 at best.
         ssim: structural similarity, 1 at best. flip: mean FLIP error, 0 at best.
         ms, cpu_ms: time from a raw frame to a picture of 8 bits.
         peak_MiB: peak resident memory of the process during the run.
@@ -36,6 +41,7 @@ class Run:
     condition: str
     before_dB: float
     after_dB: float
+    band_percent: float
     ssim: float
     flip: float
     ms: float
@@ -80,6 +86,7 @@ class Sight:
             condition=case.conditions.name,
             before_dB=self.before_dB,
             after_dB=psnr(picture, truth),
+            band_percent=band_percent(picture, truth),
             ssim=ssim(picture, truth),
             flip=flip(picture, truth),
             ms=cost.ms,
@@ -102,6 +109,24 @@ def flip(picture: Rgb, truth: Rgb) -> float:
     Source: Andersson et al., "FLIP: a difference evaluator for alternating images", 2020.
     """
     return float(flip_evaluator.evaluate(truth, np.ascontiguousarray(picture), "LDR", applyMagma=False)[1])
+
+
+def band_percent(picture: Rgb, truth: Rgb) -> float:
+    """RMS of the error between 0.18 and 0.30 cycles/px down the columns, in percent of the RMS of the true picture.
+
+    The panel swallows this band. Too weak a prior draws fine horizontal lines there, which cost few dB.
+
+    Args:
+        picture: display-encoded, as for PSNR. truth: what it should be.
+    """
+    rows = len(truth)
+    window = np.hanning(rows + 2)[1:-1, None, None]
+    spectrum = np.fft.rfft((picture.astype(np.float64) - truth) * window, axis=0)
+    frequency = np.fft.rfftfreq(rows)
+    band = (frequency >= _BAND[0]) & (frequency <= _BAND[1])
+    # Parseval: the other half of the spectrum has as much.
+    energy = 2 * float(np.mean(np.sum(np.abs(spectrum[band]) ** 2, axis=0))) / (rows * float(np.sum(window**2)))
+    return 100 * float(np.sqrt(energy / np.mean(truth.astype(np.float64) ** 2)))
 
 
 def of_group(runs: Iterable[Run], group: Group, tier: Tier) -> list[Run]:

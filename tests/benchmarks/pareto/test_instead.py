@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.benchmarks.pareto.instead import Peer, _dehazed, _demosaiced, _richardson_lucy, _wiener, peer_rows
+from tests.benchmarks.pareto.instead import Peer, _dehazed, _richardson_lucy, _wiener, demosaiced, peer_rows
 from tests.benchmarks.pareto.made_runs import DB, MS, good_runs
 from udccal.cfa import cfa_named
 from udccal.tiers import Tier
@@ -59,7 +59,7 @@ def test_deblurring_of_others_sharpens() -> None:
 def test_even_colours_are_demosaiced_and_haze_is_taken_off() -> None:
     colours = np.array([800.0, 2000.0, 400.0], np.float32)
     for cfa in ("RGGB", "GRBG"):
-        picture = _demosaiced(colours[cfa_named(cfa).channel_map(32, 40)], cfa)
+        picture = demosaiced(colours[cfa_named(cfa).channel_map(32, 40)], cfa)
         np.testing.assert_allclose(picture, np.broadcast_to(colours, picture.shape), rtol=1e-3)
     scene = np.full((120, 160, 3), 0.02, np.float32)
     scene[40:80, 60:100] = (0.6, 0.1, 0.05)

@@ -13,7 +13,7 @@ from tests.benchmarks.pareto.drawing import draw
 from tests.benchmarks.pareto.fine_scenes import bands_of, mosaic_of
 from tests.benchmarks.pareto.groups import Group, cases_of
 from tests.benchmarks.pareto.made_runs import DB, good_runs, made
-from tests.benchmarks.pareto.runs import Clear, flip, mean_dB, median_ms, of_group, write_csv
+from tests.benchmarks.pareto.runs import Clear, band_percent, flip, mean_dB, median_ms, of_group, write_csv
 from tests.benchmarks.pareto.sheets import busiest_part, shown_part, write_sheet
 from tests.benchmarks.pareto.tables import clear_dB, groups_table
 from tests.benchmarks.pictures import Shot
@@ -79,6 +79,17 @@ def test_flip_tells_a_spoilt_picture_from_a_good_one() -> None:
     assert flip(green, truth) > 0.1
 
 
+@pytest.mark.parametrize(("cycles_per_px", "seen"), [(0.24, 1.0), (0.19, 1.0), (0.12, 0.0), (0.36, 0.0)])
+def test_lines_in_the_band_that_the_panel_swallows_are_told_by_their_size(cycles_per_px: float, seen: float) -> None:
+    truth = np.full((250, 40, 3), 0.5, np.float32)
+    lines = (0.01 * np.sin(2 * np.pi * cycles_per_px * np.arange(250))).astype(np.float32)
+    expected = pytest.approx(100 * seen * 0.01 / np.sqrt(2) / 0.5, rel=0.02, abs=0.01)
+    assert band_percent(truth + lines[:, None, None], truth) == expected
+    across = np.broadcast_to(lines[:40, None], truth.shape)
+    assert band_percent(truth + across, truth) == pytest.approx(0.0, abs=0.01)
+    assert band_percent(truth, truth) == 0.0
+
+
 def test_means_of_a_group_leave_the_others_out() -> None:
     runs = [*good_runs(), made(Group.dark, Tier.fast, "cellar", dB=5.0)]
     assert mean_dB(of_group(runs, Group.nineteen, Tier.fast)) == DB[Tier.fast]
@@ -105,7 +116,7 @@ def test_tables_and_drawings_show_every_group(tmp_path: Path) -> None:
     assert clear_dB(clear, Group.nineteen) == 39.0
     lines = groups_table(runs, clear).splitlines()
     assert len(lines) == 2 + len(Group)
-    assert lines[2].endswith("| 2 | 20.00 | 25.00 | 31.00 | 33.00 | 34.00 | 39.00 |")
+    assert lines[2].endswith("| 2 | 20.00 | 25.00 | 31.00 | 33.00 | 34.00 | 39.00 | 2.50, 2.50, 2.50, 2.50 |")
     draw(runs, clear, "a title", tmp_path / "pareto.svg")
     drawing = (tmp_path / "pareto.svg").read_text(encoding="utf-8")
     assert drawing.startswith("<?xml")

@@ -34,6 +34,8 @@ class Peer:
     script: str
 
 
+# Their arguments are those that the works' own run gives them.
+SCICO = Peer("deconv", "scico", "deconv_scico.py sv 12 30 2e-4")
 PEERS = (
     Peer("noise", "classic", "noise_floor.py --eff"),
     Peer("noise", "classic", "noise_floor.py --nonlin"),
@@ -50,9 +52,9 @@ PEERS = (
     Peer("deconv", "classic", "deconv_tiles.py wiener"),
     Peer("deconv", "classic", "deconv_tiles.py skwiener"),
     Peer("deconv", "classic", "deconv_tiles.py skrl"),
-    Peer("deconv", "regpsf", "deconv_regularizepsf.py"),
-    Peer("deconv", "scico", "deconv_scico.py sv"),
-    Peer("deconv", "torch", "deconv_deepinv.py"),
+    Peer("deconv", "regpsf", "deconv_regularizepsf.py 256 4"),
+    SCICO,
+    Peer("deconv", "torch", "deconv_deepinv.py 12 10 2e-4"),
     Peer("intrinsics", "classic", "intrinsics_opencv.py"),
     Peer("intrinsics", None, "intrinsics_mrcal.py"),
 )
@@ -60,7 +62,7 @@ OURS = {
     "noise": ("ours_noise --small 20", "ours_noise --variant nonlin --seeds 0"),
     "hdr": ("ours_hdr",),
     "psf_field": ("ours_psf_field",),
-    "deconv": ("ours_deconv",),
+    "deconv": ("ours_deconv --tier fast", "ours_deconv", "ours_deconv --tier accurate"),
     "intrinsics": ("ours_intrinsics --starts 1000 --covered 200",),
 }
 
@@ -76,11 +78,7 @@ def main() -> None:
     options = parser.parse_args()
     works = tuple(options.works) or tuple(OURS)
     options.out.mkdir(parents=True, exist_ok=True)
-    environment = {
-        **os.environ,
-        "PEERS_VENVS": str(options.environments),
-        "PEERS_OUT": os.environ.get("PEERS_OUT", str(options.environments / "data")),
-    }
+    environment = environment_for(options.environments)
     if not options.ours_only:
         _set_up(options.peers, environment)
     results = options.out / "results.jsonl"
@@ -88,15 +86,45 @@ def main() -> None:
     for work in works:
         _read_once(Path(environment["PEERS_OUT"]), work)
         for script in OURS[work]:
-            command = [sys.executable, "-m", *f"tests.benchmarks.peers.{script}".split(), "--peers", str(options.peers)]
-            kept += _run(work, f"udccal ({script})", command, _ROOT, environment)
+            kept += run_ours(work, script, options.peers, environment)
         for peer in PEERS if not options.ours_only else ():
             if peer.work == work:
-                python = _python(peer, options.environments)
-                kept += _run(work, peer.script, [python, *peer.script.split()], options.peers, environment)
+                kept += run_peer(peer, python_of(peer, options.environments), options.peers, environment)
         results.write_text("".join(line.text() + "\n" for line in kept), encoding="utf-8")
     stamp = f"Measured {datetime.now(UTC):%Y-%m-%d}, all in one run." if not options.ours_only else ""
     put_table(_PAGE, "peers", f"{stamp}\n\n{tables(kept)}", {line.commit for line in kept})
+
+
+def environment_for(environments: Path) -> dict[str, str]:
+    """Variables of the scripts: where their environments are, and where inputs are kept."""
+    return {
+        **os.environ,
+        "PEERS_VENVS": str(environments),
+        "PEERS_OUT": os.environ.get("PEERS_OUT", str(environments / "data")),
+    }
+
+
+def run_ours(work: str, script: str, peers: Path, environment: dict[str, str]) -> list[Line]:
+    """Run one of ``OURS`` with its arguments; a line says so where it failed.
+
+    Args:
+        work: its name. script: a module of this package, and its arguments.
+        peers: folder of works.py.
+        environment: of ``environment_for``.
+    """
+    command = [sys.executable, "-m", *f"tests.benchmarks.peers.{script}".split(), "--peers", str(peers)]
+    return _run(work, f"udccal ({script})", command, _ROOT, environment)
+
+
+def run_peer(peer: Peer, python: str, peers: Path, environment: dict[str, str]) -> list[Line]:
+    """Run a peer's script; a line says so where it failed.
+
+    Args:
+        peer: what to run. python: of its environment.
+        peers: folder of the scripts.
+        environment: of ``environment_for``.
+    """
+    return _run(peer.work, peer.script, [python, *peer.script.split()], peers, environment)
 
 
 def _set_up(peers: Path, environment: dict[str, str]) -> None:
@@ -118,7 +146,8 @@ def _read_once(data: Path, work: str) -> None:
                 pass
 
 
-def _python(peer: Peer, environments: Path) -> str:
+def python_of(peer: Peer, environments: Path) -> str:
+    """The Python of a peer's environment, which need not be there."""
     if peer.environment is None:
         return _SYSTEM_PYTHON
     return str(environments / f"venv_{peer.environment}" / "bin" / "python")
