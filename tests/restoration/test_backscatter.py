@@ -52,6 +52,17 @@ def test_the_level_is_what_dark_places_allow(mask: PanelMask, toy_noise: Noise, 
     np.testing.assert_allclose(mask.rate(found), mask.white * found[CHANNELS])
 
 
+def test_a_few_dark_blocks_of_many_give_the_level(toy_noise: Noise) -> None:
+    """Of 40 000 blocks eight are dark: a percentile of all of them would not see these."""
+    white = np.full((1600, 1600), 1000.0, np.float32)
+    scene = np.full(white.shape, 2000.0)
+    scene[800:816, 400:432] = 0.0
+    frame = scene + 0.3 * white
+    found = levels_of(PanelMask(white, CFA), frame, 1.0, toy_noise)
+    np.testing.assert_allclose(found, 0.3, rtol=0.2)
+    assert np.percentile(frame.reshape(200, 8, 200, 8).mean(axis=(1, 3)), 0.1) > 2 * 0.3 * 1000
+
+
 def test_noise_makes_no_panel_darker_than_it_is(mask: PanelMask, toy_noise: Noise) -> None:
     """Ten thousand blocks of a panel alone, at little light: the darkest of them are dark by noise."""
     white = np.full((800, 800), 100.0, np.float32)

@@ -28,6 +28,8 @@ BLOCK = 8
 # Light of a block that noise hardly exceeds: so many sigma above its mean. Of that, the darkest places give the level.
 SIGMAS = 3.5
 PERCENTILE = 0.1
+# Strips across the frame: the darkest one gives the level, so that a dark strip is found beside bright ones.
+STRIPS = 12
 # A frame is darker than its panel's light where this is more than so many times the frame, and more than so few e-.
 _MORE, _NEGLIGIBLE_E = 1.2, 1.0
 # Samples of which the sums are taken: few, and by an odd step, so that every colour is among them.
@@ -254,10 +256,10 @@ class PanelMask:
     ) -> Float32[np.ndarray, "3"]:
         """Estimate each colour's level, from 0 to 1; 0 for a colour without samples.
 
-        Light only adds, so a frame is nowhere darker than its backscatter. The level is the 0.1st percentile of frame
-        over white panel in blocks of 8 x 8 samples, where each block is taken 3.5 sigma of its noise brighter than it
-        is: of some thousand blocks, the darkest are dark by noise. In a scene without dark places the level is too
-        high, by at most the scene's own darkest places.
+        Light only adds, so a frame is nowhere darker than its backscatter. In each of 12 strips across the frame, the
+        0.1st percentile of frame over white panel is taken in blocks of 8 x 8 samples; the level is the lowest strip's.
+        Each block is taken 3.5 sigma of its noise brighter than it is: of some thousand blocks, the darkest are dark by
+        noise. In a scene without dark places the level is too high, by at most the scene's own darkest places.
 
         Args:
             signal_e: signal in e-, divided by the wire.
@@ -273,8 +275,10 @@ class PanelMask:
             seen += SIGMAS * np.sqrt((np.maximum(seen, 0) + np.float32(floor_e2)) / np.float32(samples))
             usable = possible > 0
             if usable.any():
-                ratio = np.percentile(seen[usable] / possible[usable], PERCENTILE)
-                levels[channel] = np.clip(ratio / exposure_s, 0.0, 1.0)
+                ratio = seen[usable] / possible[usable]
+                strips = np.array_split(ratio, min(STRIPS, ratio.size))
+                lowest = min(np.percentile(strip, PERCENTILE) for strip in strips)
+                levels[channel] = np.clip(lowest / exposure_s, 0.0, 1.0)
         return levels
 
     def rate(self, levels: Float32[np.ndarray, "3"]) -> Float32[np.ndarray, "rows columns"]:

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, UInt8, UInt16
 
 from udccal.cfa import Cfa
 from udccal.models.noise import Noise, linear_signal
-from udccal.restoration.backscatter import BLOCK, PERCENTILE, SIGMAS, SPARSE
+from udccal.restoration.backscatter import BLOCK, PERCENTILE, SIGMAS, SPARSE, STRIPS
 from udccal.restoration.dark_places import COLOURFUL, LEAST_E, NEGLIGIBLE, STEP
 from udccal.restoration.defects import OUTLIER_RATIO, OUTLIER_SIGMA
 from udccal.restoration.device.planes import Mosaic, apart, box_mean, resized, together
@@ -100,8 +100,10 @@ class FrontEnd(eqx.Module):
             seen, possible = (each[channels == channel].mean(axis=0) for each in both)
             samples = np.count_nonzero(channels == channel) * min(BLOCK**2, signal.size) / len(channels)
             seen += SIGMAS * jnp.sqrt((jnp.maximum(seen, 0) + floor_e2) / samples)
-            ratio = jnp.where(possible > 0, seen / (possible * exposure_s), jnp.nan)
-            levels.append(jnp.clip(jnp.nan_to_num(jnp.nanpercentile(ratio, PERCENTILE)), 0, 1))
+            ratio = jnp.where(possible > 0, seen / (possible * exposure_s), jnp.nan).ravel()
+            strips = jnp.array_split(ratio, min(STRIPS, ratio.size))
+            lowest = jnp.nanmin(jnp.stack([jnp.nanpercentile(strip, PERCENTILE) for strip in strips]))
+            levels.append(jnp.clip(jnp.nan_to_num(lowest), 0, 1))
         return together(jnp.stack(levels)[channels, None, None] * apart(white, cfa), cfa)
 
 
