@@ -188,10 +188,24 @@ def search(stamps: Stamps, rules: StampsRules, orders: Orders | None) -> Choice[
     tried = [best] if orders else _neighbours(stamps, best, image_degree, rules)
     best = choose(tried).best
     # Others were compared without a model error and with the same samples left out; this fit does not compare.
-    state = without_outliers(stamps, best.fit.place, rules)
+    state = best.fit.place if orders else _denser(stamps, best.fit.place, rules)
+    state = without_outliers(stamps, state, rules)
     state = replace(state, model_error=of_stars_left_out(stamps, state, rules))
     final = replace(best, fit=improve(stamps, state, rules, rules.steps_to_end))
     return Choice(final, (*(t for t in tried if t is not best), final))
+
+
+def _denser(stamps: Stamps, state: State, rules: StampsRules) -> State:
+    """Return a field of one image on the next denser nodes.
+
+    The evidence prefers nodes on which a spline errs by up to 1 % at a sharp peak, at all places alike: four times what
+    is stated. On denser ones the error is a fourth of that and the prior's smoothness holds them, so that error bars
+    grow little. Several images have no room for more nodes.
+    """
+    denser = [one for one in rules.spacings_px if one < state.field.spacing_px]
+    if not denser or len(state.field.mix) > 1:
+        return state
+    return improve(stamps, state.with_spacing(stamps, denser[0], rules), rules, rules.steps_to_compare).place
 
 
 def attempt(stamps: Stamps, found: Found, rules: StampsRules) -> Attempt[Found]:
