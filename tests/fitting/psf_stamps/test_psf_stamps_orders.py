@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from tests.fitting.psf_stamps.test_psf_stamps import READ_E, SENSOR, places
+from tests.scenes.stamps import drawn
 from udccal.fitting.psf_stamps.data import Stamps, StampsRules
 from udccal.fitting.psf_stamps.fit import fit_psf_stamps
-from udccal.fitting.psf_stamps.search import Found, coarse, improve, with_more_images
+from udccal.fitting.psf_stamps.search import Found, Orders, coarse, improve, with_more_images
 from udccal.numerics import in_float64
 
 # (map degree, image degree) of the truths.
@@ -54,6 +55,16 @@ def fitted(order: tuple[int, int], map_degree: int) -> tuple[Stamps, Found]:
     """Stamps of a field of known order, and a fit of one image behind a map of some degree."""
     stamps = made(order, 3)
     return stamps, improve(stamps, coarse(stamps, RULES, map_degree), RULES, 12)
+
+
+@pytest.mark.medium
+def test_a_sharp_peak_is_within_its_error_bars() -> None:
+    """A spline on nodes 0.7 px apart misses it by many sigma."""
+    data = drawn("moffat", 3, 20, 15, 162e3, 3.4, varies=0.8)
+    middle = np.s_[:, 7, 7]
+    assert np.abs(data.errors(fit_psf_stamps(data.stamps).term)[2][middle]).max() < 3.5
+    wide = fit_psf_stamps(data.stamps, Orders(3, 0, 0.7))
+    assert np.abs(data.errors(wide.term)[2][middle]).max() > 4.5
 
 
 @pytest.mark.medium

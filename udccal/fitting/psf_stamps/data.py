@@ -120,6 +120,7 @@ class StampsRules:
             loses more than the second fraction of its samples.
         coarse: assumed relative model errors of the fits that lead from a round star to a field.
         spacings_px: spacings of nodes, the coarsest first.
+        most_spacing_px: spacing below which fields of one image end.
         highest: largest degrees of the map and of the images' strengths.
         image_beyond, images_at_once: new images are as many as this, of those whose significance is at least this part
             of the best one's.
@@ -152,6 +153,7 @@ class StampsRules:
     star_lost: float = 0.2
     coarse: tuple[float, ...] = (0.3, 0.1, 0.05, 0.02)
     spacings_px: tuple[float, ...] = (1.0, 0.7, 0.5, 0.35)
+    most_spacing_px: float = 0.7
     highest: tuple[int, int] = (4, 4)
     image_beyond: float = 0.1
     images_at_once: int = 3

@@ -196,13 +196,13 @@ def search(stamps: Stamps, rules: StampsRules, orders: Orders | None) -> Choice[
 
 
 def _denser(stamps: Stamps, state: State, rules: StampsRules) -> State:
-    """Return a field of one image on the next denser nodes.
+    """Return a field of one image on denser nodes than the evidence prefers, half a pixel apart or less.
 
-    The evidence prefers nodes on which a spline errs by up to 1 % at a sharp peak, at all places alike: four times what
-    is stated. On denser ones the error is a fourth of that and the prior's smoothness holds them, so that error bars
-    grow little. Several images have no room for more nodes.
+    A spline on its nodes errs by up to 1 % at a sharp peak, at all places alike: four times what is stated. On
+    denser ones the prior's smoothness holds what the data do not, so that error bars grow little. Several images have
+    no room for more nodes.
     """
-    denser = [one for one in rules.spacings_px if one < state.field.spacing_px]
+    denser = [one for one in rules.spacings_px if one < min(state.field.spacing_px, rules.most_spacing_px)]
     if not denser or len(state.field.mix) > 1:
         return state
     return improve(stamps, state.with_spacing(stamps, denser[0], rules), rules, rules.steps_to_compare).place
