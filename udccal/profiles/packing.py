@@ -84,7 +84,13 @@ def unpack(packed: Packed, kind: type, folder: Path, geometry: Geometry | None) 
     Raises:
         ProfileError: when a field is missing, unknown or of the wrong type, or an array's file is missing or altered.
     """
-    stored = {parameter.name: parameter for parameter in (*packed.parameters, *packed.arrays)}
+    entries = (*packed.parameters, *packed.arrays)
+    stored = {entry.name: entry for entry in entries}
+    if len(stored) < len(entries):
+        twice = next(entry.name for entry in entries if stored[entry.name] is not entry)
+        raise ProfileError(
+            f"Expected each parameter of {kind.__name__} once, found '{twice}' twice. Restore the profile from a copy."
+        )
     allowed = _classes_beside(kind)
     used: set[str] = set()
 
