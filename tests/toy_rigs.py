@@ -18,6 +18,25 @@ _CHANGES = {
     "[view]\ncolumns = 960\nrows = 540": "[view]\ncolumns = 120\nrows = 68",
 }
 
+# Enough pixels for the corners of a board, captures that every fit can use, and the part of the panel that is seen.
+_FIVE_TERMS = {
+    "columns = 128": "columns = 256",
+    "rows = 96": "rows = 192",
+    "pitch_um = 55.2": "pitch_um = 27.6",
+    "flats = 100": "flats = 16",
+    "psf_rows = 3": "psf_rows = 1",
+    "psf_shifts = 3": "psf_shifts = 2",
+    "psf_exposures = 6": "psf_exposures = 3",
+    "psf_region_columns = 16": "psf_region_columns = 48",
+    "psf_region_rows = 32": "psf_region_rows = 144",
+    "backscatter_pictures = 8": "backscatter_pictures = 6",
+    "backscatter_frames = 4": "backscatter_frames = 2",
+    "board_views = 6": "board_views = 3",
+    "columns = 1920": "columns = 240",
+    "rows = 1080": "rows = 136",
+    "panel_x_px = { value = 960.0": "panel_x_px = { value = 120.0",
+    "panel_y_px = { value = 300.0": "panel_y_px = { value = 60.0",
+}
 
 # The emulated camera of Basler's SDK has this many pixels across and down.
 _EMULATED = {"columns = 128": "columns = 4096", "rows = 96": "rows = 4096", "pitch_um = 55.2": "pitch_um = 1.725"}
@@ -27,6 +46,13 @@ def write_emulated_rig(folder: Path) -> Path:
     """The toy rig with the sensor of the camera that Basler's SDK emulates; returns the rig's folder."""
     rig = write_toy_rig(folder)
     change_rig(rig, _EMULATED)
+    return rig
+
+
+def write_five_term_rig(folder: Path) -> Path:
+    """A toy rig of which all five terms can be captured and fitted in a minute or two; returns the rig's folder."""
+    rig = write_toy_rig(folder)
+    change_rig(rig, _FIVE_TERMS)
     return rig
 
 

@@ -13,13 +13,17 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from tests.toy_rigs import change_rig, write_toy_rig
+from tests.toy_rigs import change_rig, write_five_term_rig, write_toy_rig
+from udccal.benches.capture import TERMS
+from udccal.sessions.schema import LedSubject
 from udccal.sessions.store import Session
 
 _TERMS = ("--term", "wire", "--term", "psf")
 _PATIENCE_S = 400.0
+_WAITS = "Enter · skip · back · quit · wrong"
 
 
 @pytest.fixture
@@ -41,7 +45,7 @@ def command(rig: Path, folder: Path, *words: str) -> list[str]:
 
 
 class Terminal:
-    """A program in a pseudo-terminal, by keys."""
+    """A program in a pseudo-terminal, by keys; it does not outlive its test."""
 
     def __init__(self, words: list[str]) -> None:
         self._keys, theirs = pty.openpty()
@@ -57,6 +61,15 @@ class Terminal:
         os.set_blocking(self._keys, False)
         self.shown = ""
         self._read = 0
+
+    def __enter__(self) -> Terminal:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        if self.process.poll() is None:
+            os.killpg(self.process.pid, signal.SIGKILL)
+            self.process.wait()
+        os.close(self._keys)
 
     def until(self, words: str) -> None:
         """Wait until the words are shown, after those waited for before."""
@@ -86,69 +99,108 @@ class Terminal:
                 time.sleep(0.05)
 
 
-@pytest.mark.slow
-def test_a_practice_by_keys_gives_the_session_that_no_mistake_has_touched(rig: Path, tmp_path: Path) -> None:
-    (tmp_path / "plain").mkdir()
-    plain = Terminal(command(rig, tmp_path / "plain", "--yes", "--json-events"))
-    plain.until('"event": "done"}')
-    plain.stop()
+def five_terms(rig: Path, folder: Path, *words: str) -> Terminal:
+    places = ["--rig", str(rig), "--session", str(folder / "s"), "--profile", str(folder / "p")]
+    return Terminal([sys.executable, "-m", "udccal.cli.main", "calibrate", *places, "--practice", *words])
+
+
+def undisturbed(rig: Path, folder: Path) -> None:
+    """Capture every step by ``--yes``, and read what is written for programs."""
+    with five_terms(rig, folder, "--yes", "--json-events") as plain:
+        plain.until('"event": "done"}')
+        plain.stop()  # the fits are no part of this test
     told = [json.loads(line) for line in plain.shown.splitlines() if line.startswith('{"')]
     assert {event["event"] for event in told} == {"step", "readings", "progress", "verdict", "done"}
     assert told[-1]["complete"]
     readings = [reading for event in told if event["event"] == "readings" for reading in event["readings"]]
-    assert {reading["ok"] for reading in readings} <= {True, False}
-    assert len(readings) > 0
+    assert {reading["ok"] for reading in readings} == {True, False}
 
-    first = Terminal(command(rig, tmp_path))
-    first.until("Step 1 of 4")
-    first.until("Enter · skip · back · quit · wrong")
-    first.type("jump")
-    first.until("'jump' is none of the answers: Enter, skip, back, quit, wrong.")
-    first.type("wrong")
-    first.until("Little light is seen")
-    first.type()
-    first.until("✗ Step wire/flat: Expected to see the light")
-    first.type()  # tries again
-    first.until("evenness")
-    first.type("skip")
-    first.until("This step takes up the exposure of wire/flat, which was not captured.")
-    first.type("back")
-    first.until("Step 1 of 4")
-    first.until("Enter · skip · back · quit · wrong")
-    first.type()
-    first.until("✓ Even light for the wire")
-    assert first.stop() == 130
-    assert "Stopped. Run the same command again" in first.shown.replace("\n", " ")
-    assert "Traceback" not in first.shown
 
-    second = Terminal(command(rig, tmp_path))
-    second.until("Step 2 of 4")
-    second.until("Enter · skip · back · quit · wrong")
-    second.type()
-    second.until("✓ Darkness for the wire")
-    second.type()
-    second.until("Step 3 of 4")
-    second.type("wrong")
-    second.until("Move the LED so that its image goes")
-    second.type("again")
-    second.until("✓ LED in cell 1 of 2")
-    second.until("✓ LED in cell 2 of 2")
-    second.until("Everything is captured.")
-    second.stop()  # the fits are no part of this test
+def take(terminal: Terminal, step: int, title: str) -> None:
+    """Capture a step that waits for Enter, and go on."""
+    terminal.until(f"Step {step} of 10")
+    terminal.until(_WAITS)
+    terminal.type()
+    terminal.until(f"✓ {title}")
+    terminal.type()
 
+
+def do_wrong_at_first(terminal: Terminal) -> None:
+    """Mistype, capture nothing of no light, skip what the next step needs, come back, and stop amid the boards."""
+    terminal.until("Step 1 of 10")
+    terminal.until(_WAITS)
+    terminal.type("jump")
+    terminal.until("'jump' is none of the answers: Enter, skip, back, quit, wrong.")
+    terminal.type("wrong")
+    terminal.until("Little light is seen")
+    terminal.type()
+    terminal.until("✗ Step noise/flat_stack: Expected")
+    terminal.type()  # tries again
+    terminal.until("evenness")
+    terminal.type("skip")
+    terminal.until("This step takes up the exposure of noise/flat_stack, which was not captured.")
+    terminal.type("back")
+    take(terminal, 1, "Even light for the noise")
+    take(terminal, 2, "Darkness for the noise")
+    take(terminal, 3, "Board on the jig")
+    terminal.until("Step 4 of 10")
+    terminal.until("8 of 24 frames")
+    assert terminal.stop() == 130
+    assert "Stopped. Run the same command again" in terminal.shown.replace("\n", " ")
+    assert "Traceback" not in terminal.shown
+
+
+def go_on(terminal: Terminal) -> None:
+    """Hold the board and the LED wrongly before they are captured, and capture the rest."""
+    terminal.until("Step 4 of 10")
+    terminal.type("wrong")
+    terminal.until("0 of the board's corners are seen")
+    terminal.type("again")
+    terminal.until("✓ Board held by hand")
+    take(terminal, 5, "Even light for the wire")
+    take(terminal, 6, "Darkness for the wire")
+    terminal.until("Step 7 of 10")
+    terminal.until("[again")
+    terminal.type("wrong")  # the second mistake since the start: a lit room
+    terminal.until("Darken the room.")
+    terminal.type("wrong")
+    terminal.until("Move the LED so that its image goes")
+    terminal.type("again")
+    for cell in (1, 2, 3):
+        terminal.until(f"✓ LED in cell {cell} of 3")
+    take(terminal, 10, "Blackout for the panel's own light")
+    terminal.until("Everything is captured.")
+    terminal.stop()  # the fits are no part of this test
+
+
+@pytest.mark.slow
+def test_a_practice_of_all_terms_by_keys_gives_the_session_that_no_mistake_has_touched(tmp_path: Path) -> None:
+    rig = write_five_term_rig(tmp_path)
+    (tmp_path / "plain").mkdir()
+    undisturbed(rig, tmp_path / "plain")
+    for act in (do_wrong_at_first, go_on):
+        with five_terms(rig, tmp_path) as terminal:
+            act(terminal)
     one, other = (Session.open(folder / "s") for folder in (tmp_path / "plain", tmp_path))
+    assert {step.term for step in one.manifest.steps} == set(TERMS)
     assert [step.id for step in one.manifest.steps] == [step.id for step in other.manifest.steps]
     for mine, theirs in zip(one.manifest.steps, other.manifest.steps, strict=True):
-        assert mine.subject == theirs.subject
-        assert [capture.sha256 for capture in mine.captures] == [capture.sha256 for capture in theirs.captures]
+        if isinstance(mine.subject, LedSubject) and isinstance(theirs.subject, LedSubject):
+            # An LED that came from a wrong place rests where it is wanted, but not to the same thousandth of a pixel.
+            off = np.hypot(mine.subject.x_px - theirs.subject.x_px, mine.subject.y_px - theirs.subject.y_px)
+            assert off < 0.2, mine.id
+            continue
+        assert mine.subject == theirs.subject, mine.id
+        same = [capture.sha256 for capture in mine.captures] == [capture.sha256 for capture in theirs.captures]
+        assert same, mine.id
 
 
 @pytest.mark.medium
 def test_quit_leaves_with_130_and_fits_nothing(rig: Path, tmp_path: Path) -> None:
-    terminal = Terminal(command(rig, tmp_path))
-    terminal.until("Enter · skip · back · quit · wrong")
-    terminal.type("quit")
-    assert terminal.ended() == 130
+    with Terminal(command(rig, tmp_path)) as terminal:
+        terminal.until(_WAITS)
+        terminal.type("quit")
+        assert terminal.ended() == 130
     assert not (tmp_path / "p").exists()
 
 
@@ -225,13 +277,13 @@ def practised(rig: Path, folder: Path, typed: str) -> tuple[int, str]:
 def test_two_at_once_do_not_share_a_session(rig: Path, tmp_path: Path) -> None:
     folder = tmp_path / "à 用户 'x'"
     folder.mkdir()
-    first = Terminal(command(rig, folder))
-    first.until("Enter · skip · back · quit · wrong")
-    status, said = practised(rig, folder, "\n")
-    assert status == 1
-    assert "to be free, found that another process is writing to it." in said, said
-    first.type("quit")
-    assert first.ended() == 130
+    with Terminal(command(rig, folder)) as first:
+        first.until(_WAITS)
+        status, said = practised(rig, folder, "\n")
+        assert status == 1
+        assert "to be free, found that another process is writing to it." in said, said
+        first.type("quit")
+        assert first.ended() == 130
 
 
 @pytest.mark.slow
