@@ -67,7 +67,7 @@ def deconvolutions_of(peers: Path, environments: Path) -> Deconvolutions:
         for size, tier in itertools.product(SIZES, TIERS)
     }
     floor = Deconvolved.of(run_peer(_FLOOR, sys.executable, peers, environment))
-    python = python_of(SCICO, environments)
+    python = python_of(SCICO.environment, environments)
     scico = Deconvolved.of(run_peer(SCICO, python, peers, environment)) if Path(python).is_file() else None
     return Deconvolutions(ours, floor, scico)
 

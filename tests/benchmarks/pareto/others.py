@@ -23,6 +23,7 @@ from jaxtyping import Float32
 from tests.benchmarks.pareto.instead import Peer, Rgb, demosaiced
 from tests.benchmarks.pareto.restoring import Taken
 from tests.benchmarks.pareto.runs import Sight
+from tests.benchmarks.peers.run import python_of
 from udccal.restoration.metrics import psnr
 from udccal.restoration.runtime import Restorer
 
@@ -40,7 +41,7 @@ class Other:
 
     def python(self, environments: Path) -> Path:
         """The interpreter of its environment, which need not be there."""
-        return environments / f"venv_{self.environment}" / "bin" / "python"
+        return Path(python_of(self.environment, environments))
 
 
 OTHERS: Final = (

@@ -89,7 +89,7 @@ def main() -> None:
             kept += run_ours(work, script, options.peers, environment)
         for peer in PEERS if not options.ours_only else ():
             if peer.work == work:
-                kept += run_peer(peer, python_of(peer, options.environments), options.peers, environment)
+                kept += run_peer(peer, python_of(peer.environment, options.environments), options.peers, environment)
         results.write_text("".join(line.text() + "\n" for line in kept), encoding="utf-8")
     stamp = f"Measured {datetime.now(UTC):%Y-%m-%d}, all in one run." if not options.ours_only else ""
     put_table(_PAGE, "peers", f"{stamp}\n\n{tables(kept)}", {line.commit for line in kept})
@@ -146,11 +146,11 @@ def _read_once(data: Path, work: str) -> None:
                 pass
 
 
-def python_of(peer: Peer, environments: Path) -> str:
-    """The Python of a peer's environment, which need not be there."""
-    if peer.environment is None:
+def python_of(environment: str | None, environments: Path) -> str:
+    """The Python of an environment of setup.sh, which need not be there; None is the system's."""
+    if environment is None:
         return _SYSTEM_PYTHON
-    return str(environments / f"venv_{peer.environment}" / "bin" / "python")
+    return str(environments / f"venv_{environment}" / "bin" / "python")
 
 
 def _read(path: Path) -> list[Line]:

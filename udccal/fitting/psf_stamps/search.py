@@ -198,9 +198,9 @@ def search(stamps: Stamps, rules: StampsRules, orders: Orders | None) -> Choice[
 def _denser(stamps: Stamps, state: State, rules: StampsRules) -> State:
     """Return a field of one image on denser nodes than the evidence prefers, half a pixel apart or less.
 
-    A spline on its nodes errs by up to 1 % at a sharp peak, at all places alike: four times what is stated. On
-    denser ones the prior's smoothness holds what the data do not, so that error bars grow little. Several images have
-    no room for more nodes.
+    On the nodes that it prefers, a spline errs by up to 1 % at a sharp peak, at all places alike: four times what is
+    stated. On denser ones the prior's smoothness holds what the data do not, so that error bars grow little.
+    Several images have no room for more nodes.
     """
     denser = [one for one in rules.spacings_px if one < min(state.field.spacing_px, rules.most_spacing_px)]
     if not denser or len(state.field.mix) > 1:
