@@ -15,6 +15,7 @@ from udccal.simulation.truth import RigTruth
 
 # In sensor pixels: cells have the finest size up to the reach from the source, then grow by a factor to the coarsest.
 _FINEST, _COARSEST, _FINE_REACH, _GROWTH = 1 / 32, 0.25, 3.0, 1.06
+_BLOCK_ROWS = 64
 
 
 @dataclass(frozen=True)
@@ -55,16 +56,18 @@ def angular_spread(
     relative_step = spectrum.step_nm / spectrum.wavelengths_nm
     # Power is even: only cells with l_y >= 0 are computed; the others are their mirror image.
     half_y = edges_y[edges_y.size // 2 :]
-    cells = np.zeros((3, half_y.size - 1, edges_x.size - 1))
-    for wavelength_nm, weights, relative in zip(
-        spectrum.wavelengths_nm, spectrum.weights.T, relative_step, strict=True
-    ):
-        per_y = power.step_y * wavelength_nm * 1e-6
-        per_x = power.step_x * wavelength_nm * 1e-6
+    picks = []
+    for wavelength_nm, relative in zip(spectrum.wavelengths_nm, relative_step, strict=True):
+        per_y, per_x = (step * wavelength_nm * 1e-6 for step in (power.step_y, power.step_x))
         pick_y = _cell_operator(half_y, float(relative), per_y, power.zero_y, power.cumulative.shape[0])
         pick_x = _cell_operator(edges_x, float(relative), per_x, power.zero_x, power.cumulative.shape[1])
-        light = (pick_x @ np.ascontiguousarray((pick_y @ power.cumulative).T)).T
-        cells += weights[:, None, None] * light
+        picks.append((pick_y, pick_x))
+    cells = np.empty((3, half_y.size - 1, edges_x.size - 1))
+    # Rows by the block, so that one block's light at every wavelength stays in the processor's cache.
+    for first in range(0, half_y.size - 1, _BLOCK_ROWS):
+        rows = slice(first, first + _BLOCK_ROWS)
+        light = [pick_x @ np.ascontiguousarray((pick_y[rows] @ power.cumulative).T) for pick_y, pick_x in picks]
+        cells[:, rows] = np.tensordot(spectrum.weights, light, axes=1).swapaxes(1, 2)
     return AngularSpread(edges_x, edges_y, _cumulative(np.concatenate([cells[:, ::-1, ::-1], cells], axis=1)))
 
 
