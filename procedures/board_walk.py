@@ -26,6 +26,7 @@ from udccal.sessions.writer import SessionWriter
 
 _STILL_PX, _STILL_LOOKS, _UNKNOWN_PX = 1.0, 3, math.inf
 _FEWEST_COMMON: Final = 4
+_IN_VAIN_LOOKS: Final = 15  # with too few corners, after which another pose is suggested
 _UNLIKE: Final = 0.02  # of the sensor's width, by which the corners of two views differ at least
 
 
@@ -58,6 +59,7 @@ class BoardVisit:
         for seen in _captured(step_ids, writer, poses[0].spec):
             self._count(seen)
         self._seen: deque[CornersSeen] = deque(maxlen=_STILL_LOOKS)
+        self._in_vain = 0
         self._asked = self._ask()
         step = self._asked
         assert isinstance(step.exposure, Metered)
@@ -98,6 +100,7 @@ class BoardVisit:
         done = self._writer.completed_ids
         step = self._view(next(step_id for step_id in self._step_ids if step_id not in done), self._next.pose())
         set_up(step, self._bench, self._writer)
+        self._in_vain = 0
         return step
 
     def _unlike(self, seen: CornersSeen) -> Reading:
@@ -110,6 +113,7 @@ class BoardVisit:
         if not room.ok:
             return why_not(room)
         if not corners.ok:
+            self._look_in_vain(corners.value > 0)
             return (
                 f"{corners.value:.0f} of the board's corners are seen, at least {corners.low:.0f} are needed. Hold the "
                 "board in the outline, evenly lit and flat."
@@ -123,6 +127,14 @@ class BoardVisit:
             self._seen.clear()
             return "Such a view is there already. Hold the board as the outline shows it."
         return ""
+
+
+    def _look_in_vain(self, board: bool) -> None:
+        """Suggest another pose where a board has been seen in part for long: this one may not be seen any better."""
+        self._in_vain = self._in_vain + 1 if board else 0
+        if self._in_vain >= _IN_VAIN_LOOKS:
+            self._asked = self._ask()
+            self._seen.clear()
 
 
 def _movement(looks: deque[CornersSeen]) -> Reading:

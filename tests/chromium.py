@@ -89,9 +89,9 @@ class Page:
         assert "exceptionDetails" not in found, found["exceptionDetails"]
         return found["result"].get("value")
 
-    def wait(self, condition: str) -> None:
+    def wait(self, condition: str, patience_s: float = PATIENCE_S) -> None:
         """Wait until an expression in the page holds."""
-        end_s = time.monotonic() + PATIENCE_S
+        end_s = time.monotonic() + patience_s
         while not self.run(f"Boolean({condition})"):
             assert time.monotonic() < end_s, f"never held: {condition}; the page says: {self.text}"
             time.sleep(0.03)

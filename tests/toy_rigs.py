@@ -24,6 +24,8 @@ _FIVE_TERMS = {
     "rows = 96": "rows = 192",
     "pitch_um = 55.2": "pitch_um = 27.6",
     "flats = 100": "flats = 16",
+    # An image as wide in pixels as on the reduced rig: of a point within one pixel, exposures cannot be told.
+    "psf_led_mm = 2.3": "psf_led_mm = 9.2",
     "psf_rows = 3": "psf_rows = 1",
     "psf_shifts = 3": "psf_shifts = 2",
     "psf_exposures = 6": "psf_exposures = 3",
@@ -31,7 +33,7 @@ _FIVE_TERMS = {
     "psf_region_rows = 32": "psf_region_rows = 144",
     "backscatter_pictures = 8": "backscatter_pictures = 6",
     "backscatter_frames = 4": "backscatter_frames = 2",
-    "board_views = 6": "board_views = 3",
+    "board_views = 6": "board_views = 4",
     "columns = 1920": "columns = 240",
     "rows = 1080": "rows = 136",
     "panel_x_px = { value = 960.0": "panel_x_px = { value = 120.0",

@@ -6,6 +6,7 @@ import numpy as np
 
 from tests.benchmarks.rows import Row, at_most
 from tests.scenes.psf_wave_optics import held_out_positions
+from udccal.benches.capture import TERMS
 from udccal.displays.pictures import face_picture
 from udccal.models.backscatter import backscatter_rate as fitted_backscatter
 from udccal.models.geometry import project_directions, tilt_rad
@@ -13,6 +14,7 @@ from udccal.models.psf import psf_kernels
 from udccal.models.wire import wire_map as fitted_wire
 from udccal.numerics import in_float64
 from udccal.profiles.profile import Profile
+from udccal.result import FitStatus
 from udccal.simulation import backscatter, psf, wire
 from udccal.simulation.truth import RigTruth, pixels_to_directions
 
@@ -23,7 +25,9 @@ _BACKSCATTER_SEEDS = (7001, 7002, 7003, 7004, 7005)
 @in_float64
 def term_rows(profile: Profile, truth: RigTruth) -> list[Row]:
     """All rows of the table that concern the terms."""
+    stopped = sum(profile.result(term).status is not FitStatus.CONVERGED for term in TERMS)
     return [
+        at_most("terms whose fit has not converged", stopped, 0, ""),
         *_wire_rows(profile, truth),
         *_psf_rows(profile, truth),
         *_backscatter_rows(profile, truth),

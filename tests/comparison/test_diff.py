@@ -242,3 +242,14 @@ def test_five_micrometres_are_significant_and_harmless(measured: Profile) -> Non
     assert found.movement.p_value < 1e-6
     assert found.picture_dB_lost < 0.05
     assert found.advice.startswith("Go on with either profile: wire changed, too little to matter; the camera moved by")
+
+
+@pytest.mark.medium
+@pytest.mark.parametrize(("part", "verdict"), [(0.0001, "changed"), (0.01, "same")])
+def test_light_in_electrons_is_as_uncertain_as_the_gain(measured: Profile, part: float, verdict: str) -> None:
+    numbers = measured.noise.estimates
+    known = tuple(replace(one, sigma=part * one.value) if one.name == "K_DN_per_e" else one for one in numbers)
+    measured = with_result(measured, "noise", estimates=known)
+    light = measured.backscatter.term
+    other = with_result(measured, "backscatter", term=replace(light, mask=1.015 * light.mask), captures=None)
+    assert udccal.diff(measured, other).terms[4].verdict == verdict

@@ -60,3 +60,14 @@ def test_frames_of_another_gain_fail(result: FitResult[Noise]) -> None:
 def test_flats_that_are_all_clipped_cannot_be_judged(result: FitResult[Noise]) -> None:
     found = judge_noise(captured(replace(SENSOR, levels=(1.6, 2.0)), 4), result, ValidationLimits())
     assert failed(found) == {"captures"}
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_gain_of_few_samples_is_judged_by_its_error(seed: int) -> None:
+    small = replace(SENSOR, rows=48, columns=64)
+    result = measure(small, 10 + seed)
+    found = named(judge_noise(captured(small, 20 + seed), result, ValidationLimits()), "gain")
+    assert found.ok, found
+    assert 1.5 < (found.limit or 0.0) < 10.0
+    other = captured(replace(small, K_DN_per_e=1.15 * small.K_DN_per_e), 30 + seed)
+    assert "gain" in failed(judge_noise(other, result, ValidationLimits()))

@@ -6,7 +6,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -29,11 +29,11 @@ class Running:
 
 
 @contextmanager
-def practising(folder: Path, *words: str) -> Iterator[Running]:
-    """Run a practice of the noise's steps with a page; it does not outlive the test."""
-    paths = {"--rig": write_toy_rig(folder), "--session": folder / "session", "--profile": folder / "profile"}
+def practising(rig: Path, folder: Path, *words: str) -> Iterator[Running]:
+    """Run a practice with a page; it does not outlive the test."""
+    paths = {"--rig": rig, "--session": folder / "session", "--profile": folder / "profile"}
     given = [str(word) for pair in paths.items() for word in pair]
-    command = [*COMMAND, *given, "--practice", "--web", "--term", "noise", *words]
+    command = [*COMMAND, *given, "--practice", "--web", *words]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         try:
             said = ""
@@ -47,6 +47,11 @@ def practising(folder: Path, *words: str) -> Iterator[Running]:
             process.terminate()
 
 
+def noise_practice(folder: Path) -> AbstractContextManager[Running]:
+    """A practice of the noise's steps alone."""
+    return practising(write_toy_rig(folder), folder, "--term", "noise")
+
+
 def take(page: Page) -> None:
     """Capture a step that is set up rightly."""
     says(page, "All is right.")
@@ -56,7 +61,7 @@ def take(page: Page) -> None:
 
 @pytest.mark.medium
 def test_a_practice_with_a_mistake_and_a_reload_captures_every_step(tmp_path: Path) -> None:
-    with chromium(tmp_path) as browser, practising(tmp_path) as running:
+    with chromium(tmp_path) as browser, noise_practice(tmp_path) as running:
         page = browser.open(running.address, 390, 844)
         says(page, "Step 1 of 2")
         see_the_picture(page)
@@ -82,7 +87,7 @@ def test_a_practice_with_a_mistake_and_a_reload_captures_every_step(tmp_path: Pa
 
 @pytest.mark.medium
 def test_stopping_on_the_page_ends_the_command(tmp_path: Path) -> None:
-    with chromium(tmp_path) as browser, practising(tmp_path) as running:
+    with chromium(tmp_path) as browser, noise_practice(tmp_path) as running:
         page = browser.open(running.address, 1280, 800)
         page.tap("button.quit")
         page.tap("button.quit")

@@ -59,6 +59,8 @@ def effects_of(
         case "backscatter":
             error = _stated(a.backscatter, b.backscatter, "held_out_without_noise_of_peak", 100.0)
             name, lost = "panel's light, RMS, of its peak", loss.backscatter
+            gain = 100 * float(np.hypot(*(_relative_sigma(p.noise, "K_DN_per_e") for p in (a, b))))
+            error = None if error is None else float(np.hypot(error, gain))  # electrons are DN over the gain
             first = Effect(name, _light(maps), "%", limits.backscatter_percent, error)
     return first, Effect(_LOSS, lost, "dB", limits.picture_dB)
 
@@ -111,6 +113,12 @@ def _stated(a: FitResult, b: FitResult, name: str, unit: float) -> float | None:
     """Error that both profiles state of themselves under this name, as an estimate or a diagnostic."""
     one, other = (_number(result, name) for result in (a, b))
     return None if one is None or other is None else unit * float(np.hypot(one, other))
+
+
+def _relative_sigma(result: FitResult, name: str) -> float:
+    """Relative error of an estimate; 0 of one that was not made."""
+    estimate = next((one for one in result.estimates if one.name == name), None)
+    return estimate.sigma / abs(estimate.value) if estimate is not None and estimate.value else 0.0
 
 
 def _number(result: FitResult, name: str) -> float | None:

@@ -10,6 +10,7 @@ from typing import final
 
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy.special import ndtri
 
 from udccal.fitting.engine.gaussian import square_root
 from udccal.fitting.noise.data import NoiseData, NoiseRules, read_noise
@@ -47,7 +48,8 @@ def judge_noise(data: NoiseData, result: FitResult[Noise], limits: ValidationLim
     transfer = _Transfer.of(result, seen)
     if not transfer.usable.any():
         return unusable("noise", "No flat lies between dark noise and saturation. Set up the lamp and capture again.")
-    found, gain = transfer.prediction(), transfer.gain()
+    found, (gain, sigma) = transfer.prediction(), transfer.gain()
+    explained = float(ndtri(1 - limits.chance / 2)) * sigma
     z = np.full(transfer.usable.shape, np.nan)
     z[transfer.usable] = found.z
     own = result.chi2_dof
@@ -57,7 +59,7 @@ def judge_noise(data: NoiseData, result: FitResult[Noise], limits: ValidationLim
             "noise",
             "gain",
             100 * abs(gain - 1),
-            limits.K_percent,
+            max(limits.K_percent, 100 * explained),
             "%",
             f"The variance of flats grows with their mean {gain:.4f} times as fast as the profile says.",
         ),
@@ -112,12 +114,14 @@ class _Transfer:
         ]
         return Prediction(z, np.zeros((len(z), 0)), np.transpose(slopes) @ square_root(self.cov))
 
-    def gain(self) -> float:
-        """The gain by these flats over the profile's, by weighted least squares."""
+    def gain(self) -> tuple[float, float]:
+        """The gain by these flats over the profile's, by weighted least squares, and its sigma by the errors of both."""
         expected, (K, _, sigma_d, row, _) = self.predicted(self.values), self.values
         floor = (K * sigma_d) ** 2 - row**2 + self.rounding
-        light, weight = expected - floor, self.dof[self.usable] / np.maximum(expected, 1e-9) ** 2
-        return float(np.sum(weight * light * (self.variance[self.usable] - floor)) / np.sum(weight * light**2))
+        light, weight = expected - floor, self.dof[self.usable] / np.maximum(expected, 1e-9) ** 2 / 2
+        information = float(np.sum(weight * light**2))
+        ratio = float(np.sum(weight * light * (self.variance[self.usable] - floor)) / information)
+        return ratio, float(np.hypot(information**-0.5, self.cov[0, 0] ** 0.5 / K))
 
 
 def transfer_numbers(result: FitResult[Noise]) -> tuple[Float[np.ndarray, "5"], Float[np.ndarray, "5 5"]]:

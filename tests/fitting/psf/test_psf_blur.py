@@ -61,3 +61,20 @@ def test_the_blur_is_an_ellipse_along_the_radius() -> None:
     np.testing.assert_allclose([red / green, blue / green], [[4.0] * 3, [0.25] * 3])
     even = replace(model, blur_growth=np.zeros(2))
     np.testing.assert_allclose(ellipse(even, scene.geometry, (5.0, 700.0)), 0.09 * np.eye(2), rtol=1e-6)
+
+
+@pytest.mark.medium
+@in_float64
+def test_pictures_sharper_than_the_model_allows_converge_without_blur() -> None:
+    """The LED is said to be 6 % wider than it is: the sharpest model is too wide for pictures of a sharp lens."""
+    scene, rng = small_scene(positions=(4, 3), shifts=3, half=(8, 6)), np.random.default_rng(5)
+    start = start_model(scene.rig, scene.geometry, scene.wire)
+    prior = start_prior(scene.rig, start)
+    theta = prior.mean.copy()
+    theta[BLUR] = np.log(1e-3)
+    shots = shots_of(scene, pictures(scene, theta, rng), rng)
+    shots = replace(shots, disc_px=1.06 * shots.disc_px)
+    fit = fit_diffraction(shots, scene.geometry, start, prior, replace(PsfRules(), close_px=scene.half))
+    assert fit.converged
+    assert np.exp(fit.theta[BLUR]) < 0.02
+    assert fit.solution.equations.step(0.0).gain < 0.3  # without the curvature: 0.54
