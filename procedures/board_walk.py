@@ -128,7 +128,6 @@ class BoardVisit:
             return "Such a view is there already. Hold the board as the outline shows it."
         return ""
 
-
     def _look_in_vain(self, board: bool) -> None:
         """Suggest another pose where a board has been seen in part for long: this one may not be seen any better."""
         self._in_vain = self._in_vain + 1 if board else 0

@@ -24,8 +24,8 @@ _FIVE_TERMS = {
     "rows = 96": "rows = 192",
     "pitch_um = 55.2": "pitch_um = 27.6",
     "flats = 100": "flats = 16",
-    # An image as wide in pixels as on the reduced rig: of a point within one pixel, exposures cannot be told.
-    "psf_led_mm = 2.3": "psf_led_mm = 9.2",
+    # An image two pixels wide: of a point within one pixel, neither exposure nor place can be told.
+    "psf_led_mm = 2.3": "psf_led_mm = 18.4",
     "psf_rows = 3": "psf_rows = 1",
     "psf_shifts = 3": "psf_shifts = 2",
     "psf_exposures = 6": "psf_exposures = 3",

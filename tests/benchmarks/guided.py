@@ -4,7 +4,8 @@
 
 The rig is specimen 0 of the accuracy table. The simulated hand holds the LED up to 20 px and boards up to 3 degrees
 away from where they are wanted, and goes on wherever the guide says that all is in order. Both sessions are fitted.
-Captures and profiles in DIR are kept, and a second run goes on from there. Writes DIR/guided.json and, of
+Captures and profiles in DIR are kept, and a second run goes on from there. Prompts are those of the run that captured
+the last step. Writes DIR/guided.json and, of
 the full-size rig, the table of docs/cli.md; exits with 1 where a number misses its limit.
 """
 
@@ -57,9 +58,9 @@ def calibrated(draw: Draw, folder: Path, by_hand: bool) -> Calibrated:
     session, profile, commit, asked = (folder / name for name in ("session", "profile", "commit.txt", "prompts.txt"))
     if not commit.exists():
         world = SimulatedWorld(draw.truth, seed=draw.seed)
-        if by_hand:
+        if by_hand and not asked.exists():
             write_atomically(asked, str(_led(world, session)).encode())
-        else:
+        elif not by_hand:
             with simulated_bench(world) as bench:
                 capture(session, bench)
         fit_to_profile(Output(), session, profile)

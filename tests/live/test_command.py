@@ -113,7 +113,7 @@ def test_what_cannot_begin_is_refused_before_the_profile_is_read(
     monkeypatch.setattr("udccal.cli.jobs.live.keep_compilations", lambda: None)
     camera = LiveCamera("sim", None, None, None, 30.0, 0)
     wanted = LiveRun(
-        Path("no-such-profile"), Tier.preview, camera, "shm:not-made", None, None, 1.0, Limits(frames=1), None
+        Path("no-such-profile"), Tier.preview, camera, "shm:not-made", None, None, None, 1.0, Limits(frames=1), None
     )
     with pytest.raises(UdccalError, match=message):
         run_live(Output(), replace(wanted, **changes))
@@ -126,7 +126,7 @@ def test_another_camera_is_refused_before_the_profile_is_prepared(
     monkeypatch.setattr("udccal.cli.jobs.live.Restorer", None)
     write_png16(tmp_path / "small.png", np.full((32, 48), 900, np.uint16))
     camera = LiveCamera("files", None, tmp_path, 1e-3, 30.0, 0)
-    wanted = LiveRun(profile_folder, Tier.fast, camera, "shm:not-made", None, None, 1.0, Limits(frames=1), None)
+    wanted = LiveRun(profile_folder, Tier.fast, camera, "shm:not-made", None, None, None, 1.0, Limits(frames=1), None)
     with pytest.raises(CameraError, match=r"a camera of 96 x 64.* found 48 x 32"):
         run_live(Output(), wanted)
 

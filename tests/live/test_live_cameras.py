@@ -14,8 +14,9 @@ from tests.virtual_u3v.backend import VirtualBackend
 from tests.virtual_u3v.camera import VirtualCamera
 from tests.virtual_u3v.faults import Faults
 from tests.virtual_u3v.model import CameraModel
+from udccal.cameras.protocol import Region, Settings
 from udccal.cameras.u3v.camera import U3vCamera
-from udccal.cli.jobs.live_cameras import LiveCamera
+from udccal.cli.jobs.live_cameras import LiveCamera, region_of
 from udccal.errors import CameraError
 from udccal.live.pipeline import Limits, Pipeline
 from udccal.live.tally import Figures
@@ -40,20 +41,45 @@ def plug(model: CameraModel, faults: Faults, monkeypatch: pytest.MonkeyPatch) ->
 
 def run(profile: Profile) -> Figures:
     camera = LiveCamera("u3v", None, None, 2e-3, 25.0, 0)
+    restorer = Restorer.from_profile(profile, Tier.preview)
     with camera.open(profile.rig) as deliver:
-        frames = deliver(Restorer.from_profile(profile, Tier.preview).view, None)
+        frames = deliver(restorer.view, None, restorer.seen_rows)
         pipeline = Pipeline(frames, restore, SHAPE, ListSink(), None, Limits(frames=5), threading.Event())
         return pipeline.run(lambda figures: None)
 
 
 def test_it_is_set_and_streams_until_the_run_ends(live_profile: Profile, plugged: U3vCamera) -> None:
-    asked: list[float] = []
+    asked: list[Settings] = []
     configure = plugged.configure
-    plugged.configure = lambda settings: asked.append(settings.exposure_s) or configure(settings)
+    plugged.configure = lambda settings: asked.append(settings) or configure(settings)
     assert run(live_profile).written == 5
-    assert asked == [2e-3]
+    assert {settings.exposure_s for settings in asked} == {2e-3}
     with plugged:  # it can be opened again
         assert plugged.mode.frame_rate_hz == pytest.approx(25.0)
+
+
+@pytest.mark.parametrize(
+    ("rows", "steps", "expected"),
+    [
+        (slice(300, 700), (4, 2, 4, 2), (284, 432)),
+        (slice(301, 700), (4, 16, 4, 16), (272, 448)),
+        (slice(4, 1530), (4, 2, 4, 2), (0, 1536)),
+        (slice(1000, 1536), (4, 2, 4, 2), (984, 552)),
+        (slice(1000, 1530), (4, 500, 4, 500), (0, 1536)),
+    ],
+)
+def test_rows_are_read_in_the_cameras_steps(
+    rows: slice, steps: tuple[int, int, int, int], expected: tuple[int, int]
+) -> None:
+    assert region_of(rows, Region(0, 0, 2048, 1536), steps) == Region(0, expected[0], 2048, expected[1])
+
+
+def test_it_reads_the_rows_that_the_view_needs(live_profile: Profile, plugged: U3vCamera) -> None:
+    camera, restorer = LiveCamera("u3v", None, None, 2e-3, 25.0, 0), Restorer.from_profile(live_profile, Tier.preview)
+    with camera.open(live_profile.rig) as deliver:
+        frame = next(deliver(restorer.view, None, slice(24, 40)))
+    assert frame.settings.region == Region(0, 8, 96, 48)
+    assert frame.data.shape == (48, 96)
 
 
 def test_one_that_falls_silent_ends_the_run(

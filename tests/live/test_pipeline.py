@@ -43,7 +43,7 @@ class ListSink:
         self.calls.append("close")
 
 
-def restore(frame: Frame) -> Picture:
+def restore(frame: Frame, captured_ns: int) -> Picture:
     return np.full((*SHAPE, 3), frame.frame_id % 251, np.uint8)
 
 
@@ -105,15 +105,33 @@ def test_it_ends_when_it_is_told_to() -> None:
 
 
 def test_every_frame_is_written_or_counted_as_dropped() -> None:
-    def slow(frame: Frame) -> Picture:
+    def slow(frame: Frame, captured_ns: int) -> Picture:
         time.sleep(0.03)
-        return restore(frame)
+        return restore(frame, captured_ns)
 
     sink = ListSink()
     figures = run(itertools.islice(endless(), 60), sink, restore=slow)
     assert figures.dropped_before_restoration > 10
     assert figures.captured == figures.written + figures.dropped
     assert figures.restoration_ms.p50 >= 30
+
+
+def test_written_pictures_are_told_after_the_frames_they_are_of() -> None:
+    told: list[tuple[int, int]] = []
+    arrived: dict[int, int] = {}
+
+    def noted(frame: Frame, captured_ns: int) -> Picture:
+        arrived[frame.frame_id] = captured_ns
+        return restore(frame, captured_ns)
+
+    sink, frames = ListSink(), itertools.islice(endless(), 20)
+
+    def wrote(picture: Picture, at_ns: int) -> None:
+        told.append((int(picture[0, 0, 0]), at_ns))
+
+    Pipeline(frames, noted, SHAPE, sink, None, Limits(), threading.Event(), wrote).run(lambda figures: None)
+    assert [number for number, _ in told] == [frame.frame_id for frame in sink.frames]
+    assert all(at_ns > arrived[number] for number, at_ns in told)
 
 
 def test_frames_that_the_camera_lost_or_broke_are_counted() -> None:
@@ -131,7 +149,7 @@ def test_an_error_of_any_stage_ends_all_with_its_sentence() -> None:
         yield raw_frame(0)
         raise CameraLost("Expected the camera, found it unplugged. Plug it in.")
 
-    def broken(frame: Frame) -> Picture:
+    def broken(frame: Frame, captured_ns: int) -> Picture:
         raise ZeroDivisionError("division by zero")
 
     for frames, sink, how, error, message in (

@@ -12,9 +12,11 @@ import pytest
 
 from tests.live.conftest import COLUMNS, NOISE, ROWS, profile_of, raw_frame
 from tests.live.test_pipeline import ListSink
+from udccal.cameras.protocol import Frame, Region
 from udccal.errors import LiveError, RestorationError
 from udccal.live.exposure import AutoExposure
 from udccal.live.follow import ProfileFollower
+from udccal.live.own_pictures import OwnPictures
 from udccal.live.pacing import looped
 from udccal.live.pipeline import Limits, Pipeline
 from udccal.live.restoring import Restoring
@@ -22,7 +24,7 @@ from udccal.profiles.profile import Profile
 from udccal.profiles.store import write_profile
 from udccal.restoration.runtime import Restorer
 from udccal.restoration.tone import Tone, display_exposure
-from udccal.rig import RigDescription
+from udccal.rig import RigDescription, load_rig
 from udccal.tiers import Tier
 
 
@@ -63,16 +65,60 @@ def restoring(live_profile: Profile) -> Restoring:
 
 def test_frames_of_another_camera_are_refused(restoring: Restoring) -> None:
     assert restoring.shape == (ROWS, COLUMNS)
-    assert restoring.restore(raw_frame(0)).shape == (ROWS, COLUMNS, 3)
+    assert restoring.restore(raw_frame(0), 0).shape == (ROWS, COLUMNS, 3)
     frame = raw_frame(0)
     with pytest.raises(RestorationError, match="96 x 64"):
-        restoring.restore(replace(frame, data=frame.data[:32]))
+        restoring.restore(replace(frame, data=frame.data[:32]), 0)
 
 
 def test_a_profile_of_another_view_is_refused(restoring: Restoring, live_rig: RigDescription) -> None:
     larger = live_rig.model_copy(update={"view": live_rig.view.model_copy(update={"columns": 32, "rows": 18})})
     with pytest.raises(LiveError, match=r"view of 64 x 36.* found .* 32 x 18. Start another run"):
         restoring.replace(Restorer.from_profile(profile_of(larger), Tier.preview))
+
+
+def part_of(frame: Frame, rows: slice) -> Frame:
+    """The frame as a camera delivers it that reads these rows alone."""
+    region = Region(0, rows.start, frame.data.shape[1], rows.stop - rows.start)
+    return replace(frame, data=frame.data[rows].copy(), settings=replace(frame.settings, region=region))
+
+
+@pytest.mark.parametrize("tier", [Tier.preview, Tier.fast])
+def test_rows_that_the_view_needs_are_enough(live_profile: Profile, tier: Tier) -> None:
+    restorer = Restorer.from_profile(live_profile, tier)
+    needed, rng = restorer.seen_rows, np.random.default_rng(2)
+    frames = [replace(raw_frame(i), data=rng.integers(500, 3000, (64, 96)).astype(np.uint16)) for i in range(3)]
+    whole, read = Restoring(restorer), Restoring(restorer)
+    for frame in frames:
+        np.testing.assert_array_equal(whole.restore(frame, 0), read.restore(part_of(frame, needed), 0))
+    if tier is Tier.preview:
+        assert (needed.start, needed.stop) != (0, 64)
+        with pytest.raises(LiveError, match=rf"Expected rows {needed.start} to .* reads rows {needed.start + 2} to"):
+            read.restore(part_of(frames[0], slice(needed.start + 2, 64)), 0)
+
+
+def test_a_profile_whose_view_needs_other_rows_is_refused(restoring: Restoring) -> None:
+    restorer = restoring._restorer
+    restoring.restore(part_of(raw_frame(0), restorer.seen_rows), 0)
+    with pytest.raises(LiveError, match="which the view needs"):
+        restoring.replace(replace(restorer, rectification=restorer.rectification.from_row(4)))
+    restoring.replace(restorer)
+
+
+def test_a_mirrors_panel_shows_the_newest_picture_that_was_there() -> None:
+    pictures = [np.full((9, 16, 3), 10 * n, np.uint8) for n in range(3)]
+    own = OwnPictures(load_rig("lg55-reduced").panel.model_copy(update={"columns": 32, "rows": 18}), 0.02)
+    assert own.at(10**12) is None
+    for n, picture in enumerate(pictures):
+        own.wrote(picture, n * 10**9)
+    for at_ns, expected in ((0, None), (10**9, 0), (1_020_000_000, 10), (1_990_000_000, 10), (9 * 10**9, 20)):
+        found = own.at(at_ns)
+        if expected is None:
+            assert found is None
+        else:
+            assert found is not None
+            assert found.shape == (18, 32, 3)
+            assert set(found.ravel()) == {expected}
 
 
 def test_a_changed_profile_is_taken_up_between_two_frames(

@@ -21,16 +21,16 @@ from udccal.result import FitStatus
 # What a person does wrong at first, and what the page then says.
 MISTAKES: Final = {"noise/dark_stack": "light leak", "geometry/panel": "corners", "psf/p00": "LED"}
 # Guided steps that wait for nobody once their light is right.
-BY_ITSELF: Final = ("geometry/board", "psf/")
+BY_ITSELF: Final = ("geometry/views", "psf/")
 FIT_S: Final = 900.0
-# The simulator computes its blur before the first board is seen.
-BLUR_S: Final = 300.0
+# The simulator computes its blur before the first board is seen, and a pattern of light for each place of the LED.
+SIMULATED_S: Final = 300.0
 
 
 def next_step(page: Page, before: str) -> str:
     """Wait for another step than the one before, and return its name; none when everything is captured."""
     done = "document.body.innerText.includes('Everything is captured.')"
-    page.wait(f"{done} || (known.step && known.step !== {json.dumps(before)})")
+    page.wait(f"{done} || (known.step && known.step !== {json.dumps(before)})", SIMULATED_S)
     return "" if page.run(done) else str(page.run("known.step"))
 
 
@@ -56,7 +56,7 @@ def walk(page: Page) -> list[str]:
     walked: list[str] = []
     while step := next_step(page, walked[-1] if walked else ""):
         walked.append(step)
-        page.wait("document.querySelector('#readings li')", BLUR_S)
+        page.wait("document.querySelector('#readings li')", SIMULATED_S)
         if step in MISTAKES:
             err(page, step)
         if step.startswith(BY_ITSELF):
@@ -103,7 +103,7 @@ def test_a_practice_of_all_terms_on_a_page_is_fitted_compared_and_validated(tmp_
         assert all(getattr(profile, term).status is not FitStatus.NOT_CAPTURED for term in TERMS)
         check_page(browser, tmp_path / "profile-report.html")
         places = ("--rig", rig, "--session", tmp_path / "day", "--profile", other)
-        run(*COMMAND[3:], *places, "--camera", "sim", "--noise-seed", "1", status=(0, 3))
+        run(*COMMAND[3:], *places, "--practice", "--yes", "--noise-seed", "1", status=(0, 3))
         run("profile", "diff", mine, other, "--out", tmp_path / "diff", status=(0, 3))
         check_page(browser, tmp_path / "diff" / "diff.html")
         validated = ("--session", tmp_path / "day", "--out", tmp_path / "validation")

@@ -34,6 +34,12 @@ def run(
     fps: Annotated[float, typer.Option("--fps", min=1.0, max=1000.0, help="Frames per second.")] = 30.0,
     tier: Annotated[Tier, typer.Option("--tier", help="How much is done to a frame; see restore.")] = Tier.preview,
     panel_picture: PanelPicturePath = None,
+    mirror: Annotated[
+        bool, typer.Option("--mirror", help="The panel shows this run's own pictures, scaled to fill it.")
+    ] = False,
+    mirror_delay_ms: Annotated[
+        float, typer.Option("--mirror-delay-ms", min=0.0, max=500.0, help="How much later the panel shows a picture.")
+    ] = 25.0,
     hook: Annotated[
         str | None, typer.Option("--hook", help="module:function of your own that alters each frame before output.")
     ] = None,
@@ -51,5 +57,7 @@ def run(
     from udccal.live.pipeline import Limits
 
     source = LiveCamera(camera.value, serial, files, exposure_s, fps, seed)
-    wanted = LiveRun(profile, tier, source, sink, panel_picture, hook, hook_ms * 1e-3, Limits(frames, seconds), log)
+    delay_s = mirror_delay_ms * 1e-3 if mirror else None
+    limits = Limits(frames, seconds)
+    wanted = LiveRun(profile, tier, source, sink, panel_picture, delay_s, hook, hook_ms * 1e-3, limits, log)
     run_live(context.obj, wanted)

@@ -47,30 +47,37 @@ class _Captured:
     captured_ns: int
 
 
+def ignored(picture: Picture, at_ns: int) -> None:
+    """Take a written picture and do nothing with it."""
+
+
 @final
 class Pipeline:
     """One live run.
 
     Args:
         frames: the camera's frames; the run ends where they end.
-        restore: returns a frame as display-encoded RGB.
+        restore: returns a frame, which arrived at a time in ns of the monotonic clock, as display-encoded RGB.
         shape: rows and columns of these pictures.
         sink: takes them.
         hook: alters restored frames; None for none.
         limits: when to end.
         stop: ends the run when set; set when the run has ended.
+        wrote: gets every picture that the sink has taken, and when, in ns of the monotonic clock.
     """
 
     def __init__(
         self,
         frames: Iterable[Frame],
-        restore: Callable[[Frame], Picture],
+        restore: Callable[[Frame, int], Picture],
         shape: tuple[int, int],
         sink: Sink,
         hook: TimedHook | None,
         limits: Limits,
         stop: threading.Event,
+        wrote: Callable[[Picture, int], None] = ignored,
     ) -> None:
+        self._wrote = wrote
         self._frames, self._sink, self._hook = frames, sink, hook
         self._restore_frame, self._shape = restore, shape
         self._limits, self._stop = limits, stop
@@ -149,7 +156,7 @@ class Pipeline:
         try:
             while (item := self._captured.get()) is not None:
                 start = time.monotonic()
-                picture = self._restore_frame(item.frame)
+                picture = self._restore_frame(item.frame, item.captured_ns)
                 self._tally.took(Stage.RESTORATION, time.monotonic() - start)
                 if self._restored.put(RestoredFrame(picture, item.frame.frame_id, item.captured_ns)):
                     self._tally.dropped(Stage.OUTPUT)
@@ -175,7 +182,9 @@ class Pipeline:
             frame = RestoredFrame(altered, frame.frame_id, frame.captured_ns)
         self._sink.write(frame)
         self._tally.took(Stage.OUTPUT, time.monotonic() - start)
-        self._tally.written((time.monotonic_ns() - frame.captured_ns) * 1e-9, late)
+        written_ns = time.monotonic_ns()
+        self._wrote(frame.picture, written_ns)
+        self._tally.written((written_ns - frame.captured_ns) * 1e-9, late)
 
 
 def _as_sentence(stage: Stage, error: Exception) -> UdccalError:

@@ -1,15 +1,19 @@
-"""The restorer of a live run, which another of the same camera may replace between two frames."""
+"""The restorer of a live run, which another of the same camera may replace between two frames.
+
+The camera may read fewer rows than the sensor has.
+"""
 
 from __future__ import annotations
 
 from typing import final
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import UInt8, UInt16
 
 from udccal.cameras.protocol import Frame
 from udccal.errors import LiveError
 from udccal.live.exposure import AutoExposure
+from udccal.live.own_pictures import OwnPictures, PanelPicture
 from udccal.restoration.runtime import Restorer
 from udccal.restoration.tone import Tone
 from udccal.rig import RigDescription
@@ -21,14 +25,14 @@ class Restoring:
 
     Args:
         restorer: the first restorer.
-        panel_picture: what the panel shows all the time, 8-bit RGB; None when not known.
+        panel: what the panel shows: always the same 8-bit RGB picture, or the run's own; None when not known.
     """
 
-    def __init__(
-        self, restorer: Restorer, panel_picture: UInt8[np.ndarray, "panel_rows panel_columns 3"] | None = None
-    ) -> None:
-        self._panel_picture = panel_picture
+    def __init__(self, restorer: Restorer, panel: PanelPicture | OwnPictures | None = None) -> None:
+        self._panel = panel
         self._exposure: AutoExposure | None = None
+        self._whole: UInt16[np.ndarray, "sensor_rows sensor_columns"] | None = None
+        self._read = slice(0, restorer.rig.camera.rows)
         self._restorer = self._warm(restorer)
 
     @property
@@ -48,27 +52,57 @@ class Restoring:
                 f"Expected a changed profile of {before}, with which this run began, found one of {after}. "
                 "Start another run for it."
             )
+        self._check_rows(restorer)
         self._restorer = self._warm(restorer)
 
-    def restore(self, frame: Frame) -> UInt8[np.ndarray, "rows columns 3"]:
-        """Return a frame as display-encoded RGB.
+    def restore(self, frame: Frame, captured_ns: int) -> UInt8[np.ndarray, "rows columns 3"]:
+        """Return a frame, which arrived at ``captured_ns`` of the monotonic clock, as display-encoded RGB.
 
         Raises:
+            LiveError: when it lacks rows that the view needs.
             RestorationError: when the frame is not of the profile's camera.
         """
-        restorer, exposure_s, shown = self._restorer, frame.settings.exposure_s, self._panel_picture
+        restorer, exposure_s, shown = self._restorer, frame.settings.exposure_s, self._shown(captured_ns)
+        mosaic = self._of_sensor(frame)
         if self._exposure is None:
-            self._exposure = AutoExposure(restorer.restore(frame.data, exposure_s, shown))
-        picture = restorer.display(frame.data, exposure_s, self._exposure.tone, shown)
+            self._exposure = AutoExposure(restorer.restore(mosaic, exposure_s, shown))
+        picture = restorer.display(mosaic, exposure_s, self._exposure.tone, shown)
         self._exposure.follow(picture)
         return picture
+
+    def _shown(self, captured_ns: int) -> PanelPicture | None:
+        return self._panel.at(captured_ns) if isinstance(self._panel, OwnPictures) else self._panel
+
+    def _of_sensor(self, frame: Frame) -> UInt16[np.ndarray, "rows columns"]:
+        """Return a frame of the whole sensor: rows that were not read are as those read beside them at first."""
+        camera, region = self._restorer.rig.camera, frame.settings.region
+        rows = slice(region.y, region.y + region.rows)
+        if frame.data.shape != (region.rows, camera.columns) or region.rows == camera.rows or rows.stop > camera.rows:
+            return frame.data  # whole, or of another camera, which is refused
+        if self._whole is None or rows != self._read:
+            self._read = rows
+            self._check_rows(self._restorer)
+            # Mirrored, the colour pattern goes on.
+            self._whole = np.pad(frame.data, ((rows.start, camera.rows - rows.stop), (0, 0)), mode="reflect")
+        self._whole[rows] = frame.data
+        return self._whole
+
+    def _check_rows(self, restorer: Restorer) -> None:
+        wanted, read = restorer.seen_rows, self._read
+        if wanted.start < read.start or wanted.stop > read.stop:
+            raise LiveError(
+                f"Expected rows {wanted.start} to {wanted.stop} of the sensor, which the view needs, found that the "
+                f"camera reads rows {read.start} to {read.stop}. Start another run."
+            )
 
     def _warm(self, restorer: Restorer) -> Restorer:
         """Restore a grey frame: the first takes longer than others, and the camera's next ones would be dropped."""
         camera = restorer.rig.camera
         grey = np.full((camera.rows, camera.columns), 1 << (camera.bits - 1), np.uint16)
-        restorer.restore(grey, camera.min_exposure_s, self._panel_picture)
-        restorer.display(grey, camera.min_exposure_s, Tone(1.0), self._panel_picture)
+        panel = restorer.rig.panel
+        shown = None if self._panel is None else np.zeros((panel.rows, panel.columns, 3), np.uint8)
+        restorer.restore(grey, camera.min_exposure_s, shown)
+        restorer.display(grey, camera.min_exposure_s, Tone(1.0), shown)
         return restorer
 
 

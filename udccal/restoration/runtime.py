@@ -176,6 +176,14 @@ class Restorer:
         """Rows of the frame that are worked on: those that the view sees, and what their tiles reach beyond."""
         return _needed_rows(self.sharpener, self.rig)
 
+    @property
+    def seen_rows(self) -> slice:
+        """Rows of the frame that ``display`` depends on: a camera may leave out the others."""
+        if self.sharpener is not None:
+            return self.rows
+        first, last = self.rectification.rows
+        return slice(max(first, 0) // (cell := cfa_named(self.rig.camera.cfa).rows) * cell, min(last, self.rows.stop))
+
     def restore(
         self,
         mosaic: UInt16[np.ndarray, "frame_rows frame_columns"],

@@ -115,7 +115,7 @@ class _Transfer:
         return Prediction(z, np.zeros((len(z), 0)), np.transpose(slopes) @ square_root(self.cov))
 
     def gain(self) -> tuple[float, float]:
-        """The gain by these flats over the profile's, by weighted least squares, and its sigma by the errors of both."""
+        """The gain by these flats over the profile's, by weighted least squares; and its sigma, by both errors."""
         expected, (K, _, sigma_d, row, _) = self.predicted(self.values), self.values
         floor = (K * sigma_d) ** 2 - row**2 + self.rounding
         light, weight = expected - floor, self.dof[self.usable] / np.maximum(expected, 1e-9) ** 2 / 2

@@ -20,7 +20,8 @@ from udccal.errors import LiveError
 from udccal.live.durations import Spread
 from udccal.live.follow import ProfileFollower
 from udccal.live.hook import TimedHook, load_hook
-from udccal.live.pipeline import Limits, Pipeline
+from udccal.live.own_pictures import OwnPictures
+from udccal.live.pipeline import Limits, Pipeline, ignored
 from udccal.live.restoring import Restoring
 from udccal.live.sinks.protocol import make_sink
 from udccal.live.tally import Figures
@@ -44,10 +45,22 @@ class LiveRun:
     camera: LiveCamera
     sink: str
     panel_picture: Path | None
+    mirror_delay_s: float | None
     hook: str | None
     hook_s: float
     limits: Limits
     log: Path | None
+
+    def __post_init__(self) -> None:
+        if self.mirror_delay_s is None:
+            return
+        if self.panel_picture is not None:
+            raise LiveError("Expected one of --mirror and --panel-picture, found both. Leave one out.")
+        if self.camera.kind in ("sim", "files"):
+            raise LiveError(
+                f"Expected --mirror with a camera that sees the panel, found --camera {self.camera.kind}, whose frames "
+                "are made before. Use --camera u3v or pylon."
+            )
 
 
 def run_live(output: Output, wanted: LiveRun) -> None:
@@ -72,8 +85,9 @@ def run_live(output: Output, wanted: LiveRun) -> None:
             shown = None if wanted.panel_picture is None else read_panel_picture(wanted.panel_picture, profile.rig)
             deliver = open_.enter_context(wanted.camera.open(profile.rig))  # another camera is refused at once
             restorer = prepared(profile)
-            restoring = Restoring(restorer, shown)
-            frames = deliver(restorer.view, shown)
+            own = None if wanted.mirror_delay_s is None else OwnPictures(profile.rig.panel, wanted.mirror_delay_s)
+            restoring = Restoring(restorer, own or shown)
+            frames = deliver(restorer.view, shown, restorer.seen_rows)
         open_.enter_context(_ended_by_signals(stop))
         open_.enter_context(follower)
         output.say("Running; Ctrl-C ends it.")
@@ -83,7 +97,8 @@ def run_live(output: Output, wanted: LiveRun) -> None:
                 stage.update(round(figures.elapsed_s), text=_line(figures))
                 write(figures)
 
-            run = Pipeline(frames, restoring.restore, restoring.shape, sink, hook, wanted.limits, stop)
+            shape, wrote = restoring.shape, ignored if own is None else own.wrote
+            run = Pipeline(frames, restoring.restore, shape, sink, hook, wanted.limits, stop, wrote)
             whole = run.run(show)
         write(whole)
     output.table(_table(whole))

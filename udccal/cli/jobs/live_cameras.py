@@ -17,7 +17,7 @@ from udccal.cameras.checks import check_settings
 from udccal.cameras.choice import check_camera, mode_for
 from udccal.cameras.files import FileCamera
 from udccal.cameras.picture_files.sidecar import list_folder
-from udccal.cameras.protocol import Camera, Frame, Range, Settings
+from udccal.cameras.protocol import Camera, Frame, Range, Region, Settings
 from udccal.cameras.simulated import SimulatedCamera
 from udccal.cli.jobs.benches import pylon_camera, u3v_camera
 from udccal.cli.jobs.demonstration import portrait
@@ -33,8 +33,10 @@ _LOOP: Final = 8
 _DEFAULT_EXPOSURE_S: Final = 8e-3
 
 PanelPicture = UInt8[np.ndarray, "panel_rows panel_columns 3"]
-# Delivers frames; a simulated camera sees a scene that fills the view, and what the panel shows.
-Frames = Callable[[VirtualView, PanelPicture | None], Iterator[Frame]]
+# Delivers frames of these rows at least; a simulated camera sees a scene that fills the view, and what the panel shows.
+Frames = Callable[[VirtualView, PanelPicture | None, slice], Iterator[Frame]]
+# Rows above and below those that the view needs: a profile that replaces this one may see a little further.
+_SPARE_ROWS: Final = 16
 
 
 @final
@@ -77,33 +79,50 @@ class LiveCamera:
             if self.exposure_s is not None:
                 camera = SimulatedCamera(world)
                 check_settings(Settings(self.exposure_s, 0.0, camera.sensor), camera.features, camera.sensor)
-            yield lambda view, shown: looped(self._rendered(world, view, shown), self.rate_hz)
+            yield lambda view, shown, rows: looped(self._rendered(world, view, shown, rows), self.rate_hz)
         elif self.files is not None:
             with FileCamera(self.files, rig.camera.cfa, rig.camera.bits, self.exposure_s) as files:
                 check_camera(files, rig)
                 count = len(list_folder(self.files))
-                yield lambda view, shown: paced(files.frames(count), self.rate_hz)
+                yield lambda view, shown, rows: paced(files.frames(count), self.rate_hz)
         else:
             with u3v_camera(self.serial) if self.kind == "u3v" else pylon_camera(self.serial) as real:
                 self._set(real, rig)
                 check_camera(real, rig)
-                yield lambda view, shown: streamed(real)
+                yield lambda view, shown, rows: streamed(self._reading(real, rows))
 
     def _rendered(
-        self, world: SimulatedWorld, view: VirtualView, panel_picture: PanelPicture | None
+        self, world: SimulatedWorld, view: VirtualView, panel_picture: PanelPicture | None, rows: slice
     ) -> tuple[Frame, ...]:
         """Return a few frames of a photograph before the simulated rig, so that simulation takes no time later."""
         scene = capture_photograph(world, portrait(), view, panel_picture)
         with SimulatedCamera(world) as camera:
-            camera.configure(Settings(self.exposure_s or scene.exposure_s, 0.0, camera.sensor))
+            region = region_of(rows, camera.sensor, camera.features.region_steps)
+            camera.configure(Settings(self.exposure_s or scene.exposure_s, 0.0, region))
             return tuple(camera.frames(_LOOP))
+
+    def _reading(self, camera: Camera, rows: slice) -> Camera:
+        """Have the camera read these rows."""
+        camera.configure(self._settings(camera, region_of(rows, camera.sensor, camera.features.region_steps)))
+        return camera
+
+    def _settings(self, camera: Camera, region: Region) -> Settings:
+        exposure_s = self.exposure_s or _within(_DEFAULT_EXPOSURE_S, camera.features.exposure_s)
+        return Settings(exposure_s, _within(0.0, camera.features.gain_dB), region)
 
     def _set(self, camera: Camera, rig: RigDescription) -> None:
         mode = mode_for(camera.features, camera.sensor, rig.camera.cfa, rig.camera.bits)
         rate_hz = _within(min(self.rate_hz, mode.frame_rate_hz or self.rate_hz), camera.features.frame_rate_hz)
         camera.set_mode(replace(mode, frame_rate_hz=rate_hz))
-        exposure_s = self.exposure_s or _within(_DEFAULT_EXPOSURE_S, camera.features.exposure_s)
-        camera.configure(Settings(exposure_s, _within(0.0, camera.features.gain_dB), camera.sensor))
+        camera.configure(self._settings(camera, camera.sensor))
+
+
+def region_of(rows: slice, sensor: Region, steps: tuple[int, int, int, int]) -> Region:
+    """Return the region of whole rows that has these and some to spare, in the camera's ``region_steps``."""
+    _, step_y, _, step_rows = steps
+    first = max(rows.start - _SPARE_ROWS, 0) // step_y * step_y
+    count = -(-(min(rows.stop + _SPARE_ROWS, sensor.rows) - first) // step_rows) * step_rows
+    return Region(0, first, sensor.columns, count) if first + count <= sensor.rows else sensor
 
 
 def _within(value: float, bounds: Range) -> float:

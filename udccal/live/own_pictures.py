@@ -1,0 +1,49 @@
+"""What an AR mirror's panel shows: the run's own pictures, each until the next one."""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from typing import Final, final
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from udccal.rig import Panel
+
+PanelPicture = UInt8[np.ndarray, "panel_rows panel_columns 3"]
+# Pictures of half a second at 30 Hz: no panel is later.
+_KEPT: Final = 16
+
+
+@final
+class OwnPictures:
+    """The pictures that the sink took, scaled to fill the panel.
+
+    Args:
+        panel: its size.
+        delay_s: from a picture's writing to the middle of its time on the panel.
+    """
+
+    def __init__(self, panel: Panel, delay_s: float) -> None:
+        self._size, self._delay_ns = (panel.columns, panel.rows), round(delay_s * 1e9)
+        self._written: deque[tuple[int, UInt8[np.ndarray, "rows columns 3"]]] = deque(maxlen=_KEPT)
+        self._latest: tuple[int, PanelPicture] | None = None
+        self._lock = threading.Lock()
+
+    def wrote(self, picture: UInt8[np.ndarray, "rows columns 3"], at_ns: int) -> None:
+        """Take a picture that the sink has taken at a time of the monotonic clock."""
+        with self._lock:
+            self._written.append((at_ns, picture))
+
+    def at(self, captured_ns: int) -> PanelPicture | None:
+        """Return what the panel showed while a frame was exposed that arrived then; None before the first picture."""
+        with self._lock:
+            shown = [one for one in self._written if one[0] + self._delay_ns <= captured_ns]
+        if not shown:
+            return None
+        at_ns, picture = shown[-1]
+        if self._latest is None or self._latest[0] != at_ns:
+            self._latest = at_ns, cv2.resize(picture, self._size, interpolation=cv2.INTER_AREA)
+        return self._latest[1]
