@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import final
 
@@ -59,8 +60,8 @@ def effects_of(
         case "backscatter":
             error = _stated(a.backscatter, b.backscatter, "held_out_without_noise_of_peak", 100.0)
             name, lost = "panel's light, RMS, of its peak", loss.backscatter
-            gain = 100 * float(np.hypot(*(_relative_sigma(p.noise, "K_DN_per_e") for p in (a, b))))
-            error = None if error is None else float(np.hypot(error, gain))  # electrons are DN over the gain
+            gain = 100 * math.hypot(*(_relative_sigma(p.noise, "K_DN_per_e") for p in (a, b)))
+            error = None if error is None else math.hypot(error, gain)  # electrons are DN over the gain
             first = Effect(name, _light(maps), "%", limits.backscatter_percent, error)
     return first, Effect(_LOSS, lost, "dB", limits.picture_dB)
 
