@@ -136,12 +136,10 @@ def test_video_names_are_checked_first(tmp_path: Path) -> None:
             VideoSink(wrong, 30.0)
 
 
-def test_a_window_is_refused_where_opencv_has_none(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cv2, "getBuildInformation", lambda: "  GUI:                           NONE\n")
-    with pytest.raises(LiveError, match=r"headless build .* --sink shm:NAME"):
+def test_a_window_needs_its_package(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pygame", None)
+    with pytest.raises(LiveError, match=r"pip install 'udccal\[window\]'"):
         WindowSink("", 30.0)
-    monkeypatch.setattr(cv2, "getBuildInformation", lambda: "  GUI:                           QT5\n")
-    WindowSink("", 30.0)
 
 
 def test_a_virtual_camera_needs_its_package(monkeypatch: pytest.MonkeyPatch) -> None:

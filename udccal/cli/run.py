@@ -19,7 +19,7 @@ def run(
         str,
         typer.Option(
             "--sink",
-            help="Where frames go: shm:NAME, video:FILE.mp4, images:FOLDER, v4l2:/dev/videoN, window:TITLE.",
+            help="Where frames go: shm:NAME, video:FILE.mp4, images:FOLDER, v4l2:/dev/videoN, window:MONITOR.",
         ),
     ],
     camera: Annotated[
