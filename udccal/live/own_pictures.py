@@ -38,12 +38,16 @@ class OwnPictures:
             self._written.append((at_ns, picture))
 
     def at(self, captured_ns: int) -> PanelPicture | None:
-        """Return what the panel showed while a frame was exposed that arrived then; None before the first picture."""
+        """Return what the panel showed while a frame was exposed that arrived then; None before the first picture.
+
+        Frames come in order: pictures before the one that is returned are forgotten.
+        """
         with self._lock:
-            shown = [one for one in self._written if one[0] + self._delay_ns <= captured_ns]
-        if not shown:
+            while len(self._written) > 1 and self._written[1][0] + self._delay_ns <= captured_ns:
+                self._written.popleft()
+            at_ns, picture = self._written[0] if self._written else (captured_ns, None)
+        if picture is None or at_ns + self._delay_ns > captured_ns:
             return None
-        at_ns, picture = shown[-1]
         if self._latest is None or self._latest[0] != at_ns:
             self._latest = at_ns, cv2.resize(picture, self._size, interpolation=cv2.INTER_AREA)
         return self._latest[1]
