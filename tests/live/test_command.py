@@ -13,6 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import cv2
+import jax
 import numpy as np
 import pytest
 
@@ -21,7 +22,7 @@ from tests.live.conftest import COLUMNS, ROWS
 from udccal.cli.jobs.live import LiveRun, run_live
 from udccal.cli.jobs.live_cameras import LiveCamera
 from udccal.cli.output import Output
-from udccal.errors import CameraError, UdccalError
+from udccal.errors import CameraError, LiveError, UdccalError
 from udccal.io.png import read_rgb8, write_png16
 from udccal.live.pipeline import Limits
 from udccal.tiers import Tier
@@ -95,7 +96,7 @@ def test_a_signal_ends_it_and_removes_the_shared_memory(
 def test_a_sink_that_is_not_here_is_refused(profile_folder: Path) -> None:
     done = udccal_run("--profile", profile_folder, "--sink", "window:")
     assert done.returncode == 1
-    assert "headless build" in json.loads(done.stdout)["error"]
+    assert "a desktop to open a window on, found none" in json.loads(done.stdout)["error"]
 
 
 @pytest.mark.parametrize(
@@ -113,10 +114,44 @@ def test_what_cannot_begin_is_refused_before_the_profile_is_read(
     monkeypatch.setattr("udccal.cli.jobs.live.keep_compilations", lambda: None)
     camera = LiveCamera("sim", None, None, None, 30.0, 0)
     wanted = LiveRun(
-        Path("no-such-profile"), Tier.preview, camera, "shm:not-made", None, None, None, 1.0, Limits(frames=1), None
+        Path("no-such-profile"),
+        Tier.preview,
+        camera,
+        "shm:not-made",
+        None,
+        None,
+        "cpu",
+        None,
+        1.0,
+        Limits(frames=1),
+        None,
     )
     with pytest.raises(UdccalError, match=message):
         run_live(Output(), replace(wanted, **changes))
+
+
+@pytest.mark.parametrize(
+    ("kind", "changes", "message"),
+    [
+        ("sim", {"mirror_delay_s": 0.02}, "--mirror with a camera that sees the panel, found --camera sim"),
+        ("u3v", {"mirror_delay_s": 0.02, "panel_picture": Path("a.png")}, "one of --mirror and --panel-picture"),
+        ("u3v", {"device": "gpu"}, "a tier that deblurs with --device gpu, found preview"),
+    ],
+)
+def test_what_does_not_go_together_is_refused(kind: str, changes: dict[str, object], message: str) -> None:
+    camera = LiveCamera(kind, None, None, None, 30.0, 0)
+    wanted = LiveRun(Path("p"), Tier.preview, camera, "shm:not-made", None, None, "cpu", None, 1.0, Limits(), None)
+    with pytest.raises(LiveError, match=message):
+        replace(wanted, **changes)
+
+
+def test_a_gpu_that_is_not_there_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("udccal.cli.jobs.live.keep_compilations", lambda: None)
+    monkeypatch.setattr("jax.devices", lambda: jax.local_devices(backend="cpu"))
+    camera = LiveCamera("u3v", None, None, None, 30.0, 0)
+    wanted = LiveRun(Path("p"), Tier.fast, camera, "shm:not-made", None, None, "gpu", None, 1.0, Limits(), None)
+    with pytest.raises(LiveError, match=r"a GPU that JAX can use, found none. .* leave --device out"):
+        run_live(Output(), wanted)
 
 
 def test_another_camera_is_refused_before_the_profile_is_prepared(
@@ -126,7 +161,9 @@ def test_another_camera_is_refused_before_the_profile_is_prepared(
     monkeypatch.setattr("udccal.cli.jobs.live.Restorer", None)
     write_png16(tmp_path / "small.png", np.full((32, 48), 900, np.uint16))
     camera = LiveCamera("files", None, tmp_path, 1e-3, 30.0, 0)
-    wanted = LiveRun(profile_folder, Tier.fast, camera, "shm:not-made", None, None, None, 1.0, Limits(frames=1), None)
+    wanted = LiveRun(
+        profile_folder, Tier.fast, camera, "shm:not-made", None, None, "cpu", None, 1.0, Limits(frames=1), None
+    )
     with pytest.raises(CameraError, match=r"a camera of 96 x 64.* found 48 x 32"):
         run_live(Output(), wanted)
 

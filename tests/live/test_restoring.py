@@ -7,11 +7,13 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 
 from tests.live.conftest import COLUMNS, NOISE, ROWS, profile_of, raw_frame
 from tests.live.test_pipeline import ListSink
+from tests.scenes import toy_restorer
 from udccal.cameras.protocol import Frame, Region
 from udccal.errors import LiveError, RestorationError
 from udccal.live.exposure import AutoExposure
@@ -22,6 +24,7 @@ from udccal.live.pipeline import Limits, Pipeline
 from udccal.live.restoring import Restoring
 from udccal.profiles.profile import Profile
 from udccal.profiles.store import write_profile
+from udccal.restoration.device.restorer import DeviceRestorer
 from udccal.restoration.runtime import Restorer
 from udccal.restoration.tone import Tone, display_exposure
 from udccal.rig import RigDescription, load_rig
@@ -95,6 +98,18 @@ def test_rows_that_the_view_needs_are_enough(live_profile: Profile, tier: Tier) 
         assert (needed.start, needed.stop) != (0, 64)
         with pytest.raises(LiveError, match=rf"Expected rows {needed.start} to .* reads rows {needed.start + 2} to"):
             read.restore(part_of(frames[0], slice(needed.start + 2, 64)), 0)
+
+
+@pytest.mark.medium
+def test_a_device_shows_the_same() -> None:
+    restorer = toy_restorer.made(Tier.balanced, toy_restorer.rig(), NOISE, toy_restorer.geometry(), toy_restorer.grid())
+    on_device = Restoring(restorer, None, jax.devices("cpu")[0])
+    assert isinstance(on_device._shows, DeviceRestorer)
+    settings = replace(raw_frame(0).settings, region=Region(0, 0, toy_restorer.COLUMNS, toy_restorer.ROWS))
+    data = toy_restorer.exposed(restorer, toy_restorer.grid(), toy_restorer.scene())
+    frame = replace(raw_frame(0), data=data, settings=replace(settings, exposure_s=toy_restorer.EXPOSURE_S))
+    off = on_device.restore(frame, 0).astype(int) - Restoring(restorer).restore(frame, 0)
+    assert np.abs(off).max() <= 2
 
 
 def test_a_profile_whose_view_needs_other_rows_is_refused(restoring: Restoring) -> None:

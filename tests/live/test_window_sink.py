@@ -20,9 +20,10 @@ import numpy as np
 from udccal.live.sinks.protocol import RestoredFrame
 from udccal.live.sinks.window import WindowSink
 
-sink, picture = WindowSink(sys.argv[1], 30.0), np.zeros((4, 8, 3), np.uint8)
+picture = np.zeros((4, 8, 3), np.uint8)
 picture[:, :4, 0] = picture[:, 4:, 1] = 200
 try:
+    sink = WindowSink(sys.argv[1], 30.0)
     sink.open((4, 8))
     for _ in range(20):
         sink.write(RestoredFrame(picture, 0, 0))
@@ -32,7 +33,8 @@ try:
         print("shown", flush=True)
 except Exception as error:
     print(error, flush=True)
-sink.close()
+else:
+    sink.close()
 """
 
 

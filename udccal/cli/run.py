@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import enum
 from pathlib import Path
 from typing import Annotated
 
@@ -10,6 +11,13 @@ import typer
 from udccal.cli.bench_options import CameraKind
 from udccal.cli.options import FoundProfile, PanelPicturePath, Seed
 from udccal.tiers import Tier
+
+
+class Device(enum.StrEnum):
+    """Where frames are restored."""
+
+    cpu = "cpu"
+    gpu = "gpu"
 
 
 def run(
@@ -40,6 +48,7 @@ def run(
     mirror_delay_ms: Annotated[
         float, typer.Option("--mirror-delay-ms", min=0.0, max=500.0, help="How much later the panel shows a picture.")
     ] = 25.0,
+    device: Annotated[Device, typer.Option("--device", help="gpu: restore on a GPU that JAX can use.")] = Device.cpu,
     hook: Annotated[
         str | None, typer.Option("--hook", help="module:function of your own that alters each frame before output.")
     ] = None,
@@ -59,5 +68,6 @@ def run(
     source = LiveCamera(camera.value, serial, files, exposure_s, fps, seed)
     delay_s = mirror_delay_ms * 1e-3 if mirror else None
     limits = Limits(frames, seconds)
-    wanted = LiveRun(profile, tier, source, sink, panel_picture, delay_s, hook, hook_ms * 1e-3, limits, log)
+    shown = panel_picture, delay_s
+    wanted = LiveRun(profile, tier, source, sink, *shown, device.value, hook, hook_ms * 1e-3, limits, log)
     run_live(context.obj, wanted)

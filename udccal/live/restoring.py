@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from typing import final
 
+import jax
 import numpy as np
 from jaxtyping import UInt8, UInt16
 
@@ -14,6 +15,7 @@ from udccal.cameras.protocol import Frame
 from udccal.errors import LiveError
 from udccal.live.exposure import AutoExposure
 from udccal.live.own_pictures import OwnPictures, PanelPicture
+from udccal.restoration.device.restorer import DeviceRestorer
 from udccal.restoration.runtime import Restorer
 from udccal.restoration.tone import Tone
 from udccal.rig import RigDescription
@@ -26,14 +28,27 @@ class Restoring:
     Args:
         restorer: the first restorer.
         panel: what the panel shows: always the same 8-bit RGB picture, or the run's own; None when not known.
+        device: of JAX, on which frames are restored; None for the processor.
+
+    Raises:
+        RestorationError: when the tier does not run on a device.
     """
 
-    def __init__(self, restorer: Restorer, panel: PanelPicture | OwnPictures | None = None) -> None:
-        self._panel = panel
+    def __init__(
+        self,
+        restorer: Restorer,
+        panel: PanelPicture | OwnPictures | None = None,
+        device: jax.Device | None = None,
+    ) -> None:
+        self._panel, self._device = panel, device
         self._exposure: AutoExposure | None = None
         self._whole: UInt16[np.ndarray, "sensor_rows sensor_columns"] | None = None
         self._read = slice(0, restorer.rig.camera.rows)
-        self._restorer = self._warm(restorer)
+        self._shows = self._warm(restorer)
+
+    @property
+    def _restorer(self) -> Restorer:
+        return self._shows.restorer if isinstance(self._shows, DeviceRestorer) else self._shows
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -53,7 +68,7 @@ class Restoring:
                 "Start another run for it."
             )
         self._check_rows(restorer)
-        self._restorer = self._warm(restorer)
+        self._shows = self._warm(restorer)
 
     def restore(self, frame: Frame, captured_ns: int) -> UInt8[np.ndarray, "rows columns 3"]:
         """Return a frame, which arrived at ``captured_ns`` of the monotonic clock, as display-encoded RGB.
@@ -62,11 +77,12 @@ class Restoring:
             LiveError: when it lacks rows that the view needs.
             RestorationError: when the frame is not of the profile's camera.
         """
-        restorer, exposure_s, shown = self._restorer, frame.settings.exposure_s, self._shown(captured_ns)
+        shows, restorer, exposure_s = self._shows, self._restorer, frame.settings.exposure_s
+        shown = self._shown(captured_ns)
         mosaic = self._of_sensor(frame)
         if self._exposure is None:
             self._exposure = AutoExposure(restorer.restore(mosaic, exposure_s, shown))
-        picture = restorer.display(mosaic, exposure_s, self._exposure.tone, shown)
+        picture = shows.display(mosaic, exposure_s, self._exposure.tone, shown)
         self._exposure.follow(picture)
         return picture
 
@@ -95,15 +111,16 @@ class Restoring:
                 f"camera reads rows {read.start} to {read.stop}. Start another run."
             )
 
-    def _warm(self, restorer: Restorer) -> Restorer:
+    def _warm(self, restorer: Restorer) -> Restorer | DeviceRestorer:
         """Restore a grey frame: the first takes longer than others, and the camera's next ones would be dropped."""
         camera = restorer.rig.camera
         grey = np.full((camera.rows, camera.columns), 1 << (camera.bits - 1), np.uint16)
         panel = restorer.rig.panel
         shown = None if self._panel is None else np.zeros((panel.rows, panel.columns, 3), np.uint8)
         restorer.restore(grey, camera.min_exposure_s, shown)
-        restorer.display(grey, camera.min_exposure_s, Tone(1.0), shown)
-        return restorer
+        shows = restorer if self._device is None else DeviceRestorer.of(restorer, self._device)
+        shows.display(grey, camera.min_exposure_s, Tone(1.0), shown)
+        return shows
 
 
 def _sizes(rig: RigDescription) -> str:

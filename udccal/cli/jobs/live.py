@@ -10,7 +10,9 @@ from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import FrameType
-from typing import Final, final
+from typing import Final, Literal, final
+
+import jax
 
 from udccal.cli.jobs.live_cameras import LiveCamera
 from udccal.cli.jobs.panel_picture import read_panel_picture
@@ -46,12 +48,18 @@ class LiveRun:
     sink: str
     panel_picture: Path | None
     mirror_delay_s: float | None
+    device: Literal["cpu", "gpu"]
     hook: str | None
     hook_s: float
     limits: Limits
     log: Path | None
 
     def __post_init__(self) -> None:
+        if self.device == "gpu" and self.tier is Tier.preview:
+            raise LiveError(
+                "Expected a tier that deblurs with --device gpu, found preview, which takes some milliseconds of a "
+                "processor. Choose --tier fast, balanced or accurate."
+            )
         if self.mirror_delay_s is None:
             return
         if self.panel_picture is not None:
@@ -70,6 +78,7 @@ def run_live(output: Output, wanted: LiveRun) -> None:
         UdccalError: when the run cannot begin, or a part of it fails.
     """
     keep_compilations()
+    device = _gpu() if wanted.device == "gpu" else None
     sink = make_sink(wanted.sink, wanted.camera.rate_hz)
     hook = None if wanted.hook is None else TimedHook(load_hook(wanted.hook), wanted.hook_s)
     path, stop = find_profile(wanted.profile), threading.Event()
@@ -86,7 +95,7 @@ def run_live(output: Output, wanted: LiveRun) -> None:
             deliver = open_.enter_context(wanted.camera.open(profile.rig))  # another camera is refused at once
             restorer = prepared(profile)
             own = None if wanted.mirror_delay_s is None else OwnPictures(profile.rig.panel, wanted.mirror_delay_s)
-            restoring = Restoring(restorer, own or shown)
+            restoring = Restoring(restorer, own or shown, device)
             frames = deliver(restorer.view, shown, restorer.seen_rows)
         open_.enter_context(_ended_by_signals(stop))
         open_.enter_context(follower)
@@ -103,6 +112,16 @@ def run_live(output: Output, wanted: LiveRun) -> None:
         write(whole)
     output.table(_table(whole))
     output.result(whole)
+
+
+def _gpu() -> jax.Device:
+    found = [device for device in jax.devices() if device.platform != "cpu"]
+    if not found:
+        raise LiveError(
+            "Expected a GPU that JAX can use, found none. Install JAX for it (docs.jax.dev, Installation), or leave "
+            "--device out."
+        )
+    return found[0]
 
 
 @contextlib.contextmanager

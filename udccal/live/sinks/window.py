@@ -29,20 +29,13 @@ class WindowSink:
         self._title = "udccal" if self._monitor is not None else target or "udccal"
         self._pygame = _library()
         self._window: Any = None
+        self._reach_desktop()
+        self._pygame.display.quit()  # windows belong to the thread that opens them
 
     def open(self, shape: tuple[int, int]) -> None:
         """Open the window."""
         game, (rows, columns) = self._pygame, shape
-        try:
-            game.display.init()
-            driver = game.display.get_driver()
-        except game.error as error:
-            driver = str(error)
-        if not game.display.get_init() or driver in _INVISIBLE:
-            raise LiveError(
-                f"Expected a desktop to open a window on, found none ({driver}). Run this in a desktop session, or use "
-                "--sink shm:NAME."
-            )
+        self._reach_desktop()
         if self._monitor is None:
             self._window = game.Window(self._title, (columns, rows), resizable=True)
             return
@@ -54,6 +47,19 @@ class WindowSink:
         place = (_CENTRED_ON | self._monitor,) * 2
         self._window = game.Window(self._title, sizes[self._monitor], place, fullscreen_desktop=True, borderless=True)
         game.mouse.set_visible(False)
+
+    def _reach_desktop(self) -> None:
+        game = self._pygame
+        try:
+            game.display.init()
+            driver = game.display.get_driver()
+        except game.error as error:
+            driver = str(error)
+        if not game.display.get_init() or driver in _INVISIBLE:
+            raise LiveError(
+                f"Expected a desktop to open a window on, found none ({driver}). Run this in a desktop session, or use "
+                "--sink shm:NAME."
+            )
 
     def write(self, frame: RestoredFrame) -> None:
         """Show a frame."""
