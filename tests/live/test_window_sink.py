@@ -51,10 +51,7 @@ def shower(display: str, target: str) -> subprocess.Popen[str]:
 
 def line(process: subprocess.Popen[str]) -> str:
     assert process.stdout is not None
-    found = "pygame"
-    while found.startswith("pygame"):  # the library's greeting
-        found = process.stdout.readline()
-    return found.strip()
+    return process.stdout.readline().strip()
 
 
 def test_a_monitor_is_filled_without_distortion() -> None:

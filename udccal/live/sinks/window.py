@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import os
 from types import ModuleType
 from typing import Any, Final, final
 
@@ -86,6 +87,7 @@ class WindowSink:
 
 
 def _library() -> ModuleType:
+    os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")  # its greeting would stand before our JSON
     try:
         return importlib.import_module("pygame")
     except ImportError as error:
