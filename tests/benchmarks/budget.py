@@ -29,12 +29,12 @@ from udccal.arrangements import Photograph
 from udccal.cfa import cfa_named
 from udccal.profiles.store import load_profile
 from udccal.restoration.backscatter import PanelLight
-from udccal.restoration.deblur import THREE_COLOURS
+from udccal.restoration.colour_tables import THREE_COLOURS, colour_tables
 from udccal.restoration.demosaic import demosaic
 from udccal.restoration.kernel_grid import KernelGrid, interpolated_kernels
 from udccal.restoration.linear import variance_e2
 from udccal.restoration.metrics import encode_srgb, least_squares_gain, psnr
-from udccal.restoration.mosaic_filter import FilterTables, Pattern, filter_tables, filtered_and_joined
+from udccal.restoration.mosaic_filter import Pattern, Tables, filter_tables, filtered_and_joined
 from udccal.restoration.plan import PlanOptions, kernel_grid
 from udccal.restoration.runtime import Restorer
 from udccal.restoration.shrink import BandNoise, measured_noise, shrunk
@@ -86,13 +86,14 @@ class Filter:
 
     pattern: Pattern
     layout: TileLayout
-    tables: FilterTables
+    tables: Tables
     noise: BandNoise
 
     @classmethod
     def of(cls, grid: KernelGrid, pattern: Pattern, rows: int, columns: int) -> Filter:
         layout = layout_for(rows, columns, (pattern.rows, pattern.columns), (_TILE, _TILE), (0, rows))
-        tables = filter_tables(grid, layout, pattern, _WORKERS)
+        whole = pattern is THREE_COLOURS
+        tables = colour_tables(grid, layout, _WORKERS) if whole else filter_tables(grid, layout, pattern, _WORKERS)
         return cls(pattern, layout, tables, measured_noise(tables, layout, pattern, _WORKERS))
 
     def restored(self, light_e: Rgb, variance: Rgb) -> Rgb:

@@ -10,27 +10,23 @@ fitted to the finest diagonal detail of the tiles, where a blurred picture has n
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Final, final
-
 import cv2
 import numpy as np
 from jaxtyping import Float, Float32
 from scipy.optimize import nnls
 
-from udccal.cfa import BLUE, GREEN, RED, Site
 from udccal.errors import RestorationError
 from udccal.restoration.blur import blurred
 from udccal.restoration.checks import check_count, real_array
+from udccal.restoration.colour_tables import THREE_COLOURS, colour_tables
 from udccal.restoration.kernel_grid import KernelGrid
-from udccal.restoration.mosaic_filter import filter_tables, filtered_and_joined
+from udccal.restoration.mosaic_filter import filtered_and_joined
 from udccal.restoration.network import refined, sharper
 from udccal.restoration.plan import PlanOptions
 from udccal.restoration.shrink import measured_noise, shrunk
 from udccal.restoration.tiles import TileLayout, layout_for
 from udccal.tiers import Tier, tier_named
 
-_EVERY = (slice(None), slice(None))
 # The finest diagonal detail: second differences along both axes.
 _DIAGONAL = np.outer([1.0, -2.0, 1.0], [1.0, -2.0, 1.0]).astype(np.float32)
 # Median of |x| of a normal distribution with sigma 1.
@@ -40,19 +36,6 @@ _REWEIGHTINGS = 3
 _LEAST_VARIANCE = float(np.finfo(np.float32).eps) ** 2
 # The result is in single precision, and overshoots.
 _MOST = 1e36
-
-
-@final
-@dataclass(frozen=True, eq=False)
-class _ThreeColours:
-    """The pattern of pictures that have all colours at every pixel. There is one; it is compared by identity."""
-
-    sites: tuple[Site, ...] = tuple(Site(0, 0, channel, _EVERY) for channel in (RED, GREEN, BLUE))
-    rows: int = 1
-    columns: int = 1
-
-
-THREE_COLOURS: Final = _ThreeColours()
 
 
 def deblur(
@@ -98,7 +81,7 @@ def deblur(
     tiles = _cut(light, layout)
     read, slope = _noise_line(tiles)
     noise = np.sqrt(np.maximum(read + slope * tiles.mean(axis=(2, 3)), _LEAST_VARIANCE)).astype(np.float32)
-    tables = filter_tables(grid, layout, THREE_COLOURS, workers)
+    tables = colour_tables(grid, layout, workers)
     given = noise, tables, layout, THREE_COLOURS, workers
     chosen, strengths = filtered_and_joined(tiles, *given)
     if tier is Tier.fast:

@@ -29,7 +29,6 @@ from jaxtyping import Complex64, Complex128, Float, Float32, Float64, Int
 from scipy import fft
 
 from udccal.cfa import Site
-from udccal.restoration.eigen import eigen_of_three
 from udccal.restoration.kernel_grid import KernelGrid, centred, interpolated_kernels
 from udccal.restoration.site_planes import joined_planes, plane_spectra
 from udccal.restoration.tiles import TileLayout
@@ -72,10 +71,35 @@ class Pattern(Protocol):
         """Columns of the cell."""
 
 
+@runtime_checkable
+class Tables(Protocol):
+    """What the filter needs of the kernels: of a mosaic, ``FilterTables``; of whole colours, ``ColourTables``."""
+
+    @property
+    def matched(self) -> Complex64[np.ndarray, "*tiles places sites site_rows site_half"]:
+        """Transfer from each site plane to the picture's plane at each place of the cell."""
+
+    def at(self, tiles: int | Int[np.ndarray, " some"]) -> Tables:
+        """Return the tables of one tile, or of several."""
+
+    def along(self, spectra: Complex64[np.ndarray, "sites rows half"]) -> Complex64[np.ndarray, "sites rows half"]:
+        """Return the site planes' spectra in the coordinates that the other methods work in."""
+
+    def costs(
+        self, along: Complex64[np.ndarray, "sites rows half"], samples: float
+    ) -> Callable[[Float32[np.ndarray, " some"]], Float32[np.ndarray, " some"]]:
+        """Return the negative log likelihood of a tile's ``samples``, twice and up to a constant, by strength."""
+
+    def solved(
+        self, along: Complex64[np.ndarray, "sites rows half"], strength: np.float32
+    ) -> Complex64[np.ndarray, "sites rows half"]:
+        """Return (B + 1 / s)^-1 Y; ``along`` may be overwritten."""
+
+
 @final
 @dataclass(frozen=True)
 class FilterTables:
-    """What the filter needs of the kernels of one tile, or of several.
+    """The tables of the kernels of one tile, or of several, of a mosaic.
 
     Attributes:
         matched: transfer from each site plane of the mosaic to the picture's plane at each place of the cell: prior
@@ -92,9 +116,37 @@ class FilterTables:
         """Return the tables of one tile, or of several."""
         return FilterTables(self.matched[tiles], self.vectors[tiles], self.values[tiles])
 
+    def along(self, spectra: Complex64[np.ndarray, "sites rows half"]) -> Complex64[np.ndarray, "sites rows half"]:
+        """Return V Y: along the eigenvectors."""
+        return _products(self.vectors, spectra)
+
+    def costs(
+        self, along: Complex64[np.ndarray, "sites rows half"], samples: float
+    ) -> Callable[[Float32[np.ndarray, " some"]], Float32[np.ndarray, " some"]]:
+        """Return the likelihood of every n-th frequency, ready for any strengths; see ``Tables``."""
+        some = along[:, ::SPARSE, ::SPARSE]
+        power = ((some.real**2 + some.imag**2) / np.float32(samples)).ravel()
+        value = self.values[:, ::SPARSE, ::SPARSE].ravel()
+
+        def costs(strengths: Float32[np.ndarray, " some"]) -> Float32[np.ndarray, " some"]:
+            variance = strengths[:, None] * value
+            variance += 1
+            found: Float32[np.ndarray, " some"] = np.log(variance).sum(axis=1)
+            return found + np.divide(power, variance, out=variance).sum(axis=1)
+
+        return costs
+
+    def solved(
+        self, along: Complex64[np.ndarray, "sites rows half"], strength: np.float32
+    ) -> Complex64[np.ndarray, "sites rows half"]:
+        """Return (B + 1 / s)^-1 Y."""
+        weighted = np.conjugate(along)
+        weighted *= 1 / (self.values + 1 / strength)
+        return np.conjugate(_products(self.vectors.swapaxes(0, 1), weighted), out=weighted)
+
 
 def filter_tables(grid: KernelGrid, layout: TileLayout, pattern: Pattern, workers: int) -> FilterTables:
-    """Compute the tables of every tile.
+    """Compute the tables of every tile of a mosaic.
 
     Args:
         grid: kernels over the sensor.
@@ -120,8 +172,6 @@ def prior_density(rows: int, columns: int) -> Float64[np.ndarray, "rows columns"
 def _tables_of(
     kernels: Float[np.ndarray, "3 ky kx"], density: Float64[np.ndarray, "rows columns"], pattern: Pattern
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    if len(pattern.sites) == len(COLOURS) and pattern.rows == pattern.columns == 1:
-        return _tables_without_aliases(kernels, density, pattern)
     rows, columns = density.shape
     transfer = fft.fft2(np.stack([centred(kernel, rows, columns) for kernel in kernels]))
     half, count, aliases = columns // pattern.columns // 2 + 1, len(pattern.sites), pattern.rows * pattern.columns
@@ -145,24 +195,6 @@ def _tables_of(
     )
 
 
-def _tables_without_aliases(
-    kernels: Float[np.ndarray, "3 ky kx"], density: Float64[np.ndarray, "rows columns"], pattern: Pattern
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Of three colours at every pixel: B = P R P^H with a real matrix R and the transfers' phases P."""
-    channels, (rows, columns) = channels_of(pattern), density.shape
-    transfer = fft.rfft2(np.stack([centred(kernels[channel], rows, columns) for channel in channels]))
-    density = density[:, : transfer.shape[2]]
-    size = np.abs(transfer)
-    phase = np.where(size > 0, transfer, 1.0) / np.where(size > 0, size, 1.0)
-    colours = COLOURS[np.ix_(channels, channels)][..., None, None]
-    values, vectors = eigen_of_three(density * size[:, None] * size * colours)
-    return (
-        (density * np.conj(transfer))[None].astype(np.complex64),
-        (np.conj(phase) * np.swapaxes(vectors, 0, 1)).astype(np.complex64),
-        np.maximum(values, 0.0).astype(np.float32),
-    )
-
-
 def _phases(rows: int, columns: int, pattern: Pattern) -> list[Complex128[np.ndarray, "rows columns"]]:
     """Return exp(2 pi i f.p) for the place p of every site."""
     y, x = np.arange(rows)[:, None] / rows, np.arange(columns) / columns
@@ -181,7 +213,7 @@ def _polyphase(
 def filtered(
     tiles: Float32[np.ndarray, "tiles *colours rows columns"],
     noise_e: Float32[np.ndarray, "tiles 3"],
-    tables: FilterTables,
+    tables: Tables,
     layout: TileLayout,
     pattern: Pattern,
     workers: int,
@@ -209,7 +241,7 @@ def filtered(
 def filtered_and_joined(
     tiles: Tiles,
     noise_e: Float32[np.ndarray, "tiles 3"],
-    tables: FilterTables,
+    tables: Tables,
     layout: TileLayout,
     pattern: Pattern,
     workers: int,
@@ -227,7 +259,7 @@ def filtered_and_joined(
 def _filter_each(
     tiles: Tiles,
     noise_e: Float32[np.ndarray, "tiles 3"],
-    tables: FilterTables,
+    tables: Tables,
     layout: TileLayout,
     pattern: Pattern,
     workers: int,
@@ -252,7 +284,7 @@ def _filter_each(
 def _filtered_tile(
     tile: Float32[np.ndarray, "*colours rows columns"],
     noise_e: Float32[np.ndarray, "3"],
-    tables: FilterTables,
+    tables: Tables,
     layout: TileLayout,
     pattern: Pattern,
     strength: np.float32 | None,
@@ -261,7 +293,7 @@ def _filtered_tile(
     spectrum = _whitened(tile, levels, noise_e, tables, layout, pattern)
     if strength is None:
         samples = layout.power / (pattern.rows * pattern.columns)
-        strength = _likeliest(spectrum, tables.values, samples)
+        strength = _likeliest(tables.costs(spectrum, samples))
     return _picture(spectrum, strength, levels, noise_e, tables, layout, pattern), strength
 
 
@@ -291,11 +323,11 @@ def _whitened(
     tile: Float32[np.ndarray, "*colours rows columns"],
     levels: Float32[np.ndarray, "3"],
     noise_e: Float32[np.ndarray, "3"],
-    tables: FilterTables,
+    tables: Tables,
     layout: TileLayout,
     pattern: Pattern,
 ) -> Complex64[np.ndarray, "sites site_rows site_half"]:
-    """Return V Y: the tile's samples in units of their noise, less their colours' levels, along the eigenvectors."""
+    """Return the tile's samples in units of their noise, less their colours' levels, in the tables' coordinates."""
     cell = pattern.rows, pattern.columns
     parts = []
     cells = (each[channels_of(pattern)].reshape(-1, *cell) for each in (levels, 1 / noise_e))
@@ -308,7 +340,7 @@ def _whitened(
         flat *= layout.taper
         parts.append(plane_spectra(flat, cell))
     spectrum = parts[0] if len(parts) == 1 else np.concatenate(parts)
-    return _products(tables.vectors, spectrum)
+    return tables.along(spectrum)
 
 
 def _picture(
@@ -316,19 +348,18 @@ def _picture(
     strength: np.float32,
     levels: Float32[np.ndarray, "3"],
     noise_e: Float32[np.ndarray, "3"],
-    tables: FilterTables,
+    tables: Tables,
     layout: TileLayout,
     pattern: Pattern,
 ) -> Float32[np.ndarray, "rows columns 3"]:
     """Return the posterior's mean in e-."""
-    weighted = np.conjugate(whitened)
-    weighted *= 1 / (tables.values + 1 / strength)
-    by_site = np.conjugate(_products(tables.vectors.swapaxes(0, 1), weighted), out=weighted)
+    by_site = tables.solved(whitened, strength)
     cell, channels = (pattern.rows, pattern.columns), channels_of(pattern)
-    mixed = np.zeros((len(COLOURS), len(tables.matched), *by_site.shape[1:]), dtype=np.complex64)
+    matched = tables.matched
+    mixed = np.zeros((len(COLOURS), len(matched), *by_site.shape[1:]), dtype=np.complex64)
     for colour, spectrum in enumerate(mixed):
         own = _evenly(np.flatnonzero(channels == colour))
-        np.sum(tables.matched[:, own] * by_site[own], axis=1, out=spectrum)
+        np.sum(matched[:, own] * by_site[own], axis=1, out=spectrum)
     # Colours have much that cancels in their sum. In single precision, they are mixed before they become pictures.
     common = mixed.sum(axis=0)
     common *= np.float32(COMMON)
@@ -354,23 +385,13 @@ def _products(
     return found
 
 
-def _likeliest(
-    spectrum: Complex64[np.ndarray, "sites site_rows site_half"],
-    values: Float32[np.ndarray, "sites site_rows site_half"],
-    samples: float,
-) -> np.float32:
-    """Return the prior's strength under which the spectrum is most probable."""
-    some = spectrum[:, ::SPARSE, ::SPARSE]
-    power = ((some.real**2 + some.imag**2) / np.float32(samples)).ravel()
-    value = values[:, ::SPARSE, ::SPARSE].ravel()
+def _likeliest(costs: Callable[[Float32[np.ndarray, " some"]], Float32[np.ndarray, " some"]]) -> np.float32:
+    """Return the prior's strength under which a tile's samples are most probable."""
 
     def cheapest(indices: Iterable[int]) -> int:
         """Return the likeliest of some strengths, all of which are tried at once: threads wait for every call."""
         some = [index for index in indices if 0 <= index < len(STRENGTHS)]
-        variance = STRENGTHS[some, None] * value
-        variance += 1
-        cost = np.log(variance).sum(axis=1) + np.divide(power, variance, out=variance).sum(axis=1)
-        return some[int(cost.argmin())]
+        return some[int(costs(STRENGTHS[some]).argmin())]
 
     # The cost has one valley: first where it is, then by half steps where it is lowest.
     best = cheapest(range(0, len(STRENGTHS), _STRIDE))

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Int
 from scipy import sparse
 
-from udccal.restoration.mosaic_filter import STRENGTHS, FilterTables, Pattern, filtered
+from udccal.restoration.mosaic_filter import STRENGTHS, Pattern, Tables, filtered
 from udccal.restoration.tiles import BLEND_PX, TAPER_PX, Strip, TileLayout
 
 LEVELS, BANDS = 4, 3
@@ -58,7 +58,7 @@ class BandNoise:
 
 
 def measured_noise(
-    tables: FilterTables,
+    tables: Tables,
     layout: TileLayout,
     pattern: Pattern,
     workers: int,

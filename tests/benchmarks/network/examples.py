@@ -13,9 +13,9 @@ from scipy import fft
 from tests.benchmarks.network.pictures import drawn_picture, photographs
 from udccal.cfa import Cfa, cfa_named
 from udccal.restoration.clipped import completed
-from udccal.restoration.deblur import THREE_COLOURS
+from udccal.restoration.colour_tables import THREE_COLOURS, colour_tables
 from udccal.restoration.kernel_grid import KernelGrid, centred
-from udccal.restoration.mosaic_filter import FilterTables, Pattern, filter_tables, filtered, filtered_and_joined
+from udccal.restoration.mosaic_filter import Pattern, Tables, filter_tables, filtered, filtered_and_joined
 from udccal.restoration.network import details, noise_planes, sharper
 from udccal.restoration.shrink import BandNoise, measured_noise, shrunk
 from udccal.restoration.tiles import TileLayout, layout_for
@@ -48,7 +48,7 @@ class Optics:
 
     kernels: Float32[np.ndarray, "3 rows columns"]
     layout: TileLayout
-    tables: FilterTables
+    tables: Tables
     noise: BandNoise
     pattern: Pattern
 
@@ -58,7 +58,8 @@ class Optics:
         pattern = _PATTERNS[turn % len(_PATTERNS)]
         layout = layout_for(_USED_PX, _USED_PX, (2, 2), (_TILE_PX, _TILE_PX), (0, _USED_PX))
         grid = KernelGrid(np.zeros(1), np.zeros(1), kernels[None, None])
-        tables = filter_tables(grid, layout, pattern, 1)
+        whole = pattern is THREE_COLOURS
+        tables = colour_tables(grid, layout, 1) if whole else filter_tables(grid, layout, pattern, 1)
         return cls(kernels, layout, tables, measured_noise(tables, layout, pattern, 1), pattern)
 
     @property
@@ -174,7 +175,7 @@ def _clipped(
     tile: Float32[np.ndarray, "tile tile"],
     most_e: float,
     noise_e: Float32[np.ndarray, "1 3"],
-    given: tuple[FilterTables, TileLayout, Pattern, int],
+    given: tuple[Tables, TileLayout, Pattern, int],
 ) -> Float32[np.ndarray, "tile tile"]:
     """Clip a tile, and complete it as restoration does."""
     held = np.minimum(tile, np.float32(most_e))
