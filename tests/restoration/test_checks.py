@@ -24,6 +24,7 @@ from udccal.restoration import one_frame
 from udccal.restoration.checks import check_frame, check_panel_picture, check_raw_file
 from udccal.restoration.deblur import deblur
 from udccal.restoration.plan import PlanOptions
+from udccal.restoration.runtime import Restorer
 from udccal.restoration.scene_plan import Wish
 from udccal.restoration.tone import Tone
 from udccal.result import FitStatus
@@ -157,6 +158,12 @@ def test_one_frame_is_checked_before_the_profile_is_prepared(profile: Profile, m
 def test_options_that_cannot_be_are_refused(options: dict[str, Any], message: str) -> None:
     with pytest.raises(RestorationError, match=message):
         PlanOptions(**options)
+
+
+@pytest.mark.parametrize("options", [{"workers": 2}, {}, 3])
+def test_options_are_plan_options(profile: Profile, options: Any) -> None:
+    with pytest.raises(RestorationError, match="Expected options as PlanOptions, found"):
+        Restorer.from_profile(profile, Tier.fast, options)
 
 
 @pytest.mark.parametrize("exposure", [-1.0, np.nan, np.inf, True, "1"])

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, UInt8, UInt16
 
 from udccal.cfa import cfa_named
+from udccal.errors import RestorationError
 from udccal.kernels import fitted_size
 from udccal.models.geometry import VirtualView
 from udccal.models.noise import Noise
@@ -131,10 +132,12 @@ class Restorer:
                 do not pass them.
 
         Raises:
-            RestorationError: when its geometry leaves no view through the panel, or a term gives values that are not
-                finite.
+            RestorationError: when its geometry leaves no view through the panel, a term gives values that are not
+                finite, or options are no ``PlanOptions``.
         """
-        options, tier = options or PlanOptions(), tier_named(tier)
+        options, tier = PlanOptions() if options is None else options, tier_named(tier)
+        if not isinstance(options, PlanOptions):
+            raise RestorationError(f"Expected options as PlanOptions, found {options!r:.80}. Give PlanOptions(...).")
         rig, geometry = profile.rig, profile.geometry.term
         camera, cfa = rig.camera, cfa_named(rig.camera.cfa)
         view = kept_view(geometry, rig, keep)
