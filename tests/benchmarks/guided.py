@@ -4,9 +4,9 @@
 
 The rig is specimen 0 of the accuracy table. The simulated hand holds the LED up to 20 px and boards up to 3 degrees
 away from where they are wanted, and goes on wherever the guide says that all is in order. Both sessions are fitted.
-Captures and profiles in DIR are kept, and a second run goes on from there. Prompts are those of the run that captured
-the last step. Writes DIR/guided.json and, of
-the full-size rig, the table of docs/cli.md; exits with 1 where a number misses its limit.
+Captures, prompts and profiles in DIR are kept, and a second run goes on from there: a step that a stopped run left is
+captured again, and its prompts count twice. Writes DIR/guided.json and, of the full-size rig, the table of docs/cli.md;
+exits with 1 where a number misses its limit.
 """
 
 from __future__ import annotations
@@ -30,6 +30,7 @@ from udccal.benches.capture import capture
 from udccal.cli.jobs.fit import fit_to_profile
 from udccal.cli.output import Output
 from udccal.guide.capture import lead_capture
+from udccal.guide.events import Answer
 from udccal.io.atomic import write_atomically
 from udccal.profiles.profile import Profile
 from udccal.profiles.store import read_profile
@@ -58,9 +59,9 @@ def calibrated(draw: Draw, folder: Path, by_hand: bool) -> Calibrated:
     session, profile, commit, asked = (folder / name for name in ("session", "profile", "commit.txt", "prompts.txt"))
     if not commit.exists():
         world = SimulatedWorld(draw.truth, seed=draw.seed)
-        if by_hand and not asked.exists():
-            write_atomically(asked, str(_led(world, session)).encode())
-        elif not by_hand:
+        if by_hand:
+            _lead(world, session, asked)
+        else:
             with simulated_bench(world) as bench:
                 capture(session, bench)
         fit_to_profile(Output(), session, profile)
@@ -69,15 +70,28 @@ def calibrated(draw: Draw, folder: Path, by_hand: bool) -> Calibrated:
     return Calibrated(read_profile(profile), prompts, commit.read_text(encoding="utf-8").strip())
 
 
-def _led(world: SimulatedWorld, session: Path) -> int:
-    """Lead a willing person, whose hand is inexact, through every step; returns how often it was asked."""
-    person = Scripted()
+class _Counted(Scripted):
+    """A willing person whose prompts are counted in a file, on top of those of earlier runs."""
+
+    def __init__(self, file: Path) -> None:
+        super().__init__()
+        self._file, self._before = file, int(file.read_text(encoding="utf-8")) if file.exists() else 0
+
+    def answer(self, offered: tuple[Answer, ...], wait_s: float) -> Answer | None:
+        before, answer = self.prompts, super().answer(offered, wait_s)
+        if self.prompts > before:
+            write_atomically(self._file, str(self._before + self.prompts).encode())
+        return answer
+
+
+def _lead(world: SimulatedWorld, session: Path, asked: Path) -> None:
+    """Lead a willing person, whose hand is inexact, through every step that the session lacks."""
+    person = _Counted(asked)
     with simulated_bench(world) as bench:
         held = replace(bench, stage=Hand(world))
         with SessionWriter.create_or_resume(session, bench.rig, bench.camera.identity, now=bench.now) as writer:
             lead_capture(writer, held, person, get_args(TermName))
     assert person.done.complete, person.done.sentence
-    return person.prompts
 
 
 def judged(commanded: Calibrated, guided: Calibrated, draw: Draw) -> list[Row]:

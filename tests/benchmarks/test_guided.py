@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 
 import pytest
 
 from tests.benchmarks.draws import Draw
-from tests.benchmarks.guided import Calibrated, judged, sigma_ratios
+from tests.benchmarks.guided import Calibrated, _Counted, judged, sigma_ratios
+from udccal.guide.events import Answer, VerdictEvent
 from udccal.profiles.profile import Profile
 from udccal.profiles.store import load_profile
 from udccal.result import FitResult
@@ -38,3 +40,16 @@ def test_wider_error_bars_and_many_prompts_are_missed(shipped: Profile, by: floa
     rows = judged(Calibrated(shipped, 0, "a"), Calibrated(changed, prompts, "b"), Draw("lg55-reduced", 0))
     # The shipped profile is of another specimen: its errors are not judged here.
     assert sum(not row.ok for row in rows if not row.name.startswith("guided:")) == missed
+
+
+def test_prompts_of_a_stopped_run_count(tmp_path: Path) -> None:
+    asked = tmp_path / "prompts.txt"
+    for expected in ("1", "2"):
+        person = _Counted(asked)
+        person.tell(VerdictEvent("dark", True, "", (Answer.go,)))
+        assert person.answer((Answer.go,), 0.0) is Answer.go
+        assert asked.read_text() == expected
+    person = _Counted(asked)
+    person.tell(VerdictEvent("dark", False, "Light leaks in.", (Answer.go,)))
+    assert person.answer((Answer.go,), 0.0) is None
+    assert asked.read_text() == "2"
