@@ -36,6 +36,5 @@ NoiseSeed = Annotated[
 ]
 Seed = Annotated[int, typer.Option("--seed", min=0, help="Chooses the specimen of the simulated rig, and its noise.")]
 IterationLog = Annotated[Path | None, typer.Option("--log", help="Write every iteration of every solver to this file.")]
-PanelPicturePath = Annotated[
-    Path | None, typer.Option("--panel-picture", help="8-bit RGB PNG that the panel showed; omit if not known.")
-]
+_PANEL_HELP = "8-bit RGB PNG that the panel showed, as seen from behind; omit if not known."
+PanelPicturePath = Annotated[Path | None, typer.Option("--panel-picture", help=_PANEL_HELP)]

@@ -58,7 +58,7 @@ def prepare(
     path: ProfileArgument,
     tier: Annotated[Tier, typer.Option("--tier", help="How much restoration does to a frame.")] = Tier.balanced,
 ) -> None:
-    """Compute what restoration needs of a profile and keep it, so that the next ``udccal restore`` starts quickly."""
+    """Compute what restoration needs of a profile and keep it, so that the next restore starts quickly."""
     from udccal.cli.jobs.prepare import prepare_profile
 
     prepare_profile(context.obj, path, tier)

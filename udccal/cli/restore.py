@@ -31,7 +31,9 @@ class TierChoice(enum.StrEnum):
 
 def restore(
     context: typer.Context,
-    images: Annotated[list[Path], typer.Argument(metavar="IMAGE...", help="Raw mosaics: 16-bit PNG, or DNG.")],
+    images: Annotated[
+        list[Path], typer.Argument(metavar="IMAGE...", help="Raw mosaics: 16-bit PNG, or camera raw such as DNG.")
+    ],
     profile: FoundProfile,
     out: Annotated[
         Path | None, typer.Option("--out", help="Folder for the results; with --explain, for plan.json if given.")

@@ -27,7 +27,8 @@ def run(
         str,
         typer.Option(
             "--sink",
-            help="Where frames go: shm:NAME, video:FILE.mp4, images:FOLDER, v4l2:/dev/videoN, window:MONITOR.",
+            help="Where frames go: shm:NAME, video:FILE.mp4, images:FOLDER, v4l2:/dev/videoN, "
+            "window:TITLE, or window:N to fill monitor N.",
         ),
     ],
     camera: Annotated[

@@ -7,7 +7,9 @@ from typing import Annotated
 
 import typer
 
-from udccal.cli.options import OutFolder, PanelPicturePath, RigName, Seed
+from udccal.cli.options import OutFolder, RigName, Seed
+
+_PANEL_HELP = "8-bit RGB PNG that the panel shows, as seen from behind; without it the panel is dark."
 
 
 def simulate(
@@ -15,7 +17,7 @@ def simulate(
     images: Annotated[list[Path], typer.Argument(metavar="IMAGE...", help="Photographs: PNG, JPEG, HDR or EXR.")],
     rig: RigName,
     out: OutFolder,
-    panel_picture: PanelPicturePath = None,
+    panel_picture: Annotated[Path | None, typer.Option("--panel-picture", help=_PANEL_HELP)] = None,
     seed: Seed = 0,
 ) -> None:
     """Degrade photographs as a simulated rig would see them: a raw mosaic, a preview, and the ideal view."""
