@@ -115,3 +115,14 @@ def test_a_picture_without_noise_that_is_flat_in_most_places_becomes_sharper(toy
     flat = np.rint(255 * flat) / 255
     found = udccal.deblur(flat, one.kernels, one.x_px, one.y_px, tile_px=TILE, workers=1, tier=tier)
     assert rms(found, drawn) < 0.8 * rms(flat, drawn)
+
+
+@pytest.mark.parametrize("level", [0.0, 1.0])
+def test_clipped_or_blank_rows_do_not_hide_the_noise_of_the_others(
+    toy_grid: KernelGrid, sharp: np.ndarray, soft: np.ndarray, level: float
+) -> None:
+    whole = noisy(soft, 1e3)
+    part = np.where(np.arange(len(soft))[:, None, None] < 0.4 * len(soft), np.float32(level), whole)
+    below = slice(int(0.75 * len(soft)), None)
+    alone, beside = (deblurred(picture, toy_grid)[below] for picture in (whole, part))
+    assert rms(beside, sharp[below]) < 1.2 * rms(alone, sharp[below])

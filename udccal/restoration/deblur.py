@@ -32,6 +32,10 @@ _DIAGONAL = np.outer([1.0, -2.0, 1.0], [1.0, -2.0, 1.0]).astype(np.float32)
 # Median of |x| of a normal distribution with sigma 1.
 _MEDIAN = 0.6745
 _REWEIGHTINGS = 3
+# Detail below this, of the largest value, is rounding; where all of it within as many px is, the picture is flat.
+_FLAT, _NEAR = 2e-6, np.ones((5, 5), dtype=np.uint8)
+# Least part of a tile from which noise is taken.
+_LEAST_SEEN = 0.05
 # Rounding to single precision, of the largest value. A picture that is flat in most places shows no noise at all.
 _LEAST_VARIANCE = float(np.finfo(np.float32).eps) ** 2
 # The result is in single precision, and overshoots.
@@ -107,10 +111,12 @@ def _cut(
 def _noise_line(tiles: Float32[np.ndarray, "tiles 3 rows columns"]) -> tuple[float, float]:
     """Return the variance of the noise without light, and how it grows with light."""
     gain = float(np.sum(_DIAGONAL**2))
-    planes = tiles.reshape(-1, *tiles.shape[2:])
-    detail = np.array([np.median(np.abs(cv2.filter2D(plane, cv2.CV_32F, _DIAGONAL))) for plane in planes])
-    variance = (detail.astype(np.float64) / _MEDIAN) ** 2 / gain
-    light = np.maximum(planes.mean(axis=(1, 2)), 0).astype(np.float64)
+    variance, light, seen = (np.array(part) for part in zip(*map(_noise_of, tiles.reshape(-1, *tiles.shape[2:]))))
+    # Tiles that are mostly clipped or blank tell only where no others do.
+    used = seen >= (0.5 if seen.max() >= 0.5 else _LEAST_SEEN)
+    if not used.any():
+        return 0.0, 0.0
+    variance, light = variance[used] / gain, light[used]
     design = np.stack([np.ones_like(light), light], axis=1)
     # Detail adds to noise, so that the lower ones of what was found are the noise.
     weight = np.ones_like(light)
@@ -121,6 +127,19 @@ def _noise_line(tiles: Float32[np.ndarray, "tiles 3 rows columns"]) -> tuple[flo
         weight = np.where(variance > 1.5 * expected, 0.1, 1.0) / expected
         weight /= weight.max()
     return float(read), float(slope)
+
+
+def _noise_of(plane: Float32[np.ndarray, "rows columns"]) -> tuple[float, float, float]:
+    """Return the square of the detail's sigma and the mean light of a plane, and the part of it that they are from.
+
+    Clipped and blank areas have no noise. They would make that of all others seem smaller.
+    """
+    detail = np.abs(cv2.filter2D(plane, cv2.CV_32F, _DIAGONAL))
+    seen = cv2.dilate(detail, _NEAR) > _FLAT
+    if not seen.any():
+        return 0.0, 0.0, 0.0
+    sigma = float(np.median(detail[seen])) / _MEDIAN
+    return sigma**2, max(float(plane[seen].mean()), 0.0), float(seen.mean())
 
 
 def _checked(picture: np.ndarray, kernels: np.ndarray, x_px: np.ndarray, y_px: np.ndarray) -> KernelGrid:
