@@ -111,7 +111,7 @@ def _cut(
 def _noise_line(tiles: Float32[np.ndarray, "tiles 3 rows columns"]) -> tuple[float, float]:
     """Return the variance of the noise without light, and how it grows with light."""
     gain = float(np.sum(_DIAGONAL**2))
-    variance, light, seen = (np.array(part) for part in zip(*map(_noise_of, tiles.reshape(-1, *tiles.shape[2:]))))
+    variance, light, seen = np.array([_noise_of(plane) for plane in tiles.reshape(-1, *tiles.shape[2:])]).T
     # Tiles that are mostly clipped or blank tell only where no others do.
     used = seen >= (0.5 if seen.max() >= 0.5 else _LEAST_SEEN)
     if not used.any():

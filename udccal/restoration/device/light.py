@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import functools
-
 import cv2
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.special import log_ndtr
-from jaxtyping import Array, Bool, Float, UInt8, UInt16
+from jaxtyping import Array, Bool, Float, Int, UInt8, UInt16
 
 from udccal.cfa import Cfa
 from udccal.models.noise import Noise, linear_signal
@@ -21,6 +19,9 @@ from udccal.restoration.device.planes import Mosaic, apart, box_mean, resized, t
 from udccal.restoration.mosaic_filter import channels_of
 
 _AROUND = tuple((down, across) for down in range(3) for across in range(3) if (down, across) != (1, 1))
+
+# What ``PanelTables`` takes of ``PanelSums``.
+PANEL_TABLES = ("shares", "pixels", "starts", "gain", "mix", "light", "down", "across")
 
 # Sigmas below 0 from which the mean of what is not negative is taken from a series.
 _FAR = 8.0
@@ -107,21 +108,35 @@ class FrontEnd(eqx.Module):
         return together(jnp.stack(levels)[channels, None, None] * apart(white, cfa), cfa)
 
 
-@functools.partial(jax.jit, static_argnames=("cfa",))
-def panel_rate(seen: UInt8[Array, "seen_rows seen_columns 3"], sums: dict[str, Array], cfa: Cfa) -> Mosaic:
-    """Return the backscatter of a panel's picture in e-/s as ``PanelLight.rate`` does, by the tables of ``PanelSums``.
+class PanelTables(eqx.Module):
+    """The arrays of ``PanelSums``, by the same names, on a device. cfa: the colour pattern."""
 
-    Args:
-        seen: the part of what the panel shows that the camera sees. sums: tables by their names. cfa: colour pattern.
-    """
-    light, starts = sums["light"][seen].reshape(-1, 3).T, sums["starts"]
-    shares = (sums["shares"] * light[:, sums["pixels"]]).T
-    place = jnp.repeat(jnp.arange(len(starts) - 1), jnp.diff(starts), total_repeat_length=len(shares))
-    collected = jax.ops.segment_sum(shares, place, len(starts) - 1, indices_are_sorted=True)
-    with jax.default_matmul_precision("highest"):
-        grid = (sums["gain"] * (sums["mix"] @ collected.T)).reshape(3, sums["down"].shape[1], -1)
-        whole = sums["down"] @ grid @ sums["across"].T
-    return together(jnp.stack([apart(whole[site.channel], cfa)[at] for at, site in enumerate(cfa.sites)]), cfa)
+    shares: Float[Array, "3 shares"]
+    pixels: Int[Array, " shares"]
+    starts: Int[Array, " places_and_end"]
+    gain: Float[Array, "3 places"]
+    mix: Float[Array, "3 3"]
+    light: Float[Array, " 256"]
+    down: Float[Array, "rows grid_rows"]
+    across: Float[Array, "columns grid_columns"]
+    cfa: Cfa = eqx.field(static=True)
+
+    @jax.jit
+    def rate(self, seen: UInt8[Array, "seen_rows seen_columns 3"]) -> Mosaic:
+        """Return the backscatter of a panel's picture in e-/s as ``PanelLight.rate`` does.
+
+        Args:
+            seen: the part of what the panel shows that the camera sees.
+        """
+        light = self.light[seen].reshape(-1, 3).T
+        shares, places = (self.shares * light[:, self.pixels]).T, len(self.starts) - 1
+        place = jnp.repeat(jnp.arange(places), jnp.diff(self.starts), total_repeat_length=len(shares))
+        collected = jax.ops.segment_sum(shares, place, places, indices_are_sorted=True)
+        with jax.default_matmul_precision("highest"):
+            grid = (self.gain * (self.mix @ collected.T)).reshape(3, self.down.shape[1], -1)
+            whole = self.down @ grid @ self.across.T
+        sites = [apart(whole[site.channel], self.cfa)[at] for at, site in enumerate(self.cfa.sites)]
+        return together(jnp.stack(sites), self.cfa)
 
 
 def plausible(picture_e: Float[Array, "3 rows columns"], error_e: Mosaic) -> Float[Array, "3 rows columns"]:

@@ -15,7 +15,7 @@ from udccal.errors import RestorationError
 from udccal.restoration.backscatter import refuse_excess_of
 from udccal.restoration.checks import check_frame, check_panel_picture
 from udccal.restoration.device.bands import blurred, refined, shrunk
-from udccal.restoration.device.light import FrontEnd, panel_rate, plausible
+from udccal.restoration.device.light import PANEL_TABLES, FrontEnd, PanelTables, plausible
 from udccal.restoration.device.planes import Mosaic, box_mean, cut, resampled
 from udccal.restoration.device.tile_filter import TileFilter
 from udccal.restoration.kernel_grid import interpolated_kernels
@@ -97,13 +97,13 @@ class DeviceRestorer:
     places is decided by all of its rows.
 
     Attributes:
-        restorer: as prepared. stages: what frames pass. panel: tables of ``PanelSums``.
+        restorer: as prepared. stages: what frames pass. panel: sums over the panel's pixels.
         latest: picture of the panel. rate: its backscatter in e-/s.
     """
 
     restorer: Restorer
     stages: _Stages
-    panel: dict[str, Array] | None
+    panel: PanelTables | None
     latest: PanelPicture
     rate: Mosaic
 
@@ -141,14 +141,15 @@ class DeviceRestorer:
                 None if noise is None else (noise.variance, noise.probe),
                 (network_weights(), kernels) if restorer.tier is Tier.accurate else None,
                 (pixel.astype(np.int32) - before, np.stack([index % len(taps), index // len(taps)], axis=-1), taps),
-                None if restorer.panel is None else vars(restorer.panel.sums),
+                None if restorer.panel is None else tuple(getattr(restorer.panel.sums, name) for name in PANEL_TABLES),
                 np.zeros((layout.reach.stop - layout.reach.start, camera.columns), np.float32),
             ),
             device or jax.devices()[0],
         )
         tiles = TileFilter(*filters, layout, cfa)
         stages = _Stages(FrontEnd(*front, cfa), tiles, bands, learned, maps, options.network_views, error)
-        return cls(restorer, stages, panel, np.empty((0, 0, 3), np.uint8), dark)
+        sums = None if panel is None else PanelTables(*panel, cfa)
+        return cls(restorer, stages, sums, np.empty((0, 0, 3), np.uint8), dark)
 
     def display(
         self,
@@ -163,11 +164,11 @@ class DeviceRestorer:
         noise, panel = self.restorer.noise, self.restorer.panel
         known = panel_picture is not None and panel is not None
         # A panel that stands still costs a comparison.
-        if panel_picture is not None and panel is not None:
+        if panel_picture is not None and panel is not None and self.panel is not None:
             seen = panel.sums.seen(panel_picture)
             if not np.array_equal(self.latest, seen):
                 self.latest = seen.copy()
-                self.rate = panel_rate(jax.device_put(self.latest, self.rate.device), self.panel, panel.cfa)
+                self.rate = self.panel.rate(jax.device_put(self.latest, self.rate.device))
         exposed = np.array([exposure_s, dark_DN(noise, exposure_s), variance_floor_e2(noise, exposure_s)], np.float32)
         scale = replace(tone, exposure=tone.exposure / exposure_s).scale()
         rows = self.restorer.blind.mended(mosaic[self.restorer.rows], exposure_s)
