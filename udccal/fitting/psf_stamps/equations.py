@@ -94,12 +94,18 @@ def _with_nodes(
     return np.concatenate([dense, every.reshape(-1, dense.shape[1])])
 
 
-def laplace(stamps: Stamps, state: State) -> Laplace:
-    """Build and solve the equations at a state with priors; raise LinAlgError when they are singular."""
+def laplace(stamps: Stamps, state: State, drawn: bool = True) -> Laplace:
+    """Build and solve the equations at a state with priors; raise LinAlgError when they are singular.
+
+    Args:
+        stamps: the data.
+        state: where the equations are expanded.
+        drawn: whether the mode is the posterior's; otherwise it is one step towards what the data alone prefer.
+    """
     seen, (stars, planes), kept = expectation(stamps, state), state.light_e.shape, state.kept.ravel()
     numbers, count = np.arange(state.vector.size), state.maps_from + state.maps
     prior, nodes = state.prior, numbers[count:].reshape(planes, -1)[:, kept]
-    pull, size, colours = prior @ state.vector, np.zeros(count), []
+    pull, size, colours = drawn * (prior @ state.vector), np.zeros(count), []
     for own, mine in enumerate(nodes):
         colour = normal_equations(stamps, state, seen, own)
         size[colour.index] += colour.dense.diagonal()
