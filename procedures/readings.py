@@ -110,7 +110,8 @@ def find_led(frame: Frame, rig: RigDescription) -> LedSeen:
     row, column = (int(index) for index in np.unravel_index(int(light.argmax()), light.shape))
     surroundings_DN = float(np.median(frame.data)) - rig.camera.black_DN.value
     region = frame.settings.region
-    x, y = _centroid(light, column, row)
+    # Where all light has one level, or single samples alone stick out, there is nothing to weigh.
+    x, y = _centroid(light, column, row) if light[row, column] > 0 else (float(column), float(row))
     return LedSeen((region.x + x, region.y + y), float(light[row, column]), surroundings_DN)
 
 

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import pytest
 from procedures.led_walk import nearest_phase_px, phase_distance_px
 from procedures.psf import PsfProcedure, field_cells, led_positions_px
 from procedures.readings import find_led, head_room, led_change
+from tests.guide.painted import PaintedRig, painted_bench, painted_rig
 from udccal.arrangements import Led
 from udccal.benches.bench import simulated_bench, simulated_rig
 from udccal.cameras.protocol import Frame, Region, Settings
@@ -58,6 +60,48 @@ def test_an_led_is_found_to_some_tenths_of_a_pixel(offset: float) -> None:
     seen = find_led(Frame(data, Settings(1e-3, 0.0, Region(100, 200, 80, 60)), 0.0, 0, True), rig)
     assert seen.place_px == pytest.approx((140 + offset, 230 + offset), abs=0.25)
     assert seen.room.ok
+
+
+def dark(rows: int, columns: int) -> np.ndarray:
+    return np.full((rows, columns), 64, np.uint16)
+
+
+def speckled(rows: int, columns: int) -> np.ndarray:
+    """Single samples that are a code above all others, without neighbours."""
+    data = dark(rows, columns)
+    data[1::8, 3::8] += 1
+    return data
+
+
+def flooded(rows: int, columns: int) -> np.ndarray:
+    return np.full((rows, columns), 4095, np.uint16)
+
+
+@pytest.mark.parametrize("paint", [dark, speckled, flooded])
+def test_frames_without_any_small_light_have_no_led(paint: Callable[[int, int], np.ndarray]) -> None:
+    seen = find_led(
+        Frame(paint(60, 80), Settings(1e-3, 0.0, Region(100, 200, 80, 60)), 0.0, 0, True), load_rig("lg55-reduced")
+    )
+    assert seen.peak_DN == 0
+    assert np.isfinite(seen.place_px).all()
+    assert seen.room.ok is (paint is not flooded)
+
+
+@pytest.mark.parametrize(
+    ("paint", "sentence"),
+    [(dark, "No LED is seen."), (speckled, "No LED is seen."), (flooded, "The surroundings are nearly as bright")],
+)
+def test_a_look_at_no_light_says_what_to_do(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, paint: Callable[[int, int], np.ndarray], sentence: str
+) -> None:
+    painted = PaintedRig(painted_rig(psf_columns=2, psf_rows=1))
+    bench = painted_bench(painted)
+    guided = next(iter(PsfProcedure().guided(painted.rig)))
+    monkeypatch.setattr(painted, "_paint", lambda: paint(painted.sensor.rows, painted.sensor.columns))
+    with SessionWriter.create(tmp_path / "s", painted.rig, bench.camera.identity) as writer:
+        look = guided.begin(bench.camera, bench.display, bench.stage, writer).look()
+    assert look.sentence.startswith(sentence)
+    assert not look.in_order
 
 
 def test_head_room_is_bounded_on_both_sides() -> None:

@@ -88,3 +88,49 @@ def test_pictures_without_boards_cannot_be_judged(result: FitResult[Geometry], v
     empty = BoardCorners(np.zeros(0, dtype=np.int64), np.zeros((0, 2)), np.zeros(0))
     bare = tuple(replace(view, corners=empty) for view in views)
     assert failed(judge_geometry(bare, result, SIZE, ValidationLimits())) == {"captures"}
+
+
+def scattered(view: BoardView, by_px: float) -> BoardView:
+    """The view with corners that lie where no pose of its board puts them."""
+    noise = by_px * np.random.default_rng(7).normal(size=view.corners.xy.shape)
+    return replace(view, corners=replace(view.corners, xy=view.corners.xy + noise))
+
+
+@pytest.mark.parametrize("by_px", [0.3, 1.2, 1.5, 2.0, 3.0, 5.0, 20.0])
+def test_one_strange_view_fails_by_name_and_the_others_are_judged(
+    result: FitResult[Geometry], views: tuple[BoardView, ...], by_px: float
+) -> None:
+    found = judge_geometry((*views[:4], scattered(views[4], by_px), *views[5:]), result, SIZE, ValidationLimits())
+    assert failed(found) == {"strange views"}
+    assert named(found, "strange views").value == 1
+    assert "In geometry/view_4," in named(found, "strange views").what
+    assert named(found, "chi-squared").value == pytest.approx(1.0, abs=0.25)
+
+
+def test_a_strange_jig_says_nothing_of_the_cameras_turn(
+    result: FitResult[Geometry], views: tuple[BoardView, ...]
+) -> None:
+    found = judge_geometry((scattered(views[0], 5.0), *views[1:]), result, SIZE, ValidationLimits())
+    assert failed(found) == {"strange views"}
+    assert "camera's turn" not in {check.name for check in found.checks}
+
+
+def few(view: BoardView, ids: np.ndarray) -> BoardView:
+    corners = view.corners
+    return replace(view, corners=BoardCorners(corners.ids[ids], corners.xy[ids], corners.sigma[ids]))
+
+
+def test_corners_on_one_line_cannot_be_judged(result: FitResult[Geometry], views: tuple[BoardView, ...]) -> None:
+    line = few(views[1], np.arange(8))
+    found = judge_geometry([line], result, SIZE, ValidationLimits())
+    assert failed(found) == {"captures"}
+    assert "two rows of corners" in named(found, "captures").what
+    assert not failed(judge_geometry([line, *views], result, SIZE, ValidationLimits()))
+
+
+def test_a_strange_view_alone_cannot_be_judged(result: FitResult[Geometry], views: tuple[BoardView, ...]) -> None:
+    six = few(views[1], np.array([1, 3, 32, 67, 72, 83]))
+    six.corners.xy[4] += [3.0, 1.0]  # left out; the five others are too few to test a pose
+    found = judge_geometry([six], result, SIZE, ValidationLimits())
+    assert failed(found) == {"captures"}
+    assert "In geometry/view_1," in named(found, "captures").what

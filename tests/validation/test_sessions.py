@@ -123,6 +123,21 @@ def test_a_changed_rig_fails_the_check_of_what_changed(
     assert found.advice.startswith("Calibrate the rig again")
 
 
+def test_a_session_that_was_interrupted_is_compared_by_what_it_has(
+    tmp_path: Path, truth: RigTruth, first: udccal.Session
+) -> None:
+    later = captured(tmp_path / "later", truth, 4, terms=("noise", "wire"))
+    steps = tuple(step for step in later.manifest.steps if step.id != "wire/dark")
+    interrupted = udccal.Session(later.path, later.manifest.model_copy(update={"steps": steps}))
+    for found in (udccal.compare_sessions(interrupted, first), udccal.compare_sessions(first, interrupted)):
+        assert found.ok
+        assert {check.term for check in found.checks if check.ok} == {"noise"}
+        (wire,) = (check for check in found.checks if check.term == "wire")
+        assert (wire.name, wire.ok) == ("NOT_CAPTURED", None)
+        assert wire.what.startswith("One of the sessions has captures of a part of this term.")
+        assert "'wire/dark'" in wire.what
+
+
 def test_the_same_session_twice_confirms_nothing(first: udccal.Session) -> None:
     with pytest.raises(SessionError, match="found the same one twice"):
         udccal.compare_sessions(first, first)

@@ -3,19 +3,26 @@
 from __future__ import annotations
 
 import threading
+from pathlib import Path
 
 import pytest
 
+from tests.guide.painted import PaintedRig, painted_bench, painted_rig
 from tests.web.capture import DRAWING, READY, SAMPLING, VERDICT
+from udccal.cameras.protocol import Frame
+from udccal.guide.capture import lead_capture
 from udccal.guide.events import (
     Answer,
     DoneEvent,
+    Event,
+    Outline,
     Person,
     ProgressEvent,
     ReadingsEvent,
     StepEvent,
     VerdictEvent,
 )
+from udccal.sessions.writer import SessionWriter
 from udccal.web.lead import LAPSE_S, Lead
 from udccal.web.person import Reception, WebPerson
 
@@ -106,6 +113,49 @@ def test_news_come_when_something_happens_and_not_before(person: WebPerson) -> N
     assert person.news(MINE, version, 0, 0.1).version == version
     threading.Timer(0.1, person.tell, (STEP,)).start()
     assert person.news(MINE, version, 0, 10.0).shown.step == STEP
+
+
+class Clicking:
+    """A window's person who clicks while the last frames of a step that goes by itself are taken."""
+
+    def __init__(self, clicked: Answer) -> None:
+        self.inner, self.clicked = WebPerson(SAMPLING), clicked
+        self.receptions: list[Reception] = []
+        self.visited: list[str] = []
+
+    def tell(self, event: Event) -> None:
+        self.inner.tell(event)
+        if isinstance(event, StepEvent):
+            self.visited.append(event.id)
+        if isinstance(event, ProgressEvent) and event.frames == event.of and not self.receptions:
+            question = self.inner.news(MINE, 0, 0, 0.0).shown.question
+            assert question is not None
+            self.receptions.append(self.inner.give(MINE, question.number, self.clicked))
+
+    def look(self, frame: Frame, outlines: tuple[Outline, ...]) -> None:
+        self.inner.look(frame, outlines)
+
+    def answer(self, offered: tuple[Answer, ...], wait_s: float) -> Answer | None:
+        return self.inner.answer(offered, wait_s)
+
+
+@pytest.mark.parametrize(
+    ("clicked", "after"),
+    [
+        (Answer.quit, []),
+        (Answer.back, ["psf/p00", "psf/p01"]),
+        (Answer.again, ["psf/p00", "psf/p01"]),
+        (Answer.skip, ["psf/p01"]),
+    ],
+)
+def test_a_click_during_the_last_frames_of_a_step_is_obeyed(tmp_path: Path, clicked: Answer, after: list[str]) -> None:
+    bench, person = painted_bench(PaintedRig(painted_rig(psf_columns=2, psf_rows=1))), Clicking(clicked)
+    with SessionWriter.create(tmp_path / "s", bench.rig, bench.camera.identity, now=bench.now) as writer:
+        done = lead_capture(writer, bench, person, ["psf"])
+    assert person.receptions == [Reception.taken]
+    assert person.visited == ["psf/p00", *after]
+    assert done.stopped is (clicked is Answer.quit)
+    assert done.complete is not done.stopped
 
 
 def test_the_first_window_that_answers_leads_and_others_watch(person: WebPerson) -> None:

@@ -70,7 +70,7 @@ class BenchOptions:
         """Whether a person has to set things up before the camera."""
         return self.camera in (CameraKind.u3v, CameraKind.pylon)
 
-    def capture(self, output: Output, rig: RigDescription, wanted: Wanted, person: Person | None) -> bool:
+    def capture(self, output: Output, rig: RigDescription, wanted: Wanted, person: Person | None, agree: bool) -> bool:
         """Capture a session; return False when the person has stopped it.
 
         Args:
@@ -78,6 +78,7 @@ class BenchOptions:
             rig: the rig, with the captures that are wanted.
             wanted: session, terms and steps.
             person: who is led at a real rig, or at a simulated one for practice; None where nobody is.
+            agree: whether it goes on by itself wherever all is in order.
 
         Raises:
             CameraError: when the camera cannot be opened or does not fit the rig.
@@ -86,7 +87,7 @@ class BenchOptions:
         if person is None:
             self._watched(output, rig, wanted)
             return True
-        return self._led(output, rig, wanted, person)
+        return self._led(output, rig, wanted, person, agree)
 
     def _watched(self, output: Output, rig: RigDescription, wanted: Wanted) -> None:
         from udccal.benches.bench import simulate
@@ -102,17 +103,19 @@ class BenchOptions:
         with opened as bench:
             capture_watched(output, bench, wanted)
 
-    def _led(self, output: Output, rig: RigDescription, wanted: Wanted, person: Person) -> bool:
+    def _led(self, output: Output, rig: RigDescription, wanted: Wanted, person: Person, agree: bool) -> bool:
         from udccal.cli.jobs import benches, guided
 
+        led = guided.led_by(output, person, agree)
         if self.camera is CameraKind.sim:
-            with guided.practice_bench(rig, self.seed, self.noise_seed, person) as (bench, practising):
+            with guided.practice_bench(rig, self.seed, self.noise_seed, led) as (bench, practising):
                 return not guided.capture_led(output, bench, practising, wanted).stopped
         find = benches.u3v_camera if self.camera is CameraKind.u3v else benches.pylon_camera
         seen = find(self.serial)
         if self.display is DisplayKind.window:
             shown = benches.window_display(rig, self.monitor)
         else:
-            shown = benches.manual_display(rig, wanted.pictures, person)
+            # No frame tells whether a picture is on the panel, so that nobody but the person can say that it is.
+            shown = benches.manual_display(rig, wanted.pictures, guided.led_by(output, person, agree=False))
         with benches.real_bench(rig, seen, shown) as bench:
-            return not guided.capture_led(output, bench, person, wanted).stopped
+            return not guided.capture_led(output, bench, led, wanted).stopped

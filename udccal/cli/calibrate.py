@@ -81,7 +81,6 @@ def calibrate(
     """Capture every calibration step of a rig, then fit them. An interrupted session continues where it stopped."""
     from udccal.cli.jobs.capture import Wanted
     from udccal.cli.jobs.fit import fit_to_profile
-    from udccal.cli.jobs.guided import led_by
     from udccal.io.out_folder import check_writable
     from udccal.profiles.store import check_replaceable
     from udccal.rig import load_rig
@@ -100,7 +99,7 @@ def calibrate(
         session, [t.value for t in term or TermChoice], {Exchanged(part.value) for part in exchanged or ()}, again or ()
     )
     with _person(output, description, port if web else None) if led else nullcontext() as person:
-        goes_on = options.capture(output, description, wanted, person and led_by(output, person, yes))
+        goes_on = options.capture(output, description, wanted, person, yes)
     if not goes_on:
         raise typer.Exit(STOPPED)
     if not fit_to_profile(output, session, profile, log):

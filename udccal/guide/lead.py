@@ -147,8 +147,9 @@ class Leading:
                 sentence = f"{step.title}: {self._frames(step)} frames captured."
                 if not step.by_itself:
                     return self._verdict(step, True, sentence, _AFTER)
+                said = self._asked(step)  # while the last frames were taken: the verdict ends the question
                 self.person.tell(VerdictEvent(step.id, True, sentence, ()))
-                return Answer.go
+                return said or Answer.go
 
     def _look(self, step: GuidedStep, visit: Visit) -> Look | None:
         try:

@@ -54,7 +54,13 @@ def judge_geometry(
     if not views:
         return unusable("geometry", "No board shows enough corners. Capture the boards again, evenly lit and sharp.")
     lens = Intrinsics.of_geometry(result.term).vector
-    points, place = _posed(_points(views, result, rules), lens, rules)
+    given = _points(views, result, rules)
+    if not given.names:
+        return unusable("geometry", "No board holds a pose. Capture boards that show two rows of corners or more.")
+    points, place = _posed(given, lens, rules)
+    strange = _strange_check([views[k].step_id for k in given.names if k not in points.names])
+    if not points.names:
+        return unusable("geometry", strange[0].what)
     each = [_prediction(points, place, result, view) for view in range(len(points.names))]
     ratios = np.array([one.chi2 / one.dof for one in each])
     noise = float(np.sqrt(2 * np.mean(points.sigma[points.used] ** 2)))
@@ -84,6 +90,7 @@ def judge_geometry(
             limits,
             "Corners of the middle one of the boards",
         ),
+        *strange,
         *_jig_check(views, points, place, result.term, limits),
     )
     caption = (
@@ -105,13 +112,19 @@ def _points(views: Sequence[BoardView], result: FitResult[Geometry], rules: Geom
 
 
 def _posed(points: Points, lens: Float[np.ndarray, "9"], rules: GeometryRules) -> tuple[Points, Bundle]:
-    """The best pose of every view with the lens held, without outliers, which are marked."""
+    """The best pose of every view with the lens held, without outliers, which are marked.
+
+    A view of which they leave too few corners, or less than half, is left out whole: it has no pose that could be told.
+    """
     place, held = Bundle(lens, best_poses(points, lens)[0]), np.zeros(LENS, dtype=bool)
     for _ in range(2):
         place = solve(place, points, held).place
         size = np.abs(linearised(place, points)[0] / points.sigma[:, None]).max(axis=1)
         points = replace(points, used=~rules.corners.off(size))
-    return points, solve(place, points, held).place
+    every = np.bincount(points.view, minlength=len(points.names))
+    strange = points.sums(np.ones(len(points.used))) < np.maximum(rules.least_corners, 0.5 * every)
+    points, place = points.without(strange), Bundle(lens, place.poses[~strange])
+    return points, solve(place, points, held).place if points.names else place
 
 
 def _prediction(points: Points, place: Bundle, result: FitResult[Geometry], only: int | None = None) -> Prediction:
@@ -146,6 +159,17 @@ def _cell_means(
             for axis in (0, 1)
         ]
     return np.hstack([maps[0], np.full((shape[0], 1), np.nan), maps[1]])
+
+
+def _strange_check(step_ids: Sequence[str]) -> tuple[Check, ...]:
+    """The failed check of views that have no pose; none where every view has one."""
+    if not step_ids:
+        return ()
+    what = (
+        f"In {', '.join(step_ids)}, most corners lie elsewhere than the profile's lens shows those of a flat board. See "
+        "whether the board moved or bent there, and capture it again."
+    )
+    return (at_most("geometry", "strange views", float(len(step_ids)), 0.0, "1", what),)
 
 
 def _jig_check(

@@ -8,7 +8,7 @@ from typing import final
 
 from udccal.comparison.comparable import check_sessions
 from udccal.comparison.estimates import ORDER
-from udccal.errors import SessionError
+from udccal.errors import MissingStepError, SessionError
 from udccal.io.hashing import sha256_file
 from udccal.sessions.manifest import MANIFEST_NAME
 from udccal.sessions.schema import TermName
@@ -100,6 +100,13 @@ def compared(
 def _judged(term: TermName, session: Session, against: Session, limits: ValidationLimits) -> Judged:
     if not session.steps(term) or not against.steps(term):
         return _not_counted(term, "NOT_CAPTURED", "One of the sessions has no captures of this term.")
+    try:
+        return _by_captures(term, session, against, limits)
+    except MissingStepError as error:
+        return _not_counted(term, "NOT_CAPTURED", f"One of the sessions has captures of a part of this term. {error}")
+
+
+def _by_captures(term: TermName, session: Session, against: Session, limits: ValidationLimits) -> Judged:
     match term:
         case "noise":
             return compare_noise(against, session, limits)

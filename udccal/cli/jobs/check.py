@@ -8,7 +8,6 @@ from pathlib import Path
 
 from udccal.cli.bench_options import BenchOptions
 from udccal.cli.jobs.capture import Wanted
-from udccal.cli.jobs.guided import led_by
 from udccal.cli.jobs.terminal import TerminalPerson
 from udccal.cli.output import Output, plain
 from udccal.compilation import keep_compilations
@@ -55,8 +54,8 @@ def check_profile(
     with storing_in(out):
         _put_aside(folder, out / "check.json", out / "check.html")
     wanted = Wanted(folder, ("wire", "backscatter"), like=profile)
-    person = led_by(output, TerminalPerson(output), agree) if options.real else None
-    if not options.capture(output, rig, wanted, person):
+    person = TerminalPerson(output) if options.real else None
+    if not options.capture(output, rig, wanted, person, agree):
         return None
     with output.stage("comparing"):
         found, solved = check_rig(profile, Session.open(folder))
