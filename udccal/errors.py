@@ -61,6 +61,10 @@ class RestorationError(UdccalError):
     """A frame cannot be restored with the profile chosen."""
 
 
+class PanelPictureError(RestorationError):
+    """A frame is darker than the light of the picture that the panel is said to have shown."""
+
+
 class LiveError(UdccalError):
     """A live run cannot begin or go on: its sink, its hook, or a stage of it."""
 

@@ -8,6 +8,7 @@ import secrets
 import signal
 import subprocess
 import sys
+import threading
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -19,12 +20,18 @@ import pytest
 
 from examples.read_live import frames
 from tests.live.conftest import COLUMNS, ROWS
-from udccal.cli.jobs.live import LiveRun, run_live
+from tests.live.test_live_cameras import plug
+from tests.virtual_u3v.faults import Faults
+from tests.virtual_u3v.model import CameraModel
+from udccal.cli.jobs.live import LiveRun, _ended_by_signals, run_live
 from udccal.cli.jobs.live_cameras import LiveCamera
 from udccal.cli.output import Output
-from udccal.errors import CameraError, LiveError, UdccalError
-from udccal.io.png import read_rgb8, write_png16
+from udccal.errors import CameraError, LiveError, PanelPictureError, UdccalError
+from udccal.io.png import read_rgb8, write_png16, write_rgb8
+from udccal.live.own_pictures import OwnPictures
 from udccal.live.pipeline import Limits
+from udccal.restoration.runtime import Restorer
+from udccal.rig import RigDescription
 from udccal.tiers import Tier
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -143,6 +150,81 @@ def test_what_does_not_go_together_is_refused(kind: str, changes: dict[str, obje
     wanted = LiveRun(Path("p"), Tier.preview, camera, "shm:not-made", None, None, "cpu", None, 1.0, Limits(), None)
     with pytest.raises(LiveError, match=message):
         replace(wanted, **changes)
+
+
+def test_a_mirrors_sink_gets_mirror_images_of_what_the_camera_sees_on_the_panel(
+    profile_folder: Path, live_rig: RigDescription, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("udccal.cli.jobs.live.keep_compilations", lambda: None)
+    plug(CameraModel(columns=96, rows=64, cfa=live_rig.camera.cfa, bits=live_rig.camera.bits), Faults(), monkeypatch)
+    seen: list[np.ndarray] = []
+    monkeypatch.setattr(OwnPictures, "wrote", lambda own, picture, at_ns: seen.append(picture))
+    camera, out = LiveCamera("u3v", None, None, 2e-3, 25.0, 0), tmp_path / "out"
+    hook = "tests.live.test_command:marked"
+    wanted = LiveRun(
+        profile_folder, Tier.preview, camera, f"images:{out}", None, 0.02, "cpu", hook, 10.0, Limits(frames=3), None
+    )
+    run_live(Output(), wanted)
+    shown = [read_rgb8(file) for file in sorted(out.iterdir())]
+    assert len(shown) == len(seen) == 3
+    for mirrored, picture in zip(shown, seen, strict=True):
+        assert np.all(picture[0, 0] == (1, 2, 3))
+        np.testing.assert_array_equal(mirrored, picture[:, ::-1])
+
+
+def marked(picture: np.ndarray, frame_id: int) -> np.ndarray:
+    picture[0, 0] = (1, 2, 3)
+    return picture
+
+
+def test_frames_without_their_panel_picture_are_counted(
+    profile_folder: Path, live_rig: RigDescription, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("udccal.cli.jobs.live.keep_compilations", lambda: None)
+    restores = Restorer.restore
+
+    def refusing(self: Restorer, mosaic: np.ndarray, exposure_s: float, shown: np.ndarray | None = None) -> np.ndarray:
+        if shown is not None and shown.any():
+            raise PanelPictureError("Expected a frame at least as bright as the panel's own light.")
+        return restores(self, mosaic, exposure_s, shown)
+
+    monkeypatch.setattr(Restorer, "restore", refusing)
+    shown = np.full((live_rig.panel.rows, live_rig.panel.columns, 3), 200, np.uint8)
+    write_rgb8(tmp_path / "panel.png", shown)
+    raw, log, out = write_raw_files(tmp_path / "raw", 3), tmp_path / "log.jsonl", tmp_path / "out"
+    camera = LiveCamera("files", None, raw, 1e-3, 5.0, 0)
+    panel = tmp_path / "panel.png"
+    run_live(
+        Output(),
+        LiveRun(profile_folder, Tier.preview, camera, f"images:{out}", panel, None, "cpu", None, 1.0, Limits(), log),
+    )
+    whole = json.loads(log.read_text().splitlines()[-1])
+    assert (whole["written"], whole["without_panel_picture"]) == (3, 1)
+
+
+def test_signals_that_are_ignored_stay_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    """``nohup`` has SIGHUP ignored: the run goes on when its terminal closes."""
+    stop = threading.Event()
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with _ended_by_signals(stop):
+            os.kill(os.getpid(), signal.SIGHUP)
+            assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+            assert not stop.is_set()
+            os.kill(os.getpid(), signal.SIGTERM)
+            assert stop.wait(10)
+        assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
+def test_handlers_that_are_not_pythons_stay(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[object] = []
+    monkeypatch.setattr("signal.getsignal", lambda number: None)
+    monkeypatch.setattr("signal.signal", lambda number, handler: asked.append(number))
+    with _ended_by_signals(threading.Event()):
+        pass
+    assert not asked
 
 
 def test_a_gpu_that_is_not_there_is_said(monkeypatch: pytest.MonkeyPatch) -> None:

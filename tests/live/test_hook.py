@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import sys
 import threading
 import time
 from pathlib import Path
@@ -89,6 +90,43 @@ def test_a_hook_is_found_in_the_present_folder(tmp_path: Path, monkeypatch: pyte
     for wrong in ("hook_of_mine:other", "no_such_module_here:same", "hook_of_mine", ":", "hook_of_mine:LEVEL"):
         with pytest.raises(LiveError, match="--hook"):
             load_hook(wrong)
+
+
+@pytest.mark.parametrize(
+    ("source", "message"),
+    [
+        ("def same(picture, frame_id)\n    return picture\n", r"SyntaxError: expected ':' \(broken_hook.py, line 1\)"),
+        ("LEVEL = 1 / 0\n", "ZeroDivisionError: division by zero"),
+        ("import sys\nsys.exit('Usage: broken_hook.py FILE')\n", "SystemExit: Usage: broken_hook.py FILE"),
+        ("import no_such_module_here\n", "ModuleNotFoundError: No module named 'no_such_module_here'"),
+    ],
+)
+def test_a_module_that_cannot_be_imported_is_said_with_its_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, source: str, message: str
+) -> None:
+    (tmp_path / "broken_hook.py").write_text(source)
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(LiveError, match=f"found for 'broken_hook:same': {message}"):
+        load_hook("broken_hook:same")
+
+
+def test_a_module_is_named_in_full() -> None:
+    with pytest.raises(LiveError, match=r"found for '\.m:f': TypeError: .*relative import"):
+        load_hook(".m:f")
+
+
+def test_the_modules_folder_alone_leaves_the_path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.path", list(sys.path))
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "appending_hook.py").write_text(
+        "import sys\nsys.path.append('/of/the/hook')\ndef same(picture, frame_id):\n    return picture\n"
+    )
+    before = list(sys.path)
+    load_hook("appending_hook:same")
+    assert sys.path == [*before, "/of/the/hook"]
+    sys.path.insert(0, str(tmp_path))  # a person's own entry stays where it is
+    load_hook("appending_hook:same")
+    assert sys.path == [str(tmp_path), *before, "/of/the/hook"]
 
 
 def test_the_examples_cross_stays_on_the_scene() -> None:

@@ -6,6 +6,7 @@ import itertools
 import threading
 import time
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,9 +15,11 @@ from tests.live.conftest import raw_frame
 from udccal.cameras.protocol import Frame
 from udccal.errors import CameraLost, LiveError, UdccalError
 from udccal.live.hook import Picture, TimedHook
+from udccal.live.newest import Newest
 from udccal.live.pacing import looped
 from udccal.live.pipeline import Limits, Pipeline
 from udccal.live.sinks.protocol import RestoredFrame
+from udccal.live.sinks.video import VideoSink
 from udccal.live.tally import Figures
 
 SHAPE = (4, 6)
@@ -160,6 +163,51 @@ def test_an_error_of_any_stage_ends_all_with_its_sentence() -> None:
         with pytest.raises(error, match=message) as found:
             run(frames, sink, restore=how)
         assert isinstance(found.value, UdccalError)
+
+
+def test_the_first_error_is_told_when_closing_fails_too(tmp_path: Path) -> None:
+    def broken(picture: Picture, frame_id: int) -> Picture:
+        raise ValueError("no cross to draw")
+
+    sink = VideoSink(str(tmp_path / "a.mp4"), 200.0)
+    with pytest.raises(LiveError, match="ValueError: no cross to draw"):
+        Pipeline(endless(), restore, SHAPE, sink, TimedHook(broken, 10.0), Limits(seconds=20.0), threading.Event()).run(
+            lambda figures: None
+        )
+    assert not any(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("stage", ["acquisition", "restoration"])
+def test_an_error_of_another_stage_is_told_before_that_of_closing(stage: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """However late the thread of the error goes on: closing begins when the error has been noted."""
+
+    class Spiteful(ListSink):
+        def close(self) -> None:
+            super().close()
+            raise LiveError("hold 0 frames")
+
+    def close_and_wait(queue: Newest[object]) -> None:
+        closes(queue)
+        time.sleep(0.2)
+
+    def unplugged() -> Iterator[Frame]:
+        if stage == "acquisition":
+            raise CameraLost("the first error")
+        yield from endless()
+
+    def broken(frame: Frame, captured_ns: int) -> Picture:
+        raise LiveError("the first error")
+
+    closes = Newest.close
+    monkeypatch.setattr(Newest, "close", close_and_wait)
+    with pytest.raises(UdccalError, match="the first error"):
+        run(unplugged(), Spiteful(), restore=broken)
+
+
+def test_an_error_of_closing_alone_is_told(tmp_path: Path) -> None:
+    sink = VideoSink(str(tmp_path / "a.mp4"), 200.0)
+    with pytest.raises(LiveError, match="hold 0 frames"):
+        Pipeline(iter(()), restore, SHAPE, sink, None, Limits(), threading.Event()).run(lambda figures: None)
 
 
 def test_a_stage_that_does_not_end_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

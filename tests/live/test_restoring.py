@@ -13,9 +13,10 @@ import pytest
 
 from tests.live.conftest import COLUMNS, NOISE, ROWS, profile_of, raw_frame
 from tests.live.test_pipeline import ListSink
+from tests.restoration.test_device import panel_light
 from tests.scenes import toy_restorer
 from udccal.cameras.protocol import Frame, Region
-from udccal.errors import LiveError, RestorationError
+from udccal.errors import LiveError, ProfileError, RestorationError
 from udccal.live.exposure import AutoExposure
 from udccal.live.follow import ProfileFollower
 from udccal.live.own_pictures import OwnPictures
@@ -24,6 +25,7 @@ from udccal.live.pipeline import Limits, Pipeline
 from udccal.live.restoring import Restoring
 from udccal.profiles.profile import Profile
 from udccal.profiles.store import write_profile
+from udccal.restoration.backscatter import PanelMask
 from udccal.restoration.device.restorer import DeviceRestorer
 from udccal.restoration.runtime import Restorer
 from udccal.restoration.tone import Tone, display_exposure
@@ -136,6 +138,54 @@ def test_a_mirrors_panel_shows_the_newest_picture_that_was_there() -> None:
             assert set(found.ravel()) == {expected}
 
 
+@pytest.mark.parametrize(("rate_hz", "delay_s"), [(30, 0.5), (120, 0.3), (500, 0.5)])
+def test_a_picture_is_kept_until_the_next_one_is_on_the_panel(rate_hz: int, delay_s: float) -> None:
+    """However fast pictures come, and though a frame waits a while for its restoration."""
+    own = OwnPictures(load_rig("lg55-reduced").panel.model_copy(update={"columns": 1, "rows": 1}), delay_s)
+    period_ns, delayed = 10**9 // rate_hz, round(delay_s * rate_hz)
+    for n in range(2 * rate_hz):
+        own.wrote(np.full((1, 1, 3), n % 251, np.uint8), n * period_ns)
+        waiting = max(n - rate_hz // 10, 0)
+        found = own.at(waiting * period_ns + period_ns // 2)
+        assert (None if found is None else found[0, 0, 0]) == (None if waiting < delayed else (waiting - delayed) % 251)
+
+
+def test_pictures_that_no_frame_asks_for_are_forgotten() -> None:
+    own = OwnPictures(load_rig("lg55-reduced").panel, 0.1)
+    for n in range(1000):
+        own.wrote(np.zeros((1, 1, 3), np.uint8), n * 10**7)
+    assert len(own._written) < 120
+
+
+@pytest.mark.parametrize("tier", [Tier.preview, Tier.fast])
+def test_a_frame_darker_than_the_panels_picture_is_restored_without_it(tier: Tier) -> None:
+    rig, panel = toy_restorer.rig(), panel_light(toy_restorer.rig())
+    white = np.full((rig.panel.rows, rig.panel.columns, 3), 255, np.uint8)
+    plain = toy_restorer.made(tier, rig, NOISE, toy_restorer.geometry(), toy_restorer.grid())
+    mask = PanelMask(panel.rate(white)[plain.rows], panel.cfa, 0.0)
+    restorer = replace(plain, mask=mask, panel=None if tier is Tier.preview else panel.of_rows(plain.rows))
+    settings = replace(raw_frame(0).settings, region=Region(0, 0, toy_restorer.COLUMNS, toy_restorer.ROWS))
+    dark, bright = (
+        replace(
+            raw_frame(n),
+            data=np.full((toy_restorer.ROWS, toy_restorer.COLUMNS), level, np.uint16),
+            settings=replace(settings, exposure_s=toy_restorer.EXPOSURE_S),
+        )
+        for n, level in enumerate((66, 2000))
+    )
+    known, unknown, refused = Restoring(restorer, white), Restoring(restorer), list[str]()
+
+    def restored(frame: Frame) -> np.ndarray:
+        return known.restore(frame, 0, lambda: refused.append("dark"))
+
+    np.testing.assert_array_equal(restored(dark), unknown.restore(dark, 0))
+    assert refused == ([] if tier is Tier.preview else ["dark"])  # a preview estimates the panel's light always
+    restored(bright)
+    assert len(refused) <= 1
+    restored(dark)
+    assert len(refused) == (0 if tier is Tier.preview else 2)
+
+
 def test_a_changed_profile_is_taken_up_between_two_frames(
     restoring: Restoring, live_rig: RigDescription, profile_folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -192,3 +242,62 @@ def test_a_change_before_the_run_begins_is_taken_up(profile_folder: Path, monkey
     (profile_folder / "profile.json").touch()
     with follower:
         assert taken.wait(30)
+
+
+class Following:
+    """A profile that is followed, whose loading fails as it is told to, and what was said and tried."""
+
+    def __init__(self, folder: Path) -> None:
+        self.error: Exception | None = None
+        self.said: list[str] = []
+        self.tried = 0
+        self.follower = ProfileFollower(folder, self.take, self.said.append)
+
+    def take(self) -> None:
+        self.tried += 1
+        if self.error is not None:
+            raise self.error
+
+    def wait(self, more: int = 3) -> None:
+        """Wait until the profile has been tried again so many times."""
+        wanted, deadline = self.tried + more, time.monotonic() + 30
+        while self.tried < wanted and time.monotonic() < deadline:
+            time.sleep(0.002)
+        assert self.tried >= wanted
+
+
+@pytest.fixture
+def following(profile_folder: Path, monkeypatch: pytest.MonkeyPatch) -> Following:
+    monkeypatch.setattr("udccal.live.follow._EVERY_S", 0.01)
+    return Following(profile_folder)
+
+
+def test_a_profile_that_comes_file_by_file_is_taken_up_when_it_is_whole(
+    profile_folder: Path, following: Following
+) -> None:
+    following.error = ProfileError("Expected wire.exr, found none.")
+    (profile_folder / "profile.json").touch()
+    with following.follower:
+        following.wait()
+        following.error = ProfileError("Expected psf.exr, found none.")
+        following.wait()
+        (profile_folder / "profile.json").touch()
+        following.wait()
+        following.error = None  # the last file is there; profile.json has stayed as it was
+        following.wait(1)
+        time.sleep(0.1)
+        tried = following.tried
+        time.sleep(0.1)
+    assert following.tried == tried
+    assert ["wire.exr" in said for said in following.said] == [True, False, False, False]
+    assert ["psf.exr" in said for said in following.said] == [False, True, True, False]
+    assert "restored with the new one" in following.said[-1]
+
+
+def test_a_profile_of_another_camera_is_tried_once(profile_folder: Path, following: Following) -> None:
+    following.error = LiveError("Expected a changed profile of 96 x 64, found one of 48 x 32.")
+    (profile_folder / "profile.json").touch()
+    with following.follower:
+        following.wait(1)
+        time.sleep(0.1)
+    assert following.tried == len(following.said) == 1

@@ -17,7 +17,8 @@ from udccal import plugins
 from udccal.errors import LiveError, UdccalError
 from udccal.io.png import read_rgb8
 from udccal.live.sinks.images import ImagesSink
-from udccal.live.sinks.protocol import Sink, make_sink
+from udccal.live.sinks.mirrored import MirroredSink
+from udccal.live.sinks.protocol import RestoredFrame, Sink, make_sink
 from udccal.live.sinks.shared_memory import SharedMemorySink
 from udccal.live.sinks.video import VideoSink
 from udccal.live.sinks.virtual_camera import VirtualCameraSink
@@ -179,3 +180,29 @@ def test_a_virtual_camera_gets_its_format_before_its_frames(monkeypatch: pytest.
     with pytest.raises(LiveError, match=r"no such device.* v4l2loopback"):
         absent.open((ROWS, COLUMNS))
     absent.close()
+
+
+def test_a_mirrored_sink_gets_pictures_with_left_and_right_exchanged() -> None:
+    sink = ListSink()
+    mirrored: Sink = MirroredSink(sink)
+    picture = np.arange(4 * 6 * 3, dtype=np.uint8).reshape(4, 6, 3)
+    mirrored.open((4, 6))
+    mirrored.write(RestoredFrame(picture, 7, 9))
+    mirrored.close()
+    assert sink.calls == ["open", "close"]
+    (got,) = sink.frames
+    assert (got.frame_id, got.captured_ns) == (7, 9)
+    assert got.picture.flags.c_contiguous
+    np.testing.assert_array_equal(got.picture, picture[:, ::-1])
+
+
+def test_a_video_that_cannot_be_begun_leaves_nothing_and_ends_in_peace(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "a.mp4").write_bytes(b"an earlier one")
+    sink = VideoSink(str(tmp_path / "a.mp4"), 10.0)
+    monkeypatch.setattr(cv2.VideoWriter, "isOpened", lambda writer: False)
+    with pytest.raises(LiveError, match="Expected OpenCV to write"):
+        sink.open((ROWS, COLUMNS))
+    sink.close()
+    assert [(item.name, item.read_bytes()) for item in tmp_path.iterdir()] == [("a.mp4", b"an earlier one")]

@@ -35,6 +35,7 @@ def test_seconds_begin_anew_and_the_whole_goes_on() -> None:
         tally.dropped(Stage.ACQUISITION)
         tally.dropped(Stage.RESTORATION, 2)
         tally.took(Stage.RESTORATION, 0.010)
+        tally.without_panel_picture()
         tally.written(0.030, late_hook=True)
         figures = tally.second()
         assert (figures.captured, figures.written, figures.late_hooks) == (4, 1, 1)
@@ -43,7 +44,9 @@ def test_seconds_begin_anew_and_the_whole_goes_on() -> None:
             2,
             0,
         )
+        assert figures.without_panel_picture == 1
         assert figures.latency_ms.p50 == pytest.approx(30, rel=0.01)
     whole = tally.whole()
     assert (whole.captured, whole.written, whole.dropped) == (8, 2, 6)
+    assert whole.without_panel_picture == 2
     assert tally.second().restoration_ms == Spread(None, None, None)

@@ -44,7 +44,12 @@ def run(
     tier: Annotated[Tier, typer.Option("--tier", help="How much is done to a frame; see restore.")] = Tier.preview,
     panel_picture: PanelPicturePath = None,
     mirror: Annotated[
-        bool, typer.Option("--mirror", help="The panel shows this run's own pictures, scaled to fill it.")
+        bool,
+        typer.Option(
+            "--mirror",
+            help="The panel shows this run's own pictures, scaled to fill it; the sink gets them with left and right "
+            "exchanged, as in a mirror.",
+        ),
     ] = False,
     mirror_delay_ms: Annotated[
         float, typer.Option("--mirror-delay-ms", min=0.0, max=500.0, help="How much later the panel shows a picture.")

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import final
 
+from udccal.errors import LiveError
 from udccal.io.whole_folder import standing
 from udccal.profiles.provenance import PROFILE_NAME
 
@@ -25,7 +26,8 @@ class ProfileFollower:
 
     def __init__(self, path: Path, take: Callable[[], None], say: Callable[[str], None]) -> None:
         self._path, self._take, self._say = path, take, say
-        self._known = self._state()
+        self._settled = self._state()
+        self._said: tuple[tuple[int, int], str] | None = None
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._follow, name="profile", daemon=True)
 
@@ -39,17 +41,26 @@ class ProfileFollower:
     def _follow(self) -> None:
         while not self._ended.wait(_EVERY_S):
             state = self._state()
-            if state is not None and state != self._known:
-                self._known = state
-                self._try()
+            if state is not None and state != self._settled:
+                self._try(state)
 
-    def _try(self) -> None:
+    def _try(self, state: tuple[int, int]) -> None:
         try:
             self._take()
+        except LiveError as error:
+            self._settled = state  # whole, and not for this run: trying again would not help
+            self._say_once(state, error)
         except Exception as error:
-            self._say(f"The profile {self._path} has changed and cannot be used; the earlier one is kept. {error}")
+            self._say_once(state, error)  # it may be half copied
         else:
+            self._settled = state
             self._say(f"The profile {self._path} has changed; frames are restored with the new one from now on.")
+
+    def _say_once(self, state: tuple[int, int], error: Exception) -> None:
+        said = state, f"The profile {self._path} has changed and cannot be used; the earlier one is kept. {error}"
+        if said != self._said:
+            self._said = said
+            self._say(said[1])
 
     def _state(self) -> tuple[int, int] | None:
         """Return what changes with the profile; None where there is none at the moment."""

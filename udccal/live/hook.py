@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import os
 import queue
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import final
 
 import numpy as np
@@ -28,20 +29,31 @@ def load_hook(text: str) -> Hook:
         LiveError: when there is none.
     """
     module, _, name = text.partition(":")
-    sys.path.append(os.getcwd())
     try:
-        found = getattr(importlib.import_module(module), name)
-    except (ImportError, AttributeError, ValueError) as error:
+        with _importable(os.getcwd()):
+            found = getattr(importlib.import_module(module), name)
+    except (Exception, SystemExit) as error:  # whatever the module does when it is imported
         raise LiveError(
-            f"Expected --hook module:function with a function that can be imported, found for '{text}': {error}. "
-            "Correct the name, or start in the module's folder."
+            f"Expected --hook module:function with a function that can be imported, found for '{text}': "
+            f"{type(error).__name__}: {error}. Correct the name or the module, or start in the module's folder."
         ) from error
-    finally:
-        sys.path.pop()
     if not callable(found):
         raise LiveError(f"Expected --hook '{text}' to name a function, found {type(found).__name__}. Name another.")
     function: Hook = found
     return function
+
+
+@contextlib.contextmanager
+def _importable(folder: str) -> Iterator[None]:
+    """Have modules of a folder found meanwhile; what a module itself does to the path stays."""
+    new = folder not in sys.path
+    if new:
+        sys.path.append(folder)
+    try:
+        yield
+    finally:
+        if new and folder in sys.path:
+            sys.path.remove(folder)
 
 
 @final

@@ -64,6 +64,7 @@ class Pipeline:
         limits: when to end.
         stop: ends the run when set; set when the run has ended.
         wrote: gets every picture that the sink has taken, and when, in ns of the monotonic clock.
+        tally: counts for this run; None for one of its own.
     """
 
     def __init__(
@@ -76,6 +77,7 @@ class Pipeline:
         limits: Limits,
         stop: threading.Event,
         wrote: Callable[[Picture, int], None] = ignored,
+        tally: Tally | None = None,
     ) -> None:
         self._wrote = wrote
         self._frames, self._sink, self._hook = frames, sink, hook
@@ -83,7 +85,7 @@ class Pipeline:
         self._limits, self._stop = limits, stop
         self._captured: Newest[_Captured] = Newest()
         self._restored: Newest[RestoredFrame] = Newest()
-        self._tally = Tally()
+        self._tally = Tally() if tally is None else tally
         self._error: Exception | None = None
 
     def run(self, show: Callable[[Figures], None]) -> Figures:
@@ -95,7 +97,11 @@ class Pipeline:
         Raises:
             UdccalError: the first error of any thread; all threads have ended then.
         """
-        works = (Stage.ACQUISITION, self._acquire), (Stage.RESTORATION, self._restore), (Stage.OUTPUT, self._output)
+        works = (
+            (Stage.ACQUISITION, self._acquire, self._captured.close),
+            (Stage.RESTORATION, self._restore, self._restored.close),
+            (Stage.OUTPUT, self._output, self._close),
+        )
         threads = [threading.Thread(target=self._guarded, args=each, name=each[0], daemon=True) for each in works]
         for thread in threads:
             thread.start()
@@ -125,54 +131,55 @@ class Pipeline:
                 return
             show(self._tally.second())
 
-    def _guarded(self, stage: Stage, work: Callable[[], None]) -> None:
+    def _guarded(self, stage: Stage, work: Callable[[], None], end: Callable[[], None]) -> None:
+        """Do a stage's work and end it. An error is noted before: ending wakes the next stage, and may fail too."""
         try:
-            work()
+            self._noting(stage, work)
+        finally:
+            self._noting(stage, end)
+
+    def _noting(self, stage: Stage, part: Callable[[], None]) -> None:
+        try:
+            part()
         except Exception as error:
             if self._error is None:
                 self._error = _as_sentence(stage, error)
             self._stop.set()
 
     def _acquire(self) -> None:
-        try:
-            expected: int | None = None
+        expected: int | None = None
+        start = time.monotonic()
+        for frame in self._frames:
+            captured_ns = time.monotonic_ns()
+            self._tally.took(Stage.ACQUISITION, time.monotonic() - start)
+            lost = 0 if expected is None else max(frame.frame_id - expected, 0)
+            expected = frame.frame_id + 1
+            self._tally.captured(lost + 1)
+            self._tally.dropped(Stage.ACQUISITION, lost + (not frame.complete))
+            if frame.complete and self._captured.put(_Captured(frame, captured_ns)):
+                self._tally.dropped(Stage.RESTORATION)
+            if self._stop.is_set():
+                return
             start = time.monotonic()
-            for frame in self._frames:
-                captured_ns = time.monotonic_ns()
-                self._tally.took(Stage.ACQUISITION, time.monotonic() - start)
-                lost = 0 if expected is None else max(frame.frame_id - expected, 0)
-                expected = frame.frame_id + 1
-                self._tally.captured(lost + 1)
-                self._tally.dropped(Stage.ACQUISITION, lost + (not frame.complete))
-                if frame.complete and self._captured.put(_Captured(frame, captured_ns)):
-                    self._tally.dropped(Stage.RESTORATION)
-                if self._stop.is_set():
-                    return
-                start = time.monotonic()
-        finally:
-            self._captured.close()
 
     def _restore(self) -> None:
-        try:
-            while (item := self._captured.get()) is not None:
-                start = time.monotonic()
-                picture = self._restore_frame(item.frame, item.captured_ns)
-                self._tally.took(Stage.RESTORATION, time.monotonic() - start)
-                if self._restored.put(RestoredFrame(picture, item.frame.frame_id, item.captured_ns)):
-                    self._tally.dropped(Stage.OUTPUT)
-        finally:
-            self._restored.close()
+        while (item := self._captured.get()) is not None:
+            start = time.monotonic()
+            picture = self._restore_frame(item.frame, item.captured_ns)
+            self._tally.took(Stage.RESTORATION, time.monotonic() - start)
+            if self._restored.put(RestoredFrame(picture, item.frame.frame_id, item.captured_ns)):
+                self._tally.dropped(Stage.OUTPUT)
 
     def _output(self) -> None:
-        try:
-            self._sink.open(self._shape)
-            left = self._limits.frames
-            while left != 0 and (item := self._restored.get()) is not None:
-                self._write(item)
-                left = None if left is None else left - 1
-        finally:
-            self._stop.set()
-            self._sink.close()
+        self._sink.open(self._shape)
+        left = self._limits.frames
+        while left != 0 and (item := self._restored.get()) is not None:
+            self._write(item)
+            left = None if left is None else left - 1
+
+    def _close(self) -> None:
+        self._stop.set()
+        self._sink.close()
 
     def _write(self, frame: RestoredFrame) -> None:
         start = time.monotonic()

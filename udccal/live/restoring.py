@@ -5,6 +5,7 @@ The camera may read fewer rows than the sensor has.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import final
 
 import jax
@@ -12,13 +13,17 @@ import numpy as np
 from jaxtyping import UInt8, UInt16
 
 from udccal.cameras.protocol import Frame
-from udccal.errors import LiveError
+from udccal.errors import LiveError, PanelPictureError
 from udccal.live.exposure import AutoExposure
 from udccal.live.own_pictures import OwnPictures, PanelPicture
 from udccal.restoration.device.restorer import DeviceRestorer
 from udccal.restoration.runtime import Restorer
 from udccal.restoration.tone import Tone
 from udccal.rig import RigDescription
+
+
+def unnoted() -> None:
+    """Take no note of a frame."""
 
 
 @final
@@ -48,7 +53,7 @@ class Restoring:
 
     @property
     def _restorer(self) -> Restorer:
-        return self._shows.restorer if isinstance(self._shows, DeviceRestorer) else self._shows
+        return _restorer_of(self._shows)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -70,18 +75,40 @@ class Restoring:
         self._check_rows(restorer)
         self._shows = self._warm(restorer)
 
-    def restore(self, frame: Frame, captured_ns: int) -> UInt8[np.ndarray, "rows columns 3"]:
+    def restore(
+        self, frame: Frame, captured_ns: int, without_panel_picture: Callable[[], None] = unnoted
+    ) -> UInt8[np.ndarray, "rows columns 3"]:
         """Return a frame, which arrived at ``captured_ns`` of the monotonic clock, as display-encoded RGB.
+
+        One that is darker than the panel's picture was taken of something else: the panel went dark for a moment, or
+        showed the picture later. It is restored as if nobody knew the picture.
+
+        Args:
+            frame: of the profile's camera.
+            captured_ns: when it arrived.
+            without_panel_picture: called for such a frame.
 
         Raises:
             LiveError: when it lacks rows that the view needs.
             RestorationError: when the frame is not of the profile's camera.
         """
-        shows, restorer, exposure_s = self._shows, self._restorer, frame.settings.exposure_s
-        shown = self._shown(captured_ns)
+        shows, exposure_s, shown = self._shows, frame.settings.exposure_s, self._shown(captured_ns)
         mosaic = self._of_sensor(frame)
+        try:
+            return self._picture(shows, mosaic, exposure_s, shown)
+        except PanelPictureError:
+            without_panel_picture()
+            return self._picture(shows, mosaic, exposure_s, None)
+
+    def _picture(
+        self,
+        shows: Restorer | DeviceRestorer,
+        mosaic: UInt16[np.ndarray, "sensor_rows sensor_columns"],
+        exposure_s: float,
+        shown: PanelPicture | None,
+    ) -> UInt8[np.ndarray, "rows columns 3"]:
         if self._exposure is None:
-            self._exposure = AutoExposure(restorer.restore(mosaic, exposure_s, shown))
+            self._exposure = AutoExposure(_restorer_of(shows).restore(mosaic, exposure_s, shown))
         picture = shows.display(mosaic, exposure_s, self._exposure.tone, shown)
         self._exposure.follow(picture)
         return picture
@@ -121,6 +148,10 @@ class Restoring:
         shows = restorer if self._device is None else DeviceRestorer.of(restorer, self._device)
         shows.display(grey, camera.min_exposure_s, Tone(1.0), shown)
         return shows
+
+
+def _restorer_of(shows: Restorer | DeviceRestorer) -> Restorer:
+    return shows.restorer if isinstance(shows, DeviceRestorer) else shows
 
 
 def _sizes(rig: RigDescription) -> str:

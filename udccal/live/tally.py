@@ -33,6 +33,7 @@ class Figures:
         dropped_by_camera: frames that the camera lost or delivered incomplete.
         dropped_before_restoration, dropped_before_output: frames that a newer one replaced in a queue.
         late_hooks: frames that went out unaltered because the hook was late.
+        without_panel_picture: frames darker than the panel's picture alone, restored as if nobody knew it.
         acquisition_ms: time to the next frame, waiting for the camera included.
         restoration_ms: restoration and display encoding.
         output_ms: hook and sink.
@@ -47,6 +48,7 @@ class Figures:
     dropped_before_restoration: int
     dropped_before_output: int
     late_hooks: int
+    without_panel_picture: int
     acquisition_ms: Spread
     restoration_ms: Spread
     output_ms: Spread
@@ -64,6 +66,7 @@ class _Sums:
     captured: int = 0
     written: int = 0
     late_hooks: int = 0
+    without_panel_picture: int = 0
     dropped: Counter[Stage] = field(default_factory=Counter)
     took: dict[Stage, Durations] = field(default_factory=lambda: {stage: Durations() for stage in Stage})
     latency: Durations = field(default_factory=Durations)
@@ -78,6 +81,7 @@ class _Sums:
             dropped_before_restoration=self.dropped[Stage.RESTORATION],
             dropped_before_output=self.dropped[Stage.OUTPUT],
             late_hooks=self.late_hooks,
+            without_panel_picture=self.without_panel_picture,
             acquisition_ms=self.took[Stage.ACQUISITION].spread(),
             restoration_ms=self.took[Stage.RESTORATION].spread(),
             output_ms=self.took[Stage.OUTPUT].spread(),
@@ -119,6 +123,12 @@ class Tally:
                 sums.written += 1
                 sums.late_hooks += late_hook
                 sums.latency.add(latency_s)
+
+    def without_panel_picture(self) -> None:
+        """Count a frame that was darker than the panel's picture alone."""
+        with self._lock:
+            for sums in (self._second, self._whole):
+                sums.without_panel_picture += 1
 
     def second(self) -> Figures:
         """Return the figures since the last call, and begin anew."""

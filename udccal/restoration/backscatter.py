@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float32, Int32, UInt8
 from scipy import sparse
 
 from udccal.cfa import Cfa, cfa_named
-from udccal.errors import RestorationError
+from udccal.errors import PanelPictureError, RestorationError
 from udccal.models.backscatter import Backscatter, cubic_weights, panel_light, panel_response
 from udccal.models.noise import Noise
 from udccal.numerics import in_float64
@@ -205,7 +205,7 @@ def refuse_excess(
         clipped: samples of the frame that say less than the light was; they are left out.
 
     Raises:
-        RestorationError: when the panel's light is more than the frame's by a fifth, far beyond the mask's errors.
+        PanelPictureError: when the panel's light is more than the frame's by a fifth, far beyond the mask's errors.
     """
     use = ~clipped[SPARSE]
     seen, expected = (float(np.sum(light[SPARSE], where=use, dtype=np.float64)) for light in (signal, panel_light))
@@ -215,7 +215,7 @@ def refuse_excess(
 def refuse_excess_of(seen: float, expected: float, samples: float) -> None:
     """Refuse a frame as ``refuse_excess`` does, by the sums of its light and of the panel's over some samples."""
     if expected > _MORE * max(seen, 0.0) + samples * _NEGLIGIBLE_E:
-        raise RestorationError(
+        raise PanelPictureError(
             f"Expected a frame at least as bright as the panel's own light, found {seen / samples:.3g} e- per pixel "
             f"where the panel picture alone gives {expected / samples:.3g} e- at this exposure. Check that the "
             "exposure is in seconds (8 ms are 0.008), and that the panel showed that picture; or leave the picture out."

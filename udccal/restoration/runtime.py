@@ -204,8 +204,9 @@ class Restorer:
             the clean picture on the virtual view: linear RGB in e-/s.
 
         Raises:
-            RestorationError: when the frame, its exposure or the panel picture does not belong to this rig, or the
-                panel's picture alone would give more light than the frame has: the exposure is wrong, or the picture.
+            RestorationError: when the frame, its exposure or the panel picture does not belong to this rig.
+            PanelPictureError: when the panel's picture alone would give more light than the frame has: the exposure is
+                wrong, or the picture.
         """
         linear = self._restored_e(mosaic, exposure_s, panel_picture)
         linear /= np.float32(exposure_s)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import json
 import signal
 import threading
@@ -25,8 +26,9 @@ from udccal.live.hook import TimedHook, load_hook
 from udccal.live.own_pictures import OwnPictures
 from udccal.live.pipeline import Limits, Pipeline, ignored
 from udccal.live.restoring import Restoring
-from udccal.live.sinks.protocol import make_sink
-from udccal.live.tally import Figures
+from udccal.live.sinks.mirrored import MirroredSink
+from udccal.live.sinks.protocol import Sink, make_sink
+from udccal.live.tally import Figures, Tally
 from udccal.profiles.profile import Profile
 from udccal.profiles.store import find_profile, load_profile
 from udccal.reports.tables import Table
@@ -79,7 +81,7 @@ def run_live(output: Output, wanted: LiveRun) -> None:
     """
     keep_compilations()
     device = _gpu() if wanted.device == "gpu" else None
-    sink = make_sink(wanted.sink, wanted.camera.rate_hz)
+    sink = _sink(wanted)
     hook = None if wanted.hook is None else TimedHook(load_hook(wanted.hook), wanted.hook_s)
     path, stop = find_profile(wanted.profile), threading.Event()
 
@@ -106,12 +108,18 @@ def run_live(output: Output, wanted: LiveRun) -> None:
                 stage.update(round(figures.elapsed_s), text=_line(figures))
                 write(figures)
 
+            tally = Tally()
+            restore = functools.partial(restoring.restore, without_panel_picture=tally.without_panel_picture)
             shape, wrote = restoring.shape, ignored if own is None else own.wrote
-            run = Pipeline(frames, restoring.restore, shape, sink, hook, wanted.limits, stop, wrote)
-            whole = run.run(show)
+            whole = Pipeline(frames, restore, shape, sink, hook, wanted.limits, stop, wrote, tally).run(show)
         write(whole)
     output.table(_table(whole))
     output.result(whole)
+
+
+def _sink(wanted: LiveRun) -> Sink:
+    sink = make_sink(wanted.sink, wanted.camera.rate_hz)
+    return sink if wanted.mirror_delay_s is None else MirroredSink(sink)
 
 
 def _gpu() -> jax.Device:
@@ -126,14 +134,18 @@ def _gpu() -> jax.Device:
 
 @contextlib.contextmanager
 def _ended_by_signals(stop: threading.Event) -> Iterator[None]:
-    """Set ``stop`` at Ctrl-C and whatever else asks this process to end; a second time, Ctrl-C is itself again."""
+    """Set ``stop`` at Ctrl-C and whatever else asks this process to end; a second time, Ctrl-C is itself again.
+
+    Signals that are ignored stay so, as SIGHUP under ``nohup``; so do handlers that are not Python's.
+    """
 
     def end(number: int, _: FrameType | None) -> None:
         stop.set()
         signal.signal(number, before[signal.Signals(number)])
 
     numbers = [signal.Signals[name] for name in _ENDING if hasattr(signal, name)]
-    before = {number: signal.signal(number, end) for number in numbers}
+    ours = [number for number in numbers if signal.getsignal(number) not in (signal.SIG_IGN, None)]
+    before = {number: signal.signal(number, end) for number in ours}
     try:
         yield
     finally:
@@ -178,6 +190,7 @@ def _table(figures: Figures) -> Table:
         ("dropped before restoration", figures.dropped_before_restoration),
         ("dropped before output", figures.dropped_before_output),
         ("hooks that were late", figures.late_hooks),
+        ("without the panel's picture", figures.without_panel_picture),
     )
     times = (
         ("acquisition: 50th/95th/99th percentile", figures.acquisition_ms),

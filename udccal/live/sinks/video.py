@@ -42,15 +42,17 @@ class VideoSink:
 
     def open(self, shape: tuple[int, int]) -> None:
         """Begin the file under its temporary name."""
-        self._temporary = self._naming.enter_context(atomic_path(self._path))
-        rows, columns = shape
-        fourcc = cv2.VideoWriter.fourcc(*_CODEC)
-        self._writer = cv2.VideoWriter(str(self._temporary), cv2.CAP_FFMPEG, fourcc, self._rate_hz, (columns, rows))
-        if not self._writer.isOpened():
-            raise LiveError(
-                f"Expected OpenCV to write {self._path} as {_CODEC} video of {columns} x {rows} px, found that it "
-                "cannot. Use --sink images:FOLDER."
-            )
+        with ExitStack() as naming:
+            self._temporary = naming.enter_context(atomic_path(self._path))
+            rows, columns = shape
+            fourcc = cv2.VideoWriter.fourcc(*_CODEC)
+            writer = cv2.VideoWriter(str(self._temporary), cv2.CAP_FFMPEG, fourcc, self._rate_hz, (columns, rows))
+            if not writer.isOpened():
+                raise LiveError(
+                    f"Expected OpenCV to write {self._path} as {_CODEC} video of {columns} x {rows} px, found that it "
+                    "cannot. Use --sink images:FOLDER."
+                )
+            self._writer, self._naming = writer, naming.pop_all()
 
     def write(self, frame: RestoredFrame) -> None:
         """Write a frame at its time."""
@@ -70,7 +72,6 @@ class VideoSink:
             LiveError: when it is not whole, as on a full disk; no file is left then.
         """
         if self._writer is None:
-            self._naming.close()
             return
         with self._naming:
             self._writer.release()
