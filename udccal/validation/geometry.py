@@ -166,8 +166,8 @@ def _strange_check(step_ids: Sequence[str]) -> tuple[Check, ...]:
     if not step_ids:
         return ()
     what = (
-        f"In {', '.join(step_ids)}, most corners lie elsewhere than the profile's lens shows those of a flat board. See "
-        "whether the board moved or bent there, and capture it again."
+        f"In {', '.join(step_ids)}, most corners lie elsewhere than the profile's lens shows those of a flat board. "
+        "See whether the board moved or bent there, and capture it again."
     )
     return (at_most("geometry", "strange views", float(len(step_ids)), 0.0, "1", what),)
 
