@@ -73,7 +73,7 @@ def test_the_forecast_says_what_each_tier_gives(
     profile: Profile, frame: np.ndarray, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     small = PlanOptions(grid_rows=2, grid_columns=2, tile_rows=96, tile_columns=128)
-    monkeypatch.setattr(runtime, "PlanOptions", lambda: small)
+    monkeypatch.setattr(runtime, "checked_options", lambda given: small)
     plan = plan_of(profile, frame, Tier.preview, forecast=True)
     assert plan.tier is Tier.preview
     preview, fast, balanced, accurate = plan.tiers

@@ -69,6 +69,19 @@ class PlanOptions:
             )
 
 
+def checked_options(options: PlanOptions | None) -> PlanOptions:
+    """Return the options, or the defaults for None.
+
+    Raises:
+        RestorationError: when they are something else.
+    """
+    if options is None:
+        return PlanOptions()
+    if not isinstance(options, PlanOptions):
+        raise RestorationError(f"Expected options as PlanOptions, found {options!r:.80}. Give PlanOptions(...).")
+    return options
+
+
 def kernel_grid(psf: PsfField, rig: RigDescription, options: PlanOptions) -> KernelGrid:
     """Evaluate the psf at a grid of positions that spans the sensor from edge to edge.
 

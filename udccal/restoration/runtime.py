@@ -15,7 +15,6 @@ import numpy as np
 from jaxtyping import Bool, Float32, UInt8, UInt16
 
 from udccal.cfa import cfa_named
-from udccal.errors import RestorationError
 from udccal.kernels import fitted_size
 from udccal.models.geometry import VirtualView
 from udccal.models.noise import Noise
@@ -30,7 +29,7 @@ from udccal.restoration.defects import without_defects
 from udccal.restoration.demosaic import demosaic
 from udccal.restoration.kernel_grid import KernelGrid
 from udccal.restoration.linear import saturated, to_electrons, variance_e2
-from udccal.restoration.plan import PlanOptions, kernel_grid
+from udccal.restoration.plan import PlanOptions, checked_options, kernel_grid
 from udccal.restoration.prepared import kept
 from udccal.restoration.preview import Preview
 from udccal.restoration.rectify import Rectification
@@ -135,9 +134,7 @@ class Restorer:
             RestorationError: when its geometry leaves no view through the panel, a term gives values that are not
                 finite, or options are no ``PlanOptions``.
         """
-        options, tier = PlanOptions() if options is None else options, tier_named(tier)
-        if not isinstance(options, PlanOptions):
-            raise RestorationError(f"Expected options as PlanOptions, found {options!r:.80}. Give PlanOptions(...).")
+        options, tier = checked_options(options), tier_named(tier)
         rig, geometry = profile.rig, profile.geometry.term
         camera, cfa = rig.camera, cfa_named(rig.camera.cfa)
         view = kept_view(geometry, rig, keep)
