@@ -21,7 +21,7 @@ from scipy import fft
 
 from udccal.cfa import BLUE, GREEN, RED, Site
 from udccal.restoration.kernel_grid import KernelGrid, centred, interpolated_kernels
-from udccal.restoration.mosaic_filter import COLOURFUL, COMMON, SPARSE, prior_density
+from udccal.restoration.mosaic_filter import COLOURFUL, COMMON, SPARSE, power_of, prior_density
 from udccal.restoration.tiles import TileLayout
 
 _EVERY = (slice(None), slice(None))
@@ -71,14 +71,14 @@ class ColourTables:
         """Return the likelihood of every n-th frequency, ready for any strengths; see ``Tables``."""
         some, h = along[:, ::SPARSE, ::SPARSE] / np.sqrt(np.float32(samples)), self.transfer[:, ::SPARSE, ::SPARSE]
         density = self.density[::SPARSE, ::SPARSE]
-        power, size, product = _power(some), _power(h), np.conjugate(h) * some
+        power, size, product = power_of(some), power_of(h), np.conjugate(h) * some
 
         def cost(strength: np.float32) -> np.float32:
             own = strength * density
             weight = 1 / (1 + own * size)
             shared = own * np.float32(COMMON)
             beyond = 1 + shared * (size * weight).sum(axis=0)
-            explained = shared * _power((product * weight).sum(axis=0)) / beyond
+            explained = shared * power_of((product * weight).sum(axis=0)) / beyond
             found: np.float32 = (power * weight - np.log(weight)).sum() + (np.log(beyond) - explained).sum()
             return found
 
@@ -89,7 +89,7 @@ class ColourTables:
     ) -> Complex64[np.ndarray, "3 rows half"]:
         """Return (B + 1 / s)^-1 Y; ``along`` is overwritten."""
         own = strength * self.density
-        size = _power(self.transfer)
+        size = power_of(self.transfer)
         weight = strength / (1 + own * size)
         shared = self.density * np.float32(COMMON)
         along *= weight
@@ -97,10 +97,6 @@ class ColourTables:
         in_common *= shared / (1 + shared * (size * weight).sum(axis=0))
         along -= self.transfer * (weight * in_common)
         return along
-
-
-def _power(values: Complex64[np.ndarray, "*shape"]) -> Float32[np.ndarray, "*shape"]:
-    return values.real**2 + values.imag**2
 
 
 def colour_tables(grid: KernelGrid, layout: TileLayout, workers: int) -> ColourTables:

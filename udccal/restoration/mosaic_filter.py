@@ -125,7 +125,7 @@ class FilterTables:
     ) -> Callable[[Float32[np.ndarray, " some"]], Float32[np.ndarray, " some"]]:
         """Return the likelihood of every n-th frequency, ready for any strengths; see ``Tables``."""
         some = along[:, ::SPARSE, ::SPARSE]
-        power = ((some.real**2 + some.imag**2) / np.float32(samples)).ravel()
+        power = (power_of(some) / np.float32(samples)).ravel()
         value = self.values[:, ::SPARSE, ::SPARSE].ravel()
 
         def costs(strengths: Float32[np.ndarray, " some"]) -> Float32[np.ndarray, " some"]:
@@ -143,6 +143,11 @@ class FilterTables:
         weighted = np.conjugate(along)
         weighted *= 1 / (self.values + 1 / strength)
         return np.conjugate(_products(self.vectors.swapaxes(0, 1), weighted), out=weighted)
+
+
+def power_of(values: Complex64[np.ndarray, "*shape"]) -> Float32[np.ndarray, "*shape"]:
+    """Return the square of each number's size."""
+    return values.real**2 + values.imag**2
 
 
 def filter_tables(grid: KernelGrid, layout: TileLayout, pattern: Pattern, workers: int) -> FilterTables:

@@ -15,7 +15,7 @@ import numpy as np
 import scipy.ndimage
 import scipy.sparse
 from jaxtyping import Bool, Float, Int
-from scipy.linalg import cholesky, solve_triangular
+from scipy.linalg import cho_solve, cholesky, solve_triangular
 from scipy.linalg.blas import dtrsm
 
 from udccal.fitting.engine.least_squares import Step
@@ -84,6 +84,17 @@ class Laplace:
             dense, [divided(c.band, x, False) for c, x in zip(self.colours, own, strict=True)], self.kept
         )
 
+    def solved(self, right: Float[np.ndarray, " unknowns"]) -> Float[np.ndarray, " unknowns"]:
+        """Solve the equations for another right side, in the order of ``Changes``, by the factors that are there."""
+        dense, nodes = right[: len(self.root)].copy(), right[len(self.root) :].reshape(len(self.colours), -1)
+        halves = [divided(c.band, x[self.kept, None], True) for c, x in zip(self.colours, nodes, strict=True)]
+        for c, half in zip(self.colours, halves, strict=True):
+            dense[c.index] -= c.cross.T @ half[:, 0]
+        dense = cho_solve((self.root, True), dense)[:, None]
+        own = [half - c.cross @ dense[c.index] for c, half in zip(self.colours, halves, strict=True)]
+        images = [divided(c.band, x, False) for c, x in zip(self.colours, own, strict=True)]
+        return _with_nodes(dense, images, self.kept)[:, 0]
+
 
 def _with_nodes(
     dense: Float[np.ndarray, "dense k"], nodes: list[Float[np.ndarray, "own k"]], kept: Bool[np.ndarray, " nodes"]
@@ -94,18 +105,12 @@ def _with_nodes(
     return np.concatenate([dense, every.reshape(-1, dense.shape[1])])
 
 
-def laplace(stamps: Stamps, state: State, drawn: bool = True) -> Laplace:
-    """Build and solve the equations at a state with priors; raise LinAlgError when they are singular.
-
-    Args:
-        stamps: the data.
-        state: where the equations are expanded.
-        drawn: whether the mode is the posterior's; otherwise it is one step towards what the data alone prefer.
-    """
+def laplace(stamps: Stamps, state: State) -> Laplace:
+    """Build and solve the equations at a state with priors; raise LinAlgError when they are singular."""
     seen, (stars, planes), kept = expectation(stamps, state), state.light_e.shape, state.kept.ravel()
     numbers, count = np.arange(state.vector.size), state.maps_from + state.maps
     prior, nodes = state.prior, numbers[count:].reshape(planes, -1)[:, kept]
-    pull, size, colours = drawn * (prior @ state.vector), np.zeros(count), []
+    pull, size, colours = prior @ state.vector, np.zeros(count), []
     for own, mine in enumerate(nodes):
         colour = normal_equations(stamps, state, seen, own)
         size[colour.index] += colour.dense.diagonal()

@@ -238,7 +238,7 @@ def _report(
     draws = draws * inflation + drawn(state, *draws.shape)
     # The way that is left is one more standard deviation, and so is the way back to what the data alone prefer: kernels
     # with more structure than the priors expect are smoothed by about as much.
-    for seed_of, way in ((2, posterior.mode), (3, laplace(stamps, state, drawn=False).mode - posterior.mode)):
+    for seed_of, way in ((2, posterior.mode), (3, posterior.solved(state.prior @ state.vector))):
         draws += way[:, None] * np.random.default_rng(seed_of).standard_normal(rules.draws[1])
     term = _term(stamps, state, draws / np.sqrt(rules.draws[1]))
     # The expected error, then the maps' coefficients, named by colour, element and degrees in x and y.

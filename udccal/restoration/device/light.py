@@ -20,9 +20,6 @@ from udccal.restoration.mosaic_filter import channels_of
 
 _AROUND = tuple((down, across) for down in range(3) for across in range(3) if (down, across) != (1, 1))
 
-# What ``PanelTables`` takes of ``PanelSums``.
-PANEL_TABLES = ("shares", "pixels", "starts", "gain", "mix", "light", "down", "across")
-
 # Sigmas below 0 from which the mean of what is not negative is taken from a series.
 _FAR = 8.0
 

@@ -15,7 +15,7 @@ from udccal.errors import RestorationError
 from udccal.restoration.backscatter import refuse_excess_of
 from udccal.restoration.checks import check_frame, check_panel_picture
 from udccal.restoration.device.bands import blurred, refined, shrunk
-from udccal.restoration.device.light import PANEL_TABLES, FrontEnd, PanelTables, plausible
+from udccal.restoration.device.light import FrontEnd, PanelTables, plausible
 from udccal.restoration.device.planes import Mosaic, box_mean, cut, resampled
 from udccal.restoration.device.tile_filter import TileFilter
 from udccal.restoration.kernel_grid import interpolated_kernels
@@ -141,14 +141,18 @@ class DeviceRestorer:
                 None if noise is None else (noise.variance, noise.probe),
                 (network_weights(), kernels) if restorer.tier is Tier.accurate else None,
                 (pixel.astype(np.int32) - before, np.stack([index % len(taps), index // len(taps)], axis=-1), taps),
-                None if restorer.panel is None else tuple(getattr(restorer.panel.sums, name) for name in PANEL_TABLES),
+                None if restorer.panel is None else vars(restorer.panel.sums),
                 np.zeros((layout.reach.stop - layout.reach.start, camera.columns), np.float32),
             ),
             device or jax.devices()[0],
         )
         tiles = TileFilter(*filters, layout, cfa)
         stages = _Stages(FrontEnd(*front, cfa), tiles, bands, learned, maps, options.network_views, error)
-        sums = None if panel is None else PanelTables(*panel, cfa)
+        sums = (
+            None
+            if panel is None
+            else PanelTables(**{name: part for name, part in panel.items() if name != "region"}, cfa=cfa)
+        )
         return cls(restorer, stages, sums, np.empty((0, 0, 3), np.uint8), dark)
 
     def display(
