@@ -12,7 +12,7 @@ from typing import final
 import numpy as np
 
 from udccal.arrangements import Dark, FlatLight
-from udccal.fitting.engine.information import cramer_rao
+from udccal.fitting.engine.gaussian import cramer_rao
 from udccal.fitting.noise.data import NoiseRules
 from udccal.fitting.noise.transfer import temporal_variance
 from udccal.planning.design import Limits

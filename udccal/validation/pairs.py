@@ -12,9 +12,9 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.special import ndtri
 
+from udccal.bins import Bins
 from udccal.cfa import cfa_named
 from udccal.fitting.backscatter.data import grid_step
-from udccal.fitting.bins import Bins
 from udccal.fitting.engine.misfit import excess_sigma
 from udccal.fitting.noise.data import NoiseRules, read_noise
 from udccal.fitting.noise.moments import NoiseMoments, reduced, stacked

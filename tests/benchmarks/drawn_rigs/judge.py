@@ -16,6 +16,7 @@ from tests.benchmarks.drawn_rigs.sensor import DrawnSensor
 from tests.benchmarks.drawn_rigs.session import LED_REGION, WRITERS, panel_picture
 from tests.benchmarks.drawn_rigs.wire import wire_map
 from udccal.fitting.geometry.fit import term_at
+from udccal.fitting.psf.held_out import KernelError, stated_by
 from udccal.models.backscatter import backscatter_rate
 from udccal.models.geometry import project_directions, tilt_rad
 from udccal.models.psf import psf_kernels
@@ -87,16 +88,17 @@ def _psf(profile: Profile, rig: Rig) -> list[Judged]:
     true = np.stack([diffraction.kernel(rig, place, rows, columns) for place in places])
     found = np.asarray(psf_kernels(profile.psf.term, places, rows, columns))
     relative = 100 * np.sqrt(((found - true) ** 2).sum(axis=(2, 3)) / (true**2).sum(axis=(2, 3)))
-    stated = 100 * (profile.psf.diagnostic("kernel_error_l2") or math.nan)
-    words = ("The kernel is off by",)
+    # The note repeats what is stated, and nothing is told where that is too small.
+    stated = stated_by(profile.psf) or KernelError(math.nan)
+    whole, faint = 100 * stated.relative_l2(found).max(axis=0), 100 * stated.relative_rms(found)
     rows_of = [
-        judged(f"psf relative L2, {colour}, worst of {_PLACES} places", worst, 3.0, "%", profile.psf, stated, words)
-        for colour, worst in zip(("red", "green", "blue"), relative.max(axis=0), strict=True)
+        judged(f"psf relative L2, {colour}, worst of {_PLACES} places", worst, 3.0, "%", profile.psf, of_colour, ())
+        for colour, worst, of_colour in zip(("red", "green", "blue"), relative.max(axis=0), whole, strict=True)
     ]
     seen = true > _VISIBLE * true.max(axis=(2, 3), keepdims=True)
     tail = 100 * _rms(((found - true)[seen]) / true[seen])
     name = "psf where above 1e-4 of its peak, RMS of the relative error"
-    return [*rows_of, judged(name, tail, 15.0, "%", profile.psf, math.nan, words)]
+    return [*rows_of, judged(name, tail, 15.0, "%", profile.psf, faint, ())]
 
 
 def _scatter(profile: Profile, rig: Rig) -> list[Judged]:

@@ -14,7 +14,8 @@ from jaxtyping import Array, Float
 
 from tests.benchmarks.efficiency.trials import Trials
 from tests.fitting.geometry.boards import VISIBLE_BEND, Sight, calibrated, sight
-from udccal.fitting.engine.information import cramer_rao, fisher_information
+from tests.scenes.information import fisher_information
+from udccal.fitting.engine.gaussian import cramer_rao
 from udccal.fitting.geometry.calibrated import CalibratedViews, Gauge, field_grid
 from udccal.fitting.geometry.corners import board_points_mm
 from udccal.fitting.geometry.data import GeometryData

@@ -10,7 +10,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from tests.benchmarks.efficiency.trials import Trials, column
-from udccal.fitting.engine.information import cramer_rao, fisher_information
+from tests.scenes.information import fisher_information
+from udccal.fitting.engine.gaussian import cramer_rao
 from udccal.fitting.hdr.merge import merge_bracket
 from udccal.models.noise import Noise
 

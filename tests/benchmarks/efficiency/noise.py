@@ -14,8 +14,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from tests.benchmarks.efficiency.trials import Trials, column
+from tests.scenes.information import fisher_information
 from tests.scenes.noise import ToySensor, expose, measure, patterns, truth
-from udccal.fitting.engine.information import cramer_rao, fisher_information
+from udccal.fitting.engine.gaussian import cramer_rao
 from udccal.fitting.noise.codes import DarkPair, dark_pair, excess_kurtosis, pair_probability
 from udccal.fitting.noise.data import NoiseRules
 from udccal.fitting.noise.transfer import temporal_variance

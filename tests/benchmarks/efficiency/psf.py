@@ -17,8 +17,7 @@ from tests.benchmarks.efficiency.trials import Trials
 from tests.benchmarks.psf_kernels import kernel_and_slopes, light_and_slopes
 from tests.scenes.psf import Picture, Scene, pictures, shots_of, small_scene
 from udccal.effort import FitEffort
-from udccal.fitting.engine.gaussian import Prior, scaled_inverse
-from udccal.fitting.engine.information import cramer_rao
+from udccal.fitting.engine.gaussian import Prior, cramer_rao, scaled_inverse
 from udccal.fitting.psf.data import PsfRules, Shots
 from udccal.fitting.psf.diffraction import fit_diffraction
 from udccal.fitting.psf.kernel import WAVELENGTHS_NM, Evaluator, fit_lattice, start_model, start_prior

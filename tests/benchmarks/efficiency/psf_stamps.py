@@ -15,7 +15,8 @@ from jaxtyping import Array, Float
 from scipy.linalg import block_diag
 
 from tests.benchmarks.efficiency.trials import Trials
-from udccal.fitting.engine.information import cramer_rao, fisher_information
+from tests.scenes.information import fisher_information
+from udccal.fitting.engine.gaussian import cramer_rao
 from udccal.fitting.psf_stamps.data import Stamps, StampsRules, offsets
 from udccal.fitting.psf_stamps.field import PsfField, Seen, response
 from udccal.fitting.psf_stamps.fit import fit_psf_stamps

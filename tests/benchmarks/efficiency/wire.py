@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from tests.benchmarks.efficiency.trials import Trials
+from tests.scenes.information import fisher_information
 from tests.scenes.wire import (
     COLUMNS,
     ELECTRONS,
@@ -34,7 +35,7 @@ from tests.scenes.wire import (
     start,
 )
 from udccal.effort import FitEffort
-from udccal.fitting.engine.information import cramer_rao, fisher_information
+from udccal.fitting.engine.gaussian import cramer_rao
 from udccal.fitting.wire.data import odd_step
 from udccal.fitting.wire.parameters import SHAPE_NAMES, shape_sigma, shape_vector, with_shape
 from udccal.fitting.wire.rules import WireRules, WireStart

@@ -10,7 +10,8 @@ import numpy as np
 from tests.benchmarks.efficiency.geometry import corners_seen
 from tests.benchmarks.robust.family import Answer, Case, Family, Number, of_result
 from tests.fitting.geometry.boards import Sight, sight
-from udccal.fitting.engine.information import cramer_rao, fisher_information
+from tests.scenes.information import fisher_information
+from udccal.fitting.engine.gaussian import cramer_rao
 from udccal.fitting.geometry.bundle import INTRINSIC_NAMES, LENS
 from udccal.fitting.geometry.corners import board_points_mm
 from udccal.fitting.geometry.fit import fit_geometry

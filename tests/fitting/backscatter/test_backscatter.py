@@ -9,6 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tests.simulation.toy import toy_rig, toy_truth
+from udccal.bins import Bins, block_weights
 from udccal.cameras.protocol import CameraIdentity, Region, Settings
 from udccal.cfa import PATTERNS, Cfa, cfa_named
 from udccal.displays.pictures import face_picture
@@ -22,7 +23,6 @@ from udccal.fitting.backscatter.data import (
 )
 from udccal.fitting.backscatter.fit import fit_backscatter
 from udccal.fitting.backscatter.parameters import BackscatterRules
-from udccal.fitting.bins import Bins, block_weights
 from udccal.fitting.noise.fit import nominal_noise
 from udccal.fitting.nominal import nominal_geometry
 from udccal.models.backscatter import Backscatter, backscatter_rate

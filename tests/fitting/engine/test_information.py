@@ -7,7 +7,8 @@ import pytest
 from jaxtyping import Array, Float
 from scipy.stats import norm
 
-from udccal.fitting.engine.information import cramer_rao, fisher_information
+from tests.scenes.information import fisher_information
+from udccal.fitting.engine.gaussian import cramer_rao
 
 
 def _shot_noise(x: Float[Array, "2"], times: Float[Array, " n"]) -> tuple[Float[Array, " n"], Float[Array, " n"]]:

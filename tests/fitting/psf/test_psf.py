@@ -179,6 +179,9 @@ def test_blur_without_a_grating_is_carried_by_the_image() -> None:
     assert float(result.term.diffraction_fraction) == 0.0
     assert result.chi2_dof < 10.0
     assert "not that of a panel's grating" in result.notes[0]
+    stated = stated_by(result)
+    assert stated is not None
+    assert any("The kernel is off by" in note for note in result.notes) == (stated.size > 0)
     assert result.term.residual.shape[2:] == tuple(2 * result.term.support_px[::-1].astype(int) + 1)
     place = np.array([[430.0, 300.0]])
     truth = streak(place[0], place[0], 0.0, rig)[None, :, 6:-6, 6:-6]

@@ -81,6 +81,11 @@ def test_an_error_is_in_the_unit_of_its_kernels() -> None:
     np.testing.assert_allclose(error.of_kernels(kernel), 16.0 * 0.02 * np.sqrt(part / (1 + part)))
     wanted = np.sqrt((error.of_kernels(kernel) ** 2).sum() / (kernel**2).sum())
     np.testing.assert_allclose(error.relative_l2(kernel), wanted)
+    lit = part[part > 0]
+    rms = np.sqrt(np.mean((0.02 * np.sqrt(lit / (1 + lit)) / lit) ** 2))
+    # A sample that is a hundred-thousandth of the peak does not count; one of a thousandth does.
+    assert error.relative_rms(kernel + [[[0.0, 0.0], [1.6e-4, 0.0]]]) == pytest.approx(rms)
+    assert error.relative_rms(kernel + [[[0.0, 0.0], [1.6e-2, 0.0]]]) > 2 * rms
 
 
 @pytest.mark.slow

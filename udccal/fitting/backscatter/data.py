@@ -12,9 +12,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped, UInt8
 from scipy.spatial.transform import Rotation
 
+from udccal.bins import Bins
 from udccal.fitting.backscatter.model import Moves, PanelCrop, PerBin, PerShot, Pictures, Rays, Usable, corners_of
 from udccal.fitting.backscatter.parameters import BackscatterRules, linear_of, prior_of
-from udccal.fitting.bins import Bins
 from udccal.fitting.nominal import nominal_backscatter
 from udccal.fitting.wire.data import ideal_points
 from udccal.models.geometry import Geometry

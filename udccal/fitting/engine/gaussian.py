@@ -175,3 +175,29 @@ def scaled_inverse(matrix: Float[np.ndarray, "*k n n"], rcond: float = 1e-12) ->
     seen = size > rcond * size.max(axis=-1, keepdims=True, initial=0.0)
     values = np.where(seen, 1 / np.where(seen, values, 1.0), 0.0)
     return np.asarray((vectors * values[..., None, :]) @ np.swapaxes(vectors, -1, -2) / outer)
+
+
+def cramer_rao(
+    information: Float[np.ndarray, "n n"], slopes: Float[np.ndarray, "quantities n"] | None = None
+) -> Float[np.ndarray, " quantities"]:
+    """Smallest standard deviation of unbiased estimates of the parameters or of functions of them (Cramér–Rao bound).
+
+    Parameters of very different size are scaled before the inversion.
+
+    Args:
+        information: Fisher information on the n parameters.
+        slopes: derivatives of each quantity by the parameters; without them the parameters are the quantities.
+
+    Returns:
+        one sigma per quantity, in its unit; infinite where the data do not determine it.
+    """
+    root = np.sqrt(np.diag(information))
+    seen = root > 0
+    scale = np.where(seen, root, 1.0)
+    inverse = scaled_inverse(information, 1e-13)
+    directions = np.eye(len(root)) if slopes is None else np.asarray(slopes, dtype=np.float64)
+    variance = np.einsum("qi,ij,qj->q", directions, inverse, directions)
+    # A direction in the null space of the information comes back shortened from its projection.
+    short = (directions @ (inverse @ information) - directions) / scale
+    lost = np.linalg.norm(short, axis=1) > 1e-6 * np.linalg.norm(directions / scale, axis=1)
+    return np.where(lost, np.inf, np.sqrt(np.maximum(variance, 0.0)))

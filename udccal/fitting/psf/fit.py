@@ -179,13 +179,11 @@ def _report(
     if fit.phase:
         figures["wire_phase_strength"], figures["wire_phase_strength_sigma"] = fit.phase.best.fit
     lengths = zip(("support_rows", "support_columns"), support.half_px, strict=True)
-    misfit = ""
-    if pattern_p <= SIGNIFICANT:
-        off = f" The kernel is off by {100 * error_l2:.2g} % where it was not captured; sigmas include that."
+    off = _said_to_be_off(stated, selection.magnitude) if error.size else ""
+    misfit = "" if diffracts else off
+    if diffracts and pattern_p <= SIGNIFICANT:
         numbered = f"{', '.join(_NUMBERS)} are numbers of a model that they refute"
-        misfit = (
-            f"Residuals of diffraction have a pattern (p = {pattern_p:.1g}): {numbered}.{off if error.size else ''}"
-        )
+        misfit = f"Residuals of diffraction have a pattern (p = {pattern_p:.1g}): {numbered}. {off}".rstrip()
     return FitResult(
         name="psf",
         term=term,
@@ -275,6 +273,12 @@ def _posterior(
     return Posterior(np.concatenate([fit.theta, np.zeros(1 + patterns)]), factor, term_at)
 
 
+def _said_to_be_off(stated: KernelError, magnitude: Float[np.ndarray, "3 rows columns"]) -> str:
+    whole, faint = (100 * float(np.mean(part(magnitude))) for part in (stated.relative_l2, stated.relative_rms))
+    where = "where it was not captured, and its faint parts, down to 1e-4 of the peak,"
+    return f"The kernel is off by {whole:.2g} % {where} by {faint:.2g} %; sigmas include that."
+
+
 def _notes(data: PsfData, diffracts: bool, misfit: str, support: tuple[str, ...]) -> tuple[str, ...]:
     notes = [
         "The blur is not that of a panel's grating: an image carries the kernel; no number of diffraction is known.",
@@ -284,8 +288,8 @@ def _notes(data: PsfData, diffracts: bool, misfit: str, support: tuple[str, ...]
         notes = [
             "cov leaves out spectra and field coefficients of the residual.",
             "chi2_dof is of the fit of diffraction and allows for the model error of its residuals.",
-            *([misfit] if misfit else []),
         ]
+    notes += [misfit] if misfit else []
     if data.doubted:
         notes.append(f"{len(data.doubted)} of {data.taken} brackets are in doubt. {data.doubted[0]}")
     left_out, why = data.dark + data.clipped, f"{data.dark} without an LED, {data.clipped} clipped."

@@ -54,6 +54,11 @@ class KernelError:
         error, light = ((part**2).sum(axis=(-2, -1)) for part in (self.of_kernels(kernels), kernels))
         return np.asarray(np.sqrt(error / np.maximum(light, 1e-300)))
 
+    def relative_rms(self, kernels: Float[np.ndarray, "*n rows columns"]) -> float:
+        """Return the RMS of the relative error of all samples that are brighter than 1e-4 of their kernel's peak."""
+        seen = kernels > 1e-4 * kernels.max(axis=(-2, -1), keepdims=True)
+        return float(np.sqrt(np.mean((self.of_kernels(kernels)[seen] / kernels[seen]) ** 2)))
+
 
 def estimate_kernel_error(
     residual: Float[np.ndarray, " samples"],

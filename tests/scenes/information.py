@@ -1,4 +1,4 @@
-"""Fisher information of Gaussian, possibly clipped samples, and the Cramér–Rao bound that follows from it.
+"""Fisher information of Gaussian, possibly clipped samples.
 
 The model is given as one pure JAX function from parameters to the mean and variance of every sample. Its derivatives
 come from automatic differentiation, so that a bound and a fit share one likelihood. With mean m, variance v and samples
@@ -21,7 +21,6 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy.special import log_ndtr, ndtr
 
-from udccal.fitting.engine.gaussian import scaled_inverse
 from udccal.numerics import in_float64
 
 # Parameters to (mean, variance) of every sample.
@@ -49,32 +48,6 @@ def fisher_information(
     own, cross, square = _clipped_moments((clip - mean) / sigma)
     mixed = by_mean.T @ (by_sigma * cross[:, None])
     return by_mean.T @ (by_mean * own[:, None]) + mixed + mixed.T + by_sigma.T @ (by_sigma * square[:, None])
-
-
-def cramer_rao(
-    information: Float[np.ndarray, "n n"], slopes: Float[np.ndarray, "quantities n"] | None = None
-) -> Float[np.ndarray, " quantities"]:
-    """Smallest standard deviation of unbiased estimates of the parameters or of functions of them (Cramér–Rao bound).
-
-    Parameters of very different size are scaled before the inversion.
-
-    Args:
-        information: of the n parameters; see ``fisher_information``.
-        slopes: derivatives of each quantity by the parameters; without them the parameters are the quantities.
-
-    Returns:
-        one sigma per quantity, in its unit; infinite where the data do not determine it.
-    """
-    root = np.sqrt(np.diag(information))
-    seen = root > 0
-    scale = np.where(seen, root, 1.0)
-    inverse = scaled_inverse(information, 1e-13)
-    directions = np.eye(len(root)) if slopes is None else np.asarray(slopes, dtype=np.float64)
-    variance = np.einsum("qi,ij,qj->q", directions, inverse, directions)
-    # A direction in the null space of the information comes back shortened from its projection.
-    short = (directions @ (inverse @ information) - directions) / scale
-    lost = np.linalg.norm(short, axis=1) > 1e-6 * np.linalg.norm(directions / scale, axis=1)
-    return np.where(lost, np.inf, np.sqrt(np.maximum(variance, 0.0)))
 
 
 @functools.partial(jax.jit, static_argnums=0)
