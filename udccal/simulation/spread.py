@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import cv2
@@ -15,7 +16,7 @@ from udccal.simulation.truth import RigTruth
 
 # In sensor pixels: cells have the finest size up to the reach from the source, then grow by a factor to the coarsest.
 _FINEST, _COARSEST, _FINE_REACH, _GROWTH = 1 / 32, 0.25, 3.0, 1.06
-_BLOCK_ROWS = 64
+_BLOCK_ROWS, _WORKERS = 64, 2
 
 
 @dataclass(frozen=True)
@@ -63,11 +64,15 @@ def angular_spread(
         pick_x = _cell_operator(edges_x, float(relative), per_x, power.zero_x, power.cumulative.shape[1])
         picks.append((pick_y, pick_x))
     cells = np.empty((3, half_y.size - 1, edges_x.size - 1))
-    # Rows by the block, so that one block's light at every wavelength stays in the processor's cache.
-    for first in range(0, half_y.size - 1, _BLOCK_ROWS):
+
+    def fill(first: int) -> None:
         rows = slice(first, first + _BLOCK_ROWS)
         light = [pick_x @ np.ascontiguousarray((pick_y[rows] @ power.cumulative).T) for pick_y, pick_x in picks]
         cells[:, rows] = np.tensordot(spectrum.weights, light, axes=1).swapaxes(1, 2)
+
+    # Rows by the block, so that one block's light at every wavelength stays in the processor's cache.
+    with ThreadPoolExecutor(_WORKERS) as pool:
+        list(pool.map(fill, range(0, half_y.size - 1, _BLOCK_ROWS)))
     return AngularSpread(edges_x, edges_y, _cumulative(np.concatenate([cells[:, ::-1, ::-1], cells], axis=1)))
 
 
