@@ -47,8 +47,8 @@ class Session:
         return self.views.planned(self.by_hand[0], self.world._arrangement)
 
     def sigma(self, views: list[BoardView | None]) -> np.ndarray:
-        told = sum(self.views.told(view) for view in [self.exact(self.on_jig), *views])
-        return np.sqrt(np.diag(scaled_inverse(rig_prior(self.rig).precision + told, 1e-15)))
+        information = sum(self.views.information(view) for view in [self.exact(self.on_jig), *views])
+        return np.sqrt(np.diag(scaled_inverse(rig_prior(self.rig).precision + information, 1e-15)))
 
     def over_exact(self, views: list[BoardView | None]) -> float:
         """The worst of the nine sigmas, in units of that by the exact poses."""

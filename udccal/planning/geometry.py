@@ -110,7 +110,7 @@ class BoardViews:
         sigma = self._sigma_px(step, points_px, self._window_px(spec, float(pose[5])), parallel=False)
         return BoardView(corners, points_px, sigma, pose, parallel=False)
 
-    def told(self, view: BoardView | None) -> Float[np.ndarray, "9 9"]:
+    def information(self, view: BoardView | None) -> Float[np.ndarray, "9 9"]:
         """Return the Fisher information of one view on the intrinsics, whatever its own pose; none without a pose."""
         size = len(self.intrinsics)
         if view is None or not (points := gather([view.board], [view.image], [view.sigma]).points).names:
@@ -217,26 +217,26 @@ class NextView:
         self._known, by_hand = rig_prior(rig).precision, []
         for step in state.steps("geometry"):
             if isinstance(board := step.arrangement, Board):
-                told, self._step = self._views.told(self._views.planned(step, board)), step
+                information, self._step = self._views.information(self._views.planned(step, board)), step
                 if board.parallel_to_panel:
-                    self._known = self._known + told
+                    self._known = self._known + information
                 else:
-                    by_hand.append(told)
+                    by_hand.append(information)
         self._to_come, self._average = len(by_hand), np.mean(by_hand, axis=0)
         self._usual = _sigma(self._known + np.sum(by_hand, axis=0))
-        self._tell = np.array([self._views.told(self._views.planned(self._step, pose)) for pose in poses])
+        self._of_poses = np.array([self._views.information(self._views.planned(self._step, pose)) for pose in poses])
 
     def taken(self, numbers: Int[np.ndarray, " n"], points_px: Float[np.ndarray, "n 2"]) -> None:
         """Count a view that was captured, by the corners seen; see ``BoardViews.seen``."""
         view = self._views.seen(self._step, self._poses[0].spec, numbers, points_px)
-        self._known = self._known + self._views.told(view)
+        self._known = self._known + self._views.information(view)
         self._to_come -= 1
 
     def pose(self) -> Board:
         """Return the pose to ask for now; another one each time."""
         self._open = self._open or list(range(len(self._poses)))
         later = max(self._to_come - 1, 0) * self._average
-        worst = (_sigma(self._known + later + self._tell[self._open]) / self._usual).max(axis=-1)
+        worst = (_sigma(self._known + later + self._of_poses[self._open]) / self._usual).max(axis=-1)
         return self._poses[self._open.pop(int(worst.argmin()))]
 
 
