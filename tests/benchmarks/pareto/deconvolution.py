@@ -100,7 +100,7 @@ def deconv_table(found: Deconvolutions) -> str:
 
 
 def _cells(one: Deconvolved) -> str:
-    return f"{one.dB:.2f} | {one.seconds:.2g}"
+    return f"{one.dB:.2f} | {one.seconds:.3g}"
 
 
 def _script(size: tuple[int, int], tier: Tier) -> str:
